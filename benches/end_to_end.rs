@@ -11,9 +11,9 @@ mod support;
 use scanhub_drivers::lms;
 use std::process::ExitCode;
 
+use support::environment::{BenchEnvironment, Child, SENSORS, STEP_TIMEOUT};
 use support::figures::{self, Figure, Target};
-use support::stage::{Child, PATIENCE, SENSORS, Stage};
-use support::truth::Truth;
+use support::truth::SensorTruth;
 use support::{Options, Outcome};
 
 fn main() -> ExitCode {
@@ -21,36 +21,36 @@ fn main() -> ExitCode {
 }
 
 fn measure(options: &Options) -> Outcome<()> {
-    let mut figures = transport(options.count(1500))?;
-    for (rate, streaming, first) in STARTS {
-        figures.extend(starts(options.pairs(), rate, streaming, first)?);
+    let mut figures = measure_transport(options.count(1500))?;
+    for (rate, streaming, first) in START_CASES {
+        figures.extend(measure_starts(options.pairs(), rate, streaming, first)?);
     }
     figures::print("end_to_end", options.json, &figures);
     Ok(())
 }
 
 /// `count` telegrams of each sensor through the hub; each figure has a value per sensor.
-fn transport(count: usize) -> Outcome<Vec<Figure>> {
-    let stage = Stage::new()?;
+fn measure_transport(count: usize) -> Outcome<Vec<Figure>> {
+    let environment = BenchEnvironment::new()?;
     let start = |sensor: &&str| {
-        let consumer = stage.consumer("telegram", sensor, &[&count.to_string()])?;
-        consumer.await_line("attaching", PATIENCE)?;
-        Ok(consumer)
+        let subscriber = environment.start_subscriber("telegram", sensor, &[&count.to_string()])?;
+        subscriber.wait_for_line("attaching", STEP_TIMEOUT)?;
+        Ok(subscriber)
     };
     // Whoever listens from the beginning can tell whether something was lost: the sensors come last.
-    let consumers: Vec<Child> = SENSORS.iter().map(start).collect::<Outcome<_>>()?;
-    let hub = stage.hub(&SENSORS)?;
-    hub.await_line("ready", PATIENCE)?;
-    let simulator = stage.simulate(&SENSORS, 500_000)?;
+    let subscribers: Vec<Child> = SENSORS.iter().map(start).collect::<Outcome<_>>()?;
+    let hub = environment.start_hub(&SENSORS)?;
+    hub.wait_for_line("ready", STEP_TIMEOUT)?;
+    let simulator = environment.simulate(&SENSORS, 500_000)?;
     let mut received = Vec::new();
-    for consumer in &consumers {
-        received.push(consumer.lines_until("end", PATIENCE + count as u32 * PATIENCE / 400)?);
+    for subscriber in &subscribers {
+        received.push(subscriber.lines_until("end", STEP_TIMEOUT + count as u32 * STEP_TIMEOUT / 400)?);
     }
     drop(hub);
     drop(simulator);
     let mut found = [const { Vec::new() }; 6];
     for (sensor, lines) in SENSORS.iter().zip(&received) {
-        let truth = Truth::read(&stage.truth(), sensor)?;
+        let truth = SensorTruth::read(&environment.truth(), sensor)?;
         let hashes: Vec<&str> = lines.iter().filter_map(|line| line.words().get(6).copied()).collect();
         let times: Vec<u64> = lines.iter().map(|line| line.number(2)).collect::<Outcome<_>>()?;
         let places: Vec<Option<usize>> =
@@ -74,16 +74,21 @@ fn transport(count: usize) -> Outcome<Vec<Figure>> {
     let figure = |name, unit, hub, target| Figure { name, unit, hub, baseline: Vec::new(), target };
     Ok(vec![
         figure("telegrams received", "1", received, Target::None),
-        figure("lost", "1", lost, Target::Most(0.0)),
-        figure("not bit for bit", "1", altered, Target::Most(0.0)),
-        figure("out of order", "1", disordered, Target::Most(0.0)),
-        figure("sent before the first received", "1", before, Target::Most(0.0)),
+        figure("lost", "1", lost, Target::Max(0.0)),
+        figure("not bit for bit", "1", altered, Target::Max(0.0)),
+        figure("out of order", "1", disordered, Target::Max(0.0)),
+        figure("sent before the first received", "1", before, Target::Max(0.0)),
         Figure { baseline: vec![NOMINAL_HZ; 2], ..figure("rate", "Hz", hz, Target::None) },
     ])
 }
 
 /// Starts of the hub and of the baseline, each with a sensor that was just powered on at `rate`.
-fn starts(pairs: usize, rate: u32, streaming: &'static str, first: &'static str) -> Outcome<[Figure; 2]> {
+fn measure_starts(
+    pairs: usize,
+    rate: u32,
+    streaming: &'static str,
+    first: &'static str,
+) -> Outcome<[Figure; 2]> {
     let new = |name| Figure { name, unit: "ms", hub: Vec::new(), baseline: Vec::new(), target: Target::None };
     let mut figures = [new(streaming), new(first)];
     for _ in 0..pairs {
@@ -97,36 +102,36 @@ fn starts(pairs: usize, rate: u32, streaming: &'static str, first: &'static str)
 
 /// Milliseconds from exec of the hub to the state streaming and to the first scan in a consumer's hands.
 fn start_hub(rate: u32) -> Outcome<[f64; 2]> {
-    let stage = Stage::new()?;
-    let _simulator = stage.simulate(&ONE, rate)?;
-    let statuses = stage.consumer("status", ONE[0], &[])?;
-    let scans = stage.consumer("scan", ONE[0], &[])?;
-    statuses.await_line("attaching", PATIENCE)?;
-    scans.await_line("attaching", PATIENCE)?;
-    let hub = stage.hub(&ONE)?;
+    let environment = BenchEnvironment::new()?;
+    let _simulator = environment.simulate(&ONE_SENSOR, rate)?;
+    let statuses = environment.start_subscriber("status", ONE_SENSOR[0], &[])?;
+    let scans = environment.start_subscriber("scan", ONE_SENSOR[0], &[])?;
+    statuses.wait_for_line("attaching", STEP_TIMEOUT)?;
+    scans.wait_for_line("attaching", STEP_TIMEOUT)?;
+    let hub = environment.start_hub(&ONE_SENSOR)?;
     let since = |at: u64| (at - hub.started_ns) as f64 / 1e6;
-    let first = since(scans.await_line("scan", PATIENCE)?.number(2)?);
-    let streaming = since(statuses.await_line("status front streaming", PATIENCE)?.number(3)?);
+    let first = since(scans.wait_for_line("scan", STEP_TIMEOUT)?.number(2)?);
+    let streaming = since(statuses.wait_for_line("status front streaming", STEP_TIMEOUT)?.number(3)?);
     Ok([streaming, first])
 }
 
 /// The same of a host that knows the rate.
 fn start_baseline(rate: u32) -> Outcome<[f64; 2]> {
-    let stage = Stage::new()?;
-    let _simulator = stage.simulate(&ONE, rate)?;
-    let host = stage.part(&["host", &stage.port(ONE[0]), &rate.to_string()])?;
+    let environment = BenchEnvironment::new()?;
+    let _simulator = environment.simulate(&ONE_SENSOR, rate)?;
+    let host = environment.start_part(&["host", &environment.port(ONE_SENSOR[0]), &rate.to_string()])?;
     let since = |at: u64| (at - host.started_ns) as f64 / 1e6;
-    let streaming = since(host.await_line("streaming", PATIENCE)?.number(1)?);
-    Ok([streaming, since(host.await_line("scan", PATIENCE)?.number(1)?)])
+    let streaming = since(host.wait_for_line("streaming", STEP_TIMEOUT)?.number(1)?);
+    Ok([streaming, since(host.wait_for_line("scan", STEP_TIMEOUT)?.number(1)?)])
 }
 
 /// Rate at power-on, and the names of its figures.
-const STARTS: [(u32, &str, &str); 4] = [
+const START_CASES: [(u32, &str, &str); 4] = [
     (500_000, "500000 Bd to streaming", "500000 Bd to first scan"),
     (38_400, "38400 Bd to streaming", "38400 Bd to first scan"),
     (19_200, "19200 Bd to streaming", "19200 Bd to first scan"),
     (9_600, "9600 Bd to streaming", "9600 Bd to first scan"),
 ];
-const ONE: [&str; 1] = ["front"];
+const ONE_SENSOR: [&str; 1] = ["front"];
 /// 180 degrees in halves: two turns of the mirror.
-const NOMINAL_HZ: f64 = 1e9 / (2.0 * lms::variant::MIRROR_TURN as f64);
+const NOMINAL_HZ: f64 = 1e9 / (2.0 * lms::variant::MIRROR_PERIOD as f64);

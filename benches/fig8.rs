@@ -10,22 +10,22 @@ use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use scanhub_drivers::lms::variant::{MIRROR_TURN, Unit, Variant};
-use scanhub_preprocess::background::{Method, Model, Settings};
+use scanhub_drivers::lms::variant::{MIRROR_PERIOD, Unit, Variant};
+use scanhub_preprocess::background::{BackgroundModel, Method, Settings};
 use scanhub_preprocess::segments::Segmenter;
 use scanhub_schema::{Background, Foreground, Nanos, Pose, Scan};
 use scanhub_sim::room::Room;
 
 /// Number of scans, as in the paper's figure.
-const SCANS: u64 = 2_000;
+const SCAN_COUNT: u64 = 2_000;
 /// Time between two scans.
-const SCAN_NS: Nanos = 2 * MIRROR_TURN;
+const SCAN_PERIOD_NS: Nanos = 2 * MIRROR_PERIOD;
 /// End of the time in which nothing changes: box 1 is put down at 15 s.
-const BEFORE_NS: Nanos = 14_900_000_000;
+const UNCHANGED_UNTIL_NS: Nanos = 14_900_000_000;
 /// Time of the snapshot: the person is in the room, and box 1 is still foreground.
 const SNAPSHOT_NS: Nanos = 19_000_000_000;
 /// Difference of two backgrounds that is drawn, in mm: the threshold of the methods.
-const DIFFERENT_MM: u16 = 30;
+const MIN_DIFFERENCE_MM: u16 = 30;
 
 struct Options {
     draw: Option<PathBuf>,
@@ -60,11 +60,11 @@ impl Options {
 
 /// What is kept of the run.
 #[derive(Default)]
-struct Run {
+struct WarningRun {
     /// Every position that was background at any time.
-    models: Vec<Place>,
+    models: Vec<Position>,
     /// Every position that was foreground at any time.
-    foreground: Vec<Place>,
+    foreground: Vec<Position>,
     before: Vec<u16>,
     after: Vec<u16>,
     snapshot: Option<(Vec<u16>, Box<Foreground>)>,
@@ -72,27 +72,28 @@ struct Run {
     scan: Box<Scan>,
 }
 
-impl Run {
-    fn new(options: &Options) -> Run {
-        let mut run = Run::default();
+impl WarningRun {
+    fn new(options: &Options) -> WarningRun {
+        let mut run = WarningRun::default();
         let beams = Variant::HALF.beams();
-        let mut model = Model::new(Settings { method: options.method, ..Settings::default() }, beams);
+        let mut model =
+            BackgroundModel::new(Settings { method: options.method, ..Settings::default() }, beams);
         let mut cutter = Segmenter::new(Pose::default(), beams);
         let mut foreground = Foreground::of(beams);
         let mut background = Background::zeroed(Background::len(beams));
         let room = Room::new(&"fig8".parse().expect("a world that the program brings along"), options.seed);
-        for end_ns in (1..=SCANS).map(|number| number * SCAN_NS) {
+        for end_ns in (1..=SCAN_COUNT).map(|number| number * SCAN_PERIOD_NS) {
             let scan = scan(&room, end_ns);
             model.update(&scan, &mut foreground);
             cutter.update(&scan, &mut foreground);
-            model.show(&mut background);
+            model.write(&mut background);
             let ranges = background.ranges();
             if ranges != run.after {
-                run.models.extend(places(&scan, ranges));
+                run.models.extend(fill_slots(&scan, ranges));
                 run.after = ranges.to_vec();
             }
-            run.foreground.extend(foreground.readings().map(|(i, range)| Place::of(&scan, i, range)));
-            if end_ns < BEFORE_NS {
+            run.foreground.extend(foreground.readings().map(|(i, range)| Position::of(&scan, i, range)));
+            if end_ns < UNCHANGED_UNTIL_NS {
                 run.before.clone_from(&run.after);
             }
             if end_ns >= SNAPSHOT_NS && run.snapshot.is_none() {
@@ -104,40 +105,40 @@ impl Run {
     }
 
     /// Returns the positions of `other` that differ from `model`.
-    fn differences(&self, model: &[u16], other: &[u16]) -> Vec<Place> {
-        let differs = |i: &usize| known(other[*i]) && model[*i].abs_diff(other[*i]) > DIFFERENT_MM;
-        (0..model.len()).filter(differs).map(|i| Place::of(&self.scan, i, other[i])).collect()
+    fn differences(&self, model: &[u16], other: &[u16]) -> Vec<Position> {
+        let differs = |i: &usize| is_known(other[*i]) && model[*i].abs_diff(other[*i]) > MIN_DIFFERENCE_MM;
+        (0..model.len()).filter(differs).map(|i| Position::of(&self.scan, i, other[i])).collect()
     }
 
-    fn overlay(&self) -> Picture {
-        let mut picture = Picture::new("all models and all foreground of 2000 scans");
+    fn overlay(&self) -> FloorPlan {
+        let mut picture = FloorPlan::new("all models and all foreground of 2000 scans");
         picture.dots("background", &self.models);
         picture.dots("foreground", &self.foreground);
         picture
     }
 
-    fn before(&self) -> Picture {
-        let mut picture = Picture::new("the model before anything changed");
-        picture.dots("background", &places(&self.scan, &self.before));
+    fn before(&self) -> FloorPlan {
+        let mut picture = FloorPlan::new("the model before anything changed");
+        picture.dots("background", &fill_slots(&self.scan, &self.before));
         picture
     }
 
-    fn after(&self) -> Picture {
-        let mut picture = Picture::new("the model at the end, and what is different");
-        picture.dots("background", &places(&self.scan, &self.after));
+    fn after(&self) -> FloorPlan {
+        let mut picture = FloorPlan::new("the model at the end, and what is different");
+        picture.dots("background", &fill_slots(&self.scan, &self.after));
         picture.dots("gone", &self.differences(&self.after, &self.before));
         picture.dots("new", &self.differences(&self.before, &self.after));
         picture
     }
 
-    fn snapshot(&self) -> Picture {
-        let mut picture = Picture::new("one scan: foreground before its model, in segments");
+    fn snapshot(&self) -> FloorPlan {
+        let mut picture = FloorPlan::new("one scan: foreground before its model, in segments");
         if let Some((model, foreground)) = &self.snapshot {
-            picture.dots("background", &places(&self.scan, model));
-            let dots = foreground.readings().map(|(i, range)| Place::of(&self.scan, i, range));
+            picture.dots("background", &fill_slots(&self.scan, model));
+            let dots = foreground.readings().map(|(i, range)| Position::of(&self.scan, i, range));
             picture.dots("foreground", &dots.collect::<Vec<_>>());
             for segment in foreground.segments() {
-                picture.ring(Place { right_mm: -segment.y_mm, ahead_mm: segment.x_mm }, segment.width);
+                picture.ring(Position { right_mm: -segment.y_mm, ahead_mm: segment.x_mm }, segment.width);
             }
         }
         picture
@@ -150,16 +151,16 @@ fn scan(room: &Room, end_ns: Nanos) -> Box<Scan> {
 }
 
 /// Returns whether the background of a beam is a range.
-fn known(range: u16) -> bool {
+fn is_known(range: u16) -> bool {
     range != Background::UNKNOWN && range != Background::FAR
 }
 
-fn places(scan: &Scan, ranges: &[u16]) -> Vec<Place> {
-    let known = ranges.iter().enumerate().filter(|(_, range)| known(**range));
-    known.map(|(i, &range)| Place::of(scan, i, range)).collect()
+fn fill_slots(scan: &Scan, ranges: &[u16]) -> Vec<Position> {
+    let known = ranges.iter().enumerate().filter(|(_, range)| is_known(**range));
+    known.map(|(i, &range)| Position::of(scan, i, range)).collect()
 }
 
-fn draw(run: &Run, directory: &Path) -> std::io::Result<()> {
+fn draw(run: &WarningRun, directory: &Path) -> std::io::Result<()> {
     std::fs::create_dir_all(directory)?;
     for (name, picture) in [
         ("overlay", run.overlay()),
@@ -183,9 +184,9 @@ fn main() -> ExitCode {
             return ExitCode::from(2);
         }
     };
-    let run = Run::new(&options);
-    let known = |model: &[u16]| model.iter().filter(|range| known(**range)).count();
-    println!("fig8, seed {}, {:?}, {} scans", options.seed, options.method, SCANS);
+    let run = WarningRun::new(&options);
+    let known = |model: &[u16]| model.iter().filter(|range| is_known(**range)).count();
+    println!("fig8, seed {}, {:?}, {} scans", options.seed, options.method, SCAN_COUNT);
     println!("  foreground readings in all      {:>6}", run.foreground.len());
     println!("  beams of the model before       {:>6}", known(&run.before));
     println!("  beams of the model at the end   {:>6}", known(&run.after));
@@ -205,17 +206,17 @@ fn main() -> ExitCode {
 
 /// A position in the frame of the sensor.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Place {
+struct Position {
     right_mm: i32,
     ahead_mm: i32,
 }
 
-impl Place {
+impl Position {
     /// Returns where beam `i` of `scan` ends if it has this range, in units of the scan.
-    fn of(scan: &Scan, i: usize, range: u16) -> Place {
+    fn of(scan: &Scan, i: usize, range: u16) -> Position {
         let mm = f64::from(range) * f64::from(scan.unit_um) / 1000.0;
         let (left, ahead) = scan.angle(i).sin_cos();
-        Place { right_mm: (-mm * left).round() as i32, ahead_mm: (mm * ahead).round() as i32 }
+        Position { right_mm: (-mm * left).round() as i32, ahead_mm: (mm * ahead).round() as i32 }
     }
 
     /// Returns the position on the page. A pixel is a centimeter.
@@ -228,21 +229,21 @@ impl Place {
 /// A baseline plan as SVG, seen from above, with the sensor at the bottom: dots in classes, rings, a scale. Dots of one
 /// class are one path on a grid of a centimeter, so the file is small. It has no background and no extreme colors, so
 /// it is readable on light and on dark pages.
-struct Picture {
+struct FloorPlan {
     body: String,
     legend: Vec<&'static str>,
     title: &'static str,
 }
 
-impl Picture {
+impl FloorPlan {
     /// Creates an empty picture.
-    fn new(title: &'static str) -> Picture {
-        Picture { body: String::new(), legend: Vec::new(), title }
+    fn new(title: &'static str) -> FloorPlan {
+        FloorPlan { body: String::new(), legend: Vec::new(), title }
     }
 
-    /// Draws a dot at each of `places`, in the color of `class`, one of [`CLASSES`].
-    fn dots(&mut self, class: &'static str, places: &[Place]) {
-        let pixels: BTreeSet<(i32, i32)> = places.iter().map(|place| place.pixel()).collect();
+    /// Draws a dot at each of `positions`, in the color of `class`, one of [`CLASSES`].
+    fn dots(&mut self, class: &'static str, positions: &[Position]) {
+        let pixels: BTreeSet<(i32, i32)> = positions.iter().map(|place| place.pixel()).collect();
         let _ = write!(self.body, "<path class=\"{class}\" d=\"");
         let mut pen: Option<(i32, i32)> = None;
         for (x, y) in pixels {
@@ -257,15 +258,15 @@ impl Picture {
     }
 
     /// Draws a ring around an object of `width_mm`.
-    fn ring(&mut self, middle: Place, width_mm: u16) {
-        let (x, y) = middle.pixel();
+    fn ring(&mut self, center: Position, width_mm: u16) {
+        let (x, y) = center.pixel();
         let radius = width_mm / 20 + 9;
         let _ = writeln!(self.body, "<circle class=\"ring\" cx=\"{x}\" cy=\"{y}\" r=\"{radius}\"/>");
     }
 
     /// Returns the SVG.
     fn finish(self) -> String {
-        let (x, y) = (Place { right_mm: 0, ahead_mm: 0 }).pixel();
+        let (x, y) = (Position { right_mm: 0, ahead_mm: 0 }).pixel();
         let mut text = format!(
             "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {WIDTH} {HEIGHT}\" font-family=\"sans-serif\" \
              font-size=\"15\">\n<title>{}</title>\n<style>path{{fill:none;stroke-width:3;stroke-linecap:round}}\

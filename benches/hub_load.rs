@@ -11,12 +11,12 @@ use std::thread;
 use std::time::Duration;
 
 use scanhub_schema::{Counter, Status};
+use support::environment::{BenchEnvironment, STEP_TIMEOUT};
 use support::figures::{self, SimultaneousFigure, Target, percentile};
-use support::simultaneous::{Candidate, Comparison, SETTLING};
-use support::stage::{PATIENCE, Stage};
-use support::truth::Truth;
-use support::usage::Work;
-use support::{Options, Outcome, clock, consumer};
+use support::simultaneous::{Comparison, MeasuredProgram, SETTLE_TIME};
+use support::truth::SensorTruth;
+use support::usage::ThreadUsage;
+use support::{Options, Outcome, clock, subscriber};
 
 fn main() -> ExitCode {
     support::main(|options| {
@@ -39,22 +39,27 @@ fn measure(options: &Options, sensors: usize) -> Outcome<()> {
             percentile(&seconds, 0.5)
         };
         let series = |number: usize| rounds.iter().filter_map(|loads| in_round(&loads[number])).collect();
-        let programs = (0..comparison.candidates.len()).map(series).collect();
+        let programs = (0..comparison.programs.len()).map(series).collect();
         SimultaneousFigure { name, unit, programs, target }
     };
     let figures = [
-        figure("CPU time per telegram", "us", |load| load.each(load.all.busy_ns / 1000), Target::Ratio(2.0)),
+        figure(
+            "CPU time per telegram",
+            "us",
+            |load| load.each(load.process.busy_ns / 1000),
+            Target::Ratio(2.0),
+        ),
         figure(
             "of it in threads that read",
             "us",
             |load| load.each(load.readers.busy_ns / 1000),
             Target::None,
         ),
-        figure("sleeps per telegram", "1", |load| load.each(load.all.voluntary), Target::Most(6.0)),
+        figure("sleeps per telegram", "1", |load| load.each(load.process.voluntary), Target::Max(6.0)),
         figure("of it in threads that read", "1", |load| load.each(load.readers.voluntary), Target::None),
-        figure("preemptions per telegram", "1", |load| load.each(load.all.involuntary), Target::None),
+        figure("preemptions per telegram", "1", |load| load.each(load.process.involuntary), Target::None),
         figure("counter wakeups per telegram", "1", |load| load.wakeups, Target::None),
-        figure("telegrams per second", "1", |load| Some(load.telegrams), Target::None),
+        figure("telegrams per second", "1", |load| Some(load.telegram_count), Target::None),
     ];
     let names = comparison.names();
     figures::print_simultaneous("hub_load", sensors, options.json, &names, &figures);
@@ -63,15 +68,15 @@ fn measure(options: &Options, sensors: usize) -> Outcome<()> {
 
 /// Resources that a program used in a second.
 struct Load {
-    telegrams: f64,
-    all: Work,
-    readers: Work,
+    telegram_count: f64,
+    process: ThreadUsage,
+    readers: ThreadUsage,
     wakeups: Option<f64>,
 }
 
 impl Load {
     fn each(&self, count: u64) -> Option<f64> {
-        Some(count as f64 / self.telegrams)
+        Some(count as f64 / self.telegram_count)
     }
 }
 
@@ -81,25 +86,26 @@ fn load_of_round(comparison: &Comparison, round: usize, seconds: u64) -> Outcome
     let mut running = Vec::new();
     let mut subscribers = Vec::new();
     let mut stages = Vec::new();
-    for (number, candidate) in comparison.candidates.iter().enumerate() {
-        let lines = comparison.lines(comparison.place(number, round));
+    for (number, candidate) in comparison.programs.iter().enumerate() {
+        let lines = comparison.lines(comparison.line_index(number, round));
         let program = candidate.start(lines, sensors, 0)?;
         if candidate.is_hub() {
             subscribers.push(candidate.subscribe_to_scans(sensors)?);
         } else {
-            program.await_line("woken", PATIENCE)?;
+            program.wait_for_line("woken", STEP_TIMEOUT)?;
         }
         running.push(program);
         stages.push(lines);
     }
-    thread::sleep(SETTLING);
+    thread::sleep(SETTLE_TIME);
     let counters = || -> Outcome<Vec<Option<(f64, f64)>>> {
-        let of = |candidate: &Candidate| candidate.is_hub().then(|| counters(&candidate.stage, sensors));
-        comparison.candidates.iter().map(|candidate| of(candidate).transpose()).collect()
+        let of =
+            |candidate: &MeasuredProgram| candidate.is_hub().then(|| counters(&candidate.stage, sensors));
+        comparison.programs.iter().map(|candidate| of(candidate).transpose()).collect()
     };
-    let look = || -> Outcome<Vec<Look>> {
+    let look = || -> Outcome<Vec<Sample>> {
         let of = |number: usize| {
-            Look::at(running[number].guard.pid(), comparison.candidates[number].is_hub().then_some(sensors))
+            Sample::take(running[number].guard.pid(), comparison.programs[number].is_hub().then_some(sensors))
         };
         (0..running.len()).map(of).collect()
     };
@@ -110,15 +116,15 @@ fn load_of_round(comparison: &Comparison, round: usize, seconds: u64) -> Outcome
         looks.push(look()?);
     }
     let mut loads = Vec::new();
-    for (number, (counted, stage)) in counted.into_iter().zip(counters()?).zip(stages).enumerate() {
-        let truths = sensors.iter().map(|sensor| Truth::read(&stage.truth(), sensor));
+    for (number, (counted, environment)) in counted.into_iter().zip(counters()?).zip(stages).enumerate() {
+        let truths = sensors.iter().map(|sensor| SensorTruth::read(&environment.truth(), sensor));
         let truths = truths.collect::<Outcome<Vec<_>>>()?;
-        let of_second = |looks: &[Vec<Look>]| {
+        let of_second = |looks: &[Vec<Sample>]| {
             let (before, after) = (&looks[0][number], &looks[1][number]);
             Load {
-                telegrams: truths.iter().map(|truth| truth.count(before.now, after.now)).sum::<usize>()
+                telegram_count: truths.iter().map(|truth| truth.count(before.now, after.now)).sum::<usize>()
                     as f64,
-                all: after.all.since(before.all),
+                process: after.process.since(before.process),
                 readers: after.readers.since(before.readers),
                 wakeups: match counted {
                     (Some(before), Some(after)) => Some((after.0 - before.0) / (after.1 - before.1)),
@@ -126,40 +132,40 @@ fn load_of_round(comparison: &Comparison, round: usize, seconds: u64) -> Outcome
                 },
             }
         };
-        loads.push(looks.windows(2).map(of_second).filter(|load| load.telegrams > 0.0).collect());
+        loads.push(looks.windows(2).map(of_second).filter(|load| load.telegram_count > 0.0).collect());
     }
     running.into_iter().try_for_each(|program| program.guard.kill())?;
     Ok(loads)
 }
 
 /// Resources that a process has used since its start.
-struct Look {
+struct Sample {
     now: u64,
-    all: Work,
-    readers: Work,
+    process: ThreadUsage,
+    readers: ThreadUsage,
 }
 
-impl Look {
+impl Sample {
     /// Reads the counters of `pid`. The reading threads of a hub have the names of its sensors. All threads of the
     /// baseline are readers, except the first, which only waits for them.
-    fn at(pid: u32, sensors: Option<&[&str]>) -> Outcome<Look> {
+    fn take(pid: u32, sensors: Option<&[&str]>) -> Outcome<Sample> {
         let now = clock::now();
-        let all = Work::of(pid, |_| true)?;
+        let process = ThreadUsage::of(pid, |_| true)?;
         let readers = match sensors {
-            Some(sensors) => Work::of(pid, |name| sensors.contains(&name))?,
-            None => all,
+            Some(sensors) => ThreadUsage::of(pid, |name| sensors.contains(&name))?,
+            None => process,
         };
-        Ok(Look { now, all, readers })
+        Ok(Sample { now, process, readers })
     }
 }
 
 /// Returns wake-ups and telegrams of all links as the hub has counted them. Called outside of the measured time,
 /// because it is a subscriber more.
-fn counters(stage: &Stage, sensors: &[&str]) -> Outcome<(f64, f64)> {
+fn counters(environment: &BenchEnvironment, sensors: &[&str]) -> Outcome<(f64, f64)> {
     let mut sum = (0, 0);
     for sensor in sensors {
         let mut statuses =
-            consumer::builder::<Status>(stage.domain.name(), sensor).timeout(PATIENCE).open()?;
+            subscriber::builder::<Status>(environment.domain.name(), sensor).timeout(STEP_TIMEOUT).open()?;
         let status = statuses.next()?.ok_or("no status")?;
         sum.0 += status.counters[Counter::Wakeups];
         sum.1 += status.counters[Counter::Telegrams];

@@ -16,52 +16,64 @@ use std::time::{Duration, Instant};
 use scanhub_config::Sources;
 use scanhub_daemon::{ReadOptions, RecordingReader};
 use scanhub_drivers::lms;
-use scanhub_drivers::lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
+use scanhub_drivers::lms::variant::{MIRROR_PERIOD, Mode, Unit, Variant};
 use scanhub_schema::file::Writer;
 use scanhub_schema::{Header, Scan, Topic};
 use scanhub_sim::room::Room;
+use support::environment::{BenchEnvironment, Child, STEP_TIMEOUT};
 use support::figures::{self, Figure, Target, percentile};
-use support::stage::{Child, PATIENCE, Stage};
 use support::{Options, Outcome};
 
 /// A language beside Rust.
 struct Language {
     figures: [&'static str; 3],
     /// What its p50 may be beside Rust's.
-    ratio: f64,
+    max_ratio: f64,
     /// Program and first arguments of its consumer, or nothing, said why, where this machine cannot run it. What follows
     /// are domain, sensor and number of scans; it prints `aged SENSOR NS` for each, and `end`.
-    consumer: fn() -> Outcome<Option<Vec<String>>>,
+    subscriber_command: fn() -> Outcome<Option<Vec<String>>>,
 }
 
 const LANGUAGES: [Language; 2] = [
-    Language { figures: ["Python, p50", "Python, p90", "Python, p99"], ratio: 3.0, consumer: python },
-    Language { figures: ["C, p50", "C, p90", "C, p99"], ratio: 1.1, consumer: c },
+    Language {
+        figures: ["Python, p50", "Python, p90", "Python, p99"],
+        max_ratio: 3.0,
+        subscriber_command: python_subscriber,
+    },
+    Language { figures: ["C, p50", "C, p90", "C, p99"], max_ratio: 1.1, subscriber_command: c_subscriber },
 ];
 
 fn main() -> ExitCode {
-    support::main_with(play, measure)
+    support::main_with(run_part, measure)
 }
 
-fn play(words: &[&str]) -> Outcome<()> {
+fn run_part(words: &[&str]) -> Outcome<()> {
     match *words {
         ["read", file] => read(file.as_ref()),
-        _ => support::play(words),
+        _ => support::run_part(words),
     }
 }
 
 fn measure(options: &Options) -> Outcome<()> {
-    let stage = Stage::new()?;
-    let _simulator = stage.simulate(&[SENSOR], 500_000)?;
-    let hub = stage.hub(&[SENSOR])?;
-    hub.await_line("ready", PATIENCE)?;
+    let environment = BenchEnvironment::new()?;
+    let _simulator = environment.simulate(&[SENSOR], 500_000)?;
+    let hub = environment.start_hub(&[SENSOR])?;
+    hub.wait_for_line("ready", STEP_TIMEOUT)?;
     let count = options.count(800);
-    let rust = || stage.part(&["ages", stage.domain.name(), SENSOR, &(count + SETTLING).to_string()]);
+    let rust = || {
+        environment.start_part(&[
+            "ages",
+            environment.domain.name(),
+            SENSOR,
+            &(count + SETTLE_TIME).to_string(),
+        ])
+    };
     let mut figures = Vec::new();
-    for Language { figures: names, ratio, consumer } in LANGUAGES {
-        let Some(words) = consumer()? else { continue };
+    for Language { figures: names, max_ratio, subscriber_command: subscriber } in LANGUAGES {
+        let Some(words) = subscriber()? else { continue };
         let own = || {
-            let last = [stage.domain.name(), SENSOR, &(count + SETTLING).to_string()].map(str::to_owned);
+            let last =
+                [environment.domain.name(), SENSOR, &(count + SETTLE_TIME).to_string()].map(str::to_owned);
             Child::start(&words[0], &[&words[1..], &last].concat())
         };
         let (mut others, mut baselines) = (Vec::new(), Vec::new());
@@ -74,44 +86,44 @@ fn measure(options: &Options) -> Outcome<()> {
                 others.push(ages(&own()?, count)?);
             }
         }
-        let targets = [(0.5, Target::Ratio(ratio)), (0.9, Target::None), (0.99, Target::None)];
+        let targets = [(0.5, Target::Ratio(max_ratio)), (0.9, Target::None), (0.99, Target::None)];
         for (name, (part, target)) in names.into_iter().zip(targets) {
             let at = |runs: &[Vec<f64>]| runs.iter().filter_map(|run| percentile(run, part)).collect();
             figures.push(Figure { name, unit: "us", hub: at(&others), baseline: at(&baselines), target });
         }
     }
-    figures.extend(reading(&stage, options)?);
+    figures.extend(measure_reading(&environment, options)?);
     figures::print("languages", options.json, &figures);
     Ok(())
 }
 
 /// Ages of `count` scans in microseconds, sorted. The first ones are left out.
-fn ages(consumer: &Child, count: usize) -> Outcome<Vec<f64>> {
-    let lines = consumer.lines_until("end", PATIENCE + Duration::from_millis(50) * count as u32)?;
-    let aged = lines.iter().filter(|line| line.text.starts_with("aged")).skip(SETTLING);
+fn ages(subscriber: &Child, count: usize) -> Outcome<Vec<f64>> {
+    let lines = subscriber.lines_until("end", STEP_TIMEOUT + Duration::from_millis(50) * count as u32)?;
+    let aged = lines.iter().filter(|line| line.text.starts_with("aged")).skip(SETTLE_TIME);
     let mut ages: Vec<f64> = aged.map(|line| Ok(line.number(2)? as f64 / 1e3)).collect::<Outcome<_>>()?;
     ages.sort_by(f64::total_cmp);
     Ok(ages)
 }
 
 /// Measures how long a recording takes to read.
-fn reading(stage: &Stage, options: &Options) -> Outcome<Option<Figure>> {
-    let Some(mut words) = python()? else { return Ok(None) };
-    let file = stage.file("read.mcap");
+fn measure_reading(environment: &BenchEnvironment, options: &Options) -> Outcome<Option<Figure>> {
+    let Some(mut words) = python_subscriber()? else { return Ok(None) };
+    let file = environment.file("read.mcap");
     record(&file, options.seconds(600))?;
     let file = file.display().to_string();
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/languages/read.py");
     words.truncate(words.len() - 1);
     words.extend([script.display().to_string(), file.clone()]);
     let run = |child: Child| -> Outcome<f64> {
-        let lines = child.lines_until("end", PATIENCE + Duration::from_secs(60))?;
-        let took = lines.iter().find(|line| line.text.starts_with("took")).ok_or("it did not read")?;
-        Ok(took.number(1)? as f64 / 1e6)
+        let lines = child.lines_until("end", STEP_TIMEOUT + Duration::from_secs(60))?;
+        let read_line = lines.iter().find(|line| line.text.starts_with("took")).ok_or("it did not read")?;
+        Ok(read_line.number(1)? as f64 / 1e6)
     };
     let (mut pythons, mut rusts) = (Vec::new(), Vec::new());
     for _ in 0..options.pairs() {
         pythons.push(run(Child::start(&words[0], &words[1..])?)?);
-        rusts.push(run(stage.part(&["read", &file])?)?);
+        rusts.push(run(environment.start_part(&["read", &file])?)?);
     }
     let name = "Python, reading a recording into numpy";
     Ok(Some(Figure { name, unit: "ms", hub: pythons, baseline: rusts, target: Target::Ratio(1.3) }))
@@ -120,13 +132,13 @@ fn reading(stage: &Stage, options: &Options) -> Outcome<Option<Figure>> {
 /// Writes a recording of two sensors. The scans repeat after a while.
 fn record(file: &Path, seconds: u64) -> Outcome<()> {
     let room = Room::new(&"room".parse()?, 1);
-    let period_ns = Variant::HALF.turns() * MIRROR_TURN;
+    let period_ns = Variant::HALF.revolutions() * MIRROR_PERIOD;
     let telegram = |number| {
         let words = room.scan(Variant::HALF, Unit::Mm, Mode(1), number * period_ns);
         lms::measured::encode(0, Unit::Mm, &words, 0x10)
     };
     let telegrams: Vec<_> = (0..200).map(telegram).collect();
-    let mode = lms::reply::configuration(0, Mode(1), Unit::Mm, 0x10);
+    let mode = lms::reply::configuration_reply(0, Mode(1), Unit::Mm, 0x10);
     let mut writer = Writer::begin(File::create(file)?, "", BTreeMap::new())?;
     for seq in 0..seconds * 1_000_000_000 / period_ns {
         for (number, sensor) in RECORDED.iter().enumerate() {
@@ -144,7 +156,7 @@ fn record(file: &Path, seconds: u64) -> Outcome<()> {
             };
             header.set_sent_at(end_ns + 100_000);
             let telegram = if seq == 0 { &mode } else { &telegrams[seq as usize % telegrams.len()] };
-            writer.sample(sensor, Topic::Telegram, &header, telegram.bytes())?;
+            writer.write_sample(sensor, Topic::Telegram, &header, telegram.bytes())?;
         }
         if seq % 40 == 0 {
             writer.close_chunk()?;
@@ -180,7 +192,7 @@ fn read(file: &Path) -> Outcome<()> {
     Ok(())
 }
 
-fn python() -> Outcome<Option<Vec<String>>> {
+fn python_subscriber() -> Outcome<Option<Vec<String>>> {
     let top = Path::new(env!("CARGO_MANIFEST_DIR"));
     let made = || top.join("target/venv/bin/python").display().to_string();
     let python = std::env::var("SCANHUB_PYTHON").unwrap_or_else(|_| made());
@@ -195,7 +207,7 @@ fn python() -> Outcome<Option<Vec<String>>> {
 }
 
 /// Built against the library that Cargo put beside this bench.
-fn c() -> Outcome<Option<Vec<String>>> {
+fn c_subscriber() -> Outcome<Option<Vec<String>>> {
     let top = Path::new(env!("CARGO_MANIFEST_DIR"));
     let own = std::env::current_exe()?;
     let library = own.parent().ok_or("a bench is in a directory")?.join("libscanhub.so");
@@ -224,4 +236,4 @@ const SENSOR: &str = "front";
 /// Sensors in the recording.
 const RECORDED: [&str; 2] = ["front", "rear"];
 /// Scans at the start of a run that do not count.
-const SETTLING: usize = 40;
+const SETTLE_TIME: usize = 40;

@@ -14,10 +14,10 @@ use std::collections::HashMap;
 use std::process::ExitCode;
 use std::time::Duration;
 
+use support::environment::{BenchEnvironment, Child, OutputLine, SENSORS, STEP_TIMEOUT};
 use support::figures::{self, SimultaneousFigure, Target, percentile};
-use support::simultaneous::{Candidate, Comparison, SETTLING};
-use support::stage::{Child, Line, PATIENCE, SENSORS, Stage};
-use support::truth::Truth;
+use support::simultaneous::{Comparison, MeasuredProgram, SETTLE_TIME};
+use support::truth::SensorTruth;
 use support::{Options, Outcome};
 
 fn main() -> ExitCode {
@@ -28,24 +28,24 @@ fn main() -> ExitCode {
 
 fn measure(options: &Options, sensors: usize) -> Outcome<()> {
     let comparison = Comparison::start(options, sensors)?;
-    let count = options.count((options.seconds(20) * RATE_MHZ / 1000) as usize);
+    let count = options.count((options.seconds(20) * SCAN_RATE_MHZ / 1000) as usize);
     let mut rounds = Vec::new();
     for round in 0..comparison.rounds(options) {
         rounds.push(receive_round(&comparison, round, count)?);
     }
-    let places = 0..comparison.candidates.len();
+    let places = 0..comparison.programs.len();
     let sent = places.map(|place| sent(comparison.lines(place), comparison.sensors));
     let sent = sent.collect::<Outcome<Vec<_>>>()?;
     let mut latencies = Vec::new();
     for (round, runs) in rounds.iter().enumerate() {
-        let of = |(number, run): (usize, &Run)| {
-            let is_hub = comparison.candidates[number].is_hub();
-            run.latencies(&sent[comparison.place(number, round)], shared_span(runs), is_hub)
+        let of = |(number, run): (usize, &WarningRun)| {
+            let is_hub = comparison.programs[number].is_hub();
+            run.latencies(&sent[comparison.line_index(number, round)], shared_span(runs), is_hub)
         };
         latencies.push(runs.iter().enumerate().map(of).collect::<Outcome<Vec<_>>>()?);
     }
     let series = |of: &dyn Fn(&Latencies) -> Option<f64>| {
-        let programs = 0..comparison.candidates.len();
+        let programs = 0..comparison.programs.len();
         programs.map(|number| latencies.iter().filter_map(|round| of(&round[number])).collect()).collect()
     };
     let figure = |name, of: fn(&Latencies) -> &[f64], part, target| {
@@ -71,9 +71,9 @@ fn measure(options: &Options, sensors: usize) -> Outcome<()> {
 }
 
 /// Telegrams received through one program in a round.
-struct Run(Vec<Arrived>);
+struct WarningRun(Vec<ReceivedTelegram>);
 
-struct Arrived {
+struct ReceivedTelegram {
     sensor: usize,
     hash: String,
     /// When whoever has the pty open had its last byte.
@@ -82,7 +82,7 @@ struct Arrived {
     at_ns: u64,
 }
 
-impl Run {
+impl WarningRun {
     /// Returns the time from which the run counts, and its end. They come from the sensor that started to stream last
     /// and from the one that ended first.
     fn span(&self) -> (u64, u64) {
@@ -92,12 +92,12 @@ impl Run {
         }
         let first = ends.values().map(|ends| ends.0).max().unwrap_or_default();
         let last = ends.values().map(|ends| ends.1).min().unwrap_or_default();
-        (first + SETTLING.as_nanos() as u64, last)
+        (first + SETTLE_TIME.as_nanos() as u64, last)
     }
 
     /// Returns microseconds from sent to received and from sent to read of the telegrams received in `span`. A hub
     /// verifies checksums, so all its telegrams were sent. A baseline without checksums may receive parts of two.
-    fn latencies(&self, sent: &Sent, span: (u64, u64), is_hub: bool) -> Outcome<Latencies> {
+    fn latencies(&self, sent: &SentTimes, span: (u64, u64), is_hub: bool) -> Outcome<Latencies> {
         let mut latencies = Latencies::default();
         for arrived in self.0.iter().filter(|arrived| (span.0..=span.1).contains(&arrived.at_ns)) {
             let Some(&sent_ns) = sent.get(&(arrived.sensor, arrived.hash.clone())) else {
@@ -116,8 +116,8 @@ impl Run {
 }
 
 /// Returns the span in which all runs of a round count.
-fn shared_span(runs: &[Run]) -> (u64, u64) {
-    let spans = runs.iter().map(Run::span);
+fn shared_span(runs: &[WarningRun]) -> (u64, u64) {
+    let spans = runs.iter().map(WarningRun::span);
     spans.fold((0, u64::MAX), |all, span| (all.0.max(span.0), all.1.min(span.1)))
 }
 
@@ -129,25 +129,29 @@ struct Latencies {
 }
 
 /// Runs all programs until each has received `count` telegrams of each sensor after the start. Returns them.
-fn receive_round(comparison: &Comparison, round: usize, count: usize) -> Outcome<Vec<Run>> {
-    let count = count + (SETTLING.as_millis() as u64 * RATE_MHZ / 1_000_000) as usize;
-    let start = |(number, candidate): (usize, &Candidate)| -> Outcome<_> {
-        let program =
-            candidate.start(comparison.lines(comparison.place(number, round)), comparison.sensors, count)?;
-        let subscribe = |sensor: &&str| candidate.stage.consumer("telegram", sensor, &[&count.to_string()]);
+fn receive_round(comparison: &Comparison, round: usize, count: usize) -> Outcome<Vec<WarningRun>> {
+    let count = count + (SETTLE_TIME.as_millis() as u64 * SCAN_RATE_MHZ / 1_000_000) as usize;
+    let start = |(number, candidate): (usize, &MeasuredProgram)| -> Outcome<_> {
+        let program = candidate.start(
+            comparison.lines(comparison.line_index(number, round)),
+            comparison.sensors,
+            count,
+        )?;
+        let subscribe =
+            |sensor: &&str| candidate.stage.start_subscriber("telegram", sensor, &[&count.to_string()]);
         let subscribed = if candidate.is_hub() { comparison.sensors } else { &[] };
         Ok((program, subscribed.iter().map(subscribe).collect::<Outcome<Vec<_>>>()?))
     };
-    let running = comparison.candidates.iter().enumerate().map(start).collect::<Outcome<Vec<_>>>()?;
+    let running = comparison.programs.iter().enumerate().map(start).collect::<Outcome<Vec<_>>>()?;
     let mut runs = Vec::new();
-    for (candidate, (program, subscribers)) in comparison.candidates.iter().zip(&running) {
+    for (candidate, (program, subscribers)) in comparison.programs.iter().zip(&running) {
         let run = match candidate.is_hub() {
             true => through_hub(subscribers, count),
             false => through_baseline(program, comparison.sensors.len(), count),
         };
         runs.push(run.map_err(|error| format!("{}: {error}", candidate.name))?);
     }
-    for (candidate, (program, _)) in comparison.candidates.iter().zip(running) {
+    for (candidate, (program, _)) in comparison.programs.iter().zip(running) {
         match candidate.is_hub() {
             true => program.guard.kill()?,
             false => program.guard.wait()?,
@@ -156,51 +160,51 @@ fn receive_round(comparison: &Comparison, round: usize, count: usize) -> Outcome
     Ok(runs)
 }
 
-fn through_hub(subscribers: &[Child], count: usize) -> Outcome<Run> {
-    let mut run = Run(Vec::new());
+fn through_hub(subscribers: &[Child], count: usize) -> Outcome<WarningRun> {
+    let mut run = WarningRun(Vec::new());
     for (sensor, subscriber) in subscribers.iter().enumerate() {
-        for line in subscriber.lines_until("end", patience(count))? {
+        for line in subscriber.lines_until("end", timeout(count))? {
             if let ["telegram", _, _, _, _, _, hash, _] = line.words()[..] {
                 let (hash, at_ns, read_ns) = (hash.to_owned(), line.number(2)?, line.number(7)?);
-                run.0.push(Arrived { sensor, hash, read_ns, at_ns });
+                run.0.push(ReceivedTelegram { sensor, hash, read_ns, at_ns });
             }
         }
     }
     Ok(run)
 }
 
-fn through_baseline(baseline: &Child, sensors: usize, count: usize) -> Outcome<Run> {
-    let lines = baseline.lines_until("end", patience(count))?;
-    let of = |what: &str, sensor: usize| -> Vec<&Line> {
+fn through_baseline(baseline: &Child, sensors: usize, count: usize) -> Outcome<WarningRun> {
+    let lines = baseline.lines_until("end", timeout(count))?;
+    let of = |description: &str, sensor: usize| -> Vec<&OutputLine> {
         let number = sensor.to_string();
-        lines.iter().filter(|line| line.words().get(..2) == Some(&[what, &number])).collect()
+        lines.iter().filter(|line| line.words().get(..2) == Some(&[description, &number])).collect()
     };
-    let mut run = Run(Vec::new());
+    let mut run = WarningRun(Vec::new());
     for sensor in 0..sensors {
         // The wake-up carries no bytes: the nth is that of the nth telegram.
         for (read, woken) in of("read", sensor).into_iter().zip(of("woken", sensor)) {
             let (hash, at_ns, read_ns) = (read.words()[2].to_owned(), woken.number(2)?, read.number(3)?);
-            run.0.push(Arrived { sensor, hash, read_ns, at_ns });
+            run.0.push(ReceivedTelegram { sensor, hash, read_ns, at_ns });
         }
     }
     Ok(run)
 }
 
 /// When each telegram was sent, by sensor and hash.
-type Sent = HashMap<(usize, String), u64>;
+type SentTimes = HashMap<(usize, String), u64>;
 
-fn sent(stage: &Stage, sensors: &[&str]) -> Outcome<Sent> {
+fn sent(environment: &BenchEnvironment, sensors: &[&str]) -> Outcome<SentTimes> {
     let mut sent = HashMap::new();
     for (number, sensor) in sensors.iter().enumerate() {
-        let truth = Truth::read(&stage.truth(), sensor)?;
+        let truth = SensorTruth::read(&environment.truth(), sensor)?;
         sent.extend(truth.sent.into_iter().map(|one| ((number, one.hash), one.at_ns)));
     }
     Ok(sent)
 }
 
-fn patience(count: usize) -> Duration {
-    PATIENCE + Duration::from_millis(50) * count as u32
+fn timeout(count: usize) -> Duration {
+    STEP_TIMEOUT + Duration::from_millis(50) * count as u32
 }
 
 /// Telegrams per second of a sensor, times 1000.
-const RATE_MHZ: u64 = 37_500;
+const SCAN_RATE_MHZ: u64 = 37_500;

@@ -18,9 +18,9 @@ use std::process::ExitCode;
 
 use scanhub_drivers::lms::reply::Reply;
 use serde_json::Value;
+use support::environment::{BenchEnvironment, OutputLine, STEP_TIMEOUT};
 use support::figures::{self, Figure, Target};
-use support::stage::{Line, PATIENCE, Stage};
-use support::truth::{Truth, hash};
+use support::truth::{SensorTruth, hash};
 use support::{Options, Outcome};
 
 fn main() -> ExitCode {
@@ -29,19 +29,19 @@ fn main() -> ExitCode {
 
 fn measure(options: &Options) -> Outcome<()> {
     let mut figures = Vec::new();
-    for (rate, state, name) in STARTS {
+    for (rate, state, name) in START_CASES {
         let times = (0..options.pairs()).map(|_| start(rate, state)).collect::<Outcome<Vec<f64>>>()?;
-        let most = if (rate, state) == ("500000", "streaming") { 500.0 } else { 5_000.0 };
+        let maximum = if (rate, state) == ("500000", "streaming") { 500.0 } else { 5_000.0 };
         figures.push(Figure {
             name,
             unit: "ms",
             hub: times,
             baseline: Vec::new(),
-            target: Target::Most(most),
+            target: Target::Max(maximum),
         });
     }
     figures.extend(cold_starts(options.pairs())?);
-    figures.push(stale(options.pairs())?);
+    figures.push(measure_adoption(options.pairs())?);
     figures.extend(power_cycles(options.pairs())?);
     figures::print("moods", options.json, &figures);
     Ok(())
@@ -49,56 +49,56 @@ fn measure(options: &Options) -> Outcome<()> {
 
 /// Milliseconds from exec of the hub to the first scan in a consumer's hands.
 fn start(rate: &str, state: &str) -> Outcome<f64> {
-    let stage = Stage::new()?;
-    let _simulator = stage.simulate_one("front", &["--baud", rate, "--state", state])?;
-    let scans = stage.consumer("scan", "front", &[])?;
-    scans.await_line("attaching", PATIENCE)?;
-    let hub = stage.hub(&["front"])?;
-    Ok((scans.await_line("scan", PATIENCE)?.number(2)? - hub.started_ns) as f64 / 1e6)
+    let environment = BenchEnvironment::new()?;
+    let _simulator = environment.simulate_one("front", &["--baud", rate, "--state", state])?;
+    let scans = environment.start_subscriber("scan", "front", &[])?;
+    scans.wait_for_line("attaching", STEP_TIMEOUT)?;
+    let hub = environment.start_hub(&["front"])?;
+    Ok((scans.wait_for_line("scan", STEP_TIMEOUT)?.number(2)? - hub.started_ns) as f64 / 1e6)
 }
 
 /// A sensor at rest at 9600 that answers after 60 ms: the hub's first start, the next one with what it keeps of the first,
 /// and the least that could be said, in turns.
 fn cold_starts(count: usize) -> Outcome<[Figure; 2]> {
-    let (mut first, mut again, mut least) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut first, mut again, mut shortest) = (Vec::new(), Vec::new(), Vec::new());
     for _ in 0..count {
-        let stage = Stage::new()?;
+        let environment = BenchEnvironment::new()?;
         for times in [&mut first, &mut again] {
-            let _simulator = stage.simulate_one("front", &QUICK)?;
-            let scans = stage.consumer("scan", "front", &[])?;
-            scans.await_line("attaching", PATIENCE)?;
-            let hub = stage.hub(&["front"])?;
-            times.push((scans.await_line("scan", PATIENCE)?.number(2)? - hub.started_ns) as f64 / 1e6);
+            let _simulator = environment.simulate_one("front", &QUICK_FLAGS)?;
+            let scans = environment.start_subscriber("scan", "front", &[])?;
+            scans.wait_for_line("attaching", STEP_TIMEOUT)?;
+            let hub = environment.start_hub(&["front"])?;
+            times.push((scans.wait_for_line("scan", STEP_TIMEOUT)?.number(2)? - hub.started_ns) as f64 / 1e6);
         }
-        drop(stage);
-        let stage = Stage::new()?;
-        let _simulator = stage.simulate_one("front", &QUICK)?;
-        let host = stage.part(&["host", "blindly", &stage.port("front"), "9600"])?;
-        least.push((host.await_line("scan", PATIENCE)?.number(1)? - host.started_ns) as f64 / 1e6);
+        drop(environment);
+        let stage = BenchEnvironment::new()?;
+        let _simulator = stage.simulate_one("front", &QUICK_FLAGS)?;
+        let host = stage.start_part(&["host", "blindly", &stage.port("front"), "9600"])?;
+        shortest.push((host.wait_for_line("scan", STEP_TIMEOUT)?.number(1)? - host.started_ns) as f64 / 1e6);
     }
-    let figure = |name, hub, most| Figure {
+    let figure = |name, hub, maximum| Figure {
         name,
         unit: "ms",
         hub,
-        baseline: least.clone(),
-        target: Target::Most(most),
+        baseline: shortest.clone(),
+        target: Target::Max(maximum),
     };
     Ok([figure("power on, quick answers", first, 700.0), figure("the same, the next start", again, 700.0)])
 }
 
 /// A stream at the wanted rate that somebody left: from exec of the hub until it has adopted it, as its status says.
-fn stale(count: usize) -> Outcome<Figure> {
+fn measure_adoption(count: usize) -> Outcome<Figure> {
     let mut hub = Vec::new();
     for _ in 0..count {
-        let stage = Stage::new()?;
-        let _simulator = stage.simulate_one("front", &["--baud", "500000", "--state", "streaming"])?;
-        let statuses = stage.consumer("status", "front", &[])?;
-        statuses.await_line("attaching", PATIENCE)?;
-        let process = stage.hub(&["front"])?;
-        let adopted = statuses.await_line("status front streaming", PATIENCE)?.number(3)?;
+        let environment = BenchEnvironment::new()?;
+        let _simulator = environment.simulate_one("front", &["--baud", "500000", "--state", "streaming"])?;
+        let statuses = environment.start_subscriber("status", "front", &[])?;
+        statuses.wait_for_line("attaching", STEP_TIMEOUT)?;
+        let process = environment.start_hub(&["front"])?;
+        let adopted = statuses.wait_for_line("status front streaming", STEP_TIMEOUT)?.number(3)?;
         hub.push((adopted - process.started_ns) as f64 / 1e6);
     }
-    let target = Target::Most(150.0);
+    let target = Target::Max(150.0);
     Ok(Figure { name: "500000 Bd, streaming, adopted", unit: "ms", hub, baseline: Vec::new(), target })
 }
 
@@ -106,43 +106,50 @@ fn stale(count: usize) -> Outcome<Figure> {
 fn power_cycles(count: usize) -> Outcome<[Figure; 3]> {
     let (mut back, mut lost, mut writes) = (Vec::new(), Vec::new(), Vec::new());
     for _ in 0..count {
-        let stage = Stage::new()?;
-        let follow = |sensor| stage.consumer("telegram", sensor, &["0"]);
+        let environment = BenchEnvironment::new()?;
+        let follow = |sensor| environment.start_subscriber("telegram", sensor, &["0"]);
         let (front, rear) = (follow("front")?, follow("rear")?);
-        for consumer in [&front, &rear] {
-            consumer.await_line("attaching", PATIENCE)?;
+        for subscriber in [&front, &rear] {
+            subscriber.wait_for_line("attaching", STEP_TIMEOUT)?;
         }
-        let hub = stage.hub(&["front", "rear"])?;
-        hub.await_line("ready", PATIENCE)?;
-        let healthy = stage.simulate_one("rear", &["--state", "streaming", "--baud", "500000"])?;
+        let hub = environment.start_hub(&["front", "rear"])?;
+        hub.wait_for_line("ready", STEP_TIMEOUT)?;
+        let healthy = environment.simulate_one("rear", &["--state", "streaming", "--baud", "500000"])?;
         let cycled = ["--state", "streaming", "--baud", "500000", "--boot", "1s", "--fault", "power_at=2"];
-        let cycled = stage.simulate_one("front", &cycled)?;
-        let banner = await_banner(&stage)?;
+        let cycled = environment.simulate_one("front", &cycled)?;
+        let banner = wait_for_boot_message(&environment)?;
         let mut received = Vec::new();
-        while received.last().is_none_or(|line: &Line| line.number(2).is_ok_and(|at| at < banner)) {
-            received.push(front.await_line("telegram", PATIENCE)?);
+        while received.last().is_none_or(|line: &OutputLine| line.number(2).is_ok_and(|at| at < banner)) {
+            received.push(front.wait_for_line("telegram", STEP_TIMEOUT)?);
         }
         let first = received[received.len() - 1].number(2)?;
         back.push((first - banner) as f64 / 1e6);
         // The other sensor's last telegrams are on their way.
         drop(healthy);
-        let truth = Truth::read(&stage.own_truth("rear"), "rear")?;
+        let truth = SensorTruth::read(&environment.own_truth("rear"), "rear")?;
         let last = truth.sent.last().map(|sent| sent.hash.clone()).unwrap_or_default();
         let mut hashes = HashSet::new();
         while !hashes.contains(&last) {
-            let line = rear.await_line("telegram", PATIENCE)?;
+            let line = rear.wait_for_line("telegram", STEP_TIMEOUT)?;
             hashes.insert(line.words().get(6).copied().unwrap_or_default().to_owned());
         }
         let missing = truth.sent.iter().filter(|sent| !hashes.contains(&sent.hash)).count();
         lost.push(missing as f64);
         drop((cycled, hub));
         let eeprom = ["front", "rear"].map(|sensor| {
-            Truth::read(&stage.own_truth(sensor), sensor).ok().and_then(|truth| truth.eeprom_writes)
+            SensorTruth::read(&environment.own_truth(sensor), sensor)
+                .ok()
+                .and_then(|truth| truth.eeprom_writes)
         });
         writes.push(eeprom.into_iter().flatten().sum::<u64>() as f64);
     }
-    let figure =
-        |name, unit, hub, most| Figure { name, unit, hub, baseline: Vec::new(), target: Target::Most(most) };
+    let figure = |name, unit, hub, maximum| Figure {
+        name,
+        unit,
+        hub,
+        baseline: Vec::new(),
+        target: Target::Max(maximum),
+    };
     Ok([
         figure("power cycle: banner to telegram", "ms", back, 5_000.0),
         figure("power cycle: lost of the other", "1", lost, 0.0),
@@ -151,12 +158,12 @@ fn power_cycles(count: usize) -> Outcome<[Figure; 3]> {
 }
 
 /// Waits until the sensor has said that its power came on; when its last byte was written.
-fn await_banner(stage: &Stage) -> Outcome<u64> {
+fn wait_for_boot_message(environment: &BenchEnvironment) -> Outcome<u64> {
     let banner = Reply::PowerOn(b"LMS200;301063;V02.30").encode(0, 0x10).ok_or("no banner")?;
     let banner = hash(banner.bytes());
-    let give_up_at = support::clock::now() + PATIENCE.as_nanos() as u64;
+    let give_up_at = support::clock::now() + STEP_TIMEOUT.as_nanos() as u64;
     loop {
-        for line in std::fs::read_to_string(stage.own_truth("front"))?.lines() {
+        for line in std::fs::read_to_string(environment.own_truth("front"))?.lines() {
             let Ok(value) = serde_json::from_str::<Value>(line) else { continue };
             if value["sha256"] == banner.as_str() {
                 return Ok(value["sent_ns"].as_u64().unwrap_or_default());
@@ -165,15 +172,15 @@ fn await_banner(stage: &Stage) -> Outcome<u64> {
         if support::clock::now() > give_up_at {
             return Err("the sensor's power did not come on".into());
         }
-        support::clock::rest(support::clock::now() + 20_000_000);
+        support::clock::sleep_until(support::clock::now() + 20_000_000);
     }
 }
 
 /// Idle at 9600, 60 ms from ACK to reply.
-const QUICK: [&str; 4] = ["--baud", "9600", "--fault", "answer=0.06"];
+const QUICK_FLAGS: [&str; 4] = ["--baud", "9600", "--fault", "answer=0.06"];
 
 /// Rate of the line, what the sensor was left doing, and the name of the figure.
-const STARTS: [(&str, &str, &str); 12] = [
+const START_CASES: [(&str, &str, &str); 12] = [
     ("500000", "idle", "500000 Bd, idle"),
     ("500000", "streaming", "500000 Bd, streaming"),
     ("500000", "installation", "500000 Bd, installation mode"),

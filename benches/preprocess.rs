@@ -10,99 +10,100 @@ mod decoded_scan;
 use std::hint::black_box;
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use scanhub_drivers::lms::variant::{MIRROR_TURN, Unit, Variant};
-use scanhub_preprocess::background::{self, Method, Model};
+use scanhub_drivers::lms::variant::{MIRROR_PERIOD, Unit, Variant};
+use scanhub_preprocess::background::{self, BackgroundModel, Method};
 use scanhub_preprocess::segments::Segmenter;
 use scanhub_preprocess::{marks, zones};
 use scanhub_schema::{Foreground, Marks, Pose, Scan, Zones};
 use scanhub_sim::room::Room;
 
-const POSE: Pose = Pose { x_m: 0.3, y_m: -0.1, yaw_rad: 0.2, upside_down: 0, reserved: [0; 7] };
+const SENSOR_POSE: Pose = Pose { x_m: 0.3, y_m: -0.1, yaw_rad: 0.2, upside_down: 0, reserved: [0; 7] };
 /// Of each scan.
-const BEAMS: usize = 361;
+const BEAM_COUNT: usize = 361;
 /// Somebody walks through the room, and its background has been learned.
-const FIRST: u64 = 800;
+const FIRST_SCAN: u64 = 800;
 /// Scans that take turns.
-const COUNT: u64 = 64;
+const SCAN_COUNT: u64 = 64;
 
 /// Scans of a world from the first one.
 fn scans(world: &str, count: u64) -> Vec<Box<Scan>> {
     let room = Room::new(&world.parse().expect("a world that the program brings along"), 1);
     let scan = |number| {
-        let end_ns = number * Variant::HALF.turns() * MIRROR_TURN;
+        let end_ns = number * Variant::HALF.revolutions() * MIRROR_PERIOD;
         decoded_scan::scan(&room.scan(Variant::HALF, Unit::Mm, decoded_scan::MODE, end_ns), Unit::Mm)
     };
     (1..=count).map(scan).collect()
 }
 
 /// A model that has learned from what came before, and the scans that come then.
-fn model(method: Method, scans: &[Box<Scan>]) -> (Model, &[Box<Scan>]) {
-    let mut model = Model::new(background::Settings { method, ..background::Settings::default() }, BEAMS);
-    let (past, present) = scans.split_at(FIRST as usize);
-    past.iter().for_each(|scan| model.update(scan, &mut Foreground::of(BEAMS)));
+fn model(method: Method, scans: &[Box<Scan>]) -> (BackgroundModel, &[Box<Scan>]) {
+    let mut model =
+        BackgroundModel::new(background::Settings { method, ..background::Settings::default() }, BEAM_COUNT);
+    let (past, present) = scans.split_at(FIRST_SCAN as usize);
+    past.iter().for_each(|scan| model.update(scan, &mut Foreground::of(BEAM_COUNT)));
     (model, present)
 }
 
 /// Times `update` over `scans` in turn.
-fn bench(c: &mut Criterion, name: &str, scans: &[Box<Scan>], mut update: impl FnMut(&Scan)) {
+fn time_scans(c: &mut Criterion, name: &str, scans: &[Box<Scan>], mut update: impl FnMut(&Scan)) {
     let mut next = scans.iter().cycle();
     c.bench_function(name, |b| b.iter(|| update(black_box(next.next().expect("a cycle")))));
 }
 
-fn check(c: &mut Criterion) {
-    let scans = scans("fig8", COUNT);
+fn bench_zones(c: &mut Criterion) {
+    let scans = scans("fig8", SCAN_COUNT);
     let eight = [2000, 1800, 1600, 1400, 1200, 1000, 800, 600];
     let cases: [(&str, Pose, &[u16]); 3] = [
         ("zones, 2 circles, at the centre", Pose::default(), &[1000, 600]),
-        ("zones, 2 circles, off the centre", POSE, &[1000, 600]),
-        ("zones, 8 circles, off the centre", POSE, &eight),
+        ("zones, 2 circles, off the centre", SENSOR_POSE, &[1000, 600]),
+        ("zones, 8 circles, off the centre", SENSOR_POSE, &eight),
     ];
     for (name, pose, radii_mm) in cases {
         let settings = zones::Settings { radii_mm: radii_mm.to_vec(), ..zones::Settings::default() };
-        let mut check = zones::Check::new(pose, &settings, BEAMS);
+        let mut check = zones::ZoneChecker::new(pose, &settings, BEAM_COUNT);
         let mut out = Zones::default();
-        bench(c, name, &scans, |scan| check.update(scan, black_box(&mut out)));
+        time_scans(c, name, &scans, |scan| check.update(scan, black_box(&mut out)));
     }
 }
 
-fn find(c: &mut Criterion) {
+fn bench_finders(c: &mut Criterion) {
     for (name, world) in [("marks, none", "fig8"), ("marks, 12", "strips")] {
         let mut finder = marks::MarkDetector::new(marks::Settings::default());
         let mut out = Marks::default();
-        bench(c, name, &scans(world, COUNT), |scan| finder.update(scan, black_box(&mut out)));
+        time_scans(c, name, &scans(world, SCAN_COUNT), |scan| finder.update(scan, black_box(&mut out)));
     }
 }
 
-fn learn(c: &mut Criterion) {
-    let scans = scans("fig8", FIRST + COUNT);
+fn bench_background(c: &mut Criterion) {
+    let scans = scans("fig8", FIRST_SCAN + SCAN_COUNT);
     for (name, method) in [("background, paper", Method::Paper), ("background, multi", Method::Multi)] {
         let (mut model, scans) = model(method, &scans);
-        let mut out = Foreground::of(BEAMS);
-        bench(c, name, scans, |scan| model.update(scan, black_box(&mut out)));
+        let mut out = Foreground::of(BEAM_COUNT);
+        time_scans(c, name, scans, |scan| model.update(scan, black_box(&mut out)));
     }
     let (mut model, scans) = model(Method::Multi, &scans);
-    let mut cutter = Segmenter::new(POSE, BEAMS);
+    let mut cutter = Segmenter::new(SENSOR_POSE, BEAM_COUNT);
     // What stands before the background is found once, and cut again and again.
-    let mut foreground = Foreground::of(BEAMS);
+    let mut foreground = Foreground::of(BEAM_COUNT);
     model.update(&scans[0], &mut foreground);
-    bench(c, "segments", &scans[..1], |scan| cutter.update(scan, black_box(&mut foreground)));
+    time_scans(c, "segments", &scans[..1], |scan| cutter.update(scan, black_box(&mut foreground)));
 }
 
-fn all(c: &mut Criterion) {
-    let scans = scans("fig8", FIRST + COUNT);
+fn bench_all(c: &mut Criterion) {
+    let scans = scans("fig8", FIRST_SCAN + SCAN_COUNT);
     let cases = [
         ("zones, marks, background paper", Method::Paper, false),
         ("zones, marks, background multi", Method::Multi, false),
         ("zones, marks, background multi, segments", Method::Multi, true),
     ];
     for (name, method, with_segments) in cases {
-        let mut check = zones::Check::new(POSE, &zones::Settings::default(), BEAMS);
+        let mut check = zones::ZoneChecker::new(SENSOR_POSE, &zones::Settings::default(), BEAM_COUNT);
         let mut finder = marks::MarkDetector::new(marks::Settings::default());
         let (mut model, scans) = model(method, &scans);
-        let mut cutter = Segmenter::new(POSE, BEAMS);
+        let mut cutter = Segmenter::new(SENSOR_POSE, BEAM_COUNT);
         let (mut zones, mut marks) = (Zones::default(), Marks::default());
-        let mut foreground = Foreground::of(BEAMS);
-        bench(c, name, scans, |scan| {
+        let mut foreground = Foreground::of(BEAM_COUNT);
+        time_scans(c, name, scans, |scan| {
             check.update(scan, black_box(&mut zones));
             finder.update(scan, black_box(&mut marks));
             model.update(scan, black_box(&mut foreground));
@@ -113,5 +114,5 @@ fn all(c: &mut Criterion) {
     }
 }
 
-criterion_group!(benches, check, find, learn, all);
+criterion_group!(benches, bench_zones, bench_finders, bench_background, bench_all);
 criterion_main!(benches);

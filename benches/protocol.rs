@@ -5,17 +5,17 @@
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use fastrand::Rng;
-use scanhub_drivers::lms::framer::{Found, Framer};
-use scanhub_drivers::lms::header::Expect;
-use scanhub_drivers::lms::measured::{self, Measured};
+use scanhub_drivers::lms::framer::{Framer, FramerEvent};
+use scanhub_drivers::lms::header::ExpectedHeaders;
+use scanhub_drivers::lms::measured::{self, MeasuredValues};
 use scanhub_drivers::lms::telegram::{Telegram, crc};
 use scanhub_drivers::lms::variant::{Mode, Unit};
-use scanhub_schema::{Contents, Scan};
+use scanhub_schema::{ArrayFlags, Scan};
 use std::hint::black_box;
 
 /// Lengths of the reads for one telegram: as the hub reads, late on purpose, and as a UART hands bytes over.
-const LATE: [usize; 3] = [16, 560, 156];
-const PIECES: [usize; 46] = {
+const READ_LENS: [usize; 3] = [16, 560, 156];
+const UART_READ_LENS: [usize; 46] = {
     let mut pieces = [16; 46];
     pieces[45] = 732 - 45 * 16;
     pieces
@@ -34,10 +34,12 @@ fn telegrams() -> Vec<Vec<u8>> {
 fn framing(c: &mut Criterion) {
     let telegrams = telegrams();
     let mut group = c.benchmark_group("telegram of 732 bytes");
-    for (name, reads) in [("framer and crc, 3 reads", &LATE[..]), ("framer and crc, 46 reads", &PIECES[..])] {
+    for (name, reads) in
+        [("framer and crc, 3 reads", &READ_LENS[..]), ("framer and crc, 46 reads", &UART_READ_LENS[..])]
+    {
         let mut framer = Framer::default();
         let header = telegrams[0][..7].try_into().expect("a telegram has a header");
-        framer.expect(Expect::Stream { header, reply: None });
+        framer.expect(ExpectedHeaders::Stream { header, reply: None });
         let mut next = telegrams.iter().cycle();
         group.bench_function(name, |b| {
             b.iter(|| {
@@ -45,9 +47,9 @@ fn framing(c: &mut Criterion) {
                 let mut found = 0;
                 for &len in reads {
                     let (read, rest) = bytes.split_at(len);
-                    framer.spare()[..len].copy_from_slice(read);
+                    framer.read_buffer()[..len].copy_from_slice(read);
                     framer.commit(len);
-                    while let Some(Found::Telegram(framed)) = framer.poll() {
+                    while let Some(FramerEvent::Telegram(framed)) = framer.poll() {
                         black_box(framed.telegram.bytes());
                         found += 1;
                     }
@@ -67,10 +69,10 @@ fn framing(c: &mut Criterion) {
 fn decoding(c: &mut Criterion) {
     let telegrams = telegrams();
     let telegram = Telegram::check(&telegrams[0]).expect("a telegram");
-    let mut scan = Scan::zeroed(Scan::len(361, Contents::UPPER));
+    let mut scan = Scan::zeroed(Scan::len(361, ArrayFlags::UPPER));
     c.bench_function("decode of 361 beams", |b| {
         b.iter(|| {
-            let measured = Measured::decode(black_box(telegram)).expect("a scan");
+            let measured = MeasuredValues::decode(black_box(telegram)).expect("a scan");
             measured.scan(black_box(Mode(1))).write(&mut scan);
             black_box(&mut scan);
         });

@@ -18,44 +18,46 @@ use std::time::{Duration, Instant};
 
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
 use rustix::time::{ClockId, clock_gettime};
-use scanhub_schema::datagram::{Datagram, HEAD, Head, MTU_ETHERNET, Packed};
-use scanhub_schema::{Foreground, Marks, Ring, Scan, Topic, Zones};
-use scanhub_shm::{Bell, Node, Payload};
-use support::source::{self, SENSOR, Source};
-use support::stage::{PATIENCE, Stage};
+use scanhub_schema::datagram::{Datagram, DatagramPayload, HEADER_LEN, Head, MTU_ETHERNET};
+use scanhub_schema::{DoorbellWord, Foreground, Marks, Scan, Topic, Zones};
+use scanhub_shm::{Doorbell, Node, Payload};
+use support::environment::{BenchEnvironment, STEP_TIMEOUT};
+use support::source::{self, SENSOR, ScanSource};
 use support::{Outcome, clock};
 
 /// What consumers do until there is something.
 #[derive(Clone, Copy, PartialEq)]
-enum Rest {
+enum WaitMethod {
     Awake,
-    Bell,
+    Doorbell,
     Event,
 }
 
 fn publish(c: &mut Criterion) {
-    Stage::sweep().expect("the temporary directory can be read");
+    BenchEnvironment::remove_leftovers().expect("the temporary directory can be read");
     let mut group = c.benchmark_group("publish a scan");
     group.sample_size(10).warm_up_time(Duration::from_millis(500)).measurement_time(Duration::from_secs(2));
-    for (name, rest) in
-        [("awake", Rest::Awake), ("asleep at the bell", Rest::Bell), ("asleep at the event", Rest::Event)]
-    {
-        for count in CONSUMERS.into_iter().filter(|count| *count > 0 || rest == Rest::Awake) {
-            let stage = Stage::new().expect("a domain");
-            let mut source = Source::open(&stage.domain).expect("a publisher");
-            let node = scanhub_shm::client_node(&stage.domain).expect("a node");
-            let crowd = Crowd::default();
+    for (name, rest) in [
+        ("awake", WaitMethod::Awake),
+        ("asleep at the bell", WaitMethod::Doorbell),
+        ("asleep at the event", WaitMethod::Event),
+    ] {
+        for count in SUBSCRIBER_COUNTS.into_iter().filter(|count| *count > 0 || rest == WaitMethod::Awake) {
+            let environment = BenchEnvironment::new().expect("a domain");
+            let mut source = ScanSource::open(&environment.domain).expect("a publisher");
+            let node = scanhub_shm::client_node(&environment.domain).expect("a node");
+            let crowd = SubscriberThreads::default();
             thread::scope(|scope| {
-                let _end = End(&crowd);
-                if rest != Rest::Awake {
+                let _end = EndOnDrop(&crowd);
+                if rest != WaitMethod::Awake {
                     for _ in 0..count {
                         scope.spawn(|| {
-                            follow(&node, rest, &crowd).unwrap_or_else(|error| eprintln!("{error}"))
+                            run_subscriber(&node, rest, &crowd).unwrap_or_else(|error| eprintln!("{error}"))
                         });
                     }
                     wait_until(|| crowd.ready.load(Ordering::Acquire) == count);
                 }
-                let awake: Vec<_> = (0..if rest == Rest::Awake { count } else { 0 })
+                let awake: Vec<_> = (0..if rest == WaitMethod::Awake { count } else { 0 })
                     .map(|_| subscriber(&node).expect("a place"))
                     .collect();
                 let mut sent = 0;
@@ -63,17 +65,17 @@ fn publish(c: &mut Criterion) {
                     b.iter_custom(|times| {
                         let mut busy = Duration::ZERO;
                         for _ in 0..times {
-                            let before = processor_time();
+                            let before = cpu_time();
                             source.publish(0).expect("is sent");
-                            busy += processor_time() - before;
+                            busy += cpu_time() - before;
                             sent += 1;
                             for subscriber in &awake {
                                 assert!(matches!(Scan::receive(subscriber), Ok(Some(_))), "a scan for each");
                             }
-                            if rest != Rest::Awake {
+                            if rest != WaitMethod::Awake {
                                 wait_until(|| crowd.received.load(Ordering::Acquire) >= sent * count);
                                 // Scans do not come one upon the other: the last one, too, is asleep again.
-                                thread::sleep(PAUSE);
+                                thread::sleep(SCAN_INTERVAL);
                             }
                         }
                         busy
@@ -87,44 +89,44 @@ fn publish(c: &mut Criterion) {
 
 /// What the threads of consumers have come to.
 #[derive(Default)]
-struct Crowd {
+struct SubscriberThreads {
     ready: AtomicU64,
     received: AtomicU64,
-    is_over: AtomicBool,
+    should_end: AtomicBool,
 }
 
 /// Lets the consumers go, however the bench ends: they look at least so often.
-struct End<'a>(&'a Crowd);
+struct EndOnDrop<'a>(&'a SubscriberThreads);
 
-impl Drop for End<'_> {
+impl Drop for EndOnDrop<'_> {
     fn drop(&mut self) {
-        self.0.is_over.store(true, Ordering::Release);
+        self.0.should_end.store(true, Ordering::Release);
     }
 }
 
-fn follow(node: &Node, rest: Rest, crowd: &Crowd) -> Outcome<()> {
+fn run_subscriber(node: &Node, wait_method: WaitMethod, threads: &SubscriberThreads) -> Outcome<()> {
     let subscriber = subscriber(node)?;
-    let bell = Bell::open(node, SENSOR)?.ok_or("no bell")?;
-    let listener = match rest {
-        Rest::Event => {
+    let doorbell = Doorbell::open(node, SENSOR)?.ok_or("no bell")?;
+    let listener = match wait_method {
+        WaitMethod::Event => {
             Some(scanhub_shm::listener(node, &scanhub_shm::open_wake(node, SENSOR)?.ok_or("no event")?)?)
         }
-        Rest::Awake | Rest::Bell => None,
+        WaitMethod::Awake | WaitMethod::Doorbell => None,
     };
-    crowd.ready.fetch_add(1, Ordering::Release);
-    while !crowd.is_over.load(Ordering::Acquire) {
-        let rung = bell.rung(Ring::First);
+    threads.ready.fetch_add(1, Ordering::Release);
+    while !threads.should_end.load(Ordering::Acquire) {
+        let rung = doorbell.ring_count(DoorbellWord::First);
         if let Some(listener) = &listener {
             scanhub_shm::take_wakeups(&[listener])?;
         }
         while Scan::receive(&subscriber).map_err(|error| format!("{error:?}"))?.is_some() {
-            crowd.received.fetch_add(1, Ordering::Release);
+            threads.received.fetch_add(1, Ordering::Release);
         }
         match &listener {
-            Some(listener) => scanhub_shm::sleep(&[listener], LOOK)?,
-            None => scanhub_shm::sleep_at_bells(
-                &[(&bell, Ring::First, rung)],
-                clock::now() + LOOK.as_nanos() as u64,
+            Some(listener) => scanhub_shm::sleep(&[listener], END_POLL_INTERVAL)?,
+            None => scanhub_shm::wait_on_doorbells(
+                &[(&doorbell, DoorbellWord::First, rung)],
+                clock::now() + END_POLL_INTERVAL.as_nanos() as u64,
             )
             .map_err(|_| "no bells on this system")?,
         }
@@ -137,15 +139,15 @@ fn subscriber(node: &Node) -> Outcome<scanhub_shm::Subscriber<Scan>> {
     Ok(Scan::subscriber(node, &service)?)
 }
 
-fn wait_until(is_so: impl Fn() -> bool) {
-    let give_up_at = Instant::now() + 6 * PATIENCE;
-    while !is_so() {
+fn wait_until(is_true: impl Fn() -> bool) {
+    let give_up_at = Instant::now() + 6 * STEP_TIMEOUT;
+    while !is_true() {
         assert!(Instant::now() < give_up_at, "the consumers do not come on");
         thread::sleep(Duration::from_micros(100));
     }
 }
 
-fn processor_time() -> Duration {
+fn cpu_time() -> Duration {
     let used = clock_gettime(ClockId::ThreadCPUTime);
     Duration::new(used.tv_sec as u64, used.tv_nsec as u32)
 }
@@ -161,7 +163,7 @@ fn datagram(c: &mut Criterion) {
 
 type Group<'a> = criterion::BenchmarkGroup<'a, criterion::measurement::WallTime>;
 
-fn payload<P: Packed + ?Sized>(group: &mut Group<'_>, topic: Topic, sent: &P)
+fn payload<P: DatagramPayload + ?Sized>(group: &mut Group<'_>, topic: Topic, sent: &P)
 where
     Box<P>: Default,
 {
@@ -169,11 +171,11 @@ where
     let mut buffer = [0; MTU_ETHERNET];
     group.bench_function(format!("{}, pack and seal", topic.name()), |b| {
         b.iter(|| {
-            let len = black_box(sent).pack(&mut buffer[HEAD..]).expect("fits");
+            let len = black_box(sent).pack(&mut buffer[HEADER_LEN..]).expect("fits");
             black_box(head.seal(&mut buffer, len).expect("fits"));
         });
     });
-    let len = sent.pack(&mut buffer[HEAD..]).expect("fits");
+    let len = sent.pack(&mut buffer[HEADER_LEN..]).expect("fits");
     let sealed = head.seal(&mut buffer, len).expect("fits").to_vec();
     let mut received = Box::default();
     group.bench_function(format!("{}, read, check and unpack", topic.name()), |b| {
@@ -185,11 +187,11 @@ where
     });
 }
 
-const CONSUMERS: [u64; 6] = [0, 1, 4, 16, 64, 200];
+const SUBSCRIBER_COUNTS: [u64; 6] = [0, 1, 4, 16, 64, 200];
 /// Between two scans, so that all sleep: a sensor's are 26 times as far apart.
-const PAUSE: Duration = Duration::from_millis(1);
+const SCAN_INTERVAL: Duration = Duration::from_millis(1);
 /// So often consumers look whether the bench is over.
-const LOOK: Duration = Duration::from_millis(500);
+const END_POLL_INTERVAL: Duration = Duration::from_millis(500);
 
 criterion_group!(benches, publish, datagram);
 criterion_main!(benches);

@@ -26,13 +26,13 @@ use rustix::fs::{Mode, OFlags, fcntl_setfl, open};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
 use scanhub_drivers::lms;
-use scanhub_drivers::lms::variant::{MIRROR_TURN, Unit};
+use scanhub_drivers::lms::variant::{MIRROR_PERIOD, Unit};
 use scanhub_sim::options::{Scanner, SimulateOptions};
 use scanhub_sim::{Event, simulate_with};
 
+use support::environment::{BenchEnvironment, Child, PROGRAM, STEP_TIMEOUT};
 use support::figures::{self, Figure, Target};
-use support::stage::{Child, PATIENCE, PROGRAM, Stage};
-use support::usage::Work;
+use support::usage::ThreadUsage;
 use support::{Options, Outcome, clock};
 
 fn main() -> ExitCode {
@@ -40,79 +40,79 @@ fn main() -> ExitCode {
 }
 
 fn measure(options: &Options) -> Outcome<()> {
-    let stage = Stage::new()?;
-    let name = stage.port("front");
-    let mut plug = Plug::at(&name)?;
-    let hub = stage.hub(&["front"])?;
-    hub.await_line("ready", PATIENCE)?;
-    let telegrams = stage.consumer("telegram", "front", &["0"])?;
-    let statuses = stage.consumer("status", "front", &[])?;
-    telegrams.await_line("telegram", PATIENCE)?;
+    let environment = BenchEnvironment::new()?;
+    let name = environment.port("front");
+    let mut plug = PluggedSensor::plug_in(&name)?;
+    let hub = environment.start_hub(&["front"])?;
+    hub.wait_for_line("ready", STEP_TIMEOUT)?;
+    let telegrams = environment.start_subscriber("telegram", "front", &["0"])?;
+    let statuses = environment.start_subscriber("status", "front", &[])?;
+    telegrams.wait_for_line("telegram", STEP_TIMEOUT)?;
     let (mut noticed, mut back, mut busy, mut torn) = (Vec::new(), Vec::new(), Vec::new(), 0.0);
     for round in 0..options.count(20) {
         // A different phase of the stream in each round.
-        clock::rest(clock::now() + (300 + 11 * (round as u64 % 20)) * MILLIS);
+        clock::sleep_until(clock::now() + (300 + 11 * (round as u64 % 20)) * MILLIS);
         telegrams.lines_so_far();
         statuses.lines_so_far();
-        let pulled = plug.pull(&name)?;
-        let absent = statuses.await_line("status front absent", PATIENCE)?.number(3)?;
+        let pulled = plug.unplug(&name)?;
+        let absent = statuses.wait_for_line("status front absent", STEP_TIMEOUT)?.number(3)?;
         noticed.push(absent.saturating_sub(pulled) as f64 / 1e6);
-        let (before, begun) = (Work::of(hub.guard.pid(), |_| true)?, clock::now());
+        let (before, started) = (ThreadUsage::of(hub.guard.pid(), |_| true)?, clock::now());
         // A different phase of the hub's polls, too.
-        clock::rest(begun + (1_000 + 37 * (round as u64 % 20)) * MILLIS);
-        let work = Work::of(hub.guard.pid(), |_| true)?.since(before);
-        busy.push(100.0 * work.busy_ns as f64 / (clock::now() - begun) as f64);
+        clock::sleep_until(started + (1_000 + 37 * (round as u64 % 20)) * MILLIS);
+        let work = ThreadUsage::of(hub.guard.pid(), |_| true)?.since(before);
+        busy.push(100.0 * work.busy_ns as f64 / (clock::now() - started) as f64);
         // Drops what arrived before the sensor was unplugged.
         telegrams.lines_so_far();
         let other_number = (round % 2 == 1).then(make_pty).transpose()?;
-        plug = Plug::at(&name)?;
-        let line = telegrams.await_line("telegram", PATIENCE)?;
-        back.push((line.number(2)? - plug.since) as f64 / 1e6);
+        plug = PluggedSensor::plug_in(&name)?;
+        let line = telegrams.wait_for_line("telegram", STEP_TIMEOUT)?;
+        back.push((line.number(2)? - plug.plugged_ns) as f64 / 1e6);
         torn += f64::from(u8::from(line.words().get(5) != Some(&"true")));
         drop(other_number);
     }
     drop((telegrams, statuses, hub));
-    plug.pull(&name)?;
+    plug.unplug(&name)?;
     let figure = |name, unit, hub, target| Figure { name, unit, hub, baseline: Vec::new(), target };
     let worst = |values: &[f64]| vec![values.iter().copied().fold(0.0, f64::max)];
     let mut figures = vec![
-        figure("unplugged until absent, longest", "ms", worst(&noticed), Target::Most(50.0)),
+        figure("unplugged until absent, longest", "ms", worst(&noticed), Target::Max(50.0)),
         figure("unplugged until absent", "ms", noticed, Target::None),
-        figure("plugged in until a telegram, longest", "ms", worst(&back), Target::Most(500.0)),
+        figure("plugged in until a telegram, longest", "ms", worst(&back), Target::Max(500.0)),
         figure("plugged in until a telegram", "ms", back, Target::None),
-        figure("hub while absent, maximum", "% of a core", worst(&busy), Target::Most(2.0)),
+        figure("hub while absent, maximum", "% of a core", worst(&busy), Target::Max(2.0)),
         figure("hub while absent", "% of a core", busy, Target::None),
-        figure("torn telegrams", "1", vec![torn], Target::Most(0.0)),
+        figure("torn telegrams", "1", vec![torn], Target::Max(0.0)),
     ];
-    drop(stage);
+    drop(environment);
     figures.extend(rotating_scanners(options)?);
     figures::print("replug", options.json, &figures);
     Ok(())
 }
 
 /// A streaming sensor that is plugged in under a name.
-struct Plug {
-    pulled: Arc<AtomicBool>,
+struct PluggedSensor {
+    is_unplugged: Arc<AtomicBool>,
     sensor: JoinHandle<OwnedFd>,
     /// Time at which its name appeared.
-    since: u64,
+    plugged_ns: u64,
 }
 
-impl Plug {
-    fn at(name: &str) -> Outcome<Plug> {
+impl PluggedSensor {
+    fn plug_in(name: &str) -> Outcome<PluggedSensor> {
         let (line, pty) = make_pty()?;
-        let pulled = Arc::new(AtomicBool::new(false));
+        let is_unplugged = Arc::new(AtomicBool::new(false));
         let sensor = thread::spawn({
-            let pulled = pulled.clone();
-            move || stream(line, &pulled)
+            let is_unplugged = is_unplugged.clone();
+            move || stream(line, &is_unplugged)
         });
         symlink(OsStr::from_bytes(&pty), name)?;
-        Ok(Plug { pulled, sensor, since: clock::now() })
+        Ok(PluggedSensor { is_unplugged, sensor, plugged_ns: clock::now() })
     }
 
     /// Unplugs the sensor, and returns the time.
-    fn pull(self, name: &str) -> Outcome<u64> {
-        self.pulled.store(true, Ordering::Relaxed);
+    fn unplug(self, name: &str) -> Outcome<u64> {
+        self.is_unplugged.store(true, Ordering::Relaxed);
         let line = self.sensor.join().map_err(|_| "the sensor panicked")?;
         fs::remove_file(name)?;
         let at = clock::now();
@@ -122,25 +122,25 @@ impl Plug {
 }
 
 /// Sends scans like a sensor, two mirror turns apart and each in two parts, while a program has the line open.
-fn stream(line: OwnedFd, pulled: &AtomicBool) -> OwnedFd {
+fn stream(line: OwnedFd, is_unplugged: &AtomicBool) -> OwnedFd {
     let mut at = clock::now();
-    let mut heard = [0; 256];
+    let mut buffer = [0; 256];
     for number in 0_u16.. {
         let words: [u16; 361] = std::array::from_fn(|beam| 500 + (number % 1000) + beam as u16);
         let scan = lms::measured::encode(0, Unit::Mm, &words, 0x10);
         let (first, second) = scan.bytes().split_at(508);
         for part in [first, second] {
-            at += MIRROR_TURN;
-            clock::rest(at);
-            if pulled.load(Ordering::Relaxed) {
+            at += MIRROR_PERIOD;
+            clock::sleep_until(at);
+            if is_unplugged.load(Ordering::Relaxed) {
                 break;
             }
-            while rustix::io::read(&line, &mut heard).is_ok_and(|len| len > 0) {}
+            while rustix::io::read(&line, &mut buffer).is_ok_and(|len| len > 0) {}
             if is_open(&line) {
                 let _ = rustix::io::write(&line, part);
             }
         }
-        if pulled.load(Ordering::Relaxed) {
+        if is_unplugged.load(Ordering::Relaxed) {
             break;
         }
     }
@@ -174,22 +174,22 @@ const MILLIS: u64 = 1_000_000;
 struct RotatingScanner {
     family: &'static str,
     scanner: Scanner,
-    back: &'static str,
-    powered: &'static str,
+    replug_figure: &'static str,
+    power_figure: &'static str,
 }
 
 const SCANNERS: [RotatingScanner; 2] = [
     RotatingScanner {
         family: "ld",
         scanner: Scanner::Ld(scanhub_sim::ld::Model::Ld19),
-        back: "LD19: plugged in until a scan, longest",
-        powered: "LD19: powered on until a scan, without 0.5 s of booting, longest",
+        replug_figure: "LD19: plugged in until a scan, longest",
+        power_figure: "LD19: powered on until a scan, without 0.5 s of booting, longest",
     },
     RotatingScanner {
         family: "rplidar",
         scanner: Scanner::Rplidar { model: scanhub_sim::rplidar::Model::A1, mode: 3 },
-        back: "RPLIDAR A1: plugged in until a scan, longest",
-        powered: "RPLIDAR A1: powered on until a scan, without 0.5 s of booting, longest",
+        replug_figure: "RPLIDAR A1: plugged in until a scan, longest",
+        power_figure: "RPLIDAR A1: powered on until a scan, without 0.5 s of booting, longest",
     },
 ];
 
@@ -205,46 +205,46 @@ fn rotating_scanners(options: &Options) -> Outcome<Vec<Figure>> {
 
 impl RotatingScanner {
     fn measure(&self, options: &Options) -> Outcome<[Figure; 2]> {
-        let stage = Stage::new()?;
-        let port = PathBuf::from(stage.port("front"));
+        let environment = BenchEnvironment::new()?;
+        let port = PathBuf::from(environment.port("front"));
         let events = Arc::new(Mutex::new(VecDeque::new()));
         let (stop, stopped) = UnixStream::pair()?;
         let simulator = thread::spawn({
             let (events, port) = (events.clone(), port.clone());
             let scanner = Some(self.scanner);
             let options =
-                SimulateOptions { ports: vec![port], scanner, boot: BOOT, ..SimulateOptions::default() };
+                SimulateOptions { ports: vec![port], scanner, boot: BOOT_TIME, ..SimulateOptions::default() };
             let next = move |_: &Path| events.lock().ok()?.pop_front();
             move || simulate_with(&options, &stopped, |_| {}, |_| {}, next, |_, _| {})
         });
-        await_name(&port);
-        let mut command = stage.hub_command(PROGRAM, &["front"]);
+        wait_for_name(&port);
+        let mut command = environment.hub_command(PROGRAM, &["front"]);
         command.arg(format!("--set=link.front.family={}", self.family));
-        let hub = Child::of(command, Stdio::null())?;
-        hub.await_line("ready", PATIENCE)?;
-        let scans = stage.consumer("each", "front", &[])?;
-        scans.await_line("scanned", PATIENCE)?;
+        let hub = Child::spawn(command, Stdio::null())?;
+        hub.wait_for_line("ready", STEP_TIMEOUT)?;
+        let scans = environment.start_subscriber("each", "front", &[])?;
+        scans.wait_for_line("scanned", STEP_TIMEOUT)?;
         let inject =
             |event: Event| events.lock().map(|mut events| events.push_back(event)).map_err(|_| "poisoned");
         let (mut back, mut powered) = (Vec::new(), Vec::new());
         for round in 0..options.count(10) as u64 {
             // A different phase of the revolution in each round.
-            clock::rest(clock::now() + (1_000 + 37 * (round % 10)) * MILLIS);
-            inject(Event::Unplug(OUT))?;
+            clock::sleep_until(clock::now() + (1_000 + 37 * (round % 10)) * MILLIS);
+            inject(Event::Unplug(UNPLUGGED_NS))?;
             while port.exists() {
-                clock::rest(clock::now() + MILLIS);
+                clock::sleep_until(clock::now() + MILLIS);
             }
             scans.lines_so_far();
-            await_name(&port);
+            wait_for_name(&port);
             let since = clock::now();
-            back.push((scans.await_line("scanned", PATIENCE)?.number(2)? - since) as f64 / 1e6);
-            clock::rest(clock::now() + (1_000 + 41 * (round % 10)) * MILLIS);
+            back.push((scans.wait_for_line("scanned", STEP_TIMEOUT)?.number(2)? - since) as f64 / 1e6);
+            clock::sleep_until(clock::now() + (1_000 + 41 * (round % 10)) * MILLIS);
             inject(Event::PowerCycle)?;
             // By then, whatever was in transit has arrived, and the scanner has sent nothing else.
-            clock::rest(clock::now() + BOOT.as_nanos() as u64);
+            clock::sleep_until(clock::now() + BOOT_TIME.as_nanos() as u64);
             let since = clock::now();
             scans.lines_so_far();
-            powered.push((scans.await_line("scanned", PATIENCE)?.number(2)? - since) as f64 / 1e6);
+            powered.push((scans.wait_for_line("scanned", STEP_TIMEOUT)?.number(2)? - since) as f64 / 1e6);
         }
         drop((scans, hub, stop));
         simulator.join().map_err(|_| "the simulator panicked")??;
@@ -256,17 +256,20 @@ impl RotatingScanner {
             baseline: Vec::new(),
             target,
         };
-        Ok([figure(self.back, &back, Target::Most(500.0)), figure(self.powered, &powered, Target::None)])
+        Ok([
+            figure(self.replug_figure, &back, Target::Max(500.0)),
+            figure(self.power_figure, &powered, Target::None),
+        ])
     }
 }
 
-fn await_name(port: &Path) {
+fn wait_for_name(port: &Path) {
     while !port.exists() {
-        clock::rest(clock::now() + MILLIS);
+        clock::sleep_until(clock::now() + MILLIS);
     }
 }
 
 /// Time from power-on to the boot message.
-const BOOT: Duration = Duration::from_millis(500);
+const BOOT_TIME: Duration = Duration::from_millis(500);
 /// Time for which an adapter is unplugged, in ns.
-const OUT: u64 = 2_000 * MILLIS;
+const UNPLUGGED_NS: u64 = 2_000 * MILLIS;

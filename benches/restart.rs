@@ -18,9 +18,11 @@ use std::time::Duration;
 
 use supervisor::Supervisor;
 use support::baseline;
+use support::environment::{
+    BenchEnvironment, Child, PROGRAM, SENSORS, STEP_TIMEOUT, STEP_TIMEOUT as WAIT_TIMEOUT,
+};
 use support::figures::{self, Figure, Target};
-use support::stage::{Child, PATIENCE, PROGRAM, SENSORS, Stage};
-use support::truth::Truth;
+use support::truth::SensorTruth;
 use support::{Options, Outcome, clock};
 
 fn main() -> ExitCode {
@@ -28,11 +30,18 @@ fn main() -> ExitCode {
 }
 
 fn measure(options: &Options) -> Outcome<()> {
-    let stage = Stage::new()?;
-    let simulator = stage.simulate(&SENSORS, 500_000)?;
-    let follow = |sensor: &&str| stage.consumer("telegram", sensor, &["0"]);
-    let consumers: Vec<Child> = SENSORS.iter().map(follow).collect::<Outcome<_>>()?;
-    let mut runs = Runs { stage: &stage, consumers: &consumers, hub: None, torn: 0, missed: 0, received: 0 };
+    let environment = BenchEnvironment::new()?;
+    let simulator = environment.simulate(&SENSORS, 500_000)?;
+    let follow = |sensor: &&str| environment.start_subscriber("telegram", sensor, &["0"]);
+    let subscribers: Vec<Child> = SENSORS.iter().map(follow).collect::<Outcome<_>>()?;
+    let mut runs = HubRuns {
+        stage: &environment,
+        subscribers: &subscribers,
+        hub: None,
+        incomplete: 0,
+        missed: 0,
+        received: 0,
+    };
     runs.restart()?;
     let (mut hub, mut baseline) = (Vec::new(), Vec::new());
     // A series of kills, then the same number of starts of the baseline, on the same streams.
@@ -45,72 +54,74 @@ fn measure(options: &Options) -> Outcome<()> {
         runs.kill()?;
         for _ in 0..each {
             thread::sleep(run_time(baseline.len()));
-            baseline.push(start_baseline(&stage)?);
+            baseline.push(start_baseline(&environment)?);
         }
         runs.restart()?;
     }
     runs.kill()?;
-    let (torn, missed, received) = (runs.torn as f64, runs.missed as f64, runs.received as f64);
-    drop(consumers);
+    let (torn, missed, received) = (runs.incomplete as f64, runs.missed as f64, runs.received as f64);
+    drop(subscribers);
     drop(simulator);
     let writes: Outcome<Vec<_>> = SENSORS
         .iter()
-        .map(|sensor| Ok(Truth::read(&stage.truth(), sensor)?.eeprom_writes.ok_or("no summary")?))
+        .map(|sensor| {
+            Ok(SensorTruth::read(&environment.truth(), sensor)?.eeprom_writes.ok_or("no summary")?)
+        })
         .collect();
     let writes = writes?.iter().sum::<u64>() as f64;
-    let figure = |name, of: fn(&Start) -> f64, target| {
+    let figure = |name, of: fn(&StartTimes) -> f64, target| {
         let baseline = baseline.iter().map(of).collect();
         Figure { name, unit: "ms", hub: hub.iter().map(of).collect(), baseline, target }
     };
     let count =
         |name, value, target| Figure { name, unit: "1", hub: vec![value], baseline: Vec::new(), target };
     let mut figures = vec![
-        figure("exec to services up", |start| start.up_ms, Target::Most(50.0)),
-        figure("exec to first telegram, sooner", |start| start.first_ms[0], Target::Most(500.0)),
-        figure("exec to first telegram, later", |start| start.first_ms[1], Target::Most(500.0)),
+        figure("exec to services up", |start| start.up_ms, Target::Max(50.0)),
+        figure("exec to first telegram, sooner", |start| start.first_ms[0], Target::Max(500.0)),
+        figure("exec to first telegram, later", |start| start.first_ms[1], Target::Max(500.0)),
         count("telegrams received", received, Target::None),
-        count("of them torn", torn, Target::Most(0.0)),
-        count("missed within a run", missed, Target::Most(0.0)),
-        count("EEPROM writes", writes, Target::Most(0.0)),
+        count("of them torn", torn, Target::Max(0.0)),
+        count("missed within a run", missed, Target::Max(0.0)),
+        count("EEPROM writes", writes, Target::Max(0.0)),
     ];
-    drop(stage);
-    figures.extend(with_kept_line(options.count(20))?);
+    drop(environment);
+    figures.extend(measure_kept_line(options.count(20))?);
     figures::print("restart", options.json, &figures);
     Ok(())
 }
 
 /// Times of a start, in ms from exec.
-struct Start {
+struct StartTimes {
     up_ms: f64,
     /// First telegram of the subscriber that was served first, and of the other one.
     first_ms: [f64; 2],
 }
 
-impl Start {
-    fn new(started_ns: u64, up_ns: u64, mut first_ns: [u64; 2]) -> Start {
+impl StartTimes {
+    fn new(started_ns: u64, up_ns: u64, mut first_ns: [u64; 2]) -> StartTimes {
         first_ns.sort_unstable();
         let since = |at: u64| (at - started_ns) as f64 / 1e6;
-        Start { up_ms: since(up_ns), first_ms: first_ns.map(since) }
+        StartTimes { up_ms: since(up_ns), first_ms: first_ns.map(since) }
     }
 }
 
 /// The runs of the hub, and the subscribers, which outlive them.
-struct Runs<'a> {
-    stage: &'a Stage,
-    consumers: &'a [Child],
+struct HubRuns<'a> {
+    stage: &'a BenchEnvironment,
+    subscribers: &'a [Child],
     hub: Option<Child>,
-    torn: u64,
+    incomplete: u64,
     missed: u64,
     received: u64,
 }
 
-impl Runs<'_> {
+impl HubRuns<'_> {
     fn kill(&mut self) -> Outcome<()> {
         if let Some(hub) = self.hub.take() {
             hub.guard.kill()?;
         }
-        for consumer in self.consumers {
-            for line in consumer.lines_so_far() {
+        for subscriber in self.subscribers {
+            for line in subscriber.lines_so_far() {
                 self.count(&line.words());
             }
         }
@@ -118,20 +129,20 @@ impl Runs<'_> {
     }
 
     /// Kills the hub, if one runs, and starts the next. Returns when each subscriber has a telegram of it.
-    fn restart(&mut self) -> Outcome<Start> {
+    fn restart(&mut self) -> Outcome<StartTimes> {
         self.kill()?;
-        let hub = self.stage.hub(&SENSORS)?;
-        let up_ns = hub.await_line("ready", PATIENCE)?.at_ns;
+        let hub = self.stage.start_hub(&SENSORS)?;
+        let up_ns = hub.wait_for_line("ready", STEP_TIMEOUT)?.at_ns;
         let mut first_ns = [0; 2];
-        for (first_ns, consumer) in first_ns.iter_mut().zip(self.consumers) {
+        for (first_ns, subscriber) in first_ns.iter_mut().zip(self.subscribers) {
             // The last telegrams of the killed hub may still be in the pipe.
             while *first_ns < hub.started_ns {
-                let line = consumer.await_line("telegram", PATIENCE)?;
+                let line = subscriber.wait_for_line("telegram", STEP_TIMEOUT)?;
                 self.count(&line.words());
                 *first_ns = line.number(2)?;
             }
         }
-        let start = Start::new(hub.started_ns, up_ns, first_ns);
+        let start = StartTimes::new(hub.started_ns, up_ns, first_ns);
         self.hub = Some(hub);
         Ok(start)
     }
@@ -140,23 +151,23 @@ impl Runs<'_> {
         if let ["telegram", _, _, _, missed, intact, ..] = words {
             self.received += 1;
             self.missed += missed.parse().unwrap_or(1);
-            self.torn += u64::from(*intact != "true");
+            self.incomplete += u64::from(*intact != "true");
         }
     }
 }
 
-fn start_baseline(stage: &Stage) -> Outcome<Start> {
-    let baseline = stage.bare(&SENSORS, 0, baseline::LEAD)?;
-    let up_ns = baseline.await_line("ready", PATIENCE)?.at_ns;
+fn start_baseline(environment: &BenchEnvironment) -> Outcome<StartTimes> {
+    let baseline = environment.start_baseline(&SENSORS, 0, baseline::WAKE_AHEAD_NS)?;
+    let up_ns = baseline.wait_for_line("ready", STEP_TIMEOUT)?.at_ns;
     let mut first_ns = [0; 2];
     while first_ns.contains(&0) {
-        let line = baseline.await_line("woken", PATIENCE)?;
+        let line = baseline.wait_for_line("woken", STEP_TIMEOUT)?;
         let first_ns = &mut first_ns[line.number(1)? as usize];
         if *first_ns == 0 {
             *first_ns = line.number(2)?;
         }
     }
-    let start = Start::new(baseline.started_ns, up_ns, first_ns);
+    let start = StartTimes::new(baseline.started_ns, up_ns, first_ns);
     baseline.guard.kill()?;
     Ok(start)
 }
@@ -170,9 +181,9 @@ fn run_time(n: usize) -> Duration {
 /// times, spread evenly over a telegram, and half as many times in the 0.6 ms in which a telegram is read: the only
 /// time in which it has left the line and is not yet sent. The telegrams of a subscriber are compared with those that
 /// the simulated sensor sent.
-fn with_kept_line(kills: usize) -> Outcome<Vec<Figure>> {
-    let spread = run_with_kept_line(kills, |n| PERIOD_NS * (2 * n + 1) / (2 * kills as u64))?;
-    let reading = run_with_kept_line(kills.div_ceil(2), |_| PERIOD_NS - READING_NS / 2)?;
+fn measure_kept_line(kills: usize) -> Outcome<Vec<Figure>> {
+    let spread = kill_with_kept_line(kills, |n| SCAN_PERIOD_NS * (2 * n + 1) / (2 * kills as u64))?;
+    let reading = kill_with_kept_line(kills.div_ceil(2), |_| SCAN_PERIOD_NS - READ_AHEAD_NS / 2)?;
     let series = |name, hub, target| Figure { name, unit: "ms", hub, baseline: Vec::new(), target };
     let count = |name, value: usize, target| Figure {
         name,
@@ -184,27 +195,27 @@ fn with_kept_line(kills: usize) -> Outcome<Vec<Figure>> {
     let longest = |silences: &[f64]| silences.iter().copied().fold(0.0, f64::max);
     Ok(vec![
         series("kept: silence of telegrams", spread.telegrams_ms.clone(), Target::None),
-        series("kept: longest silence", vec![longest(&spread.telegrams_ms)], Target::Most(300.0)),
+        series("kept: longest silence", vec![longest(&spread.telegrams_ms)], Target::Max(300.0)),
         series("kept: silence of scans", spread.scans_ms.clone(), Target::None),
-        series("kept: longest silence", vec![longest(&spread.scans_ms)], Target::Most(300.0)),
+        series("kept: longest silence", vec![longest(&spread.scans_ms)], Target::Max(300.0)),
         count("kept: kills", kills, Target::None),
         count("kept: telegrams sent", spread.sent, Target::None),
-        count("kept: telegrams lost", spread.lost, Target::Most(0.0)),
-        count("kept: of these, while none was being read", spread.lost_otherwise, Target::Most(0.0)),
+        count("kept: telegrams lost", spread.lost, Target::Max(0.0)),
+        count("kept: of these, while none was being read", spread.lost_while_idle, Target::Max(0.0)),
         count("kept: aborted by the sensor", spread.aborted, Target::None),
         count("kept, while reading: kills", kills.div_ceil(2), Target::None),
         count("kept, while reading: lost", reading.lost, Target::None),
         count(
             "kept, while reading: of these, while none was being read",
-            reading.lost_otherwise,
-            Target::Most(0.0),
+            reading.lost_while_idle,
+            Target::Max(0.0),
         ),
     ])
 }
 
 /// Results of several kills.
 #[derive(Default)]
-struct Cost {
+struct KillResults {
     /// Time from the last telegram of a run to the first of the next one, on receipt.
     telegrams_ms: Vec<f64>,
     /// Time from the last scan of a run to the first of the next one, on receipt.
@@ -214,7 +225,7 @@ struct Cost {
     lost: usize,
     /// Lost telegrams that no hub should have been reading when it was killed. A hub that is woken late reads all bytes
     /// that have arrived.
-    lost_otherwise: usize,
+    lost_while_idle: usize,
     /// Telegrams that the sensor aborted in this time to answer the next hub.
     aborted: usize,
 }
@@ -238,7 +249,7 @@ impl Receiver {
 
     /// Waits for the next sample.
     fn next(&mut self) -> Outcome<()> {
-        let line = self.process.next_line(PATIENCE)?;
+        let line = self.process.next_line(STEP_TIMEOUT)?;
         let words = line.words();
         if words.len() <= self.words.1 {
             return Ok(());
@@ -254,8 +265,8 @@ impl Receiver {
 
     /// Receives until there is a sample at or after `until_ns`, and until there have been `silences` changes of the
     /// run.
-    fn follow(&mut self, until_ns: u64, silences: usize) -> Outcome<()> {
-        while self.last_ns < until_ns || self.silences_ms.len() < silences {
+    fn receive_until(&mut self, until_ns: u64, run_changes: usize) -> Outcome<()> {
+        while self.last_ns < until_ns || self.silences_ms.len() < run_changes {
             self.next()?;
         }
         Ok(())
@@ -263,40 +274,43 @@ impl Receiver {
 }
 
 /// Kills the hub `kills` times, number n at the time `moment(n)` after the last byte of a telegram.
-fn run_with_kept_line(kills: usize, moment: impl Fn(u64) -> u64) -> Outcome<Cost> {
-    let stage = Stage::new()?;
+fn kill_with_kept_line(kills: usize, moment: impl Fn(u64) -> u64) -> Outcome<KillResults> {
+    let environment = BenchEnvironment::new()?;
     let sensor = SENSORS[0];
-    let simulator = stage.simulate_one(sensor, &["--baud", "500000"])?;
-    let mut supervisor = Supervisor::new(stage.file("notify").display().to_string());
-    let command = stage.hub_command(PROGRAM, &[sensor]);
+    let simulator = environment.simulate_one(sensor, &["--baud", "500000"])?;
+    let mut supervisor = Supervisor::new(environment.file("notify").display().to_string());
+    let command = environment.hub_command(PROGRAM, &[sensor]);
     let mut start = || -> Outcome<Child> {
         let (command, stdin) = supervisor.service(&command, None);
-        let hub = Child::of(command, stdin)?;
-        hub.await_line("ready", PATIENCE)?;
-        supervisor.hear(&format!("FDNAME={sensor}"));
+        let hub = Child::spawn(command, stdin)?;
+        hub.wait_for_line("ready", STEP_TIMEOUT)?;
+        supervisor.wait_for_message(&format!("FDNAME={sensor}"));
         Ok(hub)
     };
     let mut hub = start()?;
-    let mut telegrams = Receiver::new(stage.consumer("telegram", sensor, &["0"])?, (2, 3));
-    let mut scans = Receiver::new(stage.part(&["consume", "each", stage.domain.name(), sensor])?, (2, 3));
+    let mut telegrams = Receiver::new(environment.start_subscriber("telegram", sensor, &["0"])?, (2, 3));
+    let mut scans = Receiver::new(
+        environment.start_part(&["consume", "each", environment.domain.name(), sensor])?,
+        (2, 3),
+    );
     let mut killed_ns = Vec::new();
     for n in 0..kills {
-        let settled_ns = clock::now() + SETTLING.as_nanos() as u64;
-        telegrams.follow(settled_ns, n)?;
-        scans.follow(settled_ns, n)?;
+        let settled_ns = clock::now() + SETTLE_TIME.as_nanos() as u64;
+        telegrams.receive_until(settled_ns, n)?;
+        scans.receive_until(settled_ns, n)?;
         let last_byte_ns: u64 = telegrams.lines.last().ok_or("no telegram")?[7].parse()?;
-        clock::rest(last_byte_ns + moment(n as u64) + PERIOD_NS);
+        clock::sleep_until(last_byte_ns + moment(n as u64) + SCAN_PERIOD_NS);
         killed_ns.push(clock::now());
         hub.guard.kill()?;
-        thread::sleep(RESTART);
+        thread::sleep(RESTART_PAUSE);
         hub = start()?;
     }
-    let settled_ns = clock::now() + SETTLING.as_nanos() as u64;
-    telegrams.follow(settled_ns, kills)?;
-    scans.follow(settled_ns, kills)?;
+    let settled_ns = clock::now() + SETTLE_TIME.as_nanos() as u64;
+    telegrams.receive_until(settled_ns, kills)?;
+    scans.receive_until(settled_ns, kills)?;
     hub.guard.kill()?;
     drop(simulator);
-    let truth = Truth::read(&stage.own_truth(sensor), sensor)?;
+    let truth = SensorTruth::read(&environment.own_truth(sensor), sensor)?;
     let received: HashSet<&str> = telegrams.lines.iter().map(|words| words[6].as_str()).collect();
     let is_received = |hash: &String| received.contains(hash.as_str());
     let first = truth.sent.iter().position(|sent| is_received(&sent.hash)).ok_or("nothing was sent")?;
@@ -304,29 +318,29 @@ fn run_with_kept_line(kills: usize, moment: impl Fn(u64) -> u64) -> Outcome<Cost
     let span = &truth.sent[first..=last];
     let lost: Vec<u64> = span.iter().filter(|sent| !is_received(&sent.hash)).map(|sent| sent.at_ns).collect();
     let is_reading = |end_ns: u64, killed_ns: u64| {
-        (end_ns.saturating_sub(READING_NS + NOISE_NS)..end_ns + LATE_NS).contains(&killed_ns)
+        (end_ns.saturating_sub(READ_AHEAD_NS + CLOCK_NOISE_NS)..end_ns + MAX_DELAY_NS).contains(&killed_ns)
     };
     let otherwise = |end_ns: &&u64| !killed_ns.iter().any(|killed_ns| is_reading(**end_ns, *killed_ns));
     let meanwhile = span[0].at_ns..span[span.len() - 1].at_ns;
-    Ok(Cost {
+    Ok(KillResults {
         telegrams_ms: telegrams.silences_ms,
         scans_ms: scans.silences_ms,
         sent: span.len(),
         lost: lost.len(),
-        lost_otherwise: lost.iter().filter(otherwise).count(),
+        lost_while_idle: lost.iter().filter(otherwise).count(),
         aborted: truth.aborted_ns.iter().filter(|at_ns| meanwhile.contains(*at_ns)).count(),
     })
 }
 
 /// Time from one telegram of 361 beams to the next: two turns of the mirror.
-const PERIOD_NS: u64 = 26_640_000;
+const SCAN_PERIOD_NS: u64 = 26_640_000;
 /// Time before a telegram's end at which the hub begins to read.
-const READING_NS: u64 = 600_000;
+const READ_AHEAD_NS: u64 = 600_000;
 /// Difference between the times that two processes report for the same event.
-const NOISE_NS: u64 = 400_000;
+const CLOCK_NOISE_NS: u64 = 400_000;
 /// Delay of a hub that shares its processors.
-const LATE_NS: u64 = 4_000_000;
+const MAX_DELAY_NS: u64 = 4_000_000;
 /// Time after which the hub certainly knows the sensor's timing.
-const SETTLING: Duration = Duration::from_millis(700);
+const SETTLE_TIME: Duration = Duration::from_millis(700);
 /// Pause of a service manager: RestartSec of the unit.
-const RESTART: Duration = Duration::from_millis(20);
+const RESTART_PAUSE: Duration = Duration::from_millis(20);

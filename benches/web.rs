@@ -11,7 +11,7 @@ mod test_child;
 
 /// The part of the test kit that the browser's driver needs.
 mod testkit {
-    pub(crate) use crate::support::stage::PATIENCE;
+    pub(crate) use crate::support::environment::STEP_TIMEOUT as WAIT_TIMEOUT;
     pub(crate) use crate::test_child::{Child, spawn};
 }
 
@@ -22,13 +22,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-use browser::{Browser, Look};
+use browser::{Appearance, Browser};
 use scanhub_schema::Scan;
 use serde_json::{Value, json};
+use support::environment::{BenchEnvironment, Child, PROGRAM, SENSORS, STEP_TIMEOUT};
 use support::figures::{self, Figure, Target, percentile};
-use support::stage::{Child, PATIENCE, PROGRAM, SENSORS, Stage};
-use support::usage::Work;
-use support::{Options, Outcome, clock, consumer};
+use support::usage::ThreadUsage;
+use support::{Options, Outcome, clock, subscriber};
 use tungstenite::client::IntoClientRequest;
 use tungstenite::{Message, WebSocket};
 
@@ -38,9 +38,9 @@ fn main() -> ExitCode {
 
 /// The figures of all runs, by their names.
 #[derive(Default)]
-struct Series(Vec<Figure>);
+struct FigureList(Vec<Figure>);
 
-impl Series {
+impl FigureList {
     /// Adds the value of a run, and of its baseline if it has one.
     fn push(
         &mut self,
@@ -59,32 +59,32 @@ impl Series {
 
 fn measure(options: &Options) -> Outcome<()> {
     let span = Duration::from_secs(options.seconds(20));
-    let mut series = Series::default();
+    let mut series = FigureList::default();
     for _ in 0..options.pairs_or(2) {
-        lms(&mut series, span)?;
-        turning(&mut series, span)?;
+        measure_lms(&mut series, span)?;
+        measure_rotating(&mut series, span)?;
     }
     figures::print("web", options.json, &series.0);
     Ok(())
 }
 
 /// Measures two sensors of 361 beams at 37.5 Hz.
-fn lms(series: &mut Series, span: Duration) -> Outcome<()> {
-    let stage = Stage::new()?;
-    let _simulator = stage.simulate_as(&SENSORS, &["--baud", "500000", "--world", "demo"])?;
-    let hub = stage.hub(&SENSORS)?;
-    hub.await_line("ready", PATIENCE)?;
-    let (web, url) = serve(&stage)?;
-    let mut page = Browser::start(stage.file("browser"), Look::LAPTOP).ok_or(NO_BROWSER)?;
+fn measure_lms(series: &mut FigureList, span: Duration) -> Outcome<()> {
+    let environment = BenchEnvironment::new()?;
+    let _simulator = environment.simulate_as(&SENSORS, &["--baud", "500000", "--world", "demo"])?;
+    let hub = environment.start_hub(&SENSORS)?;
+    hub.wait_for_line("ready", STEP_TIMEOUT)?;
+    let (web, url) = serve(&environment)?;
+    let mut page = Browser::start(environment.file("browser"), Appearance::LAPTOP).ok_or(NO_BROWSER)?;
     page.open("about:blank");
-    page.ask(BLANK);
+    page.ask(BLANK_SCRIPT);
     thread::sleep(span);
     let blank = numbers(&page.ask("blank"));
     page.open(&url);
     page.await_true("window.scanhub?.beams > 600");
     let size = page.ask("fetch('/').then((page) => page.text()).then((text) => text.length)").as_f64();
-    series.push(("bytes of the page", "kB", Target::Most(60.0)), size.map(|bytes| bytes / 1e3), None);
-    let delays = delays(&stage, &mut page, span)?;
+    series.push(("bytes of the page", "kB", Target::Max(60.0)), size.map(|bytes| bytes / 1e3), None);
+    let delays = delays(&environment, &mut page, span)?;
     for (name, part) in [("published to end of frame, median", 0.5), ("published to end of frame, p99", 0.99)]
     {
         let (delay, baseline) = (percentile(&delays, part), percentile(&blank, part));
@@ -95,7 +95,7 @@ fn lms(series: &mut Series, span: Duration) -> Outcome<()> {
         } else {
             "the same above the baseline, p99"
         };
-        series.push((name, "ms", Target::Most(21.7)), above, None);
+        series.push((name, "ms", Target::Max(21.7)), above, None);
     }
     drop(page);
 
@@ -107,32 +107,33 @@ fn lms(series: &mut Series, span: Duration) -> Outcome<()> {
             ("no viewer: age of a scan at a subscriber, median", Target::None),
         ],
         [
-            ("1 viewer: server", Target::Most(1.0)),
+            ("1 viewer: server", Target::Max(1.0)),
             ("1 viewer: hub", Target::None),
             ("1 viewer: age of a scan at a subscriber, median", Target::None),
         ],
         [
-            ("16 viewers: server", Target::Most(6.0)),
+            ("16 viewers: server", Target::Max(6.0)),
             ("16 viewers: hub", Target::None),
             ("16 viewers: age of a scan at a subscriber, median", Target::None),
         ],
     ];
     for (count, names) in [0, 1, 16].into_iter().zip(names) {
-        let viewers = start_viewers(&url, count, span + 2 * SETTLING);
-        thread::sleep(SETTLING);
-        let before = [Work::of(web.guard.pid(), |_| true)?, Work::of(hub.guard.pid(), |_| true)?];
-        let begun = clock::now();
-        let ages = ages(&stage, span)?;
-        let took = (clock::now() - begun) as f64;
+        let viewers = start_viewers(&url, count, span + 2 * SETTLE_TIME);
+        thread::sleep(SETTLE_TIME);
+        let before =
+            [ThreadUsage::of(web.guard.pid(), |_| true)?, ThreadUsage::of(hub.guard.pid(), |_| true)?];
+        let started = clock::now();
+        let ages = ages(&environment, span)?;
+        let elapsed = (clock::now() - started) as f64;
         for ((child, before), (name, target)) in [&web, &hub].into_iter().zip(before).zip(names) {
-            let work = Work::of(child.guard.pid(), |_| true)?.since(before);
-            series.push((name, "%", target), Some(100.0 * work.busy_ns as f64 / took), None);
+            let work = ThreadUsage::of(child.guard.pid(), |_| true)?.since(before);
+            series.push((name, "%", target), Some(100.0 * work.busy_ns as f64 / elapsed), None);
         }
         series.push((names[2].0, "us", names[2].1), percentile(&ages, 0.5), None);
         viewers.into_iter().for_each(|viewer| drop(viewer.join()));
     }
-    let wire = view(&url, span / 2)?;
-    let json = echoed(&stage, span / 2)?;
+    let wire = run_viewer(&url, span / 2)?;
+    let json = echoed(&environment, span / 2)?;
     series.push(
         ("a second of the default view; as lines of echo --json", "kB", Target::None),
         Some(wire / 1e3),
@@ -144,28 +145,28 @@ fn lms(series: &mut Series, span: Duration) -> Outcome<()> {
 
 /// Measures two sensors of 3240 beams at 10 Hz, in a picture that turns, so that all of it is drawn as often as
 /// possible.
-fn turning(series: &mut Series, span: Duration) -> Outcome<()> {
-    let stage = Stage::new()?;
-    let world = stage.file("world").display().to_string();
-    std::fs::write(&world, HALL)?;
+fn measure_rotating(series: &mut FigureList, span: Duration) -> Outcome<()> {
+    let environment = BenchEnvironment::new()?;
+    let world = environment.file("world").display().to_string();
+    std::fs::write(&world, HALL_WORLD)?;
     let flags = ["--family", "rplidar", "--model", "s2", "--world", &world];
-    let _simulator = stage.simulate_as(&SENSORS, &flags)?;
-    let mut command: Command = stage.hub_command(PROGRAM, &SENSORS);
+    let _simulator = environment.simulate_as(&SENSORS, &flags)?;
+    let mut command: Command = environment.hub_command(PROGRAM, &SENSORS);
     for sensor in SENSORS {
         for setting in ["family=rplidar", "model=s2", "beams=3240"] {
             command.arg(format!("--set=link.{sensor}.{setting}"));
         }
     }
-    let hub = Child::of(command, Stdio::null())?;
-    hub.await_line("ready", PATIENCE)?;
-    let (web, url) = serve(&stage)?;
-    let mut page = Browser::start(stage.file("browser"), Look::LAPTOP).ok_or(NO_BROWSER)?;
+    let hub = Child::spawn(command, Stdio::null())?;
+    hub.wait_for_line("ready", STEP_TIMEOUT)?;
+    let (web, url) = serve(&environment)?;
+    let mut page = Browser::start(environment.file("browser"), Appearance::LAPTOP).ok_or(NO_BROWSER)?;
     page.open(&url);
     page.await_true("window.scanhub?.beams > 6000 && scanhub.sensors.every(({ hz }) => hz > 9)");
     page.call("Performance.enable", json!({}));
-    page.ask(TURN);
-    thread::sleep(SETTLING);
-    let (frames, script, begun) =
+    page.ask(TURN_SCRIPT);
+    thread::sleep(SETTLE_TIME);
+    let (frames, script, started) =
         (page.ask("scanhub.frames").as_f64(), script_seconds(&mut page), clock::now());
     thread::sleep(span);
     let (frames, script) = (
@@ -176,29 +177,29 @@ fn turning(series: &mut Series, span: Duration) -> Outcome<()> {
             .ok_or("no frames")?,
         script_seconds(&mut page) - script,
     );
-    let took = (clock::now() - begun) as f64 / 1e9;
-    series.push(("2 x 3240 beams at 10 Hz: frames", "1/s", Target::Least(30.0)), Some(frames / took), None);
+    let elapsed = (clock::now() - started) as f64 / 1e9;
+    series.push(("2 x 3240 beams at 10 Hz: frames", "1/s", Target::Min(30.0)), Some(frames / elapsed), None);
     let name = "2 x 3240 beams at 10 Hz: script in a frame";
-    series.push((name, "ms", Target::Most(4.0)), Some(1e3 * script / frames), None);
+    series.push((name, "ms", Target::Max(4.0)), Some(1e3 * script / frames), None);
     drop((web, hub));
     Ok(())
 }
 
 /// Starts the server, and returns its address.
-fn serve(stage: &Stage) -> Outcome<(Child, String)> {
-    let words = ["web", "--listen", "127.0.0.1:0", "--domain", stage.domain.name()];
+fn serve(environment: &BenchEnvironment) -> Outcome<(Child, String)> {
+    let words = ["web", "--listen", "127.0.0.1:0", "--domain", environment.domain.name()];
     let web = Child::start(PROGRAM, &words.map(str::to_owned))?;
-    let ready = web.await_line("ready", PATIENCE)?;
+    let ready = web.wait_for_line("ready", STEP_TIMEOUT)?;
     let url = ready.words().get(1).ok_or("no address")?.to_string();
     Ok((web, url))
 }
 
 /// Returns the times from the moment at which a subscriber has a scan to the end of the frame that draws it, in ms,
 /// sorted.
-fn delays(stage: &Stage, page: &mut Browser, span: Duration) -> Outcome<Vec<f64>> {
+fn delays(environment: &BenchEnvironment, page: &mut Browser, span: Duration) -> Outcome<Vec<f64>> {
     let over = AtomicBool::new(false);
     let (received, shown) = thread::scope(|scope| {
-        let receivers = SENSORS.map(|sensor| scope.spawn(|| receive(stage, sensor, &over)));
+        let receivers = SENSORS.map(|sensor| scope.spawn(|| receive(environment, sensor, &over)));
         let mut shown: HashMap<i64, f64> = HashMap::new();
         for _ in 0..=span.as_secs() / 2 {
             thread::sleep(Duration::from_secs(2));
@@ -222,14 +223,19 @@ fn delays(stage: &Stage, page: &mut Browser, span: Duration) -> Outcome<Vec<f64>
     if delays.len() < 100 { Err(format!("only {} scans were seen", delays.len()).into()) } else { Ok(delays) }
 }
 
-type Received = HashMap<i64, f64>;
+type ReceivedStamps = HashMap<i64, f64>;
 
 /// Returns when scans of `sensor` arrived, in ms since 1970, by their stamps.
-fn receive(stage: &Stage, sensor: &str, over: &AtomicBool) -> Result<Received, String> {
-    let follow = || -> Outcome<Received> {
-        let mut received = Received::new();
-        let mut scans = consumer::builder::<Scan>(stage.domain.name(), sensor).timeout(PATIENCE).open()?;
-        while !over.load(Ordering::Relaxed) {
+fn receive(
+    environment: &BenchEnvironment,
+    sensor: &str,
+    is_finished: &AtomicBool,
+) -> Result<ReceivedStamps, String> {
+    let follow = || -> Outcome<ReceivedStamps> {
+        let mut received = ReceivedStamps::new();
+        let mut scans =
+            subscriber::builder::<Scan>(environment.domain.name(), sensor).timeout(STEP_TIMEOUT).open()?;
+        while !is_finished.load(Ordering::Relaxed) {
             let scan = scans.next()?.ok_or("no scan")?;
             let now_ms = SystemTime::now().duration_since(UNIX_EPOCH)?.as_secs_f64() * 1e3;
             received.insert(key(scan.header().wall_ns as f64 / 1e6), now_ms);
@@ -245,8 +251,9 @@ fn key(stamp_ms: f64) -> i64 {
 }
 
 /// Returns the ages of scans at a subscriber, in us, sorted.
-fn ages(stage: &Stage, span: Duration) -> Outcome<Vec<f64>> {
-    let mut scans = consumer::builder::<Scan>(stage.domain.name(), SENSORS[0]).timeout(PATIENCE).open()?;
+fn ages(environment: &BenchEnvironment, span: Duration) -> Outcome<Vec<f64>> {
+    let mut scans =
+        subscriber::builder::<Scan>(environment.domain.name(), SENSORS[0]).timeout(STEP_TIMEOUT).open()?;
     let (mut ages, until) = (Vec::new(), clock::now() + span.as_nanos() as u64);
     while clock::now() < until {
         let stamp = scans.next()?.ok_or("no scan")?.header().stamp_last_ns;
@@ -257,10 +264,10 @@ fn ages(stage: &Stage, span: Duration) -> Outcome<Vec<f64>> {
 }
 
 /// Returns the bytes per second of the same topics as lines of `echo --json`.
-fn echoed(stage: &Stage, span: Duration) -> Outcome<f64> {
+fn echoed(environment: &BenchEnvironment, span: Duration) -> Outcome<f64> {
     let topics = ["*/scan", "*/foreground", "*/background", "*/marks", "*/zones", "*/status"];
     let run_for = format!("--for={}s", span.as_secs().max(1));
-    let mut words = vec!["echo", "--json", "--domain", stage.domain.name(), &run_for];
+    let mut words = vec!["echo", "--json", "--domain", environment.domain.name(), &run_for];
     words.extend(topics);
     let output = Command::new(PROGRAM).args(words).env("SCANHUB_LOG", "off").output()?;
     Ok(output.stdout.len() as f64 / span.as_secs().max(1) as f64)
@@ -268,8 +275,8 @@ fn echoed(stage: &Stage, span: Duration) -> Outcome<f64> {
 
 /// Returns the CPU time of the page's scripts in seconds.
 fn script_seconds(page: &mut Browser) -> f64 {
-    let told = page.call("Performance.getMetrics", json!({}));
-    let mut metrics = told["metrics"].as_array().into_iter().flatten();
+    let metrics_reply = page.call("Performance.getMetrics", json!({}));
+    let mut metrics = metrics_reply["metrics"].as_array().into_iter().flatten();
     let spent = metrics.find(|metric| metric["name"] == "ScriptDuration");
     spent.and_then(|metric| metric["value"].as_f64()).unwrap_or(f64::NAN)
 }
@@ -283,7 +290,7 @@ fn numbers(value: &Value) -> Vec<f64> {
 }
 
 /// A page that needs no data, and draws 722 points as soon as it may, 37.5 times per second.
-const BLANK: &str = "(() => {
+const BLANK_SCRIPT: &str = "(() => {
     const canvas = document.createElement('canvas');
     [canvas.width, canvas.height] = [1280, 800];
     document.body.append(canvas);
@@ -305,7 +312,7 @@ const BLANK: &str = "(() => {
     }, 26.7);
 })()";
 /// Turns the picture with each frame.
-const TURN: &str = "(() => {
+const TURN_SCRIPT: &str = "(() => {
     const turn = () => {
         dispatchEvent(new KeyboardEvent('keydown', { key: '[' }));
         requestAnimationFrame(turn);
@@ -313,18 +320,18 @@ const TURN: &str = "(() => {
     turn();
 })()";
 /// Walls all around, so that every beam ends at one.
-const HALL: &str =
+const HALL_WORLD: &str =
     "[[thing]]\nline = [[6000, -6000], [6000, 6000], [-6000, 6000], [-6000, -6000], [6000, -6000]]\n";
 const NO_BROWSER: &str = "there is no browser (Debian: apt-get install chromium)";
 /// Time after which the programs run as they will for hours.
-const SETTLING: Duration = Duration::from_secs(2);
+const SETTLE_TIME: Duration = Duration::from_secs(2);
 
 /// Plays a viewer without a picture: subscribes to the same channels as the page, and reads as fast as possible for
 /// `span`. Returns the bytes of messages per second after the first second.
-fn view(url: &str, span: Duration) -> Outcome<f64> {
+fn run_viewer(url: &str, span: Duration) -> Outcome<f64> {
     let mut socket = connect(url)?;
-    let (begun, mut bytes, mut since) = (Instant::now(), 0, None);
-    while begun.elapsed() < span {
+    let (started, mut bytes, mut since) = (Instant::now(), 0, None);
+    while started.elapsed() < span {
         match socket.read()? {
             Message::Text(text) => {
                 let message: Value = serde_json::from_str(&text)?;
@@ -332,16 +339,16 @@ fn view(url: &str, span: Duration) -> Outcome<f64> {
                 let word = |channel: &Value| channel["topic"].as_str()?.rsplit('/').next().map(str::to_owned);
                 let is_seldom =
                     |word: String| ["lines", "cloud", "tilt", "tf_static"].contains(&word.as_str());
-                let wanted = channels.filter(|channel| !word(channel).is_some_and(is_seldom));
-                let wanted: Vec<Value> = wanted
+                let expected = channels.filter(|channel| !word(channel).is_some_and(is_seldom));
+                let expected: Vec<Value> = expected
                     .map(|channel| json!({ "id": channel["id"], "channelId": channel["id"] }))
                     .collect();
-                if !wanted.is_empty() {
-                    let request = json!({ "op": "subscribe", "subscriptions": wanted });
+                if !expected.is_empty() {
+                    let request = json!({ "op": "subscribe", "subscriptions": expected });
                     socket.send(Message::text(request.to_string()))?;
                 }
             }
-            Message::Binary(frame) if begun.elapsed() > WARM_UP => {
+            Message::Binary(frame) if started.elapsed() > WARM_UP_TIME => {
                 since.get_or_insert_with(Instant::now);
                 bytes += frame.len();
             }
@@ -356,7 +363,7 @@ fn start_viewers(url: &str, count: usize, span: Duration) -> Vec<thread::JoinHan
     let one = |_| {
         let url = url.to_owned();
         thread::spawn(move || {
-            if let Err(error) = view(&url, span) {
+            if let Err(error) = run_viewer(&url, span) {
                 eprintln!("viewer: {error}");
             }
         })
@@ -373,4 +380,4 @@ fn connect(url: &str) -> Outcome<WebSocket<TcpStream>> {
 }
 
 /// Time that a viewer does not count.
-const WARM_UP: Duration = Duration::from_secs(1);
+const WARM_UP_TIME: Duration = Duration::from_secs(1);

@@ -128,9 +128,9 @@ verbs! {
     Demo(demo::Demo),
     Simulate(Box<simulate::Simulate>),
     Probe(probe::ProbeArgs) => |probe, it|
-        probe.run(it.json, || it.domain.places(), &mut it.out, &*it.signals.stop()?),
+        probe.run(it.json, || it.domain.locations(), &mut it.out, &*it.signals.stop()?),
     Configure(configure::ConfigureArgs) => |configure, it|
-        configure.run(it.json, &it.domain.places()?, &mut it.out, &*it.signals.any_end()?),
+        configure.run(it.json, &it.domain.locations()?, &mut it.out, &*it.signals.any_stop()?),
     Config(config::Config),
     Doctor(run::Doctor),
     List(list::ListArgs),
@@ -178,7 +178,7 @@ mod tests {
 
     /// Returns how this program parses its first command line in `line`.
     fn read(line: &str) -> ArgMatches {
-        let words = shell::of_the_program(line);
+        let words = shell::scanhub_commands(line);
         let first = words.first().unwrap_or_else(|| panic!("nothing for this program: {line}"));
         let read = Cli::command().try_get_matches_from(first);
         read.unwrap_or_else(|error| panic!("{line}: {error}"))
@@ -236,9 +236,9 @@ mod tests {
         let mut count = 0;
         for block in blocks::blocks().into_iter().filter(|block| block.language == "sh") {
             for line in shell::lines(&block.text) {
-                for words in shell::of_the_program(&line) {
+                for words in shell::scanhub_commands(&line) {
                     let read = Cli::command().try_get_matches_from(&words);
-                    read.unwrap_or_else(|error| panic!("{}: {line}: {error}", block.place));
+                    read.unwrap_or_else(|error| panic!("{}: {line}: {error}", block.location));
                     count += 1;
                 }
             }

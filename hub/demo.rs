@@ -1,10 +1,10 @@
 //! `scanhub demo`: simulators, a hub, a subscriber for each sensor, and a people tracker, all in one terminal. Each of
 //! them is a separate process, as in real use. This process starts them, reads their output, compares sent with
-//! received telegrams, and shows the picture of `watch`.
+//! received telegrams, and shows the picture of `measure`.
 
-mod account;
-mod cast;
-mod stage;
+mod delivery_stats;
+mod environment;
+mod participants;
 
 use std::io::Write;
 use std::path::Path;
@@ -23,9 +23,9 @@ use scanhub_viewer::{WatchArgs, can_show_pictures};
 use serde::Serialize;
 use serde_json::Value;
 
-use account::{Account, Sensor, counted};
-use cast::{Families, World};
-use stage::{Line, Stage};
+use delivery_stats::{DeliveryStats, Sensor, counted};
+use environment::{ChildEvent, DemoEnvironment};
+use participants::{Families, World};
 
 /// Run simulated sensors, the hub and a consumer for each in one terminal
 #[derive(Args, Debug)]
@@ -64,39 +64,39 @@ impl Demo {
     /// [`Kind::Check`] if a telegram that a sensor sent did not arrive, [`Kind::Interrupted`] if a bounded run was stopped,
     /// [`Kind::Timeout`] if a sensor does not stream within 30 seconds, [`Kind::Failed`] if a process ends early.
     pub(crate) fn run(&self, context: &mut Context) -> Result<(), Failure> {
-        let stop = context.signals.any_end()?;
+        let stop = context.signals.any_stop()?;
         let json = context.json;
         let shows = !self.headless && !json;
         let has_picture = shows && can_show_pictures();
         let sensors = self.world.sensors(self.family)?;
-        let stage = Stage::new(has_picture, self.world, sensors)?;
+        let environment = DemoEnvironment::new(has_picture, self.world, sensors)?;
         // If no port is free, the demonstration runs without the page.
-        let web = if shows { stage.start_web().ok() } else { None };
+        let web = if shows { environment.start_web().ok() } else { None };
         let url = web.as_ref().map(|(_, url)| url.as_str());
         let played = if has_picture {
-            play_with_picture(self, &stage, url, &mut context.out, &stop)
+            play_with_picture(self, &environment, url, &mut context.out, &stop)
         } else {
-            let (mut view, mut is_said) = (View::new(attach(&stage), url), false);
-            let mut show = |account: &Account, elapsed: Duration| {
+            let (mut view, mut is_ready_printed) = (View::new(attach_hint(&environment), url), false);
+            let mut show = |stats: &DeliveryStats, elapsed: Duration| {
                 if shows {
-                    view.draw(&mut context.out, account, elapsed);
-                } else if !std::mem::replace(&mut is_said, true) {
-                    say_ready(&mut context.out, &stage, json);
+                    view.draw(&mut context.out, stats, elapsed);
+                } else if !std::mem::replace(&mut is_ready_printed, true) {
+                    print_ready(&mut context.out, &environment, json);
                 }
             };
-            play(self, &stage, &mut show, &|| stop.swap(false, Ordering::Relaxed))
+            play(self, &environment, &mut show, &|| stop.swap(false, Ordering::Relaxed))
         };
         drop(web);
-        stage.print_errors();
-        let (account, end) = played?;
-        crate::print_own(&account.summary(json).join("\n"))?;
-        if end == End::Hurried {
+        environment.print_errors();
+        let (stats, end) = played?;
+        crate::print_own(&stats.summary(json).join("\n"))?;
+        if end == EndReason::Interrupted {
             return Err(Failure::new(Kind::Interrupted, "interrupted before all telegrams had arrived", ""));
         }
-        if let Some(loss) = account.loss() {
+        if let Some(loss) = stats.loss() {
             return Err(Failure::new(Kind::Check, loss, "is the machine too busy to run all processes?"));
         }
-        if end == End::Stopped && self.run_for.is_some() {
+        if end == EndReason::Stopped && self.run_for.is_some() {
             return Err(Failure::new(Kind::Interrupted, "interrupted before the time was over", ""));
         }
         Ok(())
@@ -116,22 +116,22 @@ fn families() -> impl TypedValueParser<Value = Families> {
 /// Does the same as [`play`] while the terminal shows the picture. Closing the picture ends the demonstration.
 fn play_with_picture(
     options: &Demo,
-    stage: &Stage,
+    environment: &DemoEnvironment,
     url: Option<&str>,
     out: &mut dyn Write,
     stop: &AtomicBool,
-) -> Result<(Account, End), Failure> {
-    let note = url.map_or_else(|| attach(stage), |url| short(url, &stage.domain));
-    let places = [stage.domain.clone()];
+) -> Result<(DeliveryStats, EndReason), Failure> {
+    let note = url.map_or_else(|| attach_hint(environment), |url| page_hint(url, &environment.domain));
+    let locations = [environment.domain.clone()];
     let (closed, over) = (AtomicBool::new(false), AtomicBool::new(false));
     thread::scope(|scope| {
         let play = scope.spawn(|| {
-            let _over = Raise(&over);
-            let is_asked = || stop.swap(false, Ordering::Relaxed) | closed.swap(false, Ordering::Relaxed);
-            play(options, stage, &mut |_, _| {}, &is_asked)
+            let _over = SetOnDrop(&over);
+            let must_end = || stop.swap(false, Ordering::Relaxed) | closed.swap(false, Ordering::Relaxed);
+            play(options, environment, &mut |_, _| {}, &must_end)
         });
-        let closing = Raise(&closed);
-        let shown = WatchArgs::default().show(&note, &places, out, &over);
+        let closing = SetOnDrop(&closed);
+        let shown = WatchArgs::default().show(&note, &locations, out, &over);
         drop(closing);
         let played = play.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
         shown.and(played)
@@ -139,9 +139,9 @@ fn play_with_picture(
 }
 
 /// Sets a flag when it is dropped, even by a panic, so that the other thread ends.
-struct Raise<'a>(&'a AtomicBool);
+struct SetOnDrop<'a>(&'a AtomicBool);
 
-impl Drop for Raise<'_> {
+impl Drop for SetOnDrop<'_> {
     fn drop(&mut self) {
         self.0.store(true, Ordering::Relaxed);
     }
@@ -163,32 +163,32 @@ impl View {
     }
 
     /// Writes the counts after `elapsed`, once a second.
-    fn draw(&mut self, out: &mut dyn Write, account: &Account, elapsed: Duration) {
+    fn draw(&mut self, out: &mut dyn Write, stats: &DeliveryStats, elapsed: Duration) {
         if elapsed.as_secs() >= self.next_s {
             self.next_s = elapsed.as_secs() + 1;
-            let text = self.lines(account, elapsed).join("\n") + "\n\n";
+            let text = self.lines(stats, elapsed).join("\n") + "\n\n";
             let _ = out.write_all(text.as_bytes()).and_then(|()| out.flush());
         }
     }
 
-    fn lines(&self, account: &Account, elapsed: Duration) -> Vec<String> {
+    fn lines(&self, stats: &DeliveryStats, elapsed: Duration) -> Vec<String> {
         let seconds = elapsed.as_secs();
         let mut lines = vec![
             format!(
                 "scanhub demo  {:02}:{:02}   the hub uses {:.1} % of a processor   Ctrl-C quits",
                 seconds / 60,
                 seconds % 60,
-                account.hub_cpu_percent
+                stats.hub_cpu_percent
             ),
             self.attach.clone(),
         ];
         lines.extend(self.url.iter().map(|url| format!("browser: {url}")));
-        lines.extend(account.news.iter().map(|news| format!("people: {news}")));
-        for sensor in &account.sensors {
+        lines.extend(stats.tracker_line.iter().map(|line| format!("people: {line}")));
+        for sensor in &stats.sensors {
             lines.push(String::new());
             lines.extend(sensor_lines(sensor));
         }
-        lines.extend(account.tilted_words());
+        lines.extend(stats.tilt_summary());
         lines
     }
 }
@@ -196,7 +196,7 @@ impl View {
 /// Returns the counts of a sensor and the profile of its scan.
 fn sensor_lines(sensor: &Sensor) -> [String; 3] {
     // Telegrams on their way are not lost: the simulators are a little ahead of the subscribers.
-    let lost = sensor.lost().saturating_sub(IN_FLIGHT);
+    let lost_count = sensor.lost().saturating_sub(MAX_IN_FLIGHT);
     let nearest = match sensor.nearest_mm {
         Some(mm) => format!("nearest {:.2} m at {:.1} degrees", mm as f64 / 1000.0, sensor.nearest_deg),
         None => "nothing seen".to_owned(),
@@ -209,11 +209,11 @@ fn sensor_lines(sensor: &Sensor) -> [String; 3] {
             sensor.baud,
             sensor.hz().map_or("-".into(), |hz| format!("{hz:.2}")),
             counted(sensor.received_count, "telegram"),
-            lost,
+            lost_count,
             sensor.lost_on_line().unwrap_or_default(),
         ),
         format!("  left  {}  right", profile(sensor)),
-        format!("        {:<COLUMNS$}", format!("(the taller, the nearer)   {nearest}")),
+        format!("        {:<PROFILE_COLUMNS$}", format!("(the taller, the nearer)   {nearest}")),
     ]
 }
 
@@ -224,47 +224,52 @@ fn profile(sensor: &Sensor) -> String {
     }
     let beams = sensor.ranges.len();
     let column = |n: usize| {
-        let nearest = sensor.ranges[n * beams / COLUMNS..(n + 1) * beams / COLUMNS].iter().flatten().min();
+        let nearest = sensor.ranges[n * beams / PROFILE_COLUMNS..(n + 1) * beams / PROFILE_COLUMNS]
+            .iter()
+            .flatten()
+            .min();
         nearest.map_or(' ', |&mm| {
-            BLOCKS[(BLOCKS.len() - 1) - (mm as usize * BLOCKS.len() / FAR_MM).min(BLOCKS.len() - 1)]
+            PROFILE_BLOCKS[(PROFILE_BLOCKS.len() - 1)
+                - (mm as usize * PROFILE_BLOCKS.len() / MAX_PROFILE_RANGE_MM).min(PROFILE_BLOCKS.len() - 1)]
         })
     };
     // Beam 0 is on the right.
-    (0..COLUMNS).rev().map(column).collect()
+    (0..PROFILE_COLUMNS).rev().map(column).collect()
 }
 
 /// Columns of a profile.
-const COLUMNS: usize = 60;
-const BLOCKS: [char; 8] = ['▁', '▂', '▃', '▄', '▅', '▆', '▇', '█'];
+const PROFILE_COLUMNS: usize = 60;
+const PROFILE_BLOCKS: [char; 8] = ['▁', '▂', '▃', '▄', '▅', '▆', '▇', '█'];
 /// Range of the lowest block.
-const FAR_MM: usize = 8000;
+const MAX_PROFILE_RANGE_MM: usize = 8000;
 /// Maximum number of telegrams on their way at an update.
-const IN_FLIGHT: u64 = 12;
+const MAX_IN_FLIGHT: u64 = 12;
 
 /// Returns the command that shows a topic of the demonstration in another terminal.
-fn attach(stage: &Stage) -> String {
-    format!("other terminal: scanhub echo {} {}", stage.world.topic(), stage.domain.flags())
+fn attach_hint(environment: &DemoEnvironment) -> String {
+    format!("other terminal: scanhub echo {} {}", environment.world.topic(), environment.domain.flags())
 }
 
 /// Returns the address of the page, short enough for 80 columns together with the keys.
-fn short(url: &str, domain: &Domain) -> String {
+fn page_hint(url: &str, domain: &Domain) -> String {
     format!("browser: {url}  domain: {}", domain.name())
 }
 
 /// Prints the domain of the demonstration.
-fn say_ready(out: &mut dyn Write, stage: &Stage, json: bool) {
-    let domain = &stage.domain;
-    let ready = Ready { class: "ready", domain: domain.name(), root: domain.root(), pid: std::process::id() };
+fn print_ready(out: &mut dyn Write, environment: &DemoEnvironment, json: bool) {
+    let domain = &environment.domain;
+    let ready =
+        ReadyLine { class: "ready", domain: domain.name(), root: domain.root(), pid: std::process::id() };
     let line = match json {
-        true => crate::line(&ready),
-        false => format!("ready {} in {}; {}", ready.domain, ready.root.display(), attach(stage)),
+        true => crate::to_json_line(&ready),
+        false => format!("ready {} in {}; {}", ready.domain, ready.root.display(), attach_hint(environment)),
     };
     let _ = out.write_all(format!("{line}\n").as_bytes());
 }
 
 /// Class `ready`. The order of keys is part of the contract.
 #[derive(Serialize)]
-struct Ready<'a> {
+struct ReadyLine<'a> {
     class: &'static str,
     domain: &'a str,
     root: &'a Path,
@@ -273,13 +278,13 @@ struct Ready<'a> {
 
 /// Reason for the end of a demonstration.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum End {
+enum EndReason {
     /// The configured time has elapsed.
     TimeOver,
     /// The user stopped it.
     Stopped,
     /// The user stopped it, and then did not wait for the telegrams that were on their way.
-    Hurried,
+    Interrupted,
 }
 
 /// Starts all processes, and compares sent telegrams with received ones until the configured time has elapsed or the
@@ -287,51 +292,52 @@ enum End {
 /// Telegrams on their way still arrive after that, unless there is another request.
 fn play(
     options: &Demo,
-    stage: &Stage,
-    show: &mut dyn FnMut(&Account, Duration),
-    is_asked: &dyn Fn() -> bool,
-) -> Result<(Account, End), Failure> {
+    environment: &DemoEnvironment,
+    show: &mut dyn FnMut(&DeliveryStats, Duration),
+    must_end: &dyn Fn() -> bool,
+) -> Result<(DeliveryStats, EndReason), Failure> {
     let (lines, received) = mpsc::channel();
-    let hub = stage.start_hub(lines.clone())?;
-    let consumers = stage.start_consumers(&lines)?;
-    let tracker = stage.start_tracker(&lines)?;
-    let mut account = Account::new(&stage.sensors);
+    let hub = environment.start_hub(lines.clone())?;
+    let subscribers = environment.start_subscribers(&lines)?;
+    let tracker = environment.start_tracker(&lines)?;
+    let mut stats = DeliveryStats::new(&environment.sensors);
     // Start the simulators last, so that the subscribers receive everything from the beginning.
     let mut simulators = Vec::new();
     let mut tilted = None;
     let mut ready = 0;
     let mut first_sample: Option<Instant> = None;
-    let begun = Instant::now();
-    let mut next_look = begun;
+    let start = Instant::now();
+    let mut next_update = start;
     let mut end = None;
     let end = loop {
-        match received.recv_timeout(next_look.saturating_duration_since(Instant::now()).min(PATIENCE)) {
-            Ok(Line::Said { of: TRACKER, text }) => account.take_news(text),
-            Ok(Line::Said { of: SIMULATOR, text }) => account.take_simulator_line(&text),
-            Ok(Line::Said { of, text }) => {
+        match received.recv_timeout(next_update.saturating_duration_since(Instant::now()).min(MAX_LINE_WAIT))
+        {
+            Ok(ChildEvent::Line { child: TRACKER, text }) => stats.set_tracker_line(text),
+            Ok(ChildEvent::Line { child: SIMULATOR, text }) => stats.take_simulator_line(&text),
+            Ok(ChildEvent::Line { child: of, text }) => {
                 let value: Value = serde_json::from_str(&text).unwrap_or_default();
                 if value["class"] == "status" && simulators.is_empty() {
                     ready |= 1 << of;
-                    if ready == (1 << stage.sensors.len()) - 1 {
-                        simulators = stage.start_simulators(options.seed, &lines)?;
-                        tilted = stage.start_tilted(&lines)?;
+                    if ready == (1 << environment.sensors.len()) - 1 {
+                        simulators = environment.start_simulators(options.seed, &lines)?;
+                        tilted = environment.start_tilt(&lines)?;
                     }
                 }
-                account.take(of, &value);
-                if account.all_stream() {
+                stats.handle_line(of, &value);
+                if stats.all_stream() {
                     first_sample.get_or_insert_with(Instant::now);
                 }
             }
-            Ok(Line::Ended { of }) => return Err(ended(of)),
+            Ok(ChildEvent::Ended { child: of }) => return Err(ended(of)),
             Err(RecvTimeoutError::Timeout | RecvTimeoutError::Disconnected) => {}
         }
         let now = Instant::now();
-        if now >= next_look {
-            next_look = now + REFRESH;
-            account.look_at_hub(hub.pid());
-            show(&account, begun.elapsed());
+        if now >= next_update {
+            next_update = now + REFRESH_INTERVAL;
+            stats.update_cpu_time(hub.pid());
+            show(&stats, start.elapsed());
         }
-        if first_sample.is_none() && begun.elapsed() > START_LIMIT {
+        if first_sample.is_none() && start.elapsed() > START_TIMEOUT {
             return Err(Failure::new(
                 Kind::Timeout,
                 "not every sensor streams after 30 seconds",
@@ -339,38 +345,38 @@ fn play(
             ));
         }
         let over = options.run_for.zip(first_sample).is_some_and(|(limit, first)| first.elapsed() >= limit);
-        match (end, is_asked()) {
-            (Some(_), true) => break End::Hurried,
-            (Some(end), false) if account.is_complete(LATE) => break end,
+        match (end, must_end()) {
+            (Some(_), true) => break EndReason::Interrupted,
+            (Some(end), false) if stats.is_complete(STREAM_TIMEOUT) => break end,
             (None, is_asked) if is_asked || over => {
                 // Telegrams that were sent by now arrive before any process is stopped.
-                account.cut();
-                end = Some(if is_asked { End::Stopped } else { End::TimeOver });
+                stats.cut();
+                end = Some(if is_asked { EndReason::Stopped } else { EndReason::TimeOver });
             }
             _ => {}
         }
     };
     drop(tilted);
     drop(tracker);
-    drop(consumers);
+    drop(subscribers);
     drop(hub);
     let mut open = simulators.len();
     drop(simulators);
     // Their last lines are their summaries.
     while open > 0
-        && let Ok(line) = received.recv_timeout(END_LIMIT)
+        && let Ok(line) = received.recv_timeout(SUMMARY_TIMEOUT)
     {
         match line {
-            Line::Said { of: SIMULATOR, text } => account.take_simulator_line(&text),
-            Line::Ended { of: SIMULATOR } => open -= 1,
+            ChildEvent::Line { child: SIMULATOR, text } => stats.take_simulator_line(&text),
+            ChildEvent::Ended { child: SIMULATOR } => open -= 1,
             _ => {}
         }
     }
-    Ok((account, end))
+    Ok((stats, end))
 }
 
-fn ended(of: usize) -> Failure {
-    let who = match of {
+fn ended(child: usize) -> Failure {
+    let process = match child {
         HUB => "the hub",
         SIMULATOR => "a simulator",
         TILTED => "what sees in three dimensions",
@@ -378,7 +384,7 @@ fn ended(of: usize) -> Failure {
         WEB => "the picture for browsers",
         _ => "a consumer",
     };
-    Failure::new(Kind::Failed, format!("{who} ended early"), "its output is above")
+    Failure::new(Kind::Failed, format!("{process} ended early"), "its output is above")
 }
 
 /// Numbers of the processes. A subscriber has the number of its sensor.
@@ -388,12 +394,12 @@ const WEB: usize = 102;
 const TILTED: usize = 103;
 const TRACKER: usize = 104;
 /// Interval between updates of the view.
-const REFRESH: Duration = Duration::from_millis(250);
+const REFRESH_INTERVAL: Duration = Duration::from_millis(250);
 /// Maximum wait for a line before the time is checked.
-const PATIENCE: Duration = Duration::from_millis(50);
+const MAX_LINE_WAIT: Duration = Duration::from_millis(50);
 /// Limit for all sensors to stream. It takes far less unless the machine is busy.
-const START_LIMIT: Duration = Duration::from_secs(30);
+const START_TIMEOUT: Duration = Duration::from_secs(30);
 /// Maximum wait for the last lines of a simulator that has ended.
-const END_LIMIT: Duration = Duration::from_secs(2);
+const SUMMARY_TIMEOUT: Duration = Duration::from_secs(2);
 /// A sensor without a telegram for this time has stopped streaming.
-const LATE: Duration = Duration::from_secs(10);
+const STREAM_TIMEOUT: Duration = Duration::from_secs(10);

@@ -4,7 +4,7 @@
 mod cli;
 mod demo;
 mod mounts;
-mod own_domain;
+mod private_domain;
 mod replay;
 
 use std::ffi::c_int;
@@ -68,7 +68,7 @@ fn run(cli: Cli) -> Result<(), Failure> {
     cli.verb.run(&mut Context::new(cli.global.json, domain, streams, Box::new(ProcessSignals)))
 }
 
-fn line(value: &impl Serialize) -> String {
+fn to_json_line(value: &impl Serialize) -> String {
     json_line(serde_json::to_string(value).unwrap_or_default())
 }
 
@@ -83,7 +83,7 @@ impl Signals for ProcessSignals {
         flag(&[SIGINT, SIGTERM])
     }
 
-    fn any_end(&self) -> Result<Arc<AtomicBool>, Failure> {
+    fn any_stop(&self) -> Result<Arc<AtomicBool>, Failure> {
         match scanhub_daemon::is_hangup_ignored() {
             true => flag(&[SIGINT, SIGTERM, SIGQUIT]),
             false => flag(&[SIGINT, SIGTERM, SIGHUP, SIGQUIT]),
@@ -132,7 +132,7 @@ fn print_own(text: &str) -> Result<(), Failure> {
 }
 
 /// Writes one line to stdout. Ignores errors, as of a reader that has closed it.
-fn say(line: &str) {
+fn print_status(line: &str) {
     let _ = print(line);
 }
 
@@ -140,17 +140,17 @@ fn say(line: &str) {
 /// stderr.
 fn report(failure: &Failure, json: bool, quiet: bool) {
     if !json {
-        return complain(&format!("scanhub: {failure}"));
+        return print_error(&format!("scanhub: {failure}"));
     }
     let line = scanhub_verbs::error_line(failure);
     // A full disk takes no error either.
     if quiet || print(&line).is_err() {
-        complain(&line);
+        print_error(&line);
     }
 }
 
 /// Writes one line to stderr. Ignores errors, as of a terminal that was closed.
-fn complain(line: &str) {
+fn print_error(line: &str) {
     let _ = io::stderr().lock().write_all(format!("{}\n", Printable(line)).as_bytes());
 }
 
@@ -172,7 +172,7 @@ fn refuse(error: &clap::Error) -> ExitCode {
 fn start_log() {
     let level = std::env::var("SCANHUB_LOG").ok().and_then(|level| level.parse().ok());
     tracing_subscriber::fmt()
-        .with_writer(|| replay::line::Log)
+        .with_writer(|| replay::progress_line::LogWriter)
         .with_max_level(level.unwrap_or(LevelFilter::INFO))
         .with_target(false)
         .with_ansi(false)

@@ -5,10 +5,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{self, Sender};
 use std::thread::{self, JoinHandle};
 
-use scanhub_client::{Publication, PublishSession, SensorPublisher, Wake};
+use scanhub_client::{Publication, PublishSession, SensorPublisher, WakeEvent};
 use scanhub_daemon::Player;
 use scanhub_schema::limits::TopicLimits;
-use scanhub_schema::{Failure, Flags, Header, Kind, Maker, Tilt};
+use scanhub_schema::{Failure, Flags, Header, Kind, PublisherKind, Tilt};
 use scanhub_shm::Domain;
 use scanhub_sim::mount::Report;
 use scanhub_sim::options::SimulateOptions;
@@ -25,7 +25,7 @@ impl SimulatedMounts {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Usage`] if a port has no mount. Otherwise the errors of [`PublishSession::beside`].
+    /// Returns [`Kind::Usage`] if a port has no mount. Otherwise the errors of [`PublishSession::open_named`].
     pub(crate) fn start(
         names: &[String],
         options: &SimulateOptions,
@@ -78,7 +78,7 @@ impl RecordedMounts {
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`PublishSession::beside`].
+    /// Returns the errors of [`PublishSession::open_named`].
     pub(crate) fn start(player: &Arc<Player>, domain: &Domain) -> Result<RecordedMounts, Failure> {
         let mut mounts = RecordedMounts { stop: Arc::default(), threads: Vec::new() };
         for mount in player.mounts() {
@@ -114,7 +114,8 @@ struct MountTopic {
 
 impl MountTopic {
     fn open(name: &str, domain: &Domain) -> Result<MountTopic, Failure> {
-        let sensor = PublishSession::beside(domain, name, Maker::Mount.topics(), TopicLimits::default())?;
+        let sensor =
+            PublishSession::open_named(domain, name, PublisherKind::Mount.topics(), TopicLimits::default())?;
         Ok(MountTopic { topic: sensor.topic()?, sensor })
     }
 
@@ -123,7 +124,7 @@ impl MountTopic {
         let header = change(self.topic.header_at(stamp_ns));
         // Without memory, the sample's number is skipped. A subscriber that is not woken polls ten times a second.
         let _ = self.topic.send_with(&header, |sample| *sample = tilt);
-        let _ = self.sensor.wake(Wake::Telegram);
+        let _ = self.sensor.wake(WakeEvent::Telegram);
     }
 }
 

@@ -1,8 +1,8 @@
 //! `scanhub replay`: runs a hub that plays a recording. A terminal shows a progress line, and its keys control the
 //! player.
 
-pub(crate) mod line;
 pub(crate) mod page;
+pub(crate) mod progress_line;
 
 use std::io::{IsTerminal, Read, stderr, stdin};
 use std::os::fd::AsFd;
@@ -25,9 +25,9 @@ use scanhub_verbs::duration;
 use serde::Serialize;
 
 use crate::cli;
-use crate::cli::run::{self, Configured};
+use crate::cli::run::{self, ConfigOptions};
 use crate::mounts::RecordedMounts;
-use line::Line;
+use progress_line::ProgressLine;
 
 /// Run a hub that plays a recording instead of sensors, with the keys of a player
 #[derive(Args, Debug)]
@@ -36,7 +36,7 @@ pub(crate) struct Replay {
     /// Recording to play: MCAP file, telegram stream or CARMEN log, plain or gzipped
     file: PathBuf,
     /// Speed relative to the recording, 0.015625 to 64, or max: as fast as it can be read
-    #[arg(long, default_value = "1", value_name = "FACTOR|max", value_parser = pace)]
+    #[arg(long, default_value = "1", value_name = "FACTOR|max", value_parser = parse_rate)]
     rate: PlaybackRate,
     /// Start again at the end, until Ctrl-C; each lap forgets what was learned
     #[arg(long = "loop", conflicts_with = "hold")]
@@ -60,7 +60,7 @@ pub(crate) struct Replay {
     #[arg(long, value_name = "NAME", value_parser = cli::family)]
     family: Option<Family>,
     #[command(flatten)]
-    configured: Configured,
+    configured: ConfigOptions,
 }
 
 impl Replay {
@@ -72,7 +72,7 @@ impl Replay {
             sensor: self.sensor.as_deref(),
             family: self.family,
             sources: &self.configured.sources(),
-            play: self.play()?,
+            options: self.play()?,
             holds: self.hold,
         };
         let mut console = None;
@@ -82,7 +82,7 @@ impl Replay {
             if started.is_err() {
                 return player.end();
             }
-            run::say_ready(ready, &domain, context.json);
+            run::print_ready(ready, &domain, context.json);
             if !context.json {
                 console = Console::open(player);
             }
@@ -90,7 +90,11 @@ impl Replay {
         drop(console);
         let played = played?;
         mounts.transpose()?;
-        crate::print(&if context.json { crate::line(&Replayed::of(&played)) } else { line::summary(&played) })
+        crate::print(&if context.json {
+            crate::to_json_line(&ReplaySummary::of(&played))
+        } else {
+            progress_line::summary(&played)
+        })
     }
 
     /// The options of the player.
@@ -143,12 +147,12 @@ impl Drop for Console {
 
 /// Handles keys and draws the progress line until the other end of `closed` is closed.
 fn run_console(player: &Player, closed: &UnixStream) {
-    let mut keys = Keys::take_over();
-    let mut line = stderr().is_terminal().then(Line::default);
+    let mut keys = RawKeyboard::take_over();
+    let mut line = stderr().is_terminal().then(ProgressLine::default);
     let mut drawn_at = None;
     loop {
         let progress = player.progress();
-        if drawn_at.is_none_or(|at| progress.now_ns >= at + REDRAW_NS) {
+        if drawn_at.is_none_or(|at| progress.now_ns >= at + REDRAW_INTERVAL_NS) {
             drawn_at = Some(progress.now_ns);
             line.iter_mut().for_each(|line| line.draw(&progress));
         }
@@ -157,7 +161,7 @@ fn run_console(player: &Player, closed: &UnixStream) {
         if keys.is_some() {
             fds.push(PollFd::from_borrowed_fd(input.as_fd(), PollFlags::IN));
         }
-        let _ = poll(&mut fds, Some(&REDRAW));
+        let _ = poll(&mut fds, Some(&REDRAW_INTERVAL));
         if !fds[0].revents().is_empty() {
             return;
         }
@@ -201,35 +205,35 @@ fn handle_keys(player: &Player, mut pressed: &[u8]) {
 }
 
 /// The terminal without echo and line buffering, for single keys. Dropping it restores the terminal.
-struct Keys {
-    before: Termios,
+struct RawKeyboard {
+    saved: Termios,
 }
 
-impl Keys {
+impl RawKeyboard {
     /// Changes the mode of the terminal. Returns `None` if standard input is not a terminal, or if this process runs in
     /// the background.
-    fn take_over() -> Option<Keys> {
+    fn take_over() -> Option<RawKeyboard> {
         let keyboard = stdin();
         if !keyboard.is_terminal() || tcgetpgrp(&keyboard).ok()? != getpgrp() {
             return None;
         }
-        let before = tcgetattr(&keyboard).ok()?;
-        let mut ours = before.clone();
+        let saved = tcgetattr(&keyboard).ok()?;
+        let mut ours = saved.clone();
         // Ctrl-C stays a signal. Ctrl-Z and Ctrl-\ would leave the terminal in this mode.
         ours.local_modes -= LocalModes::ICANON | LocalModes::ECHO;
-        ours.special_codes[SpecialCodeIndex::VSUSP] = DISABLED;
-        ours.special_codes[SpecialCodeIndex::VQUIT] = DISABLED;
+        ours.special_codes[SpecialCodeIndex::VSUSP] = DISABLED_CHARACTER;
+        ours.special_codes[SpecialCodeIndex::VQUIT] = DISABLED_CHARACTER;
         ours.special_codes[SpecialCodeIndex::VMIN] = 1;
         ours.special_codes[SpecialCodeIndex::VTIME] = 0;
         tcsetattr(&keyboard, OptionalActions::Now, &ours).ok()?;
-        Some(Keys { before })
+        Some(RawKeyboard { saved })
     }
 }
 
-impl Drop for Keys {
+impl Drop for RawKeyboard {
     fn drop(&mut self) {
         // Fails if the terminal was closed. Then there is nothing to restore.
-        let _ = tcsetattr(stdin(), OptionalActions::Now, &self.before);
+        let _ = tcsetattr(stdin(), OptionalActions::Now, &self.saved);
     }
 }
 
@@ -237,20 +241,20 @@ fn nanos(duration: Duration) -> u64 {
     u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX)
 }
 
-fn pace(text: &str) -> Result<PlaybackRate, String> {
+fn parse_rate(text: &str) -> Result<PlaybackRate, String> {
     if text == "max" {
         return Ok(PlaybackRate::Max);
     }
     let rate =
-        text.parse().ok().filter(|rate| (PlaybackRate::SLOWEST..=PlaybackRate::FASTEST).contains(rate));
+        text.parse().ok().filter(|rate| (PlaybackRate::MIN_FACTOR..=PlaybackRate::MAX_FACTOR).contains(rate));
     rate.map(PlaybackRate::Times).ok_or_else(|| {
-        format!("a number from {} to {}, or max", PlaybackRate::SLOWEST, PlaybackRate::FASTEST)
+        format!("a number from {} to {}, or max", PlaybackRate::MIN_FACTOR, PlaybackRate::MAX_FACTOR)
     })
 }
 
 /// Class `replayed`.
 #[derive(Serialize)]
-struct Replayed {
+struct ReplaySummary {
     class: &'static str,
     telegrams: u64,
     laps: u32,
@@ -259,19 +263,19 @@ struct Replayed {
     paused_s: f64,
 }
 
-impl Replayed {
-    fn of(played: &Progress) -> Replayed {
+impl ReplaySummary {
+    fn of(played: &Progress) -> ReplaySummary {
         let Progress { telegrams, lap: laps, position_ns, took_ns, paused_ns, .. } = *played;
         let [position_s, took_s, paused_s] = [position_ns, took_ns, paused_ns].map(|ns| ns as f64 / 1e9);
-        Replayed { class: "replayed", telegrams, laps, position_s, took_s, paused_s }
+        ReplaySummary { class: "replayed", telegrams, laps, position_s, took_s, paused_s }
     }
 }
 
 /// Minimum interval between two progress lines.
-const REDRAW_NS: u64 = 200_000_000;
-const REDRAW: Timespec = Timespec { tv_sec: 0, tv_nsec: REDRAW_NS as i64 };
+const REDRAW_INTERVAL_NS: u64 = 200_000_000;
+const REDRAW_INTERVAL: Timespec = Timespec { tv_sec: 0, tv_nsec: REDRAW_INTERVAL_NS as i64 };
 /// Value of a special character that no key produces (`_POSIX_VDISABLE`).
-const DISABLED: u8 = 0;
+const DISABLED_CHARACTER: u8 = 0;
 
 /// The keys, for the end of the help.
 const AFTER_HELP: &str = "\
@@ -292,9 +296,15 @@ mod tests {
 
     #[test]
     fn rates() {
-        assert_eq!((pace("max"), pace("0.5")), (Ok(PlaybackRate::Max), Ok(PlaybackRate::Times(0.5))));
+        assert_eq!(
+            (parse_rate("max"), parse_rate("0.5")),
+            (Ok(PlaybackRate::Max), Ok(PlaybackRate::Times(0.5)))
+        );
         for wrong in ["0", "-1", "65", "nan", "inf", "fast", ""] {
-            assert!(pace(wrong).is_err_and(|error| error.contains("0.015625 to 64, or max")), "{wrong}");
+            assert!(
+                parse_rate(wrong).is_err_and(|error| error.contains("0.015625 to 64, or max")),
+                "{wrong}"
+            );
         }
     }
 }

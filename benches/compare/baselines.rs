@@ -12,33 +12,33 @@ use rustix::net::{
     RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, SendAncillaryBuffer, SendAncillaryMessage,
     SendFlags, recvmsg, sendmsg,
 };
-use scanhub_schema::{Ring, Wake};
-use scanhub_shm::{Bell, Node, Waker};
+use scanhub_schema::{DoorbellWord, WakeEvent};
 use scanhub_shm::{Domain, Environment, HubLock};
+use scanhub_shm::{Doorbell, Node, WakeSender};
 
-use super::message::{Label, PHASES, Way};
-use super::process::{Inlet, Outlet, Task};
+use super::message::{Label, Mechanism, PHASES};
+use super::process::{MessageReceiver, MessageSender, RunParameters};
 use super::sockets::listening_path;
 use super::topic::SENSOR;
 use crate::support::{Outcome, clock};
 
 /// The writer of a futex word.
-pub(crate) struct Word {
-    waker: Waker,
+pub(crate) struct FutexWriter {
+    waker: WakeSender,
     _node: Node,
     _lock: HubLock,
 }
 
-impl Word {
-    pub(crate) fn new(task: &Task) -> Outcome<Word> {
+impl FutexWriter {
+    pub(crate) fn new(task: &RunParameters) -> Outcome<FutexWriter> {
         let domain = Domain::of_hub(task.domain, None, &Environment::of_process())?;
         let lock = HubLock::acquire(domain.root())?;
         let node = scanhub_shm::hub_node(&domain)?;
-        Ok(Word { waker: Waker::new(&node, SENSOR)?, _node: node, _lock: lock })
+        Ok(FutexWriter { waker: WakeSender::new(&node, SENSOR)?, _node: node, _lock: lock })
     }
 }
 
-impl Outlet for Word {
+impl MessageSender for FutexWriter {
     fn open(&mut self) -> Outcome<()> {
         Ok(())
     }
@@ -48,70 +48,70 @@ impl Outlet for Word {
     }
 
     fn send(&mut self) -> Outcome<()> {
-        self.waker.ring(Ring::First);
-        Ok(self.waker.tell(Wake::Telegram)?)
+        self.waker.ring(DoorbellWord::First);
+        Ok(self.waker.notify(WakeEvent::Telegram)?)
     }
 }
 
 /// The reader of a futex word.
-pub(crate) struct WordInlet {
-    bell: Bell,
-    rung: u32,
-    spins: bool,
-    counted: Counted,
+pub(crate) struct FutexReader {
+    doorbell: Doorbell,
+    last_count: u32,
+    is_spinning: bool,
+    matcher: WakeupMatcher,
     _node: Node,
 }
 
-impl WordInlet {
-    pub(crate) fn new(task: &Task) -> Outcome<WordInlet> {
+impl FutexReader {
+    pub(crate) fn new(task: &RunParameters) -> Outcome<FutexReader> {
         let node = scanhub_shm::client_node(&Domain::of_hub(task.domain, None, &Environment::of_process())?)?;
-        let bell = Bell::open(&node, SENSOR)?.ok_or("no bell")?;
-        let rung = bell.rung(Ring::First);
-        Ok(WordInlet {
-            bell,
-            rung,
-            spins: task.way == Way::SpinBaseline,
-            counted: Counted::new(task),
+        let doorbell = Doorbell::open(&node, SENSOR)?.ok_or("no bell")?;
+        let last_count = doorbell.ring_count(DoorbellWord::First);
+        Ok(FutexReader {
+            doorbell,
+            last_count,
+            is_spinning: task.mechanism == Mechanism::SpinBaseline,
+            matcher: WakeupMatcher::new(task),
             _node: node,
         })
     }
 }
 
-impl Inlet for WordInlet {
+impl MessageReceiver for FutexReader {
     fn next(&mut self) -> Outcome<Label> {
-        while !self.counted.is_waiting() {
-            let rung = self.bell.rung(Ring::First);
-            if rung != self.rung {
-                self.counted.add(u64::from(rung.wrapping_sub(self.rung)));
-                self.rung = rung;
-            } else if self.spins {
+        while !self.matcher.is_waiting() {
+            let rung = self.doorbell.ring_count(DoorbellWord::First);
+            if rung != self.last_count {
+                self.matcher.add(u64::from(rung.wrapping_sub(self.last_count)));
+                self.last_count = rung;
+            } else if self.is_spinning {
                 std::hint::spin_loop();
             } else {
-                let until = clock::now() + LONG_NS;
-                scanhub_shm::sleep_at_bells(&[(&self.bell, Ring::First, rung)], until)
+                let until = clock::now() + STEP_TIMEOUT_NS;
+                scanhub_shm::wait_on_doorbells(&[(&self.doorbell, DoorbellWord::First, rung)], until)
                     .map_err(|error| format!("{error:?}"))?;
             }
         }
-        Ok(self.counted.take())
+        Ok(self.matcher.take())
     }
 }
 
 /// The writing end of an eventfd.
-pub(crate) struct Counter {
+pub(crate) struct EventfdWriter {
     eventfd: OwnedFd,
     listener: UnixListener,
     path: String,
 }
 
-impl Counter {
-    pub(crate) fn new(task: &Task) -> Outcome<Counter> {
-        let path = listening_path(task.place);
+impl EventfdWriter {
+    pub(crate) fn new(task: &RunParameters) -> Outcome<EventfdWriter> {
+        let path = listening_path(task.path_prefix);
         let eventfd = eventfd(0, EventfdFlags::CLOEXEC)?;
-        Ok(Counter { eventfd, listener: UnixListener::bind(&path)?, path })
+        Ok(EventfdWriter { eventfd, listener: UnixListener::bind(&path)?, path })
     }
 }
 
-impl Outlet for Counter {
+impl MessageSender for EventfdWriter {
     fn open(&mut self) -> Outcome<()> {
         let (stream, _) = self.listener.accept()?;
         let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
@@ -132,37 +132,37 @@ impl Outlet for Counter {
     }
 }
 
-impl Drop for Counter {
+impl Drop for EventfdWriter {
     fn drop(&mut self) {
         let _ = std::fs::remove_file(&self.path);
     }
 }
 
 /// The reading end of an eventfd.
-pub(crate) struct CounterInlet {
+pub(crate) struct EventfdReader {
     stream: UnixStream,
     eventfd: Option<OwnedFd>,
-    counted: Counted,
+    matcher: WakeupMatcher,
 }
 
-impl CounterInlet {
-    pub(crate) fn new(task: &Task) -> Outcome<CounterInlet> {
-        let stream = UnixStream::connect(listening_path(task.place))?;
-        Ok(CounterInlet { stream, eventfd: None, counted: Counted::new(task) })
+impl EventfdReader {
+    pub(crate) fn new(task: &RunParameters) -> Outcome<EventfdReader> {
+        let stream = UnixStream::connect(listening_path(task.path_prefix))?;
+        Ok(EventfdReader { stream, eventfd: None, matcher: WakeupMatcher::new(task) })
     }
 }
 
-impl Inlet for CounterInlet {
+impl MessageReceiver for EventfdReader {
     fn next(&mut self) -> Outcome<Label> {
         if self.eventfd.is_none() {
             self.eventfd = Some(received_descriptor(&self.stream)?);
         }
-        while let (false, Some(eventfd)) = (self.counted.is_waiting(), &self.eventfd) {
-            let mut told = [0; 8];
-            rustix::io::read(eventfd, &mut told)?;
-            self.counted.add(u64::from_ne_bytes(told));
+        while let (false, Some(eventfd)) = (self.matcher.is_waiting(), &self.eventfd) {
+            let mut count_bytes = [0; 8];
+            rustix::io::read(eventfd, &mut count_bytes)?;
+            self.matcher.add(u64::from_ne_bytes(count_bytes));
         }
-        Ok(self.counted.take())
+        Ok(self.matcher.take())
     }
 }
 
@@ -179,39 +179,42 @@ fn received_descriptor(stream: &UnixStream) -> Outcome<OwnedFd> {
 }
 
 /// Finds out which message a wake-up belongs to: only a count arrives.
-struct Counted {
-    way: Way,
-    told: u64,
-    taken: u64,
+struct WakeupMatcher {
+    mechanism: Mechanism,
+    wakeup_count: u64,
+    matched_count: u64,
     phase: usize,
 }
 
-impl Counted {
-    fn new(task: &Task) -> Counted {
-        Counted { way: task.way, told: 0, taken: 0, phase: 0 }
+impl WakeupMatcher {
+    fn new(task: &RunParameters) -> WakeupMatcher {
+        WakeupMatcher { mechanism: task.mechanism, wakeup_count: 0, matched_count: 0, phase: 0 }
     }
 
-    fn add(&mut self, told: u64) {
-        self.told += told;
+    fn add(&mut self, wakeup_count: u64) {
+        self.wakeup_count += wakeup_count;
     }
 
     fn is_waiting(&self) -> bool {
-        self.taken < self.told
+        self.matched_count < self.wakeup_count
     }
 
     fn take(&mut self) -> Label {
-        let number = self.taken;
-        self.taken += 1;
-        let label =
-            Label { phase: self.phase, number, is_end: number == PHASES[self.phase].count(self.way) as u64 };
+        let number = self.matched_count;
+        self.matched_count += 1;
+        let label = Label {
+            phase: self.phase,
+            number,
+            is_end: number == PHASES[self.phase].count(self.mechanism) as u64,
+        };
         if label.is_end {
             self.phase += 1;
-            self.told -= self.taken;
-            self.taken = 0;
+            self.wakeup_count -= self.matched_count;
+            self.matched_count = 0;
         }
         label
     }
 }
 
 /// Longer than any step takes.
-const LONG_NS: u64 = 10_000_000_000;
+const STEP_TIMEOUT_NS: u64 = 10_000_000_000;

@@ -41,10 +41,10 @@ use std::io::IsTerminal;
 use std::process::ExitCode;
 use std::thread::available_parallelism;
 
-use message::{PHASES, Way};
-use process::Task;
-use run::{Case, Measured};
-use support::stage::Stage;
+use message::{Mechanism, PHASES};
+use process::RunParameters;
+use run::{Case, PhaseFigures};
+use support::environment::BenchEnvironment;
 use support::{Options, Outcome};
 
 /// Results of a mechanism in one phase, one per run.
@@ -52,7 +52,7 @@ pub(crate) struct Cell {
     pub(crate) case: Case,
     /// Index of the phase in the schedule.
     pub(crate) phase: usize,
-    pub(crate) runs: Vec<Measured>,
+    pub(crate) runs: Vec<PhaseFigures>,
 }
 
 impl Cell {
@@ -62,7 +62,7 @@ impl Cell {
     }
 
     /// Returns whether the messages, receivers and rate are the same.
-    fn is_beside(&self, other: &Cell) -> bool {
+    fn has_same_load(&self, other: &Cell) -> bool {
         let place = |cell: &Cell| (cell.case.payload, cell.case.receivers, cell.phase);
         place(self) == place(other)
     }
@@ -70,22 +70,28 @@ impl Cell {
 
 impl fmt::Display for Cell {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Case { way, payload, receivers } = self.case;
-        write!(f, "{}, {payload} B to {receivers}, {}", way.name(), PHASES[self.phase].name)
+        let Case { mechanism, payload, receivers } = self.case;
+        write!(f, "{}, {payload} B to {receivers}, {}", mechanism.name(), PHASES[self.phase].name)
     }
 }
 
 fn main() -> ExitCode {
-    support::main_with(play, measure)
+    support::main_with(run_part, measure)
 }
 
 /// Plays a process of a run.
-fn play(words: &[&str]) -> Outcome<()> {
+fn run_part(words: &[&str]) -> Outcome<()> {
     let [part, way, payload, receivers, domain, place, ref rest @ ..] = *words else {
         return Err(format!("no part {words:?}").into());
     };
-    let way = Way::named(way)?;
-    let task = Task { way, payload: payload.parse()?, receivers: receivers.parse()?, domain, place };
+    let mechanism = Mechanism::from_name(way)?;
+    let task = RunParameters {
+        mechanism,
+        payload: payload.parse()?,
+        receivers: receivers.parse()?,
+        domain,
+        path_prefix: place,
+    };
     match (part, rest) {
         ("send", []) => process::send_all(&task),
         ("receive", [number, address]) => process::receive_all(&task, number.parse()?, address),
@@ -96,17 +102,21 @@ fn play(words: &[&str]) -> Outcome<()> {
 fn measure(options: &Options) -> Outcome<()> {
     let pairs = if options.quick { options.pairs().min(2) } else { options.pairs() };
     let (payloads, receivers): (&[usize], &[usize]) =
-        if options.quick { (&[TELEGRAM, MEBIBYTE], &[1, 16]) } else { (&PAYLOADS, &RECEIVERS) };
-    let stage = Stage::new()?;
+        if options.quick { (&[TELEGRAM_LEN, MEBIBYTE], &[1, 16]) } else { (&PAYLOAD_LENS, &RECEIVER_COUNTS) };
+    let environment = BenchEnvironment::new()?;
     let processors = available_parallelism()?.get();
     let mut cells = Vec::new();
     for (number, payload) in payloads.iter().enumerate() {
         for receivers in receivers {
-            tell(&format!("{payload} bytes to {receivers}, length {} of {}", number + 1, payloads.len()));
-            cells.extend(compare(&stage, *payload, *receivers, processors, pairs)?);
+            print_progress(&format!(
+                "{payload} bytes to {receivers}, length {} of {}",
+                number + 1,
+                payloads.len()
+            ));
+            cells.extend(compare(&environment, *payload, *receivers, processors, pairs)?);
         }
     }
-    drop(stage);
+    drop(environment);
     report::print_tables(options, processors, pairs, &cells);
     report::print_targets(options, &cells);
     Ok(())
@@ -115,18 +125,18 @@ fn measure(options: &Options) -> Outcome<()> {
 /// Runs all mechanisms with the same messages and the same number of receivers, `pairs` times, each time starting with
 /// another one.
 fn compare(
-    stage: &Stage,
+    stage: &BenchEnvironment,
     payload: usize,
     receivers: usize,
     processors: usize,
     pairs: usize,
 ) -> Outcome<Vec<Cell>> {
-    let ways = Way::ALL.into_iter().filter(|way| way.runs(receivers, payload, processors));
-    let mut cases: Vec<_> = ways.map(|way| Case { way, payload, receivers }).collect();
+    let ways = Mechanism::ALL.into_iter().filter(|way| way.is_run_with(receivers, payload, processors));
+    let mut cases: Vec<_> = ways.map(|way| Case { mechanism: way, payload, receivers }).collect();
     let mut cells: Vec<Cell> = Vec::new();
     for case in &cases {
         let phases = 1..PHASES.len();
-        let phases = phases.filter(|phase| PHASES[*phase].count(case.way) > 0);
+        let phases = phases.filter(|phase| PHASES[*phase].count(case.mechanism) > 0);
         cells.extend(phases.map(|phase| Cell { case: *case, phase, runs: Vec::new() }));
     }
     for _ in 0..pairs {
@@ -143,14 +153,14 @@ fn compare(
 }
 
 /// Prints the progress on a terminal.
-fn tell(progress: &str) {
+fn print_progress(progress: &str) {
     if std::io::stderr().is_terminal() {
         eprintln!("{progress}");
     }
 }
 
 /// Length of a telegram of 361 beams.
-const TELEGRAM: usize = 732;
+const TELEGRAM_LEN: usize = 732;
 const MEBIBYTE: usize = 1 << 20;
-const PAYLOADS: [usize; 4] = [TELEGRAM, message::SCAN, 1 << 16, MEBIBYTE];
-const RECEIVERS: [usize; 4] = [1, 4, 16, 64];
+const PAYLOAD_LENS: [usize; 4] = [TELEGRAM_LEN, message::SCAN_LEN, 1 << 16, MEBIBYTE];
+const RECEIVER_COUNTS: [usize; 4] = [1, 4, 16, 64];

@@ -3,13 +3,13 @@
 
 use std::hint::black_box;
 
-use scanhub_schema::{Contents, Scan};
+use scanhub_schema::{ArrayFlags, Scan};
 
 use crate::support::Outcome;
 
 /// A mechanism that carries messages from one process to others, and what the receivers wait for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Way {
+pub(crate) enum Mechanism {
     /// A topic of the hub; receivers sleep on its doorbell.
     Doorbell,
     /// A topic; receivers sleep on its event.
@@ -36,70 +36,84 @@ pub(crate) enum Way {
     SpinBaseline,
 }
 
-impl Way {
+impl Mechanism {
     /// All mechanisms in the order of the tables.
-    pub(crate) const ALL: [Way; 12] = [
-        Way::Doorbell,
-        Way::Event,
-        Way::Spin,
-        Way::Subscription,
-        Way::Multicast,
-        Way::UnixDatagram,
-        Way::UnixStream,
-        Way::Tcp,
-        Way::Pipe,
-        Way::FutexBaseline,
-        Way::EventfdBaseline,
-        Way::SpinBaseline,
+    pub(crate) const ALL: [Mechanism; 12] = [
+        Mechanism::Doorbell,
+        Mechanism::Event,
+        Mechanism::Spin,
+        Mechanism::Subscription,
+        Mechanism::Multicast,
+        Mechanism::UnixDatagram,
+        Mechanism::UnixStream,
+        Mechanism::Tcp,
+        Mechanism::Pipe,
+        Mechanism::FutexBaseline,
+        Mechanism::EventfdBaseline,
+        Mechanism::SpinBaseline,
     ];
 
     /// Returns the name in tables and on command lines.
     pub(crate) fn name(self) -> &'static str {
         match self {
-            Way::Doorbell => "topic, doorbell",
-            Way::Event => "topic, event",
-            Way::Spin => "topic, spinning",
-            Way::Subscription => "topic, Subscriber::next",
-            Way::Multicast => "UDP multicast",
-            Way::UnixDatagram => "Unix datagrams",
-            Way::UnixStream => "Unix streams",
-            Way::Tcp => "TCP",
-            Way::Pipe => "pipes",
-            Way::FutexBaseline => "baseline: futex",
-            Way::EventfdBaseline => "baseline: eventfd",
-            Way::SpinBaseline => "baseline: cache line",
+            Mechanism::Doorbell => "topic, doorbell",
+            Mechanism::Event => "topic, event",
+            Mechanism::Spin => "topic, spinning",
+            Mechanism::Subscription => "topic, Subscriber::next",
+            Mechanism::Multicast => "UDP multicast",
+            Mechanism::UnixDatagram => "Unix datagrams",
+            Mechanism::UnixStream => "Unix streams",
+            Mechanism::Tcp => "TCP",
+            Mechanism::Pipe => "pipes",
+            Mechanism::FutexBaseline => "baseline: futex",
+            Mechanism::EventfdBaseline => "baseline: eventfd",
+            Mechanism::SpinBaseline => "baseline: cache line",
         }
     }
 
     /// Returns the mechanism of this name.
-    pub(crate) fn named(name: &str) -> Outcome<Way> {
-        Ok(Way::ALL.into_iter().find(|way| way.name() == name).ok_or_else(|| format!("no way {name}"))?)
+    pub(crate) fn from_name(name: &str) -> Outcome<Mechanism> {
+        Ok(Mechanism::ALL
+            .into_iter()
+            .find(|mechanism| mechanism.name() == name)
+            .ok_or_else(|| format!("no way {name}"))?)
     }
 
     /// Returns whether users would take this mechanism instead of topics.
     pub(crate) fn is_alternative(self) -> bool {
-        matches!(self, Way::Multicast | Way::UnixDatagram | Way::UnixStream | Way::Tcp | Way::Pipe)
+        matches!(
+            self,
+            Mechanism::Multicast
+                | Mechanism::UnixDatagram
+                | Mechanism::UnixStream
+                | Mechanism::Tcp
+                | Mechanism::Pipe
+        )
     }
 
     /// Returns whether this is a baseline, which wakes and carries no data.
     pub(crate) fn is_baseline(self) -> bool {
-        matches!(self, Way::FutexBaseline | Way::EventfdBaseline | Way::SpinBaseline)
+        matches!(self, Mechanism::FutexBaseline | Mechanism::EventfdBaseline | Mechanism::SpinBaseline)
     }
 
     /// Returns whether the sender never waits for its receivers, so that slow ones miss messages.
-    pub(crate) fn loses(self) -> bool {
-        !self.is_baseline() && !matches!(self, Way::UnixDatagram | Way::UnixStream | Way::Tcp | Way::Pipe)
+    pub(crate) fn is_lossy(self) -> bool {
+        !self.is_baseline()
+            && !matches!(
+                self,
+                Mechanism::UnixDatagram | Mechanism::UnixStream | Mechanism::Tcp | Mechanism::Pipe
+            )
     }
 
     /// Returns whether the mechanism is run with this number of receivers and messages of this size. A receiver that
     /// spins needs its own processor, and so does the sender. A baseline is between two processes. The client library
     /// is compared only with the messages that it is used for.
-    pub(crate) fn runs(self, receivers: usize, payload: usize, processors: usize) -> bool {
+    pub(crate) fn is_run_with(self, receivers: usize, payload: usize, processors: usize) -> bool {
         match self {
-            Way::Spin => receivers < processors,
-            Way::SpinBaseline => receivers == 1 && processors > 1,
-            Way::FutexBaseline | Way::EventfdBaseline => receivers == 1,
-            Way::Subscription => receivers == 1 && payload == SCAN,
+            Mechanism::Spin => receivers < processors,
+            Mechanism::SpinBaseline => receivers == 1 && processors > 1,
+            Mechanism::FutexBaseline | Mechanism::EventfdBaseline => receivers == 1,
+            Mechanism::Subscription => receivers == 1 && payload == SCAN_LEN,
             _ => true,
         }
     }
@@ -121,18 +135,18 @@ impl Label {
     pub(crate) fn write(self, bytes: &mut [u8]) {
         let kind = self.phase as u64 * 2 + u64::from(self.is_end);
         let number = self.number.to_le_bytes();
-        let tail = bytes.len() - NUMBER;
-        bytes[..NUMBER].copy_from_slice(&number);
-        bytes[NUMBER..HEAD].copy_from_slice(&kind.to_le_bytes());
+        let tail = bytes.len() - NUMBER_LEN;
+        bytes[..NUMBER_LEN].copy_from_slice(&number);
+        bytes[NUMBER_LEN..LABEL_LEN].copy_from_slice(&kind.to_le_bytes());
         bytes[tail..].copy_from_slice(&number);
     }
 
     /// Reads a byte of each cache line of a message, and returns its label. Fails if its ends belong to different
     /// messages.
     pub(crate) fn read(bytes: &[u8]) -> Outcome<Label> {
-        black_box(bytes.iter().step_by(CACHE_LINE).fold(0u64, |sum, byte| sum + u64::from(*byte)));
-        let [number, kind] = [&bytes[..NUMBER], &bytes[NUMBER..HEAD]].map(word);
-        if word(&bytes[bytes.len() - NUMBER..]) != number {
+        black_box(bytes.iter().step_by(CACHE_LINE_LEN).fold(0u64, |sum, byte| sum + u64::from(*byte)));
+        let [number, kind] = [&bytes[..NUMBER_LEN], &bytes[NUMBER_LEN..LABEL_LEN]].map(word);
+        if word(&bytes[bytes.len() - NUMBER_LEN..]) != number {
             return Err(format!("message {number} is torn").into());
         }
         Ok(Label { phase: kind as usize / 2, number, is_end: kind % 2 == 1 })
@@ -144,15 +158,15 @@ fn word(bytes: &[u8]) -> u64 {
 }
 
 /// A message in the sender's own memory. It is written again for each send, because real data was just computed.
-pub(crate) struct Draft {
+pub(crate) struct MessageBuffer {
     contents: Vec<u8>,
     bytes: Vec<u8>,
 }
 
-impl Draft {
+impl MessageBuffer {
     /// Creates messages of `len` bytes.
-    pub(crate) fn new(len: usize) -> Draft {
-        Draft { contents: contents(len), bytes: contents(len) }
+    pub(crate) fn new(len: usize) -> MessageBuffer {
+        MessageBuffer { contents: contents(len), bytes: contents(len) }
     }
 
     /// Returns the message.
@@ -168,7 +182,7 @@ impl Draft {
 
     /// Writes a message of the minimum length.
     pub(crate) fn write_short(&mut self, label: Label) -> &[u8] {
-        let bytes = &mut self.bytes[..SHORT];
+        let bytes = &mut self.bytes[..MIN_MESSAGE_LEN];
         label.write(bytes);
         bytes
     }
@@ -180,14 +194,14 @@ pub(crate) fn contents(len: usize) -> Vec<u8> {
 }
 
 /// Beams of the hub's own messages: 180 degrees at 0.5 degrees.
-pub(crate) const BEAMS: usize = 361;
-/// Length of a scan of [`BEAMS`] beams.
-pub(crate) const SCAN: usize = Scan::len(BEAMS, Contents::UPPER);
+pub(crate) const BEAM_COUNT: usize = 361;
+/// Length of a scan of [`BEAM_COUNT`] beams.
+pub(crate) const SCAN_LEN: usize = Scan::len(BEAM_COUNT, ArrayFlags::UPPER);
 /// Length of the shortest message.
-pub(crate) const SHORT: usize = HEAD + NUMBER;
-const NUMBER: usize = size_of::<u64>();
-const HEAD: usize = 2 * NUMBER;
-const CACHE_LINE: usize = 64;
+pub(crate) const MIN_MESSAGE_LEN: usize = LABEL_LEN + NUMBER_LEN;
+const NUMBER_LEN: usize = size_of::<u64>();
+const LABEL_LEN: usize = 2 * NUMBER_LEN;
+const CACHE_LINE_LEN: usize = 64;
 
 /// Messages at one rate.
 pub(crate) struct Phase {
@@ -196,29 +210,29 @@ pub(crate) struct Phase {
     /// Time from one message to the next, in ns; 0 for no pause.
     pub(crate) period_ns: u64,
     /// Maximum number of messages.
-    count: usize,
+    max_count: usize,
     /// Time after which the phase ends in any case, in ns: some mechanisms cannot keep the rate.
-    most_ns: u64,
+    max_ns: u64,
 }
 
 impl Phase {
     /// Returns the number of messages of `way`. Baselines are always paced: a wake-up that no receiver waits for is not
     /// one.
-    pub(crate) fn count(&self, way: Way) -> usize {
-        if way.is_baseline() && self.period_ns == 0 { 0 } else { self.count }
+    pub(crate) fn count(&self, mechanism: Mechanism) -> usize {
+        if mechanism.is_baseline() && self.period_ns == 0 { 0 } else { self.max_count }
     }
 
     /// Returns when the phase ends in any case, in ns from its start. Receivers of a baseline detect the end by the
     /// count alone.
-    pub(crate) fn most_ns(&self, way: Way) -> u64 {
-        if way.is_baseline() { u64::MAX } else { self.most_ns }
+    pub(crate) fn max_ns(&self, mechanism: Mechanism) -> u64 {
+        if mechanism.is_baseline() { u64::MAX } else { self.max_ns }
     }
 }
 
 /// The phases in their order. The first one fills memory and caches, and does not count.
 pub(crate) const PHASES: [Phase; 4] = [
-    Phase { name: "warm-up", period_ns: 1_000_000, count: 20, most_ns: 40_000_000 },
-    Phase { name: "37.5 Hz", period_ns: 26_666_667, count: 28, most_ns: 900_000_000 },
-    Phase { name: "1 kHz", period_ns: 1_000_000, count: 400, most_ns: 500_000_000 },
-    Phase { name: "flat out", period_ns: 0, count: 2000, most_ns: 300_000_000 },
+    Phase { name: "warm-up", period_ns: 1_000_000, max_count: 20, max_ns: 40_000_000 },
+    Phase { name: "37.5 Hz", period_ns: 26_666_667, max_count: 28, max_ns: 900_000_000 },
+    Phase { name: "1 kHz", period_ns: 1_000_000, max_count: 400, max_ns: 500_000_000 },
+    Phase { name: "flat out", period_ns: 0, max_count: 2000, max_ns: 300_000_000 },
 ];

@@ -3,16 +3,16 @@
 
 use std::os::unix::net::UnixDatagram;
 
-use super::message::{PHASES, Way};
-use super::process::control;
+use super::message::{Mechanism, PHASES};
+use super::process::control_path;
 use crate::support::Outcome;
+use crate::support::environment::{BenchEnvironment, Child, OutputLine, STEP_TIMEOUT};
 use crate::support::figures::percentile;
-use crate::support::stage::{Child, Line, PATIENCE, Stage};
 
 /// A mechanism with a number of receivers and a length of messages.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Case {
-    pub(crate) way: Way,
+    pub(crate) mechanism: Mechanism,
     /// Bytes of a message.
     pub(crate) payload: usize,
     pub(crate) receivers: usize,
@@ -20,7 +20,7 @@ pub(crate) struct Case {
 
 /// Figures of one phase.
 #[derive(Clone, Debug)]
-pub(crate) struct Measured {
+pub(crate) struct PhaseFigures {
     /// Time from just before the send until the message is received, of all receivers: p50, p99, p99.9, in us.
     pub(crate) latency: [Option<f64>; 3],
     /// The same for the last receiver of each message that all of them received.
@@ -41,44 +41,44 @@ pub(crate) struct Measured {
 
 impl Case {
     /// Runs it, and returns one result for each phase that it has, with the index of the phase.
-    pub(crate) fn measure(&self, stage: &Stage) -> Outcome<Vec<(usize, Measured)>> {
-        let place = stage.port("compare");
+    pub(crate) fn measure(&self, environment: &BenchEnvironment) -> Outcome<Vec<(usize, PhaseFigures)>> {
+        let place = environment.port("compare");
         let [payload, receivers] = [self.payload, self.receivers].map(|number| number.to_string());
-        let words = [self.way.name(), &payload, &receivers, stage.domain.name(), &place];
-        let sender = stage.part(&[&["send"], &words[..]].concat())?;
-        let ready = sender.await_line("ready", PATIENCE)?;
+        let words = [self.mechanism.name(), &payload, &receivers, environment.domain.name(), &place];
+        let sender = environment.start_part(&[&["send"], &words[..]].concat())?;
+        let ready = sender.wait_for_line("ready", STEP_TIMEOUT)?;
         let address = ready.words().get(1).ok_or("no address")?.to_string();
         let start = |number: usize| {
-            stage.part(&[&["receive"], &words[..], &[&number.to_string(), &address]].concat())
+            environment.start_part(&[&["receive"], &words[..], &[&number.to_string(), &address]].concat())
         };
         let receivers = (0..self.receivers).map(start).collect::<Outcome<Vec<_>>>()?;
         for receiver in &receivers {
-            receiver.await_line("ready", PATIENCE)?;
+            receiver.wait_for_line("ready", STEP_TIMEOUT)?;
         }
         let tell = UnixDatagram::unbound()?;
-        tell.connect(control(&place))?;
-        tell.send(GO)?;
-        sender.await_line("open", PATIENCE)?;
+        tell.connect(control_path(&place))?;
+        tell.send(GO_MESSAGE)?;
+        sender.wait_for_line("open", STEP_TIMEOUT)?;
         let mut measured = Vec::new();
         for (number, phase) in PHASES.iter().enumerate() {
-            tell.send(GO)?;
-            let mut sent = Report::of(&sender, "sent")?;
+            tell.send(GO_MESSAGE)?;
+            let mut sent = Report::wait_for(&sender, "sent")?;
             let sending_ns = sent.numbers.remove(0);
-            let took =
-                receivers.iter().map(|child| Report::of(child, "took")).collect::<Outcome<Vec<_>>>()?;
-            if number > 0 && phase.count(self.way) > 0 {
-                let mut figures = figures(&sent, &took)?;
+            let reports =
+                receivers.iter().map(|child| Report::wait_for(child, "took")).collect::<Outcome<Vec<_>>>()?;
+            if number > 0 && phase.count(self.mechanism) > 0 {
+                let mut figures = figures(&sent, &reports)?;
                 if phase.period_ns > 0 {
                     let count = sent.numbers.len() as f64;
                     figures.sending_us = Some(sending_ns as f64 / 1e3 / count);
-                    figures.kept_percent = Some(100.0 * count / phase.count(self.way) as f64);
+                    figures.kept_percent = Some(100.0 * count / phase.count(self.mechanism) as f64);
                 }
                 measured.push((number, figures));
             }
         }
-        tell.send(GO)?;
+        tell.send(GO_MESSAGE)?;
         for child in receivers.iter().chain([&sender]) {
-            child.await_line("end", PATIENCE)?;
+            child.wait_for_line("end", STEP_TIMEOUT)?;
         }
         receivers.into_iter().chain([sender]).try_for_each(|child| child.guard.wait())?;
         Ok(measured)
@@ -93,20 +93,20 @@ struct Report {
 }
 
 impl Report {
-    fn of(child: &Child, word: &str) -> Outcome<Report> {
-        let Line { text, .. } = child.await_line(word, PATIENCE)?;
+    fn wait_for(child: &Child, word: &str) -> Outcome<Report> {
+        let OutputLine { text, .. } = child.wait_for_line(word, STEP_TIMEOUT)?;
         let mut numbers = text.split_whitespace().skip(1).map(str::parse);
         let busy_ns = numbers.next().ok_or("no account")??;
         Ok(Report { busy_ns, numbers: numbers.collect::<Result<_, _>>()? })
     }
 }
 
-fn figures(sent: &Report, took: &[Report]) -> Outcome<Measured> {
+fn figures(sent: &Report, receivers: &[Report]) -> Outcome<PhaseFigures> {
     let mut all = Vec::new();
     let mut last = vec![(0usize, 0u64); sent.numbers.len()];
     let mut end_ns = 0;
-    for account in took {
-        for message in account.numbers.chunks_exact(2) {
+    for report in receivers {
+        for message in report.numbers.chunks_exact(2) {
             let number = message[0] as usize;
             let sent_ns = *sent.numbers.get(number).ok_or_else(|| format!("nobody sent {number}"))?;
             let latency = message[1].saturating_sub(sent_ns);
@@ -116,16 +116,18 @@ fn figures(sent: &Report, took: &[Report]) -> Outcome<Measured> {
         }
     }
     let received = all.len();
-    let of_all = last.iter().filter(|(receivers, _)| *receivers == took.len());
+    let of_all = last.iter().filter(|(count, _)| *count == receivers.len());
     let begin_ns = *sent.numbers.first().ok_or("nothing was sent")?;
-    let expected = sent.numbers.len() * took.len();
-    let busy_ns: u64 = took.iter().map(|account| account.busy_ns).sum();
-    Ok(Measured {
+    let expected = sent.numbers.len() * receivers.len();
+    let busy_ns: u64 = receivers.iter().map(|report| report.busy_ns).sum();
+    Ok(PhaseFigures {
         last: percentiles(of_all.map(|(_, latency)| *latency).collect()),
         latency: percentiles(all),
         sender_us: sent.busy_ns as f64 / 1e3 / sent.numbers.len() as f64,
         receiver_us: (received > 0).then(|| busy_ns as f64 / 1e3 / received as f64),
-        rate_hz: received as f64 / took.len() as f64 / (end_ns.saturating_sub(begin_ns).max(1) as f64 / 1e9),
+        rate_hz: received as f64
+            / receivers.len() as f64
+            / (end_ns.saturating_sub(begin_ns).max(1) as f64 / 1e9),
         missed_percent: 100.0 * (expected - received) as f64 / expected as f64,
         sending_us: None,
         kept_percent: None,
@@ -139,4 +141,4 @@ fn percentiles(times: Vec<u64>) -> [Option<f64>; 3] {
     [0.5, 0.99, 0.999].map(|part| percentile(&sorted, part))
 }
 
-const GO: &[u8] = b"go";
+const GO_MESSAGE: &[u8] = b"go";

@@ -17,34 +17,34 @@ use rustix::net::{
 };
 use rustix::pipe::fcntl_setpipe_size;
 
-use super::message::{Draft, Label, SHORT, Way};
-use super::process::{Inlet, Outlet, Task};
+use super::message::{Label, MIN_MESSAGE_LEN, Mechanism, MessageBuffer};
+use super::process::{MessageReceiver, MessageSender, RunParameters};
 use crate::support::Outcome;
 
 /// The sending sockets of UDP multicast on the loopback, which is one for the group, or of Unix datagram sockets, which
 /// are one per receiver. A message that is longer than a datagram is sent as several and reassembled by the receiver,
 /// as users would do it; if one of them is lost, the message is lost.
-pub(crate) struct Datagrams {
+pub(crate) struct DatagramSender {
     group: Option<Ipv4Addr>,
     paths: Vec<String>,
     sockets: Vec<OwnedFd>,
-    draft: Draft,
+    buffer: MessageBuffer,
     /// Bytes of a message in one datagram.
-    part: usize,
+    part_len: usize,
 }
 
-impl Datagrams {
-    pub(crate) fn new(task: &Task) -> Outcome<Datagrams> {
+impl DatagramSender {
+    pub(crate) fn new(task: &RunParameters) -> Outcome<DatagramSender> {
         let [_, _, high, low] = std::process::id().to_be_bytes();
-        let group = (task.way == Way::Multicast).then(|| Ipv4Addr::new(239, 83, high, low));
+        let group = (task.mechanism == Mechanism::Multicast).then(|| Ipv4Addr::new(239, 83, high, low));
         let receivers = if group.is_some() { 0 } else { task.receivers };
-        let paths = (0..receivers).map(|number| mailbox(task.place, number)).collect();
-        let (draft, part) = (Draft::new(task.payload), part(task));
-        Ok(Datagrams { group, paths, sockets: Vec::new(), draft, part })
+        let paths = (0..receivers).map(|number| socket_path(task.path_prefix, number)).collect();
+        let (buffer, part_len) = (MessageBuffer::new(task.payload), max_part_len(task));
+        Ok(DatagramSender { group, paths, sockets: Vec::new(), buffer, part_len })
     }
 }
 
-impl Outlet for Datagrams {
+impl MessageSender for DatagramSender {
     fn address(&self) -> Outcome<String> {
         Ok(self.group.map_or("-".into(), |group| group.to_string()))
     }
@@ -54,7 +54,7 @@ impl Outlet for Datagrams {
             let socket = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0))?;
             set_ip_multicast_if(&socket, &Ipv4Addr::LOCALHOST)?;
             socket.set_multicast_ttl_v4(0)?;
-            socket.connect((group, PORT))?;
+            socket.connect((group, GROUP_PORT))?;
             self.sockets.push(socket.into());
         }
         for path in &self.paths {
@@ -66,16 +66,16 @@ impl Outlet for Datagrams {
     }
 
     fn write(&mut self, label: Label) -> Outcome<()> {
-        self.draft.write(label);
+        self.buffer.write(label);
         Ok(())
     }
 
     fn send(&mut self) -> Outcome<()> {
-        self.sockets.iter().try_for_each(|socket| send(socket, self.draft.bytes(), self.part))
+        self.sockets.iter().try_for_each(|socket| send(socket, self.buffer.bytes(), self.part_len))
     }
 
     fn end(&mut self, label: Label) -> Outcome<()> {
-        let message = self.draft.write_short(label);
+        let message = self.buffer.write_short(label);
         for socket in &self.sockets {
             rustix::io::write(socket, message)?;
         }
@@ -83,7 +83,7 @@ impl Outlet for Datagrams {
     }
 }
 
-impl Drop for Datagrams {
+impl Drop for DatagramSender {
     fn drop(&mut self) {
         for path in &self.paths {
             let _ = std::fs::remove_file(path);
@@ -96,7 +96,7 @@ fn send(socket: &OwnedFd, message: &[u8], part: usize) -> Outcome<()> {
         rustix::io::write(socket, message)?;
         return Ok(());
     }
-    let number = &message[..NUMBER];
+    let number = &message[..NUMBER_LEN];
     for (index, bytes) in message.chunks(part).enumerate() {
         let index = (index as u64).to_le_bytes();
         let slices = [number, &index, bytes].map(IoSlice::new);
@@ -106,59 +106,59 @@ fn send(socket: &OwnedFd, message: &[u8], part: usize) -> Outcome<()> {
 }
 
 /// A receiving socket.
-pub(crate) struct DatagramsInlet {
+pub(crate) struct DatagramReceiver {
     socket: OwnedFd,
     message: Vec<u8>,
     len: usize,
-    part: usize,
+    part_len: usize,
     /// Parts of the message that have arrived.
-    parts: usize,
+    received_parts: usize,
 }
 
-impl DatagramsInlet {
-    pub(crate) fn new(task: &Task, number: usize, address: &str) -> Outcome<DatagramsInlet> {
-        let socket = match task.way {
-            Way::Multicast => group_socket(address.parse()?)?,
-            _ => UnixDatagram::bind(mailbox(task.place, number))?.into(),
+impl DatagramReceiver {
+    pub(crate) fn new(task: &RunParameters, number: usize, address: &str) -> Outcome<DatagramReceiver> {
+        let socket = match task.mechanism {
+            Mechanism::Multicast => group_socket(address.parse()?)?,
+            _ => UnixDatagram::bind(socket_path(task.path_prefix, number))?.into(),
         };
-        let (len, part) = (task.payload, part(task));
+        let (len, part_len) = (task.payload, max_part_len(task));
         // A part that arrives instead of the last one may be longer.
-        Ok(DatagramsInlet { socket, message: vec![0; len + part], len, part, parts: 0 })
+        Ok(DatagramReceiver { socket, message: vec![0; len + part_len], len, part_len, received_parts: 0 })
     }
 
     /// Receives the next part, and writes it after those that have arrived. Returns the label of the message if that
     /// was the last part.
     fn take_part(&mut self) -> Outcome<Option<Label>> {
-        let place = self.parts * self.part;
-        let (mut number, mut index) = ([0; NUMBER], [0; NUMBER]);
-        let body = &mut self.message[place..][..self.part];
+        let place = self.received_parts * self.part_len;
+        let (mut number, mut index) = ([0; NUMBER_LEN], [0; NUMBER_LEN]);
+        let body = &mut self.message[place..][..self.part_len];
         let mut slices = [&mut number[..], &mut index[..], body].map(IoSliceMut::new);
         let mut control = RecvAncillaryBuffer::default();
         let len = recvmsg(&self.socket, &mut slices, &mut control, RecvFlags::empty())?.bytes;
-        if len == SHORT {
-            let tail = &self.message[place..][..NUMBER];
+        if len == MIN_MESSAGE_LEN {
+            let tail = &self.message[place..][..NUMBER_LEN];
             return Ok(Some(Label::read(&[&number, &index, tail].concat())?));
         }
         let index = u64::from_le_bytes(index) as usize;
         if index == 0 {
-            self.message.copy_within(place..place + self.part, 0);
-        } else if index != self.parts || self.message[..NUMBER] != number {
+            self.message.copy_within(place..place + self.part_len, 0);
+        } else if index != self.received_parts || self.message[..NUMBER_LEN] != number {
             // The parts that have arrived will never be complete.
-            self.parts = 0;
+            self.received_parts = 0;
             return Ok(None);
         }
-        self.parts = index + 1;
-        if self.parts < self.len.div_ceil(self.part) {
+        self.received_parts = index + 1;
+        if self.received_parts < self.len.div_ceil(self.part_len) {
             return Ok(None);
         }
-        self.parts = 0;
+        self.received_parts = 0;
         Ok(Some(Label::read(&self.message[..self.len])?))
     }
 }
 
-impl Inlet for DatagramsInlet {
+impl MessageReceiver for DatagramReceiver {
     fn next(&mut self) -> Outcome<Label> {
-        if self.len <= self.part {
+        if self.len <= self.part_len {
             let len = rustix::io::read(&self.socket, &mut self.message)?;
             return Label::read(&self.message[..len]);
         }
@@ -174,9 +174,9 @@ impl Inlet for DatagramsInlet {
 fn group_socket(group: Ipv4Addr) -> Outcome<OwnedFd> {
     let socket = socket_with(AddressFamily::INET, SocketType::DGRAM, SocketFlags::CLOEXEC, None)?;
     set_socket_reuseaddr(&socket, true)?;
-    bind(&socket, &SocketAddrV4::new(group, PORT))?;
-    if set_socket_recv_buffer_size_force(&socket, ROOM).is_err() {
-        set_socket_recv_buffer_size(&socket, ROOM)?;
+    bind(&socket, &SocketAddrV4::new(group, GROUP_PORT))?;
+    if set_socket_recv_buffer_size_force(&socket, RECEIVE_BUFFER_LEN).is_err() {
+        set_socket_recv_buffer_size(&socket, RECEIVE_BUFFER_LEN)?;
     }
     let socket = UdpSocket::from(socket);
     socket.join_multicast_v4(&group, &Ipv4Addr::LOCALHOST)?;
@@ -184,36 +184,36 @@ fn group_socket(group: Ipv4Addr) -> Outcome<OwnedFd> {
 }
 
 /// Returns how much of a message a datagram of this kind holds.
-fn part(task: &Task) -> usize {
-    match task.way {
-        Way::Multicast if task.payload > UDP => UDP - 2 * NUMBER,
-        Way::Multicast => UDP,
-        _ => UNIX,
+fn max_part_len(task: &RunParameters) -> usize {
+    match task.mechanism {
+        Mechanism::Multicast if task.payload > MAX_UDP_LEN => MAX_UDP_LEN - 2 * NUMBER_LEN,
+        Mechanism::Multicast => MAX_UDP_LEN,
+        _ => MAX_UNIX_LEN,
     }
 }
 
-fn mailbox(place: &str, number: usize) -> String {
-    format!("{place}-mailbox-{number}")
+fn socket_path(path_prefix: &str, number: usize) -> String {
+    format!("{path_prefix}-mailbox-{number}")
 }
 
 /// Length of each of the two numbers at the start of a part: that of the message, and its own.
-const NUMBER: usize = size_of::<u64>();
+const NUMBER_LEN: usize = size_of::<u64>();
 /// Maximum length of a UDP datagram.
-const UDP: usize = 65_507;
+const MAX_UDP_LEN: usize = 65_507;
 /// Maximum length that the system's send buffer holds with the kernel's overhead.
-const UNIX: usize = 65_536;
+const MAX_UNIX_LEN: usize = 65_536;
 /// Receive buffer of a member of the group, in bytes.
-const ROOM: usize = 4 << 20;
+const RECEIVE_BUFFER_LEN: usize = 4 << 20;
 /// Port of all groups; each run has its own group.
-const PORT: u16 = 29_183;
+const GROUP_PORT: u16 = 29_183;
 
 /// The sending ends of Unix stream sockets, TCP or pipes: one connection per receiver, and one write to each for a
 /// message. All messages have the same length, so a receiver reads exactly one message, with one read if possible.
-pub(crate) struct Streams {
+pub(crate) struct StreamSender {
     listener: Listener,
     receivers: usize,
     ends: Vec<File>,
-    draft: Draft,
+    buffer: MessageBuffer,
 }
 
 /// The addresses on which receivers connect.
@@ -223,27 +223,33 @@ enum Listener {
     Pipes(Vec<String>),
 }
 
-impl Streams {
-    pub(crate) fn new(task: &Task) -> Outcome<Streams> {
-        let listener = match task.way {
-            Way::Tcp => Listener::Tcp(TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?),
-            Way::Pipe => {
-                let paths: Vec<_> = (0..task.receivers).map(|number| pipe(task.place, number)).collect();
+impl StreamSender {
+    pub(crate) fn new(task: &RunParameters) -> Outcome<StreamSender> {
+        let listener = match task.mechanism {
+            Mechanism::Tcp => Listener::Tcp(TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?),
+            Mechanism::Pipe => {
+                let paths: Vec<_> =
+                    (0..task.receivers).map(|number| pipe_path(task.path_prefix, number)).collect();
                 for path in &paths {
                     mknodat(CWD, path.as_str(), FileType::Fifo, Mode::RUSR | Mode::WUSR, 0)?;
                 }
                 Listener::Pipes(paths)
             }
             _ => {
-                let path = listening_path(task.place);
+                let path = listening_path(task.path_prefix);
                 Listener::Unix(UnixListener::bind(&path)?, path)
             }
         };
-        Ok(Streams { listener, receivers: task.receivers, ends: Vec::new(), draft: Draft::new(task.payload) })
+        Ok(StreamSender {
+            listener,
+            receivers: task.receivers,
+            ends: Vec::new(),
+            buffer: MessageBuffer::new(task.payload),
+        })
     }
 }
 
-impl Outlet for Streams {
+impl MessageSender for StreamSender {
     fn address(&self) -> Outcome<String> {
         Ok(match &self.listener {
             Listener::Tcp(listener) => listener.local_addr()?.to_string(),
@@ -263,7 +269,7 @@ impl Outlet for Streams {
                 Listener::Pipes(paths) => {
                     let end = OpenOptions::new().write(true).open(&paths[number])?;
                     // As large as a message. Users may not be allowed that; then the size stays.
-                    let _ = fcntl_setpipe_size(&end, self.draft.bytes().len().max(PIPE));
+                    let _ = fcntl_setpipe_size(&end, self.buffer.bytes().len().max(PIPE_LEN));
                     end
                 }
             };
@@ -273,19 +279,19 @@ impl Outlet for Streams {
     }
 
     fn write(&mut self, label: Label) -> Outcome<()> {
-        self.draft.write(label);
+        self.buffer.write(label);
         Ok(())
     }
 
     fn send(&mut self) -> Outcome<()> {
         for end in &mut self.ends {
-            end.write_all(self.draft.bytes())?;
+            end.write_all(self.buffer.bytes())?;
         }
         Ok(())
     }
 }
 
-impl Drop for Streams {
+impl Drop for StreamSender {
     fn drop(&mut self) {
         let paths: &[String] = match &self.listener {
             Listener::Unix(_, path) => std::slice::from_ref(path),
@@ -299,26 +305,27 @@ impl Drop for Streams {
 }
 
 /// The receiving end of a connection.
-pub(crate) struct StreamInlet {
+pub(crate) struct StreamReceiver {
     end: File,
     message: Vec<u8>,
 }
 
-impl StreamInlet {
-    pub(crate) fn new(task: &Task, number: usize, address: &str) -> Outcome<StreamInlet> {
-        let end = match task.way {
-            Way::Tcp => File::from(OwnedFd::from(TcpStream::connect(address)?)),
+impl StreamReceiver {
+    pub(crate) fn new(task: &RunParameters, number: usize, address: &str) -> Outcome<StreamReceiver> {
+        let end = match task.mechanism {
+            Mechanism::Tcp => File::from(OwnedFd::from(TcpStream::connect(address)?)),
             // Opened for writing too, because a pipe without a writer is at its end.
-            Way::Pipe => {
-                OpenOptions::new().read(true).write(true).open(Path::new(&pipe(task.place, number)))?
-            }
-            _ => File::from(OwnedFd::from(UnixStream::connect(listening_path(task.place))?)),
+            Mechanism::Pipe => OpenOptions::new()
+                .read(true)
+                .write(true)
+                .open(Path::new(&pipe_path(task.path_prefix, number)))?,
+            _ => File::from(OwnedFd::from(UnixStream::connect(listening_path(task.path_prefix))?)),
         };
-        Ok(StreamInlet { end, message: vec![0; task.payload] })
+        Ok(StreamReceiver { end, message: vec![0; task.payload] })
     }
 }
 
-impl Inlet for StreamInlet {
+impl MessageReceiver for StreamReceiver {
     fn next(&mut self) -> Outcome<Label> {
         self.end.read_exact(&mut self.message)?;
         Label::read(&self.message)
@@ -326,13 +333,13 @@ impl Inlet for StreamInlet {
 }
 
 /// Returns the path on which a Unix socket listens.
-pub(crate) fn listening_path(place: &str) -> String {
-    format!("{place}-listening_path")
+pub(crate) fn listening_path(path_prefix: &str) -> String {
+    format!("{path_prefix}-listening_path")
 }
 
-fn pipe(place: &str, number: usize) -> String {
-    format!("{place}-pipe-{number}")
+fn pipe_path(path_prefix: &str, number: usize) -> String {
+    format!("{path_prefix}-pipe-{number}")
 }
 
 /// Default size of a pipe.
-const PIPE: usize = 1 << 16;
+const PIPE_LEN: usize = 1 << 16;

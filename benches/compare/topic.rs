@@ -4,72 +4,74 @@
 
 use iceoryx2::prelude::ServiceName;
 use scanhub_schema::limits::TopicLimits;
-use scanhub_schema::{Header, Ring, Scan, ScanHead, Topic, Wake, limits};
-use scanhub_shm::{Bell, Listener, Node, Payload, Publisher, SampleMut, Subscriber, TopicService, Waker};
+use scanhub_schema::{DoorbellWord, Header, Scan, ScanHead, Topic, WakeEvent, limits};
 use scanhub_shm::{Domain, Environment, HubLock};
+use scanhub_shm::{
+    Doorbell, Listener, Node, Payload, Publisher, SampleMut, Subscriber, TopicService, WakeSender,
+};
 
-use super::message::{BEAMS, Label, SCAN, SHORT, Way, contents};
-use super::process::{Inlet, Outlet, Task};
-use crate::support::{Outcome, clock, consumer};
+use super::message::{BEAM_COUNT, Label, MIN_MESSAGE_LEN, Mechanism, SCAN_LEN, contents};
+use super::process::{MessageReceiver, MessageSender, RunParameters};
+use crate::support::{Outcome, clock, subscriber};
 
 /// Membership of a publishing process.
-struct Hub {
-    waker: Waker,
+struct HubMembership {
+    waker: WakeSender,
     node: Node,
     _lock: HubLock,
 }
 
-impl Hub {
-    fn new(task: &Task) -> Outcome<Hub> {
+impl HubMembership {
+    fn new(task: &RunParameters) -> Outcome<HubMembership> {
         let domain = Domain::of_hub(task.domain, None, &Environment::of_process())?;
         let lock = HubLock::acquire(domain.root())?;
         let node = scanhub_shm::hub_node(&domain)?;
-        Ok(Hub { waker: Waker::new(&node, SENSOR)?, node, _lock: lock })
+        Ok(HubMembership { waker: WakeSender::new(&node, SENSOR)?, node, _lock: lock })
     }
 
     /// Sends the written sample, and wakes all subscribers.
     fn send<P: Payload + ?Sized>(&self, written: Option<SampleMut<P>>) -> Outcome<()> {
         let sample = written.ok_or("nothing was written")?;
         sample.send().map_err(|error| format!("not sent: {error:?}"))?;
-        self.waker.ring(Ring::First);
-        Ok(self.waker.tell(Wake::Telegram)?)
+        self.waker.ring(DoorbellWord::First);
+        Ok(self.waker.notify(WakeEvent::Telegram)?)
     }
 }
 
 /// The publisher of a topic of bytes.
-pub(crate) struct Bytes {
+pub(crate) struct BytesSender {
     written: Option<SampleMut<[u8]>>,
     publisher: Publisher<[u8]>,
     _service: TopicService<[u8]>,
     contents: Vec<u8>,
-    hub: Hub,
+    hub: HubMembership,
 }
 
-impl Bytes {
-    pub(crate) fn new(task: &Task) -> Outcome<Bytes> {
-        let hub = Hub::new(task)?;
+impl BytesSender {
+    pub(crate) fn new(task: &RunParameters) -> Outcome<BytesSender> {
+        let hub = HubMembership::new(task)?;
         let service = hub
             .node
-            .service_builder(&ServiceName::new(SERVICE)?)
+            .service_builder(&ServiceName::new(SERVICE_NAME)?)
             .publish_subscribe::<[u8]>()
             .user_header::<Header>()
-            .max_publishers(limits::PUBLISHERS)
+            .max_publishers(limits::MAX_PUBLISHERS)
             .max_subscribers(TopicLimits::default().subscribers)
-            .max_nodes(limits::NODES)
-            .subscriber_max_buffer_size(limits::buffer(Topic::Scan))
-            .subscriber_max_borrowed_samples(limits::BORROWED)
-            .history_size(limits::history(Topic::Scan))
+            .max_nodes(limits::MAX_NODES)
+            .subscriber_max_buffer_size(limits::queue_len(Topic::Scan))
+            .subscriber_max_borrowed_samples(limits::MAX_BORROWED_SAMPLES)
+            .history_size(limits::history_len(Topic::Scan))
             .enable_safe_overflow(true)
             .create()?;
         let publisher = service
             .publisher_builder()
-            .max_loaned_samples(limits::LOANED)
+            .max_loaned_samples(limits::MAX_LOANED_SAMPLES)
             .override_sample_preallocation(|_| {
-                limits::samples(Topic::Scan, TopicLimits::default().subscribers)
+                limits::sample_count(Topic::Scan, TopicLimits::default().subscribers)
             })
             .initial_max_slice_len(task.payload)
             .create()?;
-        Ok(Bytes { written: None, publisher, _service: service, contents: contents(task.payload), hub })
+        Ok(BytesSender { written: None, publisher, _service: service, contents: contents(task.payload), hub })
     }
 
     /// Writes a message of this length into a loan.
@@ -81,7 +83,7 @@ impl Bytes {
     }
 }
 
-impl Outlet for Bytes {
+impl MessageSender for BytesSender {
     fn open(&mut self) -> Outcome<()> {
         Ok(())
     }
@@ -95,47 +97,47 @@ impl Outlet for Bytes {
     }
 
     fn end(&mut self, label: Label) -> Outcome<()> {
-        self.loan(label, SHORT)?;
+        self.loan(label, MIN_MESSAGE_LEN)?;
         self.send()
     }
 }
 
 /// A subscriber to the topic of bytes.
-pub(crate) struct BytesInlet {
+pub(crate) struct BytesReceiver {
     subscriber: Subscriber<[u8]>,
-    wait: Wait,
+    wait: WaitMethod,
     _node: Node,
 }
 
 /// How a subscriber waits, as in the client library.
-enum Wait {
+enum WaitMethod {
     /// The doorbell, its count when samples were last received, and whether the subscriber sleeps.
-    Bell(Bell, u32, bool),
+    Doorbell(Doorbell, u32, bool),
     /// The event, and whether wake-ups were taken since the last sleep.
     Event(Box<Listener>, bool),
 }
 
-impl BytesInlet {
-    pub(crate) fn new(task: &Task) -> Outcome<BytesInlet> {
+impl BytesReceiver {
+    pub(crate) fn new(task: &RunParameters) -> Outcome<BytesReceiver> {
         let node = scanhub_shm::client_node(&Domain::of_hub(task.domain, None, &Environment::of_process())?)?;
-        let wait = if task.way == Way::Event {
+        let wait = if task.mechanism == Mechanism::Event {
             let event = scanhub_shm::open_wake(&node, SENSOR)?.ok_or("no event")?;
-            Wait::Event(Box::new(scanhub_shm::listener(&node, &event)?), false)
+            WaitMethod::Event(Box::new(scanhub_shm::listener(&node, &event)?), false)
         } else {
-            let bell = Bell::open(&node, SENSOR)?.ok_or("no bell")?;
-            let rung = bell.rung(Ring::First);
-            Wait::Bell(bell, rung, task.way == Way::Doorbell)
+            let doorbell = Doorbell::open(&node, SENSOR)?.ok_or("no bell")?;
+            let rung = doorbell.ring_count(DoorbellWord::First);
+            WaitMethod::Doorbell(doorbell, rung, task.mechanism == Mechanism::Doorbell)
         };
         let service = node
-            .service_builder(&ServiceName::new(SERVICE)?)
+            .service_builder(&ServiceName::new(SERVICE_NAME)?)
             .publish_subscribe::<[u8]>()
             .user_header::<Header>()
             .open()?;
-        Ok(BytesInlet { subscriber: service.subscriber_builder().create()?, wait, _node: node })
+        Ok(BytesReceiver { subscriber: service.subscriber_builder().create()?, wait, _node: node })
     }
 }
 
-impl Inlet for BytesInlet {
+impl MessageReceiver for BytesReceiver {
     fn next(&mut self) -> Outcome<Label> {
         loop {
             if let Some(sample) = self.subscriber.receive()? {
@@ -146,27 +148,27 @@ impl Inlet for BytesInlet {
     }
 }
 
-impl Wait {
+impl WaitMethod {
     /// Sleeps or spins until there may be a sample; returns at once if one may have arrived since samples were last
     /// received.
     fn wait(&mut self) -> Outcome<()> {
         match self {
-            Wait::Bell(bell, rung, sleeps) => {
-                if bell.rung(Ring::First) == *rung && *sleeps {
-                    let until = clock::now() + LONG_NS;
-                    scanhub_shm::sleep_at_bells(&[(bell, Ring::First, *rung)], until)
+            WaitMethod::Doorbell(doorbell, rung, sleeps) => {
+                if doorbell.ring_count(DoorbellWord::First) == *rung && *sleeps {
+                    let until = clock::now() + STEP_TIMEOUT_NS;
+                    scanhub_shm::wait_on_doorbells(&[(doorbell, DoorbellWord::First, *rung)], until)
                         .map_err(|error| format!("{error:?}"))?;
                 }
-                while bell.rung(Ring::First) == *rung && !*sleeps {
+                while doorbell.ring_count(DoorbellWord::First) == *rung && !*sleeps {
                     std::hint::spin_loop();
                 }
-                *rung = bell.rung(Ring::First);
+                *rung = doorbell.ring_count(DoorbellWord::First);
                 Ok(())
             }
-            Wait::Event(listener, taken) => {
+            WaitMethod::Event(listener, taken) => {
                 *taken = !*taken && scanhub_shm::take_wakeups(&[listener])?;
                 if !*taken {
-                    scanhub_shm::sleep(&[listener], LONG)?;
+                    scanhub_shm::sleep(&[listener], STEP_TIMEOUT)?;
                 }
                 Ok(())
             }
@@ -175,36 +177,36 @@ impl Wait {
 }
 
 /// The publisher of the hub's topic of scans.
-pub(crate) struct Scans {
+pub(crate) struct ScanSender {
     written: Option<SampleMut<Scan>>,
     publisher: Publisher<Scan>,
     _service: TopicService<Scan>,
     next: u64,
-    hub: Hub,
+    hub: HubMembership,
 }
 
-impl Scans {
-    pub(crate) fn new(task: &Task) -> Outcome<Scans> {
-        let hub = Hub::new(task)?;
+impl ScanSender {
+    pub(crate) fn new(task: &RunParameters) -> Outcome<ScanSender> {
+        let hub = HubMembership::new(task)?;
         let limits = TopicLimits::default();
         let service = Scan::create(&hub.node, SENSOR, &limits)?;
         let publisher = Scan::publisher(&service, &limits)?;
-        Ok(Scans { written: None, publisher, _service: service, next: 0, hub })
+        Ok(ScanSender { written: None, publisher, _service: service, next: 0, hub })
     }
 }
 
-impl Outlet for Scans {
+impl MessageSender for ScanSender {
     fn open(&mut self) -> Outcome<()> {
         Ok(())
     }
 
     fn write(&mut self, label: Label) -> Outcome<()> {
-        let loan = Scan::loan(&self.publisher, SCAN).map_err(|error| format!("no loan: {error:?}"))?;
+        let loan = Scan::loan(&self.publisher, SCAN_LEN).map_err(|error| format!("no loan: {error:?}"))?;
         let sample = self.written.insert(loan);
         let kind = label.phase as u64 * 2 + u64::from(label.is_end);
         *sample.user_header_mut() =
             Header { seq: label.number, topic_seq: self.next, boot: 1, wall_ns: kind, ..Header::default() };
-        let arrays = Scan::write(sample).begin(ScanHead::lms(BEAMS, -90_000, 500, 1, 13));
+        let arrays = Scan::write(sample).begin(ScanHead::lms(BEAM_COUNT, -90_000, 500, 1, 13));
         arrays.ranges.fill(label.number as u16);
         self.next += 1;
         Ok(())
@@ -216,18 +218,18 @@ impl Outlet for Scans {
 }
 
 /// A subscriber to scans that uses the client library.
-pub(crate) struct ScansInlet(scanhub_client::Subscriber<Scan>);
+pub(crate) struct ScanReceiver(scanhub_client::Subscriber<Scan>);
 
-impl ScansInlet {
-    pub(crate) fn new(task: &Task) -> Outcome<ScansInlet> {
-        let mut scans = consumer::subscribe::<Scan>(task.domain, SENSOR)?;
+impl ScanReceiver {
+    pub(crate) fn new(task: &RunParameters) -> Outcome<ScanReceiver> {
+        let mut scans = subscriber::subscribe::<Scan>(task.domain, SENSOR)?;
         // Joins the domain; no message has been sent yet.
         scans.try_next()?;
-        Ok(ScansInlet(scans))
+        Ok(ScanReceiver(scans))
     }
 }
 
-impl Inlet for ScansInlet {
+impl MessageReceiver for ScanReceiver {
     fn next(&mut self) -> Outcome<Label> {
         let scan = self.0.next()?.ok_or("no scan")?;
         let Header { seq: number, wall_ns: kind, .. } = *scan.header();
@@ -241,6 +243,6 @@ impl Inlet for ScansInlet {
 
 /// The sensor whose subscribers are woken.
 pub(crate) const SENSOR: &str = "front";
-const SERVICE: &str = "compare";
-const LONG: std::time::Duration = std::time::Duration::from_secs(10);
-const LONG_NS: u64 = 10_000_000_000;
+const SERVICE_NAME: &str = "compare";
+const STEP_TIMEOUT: std::time::Duration = std::time::Duration::from_secs(10);
+const STEP_TIMEOUT_NS: u64 = 10_000_000_000;

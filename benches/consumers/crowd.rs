@@ -10,18 +10,18 @@ use std::time::Duration;
 use scanhub_client::Wait;
 use scanhub_schema::Scan;
 
-use crate::growth::{Quantity, Sweep};
-use crate::support::consumer::builder;
+use crate::growth::{ParameterRange, Quantity};
+use crate::support::environment::{BenchEnvironment, Child, SENSORS, STEP_TIMEOUT};
 use crate::support::figures::{self, Cell, Figure, Target, percentile};
-use crate::support::stage::{Child, PATIENCE, SENSORS, Stage};
-use crate::support::truth::Truth;
-use crate::support::usage::{Resident, Work, segments};
+use crate::support::subscriber::builder;
+use crate::support::truth::SensorTruth;
+use crate::support::usage::{ResidentMemory, ThreadUsage, segments};
 use crate::support::{Options, Outcome, clock};
 
 /// Measures 1 to 200 subscribers, for each way to wait.
-pub(crate) fn consumers(options: &Options) -> Outcome<()> {
-    let stage = Stage::new()?;
-    let _simulator = stage.simulate(&[SENSOR], 500_000)?;
+pub(crate) fn measure_subscribers(options: &Options) -> Outcome<()> {
+    let environment = BenchEnvironment::new()?;
+    let _simulator = environment.simulate(&[SENSOR], 500_000)?;
     for wait in ["doorbell", "event"] {
         let quantity = |name, unit, linear| Quantity { name, unit, linear };
         let quantities = vec![
@@ -33,18 +33,18 @@ pub(crate) fn consumers(options: &Options) -> Outcome<()> {
             quantity("shared memory of the domain", "kB", Some(1.0)),
             quantity("missed", "1", None),
         ];
-        let mut sweep = Sweep::new(
+        let mut sweep = ParameterRange::new(
             &format!("subscribers of one sensor, waiting for the {wait}"),
             "subscribers",
             quantities,
         );
         for _ in 0..options.pairs().min(3) {
             // One hub for all numbers: subscribers that leave give their memory back.
-            let hub = stage.hub_for_crowd(&[SENSOR])?;
-            hub.await_line("ready", PATIENCE)?;
+            let hub = environment.hub_with_many_slots(&[SENSOR])?;
+            hub.wait_for_line("ready", STEP_TIMEOUT)?;
             let mut runs = Vec::new();
-            for count in CONSUMERS {
-                match run(&stage, &hub, count, options.seconds(8), wait) {
+            for count in SUBSCRIBER_COUNTS {
+                match run(&environment, &hub, count, options.seconds(8), wait) {
                     Ok(values) => runs.push((count, values)),
                     // An overloaded machine wakes too few of them in time.
                     Err(error) => eprintln!("{count} subscribers, waiting for the {wait}: {error}"),
@@ -61,11 +61,17 @@ pub(crate) fn consumers(options: &Options) -> Outcome<()> {
 /// Subscribes to the scans of `sensor` `count` times, and receives for `seconds` from the moment at which each
 /// subscriber has a scan. Prints for each scan how many subscribers got it and when the last one did, `last SEQ COUNT
 /// AGE_NS`, and `missed COUNT`.
-pub(crate) fn follow(domain: &str, sensor: &str, count: usize, seconds: u64, wait: &str) -> Outcome<()> {
+pub(crate) fn subscribe_many(
+    domain: &str,
+    sensor: &str,
+    count: usize,
+    seconds: u64,
+    wait: &str,
+) -> Outcome<()> {
     let wait = if wait == "event" { Wait::Event } else { Wait::Doorbell };
     let all = Barrier::new(count + 1);
     let follow = || -> Result<(Vec<(u64, u64)>, u64), String> {
-        let attached = builder::<Scan>(domain, sensor).wait(wait).timeout(PATIENCE).open();
+        let attached = builder::<Scan>(domain, sensor).wait(wait).timeout(STEP_TIMEOUT).open();
         let attached = attached.map_err(Into::into).and_then(|mut scans| -> Outcome<_> {
             scans.next()?.map(drop).map_or(Err("no scan arrived".into()), |()| Ok(scans))
         });
@@ -106,31 +112,51 @@ pub(crate) fn follow(domain: &str, sensor: &str, count: usize, seconds: u64, wai
 }
 
 /// Starts `count` subscribers in a few processes, and waits until each has a scan.
-fn start(stage: &Stage, sensor: &str, count: usize, seconds: u64, wait: &str) -> Outcome<Vec<Child>> {
-    let processes = PROCESSES.min(count);
+fn start(
+    environment: &BenchEnvironment,
+    sensor: &str,
+    count: usize,
+    seconds: u64,
+    wait: &str,
+) -> Outcome<Vec<Child>> {
+    let processes = PROCESS_COUNT.min(count);
     let part = |number: usize| {
         let share = (count * (number + 1) / processes - count * number / processes).to_string();
-        stage.part(&["followers", stage.domain.name(), sensor, &share, &seconds.to_string(), wait])
+        environment.start_part(&[
+            "followers",
+            environment.domain.name(),
+            sensor,
+            &share,
+            &seconds.to_string(),
+            wait,
+        ])
     };
     let crowd: Vec<Child> = (0..processes).map(part).collect::<Outcome<_>>()?;
-    crowd.iter().try_for_each(|child| child.await_line("following", PATIENCE).map(drop))?;
+    crowd.iter().try_for_each(|child| child.wait_for_line("following", STEP_TIMEOUT).map(drop))?;
     Ok(crowd)
 }
 
 /// Returns the values of the sweep for `count` subscribers.
-fn run(stage: &Stage, hub: &Child, count: usize, seconds: u64, wait: &str) -> Outcome<[f64; 7]> {
-    let crowd = start(stage, SENSOR, count, seconds, wait)?;
+fn run(
+    environment: &BenchEnvironment,
+    hub: &Child,
+    count: usize,
+    seconds: u64,
+    wait: &str,
+) -> Outcome<[f64; 7]> {
+    let crowd = start(environment, SENSOR, count, seconds, wait)?;
     // Ends before the first subscriber leaves.
-    let look = || -> Outcome<(u64, Work)> { Ok((clock::now(), Work::of(hub.guard.pid(), |_| true)?)) };
+    let look =
+        || -> Outcome<(u64, ThreadUsage)> { Ok((clock::now(), ThreadUsage::of(hub.guard.pid(), |_| true)?)) };
     let before = look()?;
     thread::sleep(Duration::from_millis(900 * seconds));
     let after = look()?;
-    let memory = Resident::of(hub.guard.pid())?;
-    let shared: f64 = segments(&stage.domain)?.values().map(|(_, bytes)| bytes).sum();
-    let telegrams = Truth::read(&stage.truth(), SENSOR)?.count(before.0, after.0);
+    let memory = ResidentMemory::of(hub.guard.pid())?;
+    let shared: f64 = segments(&environment.domain)?.values().map(|(_, bytes)| bytes).sum();
+    let telegrams = SensorTruth::read(&environment.truth(), SENSOR)?.count(before.0, after.0);
     let (mut last, mut missed) = (BTreeMap::<u64, (u64, u64)>::new(), 0);
     for child in &crowd {
-        for line in child.lines_until("end", PATIENCE + Duration::from_secs(seconds))? {
+        for line in child.lines_until("end", STEP_TIMEOUT + Duration::from_secs(seconds))? {
             if line.text.starts_with("missed") {
                 missed += line.number(1)?;
                 continue;
@@ -147,7 +173,7 @@ fn run(stage: &Stage, hub: &Child, count: usize, seconds: u64, wait: &str) -> Ou
         after.1.since(before.1).busy_ns as f64 / 1e3 / telegrams as f64,
         at(0.5)?,
         at(0.99)?,
-        memory.own / 1024.0,
+        memory.heap_and_stacks / 1024.0,
         memory.shared / 1024.0,
         shared / 1024.0,
         missed as f64,
@@ -155,35 +181,37 @@ fn run(stage: &Stage, hub: &Child, count: usize, seconds: u64, wait: &str) -> Ou
 }
 
 const SENSOR: &str = "front";
-const CONSUMERS: [usize; 5] = [1, 4, 16, 64, 200];
-const PROCESSES: usize = 4;
+const SUBSCRIBER_COUNTS: [usize; 5] = [1, 4, 16, 64, 200];
+const PROCESS_COUNT: usize = 4;
 
 /// Number and bytes of files, by the ends of their names.
-type Kinds = BTreeMap<String, (usize, f64)>;
+type SegmentSizes = BTreeMap<String, (usize, f64)>;
 
 /// Measures the memory of a hub with two links and 100 subscribers to the scans of each.
-pub(crate) fn memory(options: &Options) -> Outcome<()> {
-    let stage = Stage::new()?;
-    let _simulator = stage.simulate(&SENSORS, 500_000)?;
-    let hub = stage.hub_for_crowd(&SENSORS)?;
-    hub.await_line("ready", PATIENCE)?;
-    let alone = segments(&stage.domain)?;
+pub(crate) fn measure_memory(options: &Options) -> Outcome<()> {
+    let environment = BenchEnvironment::new()?;
+    let _simulator = environment.simulate(&SENSORS, 500_000)?;
+    let hub = environment.hub_with_many_slots(&SENSORS)?;
+    hub.wait_for_line("ready", STEP_TIMEOUT)?;
+    let alone = segments(&environment.domain)?;
     // They stay until they are ended, so that the first ones are still attached when the last ones are.
     let (seconds, long) = (options.seconds(8), 3600);
-    let crowds: Vec<_> =
-        SENSORS.iter().map(|sensor| start(&stage, sensor, 100, long, "doorbell")).collect::<Outcome<_>>()?;
+    let crowds: Vec<_> = SENSORS
+        .iter()
+        .map(|sensor| start(&environment, sensor, 100, long, "doorbell"))
+        .collect::<Outcome<_>>()?;
     thread::sleep(Duration::from_secs(seconds));
-    let resident = Resident::of(hub.guard.pid())?;
-    let full = segments(&stage.domain)?;
+    let resident = ResidentMemory::of(hub.guard.pid())?;
+    let full = segments(&environment.domain)?;
     drop(crowds);
     let figure = |name, bytes: f64, target| {
         let hub = vec![bytes / 1024.0 / 1024.0];
         Figure { name, unit: "MiB", hub, baseline: Vec::new(), target }
     };
-    let sum = |kinds: &Kinds| kinds.values().map(|(_, bytes)| bytes).sum();
+    let sum = |kinds: &SegmentSizes| kinds.values().map(|(_, bytes)| bytes).sum();
     let rows = [
-        figure("resident, 2 links, 200 subscribers", resident.all, Target::Most(16.0)),
-        figure("of this, own", resident.own, Target::None),
+        figure("resident, 2 links, 200 subscribers", resident.all, Target::Max(16.0)),
+        figure("of this, own", resident.heap_and_stacks, Target::None),
         figure("of this, program and libraries", resident.files, Target::None),
         figure("of this, shared memory touched", resident.shared, Target::None),
         figure("shared memory, no subscriber", sum(&alone), Target::None),
@@ -195,7 +223,7 @@ pub(crate) fn memory(options: &Options) -> Outcome<()> {
     Ok(())
 }
 
-fn cells(when: &str, kinds: &Kinds) -> Vec<Cell> {
+fn cells(when: &str, segments: &SegmentSizes) -> Vec<Cell> {
     let cell = |kind: &String, column: &str, unit, value| Cell {
         table: format!("shared memory of two links, {when}"),
         row: format!(".{kind}"),
@@ -206,5 +234,5 @@ fn cells(when: &str, kinds: &Kinds) -> Vec<Cell> {
     let row = |(kind, (count, bytes)): (&String, &(usize, f64))| {
         [cell(kind, "segments", "1", *count as f64), cell(kind, "taken", "kB", bytes / 1024.0)]
     };
-    kinds.iter().flat_map(row).collect()
+    segments.iter().flat_map(row).collect()
 }

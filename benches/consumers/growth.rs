@@ -12,7 +12,7 @@ pub(crate) struct Quantity {
 }
 
 /// Values of several quantities, measured for several numbers.
-pub(crate) struct Sweep {
+pub(crate) struct ParameterRange {
     title: String,
     /// What is counted.
     counted: &'static str,
@@ -26,15 +26,15 @@ pub(crate) struct Sweep {
 struct Growth {
     /// Parameters of `fixed + each * n`, by least squares of relative errors.
     fixed: f64,
-    each: f64,
+    per_item: f64,
     /// Slope of the logarithms for large numbers: 1 for a quantity that grows linearly.
     exponent: f64,
 }
 
-impl Sweep {
+impl ParameterRange {
     /// Creates a sweep without values.
-    pub(crate) fn new(title: &str, counted: &'static str, quantities: Vec<Quantity>) -> Sweep {
-        Sweep { title: title.to_owned(), counted, quantities, rows: Vec::new() }
+    pub(crate) fn new(title: &str, counted: &'static str, quantities: Vec<Quantity>) -> ParameterRange {
+        ParameterRange { title: title.to_owned(), counted, quantities, rows: Vec::new() }
     }
 
     /// Adds the values of one run with `number`: one for each quantity, in their order.
@@ -77,7 +77,7 @@ impl Sweep {
             };
             let columns = [
                 ("fixed", quantity.unit, growth.fixed),
-                ("for each", quantity.unit, growth.each),
+                ("for each", quantity.unit, growth.per_item),
                 ("exponent", "1", growth.exponent),
                 ("exponent of linear growth", "1", linear),
             ];
@@ -88,7 +88,7 @@ impl Sweep {
                 unit,
                 values: vec![value],
             }));
-            if !json && growth.exponent > linear + BEYOND {
+            if !json && growth.exponent > linear + EXPONENT_TOLERANCE {
                 println!("{}: {} grows WORSE THAN LINEARLY", self.title, quantity.name);
             }
         }
@@ -113,14 +113,14 @@ impl Growth {
         if points.len() < 3 || points.iter().any(|&(n, value)| n <= 0.0 || value <= 0.0) {
             return None;
         }
-        let (fixed, each) = line(points.iter().map(|&(n, value)| (n, value, 1.0 / (value * value))))?;
-        let far = points.iter().filter(|(n, _)| n * FAR >= greatest);
+        let (fixed, per_item) = line(points.iter().map(|&(n, value)| (n, value, 1.0 / (value * value))))?;
+        let far = points.iter().filter(|(n, _)| n * LARGE_FACTOR >= greatest);
         let near = points.len().saturating_sub(3);
         // At least three, or the slope would be the spread of two runs.
         let far: Vec<_> =
             if far.clone().count() < 3 { points[near..].to_vec() } else { far.copied().collect() };
         let (_, exponent) = line(far.iter().map(|(n, value)| (n.ln(), value.ln(), 1.0)))?;
-        Some(Growth { fixed, each, exponent })
+        Some(Growth { fixed, per_item, exponent })
     }
 }
 
@@ -140,6 +140,6 @@ fn line(points: impl Iterator<Item = (f64, f64, f64)>) -> Option<(f64, f64)> {
 }
 
 /// Numbers within this factor of the largest one count as large.
-const FAR: f64 = 16.0;
+const LARGE_FACTOR: f64 = 16.0;
 /// An exponent that is larger than that of linear growth by this much is not explained by the spread of a few runs.
-const BEYOND: f64 = 0.25;
+const EXPONENT_TOLERANCE: f64 = 0.25;

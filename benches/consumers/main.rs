@@ -41,10 +41,10 @@ use std::time::Duration;
 
 use rustix::process::{Pid, Signal, kill_process};
 use scanhub_schema::{Counter, Status};
+use support::environment::{BenchEnvironment, Child, OutputLine, STEP_TIMEOUT};
 use support::figures::{self, Figure, Target};
-use support::stage::{Child, Line, PATIENCE, Stage};
-use support::usage::{Resident, Work};
-use support::{Options, Outcome, consumer};
+use support::usage::{ResidentMemory, ThreadUsage};
+use support::{Options, Outcome, subscriber};
 
 fn main() -> ExitCode {
     let play = |words: &[&str]| match *words {
@@ -53,101 +53,110 @@ fn main() -> ExitCode {
             sensors::drive(begin.as_ref(), beams.parse()?, sensors.parse()?, telegrams.parse()?, followed)
         }
         ["followers", domain, sensor, count, seconds, wait] => {
-            crowd::follow(domain, sensor, count.parse()?, seconds.parse()?, wait)
+            crowd::subscribe_many(domain, sensor, count.parse()?, seconds.parse()?, wait)
         }
-        _ => support::play(words),
+        _ => support::run_part(words),
     };
     support::main_with(play, measure)
 }
 
 fn measure(options: &Options) -> Outcome<()> {
     faults(options)?;
-    sensors::in_virtual_time(options)?;
-    sensors::beams_in_virtual_time(options)?;
-    crowd::consumers(options)?;
-    crowd::memory(options)?;
-    sensors::on_lines(options)
+    sensors::measure_virtual_time(options)?;
+    sensors::measure_variants(options)?;
+    crowd::measure_subscribers(options)?;
+    crowd::measure_memory(options)?;
+    sensors::measure_lines(options)
 }
 
 /// Measures a crowd, and what broken subscribers do to the others.
 fn faults(options: &Options) -> Outcome<()> {
-    let stage = Stage::new()?;
-    let _simulator = stage.simulate(&[SENSOR], 500_000)?;
-    let hub = stage.hub_for_crowd(&[SENSOR])?;
-    hub.await_line("ready", PATIENCE)?;
-    let mut figures = crowd(&stage, &hub, options.count(100), options.seconds(20))?;
-    figures.extend(kills(&stage, &hub)?);
-    figures.extend(stop(&stage)?);
-    figures.extend(places(&stage)?);
+    let environment = BenchEnvironment::new()?;
+    let _simulator = environment.simulate(&[SENSOR], 500_000)?;
+    let hub = environment.hub_with_many_slots(&[SENSOR])?;
+    hub.wait_for_line("ready", STEP_TIMEOUT)?;
+    let mut figures = measure_crowd(&environment, &hub, options.count(100), options.seconds(20))?;
+    figures.extend(measure_kills(&environment, &hub)?);
+    figures.extend(measure_stopped(&environment)?);
+    figures.extend(fill_slots(&environment)?);
     // Requesting a status needs a place, and the crowd has left by now.
-    thread::sleep(CLEANED);
-    let failed = counter(&stage, Counter::LoanFailed)?;
-    figures.push(figure("samples without memory", "1", failed, Target::Most(0.0)));
+    thread::sleep(CLEANUP_TIMEOUT);
+    let failed = counter(&environment, Counter::LoanFailed)?;
+    figures.push(figure("samples without memory", "1", failed, Target::Max(0.0)));
     figures::print("consumers", options.json, &figures);
     Ok(())
 }
 
 /// Measures `count` subscribers for `seconds`.
-fn crowd(stage: &Stage, hub: &Child, count: usize, seconds: u64) -> Outcome<Vec<Figure>> {
-    let before = attaching(stage)?;
-    let each = count.div_ceil(PROCESSES).to_string();
-    let start = |_| stage.part(&["crowd", stage.domain.name(), SENSOR, &each, &seconds.to_string()]);
-    let crowd: Vec<Child> = (0..PROCESSES).map(start).collect::<Outcome<_>>()?;
+fn measure_crowd(
+    environment: &BenchEnvironment,
+    hub: &Child,
+    count: usize,
+    seconds: u64,
+) -> Outcome<Vec<Figure>> {
+    let before = start_subscriber(environment)?;
+    let each = count.div_ceil(PROCESS_COUNT).to_string();
+    let start = |_| {
+        environment.start_part(&["crowd", environment.domain.name(), SENSOR, &each, &seconds.to_string()])
+    };
+    let crowd: Vec<Child> = (0..PROCESS_COUNT).map(start).collect::<Outcome<_>>()?;
     for child in &crowd {
-        child.await_line("following", PATIENCE)?;
+        child.wait_for_line("following", STEP_TIMEOUT)?;
     }
-    let (from, telegrams) = (Work::of(hub.guard.pid(), |_| true)?, counter(stage, Counter::Telegrams)?);
+    let (from, telegrams) =
+        (ThreadUsage::of(hub.guard.pid(), |_| true)?, counter(environment, Counter::Telegrams)?);
     let mut lines = Vec::new();
     for child in &crowd {
-        lines.extend(child.lines_until("end", PATIENCE + Duration::from_secs(seconds))?);
+        lines.extend(child.lines_until("end", STEP_TIMEOUT + Duration::from_secs(seconds))?);
     }
-    let work = Work::of(hub.guard.pid(), |_| true)?.since(from);
-    let telegrams = counter(stage, Counter::Telegrams)? - telegrams;
-    let sum = |i| lines.iter().map(|line: &Line| line.number(i)).sum::<Outcome<u64>>().map(|sum| sum as f64);
+    let work = ThreadUsage::of(hub.guard.pid(), |_| true)?.since(from);
+    let telegrams = counter(environment, Counter::Telegrams)? - telegrams;
+    let sum =
+        |i| lines.iter().map(|line: &OutputLine| line.number(i)).sum::<Outcome<u64>>().map(|sum| sum as f64);
     let [received, missed, published] = [sum(1)?, sum(2)?, sum(3)?];
     drop(before);
     Ok(vec![
         figure("subscribers", "1", lines.len() as f64, Target::None),
         figure("scans received by them", "1", received, Target::None),
-        figure("missed", "1", missed, Target::Most(0.0)),
-        figure("not accounted for", "1", (published - received - missed).abs(), Target::Most(0.0)),
+        figure("missed", "1", missed, Target::Max(0.0)),
+        figure("not accounted for", "1", (published - received - missed).abs(), Target::Max(0.0)),
         figure("CPU time of the hub per telegram", "us", work.busy_ns as f64 / 1e3 / telegrams, Target::None),
     ])
 }
 
 /// Kills a process that holds samples, again and again.
-fn kills(stage: &Stage, hub: &Child) -> Outcome<Vec<Figure>> {
-    let witness = attaching(stage)?;
+fn measure_kills(environment: &BenchEnvironment, hub: &Child) -> Outcome<Vec<Figure>> {
+    let witness = start_subscriber(environment)?;
     let open = || -> Outcome<usize> { Ok(fs::read_dir(format!("/proc/{}/fd", hub.guard.pid()))?.count()) };
     let segments = || -> Outcome<usize> {
         let entries = fs::read_dir("/dev/shm")?.flatten();
-        let prefix = stage.domain.prefix();
+        let prefix = environment.domain.prefix();
         Ok(entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(&prefix)).count())
     };
-    thread::sleep(CLEANED);
+    thread::sleep(CLEANUP_TIMEOUT);
     let before = (open()?, segments()?, resident(hub)?);
     let mut held = 0;
-    for _ in 0..KILLS {
-        let holder = stage.part(&["hold", stage.domain.name(), SENSOR, "12"])?;
-        held += holder.await_line("holding", PATIENCE)?.number(1)?;
+    for _ in 0..KILL_COUNT {
+        let holder = environment.start_part(&["hold", environment.domain.name(), SENSOR, "12"])?;
+        held += holder.wait_for_line("holding", STEP_TIMEOUT)?.number(1)?;
         holder.guard.kill()?;
     }
-    thread::sleep(CLEANED);
+    thread::sleep(CLEANUP_TIMEOUT);
     let after = (open()?, segments()?, resident(hub)?);
     let grown = |before: usize, after: usize| after as f64 - before as f64;
     Ok(vec![
         figure("samples held by killed processes", "1", held as f64, Target::None),
-        figure("missed by the witness", "1", missed(&witness)?, Target::Most(0.0)),
-        figure("more descriptors of the hub", "1", grown(before.0, after.0), Target::Most(0.0)),
-        figure("more segments", "1", grown(before.1, after.1), Target::Most(0.0)),
-        figure("more resident memory of the hub", "kB", grown(before.2, after.2), Target::Most(64.0)),
+        figure("missed by the witness", "1", missed(&witness)?, Target::Max(0.0)),
+        figure("more descriptors of the hub", "1", grown(before.0, after.0), Target::Max(0.0)),
+        figure("more segments", "1", grown(before.1, after.1), Target::Max(0.0)),
+        figure("more resident memory of the hub", "kB", grown(before.2, after.2), Target::Max(64.0)),
     ])
 }
 
 /// Stops a subscriber for two seconds.
-fn stop(stage: &Stage) -> Outcome<Vec<Figure>> {
+fn measure_stopped(environment: &BenchEnvironment) -> Outcome<Vec<Figure>> {
     // The witness attached before, and reports everything that was published.
-    let (witness, stopped) = (attaching(stage)?, attaching(stage)?);
+    let (witness, stopped) = (start_subscriber(environment)?, start_subscriber(environment)?);
     let pid = Pid::from_raw(stopped.guard.pid() as i32).ok_or("no process")?;
     thread::sleep(Duration::from_secs(1));
     kill_process(pid, Signal::STOP)?;
@@ -155,7 +164,7 @@ fn stop(stage: &Stage) -> Outcome<Vec<Figure>> {
     kill_process(pid, Signal::CONT)?;
     thread::sleep(Duration::from_secs(1));
     let (stopped, witness) = (measured(&stopped), measured(&witness));
-    let read = |line: &Line| line.number(7);
+    let read = |line: &OutputLine| line.number(7);
     let span = read(stopped.first().ok_or("no telegram arrived")?)?
         ..=read(stopped.last().ok_or("no telegram arrived")?)?;
     let mut published = 0.0;
@@ -169,28 +178,28 @@ fn stop(stage: &Stage) -> Outcome<Vec<Figure>> {
             "of these not reported",
             "1",
             (published - stopped.len() as f64 - lost).abs(),
-            Target::Most(0.0),
+            Target::Max(0.0),
         ),
-        figure("missed by the witness of the stop", "1", others, Target::Most(0.0)),
+        figure("missed by the witness of the stop", "1", others, Target::Max(0.0)),
     ])
 }
 
 /// Takes all places of a topic, and one more.
-fn places(stage: &Stage) -> Outcome<Vec<Figure>> {
-    let crowd = stage.part(&["stay", stage.domain.name(), SENSOR, "210"])?;
-    let refused = crowd.await_line("refused", 6 * PATIENCE)?;
+fn fill_slots(environment: &BenchEnvironment) -> Outcome<Vec<Figure>> {
+    let crowd = environment.start_part(&["stay", environment.domain.name(), SENSOR, "210"])?;
+    let refused = crowd.wait_for_line("refused", 6 * STEP_TIMEOUT)?;
     eprintln!("{}", refused.text);
     Ok(vec![figure("subscribers before one was refused", "1", refused.number(1)? as f64, Target::None)])
 }
 
 /// Starts a subscriber to telegrams that prints each of them, and waits for the first.
-fn attaching(stage: &Stage) -> Outcome<Child> {
-    let consumer = stage.consumer("telegram", SENSOR, &["0"])?;
-    consumer.await_line("telegram", PATIENCE)?;
-    Ok(consumer)
+fn start_subscriber(environment: &BenchEnvironment) -> Outcome<Child> {
+    let subscriber = environment.start_subscriber("telegram", SENSOR, &["0"])?;
+    subscriber.wait_for_line("telegram", STEP_TIMEOUT)?;
+    Ok(subscriber)
 }
 
-fn measured(consumer: &Child) -> Vec<Line> {
+fn measured(consumer: &Child) -> Vec<OutputLine> {
     consumer.lines_so_far().into_iter().filter(|line| line.text.starts_with("telegram")).collect()
 }
 
@@ -198,18 +207,19 @@ fn missed(consumer: &Child) -> Outcome<f64> {
     sum_of_missed(&measured(consumer))
 }
 
-fn sum_of_missed(lines: &[Line]) -> Outcome<f64> {
+fn sum_of_missed(lines: &[OutputLine]) -> Outcome<f64> {
     lines.iter().map(|line| line.number(4)).sum::<Outcome<u64>>().map(|sum| sum as f64)
 }
 
-fn counter(stage: &Stage, counter: Counter) -> Outcome<f64> {
-    let mut status = consumer::builder::<Status>(stage.domain.name(), SENSOR).timeout(PATIENCE).open()?;
+fn counter(stage: &BenchEnvironment, counter: Counter) -> Outcome<f64> {
+    let mut status =
+        subscriber::builder::<Status>(stage.domain.name(), SENSOR).timeout(STEP_TIMEOUT).open()?;
     Ok(status.next()?.ok_or("no status")?.counters[counter] as f64)
 }
 
 /// Returns the resident memory of the hub in kB, without shared memory.
 fn resident(hub: &Child) -> Outcome<usize> {
-    Ok((Resident::of(hub.guard.pid())?.own / 1024.0) as usize)
+    Ok((ResidentMemory::of(hub.guard.pid())?.heap_and_stacks / 1024.0) as usize)
 }
 
 fn figure(name: &'static str, unit: &'static str, value: f64, target: Target) -> Figure {
@@ -217,7 +227,7 @@ fn figure(name: &'static str, unit: &'static str, value: f64, target: Target) ->
 }
 
 const SENSOR: &str = "front";
-const PROCESSES: usize = 4;
-const KILLS: usize = 20;
+const PROCESS_COUNT: usize = 4;
+const KILL_COUNT: usize = 20;
 /// Time after which the remains of dead processes are certainly removed: the hub does it every 5 s.
-const CLEANED: Duration = Duration::from_secs(12);
+const CLEANUP_TIMEOUT: Duration = Duration::from_secs(12);

@@ -9,27 +9,27 @@ use rustix::time::{ClockId, clock_gettime};
 use scanhub_config::{Config, Sources};
 use scanhub_drivers::lms::measured;
 use scanhub_drivers::lms::telegram::STX;
-use scanhub_drivers::lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
+use scanhub_drivers::lms::variant::{MIRROR_PERIOD, Mode, Unit, Variant};
 use scanhub_schema::{Background, Failure, Foreground, Kind, Marks, Nanos, Scan, Status, Zones};
 use scanhub_shm::{Node, Payload, Subscriber};
 use scanhub_sim::room::Room;
 
-use crate::growth::{Quantity, Sweep};
+use crate::growth::{ParameterRange, Quantity};
+use crate::support::environment::{BenchEnvironment, Child, STEP_TIMEOUT};
 use crate::support::figures::{self, Figure, Target, percentile};
-use crate::support::stage::{Child, PATIENCE, Stage};
-use crate::support::truth::Truth;
-use crate::support::usage::{Resident, Work, segments};
+use crate::support::truth::SensorTruth;
+use crate::support::usage::{ResidentMemory, ThreadUsage, segments};
 use crate::support::{Options, Outcome, clock};
 use crate::virtual_hub::{VirtualLink, virtual_hub};
 
 /// Numbers of sensors on lines.
-const ON_LINES: [usize; 5] = [1, 2, 4, 8, 16];
+const LINE_SENSOR_COUNTS: [usize; 5] = [1, 2, 4, 8, 16];
 /// Scans of a sensor on a line that do not count.
-const SETTLING: usize = 80;
+const SKIPPED_SCANS: usize = 80;
 
 /// Measures 1 to 16 sensors, each with its own simulator at the other end of a pty and a subscriber to its scans. The
 /// rate shows whether simulators and hub, on the same processors, keep up with the sensors.
-pub(crate) fn on_lines(options: &Options) -> Outcome<()> {
+pub(crate) fn measure_lines(options: &Options) -> Outcome<()> {
     let quantity = |name, unit, linear| Quantity { name, unit, linear };
     let quantities = vec![
         quantity("CPU time per telegram", "us", Some(0.0)),
@@ -40,8 +40,8 @@ pub(crate) fn on_lines(options: &Options) -> Outcome<()> {
         quantity("shared memory of the domain", "kB", Some(1.0)),
         quantity("rate of the slowest sensor", "Hz", None),
     ];
-    let mut sweep = Sweep::new("sensors on ptys", "sensors", quantities);
-    for sensors in ON_LINES {
+    let mut sweep = ParameterRange::new("sensors on ptys", "sensors", quantities);
+    for sensors in LINE_SENSOR_COUNTS {
         for _ in 0..options.pairs().min(3) {
             match run_on_lines(sensors, options.seconds(10)) {
                 Ok(values) => sweep.add(sensors, &values),
@@ -55,39 +55,43 @@ pub(crate) fn on_lines(options: &Options) -> Outcome<()> {
 
 /// Returns the values of the sweep.
 fn run_on_lines(sensors: usize, seconds: u64) -> Outcome<[f64; 7]> {
-    let stage = Stage::new()?;
+    let environment = BenchEnvironment::new()?;
     let names: Vec<String> = (0..sensors).map(|number| format!("s{number}")).collect();
     let names: Vec<&str> = names.iter().map(String::as_str).collect();
-    let _simulators: Vec<Child> =
-        names.iter().map(|name| stage.simulate_one(name, &["--baud", "500000"])).collect::<Outcome<_>>()?;
-    let hub = stage.hub(&names)?;
-    hub.await_line("ready", PATIENCE)?;
-    let count = SETTLING + (seconds as f64 * RATE) as usize;
-    let start = |name: &&str| stage.part(&["ages", stage.domain.name(), name, &count.to_string()]);
-    let consumers: Vec<Child> = names.iter().map(start).collect::<Outcome<_>>()?;
-    let patience = PATIENCE + Duration::from_secs(4 * seconds);
+    let _simulators: Vec<Child> = names
+        .iter()
+        .map(|name| environment.simulate_one(name, &["--baud", "500000"]))
+        .collect::<Outcome<_>>()?;
+    let hub = environment.start_hub(&names)?;
+    hub.wait_for_line("ready", STEP_TIMEOUT)?;
+    let count = SKIPPED_SCANS + (seconds as f64 * SCAN_RATE_HZ) as usize;
+    let start =
+        |name: &&str| environment.start_part(&["ages", environment.domain.name(), name, &count.to_string()]);
+    let subscribers: Vec<Child> = names.iter().map(start).collect::<Outcome<_>>()?;
+    let patience = STEP_TIMEOUT + Duration::from_secs(4 * seconds);
     // Wait until all sensors stream and the timing of each line is known.
-    for consumer in &consumers {
-        consumer.await_line("attaching", PATIENCE)?;
+    for subscriber in &subscribers {
+        subscriber.wait_for_line("attaching", STEP_TIMEOUT)?;
     }
-    thread::sleep(Duration::from_millis((SETTLING as f64 / RATE * 1e3) as u64));
-    let look = || -> Outcome<(u64, Work)> { Ok((clock::now(), Work::of(hub.guard.pid(), |_| true)?)) };
+    thread::sleep(Duration::from_millis((SKIPPED_SCANS as f64 / SCAN_RATE_HZ * 1e3) as u64));
+    let look =
+        || -> Outcome<(u64, ThreadUsage)> { Ok((clock::now(), ThreadUsage::of(hub.guard.pid(), |_| true)?)) };
     let before = look()?;
     thread::sleep(Duration::from_secs(seconds));
     let after = look()?;
-    let memory = Resident::of(hub.guard.pid())?;
-    let shared: f64 = segments(&stage.domain)?.values().map(|(_, bytes)| bytes).sum();
+    let memory = ResidentMemory::of(hub.guard.pid())?;
+    let shared: f64 = segments(&environment.domain)?.values().map(|(_, bytes)| bytes).sum();
     let mut ages = Vec::new();
-    for consumer in &consumers {
-        let lines = consumer.lines_until("end", patience)?;
-        for line in lines.iter().filter(|line| line.text.starts_with("aged")).skip(SETTLING) {
+    for subscriber in &subscribers {
+        let lines = subscriber.lines_until("end", patience)?;
+        for line in lines.iter().filter(|line| line.text.starts_with("aged")).skip(SKIPPED_SCANS) {
             ages.push(line.number(2)? as f64 / 1e3);
         }
     }
     ages.sort_by(f64::total_cmp);
     let mut counts = Vec::new();
     for name in &names {
-        counts.push(Truth::read(&stage.own_truth(name), name)?.count(before.0, after.0));
+        counts.push(SensorTruth::read(&environment.own_truth(name), name)?.count(before.0, after.0));
     }
     let slowest = *counts.iter().min().ok_or("no sensor")? as f64 / ((after.0 - before.0) as f64 / 1e9);
     let telegrams = counts.iter().sum::<usize>() as f64;
@@ -96,7 +100,7 @@ fn run_on_lines(sensors: usize, seconds: u64) -> Outcome<[f64; 7]> {
         after.1.since(before.1).busy_ns as f64 / 1e3 / telegrams,
         at(0.5)?,
         at(0.99)?,
-        memory.own / 1024.0,
+        memory.heap_and_stacks / 1024.0,
         memory.shared / 1024.0,
         shared / 1024.0,
         slowest,
@@ -106,7 +110,7 @@ fn run_on_lines(sensors: usize, seconds: u64) -> Outcome<[f64; 7]> {
 /// Measures 1 to 1,000 sensors in virtual time: how many could one core serve if their bytes cost nothing to receive?
 /// Many sensors are distributed over several hubs, because a hub has at most 256 links and a process not enough
 /// descriptors for more.
-pub(crate) fn in_virtual_time(options: &Options) -> Outcome<()> {
+pub(crate) fn measure_virtual_time(options: &Options) -> Outcome<()> {
     let quantity = |name, unit, linear| Quantity { name, unit, linear };
     let quantities = vec![
         quantity("CPU time per telegram, all topics subscribed", "us", Some(0.0)),
@@ -116,13 +120,13 @@ pub(crate) fn in_virtual_time(options: &Options) -> Outcome<()> {
         quantity("telegrams not received", "1", None),
         quantity("descriptors per sensor and its subscribers", "1", None),
     ];
-    let mut sweep = Sweep::new("sensors in virtual time", "sensors", quantities);
+    let mut sweep = ParameterRange::new("sensors in virtual time", "sensors", quantities);
     let mut of_most = Vec::new();
     let telegrams = options.count(20_000);
     // Leaves out numbers of sensors for which there are too few telegrams.
-    for sensors in IN_VIRTUAL_TIME.into_iter().filter(|sensors| sensors * 4 <= telegrams) {
+    for sensors in VIRTUAL_SENSOR_COUNTS.into_iter().filter(|sensors| sensors * 4 <= telegrams) {
         // Setting up many sensors takes longer than measuring them, and they are many values.
-        for _ in 0..if sensors > SHARE { 1 } else { runs(options) } {
+        for _ in 0..if sensors > SENSORS_PER_HUB { 1 } else { runs(options) } {
             let both = run_in_virtual_time(sensors, Variant::HALF, telegrams, true).and_then(|followed| {
                 Ok((followed, run_in_virtual_time(sensors, Variant::HALF, telegrams, false)?))
             });
@@ -134,14 +138,14 @@ pub(crate) fn in_virtual_time(options: &Options) -> Outcome<()> {
                     continue;
                 }
             };
-            let per_core = |us: f64| 1e6 / (us * RATE);
+            let per_core = |us: f64| 1e6 / (us * SCAN_RATE_HZ);
             let descriptors = followed.descriptors / sensors as f64;
             let lost = followed.lost;
             sweep.add(
                 sensors,
                 &[followed.us, alone.us, per_core(followed.us), per_core(alone.us), lost, descriptors],
             );
-            of_most.extend((sensors == MOST).then_some(followed.us));
+            of_most.extend((sensors == MAX_SENSORS).then_some(followed.us));
         }
     }
     sweep.print(options.json);
@@ -152,7 +156,7 @@ pub(crate) fn in_virtual_time(options: &Options) -> Outcome<()> {
             hub: of_most,
             baseline: Vec::new(),
             // This number of sensors at their full rate on one core.
-            target: Target::Most((1e7 / (MOST as f64 * RATE)).floor() / 10.0),
+            target: Target::Max((1e7 / (MAX_SENSORS as f64 * SCAN_RATE_HZ)).floor() / 10.0),
         };
         figures::print("consumers", options.json, &[figure]);
     }
@@ -160,9 +164,9 @@ pub(crate) fn in_virtual_time(options: &Options) -> Outcome<()> {
 }
 
 /// Measures all variants of the LMS, with 16 sensors.
-pub(crate) fn beams_in_virtual_time(options: &Options) -> Outcome<()> {
+pub(crate) fn measure_variants(options: &Options) -> Outcome<()> {
     let quantities = vec![Quantity { name: "CPU time per telegram", unit: "us", linear: Some(1.0) }];
-    let mut sweep = Sweep::new("beams in virtual time, 16 sensors", "beams", quantities);
+    let mut sweep = ParameterRange::new("beams in virtual time, 16 sensors", "beams", quantities);
     let mut variants = Variant::ALL;
     variants.sort_by_key(|variant| variant.beams());
     for variant in variants {
@@ -174,7 +178,7 @@ pub(crate) fn beams_in_virtual_time(options: &Options) -> Outcome<()> {
     Ok(())
 }
 
-struct Cost {
+struct TelegramCost {
     /// CPU time per telegram, in us.
     us: f64,
     lost: f64,
@@ -182,44 +186,56 @@ struct Cost {
 }
 
 /// Runs `sensors` in several hubs, which begin together.
-fn run_in_virtual_time(sensors: usize, variant: Variant, telegrams: usize, followed: bool) -> Outcome<Cost> {
-    let stage = Stage::new()?;
-    let begin = stage.file("begin");
+fn run_in_virtual_time(
+    sensors: usize,
+    variant: Variant,
+    telegrams: usize,
+    has_subscribers: bool,
+) -> Outcome<TelegramCost> {
+    let environment = BenchEnvironment::new()?;
+    let begin = environment.file("begin");
     let name = begin.display().to_string();
-    let hubs = sensors.div_ceil(SHARE);
+    let hubs = sensors.div_ceil(SENSORS_PER_HUB);
     let beams = variant.beams().to_string();
     let mut parts = Vec::new();
     for number in 0..hubs {
         let share = (sensors * (number + 1) / hubs - sensors * number / hubs).to_string();
         let telegrams = telegrams.div_ceil(hubs).to_string();
-        parts.push(stage.part(&["driven", &name, &beams, &share, &telegrams, &followed.to_string()])?);
+        parts.push(environment.start_part(&[
+            "driven",
+            &name,
+            &beams,
+            &share,
+            &telegrams,
+            &has_subscribers.to_string(),
+        ])?);
     }
     // Learning takes far less than a millisecond per telegram.
-    let patience = PATIENCE + Duration::from_millis(sensors as u64 * 760);
-    parts.iter().try_for_each(|part: &Child| part.await_line("ready", patience).map(drop))?;
+    let patience = STEP_TIMEOUT + Duration::from_millis(sensors as u64 * 760);
+    parts.iter().try_for_each(|part: &Child| part.wait_for_line("ready", patience).map(drop))?;
     std::fs::write(&begin, "")?;
     let (mut ns, mut published, mut received, mut descriptors) = (0.0, 0.0, 0.0, 0.0);
     for part in &parts {
-        let cost = part.await_line("cost", patience)?;
+        let cost = part.wait_for_line("cost", patience)?;
         ns += cost.number(1)? as f64;
         published += cost.number(2)? as f64;
         received += cost.number(3)? as f64;
         descriptors += cost.number(4)? as f64;
     }
     parts.into_iter().try_for_each(|part| part.guard.wait())?;
-    Ok(Cost { us: ns / published / 1e3, lost: published - received, descriptors })
+    Ok(TelegramCost { us: ns / published / 1e3, lost: published - received, descriptors })
 }
 
 fn runs(options: &Options) -> usize {
     options.pairs().min(3)
 }
 
-const IN_VIRTUAL_TIME: [usize; 6] = [1, 4, 16, 64, 250, MOST];
-const MOST: usize = 1000;
+const VIRTUAL_SENSOR_COUNTS: [usize; 6] = [1, 4, 16, 64, 250, MAX_SENSORS];
+const MAX_SENSORS: usize = 1000;
 /// Sensors of one hub. The descriptors of the hub and its subscribers belong to one process.
-const SHARE: usize = 125;
+const SENSORS_PER_HUB: usize = 125;
 /// Scans per second of a sensor with 361 beams.
-const RATE: f64 = 37.5;
+const SCAN_RATE_HZ: f64 = 37.5;
 
 /// Drives a hub in virtual time: telegrams of the simulated room of Fig. 8 go through framer, session, decoding and all
 /// processors into topics in shared memory. Nothing sleeps or waits, so the CPU time of a telegram remains. Each topic
@@ -232,83 +248,84 @@ pub(crate) fn drive(
     beams: usize,
     sensors: usize,
     telegrams: usize,
-    followed: bool,
+    has_subscribers: bool,
 ) -> Outcome<()> {
     let variant = Variant::of_beams(beams).ok_or("no variant has so many beams")?;
-    let stage = Stage::new()?;
+    let environment = BenchEnvironment::new()?;
     let config = config(sensors, variant)?;
-    virtual_hub(&config, &stage.domain, |links| {
-        let node = scanhub_shm::client_node(&stage.domain)?;
-        let followed = config.links.iter().filter(|_| followed);
+    virtual_hub(&config, &environment.domain, |links| {
+        let node = scanhub_shm::client_node(&environment.domain)?;
+        let followed = config.links.iter().filter(|_| has_subscribers);
         let subscribers: Vec<Subscribers> =
             followed.map(|link| Subscribers::attach(&node, &link.name)).collect::<Result<_, _>>()?;
         let descriptors = std::fs::read_dir("/proc/self/fd")?.count();
-        let mut stream = Stream::new(variant);
-        let learning = (LEARNED_NS / stream.period) as usize / TOGETHER;
-        let mut turn = |links: &mut [VirtualLink<'_>]| -> Outcome<Costs> {
+        let mut stream = SensorStreams::new(variant);
+        let learning = (LEARNING_TIME_NS / stream.period) as usize / TELEGRAMS_PER_TAKE;
+        let mut pass_telegrams = |links: &mut [VirtualLink<'_>]| -> Outcome<TotalCost> {
             let before = cpu_ns();
-            let published = stream.turn(links);
-            let busy_ns = cpu_ns() - before;
+            let published = stream.pass_next(links);
+            let cpu_time_ns = cpu_ns() - before;
             let received = subscribers.iter().map(Subscribers::take).sum::<Result<usize, _>>()?;
-            Ok(Costs { busy_ns, published, received })
+            Ok(TotalCost { cpu_time_ns, published, received })
         };
         for _ in 0..learning {
-            turn(links)?;
+            pass_telegrams(links)?;
         }
         println!("ready");
-        let deadline = clock::now() + PATIENCE.as_nanos() as u64;
+        let deadline = clock::now() + STEP_TIMEOUT.as_nanos() as u64;
         while !begin.exists() {
             if clock::now() > deadline {
                 return Err("the start file did not appear".into());
             }
             std::thread::sleep(Duration::from_millis(5));
         }
-        let mut all = Costs::default();
-        for _ in 0..telegrams.div_ceil(TOGETHER * sensors) {
-            let Costs { busy_ns, published, received } = turn(links)?;
-            all.busy_ns += busy_ns;
+        let mut all = TotalCost::default();
+        for _ in 0..telegrams.div_ceil(TELEGRAMS_PER_TAKE * sensors) {
+            let TotalCost { cpu_time_ns, published, received } = pass_telegrams(links)?;
+            all.cpu_time_ns += cpu_time_ns;
             all.published += published;
             all.received += received;
         }
-        println!("cost {} {} {} {descriptors}", all.busy_ns, all.published, all.received);
+        println!("cost {} {} {} {descriptors}", all.cpu_time_ns, all.published, all.received);
         Ok(())
     })?
 }
 
 /// Costs of a few telegrams of each sensor.
 #[derive(Default)]
-struct Costs {
-    busy_ns: u64,
+struct TotalCost {
+    cpu_time_ns: u64,
     published: usize,
     received: usize,
 }
 
 /// Telegrams of the sensors. All of them see the same, each at a different moment.
-struct Stream {
+struct SensorStreams {
     telegrams: Vec<Vec<u8>>,
     period: Nanos,
     now: Nanos,
     number: usize,
 }
 
-impl Stream {
-    fn new(variant: Variant) -> Stream {
+impl SensorStreams {
+    fn new(variant: Variant) -> SensorStreams {
         let room = Room::new(&"fig8".parse().expect("a world that the program brings along"), 1);
-        let period = variant.turns() * MIRROR_TURN;
+        let period = variant.revolutions() * MIRROR_PERIOD;
         let telegram = |number| {
             let words = room.scan(variant, Unit::Mm, MODE, number * period);
             measured::encode(0, Unit::Mm, &words, 0x10).bytes().to_vec()
         };
         // A telegram that ends with a start byte would wait for the next one.
-        let telegrams = (1..=SEEN).map(telegram).filter(|bytes| bytes.last() != Some(&STX)).collect();
-        Stream { telegrams, period, now: clock::now(), number: 0 }
+        let telegrams =
+            (1..=TELEGRAM_COUNT).map(telegram).filter(|bytes| bytes.last() != Some(&STX)).collect();
+        SensorStreams { telegrams, period, now: clock::now(), number: 0 }
     }
 
     /// Passes the next telegrams of each sensor to the hub in three reads, like the hub reads them: the first bytes,
     /// most of it, the end. Returns how many were published.
-    fn turn(&mut self, links: &mut [VirtualLink<'_>]) -> usize {
+    fn pass_next(&mut self, links: &mut [VirtualLink<'_>]) -> usize {
         let mut published = 0;
-        for _ in 0..TOGETHER {
+        for _ in 0..TELEGRAMS_PER_TAKE {
             for piece in 0..3 {
                 for (sensor, link) in links.iter_mut().enumerate() {
                     let telegram = &self.telegrams[(self.number + 37 * sensor) % self.telegrams.len()];
@@ -399,11 +416,11 @@ fn cpu_ns() -> u64 {
 }
 
 /// Time until a background is known: ten seconds, and some more.
-const LEARNED_NS: Nanos = 10_500_000_000;
+const LEARNING_TIME_NS: Nanos = 10_500_000_000;
 /// 13 bits of range, 3 of intensity.
 const MODE: Mode = Mode(1);
 /// Number of different telegrams.
-const SEEN: u64 = 512;
+const TELEGRAM_COUNT: u64 = 512;
 /// Telegrams of each sensor before the subscribers take them. The shortest queue holds four samples, and a sample may
 /// be published later than its telegram.
-const TOGETHER: usize = 3;
+const TELEGRAMS_PER_TAKE: usize = 3;

@@ -8,7 +8,7 @@ use std::thread;
 
 use rustix::fs::{OFlags, fcntl_setfl};
 use scanhub_drivers::lms;
-use scanhub_drivers::lms::measured::Measured;
+use scanhub_drivers::lms::measured::MeasuredValues;
 use scanhub_drivers::lms::telegram::Telegram;
 use scanhub_drivers::lms::variant::{Mode, Unit};
 use scanhub_preprocess::{background, marks, segments, zones};
@@ -16,23 +16,23 @@ use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Foreground, Marks, Pose, Scan, Zones};
 
 use crate::datagrams;
-use crate::line::Discarding;
+use crate::line::DiscardingParser;
 use crate::line::Parser;
-use crate::support::baseline::Line;
-use crate::support::consumer::subscribe;
-use crate::support::stage::SENSORS;
+use crate::support::baseline::SerialLine;
+use crate::support::environment::SENSORS;
+use crate::support::subscriber::subscribe;
 use crate::support::{Outcome, clock};
 
 /// Reads two serial lines, at most `most` bytes at once, like the simplest of programs: a thread per line blocks in
 /// `read` and finds telegrams with a state machine of six states. There is no other system call. One byte at a time is
 /// how programs read a UART with 16 bytes; more than 16 are never available.
-pub(crate) fn bytes(ports: [&str; 2], most: usize) -> Outcome<()> {
-    for_both(|number, progress| {
-        let line = Line::open(Path::new(ports[number]), RATE)?;
+pub(crate) fn read_bytes(ports: [&str; 2], max_read: usize) -> Outcome<()> {
+    run_for_both(|number, progress| {
+        let line = SerialLine::open(Path::new(ports[number]), BAUD_RATE)?;
         fcntl_setfl(&line, OFlags::RDWR)?;
-        let header = lms::measured::encode(0, Unit::Mm, &[0; BEAMS], 0x10).bytes()[..7].try_into()?;
+        let header = lms::measured::encode(0, Unit::Mm, &[0; BEAM_COUNT], 0x10).bytes()[..7].try_into()?;
         let (mut parser, mut processors, mut bytes) =
-            (Discarding::new(header), Processors::new(), vec![0; most]);
+            (DiscardingParser::new(header), Processors::new(), vec![0; max_read]);
         loop {
             let len = line.read(&mut bytes)?;
             parser.read(&bytes[..len], &mut |accepted| {
@@ -45,8 +45,8 @@ pub(crate) fn bytes(ports: [&str; 2], most: usize) -> Outcome<()> {
 }
 
 /// Receives bare telegrams at `port` for the first sensor, and at the next one for the second.
-pub(crate) fn datagrams(port: u16) -> Outcome<()> {
-    for_both(|number, progress| {
+pub(crate) fn receive_datagrams(port: u16) -> Outcome<()> {
+    run_for_both(|number, progress| {
         let (socket, mut processors) = (datagrams::receiver(port + number as u16)?, Processors::new());
         let mut datagram = [0; 2048];
         loop {
@@ -59,8 +59,8 @@ pub(crate) fn datagrams(port: u16) -> Outcome<()> {
 }
 
 /// Receives the hub's scans and reads every range.
-pub(crate) fn scans(domain: &str) -> Outcome<()> {
-    for_both(|number, progress| {
+pub(crate) fn receive_scans(domain: &str) -> Outcome<()> {
+    run_for_both(|number, progress| {
         let mut scans = subscribe::<Scan>(domain, SENSORS[number])?;
         loop {
             let Some(scan) = scans.next()? else { continue };
@@ -71,8 +71,8 @@ pub(crate) fn scans(domain: &str) -> Outcome<()> {
 }
 
 /// Receives the hub's zones and foreground, and reads both.
-pub(crate) fn results(domain: &str) -> Outcome<()> {
-    for_both(|number, progress| {
+pub(crate) fn receive_results(domain: &str) -> Outcome<()> {
+    run_for_both(|number, progress| {
         let mut foreground = subscribe::<Foreground>(domain, SENSORS[number])?;
         let mut zones = subscribe::<Zones>(domain, SENSORS[number])?;
         loop {
@@ -91,7 +91,7 @@ pub(crate) fn results(domain: &str) -> Outcome<()> {
 }
 
 /// Runs `follow` for both sensors; it ends only by an error.
-fn for_both(follow: impl Fn(usize, &mut Progress) -> Outcome<()> + Sync) -> Outcome<()> {
+fn run_for_both(follow: impl Fn(usize, &mut Progress) -> Outcome<()> + Sync) -> Outcome<()> {
     let follow_or_end = |number: usize| {
         let mut progress = Progress { sensor: SENSORS[number], count: 0 };
         if let Err(error) = follow(number, &mut progress) {
@@ -123,21 +123,21 @@ impl Progress {
 }
 
 /// Beams of a scan.
-const BEAMS: usize = 361;
+const BEAM_COUNT: usize = 361;
 /// Baud rate of the simulated sensors.
-const RATE: u32 = 500_000;
+const BAUD_RATE: u32 = 500_000;
 /// Scans between two reports, somewhat less than a second.
 const REPORT_INTERVAL: u64 = 32;
 
 /// Everything that is computed from the scans of one sensor, with the same code and settings as in the hub: decoding,
 /// zones, marks, background, and foreground with its segments.
 struct Processors {
-    zones: zones::Check,
+    zone_checker: zones::ZoneChecker,
     marks: marks::MarkDetector,
-    model: background::Model,
-    cutter: segments::Segmenter,
+    model: background::BackgroundModel,
+    segmenter: segments::Segmenter,
     scan: Box<Scan>,
-    near: Zones,
+    zones_out: Zones,
     found: Marks,
     foreground: Box<Foreground>,
 }
@@ -146,12 +146,12 @@ impl Processors {
     fn new() -> Box<Processors> {
         let TopicLimits { beams, contents, .. } = TopicLimits::default();
         Box::new(Processors {
-            zones: zones::Check::new(Pose::default(), &zones::Settings::default(), beams),
+            zone_checker: zones::ZoneChecker::new(Pose::default(), &zones::Settings::default(), beams),
             marks: marks::MarkDetector::new(marks::Settings::default()),
-            model: background::Model::new(background::Settings::default(), beams),
-            cutter: segments::Segmenter::new(Pose::default(), beams),
+            model: background::BackgroundModel::new(background::Settings::default(), beams),
+            segmenter: segments::Segmenter::new(Pose::default(), beams),
             scan: Scan::zeroed(Scan::len(beams, contents)),
-            near: Zones::default(),
+            zones_out: Zones::default(),
             found: Marks::default(),
             foreground: Foreground::of(beams),
         })
@@ -159,13 +159,13 @@ impl Processors {
 
     /// Processes `telegram`, and returns whether it was a scan.
     fn take(&mut self, telegram: Telegram<'_>) -> bool {
-        let Some(measured) = Measured::decode(telegram) else { return false };
+        let Some(measured) = MeasuredValues::decode(telegram) else { return false };
         measured.scan(MODE).write(&mut self.scan);
-        self.zones.update(&self.scan, &mut self.near);
+        self.zone_checker.update(&self.scan, &mut self.zones_out);
         self.marks.update(&self.scan, &mut self.found);
         self.model.update(&self.scan, &mut self.foreground);
-        self.cutter.update(&self.scan, &mut self.foreground);
-        black_box((self.near.verdict(), self.found.marks().len(), self.foreground.segments().len()));
+        self.segmenter.update(&self.scan, &mut self.foreground);
+        black_box((self.zones_out.verdict(), self.found.marks().len(), self.foreground.segments().len()));
         true
     }
 }

@@ -27,12 +27,12 @@ impl Share {
     }
 
     /// Returns the sum with `other`.
-    pub(crate) fn plus(self, other: Share) -> Share {
+    pub(crate) fn add(self, other: Share) -> Share {
         Share { user: self.user + other.user, system: self.system + other.system }
     }
 
     /// Returns the difference to `other`.
-    pub(crate) fn less(self, other: Share) -> Share {
+    pub(crate) fn subtract(self, other: Share) -> Share {
         Share { user: self.user - other.user, system: self.system - other.system }
     }
 }
@@ -107,9 +107,10 @@ impl<'a> Span<'a> {
         self.sum(|_| true)
     }
 
-    fn sum(&self, wanted: impl Fn(&Usage) -> bool) -> f64 {
-        let wanted = self.after.processes.iter().filter(|(_, usage)| wanted(usage));
-        let busy: u64 = wanted.map(|(pid, usage)| usage.since(self.before.processes.get(pid)).busy_ns).sum();
+    fn sum(&self, is_counted: impl Fn(&Usage) -> bool) -> f64 {
+        let expected = self.after.processes.iter().filter(|(_, usage)| is_counted(usage));
+        let busy: u64 =
+            expected.map(|(pid, usage)| usage.since(self.before.processes.get(pid)).busy_ns).sum();
         self.percent(busy as f64)
     }
 
@@ -164,7 +165,7 @@ impl Usage {
         let fields: Vec<&str> = stat.rsplit_once(')')?.1.split_whitespace().collect();
         let field = |number: usize| fields.get(number - 3)?.parse::<u64>().ok();
         let mut usage =
-            Usage { user: field(14)?, system: field(15)?, is_kernel: field(4)? == KTHREADD, busy_ns: 0 };
+            Usage { user: field(14)?, system: field(15)?, is_kernel: field(4)? == KTHREADD_PID, busy_ns: 0 };
         for task in read_dir(process.join("task")).ok()?.flatten() {
             let schedstat = read_to_string(task.path().join("schedstat")).unwrap_or_default();
             usage.busy_ns += schedstat.split_whitespace().next().map_or(Some(0), |ns| ns.parse().ok())?;
@@ -199,4 +200,4 @@ impl Usage {
 /// Ticks per second of the figures that the kernel reports, whatever its own tick is.
 const USER_HZ: f64 = 100.0;
 /// Parent of all threads of the kernel.
-const KTHREADD: u64 = 2;
+const KTHREADD_PID: u64 = 2;

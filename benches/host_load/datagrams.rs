@@ -8,7 +8,7 @@ use rustix::net::sockopt::{
 };
 use rustix::net::{AddressFamily, SocketAddrV4, SocketFlags, SocketType, bind, socket_with};
 use scanhub_drivers::lms;
-use scanhub_drivers::lms::variant::{MIRROR_TURN, Unit, Variant};
+use scanhub_drivers::lms::variant::{MIRROR_PERIOD, Unit, Variant};
 use scanhub_sim::room::Room;
 
 use crate::consumer::MODE;
@@ -26,7 +26,7 @@ pub(crate) fn send(port: u16) -> Outcome<()> {
     for number in 0.. {
         for (sensor, telegrams) in rooms.iter().enumerate() {
             // Sensors are not synchronized; here they are half a scan apart.
-            clock::rest(begin + number * PERIOD + sensor as u64 * PERIOD / 2);
+            clock::sleep_until(begin + number * SCAN_PERIOD_NS + sensor as u64 * SCAN_PERIOD_NS / 2);
             let telegram = &telegrams[number as usize % telegrams.len()];
             socket.send_to(telegram, (GROUP, port + sensor as u16))?;
         }
@@ -52,7 +52,7 @@ pub(crate) fn port() -> u16 {
 fn telegrams(sensor: u64) -> Vec<Vec<u8>> {
     let room = Room::of_port(&"room".parse().expect("a world that the program brings along"), 1, sensor);
     let telegram = |number: u64| {
-        let words = room.scan(Variant::HALF, Unit::Mm, MODE, number * PERIOD);
+        let words = room.scan(Variant::HALF, Unit::Mm, MODE, number * SCAN_PERIOD_NS);
         lms::measured::encode(0, Unit::Mm, &words, 0x10).bytes().to_vec()
     };
     (1..=375).map(telegram).collect()
@@ -61,4 +61,4 @@ fn telegrams(sensor: u64) -> Vec<Vec<u8>> {
 /// A group that never leaves this machine, by its scope and the time to live.
 const GROUP: Ipv4Addr = Ipv4Addr::new(239, 255, 76, 90);
 /// Time from scan to scan of 361 beams, in ns.
-const PERIOD: u64 = 2 * MIRROR_TURN;
+const SCAN_PERIOD_NS: u64 = 2 * MIRROR_PERIOD;

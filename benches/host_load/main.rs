@@ -39,22 +39,22 @@ use std::io::IsTerminal;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use set_up::{Host, Load, SetUp, WORD};
+use set_up::{Host, Load, PART_NAME, Setup};
 use support::figures::{self, Cell, Figure, Target};
 use support::{Options, Outcome};
 
 fn main() -> ExitCode {
-    support::main_with(play, measure)
+    support::main_with(run_part, measure)
 }
 
-fn play(words: &[&str]) -> Outcome<()> {
+fn run_part(words: &[&str]) -> Outcome<()> {
     match *words {
-        [WORD, "bytes", most, front, rear] => consumer::bytes([front, rear], most.parse()?),
-        [WORD, "datagrams", port] => consumer::datagrams(port.parse()?),
-        [WORD, "scans", domain] => consumer::scans(domain),
-        [WORD, "results", domain] => consumer::results(domain),
-        [WORD, "unit", port] => datagrams::send(port.parse()?),
-        _ => support::play(words),
+        [PART_NAME, "bytes", most, front, rear] => consumer::read_bytes([front, rear], most.parse()?),
+        [PART_NAME, "datagrams", port] => consumer::receive_datagrams(port.parse()?),
+        [PART_NAME, "scans", domain] => consumer::receive_scans(domain),
+        [PART_NAME, "results", domain] => consumer::receive_results(domain),
+        [PART_NAME, "unit", port] => datagrams::send(port.parse()?),
+        _ => support::run_part(words),
     }
 }
 
@@ -70,19 +70,19 @@ fn measure(options: &Options) -> Outcome<()> {
     let mut runs = Vec::new();
     for pair in 0..pairs {
         // The CPU time of the sender without receivers.
-        let deaf = SetUp::Datagrams.start(0)?.watch(span)?.outside;
-        for (turn, &count) in counts.iter().enumerate() {
-            let mut set_ups = SetUp::ALL;
-            set_ups.rotate_left((pair + turn) % SetUp::ALL.len());
-            for set_up in set_ups {
+        let deaf = Setup::Datagrams.start(0)?.measure(span)?.drivers;
+        for (round, &count) in counts.iter().enumerate() {
+            let mut set_ups = Setup::ALL;
+            set_ups.rotate_left((pair + round) % Setup::ALL.len());
+            for setup in set_ups {
                 if std::io::stderr().is_terminal() {
-                    eprintln!("{} of {pairs}: {count} subscribers, {}", pair + 1, set_up.name());
+                    eprintln!("{} of {pairs}: {count} subscribers, {}", pair + 1, setup.name());
                 }
-                let load = set_up.start(count)?.watch(span)?;
-                runs.push(Run {
-                    set_up,
+                let load = setup.start(count)?.measure(span)?;
+                runs.push(WarningRun {
+                    set_up: setup,
                     count,
-                    host: load.of_host((set_up == SetUp::Datagrams).then_some(deaf)),
+                    host: load.of_host((setup == Setup::Datagrams).then_some(deaf)),
                     load,
                 });
             }
@@ -93,8 +93,8 @@ fn measure(options: &Options) -> Outcome<()> {
 }
 
 /// One run of a set-up.
-struct Run {
-    set_up: SetUp,
+struct WarningRun {
+    set_up: Setup,
     count: usize,
     host: Host,
     load: Load,
@@ -102,7 +102,7 @@ struct Run {
 
 /// All runs.
 struct Tables<'a> {
-    runs: &'a [Run],
+    runs: &'a [WarningRun],
     counts: &'a [usize],
     processors: usize,
 }
@@ -111,29 +111,29 @@ struct Tables<'a> {
 struct Table {
     name: &'static str,
     unit: &'static str,
-    rows: &'static [SetUp],
-    value: Value,
+    rows: &'static [Setup],
+    value_of: Value,
 }
 
 /// Value of a run that a table shows.
-type Value = fn(&Run) -> f64;
+type Value = fn(&WarningRun) -> f64;
 
 impl<'a> Tables<'a> {
     /// Creates the tables of runs with these numbers of subscribers.
-    fn of(runs: &'a [Run], counts: &'a [usize]) -> Outcome<Tables<'a>> {
+    fn of(runs: &'a [WarningRun], counts: &'a [usize]) -> Outcome<Tables<'a>> {
         Ok(Tables { runs, counts, processors: cpu_time::processors()? })
     }
 
     /// Prints the tables.
     fn print(&self, options: &Options) {
-        figures::print_cells(BENCH, options.json, &self.cells());
-        figures::print(BENCH, options.json, &self.figures());
+        figures::print_cells(BENCH_NAME, options.json, &self.cells());
+        figures::print(BENCH_NAME, options.json, &self.figures());
     }
 
     fn cells(&self) -> Vec<Cell> {
         let mut cells = Vec::new();
-        for Table { name, unit, rows, value } in TABLES {
-            self.table(name.into(), unit, rows, value, &mut cells);
+        for Table { name, unit, rows, value_of } in TABLES {
+            self.table(name.into(), unit, rows, value_of, &mut cells);
         }
         // As a share of all processors, like in the paper.
         let all = self.processors;
@@ -142,17 +142,17 @@ impl<'a> Tables<'a> {
         for (part, value) in parts {
             let table = format!("{part}, /proc/stat, of all {all} processors");
             let from = cells.len();
-            self.table(table, "%", &SetUp::ALL, value, &mut cells);
+            self.table(table, "%", &Setup::ALL, value, &mut cells);
             let values = cells[from..].iter_mut().flat_map(|cell| &mut cell.values);
             values.for_each(|value| *value /= all as f64);
         }
         cells
     }
 
-    fn table(&self, table: String, unit: &'static str, rows: &[SetUp], value: Value, cells: &mut Vec<Cell>) {
+    fn table(&self, table: String, unit: &'static str, rows: &[Setup], value: Value, cells: &mut Vec<Cell>) {
         for &set_up in rows {
             for &count in self.counts {
-                let (row, column) = (set_up.name().into(), consumers(count));
+                let (row, column) = (set_up.name().into(), subscriber_label(count));
                 let values = self.series(set_up, count, value);
                 cells.push(Cell { table: table.clone(), row, column, unit, values });
             }
@@ -164,7 +164,7 @@ impl<'a> Tables<'a> {
     fn figures(&self) -> Vec<Figure> {
         let of = |name, value: Value, target| {
             let [hub, baseline] =
-                [SetUp::Results, SetUp::Bytes].map(|set_up| self.series(set_up, FOUR, value));
+                [Setup::Results, Setup::Bytes].map(|set_up| self.series(set_up, MAX_SUBSCRIBERS, value));
             Figure { name, unit: "%", hub, baseline, target }
         };
         vec![
@@ -175,46 +175,46 @@ impl<'a> Tables<'a> {
         ]
     }
 
-    fn series(&self, set_up: SetUp, count: usize, value: Value) -> Vec<f64> {
+    fn series(&self, set_up: Setup, count: usize, value: Value) -> Vec<f64> {
         self.chosen(set_up, count).map(value).collect()
     }
 
-    fn chosen(&self, set_up: SetUp, count: usize) -> impl Iterator<Item = &Run> {
+    fn chosen(&self, set_up: Setup, count: usize) -> impl Iterator<Item = &WarningRun> {
         self.runs.iter().filter(move |run| run.set_up == set_up && run.count == count)
     }
 }
 
-fn consumers(count: usize) -> String {
+fn subscriber_label(count: usize) -> String {
     if count == 1 { "1 subscriber".into() } else { format!("{count} subscribers") }
 }
 
-const fn load(name: &'static str, rows: &'static [SetUp], value: Value) -> Table {
-    Table { name, unit: "%", rows, value }
+const fn load(name: &'static str, rows: &'static [Setup], value_of: Value) -> Table {
+    Table { name, unit: "%", rows, value_of }
 }
 
-const BENCH: &str = "host_load";
+const BENCH_NAME: &str = "host_load";
 /// Number of consumers in the paper's set-up, to which its figures belong.
-const FOUR: usize = 4;
+const MAX_SUBSCRIBERS: usize = 4;
 /// Set-ups with a hub.
-const WITH_HUB: [SetUp; 2] = [SetUp::Scans, SetUp::Results];
+const WITH_HUB: [Setup; 2] = [Setup::Scans, Setup::Results];
 /// Load is in percent of one processor.
 const TABLES: [Table; 11] = [
-    load("system, processes of the host", &SetUp::ALL, |run| run.host.processes.system),
-    load("user, processes of the host", &SetUp::ALL, |run| run.host.processes.user),
+    load("system, processes of the host", &Setup::ALL, |run| run.host.processes.system),
+    load("user, processes of the host", &Setup::ALL, |run| run.host.processes.user),
     load("system, the hub's part", &WITH_HUB, |run| run.load.hub.system),
     load("user, the hub's part", &WITH_HUB, |run| run.load.hub.user),
-    load("system, /proc/stat", &SetUp::ALL, |run| run.host.machine.system),
-    load("user, /proc/stat", &SetUp::ALL, |run| run.host.machine.user),
-    load("threads of the kernel", &SetUp::ALL, |run| run.load.kernel),
-    load("left out: simulators or unit", &SetUp::ALL, |run| run.load.outside.total()),
+    load("system, /proc/stat", &Setup::ALL, |run| run.host.machine.system),
+    load("user, /proc/stat", &Setup::ALL, |run| run.host.machine.user),
+    load("threads of the kernel", &Setup::ALL, |run| run.load.kernel),
+    load("left out: simulators or unit", &Setup::ALL, |run| run.load.drivers.total()),
     Table {
         name: "minimum of scans a second of each sensor",
         unit: "Hz",
-        rows: &SetUp::ALL,
-        value: |run| run.load.hz,
+        rows: &Setup::ALL,
+        value_of: |run| run.load.hz,
     },
-    load("/proc/stat, as a share of the scheduler's count", &SetUp::ALL, |run| {
+    load("/proc/stat, as a share of the scheduler's count", &Setup::ALL, |run| {
         100.0 * run.load.machine.total() / run.load.all_processes
     }),
-    load("stolen by the hypervisor", &SetUp::ALL, |run| run.load.stolen),
+    load("stolen by the hypervisor", &Setup::ALL, |run| run.load.stolen),
 ];

@@ -7,11 +7,11 @@ use std::time::Duration;
 use crate::cpu_time::{Share, Snapshot, Span};
 use crate::datagrams;
 use crate::support::Outcome;
-use crate::support::stage::{Child, PATIENCE, SENSORS, Stage};
+use crate::support::environment::{BenchEnvironment, Child, SENSORS, STEP_TIMEOUT};
 
 /// How data gets to the subscribers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum SetUp {
+pub(crate) enum Setup {
     /// Each has two serial lines of its own, reads them byte by byte and does everything itself.
     Bytes,
     /// The same, but each reads all bytes that have arrived.
@@ -24,78 +24,78 @@ pub(crate) enum SetUp {
     Results,
 }
 
-impl SetUp {
+impl Setup {
     /// All set-ups in the order of the tables.
-    pub(crate) const ALL: [SetUp; 5] =
-        [SetUp::Bytes, SetUp::Blocks, SetUp::Datagrams, SetUp::Scans, SetUp::Results];
+    pub(crate) const ALL: [Setup; 5] =
+        [Setup::Bytes, Setup::Blocks, Setup::Datagrams, Setup::Scans, Setup::Results];
 
     /// Returns the name in tables.
     pub(crate) fn name(self) -> &'static str {
         match self {
-            SetUp::Bytes => "raw bytes",
-            SetUp::Blocks => "raw bytes in blocks",
-            SetUp::Datagrams => "datagrams",
-            SetUp::Scans => "hub, scans",
-            SetUp::Results => "hub, zones and foreground",
+            Setup::Bytes => "raw bytes",
+            Setup::Blocks => "raw bytes in blocks",
+            Setup::Datagrams => "datagrams",
+            Setup::Scans => "hub, scans",
+            Setup::Results => "hub, zones and foreground",
         }
     }
 
     /// Starts it for `count` subscribers; with none, only the sender of datagrams runs.
-    pub(crate) fn start(self, count: usize) -> Outcome<Processes> {
-        let stage = Stage::new()?;
-        let part = |words: &[&str]| stage.part(&[&[WORD], words].concat());
-        let domain = stage.domain.name();
-        let (mut consumers, mut hub, mut outside) = (Vec::new(), None, Vec::new());
+    pub(crate) fn start(self, count: usize) -> Outcome<SetupProcesses> {
+        let environment = BenchEnvironment::new()?;
+        let part = |words: &[&str]| environment.start_part(&[&[PART_NAME], words].concat());
+        let domain = environment.domain.name();
+        let (mut subscribers, mut hub, mut drivers) = (Vec::new(), None, Vec::new());
         match self {
-            SetUp::Bytes | SetUp::Blocks => {
-                let most = if self == SetUp::Bytes { "1" } else { "4096" };
+            Setup::Bytes | Setup::Blocks => {
+                let maximum = if self == Setup::Bytes { "1" } else { "4096" };
                 for number in 0..count {
                     let lines = SENSORS.map(|sensor| format!("{sensor}-{number}"));
-                    outside.push(stage.simulate_streaming(&lines.each_ref().map(String::as_str))?);
-                    let [front, rear] = lines.map(|line| stage.port(&line));
-                    consumers.push(part(&["bytes", most, &front, &rear])?);
+                    drivers.push(environment.simulate_streaming(&lines.each_ref().map(String::as_str))?);
+                    let [front, rear] = lines.map(|line| environment.port(&line));
+                    subscribers.push(part(&["bytes", maximum, &front, &rear])?);
                 }
             }
-            SetUp::Datagrams => {
+            Setup::Datagrams => {
                 let port = datagrams::port().to_string();
                 for _ in 0..count {
-                    consumers.push(part(&["datagrams", &port])?);
+                    subscribers.push(part(&["datagrams", &port])?);
                 }
                 let sender = part(&["unit", &port])?;
-                sender.await_line("ready", PATIENCE)?;
-                outside.push(sender);
+                sender.wait_for_line("ready", STEP_TIMEOUT)?;
+                drivers.push(sender);
             }
-            SetUp::Scans | SetUp::Results => {
-                outside.push(stage.simulate_streaming(&SENSORS)?);
-                hub.insert(stage.hub(&SENSORS)?).await_line("ready", PATIENCE)?;
-                let topics = if self == SetUp::Scans { "scans" } else { "results" };
+            Setup::Scans | Setup::Results => {
+                drivers.push(environment.simulate_streaming(&SENSORS)?);
+                hub.insert(environment.start_hub(&SENSORS)?).wait_for_line("ready", STEP_TIMEOUT)?;
+                let topics = if self == Setup::Scans { "scans" } else { "results" };
                 for _ in 0..count {
-                    consumers.push(part(&[topics, domain])?);
+                    subscribers.push(part(&[topics, domain])?);
                 }
             }
         }
-        for consumer in &consumers {
+        for subscriber in &subscribers {
             for sensor in SENSORS {
-                consumer.await_line(&format!("had {sensor}"), PATIENCE)?;
+                subscriber.wait_for_line(&format!("had {sensor}"), STEP_TIMEOUT)?;
             }
         }
-        Ok(Processes { consumers, hub, outside, _stage: stage })
+        Ok(SetupProcesses { consumers: subscribers, hub, drivers, _stage: environment })
     }
 }
 
 /// All processes of a set-up; they are ended in this order.
-pub(crate) struct Processes {
+pub(crate) struct SetupProcesses {
     pub(crate) consumers: Vec<Child>,
     pub(crate) hub: Option<Child>,
     /// Processes that stand for hardware.
-    pub(crate) outside: Vec<Child>,
-    _stage: Stage,
+    pub(crate) drivers: Vec<Child>,
+    _stage: BenchEnvironment,
 }
 
-impl Processes {
+impl SetupProcesses {
     /// Measures for `span`.
-    pub(crate) fn watch(&self, span: Duration) -> Outcome<Load> {
-        thread::sleep(SETTLING);
+    pub(crate) fn measure(&self, span: Duration) -> Outcome<Load> {
+        thread::sleep(SETTLE_TIME);
         let before = Snapshot::take()?;
         thread::sleep(span);
         let after = Snapshot::take()?;
@@ -104,9 +104,9 @@ impl Processes {
 
     /// Returns the scans per second of the subscriber and sensor with the fewest; 0 without subscribers.
     fn hz(&self, from_ns: u64, to_ns: u64) -> Outcome<f64> {
-        let mut least: Option<f64> = None;
-        for consumer in &self.consumers {
-            let lines = consumer.lines_so_far();
+        let mut minimum: Option<f64> = None;
+        for subscriber in &self.consumers {
+            let lines = subscriber.lines_so_far();
             for sensor in SENSORS {
                 let mut counts = Vec::new();
                 for line in lines.iter().filter(|line| line.text.starts_with(&format!("had {sensor} "))) {
@@ -120,17 +120,17 @@ impl Processes {
                     // Too slow, or the time is too short for a rate.
                     _ => 0.0,
                 };
-                least = Some(least.map_or(hz, |least| least.min(hz)));
+                minimum = Some(minimum.map_or(hz, |minimum| minimum.min(hz)));
             }
         }
-        Ok(least.unwrap_or_default())
+        Ok(minimum.unwrap_or_default())
     }
 }
 
 /// Second word of the command line of a part of this bench.
-pub(crate) const WORD: &str = "host-load";
+pub(crate) const PART_NAME: &str = "host-load";
 /// Time after which buffers, caches and timing are as they will stay.
-const SETTLING: Duration = Duration::from_secs(2);
+const SETTLE_TIME: Duration = Duration::from_secs(2);
 
 /// CPU time during a run, in percent of one processor.
 #[derive(Clone, Copy, Debug)]
@@ -144,7 +144,7 @@ pub(crate) struct Load {
     /// Threads of the kernel.
     pub(crate) kernel: f64,
     /// Processes that stand for hardware.
-    pub(crate) outside: Share,
+    pub(crate) drivers: Share,
     /// This process.
     pub(crate) bench: Share,
     /// All processes and threads of the kernel that existed at the end.
@@ -166,14 +166,14 @@ pub(crate) struct Host {
 
 impl Load {
     /// Returns the CPU time in `span` of these processes.
-    pub(crate) fn of(span: &Span<'_>, children: &Processes, hz: f64) -> Outcome<Load> {
+    pub(crate) fn of(span: &Span<'_>, children: &SetupProcesses, hz: f64) -> Outcome<Load> {
         let hub = span.of(&pids(&children.hub))?;
         Ok(Load {
             machine: span.machine(),
-            processes: span.of(&pids(&children.consumers))?.plus(hub),
+            processes: span.of(&pids(&children.consumers))?.add(hub),
             hub,
             kernel: span.kernel(),
-            outside: span.of(&pids(&children.outside))?,
+            drivers: span.of(&pids(&children.drivers))?,
             bench: span.of(&[std::process::id()])?,
             all_processes: span.all_processes(),
             stolen: span.stolen(),
@@ -184,12 +184,12 @@ impl Load {
     /// Returns the host's part. On a loopback, a datagram is delivered within the system call of the sender; on a
     /// network, the receiver's interrupt does that. The time that a sender needs beyond one without receivers, `deaf`,
     /// therefore belongs to the host. Other set-ups do not need `deaf`.
-    pub(crate) fn of_host(&self, deaf: Option<Share>) -> Host {
-        let delivery = deaf.map_or(0.0, |deaf| (self.outside.total() - deaf.total()).max(0.0));
+    pub(crate) fn of_host(&self, idle: Option<Share>) -> Host {
+        let delivery = idle.map_or(0.0, |deaf| (self.drivers.total() - deaf.total()).max(0.0));
         let delivery = Share { user: 0.0, system: delivery };
         Host {
-            machine: self.machine.less(self.outside).less(self.bench).plus(delivery),
-            processes: self.processes.plus(delivery),
+            machine: self.machine.subtract(self.drivers).subtract(self.bench).add(delivery),
+            processes: self.processes.add(delivery),
         }
     }
 }

@@ -11,25 +11,25 @@ use std::time::{Duration, Instant, SystemTime};
 use rustix::event::{EventfdFlags, eventfd};
 use rustix::process::{Signal, set_parent_process_death_signal};
 use scanhub_schema::Topic;
-use scanhub_schema::datagram::{Datagram, HEAD, Packed};
+use scanhub_schema::datagram::{Datagram, DatagramPayload, HEADER_LEN};
 
+use crate::support::environment::{BenchEnvironment, GuardedProcess, SENSORS, STEP_TIMEOUT};
 use crate::support::figures::{Figure, Target, percentile};
-use crate::support::source::{self, SENSOR, Source};
-use crate::support::stage::{Guard, PATIENCE, SENSORS, Stage};
-use crate::support::usage::Work;
+use crate::support::source::{self, SENSOR, ScanSource};
+use crate::support::usage::ThreadUsage;
 use crate::support::{Outcome, clock};
-use crate::wire::{self, is_of, number};
+use crate::wire::{self, has_topic, number};
 
 /// Samples of a run.
-const COUNT: usize = 800;
+const SAMPLE_COUNT: usize = 800;
 /// Samples at the start of a run that do not count.
-const SETTLING: usize = 80;
+const SKIPPED_SAMPLES: usize = 80;
 /// Two sensors at 37.5 Hz send every 13 ms; here it is somewhat faster, to keep runs short.
 const PERIOD_NS: u64 = 7_000_000;
 /// Position of the number in the header.
-const NUMBER: std::ops::Range<usize> = 20..24;
+const NUMBER_FIELD: std::ops::Range<usize> = 20..24;
 /// Words that make this program the sender of a bare run.
-pub(crate) const PART: [&str; 2] = ["part", "sender"];
+pub(crate) const SENDER_PART: [&str; 2] = ["part", "sender"];
 
 /// Measures p50 and p99 from shared memory to an application behind the loopback, alternating with an eventfd and a
 /// datagram of the same length.
@@ -37,11 +37,11 @@ pub(crate) fn latency(pairs: usize) -> Outcome<Vec<Figure>> {
     let (mut hub, mut baseline): (Vec<Run>, Vec<Run>) = Default::default();
     for pair in 0..pairs {
         if pair % 2 == 0 {
-            hub.push(through_gateway()?);
-            baseline.push(bare_run()?);
+            hub.push(gateway_run()?);
+            baseline.push(baseline_run()?);
         } else {
-            baseline.push(bare_run()?);
-            hub.push(through_gateway()?);
+            baseline.push(baseline_run()?);
+            hub.push(gateway_run()?);
         }
     }
     let figure = |name, part| {
@@ -54,14 +54,14 @@ pub(crate) fn latency(pairs: usize) -> Outcome<Vec<Figure>> {
     Ok(vec![figure("latency: p50", 0.5), figure("latency: p99", 0.99), absent])
 }
 
-fn through_gateway() -> Outcome<Run> {
-    let stage = Stage::new()?;
-    let mut source = Source::open(&stage.domain)?;
-    let gateway = wire::gateway(&stage, "lo", &[format!("--topic={SENSOR}/scan")])?;
+fn gateway_run() -> Outcome<Run> {
+    let environment = BenchEnvironment::new()?;
+    let mut source = ScanSource::open(&environment.domain)?;
+    let gateway = wire::gateway(&environment, "lo", &[format!("--topic={SENSOR}/scan")])?;
     // Until the gateway has found the hub and its sensor.
-    let attached = clock::now() + ATTACHING_NS;
+    let attached = clock::now() + ATTACH_TIMEOUT_NS;
     while clock::now() < attached {
-        clock::rest(clock::now() + PERIOD_NS);
+        clock::sleep_until(clock::now() + PERIOD_NS);
         source.publish(wall_ns())?;
     }
     let application = Application::start(|bytes| {
@@ -73,18 +73,18 @@ fn through_gateway() -> Outcome<Run> {
     application.end()
 }
 
-fn bare_run() -> Outcome<Run> {
+fn baseline_run() -> Outcome<Run> {
     let wake = eventfd(0, EventfdFlags::CLOEXEC)?;
-    let stamps: Arc<[AtomicU64]> = (0..SETTLING + COUNT).map(|_| AtomicU64::new(0)).collect();
+    let stamps: Arc<[AtomicU64]> = (0..SKIPPED_SAMPLES + SAMPLE_COUNT).map(|_| AtomicU64::new(0)).collect();
     let theirs = stamps.clone();
     let application = Application::start(move |bytes| {
-        let number = u32::from_le_bytes(bytes.get(NUMBER)?.try_into().ok()?);
+        let number = u32::from_le_bytes(bytes.get(NUMBER_FIELD)?.try_into().ok()?);
         Some(theirs.get(number as usize)?.load(Ordering::Acquire))
     })?;
     let mut command = Command::new(std::env::current_exe()?);
-    let mut sender = command.args(PART).stdin(wake.try_clone()?).stdout(Stdio::piped()).spawn()?;
+    let mut sender = command.args(SENDER_PART).stdin(wake.try_clone()?).stdout(Stdio::piped()).spawn()?;
     let stdout = sender.stdout.take();
-    let sender = Guard::new(sender);
+    let sender = GuardedProcess::new(sender);
     stdout.ok_or("no pipe")?.read_exact(&mut [0; 1])?;
     let mut next = stamps.iter();
     paced(|| {
@@ -98,18 +98,18 @@ fn bare_run() -> Outcome<Run> {
 
 /// Plays the process that a bare run wakes: sends a datagram with the next number each time that the eventfd, its
 /// stdin, is signaled.
-pub(crate) fn sender() -> Outcome<()> {
+pub(crate) fn run_sender() -> Outcome<()> {
     set_parent_process_death_signal(Some(Signal::TERM))?;
     let socket = wire::sender()?;
-    let mut datagram = vec![0; HEAD + source::scan().pack(&mut [0; 2048]).unwrap_or_default()];
+    let mut datagram = vec![0; HEADER_LEN + source::scan().pack(&mut [0; 2048]).unwrap_or_default()];
     println!("ready");
-    let mut numbers = 0..(SETTLING + COUNT) as u32;
+    let mut numbers = 0..(SKIPPED_SAMPLES + SAMPLE_COUNT) as u32;
     while !numbers.is_empty() {
         let mut count = [0; 8];
         rustix::io::read(rustix::stdio::stdin(), &mut count)?;
         // A sender that is late reads a count of several.
         for number in numbers.by_ref().take(u64::from_ne_bytes(count) as usize) {
-            datagram[NUMBER].copy_from_slice(&number.to_le_bytes());
+            datagram[NUMBER_FIELD].copy_from_slice(&number.to_le_bytes());
             socket.send_to(&datagram, wire::address(Topic::Scan))?;
         }
     }
@@ -122,17 +122,17 @@ type Run = (Vec<f64>, f64);
 /// A thread that collects the ages of datagrams.
 struct Application {
     /// Whether no more datagrams will be sent.
-    is_over: Arc<AtomicBool>,
+    is_finished: Arc<AtomicBool>,
     thread: JoinHandle<Vec<u64>>,
 }
 
 impl Application {
     /// Starts the thread. `stamp` finds in a datagram when it was made, in ns.
     fn start(stamp: impl Fn(&[u8]) -> Option<u64> + Send + 'static) -> Outcome<Application> {
-        let (socket, is_over) = (wire::receiver()?, Arc::new(AtomicBool::new(false)));
-        let flag = is_over.clone();
+        let (socket, is_finished) = (wire::receiver()?, Arc::new(AtomicBool::new(false)));
+        let flag = is_finished.clone();
         let thread = thread::spawn(move || {
-            let (mut ages, mut bytes) = (Vec::with_capacity(SETTLING + COUNT), [0; 2048]);
+            let (mut ages, mut bytes) = (Vec::with_capacity(SKIPPED_SAMPLES + SAMPLE_COUNT), [0; 2048]);
             loop {
                 match socket.recv(&mut bytes) {
                     Ok(len) => {
@@ -143,25 +143,25 @@ impl Application {
                 }
             }
         });
-        Ok(Application { is_over, thread })
+        Ok(Application { is_finished, thread })
     }
 
     /// Returns what arrived. A hub does not wait for a process that is descheduled.
     fn end(self) -> Outcome<Run> {
-        self.is_over.store(true, Ordering::Relaxed);
+        self.is_finished.store(true, Ordering::Relaxed);
         let ages = self.thread.join().map_err(|_| "the application panicked")?;
-        let absent = (SETTLING + COUNT).saturating_sub(ages.len()) as f64;
-        let mut ages: Vec<_> = ages.iter().skip(SETTLING).map(|&age| age as f64 / 1e3).collect();
+        let absent = (SKIPPED_SAMPLES + SAMPLE_COUNT).saturating_sub(ages.len()) as f64;
+        let mut ages: Vec<_> = ages.iter().skip(SKIPPED_SAMPLES).map(|&age| age as f64 / 1e3).collect();
         ages.sort_by(f64::total_cmp);
         Ok((ages, absent))
     }
 }
 
-fn paced(mut tell: impl FnMut() -> Outcome<()>) -> Outcome<()> {
+fn paced(mut signal: impl FnMut() -> Outcome<()>) -> Outcome<()> {
     let begin = clock::now();
-    (0..(SETTLING + COUNT) as u64).try_for_each(|n| {
-        clock::rest(begin + n * PERIOD_NS);
-        tell()
+    (0..(SKIPPED_SAMPLES + SAMPLE_COUNT) as u64).try_for_each(|n| {
+        clock::sleep_until(begin + n * PERIOD_NS);
+        signal()
     })
 }
 
@@ -171,61 +171,61 @@ fn wall_ns() -> u64 {
 }
 
 /// Time in which the gateway certainly finds a new hub.
-const ATTACHING_NS: u64 = 6_000_000_000;
+const ATTACH_TIMEOUT_NS: u64 = 6_000_000_000;
 
-const SPAN: Duration = Duration::from_secs(8);
+const MEASURE_TIME: Duration = Duration::from_secs(8);
 /// Time in which the gateway certainly finds a new hub.
-const ATTACHING: Duration = Duration::from_secs(6);
-const FLAT_OUT: Duration = Duration::from_secs(3);
+const ATTACH_TIMEOUT: Duration = Duration::from_secs(6);
+const UNPACED_TIME: Duration = Duration::from_secs(3);
 /// Name of the thread that is the baseline.
-const BARE: &str = "bare";
+const BASELINE_THREAD: &str = "bare";
 /// Datagrams within this time are sent without a pause.
 const BURST_NS: u64 = 1_000_000;
 
 /// Time of arrival, and a datagram.
-type Received = (u64, Vec<u8>);
+type ReceivedDatagram = (u64, Vec<u8>);
 
 /// Measures the gateway's CPU time per datagram for two sensors with all their topics, compared with a thread that
 /// sends the same datagrams at the same times; and how many datagrams per second it can send.
 pub(crate) fn cpu_time(pairs: usize) -> Outcome<Vec<Figure>> {
     let (mut hub, mut baseline, mut share, mut rate) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     {
-        let stage = Stage::new()?;
-        let _simulator = stage.simulate(&SENSORS, 500_000)?;
-        let running = stage.hub(&SENSORS)?;
-        running.await_line("ready", PATIENCE)?;
+        let environment = BenchEnvironment::new()?;
+        let _simulator = environment.simulate(&SENSORS, 500_000)?;
+        let running = environment.start_hub(&SENSORS)?;
+        running.wait_for_line("ready", STEP_TIMEOUT)?;
         for _ in 0..pairs {
-            let (busy_ns, received) = of_gateway(&stage)?;
+            let (busy_ns, received) = gateway_cpu_time(&environment)?;
             hub.push(busy_ns / 1e3 / received.len() as f64);
-            share.push(busy_ns / SPAN.as_nanos() as f64 * 100.0);
-            rate.push(received.len() as f64 / SPAN.as_secs_f64());
-            baseline.push(of_bare(&received)? / 1e3 / received.len() as f64);
+            share.push(busy_ns / MEASURE_TIME.as_nanos() as f64 * 100.0);
+            rate.push(received.len() as f64 / MEASURE_TIME.as_secs_f64());
+            baseline.push(baseline_cpu_time(&received)? / 1e3 / received.len() as f64);
         }
     }
-    let (mut most, mut bare) = (Vec::new(), Vec::new());
+    let (mut maximum, mut bare) = (Vec::new(), Vec::new());
     for _ in 0..pairs {
-        most.push(most_of_gateway()?);
-        bare.push(most_of_bare()?);
+        maximum.push(max_rate_of_gateway()?);
+        bare.push(max_rate_of_baseline()?);
     }
     let figure = |name, unit, hub, baseline, target| Figure { name, unit, hub, baseline, target };
     Ok(vec![
         figure("gateway: CPU time, datagram", "us", hub, baseline, Target::Ratio(2.0)),
         figure("gateway: share of one core", "%", share, Vec::new(), Target::None),
         figure("gateway: datagrams a second", "1", rate, Vec::new(), Target::None),
-        figure("gateway: maximum of scans a second", "1", most, bare, Target::None),
+        figure("gateway: maximum of scans a second", "1", maximum, bare, Target::None),
     ])
 }
 
 /// Returns the gateway's CPU time in ns, and what it sends.
-fn of_gateway(stage: &Stage) -> Outcome<(f64, Vec<Received>)> {
-    let gateway = wire::gateway(stage, "lo", &wire::all_topics())?;
-    thread::sleep(ATTACHING);
+fn gateway_cpu_time(environment: &BenchEnvironment) -> Outcome<(f64, Vec<ReceivedDatagram>)> {
+    let gateway = wire::gateway(environment, "lo", &wire::all_topics())?;
+    thread::sleep(ATTACH_TIMEOUT);
     let (stop, socket) = (Arc::new(AtomicBool::new(false)), wire::receiver()?);
     let flag = stop.clone();
-    let before = Work::of(gateway.pid(), |_| true)?;
+    let before = ThreadUsage::of(gateway.pid(), |_| true)?;
     let listening = thread::spawn(move || receive(&socket, &flag));
-    thread::sleep(SPAN);
-    let busy_ns = Work::of(gateway.pid(), |_| true)?.since(before).busy_ns;
+    thread::sleep(MEASURE_TIME);
+    let busy_ns = ThreadUsage::of(gateway.pid(), |_| true)?.since(before).busy_ns;
     stop.store(true, Ordering::Relaxed);
     let received = listening.join().map_err(|_| "a listener panicked")?;
     drop(gateway.end()?);
@@ -233,17 +233,20 @@ fn of_gateway(stage: &Stage) -> Outcome<(f64, Vec<Received>)> {
 }
 
 /// Returns the CPU time of a thread that sends the same, with a receiver too.
-fn of_bare(received: &[Received]) -> Outcome<f64> {
+fn baseline_cpu_time(received: &[ReceivedDatagram]) -> Outcome<f64> {
     let (stop, socket, to_groups) = (Arc::new(AtomicBool::new(false)), wire::receiver()?, wire::sender()?);
     let flag = stop.clone();
     let listening = thread::spawn(move || receive(&socket, &flag));
     let datagrams = received.to_vec();
     let (before, at_end) = thread::Builder::new()
-        .name(BARE.into())
+        .name(BASELINE_THREAD.into())
         .spawn(move || -> Result<_, String> {
-            let own = || Work::of(std::process::id(), |name| name == BARE).map_err(|error| error.to_string());
+            let own = || {
+                ThreadUsage::of(std::process::id(), |name| name == BASELINE_THREAD)
+                    .map_err(|error| error.to_string())
+            };
             let before = own()?;
-            send_again(&to_groups, &datagrams).map_err(|error| error.to_string())?;
+            send_repeatedly(&to_groups, &datagrams).map_err(|error| error.to_string())?;
             Ok((before, own()?))
         })?
         .join()
@@ -253,13 +256,13 @@ fn of_bare(received: &[Received]) -> Outcome<f64> {
     Ok(at_end.since(before).busy_ns as f64)
 }
 
-fn send_again(to_groups: &UdpSocket, datagrams: &[Received]) -> std::io::Result<()> {
+fn send_repeatedly(to_groups: &UdpSocket, datagrams: &[ReceivedDatagram]) -> std::io::Result<()> {
     let Some(first_ns) = datagrams.first().map(|(at_ns, _)| *at_ns) else { return Ok(()) };
     let (begin, mut burst_ns) = (clock::now(), first_ns);
     for (at_ns, datagram) in datagrams {
         if at_ns - burst_ns > BURST_NS {
             burst_ns = *at_ns;
-            clock::rest(begin + burst_ns - first_ns);
+            clock::sleep_until(begin + burst_ns - first_ns);
         }
         let topic = Datagram::read(datagram).ok().and_then(|datagram| Topic::of_number(datagram.head.topic));
         to_groups.send_to(datagram, wire::address(topic.unwrap_or(Topic::Status)))?;
@@ -267,7 +270,7 @@ fn send_again(to_groups: &UdpSocket, datagrams: &[Received]) -> std::io::Result<
     Ok(())
 }
 
-fn receive(socket: &UdpSocket, stop: &AtomicBool) -> Vec<Received> {
+fn receive(socket: &UdpSocket, stop: &AtomicBool) -> Vec<ReceivedDatagram> {
     let (mut received, mut bytes) = (Vec::new(), [0; 2048]);
     while !stop.load(Ordering::Relaxed) {
         if let Ok(len) = socket.recv(&mut bytes) {
@@ -278,16 +281,16 @@ fn receive(socket: &UdpSocket, stop: &AtomicBool) -> Vec<Received> {
 }
 
 /// Returns how many scans per second the gateway sends if there are always more.
-fn most_of_gateway() -> Outcome<f64> {
-    let stage = Stage::new()?;
-    let mut source = Source::open(&stage.domain)?;
-    let gateway = wire::gateway(&stage, "lo", &[format!("--topic={SENSOR}/scan")])?;
+fn max_rate_of_gateway() -> Outcome<f64> {
+    let environment = BenchEnvironment::new()?;
+    let mut source = ScanSource::open(&environment.domain)?;
+    let gateway = wire::gateway(&environment, "lo", &[format!("--topic={SENSOR}/scan")])?;
     let begin = Instant::now();
-    while begin.elapsed() < ATTACHING + FLAT_OUT {
+    while begin.elapsed() < ATTACH_TIMEOUT + UNPACED_TIME {
         source.publish(0)?;
     }
     let lines = gateway.end()?;
-    let scans: Vec<_> = lines.iter().filter(|(_, line)| is_of(line, SENSOR, "scan")).collect();
+    let scans: Vec<_> = lines.iter().filter(|(_, line)| has_topic(line, SENSOR, "scan")).collect();
     // Between two of its statistics in the middle.
     let [.., (from_ns, first), (to_ns, last), _] = scans[..] else { return Err("too few statistics".into()) };
     if number(last, "missed") == number(first, "missed") {
@@ -297,13 +300,13 @@ fn most_of_gateway() -> Outcome<f64> {
 }
 
 /// Returns how many datagrams of this length a loop sends per second.
-fn most_of_bare() -> Outcome<f64> {
+fn max_rate_of_baseline() -> Outcome<f64> {
     let to_groups = wire::sender()?;
-    let datagram = vec![0; HEAD + source::scan().pack(&mut [0; 2048]).unwrap_or_default()];
+    let datagram = vec![0; HEADER_LEN + source::scan().pack(&mut [0; 2048]).unwrap_or_default()];
     let (begin, mut sent) = (Instant::now(), 0u64);
-    while begin.elapsed() < FLAT_OUT {
+    while begin.elapsed() < UNPACED_TIME {
         to_groups.send_to(&datagram, wire::address(Topic::Scan))?;
         sent += 1;
     }
-    Ok(sent as f64 / FLAT_OUT.as_secs_f64())
+    Ok(sent as f64 / UNPACED_TIME.as_secs_f64())
 }

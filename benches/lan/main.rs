@@ -26,20 +26,22 @@ use std::thread;
 use std::time::Duration;
 
 use machine::Machine;
-use scanhub_schema::datagram::{DatagramError, HEAD, Head, MTU_ETHERNET, MTU_SAFE, PORT, Packed};
-use scanhub_schema::{Contents, Scan, ScanHead, Topic, Verdict, Zones};
+use scanhub_schema::datagram::{
+    DatagramError, DatagramPayload, HEADER_LEN, Head, MTU_ETHERNET, MTU_SAFE, PORT,
+};
+use scanhub_schema::{ArrayFlags, Scan, ScanHead, Topic, Verdict, Zones};
+use support::environment::{BenchEnvironment, SENSORS, STEP_TIMEOUT};
 use support::figures::{self, Figure, Target};
 use support::source;
-use support::stage::{PATIENCE, SENSORS, Stage};
 use support::{Options, Outcome, clock};
-use wire::{Program, is_of, number, sum};
+use wire::{Program, has_topic, number, sum};
 
 fn main() -> ExitCode {
-    let is_sender = std::env::args().skip(1).eq(gateway::PART);
-    let outcome = match (wire::inside(), is_sender) {
-        (true, true) => gateway::sender().map(|()| ExitCode::SUCCESS),
+    let is_sender = std::env::args().skip(1).eq(gateway::SENDER_PART);
+    let outcome = match (wire::is_in_namespace(), is_sender) {
+        (true, true) => gateway::run_sender().map(|()| ExitCode::SUCCESS),
         (true, false) => return support::main(measure),
-        (false, _) => wire::enter(),
+        (false, _) => wire::rerun_in_namespace(),
     };
     outcome.unwrap_or_else(|error| {
         eprintln!("{error}");
@@ -53,44 +55,44 @@ fn measure(options: &Options) -> Outcome<()> {
     print(gateway::latency(options.pairs())?);
     print(gateway::cpu_time(options.pairs())?);
     print(damaged_datagrams(options.count(1_000_000) as u64)?);
-    print(healthy(options.seconds(60))?);
-    print(link_down()?);
+    print(measure_healthy_link(options.seconds(60))?);
+    print(measure_link_down()?);
     Ok(())
 }
 
 /// Sends all topics of two sensors over a cable between two machines.
-fn healthy(seconds: u64) -> Outcome<Vec<Figure>> {
-    let stage = Stage::new()?;
+fn measure_healthy_link(seconds: u64) -> Outcome<Vec<Figure>> {
+    let environment = BenchEnvironment::new()?;
     let machine = Machine::new(2);
     let network = format!("--net={}", machine.network().display());
     let mut listen = Command::new("nsenter");
     listen.args([&network, wire::PROGRAM, "listen", "--stats", "--json"]);
     let listener = Program::start(listen, "ready")?;
-    let _simulator = stage.simulate(&SENSORS, 500_000)?;
-    let hub = stage.hub(&SENSORS)?;
-    hub.await_line("ready", PATIENCE)?;
-    let gateway = wire::gateway(&stage, &machine.end(), &wire::all_topics())?;
+    let _simulator = environment.simulate(&SENSORS, 500_000)?;
+    let hub = environment.start_hub(&SENSORS)?;
+    hub.wait_for_line("ready", STEP_TIMEOUT)?;
+    let gateway = wire::gateway(&environment, &machine.test_interface(), &wire::all_topics())?;
     thread::sleep(Duration::from_secs(seconds));
     let sent = gateway.end()?;
-    let heard = listener.end()?;
+    let output_lines = listener.end()?;
     let mut rates = Vec::new();
     for sensor in SENSORS {
-        let lines: Vec<_> = sent.iter().filter(|(_, line)| is_of(line, sensor, "scan")).collect();
+        let lines: Vec<_> = sent.iter().filter(|(_, line)| has_topic(line, sensor, "scan")).collect();
         // The first statistics are from before the sensors stream, the last may cover a fraction of a second.
         let [(from_ns, first), .., (to_ns, last), _] = lines[..] else { return Err("too short".into()) };
         let count = number(last, "sent") - number(first, "sent");
         rates.push(count as f64 / ((to_ns - from_ns) as f64 / 1e9));
     }
-    let count = |key: &str| sum(&heard, key);
+    let count = |key: &str| sum(&output_lines, key);
     let figure = |name, hub, target| Figure { name, unit: "1", hub, baseline: Vec::new(), target };
     Ok(vec![
         Figure { unit: "Hz", ..figure("cable: scans of each sensor", rates, Target::None) },
         figure("cable: datagrams received", vec![count("received")], Target::None),
-        figure("cable: lost", vec![count("lost")], Target::Most(0.0)),
+        figure("cable: lost", vec![count("lost")], Target::Max(0.0)),
         figure(
             "cable: duplicated or reordered",
             vec![count("duplicate") + count("reordered")],
-            Target::Most(0.0),
+            Target::Max(0.0),
         ),
     ])
 }
@@ -107,19 +109,19 @@ const VARIANTS: [(usize, &str, &str); 5] = [
 
 /// Returns the lengths of a scan's datagram for each variant of the LMS, without the headers of IP and UDP.
 fn sizes() -> Vec<Figure> {
-    let variant = |(count, plain, full)| [size(plain, count, 0), size(full, count, Contents::UPPER)];
+    let variant = |(count, plain, full)| [size(plain, count, 0), size(full, count, ArrayFlags::UPPER)];
     VARIANTS.into_iter().flat_map(variant).collect()
 }
 
 fn size(name: &'static str, count: usize, contents: u8) -> Figure {
     let scan = Scan::of(ScanHead { contents, ..ScanHead::default() }, &vec![0; count]);
-    let len = scan.pack(&mut [0; MTU_ETHERNET]).map(|packed| HEAD + packed);
+    let len = scan.pack(&mut [0; MTU_ETHERNET]).map(|packed| HEADER_LEN + packed);
     let hub = len.map(|len| len as f64).into_iter().collect();
-    Figure { name, unit: "B", hub, baseline: Vec::new(), target: Target::Most(MTU_SAFE as f64) }
+    Figure { name, unit: "B", hub, baseline: Vec::new(), target: Target::Max(MTU_SAFE as f64) }
 }
 
 /// Damaged datagrams between two intact ones; a listener's buffer certainly holds this number.
-const INTERVAL: u64 = 50;
+const DAMAGED_PER_INTACT: u64 = 50;
 
 /// Sends `count` damaged and random datagrams to a listener: what does it accept, what does it report, and does its
 /// memory grow?
@@ -130,16 +132,16 @@ fn damaged_datagrams(count: u64) -> Outcome<Vec<Figure>> {
     let (socket, to) = (wire::sender()?, wire::address(Topic::Zones));
     let mut random = fastrand::Rng::with_seed(6);
     let mut buffer = [0; MTU_ETHERNET];
-    let scan = sealed(&mut buffer, Topic::Scan, 0, &*source::scan())?;
-    let whole = [scan, sealed(&mut buffer, Topic::Zones, 0, &Zones::unknown())?];
+    let scan = sealed_datagram(&mut buffer, Topic::Scan, 0, &*source::scan())?;
+    let whole = [scan, sealed_datagram(&mut buffer, Topic::Zones, 0, &Zones::unknown())?];
     let (mut sequence, mut begin_kb) = (0, 0);
     for n in 1..=count {
-        socket.send_to(&damaged(&mut random, &whole), to)?;
-        if n % INTERVAL == 0 {
+        socket.send_to(&damaged_datagram(&mut random, &whole), to)?;
+        if n % DAMAGED_PER_INTACT == 0 {
             let zones = Zones { verdict: Verdict::Stop as u8, ..Zones::unknown() };
-            socket.send_to(&sealed(&mut buffer, Topic::Zones, sequence, &zones)?, to)?;
+            socket.send_to(&sealed_datagram(&mut buffer, Topic::Zones, sequence, &zones)?, to)?;
             sequence += 1;
-            listener.await_class("zones")?;
+            listener.wait_for_class("zones")?;
         }
         if n == count / 10 {
             begin_kb = resident_kb(&listener)?;
@@ -156,30 +158,30 @@ fn damaged_datagrams(count: u64) -> Outcome<Vec<Figure>> {
     }
     let received: u64 = of_class("lan").map(|line| number(line, "received")).sum();
     let figure = |name, hub, target| Figure { name, unit: "1", hub: vec![hub], baseline: Vec::new(), target };
-    let most = |name, hub: u64| figure(name, hub as f64, Target::Most(0.0));
+    let at_most = |name, hub: u64| figure(name, hub as f64, Target::Max(0.0));
     Ok(vec![
         figure("damaged: sent", count as f64, Target::None),
-        most("damaged: refused without reason", count - counted.min(count)),
-        most("damaged: accepted and not sent", received.saturating_sub(u64::from(sequence))),
-        most("intact: sent and not accepted", u64::from(sequence).saturating_sub(received)),
-        Figure { unit: "kB", ..figure("damaged: memory grown", grown_kb as f64, Target::Most(512.0)) },
+        at_most("damaged: refused without reason", count - counted.min(count)),
+        at_most("damaged: accepted and not sent", received.saturating_sub(u64::from(sequence))),
+        at_most("intact: sent and not accepted", u64::from(sequence).saturating_sub(received)),
+        Figure { unit: "kB", ..figure("damaged: memory grown", grown_kb as f64, Target::Max(512.0)) },
     ])
 }
 
-fn sealed(
+fn sealed_datagram(
     buffer: &mut [u8],
     topic: Topic,
     sequence: u32,
-    payload: &(impl Packed + ?Sized),
+    payload: &(impl DatagramPayload + ?Sized),
 ) -> Outcome<Vec<u8>> {
-    let len = payload.pack(&mut buffer[HEAD..]).ok_or("it does not fit")?;
+    let len = payload.pack(&mut buffer[HEADER_LEN..]).ok_or("it does not fit")?;
     let head = Head { topic: topic.number(), hub: 1, epoch: 1, sequence, revision: 1, ..Head::default() };
     Ok(head.seal(buffer, len).ok_or("it does not fit")?.to_vec())
 }
 
 /// Returns one of `whole` with some bits, its end, or all of its rest changed; or noise.
-fn damaged(random: &mut fastrand::Rng, whole: &[Vec<u8>]) -> Vec<u8> {
-    let mut bytes = whole[random.usize(..whole.len())].clone();
+fn damaged_datagram(random: &mut fastrand::Rng, intact: &[Vec<u8>]) -> Vec<u8> {
+    let mut bytes = intact[random.usize(..intact.len())].clone();
     match random.u8(..5) {
         0 => (0..random.usize(1..4)).for_each(|_| {
             let bit = random.usize(..8 * bytes.len());
@@ -195,7 +197,7 @@ fn damaged(random: &mut fastrand::Rng, whole: &[Vec<u8>]) -> Vec<u8> {
         _ => bytes = (0..random.usize(..MTU_ETHERNET)).map(|_| random.u8(..)).collect(),
     }
     // Flips may have canceled each other.
-    if whole.contains(&bytes) {
+    if intact.contains(&bytes) {
         bytes[0] ^= 0x80;
     }
     bytes
@@ -208,11 +210,11 @@ fn resident_kb(program: &Program) -> Outcome<u64> {
 }
 
 /// Time for which the gateway's link is down.
-const DOWN: Duration = Duration::from_secs(10);
+const DOWN_TIME: Duration = Duration::from_secs(10);
 
 /// Takes the gateway's link down: when is it received again, and does another machine notice?
-fn link_down() -> Outcome<Vec<Figure>> {
-    let stage = Stage::new()?;
+fn measure_link_down() -> Outcome<Vec<Figure>> {
+    let environment = BenchEnvironment::new()?;
     let (pulled, other) = (Machine::new(3), Machine::new(4));
     let listener = |machine: &Machine, flag: &str| {
         let mut listen = Command::new("nsenter");
@@ -221,19 +223,20 @@ fn link_down() -> Outcome<Vec<Figure>> {
         Program::start(listen, "ready")
     };
     let (there, elsewhere) = (listener(&pulled, "--topic=scan")?, listener(&other, "--stats")?);
-    let _simulator = stage.simulate(&SENSORS, 500_000)?;
-    let hub = stage.hub(&SENSORS)?;
-    hub.await_line("ready", PATIENCE)?;
-    let copies = format!("--to={}:{PORT}", other.there());
-    let gateway = wire::gateway(&stage, &pulled.end(), &[wire::all_topics(), vec![copies]].concat())?;
-    there.await_after(0, "scan")?;
-    pulled.run("ip link set eth0 down");
-    thread::sleep(DOWN);
-    pulled.run("ip link set eth0 up");
+    let _simulator = environment.simulate(&SENSORS, 500_000)?;
+    let hub = environment.start_hub(&SENSORS)?;
+    hub.wait_for_line("ready", STEP_TIMEOUT)?;
+    let copies = format!("--to={}:{PORT}", other.test_address());
+    let gateway =
+        wire::gateway(&environment, &pulled.test_interface(), &[wire::all_topics(), vec![copies]].concat())?;
+    there.wait_for_class_after(0, "scan")?;
+    pulled.run_command("ip link set eth0 down");
+    thread::sleep(DOWN_TIME);
+    pulled.run_command("ip link set eth0 up");
     let plugged_ns = clock::now();
-    let heard_ns = there.await_after(plugged_ns, "scan")?;
+    let heard_ns = there.wait_for_class_after(plugged_ns, "scan")?;
     let sent = gateway.end()?;
-    let heard = elsewhere.end()?;
+    let output_lines = elsewhere.end()?;
     drop(there.end()?);
     let last = sent.iter().rev().take_while(|(_, line)| line["class"] != "lan_link");
     let missed =
@@ -242,9 +245,9 @@ fn link_down() -> Outcome<Vec<Figure>> {
         |name, unit, value, target| Figure { name, unit, hub: vec![value], baseline: vec![], target };
     let again_ms = (heard_ns - plugged_ns) as f64 / 1e6;
     Ok(vec![
-        figure("down for 10 s: until received again", "ms", again_ms, Target::Most(1000.0)),
-        figure("the same: received by another machine", "1", sum(&heard, "received"), Target::None),
-        figure("the same: lost by another machine", "1", sum(&heard, "lost"), Target::Most(0.0)),
-        figure("the same: missed by the gateway", "1", missed.max().unwrap_or(0) as f64, Target::Most(0.0)),
+        figure("down for 10 s: until received again", "ms", again_ms, Target::Max(1000.0)),
+        figure("the same: received by another machine", "1", sum(&output_lines, "received"), Target::None),
+        figure("the same: lost by another machine", "1", sum(&output_lines, "lost"), Target::Max(0.0)),
+        figure("the same: missed by the gateway", "1", missed.max().unwrap_or(0) as f64, Target::Max(0.0)),
     ])
 }

@@ -10,22 +10,22 @@ use std::time::Duration;
 use rustix::net::sockopt::{set_ip_multicast_if, set_socket_recv_buffer_size_force};
 use rustix::process::{Pid, Signal, kill_process};
 use scanhub_schema::Topic;
-use scanhub_schema::datagram::{GROUPS, PORT, group};
+use scanhub_schema::datagram::{GROUP_PREFIX, PORT, group};
 use serde_json::Value;
 
-use crate::support::stage::{Guard, PATIENCE, Stage};
+use crate::support::environment::{BenchEnvironment, GuardedProcess, STEP_TIMEOUT};
 use crate::support::{Outcome, clock};
 
 pub(crate) const PROGRAM: &str = env!("CARGO_BIN_EXE_scanhub");
-const INSIDE: &str = "SCANHUB_BENCH_NETWORK";
+const NAMESPACE_VARIABLE: &str = "SCANHUB_BENCH_NETWORK";
 
 /// Returns whether this process runs in its own network namespace.
-pub(crate) fn inside() -> bool {
-    env::var_os(INSIDE).is_some()
+pub(crate) fn is_in_namespace() -> bool {
+    env::var_os(NAMESPACE_VARIABLE).is_some()
 }
 
 /// Runs this program again in a network namespace that has only the loopback.
-pub(crate) fn enter() -> Outcome<ExitCode> {
+pub(crate) fn rerun_in_namespace() -> Outcome<ExitCode> {
     let mut unshare = Command::new("unshare");
     unshare.arg("--net");
     if !rustix::process::getuid().is_root() {
@@ -33,7 +33,7 @@ pub(crate) fn enter() -> Outcome<ExitCode> {
     }
     let state = tempfile::tempdir()?;
     unshare.args(["sh", "-c", "ip link set lo up && exec \"$@\"", "sh"]).arg(env::current_exe()?);
-    unshare.args(env::args().skip(1)).env(INSIDE, "1").env("XDG_STATE_HOME", state.path());
+    unshare.args(env::args().skip(1)).env(NAMESPACE_VARIABLE, "1").env("XDG_STATE_HOME", state.path());
     let status = unshare.env_remove("STATE_DIRECTORY").status()?;
     Ok(if status.success() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
@@ -42,8 +42,10 @@ pub(crate) fn enter() -> Outcome<ExitCode> {
 pub(crate) fn receiver() -> Outcome<UdpSocket> {
     let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, PORT))?;
     for last in 80..84 {
-        socket
-            .join_multicast_v4(&Ipv4Addr::new(GROUPS[0], GROUPS[1], GROUPS[2], last), &Ipv4Addr::LOCALHOST)?;
+        socket.join_multicast_v4(
+            &Ipv4Addr::new(GROUP_PREFIX[0], GROUP_PREFIX[1], GROUP_PREFIX[2], last),
+            &Ipv4Addr::LOCALHOST,
+        )?;
     }
     let _ = set_socket_recv_buffer_size_force(&socket, 8 << 20);
     socket.set_read_timeout(Some(Duration::from_millis(200)))?;
@@ -59,7 +61,7 @@ pub(crate) fn sender() -> Outcome<UdpSocket> {
 
 /// Returns the address of the datagrams of `topic`.
 pub(crate) fn address(topic: Topic) -> (Ipv4Addr, u16) {
-    (Ipv4Addr::new(GROUPS[0], GROUPS[1], GROUPS[2], group(topic)), PORT)
+    (Ipv4Addr::new(GROUP_PREFIX[0], GROUP_PREFIX[1], GROUP_PREFIX[2], group(topic)), PORT)
 }
 
 /// Returns the flags of a gateway that sends all topics.
@@ -68,17 +70,17 @@ pub(crate) fn all_topics() -> Vec<String> {
 }
 
 /// Starts the gateway of `stage`.
-pub(crate) fn gateway(stage: &Stage, interface: &str, flags: &[String]) -> Outcome<Program> {
+pub(crate) fn gateway(environment: &BenchEnvironment, interface: &str, flags: &[String]) -> Outcome<Program> {
     let mut command = Command::new(PROGRAM);
     command
-        .args(["gateway", "--json", "--interface", interface, "--domain", stage.domain.name()])
+        .args(["gateway", "--json", "--interface", interface, "--domain", environment.domain.name()])
         .args(flags);
     Program::start(command, "gateway")
 }
 
 /// A program that prints JSON.
 pub(crate) struct Program {
-    guard: Guard,
+    guard: GuardedProcess,
     lines: Receiver<(u64, Value)>,
 }
 
@@ -98,8 +100,8 @@ impl Program {
                 }
             }
         });
-        let program = Program { guard: Guard::new(process), lines };
-        program.await_class(class)?;
+        let program = Program { guard: GuardedProcess::new(process), lines };
+        program.wait_for_class(class)?;
         Ok(program)
     }
 
@@ -108,9 +110,9 @@ impl Program {
     }
 
     /// Returns the next line of this class, and drops the lines before it.
-    pub(crate) fn await_class(&self, class: &str) -> Outcome<Value> {
+    pub(crate) fn wait_for_class(&self, class: &str) -> Outcome<Value> {
         loop {
-            let (_, line) = self.lines.recv_timeout(PATIENCE).map_err(|_| format!("no {class} came"))?;
+            let (_, line) = self.lines.recv_timeout(STEP_TIMEOUT).map_err(|_| format!("no {class} came"))?;
             if line["class"] == class {
                 return Ok(line);
             }
@@ -118,9 +120,10 @@ impl Program {
     }
 
     /// Returns when the first line of this class after `since_ns` arrived, and drops the lines before it.
-    pub(crate) fn await_after(&self, since_ns: u64, class: &str) -> Outcome<u64> {
+    pub(crate) fn wait_for_class_after(&self, since_ns: u64, class: &str) -> Outcome<u64> {
         loop {
-            let (at_ns, line) = self.lines.recv_timeout(PATIENCE).map_err(|_| format!("no {class} came"))?;
+            let (at_ns, line) =
+                self.lines.recv_timeout(STEP_TIMEOUT).map_err(|_| format!("no {class} came"))?;
             if at_ns > since_ns && line["class"] == class {
                 return Ok(at_ns);
             }
@@ -132,7 +135,7 @@ impl Program {
         let pid = Pid::from_raw(self.pid() as i32).ok_or("no process")?;
         kill_process(pid, Signal::TERM)?;
         let mut lines = Vec::new();
-        while let Ok(line) = self.lines.recv_timeout(PATIENCE) {
+        while let Ok(line) = self.lines.recv_timeout(STEP_TIMEOUT) {
             lines.push(line);
         }
         self.guard.wait()?;
@@ -141,7 +144,7 @@ impl Program {
 }
 
 /// Returns whether a line has statistics of this sensor and topic.
-pub(crate) fn is_of(line: &Value, sensor: &str, topic: &str) -> bool {
+pub(crate) fn has_topic(line: &Value, sensor: &str, topic: &str) -> bool {
     line["class"] == "lan" && line["sensor"] == sensor && line["topic"] == topic
 }
 

@@ -57,28 +57,28 @@ mod on_x86_64 {
     use std::thread;
     use std::time::{Duration, Instant};
 
-    use crate::profile::{self, Code, Profile, Sum};
+    use crate::profile::{self, Code, Profile, Totals};
     use crate::steps::{Stepper, link_thread};
+    use crate::support::environment::{BenchEnvironment, Child, PROGRAM, STEP_TIMEOUT};
     use crate::support::figures::{self, Cell};
-    use crate::support::stage::{Child, PATIENCE, PROGRAM, Stage};
     use crate::support::{Options, Outcome};
 
     pub(crate) fn measure(options: &Options) -> Outcome<()> {
         let count = options.count(if options.quick { 10 } else { 100 });
         let (mut cells, mut order) = (Vec::new(), [Vec::new(), Vec::new()]);
         for background in ["learned", "not learned"] {
-            let stage = Stage::new()?;
+            let environment = BenchEnvironment::new()?;
             let flags = ["--baud", "500000", "--state", "streaming", "--lossless"];
-            let _simulator = stage.simulate_as(&[SENSOR], &flags)?;
+            let _simulator = environment.simulate_as(&[SENSOR], &flags)?;
             if background == "learned" {
-                learn(&stage, 10 * count as u64, &mut cells)?;
+                measure_learning(&environment, 10 * count as u64, &mut cells)?;
             }
-            let mut command = stage.hub_command(PROGRAM, &[SENSOR]);
+            let mut command = environment.hub_command(PROGRAM, &[SENSOR]);
             command.arg(format!("--set=link.{SENSOR}.baud=9600"));
-            let hub = Child::of(command, Stdio::null())?;
-            hub.await_line("ready", PATIENCE)?;
-            let subscriber = stage.consumer("scan", SENSOR, &[])?;
-            subscriber.await_line("scan", 2 * PATIENCE)?;
+            let hub = Child::spawn(command, Stdio::null())?;
+            hub.wait_for_line("ready", STEP_TIMEOUT)?;
+            let subscriber = environment.start_subscriber("scan", SENSOR, &[])?;
+            subscriber.wait_for_line("scan", 2 * STEP_TIMEOUT)?;
             let mut stepper = match Stepper::attach(link_thread(hub.guard.pid(), SENSOR)?) {
                 Ok(stepper) => stepper,
                 Err(reason) => {
@@ -93,10 +93,10 @@ mod on_x86_64 {
                      set CARGO_PROFILE_BENCH_STRIP=none and CARGO_PROFILE_RELEASE_STRIP=none"
                 );
             }
-            let end = Instant::now() + Duration::from_secs(options.seconds(MOST_SECONDS));
+            let end = Instant::now() + Duration::from_secs(options.seconds(MAX_SECONDS));
             let (profile, calls) = step(&mut stepper, &code, count, end)?;
             stepper.detach();
-            show(background, &profile, &calls, code.has_names(), &mut cells);
+            add_tables(background, &profile, &calls, code.has_names(), &mut cells);
             for (patterns, of_status) in order.iter_mut().zip([false, true]) {
                 patterns.extend(profile.patterns(of_status));
             }
@@ -113,18 +113,20 @@ mod on_x86_64 {
         let mut known = HashSet::new();
         let patterns = patterns.iter().filter(|pattern| known.insert(*pattern));
         let lines: String = patterns.map(|pattern| format!("    *(.text.{pattern})\n")).collect();
-        format!("{ABOUT}SECTIONS\n{{\n  .text.path :\n  {{\n{lines}  }}\n}}\nINSERT BEFORE .text;\n")
+        format!(
+            "{LINK_ORDER_HEADER}SECTIONS\n{{\n  .text.path :\n  {{\n{lines}  }}\n}}\nINSERT BEFORE .text;\n"
+        )
     }
 
     /// Starts a hub at 500,000 baud that learns the background and saves it. Then counts its system calls for `count`
     /// telegrams.
-    fn learn(stage: &Stage, count: u64, cells: &mut Vec<Cell>) -> Outcome<()> {
-        let hub = stage.hub(&[SENSOR])?;
-        hub.await_line("ready", PATIENCE)?;
-        let subscriber = stage.consumer("scan", SENSOR, &[])?;
-        subscriber.await_line("scan", PATIENCE)?;
-        let end = Instant::now() + 6 * PATIENCE;
-        while saved_background(&stage.file("scanhub")).is_none() {
+    fn measure_learning(environment: &BenchEnvironment, count: u64, cells: &mut Vec<Cell>) -> Outcome<()> {
+        let hub = environment.start_hub(&[SENSOR])?;
+        hub.wait_for_line("ready", STEP_TIMEOUT)?;
+        let subscriber = environment.start_subscriber("scan", SENSOR, &[])?;
+        subscriber.wait_for_line("scan", STEP_TIMEOUT)?;
+        let end = Instant::now() + 6 * STEP_TIMEOUT;
+        while saved_background(&environment.file("scanhub")).is_none() {
             if Instant::now() > end {
                 return Err("the hub did not learn the background".into());
             }
@@ -132,10 +134,10 @@ mod on_x86_64 {
         }
         // `measure` reports why it cannot attach.
         let Ok(mut stepper) = Stepper::attach(link_thread(hub.guard.pid(), SENSOR)?) else { return Ok(()) };
-        stepper.run()?;
+        stepper.run_telegram()?;
         let (mut calls, mut telegrams) = (BTreeMap::<u64, u64>::new(), 0);
         while telegrams < count {
-            let cost = stepper.run()?;
+            let cost = stepper.run_telegram()?;
             telegrams += cost.telegrams;
             cost.system_calls.iter().for_each(|(call, count)| *calls.entry(*call).or_default() += count);
         }
@@ -166,14 +168,14 @@ mod on_x86_64 {
         end: Instant,
     ) -> Outcome<(Profile<'a>, Vec<BTreeMap<u64, u64>>)> {
         let (mut profile, mut calls) = (Profile::new(code), Vec::new());
-        stepper.pass(INTERVAL)?;
+        stepper.run_past_telegram(TELEGRAM_INTERVAL)?;
         while calls.len() < count && Instant::now() < end {
             let mut steps = Vec::new();
             let mut of_status = Vec::new();
-            let mut cost = stepper.telegram(|address, calls, system_call| {
-                let stage = profile.stage(address, calls.iter().map(|call| call.function));
-                steps.push((address, stage));
-                of_status.extend(system_call.filter(|_| stage == profile::Stage::Status));
+            let mut cost = stepper.step_telegram(|address, calls, system_call| {
+                let environment = profile.stage(address, calls.iter().map(|call| call.function));
+                steps.push((address, environment));
+                of_status.extend(system_call.filter(|_| environment == profile::PathStage::Status));
             })?;
             for call in of_status {
                 cost.system_calls.entry(call).and_modify(|count| *count -= 1);
@@ -189,8 +191,8 @@ mod on_x86_64 {
                 calls.push(cost.system_calls);
             }
             // Otherwise, the hub still reads the first bytes of the next telegram before most of it has arrived.
-            if cost.lag > INTERVAL * 2 / 3 {
-                stepper.pass(INTERVAL)?;
+            if cost.lag > TELEGRAM_INTERVAL * 2 / 3 {
+                stepper.run_past_telegram(TELEGRAM_INTERVAL)?;
             }
         }
         if calls.is_empty() {
@@ -200,7 +202,7 @@ mod on_x86_64 {
     }
 
     /// Adds the tables of one state of the background.
-    fn show(
+    fn add_tables(
         background: &str,
         profile: &Profile<'_>,
         calls: &[BTreeMap<u64, u64>],
@@ -212,7 +214,8 @@ mod on_x86_64 {
             cells.push(Cell { table: table.to_owned(), row: row.to_owned(), column, unit: "1", values });
         };
         add("per telegram", "measured telegrams", "", vec![calls.len() as f64]);
-        let each = |value: fn(&Sum) -> u64| profile.each.iter().map(|sum| value(sum) as f64).collect();
+        let each =
+            |value: fn(&Totals) -> u64| profile.per_telegram.iter().map(|sum| value(sum) as f64).collect();
         add("per telegram", "instructions", "", each(|sum| sum.instructions));
         add("per telegram", "code lines of 64 bytes", "", each(|sum| sum.lines));
         add("per telegram", "code pages of 4 KiB", "", each(|sum| sum.pages));
@@ -228,28 +231,30 @@ mod on_x86_64 {
             return;
         }
         let telegrams = profile.telegrams as f64;
-        let mut rows = |table: &str, row: &str, sum: &Sum| {
+        let mut rows = |table: &str, row: &str, sum: &Totals| {
             for (column, count) in
                 [("instructions", sum.instructions), ("code lines", sum.lines), ("code pages", sum.pages)]
             {
                 add(table, row, column, vec![(count as f64 / telegrams * 10.0).round() / 10.0]);
             }
         };
-        for (stage, sum) in &profile.by_stage {
-            rows("by stage, mean", stage.name(), sum);
+        for (environment, sum) in &profile.by_stage {
+            rows("by stage, mean", environment.name(), sum);
         }
         for (name, sum) in sorted(&profile.by_crate, |sum| sum.instructions) {
             rows("by crate, mean", name, &sum);
         }
-        for (name, sum) in sorted(&profile.by_function, |sum| sum.instructions).into_iter().take(SHOWN) {
-            rows(&format!("{SHOWN} functions by instructions, mean, {background}"), name, &sum);
+        for (name, sum) in
+            sorted(&profile.by_function, |sum| sum.instructions).into_iter().take(MAX_TABLE_ROWS)
+        {
+            rows(&format!("{MAX_TABLE_ROWS} functions by instructions, mean, {background}"), name, &sum);
         }
-        for (name, sum) in sorted(&profile.by_function, |sum| sum.lines).into_iter().take(SHOWN) {
-            rows(&format!("{SHOWN} functions by code lines, mean, {background}"), name, &sum);
+        for (name, sum) in sorted(&profile.by_function, |sum| sum.lines).into_iter().take(MAX_TABLE_ROWS) {
+            rows(&format!("{MAX_TABLE_ROWS} functions by code lines, mean, {background}"), name, &sum);
         }
     }
 
-    fn sorted<'a>(sums: &HashMap<&'a str, Sum>, key: fn(&Sum) -> u64) -> Vec<(&'a str, Sum)> {
+    fn sorted<'a>(sums: &HashMap<&'a str, Totals>, key: fn(&Totals) -> u64) -> Vec<(&'a str, Totals)> {
         let mut sorted: Vec<_> = sums.iter().map(|(name, sum)| (*name, *sum)).collect();
         sorted.sort_by_key(|(name, sum)| (std::cmp::Reverse(key(sum)), *name));
         sorted
@@ -283,12 +288,12 @@ mod on_x86_64 {
     const SENSOR: &str = "front";
     /// The linker script that `hub/build.rs` passes to the linker, and its first lines.
     const LINK_ORDER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/hub/path.lds");
-    const ABOUT: &str = "/* The functions that run for each telegram, in the order in which they run, and then those of the\n   \
+    const LINK_ORDER_HEADER: &str = "/* The functions that run for each telegram, in the order in which they run, and then those of the\n   \
         status. Written by the bench `path`. */\n";
     /// Time between two telegrams at 9,600 baud.
-    const INTERVAL: Duration = Duration::from_millis(773);
+    const TELEGRAM_INTERVAL: Duration = Duration::from_millis(773);
     /// Limit for the steps of one state of the background, in seconds. An idle machine needs less for 100 telegrams.
-    const MOST_SECONDS: u64 = 110;
+    const MAX_SECONDS: u64 = 110;
     /// Number of functions in a table.
-    const SHOWN: usize = 20;
+    const MAX_TABLE_ROWS: usize = 20;
 }

@@ -99,7 +99,7 @@ pub(crate) fn crate_of(name: &str) -> &str {
 
 /// Stages of the path of a telegram.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub(crate) enum Stage {
+pub(crate) enum PathStage {
     Sleeping,
     Read,
     Framing,
@@ -115,45 +115,45 @@ pub(crate) enum Stage {
 
 /// Stages by a part of the names of functions. The innermost function with a stage counts, so that the shared-memory
 /// library, `memcpy` and the standard library belong to their callers. The first entry that fits a name counts.
-const STAGES: [(&str, Stage); 34] = [
-    ("preprocess::zones::", Stage::Zones),
-    ("Pipeline::check_zones", Stage::Zones),
-    ("scanhub_preprocess::", Stage::Processors),
-    ("Pipeline::process", Stage::Processors),
-    ("lms::arrival::", Stage::Read),
-    ("::defer_read", Stage::Read),
-    ("::can_defer_read", Stage::Read),
-    ("::commit", Stage::Read),
-    ("::spare", Stage::Read),
-    ("SessionDriver<S>::read", Stage::Read),
-    ("scanhub_port::tty::", Stage::Read),
-    ("lms::framer::", Stage::Framing),
-    ("lms::telegram::", Stage::Framing),
-    ("lms::session::", Stage::Framing),
-    ("lms::dialogue::", Stage::Framing),
-    ("lms::measured::", Stage::Decode),
-    ("line::scan::", Stage::Decode),
-    ("link_output::decode", Stage::Decode),
-    ("::copy_from", Stage::Decode),
-    ("daemon::publisher::", Stage::Publish),
-    ("daemon::topics::", Stage::Publish),
-    ("LinkOutput<S>::prepare", Stage::Publish),
-    ("LinkOutput<S>::telegram", Stage::Publish),
-    ("LinkOutput<S>::publish_scan", Stage::Publish),
-    ("scanhub_shm::", Stage::Publish),
-    ("SessionDriver<S>::drain", Stage::Bookkeeping),
-    ("SessionDriver<S>::on_wakeup", Stage::Bookkeeping),
-    ("daemon::diagnosis::", Stage::Bookkeeping),
-    ("daemon::link_stats::", Stage::Bookkeeping),
-    ("LinkCore<S>::", Stage::Bookkeeping),
-    ("daemon::system::", Stage::Sleeping),
-    ("LiveLink<S>::", Stage::Sleeping),
-    ("scanhub_port::clock::", Stage::Sleeping),
-    ("rustix::", Stage::Sleeping),
+const STAGES: [(&str, PathStage); 34] = [
+    ("preprocess::zones::", PathStage::Zones),
+    ("Pipeline::check_zones", PathStage::Zones),
+    ("scanhub_preprocess::", PathStage::Processors),
+    ("Pipeline::process", PathStage::Processors),
+    ("lms::arrival::", PathStage::Read),
+    ("::defer_read", PathStage::Read),
+    ("::can_defer_read", PathStage::Read),
+    ("::commit", PathStage::Read),
+    ("::spare", PathStage::Read),
+    ("SessionDriver<S>::read", PathStage::Read),
+    ("scanhub_port::tty::", PathStage::Read),
+    ("lms::framer::", PathStage::Framing),
+    ("lms::telegram::", PathStage::Framing),
+    ("lms::session::", PathStage::Framing),
+    ("lms::dialogue::", PathStage::Framing),
+    ("lms::measured::", PathStage::Decode),
+    ("line::scan::", PathStage::Decode),
+    ("link_output::decode", PathStage::Decode),
+    ("::copy_from", PathStage::Decode),
+    ("daemon::publisher::", PathStage::Publish),
+    ("daemon::topics::", PathStage::Publish),
+    ("LinkOutput<S>::prepare", PathStage::Publish),
+    ("LinkOutput<S>::telegram", PathStage::Publish),
+    ("LinkOutput<S>::publish_scan", PathStage::Publish),
+    ("scanhub_shm::", PathStage::Publish),
+    ("SessionDriver<S>::drain", PathStage::Bookkeeping),
+    ("SessionDriver<S>::on_wakeup", PathStage::Bookkeeping),
+    ("daemon::diagnosis::", PathStage::Bookkeeping),
+    ("daemon::link_stats::", PathStage::Bookkeeping),
+    ("LinkCore<S>::", PathStage::Bookkeeping),
+    ("daemon::system::", PathStage::Sleeping),
+    ("LiveLink<S>::", PathStage::Sleeping),
+    ("scanhub_port::clock::", PathStage::Sleeping),
+    ("rustix::", PathStage::Sleeping),
 ];
 
 /// Ends of the names of functions in which everything belongs to the status. With it, the hub saves the scanner's identity.
-const STATUS: [&str; 6] = [
+const STATUS_SUFFIXES: [&str; 6] = [
     "SessionDriver<S>::report",
     "LinkCore<S>::show",
     "LinkCore<S>::show_session",
@@ -162,34 +162,34 @@ const STATUS: [&str; 6] = [
     "Platform>::store_record",
 ];
 
-impl Stage {
+impl PathStage {
     pub(crate) fn name(self) -> &'static str {
         match self {
-            Stage::Sleeping => "sleeping",
-            Stage::Read => "read",
-            Stage::Framing => "framing and CRC",
-            Stage::Decode => "decode",
-            Stage::Zones => "zones",
-            Stage::Publish => "publish and doorbell",
-            Stage::Processors => "background, other processors",
-            Stage::Bookkeeping => "bookkeeping",
-            Stage::Status => "status, checks ten times a second",
-            Stage::Other => "other",
+            PathStage::Sleeping => "sleeping",
+            PathStage::Read => "read",
+            PathStage::Framing => "framing and CRC",
+            PathStage::Decode => "decode",
+            PathStage::Zones => "zones",
+            PathStage::Publish => "publish and doorbell",
+            PathStage::Processors => "background, other processors",
+            PathStage::Bookkeeping => "bookkeeping",
+            PathStage::Status => "status, checks ten times a second",
+            PathStage::Other => "other",
         }
     }
 
     /// Returns the stage of a function with the name `name`, if it has one.
-    fn of(name: &str) -> Option<Stage> {
-        if STATUS.iter().any(|end| name.ends_with(end)) {
-            return Some(Stage::Status);
+    fn of_function(name: &str) -> Option<PathStage> {
+        if STATUS_SUFFIXES.iter().any(|end| name.ends_with(end)) {
+            return Some(PathStage::Status);
         }
-        STAGES.iter().find(|(part, _)| name.contains(part)).map(|(_, stage)| *stage)
+        STAGES.iter().find(|(part, _)| name.contains(part)).map(|(_, environment)| *environment)
     }
 }
 
 /// Sums over the telegrams of a profile, for a stage, a crate or a function.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Sum {
+pub(crate) struct Totals {
     pub(crate) instructions: u64,
     pub(crate) lines: u64,
     pub(crate) pages: u64,
@@ -206,8 +206,8 @@ struct Steps {
 impl Steps {
     fn add(&mut self, address: u64) {
         self.instructions += 1;
-        self.lines.insert(address / LINE);
-        self.pages.insert(address / PAGE);
+        self.lines.insert(address / CACHE_LINE_LEN);
+        self.pages.insert(address / PAGE_LEN);
     }
 }
 
@@ -215,15 +215,15 @@ impl Steps {
 pub(crate) struct Profile<'a> {
     code: &'a Code,
     /// Stage of each function that was met, by its address.
-    stages: HashMap<u64, Option<Stage>>,
+    stages: HashMap<u64, Option<PathStage>>,
     pub(crate) telegrams: u64,
-    pub(crate) by_stage: BTreeMap<Stage, Sum>,
-    pub(crate) by_crate: HashMap<&'a str, Sum>,
-    pub(crate) by_function: HashMap<&'a str, Sum>,
+    pub(crate) by_stage: BTreeMap<PathStage, Totals>,
+    pub(crate) by_crate: HashMap<&'a str, Totals>,
+    pub(crate) by_function: HashMap<&'a str, Totals>,
     /// Sums of each telegram, without the status.
-    pub(crate) each: Vec<Sum>,
+    pub(crate) per_telegram: Vec<Totals>,
     /// Addresses of functions in the order of their first steps: for the path, and for the status.
-    order: [Vec<u64>; 2],
+    first_steps: [Vec<u64>; 2],
 }
 
 impl<'a> Profile<'a> {
@@ -235,8 +235,8 @@ impl<'a> Profile<'a> {
             by_stage: BTreeMap::new(),
             by_crate: HashMap::new(),
             by_function: HashMap::new(),
-            each: Vec::new(),
-            order: Default::default(),
+            per_telegram: Vec::new(),
+            first_steps: Default::default(),
         }
     }
 
@@ -249,43 +249,43 @@ impl<'a> Profile<'a> {
             let begin = symbols.partition_point(|(start, _)| *start < address);
             symbols[begin..].iter().take_while(move |(start, _)| *start == address)
         };
-        let order = &self.order[usize::from(of_status)];
+        let order = &self.first_steps[usize::from(of_status)];
         order.iter().flat_map(|address| of_address(*address)).map(|(_, symbol)| pattern(symbol)).collect()
     }
 
     /// Returns the stage of an instruction at `address` in the functions `calls`, outermost first.
-    pub(crate) fn stage(&mut self, address: u64, calls: impl DoubleEndedIterator<Item = u64>) -> Stage {
+    pub(crate) fn stage(&mut self, address: u64, calls: impl DoubleEndedIterator<Item = u64>) -> PathStage {
         let mut found = self.stage_of(address);
         for function in calls.rev() {
-            let stage = self.stage_of(function);
-            if stage == Some(Stage::Status) {
-                return Stage::Status;
+            let environment = self.stage_of(function);
+            if environment == Some(PathStage::Status) {
+                return PathStage::Status;
             }
-            found = found.or(stage);
+            found = found.or(environment);
         }
-        found.unwrap_or(Stage::Other)
+        found.unwrap_or(PathStage::Other)
     }
 
-    fn stage_of(&mut self, address: u64) -> Option<Stage> {
+    fn stage_of(&mut self, address: u64) -> Option<PathStage> {
         let code = self.code;
-        *self.stages.entry(address).or_insert_with(|| Stage::of(code.name(address)))
+        *self.stages.entry(address).or_insert_with(|| PathStage::of_function(code.name(address)))
     }
 
     /// Adds the steps of a telegram.
-    pub(crate) fn add(&mut self, steps: impl Iterator<Item = (u64, Stage)>) {
+    pub(crate) fn add(&mut self, steps: impl Iterator<Item = (u64, PathStage)>) {
         let mut all = Steps::default();
-        let mut by_stage = HashMap::<Stage, Steps>::new();
+        let mut by_stage = HashMap::<PathStage, Steps>::new();
         let (mut by_crate, mut by_function) = (HashMap::<&str, Steps>::new(), HashMap::<&str, Steps>::new());
-        for (address, stage) in steps {
-            by_stage.entry(stage).or_default().add(address);
+        for (address, environment) in steps {
+            by_stage.entry(environment).or_default().add(address);
             if let Some((index, _)) = self.code.function(address) {
-                let order = &mut self.order[usize::from(stage == Stage::Status)];
+                let order = &mut self.first_steps[usize::from(environment == PathStage::Status)];
                 let function = self.code.functions[index].0;
                 if !order.contains(&function) {
                     order.push(function);
                 }
             }
-            if stage == Stage::Status {
+            if environment == PathStage::Status {
                 continue;
             }
             all.add(address);
@@ -294,16 +294,16 @@ impl<'a> Profile<'a> {
             by_crate.entry(crate_of(name)).or_default().add(address);
         }
         self.telegrams += 1;
-        let mut sum = Sum::default();
+        let mut sum = Totals::default();
         sum.add(&all);
-        self.each.push(sum);
+        self.per_telegram.push(sum);
         by_stage.iter().for_each(|(key, steps)| self.by_stage.entry(*key).or_default().add(steps));
         by_crate.iter().for_each(|(key, steps)| self.by_crate.entry(key).or_default().add(steps));
         by_function.iter().for_each(|(key, steps)| self.by_function.entry(key).or_default().add(steps));
     }
 }
 
-impl Sum {
+impl Totals {
     fn add(&mut self, steps: &Steps) {
         self.instructions += steps.instructions;
         self.lines += steps.lines.len() as u64;
@@ -312,5 +312,5 @@ impl Sum {
 }
 
 /// Bytes of a code line and of a code page.
-const LINE: u64 = 64;
-const PAGE: u64 = 4096;
+const CACHE_LINE_LEN: u64 = 64;
+const PAGE_LEN: u64 = 4096;

@@ -17,7 +17,7 @@
 use std::ops::Range;
 
 use scanhub_drivers::lms::variant::{Unit, Variant};
-use scanhub_preprocess::background::{Method as Kind, Model, Settings, Start};
+use scanhub_preprocess::background::{BackgroundModel, Method as Kind, Settings, Start};
 use scanhub_preprocess::segments::Segmenter;
 use scanhub_schema::{Foreground, Pose, Scan};
 
@@ -40,29 +40,34 @@ const SCENES: [Scene; 11] = [
 
 /// Targets of `multi`: name of the figure, row, table, target.
 const TARGETS: [(&str, &str, &str, Target); 11] = [
-    ("recall in Fig. 8", "Fig. 8", RECALL, Target::Least(0.99)),
-    ("precision in Fig. 8", "Fig. 8", PRECISION, Target::Least(0.95)),
-    ("wrong beams a scan in Fig. 8", "Fig. 8", WRONG, Target::Most(0.2)),
-    ("recall in a corridor", "corridor, in cm", RECALL, Target::Least(0.95)),
-    ("wrong beams a scan in a corridor", "corridor, in cm", WRONG, Target::Most(0.4)),
-    ("recall at the sensor", "a person walks up to the sensor", RECALL, Target::Least(0.95)),
-    ("wrong beams a scan at the sensor", "a person walks up to the sensor", WRONG, Target::Most(0.4)),
-    ("precision before a wall with few readings", "a wall with few readings", PRECISION, Target::Least(0.9)),
+    ("recall in Fig. 8", "Fig. 8", RECALL_TABLE, Target::Min(0.99)),
+    ("precision in Fig. 8", "Fig. 8", PRECISION_TABLE, Target::Min(0.95)),
+    ("wrong beams a scan in Fig. 8", "Fig. 8", WRONG_TABLE, Target::Max(0.2)),
+    ("recall in a corridor", "corridor, in cm", RECALL_TABLE, Target::Min(0.95)),
+    ("wrong beams a scan in a corridor", "corridor, in cm", WRONG_TABLE, Target::Max(0.4)),
+    ("recall at the sensor", "a person walks up to the sensor", RECALL_TABLE, Target::Min(0.95)),
+    ("wrong beams a scan at the sensor", "a person walks up to the sensor", WRONG_TABLE, Target::Max(0.4)),
+    (
+        "precision before a wall with few readings",
+        "a wall with few readings",
+        PRECISION_TABLE,
+        Target::Min(0.9),
+    ),
     (
         "wrong beams a scan before a wall with few readings",
         "a wall with few readings",
-        WRONG,
-        Target::Most(0.25),
+        WRONG_TABLE,
+        Target::Max(0.25),
     ),
-    ("percent of a box new after N", NEW, BOX, Target::Most(0.0)),
-    ("percent of a box left after 2N", LEFT, BOX, Target::Most(0.0)),
+    ("percent of a box new after N", NEW_ROW, BOX_TABLE, Target::Max(0.0)),
+    ("percent of a box left after 2N", LEFT_ROW, BOX_TABLE, Target::Max(0.0)),
 ];
-const BOX: &str = "of a box in Fig. 8";
-const NEW: &str = "put down: new after N scans";
-const LEFT: &str = "taken away: left after 2N";
-const RECALL: &str = "recall";
-const PRECISION: &str = "precision";
-const WRONG: &str = "wrong beams a scan";
+const BOX_TABLE: &str = "of a box in Fig. 8";
+const NEW_ROW: &str = "put down: new after N scans";
+const LEFT_ROW: &str = "taken away: left after 2N";
+const RECALL_TABLE: &str = "recall";
+const PRECISION_TABLE: &str = "precision";
+const WRONG_TABLE: &str = "wrong beams a scan";
 
 const METHODS: [&str; 5] = ["multi", "paper", "paper, first scan", "teach-in", "mixtures (MOG2)"];
 
@@ -87,7 +92,7 @@ fn method(name: &str) -> Box<dyn Detector> {
 /// Measures the methods in all scenes with these `seeds`.
 pub(crate) fn measure(seeds: Range<u64>, is_json: bool) {
     let mut boxes = [Boxes::default(); METHODS.len()];
-    let mut bytes = [Bytes::default(); METHODS.len()];
+    let mut bytes = [PayloadBytes::default(); METHODS.len()];
     let mut cells = Vec::new();
     for (number, scene) in SCENES.iter().enumerate() {
         let mut scores = [Score::default(); METHODS.len()];
@@ -106,11 +111,13 @@ pub(crate) fn measure(seeds: Range<u64>, is_json: bool) {
         cells.extend(METHODS.iter().zip(&scores).flat_map(|(name, score)| scored(scene, name, score)));
     }
     // One table for each of these quantities, although they are counted scene by scene.
-    cells.sort_by_key(|cell| [RECALL, PRECISION, WRONG].iter().position(|table| cell.table == *table));
+    cells.sort_by_key(|cell| {
+        [RECALL_TABLE, PRECISION_TABLE, WRONG_TABLE].iter().position(|table| cell.table == *table)
+    });
     for (name, boxes) in METHODS.iter().zip(&boxes) {
-        let rows = [NEW, "taken away: left after N", LEFT];
+        let rows = [NEW_ROW, "taken away: left after N", LEFT_ROW];
         let values = rows.into_iter().zip(boxes.percents());
-        cells.extend(values.map(|(row, percent)| cell(BOX, row, name, "%", percent)));
+        cells.extend(values.map(|(row, percent)| cell(BOX_TABLE, row, name, "%", percent)));
     }
     for (name, bytes) in METHODS.iter().zip(&bytes).filter(|(name, _)| settings(name).is_some()) {
         let rows = ["scans", "foreground", "foreground when empty"];
@@ -125,18 +132,18 @@ pub(crate) fn measure(seeds: Range<u64>, is_json: bool) {
     let mut figures =
         Vec::from(TARGETS.map(|(name, row, table, target)| figure(name, value(table, row), target)));
     let [scans, foreground, _] = bytes[0].per_second();
-    figures.push(figure(
-        "bytes of scans for one of foreground",
-        vec![scans / foreground],
-        Target::Least(10.0),
-    ));
+    figures.push(figure("bytes of scans for one of foreground", vec![scans / foreground], Target::Min(10.0)));
     figures::print("perception, foreground", is_json, &figures);
     figures::print_cells("perception, foreground", is_json, &cells);
 }
 
 fn scored(scene: &Scene, method: &str, score: &Score) -> [Cell; 3] {
-    [(RECALL, score.recall()), (PRECISION, score.precision()), (WRONG, score.wrong_per_scan())]
-        .map(|(table, value)| cell(table, scene.name, method, "1", value))
+    [
+        (RECALL_TABLE, score.recall()),
+        (PRECISION_TABLE, score.precision()),
+        (WRONG_TABLE, score.wrong_per_scan()),
+    ]
+    .map(|(table, value)| cell(table, scene.name, method, "1", value))
 }
 
 fn cell(table: &str, row: &str, method: &str, unit: &'static str, value: f64) -> Cell {
@@ -147,7 +154,7 @@ fn cell(table: &str, row: &str, method: &str, unit: &'static str, value: f64) ->
 
 /// Payload bytes of several runs, without headers.
 #[derive(Clone, Copy, Debug, Default)]
-struct Bytes {
+struct PayloadBytes {
     scans: u64,
     scan: u64,
     foreground: u64,
@@ -155,11 +162,11 @@ struct Bytes {
     empty: (u64, u64),
 }
 
-impl Bytes {
+impl PayloadBytes {
     /// Adds a `run` with the method of `settings`.
     fn add(&mut self, settings: Settings, run: &[LabeledScan]) {
         let beams = Variant::HALF.beams();
-        let mut model = Model::new(settings, beams);
+        let mut model = BackgroundModel::new(settings, beams);
         let mut cutter = Segmenter::new(Pose::default(), beams);
         let mut out = Foreground::of(beams);
         for frame in run {
@@ -187,7 +194,7 @@ impl Bytes {
     }
 }
 
-/// A teach-in that never adapts. The background of a beam is the median of its first [`TEACH_SCANS`] readings; what is
+/// A teach-in that never adapts. The background of a beam is the median of its first [`LEARNING_SCANS`] readings; what is
 /// nearer by more than 30 mm (60 in cm mode) is foreground.
 struct TeachIn {
     scans: usize,
@@ -196,7 +203,7 @@ struct TeachIn {
 }
 
 /// 5 s. The room of Fig. 8 is empty for the first 8 s.
-const TEACH_SCANS: usize = 187;
+const LEARNING_SCANS: usize = 187;
 
 impl TeachIn {
     fn new(beams: usize) -> TeachIn {
@@ -212,10 +219,10 @@ impl Detector for TeachIn {
             let reading = scan.distance_mm(i);
             *is_foreground =
                 reading.zip(self.background_mm[i]).is_some_and(|(mm, wall_mm)| mm + threshold_mm < wall_mm);
-            if self.scans <= TEACH_SCANS {
+            if self.scans <= LEARNING_SCANS {
                 self.readings_mm[i].extend(reading);
             }
-            if self.scans == TEACH_SCANS {
+            if self.scans == LEARNING_SCANS {
                 let readings = &mut self.readings_mm[i];
                 readings.sort_unstable();
                 self.background_mm[i] = readings.get(readings.len() / 2).copied();
@@ -267,25 +274,25 @@ impl Detector for Mixtures {
 
 /// Updates `beam` with a reading, and returns whether the reading is background.
 fn mix(beam: &mut Vec<Gaussian>, mm: f64, rate: f64, scale: f64) -> bool {
-    const PRIOR: f64 = 0.05;
-    let (mut is_background, mut met, mut before) = (false, false, 0.0);
+    const WEIGHT_DECAY: f64 = 0.05;
+    let (mut is_background, mut is_matched, mut before) = (false, false, 0.0);
     for gaussian in beam.iter_mut() {
         let off = mm - gaussian.mean_mm;
-        is_background |= before < 0.9 && !met && off * off < 16.0 * gaussian.variance;
+        is_background |= before < 0.9 && !is_matched && off * off < 16.0 * gaussian.variance;
         before += gaussian.weight;
-        gaussian.weight = (1.0 - rate) * gaussian.weight - rate * PRIOR;
-        if !met && off * off < 9.0 * gaussian.variance {
-            met = true;
+        gaussian.weight = (1.0 - rate) * gaussian.weight - rate * WEIGHT_DECAY;
+        if !is_matched && off * off < 9.0 * gaussian.variance {
+            is_matched = true;
             gaussian.weight += rate;
             let share = rate / gaussian.weight;
             gaussian.mean_mm += share * off;
-            let (least, most) = ((5.0 * scale).powi(2), (40.0 * scale).powi(2));
+            let (minimum, maximum) = ((5.0 * scale).powi(2), (40.0 * scale).powi(2));
             gaussian.variance =
-                (gaussian.variance + share * (off * off - gaussian.variance)).clamp(least, most);
+                (gaussian.variance + share * (off * off - gaussian.variance)).clamp(minimum, maximum);
         }
     }
     beam.retain(|gaussian| gaussian.weight > 0.0);
-    if !met {
+    if !is_matched {
         beam.truncate(4);
         let weight = if beam.is_empty() { 1.0 } else { rate };
         beam.push(Gaussian { weight, mean_mm: mm, variance: (15.0 * scale).powi(2) });

@@ -14,17 +14,17 @@ use std::ops::Range;
 use std::time::Instant;
 
 use fastrand::Rng;
-use scanhub_preprocess::lines::{LineFinder, Settings, Stop};
+use scanhub_preprocess::lines::{LineFinder, Settings, StopCriterion};
 use scanhub_schema::{Lines, Pose, Scan};
 
 use crate::figures::{self, Cell, Figure, Target};
 use crate::recordings::{self, normal, scan};
 
-const VERTICES: [usize; 5] = [10, 20, 30, 40, 50];
+const VERTEX_COUNTS: [usize; 5] = [10, 20, 30, 40, 50];
 /// Ratios that PLE publishes, and those of its optimized form.
-const PLE: [[f64; 5]; 2] = [[0.68, 0.86, 0.85, 0.87, 0.85], [0.44, 0.65, 0.67, 0.71, 0.71]];
+const PLE_RATIOS: [[f64; 5]; 2] = [[0.68, 0.86, 0.85, 0.87, 0.85], [0.44, 0.65, 0.67, 0.71, 0.71]];
 /// Maximum time for a scan of 360 beams, in us.
-const TIME_US: [f64; 2] = [100.0, 1000.0];
+const MAX_TIME_US: [f64; 2] = [100.0, 1000.0];
 const NAMES: [[&str; 5]; 2] = [
     ["10 vertices: RMSE", "20 vertices: RMSE", "30 vertices: RMSE", "40 vertices: RMSE", "50 vertices: RMSE"],
     [
@@ -41,18 +41,19 @@ pub(crate) fn measure(is_quick: bool, is_json: bool) {
     let mut figures = Vec::new();
     let mut cells = Vec::new();
     let seeds = if is_quick { 1..2 } else { 1..5 };
-    of_rooms(seeds.clone(), &mut figures, &mut cells);
-    of_true_rooms(seeds, &mut cells);
-    of_logs(if is_quick { 20 } else { 200 }, &mut cells);
+    measure_rooms(seeds.clone(), &mut figures, &mut cells);
+    compare_with_walls(seeds, &mut cells);
+    measure_logs(if is_quick { 20 } else { 200 }, &mut cells);
     figures::print("perception, lines", is_json, &figures);
     figures::print_cells("perception, lines", is_json, &cells);
 }
 
 /// Returns the hub's line finder, limited only by the number of vertices. Points farther apart than `gap_m` are not
 /// connected.
-fn hub(count: usize, refine: bool, gap_m: f64) -> LineFinder {
+fn hub_line_finder(count: usize, refine: bool, gap_m: f64) -> LineFinder {
     // Two beams, as for the others: all beams of a room count.
-    let settings = Settings { max: count as u8 - 1, min_points: 2, refine, stop: Stop::Number(gap_m) };
+    let settings =
+        Settings { max: count as u8 - 1, min_points: 2, refine, stop: StopCriterion::Number(gap_m) };
     LineFinder::new(Pose::default(), settings, 1081)
 }
 
@@ -65,19 +66,19 @@ fn run(finder: &mut LineFinder, scans: &[Box<Scan>]) -> (Score, f64) {
         let begin = Instant::now();
         finder.update(scan, &mut lines);
         taken_us += 1e6 * begin.elapsed().as_secs_f64();
-        scores.push(Found::of(&lines).score(scan));
+        scores.push(FoundLines::of(&lines).score(scan));
     }
     (mean(&scores), taken_us / scans.len().max(1) as f64)
 }
 
-fn of_rooms(seeds: Range<u64>, figures: &mut Vec<Figure>, cells: &mut Vec<Cell>) {
-    let draws: Vec<Vec<Box<Scan>>> = seeds.map(|seed| scans(draw_rooms(seed, RAYS))).collect();
+fn measure_rooms(seeds: Range<u64>, figures: &mut Vec<Figure>, cells: &mut Vec<Cell>) {
+    let draws: Vec<Vec<Box<Scan>>> = seeds.map(|seed| scans(draw_rooms(seed, RAY_COUNT))).collect();
     for (form, refine) in [false, true].into_iter().enumerate() {
         let mut times = Vec::new();
-        for (number, &count) in VERTICES.iter().enumerate() {
+        for (number, &count) in VERTEX_COUNTS.iter().enumerate() {
             let (mut ours, mut theirs, mut shares) = (Vec::new(), Vec::new(), Vec::new());
             for scans in &draws {
-                let (score, time_us) = run(&mut hub(count, refine, f64::INFINITY), scans);
+                let (score, time_us) = run(&mut hub_line_finder(count, refine, f64::INFINITY), scans);
                 ours.push(score.rmse);
                 shares.push(score.share);
                 times.push(time_us);
@@ -85,7 +86,7 @@ fn of_rooms(seeds: Range<u64>, figures: &mut Vec<Figure>, cells: &mut Vec<Cell>)
                     scans.iter().map(|scan| end_points(scan, count).score(scan)).collect();
                 theirs.push(mean(&scores).rmse);
             }
-            let (name, target) = (NAMES[form][number], Target::Ratio(PLE[form][number]));
+            let (name, target) = (NAMES[form][number], Target::Ratio(PLE_RATIOS[form][number]));
             figures.push(Figure { name, unit: "m", hub: ours, baseline: theirs, target });
             cells.push(Cell {
                 table: "rooms: share of the beams".to_owned(),
@@ -96,7 +97,8 @@ fn of_rooms(seeds: Range<u64>, figures: &mut Vec<Figure>, cells: &mut Vec<Cell>)
             });
         }
         let longer = scans(draw_rooms(1, 1081));
-        let of_longer = VERTICES.map(|count| run(&mut hub(count, refine, f64::INFINITY), &longer).1);
+        let of_longer =
+            VERTEX_COUNTS.map(|count| run(&mut hub_line_finder(count, refine, f64::INFINITY), &longer).1);
         let name = if refine { "time of 1081 beams, refined" } else { "time of 1081 beams" };
         figures.push(Figure {
             name,
@@ -111,16 +113,16 @@ fn of_rooms(seeds: Range<u64>, figures: &mut Vec<Figure>, cells: &mut Vec<Cell>)
             unit: "us",
             hub: times,
             baseline: Vec::new(),
-            target: Target::Most(TIME_US[form]),
+            target: Target::Max(MAX_TIME_US[form]),
         });
     }
 }
 
 /// Compares lines with the true walls, as a user can configure them, next to end-point fit with the true number of vertices.
-fn of_true_rooms(seeds: Range<u64>, cells: &mut Vec<Cell>) {
-    let draws: Vec<Vec<Room>> = seeds.map(|seed| draw_rooms(seed, RAYS)).collect();
+fn compare_with_walls(seeds: Range<u64>, cells: &mut Vec<Cell>) {
+    let draws: Vec<Vec<Room>> = seeds.map(|seed| draw_rooms(seed, RAY_COUNT)).collect();
     let mut lines = Lines::default();
-    let mut put = |row: &str, find: &mut dyn FnMut(&Room) -> Found| {
+    let mut put = |row: &str, find: &mut dyn FnMut(&Room) -> FoundLines| {
         let mut columns = [const { Vec::new() }; 4];
         for rooms in &draws {
             let (mut scores, mut of_truth, mut ratio) = (Vec::new(), Vec::new(), 0.0);
@@ -148,32 +150,32 @@ fn of_true_rooms(seeds: Range<u64>, cells: &mut Vec<Cell>) {
     };
     for (row, refine) in [("default", false), ("refined", true)] {
         let settings = Settings { refine, ..Settings::default() };
-        let mut finder = LineFinder::new(Pose::default(), settings, RAYS);
+        let mut finder = LineFinder::new(Pose::default(), settings, RAY_COUNT);
         put(row, &mut |room| {
             finder.update(&room.scan, &mut lines);
-            Found::of(&lines)
+            FoundLines::of(&lines)
         });
     }
     put("end-point fit", &mut |room| end_points(&room.scan, room.corners + 1));
     // A line of one beam for each beam.
     put("true walls", &mut |room| {
         let line = |(beam, range): (usize, &f64)| (beam, beam, *range, room.scan.angle(beam));
-        Found { lines: room.walls_m.iter().enumerate().map(line).collect() }
+        FoundLines { lines: room.walls_m.iter().enumerate().map(line).collect() }
     });
 }
 
-fn of_logs(most: usize, cells: &mut Vec<Cell>) {
+fn measure_logs(max_scans: usize, cells: &mut Vec<Cell>) {
     let logs = recordings::logs();
     if logs.is_empty() {
         eprintln!("left out: SCANHUB_DATA names no folder with carmen/*.log.gz");
     }
     for (name, scans) in logs {
-        let every = scans.len().div_ceil(most).max(1);
+        let every = scans.len().div_ceil(max_scans).max(1);
         let scans: Vec<Box<Scan>> = scans.into_iter().map(|(scan, _)| scan).step_by(every).collect();
-        type Baseline = fn(&Scan, usize) -> Found;
+        type Baseline = fn(&Scan, usize) -> FoundLines;
         let baselines: [(&str, Baseline); 3] =
             [("end-point fit", end_points), ("split and merge", split_and_merge), ("RANSAC", ransac)];
-        for count in VERTICES {
+        for count in VERTEX_COUNTS {
             let mut put = |row: &str, score: Score| {
                 for (what, unit, value) in [("RMSE", "m", score.rmse), ("share", "1", score.share)] {
                     cells.push(Cell {
@@ -189,14 +191,14 @@ fn of_logs(most: usize, cells: &mut Vec<Cell>) {
                 let scores: Vec<Score> = scans.iter().map(|scan| baseline(scan, count).score(scan)).collect();
                 put(row, mean(&scores));
             }
-            put("hub", run(&mut hub(count, false, 1.0), &scans).0);
-            put("hub, refined", run(&mut hub(count, true, 1.0), &scans).0);
+            put("hub", run(&mut hub_line_finder(count, false, 1.0), &scans).0);
+            put("hub, refined", run(&mut hub_line_finder(count, true, 1.0), &scans).0);
         }
     }
 }
 
 /// Lines that a method found in a scan, in the order of their beams.
-struct Found {
+struct FoundLines {
     /// First beam, last beam, and the line: distance from the sensor and direction of its nearest point.
     lines: Vec<(usize, usize, f64, f64)>,
 }
@@ -210,13 +212,13 @@ struct Score {
     share: f64,
 }
 
-impl Found {
+impl FoundLines {
     /// Returns the lines that the hub found, for a sensor at the robot's center.
-    fn of(lines: &Lines) -> Found {
+    fn of(lines: &Lines) -> FoundLines {
         let line = |line: &scanhub_schema::Line| {
             (usize::from(line.first), usize::from(line.last), f64::from(line.r_m), f64::from(line.alpha_rad))
         };
-        Found { lines: lines.lines().iter().map(line).collect() }
+        FoundLines { lines: lines.lines().iter().map(line).collect() }
     }
 
     /// Compares the lines with the beams.
@@ -226,21 +228,21 @@ impl Found {
 
     /// Compares the lines with these ranges in meters of the beams of `scan`.
     fn compare(&self, range: impl Fn(usize) -> Option<f64>, scan: &Scan) -> Score {
-        let (mut square, mut met) = (0.0, 0);
+        let (mut square, mut count) = (0.0, 0);
         let mut is_met = vec![false; scan.beams()];
         for &(first, last, r, alpha) in &self.lines {
             for (beam, is_met) in is_met.iter_mut().enumerate().take(last + 1).skip(first) {
                 let Some(range) = range(beam).filter(|_| !*is_met) else { continue };
                 let off = range - r / (scan.angle(beam) - alpha).cos();
                 square += off * off;
-                met += 1;
+                count += 1;
                 *is_met = true;
             }
         }
         let readings = (0..scan.beams()).filter(|&beam| scan.distance_m(beam).is_some()).count();
         Score {
-            rmse: (square / f64::from(met.max(1))).sqrt(),
-            share: f64::from(met) / readings.max(1) as f64,
+            rmse: (square / f64::from(count.max(1))).sqrt(),
+            share: f64::from(count) / readings.max(1) as f64,
         }
     }
 }
@@ -275,7 +277,7 @@ fn normal_form(normal: (f64, f64), x: f64, y: f64) -> (f64, f64) {
     (turned * r, (turned * normal.1).atan2(turned * normal.0))
 }
 
-fn through(a: Point, b: Point) -> (f64, f64) {
+fn line_through(a: Point, b: Point) -> (f64, f64) {
     let length = (b.x - a.x).hypot(b.y - a.y).max(1e-12);
     normal_form(((b.y - a.y) / length, (a.x - b.x) / length), a.x, a.y)
 }
@@ -314,7 +316,7 @@ fn vertices(points: &[Point], count: usize) -> Vec<usize> {
 }
 
 /// Returns the beams that meet the line between the ends that its outermost points have on it.
-fn met(points: &[Point], (r, alpha): (f64, f64)) -> Option<(usize, usize, f64, f64)> {
+fn beams_on_line(points: &[Point], (r, alpha): (f64, f64)) -> Option<(usize, usize, f64, f64)> {
     let (first, last) = (points.first()?, points.last()?);
     let (sin, cos) = alpha.sin_cos();
     // Angle by which a point appears to the left of the end on the line, in radians.
@@ -330,17 +332,17 @@ fn met(points: &[Point], (r, alpha): (f64, f64)) -> Option<(usize, usize, f64, f
 }
 
 /// Iterative end-point fit: the polyline through some of the points.
-fn end_points(scan: &Scan, count: usize) -> Found {
+fn end_points(scan: &Scan, count: usize) -> FoundLines {
     let points = points(scan);
     let mut lines = Vec::new();
     if points.len() > 1 {
         for pair in vertices(&points, count).windows(2) {
             let (a, b) = (points[pair[0]], points[pair[1]]);
-            let (r, alpha) = through(a, b);
+            let (r, alpha) = line_through(a, b);
             lines.push((a.beam, b.beam, r, alpha));
         }
     }
-    Found { lines }
+    FoundLines { lines }
 }
 
 /// Returns the line of orthogonal least squares, and the sum of the squares.
@@ -361,10 +363,10 @@ fn regression(points: &[Point]) -> ((f64, f64), f64) {
 
 /// Split and merge: cuts into twice as many pieces as end-point fit, then merges the neighbors whose common line is
 /// nearest to their points until few enough are left.
-fn split_and_merge(scan: &Scan, count: usize) -> Found {
+fn split_and_merge(scan: &Scan, count: usize) -> FoundLines {
     let points = points(scan);
     if points.len() < 2 {
-        return Found { lines: Vec::new() };
+        return FoundLines { lines: Vec::new() };
     }
     let cuts = vertices(&points, 2 * count);
     let mut pieces: Vec<(usize, usize)> = cuts.windows(2).map(|pair| (pair[0], pair[1])).collect();
@@ -386,45 +388,45 @@ fn split_and_merge(scan: &Scan, count: usize) -> Found {
         let (one, points) = (points[first], &points[first..=last]);
         // A single point is a line across its beam.
         let alone = (one.x.hypot(one.y), one.y.atan2(one.x));
-        met(points, if points.len() > 1 { regression(points).0 } else { alone })
+        beams_on_line(points, if points.len() > 1 { regression(points).0 } else { alone })
     };
-    Found { lines: pieces.iter().filter_map(line).collect() }
+    FoundLines { lines: pieces.iter().filter_map(line).collect() }
 }
 
 /// Number of lines that RANSAC tries for each line that it finds.
-const TRIES: usize = 200;
+const RANSAC_TRIES: usize = 200;
 /// Maximum distance of a point that belongs to a line of RANSAC, in meters.
-const NEAR_M: f64 = 0.05;
+const RANSAC_DISTANCE_M: f64 = 0.05;
 
 /// RANSAC: of random lines through two points, takes the one with the longest row of near points, removes these points,
 /// and repeats.
-fn ransac(scan: &Scan, count: usize) -> Found {
+fn ransac(scan: &Scan, count: usize) -> FoundLines {
     let mut random = Rng::with_seed(1);
     let mut left = points(scan);
     let mut lines = Vec::new();
     while lines.len() + 1 < count && left.len() > 2 {
         let mut best = 0..0;
-        for _ in 0..TRIES {
+        for _ in 0..RANSAC_TRIES {
             let first = random.usize(..left.len());
             let second = random.usize(first.saturating_sub(10)..(first + 11).min(left.len()));
             if first != second {
-                let row = row(&left, first, through(left[first], left[second]));
+                let row = near_run(&left, first, line_through(left[first], left[second]));
                 best = if row.len() > best.len() { row } else { best };
             }
         }
         if best.len() < 2 {
             break;
         }
-        lines.extend(met(&left[best.clone()], regression(&left[best.clone()]).0));
+        lines.extend(beams_on_line(&left[best.clone()], regression(&left[best.clone()]).0));
         left.drain(best);
     }
     // If two lines cover a beam, the first one counts: it has more points.
-    Found { lines }
+    FoundLines { lines }
 }
 
 /// Returns the points around one of them that are near the line, without a break in their beams.
-fn row(points: &[Point], at: usize, (r, alpha): (f64, f64)) -> std::ops::Range<usize> {
-    let near = |p: &Point| (p.x * alpha.cos() + p.y * alpha.sin() - r).abs() < NEAR_M;
+fn near_run(points: &[Point], at: usize, (r, alpha): (f64, f64)) -> std::ops::Range<usize> {
+    let near = |p: &Point| (p.x * alpha.cos() + p.y * alpha.sin() - r).abs() < RANSAC_DISTANCE_M;
     let (mut first, mut end) = (at, at + 1);
     while first > 0 && near(&points[first - 1]) && points[first].beam - points[first - 1].beam <= 2 {
         first -= 1;
@@ -436,18 +438,18 @@ fn row(points: &[Point], at: usize, (r, alpha): (f64, f64)) -> std::ops::Range<u
 }
 
 /// Number of scans in a set.
-const SCANS: usize = 260;
+const SCANS_PER_SET: usize = 260;
 /// Number of rays of a scan in the experiment.
-const RAYS: usize = 360;
-const CORNERS: [usize; 7] = [3, 4, 5, 6, 12, 36, 180];
+const RAY_COUNT: usize = 360;
+const CORNER_COUNTS: [usize; 7] = [3, 4, 5, 6, 12, 36, 180];
 /// Standard deviation of the noise of a ray: of the angle in degrees, of the range in meters.
-const NOISE: (f64, f64) = (0.2, 0.03);
+const RAY_NOISE: (f64, f64) = (0.2, 0.03);
 
 /// Returns the set of scans of `seed`, each with `rays` rays over a full turn including both ends: the first and the
 /// last ray have the same direction.
 fn draw_rooms(seed: u64, rays: usize) -> Vec<Room> {
     let mut random = Rng::with_seed(seed);
-    (0..SCANS).map(|_| room(&mut random, rays)).collect()
+    (0..SCANS_PER_SET).map(|_| room(&mut random, rays)).collect()
 }
 
 fn scans(rooms: Vec<Room>) -> Vec<Box<Scan>> {
@@ -464,7 +466,7 @@ struct Room {
 }
 
 fn room(random: &mut Rng, rays: usize) -> Room {
-    let corners = CORNERS[random.usize(..CORNERS.len())];
+    let corners = CORNER_COUNTS[random.usize(..CORNER_COUNTS.len())];
     let (turned, scale) = (random.f64(), 5.0 + 5.0 * random.f64());
     let mean = (corners * corners) as f64 / 5.0;
     let distances: Vec<f64> =
@@ -481,7 +483,7 @@ fn room(random: &mut Rng, rays: usize) -> Room {
     let angles = (0..rays).map(|ray| ray as f64 * step - PI);
     let walls_m = angles.clone().map(wall).collect();
     let ranges: Vec<f64> = angles
-        .map(|angle| wall(angle + NOISE.0.to_radians() * normal(random)) + NOISE.1 * normal(random))
+        .map(|angle| wall(angle + RAY_NOISE.0.to_radians() * normal(random)) + RAY_NOISE.1 * normal(random))
         .collect();
     Room { scan: scan(-PI, step, &ranges), walls_m, corners }
 }

@@ -12,7 +12,7 @@ use std::time::Instant;
 
 use fastrand::Rng;
 use scanhub_preprocess::lines::{LineFinder, Settings as LineSettings};
-use scanhub_preprocess::motion::{MotionEstimator, Rigid, Settings};
+use scanhub_preprocess::motion::{MotionEstimator, Pose2, Settings};
 use scanhub_schema::{Lines, Motion, Pose, Scan};
 
 use crate::figures::{self, Cell, Figure, Target};
@@ -27,9 +27,9 @@ pub(crate) fn measure(is_quick: bool, is_json: bool) {
         eprintln!("left out: SCANHUB_DATA names no folder with carmen/ and moving/");
     }
     for drive in &drives {
-        of_drive(drive, if is_quick { 100 } else { 400 }, &mut cells);
+        measure_drive(drive, if is_quick { 100 } else { 400 }, &mut cells);
     }
-    of_simulated(if is_quick { 2 } else { 10 }, &mut figures);
+    measure_simulated(if is_quick { 2 } else { 10 }, &mut figures);
     figures::print("perception, motion", is_json, &figures);
     figures::print_cells("perception, motion", is_json, &cells);
 }
@@ -56,14 +56,14 @@ fn run(scans: &[Box<Scan>], settings: Settings) -> (Vec<Motion>, [f64; 2]) {
 }
 
 /// Returns the difference between `truth` and `found`, in mm and degrees.
-fn off(truth: &Rigid, found: &Rigid) -> (f64, f64) {
+fn pose_error(truth: &Pose2, found: &Pose2) -> (f64, f64) {
     let between = truth.inverse().then(found);
     (1000.0 * between.x.hypot(between.y), between.yaw.to_degrees().abs())
 }
 
-fn step(motion: &Motion) -> Option<Rigid> {
+fn step(motion: &Motion) -> Option<Pose2> {
     let [x, y, yaw] = [motion.dx_m, motion.dy_m, motion.dyaw_rad].map(f64::from);
-    motion.has_step().then(|| Rigid::new(x, y, yaw))
+    motion.has_step().then(|| Pose2::new(x, y, yaw))
 }
 
 fn median(values: &mut [f64]) -> f64 {
@@ -72,22 +72,22 @@ fn median(values: &mut [f64]) -> f64 {
 }
 
 /// Adds the scores of at most `most` steps of `drive`, evenly spread.
-fn of_drive(drive: &Drive, most: usize, cells: &mut Vec<Cell>) {
+fn measure_drive(drive: &Drive, max_steps: usize, cells: &mut Vec<Cell>) {
     let (motions, times_us) = run(&drive.scans, drive.settings);
-    let steps: Vec<(usize, Rigid)> = drive.steps().collect();
-    let every = steps.len().div_ceil(most).max(1);
+    let steps: Vec<(usize, Pose2)> = drive.steps().collect();
+    let every = steps.len().div_ceil(max_steps).max(1);
     let steps: Vec<_> = steps.into_iter().step_by(every).collect();
     let mut put = |row: &str,
-                   found: &dyn Fn(usize) -> Option<Rigid>,
+                   found: &dyn Fn(usize) -> Option<Pose2>,
                    says: &dyn Fn(usize) -> bool,
                    time_us: Option<f64>| {
         let pairs: Vec<(f64, f64)> =
-            steps.iter().filter_map(|(at, truth)| Some(off(truth, &found(*at)?))).collect();
+            steps.iter().filter_map(|(at, truth)| Some(pose_error(truth, &found(*at)?))).collect();
         let mut offs: [Vec<f64>; 2] = pairs.iter().copied().collect::<(Vec<_>, Vec<_>)>().into();
         let [mm, degrees] = offs.each_mut().map(|values| median(values));
-        let is_wrong = |(mm, degrees): &&(f64, f64)| *mm > drive.wrong_mm || *degrees > 5.0;
-        let is_silent = |(at, truth): &&(usize, Rigid)| {
-            found(*at).is_some_and(|found| is_wrong(&&off(truth, &found))) && !says(*at)
+        let is_wrong = |(mm, degrees): &&(f64, f64)| *mm > drive.min_wrong_mm || *degrees > 5.0;
+        let is_silent = |(at, truth): &&(usize, Pose2)| {
+            found(*at).is_some_and(|found| is_wrong(&&pose_error(truth, &found))) && !says(*at)
         };
         let silent = steps.iter().filter(is_silent).count();
         let share = |count: usize| count as f64 / steps.len().max(1) as f64;
@@ -109,12 +109,12 @@ fn of_drive(drive: &Drive, most: usize, cells: &mut Vec<Cell>) {
         }
     };
     put("hub", &|at| step(&motions[at]), &|at| motions[at].is_degenerate(), Some(times_us[1]));
-    type Baseline = fn(&Scan, &Scan) -> Rigid;
+    type Baseline = fn(&Scan, &Scan) -> Pose2;
     let baselines: [(&str, Baseline); 2] =
         [("point to point", point_to_point), ("point to line", point_to_line)];
     for (row, baseline) in baselines {
         let begin = Instant::now();
-        let found: Vec<Rigid> =
+        let found: Vec<Pose2> =
             steps.iter().map(|(at, _)| baseline(&drive.scans[at - 1], &drive.scans[*at])).collect();
         let time_us = 1e6 * begin.elapsed().as_secs_f64() / steps.len().max(1) as f64;
         let of = |at: usize| found.get(steps.iter().position(|(step, _)| *step == at)?).copied();
@@ -123,11 +123,11 @@ fn of_drive(drive: &Drive, most: usize, cells: &mut Vec<Cell>) {
 }
 
 /// Adds the figures of simulated drives, with `seeds` of each kind.
-fn of_simulated(seeds: u64, figures: &mut Vec<Figure>) {
+fn measure_simulated(seeds: u64, figures: &mut Vec<Figure>) {
     let mut put =
         |name, unit, hub, baseline, target| figures.push(Figure { name, unit, hub, baseline, target });
     let of_each = |of: &dyn Fn(u64) -> f64| (1..=seeds).map(of).collect::<Vec<f64>>();
-    let error = |kind: Kind, beams: usize, seed: u64, by_hub: bool| {
+    let error = |kind: DriveKind, beams: usize, seed: u64, by_hub: bool| {
         let (scans, truth) = drive(kind, beams, 200, seed);
         let motions = run(&scans, Settings::default()).0;
         let mut offs: Vec<f64> = (1..scans.len())
@@ -137,12 +137,12 @@ fn of_simulated(seeds: u64, figures: &mut Vec<Figure>) {
                     true => step(&motions[at])?,
                     false => point_to_line(&scans[at - 1], &scans[at]),
                 };
-                Some(off(&truth, &found).0)
+                Some(pose_error(&truth, &found).0)
             })
             .collect();
         median(&mut offs)
     };
-    use Kind::{Corridor, Hidden, Jump, People, Room};
+    use DriveKind::{Corridor, Hidden, Jump, People, Room};
     let time = |beams: usize, part: usize| {
         move |seed| run(&drive(Room, beams, 300, seed).0, Settings::default()).1[part]
     };
@@ -150,7 +150,7 @@ fn of_simulated(seeds: u64, figures: &mut Vec<Figure>) {
         (361, ["time a scan, 361 beams", "lines of it, 361 beams"]),
         (1081, ["time a scan, 1081 beams", "lines of it, 1081 beams"]),
     ] {
-        put(name, "us", of_each(&time(beams, 1)), Vec::new(), Target::Most(1000.0));
+        put(name, "us", of_each(&time(beams, 1)), Vec::new(), Target::Max(1000.0));
         put(lines, "us", of_each(&time(beams, 0)), Vec::new(), Target::None);
     }
     let by = |kind, by_hub| of_each(&|seed| error(kind, 361, seed, by_hub));
@@ -164,20 +164,20 @@ fn of_simulated(seeds: u64, figures: &mut Vec<Figure>) {
         let steps = motions.iter().filter(|motion| motion.has_step());
         steps.clone().filter(says).count() as f64 / steps.count().max(1) as f64
     });
-    put("corridor: reported as degenerate", "1", corridor, Vec::new(), Target::Least(0.99));
+    put("corridor: reported as degenerate", "1", corridor, Vec::new(), Target::Min(0.99));
     let room = of_each(&|seed| {
         let motions = run(&drive(Room, 361, 200, seed).0, Settings::default()).0;
         motions.iter().filter(|motion| motion.is_degenerate()).count() as f64 / motions.len() as f64
     });
-    put("room: reported as degenerate", "1", room, Vec::new(), Target::Most(0.01));
+    put("room: reported as degenerate", "1", room, Vec::new(), Target::Max(0.01));
     let jumps = of_each(&|seed| {
         let (scans, truth) = drive(Jump, 361, 200, seed);
         let motions = run(&scans, Settings::default()).0;
         let jumps: Vec<usize> =
-            (1..scans.len()).filter(|&at| off(&truth[at - 1], &truth[at]).0 > 1000.0).collect();
+            (1..scans.len()).filter(|&at| pose_error(&truth[at - 1], &truth[at]).0 > 1000.0).collect();
         jumps.iter().filter(|&&at| !motions[at].has_step()).count() as f64 / jumps.len().max(1) as f64
     });
-    put("jumps that are rejected", "1", jumps, Vec::new(), Target::Least(0.99));
+    put("jumps that are rejected", "1", jumps, Vec::new(), Target::Min(0.99));
     let unsure = of_each(&|seed| {
         let (scans, truth) = drive(Room, 361, 400, seed);
         let motions = run(&scans, Settings::default()).0;
@@ -191,9 +191,9 @@ fn of_simulated(seeds: u64, figures: &mut Vec<Figure>) {
             .collect();
         squares.iter().sum::<f64>() / (3 * squares.len().max(1)) as f64
     });
-    put("squared error by covariance", "1", unsure, Vec::new(), Target::Most(2.0));
+    put("squared error by covariance", "1", unsure, Vec::new(), Target::Max(2.0));
     let drift = of_each(&|seed| {
-        let (scans, _) = drive(Kind::Standing, 361, 1000, seed);
+        let (scans, _) = drive(DriveKind::Standing, 361, 1000, seed);
         let motions = run(&scans, Settings::default()).0;
         motions.last().map_or(f64::NAN, |last| 1000.0 * last.x_m.hypot(last.y_m))
     });
@@ -202,11 +202,11 @@ fn of_simulated(seeds: u64, figures: &mut Vec<Figure>) {
 
 type Point = (f64, f64);
 
-const ROUNDS: usize = 40;
+const MAX_ITERATIONS: usize = 40;
 /// Maximum distance between two points of a pair, in meters.
-const MOST_M: f64 = 1.0;
+const MAX_PAIR_DISTANCE_M: f64 = 1.0;
 /// Share of the pairs that are used.
-const KEPT: f64 = 0.9;
+const TRIM_SHARE: f64 = 0.9;
 
 fn points(scan: &Scan) -> Vec<Point> {
     let point = |i| {
@@ -216,31 +216,31 @@ fn points(scan: &Scan) -> Vec<Point> {
     (0..scan.beams()).filter_map(point).collect()
 }
 
-fn square((x, y): Point, (a, b): Point) -> f64 {
+fn squared_distance((x, y): Point, (a, b): Point) -> f64 {
     (x - a) * (x - a) + (y - b) * (y - b)
 }
 
 /// Returns for each point of `moved` the nearest one of `fixed`: both indices and the square of their distance.
 fn pairs(fixed: &[Point], moved: &[Point]) -> Vec<(usize, usize, f64)> {
     let nearest = |(i, &point): (usize, &Point)| {
-        let by_distance = fixed.iter().enumerate().map(|(j, &other)| (j, square(point, other)));
+        let by_distance = fixed.iter().enumerate().map(|(j, &other)| (j, squared_distance(point, other)));
         let (j, square) = by_distance.min_by(|a, b| a.1.total_cmp(&b.1))?;
-        (square < MOST_M * MOST_M).then_some((i, j, square))
+        (square < MAX_PAIR_DISTANCE_M * MAX_PAIR_DISTANCE_M).then_some((i, j, square))
     };
     moved.iter().enumerate().filter_map(nearest).collect()
 }
 
 fn trim<T>(mut pairs: Vec<T>, by: impl Fn(&T) -> f64) -> Vec<T> {
     pairs.sort_by(|a, b| by(a).total_cmp(&by(b)));
-    pairs.truncate((KEPT * pairs.len() as f64).ceil() as usize);
+    pairs.truncate((TRIM_SHARE * pairs.len() as f64).ceil() as usize);
     pairs
 }
 
 /// Point-to-point matching by least squares, with the method of Umeyama in the plane.
-fn point_to_point(before: &Scan, now: &Scan) -> Rigid {
+fn point_to_point(before: &Scan, now: &Scan) -> Pose2 {
     let (fixed, own) = (points(before), points(now));
-    let mut pose = Rigid::default();
-    for _ in 0..ROUNDS {
+    let mut pose = Pose2::default();
+    for _ in 0..MAX_ITERATIONS {
         let moved: Vec<Point> = own.iter().map(|&point| pose.point(point)).collect();
         let pairs = trim(pairs(&fixed, &moved), |pair| pair.2);
         if pairs.len() < 3 {
@@ -258,9 +258,9 @@ fn point_to_point(before: &Scan, now: &Scan) -> Rigid {
             along += p.0 * q.0 + p.1 * q.1;
             across += p.0 * q.1 - p.1 * q.0;
         }
-        let turn = Rigid::new(0.0, 0.0, across.atan2(along));
+        let turn = Pose2::new(0.0, 0.0, across.atan2(along));
         let turned = turn.point(a);
-        let step = Rigid::new(b.0 - turned.0, b.1 - turned.1, turn.yaw);
+        let step = Pose2::new(b.0 - turned.0, b.1 - turned.1, turn.yaw);
         pose = step.then(&pose);
         if step.x.hypot(step.y) < 1e-5 && step.yaw.abs() < 1e-5 {
             break;
@@ -270,17 +270,18 @@ fn point_to_point(before: &Scan, now: &Scan) -> Rigid {
 }
 
 /// Point-to-line matching as in Censi (ICRA 2008).
-fn point_to_line(before: &Scan, now: &Scan) -> Rigid {
+fn point_to_line(before: &Scan, now: &Scan) -> Pose2 {
     let (fixed, own) = (points(before), points(now));
-    let mut pose = Rigid::default();
-    for _ in 0..ROUNDS {
+    let mut pose = Pose2::default();
+    for _ in 0..MAX_ITERATIONS {
         let moved: Vec<Point> = own.iter().map(|&point| pose.point(point)).collect();
         // The line goes through the nearest point and the nearer one of its neighbors.
         let of_pair = |(i, j, _): (usize, usize, f64)| {
             let point = moved[i];
             let neighbors = [j.checked_sub(1), Some(j + 1)].into_iter().flatten();
             let neighbors = neighbors.filter_map(|other| fixed.get(other).copied());
-            let other = neighbors.min_by(|a, b| square(point, *a).total_cmp(&square(point, *b)))?;
+            let other = neighbors
+                .min_by(|a, b| squared_distance(point, *a).total_cmp(&squared_distance(point, *b)))?;
             let (dx, dy) = (other.0 - fixed[j].0, other.1 - fixed[j].1);
             let length = dx.hypot(dy);
             let normal = (-dy / length, dx / length);
@@ -299,8 +300,8 @@ fn point_to_line(before: &Scan, now: &Scan) -> Rigid {
                 }
             }
         }
-        let Some([x, y, yaw]) = solved(m, v) else { break };
-        pose = Rigid::new(x, y, yaw).then(&pose);
+        let Some([x, y, yaw]) = solve(m, v) else { break };
+        pose = Pose2::new(x, y, yaw).then(&pose);
         if x.hypot(y) < 1e-5 && yaw.abs() < 1e-5 {
             break;
         }
@@ -309,7 +310,7 @@ fn point_to_line(before: &Scan, now: &Scan) -> Rigid {
 }
 
 /// Returns the solution x of m x = v, by Cramer's rule; `None` if m is singular.
-fn solved(m: [[f64; 3]; 3], v: [f64; 3]) -> Option<[f64; 3]> {
+fn solve(m: [[f64; 3]; 3], v: [f64; 3]) -> Option<[f64; 3]> {
     let of = |m: &[[f64; 3]; 3]| {
         m[0][0] * (m[1][1] * m[2][2] - m[1][2] * m[2][1]) - m[0][1] * (m[1][0] * m[2][2] - m[1][2] * m[2][0])
             + m[0][2] * (m[1][0] * m[2][1] - m[1][1] * m[2][0])
@@ -326,7 +327,7 @@ fn solved(m: [[f64; 3]; 3], v: [f64; 3]) -> Option<[f64; 3]> {
 
 /// Kind of a simulated drive.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Kind {
+enum DriveKind {
     /// A room.
     Room,
     /// People walk around the robot and hide about half of the view.
@@ -343,31 +344,31 @@ enum Kind {
 
 /// Standard deviation of a range, in meters.
 const NOISE_M: f64 = 0.01;
-const CROWD: usize = 9;
-const PERIOD_S: f64 = 1.0 / 37.5;
+const PEOPLE_COUNT: usize = 9;
+const SCAN_PERIOD_S: f64 = 1.0 / 37.5;
 
 /// Returns the walls of a room: a rectangle with pillars and boxes in it.
 fn room(random: &mut Rng) -> Vec<(Point, Point)> {
-    let mut walls = boxed((0.0, 0.0), (12.0, 9.0), 0.0);
+    let mut walls = box_walls((0.0, 0.0), (12.0, 9.0), 0.0);
     for _ in 0..8 {
         let at = (11.0 * (random.f64() - 0.5), 8.0 * (random.f64() - 0.5));
         if at.0.hypot(at.1) > 2.5 {
             let size = (0.3 + random.f64(), 0.3 + random.f64());
-            walls.extend(boxed(at, size, PI * random.f64()));
+            walls.extend(box_walls(at, size, PI * random.f64()));
         }
     }
     walls
 }
 
-fn boxed(center: Point, (long, wide): (f64, f64), yaw: f64) -> Vec<(Point, Point)> {
-    let pose = Rigid::new(center.0, center.1, yaw);
+fn box_walls(center: Point, (long, wide): (f64, f64), yaw: f64) -> Vec<(Point, Point)> {
+    let pose = Pose2::new(center.0, center.1, yaw);
     let corners = [(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)]
         .map(|(x, y): Point| pose.point((x * long / 2.0, y * wide / 2.0)));
     (0..4).map(|i| (corners[i], corners[(i + 1) % 4])).collect()
 }
 
 /// Returns the distance to the wall from `from` along the unit vector `along`.
-fn to_wall(from: Point, along: Point, ((x1, y1), (x2, y2)): &(Point, Point)) -> Option<f64> {
+fn distance_to_wall(from: Point, along: Point, ((x1, y1), (x2, y2)): &(Point, Point)) -> Option<f64> {
     let (dx, dy) = (x2 - x1, y2 - y1);
     let cross = along.0 * dy - along.1 * dx;
     let (ox, oy) = (x1 - from.0, y1 - from.1);
@@ -376,7 +377,7 @@ fn to_wall(from: Point, along: Point, ((x1, y1), (x2, y2)): &(Point, Point)) -> 
 }
 
 /// Returns the distance to a disc of `radius`.
-fn to_disc(from: Point, along: Point, center: Point, radius: f64) -> Option<f64> {
+fn distance_to_disc(from: Point, along: Point, center: Point, radius: f64) -> Option<f64> {
     let (dx, dy) = (center.0 - from.0, center.1 - from.1);
     let ahead = dx * along.0 + dy * along.1;
     let inside = radius * radius - (dx * dx + dy * dy - ahead * ahead);
@@ -390,41 +391,41 @@ struct Walker {
 }
 
 /// Moves the people, and replaces those who leave the view from `seen`, so that about half of the view is hidden.
-fn crowd(people: &mut Vec<Walker>, seen: &Rigid, random: &mut Rng) {
+fn move_people(people: &mut Vec<Walker>, visible_from: &Pose2, random: &mut Rng) {
     for Walker { at, by_second } in people.iter_mut() {
-        *at = (at.0 + by_second.0 * PERIOD_S, at.1 + by_second.1 * PERIOD_S);
+        *at = (at.0 + by_second.0 * SCAN_PERIOD_S, at.1 + by_second.1 * SCAN_PERIOD_S);
     }
     let from_robot = |walker: &Walker| {
-        let (x, y) = seen.inverse().point(walker.at);
+        let (x, y) = visible_from.inverse().point(walker.at);
         (x.hypot(y), y.atan2(x))
     };
     people.retain(|walker| {
         let (far, bearing) = from_robot(walker);
         (0.6..3.2).contains(&far) && bearing.abs() < 1.7
     });
-    while people.len() < CROWD {
+    while people.len() < PEOPLE_COUNT {
         let (far, bearing) = (0.8 + 2.2 * random.f64(), 3.2 * (random.f64() - 0.5));
-        let (way, speed) = (TAU * random.f64(), 0.5 + random.f64());
-        let at = seen.point((far * bearing.cos(), far * bearing.sin()));
-        people.push(Walker { at, by_second: (speed * way.cos(), speed * way.sin()) });
+        let (direction, speed) = (TAU * random.f64(), 0.5 + random.f64());
+        let at = visible_from.point((far * bearing.cos(), far * bearing.sin()));
+        people.push(Walker { at, by_second: (speed * direction.cos(), speed * direction.sin()) });
     }
 }
 
 /// Returns `count` scans of `beams` beams over 180 degrees (1081 beams: over 270), and the pose of the robot at each.
-fn drive(kind: Kind, beams: usize, count: usize, seed: u64) -> (Vec<Box<Scan>>, Vec<Rigid>) {
+fn drive(kind: DriveKind, beams: usize, count: usize, seed: u64) -> (Vec<Box<Scan>>, Vec<Pose2>) {
     let mut random = Rng::with_seed(seed);
     let walls = match kind {
-        Kind::Corridor => vec![((-500.0, 1.2), (500.0, 1.2)), ((-500.0, -1.0), (500.0, -1.0))],
+        DriveKind::Corridor => vec![((-500.0, 1.2), (500.0, 1.2)), ((-500.0, -1.0), (500.0, -1.0))],
         _ => room(&mut random),
     };
     let half = if beams == 1081 { 0.75 * PI } else { 0.5 * PI };
     let (first, step) = (-half, 2.0 * half / (beams - 1) as f64);
     let mut people: Vec<Walker> = Vec::new();
     let (mut scans, mut poses) = (Vec::new(), Vec::new());
-    let mut pose = Rigid::new(0.0, 0.0, TAU * random.f64());
+    let mut pose = Pose2::new(0.0, 0.0, TAU * random.f64());
     let (mut speed, mut turn) = (0.6, 0.0);
-    if kind == Kind::Corridor {
-        pose = Rigid::default();
+    if kind == DriveKind::Corridor {
+        pose = Pose2::default();
     }
     for at in 0..count {
         if at > 0 {
@@ -435,45 +436,47 @@ fn drive(kind: Kind, beams: usize, count: usize, seed: u64) -> (Vec<Box<Scan>>, 
             let home = (-pose.y).atan2(-pose.x) - pose.yaw;
             let turn = if is_far { 1.5 * home.sin() } else { turn };
             let (speed, turn) = match kind {
-                Kind::Standing => (0.0, 0.0),
-                Kind::Corridor => (speed, 0.2 * (-pose.y - pose.yaw)),
+                DriveKind::Standing => (0.0, 0.0),
+                DriveKind::Corridor => (speed, 0.2 * (-pose.y - pose.yaw)),
                 _ => (speed, turn),
             };
-            pose = pose.then(&Rigid::new(speed * PERIOD_S, 0.0, turn * PERIOD_S));
+            pose = pose.then(&Pose2::new(speed * SCAN_PERIOD_S, 0.0, turn * SCAN_PERIOD_S));
         }
-        let seen = if kind == Kind::Jump && at % 50 == 49 {
-            Rigid::new(7.0 * (random.f64() - 0.5), 5.0 * (random.f64() - 0.5), pose.yaw + PI * random.f64())
+        let visible_from = if kind == DriveKind::Jump && at % 50 == 49 {
+            Pose2::new(7.0 * (random.f64() - 0.5), 5.0 * (random.f64() - 0.5), pose.yaw + PI * random.f64())
         } else {
             pose
         };
-        if matches!(kind, Kind::People | Kind::Hidden) {
-            crowd(&mut people, &seen, &mut random);
+        if matches!(kind, DriveKind::People | DriveKind::Hidden) {
+            move_people(&mut people, &visible_from, &mut random);
         }
         let ranges: Vec<f64> = (0..beams)
             .map(|beam| {
                 let angle = first + beam as f64 * step;
-                let (sin, cos) = (seen.yaw + angle).sin_cos();
-                let (from, along) = ((seen.x, seen.y), (cos, sin));
-                let mut range =
-                    walls.iter().filter_map(|wall| to_wall(from, along, wall)).fold(f64::INFINITY, f64::min);
+                let (sin, cos) = (visible_from.yaw + angle).sin_cos();
+                let (from, along) = ((visible_from.x, visible_from.y), (cos, sin));
+                let mut range = walls
+                    .iter()
+                    .filter_map(|wall| distance_to_wall(from, along, wall))
+                    .fold(f64::INFINITY, f64::min);
                 for walker in &people {
-                    let disc = to_disc(from, along, walker.at, 0.2).filter(|disc| *disc < range);
-                    range =
-                        disc.map_or(range, |disc| if kind == Kind::Hidden { f64::INFINITY } else { disc });
+                    let disc = distance_to_disc(from, along, walker.at, 0.2).filter(|disc| *disc < range);
+                    range = disc
+                        .map_or(range, |disc| if kind == DriveKind::Hidden { f64::INFINITY } else { disc });
                 }
                 range + NOISE_M * normal(&mut random)
             })
             .map(|range| if range < 25.0 { range } else { f64::INFINITY })
             .collect();
         scans.push(scan(first, step, &ranges));
-        poses.push(seen);
+        poses.push(visible_from);
     }
     (scans, poses)
 }
 
 /// Returns the square of `off` in standard deviations of `covariance`.
-fn normalized(off: &[f64; 3], covariance: &[f32; 9]) -> Option<f64> {
+fn normalized(deviation: &[f64; 3], covariance: &[f32; 9]) -> Option<f64> {
     let matrix = std::array::from_fn(|i| std::array::from_fn(|j| f64::from(covariance[3 * i + j])));
-    let x = solved(matrix, *off)?;
-    Some(x.iter().zip(off).map(|(x, off)| x * off).sum())
+    let x = solve(matrix, *deviation)?;
+    Some(x.iter().zip(deviation).map(|(x, off)| x * off).sum())
 }

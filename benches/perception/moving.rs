@@ -11,7 +11,7 @@
 use std::ops::Range;
 use std::time::Instant;
 
-use scanhub_preprocess::background::{Class, Method, Model, Settings};
+use scanhub_preprocess::background::{BackgroundModel, Class, Method, Settings};
 use scanhub_preprocess::motion::{self, MotionEstimator};
 use scanhub_schema::{Foreground, Motion, Pose, Scan};
 
@@ -22,8 +22,8 @@ use crate::worlds::{self, Drive};
 /// Measures on simulated drives with these `seeds` and on recorded ones.
 pub(crate) fn measure(seeds: Range<u64>, is_json: bool) {
     let (mut figures, mut cells) = (Vec::new(), Vec::new());
-    of_drives(seeds, &mut figures);
-    of_recordings(&mut cells);
+    measure_drives(seeds, &mut figures);
+    measure_recordings(&mut cells);
     figures::print("perception, moving", is_json, &figures);
     figures::print_cells("perception, moving", is_json, &cells);
 }
@@ -31,7 +31,7 @@ pub(crate) fn measure(seeds: Range<u64>, is_json: bool) {
 /// The processors that the method needs, in the order in which the hub runs them.
 struct Processors {
     motion: MotionEstimator,
-    model: Model,
+    model: BackgroundModel,
     out: Box<Foreground>,
 }
 
@@ -40,7 +40,7 @@ impl Processors {
         let settings = Settings { method, ..Settings::default() };
         Processors {
             motion: MotionEstimator::new(Pose::default(), motion::Settings::default(), beams),
-            model: Model::new(settings, beams),
+            model: BackgroundModel::new(settings, beams),
             out: Foreground::of(beams),
         }
     }
@@ -49,7 +49,7 @@ impl Processors {
         if self.model.method() == Method::Moving {
             let mut motion = Motion::default();
             self.motion.update(scan, stamp_ns, 0, &mut motion);
-            self.model.follow(&Pose::default(), &motion, &self.motion.velocity());
+            self.model.set_motion(&Pose::default(), &motion, &self.motion.velocity());
         }
         self.model.update(scan, &mut self.out);
         self.model.classes()
@@ -61,7 +61,7 @@ impl Processors {
 fn run(drive: &Drive, method: Method, from: usize) -> (f64, f64, f64) {
     let beams = drive.scans[0].beams();
     let mut processors = Processors::new(method, beams);
-    let mut free = worlds::Seen::default();
+    let mut free = worlds::ObservedSquares::default();
     let (mut due, mut found, mut wrong, mut taken_us) = (0, 0, 0, 0.0);
     for (at, scan) in drive.scans.iter().enumerate() {
         let begin = Instant::now();
@@ -82,13 +82,13 @@ fn run(drive: &Drive, method: Method, from: usize) -> (f64, f64, f64) {
                 wrong += usize::from(!is_person && is_reported);
             }
         }
-        free.look(drive, at);
+        free.observe(drive, at);
     }
     let share = |part: usize, of: usize| part as f64 / of.max(1) as f64;
     (share(found, due), share(found, found + wrong), taken_us / drive.scans.len() as f64)
 }
 
-fn of_drives(seeds: Range<u64>, figures: &mut Vec<Figure>) {
+fn measure_drives(seeds: Range<u64>, figures: &mut Vec<Figure>) {
     let mut put =
         |name, unit, hub, baseline, target| figures.push(Figure { name, unit, hub, baseline, target });
     let of = |speed: f64, beams: usize, method: Method| -> [Vec<f64>; 3] {
@@ -101,25 +101,25 @@ fn of_drives(seeds: Range<u64>, figures: &mut Vec<Figure>) {
         columns
     };
     let [recall, precision, time_us] = of(0.02, 361, Method::Moving);
-    put("driving: recall", "1", recall, Vec::new(), Target::Least(0.95));
-    put("driving: precision", "1", precision, Vec::new(), Target::Least(0.90));
+    put("driving: recall", "1", recall, Vec::new(), Target::Min(0.95));
+    put("driving: precision", "1", precision, Vec::new(), Target::Min(0.90));
     put("driving: time a scan, 361 beams", "us", time_us, Vec::new(), Target::None);
     let [recall, precision, time_us] = of(0.02, 1081, Method::Moving);
-    put("driving, 1081 beams: recall", "1", recall, Vec::new(), Target::Least(0.95));
-    put("driving, 1081 beams: precision", "1", precision, Vec::new(), Target::Least(0.90));
+    put("driving, 1081 beams: recall", "1", recall, Vec::new(), Target::Min(0.95));
+    put("driving, 1081 beams: precision", "1", precision, Vec::new(), Target::Min(0.90));
     put("driving: time a scan, 1081 beams", "us", time_us, Vec::new(), Target::None);
     let [moving, multi] = [Method::Moving, Method::Multi].map(|method| of(0.0, 361, method));
     let less = |of: usize| multi[of].iter().zip(&moving[of]).map(|(multi, moving)| multi - moving).collect();
     put("standing: recall; multi", "1", moving[0].clone(), multi[0].clone(), Target::None);
     put("standing: precision; multi", "1", moving[1].clone(), multi[1].clone(), Target::None);
-    put("standing: recall below multi's", "1", less(0), Vec::new(), Target::Most(0.01));
-    put("standing: precision below multi's", "1", less(1), Vec::new(), Target::Most(0.01));
+    put("standing: recall below multi's", "1", less(0), Vec::new(), Target::Max(0.01));
+    put("standing: precision below multi's", "1", less(1), Vec::new(), Target::Max(0.01));
 }
 
 /// Adds the scores for the other car while it moves: the share of its beams that are reported, and other beams that
 /// are, per scan.
-fn of_recordings(cells: &mut Vec<Cell>) {
-    let recordings = recordings::with_another();
+fn measure_recordings(cells: &mut Vec<Cell>) {
+    let recordings = recordings::drives_with_other_car();
     if recordings.is_empty() {
         eprintln!("left out: SCANHUB_DATA names no folder with moving/*.jsonl.gz");
     }

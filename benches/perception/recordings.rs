@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use fastrand::Rng;
 use flate2::read::MultiGzDecoder;
-use scanhub_preprocess::motion::{Rigid, Settings};
+use scanhub_preprocess::motion::{Pose2, Settings};
 use scanhub_schema::{Code, Scan, ScanHead};
 use serde_json::Value;
 
@@ -16,22 +16,22 @@ use serde_json::Value;
 const CARS: [&str; 2] = ["overtakes", "intersection"];
 
 /// A scan, and the pose of the robot at it, if it is known.
-type PosedScan = (Box<Scan>, Option<Rigid>);
+type PosedScan = (Box<Scan>, Option<Pose2>);
 
 /// Consecutive scans of a robot.
 pub(crate) struct Drive {
     pub(crate) name: String,
     pub(crate) scans: Vec<Box<Scan>>,
     /// Position of the robot at each scan, if it is known.
-    pub(crate) positions: Vec<Option<Rigid>>,
+    pub(crate) positions: Vec<Option<Pose2>>,
     pub(crate) settings: Settings,
     /// Error from which a step is wrong, in mm.
-    pub(crate) wrong_mm: f64,
+    pub(crate) min_wrong_mm: f64,
 }
 
 impl Drive {
     /// Returns the indices of the scans whose step from the previous scan is known, with that step.
-    pub(crate) fn steps(&self) -> impl Iterator<Item = (usize, Rigid)> + '_ {
+    pub(crate) fn steps(&self) -> impl Iterator<Item = (usize, Pose2)> + '_ {
         let step = |at: usize| Some((at, self.positions[at - 1]?.inverse().then(&self.positions[at]?)));
         (1..self.positions.len()).filter_map(step)
     }
@@ -47,14 +47,14 @@ pub(crate) fn drives() -> Vec<Drive> {
             Settings { max_step_m: 3.5, max_turn_deg: 80.0, ..Settings::default() }
         };
         let (scans, positions) = scans.into_iter().unzip();
-        Drive { name, scans, positions, settings, wrong_mm: 200.0 }
+        Drive { name, scans, positions, settings, min_wrong_mm: 200.0 }
     });
     let cars = CARS.iter().filter_map(|name| model_car(name));
     logs.chain(cars).collect()
 }
 
 /// Returns the drives of model cars, with the position of the other car at each scan.
-pub(crate) fn with_another() -> Vec<(Drive, Vec<Option<Rigid>>)> {
+pub(crate) fn drives_with_other_car() -> Vec<(Drive, Vec<Option<Pose2>>)> {
     let of = |name: &str| {
         let path = car_path(name);
         let others = lines(&path)
@@ -67,17 +67,17 @@ pub(crate) fn with_another() -> Vec<(Drive, Vec<Option<Rigid>>)> {
 
 /// Returns the folder of recordings: SCANHUB_DATA, or `../shared/data`.
 fn folder() -> PathBuf {
-    let beside = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
-    std::env::var_os("SCANHUB_DATA").map_or(beside, PathBuf::from)
+    let default_folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
+    std::env::var_os("SCANHUB_DATA").map_or(default_folder, PathBuf::from)
 }
 
 fn car_path(name: &str) -> PathBuf {
     folder().join(format!("moving/{name}.jsonl.gz"))
 }
 
-fn position(value: &Value) -> Option<Rigid> {
+fn position(value: &Value) -> Option<Pose2> {
     let number = |at: usize| value.get(at)?.as_f64();
-    Some(Rigid::new(number(0)?, number(1)?, number(2)?))
+    Some(Pose2::new(number(0)?, number(1)?, number(2)?))
 }
 
 fn lines(path: &Path) -> io::Result<impl Iterator<Item = String>> {
@@ -98,7 +98,7 @@ fn carmen(path: &Path) -> Option<Vec<PosedScan>> {
         // Three of the logs have 81 m for no return.
         let ranges: Vec<f64> =
             ranges.iter().map(|&range| if range < 50.0 { range } else { f64::INFINITY }).collect();
-        Some((scan(-PI / 2.0, step, &ranges), Some(Rigid::new(x, y, yaw))))
+        Some((scan(-PI / 2.0, step, &ranges), Some(Pose2::new(x, y, yaw))))
     };
     Some(lines(path).ok()?.filter_map(read).collect())
 }
@@ -124,7 +124,13 @@ fn model_car(name: &str) -> Option<Drive> {
         Some((scan(first, step, &ranges), position(&value["platform"])))
     };
     let (scans, positions): (Vec<_>, Vec<_>) = lines(&car_path(name)).ok()?.filter_map(read).unzip();
-    Some(Drive { name: name.to_owned(), scans, positions, settings: Settings::default(), wrong_mm: 100.0 })
+    Some(Drive {
+        name: name.to_owned(),
+        scans,
+        positions,
+        settings: Settings::default(),
+        min_wrong_mm: 100.0,
+    })
 }
 
 /// Returns a scan of these ranges in meters, in units of 1 mm. Ranges beyond what a scan can hold have no return.

@@ -18,27 +18,27 @@ use rustix::io::Errno;
 use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::command::Request;
-use scanhub_drivers::lms::framer::{Found, Framer};
+use scanhub_drivers::lms::framer::{Framer, FramerEvent};
 use scanhub_drivers::lms::variant::Baud;
 
-use super::stage::Guard;
-use super::{Outcome, PART, clock, truth};
+use super::environment::GuardedProcess;
+use super::{Outcome, PART_WORD, clock, truth};
 
 /// Reads `count` telegrams (0: forever) from each of `ports` in a separate thread, and wakes one process per port. It
 /// wakes up `lead` nanoseconds before the expected end of a telegram, or, with 0, as long before it as the hub does. The
 /// first line says that it is up; at the end it prints the hash of each telegram and when it was read.
-pub(crate) fn chain(ports: &[&str], count: usize, lead: u64) -> Outcome<()> {
+pub(crate) fn run_baseline(ports: &[&str], count: usize, wake_ahead_ns: u64) -> Outcome<()> {
     let mut sleepers = Vec::new();
     let mut ends = Vec::new();
     for (number, port) in ports.iter().enumerate() {
         let wake = eventfd(0, EventfdFlags::CLOEXEC)?;
         sleepers.push(start_sleeper(number, count, wake.try_clone()?)?);
-        ends.push((Line::open(Path::new(port), RATE)?, wake));
+        ends.push((SerialLine::open(Path::new(port), BAUD_RATE)?, wake));
     }
     println!("ready");
     let threads: Vec<_> = ends
         .into_iter()
-        .map(|(line, wake)| thread::spawn(move || read_or_end(&line, &wake, count, lead)))
+        .map(|(line, wake)| thread::spawn(move || read_or_end(&line, &wake, count, wake_ahead_ns)))
         .collect();
     for (number, thread) in threads.into_iter().enumerate() {
         let telegrams = thread.join().map_err(|_| "a reader panicked")?;
@@ -46,14 +46,14 @@ pub(crate) fn chain(ports: &[&str], count: usize, lead: u64) -> Outcome<()> {
             println!("read {number} {} {at}", truth::hash(&telegram));
         }
     }
-    sleepers.into_iter().try_for_each(Guard::wait)?;
+    sleepers.into_iter().try_for_each(GuardedProcess::wait)?;
     println!("end");
     Ok(())
 }
 
 /// Sleeps on the eventfd that is its stdin until `count` telegrams were reported (0: forever), and then prints the time
 /// of each wake-up. With 0 it prints the first one at once.
-pub(crate) fn sleeper(number: &str, count: usize) -> Outcome<()> {
+pub(crate) fn run_sleeper(number: &str, count: usize) -> Outcome<()> {
     let wake = rustix::stdio::stdin();
     let mut times = Vec::with_capacity(count);
     let mut is_reported = false;
@@ -73,33 +73,43 @@ pub(crate) fn sleeper(number: &str, count: usize) -> Outcome<()> {
 }
 
 /// Starts a process that sleeps on `wake` until `count` wake-ups have arrived, see [`sleeper`].
-pub(crate) fn start_sleeper(number: usize, count: usize, wake: OwnedFd) -> Outcome<Guard> {
-    let words = [PART, "sleeper", &number.to_string(), &count.to_string()].map(String::from);
+pub(crate) fn start_sleeper(number: usize, count: usize, wake: OwnedFd) -> Outcome<GuardedProcess> {
+    let words = [PART_WORD, "sleeper", &number.to_string(), &count.to_string()].map(String::from);
     let process = Command::new(std::env::current_exe()?).args(words).stdin(Stdio::from(wake)).spawn()?;
-    Ok(Guard::new(process))
+    Ok(GuardedProcess::new(process))
 }
 
 /// Reads, and ends the whole process on an error: with one reader less, the baseline would be too low.
-fn read_or_end(line: &Line, wake: &OwnedFd, count: usize, lead: u64) -> Vec<([u8; LENGTH], u64)> {
-    read(line, wake, count, lead).unwrap_or_else(|error| {
+fn read_or_end(
+    line: &SerialLine,
+    wake: &OwnedFd,
+    count: usize,
+    wake_ahead_ns: u64,
+) -> Vec<([u8; TELEGRAM_LEN], u64)> {
+    read(line, wake, count, wake_ahead_ns).unwrap_or_else(|error| {
         eprintln!("baseline: {error}");
         std::process::exit(1)
     })
 }
 
 /// The read loop. What it keeps of each telegram, it keeps after the wake-up, in the pause before the next telegram.
-fn read(line: &Line, wake: impl AsFd, count: usize, lead: u64) -> Result<Vec<([u8; LENGTH], u64)>, String> {
+fn read(
+    line: &SerialLine,
+    wake: impl AsFd,
+    count: usize,
+    wake_ahead_ns: u64,
+) -> Result<Vec<([u8; TELEGRAM_LEN], u64)>, String> {
     let words = |error: Box<dyn std::error::Error>| error.to_string();
-    line.await_pause(PAUSE).map_err(words)?;
-    let mut kept = Vec::with_capacity(count);
-    let mut own_lead = lms::Lead::default();
+    line.wait_for_pause(TELEGRAM_PAUSE_NS).map_err(words)?;
+    let mut telegrams = Vec::with_capacity(count);
+    let mut own_lead = lms::WakeLead::default();
     let mut duration = TelegramDuration::default();
-    let mut telegram = [0; LENGTH];
-    while count == 0 || kept.len() < count {
+    let mut telegram = [0; TELEGRAM_LEN];
+    while count == 0 || telegrams.len() < count {
         let mut filled = 0;
         let mut first = 0;
         let mut reads_near_end = 0;
-        while filled < LENGTH {
+        while filled < TELEGRAM_LEN {
             clock::readable(line, None).map_err(|error| error.to_string())?;
             let len = line.read(&mut telegram[filled..]).map_err(words)?;
             let fresh = filled == 0 && len > 0;
@@ -107,8 +117,10 @@ fn read(line: &Line, wake: impl AsFd, count: usize, lead: u64) -> Result<Vec<([u
             reads_near_end += u32::from(reads_near_end > 0 && len > 0);
             if fresh {
                 first = clock::now();
-                if let Some(duration) = duration.known.filter(|_| filled < LENGTH) {
-                    clock::rest(first + duration - if lead > 0 { lead } else { own_lead.nanos() });
+                if let Some(duration) = duration.duration_ns.filter(|_| filled < TELEGRAM_LEN) {
+                    clock::sleep_until(
+                        first + duration - if wake_ahead_ns > 0 { wake_ahead_ns } else { own_lead.nanos() },
+                    );
                     // As in the hub: bytes have certainly arrived, so there is no need to poll.
                     filled += line.read(&mut telegram[filled..]).map_err(words)?;
                     reads_near_end = 1;
@@ -118,7 +130,7 @@ fn read(line: &Line, wake: impl AsFd, count: usize, lead: u64) -> Result<Vec<([u
         let last = clock::now();
         if telegram[0] != lms::telegram::STX {
             // The pause was not the one between two telegrams: the sender was descheduled.
-            line.await_pause(PAUSE).map_err(words)?;
+            line.wait_for_pause(TELEGRAM_PAUSE_NS).map_err(words)?;
             continue;
         }
         rustix::io::write(&wake, &1u64.to_ne_bytes()).map_err(|error| error.to_string())?;
@@ -127,27 +139,27 @@ fn read(line: &Line, wake: impl AsFd, count: usize, lead: u64) -> Result<Vec<([u
             own_lead.adapt(reads_near_end);
         }
         if count > 0 {
-            kept.push((telegram, last));
+            telegrams.push((telegram, last));
         }
     }
-    Ok(kept)
+    Ok(telegrams)
 }
 
 /// Duration of a telegram, estimated like in the hub: the minimum of several.
 #[derive(Default)]
 struct TelegramDuration {
-    known: Option<u64>,
+    duration_ns: Option<u64>,
     minimum: Option<u64>,
     counted: u32,
 }
 
 impl TelegramDuration {
-    fn learn(&mut self, took: u64) {
-        self.minimum = Some(self.minimum.map_or(took, |minimum| minimum.min(took)));
+    fn learn(&mut self, duration_ns: u64) {
+        self.minimum = Some(self.minimum.map_or(duration_ns, |minimum| minimum.min(duration_ns)));
         self.counted += 1;
-        if self.counted >= if self.known.is_none() { 3 } else { 16 } {
+        if self.counted >= if self.duration_ns.is_none() { 3 } else { 16 } {
             *self = TelegramDuration {
-                known: self.minimum.filter(|&minimum| minimum > 2 * LEAD),
+                duration_ns: self.minimum.filter(|&minimum| minimum > 2 * WAKE_AHEAD_NS),
                 ..TelegramDuration::default()
             };
         }
@@ -155,34 +167,34 @@ impl TelegramDuration {
 }
 
 /// Baud rate that the hub sets.
-const RATE: u32 = 500_000;
+const BAUD_RATE: u32 = 500_000;
 /// Length of a telegram of 361 beams, in bytes.
-const LENGTH: usize = 732;
+const TELEGRAM_LEN: usize = 732;
 /// Time before the expected end of a telegram at which the baseline wakes up, in ns. The hub learns its
 /// own; this one stays as it is, so that ratios can be compared with earlier ones.
-pub(crate) const LEAD: u64 = 600_000;
+pub(crate) const WAKE_AHEAD_NS: u64 = 600_000;
 /// Longer than the 3.2 ms within a telegram and shorter than the 8.8 ms after it, in ns.
-const PAUSE: u64 = 6_000_000;
+const TELEGRAM_PAUSE_NS: u64 = 6_000_000;
 
 /// Starts the scanner at `port`, which is at `rate`, as a hub that knew the rate would. Prints when the scanner
 /// confirmed the stream and when the first scan had arrived.
-pub(crate) fn start(port: &Path, rate: u32) -> Outcome<()> {
+pub(crate) fn start_scanner(port: &Path, rate: u32) -> Outcome<()> {
     stream(port, rate, &[Request::Status], &[Request::Type, Request::Configuration])
 }
 
 /// Does the same without any request for information: the shortest possible dialog.
-pub(crate) fn start_blindly(port: &Path, rate: u32) -> Outcome<()> {
+pub(crate) fn start_scanner_unchecked(port: &Path, rate: u32) -> Outcome<()> {
     stream(port, rate, &[], &[])
 }
 
 fn stream(port: &Path, rate: u32, before: &[Request], after: &[Request]) -> Outcome<()> {
-    let mut host = Host { line: Line::open(port, rate)?, framer: Framer::default(), rate };
+    let mut host = LmsHost { line: SerialLine::open(port, rate)?, framer: Framer::default(), rate };
     before.iter().try_for_each(|&request| host.request(request))?;
-    if rate != STREAM.rate() {
-        host.request(Request::Baud(STREAM))?;
-        host.line.set_rate(STREAM.rate())?;
-        host.rate = STREAM.rate();
-        clock::rest(clock::now() + SETTLE);
+    if rate != STREAM_BAUD.rate() {
+        host.request(Request::Baud(STREAM_BAUD))?;
+        host.line.set_rate(STREAM_BAUD.rate())?;
+        host.rate = STREAM_BAUD.rate();
+        clock::sleep_until(clock::now() + SETTLE_TIME_NS);
     }
     after.iter().chain(&[Request::Stream]).try_for_each(|&request| host.request(request))?;
     println!("streaming {}", clock::now());
@@ -191,21 +203,21 @@ fn stream(port: &Path, rate: u32, before: &[Request], after: &[Request]) -> Outc
     Ok(())
 }
 
-struct Host {
-    line: Line,
+struct LmsHost {
+    line: SerialLine,
     framer: Framer,
     rate: u32,
 }
 
-impl Host {
+impl LmsHost {
     /// Sends `request` until the scanner replies.
     fn request(&mut self, request: Request) -> Outcome<()> {
-        for _ in 0..TRIES {
-            let byte_time = scanhub_schema::line_time(1, self.rate) + GAP;
+        for _ in 0..MAX_TRIES {
+            let byte_time = scanhub_schema::line_time(1, self.rate) + BYTE_GAP_NS;
             for &byte in request.encode(0).bytes() {
                 let next = clock::now() + byte_time;
                 self.line.write(byte)?;
-                clock::rest(next);
+                clock::sleep_until(next);
             }
             if self.receive(request.command() | lms::telegram::REPLY, clock::now() + REPLY_TIMEOUT)? {
                 return Ok(());
@@ -218,7 +230,7 @@ impl Host {
     fn receive(&mut self, command: u8, until: u64) -> Outcome<bool> {
         loop {
             while let Some(found) = self.framer.poll() {
-                if let Found::Telegram(framed) = found
+                if let FramerEvent::Telegram(framed) = found
                     && framed.telegram.command() == command
                 {
                     return Ok(true);
@@ -226,36 +238,36 @@ impl Host {
             }
             let end = self.framer.hold().map_or(until, |hold| until.min(clock::now() + hold));
             if clock::readable(&self.line, Some(end))? {
-                let len = self.line.read(self.framer.spare())?;
+                let len = self.line.read(self.framer.read_buffer())?;
                 self.framer.commit(len);
             } else if clock::now() >= until {
                 return Ok(false);
             } else {
-                self.framer.release(lms::framer::VETO_HOLD);
+                self.framer.release(lms::framer::VETO_HOLD_TIME);
             }
         }
     }
 }
 
-const STREAM: Baud = Baud::B500000;
+const STREAM_BAUD: Baud = Baud::B500000;
 /// Gap between two bytes of a request, in ns. The scanner needs at least 55 us.
-const GAP: u64 = 80_000;
+const BYTE_GAP_NS: u64 = 80_000;
 /// Pause after a change of the rate, in ns, as in the hub.
-const SETTLE: u64 = 20_000_000;
+const SETTLE_TIME_NS: u64 = 20_000_000;
 /// Timeout of a reply, in ns.
 const REPLY_TIMEOUT: u64 = 300_000_000;
 /// Timeout of the first scan, in ns.
 const SCAN_TIMEOUT: u64 = 2_000_000_000;
-const TRIES: u32 = 10;
+const MAX_TRIES: u32 = 10;
 
 /// An open line, without any system call that is not needed.
-pub(crate) struct Line(OwnedFd);
+pub(crate) struct SerialLine(OwnedFd);
 
-impl Line {
+impl SerialLine {
     /// Opens the line at `path`, raw, at `rate` bits per second.
-    pub(crate) fn open(path: &Path, rate: u32) -> Outcome<Line> {
+    pub(crate) fn open(path: &Path, rate: u32) -> Outcome<SerialLine> {
         let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
-        let line = Line(open(path, flags, Mode::empty())?);
+        let line = SerialLine(open(path, flags, Mode::empty())?);
         line.set_rate(rate)?;
         Ok(line)
     }
@@ -284,7 +296,7 @@ impl Line {
     }
 
     /// Discards bytes until none has arrived for `pause` nanoseconds.
-    pub(crate) fn await_pause(&self, pause: u64) -> Outcome<()> {
+    pub(crate) fn wait_for_pause(&self, pause: u64) -> Outcome<()> {
         let mut buffer = [0; 1024];
         while clock::readable(self, Some(clock::now() + pause))? {
             self.read(&mut buffer)?;
@@ -293,7 +305,7 @@ impl Line {
     }
 }
 
-impl AsFd for Line {
+impl AsFd for SerialLine {
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.0.as_fd()
     }

@@ -13,7 +13,7 @@ pub(crate) fn now() -> u64 {
 }
 
 /// Sleeps until `until`.
-pub(crate) fn rest(until: u64) {
+pub(crate) fn sleep_until(until: u64) {
     let _ = poll(&mut [], Some(&span(until)));
 }
 

@@ -1,6 +1,6 @@
 //! Figures with their spread: a series of values, one per run, next to those of the baseline, with the ratio run by
 //! run; figures of programs that ran at the same time; or cells of tables. They are printed as tables, or with `--json`
-//! as one line each (`SPREAD` is `{median, least, most}` or null):
+//! as one line each (`PACE_SPREAD` is `{median, least, most}` or null):
 //!
 //! - `{class: "measurement", bench, name, unit, runs, hub: SPREAD, baseline: SPREAD, ratio: SPREAD, target, met}`
 //! - the same with more keys, one line for each program that ran at the same time as the hub: `sensors`, `program` (its
@@ -47,9 +47,9 @@ pub(crate) enum Target {
     /// No target.
     None,
     /// Maximum of the hub's median.
-    Most(f64),
+    Max(f64),
     /// Minimum of the hub's median.
-    Least(f64),
+    Min(f64),
     /// Maximum of the median of the ratios to the baseline.
     Ratio(f64),
 }
@@ -67,11 +67,11 @@ impl Spread {
 
     /// Returns the spread as it is in tables.
     pub(crate) fn text(&self) -> String {
-        let Spread(middle, least, most) = self;
-        if least == most {
-            return short(*middle);
+        let Spread(middle, minimum, maximum) = self;
+        if minimum == maximum {
+            return short_number(*middle);
         }
-        format!("{} [{} .. {}]", short(*middle), short(*least), short(*most))
+        format!("{} [{} .. {}]", short_number(*middle), short_number(*minimum), short_number(*maximum))
     }
 
     /// Returns the spread as it is in lines of JSON.
@@ -102,23 +102,26 @@ impl Figure {
         json!({
             "class": "measurement", "bench": bench, "name": self.name, "unit": self.unit,
             "runs": self.hub.len(), "hub": hub, "baseline": baseline, "ratio": ratio,
-            "target": verdict.as_ref().map(|(words, _)| words), "met": verdict.as_ref().map(|(_, met)| met),
+            "target": verdict.as_ref().map(|(words, _)| words), "met": verdict.as_ref().map(|(_, is_met)| is_met),
         })
     }
 
     /// Returns the target and whether it was met, as they are in tables.
     fn verdict_text(&self) -> String {
-        self.verdict()
-            .map_or(String::new(), |(words, met)| format!("{words}: {}", if met { "met" } else { "MISSED" }))
+        self.verdict().map_or(String::new(), |(words, is_met)| {
+            format!("{words}: {}", if is_met { "met" } else { "MISSED" })
+        })
     }
 
     /// Returns the target as text, and whether it was met.
     fn verdict(&self) -> Option<(String, bool)> {
         match self.target {
             Target::None => None,
-            Target::Most(most) => Some((format!("<= {most}"), Spread::of(&self.hub)?.0 <= most)),
-            Target::Least(least) => Some((format!(">= {least}"), Spread::of(&self.hub)?.0 >= least)),
-            Target::Ratio(most) => Some((format!("ratio <= {most}"), Spread::of(&self.ratios())?.0 <= most)),
+            Target::Max(maximum) => Some((format!("<= {maximum}"), Spread::of(&self.hub)?.0 <= maximum)),
+            Target::Min(minimum) => Some((format!(">= {minimum}"), Spread::of(&self.hub)?.0 >= minimum)),
+            Target::Ratio(maximum) => {
+                Some((format!("ratio <= {maximum}"), Spread::of(&self.ratios())?.0 <= maximum))
+            }
         }
     }
 }
@@ -214,8 +217,8 @@ impl Mean {
     }
 
     fn text(&self) -> String {
-        let error = self.1.map_or(String::new(), |error| format!(" +- {}", short(error)));
-        format!("{}{error}", short(self.0))
+        let error = self.1.map_or(String::new(), |error| format!(" +- {}", short_number(error)));
+        format!("{}{error}", short_number(self.0))
     }
 
     fn json(&self) -> Value {
@@ -235,13 +238,13 @@ pub(crate) fn print_cells(bench: &str, json: bool, cells: &[Cell]) {
         }
         return;
     }
-    for table in appearing(cells.iter().map(|cell| &cell.table)) {
+    for table in in_order_of_appearance(cells.iter().map(|cell| &cell.table)) {
         let cells: Vec<&Cell> = cells.iter().filter(|cell| cell.table == *table).collect();
-        let columns = appearing(cells.iter().map(|cell| &cell.column));
+        let columns = in_order_of_appearance(cells.iter().map(|cell| &cell.column));
         println!("{bench}: {table}");
         let heads = columns.iter().map(|column| format!(" {column:>26}"));
         println!("{:28}{}", "", heads.collect::<String>());
-        for row in appearing(cells.iter().map(|cell| &cell.row)) {
+        for row in in_order_of_appearance(cells.iter().map(|cell| &cell.row)) {
             let text = |column: &&String| {
                 let cell = cells.iter().find(|cell| cell.row == *row && cell.column == **column);
                 let spread = cell.and_then(|cell| Some((Spread::of(&cell.values)?, cell.unit)));
@@ -257,7 +260,7 @@ pub(crate) fn print_cells(bench: &str, json: bool, cells: &[Cell]) {
 }
 
 /// Returns each name once, in order of appearance.
-fn appearing<'a>(names: impl Iterator<Item = &'a String>) -> Vec<&'a String> {
+fn in_order_of_appearance<'a>(names: impl Iterator<Item = &'a String>) -> Vec<&'a String> {
     let mut found = Vec::new();
     for name in names {
         if !found.contains(&name) {
@@ -278,7 +281,7 @@ pub(crate) fn percentile(sorted: &[f64], part: f64) -> Option<f64> {
     sorted.get(rank.saturating_sub(1).min(last)).copied()
 }
 
-fn short(value: f64) -> String {
+fn short_number(value: f64) -> String {
     match value.abs() {
         size if size >= 100.0 || value == value.trunc() => format!("{value:.0}"),
         size if size >= 10.0 => format!("{value:.1}"),

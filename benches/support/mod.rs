@@ -6,11 +6,11 @@
 
 pub(crate) mod baseline;
 pub(crate) mod clock;
-pub(crate) mod consumer;
+pub(crate) mod environment;
 pub(crate) mod figures;
 pub(crate) mod simultaneous;
 pub(crate) mod source;
-pub(crate) mod stage;
+pub(crate) mod subscriber;
 pub(crate) mod truth;
 pub(crate) mod usage;
 
@@ -25,23 +25,23 @@ pub(crate) type Outcome<T> = Result<T, Box<dyn Error>>;
 /// Runs a bench: plays the part that the command line names, because a bench starts itself as subscriber and as
 /// baseline. Otherwise it measures.
 pub(crate) fn main(measure: impl FnOnce(&Options) -> Outcome<()>) -> ExitCode {
-    main_with(play, measure)
+    main_with(run_part, measure)
 }
 
-/// Runs a bench that has its own parts. It passes the parts that it does not know to [`play`].
+/// Runs a bench that has its own parts. It passes the parts that it does not know to [`run_part`].
 pub(crate) fn main_with(
-    play: impl FnOnce(&[&str]) -> Outcome<()>,
+    run_part: impl FnOnce(&[&str]) -> Outcome<()>,
     measure: impl FnOnce(&Options) -> Outcome<()>,
 ) -> ExitCode {
     let words: Vec<String> = std::env::args().skip(1).collect();
     let outcome = match words.iter().map(String::as_str).collect::<Vec<_>>()[..] {
         // A part ends with the process that started it.
-        [PART, ref part @ ..] => {
-            set_parent_process_death_signal(Some(Signal::TERM)).map_err(Into::into).and_then(|()| play(part))
-        }
-        _ => {
-            stage::Stage::sweep().and_then(|()| Options::parse(&words)).and_then(|options| measure(&options))
-        }
+        [PART_WORD, ref part @ ..] => set_parent_process_death_signal(Some(Signal::TERM))
+            .map_err(Into::into)
+            .and_then(|()| run_part(part)),
+        _ => environment::BenchEnvironment::remove_leftovers()
+            .and_then(|()| Options::parse(&words))
+            .and_then(|options| measure(&options)),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,
@@ -53,28 +53,30 @@ pub(crate) fn main_with(
 }
 
 /// Plays one of the parts that benches share.
-pub(crate) fn play(words: &[&str]) -> Outcome<()> {
+pub(crate) fn run_part(words: &[&str]) -> Outcome<()> {
     match *words {
-        ["consume", "scan", domain, sensor] => consumer::scans(domain, sensor),
-        ["consume", "each", domain, sensor] => consumer::each_scan(domain, sensor),
-        ["consume", "telegram", domain, sensor, count] => consumer::telegrams(domain, sensor, count.parse()?),
-        ["ages", domain, sensor, count] => consumer::ages(domain, sensor, count.parse()?),
-        ["consume", "status", domain, sensor] => consumer::statuses(domain, sensor),
-        ["crowd", domain, sensor, count, seconds] => {
-            consumer::follow(domain, sensor, count.parse()?, seconds.parse()?)
+        ["consume", "scan", domain, sensor] => subscriber::print_first_scans(domain, sensor),
+        ["consume", "each", domain, sensor] => subscriber::print_scans(domain, sensor),
+        ["consume", "telegram", domain, sensor, count] => {
+            subscriber::print_telegrams(domain, sensor, count.parse()?)
         }
-        ["hold", domain, sensor, count] => consumer::hold(domain, sensor, count.parse()?),
-        ["stay", domain, sensor, count] => consumer::stay(domain, sensor, count.parse()?),
-        ["bare", count, lead, ref ports @ ..] => baseline::chain(ports, count.parse()?, lead.parse()?),
-        ["sleeper", number, count] => baseline::sleeper(number, count.parse()?),
-        ["host", "blindly", port, rate] => baseline::start_blindly(port.as_ref(), rate.parse()?),
-        ["host", port, rate] => baseline::start(port.as_ref(), rate.parse()?),
+        ["ages", domain, sensor, count] => subscriber::print_ages(domain, sensor, count.parse()?),
+        ["consume", "status", domain, sensor] => subscriber::print_statuses(domain, sensor),
+        ["crowd", domain, sensor, count, seconds] => {
+            subscriber::count_samples(domain, sensor, count.parse()?, seconds.parse()?)
+        }
+        ["hold", domain, sensor, count] => subscriber::hold_samples(domain, sensor, count.parse()?),
+        ["stay", domain, sensor, count] => subscriber::hold_slots(domain, sensor, count.parse()?),
+        ["bare", count, lead, ref ports @ ..] => baseline::run_baseline(ports, count.parse()?, lead.parse()?),
+        ["sleeper", number, count] => baseline::run_sleeper(number, count.parse()?),
+        ["host", "blindly", port, rate] => baseline::start_scanner_unchecked(port.as_ref(), rate.parse()?),
+        ["host", port, rate] => baseline::start_scanner(port.as_ref(), rate.parse()?),
         _ => Err(format!("no part {words:?}").into()),
     }
 }
 
 /// First word of the command line of a part.
-pub(crate) const PART: &str = "part";
+pub(crate) const PART_WORD: &str = "part";
 
 /// Options of a bench. Each has a default, which depends on the bench.
 #[derive(Clone, Debug, Default)]
@@ -88,7 +90,7 @@ pub(crate) struct Options {
     count: Option<usize>,
     sensors: Option<usize>,
     /// The program of another build, to be measured at the same time.
-    pub(crate) beside: Option<String>,
+    pub(crate) other_program: Option<String>,
 }
 
 impl Options {
@@ -108,7 +110,7 @@ impl Options {
                 "--seconds" => options.seconds = Some(number(word, value()?)?),
                 "--count" => options.count = Some(number(word, value()?)?),
                 "--sensors" => options.sensors = Some(number(word, value()?)?),
-                "--beside" => options.beside = Some(value()?.clone()),
+                "--beside" => options.other_program = Some(value()?.clone()),
                 "--bench" => {}
                 _ => {
                     let known =
@@ -137,7 +139,7 @@ impl Options {
 
     /// Returns the numbers of sensors to measure with, one after the other.
     pub(crate) fn sensors(&self, default: &[usize]) -> Vec<usize> {
-        self.sensors.map_or(default.to_vec(), |sensors| vec![sensors.clamp(1, stage::ALL_AROUND.len())])
+        self.sensors.map_or(default.to_vec(), |sensors| vec![sensors.clamp(1, environment::ALL_AROUND.len())])
     }
 
     /// Returns the number of telegrams or repetitions.

@@ -6,28 +6,28 @@
 use std::process::Stdio;
 use std::time::Duration;
 
-use super::stage::{ALL_AROUND, Child, PATIENCE, PROGRAM, Stage};
+use super::environment::{ALL_AROUND, BenchEnvironment, Child, PROGRAM, STEP_TIMEOUT};
 use super::{Options, Outcome, baseline};
 
 /// The programs and their lines.
 pub(crate) struct Comparison {
     pub(crate) sensors: &'static [&'static str],
     /// The hub, two baselines and, with `--beside`, the hub of the other build, in this order.
-    pub(crate) candidates: Vec<Candidate>,
+    pub(crate) programs: Vec<MeasuredProgram>,
     /// One per candidate.
-    lines: Vec<Lines>,
+    lines: Vec<SimulatedSensors>,
 }
 
 /// A program that is measured.
-pub(crate) struct Candidate {
+pub(crate) struct MeasuredProgram {
     /// Name in tables.
     pub(crate) name: String,
-    pub(crate) kind: Kind,
+    pub(crate) program: ProgramKind,
     /// Domain and directory of a hub.
-    pub(crate) stage: Stage,
+    pub(crate) stage: BenchEnvironment,
 }
 
-pub(crate) enum Kind {
+pub(crate) enum ProgramKind {
     /// The hub of the program at this path.
     Hub(String),
     /// The baseline that wakes up this long before the end of a telegram, in ns; 0: as long as the hub.
@@ -35,10 +35,10 @@ pub(crate) enum Kind {
 }
 
 /// A set of simulated sensors.
-struct Lines {
+struct SimulatedSensors {
     // Ends before the directory with its ports is removed.
     _simulator: Child,
-    stage: Stage,
+    stage: BenchEnvironment,
 }
 
 impl Comparison {
@@ -47,79 +47,84 @@ impl Comparison {
     pub(crate) fn start(options: &Options, sensors: usize) -> Outcome<Comparison> {
         let sensors = ALL_AROUND.get(..sensors).ok_or("too many sensors")?;
         let mut kinds = vec![
-            ("hub".to_owned(), Kind::Hub(PROGRAM.to_owned())),
-            (BASELINE.to_owned(), Kind::Baseline(baseline::LEAD)),
-            (format!("{BASELINE}, woken as the hub"), Kind::Baseline(0)),
+            ("hub".to_owned(), ProgramKind::Hub(PROGRAM.to_owned())),
+            (BASELINE_NAME.to_owned(), ProgramKind::Baseline(baseline::WAKE_AHEAD_NS)),
+            (format!("{BASELINE_NAME}, woken as the hub"), ProgramKind::Baseline(0)),
         ];
-        kinds.extend(options.beside.iter().map(|path| (path.clone(), Kind::Hub(path.clone()))));
+        kinds.extend(options.other_program.iter().map(|path| (path.clone(), ProgramKind::Hub(path.clone()))));
         let count = kinds.len();
-        let create = |(number, (name, kind))| -> Outcome<Candidate> {
-            let stage = Stage::numbered(number)?;
-            let kind = match kind {
-                Kind::Hub(path) => Kind::Hub(copied(&path, &stage)?),
-                baseline @ Kind::Baseline(_) => baseline,
+        let create = |(number, (name, program))| -> Outcome<MeasuredProgram> {
+            let environment = BenchEnvironment::numbered(number)?;
+            let program = match program {
+                ProgramKind::Hub(path) => ProgramKind::Hub(copy_program(&path, &environment)?),
+                baseline @ ProgramKind::Baseline(_) => baseline,
             };
-            Ok(Candidate { name, kind, stage })
+            Ok(MeasuredProgram { name, program, stage: environment })
         };
-        let candidates = kinds.into_iter().enumerate().map(create).collect::<Outcome<Vec<_>>>()?;
+        let programs = kinds.into_iter().enumerate().map(create).collect::<Outcome<Vec<_>>>()?;
         let lines = (count..2 * count)
             .map(|number| {
-                let stage = Stage::numbered(number)?;
-                Ok(Lines { _simulator: stage.simulate(sensors, 500_000)?, stage })
+                let environment = BenchEnvironment::numbered(number)?;
+                Ok(SimulatedSensors {
+                    _simulator: environment.simulate(sensors, 500_000)?,
+                    stage: environment,
+                })
             })
             .collect::<Outcome<Vec<_>>>()?;
         for lines in &lines {
-            let hub = candidates[0].start(&lines.stage, sensors, 0)?;
-            let _subscribers = candidates[0].subscribe_to_scans(sensors)?;
+            let hub = programs[0].start(&lines.stage, sensors, 0)?;
+            let _subscribers = programs[0].subscribe_to_scans(sensors)?;
             hub.guard.kill()?;
         }
-        Ok(Comparison { sensors, candidates, lines })
+        Ok(Comparison { sensors, programs, lines })
     }
 
     /// Returns the index of the lines that a candidate reads in a round.
-    pub(crate) fn place(&self, candidate: usize, round: usize) -> usize {
-        (candidate + round) % self.lines.len()
+    pub(crate) fn line_index(&self, program: usize, round: usize) -> usize {
+        (program + round) % self.lines.len()
     }
 
     /// Returns the stage of the lines with this index.
-    pub(crate) fn lines(&self, place: usize) -> &Stage {
-        &self.lines[place].stage
+    pub(crate) fn lines(&self, line_index: usize) -> &BenchEnvironment {
+        &self.lines[line_index].stage
     }
 
     /// Returns the number of rounds. By default, each candidate reads all lines twice.
     pub(crate) fn rounds(&self, options: &Options) -> usize {
-        options.pairs_or(2 * self.candidates.len())
+        options.pairs_or(2 * self.programs.len())
     }
 
     /// Returns the names of all candidates.
     pub(crate) fn names(&self) -> Vec<&str> {
-        self.candidates.iter().map(|candidate| candidate.name.as_str()).collect()
+        self.programs.iter().map(|candidate| candidate.name.as_str()).collect()
     }
 }
 
-impl Candidate {
+impl MeasuredProgram {
     /// Starts the program on `lines`. A baseline ends after `count` telegrams from each (0: never).
-    pub(crate) fn start(&self, lines: &Stage, sensors: &[&str], count: usize) -> Outcome<Child> {
-        let child = match &self.kind {
-            Kind::Hub(path) => Child::of(self.stage.hub_command_on(lines, path, sensors), Stdio::null()),
-            Kind::Baseline(lead) => lines.bare(sensors, count, *lead),
+    pub(crate) fn start(&self, lines: &BenchEnvironment, sensors: &[&str], count: usize) -> Outcome<Child> {
+        let child = match &self.program {
+            ProgramKind::Hub(path) => {
+                Child::spawn(self.stage.hub_command_on(lines, path, sensors), Stdio::null())
+            }
+            ProgramKind::Baseline(lead) => lines.start_baseline(sensors, count, *lead),
         };
         let child = child.map_err(|error| format!("{}: {error}", self.name))?;
-        child.await_line("ready", PATIENCE).map_err(|error| format!("{}: {error}", self.name))?;
+        child.wait_for_line("ready", STEP_TIMEOUT).map_err(|error| format!("{}: {error}", self.name))?;
         Ok(child)
     }
 
     /// Returns whether it is a hub.
     pub(crate) fn is_hub(&self) -> bool {
-        matches!(self.kind, Kind::Hub(_))
+        matches!(self.program, ProgramKind::Hub(_))
     }
 
     /// Starts a subscriber to the scans of each sensor, and waits until every subscriber has received one. Only for hubs.
     pub(crate) fn subscribe_to_scans(&self, sensors: &[&str]) -> Outcome<Vec<Child>> {
-        let start = |sensor: &&str| self.stage.consumer("scan", sensor, &[]);
+        let start = |sensor: &&str| self.stage.start_subscriber("scan", sensor, &[]);
         let subscribers = sensors.iter().map(start).collect::<Outcome<Vec<_>>>()?;
         for subscriber in &subscribers {
-            let scan = subscriber.await_line("scan", PATIENCE);
+            let scan = subscriber.wait_for_line("scan", STEP_TIMEOUT);
             scan.map_err(|error| format!("{}: {error} (layouts in shared memory may differ)", self.name))?;
         }
         Ok(subscribers)
@@ -128,14 +133,14 @@ impl Candidate {
 
 /// Copies the program at `path` into the directory of `stage`, and returns the path of the copy. The simulators run
 /// from the program of this build. If a hub ran from the same file, they would keep its code in the processor's caches.
-fn copied(path: &str, stage: &Stage) -> Outcome<String> {
-    let copy = stage.file("scanhub");
+fn copy_program(path: &str, environment: &BenchEnvironment) -> Outcome<String> {
+    let copy = environment.file("scanhub");
     std::fs::copy(path, &copy).map_err(|error| format!("{path}: {error}"))?;
     Ok(copy.display().to_string())
 }
 
 /// Name of the baseline in tables.
-const BASELINE: &str = "baseline";
+const BASELINE_NAME: &str = "baseline";
 /// Time at the start of a round that does not count. The hub learns the background in 6.3 s and the duration of a
 /// telegram in the first scans.
-pub(crate) const SETTLING: Duration = Duration::from_secs(8);
+pub(crate) const SETTLE_TIME: Duration = Duration::from_secs(8);

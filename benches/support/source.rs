@@ -1,9 +1,9 @@
 //! A hub without sensors, which publishes the same scan on request.
 
 use scanhub_schema::limits::TopicLimits;
-use scanhub_schema::{Header, Ring, Scan, ScanHead, Status, Wake};
+use scanhub_schema::{DoorbellWord, Header, Scan, ScanHead, Status, WakeEvent};
 use scanhub_shm::{Domain, HubLock};
-use scanhub_shm::{Node, Payload, Publisher, TopicService, Waker};
+use scanhub_shm::{Node, Payload, Publisher, TopicService, WakeSender};
 
 use super::Outcome;
 
@@ -11,9 +11,9 @@ use super::Outcome;
 pub(crate) const SENSOR: &str = "front";
 
 /// A hub without sensors, which publishes the same scan on request.
-pub(crate) struct Source {
+pub(crate) struct ScanSource {
     publisher: Publisher<Scan>,
-    waker: Waker,
+    waker: WakeSender,
     next: u64,
     _service: TopicService<Scan>,
     /// Every hub has this topic. A gateway would request it again and again if it did not exist.
@@ -22,17 +22,17 @@ pub(crate) struct Source {
     _lock: HubLock,
 }
 
-impl Source {
-    pub(crate) fn open(domain: &Domain) -> Outcome<Source> {
+impl ScanSource {
+    pub(crate) fn open(domain: &Domain) -> Outcome<ScanSource> {
         let lock = HubLock::acquire(domain.root())?;
         let node = scanhub_shm::hub_node(domain)?;
         // Maximum number of subscribers in any bench.
         let limits = TopicLimits { subscribers: 200, ..TopicLimits::default() };
-        let waker = Waker::new(&node, SENSOR)?;
+        let waker = WakeSender::new(&node, SENSOR)?;
         let service = Scan::create(&node, SENSOR, &limits)?;
         let status = Status::create(&node, SENSOR, &limits)?;
         lock.report_ready()?;
-        Ok(Source {
+        Ok(ScanSource {
             publisher: Scan::publisher(&service, &limits)?,
             waker,
             next: 0,
@@ -54,8 +54,8 @@ impl Source {
         let to = Scan::write(&mut sample).begin(**scan);
         to.ranges.copy_from_slice(scan.ranges());
         sample.send().map_err(|error| format!("not sent: {error:?}"))?;
-        self.waker.ring(Ring::First);
-        self.waker.tell(Wake::Telegram)?;
+        self.waker.ring(DoorbellWord::First);
+        self.waker.notify(WakeEvent::Telegram)?;
         Ok(())
     }
 }

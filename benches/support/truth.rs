@@ -10,7 +10,7 @@ use super::Outcome;
 
 /// A telegram of measured data that was sent completely.
 #[derive(Clone, Debug)]
-pub(crate) struct Sent {
+pub(crate) struct SentTelegram {
     pub(crate) hash: String,
     /// Index among all telegrams that the sensor sent.
     pub(crate) index: u64,
@@ -20,20 +20,20 @@ pub(crate) struct Sent {
 
 /// The telegrams of one sensor, in order.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Truth {
-    pub(crate) sent: Vec<Sent>,
+pub(crate) struct SensorTruth {
+    pub(crate) sent: Vec<SentTelegram>,
     /// Telegrams for which the host had no room, or not enough: the rest of a later one may complete it.
-    overrun: Vec<Sent>,
+    overrun: Vec<SentTelegram>,
     /// Times at which the sensor aborted a telegram of measured data to answer a request.
     pub(crate) aborted_ns: Vec<u64>,
     /// Number of EEPROM writes; known once the simulator has ended.
     pub(crate) eeprom_writes: Option<u64>,
 }
 
-impl Truth {
+impl SensorTruth {
     /// Reads what `sensor` sent from the file at `path`.
-    pub(crate) fn read(path: &Path, sensor: &str) -> Outcome<Truth> {
-        let mut truth = Truth::default();
+    pub(crate) fn read(path: &Path, sensor: &str) -> Outcome<SensorTruth> {
+        let mut truth = SensorTruth::default();
         for line in std::fs::read_to_string(path)?.lines() {
             // The last line may be incomplete.
             let Ok(value) = serde_json::from_str::<Value>(line) else { continue };
@@ -48,7 +48,7 @@ impl Truth {
             } else if value["kind"] == "data" && (value["fault"].is_null() || value["fault"] == "overrun") {
                 let hash = value["sha256"].as_str().unwrap_or_default().to_owned();
                 let number = |key: &str| value[key].as_u64().unwrap_or_default();
-                let sent = Sent { hash, index: number("index"), at_ns: number("sent_ns") };
+                let sent = SentTelegram { hash, index: number("index"), at_ns: number("sent_ns") };
                 if value["fault"].is_null() { &mut truth.sent } else { &mut truth.overrun }.push(sent);
             }
         }
@@ -59,20 +59,20 @@ impl Truth {
     /// sending. The sensor sends one telegram every `every_ns`, and some of the neighbors of each telegram were sent in
     /// time.
     pub(crate) fn due(&self, every_ns: u64) -> (HashMap<&str, Vec<u64>>, u64) {
-        let mut all: Vec<&Sent> = self.sent.iter().chain(&self.overrun).collect();
+        let mut all: Vec<&SentTelegram> = self.sent.iter().chain(&self.overrun).collect();
         all.sort_by_key(|sent| sent.index);
-        let begin = |sent: &&Sent| sent.at_ns.saturating_sub(sent.index * every_ns);
+        let begin = |sent: &&SentTelegram| sent.at_ns.saturating_sub(sent.index * every_ns);
         let begins: Vec<u64> = all.iter().map(begin).collect();
-        let least = |n: usize| {
-            let around = n.saturating_sub(NEIGHBORS)..(n + NEIGHBORS).min(begins.len());
+        let min_delay = |n: usize| {
+            let around = n.saturating_sub(NEIGHBOR_COUNT)..(n + NEIGHBOR_COUNT).min(begins.len());
             begins[around].iter().copied().min().unwrap_or_default()
         };
-        let least: Vec<u64> = (0..begins.len()).map(least).collect();
+        let min_delay: Vec<u64> = (0..begins.len()).map(min_delay).collect();
         let mut due: HashMap<&str, Vec<u64>> = HashMap::new();
-        for (sent, begin) in all.into_iter().zip(&least) {
+        for (sent, begin) in all.into_iter().zip(&min_delay) {
             due.entry(&sent.hash).or_default().push(begin + sent.index * every_ns);
         }
-        let stood = least.windows(2).map(|pair| pair[1].saturating_sub(pair[0])).sum();
+        let stood = min_delay.windows(2).map(|pair| pair[1].saturating_sub(pair[0])).sum();
         (due, stood)
     }
 
@@ -83,7 +83,7 @@ impl Truth {
 }
 
 /// Number of telegrams on either side, one of which was sent in time.
-const NEIGHBORS: usize = 200;
+const NEIGHBOR_COUNT: usize = 200;
 
 /// Returns the SHA-256 of `bytes` as the simulator writes it.
 pub(crate) fn hash(bytes: &[u8]) -> String {

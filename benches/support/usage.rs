@@ -10,7 +10,7 @@ use super::Outcome;
 
 /// CPU time and context switches of a process, or of some of its threads.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Work {
+pub(crate) struct ThreadUsage {
     /// CPU time, in ns.
     pub(crate) busy_ns: u64,
     /// Number of times that a thread went to sleep.
@@ -19,13 +19,13 @@ pub(crate) struct Work {
     pub(crate) involuntary: u64,
 }
 
-impl Work {
+impl ThreadUsage {
     /// Returns the counters of the threads of `pid` whose names `wanted` accepts.
-    pub(crate) fn of(pid: u32, wanted: impl Fn(&str) -> bool) -> Outcome<Work> {
-        let mut work = Work::default();
+    pub(crate) fn of(pid: u32, is_counted: impl Fn(&str) -> bool) -> Outcome<ThreadUsage> {
+        let mut work = ThreadUsage::default();
         for task in read_dir(format!("/proc/{pid}/task"))? {
             let task = task?.path();
-            if !wanted(read_to_string(task.join("comm"))?.trim()) {
+            if !is_counted(read_to_string(task.join("comm"))?.trim()) {
                 continue;
             }
             let schedstat = read_to_string(task.join("schedstat"))?;
@@ -38,8 +38,8 @@ impl Work {
     }
 
     /// Returns what was added since `before`.
-    pub(crate) fn since(&self, before: Work) -> Work {
-        Work {
+    pub(crate) fn since(&self, before: ThreadUsage) -> ThreadUsage {
+        ThreadUsage {
             busy_ns: self.busy_ns.saturating_sub(before.busy_ns),
             voluntary: self.voluntary.saturating_sub(before.voluntary),
             involuntary: self.involuntary.saturating_sub(before.involuntary),
@@ -54,20 +54,20 @@ fn field(status: &str, name: &str) -> Outcome<u64> {
 
 /// Resident memory of a process, in bytes.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Resident {
+pub(crate) struct ResidentMemory {
     /// All of it.
     pub(crate) all: f64,
     /// Heap and stacks.
-    pub(crate) own: f64,
+    pub(crate) heap_and_stacks: f64,
     /// Pages of programs and libraries.
     pub(crate) files: f64,
     /// Pages of shared memory that the process has touched. Subscribers share them.
     pub(crate) shared: f64,
 }
 
-impl Resident {
+impl ResidentMemory {
     /// Reads the memory of `pid`.
-    pub(crate) fn of(pid: u32) -> Outcome<Resident> {
+    pub(crate) fn of(pid: u32) -> Outcome<ResidentMemory> {
         let status = read_to_string(format!("/proc/{pid}/status"))?;
         let field = |name: &str| -> Outcome<f64> {
             let line = status.lines().find_map(|line| line.strip_prefix(name));
@@ -75,9 +75,9 @@ impl Resident {
                 line.and_then(|line| line.split_whitespace().next()).ok_or_else(|| format!("no {name}"))?;
             Ok(kb.parse::<f64>()? * 1024.0)
         };
-        Ok(Resident {
+        Ok(ResidentMemory {
             all: field("VmRSS:")?,
-            own: field("RssAnon:")?,
+            heap_and_stacks: field("RssAnon:")?,
             files: field("RssFile:")?,
             shared: field("RssShmem:")?,
         })

@@ -7,13 +7,13 @@ use scanhub_client::{Error, Scan, Subscriber};
 use tokio::task::JoinSet;
 use tokio::time::timeout;
 
-const SILENCE: Duration = Duration::from_millis(500);
+const SILENCE_TIMEOUT: Duration = Duration::from_millis(500);
 
-async fn follow(sensor: &str) -> Result<(), Error> {
+async fn subscribe_marks(sensor: &str) -> Result<(), Error> {
     let mut scans = Subscriber::<Scan>::builder(sensor).open_pollable()?;
     loop {
         // The timeout drops the future; no scan is lost by that.
-        match timeout(SILENCE, scans.next()).await {
+        match timeout(SILENCE_TIMEOUT, scans.next()).await {
             Ok(Some(scan)) => println!("{sensor}: {} beams", scan?.beams()),
             Ok(None) => return Ok(()),
             Err(_) => println!("{sensor}: silent; there is a hub: {}", scans.hub_is_running()),
@@ -25,7 +25,7 @@ async fn follow(sensor: &str) -> Result<(), Error> {
 pub(crate) async fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut tasks = JoinSet::new();
     for sensor in ["front", "rear"] {
-        tasks.spawn(follow(sensor));
+        tasks.spawn(subscribe_marks(sensor));
     }
     tokio::select! {
         ended = tokio::signal::ctrl_c() => ended?,

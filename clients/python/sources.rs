@@ -8,7 +8,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 /// Directories below a package that do not change the module.
-const LEFT_OUT: [&str; 4] = ["tests", "benches", "examples", "target"];
+const SKIPPED_DIRECTORIES: [&str; 4] = ["tests", "benches", "examples", "target"];
 
 /// Extensions of the files that change the module. Other files are documents, or products of Python, maturin or an editor.
 const EXTENSIONS: [&str; 7] = ["rs", "toml", "txt", "py", "pyi", "typed", "lock"];
@@ -52,7 +52,7 @@ fn add(root: &Path, path: &Path, hasher: &mut DefaultHasher) -> io::Result<()> {
     names.sort();
     for name in names {
         let file = name.file_name().unwrap_or_default().to_string_lossy();
-        if file.starts_with('.') || LEFT_OUT.contains(&&*file) {
+        if file.starts_with('.') || SKIPPED_DIRECTORIES.contains(&&*file) {
             continue;
         }
         if root.join(&name).is_dir() {

@@ -7,7 +7,7 @@ use std::process::Command;
 
 use clap::Args;
 use scanhub_schema::{Failure, Kind};
-use scanhub_tools::bridge_program::{PROGRAM, find, places};
+use scanhub_tools::bridge_program::{PROGRAM, find, search_directories};
 use scanhub_verbs::context::Context;
 
 /// Carry topics to other machines and back over Zenoh, through a router or as one (program scanhub-bridge)
@@ -35,7 +35,7 @@ impl Bridge {
     /// [`Kind::Configuration`] if there is none, if it has another version, or if it cannot be started.
     pub(crate) fn run(&self, context: &mut Context) -> Result<(), Failure> {
         // The error and its remedy are in one line.
-        let program = find(&places()).map_err(|Failure { kind, message, hint }| {
+        let program = find(&search_directories()).map_err(|Failure { kind, message, hint }| {
             Failure::new(kind, format!("{message}; {hint}"), "")
         })?;
         let mut command = Command::new(&program);

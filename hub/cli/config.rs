@@ -10,14 +10,14 @@ use serde::Serialize;
 
 use super::gateway::Gateway;
 use super::run::Run;
-use crate::{line, print};
+use crate::{print, to_json_line};
 
 /// Print a default configuration, check one, or show the values in effect and their origin
 #[derive(Args, Debug)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Config {
     #[command(subcommand)]
-    order: Order,
+    command: ConfigCommand,
 }
 
 const EXAMPLES: &str = "\
@@ -27,7 +27,7 @@ Examples:
   scanhub config show";
 
 #[derive(Debug, Subcommand)]
-enum Order {
+enum ConfigCommand {
     /// Print a configuration to start from, with all default values
     #[command(after_help = "Example:\n  scanhub config default > scanhub.toml")]
     Default,
@@ -49,9 +49,9 @@ enum Order {
 
 impl Config {
     pub(crate) fn run(&self, context: &mut Context) -> Result<(), Failure> {
-        let text = match &self.order {
-            Order::Default => DEFAULT.trim_end().to_owned(),
-            Order::Check { file, run } => {
+        let text = match &self.command {
+            ConfigCommand::Default => DEFAULT.trim_end().to_owned(),
+            ConfigCommand::Check { file, run } => {
                 let mut sources = run.sources();
                 if let Some(file) = file {
                     sources.files = vec![file.clone()];
@@ -61,10 +61,10 @@ impl Config {
                 let links = scanhub_config::Config::of(&sources)?.links;
                 if context.json { checked_line(&links) } else { checked(&links) }
             }
-            Order::Show { run } => {
+            ConfigCommand::Show { run } => {
                 let values = values(&run.sources())?;
                 if context.json {
-                    values.iter().map(line).collect::<Vec<_>>().join("\n")
+                    values.iter().map(to_json_line).collect::<Vec<_>>().join("\n")
                 } else {
                     table(&values)
                 }
@@ -75,7 +75,7 @@ impl Config {
 }
 
 #[derive(Serialize)]
-struct Checked<'a> {
+struct CheckReport<'a> {
     class: &'static str,
     links: Vec<CheckedLink<'a>>,
 }
@@ -88,7 +88,7 @@ struct CheckedLink<'a> {
 
 fn checked_line(links: &[Link]) -> String {
     let links = links.iter().map(|link| CheckedLink { name: &link.name, port: link.port.name() }).collect();
-    line(&Checked { class: "checked", links })
+    to_json_line(&CheckReport { class: "checked", links })
 }
 
 fn checked(links: &[Link]) -> String {
@@ -99,7 +99,8 @@ fn checked(links: &[Link]) -> String {
 
 /// Key, value and place, one below the other; what is longer than its column takes the room that it needs.
 fn table(values: &[Value]) -> String {
-    let width = |of: &dyn Fn(&Value) -> usize| values.iter().map(of).filter(|&len| len <= WIDEST).max();
+    let width =
+        |of: &dyn Fn(&Value) -> usize| values.iter().map(of).filter(|&len| len <= MAX_COLUMN_WIDTH).max();
     let key_width = width(&|value| value.key.len()).unwrap_or_default();
     let text_width = width(&|value| value.text().len()).unwrap_or_default();
     let row = |value: &Value| {
@@ -110,7 +111,7 @@ fn table(values: &[Value]) -> String {
 }
 
 /// A column is not made wider than this for the sake of one row.
-const WIDEST: usize = 48;
+const MAX_COLUMN_WIDTH: usize = 48;
 
 const SHOW_EXAMPLES: &str = "\
 Examples:

@@ -4,15 +4,15 @@ use std::io::{IsTerminal, Write, stderr};
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use scanhub_recording::convert::{self, ConvertOptions, Converted};
-use scanhub_recording::{Damage, Form, Unread};
+use scanhub_recording::convert::{self, ConversionResult, ConvertOptions};
+use scanhub_recording::{Damage, Form, UnreadLines};
 use scanhub_schema::file::Compression;
 use scanhub_schema::{Failure, Family};
 use scanhub_sim::options;
 use scanhub_verbs::context::Context;
 use serde::Serialize;
 
-use crate::{complain, line, print};
+use crate::{print, print_error, to_json_line};
 
 /// Convert a recording to another format, or repair a damaged one
 #[derive(Args, Debug)]
@@ -91,15 +91,25 @@ impl Convert {
         }
         let is_stdout_taken = self.output == Path::new("-");
         match (json, is_stdout_taken) {
-            (true, false) => return print(&line(&Line::of(self, &converted))),
-            (true, true) => complain(&line(&Line::of(self, &converted))),
-            (false, _) => complain(&self.words(&converted)),
+            (true, false) => return print(&to_json_line(&ConvertedLine::of(self, &converted))),
+            (true, true) => print_error(&to_json_line(&ConvertedLine::of(self, &converted))),
+            (false, _) => print_error(&self.summary(&converted)),
         }
         Ok(())
     }
 
-    fn words(&self, converted: &Converted) -> String {
-        let Converted { telegrams, scans, marks, dropped, unread, took_ns, encoding, damage, .. } = converted;
+    fn summary(&self, converted: &ConversionResult) -> String {
+        let ConversionResult {
+            telegrams,
+            scans,
+            marks,
+            dropped,
+            unread,
+            duration_ns: took_ns,
+            encoding,
+            damage,
+            ..
+        } = converted;
         let what = match marks {
             Some(marks) => format!("{marks} marks in {scans} scans"),
             None => format!("{telegrams} telegrams, {scans} scans"),
@@ -116,7 +126,7 @@ impl Convert {
                 if *dropped == 1 { ("", "a complete scan") } else { ("s", "complete scans") };
             words += &format!("; {dropped} telegram{plural} dropped (not {what})");
         }
-        if *unread != Unread::default() {
+        if *unread != UnreadLines::default() {
             words += &format!("; dropped from the log: {unread}");
         }
         if !damage.is_none() {
@@ -128,7 +138,7 @@ impl Convert {
 
 /// The line that reports the conversion; the order of the keys is part of the format.
 #[derive(Serialize)]
-struct Line<'a> {
+struct ConvertedLine<'a> {
     class: &'static str,
     input: &'a Path,
     output: &'a Path,
@@ -167,12 +177,13 @@ struct Missing {
     checksum: bool,
 }
 
-impl<'a> Line<'a> {
-    fn of(convert: &'a Convert, converted: &'a Converted) -> Self {
-        let Unread { poses, odometry, remissions, lines } = converted.unread;
+impl<'a> ConvertedLine<'a> {
+    fn of(convert: &'a Convert, converted: &'a ConversionResult) -> Self {
+        let UnreadLines { poses, odometry, remissions, lines } = converted.unread;
         let is_log = converted.forms.0 == Form::Carmen;
-        let Damage { telegrams, bytes, chunks, repeats, is_cut, is_harmed } = converted.damage;
-        Line {
+        let Damage { telegrams, bytes, chunks, repeats, is_truncated: is_cut, is_damaged: is_harmed } =
+            converted.damage;
+        ConvertedLine {
             class: "converted",
             input: &convert.input,
             output: &convert.output,
@@ -182,7 +193,7 @@ impl<'a> Line<'a> {
             telegrams: converted.telegrams,
             scans: converted.scans,
             dropped: converted.dropped,
-            seconds: converted.took_ns.map(seconds),
+            seconds: converted.duration_ns.map(seconds),
             missing: Missing {
                 telegrams,
                 bytes,

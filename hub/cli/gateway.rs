@@ -7,7 +7,7 @@ use scanhub_schema::{Failure, Kind};
 use scanhub_verbs::context::{Context, DomainOptions};
 use scanhub_verbs::duration;
 
-use super::run::Configured;
+use super::run::ConfigOptions;
 
 /// Send what the hub publishes as UDP datagrams, one sample each, to multicast groups and to hosts
 #[derive(Args, Debug, Default)]
@@ -15,34 +15,34 @@ pub(crate) struct Gateway {
     #[command(flatten)]
     args: GatewayArgs,
     #[command(flatten)]
-    configured: Configured,
+    configured: ConfigOptions,
 }
 
 impl Gateway {
     /// Runs the gateway with the values of the configuration for arguments that are missing.
     pub(crate) fn run(&self, context: &mut Context) -> Result<(), Failure> {
-        let args = over(&self.args, &self.configured.sources().read())?;
+        let args = merge_section(&self.args, &self.configured.sources().read())?;
         if self.args.topics.is_empty() {
             // They come from the configuration.
-            args.check().map_err(of_section)?;
+            args.check().map_err(in_gateway_section)?;
         }
         args.run(context)
     }
 
     /// Checks that a gateway accepts the section in `sources`.
     pub(super) fn check(sources: &SourceMap, domain: &DomainOptions) -> Result<(), Failure> {
-        let args = over(&GatewayArgs::default(), sources)?;
-        domain.places()?;
-        args.check().map_err(of_section)
+        let args = merge_section(&GatewayArgs::default(), sources)?;
+        domain.locations()?;
+        args.check().map_err(in_gateway_section)
     }
 }
 
 /// Returns `args`, with the values of the section in `sources` for those that are missing.
-fn over(args: &GatewayArgs, sources: &SourceMap) -> Result<GatewayArgs, Failure> {
+fn merge_section(args: &GatewayArgs, sources: &SourceMap) -> Result<GatewayArgs, Failure> {
     let section = scanhub_config::Gateway::of(sources)?;
     let every = section.background_every.map(|text| duration::parse(&text)).transpose().map_err(|what| {
-        let place = scanhub_config::Gateway::background_every_place(sources).unwrap_or_default();
-        Failure::new(Kind::Configuration, format!("{place}: {what}"), "write 10s, 250ms, 5m")
+        let location = scanhub_config::Gateway::background_every_location(sources).unwrap_or_default();
+        Failure::new(Kind::Configuration, format!("{location}: {what}"), "write 10s, 250ms, 5m")
     })?;
     let or = |args: &[String], section: Option<Vec<String>>| match args {
         [] => section.unwrap_or_default(),
@@ -60,6 +60,6 @@ fn over(args: &GatewayArgs, sources: &SourceMap) -> Result<GatewayArgs, Failure>
     })
 }
 
-fn of_section(failure: Failure) -> Failure {
+fn in_gateway_section(failure: Failure) -> Failure {
     Failure::new(Kind::Configuration, format!("section gateway: {}", failure.message), failure.hint)
 }

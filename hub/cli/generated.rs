@@ -79,19 +79,19 @@ impl Complete {
     }
 
     fn print(&self) {
-        let line = Line::read(&Cli::command(), &self.words);
-        let Some(name) = line.wanted else { return };
+        let line = CommandLine::read(&Cli::command(), &self.words);
+        let Some(name) = line.name_kind else { return };
         let domain = line.value_of("domain").or_else(|| std::env::var("SCANHUB_DOMAIN").ok());
         let domain = domain.unwrap_or_else(|| scanhub_shm::DEFAULT_DOMAIN.to_owned());
         let root = line.value_of("root");
         let root = root.as_deref().map(std::path::Path::new);
-        let Ok(places) = Domain::candidates(&domain, root, &Environment::of_process()) else { return };
+        let Ok(locations) = Domain::candidates(&domain, root, &Environment::of_process()) else { return };
         let mut words = match name {
-            Name::Sensor => scanhub_client::live_sensors(&places),
-            Name::Topic => scanhub_client::live_topics(&places),
+            NameKind::Sensor => scanhub_client::live_sensors(&locations),
+            NameKind::Topic => scanhub_client::live_topics(&locations),
         };
         if line.takes_robot && !words.is_empty() {
-            words.push(if name == Name::Sensor { "robot" } else { "robot/zones" }.to_owned());
+            words.push(if name == NameKind::Sensor { "robot" } else { "robot/zones" }.to_owned());
         }
         if !words.is_empty() {
             let _ = print_own(&words.join("\n"));
@@ -101,27 +101,27 @@ impl Complete {
 
 /// Kind of the names of the hub that can come next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Name {
+enum NameKind {
     Sensor,
     Topic,
 }
 
 /// A command line up to the cursor.
 #[derive(Debug, Default)]
-struct Line {
+struct CommandLine {
     /// Kind of the name that is expected next, if it is a name that the hub has.
-    wanted: Option<Name>,
+    name_kind: Option<NameKind>,
     /// Whether `robot`, all sensors together, is accepted too.
     takes_robot: bool,
     values: Vec<(String, String)>,
 }
 
-impl Line {
+impl CommandLine {
     /// Parses `words`, the program's name first, according to the definition `whole`.
-    fn read(whole: &Command, words: &[String]) -> Line {
+    fn read(definition: &Command, words: &[String]) -> CommandLine {
         let everywhere = Cli::command();
-        let mut line = Line::default();
-        let (mut command, mut positional) = (whole, 0);
+        let mut line = CommandLine::default();
+        let (mut command, mut positional) = (definition, 0);
         // Some shells split `--domain=robot` into three words.
         let mut words: VecDeque<&str> =
             words.iter().skip(1).map(String::as_str).filter(|word| *word != "=").collect();
@@ -135,7 +135,7 @@ impl Line {
                     match words.pop_front() {
                         Some(value) => line.values.push((option.get_id().to_string(), value.to_owned())),
                         None => {
-                            line.wanted = name(option);
+                            line.name_kind = name(option);
                             return line;
                         }
                     }
@@ -154,13 +154,13 @@ impl Line {
         };
         let all: Vec<_> = command.get_positionals().collect();
         let next = all.get(positional).copied().or_else(|| all.last().copied().filter(is_many));
-        line.wanted = next.and_then(name);
+        line.name_kind = next.and_then(name);
         line.takes_robot = ["echo", "hz", "latency", "leds"].contains(&command.get_name());
         line
     }
 
     fn value_of(&self, id: &str) -> Option<String> {
-        self.values.iter().rev().find(|(known, _)| known == id).map(|(_, value)| value.clone())
+        self.values.iter().rev().find(|(flag, _)| flag == id).map(|(_, value)| value.clone())
     }
 }
 
@@ -176,11 +176,11 @@ fn option<'a>(command: &'a Command, word: &str) -> Option<&'a Arg> {
 }
 
 /// Returns which names of a hub `arg` takes, as its value name states.
-fn name(arg: &Arg) -> Option<Name> {
+fn name(arg: &Arg) -> Option<NameKind> {
     let named = arg.get_value_names().and_then(|names| names.first()).map(|name| name.to_string());
     match named.unwrap_or_else(|| arg.get_id().to_string().to_uppercase()).as_str() {
-        "SENSOR" => Some(Name::Sensor),
-        text if text.starts_with("SENSOR/TOPIC") => Some(Name::Topic),
+        "SENSOR" => Some(NameKind::Sensor),
+        text if text.starts_with("SENSOR/TOPIC") => Some(NameKind::Topic),
         _ => None,
     }
 }
@@ -271,9 +271,9 @@ const NAME: &str = env!("CARGO_PKG_NAME");
 mod tests {
     use super::*;
 
-    fn wanted(text: &str) -> Option<Name> {
+    fn wanted(text: &str) -> Option<NameKind> {
         let words: Vec<_> = text.split_whitespace().map(String::from).collect();
-        Line::read(&Cli::command(), &words).wanted
+        CommandLine::read(&Cli::command(), &words).name_kind
     }
 
     #[test]
@@ -287,7 +287,7 @@ mod tests {
             "scanhub record -o x.mcap",
             "scanhub gateway --topic",
         ] {
-            assert_eq!(wanted(text), Some(Name::Topic), "{text}");
+            assert_eq!(wanted(text), Some(NameKind::Topic), "{text}");
         }
         for text in [
             "scanhub info",
@@ -298,7 +298,7 @@ mod tests {
             "scanhub watch",
             "scanhub watch front",
         ] {
-            assert_eq!(wanted(text), Some(Name::Sensor), "{text}");
+            assert_eq!(wanted(text), Some(NameKind::Sensor), "{text}");
         }
         for text in [
             "",
@@ -322,10 +322,10 @@ mod tests {
     fn reads_domain_in_every_notation() {
         for text in ["scanhub --domain x echo", "scanhub echo --domain=x", "scanhub echo --domain = x"] {
             let words: Vec<_> = text.split_whitespace().map(String::from).collect();
-            let line = Line::read(&Cli::command(), &words);
+            let line = CommandLine::read(&Cli::command(), &words);
             assert_eq!(
-                (line.wanted, line.value_of("domain")),
-                (Some(Name::Topic), Some("x".into())),
+                (line.name_kind, line.value_of("domain")),
+                (Some(NameKind::Topic), Some("x".into())),
                 "{text}"
             );
         }

@@ -10,14 +10,14 @@ use scanhub_tools::doctor::DoctorArgs;
 use scanhub_verbs::context::Context;
 use serde::Serialize;
 
-use crate::{line, say};
+use crate::{print_status, to_json_line};
 
 /// Run the hub in the foreground, until SIGINT or SIGTERM
 #[derive(Args, Debug)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Run {
     #[command(flatten)]
-    configured: Configured,
+    configured: ConfigOptions,
     /// Add a link with default settings; PORT is a tty, tcp:HOST:PORT or file:PATH[?rate=max], and keys of the link may follow
     /// it, as in front=/dev/ttyUSB0,family=ld
     #[arg(long, value_name = "NAME=PORT[,KEY=VALUE]")]
@@ -35,7 +35,7 @@ impl Run {
     pub(crate) fn run(&self, context: &mut Context) -> Result<(), Failure> {
         let domain = context.domain.of_hub()?;
         let read = || Config::load(&self.sources());
-        scanhub_daemon::run(&read, &domain, |ready| say_ready(ready, &domain, context.json))
+        scanhub_daemon::run(&read, &domain, |ready| print_ready(ready, &domain, context.json))
     }
 
     /// Returns the sources of the configuration.
@@ -46,7 +46,7 @@ impl Run {
 
 /// Options that name the sources of a configuration, apart from links.
 #[derive(Args, Debug, Default)]
-pub(crate) struct Configured {
+pub(crate) struct ConfigOptions {
     /// Read this TOML file after those in /etc/scanhub
     #[arg(long, env = "SCANHUB_CONFIG", value_name = "FILE")]
     config: Option<PathBuf>,
@@ -58,7 +58,7 @@ pub(crate) struct Configured {
     set: Vec<String>,
 }
 
-impl Configured {
+impl ConfigOptions {
     /// Returns the sources, without links.
     pub(crate) fn sources(&self) -> Sources {
         let mut files = if self.no_system_config { Vec::new() } else { Sources::system() };
@@ -86,16 +86,16 @@ Examples:
 impl Doctor {
     /// Checks the setup that [`Run`] would use.
     pub(crate) fn run(&self, context: &mut Context) -> Result<(), Failure> {
-        let domains = (context.domain.of_hub()?, context.domain.places()?);
+        let domains = (context.domain.of_hub()?, context.domain.locations()?);
         let stop = context.signals.stop()?;
         self.args.run(&self.run.sources(), domains, context.json, &mut context.out, &stop)
     }
 }
 
 /// Prints that a hub is ready.
-pub(crate) fn say_ready(ready: &scanhub_daemon::Ready, domain: &Domain, json: bool) {
-    say(&if json {
-        line(&HubReady {
+pub(crate) fn print_ready(ready: &scanhub_daemon::StartReport, domain: &Domain, json: bool) {
+    print_status(&if json {
+        to_json_line(&HubReady {
             class: "ready",
             domain: domain.name(),
             root: domain.root(),
@@ -105,7 +105,7 @@ pub(crate) fn say_ready(ready: &scanhub_daemon::Ready, domain: &Domain, json: bo
             waiting: &ready.waiting,
         })
     } else {
-        let place = domain.root().display();
+        let root = domain.root().display();
         let without_port: Vec<_> =
             ready.waiting.iter().filter(|name| !ready.taken.contains(name)).cloned().collect();
         let waiting = |what: &str, names: &[String]| match names {
@@ -113,7 +113,7 @@ pub(crate) fn say_ready(ready: &scanhub_daemon::Ready, domain: &Domain, json: bo
             names => format!("; waiting for the {what} of {}", names.join(", ")),
         };
         let (ports, names) = (waiting("port", &without_port), waiting("name", &ready.taken));
-        format!("ready {} in {place}, sensors: {}{ports}{names}", domain.name(), ready.sensors.join(", "))
+        format!("ready {} in {root}, sensors: {}{ports}{names}", domain.name(), ready.sensors.join(", "))
     });
 }
 

@@ -14,7 +14,7 @@ use serde::Serialize;
 use signal_hook::consts::{SIGINT, SIGTERM};
 
 use crate::mounts::SimulatedMounts;
-use crate::{line, no_handler, say};
+use crate::{no_handler, print_status, to_json_line};
 
 /// Simulate sensors at the other end of ptys, or behind TCP
 #[derive(Args, Debug)]
@@ -129,14 +129,14 @@ impl Simulate {
             let write = write.try_clone().map_err(no_handler)?;
             signal_hook::low_level::pipe::register(signal, write).map_err(no_handler)?;
         }
-        let announce = |ready: &[scanhub_sim::Ready]| {
+        let announce = |ready: &[scanhub_sim::SimulatedPort]| {
             if context.json {
                 let ports =
                     ready.iter().map(|one| ReadyPort { port: &one.port, pty: one.pty.as_deref() }).collect();
-                say(&line(&SimulatorReady { class: "ready", ports }));
+                print_status(&to_json_line(&SimulatorReady { class: "ready", ports }));
             } else {
                 let ports: Vec<_> = ready.iter().map(|one| one.port.display().to_string()).collect();
-                say(&format!("ready {}", ports.join(" ")));
+                print_status(&format!("ready {}", ports.join(" ")));
             }
         };
         let mounts = SimulatedMounts::start(&self.angles, &options, &context.domain.of_publisher()?)?;

@@ -14,14 +14,14 @@ use scanhub_verbs::context::Context;
 use scanhub_viewer::WebArgs;
 use scanhub_viewer::server::player::{Playback, PlayerCommand, Progress};
 
-use crate::own_domain::OwnDomain;
+use crate::private_domain::PrivateDomain;
 
 /// Serves the picture of a hub, or with `--replay` that of a recording.
 pub(crate) fn run(web: &WebArgs, context: &mut Context) -> Result<(), Failure> {
-    let (places, stop) = (context.domain.places()?, context.signals.stop()?);
+    let (locations, stop) = (context.domain.locations()?, context.signals.stop()?);
     match &web.replay {
         Some(file) => show(web, file, context.json, &mut context.out, &stop),
-        None => web.run(&places, context.json, None, &mut context.out, &stop),
+        None => web.run(&locations, context.json, None, &mut context.out, &stop),
     }
 }
 
@@ -34,14 +34,14 @@ fn show(
     stop: &Arc<AtomicBool>,
 ) -> Result<(), Failure> {
     web.check()?;
-    let domain = OwnDomain::new("web")?;
+    let domain = PrivateDomain::new("web")?;
     let sources = Sources { files: Sources::system(), ..Sources::default() };
     let replay = scanhub_daemon::Replay {
         file,
         sensor: None,
         family: None,
         sources: &sources,
-        play: PlaybackOptions { is_looped: web.is_looped, ..PlaybackOptions::default() },
+        options: PlaybackOptions { is_looped: web.is_looped, ..PlaybackOptions::default() },
         // Viewers keep the last picture until the user ends the verb.
         holds: true,
     };
@@ -50,12 +50,13 @@ fn show(
         let (replay, domain) = (&replay, &domain);
         let hub = thread::Builder::new().name("hub".into()).spawn_scoped(scope, move || {
             // The page ends with the hub, even if the hub panics.
-            let _over = Over(stop);
+            let _over = SetOnDrop(stop);
             scanhub_daemon::replay(replay, domain, |_, player| {
-                let _ = ready.send(Keys(player.clone()));
+                let _ = ready.send(PlayerControls(player.clone()));
             })
         });
-        let hub = hub.map_err(|error| Failure::new(Kind::Short, format!("no thread: {error}"), ""))?;
+        let hub =
+            hub.map_err(|error| Failure::new(Kind::ResourceExhausted, format!("no thread: {error}"), ""))?;
         let mut shown = Ok(());
         if let Ok(keys) = is_ready.recv() {
             shown = web.run(std::slice::from_ref(domain), json, Some(&keys), out, stop);
@@ -70,9 +71,9 @@ fn show(
 }
 
 /// The player that viewers control.
-struct Keys(Arc<Player>);
+struct PlayerControls(Arc<Player>);
 
-impl Playback for Keys {
+impl Playback for PlayerControls {
     fn command(&self, command: PlayerCommand) {
         match command {
             PlayerCommand::Toggle => self.0.toggle(),
@@ -101,9 +102,9 @@ impl Playback for Keys {
 }
 
 /// Sets `stop` when it is dropped.
-struct Over<'a>(&'a AtomicBool);
+struct SetOnDrop<'a>(&'a AtomicBool);
 
-impl Drop for Over<'_> {
+impl Drop for SetOnDrop<'_> {
     fn drop(&mut self) {
         self.0.store(true, Ordering::Relaxed);
     }

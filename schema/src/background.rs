@@ -9,7 +9,7 @@ use iceoryx2::prelude::ZeroCopySend;
 
 use crate::MAX_BEAMS;
 use crate::limits::TopicLimits;
-use crate::payload::{Packed, packed_as_is, read_head, sliced, write};
+use crate::payload::{DatagramPayload, packed_as_is, read_head, sliced, write};
 use crate::topic::PayloadLen;
 
 /// Head of a background model, before the ranges. 32 bytes.
@@ -43,7 +43,7 @@ sliced! {
 }
 
 impl PayloadLen for Background {
-    fn longest(limits: &TopicLimits) -> usize {
+    fn max_payload_len(limits: &TopicLimits) -> usize {
         Background::len(limits.beams)
     }
 }
@@ -195,7 +195,7 @@ pub struct ForegroundArrays<'a> {
 }
 
 impl PayloadLen for Foreground {
-    fn longest(limits: &TopicLimits) -> usize {
+    fn max_payload_len(limits: &TopicLimits) -> usize {
         Foreground::len(limits.beams)
     }
 }
@@ -203,7 +203,7 @@ impl PayloadLen for Foreground {
 impl Foreground {
     /// Returns the length in bytes of a foreground for `beams` beams.
     pub const fn len(beams: usize) -> usize {
-        BITS + set(beams) + 2 * beams
+        BITS_OFFSET + bit_set_len(beams) + 2 * beams
     }
 
     /// Returns an empty foreground of a scan of `beams` beams.
@@ -221,8 +221,9 @@ impl Foreground {
     pub fn begin(&mut self, head: ForegroundHead) -> ForegroundArrays<'_> {
         **self = head;
         let n = usize::from(head.count);
-        let (segments, rest) = self.memory_mut()[Foreground::HEAD..].split_at_mut(BITS - Foreground::HEAD);
-        let (bits, rest) = rest.split_at_mut(set(n));
+        let (segments, rest) =
+            self.memory_mut()[Foreground::HEAD..].split_at_mut(BITS_OFFSET - Foreground::HEAD);
+        let (bits, rest) = rest.split_at_mut(bit_set_len(n));
         ForegroundArrays {
             segments: cast_slice_mut(segments),
             bits: &mut bits[..n.div_ceil(8)],
@@ -246,13 +247,14 @@ impl Foreground {
 
     /// Returns the ranges of the foreground beams in device units.
     pub fn ranges(&self) -> &[u16] {
-        let (n, begin) = (usize::from(self.beams).min(self.scan_beams()), BITS + set(self.scan_beams()));
+        let (n, begin) =
+            (usize::from(self.beams).min(self.scan_beams()), BITS_OFFSET + bit_set_len(self.scan_beams()));
         self.memory().get(begin..begin + 2 * n).map_or(&[], cast_slice)
     }
 
     /// Returns the used segments.
     pub fn segments(&self) -> &[Segment] {
-        let all: &[Segment] = self.memory().get(Foreground::HEAD..BITS).map_or(&[], cast_slice);
+        let all: &[Segment] = self.memory().get(Foreground::HEAD..BITS_OFFSET).map_or(&[], cast_slice);
         &all[..usize::from(self.segments).min(all.len())]
     }
 
@@ -264,7 +266,7 @@ impl Foreground {
 
     /// Returns a bit for every beam of the scan, as [`ForegroundArrays::bits`].
     fn bits(&self) -> &[u8] {
-        self.memory().get(BITS..BITS + self.scan_beams().div_ceil(8)).unwrap_or_default()
+        self.memory().get(BITS_OFFSET..BITS_OFFSET + self.scan_beams().div_ceil(8)).unwrap_or_default()
     }
 
     /// Returns the number of beams of the scan, or 0 if there is too little memory for them.
@@ -278,7 +280,7 @@ impl Foreground {
     }
 }
 
-impl Packed for Foreground {
+impl DatagramPayload for Foreground {
     /// Writes head, bits, the used ranges, and as many segments as there is room for. The other segments are counted as
     /// left out.
     fn pack(&self, room: &mut [u8]) -> Option<usize> {
@@ -371,10 +373,10 @@ impl fmt::Debug for Foreground {
 }
 
 /// Offset of the bits.
-const BITS: usize = Foreground::HEAD + MAX_SEGMENTS * size_of::<Segment>();
+const BITS_OFFSET: usize = Foreground::HEAD + MAX_SEGMENTS * size_of::<Segment>();
 
 /// Returns the length in bytes of a bit for every beam. It is even, because the ranges that follow take two bytes each.
-const fn set(beams: usize) -> usize {
+const fn bit_set_len(beams: usize) -> usize {
     2 * beams.div_ceil(16)
 }
 
@@ -395,7 +397,7 @@ mod tests {
     }
 
     #[test]
-    fn readings_pair_beams_with_ranges_and_segments_with_support() {
+    fn readings_and_support_are_decoded_from_bits() {
         let mut foreground = Foreground::of(401);
         let arrays = foreground.begin(ForegroundHead { count: 401, beams: 2, ..ForegroundHead::default() });
         (arrays.bits[0], arrays.bits[50]) = (0x80, 1);

@@ -81,20 +81,20 @@ impl Request {
 
     /// Returns the request as bytes.
     pub fn encode(&self) -> Vec<u8> {
-        let mut bytes = vec![0; REQUEST_HEAD];
-        text::write(&mut bytes[..SENSOR], &self.sensor);
+        let mut bytes = vec![0; REQUEST_HEAD_LEN];
+        text::write(&mut bytes[..SENSOR_NAME_LEN], &self.sensor);
         let verb = self.verb.map_or(0, |verb| verb as u16);
-        bytes[SENSOR..SENSOR + 2].copy_from_slice(&verb.to_le_bytes());
+        bytes[SENSOR_NAME_LEN..SENSOR_NAME_LEN + 2].copy_from_slice(&verb.to_le_bytes());
         bytes.extend_from_slice(self.model.as_ref().map_or(&[], |model| model.bytes()));
         bytes
     }
 
     /// Returns the request in `bytes`, if that is one.
     pub fn decode(bytes: &[u8]) -> Option<Request> {
-        let (head, model) = bytes.split_at_checked(REQUEST_HEAD)?;
-        let verb = u16::from_le_bytes([head[SENSOR], head[SENSOR + 1]]);
+        let (head, model) = bytes.split_at_checked(REQUEST_HEAD_LEN)?;
+        let verb = u16::from_le_bytes([head[SENSOR_NAME_LEN], head[SENSOR_NAME_LEN + 1]]);
         Some(Request {
-            sensor: text::read(&head[..SENSOR]).to_owned(),
+            sensor: text::read(&head[..SENSOR_NAME_LEN]).to_owned(),
             verb: Verb::all().find(|known| *known as u16 == verb),
             model: if model.is_empty() { None } else { Some(Background::read(model)?) },
         })
@@ -103,17 +103,17 @@ impl Request {
 
 /// A background model in a response.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Shown {
+pub struct ResponseModel {
     /// As it is now.
     pub model: Box<Background>,
     /// When the model was saved that the next hub starts with, in nanoseconds since 1970; nothing if there is none.
     pub kept_wall_ns: Option<u64>,
 }
 
-impl From<Box<Background>> for Shown {
+impl From<Box<Background>> for ResponseModel {
     /// A model that is not saved.
-    fn from(model: Box<Background>) -> Shown {
-        Shown { model, kept_wall_ns: None }
+    fn from(model: Box<Background>) -> ResponseModel {
+        ResponseModel { model, kept_wall_ns: None }
     }
 }
 
@@ -121,23 +121,23 @@ impl From<Box<Background>> for Shown {
 /// (two bytes each, little-endian), then the message, then the model. The second line of the message of a failure
 /// is the remedy; with a model, it is the time at which a model was saved, in decimal digits.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Response(pub Result<Option<Shown>, Failure>);
+pub struct Response(pub Result<Option<ResponseModel>, Failure>);
 
 impl Response {
     /// Bytes of a response without a model; a message beyond it is cut.
-    pub const MAX: usize = 1024;
+    pub const MAX_LEN: usize = 1024;
 
     /// Returns the response as bytes.
     pub fn encode(&self) -> Vec<u8> {
-        let (code, said) = match &self.0 {
+        let (code, body) = match &self.0 {
             Ok(shown) => {
                 let kept = shown.as_ref().and_then(|shown| shown.kept_wall_ns);
                 (0, kept.map(|wall_ns| wall_ns.to_string()).unwrap_or_default())
             }
             Err(failure) => (failure.kind.exit_code(), format!("{}\n{}", failure.message, failure.hint)),
         };
-        let mut message = vec![0; said.trim_end().len().min(Response::MAX - HEAD)];
-        text::write(&mut message, said.trim_end());
+        let mut message = vec![0; body.trim_end().len().min(Response::MAX_LEN - RESPONSE_HEAD_LEN)];
+        text::write(&mut message, body.trim_end());
         let head = [u16::from(code), message.len() as u16].map(u16::to_le_bytes);
         let model = self.0.as_ref().ok().and_then(Option::as_ref);
         let model = model.map_or(&[][..], |shown| shown.model.bytes());
@@ -153,24 +153,24 @@ impl Response {
             let kept_wall_ns = message.parse().ok();
             return Some(Response(Ok(match model {
                 [] => None,
-                model => Some(Shown { model: Background::read(model)?, kept_wall_ns }),
+                model => Some(ResponseModel { model: Background::read(model)?, kept_wall_ns }),
             })));
         }
-        let kind = ANSWERS.into_iter().find(|kind| u16::from(kind.exit_code()) == code);
+        let kind = RESPONSE_KINDS.into_iter().find(|kind| u16::from(kind.exit_code()) == code);
         let (message, hint) = message.split_once('\n').unwrap_or((message, ""));
         Some(Response(Err(Failure::new(kind.unwrap_or(Kind::Failed), message, hint))))
     }
 }
 
 /// Exit code and message length.
-const HEAD: usize = 4;
+const RESPONSE_HEAD_LEN: usize = 4;
 
 /// Bytes of a request for the sensor's name, and before the model.
-const SENSOR: usize = 32;
-const REQUEST_HEAD: usize = 40;
+const SENSOR_NAME_LEN: usize = 32;
+const REQUEST_HEAD_LEN: usize = 40;
 
 /// The failures that a hub answers with; each exit code stands for one of them.
-const ANSWERS: [Kind; 4] = [Kind::Failed, Kind::NoTopic, Kind::Short, Kind::Configuration];
+const RESPONSE_KINDS: [Kind; 4] = [Kind::Failed, Kind::NoTopic, Kind::ResourceExhausted, Kind::Configuration];
 
 #[cfg(test)]
 mod tests {
@@ -204,19 +204,19 @@ mod tests {
         for response in [
             Response(Ok(None)),
             Response(Ok(Some(model.clone().into()))),
-            Response(Ok(Some(Shown { model, kept_wall_ns: Some(u64::MAX) }))),
+            Response(Ok(Some(ResponseModel { model, kept_wall_ns: Some(u64::MAX) }))),
             failure(Kind::Failed, ""),
-            failure(Kind::Short, "later"),
+            failure(Kind::ResourceExhausted, "later"),
             failure(Kind::NoTopic, "a, b"),
         ] {
             assert_eq!(Response::decode(&response.encode()), Some(response));
         }
         let long = Response(Err(Failure::new(Kind::Failed, "é".repeat(2000), ""))).encode();
-        assert!(long.len() <= Response::MAX && Response::decode(&long).is_some());
+        assert!(long.len() <= Response::MAX_LEN && Response::decode(&long).is_some());
     }
 
     #[test]
-    fn what_is_no_response() {
+    fn malformed_responses_decode_to_none() {
         for bytes in [&[][..], &[0, 0, 1], &[1, 0, 2, 0, b'a'], &[0, 0, 0, 0, 1]] {
             assert_eq!(Response::decode(bytes), None);
         }

@@ -19,8 +19,8 @@ impl ScanColumns {
     /// # Errors
     ///
     /// The error of `line`.
-    pub fn names(self, line: &mut impl Write, beams: usize) -> io::Result<()> {
-        write!(line, "{STAMPS},unit_um,first_angle_deg,step_deg")?;
+    pub fn write_header(self, line: &mut impl Write, beams: usize) -> io::Result<()> {
+        write!(line, "{STAMP_COLUMNS},unit_um,first_angle_deg,step_deg")?;
         (0..beams).try_for_each(|i| write!(line, ",range_{i}"))?;
         let intensities = if self.intensities { beams } else { 0 };
         (0..intensities).try_for_each(|i| write!(line, ",intensity_{i}"))
@@ -32,8 +32,8 @@ impl ScanColumns {
     /// # Errors
     ///
     /// The error of `line`.
-    pub fn row(self, line: &mut impl Write, header: &Header, scan: &Scan) -> io::Result<()> {
-        stamps(line, header)?;
+    pub fn write_row(self, line: &mut impl Write, header: &Header, scan: &Scan) -> io::Result<()> {
+        write_stamps(line, header)?;
         let unit_um = if self.meters { UM_PER_M } else { scan.unit_um };
         write!(line, ",{unit_um},{},{}", in_degrees(scan.first_angle), in_degrees(scan.step))?;
         for i in 0..scan.beams() {
@@ -67,9 +67,9 @@ impl MarkColumns {
     /// # Errors
     ///
     /// The error of `out`.
-    pub fn names(self, out: &mut impl Write) -> io::Result<()> {
+    pub fn write_header(self, out: &mut impl Write) -> io::Result<()> {
         let range = if self.meters { "range_m" } else { "range_mm" };
-        writeln!(out, "{STAMPS},marks,mark,angle_deg,{range},peak,weight,first_beam,last_beam,edge")
+        writeln!(out, "{STAMP_COLUMNS},marks,mark,angle_deg,{range},peak,weight,first_beam,last_beam,edge")
     }
 
     /// Writes the lines of `marks`: column `marks` is their number, or empty if the sensor's mode has no marks. Without a mark,
@@ -78,16 +78,16 @@ impl MarkColumns {
     /// # Errors
     ///
     /// The error of `out`.
-    pub fn rows(self, out: &mut impl Write, header: &Header, marks: &Marks) -> io::Result<()> {
+    pub fn write_rows(self, out: &mut impl Write, header: &Header, marks: &Marks) -> io::Result<()> {
         for (number, mark) in marks.marks().iter().enumerate() {
-            stamps(out, header)?;
+            write_stamps(out, header)?;
             let (count, angle_deg) = (marks.marks().len(), f64::from(mark.angle_mdeg) / 1000.0);
             let range = f64::from(mark.range_dmm) / if self.meters { 10_000.0 } else { 10.0 };
             write!(out, ",{count},{number},{angle_deg},{range},{},{}", mark.peak, mark.weight)?;
             writeln!(out, ",{},{},{}", mark.first_beam, mark.last_beam, mark.edge)?;
         }
         if marks.marks().is_empty() {
-            stamps(out, header)?;
+            write_stamps(out, header)?;
             let count = if marks.is_available() { "0" } else { "" };
             writeln!(out, ",{count},,,,,,,,")?;
         }
@@ -95,18 +95,18 @@ impl MarkColumns {
     }
 }
 
-fn stamps(line: &mut impl Write, header: &Header) -> io::Result<()> {
+fn write_stamps(line: &mut impl Write, header: &Header) -> io::Result<()> {
     let (stamp_ns, wall_ns) = (header.stamp_first_ns, header.wall_ns);
     write!(line, "{},{},{stamp_ns},{wall_ns},{}", header.seq, header.topic_seq, header.quality().name())
 }
 
-const STAMPS: &str = "seq,topic_seq,stamp_ns,wall_ns,quality";
+const STAMP_COLUMNS: &str = "seq,topic_seq,stamp_ns,wall_ns,quality";
 const UM_PER_M: u32 = 1_000_000;
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Contents, Mark, ScanHead};
+    use crate::{ArrayFlags, Mark, ScanHead};
 
     fn text(write: impl FnOnce(&mut Vec<u8>) -> io::Result<()>) -> String {
         let mut line = Vec::new();
@@ -115,10 +115,10 @@ mod tests {
     }
 
     #[test]
-    fn a_scan_has_ranges_in_meters_and_intensities_on_request() {
+    fn scan_row_has_optional_meters_and_intensities() {
         let head = ScanHead {
             unit_um: 250,
-            contents: Contents::UPPER,
+            contents: ArrayFlags::UPPER,
             intensity_bits: 8,
             valid_to: 39_999,
             ..ScanHead::default()
@@ -129,15 +129,18 @@ mod tests {
         let all = ScanColumns { meters: true, intensities: true };
         let begin =
             "seq,topic_seq,stamp_ns,wall_ns,quality,unit_um,first_angle_deg,step_deg,range_0,range_1,range_2";
-        assert_eq!(text(|line| plain.names(line, 3)), begin);
-        assert_eq!(text(|line| all.names(line, 3)), format!("{begin},intensity_0,intensity_1,intensity_2"));
-        assert_eq!(text(|line| plain.row(line, &header, &scan)), "5,0,0,0,clean,250,0,0,1,,12345");
+        assert_eq!(text(|line| plain.write_header(line, 3)), begin);
         assert_eq!(
-            text(|line| all.row(line, &header, &scan)),
+            text(|line| all.write_header(line, 3)),
+            format!("{begin},intensity_0,intensity_1,intensity_2")
+        );
+        assert_eq!(text(|line| plain.write_row(line, &header, &scan)), "5,0,0,0,clean,250,0,0,1,,12345");
+        assert_eq!(
+            text(|line| all.write_row(line, &header, &scan)),
             "5,0,0,0,clean,1000000,0,0,0.00025,,3.08625,7,0,255"
         );
         scan.intensity_bits = 0;
-        let empty = text(|line| ScanColumns { intensities: true, ..plain }.row(line, &header, &scan));
+        let empty = text(|line| ScanColumns { intensities: true, ..plain }.write_row(line, &header, &scan));
         assert_eq!(empty, "5,0,0,0,clean,250,0,0,1,,12345,,,");
     }
 
@@ -154,7 +157,7 @@ mod tests {
             last_beam: 2,
         };
         let header = Header { seq: 5, ..Header::default() };
-        let rows = |meters, marks: &Marks| text(|out| MarkColumns { meters }.rows(out, &header, marks));
+        let rows = |meters, marks: &Marks| text(|out| MarkColumns { meters }.write_rows(out, &header, marks));
         let first = "5,0,0,0,clean,2,0,0,0,0,0,0,0,0\n";
         assert_eq!(rows(false, &marks), format!("{first}5,0,0,0,clean,2,1,-90.5,1234.5,9,17,0,2,1\n"));
         assert!(rows(true, &marks).ends_with(",2,1,-90.5,1.2345,9,17,0,2,1\n"));
@@ -164,7 +167,7 @@ mod tests {
         let columns = |row: &str| row.trim_end().split(',').count();
         assert_eq!(
             columns(&rows(false, &unavailable)),
-            columns(&text(|out| MarkColumns::default().names(out)))
+            columns(&text(|out| MarkColumns::default().write_header(out)))
         );
     }
 }

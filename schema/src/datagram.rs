@@ -10,26 +10,26 @@ use crate::payload::{read_head, write};
 use crate::text::named;
 use crate::{Topic, check_sensor, text};
 
-pub use crate::payload::{FixedPayload, Packed, UsedElements};
+pub use crate::payload::{DatagramPayload, FixedPayload, UsedElements};
 
 /// Bytes of the header.
-pub const HEAD: usize = size_of::<DatagramHead>();
+pub const HEADER_LEN: usize = size_of::<DatagramHead>();
 /// Bytes of the MAC after the payload, if [`LanFlags::AUTHENTICATED`] is set.
-pub const MAC: usize = 16;
+pub const MAC_LEN: usize = 16;
 /// Longest datagram that is never fragmented where tunnels leave an MTU of 1400.
 pub const MTU_SAFE: usize = 1372;
 /// Lowest limit that a gateway accepts, which every network can carry. Longer samples are sent in parts.
-pub const MTU_LEAST: usize = 576;
+pub const MIN_MTU: usize = 576;
 /// Longest datagram on an Ethernet.
 pub const MTU_ETHERNET: usize = 1472;
 /// Longest payload of a part.
-pub const PART_LONGEST: usize = MTU_ETHERNET - HEAD;
+pub const MAX_PART_LEN: usize = MTU_ETHERNET - HEADER_LEN;
 /// Maximum number of parts of a sample.
-pub const PARTS: usize = 255;
+pub const MAX_PARTS: usize = 255;
 /// Port of all groups.
 pub const PORT: u16 = 22_200;
 /// First three bytes of all groups. [`group`] returns the last one.
-pub const GROUPS: [u8; 3] = [239, 255, 76];
+pub const GROUP_PREFIX: [u8; 3] = [239, 255, 76];
 
 /// Header of a datagram as it is sent. 48 bytes.
 #[derive(Clone, Copy, Pod, Zeroable)]
@@ -143,20 +143,20 @@ impl Default for Head {
 pub struct Datagram<'a> {
     /// Header, before the payload.
     pub head: Head,
-    /// Payload, or a part of it. [`Packed::unpack`] checks the content of a whole payload.
+    /// Payload, or a part of it. [`DatagramPayload::unpack`] checks the content of a whole payload.
     pub payload: &'a [u8],
     /// MAC, if the datagram has one. It is not checked here.
-    pub mac: Option<&'a [u8; MAC]>,
+    pub mac: Option<&'a [u8; MAC_LEN]>,
 }
 
 impl Head {
-    /// Writes the header and the checksum before a payload of `len` bytes that starts at [`HEAD`] in `buffer`. Returns
+    /// Writes the header and the checksum before a payload of `len` bytes that starts at [`HEADER_LEN`] in `buffer`. Returns
     /// the whole datagram, without a MAC, or `None` if the buffer ends before the payload does or the length does not
     /// fit into two bytes.
     pub fn seal<'a>(&self, buffer: &'a mut [u8], len: usize) -> Option<&'a [u8]> {
-        let datagram = buffer.get_mut(..HEAD + len)?;
+        let datagram = buffer.get_mut(..HEADER_LEN + len)?;
         self.write(datagram, len, self.flags & !LanFlags::AUTHENTICATED)?;
-        Some(checked(datagram))
+        Some(add_checksum(datagram))
     }
 
     /// Does the same as [`seal`](Head::seal), and appends the MAC that `mac` computes from header and payload while the
@@ -165,20 +165,20 @@ impl Head {
         &self,
         buffer: &'a mut [u8],
         len: usize,
-        mac: impl FnOnce(&[u8]) -> [u8; MAC],
+        mac: impl FnOnce(&[u8]) -> [u8; MAC_LEN],
     ) -> Option<&'a [u8]> {
-        let datagram = buffer.get_mut(..HEAD + len + MAC)?;
+        let datagram = buffer.get_mut(..HEADER_LEN + len + MAC_LEN)?;
         self.write(datagram, len, self.flags | LanFlags::AUTHENTICATED)?;
-        let (covered, place) = datagram.split_last_chunk_mut::<MAC>()?;
-        *place = mac(covered);
-        Some(checked(datagram))
+        let (input, mac_field) = datagram.split_last_chunk_mut::<MAC_LEN>()?;
+        *mac_field = mac(input);
+        Some(add_checksum(datagram))
     }
 
     /// Writes the header to the start of `datagram`, with a checksum of 0.
     fn write(&self, datagram: &mut [u8], len: usize, flags: u8) -> Option<()> {
         let &Head { topic, hub, epoch, sequence, stamp_ns, .. } = self;
         let &Head { sensor, part, parts, family, revision, counter, .. } = self;
-        let (magic, version, header_len) = (MAGIC, VERSION, HEAD as u8);
+        let (magic, version, header_len) = (MAGIC, VERSION, HEADER_LEN as u8);
         let (payload_len, crc) = (u16::try_from(len).ok()?, 0);
         let head = DatagramHead {
             magic,
@@ -199,23 +199,23 @@ impl Head {
             counter,
             crc,
         };
-        datagram.get_mut(..HEAD)?.copy_from_slice(bytes_of(&head));
+        datagram.get_mut(..HEADER_LEN)?.copy_from_slice(bytes_of(&head));
         Some(())
     }
 }
 
 /// Writes the checksum into `datagram`, whose checksum field is 0, and returns it.
-fn checked(datagram: &mut [u8]) -> &[u8] {
+fn add_checksum(datagram: &mut [u8]) -> &[u8] {
     let crc = CRC.checksum(datagram);
-    datagram[CRC_AT..HEAD].copy_from_slice(&crc.to_le_bytes());
+    datagram[CRC_OFFSET..HEADER_LEN].copy_from_slice(&crc.to_le_bytes());
     datagram
 }
 
 /// Returns the three pieces of `bytes` that the MAC covers: header and payload with a checksum of 0. `bytes` is a
 /// datagram with a MAC that [`read`](Datagram::read) has accepted.
-pub fn covered(bytes: &[u8]) -> [&[u8]; 3] {
-    let end = bytes.len().saturating_sub(MAC).max(HEAD);
-    [&bytes[..CRC_AT], &[0; HEAD - CRC_AT], &bytes[HEAD..end]]
+pub fn mac_input(bytes: &[u8]) -> [&[u8]; 3] {
+    let end = bytes.len().saturating_sub(MAC_LEN).max(HEADER_LEN);
+    [&bytes[..CRC_OFFSET], &[0; HEADER_LEN - CRC_OFFSET], &bytes[HEADER_LEN..end]]
 }
 
 impl<'a> Datagram<'a> {
@@ -243,12 +243,12 @@ impl<'a> Datagram<'a> {
         let DatagramHead { topic, flags, hub, epoch, sequence, stamp_ns, .. } = head;
         let DatagramHead { sensor, part, parts, family, revision, counter, .. } = head;
         let begin = usize::from(head.header_len);
-        if begin < HEAD || begin > bytes.len() || part >= parts {
+        if begin < HEADER_LEN || begin > bytes.len() || part >= parts {
             return Err(DatagramError::Header);
         }
         let payload_len = usize::from(head.payload_len);
         let (payload, mac) = bytes[begin..].split_at_checked(payload_len).ok_or(DatagramError::Length)?;
-        if parts > 1 && payload.len() > PART_LONGEST {
+        if parts > 1 && payload.len() > MAX_PART_LEN {
             return Err(DatagramError::Length);
         }
         let mac = match (flags & LanFlags::AUTHENTICATED != 0, mac) {
@@ -257,9 +257,9 @@ impl<'a> Datagram<'a> {
             _ => return Err(DatagramError::Length),
         };
         let mut digest = CRC.digest();
-        digest.update(&bytes[..CRC_AT]);
-        digest.update(&[0; HEAD - CRC_AT]);
-        digest.update(&bytes[HEAD..]);
+        digest.update(&bytes[..CRC_OFFSET]);
+        digest.update(&[0; HEADER_LEN - CRC_OFFSET]);
+        digest.update(&bytes[HEADER_LEN..]);
         if digest.finalize() != head.crc {
             return Err(DatagramError::Crc);
         }
@@ -284,13 +284,13 @@ impl<'a> Datagram<'a> {
 /// Returns the last byte of the group that `topic` is sent to. There is one group for each class of traffic, because
 /// switches filter by group and not by port. The group of announcements is [`Announce::GROUP`].
 pub fn group(topic: Topic) -> u8 {
-    topic.row().group
+    topic.spec().group
 }
 
 const MAGIC: [u8; 4] = *b"SHUB";
 const VERSION: u8 = 2;
 /// Offset of the checksum, which is computed with these four bytes as 0.
-const CRC_AT: usize = std::mem::offset_of!(DatagramHead, crc);
+const CRC_OFFSET: usize = std::mem::offset_of!(DatagramHead, crc);
 const CRC: Crc<u32, Table<16>> = Crc::<u32, Table<16>>::new(&CRC_32_ISCSI);
 
 // Payloads are sent as they are in memory.
@@ -405,7 +405,8 @@ pub struct Announced {
 
 /// Maximum number of topics of an announcement: 37. That many fit into the shortest datagram that a gateway may be limited
 /// to, with a MAC and the numbers of replaced samples. An announcement is never sent in parts.
-const MAX_TOPICS: usize = (MTU_LEAST - HEAD - MAC - size_of::<AnnounceHead>()) / (size_of::<Announced>() + 4);
+const MAX_TOPICS: usize =
+    (MIN_MTU - HEADER_LEN - MAC_LEN - size_of::<AnnounceHead>()) / (size_of::<Announced>() + 4);
 
 const _: () = assert!(Topic::ALL.len() <= MAX_TOPICS);
 
@@ -425,8 +426,8 @@ impl Announce {
 
     /// Adds a topic, or ignores it if there are 37 already.
     pub fn add(&mut self, topic: Announced) {
-        if let Some(place) = self.topics.get_mut(usize::from(self.head.count)) {
-            *place = topic;
+        if let Some(slot) = self.topics.get_mut(usize::from(self.head.count)) {
+            *slot = topic;
             self.head.count += 1;
         }
     }
@@ -434,8 +435,8 @@ impl Announce {
     /// Sets how many samples of the topic that was added last were replaced by newer ones before they got a sequence number.
     /// The number wraps. Call it for all topics or for none.
     pub fn add_replaced(&mut self, replaced: u64) {
-        if let Some(place) = self.replaced[..usize::from(self.head.count)].last_mut() {
-            *place = replaced as u32;
+        if let Some(slot) = self.replaced[..usize::from(self.head.count)].last_mut() {
+            *slot = replaced as u32;
             self.head.flags |= AnnounceHead::REPLACED;
         }
     }
@@ -457,17 +458,17 @@ impl Announce {
     }
 
     /// Returns the announcement with only those of its topics that are among `topics`.
-    pub fn only(&self, topics: &[Topic]) -> Announce {
-        let mut only = Announce::new(self.boot, self.sensor(), self.kind());
+    pub fn restricted_to(&self, topics: &[Topic]) -> Announce {
+        let mut restricted = Announce::new(self.boot, self.sensor(), self.kind());
         for announced in self.topics() {
             if Topic::of_number(announced.topic).is_some_and(|topic| topics.contains(&topic)) {
-                only.add(*announced);
+                restricted.add(*announced);
                 if let Some(replaced) = self.replaced(announced.topic) {
-                    only.add_replaced(replaced.into());
+                    restricted.add_replaced(replaced.into());
                 }
             }
         }
-        only
+        restricted
     }
 
     /// Returns the sensor's name.
@@ -523,7 +524,7 @@ mod tests {
 
     fn sealed(head: Head, payload: &[u8]) -> Vec<u8> {
         let mut buffer = [0xAA; MTU_ETHERNET];
-        buffer[HEAD..HEAD + payload.len()].copy_from_slice(payload);
+        buffer[HEADER_LEN..HEADER_LEN + payload.len()].copy_from_slice(payload);
         head.seal(&mut buffer, payload.len()).unwrap().to_vec()
     }
 
@@ -550,7 +551,7 @@ mod tests {
         };
         let bytes = sealed(head, b"payload");
         assert_eq!(Datagram::read(&bytes), Ok(Datagram { head, payload: b"payload", mac: None }));
-        assert_eq!(head.seal(&mut [0; HEAD], 1), None);
+        assert_eq!(head.seal(&mut [0; HEADER_LEN], 1), None);
         assert_eq!(head.seal(&mut vec![0; 70_000], 65_536), None);
     }
 
@@ -585,8 +586,8 @@ mod tests {
             let (head, mut buffer) = (Head { parts, ..Head::default() }, vec![0; 2000]);
             Datagram::read(head.seal(&mut buffer, len).unwrap()).map(|datagram| datagram.payload.len())
         };
-        assert_eq!((of(2, PART_LONGEST), of(1, 1900)), (Ok(PART_LONGEST), Ok(1900)));
-        assert_eq!(of(2, PART_LONGEST + 1), Err(DatagramError::Length));
+        assert_eq!((of(2, MAX_PART_LEN), of(1, 1900)), (Ok(MAX_PART_LEN), Ok(1900)));
+        assert_eq!(of(2, MAX_PART_LEN + 1), Err(DatagramError::Length));
     }
 
     #[test]
@@ -602,11 +603,11 @@ mod tests {
     #[test]
     fn a_longer_header_of_a_later_version_is_skipped() {
         let mut bytes = sealed(Head::default(), b"1234");
-        bytes.splice(HEAD..HEAD, [1, 2, 3, 4]);
+        bytes.splice(HEADER_LEN..HEADER_LEN, [1, 2, 3, 4]);
         bytes[5] = 52;
-        bytes[CRC_AT..HEAD].fill(0);
+        bytes[CRC_OFFSET..HEADER_LEN].fill(0);
         let crc = CRC.checksum(&bytes).to_le_bytes();
-        bytes[CRC_AT..HEAD].copy_from_slice(&crc);
+        bytes[CRC_OFFSET..HEADER_LEN].copy_from_slice(&crc);
         assert_eq!(Datagram::read(&bytes).unwrap().payload, b"1234");
     }
 
@@ -628,13 +629,13 @@ mod tests {
     }
 
     #[test]
-    fn an_announcement_with_a_mac_fits_into_the_shortest_datagram() {
+    fn longest_announcement_fits_the_shortest_datagram() {
         let mut announce = Announce::new(1, "front", "");
         for topic in 0..100 {
             announce.add(Announced { topic, ..Announced::default() });
             announce.add_replaced(topic.into());
         }
-        let mut room = [0; MTU_LEAST - HEAD - MAC];
+        let mut room = [0; MIN_MTU - HEADER_LEN - MAC_LEN];
         let len = announce.pack(&mut room).expect("it fits");
         assert_eq!((announce.topics().len(), announce.replaced(36)), (37, Some(99)));
         assert_eq!(Announce::unpack(&room[..len]), Some(announce));
@@ -646,7 +647,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_replaced_is_said_of_all_topics_or_of_none() {
+    fn replaced_counts_cover_all_topics_or_none() {
         let mut announce = Announce::new(1, "front", "");
         announce.add_replaced(9);
         assert_eq!((announce.revision(), announce.replaced(0)), (1, None), "there is no topic");
@@ -659,7 +660,7 @@ mod tests {
         let read = Announce::unpack(&room[..92]).unwrap();
         let replaced = [Topic::Scan, Topic::Status, Topic::Zones].map(|topic| read.replaced(topic.number()));
         assert_eq!((read, replaced), (announce, [Some(7), Some(3), None]));
-        let only = read.only(&[Topic::Status, Topic::Zones]);
+        let only = read.restricted_to(&[Topic::Status, Topic::Zones]);
         assert_eq!(
             (only.sensor(), only.topics(), only.replaced(Topic::Scan.number())),
             ("front", &read.topics()[1..], None)

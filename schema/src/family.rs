@@ -11,7 +11,7 @@ use bytemuck::TransparentWrapper;
 use bytemuck::allocation::TransparentWrapperAlloc;
 
 use crate::text::named;
-use crate::{Code, Contents, ScanHead};
+use crate::{ArrayFlags, Code, ScanHead};
 
 /// A family of scanners with one protocol.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -27,7 +27,7 @@ pub enum Family {
 
 /// Contents of a telegram of a family that sends packets.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct PacketFacts {
+pub struct PacketInfo {
     /// `data`, or `reply` to a request.
     pub kind: &'static str,
     /// Whether the checksums are correct; `None` if there are none.
@@ -58,7 +58,7 @@ impl Family {
             // Telegram listing: 812 bytes, and two of the checksum.
             Family::Lms => 814,
             // 10 ms of packets, of an STL27L the most.
-            Family::Ld => 17 * LD_PACKET,
+            Family::Ld => 17 * LD_PACKET_LEN,
             Family::Rplidar => 800,
         }
     }
@@ -70,13 +70,13 @@ impl Family {
     }
 
     /// Returns the contents of `bytes`, a telegram of the family. `None` if the family does not send packets.
-    pub fn packets(self, bytes: &[u8]) -> Option<PacketFacts> {
+    pub fn packets(self, bytes: &[u8]) -> Option<PacketInfo> {
         match self {
             Family::Lms => None,
             // The scanner sends no replies, and every published packet had a correct checksum.
             Family::Ld => {
-                let packets = bytes.len() / LD_PACKET;
-                Some(PacketFacts { kind: "data", checked: Some(true), packets })
+                let packets = bytes.len() / LD_PACKET_LEN;
+                Some(PacketInfo { kind: "data", checked: Some(true), packets })
             }
             Family::Rplidar => Some(slamtec_packets(bytes)),
         }
@@ -92,7 +92,7 @@ impl ScanHead {
     /// Returns the head of a revolution of a scanner of `family` that rotates clockwise. Its points are assigned to a
     /// grid of `beams` equal bins, the first one ahead. Ranges are in millimeters, intensities have 8 bits, and angles
     /// are exact. The caller sets the times.
-    pub fn turning(family: Family, beams: usize) -> ScanHead {
+    pub fn of_revolution(family: Family, beams: usize) -> ScanHead {
         let step = -TAU / beams.max(1) as f64;
         ScanHead {
             step,
@@ -103,7 +103,7 @@ impl ScanHead {
             no_return: Code::NoReturn.value(),
             beyond: Code::NoReturn.value(),
             family: family as u8,
-            contents: Contents::TURNING,
+            contents: ArrayFlags::REVOLUTION,
             intensity_bits: 8,
             ..ScanHead::default()
         }
@@ -111,19 +111,19 @@ impl ScanHead {
 }
 
 /// Length of a packet of an LDROBOT (manual of the LD19, "data packet format").
-const LD_PACKET: usize = 47;
+const LD_PACKET_LEN: usize = 47;
 
 /// Returns the contents of an RPLIDAR's packets or response. Packets of one point have neither a checksum nor a
 /// type. Packets with a head and a correct checksum are of another type (rplidar_sdk, `sl_lidar_cmd.h`).
-fn slamtec_packets(bytes: &[u8]) -> PacketFacts {
-    const CAPSULES: [usize; 3] = [84, 132, 170];
-    const POINT: usize = 5;
-    const HEAD: usize = 7;
+fn slamtec_packets(bytes: &[u8]) -> PacketInfo {
+    const CAPSULE_LENS: [usize; 3] = [84, 132, 170];
+    const POINT_LEN: usize = 5;
+    const HEAD_LEN: usize = 7;
     // A packet may start like a response. The head of a response has its length, unless a stream follows.
-    if let Some(&[0xA5, 0x5A, low, middle, high, ..]) = bytes.first_chunk::<HEAD>() {
+    if let Some(&[0xA5, 0x5A, low, middle, high, ..]) = bytes.first_chunk::<HEAD_LEN>() {
         let len = u32::from_le_bytes([low, middle, high, 0]) as usize;
-        if bytes.len() == HEAD || bytes.len() == HEAD + len {
-            return PacketFacts { kind: "reply", checked: None, packets: 1 };
+        if bytes.len() == HEAD_LEN || bytes.len() == HEAD_LEN + len {
+            return PacketInfo { kind: "reply", checked: None, packets: 1 };
         }
     }
     let is_capsule = |len: &usize| {
@@ -134,9 +134,9 @@ fn slamtec_packets(bytes: &[u8]) -> PacketFacts {
         let sum = rest.iter().fold(0, |sum, byte| sum ^ byte);
         (first >> 4, second >> 4) == (0xA, 0x5) && sum == first & 15 | second << 4
     };
-    let capsule = CAPSULES.into_iter().find(is_capsule);
-    let packets = bytes.len() / capsule.unwrap_or(POINT);
-    PacketFacts { kind: "data", checked: capsule.map(|_| true), packets }
+    let capsule = CAPSULE_LENS.into_iter().find(is_capsule);
+    let packets = bytes.len() / capsule.unwrap_or(POINT_LEN);
+    PacketInfo { kind: "data", checked: capsule.map(|_| true), packets }
 }
 
 impl ScanHead {
@@ -155,10 +155,10 @@ impl ScanHead {
     ) -> ScanHead {
         let in_radians = |mdeg: f64| (mdeg / 1000.0).to_radians();
         let step = in_radians(step_mdeg.into());
-        let greatest = ((1_u32 << range_bits.min(16)) - 1) as u16;
-        let turns = (1000 / step_mdeg.max(1)).max(1);
-        let beam_time_ns = step_mdeg * (TURN_NS / 360) / 1000;
-        let age_ns = (turns - 1) * TURN_NS + count.saturating_sub(1) as u32 * beam_time_ns;
+        let max_value = ((1_u32 << range_bits.min(16)) - 1) as u16;
+        let revolutions = (1000 / step_mdeg.max(1)).max(1);
+        let beam_time_ns = step_mdeg * (REVOLUTION_NS / 360) / 1000;
+        let age_ns = (revolutions - 1) * REVOLUTION_NS + count.saturating_sub(1) as u32 * beam_time_ns;
         ScanHead {
             first_angle: in_radians(first_angle_mdeg.into()),
             step,
@@ -167,13 +167,13 @@ impl ScanHead {
             first_beam_ns: -(age_ns as i32),
             unit_um: 1000 * unit_mm,
             count: count as u16,
-            valid_to: greatest.saturating_sub(9),
-            no_return: greatest,
-            beyond: greatest.saturating_sub(8),
+            valid_to: max_value.saturating_sub(9),
+            no_return: max_value,
+            beyond: max_value.saturating_sub(8),
             family: Family::Lms as u8,
-            contents: Contents::UPPER,
-            turns: turns as u8,
-            turn_ns: if turns > 1 { TURN_NS } else { 0 },
+            contents: ArrayFlags::UPPER,
+            turns: revolutions as u8,
+            turn_ns: if revolutions > 1 { REVOLUTION_NS } else { 0 },
             ..ScanHead::default()
         }
     }
@@ -201,7 +201,7 @@ pub(crate) fn has_reflector_bits(mode: u8) -> bool {
 pub(crate) const REFLECTOR_MODE: u8 = 0x01;
 
 /// Time of one revolution of the mirror (75 Hz).
-const TURN_NS: u32 = 13_320_000;
+const REVOLUTION_NS: u32 = 13_320_000;
 
 /// Bytes that a scanner sent, with names for their fields.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -214,7 +214,7 @@ pub struct Telegram<'a> {
 
 impl<'a> Telegram<'a> {
     /// Maximum length of a telegram of any family, in bytes.
-    pub const MAX: usize = {
+    pub const MAX_LEN: usize = {
         let (mut max, mut at) = (0, 0);
         while at < Family::ALL.len() {
             let len = Family::ALL[at].max_telegram();
@@ -226,17 +226,17 @@ impl<'a> Telegram<'a> {
 
     /// Returns the telegram with which a payload of `family`'s begins: of an LMS its length field says how long it is, and what
     /// follows is a later revision's; of another family it is all of the payload. Nothing if there is none, or if it is longer
-    /// than [`MAX`](Self::MAX).
+    /// than [`MAX`](Self::MAX_LEN).
     pub fn of(family: u8, payload: &'a [u8]) -> Option<Telegram<'a>> {
         let family = Family::of_number(family);
         let len = match (family, payload) {
             (Some(Family::Lms), [STX, _, low, high, ..]) => {
-                usize::from(u16::from_le_bytes([*low, *high])) + AROUND_DATA
+                usize::from(u16::from_le_bytes([*low, *high])) + FRAME_LEN
             }
             (Some(Family::Lms), _) | (_, []) => return None,
             _ => payload.len(),
         };
-        let bytes = payload.get(..len).filter(|bytes| bytes.len() <= Telegram::MAX)?;
+        let bytes = payload.get(..len).filter(|bytes| bytes.len() <= Telegram::MAX_LEN)?;
         Some(Telegram { family, bytes })
     }
 
@@ -246,7 +246,7 @@ impl<'a> Telegram<'a> {
     }
 
     /// Returns facts about the packets. `None` for an LMS, and for a family that this version does not know.
-    pub fn packets(self) -> Option<PacketFacts> {
+    pub fn packets(self) -> Option<PacketInfo> {
         self.family?.packets(self.bytes)
     }
 
@@ -318,7 +318,7 @@ impl DerefMut for TelegramBytes {
 /// Begins every telegram of an LMS (Telegram listing 4).
 const STX: u8 = 0x02;
 /// STX, address, length and CRC (Telegram listing 4).
-const AROUND_DATA: usize = 6;
+const FRAME_LEN: usize = 6;
 
 #[cfg(test)]
 mod tests {
@@ -327,19 +327,19 @@ mod tests {
 
     #[test]
     fn a_packet_that_begins_like_an_answer_is_none() {
-        let said = |bytes: &[u8]| {
+        let packet_facts = |bytes: &[u8]| {
             let facts = Family::Rplidar.packets(bytes).expect("packets");
             (facts.kind, facts.checked, facts.packets)
         };
         let info = [&[0xA5, 0x5A, 20, 0, 0, 0, 4][..], &[7; 20]].concat();
-        assert_eq!(said(&info), ("reply", None, 1));
-        assert_eq!(said(&[0xA5, 0x5A, 0x84, 0, 0, 0x40, 0x84]), ("reply", None, 1));
+        assert_eq!(packet_facts(&info), ("reply", None, 1));
+        assert_eq!(packet_facts(&[0xA5, 0x5A, 0x84, 0, 0, 0x40, 0x84]), ("reply", None, 1));
         // The nibbles of the checksum are A5h, and so is the checksum of the rest.
         let mut capsule = [0; 132];
         (capsule[0], capsule[1], capsule[2]) = (0xA5, 0x5A, 0xA5);
-        assert_eq!(said(&capsule), ("data", Some(true), 1));
-        assert_eq!(said(&[capsule, capsule].concat()), ("data", Some(true), 2));
-        assert_eq!(said(&[1; 15]), ("data", None, 3));
+        assert_eq!(packet_facts(&capsule), ("data", Some(true), 1));
+        assert_eq!(packet_facts(&[capsule, capsule].concat()), ("data", Some(true), 2));
+        assert_eq!(packet_facts(&[1; 15]), ("data", None, 3));
     }
 
     #[test]
@@ -358,7 +358,7 @@ mod tests {
     #[test]
     fn half_degrees_are_measured_one_turn_later() {
         let of = |count, step_mdeg| Scan::of(ScanHead::lms(count, 0, step_mdeg, 1, 13), &vec![0; count]);
-        let (turn_ns, half) = (i64::from(TURN_NS), of(361, 500));
+        let (turn_ns, half) = (i64::from(REVOLUTION_NS), of(361, 500));
         assert_eq!(half.beam_ns(360), -turn_ns);
         assert_eq!(half.beam_ns(359), -turn_ns * 500 / 360_000);
         assert_eq!(half.beam_ns(0), -turn_ns - turn_ns / 2);
@@ -392,7 +392,7 @@ mod tests {
     }
 
     #[test]
-    fn packets_are_all_of_the_payload_whatever_they_begin_with() {
+    fn payload_is_interpreted_by_its_family() {
         let bytes = [2; 3 * 47];
         let telegram = Telegram::of(Family::Ld as u8, &bytes).expect("packets");
         let facts = telegram.packets().expect("no LMS");
@@ -401,7 +401,7 @@ mod tests {
         assert_eq!((of_tomorrow.bytes, of_tomorrow.packets()), (&bytes[..], None));
         for family in Family::ALL.into_iter().filter(|family| *family != Family::Lms) {
             assert_eq!(Telegram::of(family as u8, &[]), None);
-            assert_eq!(Telegram::of(family as u8, &[1; Telegram::MAX + 1]), None);
+            assert_eq!(Telegram::of(family as u8, &[1; Telegram::MAX_LEN + 1]), None);
         }
     }
 }

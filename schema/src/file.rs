@@ -33,7 +33,7 @@ pub struct Writer<W: Write> {
 
 /// Description of a channel that does not belong to the hub.
 #[derive(Clone, Copy, Debug)]
-pub struct Foreign<'a> {
+pub struct ForeignChannel<'a> {
     /// Name of the channel.
     pub topic: &'a str,
     /// Encoding of its messages, such as `cdr`.
@@ -50,8 +50,8 @@ impl<W: Write> Writer<W> {
     /// # Errors
     ///
     /// Returns the error of `out`.
-    pub fn begin(out: W, profile: &str, facts: BTreeMap<String, String>) -> io::Result<Self> {
-        Writer::packed(out, profile, Compression::None, facts)
+    pub fn begin(out: W, profile: &str, metadata: BTreeMap<String, String>) -> io::Result<Self> {
+        Writer::begin_compressed(out, profile, Compression::None, metadata)
     }
 
     /// Does the same as [`begin`](Self::begin), with chunks that are compressed by `compression`.
@@ -59,15 +59,15 @@ impl<W: Write> Writer<W> {
     /// # Errors
     ///
     /// Returns the error of `out`.
-    pub fn packed(
+    pub fn begin_compressed(
         out: W,
         profile: &str,
         compression: Compression,
-        facts: BTreeMap<String, String>,
+        metadata: BTreeMap<String, String>,
     ) -> io::Result<Self> {
         // A chunk is written when it is closed, so a process that is killed leaves only whole chunks.
         let options = WriteOptions::new()
-            .compression(compression.of_library())
+            .compression(compression.to_library())
             .compression_level(compression.level())
             // Chunks are short, and the caller has a thread for writing them.
             .compression_threads(0)
@@ -77,26 +77,36 @@ impl<W: Write> Writer<W> {
             .disable_seeking(true);
         let mcap = options.create(NoSeek::new(BufWriter::new(out))).map_err(io_error)?;
         let mut writer = Writer { mcap, channels: BTreeMap::new(), message: Vec::with_capacity(4096) };
-        writer.note(METADATA, facts)?;
+        writer.write_metadata(METADATA, metadata)?;
         writer.close_chunk()?;
         Ok(writer)
     }
 
     /// Writes a sample of `sensor`'s `topic`. `payload` is packed as for a network
-    /// ([`Packed`](crate::datagram::Packed)).
+    /// ([`DatagramPayload`](crate::datagram::DatagramPayload)).
     ///
     /// # Errors
     ///
     /// Returns the error of `W`.
-    pub fn sample(&mut self, sensor: &str, topic: Topic, header: &Header, payload: &[u8]) -> io::Result<()> {
-        let known = self.channels.get(sensor).and_then(|its| its.iter().find(|(its, _)| *its == topic));
+    pub fn write_sample(
+        &mut self,
+        sensor: &str,
+        topic: Topic,
+        header: &Header,
+        payload: &[u8],
+    ) -> io::Result<()> {
+        let known = self.channels.get(sensor).and_then(|topics| topics.iter().find(|(its, _)| *its == topic));
         let channel = match known {
             Some(&(_, channel)) => channel,
             None => {
                 let name = format!("{sensor}/{}", topic.name());
-                let schema = (schema(topic), LAYOUT, ENCODING);
-                let channel =
-                    self.channel(&Foreign { topic: &name, encoding: ENCODING, schema, metadata: &[] })?;
+                let schema = (schema_name(topic), LAYOUT, ENCODING);
+                let channel = self.add_channel(&ForeignChannel {
+                    topic: &name,
+                    encoding: ENCODING,
+                    schema,
+                    metadata: &[],
+                })?;
                 self.channels.entry(sensor.to_owned()).or_default().push((topic, channel));
                 channel
             }
@@ -105,7 +115,7 @@ impl<W: Write> Writer<W> {
         message.clear();
         message.extend_from_slice(bytes_of(header));
         message.extend_from_slice(payload);
-        let written = self.message(channel, header.topic_seq as u32, header.wall_ns, &message);
+        let written = self.write_message(channel, header.topic_seq as u32, header.wall_ns, &message);
         self.message = message;
         written
     }
@@ -115,12 +125,12 @@ impl<W: Write> Writer<W> {
     /// # Errors
     ///
     /// Returns the error of `W`.
-    pub fn channel(&mut self, foreign: &Foreign<'_>) -> io::Result<u16> {
-        let (name, text, language) = foreign.schema;
+    pub fn add_channel(&mut self, description: &ForeignChannel<'_>) -> io::Result<u16> {
+        let (name, text, language) = description.schema;
         let schema = self.mcap.add_schema(name, language, text.as_bytes()).map_err(io_error)?;
         let metadata =
-            foreign.metadata.iter().map(|&(key, value)| (key.to_owned(), value.to_owned())).collect();
-        self.mcap.add_channel(schema, foreign.topic, foreign.encoding, &metadata).map_err(io_error)
+            description.metadata.iter().map(|&(key, value)| (key.to_owned(), value.to_owned())).collect();
+        self.mcap.add_channel(schema, description.topic, description.encoding, &metadata).map_err(io_error)
     }
 
     /// Writes a message into a channel, at `time_ns` since 1970.
@@ -128,7 +138,13 @@ impl<W: Write> Writer<W> {
     /// # Errors
     ///
     /// Returns the error of `W`.
-    pub fn message(&mut self, channel_id: u16, sequence: u32, time_ns: u64, data: &[u8]) -> io::Result<()> {
+    pub fn write_message(
+        &mut self,
+        channel_id: u16,
+        sequence: u32,
+        time_ns: u64,
+        data: &[u8],
+    ) -> io::Result<()> {
         let header = MessageHeader { channel_id, sequence, log_time: time_ns, publish_time: time_ns };
         self.mcap.write_to_known_channel(&header, data).map_err(io_error)
     }
@@ -139,7 +155,7 @@ impl<W: Write> Writer<W> {
     /// # Errors
     ///
     /// Returns the error of `W`.
-    pub fn copied_channel(
+    pub fn copy_channel(
         &mut self,
         channel: &Channel,
         schema: Option<(&str, &str, &[u8])>,
@@ -159,7 +175,7 @@ impl<W: Write> Writer<W> {
     /// # Errors
     ///
     /// Returns the error of `W`.
-    pub fn copied_message(&mut self, header: &MessageHeader, data: &[u8]) -> io::Result<()> {
+    pub fn copy_message(&mut self, header: &MessageHeader, data: &[u8]) -> io::Result<()> {
         self.mcap.write_to_known_channel(header, data).map_err(io_error)
     }
 
@@ -168,7 +184,7 @@ impl<W: Write> Writer<W> {
     /// # Errors
     ///
     /// Returns the error of `W`.
-    pub fn copied_attachment(&mut self, attachment: &Attachment<'_>) -> io::Result<()> {
+    pub fn copy_attachment(&mut self, attachment: &Attachment<'_>) -> io::Result<()> {
         self.mcap.attach(attachment).map_err(io_error)
     }
 
@@ -177,8 +193,8 @@ impl<W: Write> Writer<W> {
     /// # Errors
     ///
     /// Returns the error of `W`.
-    pub fn note(&mut self, name: &str, facts: BTreeMap<String, String>) -> io::Result<()> {
-        self.mcap.write_metadata(&Metadata { name: name.to_owned(), metadata: facts }).map_err(io_error)
+    pub fn write_metadata(&mut self, name: &str, metadata: BTreeMap<String, String>) -> io::Result<()> {
+        self.mcap.write_metadata(&Metadata { name: name.to_owned(), metadata }).map_err(io_error)
     }
 
     /// Closes the chunk and passes everything to `W`.
@@ -202,13 +218,13 @@ impl<W: Write> Writer<W> {
 }
 
 /// Returns header and payload of a message of a recording; `None` if it is shorter than a header.
-pub fn parts(message: &[u8]) -> Option<(Header, &[u8])> {
+pub fn split_message(message: &[u8]) -> Option<(Header, &[u8])> {
     let (header, payload) = message.split_at_checked(size_of::<Header>())?;
     Some((bytemuck::pod_read_unaligned(header), payload))
 }
 
 /// Returns the name of the type of `topic`'s messages.
-pub fn schema(topic: Topic) -> &'static str {
+pub fn schema_name(topic: Topic) -> &'static str {
     match topic {
         Topic::Telegram => "scanhub.Telegram.v2",
         other => other.payload(),
@@ -252,7 +268,7 @@ impl Compression {
         }
     }
 
-    fn of_library(self) -> Option<mcap::Compression> {
+    fn to_library(self) -> Option<mcap::Compression> {
         match self {
             Compression::None => None,
             Compression::Lz4 => Some(mcap::Compression::Lz4),

@@ -51,13 +51,13 @@ impl Header {
     pub fn hub_time_ns(&self) -> Option<u64> {
         let [low, middle, high] = self.hub_time;
         let units = u32::from_le_bytes([low, middle, high, 0]);
-        (1..HUB_TIME_MORE).contains(&units).then(|| u64::from(units) * HUB_TIME_UNIT_NS)
+        (1..MAX_HUB_TIME).contains(&units).then(|| u64::from(units) * HUB_TIME_UNIT_NS)
     }
 
     /// Sets the moment at which the sample is sent to `now_ns` of CLOCK_MONOTONIC; the telegram's stamps must be set.
     pub fn set_sent_at(&mut self, now_ns: u64) {
         let units = now_ns.saturating_sub(self.stamp_last_ns).div_ceil(HUB_TIME_UNIT_NS);
-        let units = units.clamp(1, HUB_TIME_MORE.into()) as u32;
+        let units = units.clamp(1, MAX_HUB_TIME.into()) as u32;
         let [low, middle, high, _] = units.to_le_bytes();
         self.hub_time = [low, middle, high];
     }
@@ -84,7 +84,7 @@ impl Header {
 }
 
 const HUB_TIME_UNIT_NS: u64 = 256;
-const HUB_TIME_MORE: u32 = 0xFF_FFFF;
+const MAX_HUB_TIME: u32 = 0xFF_FFFF;
 
 /// Quality of a telegram whose checksum was right.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

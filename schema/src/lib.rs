@@ -24,9 +24,9 @@ mod topic;
 mod tracks;
 mod zones;
 
-pub mod limits;
 #[cfg(feature = "json")]
-mod saved;
+mod background_file;
+pub mod limits;
 
 /// The payloads of all topics, with the types of their fields. The client library exports them too.
 pub mod payloads {
@@ -41,16 +41,16 @@ pub mod payloads {
     pub use crate::zones::*;
 }
 
-pub use control::{Request, Response, Shown, Verb};
+pub use control::{Request, Response, ResponseModel, Verb};
 pub use header::{Flags, Header, Quality, Reasons};
 pub use payloads::*;
 pub use renamed::renamed;
 pub use text::{Failure, Kind, Printable, escape_json, json_line};
 pub use time::{Age, MICROS, MILLIS, MIN_RATE_SPAN, Nanos, line_time, rate_hz};
 pub use topic::{
-    CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE, Maker, Pace, ROBOT, Ring, Row, Topic, WAKE, Wake,
-    check_followed, check_sensor, is_remote, of_service,
+    CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE, DoorbellWord, PublishRate, PublisherKind, ROBOT, Topic,
+    TopicSpec, WAKE, WakeEvent, check_any_sensor, check_sensor, is_remote, parse_service_name,
 };
 
 #[cfg(feature = "json")]
-pub use saved::{SavedModel, as_json, unit_in_mm};
+pub use background_file::{BackgroundFile, as_json, unit_in_mm};

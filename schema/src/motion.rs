@@ -89,7 +89,7 @@ impl Default for Motion {
 
 impl FixedPayload for Motion {
     /// The covariance of the pose is missing.
-    const FIRST_REVISION: usize = std::mem::offset_of!(Motion, pose_covariance);
+    const FIRST_REVISION_LEN: usize = std::mem::offset_of!(Motion, pose_covariance);
 
     fn is_valid(&self) -> bool {
         let step = [self.dx_m, self.dy_m, self.dyaw_rad, self.overlap];
@@ -106,18 +106,18 @@ impl Motion {
     pub const OPEN: u8 = 2;
 
     /// Returns how the step was found; a number that is not known says nothing.
-    pub fn how(&self) -> MotionMethod {
+    pub fn method(&self) -> MotionMethod {
         MotionMethod::ALL.get(usize::from(self.method)).copied().unwrap_or(MotionMethod::Refused)
     }
 
     /// Returns whether there is a step: else its numbers are 0.
     pub fn has_step(&self) -> bool {
-        !matches!(self.how(), MotionMethod::First | MotionMethod::Refused)
+        !matches!(self.method(), MotionMethod::First | MotionMethod::Refused)
     }
 
     /// Returns whether the summed pose is known: else it is 0.
     pub fn has_pose(&self) -> bool {
-        self.how() != MotionMethod::Refused
+        self.method() != MotionMethod::Refused
     }
 
     /// Returns whether the summed pose is known, and no step that it contains was degenerate.
@@ -127,9 +127,9 @@ impl Motion {
 
     /// Returns the covariance of the summed pose; `None` if the pose is not valid, or if the sender's payload has none.
     pub fn sum_covariance(&self) -> Option<&[f32; 9]> {
-        let is_first = self.how() == MotionMethod::First;
-        let is_given = is_first || self.pose_covariance != [0.0; 9];
-        (self.has_valid_pose() && is_given).then_some(&self.pose_covariance)
+        let is_first = self.method() == MotionMethod::First;
+        let is_reported = is_first || self.pose_covariance != [0.0; 9];
+        (self.has_valid_pose() && is_reported).then_some(&self.pose_covariance)
     }
 
     /// Returns whether the surroundings leave a direction open.
@@ -143,10 +143,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_not_known_is_refused() {
+    fn unknown_method_has_no_step_and_no_pose() {
         for (number, method) in MotionMethod::ALL.into_iter().enumerate() {
             let motion = Motion { method: number as u8, ..Motion::default() };
-            assert_eq!((motion.how(), method as usize), (method, number));
+            assert_eq!((motion.method(), method as usize), (method, number));
         }
         let later = Motion { method: 6, x_m: 1.0, ..Motion::default() };
         assert!(!later.has_step() && !later.has_pose());

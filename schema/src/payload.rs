@@ -2,7 +2,7 @@
 //! elements of arrays. A received payload is checked against its own counts before it is used.
 //!
 //! Most payloads are structs of fixed size, for which [`FixedPayload`] is all that they implement. The others have a head of
-//! fixed size and arrays whose length depends on the number of beams. `sliced!` defines them, and they implement [`Packed`]
+//! fixed size and arrays whose length depends on the number of beams. `sliced!` defines them, and they implement [`DatagramPayload`]
 //! next to their definition. They have whole words of eight bytes, so that every array is aligned.
 
 use bytemuck::{Pod, bytes_of, bytes_of_mut, pod_read_unaligned};
@@ -12,7 +12,7 @@ use crate::limits::TopicLimits;
 use crate::{Telegram, Topic};
 
 /// A payload that can be sent over a network.
-pub trait Packed {
+pub trait DatagramPayload {
     /// Writes the payload to the start of `room`. Returns its length, or `None` if there is too little room.
     fn pack(&self, room: &mut [u8]) -> Option<usize>;
 
@@ -32,8 +32,8 @@ pub trait Packed {
     fn fill(&mut self, payload: &[u8], room: usize) -> bool;
 
     /// Gives `place` memory of `room` bytes if it has less.
-    fn make_room(place: &mut Box<Self>, room: usize) {
-        let _ = (place, room);
+    fn make_room(target: &mut Box<Self>, room: usize) {
+        let _ = (target, room);
     }
 
     /// Replaces the value by `payload`. Returns `false`, and leaves the value undefined, if `payload` has no
@@ -45,10 +45,10 @@ pub trait Packed {
 
     /// Does the same as [`unpack`](Self::unpack), and makes `place` longer if it is too short.
     #[must_use]
-    fn unpack_into(place: &mut Box<Self>, payload: &[u8]) -> bool {
+    fn unpack_into(target: &mut Box<Self>, payload: &[u8]) -> bool {
         Self::room(payload).is_some_and(|room| {
-            Self::make_room(place, room);
-            place.fill(payload, room)
+            Self::make_room(target, room);
+            target.fill(payload, room)
         })
     }
 }
@@ -58,7 +58,7 @@ pub trait FixedPayload: Pod {
     /// Arrays at the end of the struct. A datagram has only their used elements.
     const ARRAYS: &'static [UsedElements] = &[];
     /// Length in bytes of the first revision. Fields that it does not have are read as 0.
-    const FIRST_REVISION: usize = size_of::<Self>();
+    const FIRST_REVISION_LEN: usize = size_of::<Self>();
 
     /// Returns whether the values do not contradict each other and all numbers that must be finite are.
     fn is_valid(&self) -> bool {
@@ -93,7 +93,7 @@ macro_rules! used_elements {
 
 pub(crate) use used_elements;
 
-impl<P: FixedPayload> Packed for P {
+impl<P: FixedPayload> DatagramPayload for P {
     fn pack(&self, room: &mut [u8]) -> Option<usize> {
         let bytes = bytes_of(self);
         let head = P::ARRAYS.first().map_or(bytes.len(), |array| array.at);
@@ -119,7 +119,7 @@ impl<P: FixedPayload> Packed for P {
 
 /// Copies the fields in `payload` into `memory`. `None` if it is too short, or has more elements than the struct.
 fn unpack_fields<P: FixedPayload>(memory: &mut [u8], payload: &[u8]) -> Option<()> {
-    let whole = if payload.len() < memory.len() { P::FIRST_REVISION } else { memory.len() };
+    let whole = if payload.len() < memory.len() { P::FIRST_REVISION_LEN } else { memory.len() };
     let head = P::ARRAYS.first().map_or(whole, |array| array.at);
     let (head, mut rest) = payload.split_at_checked(head)?;
     memory[..head.len()].copy_from_slice(head);
@@ -131,11 +131,11 @@ fn unpack_fields<P: FixedPayload>(memory: &mut [u8], payload: &[u8]) -> Option<(
     Some(())
 }
 
-/// Implements [`Packed`] for a payload of variable length that is sent as it is in memory. Its functions `packed_len` and
+/// Implements [`DatagramPayload`] for a payload of variable length that is sent as it is in memory. Its functions `packed_len` and
 /// `widen` do the rest: the length of a valid payload, and the limits that it needs.
 macro_rules! packed_as_is {
     ($payload:ident) => {
-        impl $crate::payload::Packed for $payload {
+        impl $crate::payload::DatagramPayload for $payload {
             fn pack(&self, room: &mut [u8]) -> Option<usize> {
                 $crate::payload::write(room, &[self.bytes()])
             }
@@ -181,7 +181,7 @@ impl<'a> Datagram<'a> {
     }
 
     /// Checks that the topic is known, and that the payload is valid for it. Returns the bytes of memory that the payload
-    /// fills, as [`Packed::room`] does. They are 0 for an announcement.
+    /// fills, as [`DatagramPayload::room`] does. They are 0 for an announcement.
     ///
     /// # Errors
     ///
@@ -209,13 +209,13 @@ macro_rules! rooms {
 
 crate::for_each_topic!(rooms);
 
-impl Packed for [u8] {
+impl DatagramPayload for [u8] {
     fn pack(&self, room: &mut [u8]) -> Option<usize> {
         write(room, &[self])
     }
 
     fn room(payload: &[u8]) -> Option<usize> {
-        (1..=Telegram::MAX).contains(&payload.len()).then_some(payload.len())
+        (1..=Telegram::MAX_LEN).contains(&payload.len()).then_some(payload.len())
     }
 
     fn widen(limits: &mut TopicLimits, payload: &[u8]) {
@@ -385,13 +385,17 @@ pub(crate) use sliced;
 mod tests {
     use super::*;
     use crate::{
-        Background, BackgroundHead, Cloud, CloudHead, CloudPoint, Contents, Corner, Early, Event, EventKind,
-        Foreground, ForegroundHead, Line, Lines, MAX_BEAMS, Mark, Marks, Motion, Obstacle, Obstacles, Pose,
-        Scan, ScanHead, Segment, Status, Tilt, Track, TrackSensor, Tracks, Zone, Zones,
+        ArrayFlags, Background, BackgroundHead, Cloud, CloudHead, CloudPoint, Corner, Early, Event,
+        EventKind, Foreground, ForegroundHead, Line, Lines, MAX_BEAMS, Mark, Marks, Motion, Obstacle,
+        Obstacles, Pose, Scan, ScanHead, Segment, Status, Tilt, Track, TrackSensor, Tracks, Zone, Zones,
     };
 
     /// Packs `value` into `len` bytes, and unpacks it into `back`.
-    fn there_and_back<T: Packed + PartialEq + std::fmt::Debug + ?Sized>(value: &T, back: &mut T, len: usize) {
+    fn check_round_trip<T: DatagramPayload + PartialEq + std::fmt::Debug + ?Sized>(
+        value: &T,
+        back: &mut T,
+        len: usize,
+    ) {
         let mut room = [0xAA; 2000];
         assert_eq!(value.pack(&mut room), Some(len));
         assert!(back.unpack(&room[..len + 7]), "what follows is a later revision's");
@@ -405,23 +409,23 @@ mod tests {
     #[test]
     fn payloads_go_there_and_back() {
         let head =
-            ScanHead { unit_um: 1000, valid_to: 8182, contents: Contents::UPPER, ..ScanHead::default() };
+            ScanHead { unit_um: 1000, valid_to: 8182, contents: ArrayFlags::UPPER, ..ScanHead::default() };
         let mut scan = Scan::of(head, &[0; 361]);
         scan.arrays().ranges[360] = 0x1234;
         let mut room = Scan::zeroed(64 + 3 * 361);
-        there_and_back(&*scan, &mut room, 64 + 3 * 361);
+        check_round_trip(&*scan, &mut room, 64 + 3 * 361);
         assert!(!Scan::zeroed(64 + 3 * 360).unpack(scan.bytes()), "there is too little memory");
         let mut marks = Marks { count: 2, flags: 1, ..Marks::default() };
         marks.mark_array[1] = Mark { angle_mdeg: -1, ..Mark::default() };
-        there_and_back(&marks, &mut Marks::default(), 4 + 32);
+        check_round_trip(&marks, &mut Marks::default(), 4 + 32);
         let mut zones = Zones { count: 2, ..Zones::unknown() };
         zones.zone_array[1] = Zone { radius_mm: 600, ..Zone::default() };
-        there_and_back(&zones, &mut Zones::default(), 12 + 16);
+        check_round_trip(&zones, &mut Zones::default(), 12 + 16);
         let early = Early { verdict: 2, beam: 90, distance_mm: 512, bytes_seen: 240, ..Early::default() };
-        there_and_back(&early, &mut Early::default(), 12);
+        check_round_trip(&early, &mut Early::default(), 12);
         let model = Background::of(BackgroundHead::default(), &[0, 0, 7]);
-        there_and_back(&*model, &mut Background::zeroed(38), 32 + 6);
-        there_and_back(&Status { baud: 500_000, ..Status::default() }, &mut Status::default(), 592);
+        check_round_trip(&*model, &mut Background::zeroed(38), 32 + 6);
+        check_round_trip(&Status { baud: 500_000, ..Status::default() }, &mut Status::default(), 592);
     }
 
     /// Returns a foreground of 361 beams with 64 foreground beams and as many segments.
@@ -462,7 +466,7 @@ mod tests {
     }
 
     #[test]
-    fn what_contradicts_itself_is_refused() {
+    fn contradictory_payloads_are_refused() {
         let refused = |payload: &[u8]| !Foreground::of(3).unpack(payload);
         let mut good = [0; 24 + 1 + 2];
         (good[8], good[10], good[24]) = (3, 1, 4);
@@ -484,7 +488,7 @@ mod tests {
         let mut lines = Lines { count: 2, corners: 1, ..Lines::default() };
         lines.line_array[1] = Line { alpha_rad: -1.0, last: 7, ..Line::default() };
         lines.corner_array[0] = Corner { x_m: 2.0, second_line: 1, ..Corner::default() };
-        there_and_back(&lines, &mut Lines::default(), 12 + 80 + 12);
+        check_round_trip(&lines, &mut Lines::default(), 12 + 80 + 12);
     }
 
     #[test]
@@ -549,12 +553,12 @@ mod tests {
     #[test]
     fn tilted_payloads_go_there_and_back() {
         let tilt = Tilt { angle_rad: -0.5, rate_rad_s: 0.25 };
-        there_and_back(&tilt, &mut Tilt::default(), 16);
+        check_round_trip(&tilt, &mut Tilt::default(), 16);
         assert!(Tilt::default().unpack(bytes_of(&Tilt::default())), "a rate need not be known");
-        there_and_back(&*cloud(), &mut Cloud::zeroed(Cloud::len(3)), 16 + 3 * 16);
+        check_round_trip(&*cloud(), &mut Cloud::zeroed(Cloud::len(3)), 16 + 3 * 16);
         assert!(!Cloud::zeroed(Cloud::len(2)).unpack(cloud().bytes()), "there is too little memory");
-        there_and_back(&obstacles(), &mut Obstacles::default(), 16 + 48);
-        there_and_back(&Obstacles::default(), &mut Obstacles::default(), 16);
+        check_round_trip(&obstacles(), &mut Obstacles::default(), 16 + 48);
+        check_round_trip(&Obstacles::default(), &mut Obstacles::default(), 16);
     }
 
     #[test]
@@ -589,7 +593,7 @@ mod tests {
         assert_eq!(limits.beams, 500);
     }
 
-    fn two() -> Tracks {
+    fn two_tracks() -> Tracks {
         let mut tracks = Tracks::default();
         for name in ["front", "kitchen.rear"] {
             tracks.push_sensor(TrackSensor::new(name, &Pose::default()));
@@ -601,16 +605,16 @@ mod tests {
 
     #[test]
     fn people_go_there_and_back() {
-        there_and_back(&two(), &mut Tracks::default(), 8 + 2 * 80 + 2 * 72);
-        there_and_back(&Tracks::default(), &mut Tracks::default(), 8);
-        let event = Event::new(EventKind::Door, 5, Some("hall")).through("left", "kitchen", "hall");
-        there_and_back(&event, &mut Event::default(), 112);
+        check_round_trip(&two_tracks(), &mut Tracks::default(), 8 + 2 * 80 + 2 * 72);
+        check_round_trip(&Tracks::default(), &mut Tracks::default(), 8);
+        let event = Event::new(EventKind::Door, 5, Some("hall")).with_door("left", "kitchen", "hall");
+        check_round_trip(&event, &mut Event::default(), 112);
     }
 
     #[test]
     fn tracks_that_contradict_themselves_are_refused() {
         let mut sound = [0; 8 + 2 * 80 + 2 * 72];
-        assert_eq!(two().pack(&mut sound), Some(sound.len()));
+        assert_eq!(two_tracks().pack(&mut sound), Some(sound.len()));
         for (at, bytes) in [
             (0, &[65][..]),
             (0, &[3]),

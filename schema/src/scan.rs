@@ -17,9 +17,9 @@ pub const MAX_BEAMS: usize = 8192;
 
 /// Arrays that a scan has in addition to the ranges, each with a value for every beam. Bits of
 /// [`ScanHead::contents`].
-pub struct Contents;
+pub struct ArrayFlags;
 
-impl Contents {
+impl ArrayFlags {
     /// One byte: intensities, or the field bits above the range in some modes of an LMS.
     pub const UPPER: u8 = 1;
     /// Two bytes: intensities.
@@ -27,7 +27,7 @@ impl Contents {
     /// The exact angle in radians, a 32-bit float; NaN if nothing was measured.
     pub const ANGLES: u8 = 4;
     /// Arrays of a revolution on a grid of beams.
-    pub const TURNING: u8 = Contents::UPPER | Contents::ANGLES;
+    pub const REVOLUTION: u8 = ArrayFlags::UPPER | ArrayFlags::ANGLES;
     /// All arrays.
     pub const ALL: u8 = 7;
 }
@@ -62,7 +62,7 @@ pub struct ScanHead {
     pub family: u8,
     /// Flags: [`Scan::INCOMPLETE`].
     pub flags: u8,
-    /// Arrays that follow the head: [`Contents`].
+    /// Arrays that follow the head: [`ArrayFlags`].
     pub contents: u8,
     /// Bits of an intensity; 0 if there are none.
     pub intensity_bits: u8,
@@ -116,7 +116,7 @@ pub enum Intensities<'a> {
 }
 
 impl PayloadLen for Scan {
-    fn longest(limits: &TopicLimits) -> usize {
+    fn max_payload_len(limits: &TopicLimits) -> usize {
         Scan::len(limits.beams, limits.contents)
     }
 }
@@ -131,7 +131,7 @@ impl Scan {
 
     /// Returns the length in bytes of a scan of `beams` beams with the arrays of `contents`.
     pub const fn len(beams: usize, contents: u8) -> usize {
-        Scan::HEAD + beams * per_beam(contents)
+        Scan::HEAD + beams * total_bytes_per_beam(contents)
     }
 
     /// Returns a scan with `head` and a beam for each of `ranges`. All other arrays are 0.
@@ -151,10 +151,10 @@ impl Scan {
         **self = head;
         let (n, contents) = (usize::from(head.count), head.contents);
         let (_, rest) = self.memory_mut().split_at_mut(Scan::HEAD);
-        let (angles, rest) = rest.split_at_mut(if contents & Contents::ANGLES != 0 { 4 * n } else { 0 });
+        let (angles, rest) = rest.split_at_mut(if contents & ArrayFlags::ANGLES != 0 { 4 * n } else { 0 });
         let (ranges, rest) = rest.split_at_mut(2 * n);
-        let (wide, rest) = rest.split_at_mut(if contents & Contents::WIDE != 0 { 2 * n } else { 0 });
-        let upper = &mut rest[..if contents & Contents::UPPER != 0 { n } else { 0 }];
+        let (wide, rest) = rest.split_at_mut(if contents & ArrayFlags::WIDE != 0 { 2 * n } else { 0 });
+        let upper = &mut rest[..if contents & ArrayFlags::UPPER != 0 { n } else { 0 }];
         ScanArrays {
             angles: cast_slice_mut(angles),
             ranges: cast_slice_mut(ranges),
@@ -166,7 +166,7 @@ impl Scan {
     /// Returns the ranges in device units, codes included.
     #[inline]
     pub fn ranges(&self) -> &[u16] {
-        self.array(Contents::ANGLES, 2)
+        self.array(ArrayFlags::ANGLES, 2)
     }
 
     /// Returns the arrays for writing.
@@ -182,8 +182,8 @@ impl Scan {
     /// Returns the bits above the ranges, one value for each beam; empty if the sensor does not send them.
     #[inline]
     pub fn upper(&self) -> &[u8] {
-        if self.has(Contents::UPPER) {
-            self.array(Contents::ANGLES | RANGES | Contents::WIDE, 1)
+        if self.has(ArrayFlags::UPPER) {
+            self.array(ArrayFlags::ANGLES | RANGES | ArrayFlags::WIDE, 1)
         } else {
             &[]
         }
@@ -194,8 +194,8 @@ impl Scan {
     pub fn intensities(&self) -> Intensities<'_> {
         if self.intensity_bits == 0 {
             Intensities::Narrow(&[])
-        } else if self.has(Contents::WIDE) {
-            Intensities::Wide(self.array(Contents::ANGLES | RANGES, 2))
+        } else if self.has(ArrayFlags::WIDE) {
+            Intensities::Wide(self.array(ArrayFlags::ANGLES | RANGES, 2))
         } else {
             Intensities::Narrow(self.upper())
         }
@@ -205,13 +205,13 @@ impl Scan {
     /// [`angle`](Self::angle) of the grid is exact.
     #[inline]
     pub fn exact_angles(&self) -> &[f32] {
-        if self.has(Contents::ANGLES) { self.array(0, 4) } else { &[] }
+        if self.has(ArrayFlags::ANGLES) { self.array(0, 4) } else { &[] }
     }
 
     /// Returns the number of beams: `count`, unless there is memory for fewer.
     #[inline]
     pub fn beams(&self) -> usize {
-        let room = self.memory().len().saturating_sub(Scan::HEAD) / per_beam(self.contents);
+        let room = self.memory().len().saturating_sub(Scan::HEAD) / total_bytes_per_beam(self.contents);
         usize::from(self.count).min(room)
     }
 
@@ -257,8 +257,8 @@ impl Scan {
     /// Returns the time at which beam `i` was measured, in ns after the sample's stamp. The stamp of an LMS is the end
     /// of its last revolution.
     pub fn beam_ns(&self, i: usize) -> i64 {
-        let turn = i % usize::from(self.turns.max(1));
-        let [i, turn] = [i, turn].map(|number| number as i64);
+        let revolution = i % usize::from(self.turns.max(1));
+        let [i, turn] = [i, revolution].map(|number| number as i64);
         i64::from(self.first_beam_ns) + i * i64::from(self.beam_time_ns) + turn * i64::from(self.turn_ns)
     }
 
@@ -276,7 +276,7 @@ impl Scan {
     #[inline]
     fn array<T: Pod>(&self, before: u8, size: usize) -> &[T] {
         let n = self.beams();
-        let begin = Scan::HEAD + n * width(before & (self.contents | RANGES));
+        let begin = Scan::HEAD + n * bytes_per_beam(before & (self.contents | RANGES));
         self.memory().get(begin..begin + n * size).map_or(&[], cast_slice)
     }
 
@@ -288,7 +288,7 @@ impl Scan {
     fn packed_len(payload: &[u8]) -> Option<usize> {
         let head: ScanHead = read_head(payload)?;
         let len = Scan::len(head.count.into(), head.contents);
-        let is_known = usize::from(head.count) <= MAX_BEAMS && head.contents & !Contents::ALL == 0;
+        let is_known = usize::from(head.count) <= MAX_BEAMS && head.contents & !ArrayFlags::ALL == 0;
         let is_finite = head.first_angle.is_finite() && head.step.is_finite() && head.spacing.is_finite();
         (is_known && is_finite && len <= payload.len()).then_some(len)
     }
@@ -345,15 +345,15 @@ pub fn in_sector_mdeg(radians: f64) -> i32 {
     ((mdeg + 180_000).rem_euclid(360_000) - 180_000) as i32
 }
 
-/// Bit for the ranges, which every scan has, alongside [`Contents`].
+/// Bit for the ranges, which every scan has, alongside [`ArrayFlags`].
 const RANGES: u8 = 0x80;
 
 /// Returns the bytes of a beam in the arrays of `contents`.
-const fn width(contents: u8) -> usize {
-    4 * bit(contents, Contents::ANGLES)
+const fn bytes_per_beam(contents: u8) -> usize {
+    4 * bit(contents, ArrayFlags::ANGLES)
         + 2 * bit(contents, RANGES)
-        + 2 * bit(contents, Contents::WIDE)
-        + bit(contents, Contents::UPPER)
+        + 2 * bit(contents, ArrayFlags::WIDE)
+        + bit(contents, ArrayFlags::UPPER)
 }
 
 const fn bit(contents: u8, mask: u8) -> usize {
@@ -361,8 +361,8 @@ const fn bit(contents: u8, mask: u8) -> usize {
 }
 
 /// Returns the bytes of a beam in all arrays of a scan with `contents`.
-const fn per_beam(contents: u8) -> usize {
-    width(contents & Contents::ALL | RANGES)
+const fn total_bytes_per_beam(contents: u8) -> usize {
+    bytes_per_beam(contents & ArrayFlags::ALL | RANGES)
 }
 
 /// Reason why a beam has no valid reading. Its value is above the ranges. An LMS has its own values, and all other
@@ -436,7 +436,7 @@ mod tests {
     use super::*;
 
     /// Returns a scan of a clockwise revolution, with all arrays.
-    fn turning() -> Box<Scan> {
+    fn revolution() -> Box<Scan> {
         let head = ScanHead {
             step: -TAU / 4.0,
             unit_um: 250,
@@ -444,7 +444,7 @@ mod tests {
             no_return: Code::NoReturn.value(),
             beyond: Code::NoReturn.value(),
             family: Family::Ld as u8,
-            contents: Contents::ALL,
+            contents: ArrayFlags::ALL,
             intensity_bits: 16,
             beam_time_ns: 100,
             ..ScanHead::default()
@@ -459,7 +459,7 @@ mod tests {
 
     #[test]
     fn each_array_is_where_it_was_written() {
-        let scan = turning();
+        let scan = revolution();
         assert_eq!((scan.bytes().len(), scan.beams()), (64 + 3 * 9, 3));
         assert_eq!((scan.range(0), scan.distance_mm(0)), (Some(4001), Some(1000)));
         assert_eq!((scan.code(1), scan.code(2)), (Some(Code::NoReturn), Some(Code::NotMeasured)));
@@ -471,7 +471,7 @@ mod tests {
 
     #[test]
     fn a_count_beyond_the_memory_is_cut() {
-        let mut scan = turning();
+        let mut scan = revolution();
         scan.count = u16::MAX;
         // 32 bytes after the head, in whole words.
         assert_eq!((scan.ranges().len(), scan.upper().len(), scan.exact_angles().len()), (3, 3, 3));

@@ -13,7 +13,7 @@ use crate::text::named;
 use crate::{Family, text};
 
 /// Room for counters in a [`Status`]; new ones append.
-pub const COUNTERS: usize = 28;
+pub const MAX_COUNTERS: usize = 28;
 
 /// The payload of topic `status`, 592 bytes: published every second and on every change.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
@@ -111,7 +111,7 @@ impl Status {
 
     /// Returns the share of the line's bytes that were in nothing over the last 10 s, 0 to 1: those of a stream,
     /// without scans that the sensor broke off to answer.
-    pub fn damaged(&self) -> f64 {
+    pub fn damaged_share(&self) -> f64 {
         self.counters[Counter::DamagedPpm] as f64 / 1e6
     }
 
@@ -129,8 +129,8 @@ impl Status {
     /// Returns what the line takes away, in words such as `41 % lost on the line`, if that is more than a thousandth in
     /// the last 10 s.
     pub fn line_loss(&self) -> Option<String> {
-        let lost = self.lost_share().filter(|&share| share > WELL);
-        let damaged = Some(self.damaged()).filter(|&share| share > WELL);
+        let lost = self.lost_share().filter(|&share| share > LOSS_REPORT_THRESHOLD);
+        let damaged = Some(self.damaged_share()).filter(|&share| share > LOSS_REPORT_THRESHOLD);
         let (share, word) = lost.map(|share| (share, "lost")).or(damaged.map(|share| (share, "damaged")))?;
         let (percent, digits) = (100.0 * share, usize::from(share < 0.0995));
         Some(format!("{percent:.digits$} % {word} on the line"))
@@ -139,7 +139,7 @@ impl Status {
     /// Returns the numbers of discarded and of all bytes since the hub's start, if telegrams have arrived, but most bytes were
     /// in none, and the hub looks for the scanner again. Only then are they a finding: before, the bytes may be those of
     /// another scanner.
-    pub fn mostly_discarded(&self) -> Option<(u64, u64)> {
+    pub fn discarded_and_read(&self) -> Option<(u64, u64)> {
         let (discarded, read) = (self.counters[Counter::BytesDiscarded], self.counters[Counter::BytesRead]);
         let has_replied = self.counters[Counter::Telegrams] > 0;
         let is_finding = self.state() == Some(State::Probing) && has_replied && discarded > read / 2;
@@ -152,7 +152,7 @@ impl Status {
     }
 
     /// Returns `model` for text. A model that scanhub does not know has only a number.
-    pub fn shown_model(model: &str) -> String {
+    pub fn display_model(model: &str) -> String {
         if Status::is_model_number(model) { format!("{model} (unknown)") } else { model.to_owned() }
     }
 
@@ -180,14 +180,14 @@ impl Status {
 
     /// Returns how a scanner measures whose modes have names, the second word of what the sensor calls itself; nothing
     /// if unknown.
-    pub fn way(&self) -> Option<&str> {
+    pub fn mode_name(&self) -> Option<&str> {
         let is_named = self.family().is_some_and(|family| family != Family::Lms);
         let word = self.sensor_type().split_whitespace().nth(1).filter(|_| is_named)?;
         word.starts_with(|c: char| c.is_ascii_lowercase()).then_some(word)
     }
 
     /// Returns what the scanner sends, of which [`lost_on_line`](Self::lost_on_line) counts: scans, or packets.
-    pub fn sent(&self) -> &'static str {
+    pub fn transmission_name(&self) -> &'static str {
         if self.family() == Some(Family::Lms) { "scans" } else { "packets" }
     }
 
@@ -226,7 +226,7 @@ impl Status {
 }
 
 /// A line that takes away more than this share has something that is to be looked for.
-const WELL: f64 = 0.001;
+const LOSS_REPORT_THRESHOLD: f64 = 0.001;
 
 /// Flag in the first reserved byte of the pose: a threshold for reflectors is configured.
 const MARK_LEVEL: u8 = 1;
@@ -266,11 +266,11 @@ named! {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Counters.v2"))]
 #[repr(C)]
-pub struct Counters(pub [u64; COUNTERS]);
+pub struct Counters(pub [u64; MAX_COUNTERS]);
 
 impl Counters {
     /// Returns name and value of every counter that has a name, in their order.
-    pub fn named(&self) -> impl Iterator<Item = (&'static str, u64)> + '_ {
+    pub fn named_values(&self) -> impl Iterator<Item = (&'static str, u64)> + '_ {
         Counter::ALL.iter().map(|&counter| (counter.name(), self[counter]))
     }
 }
@@ -437,9 +437,9 @@ mod tests {
     }
 
     #[test]
-    fn what_the_line_takes_away_is_told_in_words() {
+    fn line_loss_is_described_as_text() {
         let mut status = Status::default();
-        assert_eq!((status.damaged(), status.lost_on_line(), status.line_loss()), (0.0, None, None));
+        assert_eq!((status.damaged_share(), status.lost_on_line(), status.line_loss()), (0.0, None, None));
         status.counters[Counter::DamagedPpm] = 430_000;
         assert_eq!(status.line_loss().as_deref(), Some("43 % damaged on the line"));
         status.counters[Counter::DueOnLine] = 1000;
@@ -455,7 +455,7 @@ mod tests {
 
     #[test]
     fn counters_fit() {
-        assert!(Counter::ALL.len() <= COUNTERS);
+        assert!(Counter::ALL.len() <= MAX_COUNTERS);
     }
 
     #[test]

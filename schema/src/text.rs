@@ -119,7 +119,7 @@ pub enum Kind {
     /// A file to write exists, or cannot be made: exit 73.
     Output,
     /// Shared memory or descriptors are short, try later: exit 75.
-    Short,
+    ResourceExhausted,
     /// A value in the configuration, in `--set` or in `--link`: exit 78.
     Configuration,
     /// Interrupted before a bounded run was through: exit 130.
@@ -145,7 +145,7 @@ impl Kind {
             Kind::Check => "check",
             Kind::Input => "input",
             Kind::Output => "output",
-            Kind::Short => "short",
+            Kind::ResourceExhausted => "short",
             Kind::Configuration => "configuration",
             Kind::Interrupted => "interrupted",
         }
@@ -163,7 +163,7 @@ impl Kind {
             Kind::Check => 5,
             Kind::Input => 66,
             Kind::Output => 73,
-            Kind::Short | Kind::NameHeld => 75,
+            Kind::ResourceExhausted | Kind::NameHeld => 75,
             Kind::Configuration => 78,
             Kind::Interrupted => 130,
         }
@@ -230,7 +230,7 @@ mod tests {
     }
 
     #[test]
-    fn a_line_of_json_says_the_same_without_control_characters() {
+    fn json_line_escapes_control_characters() {
         let text = "é\u{80}\x1b \u{9f}\x7f\u{a0}\u{9b}\u{9b}°\n";
         let line = json_line(serde_json::to_string(text).unwrap());
         assert_eq!(line, "\"é\\u0080\\u001b \\u009f\\u007f\u{a0}\\u009b\\u009b°\\n\"");

@@ -115,7 +115,7 @@ impl CloudPoint {
 }
 
 impl PayloadLen for Cloud {
-    fn longest(limits: &TopicLimits) -> usize {
+    fn max_payload_len(limits: &TopicLimits) -> usize {
         Cloud::len(limits.beams)
     }
 }
@@ -220,16 +220,16 @@ impl SweepPoints {
     /// Adds a sample of topic `cloud`. With the last sample of a sweep, returns the points of the sweep. A sweep with a
     /// missed sample, or with more than 262,144 points, is dropped.
     pub fn take(&mut self, header: &Header, cloud: &Cloud) -> Option<&[CloudPoint]> {
-        let this = (header.boot, header.topic_seq);
+        let position = (header.boot, header.topic_seq);
         if cloud.has(Cloud::FIRST) {
             self.points.clear();
-        } else if self.next != Some(this) {
+        } else if self.next != Some(position) {
             self.next = None;
             return None;
         }
         let has_room = self.points.len() + cloud.points().len() <= MAX_SWEEP_POINTS;
-        let goes_on = has_room && !cloud.has(Cloud::LAST);
-        self.next = goes_on.then_some((header.boot, header.topic_seq.wrapping_add(1)));
+        let continues = has_room && !cloud.has(Cloud::LAST);
+        self.next = continues.then_some((header.boot, header.topic_seq.wrapping_add(1)));
         if !has_room {
             return None;
         }
@@ -307,8 +307,9 @@ impl FixedPayload for Obstacles {
         &[used_elements!(Obstacles, obstacle_array: [Obstacle; MAX_OBSTACLES], count)];
 
     fn is_valid(&self) -> bool {
-        let is_finite = |one: &Obstacle| {
-            are_finite([one.middle, one.low, one.high].as_flattened()) && one.distance_m.is_finite()
+        let is_finite = |obstacle: &Obstacle| {
+            are_finite([obstacle.middle, obstacle.low, obstacle.high].as_flattened())
+                && obstacle.distance_m.is_finite()
         };
         self.obstacles().iter().all(is_finite)
     }
@@ -329,8 +330,8 @@ impl Obstacles {
     /// Adds an obstacle, or counts it as left out if there is no room for it.
     pub fn push(&mut self, obstacle: Obstacle) {
         match self.obstacle_array.get_mut(usize::from(self.count)) {
-            Some(place) => {
-                *place = obstacle;
+            Some(slot) => {
+                *slot = obstacle;
                 self.count += 1;
             }
             None => self.dropped += 1,
@@ -368,7 +369,7 @@ mod tests {
     }
 
     /// Returns the number of points of each complete sweep. A sample has a number, flags and a count of points.
-    fn gathered(sweep: &mut SweepPoints, samples: &[(u64, u8, usize)]) -> Vec<usize> {
+    fn complete_sweeps(sweep: &mut SweepPoints, samples: &[(u64, u8, usize)]) -> Vec<usize> {
         let mut whole = Vec::new();
         for &(topic_seq, flags, count) in samples {
             let head = CloudHead { flags, ..CloudHead::default() };
@@ -384,12 +385,20 @@ mod tests {
         let (first, last) = (Cloud::FIRST, Cloud::LAST);
         let mut sweep = SweepPoints::default();
         // A program that starts in the middle of a sweep waits for the next one.
-        assert_eq!(gathered(&mut sweep, &[(3, 0, 5), (4, last, 5)]), [0; 0]);
-        assert_eq!(gathered(&mut sweep, &[(5, first, 5), (6, 0, 2), (7, last, 1)]), [8]);
-        assert_eq!(gathered(&mut sweep, &[(8, first | last, 4), (9, last, 3)]), [4], "9 has no beginning");
-        assert_eq!(gathered(&mut sweep, &[(10, first, 5), (12, last, 5)]), [0; 0], "11 was missed");
-        assert_eq!(gathered(&mut sweep, &[(20, first, 5), (21, first, 2), (22, last, 1)]), [3]);
-        assert_eq!(gathered(&mut sweep, &[(99, first, 5), (100, last, 5)]), [0; 0], "another one sends it");
+        assert_eq!(complete_sweeps(&mut sweep, &[(3, 0, 5), (4, last, 5)]), [0; 0]);
+        assert_eq!(complete_sweeps(&mut sweep, &[(5, first, 5), (6, 0, 2), (7, last, 1)]), [8]);
+        assert_eq!(
+            complete_sweeps(&mut sweep, &[(8, first | last, 4), (9, last, 3)]),
+            [4],
+            "9 has no beginning"
+        );
+        assert_eq!(complete_sweeps(&mut sweep, &[(10, first, 5), (12, last, 5)]), [0; 0], "11 was missed");
+        assert_eq!(complete_sweeps(&mut sweep, &[(20, first, 5), (21, first, 2), (22, last, 1)]), [3]);
+        assert_eq!(
+            complete_sweeps(&mut sweep, &[(99, first, 5), (100, last, 5)]),
+            [0; 0],
+            "another one sends it"
+        );
     }
 
     #[test]
@@ -398,14 +407,14 @@ mod tests {
         samples[0].1 = Cloud::FIRST;
         samples.push((33, Cloud::LAST, 1));
         let mut sweep = SweepPoints::default();
-        assert_eq!(gathered(&mut sweep, &samples), [0; 0]);
+        assert_eq!(complete_sweeps(&mut sweep, &samples), [0; 0]);
         samples.truncate(32);
         samples[31].1 = Cloud::LAST;
-        assert_eq!(gathered(&mut sweep, &samples), [262_144]);
+        assert_eq!(complete_sweeps(&mut sweep, &samples), [262_144]);
     }
 
     #[test]
-    fn what_is_too_many_is_left_out() {
+    fn surplus_obstacles_are_dropped_and_counted() {
         let mut found = Obstacles { flags: Obstacles::COMPLETE, ..Obstacles::default() };
         (0..=MAX_OBSTACLES as u32).for_each(|points| found.push(Obstacle { points, ..Obstacle::default() }));
         assert_eq!((found.obstacles().len(), found.dropped), (MAX_OBSTACLES, 1));

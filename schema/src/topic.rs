@@ -9,10 +9,10 @@ use crate::limits::TopicLimits;
 use crate::{Failure, Kind};
 
 /// The table of topics. Calls the macro `$each` with its rows: with those of all topics, `links`: with those that a hub
-/// publishes for each link, or `makers`: with all rows in groups `MAKER { .. }`, one for each [`Maker`].
+/// publishes for each link, or `makers`: with all rows in groups `MAKER { .. }`, one for each [`PublisherKind`].
 ///
 /// A row is `VARIANT PAYLOAD, name, number, type, group, pace, ring, waiting, kept: description;`. Its columns are those
-/// of [`Row`]. A payload other than `[u8]` is a type of this crate.
+/// of [`TopicSpec`]. A payload other than `[u8]` is a type of this crate.
 ///
 /// # Examples
 ///
@@ -111,7 +111,7 @@ macro_rules! payload_type {
 
 /// Properties of a topic, other than those of its payload.
 #[derive(Clone, Copy, Debug)]
-pub struct Row {
+pub struct TopicSpec {
     /// Name, as in `front/scan`.
     pub name: &'static str,
     /// Number in datagrams and in C. A new topic gets the next free one, wherever its row is.
@@ -121,21 +121,21 @@ pub struct Row {
     /// Last byte of the topic's multicast group.
     pub group: u8,
     /// Publish rate.
-    pub pace: Pace,
+    pub publish_rate: PublishRate,
     /// Doorbell word that the hub rings after a sample.
-    pub ring: Ring,
+    pub doorbell_word: DoorbellWord,
     /// Samples that are queued for a subscriber. One more drops the oldest. The topics that a recorder must not lose
     /// have room for 1.7 s: with a queue of 16, a recorder lost 7 scans while its machine was stopped for 0.6 s.
-    pub waiting: usize,
+    pub queue_len: usize,
     /// Number of samples in the history for late joiners.
-    pub kept: usize,
+    pub history_len: usize,
     /// Returns the length in bytes of the longest payload of a topic that is created with these limits.
-    pub longest: fn(&TopicLimits) -> usize,
+    pub max_payload_len: fn(&TopicLimits) -> usize,
 }
 
 /// Publish rate of a topic.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Pace {
+pub enum PublishRate {
     /// With each scan.
     Scan,
     /// Every second, and after each change.
@@ -147,7 +147,7 @@ pub enum Pace {
 /// Words of a sensor's doorbell. There are three, so that a subscriber to `zones` need not wait for the marks of the
 /// same scan.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Ring {
+pub enum DoorbellWord {
     /// Rung as soon as telegram, scan and zones are sent.
     First,
     /// Rung after all samples of a telegram are sent.
@@ -156,9 +156,9 @@ pub enum Ring {
     Early,
 }
 
-impl Ring {
+impl DoorbellWord {
     /// All words.
-    pub const ALL: [Ring; 3] = [Ring::First, Ring::Last, Ring::Early];
+    pub const ALL: [DoorbellWord; 3] = [DoorbellWord::First, DoorbellWord::Last, DoorbellWord::Early];
 }
 
 macro_rules! rows {
@@ -176,16 +176,16 @@ macro_rules! rows {
         }
 
         /// One row for each of [`Topic::ALL`].
-        pub(super) const ROWS: [Row; Topic::ALL.len()] = [$(Row {
+        pub(super) const SPECS: [TopicSpec; Topic::ALL.len()] = [$(TopicSpec {
             name: stringify!($name),
             number: $number,
             payload: $kind,
             group: $group,
-            pace: Pace::$pace,
-            ring: Ring::$ring,
-            waiting: $waiting,
-            kept: $kept,
-            longest: <crate::payload_type!($payload) as PayloadLen>::longest,
+            publish_rate: PublishRate::$pace,
+            doorbell_word: DoorbellWord::$ring,
+            queue_len: $waiting,
+            history_len: $kept,
+            max_payload_len: <crate::payload_type!($payload) as PayloadLen>::max_payload_len,
         },)*];
     };
 }
@@ -195,17 +195,17 @@ crate::for_each_topic!(rows);
 /// Length of the longest payload of a topic.
 pub(crate) trait PayloadLen {
     /// Returns the length in bytes of the longest payload of a topic that is created with `limits`.
-    fn longest(limits: &TopicLimits) -> usize;
+    fn max_payload_len(limits: &TopicLimits) -> usize;
 }
 
 impl PayloadLen for [u8] {
-    fn longest(limits: &TopicLimits) -> usize {
+    fn max_payload_len(limits: &TopicLimits) -> usize {
         limits.telegram
     }
 }
 
 impl<P: Pod> PayloadLen for P {
-    fn longest(_limits: &TopicLimits) -> usize {
+    fn max_payload_len(_limits: &TopicLimits) -> usize {
         size_of::<P>()
     }
 }
@@ -223,13 +223,13 @@ crate::for_each_topic!(links: links);
 
 impl Topic {
     /// Returns the topic's row of the table.
-    pub const fn row(self) -> &'static Row {
-        &ROWS[self as usize]
+    pub const fn spec(self) -> &'static TopicSpec {
+        &SPECS[self as usize]
     }
 
     /// Returns the topic's name, as in `front/scan`.
     pub fn name(self) -> &'static str {
-        self.row().name
+        self.spec().name
     }
 
     /// Returns the topic called `name`.
@@ -248,7 +248,7 @@ impl Topic {
 
     /// Returns the topic's number in datagrams, from 1.
     pub fn number(self) -> u8 {
-        self.row().number
+        self.spec().number
     }
 
     /// Returns the topic with this number.
@@ -258,12 +258,12 @@ impl Topic {
 
     /// Returns the type of the payload, which is the same in all languages.
     pub fn payload(self) -> &'static str {
-        self.row().payload
+        self.spec().payload
     }
 
     /// Returns the length in bytes of the longest payload if the topic is created with `limits`.
-    pub fn longest(self, limits: &TopicLimits) -> usize {
-        (self.row().longest)(limits)
+    pub fn max_payload_len(self, limits: &TopicLimits) -> usize {
+        (self.spec().max_payload_len)(limits)
     }
 
     /// Returns the revision of the payload. A higher revision only appends fields.
@@ -293,7 +293,7 @@ pub const WAKE: &str = "wake";
 /// Reason why subscribers are woken: the ID of the event.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(usize)]
-pub enum Wake {
+pub enum WakeEvent {
     /// All samples of a telegram are sent.
     Telegram = 1,
     /// The status changed, or another sample was published without a telegram, such as zones that became unknown or a
@@ -307,7 +307,7 @@ pub enum Wake {
     Early = 5,
 }
 
-impl Wake {
+impl WakeEvent {
     /// Returns the name of the wake service of `sensor`.
     pub fn service(sensor: &str) -> String {
         service(sensor, WAKE)
@@ -316,7 +316,7 @@ impl Wake {
 
 /// Returns the sensor and topic of a service's name, or `None` if it is not one of these names. Reverses
 /// [`Topic::service`]. The wake service has no topic.
-pub fn of_service(name: &str) -> Option<(&str, Option<Topic>)> {
+pub fn parse_service_name(name: &str) -> Option<(&str, Option<Topic>)> {
     let (sensor, topic) = name.strip_prefix("scanhub/v2/")?.split_once('/')?;
     if topic == WAKE { Some((sensor, None)) } else { Some((sensor, Some(Topic::parse(topic)?))) }
 }
@@ -331,8 +331,8 @@ pub const ROBOT: &str = "robot";
 /// Returns [`Kind::Configuration`] with an example if the name is not valid.
 pub fn check_sensor(name: &str) -> Result<(), Failure> {
     if name == ROBOT {
-        let what = format!("sensor name {ROBOT:?} is not possible: it stands for all sensors");
-        return Err(Failure::new(Kind::Configuration, what, "any other name, for example front"));
+        let message = format!("sensor name {ROBOT:?} is not possible: it stands for all sensors");
+        return Err(Failure::new(Kind::Configuration, message, "any other name, for example front"));
     }
     let allowed = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_' || c == '-';
     if (1..=24).contains(&name.len()) && name.chars().all(allowed) {
@@ -351,7 +351,7 @@ pub fn check_sensor(name: &str) -> Result<(), Failure> {
 /// # Errors
 ///
 /// Returns [`Kind::Configuration`] with an example if the name is not valid.
-pub fn check_followed(name: &str) -> Result<(), Failure> {
+pub fn check_any_sensor(name: &str) -> Result<(), Failure> {
     match name.split_once('.') {
         Some((hub, sensor)) => check_sensor(hub).and_then(|()| check_sensor(sensor)),
         None => check_sensor(name),
@@ -369,7 +369,7 @@ fn service(sensor: &str, topic: &str) -> String {
 
 /// Kind of a publisher. All topics under one name have the same publisher.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Maker {
+pub enum PublisherKind {
     /// A hub, for a link; or a listener, for a link of another machine.
     Link,
     /// A program that tracks people.
@@ -380,14 +380,14 @@ pub enum Maker {
     Tilted,
 }
 
-impl Maker {
+impl PublisherKind {
     /// Returns the description of a name that has these topics.
     pub const fn name(self) -> &'static str {
         match self {
-            Maker::Link => "a sensor",
-            Maker::Tracker => "a tracker",
-            Maker::Mount => "a mount",
-            Maker::Tilted => "a cloud",
+            PublisherKind::Link => "a sensor",
+            PublisherKind::Tracker => "a tracker",
+            PublisherKind::Mount => "a mount",
+            PublisherKind::Tilted => "a cloud",
         }
     }
 }
@@ -396,13 +396,13 @@ macro_rules! makers {
     ($($maker:ident {
         $($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*
     })*) => {
-        impl Maker {
+        impl PublisherKind {
             /// All kinds.
-            pub const ALL: [Maker; [$(stringify!($maker)),*].len()] = [$(Maker::$maker),*];
+            pub const ALL: [PublisherKind; [$(stringify!($maker)),*].len()] = [$(PublisherKind::$maker),*];
 
             /// Returns its topics, in the order of [`Topic::ALL`].
             pub const fn topics(self) -> &'static [Topic] {
-                match self { $(Maker::$maker => &[$(Topic::$topic),*],)* }
+                match self { $(PublisherKind::$maker => &[$(Topic::$topic),*],)* }
             }
         }
     };
@@ -412,9 +412,9 @@ crate::for_each_topic!(makers: makers);
 
 impl Topic {
     /// Returns the kind of its publisher.
-    pub fn maker(self) -> Maker {
-        let has = |maker: &Maker| maker.topics().contains(&self);
-        Maker::ALL.into_iter().find(has).unwrap_or(Maker::Link)
+    pub fn publisher_kind(self) -> PublisherKind {
+        let has = |maker: &PublisherKind| maker.topics().contains(&self);
+        PublisherKind::ALL.into_iter().find(has).unwrap_or(PublisherKind::Link)
     }
 }
 
@@ -426,14 +426,14 @@ mod tests {
     fn service_names_go_there_and_back() {
         assert_eq!(Topic::Scan.service("front"), "scanhub/v2/front/scan");
         for topic in Topic::ALL {
-            assert_eq!(of_service(&topic.service("rear")), Some(("rear", Some(topic))));
+            assert_eq!(parse_service_name(&topic.service("rear")), Some(("rear", Some(topic))));
             assert_eq!(Topic::parse(topic.name()), Some(topic));
             assert_eq!(Topic::of_number(topic.number()), Some(topic));
         }
-        assert_eq!(of_service(&Wake::service("rear")), Some(("rear", None)));
-        assert_eq!(of_service("scanhub/v1/rear/scan"), None);
+        assert_eq!(parse_service_name(&WakeEvent::service("rear")), Some(("rear", None)));
+        assert_eq!(parse_service_name("scanhub/v1/rear/scan"), None);
         for control in [CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE] {
-            assert_eq!(of_service(control), None);
+            assert_eq!(parse_service_name(control), None);
         }
     }
 
@@ -442,16 +442,19 @@ mod tests {
         assert!(check_sensor("front_2-b").is_ok());
         for bad in ["", "Front", "a/b", "a b", "ä", ROBOT, &"a".repeat(25)] {
             assert_eq!(check_sensor(bad).map_err(|failure| failure.kind), Err(Kind::Configuration), "{bad}");
-            assert!(check_followed(bad).is_err() && check_followed(&format!("hub.{bad}")).is_err(), "{bad}");
+            assert!(
+                check_any_sensor(bad).is_err() && check_any_sensor(&format!("hub.{bad}")).is_err(),
+                "{bad}"
+            );
         }
-        assert!(check_sensor("hub.front").is_err() && check_followed("00ab.front").is_ok());
-        assert!(check_followed("front").is_ok() && check_followed("a.b.c").is_err());
+        assert!(check_sensor("hub.front").is_err() && check_any_sensor("00ab.front").is_ok());
+        assert!(check_any_sensor("front").is_ok() && check_any_sensor("a.b.c").is_err());
         assert!(is_remote("hub.front") && !is_remote("front"));
     }
 
     #[allow(unreachable_pub)]
     mod with_one_more {
-        use super::super::{Pace, PayloadLen, Ring, Row};
+        use super::super::{DoorbellWord, PayloadLen, PublishRate, TopicSpec};
 
         rows! {
             Telegram [u8], telegram, 1, "u8[]", 83, Scan, First, 16, 0: "Bytes.";
@@ -461,33 +464,43 @@ mod tests {
 
     #[test]
     fn a_row_is_all_that_a_topic_needs_here() {
-        use with_one_more::{ROWS, Topic};
+        use with_one_more::{SPECS, Topic};
         assert_eq!(Topic::ALL, [Topic::Telegram, Topic::Beat]);
-        let row = &ROWS[Topic::Beat as usize];
-        assert_eq!((row.name, row.pace, row.ring), ("beat", super::Pace::Change, super::Ring::Last));
-        assert_eq!((row.waiting, row.kept), (2, 1));
+        let row = &SPECS[Topic::Beat as usize];
+        assert_eq!(
+            (row.name, row.publish_rate, row.doorbell_word),
+            ("beat", super::PublishRate::Change, super::DoorbellWord::Last)
+        );
+        assert_eq!((row.queue_len, row.history_len), (2, 1));
         let limits = crate::limits::TopicLimits::default();
-        assert_eq!((row.longest)(&limits), size_of::<crate::Marks>());
-        assert_eq!((ROWS[0].longest)(&limits), crate::Telegram::MAX);
+        assert_eq!((row.max_payload_len)(&limits), size_of::<crate::Marks>());
+        assert_eq!((SPECS[0].max_payload_len)(&limits), crate::Telegram::MAX_LEN);
     }
 
     #[test]
-    fn names_and_types_are_unique_and_a_status_goes_where_announcements_go() {
-        let rows = super::Topic::ALL.map(super::Topic::row);
+    fn topics_are_unique_and_status_uses_announce_group() {
+        let rows = super::Topic::ALL.map(super::Topic::spec);
         for (number, row) in rows.iter().enumerate() {
             let others = &rows[..number];
             assert!(others.iter().all(|other| other.name != row.name && other.payload != row.payload));
             assert!(others.iter().all(|other| other.number != row.number));
             assert!((1..=rows.len()).contains(&row.number.into()), "readers have a table of all numbers");
         }
-        assert_eq!(super::Topic::Status.row().group, crate::datagram::Announce::GROUP);
+        assert_eq!(super::Topic::Status.spec().group, crate::datagram::Announce::GROUP);
     }
 
     #[test]
     fn every_topic_has_one_maker() {
-        let topics: Vec<Topic> = Maker::ALL.into_iter().flat_map(|maker| maker.topics()).copied().collect();
+        let topics: Vec<Topic> =
+            PublisherKind::ALL.into_iter().flat_map(|maker| maker.topics()).copied().collect();
         assert_eq!(topics, Topic::ALL);
-        assert_eq!((Topic::Early.maker(), Topic::Events.maker()), (Maker::Link, Maker::Tracker));
-        assert_eq!((Topic::Tilt.maker(), Topic::Obstacles.maker()), (Maker::Mount, Maker::Tilted));
+        assert_eq!(
+            (Topic::Early.publisher_kind(), Topic::Events.publisher_kind()),
+            (PublisherKind::Link, PublisherKind::Tracker)
+        );
+        assert_eq!(
+            (Topic::Tilt.publisher_kind(), Topic::Obstacles.publisher_kind()),
+            (PublisherKind::Mount, PublisherKind::Tilted)
+        );
     }
 }

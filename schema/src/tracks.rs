@@ -11,7 +11,7 @@ use crate::{Pose, text};
 /// Maximum number of people in a sample.
 pub const MAX_TRACKS: usize = 64;
 /// Maximum number of sensors that a sample names.
-pub const TRACK_SENSORS: usize = 32;
+pub const MAX_TRACK_SENSORS: usize = 32;
 
 /// The payload of topic `tracks`, 7432 bytes: all people at one instant, on the map of the site. The instant is the
 /// sample's `wall_ns`.
@@ -21,14 +21,14 @@ pub const TRACK_SENSORS: usize = 32;
 pub struct Tracks {
     /// Number of people, at most [`MAX_TRACKS`].
     pub count: u8,
-    /// Number of sensors of the site, at most [`TRACK_SENSORS`].
+    /// Number of sensors of the site, at most [`MAX_TRACK_SENSORS`].
     pub sensors: u8,
     /// 0.
     pub reserved: [u8; 6],
     /// The people by ID; 0 beyond `count`.
     pub track_array: [Track; MAX_TRACKS],
     /// The sensors in the order of the site; 0 beyond `sensors`.
-    pub sensor_array: [TrackSensor; TRACK_SENSORS],
+    pub sensor_array: [TrackSensor; MAX_TRACK_SENSORS],
 }
 
 /// One person.
@@ -118,7 +118,7 @@ impl Default for TrackSensor {
 impl FixedPayload for Tracks {
     const ARRAYS: &'static [UsedElements] = &[
         used_elements!(Tracks, track_array: [Track; MAX_TRACKS], count),
-        used_elements!(Tracks, sensor_array: [TrackSensor; TRACK_SENSORS], sensors),
+        used_elements!(Tracks, sensor_array: [TrackSensor; MAX_TRACK_SENSORS], sensors),
     ];
 
     fn is_valid(&self) -> bool {
@@ -127,8 +127,8 @@ impl FixedPayload for Tracks {
             let numbers = [x_m, y_m, vx_m_s, vy_m_s, score];
             are_finite(numbers.iter().chain(&track.covariance)) && u64::from(sensors) >> self.sensors == 0
         };
-        let is_placed = |sensor: &TrackSensor| are_finite(&[sensor.x_m, sensor.y_m, sensor.yaw_rad]);
-        self.tracks().iter().all(is_track) && self.sensors().iter().all(is_placed)
+        let is_sensor = |sensor: &TrackSensor| are_finite(&[sensor.x_m, sensor.y_m, sensor.yaw_rad]);
+        self.tracks().iter().all(is_track) && self.sensors().iter().all(is_sensor)
     }
 }
 
@@ -140,11 +140,11 @@ impl Tracks {
 
     /// Returns the sensors of the site.
     pub fn sensors(&self) -> &[TrackSensor] {
-        &self.sensor_array[..usize::from(self.sensors).min(TRACK_SENSORS)]
+        &self.sensor_array[..usize::from(self.sensors).min(MAX_TRACK_SENSORS)]
     }
 
     /// Returns the names of the sensors that see `track`.
-    pub fn seen_by<'a>(&'a self, track: &Track) -> impl Iterator<Item = &'a str> + use<'a> {
+    pub fn sensor_names_of<'a>(&'a self, track: &Track) -> impl Iterator<Item = &'a str> + use<'a> {
         let bits = track.sensors;
         let sensors = self.sensors().iter().enumerate();
         sensors.filter(move |(i, _)| bits >> i & 1 == 1).map(|(_, sensor)| sensor.name())
@@ -152,16 +152,16 @@ impl Tracks {
 
     /// Adds a person, unless there are [`MAX_TRACKS`] already.
     pub fn push(&mut self, track: Track) {
-        if let Some(place) = self.track_array.get_mut(usize::from(self.count)) {
-            *place = track;
+        if let Some(slot) = self.track_array.get_mut(usize::from(self.count)) {
+            *slot = track;
             self.count += 1;
         }
     }
 
-    /// Adds a sensor of the site, unless there are [`TRACK_SENSORS`] already.
+    /// Adds a sensor of the site, unless there are [`MAX_TRACK_SENSORS`] already.
     pub fn push_sensor(&mut self, sensor: TrackSensor) {
-        if let Some(place) = self.sensor_array.get_mut(usize::from(self.sensors)) {
-            *place = sensor;
+        if let Some(slot) = self.sensor_array.get_mut(usize::from(self.sensors)) {
+            *slot = sensor;
             self.sensors += 1;
         }
     }
@@ -269,7 +269,7 @@ impl Event {
     }
 
     /// Adds the door and the rooms on both sides of it.
-    pub fn through(mut self, door: &str, from: &str, to: &str) -> Event {
+    pub fn with_door(mut self, door: &str, from: &str, to: &str) -> Event {
         text::write(&mut self.door_text, door);
         text::write(&mut self.from_text, from);
         text::write(&mut self.to_text, to);
@@ -313,7 +313,7 @@ mod tests {
         assert_eq!((tracks.tracks().len(), tracks.sensors().len()), (1, 2));
         let track = &tracks.tracks()[0];
         assert_eq!((track.room_name(), track.state()), (Some("hall"), TrackState::BetweenRooms));
-        assert!(tracks.seen_by(track).eq(["kitchen.rear"]));
+        assert!(tracks.sensor_names_of(track).eq(["kitchen.rear"]));
         for (number, state) in TrackState::ALL.into_iter().enumerate() {
             assert_eq!(state as usize, number);
         }
@@ -321,22 +321,22 @@ mod tests {
     }
 
     #[test]
-    fn what_is_too_many_is_left_out() {
+    fn surplus_tracks_and_sensors_are_dropped() {
         let mut tracks = Tracks::default();
         (0..=MAX_TRACKS as u64).for_each(|id| tracks.push(Track { id, ..Track::default() }));
-        (0..=TRACK_SENSORS).for_each(|_| tracks.push_sensor(TrackSensor::default()));
-        assert_eq!((tracks.tracks().len(), tracks.sensors().len()), (MAX_TRACKS, TRACK_SENSORS));
+        (0..=MAX_TRACK_SENSORS).for_each(|_| tracks.push_sensor(TrackSensor::default()));
+        assert_eq!((tracks.tracks().len(), tracks.sensors().len()), (MAX_TRACKS, MAX_TRACK_SENSORS));
         assert_eq!(tracks.tracks()[MAX_TRACKS - 1].id, MAX_TRACKS as u64 - 1);
     }
 
     #[test]
-    fn an_event_says_what_it_was_made_of() {
+    fn event_reports_its_kind_room_and_door() {
         let appeared = Event::new(EventKind::Appeared, 3, None);
         assert_eq!(
             (appeared.kind(), appeared.room_name(), appeared.door()),
             (Some(EventKind::Appeared), None, None)
         );
-        let door = Event::new(EventKind::Door, 3, Some("kitchen")).through("left", "hall", "kitchen");
+        let door = Event::new(EventKind::Door, 3, Some("kitchen")).with_door("left", "hall", "kitchen");
         assert_eq!((door.room_name(), door.door()), (Some("kitchen"), Some(("left", "hall", "kitchen"))));
         for (number, kind) in EventKind::ALL.into_iter().enumerate() {
             assert_eq!((kind as usize, EventKind::of_number(number as u8)), (number, Some(kind)));

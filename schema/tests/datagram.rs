@@ -9,25 +9,25 @@ mod values;
 mod vectors;
 
 use scanhub_schema::Family;
-use scanhub_schema::datagram::{Datagram, DatagramError, HEAD, Head, LanFlags, MTU_LEAST, MTU_SAFE};
+use scanhub_schema::datagram::{Datagram, DatagramError, HEADER_LEN, Head, LanFlags, MIN_MTU, MTU_SAFE};
 use vectors::{Vector, bytes as vector, vectors};
 
 /// Changes a datagram and makes its checksum right again.
-fn with(datagram: &[u8], change: impl FnOnce(&mut Vec<u8>)) -> Vec<u8> {
+fn changed(datagram: &[u8], change: impl FnOnce(&mut Vec<u8>)) -> Vec<u8> {
     let mut bytes = datagram.to_vec();
     change(&mut bytes);
-    bytes[CRC_AT..HEAD].fill(0);
+    bytes[CRC_OFFSET..HEADER_LEN].fill(0);
     let crc = crc::Crc::<u32>::new(&crc::CRC_32_ISCSI).checksum(&bytes);
-    bytes[CRC_AT..HEAD].copy_from_slice(&crc.to_le_bytes());
+    bytes[CRC_OFFSET..HEADER_LEN].copy_from_slice(&crc.to_le_bytes());
     bytes
 }
 
 #[test]
 fn values_are_these_bytes() {
     let mut built = 0;
-    for (name, head, pack) in values::ALL {
+    for (name, head, pack) in values::GOLDEN_DATAGRAMS {
         let mut buffer = [0xAA; MTU_SAFE];
-        let len = pack(&mut buffer[HEAD..]).unwrap_or_else(|| panic!("{name} does not fit"));
+        let len = pack(&mut buffer[HEADER_LEN..]).unwrap_or_else(|| panic!("{name} does not fit"));
         let datagram = head.seal(&mut buffer, len).expect("there is room");
         assert_eq!(datagram, vector(name), "{name}");
         built += 1;
@@ -37,26 +37,27 @@ fn values_are_these_bytes() {
 
 #[test]
 fn a_later_hub_appends() {
-    let zones = Head { sequence: 5003, ..values::ZONES };
-    let datagram = sealed(zones, &vector("zones")[HEAD..]);
-    let header = with(&datagram, |bytes| {
+    let zones = Head { sequence: 5003, ..values::ZONES_HEAD };
+    let datagram = sealed_datagram(zones, &vector("zones")[HEADER_LEN..]);
+    let header = changed(&datagram, |bytes| {
         bytes[5] = 56;
-        bytes.splice(HEAD..HEAD, 0xA0..0xA8);
+        bytes.splice(HEADER_LEN..HEADER_LEN, 0xA0..0xA8);
     });
     assert_eq!(header, vector("longer_header"));
-    let payload = [&vector("zones")[HEAD..], b"later"].concat();
-    let datagram = sealed(Head { sequence: 5004, revision: 2, ..values::ZONES }, &payload);
+    let payload = [&vector("zones")[HEADER_LEN..], b"later"].concat();
+    let datagram = sealed_datagram(Head { sequence: 5004, revision: 2, ..values::ZONES_HEAD }, &payload);
     assert_eq!(datagram, vector("longer_payload"));
 }
 
 /// The MAC is the first 16 bytes of HMAC-SHA256 under the list's key, over the datagram before it with a CRC of 0.
 #[test]
 fn the_mac_stands_behind_the_payload() {
-    const OF_KEY: [u8; 16] =
+    const KEY_BYTES: [u8; 16] =
         [0x1F, 0xA1, 0xF0, 0x6A, 0x94, 0xBD, 0x5B, 0x68, 0xBA, 0xC5, 0xCD, 0x71, 0xBC, 0x76, 0x3E, 0x48];
-    let plain = sealed(Head { sequence: 5002, ..values::ZONES }, &vector("zones")[HEAD..]);
-    for (name, mac) in [("authenticated", OF_KEY), ("mac", [0; 16])] {
-        let datagram = with(&plain, |bytes| {
+    let plain =
+        sealed_datagram(Head { sequence: 5002, ..values::ZONES_HEAD }, &vector("zones")[HEADER_LEN..]);
+    for (name, mac) in [("authenticated", KEY_BYTES), ("mac", [0; 16])] {
+        let datagram = changed(&plain, |bytes| {
             bytes[7] |= LanFlags::AUTHENTICATED;
             bytes.extend(mac);
         });
@@ -70,10 +71,10 @@ fn the_mac_stands_behind_the_payload() {
 fn parts_of_a_scan_are_these_bytes() {
     let scan = vector("scan");
     let whole = Datagram::read(&scan).unwrap();
-    let parts: Vec<&[u8]> = whole.payload.chunks(MTU_LEAST - HEAD).collect();
+    let parts: Vec<&[u8]> = whole.payload.chunks(MIN_MTU - HEADER_LEN).collect();
     for (part, payload) in parts.iter().enumerate() {
         let head = Head { part: part as u8, parts: parts.len() as u8, ..whole.head };
-        assert_eq!(sealed(head, payload), vector(&format!("scan_part_{part}")));
+        assert_eq!(sealed_datagram(head, payload), vector(&format!("scan_part_{part}")));
     }
     assert_eq!(parts.len(), 3);
 }
@@ -81,23 +82,26 @@ fn parts_of_a_scan_are_these_bytes() {
 #[test]
 fn refusals_are_these_bytes() {
     let zones = vector("zones");
-    let numbered = |head: Head| sealed(head, &zones[HEAD..]);
+    let numbered = |head: Head| sealed_datagram(head, &zones[HEADER_LEN..]);
     let expected = [
         ("short", zones[..47].to_vec()),
-        ("magic", with(&zones, |bytes| bytes[3] = b'P')),
-        ("version", with(&zones, |bytes| bytes[4] = 1)),
-        ("header", with(&zones, |bytes| bytes[5] = 47)),
-        ("header_beyond", with(&zones, |bytes| bytes[5] = 77)),
-        ("header_part", with(&zones, |bytes| bytes[33..35].fill(2))),
-        ("length", with(&zones, |bytes| bytes.push(0))),
+        ("magic", changed(&zones, |bytes| bytes[3] = b'P')),
+        ("version", changed(&zones, |bytes| bytes[4] = 1)),
+        ("header", changed(&zones, |bytes| bytes[5] = 47)),
+        ("header_beyond", changed(&zones, |bytes| bytes[5] = 77)),
+        ("header_part", changed(&zones, |bytes| bytes[33..35].fill(2))),
+        ("length", changed(&zones, |bytes| bytes.push(0))),
         ("unauthenticated", zones.clone()),
-        ("epoch", numbered(Head { sequence: 5001, epoch: values::ZONES.epoch - 1, ..values::ZONES })),
-        ("twin", numbered(Head { sequence: 5001, ..values::ZONES })),
-        ("stale", numbered(Head { sequence: 5000 - 1024, ..values::ZONES })),
-        ("capacity", numbered(Head { hub: 0xFEDC_BA98_7654_3210, ..values::ZONES })),
-        ("skipped", numbered(Head { topic: 255, ..values::ZONES })),
-        ("payload", with(&zones, |bytes| bytes[HEAD + 1] = 3)),
-        ("revision", numbered(Head { revision: 0, ..values::ZONES })),
+        (
+            "epoch",
+            numbered(Head { sequence: 5001, epoch: values::ZONES_HEAD.epoch - 1, ..values::ZONES_HEAD }),
+        ),
+        ("twin", numbered(Head { sequence: 5001, ..values::ZONES_HEAD })),
+        ("stale", numbered(Head { sequence: 5000 - 1024, ..values::ZONES_HEAD })),
+        ("capacity", numbered(Head { hub: 0xFEDC_BA98_7654_3210, ..values::ZONES_HEAD })),
+        ("skipped", numbered(Head { topic: 255, ..values::ZONES_HEAD })),
+        ("payload", changed(&zones, |bytes| bytes[HEADER_LEN + 1] = 3)),
+        ("revision", numbered(Head { revision: 0, ..values::ZONES_HEAD })),
     ];
     for (name, datagram) in &expected {
         assert_eq!(*datagram, vector(name), "{name}");
@@ -110,15 +114,15 @@ fn refusals_are_these_bytes() {
 /// Which datagrams a receiver refuses although their bytes are right is tested in `clients/network/tests/golden.rs`.
 #[test]
 fn these_bytes_are_values_or_refused() {
-    for Vector { name, bytes, says } in vectors() {
+    for Vector { name, bytes, description } in vectors() {
         let checked = Datagram::read(&bytes).and_then(|datagram| {
             datagram.check_payload()?;
             Ok(datagram)
         });
-        match (says["refusal"].as_str(), checked) {
+        match (description["refusal"].as_str(), checked) {
             (None, Ok(datagram)) => {
-                assert_eq!(says::head(&datagram), says["head"], "{name}");
-                assert_eq!(says::payload(&datagram), says["payload"], "{name}");
+                assert_eq!(says::head(&datagram), description["head"], "{name}");
+                assert_eq!(says::payload(&datagram), description["payload"], "{name}");
             }
             (None, Err(refused)) => panic!("{name}: {refused:?}"),
             (Some(refusal), Err(refused)) => assert_eq!(refused.name(), refusal, "{name}"),
@@ -136,7 +140,11 @@ fn every_reason_has_its_datagram() {
     let vectors = vectors();
     // When a datagram was sent again is nothing that its bytes say.
     for reason in DatagramError::ALL.into_iter().filter(|reason| *reason != DatagramError::Untimely) {
-        assert!(vectors.iter().any(|vector| vector.says["refusal"] == reason.name()), "{}", reason.name());
+        assert!(
+            vectors.iter().any(|vector| vector.description["refusal"] == reason.name()),
+            "{}",
+            reason.name()
+        );
     }
 }
 
@@ -158,7 +166,7 @@ fn the_page_shows_these_bytes() {
         assert_eq!(row[0].parse(), Ok(end), "{row:?}");
         end += row[1].parse::<usize>().unwrap();
     }
-    assert_eq!(end, HEAD);
+    assert_eq!(end, HEADER_LEN);
     let families = Family::ALL.map(|family| format!("{} {}", family as u8, family.name())).join(", ");
     assert!(section("Header").contains(&families), "{families}");
     let is_datagram = |row: &&Vec<&str>| row[0].starts_with('`');
@@ -166,7 +174,7 @@ fn the_page_shows_these_bytes() {
     let sizes =
         sizes.iter().filter(is_datagram).map(|row| (row[0].trim_matches('`'), row[1].parse().unwrap()));
     let vectors = vectors();
-    let sound = vectors.iter().filter(|vector| vector.says["refusal"].is_null());
+    let sound = vectors.iter().filter(|vector| vector.description["refusal"].is_null());
     assert!(sizes.eq(sound.map(|vector| (vector.name.as_str(), vector.bytes.len()))));
     let example =
         vector("zones").chunks(16).enumerate().fold(String::from("text\n"), |lines, (number, bytes)| {
@@ -179,11 +187,11 @@ fn the_page_shows_these_bytes() {
     assert!(reasons.eq(DatagramError::ALL.map(DatagramError::name)));
 }
 
-fn sealed(head: Head, payload: &[u8]) -> Vec<u8> {
+fn sealed_datagram(head: Head, payload: &[u8]) -> Vec<u8> {
     let mut buffer = [0; MTU_SAFE];
-    buffer[HEAD..HEAD + payload.len()].copy_from_slice(payload);
+    buffer[HEADER_LEN..HEADER_LEN + payload.len()].copy_from_slice(payload);
     head.seal(&mut buffer, payload.len()).unwrap().to_vec()
 }
 
 /// Where the checksum stands.
-const CRC_AT: usize = 44;
+const CRC_OFFSET: usize = 44;

@@ -4,8 +4,8 @@
 
 use std::collections::BTreeMap;
 
-use scanhub_schema::datagram::Packed;
-use scanhub_schema::file::{Writer, parts};
+use scanhub_schema::datagram::DatagramPayload;
+use scanhub_schema::file::{Writer, split_message};
 use scanhub_schema::{Flags, Header, Topic, Zones};
 
 fn header(seq: u64, topic_seq: u64) -> Header {
@@ -26,17 +26,17 @@ fn header(seq: u64, topic_seq: u64) -> Header {
 }
 
 /// The reply to a request to be quiet (Telegram listing 7.11), with its CRC.
-const TELEGRAM: [u8; 9] = [0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A];
+const TELEGRAM_BYTES: [u8; 9] = [0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A];
 
 fn recording() -> Vec<u8> {
     let facts = BTreeMap::from([("domain".to_owned(), "scanhub".to_owned())]);
     let mut writer = Writer::begin(Vec::new(), "", facts).unwrap();
     let mut room = [0; 256];
     let len = Zones::unknown().pack(&mut room).unwrap();
-    writer.sample("rear", Topic::Telegram, &header(40, 40), &TELEGRAM).unwrap();
-    writer.sample("rear", Topic::Zones, &header(40, 7), &room[..len]).unwrap();
+    writer.write_sample("rear", Topic::Telegram, &header(40, 40), &TELEGRAM_BYTES).unwrap();
+    writer.write_sample("rear", Topic::Zones, &header(40, 7), &room[..len]).unwrap();
     writer.close_chunk().unwrap();
-    writer.sample("rear", Topic::Telegram, &header(43, 43), &TELEGRAM).unwrap();
+    writer.write_sample("rear", Topic::Telegram, &header(43, 43), &TELEGRAM_BYTES).unwrap();
     writer.finish().unwrap()
 }
 
@@ -54,12 +54,12 @@ fn values_are_these_bytes() {
 fn others_read_it() {
     let recording = recording();
     let messages: Vec<_> = mcap::MessageStream::new(&recording).unwrap().map(Result::unwrap).collect();
-    let said: Vec<_> = messages.iter().map(|m| (m.channel.topic.as_str(), m.sequence)).collect();
-    assert_eq!(said, [("rear/telegram", 40), ("rear/zones", 7), ("rear/telegram", 43)]);
+    let messages_read: Vec<_> = messages.iter().map(|m| (m.channel.topic.as_str(), m.sequence)).collect();
+    assert_eq!(messages_read, [("rear/telegram", 40), ("rear/zones", 7), ("rear/telegram", 43)]);
     assert_eq!(messages[0].data[..64], *bytemuck::bytes_of(&header(40, 40)));
-    assert_eq!(messages[0].data[64..], TELEGRAM);
-    assert_eq!(parts(&messages[0].data), Some((header(40, 40), &TELEGRAM[..])));
-    assert_eq!(parts(&messages[0].data[..63]), None);
+    assert_eq!(messages[0].data[64..], TELEGRAM_BYTES);
+    assert_eq!(split_message(&messages[0].data), Some((header(40, 40), &TELEGRAM_BYTES[..])));
+    assert_eq!(split_message(&messages[0].data[..63]), None);
     let schema = messages[1].channel.schema.as_ref().unwrap();
     assert_eq!((schema.name.as_str(), schema.encoding.as_str()), ("scanhub.Zones.v2", "scanhub.v2"));
 }
@@ -67,8 +67,8 @@ fn others_read_it() {
 /// What was closed is there although nothing follows, as after a kill.
 #[test]
 fn a_closed_chunk_outlives_its_writer() {
-    struct Disk<'a>(&'a mut Vec<u8>);
-    impl std::io::Write for Disk<'_> {
+    struct FullDisk<'a>(&'a mut Vec<u8>);
+    impl std::io::Write for FullDisk<'_> {
         fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
             self.0.extend_from_slice(bytes);
             Ok(bytes.len())
@@ -78,10 +78,10 @@ fn a_closed_chunk_outlives_its_writer() {
         }
     }
     let mut disk = Vec::new();
-    let mut writer = Writer::begin(Disk(&mut disk), "", BTreeMap::new()).unwrap();
-    writer.sample("rear", Topic::Telegram, &header(40, 40), &TELEGRAM).unwrap();
+    let mut writer = Writer::begin(FullDisk(&mut disk), "", BTreeMap::new()).unwrap();
+    writer.write_sample("rear", Topic::Telegram, &header(40, 40), &TELEGRAM_BYTES).unwrap();
     writer.close_chunk().unwrap();
-    writer.sample("rear", Topic::Telegram, &header(41, 41), &TELEGRAM).unwrap();
+    writer.write_sample("rear", Topic::Telegram, &header(41, 41), &TELEGRAM_BYTES).unwrap();
     std::mem::forget(writer);
     let found = mcap::MessageStream::new_with_options(&disk, mcap::read::Options::IgnoreEndMagic.into())
         .unwrap()

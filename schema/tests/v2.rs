@@ -4,12 +4,12 @@
 use std::mem::{offset_of, size_of};
 
 use scanhub_schema::{
-    Background, BackgroundHead, BackgroundWord, COUNTERS, Cloud, CloudHead, CloudPoint, CloudWord, Code,
-    Contents, Corner, Counter, Counters, Early, Event, EventKind, Failure, Family, Foreground,
-    ForegroundHead, ForegroundWord, Header, Kind, Line, Lines, MAX_BEAMS, MAX_LINES, MAX_OBSTACLES,
-    MAX_SEGMENTS, MAX_TRACKS, Mark, Marks, Motion, MotionMethod, Obstacle, Obstacles, PointClass, Pose,
-    Request, Response, Scan, ScanHead, ScanWord, Segment, Shown, State, Status, TRACK_SENSORS, Tilt, Track,
-    TrackSensor, TrackState, Tracks, Verb, Verdict, Zone, Zones,
+    ArrayFlags, Background, BackgroundHead, BackgroundWord, Cloud, CloudHead, CloudPoint, CloudWord, Code,
+    Corner, Counter, Counters, Early, Event, EventKind, Failure, Family, Foreground, ForegroundHead,
+    ForegroundWord, Header, Kind, Line, Lines, MAX_BEAMS, MAX_COUNTERS, MAX_LINES, MAX_OBSTACLES,
+    MAX_SEGMENTS, MAX_TRACK_SENSORS, MAX_TRACKS, Mark, Marks, Motion, MotionMethod, Obstacle, Obstacles,
+    PointClass, Pose, Request, Response, ResponseModel, Scan, ScanHead, ScanWord, Segment, State, Status,
+    Tilt, Track, TrackSensor, TrackState, Tracks, Verb, Verdict, Zone, Zones,
 };
 
 /// Builds the expected bytes: `size` zeros with `fields` written over them.
@@ -22,7 +22,7 @@ fn golden(size: usize, fields: &[(usize, &[u8])]) -> Vec<u8> {
 }
 
 /// Returns the bytes with this name that readers in other languages use.
-fn shared(name: &str) -> Vec<u8> {
+fn read_vector(name: &str) -> Vec<u8> {
     let lines = include_str!("../../tests/vectors/v2/bytes.txt").lines();
     let digits = lines.filter_map(|line| line.split_once(' ')).find(|(of, _)| *of == name);
     let (_, digits) = digits.unwrap_or_else(|| panic!("no bytes {name}"));
@@ -83,7 +83,7 @@ fn header_bytes() {
         ],
     );
     assert_eq!(bytemuck::bytes_of(&header), expected);
-    assert_eq!(shared("header"), expected);
+    assert_eq!(read_vector("header"), expected);
 }
 
 #[test]
@@ -111,7 +111,7 @@ fn marks_bytes() {
     };
     let mark = [0xFE, 0xFF, 0xFF, 0xFF, 3, 2, 1, 0, 5, 4, 7, 1, 6, 1, 8, 1];
     assert_eq!(bytemuck::bytes_of(&marks), golden(1028, &[(0, &[64, 3]), (1012, &mark)]));
-    assert_eq!(bytemuck::bytes_of(&marks), shared("marks"));
+    assert_eq!(bytemuck::bytes_of(&marks), read_vector("marks"));
 }
 
 #[test]
@@ -142,7 +142,7 @@ fn zones_bytes() {
     let head = [1, 2, 2, 1, 5, 4, 3, 0, 6, 1, 1, 0];
     let expected = golden(76, &[(0, &head), (20, &[0x58, 0x02, 7, 1, 1])]);
     assert_eq!(bytemuck::bytes_of(&zones), expected);
-    assert_eq!(shared("zones"), expected);
+    assert_eq!(read_vector("zones"), expected);
 }
 
 #[test]
@@ -183,7 +183,7 @@ fn foreground_bytes() {
         ],
     );
     assert_eq!(foreground.bytes(), expected);
-    assert_eq!(shared("foreground"), expected);
+    assert_eq!(read_vector("foreground"), expected);
 }
 
 #[test]
@@ -221,14 +221,14 @@ fn background_bytes() {
         ],
     );
     assert_eq!(model.bytes(), expected);
-    assert_eq!(shared("background"), expected);
+    assert_eq!(read_vector("background"), expected);
     assert_eq!(Background::read(&expected), Some(model));
 }
 
 #[test]
 fn status_layout() {
     assert_eq!((size_of::<Status>(), align_of::<Status>()), (592, 8));
-    assert_eq!((size_of::<Counters>(), COUNTERS), (224, 28));
+    assert_eq!((size_of::<Counters>(), MAX_COUNTERS), (224, 28));
     assert_eq!(offset_of!(Status, state), 0);
     assert_eq!(offset_of!(Status, mode), 1);
     assert_eq!(offset_of!(Status, unit_mm), 2);
@@ -288,7 +288,7 @@ fn status_bytes() {
         ],
     );
     assert_eq!(bytemuck::bytes_of(&status), expected);
-    assert_eq!(shared("status"), expected);
+    assert_eq!(read_vector("status"), expected);
 }
 
 #[test]
@@ -326,7 +326,7 @@ fn request_bytes() {
         ],
     );
     assert_eq!(request.encode(), expected);
-    assert_eq!(shared("request"), expected);
+    assert_eq!(read_vector("request"), expected);
     assert_eq!(Request::decode(&expected), Some(request));
 }
 
@@ -339,9 +339,9 @@ fn response_bytes() {
         golden(34, &[(8, &0.5_f64.to_le_bytes()), (20, &[0xE8, 3, 0, 0, 1, 0, 1]), (32, &[0x34, 0x12])]);
     let shown = Response(Ok(Some(model.clone().into())));
     assert_eq!(shown.encode(), [&[0; 4], &bytes[..]].concat());
-    let kept = Response(Ok(Some(Shown { model, kept_wall_ns: Some(17) })));
+    let kept = Response(Ok(Some(ResponseModel { model, kept_wall_ns: Some(17) })));
     assert_eq!(kept.encode(), [&[0, 0, 2, 0, b'1', b'7'], &bytes[..]].concat());
-    let refused = Response(Err(Failure::new(Kind::Short, "busy", "wait")));
+    let refused = Response(Err(Failure::new(Kind::ResourceExhausted, "busy", "wait")));
     assert_eq!(refused.encode(), b"\x4b\0\x09\0busy\nwait");
 }
 
@@ -359,7 +359,7 @@ fn scan_layout() {
     assert_eq!((offset_of!(ScanHead, intensity_bits), offset_of!(ScanHead, turns)), (45, 46));
     assert_eq!((offset_of!(ScanHead, reserved), offset_of!(ScanHead, turn_ns)), (47, 48));
     assert_eq!(offset_of!(ScanHead, reserved2), 52);
-    assert_eq!([Contents::UPPER, Contents::WIDE, Contents::ANGLES, Scan::INCOMPLETE], [1, 2, 4, 1]);
+    assert_eq!([ArrayFlags::UPPER, ArrayFlags::WIDE, ArrayFlags::ANGLES, Scan::INCOMPLETE], [1, 2, 4, 1]);
     assert_eq!([0, 1, 2, 4, 7].map(|contents| Scan::len(100, contents)), [264, 364, 464, 664, 964]);
 }
 
@@ -387,7 +387,7 @@ fn the_bytes_of_a_scan_of_the_lms() {
         ],
     );
     assert_eq!(scan.bytes(), expected);
-    assert_eq!(shared("scan"), expected);
+    assert_eq!(read_vector("scan"), expected);
 }
 
 /// A clockwise scan with exact angles, a missing packet, and all values of a beam.
@@ -406,7 +406,7 @@ fn the_bytes_of_a_scan_of_a_turn() {
         collisions: 0x0506,
         family: Family::Ld as u8,
         flags: Scan::INCOMPLETE,
-        contents: Contents::ANGLES | Contents::WIDE,
+        contents: ArrayFlags::ANGLES | ArrayFlags::WIDE,
         intensity_bits: 12,
         turns: 1,
         ..ScanHead::default()
@@ -431,7 +431,7 @@ fn the_bytes_of_a_scan_of_a_turn() {
         ],
     );
     assert_eq!(scan.bytes(), expected);
-    assert_eq!(shared("scan_turn"), expected);
+    assert_eq!(read_vector("scan_turn"), expected);
 }
 
 /// Meanings of values above the ranges: those of an LMS, and those of all other families.
@@ -479,7 +479,7 @@ fn early_bytes() {
     };
     let expected = golden(12, &[(0, &[2, 1, 2, 1, 6, 5, 4, 3, 8, 7, 0x0A, 9])]);
     assert_eq!(bytemuck::bytes_of(&early), expected);
-    assert_eq!(bytemuck::bytes_of(&early), shared("early"));
+    assert_eq!(bytemuck::bytes_of(&early), read_vector("early"));
 }
 
 #[test]
@@ -538,7 +538,7 @@ fn lines_bytes() {
     let head = [64, 64, 1, 0, 2, 1, 4, 3, 0, 0, 0x80, 0x3F];
     let expected = golden(3340, &[(0, &head), (12 + 63 * 40, &line), (2572 + 63 * 12, &corner)]);
     assert_eq!(bytemuck::bytes_of(&lines), expected);
-    assert_eq!(bytemuck::bytes_of(&lines), shared("lines"));
+    assert_eq!(bytemuck::bytes_of(&lines), read_vector("lines"));
 }
 
 #[test]
@@ -596,7 +596,7 @@ fn motion_bytes() {
         ],
     );
     assert_eq!(bytemuck::bytes_of(&motion), expected);
-    assert_eq!(shared("motion"), expected);
+    assert_eq!(read_vector("motion"), expected);
 }
 
 #[test]
@@ -610,7 +610,7 @@ fn tilt_bytes() {
     let tilt = Tilt { angle_rad: -0.5, rate_rad_s: 2.0 };
     let expected = golden(16, &[(6, &[0xE0, 0xBF]), (15, &[0x40])]);
     assert_eq!(bytemuck::bytes_of(&tilt), expected);
-    assert_eq!(bytemuck::bytes_of(&tilt), shared("tilt"));
+    assert_eq!(bytemuck::bytes_of(&tilt), read_vector("tilt"));
 }
 
 #[test]
@@ -640,7 +640,7 @@ fn cloud_bytes() {
     let point = [0, 0, 0x80, 0x3F, 0, 0, 0x80, 0xBF, 0, 0, 0, 0x3F, 2, 1, 3];
     let expected = golden(48, &[(0, &[4, 3, 2, 1, 8, 7, 6, 5, 2, 0, 15]), (32, &point)]);
     assert_eq!(cloud.bytes(), expected);
-    assert_eq!(cloud.bytes(), shared("cloud"));
+    assert_eq!(cloud.bytes(), read_vector("cloud"));
 }
 
 #[test]
@@ -683,12 +683,12 @@ fn obstacles_bytes() {
     let head = [4, 3, 2, 1, 8, 7, 6, 5, 0x0C, 0x0B, 0x0A, 9, 64, 12];
     let expected = golden(3088, &[(0, &head[..]), (16 + 63 * 48, &obstacle)]);
     assert_eq!(bytemuck::bytes_of(&found), expected);
-    assert_eq!(bytemuck::bytes_of(&found), shared("obstacles"));
+    assert_eq!(bytemuck::bytes_of(&found), read_vector("obstacles"));
 }
 
 #[test]
 fn tracks_layout() {
-    assert_eq!((size_of::<Tracks>(), align_of::<Tracks>(), MAX_TRACKS, TRACK_SENSORS), (7432, 8, 64, 32));
+    assert_eq!((size_of::<Tracks>(), align_of::<Tracks>(), MAX_TRACKS, MAX_TRACK_SENSORS), (7432, 8, 64, 32));
     assert_eq!(
         (offset_of!(Tracks, count), offset_of!(Tracks, sensors), offset_of!(Tracks, reserved)),
         (0, 1, 2)
@@ -748,13 +748,13 @@ fn tracks_bytes() {
     let fields = [(0, &[64, 32][..]), (last, &bytes), (last + 72, &[3]), (5128 + 31 * 72, &sensor)];
     let expected = golden(7432, &fields);
     assert_eq!(bytemuck::bytes_of(&tracks), expected);
-    assert_eq!(bytemuck::bytes_of(&tracks), shared("tracks"));
+    assert_eq!(bytemuck::bytes_of(&tracks), read_vector("tracks"));
 }
 
 #[test]
 fn event_bytes() {
     let event = Event::new(EventKind::Door, 0x0102_0304_0506_0708, Some("kitchen"))
-        .through("left", "hall", "kitchen");
+        .with_door("left", "hall", "kitchen");
     let fields = [
         (0, &[8, 7, 6, 5, 4, 3, 2, 1, 2][..]),
         (16, b"kitchen"),
@@ -763,5 +763,5 @@ fn event_bytes() {
         (88, b"kitchen"),
     ];
     assert_eq!(bytemuck::bytes_of(&event), golden(112, &fields));
-    assert_eq!(bytemuck::bytes_of(&event), shared("event"));
+    assert_eq!(bytemuck::bytes_of(&event), read_vector("event"));
 }

@@ -1,8 +1,10 @@
 //! What has to hold whatever a network carries: datagrams are refused, or they say what can be said again.
 
-use scanhub_network::lan::{EvictedTotals, Fresh, GatewayTable, MAX_ROWS};
+use scanhub_network::lan::{EvictedTotals, GatewayTable, MAX_ROWS, SequenceStatus};
 use scanhub_schema::Topic;
-use scanhub_schema::datagram::{Announce, Datagram, DatagramError, HEAD, Head, MTU_ETHERNET, Packed};
+use scanhub_schema::datagram::{
+    Announce, Datagram, DatagramError, DatagramPayload, HEADER_LEN, Head, MTU_ETHERNET,
+};
 
 /// Any datagrams, one after the other: each is counted once, what is refused changes nothing, and what is not, can be
 /// said again.
@@ -10,7 +12,7 @@ use scanhub_schema::datagram::{Announce, Datagram, DatagramError, HEAD, Head, MT
 /// A piece begins with a byte and its length in two more. Odd: a header in short and a payload, to which a checksum is
 /// made; even: a datagram as it is.
 pub(crate) fn lan(data: &[u8]) {
-    let mut account = Box::new(GatewayTable::new(&Topic::ALL));
+    let mut table = Box::new(GatewayTable::new(&Topic::ALL));
     let mut rest = data;
     let (mut given, mut accepted) = (0, 0);
     while let [mode, low, high, after @ ..] = rest {
@@ -18,51 +20,51 @@ pub(crate) fn lan(data: &[u8]) {
         let (piece, after) = after.split_at(len);
         rest = after;
         let mut buffer = [0; MTU_ETHERNET];
-        let bytes = if mode & 1 == 0 { Some(piece) } else { sealed(piece, &mut buffer) };
+        let bytes = if mode & 1 == 0 { Some(piece) } else { sealed_datagram(piece, &mut buffer) };
         let Some(bytes) = bytes else { continue };
-        let before = figures(&account);
+        let before = counters(&table);
         // From one of two senders, half a second later.
         let (from, now_ns) = (u64::from(mode >> 1 & 1), 500_000_000 * given);
-        let result = account.receive(bytes, from, now_ns);
+        let result = table.receive(bytes, from, now_ns);
         given += 1;
         match result {
             Ok((datagram, fresh)) => {
                 accepted += 1;
                 assert_eq!(Datagram::read(bytes), Ok(datagram));
                 assert!(datagram.check_payload().is_ok());
-                can_be_said_again(&datagram);
-                is_seen_if_damaged(bytes, data);
+                can_be_reencoded(&datagram);
+                is_damage_detected(bytes, data);
                 assert_ne!(
-                    account.receive(bytes, from, now_ns).map(|(_, again)| again),
-                    Ok(Fresh::New),
+                    table.receive(bytes, from, now_ns).map(|(_, again)| again),
+                    Ok(SequenceStatus::New),
                     "{fresh:?} and new again"
                 );
                 given += 1;
                 accepted += 1;
             }
             Err(refusal) => {
-                assert_eq!(figures(&account), before, "{refusal:?}");
+                assert_eq!(counters(&table), before, "{refusal:?}");
                 let read = Datagram::read(bytes).map(|_| ());
                 assert!(read == Err(refusal) || read.is_ok() && refusal > DatagramError::Crc, "{refusal:?}");
             }
         }
     }
-    let refused: u64 = DatagramError::ALL.iter().map(|&refusal| account.refused(refusal)).sum();
-    let given_up = account.evicted();
-    let in_rows: u64 = account.rows().map(|row| row.received + row.duplicate).sum();
+    let refused: u64 = DatagramError::ALL.iter().map(|&refusal| table.refused(refusal)).sum();
+    let given_up = table.evicted();
+    let in_rows: u64 = table.rows().map(|row| row.received + row.duplicate).sum();
     let counted = in_rows + given_up.received + given_up.duplicate;
     assert_eq!((given, accepted), (counted + refused, counted));
-    assert!(account.rows().count() <= MAX_ROWS);
+    assert!(table.rows().count() <= MAX_ROWS);
 }
 
 /// Received, lost, duplicate and reordered of each row, and what was given up.
-fn figures(account: &GatewayTable) -> (Vec<[u64; 4]>, EvictedTotals) {
-    let rows = account.rows().map(|row| [row.received, row.lost(), row.duplicate, row.reordered]);
-    (rows.collect(), account.evicted())
+fn counters(table: &GatewayTable) -> (Vec<[u64; 4]>, EvictedTotals) {
+    let rows = table.rows().map(|row| [row.received, row.lost(), row.duplicate, row.reordered]);
+    (rows.collect(), table.evicted())
 }
 
 /// A datagram of few hubs, epochs and sensors, so that they meet.
-fn sealed<'a>(piece: &[u8], buffer: &'a mut [u8]) -> Option<&'a [u8]> {
+fn sealed_datagram<'a>(piece: &[u8], buffer: &'a mut [u8]) -> Option<&'a [u8]> {
     let (short, payload) = piece.split_first_chunk::<10>()?;
     let head = Head {
         topic: short[0],
@@ -76,13 +78,13 @@ fn sealed<'a>(piece: &[u8], buffer: &'a mut [u8]) -> Option<&'a [u8]> {
         parts: 1 + (short[9] >> 4 & 3),
         ..Head::default()
     };
-    buffer.get_mut(HEAD..HEAD + payload.len())?.copy_from_slice(payload);
+    buffer.get_mut(HEADER_LEN..HEADER_LEN + payload.len())?.copy_from_slice(payload);
     head.seal(buffer, payload.len())
 }
 
 /// What a payload says, packed again, says the same.
-fn can_be_said_again(datagram: &Datagram<'_>) {
-    fn again<T: Packed + ?Sized>(payload: &[u8])
+fn can_be_reencoded(datagram: &Datagram<'_>) {
+    fn reencode<T: DatagramPayload + ?Sized>(payload: &[u8])
     where
         Box<T>: Default,
     {
@@ -104,17 +106,17 @@ fn can_be_said_again(datagram: &Datagram<'_>) {
     };
     macro_rules! by_topic {
         ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
-            match topic { $(Topic::$topic => again::<scanhub_schema::payload_type!($payload)>(payload),)* }
+            match topic { $(Topic::$topic => reencode::<scanhub_schema::payload_type!($payload)>(payload),)* }
         };
     }
     scanhub_schema::for_each_topic!(by_topic);
 }
 
 /// The checksum sees one to three changed bits, wherever they are (its Hamming distance at these lengths is 4).
-fn is_seen_if_damaged(bytes: &[u8], places: &[u8]) {
+fn is_damage_detected(bytes: &[u8], offsets: &[u8]) {
     let mut damaged = bytes.to_vec();
     let mut at = 0;
-    for (number, place) in places.iter().rev().take(3).enumerate() {
+    for (number, place) in offsets.iter().rev().take(3).enumerate() {
         at = (at * 256 + usize::from(*place)) % (8 * bytes.len());
         damaged[at / 8] ^= 1 << (at % 8);
         let is_changed = damaged != bytes;

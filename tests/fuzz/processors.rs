@@ -1,10 +1,10 @@
 //! Any scans and any settings, through all processors: whatever the bytes say, what comes out keeps to its own rules.
 
-use scanhub_preprocess::background::{Candidate, Method, Model, Settings, Start};
+use scanhub_preprocess::background::{BackgroundModel, Candidate, Method, Settings, Start};
 use scanhub_preprocess::segments::Segmenter;
 use scanhub_preprocess::{marks, zones};
 use scanhub_schema::limits::TopicLimits;
-use scanhub_schema::{Background, Contents, Foreground, MAX_BEAMS, MAX_ZONES, Marks, Scan, Verdict, Zones};
+use scanhub_schema::{ArrayFlags, Background, Foreground, MAX_BEAMS, MAX_ZONES, Marks, Scan, Verdict, Zones};
 
 use super::scans::{Bytes, fill, layout};
 
@@ -12,7 +12,7 @@ use super::scans::{Bytes, fill, layout};
 pub(super) fn processors(data: &[u8]) {
     let mut bytes = Bytes(data);
     // Now and then a scan has more beams than that.
-    let most = TopicLimits::default().beams;
+    let maximum = TopicLimits::default().beams;
     let pose = bytes.pose();
     let radii_mm: Vec<u16> = (0..bytes.u8() % 10).map(|_| bytes.u16()).collect();
     let body_mask: Vec<zones::Sector> = (0..bytes.u8() % 80)
@@ -20,7 +20,7 @@ pub(super) fn processors(data: &[u8]) {
         .collect();
     let flags = bytes.u8();
     let is = |bit: u8| flags >> bit & 1 == 1;
-    let mut check = zones::Check::new(
+    let mut check = zones::ZoneChecker::new(
         pose,
         &zones::Settings {
             radii_mm: radii_mm.clone(),
@@ -32,7 +32,7 @@ pub(super) fn processors(data: &[u8]) {
             exact: is(0),
             no_return_is_far: is(1),
         },
-        most,
+        maximum,
     );
     let max_gap = u16::from(bytes.u8());
     let mut finder = marks::MarkDetector::new(marks::Settings {
@@ -50,23 +50,23 @@ pub(super) fn processors(data: &[u8]) {
         start: if is(7) { Start::FirstScan } else { Start::Empty },
         no_return_is_far: Some(is(1)),
     };
-    let mut model = Model::new(settings, most);
-    let mut cutter = Segmenter::new(pose, most);
+    let mut model = BackgroundModel::new(settings, maximum);
+    let mut cutter = Segmenter::new(pose, maximum);
     let (mut zones, mut marks) = (Zones::unknown(), Marks::default());
-    let mut foreground = Foreground::of(most);
-    let mut background = Background::zeroed(Background::len(most));
-    let mut scan = Scan::zeroed(Scan::len(MAX_BEAMS, Contents::ALL));
+    let mut foreground = Foreground::of(maximum);
+    let mut background = Background::zeroed(Background::len(maximum));
+    let mut scan = Scan::zeroed(Scan::len(MAX_BEAMS, ArrayFlags::ALL));
     while !bytes.is_empty() {
         match bytes.u8() {
             0..=3 => model.reset(),
             4..=7 => model.freeze(),
             8..=11 => model.thaw(),
             12..=15 => {
-                model.show(&mut background);
+                model.write(&mut background);
                 assert_eq!(model.load(&background), Ok(()), "what it has shown");
             }
             16..=19 => {
-                check.stale(&mut zones);
+                check.write_stale(&mut zones);
                 assert_eq!(zones.verdict(), Verdict::Unknown);
             }
             20..=127 => layout(&mut bytes, &mut scan),
@@ -79,8 +79,8 @@ pub(super) fn processors(data: &[u8]) {
         assert_marks(&scan, &marks, max_gap);
         model.update(&scan, &mut foreground);
         cutter.update(&scan, &mut foreground);
-        assert_foreground(&scan, &foreground, most);
-        assert_eq!(model.classes().len(), scan.beams().min(most));
+        assert_foreground(&scan, &foreground, maximum);
+        assert_eq!(model.classes().len(), scan.beams().min(maximum));
     }
 }
 
@@ -109,8 +109,8 @@ fn assert_marks(scan: &Scan, marks: &Marks, max_gap: u16) {
     assert!(covered <= lit * (usize::from(max_gap) + 1));
 }
 
-fn assert_foreground(scan: &Scan, foreground: &Foreground, most: usize) {
-    assert_eq!(usize::from(foreground.count), scan.beams().min(most));
+fn assert_foreground(scan: &Scan, foreground: &Foreground, max_segments: usize) {
+    assert_eq!(usize::from(foreground.count), scan.beams().min(max_segments));
     let mut beams = 0;
     for (beam, range) in foreground.readings() {
         assert_eq!(scan.range(beam), Some(range), "beam {beam}");

@@ -1,6 +1,6 @@
 //! Scans, and what they are read as, from the bytes of an input. Refuses to know who looks at them.
 
-use scanhub_schema::{Contents, Family, MAX_BEAMS, Pose, Scan, ScanArrays, ScanHead};
+use scanhub_schema::{ArrayFlags, Family, MAX_BEAMS, Pose, Scan, ScanArrays, ScanHead};
 
 /// Another sensor, or the same one set otherwise; now and then one that there is.
 pub(super) fn layout(bytes: &mut Bytes<'_>, scan: &mut Scan) {
@@ -21,7 +21,7 @@ pub(super) fn layout(bytes: &mut Bytes<'_>, scan: &mut Scan) {
         beyond: greatest.saturating_sub(8),
         family: if range_bits & 0x80 == 0 { Family::Lms } else { Family::Ld } as u8,
         intensity_bits: bytes.u8(),
-        contents: bytes.u8() & Contents::ALL,
+        contents: bytes.u8() & ArrayFlags::ALL,
         ..ScanHead::default()
     };
     scan.begin(head);

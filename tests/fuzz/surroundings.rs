@@ -1,36 +1,36 @@
 //! Any scans through those processors that follow the robot: lines, motion, and the map around it. Whatever the bytes say,
 //! what comes out keeps to its own rules, and nothing is surer than the readings that say it.
 
-use scanhub_preprocess::background::{Candidate, Class, Method, Model, Settings, Start};
-use scanhub_preprocess::lines::{self, LineFinder, Stop};
+use scanhub_preprocess::background::{BackgroundModel, Candidate, Class, Method, Settings, Start};
+use scanhub_preprocess::lines::{self, LineFinder, StopCriterion};
 use scanhub_preprocess::motion::{self, MotionEstimator};
-use scanhub_schema::datagram::Packed;
+use scanhub_schema::datagram::DatagramPayload;
 use scanhub_schema::limits::TopicLimits;
-use scanhub_schema::{Contents, Foreground, Lines, MAX_BEAMS, Motion, MotionMethod, Scan};
+use scanhub_schema::{ArrayFlags, Foreground, Lines, MAX_BEAMS, Motion, MotionMethod, Scan};
 
 use super::scans::{Bytes, fill, layout};
 
 /// Read as settings, then as one scan after the other until nothing is left.
 pub(super) fn surroundings(data: &[u8]) {
     let mut bytes = Bytes(data);
-    let most = TopicLimits::default().beams;
+    let maximum = TopicLimits::default().beams;
     let mut pose = bytes.pose();
     let of_lines = lines::Settings {
         max: 1 + bytes.u8() % 64,
         min_points: 3 + u16::from(bytes.u8() % 16),
         refine: bytes.u8() % 4 == 0,
-        stop: Stop::Likelihood,
+        stop: StopCriterion::Likelihood,
     };
     let of_motion = motion::Settings {
         max_step_m: 0.01 + f64::from(bytes.u8()) / 100.0,
         max_turn_deg: 1.0 + f64::from(bytes.u8() % 85),
         min_overlap: 0.1 + f64::from(bytes.u8() % 91) / 100.0,
     };
-    let mut finder = LineFinder::new(pose, of_lines, most);
-    let mut estimator = MotionEstimator::new(pose, of_motion, most);
-    let mut model = Model::new(MAP, most);
-    let mut foreground = Foreground::of(most);
-    let mut scan = Scan::zeroed(Scan::len(MAX_BEAMS, Contents::ALL));
+    let mut finder = LineFinder::new(pose, of_lines, maximum);
+    let mut estimator = MotionEstimator::new(pose, of_motion, maximum);
+    let mut model = BackgroundModel::new(MAP_SETTINGS, maximum);
+    let mut foreground = Foreground::of(maximum);
+    let mut scan = Scan::zeroed(Scan::len(MAX_BEAMS, ArrayFlags::ALL));
     let (mut before, mut stamp_ns) = (Motion::default(), 0);
     for _ in 0..SCANS {
         if bytes.is_empty() {
@@ -39,7 +39,7 @@ pub(super) fn surroundings(data: &[u8]) {
         // Else it is the same scan again.
         let what = bytes.u8();
         match what {
-            0..=3 => estimator.forget(),
+            0..=3 => estimator.reset(),
             4..=7 => {
                 pose = bytes.pose();
                 finder.change(pose, of_lines);
@@ -62,7 +62,7 @@ pub(super) fn surroundings(data: &[u8]) {
         estimator.update(&scan, stamp_ns, period_ns, &mut motion);
         assert_motion(&scan, &before, &motion, &of_motion);
         before = motion;
-        model.follow(&pose, &motion, &estimator.velocity());
+        model.set_motion(&pose, &motion, &estimator.velocity());
         model.update(&scan, &mut foreground);
         assert!(foreground.readings().all(|(beam, range)| scan.range(beam) == Some(range)));
         if !motion.has_pose() {
@@ -95,7 +95,7 @@ fn assert_motion(scan: &Scan, before: &Motion, motion: &Motion, settings: &motio
     assert!({ numbers }.all(|number| number.is_finite()), "{motion:?}");
     assert!([0, 4, 8].iter().all(|at| motion.pose_covariance[*at] >= 0.0), "{motion:?}");
     assert!(motion.has_valid_pose() || motion.pose_covariance == [0.0; 9], "{motion:?}");
-    match motion.how() {
+    match motion.method() {
         MotionMethod::First => assert_eq!(*motion, Motion::default()),
         MotionMethod::Refused => {
             let refused_steps = before.refused_steps.saturating_add(1);
@@ -110,12 +110,12 @@ fn assert_motion(scan: &Scan, before: &Motion, motion: &Motion, settings: &motio
             assert_eq!(motion.refused_steps, before.refused_steps);
             let of = |row: usize, column: usize| f64::from(motion.covariance[3 * row + column]);
             for (row, column) in [(0, 1), (0, 2), (1, 2)] {
-                let most = (of(row, row) * of(column, column)).sqrt();
-                assert!((of(row, column) - of(column, row)).abs() <= 1e-5 * most, "{motion:?}");
-                assert!(of(row, column).abs() <= (1.0 + 1e-5) * most, "{motion:?}");
+                let maximum = (of(row, row) * of(column, column)).sqrt();
+                assert!((of(row, column) - of(column, row)).abs() <= 1e-5 * maximum, "{motion:?}");
+                assert!(of(row, column).abs() <= (1.0 + 1e-5) * maximum, "{motion:?}");
             }
             // Of all beams together, if they looked at one wall and nothing else were unsure.
-            let surest = LEAST_VARIANCE / scan.beams() as f64;
+            let surest = MIN_VARIANCE / scan.beams() as f64;
             assert!(of(0, 0) >= surest && of(1, 1) >= surest && of(2, 2) > 0.0, "{motion:?}");
         }
     }
@@ -138,7 +138,7 @@ fn walls(bytes: &mut Bytes<'_>, scan: &mut Scan) {
 }
 
 /// The map's own settings.
-const MAP: Settings = Settings {
+const MAP_SETTINGS: Settings = Settings {
     method: Method::Moving,
     threshold_mm: None,
     candidate_mm: None,
@@ -148,6 +148,6 @@ const MAP: Settings = Settings {
     no_return_is_far: None,
 };
 /// A hundredth of the least variance of a range, (5 mm)^2, of which a beam that grazes its wall has a twentieth.
-const LEAST_VARIANCE: f64 = 2.5e-7;
+const MIN_VARIANCE: f64 = 2.5e-7;
 /// A map takes long to forget.
 const SCANS: usize = 40;

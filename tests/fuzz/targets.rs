@@ -8,19 +8,19 @@ mod scans;
 mod surroundings;
 
 use scanhub_drivers::line::Control;
-use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _};
+use scanhub_drivers::line::{Action, Event, Protocol as _, ScannerSession as _};
 use scanhub_drivers::lms;
-use scanhub_drivers::lms::Session;
+use scanhub_drivers::lms::LmsSession;
 use scanhub_drivers::lms::Settings;
 use scanhub_drivers::lms::command::Request;
 use scanhub_drivers::lms::explain::explain;
-use scanhub_drivers::lms::framer::{Found, Framer, SUFFIX_HOLD, Tally, VETO_HOLD};
-use scanhub_drivers::lms::header::Expect;
-use scanhub_drivers::lms::measured::Measured;
+use scanhub_drivers::lms::framer::{Framer, FramerCounters, FramerEvent, SUFFIX_HOLD_TIME, VETO_HOLD_TIME};
+use scanhub_drivers::lms::header::ExpectedHeaders;
+use scanhub_drivers::lms::measured::MeasuredValues;
 use scanhub_drivers::lms::reply::Reply;
-use scanhub_drivers::lms::telegram::{FRAME, MAX_LENGTH, STX, Telegram, Writer};
+use scanhub_drivers::lms::telegram::{FRAME_LEN, MAX_LENGTH, STX, Telegram, Writer};
 use scanhub_drivers::lms::variant::{Baud, Variant};
-use scanhub_lms_configure::eeprom::Write;
+use scanhub_lms_configure::eeprom::EepromWrite;
 use scanhub_schema::{MILLIS, Nanos};
 
 /// A target by its name.
@@ -46,17 +46,17 @@ pub fn framer(data: &[u8]) {
     // The head of a stream is that of a telegram that came, so its length is possible.
     let head = bytes.first_chunk().filter(|head: &&[u8; 7]| head[3] < 3);
     let expect = match (expects & 3, head) {
-        (1, Some(&header)) => Expect::Stream { header, reply: None },
-        (2, Some(&header)) => Expect::Stream { header, reply: Some(expects | 0x80) },
-        _ => Expect::Anything,
+        (1, Some(&header)) => ExpectedHeaders::Stream { header, reply: None },
+        (2, Some(&header)) => ExpectedHeaders::Stream { header, reply: Some(expects | 0x80) },
+        _ => ExpectedHeaders::Anything,
     };
     let mut framer = Framer::default();
     framer.expect(expect);
-    framer.await_acknowledge(expects & 4 != 0);
+    framer.expect_acknowledge(expects & 4 != 0);
     let mut looked_at = 0;
     let mut rest = bytes;
     while !rest.is_empty() {
-        let spare = framer.spare();
+        let spare = framer.read_buffer();
         let len = rest.len().min(spare.len()).min(usize::from(*piece) + 1);
         assert!(len > 0, "no room although everything was polled");
         spare[..len].copy_from_slice(&rest[..len]);
@@ -64,23 +64,23 @@ pub fn framer(data: &[u8]) {
         rest = &rest[len..];
         drain(&mut framer, bytes, &mut looked_at);
     }
-    framer.release(SUFFIX_HOLD);
+    framer.release(SUFFIX_HOLD_TIME);
     drain(&mut framer, bytes, &mut looked_at);
-    framer.release(VETO_HOLD);
+    framer.release(VETO_HOLD_TIME);
     drain(&mut framer, bytes, &mut looked_at);
 }
 
-fn drain(framer: &mut Framer, bytes: &[u8], looked_at: &mut usize) {
+fn drain(framer: &mut Framer, bytes: &[u8], checked_len: &mut usize) {
     while let Some(found) = framer.poll() {
-        let Found::Telegram(framed) = found else { continue };
+        let FramerEvent::Telegram(framed) = found else { continue };
         let telegram = framed.telegram.bytes();
         assert!(Telegram::check(telegram).is_some());
-        let ahead = &bytes[*looked_at..];
+        let ahead = &bytes[*checked_len..];
         let at = ahead.windows(telegram.len()).position(|window| window == telegram);
         let at = at.expect("a telegram that nobody sent, or one out of order");
-        *looked_at += at + telegram.len();
+        *checked_len += at + telegram.len();
     }
-    let Tally { read, in_telegrams, acknowledge, discarded, .. } = *framer.tally();
+    let FramerCounters { read, in_telegrams, acknowledge, discarded, .. } = *framer.counters();
     assert_eq!(read, in_telegrams + acknowledge + discarded + framer.buffered() as u64);
 }
 
@@ -94,12 +94,12 @@ pub fn replies(data: &[u8]) {
     if let Some(request) = Request::decode(telegram) {
         assert_eq!(request.encode(*address).bytes(), encoded.bytes(), "{request:?}");
     }
-    if let Some(write) = Write::decode(telegram) {
+    if let Some(write) = EepromWrite::decode(telegram) {
         assert!(lms::command::EEPROM_WRITES.contains(command), "{write:?}");
         let again = write.encode(*address).expect("what was read can be said");
         assert_eq!(again.bytes(), encoded.bytes(), "{write:?}");
     }
-    if let Some(measured) = Measured::decode(telegram) {
+    if let Some(measured) = MeasuredValues::decode(telegram) {
         assert_eq!(measured.words().len(), measured.count());
         assert!((1..=401).contains(&measured.count()));
     }
@@ -130,41 +130,41 @@ pub fn session(data: &[u8]) {
         mode: None,
     };
     let mut now: Nanos = 1_000 * MILLIS;
-    let mut session = Session::new(settings, now);
+    let mut session = LmsSession::new(settings, now);
     let mut read = 0;
-    let mut said = Vec::new();
+    let mut request_bytes = Vec::new();
     let mut rest = program;
     while let [what, much, after @ ..] = rest {
         rest = after;
         let mut until = Nanos::MAX;
         loop {
-            match session.poll_output() {
-                Output::Transmit { bytes, not_before } if what & 0x80 == 0 => {
+            match session.poll_action() {
+                Action::Transmit { bytes, not_before } if what & 0x80 == 0 => {
                     now = now.max(not_before);
-                    said.extend(bytes);
-                    session.transmitted(now);
+                    request_bytes.extend(bytes);
+                    session.handle_transmitted(now);
                 }
-                Output::Transmit { .. } => break,
-                Output::SetDtr(_) => panic!("such a scanner has nothing at this line"),
-                Output::SetRate(baud) => assert!(baud == settings.baud.rate() || !settings.fixed_rate),
-                Output::Event(Event::Scan(_)) => panic!("a telegram is a scan"),
-                Output::Event(Event::Telegram(received)) => {
+                Action::Transmit { .. } => break,
+                Action::SetDtr(_) => panic!("such a scanner has nothing at this line"),
+                Action::SetRate(baud) => assert!(baud == settings.baud.rate() || !settings.fixed_rate),
+                Action::Event(Event::Scan(_)) => panic!("a telegram is a scan"),
+                Action::Event(Event::Telegram(received)) => {
                     assert!(Telegram::check(received.bytes).is_some());
                     assert!(received.first <= received.last && received.last <= now);
                 }
-                Output::Rest(at) | Output::Wait { until: at, .. } => {
+                Action::SleepUntil(at) | Action::Wait { until: at, .. } => {
                     until = at;
                     break;
                 }
             }
         }
-        let tally = session.tally();
-        let known = tally.in_telegrams + tally.acknowledge + tally.discarded + session.account().buffered;
+        let tally = session.framer_counters();
+        let known = tally.in_telegrams + tally.acknowledge + tally.discarded + session.stats().buffered;
         assert_eq!((tally.read, known), (read, read), "bytes vanished");
         match what & 3 {
             // Bytes of the program itself.
             0 => {
-                let spare = session.spare();
+                let spare = session.read_buffer();
                 let len = rest.len().min(usize::from(*much)).min(spare.len());
                 spare[..len].copy_from_slice(&rest[..len]);
                 rest = &rest[len..];
@@ -183,8 +183,8 @@ pub fn session(data: &[u8]) {
                 session.handle_timeout(now);
             }
             3 if what & 0x40 != 0 => {
-                const ORDERS: [Control; 3] = [Control::Pause, Control::Resume, Control::Resync];
-                session.control(ORDERS[usize::from(*much) % ORDERS.len()], now);
+                const CONTROLS: [Control; 3] = [Control::Pause, Control::Resume, Control::Resync];
+                session.control(CONTROLS[usize::from(*much) % CONTROLS.len()], now);
             }
             // A reply with a right checksum, its data from the program.
             _ => {
@@ -193,7 +193,7 @@ pub fn session(data: &[u8]) {
                 rest = after;
                 let [command, reply @ ..] = reply else { continue };
                 let telegram = Writer::new(0x80, command | 0x80).slice(reply).byte(0x10).finish();
-                let spare = session.spare();
+                let spare = session.read_buffer();
                 let len = telegram.bytes().len().min(spare.len());
                 spare[..len].copy_from_slice(&telegram.bytes()[..len]);
                 read += len as u64;
@@ -201,16 +201,16 @@ pub fn session(data: &[u8]) {
             }
         }
     }
-    assert!(said.is_empty() || !settings.listen_only, "a listener speaks");
-    assert_harmless(&said);
+    assert!(request_bytes.is_empty() || !settings.listen_only, "a listener speaks");
+    assert_harmless(&request_bytes);
 }
 
 /// No telegram that stands anywhere in what was said, whatever it was cut by, writes the EEPROM.
-fn assert_harmless(said: &[u8]) {
-    for at in 0..said.len() {
-        let [STX, _, low, high, command, ..] = said[at..] else { continue };
-        let len = usize::from(u16::from_le_bytes([low, high])) + FRAME;
-        let telegram = said.get(at..at + len).and_then(Telegram::check);
+fn assert_harmless(request_bytes: &[u8]) {
+    for at in 0..request_bytes.len() {
+        let [STX, _, low, high, command, ..] = request_bytes[at..] else { continue };
+        let len = usize::from(u16::from_le_bytes([low, high])) + FRAME_LEN;
+        let telegram = request_bytes.get(at..at + len).and_then(Telegram::check);
         let is_write = telegram.is_some() && lms::command::EEPROM_WRITES.contains(&command);
         assert!(!is_write, "{command:02X}h was said");
     }

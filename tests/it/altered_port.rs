@@ -7,14 +7,14 @@ use std::process::Command;
 
 use rustix::termios::{LocalModes, OptionalActions, Termios, tcgetattr, tcsetattr};
 
-use crate::testkit::{Program, TERM, TestEnv, open_line, until};
+use crate::testkit::{Program, TERM, TestEnv, open_line, wait_until};
 
 /// A process that had the port open before the hub.
-struct Other(File);
+struct OtherProcess(File);
 
-impl Other {
-    fn at(place: &Path) -> Other {
-        Other(open_line(place, 9600))
+impl OtherProcess {
+    fn open(path: &Path) -> OtherProcess {
+        OtherProcess(open_line(path, 9600))
     }
 
     fn change(&self, change: impl Fn(&mut Termios)) {
@@ -29,7 +29,7 @@ impl Other {
 }
 
 #[test]
-fn rate_set_by_another_process_is_set_again_whatever_the_family() {
+fn hub_restores_baud_rate_changed_by_another_process() {
     let cases = [
         (&["--baud=500000"][..], "", 500_000),
         (&["--family=ld", "--model=ld19"], ",model=ld19", 230_400),
@@ -38,20 +38,20 @@ fn rate_set_by_another_process_is_set_again_whatever_the_family() {
     let hubs = cases.map(|(simulated, link, rate)| {
         let env = TestEnv::new();
         let simulator = env.simulator(&["front"], &[&["--seed=40"], simulated].concat());
-        let other = Other::at(&env.path("front"));
+        let other = OtherProcess::open(&env.path("front"));
         let hub = env.hub(&[format!("{}{link}", env.link("front"))]);
         env.await_info("front", |info| info["state"] == "streaming");
         other.change(|termios| termios.set_speed(9600).expect("a valid rate"));
-        until("the hub has set its rate again", || other.rate() == rate);
+        wait_until("the hub has set its rate again", || other.rate() == rate);
         (env, simulator, hub)
     });
     for (env, _simulator, hub) in hubs {
         // The status has the message for ten seconds, which a busy machine may not look at in time; the log keeps it.
         env.await_info("front", |info| info["state"] == "streaming" && info["last_error"] == "");
         let outcome = hub.end(TERM);
-        let says = |words: &str| outcome.errors.contains(words);
-        assert!(says("the port was set to 9600 baud by another process"), "{outcome}");
-        assert_eq!((outcome.code, says("cable")), (Some(0), false), "{outcome}");
+        let logs = |words: &str| outcome.stderr.contains(words);
+        assert!(logs("the port was set to 9600 baud by another process"), "{outcome}");
+        assert_eq!((outcome.exit_code, logs("cable")), (Some(0), false), "{outcome}");
     }
 }
 
@@ -59,32 +59,34 @@ fn rate_set_by_another_process_is_set_again_whatever_the_family() {
 fn a_program_that_is_known_to_change_ports_is_named() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--seed=41", "--baud=500000"]);
-    let other = Other::at(&env.path("front"));
+    let other = OtherProcess::open(&env.path("front"));
     let hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
     // Any program of this name.
     symlink(env!("CARGO_BIN_EXE_scanhub"), env.path("ModemManager")).expect("a link");
     let mut command = Command::new(env.path("ModemManager"));
-    command.args(["simulate", "--json", "--port", &env.word("other")]).env("SCANHUB_END_WITH_PARENT", "1");
+    command
+        .args(["simulate", "--json", "--port", &env.path_argument("other")])
+        .env("SCANHUB_END_WITH_PARENT", "1");
     let _program = Program::start(command).ready();
     other.change(|termios| termios.set_speed(115_200).expect("a valid rate"));
-    until("the hub has set its rate again", || other.rate() == 500_000);
+    wait_until("the hub has set its rate again", || other.rate() == 500_000);
     let outcome = hub.end(TERM);
     let words = "set to 115200 baud by another process; ModemManager runs";
-    assert!(outcome.errors.contains(words), "{outcome}");
+    assert!(outcome.stderr.contains(words), "{outcome}");
 }
 
 #[test]
 fn other_settings_are_made_again_too() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--seed=42", "--baud=500000"]);
-    let other = Other::at(&env.path("front"));
+    let other = OtherProcess::open(&env.path("front"));
     let hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
     other.change(|termios| termios.local_modes.insert(LocalModes::ICANON));
-    until("the line is raw again", || {
+    wait_until("the line is raw again", || {
         !tcgetattr(&other.0).expect("a terminal").local_modes.contains(LocalModes::ICANON)
     });
     let outcome = hub.end(TERM);
-    assert!(outcome.errors.contains("the port's settings were changed by another process"), "{outcome}");
+    assert!(outcome.stderr.contains("the port's settings were changed by another process"), "{outcome}");
 }

@@ -12,14 +12,14 @@ use std::time::{Duration, Instant};
 use serde_json::{Value, json};
 use tungstenite::{Message, WebSocket};
 
-use crate::testkit::{Child, PATIENCE, spawn};
+use crate::testkit::{Child, WAIT_TIMEOUT, spawn};
 
 /// Where Debian has it, with a window and without.
-const NAMES: [&str; 2] = ["chromium", "chromium-headless-shell"];
+const BROWSER_NAMES: [&str; 2] = ["chromium", "chromium-headless-shell"];
 
 /// What a page is looked at with.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Look {
+pub(crate) struct Appearance {
     pub(crate) width: u32,
     pub(crate) height: u32,
     /// `light` or `dark`.
@@ -28,9 +28,11 @@ pub(crate) struct Look {
     pub(crate) is_phone: bool,
 }
 
-impl Look {
-    pub(crate) const LAPTOP: Look = Look { width: 1280, height: 800, scheme: "light", is_phone: false };
-    pub(crate) const PHONE: Look = Look { width: 390, height: 844, scheme: "dark", is_phone: true };
+impl Appearance {
+    pub(crate) const LAPTOP: Appearance =
+        Appearance { width: 1280, height: 800, scheme: "light", is_phone: false };
+    pub(crate) const PHONE: Appearance =
+        Appearance { width: 390, height: 844, scheme: "dark", is_phone: true };
 }
 
 /// A browser with one page.
@@ -41,13 +43,13 @@ pub(crate) struct Browser {
     calls: u64,
     profile: PathBuf,
     /// What the page complained about.
-    pub(crate) complaints: Vec<String>,
+    pub(crate) console_errors: Vec<String>,
 }
 
 impl Browser {
     /// A new one that keeps its things in `profile`, looking as `look` says; nothing where there is none.
-    pub(crate) fn start(profile: PathBuf, look: Look) -> Option<Browser> {
-        let spawned = NAMES.iter().find_map(|name| {
+    pub(crate) fn start(profile: PathBuf, appearance: Appearance) -> Option<Browser> {
+        let spawned = BROWSER_NAMES.iter().find_map(|name| {
             let mut command = Command::new(name);
             command.args(["--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]);
             command.args(["--remote-debugging-port=0", "--no-first-run", "--disable-dev-shm-usage"]);
@@ -62,10 +64,16 @@ impl Browser {
         thread::spawn(move || lines.for_each(drop));
         let (host, _) = address.split_once('/').expect("a path");
         let stream = TcpStream::connect(host).expect("its own port");
-        stream.set_read_timeout(Some(PATIENCE)).expect("a timeout");
+        stream.set_read_timeout(Some(WAIT_TIMEOUT)).expect("a timeout");
         let (socket, _) = tungstenite::client(format!("ws://{address}"), stream).expect("its protocol");
-        let mut browser =
-            Browser { process, socket, session: String::new(), calls: 0, profile, complaints: Vec::new() };
+        let mut browser = Browser {
+            process,
+            socket,
+            session: String::new(),
+            calls: 0,
+            profile,
+            console_errors: Vec::new(),
+        };
         let target = browser.call("Target.createTarget", json!({ "url": "about:blank" }));
         let attached = json!({ "targetId": target["targetId"], "flatten": true });
         let session = browser.call("Target.attachToTarget", attached);
@@ -73,13 +81,13 @@ impl Browser {
         for domain in ["Page", "Runtime", "Log"] {
             browser.call(&format!("{domain}.enable"), json!({}));
         }
-        browser.set_look(look);
+        browser.set_appearance(appearance);
         Some(browser)
     }
 
     /// Changes the size of the window, the color scheme and the kind of device.
-    pub(crate) fn set_look(&mut self, look: Look) {
-        let Look { width, height, scheme, is_phone } = look;
+    pub(crate) fn set_appearance(&mut self, appearance: Appearance) {
+        let Appearance { width, height, scheme, is_phone } = appearance;
         let ratio = if is_phone { 2 } else { 1 };
         let screen =
             json!({ "width": width, "height": height, "deviceScaleFactor": ratio, "mobile": is_phone });
@@ -98,18 +106,18 @@ impl Browser {
 
     /// What `script` is on the page.
     pub(crate) fn ask(&mut self, script: &str) -> Value {
-        let asked = json!({ "expression": script, "returnByValue": true, "awaitPromise": true });
-        let told = self.call("Runtime.evaluate", asked);
-        assert!(told.get("exceptionDetails").is_none(), "{script}: {told}");
-        told["result"]["value"].clone()
+        let parameters = json!({ "expression": script, "returnByValue": true, "awaitPromise": true });
+        let response = self.call("Runtime.evaluate", parameters);
+        assert!(response.get("exceptionDetails").is_none(), "{script}: {response}");
+        response["result"]["value"].clone()
     }
 
     /// Waits until `script` is true on the page.
     pub(crate) fn await_true(&mut self, script: &str) {
-        let give_up_at = Instant::now() + PATIENCE;
+        let give_up_at = Instant::now() + WAIT_TIMEOUT;
         while self.ask(script) != Value::Bool(true) {
-            let seen = |browser: &mut Browser| browser.ask("JSON.stringify(window.scanhub)");
-            assert!(Instant::now() < give_up_at, "{script} is not to be seen: {}", seen(self));
+            let page_state = |browser: &mut Browser| browser.ask("JSON.stringify(window.scanhub)");
+            assert!(Instant::now() < give_up_at, "{script} is not to be seen: {}", page_state(self));
             thread::sleep(Duration::from_millis(20));
         }
     }
@@ -143,9 +151,9 @@ impl Browser {
     }
 
     /// Writes what is to be seen to a PNG file.
-    pub(crate) fn photograph(&mut self, path: &Path) {
-        let told = self.call("Page.captureScreenshot", json!({ "format": "png" }));
-        let text = told["data"].as_str().expect("a picture");
+    pub(crate) fn save_screenshot(&mut self, path: &Path) {
+        let response = self.call("Page.captureScreenshot", json!({ "format": "png" }));
+        let text = response["data"].as_str().expect("a picture");
         fs::write(path, from_base64(text)).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
     }
 
@@ -158,21 +166,22 @@ impl Browser {
         }
         self.socket.send(Message::text(call.to_string())).expect("the browser lives");
         loop {
-            let told = match self.socket.read() {
+            let response = match self.socket.read() {
                 // The test's process was stopped and continued, for example by a virtual machine that was suspended.
                 Err(tungstenite::Error::Io(error)) if error.kind() == ErrorKind::Interrupted => continue,
                 told => told.unwrap_or_else(|error| panic!("{method}: {error}")),
             };
-            let Message::Text(text) = told else { continue };
-            let told: Value = serde_json::from_str(&text).expect("JSON");
-            if told["id"] == self.calls {
-                assert!(told.get("error").is_none(), "{method}: {told}");
-                return told["result"].clone();
+            let Message::Text(text) = response else { continue };
+            let response: Value = serde_json::from_str(&text).expect("JSON");
+            if response["id"] == self.calls {
+                assert!(response.get("error").is_none(), "{method}: {response}");
+                return response["result"].clone();
             }
-            let is_complaint = told["method"] == "Runtime.exceptionThrown"
-                || told["method"] == "Log.entryAdded" && told["params"]["entry"]["source"] == "security";
+            let is_complaint = response["method"] == "Runtime.exceptionThrown"
+                || response["method"] == "Log.entryAdded"
+                    && response["params"]["entry"]["source"] == "security";
             if is_complaint {
-                self.complaints.push(told["params"].to_string());
+                self.console_errors.push(response["params"].to_string());
             }
         }
     }

@@ -10,17 +10,17 @@ use std::thread;
 use rustix::process::Signal;
 
 use crate::testkit::{
-    Child, Program, TestEnv, can_sit, end_runs_of, only, output, own_program, spawn, status, until,
-    write_program,
+    Child, Program, TestEnv, can_open_terminal, end_runs_of, output, own_program, single_test_args, spawn,
+    status, wait_until, write_program,
 };
 
 /// Variable that the testkit sets: the test binary that a process descends from.
-const RUN: &str = "SCANHUB_TEST_RUN";
+const RUN_VARIABLE: &str = "SCANHUB_TEST_RUN";
 /// Set in the process that acts as the next run of the tests.
-const INSIDE: &str = "SCANHUB_TEST_NEXT_RUN";
+const NEXT_RUN_VARIABLE: &str = "SCANHUB_TEST_NEXT_RUN";
 
 /// Whether a process runs; a zombie does not.
-fn runs(pid: &str) -> bool {
+fn is_running(pid: &str) -> bool {
     let stat = fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
     stat.rsplit_once(')').is_some_and(|(_, rest)| !rest.trim_start().starts_with(['Z', 'X']))
 }
@@ -40,30 +40,30 @@ fn shell(script: &str) -> (Child, String) {
 fn dropping_a_script_ends_its_children() {
     // As the shell script that starts Debian's browser: it does not `exec`.
     let (script, child) = shell("sleep 1000 & echo $!; wait");
-    assert!(runs(&child));
+    assert!(is_running(&child));
     drop(script);
-    assert!(!runs(&child), "the child of the script still runs");
+    assert!(!is_running(&child), "the child of the script still runs");
     // The script has ended before its child.
     let (mut script, child) = shell("sleep 1000 & echo $!");
-    assert!(script.wait().is_ok_and(|status| status.success()) && runs(&child));
+    assert!(script.wait().is_ok_and(|status| status.success()) && is_running(&child));
     drop(script);
-    assert!(!runs(&child), "the child of an ended script still runs");
+    assert!(!is_running(&child), "the child of an ended script still runs");
     // A program that ignores TERM, as does its child.
     let (script, child) = shell("trap '' TERM; sleep 1000 & echo $!; wait");
     drop(script);
-    assert!(!runs(&child), "TERM was ignored");
+    assert!(!is_running(&child), "TERM was ignored");
 }
 
 #[test]
 fn dropping_a_program_ends_its_daemons() {
-    if !can_sit() {
+    if !can_open_terminal() {
         return;
     }
     let (mut script, daemon) = shell("setsid --fork sh -c 'echo $$; exec sleep 1000'");
     assert!(script.wait().is_ok_and(|status| status.success()));
-    assert_eq!(script.family().len(), 1, "{:?}", script.family());
+    assert_eq!(script.living_command_lines().len(), 1, "{:?}", script.living_command_lines());
     drop(script);
-    assert!(!runs(&daemon), "the daemon still runs");
+    assert!(!is_running(&daemon), "the daemon still runs");
 }
 
 #[test]
@@ -71,13 +71,18 @@ fn outcome_names_leftover_processes() {
     let mut script = Command::new("sh");
     script.args(["-c", "sleep 1000 > /dev/null 2>&1 & exit 0"]);
     let outcome = Program::start(script).wait();
-    assert_eq!((outcome.code, outcome.left.len()), (Some(0), 1), "{outcome}: {:?}", outcome.left);
+    assert_eq!(
+        (outcome.exit_code, outcome.leftover_processes.len()),
+        (Some(0), 1),
+        "{outcome}: {:?}",
+        outcome.leftover_processes
+    );
 }
 
 /// Starts a process that looks like a descendant of the test binary in `run`.
-fn pretend(run: &str) -> Child {
-    let (child, _) = shell(&format!("echo; export {RUN}='{run}'; exec sleep 1000"));
-    until("it sleeps", || child.family() == ["sleep 1000"]);
+fn start_with_run(run: &str) -> Child {
+    let (child, _) = shell(&format!("echo; export {RUN_VARIABLE}='{run}'; exec sleep 1000"));
+    wait_until("it sleeps", || child.living_command_lines() == ["sleep 1000"]);
     child
 }
 
@@ -89,40 +94,41 @@ fn is_killed(mut child: Child) -> bool {
 #[test]
 fn ends_processes_of_interrupted_runs() {
     let (env, own) = (TestEnv::new(), std::process::id());
-    let (mut ended, run) = shell(&format!("echo ${RUN}"));
+    let (mut ended, run) = shell(&format!("echo ${RUN_VARIABLE}"));
     ended.wait().expect("it ends");
     let start = run.rsplit(':').next().expect("the start time of this process");
-    let (target, gone) = (env.word("target"), ended.id());
+    let (target, ended_pid) = (env.path_argument("target"), ended.id());
     // The second: another process has the ID of the test binary by now.
-    let left = [format!("{target}:{gone}:5"), format!("{target}:{own}:5")].map(|run| pretend(&run));
+    let left =
+        [format!("{target}:{ended_pid}:5"), format!("{target}:{own}:5")].map(|run| start_with_run(&run));
     // The test binary runs; it started too late; it is in another directory; it is not named.
     let kept = [
         format!("{target}:{own}:{start}"),
-        format!("{target}:{gone}:6"),
-        format!("{target}x:{gone}:5"),
+        format!("{target}:{ended_pid}:6"),
+        format!("{target}x:{ended_pid}:5"),
         target.clone(),
     ];
-    let mut kept = kept.map(|run| pretend(&run));
+    let mut kept = kept.map(|run| start_with_run(&run));
     end_runs_of(&target, 6);
     assert!(left.into_iter().all(is_killed));
     for child in &mut kept {
-        assert_eq!(child.try_wait().ok(), Some(None), "{:?}", child.family());
+        assert_eq!(child.try_wait().ok(), Some(None), "{:?}", child.living_command_lines());
     }
 }
 
 #[test]
 fn first_child_ends_interrupted_runs() {
     const NAME: &str = "children::first_child_ends_interrupted_runs";
-    if std::env::var_os(INSIDE).is_some() {
+    if std::env::var_os(NEXT_RUN_VARIABLE).is_some() {
         assert!(status(Command::new("true")).is_ok_and(|status| status.success()));
         return;
     }
-    let (mut ended, run) = shell(&format!("echo ${RUN}"));
+    let (mut ended, run) = shell(&format!("echo ${RUN_VARIABLE}"));
     ended.wait().expect("it ends");
     let target = run.rsplitn(3, ':').nth(2).expect("the target directory");
-    let left = pretend(&format!("{target}:{}:5", ended.id()));
+    let left = start_with_run(&format!("{target}:{}:5", ended.id()));
     let mut next = Command::new(own_program());
-    let next = output(next.args(only(NAME)).env(INSIDE, "1")).expect("it runs");
+    let next = output(next.args(single_test_args(NAME)).env(NEXT_RUN_VARIABLE, "1")).expect("it runs");
     assert!(next.status.success(), "{next:?}");
     assert!(is_killed(left));
 }

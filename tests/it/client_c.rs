@@ -9,11 +9,11 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use crate::testkit::{INT, KILL, Program, TERM, TestEnv, hash, is_class, number, output};
-use installed::{Installed, header_directory, is_there, source};
-use scanhub_schema::{Code, Contents, Header, Scan};
+use installed::{InstalledLibrary, header_directory, is_installed, source};
+use scanhub_schema::{ArrayFlags, Code, Header, Scan};
 use serde_json::Value;
 
-fn succeeded(output: &Output) -> String {
+fn expect_success(output: &Output) -> String {
     let text = |bytes| String::from_utf8_lossy(bytes).into_owned();
     assert!(output.status.success(), "{}{}", text(&output.stdout), text(&output.stderr));
     text(&output.stdout)
@@ -22,8 +22,8 @@ fn succeeded(output: &Output) -> String {
 /// A program that finds the hub of this environment.
 fn program(env: &TestEnv, program: &Path, words: &[&str]) -> Program {
     let mut command = Command::new(program);
-    command.args(words).env("SCANHUB_DOMAIN", env.place().name()).env_remove("XDG_RUNTIME_DIR");
-    command.env("RUNTIME_DIRECTORY", env.place().root().parent().expect("it has one"));
+    command.args(words).env("SCANHUB_DOMAIN", env.domain().name()).env_remove("XDG_RUNTIME_DIR");
+    command.env("RUNTIME_DIRECTORY", env.domain().root().parent().expect("it has one"));
     Program::start(command)
 }
 
@@ -36,7 +36,7 @@ fn data(line: &Value) -> Vec<u8> {
 /// In every standard that people use.
 #[test]
 fn the_header_has_the_layout_of_schema() {
-    if !is_there("cc") {
+    if !is_installed("cc") {
         return;
     }
     let env = TestEnv::new();
@@ -44,7 +44,7 @@ fn the_header_has_the_layout_of_schema() {
     for (compiler, standard) in
         [("cc", "-std=c99"), ("cc", "-std=c11"), ("c++", "-std=c++11"), ("c++", "-std=c++20")]
     {
-        if !is_there(compiler) {
+        if !is_installed(compiler) {
             continue;
         }
         let mut cc = Command::new(compiler);
@@ -53,16 +53,16 @@ fn the_header_has_the_layout_of_schema() {
             cc.args(["-x", "c++"]);
         }
         cc.arg("-I").arg(header_directory()).arg(env.path("layout.c")).arg("-o").arg(env.path("layout"));
-        succeeded(&output(cc).expect("a compiler"));
-        let said = succeeded(&output(Command::new(env.path("layout"))).expect("it runs"));
-        assert_eq!(said.lines().collect::<Vec<_>>(), layout::expected(), "{compiler} {standard}");
+        expect_success(&output(cc).expect("a compiler"));
+        let printed = expect_success(&output(Command::new(env.path("layout"))).expect("it runs"));
+        assert_eq!(printed.lines().collect::<Vec<_>>(), layout::expected(), "{compiler} {standard}");
     }
 }
 
 /// A program may read datagrams and topics.
 #[test]
 fn both_headers_go_into_one_program() {
-    if !is_there("cc") {
+    if !is_installed("cc") {
         return;
     }
     let env = TestEnv::new();
@@ -73,25 +73,25 @@ fn both_headers_go_into_one_program() {
         cc.args(["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-c", &file, "-o"]);
         cc.arg(env.path("both.o")).arg("-I").arg(header_directory());
         cc.arg("-I").arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/c"));
-        succeeded(&output(cc).expect("a compiler"));
+        expect_success(&output(cc).expect("a compiler"));
     }
 }
 
 #[test]
-fn what_the_header_computes_is_what_schema_computes() {
-    if !is_there("cc") {
+fn c_header_computes_the_same_values_as_schema() {
+    if !is_installed("cc") {
         return;
     }
     let env = TestEnv::new();
     let header = Header { stamp_first_ns: 5_000_000_000, ..Header::default() };
     for scan in layout::scans() {
-        env.file("computes.c", layout::computes(&header, &scan));
+        env.file("computes.c", layout::computed_values_c(&header, &scan));
         let mut cc = Command::new("cc");
         cc.args(["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-fsanitize=undefined"]);
         cc.args(["-fno-sanitize-recover=all", "-I"]).arg(header_directory()).arg(env.path("computes.c"));
-        succeeded(&output(cc.arg("-o").arg(env.path("computes"))).expect("a compiler"));
-        let said = succeeded(&output(Command::new(env.path("computes"))).expect("it runs"));
-        let mut lines = said.lines();
+        expect_success(&output(cc.arg("-o").arg(env.path("computes"))).expect("a compiler"));
+        let printed = expect_success(&output(Command::new(env.path("computes"))).expect("it runs"));
+        let mut lines = printed.lines();
         let head = format!("{} {} {}", scan.beams(), scan.collisions, u8::from(scan.is_incomplete()));
         assert_eq!(lines.next(), Some(head.as_str()));
         for (i, line) in lines.enumerate() {
@@ -108,32 +108,32 @@ fn what_the_header_computes_is_what_schema_computes() {
             let at_ns = header.stamp_first_ns.saturating_add_signed(scan.beam_ns(i)).to_string();
             assert_eq!(rest, [code, intensity, at_ns], "beam {i}");
         }
-        assert_eq!(said.lines().count(), scan.beams() + 4);
+        assert_eq!(printed.lines().count(), scan.beams() + 4);
     }
 }
 
 /// Everybody who waits in another way gets the same, where the hub wrote it.
 #[test]
 fn a_program_in_c_has_every_sample_in_shared_memory() {
-    let Some(installed) = Installed::once() else { return };
+    let Some(installed) = InstalledLibrary::installed() else { return };
     let env = TestEnv::new();
     let follow = installed.compile(&env, &source("follow.c"), &[]);
     let simulator = env.simulator(&["front"], &["--seed=31"]);
     let hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
-    let mut followers: Vec<_> = ["doorbell", "event", "spin", "poll"]
+    let mut subscribers: Vec<_> = ["doorbell", "event", "spin", "poll"]
         .iter()
-        .map(|way| program(&env, &follow, &["front", "1", way, "60"]))
+        .map(|wait_method| program(&env, &follow, &["front", "1", wait_method, "60"]))
         .collect();
-    for follower in &mut followers {
-        follower.await_line("its begin", is_class("open"));
+    for subscriber in &mut subscribers {
+        subscriber.await_line("its begin", is_class("open"));
     }
-    let outcomes: Vec<_> = followers.into_iter().map(Program::wait).collect();
-    assert_eq!(hub.end(TERM).code, Some(0));
-    assert_eq!(simulator.end(TERM).code, Some(0));
+    let outcomes: Vec<_> = subscribers.into_iter().map(Program::wait).collect();
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
+    assert_eq!(simulator.end(TERM).exit_code, Some(0));
     let sent: HashSet<String> = env.truth("front").into_iter().map(|sent| sent.hash).collect();
     for outcome in &outcomes {
-        assert_eq!(outcome.code, Some(0), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(0), "{outcome}");
         let samples = outcome.of_class("sample");
         assert_eq!(samples.len(), 60, "{outcome}");
         assert!(samples.iter().all(|line| line["shared"] == true && line["restarted"] == 0), "{outcome}");
@@ -147,42 +147,44 @@ fn a_program_in_c_has_every_sample_in_shared_memory() {
 
 #[test]
 fn a_program_in_c_outlives_its_hub() {
-    let Some(installed) = Installed::once() else { return };
+    let Some(installed) = InstalledLibrary::installed() else { return };
     let env = TestEnv::new();
     let follow = installed.compile(&env, &source("follow.c"), &[]);
     // There is no hub yet.
-    let mut followers = ["doorbell", "poll"].map(|way| program(&env, &follow, &["front", "2", way, "0"]));
-    for follower in &mut followers {
-        follower.await_line("its begin", is_class("open"));
+    let mut subscribers =
+        ["doorbell", "poll"].map(|wait_method| program(&env, &follow, &["front", "2", wait_method, "0"]));
+    for subscriber in &mut subscribers {
+        subscriber.await_line("its begin", is_class("open"));
     }
     let simulator = env.simulator(&["front"], &["--seed=32"]);
     let mut boots = Vec::new();
     for how in [KILL, TERM, KILL] {
         let hub = env.hub(&[env.link("front")]);
-        for follower in &mut followers {
+        for subscriber in &mut subscribers {
             let is_new = |line: &Value| is_class("sample")(line) && !boots.contains(&line["boot"]);
-            let first = follower.await_line("a scan of this hub", is_new);
+            let first = subscriber.await_line("a scan of this hub", is_new);
             assert_eq!(first["restarted"], u64::from(!boots.is_empty()), "{first}");
             assert_eq!(
                 (number(&first, "missed"), data(&first).len()),
-                (0, Scan::len(361, Contents::UPPER)),
+                (0, Scan::len(361, ArrayFlags::UPPER)),
                 "{first}"
             );
-            follower.await_lines(20, "scans", |line| line["boot"] == first["boot"] && line["restarted"] == 0);
+            subscriber
+                .await_lines(20, "scans", |line| line["boot"] == first["boot"] && line["restarted"] == 0);
         }
         let info = env.info("front");
-        boots.push(followers[0].await_line("one more", is_class("sample"))["boot"].clone());
+        boots.push(subscribers[0].await_line("one more", is_class("sample"))["boot"].clone());
         assert_eq!(info["state"], "streaming");
         hub.end(how);
     }
-    for follower in followers {
-        assert_eq!(follower.end(INT).code, None);
+    for subscriber in subscribers {
+        assert_eq!(subscriber.end(INT).exit_code, None);
     }
     drop(simulator);
 }
 
 /// Returns whether a line has this reason, SCANHUB_SILENCE_.. of the header, and `text` is a part of its text.
-fn has(reason: u64, text: &str) -> impl Fn(&Value) -> bool {
+fn has_reason(reason: u64, text: &str) -> impl Fn(&Value) -> bool {
     move |line| line["reason"] == reason && line["text"].as_str().is_some_and(|it| it.contains(text))
 }
 
@@ -192,34 +194,34 @@ fn a_program_in_c_names_the_user_of_a_domain() {
         eprintln!("skipped: only root can create a directory of another user");
         return;
     }
-    let Some(installed) = Installed::once() else { return };
+    let Some(installed) = InstalledLibrary::installed() else { return };
     let env = TestEnv::new();
     let silence = installed.compile(&env, &source("silence.c"), &[]);
-    let place = env.place();
-    std::fs::create_dir_all(place.root()).expect("a directory");
-    std::os::unix::fs::chown(place.root(), Some(65_534), Some(65_534)).expect("root may");
+    let domain = env.domain();
+    std::fs::create_dir_all(domain.root()).expect("a directory");
+    std::os::unix::fs::chown(domain.root(), Some(65_534), Some(65_534)).expect("root may");
     let other_user = 2;
-    for way in ["doorbell", "event"] {
-        let mut follower = program(&env, &silence, &["front", way]);
-        let line = follower.await_line("the other user", has(other_user, "belongs to user"));
-        assert!(has(other_user, "\n  ")(&line), "no remedy: {line}");
+    for wait_method in ["doorbell", "event"] {
+        let mut subscriber = program(&env, &silence, &["front", wait_method]);
+        let line = subscriber.await_line("the other user", has_reason(other_user, "belongs to user"));
+        assert!(has_reason(other_user, "\n  ")(&line), "no remedy: {line}");
     }
 }
 
 #[test]
 fn a_program_in_c_learns_why_no_sample_arrives() {
     let [waiting, no_hub, unknown_sensor, paused] = [0, 1, 3, 6];
-    let Some(installed) = Installed::once() else { return };
+    let Some(installed) = InstalledLibrary::installed() else { return };
     let env = TestEnv::new();
     let silence = installed.compile(&env, &source("silence.c"), &[]);
-    let start = |sensor, way| program(&env, &silence, &[sensor, way]);
+    let start = |sensor, wait_method| program(&env, &silence, &[sensor, wait_method]);
     let mut scans = start("front", "doorbell");
-    let mut mistyped = ["doorbell", "event"].map(|way| start("frnot", way));
-    for follower in mistyped.iter_mut().chain([&mut scans]) {
-        let line = follower.await_line("there is no hub", has(no_hub, "scanhub run"));
+    let mut mistyped = ["doorbell", "event"].map(|wait_method| start("frnot", wait_method));
+    for subscriber in mistyped.iter_mut().chain([&mut scans]) {
+        let line = subscriber.await_line("there is no hub", has_reason(no_hub, "scanhub run"));
         assert_eq!((&line["sensors"], &line["topics"]), (&"".into(), &"".into()), "{line}");
         let earlier = number(&line, "silent_ns");
-        let later = follower.await_line("time passes", is_class("silence"));
+        let later = subscriber.await_line("time passes", is_class("silence"));
         assert!(number(&later, "silent_ns") > earlier, "{line}, {later}");
     }
     // Without a hub, a poll of half a second times out, so the program prints its lines.
@@ -229,41 +231,44 @@ fn a_program_in_c_learns_why_no_sample_arrives() {
 
     let _simulators = ["front", "rear"].map(|name| env.simulator(&[name], &["--baud=500000"]));
     let _hub = env.hub(&[env.link("front"), env.link("rear")]);
-    for follower in &mut mistyped {
-        let is_it = has(unknown_sensor, "no sensor frnot\n  the sensors are front, rear");
-        let line = follower.await_line("the names that exist", is_it);
+    for subscriber in &mut mistyped {
+        let is_it = has_reason(unknown_sensor, "no sensor frnot\n  the sensors are front, rear");
+        let line = subscriber.await_line("the names that exist", is_it);
         assert_eq!(line["sensors"], "front rear", "{line}");
         let topics: Vec<&str> = line["topics"].as_str().expect("a text").split(' ').collect();
         assert!(topics.contains(&"front/scan") && topics.contains(&"rear/status"), "{line}");
         // Sensor by sensor.
         assert!(topics.is_sorted_by_key(|topic| topic.split('/').next()), "{line}");
     }
-    let is_streaming = |line: &Value| has(waiting, "")(line) && number(line, "silent_ns") < 100_000_000;
+    let is_streaming =
+        |line: &Value| has_reason(waiting, "")(line) && number(line, "silent_ns") < 100_000_000;
     scans.await_line("scans", is_streaming);
-    assert_eq!(env.run(&["control", "front", "pause"]).code, Some(0));
-    let line = scans.await_line("the pause", has(paused, "front is paused\n  scanhub control front resume"));
+    assert_eq!(env.run(&["control", "front", "pause"]).exit_code, Some(0));
+    let line =
+        scans.await_line("the pause", has_reason(paused, "front is paused\n  scanhub control front resume"));
     assert!(number(&line, "silent_ns") > 0, "{line}");
-    assert_eq!(env.run(&["control", "front", "resume"]).code, Some(0));
+    assert_eq!(env.run(&["control", "front", "resume"]).exit_code, Some(0));
     scans.await_line("scans again", is_streaming);
 }
 
 /// Nobody who acts on zones needs a clock.
 #[test]
 fn zones_get_unknown_when_the_hub_is_killed() {
-    let Some(installed) = Installed::once() else { return };
+    let Some(installed) = InstalledLibrary::installed() else { return };
     let env = TestEnv::new();
     let follow = installed.compile(&env, &source("follow.c"), &[]);
     let _simulator = env.simulator(&["front"], &["--seed=33"]);
     let hub = env.hub(&[env.link("front")]);
-    let mut followers = ["doorbell", "poll"].map(|way| program(&env, &follow, &["front", "4", way, "0"]));
-    for follower in &mut followers {
-        follower.await_line("a verdict", |line| {
+    let mut subscribers =
+        ["doorbell", "poll"].map(|wait_method| program(&env, &follow, &["front", "4", wait_method, "0"]));
+    for subscriber in &mut subscribers {
+        subscriber.await_line("a verdict", |line| {
             is_class("sample")(line) && line["stale"] == 0 && data(line)[0] < 3
         });
     }
     hub.end(KILL);
-    for follower in &mut followers {
-        let unknown = follower.await_line("silence", |line| line["stale"] == 1);
+    for subscriber in &mut subscribers {
+        let unknown = subscriber.await_line("silence", |line| line["stale"] == 1);
         assert_eq!((data(&unknown)[0], unknown.get("seq")), (3, None), "{unknown}");
     }
 }
@@ -271,18 +276,19 @@ fn zones_get_unknown_when_the_hub_is_killed() {
 /// The worst of its sensors, of which one is switched off, then the hub killed.
 #[test]
 fn a_robot_is_as_unknown_as_its_worst_sensor() {
-    let Some(installed) = Installed::once() else { return };
+    let Some(installed) = InstalledLibrary::installed() else { return };
     let env = TestEnv::new();
     let robot = installed.compile(&env, &source("robot.c"), &[]);
-    let mut followers =
+    let mut subscribers =
         [&["doorbell"][..], &["poll"], &["event", "front rear"]].map(|words| program(&env, &robot, words));
-    for follower in &mut followers {
-        let first = follower.await_line("there is no hub", is_class("robot"));
+    for subscriber in &mut subscribers {
+        let first = subscriber.await_line("there is no hub", is_class("robot"));
         assert_eq!((&first["verdict"], &first["nearest_mm"]), (&3.into(), &Value::Null), "{first}");
     }
     // All is clear: nothing in the simulated room is so near.
     let _front = env.simulator(&["front"], &["--seed=36", "--baud=500000"]);
-    let rear = env.start(&["simulate", "--json", "--baud=500000", &format!("--port={}", env.word("rear"))]);
+    let rear =
+        env.start(&["simulate", "--json", "--baud=500000", &format!("--port={}", env.path_argument("rear"))]);
     let rear = rear.ready();
     let hub = env.hub(&[&env.link("front"), &env.link("rear"), "--set=zones.radii=[0.02,0.01]"]);
     let verdicts = |line: &Value| {
@@ -294,8 +300,8 @@ fn a_robot_is_as_unknown_as_its_worst_sensor() {
         (number(line, "verdict"), sensors)
     };
     let both = |front, rear| vec![(Some("front".to_owned()), front), (Some("rear".to_owned()), rear)];
-    for follower in &mut followers {
-        let line = follower.await_line("all is clear", |line| verdicts(line) == (0, both(0, 0)));
+    for subscriber in &mut subscribers {
+        let line = subscriber.await_line("all is clear", |line| verdicts(line) == (0, both(0, 0)));
         assert_eq!(line["worst"], line["sensors"][0]["sensor"], "{line}");
         let nearest =
             line["sensors"].as_array().expect("a list").iter().min_by_key(|it| number(it, "nearest_mm"));
@@ -305,21 +311,21 @@ fn a_robot_is_as_unknown_as_its_worst_sensor() {
             (&nearest["nearest_mm"], &nearest["sensor"])
         );
     }
-    env.kill_simulator(rear, "rear");
-    for follower in &mut followers {
-        let line = follower.await_line("the rear is gone", |line| verdicts(line) == (3, both(0, 3)));
+    env.kill_port_simulator(rear, "rear");
+    for subscriber in &mut subscribers {
+        let line = subscriber.await_line("the rear is gone", |line| verdicts(line) == (3, both(0, 3)));
         assert_eq!(line["worst"], "rear", "{line}");
     }
-    assert_eq!(hub.end(KILL).code, None);
-    for follower in &mut followers {
-        follower.await_line("the hub is gone", |line| verdicts(line) == (3, both(3, 3)));
+    assert_eq!(hub.end(KILL).exit_code, None);
+    for subscriber in &mut subscribers {
+        subscriber.await_line("the hub is gone", |line| verdicts(line) == (3, both(3, 3)));
     }
 }
 
 /// Once as it is, and with two watches over memory, of the compiler and of valgrind: the library shares it with the program.
 #[test]
-fn what_a_program_does_wrong_is_refused() {
-    let Some(installed) = Installed::once() else { return };
+fn c_library_rejects_misuse() {
+    let Some(installed) = InstalledLibrary::installed() else { return };
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--seed=34"]);
     let _hub = env.hub(&[env.link("front")]);
@@ -331,7 +337,7 @@ fn what_a_program_does_wrong_is_refused() {
         Ok(watched) => ways.push(vec![watched.display().to_string()]),
         Err(_) => eprintln!("without the compiler's watch over memory: it has none"),
     }
-    if is_there("valgrind") {
+    if is_installed("valgrind") {
         // What a child keeps of its parent is found, in part by addresses of its middle.
         let leaks = ["--leak-check=full", "--show-leak-kinds=definite", "--errors-for-leak-kinds=definite"];
         let known =
@@ -341,18 +347,18 @@ fn what_a_program_does_wrong_is_refused() {
             ["valgrind", "--quiet", leaks[0], leaks[1], leaks[2], known, frames, "--error-exitcode=9"];
         ways.push(words.into_iter().map(str::to_owned).chain([plain]).collect());
     }
-    for way in ways {
-        let words: Vec<&str> = way[1..].iter().map(String::as_str).chain(["front"]).collect();
-        let outcome = program(&env, Path::new(&way[0]), &words).wait();
-        assert_eq!(outcome.code, Some(0), "{outcome}");
-        assert_eq!(outcome.out, b"all refused\n", "{outcome}");
+    for wait_method in ways {
+        let words: Vec<&str> = wait_method[1..].iter().map(String::as_str).chain(["front"]).collect();
+        let outcome = program(&env, Path::new(&wait_method[0]), &words).wait();
+        assert_eq!(outcome.exit_code, Some(0), "{outcome}");
+        assert_eq!(outcome.stdout, b"all refused\n", "{outcome}");
     }
 }
 
 /// The examples, as the page about them builds them; and a program into which the library is linked.
 #[test]
 fn the_examples_build_and_run() {
-    let Some(installed) = Installed::once() else { return };
+    let Some(installed) = InstalledLibrary::installed() else { return };
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--seed=35"]);
     let _hub = env.hub(&[env.link("front")]);
@@ -366,10 +372,13 @@ fn the_examples_build_and_run() {
     built.extend(cmake.iter().skip(1).map(|build| build.join("nearest_static")));
     for nearest in &built {
         let outcome = program(&env, nearest, &["front", "5"]).wait();
-        assert_eq!(outcome.code, Some(0), "{outcome}");
-        let said = String::from_utf8_lossy(&outcome.out).into_owned();
-        assert_eq!(said.lines().count(), 5, "{said}");
-        assert!(said.lines().all(|line| line.contains(" m at ") && line.ends_with(" degrees")), "{said}");
+        assert_eq!(outcome.exit_code, Some(0), "{outcome}");
+        let printed = String::from_utf8_lossy(&outcome.stdout).into_owned();
+        assert_eq!(printed.lines().count(), 5, "{printed}");
+        assert!(
+            printed.lines().all(|line| line.contains(" m at ") && line.ends_with(" degrees")),
+            "{printed}"
+        );
     }
     let mut mounts = vec![installed.compile(&env, &examples.join("mount.c"), &[])];
     mounts.extend(cmake.iter().map(|build| build.join("mount")));
@@ -381,18 +390,18 @@ fn the_examples_build_and_run() {
         );
         let again = program(&env, path, &["swing"]).wait();
         let held = format!("the name swing is published by process {} (", mount.pid());
-        assert!(again.code == Some(1) && again.errors.contains(&held), "{again}");
-        assert_eq!(mount.end(INT).errors, "");
+        assert!(again.exit_code == Some(1) && again.stderr.contains(&held), "{again}");
+        assert_eq!(mount.end(INT).stderr, "");
     }
     let Some(stop) = installed.compile_cpp(&env, &examples.join("stop.cpp")) else { return };
     for stop in cmake.iter().map(|build| build.join("stop")).chain([stop]) {
         let outcome = program(&env, &stop, &["Front"]).wait();
-        assert_eq!(outcome.code, Some(1), "{outcome}");
-        assert!(outcome.errors.contains("\"Front\" is not possible"), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(1), "{outcome}");
+        assert!(outcome.stderr.contains("\"Front\" is not possible"), "{outcome}");
         let (feed, _keep) = std::io::pipe().expect("a pipe");
         let mut command = Command::new(&stop);
-        command.arg("front").env("SCANHUB_DOMAIN", env.place().name()).env_remove("XDG_RUNTIME_DIR");
-        command.env("RUNTIME_DIRECTORY", env.place().root().parent().expect("it has one"));
+        command.arg("front").env("SCANHUB_DOMAIN", env.domain().name()).env_remove("XDG_RUNTIME_DIR");
+        command.env("RUNTIME_DIRECTORY", env.domain().root().parent().expect("it has one"));
         let mut stop = Program::start_with(command, feed);
         let verdict = stop.next_text();
         assert!(
@@ -404,26 +413,26 @@ fn the_examples_build_and_run() {
 
 #[test]
 fn cpp_20_has_optional_samples_and_spans() {
-    let Some(installed) = Installed::once() else { return };
+    let Some(installed) = InstalledLibrary::installed() else { return };
     let env = TestEnv::new();
     let Some(modern) = installed.compile_cpp20(&env, &source("modern.cpp")) else { return };
     let _simulator = env.simulator(&["front"], &["--seed=37"]);
     let _hub = env.hub(&[env.link("front")]);
     let outcome = program(&env, &modern, &["front"]).wait();
-    assert_eq!(outcome.code, Some(0), "{outcome}");
-    assert_eq!(String::from_utf8_lossy(&outcome.out), "361\n".repeat(5), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
+    assert_eq!(String::from_utf8_lossy(&outcome.stdout), "361\n".repeat(5), "{outcome}");
 }
 
 #[test]
 fn install_script_says_how_programs_find_the_library() {
-    let Some(installed) = Installed::once() else { return };
+    let Some(installed) = InstalledLibrary::installed() else { return };
     let flag = format!("link programs with -Wl,-rpath,{}", installed.prefix.join("lib").display());
     assert!(installed.messages.trim_end().ends_with(&flag), "{}", installed.messages);
 }
 
 #[test]
-fn what_is_installed_is_taken_away_again() {
-    let Some(installed) = Installed::once() else { return };
+fn install_script_removes_every_file_it_installs() {
+    let Some(installed) = InstalledLibrary::installed() else { return };
     let env = TestEnv::new();
     let destination = env.path("machine");
     let run = |words: &[&str]| {
@@ -433,7 +442,7 @@ fn what_is_installed_is_taken_away_again() {
         output(command).expect("sh")
     };
     for _ in 0..2 {
-        succeeded(&run(&["--prefix", "/opt/robot"]));
+        expect_success(&run(&["--prefix", "/opt/robot"]));
     }
     let below = destination.join("opt/robot");
     for file in [
@@ -452,8 +461,8 @@ fn what_is_installed_is_taken_away_again() {
     let version = std::fs::read_to_string(version).expect("a version file");
     let line = concat!("set(PACKAGE_VERSION \"", env!("CARGO_PKG_VERSION"), "\")\n");
     assert!(version.contains(line), "{version}");
-    succeeded(&run(&["--prefix", "/opt/robot", "--remove"]));
+    expect_success(&run(&["--prefix", "/opt/robot", "--remove"]));
     let left = output(Command::new("find").arg(&destination).args(["!", "-type", "d"])).expect("find");
-    assert_eq!(succeeded(&left), "");
+    assert_eq!(expect_success(&left), "");
     assert_eq!(run(&["--prefix", "here"]).status.code(), Some(2));
 }

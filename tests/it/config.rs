@@ -9,24 +9,24 @@ use crate::testkit;
 use crate::testkit::{Outcome, TestEnv, output, skip};
 
 fn text(outcome: &Outcome) -> String {
-    String::from_utf8_lossy(&outcome.out).into_owned()
+    String::from_utf8_lossy(&outcome.stdout).into_owned()
 }
 
 /// What the program prints for `arguments`, which it takes.
-fn printed(env: &TestEnv, arguments: &[&str]) -> String {
+fn print_config(env: &TestEnv, arguments: &[&str]) -> String {
     let outcome = env.run(arguments);
-    assert_eq!((outcome.code, outcome.errors.as_str()), (Some(0), ""), "{outcome}");
+    assert_eq!((outcome.exit_code, outcome.stderr.as_str()), (Some(0), ""), "{outcome}");
     text(&outcome)
 }
 
 #[test]
-fn the_default_can_be_loaded_and_is_what_holds_without_it() {
+fn printed_default_loads_and_equals_built_in_defaults() {
     let env = TestEnv::new();
-    let default = env.file("default.toml", printed(&env, &["config", "default"]));
+    let default = env.file("default.toml", print_config(&env, &["config", "default"]));
     let ok = "ok: 1 link: front at /dev/ttyUSB0\n";
-    assert_eq!(printed(&env, &["config", "check", &default]), ok);
+    assert_eq!(print_config(&env, &["config", "check", &default]), ok);
     let links = ["--link=front=/dev/ttyUSB0"];
-    assert_eq!(printed(&env, &[&["config", "check", "--no-system-config"], &links[..]].concat()), ok);
+    assert_eq!(print_config(&env, &[&["config", "check", "--no-system-config"], &links[..]].concat()), ok);
     let values = |arguments: &[&str]| -> Vec<_> {
         let outcome = env.run(&[&["config", "show", "--json", "--no-system-config"], arguments].concat());
         let lines = outcome.of_class("value");
@@ -38,7 +38,7 @@ fn the_default_can_be_loaded_and_is_what_holds_without_it() {
 }
 
 #[test]
-fn a_check_refuses_what_a_hub_refuses() {
+fn config_check_rejects_bad_configurations() {
     let env = TestEnv::new();
     let file = env.file("scanhub.toml", "[[link]]\nname = \"a\"\nprot = \"/dev/x\"\n");
     let gateway = env.file("gateway.toml", "[gateway]\nbackground_every = \"10\"\n");
@@ -58,15 +58,19 @@ fn a_check_refuses_what_a_hub_refuses() {
         (vec![empty.as_str()], "no link is configured".to_owned()),
     ] {
         let outcome = env.run(&[&["config", "check"], &arguments[..]].concat());
-        assert_eq!((outcome.code, outcome.out.len()), (Some(78), 0), "{outcome}");
-        assert!(outcome.errors.contains(&place), "{place}: {outcome}");
+        assert_eq!((outcome.exit_code, outcome.stdout.len()), (Some(78), 0), "{outcome}");
+        assert!(outcome.stderr.contains(&place), "{place}: {outcome}");
         let outcome = env.run(&[&["config", "check", "--json"], &arguments[..]].concat());
         let error = &outcome.of_class("error")[0];
-        assert_eq!((outcome.code, error["kind"].as_str()), (Some(78), Some("configuration")), "{outcome}");
+        assert_eq!(
+            (outcome.exit_code, error["kind"].as_str()),
+            (Some(78), Some("configuration")),
+            "{outcome}"
+        );
     }
     let missing = env.run(&["config", "check", "/nowhere/scanhub.toml"]);
-    assert_eq!((missing.code, missing.out.len()), (Some(66), 0), "{missing}");
-    assert!(missing.errors.contains("/nowhere/scanhub.toml: No such file"), "{missing}");
+    assert_eq!((missing.exit_code, missing.stdout.len()), (Some(66), 0), "{missing}");
+    assert!(missing.stderr.contains("/nowhere/scanhub.toml: No such file"), "{missing}");
     let link = ["config", "check", "--json", "--no-system-config", "--link", "a=tcp:box:4001"];
     let checked = env.run(&link).of_class("checked");
     assert_eq!(checked[0]["links"][0]["port"], "tcp:box:4001", "{checked:?}");
@@ -78,7 +82,7 @@ fn values_stand_below_each_other_with_their_places() {
     let file =
         env.file("scanhub.toml", "[[link]]\nname = \"a\"\nport = \"/dev/x\"\n[zones]\nradii = [2.0, 1.0]\n");
     let words = ["config", "show", "--no-system-config", "--config", &file, "--set", "link.a.pose.x=0.3"];
-    let shown = printed(&env, &words);
+    let shown = print_config(&env, &words);
     let row = |key: &str| {
         let found = shown.lines().find(|line| line.split_whitespace().next() == Some(key));
         found.unwrap_or_else(|| panic!("no {key}: {shown}"))
@@ -95,7 +99,7 @@ fn values_stand_below_each_other_with_their_places() {
 }
 
 #[test]
-fn a_slip_is_told_the_nearest_name() {
+fn typo_gets_a_tip_with_the_nearest_name() {
     let env = TestEnv::new();
     for (arguments, nearest) in [
         (&["ehco"][..], "'echo'"),
@@ -104,18 +108,21 @@ fn a_slip_is_told_the_nearest_name() {
         (&["run", "--lnik", "a=b"], "'--link'"),
     ] {
         let outcome = env.run(arguments);
-        assert_eq!(outcome.code, Some(2), "{outcome}");
-        assert!(outcome.errors.contains("tip: "), "{outcome}");
-        assert!(outcome.errors.contains(nearest), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(2), "{outcome}");
+        assert!(outcome.stderr.contains("tip: "), "{outcome}");
+        assert!(outcome.stderr.contains(nearest), "{outcome}");
     }
     let outcome = env.run(&["wacth", "--json"]);
     let error = &outcome.lines()[0];
-    assert_eq!((outcome.code, &error["hint"]), (Some(2), &"a similar subcommand exists: 'watch'".into()));
+    assert_eq!(
+        (outcome.exit_code, &error["hint"]),
+        (Some(2), &"a similar subcommand exists: 'watch'".into())
+    );
 }
 
 /// The verbs that the help names, but `help` itself.
 fn verbs(env: &TestEnv) -> Vec<String> {
-    let help = printed(env, &["--help"]);
+    let help = print_config(env, &["--help"]);
     let rows =
         help.lines().skip_while(|line| *line != "Commands:").skip(1).take_while(|line| !line.is_empty());
     let verbs = rows.filter(|row| row.starts_with("  ") && !row.starts_with("   "));
@@ -131,14 +138,14 @@ fn every_verb_has_an_example_a_page_and_a_completion() {
     let env = TestEnv::new();
     let verbs = verbs(&env);
     assert!(verbs.len() > 15, "{verbs:?}");
-    let pages = env.word("man");
-    printed(&env, &["man", &pages]);
-    let completions = ["bash", "zsh", "fish"].map(|shell| printed(&env, &["completions", shell]));
+    let pages = env.path_argument("man");
+    print_config(&env, &["man", &pages]);
+    let completions = ["bash", "zsh", "fish"].map(|shell| print_config(&env, &["completions", shell]));
     for verb in &verbs {
         // A program of its own, which `cargo test` does not build; its tests hold its help.
         let is_apart = verb == "bridge";
         assert!(
-            is_apart || printed(&env, &[verb, "--help"]).contains(&format!("  scanhub {verb}")),
+            is_apart || print_config(&env, &[verb, "--help"]).contains(&format!("  scanhub {verb}")),
             "{verb}"
         );
         let page = fs::read_to_string(Path::new(&pages).join(format!("scanhub-{verb}.1")));
@@ -148,45 +155,55 @@ fn every_verb_has_an_example_a_page_and_a_completion() {
             assert!(text.contains(verb.as_str()), "{verb}: {text}");
         }
     }
-    assert!(printed(&env, &["man"]).contains(".TH scanhub 1"));
+    assert!(print_config(&env, &["man"]).contains(".TH scanhub 1"));
     let refused = env.run(&["man", "/dev/null/man"]);
-    assert_eq!((refused.code, refused.errors.contains("/dev/null/man: ")), (Some(73), true), "{refused}");
+    assert_eq!(
+        (refused.exit_code, refused.stderr.contains("/dev/null/man: ")),
+        (Some(73), true),
+        "{refused}"
+    );
 
     // The shell itself says what it would complete; there is a bash on most machines.
     let script = env.file("completion", &completions[0]);
     let ask = "source \"$0\"; COMP_WORDS=(scanhub ec); COMP_CWORD=1; _scanhub scanhub ec scanhub; echo \"${COMPREPLY[*]}\"";
     match output(Command::new("bash").args(["-c", ask, &script])) {
-        Ok(said) => assert_eq!(String::from_utf8_lossy(&said.stdout).trim(), "echo"),
+        Ok(completion_output) => {
+            assert_eq!(String::from_utf8_lossy(&completion_output.stdout).trim(), "echo")
+        }
         Err(error) => skip("bash", error),
     }
 }
 
 /// What bash itself completes behind `words`, the last of which is being typed.
-fn completed(env: &TestEnv, words: &[&str]) -> Option<Vec<String>> {
+fn complete_words(env: &TestEnv, words: &[&str]) -> Option<Vec<String>> {
     let program = Path::new(env!("CARGO_BIN_EXE_scanhub"));
-    let script = env.file("completion", printed(env, &["completions", "bash"]));
+    let script = env.file("completion", print_config(env, &["completions", "bash"]));
     let ask = "source \"$0\"; COMP_WORDS=(\"$@\"); COMP_CWORD=$(($# - 1)); \
                \"$(complete -p scanhub | sed 's/.*-F \\([^ ]*\\).*/\\1/')\" \"$1\" \"${@: -1}\" \"${@: -2:1}\"; printf '%s\\n' \"${COMPREPLY[@]}\"";
     let path = format!("{}:{}", program.parent()?.display(), std::env::var("PATH").unwrap_or_default());
     let mut bash = Command::new("bash");
     bash.args(["-c", ask, &script, "scanhub"]).args(words).env("PATH", path);
-    let said = match output(bash) {
-        Ok(said) => said,
+    let completion_output = match output(bash) {
+        Ok(completion_output) => completion_output,
         Err(error) => {
             skip("bash", error);
             return None;
         }
     };
-    assert_eq!((said.status.success(), said.stderr.is_empty()), (true, true), "{said:?}");
-    Some(String::from_utf8_lossy(&said.stdout).lines().map(String::from).collect())
+    assert_eq!(
+        (completion_output.status.success(), completion_output.stderr.is_empty()),
+        (true, true),
+        "{completion_output:?}"
+    );
+    Some(String::from_utf8_lossy(&completion_output.stdout).lines().map(String::from).collect())
 }
 
 #[test]
-fn sensors_and_topics_of_the_running_hub_are_completed() {
+fn completes_sensors_and_topics_of_the_running_hub() {
     let env = TestEnv::new();
-    let (domain, root) = (format!("--domain={}", env.place().name()), env.place().root().to_owned());
+    let (domain, root) = (format!("--domain={}", env.domain().name()), env.domain().root().to_owned());
     let root = format!("--root={}", root.parent().expect("a directory").display());
-    let ask = |words: &[&str]| completed(&env, &[&words[..1], &[&domain, &root], &words[1..]].concat());
+    let ask = |words: &[&str]| complete_words(&env, &[&words[..1], &[&domain, &root], &words[1..]].concat());
     let Some(before) = ask(&["echo", "front/s"]) else { return };
     assert_eq!(before, [""; 1], "without a hub there is nothing to add");
     let hub = env.hub(&["--link=front=/no/such/port", "--link=rear=/no/such/port2"]);
@@ -206,7 +223,7 @@ fn sensors_and_topics_of_the_running_hub_are_completed() {
             "{words:?}"
         );
     }
-    assert_eq!(hub.end(testkit::TERM).code, Some(0));
+    assert_eq!(hub.end(testkit::TERM).exit_code, Some(0));
 }
 
 /// All files below `directory`.
@@ -216,7 +233,7 @@ fn files(directory: &Path) -> Vec<PathBuf> {
 }
 
 #[test]
-fn what_is_installed_can_be_taken_away() {
+fn install_script_removes_manuals_and_completions() {
     let env = TestEnv::new();
     let install = |arguments: &[&str]| {
         let mut command = Command::new("sh");

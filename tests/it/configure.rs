@@ -7,35 +7,35 @@ use std::process::Stdio;
 use std::thread;
 
 use crate::testkit;
-use crate::testkit::{Child, INT, TERM, TestEnv, number, spawn, terminal, until};
+use crate::testkit::{Child, INT, TERM, TestEnv, number, spawn, terminal, wait_until};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
 /// The program with a person before it: what it asks is read, and answered on a terminal.
-struct Person {
+struct ConfigureSession {
     process: Child,
     /// The person's side of the terminal.
     keys: File,
 }
 
 /// What came of it.
-struct Seen {
+struct ConfigureOutcome {
     code: Option<i32>,
     out: String,
     errors: String,
 }
 
-impl Person {
-    fn start(env: &TestEnv, arguments: &[&str]) -> Person {
+impl ConfigureSession {
+    fn start(env: &TestEnv, arguments: &[&str]) -> ConfigureSession {
         let (keys, screen) = terminal();
         let mut command = env.command(&[&["configure"], arguments].concat());
         command.stdin(Stdio::from(screen.try_clone().unwrap()));
         command.stdout(Stdio::piped()).stderr(Stdio::from(screen));
-        Person { process: spawn(command).unwrap(), keys }
+        ConfigureSession { process: spawn(command).unwrap(), keys }
     }
 
     /// Reads until it asks, answers by `act`, and waits for its end.
-    fn answer(mut self, act: impl FnOnce(&mut File, u32)) -> Seen {
+    fn answer_questions(mut self, act: impl FnOnce(&mut File, u32)) -> ConfigureOutcome {
         let mut stdout = self.process.stdout.take().unwrap();
         let out = thread::spawn(move || {
             let mut text = String::new();
@@ -54,15 +54,15 @@ impl Person {
             errors.push(byte[0]);
         }
         let code = self.process.wait().unwrap().code();
-        Seen { code, out: out.join().unwrap(), errors: String::from_utf8(errors).unwrap() }
+        ConfigureOutcome { code, out: out.join().unwrap(), errors: String::from_utf8(errors).unwrap() }
     }
 
-    fn types(self, text: &str) -> Seen {
-        self.answer(|keys, _| keys.write_all(text.as_bytes()).unwrap())
+    fn type_text(self, text: &str) -> ConfigureOutcome {
+        self.answer_questions(|keys, _| keys.write_all(text.as_bytes()).unwrap())
     }
 }
 
-impl Seen {
+impl ConfigureOutcome {
     fn lines(&self) -> Vec<Value> {
         self.out.lines().map(|line| serde_json::from_str(line).unwrap_or_else(|_| panic!("{line}"))).collect()
     }
@@ -73,8 +73,8 @@ fn signal(pid: u32, signal: Signal) {
 }
 
 fn probe(env: &TestEnv, port: &str) -> Value {
-    let outcome = env.search(&["probe", &env.word(port), "--json"]);
-    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let outcome = env.search(&["probe", &env.path_argument(port), "--json"]);
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     outcome.lines()[0].clone()
 }
 
@@ -82,11 +82,12 @@ fn probe(env: &TestEnv, port: &str) -> Value {
 fn a_person_says_yes_and_it_is_written_once() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--baud=38400"]);
-    let port = env.word("front");
+    let port = env.path_argument("front");
     let before = probe(&env, "front");
-    let seen = Person::start(&env, &[&port, "unit=cm", "mode=fields-ab", "--json"]).types("yes\n");
-    assert_eq!(seen.code, Some(0), "{}\n{}", seen.out, seen.errors);
-    let lines = seen.lines();
+    let result =
+        ConfigureSession::start(&env, &[&port, "unit=cm", "mode=fields-ab", "--json"]).type_text("yes\n");
+    assert_eq!(result.code, Some(0), "{}\n{}", result.out, result.errors);
+    let lines = result.lines();
     let items: Vec<_> = lines.iter().map(|line| (&line["class"], &line["item"], &line["offset"])).collect();
     assert_eq!(items[0], (&"difference".into(), &"measuring mode".into(), &5.into()), "{lines:?}");
     assert_eq!(items[1], (&"difference".into(), &"unit".into(), &6.into()), "{lines:?}");
@@ -98,8 +99,8 @@ fn a_person_says_yes_and_it_is_written_once() {
     );
     assert_eq!(configured["before"], before["configuration"]);
     // Stdout is a pipe: who is asked sees it on the terminal.
-    let shown = seen.errors.split("Type yes").next().unwrap();
-    assert!(shown.contains("unit: 01h (1 mm) -> 00h (10 mm)"), "{}", seen.errors);
+    let shown = result.errors.split("Type yes").next().unwrap();
+    assert!(shown.contains("unit: 01h (1 mm) -> 00h (10 mm)"), "{}", result.errors);
     let after = probe(&env, "front");
     assert_eq!(configured["after"], after["configuration"]);
     assert_eq!((number(&after, "unit_mm"), number(&after, "mode")), (10, 4), "{after}");
@@ -107,39 +108,39 @@ fn a_person_says_yes_and_it_is_written_once() {
 
     // Back by what it was told, in words this time.
     let backup = format!("configuration={}", before["configuration"].as_str().unwrap());
-    let seen = Person::start(&env, &[&port, &backup]).types("yes\n");
-    assert_eq!(seen.code, Some(0), "{}", seen.errors);
-    assert!(seen.out.contains("unit: 00h (10 mm) -> 01h (1 mm)"), "{}", seen.out);
-    assert!(seen.out.contains("to go back: scanhub configure"), "{}", seen.out);
+    let result = ConfigureSession::start(&env, &[&port, &backup]).type_text("yes\n");
+    assert_eq!(result.code, Some(0), "{}", result.errors);
+    assert!(result.out.contains("unit: 00h (10 mm) -> 01h (1 mm)"), "{}", result.out);
+    assert!(result.out.contains("to go back: scanhub configure"), "{}", result.out);
     assert_eq!(probe(&env, "front")["configuration"], before["configuration"]);
 
     // And again: nothing to do, nothing asked.
     let outcome = env.run(&["configure", &port, &backup, "unit=mm"]);
-    assert_eq!(outcome.code, Some(0), "{outcome}");
-    assert!(String::from_utf8_lossy(&outcome.out).contains("nothing to change"), "{outcome}");
-    assert_eq!(simulator.end(TERM).code, Some(0));
-    assert_eq!(env.simulated("front").1, 2);
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
+    assert!(String::from_utf8_lossy(&outcome.stdout).contains("nothing to change"), "{outcome}");
+    assert_eq!(simulator.end(TERM).exit_code, Some(0));
+    assert_eq!(env.simulator_totals("front").1, 2);
 }
 
 #[test]
-fn marks_become_available_by_the_command_that_is_named() {
+fn suggested_command_makes_marks_available() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--baud=38400", "--mode=0x00"]);
-    let port = env.word("front");
+    let port = env.path_argument("front");
     let marks = |hub: testkit::Program| {
-        let told = env.await_info("front", |info| !info["marks"]["available"].is_null())["marks"].clone();
+        let reported = env.await_info("front", |info| !info["marks"]["available"].is_null())["marks"].clone();
         let outcome = env.run(&["echo", "--json", "front/marks", "-n", "3"]);
         let lines = outcome.of_class("marks");
-        assert!(lines.iter().all(|line| line["available"] == told["available"]), "{outcome}");
+        assert!(lines.iter().all(|line| line["available"] == reported["available"]), "{outcome}");
         let doctor = env.run(&["doctor", &port, "--json", "--no-system-config"]).of_class("check");
         let found = doctor.iter().find(|line| line["name"] == "marks").expect("it is checked").clone();
         let ended = hub.end(TERM);
-        assert_eq!(ended.code, Some(0), "{ended}");
-        (told, found, ended.errors)
+        assert_eq!(ended.exit_code, Some(0), "{ended}");
+        (reported, found, ended.stderr)
     };
-    let (told, found, log) = marks(env.hub(&[env.link("front")]));
+    let (reported, found, log) = marks(env.hub(&[env.link("front")]));
     let command = format!("scanhub configure {port} mode=0x01");
-    assert_eq!(told, serde_json::json!({ "available": false, "remedy": command }));
+    assert_eq!(reported, serde_json::json!({ "available": false, "remedy": command }));
     assert_eq!(
         (&found["state"], &found["remedy"]),
         (&"warning".into(), &format!("stop the hub first: {command}").into())
@@ -147,24 +148,24 @@ fn marks_become_available_by_the_command_that_is_named() {
     assert!(log.contains(&command), "{log}");
 
     let words: Vec<&str> = command.split(' ').skip(2).collect();
-    let seen = Person::start(&env, &words).types("yes\n");
-    assert_eq!(seen.code, Some(0), "{}", seen.errors);
-    let (told, found, log) = marks(env.hub(&[env.link("front")]));
-    assert_eq!(told, serde_json::json!({ "available": true, "remedy": null }));
+    let result = ConfigureSession::start(&env, &words).type_text("yes\n");
+    assert_eq!(result.code, Some(0), "{}", result.errors);
+    let (reported, found, log) = marks(env.hub(&[env.link("front")]));
+    assert_eq!(reported, serde_json::json!({ "available": true, "remedy": null }));
     assert_eq!(found["state"], "ok");
     assert!(!log.contains("scanhub configure"), "{log}");
 }
 
 #[test]
-fn the_way_back_brings_back_what_was_changed() {
+fn reports_command_that_restores_previous_settings() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--baud=38400"]);
-    let port = env.word("front");
+    let port = env.path_argument("front");
     let done = |settings: &[&str]| {
-        let seen = Person::start(&env, &[&[&port[..]], settings].concat()).types("yes\n");
-        assert_eq!(seen.code, Some(0), "{}", seen.errors);
-        assert!(seen.errors.contains("EEPROM wears out after a few thousand writes."), "{}", seen.errors);
-        seen.out
+        let result = ConfigureSession::start(&env, &[&[&port[..]], settings].concat()).type_text("yes\n");
+        assert_eq!(result.code, Some(0), "{}", result.errors);
+        assert!(result.errors.contains("EEPROM wears out after a few thousand writes."), "{}", result.errors);
+        result.out
     };
     let hex = probe(&env, "front")["configuration"].as_str().unwrap().to_owned();
     let out = done(&["power_on_baud=keep"]);
@@ -185,20 +186,20 @@ fn the_way_back_brings_back_what_was_changed() {
 fn everything_else_than_yes_writes_nothing() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--baud=500000"]);
-    let port = env.word("front");
+    let port = env.path_argument("front");
     for answer in ["no\n", "y\n", "\n", "YES\n", "\x04"] {
-        let seen = Person::start(&env, &[&port, "unit=cm"]).types(answer);
-        assert_eq!(seen.code, Some(1), "{answer:?}: {}", seen.errors);
-        assert!(seen.errors.contains("nothing was written"), "{}", seen.errors);
-        assert!(seen.errors.contains("\nscanhub: not confirmed"), "{answer:?}: {:?}", seen.errors);
+        let result = ConfigureSession::start(&env, &[&port, "unit=cm"]).type_text(answer);
+        assert_eq!(result.code, Some(1), "{answer:?}: {}", result.errors);
+        assert!(result.errors.contains("nothing was written"), "{}", result.errors);
+        assert!(result.errors.contains("\nscanhub: not confirmed"), "{answer:?}: {:?}", result.errors);
     }
-    let seen = Person::start(&env, &[&port, "unit=cm"]).answer(|_, pid| {
+    let result = ConfigureSession::start(&env, &[&port, "unit=cm"]).answer_questions(|_, pid| {
         signal(pid, INT);
     });
-    assert_eq!(seen.code, Some(130), "{}", seen.errors);
+    assert_eq!(result.code, Some(130), "{}", result.errors);
     // No terminal, no person: the difference is shown all the same.
     let outcome = env.run(&["configure", &port, "unit=cm", "--json"]);
-    assert_eq!(outcome.code, Some(2), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(2), "{outcome}");
     assert_eq!(outcome.of_class("difference").len(), 1, "{outcome}");
     assert_eq!(outcome.of_class("error")[0]["kind"], "usage", "{outcome}");
     // Nor is one asked who cannot see the question.
@@ -206,18 +207,18 @@ fn everything_else_than_yes_writes_nothing() {
     let mut unseen = env.command(&["configure", &port, "unit=cm"]);
     unseen.stdin(Stdio::from(screen)).stdout(Stdio::null()).stderr(Stdio::null());
     let mut process = spawn(unseen).unwrap();
-    until("it does not ask", || process.try_wait().unwrap().is_some());
+    wait_until("it does not ask", || process.try_wait().unwrap().is_some());
     assert_eq!(process.wait().unwrap().code(), Some(2));
     assert_eq!(number(&probe(&env, "front"), "unit_mm"), 1);
-    assert_eq!(simulator.end(TERM).code, Some(0));
-    assert_eq!(env.simulated("front").1, 0);
+    assert_eq!(simulator.end(TERM).exit_code, Some(0));
+    assert_eq!(env.simulator_totals("front").1, 0);
 }
 
 #[test]
-fn what_cannot_be_is_refused_before_anything_is_written() {
+fn rejects_impossible_settings_without_writing() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--baud=500000"]);
-    let port = env.word("front");
+    let port = env.path_argument("front");
     for (setting, code, words) in [
         ("unit=dm", 78, "mm or cm"),
         ("units=mm", 78, "did you mean unit"),
@@ -225,12 +226,12 @@ fn what_cannot_be_is_refused_before_anything_is_written() {
         ("sensitivity=high", 78, "only the LMS 291"),
     ] {
         let outcome = env.run(&["configure", &port, setting]);
-        assert_eq!(outcome.code, Some(code), "{outcome}");
-        assert!(outcome.errors.contains(words), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(code), "{outcome}");
+        assert!(outcome.stderr.contains(words), "{outcome}");
     }
-    assert_eq!(env.run(&["configure", &port]).code, Some(2));
-    assert_eq!(env.run(&["configure", &port, "unit=cm", "--password=short"]).code, Some(78));
-    let wrong = Person::start(&env, &[&port, "unit=cm", "--password=mistaken"]).types("yes\n");
+    assert_eq!(env.run(&["configure", &port]).exit_code, Some(2));
+    assert_eq!(env.run(&["configure", &port, "unit=cm", "--password=short"]).exit_code, Some(78));
+    let wrong = ConfigureSession::start(&env, &[&port, "unit=cm", "--password=mistaken"]).type_text("yes\n");
     assert_eq!(wrong.code, Some(1), "{}", wrong.errors);
     for words in ["wrong password?", "nothing was written", "values on request"] {
         assert!(wrong.errors.contains(words), "{words}: {}", wrong.errors);
@@ -240,53 +241,55 @@ fn what_cannot_be_is_refused_before_anything_is_written() {
     let hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
     let outcome = env.run(&["configure", &port, "unit=cm"]);
-    assert_eq!(outcome.code, Some(4), "{outcome}");
-    assert!(outcome.errors.contains(&format!("in use by the hub, process {};", hub.pid())), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(4), "{outcome}");
+    assert!(outcome.stderr.contains(&format!("in use by the hub, process {};", hub.pid())), "{outcome}");
     assert_eq!(env.info("front")["state"], "streaming");
     drop(hub);
-    assert_eq!(simulator.end(TERM).code, Some(0));
-    assert_eq!(env.simulated("front").1, 0);
+    assert_eq!(simulator.end(TERM).exit_code, Some(0));
+    assert_eq!(env.simulator_totals("front").1, 0);
 }
 
 #[test]
-fn a_stream_that_was_found_goes_on() {
+fn resumes_an_abandoned_stream_after_writing() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--baud=500000"]);
     let hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
     hub.end(testkit::KILL);
-    let seen = Person::start(&env, &[&env.word("front"), "availability=3"]).types("yes\n");
-    assert_eq!(seen.code, Some(0), "{}", seen.errors);
-    assert!(seen.out.contains("now at: all values, continuously"), "{}", seen.out);
+    let result =
+        ConfigureSession::start(&env, &[&env.path_argument("front"), "availability=3"]).type_text("yes\n");
+    assert_eq!(result.code, Some(0), "{}", result.errors);
+    assert!(result.out.contains("now at: all values, continuously"), "{}", result.out);
     let sent = env.truth("front").len();
-    until("it streams on", || env.truth("front").len() > sent + 20);
+    wait_until("it streams on", || env.truth("front").len() > sent + 20);
     assert_eq!(number(&probe(&env, "front"), "availability"), 1);
-    assert_eq!(simulator.end(TERM).code, Some(0));
-    assert_eq!(env.simulated("front").1, 1);
+    assert_eq!(simulator.end(TERM).exit_code, Some(0));
+    assert_eq!(env.simulator_totals("front").1, 1);
 }
 
 #[test]
-fn what_was_begun_goes_to_its_end() {
+fn signals_do_not_interrupt_a_write_in_progress() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--baud=500000"]);
-    let port = env.word("front");
+    let port = env.path_argument("front");
     let signals = [(Signal::HUP, "unit=cm", 10), (Signal::QUIT, "unit=mm", 1), (TERM, "unit=cm", 10)];
     for (sent, setting, unit_mm) in signals {
-        let seen = Person::start(&env, &[&port, setting, "--json"]).answer(|keys, pid| {
-            let before = env.truth("front").len();
-            keys.write_all(b"yes\n").unwrap();
-            // The simulator may not have recorded the last telegram before the question yet.
-            until("it has begun", || env.truth("front").len() > before + 1);
-            if sent == Signal::HUP {
-                // The terminal is closed, too.
-                *keys = File::open("/dev/null").unwrap();
-            }
-            signal(pid, sent);
-        });
-        assert_eq!(seen.code, Some(0), "{sent:?}: {}", seen.errors);
-        assert_eq!(seen.lines().last().unwrap()["written"], true, "{sent:?}: {}", seen.out);
+        let result =
+            ConfigureSession::start(&env, &[&port, setting, "--json"]).answer_questions(|keys, pid| {
+                let before = env.truth("front").len();
+                keys.write_all(b"yes\n").unwrap();
+                // The simulator may not have recorded the last telegram before the question yet.
+                wait_until("it has begun", || env.truth("front").len() > before + 1);
+                if sent == Signal::HUP {
+                    // The terminal is closed, too.
+                    *keys = File::open("/dev/null").unwrap();
+                }
+                signal(pid, sent);
+            });
+        assert_eq!(result.code, Some(0), "{sent:?}: {}", result.errors);
+        assert_eq!(result.lines().last().unwrap()["written"], true, "{sent:?}: {}", result.out);
         assert_eq!(number(&probe(&env, "front"), "unit_mm"), unit_mm, "{sent:?}");
     }
-    assert_eq!(simulator.end(TERM).code, Some(0));
-    assert_eq!(env.simulated("front").1, 3);
+    assert_eq!(simulator.end(TERM).exit_code, Some(0));
+    assert_eq!(env.simulator_totals("front").1, 3);
 }

@@ -1,7 +1,9 @@
 //! What users ask of a running hub: a sensor is stopped, streams again, is begun anew with; and what is refused.
 
 use crate::testkit;
-use crate::testkit::{INT, Outcome, REAL_ANSWERS, TERM, TestEnv, is_class, number, sequence, until};
+use crate::testkit::{
+    INT, Outcome, REAL_REPLY_TIME, TERM, TestEnv, contiguous_numbers, is_class, number, wait_until,
+};
 use serde_json::Value;
 
 fn control(env: &TestEnv, sensor: &str, verb: &str) -> Outcome {
@@ -9,10 +11,10 @@ fn control(env: &TestEnv, sensor: &str, verb: &str) -> Outcome {
 }
 
 /// Asks for `verb`, which must be taken.
-fn taken(env: &TestEnv, sensor: &str, verb: &str) {
+fn control_accepted(env: &TestEnv, sensor: &str, verb: &str) {
     let outcome = control(env, sensor, verb);
     let [line] = &outcome.lines()[..] else { panic!("not one line: {outcome}") };
-    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     assert_eq!(
         *line,
         serde_json::json!({ "class": "control", "sensor": sensor, "verb": verb, "outcome": "taken" })
@@ -24,51 +26,51 @@ fn await_state(env: &TestEnv, sensor: &str, state: &str) -> Value {
 }
 
 #[test]
-fn a_paused_sensor_stops_and_a_resumed_one_goes_on_without_a_gap() {
+fn paused_sensor_stops_and_resumes_without_a_gap() {
     let env = TestEnv::new();
     let hub = env.hub(&[env.link("front"), env.link("rear")]);
-    let mut consumers = ["front/telegram", "front/scan", "rear/scan"].map(|topic| env.echo(&[topic]));
-    let simulator = env.simulator(&["front", "rear"], &["--seed=31", "--baud=500000", REAL_ANSWERS]);
-    for consumer in &mut consumers[1..] {
-        consumer.await_lines(20, "a scan", is_class("scan"));
+    let mut subscribers = ["front/telegram", "front/scan", "rear/scan"].map(|topic| env.echo(&[topic]));
+    let simulator = env.simulator(&["front", "rear"], &["--seed=31", "--baud=500000", REAL_REPLY_TIME]);
+    for subscriber in &mut subscribers[1..] {
+        subscriber.await_lines(20, "a scan", is_class("scan"));
     }
-    taken(&env, "front", "pause");
+    control_accepted(&env, "front", "pause");
     await_state(&env, "front", "paused");
     // It is the sensor that was stopped: it sends nothing any more while the other one goes on.
     let mut sent = 0;
-    until("the sensor is stopped", || {
+    wait_until("the sensor is stopped", || {
         let before = std::mem::replace(&mut sent, env.truth("front").len());
-        consumers[2].await_lines(10, "a scan of the other sensor", is_class("scan"));
+        subscribers[2].await_lines(10, "a scan of the other sensor", is_class("scan"));
         before == sent
     });
     // The second of two statuses is one of the pause.
     let statuses = env.run(&["echo", "front/status", "-n", "2", "--timeout", "5s"]);
-    assert_eq!(statuses.code, Some(0), "{statuses}");
+    assert_eq!(statuses.exit_code, Some(0), "{statuses}");
     let paused = env.info("front");
-    consumers[2].await_lines(40, "a scan of the other sensor", is_class("scan"));
+    subscribers[2].await_lines(40, "a scan of the other sensor", is_class("scan"));
     let later = env.info("front");
     assert_eq!((&later["state"], &later["last_error"]), (&"paused".into(), &"".into()));
     assert_eq!(later["counters"]["telegrams"], paused["counters"]["telegrams"]);
     assert_eq!(env.truth("front").len(), sent);
     // Once more changes nothing.
-    taken(&env, "front", "pause");
-    taken(&env, "front", "resume");
+    control_accepted(&env, "front", "pause");
+    control_accepted(&env, "front", "resume");
     let before = number(&paused["counters"], "telegrams");
-    consumers[1].await_lines(40, "a scan after the pause", |line| {
+    subscribers[1].await_lines(40, "a scan after the pause", |line| {
         line["class"] == "scan" && number(line, "seq") >= before
     });
     let resumed = await_state(&env, "front", "streaming");
     assert_eq!(resumed["counters"]["resyncs"], 0, "{resumed}");
 
-    let [telegrams, scans, others] = consumers.map(|consumer| consumer.end(INT));
+    let [telegrams, scans, others] = subscribers.map(|subscriber| subscriber.end(INT));
     for (outcome, class) in [(&telegrams, "telegram"), (&scans, "scan"), (&others, "scan")] {
-        sequence(&outcome.of_class(class), "topic_seq");
+        contiguous_numbers(&outcome.of_class(class), "topic_seq");
         assert_eq!(outcome.of_class("summary")[0]["missed"], 0);
     }
-    sequence(&telegrams.of_class("telegram"), "seq");
-    assert_eq!(hub.end(TERM).code, Some(0));
-    assert_eq!(simulator.end(TERM).code, Some(0));
-    assert_eq!((env.simulated("front").1, env.simulated("rear").1), (0, 0), "EEPROM");
+    contiguous_numbers(&telegrams.of_class("telegram"), "seq");
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
+    assert_eq!(simulator.end(TERM).exit_code, Some(0));
+    assert_eq!((env.simulator_totals("front").1, env.simulator_totals("rear").1), (0, 0), "EEPROM");
 }
 
 #[test]
@@ -77,43 +79,43 @@ fn a_resync_is_counted_and_ends_a_pause() {
     let _simulator = env.simulator(&["front"], &["--seed=32", "--baud=500000"]);
     let _hub = env.hub(&[env.link("front")]);
     await_state(&env, "front", "streaming");
-    taken(&env, "front", "resync");
+    control_accepted(&env, "front", "resync");
     let resyncs = |info: &Value| number(&info["counters"], "resyncs");
     env.await_info("front", |info| info["state"] == "streaming" && resyncs(info) == 1);
-    taken(&env, "front", "pause");
+    control_accepted(&env, "front", "pause");
     await_state(&env, "front", "paused");
-    taken(&env, "front", "resync");
+    control_accepted(&env, "front", "resync");
     env.await_info("front", |info| info["state"] == "streaming" && resyncs(info) == 2);
 }
 
 #[test]
-fn an_absent_sensor_can_be_paused_and_stays_so_when_it_comes() {
+fn absent_sensor_can_be_paused_before_it_appears() {
     let env = TestEnv::new();
     let _hub = env.hub(&[env.link("front")]);
     await_state(&env, "front", "absent");
-    taken(&env, "front", "pause");
+    control_accepted(&env, "front", "pause");
     let refused = control(&env, "front", "resync");
     let error = &refused.of_class("error")[0];
-    assert_eq!((refused.code, &error["kind"]), (Some(1), &"failed".into()), "{refused}");
+    assert_eq!((refused.exit_code, &error["kind"]), (Some(1), &"failed".into()), "{refused}");
     assert_eq!(error["message"], "front: the port is away");
     let simulator = env.simulator(&["front"], &["--seed=33", "--baud=500000"]);
     await_state(&env, "front", "paused");
     // It went and came again.
-    assert_eq!(simulator.end(TERM).code, Some(0));
+    assert_eq!(simulator.end(TERM).exit_code, Some(0));
     await_state(&env, "front", "absent");
     let _simulator = env.simulator(&["front"], &["--seed=33", "--baud=500000"]);
     let info = await_state(&env, "front", "paused");
     // Each time it was told to stop, and said so; it did not send a scan.
     assert!(number(&info["counters"], "telegrams") <= 2, "{info}");
-    taken(&env, "front", "resume");
+    control_accepted(&env, "front", "resume");
     await_state(&env, "front", "streaming");
 }
 
 #[test]
-fn what_is_not_there_or_takes_no_requests_is_refused() {
+fn rejects_requests_to_missing_hub_sensor_or_session() {
     let env = TestEnv::new();
     let outcome = control(&env, "front", "pause");
-    assert_eq!((outcome.code, &outcome.of_class("error")[0]["kind"]), (Some(3), &"no_hub".into()));
+    assert_eq!((outcome.exit_code, &outcome.of_class("error")[0]["kind"]), (Some(3), &"no_hub".into()));
 
     let scans: Vec<u8> = (0..4000).flat_map(testkit::scan).collect();
     let file = env.file("scans", scans);
@@ -125,13 +127,13 @@ fn what_is_not_there_or_takes_no_requests_is_refused() {
     ] {
         let outcome = control(&env, sensor, "resync");
         let error = &outcome.of_class("error")[0];
-        assert_eq!((outcome.code, &error["kind"]), (Some(code), &kind.into()), "{outcome}");
+        assert_eq!((outcome.exit_code, &error["kind"]), (Some(code), &kind.into()), "{outcome}");
         assert_eq!(error["message"], message);
         assert!(error["hint"].as_str().is_some_and(|hint| hint.contains("front")), "{outcome}");
     }
     let usage = env.run(&["control", "front", "stop"]);
-    assert_eq!(usage.code, Some(2), "{usage}");
-    assert!(usage.errors.contains("pause, resume, resync"), "{usage}");
+    assert_eq!(usage.exit_code, Some(2), "{usage}");
+    assert!(usage.stderr.contains("pause, resume, resync"), "{usage}");
 }
 
 #[test]
@@ -151,16 +153,16 @@ fn many_ask_at_once_and_some_are_killed_while_they_do() {
             }
             let outcome = program.wait();
             // Taken, or told to come back.
-            assert!(matches!(outcome.code, Some(0 | 75)), "{outcome}");
+            assert!(matches!(outcome.exit_code, Some(0 | 75)), "{outcome}");
             assert_eq!(outcome.lines().len(), 1, "{outcome}");
         }
     }
     // The killed ones may still take the places of all that may ask at a time.
-    until("there is room to ask", || {
+    wait_until("there is room to ask", || {
         let outcome = control(&env, "front", "resume");
-        assert!(matches!(outcome.code, Some(0 | 75)), "{outcome}");
-        outcome.code == Some(0)
+        assert!(matches!(outcome.exit_code, Some(0 | 75)), "{outcome}");
+        outcome.exit_code == Some(0)
     });
     await_state(&env, "front", "streaming");
-    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
 }

@@ -13,7 +13,7 @@ fn a_stream_becomes_a_recording_that_plays() {
     let stream = env.file("a.bin", &bytes);
     let mcap = stream.replace("a.bin", "a.mcap");
     let outcome = env.run(&["convert", &stream, &mcap, "--json", "--sensor=left"]);
-    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let line = outcome.of_class("converted").pop().unwrap_or_else(|| panic!("{outcome}"));
     let missing = json!({"telegrams": 0, "bytes": 0, "chunks": 0, "stamps": 0, "begin": false, "end": false, "checksum": false});
     assert_eq!(line["sensors"], json!(["left"]));
@@ -21,8 +21,8 @@ fn a_stream_becomes_a_recording_that_plays() {
     assert_eq!((&line["from"], &line["to"]), (&json!("telegram stream"), &json!("MCAP")));
     // The telegrams as they were, to whoever reads stdout.
     let outcome = env.run(&["convert", &mcap, "-", "--sensor=left"]);
-    assert_eq!(outcome.code, Some(0), "{outcome}");
-    assert!(outcome.errors.contains("20 telegrams, 20 scans"), "{}", outcome.errors);
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
+    assert!(outcome.stderr.contains("20 telegrams, 20 scans"), "{}", outcome.stderr);
     // One who has had enough is no trouble, and is told nothing.
     let (reader, writer) = std::io::pipe().expect("a pipe");
     drop(reader);
@@ -39,7 +39,7 @@ fn a_stream_becomes_a_recording_that_plays() {
 }
 
 #[test]
-fn bytes_between_telegrams_are_counted_by_whoever_reads_them() {
+fn every_reader_counts_bytes_between_telegrams() {
     let env = TestEnv::new();
     let mut random = fastrand::Rng::with_seed(5);
     let mut bytes = testkit::scan(1);
@@ -49,7 +49,7 @@ fn bytes_between_telegrams_are_counted_by_whoever_reads_them() {
     let mcap = stream.replace("a.bin", "a.mcap");
     let outcome = env.run(&["convert", &stream, &mcap]);
     assert!(
-        outcome.code == Some(66) && outcome.errors.contains("lms 15 %"),
+        outcome.exit_code == Some(66) && outcome.stderr.contains("lms 15 %"),
         "too few to recognize: {outcome}"
     );
     let outcome = env.run(&["convert", &stream, &mcap, "--family=lms", "--json"]);
@@ -57,7 +57,7 @@ fn bytes_between_telegrams_are_counted_by_whoever_reads_them() {
     assert_eq!((&line["telegrams"], &line["missing"]["bytes"]), (&json!(8), &json!(31_002)));
     assert_eq!(line["sensors"], json!(["front"]));
     let outcome = env.run(&["convert", &stream, &mcap, "--family=lms", "--force"]);
-    assert!(outcome.errors.contains("31002 bytes that could not be used"), "{outcome}");
+    assert!(outcome.stderr.contains("31002 bytes that could not be used"), "{outcome}");
     let outcome = env.run(&["telegram", "decode", &stream, "--json"]);
     let summary = outcome.of_class("summary").pop().unwrap_or_else(|| panic!("{outcome}"));
     assert_eq!((&summary["telegrams"], &summary["bytes_discarded"]), (&json!(8), &json!(31_002)));
@@ -67,23 +67,23 @@ fn bytes_between_telegrams_are_counted_by_whoever_reads_them() {
     let counters = &info["counters"];
     assert_eq!((&counters["telegrams"], &counters["bytes_discarded"]), (&json!(8), &json!(31_002)));
     let outcome = hub.end(testkit::INT);
-    assert!(outcome.errors.contains("missing: 31002 bytes that could not be used"), "{outcome}");
+    assert!(outcome.stderr.contains("missing: 31002 bytes that could not be used"), "{outcome}");
 }
 
 #[test]
-fn reports_what_it_leaves_out_of_a_log() {
+fn reports_lines_dropped_from_a_log() {
     let env = TestEnv::new();
     let scan = |time: &str| format!("FLASER 181{} 1 2 3 1 2 3 {time} host 1\n", " 1.25".repeat(181));
     let lines = ["ODOM 1 2 3 0 0 0 9.5 host 1\n", &scan("10.123457"), &scan("11.5"), "SYNC laser\n"];
     let log = env.file("a.log", lines.concat());
-    let outcome = env.run(&["convert", &log, &env.word("a.mcap"), "--json"]);
+    let outcome = env.run(&["convert", &log, &env.path_argument("a.mcap"), "--json"]);
     let line = outcome.of_class("converted").pop().unwrap_or_else(|| panic!("{outcome}"));
     let dropped = json!({"poses": 2, "odometry": 1, "remissions": 0, "lines": 1});
     assert_eq!((&line["log_dropped"], &line["marks"], &line["dropped"]), (&dropped, &json!(null), &json!(0)));
-    let outcome = env.run(&["convert", &log, &env.word("a.bin")]);
-    let says = "; dropped from the log: 2 poses, 1 line of odometry, 1 other line";
-    assert!(outcome.errors.contains(says), "{outcome}");
-    let outcome = env.run(&["convert", &env.word("a.mcap"), &env.word("b.log"), "--json"]);
+    let outcome = env.run(&["convert", &log, &env.path_argument("a.bin")]);
+    let message = "; dropped from the log: 2 poses, 1 line of odometry, 1 other line";
+    assert!(outcome.stderr.contains(message), "{outcome}");
+    let outcome = env.run(&["convert", &env.path_argument("a.mcap"), &env.path_argument("b.log"), "--json"]);
     let line = outcome.of_class("converted").pop().unwrap_or_else(|| panic!("{outcome}"));
     assert_eq!(
         (&line["log_dropped"], &line["dropped"], &line["scans"]),
@@ -99,11 +99,11 @@ fn rows_of_a_hub_have_meters_intensities_and_marks() {
     let _simulator = env.simulator(&["front"], &["--world=room", "--mode=0x01"]);
     let _hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
-    let recording = env.word("walk.mcap");
-    assert_eq!(env.run(&["record", "-n", "100", "-o", &recording]).code, Some(0));
-    let [scans, marks] = ["scans.csv", "marks.csv"].map(|name| env.word(name));
+    let recording = env.path_argument("walk.mcap");
+    assert_eq!(env.run(&["record", "-n", "100", "-o", &recording]).exit_code, Some(0));
+    let [scans, marks] = ["scans.csv", "marks.csv"].map(|name| env.path_argument(name));
     let outcome = env.run(&["convert", &recording, &scans, "--meters", "--intensities"]);
-    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let text = std::fs::read_to_string(&scans).expect("rows");
     let names: Vec<&str> = text.lines().next().expect("names").split(',').collect();
     let row: Vec<&str> = text.lines().nth(1).expect("a row").split(',').collect();
@@ -127,16 +127,16 @@ fn rows_of_a_hub_have_meters_intensities_and_marks() {
     assert_eq!((&line["marks"], &line["telegrams"]), (&json!(rows), &json!(0)));
     let words = ["echo", "front/scan", "--csv", "--meters", "--intensities", "-n", "1", "--timeout=30s"];
     let outcome = env.run(&words);
-    let text = String::from_utf8_lossy(&outcome.out).into_owned();
+    let text = String::from_utf8_lossy(&outcome.stdout).into_owned();
     assert!(text.contains(",intensity_0,") && text.contains(",1000000,"), "{outcome}");
 }
 
 #[test]
-fn what_cannot_be_converted_is_refused() {
+fn rejects_impossible_conversions() {
     let env = TestEnv::new();
     let stream = env.file("a.bin", testkit::scan(1));
     let there = env.file("there.bin", "mine");
-    for (arguments, code, says) in [
+    for (arguments, code, message) in [
         (["convert", &stream[..], &stream[..]], 73, "both read and written"),
         (["convert", &stream, &there], 73, "--force replaces it"),
         (["convert", &stream, "x.txt"], 2, "is not a known format"),
@@ -144,15 +144,15 @@ fn what_cannot_be_converted_is_refused() {
         (["convert", "/no/such/file", "x.mcap"], 66, "/no/such/file"),
     ] {
         let outcome = env.run(&arguments);
-        assert!(outcome.code == Some(code) && outcome.errors.contains(says), "{outcome}");
+        assert!(outcome.exit_code == Some(code) && outcome.stderr.contains(message), "{outcome}");
     }
-    for (output, option, says) in [
+    for (output, option, message) in [
         ("x.mcap", "--meters", "scanhub convert IN OUT.csv --meters"),
         ("x.log", "--intensities", "scanhub convert IN OUT.csv --intensities"),
         ("x.bin", "--topic=front/marks", "scanhub convert IN OUT.csv --topic SENSOR/marks"),
         ("x.csv", "--topic=front/zones", "scanhub echo SENSOR/TOPIC --json"),
     ] {
         let outcome = env.run(&["convert", &stream, output, option]);
-        assert!(outcome.code == Some(2) && outcome.errors.contains(says), "{outcome}");
+        assert!(outcome.exit_code == Some(2) && outcome.stderr.contains(message), "{outcome}");
     }
 }

@@ -6,8 +6,10 @@ use std::path::Path;
 use std::process::Command;
 
 use crate::testkit;
-use crate::testkit::{HUP, INT, Outcome, Program, is_there, number, output, shared_memory, until};
-use crate::web::{channels, view};
+use crate::testkit::{
+    HUP, INT, Outcome, Program, exists_or_is_symlink, number, output, shared_memory, wait_until,
+};
+use crate::web::{channels, connect_viewer};
 
 /// Runs the demonstration in an empty environment; `end` may wait for something and hasten its end.
 fn demo(arguments: &[&str], end: impl FnOnce(Program) -> Outcome) -> Outcome {
@@ -19,12 +21,12 @@ fn demo(arguments: &[&str], end: impl FnOnce(Program) -> Outcome) -> Outcome {
     let program = Program::start(command);
     let name = format!("demo-{}", program.pid());
     let outcome = end(program);
-    assert!(!is_there(&home), "it kept something");
+    assert!(!exists_or_is_symlink(&home), "it kept something");
     assert_eq!(shared_memory(&format!("sh_{name}_")), [] as [&Path; 0]);
     assert_eq!(fs::read_dir(&temporary).expect("it is there").count(), 0, "its directory is left");
     let uid = rustix::process::getuid().as_raw();
-    assert!(!is_there(format!("/tmp/scanhub-{uid}/{name}").as_ref()), "its domain is left");
-    assert_eq!(outcome.left, [] as [String; 0]);
+    assert!(!exists_or_is_symlink(format!("/tmp/scanhub-{uid}/{name}").as_ref()), "its domain is left");
+    assert_eq!(outcome.leftover_processes, [] as [String; 0]);
     outcome
 }
 
@@ -37,7 +39,7 @@ fn processes(domain: &str) -> Vec<String> {
 
 /// Checks that the last lines, one for each of `names`, account for every telegram of a stream: it arrived, or a busy machine
 /// made the demonstration's subscriber miss it, and then the exit code and the message say so.
-fn accounts_for_all(outcome: &Outcome, names: &[&str]) {
+fn check_summaries(outcome: &Outcome, names: &[&str]) {
     let lines = outcome.of_class("summary");
     let sensors: Vec<_> = lines.iter().map(|line| line["sensor"].as_str().unwrap_or_default()).collect();
     assert_eq!(sensors, names, "{outcome}");
@@ -51,11 +53,11 @@ fn accounts_for_all(outcome: &Outcome, names: &[&str]) {
         assert!(line["nearest_mm"].is_u64() && line["hub_cpu_percent"].is_f64(), "{outcome}");
         lost_in_all += lost;
     }
-    ends_as_counted(outcome, lost_in_all);
+    check_exit_code(outcome, lost_in_all);
 }
 
-fn ends_as_counted(outcome: &Outcome, lost: u64) {
-    assert_eq!(outcome.code, Some(if lost == 0 { 0 } else { 5 }), "{outcome}");
+fn check_exit_code(outcome: &Outcome, lost: u64) {
+    assert_eq!(outcome.exit_code, Some(if lost == 0 { 0 } else { 5 }), "{outcome}");
     if lost > 0 {
         let message = outcome.of_class("error")[0]["message"].to_string();
         let telegrams =
@@ -76,13 +78,13 @@ fn of_another_family_or_of_all() {
         ("mixed", &["front", "side", "top"]),
     ] {
         let outcome = demo(&["--headless", "--for", "2s", "--json", "--family", family], Program::wait);
-        accounts_for_all(&outcome, names);
+        check_summaries(&outcome, names);
         // Ten revolutions in a second, and not hundreds of packets. Stamps of a few scans are rough on a busy machine.
         let last = &outcome.of_class("summary")[1];
         assert!(last["hz"].is_null() || last["hz"].as_f64().is_some_and(|hz| hz < 50.0), "{last}");
     }
     let outcome = demo(&["--family", "sick"], Program::wait);
-    assert!(outcome.code == Some(2) && outcome.errors.contains("lms, ld, rplidar, mixed"), "{outcome}");
+    assert!(outcome.exit_code == Some(2) && outcome.stderr.contains("lms, ld, rplidar, mixed"), "{outcome}");
 }
 
 #[test]
@@ -91,21 +93,21 @@ fn a_sensor_on_a_mount_sees_in_three_dimensions() {
         let ready = program.await_line("ready", testkit::is_class("ready"));
         let domain = ready["domain"].as_str().expect("a name");
         // The demo is ready before `tilt` has started.
-        until("hall is published", || {
-            let list = beside(domain, &["list"]).wait();
+        wait_until("hall is published", || {
+            let list = run_in_demo(domain, &["list"]).wait();
             list.lines().iter().any(|line| line["sensor"] == "hall")
         });
-        let mut echo = beside(domain, &["echo", "hall/obstacles"]);
+        let mut echo = run_in_demo(domain, &["echo", "hall/obstacles"]);
         echo.await_lines(3, "a sweep", testkit::is_class("obstacles"));
-        assert_eq!(echo.end(INT).code, Some(0));
+        assert_eq!(echo.end(INT).exit_code, Some(0));
         program.end(INT)
     });
     let [front, hall] = &outcome.of_class("summary")[..] else { panic!("{outcome}") };
     assert_eq!(front["sensor"], "front", "{outcome}");
-    ends_as_counted(&outcome, number(front, "lost"));
+    check_exit_code(&outcome, number(front, "lost"));
     assert!(hall["sensor"] == "hall" && number(hall, "sweeps") >= 2, "{outcome}");
     let outcome = demo(&["--world", "tilt", "--family", "ld"], Program::wait);
-    assert!(outcome.code == Some(2) && outcome.errors.contains("--family"), "{outcome}");
+    assert!(outcome.exit_code == Some(2) && outcome.stderr.contains("--family"), "{outcome}");
 }
 
 #[test]
@@ -129,7 +131,7 @@ fn headless_in_an_empty_environment() {
         assert!(root.ends_with(domain), "{root}");
         program.wait()
     });
-    accounts_for_all(&outcome, &["front", "rear"]);
+    check_summaries(&outcome, &["front", "rear"]);
 }
 
 #[test]
@@ -142,38 +144,38 @@ fn where_the_users_own_place_is_too_long_for_a_domain() {
     let outcome = Program::start(command).wait();
     let left = fs::read_dir(&place).expect("it is there").count();
     assert_eq!(left, 0, "{outcome}");
-    accounts_for_all(&outcome, &["front", "rear"]);
+    check_summaries(&outcome, &["front", "rear"]);
 }
 
 #[test]
-fn refuses_hub_on_the_command_line_and_ignores_that_of_the_environment() {
+fn rejects_domain_flag_and_ignores_its_variable() {
     for option in ["--domain", "--root"] {
         let refused = demo(&["--headless", "--for", "1s", option, "other"], Program::wait);
-        assert_eq!(refused.code, Some(2), "{refused}");
+        assert_eq!(refused.exit_code, Some(2), "{refused}");
         for word in [&format!("cannot be used with {option}")[..], "tip: leave out", "Usage: scanhub demo"] {
-            assert!(refused.errors.contains(word), "no {word:?}: {refused}");
+            assert!(refused.stderr.contains(word), "no {word:?}: {refused}");
         }
         let refused = demo(&[option, "other", "--json"], Program::wait);
         let line = &refused.of_class("error")[0];
-        assert_eq!((refused.code, &line["kind"]), (Some(2), &"usage".into()), "{refused}");
+        assert_eq!((refused.exit_code, &line["kind"]), (Some(2), &"usage".into()), "{refused}");
         assert!(line["hint"].as_str().is_some_and(|hint| hint.starts_with("leave out")), "{refused}");
     }
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
     command.args(["web", "--replay", "walk.mcap", "--domain", "other"]).env_clear();
     let refused = Program::start(command).wait();
-    assert_eq!(refused.code, Some(2), "{refused}");
-    assert!(refused.errors.contains("web --replay runs its own hub in its own domain"), "{refused}");
+    assert_eq!(refused.exit_code, Some(2), "{refused}");
+    assert!(refused.stderr.contains("web --replay runs its own hub in its own domain"), "{refused}");
 
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
     command.args(["demo", "--headless", "--for", "1s", "--json"]).env_clear().env("SCANHUB_DOMAIN", "other");
     let outcome = Program::start(command).wait();
     let ready = &outcome.of_class("ready")[0];
     assert!(ready["domain"].as_str().is_some_and(|name| name.starts_with("demo-")), "{outcome}");
-    accounts_for_all(&outcome, &["front", "rear"]);
+    check_summaries(&outcome, &["front", "rear"]);
 }
 
 /// A verb of the program in `domain` of a demonstration that runs.
-fn beside(domain: &str, arguments: &[&str]) -> Program {
+fn run_in_demo(domain: &str, arguments: &[&str]) -> Program {
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
     command.args(arguments).args(["--json", "--domain", domain]).env_clear();
     Program::start(command)
@@ -185,11 +187,11 @@ fn people_are_followed_from_room_to_room_in_the_house() {
         let ready = program.await_line("ready", testkit::is_class("ready"));
         let domain = ready["domain"].as_str().expect("a name");
         // The demo is ready before `track` has started.
-        until("people is published", || {
-            let list = beside(domain, &["list"]).wait();
+        wait_until("people is published", || {
+            let list = run_in_demo(domain, &["list"]).wait();
             list.lines().iter().any(|line| line["sensor"] == "people")
         });
-        let mut echo = beside(domain, &["echo", "people/tracks", "people/events"]);
+        let mut echo = run_in_demo(domain, &["echo", "people/tracks", "people/events"]);
         let tracks = echo.await_line("somebody whom a sensor sees", |line| {
             line["tracks"].as_array().is_some_and(|tracks| {
                 let is_seen = |track: &serde_json::Value| {
@@ -204,12 +206,12 @@ fn people_are_followed_from_room_to_room_in_the_house() {
         let door = echo.await_line("who goes through a door", |line| line["kind"] == "door");
         assert!(["left", "right"].iter().any(|name| door["door"] == *name), "{door}");
         assert!(number(&door, "id") > 0, "{door}");
-        assert_eq!(echo.end(INT).code, Some(0));
+        assert_eq!(echo.end(INT).exit_code, Some(0));
         program.end(INT)
     });
-    accounts_for_all(&outcome, &["hall", "hall-door", "kitchen", "kitchen-door"]);
+    check_summaries(&outcome, &["hall", "hall-door", "kitchen", "kitchen-door"]);
     let refused = demo(&["--world", "house", "--family", "mixed", "--headless"], Program::wait);
-    assert!(refused.code == Some(2) && refused.errors.contains("one family"), "{refused}");
+    assert!(refused.exit_code == Some(2) && refused.stderr.contains("one family"), "{refused}");
 }
 
 #[test]
@@ -218,12 +220,12 @@ fn interrupted() {
     for signal in [INT, HUP] {
         let outcome = demo(&["--headless", "--json"], |program| {
             let name = format!("demo-{}", program.pid());
-            until("hub, simulator and consumers", || processes(&name).len() >= 4);
-            until("a domain", || !shared_memory(&format!("sh_{name}_")).is_empty());
+            wait_until("hub, simulator and consumers", || processes(&name).len() >= 4);
+            wait_until("a domain", || !shared_memory(&format!("sh_{name}_")).is_empty());
             program.end(signal)
         });
         let lost = outcome.of_class("summary").iter().map(|line| number(line, "lost")).sum();
-        ends_as_counted(&outcome, lost);
+        check_exit_code(&outcome, lost);
     }
 }
 
@@ -232,20 +234,20 @@ fn second_interrupt_ends_at_once() {
     let outcome = demo(&["--headless", "--json"], |mut program| {
         let ready = program.await_line("ready", testkit::is_class("ready"));
         let domain = ready["domain"].as_str().expect("a name");
-        let mut echo = beside(domain, &["echo", "front/scan"]);
+        let mut echo = run_in_demo(domain, &["echo", "front/scan"]);
         echo.await_lines(2, "a scan", testkit::is_class("scan"));
-        assert_eq!(echo.end(INT).code, Some(0));
+        assert_eq!(echo.end(INT).exit_code, Some(0));
         // Telegrams on their way from a simulator that does not run never arrive, so the demonstration waits for them.
         let simulator = process_of(domain, "simulate");
         rustix::process::kill_process(simulator, rustix::process::Signal::STOP).expect("it runs");
         program.signal(INT);
-        until("it ends", || {
+        wait_until("it ends", || {
             program.signal(INT);
-            program.is_over()
+            program.has_ended()
         });
         program.wait()
     });
-    assert_eq!(outcome.code, Some(130), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(130), "{outcome}");
     assert_eq!(outcome.of_class("error")[0]["message"], "interrupted before all telegrams had arrived");
     assert_eq!(outcome.of_class("summary").len(), 2, "{outcome}");
 }
@@ -272,7 +274,7 @@ fn the_page_outlives_its_viewers() {
         };
         let host = url.trim_end_matches('/');
         let connect = || {
-            let mut viewer = view(host, "/", None).expect("the page is open");
+            let mut viewer = connect_viewer(host, "/", None).expect("the page is open");
             channels(&mut viewer, ["/front/scan"]);
             viewer
         };
@@ -287,14 +289,14 @@ fn the_page_outlives_its_viewers() {
         connect();
         program.end(INT)
     });
-    assert!([Some(0), Some(5)].contains(&outcome.code), "{outcome}");
+    assert!([Some(0), Some(5)].contains(&outcome.exit_code), "{outcome}");
 }
 
 #[test]
 fn the_picture_into_a_pipe() {
     let outcome = demo(&["--for", "2s"], Program::wait);
-    assert!([Some(0), Some(5)].contains(&outcome.code), "{outcome}");
-    let text = String::from_utf8_lossy(&outcome.out);
+    assert!([Some(0), Some(5)].contains(&outcome.exit_code), "{outcome}");
+    let text = String::from_utf8_lossy(&outcome.stdout);
     assert!(!text.contains('\x1b'), "controls a terminal that is none: {text:?}");
     for word in [
         "scanhub demo",

@@ -8,7 +8,7 @@ use std::process::Command;
 use crate::testkit::{TestEnv, output, skip};
 
 /// How much a unit may be exposed, by the measure of systemd-analyze, in tenths.
-const MOST_EXPOSED: u32 = 15;
+const MAX_EXPOSURE: u32 = 15;
 
 fn dist() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("hub/dist")
@@ -41,10 +41,10 @@ fn install(destination: &Path, words: &[&str]) -> (Option<i32>, String) {
 }
 
 #[test]
-fn what_is_installed_is_taken_away_again() {
+fn install_script_removes_every_file_it_installs() {
     let env = TestEnv::new();
     let destination = env.path("machine");
-    let program = env.word("a program");
+    let program = env.path_argument("a program");
     std::os::unix::fs::symlink(env!("CARGO_BIN_EXE_scanhub"), &program).expect("a name with a blank");
     let (code, text) = install(&destination, &["--program"]);
     assert!(code == Some(2) && text.contains("--program needs a file"), "{text}");
@@ -69,12 +69,12 @@ fn what_is_installed_is_taken_away_again() {
 }
 
 #[test]
-fn an_adapter_that_is_plugged_in_after_the_start_is_not_denied() {
+fn unit_allows_adapters_plugged_in_after_the_start() {
     let unit = fs::read_to_string(dist().join("scanhub.service")).expect("is there");
-    let is_said = |line: &str| unit.lines().any(|it| it == line);
+    let has_line = |line: &str| unit.lines().any(|it| it == line);
     // systemd.resource-control(5): a group that no driver has registered at the start is left out of the list.
     for (group, driver) in [("ttyUSB", "usbserial"), ("ttyACM", "cdc_acm")] {
-        assert!(is_said(&format!("DeviceAllow=char-{group} rw")), "{group}");
+        assert!(has_line(&format!("DeviceAllow=char-{group} rw")), "{group}");
         for key in ["Wants=", "After="] {
             let mut named = unit.lines().filter_map(|line| line.strip_prefix(key));
             let loads = format!("modprobe@{driver}.service");
@@ -85,11 +85,11 @@ fn an_adapter_that_is_plugged_in_after_the_start_is_not_denied() {
 
 /// Hub and gateway are one user, and what they keep is for that user alone.
 #[test]
-fn what_is_kept_lies_in_one_closed_directory() {
+fn units_share_one_private_state_directory() {
     for unit in ["scanhub.service", "scanhub-gateway.service"] {
         let text = fs::read_to_string(dist().join(unit)).expect("is there");
-        for wanted in ["User=scanhub", "StateDirectory=scanhub", "StateDirectoryMode=0700", "UMask=0077"] {
-            assert!(text.lines().any(|line| line == wanted), "{unit}: {wanted}");
+        for expected in ["User=scanhub", "StateDirectory=scanhub", "StateDirectoryMode=0700", "UMask=0077"] {
+            assert!(text.lines().any(|line| line == expected), "{unit}: {expected}");
         }
     }
 }
@@ -99,7 +99,7 @@ fn units_leave_little_open() {
     for unit in ["scanhub.service", "scanhub-gateway.service"] {
         let path = dist().join(unit);
         let analyze = |words: &[&str]| output(Command::new("systemd-analyze").args(words).arg(&path));
-        let limit = format!("--threshold={MOST_EXPOSED}");
+        let limit = format!("--threshold={MAX_EXPOSURE}");
         let Ok(output) = analyze(&["security", "--offline=true", "--no-pager", &limit]) else {
             skip("systemd-analyze", "there is none");
             return;
@@ -112,8 +112,8 @@ fn units_leave_little_open() {
         assert!(output.status.success(), "{unit} is too open:\n{text}");
         // What it says of a program that is not installed here is no fault of the unit.
         let output = analyze(&["verify"]).unwrap_or_else(|error| panic!("{error}"));
-        let said = String::from_utf8_lossy(&output.stderr).into_owned();
-        let faults: Vec<_> = said.lines().filter(|line| line.contains(unit)).collect();
+        let errors = String::from_utf8_lossy(&output.stderr).into_owned();
+        let faults: Vec<_> = errors.lines().filter(|line| line.contains(unit)).collect();
         let is_fault = |line: &&&str| !line.contains("not executable") && !line.contains("man scanhub(1)");
         let faults: Vec<_> = faults.iter().filter(is_fault).collect();
         assert!(faults.is_empty(), "{faults:?}");

@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use crate::testkit::{KILL, Outcome, Program, REAL_ANSWERS, TERM, TestEnv, until};
+use crate::testkit::{KILL, Outcome, Program, REAL_REPLY_TIME, TERM, TestEnv, wait_until};
 use rustix::fs::inotify::{self, CreateFlags, WatchFlags};
 use rustix::io::Errno;
 use rustix::process::Signal;
@@ -25,11 +25,11 @@ fn doctor(env: &TestEnv, arguments: &[&str], code: i32) -> (Vec<Value>, Outcome)
 }
 
 /// As [`doctor`], for the scanner at `port`. On a busy machine, a simulated scanner may reply too late: then it runs again.
-fn doctor_of(port: &str, env: &TestEnv, arguments: &[&str], code: i32) -> (Vec<Value>, Outcome) {
+fn doctor_of_port(port: &str, env: &TestEnv, arguments: &[&str], code: i32) -> (Vec<Value>, Outcome) {
     let is_late =
         |line: &Value| line["name"] == "sensor" && line["port"] == port && line["state"] == "failed";
     let mut outcome = run(env, arguments);
-    until("the scanner replies", || {
+    wait_until("the scanner replies", || {
         let has_replied = !outcome.of_class("check").iter().any(is_late);
         if !has_replied {
             outcome = run(env, arguments);
@@ -44,7 +44,7 @@ fn run(env: &TestEnv, arguments: &[&str]) -> Outcome {
 }
 
 fn checks(outcome: Outcome, code: i32) -> (Vec<Value>, Outcome) {
-    assert_eq!(outcome.code, Some(code), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(code), "{outcome}");
     let findings = outcome.of_class("check");
     let errors = outcome.of_class("error");
     assert_eq!(findings.len() + errors.len(), outcome.lines().len());
@@ -62,9 +62,9 @@ fn the_page_has_a_line_for_each_check() {
 #[test]
 fn a_set_up_that_works() {
     let env = TestEnv::new();
-    let simulator = env.simulator(&["front"], &["--baud=38400", REAL_ANSWERS]);
-    let port = env.word("front");
-    let (findings, _) = doctor_of(&port, &env, &[&port], 0);
+    let simulator = env.simulator(&["front"], &["--baud=38400", REAL_REPLY_TIME]);
+    let port = env.path_argument("front");
+    let (findings, _) = doctor_of_port(&port, &env, &[&port], 0);
     for name in ["memory", "domain", "leftovers", "descriptors"] {
         assert_eq!(state(&findings, name, None).0, "ok", "{findings:#?}");
     }
@@ -77,21 +77,21 @@ fn a_set_up_that_works() {
     let (found, text) = state(&findings, "sensor", Some(&port));
     assert!(found == "ok" && text.contains("LMS200") && text.contains("38400 Bd"), "{text}");
     let outcome = env.run(&["doctor", &port, "--no-system-config"]);
-    let text = String::from_utf8_lossy(&outcome.out);
+    let text = String::from_utf8_lossy(&outcome.stdout);
     assert!(text.contains("ok       sensor") && text.contains(&port), "{outcome}");
-    assert_eq!(simulator.end(TERM).code, Some(0));
-    assert_eq!(env.simulated("front").1, 0);
+    assert_eq!(simulator.end(TERM).exit_code, Some(0));
+    assert_eq!(env.simulator_totals("front").1, 0);
 }
 
 #[test]
-fn what_is_wrong_is_told_with_its_remedy() {
+fn reports_bad_settings_and_ports() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &[] as &[&str]);
-    let (front, absent) = (env.word("front"), env.word("absent"));
+    let (front, absent) = (env.path_argument("front"), env.path_argument("absent"));
     let links = [env.link("front"), env.link("absent"), "--link=null=/dev/null".into()];
     let mut arguments: Vec<&str> = links.iter().map(String::as_str).collect();
     arguments.extend(["--set", "link.front.unit=cm"]);
-    let (findings, outcome) = doctor_of(&front, &env, &arguments, 5);
+    let (findings, outcome) = doctor_of_port(&front, &env, &arguments, 5);
     assert!(state(&findings, "configuration", None).1.contains("front, absent, null"));
     let (found, text) = state(&findings, "settings", Some(&front));
     assert!(found == "warning" && text.contains("unit=cm"), "{text}");
@@ -118,12 +118,12 @@ fn what_is_wrong_is_told_with_its_remedy() {
 fn a_port_of_the_hub_is_found_by_any_of_its_names() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &[] as &[&str]);
-    let (front, again, directory) = (env.word("front"), env.word("again"), env.path(""));
+    let (front, again, directory) = (env.path_argument("front"), env.path_argument("again"), env.path(""));
     std::os::unix::fs::symlink(&front, &again).expect("a link");
     let device = env.path("front").canonicalize().expect("a pty").display().to_string();
     // Without a hub, the link of the configuration is found.
     let arguments = [&again, &env.link("front"), "--set", "link.front.unit=cm"];
-    let (findings, _) = doctor_of(&again, &env, &arguments, 0);
+    let (findings, _) = doctor_of_port(&again, &env, &arguments, 0);
     let (found, text) = state(&findings, "settings", Some(&again));
     assert!(found == "warning" && text.contains("unit=cm"), "{text}");
 
@@ -147,33 +147,36 @@ fn a_port_of_the_hub_is_found_by_any_of_its_names() {
         for verb in [&["probe", name][..], &["configure", name, "unit=mm"]] {
             let outcome = in_directory(&[verb, &["--json"]].concat()).wait();
             let message = outcome.of_class("error")[0]["message"].to_string();
-            assert!(outcome.code == Some(4) && message.contains("its link front is streaming"), "{outcome}");
+            assert!(
+                outcome.exit_code == Some(4) && message.contains("its link front is streaming"),
+                "{outcome}"
+            );
         }
     }
     // The links of the hub, from another directory, with a name that leads to the port.
     let (findings, _) = doctor(&env, &[], 0);
     let (found, text) = state(&findings, "sensor", Some(&env.path("./front").display().to_string()));
     assert!(found == "ok" && text.contains("link front of the hub: streaming"), "{text}");
-    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
 }
 
 #[test]
 fn a_sensor_that_is_not_well_is_no_good_set_up() {
     let env = TestEnv::new();
     let dirty = env.simulator(&["dirty"], &["--type=lms291", "--pollution=20"]);
-    let port = env.word("dirty");
-    let (findings, _) = doctor_of(&port, &env, &[&port], 0);
+    let port = env.path_argument("dirty");
+    let (findings, _) = doctor_of_port(&port, &env, &[&port], 0);
     let (found, text) = state(&findings, "health", Some(&port));
     assert!(found == "warning" && text.contains("window is dirty, 20 % clear"), "{text}");
     drop(dirty);
     let _broken = env.simulator(&["broken"], &["--type=lms211", "--status=0x13", "--error=3:18"]);
-    let port = env.word("broken");
-    let (findings, _) = doctor_of(&port, &env, &[&port], 5);
+    let port = env.path_argument("broken");
+    let (findings, _) = doctor_of_port(&port, &env, &[&port], 5);
     let (found, text) = state(&findings, "health", Some(&port));
     assert!(found == "failed" && text.contains("error 18: dirt on the window"), "{text}");
     let _former = env.simulator(&["former"], &["--permanent-baud=38400", "--status=0x12", "--error=2:18"]);
-    let port = env.word("former");
-    let (findings, _) = doctor_of(&port, &env, &[&port], 0);
+    let port = env.path_argument("former");
+    let (findings, _) = doctor_of_port(&port, &env, &[&port], 0);
     assert_eq!(state(&findings, "health", Some(&port)).0, "warning");
     let (found, text) = state(&findings, "power-on", Some(&port));
     let remedy = format!("scanhub configure {port} power_on_baud=9600");
@@ -181,40 +184,40 @@ fn a_sensor_that_is_not_well_is_no_good_set_up() {
 }
 
 #[test]
-fn a_port_without_a_sensor_is_asked_for_a_bounded_time() {
+fn reports_a_silent_port_after_a_bounded_search() {
     let env = TestEnv::new();
     // A sensor that answers nothing.
     let _simulator = env.simulator(&["front"], &["--fault=mute=1"]);
-    let (findings, _) = doctor(&env, &[&env.word("front")], 5);
-    let (found, text) = state(&findings, "sensor", Some(&env.word("front")));
+    let (findings, _) = doctor(&env, &[&env.path_argument("front")], 5);
+    let (found, text) = state(&findings, "sensor", Some(&env.path_argument("front")));
     assert!(found == "failed" && text.contains("looked for lms at 9600"), "{text}");
 }
 
 #[test]
-fn a_running_hub_is_asked_instead_and_a_dead_one_leaves_traces() {
+fn queries_a_running_hub_and_reports_a_killed_one() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--baud=500000"]);
     let hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
     let before = env.info("front");
-    let (port, link) = (env.word("front"), env.link("front"));
+    let (port, link) = (env.path_argument("front"), env.link("front"));
     let (findings, _) = doctor(&env, &[&link], 0);
     // A link of the hub stands for its port.
     let (named, _) = doctor(&env, &["front"], 0);
-    assert_eq!(state(&named, "sensor", Some(&env.word("front"))).0, "ok", "{named:#?}");
+    assert_eq!(state(&named, "sensor", Some(&env.path_argument("front"))).0, "ok", "{named:#?}");
     let pid = format!("process {}", hub.pid());
     assert!(state(&findings, "domain", None).1.contains(&pid));
     assert!(state(&findings, "holder", Some(&port)).1.contains(&pid));
     assert!(state(&findings, "sensor", Some(&port)).1.contains("streaming"));
     let after = env.info("front");
-    let account = |info: &Value| (info["counters"]["aborted"].clone(), info["counters"]["resyncs"].clone());
-    assert_eq!(account(&before), account(&after), "it was disturbed");
+    let counters = |info: &Value| (info["counters"]["aborted"].clone(), info["counters"]["resyncs"].clone());
+    assert_eq!(counters(&before), counters(&after), "it was disturbed");
 
-    assert_eq!(hub.end(KILL).code, None);
+    assert_eq!(hub.end(KILL).exit_code, None);
     let (findings, _) = doctor(&env, &[&link], 0);
     let (found, text) = state(&findings, "leftovers", None);
     assert!(found == "warning" && text.contains("1 process died") && text.contains("scanhub run"), "{text}");
-    assert!(!env.left_behind().is_empty(), "it deleted something");
+    assert!(!env.leftover_files().is_empty(), "it deleted something");
 }
 
 #[test]
@@ -228,7 +231,7 @@ fn a_hub_that_is_stopped_is_no_good_set_up() {
     let (found, text) = state(&findings, "domain", None);
     let continued = format!("kill -CONT {}", hub.pid());
     assert!(found == "failed" && text.contains(&continued), "{text}");
-    let port = env.word("front");
+    let port = env.path_argument("front");
     for name in ["sensor", "line-errors"] {
         let (found, text) = state(&findings, name, Some(&port));
         assert!(found == "skipped" && text.contains("does not publish"), "{text}");
@@ -237,17 +240,17 @@ fn a_hub_that_is_stopped_is_no_good_set_up() {
     let (named, _) = doctor(&env, &["front"], 5);
     assert_eq!(state(&named, "port", Some("front")).0, "skipped", "{named:#?}");
     hub.signal(Signal::CONT);
-    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
 }
 
 #[test]
-fn a_hub_is_listed_below_its_root_and_is_no_leftover_below_another() {
+fn hub_is_not_reported_as_leftover_of_another_root() {
     let env = TestEnv::new();
     let hub = env.hub(&[env.link("absent")]);
-    assert!(!env.left_behind().is_empty(), "it has shared memory");
+    assert!(!env.leftover_files().is_empty(), "it has shared memory");
     let domains = |root: &Path| Program::start(env.command_at(root, &["list", "--domains", "--json"])).wait();
-    let place = env.place();
-    let here = domains(place.root().parent().unwrap()).of_class("domain");
+    let domain = env.domain();
+    let here = domains(domain.root().parent().unwrap()).of_class("domain");
     assert!(here.len() == 1 && here[0]["pid"] == hub.pid(), "{here:?}");
     let other = env.path("other");
     assert!(domains(&other).of_class("domain").is_empty());
@@ -258,7 +261,7 @@ fn a_hub_is_listed_below_its_root_and_is_no_leftover_below_another() {
 }
 
 #[test]
-fn what_another_program_has_is_not_touched() {
+fn does_not_open_a_port_held_by_another_program() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &[] as &[&str]);
     let holder = std::fs::File::options().read(true).write(true).open(env.path("front")).unwrap();
@@ -267,19 +270,19 @@ fn what_another_program_has_is_not_touched() {
     let device = env.path("front").canonicalize().unwrap();
     inotify::add_watch(&watch, &device, WatchFlags::OPEN).unwrap();
     // This process has it open.
-    let (findings, _) = doctor(&env, &[&env.word("front")], 5);
+    let (findings, _) = doctor(&env, &[&env.path_argument("front")], 5);
     assert_eq!(rustix::io::read(&watch, &mut [0; 64]), Err(Errno::AGAIN), "it was opened");
     drop(std::fs::File::open(&device).unwrap());
     assert!(rustix::io::read(&watch, &mut [0; 64]).is_ok(), "nobody would have noticed");
-    let (found, text) = state(&findings, "holder", Some(&env.word("front")));
+    let (found, text) = state(&findings, "holder", Some(&env.path_argument("front")));
     assert!(found == "failed" && text.contains(&format!("process {}", std::process::id())), "{text}");
-    assert_eq!(state(&findings, "sensor", Some(&env.word("front"))).0, "skipped");
+    assert_eq!(state(&findings, "sensor", Some(&env.path_argument("front"))).0, "skipped");
     let after = rustix::termios::tcgetattr(&holder).unwrap();
     assert_eq!(before.output_speed(), after.output_speed());
 }
 
 #[test]
-fn a_hub_that_would_not_start_for_want_of_descriptors_is_no_good_set_up() {
+fn too_few_descriptors_for_a_hub_is_a_failure() {
     let env = TestEnv::new();
     let link = env.link("absent");
     let limited = |limit: u64, arguments: &[&str]| {
@@ -296,12 +299,12 @@ fn a_hub_that_would_not_start_for_want_of_descriptors_is_no_good_set_up() {
     };
     let run = ["run", "--json", &link];
     let refused = limited(40, &run).wait();
-    assert_eq!(refused.code, Some(75), "{refused}");
-    let words = refused.errors.split_once("descriptors are short: ").expect("it says so").1.split(' ');
+    assert_eq!(refused.exit_code, Some(75), "{refused}");
+    let words = refused.stderr.split_once("descriptors are short: ").expect("it says so").1.split(' ');
     let numbers: Vec<u64> = words.filter_map(|word| word.parse().ok()).collect();
     let enough = numbers[0] + numbers[1];
-    assert_eq!(limited(enough - 1, &run).wait().code, Some(75));
+    assert_eq!(limited(enough - 1, &run).wait().exit_code, Some(75));
     assert_eq!(doctor(enough - 1), "failed");
-    assert_eq!(limited(enough, &run).ready().end(TERM).code, Some(0));
+    assert_eq!(limited(enough, &run).ready().end(TERM).exit_code, Some(0));
     assert_eq!(doctor(enough), "warning");
 }

@@ -7,10 +7,12 @@ use std::os::unix::fs::{PermissionsExt, symlink};
 use std::os::unix::process::CommandExt;
 use std::process::Command;
 
-use crate::testkit::{Findings, Line, Program, TestEnv, open_line, side_by_side, skip, succeeds, until};
+use crate::testkit::{
+    Findings, Program, TestEnv, TestLine, open_line, run_concurrently, skip, succeeds, wait_until,
+};
 
 /// What a simulated sensor has, and what the doctor says of it.
-const SENSORS: [(&str, &[&str], &str, &str, &str); 10] = [
+const BROKEN_SENSORS: [(&str, &[&str], &str, &str, &str); 10] = [
     ("the window is dirty", &["--type=lms291", "--pollution=60"], "health", "warning", "clean its window"),
     (
         "an error of the sensor",
@@ -54,70 +56,83 @@ const SENSORS: [(&str, &[&str], &str, &str, &str); 10] = [
 ];
 
 #[test]
-fn what_is_wrong_with_a_sensor() {
-    side_by_side(SENSORS.into_iter().enumerate(), |(number, (set_up, flags, name, state, remedy))| {
-        let env = TestEnv::new();
-        let port = format!("p{number}");
-        let _simulator = env.simulator(&[&port], flags);
-        let (link, of) = (env.link(&port), |key: &str| format!("link.{port}.{key}"));
-        let wanted = [of("unit=mm"), of("type=lms200")];
-        let examine = || Findings::of(&env, &[&link, "--set", &wanted[0], "--set", &wanted[1]]);
-        let mut findings = examine();
-        // A busy machine may run the simulated sensor too late to reply.
-        until("a sensor that can reply does", || {
-            let is_heard = name == "sensor" || findings.said("sensor").0 != "failed";
-            if !is_heard {
-                findings = examine();
-            }
-            is_heard
-        });
-        findings.complain(set_up, name, state, remedy);
-    });
+fn finds_sensor_faults() {
+    run_concurrently(
+        BROKEN_SENSORS.into_iter().enumerate(),
+        |(number, (set_up, flags, name, state, remedy))| {
+            let env = TestEnv::new();
+            let port = format!("p{number}");
+            let _simulator = env.simulator(&[&port], flags);
+            let (link, of) = (env.link(&port), |key: &str| format!("link.{port}.{key}"));
+            let expected = [of("unit=mm"), of("type=lms200")];
+            let examine = || Findings::of(&env, &[&link, "--set", &expected[0], "--set", &expected[1]]);
+            let mut findings = examine();
+            // A busy machine may run the simulated sensor too late to reply.
+            wait_until("a sensor that can reply does", || {
+                let has_replied = name == "sensor" || findings.state_and_text("sensor").0 != "failed";
+                if !has_replied {
+                    findings = examine();
+                }
+                has_replied
+            });
+            findings.assert_problem(set_up, name, state, remedy);
+        },
+    );
 }
 
 #[test]
-fn what_is_wrong_with_a_port() {
+fn finds_port_faults() {
     let env = TestEnv::new();
-    let port = |name: &str| Findings::of(&env, &[&env.word(name)]);
+    let port = |name: &str| Findings::of(&env, &[&env.path_argument(name)]);
     // What there is instead depends on the machine.
-    let instead = |finding: &Findings| if finding.said("port").1.is_empty() { "there are" } else { "" };
+    let instead =
+        |finding: &Findings| if finding.state_and_text("port").1.is_empty() { "there are" } else { "" };
     let absent = port("absent");
-    absent.complain("no such port", "port", "failed", instead(&absent));
+    absent.assert_problem("no such port", "port", "failed", instead(&absent));
     symlink("/dev/pts/no-such-line", env.path("unplugged")).expect("a symlink");
     let unplugged = port("unplugged");
-    assert!(unplugged.said("port").1.contains("points to"), "{:?}", unplugged.said("port"));
-    unplugged.complain("the adapter behind the name is gone", "port", "failed", "");
-    Findings::of(&env, &["/dev/null"]).complain("no serial line", "access", "failed", "name a tty");
-    port("").complain("a directory", "access", "failed", "it is a directory");
+    assert!(
+        unplugged.state_and_text("port").1.contains("points to"),
+        "{:?}",
+        unplugged.state_and_text("port")
+    );
+    unplugged.assert_problem("the adapter behind the name is gone", "port", "failed", "");
+    Findings::of(&env, &["/dev/null"]).assert_problem("no serial line", "access", "failed", "name a tty");
+    port("").assert_problem("a directory", "access", "failed", "it is a directory");
 
-    let line = Line::at(&env.path("held"));
+    let line = TestLine::create(&env.path("held"));
     let holder = open_line(&env.path("held"), 9600);
-    port("held").complain("another program has the port", "holder", "failed", "stop it first");
+    port("held").assert_problem("another program has the port", "holder", "failed", "stop it first");
     drop((holder, line));
 
     let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
     let server = format!("tcp:{}", listener.local_addr().expect("an address"));
     drop(listener);
-    Findings::of(&env, &[&server]).complain("the serial server refuses", "port", "failed", "raw TCP mode");
-    let recording = env.word("recording");
+    Findings::of(&env, &[&server]).assert_problem(
+        "the serial server refuses",
+        "port",
+        "failed",
+        "raw TCP mode",
+    );
+    let recording = env.path_argument("recording");
     let link = format!("--link=front=file:{recording}");
-    Findings::of(&env, &[&link]).complain("no such recording", "port", "failed", "existing recording");
+    Findings::of(&env, &[&link]).assert_problem("no such recording", "port", "failed", "existing recording");
 }
 
 #[test]
-fn who_may_not_open_the_port() {
-    const SET_UP: &str = "no permission at the port";
+fn reports_missing_port_permission_with_remedy() {
+    const NO_PERMISSION: &str = "no permission at the port";
     let env = TestEnv::new();
-    let _line = Line::at(&env.path("front"));
-    let arguments = ["doctor", "--json", "--no-system-config", &env.word("front")];
+    let _line = TestLine::create(&env.path("front"));
+    let arguments = ["doctor", "--json", "--no-system-config", &env.path_argument("front")];
     if !rustix::process::getuid().is_root() {
         fs::set_permissions(env.path("front"), fs::Permissions::from_mode(0o000)).expect("it is ours");
         let findings = Findings::in_outcome(&env.run(&arguments));
-        return findings.complain(SET_UP, "access", "failed", "chmod u+rw");
+        return findings.assert_problem(NO_PERMISSION, "access", "failed", "chmod u+rw");
     }
     // Root may open all: somebody else asks.
     let as_nobody = |mut command: Command| {
-        command.uid(NOBODY).gid(NOBODY);
+        command.uid(UNPRIVILEGED_UID).gid(UNPRIVILEGED_UID);
         command
     };
     let mut attempt = as_nobody(Command::new(env!("CARGO_BIN_EXE_scanhub")));
@@ -131,16 +146,16 @@ fn who_may_not_open_the_port() {
         fs::set_permissions(&device, fs::Permissions::from_mode(mode)).expect("root may");
         Findings::in_outcome(&Program::start(as_nobody(env.command(&arguments))).wait())
     };
-    group(20, 0o660).complain(SET_UP, "access", "failed", "sudo usermod -aG");
-    group(0, 0o600).complain("no group may use the port", "access", "failed", "udev rule");
+    group(20, 0o660).assert_problem(NO_PERMISSION, "access", "failed", "sudo usermod -aG");
+    group(0, 0o600).assert_problem("no group may use the port", "access", "failed", "udev rule");
 }
 
 #[test]
-fn what_is_wrong_with_the_configuration() {
+fn finds_configuration_faults() {
     let env = TestEnv::new();
     let broken = |set_up, text: &str, remedy| {
         let file = env.file("scanhub.toml", text);
-        Findings::of(&env, &["--config", &file]).complain(set_up, "configuration", "failed", remedy);
+        Findings::of(&env, &["--config", &file]).assert_problem(set_up, "configuration", "failed", remedy);
     };
     broken("an unknown key", "[[link]]\nname = \"front\"\nbuad = 500000\n", "baud");
     broken(
@@ -152,9 +167,9 @@ fn what_is_wrong_with_the_configuration() {
     broken("two links at one port", two, "name the port of each sensor");
     broken("a gateway that cannot be", "[gateway]\nttl = 1000\n", "");
     File::create(env.path("scanhub.toml")).expect("an empty file");
-    let missing = env.word("no-such.toml");
-    Findings::of(&env, &["--config", &missing]).complain("no such file", "configuration", "failed", "");
+    let missing = env.path_argument("no-such.toml");
+    Findings::of(&env, &["--config", &missing]).assert_problem("no such file", "configuration", "failed", "");
 }
 
 /// The user that has nothing.
-const NOBODY: u32 = 65534;
+const UNPRIVILEGED_UID: u32 = 65534;

@@ -17,7 +17,7 @@ use scanhub_shm::Domain;
 use scanhub_tools::doctor::{Bridge, CheckTargets, System, run_checks};
 
 /// `sh` with these words before the program, as `ulimit -f 100; exec`, and its arguments.
-fn under(env: &TestEnv, words: &str, arguments: &[&str]) -> Command {
+fn command_under(env: &TestEnv, words: &str, arguments: &[&str]) -> Command {
     let inner = env.command(&[&["doctor", "--json", "--no-system-config"], arguments].concat());
     let mut command = Command::new("sh");
     command
@@ -38,22 +38,26 @@ fn a_set_up_that_is_well() {
         let findings = Findings::of(&env, &flags);
         // How this machine itself is set up no test can know.
         let not_of_the_machine = ["service", "udev", "logout"];
-        assert!(not_of_the_machine.iter().all(|name| !findings.said(name).1.is_empty()));
-        findings.without(&not_of_the_machine).are_silent();
+        assert!(not_of_the_machine.iter().all(|name| !findings.state_and_text(name).1.is_empty()));
+        findings.without(&not_of_the_machine).assert_no_problem();
         findings
     };
     let findings = examine();
-    assert!(findings.said("version").1.contains(env!("CARGO_PKG_VERSION")), "{:?}", findings.said("version"));
+    assert!(
+        findings.state_and_text("version").1.contains(env!("CARGO_PKG_VERSION")),
+        "{:?}",
+        findings.state_and_text("version")
+    );
     let hub = env.hub(&flags[..1]);
     env.await_info("front", |info| info["state"] == "streaming");
-    assert!(examine().said("version").1.ends_with("the hub runs the same program"));
-    assert_eq!(hub.end(TERM).code, Some(0));
-    assert!(examine().said("leftovers").1.starts_with("none"), "an orderly end leaves nothing");
-    well_kept(&env).are_silent();
+    assert!(examine().state_and_text("version").1.ends_with("the hub runs the same program"));
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
+    assert!(examine().state_and_text("leftovers").1.starts_with("none"), "an orderly end leaves nothing");
+    healthy_machine(&env).assert_no_problem();
 }
 
 /// A machine on which everything is installed, looked at by an ordinary user.
-fn well_kept(env: &TestEnv) -> Findings {
+fn healthy_machine(env: &TestEnv) -> Findings {
     let machine = env.path("machine");
     let put = |path: &str, text: &str| {
         let path = machine.join(path);
@@ -73,37 +77,37 @@ fn well_kept(env: &TestEnv) -> Findings {
     put("sys/fs/cgroup/system.slice/scanhub.service/cgroup.procs", "7\n");
     fs::create_dir_all(machine.join("usr/local/bin")).expect("can be created");
     let _ = symlink(crate::testkit::own_program(), machine.join("usr/local/bin/scanhub"));
-    laid_out(env)
+    healthy_layout(env)
 }
 
 /// What is found on the machine below the environment's directory `machine`, for the user 1000.
-fn laid_out(env: &TestEnv) -> Findings {
+fn healthy_layout(env: &TestEnv) -> Findings {
     // The ports of this machine are unknown to a test.
-    with_ports(env).of_machine().without(&["ports", "multicast"])
+    port_findings(env).without_ports().without(&["ports", "multicast"])
 }
 
 /// All findings, including the ports of this machine and the adapters of the made-up one.
-fn with_ports(env: &TestEnv) -> Findings {
+fn port_findings(env: &TestEnv) -> Findings {
     let targets = CheckTargets {
         ports: Vec::new(),
         config: None,
         gateway: Gateway { interface: Some("lo".to_owned()), ..Gateway::default() },
-        domain: env.place(),
-        places: Vec::new(),
+        domain: env.domain(),
+        locations: Vec::new(),
         system: System::at(env.path("machine"), 1000),
         bridge: Bridge::default(),
         clean: false,
     };
     let mut lines = Vec::new();
-    let mut tell = |finding: &scanhub_tools::doctor::Finding| {
+    let mut add_finding = |finding: &scanhub_tools::doctor::Finding| {
         lines.push(serde_json::to_value(finding).expect("is JSON"))
     };
-    let _ = run_checks(&targets, &AtomicBool::new(false), &mut tell);
+    let _ = run_checks(&targets, &AtomicBool::new(false), &mut add_finding);
     Findings::in_lines(lines)
 }
 
 #[test]
-fn names_what_keeps_an_adapter_from_having_a_port() {
+fn reports_missing_module_and_brltty_for_an_adapter() {
     let env = TestEnv::new();
     let put = |path: &str, text: &str| {
         let path = env.path("machine").join(path);
@@ -113,9 +117,9 @@ fn names_what_keeps_an_adapter_from_having_a_port() {
     put("sys/bus/usb/devices/1-1/idVendor", "1a86\n");
     put("sys/bus/usb/devices/1-1/idProduct", "7523\n");
     let ports = || {
-        let findings = with_ports(&env);
+        let findings = port_findings(&env);
         // It is a failure only where this machine has no port to examine.
-        let (state, finding) = findings.said("ports");
+        let (state, finding) = findings.state_and_text("ports");
         assert!(["warning", "failed"].contains(&state), "{state}");
         (state.to_owned(), finding.to_owned(), findings)
     };
@@ -124,51 +128,70 @@ fn names_what_keeps_an_adapter_from_having_a_port() {
         finding.contains("(CH340, 1a86:7523) has no port: the kernel module ch341 is not loaded"),
         "{finding}"
     );
-    findings.complain("an adapter without its module", "ports", &state, "sudo modprobe ch341");
+    findings.assert_problem("an adapter without its module", "ports", &state, "sudo modprobe ch341");
     put("proc/812/comm", "brltty\n");
     let (state, finding, findings) = ports();
     assert!(finding.contains("brltty, process 812"), "{finding}");
-    findings.complain("an adapter that brltty takes away", "ports", &state, "sudo apt remove brltty");
+    findings.assert_problem("an adapter that brltty takes away", "ports", &state, "sudo apt remove brltty");
 }
 
 #[test]
-fn what_an_administrator_may_have_left() {
+fn finds_faults_of_service_and_udev_rule() {
     let env = TestEnv::new();
-    well_kept(&env);
+    healthy_machine(&env);
     let at = |path: &str| env.path("machine").join(path);
     let remove = |path: &str| fs::remove_file(at(path)).unwrap_or_else(|error| panic!("{path}: {error}"));
     remove("var/lib/systemd/linger/robot");
-    laid_out(&env).complain(
+    healthy_layout(&env).assert_problem(
         "logging out takes shared memory away",
         "logout",
         "warning",
         "enable-linger robot",
     );
     remove("sys/fs/cgroup/system.slice/scanhub.service/cgroup.procs");
-    laid_out(&env).complain("the service does not run", "service", "failed", "systemctl status scanhub");
+    healthy_layout(&env).assert_problem(
+        "the service does not run",
+        "service",
+        "failed",
+        "systemctl status scanhub",
+    );
     remove("usr/local/bin/scanhub");
-    laid_out(&env).complain("the service's program is gone", "service", "failed", "install.sh");
+    healthy_layout(&env).assert_problem("the service's program is gone", "service", "failed", "install.sh");
     write_program(at("usr/local/bin/scanhub"), "#!/bin/sh\necho scanhub 0.0.1\n");
-    let stale = laid_out(&env);
-    stale.complain("the service is of another version", "service", "warning", "restart scanhub");
-    assert!(stale.said("service").1.contains("version 0.0.1"), "{:?}", stale.said("service"));
+    let stale = healthy_layout(&env);
+    stale.assert_problem("the service is of another version", "service", "warning", "restart scanhub");
+    assert!(
+        stale.state_and_text("service").1.contains("version 0.0.1"),
+        "{:?}",
+        stale.state_and_text("service")
+    );
     fs::write(at("etc/udev/rules.d/60-scanhub.rules"), "# of a year ago\n").expect("can be written");
-    laid_out(&env).complain("the udev rule is of another version", "udev", "warning", "install.sh");
+    healthy_layout(&env).assert_problem(
+        "the udev rule is of another version",
+        "udev",
+        "warning",
+        "install.sh",
+    );
 }
 
 #[test]
-fn what_is_short() {
+fn finds_resource_shortages() {
     let env = TestEnv::new();
     let link = env.link("absent");
-    let limited = |words| Findings::in_outcome(&Program::start(under(&env, words, &[&link])).wait());
-    limited("ulimit -n 64").complain("descriptors are short", "descriptors", "failed", "LimitNOFILE=");
-    limited("ulimit -n 128").complain(
+    let limited = |words| Findings::in_outcome(&Program::start(command_under(&env, words, &[&link])).wait());
+    limited("ulimit -n 64").assert_problem("descriptors are short", "descriptors", "failed", "LimitNOFILE=");
+    limited("ulimit -n 128").assert_problem(
         "descriptors for few consumers",
         "descriptors",
         "warning",
         "sudo prlimit --pid $$ --nofile=",
     );
-    limited("ulimit -f 100").complain("files may not be long", "file-size", "failed", "ulimit -f unlimited");
+    limited("ulimit -f 100").assert_problem(
+        "files may not be long",
+        "file-size",
+        "failed",
+        "ulimit -f unlimited",
+    );
     let unshare = ["unshare", "--mount", "--map-root-user"];
     let unshare = &unshare[..if rustix::process::getuid().is_root() { 2 } else { 3 }];
     let mounted = |options: &str, after: &str| {
@@ -191,71 +214,88 @@ fn what_is_short() {
         let mut command = mounted(options, after);
         command.arg(inner.get_program()).args(inner.get_args()).env("SCANHUB_END_WITH_PARENT", "1");
         let findings = Findings::in_outcome(&Program::start(command).wait());
-        findings.complain(set_up, "memory", "failed", remedy);
+        findings.assert_problem(set_up, "memory", "failed", remedy);
     }
 }
 
 #[test]
-fn what_is_wrong_with_the_domain() {
+fn finds_domain_faults() {
     let env = TestEnv::new();
-    let root = env.place().root().to_owned();
+    let root = env.domain().root().to_owned();
     fs::create_dir(&root).expect("can be created");
     fs::set_permissions(&root, fs::Permissions::from_mode(0o777)).expect("it is ours");
-    Findings::of(&env, &[]).complain("others may write in the domain", "domain", "failed", "chmod go-w");
+    Findings::of(&env, &[]).assert_problem(
+        "others may write in the domain",
+        "domain",
+        "failed",
+        "chmod go-w",
+    );
     if std::os::unix::fs::chown(&root, Some(1), None).is_ok() {
         fs::set_permissions(&root, fs::Permissions::from_mode(0o700)).expect("root may");
-        Findings::of(&env, &[]).complain("the domain is another user's", "domain", "failed", "run as user 1");
+        Findings::of(&env, &[]).assert_problem(
+            "the domain is another user's",
+            "domain",
+            "failed",
+            "run as user 1",
+        );
     } else {
         skip("root", "this user cannot give a directory away");
     }
     let nowhere = env.command_at(Path::new("/dev/null"), &["doctor", "--json", "--no-system-config"]);
     let findings = Findings::in_outcome(&Program::start(nowhere).wait());
-    findings.complain("no domain can be created there", "domain", "failed", "--root");
+    findings.assert_problem("no domain can be created there", "domain", "failed", "--root");
 }
 
 #[test]
-fn what_a_dead_hub_left_is_taken_away_and_a_living_ones_is_not() {
+fn clean_removes_files_of_killed_hubs_only() {
     let env = TestEnv::new();
     let link = env.link("absent");
     let hub = env.hub(&[&link]);
-    let before = env.left_behind();
+    let before = env.leftover_files();
     let alive = Findings::of(&env, &["--clean"]);
-    assert!(alive.said("clean").0 == "skipped" && alive.said("clean").1.contains(&hub.pid().to_string()));
+    assert!(
+        alive.state_and_text("clean").0 == "skipped"
+            && alive.state_and_text("clean").1.contains(&hub.pid().to_string())
+    );
     assert!(before.iter().all(|path| path.exists()), "{before:?}");
     hub.end(KILL);
-    Findings::of(&env, &[]).complain("a hub was killed", "leftovers", "warning", "doctor --clean");
+    Findings::of(&env, &[]).assert_problem("a hub was killed", "leftovers", "warning", "doctor --clean");
     // A neighbour whose name begins alike, and one that is a hub of this name elsewhere.
     let (neighbour, other) = (TestEnv::new(), env.path("other"));
-    let theirs = Program::start(env.command_at(&other, &["run", "--json", &link])).ready();
-    let held = env.left_behind().len();
+    let other_hub = Program::start(env.command_at(&other, &["run", "--json", &link])).ready();
+    let held = env.leftover_files().len();
     let hub = neighbour.hub(&[&link]);
-    let neighbours = neighbour.left_behind();
+    let neighbours = neighbour.leftover_files();
     let clean = Findings::of(&env, &["--clean"]);
-    assert!(clean.said("clean").1.starts_with("removed what 1 process left"), "{:?}", clean.said("clean"));
-    clean.without(&["multicast", "logout", "service", "udev", "port"]).of_machine().are_silent();
-    assert!(!env.place().root().exists());
-    let left = env.left_behind();
+    assert!(
+        clean.state_and_text("clean").1.starts_with("removed what 1 process left"),
+        "{:?}",
+        clean.state_and_text("clean")
+    );
+    clean.without(&["multicast", "logout", "service", "udev", "port"]).without_ports().assert_no_problem();
+    assert!(!env.domain().root().exists());
+    let left = env.leftover_files();
     assert!(left.len() < held && !left.is_empty(), "{left:?}");
-    assert_eq!(neighbour.left_behind(), neighbours);
+    assert_eq!(neighbour.leftover_files(), neighbours);
     // The other one is as it was: who comes now finds it.
-    assert_eq!(theirs.end(TERM).code, Some(0));
-    assert_eq!((env.left_behind().len(), hub.end(TERM).code), (0, Some(0)));
+    assert_eq!(other_hub.end(TERM).exit_code, Some(0));
+    assert_eq!((env.leftover_files().len(), hub.end(TERM).exit_code), (0, Some(0)));
 }
 
 #[test]
-fn who_waits_for_the_next_hub_keeps_what_it_has() {
+fn clean_keeps_the_domain_of_a_waiting_subscriber() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &[] as &[&str]);
     let link = env.link("front");
     let hub = env.hub(&[&link]);
-    let mut consumer = env.echo(&["front/scan"]);
-    consumer.await_line("a scan", is_class("scan"));
+    let mut subscriber = env.echo(&["front/scan"]);
+    subscriber.await_line("a scan", is_class("scan"));
     hub.end(KILL);
     Findings::of(&env, &["--clean", "/dev/null"]);
-    assert!(env.place().root().exists());
+    assert!(env.domain().root().exists());
     let _hub = env.hub(&[&link]);
     let is_anew = |line: &serde_json::Value| line["class"] == "scan" && line["topic_seq"] == 0;
-    consumer.await_line("a scan of the next hub", is_anew);
+    subscriber.await_line("a scan of the next hub", is_anew);
 }
 
 #[test]
@@ -263,18 +303,18 @@ fn files_without_a_domain_are_taken_away() {
     let env = TestEnv::new();
     let hub = env.hub(&[env.link("absent")]);
     hub.end(KILL);
-    fs::remove_dir_all(env.place().root()).expect("it is ours");
+    fs::remove_dir_all(env.domain().root()).expect("it is ours");
     let findings = Findings::of(&env, &[]);
-    findings.complain("files of a domain that is gone", "leftovers", "warning", "doctor --clean");
+    findings.assert_problem("files of a domain that is gone", "leftovers", "warning", "doctor --clean");
     // Somebody still reads one of them.
-    let files = env.left_behind();
+    let files = env.leftover_files();
     let held = fs::File::open(&files[0]).expect("it is ours");
     Findings::of(&env, &["--clean"]);
-    assert_eq!(env.left_behind(), files[..1]);
+    assert_eq!(env.leftover_files(), files[..1]);
     drop(held);
     Findings::of(&env, &["--clean"]);
-    assert!(shared_memory(&env.place().prefix()).is_empty());
-    assert_eq!(Findings::of(&env, &["--clean"]).said("clean").1, "nothing to remove");
+    assert!(shared_memory(&env.domain().prefix()).is_empty());
+    assert_eq!(Findings::of(&env, &["--clean"]).state_and_text("clean").1, "nothing to remove");
 }
 
 #[test]
@@ -296,7 +336,7 @@ fn two_hubs_and_one_that_was_replaced() {
     let _first = run_at(&program, &service);
     let _second = run_at(Path::new(env!("CARGO_BIN_EXE_scanhub")), &user);
     fs::remove_file(&program).expect("it is ours");
-    let name = env.place().name().to_owned();
+    let name = env.domain().name().to_owned();
     let mut doctor = Command::new(env!("CARGO_BIN_EXE_scanhub"));
     doctor.args(["doctor", "--json", "--no-system-config", "--domain", &name, &link]);
     doctor
@@ -304,12 +344,11 @@ fn two_hubs_and_one_that_was_replaced() {
         .env("XDG_RUNTIME_DIR", env.path("b"))
         .env_remove("SCANHUB_CONFIG");
     let findings = Findings::in_outcome(&Program::start(doctor).wait());
-    findings.complain("two hubs of one name", "hubs", "warning", "--domain");
-    findings.complain("the hub's program was replaced", "version", "warning", "restart scanhub");
-    assert!(
-        Domain::at(&name, &user)
-            .is_ok_and(|second| findings.said("hubs").1.contains(&second.root().display().to_string()))
-    );
+    findings.assert_problem("two hubs of one name", "hubs", "warning", "--domain");
+    findings.assert_problem("the hub's program was replaced", "version", "warning", "restart scanhub");
+    assert!(Domain::at(&name, &user).is_ok_and(|second| {
+        findings.state_and_text("hubs").1.contains(&second.root().display().to_string())
+    }));
 }
 
 #[test]
@@ -317,8 +356,8 @@ fn no_way_to_the_network() {
     in_a_network("doctor_machine::no_way_to_the_network", || {
         let env = TestEnv::new();
         // Nobody named an interface: nothing goes to a network.
-        assert_eq!(Findings::of(&env, &[]).said("multicast").0, "skipped");
+        assert_eq!(Findings::of(&env, &[]).state_and_text("multicast").0, "skipped");
         let interface = Findings::of(&env, &["--set", "gateway.interface=eth7"]);
-        interface.complain("the gateway's interface is gone", "multicast", "failed", "there are lo");
+        interface.assert_problem("the gateway's interface is gone", "multicast", "failed", "there are lo");
     });
 }

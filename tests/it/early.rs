@@ -3,25 +3,28 @@
 
 use std::cell::RefCell;
 
-use crate::testkit::{INT, Program, TERM, TestEnv, accounted, is_class, number};
+use crate::testkit::{INT, Program, TERM, TestEnv, checked_topic_seqs, is_class, number};
 use serde_json::Value;
 
 /// A post in the smaller circle, to the right and a little ahead: in the first third of each telegram, and of each turn.
-pub(crate) const POST: &str = "[noise]\nerrors = 0\n[[thing]]\nradius_mm = 60\npose = [460, 200]\n\
+pub(crate) const POST_WORLD: &str = "[noise]\nerrors = 0\n[[thing]]\nradius_mm = 60\npose = [460, 200]\n\
     [[thing]]\nline = [[-3000, -1000], [3000, -1000], [3000, 4000], [-3000, 4000], [-3000, -1000]]\n";
 
 /// A scanner: the simulator's flags, its link's keys, and a bit more than the beams of a third of its scan.
 struct Scanner {
     flags: &'static [&'static str],
     keys: &'static [&'static str],
-    third: u64,
+    first_third: u64,
 }
 
-const LMS: Scanner = Scanner { flags: &["--baud=500000"], keys: &[], third: 250 };
-const LD: Scanner =
-    Scanner { flags: &["--family=ld", "--model=ld19"], keys: &["family=ld", "model=ld19"], third: 150 };
-const RPLIDAR: Scanner =
-    Scanner { flags: &["--family=rplidar", "--model=a1"], keys: &["family=rplidar", "model=a1"], third: 480 };
+const LMS_SCANNER: Scanner = Scanner { flags: &["--baud=500000"], keys: &[], first_third: 250 };
+const LD_SCANNER: Scanner =
+    Scanner { flags: &["--family=ld", "--model=ld19"], keys: &["family=ld", "model=ld19"], first_third: 150 };
+const RPLIDAR_SCANNER: Scanner = Scanner {
+    flags: &["--family=rplidar", "--model=a1"],
+    keys: &["family=rplidar", "model=a1"],
+    first_third: 480,
+};
 
 impl Scanner {
     /// A hub of it, and its simulator in `world` on a line with `faults`.
@@ -35,29 +38,34 @@ impl Scanner {
 }
 
 /// Follows `front/early` and `front/zones` of a line with `faults` until they have told `enough`.
-fn follow(env: &TestEnv, scanner: &Scanner, faults: &[&str], enough: impl Fn(&Judged) -> bool) {
-    let (hub, simulator) = scanner.start(env, POST, faults);
+fn check_warnings(
+    env: &TestEnv,
+    scanner: &Scanner,
+    faults: &[&str],
+    is_enough: impl Fn(&WarningFates) -> bool,
+) {
+    let (hub, simulator) = scanner.start(env, POST_WORLD, faults);
     let mut echo = env.echo(&["front/early", "front/zones"]);
     let lines = RefCell::new(Vec::new());
     echo.await_line("enough warnings", |line| {
         let mut lines = lines.borrow_mut();
         lines.push(line.clone());
         // Not after every line: a test that reads slowly makes the client late.
-        lines.len().is_multiple_of(16) && enough(&judge(&lines, scanner.third))
+        lines.len().is_multiple_of(16) && is_enough(&count_fates(&lines, scanner.first_third))
     });
     let outcome = echo.end(INT);
     assert_eq!(number(&env.info("front")["counters"], "loan_failed"), 0);
-    assert_eq!((hub.end(TERM).code, simulator.end(TERM).code), (Some(0), Some(0)));
+    assert_eq!((hub.end(TERM).exit_code, simulator.end(TERM).exit_code), (Some(0), Some(0)));
     // No gap is excused that the client did not report.
-    accounted(&outcome, "early");
-    accounted(&outcome, "zones");
-    let judged = judge(&outcome.lines(), scanner.third);
-    assert_eq!(judged.wrong, [""; 0], "{judged:?}");
+    checked_topic_seqs(&outcome, "early");
+    checked_topic_seqs(&outcome, "zones");
+    let counts = count_fates(&outcome.lines(), scanner.first_third);
+    assert_eq!(counts.wrong, [""; 0], "{counts:?}");
 }
 
 /// Fates of the warnings. Each warning is in exactly one of the counts.
 #[derive(Debug, Default)]
-struct Judged {
+struct WarningFates {
     /// The zones of their scan were at least as bad.
     confirmed: usize,
     /// Confirmed ones that were sent when the first third of the scan had arrived, or less.
@@ -74,43 +82,43 @@ struct Judged {
 }
 
 /// A sample of a topic, with the number of samples that the client missed just before it.
-struct Numbered<'a> {
+struct NumberedSample<'a> {
     line: &'a Value,
     missed: u64,
 }
 
 /// Returns the samples of `class` in `lines`. A silence that the client reports itself is not a sample.
-fn numbered<'a>(lines: &'a [Value], class: &str) -> Vec<Numbered<'a>> {
+fn numbered_samples<'a>(lines: &'a [Value], class: &str) -> Vec<NumberedSample<'a>> {
     let samples: Vec<_> =
         lines.iter().filter(|line| line["class"] == class && line["topic_seq"].is_u64()).collect();
     let missed = |at: usize| {
         let before = at.checked_sub(1).map(|before| number(samples[before], "topic_seq"));
         before.map_or(0, |before| number(samples[at], "topic_seq").saturating_sub(before + 1))
     };
-    samples.iter().enumerate().map(|(at, &line)| Numbered { line, missed: missed(at) }).collect()
+    samples.iter().enumerate().map(|(at, &line)| NumberedSample { line, missed: missed(at) }).collect()
 }
 
 /// Finds what became of each warning in `lines`, by its number: the next sample of the topic withdraws it or replaces it, or
 /// the zones of its scan confirm it. It depends on the numbers alone, and not on which of two topics was printed first.
-fn judge(lines: &[Value], third: u64) -> Judged {
-    let (warnings, zones) = (numbered(lines, "early"), numbered(lines, "zones"));
-    let mut judged = Judged::default();
+fn count_fates(lines: &[Value], third: u64) -> WarningFates {
+    let (warnings, zones) = (numbered_samples(lines, "early"), numbered_samples(lines, "zones"));
+    let mut counts = WarningFates::default();
     let is_withdrawn = |line: &Value| line["withdrawn"] == true;
-    for (at, Numbered { line, missed }) in warnings.iter().enumerate() {
+    for (at, NumberedSample { line, missed }) in warnings.iter().enumerate() {
         let (seq, next) = (number(line, "seq"), warnings.get(at + 1));
         let is_of_same = |other: &Value| number(other, "seq") == seq;
         let is_sound = (line["verdict"] == "stop" || line["verdict"] == "slow")
             && number(line, "bytes_seen") < 732
             && number(line, "beams_seen") > 0;
         if !is_sound {
-            judged.wrong.push(format!("not a warning: {line}"));
+            counts.wrong.push(format!("not a warning: {line}"));
         }
         if is_withdrawn(line) {
             let stood = at.checked_sub(1).map(|before| warnings[before].line);
             let is_its = stood.is_some_and(|stood| !is_withdrawn(stood) && is_of_same(stood));
             // The first sample of the client may withdraw a warning that was sent before it attached.
             if !is_its && *missed == 0 && at > 0 {
-                judged.wrong.push(format!("nothing to withdraw: {line}"));
+                counts.wrong.push(format!("nothing to withdraw: {line}"));
             }
             continue;
         }
@@ -118,17 +126,17 @@ fn judge(lines: &[Value], third: u64) -> Judged {
             Some(next) if is_of_same(next.line) => {
                 let is_worse = line["verdict"] == "slow" && next.line["verdict"] == "stop";
                 if is_withdrawn(next.line) {
-                    judged.withdrawn += 1;
+                    counts.withdrawn += 1;
                 } else if is_worse || next.missed > 0 {
-                    judged.worsened += 1;
+                    counts.worsened += 1;
                 } else {
-                    judged.wrong.push(format!("no worse than {line}: {}", next.line));
+                    counts.wrong.push(format!("no worse than {line}: {}", next.line));
                 }
                 continue;
             }
             Some(next) if next.missed > 0 => {
                 // Its withdrawal may be among them.
-                judged.unknown += 1;
+                counts.unknown += 1;
                 continue;
             }
             _ => {}
@@ -136,21 +144,21 @@ fn judge(lines: &[Value], third: u64) -> Judged {
         // For a revolution, only its packets are numbered before it is complete, so its zones have a greater number.
         let is_telegram = number(line, "bytes_seen") > 0;
         let of_scan = zones.iter().position(|zones| number(zones.line, "seq") >= seq);
-        let Some(Numbered { line: of_scan, missed }) = of_scan.map(|at| &zones[at]) else {
-            judged.unknown += 1;
+        let Some(NumberedSample { line: of_scan, missed }) = of_scan.map(|at| &zones[at]) else {
+            counts.unknown += 1;
             continue;
         };
         let is_first = of_scan["topic_seq"] == zones[0].line["topic_seq"];
         if is_telegram && number(of_scan, "seq") == seq {
         } else if *missed > 0 || is_first {
-            judged.unknown += 1;
+            counts.unknown += 1;
             continue;
         } else if is_telegram {
-            judged.wrong.push(format!("no zones and not withdrawn: {line}, then {of_scan}"));
+            counts.wrong.push(format!("no zones and not withdrawn: {line}, then {of_scan}"));
             continue;
         }
         if of_scan["stale"] == true {
-            judged.unknown += 1;
+            counts.unknown += 1;
             continue;
         }
         let holds = of_scan["verdict"] == "stop" || of_scan["verdict"] == line["verdict"];
@@ -160,51 +168,53 @@ fn judge(lines: &[Value], third: u64) -> Judged {
         let is_unsure =
             of_scan["verdict"] == "unknown" && (waited || line["verdict"] == "slow" && !is_telegram);
         if !holds && !is_unsure {
-            judged.wrong.push(format!("{line} does not hold: {of_scan}"));
+            counts.wrong.push(format!("{line} does not hold: {of_scan}"));
         }
-        judged.confirmed += 1;
-        judged.confirmed_early += usize::from(number(line, "beams_seen") <= third);
+        counts.confirmed += 1;
+        counts.confirmed_early += usize::from(number(line, "beams_seen") <= third);
     }
-    judged
+    counts
 }
 
 #[test]
-fn warnings_come_before_the_telegram_ends_and_its_zones_confirm_them() {
+fn zones_confirm_warnings_of_incomplete_telegrams() {
     let env = TestEnv::new();
     // The post is in the first third, and the telegram is read in three. A busy hub reads it later, but not always.
-    follow(&env, &LMS, &[], |judged| judged.confirmed >= 20 && judged.confirmed_early >= 10);
+    check_warnings(&env, &LMS_SCANNER, &[], |counts| counts.confirmed >= 20 && counts.confirmed_early >= 10);
 }
 
 #[test]
-fn warnings_come_before_a_turn_ends_and_its_zones_confirm_them() {
-    for scanner in [&LD, &RPLIDAR] {
+fn zones_confirm_warnings_of_incomplete_revolutions() {
+    for scanner in [&LD_SCANNER, &RPLIDAR_SCANNER] {
         let env = TestEnv::new();
-        follow(&env, scanner, &[], |judged| judged.confirmed >= 12 && judged.confirmed_early >= 7);
+        check_warnings(&env, scanner, &[], |counts| counts.confirmed >= 12 && counts.confirmed_early >= 7);
     }
 }
 
 #[test]
-fn a_warning_of_a_telegram_that_is_damaged_is_taken_back() {
+fn warning_of_a_damaged_telegram_is_withdrawn() {
     let env = TestEnv::new();
-    follow(&env, &LMS, &["--fault=truncate=0.3"], |judged| judged.confirmed >= 5 && judged.withdrawn >= 5);
+    check_warnings(&env, &LMS_SCANNER, &["--fault=truncate=0.3"], |counts| {
+        counts.confirmed >= 5 && counts.withdrawn >= 5
+    });
 }
 
 /// Most of some turns is lost: they are counted, and make no scan.
-const HOLES: &str = "--fault=silence=0.07,silence_at=3,silence_every=0.3";
+const GAPS: &str = "--fault=silence=0.07,silence_at=3,silence_every=0.3";
 
 #[test]
-fn a_warning_of_a_turn_that_makes_no_scan_is_taken_back() {
-    for scanner in [&LD, &RPLIDAR] {
+fn warning_of_a_revolution_without_scan_is_withdrawn() {
+    for scanner in [&LD_SCANNER, &RPLIDAR_SCANNER] {
         let env = TestEnv::new();
-        follow(&env, scanner, &[HOLES], |judged| judged.confirmed >= 5 && judged.withdrawn >= 5);
+        check_warnings(&env, scanner, &[GAPS], |counts| counts.confirmed >= 5 && counts.withdrawn >= 5);
     }
 }
 
 #[test]
-fn nothing_is_judged_while_nobody_follows() {
-    for scanner in [&LD, &RPLIDAR] {
+fn warnings_are_computed_only_for_subscribers() {
+    for scanner in [&LD_SCANNER, &RPLIDAR_SCANNER] {
         let env = TestEnv::new();
-        let (_hub, _simulator) = scanner.start(&env, POST, &[]);
+        let (_hub, _simulator) = scanner.start(&env, POST_WORLD, &[]);
         let mut zones = env.echo(&["front/zones"]);
         zones.await_lines(10, "a post", |line| line["verdict"] == "stop");
         let first = env.echo(&["front/early"]).await_line("a warning", is_class("early"));

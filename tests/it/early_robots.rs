@@ -3,83 +3,83 @@
 
 use std::process::Command;
 
-use crate::client_c::installed::{Installed, source};
-use crate::early::POST;
+use crate::client_c::installed::{InstalledLibrary, source};
+use crate::early::POST_WORLD;
 use crate::python::check_on;
-use crate::testkit::{INT, Program, TERM, TestEnv, until};
+use crate::testkit::{INT, Program, TERM, TestEnv, wait_until};
 use scanhub_client::{Publication, PublishSession, RobotSubscriber, SensorPublisher};
 use scanhub_schema::limits::TopicLimits;
-use scanhub_schema::{Early, Header, Topic, Verdict, Wake, Zones};
+use scanhub_schema::{Early, Header, Topic, Verdict, WakeEvent, Zones};
 use serde_json::Value;
 
 #[test]
-fn a_hub_warns_a_robot_in_python_only_while_it_wants_that() {
+fn python_robot_subscribes_to_warnings_until_it_ends() {
     let env = TestEnv::new();
     let Some(mut command) = check_on(&env, "robot") else { return };
     command.args(["--early", "front"]);
-    let flags = ["--seed=28", "--baud=500000", &format!("--world={}", env.file("post.toml", POST))];
+    let flags = ["--seed=28", "--baud=500000", &format!("--world={}", env.file("post.toml", POST_WORLD))];
     let (hub, simulator) = (env.hub(&[env.link("front")]), env.simulator(&["front"], &flags));
     let mut robot = Program::start(command);
     robot.await_line("the post", |line| line["verdict"] == "stop");
-    until("it follows warnings", || env.subscribers("front/early") == 1);
+    wait_until("it follows warnings", || env.subscribers("front/early") == 1);
     robot.await_line("the post, after that", |line| line["verdict"] == "stop");
-    assert_eq!(robot.end(INT).code, Some(0));
-    until("nobody follows them", || env.subscribers("front/early") == 0);
-    assert_eq!((hub.end(TERM).code, simulator.end(TERM).code), (Some(0), Some(0)));
+    assert_eq!(robot.end(INT).exit_code, Some(0));
+    wait_until("nobody follows them", || env.subscribers("front/early") == 0);
+    assert_eq!((hub.end(TERM).exit_code, simulator.end(TERM).exit_code), (Some(0), Some(0)));
 }
 
 /// A sensor whose zones and warnings are said here.
-struct Warning {
+struct SimulatedSensor {
     zones: Publication<Zones>,
     early: Publication<Early>,
     sensor: SensorPublisher,
 }
 
-impl Warning {
+impl SimulatedSensor {
     /// One called `robot1.front`, alone in the domain of `env`.
-    fn new(env: &TestEnv) -> Warning {
+    fn new(env: &TestEnv) -> SimulatedSensor {
         let topics = [Topic::Zones, Topic::Early];
         let session =
-            PublishSession::open(&env.place(), &topics, TopicLimits::default()).expect("nobody else");
+            PublishSession::open(&env.domain(), &topics, TopicLimits::default()).expect("nobody else");
         let sensor = session.sensor("robot1.front").expect("a name");
         let (zones, early) = (sensor.topic().expect("room"), sensor.topic().expect("room"));
-        Warning { zones, early, sensor }
+        SimulatedSensor { zones, early, sensor }
     }
 
     /// The header of what is said of scan `seq`, whose zones hold for longer than a test.
-    fn of_scan(&self, seq: u64) -> Header {
+    fn header_of_scan(&self, seq: u64) -> Header {
         Header { seq, period_us: 1_000_000_000, ..self.zones.header() }
     }
 
-    fn zones(&mut self, seq: u64, verdict: Verdict) {
-        let header = self.of_scan(seq);
+    fn publish_zones(&mut self, seq: u64, verdict: Verdict) {
+        let header = self.header_of_scan(seq);
         let zones = Zones { verdict: verdict as u8, ..Zones::unknown() };
         self.zones.send_with(&header, |sample| *sample = zones).expect("there is room");
-        self.sensor.wake(Wake::Telegram).expect("they are woken");
+        self.sensor.wake(WakeEvent::Telegram).expect("they are woken");
     }
 
-    fn warn(&mut self, seq: u64, flags: u8) {
-        let header = self.of_scan(seq);
+    fn publish_warning(&mut self, seq: u64, flags: u8) {
+        let header = self.header_of_scan(seq);
         let stop = Early { verdict: 2, flags, beam: 40, distance_mm: 500, bytes_seen: 240, beams_seen: 116 };
         self.early.send_with(&header, |sample| *sample = stop).expect("there is room");
-        self.sensor.wake(Wake::Early).expect("they are woken");
+        self.sensor.wake(WakeEvent::Early).expect("they are woken");
     }
 }
 
 /// Programs that follow the verdict of `robot1.front`, each with warnings or without.
-fn robots(env: &TestEnv) -> Vec<(bool, Program)> {
+fn start_robots(env: &TestEnv) -> Vec<(bool, Program)> {
     let mut commands = Vec::new();
     for early in [false, true] {
         if let Some(mut command) = check_on(env, "robot") {
             command.args(early.then_some("--early")).arg("robot1.front");
             commands.push((early, command));
         }
-        let Some(installed) = Installed::once() else { continue };
-        for way in ["doorbell", "poll"] {
+        let Some(installed) = InstalledLibrary::installed() else { continue };
+        for wait_method in ["doorbell", "poll"] {
             let mut command = Command::new(installed.compile(env, &source("robot.c"), &[]));
-            command.args([way, "robot1.front"]).args(early.then_some("early"));
-            command.env("SCANHUB_DOMAIN", env.place().name()).env_remove("XDG_RUNTIME_DIR");
-            command.env("RUNTIME_DIRECTORY", env.place().root().parent().expect("it has one"));
+            command.args([wait_method, "robot1.front"]).args(early.then_some("early"));
+            command.env("SCANHUB_DOMAIN", env.domain().name()).env_remove("XDG_RUNTIME_DIR");
+            command.env("RUNTIME_DIRECTORY", env.domain().root().parent().expect("it has one"));
             commands.push((early, command));
         }
     }
@@ -88,85 +88,86 @@ fn robots(env: &TestEnv) -> Vec<(bool, Program)> {
 
 /// What a line says of the robot, in C by its number.
 fn verdict(line: &Value) -> Option<Verdict> {
-    let said = |verdict: &Verdict| line["verdict"] == verdict.name() || line["verdict"] == *verdict as u64;
-    Verdict::ALL.into_iter().find(said)
+    let is_reported =
+        |verdict: &Verdict| line["verdict"] == verdict.name() || line["verdict"] == *verdict as u64;
+    Verdict::ALL.into_iter().find(is_reported)
 }
 
 #[test]
-fn robots_in_all_languages_take_warnings_if_they_are_wanted() {
+fn robots_handle_warnings_only_if_requested() {
     let env = TestEnv::new();
-    let mut sensor = Warning::new(&env);
-    let mut robots = robots(&env);
-    let builder = || RobotSubscriber::builder(&["robot1.front"]).in_domain(&env.place());
+    let mut sensor = SimulatedSensor::new(&env);
+    let mut robots = start_robots(&env);
+    let builder = || RobotSubscriber::builder(&["robot1.front"]).in_domain(&env.domain());
     let mut in_rust = [(false, builder()), (true, builder().early())]
         .map(|(is_early, builder)| (is_early, builder.open().expect("a name")));
     let all = robots.len() as u64 + 2;
-    until("zones are followed by all, and warnings by those who want them", || {
+    wait_until("zones are followed by all, and warnings by those who want them", || {
         for (_, robot) in &mut in_rust {
             robot.now().expect("a domain");
         }
-        let followers = |topic: &str| env.subscribers(&format!("robot1.front/{topic}"));
-        (followers("zones"), followers("early")) == (all, all / 2)
+        let subscribers = |topic: &str| env.subscribers(&format!("robot1.front/{topic}"));
+        (subscribers("zones"), subscribers("early")) == (all, all / 2)
     });
-    let mut hear = |warned: bool, wanted: Verdict| {
+    let mut await_verdict = |warned: bool, expected: Verdict| {
         for (_, robot) in in_rust.iter_mut().filter(|(early, _)| *early || !warned) {
-            until("the verdict in Rust", || robot.now().expect("a domain").verdict() == wanted);
+            wait_until("the verdict in Rust", || robot.now().expect("a domain").verdict() == expected);
         }
         for (_, robot) in robots.iter_mut().filter(|(early, _)| *early || !warned) {
-            let line = robot.await_line(wanted.name(), |line| verdict(line) == Some(wanted));
-            assert_eq!(line["nearest_mm"].as_u64(), (wanted == Verdict::Stop).then_some(500), "{line}");
+            let line = robot.await_line(expected.name(), |line| verdict(line) == Some(expected));
+            assert_eq!(line["nearest_mm"].as_u64(), (expected == Verdict::Stop).then_some(500), "{line}");
         }
     };
-    sensor.zones(7, Verdict::Clear);
-    hear(false, Verdict::Clear);
-    sensor.warn(8, 0);
-    hear(true, Verdict::Stop);
-    sensor.warn(8, Early::WITHDRAWN);
-    hear(true, Verdict::Clear);
-    sensor.warn(8, 0);
-    hear(true, Verdict::Stop);
-    sensor.zones(8, Verdict::Clear);
-    hear(false, Verdict::Clear);
-    sensor.zones(9, Verdict::Slow);
-    hear(false, Verdict::Slow);
+    sensor.publish_zones(7, Verdict::Clear);
+    await_verdict(false, Verdict::Clear);
+    sensor.publish_warning(8, 0);
+    await_verdict(true, Verdict::Stop);
+    sensor.publish_warning(8, Early::WITHDRAWN);
+    await_verdict(true, Verdict::Clear);
+    sensor.publish_warning(8, 0);
+    await_verdict(true, Verdict::Stop);
+    sensor.publish_zones(8, Verdict::Clear);
+    await_verdict(false, Verdict::Clear);
+    sensor.publish_zones(9, Verdict::Slow);
+    await_verdict(false, Verdict::Slow);
     assert_eq!(in_rust[0].1.now().expect("a domain").nearest(), None);
     for (early, robot) in robots {
         let outcome = robot.end(INT);
-        let mut said: Vec<Verdict> = outcome.of_class("robot").iter().filter_map(verdict).collect();
-        said.retain(|verdict| *verdict != Verdict::Unknown);
-        said.dedup();
+        let mut reported: Vec<Verdict> = outcome.of_class("robot").iter().filter_map(verdict).collect();
+        reported.retain(|verdict| *verdict != Verdict::Unknown);
+        reported.dedup();
         let (clear, stop, slow) = (Verdict::Clear, Verdict::Stop, Verdict::Slow);
-        let wanted = if early { vec![clear, stop, clear, stop, clear, slow] } else { vec![clear, slow] };
-        assert_eq!(said, wanted, "{outcome}");
+        let expected = if early { vec![clear, stop, clear, stop, clear, slow] } else { vec![clear, slow] };
+        assert_eq!(reported, expected, "{outcome}");
     }
 }
 
 #[test]
-fn lights_follow_warnings_and_withdrawals_without_any_zones() {
+fn leds_show_warnings_and_withdrawals_if_requested() {
     for follows_early in [false, true] {
         let env = TestEnv::new();
-        let mut sensor = Warning::new(&env);
+        let mut sensor = SimulatedSensor::new(&env);
         let early: &[&str] = if follows_early { &["--early"] } else { &[] };
         let mut leds = env.start(&[&["leds", "robot1.front", "--hold=0s", "--json"], early].concat());
-        let followers = ["robot1.front/zones", "robot1.front/early"];
-        until("it follows", || followers.map(|topic| env.subscribers(topic)) == [1, follows_early.into()]);
-        let mut shows = |is_of_warning: bool, wanted: Verdict| {
+        let topics = ["robot1.front/zones", "robot1.front/early"];
+        wait_until("it follows", || topics.map(|topic| env.subscribers(topic)) == [1, follows_early.into()]);
+        let mut shows = |is_of_warning: bool, expected: Verdict| {
             if follows_early || !is_of_warning {
-                let is_it = |line: &Value| line["class"] == "leds" && verdict(line) == Some(wanted);
-                leds.await_line(wanted.name(), is_it);
+                let is_it = |line: &Value| line["class"] == "leds" && verdict(line) == Some(expected);
+                leds.await_line(expected.name(), is_it);
             }
         };
-        sensor.zones(7, Verdict::Clear);
+        sensor.publish_zones(7, Verdict::Clear);
         shows(false, Verdict::Clear);
-        sensor.warn(8, 0);
+        sensor.publish_warning(8, 0);
         shows(true, Verdict::Stop);
-        sensor.warn(8, Early::WITHDRAWN);
+        sensor.publish_warning(8, Early::WITHDRAWN);
         shows(true, Verdict::Clear);
-        sensor.warn(9, 0);
+        sensor.publish_warning(9, 0);
         shows(true, Verdict::Stop);
-        sensor.zones(9, Verdict::Clear);
+        sensor.publish_zones(9, Verdict::Clear);
         shows(true, Verdict::Clear);
-        sensor.zones(10, Verdict::Slow);
+        sensor.publish_zones(10, Verdict::Slow);
         shows(false, Verdict::Slow);
         let outcome = leds.end(INT);
         let lights = outcome.of_class("leds");
@@ -174,8 +175,8 @@ fn lights_follow_warnings_and_withdrawals_without_any_zones() {
         shown.retain(|verdict| *verdict != Verdict::Unknown);
         shown.dedup();
         let (clear, stop, slow) = (Verdict::Clear, Verdict::Stop, Verdict::Slow);
-        let wanted =
+        let expected =
             if follows_early { vec![clear, stop, clear, stop, clear, slow] } else { vec![clear, slow] };
-        assert_eq!(shown, wanted, "{outcome}");
+        assert_eq!(shown, expected, "{outcome}");
     }
 }

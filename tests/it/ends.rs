@@ -6,7 +6,7 @@ use std::os::unix::fs::symlink;
 use std::process::Stdio;
 
 use crate::testkit;
-use crate::testkit::{INT, KILL, Program, TERM, TestEnv, is_class, is_there, spawn, until};
+use crate::testkit::{INT, KILL, Program, TERM, TestEnv, exists_or_is_symlink, is_class, spawn, wait_until};
 use rustix::pipe::{PipeFlags, pipe_with};
 use serde_json::Value;
 
@@ -23,28 +23,28 @@ fn a_hub_ends_by_both_signals_and_leaves_nothing() {
         let env = TestEnv::new();
         let simulator = env.simulator(&["front"], &["--baud=500000"]);
         let hub = env.hub(&[env.link("front"), env.link("rear")]);
-        let mut consumer = env.echo(&["front/scan"]);
-        consumer.await_lines(3, "a scan", is_class("scan"));
-        assert!(!env.left_behind().is_empty(), "looked at the wrong place");
-        assert_eq!(hub.end(signal).code, Some(0), "{signal:?}");
+        let mut subscriber = env.echo(&["front/scan"]);
+        subscriber.await_lines(3, "a scan", is_class("scan"));
+        assert!(!env.leftover_files().is_empty(), "looked at the wrong place");
+        assert_eq!(hub.end(signal).exit_code, Some(0), "{signal:?}");
         // Once the consumer has gone too.
-        assert_eq!(consumer.end(INT).code, Some(0));
-        until("shared memory is free", || env.left_behind().is_empty());
-        assert_eq!(simulator.end(signal).code, Some(0));
-        assert!(!is_there(&env.path("front")), "the simulator's symlink is left");
+        assert_eq!(subscriber.end(INT).exit_code, Some(0));
+        wait_until("shared memory is free", || env.leftover_files().is_empty());
+        assert_eq!(simulator.end(signal).exit_code, Some(0));
+        assert!(!exists_or_is_symlink(&env.path("front")), "the simulator's symlink is left");
     }
 }
 
 #[test]
-fn interrupted_consumers_say_what_they_received() {
+fn interrupted_echo_reports_its_sample_count() {
     let env = TestEnv::new();
     let _hub = hub(&env);
     for signal in [INT, TERM] {
         for (bounds, code) in [(&[][..], 0), (&["-n", "100000"], 130), (&["--for", "5m"], 130)] {
-            let mut consumer = env.start(&[&["echo", "--json", "front/scan"], bounds].concat());
-            consumer.await_lines(3, "a scan", is_class("scan"));
-            let outcome = consumer.end(signal);
-            assert_eq!(outcome.code, Some(code), "{}", outcome.errors);
+            let mut subscriber = env.start(&[&["echo", "--json", "front/scan"], bounds].concat());
+            subscriber.await_lines(3, "a scan", is_class("scan"));
+            let outcome = subscriber.end(signal);
+            assert_eq!(outcome.exit_code, Some(code), "{}", outcome.stderr);
             let (lines, scans) = (outcome.lines(), outcome.of_class("scan").len() as u64);
             let end: Vec<_> = lines.iter().skip_while(|line| line["class"] != "summary").collect();
             assert_eq!((end[0]["received"].as_u64(), &end[0]["missed"]), (Some(scans), &0.into()));
@@ -54,7 +54,7 @@ fn interrupted_consumers_say_what_they_received() {
     }
     // One that is through is not interrupted.
     let outcome = env.run(&["echo", "--json", "front/scan", "-n", "5"]);
-    assert_eq!((outcome.code, outcome.of_class("scan").len()), (Some(0), 5), "{outcome}");
+    assert_eq!((outcome.exit_code, outcome.of_class("scan").len()), (Some(0), 5), "{outcome}");
 }
 
 #[test]
@@ -105,7 +105,7 @@ fn a_killed_echo_leaves_whole_lines() {
         let mut command = env.command(&["echo", "--json", "front/scan", "front/telegram"]);
         command.stdin(Stdio::null()).stdout(file).stderr(Stdio::null());
         let mut echo = spawn(command).expect("starts");
-        until("some lines", || fs::metadata(&path).is_ok_and(|metadata| metadata.len() > 40_000));
+        wait_until("some lines", || fs::metadata(&path).is_ok_and(|metadata| metadata.len() > 40_000));
         echo.kill().expect("is killed");
         echo.wait().expect("is dead");
         let text = fs::read_to_string(&path).expect("is text");
@@ -122,19 +122,19 @@ fn a_simulator_takes_and_leaves_only_its_own_place() {
     // What a killed simulator left behind is replaced.
     let simulator = env.simulator(&["front"], &[] as &[&str]);
     let old = fs::read_link(&port).expect("a symlink");
-    assert_eq!(simulator.end(KILL).code, None);
+    assert_eq!(simulator.end(KILL).exit_code, None);
     assert_eq!(fs::read_link(&port).ok(), Some(old));
     let simulator = env.simulator(&["front"], &[] as &[&str]);
     assert!(fs::metadata(&port).is_ok(), "leads nowhere");
-    assert_eq!(simulator.end(INT).code, Some(0));
-    assert!(!is_there(&port));
+    assert_eq!(simulator.end(INT).exit_code, Some(0));
+    assert!(!exists_or_is_symlink(&port));
     // Nothing else is.
     symlink(&mine, &port).expect("a symlink");
-    let link = env.word("front");
+    let link = env.path_argument("front");
     for place in [&mine, &link] {
         let outcome = env.run(&["simulate", "--port", place]);
-        assert_eq!(outcome.code, Some(4), "{outcome}");
-        assert!(outcome.errors.contains(place), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(4), "{outcome}");
+        assert!(outcome.stderr.contains(place), "{outcome}");
     }
     assert_eq!(fs::read(&mine).ok(), Some(b"mine".to_vec()));
     assert_eq!(fs::read_link(&port).ok(), Some(mine.into()));

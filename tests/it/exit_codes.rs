@@ -7,13 +7,13 @@ use std::os::unix::net::UnixListener;
 
 use rustix::fs::{CWD, FileType, Mode, mknodat};
 
-use crate::strangers::{STRANGER, beside_a_stranger, scanhub};
+use crate::foreign_user::{OTHER_UID, scanhub, with_another_user};
 use crate::testkit::{Outcome, Program, TestEnv};
 
 /// Command lines with an input file, for which `FILE` stands, and whether that is a recording, which may have any size.
 /// `doctor` is not one of them: it reports such a file as a failed check. Nor is a file that a configuration names, because
 /// its name is a value of the configuration (78).
-const INPUTS: [(&str, bool); 20] = [
+const INPUT_COMMANDS: [(&str, bool); 20] = [
     ("run --no-system-config --config FILE", false),
     ("run --no-system-config --link=a=file:FILE", true),
     ("config check FILE", false),
@@ -37,7 +37,7 @@ const INPUTS: [(&str, bool); 20] = [
 ];
 
 /// Command lines with an output file, for which `FILE` stands.
-const OUTPUTS: [&str; 6] = [
+const OUTPUT_COMMANDS: [&str; 6] = [
     "record --output FILE",
     "convert LOG FILE",
     "simulate --port=PORT --truth FILE",
@@ -46,7 +46,7 @@ const OUTPUTS: [&str; 6] = [
     "background front save FILE",
 ];
 
-const SITE: &str = "[[sensor]]\nname = \"front\"\npose = { x = 0, y = 0, yaw = 0 }\n[[room]]\nname = \"a\\u0007<b>\"\npolygon = \
+const SITE_FILE: &str = "[[sensor]]\nname = \"front\"\npose = { x = 0, y = 0, yaw = 0 }\n[[room]]\nname = \"a\\u0007<b>\"\npolygon = \
                     [[0, 0], [4, 0], [4, 3]]\n";
 
 /// Runs the program with the words of `line`, and with `file` for `FILE`.
@@ -54,10 +54,10 @@ fn run(env: &TestEnv, line: &str, file: &str) -> Outcome {
     let words: Vec<String> = line
         .split(' ')
         .map(|word| {
-            let word = word.replace("FILE", file).replace("LOG", &env.word("walk.log"));
-            word.replace("SITE", &env.word("site.toml")).replace("PORT", &env.word("port"))
+            let word = word.replace("FILE", file).replace("LOG", &env.path_argument("walk.log"));
+            word.replace("SITE", &env.path_argument("site.toml")).replace("PORT", &env.path_argument("port"))
         })
-        .map(|word| word.replace("OUT", &env.word("out")))
+        .map(|word| word.replace("OUT", &env.path_argument("out")))
         .collect();
     env.run(&words.iter().map(String::as_str).collect::<Vec<_>>())
 }
@@ -72,15 +72,15 @@ fn an_input_that_cannot_be_read_is_66() {
     fs::create_dir(&directory).expect("a directory");
     mknodat(CWD, &pipe, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).expect("a pipe");
     let _listener = UnixListener::bind(&socket).expect("a socket");
-    for (line, is_recording) in INPUTS {
-        for file in ["absent", "directory", "pipe", "socket"].map(|name| env.word(name)) {
+    for (line, is_recording) in INPUT_COMMANDS {
+        for file in ["absent", "directory", "pipe", "socket"].map(|name| env.path_argument(name)) {
             let outcome = run(&env, line, &file);
-            assert_eq!(outcome.code, Some(66), "{line} {file}: {outcome}");
-            assert!(outcome.errors.contains(&file), "the message names the file: {line}: {outcome}");
+            assert_eq!(outcome.exit_code, Some(66), "{line} {file}: {outcome}");
+            assert!(outcome.stderr.contains(&file), "the message names the file: {line}: {outcome}");
         }
         let files = if is_recording { vec!["/dev/zero"] } else { vec!["/dev/zero", &long] };
         for file in files {
-            assert_eq!(run(&env, line, file).code, Some(66), "{line} {file}");
+            assert_eq!(run(&env, line, file).exit_code, Some(66), "{line} {file}");
         }
     }
     // `telegram decode` reports bytes without a telegram itself (5).
@@ -88,11 +88,13 @@ fn an_input_that_cannot_be_read_is_66() {
     let mut random = fastrand::Rng::with_seed(43);
     let junk = env.file("junk", std::iter::repeat_with(|| random.u8(..)).take(50_000).collect::<Vec<u8>>());
     let zeros = env.file("zeros", vec![0; 50_000]);
-    for (line, _) in INPUTS.into_iter().filter(|(line, is_recording)| *is_recording && is_checked(line)) {
+    for (line, _) in
+        INPUT_COMMANDS.into_iter().filter(|(line, is_recording)| *is_recording && is_checked(line))
+    {
         for file in [&junk, &zeros] {
             let outcome = run(&env, line, file);
-            assert_eq!(outcome.code, Some(66), "{line} {file}: {outcome}");
-            assert!(outcome.errors.contains(file), "the message names the file: {line}: {outcome}");
+            assert_eq!(outcome.exit_code, Some(66), "{line} {file}: {outcome}");
+            assert!(outcome.stderr.contains(file), "the message names the file: {line}: {outcome}");
         }
     }
     assert!(!env.path("out.csv").exists() && !env.path("out.mcap").exists());
@@ -100,15 +102,15 @@ fn an_input_that_cannot_be_read_is_66() {
 
 #[test]
 fn an_input_that_this_user_may_not_read_is_66() {
-    beside_a_stranger("exit_codes::an_input_that_this_user_may_not_read_is_66", || {
+    with_another_user("exit_codes::an_input_that_this_user_may_not_read_is_66", || {
         fs::write("/tmp/secret", "text").expect("a file");
         fs::set_permissions("/tmp/secret", Permissions::from_mode(0o600)).expect("it is ours");
-        for (line, _) in INPUTS {
+        for (line, _) in INPUT_COMMANDS {
             let line =
                 line.replace("FILE", "/tmp/secret").replace("PORT", "/tmp/port").replace("OUT", "/tmp/out");
-            let outcome = Program::start(scanhub(STRANGER, &line.split(' ').collect::<Vec<_>>())).wait();
-            assert_eq!(outcome.code, Some(66), "{line}: {outcome}");
-            assert!(outcome.errors.contains("Permission denied"), "{line}: {outcome}");
+            let outcome = Program::start(scanhub(OTHER_UID, &line.split(' ').collect::<Vec<_>>())).wait();
+            assert_eq!(outcome.exit_code, Some(66), "{line}: {outcome}");
+            assert!(outcome.stderr.contains("Permission denied"), "{line}: {outcome}");
         }
     });
 }
@@ -127,12 +129,12 @@ fn a_wrong_value_in_a_file_that_could_be_read_is_78() {
         "web --listen=127.0.0.1:0 --token-file FILE",
     ] {
         let outcome = run(&env, line, &file);
-        assert_eq!(outcome.code, Some(78), "{line}: {outcome}");
-        assert!(outcome.errors.contains("wrong.toml"), "{line}: {outcome}");
+        assert_eq!(outcome.exit_code, Some(78), "{line}: {outcome}");
+        assert!(outcome.stderr.contains("wrong.toml"), "{line}: {outcome}");
     }
     fs::set_permissions(&file, Permissions::from_mode(0o600)).expect("it is ours");
     for line in ["gateway --no-system-config --interface=lo --key-file FILE", "listen --key-file FILE"] {
-        assert_eq!(run(&env, line, &file).code, Some(78), "{line}");
+        assert_eq!(run(&env, line, &file).exit_code, Some(78), "{line}");
     }
 }
 
@@ -141,7 +143,7 @@ fn an_output_that_cannot_be_created_is_73() {
     let env = TestEnv::new();
     let scan = format!("FLASER 181{} 0 0 0 0 0 0 1.5 host 1.5\n", " 1.5".repeat(181));
     env.file("walk.log", scan);
-    env.file("site.toml", SITE);
+    env.file("site.toml", SITE_FILE);
     let [directory, pipe, link, dangling] =
         ["directory.mcap", "pipe.mcap", "link.mcap", "dangling.mcap"].map(|name| env.path(name));
     let file = env.file("old.mcap", "old");
@@ -149,29 +151,29 @@ fn an_output_that_cannot_be_created_is_73() {
     mknodat(CWD, &pipe, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).expect("a pipe");
     symlink(&file, &link).expect("a link");
     symlink("absent", &dangling).expect("a link");
-    for line in OUTPUTS {
-        let refused = |file: &str, says: &str| {
+    for line in OUTPUT_COMMANDS {
+        let refused = |file: &str, message: &str| {
             for line in [line.to_owned(), format!("{line} --force")] {
                 if line.starts_with("key") && line.ends_with("--force") {
                     continue;
                 }
                 let outcome = run(&env, &line, file);
-                assert_eq!(outcome.code, Some(73), "{line} {file}: {outcome}");
-                assert!(outcome.errors.contains(says), "{line} {file}: {outcome}");
+                assert_eq!(outcome.exit_code, Some(73), "{line} {file}: {outcome}");
+                assert!(outcome.stderr.contains(message), "{line} {file}: {outcome}");
             }
         };
-        refused(&env.word("directory.mcap"), "it is a directory");
-        refused(&env.word("pipe.mcap"), "it is a pipe");
-        refused(&env.word("link.mcap"), &format!("it is a link to {file}"));
-        refused(&env.word("dangling.mcap"), "it is a link to absent");
-        refused(&env.word("nowhere/new.mcap"), "No such file or directory");
+        refused(&env.path_argument("directory.mcap"), "it is a directory");
+        refused(&env.path_argument("pipe.mcap"), "it is a pipe");
+        refused(&env.path_argument("link.mcap"), &format!("it is a link to {file}"));
+        refused(&env.path_argument("dangling.mcap"), "it is a link to absent");
+        refused(&env.path_argument("nowhere/new.mcap"), "No such file or directory");
         // `convert` knows no such format.
         if !line.starts_with("convert") {
             refused("/dev/null", "it is a device");
         }
         let outcome = run(&env, line, &file);
-        assert_eq!(outcome.code, Some(73), "{line}: {outcome}");
-        assert!(outcome.errors.contains("old.mcap exists"), "{line}: {outcome}");
+        assert_eq!(outcome.exit_code, Some(73), "{line}: {outcome}");
+        assert!(outcome.stderr.contains("old.mcap exists"), "{line}: {outcome}");
     }
     assert_eq!(fs::read_to_string(&file).expect("it is there"), "old");
     assert!(!env.path("absent").exists() && !env.path("nowhere").exists());
@@ -180,40 +182,47 @@ fn an_output_that_cannot_be_created_is_73() {
 #[test]
 fn an_existing_output_is_replaced_by_force() {
     let env = TestEnv::new();
-    env.file("site.toml", SITE);
+    env.file("site.toml", SITE_FILE);
     let file = env.file("old.svg", "old");
-    assert_eq!(run(&env, "site check SITE --svg FILE --force", &file).code, Some(0));
+    assert_eq!(run(&env, "site check SITE --svg FILE --force", &file).exit_code, Some(0));
     let drawing = fs::read_to_string(&file).expect("a drawing");
     assert!(drawing.contains(">a?&lt;b&gt;<"), "{drawing}");
     let truth = env.file("truth", "old");
-    let simulator =
-        env.start(&["simulate", "--json", "--port", &env.word("port"), "--truth", &truth, "--force"]);
+    let simulator = env.start(&[
+        "simulate",
+        "--json",
+        "--port",
+        &env.path_argument("port"),
+        "--truth",
+        &truth,
+        "--force",
+    ]);
     drop(simulator.ready());
     assert!(!fs::read_to_string(&truth).expect("a file").starts_with("old"));
     // `man` checks each page.
-    let pages = env.word("man");
+    let pages = env.path_argument("man");
     fs::create_dir(&pages).expect("a directory");
     let page = env.path("man/scanhub-run.1");
     symlink(&file, &page).expect("a link");
     let outcome = env.run(&["man", &pages]);
-    assert_eq!(outcome.code, Some(73), "{outcome}");
-    assert!(outcome.errors.contains("scanhub-run.1: it is a link to"), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(73), "{outcome}");
+    assert!(outcome.stderr.contains("scanhub-run.1: it is a link to"), "{outcome}");
     fs::remove_file(&page).expect("it is ours");
     for _ in 0..2 {
-        assert_eq!(env.run(&["man", &pages]).code, Some(0));
+        assert_eq!(env.run(&["man", &pages]).exit_code, Some(0));
     }
     assert!(fs::read_to_string(&page).expect("a page").contains("scanhub-run"));
     assert_eq!(fs::read_to_string(&file).expect("a drawing"), drawing);
 }
 
 #[test]
-fn a_token_comes_from_a_file_that_only_this_user_can_read() {
+fn token_file_must_be_readable_only_by_its_user() {
     let env = TestEnv::new();
     let file = env.file("token", "carrot\n");
     let web = |env: &TestEnv| env.command(&["web", "--json", "--listen=127.0.0.1:0", "--token-file", &file]);
     fs::set_permissions(&file, Permissions::from_mode(0o640)).expect("it is ours");
     let refused = Program::start(web(&env)).wait();
-    assert_eq!(refused.code, Some(78), "{refused}");
+    assert_eq!(refused.exit_code, Some(78), "{refused}");
     assert!(refused.to_string().contains("mode 0640"), "{refused}");
     fs::set_permissions(&file, Permissions::from_mode(0o600)).expect("it is ours");
     let mut command = web(&env);

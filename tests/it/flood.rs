@@ -6,7 +6,7 @@ use std::net::TcpListener;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use crate::testkit::{INT, Line, Program, TERM, TestEnv, bytes_of, is_class, number, scan, until};
+use crate::testkit::{INT, Program, TERM, TestEnv, TestLine, bytes_of, is_class, number, scan, wait_until};
 use fastrand::Rng;
 
 /// Garbage that a framer has to work for: noise, start bytes, and heads of telegrams that never end.
@@ -36,10 +36,10 @@ fn resident_kb(pid: u32) -> u64 {
 
 /// Waits for all that was `sent`, in order and bit for bit. Of random frames one in 65,536 has a right checksum by
 /// chance: what else comes must be marked, and is counted.
-fn receive(consumer: &mut Program, sent: &[Vec<u8>]) -> u64 {
+fn receive(subscriber: &mut Program, sent: &[Vec<u8>]) -> u64 {
     let mut wrong = 0;
     for sent in sent {
-        while let line = consumer.await_line("a telegram in garbage", is_class("telegram"))
+        while let line = subscriber.await_line("a telegram in garbage", is_class("telegram"))
             && bytes_of(&line) != *sent
         {
             assert_eq!(line["quality"], "suspect", "{line}");
@@ -52,10 +52,10 @@ fn receive(consumer: &mut Program, sent: &[Vec<u8>]) -> u64 {
 #[test]
 fn telegrams_in_a_flood_of_garbage() {
     let env = TestEnv::new();
-    let line = Line::at(&env.path("front"));
+    let line = TestLine::create(&env.path("front"));
     let hub = env.hub(&[env.lms_link("front")]);
-    let mut consumer = env.echo(&["front/telegram"]);
-    line.await_open();
+    let mut subscriber = env.echo(&["front/telegram"]);
+    line.wait_until_open();
     let mut random = Rng::with_seed(4);
     let mut sent = Vec::new();
     let mut flood = |sent: &mut Vec<Vec<u8>>, telegrams: usize| {
@@ -69,25 +69,25 @@ fn telegrams_in_a_flood_of_garbage() {
     // first flood, after which everything that the hub ever touches was touched.
     let steady = scan(0);
     line.send(&[&steady[..], &steady].concat());
-    consumer.await_lines(2, "the stream", is_class("telegram"));
+    subscriber.await_lines(2, "the stream", is_class("telegram"));
     flood(&mut sent, 10);
-    let mut wrong = receive(&mut consumer, &sent);
+    let mut wrong = receive(&mut subscriber, &sent);
     let before_kb = resident_kb(hub.pid());
-    let begun = sent.len();
+    let started = sent.len();
     flood(&mut sent, 50);
-    wrong += receive(&mut consumer, &sent[begun..]);
+    wrong += receive(&mut subscriber, &sent[started..]);
     let grown_kb = resident_kb(hub.pid()).saturating_sub(before_kb);
     eprintln!("resident memory: {before_kb} kB, {grown_kb} kB more after {} more bytes", 50 * 200_000);
     assert!(grown_kb <= 64, "the hub grew by {grown_kb} kB");
     let all = 2 + wrong + sent.len() as u64;
     let info = env.await_info("front", |info| number(&info["counters"], "telegrams") >= all);
     assert_eq!(number(&info["counters"], "telegrams"), all, "{info}");
-    consumer.end(INT);
-    assert_eq!(hub.end(TERM).code, Some(0));
+    subscriber.end(INT);
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
 }
 
 /// Processor time that a process has taken.
-fn worked(pid: u32) -> Duration {
+fn cpu_time(pid: u32) -> Duration {
     let tasks = std::fs::read_dir(format!("/proc/{pid}/task")).expect("the hub lives").flatten();
     let of_task = |task: std::fs::DirEntry| {
         let text = std::fs::read_to_string(task.path().join("schedstat")).ok()?;
@@ -102,7 +102,7 @@ fn a_serial_server_that_sends_garbage_at_full_speed() {
     let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");
     let link = format!("--link=front=tcp:{},family=lms", listener.local_addr().expect("it has an address"));
     let hub = env.hub(&[link]);
-    let mut consumer = env.echo(&["front/telegram"]);
+    let mut subscriber = env.echo(&["front/telegram"]);
     let (mut server, _) = listener.accept().expect("the hub comes");
     // More than is allowed at once, with telegrams in it; then garbage without an end.
     let mut random = Rng::with_seed(5);
@@ -118,25 +118,25 @@ fn a_serial_server_that_sends_garbage_at_full_speed() {
         server.write_all(&flood).expect("the hub reads");
         while server.write_all(&endless).is_ok() {}
     });
-    consumer.await_lines(2, "the stream", is_class("telegram"));
-    receive(&mut consumer, &sent);
-    consumer.end(INT);
+    subscriber.await_lines(2, "the stream", is_class("telegram"));
+    receive(&mut subscriber, &sent);
+    subscriber.end(INT);
     let says = "the server sends more than a line of 500000 baud carries";
     env.await_info("front", |info| info["last_error"].as_str().is_some_and(|error| error.starts_with(says)));
     let bytes = || number(&env.info("front")["counters"], "bytes_read");
     // The counters are as old as the last status: a second.
-    let (before, since, idle) = (bytes(), Instant::now(), worked(hub.pid()));
-    until("a part of it is read", || bytes() > before + 300_000);
-    let worked = worked(hub.pid()).saturating_sub(idle);
-    let (read, took) = (bytes() - before, since.elapsed());
-    let most = 100_000.0 * (took.as_secs_f64() + 2.0);
-    let share = worked.as_secs_f64() / took.as_secs_f64();
-    eprintln!("{read} bytes in {took:?}, {:.1} % of a processor", 100.0 * share);
-    assert!(read as f64 <= most, "{read} bytes in {took:?}");
+    let (before, since, idle) = (bytes(), Instant::now(), cpu_time(hub.pid()));
+    wait_until("a part of it is read", || bytes() > before + 300_000);
+    let worked = cpu_time(hub.pid()).saturating_sub(idle);
+    let (read, elapsed) = (bytes() - before, since.elapsed());
+    let maximum = 100_000.0 * (elapsed.as_secs_f64() + 2.0);
+    let share = worked.as_secs_f64() / elapsed.as_secs_f64();
+    eprintln!("{read} bytes in {elapsed:?}, {:.1} % of a processor", 100.0 * share);
+    assert!(read as f64 <= maximum, "{read} bytes in {elapsed:?}");
     assert!(share < 0.5, "{:.1} % of a processor, in a program that is not optimized", 100.0 * share);
     let outcome = hub.end(TERM);
-    assert_eq!(outcome.code, Some(0), "{outcome}");
-    let said = outcome.errors.lines().filter(|line| line.contains(says)).count();
-    assert!((1..=2).contains(&said), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
+    let message_count = outcome.stderr.lines().filter(|line| line.contains(says)).count();
+    assert!((1..=2).contains(&message_count), "{outcome}");
     writer.join().expect("it ends with the hub");
 }

@@ -31,7 +31,7 @@ fn input(line: &str) -> Vec<u8> {
 }
 
 /// Returns one input of `corpus` with a few bytes changed, inserted, cut off or copied from another input.
-fn mutated(random: &mut Rng, corpus: &[Vec<u8>]) -> Vec<u8> {
+fn mutate(random: &mut Rng, corpus: &[Vec<u8>]) -> Vec<u8> {
     let mut input = corpus[random.usize(..corpus.len())].clone();
     for _ in 0..random.usize(1..8) {
         let at = random.usize(..=input.len());
@@ -48,7 +48,7 @@ fn mutated(random: &mut Rng, corpus: &[Vec<u8>]) -> Vec<u8> {
             _ => input.insert(at, random.u8(..)),
         }
     }
-    input.truncate(MAX_LENGTH);
+    input.truncate(MAX_INPUT_LEN);
     input
 }
 
@@ -57,12 +57,12 @@ fn run(name: &str) {
     let corpus = corpus(name);
     corpus.iter().for_each(|input| target(input));
     let mut random = Rng::with_seed(1);
-    for number in 0..ROUNDS {
+    for number in 0..MUTATION_ROUNDS {
         let input = if number % 4 == 0 {
             let len = random.usize(..400);
             (0..len).map(|_| random.u8(..)).collect()
         } else {
-            mutated(&mut random, &corpus)
+            mutate(&mut random, &corpus)
         };
         if let Err(panic) = std::panic::catch_unwind(|| target(&input)) {
             eprintln!("{name}, input {number}: {input:02x?}");
@@ -112,6 +112,6 @@ fn recording() {
 }
 
 /// Number of inputs for each target in addition to those of the corpus.
-const ROUNDS: u32 = 4_000;
+const MUTATION_ROUNDS: u32 = 4_000;
 /// Maximum length of a mutated input, in bytes.
-const MAX_LENGTH: usize = 4_096;
+const MAX_INPUT_LEN: usize = 4_096;

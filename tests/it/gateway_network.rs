@@ -5,21 +5,21 @@ use std::net::Ipv4Addr;
 use std::process::{Command, Stdio};
 
 use crate::testkit::{
-    Outcome, Program, Receiver, TERM, TestEnv, USR1, in_a_network, ip, is_class, number, read, skip, spawn,
-    succeeds, until,
+    Outcome, Program, Receiver, TERM, TestEnv, USR1, decode_datagram, in_a_network, ip, is_class, number,
+    skip, spawn, succeeds, wait_until,
 };
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::pipe::fcntl_setpipe_size;
-use scanhub_network::lan::{GatewayTable, Row};
+use scanhub_network::lan::{GatewayTable, StreamCounters};
 use scanhub_schema::datagram::{Announce, Datagram};
 use scanhub_schema::{Background, Topic};
 use serde_json::Value;
 
-const STREAM: [&str; 2] = ["--seed=62", "--baud=500000"];
-const OURS: Ipv4Addr = Ipv4Addr::new(10, 76, 0, 1);
+const STREAM_FLAGS: [&str; 2] = ["--seed=62", "--baud=500000"];
+const OWN_ADDRESS: Ipv4Addr = Ipv4Addr::new(10, 76, 0, 1);
 
 /// An interface with another one at the end of its cable.
-fn plug() {
+fn create_interface() {
     ip("link add ours type veth peer name theirs");
     ip("addr add 10.76.0.1/24 dev ours");
     ip("link set ours up");
@@ -33,19 +33,19 @@ fn await_state(gateway: &mut Program, state: &str) -> Value {
 
 /// Waits until the account of the scans says more of `key` than now.
 fn await_growth(gateway: &mut Program, key: &str) {
-    let mut asked = || {
+    let mut current = || {
         gateway.signal(USR1);
         number(&gateway.await_line("the account", |it| it["class"] == "lan" && it["topic"] == "scan"), key)
     };
-    let now = asked();
-    until(key, || asked() > now + 3);
+    let now = current();
+    wait_until(key, || current() > now + 3);
 }
 
 /// The first number that the account of `row` can begin with: that of its first datagram, or that which an earlier
 /// announcement says is next.
-fn first(heard: &[Vec<u8>], row: &Row) -> u64 {
-    let found = heard.iter().find_map(|bytes| {
-        let Datagram { head, payload, .. } = read(bytes);
+fn first_sequence(received: &[Vec<u8>], row: &StreamCounters) -> u64 {
+    let found = received.iter().find_map(|bytes| {
+        let Datagram { head, payload, .. } = decode_datagram(bytes);
         if head.sensor != row.sensor {
             return None;
         }
@@ -60,16 +60,16 @@ fn first(heard: &[Vec<u8>], row: &Row) -> u64 {
 }
 
 /// All numbers from the first one heard on were used once: what was not sent has failed.
-fn is_gap_free(heard: &[Vec<u8>], outcome: &Outcome) {
-    assert_eq!(outcome.code, Some(0), "{outcome}");
-    let mut ours = Box::new(GatewayTable::new(&Topic::ALL));
-    heard.iter().for_each(|bytes| assert!(ours.receive(bytes, 1, 0).is_ok()));
+fn check_gap_free(received: &[Vec<u8>], outcome: &Outcome) {
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
+    let mut table = Box::new(GatewayTable::new(&Topic::ALL));
+    received.iter().for_each(|bytes| assert!(table.receive(bytes, 1, 0).is_ok()));
     let lines = outcome.of_class("lan");
-    for row in ours.rows() {
+    for row in table.rows() {
         let topic = Topic::of_number(row.topic).map_or("announce", Topic::name);
         let line = lines.iter().rfind(|line| line["topic"] == topic).expect("its account");
         let numbered = number(line, "sent") + number(line, "send_failed");
-        assert_eq!(first(heard, row) + row.received + row.lost(), numbered, "{line}");
+        assert_eq!(first_sequence(received, row) + row.received + row.lost(), numbered, "{line}");
     }
 }
 
@@ -77,12 +77,12 @@ fn is_gap_free(heard: &[Vec<u8>], outcome: &Outcome) {
 fn a_link_that_goes_and_comes() {
     in_a_network("gateway_network::a_link_that_goes_and_comes", || {
         let env = TestEnv::new();
-        plug();
-        let _simulator = env.simulator(&["front"], &STREAM);
+        create_interface();
+        let _simulator = env.simulator(&["front"], &STREAM_FLAGS);
         let _hub = env.hub(&[env.link("front")]);
         let mut gateway = env.gateway(&["--interface=ours", "--to=10.76.0.9:22200"]);
-        let receiver = Receiver::new(OURS);
-        receiver.await_more(10, |datagram| datagram.head.topic == Topic::Scan.number());
+        let receiver = Receiver::new(OWN_ADDRESS);
+        receiver.wait_for_datagrams(10, |datagram| datagram.head.topic == Topic::Scan.number());
         await_growth(&mut gateway, "sent");
         // The cable is out, then it is switched off, then it is another one of that name.
         for (away, back) in [
@@ -98,32 +98,32 @@ fn a_link_that_goes_and_comes() {
             await_state(&mut gateway, "up");
             await_growth(&mut gateway, "sent");
         }
-        let mut heard = receiver.finish();
+        let mut received = receiver.finish();
         ip("link del ours");
         await_state(&mut gateway, "down");
         await_growth(&mut gateway, "send_failed");
-        plug();
+        create_interface();
         await_state(&mut gateway, "up");
         await_growth(&mut gateway, "sent");
         // There the groups have to be joined anew.
-        let again = Receiver::new(OURS);
-        again.await_more(10, |datagram| datagram.head.topic == Topic::Scan.number());
+        let again = Receiver::new(OWN_ADDRESS);
+        again.wait_for_datagrams(10, |datagram| datagram.head.topic == Topic::Scan.number());
         let outcome = gateway.end(TERM);
-        heard.extend(again.finish());
-        is_gap_free(&heard, &outcome);
+        received.extend(again.finish());
+        check_gap_free(&received, &outcome);
     });
 }
 
 #[test]
-fn what_a_full_queue_drops_is_counted() {
-    in_a_network("gateway_network::what_a_full_queue_drops_is_counted", || {
+fn datagrams_dropped_by_a_full_queue_are_counted() {
+    in_a_network("gateway_network::datagrams_dropped_by_a_full_queue_are_counted", || {
         let env = TestEnv::new();
-        plug();
-        let _simulator = env.simulator(&["front"], &STREAM);
+        create_interface();
+        let _simulator = env.simulator(&["front"], &STREAM_FLAGS);
         let _hub = env.hub(&[env.link("front")]);
         let mut gateway = env.gateway(&["--interface=ours"]);
-        let receiver = Receiver::new(OURS);
-        receiver.await_more(10, |datagram| datagram.head.topic == Topic::Scan.number());
+        let receiver = Receiver::new(OWN_ADDRESS);
+        receiver.wait_for_datagrams(10, |datagram| datagram.head.topic == Topic::Scan.number());
         let limit = "qdisc add dev ours root tbf rate 64kbit burst 2000 limit 4000";
         if !succeeds(Command::new("tc").args(limit.split(' '))) {
             skip("tc", "there is no queue that can be limited here");
@@ -136,7 +136,7 @@ fn what_a_full_queue_drops_is_counted() {
         await_state(&mut gateway, "recovered");
         await_growth(&mut gateway, "sent");
         let outcome = gateway.end(TERM);
-        is_gap_free(&receiver.finish(), &outcome);
+        check_gap_free(&receiver.finish(), &outcome);
     });
 }
 
@@ -145,7 +145,7 @@ fn a_reader_that_does_not_read_delays_nothing() {
     in_a_network("gateway_network::a_reader_that_does_not_read_delays_nothing", || {
         let env = TestEnv::new();
         let receiver = Receiver::new(Ipv4Addr::LOCALHOST);
-        let _simulator = env.simulator(&["front"], &STREAM);
+        let _simulator = env.simulator(&["front"], &STREAM_FLAGS);
         let _hub = env.hub(&[env.link("front")]);
         // The pipe stays open, and is soon full.
         let (_reader, writer) = std::io::pipe().expect("a pipe");
@@ -156,21 +156,21 @@ fn a_reader_that_does_not_read_delays_nothing() {
         let signal = |signal| gateway.signal(signal).expect("it lives");
         let is_scan =
             |datagram: &scanhub_schema::datagram::Datagram<'_>| datagram.head.topic == Topic::Scan.number();
-        receiver.await_more(3, is_scan);
+        receiver.wait_for_datagrams(3, is_scan);
         let now = Timespec { tv_sec: 0, tv_nsec: 0 };
-        until("a full pipe", || {
+        wait_until("a full pipe", || {
             signal(USR1);
             poll(&mut [PollFd::new(&writer, PollFlags::OUT)], Some(&now)) == Ok(0)
         });
         // Some seconds of accounts that nobody can be told.
         let is_announce =
             |datagram: &scanhub_schema::datagram::Datagram<'_>| datagram.head.topic == Announce::NUMBER;
-        receiver.await_more(3, is_announce);
+        receiver.wait_for_datagrams(3, is_announce);
         signal(USR1);
-        receiver.await_more(30, is_scan);
+        receiver.wait_for_datagrams(30, is_scan);
         signal(TERM);
         let mut status = None;
-        until("its end", || {
+        wait_until("its end", || {
             status = gateway.try_wait().expect("a child");
             status.is_some()
         });
@@ -179,59 +179,59 @@ fn a_reader_that_does_not_read_delays_nothing() {
 }
 
 #[test]
-fn the_account_is_told_when_asked_for() {
-    in_a_network("gateway_network::the_account_is_told_when_asked_for", || {
+fn prints_statistics_on_sigusr1() {
+    in_a_network("gateway_network::prints_statistics_on_sigusr1", || {
         let env = TestEnv::new();
         let receiver = Receiver::new(Ipv4Addr::LOCALHOST);
-        let _simulator = env.simulator(&["front"], &STREAM);
+        let _simulator = env.simulator(&["front"], &STREAM_FLAGS);
         let _hub = env.hub(&[env.link("front")]);
         let flags = ["--interface=lo", "--topic=front/background", "--background-every=1s"];
         let words = [&["gateway", "--no-system-config"], &flags[..]].concat();
         let mut gateway = env.start(&words);
-        gateway.await_text("gateway ");
+        gateway.wait_for_text("gateway ");
         let is_background = |datagram: &scanhub_schema::datagram::Datagram<'_>| {
             datagram.head.topic == Topic::Background.number()
         };
-        receiver.await_more(3, is_background);
+        receiver.wait_for_datagrams(3, is_background);
         gateway.signal(USR1);
-        gateway.await_text("front/background: ");
-        gateway.await_text("to lo: ");
+        gateway.wait_for_text("front/background: ");
+        gateway.wait_for_text("to lo: ");
         // A new one goes out at once, between the repetitions.
         let generation = |bytes: &[u8]| {
-            let datagram = read(bytes);
+            let datagram = decode_datagram(bytes);
             let is_one = is_background(&datagram);
             let model = is_one.then(|| Background::read(datagram.payload).expect("a model"))?;
             Some(model.generation)
         };
-        assert_eq!(env.run(&["background", "front", "reset"]).code, Some(0));
-        until("another generation", || {
-            let mut all: Vec<_> = receiver.heard().iter().filter_map(|bytes| generation(bytes)).collect();
+        assert_eq!(env.run(&["background", "front", "reset"]).exit_code, Some(0));
+        wait_until("another generation", || {
+            let mut all: Vec<_> = receiver.datagrams().iter().filter_map(|bytes| generation(bytes)).collect();
             all.dedup();
             all.len() > 1
         });
         let outcome = gateway.end(TERM);
-        assert_eq!(outcome.code, Some(0), "{outcome}");
-        let text = String::from_utf8_lossy(&outcome.out);
+        assert_eq!(outcome.exit_code, Some(0), "{outcome}");
+        let text = String::from_utf8_lossy(&outcome.stdout);
         assert_eq!(text.lines().filter(|line| line.starts_with("to lo: ")).count(), 2, "{text}");
         for bytes in receiver.finish() {
-            let topic = read(&bytes).head.topic;
+            let topic = decode_datagram(&bytes).head.topic;
             assert!([Announce::NUMBER, Topic::Background.number()].contains(&topic), "{topic}");
         }
     });
 }
 
 #[test]
-fn what_cannot_be_is_refused() {
-    in_a_network("gateway_network::what_cannot_be_is_refused", || {
+fn rejects_impossible_settings_with_a_hint() {
+    in_a_network("gateway_network::rejects_impossible_settings_with_a_hint", || {
         let env = TestEnv::new();
         let _hub = env.hub(&[env.link("front")]);
         let config = |text: &str| format!("--config={}", env.file("gateway.toml", text));
-        let refused = |flags: &[&str], code: i32, said: &str, hint: &str| {
-            let outcome = env.gateway_at(flags).wait();
+        let refused = |flags: &[&str], code: i32, message_part: &str, hint: &str| {
+            let outcome = env.start_gateway(flags).wait();
             let error = outcome.of_class("error").pop().unwrap_or_else(|| panic!("{flags:?}: {outcome}"));
-            assert_eq!(outcome.code, Some(code), "{flags:?}: {outcome}");
+            assert_eq!(outcome.exit_code, Some(code), "{flags:?}: {outcome}");
             let (message, found) = (error["message"].to_string(), error["hint"].to_string());
-            assert!(message.contains(said) && found.contains(hint), "{flags:?}: {error}");
+            assert!(message.contains(message_part) && found.contains(hint), "{flags:?}: {error}");
         };
         refused(&[], 78, "no interface is named", "lo (127.0.0.1, this machine only)");
         refused(&["--interface=eth7"], 78, "eth7", "lo");
@@ -253,7 +253,7 @@ fn what_cannot_be_is_refused() {
         refused(&[&config("[gateway]\nintreface = \"lo\"\n")], 78, "intreface", "interface");
         refused(&[&config("[gateway]\nbackground_every = \"ten\"\n")], 78, "gateway.toml:2:20", "");
         refused(&[&config("[gateway]\ninterface = \"eth8\"\n")], 78, "eth8", "lo");
-        plug();
+        create_interface();
         refused(&[], 78, "no interface is named", "ours (10.76.0.1)");
         refused(&[&config("[gateway]\ntopics = [\"front/scan\"]\n")], 78, "no interface", "--to");
         let unwritable = {
@@ -261,15 +261,15 @@ fn what_cannot_be_is_refused() {
             command.env("XDG_STATE_HOME", "/dev/null").env_remove("STATE_DIRECTORY");
             Program::start(command).wait()
         };
-        assert_eq!(unwritable.code, Some(73), "{unwritable}");
+        assert_eq!(unwritable.exit_code, Some(73), "{unwritable}");
         // What the configuration says counts, and a flag wins over it.
-        let said = config("[gateway]\ninterface = \"eth8\"\ntopics = [\"front/status\"]\nmtu = 1400\n");
-        let mut gateway = env.gateway_at(&["--interface=lo", &said]);
+        let configured = config("[gateway]\ninterface = \"eth8\"\ntopics = [\"front/status\"]\nmtu = 1400\n");
+        let mut gateway = env.start_gateway(&["--interface=lo", &configured]);
         let begin = gateway.await_line("its begin", is_class("gateway"));
         assert_eq!((&begin["interface"], number(&begin, "longest")), (&"lo".into(), 1400));
         let line =
             gateway.await_line("a status", |line| line["class"] == "lan" && line["topic"] != "announce");
         assert_eq!(line["topic"], "status");
-        assert_eq!(gateway.end(TERM).code, Some(0));
+        assert_eq!(gateway.end(TERM).exit_code, Some(0));
     });
 }

@@ -3,18 +3,20 @@
 use std::net::UdpSocket;
 use std::os::unix::fs::PermissionsExt;
 
-use crate::testkit::{Outcome, Program, Sender, TERM, TestEnv, USR1, in_a_network, is_class, number, read};
+use crate::testkit::{
+    Outcome, Program, TERM, TestEnv, TestGateway, USR1, decode_datagram, in_a_network, is_class, number,
+};
 use scanhub_schema::datagram::{Announce, LanFlags, group};
 use scanhub_schema::{Topic, Verdict, Zones};
 use serde_json::Value;
 
-const STREAM: [&str; 2] = ["--seed=61", "--baud=500000"];
+const STREAM_FLAGS: [&str; 2] = ["--seed=61", "--baud=500000"];
 
 /// A new key.
 fn key(env: &TestEnv, name: &str) -> String {
-    let made = env.run(&["key", "new", &env.word(name), "--json"]);
-    assert_eq!(made.code, Some(0), "{made}");
-    format!("--key-file={}", env.word(name))
+    let made = env.run(&["key", "new", &env.path_argument(name), "--json"]);
+    assert_eq!(made.exit_code, Some(0), "{made}");
+    format!("--key-file={}", env.path_argument(name))
 }
 
 fn listener(env: &TestEnv, key: &str) -> Program {
@@ -22,12 +24,12 @@ fn listener(env: &TestEnv, key: &str) -> Program {
 }
 
 /// Datagrams that were refused for this reason.
-fn refused(outcome: &Outcome, why: &str) -> u64 {
-    number(outcome.of_class("lan_refused").last().expect("the account"), why)
+fn refusal_count(outcome: &Outcome, reason: &str) -> u64 {
+    number(outcome.of_class("lan_refused").last().expect("the account"), reason)
 }
 
 /// The line of this class of the account that it gives when asked.
-fn asked(program: &mut Program, class: &str) -> Value {
+fn request_statistics(program: &mut Program, class: &str) -> Value {
     program.signal(USR1);
     program.await_line(class, is_class(class))
 }
@@ -39,79 +41,85 @@ fn drain(socket: &UdpSocket) -> Vec<Vec<u8>> {
 }
 
 #[test]
-fn who_has_the_key_believes_its_gateway_alone() {
-    in_a_network("keyed::who_has_the_key_believes_its_gateway_alone", || {
+fn listener_with_key_accepts_only_its_gateway() {
+    in_a_network("keyed::listener_with_key_accepts_only_its_gateway", || {
         let env = TestEnv::new();
         let (ours, other) = (key(&env, "ours"), key(&env, "other"));
         let copy = UdpSocket::bind("127.0.0.1:22299").expect("a port");
         copy.set_nonblocking(true).expect("need not wait");
-        let _simulator = env.simulator(&["front"], &STREAM);
+        let _simulator = env.simulator(&["front"], &STREAM_FLAGS);
         let _hub = env.hub(&[env.link("front")]);
-        let mut believer = listener(&env, &ours);
-        let stranger = listener(&env, &other);
+        let mut with_key = listener(&env, &ours);
+        let with_other_key = listener(&env, &other);
         let gateway = env.gateway(&["--interface=lo", "--to=127.0.0.1:22299", &ours]);
-        let scans = believer.await_lines(20, "a scan", is_class("scan"));
+        let scans = with_key.await_lines(20, "a scan", is_class("scan"));
         // Somebody without a key.
-        let mut sender = Sender::new(5, 7, 0, "front");
+        let mut sender = TestGateway::new(5, 7, 0, "front");
         sender.announce(&Topic::ALL);
         sender.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
         assert!(scans.iter().all(|scan| scan["authenticated"] == true && scan["sensor"] == "front"));
-        assert_eq!(gateway.end(TERM).code, Some(0));
+        assert_eq!(gateway.end(TERM).exit_code, Some(0));
         let recorded = drain(&copy);
         let next = env.gateway(&["--interface=lo", &ours]);
-        believer
+        with_key
             .await_line("the next life", |line| is_class("scan")(line) && line["epoch"] != scans[0]["epoch"]);
-        assert_eq!(next.end(TERM).code, Some(0));
-        assert!(recorded.iter().all(|bytes| read(bytes).head.flags & LanFlags::AUTHENTICATED != 0));
+        assert_eq!(next.end(TERM).exit_code, Some(0));
+        assert!(
+            recorded.iter().all(|bytes| decode_datagram(bytes).head.flags & LanFlags::AUTHENTICATED != 0)
+        );
         // It is sent again to who heard it, and to who has just come.
-        let again = |mut program: Program| {
+        let replay = |mut program: Program| {
             for bytes in &recorded {
-                let topic = Topic::of_number(read(bytes).head.topic);
-                sender.to(topic.map_or(Announce::GROUP, group), bytes);
+                let topic = Topic::of_number(decode_datagram(bytes).head.topic);
+                sender.send_to_group(topic.map_or(Announce::GROUP, group), bytes);
             }
             // What comes after all of it in each of the groups that are heard has arrived after all of it.
-            let heard = [Announce::GROUP, group(Topic::Zones), group(Topic::Scan)];
-            heard.iter().for_each(|&group| sender.to(group, b"the end"));
-            while number(&asked(&mut program, "lan_refused"), "short") < heard.len() as u64 {}
+            let groups = [Announce::GROUP, group(Topic::Zones), group(Topic::Scan)];
+            groups.iter().for_each(|&group| sender.send_to_group(group, b"the end"));
+            while number(&request_statistics(&mut program, "lan_refused"), "short") < groups.len() as u64 {}
             program.end(TERM)
         };
-        let heard = again(believer);
-        assert_eq!(refused(&heard, "unauthenticated"), 2, "{heard}");
+        let replayed = replay(with_key);
+        assert_eq!(refusal_count(&replayed, "unauthenticated"), 2, "{replayed}");
         // Each of its life is known to be over.
-        assert_eq!(refused(&heard, "epoch"), recorded.len() as u64, "{heard}");
-        let come_late = again(listener(&env, &ours));
+        assert_eq!(refusal_count(&replayed, "epoch"), recorded.len() as u64, "{replayed}");
+        let late_joiner = replay(listener(&env, &ours));
         assert!(
-            come_late.of_class("scan").is_empty() && come_late.of_class("zones").is_empty(),
-            "{come_late}"
+            late_joiner.of_class("scan").is_empty() && late_joiner.of_class("zones").is_empty(),
+            "{late_joiner}"
         );
-        let stranger = stranger.end(TERM);
-        assert!(stranger.of_class("scan").is_empty() && refused(&stranger, "mac") > 20, "{stranger}");
+        let outcome_of_other_key = with_other_key.end(TERM);
+        assert!(
+            outcome_of_other_key.of_class("scan").is_empty()
+                && refusal_count(&outcome_of_other_key, "mac") > 20,
+            "{outcome_of_other_key}"
+        );
     });
 }
 
 #[test]
 fn a_key_file_that_others_can_use_is_refused() {
     let env = TestEnv::new();
-    let made = env.run(&["key", "new", &env.word("key")]);
-    assert!(made.code == Some(0) && String::from_utf8_lossy(&made.out).contains(": key "), "{made}");
+    let made = env.run(&["key", "new", &env.path_argument("key")]);
+    assert!(made.exit_code == Some(0) && String::from_utf8_lossy(&made.stdout).contains(": key "), "{made}");
     let mode = || std::fs::metadata(env.path("key")).expect("it was made").permissions().mode() & 0o777;
     assert_eq!(mode(), 0o600);
-    let again = env.run(&["key", "new", &env.word("key")]);
-    assert!(again.code == Some(73) && again.errors.contains("key exists"), "{again}");
+    let again = env.run(&["key", "new", &env.path_argument("key")]);
+    assert!(again.exit_code == Some(73) && again.stderr.contains("key exists"), "{again}");
     let short = env.file("short", "00ff\n");
     std::fs::set_permissions(env.path("short"), PermissionsExt::from_mode(0o600)).expect("it is ours");
     let open = env.file("open", "0".repeat(64));
     std::fs::set_permissions(env.path("open"), PermissionsExt::from_mode(0o644)).expect("it is ours");
-    let missing = env.word("missing");
-    for (file, said, code) in
+    let missing = env.path_argument("missing");
+    for (file, message, code) in
         [(&short, "are no key", 78), (&open, "its mode is 0644", 78), (&missing, "No such file", 66)]
     {
         for verb in [&["listen"][..], &["gateway", "--interface=lo", "--no-system-config"]] {
             let refused = env.run(&[verb, &[&format!("--key-file={file}")]].concat());
-            assert!(refused.code == Some(code) && refused.errors.contains(said), "{refused}");
+            assert!(refused.exit_code == Some(code) && refused.stderr.contains(message), "{refused}");
         }
     }
-    let bare = format!("--set=gateway.key_file=\"{}\"", env.word("key"));
+    let bare = format!("--set=gateway.key_file=\"{}\"", env.path_argument("key"));
     let bare = env.run(&["gateway", "--interface=lo", "--no-system-config", "--bare", &bare]);
-    assert!(bare.code == Some(78) && bare.errors.contains("no room for a MAC"), "{bare}");
+    assert!(bare.exit_code == Some(78) && bare.stderr.contains("no room for a MAC"), "{bare}");
 }

@@ -4,10 +4,10 @@ mod c;
 mod capture;
 mod damaged;
 mod keyed_vectors;
+mod link_failures;
 mod python;
 mod readers;
 #[path = "../../schema/tests/datagram/says.rs"]
 mod says;
-mod trouble;
 mod vectors;
 mod wireshark;

@@ -4,14 +4,14 @@
 use std::collections::BTreeSet;
 
 use crate::testkit;
-use crate::testkit::{INT, Outcome, Sender, TERM, TestEnv, in_a_network, number, until};
+use crate::testkit::{INT, Outcome, TERM, TestEnv, TestGateway, in_a_network, number, wait_until};
 use scanhub_schema::{Topic, Verdict, Zones};
 use serde_json::{Value, json};
 
-const ORDER: [&str; 6] = ["min_ns", "p50_ns", "p90_ns", "p99_ns", "p999_ns", "max_ns"];
+const PERCENTILE_KEYS: [&str; 6] = ["min_ns", "p50_ns", "p90_ns", "p99_ns", "p999_ns", "max_ns"];
 
 /// What came of the only topic.
-fn told(outcome: &Outcome) -> Value {
+fn latency_line(outcome: &Outcome) -> Value {
     outcome.of_class("latency").pop().unwrap_or_else(|| panic!("no result: {outcome}"))
 }
 
@@ -21,7 +21,7 @@ fn count(line: &Value, span: &str) -> u64 {
     if *of == Value::Null {
         return 0;
     }
-    let times = ORDER.map(|key| number(of, key));
+    let times = PERCENTILE_KEYS.map(|key| number(of, key));
     assert!(times.is_sorted(), "{span}: {line}");
     number(of, "count")
 }
@@ -35,13 +35,13 @@ fn ages_of_a_stream_are_split_and_judged() {
     for wait in ["doorbell", "event", "spin"] {
         let by = format!("--wait={wait}");
         let outcome = env.run(&["latency", "front/scan", "-n", "20", "--json", &by, "--max-p99=1h"]);
-        assert_eq!(outcome.code, Some(0), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(0), "{outcome}");
         let conditions = &outcome.lines()[0];
         assert_eq!((&conditions["class"], &conditions["wait"]), (&json!("conditions"), &json!(wait)));
         assert!(conditions["clock_read_ns"].as_f64().is_some_and(|ns| ns > 0.0), "{conditions}");
         let all = conditions["realtime"] == true && conditions["memory_locked"] == true;
         assert_eq!(conditions["refused"] == json!([]), all, "what is missing is explained: {conditions}");
-        let line = told(&outcome);
+        let line = latency_line(&outcome);
         assert_eq!((number(&line, "received"), number(&line, "in_future")), (20, 0), "{line}");
         assert_eq!(line["flags"][0], "simulated");
         assert_eq!(count(&line, "age") + number(&line, "before"), 20, "{line}");
@@ -59,7 +59,7 @@ fn ages_of_a_stream_are_split_and_judged() {
     }
     let outcome = env.run(&["latency", "front/scan", "front/telegram", "-n20", "--json", "--max-p99=1us"]);
     assert_eq!(
-        (outcome.code, &outcome.of_class("error")[0]["kind"]),
+        (outcome.exit_code, &outcome.of_class("error")[0]["kind"]),
         (Some(5), &json!("check")),
         "{outcome}"
     );
@@ -72,42 +72,42 @@ fn ages_of_a_stream_are_split_and_judged() {
     // 732 bytes of ten bits.
     assert!(number(&line["line"], "max_ns") > 14_000_000, "{line}");
     assert!(number(&line["total"], "min_ns") > number(&line["line"], "min_ns"), "{line}");
-    assert_eq!(latency.end(INT).code, Some(0));
+    assert_eq!(latency.end(INT).exit_code, Some(0));
     // A status says something without a telegram: it has an age, and nothing else.
     let mut latency = env.start(&["latency", "front/status", "--json", "--no-realtime"]);
     let line = latency.await_line("a status", |line| line["age"] != Value::Null);
     assert_eq!((&line["line"], &line["hub"], &line["total"]), (&Value::Null, &Value::Null, &Value::Null));
     let outcome = latency.end(INT);
-    assert_eq!((outcome.code, &outcome.lines()[0]["realtime"]), (Some(0), &json!(false)), "{outcome}");
-    assert!(number(&told(&outcome), "before") <= 1, "the one that is kept for late joiners");
+    assert_eq!((outcome.exit_code, &outcome.lines()[0]["realtime"]), (Some(0), &json!(false)), "{outcome}");
+    assert!(number(&latency_line(&outcome), "before") <= 1, "the one that is kept for late joiners");
     let text = env.run(&["latency", "front/scan", "-n", "5"]);
-    let out = String::from_utf8_lossy(&text.out).into_owned();
+    let out = String::from_utf8_lossy(&text.stdout).into_owned();
     // On a busy machine, all of them may have waited for the subscriber.
     let are_left_out = out.contains("5 were sent before this listened");
     assert!(are_left_out || out.contains("p99.9") && out.contains("\nwake "), "{text}");
     assert!(!out.contains(" ##"), "{text}");
-    assert!(text.errors.contains("wait by doorbell") && text.errors.contains("ns to read"), "{text}");
-    assert_eq!(env.run(&["latency"]).code, Some(2));
-    assert_eq!(env.run(&["latency", "front/scan", "--wait=long"]).code, Some(2));
-    assert_eq!((hub.end(TERM).code, simulator.end(TERM).code), (Some(0), Some(0)));
+    assert!(text.stderr.contains("wait by doorbell") && text.stderr.contains("ns to read"), "{text}");
+    assert_eq!(env.run(&["latency"]).exit_code, Some(2));
+    assert_eq!(env.run(&["latency", "front/scan", "--wait=long"]).exit_code, Some(2));
+    assert_eq!((hub.end(TERM).exit_code, simulator.end(TERM).exit_code), (Some(0), Some(0)));
 }
 
 #[test]
-fn of_a_remote_sensor_the_way_on_this_machine_is_known() {
-    in_a_network("latency::of_a_remote_sensor_the_way_on_this_machine_is_known", || {
+fn splits_remote_age_into_network_and_local_part() {
+    in_a_network("latency::splits_remote_age_into_network_and_local_part", || {
         let env = TestEnv::new();
-        let mut sender = Sender::new(0x5f3a_12bc_00d1_e2f3, 7, 3, "front");
+        let mut sender = TestGateway::new(0x5f3a_12bc_00d1_e2f3, 7, 3, "front");
         let publisher = ["listen", "--json", "--publish", "--name=robot1=5f3a12bc00d1e2f3"];
         let mut listener = env.start(&publisher).ready();
-        sender.await_published(&mut listener, &[Topic::Zones]);
+        sender.wait_until_published(&mut listener, &[Topic::Zones]);
         let mut latency = env.start(&["latency", "--json", "robot1.front/zones"]);
-        until("it is attached", || env.subscribers("robot1.front/zones") == 1);
+        wait_until("it is attached", || env.subscribers("robot1.front/zones") == 1);
         let zones = Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() };
         let known = |line: &Value| line["class"] == "latency" && line["age"] != Value::Null;
         sender.stamp_ns = testkit::wall_ns() - 50_000_000;
         // Samples from before its own report that it is attached do not count.
         let mut line = Value::Null;
-        until("ages", || {
+        wait_until("ages", || {
             sender.send(Topic::Zones, &zones);
             latency.printed(known).map(|printed| line = printed).is_some()
         });
@@ -122,7 +122,7 @@ fn of_a_remote_sensor_the_way_on_this_machine_is_known() {
         sender.send(Topic::Zones, &zones);
         let line = latency.await_line("clocks that differ", |line| line["in_future"] == 1);
         assert!(count(&line, "age") > count(&line, "network"), "{line}");
-        assert_eq!(latency.end(INT).code, Some(0));
-        assert_eq!(listener.end(TERM).code, Some(0));
+        assert_eq!(latency.end(INT).exit_code, Some(0));
+        assert_eq!(listener.end(TERM).exit_code, Some(0));
     });
 }

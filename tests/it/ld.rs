@@ -3,12 +3,14 @@
 
 use serde_json::Value;
 
-use crate::testkit::{INT, Program, TERM, TestEnv, hash, is_class, is_there, number, sequence};
+use crate::testkit::{
+    INT, Program, TERM, TestEnv, contiguous_numbers, exists_or_is_symlink, hash, is_class, number,
+};
 
 /// Bytes of a packet of twelve points.
-const PACKET: usize = 47;
+const PACKET_LEN: usize = 47;
 /// What its packets begin with.
-const BEGIN: [u8; 2] = [0x54, 0x2C];
+const PACKET_HEADER: [u8; 2] = [0x54, 0x2C];
 
 fn ld19(env: &TestEnv) -> Program {
     env.simulator(&["front"], &["--family=ld", "--model=ld19", "--world=room", "--seed=7"])
@@ -53,7 +55,7 @@ fn a_scanner_that_turns_is_published_like_any_other() {
     let simulator = ld19(&env);
     scans.await_lines(20, "a scan", is_class("scan"));
     zones.await_line("a verdict", |line| is_class("zones")(line) && line["verdict"] != "unknown");
-    raw.await_bytes(100 * PACKET);
+    raw.await_bytes(100 * PACKET_LEN);
     let info = env.await_info("front", |info| info["hz"].as_f64().is_some_and(|hz| hz > 8.0));
     let facts =
         ["state", "family", "model", "type", "baud", "unit_mm", "angle_deg", "step_deg", "last_error"];
@@ -71,15 +73,15 @@ fn a_scanner_that_turns_is_published_like_any_other() {
     assert_eq!(facts.map(|key| info[key].clone()), expected, "{info}");
 
     let scans = scans.end(INT).of_class("scan");
-    sequence(&scans, "topic_seq");
+    contiguous_numbers(&scans, "topic_seq");
     for scan in &scans {
         check_scan(scan, 450);
     }
     let outcome = raw.end(INT);
-    let packets: Vec<&[u8]> = outcome.out.chunks(PACKET).collect();
-    assert!(packets.iter().all(|packet| packet.len() == PACKET && packet.starts_with(&BEGIN)));
-    assert_eq!(hub.end(TERM).code, Some(0));
-    assert_eq!(simulator.end(TERM).code, Some(0));
+    let packets: Vec<&[u8]> = outcome.stdout.chunks(PACKET_LEN).collect();
+    assert!(packets.iter().all(|packet| packet.len() == PACKET_LEN && packet.starts_with(&PACKET_HEADER)));
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
+    assert_eq!(simulator.end(TERM).exit_code, Some(0));
     let truth = env.truth("front");
     let arrived: Vec<String> = packets.into_iter().map(hash).collect();
     let begin = truth.iter().position(|sent| sent.hash == arrived[0]).expect("it was sent");
@@ -113,21 +115,21 @@ fn a_scanner_that_goes_and_comes_back() {
     let env = TestEnv::new();
     let simulator = ld19(&env);
     let hub = hub(&env, &["model=ld19"]);
-    let mut consumer = env.echo(&["front/scan", "front/status"]);
-    consumer.await_lines(5, "a scan", is_class("scan"));
-    env.kill_simulator(simulator, "front");
-    assert!(!is_there(&env.path("front")));
-    consumer.await_line("absent", |line| line["state"] == "absent");
+    let mut subscriber = env.echo(&["front/scan", "front/status"]);
+    subscriber.await_lines(5, "a scan", is_class("scan"));
+    env.kill_port_simulator(simulator, "front");
+    assert!(!exists_or_is_symlink(&env.path("front")));
+    subscriber.await_line("absent", |line| line["state"] == "absent");
     let _simulator = ld19(&env);
-    consumer.await_line("streaming", |line| line["state"] == "streaming");
-    for scan in consumer.await_lines(5, "a scan", is_class("scan")) {
+    subscriber.await_line("streaming", |line| line["state"] == "streaming");
+    for scan in subscriber.await_lines(5, "a scan", is_class("scan")) {
         check_scan(&scan, 450);
     }
     let info = env.info("front");
     assert_eq!((number(&info["counters"], "reconnects"), &info["last_error"]), (1, &"".into()), "{info}");
     // One hub, one life: the numbers go on.
-    sequence(&consumer.end(INT).of_class("scan"), "topic_seq");
-    assert_eq!(hub.end(TERM).code, Some(0));
+    contiguous_numbers(&subscriber.end(INT).of_class("scan"), "topic_seq");
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
 }
 
 #[test]
@@ -137,15 +139,15 @@ fn marks_need_a_level() {
     let without = hub(&env, &["model=ld19"]);
     let marks = env.echo(&["front/marks"]).await_line("marks", is_class("marks"));
     assert_eq!((&marks["available"], &marks["marks"]), (&false.into(), &Value::Array(Vec::new())), "{marks}");
-    let said = env.run(&["echo", "front/marks", "-n", "1"]);
-    assert!(String::from_utf8_lossy(&said.out).contains("set link.NAME.marks.level"), "{said}");
+    let outcome = env.run(&["echo", "front/marks", "-n", "1"]);
+    assert!(String::from_utf8_lossy(&outcome.stdout).contains("set link.NAME.marks.level"), "{outcome}");
     let offer = |env: &TestEnv| env.info("front")["marks"].clone();
     let remedy = "set link.front.marks.level";
     assert_eq!(offer(&env), serde_json::json!({ "available": false, "remedy": remedy }));
-    let shown = |env: &TestEnv| String::from_utf8_lossy(&env.run(&["info", "front"]).out).into_owned();
+    let shown = |env: &TestEnv| String::from_utf8_lossy(&env.run(&["info", "front"]).stdout).into_owned();
     let info = shown(&env);
     assert!(info.contains(&format!("unavailable: {remedy}")), "{info}");
-    assert_eq!(without.end(TERM).code, Some(0));
+    assert_eq!(without.end(TERM).exit_code, Some(0));
     // Reflectors of the room have 255 of 255.
     let _hub = hub(&env, &["model=ld19", "marks.level=250"]);
     let is_found = |line: &Value| line["marks"].as_array().is_some_and(|marks| !marks.is_empty());
@@ -162,16 +164,16 @@ fn marks_need_a_level() {
 }
 
 #[test]
-fn probe_hears_what_it_is_and_leaves_no_trace() {
+fn probe_identifies_both_models() {
     let env = TestEnv::new();
     let models = [("front", "ld19", 230_400, 4_500.0), ("side", "stl27l", 921_600, 21_600.0)];
     for (name, model, rate, points) in models {
         let model_of = format!("--model={model}");
         let simulator = env.simulator(&[name], &["--family=ld", &model_of, "--world=room", "--seed=7"]);
-        let outcome = env.search(&["probe", &env.word(name), "--json"]);
+        let outcome = env.search(&["probe", &env.path_argument(name), "--json"]);
         let [found] = &outcome.lines()[..] else { panic!("{outcome}") };
         assert_eq!(
-            (outcome.code, &found["class"], &found["family"]),
+            (outcome.exit_code, &found["class"], &found["family"]),
             (Some(0), &"probe".into(), &"ld".into())
         );
         assert_eq!((found["model"].as_str(), number(found, "baud")), (Some(model), rate), "{found}");
@@ -179,22 +181,22 @@ fn probe_hears_what_it_is_and_leaves_no_trace() {
         assert!((of("points_per_second") / points - 1.0).abs() < 0.02, "{found}");
         assert!((of("turns_per_second") / 10.0 - 1.0).abs() < 0.05 && of("damaged") == 0.0, "{found}");
         assert!(number(found, "packets") > 20 && found["problem"].is_null(), "{found}");
-        assert_eq!(outcome.errors, "", "no progress without a terminal");
-        let text = env.search(&["probe", &env.word(name)]).to_string();
+        assert_eq!(outcome.stderr, "", "no progress without a terminal");
+        let text = env.search(&["probe", &env.path_argument(name)]).to_string();
         for word in ["family", "ld", model, "Bd", "turns"] {
             assert!(text.contains(word), "{word}: {text}");
         }
-        assert_eq!(simulator.end(TERM).code, Some(0));
+        assert_eq!(simulator.end(TERM).exit_code, Some(0));
     }
 }
 
 #[test]
-fn doctor_judges_what_it_hears() {
+fn doctor_checks_a_rotating_scanner() {
     let env = TestEnv::new();
-    let port = env.word("front");
+    let port = env.path_argument("front");
     let check = |arguments: &[&str], code: i32| {
         let outcome = env.run(&[&["doctor", "--json", "--no-system-config"], arguments].concat());
-        assert_eq!(outcome.code, Some(code), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(code), "{outcome}");
         let found = outcome.of_class("check");
         move |name: &str| {
             let of = found.iter().find(|line| line["name"] == name && !line["port"].is_null());
@@ -218,7 +220,7 @@ fn doctor_judges_what_it_hears() {
     env.await_info("front", |info| info["state"] == "streaming");
     let of_hub = check(&["front"], 0);
     assert!(of_hub("sensor").1.contains("streaming, family ld, LD19, 230400 Bd"), "{}", of_hub("sensor").1);
-    assert_eq!((hub.end(TERM).code, simulator.end(TERM).code), (Some(0), Some(0)));
+    assert_eq!((hub.end(TERM).exit_code, simulator.end(TERM).exit_code), (Some(0), Some(0)));
 
     let _lossy = env.simulator(&["front"], &["--family=ld", "--world=room", "--fault=loss=0.02,burst=3"]);
     let lossy = check(&[&port], 0);

@@ -10,14 +10,14 @@ use crate::testkit::{KILL, Outcome, Program, TERM, TestEnv, is_class, number};
 use serde_json::Value;
 
 /// Whoever learns so soon is a first hub; whoever needs so long learns nothing in a test.
-const SOON: &str = "--set=background.scans=20";
-const LATE: &str = "--set=background.scans=8191";
+const QUICK_LEARNING: &str = "--set=background.scans=20";
+const SLOW_LEARNING: &str = "--set=background.scans=8191";
 
 /// A wall around the sensor, 3 m ahead.
-const ROOM: &str = "[noise]\nerrors = 0\ntail = 0\n\n\
+const ROOM_WORLD: &str = "[noise]\nerrors = 0\ntail = 0\n\n\
      [[thing]]\nline = [[3000, -500], [3000, 3000], [-3000, 3000], [-3000, -500]]\n";
 /// In it somebody who stands 1.5 m ahead.
-const PERSON: &str = "\n[[thing]]\nradius_mm = 150\npose = [0, 1500]\n";
+const POST: &str = "\n[[thing]]\nradius_mm = 150\npose = [0, 1500]\n";
 
 fn simulator(env: &TestEnv, world: &str) -> Program {
     let world = env.file("world.toml", world);
@@ -25,56 +25,58 @@ fn simulator(env: &TestEnv, world: &str) -> Program {
 }
 
 fn file(env: &TestEnv) -> PathBuf {
-    env.path("state/scanhub").join(env.place().name()).join("front.background.json")
+    env.path("state/scanhub").join(env.domain().name()).join("front.background.json")
 }
 
-fn shown(env: &TestEnv) -> Value {
+fn show_background(env: &TestEnv) -> Value {
     let outcome = env.run(&["background", "front", "show", "--json"]);
     let [line] = &outcome.lines()[..] else { panic!("not one line: {outcome}") };
     line.clone()
 }
 
 fn known_beams(env: &TestEnv) -> u64 {
-    number(&shown(env), "known_beams")
+    number(&show_background(env), "known_beams")
 }
 
 /// A hub that has seen scans, and what it ended with.
-fn look(env: &TestEnv, flags: &[&str], look: impl FnOnce()) -> Outcome {
+fn with_streaming_hub(env: &TestEnv, flags: &[&str], action: impl FnOnce()) -> Outcome {
     let link = env.link("front");
     let hub = env.hub(&[&[link.as_str()], flags].concat());
     let mut scans = env.echo(&["front/scan"]);
     scans.await_lines(3, "a scan", is_class("scan"));
-    look();
+    action();
     drop(scans);
     let outcome = hub.end(TERM);
-    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     outcome
 }
 
 /// The room as a first hub has learned and kept it.
-fn learn(env: &TestEnv) {
-    look(env, &[SOON], || testkit::until("the room is learned", || known_beams(env) > 350));
+fn save_background_of_room(env: &TestEnv) {
+    with_streaming_hub(env, &[QUICK_LEARNING], || {
+        testkit::wait_until("the room is learned", || known_beams(env) > 350)
+    });
     assert!(file(env).exists());
 }
 
 #[test]
-fn who_comes_while_the_hub_is_away_is_foreground_at_once() {
+fn post_placed_between_hub_runs_is_foreground_at_once() {
     for how in [TERM, KILL] {
         let env = TestEnv::new();
-        let room = simulator(&env, ROOM);
-        let hub = env.hub(&[&env.link("front"), SOON]);
-        testkit::until("the room is learned and kept", || {
-            let shown = shown(&env);
+        let room = simulator(&env, ROOM_WORLD);
+        let hub = env.hub(&[&env.link("front"), QUICK_LEARNING]);
+        testkit::wait_until("the room is learned and kept", || {
+            let shown = show_background(&env);
             number(&shown, "known_beams") > 350 && shown["kept_wall_ns"].is_u64()
         });
         assert_eq!(fs::metadata(file(&env)).expect("kept").permissions().mode() & 0o777, 0o600);
         hub.end(how);
         room.end(TERM);
 
-        let _simulator = simulator(&env, &[ROOM, PERSON].concat());
-        let hub = env.hub(&[&env.link("front"), LATE]);
-        let mut consumer = env.echo(&["front/foreground"]);
-        let first = consumer.await_line("foreground", is_class("foreground"));
+        let _simulator = simulator(&env, &[ROOM_WORLD, POST].concat());
+        let hub = env.hub(&[&env.link("front"), SLOW_LEARNING]);
+        let mut subscriber = env.echo(&["front/foreground"]);
+        let first = subscriber.await_line("foreground", is_class("foreground"));
         // The post is 11 degrees wide. Of a first scan two beams may not have been believed.
         let (beams, generation) =
             (first["beams"].as_array().map_or(0, Vec::len), number(&first, "generation"));
@@ -82,22 +84,25 @@ fn who_comes_while_the_hub_is_away_is_foreground_at_once() {
         let nearest = number(&first["segments"][0], "nearest_mm");
         assert!((1300..1400).contains(&nearest), "{first}");
         let text = env.run(&["background", "front", "show"]);
-        assert!(String::from_utf8_lossy(&text.out).contains(" beams known, 0 far, in 1 mm, kept "), "{text}");
-        let log = hub.end(TERM).errors;
+        assert!(
+            String::from_utf8_lossy(&text.stdout).contains(" beams known, 0 far, in 1 mm, kept "),
+            "{text}"
+        );
+        let log = hub.end(TERM).stderr;
         assert!(log.contains("front: starts with the background saved "), "{log}");
     }
 }
 
 #[test]
-fn what_does_not_fit_or_is_not_wanted_is_not_taken() {
+fn unusable_or_unwanted_background_is_not_loaded() {
     let env = TestEnv::new();
-    let _simulator = simulator(&env, ROOM);
-    learn(&env);
+    let _simulator = simulator(&env, ROOM_WORLD);
+    save_background_of_room(&env);
     let kept = fs::read(file(&env)).expect("kept");
     let empty = |flags: &[&str], why: &str| {
-        let flags = [&[LATE], flags].concat();
-        let outcome = look(&env, &flags, || assert_eq!(known_beams(&env), 0, "{flags:?}"));
-        assert!(outcome.errors.contains(why), "{outcome}\n{}", outcome.errors);
+        let flags = [&[SLOW_LEARNING], flags].concat();
+        let outcome = with_streaming_hub(&env, &flags, || assert_eq!(known_beams(&env), 0, "{flags:?}"));
+        assert!(outcome.stderr.contains(why), "{outcome}\n{}", outcome.stderr);
         assert_eq!(fs::read(file(&env)).expect("still there"), kept, "{flags:?}");
     };
     empty(&["--set=link.front.pose.x=0.2"], "the background starts empty: ");
@@ -117,26 +122,27 @@ fn what_does_not_fit_or_is_not_wanted_is_not_taken() {
         ("\u{0}\u{1}".to_owned(), "is no background model"),
     ] {
         fs::write(file(&env), &wrong).expect("written");
-        let outcome = look(&env, &[LATE], || assert_eq!(known_beams(&env), 0, "{why}"));
-        assert!(outcome.errors.contains(why), "{why}: {}", outcome.errors);
+        let outcome =
+            with_streaming_hub(&env, &[SLOW_LEARNING], || assert_eq!(known_beams(&env), 0, "{why}"));
+        assert!(outcome.stderr.contains(why), "{why}: {}", outcome.stderr);
     }
     fs::write(file(&env), &kept).expect("written");
     fs::set_permissions(file(&env), fs::Permissions::from_mode(0o666)).expect("set");
     empty(&[], "others can write it");
     // As it was it is taken.
     fs::set_permissions(file(&env), fs::Permissions::from_mode(0o600)).expect("set");
-    look(&env, &[LATE], || assert!(known_beams(&env) > 350));
+    with_streaming_hub(&env, &[SLOW_LEARNING], || assert!(known_beams(&env) > 350));
     // What was forgotten on purpose does not come back.
     for (flags, content) in [
-        (vec![LATE], &kept[..]),
+        (vec![SLOW_LEARNING], &kept[..]),
         // Also not what the hub that forgets did not take.
-        (vec![LATE, "--set=link.front.pose.x=0.2"], &kept),
-        (vec![LATE], b"cut short"),
+        (vec![SLOW_LEARNING, "--set=link.front.pose.x=0.2"], &kept),
+        (vec![SLOW_LEARNING], b"cut short"),
     ] {
         fs::write(file(&env), content).expect("written");
-        look(&env, &flags, || {
-            assert_eq!(env.run(&["background", "front", "reset"]).code, Some(0));
-            testkit::until("it is gone", || !file(&env).exists());
+        with_streaming_hub(&env, &flags, || {
+            assert_eq!(env.run(&["background", "front", "reset"]).exit_code, Some(0));
+            testkit::wait_until("it is gone", || !file(&env).exists());
         });
     }
 }
@@ -144,11 +150,11 @@ fn what_does_not_fit_or_is_not_wanted_is_not_taken() {
 #[test]
 fn where_nothing_is_kept_nothing_is_written() {
     let env = TestEnv::new();
-    let simulator = simulator(&env, ROOM);
-    let is_known = || testkit::until("it is learned", || known_beams(&env) > 350);
-    look(&env, &[SOON, "--set=background.keep=false"], || {
+    let simulator = simulator(&env, ROOM_WORLD);
+    let is_known = || testkit::wait_until("it is learned", || known_beams(&env) > 350);
+    with_streaming_hub(&env, &[QUICK_LEARNING, "--set=background.keep=false"], || {
         is_known();
-        assert!(shown(&env)["kept_wall_ns"].is_null());
+        assert!(show_background(&env)["kept_wall_ns"].is_null());
     });
     assert!(!file(&env).exists());
     simulator.end(TERM);
@@ -162,14 +168,14 @@ fn where_nothing_is_kept_nothing_is_written() {
         .collect();
     let log = env.file("log", log);
     let is_played = |hub: Program, words: &str| {
-        testkit::until("it is learned", || known_beams(&env) == 181);
-        assert!(shown(&env)["kept_wall_ns"].is_null(), "{words}");
+        testkit::wait_until("it is learned", || known_beams(&env) == 181);
+        assert!(show_background(&env)["kept_wall_ns"].is_null(), "{words}");
         hub.end(TERM);
         assert!(!file(&env).exists(), "{words}");
     };
     let link = format!("--link=front=file:{log}");
     let resolution = "--set=link.front.resolution=1";
-    is_played(env.hub(&[&link, SOON, resolution]), "file:");
-    let words = ["replay", "--json", "--no-system-config", &log, "--hold", SOON, resolution];
+    is_played(env.hub(&[&link, QUICK_LEARNING, resolution]), "file:");
+    let words = ["replay", "--json", "--no-system-config", &log, "--hold", QUICK_LEARNING, resolution];
     is_played(env.start(&words).ready(), "replay");
 }

@@ -6,7 +6,8 @@ use std::path::PathBuf;
 use std::process::Stdio;
 
 use crate::testkit::{
-    INT, KILL, Program, Sender, TERM, TestEnv, in_a_network, is_class, number, spawn, terminal, until,
+    INT, KILL, Program, TERM, TestEnv, TestGateway, in_a_network, is_class, number, spawn, terminal,
+    wait_until,
 };
 use rustix::process::Signal;
 use rustix::time::{ClockId, clock_gettime};
@@ -19,28 +20,28 @@ fn world(env: &TestEnv, name: &str, thing: &str) -> String {
     format!("--world={}", env.file(name, format!("{room}\n{thing}")))
 }
 
-const POST: &str = "[[thing]]\nradius_mm = 20\npose = [0, 400]\n";
-const STRIP: &str = "[[thing]]\nline = [[-50, 2000], [50, 2000]]\nsurface = \"reflector\"\n";
+const POST_WORLD: &str = "[[thing]]\nradius_mm = 20\npose = [0, 400]\n";
+const STRIP_WORLD: &str = "[[thing]]\nline = [[-50, 2000], [50, 2000]]\nsurface = \"reflector\"\n";
 
 fn simulator(env: &TestEnv, world: &str) -> Program {
     env.simulator(&["front"], &["--seed=61", "--baud=500000", world])
 }
 
 /// Diodes as Linux has them.
-struct Diodes(PathBuf);
+struct FakeLeds(PathBuf);
 
-const NAMES: [&str; 4] = ["gn", "ye", "rd", "mk"];
+const LED_NAMES: [&str; 4] = ["gn", "ye", "rd", "mk"];
 
-impl Diodes {
-    fn new(env: &TestEnv) -> Diodes {
-        let diodes = Diodes(env.path("leds"));
+impl FakeLeds {
+    fn new(env: &TestEnv) -> FakeLeds {
+        let diodes = FakeLeds(env.path("leds"));
         fs::create_dir(&diodes.0).unwrap();
-        NAMES.iter().for_each(|name| diodes.plug(name));
+        LED_NAMES.iter().for_each(|name| diodes.create_led(name));
         diodes
     }
 
     /// There is one with all its files, or none.
-    fn plug(&self, name: &str) {
+    fn create_led(&self, name: &str) {
         let aside = self.0.with_extension(name);
         fs::create_dir(&aside).unwrap();
         for (file, content) in
@@ -51,14 +52,14 @@ impl Diodes {
         fs::rename(&aside, self.0.join(name)).unwrap();
     }
 
-    fn unplug(&self, name: &str) {
+    fn remove_led(&self, name: &str) {
         fs::remove_dir_all(self.0.join(name)).unwrap();
     }
 
     /// Those that are lit; nothing while one is neither on nor off.
-    fn lit(&self) -> Option<String> {
+    fn lit_names(&self) -> Option<String> {
         let mut lit = Vec::new();
-        for name in NAMES {
+        for name in LED_NAMES {
             match fs::read_to_string(self.0.join(name).join("brightness")).ok()?.as_str() {
                 "255\n" => lit.push(name),
                 "0\n" => {}
@@ -68,8 +69,8 @@ impl Diodes {
         Some(lit.join(" "))
     }
 
-    fn await_lit(&self, names: &str) {
-        until(&format!("{names} lit"), || self.lit().as_deref() == Some(names));
+    fn wait_until_lit(&self, names: &str) {
+        wait_until(&format!("{names} lit"), || self.lit_names().as_deref() == Some(names));
     }
 
     fn flags(&self) -> [String; 2] {
@@ -79,30 +80,30 @@ impl Diodes {
 }
 
 #[test]
-fn the_lights_follow_the_verdict_and_stop_is_lit_when_nobody_says_anything() {
+fn leds_show_the_verdict_and_red_without_one() {
     let env = TestEnv::new();
-    let diodes = Diodes::new(&env);
+    let diodes = FakeLeds::new(&env);
     let [root, led] = diodes.flags();
     // Before there is a hub.
     let leds = env.start(&["leds", "front", "--json", &root, &led]);
-    diodes.await_lit("rd");
-    let open = world(&env, "open", STRIP);
+    diodes.wait_until_lit("rd");
+    let open = world(&env, "open", STRIP_WORLD);
     let sensor = simulator(&env, &open);
     let hub = env.hub(&[env.link("front")]);
-    diodes.await_lit("gn mk");
+    diodes.wait_until_lit("gn mk");
     // The sensor falls silent, then the hub.
-    assert_eq!(sensor.end(TERM).code, Some(0));
-    diodes.await_lit("rd");
+    assert_eq!(sensor.end(TERM).exit_code, Some(0));
+    diodes.wait_until_lit("rd");
     let _sensor = simulator(&env, &open);
-    diodes.await_lit("gn mk");
+    diodes.wait_until_lit("gn mk");
     drop(hub.end(KILL));
-    diodes.await_lit("rd");
+    diodes.wait_until_lit("rd");
     let hub = env.hub(&[env.link("front")]);
-    diodes.await_lit("gn mk");
+    diodes.wait_until_lit("gn mk");
     // The reader ends by itself, so no program watches the verdict any more.
     let outcome = leds.end(INT);
-    assert_eq!((outcome.code, diodes.lit().as_deref()), (Some(0), Some("rd")), "{outcome}");
-    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!((outcome.exit_code, diodes.lit_names().as_deref()), (Some(0), Some("rd")), "{outcome}");
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
 
     let lines = outcome.of_class("leds");
     let verdicts: Vec<_> = lines.iter().map(|line| line["verdict"].as_str().unwrap()).collect();
@@ -120,56 +121,56 @@ fn the_lights_follow_the_verdict_and_stop_is_lit_when_nobody_says_anything() {
 }
 
 #[test]
-fn a_mark_that_nobody_sees_any_more_is_dark() {
+fn mark_led_turns_off_when_scans_end() {
     let env = TestEnv::new();
-    let diodes = Diodes::new(&env);
+    let diodes = FakeLeds::new(&env);
     let [root, led] = diodes.flags();
-    let sensor = simulator(&env, &world(&env, "open", STRIP));
+    let sensor = simulator(&env, &world(&env, "open", STRIP_WORLD));
     let hub = env.hub(&[env.link("front")]);
     let leds = env.start(&["leds", "front", "--json", &root, &led]);
-    diodes.await_lit("gn mk");
+    diodes.wait_until_lit("gn mk");
     // The last marks wait together with the hub's word that there are no scans.
     leds.signal(Signal::STOP);
-    assert_eq!(env.run(&["echo", "front/marks", "-n", "5"]).code, Some(0));
-    assert_eq!(sensor.end(TERM).code, Some(0));
+    assert_eq!(env.run(&["echo", "front/marks", "-n", "5"]).exit_code, Some(0));
+    assert_eq!(sensor.end(TERM).exit_code, Some(0));
     env.echo(&["front/zones"]).await_line("unknown", |line| line["verdict"] == "unknown");
     leds.signal(Signal::CONT);
-    diodes.await_lit("rd");
+    diodes.wait_until_lit("rd");
     let outcome = leds.end(INT);
     let last = outcome.of_class("leds").pop().expect("a line");
-    assert_eq!((outcome.code, &last["mark"], &last["marks"]), (Some(0), &false.into(), &Value::Null));
-    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!((outcome.exit_code, &last["mark"], &last["marks"]), (Some(0), &false.into(), &Value::Null));
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
 }
 
 #[test]
-fn a_post_before_the_robot_is_red_and_one_in_the_outer_circle_yellow() {
+fn stop_lights_red_and_slow_lights_yellow() {
     let env = TestEnv::new();
-    let diodes = Diodes::new(&env);
+    let diodes = FakeLeds::new(&env);
     let [root, led] = diodes.flags();
-    let _sensor = simulator(&env, &world(&env, "post", POST));
+    let _sensor = simulator(&env, &world(&env, "post", POST_WORLD));
     let hub = env.hub(&[env.link("front")]);
     let mut leds = env.start(&["leds", "front", "--json", &root, &led]);
     leds.await_line("stop", |line| line["verdict"] == "stop" && line["red"] == true);
-    assert_eq!(diodes.lit().as_deref(), Some("rd"));
-    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(diodes.lit_names().as_deref(), Some("rd"));
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
     let _hub = env.hub(&[&env.link("front"), "--set=zones.radii=[1.0, 0.2]"]);
     leds.await_line("slow", |line| line["verdict"] == "slow" && line["yellow"] == true);
-    diodes.await_lit("ye");
-    assert_eq!(leds.end(TERM).code, Some(0));
-    assert_eq!(diodes.lit().as_deref(), Some("rd"));
+    diodes.wait_until_lit("ye");
+    assert_eq!(leds.end(TERM).exit_code, Some(0));
+    assert_eq!(diodes.lit_names().as_deref(), Some("rd"));
 }
 
 #[test]
-fn a_diode_that_is_unplugged_is_told_and_the_others_go_on() {
+fn reports_unplugged_led_and_drives_the_others() {
     let env = TestEnv::new();
-    let diodes = Diodes::new(&env);
+    let diodes = FakeLeds::new(&env);
     let [root, led] = diodes.flags();
-    let sensor = simulator(&env, &world(&env, "open", STRIP));
+    let sensor = simulator(&env, &world(&env, "open", STRIP_WORLD));
     let _hub = env.hub(&[env.link("front")]);
     let mut leds = env.start(&["leds", "front", "--json", &root, &led]);
-    diodes.await_lit("gn mk");
-    diodes.unplug("gn");
-    assert_eq!(sensor.end(TERM).code, Some(0));
+    diodes.wait_until_lit("gn mk");
+    diodes.remove_led("gn");
+    assert_eq!(sensor.end(TERM).exit_code, Some(0));
     let failed = leds.await_line("the failure", |line| line["class"] == "led");
     assert_eq!(
         (&failed["light"], &failed["name"], &failed["state"]),
@@ -177,13 +178,13 @@ fn a_diode_that_is_unplugged_is_told_and_the_others_go_on() {
     );
     assert!(failed["message"].as_str().is_some_and(|message| message.contains("gn/brightness")), "{failed}");
     assert_eq!(fs::read_to_string(diodes.0.join("rd/brightness")).unwrap(), "255\n", "the stop light");
-    diodes.plug("gn");
+    diodes.create_led("gn");
     let back = leds.await_line("its return", |line| line["class"] == "led");
     assert_eq!((&back["name"], &back["state"]), (&"gn".into(), &"recovered".into()));
-    assert_eq!(diodes.lit().as_deref(), Some("rd"));
-    let _sensor = simulator(&env, &world(&env, "open", STRIP));
-    diodes.await_lit("gn mk");
-    assert_eq!(leds.end(INT).code, Some(0));
+    assert_eq!(diodes.lit_names().as_deref(), Some("rd"));
+    let _sensor = simulator(&env, &world(&env, "open", STRIP_WORLD));
+    diodes.wait_until_lit("gn mk");
+    assert_eq!(leds.end(INT).exit_code, Some(0));
 }
 
 #[test]
@@ -195,14 +196,14 @@ fn the_robot_is_red_for_the_sensor_that_is_worst_off() {
     let _hub = env.hub(&[env.link("front"), env.link("rear")]);
     let mut leds = env.start(&["leds", "robot", "--json"]);
     leds.await_line("clear", |line| line["verdict"] == "clear" && line["green"] == true);
-    assert_eq!(rear.end(TERM).code, Some(0));
+    assert_eq!(rear.end(TERM).exit_code, Some(0));
     // Any sensor may be late for a moment; that one stays away.
     let lost = leds.await_line("unknown", |line| line["verdict"] == "unknown" && line["worst"] == "rear");
     assert_eq!(
         (&lost["sensor"], &lost["worst"], &lost["red"]),
         (&"robot".into(), &"rear".into(), &true.into())
     );
-    assert_eq!(leds.end(INT).code, Some(0));
+    assert_eq!(leds.end(INT).exit_code, Some(0));
 }
 
 fn now_ns() -> u64 {
@@ -212,51 +213,51 @@ fn now_ns() -> u64 {
 
 /// Each verdict said once: what stands for a moment and what is held is known to the test.
 #[test]
-fn a_worse_verdict_is_shown_at_once_and_a_better_one_only_when_it_has_stood() {
-    in_a_network("leds::a_worse_verdict_is_shown_at_once_and_a_better_one_only_when_it_has_stood", || {
+fn only_a_better_verdict_waits_for_the_hold_time() {
+    in_a_network("leds::only_a_better_verdict_waits_for_the_hold_time", || {
         let env = TestEnv::new();
-        let mut front = Sender::new(1, 7, 0, "front");
+        let mut front = TestGateway::new(1, 7, 0, "front");
         let mut listener =
             env.start(&["listen", "--json", "--publish", "--name=robot1=0000000000000001"]).ready();
-        front.await_published(&mut listener, &[Topic::Zones]);
-        let mut say = |verdict: Verdict| {
+        front.wait_until_published(&mut listener, &[Topic::Zones]);
+        let mut send_verdict = |verdict: Verdict| {
             front.send(Topic::Zones, &Zones { verdict: verdict as u8, ..Zones::unknown() });
         };
         // Others see what is said as it is said.
         let leds = |hold: &[&str]| {
             let before = env.subscribers("robot1.front/zones");
             let program = env.start(&[&["leds", "robot1.front", "--json"], hold].concat());
-            until("it follows", || env.subscribers("robot1.front/zones") > before);
+            wait_until("it follows", || env.subscribers("robot1.front/zones") > before);
             program
         };
         let (mut usual, mut long, mut none) = (leds(&[]), leds(&["--hold=1h"]), leds(&["--hold=0s"]));
-        say(Verdict::Stop);
+        send_verdict(Verdict::Stop);
         let is =
             |verdict: &'static str| move |line: &Value| is_class("leds")(line) && line["verdict"] == verdict;
         for program in [&mut usual, &mut long, &mut none] {
             program.await_line("stop at once, whatever the hold", is("stop"));
         }
-        let said_ns = now_ns();
+        let sent_ns = now_ns();
         let mut shown = Value::Null;
         // The verdict is valid while it is repeated.
-        until("clear when it has stood", || {
-            say(Verdict::Clear);
+        wait_until("clear when it has stood", || {
+            send_verdict(Verdict::Clear);
             usual.printed(is("clear")).map(|line| shown = line).is_some()
         });
         none.await_line("clear at once", is("clear"));
-        let stood_ns = number(&shown, "stamp_ns") - said_ns;
-        assert!(stood_ns > 250_000_000, "it had stood for {} ms", stood_ns / 1_000_000);
+        let valid_ns = number(&shown, "stamp_ns") - sent_ns;
+        assert!(valid_ns > 250_000_000, "it had stood for {} ms", valid_ns / 1_000_000);
         let outcome = long.end(INT);
         let verdicts: Vec<_> = outcome.of_class("leds").iter().map(|line| line["verdict"].clone()).collect();
         assert_eq!(verdicts, ["unknown", "stop", "unknown"], "at the end nobody watches: {outcome}");
-        assert_eq!((usual.end(INT).code, none.end(INT).code), (Some(0), Some(0)));
+        assert_eq!((usual.end(INT).exit_code, none.end(INT).exit_code), (Some(0), Some(0)));
     });
 }
 
 #[test]
-fn what_is_no_light_is_refused() {
+fn rejects_unknown_leds_and_sensors() {
     let env = TestEnv::new();
-    let diodes = Diodes::new(&env);
+    let diodes = FakeLeds::new(&env);
     let [root, _] = diodes.flags();
     for (sensor, led, what) in [
         ("front", "red=nd", "has no light \"nd\""),
@@ -268,7 +269,7 @@ fn what_is_no_light_is_refused() {
     ] {
         let outcome = env.run(&["leds", sensor, "--json", &root, "--led", led]);
         let error = &outcome.of_class("error")[0];
-        assert_eq!((outcome.code, &error["kind"]), (Some(78), &"configuration".into()), "{outcome}");
+        assert_eq!((outcome.exit_code, &error["kind"]), (Some(78), &"configuration".into()), "{outcome}");
         assert!(error["message"].as_str().is_some_and(|message| message.contains(what)), "{outcome}");
         assert!(error["hint"].as_str().is_some_and(|hint| !hint.is_empty()), "{outcome}");
     }
@@ -281,10 +282,13 @@ fn what_is_no_light_is_refused() {
     // One that was taken before another was refused shows the stop light.
     assert_eq!(fs::read_to_string(diodes.0.join("rd/brightness")).unwrap(), "255\n");
     // As with all that follow: bounded needs a hub, and a hub knows its sensors.
-    assert_eq!(env.run(&["leds", "front", "--for=1s"]).code, Some(3));
+    assert_eq!(env.run(&["leds", "front", "--for=1s"]).exit_code, Some(3));
     let _hub = env.hub(&[env.link("front")]);
     let unknown = env.run(&["leds", "side", "--json"]);
-    assert_eq!((unknown.code, &unknown.of_class("error")[0]["hint"]), (Some(3), &"there are front".into()));
+    assert_eq!(
+        (unknown.exit_code, &unknown.of_class("error")[0]["hint"]),
+        (Some(3), &"there are front".into())
+    );
 }
 
 #[test]
@@ -296,11 +300,11 @@ fn on_a_terminal_one_line_is_drawn_over_itself() {
         command.env_remove("NO_COLOR").envs(no_color.map(|value| ("NO_COLOR", value)));
         command.stdin(Stdio::null()).stderr(Stdio::null()).stdout(Stdio::from(screen));
         let mut process = spawn(command).unwrap();
-        let mut seen = Vec::new();
+        let mut printed = Vec::new();
         // A terminal that nobody has open any more ends by an error.
-        let _ = keys.read_to_end(&mut seen);
+        let _ = keys.read_to_end(&mut printed);
         assert_eq!(process.wait().unwrap().code(), Some(3));
-        let text = String::from_utf8(seen).unwrap();
+        let text = String::from_utf8(printed).unwrap();
         assert!(text.starts_with("\r\x1b[K\x1b[?7lfront"), "{text:?}");
         assert!(text.contains(colour) && text.ends_with("unknown\x1b[?7h\r\n"), "{text:?}");
         assert_eq!(text.matches('\n').count(), 1, "{text:?}");

@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use crate::testkit;
 use crate::testkit::{
-    INT, KILL, Program, Sender, TERM, TestEnv, in_a_network, in_own_process, is_class, number, sequence,
-    until,
+    INT, KILL, Program, TERM, TestEnv, TestGateway, contiguous_numbers, in_a_network, in_own_process,
+    is_class, number, wait_until,
 };
 use rustix::process::Signal;
 use scanhub_client::Subscriber;
@@ -18,7 +18,7 @@ use scanhub_shm::Payload;
 use serde_json::Value;
 
 /// What a consumer that is killed holds its samples of: the domain's name and where it is.
-const HOLD: [&str; 2] = ["SCANHUB_TEST_DOMAIN", "SCANHUB_TEST_BASE"];
+const HOLD_VARIABLES: [&str; 2] = ["SCANHUB_TEST_DOMAIN", "SCANHUB_TEST_BASE"];
 
 /// A hub with a recording of many minutes that has a scan every `period_ms`: slow enough that whoever loses one was not
 /// just kept waiting by a busy machine.
@@ -31,26 +31,26 @@ fn streaming(env: &TestEnv, period_ms: u32, flags: &[&str]) -> Program {
     env.hub(&[&["--link", &format!("front=file:{file}")], flags].concat())
 }
 
-fn subscribe(place: &Domain) -> Subscriber<Scan> {
-    Subscriber::builder("front").in_domain(place).timeout(Duration::from_secs(20)).open().expect("a name")
+fn subscribe(domain: &Domain) -> Subscriber<Scan> {
+    Subscriber::builder("front").in_domain(domain).timeout(Duration::from_secs(20)).open().expect("a name")
 }
 
 /// Subscribes `count` consumers and receives until each has `wanted` scans: what they missed between them, in all.
-fn follow(place: &Domain, count: usize, wanted: usize) -> u64 {
-    let mut consumers: Vec<_> = (0..count).map(|_| (subscribe(place), 0, 0)).collect();
-    while consumers.iter().any(|(_, received, _)| *received < wanted) {
-        for (consumer, received, missed) in &mut consumers {
-            while let Some(scan) = consumer.try_next().expect("works") {
+fn count_missed(domain: &Domain, count: usize, sample_count: usize) -> u64 {
+    let mut subscribers: Vec<_> = (0..count).map(|_| (subscribe(domain), 0, 0)).collect();
+    while subscribers.iter().any(|(_, received, _)| *received < sample_count) {
+        for (subscriber, received, missed) in &mut subscribers {
+            while let Some(scan) = subscriber.try_next().expect("works") {
                 assert!(!scan.restarted);
                 (*received, *missed) = (*received + 1, *missed + scan.missed);
             }
         }
         // The next one comes for all at the same time.
-        let (consumer, received, missed) = &mut consumers[0];
-        let scan = consumer.next().expect("works").expect("comes");
+        let (subscriber, received, missed) = &mut subscribers[0];
+        let scan = subscriber.next().expect("works").expect("comes");
         (*received, *missed) = (*received + 1, *missed + scan.missed);
     }
-    consumers.iter().map(|(.., missed)| missed).sum()
+    subscribers.iter().map(|(.., missed)| missed).sum()
 }
 
 #[test]
@@ -59,76 +59,69 @@ fn forty_consumers_lose_nothing() {
         let env = TestEnv::new();
         let hub = streaming(&env, 100, &["--set=limits.subscribers=41"]);
         let mut echo = env.echo(&["front/scan"]);
-        let place = env.place();
+        let domain = env.domain();
         let threads: Vec<_> = (0..4)
             .map(|_| {
-                let place = place.clone();
-                thread::spawn(move || follow(&place, 10, 40))
+                let place = domain.clone();
+                thread::spawn(move || count_missed(&place, 10, 40))
             })
             .collect();
         let missed: Vec<_> = threads.into_iter().map(|thread| thread.join().expect("no panic")).collect();
         assert_eq!(missed, [0; 4]);
         echo.await_lines(10, "a scan", is_class("scan"));
         let outcome = echo.end(INT);
-        sequence(&outcome.of_class("scan"), "topic_seq");
+        contiguous_numbers(&outcome.of_class("scan"), "topic_seq");
         assert_eq!(env.info("front")["counters"]["loan_failed"], 0);
-        assert_eq!(hub.end(TERM).code, Some(0));
+        assert_eq!(hub.end(TERM).exit_code, Some(0));
     });
 }
 
 #[test]
-fn more_consumers_than_there_are_places_are_refused_with_the_limit() {
-    in_own_process(
-        "limits_consumers::more_consumers_than_there_are_places_are_refused_with_the_limit",
-        || {
-            let env = TestEnv::new();
-            let hub = env.hub(&[env.link("front"), "--set=limits.subscribers=3".to_owned()]);
-            let node = scanhub_shm::client_node(&env.place()).expect("joins");
-            let topic = Scan::open(&node, "front").expect("works").expect("is there");
-            let subscribers: Vec<_> =
-                (0..3).map(|_| Scan::subscriber(&node, &topic).expect("a place")).collect();
-            assert_eq!(env.subscribers("front/scan"), 3);
-            let outcome = env.run(&["echo", "front/scan", "--json"]);
-            let error = &outcome.of_class("error")[0];
-            assert_eq!((outcome.code, &error["kind"]), (Some(75), &"short".into()), "{outcome}");
-            assert_eq!(
-                error["message"],
-                "scanhub/v2/front/scan has 3 subscribers, the most that are possible"
-            );
-            assert!(error["hint"].to_string().contains("limits.subscribers, up to 250"), "{error}");
-            // The other topics are not concerned.
-            assert_eq!(env.info("front")["state"], "absent");
-            drop(subscribers);
-            let late = env.echo(&["front/scan"]);
-            assert_eq!(late.end(INT).code, Some(0));
-            assert_eq!(hub.end(TERM).code, Some(0));
-        },
-    );
+fn reports_configured_limit_to_surplus_subscriber() {
+    in_own_process("limits_consumers::reports_configured_limit_to_surplus_subscriber", || {
+        let env = TestEnv::new();
+        let hub = env.hub(&[env.link("front"), "--set=limits.subscribers=3".to_owned()]);
+        let node = scanhub_shm::client_node(&env.domain()).expect("joins");
+        let topic = Scan::open(&node, "front").expect("works").expect("is there");
+        let subscribers: Vec<_> = (0..3).map(|_| Scan::subscriber(&node, &topic).expect("a place")).collect();
+        assert_eq!(env.subscribers("front/scan"), 3);
+        let outcome = env.run(&["echo", "front/scan", "--json"]);
+        let error = &outcome.of_class("error")[0];
+        assert_eq!((outcome.exit_code, &error["kind"]), (Some(75), &"short".into()), "{outcome}");
+        assert_eq!(error["message"], "scanhub/v2/front/scan has 3 subscribers, the most that are possible");
+        assert!(error["hint"].to_string().contains("limits.subscribers, up to 250"), "{error}");
+        // The other topics are not concerned.
+        assert_eq!(env.info("front")["state"], "absent");
+        drop(subscribers);
+        let late = env.echo(&["front/scan"]);
+        assert_eq!(late.end(INT).exit_code, Some(0));
+        assert_eq!(hub.end(TERM).exit_code, Some(0));
+    });
 }
 
 #[test]
-fn a_consumer_without_a_place_is_told_the_flag() {
-    in_a_network("limits_consumers::a_consumer_without_a_place_is_told_the_flag", || {
+fn refusal_on_a_remote_topic_names_the_listener_flag() {
+    in_a_network("limits_consumers::refusal_on_a_remote_topic_names_the_listener_flag", || {
         let env = TestEnv::new();
-        let mut sender = Sender::new(0x5f3a_12bc_00d1_e2f3, 7, 3, "front");
+        let mut sender = TestGateway::new(0x5f3a_12bc_00d1_e2f3, 7, 3, "front");
         let flags = ["listen", "--json", "--publish", "--subscribers=2", "--name=robot1=5f3a12bc00d1e2f3"];
         let mut program = env.start(&flags).ready();
-        sender.await_published(&mut program, &[Topic::Zones, Topic::Status]);
-        let node = scanhub_shm::client_node(&env.place()).expect("joins");
+        sender.wait_until_published(&mut program, &[Topic::Zones, Topic::Status]);
+        let node = scanhub_shm::client_node(&env.domain()).expect("joins");
         let topic = Zones::open(&node, "robot1.front").expect("works").expect("is there");
         let subscribers = [(); 2].map(|()| Zones::subscriber(&node, &topic).expect("a place"));
         let outcome = env.run(&["echo", "robot1.front/zones", "--json"]);
         let error = &outcome.of_class("error")[0];
-        assert_eq!((outcome.code, &error["kind"]), (Some(75), &"short".into()), "{outcome}");
+        assert_eq!((outcome.exit_code, &error["kind"]), (Some(75), &"short".into()), "{outcome}");
         assert!(error["message"].as_str().is_some_and(|text| text.contains("has 2 subscribers")), "{error}");
         assert!(error["hint"].as_str().is_some_and(|text| text.contains("greater --subscribers")), "{error}");
         drop((subscribers, topic, node));
-        assert_eq!(program.end(TERM).code, Some(0));
+        assert_eq!(program.end(TERM).exit_code, Some(0));
     });
 }
 
 #[test]
-fn a_stopped_consumer_knows_what_it_missed_and_nobody_else_misses_anything() {
+fn only_a_stopped_subscriber_misses_samples() {
     let env = TestEnv::new();
     let hub = streaming(&env, 50, &[]);
     let (mut stopped, mut other) = (env.echo(&["front/scan"]), env.echo(&["front/scan"]));
@@ -144,61 +137,72 @@ fn a_stopped_consumer_knows_what_it_missed_and_nobody_else_misses_anything() {
     let summary = &stopped.of_class("summary")[0];
     let at = |scan: &Value| number(scan, "topic_seq");
     let published = at(&scans[scans.len() - 1]) - at(&scans[0]) + 1;
-    let told: u64 = notices.iter().map(|notice| number(notice, "missed")).sum();
-    assert_eq!((number(summary, "received"), number(summary, "missed")), (scans.len() as u64, told));
-    assert_eq!(scans.len() as u64 + told, published);
-    sequence(&other.of_class("scan"), "topic_seq");
+    let reported: u64 = notices.iter().map(|notice| number(notice, "missed")).sum();
+    assert_eq!((number(summary, "received"), number(summary, "missed")), (scans.len() as u64, reported));
+    assert_eq!(scans.len() as u64 + reported, published);
+    contiguous_numbers(&other.of_class("scan"), "topic_seq");
     assert_eq!(other.of_class("summary")[0]["missed"], 0);
-    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
 }
 
 #[test]
 fn killed_consumers_that_held_samples_leave_nothing() {
-    if let [Ok(domain), Ok(base)] = HOLD.map(std::env::var) {
-        return hold(&Domain::at(&domain, base.as_ref()).expect("a place"));
+    if let [Ok(domain), Ok(base)] = HOLD_VARIABLES.map(std::env::var) {
+        return hold_samples(&Domain::at(&domain, base.as_ref()).expect("a place"));
     }
     let env = TestEnv::new();
     let hub = streaming(&env, 50, &[]);
     let mut echo = env.echo(&["front/scan"]);
     let descriptors = || fs::read_dir(format!("/proc/{}/fd", hub.pid())).expect("lives").count();
-    let place = env.place();
-    let segments = || testkit::shared_memory(&place.prefix()).len();
+    let hub_domain = env.domain();
+    let segments = || testkit::shared_memory(&hub_domain.prefix()).len();
     let (open_before, segments_before) = (descriptors(), segments());
     // Were their samples lost, the hub would have none left.
-    const { assert!(KILLS * HELD * limits::BORROWED > limits::samples(Topic::Scan, 32)) };
-    for _ in 0..KILLS {
+    const {
+        assert!(
+            KILL_COUNT * SUBSCRIBERS_PER_PROCESS * limits::MAX_BORROWED_SAMPLES
+                > limits::sample_count(Topic::Scan, 32)
+        )
+    };
+    for _ in 0..KILL_COUNT {
         let mut holder = std::process::Command::new(testkit::own_program());
-        holder.args(testkit::only("limits_consumers::killed_consumers_that_held_samples_leave_nothing"));
-        holder.env(HOLD[0], place.name()).env(HOLD[1], place.root().parent().expect("a base"));
+        holder.args(testkit::single_test_args(
+            "limits_consumers::killed_consumers_that_held_samples_leave_nothing",
+        ));
+        holder
+            .env(HOLD_VARIABLES[0], hub_domain.name())
+            .env(HOLD_VARIABLES[1], hub_domain.root().parent().expect("a base"));
         let mut holder = Program::start(holder);
-        holder.await_text("holding");
-        assert_eq!(holder.end(KILL).code, None);
+        holder.wait_for_text("holding");
+        assert_eq!(holder.end(KILL).exit_code, None);
     }
     // Before there may have been more of them: whoever asked how many consumers there are was just leaving.
-    until("the hub is as before", || descriptors() <= open_before && segments() <= segments_before);
+    wait_until("the hub is as before", || descriptors() <= open_before && segments() <= segments_before);
     echo.await_lines(40, "a scan", is_class("scan"));
     assert_eq!(env.info("front")["counters"]["loan_failed"], 0);
     let outcome = echo.end(INT);
-    sequence(&outcome.of_class("scan"), "topic_seq");
+    contiguous_numbers(&outcome.of_class("scan"), "topic_seq");
     assert_eq!(outcome.of_class("summary")[0]["missed"], 0);
-    assert_eq!(hub.end(TERM).code, Some(0));
-    assert!(env.left_behind().is_empty(), "{:?}", env.left_behind());
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
+    assert!(env.leftover_files().is_empty(), "{:?}", env.leftover_files());
 }
 
 /// Takes all the samples that it may hold, says so, and stays.
-fn hold(place: &Domain) {
-    let node = scanhub_shm::client_node(place).expect("joins");
+fn hold_samples(domain: &Domain) {
+    let node = scanhub_shm::client_node(domain).expect("joins");
     let topic = Scan::open(&node, "front").expect("works").expect("is there");
-    let mut consumers = Vec::new();
+    let mut subscribers = Vec::new();
     // Those that were killed before have their places until the hub looks after them.
-    until("places", || {
-        consumers.extend(Scan::subscriber(&node, &topic));
-        consumers.len() == HELD
+    wait_until("places", || {
+        subscribers.extend(Scan::subscriber(&node, &topic));
+        subscribers.len() == SUBSCRIBERS_PER_PROCESS
     });
     let mut held = Vec::new();
-    for consumer in &consumers {
-        for _ in 0..limits::BORROWED {
-            until("a scan", || Scan::receive(consumer).expect("works").map(|scan| held.push(scan)).is_some());
+    for subscriber in &subscribers {
+        for _ in 0..limits::MAX_BORROWED_SAMPLES {
+            wait_until("a scan", || {
+                Scan::receive(subscriber).expect("works").map(|scan| held.push(scan)).is_some()
+            });
         }
     }
     println!("\nholding {}", held.len());
@@ -207,6 +211,6 @@ fn hold(place: &Domain) {
     }
 }
 
-const KILLS: usize = 20;
+const KILL_COUNT: usize = 20;
 /// Consumers in each process that is killed.
-const HELD: usize = 12;
+const SUBSCRIBERS_PER_PROCESS: usize = 12;

@@ -4,18 +4,18 @@
 use std::process::Command;
 
 use crate::testkit::{
-    INT, Outcome, Program, TERM, TestEnv, in_a_network, is_class, number, output, sequence, side_by_side,
-    until,
+    INT, Outcome, Program, TERM, TestEnv, contiguous_numbers, in_a_network, is_class, number, output,
+    run_concurrently, wait_until,
 };
 use rustix::process::{Pid, Resource, Rlimit, getrlimit, prlimit};
 
 /// Starts the program with room for `limit` descriptors, besides those that it inherits.
-fn limited<S: AsRef<str>>(env: &TestEnv, limit: u64, arguments: &[S]) -> Program {
+fn start_limited<S: AsRef<str>>(env: &TestEnv, limit: u64, arguments: &[S]) -> Program {
     let inner = env.command(arguments);
     let mut command = Command::new("sh");
     // The process that runs the tests may have left some open. A shell can close only those with one digit.
     let closed = "exec 3<&- 4<&- 5<&- 6<&- 7<&- 8<&- 9<&-";
-    let limit = limit + inherited();
+    let limit = limit + inherited_descriptors();
     let script = format!("{closed} && ulimit -n \"$0\" && exec \"$@\"");
     command.args(["-c", &script, &limit.to_string()]);
     command.arg(inner.get_program()).args(inner.get_args());
@@ -25,16 +25,16 @@ fn limited<S: AsRef<str>>(env: &TestEnv, limit: u64, arguments: &[S]) -> Program
 }
 
 /// Returns the number of descriptors from 10 on that a child of this process inherits.
-fn inherited() -> u64 {
+fn inherited_descriptors() -> u64 {
     let mut shell = Command::new("sh");
     shell.args(["-c", "for fd in /proc/$$/fd/*; do echo ${fd##*/}; done"]);
     let listed = String::from_utf8(output(shell).expect("a shell").stdout).expect("numbers");
     listed.lines().filter(|fd| fd.parse::<u32>().is_ok_and(|fd| fd > 9)).count() as u64
 }
 
-fn is_short(outcome: &Outcome) {
-    assert_eq!(outcome.code, Some(75), "{outcome}");
-    let text = outcome.errors.clone() + &String::from_utf8_lossy(&outcome.out);
+fn assert_out_of_descriptors(outcome: &Outcome) {
+    assert_eq!(outcome.exit_code, Some(75), "{outcome}");
+    let text = outcome.stderr.clone() + &String::from_utf8_lossy(&outcome.stdout);
     assert!(text.contains("descriptors are short: ") || text.contains("Too many open files"), "{outcome}");
     assert!(!text.contains("panicked"), "{outcome}");
 }
@@ -44,12 +44,12 @@ fn a_hub_starts_or_says_how_many_it_needs() {
     let env = TestEnv::new();
     let run = ["run", "--json", &env.link("front")];
     for limit in [6, 8, 12, 16, 24, 32, 40, 48] {
-        is_short(&limited(&env, limit, &run).wait());
+        assert_out_of_descriptors(&start_limited(&env, limit, &run).wait());
     }
     for limit in [88, 96, 128] {
-        let hub = limited(&env, limit, &run).ready();
+        let hub = start_limited(&env, limit, &run).ready();
         assert_eq!(env.info("front")["state"], "absent", "{limit}");
-        assert_eq!(hub.end(TERM).code, Some(0), "{limit}");
+        assert_eq!(hub.end(TERM).exit_code, Some(0), "{limit}");
     }
 }
 
@@ -66,20 +66,20 @@ fn a_client_works_or_says_how_many_it_needs() {
     ];
     for limit in [5, 6, 8, 10] {
         // Nor does one wait for a hub that it cannot see.
-        is_short(&limited(&env, limit, &["echo", "front/status"]).wait());
+        assert_out_of_descriptors(&start_limited(&env, limit, &["echo", "front/status"]).wait());
     }
-    side_by_side(verbs, |verb| {
+    run_concurrently(verbs, |verb| {
         for limit in [5, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30, 32, 64] {
-            let mut outcome = limited(&env, limit, verb).wait();
-            until("the hub answers in time, however busy the machine is", || {
-                let is_late = outcome.code == Some(3);
+            let mut outcome = start_limited(&env, limit, verb).wait();
+            wait_until("the hub answers in time, however busy the machine is", || {
+                let is_late = outcome.exit_code == Some(3);
                 if is_late {
-                    outcome = limited(&env, limit, verb).wait();
+                    outcome = start_limited(&env, limit, verb).wait();
                 }
                 !is_late
             });
-            if outcome.code != Some(0) {
-                is_short(&outcome);
+            if outcome.exit_code != Some(0) {
+                assert_out_of_descriptors(&outcome);
                 assert!(limit < 64, "{outcome}");
             }
         }
@@ -87,40 +87,40 @@ fn a_client_works_or_says_how_many_it_needs() {
 }
 
 #[test]
-fn a_hub_that_runs_out_of_them_serves_on_whom_it_serves() {
+fn hub_out_of_descriptors_keeps_serving_subscribers() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--seed=51", "--baud=500000"]);
-    let hub = limited(&env, 88, &["run", "--json", &env.link("front")]).ready();
+    let hub = start_limited(&env, 88, &["run", "--json", &env.link("front")]).ready();
     let mut served = env.echo(&["front/scan", "front/status"]);
     served.await_lines(20, "a scan", is_class("scan"));
     let others: Vec<_> = (0..16).map(|_| env.start(&["echo", "--json", "front/scan"])).collect();
     // Who is attached also ends by a signal as it should.
-    until("all are attached", || env.subscribers("front/scan") == 17);
-    let tells = |line: &serde_json::Value| {
+    wait_until("all are attached", || env.subscribers("front/scan") == 17);
+    let reports_shortage = |line: &serde_json::Value| {
         line["class"] == "status"
             && line["last_error"].as_str().is_some_and(|error| error.contains("attached but get nothing"))
     };
-    served.await_line("that others get nothing", tells);
+    served.await_line("that others get nothing", reports_shortage);
     served.await_lines(20, "a scan", is_class("scan"));
-    let asked = env.run(&["control", "front", "resync", "--json"]);
-    let error = &asked.of_class("error")[0];
-    assert_eq!((asked.code, &error["kind"]), (Some(3), &"timeout".into()), "{asked}");
+    let refused = env.run(&["control", "front", "resync", "--json"]);
+    let error = &refused.of_class("error")[0];
+    assert_eq!((refused.exit_code, &error["kind"]), (Some(3), &"timeout".into()), "{refused}");
     assert_eq!(error["message"], "the hub did not answer for front in 5 s");
     for other in others {
-        assert_eq!(other.end(INT).code, Some(0));
+        assert_eq!(other.end(INT).exit_code, Some(0));
     }
     // Who comes now is served again.
-    until("there is room again", || env.run(&["info", "front"]).code == Some(0));
+    wait_until("there is room again", || env.run(&["info", "front"]).exit_code == Some(0));
     served.await_line("that all get something", |line| line["class"] == "status" && line["last_error"] == "");
-    assert_eq!(env.run(&["echo", "front/scan", "-n", "5", "--timeout", "9s"]).code, Some(0));
+    assert_eq!(env.run(&["echo", "front/scan", "-n", "5", "--timeout", "9s"]).exit_code, Some(0));
     let outcome = served.end(INT);
-    sequence(&outcome.of_class("scan"), "topic_seq");
+    contiguous_numbers(&outcome.of_class("scan"), "topic_seq");
     let summaries = outcome.of_class("summary");
     assert!(summaries.iter().all(|summary| number(summary, "missed") == 0), "{summaries:?}");
     let outcome = hub.end(TERM);
-    assert_eq!(outcome.code, Some(0), "{outcome}");
-    assert!(outcome.errors.contains("attached but get nothing"), "{outcome}");
-    assert!(outcome.errors.contains("a request was not received: descriptors are short: "), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
+    assert!(outcome.stderr.contains("attached but get nothing"), "{outcome}");
+    assert!(outcome.stderr.contains("a request was not received: descriptors are short: "), "{outcome}");
 }
 
 #[test]
@@ -132,11 +132,11 @@ fn a_listener_that_runs_out_of_them_listens_on() {
         let maximum = getrlimit(Resource::Nofile).maximum;
         let none = Rlimit { current: Some(0), maximum };
         let usual = prlimit(pid, Resource::Nofile, none).expect("it may have fewer");
-        let told = listener.await_line("what is wrong", |line| line["kind"] == "problem");
-        assert!(told["message"].to_string().contains("cannot list network interfaces"), "{told}");
+        let notice = listener.await_line("what is wrong", |line| line["kind"] == "problem");
+        assert!(notice["message"].to_string().contains("cannot list network interfaces"), "{notice}");
         prlimit(pid, Resource::Nofile, usual).expect("as before");
         let outcome = listener.end(TERM);
-        assert_eq!(outcome.code, Some(0), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(0), "{outcome}");
         assert_eq!(outcome.of_class("notice").len(), 1, "{outcome}");
     });
 }

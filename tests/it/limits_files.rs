@@ -14,7 +14,7 @@ use scanhub_schema::file::ENCODING;
 
 /// Runs the program with all its address space in 90 MB, of which some 23 are itself, and in two seconds of processor
 /// time, which a program that is not optimized needs for what takes a second.
-fn bounded(env: &TestEnv, arguments: &[&str]) -> Outcome {
+fn run_bounded(env: &TestEnv, arguments: &[&str]) -> Outcome {
     let own = env.command(arguments);
     let mut command = Command::new("sh");
     command.args(["-c", "ulimit -v 96000 && ulimit -t 2 && exec \"$0\" \"$@\""]).arg(own.get_program());
@@ -29,10 +29,10 @@ fn bounded(env: &TestEnv, arguments: &[&str]) -> Outcome {
     Program::start(command).wait()
 }
 
-fn refused(env: &TestEnv, arguments: &[&str], code: i32, words: &str) {
-    let outcome = bounded(env, arguments);
-    assert_eq!(outcome.code, Some(code), "{arguments:?}: {outcome}");
-    assert!(outcome.errors.contains(words), "{arguments:?}: {outcome}");
+fn assert_refused(env: &TestEnv, arguments: &[&str], code: i32, words: &str) {
+    let outcome = run_bounded(env, arguments);
+    assert_eq!(outcome.exit_code, Some(code), "{arguments:?}: {outcome}");
+    assert!(outcome.stderr.contains(words), "{arguments:?}: {outcome}");
 }
 
 /// A pipe that nobody writes to.
@@ -42,7 +42,7 @@ fn pipe(env: &TestEnv) -> String {
     path.display().to_string()
 }
 
-fn packed(env: &TestEnv, name: &str, content: &[u8]) -> String {
+fn gzip_file(env: &TestEnv, name: &str, content: &[u8]) -> String {
     let mut encoder = GzEncoder::new(Vec::new(), Compression::best());
     encoder.write_all(content).expect("memory");
     env.file(name, encoder.finish().expect("memory"))
@@ -69,7 +69,7 @@ fn channel(id: u16, topic: &str, encoding: &str) -> Vec<u8> {
 }
 
 #[test]
-fn what_is_no_regular_file_is_not_waited_for() {
+fn rejects_devices_pipes_and_directories_at_once() {
     let env = TestEnv::new();
     let pipe = pipe(&env);
     for (path, words) in
@@ -91,7 +91,7 @@ fn what_is_no_regular_file_is_not_waited_for() {
         ] {
             // What a configuration names is a value of it.
             let code = if arguments.contains(&model.as_str()) { 78 } else { 66 };
-            refused(&env, arguments, code, words);
+            assert_refused(&env, arguments, code, words);
         }
     }
     // Stdin is what it is: a file is read, a pipe is not.
@@ -101,14 +101,14 @@ fn what_is_no_regular_file_is_not_waited_for() {
         Program::start_with(command, stdin).wait()
     };
     let taken = check(std::fs::File::open(&file).expect("it was written").into());
-    assert_eq!((taken.code, &taken.out[..]), (Some(0), &b"ok: 1 link: a at x\n"[..]), "{taken}");
+    assert_eq!((taken.exit_code, &taken.stdout[..]), (Some(0), &b"ok: 1 link: a at x\n"[..]), "{taken}");
     let outcome = check(std::process::Stdio::piped());
-    assert_eq!(outcome.code, Some(66), "{outcome}");
-    assert!(outcome.errors.contains("/dev/stdin: it is a pipe, not a regular file"), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(66), "{outcome}");
+    assert!(outcome.stderr.contains("/dev/stdin: it is a pipe, not a regular file"), "{outcome}");
 }
 
 #[test]
-fn what_unpacks_to_far_more_than_it_is_is_refused() {
+fn rejects_decompression_bombs() {
     let env = TestEnv::new();
     let long = |len: usize| {
         record(
@@ -116,24 +116,29 @@ fn what_unpacks_to_far_more_than_it_is_is_refused() {
             &[&[0; 16][..], &text("a"), &text("b"), &(len as u64).to_le_bytes(), &vec![0; len + 4]].concat(),
         )
     };
-    let bomb = packed(&env, "bomb.mcap.gz", &mcap(&[long(100 << 20)]));
-    let zeros = packed(&env, "zeros.bin.gz", &vec![0; 100 << 20]);
-    refused(&env, &["convert", &zeros, &env.word("x.mcap")], 66, "there is no telegram in it");
+    let bomb = gzip_file(&env, "bomb.mcap.gz", &mcap(&[long(100 << 20)]));
+    let zeros = gzip_file(&env, "zeros.bin.gz", &vec![0; 100 << 20]);
+    assert_refused(
+        &env,
+        &["convert", &zeros, &env.path_argument("x.mcap")],
+        66,
+        "there is no telegram in it",
+    );
     let telegrams: Vec<u8> = (0..100).flat_map(testkit::scan).collect();
-    let stream = packed(&env, "stream.bin.gz", &[&telegrams[..], &vec![0; 100 << 20]].concat());
+    let stream = gzip_file(&env, "stream.bin.gz", &[&telegrams[..], &vec![0; 100 << 20]].concat());
     for file in [&bomb, &stream] {
-        refused(
+        assert_refused(
             &env,
-            &["convert", file, &env.word("x.mcap")],
+            &["convert", file, &env.path_argument("x.mcap")],
             66,
             "unpacks to more than 400 times its length",
         );
-        refused(&env, &["replay", file], 66, "`zcat FILE > WHOLE`");
+        assert_refused(&env, &["replay", file], 66, "`zcat FILE > WHOLE`");
     }
 }
 
 #[test]
-fn a_chunk_that_is_too_long_is_told_and_others_are_read() {
+fn reads_long_chunks_up_to_the_limit() {
     let env = TestEnv::new();
     let chunk = |len: usize| {
         let content = record(5, &vec![0; len]);
@@ -141,57 +146,57 @@ fn a_chunk_that_is_too_long_is_told_and_others_are_read() {
         record(6, &[&[0; 16][..], &size, &[0; 4], &text(""), &size, &content].concat())
     };
     let whole = env.file("whole.mcap", mcap(&[channel(0, "t", "cdr"), chunk(7 << 20), chunk(7 << 20)]));
-    let copy = env.word("copy.mcap");
-    let outcome = bounded(&env, &["convert", &whole, &copy, "--compression", "none"]);
-    assert_eq!((outcome.code, outcome.errors.contains("missing")), (Some(0), false), "{outcome}");
+    let copy = env.path_argument("copy.mcap");
+    let outcome = run_bounded(&env, &["convert", &whole, &copy, "--compression", "none"]);
+    assert_eq!((outcome.exit_code, outcome.stderr.contains("missing")), (Some(0), false), "{outcome}");
     assert!(std::fs::metadata(&copy).expect("it was written").len() > 14 << 20);
     let long = env.file("long.mcap", mcap(&[channel(0, "t", "cdr"), chunk(20 << 20)]));
-    refused(&env, &["convert", &long, &copy, "--force"], 66, "it has a chunk of 20 MB; at most 8");
-    refused(&env, &["convert", &long, &copy, "--force"], 66, "mcap filter");
+    assert_refused(&env, &["convert", &long, &copy, "--force"], 66, "it has a chunk of 20 MB; at most 8");
+    assert_refused(&env, &["convert", &long, &copy, "--force"], 66, "mcap filter");
 }
 
 #[test]
-fn as_many_channels_as_there_are_numbers_are_read_at_once() {
+fn reads_60000_channels_within_the_limits() {
     let env = TestEnv::new();
     let channels = |topic: fn(u16) -> String, encoding| -> Vec<_> {
         (0..60_000).map(|id| channel(id, &topic(id), encoding)).collect()
     };
-    let copy = env.word("copy.mcap");
+    let copy = env.path_argument("copy.mcap");
     for (name, is_whole) in [("whole.mcap", true), ("cut.mcap", false)] {
         let cut = |mut file: Vec<u8>| {
             file.truncate(file.len() - if is_whole { 0 } else { 30 });
             file
         };
         let ours = env.file(name, cut(mcap(&channels(|id| format!("s{id}/telegram"), ENCODING))));
-        refused(&env, &["convert", &ours, &copy, "--force"], 66, "it names more than 4096 sensors");
-        refused(&env, &["replay", &ours], 66, "it names more than 4096 sensors");
+        assert_refused(&env, &["convert", &ours, &copy, "--force"], 66, "it names more than 4096 sensors");
+        assert_refused(&env, &["replay", &ours], 66, "it names more than 4096 sensors");
         let others = env.file(name, cut(mcap(&channels(|id| format!("t{id}"), "cdr"))));
-        let outcome = bounded(&env, &["convert", &others, &copy, "--force", "--compression", "none"]);
-        assert_eq!(outcome.code, Some(0), "{outcome}");
+        let outcome = run_bounded(&env, &["convert", &others, &copy, "--force", "--compression", "none"]);
+        assert_eq!(outcome.exit_code, Some(0), "{outcome}");
         let some = channels(|id| format!("s{}/telegram", id % 4000), ENCODING);
         let some = env.file(name, cut(mcap(&some)));
-        let outcome = bounded(&env, &["convert", &some, &copy, "--force", "--compression", "none"]);
-        assert_eq!(outcome.code, Some(0), "{outcome}");
-        refused(&env, &["replay", &some], 78, "more than 256 links");
+        let outcome = run_bounded(&env, &["convert", &some, &copy, "--force", "--compression", "none"]);
+        assert_eq!(outcome.exit_code, Some(0), "{outcome}");
+        assert_refused(&env, &["replay", &some], 78, "more than 256 links");
     }
 }
 
 #[test]
-fn more_links_than_a_hub_can_have_are_refused_at_the_first_of_them() {
+fn rejects_surplus_links_at_the_first_one() {
     let env = TestEnv::new();
     let links = |count: u32| -> String {
         (0..count).map(|n| format!("[[link]]\nname = \"s{n}\"\nport = \"/dev/x{n}\"\n")).collect()
     };
-    let most = env.file("most.toml", links(256));
-    let outcome = bounded(&env, &["config", "check", &most]);
-    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let max_links = env.file("most.toml", links(256));
+    let outcome = run_bounded(&env, &["config", "check", &max_links]);
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let more = env.file("more.toml", links(11_000));
-    refused(&env, &["config", "check", &more], 78, "more.toml:770:8: more than 256 links");
+    assert_refused(&env, &["config", "check", &more], 78, "more.toml:770:8: more than 256 links");
     let far_more = env.file("far-more.toml", links(20_000));
-    refused(&env, &["config", "check", &far_more], 66, "it is longer than 524288 bytes");
+    assert_refused(&env, &["config", "check", &far_more], 66, "it is longer than 524288 bytes");
     // Values of which each has a place of its own.
     let sectors = "{from_deg=1.0,to_deg=2.0,range=0.1},".repeat(13_000);
     let sectors = format!("{}[zones]\nbody_mask = [{sectors}]\n", links(2));
-    let outcome = bounded(&env, &["config", "check", &env.file("sectors.toml", sectors)]);
-    assert!(matches!(outcome.code, Some(0 | 78)), "{outcome}");
+    let outcome = run_bounded(&env, &["config", "check", &env.file("sectors.toml", sectors)]);
+    assert!(matches!(outcome.exit_code, Some(0 | 78)), "{outcome}");
 }

@@ -6,16 +6,17 @@ use std::io::{ErrorKind, Write};
 use std::process::Command;
 
 use crate::testkit::{
-    INT, Outcome, TERM, TestEnv, is_class, only, own_program, run_again, sequence, skip, status, succeeds,
+    INT, Outcome, TERM, TestEnv, contiguous_numbers, is_class, own_program, rerun_test, single_test_args,
+    skip, status, succeeds,
 };
 use rustix::process::Signal;
 
 /// Where the namespace is made: the test that shall run in it.
-const INSIDE: &str = "SCANHUB_TEST_INSIDE";
+const NAMESPACE_VARIABLE: &str = "SCANHUB_TEST_INSIDE";
 
 /// Runs `test`, which is called `name`, in a mount namespace of its own; says so if the system does not allow that.
 fn in_a_namespace(name: &str, test: impl FnOnce()) {
-    if std::env::var_os(INSIDE).is_some() {
+    if std::env::var_os(NAMESPACE_VARIABLE).is_some() {
         return test();
     }
     let mut unshare = Command::new("unshare");
@@ -29,8 +30,8 @@ fn in_a_namespace(name: &str, test: impl FnOnce()) {
         skip("mounts", "this user may not make a mount namespace");
         return;
     }
-    unshare.arg(own_program()).args(only(name)).env(INSIDE, "1");
-    run_again(name, unshare);
+    unshare.arg(own_program()).args(single_test_args(name)).env(NAMESPACE_VARIABLE, "1");
+    rerun_test(name, unshare);
 }
 
 /// A new and empty /dev/shm of so many bytes.
@@ -45,8 +46,8 @@ fn unmount() {
 }
 
 /// Takes all of /dev/shm but so many bytes.
-fn fill(left: u64) {
-    let mut file = File::create(FILL).expect("an empty file needs no memory");
+fn fill(remaining: u64) {
+    let mut file = File::create(FILL_FILE).expect("an empty file needs no memory");
     let mut len = 0;
     loop {
         match file.write(&[0xFF; 4096]) {
@@ -55,40 +56,41 @@ fn fill(left: u64) {
             Err(error) => panic!("{error}"),
         }
     }
-    file.set_len(len.saturating_sub(left)).expect("is cut");
+    file.set_len(len.saturating_sub(remaining)).expect("is cut");
 }
 
 /// Gives all of it back; the file may be gone with its /dev/shm.
 fn free() {
-    if let Ok(file) = OpenOptions::new().write(true).open(FILL) {
+    if let Ok(file) = OpenOptions::new().write(true).open(FILL_FILE) {
         file.set_len(0).expect("is cut");
     }
 }
 
-const FILL: &str = "/dev/shm/fill";
+const FILL_FILE: &str = "/dev/shm/fill";
 
 /// Ended in order, or said that memory is short.
-fn done_or_short(outcome: &Outcome) {
-    match outcome.code {
+fn assert_done_or_out_of_memory(outcome: &Outcome) {
+    match outcome.exit_code {
         Some(0) => {}
-        Some(75) => assert!(outcome.errors.contains("shared memory is"), "{outcome}"),
+        Some(75) => assert!(outcome.stderr.contains("shared memory is"), "{outcome}"),
         _ => panic!("{outcome}"),
     }
 }
 
 #[test]
-fn a_hub_starts_or_says_what_it_needs() {
-    in_a_namespace("limits_memory::a_hub_starts_or_says_what_it_needs", || {
+fn hub_starts_or_reports_the_memory_it_needs() {
+    in_a_namespace("limits_memory::hub_starts_or_reports_the_memory_it_needs", || {
         let env = TestEnv::new();
         let run = ["run".to_owned(), "--json".to_owned(), env.lms_link("front")];
         let short = |bytes: u64| {
             mount(bytes);
             let outcome = env.run(&run);
             unmount();
-            assert_eq!((outcome.code, outcome.out.is_empty()), (Some(75), true), "{outcome}");
+            assert_eq!((outcome.exit_code, outcome.stdout.is_empty()), (Some(75), true), "{outcome}");
             let free = format!("shared memory is short: /dev/shm: {} kB free, ", bytes / 1024);
-            let said = outcome.errors.split_once(&free).unwrap_or_else(|| panic!("{outcome}")).1;
-            let needed = said.split_once(" kB needed").and_then(|(number, _)| number.parse::<u64>().ok());
+            let rest_of_message = outcome.stderr.split_once(&free).unwrap_or_else(|| panic!("{outcome}")).1;
+            let needed =
+                rest_of_message.split_once(" kB needed").and_then(|(number, _)| number.parse::<u64>().ok());
             needed.unwrap_or_else(|| panic!("{outcome}")) * 1024
         };
         let needed = short(16 << 10);
@@ -104,16 +106,16 @@ fn a_hub_starts_or_says_what_it_needs() {
             mount(bytes);
             let hub = env.hub(&[env.lms_link("front")]);
             assert_eq!(env.info("front")["state"], "absent");
-            assert_eq!(hub.end(TERM).code, Some(0));
-            assert!(env.left_behind().is_empty(), "{:?}", env.left_behind());
+            assert_eq!(hub.end(TERM).exit_code, Some(0));
+            assert!(env.leftover_files().is_empty(), "{:?}", env.leftover_files());
             unmount();
         }
     });
 }
 
 #[test]
-fn memory_that_is_full_stops_nobody_who_is_there() {
-    in_a_namespace("limits_memory::memory_that_is_full_stops_nobody_who_is_there", || {
+fn full_memory_does_not_stop_attached_subscribers() {
+    in_a_namespace("limits_memory::full_memory_does_not_stop_attached_subscribers", || {
         mount(8 << 20);
         let env = TestEnv::new();
         let _simulator = env.simulator(&["front"], &["--seed=41", "--baud=500000"]);
@@ -134,26 +136,26 @@ fn memory_that_is_full_stops_nobody_who_is_there() {
                 let outcome = env.run(&[verb, &["--json"]].concat());
                 let lines = outcome.lines();
                 let error = lines.last().unwrap_or_else(|| panic!("{outcome}"));
-                assert_eq!((outcome.code, &error["kind"]), (Some(75), &"short".into()), "{outcome}");
+                assert_eq!((outcome.exit_code, &error["kind"]), (Some(75), &"short".into()), "{outcome}");
                 let message = error["message"].as_str().unwrap_or_default();
                 assert!(message.starts_with("shared memory is short: /dev/shm: "), "{outcome}");
             }
             scans.await_lines(20, "a scan", is_class("scan"));
             free();
             assert_eq!(env.info("front")["state"], "streaming");
-            assert_eq!(env.run(&["echo", "front/scan", "-n", "5"]).code, Some(0));
+            assert_eq!(env.run(&["echo", "front/scan", "-n", "5"]).exit_code, Some(0));
         }
         let outcome = scans.end(INT);
-        sequence(&outcome.of_class("scan"), "topic_seq");
+        contiguous_numbers(&outcome.of_class("scan"), "topic_seq");
         assert_eq!(outcome.of_class("summary")[0]["missed"], 0);
         assert_eq!(env.info("front")["counters"]["loan_failed"], 0);
-        assert_eq!(hub.end(TERM).code, Some(0));
+        assert_eq!(hub.end(TERM).exit_code, Some(0));
     });
 }
 
 #[test]
-fn consumers_that_come_together_where_little_is_left_end_in_order() {
-    in_a_namespace("limits_memory::consumers_that_come_together_where_little_is_left_end_in_order", || {
+fn concurrent_clients_end_cleanly_with_little_memory() {
+    in_a_namespace("limits_memory::concurrent_clients_end_cleanly_with_little_memory", || {
         mount(8 << 20);
         let env = TestEnv::new();
         let hub = env.hub(&[env.lms_link("front")]);
@@ -165,14 +167,14 @@ fn consumers_that_come_together_where_little_is_left_end_in_order() {
             let together: Vec<_> = (0..8).map(|_| env.start(&words)).collect();
             for program in together {
                 let outcome = program.wait();
-                done_or_short(&outcome);
-                short += usize::from(outcome.code == Some(75));
+                assert_done_or_out_of_memory(&outcome);
+                short += usize::from(outcome.exit_code == Some(75));
             }
             free();
         }
         assert!(short >= 24, "memory was never short: {short}");
         assert_eq!(env.info("front")["state"], "absent");
-        assert_eq!(hub.end(TERM).code, Some(0));
+        assert_eq!(hub.end(TERM).exit_code, Some(0));
     });
 }
 
@@ -181,19 +183,19 @@ fn a_bus_error_has_a_last_line() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--seed=42", "--baud=500000"]);
     let hub = env.hub(&[env.lms_link("front")]);
-    let mut consumer = env.start(&["echo", "--json", "front/scan"]);
-    consumer.await_lines(3, "a scan", is_class("scan"));
-    for (program, on_stdout) in [(hub, false), (consumer, true)] {
+    let mut subscriber = env.start(&["echo", "--json", "front/scan"]);
+    subscriber.await_lines(3, "a scan", is_class("scan"));
+    for (program, on_stdout) in [(hub, false), (subscriber, true)] {
         let outcome = program.end(Signal::BUS);
         let error = if on_stdout {
             outcome.lines().pop()
         } else {
-            outcome.errors.lines().last().and_then(|line| serde_json::from_str(line).ok())
+            outcome.stderr.lines().last().and_then(|line| serde_json::from_str(line).ok())
         };
         let error = error.unwrap_or_else(|| panic!("{outcome}"));
-        assert_eq!((outcome.code, &error["kind"]), (Some(75), &"short".into()), "{outcome}");
+        assert_eq!((outcome.exit_code, &error["kind"]), (Some(75), &"short".into()), "{outcome}");
         assert!(error["message"].as_str().is_some_and(|message| message.contains("full")), "{outcome}");
     }
     let outcome = env.hub(&[env.lms_link("front")]).end(Signal::BUS);
-    assert_eq!(outcome.code, Some(75), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(75), "{outcome}");
 }

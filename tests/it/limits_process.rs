@@ -9,7 +9,7 @@ use crate::testkit::{Outcome, Program, TERM, TestEnv, spawn};
 use rustix::process::{Pid, kill_process};
 
 /// Starts the program with at most this, in the words of ulimit.
-fn limited<S: AsRef<str>>(env: &TestEnv, limit: &str, arguments: &[S]) -> Program {
+fn start_limited<S: AsRef<str>>(env: &TestEnv, limit: &str, arguments: &[S]) -> Program {
     let inner = env.command(arguments);
     let mut command = Command::new("sh");
     command.args(["-c", &format!("ulimit {limit} && exec \"$0\" \"$@\"")]);
@@ -19,14 +19,14 @@ fn limited<S: AsRef<str>>(env: &TestEnv, limit: &str, arguments: &[S]) -> Progra
     Program::start(command)
 }
 
-fn is_short(outcome: &Outcome, words: &str) {
-    assert_eq!(outcome.code, Some(75), "{outcome}");
-    let text = outcome.errors.clone() + &String::from_utf8_lossy(&outcome.out);
+fn assert_out_of_resources(outcome: &Outcome, words: &str) {
+    assert_eq!(outcome.exit_code, Some(75), "{outcome}");
+    let text = outcome.stderr.clone() + &String::from_utf8_lossy(&outcome.stdout);
     assert!(text.contains(words), "{outcome}");
 }
 
 #[test]
-fn a_hub_without_address_space_leaves_no_segment_behind() {
+fn hub_short_of_address_space_leaves_no_segment() {
     let env = TestEnv::new();
     let (mut short, mut is_up) = (0, false);
     // Until one has room; the first ones cannot even be loaded.
@@ -52,7 +52,7 @@ fn a_hub_without_address_space_leaves_no_segment_behind() {
         } else if short > 0 {
             assert_eq!((is_up, outcome.status.code()), (true, Some(0)), "{limit}: {errors}");
         }
-        assert_eq!(env.left_behind(), Vec::<PathBuf>::new(), "{limit}: {errors}");
+        assert_eq!(env.leftover_files(), Vec::<PathBuf>::new(), "{limit}: {errors}");
         if is_up {
             break;
         }
@@ -61,21 +61,30 @@ fn a_hub_without_address_space_leaves_no_segment_behind() {
 }
 
 #[test]
-fn files_that_may_not_be_as_long_as_a_segment_are_told() {
+fn reports_a_file_size_limit_below_segment_size() {
     let env = TestEnv::new();
     let words = "files are too short: ";
     for limit in ["1", "64", "250"] {
         let limit = format!("-f {limit}");
-        is_short(&limited(&env, &limit, &["run", "--json", &env.link("front")]).wait(), words);
-        assert_eq!(env.left_behind(), Vec::<PathBuf>::new());
+        assert_out_of_resources(
+            &start_limited(&env, &limit, &["run", "--json", &env.link("front")]).wait(),
+            words,
+        );
+        assert_eq!(env.leftover_files(), Vec::<PathBuf>::new());
     }
     let hub = env.hub(&[env.link("front")]);
-    for verb in [&["record", "-o", &env.word("walk.mcap")][..], &["info", "front"], &["echo", "front/status"]]
-    {
-        is_short(&limited(&env, "-f 1", verb).wait(), words);
+    for verb in [
+        &["record", "-o", &env.path_argument("walk.mcap")][..],
+        &["info", "front"],
+        &["echo", "front/status"],
+    ] {
+        assert_out_of_resources(&start_limited(&env, "-f 1", verb).wait(), words);
     }
-    assert_eq!(hub.end(TERM).code, Some(0));
-    let file = env.word("none.mcap");
-    is_short(&limited(&env, "-f 0", &["record", "-o", &file]).wait(), "cannot record into");
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
+    let file = env.path_argument("none.mcap");
+    assert_out_of_resources(
+        &start_limited(&env, "-f 0", &["record", "-o", &file]).wait(),
+        "cannot record into",
+    );
     assert!(!env.path("none.mcap").exists());
 }

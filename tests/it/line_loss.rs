@@ -1,21 +1,21 @@
 //! A line that loses bytes: hub and clients say how much of the stream that costs, as the simulator has it.
 
-use crate::testkit::{INT, TERM, TestEnv, is_class, number, until};
+use crate::testkit::{INT, TERM, TestEnv, is_class, number, wait_until};
 
 /// What the paper found on a line of theirs.
-const BURSTS: &str = "--fault=loss=0.00135,burst=1.89";
+const BURST_FAULTS: &str = "--fault=loss=0.00135,burst=1.89";
 
 #[test]
 fn a_line_that_loses_is_seen_everywhere() {
     let env = TestEnv::new();
-    let flags = ["--baud=500000", "--state=streaming", "--seed=5", BURSTS];
+    let flags = ["--baud=500000", "--state=streaming", "--seed=5", BURST_FAULTS];
     let simulator = env.simulator(&["front"], &flags);
     let hub = env.hub(&[env.link("front")]);
-    let mut consumer = env.start(&["hz", "--json", "front/scan"]);
+    let mut subscriber = env.start(&["hz", "--json", "front/scan"]);
     let leds = env.start(&["leds", "front", "--json"]);
     env.await_info("front", |info| number(&info["counters"], "due_on_line") > 30);
     let begin = env.info("front");
-    let begun = env.truth("front").len();
+    let first_sent = env.truth("front").len();
     let mut statuses = env.echo(&["front/status"]);
     // Ten seconds and more on any machine.
     for due in [200, 400] {
@@ -26,41 +26,41 @@ fn a_line_that_loses_is_seen_everywhere() {
     }
     let end = env.info("front");
     // A status is of this second, and what is missing is lost a second later.
-    let sent = &env.truth("front")[begun..];
+    let sent = &env.truth("front")[first_sent..];
     let damaged = sent.iter().filter(|sent| sent.fault.is_some()).count() as f64;
     let grown = |name: &str| number(&end["counters"], name) as f64 - number(&begin["counters"], name) as f64;
     let (lost, due) = (grown("lost_on_line"), grown("due_on_line"));
     let (share, truth) = (lost / due, damaged / sent.len() as f64);
     println!("{lost} of {due} lost, {damaged} of {} in truth", sent.len());
     assert!(due > 350.0 && (share - truth).abs() < 0.1, "{share} instead of {truth}: {end}");
-    let told = end["damaged"].as_f64().unwrap_or_default();
-    assert!((0.3..0.55).contains(&told), "{end}");
+    let damaged_share = end["damaged"].as_f64().unwrap_or_default();
+    assert!((0.3..0.55).contains(&damaged_share), "{end}");
     assert_eq!(number(&end, "lost_on_line"), number(&end["counters"], "lost_on_line"));
 
     let text = env.run(&["info", "front"]).to_string();
     assert!(text.contains("of the bytes damaged") && text.contains("of the scans lost in 10 s"), "{text}");
-    let outcome = env.run(&["doctor", &env.word("front"), "--json"]);
+    let outcome = env.run(&["doctor", &env.path_argument("front"), "--json"]);
     let checks = outcome.of_class("check");
     let check = checks.iter().find(|check| check["name"] == "line-loss").expect("it is looked at");
     assert_eq!(check["state"], "warning", "{check}");
     let found = check["finding"].as_str().unwrap_or_default();
     assert!(found.contains(" % lost on the line; "), "{check}");
 
-    let line = consumer.await_line("a rate with losses", |line| {
+    let line = subscriber.await_line("a rate with losses", |line| {
         line["class"] == "hz" && line["lost_on_line"].as_u64() > Some(50)
     });
     assert!(line["missed"] == 0 && line["damaged"].as_f64() > Some(0.3), "{line}");
-    let outcome = consumer.end(INT);
+    let outcome = subscriber.end(INT);
     let [summary] = &outcome.of_class("summary")[..] else { panic!("{outcome}") };
     assert!(summary["lost_on_line"].as_u64() > Some(50), "{summary}");
     assert!((0.3..0.55).contains(&summary["damaged"].as_f64().unwrap_or_default()), "{summary}");
     let outcome = leds.end(INT);
-    let is_told = |line: &serde_json::Value| {
+    let has_reason = |line: &serde_json::Value| {
         line["reason"].as_str().is_some_and(|reason| reason.ends_with(" % lost on the line"))
     };
-    assert!(outcome.of_class("leds").iter().any(is_told), "{outcome}");
-    assert_eq!(hub.end(TERM).code, Some(0));
-    assert_eq!(simulator.end(INT).code, Some(0));
+    assert!(outcome.of_class("leds").iter().any(has_reason), "{outcome}");
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
+    assert_eq!(simulator.end(INT).exit_code, Some(0));
 }
 
 #[test]
@@ -69,20 +69,20 @@ fn a_line_that_is_well_says_so_from_the_first_second() {
     let simulator = env.simulator(&["front"], &["--baud=9600", "--seed=5"]);
     let hub = env.hub(&[env.link("front")]);
     let info = env.await_info("front", |info| number(&info["counters"], "due_on_line") > 60);
-    let outcome = env.run(&["doctor", &env.word("front"), "--json"]);
+    let outcome = env.run(&["doctor", &env.path_argument("front"), "--json"]);
     let checks = outcome.of_class("check");
     let check = checks.iter().find(|check| check["name"] == "line-loss").expect("it is looked at");
     // A simulated sensor stands still while a busy machine does not run it, and the hub then counts scans as lost.
     let lost = number(&env.info("front")["counters"], "lost_on_line");
     assert!(check["state"] == "ok" || lost > 0, "{check}");
     assert_eq!(info["damaged"], 0.0, "{info}");
-    assert_eq!(hub.end(TERM).code, Some(0));
-    assert_eq!(simulator.end(INT).code, Some(0));
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
+    assert_eq!(simulator.end(INT).exit_code, Some(0));
 }
 
 /// Replies arrive now and then, but hardly ever a scan.
 #[test]
-fn a_line_that_damages_all_scans_is_reported_before_another_scanner() {
+fn line_that_damages_all_scans_is_reported() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--seed=5", "--fault=loss=0.02,burst=1"]);
     let hub = env.hub(&[format!("{},family=lms", env.link("front"))]);
@@ -93,13 +93,14 @@ fn a_line_that_damages_all_scans_is_reported_before_another_scanner() {
         "{info}"
     );
     let is_found = || {
-        let outcome = env.run(&["doctor", &env.word("front"), "--json"]);
+        let outcome = env.run(&["doctor", &env.path_argument("front"), "--json"]);
         let checks = outcome.of_class("check");
         let check = checks.iter().find(|check| check["name"] == "line-loss").expect("it is looked at");
         check["state"] == "failed" && check["finding"].to_string().contains("were in no intact telegram")
     };
-    until("doctor finds it, while the hub looks for the scanner", is_found);
-    let is_told = || env.run(&["info", "front"]).to_string().contains("bytes were in no intact telegram");
-    until("info says it, while the hub looks for the scanner", is_told);
-    assert_eq!(hub.end(TERM).code, Some(0));
+    wait_until("doctor finds it, while the hub looks for the scanner", is_found);
+    let info_reports =
+        || env.run(&["info", "front"]).to_string().contains("bytes were in no intact telegram");
+    wait_until("info says it, while the hub looks for the scanner", info_reports);
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
 }

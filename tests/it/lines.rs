@@ -1,29 +1,30 @@
 //! The topic `lines`, from a line to consumers: of every family, found only while somebody follows, by the keys of a link.
 
-use crate::testkit::{INT, TERM, TestEnv, accounted, is_class, number};
+use crate::testkit::{INT, TERM, TestEnv, checked_topic_seqs, is_class, number};
 use serde_json::Value;
 
-const STREAM: [&str; 2] = ["--seed=51", "--baud=500000"];
+const STREAM_FLAGS: [&str; 2] = ["--seed=51", "--baud=500000"];
 
 fn list<'a>(line: &'a Value, key: &str) -> &'a [Value] {
     line[key].as_array().unwrap_or_else(|| panic!("no {key}: {line}"))
 }
 
 #[test]
-fn lines_come_while_they_are_followed_and_as_the_link_says() {
+fn lines_are_published_with_settings_of_each_link() {
     let env = TestEnv::new();
     let set = ["--set=lines.refine=true", "--set=link.rear.lines.max=2"].map(str::to_owned);
     let hub = env.hub(&[&[env.link("front"), env.link("rear")], &set[..]].concat());
-    let simulator = env.simulator(&["front", "rear"], &STREAM);
+    let simulator = env.simulator(&["front", "rear"], &STREAM_FLAGS);
     env.await_info("front", |info| info["state"] == "streaming");
     // The topic exists before it has a subscriber.
     let topics = env.run(&["list", "--json"]);
     let topic = |line: &&Value| line["topic"] == "lines" && line["sensor"] == "front";
     let topic = topics.lines().iter().find(topic).cloned().unwrap_or_else(|| panic!("{topics}"));
     assert_eq!((&topic["payload"], number(&topic, "subscribers")), (&"scanhub.Lines.v2".into(), 0));
-    let mut consumers =
+    let mut subscribers =
         [&["front/scan", "front/lines"], &["rear/scan", "rear/lines"]].map(|topics| env.echo(topics));
-    let found = consumers.each_mut().map(|consumer| consumer.await_lines(20, "lines", is_class("lines")));
+    let found =
+        subscribers.each_mut().map(|subscriber| subscriber.await_lines(20, "lines", is_class("lines")));
     for line in &found[0] {
         assert!(number(line, "points") > 200 && line["overflow"] == false, "{line}");
         assert!(list(line, "lines").len() > 2 && !list(line, "corners").is_empty(), "{line}");
@@ -31,8 +32,8 @@ fn lines_come_while_they_are_followed_and_as_the_link_says() {
         assert!((0.001..0.03).contains(&noise_m), "{line}");
     }
     assert!(found[1].iter().all(|line| list(line, "lines").len() <= 2 && line["overflow"] == true));
-    for consumer in consumers {
-        let outcome = consumer.end(INT);
+    for subscriber in subscribers {
+        let outcome = subscriber.end(INT);
         let seqs = |class| {
             let lines = outcome.of_class(class);
             lines.iter().map(|line| number(line, "seq")).collect::<Vec<_>>()
@@ -40,11 +41,11 @@ fn lines_come_while_they_are_followed_and_as_the_link_says() {
         // Each scan has its lines, under the same number.
         let (of_lines, of_scans) = (seqs("lines"), seqs("scan"));
         assert!(of_lines.iter().filter(|seq| of_scans.contains(seq)).count() > 10, "{outcome}");
-        accounted(&outcome, "scan");
-        accounted(&outcome, "lines");
+        checked_topic_seqs(&outcome, "scan");
+        checked_topic_seqs(&outcome, "lines");
     }
     assert_eq!(number(&env.info("front")["counters"], "loan_failed"), 0);
-    assert_eq!((hub.end(TERM).code, simulator.end(TERM).code), (Some(0), Some(0)));
+    assert_eq!((hub.end(TERM).exit_code, simulator.end(TERM).exit_code), (Some(0), Some(0)));
 }
 
 #[test]

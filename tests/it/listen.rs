@@ -5,21 +5,21 @@ use std::io::Read;
 use std::time::Duration;
 
 use crate::testkit::{
-    self, INT, Outcome, Program, Sender, TestEnv, in_a_network, is_class, let_pass, number, skip, spawn,
-    succeeds, terminal, until, wall_ns,
+    self, INT, Outcome, Program, TestEnv, TestGateway, in_a_network, is_class, number, skip, spawn, succeeds,
+    terminal, wait_at_least, wait_until, wall_ns,
 };
-use scanhub_network::lan::WINDOW;
-use scanhub_schema::datagram::{DatagramError, HEAD};
+use scanhub_network::lan::WINDOW_LEN;
+use scanhub_schema::datagram::{DatagramError, HEADER_LEN};
 use scanhub_schema::{
     Background, BackgroundHead, Early, Foreground, Line, Lines, Mark, Marks, Motion, MotionMethod, Scan,
     ScanHead, State, Status, Topic, Verdict, Zones,
 };
 use serde_json::{Value, json};
 
-const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
+const HUB_ID: u64 = 0x5f3a_12bc_00d1_e2f3;
 
 /// A reply with the shortest status there is; its checksum is nobody's business here.
-const TELEGRAM: [u8; 9] = [0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A];
+const TELEGRAM_BYTES: [u8; 9] = [0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A];
 
 fn scan() -> Box<Scan> {
     Scan::of(ScanHead::lms(3, 0, 500, 10, 13), &[100, 0x1FFF, 300])
@@ -34,14 +34,14 @@ fn listener(env: &TestEnv, words: &[&str]) -> Program {
 }
 
 /// What the account says of these topics: received, lost, duplicate, reordered.
-fn account(outcome: &Outcome, epoch: u32, topic: &str) -> [u64; 4] {
+fn counters(outcome: &Outcome, epoch: u32, topic: &str) -> [u64; 4] {
     let lines = outcome.of_class("lan");
     let found: Vec<_> = lines.iter().filter(|it| it["epoch"] == epoch && it["topic"] == topic).collect();
     let [line] = found[..] else { panic!("not one line of {topic}: {outcome}") };
     ["received", "lost", "duplicate", "reordered"].map(|key| testkit::number(line, key))
 }
 
-fn refused(outcome: &Outcome) -> Value {
+fn refusals(outcome: &Outcome) -> Value {
     let mut lines = outcome.of_class("lan_refused");
     assert_eq!(lines.len(), 1, "{outcome}");
     lines.remove(0)
@@ -52,7 +52,7 @@ fn every_topic_is_a_line() {
     in_a_network("listen::every_topic_is_a_line", || {
         let env = TestEnv::new();
         let mut program = listener(&env, &[]);
-        let mut sender = Sender::new(HUB, 7, 2, "front");
+        let mut sender = TestGateway::new(HUB_ID, 7, 2, "front");
         sender.send(Topic::Zones, &zones(Verdict::Stop));
         let early = program.await_line("zones", is_class("zones"));
         assert_eq!((&early["sensor"], &early["age_ms"]), (&json!("#2"), &Value::Null));
@@ -72,8 +72,8 @@ fn every_topic_is_a_line() {
         let mut lines = Lines { count: 1, noise_m: 0.25, ..Lines::default() };
         lines.line_array[0] = Line { r_m: 1.5, last: 7, points: 8, ..Line::default() };
         let motion = Motion { dx_m: 0.5, method: MotionMethod::Both as u8, ..Motion::default() };
-        let telegram = sender.telegram(&TELEGRAM);
-        sender.throw(Topic::Telegram, &telegram);
+        let telegram = sender.next_telegram(&TELEGRAM_BYTES);
+        sender.send_bytes(Topic::Telegram, &telegram);
         sender.send(Topic::Scan, &*scan());
         sender.send(Topic::Marks, &marks);
         sender.send(Topic::Zones, &zones(Verdict::Slow));
@@ -85,7 +85,7 @@ fn every_topic_is_a_line() {
         sender.send(Topic::Status, &status);
         program.await_line("the last one", is_class("status"));
         let outcome = program.end(INT);
-        assert_eq!(outcome.code, Some(0), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(0), "{outcome}");
         let lines = outcome.lines();
         for topic in Topic::OF_LINKS {
             let of_topic: Vec<_> = lines.iter().filter(|line| line["class"] == topic.name()).collect();
@@ -115,7 +115,7 @@ fn every_topic_is_a_line() {
         );
         assert_eq!(line("status")["port"], "/dev/ttyUSB0");
         for (topic, received) in [("announce", 1), ("zones", 2), ("scan", 1), ("status", 1)] {
-            assert_eq!(account(&outcome, 7, topic), [received, 0, 0, 0], "{topic}");
+            assert_eq!(counters(&outcome, 7, topic), [received, 0, 0, 0], "{topic}");
         }
     });
 }
@@ -126,18 +126,18 @@ fn people_read_lines_too() {
         let env = TestEnv::new();
         let words = ["listen", "--interface=lo", "--topic=zones", "--name=robot1=5f3a12bc00d1e2f3", "-n2"];
         let program = env.start(&words);
-        let mut sender = Sender::new(HUB, 7, 0, "front");
+        let mut sender = TestGateway::new(HUB_ID, 7, 0, "front");
         // It does not say on stdout that it listens.
-        until("the group is joined", || igmp().contains("514CFFEF"));
+        wait_until("the group is joined", || igmp_memberships().contains("514CFFEF"));
         sender.announce(&[Topic::Zones]);
         sender.send(Topic::Marks, &Marks::default());
         sender.send(Topic::Zones, &zones(Verdict::Clear));
         sender.next[usize::from(Topic::Zones.number())] += 3;
         sender.send(Topic::Zones, &zones(Verdict::Stop));
         let outcome = program.wait();
-        let text = String::from_utf8_lossy(&outcome.out);
+        let text = String::from_utf8_lossy(&outcome.stdout);
         let lines: Vec<_> = text.lines().collect();
-        assert_eq!(outcome.code, Some(0), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(0), "{outcome}");
         assert!(lines[0].starts_with("robot1.front/zones seq 0 topic_seq 0 at "), "{outcome}");
         assert!(
             lines[0].contains(" clear nothing near") && lines[1].contains(" stop nothing near"),
@@ -149,19 +149,19 @@ fn people_read_lines_too() {
         let of_zones = rows.into_iter().find(|row| row.contains(&"front/zones") && row.len() == 7);
         assert_eq!(of_zones, Some(vec!["robot1", "7", "front/zones", "2", "3", "0", "0"]), "{outcome}");
         assert_eq!(lines.last(), Some(&"refused: none"), "{outcome}");
-        assert!(outcome.errors.contains("listening on lo"), "{outcome}");
-        assert!(outcome.errors.contains("robot1.front/zones: missed 3"), "{outcome}");
+        assert!(outcome.stderr.contains("listening on lo"), "{outcome}");
+        assert!(outcome.stderr.contains("robot1.front/zones: missed 3"), "{outcome}");
     });
 }
 
 /// The groups that this network namespace has joined, as the kernel lists them.
-fn igmp() -> String {
+fn igmp_memberships() -> String {
     std::fs::read_to_string("/proc/net/igmp").expect("the kernel has multicast")
 }
 
 /// How many of our groups were joined on `interface`.
-fn joined(interface: &str) -> usize {
-    let text = igmp();
+fn joined_groups(interface: &str) -> usize {
+    let text = igmp_memberships();
     let mut lines = text.lines().skip_while(|line| line.split_whitespace().nth(1) != Some(interface)).skip(1);
     let groups = lines.by_ref().take_while(|line| line.starts_with("\t\t"));
     groups.filter(|line| line.contains("4CFFEF")).count()
@@ -181,14 +181,14 @@ fn on_a_terminal_the_account_is_drawn_over_itself() {
         let null = std::process::Stdio::null;
         command.stdin(null()).stdout(screen).stderr(null());
         let mut process = spawn(command).expect("starts");
-        until("the groups are joined", || joined("lo") == 4);
-        Sender::new(HUB, 7, 0, "front").send(Topic::Zones, &zones(Verdict::Clear));
+        wait_until("the groups are joined", || joined_groups("lo") == 4);
+        TestGateway::new(HUB_ID, 7, 0, "front").send(Topic::Zones, &zones(Verdict::Clear));
         let mut text = String::new();
-        let mut read = |wanted: &str| {
+        let mut read = |expected: &str| {
             let mut bytes = [0; 4096];
-            while !text.contains(wanted) {
+            while !text.contains(expected) {
                 let len =
-                    keys.read(&mut bytes).unwrap_or_else(|error| panic!("no {wanted:?}: {error}: {text}"));
+                    keys.read(&mut bytes).unwrap_or_else(|error| panic!("no {expected:?}: {error}: {text}"));
                 text.push_str(&String::from_utf8_lossy(&bytes[..len]));
             }
         };
@@ -210,15 +210,15 @@ fn groups_are_joined_where_a_link_comes_or_comes_back() {
         let env = TestEnv::new();
         for words in [&["--interface=scan0"][..], &[]] {
             let program = listener(&env, words);
-            assert_eq!(joined("scan0"), 0, "it is down");
+            assert_eq!(joined_groups("scan0"), 0, "it is down");
             assert!(ip("link set scan0 up") && ip("link set far0 up"));
-            until("the groups are joined", || joined("scan0") == 4);
+            wait_until("the groups are joined", || joined_groups("scan0") == 4);
             assert!(ip("link set far0 down") && ip("link set far0 up"));
             assert!(ip("link del scan0") && make() && ip("link set scan0 up") && ip("link set far0 up"));
-            until("the groups are joined again", || joined("scan0") == 4);
-            assert_eq!(joined("lo"), if words.is_empty() { 4 } else { 0 });
+            wait_until("the groups are joined again", || joined_groups("scan0") == 4);
+            assert_eq!(joined_groups("lo"), if words.is_empty() { 4 } else { 0 });
             let outcome = program.end(INT);
-            assert_eq!((outcome.code, outcome.of_class("notice").len()), (Some(0), 0), "{outcome}");
+            assert_eq!((outcome.exit_code, outcome.of_class("notice").len()), (Some(0), 0), "{outcome}");
             assert!(ip("link set scan0 down"));
         }
     });
@@ -229,16 +229,17 @@ fn the_account_is_exact() {
     in_a_network("listen::the_account_is_exact", || {
         let env = TestEnv::new();
         let mut program = listener(&env, &["--topic=zones", "--topic=scan"]);
-        let mut sender = Sender::new(HUB, 7, 0, "front");
+        let mut sender = TestGateway::new(HUB_ID, 7, 0, "front");
         sender.announce(&[Topic::Zones, Topic::Scan, Topic::Telegram]);
         // Of 100 zones numbers 10, 11 and 50 are lost, 20 and 21 change places, 30 comes twice, and 40 after 45.
-        let datagrams: Vec<_> = (0..100).map(|_| sender.make(Topic::Zones, &zones(Verdict::Clear))).collect();
+        let datagrams: Vec<_> =
+            (0..100).map(|_| sender.next_datagram(Topic::Zones, &zones(Verdict::Clear))).collect();
         let mut order: Vec<usize> = (0..100).filter(|n| ![10, 11, 40, 50].contains(n)).collect();
         order.swap(18, 19);
         order.insert(order.iter().position(|&n| n == 30).unwrap(), 30);
         order.insert(order.iter().position(|&n| n == 46).unwrap(), 40);
         for n in order {
-            sender.throw(Topic::Zones, &datagrams[n]);
+            sender.send_bytes(Topic::Zones, &datagrams[n]);
         }
         // Two scans are lost before an announcement tells of them, and nobody asked for telegrams.
         sender.send(Topic::Scan, &*scan());
@@ -248,9 +249,9 @@ fn the_account_is_exact() {
         sender.send(Topic::Scan, &*scan());
         program.await_lines(2, "scans", is_class("scan"));
         let outcome = program.end(INT);
-        assert_eq!(account(&outcome, 7, "zones"), [97, 3, 1, 2], "{outcome}");
-        assert_eq!(account(&outcome, 7, "scan"), [2, 2, 0, 0], "{outcome}");
-        assert_eq!(account(&outcome, 7, "announce"), [2, 0, 0, 0], "{outcome}");
+        assert_eq!(counters(&outcome, 7, "zones"), [97, 3, 1, 2], "{outcome}");
+        assert_eq!(counters(&outcome, 7, "scan"), [2, 2, 0, 0], "{outcome}");
+        assert_eq!(counters(&outcome, 7, "announce"), [2, 0, 0, 0], "{outcome}");
         assert!(outcome.of_class("lan").iter().all(|line| line["topic"] != "telegram"), "{outcome}");
         let zones = outcome.of_class("zones");
         assert_eq!(zones.len(), 97);
@@ -267,19 +268,19 @@ fn the_account_is_exact() {
 }
 
 #[test]
-fn a_gateway_that_starts_again_and_a_second_hub_are_told_apart() {
-    in_a_network("listen::a_gateway_that_starts_again_and_a_second_hub_are_told_apart", || {
+fn counts_each_epoch_and_each_hub_separately() {
+    in_a_network("listen::counts_each_epoch_and_each_hub_separately", || {
         let env = TestEnv::new();
         let mut program = listener(&env, &["--topic=zones"]);
-        let mut first = Sender::new(HUB, 7, 0, "front");
-        let mut other = Sender::new(1, 3, 0, "front");
+        let mut first = TestGateway::new(HUB_ID, 7, 0, "front");
+        let mut other = TestGateway::new(1, 3, 0, "front");
         first.announce(&[Topic::Zones]);
         other.announce(&[Topic::Zones]);
         for _ in 0..3 {
             first.send(Topic::Zones, &zones(Verdict::Clear));
             other.send(Topic::Zones, &zones(Verdict::Stop));
         }
-        let mut again = Sender::new(HUB, 8, 0, "front");
+        let mut again = TestGateway::new(HUB_ID, 8, 0, "front");
         again.send(Topic::Zones, &zones(Verdict::Slow));
         first.send(Topic::Zones, &zones(Verdict::Clear));
         other.send(Topic::Zones, &zones(Verdict::Stop));
@@ -287,23 +288,23 @@ fn a_gateway_that_starts_again_and_a_second_hub_are_told_apart() {
             line["hub"] == "0000000000000001" && line["topic_seq"] == 3
         });
         let outcome = program.end(INT);
-        assert_eq!(account(&outcome, 7, "zones"), [3, 0, 0, 0], "{outcome}");
-        assert_eq!(account(&outcome, 8, "zones"), [1, 0, 0, 0], "{outcome}");
-        assert_eq!(account(&outcome, 3, "zones"), [4, 0, 0, 0], "{outcome}");
-        assert_eq!(refused(&outcome)["epoch"], 1, "{outcome}");
+        assert_eq!(counters(&outcome, 7, "zones"), [3, 0, 0, 0], "{outcome}");
+        assert_eq!(counters(&outcome, 8, "zones"), [1, 0, 0, 0], "{outcome}");
+        assert_eq!(counters(&outcome, 3, "zones"), [4, 0, 0, 0], "{outcome}");
+        assert_eq!(refusals(&outcome)["epoch"], 1, "{outcome}");
         let slow = outcome.of_class("zones").into_iter().find(|line| line["verdict"] == "slow");
         assert_eq!(slow.map(|line| line["sensor"].clone()), Some(json!("#0")), "not announced in this life");
     });
 }
 
 #[test]
-fn a_gateway_that_starts_ever_again_stays_heard_and_accounted_for() {
-    in_a_network("listen::a_gateway_that_starts_ever_again_stays_heard_and_accounted_for", || {
+fn counts_90_gateway_runs_in_a_bounded_table() {
+    in_a_network("listen::counts_90_gateway_runs_in_a_bounded_table", || {
         const RUNS: u64 = 90;
         let env = TestEnv::new();
         let mut program = listener(&env, &["--topic=zones"]);
         for epoch in 1..=RUNS {
-            let mut sender = Sender::new(HUB, epoch as u32, 0, "front");
+            let mut sender = TestGateway::new(HUB_ID, epoch as u32, 0, "front");
             sender.announce(&[Topic::Zones]);
             sender.send(Topic::Zones, &zones(Verdict::Clear));
             sender.next[usize::from(Topic::Zones.number())] += 2;
@@ -318,7 +319,7 @@ fn a_gateway_that_starts_ever_again_stays_heard_and_accounted_for() {
         let sum = |key| number(evicted, key) + lines.iter().map(|line| number(line, key)).sum::<u64>();
         // An announcement, and of four zones the first and the last.
         assert_eq!((sum("received"), sum("lost")), (3 * RUNS, 2 * RUNS), "{outcome}");
-        assert_eq!(refused(&outcome)["capacity"], 0, "{outcome}");
+        assert_eq!(refusals(&outcome)["capacity"], 0, "{outcome}");
         assert!(outcome.of_class("notice").iter().all(|line| line["kind"] == "missed"), "{outcome}");
     });
 }
@@ -328,50 +329,55 @@ fn each_refusal_has_its_reason() {
     in_a_network("listen::each_refusal_has_its_reason", || {
         let env = TestEnv::new();
         let mut program = listener(&env, &["--topic=zones"]);
-        let mut sender = Sender::new(HUB, 7, 0, "front");
+        let mut sender = TestGateway::new(HUB_ID, 7, 0, "front");
         sender.next[usize::from(Topic::Zones.number())] = 5000;
-        let good = sender.make(Topic::Zones, &zones(Verdict::Clear));
-        sender.throw(Topic::Zones, &good);
+        let good = sender.next_datagram(Topic::Zones, &zones(Verdict::Clear));
+        sender.send_bytes(Topic::Zones, &good);
         let with = |at: usize, byte: u8| {
             let mut bytes = good.clone();
             bytes[at] = byte;
             bytes
         };
-        for bad in
-            [&good[..HEAD - 1], &with(0, b'X'), &with(4, 1), &with(5, 47), &with(36, 0), &with(HEAD, 9)]
-        {
-            sender.throw(Topic::Zones, bad);
+        for bad in [
+            &good[..HEADER_LEN - 1],
+            &with(0, b'X'),
+            &with(4, 1),
+            &with(5, 47),
+            &with(36, 0),
+            &with(HEADER_LEN, 9),
+        ] {
+            sender.send_bytes(Topic::Zones, bad);
         }
         let number = usize::from(Topic::Zones.number());
         sender.epoch = 6;
         sender.send(Topic::Zones, &zones(Verdict::Clear));
-        (sender.epoch, sender.next[number]) = (7, 5000 - WINDOW as u32);
+        (sender.epoch, sender.next[number]) = (7, 5000 - WINDOW_LEN as u32);
         sender.send(Topic::Zones, &zones(Verdict::Clear));
         sender.next[number] = 5001;
-        Sender::new(HUB, 7, 0, "front").send(Topic::Zones, &zones(Verdict::Clear));
+        TestGateway::new(HUB_ID, 7, 0, "front").send(Topic::Zones, &zones(Verdict::Clear));
         // All the others deliver for a second.
-        let mut others: Vec<_> = (0..63).map(|hub| Sender::new(hub, 7, 0, "front")).collect();
+        let mut others: Vec<_> = (0..63).map(|hub| TestGateway::new(hub, 7, 0, "front")).collect();
         for wait_ms in [1100, 0] {
             sender.send(Topic::Zones, &zones(Verdict::Slow));
             others.iter_mut().for_each(|other| other.send(Topic::Zones, &zones(Verdict::Clear)));
-            let_pass(Duration::from_millis(wait_ms));
+            wait_at_least(Duration::from_millis(wait_ms));
         }
-        Sender::new(64, 7, 0, "front").send(Topic::Zones, &zones(Verdict::Clear));
-        sender.empty(255);
-        sender.empty(Topic::Zones.number());
+        TestGateway::new(64, 7, 0, "front").send(Topic::Zones, &zones(Verdict::Clear));
+        sender.send_empty(255);
+        sender.send_empty(Topic::Zones.number());
         sender.send(Topic::Zones, &zones(Verdict::Stop));
         program.await_line("the last one", |line| line["verdict"] == "stop");
         let outcome = program.end(INT);
-        let refused = refused(&outcome);
+        let refused = refusals(&outcome);
         for reason in DatagramError::ALL {
             // A listener without a key has no use for three of them.
-            const OF_KEYS: [DatagramError; 3] =
+            const KEY_ERRORS: [DatagramError; 3] =
                 [DatagramError::Unauthenticated, DatagramError::Mac, DatagramError::Untimely];
-            let expected = u64::from(!OF_KEYS.contains(&reason));
+            let expected = u64::from(!KEY_ERRORS.contains(&reason));
             assert_eq!(refused[reason.name()], expected, "{}: {outcome}", reason.name());
         }
         let keys: Vec<_> = DatagramError::ALL.iter().map(|reason| reason.name()).collect();
-        let line = String::from_utf8_lossy(&outcome.out);
+        let line = String::from_utf8_lossy(&outcome.stdout);
         let line = line.lines().last().unwrap_or_default();
         let places: Vec<_> = keys.iter().map(|key| line.find(&format!("\"{key}\""))).collect();
         assert!(places.iter().all(Option::is_some) && places.is_sorted(), "{line}");
@@ -379,23 +385,23 @@ fn each_refusal_has_its_reason() {
 }
 
 #[test]
-fn two_gateways_with_one_number_are_told_once() {
-    in_a_network("listen::two_gateways_with_one_number_are_told_once", || {
+fn reports_two_gateways_with_one_id_once() {
+    in_a_network("listen::reports_two_gateways_with_one_id_once", || {
         let env = TestEnv::new();
         let mut program = listener(&env, &["--topic=zones", "--stats"]);
         // Of the later life first: all of the earlier one are refused.
-        let mut gateways = [9, 7].map(|epoch| Sender::new(HUB, epoch, 0, "front"));
+        let mut gateways = [9, 7].map(|epoch| TestGateway::new(HUB_ID, epoch, 0, "front"));
         for _ in 0..80 {
             gateways.iter_mut().for_each(|gateway| gateway.send(Topic::Zones, &zones(Verdict::Clear)));
             // As far apart as they send: what comes in one moment is no second gateway.
-            let_pass(Duration::from_millis(50));
+            wait_at_least(Duration::from_millis(50));
         }
         let line = program.await_line("the remedy", |line| line["kind"] == "problem");
         let message = line["message"].as_str().unwrap_or_default();
-        assert!(message.contains(&format!("{HUB:016x}")) && message.contains("gateway-*"), "{line}");
+        assert!(message.contains(&format!("{HUB_ID:016x}")) && message.contains("gateway-*"), "{line}");
         let outcome = program.end(INT);
         assert_eq!(outcome.of_class("notice").len(), 1, "{outcome}");
-        assert_eq!(account(&outcome, 9, "zones"), [80, 0, 0, 0]);
-        assert_eq!(refused(&outcome)["epoch"], 80);
+        assert_eq!(counters(&outcome, 9, "zones"), [80, 0, 0, 0]);
+        assert_eq!(refusals(&outcome)["epoch"], 80);
     });
 }

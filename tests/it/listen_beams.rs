@@ -4,11 +4,13 @@
 
 use serde_json::{Value, json};
 
-use crate::testkit::{INT, Program, Sender, TERM, TestEnv, in_a_network, is_class, number, sequence};
-use scanhub_schema::{Contents, Family, MAX_BEAMS, Scan, ScanHead, Topic};
+use crate::testkit::{
+    INT, Program, TERM, TestEnv, TestGateway, contiguous_numbers, in_a_network, is_class, number,
+};
+use scanhub_schema::{ArrayFlags, Family, MAX_BEAMS, Scan, ScanHead, Topic};
 
 /// What both say of one scan, but for what is of the place where it was published.
-fn said(line: &Value) -> Vec<Value> {
+fn values_of_scan(line: &Value) -> Vec<Value> {
     let keys = [
         "seq",
         "boot",
@@ -63,7 +65,7 @@ fn turns_of_any_length_come_whole() {
             echo.await_lines(25, "scans", |line| is_there(line) && is_class("scan")(line));
             echo.await_lines(5, "a foreground", |line| is_there(line) && is_class("foreground")(line));
             // It is sent when it is new, and the listener keeps it for who comes later.
-            assert!(echo.has_said(is_model), "no model of {beams} beams");
+            assert!(echo.has_printed(is_model), "no model of {beams} beams");
             let outcome = echo.end(INT);
             for topic in ["scan", "foreground", "telegram"] {
                 let lines = outcome.of_class(topic);
@@ -76,7 +78,7 @@ fn turns_of_any_length_come_whole() {
                 let mut compared = 0;
                 for (far, near) in both {
                     compared += 1;
-                    assert_eq!(said(far), said(&near), "{topic}");
+                    assert_eq!(values_of_scan(far), values_of_scan(&near), "{topic}");
                     assert_eq!(
                         (&far["data"], &far["packets"], &far["beams"]),
                         (&near["data"], &near["packets"], &near["beams"])
@@ -89,7 +91,7 @@ fn turns_of_any_length_come_whole() {
                 assert!(compared >= 4, "{topic}: {compared}");
             }
         }
-        assert_eq!((gateway.end(TERM).code, hub.end(TERM).code), (Some(0), Some(0)));
+        assert_eq!((gateway.end(TERM).exit_code, hub.end(TERM).exit_code), (Some(0), Some(0)));
         let outcome = listener.end(TERM);
         assert!(outcome.of_class("lan").iter().all(|row| row["lost"] == 0), "{outcome}");
         let published = &outcome.of_class("lan_published")[0];
@@ -102,27 +104,27 @@ fn turns_of_any_length_come_whole() {
 }
 
 #[test]
-fn a_sender_who_asks_for_more_with_each_scan_gets_all_of_it_at_once() {
-    in_a_network("listen_beams::a_sender_who_asks_for_more_with_each_scan_gets_all_of_it_at_once", || {
+fn publishes_scans_that_grow_beam_by_beam() {
+    in_a_network("listen_beams::publishes_scans_that_grow_beam_by_beam", || {
         let env = TestEnv::new();
         let words = ["listen", "--json", "--publish", "--name=robot1=5f3a12bc00d1e2f3"];
         let mut listener = env.start(&words).ready();
-        let mut sender = Sender::new(0x5f3a_12bc_00d1_e2f3, 7, 3, "front");
+        let mut sender = TestGateway::new(0x5f3a_12bc_00d1_e2f3, 7, 3, "front");
         sender.family = Family::Ld;
-        sender.await_published(&mut listener, &[Topic::Scan]);
+        sender.wait_until_published(&mut listener, &[Topic::Scan]);
         let mut echo = env.echo(&["robot1.front/scan"]);
-        let turn = |beams: usize| {
-            let head = ScanHead { contents: Contents::ALL, ..ScanHead::turning(Family::Ld, beams) };
+        let revolution_of = |beams: usize| {
+            let head = ScanHead { contents: ArrayFlags::ALL, ..ScanHead::of_revolution(Family::Ld, beams) };
             Scan::of(head, &vec![1_234; beams])
         };
         let beams: Vec<usize> = (450..470).chain([MAX_BEAMS, 450]).collect();
         for &beams in &beams {
-            sender.send(Topic::Scan, &*turn(beams));
+            sender.send(Topic::Scan, &*revolution_of(beams));
             let line = echo.await_line("a scan", is_class("scan"));
             assert_eq!(line["count"], beams);
             assert_eq!(line["ranges"].as_array().map(Vec::len), Some(beams));
         }
-        sequence(&echo.end(INT).of_class("scan"), "topic_seq");
+        contiguous_numbers(&echo.end(INT).of_class("scan"), "topic_seq");
         let outcome = listener.end(TERM);
         let published = &outcome.of_class("lan_published")[0];
         assert_eq!(

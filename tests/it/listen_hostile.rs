@@ -1,14 +1,14 @@
 //! `scanhub listen` against what nobody should send: damaged datagrams of every kind, and words that make no sense.
 
-use crate::testkit::{INT, Program, Sender, TestEnv, in_a_network, number};
-use scanhub_schema::datagram::{DatagramError, HEAD, Head, MTU_ETHERNET, Packed};
+use crate::testkit::{INT, Program, TestEnv, TestGateway, in_a_network, number};
+use scanhub_schema::datagram::{DatagramError, DatagramPayload, HEADER_LEN, Head, MTU_ETHERNET};
 use scanhub_schema::{Foreground, Marks, Scan, ScanHead, Status, Topic, Verdict, Zones};
 use serde_json::Value;
 
-const DAMAGED: u64 = 100_000;
+const DAMAGED_COUNT: u64 = 100_000;
 
 /// What a listener's buffer surely holds at once.
-const TURN: u64 = 50;
+const BATCH_SIZE: u64 = 50;
 
 fn resident_kb(program: &Program) -> u64 {
     let path = format!("/proc/{}/status", program.pid());
@@ -18,15 +18,15 @@ fn resident_kb(program: &Program) -> u64 {
 }
 
 /// A datagram of each of these topics, whole.
-fn whole(sender: &mut Sender) -> Vec<Vec<u8>> {
+fn valid_datagrams(sender: &mut TestGateway) -> Vec<Vec<u8>> {
     let scan = Scan::of(ScanHead::lms(361, -90_000, 500, 1, 13), &[0; 361]);
     vec![
-        sender.make(Topic::Scan, &*scan),
-        sender.make(Topic::Marks, &Marks { count: 5, ..Marks::default() }),
-        sender.make(Topic::Zones, &Zones::unknown()),
-        sender.make(Topic::Foreground, &*Foreground::of(361)),
-        sender.make(Topic::Status, &Status::default()),
-        sender.telegram(&[0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A]),
+        sender.next_datagram(Topic::Scan, &*scan),
+        sender.next_datagram(Topic::Marks, &Marks { count: 5, ..Marks::default() }),
+        sender.next_datagram(Topic::Zones, &Zones::unknown()),
+        sender.next_datagram(Topic::Foreground, &*Foreground::of(361)),
+        sender.next_datagram(Topic::Status, &Status::default()),
+        sender.next_telegram(&[0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A]),
     ]
 }
 
@@ -35,11 +35,11 @@ fn nothing_damaged_is_accepted_and_memory_stays_flat() {
     in_a_network("listen_hostile::nothing_damaged_is_accepted_and_memory_stays_flat", || {
         let env = TestEnv::new();
         let mut program = env.start(&["listen", "--json", "--topic=zones"]).ready();
-        let mut sender = Sender::new(0xabcd, 7, 0, "front");
-        let whole = whole(&mut Sender::new(0xabcd, 7, 1, "rear"));
+        let mut sender = TestGateway::new(0xabcd, 7, 0, "front");
+        let whole = valid_datagrams(&mut TestGateway::new(0xabcd, 7, 1, "rear"));
         let mut random = fastrand::Rng::with_seed(6);
         let mut kb = 0;
-        for n in 0..DAMAGED {
+        for n in 0..DAMAGED_COUNT {
             let mut bytes = whole[random.usize(..whole.len())].clone();
             match random.u8(..4) {
                 0 => (0..random.usize(1..4)).for_each(|_| {
@@ -58,13 +58,13 @@ fn nothing_damaged_is_accepted_and_memory_stays_flat() {
             if whole.contains(&bytes) {
                 bytes[0] ^= 0x80;
             }
-            sender.throw(Topic::Zones, &bytes);
-            if n % TURN == TURN - 1 {
+            sender.send_bytes(Topic::Zones, &bytes);
+            if n % BATCH_SIZE == BATCH_SIZE - 1 {
                 let seq = sender.next[usize::from(Topic::Zones.number())];
                 sender.send(Topic::Zones, &Zones { verdict: Verdict::Stop as u8, ..Zones::unknown() });
                 program.await_line("what is whole", |line| line["topic_seq"] == seq);
             }
-            if n == DAMAGED / 10 {
+            if n == DAMAGED_COUNT / 10 {
                 kb = resident_kb(&program);
             }
         }
@@ -73,13 +73,13 @@ fn nothing_damaged_is_accepted_and_memory_stays_flat() {
         let outcome = program.end(INT);
         let refused = &outcome.of_class("lan_refused")[0];
         let all: u64 = DatagramError::ALL.iter().map(|reason| number(refused, reason.name())).sum();
-        assert_eq!(all, DAMAGED, "{refused}");
+        assert_eq!(all, DAMAGED_COUNT, "{refused}");
         for reason in ["short", "magic", "version", "header", "length", "crc"] {
             assert!(number(refused, reason) > 0, "{reason}: {refused}");
         }
         let lines = outcome.of_class("lan");
         let [line] = &lines[..] else { panic!("{lines:?}") };
-        assert_eq!((number(line, "received"), number(line, "lost")), (DAMAGED / TURN, 0));
+        assert_eq!((number(line, "received"), number(line, "lost")), (DAMAGED_COUNT / BATCH_SIZE, 0));
     });
 }
 
@@ -90,17 +90,17 @@ fn sealed_nonsense_neither_ends_it_nor_fills_memory() {
         let env = TestEnv::new();
         let words = ["listen", "--json", "--publish", "--timeout=20s"];
         let mut program = env.start(&words).ready();
-        let mut sender = Sender::new(0xabcd, 7, 0, "front");
-        sender.await_published(&mut program, &[Topic::Zones]);
+        let mut sender = TestGateway::new(0xabcd, 7, 0, "front");
+        sender.wait_until_published(&mut program, &[Topic::Zones]);
         let mut random = fastrand::Rng::with_seed(7);
         let mut kb = 0;
         let mut counted = 0;
         for n in 0..20_000_u32 {
             let mut buffer = [0; MTU_ETHERNET];
             let len = random.usize(..600);
-            buffer[HEAD..HEAD + len].iter_mut().for_each(|byte| *byte = random.u8(..));
+            buffer[HEADER_LEN..HEADER_LEN + len].iter_mut().for_each(|byte| *byte = random.u8(..));
             if random.bool() {
-                let _ = Zones::unknown().pack(&mut buffer[HEAD..]);
+                let _ = Zones::unknown().pack(&mut buffer[HEADER_LEN..]);
             }
             let head = Head {
                 // One in three says that it is a part.
@@ -117,7 +117,7 @@ fn sealed_nonsense_neither_ends_it_nor_fills_memory() {
                 revision: random.u16(..3),
                 counter: random.u32(..),
             };
-            sender.throw(Topic::Zones, head.seal(&mut buffer, len).expect("it fits"));
+            sender.send_bytes(Topic::Zones, head.seal(&mut buffer, len).expect("it fits"));
             if n % 50 == 49 {
                 // Its place in the list was taken before: it goes on whatever else there is.
                 sender.send(Topic::Zones, &Zones::unknown());
@@ -130,11 +130,13 @@ fn sealed_nonsense_neither_ends_it_nor_fills_memory() {
         }
         assert!(resident_kb(&program).saturating_sub(kb) < 2048, "{kb} kB and more");
         let outcome = program.end(INT);
-        assert_eq!(outcome.code, Some(0), "{outcome}");
-        let told = |it: &&Value| {
-            it["message"].as_str().is_some_and(|told| told.contains("more is sent than there is room for"))
+        assert_eq!(outcome.exit_code, Some(0), "{outcome}");
+        let reports_flood = |it: &&Value| {
+            it["message"]
+                .as_str()
+                .is_some_and(|message| message.contains("more is sent than there is room for"))
         };
-        assert_eq!(outcome.of_class("notice").iter().filter(told).count(), 1, "{outcome}");
+        assert_eq!(outcome.of_class("notice").iter().filter(reports_flood).count(), 1, "{outcome}");
         let lines = outcome.of_class("lan");
         assert!(lines.len() <= 1024, "{} lines", lines.len());
         let own = lines.iter().find(|it| it["hub"] == "000000000000abcd" && it["topic"] == "zones");
@@ -163,27 +165,27 @@ fn words_that_make_no_sense_have_a_remedy() {
         let outcome = env.run(&[&["listen", "--json"], words].concat());
         let lines = outcome.lines();
         let error = lines.last().unwrap_or_else(|| panic!("{outcome}"));
-        assert_eq!((outcome.code, &error["kind"]), (Some(code), &kind.into()), "{outcome}");
+        assert_eq!((outcome.exit_code, &error["kind"]), (Some(code), &kind.into()), "{outcome}");
         assert!(error["hint"].as_str().is_some_and(|text| text.contains(hint)), "{outcome}");
     }
 }
 
 #[test]
-fn bounds_that_are_not_reached_are_told() {
-    in_a_network("listen_hostile::bounds_that_are_not_reached_are_told", || {
+fn reports_timeouts_and_an_occupied_port() {
+    in_a_network("listen_hostile::reports_timeouts_and_an_occupied_port", || {
         let env = TestEnv::new();
         for words in [&["--timeout=100ms"][..], &["-n5", "--for=100ms"]] {
             let outcome = env.run(&[&["listen", "--json"], words].concat());
-            assert_eq!(outcome.code, Some(3), "{outcome}");
+            assert_eq!(outcome.exit_code, Some(3), "{outcome}");
             let lines = outcome.lines();
             let error = lines.last().unwrap_or_else(|| panic!("{outcome}"));
             assert_eq!(error["kind"], "timeout", "{outcome}");
             assert_eq!(outcome.of_class("lan_refused").len(), 1, "the account comes all the same");
         }
-        assert_eq!(env.run(&["listen", "--json", "--for=100ms"]).code, Some(0));
+        assert_eq!(env.run(&["listen", "--json", "--for=100ms"]).exit_code, Some(0));
         let holder = std::net::UdpSocket::bind("0.0.0.0:22200").expect("nobody has it");
         let outcome = env.run(&["listen", "--json"]);
-        assert_eq!(outcome.code, Some(1), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(1), "{outcome}");
         assert!(
             outcome.lines()[0]["message"].as_str().is_some_and(|text| text.contains("22200")),
             "{outcome}"

@@ -1,11 +1,11 @@
 //! `scanhub listen --hub`: whom it hears where there are many, that it says which gateway is on its own machine,
 //! and the account when it is asked.
 
-use crate::testkit::{INT, Robot, Sender, TestEnv, USR1, in_a_network, is_class, number};
+use crate::testkit::{INT, Robot, TestEnv, TestGateway, USR1, in_a_network, is_class, number};
 use scanhub_schema::{Topic, Verdict, Zones};
 use serde_json::json;
 
-const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
+const HUB_ID: u64 = 0x5f3a_12bc_00d1_e2f3;
 
 fn zones(verdict: Verdict) -> Zones {
     Zones { verdict: verdict as u8, ..Zones::unknown() }
@@ -14,24 +14,24 @@ fn zones(verdict: Verdict) -> Zones {
 /// More gateways than a listener keeps apart.
 fn crowd() {
     for hub in 0..70 {
-        let mut sender = Sender::new(hub, 7, 0, "other");
+        let mut sender = TestGateway::new(hub, 7, 0, "other");
         sender.announce(&[Topic::Zones]);
         sender.send(Topic::Zones, &zones(Verdict::Stop));
     }
 }
 
 #[test]
-fn a_hub_that_is_named_is_heard_in_a_crowd() {
-    in_a_network("listen_hubs::a_hub_that_is_named_is_heard_in_a_crowd", || {
+fn receives_named_hubs_in_a_crowd() {
+    in_a_network("listen_hubs::receives_named_hubs_in_a_crowd", || {
         let env = TestEnv::new();
         let name = "--name=robot1=5f3a12bc00d1e2f3";
         let words = ["listen", "--json", "--topic=zones", name, "--hub=robot1", "--hub=00000000000000ab"];
         let mut program = env.start(&words).ready();
         crowd();
-        let senders = [HUB, 0xab].map(|hub| {
-            let mut sender = Sender::new(hub, 7, 0, "front");
+        let senders = [HUB_ID, 0xab].map(|hub| {
+            let mut sender = TestGateway::new(hub, 7, 0, "front");
             sender.announce(&[Topic::Zones]);
-            sender.throw(Topic::Zones, b"short");
+            sender.send_bytes(Topic::Zones, b"short");
             sender.send(Topic::Zones, &zones(Verdict::Clear));
             sender
         });
@@ -55,7 +55,8 @@ fn hubs_that_are_not_named_are_not_published() {
         let words = ["listen", "--json", "--publish", "--hub=5f3a12bc00d1e2f3"];
         let mut program = env.start(&words).ready();
         crowd();
-        let line = Sender::new(HUB, 7, 0, "front").await_published(&mut program, &[Topic::Zones]);
+        let line =
+            TestGateway::new(HUB_ID, 7, 0, "front").wait_until_published(&mut program, &[Topic::Zones]);
         assert_eq!((&line["sensor"], &line["here"]), (&json!("5f3a12bc00d1e2f3.front"), &json!(true)));
         let outcome = program.end(INT);
         assert_eq!(outcome.of_class("notice").len(), 1, "{outcome}");
@@ -64,8 +65,8 @@ fn hubs_that_are_not_named_are_not_published() {
 }
 
 #[test]
-fn a_gateway_on_another_machine_is_not_called_this_one_s() {
-    in_a_network("listen_hubs::a_gateway_on_another_machine_is_not_called_this_one_s", || {
+fn gateway_on_another_machine_is_not_marked_as_here() {
+    in_a_network("listen_hubs::gateway_on_another_machine_is_not_marked_as_here", || {
         let robot = Robot::new(&["front"]);
         let env = TestEnv::new();
         let mut listener = env.start(&["listen", "--json", "--publish"]).ready();
@@ -73,7 +74,7 @@ fn a_gateway_on_another_machine_is_not_called_this_one_s() {
         let line = listener.await_line("a sensor", |line| line["kind"] == "published");
         assert_eq!(line["here"], json!(null), "{line}");
         drop(gateway);
-        assert_eq!(listener.end(INT).code, Some(0));
+        assert_eq!(listener.end(INT).exit_code, Some(0));
     });
 }
 
@@ -82,7 +83,7 @@ fn a_signal_asks_for_the_account_so_far() {
     in_a_network("listen_hubs::a_signal_asks_for_the_account_so_far", || {
         let env = TestEnv::new();
         let mut program = env.start(&["listen", "--json"]).ready();
-        let mut sender = Sender::new(HUB, 7, 0, "front");
+        let mut sender = TestGateway::new(HUB_ID, 7, 0, "front");
         for received in 1..=2 {
             sender.send(Topic::Zones, &zones(Verdict::Clear));
             program.await_line("zones", is_class("zones"));
@@ -91,6 +92,6 @@ fn a_signal_asks_for_the_account_so_far() {
             assert_eq!((number(&line, "received"), &line["topic"]), (received, &json!("zones")));
         }
         let outcome = program.end(INT);
-        assert_eq!((outcome.code, outcome.of_class("lan").len()), (Some(0), 3), "{outcome}");
+        assert_eq!((outcome.exit_code, outcome.of_class("lan").len()), (Some(0), 3), "{outcome}");
     });
 }

@@ -4,48 +4,48 @@
 use std::collections::BTreeSet;
 use std::os::fd::OwnedFd;
 
-use crate::testkit::{INT, Machine, TestEnv, command_in, in_a_network, ip, skip, status, until};
+use crate::testkit::{INT, Machine, TestEnv, command_in, in_a_network, ip, skip, status, wait_until};
 use rustix::net::{AddressFamily, RecvFlags, SocketFlags, SocketType, eth, recv, socket_with};
 
 /// What comes to the network of the test of IGMP, version 2.
-struct Switch {
+struct FakeSwitch {
     socket: OwnedFd,
     /// A message's type and the last byte of its group; no report from before a leave.
-    heard: BTreeSet<(u8, u8)>,
+    memberships: BTreeSet<(u8, u8)>,
 }
 
-const REPORT: u8 = 0x16;
-const LEAVE: u8 = 0x17;
+const IGMP_REPORT: u8 = 0x16;
+const IGMP_LEAVE: u8 = 0x17;
 
-impl Switch {
-    fn new() -> Switch {
+impl FakeSwitch {
+    fn new() -> FakeSwitch {
         let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
         let socket = socket_with(AddressFamily::PACKET, SocketType::DGRAM, flags, Some(eth::IP));
-        Switch { socket: socket.expect("root of the network may"), heard: BTreeSet::new() }
+        FakeSwitch { socket: socket.expect("root of the network may"), memberships: BTreeSet::new() }
     }
 
     /// Waits for such a message of each group that a listener joins.
-    fn await_each(&mut self, what: &str, kind: u8) {
-        let wanted: BTreeSet<_> = (80..84).map(|group| (kind, group)).collect();
-        until(what, || {
+    fn wait_for_each_group(&mut self, description: &str, kind: u8) {
+        let expected: BTreeSet<_> = (80..84).map(|group| (kind, group)).collect();
+        wait_until(description, || {
             let mut bytes = [0; 2048];
             while let Ok((len, _)) = recv(&self.socket, &mut bytes[..], RecvFlags::DONTWAIT) {
                 let Some((kind, group)) = message(&bytes[..len]) else { continue };
-                if kind == LEAVE {
-                    self.heard.remove(&(REPORT, group));
+                if kind == IGMP_LEAVE {
+                    self.memberships.remove(&(IGMP_REPORT, group));
                 }
-                self.heard.insert((kind, group));
+                self.memberships.insert((kind, group));
             }
-            self.heard.is_superset(&wanted)
+            self.memberships.is_superset(&expected)
         });
     }
 }
 
 /// The message in an IP packet, if it is one of our groups.
 fn message(packet: &[u8]) -> Option<(u8, u8)> {
-    const IGMP: u8 = 2;
+    const IGMP_PROTOCOL: u8 = 2;
     let header = usize::from(packet.first()? & 15) * 4;
-    let message = packet.get(header..).filter(|_| packet[9] == IGMP)?;
+    let message = packet.get(header..).filter(|_| packet[9] == IGMP_PROTOCOL)?;
     match *message {
         [kind, _, _, _, 239, 255, 76, group, ..] => Some((kind, group)),
         _ => None,
@@ -56,53 +56,53 @@ fn message(packet: &[u8]) -> Option<(u8, u8)> {
 fn a_link_that_is_away_for_a_moment_is_joined_again() {
     in_a_network("listen_links::a_link_that_is_away_for_a_moment_is_joined_again", || {
         let machine = Machine::new(1);
-        if !speaks_version_2(&machine, "eth0") {
+        if !force_igmp_version_2(&machine, "eth0") {
             return;
         }
-        let mut switch = Switch::new();
+        let mut switch = FakeSwitch::new();
         let env = TestEnv::on(&machine);
         for words in [&["--interface=eth0"][..], &[]] {
             let listener = env.start(&[&["listen", "--json"], words].concat()).ready();
-            switch.await_each("the groups are joined", REPORT);
+            switch.wait_for_each_group("the groups are joined", IGMP_REPORT);
             for _ in 0..3 {
-                switch.heard.clear();
-                ip(&format!("link set {} down", machine.end()));
-                ip(&format!("link set {} up", machine.end()));
-                switch.await_each("the groups were left", LEAVE);
-                switch.await_each("the groups are joined again", REPORT);
+                switch.memberships.clear();
+                ip(&format!("link set {} down", machine.test_interface()));
+                ip(&format!("link set {} up", machine.test_interface()));
+                switch.wait_for_each_group("the groups were left", IGMP_LEAVE);
+                switch.wait_for_each_group("the groups are joined again", IGMP_REPORT);
             }
             let outcome = listener.end(INT);
-            assert_eq!((outcome.code, outcome.of_class("notice").len()), (Some(0), 0), "{outcome}");
-            switch.await_each("the groups are left", LEAVE);
-            switch.heard.clear();
+            assert_eq!((outcome.exit_code, outcome.of_class("notice").len()), (Some(0), 0), "{outcome}");
+            switch.wait_for_each_group("the groups are left", IGMP_LEAVE);
+            switch.memberships.clear();
         }
     });
 }
 
 #[test]
-fn an_interface_that_is_made_anew_is_heard_as_often_as_that_happens() {
-    in_a_network("listen_links::an_interface_that_is_made_anew_is_heard_as_often_as_that_happens", || {
+fn rejoins_groups_each_time_an_interface_is_recreated() {
+    in_a_network("listen_links::rejoins_groups_each_time_an_interface_is_recreated", || {
         let machine = Machine::new(1);
-        if !speaks_version_2(&machine, "default") {
+        if !force_igmp_version_2(&machine, "default") {
             return;
         }
-        let mut switch = Switch::new();
+        let mut switch = FakeSwitch::new();
         let env = TestEnv::on(&machine);
         let listener = env.start(&["listen", "--json"]).ready();
         // A socket can join 20 groups, and there are four of them.
         for _ in 0..8 {
-            switch.heard.clear();
-            machine.make_cable_anew();
-            switch.await_each("the groups are joined again", REPORT);
+            switch.memberships.clear();
+            machine.replace_cable();
+            switch.wait_for_each_group("the groups are joined again", IGMP_REPORT);
         }
         let outcome = listener.end(INT);
-        assert_eq!((outcome.code, outcome.of_class("notice").len()), (Some(0), 0), "{outcome}");
+        assert_eq!((outcome.exit_code, outcome.of_class("notice").len()), (Some(0), 0), "{outcome}");
     });
 }
 
 /// Lets whoever leaves a group on `interface` of `machine` say so, as it does in this version, so that joining again is not
 /// the first time said twice; says so if it cannot.
-fn speaks_version_2(machine: &Machine, interface: &str) -> bool {
+fn force_igmp_version_2(machine: &Machine, interface: &str) -> bool {
     let mut version = command_in(&machine.network(), "sh");
     let path = format!("/proc/sys/net/ipv4/conf/{interface}/force_igmp_version");
     version.args(["-c", &format!("echo 2 > {path}")]);

@@ -1,7 +1,7 @@
 //! `scanhub listen` against people: tracks and events of another machine are lines like those of this one.
 
-use crate::testkit::{INT, Sender, TestEnv, in_a_network, is_class};
-use scanhub_schema::{Event, EventKind, Maker, Pose, Topic, Track, TrackSensor, Tracks};
+use crate::testkit::{INT, TestEnv, TestGateway, in_a_network, is_class};
+use scanhub_schema::{Event, EventKind, Pose, PublisherKind, Topic, Track, TrackSensor, Tracks};
 use serde_json::json;
 
 #[test]
@@ -9,8 +9,8 @@ fn people_of_another_machine_are_lines() {
     in_a_network("listen_people::people_of_another_machine_are_lines", || {
         let env = TestEnv::new();
         let mut program = env.start(&["listen", "--json"]).ready();
-        let mut sender = Sender::new(0x5f3a_12bc_00d1_e2f3, 7, 200, "house");
-        sender.announce(Maker::Tracker.topics());
+        let mut sender = TestGateway::new(0x5f3a_12bc_00d1_e2f3, 7, 200, "house");
+        sender.announce(PublisherKind::Tracker.topics());
         let mut tracks = Tracks::default();
         tracks.push_sensor(TrackSensor::new("front", &Pose::default()));
         tracks.push(Track { id: 9, x_m: 1.5, sensors: 1, state: 2, ..Track::default() });

@@ -4,25 +4,25 @@
 use std::time::Duration;
 
 use crate::testkit::{
-    INT, KILL, Program, Sender, TERM, TestEnv, in_a_network, let_pass, number, output, until,
+    INT, KILL, Program, TERM, TestEnv, TestGateway, in_a_network, number, output, wait_at_least, wait_until,
 };
 use rustix::process::{Pid, Resource, Rlimit, getrlimit, prlimit};
 use scanhub_schema::datagram::Announce;
 use scanhub_schema::{Marks, Scan, ScanHead, State, Status, Topic, Verdict, Zones};
 use serde_json::{Value, json};
 
-const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
-const FRONT: &str = "robot1.front";
+const HUB_ID: u64 = 0x5f3a_12bc_00d1_e2f3;
+const SENSOR_NAME: &str = "robot1.front";
 
 fn publisher(env: &TestEnv) -> Program {
     env.start(&["listen", "--json", "--publish", "--name=robot1=5f3a12bc00d1e2f3"]).ready()
 }
 
 /// A listener that publishes what a sender has announced.
-fn published(env: &TestEnv, sender: &mut Sender) -> Program {
+fn start_and_publish(env: &TestEnv, sender: &mut TestGateway) -> Program {
     let mut program = publisher(env);
     let topics = [Topic::Zones, Topic::Scan, Topic::Status, Topic::Telegram];
-    assert_eq!(sender.await_published(&mut program, &topics)["sensor"], FRONT);
+    assert_eq!(sender.wait_until_published(&mut program, &topics)["sensor"], SENSOR_NAME);
     // Whoever lists sensors waits for one.
     sender.send(Topic::Status, &Status { state: State::Starting as u8, ..Status::default() });
     program
@@ -41,22 +41,22 @@ fn zones(verdict: Verdict) -> Zones {
 fn a_remote_sensor_is_as_a_local_one() {
     in_a_network("listen_publish::a_remote_sensor_is_as_a_local_one", || {
         let env = TestEnv::new();
-        let mut sender = Sender::new(HUB, 7, 3, "front");
-        let program = published(&env, &mut sender);
+        let mut sender = TestGateway::new(HUB_ID, 7, 3, "front");
+        let program = start_and_publish(&env, &mut sender);
         let mut echo = env.echo(&["robot1.front/zones", "robot1.front/scan", "robot1.front/telegram"]);
         let mut hz = env.start(&["hz", "--json", "robot1.front/zones"]);
-        until("hz is attached", || env.subscribers("robot1.front/zones") == 2);
+        wait_until("hz is attached", || env.subscribers("robot1.front/zones") == 2);
         let scan = Scan::of(ScanHead::lms(2, -90_000, 500, 10, 13), &[11, 12]);
         let mut status = Status { state: State::Streaming as u8, since_ns: 5, ..Status::default() };
         status.set_port("/dev/ttyUSB7");
         sender.counter = 40;
-        let telegram = sender.telegram(&[0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A]);
-        sender.throw(Topic::Telegram, &telegram);
+        let telegram = sender.next_telegram(&[0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A]);
+        sender.send_bytes(Topic::Telegram, &telegram);
         sender.send(Topic::Scan, &*scan);
         sender.send(Topic::Zones, &zones(Verdict::Slow));
         sender.send(Topic::Status, &status);
         let line = echo.await_line("zones", is_zones);
-        assert_eq!((&line["sensor"], &line["verdict"]), (&json!(FRONT), &json!("slow")));
+        assert_eq!((&line["sensor"], &line["verdict"]), (&json!(SENSOR_NAME), &json!("slow")));
         assert_eq!((&line["seq"], &line["boot"]), (&json!(40), &json!("000000000000b007")));
         assert_eq!(line["wall_ns"], sender.stamp_ns);
         let since_start_ns = std::fs::read_to_string("/proc/uptime").expect("Linux");
@@ -65,11 +65,11 @@ fn a_remote_sensor_is_as_a_local_one() {
         let age_s = uptime_s - number(&line, "stamp_ns") as f64 / 1e9;
         assert!((-1.0..60.0).contains(&age_s), "the stamp is not of the arrival: {age_s} s");
         // Two lost, one late, one doubled.
-        let (late, lost) = (sender.make(Topic::Zones, &zones(Verdict::Stop)), 2);
+        let (late, lost) = (sender.next_datagram(Topic::Zones, &zones(Verdict::Stop)), 2);
         sender.next[usize::from(Topic::Zones.number())] += lost;
         sender.send(Topic::Zones, &zones(Verdict::Clear));
-        sender.throw(Topic::Zones, &late);
-        sender.throw(Topic::Zones, &late);
+        sender.send_bytes(Topic::Zones, &late);
+        sender.send_bytes(Topic::Zones, &late);
         sender.send(Topic::Zones, &zones(Verdict::Slow));
         echo.await_lines(2, "zones", is_zones);
         hz.await_line("a second", |line| line["class"] == "hz" && line["received"] == 3);
@@ -84,7 +84,7 @@ fn a_remote_sensor_is_as_a_local_one() {
         assert_eq!((&of_zones["received"], &of_zones["missed"]), (&json!(3), &json!(3)));
         assert_eq!(hz.end(INT).of_class("summary")[0]["missed"], 3);
 
-        let info = env.await_info(FRONT, |info| info["state"] == "streaming");
+        let info = env.await_info(SENSOR_NAME, |info| info["state"] == "streaming");
         assert_eq!(info["port"], "/dev/ttyUSB7");
         assert!(number(&info, "since_ns") > 5, "the beginning is on another machine's clock: {info}");
         let listed = env.run(&["list", "--json"]).of_class("topic");
@@ -92,41 +92,41 @@ fn a_remote_sensor_is_as_a_local_one() {
         assert_eq!(topics, ["telegram", "scan", "zones", "status"], "those that were announced");
         let domains = output(env.command(&["list", "--domains", "--json"])).expect("runs");
         assert!(String::from_utf8_lossy(&domains.stdout).contains(&program.pid().to_string()));
-        env.await_info(FRONT, |info| info["state"] == "silent" && info["last_error"] != "");
+        env.await_info(SENSOR_NAME, |info| info["state"] == "silent" && info["last_error"] != "");
 
         let outcome = program.end(TERM);
-        assert_eq!(outcome.code, Some(0), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(0), "{outcome}");
         let line = &outcome.of_class("lan_published")[0];
         assert_eq!(
             (&line["sensors"], &line["late"], &line["loan_failed"]),
-            (&json!([FRONT]), &json!(1), &json!(0))
+            (&json!([SENSOR_NAME]), &json!(1), &json!(0))
         );
-        assert_eq!(env.run(&["info", FRONT, "--json"]).code, Some(3), "nobody publishes");
+        assert_eq!(env.run(&["info", SENSOR_NAME, "--json"]).exit_code, Some(3), "nobody publishes");
     });
 }
 
 #[test]
-fn consumers_outlive_the_listener_and_see_what_they_missed() {
-    in_a_network("listen_publish::consumers_outlive_the_listener_and_see_what_they_missed", || {
+fn subscribers_survive_a_killed_listener() {
+    in_a_network("listen_publish::subscribers_survive_a_killed_listener", || {
         let env = TestEnv::new();
-        let mut sender = Sender::new(HUB, 7, 0, "front");
-        let first = published(&env, &mut sender);
+        let mut sender = TestGateway::new(HUB_ID, 7, 0, "front");
+        let first = start_and_publish(&env, &mut sender);
         let mut echo = env.echo(&["robot1.front/zones"]);
         sender.send(Topic::Zones, &zones(Verdict::Clear));
         echo.await_line("zones", is_zones);
-        assert_eq!(first.end(KILL).code, None);
+        assert_eq!(first.end(KILL).exit_code, None);
         echo.await_line("the news", |line| line["kind"] == "hub_gone");
         for _ in 0..4 {
             sender.send(Topic::Zones, &zones(Verdict::Slow));
         }
-        let second = published(&env, &mut sender);
+        let second = start_and_publish(&env, &mut sender);
         echo.await_line("the news", |line| line["kind"] == "hub_back");
         sender.send(Topic::Zones, &zones(Verdict::Stop));
         echo.await_line("zones", |line| line["verdict"] == "stop");
         let outcome = echo.end(INT);
         assert_eq!(outcome.of_class("summary")[0]["missed"], 4, "{outcome}");
-        assert_eq!(second.end(TERM).code, Some(0));
-        assert!(env.left_behind().is_empty(), "{:?}", env.left_behind());
+        assert_eq!(second.end(TERM).exit_code, Some(0));
+        assert!(env.leftover_files().is_empty(), "{:?}", env.leftover_files());
     });
 }
 
@@ -134,14 +134,14 @@ fn consumers_outlive_the_listener_and_see_what_they_missed() {
 fn gateways_and_hubs_that_start_again_are_followed() {
     in_a_network("listen_publish::gateways_and_hubs_that_start_again_are_followed", || {
         let env = TestEnv::new();
-        let mut sender = Sender::new(HUB, 7, 0, "front");
-        let program = published(&env, &mut sender);
+        let mut sender = TestGateway::new(HUB_ID, 7, 0, "front");
+        let program = start_and_publish(&env, &mut sender);
         let mut echo = env.echo(&["robot1.front/zones"]);
         for _ in 0..3 {
             sender.send(Topic::Zones, &zones(Verdict::Clear));
         }
         // The gateway starts again: two come before it says who its sensor is.
-        let mut again = Sender::new(HUB, 8, 1, "front");
+        let mut again = TestGateway::new(HUB_ID, 8, 1, "front");
         again.send(Topic::Zones, &zones(Verdict::Slow));
         again.send(Topic::Zones, &zones(Verdict::Slow));
         again.announce(&[Topic::Zones]);
@@ -159,7 +159,7 @@ fn gateways_and_hubs_that_start_again_are_followed() {
         assert_eq!(outcome.of_class("summary")[0]["missed"], 3, "{outcome}");
         let outcome = program.end(INT);
         let unnamed = number(&outcome.of_class("lan_published")[0], "unnamed");
-        assert_eq!(unnamed, 2 + u64::from(sender.proofs), "{outcome}");
+        assert_eq!(unnamed, 2 + u64::from(sender.delivery_proofs), "{outcome}");
         assert_eq!(outcome.of_class("notice").iter().filter(|line| line["kind"] == "published").count(), 1);
     });
 }
@@ -169,28 +169,28 @@ fn a_hub_and_two_remote_ones_live_in_one_domain() {
     in_a_network("listen_publish::a_hub_and_two_remote_ones_live_in_one_domain", || {
         let env = TestEnv::new();
         let _simulator = env.simulator(&["front"], &["--seed=61", "--baud=500000"]);
-        let mut one = Sender::new(HUB, 7, 0, "front");
-        let mut other = Sender::new(0xab, 7, 0, "front");
-        let mut listener = published(&env, &mut one);
+        let mut one = TestGateway::new(HUB_ID, 7, 0, "front");
+        let mut other = TestGateway::new(0xab, 7, 0, "front");
+        let mut listener = start_and_publish(&env, &mut one);
         // Somebody who follows the hub's sensor waits for the hub, whoever else is in the domain.
         let mut early = env.start(&["echo", "--json", "front/scan"]);
         let absent = env.run(&["echo", "--json", "front/scan", "-n", "1"]);
         assert_eq!(
-            (absent.code, &absent.of_class("error")[0]["kind"]),
+            (absent.exit_code, &absent.of_class("error")[0]["kind"]),
             (Some(3), &json!("no_topic")),
             "{absent}"
         );
         let hub = env.hub(&[env.link("front")]);
         early.await_line("a scan", |line| line["class"] == "scan");
-        assert_eq!(early.end(INT).code, Some(0));
+        assert_eq!(early.end(INT).exit_code, Some(0));
         let second = publisher_refused(&env);
         assert!(second.contains(&format!("pid {}", listener.pid())), "{second}");
-        other.await_published(&mut listener, &[Topic::Zones, Topic::Status]);
+        other.wait_until_published(&mut listener, &[Topic::Zones, Topic::Status]);
         other.send(Topic::Status, &Status::default());
         let mut echo = env.echo(&["front/scan", "robot1.front/zones", "00000000000000ab.front/zones"]);
         one.send(Topic::Zones, &zones(Verdict::Stop));
         other.send(Topic::Zones, &zones(Verdict::Slow));
-        for sensor in ["front", FRONT, "00000000000000ab.front"] {
+        for sensor in ["front", SENSOR_NAME, "00000000000000ab.front"] {
             echo.await_line(sensor, |line| line["sensor"] == sensor && line["class"] != "notice");
         }
         // The robot's own sensors: those of other robots stand elsewhere.
@@ -202,24 +202,24 @@ fn a_hub_and_two_remote_ones_live_in_one_domain() {
         assert!(outcome.of_class("zones").iter().all(is_own), "{outcome}");
         let absent = env.run(&["echo", "--json", "robot2.front/zones", "-n", "1"]);
         assert_eq!(
-            (absent.code, &absent.of_class("error")[0]["kind"]),
+            (absent.exit_code, &absent.of_class("error")[0]["kind"]),
             (Some(3), &json!("no_topic")),
             "{absent}"
         );
         let refused = env.run(&["control", "robot1.front", "pause", "--json"]);
-        assert_eq!(refused.code, Some(2), "nobody commands another machine's sensor: {refused}");
-        assert_eq!(hub.end(TERM).code, Some(0));
+        assert_eq!(refused.exit_code, Some(2), "nobody commands another machine's sensor: {refused}");
+        assert_eq!(hub.end(TERM).exit_code, Some(0));
         one.send(Topic::Zones, &zones(Verdict::Clear));
         echo.await_line("the remote sensor goes on", |line| line["verdict"] == "clear");
         drop(echo);
-        assert_eq!(listener.end(TERM).code, Some(0));
-        assert!(env.left_behind().is_empty(), "{:?}", env.left_behind());
+        assert_eq!(listener.end(TERM).exit_code, Some(0));
+        assert!(env.leftover_files().is_empty(), "{:?}", env.leftover_files());
     });
 }
 
 #[test]
-fn what_a_gateway_sends_comes_back_once() {
-    in_a_network("listen_publish::what_a_gateway_sends_comes_back_once", || {
+fn gateway_does_not_send_remote_sensors_again() {
+    in_a_network("listen_publish::gateway_does_not_send_remote_sensors_again", || {
         let env = TestEnv::new();
         let _simulator = env.simulator(&["front"], &["--seed=62", "--baud=500000"]);
         let mut listener = env.start(&["listen", "--json", "--publish", "--interface=lo"]).ready();
@@ -243,7 +243,7 @@ fn what_a_gateway_sends_comes_back_once() {
             assert!(number(same, "stamp_ns") < number(line, "stamp_ns"), "it came later");
         }
         assert!(there.iter().filter(|line| here.iter().any(|it| it["seq"] == line["seq"])).count() > 30);
-        assert_eq!((gateway.end(TERM).code, hub.end(TERM).code), (Some(0), Some(0)));
+        assert_eq!((gateway.end(TERM).exit_code, hub.end(TERM).exit_code), (Some(0), Some(0)));
         let outcome = listener.end(TERM);
         let hubs: Vec<_> = outcome.of_class("lan").into_iter().map(|line| line["hub"].clone()).collect();
         assert!(hubs.iter().all(|hub| *hub == id), "{outcome}");
@@ -255,8 +255,8 @@ fn what_a_gateway_sends_comes_back_once() {
 fn a_number_that_another_sensor_has_is_its_own() {
     in_a_network("listen_publish::a_number_that_another_sensor_has_is_its_own", || {
         let env = TestEnv::new();
-        let mut sender = Sender::new(HUB, 7, 0, "front");
-        let mut program = published(&env, &mut sender);
+        let mut sender = TestGateway::new(HUB_ID, 7, 0, "front");
+        let mut program = start_and_publish(&env, &mut sender);
         let mut echo = env.echo(&["robot1.front/zones"]);
         sender.send(Topic::Zones, &zones(Verdict::Clear));
         echo.await_line("zones", is_zones);
@@ -267,23 +267,23 @@ fn a_number_that_another_sensor_has_is_its_own() {
         let line = program.await_line("a sensor", |line| line["kind"] == "published");
         assert_eq!(line["sensor"], "robot1.rear");
         echo.await_line("nothing is known any more", |line| line["verdict"] == "unknown");
-        env.await_info(FRONT, |info| info["state"] == "silent");
+        env.await_info(SENSOR_NAME, |info| info["state"] == "silent");
         let mut rear = env.echo(&["robot1.rear/zones"]);
         sender.send(Topic::Zones, &zones(Verdict::Stop));
         rear.await_line("its own", |line| line["verdict"] == "stop");
         // The first one comes back with another number, of which it knows nothing. What is late says nothing.
-        let mut front = Sender::new(HUB, 7, 1, "front");
+        let mut front = TestGateway::new(HUB_ID, 7, 1, "front");
         front.boot = 0xb008;
         front.next[usize::from(Topic::Zones.number())] = 40;
         front.announce(&[Topic::Zones]);
-        sender.to(Announce::GROUP, &late);
+        sender.send_to_group(Announce::GROUP, &late);
         front.send(Topic::Zones, &zones(Verdict::Slow));
         let line = echo.await_line("it again", |line| line["verdict"] == "slow");
         assert_eq!(line["topic_seq"], 2, "the network counts on in a new life of the hub");
         let outcome = echo.end(INT);
         assert!(outcome.of_class("zones").iter().all(|line| line["verdict"] != "stop"), "{outcome}");
         let (rear, program) = (rear.end(INT), program.end(INT));
-        assert_eq!((rear.code, program.code), (Some(0), Some(0)));
+        assert_eq!((rear.exit_code, program.exit_code), (Some(0), Some(0)));
         let rows = program.of_class("lan");
         let names: Vec<_> =
             rows.iter().filter(|line| line["topic"] == "zones").map(|line| &line["sensor"]).collect();
@@ -292,8 +292,8 @@ fn a_number_that_another_sensor_has_is_its_own() {
 }
 
 #[test]
-fn a_hub_that_numbers_its_sensors_otherwise_keeps_them_apart() {
-    in_a_network("listen_publish::a_hub_that_numbers_its_sensors_otherwise_keeps_them_apart", || {
+fn renumbered_sensors_are_not_mixed_up() {
+    in_a_network("listen_publish::renumbered_sensors_are_not_mixed_up", || {
         let env = TestEnv::new();
         let _simulator = env.simulator(&["front", "rear"], &["--seed=63", "--baud=500000"]);
         let mut listener = env.start(&["listen", "--json", "--publish", "--interface=lo"]).ready();
@@ -310,12 +310,12 @@ fn a_hub_that_numbers_its_sensors_otherwise_keeps_them_apart() {
         let is_scan =
             |line: &Value, name: &String| line["class"] == "scan" && line["sensor"] == name.as_str();
         let first = echo.await_line("a life", |line| is_scan(line, &front))["boot"].clone();
-        assert_eq!(hub.end(TERM).code, Some(0));
+        assert_eq!(hub.end(TERM).exit_code, Some(0));
         let hub = env.hub(&[env.link("rear"), env.link("front")]);
         let is_next = |line: &Value, name| is_scan(line, name) && line["boot"] != first;
         let next = echo.await_line("the next life", |line| is_next(line, &front))["boot"].clone();
         echo.await_line("the next life of the other", |line| is_next(line, &rear));
-        assert_eq!(hub.end(TERM).code, Some(0));
+        assert_eq!(hub.end(TERM).exit_code, Some(0));
         // The one that has the other's number now takes it at once.
         let _hub = env.hub(&[env.link("front")]);
         echo.await_line("one is left", |line| is_next(line, &front) && line["boot"] != next);
@@ -326,23 +326,27 @@ fn a_hub_that_numbers_its_sensors_otherwise_keeps_them_apart() {
             let name = sensor.rsplit('.').next().unwrap_or_default();
             assert!(port.ends_with(name), "{line}");
         }
-        assert_eq!((gateway.end(TERM).code, listener.end(TERM).code), (Some(0), Some(0)));
+        assert_eq!((gateway.end(TERM).exit_code, listener.end(TERM).exit_code), (Some(0), Some(0)));
     });
 }
 
 fn publisher_refused(env: &TestEnv) -> String {
     let outcome = env.run(&["listen", "--json", "--publish"]);
-    assert_eq!((outcome.code, &outcome.lines()[0]["kind"]), (Some(1), &json!("domain_held")), "{outcome}");
+    assert_eq!(
+        (outcome.exit_code, &outcome.lines()[0]["kind"]),
+        (Some(1), &json!("domain_held")),
+        "{outcome}"
+    );
     outcome.lines()[0]["message"].as_str().unwrap_or_default().to_owned()
 }
 
 #[test]
-fn what_has_no_room_is_counted_as_such() {
-    in_a_network("listen_publish::what_has_no_room_is_counted_as_such", || {
+fn samples_without_topic_are_counted_by_cause() {
+    in_a_network("listen_publish::samples_without_topic_are_counted_by_cause", || {
         let env = TestEnv::new();
-        let mut front = Sender::new(HUB, 7, 3, "front");
+        let mut front = TestGateway::new(HUB_ID, 7, 3, "front");
         let mut program = publisher(&env);
-        front.await_published(&mut program, &[Topic::Zones]);
+        front.wait_until_published(&mut program, &[Topic::Zones]);
         let mut echo = env.echo(&["robot1.front/zones"]);
         let pid = program.pid();
         let used = std::fs::read_dir(format!("/proc/{pid}/fd")).expect("it runs").count() as u64;
@@ -353,7 +357,7 @@ fn what_has_no_room_is_counted_as_such() {
         assert!(line["message"].to_string().contains("descriptors"), "{line}");
         front.send(Topic::Scan, &*Box::<Scan>::default());
         front.send(Topic::Marks, &Marks::default());
-        let mut rear = Sender::new(HUB, 7, 4, "rear");
+        let mut rear = TestGateway::new(HUB_ID, 7, 4, "rear");
         rear.announce(&[Topic::Zones]);
         rear.send(Topic::Zones, &zones(Verdict::Clear));
         // What there is room for goes on.
@@ -361,8 +365,12 @@ fn what_has_no_room_is_counted_as_such() {
         echo.await_line("zones", |line| is_zones(line) && line["verdict"] == "slow");
         let outcome = program.end(INT);
         let line = &outcome.of_class("lan_published")[0];
-        assert_eq!((&line["sensors"], &line["shortage"]), (&json!([FRONT]), &json!(2)), "{outcome}");
-        assert_eq!((&line["unannounced"], &line["unnamed"]), (&json!(1), &json!(front.proofs)), "{outcome}");
+        assert_eq!((&line["sensors"], &line["shortage"]), (&json!([SENSOR_NAME]), &json!(2)), "{outcome}");
+        assert_eq!(
+            (&line["unannounced"], &line["unnamed"]),
+            (&json!(1), &json!(front.delivery_proofs)),
+            "{outcome}"
+        );
     });
 }
 
@@ -372,14 +380,14 @@ fn there_is_room_for_sixteen_sensors() {
         let env = TestEnv::new();
         let mut program = publisher(&env);
         let mut senders: Vec<_> =
-            (0..17).map(|number| Sender::new(0xab, 7, number, &format!("s{number}"))).collect();
+            (0..17).map(|number| TestGateway::new(0xab, 7, number, &format!("s{number}"))).collect();
         // All but the last one are published when their gateway has delivered for a second, and deliver for another one.
         for (count, wait_ms) in [(16, 1100), (16, 1100), (17, 0)] {
             for sender in &mut senders[..count] {
                 sender.announce(&[Topic::Zones]);
                 sender.send(Topic::Zones, &zones(Verdict::Clear));
             }
-            let_pass(Duration::from_millis(wait_ms));
+            wait_at_least(Duration::from_millis(wait_ms));
         }
         let line = program.await_line("one too many", |line| line["kind"] == "problem");
         assert!(line["message"].as_str().is_some_and(|text| text.contains("16 published")), "{line}");

@@ -26,25 +26,25 @@ impl Robot {
     /// A gateway that goes on from the state that both have: an epoch far ahead, so that the seconds of their starts do
     /// not matter.
     fn gateway(&self) -> Program {
-        let domain = self.env.place().name().to_owned();
+        let domain = self.env.domain().name().to_owned();
         let state = self.env.path("state/scanhub");
         std::fs::create_dir_all(&state).expect("a state directory");
         let file = state.join(format!("gateway-{domain}-eth0-1"));
         std::fs::write(file, "5f3a12bc00d1e2f3 4000000000\n").expect("can be written");
         let mut gateway =
-            self.env.gateway_at(&["--interface=eth0", "--topic=front/scan", "--topic=front/status"]);
+            self.env.start_gateway(&["--interface=eth0", "--topic=front/scan", "--topic=front/status"]);
         let begin = gateway.await_line("its begin", is_class("gateway"));
         assert_eq!((&begin["hub"], number(&begin, "epoch")), (&json!("5f3a12bc00d1e2f3"), 4_000_000_001));
         gateway
     }
 }
 
-fn is_told(line: &Value) -> bool {
+fn reports_two_gateways(line: &Value) -> bool {
     line["message"].as_str().is_some_and(|text| text.contains("two gateways send as 5f3a12bc00d1e2f3"))
 }
 
 /// The numbers of beams of the scans.
-fn beams(outcome: &Outcome) -> Vec<usize> {
+fn beam_counts(outcome: &Outcome) -> Vec<usize> {
     let scans = outcome.of_class("scan");
     let mut beams: Vec<_> = scans.iter().map(|line| line["ranges"].as_array().map_or(0, Vec::len)).collect();
     beams.dedup();
@@ -52,8 +52,8 @@ fn beams(outcome: &Outcome) -> Vec<usize> {
 }
 
 #[test]
-fn two_machines_with_one_state_directory_are_told_and_never_mixed() {
-    in_a_network("listen_twins::two_machines_with_one_state_directory_are_told_and_never_mixed", || {
+fn reports_two_machines_with_one_id_and_mixes_nothing() {
+    in_a_network("listen_twins::reports_two_machines_with_one_id_and_mixes_nothing", || {
         let (one, other) = (Robot::new(1, 361), Robot::new(2, 181));
         // Here both cables are plugged in.
         let env = TestEnv::new();
@@ -64,28 +64,28 @@ fn two_machines_with_one_state_directory_are_told_and_never_mixed() {
         publisher.await_line("a sensor", |line| line["kind"] == "published");
         let mut echo = env.echo(&["5f3a12bc00d1e2f3.front/scan"]);
         let second = other.gateway();
-        listener.await_line("that there are two", is_told);
+        listener.await_line("that there are two", reports_two_gateways);
         echo.await_lines(100, "scans of the first one", is_class("scan"));
         let echoed = echo.end(INT);
-        assert_eq!(beams(&echoed), [361], "{echoed}");
+        assert_eq!(beam_counts(&echoed), [361], "{echoed}");
         assert_eq!(echoed.of_class("summary")[0]["missed"], 0, "{echoed}");
         // One that comes now hears either, but not both.
         let mut late = env.start(&["listen", "--json"]).ready();
-        late.await_line("that there are two", is_told);
+        late.await_line("that there are two", reports_two_gateways);
         late.await_lines(10, "scans", is_class("scan"));
         let late = late.end(INT);
-        assert!(beams(&late) == [361] || beams(&late) == [181], "{:?}", beams(&late));
+        assert!(beam_counts(&late) == [361] || beam_counts(&late) == [181], "{:?}", beam_counts(&late));
         // When the first one ends, the other one does not stand in for it: more than 3 s of it are refused.
-        assert_eq!(first.end(TERM).code, Some(0));
+        assert_eq!(first.end(TERM).exit_code, Some(0));
         let mut other = env.start(&["listen", "--json"]).ready();
         other.await_lines(200, "scans of the second one", is_class("scan"));
-        assert_eq!(beams(&other.end(INT)), [181], "alone it is heard by who comes now");
-        assert_eq!(second.end(TERM).code, Some(0));
+        assert_eq!(beam_counts(&other.end(INT)), [181], "alone it is heard by who comes now");
+        assert_eq!(second.end(TERM).exit_code, Some(0));
         let (listener, publisher) = (listener.end(INT), publisher.end(INT));
-        assert_eq!(beams(&listener), [361], "only the first one");
+        assert_eq!(beam_counts(&listener), [361], "only the first one");
         for outcome in [&listener, &publisher] {
-            let told = outcome.of_class("notice").iter().filter(|line| is_told(line)).count();
-            assert_eq!(told, 1, "{outcome}");
+            let notices = outcome.of_class("notice").iter().filter(|line| reports_two_gateways(line)).count();
+            assert_eq!(notices, 1, "{outcome}");
             assert!(number(&outcome.of_class("lan_refused")[0], "twin") > 10, "{outcome}");
             assert!(outcome.of_class("lan").iter().all(|line| line["lost"] == 0), "{outcome}");
         }

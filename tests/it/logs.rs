@@ -15,15 +15,15 @@ fn log(env: &TestEnv, ranges: &[&str], scans: u64, period_ms: u64) -> String {
 }
 
 /// What a consumer gets of `file` that is played, and what the player said.
-fn played(env: &TestEnv, file: &str) -> (Outcome, Outcome) {
+fn replay_and_echo(env: &TestEnv, file: &str) -> (Outcome, Outcome) {
     let words = ["replay", "--json", "--no-system-config", file, "--paused"];
     let player = env.start(&words).ready();
-    let mut consumer = env.echo(&["front/scan", "front/zones", "front/status"]);
+    let mut subscriber = env.echo(&["front/scan", "front/zones", "front/status"]);
     env.await_info("front", |info| info["state"] == "paused");
-    assert_eq!(env.run(&["control", "front", "resume"]).code, Some(0));
-    consumer.await_line("the end", |line| line["last_error"] == "the recording is at its end");
+    assert_eq!(env.run(&["control", "front", "resume"]).exit_code, Some(0));
+    subscriber.await_line("the end", |line| line["last_error"] == "the recording is at its end");
     let player = player.wait();
-    (consumer.end(INT), player)
+    (subscriber.end(INT), player)
 }
 
 #[test]
@@ -49,12 +49,12 @@ fn a_log_is_read_as_it_reaches_and_says_so_first() {
         let stream = file.replace("a.log", "a.bin");
         let converted = env.run(&["convert", &file, &stream]);
         let read = format!("read as values of {unit_mm} mm in {bits} bits");
-        assert!(converted.code == Some(0) && converted.errors.contains(&read), "{converted}");
-        let (heard, player) = played(&env, &file);
-        assert!(player.errors.lines().next().is_some_and(|line| line.contains(&read)), "{player}");
-        for heard in [heard, played(&env, &stream).0] {
-            let scans = heard.of_class("scan");
-            assert_eq!(scans.len(), 3, "{heard}");
+        assert!(converted.exit_code == Some(0) && converted.stderr.contains(&read), "{converted}");
+        let (outcome, player) = replay_and_echo(&env, &file);
+        assert!(player.stderr.lines().next().is_some_and(|line| line.contains(&read)), "{player}");
+        for outcome in [outcome, replay_and_echo(&env, &stream).0] {
+            let scans = outcome.of_class("scan");
+            assert_eq!(scans.len(), 3, "{outcome}");
             for scan in scans {
                 let first: Vec<_> =
                     scan["ranges"].as_array().into_iter().flatten().take(4).cloned().collect();
@@ -66,21 +66,23 @@ fn a_log_is_read_as_it_reaches_and_says_so_first() {
 }
 
 #[test]
-fn zones_stand_until_the_next_scan_of_a_log_that_became_an_mcap_file() {
+fn zones_stay_valid_until_the_next_scan_of_a_slow_log() {
     let env = TestEnv::new();
     // Much longer than a sensor that is at work leaves between two scans.
     let file = log(&env, &["1.50"], 4, 400);
     let mcap = file.replace("a.log", "a.mcap");
-    assert_eq!(env.run(&["convert", &file, &mcap]).code, Some(0));
+    assert_eq!(env.run(&["convert", &file, &mcap]).exit_code, Some(0));
     for file in [file, mcap] {
-        let (heard, _) = played(&env, &file);
-        let last = number(&heard.of_class("scan")[3], "seq");
-        let zones = heard.of_class("zones");
-        let first =
-            zones.iter().position(|zones| zones["verdict"] != "unknown").unwrap_or_else(|| panic!("{heard}"));
+        let (outcome, _) = replay_and_echo(&env, &file);
+        let last = number(&outcome.of_class("scan")[3], "seq");
+        let zones = outcome.of_class("zones");
+        let first = zones
+            .iter()
+            .position(|zones| zones["verdict"] != "unknown")
+            .unwrap_or_else(|| panic!("{outcome}"));
         // After the last one nothing more is heard, and who follows says that too.
         let until_last = zones[first..].iter().take_while(|zones| zones["seq"] != last);
         let unknown = until_last.filter(|zones| zones["verdict"] == "unknown");
-        assert_eq!(unknown.count(), 0, "{file}: {heard}");
+        assert_eq!(unknown.count(), 0, "{file}: {outcome}");
     }
 }

@@ -1,17 +1,17 @@
 //! The topic `motion`, from a line to consumers: found only while somebody follows, by the keys of a link, and the background
 //! that needs it.
 
-use crate::testkit::{INT, TERM, TestEnv, accounted, is_class, number};
+use crate::testkit::{INT, TERM, TestEnv, checked_topic_seqs, is_class, number};
 use serde_json::Value;
 
-const STREAM: [&str; 2] = ["--seed=51", "--baud=500000"];
+const STREAM_FLAGS: [&str; 2] = ["--seed=51", "--baud=500000"];
 
 #[test]
-fn a_robot_that_stands_is_said_to_stand_and_a_map_is_kept_if_wanted() {
+fn standing_robot_has_no_motion_and_learns_background() {
     let env = TestEnv::new();
     let set = ["--set=motion.max_step=0.3", "--set=link.rear.background.method=moving"].map(str::to_owned);
     let hub = env.hub(&[&[env.link("front"), env.link("rear")], &set[..]].concat());
-    let simulator = env.simulator(&["front", "rear"], &STREAM);
+    let simulator = env.simulator(&["front", "rear"], &STREAM_FLAGS);
     env.await_info("front", |info| info["state"] == "streaming");
     // The topic exists before it has a subscriber.
     let topics = env.run(&["list", "--json"]);
@@ -34,16 +34,16 @@ fn a_robot_that_stands_is_said_to_stand_and_a_map_is_kept_if_wanted() {
     let known = |line: &Value| line["class"] == "background" && number(line, "known_beams") > 0;
     rear.await_line("what stands", known);
     let refused = env.run(&["background", "rear", "load", "none.json"]);
-    assert_ne!(refused.code, Some(0), "{refused}");
+    assert_ne!(refused.exit_code, Some(0), "{refused}");
     let outcome = front.end(INT);
     let (of_motion, of_scans) = (outcome.of_class("motion"), outcome.of_class("scan"));
     // Each scan has its motion, under the same number.
     let seqs = |lines: &[Value]| lines.iter().map(|line| number(line, "seq")).collect::<Vec<_>>();
     let (of_scans, of_motion) = (seqs(&of_scans), seqs(&of_motion));
     assert!(of_motion.iter().filter(|seq| of_scans.contains(seq)).count() > 20, "{outcome}");
-    accounted(&outcome, "scan");
-    accounted(&outcome, "motion");
+    checked_topic_seqs(&outcome, "scan");
+    checked_topic_seqs(&outcome, "motion");
     drop(rear);
     assert_eq!(number(&env.info("front")["counters"], "loan_failed"), 0);
-    assert_eq!((hub.end(TERM).code, simulator.end(TERM).code), (Some(0), Some(0)));
+    assert_eq!((hub.end(TERM).exit_code, simulator.end(TERM).exit_code), (Some(0), Some(0)));
 }

@@ -11,8 +11,8 @@ use scanhub_shm::Payload;
 use scanhub_sim::Arrival;
 use scanhub_sim::device::Device;
 use scanhub_sim::ld::{LdSettings, LdSimulator};
-use scanhub_sim::machine::{self, LmsSimulator, Start};
-use scanhub_sim::operating::Operating;
+use scanhub_sim::machine::{self, LmsSimulator, StartState};
+use scanhub_sim::operating::OperatingMode;
 use scanhub_sim::room::Room;
 use scanhub_sim::rplidar::{Model, RplidarSettings, RplidarSimulator, RplidarStart};
 use serde_json::Value;
@@ -23,16 +23,16 @@ use crate::testkit::{INT, TERM, TestEnv};
 const REMEDY: &str = "Remove family from link front and restart the hub: it finds the scanner";
 
 /// A scanner that streams, and one that waits for requests, with the families that they do not belong to. An LDROBOT never waits.
-const STREAMING: [(&[&str], [&str; 2]); 3] = [
+const STREAMING_SCANNERS: [(&[&str], [&str; 2]); 3] = [
     (&["--family=ld", "--model=ld19"], ["lms", "rplidar"]),
     (&["--baud=500000", "--state=streaming"], ["ld", "rplidar"]),
     (&["--family=rplidar", "--model=a1", "--state=streaming"], ["lms", "ld"]),
 ];
-const IDLE: [(&[&str], [&str; 2]); 2] =
+const IDLE_SCANNERS: [(&[&str], [&str; 2]); 2] =
     [(&[], ["ld", "rplidar"]), (&["--family=rplidar", "--model=a1"], ["lms", "ld"])];
 
 /// Calls `check` with each scanner and each family that it does not belong to, at the same time.
-fn each_wrong(scanners: &[(&[&str], [&str; 2])], check: impl Fn(&[&str], &str) + Sync) {
+fn check_each_scanner(scanners: &[(&[&str], [&str; 2])], check: impl Fn(&[&str], &str) + Sync) {
     std::thread::scope(|scope| {
         let cases =
             scanners.iter().flat_map(|(simulated, families)| families.map(|family| (*simulated, family)));
@@ -44,8 +44,8 @@ fn each_wrong(scanners: &[(&[&str], [&str; 2])], check: impl Fn(&[&str], &str) +
 }
 
 #[test]
-fn bytes_of_another_scanner_are_reported_with_their_rate() {
-    each_wrong(&STREAMING, |simulated, family| {
+fn reports_byte_rate_of_a_scanner_of_another_family() {
+    check_each_scanner(&STREAMING_SCANNERS, |simulated, family| {
         let missing = match family {
             "lms" => "LMS replies",
             "ld" => "LDROBOT packets",
@@ -54,25 +54,25 @@ fn bytes_of_another_scanner_are_reported_with_their_rate() {
         let env = TestEnv::new();
         let _simulator = env.simulator(&["front"], &[&["--seed=43"], simulated].concat());
         let hub = env.hub(&[format!("{},family={family}", env.link("front"))]);
-        let says = format!(" bytes/s arrive, but no {missing}; is it another scanner? {REMEDY}");
+        let message = format!(" bytes/s arrive, but no {missing}; is it another scanner? {REMEDY}");
         let error = |info: &Value| info["last_error"].as_str().unwrap_or_default().to_owned();
         let info = env.await_info("front", |info| error(info).contains(" bytes/s arrive"));
         let error = error(&info);
-        let rate = error.strip_suffix(&says).unwrap_or_else(|| panic!("{says}: {info}"));
+        let rate = error.strip_suffix(&message).unwrap_or_else(|| panic!("{message}: {info}"));
         let rate: u64 = rate.replace(',', "").parse().unwrap_or_else(|_| panic!("{info}"));
         assert!((100..50_000).contains(&rate), "{info}");
         let outcome = hub.end(TERM);
-        assert_eq!(outcome.code, Some(0), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(0), "{outcome}");
         for wrong in ["no answer", "power, cable"] {
-            assert!(!outcome.errors.contains(wrong), "{outcome}");
+            assert!(!outcome.stderr.contains(wrong), "{outcome}");
         }
     });
 }
 
 #[test]
 fn a_silent_line_may_have_another_scanner() {
-    each_wrong(&IDLE, |simulated, family| {
-        let says = match family {
+    check_each_scanner(&IDLE_SCANNERS, |simulated, family| {
+        let message = match family {
             "lms" => "no answer at 9600, 19200, 38400 or 500000 baud",
             "ld" => "no packets at 230400 and 921600 baud",
             _ => "no answer at 115200, 256000, 460800 and 1000000 baud",
@@ -81,7 +81,7 @@ fn a_silent_line_may_have_another_scanner() {
         let _simulator = env.simulator(&["front"], simulated);
         let _hub = env.hub(&[format!("{},family={family}", env.link("front"))]);
         let error = |info: &Value| info["last_error"].as_str().unwrap_or_default().to_owned();
-        let info = env.await_info("front", |info| error(info).starts_with(says));
+        let info = env.await_info("front", |info| error(info).starts_with(message));
         let remedy = error(&info).split_once(" Another scanner? ").map(|(_, remedy)| remedy.to_owned());
         let is_probe = |remedy: &String| {
             let port = remedy.split_once("top the hub and try: scanhub probe ").map(|(_, port)| port);
@@ -95,14 +95,14 @@ fn a_silent_line_may_have_another_scanner() {
 
 /// `doctor` searches only for the family that a link names. `configure` writes only to an LMS.
 #[test]
-fn doctor_and_configure_name_the_search_for_any_scanner() {
+fn doctor_and_configure_suggest_scanhub_probe() {
     let try_this = |port: &str| format!("is it another scanner? Try: scanhub probe {port}; ");
     let check = |simulated: &[&str], family: &str| {
         let env = TestEnv::new();
         let _simulator = env.simulator(&["front"], &[&["--seed=43"], simulated].concat());
-        let (port, link) = (env.word("front"), format!("{},family={family}", env.link("front")));
+        let (port, link) = (env.path_argument("front"), format!("{},family={family}", env.link("front")));
         let outcome = env.run(&["doctor", &port, &link, "--json", "--no-system-config"]);
-        assert_eq!(outcome.code, Some(5), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(5), "{outcome}");
         let findings = outcome.of_class("check");
         let sensor = findings.iter().find(|line| line["name"] == "sensor").expect("is checked");
         let remedy = sensor["remedy"].as_str().expect("a text");
@@ -111,21 +111,21 @@ fn doctor_and_configure_name_the_search_for_any_scanner() {
             let outcome = env.run(&["configure", &port, "unit=mm", "--json"]);
             let failure = &outcome.of_class("error")[0];
             let hint = failure["hint"].as_str().expect("a text");
-            assert!(outcome.code == Some(3) && hint.starts_with(&try_this(&port)), "{outcome}");
+            assert!(outcome.exit_code == Some(3) && hint.starts_with(&try_this(&port)), "{outcome}");
         }
         // This leads to the scanner.
-        assert_eq!(env.search(&["probe", &port, "--json"]).code, Some(0));
+        assert_eq!(env.search(&["probe", &port, "--json"]).exit_code, Some(0));
     };
-    each_wrong(&STREAMING, check);
-    each_wrong(&IDLE, check);
+    check_each_scanner(&STREAMING_SCANNERS, check);
+    check_each_scanner(&IDLE_SCANNERS, check);
 }
 
 /// The remedy that the hub names leads to the scanner, and so does `probe`, which cannot search a port of the hub.
 #[test]
-fn a_port_of_the_hub_is_refused_with_what_the_hub_reports_and_the_next_command() {
+fn refusal_of_a_busy_port_shows_hub_error_and_remedy() {
     let (env, other) = (TestEnv::new(), TestEnv::new());
     let _simulator = env.simulator(&["front"], &["--family=ld", "--model=ld19", "--world=room"]);
-    let (port, name) = (env.word("front"), env.place().name().to_owned());
+    let (port, name) = (env.path_argument("front"), env.domain().name().to_owned());
     let hub = env.hub(&[format!("{},family=lms", env.link("front"))]);
     let error = |info: &Value| info["last_error"].as_str().unwrap_or_default().to_owned();
     let info = env.await_info("front", |info| error(info).ends_with(REMEDY));
@@ -133,7 +133,7 @@ fn a_port_of_the_hub_is_refused_with_what_the_hub_reports_and_the_next_command()
     let refused = |env: &TestEnv, verb: &[&str]| {
         let outcome = env.run(&[verb, &["--json"]].concat());
         let failure = &outcome.of_class("error")[0];
-        assert_eq!((outcome.code, &failure["kind"]), (Some(4), &"port_busy".into()), "{outcome}");
+        assert_eq!((outcome.exit_code, &failure["kind"]), (Some(4), &"port_busy".into()), "{outcome}");
         ["message", "hint"].map(|key| failure[key].as_str().expect("a text").to_owned())
     };
     for verb in [&["probe", &port][..], &["configure", &port, "unit=mm"]] {
@@ -153,7 +153,7 @@ fn a_port_of_the_hub_is_refused_with_what_the_hub_reports_and_the_next_command()
 
     let doctor = |env: &TestEnv, port: &str| {
         let outcome = env.run(&["doctor", port, "--json", "--no-system-config"]);
-        assert_eq!(outcome.code, Some(5), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(5), "{outcome}");
         let findings = outcome.of_class("check");
         let of = |name: &str| {
             let found = findings.iter().find(|line| line["name"] == name && !line["port"].is_null());
@@ -179,7 +179,7 @@ fn a_port_of_the_hub_is_refused_with_what_the_hub_reports_and_the_next_command()
     assert!(hint.starts_with(&format!("end {process}")) && hint.ends_with(&stop), "{hint}");
     drop(reader);
 
-    assert_eq!(hub.end(TERM).code, Some(0), "{info}");
+    assert_eq!(hub.end(TERM).exit_code, Some(0), "{info}");
     // Each of the two remedies leads to the scanner.
     assert_eq!(env.search(&["probe", &port, "--json"]).lines()[0]["model"], "ld19");
     let _hub = env.hub(&[env.link("front")]);
@@ -192,14 +192,17 @@ fn scanners() -> [(&'static str, Box<dyn Device>); 3] {
     let head = LdSettings { seed: 7, ..LdSettings::of(ld::Model::Ld19) };
     let machine = machine::Settings {
         baud: Baud::B500000,
-        start: Start::In(Operating::All),
+        start: StartState::Operating(OperatingMode::All),
         seed: 7,
         ..machine::Settings::default()
     };
     let unit = RplidarSettings { start: RplidarStart::Streaming, seed: 7, ..RplidarSettings::of(Model::A1) };
     [
         ("ld19", Box::new(LdSimulator::new(head, room()))),
-        ("lms scanner", Box::new(LmsSimulator::new(machine, scanhub_sim::operating::Source::Room(room())))),
+        (
+            "lms scanner",
+            Box::new(LmsSimulator::new(machine, scanhub_sim::operating::ScanSource::Room(room()))),
+        ),
         ("a1", Box::new(RplidarSimulator::new(unit, room()))),
     ]
 }
@@ -226,22 +229,22 @@ fn connect(
     }
 }
 
-const SECOND: Nanos = 1_000 * MILLIS;
+const ONE_SECOND: Nanos = 1_000 * MILLIS;
 /// Time at which the scanner is exchanged.
-const EXCHANGED_AT: Nanos = 10 * SECOND;
+const REPLACED_AT: Nanos = 10 * ONE_SECOND;
 
 /// Time, family and last error of a status.
-type Reported = (Nanos, Option<Family>, String);
+type ReportedStatus = (Nanos, Option<Family>, String);
 
 /// Runs a hub in virtual time until `end`: the scanner with this number streams, and is then replaced by the next one on the same
 /// line. `keys` belong to the link. Returns the name of the first scanner, and what the hub has reported.
-fn exchange(keys: &str, number: usize, end: Nanos) -> (&'static str, Vec<Reported>) {
+fn replace_scanner(keys: &str, number: usize, end: Nanos) -> (&'static str, Vec<ReportedStatus>) {
     let env = TestEnv::new();
     let (name, mut first) = scanners().into_iter().nth(number).expect("three");
     let (_, mut second) = scanners().into_iter().nth((number + 1) % 3).expect("three");
     let sources = Sources { links: vec![format!("a=/dev/none{keys}")], ..Sources::default() };
     let config = Config::load(&sources).expect("a configuration");
-    let domain = env.place();
+    let domain = env.domain();
     let driven = virtual_hub(&config, &domain, |links| {
         let node = scanhub_shm::client_node(&domain).expect("a node");
         let topic = Status::open(&node, "a").expect("a topic").expect("is there");
@@ -253,40 +256,39 @@ fn exchange(keys: &str, number: usize, end: Nanos) -> (&'static str, Vec<Reporte
                 reported.push((now, status.family(), status.last_error().to_owned()));
             }
         };
-        connect(&mut *first, &mut links[0], (0, EXCHANGED_AT), &mut note);
-        connect(&mut *second, &mut links[0], (EXCHANGED_AT, end), &mut note);
+        connect(&mut *first, &mut links[0], (0, REPLACED_AT), &mut note);
+        connect(&mut *second, &mut links[0], (REPLACED_AT, end), &mut note);
         reported
     });
     (name, driven.expect("the domain is free"))
 }
 
 /// Checks that a hub reports the exchange of a scanner called `name` within 4 s, with `remedy`, and no damage of the line.
-fn check_exchange(name: &str, remedy: &str, reported: &[Reported]) {
-    let says =
+fn check_replacement(name: &str, remedy: &str, reported: &[ReportedStatus]) {
+    let message =
         format!(" bytes/s arrive, but nothing from the {name}: another scanner, or a damaged line? {remedy}");
-    let is_soon = |(now, ..): &&Reported| (EXCHANGED_AT..EXCHANGED_AT + 4 * SECOND).contains(now);
+    let is_soon = |(now, ..): &&ReportedStatus| (REPLACED_AT..REPLACED_AT + 4 * ONE_SECOND).contains(now);
     let mut soon = reported.iter().filter(is_soon);
-    assert!(soon.any(|(.., error)| error.ends_with(&says)), "{says}: {reported:#?}");
+    assert!(soon.any(|(.., error)| error.ends_with(&message)), "{message}: {reported:#?}");
     let is_damaged = reported.iter().any(|(.., error)| error.contains("damaged on the line"));
     assert!(!is_damaged, "{name}: {reported:#?}");
 }
 
 #[test]
-fn an_exchanged_scanner_is_not_reported_as_a_damaged_line() {
+fn replaced_scanner_is_not_reported_as_damaged_line() {
     for number in 0..3 {
-        let (name, reported) = exchange("", number, 35 * SECOND);
-        check_exchange(name, "The search begins after 10 s without it", &reported);
-        let before =
-            reported.iter().rfind(|(now, ..)| *now < EXCHANGED_AT).and_then(|(_, family, _)| *family);
+        let (name, reported) = replace_scanner("", number, 35 * ONE_SECOND);
+        check_replacement(name, "The search begins after 10 s without it", &reported);
+        let before = reported.iter().rfind(|(now, ..)| *now < REPLACED_AT).and_then(|(_, family, _)| *family);
         let (_, family, error) = reported.last().expect("statuses");
         assert!(before.is_some() && family.is_some() && before != *family, "{name}: {reported:#?}");
         assert_eq!(error, "", "{name}: {reported:#?}");
     }
     for key in ["family=ld", "model=ld19"] {
-        let (name, reported) = exchange(&format!(",{key}"), 0, 16 * SECOND);
+        let (name, reported) = replace_scanner(&format!(",{key}"), 0, 16 * ONE_SECOND);
         let key = key.split('=').next().expect("a key");
         let remedy = format!("Remove {key} from link a and restart the hub: it finds the scanner");
-        check_exchange(name, &remedy, &reported);
+        check_replacement(name, &remedy, &reported);
     }
 }
 
@@ -310,11 +312,11 @@ fn doctor_reports_each_link_of_the_running_hub() {
     env.await_info("walk", |info| info["state"] == "silent");
     env.await_info("side", |info| info["last_error"].as_str().is_some_and(|error| error.contains("refused")));
     let outcome = env.run(&["doctor", "--json", "--no-system-config"]);
-    assert_eq!(outcome.code, Some(5), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(5), "{outcome}");
     let findings = outcome.of_class("check");
-    for (link, port, state, says) in [
-        ("front", env.word("front"), "ok", "link front of the hub: streaming, family ld, LD19"),
-        ("absent", env.word("absent"), "failed", "link absent of the hub: absent"),
+    for (link, port, state, message) in [
+        ("front", env.path_argument("front"), "ok", "link front of the hub: streaming, family ld, LD19"),
+        ("absent", env.path_argument("absent"), "failed", "link absent of the hub: absent"),
         ("side", server.clone(), "failed", "connection refused; nothing listens there"),
         ("walk", format!("file:{log}"), "ok", "link walk of the hub: silent"),
     ] {
@@ -322,7 +324,7 @@ fn doctor_reports_each_link_of_the_running_hub() {
         let found = found.unwrap_or_else(|| panic!("no {link}: {outcome}"));
         let text = |key: &str| found[key].as_str().unwrap_or_default();
         assert_eq!((text("state"), text("port")), (state, &port[..]), "{found}");
-        assert!(text("finding").contains(says), "{found}");
+        assert!(text("finding").contains(message), "{found}");
         assert!(text("state") == "ok" || text("remedy").contains(&format!("scanhub info {link}")), "{found}");
     }
     let text = env.run(&["doctor", "--no-system-config"]).to_string();
@@ -340,5 +342,5 @@ fn doctor_reports_each_link_of_the_running_hub() {
             .count()
     };
     assert!(links.iter().all(|link| count(link) > 0), "{named}");
-    assert_eq!(hub.end(INT).code, Some(0));
+    assert_eq!(hub.end(INT).exit_code, Some(0));
 }

@@ -3,20 +3,20 @@
 //! be run is named here, with the reason.
 
 mod blocks;
+mod data_blocks;
 mod lines;
 mod names;
 mod program;
-mod said;
 mod shell;
 
-use crate::testkit::{INT, Outcome, Program, TERM, TestEnv, is_class, side_by_side, until};
+use crate::testkit::{INT, Outcome, Program, TERM, TestEnv, is_class, run_concurrently, wait_until};
 use blocks::{Block, blocks};
 pub(crate) use program::Example;
 use rustix::time::{ClockId, clock_gettime};
 
 /// A room, and a sensor in it.
 #[derive(Clone, Copy, Debug)]
-struct Situation {
+struct ExampleScene {
     world: &'static str,
     sensor: &'static str,
     unit: &'static str,
@@ -24,18 +24,18 @@ struct Situation {
     wall_m: Option<f64>,
 }
 
-const SITUATIONS: [Situation; 5] = [
-    Situation { world: "empty", sensor: "lms200", unit: "mm", wall_m: None },
-    Situation { world: "empty", sensor: "lms291", unit: "cm", wall_m: None },
-    Situation { world: "wall640", sensor: "lms200", unit: "mm", wall_m: Some(0.64) },
-    Situation { world: "wall640", sensor: "lms200", unit: "cm", wall_m: Some(6.4) },
-    Situation { world: "wall640", sensor: "lms291", unit: "cm", wall_m: Some(6.4) },
+const EXAMPLE_SCENES: [ExampleScene; 5] = [
+    ExampleScene { world: "empty", sensor: "lms200", unit: "mm", wall_m: None },
+    ExampleScene { world: "empty", sensor: "lms291", unit: "cm", wall_m: None },
+    ExampleScene { world: "wall640", sensor: "lms200", unit: "mm", wall_m: Some(0.64) },
+    ExampleScene { world: "wall640", sensor: "lms200", unit: "cm", wall_m: Some(6.4) },
+    ExampleScene { world: "wall640", sensor: "lms291", unit: "cm", wall_m: Some(6.4) },
 ];
 
-impl Situation {
+impl ExampleScene {
     /// A hub with a sensor `front` that streams.
-    fn begin(&self, env: &TestEnv) -> [Program; 2] {
-        let Situation { world, sensor, unit, .. } = self;
+    fn start(&self, env: &TestEnv) -> [Program; 2] {
+        let ExampleScene { world, sensor, unit, .. } = self;
         let flags = [
             format!("--world={world}"),
             format!("--type={sensor}"),
@@ -50,32 +50,33 @@ impl Situation {
     }
 
     /// What is wrong with what these print here.
-    fn judge_all(&self, examples: &[Example]) -> Vec<String> {
+    fn check_examples(&self, examples: &[Example]) -> Vec<String> {
         let env = TestEnv::new();
-        let _running = self.begin(&env);
-        let mut recorder = env.start(&["record", "--ros2", "--json", "-o", &env.word("ros.mcap")]);
+        let _running = self.start(&env);
+        let mut recorder = env.start(&["record", "--ros2", "--json", "-o", &env.path_argument("ros.mcap")]);
         recorder
             .await_line("scans", |line| is_class("recording")(line) && line["samples"].as_u64() > Some(20));
         let recorded = recorder.end(INT);
-        assert_eq!(recorded.code, Some(0), "{recorded}");
+        assert_eq!(recorded.exit_code, Some(0), "{recorded}");
         let mut verdicts = env.echo(&["front/zones"]);
-        let mut run = |example| run(example, &env, &mut verdicts, self.wants_words(example));
-        examples.iter().filter_map(|example| self.judge(example, &run(example)).err()).collect()
+        let mut run = |example| run(example, &env, &mut verdicts, self.needs_distance(example));
+        examples.iter().filter_map(|example| self.check_example(example, &run(example)).err()).collect()
     }
 
     /// Whether there is something to tell, for an example that tells anything.
-    fn wants_words(&self, example: &Example) -> bool {
+    fn needs_distance(&self, example: &Example) -> bool {
         self.wall_m.is_some() && example.text.contains("print")
     }
 
     /// What is wrong with what an example printed here.
-    fn judge(&self, example: &Example, outcome: &Outcome) -> Result<(), String> {
-        let wrong = |what: &str| Err(format!("{}, {self:?}: {what}\n{outcome}", example.place));
+    fn check_example(&self, example: &Example, outcome: &Outcome) -> Result<(), String> {
+        let wrong =
+            |description: &str| Err(format!("{}, {self:?}: {description}\n{outcome}", example.location));
         // Either it ends when it is through, or not before it is ended.
-        if !matches!(outcome.code, None | Some(0)) || !outcome.errors.is_empty() {
+        if !matches!(outcome.exit_code, None | Some(0)) || !outcome.stderr.is_empty() {
             return wrong("it failed");
         }
-        let text = String::from_utf8_lossy(&outcome.out);
+        let text = String::from_utf8_lossy(&outcome.stdout);
         for (line, distance) in text.lines().filter_map(|line| Some((line, distance_m(line)?))) {
             let is_right = match self.wall_m {
                 Some(wall) => (distance - wall).abs() < 0.001,
@@ -85,8 +86,9 @@ impl Situation {
                 return wrong(&format!("it says {line:?}"));
             }
         }
-        let says = |line: &str| distance_m(line).is_some() || VERDICTS.iter().any(|word| line.contains(word));
-        if self.wants_words(example) && !text.lines().any(says) {
+        let has_result =
+            |line: &str| distance_m(line).is_some() || VERDICTS.iter().any(|word| line.contains(word));
+        if self.needs_distance(example) && !text.lines().any(has_result) {
             return wrong("it says no distance with its unit, and no verdict");
         }
         Ok(())
@@ -110,7 +112,7 @@ fn distance_m(line: &str) -> Option<f64> {
 
 /// Runs `example` beside the hub of `env` until it has seen some scans, and `says` something if it should. `verdicts` come
 /// with the scans.
-fn run(example: &Example, env: &TestEnv, verdicts: &mut Program, says: bool) -> Outcome {
+fn run(example: &Example, env: &TestEnv, verdicts: &mut Program, must_print: bool) -> Outcome {
     // Nobody types, and nobody closes it.
     let (stdin, _typed) = std::io::pipe().expect("a pipe");
     let mut program = Program::start_with(example.command(env), stdin);
@@ -120,13 +122,13 @@ fn run(example: &Example, env: &TestEnv, verdicts: &mut Program, says: bool) -> 
         let maps = std::fs::read_to_string(&maps).unwrap_or_default();
         maps.lines().any(|map| map.contains("/dev/shm/sh_") && map.ends_with(".data"))
     };
-    until("it follows the hub", || follows() || program.is_over());
+    wait_until("it follows the hub", || follows() || program.has_ended());
     let now_ns = monotonic_ns();
     verdicts.await_lines(10, "a scan that began after that", |line| line["stamp_ns"].as_u64() > Some(now_ns));
-    if says && !program.is_over() {
+    if must_print && !program.has_ended() {
         program.await_bytes(0);
     }
-    if program.is_over() { program.wait() } else { program.end(TERM) }
+    if program.has_ended() { program.wait() } else { program.end(TERM) }
 }
 
 /// CLOCK_MONOTONIC, as in stamps.
@@ -137,7 +139,8 @@ fn monotonic_ns() -> u64 {
 
 /// The words of the lines for a shell on `page` that begin with one of `begins`, behind the program's name.
 pub(crate) fn commands_on(page: &str, begins: &[&str]) -> Vec<Vec<String>> {
-    let blocks = blocks().into_iter().filter(|block| block.language == "sh" && block.place.starts_with(page));
+    let blocks =
+        blocks().into_iter().filter(|block| block.language == "sh" && block.location.starts_with(page));
     let lines = blocks.flat_map(|block| shell::lines(&block.text));
     let lines = lines.filter(|line| begins.iter().any(|begin| line.starts_with(begin)));
     lines.map(|line| shell::commands(&line).remove(0).split_off(1)).collect()
@@ -146,7 +149,7 @@ pub(crate) fn commands_on(page: &str, begins: &[&str]) -> Vec<Vec<String>> {
 /// The block of `page` that is in `language` and begins with `begin`.
 pub(crate) fn text_on(page: &str, language: &str, begin: &str) -> String {
     let is_it = |block: &Block| {
-        block.place.starts_with(page) && block.language == language && block.text.starts_with(begin)
+        block.location.starts_with(page) && block.language == language && block.text.starts_with(begin)
     };
     blocks().into_iter().find(is_it).unwrap_or_else(|| panic!("{page} has no {begin:?}")).text
 }
@@ -156,11 +159,11 @@ fn is_program(block: &Block) -> bool {
 }
 
 /// Pages whose programs follow a tracker, or publish a mount, and follow no hub; `track.rs` and `tilt.rs` run them.
-const OF_OTHERS: [&str; 2] = ["docs/tracks.md", "docs/tilt.md"];
+const PAGES_TESTED_ELSEWHERE: [&str; 2] = ["docs/tracks.md", "docs/tilt.md"];
 
 /// The programs on `page` in which these `words` stand, as far as this machine can run them.
-pub(crate) fn programs_on(page: &str, words: &str, env: &TestEnv) -> Vec<Example> {
-    let is_wanted = |block: &Block| block.place.starts_with(page) && block.text.contains(words);
+pub(crate) fn examples_on(page: &str, words: &str, env: &TestEnv) -> Vec<Example> {
+    let is_wanted = |block: &Block| block.location.starts_with(page) && block.text.contains(words);
     let blocks = blocks().into_iter().filter(is_wanted).map(|block| match block.language.as_str() {
         "rust,no_run" => Block { language: "rust".to_owned(), ..block },
         _ => block,
@@ -171,27 +174,28 @@ pub(crate) fn programs_on(page: &str, words: &str, env: &TestEnv) -> Vec<Example
 }
 
 #[test]
-fn every_program_on_a_page_runs_and_tells_distances_only_where_there_are_some() {
-    let is_of_others = |block: &Block| OF_OTHERS.iter().any(|page| block.place.starts_with(page));
+fn page_programs_run_and_print_only_real_distances() {
+    let is_of_others =
+        |block: &Block| PAGES_TESTED_ELSEWHERE.iter().any(|page| block.location.starts_with(page));
     let is_of_hubs = |block: &Block| is_program(block) && !is_of_others(block);
     let blocks: Vec<Block> = blocks().into_iter().filter(is_of_hubs).collect();
     assert!(blocks.len() > 10, "{blocks:#?}");
-    let wrong = wrong_with(&blocks, &SITUATIONS);
+    let wrong = failures(&blocks, &EXAMPLE_SCENES);
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
 }
 
 /// What is wrong with the programs `blocks`, each line with its place.
-fn wrong_with(blocks: &[Block], situations: &[Situation]) -> Vec<String> {
+fn failures(blocks: &[Block], scenes: &[ExampleScene]) -> Vec<String> {
     let shop = TestEnv::new();
     let (mut examples, mut wrong) = (Vec::new(), Vec::new());
     for block in blocks {
         match Example::build(block, &shop) {
             Ok(example) => examples.extend(example),
-            Err(refused) => wrong.push(format!("{}: {refused}", block.place)),
+            Err(refused) => wrong.push(format!("{}: {refused}", block.location)),
         }
     }
     // Each has a hub of its own, and all of them wait most of the time.
-    wrong.extend(side_by_side(situations, |situation| situation.judge_all(&examples)).concat());
+    wrong.extend(run_concurrently(scenes, |situation| situation.check_examples(&examples)).concat());
     wrong
 }
 
@@ -199,7 +203,7 @@ fn wrong_with(blocks: &[Block], situations: &[Situation]) -> Vec<String> {
 #[test]
 fn a_program_that_takes_codes_for_distances_is_found() {
     let block = |language: &str, text: &str| Block {
-        place: format!("planted.md:{}", text.len()),
+        location: format!("planted.md:{}", text.len()),
         language: language.to_owned(),
         text: text.to_owned(),
     };
@@ -217,13 +221,13 @@ fn a_program_that_takes_codes_for_distances_is_found() {
         ),
         (block("c", "puts(scanhub_open());\n"), "too few arguments"),
     ];
-    let situations = [SITUATIONS[0], SITUATIONS[4]];
+    let situations = [EXAMPLE_SCENES[0], EXAMPLE_SCENES[4]];
     let blocks = planted.each_ref().map(|(block, _)| block.clone());
-    let wrong = wrong_with(&blocks, &situations);
+    let wrong = failures(&blocks, &situations);
     for (block, what) in planted {
         let is_skipped = Example::build(&block, &TestEnv::new()).is_ok_and(|example| example.is_none());
         let of_it = |wrong: &&String| {
-            wrong.strip_prefix(&block.place).is_some_and(|rest| rest.starts_with([',', ':']))
+            wrong.strip_prefix(&block.location).is_some_and(|rest| rest.starts_with([',', ':']))
         };
         let is_found = wrong.iter().filter(of_it).any(|wrong| wrong.contains(what));
         assert!(is_skipped || is_found, "{block:#?}: {wrong:#?}");

@@ -10,81 +10,83 @@ fn a_telegram_costs_no_more_than_before() {
 #[cfg(target_arch = "x86_64")]
 #[test]
 fn a_telegram_costs_no_more_than_before() {
-    use crate::testkit::steps::{Cost, Stepper, link_thread};
-    use crate::testkit::{TERM, TestEnv, is_class, skip, until};
+    use crate::testkit::steps::{Stepper, TelegramCost, link_thread};
+    use crate::testkit::{TERM, TestEnv, is_class, skip, wait_until};
     use std::time::Duration;
 
     // Upper bounds, a quarter above the values that this test prints: `cargo test --test it -- path_cost --nocapture`.
     // After a change that makes the path shorter, set them to 1.25 times the new values, so that the gain stays. Take the
     // highest of five runs: the hub publishes the status with most telegrams that are stepped through, but not with all.
     /// With a learned background, for the profile `dev`. 182,000 to 217,000 were measured.
-    const MOST_INSTRUCTIONS: u64 = 271_000;
+    const MAX_INSTRUCTIONS: u64 = 271_000;
     /// At 500,000 baud. 7 were measured, and 5 to 9 on a busy machine.
-    const MOST_SYSTEM_CALLS: u64 = 9;
+    const MAX_SYSTEM_CALLS: u64 = 9;
 
     /// Telegrams that are stepped through. Each takes some seconds.
-    const STEPPED: usize = 10;
+    const STEPPED_TELEGRAMS: usize = 10;
     /// Telegrams whose system calls are counted, and telegrams before them. By then, the hub has learned how long before
     /// the end of a telegram it has to wake up.
-    const COUNTED: usize = 40;
-    const LEARNING: usize = 110;
+    const COUNTED_TELEGRAMS: usize = 40;
+    const LEARNING_TELEGRAMS: usize = 110;
     /// Time between two telegrams at 9,600 baud.
-    const INTERVAL: Duration = Duration::from_millis(773);
+    const TELEGRAM_INTERVAL: Duration = Duration::from_millis(773);
     /// Learns the background within a second.
-    const SOON: &str = "--set=background.scans=20";
+    const SHORT_LEARNING: &str = "--set=background.scans=20";
 
     /// A wall around the sensor, without the noise on which the number of instructions depends.
-    const ROOM: &str = "[noise]\nerrors = 0\ntail = 0\n\n\
+    const ROOM_WORLD: &str = "[noise]\nerrors = 0\ntail = 0\n\n\
          [[thing]]\nline = [[3000, -500], [3000, 3000], [-3000, 3000], [-3000, -500]]\n";
 
     /// Returns the values per telegram in ascending order. If two telegrams were complete before the hub read, it sleeps
     /// once for both.
-    fn sorted(costs: &[Cost], value: fn(&Cost) -> u64) -> Vec<u64> {
+    fn sorted(costs: &[TelegramCost], value: fn(&TelegramCost) -> u64) -> Vec<u64> {
         let mut values: Vec<u64> = costs.iter().map(|cost| value(cost).div_ceil(cost.telegrams)).collect();
         values.sort_unstable();
         values
     }
 
     let env = TestEnv::new();
-    let world = format!("--world={}", env.file("world.toml", ROOM));
+    let world = format!("--world={}", env.file("world.toml", ROOM_WORLD));
     let _simulator = env.simulator(&["front"], &["--seed=48", "--baud=500000", &world]);
     let link = env.lms_link("front");
-    let saved = env.path("state/scanhub").join(env.place().name()).join("front.background.json");
+    let saved = env.path("state/scanhub").join(env.domain().name()).join("front.background.json");
 
-    let hub = env.hub(&[link.as_str(), SOON]);
+    let hub = env.hub(&[link.as_str(), SHORT_LEARNING]);
     let mut subscriber = env.echo(&["front/scan"]);
     subscriber.await_lines(2, "a scan", is_class("scan"));
-    until("the background is saved", || saved.exists());
+    wait_until("the background is saved", || saved.exists());
     let mut stepper = match Stepper::attach(link_thread(hub.pid(), "front").expect("the hub runs")) {
         Ok(stepper) => stepper,
         Err(reason) => return skip("ptrace", reason),
     };
-    let costs: Vec<Cost> =
-        (0..LEARNING + COUNTED).map(|_| stepper.run().expect("the hub publishes")).collect();
+    let costs: Vec<TelegramCost> = (0..LEARNING_TELEGRAMS + COUNTED_TELEGRAMS)
+        .map(|_| stepper.run_telegram().expect("the hub publishes"))
+        .collect();
     stepper.detach();
     // On a busy machine, sleeps end at other times, and most telegrams need one or two calls more. The lower quartile
     // hardly depends on that.
-    let calls = sorted(&costs[LEARNING..], |cost| cost.system_calls.values().sum())[COUNTED / 4];
+    let calls =
+        sorted(&costs[LEARNING_TELEGRAMS..], |cost| cost.system_calls.values().sum())[COUNTED_TELEGRAMS / 4];
     drop(subscriber);
-    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
 
-    let hub = env.hub(&[link.as_str(), SOON, "--set=link.front.baud=9600"]);
+    let hub = env.hub(&[link.as_str(), SHORT_LEARNING, "--set=link.front.baud=9600"]);
     let mut subscriber = env.echo(&["front/scan"]);
     subscriber.await_lines(2, "a scan", is_class("scan"));
     let mut stepper =
         Stepper::attach(link_thread(hub.pid(), "front").expect("the hub runs")).expect("ptrace is allowed");
-    let stepped: Vec<Cost> = (0..STEPPED)
+    let stepped: Vec<TelegramCost> = (0..STEPPED_TELEGRAMS)
         .map(|_| {
             // The steps of the previous telegram have delayed the hub.
-            stepper.pass(INTERVAL).expect("the hub publishes");
-            stepper.telegram(|_, _, _| {}).expect("the hub publishes")
+            stepper.run_past_telegram(TELEGRAM_INTERVAL).expect("the hub publishes");
+            stepper.step_telegram(|_, _, _| {}).expect("the hub publishes")
         })
         .collect();
     stepper.detach();
     // A preempted hub may take another path.
-    let instructions = sorted(&stepped, |cost| cost.instructions)[STEPPED / 2];
+    let instructions = sorted(&stepped, |cost| cost.instructions)[STEPPED_TELEGRAMS / 2];
     println!("{instructions} instructions, {calls} system calls");
-    assert!(instructions <= MOST_INSTRUCTIONS, "{instructions} instructions: {stepped:?}");
-    assert!(calls <= MOST_SYSTEM_CALLS, "{calls} system calls: {costs:?}");
-    assert_eq!(hub.end(TERM).code, Some(0));
+    assert!(instructions <= MAX_INSTRUCTIONS, "{instructions} instructions: {stepped:?}");
+    assert!(calls <= MAX_SYSTEM_CALLS, "{calls} system calls: {costs:?}");
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
 }

@@ -5,22 +5,22 @@ use std::net::{TcpListener, TcpStream};
 use std::os::unix::fs::{PermissionsExt, chown, symlink};
 use std::os::unix::process::CommandExt;
 
-use crate::testkit::{self, Line, Program, TERM, TestEnv, is_class, skip, succeeds};
+use crate::testkit::{self, Program, TERM, TestEnv, TestLine, is_class, skip, succeeds};
 use rustix::process::geteuid;
 use serde_json::Value;
 
 /// Whoever is not root and owns nothing.
-const NOBODY: u32 = 65534;
+const UNPRIVILEGED_UID: u32 = 65534;
 
 /// What a hub at `port` says, which must end with code 4 and `kind`.
-fn refused(env: &TestEnv, port: &str, kind: &str) -> String {
+fn assert_refused(env: &TestEnv, port: &str, kind: &str) -> String {
     let outcome = env.run(&["run", "--json", &format!("--link=front={port}")]);
-    assert_eq!(outcome.code, Some(4), "{outcome}");
-    said(&outcome.errors, kind)
+    assert_eq!(outcome.exit_code, Some(4), "{outcome}");
+    message_and_hint(&outcome.stderr, kind)
 }
 
 /// Message and hint of the error at the end of a log.
-fn said(log: &str, kind: &str) -> String {
+fn message_and_hint(log: &str, kind: &str) -> String {
     let line: Value = serde_json::from_str(log.lines().last().unwrap_or_default())
         .unwrap_or_else(|error| panic!("{error}: {log}"));
     assert_eq!(line["kind"], kind, "{line}");
@@ -28,47 +28,47 @@ fn said(log: &str, kind: &str) -> String {
 }
 
 #[test]
-fn what_is_no_serial_line() {
+fn hub_ends_at_a_port_that_is_not_a_serial_line() {
     let env = TestEnv::new();
-    let directory = env.word("directory");
+    let directory = env.path_argument("directory");
     std::fs::create_dir(&directory).expect("a directory");
     let file = env.file("file", "");
-    for (port, says) in [
+    for (port, message) in [
         (directory.as_str(), "it is a directory"),
         (file.as_str(), "name a tty"),
         ("/dev/null", "not a serial line"),
         (&format!("{file}/front"), "not a serial line"),
     ] {
-        let text = refused(&env, port, "port_not_tty");
-        assert!(text.contains(port) && text.contains(says), "{text}");
+        let text = assert_refused(&env, port, "port_not_tty");
+        assert!(text.contains(port) && text.contains(message), "{text}");
     }
 }
 
 #[test]
-fn what_is_missing_is_waited_for() {
+fn hub_waits_for_missing_ports() {
     let env = TestEnv::new();
     symlink("/dev/ttyGone", env.path("dangling")).expect("a link");
     let hub = env.hub(&[
         "--link=gone=/dev/serial/by-id/usb-Nobody_Has_This-if00-port0",
         "--link=never=/dev/ttyNever",
-        &format!("--link=dangling={}", env.word("dangling")),
+        &format!("--link=dangling={}", env.path_argument("dangling")),
     ]);
-    for (sensor, says) in [
+    for (sensor, message) in [
         ("gone", "its adapter is not plugged in"),
         ("never", "/dev/ttyNever: no such port; "),
         ("dangling", "it points to /dev/ttyGone, which is not there"),
     ] {
         let info = env.await_info(sensor, |info| info["state"] == "absent");
-        assert!(info["last_error"].as_str().is_some_and(|error| error.contains(says)), "{info}");
+        assert!(info["last_error"].as_str().is_some_and(|error| error.contains(message)), "{info}");
     }
-    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
 }
 
 /// The rights to a pty are taken away: from nobody if this is root, else from its owner.
 #[test]
-fn what_this_user_may_not_open() {
+fn hub_waits_for_a_port_without_permission() {
     let env = TestEnv::new();
-    let _line = Line::at(&env.path("front"));
+    let _line = TestLine::create(&env.path("front"));
     let device = env.path("front").canonicalize().expect("a pty");
     let is_root = geteuid().is_root();
     let mode = if is_root { 0o600 } else { 0o000 };
@@ -77,24 +77,24 @@ fn what_this_user_may_not_open() {
     std::fs::create_dir(&home).expect("a directory");
     let mut command = env.command_at(&home, &["run", "--json", &env.link("front")]);
     if is_root {
-        chown(&home, Some(NOBODY), Some(NOBODY)).expect("root may");
-        if !command_can_run(NOBODY) {
+        chown(&home, Some(UNPRIVILEGED_UID), Some(UNPRIVILEGED_UID)).expect("root may");
+        if !command_can_run(UNPRIVILEGED_UID) {
             skip("open-directory", "the program lies where only root may run it");
             return;
         }
-        command.uid(NOBODY).gid(NOBODY);
+        command.uid(UNPRIVILEGED_UID).gid(UNPRIVILEGED_UID);
     }
     let mut hub = Program::start(command);
     let ready = hub.await_line("ready", is_class("ready"));
     assert_eq!(ready["waiting"], serde_json::json!(["front"]), "{ready}");
     let outcome = hub.end(TERM);
-    assert_eq!(outcome.code, Some(0), "{outcome}");
-    let lines: Vec<_> = outcome.errors.lines().filter(|line| line.contains("front: absent")).collect();
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
+    let lines: Vec<_> = outcome.stderr.lines().filter(|line| line.contains("front: absent")).collect();
     let [text] = lines[..] else { panic!("not one line for one reason: {outcome}") };
     let user = if is_root { "nobody" } else { "user" };
     let remedy = if is_root { "udev rule" } else { "chmod u+rw" };
-    for says in [&env.word("front"), "no permission", user, &format!("mode {mode:03o}"), remedy] {
-        assert!(text.contains(says), "{says:?}: {text}");
+    for part in [&env.path_argument("front"), "no permission", user, &format!("mode {mode:03o}"), remedy] {
+        assert!(text.contains(part), "{part:?}: {text}");
     }
 }
 
@@ -105,11 +105,11 @@ fn command_can_run(user: u32) -> bool {
 }
 
 #[test]
-fn what_another_process_has() {
+fn hub_waits_for_a_port_held_by_another_hub() {
     let env = TestEnv::new();
-    let line = Line::at(&env.path("front"));
+    let line = TestLine::create(&env.path("front"));
     let hub = env.hub(&[env.link("front")]);
-    line.await_open();
+    line.wait_until_open();
     let other = TestEnv::new();
     let _simulator = other.simulator(&["rear"], &["--seed=73", "--baud=500000"]);
     let mut second = other.start(&["run", "--json", &env.link("front"), &other.link("rear")]);
@@ -125,20 +125,20 @@ fn what_another_process_has() {
     other.await_info("rear", |info| info["state"] == "streaming");
     let list = other.run(&["list"]);
     let reason = format!("front: {text}");
-    assert!(String::from_utf8_lossy(&list.out).lines().any(|line| line == reason), "{list}");
+    assert!(String::from_utf8_lossy(&list.stdout).lines().any(|line| line == reason), "{list}");
     // On a pty the exclusive mode outlives a close; the next process finds none.
-    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
     let taken = |info: &Value| info["state"] != "absent" && info["last_error"] == "";
     other.await_info("front", taken);
-    line.await_open();
+    line.wait_until_open();
     let outcome = second.end(TERM);
-    assert_eq!(outcome.code, Some(0), "{outcome}");
-    let lines = outcome.errors.lines().filter(|line| line.contains("front: absent")).count();
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
+    let lines = outcome.stderr.lines().filter(|line| line.contains("front: absent")).count();
     assert_eq!(lines, 1, "not one line for one reason: {outcome}");
 }
 
 #[test]
-fn ready_without_json_names_what_the_hub_waits_for() {
+fn ready_text_names_ports_the_hub_waits_for() {
     let env = TestEnv::new();
     // Nothing listens at the one, and the other one accepts no connection.
     let free = TcpListener::bind("127.0.0.1:0").and_then(|socket| socket.local_addr()).expect("a port");
@@ -152,7 +152,7 @@ fn ready_without_json_names_what_the_hub_waits_for() {
     let ready = hub.next_text();
     let names = "front, rear, refused, mute";
     assert!(ready.ends_with(&format!(", sensors: {names}; waiting for the port of {names}")), "{ready}");
-    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
 }
 
 /// A server that accepts the connection at once is not waited for.
@@ -164,9 +164,9 @@ fn ready_names_no_serial_server_that_is_connected() {
     let is_connected = || {
         let mut hub = env.start(&["run", "--json", &link]);
         let ready = hub.await_line("ready", is_class("ready"));
-        assert_eq!((ready["sensors"].as_array().map(Vec::len), hub.end(TERM).code), (Some(1), Some(0)));
+        assert_eq!((ready["sensors"].as_array().map(Vec::len), hub.end(TERM).exit_code), (Some(1), Some(0)));
         ready["waiting"] == serde_json::json!([])
     };
     // On a busy machine, the hub may run too late to connect in time.
-    testkit::until("the hub is connected when it is ready", is_connected);
+    testkit::wait_until("the hub is connected when it is ready", is_connected);
 }

@@ -3,19 +3,20 @@
 use std::io::Read;
 
 use crate::testkit;
-use crate::testkit::{INT, Line, REAL_ANSWERS, TERM, TestEnv, number, open_line};
+use crate::testkit::{INT, REAL_REPLY_TIME, TERM, TestEnv, TestLine, number, open_line};
 use serde_json::Value;
 
 #[test]
-fn a_sensor_tells_of_itself_and_is_left_as_it_was() {
+fn reports_identity_without_changing_the_scanner() {
     let env = TestEnv::new();
-    let simulator = env.simulator(&["front"], &["--baud=19200", "--type=lms291", "--unit=cm", REAL_ANSWERS]);
-    let port = env.word("front");
+    let simulator =
+        env.simulator(&["front"], &["--baud=19200", "--type=lms291", "--unit=cm", REAL_REPLY_TIME]);
+    let port = env.path_argument("front");
     for _ in 0..2 {
         let outcome = env.search(&["probe", &port, "--json"]);
-        assert_eq!(outcome.code, Some(0), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(0), "{outcome}");
         let [found] = &outcome.lines()[..] else { panic!("{outcome}") };
-        let text = String::from_utf8_lossy(&outcome.out);
+        let text = String::from_utf8_lossy(&outcome.stdout);
         let begin = format!(
             r#"{{"class":"probe","port":"{port}","family":"lms","model":"lms291","baud":19200,"type":"LMS291","number":"301063""#
         );
@@ -27,20 +28,20 @@ fn a_sensor_tells_of_itself_and_is_left_as_it_was() {
         );
         assert_eq!(found["errors"], Value::Array(Vec::new()));
         assert_eq!(found["configuration"].as_str().map(str::len), Some(68), "{found}");
-        assert_eq!(outcome.errors, "", "no progress without a terminal");
+        assert_eq!(outcome.stderr, "", "no progress without a terminal");
     }
     let outcome = env.search(&["probe", &port]);
-    let text = String::from_utf8_lossy(&outcome.out);
+    let text = String::from_utf8_lossy(&outcome.stdout);
     for word in ["LMS291", "19200 Bd", "values on request", "10 mm", "180 degrees", "errors"] {
         assert!(text.contains(word), "{word}: {outcome}");
     }
-    assert_eq!(simulator.end(TERM).code, Some(0));
-    assert_eq!(env.simulated("front").1, 0);
+    assert_eq!(simulator.end(TERM).exit_code, Some(0));
+    assert_eq!(env.simulator_totals("front").1, 0);
 }
 
 /// The last line is a command for a shell; `--toml` prints a section for a file. Both start a hub that streams.
 #[test]
-fn what_is_found_can_be_run_at_once() {
+fn printed_link_and_section_start_a_hub() {
     let families: [(&str, &[&str], &str); 3] = [
         ("lms", &["--type=lms211"], "family=lms,type=lms211"),
         ("ld", &["--family=ld", "--model=ld19", "--world=room"], "family=ld,model=ld19"),
@@ -49,26 +50,26 @@ fn what_is_found_can_be_run_at_once() {
     for (family, flags, keys) in families {
         let env = TestEnv::new();
         let simulator = env.simulator(&["front"], flags);
-        let port = env.word("front");
+        let port = env.path_argument("front");
         let probed = env.search(&["probe", &port]);
-        let text = String::from_utf8_lossy(&probed.out).into_owned();
+        let text = String::from_utf8_lossy(&probed.stdout).into_owned();
         let next = text.lines().last().and_then(|line| line.strip_prefix("next: scanhub run --link "));
         let link = next.unwrap_or_else(|| panic!("{probed}"));
         assert_eq!(link, format!("front={port},{keys}"), "{probed}");
         let json = env.search(&["probe", &port, "--json"]);
         assert_eq!(json.lines()[0]["link"], link, "{json}");
         let toml = env.search(&["probe", &port, "--toml"]);
-        assert_eq!((toml.code, toml.errors.as_str()), (Some(0), ""), "{toml}");
-        let section = String::from_utf8_lossy(&toml.out).into_owned();
+        assert_eq!((toml.exit_code, toml.stderr.as_str()), (Some(0), ""), "{toml}");
+        let section = String::from_utf8_lossy(&toml.stdout).into_owned();
         assert!(section.starts_with("[[link]]\nname = \"front\"\nport = "), "{section}");
         let file = env.file("scanhub.toml", &section);
         for flags in [&["--link", link][..], &["--config", file.as_str()]] {
             let hub = env.hub(flags);
             let info = env.await_info("front", |info| info["state"] == "streaming");
             assert_eq!(info["family"], family, "{info}");
-            assert_eq!(hub.end(TERM).code, Some(0));
+            assert_eq!(hub.end(TERM).exit_code, Some(0));
         }
-        assert_eq!(simulator.end(TERM).code, Some(0));
+        assert_eq!(simulator.end(TERM).exit_code, Some(0));
     }
 }
 
@@ -76,66 +77,69 @@ fn what_is_found_can_be_run_at_once() {
 fn a_section_needs_a_port() {
     let env = TestEnv::new();
     let outcome = env.run(&["probe", "--toml"]);
-    assert_eq!((outcome.code, outcome.out.len()), (Some(2), 0), "{outcome}");
-    assert!(outcome.errors.contains("PORT"), "{outcome}");
+    assert_eq!((outcome.exit_code, outcome.stdout.len()), (Some(2), 0), "{outcome}");
+    assert!(outcome.stderr.contains("PORT"), "{outcome}");
     let outcome = env.run(&["probe", "/dev/null", "--toml", "--json"]);
     assert_eq!(
-        (outcome.code, &outcome.of_class("error")[0]["kind"]),
+        (outcome.exit_code, &outcome.of_class("error")[0]["kind"]),
         (Some(2), &"usage".into()),
         "{outcome}"
     );
 }
 
 #[test]
-fn a_dirty_window_is_told_whatever_the_status_byte_says() {
+fn reports_dirty_window_despite_ok_status() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--type=lms291", "--pollution=20"]);
-    let port = env.word("front");
+    let port = env.path_argument("front");
     let found = env.search(&["probe", &port, "--json"]);
     assert_eq!(found.lines()[0]["polluted"], true, "{found}");
     let outcome = env.search(&["probe", &port]);
-    let text = String::from_utf8_lossy(&outcome.out);
+    let text = String::from_utf8_lossy(&outcome.stdout);
     assert!(text.contains("ok, window polluted"), "{outcome}");
     assert!(text.contains("20 % clear: clean it"), "{outcome}");
 }
 
 #[test]
-fn a_stream_goes_on() {
+fn resumes_an_abandoned_stream() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--baud=500000"]);
     // A hub that is killed leaves its sensor streaming.
     let hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
     hub.end(testkit::KILL);
-    let found = env.search(&["probe", &env.word("front"), "--json"]);
-    assert_eq!((found.code, number(&found.lines()[0], "operating_mode")), (Some(0), 0x24), "{found}");
+    let found = env.search(&["probe", &env.path_argument("front"), "--json"]);
+    assert_eq!((found.exit_code, number(&found.lines()[0], "operating_mode")), (Some(0), 0x24), "{found}");
     let sent = env.truth("front").len();
-    testkit::until("it streams on", || env.truth("front").len() > sent + 20);
-    assert_eq!(simulator.end(TERM).code, Some(0));
-    assert_eq!(env.simulated("front").1, 0);
+    testkit::wait_until("it streams on", || env.truth("front").len() > sent + 20);
+    assert_eq!(simulator.end(TERM).exit_code, Some(0));
+    assert_eq!(env.simulator_totals("front").1, 0);
 }
 
 #[test]
-fn nobody_there() {
+fn reports_silent_and_unusable_ports() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--fault=mute=1"]);
-    let outcome = env.run(&["probe", &env.word("front"), "--json"]);
+    let outcome = env.run(&["probe", &env.path_argument("front"), "--json"]);
     let error = &outcome.of_class("error")[0];
-    assert_eq!((outcome.code, &error["kind"]), (Some(3), &"timeout".into()), "{outcome}");
+    assert_eq!((outcome.exit_code, &error["kind"]), (Some(3), &"timeout".into()), "{outcome}");
     for (port, code, kind) in [("/dev/null", 4, "port_not_tty"), ("/no/such", 4, "port_missing")] {
         let outcome = env.run(&["probe", port, "--json"]);
-        assert_eq!((outcome.code, &outcome.of_class("error")[0]["kind"]), (Some(code), &kind.into()));
+        assert_eq!((outcome.exit_code, &outcome.of_class("error")[0]["kind"]), (Some(code), &kind.into()));
         assert!(
             !outcome.of_class("error")[0].to_string().contains("file:"),
             "no recording is asked: {outcome}"
         );
     }
     let outcome = env.run(&["probe", "file:/etc/hostname", "--json"]);
-    assert_eq!((outcome.code, &outcome.of_class("error")[0]["kind"]), (Some(78), &"configuration".into()));
+    assert_eq!(
+        (outcome.exit_code, &outcome.of_class("error")[0]["kind"]),
+        (Some(78), &"configuration".into())
+    );
 }
 
 /// Probe and doctor search in the same way. The code is that of a silent line.
-const SEARCHES: [(&[&str], i32); 2] = [(&["probe"], 3), (&["doctor", "--no-system-config"], 5)];
+const SEARCH_COMMANDS: [(&[&str], i32); 2] = [(&["probe"], 3), (&["doctor", "--no-system-config"], 5)];
 
 /// Checks that `sent` has only requests of the search. Returns the number of each.
 fn count_requests(mut sent: &[u8]) -> [usize; 4] {
@@ -158,27 +162,27 @@ fn count_requests(mut sent: &[u8]) -> [usize; 4] {
 }
 
 #[test]
-fn an_unknown_scanner_gets_only_requests_of_the_search() {
-    for (verb, code) in SEARCHES {
+fn sends_only_search_requests_to_unknown_scanner() {
+    for (verb, code) in SEARCH_COMMANDS {
         let env = TestEnv::new();
-        let line = Line::at(&env.path("front"));
-        let program = env.start(&[verb, &[&env.word("front"), "--json"]].concat());
+        let line = TestLine::create(&env.path("front"));
+        let program = env.start(&[verb, &[&env.path_argument("front"), "--json"]].concat());
         let mut sent = Vec::new();
-        testkit::until("it ends", || {
+        testkit::wait_until("it ends", || {
             sent.extend(line.received());
-            program.is_over()
+            program.has_ended()
         });
         let outcome = program.wait();
         sent.extend(line.received());
-        assert_eq!(outcome.code, Some(code), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(code), "{outcome}");
         let text = outcome.to_string();
-        for says in [
+        for part in [
             "no byte arrived; looked for lms at 9600, 19200, 38400 or 500000 Bd, ld at ",
             "; lms: ",
             "; ld: ",
             "; rplidar: ",
         ] {
-            assert!(text.contains(says), "{says}: {outcome}");
+            assert!(text.contains(part), "{part}: {outcome}");
         }
         // Each family has four rates, and there are two rounds.
         let counts = count_requests(&sent);
@@ -189,25 +193,25 @@ fn an_unknown_scanner_gets_only_requests_of_the_search() {
 /// In virtual time, it gets no byte at all. On a busy machine, its packets may have a gap in which the search
 /// continues.
 #[test]
-fn a_scanner_that_streams_unasked_gets_no_other_request() {
+fn finds_streaming_scanner_with_search_requests_only() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["scanner"], &["--family=ld", "--model=ld19", "--world=room"]);
-    let line = Line::at(&env.path("front"));
+    let line = TestLine::create(&env.path("front"));
     let mut scanner = open_line(&env.path("scanner"), 230_400);
-    for (verb, _) in SEARCHES {
-        let program = env.start(&[verb, &[&env.word("front"), "--json"]].concat());
+    for (verb, _) in SEARCH_COMMANDS {
+        let program = env.start(&[verb, &[&env.path_argument("front"), "--json"]].concat());
         let (mut sent, mut packets) = (Vec::new(), [0; 4096]);
-        testkit::until("it ends", || {
+        testkit::wait_until("it ends", || {
             if let Ok(len) = scanner.read(&mut packets) {
                 line.offer(&packets[..len]);
             }
             sent.extend(line.received());
-            program.is_over()
+            program.has_ended()
         });
         let outcome = program.wait();
         sent.extend(line.received());
         println!("{:?}", count_requests(&sent));
-        assert_eq!(outcome.code, Some(0), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(0), "{outcome}");
         assert!(outcome.to_string().to_lowercase().contains("ld19"), "{outcome}");
     }
 }
@@ -217,12 +221,12 @@ fn a_scanner_that_streams_unasked_gets_no_other_request() {
 fn another_process_that_reads_the_port_is_named() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--family=ld", "--model=ld19", "--world=room"]);
-    let port = env.word("front");
+    let port = env.path_argument("front");
     let reader = std::fs::File::open(env.path("front")).expect("the port");
     for verb in [&["probe", &port][..], &["configure", &port, "unit=mm"]] {
         let outcome = env.run(&[verb, &["--json"]].concat());
         let error = &outcome.of_class("error")[0];
-        assert_eq!((outcome.code, &error["kind"]), (Some(4), &"port_busy".into()), "{outcome}");
+        assert_eq!((outcome.exit_code, &error["kind"]), (Some(4), &"port_busy".into()), "{outcome}");
         let holder = format!("{port}: in use by process {} (", std::process::id());
         assert!(error["message"].as_str().is_some_and(|message| message.starts_with(&holder)), "{error}");
         assert_eq!(error["hint"], "stop it first");
@@ -235,23 +239,26 @@ fn another_process_that_reads_the_port_is_named() {
 fn an_interrupt_ends_it() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--fault=mute=1"]);
-    let mut probe = env.command(&["probe", &env.word("front"), "--json"]);
+    let mut probe = env.command(&["probe", &env.path_argument("front"), "--json"]);
     probe.env("SCANHUB_LOG", "off");
     let program = testkit::Program::start(probe);
-    testkit::until("it has the port", || {
+    testkit::wait_until("it has the port", || {
         let device = env.path("front").canonicalize().unwrap();
         let open = std::fs::read_dir(format!("/proc/{}/fd", program.pid())).into_iter().flatten().flatten();
         open.filter_map(|fd| std::fs::read_link(fd.path()).ok()).any(|target| target == device)
     });
     let outcome = program.end(INT);
-    assert_eq!((outcome.code, &outcome.of_class("error")[0]["kind"]), (Some(130), &"interrupted".into()));
+    assert_eq!(
+        (outcome.exit_code, &outcome.of_class("error")[0]["kind"]),
+        (Some(130), &"interrupted".into())
+    );
 }
 
 #[test]
 fn without_a_port_the_candidates_are_listed() {
     let env = TestEnv::new();
     let outcome = env.run(&["probe", "--json"]);
-    match outcome.code {
+    match outcome.exit_code {
         // What there is depends on the machine.
         Some(0) => {
             for line in outcome.lines() {
@@ -267,7 +274,7 @@ fn without_a_port_the_candidates_are_listed() {
 }
 
 #[test]
-fn a_serial_server_that_has_another_client_is_told_with_a_remedy() {
+fn reports_busy_serial_server_with_remedy() {
     let env = TestEnv::new();
     let flags = ["--family=ld", "--model=ld19", "--world=room"];
     let mut simulator = env.start(&[&["simulate", "--json", "--tcp=127.0.0.1:0"], &flags[..]].concat());
@@ -279,7 +286,7 @@ fn a_serial_server_that_has_another_client_is_told_with_a_remedy() {
     let busy = |env: &TestEnv| {
         let busy = env.run(&["probe", port, "--json"]);
         let error = &busy.of_class("error")[0];
-        assert_eq!((busy.code, &error["kind"]), (Some(4), &"port_busy".into()), "{busy}");
+        assert_eq!((busy.exit_code, &error["kind"]), (Some(4), &"port_busy".into()), "{busy}");
         ["message", "hint"].map(|key| error[key].as_str().unwrap_or_default().to_owned())
     };
     let [_, hint] = busy(&env);
@@ -288,7 +295,7 @@ fn a_serial_server_that_has_another_client_is_told_with_a_remedy() {
     let begin = format!("{port}: in use by the hub, process {}; its link front is streaming", hub.pid());
     assert!(message.starts_with(&begin) && hint.starts_with("scanhub info front; "), "{message} {hint}");
     assert_eq!(other.info("front")["state"], "streaming", "the hub does not notice");
-    assert_eq!(hub.end(TERM).code, Some(0));
-    testkit::until("the server has no client", || env.run(&["probe", port]).code == Some(0));
-    assert_eq!(simulator.end(TERM).code, Some(0));
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
+    testkit::wait_until("the server has no client", || env.run(&["probe", port]).exit_code == Some(0));
+    assert_eq!(simulator.end(TERM).exit_code, Some(0));
 }

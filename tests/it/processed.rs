@@ -2,19 +2,19 @@
 //! one `unknown` when scans stay out, and what users may ask of the background.
 
 use crate::testkit;
-use crate::testkit::{INT, Outcome, TERM, TestEnv, accounted, is_class, number, until};
+use crate::testkit::{INT, Outcome, TERM, TestEnv, checked_topic_seqs, is_class, number, wait_until};
 use serde_json::Value;
 
-const STREAM: [&str; 2] = ["--seed=51", "--baud=500000"];
+const STREAM_FLAGS: [&str; 2] = ["--seed=51", "--baud=500000"];
 
 fn background(env: &TestEnv, arguments: &[&str]) -> Outcome {
     env.run(&[&["background", "front"], arguments, &["--json"]].concat())
 }
 
 /// Asks for `verb`, which must be taken.
-fn taken(env: &TestEnv, arguments: &[&str]) {
+fn background_accepted(env: &TestEnv, arguments: &[&str]) {
     let outcome = background(env, arguments);
-    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
 }
 
 fn model(env: &TestEnv) -> Value {
@@ -36,17 +36,17 @@ fn each_scan_has_its_marks_zones_and_foreground() {
     let env = TestEnv::new();
     let hub = env.hub(&[env.link("front")]);
     let topics = ["scan", "marks", "zones", "foreground"];
-    let mut consumers = topics.map(|topic| env.echo(&[&format!("front/{topic}")]));
+    let mut subscribers = topics.map(|topic| env.echo(&[&format!("front/{topic}")]));
     // What is there before any scan: nothing is known, and the circles are those of the configuration.
-    let first = consumers[2].await_line("the first word", is_class("zones"));
+    let first = subscribers[2].await_line("the first word", is_class("zones"));
     assert_eq!((&first["verdict"], number(&first, "topic_seq")), (&"unknown".into(), 0), "{first}");
     assert_eq!(
         (number(&first["zones"][0], "radius_mm"), number(&first["zones"][1], "radius_mm")),
         (1000, 600)
     );
-    let simulator = env.simulator(&["front"], &STREAM);
+    let simulator = env.simulator(&["front"], &STREAM_FLAGS);
     let known = |line: &Value| line["class"] != "notice" && !is_unknown(line) && line["stale"] != true;
-    let lines = consumers.each_mut().map(|consumer| consumer.await_lines(40, "a sample", known));
+    let lines = subscribers.each_mut().map(|subscriber| subscriber.await_lines(40, "a sample", known));
     let [scans, marks, zones, foregrounds] = &lines;
     for (lines, name) in lines.iter().zip(topics) {
         let of_scans = lines.iter().filter_map(|line| {
@@ -64,22 +64,22 @@ fn each_scan_has_its_marks_zones_and_foreground() {
     assert!(foregrounds.iter().all(|line| line["beams"].as_array().is_some_and(Vec::is_empty)));
     // A late subscriber missed nothing, because nothing was published before.
     let late = env.run(&["echo", "--json", "front/marks", "front/foreground", "-n", "20"]);
-    ["marks", "foreground"].iter().for_each(|topic| drop(accounted(&late, topic)));
-    for (consumer, topic) in consumers.into_iter().zip(topics) {
-        accounted(&consumer.end(INT), topic);
+    ["marks", "foreground"].iter().for_each(|topic| drop(checked_topic_seqs(&late, topic)));
+    for (subscriber, topic) in subscribers.into_iter().zip(topics) {
+        checked_topic_seqs(&subscriber.end(INT), topic);
     }
     let info = env.info("front");
     assert_eq!(number(&info["counters"], "loan_failed"), 0, "{info}");
-    assert_eq!(hub.end(TERM).code, Some(0));
-    assert_eq!(simulator.end(TERM).code, Some(0));
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
+    assert_eq!(simulator.end(TERM).exit_code, Some(0));
 }
 
 /// The last word on zones, as a late joiner hears it: it is of a silence.
-fn last_word(env: &TestEnv) -> Value {
+fn await_silence_sample(env: &TestEnv) -> Value {
     let mut last = Value::Null;
-    until("the hub says that nothing is known", || {
+    wait_until("the hub says that nothing is known", || {
         let late = env.run(&["echo", "--json", "front/zones", "-n", "1", "--timeout", "60s"]);
-        assert_eq!(late.code, Some(0), "{late}");
+        assert_eq!(late.exit_code, Some(0), "{late}");
         last = late.lines()[0].clone();
         is_unknown(&last) && last["stale"].is_null()
     });
@@ -87,23 +87,23 @@ fn last_word(env: &TestEnv) -> Value {
 }
 
 #[test]
-fn a_silence_is_said_once_and_late_joiners_know_at_once() {
+fn silence_is_published_once_also_for_late_joiners() {
     let env = TestEnv::new();
-    let simulator = env.simulator(&["front"], &STREAM);
+    let simulator = env.simulator(&["front"], &STREAM_FLAGS);
     let _hub = env.hub(&[env.link("front")]);
     await_streaming(&env);
     let mut zones = env.echo(&["front/zones"]);
     let mut scans = env.echo(&["front/scan"]);
     zones.await_lines(20, "a verdict", |line| line["class"] == "zones" && !is_unknown(line));
-    assert_eq!(env.run(&["control", "front", "pause"]).code, Some(0));
+    assert_eq!(env.run(&["control", "front", "pause"]).exit_code, Some(0));
     env.await_info("front", |info| info["state"] == "paused");
-    let unknown = last_word(&env);
+    let unknown = await_silence_sample(&env);
     // Five statuses later nothing was added to it.
     let mut statuses = env.echo(&["front/status", "front/scan", "front/background"]);
     let statuses = statuses.await_lines(5, "a status", is_class("status"));
     // A subscriber that attaches meanwhile gets no scan, which is not an error.
     assert!(statuses.iter().all(|status| status["last_error"] == ""), "{statuses:?}");
-    assert_eq!(env.run(&["control", "front", "resume"]).code, Some(0));
+    assert_eq!(env.run(&["control", "front", "resume"]).exit_code, Some(0));
     let next = zones.await_line("what comes after it", |line| {
         // A silence that the client notices has no number.
         line["class"] == "zones" && line["topic_seq"].as_u64() > unknown["topic_seq"].as_u64()
@@ -111,9 +111,9 @@ fn a_silence_is_said_once_and_late_joiners_know_at_once() {
     assert_eq!(number(&next, "topic_seq"), number(&unknown, "topic_seq") + 1);
     assert!(number(&next, "seq") > number(&unknown, "seq"), "it is of a scan: {next}");
     scans.await_lines(20, "a scan", is_class("scan"));
-    env.kill_simulator(simulator, "front");
+    env.kill_port_simulator(simulator, "front");
     let absent = env.await_info("front", |info| info["state"] == "absent");
-    let line = last_word(&env);
+    let line = await_silence_sample(&env);
     let last = scans.end(INT).of_class("scan").pop().expect("a scan");
     // It belongs to the last telegram and is published later.
     assert!(number(&line, "seq") >= number(&last, "seq"), "{line}");
@@ -122,7 +122,7 @@ fn a_silence_is_said_once_and_late_joiners_know_at_once() {
 }
 
 #[test]
-fn a_background_is_asked_held_begun_anew_and_brought_back() {
+fn background_can_be_saved_frozen_reset_and_loaded() {
     let env = TestEnv::new();
     let _hub = env.hub(&[env.link("front"), "--set=background.scans=20".into()]);
     let mut generations = env.echo(&["front/background"]);
@@ -132,27 +132,27 @@ fn a_background_is_asked_held_begun_anew_and_brought_back() {
     let first = generations.await_line("the first generation", is_class("background"));
     assert_eq!((number(&first, "generation"), number(&first, "count")), (0, 361), "{first}");
     assert!(number(&first, "known_beams") == 0 || number(&first, "topic_seq") > 0, "{first}");
-    until("it is learned", || number(&model(&env), "known_beams") > 300);
-    let file = env.word("model.json");
-    taken(&env, &["save", &file]);
+    wait_until("it is learned", || number(&model(&env), "known_beams") > 300);
+    let file = env.path_argument("model.json");
+    background_accepted(&env, &["save", &file]);
     let saved: Value = serde_json::from_str(&std::fs::read_to_string(&file).unwrap()).unwrap();
 
-    taken(&env, &["freeze"]);
+    background_accepted(&env, &["freeze"]);
     assert_eq!(model(&env)["frozen"], true);
-    taken(&env, &["reset"]);
+    background_accepted(&env, &["reset"]);
     let second = generations.await_line("the second generation", |line| line["generation"] == 1);
     assert_eq!((number(&second, "generation"), number(&second, "known_beams")), (1, 0), "{second}");
     // Frozen, it learns nothing however many scans come.
     let scans = env.run(&["echo", "--json", "front/foreground", "-n", "60"]);
     assert!(scans.of_class("foreground").iter().all(|line| number(line, "generation") == 1), "{scans}");
     assert_eq!(number(&model(&env), "known_beams"), 0);
-    taken(&env, &["load", &file]);
+    background_accepted(&env, &["load", &file]);
     let third = generations.await_line("the third generation", |line| line["generation"] == 2);
     assert_eq!(
         (number(&third, "generation"), &third["ranges"], &third["far"]),
         (2, &saved["ranges"], &saved["far"])
     );
-    taken(&env, &["thaw"]);
+    background_accepted(&env, &["thaw"]);
     assert_eq!(model(&env)["frozen"], false);
 
     // One of another resolution, and one of another unit.
@@ -179,7 +179,7 @@ fn a_background_is_asked_held_begun_anew_and_brought_back() {
         let refused = background(&env, &["load", &env.file("other.json", other.to_string())]);
         let error = &refused.of_class("error")[0];
         assert_eq!(
-            (refused.code, error["message"].as_str()),
+            (refused.exit_code, error["message"].as_str()),
             (Some(78), Some(&*format!("front: {words}"))),
             "{refused}"
         );
@@ -188,26 +188,27 @@ fn a_background_is_asked_held_begun_anew_and_brought_back() {
     let outcome = generations.end(INT);
     // One comes again after each 20 scans that it learned from.
     let lines = outcome.of_class("background");
-    let mut told: Vec<u64> = lines.iter().map(|line| number(line, "generation")).collect();
-    told.dedup();
-    assert_eq!(told, [0, 1, 2]);
+    let mut received: Vec<u64> = lines.iter().map(|line| number(line, "generation")).collect();
+    received.dedup();
+    assert_eq!(received, [0, 1, 2]);
 
     // And it is what a hub may begin with.
     drop(_hub);
     let _hub = env.hub(&[env.link("front"), format!("--set=link.front.background.start={file}")]);
-    let begun = env.echo(&["front/background"]).await_line("the model", is_class("background"));
-    assert_eq!((number(&begun, "generation"), &begun["ranges"]), (1, &saved["ranges"]));
+    let at_start = env.echo(&["front/background"]).await_line("the model", is_class("background"));
+    assert_eq!((number(&at_start, "generation"), &at_start["ranges"]), (1, &saved["ranges"]));
 }
 
 #[test]
 fn a_background_with_every_scan_or_none_at_all() {
     let env = TestEnv::new();
-    let _simulator = env.simulator(&["front", "rear"], &STREAM);
+    let _simulator = env.simulator(&["front", "rear"], &STREAM_FLAGS);
     let set = ["--set=link.front.background.publish=every-scan", "--set=link.rear.background.method=off"];
     let _hub = env.hub(&[&[env.link("front"), env.link("rear")][..], &set.map(String::from)].concat());
     let mut both = [env.echo(&["front/background"]), env.echo(&["front/scan"])];
-    let [models, scans] = both.each_mut().map(|consumer| {
-        consumer.await_lines(30, "a sample", |line| line["class"] == "background" || line["class"] == "scan")
+    let [models, scans] = both.each_mut().map(|subscriber| {
+        subscriber
+            .await_lines(30, "a sample", |line| line["class"] == "background" || line["class"] == "scan")
     });
     assert_eq!((models.len(), scans.len()), (30, 30));
     let mut rear = env.echo(&["rear/foreground", "rear/background", "rear/zones"]);
@@ -220,21 +221,21 @@ fn a_background_with_every_scan_or_none_at_all() {
     );
     let refused = env.run(&["background", "rear", "show", "--json"]);
     let error = &refused.of_class("error")[0];
-    assert_eq!((refused.code, &error["kind"]), (Some(78), &"configuration".into()), "{refused}");
+    assert_eq!((refused.exit_code, &error["kind"]), (Some(78), &"configuration".into()), "{refused}");
     assert_eq!(error["message"], "rear: background.method is \"off\", no background is kept");
     assert!(error["hint"].as_str().is_some_and(|hint| hint.contains("link.rear.background.method=multi")));
 }
 
 #[test]
-fn a_recording_is_processed_too_and_its_background_can_be_asked_for() {
+fn recording_has_zones_and_a_controllable_background() {
     let env = TestEnv::new();
     let scans: Vec<u8> = (0..4000).flat_map(testkit::scan).collect();
     let file = env.file("scans", scans);
     let _hub = env.hub(&["--link", &format!("front=file:{file}")]);
     let mut zones = env.echo(&["front/zones"]);
     zones.await_lines(10, "a verdict", |line| line["class"] == "zones" && line["verdict"] == "stop");
-    taken(&env, &["reset"]);
-    taken(&env, &["freeze"]);
+    background_accepted(&env, &["reset"]);
+    background_accepted(&env, &["freeze"]);
     let shown = model(&env);
     assert_eq!(
         (number(&shown, "generation"), number(&shown, "count"), &shown["frozen"]),
@@ -257,7 +258,7 @@ fn the_scans_of_a_slow_recording_follow_each_other() {
     env.await_info("front", |info| info["state"] == "silent");
     // At its end it is silent like any sensor. Before it nothing was said but the first word and twelve verdicts.
     let mut last = Value::Null;
-    until("the hub's word", || {
+    wait_until("the hub's word", || {
         last = env.run(&["echo", "--json", "front/zones", "-n", "1"]).lines()[0].clone();
         is_unknown(&last)
     });
@@ -266,7 +267,7 @@ fn the_scans_of_a_slow_recording_follow_each_other() {
 }
 
 #[test]
-fn a_pose_and_circles_that_cannot_be_end_the_hub_with_their_place() {
+fn bad_pose_or_circles_are_rejected_with_position() {
     let env = TestEnv::new();
     for (text, words) in [
         ("[link.pose]\nx = nan\n", ":6:5: x = NaN"),
@@ -278,8 +279,8 @@ fn a_pose_and_circles_that_cannot_be_end_the_hub_with_their_place() {
         let link = "[[link]]\nname = \"front\"\nport = \"/dev/null\"\nangle = 180\n";
         let file = env.file("hub.toml", [link, text].concat());
         let outcome = env.run(&["run", "--config", &file, "--json"]);
-        assert_eq!((outcome.code, outcome.out.is_empty()), (Some(78), true), "{outcome}");
-        assert!(outcome.errors.contains(words), "{words}: {outcome}");
+        assert_eq!((outcome.exit_code, outcome.stdout.is_empty()), (Some(78), true), "{outcome}");
+        assert!(outcome.stderr.contains(words), "{words}: {outcome}");
     }
     // Where the sensor sits is told to who asks.
     let set = ["link.front.pose.x=0.3", "link.front.pose.yaw=1.5", "link.front.pose.upside_down=true"];

@@ -9,12 +9,12 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use crate::testkit::{
-    INT, KILL, Outcome, Program, Sender, TERM, TestEnv, client_python, in_a_network, is_class, number,
-    output, python, python_for, skip, until,
+    INT, KILL, Outcome, Program, TERM, TestEnv, TestGateway, client_python, in_a_network, is_class, number,
+    output, python, python_for, skip, wait_until,
 };
 use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Header, Status, Topic, Verdict, Zones};
-use scanhub_shm::{HubLock, Node, Payload, PortFactory, Waker};
+use scanhub_shm::{HubLock, Node, Payload, PortFactory, WakeSender};
 use serde_json::{Value, json};
 
 /// A script of the package's tests, if there is a Python for it.
@@ -28,16 +28,16 @@ fn check(name: &str) -> Option<Command> {
 /// The same with the environment's domain and root as its first arguments.
 pub(crate) fn check_on(env: &TestEnv, name: &str) -> Option<Command> {
     let mut command = check(name)?;
-    let place = env.place();
-    let root = place.root().parent().expect("a domain is below its base");
-    command.arg(place.name()).arg(root);
+    let domain = env.domain();
+    let root = domain.root().parent().expect("a domain is below its base");
+    command.arg(domain.name()).arg(root);
     Some(command)
 }
 
-fn passed(command: Command) {
+fn assert_success(command: Command) {
     let outcome = Program::start(command).wait();
-    assert_eq!(outcome.code, Some(0), "{outcome}");
-    print!("{}", String::from_utf8_lossy(&outcome.out));
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
+    print!("{}", String::from_utf8_lossy(&outcome.stdout));
 }
 
 fn streaming(env: &TestEnv) -> (Program, Program) {
@@ -50,7 +50,7 @@ fn streaming(env: &TestEnv) -> (Program, Program) {
 fn samples_of_golden_bytes_are_read() {
     let Some(mut command) = check("samples") else { return };
     command.arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/vectors/v2"));
-    passed(command);
+    assert_success(command);
 }
 
 #[test]
@@ -58,7 +58,7 @@ fn arrays_are_views_of_shared_memory() {
     let env = TestEnv::new();
     let Some(command) = check_on(&env, "views") else { return };
     let _running = streaming(&env);
-    passed(command);
+    assert_success(command);
 }
 
 #[test]
@@ -70,21 +70,21 @@ fn tasks_wait_in_a_loop_of_uvloop() {
     }
     let _running = streaming(&env);
     command.arg("uvloop");
-    passed(command);
+    assert_success(command);
 }
 
 #[test]
-fn what_cannot_be_followed_is_told_in_words() {
+fn refuses_impossible_subscriptions() {
     let env = TestEnv::new();
     let Some(command) = check_on(&env, "refusals") else { return };
-    passed(command);
+    assert_success(command);
 }
 
 /// Starts a hub of `front` without a link. The test creates its topics.
-fn bare_hub(env: &TestEnv) -> (HubLock, Node, Waker) {
-    let lock = HubLock::acquire(env.place().root()).expect("no hub runs");
-    let node = scanhub_shm::hub_node(&env.place()).expect("a node");
-    let waker = Waker::new(&node, "front").expect("memory");
+fn hub_without_sensors(env: &TestEnv) -> (HubLock, Node, WakeSender) {
+    let lock = HubLock::acquire(env.domain().root()).expect("no hub runs");
+    let node = scanhub_shm::hub_node(&env.domain()).expect("a node");
+    let waker = WakeSender::new(&node, "front").expect("memory");
     (lock, node, waker)
 }
 
@@ -92,25 +92,25 @@ fn bare_hub(env: &TestEnv) -> (HubLock, Node, Waker) {
 fn hub_with_another_layout_is_a_mismatch() {
     let env = TestEnv::new();
     let Some(command) = check_on(&env, "mismatch") else { return };
-    let (lock, node, _waker) = bare_hub(&env);
+    let (lock, node, _waker) = hub_without_sensors(&env);
     let service = Topic::Scan.service("front").as_str().try_into().expect("a name");
     let _scan = node.service_builder(&service).publish_subscribe::<u64>().create().expect("a service");
     lock.report_ready().expect("the lock is open");
-    passed(command);
+    assert_success(command);
 }
 
 #[test]
 fn notice_that_raises_loses_no_sample() {
     let env = TestEnv::new();
     let Some(command) = check_on(&env, "notices") else { return };
-    let (lock, node, _waker) = bare_hub(&env);
+    let (lock, node, _waker) = hub_without_sensors(&env);
     let limits = TopicLimits::default();
     let service = Status::create(&node, "front", &limits).expect("a service");
     let publisher = Status::publisher(&service, &limits).expect("a publisher");
     lock.report_ready().expect("the lock is open");
     let (stdin, mut lines) = std::io::pipe().expect("a pipe");
     let mut script = Program::start_with(command, stdin);
-    until("the subscriber", || service.dynamic_config().number_of_subscribers() == 1);
+    wait_until("the subscriber", || service.dynamic_config().number_of_subscribers() == 1);
     lines.write_all(b"\n").expect("it reads");
     script.await_line("it waits", is_class("waits"));
     // The sample wakes no subscriber. So the look that notices the end of the hub also finds the sample.
@@ -121,15 +121,15 @@ fn notice_that_raises_loses_no_sample() {
     drop(lock);
     lines.write_all(b"\n").expect("it reads");
     let outcome = script.wait();
-    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
 }
 
 #[test]
 fn names_of_their_own_come_and_go() {
     let env = TestEnv::new();
     let Some(command) = check_on(&env, "own_names") else { return };
-    passed(command);
-    assert_eq!(env.left_behind(), Vec::<std::path::PathBuf>::new());
+    assert_success(command);
+    assert_eq!(env.leftover_files(), Vec::<std::path::PathBuf>::new());
 }
 
 /// As a user without Rust and without a network.
@@ -170,9 +170,9 @@ fn wheel_installs_without_compiler_and_network() {
     let readme = include_str!("../../clients/python/README.md");
     let example = readme.split("```python\n").nth(1).and_then(|text| text.split("```").next());
     let mut command = Command::new(empty);
-    command.args(["-u", "-c", example.expect("an example")]).env("SCANHUB_DOMAIN", env.place().name());
+    command.args(["-u", "-c", example.expect("an example")]).env("SCANHUB_DOMAIN", env.domain().name());
     command
-        .env("RUNTIME_DIRECTORY", env.place().root().parent().expect("a base"))
+        .env("RUNTIME_DIRECTORY", env.domain().root().parent().expect("a base"))
         .env_remove("XDG_RUNTIME_DIR");
     command.env("PATH", "/usr/bin:/bin");
     let mut example = Program::start(command);
@@ -207,57 +207,57 @@ fn models_and_the_flow_of_data_on_request() {
     let env = TestEnv::new();
     let Some(command) = check_on(&env, "models") else { return };
     let _running = streaming(&env);
-    passed(command);
+    assert_success(command);
 }
 
 #[test]
-fn samples_say_what_echo_says() {
+fn samples_equal_those_of_echo() {
     const TOPICS: [&str; 9] =
         ["telegram", "scan", "marks", "zones", "foreground", "background", "status", "lines", "motion"];
     let env = TestEnv::new();
     let topics = TOPICS.map(|topic| format!("front/{topic}"));
     let Some(mut command) = check_on(&env, "follow") else { return };
     let (_simulator, hub) = streaming(&env);
-    let mut follower = Program::start({
+    let mut subscriber = Program::start({
         command.args(&topics);
         command
     });
-    follower.await_line("a scan", is_class("scan"));
+    subscriber.await_line("a scan", is_class("scan"));
     let mut echo = env.start(&[&["echo", "--json"], &topics.each_ref().map(String::as_str)[..]].concat());
-    for program in [&mut echo, &mut follower] {
+    for program in [&mut echo, &mut subscriber] {
         program.await_lines(2, "a background", is_class("background"));
         program.await_lines(40, "a scan", is_class("scan"));
         program.await_lines(2, "a status", is_class("status"));
     }
-    let (echo, follower) = (echo.end(INT), ended_by_interrupt(follower));
+    let (echo, subscriber) = (echo.end(INT), ended_by_interrupt(subscriber));
     drop(hub);
     for topic in TOPICS {
-        let said = echo.of_class(topic);
-        let same = follower.of_class(topic).iter().filter(|sample| said_by(&said, sample)).count();
-        let wanted = if ["background", "status"].contains(&topic) { 1 } else { 20 };
-        assert!(same >= wanted, "{topic}: {same} of {} are what echo said", said.len());
+        let printed = echo.of_class(topic);
+        let same = subscriber.of_class(topic).iter().filter(|sample| is_printed_by(&printed, sample)).count();
+        let expected = if ["background", "status"].contains(&topic) { 1 } else { 20 };
+        assert!(same >= expected, "{topic}: {same} of {} are what echo said", printed.len());
     }
 }
 
 /// Whether `echo` said the same of the sample; what it said otherwise fails. A status and a background have no number.
-fn said_by(echo: &[Value], sample: &Value) -> bool {
+fn is_printed_by(echo: &[Value], sample: &Value) -> bool {
     let is_numbered = |line: &Value| line.get("topic_seq").is_some();
     let same = |line: &&Value| line["topic_seq"] == sample["topic_seq"] && line["boot"] == sample["boot"];
     if !echo.iter().any(is_numbered) {
-        return echo.iter().any(|line| differing(line, sample).is_empty());
+        return echo.iter().any(|line| different_keys(line, sample).is_empty());
     }
     let Some(line) = echo.iter().find(same) else { return false };
     // Each of the two decides by itself whether a verdict is stale, and then shows nothing of it.
     let of_verdict = ["verdict", "nearest_mm", "nearest_beam", "zones", "invalid_beams", "stale"];
     let is_stale = [line, sample].iter().any(|line| line["stale"] == true);
-    let mut differing = differing(line, sample);
+    let mut differing = different_keys(line, sample);
     differing.retain(|key| !is_stale || !of_verdict.contains(&key.as_str()));
     assert!(differing.is_empty(), "{differing:?}: {line} {sample}");
     true
 }
 
 /// The keys of `line` that `sample` has not, or otherwise.
-fn differing<'a>(line: &'a Value, sample: &Value) -> Vec<&'a String> {
+fn different_keys<'a>(line: &'a Value, sample: &Value) -> Vec<&'a String> {
     let keys = line.as_object().expect("an object").keys();
     // Derived from the mode: what the package offers is the mode itself.
     keys.filter(|key| *key != "marks" || line["class"] == "marks")
@@ -272,11 +272,11 @@ fn one_subscription_follows_several_sensors() {
     command.args(["front/scan", "rear/scan", "rear/status"]);
     let _simulator = env.simulator(&["front", "rear"], &["--seed=63", "--baud=500000"]);
     let _hub = env.hub(&[env.link("front"), env.link("rear")]);
-    let mut follower = Program::start(command);
+    let mut subscriber = Program::start(command);
     for (sensor, topic, count) in [("front", "scan", 40), ("rear", "scan", 40), ("rear", "status", 2)] {
-        follower.await_lines(count, sensor, |line| line["sensor"] == sensor && line["class"] == topic);
+        subscriber.await_lines(count, sensor, |line| line["sensor"] == sensor && line["class"] == topic);
     }
-    ended_by_interrupt(follower);
+    ended_by_interrupt(subscriber);
 }
 
 #[test]
@@ -286,39 +286,39 @@ fn a_subscription_outlives_several_hubs() {
     command.args(["front/scan", "front/telegram", "front/zones"]);
     let _simulator = env.simulator(&["front"], &["--seed=62", "--baud=500000"]);
     // It is there before its hub is.
-    let mut follower = Program::start(command);
+    let mut subscriber = Program::start(command);
     let mut hub = env.hub(&[env.link("front")]);
-    follower.await_line("hub_back", |line| line["kind"] == "hub_back");
+    subscriber.await_line("hub_back", |line| line["kind"] == "hub_back");
     for how in [KILL, TERM, KILL] {
-        follower.await_lines(20, "a scan", is_class("scan"));
-        let code = hub.end(how).code;
+        subscriber.await_lines(20, "a scan", is_class("scan"));
+        let code = hub.end(how).exit_code;
         assert_eq!(code, (how == TERM).then_some(0));
-        follower.await_line("hub_gone", |line| line["kind"] == "hub_gone");
+        subscriber.await_line("hub_gone", |line| line["kind"] == "hub_gone");
         hub = env.hub(&[env.link("front")]);
-        follower.await_line("hub_back", |line| line["kind"] == "hub_back");
+        subscriber.await_line("hub_back", |line| line["kind"] == "hub_back");
     }
-    follower.await_lines(20, "a scan", is_class("scan"));
-    let outcome = ended_by_interrupt(follower);
+    subscriber.await_lines(20, "a scan", is_class("scan"));
+    let outcome = ended_by_interrupt(subscriber);
     let stale: Vec<Value> =
         outcome.of_class("zones").into_iter().filter(|line| line["stale"] == true).collect();
     assert!(stale.iter().all(|line| line["verdict"] == "unknown" && line["zones"] == json!([])));
     assert!(stale.len() >= 2, "killed hubs leave a silence: {stale:?}");
     for topic in ["scan", "telegram"] {
-        let mut lives = BTreeMap::<String, Vec<Value>>::new();
+        let mut runs = BTreeMap::<String, Vec<Value>>::new();
         for line in outcome.of_class(topic) {
             let boot = line["boot"].as_str().expect("a life").to_owned();
-            let life = lives.entry(boot).or_default();
+            let lines_of_run = runs.entry(boot).or_default();
             let python = &line["python"];
             // Who was there before the hub got its samples from the first one on.
-            let next = life.last().map_or(0, |last| number(last, "topic_seq") + 1);
+            let next = lines_of_run.last().map_or(0, |last| number(last, "topic_seq") + 1);
             let is_first_hub = outcome.of_class(topic)[0]["boot"] == line["boot"];
-            assert_eq!(python["restarted"], life.is_empty() && !is_first_hub, "{line}");
-            if !life.is_empty() || !is_first_hub {
+            assert_eq!(python["restarted"], lines_of_run.is_empty() && !is_first_hub, "{line}");
+            if !lines_of_run.is_empty() || !is_first_hub {
                 assert_eq!(number(&line, "topic_seq"), next + number(python, "missed"), "{line}");
             }
-            life.push(line);
+            lines_of_run.push(line);
         }
-        assert_eq!(lives.len(), 4, "{topic}");
+        assert_eq!(runs.len(), 4, "{topic}");
     }
 }
 
@@ -329,13 +329,14 @@ fn a_robot_is_as_unknown_as_its_worst_sensor() {
     let Some(mut named) = check_on(&env, "robot") else { return };
     named.args(["front", "rear"]);
     let Some(all) = check_on(&env, "robot") else { return };
-    let mut followers = [named, all].map(Program::start);
-    for follower in &mut followers {
-        let first = follower.await_line("there is no hub", is_class("robot"));
+    let mut subscribers = [named, all].map(Program::start);
+    for subscriber in &mut subscribers {
+        let first = subscriber.await_line("there is no hub", is_class("robot"));
         assert_eq!((&first["verdict"], &first["nearest_mm"]), (&"unknown".into(), &Value::Null), "{first}");
     }
     let _front = env.simulator(&["front"], &["--seed=64", "--baud=500000"]);
-    let rear = env.start(&["simulate", "--json", "--baud=500000", &format!("--port={}", env.word("rear"))]);
+    let rear =
+        env.start(&["simulate", "--json", "--baud=500000", &format!("--port={}", env.path_argument("rear"))]);
     let rear = rear.ready();
     // All is clear: nothing in the simulated room is so near.
     let hub = env.hub(&[&env.link("front"), &env.link("rear"), "--set=zones.radii=[0.02,0.01]"]);
@@ -344,49 +345,49 @@ fn a_robot_is_as_unknown_as_its_worst_sensor() {
             line["verdict"] == verdict && line["sensors"] == json!({ "front": front, "rear": rear })
         }
     };
-    for follower in &mut followers {
-        let line = follower.await_line("all is clear", are("clear", "clear", "clear"));
+    for subscriber in &mut subscribers {
+        let line = subscriber.await_line("all is clear", are("clear", "clear", "clear"));
         // Both are equally clear. A follower of all sensors may find either one first.
         let is_sensor = |key: &str| ["front", "rear"].contains(&line[key].as_str().unwrap_or_default());
         assert!(is_sensor("worst") && is_sensor("nearest_sensor") && line["nearest_mm"].is_u64(), "{line}");
-        follower
+        subscriber
             .await_line("by now, too", |line| line["class"] == "now" && are("clear", "clear", "clear")(line));
     }
-    env.kill_simulator(rear, "rear");
-    for follower in &mut followers {
-        let line = follower.await_line("the rear is gone", are("unknown", "clear", "unknown"));
+    env.kill_port_simulator(rear, "rear");
+    for subscriber in &mut subscribers {
+        let line = subscriber.await_line("the rear is gone", are("unknown", "clear", "unknown"));
         assert_eq!(line["worst"], "rear", "{line}");
     }
-    assert_eq!(hub.end(KILL).code, None);
-    for follower in &mut followers {
-        follower.await_line("the hub is gone", are("unknown", "unknown", "unknown"));
+    assert_eq!(hub.end(KILL).exit_code, None);
+    for subscriber in &mut subscribers {
+        subscriber.await_line("the hub is gone", are("unknown", "unknown", "unknown"));
     }
-    for follower in followers {
-        ended_by_interrupt(follower);
+    for subscriber in subscribers {
+        ended_by_interrupt(subscriber);
     }
 }
 
 #[test]
-fn without_a_hub_the_robot_is_of_the_sensors_of_other_machines() {
-    in_a_network("python::without_a_hub_the_robot_is_of_the_sensors_of_other_machines", || {
+fn robot_without_a_hub_uses_remote_sensors() {
+    in_a_network("python::robot_without_a_hub_uses_remote_sensors", || {
         let env = TestEnv::new();
         let Some(command) = check_on(&env, "robot") else { return };
         let mut listener =
             env.start(&["listen", "--json", "--publish", "--name=robot1=0000000000000001"]).ready();
-        let mut front = Sender::new(1, 7, 0, "front");
-        front.await_published(&mut listener, &[Topic::Zones]);
-        Sender::new(1, 7, 1, "mapper").await_published(&mut listener, &[Topic::Scan]);
+        let mut front = TestGateway::new(1, 7, 0, "front");
+        front.wait_until_published(&mut listener, &[Topic::Zones]);
+        TestGateway::new(1, 7, 1, "mapper").wait_until_published(&mut listener, &[Topic::Scan]);
         let mut robot = Program::start(command);
         let are = |verdict: &'static str, sensor: &'static str| {
             move |line: &Value| line["verdict"] == verdict && line["sensors"] == json!({ sensor: verdict })
         };
         robot.await_line("nobody was heard", are("unknown", "robot1.front"));
         // A verdict that a client reads too late is unknown to it.
-        until("clear", || {
+        wait_until("clear", || {
             front.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
-            robot.is_heard(are("clear", "robot1.front"))
+            robot.prints(are("clear", "robot1.front"))
         });
-        until("silence", || {
+        wait_until("silence", || {
             let last = robot.last_printed(is_class("robot"));
             last.is_some_and(|line| are("unknown", "robot1.front")(&line))
         });
@@ -395,39 +396,39 @@ fn without_a_hub_the_robot_is_of_the_sensors_of_other_machines() {
         command.arg("--asked");
         let (stdin, mut ask) = std::io::pipe().expect("a pipe");
         let mut busy = Program::start_with(command, stdin);
-        let mut hear = |busy: &mut Program| {
+        let mut query_sensors = |busy: &mut Program| {
             front.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
             ask.write_all(b"\n").expect("it reads");
             busy.await_line("what it knows", is_class("now"))["sensors"].clone()
         };
-        until("the other machine's", || hear(&mut busy).get("robot1.front").is_some());
+        wait_until("the other machine's", || query_sensors(&mut busy).get("robot1.front").is_some());
         // A hub has sensors of its own, and when it goes nobody stands in for them.
         let _simulator = env.simulator(&["front"], &["--seed=65", "--baud=500000"]);
         let hub = env.hub(&[&env.link("front"), "--set=zones.radii=[0.02,0.01]"]);
-        until("the hub's own", || hear(&mut busy) == json!({"front": "clear"}));
+        wait_until("the hub's own", || query_sensors(&mut busy) == json!({"front": "clear"}));
         robot.await_line("all is forgotten", |line| {
             line["sensors"] == json!({}) && line["verdict"] == "unknown"
         });
         robot.await_line("the hub's own", are("clear", "front"));
-        assert_eq!(hub.end(KILL).code, None);
+        assert_eq!(hub.end(KILL).exit_code, None);
         robot.await_line("the hub is gone", are("unknown", "front"));
         let mut named = env.start(&["echo", "--json", "robot1.front/zones"]);
         // A verdict that a client reads too late is unknown to it.
-        until("whom one names is heard", || {
+        wait_until("whom one names is heard", || {
             front.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
-            named.is_heard(|line| line["verdict"] == "clear")
+            named.prints(|line| line["verdict"] == "clear")
         });
         let outcome = ended_by_interrupt(robot);
         let last = outcome.of_class("robot").pop().expect("a line");
         assert!(are("unknown", "front")(&last), "{outcome}");
-        assert_eq!(listener.end(TERM).code, Some(0));
+        assert_eq!(listener.end(TERM).exit_code, Some(0));
     });
 }
 
 /// Ctrl-C ends it at once, as any program in Python.
-fn ended_by_interrupt(follower: Program) -> Outcome {
-    let outcome = follower.end(INT);
-    assert_eq!(outcome.code, Some(0), "{outcome}");
+fn ended_by_interrupt(subscriber: Program) -> Outcome {
+    let outcome = subscriber.end(INT);
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     assert_eq!(outcome.of_class("end").len(), 1, "{outcome}");
     outcome
 }

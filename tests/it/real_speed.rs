@@ -2,31 +2,31 @@
 //! there in virtual time is held here as far as it can be seen from outside, so that the simulation does not drift from the
 //! kernel. `SCANHUB_SEED` names another list; CI plays one of its own each time.
 
-mod judges;
+mod environment;
+mod invariants;
 mod sensors;
-mod stage;
 
+use environment::RealSpeedEnvironment;
 use scanhub_schema::MILLIS;
-use scanhub_world::Plan;
-use stage::Stage;
+use scanhub_world::Scenario;
 
 /// The list that is played if none is named.
-const SEED: u64 = 7;
+const SCENARIO_SEED: u64 = 7;
 /// How long it lasts; nothing happens in the last seconds.
-const SECONDS: u64 = 24;
+const SCENARIO_SECONDS: u64 = 24;
 
 #[test]
-fn a_list_of_actions_does_to_the_program_what_it_does_in_virtual_time() {
-    let seed = std::env::var("SCANHUB_SEED").map_or(SEED, |seed| seed.parse().expect("a number"));
-    let plan = Plan::of_seed(seed, SECONDS);
+fn scenario_keeps_its_invariants_at_real_speed() {
+    let seed = std::env::var("SCANHUB_SEED").map_or(SCENARIO_SEED, |seed| seed.parse().expect("a number"));
+    let plan = Scenario::from_seed(seed, SCENARIO_SECONDS);
     // Whoever reads a failure wants to play it again.
     println!("SCANHUB_SEED={seed}\n{plan}");
-    let mut stage = Stage::new(seed);
+    let mut environment = RealSpeedEnvironment::new(seed);
     for action in &plan.actions {
-        stage.await_moment(action.at_ms * MILLIS);
-        stage.act(action);
+        environment.wait_until(action.at_ms * MILLIS);
+        environment.perform(action);
     }
-    stage.await_moment(plan.heals_at());
-    stage.heal();
-    stage.judge();
+    environment.wait_until(plan.faults_clear_at());
+    environment.clear_faults();
+    environment.check_invariants();
 }

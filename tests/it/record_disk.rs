@@ -9,8 +9,8 @@ use std::process::{Command, Stdio};
 use std::thread;
 
 use crate::testkit::{
-    HUP, INT, Kept, Outcome, Program, Recording, TERM, TestEnv, is_class, number, scan, skip, spawn,
-    succeeds, unbroken, until,
+    HUP, INT, Outcome, Program, RecordedMessage, Recording, TERM, TestEnv, contiguous_topic_seqs, is_class,
+    number, scan, skip, spawn, succeeds, wait_until,
 };
 use rustix::process::Signal;
 use serde_json::Value;
@@ -27,18 +27,18 @@ fn is_kind(kind: &str) -> impl Fn(&Value) -> bool {
     move |line| line["kind"] == kind
 }
 
-fn await_samples(recorder: &mut Program, more: u64) {
-    let samples = |recorder: &mut Program, least| {
-        let wanted = move |line: &Value| line["class"] == "recording" && number(line, "samples") >= least;
-        number(&recorder.await_line("samples", wanted), "samples")
+fn await_samples(recorder: &mut Program, count: u64) {
+    let samples = |recorder: &mut Program, minimum| {
+        let expected = move |line: &Value| line["class"] == "recording" && number(line, "samples") >= minimum;
+        number(&recorder.await_line("samples", expected), "samples")
     };
     let before = samples(recorder, 0);
-    samples(recorder, before + more);
+    samples(recorder, before + count);
 }
 
 /// The files of a run that came to its end, each in its order.
 fn files(outcome: &Outcome) -> Vec<PathBuf> {
-    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let end = outcome.of_class("recorded").pop().unwrap_or_else(|| panic!("{outcome}"));
     let files = end["files"].as_array().unwrap().iter();
     files.map(|file| PathBuf::from(file.as_str().unwrap())).collect()
@@ -52,17 +52,17 @@ fn nothing_missed(outcome: &Outcome) {
 }
 
 /// The telegrams of several files, none of which is missing or there twice.
-fn telegrams(recordings: &[Recording]) -> Vec<&Kept> {
+fn telegrams(recordings: &[Recording]) -> Vec<&RecordedMessage> {
     let all: Vec<_> = recordings.iter().flat_map(|recording| recording.of("front/telegram")).collect();
-    unbroken(&all);
+    contiguous_topic_seqs(&all);
     all
 }
 
 #[test]
-fn a_recording_goes_on_in_files_of_which_the_last_stay() {
+fn splits_a_recording_and_keeps_the_last_files() {
     let env = TestEnv::new();
     let _others = sensor(&env);
-    let file = env.word("walk.mcap");
+    let file = env.path_argument("walk.mcap");
     let mut recorder = env.start(&["record", "--json", "--split=128KiB", "--keep=3", "-o", &file]);
     for _ in 0..4 {
         recorder.await_line("the next file", is_kind("file"));
@@ -71,19 +71,19 @@ fn a_recording_goes_on_in_files_of_which_the_last_stay() {
     let outcome = recorder.end(INT);
     let files = files(&outcome);
     assert_eq!(files[0], env.path("walk-0001.mcap"));
-    let (gone, stay) = files.split_at(files.len() - 3);
-    assert!(gone.iter().all(|file| !file.exists()), "{files:?}");
+    let (removed, stay) = files.split_at(files.len() - 3);
+    assert!(removed.iter().all(|file| !file.exists()), "{files:?}");
     // A machine that has no time for the recorder makes one chunk of what came meanwhile.
     let lengths: Vec<_> = stay.iter().map(|file| fs::metadata(file).unwrap().len()).collect();
     assert!(lengths.iter().all(|length| *length <= 160 << 10), "{lengths:?}");
     assert!(lengths.iter().filter(|length| **length <= 128 << 10).count() > 1, "{lengths:?}");
-    let recordings: Vec<_> = stay.iter().map(|file| Recording::whole(file)).collect();
-    let wanted = |number: usize| (files.len() - 3 + number).to_string();
+    let recordings: Vec<_> = stay.iter().map(|file| Recording::read_complete(file)).collect();
+    let expected = |number: usize| (files.len() - 3 + number).to_string();
     for (number, recording) in recordings.iter().enumerate() {
         // So that it can be played alone.
-        assert_eq!(recording.kept[0].topic, "front/status");
-        assert_eq!(recording.notes("scanhub")[0]["part"], wanted(number + 1));
-        assert_eq!(recording.notes("scanhub.life").len(), 1);
+        assert_eq!(recording.messages[0].topic, "front/status");
+        assert_eq!(recording.metadata("scanhub")[0]["part"], expected(number + 1));
+        assert_eq!(recording.metadata("scanhub.life").len(), 1);
     }
     nothing_missed(&outcome);
     assert!(telegrams(&recordings).len() > 20);
@@ -93,7 +93,7 @@ fn a_recording_goes_on_in_files_of_which_the_last_stay() {
 fn keeps_the_last_files_of_all_runs_when_forced() {
     let env = TestEnv::new();
     let [_simulator, hub] = sensor(&env);
-    let file = env.word("walk.mcap");
+    let file = env.path_argument("walk.mcap");
     let words = ["record", "--split=1h", "--keep=2", "--force", "-o", &file];
     let names = || {
         let names = fs::read_dir(env.path("walk.mcap").parent().unwrap()).unwrap();
@@ -112,23 +112,23 @@ fn keeps_the_last_files_of_all_runs_when_forced() {
     assert_eq!(removed, [0, 0, 1]);
     assert_eq!(names(), ["walk-0002.mcap", "walk-0003.mcap"]);
     // A file that another recorder writes stays, and does not count.
-    let mut other = env.start(&["record", "--json", "--force", "-o", &env.word("walk-0001.mcap")]);
+    let mut other = env.start(&["record", "--json", "--force", "-o", &env.path_argument("walk-0001.mcap")]);
     await_samples(&mut other, 10);
     fs::write(env.path("walk-0000.mcap"), "my notes").unwrap();
     let outcome = env.run(&[&words[..], &["-n", "50"]].concat());
-    let text = String::from_utf8_lossy(&outcome.out).into_owned();
+    let text = String::from_utf8_lossy(&outcome.stdout).into_owned();
     let first = format!(
         "records into {}; its first sample removes 1 file of an earlier run (--keep)",
-        env.word("walk-0004.mcap")
+        env.path_argument("walk-0004.mcap")
     );
-    assert_eq!((outcome.code, text.lines().next()), (Some(0), Some(&first[..])), "{outcome}");
+    assert_eq!((outcome.exit_code, text.lines().next()), (Some(0), Some(&first[..])), "{outcome}");
     let all = ["walk-0000.mcap", "walk-0001.mcap", "walk-0003.mcap", "walk-0004.mcap"];
     assert_eq!(names(), all);
     files(&other.end(INT));
     // A run that records nothing removes nothing, and neither does one that is refused.
-    assert_eq!(hub.end(INT).code, Some(0));
-    assert_eq!(env.run(&[&words[..], &["-n", "50"]].concat()).code, Some(3));
-    assert_eq!(env.run(&["record", "--split=1h", "--keep=2", "-o", &file]).code, Some(73));
+    assert_eq!(hub.end(INT).exit_code, Some(0));
+    assert_eq!(env.run(&[&words[..], &["-n", "50"]].concat()).exit_code, Some(3));
+    assert_eq!(env.run(&["record", "--split=1h", "--keep=2", "-o", &file]).exit_code, Some(73));
     assert_eq!(names(), all);
 }
 
@@ -138,14 +138,14 @@ fn a_file_that_may_not_grow_is_followed_by_another() {
     let _others = sensor(&env);
     // 128 blocks of 512 or 1024 bytes.
     let limited = ["sh", "-c", "ulimit -f 128; exec \"$@\"", "sh"];
-    let mut recorder = start_in(&env, &limited, &["record", "--json", "-o", &env.word("walk.mcap")]);
+    let mut recorder = start_in(&env, &limited, &["record", "--json", "-o", &env.path_argument("walk.mcap")]);
     recorder.await_line("the next file", is_kind("file"));
     recorder.await_line("the next file", is_kind("file"));
     let outcome = recorder.end(INT);
     let files = files(&outcome);
     assert_eq!(files[..2], [env.path("walk.mcap"), env.path("walk-0002.mcap")]);
     // There is no room for the index of any but the last one.
-    let recordings: Vec<_> = files.iter().map(|file| Recording::left(file)).collect();
+    let recordings: Vec<_> = files.iter().map(|file| Recording::read_interrupted(file)).collect();
     nothing_missed(&outcome);
     assert!(telegrams(&recordings).len() > 50);
 }
@@ -160,8 +160,8 @@ fn a_directory_that_vanishes_is_waited_for() {
     let mut recorder = env.start(&["record", "--json", "-o", &file.display().to_string()]);
     await_samples(&mut recorder, 20);
     fs::rename(&place, env.path("unplugged")).unwrap();
-    let trouble = recorder.await_line("trouble", is_kind("write_failed"));
-    assert_eq!(trouble["file"], file.display().to_string());
+    let problem = recorder.await_line("trouble", is_kind("write_failed"));
+    assert_eq!(problem["file"], file.display().to_string());
     fs::create_dir(&place).unwrap();
     recorder.await_line("well", is_kind("write_resumed"));
     await_samples(&mut recorder, 20);
@@ -169,7 +169,7 @@ fn a_directory_that_vanishes_is_waited_for() {
     assert_eq!(files(&outcome)[1], place.join("walk-0002.mcap"));
     // What was written until it was seen is where the directory is now.
     let places = [env.path("unplugged/walk.mcap"), place.join("walk-0002.mcap")];
-    let recordings = [Recording::left(&places[0]), Recording::whole(&places[1])];
+    let recordings = [Recording::read_interrupted(&places[0]), Recording::read_complete(&places[1])];
     nothing_missed(&outcome);
     assert!(telegrams(&recordings).len() > 10);
 }
@@ -191,25 +191,27 @@ fn a_full_disk_is_waited_for() {
         start_in(&env, &["unshare", "-rm", "sh", "-c", &script, "sh"], &["record", "--json", "-o", &file]);
     recorder.await_line("trouble", is_kind("write_failed"));
     // As the recorder sees it.
-    let seen = PathBuf::from(format!("/proc/{}/root{}", recorder.pid(), place.display()));
-    let full = Recording::left(&seen.join("walk.mcap"));
+    let path_in_namespace = PathBuf::from(format!("/proc/{}/root{}", recorder.pid(), place.display()));
+    let full = Recording::read_interrupted(&path_in_namespace.join("walk.mcap"));
     assert!(!full.of("front/telegram").is_empty(), "it ends behind a whole chunk");
-    fs::remove_file(seen.join("filler")).unwrap();
+    fs::remove_file(path_in_namespace.join("filler")).unwrap();
     recorder.await_line("well", is_kind("write_resumed"));
-    let before = Recording::left(&seen.join("walk.mcap")).kept.len();
-    until("it goes on", || Recording::left(&seen.join("walk.mcap")).kept.len() > before);
+    let before = Recording::read_interrupted(&path_in_namespace.join("walk.mcap")).messages.len();
+    wait_until("it goes on", || {
+        Recording::read_interrupted(&path_in_namespace.join("walk.mcap")).messages.len() > before
+    });
     // It ends with the file system that it is in.
-    let mut open = fs::File::open(seen.join("walk.mcap")).unwrap();
+    let mut open = fs::File::open(path_in_namespace.join("walk.mcap")).unwrap();
     let outcome = recorder.end(INT);
     assert_eq!(files(&outcome).len(), 1);
     let mut bytes = Vec::new();
     open.read_to_end(&mut bytes).unwrap();
     nothing_missed(&outcome);
-    telegrams(&[Recording::whole(Path::new(&env.file("walk.mcap", bytes)))]);
+    telegrams(&[Recording::read_complete(Path::new(&env.file("walk.mcap", bytes)))]);
 }
 
 #[test]
-fn what_cannot_be_held_is_left_out_and_said() {
+fn counts_samples_dropped_because_of_a_slow_output() {
     let env = TestEnv::new();
     let stream: Vec<u8> = (0..40_000_u32).flat_map(|seed| scan((seed % 8000) as u16)).collect();
     env.file("stream", stream);
@@ -224,7 +226,7 @@ fn what_cannot_be_held_is_left_out_and_said() {
     let mut reader = fs::File::open(&pipe).unwrap();
     drop(open);
     // Again and again: a busy machine may lose most samples before the recorder can receive them.
-    let stream = env.word("stream");
+    let stream = env.path_argument("stream");
     let words = ["replay", "--json", "--no-system-config", "--loop", "--rate=max", &stream];
     let _hub = env.start(&words).ready();
     recorder.await_line("the gap", is_kind("gap_begins"));
@@ -237,13 +239,13 @@ fn what_cannot_be_held_is_left_out_and_said() {
     let end = outcome.of_class("recorded").pop().unwrap_or_else(|| panic!("{outcome}"));
     let recording = Recording::read(&read.join().unwrap().unwrap(), &pipe);
     assert!(number(&gap, "dropped") > 0 && number(&end, "dropped") >= number(&gap, "dropped"), "{end}");
-    assert_eq!(number(&end, "samples"), recording.kept.len() as u64);
+    assert_eq!(number(&end, "samples"), recording.messages.len() as u64);
     let dropped = |gap: &&BTreeMap<String, String>| -> u64 {
         let counts = gap.iter().filter(|(key, _)| key.contains('/'));
         counts.map(|(_, count)| count.parse::<u64>().unwrap()).sum()
     };
-    let told: u64 = recording.notes("scanhub.gap").iter().map(dropped).sum();
-    assert_eq!(told, number(&end, "dropped"));
+    let noted: u64 = recording.metadata("scanhub.gap").iter().map(dropped).sum();
+    assert_eq!(noted, number(&end, "dropped"));
 }
 
 #[test]
@@ -260,12 +262,12 @@ fn signals_that_come_together_are_one() {
     recorder.await_line("its begin", is_class("recording"));
     let mut reader = fs::File::open(&pipe).unwrap();
     drop(open);
-    until("it receives", || env.subscribers("front/status") > 0);
+    wait_until("it receives", || env.subscribers("front/status") > 0);
     recorder.await_lines(2, "its progress", is_class("recording"));
     // The recorder cannot handle the first one before the last one was sent. How far apart signals of one request may be is
     // tested without a clock, in the crate `verbs`.
     recorder.signal(Signal::STOP);
-    until("it is stopped", || recorder.is_stopped());
+    wait_until("it is stopped", || recorder.is_stopped());
     [INT, TERM, HUP, Signal::QUIT].into_iter().for_each(|signal| recorder.signal(signal));
     recorder.signal(Signal::CONT);
     recorder.await_line("the last summary", |line| line["class"] == "summary" && line["topic"] == "status");
@@ -274,35 +276,36 @@ fn signals_that_come_together_are_one() {
         reader.read_to_end(&mut bytes).map(|_| bytes)
     });
     let outcome = recorder.wait();
-    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let bytes = read.join().unwrap().unwrap();
     assert!(bytes.len() > 4096 && bytes.ends_with(b"\x89MCAP0\r\n"), "{} bytes", bytes.len());
 }
 
 #[test]
-fn what_cannot_be_begun_leaves_nothing_behind() {
+fn failed_start_leaves_no_file() {
     let env = TestEnv::new();
     let limited = ["sh", "-c", "ulimit -f 0; exec \"$@\"", "sh"];
-    let outcome = start_in(&env, &limited, &["record", "--json", "-o", &env.word("walk.mcap")]).wait();
-    assert_eq!(outcome.code, Some(75), "{outcome}");
+    let outcome =
+        start_in(&env, &limited, &["record", "--json", "-o", &env.path_argument("walk.mcap")]).wait();
+    assert_eq!(outcome.exit_code, Some(75), "{outcome}");
     assert_eq!(outcome.of_class("error")[0]["kind"], "short", "{outcome}");
     assert!(!env.path("walk.mcap").exists());
     std::os::unix::fs::symlink("/dev/null", env.path("nothing")).unwrap();
-    let outcome = env.run(&["record", "--json", "--force", "--for=5s", "-o", &env.word("nothing")]);
-    assert_eq!(outcome.code, Some(73), "{outcome}");
+    let outcome = env.run(&["record", "--json", "--force", "--for=5s", "-o", &env.path_argument("nothing")]);
+    assert_eq!(outcome.exit_code, Some(73), "{outcome}");
     assert!(outcome.to_string().contains("it is a link to /dev/null"), "{outcome}");
     assert!(fs::symlink_metadata(env.path("nothing")).is_ok());
 }
 
 #[test]
-fn a_recording_whose_reader_went_away_has_failed() {
+fn recorder_fails_if_its_reader_closes_the_pipe() {
     let env = TestEnv::new();
     let (reader, writer) = io::pipe().unwrap();
     drop(reader);
     let refused = |outcome: std::process::Output| {
-        let said = String::from_utf8_lossy(&outcome.stderr).into_owned();
-        assert_eq!(outcome.status.code(), Some(1), "{said}");
-        assert!(said.contains("the reader of the recording is gone"), "{said}");
+        let errors = String::from_utf8_lossy(&outcome.stderr).into_owned();
+        assert_eq!(outcome.status.code(), Some(1), "{errors}");
+        assert!(errors.contains("the reader of the recording is gone"), "{errors}");
     };
     let begin = |words: &[&str], writer: io::PipeWriter| {
         let mut command = env.command(&[&["record", "-o", "-"], words].concat());
@@ -322,19 +325,22 @@ fn a_recording_whose_reader_went_away_has_failed() {
 fn samples_of_a_file_that_was_removed_are_not_counted() {
     let env = TestEnv::new();
     let _others = sensor(&env);
-    let file = env.word("walk.mcap");
+    let file = env.path_argument("walk.mcap");
     let mut recorder = env.start(&["record", "--json", "-o", &file]);
     await_samples(&mut recorder, 20);
     fs::remove_file(&file).unwrap();
-    let gone = recorder.await_line("the loss", is_kind("file_removed"));
-    assert_eq!(gone["file"], file);
+    let lost_file = recorder.await_line("the loss", is_kind("file_removed"));
+    assert_eq!(lost_file["file"], file);
     await_samples(&mut recorder, 20);
     let outcome = recorder.end(INT);
     let end = outcome.of_class("recorded").pop().unwrap_or_else(|| panic!("{outcome}"));
-    assert_eq!((number(&end, "removed"), number(&gone, "samples") >= 20), (number(&gone, "samples"), true));
-    let next = Recording::whole(&env.path("walk-0002.mcap"));
+    assert_eq!(
+        (number(&end, "removed"), number(&lost_file, "samples") >= 20),
+        (number(&lost_file, "samples"), true)
+    );
+    let next = Recording::read_complete(&env.path("walk-0002.mcap"));
     let repeated = 1;
-    assert_eq!(number(&end, "samples") + repeated, next.kept.len() as u64, "{outcome}");
+    assert_eq!(number(&end, "samples") + repeated, next.messages.len() as u64, "{outcome}");
     assert_eq!(number(&end, "bytes"), fs::metadata(env.path("walk-0002.mcap")).unwrap().len());
     // One that is removed at the very end, too.
     let mut recorder = env.start(&["record", "--json", "--force", "-o", &file]);
@@ -349,16 +355,16 @@ fn samples_of_a_file_that_was_removed_are_not_counted() {
 fn two_recorders_do_not_write_one_file() {
     let env = TestEnv::new();
     let _others = sensor(&env);
-    let file = env.word("walk.mcap");
+    let file = env.path_argument("walk.mcap");
     let mut recorder = env.start(&["record", "--json", "-o", &file]);
     await_samples(&mut recorder, 20);
     let second = env.run(&["record", "--json", "--force", "-o", &file]);
     let error = &second.of_class("error")[0];
-    assert_eq!((second.code, &error["kind"]), (Some(73), &"output".into()), "{second}");
+    assert_eq!((second.exit_code, &error["kind"]), (Some(73), &"output".into()), "{second}");
     assert!(error["message"].as_str().unwrap().contains("another recorder writes it"), "{error}");
     await_samples(&mut recorder, 20);
     nothing_missed(&recorder.end(INT));
-    telegrams(&[Recording::whole(Path::new(&file))]);
+    telegrams(&[Recording::read_complete(Path::new(&file))]);
 }
 
 /// The program, started by other words before its own.

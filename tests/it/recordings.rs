@@ -4,7 +4,7 @@
 use std::path::PathBuf;
 
 use crate::testkit;
-use crate::testkit::{INT, KILL, Outcome, Program, TestEnv, bytes_of, number, sequence, skip};
+use crate::testkit::{INT, KILL, Outcome, Program, TestEnv, bytes_of, contiguous_numbers, number, skip};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::variant::{Mode, Unit};
 use serde_json::Value;
@@ -13,19 +13,19 @@ use serde_json::Value;
 /// very first sample; returns what it received up to the end of the recording.
 fn play(env: &TestEnv, file: &str, option: &str, topics: &[&str]) -> (Outcome, Value) {
     let before = env.hub(&["--link=a=/no/such/port"]);
-    let mut consumer = env.echo(topics);
-    assert_eq!(before.end(KILL).code, None);
-    consumer.await_line("hub_gone", |line| line["kind"] == "hub_gone");
+    let mut subscriber = env.echo(topics);
+    assert_eq!(before.end(KILL).exit_code, None);
+    subscriber.await_line("hub_gone", |line| line["kind"] == "hub_gone");
     let hub = env.hub(&["--link", &format!("a=file:{file}{option}")]);
-    let info = at_the_end(env);
-    consumer.await_line("the end", |line| line["state"] == "silent");
-    let outcome = consumer.end(INT);
-    assert_eq!(hub.end(INT).code, Some(0));
+    let info = await_end(env);
+    subscriber.await_line("the end", |line| line["state"] == "silent");
+    let outcome = subscriber.end(INT);
+    assert_eq!(hub.end(INT).exit_code, Some(0));
     (outcome, info)
 }
 
 /// What `info` says when the recording is at its end. Every byte of it is accounted for.
-fn at_the_end(env: &TestEnv) -> Value {
+fn await_end(env: &TestEnv) -> Value {
     let info = env.await_info("a", |info| info["state"] == "silent");
     assert_eq!(info["last_error"], "the recording is at its end");
     let counter = |name: &str| number(&info["counters"], name);
@@ -37,8 +37,8 @@ fn at_the_end(env: &TestEnv) -> Value {
 
 /// Replies, scans, noise between them and one damaged scan: the bytes, and the telegrams that are to be found.
 fn stream(scans: u16) -> (Vec<u8>, Vec<Vec<u8>>) {
-    let configuration = lms::reply::configuration(0, Mode(1), Unit::Mm, 0x10).bytes().to_vec();
-    let mode = lms::reply::mode(0, true, 0x10).bytes().to_vec();
+    let configuration = lms::reply::configuration_reply(0, Mode(1), Unit::Mm, 0x10).bytes().to_vec();
+    let mode = lms::reply::mode_reply(0, true, 0x10).bytes().to_vec();
     let mut random = fastrand::Rng::with_seed(31);
     let mut noise = move |len: usize| -> Vec<u8> { (0..len).map(|_| random.u8(..)).collect() };
     let (mut bytes, mut whole) = (noise(100), Vec::new());
@@ -57,63 +57,66 @@ fn stream(scans: u16) -> (Vec<u8>, Vec<Vec<u8>>) {
     (bytes, whole)
 }
 
-fn check(outcome: &Outcome, whole: &[Vec<u8>]) {
-    assert_eq!(outcome.code, Some(0), "{}", outcome.errors);
+fn check(outcome: &Outcome, expected: &[Vec<u8>]) {
+    assert_eq!(outcome.exit_code, Some(0), "{}", outcome.stderr);
     let telegrams = outcome.of_class("telegram");
     let received: Vec<_> = telegrams.iter().map(bytes_of).collect();
-    assert!(received == whole, "{} telegrams, not the {} that are there", received.len(), whole.len());
-    assert_eq!((sequence(&telegrams, "seq")[0], sequence(&telegrams, "topic_seq")[0]), (0, 0));
+    assert!(received == expected, "{} telegrams, not the {} that are there", received.len(), expected.len());
+    assert_eq!(
+        (contiguous_numbers(&telegrams, "seq")[0], contiguous_numbers(&telegrams, "topic_seq")[0]),
+        (0, 0)
+    );
 }
 
 #[test]
-fn a_recording_without_its_mode_has_marks_where_the_mode_is_set() {
+fn marks_of_a_recording_need_the_configured_mode() {
     let env = TestEnv::new();
     let bytes = (0..4).flat_map(testkit::scan).collect::<Vec<u8>>();
     let link = format!("--link=a=file:{}", env.file("recording", &bytes));
     let hub = env.hub(&[&link]);
-    at_the_end(&env);
+    await_end(&env);
     let info = env.run(&["info", "a"]).to_string();
     assert!(info.contains("does not contain its measuring mode; set link.a.mode"), "{info}");
     assert_eq!(env.info("a")["marks"]["available"], Value::Null);
-    assert_eq!(hub.end(INT).code, Some(0));
+    assert_eq!(hub.end(INT).exit_code, Some(0));
     let hub = env.hub(&[&link, "--set=link.a.mode=0x01"]);
-    at_the_end(&env);
+    await_end(&env);
     let info = env.info("a");
     assert_eq!((&info["marks"]["available"], &info["mode"]), (&Value::Bool(true), &Value::from(1)), "{info}");
-    assert_eq!(hub.end(INT).code, Some(0));
+    assert_eq!(hub.end(INT).exit_code, Some(0));
 }
 
 #[test]
-fn values_that_could_be_split_in_several_ways_are_no_scans_until_the_mode_is_told() {
+fn ambiguous_values_make_no_scans_until_mode_is_set() {
     let env = TestEnv::new();
     // 8.6 m in 14 bits; in 13 bits it would be 0.4 m.
     let scan = lms::measured::encode(0, Unit::Mm, &[8600; 181], 0x10);
     let file = env.file("recording", scan.bytes().repeat(100));
-    let trouble = "the recording does not contain its measuring mode: no scans; set link.a.mode";
+    let message = "the recording does not contain its measuring mode: no scans; set link.a.mode";
     let (outcome, _) = play(&env, &file, "", &["a/telegram", "a/scan", "a/status"]);
     assert_eq!((outcome.of_class("telegram").len(), outcome.of_class("scan").len()), (100, 0), "{outcome}");
-    assert!(outcome.of_class("status").iter().any(|line| line["last_error"] == trouble), "{outcome}");
+    assert!(outcome.of_class("status").iter().any(|line| line["last_error"] == message), "{outcome}");
     let log = env.path("a.log").display().to_string();
     let refused = env.run(&["convert", &file, &log]);
     assert!(
-        refused.code == Some(66) && refused.errors.contains("does not contain its measuring mode"),
+        refused.exit_code == Some(66) && refused.stderr.contains("does not contain its measuring mode"),
         "{refused}"
     );
     let hub = env.hub(&[&format!("--link=a=file:{file}"), "--set=link.a.mode=0x04"]);
     let outcome = env.run(&["echo", "--json", "a/scan", "-n", "1", "--timeout=30s"]);
     let ranges: Vec<_> = outcome.of_class("scan").iter().map(|scan| scan["ranges"][7].clone()).collect();
     assert_eq!(ranges, [8600], "{outcome}");
-    assert_eq!(hub.end(INT).code, Some(0));
+    assert_eq!(hub.end(INT).exit_code, Some(0));
     // Where no value has a higher bit there is one way.
     let plain = env.file("plain", testkit::scan(1).repeat(2));
     let (hub, words) = (env.hub(&[&format!("--link=a=file:{plain}")]), "no value has more than 13 bits");
-    assert_eq!(at_the_end(&env)["counters"]["telegrams"], 2);
+    assert_eq!(await_end(&env)["counters"]["telegrams"], 2);
     let outcome = hub.end(INT);
-    assert!(outcome.errors.contains(words), "{outcome}");
+    assert!(outcome.stderr.contains(words), "{outcome}");
 }
 
 #[test]
-fn who_is_started_with_the_hub_gets_a_recording_from_its_beginning() {
+fn subscriber_at_start_gets_the_whole_recording() {
     let env = TestEnv::new();
     let (bytes, whole) = stream(14);
     let file = env.file("recording", &bytes);
@@ -121,18 +124,18 @@ fn who_is_started_with_the_hub_gets_a_recording_from_its_beginning() {
     // It attaches to one topic after the other, well within the second that the hub waits.
     let outcome = env.run(&["echo", "--json", "a/telegram", "-n", &whole.len().to_string(), "--timeout=30s"]);
     check(&outcome, &whole);
-    assert_eq!(hub.end(INT).code, Some(0));
+    assert_eq!(hub.end(INT).exit_code, Some(0));
 }
 
 #[test]
 fn a_file_without_a_telegram_does_not_stream() {
     let env = TestEnv::new();
     let hub = env.hub(&[&format!("--link=a=file:{},family=lms", env.file("noise", vec![0x42; 4000]))]);
-    let info = at_the_end(&env);
+    let info = await_end(&env);
     assert_eq!(info["counters"]["bytes_discarded"], 4000);
     let outcome = hub.end(INT);
-    assert!(outcome.errors.contains("there is no telegram in the recording"), "{outcome}");
-    assert!(!outcome.errors.contains("streaming"), "{outcome}");
+    assert!(outcome.stderr.contains("there is no telegram in the recording"), "{outcome}");
+    assert!(!outcome.stderr.contains("streaming"), "{outcome}");
 }
 
 #[test]
@@ -145,7 +148,7 @@ fn the_reflectors_of_a_recording_are_marks() {
     let outcome = env.run(&["echo", "--json", "a/marks", "-n", "20"]);
     let found = |line: &Value| line["marks"].as_array().map_or(0, Vec::len);
     assert!(outcome.of_class("marks").iter().any(|line| found(line) == 5), "{outcome}");
-    assert_eq!(hub.end(INT).code, Some(0));
+    assert_eq!(hub.end(INT).exit_code, Some(0));
 }
 
 #[test]
@@ -169,7 +172,7 @@ fn in_the_pace_of_the_sensor() {
     let (outcome, _) = play(&env, &file, "", &["a/telegram", "a/scan", "a/status"]);
     check(&outcome, &whole);
     let scans = outcome.of_class("scan");
-    assert_eq!((scans.len(), sequence(&scans, "topic_seq")[0]), (whole.len() - 2, 0));
+    assert_eq!((scans.len(), contiguous_numbers(&scans, "topic_seq")[0]), (whole.len() - 2, 0));
     // Mode 1, as the reply at its beginning says: 13 bits of range.
     for (scan, telegram) in scans.iter().zip(&whole[2..]) {
         let first = u16::from_le_bytes([telegram[7], telegram[8]]);
@@ -209,8 +212,8 @@ fn a_carmen_log() {
 
 /// Recordings of real sensors, which are not part of the project: SCANHUB_DATA, or beside the project.
 fn data() -> Option<PathBuf> {
-    let beside = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
-    let place = std::env::var_os("SCANHUB_DATA").map_or(beside, PathBuf::from);
+    let default_folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
+    let place = std::env::var_os("SCANHUB_DATA").map_or(default_folder, PathBuf::from);
     if place.is_dir() {
         return Some(place);
     }
@@ -224,7 +227,7 @@ fn counters_of(data: &std::path::Path, name: &str) -> Value {
     let path = data.join(name);
     let link = format!("--link=a=file:{}?rate=max,family=lms", path.display());
     let _hub: Program = env.hub(&[link]);
-    at_the_end(&env)["counters"].clone()
+    await_end(&env)["counters"].clone()
 }
 
 #[test]

@@ -4,25 +4,25 @@
 use std::process::{Command, Stdio};
 
 use crate::testkit;
-use crate::testkit::{Child, Outcome, TERM, TestEnv, side_by_side, spawn};
+use crate::testkit::{Child, Outcome, TERM, TestEnv, run_concurrently, spawn};
 use serde_json::Value;
 
 /// Runs the program, which must refuse with `code` and `kind` and say all of `words`, in text and in JSON.
-fn refused(env: &TestEnv, arguments: &[&str], code: i32, kind: &str, words: &[&str]) {
+fn assert_refused(env: &TestEnv, arguments: &[&str], code: i32, kind: &str, words: &[&str]) {
     let outcome = env.run(arguments);
-    assert_eq!((outcome.code, outcome.out.is_empty()), (Some(code), true), "{outcome}");
-    says_all(&outcome.errors, words, &outcome);
+    assert_eq!((outcome.exit_code, outcome.stdout.is_empty()), (Some(code), true), "{outcome}");
+    check_contains_all(&outcome.stderr, words, &outcome);
 
     let outcome = env.run(&[arguments, &["--json"]].concat());
-    assert_eq!(outcome.code, Some(code), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(code), "{outcome}");
     let text = match arguments.first() {
         // The log goes to stderr too, before it.
         Some(&("run" | "replay" | "simulate")) if kind != "usage" => {
-            assert!(outcome.out.is_empty(), "{outcome}");
-            outcome.errors.lines().last().unwrap_or_default().to_owned()
+            assert!(outcome.stdout.is_empty(), "{outcome}");
+            outcome.stderr.lines().last().unwrap_or_default().to_owned()
         }
         _ => {
-            let out = String::from_utf8_lossy(&outcome.out).into_owned();
+            let out = String::from_utf8_lossy(&outcome.stdout).into_owned();
             assert_eq!(out.lines().count(), 1, "{outcome}");
             out
         }
@@ -32,18 +32,18 @@ fn refused(env: &TestEnv, arguments: &[&str], code: i32, kind: &str, words: &[&s
     let [message, hint] = ["message", "hint"].map(|key| line[key].as_str().unwrap_or_default());
     assert!(!message.is_empty() && !hint.is_empty(), "{outcome}");
     if kind != "usage" {
-        says_all(&format!("{message}\n{hint}"), words, &outcome);
+        check_contains_all(&format!("{message}\n{hint}"), words, &outcome);
     }
 }
 
-fn says_all(text: &str, words: &[&str], outcome: &Outcome) {
+fn check_contains_all(text: &str, words: &[&str], outcome: &Outcome) {
     for word in words {
         assert!(text.contains(word), "does not say {word:?}: {outcome}");
     }
 }
 
 #[test]
-fn what_is_no_command_line() {
+fn rejects_invalid_command_lines() {
     let env = TestEnv::new();
     for (arguments, word) in [
         (&["fly"][..], "fly"),
@@ -60,7 +60,7 @@ fn what_is_no_command_line() {
         (&["simulate", "--port=a", "--world=room", "--replay=x"], "--replay"),
         (&["run", "--link"], "--link"),
     ] {
-        refused(&env, arguments, 2, "usage", &[word]);
+        assert_refused(&env, arguments, 2, "usage", &[word]);
     }
     for (arguments, flag) in [
         (&["--json", "echo", "front/scan", "--csv"], "--csv"),
@@ -69,10 +69,10 @@ fn what_is_no_command_line() {
         let outcome = env.run(arguments);
         let error = &outcome.of_class("error")[0];
         let message = format!("the argument '{flag}' cannot be used with '--json'");
-        assert_eq!((outcome.code, error["message"].as_str()), (Some(2), Some(&*message)), "{outcome}");
+        assert_eq!((outcome.exit_code, error["message"].as_str()), (Some(2), Some(&*message)), "{outcome}");
     }
     let help = env.run(&["--help"]);
-    assert_eq!((help.code, help.errors.as_str()), (Some(0), ""));
+    assert_eq!((help.exit_code, help.stderr.as_str()), (Some(0), ""));
 }
 
 #[test]
@@ -83,11 +83,11 @@ fn formats_that_do_not_go_with_their_topics() {
         (["echo", "front/status", "--csv"], "--csv takes one topic"),
     ] {
         let outcome = env.run(&arguments);
-        assert_eq!(outcome.code, Some(2), "{outcome}");
-        says_all(&outcome.errors, &[word], &outcome);
+        assert_eq!(outcome.exit_code, Some(2), "{outcome}");
+        check_contains_all(&outcome.stderr, &[word], &outcome);
     }
     let outcome = env.run(&["echo", "front/telegram", "rear/telegram", "--raw"]);
-    assert_eq!(outcome.code, Some(2), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(2), "{outcome}");
 }
 
 #[test]
@@ -124,12 +124,12 @@ fn configuration_that_cannot_be() {
         (&["simulate", "--port=a", "--fault=silence=-1"], &["silence=-1", "from 0 to"]),
         (&["simulate", "--port=a", "--type=lms211", "--variant=180/0.5"], &["180/0.5", "100 degrees"]),
     ] {
-        refused(&env, arguments, 78, "configuration", words);
+        assert_refused(&env, arguments, 78, "configuration", words);
     }
 }
 
 #[test]
-fn no_topic_is_called_so_whoever_is_asked() {
+fn every_verb_rejects_unknown_topic_and_sensor_names() {
     let env = TestEnv::new();
     for (arguments, words) in [
         (&["echo", "front/scam"][..], &["front/scam", "front/scan"][..]),
@@ -163,23 +163,23 @@ fn no_topic_is_called_so_whoever_is_asked() {
         (&["leds", "Front"], &["Front"]),
     ] {
         let outcome = env.run(arguments);
-        assert_eq!((outcome.code, outcome.out.is_empty()), (Some(2), true), "{outcome}");
-        says_all(&outcome.errors, words, &outcome);
+        assert_eq!((outcome.exit_code, outcome.stdout.is_empty()), (Some(2), true), "{outcome}");
+        check_contains_all(&outcome.stderr, words, &outcome);
         let outcome = env.run(&[arguments, &["--json"]].concat());
         // What is no flag of that command line is refused there.
         let kind = outcome.of_class("error").pop().map(|line| line["kind"].clone());
-        assert_eq!((outcome.code, kind), (Some(2), Some("usage".into())), "{outcome}");
+        assert_eq!((outcome.exit_code, kind), (Some(2), Some("usage".into())), "{outcome}");
     }
     let config = env.file("topics.toml", "[gateway]\ntopics = [\"front/scam\"]\n");
     let arguments = ["gateway", "--no-system-config", "--config", &config];
-    refused(&env, &arguments, 78, "configuration", &["gateway", "front/scam"]);
+    assert_refused(&env, &arguments, 78, "configuration", &["gateway", "front/scam"]);
 }
 
 #[test]
-fn what_is_to_be_read_and_is_not_there() {
+fn unreadable_input_exits_with_66() {
     let env = TestEnv::new();
-    let missing = env.word("missing");
-    let output = env.word("out.mcap");
+    let missing = env.path_argument("missing");
+    let output = env.path_argument("out.mcap");
     for arguments in [
         &["run", "--no-system-config", "--config", &missing][..],
         &["run", "--no-system-config", &format!("--link=front=file:{missing}")],
@@ -205,11 +205,11 @@ fn what_is_to_be_read_and_is_not_there() {
     ] {
         let is_there = arguments.iter().any(|word| word.ends_with("/etc/passwd"));
         let named = if is_there { "/etc/passwd" } else { &missing };
-        refused(&env, arguments, 66, "input", &[named]);
+        assert_refused(&env, arguments, 66, "input", &[named]);
     }
     // A value in a file that is there.
     let wrong = env.file("wrong.toml", "[background]\nmethod = \"magic\"\n");
-    refused(
+    assert_refused(
         &env,
         &["run", "--no-system-config", "--link=a=/x", "--config", &wrong],
         78,
@@ -219,12 +219,12 @@ fn what_is_to_be_read_and_is_not_there() {
 }
 
 #[test]
-fn what_is_to_be_written_and_is_there_or_cannot_be() {
+fn unwritable_or_existing_output_exits_with_73() {
     let env = TestEnv::new();
     let there = env.file("there.mcap", "whole");
-    let nowhere = env.word("no/such/directory/out.mcap");
+    let nowhere = env.path_argument("no/such/directory/out.mcap");
     let input = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/vectors/recording/v1.mcap");
-    let whole = env.word("whole.mcap");
+    let whole = env.path_argument("whole.mcap");
     std::fs::copy(input, &whole).expect("a copy");
     for (arguments, words) in [
         (&["convert", input, &there][..], &["there.mcap", "--force"][..]),
@@ -237,7 +237,7 @@ fn what_is_to_be_written_and_is_there_or_cannot_be() {
         (&["simulate", "--port=a", "--truth", &nowhere], &["no/such"]),
         (&["background", "front", "save", &there], &["there.mcap", "--force"]),
     ] {
-        refused(&env, arguments, 73, "output", words);
+        assert_refused(&env, arguments, 73, "output", words);
     }
     assert_eq!(std::fs::read(env.path("there.mcap")).unwrap(), b"whole");
 }
@@ -251,35 +251,36 @@ fn no_such_sensor_or_hub() {
         &["echo", "side/*", "--for=9s"],
         &["hz", "side/scan", "--for=9s"],
         &["latency", "side/scan", "--for=9s", "--no-realtime"],
-        &["record", "side/scan", "--for=9s", "-o", &env.word("side.mcap")],
+        &["record", "side/scan", "--for=9s", "-o", &env.path_argument("side.mcap")],
         &["leds", "side", "--for=9s"],
         &["zones", "side", "mask", "--for=9s"],
         &["info", "side"],
         &["control", "side", "pause"],
         &["background", "side", "show"],
-        &["background", "side", "save", &env.word("side.json")],
+        &["background", "side", "save", &env.path_argument("side.json")],
     ];
     let asks = |verb: &[&str], kind: &str| {
         let outcome = env.run(&[verb, &["--json"]].concat());
         let errors = outcome.of_class("error");
-        let told = errors.last().map(|line| line["kind"].clone());
-        assert_eq!((outcome.code, told), (Some(3), Some(kind.into())), "{verb:?}: {outcome}");
+        let reported = errors.last().map(|line| line["kind"].clone());
+        assert_eq!((outcome.exit_code, reported), (Some(3), Some(kind.into())), "{verb:?}: {outcome}");
     };
-    side_by_side(verbs, |verb| asks(verb, "no_hub"));
+    run_concurrently(verbs, |verb| asks(verb, "no_hub"));
     asks(&["list"], "no_hub");
-    for verb in
-        [&["replay", golden, "--sensor=side"][..], &["convert", golden, &env.word("x.bin"), "--sensor=side"]]
-    {
+    for verb in [
+        &["replay", golden, "--sensor=side"][..],
+        &["convert", golden, &env.path_argument("x.bin"), "--sensor=side"],
+    ] {
         let outcome = env.run(verb);
-        assert_eq!(outcome.code, Some(3), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(3), "{outcome}");
     }
     let hub = env.hub(&["--link=front=/no/such/port"]);
-    side_by_side(verbs, |verb| asks(verb, "no_topic"));
-    assert_eq!(hub.end(TERM).code, Some(0));
+    run_concurrently(verbs, |verb| asks(verb, "no_topic"));
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
 }
 
 #[test]
-fn a_disk_that_is_full_is_told() {
+fn reports_a_full_disk() {
     let env = TestEnv::new();
     let beams = ["1.50"; 181].join(" ");
     let log = env.file("a.log", format!("FLASER 181 {beams} 0 0 0 0 0 0 1000.0 host 1000.0\n"));
@@ -296,9 +297,9 @@ fn a_disk_that_is_full_is_told() {
         let mut command = env.command(verb);
         command.stdin(Stdio::null()).stdout(full).stderr(Stdio::piped());
         let done = spawn(command).and_then(Child::wait_with_output).expect("it starts");
-        let said = String::from_utf8_lossy(&done.stderr);
+        let errors = String::from_utf8_lossy(&done.stderr);
         assert!(
-            done.status.code() == Some(1) && said.contains("cannot write: No space"),
+            done.status.code() == Some(1) && errors.contains("cannot write: No space"),
             "{verb:?}: {done:?}"
         );
     }
@@ -318,13 +319,13 @@ fn domains_that_cannot_be() {
     ] {
         let outcome = at(domain, root);
         let [line] = &outcome.lines()[..] else { panic!("{outcome}") };
-        assert_eq!((outcome.code, &line["kind"]), (Some(78), &"configuration".into()), "{outcome}");
-        says_all(line["hint"].as_str().unwrap_or_default(), &[word], &outcome);
+        assert_eq!((outcome.exit_code, &line["kind"]), (Some(78), &"configuration".into()), "{outcome}");
+        check_contains_all(line["hint"].as_str().unwrap_or_default(), &[word], &outcome);
     }
 }
 
 #[test]
-fn without_a_hub_that_is_what_is_said() {
+fn reports_that_no_hub_is_running() {
     let env = TestEnv::new();
     for arguments in [
         &["list"][..],
@@ -335,17 +336,17 @@ fn without_a_hub_that_is_what_is_said() {
         &["hz", "-n", "1"],
     ] {
         let outcome = env.run(arguments);
-        assert_eq!(outcome.code, Some(3), "{outcome}");
-        says_all(&outcome.errors, &["no hub", "scanhub run"], &outcome);
+        assert_eq!(outcome.exit_code, Some(3), "{outcome}");
+        check_contains_all(&outcome.stderr, &["no hub", "scanhub run"], &outcome);
     }
     for arguments in [&["list", "--json"][..], &["info", "--json"], &["echo", "a/scan", "-n1", "--json"]] {
         let outcome = env.run(arguments);
-        assert_eq!((outcome.code, &outcome.of_class("error")[0]["kind"]), (Some(3), &"no_hub".into()));
+        assert_eq!((outcome.exit_code, &outcome.of_class("error")[0]["kind"]), (Some(3), &"no_hub".into()));
     }
 }
 
 #[test]
-fn what_the_hub_does_not_have_and_what_does_not_come() {
+fn reports_unknown_sensors_and_timeouts() {
     let env = TestEnv::new();
     // A port that is not there is a state of the hub's, no failure.
     let hub = env.hub(&[env.link("front")]);
@@ -358,8 +359,8 @@ fn what_the_hub_does_not_have_and_what_does_not_come() {
         (&["info", "side"], "no_topic", &["side", "front"]),
     ] {
         let outcome = env.run(arguments);
-        assert_eq!(outcome.code, Some(3), "{outcome}");
-        says_all(&outcome.errors, words, &outcome);
+        assert_eq!(outcome.exit_code, Some(3), "{outcome}");
+        check_contains_all(&outcome.stderr, words, &outcome);
         let outcome = env.run(&[arguments, &["--json"]].concat());
         assert_eq!(outcome.of_class("error")[0]["kind"], kind, "{outcome}");
     }
@@ -367,28 +368,34 @@ fn what_the_hub_does_not_have_and_what_does_not_come() {
     {
         let outcome = env.run(&[&["echo", "front/scan", "--json"], bound].concat());
         assert_eq!(
-            (outcome.code, &outcome.of_class("error")[0]["kind"]),
+            (outcome.exit_code, &outcome.of_class("error")[0]["kind"]),
             (Some(3), &"timeout".into()),
             "{outcome}"
         );
         assert_eq!(outcome.of_class("summary")[0]["received"], 0, "{outcome}");
     }
-    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
 }
 
 #[test]
 fn ports_that_cannot_be_used() {
     let env = TestEnv::new();
     let file = env.file("file", "not a tty");
-    refused(&env, &["run", "--link=front=/dev/null"], 4, "port_not_tty", &["/dev/null", "name a tty"]);
-    refused(&env, &["run", &format!("--link=front={file}")], 4, "port_not_tty", &[&file, "or file:PATH"]);
-    refused(&env, &["simulate", "--port=/no/where/front"], 4, "port_missing", &["/no/where/front"]);
+    assert_refused(&env, &["run", "--link=front=/dev/null"], 4, "port_not_tty", &["/dev/null", "name a tty"]);
+    assert_refused(
+        &env,
+        &["run", &format!("--link=front={file}")],
+        4,
+        "port_not_tty",
+        &[&file, "or file:PATH"],
+    );
+    assert_refused(&env, &["simulate", "--port=/no/where/front"], 4, "port_missing", &["/no/where/front"]);
 
     let _simulator = env.simulator(&["front"], &["--baud=500000"]);
     let hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
-    let (port, pid) = (env.word("front"), format!("process {}", hub.pid()));
-    refused(&TestEnv::new(), &["probe", &port], 4, "port_busy", &[&port, &pid, "stop the hub: kill"]);
+    let (port, pid) = (env.path_argument("front"), format!("process {}", hub.pid()));
+    assert_refused(&TestEnv::new(), &["probe", &port], 4, "port_busy", &[&port, &pid, "stop the hub: kill"]);
     assert_eq!(env.info("front")["state"], "streaming", "was disturbed");
 }
 
@@ -397,9 +404,9 @@ fn a_second_hub_in_the_domain() {
     let env = TestEnv::new();
     let hub = env.hub(&[env.link("front")]);
     let pid = format!("pid {}", hub.pid());
-    refused(&env, &["run", &env.link("front")], 1, "domain_held", &[&pid, "--domain"]);
-    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_refused(&env, &["run", &env.link("front")], 1, "domain_held", &[&pid, "--domain"]);
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
     // It is free again.
     let hub = env.hub(&[env.link("front")]);
-    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
 }

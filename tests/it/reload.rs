@@ -5,20 +5,20 @@
 use std::process::Command;
 
 use crate::testkit::{
-    HUP, INT, MEASURED, Program, TERM, TestEnv, bytes_of, hash, is_class, number, sequence, skip, succeeds,
-    terminal,
+    HUP, INT, MEASURED_VALUES, Program, TERM, TestEnv, bytes_of, contiguous_numbers, hash, is_class, number,
+    skip, succeeds, terminal,
 };
 use serde_json::Value;
 
-const STREAM: [&str; 2] = ["--seed=71", "--baud=500000"];
+const STREAM_FLAGS: [&str; 2] = ["--seed=71", "--baud=500000"];
 /// Minimum time from the stamp of the last scan to that of unknown zones that the hub sends in a silence, in ns: a verdict
 /// is valid for two periods of 26.6 ms and 20 ms.
-const SILENCE_NS: u64 = 70_000_000;
+const MAX_SILENCE_NS: u64 = 70_000_000;
 
 /// The configuration of one link in a file, with `more` behind it.
-fn configure(env: &TestEnv, more: &str) -> String {
-    let port = env.word("front");
-    let text = format!("[[link]]\nname = \"front\"\nport = \"{port}\"\n{more}");
+fn configure(env: &TestEnv, settings: &str) -> String {
+    let port = env.path_argument("front");
+    let text = format!("[[link]]\nname = \"front\"\nport = \"{port}\"\n{settings}");
     format!("--config={}", env.file("scanhub.toml", text))
 }
 
@@ -27,23 +27,23 @@ fn radii(line: &Value) -> Vec<u64> {
     line["zones"].as_array().into_iter().flatten().map(|zone| number(zone, "radius_mm")).collect()
 }
 
-fn has_radii(wanted: &'static [u64]) -> impl Fn(&Value) -> bool {
-    move |line| line["class"] == "zones" && line["stale"] != true && radii(line) == wanted
+fn has_radii(expected: &'static [u64]) -> impl Fn(&Value) -> bool {
+    move |line| line["class"] == "zones" && line["stale"] != true && radii(line) == expected
 }
 
 #[test]
 fn circles_change_in_a_stream_without_a_gap() {
     let env = TestEnv::new();
-    let simulator = env.simulator(&["front"], &STREAM);
+    let simulator = env.simulator(&["front"], &STREAM_FLAGS);
     let mut supervisor = env.supervisor();
     let flags = [configure(&env, ""), "--no-system-config".to_owned()];
     let hub = env.service(&mut supervisor, &flags, None).ready();
-    supervisor.hear("READY=1");
+    supervisor.wait_for_message("READY=1");
     env.await_info("front", |info| info["state"] == "streaming");
     let mut telegrams = env.echo(&["front/telegram"]);
     let mut zones = env.echo(&["front/zones"]);
     zones.await_lines(10, "a verdict", has_radii(&[1000, 600]));
-    for (more, wanted) in [
+    for (more, expected) in [
         ("pose = { x = 0.3 }\n[zones]\nradii = [2.0, 1.0, 0.5]\n", &[2000, 1000, 500][..]),
         ("[zones]\nradii = [0.7]\n[marks]\nmin_level = 3\n[background]\nmethod = \"paper\"\n", &[700]),
         ("[background]\nmethod = \"off\"\n", &[1000, 600]),
@@ -51,12 +51,12 @@ fn circles_change_in_a_stream_without_a_gap() {
     ] {
         configure(&env, more);
         hub.signal(HUP);
-        supervisor.hear("RELOADING=1");
-        supervisor.hear("READY=1");
-        zones.await_lines(10, "a verdict of the new circles", has_radii(wanted));
+        supervisor.wait_for_message("RELOADING=1");
+        supervisor.wait_for_message("READY=1");
+        zones.await_lines(10, "a verdict of the new circles", has_radii(expected));
     }
-    let told = supervisor.heard.iter().filter(|line| line.starts_with("MONOTONIC_USEC="));
-    assert_eq!(told.count(), 4);
+    let times = supervisor.messages.iter().filter(|line| line.starts_with("MONOTONIC_USEC="));
+    assert_eq!(times.count(), 4);
     telegrams.await_lines(10, "a telegram", is_class("telegram"));
     let info = env.info("front");
     assert_eq!((number(&info["counters"], "resyncs"), number(&info["counters"], "reconnects")), (0, 0));
@@ -66,7 +66,7 @@ fn circles_change_in_a_stream_without_a_gap() {
         let mut lines = outcome.of_class(class);
         // A silence has no numbers.
         lines.retain(|line| line["topic_seq"].is_u64());
-        sequence(&lines, "topic_seq");
+        contiguous_numbers(&lines, "topic_seq");
         assert_eq!(outcome.of_class("summary")[0]["missed"], 0, "{class}");
     }
     // A line that arrived too late here has no circles.
@@ -77,7 +77,7 @@ fn circles_change_in_a_stream_without_a_gap() {
     let mut last_ns = 0;
     verdicts.retain(|line| {
         let stamp_ns = number(line, "stamp_ns");
-        let is_silence = line["verdict"] == "unknown" && stamp_ns > last_ns + SILENCE_NS;
+        let is_silence = line["verdict"] == "unknown" && stamp_ns > last_ns + MAX_SILENCE_NS;
         last_ns = if is_silence { last_ns } else { stamp_ns };
         !is_silence
     });
@@ -86,14 +86,14 @@ fn circles_change_in_a_stream_without_a_gap() {
     assert_eq!(firsts.len(), 4, "{firsts:?}");
     assert!(firsts.iter().all(|pair| pair[1]["verdict"] != "unknown"), "{firsts:?}");
     let ended = hub.end(TERM);
-    assert_eq!(ended.code, Some(0));
-    assert!(ended.errors.contains("front: pose, zones changed as configured"), "{ended}");
-    assert!(ended.errors.contains("front: zones, marks, background changed as configured"), "{ended}");
-    assert_eq!(simulator.end(TERM).code, Some(0));
-    assert_eq!(env.simulated("front").1, 0, "EEPROM");
+    assert_eq!(ended.exit_code, Some(0));
+    assert!(ended.stderr.contains("front: pose, zones changed as configured"), "{ended}");
+    assert!(ended.stderr.contains("front: zones, marks, background changed as configured"), "{ended}");
+    assert_eq!(simulator.end(TERM).exit_code, Some(0));
+    assert_eq!(env.simulator_totals("front").1, 0, "EEPROM");
     // What was sent from the first to the last that was received, was received.
     let received = telegrams.of_class("telegram");
-    let received: Vec<_> = received.iter().filter(|line| line["command"] == MEASURED).collect();
+    let received: Vec<_> = received.iter().filter(|line| line["command"] == MEASURED_VALUES).collect();
     let received: Vec<String> = received.iter().map(|line| hash(&bytes_of(line))).collect();
     let truth: Vec<_> = env.truth("front").into_iter().filter(|sent| sent.is_intact_scan()).collect();
     let first = truth.iter().position(|sent| sent.hash == received[0]).expect("it was sent");
@@ -103,21 +103,21 @@ fn circles_change_in_a_stream_without_a_gap() {
 }
 
 #[test]
-fn what_cannot_be_changed_is_said_and_what_cannot_be_changes_nothing() {
+fn reload_reports_refused_and_restart_only_changes() {
     let env = TestEnv::new();
     let mut supervisor = env.supervisor();
     let flags = [configure(&env, ""), "--no-system-config".to_owned()];
     // Nothing is at the port: the topics say all the same how it is.
     let hub = env.service(&mut supervisor, &flags, None).ready();
-    supervisor.hear("READY=1");
+    supervisor.wait_for_message("READY=1");
     let mut zones = env.echo(&["front/zones"]);
     let wrong = "baud = 38400\n[zones]\nradii = [0.6, 1.0]\n";
     configure(&env, wrong);
     hub.signal(HUP);
-    supervisor.hear("RELOADING=1");
-    supervisor.hear("READY=1");
-    let refused = supervisor.heard.iter().find(|line| line.contains("configuration refused")).cloned();
-    let place = format!("{}:6:9: radii = [0.6, 1.0]", env.word("scanhub.toml"));
+    supervisor.wait_for_message("RELOADING=1");
+    supervisor.wait_for_message("READY=1");
+    let refused = supervisor.messages.iter().find(|line| line.contains("configuration refused")).cloned();
+    let place = format!("{}:6:9: radii = [0.6, 1.0]", env.path_argument("scanhub.toml"));
     let status = format!("STATUS=sensors: front; configuration refused: {place}");
     assert_eq!(refused, Some(status));
     let more = "baud = 38400\npose = { x = 0.5 }\n[zones]\nradii = [2.0]\n\n[[link]]\nname = \"side\"\nport = \"/dev/null\"\n";
@@ -129,19 +129,19 @@ fn what_cannot_be_changed_is_said_and_what_cannot_be_changes_nothing() {
     env.await_info("front", |info| info["pose"]["x_m"] == 0.5);
     assert!(!env.run(&["list", "--json"]).to_string().contains("side"));
     let ended = hub.end(TERM);
-    assert_eq!(ended.code, Some(0));
+    assert_eq!(ended.exit_code, Some(0));
     for words in [
         format!("the configuration is refused, the old one stays: {place}; the largest first"),
         "front: pose, zones changed as configured".to_owned(),
         "front: family and baud changed; restart the hub to apply them".to_owned(),
         "side: link added; restart the hub to apply it".to_owned(),
     ] {
-        assert!(ended.errors.contains(&words), "{words}: {ended}");
+        assert!(ended.stderr.contains(&words), "{words}: {ended}");
     }
 }
 
 #[test]
-fn a_hub_ends_with_its_terminal_unless_nohup_says_otherwise() {
+fn hub_ends_with_its_terminal_except_under_nohup() {
     if !succeeds(Command::new("setsid").arg("--version")) {
         return skip("setsid", "there is none");
     }
@@ -162,10 +162,10 @@ fn a_hub_ends_with_its_terminal_unless_nohup_says_otherwise() {
             hub.signal(HUP);
             env.await_info("front", |info| info["pose"]["x_m"] == 0.5);
             let ended = hub.end(TERM);
-            assert_eq!(ended.code, Some(0));
+            assert_eq!(ended.exit_code, Some(0));
         } else {
             let ended = hub.wait();
-            assert_eq!(ended.code, Some(0), "{ended}");
+            assert_eq!(ended.exit_code, Some(0), "{ended}");
         }
     }
 }

@@ -3,10 +3,10 @@
 use std::collections::BTreeMap;
 
 use crate::testkit;
-use crate::testkit::{INT, Outcome, Program, Sitting, TERM, TestEnv, is_class, number};
+use crate::testkit::{INT, Outcome, Program, TERM, TerminalSession, TestEnv, is_class, number};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::variant::{Mode, Unit};
-use scanhub_schema::datagram::Packed;
+use scanhub_schema::datagram::DatagramPayload;
 use scanhub_schema::file::Writer;
 use scanhub_schema::{Header, Marks, Topic};
 use serde_json::Value;
@@ -26,34 +26,34 @@ fn start(env: &TestEnv, words: &[&str]) -> Program {
 }
 
 /// The wall clocks of scans, in ms from the log's beginning.
-fn walls(outcome: &Outcome) -> Vec<u64> {
+fn wall_times_ms(outcome: &Outcome) -> Vec<u64> {
     outcome.of_class("scan").iter().map(|scan| number(scan, "wall_ns") / 1_000_000 - 1_000_000).collect()
 }
 
-fn replayed(outcome: &Outcome) -> Value {
-    assert_eq!(outcome.code, Some(0), "{outcome}");
+fn replay_summary(outcome: &Outcome) -> Value {
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     outcome.of_class("replayed").pop().unwrap_or_else(|| panic!("no word of what was played: {outcome}"))
 }
 
 fn resume(env: &TestEnv) {
-    assert_eq!(env.run(&["control", "front", "resume"]).code, Some(0));
+    assert_eq!(env.run(&["control", "front", "resume"]).exit_code, Some(0));
 }
 
 #[test]
-fn it_waits_for_a_word_plays_everything_with_its_times_and_ends() {
+fn plays_whole_recording_with_its_times_after_resume() {
     let env = TestEnv::new();
     let player = start(&env, &[&log(&env, 12, 80), "--paused"]);
-    let mut consumer = env.echo(&["front/scan", "front/status"]);
+    let mut subscriber = env.echo(&["front/scan", "front/status"]);
     env.await_info("front", |info| info["state"] == "paused");
     resume(&env);
-    consumer.await_line("the end", |line| line["state"] == "silent");
-    let end = replayed(&player.wait());
+    subscriber.await_line("the end", |line| line["state"] == "silent");
+    let end = replay_summary(&player.wait());
     assert_eq!((number(&end, "telegrams"), number(&end, "laps")), (12, 0));
     assert_eq!(end["position_s"], 0.88);
     assert!(end["paused_s"].as_f64() > Some(0.0), "{end}");
-    consumer.await_line("its end", |line| line["kind"] == "hub_gone");
-    let outcome = consumer.end(INT);
-    assert_eq!(walls(&outcome), (0..12).map(|scan| scan * 80).collect::<Vec<_>>());
+    subscriber.await_line("its end", |line| line["kind"] == "hub_gone");
+    let outcome = subscriber.end(INT);
+    assert_eq!(wall_times_ms(&outcome), (0..12).map(|scan| scan * 80).collect::<Vec<_>>());
     let stamps: Vec<_> = outcome.of_class("scan").iter().map(|scan| number(scan, "stamp_ns")).collect();
     assert!(stamps.windows(2).all(|pair| pair[1] - pair[0] == 80_000_000), "{stamps:?}");
 }
@@ -62,20 +62,20 @@ fn it_waits_for_a_word_plays_everything_with_its_times_and_ends() {
 fn from_here_to_there_faster() {
     let env = TestEnv::new();
     let player = start(&env, &[&log(&env, 60, 100), "--paused", "--start=2s", "--end=4s", "--rate=4"]);
-    let mut consumer = env.echo(&["front/scan", "front/status"]);
+    let mut subscriber = env.echo(&["front/scan", "front/status"]);
     resume(&env);
-    consumer.await_line("the end", |line| line["state"] == "silent");
-    let outcome = consumer.end(INT);
-    assert_eq!(walls(&outcome), (20..40).map(|scan| scan * 100).collect::<Vec<_>>());
+    subscriber.await_line("the end", |line| line["state"] == "silent");
+    let outcome = subscriber.end(INT);
+    assert_eq!(wall_times_ms(&outcome), (20..40).map(|scan| scan * 100).collect::<Vec<_>>());
     let scans = outcome.of_class("scan");
     assert_eq!((number(&scans[0], "seq"), number(&scans[0], "topic_seq")), (0, 0));
     let stamps: Vec<_> = scans.iter().map(|scan| number(scan, "stamp_ns")).collect();
     assert!(stamps.windows(2).all(|pair| pair[1] - pair[0] == 25_000_000), "{stamps:?}");
-    assert_eq!(number(&replayed(&player.wait()), "telegrams"), 20);
+    assert_eq!(number(&replay_summary(&player.wait()), "telegrams"), 20);
 }
 
 /// Log of an LMS at half degrees whose robot turns in a room, faster and faster.
-fn turning_log(env: &TestEnv, scans: u64) -> String {
+fn log_of_turning_robot(env: &TestEnv, scans: u64) -> String {
     const PERIOD_S: f64 = 0.026_64;
     let range = |angle: f64| {
         let walls = [(3.0, 0.0), (2.0, 90.0), (4.0, 180.0), (2.5, 270.0_f64)];
@@ -95,28 +95,28 @@ fn turning_log(env: &TestEnv, scans: u64) -> String {
 
 #[test]
 fn motion_is_the_same_at_all_rates() {
-    const SCANS: u64 = 60;
+    const SCAN_COUNT: u64 = 60;
     let env = TestEnv::new();
-    let log = turning_log(&env, SCANS);
+    let log = log_of_turning_robot(&env, SCAN_COUNT);
     let motion = |rate: &str| {
         let player = start(&env, &[&log, "--paused", "--set=link.front.background.method=moving", rate]);
-        let mut consumer = env.echo(&["front/motion", "front/status"]);
+        let mut subscriber = env.echo(&["front/motion", "front/status"]);
         resume(&env);
-        consumer.await_line("the end", |line| line["state"] == "silent");
-        let outcome = consumer.end(INT);
-        assert_eq!(number(&replayed(&player.wait()), "telegrams"), SCANS);
+        subscriber.await_line("the end", |line| line["state"] == "silent");
+        let outcome = subscriber.end(INT);
+        assert_eq!(number(&replay_summary(&player.wait()), "telegrams"), SCAN_COUNT);
         let keys =
             ["method", "dx_m", "dy_m", "dyaw_deg", "covariance", "x_m", "y_m", "yaw_deg", "pose_covariance"];
         let values = |line: &Value| (number(line, "seq"), keys.map(|key| line[key].clone()));
         outcome.of_class("motion").iter().map(values).collect::<BTreeMap<_, _>>()
     };
     let recorded = motion("--rate=1");
-    assert_eq!(recorded.len() as u64, SCANS);
+    assert_eq!(recorded.len() as u64, SCAN_COUNT);
     assert!(recorded.values().skip(1).all(|values| values[0] != "first" && values[0] != "refused"));
     for rate in ["--rate=0.5", "--rate=4", "--rate=max"] {
         let found = motion(rate);
         // With `max`, a subscriber may miss samples.
-        assert!(found.len() as u64 > SCANS / 2, "{rate}: {}", found.len());
+        assert!(found.len() as u64 > SCAN_COUNT / 2, "{rate}: {}", found.len());
         for (seq, values) in found {
             assert_eq!(Some(&values), recorded.get(&seq), "{rate}, scan {seq}");
         }
@@ -124,40 +124,40 @@ fn motion_is_the_same_at_all_rates() {
 }
 
 #[test]
-fn a_lap_follows_another_until_somebody_ends_it() {
+fn loops_until_interrupted() {
     let env = TestEnv::new();
     let player = start(&env, &[&log(&env, 5, 20), "--loop"]);
-    let mut consumer = env.echo(&["front/scan"]);
-    let scans = consumer.await_lines(12, "a scan", is_class("scan"));
+    let mut subscriber = env.echo(&["front/scan"]);
+    let scans = subscriber.await_lines(12, "a scan", is_class("scan"));
     let walls: Vec<_> = scans.iter().map(|scan| number(scan, "wall_ns") / 1_000_000 - 1_000_000).collect();
     assert!(walls.iter().filter(|wall| **wall == 0).count() >= 2, "{walls:?}");
-    assert!(number(&replayed(&player.end(INT)), "laps") >= 2);
+    assert!(number(&replay_summary(&player.end(INT)), "laps") >= 2);
 }
 
 #[test]
-fn at_the_end_it_stays_if_it_is_to_and_pauses_when_asked() {
+fn hold_keeps_the_hub_running_and_pause_stops_it() {
     let env = TestEnv::new();
     let player = start(&env, &[&log(&env, 100, 100), "--sensor=left", "--hold"]);
-    assert_eq!(env.run(&["control", "left", "pause"]).code, Some(0));
+    assert_eq!(env.run(&["control", "left", "pause"]).exit_code, Some(0));
     env.await_info("left", |info| info["state"] == "paused");
-    assert!(number(&replayed(&player.end(TERM)), "telegrams") < 100);
+    assert!(number(&replay_summary(&player.end(TERM)), "telegrams") < 100);
     let player = start(&env, &[&log(&env, 100, 100), "--rate=max", "--hold"]);
     let info = env.await_info("front", |info| info["state"] == "silent");
     assert_eq!((number(&info["counters"], "telegrams"), &info["angle_deg"]), (100, &180.into()));
     // It would have ended after a second.
-    assert_eq!(number(&replayed(&player.end(TERM)), "telegrams"), 100);
+    assert_eq!(number(&replay_summary(&player.end(TERM)), "telegrams"), 100);
 }
 
 /// A recording of a hub of two lives, which each heard ten telegrams, of which the sixth says how values are split: marks
 /// were found from `understood` of each life on.
-fn lives(env: &TestEnv, understood: [u64; 2]) -> String {
+fn recording_of_two_runs(env: &TestEnv, format_versions: [u64; 2]) -> String {
     let file = std::fs::File::create(env.path("lives.mcap")).expect("a file");
     let mut writer = Writer::begin(file, "", BTreeMap::new()).expect("is written");
-    for (life, understood) in understood.into_iter().enumerate() {
+    for (run, understood) in format_versions.into_iter().enumerate() {
         for seq in 0..10 {
-            let reply = lms::reply::configuration(0, Mode(1), Unit::Mm, 0x10);
+            let reply = lms::reply::configuration_reply(0, Mode(1), Unit::Mm, 0x10);
             let telegram = if seq == 5 { reply.bytes().to_vec() } else { testkit::scan(seq as u16) };
-            let at = (life as u64 * 20 + seq) * 20_000_000;
+            let at = (run as u64 * 20 + seq) * 20_000_000;
             let (stamp_first_ns, stamp_last_ns) = (1_000_000_000 + at, 1_010_000_000 + at);
             let mut header = Header {
                 seq,
@@ -165,17 +165,17 @@ fn lives(env: &TestEnv, understood: [u64; 2]) -> String {
                 stamp_first_ns,
                 stamp_last_ns,
                 wall_ns: 1_700_000_000_000_000_000 + at,
-                boot: 7 + life as u64,
+                boot: 7 + run as u64,
                 hub_pid: 1,
                 period_us: 26_640,
                 ..Header::default()
             };
             header.set_sent_at(stamp_last_ns + 1000);
-            writer.sample("front", Topic::Telegram, &header, &telegram).expect("is written");
+            writer.write_sample("front", Topic::Telegram, &header, &telegram).expect("is written");
             if seq != 5 && seq >= understood {
                 let mut room = [0; 4096];
                 let len = Marks::default().pack(&mut room).expect("fits");
-                writer.sample("front", Topic::Marks, &header, &room[..len]).expect("is written");
+                writer.write_sample("front", Topic::Marks, &header, &room[..len]).expect("is written");
             }
         }
     }
@@ -184,7 +184,7 @@ fn lives(env: &TestEnv, understood: [u64; 2]) -> String {
 }
 
 /// A line that loses six of ten scans, and is silent for two seconds in the middle; the last 300 of 20 s.
-fn lossy(env: &TestEnv) -> String {
+fn recording_with_gaps(env: &TestEnv) -> String {
     let file = std::fs::File::create(env.path("lossy.mcap")).expect("a file");
     let mut writer = Writer::begin(file, "", BTreeMap::new()).expect("is written");
     let is_lost = |scan: &u64| scan % 10 > 3 || (300..375).contains(scan);
@@ -203,19 +203,21 @@ fn lossy(env: &TestEnv) -> String {
             ..Header::default()
         };
         header.set_sent_at(header.stamp_last_ns + 1000);
-        writer.sample("front", Topic::Telegram, &header, &testkit::scan(seq as u16)).expect("is written");
+        writer
+            .write_sample("front", Topic::Telegram, &header, &testkit::scan(seq as u16))
+            .expect("is written");
     }
     writer.finish().expect("is written");
     env.path("lossy.mcap").display().to_string()
 }
 
 #[test]
-fn scans_that_are_missing_are_no_silence_of_the_sensor() {
+fn missing_scans_are_not_reported_as_silence() {
     let env = TestEnv::new();
-    let player = start(&env, &[&lossy(&env), "--rate=2", "--set=link.front.mode=0", "--hold"]);
-    testkit::until("a rate in the list", || {
+    let player = start(&env, &[&recording_with_gaps(&env), "--rate=2", "--set=link.front.mode=0", "--hold"]);
+    testkit::wait_until("a rate in the list", || {
         let listed = env.run(&["list", "--json"]);
-        assert_eq!(listed.code, Some(0), "{listed}");
+        assert_eq!(listed.exit_code, Some(0), "{listed}");
         let rate =
             listed.lines().into_iter().find(|line| line["topic"] == "scan").map(|line| line["hz"].clone());
         // Of 37.5 scans a second 15 come, twice as fast.
@@ -223,30 +225,30 @@ fn scans_that_are_missing_are_no_silence_of_the_sensor() {
     });
     env.await_info("front", |info| info["last_error"] == "the recording is at its end");
     let outcome = player.end(INT);
-    let said = |word: &str| outcome.errors.lines().filter(|line| line.contains(word)).count();
+    let count_in_log = |word: &str| outcome.stderr.lines().filter(|line| line.contains(word)).count();
     // Once for the pause, and at the end.
-    assert_eq!((said("front: silent"), said("front: streaming")), (2, 2), "{outcome}");
+    assert_eq!((count_in_log("front: silent"), count_in_log("front: streaming")), (2, 2), "{outcome}");
 }
 
 #[test]
-fn what_the_hub_could_not_read_yet_is_no_scan() {
+fn replay_has_no_scans_before_their_mode_was_known() {
     // One of both lives knew it from the life before.
     for understood in [[0, 6], [6, 0]] {
         let env = TestEnv::new();
-        let player = start(&env, &[&lives(&env, understood), "--paused"]);
-        let mut consumer = env.echo(&["front/scan", "front/status"]);
+        let player = start(&env, &[&recording_of_two_runs(&env, understood), "--paused"]);
+        let mut subscriber = env.echo(&["front/scan", "front/status"]);
         resume(&env);
-        consumer.await_line("the end", |line| line["last_error"] == "the recording is at its end");
+        subscriber.await_line("the end", |line| line["last_error"] == "the recording is at its end");
         let scans: Vec<_> =
-            consumer.end(INT).of_class("scan").iter().map(|scan| number(scan, "seq")).collect();
-        assert_eq!(number(&replayed(&player.wait()), "telegrams"), 20);
-        let of = |life: u64, from| (from..10).filter(|seq| *seq != 5).map(move |seq| 10 * life + seq);
+            subscriber.end(INT).of_class("scan").iter().map(|scan| number(scan, "seq")).collect();
+        assert_eq!(number(&replay_summary(&player.wait()), "telegrams"), 20);
+        let of = |run: u64, from| (from..10).filter(|seq| *seq != 5).map(move |seq| 10 * run + seq);
         assert!(scans.iter().copied().eq(of(0, understood[0]).chain(of(1, understood[1]))), "{scans:?}");
     }
 }
 
 #[test]
-fn links_of_the_configuration_that_are_not_in_it_are_left_out() {
+fn ignores_configured_links_that_were_not_recorded() {
     let env = TestEnv::new();
     let text = "[[link]]\nname = \"front\"\nport = \"/dev/x\"\npose = { x = 0.25 }\n[[link]]\nname = \"rear\"\nport = \"y\"\n";
     let config = format!("--config={}", env.file("config.toml", text));
@@ -254,11 +256,11 @@ fn links_of_the_configuration_that_are_not_in_it_are_left_out() {
     assert_eq!(env.info("front")["pose"]["x_m"], 0.25);
     let outcome = player.end(INT);
     assert_eq!(outcome.of_class("ready")[0]["sensors"], Value::from(vec!["front"]));
-    assert!(outcome.errors.contains("rear: not in the recording, left out"), "{outcome}");
+    assert!(outcome.stderr.contains("rear: not in the recording, left out"), "{outcome}");
 }
 
 #[test]
-fn what_cannot_be_played_is_refused() {
+fn refuses_bad_ranges_rates_and_sensors() {
     let env = TestEnv::new();
     let log = log(&env, 3, 100);
     let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/vectors/recording/v1.mcap");
@@ -274,8 +276,8 @@ fn what_cannot_be_played_is_refused() {
         (&[golden, "--sensor=left"], 3, "has no sensor \"left\""),
     ] {
         let outcome = env.run(&[&["replay"], words].concat());
-        assert_eq!(outcome.code, Some(code), "{outcome}");
-        assert!(outcome.errors.contains(message), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(code), "{outcome}");
+        assert!(outcome.stderr.contains(message), "{outcome}");
     }
 }
 
@@ -283,22 +285,23 @@ fn what_cannot_be_played_is_refused() {
 fn keys() {
     let env = TestEnv::new();
     let words = ["replay", "--no-system-config", "--paused", &log(&env, 300, 100)];
-    let mut sitting = Sitting::start(&env.command(&words), (100, 30));
-    sitting.await_words("paused; space continues");
-    let says = |sitting: &Sitting, word: &str| testkit::until(word, || sitting.text().contains(word));
+    let mut sitting = TerminalSession::start(&env.command(&words), (100, 30));
+    sitting.wait_for_text("paused; space continues");
+    let await_text =
+        |sitting: &TerminalSession, word: &str| testkit::wait_until(word, || sitting.text().contains(word));
     sitting.press(".");
-    says(&sitting, "  1 telegrams  paused");
+    await_text(&sitting, "  1 telegrams  paused");
     sitting.press("\x1b[C");
-    says(&sitting, "  2 telegrams  paused");
+    await_text(&sitting, "  2 telegrams  paused");
     sitting.press("--");
-    says(&sitting, "  x0.25  2 telegrams  paused");
+    await_text(&sitting, "  x0.25  2 telegrams  paused");
     sitting.press("+++ ");
-    says(&sitting, "  x2  ");
-    says(&sitting, "space pauses");
+    await_text(&sitting, "  x2  ");
+    await_text(&sitting, "space pauses");
     sitting.press(" ");
     env.await_info("front", |info| info["state"] == "paused");
     sitting.press("q");
-    let (code, text, is_as_before) = sitting.end_of_lines();
+    let (code, text, is_as_before) = sitting.finish_plain();
     assert_eq!((code, is_as_before), (Some(0), true), "{text}");
     let last = text.lines().last().unwrap_or_default();
     assert!(last.contains("replayed ") && last.contains(" telegrams up to 0:"), "{text}");
@@ -309,10 +312,10 @@ fn a_signal_gives_the_terminal_back() {
     for signal in [INT, TERM] {
         let env = TestEnv::new();
         let words = ["replay", "--no-system-config", &log(&env, 300, 100)];
-        let sitting = Sitting::start(&env.command(&words), (100, 30));
-        sitting.await_words("space pauses");
+        let sitting = TerminalSession::start(&env.command(&words), (100, 30));
+        sitting.wait_for_text("space pauses");
         sitting.signal(signal);
-        let (code, text, is_as_before) = sitting.end_of_lines();
+        let (code, text, is_as_before) = sitting.finish_plain();
         assert_eq!((code, is_as_before), (Some(0), true), "{text}");
     }
 }
@@ -323,8 +326,8 @@ fn it_ends_with_its_terminal() {
     let words = ["replay", "--no-system-config", "--loop", "--paused", &log(&env, 300, 100)];
     let errors = env.path("errors");
     let file = std::fs::File::create(&errors).expect("a file");
-    let sitting = Sitting::start_for_hang_up(&env.command(&words), (100, 30), true, file);
-    sitting.await_words("ready ");
+    let sitting = TerminalSession::start_for_hang_up(&env.command(&words), (100, 30), true, file);
+    sitting.wait_for_text("ready ");
     sitting.hang_up();
     let errors = std::fs::read_to_string(errors).expect("its errors");
     assert!(!errors.contains("panicked"), "{errors}");

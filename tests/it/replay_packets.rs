@@ -6,17 +6,17 @@ use std::path::Path;
 
 use crate::testkit::Recording;
 use crate::testkit::{INT, Program, TERM, TestEnv, is_class, number};
-use scanhub_schema::datagram::Packed;
+use scanhub_schema::datagram::DatagramPayload;
 use scanhub_schema::file::{self, Writer};
 use scanhub_schema::{Family, Flags, Header, Reasons, Scan, Topic};
 use serde_json::Value;
 
 /// A recorder of `flags` that is attached.
 pub(crate) fn recorder(env: &TestEnv, name: &str, flags: &[&str]) -> Program {
-    let file = env.word(name);
+    let file = env.path_argument(name);
     let before = env.subscribers("front/telegram");
     let recorder = env.start(&[&["record", "--json", "-o", &file], flags].concat());
-    crate::testkit::until("the recorder is attached", || env.subscribers("front/telegram") > before);
+    crate::testkit::wait_until("the recorder is attached", || env.subscribers("front/telegram") > before);
     recorder
 }
 
@@ -33,30 +33,30 @@ fn record(env: &TestEnv, model: &str, settings: &[&str], scans: usize) {
     let simulator = env.simulator(&["front"], &words);
     echo.await_lines(scans, "a scan", is_class("scan"));
     for recorder in recorders {
-        assert_eq!(recorder.end(INT).code, Some(0));
+        assert_eq!(recorder.end(INT).exit_code, Some(0));
     }
-    assert_eq!((echo.end(INT).code, hub.end(TERM).code), (Some(0), Some(0)));
-    assert_eq!(simulator.end(TERM).code, Some(0));
+    assert_eq!((echo.end(INT).exit_code, hub.end(TERM).exit_code), (Some(0), Some(0)));
+    assert_eq!(simulator.end(TERM).exit_code, Some(0));
 }
 
 /// Replays `name` with these words, and records what comes of it.
 pub(crate) fn replay(env: &TestEnv, name: &str, words: &[&str]) -> Value {
-    let file = env.word(name);
+    let file = env.path_argument(name);
     let words = [&["replay", "--json", "--no-system-config", "--paused", &file], words].concat();
     let player = env.start(&words).ready();
     let recorder = recorder(env, "replayed.mcap", &["--all", "--force"]);
-    assert_eq!(env.run(&["control", "front", "resume"]).code, Some(0));
+    assert_eq!(env.run(&["control", "front", "resume"]).exit_code, Some(0));
     let outcome = player.wait();
-    assert_eq!(outcome.code, Some(0), "{outcome}");
-    assert_eq!(recorder.end(INT).code, Some(0));
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
+    assert_eq!(recorder.end(INT).exit_code, Some(0));
     outcome.of_class("replayed").pop().expect("what was played")
 }
 
 /// Headers and payloads of a topic in a file.
 pub(crate) fn samples(file: &Path, topic: &str) -> Vec<(Header, Vec<u8>)> {
-    let recording = Recording::whole(file);
-    let parts = |data: &[u8]| file::parts(data).map(|(header, payload)| (header, payload.to_vec()));
-    recording.of(topic).iter().map(|kept| parts(&kept.data).expect("a sample")).collect()
+    let recording = Recording::read_complete(file);
+    let parts = |data: &[u8]| file::split_message(data).map(|(header, payload)| (header, payload.to_vec()));
+    recording.of(topic).iter().map(|message| parts(&message.data).expect("a sample")).collect()
 }
 
 pub(crate) fn scan(payload: &[u8]) -> Box<Scan> {
@@ -122,12 +122,12 @@ fn scans_are_those_that_were_recorded() {
         check_scans(&recorded, &samples(&file, "front/scan"));
     }
     let info = |words: &[&str]| {
-        let file = env.word("all.mcap");
+        let file = env.path_argument("all.mcap");
         let words =
             [&["replay", "--json", "--no-system-config", "--hold", "--rate=max", &file], words].concat();
         let player = env.start(&words).ready();
         let info = env.await_info("front", |info| info["last_error"] == "the recording is at its end");
-        assert_eq!(player.end(TERM).code, Some(0));
+        assert_eq!(player.end(TERM).exit_code, Some(0));
         info
     };
     let known = info(&[]);
@@ -168,7 +168,7 @@ fn a_part_of_it_and_again() {
         "other scans, or another order"
     );
     assert!(replayed.windows(2).all(|pair| pair[0].0.stamp_first_ns < pair[1].0.stamp_first_ns));
-    let file = env.word("telegrams.mcap");
+    let file = env.path_argument("telegrams.mcap");
     let player =
         env.start(&["replay", "--json", "--no-system-config", "--loop", "--rate=max", &file]).ready();
     let mut echo = env.echo(&["front/scan"]);
@@ -178,19 +178,19 @@ fn a_part_of_it_and_again() {
 }
 
 #[test]
-fn bytes_of_a_line_are_played_by_the_scanners_own_clock() {
+fn stream_file_is_played_by_the_scanners_clock() {
     let env = TestEnv::new();
     record(&env, "ld19", &[], 30);
-    let (recording, bytes) = (env.word("telegrams.mcap"), env.word("telegrams.bin"));
-    assert_eq!(env.run(&["convert", &recording, &bytes]).code, Some(0));
+    let (recording, bytes) = (env.path_argument("telegrams.mcap"), env.path_argument("telegrams.bin"));
+    assert_eq!(env.run(&["convert", &recording, &bytes]).exit_code, Some(0));
     let recorded = samples(&env.path("all.mcap"), "front/scan");
     let family = "--set=link.front.family=ld";
     let words = ["replay", "--json", "--no-system-config", "--hold", "--paused", family, &bytes];
     let player = env.start(&words).ready();
     let mut echo = env.echo(&["front/scan"]);
-    assert_eq!(env.run(&["control", "front", "resume"]).code, Some(0));
+    assert_eq!(env.run(&["control", "front", "resume"]).exit_code, Some(0));
     let scans = echo.await_lines(20, "a scan", is_class("scan"));
-    assert_eq!((echo.end(INT).code, player.end(INT).code), (Some(0), Some(0)));
+    assert_eq!((echo.end(INT).exit_code, player.end(INT).exit_code), (Some(0), Some(0)));
     let stamps = |of: &Value| number(of, "stamp_ns") as i64;
     // In which turn it begins depends on what came before: they are found by what they say.
     let ranges: Vec<Vec<Option<u64>>> = scans
@@ -217,14 +217,14 @@ fn bytes_of_a_line_are_played_by_the_scanners_own_clock() {
 }
 
 #[test]
-fn what_cannot_be_played_is_refused_in_words() {
+fn refuses_recordings_of_another_family() {
     let env = TestEnv::new();
     record(&env, "ld19", &[], 25);
-    let recording = env.word("telegrams.mcap");
-    let refused = |words: &[&str], code: i32, said: &str| {
+    let recording = env.path_argument("telegrams.mcap");
+    let refused = |words: &[&str], code: i32, message: &str| {
         let outcome = env.run(&[words, &["--no-system-config"]].concat());
-        assert_eq!(outcome.code, Some(code), "{outcome}");
-        assert!(outcome.errors.contains(said), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(code), "{outcome}");
+        assert!(outcome.stderr.contains(message), "{outcome}");
     };
     refused(
         &["replay", &recording, "--set=link.front.family=lms"],
@@ -236,24 +236,28 @@ fn what_cannot_be_played_is_refused_in_words() {
         78,
         "set link.front.family = \"ld\"",
     );
-    let outcome = env.run(&["convert", &recording, &env.word("x.log")]);
-    assert_eq!((outcome.code, outcome.errors.contains("no place")), (Some(66), true), "{outcome}");
+    let outcome = env.run(&["convert", &recording, &env.path_argument("x.log")]);
+    assert_eq!((outcome.exit_code, outcome.stderr.contains("no place")), (Some(66), true), "{outcome}");
     let outcome = env.run(&["telegram", "decode", &recording]);
-    assert_eq!((outcome.code, outcome.errors.contains("of family ld")), (Some(66), true), "{outcome}");
-    let port = format!("--port={}", env.word("other"));
+    assert_eq!((outcome.exit_code, outcome.stderr.contains("of family ld")), (Some(66), true), "{outcome}");
+    let port = format!("--port={}", env.path_argument("other"));
     let outcome = env.run(&["simulate", &port, "--replay", &recording]);
-    assert_eq!((outcome.code, outcome.errors.contains("not of an LMS")), (Some(66), true), "{outcome}");
+    assert_eq!((outcome.exit_code, outcome.stderr.contains("not of an LMS")), (Some(66), true), "{outcome}");
     // A family of tomorrow.
     let later = env.path("later.mcap");
     let mut writer = Writer::begin(std::fs::File::create(&later).expect("a file"), "", BTreeMap::new())
         .expect("is written");
     let header = Header { family: 99, hub_pid: 1, ..Header::default() };
-    writer.sample("front", Topic::Telegram, &header, &[2; 47]).expect("is written");
+    writer.write_sample("front", Topic::Telegram, &header, &[2; 47]).expect("is written");
     writer.finish().expect("is written");
-    let later = env.word("later.mcap");
+    let later = env.path_argument("later.mcap");
     refused(&["replay", &later], 66, "family number 99");
-    let outcome = env.run(&["convert", &later, &env.word("later.csv")]);
-    assert_eq!((outcome.code, outcome.errors.contains("family number 99")), (Some(66), true), "{outcome}");
+    let outcome = env.run(&["convert", &later, &env.path_argument("later.csv")]);
+    assert_eq!(
+        (outcome.exit_code, outcome.stderr.contains("family number 99")),
+        (Some(66), true),
+        "{outcome}"
+    );
 }
 
 #[test]
@@ -261,9 +265,9 @@ fn other_programs_get_the_same_scans_of_packets() {
     let env = TestEnv::new();
     record(&env, "ld19", &[], 30);
     let rows = |name: &str| -> Vec<Vec<String>> {
-        let (file, out) = (env.word(name), env.word("out.csv"));
+        let (file, out) = (env.path_argument(name), env.path_argument("out.csv"));
         let outcome = env.run(&["convert", &file, &out, "--force"]);
-        assert_eq!(outcome.code, Some(0), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(0), "{outcome}");
         let text = std::fs::read_to_string(env.path("out.csv")).expect("rows");
         text.lines().skip(1).map(|row| row.split(',').map(str::to_owned).collect()).collect()
     };
@@ -278,9 +282,9 @@ fn other_programs_get_the_same_scans_of_packets() {
         computed.len()
     );
     // A stream has no stamps, and begins anywhere.
-    let (bytes, again) = (env.word("telegrams.bin"), env.word("again.mcap"));
-    for (from, to) in [(&env.word("telegrams.mcap"), &bytes), (&bytes, &again)] {
-        assert_eq!(env.run(&["convert", from, to]).code, Some(0));
+    let (bytes, again) = (env.path_argument("telegrams.bin"), env.path_argument("again.mcap"));
+    for (from, to) in [(&env.path_argument("telegrams.mcap"), &bytes), (&bytes, &again)] {
+        assert_eq!(env.run(&["convert", from, to]).exit_code, Some(0));
     }
     let all = |name: &str| {
         samples(&env.path(name), "front/telegram")

@@ -10,40 +10,40 @@ use std::sync::mpsc::channel;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use crate::testkit::{PATIENCE, TestEnv, in_own_process};
-use recorded_rooms::{LEARNING, Published, SENSORS, Subscribers};
+use crate::testkit::{TestEnv, WAIT_TIMEOUT, in_own_process};
+use recorded_rooms::{PublishedSample, SENSORS, SHORT_LEARNING, Subscribers};
 use scanhub_config::Sources;
 use scanhub_daemon::{PlaybackOptions, Player, Replay};
 use scanhub_schema::{Flags, Topic};
 use scanhub_shm::{Domain, Node};
 
-const SCANS: u64 = 400;
+const SCAN_COUNT: u64 = 400;
 /// Before this scan nothing is heard of a sensor for a second.
-const SILENCE: u64 = 300;
+const SILENCE_AT_SCAN: u64 = 300;
 
 /// Records two sensors; where, and what was published of each.
-fn record(env: &TestEnv) -> (PathBuf, Vec<Vec<Published>>) {
+fn record(env: &TestEnv) -> (PathBuf, Vec<Vec<PublishedSample>>) {
     let (file, mut published) = (env.path("two.mcap"), vec![Vec::new(), Vec::new()]);
-    recorded_rooms::record(&env.place(), &file, SCANS, Some(SILENCE), |number, sample| {
+    recorded_rooms::record(&env.domain(), &file, SCAN_COUNT, Some(SILENCE_AT_SCAN), |number, sample| {
         published[number].push(sample)
     });
     (file, published)
 }
 
 /// Replays `file` step by step; what was published of each sensor.
-fn replay(env: &TestEnv, file: &Path, play: PlaybackOptions, set: &[&str]) -> Vec<Vec<Published>> {
+fn replay(env: &TestEnv, file: &Path, play: PlaybackOptions, set: &[&str]) -> Vec<Vec<PublishedSample>> {
     let set = set.iter().map(|word| (*word).to_owned()).collect();
     let sources = Sources { set, ..Sources::default() };
-    let replay = Replay { file, sensor: None, family: None, sources: &sources, play, holds: false };
+    let replay = Replay { file, sensor: None, family: None, sources: &sources, options: play, holds: false };
     let mut published = vec![Vec::new(), Vec::new()];
     let mut telegrams = 0;
     step_through(
-        &env.place(),
+        &env.domain(),
         &replay,
         |node| SENSORS.map(|(name, _)| Subscribers::attach(node, name)),
-        |followers| {
-            for (followers, published) in followers.iter().zip(&mut published) {
-                let samples = followers.take();
+        |subscribers| {
+            for (subscribers, published) in subscribers.iter().zip(&mut published) {
+                let samples = subscribers.take();
                 telegrams += samples.iter().filter(|sample| sample.topic == Topic::Telegram).count() as u64;
                 published.extend(samples);
             }
@@ -51,7 +51,8 @@ fn replay(env: &TestEnv, file: &Path, play: PlaybackOptions, set: &[&str]) -> Ve
         },
     );
     // Samples before the first telegram, and those of the silence after the end, belong to no telegram.
-    let is_around = |it: &Published| it.header.hub_time_ns().is_none() && [0, SCANS].contains(&it.header.seq);
+    let is_around =
+        |it: &PublishedSample| it.header.hub_time_ns().is_none() && [0, SCAN_COUNT].contains(&it.header.seq);
     published.iter_mut().for_each(|published| published.retain(|it| !is_around(it)));
     published
 }
@@ -64,19 +65,20 @@ pub(crate) fn step_through<T>(
     attach: impl FnOnce(&Node) -> T,
     mut take: impl FnMut(&T) -> u64,
 ) {
-    let replay = Replay { play: PlaybackOptions { is_paused: true, ..replay.play }, ..replay.clone() };
-    let (tell, ready) = channel();
+    let replay = Replay { options: PlaybackOptions { is_paused: true, ..replay.options }, ..replay.clone() };
+    let (sender, ready) = channel();
     thread::scope(|scope| {
         let replay = &replay;
         let hub = scope.spawn(move || {
-            let told =
-                scanhub_daemon::replay(replay, domain, |_, player| tell.send(player.clone()).expect("waits"));
-            told.inspect_err(|failure| eprintln!("{failure}"))
+            let result = scanhub_daemon::replay(replay, domain, |_, player| {
+                sender.send(player.clone()).expect("waits")
+            });
+            result.inspect_err(|failure| eprintln!("{failure}"))
         });
-        let player: Arc<Player> = ready.recv_timeout(PATIENCE).expect("is up");
+        let player: Arc<Player> = ready.recv_timeout(WAIT_TIMEOUT).expect("is up");
         let node = scanhub_shm::client_node(domain).expect("a node");
         let subscribers = attach(&node);
-        let give_up_at = Instant::now() + 3 * PATIENCE;
+        let give_up_at = Instant::now() + 3 * WAIT_TIMEOUT;
         while !player.progress().is_over {
             assert!(Instant::now() < give_up_at, "it does not come to an end");
             let before = take(&subscribers);
@@ -100,24 +102,24 @@ pub(crate) fn step_through<T>(
 }
 
 /// Topic, number, reasons and payload of all samples, those of a telegram together.
-fn said(published: &[Published]) -> Vec<(u64, Topic, u8, &[u8])> {
-    let of = |it: &'_ Published| (it.header.seq, it.topic, it.header.reasons);
-    let mut said: Vec<_> = published.iter().map(|it| (of(it), &it.payload[..])).collect();
-    said.sort();
-    said.into_iter().map(|((seq, topic, reasons), payload)| (seq, topic, reasons, payload)).collect()
+fn sorted_samples(published: &[PublishedSample]) -> Vec<(u64, Topic, u8, &[u8])> {
+    let of = |it: &'_ PublishedSample| (it.header.seq, it.topic, it.header.reasons);
+    let mut samples: Vec<_> = published.iter().map(|it| (of(it), &it.payload[..])).collect();
+    samples.sort();
+    samples.into_iter().map(|((seq, topic, reasons), payload)| (seq, topic, reasons, payload)).collect()
 }
 
 /// The payloads of one topic.
-fn payloads(published: &[Published], topic: Topic) -> Vec<&[u8]> {
+fn payloads(published: &[PublishedSample], topic: Topic) -> Vec<&[u8]> {
     published.iter().filter(|it| it.topic == topic).map(|it| &it.payload[..]).collect()
 }
 
 #[test]
-fn the_same_parameters_give_the_same_bytes_and_others_give_others() {
-    in_own_process("replayed::the_same_parameters_give_the_same_bytes_and_others_give_others", || {
+fn replay_equals_recording_with_the_same_parameters() {
+    in_own_process("replayed::replay_equals_recording_with_the_same_parameters", || {
         let env = TestEnv::new();
         let (file, recorded) = record(&env);
-        let replayed = replay(&env, &file, PlaybackOptions::default(), &[LEARNING]);
+        let replayed = replay(&env, &file, PlaybackOptions::default(), &[SHORT_LEARNING]);
         for ((recorded, replayed), (name, _)) in recorded.iter().zip(&replayed).zip(SENSORS) {
             let count = |topic| [replayed, recorded].map(|published| payloads(published, topic).len());
             for topic in [Topic::Telegram, Topic::Scan, Topic::Marks, Topic::Foreground, Topic::Background] {
@@ -125,11 +127,11 @@ fn the_same_parameters_give_the_same_bytes_and_others_give_others() {
                 assert_eq!(replayed, recorded, "{name}/{}", topic.name());
             }
             let [_, zones] = count(Topic::Zones);
-            assert_eq!(zones, SCANS as usize + 1, "one says that scans stayed out");
+            assert_eq!(zones, SCAN_COUNT as usize + 1, "one says that scans stayed out");
             assert!(count(Topic::Background)[1] > 5, "models change");
-            assert!(said(recorded) == said(replayed), "{name} differs");
+            assert!(sorted_samples(recorded) == sorted_samples(replayed), "{name} differs");
             assert!(replayed.iter().all(|it| it.header.flags & Flags::REPLAYED != 0));
-            let walls = |published: &[Published]| -> Vec<u64> {
+            let walls = |published: &[PublishedSample]| -> Vec<u64> {
                 published
                     .iter()
                     .filter(|it| it.topic == Topic::Telegram)
@@ -138,19 +140,20 @@ fn the_same_parameters_give_the_same_bytes_and_others_give_others() {
             };
             assert_eq!(walls(recorded), walls(replayed), "{name}");
         }
-        let others = replay(&env, &file, PlaybackOptions::default(), &[LEARNING, "zones.radii=[2.5,1.5]"]);
+        let others =
+            replay(&env, &file, PlaybackOptions::default(), &[SHORT_LEARNING, "zones.radii=[2.5,1.5]"]);
         assert!(payloads(&others[0], Topic::Zones) != payloads(&recorded[0], Topic::Zones));
         assert!(payloads(&others[0], Topic::Foreground) == payloads(&recorded[0], Topic::Foreground));
     });
 }
 
 #[test]
-fn what_is_skipped_is_learned_from() {
-    in_own_process("replayed::what_is_skipped_is_learned_from", || {
+fn background_learns_from_skipped_scans() {
+    in_own_process("replayed::background_learns_from_skipped_scans", || {
         let env = TestEnv::new();
         let (file, recorded) = record(&env);
         let play = PlaybackOptions { start_ns: 5_000_000_000, ..PlaybackOptions::default() };
-        let replayed = replay(&env, &file, play, &[LEARNING]);
+        let replayed = replay(&env, &file, play, &[SHORT_LEARNING]);
         for (recorded, replayed) in recorded.iter().zip(&replayed) {
             for topic in [Topic::Scan, Topic::Marks, Topic::Zones, Topic::Foreground] {
                 let (all, late) = (payloads(recorded, topic), payloads(replayed, topic));

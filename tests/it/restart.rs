@@ -3,7 +3,9 @@
 
 use std::collections::{BTreeMap, HashSet};
 
-use crate::testkit::{INT, KILL, MEASURED, TERM, TestEnv, bytes_of, hash, is_class, number, sequence};
+use crate::testkit::{
+    INT, KILL, MEASURED_VALUES, TERM, TestEnv, bytes_of, contiguous_numbers, hash, is_class, number,
+};
 use serde_json::Value;
 
 #[test]
@@ -16,46 +18,46 @@ fn consumers_outlive_several_hubs() {
     let mut telegrams = env.echo(&["front/telegram"]);
     let mut scans = env.echo(&["front/scan", "front/status"]);
     for how in [KILL, KILL, TERM, KILL] {
-        telegrams.await_lines(25, "a measured telegram", |line| line["command"] == MEASURED);
+        telegrams.await_lines(25, "a measured telegram", |line| line["command"] == MEASURED_VALUES);
         scans.await_lines(25, "a scan", is_class("scan"));
-        let code = hub.end(how).code;
+        let code = hub.end(how).exit_code;
         assert_eq!(code, (how == TERM).then_some(0));
-        for consumer in [&mut telegrams, &mut scans] {
-            consumer.await_line("hub_gone", |line| line["kind"] == "hub_gone");
+        for subscriber in [&mut telegrams, &mut scans] {
+            subscriber.await_line("hub_gone", |line| line["kind"] == "hub_gone");
         }
         hub = env.hub(&link);
-        for consumer in [&mut telegrams, &mut scans] {
-            consumer.await_line("hub_back", |line| line["kind"] == "hub_back");
+        for subscriber in [&mut telegrams, &mut scans] {
+            subscriber.await_line("hub_back", |line| line["kind"] == "hub_back");
         }
     }
-    telegrams.await_lines(25, "a measured telegram", |line| line["command"] == MEASURED);
+    telegrams.await_lines(25, "a measured telegram", |line| line["command"] == MEASURED_VALUES);
     scans.await_lines(25, "a scan", is_class("scan"));
     let info = env.info("front");
     let (telegrams, scans) = (telegrams.end(INT), scans.end(INT));
-    assert_eq!((telegrams.code, scans.code), (Some(0), Some(0)), "{}", telegrams.errors);
-    assert_eq!(hub.end(TERM).code, Some(0));
-    assert_eq!(simulator.end(TERM).code, Some(0));
+    assert_eq!((telegrams.exit_code, scans.exit_code), (Some(0), Some(0)), "{}", telegrams.stderr);
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
+    assert_eq!(simulator.end(TERM).exit_code, Some(0));
 
-    let news = telegrams.of_class("notice");
-    let news = news.iter().map(|line| line["kind"].as_str().unwrap_or_default());
+    let notices = telegrams.of_class("notice");
+    let kinds = notices.iter().map(|line| line["kind"].as_str().unwrap_or_default());
     // On a busy machine a hub takes long to start.
-    let news: Vec<_> = news.filter(|kind| *kind != "stale").collect();
-    assert_eq!(news, ["hub_gone", "hub_back"].repeat(4));
+    let changes: Vec<_> = kinds.filter(|kind| *kind != "stale").collect();
+    assert_eq!(changes, ["hub_gone", "hub_back"].repeat(4));
     let truth = env.truth("front");
     let sent: HashSet<_> = truth.iter().map(|sent| &sent.hash).collect();
-    let lives = by_boot(telegrams.of_class("telegram"));
-    assert_eq!(lives.len(), 5);
-    for life in &lives {
+    let runs = split_by_boot(telegrams.of_class("telegram"));
+    assert_eq!(runs.len(), 5);
+    for run in &runs {
         // What is not torn but made of two halves would have a right checksum by chance, and be no telegram that was
         // sent.
-        assert!(life.iter().all(|line| sent.contains(&hash(&bytes_of(line)))), "never sent");
-        sequence(life, "seq");
-        sequence(life, "topic_seq");
+        assert!(run.iter().all(|line| sent.contains(&hash(&bytes_of(line)))), "never sent");
+        contiguous_numbers(run, "seq");
+        contiguous_numbers(run, "topic_seq");
     }
     // Who was there before the hub got its samples from the first one on.
-    assert!(lives[1..].iter().all(|life| number(&life[0], "topic_seq") == 0));
-    let lives = by_boot(scans.of_class("scan"));
-    assert!(lives.len() == 5 && lives[1..].iter().all(|life| number(&life[0], "topic_seq") == 0));
+    assert!(runs[1..].iter().all(|run| number(&run[0], "topic_seq") == 0));
+    let runs = split_by_boot(scans.of_class("scan"));
+    assert!(runs.len() == 5 && runs[1..].iter().all(|run| number(&run[0], "topic_seq") == 0));
     for summary in telegrams.of_class("summary").iter().chain(&scans.of_class("summary")) {
         assert_eq!(summary["missed"], 0);
     }
@@ -71,19 +73,19 @@ fn consumers_outlive_several_hubs() {
     assert!(!truth[streams..].iter().any(|sent| at_another_rate(&sent.fault)), "the rate was changed");
     let aborted = truth[streams..].iter().filter(|sent| sent.fault.as_deref() == Some("aborted")).count();
     assert!(aborted <= 4 * 2, "{aborted} scans were broken off by four adoptions");
-    assert_eq!(env.simulated("front").1, 0, "EEPROM");
+    assert_eq!(env.simulator_totals("front").1, 0, "EEPROM");
 }
 
 /// Lines by the life of the hub that they are from, in their order.
-fn by_boot(lines: Vec<Value>) -> Vec<Vec<Value>> {
+fn split_by_boot(lines: Vec<Value>) -> Vec<Vec<Value>> {
     let mut order = Vec::new();
-    let mut lives = BTreeMap::<String, Vec<Value>>::new();
+    let mut runs = BTreeMap::<String, Vec<Value>>::new();
     for line in lines {
         let boot = line["boot"].as_str().unwrap_or_default().to_owned();
-        if !lives.contains_key(&boot) {
+        if !runs.contains_key(&boot) {
             order.push(boot.clone());
         }
-        lives.entry(boot).or_default().push(line);
+        runs.entry(boot).or_default().push(line);
     }
-    order.iter().filter_map(|boot| lives.remove(boot)).collect()
+    order.iter().filter_map(|boot| runs.remove(boot)).collect()
 }

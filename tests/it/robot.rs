@@ -1,20 +1,20 @@
 //! The robot's verdict over two sensors, to those who follow it: a sensor that dies makes it unknown, a hub that dies
 //! too, and whoever comes back is heard again.
 
-use crate::testkit::{INT, KILL, Program, Sender, TERM, TestEnv, in_a_network, until};
+use crate::testkit::{INT, KILL, Program, TERM, TestEnv, TestGateway, in_a_network, wait_until};
 use scanhub_client::{Robot, RobotSubscriber};
 use scanhub_schema::{Topic, Verdict, Zones};
 use serde_json::{Value, json};
 
 /// So near that nothing in the simulated room is inside.
-const CLEAR: &str = "--set=zones.radii=[0.02,0.01]";
+const SMALL_ZONES: &str = "--set=zones.radii=[0.02,0.01]";
 
 fn hub(env: &TestEnv) -> Program {
-    env.hub(&[&env.link("front"), &env.link("rear"), CLEAR])
+    env.hub(&[&env.link("front"), &env.link("rear"), SMALL_ZONES])
 }
 
 fn sensor(env: &TestEnv, name: &str) -> Program {
-    let port = format!("--port={}", env.word(name));
+    let port = format!("--port={}", env.path_argument(name));
     env.start(&["simulate", "--json", "--baud=500000", &port]).ready()
 }
 
@@ -23,31 +23,34 @@ fn verdicts(line: &Value) -> [&str; 3] {
     let of = |value: &Value, name: &str| {
         let sensors = value["sensors"].as_array()?;
         let is_it = |sensor: &&Value| sensor["sensor"] == name;
-        sensors.iter().find(is_it).and_then(|sensor| ALL.into_iter().find(|it| sensor["verdict"] == *it))
+        sensors
+            .iter()
+            .find(is_it)
+            .and_then(|sensor| ALL_VERDICTS.into_iter().find(|it| sensor["verdict"] == *it))
     };
-    const ALL: [&str; 4] = ["clear", "slow", "stop", "unknown"];
-    let robot = ALL.into_iter().find(|it| line["verdict"] == *it).unwrap_or("none");
+    const ALL_VERDICTS: [&str; 4] = ["clear", "slow", "stop", "unknown"];
+    let robot = ALL_VERDICTS.into_iter().find(|it| line["verdict"] == *it).unwrap_or("none");
     [robot, of(line, "front").unwrap_or("none"), of(line, "rear").unwrap_or("none")]
 }
 
 #[test]
-fn a_sensor_that_dies_makes_the_robot_unknown_and_so_does_the_hub() {
+fn dead_sensor_or_hub_makes_the_robot_unknown() {
     let env = TestEnv::new();
     let (_front, rear) = (sensor(&env, "front"), sensor(&env, "rear"));
     let first = hub(&env);
     let mut echo = env.start(&["echo", "--json", "robot/zones"]);
-    let are = |wanted: [&'static str; 3]| move |line: &Value| verdicts(line) == wanted;
+    let are = |expected: [&'static str; 3]| move |line: &Value| verdicts(line) == expected;
     let line = echo.await_line("all is clear", are(["clear", "clear", "clear"]));
     assert_eq!((&line["class"], &line["sensor"]), (&"zones".into(), &"robot".into()), "{line}");
     assert!(line.get("stale").is_none() && line["nearest_mm"].is_u64(), "{line}");
 
-    env.kill_simulator(rear, "rear");
+    env.kill_port_simulator(rear, "rear");
     // Whoever says it first, hub or client; the front's own samples are not stale.
     echo.await_line("the front goes on without the rear", |line| {
         verdicts(line) == ["unknown", "clear", "unknown"] && line.get("stale").is_none()
     });
 
-    assert_eq!(first.end(KILL).code, None);
+    assert_eq!(first.end(KILL).exit_code, None);
     let line = echo.await_line("the hub is gone", are(["unknown", "unknown", "unknown"]));
     assert_eq!(line["nearest_mm"], Value::Null, "{line}");
 
@@ -55,7 +58,7 @@ fn a_sensor_that_dies_makes_the_robot_unknown_and_so_does_the_hub() {
     let _second = hub(&env);
     echo.await_line("all is clear again", are(["clear", "clear", "clear"]));
     let outcome = echo.end(INT);
-    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let summaries = outcome.of_class("summary");
     assert!(matches!(&summaries[..], [one] if one["sensor"] == "robot"), "{outcome}");
 }
@@ -64,39 +67,39 @@ fn a_sensor_that_dies_makes_the_robot_unknown_and_so_does_the_hub() {
 fn a_program_that_follows_the_robot() {
     let env = TestEnv::new();
     let mut robot =
-        RobotSubscriber::builder(&["front", "rear"]).in_domain(&env.place()).open().expect("possible names");
+        RobotSubscriber::builder(&["front", "rear"]).in_domain(&env.domain()).open().expect("possible names");
     let first = robot.next().expect("no hub is no failure");
     assert_eq!((first.verdict(), first.worst()), (Verdict::Unknown, Some("front")));
     let _front = sensor(&env, "front");
     let hub = hub(&env);
-    until("the front is heard", || {
+    wait_until("the front is heard", || {
         let verdicts: Vec<_> = robot.next().expect("a hub").sensors().map(|(_, verdict)| verdict).collect();
         verdicts == [Verdict::Clear, Verdict::Unknown]
     });
     let _rear = sensor(&env, "rear");
-    until("the rear is heard", || robot.next().expect("a hub").verdict() == Verdict::Clear);
-    assert_eq!(hub.end(TERM).code, Some(0));
-    until("nobody is heard", || {
+    wait_until("the rear is heard", || robot.next().expect("a hub").verdict() == Verdict::Clear);
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
+    wait_until("nobody is heard", || {
         robot.now().expect("no hub is no failure").sensors().all(|(_, verdict)| verdict == Verdict::Unknown)
     });
 }
 
 /// A machine without a hub of its own, as an operator's: `robot` is of the sensors that its listener publishes.
 #[test]
-fn without_a_hub_the_robot_is_of_the_sensors_of_other_machines() {
-    in_a_network("robot::without_a_hub_the_robot_is_of_the_sensors_of_other_machines", || {
+fn robot_without_a_hub_uses_remote_sensors() {
+    in_a_network("robot::robot_without_a_hub_uses_remote_sensors", || {
         let env = TestEnv::new();
         let mut listener =
             env.start(&["listen", "--json", "--publish", "--name=robot1=0000000000000001"]).ready();
         let refused = env.run(&["echo", "robot/zones", "--json", "-n", "1", "--for=10s"]);
         let error = refused.of_class("error").remove(0);
-        assert_eq!((refused.code, &error["kind"]), (Some(3), &"no_topic".into()), "{refused}");
+        assert_eq!((refused.exit_code, &error["kind"]), (Some(3), &"no_topic".into()), "{refused}");
         assert!(error["hint"].as_str().is_some_and(|hint| hint.contains("scanhub listen")), "{error}");
 
-        let mut front = Sender::new(1, 7, 0, "front");
-        front.await_published(&mut listener, &[Topic::Zones]);
+        let mut front = TestGateway::new(1, 7, 0, "front");
+        front.wait_until_published(&mut listener, &[Topic::Zones]);
         // Who publishes no zones is no part of the robot.
-        Sender::new(1, 7, 1, "mapper").await_published(&mut listener, &[Topic::Scan]);
+        TestGateway::new(1, 7, 1, "mapper").wait_until_published(&mut listener, &[Topic::Scan]);
         let mut echo = env.start(&["echo", "--json", "robot/zones"]);
         let mut leds = env.start(&["leds", "--json", "robot", "--hold=0s"]);
         let own = |line: &Value, verdict: &str, sensor: &str| {
@@ -115,19 +118,19 @@ fn without_a_hub_the_robot_is_of_the_sensors_of_other_machines() {
         // A hub has sensors of its own, and when it goes nobody stands in for them.
         let _sensor = sensor(&env, "front");
         // One who always finds something that is sent from elsewhere, too.
-        let mut busy = RobotSubscriber::builder(&[]).in_domain(&env.place()).open().expect("no names");
+        let mut busy = RobotSubscriber::builder(&[]).in_domain(&env.domain()).open().expect("no names");
         let names = |robot: &Robot| robot.sensors().map(|(name, _)| name.to_owned()).collect::<Vec<_>>();
-        let mut hear = |busy: &mut RobotSubscriber| {
+        let mut query_names = |busy: &mut RobotSubscriber| {
             front.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
-            until("it is heard", || busy.try_next().expect("a domain").is_some());
+            wait_until("it is heard", || busy.try_next().expect("a domain").is_some());
             names(busy.now().expect("a domain"))
         };
-        until("the other machine's", || hear(&mut busy) == ["robot1.front"]);
-        let own_hub = env.hub(&[&env.link("front"), CLEAR]);
-        until("the hub's own", || hear(&mut busy) == ["front"]);
+        wait_until("the other machine's", || query_names(&mut busy) == ["robot1.front"]);
+        let own_hub = env.hub(&[&env.link("front"), SMALL_ZONES]);
+        wait_until("the hub's own", || query_names(&mut busy) == ["front"]);
         drop(busy);
         echo.await_line("the hub's own", |line| own(line, "clear", "front"));
-        assert_eq!(own_hub.end(KILL).code, None);
+        assert_eq!(own_hub.end(KILL).exit_code, None);
         echo.await_line("the hub is gone", |line| own(line, "unknown", "front"));
         front.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
         let mut named = env.start(&["echo", "--json", "robot1.front/zones"]);
@@ -138,16 +141,16 @@ fn without_a_hub_the_robot_is_of_the_sensors_of_other_machines() {
         let is_own = |line: &Value| line["sensors"] == json!([]) || line["sensors"][0]["sensor"] == "front";
         assert!(lines[first_own..].iter().all(is_own), "{outcome}");
         assert_eq!(lines[lines.len() - 1]["verdict"], "unknown", "{outcome}");
-        assert_eq!((leds.end(INT).code, listener.end(TERM).code), (Some(0), Some(0)));
+        assert_eq!((leds.end(INT).exit_code, listener.end(TERM).exit_code), (Some(0), Some(0)));
     });
 }
 
 #[test]
-fn what_the_robot_is_not() {
+fn robot_has_no_scans_and_cannot_be_a_link() {
     let env = TestEnv::new();
     let scan = env.run(&["echo", "--json", "robot/scan"]);
-    assert_eq!((scan.code, &scan.of_class("error")[0]["kind"]), (Some(2), &"usage".into()), "{scan}");
+    assert_eq!((scan.exit_code, &scan.of_class("error")[0]["kind"]), (Some(2), &"usage".into()), "{scan}");
     let link = env.run(&["run", "--json", "--no-system-config", "--link=robot=/dev/ttyS0"]);
-    assert_eq!(link.code, Some(78), "{link}");
-    assert!(link.errors.contains("robot"), "{link}");
+    assert_eq!(link.exit_code, Some(78), "{link}");
+    assert!(link.stderr.contains("robot"), "{link}");
 }

@@ -4,16 +4,16 @@
 use std::collections::BTreeMap;
 use std::process::Command;
 
-use crate::testkit::{INT, MEASURED, Recording, TestEnv, is_class, number, output, python};
+use crate::testkit::{INT, MEASURED_VALUES, Recording, TestEnv, is_class, number, output, python};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::variant::Unit;
-use scanhub_schema::datagram::Packed;
+use scanhub_schema::datagram::DatagramPayload;
 use scanhub_schema::{Code, Header, Pose, Scan, file};
 use serde_json::Value;
 
 /// Two sensors with poses, of which one hangs upside down.
-const FRONT: Pose = Pose { x_m: 0.3, y_m: 0.1, yaw_rad: 0.25, upside_down: 0, reserved: [0; 7] };
-const REAR: Pose = Pose { x_m: -0.25, y_m: 0.0, yaw_rad: -2.5, upside_down: 1, reserved: [0; 7] };
+const FRONT_POSE: Pose = Pose { x_m: 0.3, y_m: 0.1, yaw_rad: 0.25, upside_down: 0, reserved: [0; 7] };
+const REAR_POSE: Pose = Pose { x_m: -0.25, y_m: 0.0, yaw_rad: -2.5, upside_down: 1, reserved: [0; 7] };
 
 fn link(env: &TestEnv, name: &str, pose: &Pose) -> Vec<String> {
     let mut words = vec![env.link(name)];
@@ -23,14 +23,14 @@ fn link(env: &TestEnv, name: &str, pose: &Pose) -> Vec<String> {
     words
 }
 
-type Published = (Header, Box<Scan>);
+type PublishedScan = (Header, Box<Scan>);
 
 /// The scans of a recording as the hub published them, by topic of ROS and wall clock, which no two scans of a sensor share.
-fn published(recording: &Recording) -> BTreeMap<(String, u64), Published> {
+fn published_scans(recording: &Recording) -> BTreeMap<(String, u64), PublishedScan> {
     let of = |sensor: &str| {
-        let kept = recording.of(&format!("{sensor}/scan"));
-        let scans = kept.into_iter().map(|kept| {
-            let (header, payload) = file::parts(&kept.data).expect("a message of the hub");
+        let scan_messages = recording.of(&format!("{sensor}/scan"));
+        let scans = scan_messages.into_iter().map(|message| {
+            let (header, payload) = file::split_message(&message.data).expect("a message of the hub");
             let mut scan = Box::default();
             assert!(Scan::unpack_into(&mut scan, payload));
             ((format!("/{sensor}/scan"), header.wall_ns), (header, scan))
@@ -46,7 +46,7 @@ fn published(recording: &Recording) -> BTreeMap<(String, u64), Published> {
 }
 
 /// What other people's reader `verb` says of the file at `path`: all messages.
-fn said(mut python: Command, verb: &str, path: &str) -> Vec<Value> {
+fn run_reader(mut python: Command, verb: &str, path: &str) -> Vec<Value> {
     python.args(["tests/testkit/read.py", verb, path]).current_dir(env!("CARGO_MANIFEST_DIR"));
     let outcome = output(python).expect("Python");
     assert!(outcome.status.success(), "{verb} {path}: {}", String::from_utf8_lossy(&outcome.stderr));
@@ -58,22 +58,23 @@ fn real(line: &Value, key: &str) -> f64 {
 }
 
 /// A message has the very numbers of the scan that the hub published.
-fn check_scan(said: &Value, (header, scan): &(Header, Box<Scan>)) {
-    let sensor = said["topic"].as_str().and_then(|topic| topic.split('/').nth(1));
-    assert_eq!(said["frame"].as_str(), sensor);
+fn check_scan(message: &Value, (header, scan): &(Header, Box<Scan>)) {
+    let sensor = message["topic"].as_str().and_then(|topic| topic.split('/').nth(1));
+    assert_eq!(message["frame"].as_str(), sensor);
     assert_eq!(
-        number(said, "stamp_ns"),
+        number(message, "stamp_ns"),
         header.wall_ns.checked_add_signed(scan.beam_ns(0)).expect("after 1970")
     );
-    let near = |key: &str, wanted: f64| assert!((real(said, key) - wanted).abs() < 1e-6, "{key}: {said}");
+    let near =
+        |key: &str, expected: f64| assert!((real(message, key) - expected).abs() < 1e-6, "{key}: {message}");
     near("angle_min", scan.angle_deg(0).to_radians());
     near("angle_max", scan.angle_deg(scan.beams() - 1).to_radians());
     near("angle_increment", scan.step);
     near("scan_time", f64::from(header.period_us) / 1e6);
     near("time_increment", 0.0);
-    let ranges = said["ranges"].as_array().expect("ranges");
+    let ranges = message["ranges"].as_array().expect("ranges");
     assert_eq!(
-        (ranges.len(), &said["intensities"]),
+        (ranges.len(), &message["intensities"]),
         (scan.beams(), &scan.intensities().iter().collect::<Vec<_>>().into())
     );
     for (i, range) in ranges.iter().enumerate() {
@@ -81,7 +82,7 @@ fn check_scan(said: &Value, (header, scan): &(Header, Box<Scan>)) {
             (Some(mm), _) => {
                 let metres = mm as f32 / 1000.0;
                 assert_eq!(range.as_f64().map(|range| range as f32), Some(metres), "beam {i}");
-                let within = real(said, "range_min") as f32..=real(said, "range_max") as f32;
+                let within = real(message, "range_min") as f32..=real(message, "range_max") as f32;
                 assert!(within.contains(&metres), "beam {i}: {metres} is not in {within:?}");
             }
             (None, Some(Code::NoReturn | Code::Beyond)) => assert_eq!(range, "inf", "beam {i}"),
@@ -91,7 +92,7 @@ fn check_scan(said: &Value, (header, scan): &(Header, Box<Scan>)) {
 }
 
 /// The direction that a transform gives the beam at `angle_deg` of a scan, as a quaternion turns it.
-fn turned(transform: &Value, angle_deg: f64) -> [f64; 3] {
+fn rotate(transform: &Value, angle_deg: f64) -> [f64; 3] {
     let [x, y, z, w] = ["qx", "qy", "qz", "qw"].map(|key| real(transform, key));
     let (b, a) = angle_deg.to_radians().sin_cos();
     [
@@ -102,8 +103,8 @@ fn turned(transform: &Value, angle_deg: f64) -> [f64; 3] {
 }
 
 /// The last message about frames knows both sensors, and each where its pose says.
-fn check_transforms(said: &[Value]) {
-    let of_frames: Vec<_> = said.iter().filter(|line| line["topic"] == "/tf_static").collect();
+fn check_transforms(messages: &[Value]) {
+    let of_frames: Vec<_> = messages.iter().filter(|line| line["topic"] == "/tf_static").collect();
     let last = of_frames.last().expect("where the sensors sit");
     let known = last["transforms"].as_array().expect("transforms");
     assert_eq!(known.len(), 2, "{last}");
@@ -112,13 +113,13 @@ fn check_transforms(said: &[Value]) {
             (&transform["frame"], number(transform, "stamp_ns")),
             (&"base_link".into(), number(last, "log_time"))
         );
-        let pose = if transform["child"] == "front" { FRONT } else { REAR };
-        assert_eq!(transform["child"], if pose == FRONT { "front" } else { "rear" });
-        for (key, wanted) in [("x", pose.x_m), ("y", pose.y_m), ("z", 0.0)] {
-            assert!((real(transform, key) - wanted).abs() < 1e-12, "{key}: {transform}");
+        let pose = if transform["child"] == "front" { FRONT_POSE } else { REAR_POSE };
+        assert_eq!(transform["child"], if pose == FRONT_POSE { "front" } else { "rear" });
+        for (key, expected) in [("x", pose.x_m), ("y", pose.y_m), ("z", 0.0)] {
+            assert!((real(transform, key) - expected).abs() < 1e-12, "{key}: {transform}");
         }
         for angle_deg in [-90.0, -10.0, 0.0, 45.0, 90.0] {
-            let [x, y, z] = turned(transform, angle_deg);
+            let [x, y, z] = rotate(transform, angle_deg);
             let (wanted_x, wanted_y) = pose.direction(angle_deg.to_radians());
             let apart = (x - wanted_x).abs() + (y - wanted_y).abs() + z.abs();
             assert!(apart < 1e-9, "{transform}: {angle_deg} degrees go to {x} {y} {z}");
@@ -130,47 +131,55 @@ fn check_transforms(said: &[Value]) {
 fn others_read_every_message_made_live_and_later() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front", "rear"], &["--world=room", "--seed=5", "--mode=0x01"]);
-    let _hub = env.hub(&[link(&env, "front", &FRONT), link(&env, "rear", &REAR)].concat());
+    let _hub = env.hub(&[link(&env, "front", &FRONT_POSE), link(&env, "rear", &REAR_POSE)].concat());
     for sensor in ["front", "rear"] {
         env.await_info(sensor, |info| info["state"] == "streaming");
     }
     // What goes on around it is recorded from before until after.
-    let [all, live, later] = ["all.mcap", "live.mcap", "later.mcap"].map(|name| env.word(name));
-    let mut around = env.start(&["record", "--all", "--json", "-o", &all]);
-    around.await_line("samples", |line| is_class("recording")(line) && number(line, "samples") >= 100);
+    let [all, live, later] = ["all.mcap", "live.mcap", "later.mcap"].map(|name| env.path_argument(name));
+    let mut recorder_of_all = env.start(&["record", "--all", "--json", "-o", &all]);
+    recorder_of_all
+        .await_line("samples", |line| is_class("recording")(line) && number(line, "samples") >= 100);
     let mut recorder = env.start(&["record", "--ros2", "--json", "-o", &live]);
     recorder.await_line("scans", |line| is_class("recording")(line) && number(line, "samples") >= 100);
     let outcome = recorder.end(INT);
-    assert_eq!(outcome.code, Some(0), "{outcome}");
-    assert_eq!(around.end(INT).code, Some(0));
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
+    assert_eq!(recorder_of_all.end(INT).exit_code, Some(0));
     let outcome = env.run(&["convert", &all, &later, "--ros2", "--json"]);
-    assert_eq!(outcome.code, Some(0), "{outcome}");
-    let account = outcome.of_class("converted").pop().expect("an account");
-    assert_eq!((&account["to"], &account["sensors"]), (&"ROS 2".into(), &Value::from(vec!["front", "rear"])));
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
+    let converted = outcome.of_class("converted").pop().expect("an account");
+    assert_eq!(
+        (&converted["to"], &converted["sensors"]),
+        (&"ROS 2".into(), &Value::from(vec!["front", "rear"]))
+    );
 
-    let recording = Recording::whole(&env.path("all.mcap"));
-    let published = published(&recording);
+    let recording = Recording::read_complete(&env.path("all.mcap"));
+    let published = published_scans(&recording);
     let is_at_an_end = |(topic, log_time): &(String, u64)| {
         let mut times = published.keys().filter(|(of, _)| of == topic).map(|(_, time)| time);
         let last = times.clone().next_back();
         Some(log_time) < times.next() || Some(log_time) > last
     };
     for (name, path) in [("live.mcap", &live), ("later.mcap", &later)] {
-        let ours = Recording::whole(&env.path(name));
-        assert!(ours.kept.iter().all(|kept| kept.encoding == "cdr"), "{name} has other messages");
-        let scans = ours.kept.iter().filter(|kept| kept.topic != "/tf_static").count();
+        let ros_recording = Recording::read_complete(&env.path(name));
+        assert!(
+            ros_recording.messages.iter().all(|message| message.encoding == "cdr"),
+            "{name} has other messages"
+        );
+        let scans = ros_recording.messages.iter().filter(|message| message.topic != "/tf_static").count();
         assert!(scans > 60, "{name}: {scans} scans");
         if name == "later.mcap" {
             let telegrams = ["front/telegram", "rear/telegram"].map(|topic| recording.of(topic)).concat();
-            let measured = telegrams.iter().filter(|kept| u64::from(kept.payload()[4]) == MEASURED).count();
-            assert_eq!((number(&account, "scans"), scans), (scans as u64, measured));
+            let measured =
+                telegrams.iter().filter(|message| u64::from(message.payload()[4]) == MEASURED_VALUES).count();
+            assert_eq!((number(&converted, "scans"), scans), (scans as u64, measured));
         }
         for (verb, modules) in [("mcap_ros2", "mcap_ros2, mcap"), ("rosbags", "rosbags, mcap")] {
             let Some(python) = python(modules) else { continue };
-            let said = said(python, verb, path);
-            assert_eq!(said.len(), ours.kept.len(), "{verb} of {name}");
+            let messages = run_reader(python, verb, path);
+            assert_eq!(messages.len(), ros_recording.messages.len(), "{verb} of {name}");
             let mut checked = 0;
-            for line in said.iter().filter(|line| line["topic"] != "/tf_static") {
+            for line in messages.iter().filter(|line| line["topic"] != "/tf_static") {
                 let topic = line["topic"].as_str().unwrap_or_default().to_owned();
                 let key = (topic, number(line, "log_time"));
                 match published.get(&key) {
@@ -181,11 +190,11 @@ fn others_read_every_message_made_live_and_later() {
                 checked += usize::from(published.contains_key(&key));
             }
             assert!(checked > 60, "{verb} of {name}: {checked} scans were published");
-            check_transforms(&said);
+            check_transforms(&messages);
             if verb == "rosbags" {
                 let of_frames = |line: &&Value| line["topic"] == "/tf_static";
                 let all_latched =
-                    said.iter().filter(of_frames).all(|line| line["durability"] == "TRANSIENT_LOCAL");
+                    messages.iter().filter(of_frames).all(|line| line["durability"] == "TRANSIENT_LOCAL");
                 assert!(all_latched, "listeners to frames would not hear them");
             }
         }
@@ -198,14 +207,14 @@ fn a_scan_is_also_written_as_points() {
     let words: [u16; 361] =
         std::array::from_fn(|beam| if beam % 3 == 0 { 0x1FFF } else { 500 + beam as u16 });
     let stream = env.file("a.bin", lms::measured::encode(0, Unit::Mm, &words, 0x10).bytes().repeat(20));
-    let file = env.word("points.mcap");
+    let file = env.path_argument("points.mcap");
     let outcome = env.run(&["convert", &stream, &file, "--mode=0", "--ros2", "--points"]);
-    assert_eq!(outcome.code, Some(0), "{outcome}");
-    let topics = |topic: &str| Recording::whole(&env.path("points.mcap")).of(topic).len();
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
+    let topics = |topic: &str| Recording::read_complete(&env.path("points.mcap")).of(topic).len();
     assert_eq!((topics("/front/scan"), topics("/front/points")), (20, 20));
     for (verb, modules) in [("mcap_ros2", "mcap_ros2, mcap"), ("rosbags", "rosbags, mcap")] {
         let Some(python) = python(modules) else { continue };
-        let messages = said(python, verb, &file);
+        let messages = run_reader(python, verb, &file);
         let of = |topic: &str| messages.iter().filter(|line| line["topic"] == topic).collect::<Vec<_>>();
         let (scans, clouds) = (of("/front/scan"), of("/front/points"));
         assert_eq!((scans.len(), clouds.len()), (20, 20), "{verb}");
@@ -225,29 +234,31 @@ fn a_scan_is_also_written_as_points() {
         }
     }
     let outcome = env.run(&["convert", &stream, "b.mcap", "--points"]);
-    assert!(outcome.code == Some(2) && outcome.errors.contains("--ros2 --points"), "{outcome}");
+    assert!(outcome.exit_code == Some(2) && outcome.stderr.contains("--ros2 --points"), "{outcome}");
 }
 
 #[test]
-fn a_stream_becomes_messages_and_rows_where_its_mode_is_known() {
+fn stream_file_converts_to_ros_and_csv_with_its_mode() {
     let env = TestEnv::new();
     let words: [u16; 361] = std::array::from_fn(|beam| (beam as u16 % 8) << 13 | (500 + 11 * beam as u16));
     let scan = lms::measured::encode(0, Unit::Mm, &words, 0x10);
     let bytes = scan.bytes().repeat(20);
     let stream = env.file("a.bin", &bytes);
-    let [bag, rows] = ["bag.mcap", "rows.csv"].map(|name| env.word(name));
+    let [bag, rows] = ["bag.mcap", "rows.csv"].map(|name| env.path_argument(name));
     for words in [&[&bag[..], "--ros2"][..], &[&rows]] {
         let outcome = env.run(&[&["convert", &stream], words].concat());
-        assert_eq!(outcome.code, Some(78), "{outcome}");
-        assert!(outcome.errors.contains("does not contain the measuring mode of front"), "{outcome}");
-        assert!(outcome.errors.contains("--mode"), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(78), "{outcome}");
+        assert!(outcome.stderr.contains("does not contain the measuring mode of front"), "{outcome}");
+        assert!(outcome.stderr.contains("--mode"), "{outcome}");
         let outcome = env.run(&[&["convert", &stream, "--mode=0x01"], words].concat());
-        assert_eq!(outcome.code, Some(0), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     }
-    let told: Vec<_> = Recording::whole(&env.path("bag.mcap")).kept;
-    assert_eq!(told.len(), 20);
+    let messages: Vec<_> = Recording::read_complete(&env.path("bag.mcap")).messages;
+    assert_eq!(messages.len(), 20);
     assert!(
-        told.iter().all(|kept| kept.topic == "/front/scan" && kept.schema == "sensor_msgs/msg/LaserScan")
+        messages
+            .iter()
+            .all(|message| message.topic == "/front/scan" && message.schema == "sensor_msgs/msg/LaserScan")
     );
     let text = std::fs::read_to_string(&rows).expect("rows");
     let lines: Vec<Vec<&str>> = text.lines().map(|line| line.split(',').collect()).collect();
@@ -264,6 +275,6 @@ fn a_stream_becomes_messages_and_rows_where_its_mode_is_known() {
         (&["b.csv", "--mode=0x77"], 78, "none of a range"),
     ] {
         let outcome = env.run(&[&["convert", &stream], words].concat());
-        assert!(outcome.code == Some(code) && outcome.errors.contains(says), "{outcome}");
+        assert!(outcome.exit_code == Some(code) && outcome.stderr.contains(says), "{outcome}");
     }
 }

@@ -4,7 +4,7 @@
 use serde_json::Value;
 
 use crate::replay_packets::{recorder, replay, samples, scan};
-use crate::testkit::{INT, Program, TERM, TestEnv, is_class, number, sequence};
+use crate::testkit::{INT, Program, TERM, TestEnv, contiguous_numbers, is_class, number};
 
 /// A scanner of this model.
 fn simulator(env: &TestEnv, model: &str, more: &[&str]) -> Program {
@@ -24,7 +24,7 @@ fn text<'a>(line: &'a Value, key: &str) -> &'a str {
 }
 
 #[test]
-fn what_it_is_is_asked_and_its_turns_are_published() {
+fn identifies_scanner_and_publishes_its_revolutions() {
     let env = TestEnv::new();
     let hub = hub(&env, &[]);
     let mut scans = env.echo(&["front/scan"]);
@@ -40,7 +40,7 @@ fn what_it_is_is_asked_and_its_turns_are_published() {
     // On a busy machine, the simulator is late, and the hub counts the turns that it expected as lost.
     assert_eq!(info["damaged"].as_f64(), Some(0.0), "{info}");
     let scans = scans.end(INT).of_class("scan");
-    sequence(&scans, "topic_seq");
+    contiguous_numbers(&scans, "topic_seq");
     let counts: Vec<u64> = scans.iter().map(|scan| number(scan, "count")).collect();
     assert!(counts[0] > 300 && counts.iter().all(|count| *count == counts[0]), "{counts:?}");
     // The first turn may have begun before it was heard.
@@ -49,9 +49,9 @@ fn what_it_is_is_asked_and_its_turns_are_published() {
     let telegrams = telegrams.end(INT).of_class("telegram");
     let kinds = |kind: &str| telegrams.iter().filter(|line| line["kind"] == kind).count();
     assert!(kinds("reply") > 3 && kinds("data") > 50, "{} and {}", kinds("reply"), kinds("data"));
-    assert_eq!(hub.end(TERM).code, Some(0));
-    assert_eq!(simulator.end(TERM).code, Some(0));
-    assert_eq!(env.simulated("front").1, 0, "nothing that it keeps was changed");
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
+    assert_eq!(simulator.end(TERM).exit_code, Some(0));
+    assert_eq!(env.simulator_totals("front").1, 0, "nothing that it keeps was changed");
 }
 
 #[test]
@@ -71,7 +71,7 @@ fn a_mode_and_a_model_may_be_named() {
 }
 
 #[test]
-fn a_mode_that_it_does_not_have_is_told() {
+fn reports_unsupported_mode() {
     let env = TestEnv::new();
     let _simulator = simulator(&env, "a1", &[]);
     let _hub = hub(&env, &["mode=ultradense"]);
@@ -80,7 +80,7 @@ fn a_mode_that_it_does_not_have_is_told() {
 }
 
 #[test]
-fn its_motor_rests_while_nobody_follows() {
+fn motor_stops_without_subscribers() {
     let env = TestEnv::new();
     let simulator = simulator(&env, "a1", &[]);
     let hub = hub(&env, &["idle=stop"]);
@@ -93,26 +93,26 @@ fn its_motor_rests_while_nobody_follows() {
     // Of the status alone nobody needs a scanner that measures.
     let _status = env.echo(&["front/status"]);
     env.await_info("front", paused);
-    assert_eq!((hub.end(TERM).code, simulator.end(TERM).code), (Some(0), Some(0)));
-    assert_eq!(env.simulated("front").1, 0);
+    assert_eq!((hub.end(TERM).exit_code, simulator.end(TERM).exit_code), (Some(0), Some(0)));
+    assert_eq!(env.simulator_totals("front").1, 0);
 }
 
 #[test]
-fn probe_asks_what_it_is_and_listens_to_its_line() {
+fn probe_identifies_scanner_and_checks_its_line() {
     let env = TestEnv::new();
     for (model, rate) in [("a1", 115_200), ("s2", 1_000_000)] {
         let simulator = simulator(&env, model, &[]);
-        let outcome = env.search(&["probe", &env.word("front"), "--json"]);
+        let outcome = env.search(&["probe", &env.path_argument("front"), "--json"]);
         let [found] = &outcome.lines()[..] else { panic!("{outcome}") };
         assert_eq!(
-            (outcome.code, text(found, "family"), text(found, "model")),
+            (outcome.exit_code, text(found, "family"), text(found, "model")),
             (Some(0), "rplidar", model),
             "{outcome}"
         );
         assert_eq!((number(found, "baud"), text(found, "health")), (rate, "good"), "{found}");
         assert!(text(found, "identity").contains("firmware"), "{found}");
-        assert_eq!(simulator.end(TERM).code, Some(0));
-        assert_eq!(env.simulated("front").1, 0);
+        assert_eq!(simulator.end(TERM).exit_code, Some(0));
+        assert_eq!(env.simulator_totals("front").1, 0);
         assert!(number(found, "packets") > 20 && found["damaged"].as_f64() == Some(0.0), "{found}");
         assert!(found["problem"].is_null(), "{found}");
         let sent = env.truth("front");
@@ -125,7 +125,7 @@ fn probe_asks_what_it_is_and_listens_to_its_line() {
 fn a_model_that_is_not_known_is_shown_with_its_number() {
     let env = TestEnv::new();
     let _simulator = simulator(&env, "s2", &["--fault=id=0x95"]);
-    let probed = env.search(&["probe", &env.word("front"), "--json"]);
+    let probed = env.search(&["probe", &env.path_argument("front"), "--json"]);
     let [found] = &probed.lines()[..] else { panic!("{probed}") };
     assert_eq!((text(found, "family"), &found["model"]), ("rplidar", &"0x95".into()), "{found}");
     assert!(text(found, "identity").starts_with("model 0x95 (unknown), firmware 1.02"), "{found}");
@@ -143,7 +143,7 @@ fn a_model_that_is_not_known_is_shown_with_its_number() {
     assert!(info.contains("0x95 (unknown)") && info.contains("denseboost 1.02"), "{info}");
     let outcome = hub.end(TERM);
     assert!(
-        outcome.errors.contains("front: found rplidar model 0x95 (unknown) at 1000000 baud"),
+        outcome.stderr.contains("front: found rplidar model 0x95 (unknown) at 1000000 baud"),
         "{outcome}"
     );
 }
@@ -160,13 +160,13 @@ fn a_stream_file_has_the_scans_that_were_recorded() {
     env.echo(&["front/scan"]).await_lines(40, "a scan with both recorders", is_class("scan"));
     let is_late = number(&env.await_info("front", |info| info["state"] == "streaming"), "lost_on_line") > 0;
     for recorder in recorders {
-        assert_eq!(recorder.end(INT).code, Some(0));
+        assert_eq!(recorder.end(INT).exit_code, Some(0));
     }
-    assert_eq!((echo.end(INT).code, hub.end(TERM).code), (Some(0), Some(0)));
-    assert_eq!(simulator.end(TERM).code, Some(0));
-    let (recording, stream) = (env.word("default.mcap"), env.word("default.bin"));
+    assert_eq!((echo.end(INT).exit_code, hub.end(TERM).exit_code), (Some(0), Some(0)));
+    assert_eq!(simulator.end(TERM).exit_code, Some(0));
+    let (recording, stream) = (env.path_argument("default.mcap"), env.path_argument("default.bin"));
     let outcome = env.run(&["convert", &recording, &stream]);
-    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     replay(&env, "default.bin", &[]);
     let ranges = |name: &str| -> Vec<Vec<u16>> {
         let scans = samples(&env.path(name), "front/scan").into_iter();
@@ -196,13 +196,13 @@ fn a_stream_file_has_the_scans_that_were_recorded() {
     let player = env.start(&words).ready();
     let info = env.await_info("front", |info| info["last_error"] == "the recording is at its end");
     assert_eq!((text(&info, "model"), text(&info, "type")), ("s1", "S1 denseboost 1.02"), "{info}");
-    assert_eq!(player.end(TERM).code, Some(0));
+    assert_eq!(player.end(TERM).exit_code, Some(0));
 }
 
 #[test]
-fn a_line_that_damages_most_bytes_is_told_before_anything_else() {
+fn reports_line_that_damages_most_bytes() {
     let env = TestEnv::new();
-    let port = env.word("front");
+    let port = env.path_argument("front");
     let _simulator = simulator(&env, "s2", &["--fault=loss=0.01,burst=1"]);
     let probed = env.search(&["probe", &port, "--json"]);
     let [found] = &probed.lines()[..] else { panic!("{probed}") };
@@ -210,7 +210,7 @@ fn a_line_that_damages_most_bytes_is_told_before_anything_else() {
     assert!(text(found, "problem").contains("of the bytes are damaged on the line"), "{found}");
 
     let outcome = env.run(&["doctor", &port, "--json", "--no-system-config"]);
-    assert_eq!(outcome.code, Some(5), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(5), "{outcome}");
     let of = |name: &str| {
         let found = outcome.of_class("check");
         let found = found.into_iter().find(|line| line["name"] == name && !line["port"].is_null());
@@ -224,14 +224,15 @@ fn a_line_that_damages_most_bytes_is_told_before_anything_else() {
 
     let _hub = hub(&env, &["model=s2"]);
     let mut status = env.echo(&["front/status"]);
-    let is_told = |line: &Value| text(line, "last_error").contains("% of the bytes are damaged on the line");
-    status.await_line("what the line does", is_told);
+    let reports_damage =
+        |line: &Value| text(line, "last_error").contains("% of the bytes are damaged on the line");
+    status.await_line("what the line does", reports_damage);
     let statuses = status.end(INT).of_class("status");
     assert!(!statuses.iter().any(|line| text(line, "last_error").contains("head")), "{statuses:#?}");
 }
 
 #[test]
-fn a_scanner_that_restarts_is_counted_and_told() {
+fn counts_and_reports_restarts_of_the_scanner() {
     let env = TestEnv::new();
     let _simulator = simulator(&env, "a1", &["--fault=brownout_at=4,brownout_every=3"]);
     let hub = hub(&env, &["model=a1"]);
@@ -239,21 +240,21 @@ fn a_scanner_that_restarts_is_counted_and_told() {
     let info = env.await_info("front", |info| text(info, "last_error").contains("times in 10 s"));
     assert!(restarts(&info) >= 2, "{info}");
     assert!(text(&info, "last_error").ends_with("is its supply strong enough?"), "{info}");
-    let log = hub.end(TERM).errors;
+    let log = hub.end(TERM).stderr;
     assert!(log.contains("the scanner restarted"), "{log}");
-    let said: Vec<_> =
+    let restart_messages: Vec<_> =
         log.lines().map(|line| line.split_once("the scanner restarted").map(|(_, end)| end)).collect();
-    let is_repeated = said.windows(2).any(|pair| pair[0].is_some() && pair[0] == pair[1]);
+    let is_repeated = restart_messages.windows(2).any(|pair| pair[0].is_some() && pair[0] == pair[1]);
     assert!(!is_repeated, "once for each count: {log}");
 }
 
 #[test]
-fn doctor_says_what_its_health_means() {
+fn doctor_reports_health_of_the_scanner() {
     let env = TestEnv::new();
-    let port = env.word("front");
+    let port = env.path_argument("front");
     let health = |code: i32| {
         let outcome = env.run(&["doctor", &port, "--json", "--no-system-config"]);
-        assert_eq!(outcome.code, Some(code), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(code), "{outcome}");
         let found = outcome.of_class("check");
         let of =
             |name: &str| found.iter().find(|line| line["name"] == name && !line["port"].is_null()).cloned();
@@ -261,31 +262,32 @@ fn doctor_says_what_its_health_means() {
         assert!(text(&sensor, "finding").contains("A1 at 115200 Bd, family rplidar, firmware"), "{sensor}");
         of("health").unwrap_or_else(|| panic!("no health: {outcome}"))
     };
-    let well = simulator(&env, "a1", &[]);
+    let healthy = simulator(&env, "a1", &[]);
     assert_eq!(text(&health(0), "state"), "ok");
-    assert_eq!(well.end(TERM).code, Some(0));
-    let _unwell = simulator(&env, "a1", &["--fault=health=2"]);
-    let unwell = health(5);
+    assert_eq!(healthy.end(TERM).exit_code, Some(0));
+    let _faulty = simulator(&env, "a1", &["--fault=health=2"]);
+    let health_of_faulty = health(5);
     assert!(
-        text(&unwell, "state") == "failed" && text(&unwell, "finding").contains("does not measure"),
-        "{unwell}"
+        text(&health_of_faulty, "state") == "failed"
+            && text(&health_of_faulty, "finding").contains("does not measure"),
+        "{health_of_faulty}"
     );
 }
 
 #[test]
-fn an_error_that_a_reset_clears_is_cleared_and_another_one_is_told() {
+fn clears_resettable_error_and_reports_persistent_one() {
     let env = TestEnv::new();
     let hub = hub(&env, &[]);
     let cleared = simulator(&env, "a1", &["--fault=health=2"]);
     env.await_info("front", |info| info["state"] == "streaming");
-    env.kill_simulator(cleared, "front");
+    env.kill_port_simulator(cleared, "front");
     env.await_info("front", |info| info["state"] == "absent");
-    let stubborn = simulator(&env, "a1", &["--fault=health=2,stubborn=1"]);
+    let persistent = simulator(&env, "a1", &["--fault=health=2,stubborn=1"]);
     let info = env.await_info("front", |info| text(info, "last_error").contains("does not measure"));
     assert_ne!(info["state"], "streaming", "{info}");
     // It comes back well, and nobody has to do anything.
-    env.kill_simulator(stubborn, "front");
+    env.kill_port_simulator(persistent, "front");
     let _well = simulator(&env, "a1", &[]);
     env.await_info("front", |info| info["state"] == "streaming" && info["last_error"] == "");
-    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
 }

@@ -15,9 +15,9 @@ use scanhub_sim::simulate::Summary;
 use scanhub_sim::{Event, simulate_with};
 use serde_json::Value;
 
-use crate::testkit::{PATIENCE, TERM, TestEnv, is_class};
+use crate::testkit::{TERM, TestEnv, WAIT_TIMEOUT, is_class};
 
-const NEEDS: &str = "500000 baud needs RS-422";
+const RS422_MESSAGE: &str = "500000 baud needs RS-422";
 
 /// A simulated scanner whose power the test can cycle.
 struct Scanner {
@@ -48,7 +48,7 @@ impl Scanner {
                 |_, _| {},
             )
         });
-        is_ready.recv_timeout(PATIENCE).expect("the port can be opened");
+        is_ready.recv_timeout(WAIT_TIMEOUT).expect("the port can be opened");
         Scanner { events, stop, thread }
     }
 
@@ -65,38 +65,38 @@ impl Scanner {
     }
 }
 
-fn names_rs422(status: &Value) -> bool {
-    status["last_error"].as_str().is_some_and(|error| error.starts_with(NEEDS))
+fn has_rs422_problem(status: &Value) -> bool {
+    status["last_error"].as_str().is_some_and(|error| error.starts_with(RS422_MESSAGE))
 }
 
-fn streams_slowly(status: &Value) -> bool {
-    status["state"] == "streaming" && status["baud"] == 38_400 && names_rs422(status)
+fn is_streaming_slowly(status: &Value) -> bool {
+    status["state"] == "streaming" && status["baud"] == 38_400 && has_rs422_problem(status)
 }
 
 /// Checks that the log has the reason, and does not repeat it. Another reason in between is possible on a busy machine, when a
 /// reply is late.
-fn warns_once(log: &str) {
+fn assert_single_warning(log: &str) {
     let warnings: Vec<_> = log.lines().filter(|line| line.contains(" WARN ")).collect();
-    let is_reason = |line: &&str| line.contains(NEEDS);
+    let is_reason = |line: &&str| line.contains(RS422_MESSAGE);
     assert!(warnings.iter().any(is_reason), "{log}");
     assert!(!warnings.windows(2).any(|pair| pair.iter().all(is_reason)), "{log}");
 }
 
 #[test]
-fn falls_back_to_38400_baud_and_the_next_hub_starts_there() {
+fn falls_back_to_38400_baud_and_saves_the_rate() {
     let env = TestEnv::new();
     let scanner = Scanner::start(&env);
     let hub = env.hub(&[env.link("front")]);
     let mut echo = env.echo(&["front/scan", "front/status"]);
     echo.await_line("lost", |line| line["last_error"].as_str().is_some_and(|error| error.contains("Status")));
     scanner.cycle_power();
-    echo.await_line("lost again", |line| line["state"] == "probing" && names_rs422(line));
+    echo.await_line("lost again", |line| line["state"] == "probing" && has_rs422_problem(line));
     scanner.cycle_power();
-    echo.await_line("streaming at 38400", streams_slowly);
+    echo.await_line("streaming at 38400", is_streaming_slowly);
     echo.await_lines(3, "a scan", is_class("scan"));
-    let log = hub.end(TERM).errors;
-    warns_once(&log);
-    let saved = env.path("state/scanhub").join(env.place().name()).join("front.rate");
+    let log = hub.end(TERM).stderr;
+    assert_single_warning(&log);
+    let saved = env.path("state/scanhub").join(env.domain().name()).join("front.rate");
     let text = fs::read_to_string(&saved).unwrap_or_else(|error| panic!("{}: {error}", saved.display()));
     assert!(text.starts_with("38400,silent=2 "), "{text}");
     scanner.end();
@@ -105,8 +105,8 @@ fn falls_back_to_38400_baud_and_the_next_hub_starts_there() {
     let scanner = Scanner::start(&env);
     let hub = env.hub(&[env.link("front")]);
     let mut echo = env.echo(&["front/status"]);
-    echo.await_line("streaming at 38400", streams_slowly);
-    let log = hub.end(TERM).errors;
-    warns_once(&log);
+    echo.await_line("streaming at 38400", is_streaming_slowly);
+    let log = hub.end(TERM).stderr;
+    assert_single_warning(&log);
     scanner.end();
 }

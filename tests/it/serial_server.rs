@@ -10,7 +10,9 @@ use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use crate::testkit;
-use crate::testkit::{INT, TERM, TestEnv, is_class, number, open_line, sequence, spawn, terminal, until};
+use crate::testkit::{
+    INT, TERM, TestEnv, contiguous_numbers, is_class, number, open_line, spawn, terminal, wait_until,
+};
 use rustix::process::Signal;
 use serde_json::Value;
 
@@ -25,18 +27,18 @@ struct Server {
 
 impl Server {
     /// A server whose serial port is the line at `place`, set to `rate` by hand.
-    fn new(env: &TestEnv, place: &str, rate: u32) -> Server {
+    fn new(env: &TestEnv, path: &str, rate: u32) -> Server {
         let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");
         let address = listener.local_addr().expect("it has an address").to_string();
         listener.set_nonblocking(true).expect("a socket");
         let (hang_up, end) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicBool::new(false)));
-        let line = open_line(&env.path(place), rate);
+        let line = open_line(&env.path(path), rate);
         let body = {
             let (hang_up, end) = (hang_up.clone(), end.clone());
             move || {
                 while !end.load(Ordering::Relaxed) {
                     match listener.accept() {
-                        Ok((socket, _)) => carry(&line, &socket, &|| {
+                        Ok((socket, _)) => forward(&line, &socket, &|| {
                             hang_up.swap(false, Ordering::Relaxed) || end.load(Ordering::Relaxed)
                         }),
                         Err(_) => thread::sleep(Duration::from_millis(5)),
@@ -60,7 +62,7 @@ impl Drop for Server {
 }
 
 /// Bytes to and fro until `is_over`, or until the other end closes the connection.
-fn carry(line: &std::fs::File, socket: &TcpStream, is_over: &dyn Fn() -> bool) {
+fn forward(line: &std::fs::File, socket: &TcpStream, is_over: &dyn Fn() -> bool) {
     let (mut line, mut socket) = (line, socket);
     let mut buffer = [0; 4096];
     socket.set_nonblocking(true).expect("a socket");
@@ -90,24 +92,24 @@ fn a_sensor_behind_a_serial_server() {
     let _simulator = env.simulator(&["line"], &["--baud=38400", "--seed=5"]);
     let server = Server::new(&env, "line", 38_400);
     let hub = env.hub(&[&server.link(), "--set=link.front.baud=38400"]);
-    let mut consumer = env.echo(&["front/telegram", "front/status"]);
-    consumer.await_lines(5, "a telegram", is_class("telegram"));
+    let mut subscriber = env.echo(&["front/telegram", "front/status"]);
+    subscriber.await_lines(5, "a telegram", is_class("telegram"));
     server.hang_up.store(true, Ordering::Relaxed);
-    let absent = consumer.await_line("absent", |line| line["state"] == "absent");
+    let absent = subscriber.await_line("absent", |line| line["state"] == "absent");
     let error = absent["last_error"].as_str().unwrap_or_default();
     assert!(error.contains(&server.address) && error.contains("closed by the serial server"), "{absent}");
-    consumer.await_line("streaming", |line| line["state"] == "streaming");
-    consumer.await_lines(5, "a telegram", is_class("telegram"));
+    subscriber.await_line("streaming", |line| line["state"] == "streaming");
+    subscriber.await_lines(5, "a telegram", is_class("telegram"));
     let info = env.info("front");
     assert_eq!(number(&info["counters"], "reconnects"), 1, "{info}");
     assert_eq!(info["port"], format!("tcp:{}", server.address));
-    let outcome = consumer.end(INT);
-    sequence(&outcome.of_class("telegram"), "seq");
-    assert_eq!(hub.end(TERM).code, Some(0));
+    let outcome = subscriber.end(INT);
+    contiguous_numbers(&outcome.of_class("telegram"), "seq");
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
 }
 
 #[test]
-fn a_scanner_of_an_unknown_family_behind_a_serial_server_is_found() {
+fn finds_scanner_of_any_family_behind_a_server() {
     for (simulated, rate, family, model) in [
         (&["--baud=38400", "--seed=5"][..], 38_400, "lms", "lms200"),
         (&["--family=ld", "--model=ld19", "--seed=5"], 230_400, "ld", "ld19"),
@@ -117,51 +119,51 @@ fn a_scanner_of_an_unknown_family_behind_a_serial_server_is_found() {
         let simulator = env.simulator(&["line"], simulated);
         let server = Server::new(&env, "line", rate);
         let hub = env.hub(&[format!("{},family=auto", server.link())]);
-        let mut consumer = env.echo(&["front/scan", "front/status"]);
-        consumer.await_line("a scan", |line| is_class("scan")(line) && line["family"] == family);
+        let mut subscriber = env.echo(&["front/scan", "front/status"]);
+        subscriber.await_line("a scan", |line| is_class("scan")(line) && line["family"] == family);
         let info = env.await_info("front", |info| info["state"] == "streaming" && info["model"] == model);
         assert_eq!((&info["family"], &info["last_error"]), (&family.into(), &"".into()), "{info}");
         // The search begins again with the connection, and with this scanner.
         server.hang_up.store(true, Ordering::Relaxed);
-        consumer.await_line("absent", |line| line["state"] == "absent");
-        consumer.await_line("a search", |line| line["state"] == "probing" && line["family"].is_null());
-        consumer.await_line("a scan", |line| is_class("scan")(line) && line["family"] == family);
-        sequence(&consumer.end(INT).of_class("scan"), "topic_seq");
+        subscriber.await_line("absent", |line| line["state"] == "absent");
+        subscriber.await_line("a search", |line| line["state"] == "probing" && line["family"].is_null());
+        subscriber.await_line("a scan", |line| is_class("scan")(line) && line["family"] == family);
+        contiguous_numbers(&subscriber.end(INT).of_class("scan"), "topic_seq");
         let outcome = hub.end(TERM);
-        assert_eq!((outcome.code, outcome.errors.contains("is now")), (Some(0), false), "{outcome}");
-        assert!(outcome.errors.contains(&format!("front: found {model}")), "{outcome}");
+        assert_eq!((outcome.exit_code, outcome.stderr.contains("is now")), (Some(0), false), "{outcome}");
+        assert!(outcome.stderr.contains(&format!("front: found {model}")), "{outcome}");
         drop(server);
-        assert_eq!(simulator.end(TERM).code, Some(0));
+        assert_eq!(simulator.end(TERM).exit_code, Some(0));
         if family == "lms" {
-            assert_eq!(env.simulated("line").1, 0, "EEPROM");
+            assert_eq!(env.simulator_totals("line").1, 0, "EEPROM");
         }
     }
 }
 
 /// Scans that are sent while the hub is stopped.
-const WAITING: usize = 20;
+const BACKLOGGED_SCANS: usize = 20;
 
 #[test]
-fn scans_that_waited_for_a_hub_at_a_standstill_say_nothing_of_now() {
+fn scans_buffered_for_a_stopped_hub_give_no_verdict() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["line"], &["--baud=38400", "--seed=5"]);
     let server = Server::new(&env, "line", 38_400);
     let hub = env.hub(&[&server.link(), "--set=link.front.baud=38400", "--set=zones.radii=[0.02,0.01]"]);
-    let mut consumer = env.echo(&["front/zones"]);
-    consumer.await_line("a verdict", |line| line["verdict"] == "clear");
+    let mut subscriber = env.echo(&["front/zones"]);
+    subscriber.await_line("a verdict", |line| line["verdict"] == "clear");
     hub.signal(Signal::STOP);
     let sent = || env.truth("line").len();
     let before = sent();
-    until("scans wait", || sent() > before + WAITING);
+    wait_until("scans wait", || sent() > before + BACKLOGGED_SCANS);
     hub.signal(Signal::CONT);
     let is_estimated = |line: &Value| line["flags"].to_string().contains("stamp_estimated");
     // The server sends five per second, so those of the last second may be recent.
-    for _ in 0..WAITING - 6 {
-        consumer.await_line("an old scan", |line| line["verdict"] == "unknown" && is_estimated(line));
+    for _ in 0..BACKLOGGED_SCANS - 6 {
+        subscriber.await_line("an old scan", |line| line["verdict"] == "unknown" && is_estimated(line));
     }
-    consumer.await_line("a new scan", |line| line["verdict"] == "clear" && !is_estimated(line));
-    consumer.end(INT);
-    assert_eq!(hub.end(TERM).code, Some(0));
+    subscriber.await_line("a new scan", |line| line["verdict"] == "clear" && !is_estimated(line));
+    subscriber.end(INT);
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
 }
 
 #[test]
@@ -170,9 +172,9 @@ fn a_serial_server_that_is_set_to_another_rate() {
     let _simulator = env.simulator(&["line"], &["--baud=9600"]);
     let server = Server::new(&env, "line", 38_400);
     let _hub = env.hub(&[&server.link(), "--set=link.front.baud=38400"]);
-    let says = "no answer at 38400 baud, the rate set in the serial server";
-    let said = |info: &Value| info["last_error"].as_str().is_some_and(|error| error.contains(says));
-    env.await_info("front", said);
+    let message = "no answer at 38400 baud, the rate set in the serial server";
+    let has_message = |info: &Value| info["last_error"].as_str().is_some_and(|error| error.contains(message));
+    env.await_info("front", has_message);
 }
 
 #[test]
@@ -183,13 +185,15 @@ fn a_serial_server_that_is_not_there() {
     // Too long for a name: nobody is asked for it.
     let nowhere = "x".repeat(64);
     let hub = env.hub(&[&format!("--link=front=tcp:{address}"), &format!("--link=named=tcp:{nowhere}:4001")]);
-    for (sensor, says) in [("front", "connection refused; nothing listens there"), ("named", "no such host")]
+    for (sensor, message) in
+        [("front", "connection refused; nothing listens there"), ("named", "no such host")]
     {
-        let said = |info: &Value| info["last_error"].as_str().is_some_and(|error| error.contains(says));
-        let info = env.await_info(sensor, said);
+        let has_message =
+            |info: &Value| info["last_error"].as_str().is_some_and(|error| error.contains(message));
+        let info = env.await_info(sensor, has_message);
         assert_eq!(info["state"], "absent", "{info}");
     }
-    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
 }
 
 #[test]
@@ -203,16 +207,16 @@ fn a_want_of_descriptors_is_not_the_servers_fault() {
         command.args(["-c", "ulimit -n \"$0\" && exec \"$@\"", &limit.to_string()]);
         command.arg(inner.get_program()).args(inner.get_args()).env("SCANHUB_END_WITH_PARENT", "1");
         let outcome = testkit::Program::start(command).wait();
-        match outcome.code {
+        match outcome.exit_code {
             Some(75) => {}
-            Some(4) => assert!(outcome.errors.contains("connection refused"), "{limit}: {outcome}"),
+            Some(4) => assert!(outcome.stderr.contains("connection refused"), "{limit}: {outcome}"),
             _ => panic!("{limit}: {outcome}"),
         }
     }
 }
 
 #[test]
-fn nobody_has_to_wait_for_a_serial_server_that_does_not_answer() {
+fn interrupt_ends_connecting_to_a_mute_serial_server() {
     let env = TestEnv::new();
     // Nobody accepts, and there is no room for one more: the kernel drops who comes.
     let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");
@@ -226,15 +230,15 @@ fn nobody_has_to_wait_for_a_serial_server_that_does_not_answer() {
         let is_socket = |entry: std::fs::DirEntry| {
             entry.path().read_link().is_ok_and(|target| target.to_string_lossy().starts_with("socket:"))
         };
-        testkit::until("it dials", || {
+        testkit::wait_until("it dials", || {
             std::fs::read_dir(&descriptors).is_ok_and(|entries| entries.flatten().any(is_socket))
         });
-        assert_eq!(program.end(INT).code, Some(130));
+        assert_eq!(program.end(INT).exit_code, Some(130));
     }
 }
 
 #[test]
-fn a_serial_server_that_serves_somebody_else_is_told_of_once() {
+fn busy_serial_server_is_reported_once() {
     let env = TestEnv::new();
     let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");
     let address = listener.local_addr().expect("it has an address");
@@ -245,9 +249,9 @@ fn a_serial_server_that_serves_somebody_else_is_told_of_once() {
     let info = env.await_info("front", |info| info["counters"]["reconnects"] == 6);
     assert_eq!(info["state"], "absent", "{info}");
     let outcome = hub.end(TERM);
-    let said = outcome.errors.lines().filter(|line| line.contains("closed by the serial server")).count();
-    assert_eq!(said, 1, "{outcome}");
-    assert!(outcome.errors.lines().count() < 8, "{outcome}");
+    let reports = outcome.stderr.lines().filter(|line| line.contains("closed by the serial server")).count();
+    assert_eq!(reports, 1, "{outcome}");
+    assert!(outcome.stderr.lines().count() < 8, "{outcome}");
 }
 
 #[test]
@@ -257,38 +261,38 @@ fn probe_and_doctor_ask_there_too() {
     let server = Server::new(&env, "sensor", 38_400);
     let port = format!("tcp:{}", server.address);
     let outcome = env.search(&["probe", &port, "--json"]);
-    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let found = &outcome.lines()[0];
     // The server has the rate; the sensor tells which it is.
     assert_eq!((number(found, "baud"), number(found, "operating_mode")), (38_400, 0x25), "{found}");
     let outcome = env.run(&["doctor", &port, "--no-system-config", "--json"]);
-    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let findings = outcome.of_class("check");
     let sensor = findings.iter().find(|line| line["name"] == "sensor").expect("it is asked");
     assert!(sensor["finding"].as_str().is_some_and(|text| text.contains("38400 Bd")), "{sensor}");
     drop(server);
     let outcome = env.search(&["probe", &port, "--json"]);
-    assert_eq!(outcome.code, Some(4), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(4), "{outcome}");
 }
 
 /// What a person sees who runs the program with `arguments` at a terminal and answers its question by yes; its exit
 /// code.
-fn confirmed(env: &TestEnv, arguments: &[&str]) -> (String, Option<i32>) {
+fn run_and_confirm(env: &TestEnv, arguments: &[&str]) -> (String, Option<i32>) {
     let (mut keys, screen) = terminal();
     let mut command = env.command(arguments);
     let screens = [0; 3].map(|_| Stdio::from(screen.try_clone().unwrap()));
     let [stdin, stdout, stderr] = screens;
     let mut process = spawn(command.stdin(stdin).stdout(stdout).stderr(stderr)).expect("it starts");
     drop((command, screen));
-    let (mut seen, mut byte) = (Vec::new(), [0]);
+    let (mut output, mut byte) = (Vec::new(), [0]);
     // A terminal that nobody has open any more ends by an error.
     while keys.read(&mut byte).is_ok_and(|len| len > 0) {
-        seen.push(byte[0]);
-        if seen.ends_with(b"Type yes: ") {
+        output.push(byte[0]);
+        if output.ends_with(b"Type yes: ") {
             keys.write_all(b"yes\n").expect("it listens");
         }
     }
-    (String::from_utf8_lossy(&seen).into_owned(), process.wait().expect("it ends").code())
+    (String::from_utf8_lossy(&output).into_owned(), process.wait().expect("it ends").code())
 }
 
 #[test]
@@ -297,10 +301,10 @@ fn a_sensor_there_can_be_configured() {
     let simulator = env.simulator(&["front"], &["--baud=38400"]);
     let server = Server::new(&env, "front", 38_400);
     let port = format!("tcp:{}", server.address);
-    let (seen, code) = confirmed(&env, &["configure", &port, "unit=cm"]);
-    assert_eq!(code, Some(0), "{seen}");
+    let (output, code) = run_and_confirm(&env, &["configure", &port, "unit=cm"]);
+    assert_eq!(code, Some(0), "{output}");
     assert_eq!(number(&env.search(&["probe", &port, "--json"]).lines()[0], "unit_mm"), 10);
     drop(server);
-    assert_eq!(simulator.end(TERM).code, Some(0));
-    assert_eq!(env.simulated("front").1, 1);
+    assert_eq!(simulator.end(TERM).exit_code, Some(0));
+    assert_eq!(env.simulator_totals("front").1, 1);
 }

@@ -4,70 +4,75 @@
 use std::collections::{HashMap, HashSet};
 use std::time::Duration;
 
-use crate::testkit::{INT, KILL, MEASURED, Program, TERM, TestEnv, bytes_of, hash, is_class, number, until};
+use crate::testkit::{
+    INT, KILL, MEASURED_VALUES, Program, TERM, TestEnv, bytes_of, hash, is_class, number, wait_until,
+};
 use rustix::process::Signal;
 use serde_json::Value;
 
-const KILLS: usize = 6;
+const KILL_COUNT: usize = 6;
 
 #[test]
-fn what_is_sent_while_a_killed_hub_is_replaced_waits_in_the_line() {
+fn restart_after_kill_loses_only_the_partial_telegram() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--seed=5", "--baud=500000"]);
     let mut supervisor = env.supervisor();
     let flags = [env.link("front")];
     let mut hub = env.service(&mut supervisor, &flags, None).ready();
-    supervisor.hear("FDNAME=front");
-    supervisor.hear("READY=1");
+    supervisor.wait_for_message("FDNAME=front");
+    supervisor.wait_for_message("READY=1");
     let mut telegrams = env.echo(&["front/telegram"]);
     let mut boots = HashSet::new();
-    for _ in 0..KILLS {
-        live(&mut telegrams, &mut boots);
-        kill_at_rest(&env, hub, &simulator, &mut telegrams);
+    for _ in 0..KILL_COUNT {
+        await_next_run(&mut telegrams, &mut boots);
+        kill_between_telegrams(&env, hub, &simulator, &mut telegrams);
         hub = env.service(&mut supervisor, &flags, None).ready();
-        supervisor.hear("READY=1");
+        supervisor.wait_for_message("READY=1");
     }
-    live(&mut telegrams, &mut boots);
+    await_next_run(&mut telegrams, &mut boots);
     // Only the service manager has the line, and it is still locked.
-    kill_at_rest(&env, hub, &simulator, &mut telegrams);
+    kill_between_telegrams(&env, hub, &simulator, &mut telegrams);
     let elsewhere = TestEnv::new();
     let other = elsewhere.hub(&flags);
-    assert!(other.has_said(|line| line["waiting"] == serde_json::json!(["front"])), "it found the line free");
-    assert_eq!(other.end(TERM).code, Some(0));
+    assert!(
+        other.has_printed(|line| line["waiting"] == serde_json::json!(["front"])),
+        "it found the line free"
+    );
+    assert_eq!(other.end(TERM).exit_code, Some(0));
     hub = env.service(&mut supervisor, &flags, None).ready();
-    live(&mut telegrams, &mut boots);
-    assert_eq!(hub.end(TERM).code, Some(0));
-    supervisor.hear("STOPPING=1");
+    await_next_run(&mut telegrams, &mut boots);
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
+    supervisor.wait_for_message("STOPPING=1");
     let got = telegrams.end(INT);
-    assert_eq!(simulator.end(TERM).code, Some(0));
+    assert_eq!(simulator.end(TERM).exit_code, Some(0));
 
     let lines = got.of_class("telegram");
-    let mut lives = HashMap::<&str, Vec<_>>::new();
+    let mut runs = HashMap::<&str, Vec<_>>::new();
     for line in &lines {
-        lives.entry(line["boot"].as_str().unwrap_or_default()).or_default().push(line.clone());
+        runs.entry(line["boot"].as_str().unwrap_or_default()).or_default().push(line.clone());
     }
-    assert_eq!(lives.len(), KILLS + 2);
+    assert_eq!(runs.len(), KILL_COUNT + 2);
     // The client reports what it misses on a busy machine.
     let notices = got.of_class("notice");
     let notices = notices.iter().filter(|line| line["kind"] == "missed");
     let missed: u64 = notices.map(|line| number(line, "missed")).sum();
-    let gaps = |life: &Vec<Value>| {
-        let numbers: Vec<u64> = life.iter().map(|line| number(line, "seq")).collect();
+    let gaps = |run: &Vec<Value>| {
+        let numbers: Vec<u64> = run.iter().map(|line| number(line, "seq")).collect();
         assert!(numbers.is_sorted_by(|one, next| one < next), "out of order: {numbers:?}");
         numbers[numbers.len() - 1] - numbers[0] + 1 - numbers.len() as u64
     };
-    assert!(lives.values().map(gaps).sum::<u64>() <= missed, "a gap that was not reported: {got}");
-    let received: Vec<_> = lines.iter().filter(|line| line["command"] == MEASURED).collect();
+    assert!(runs.values().map(gaps).sum::<u64>() <= missed, "a gap that was not reported: {got}");
+    let received: Vec<_> = lines.iter().filter(|line| line["command"] == MEASURED_VALUES).collect();
     let received: Vec<String> = received.iter().map(|line| hash(&bytes_of(line))).collect();
     let truth: Vec<_> = env.truth("front").into_iter().filter(|sent| sent.is_intact_scan()).collect();
     let at = |hash: &String| truth.iter().position(|sent| &sent.hash == hash).expect("it was sent");
     let span = &truth[at(&received[0])..=at(&received[received.len() - 1])];
     // A hub that is killed takes the telegram along that it has read in part, and no other.
-    let last_of = |life: &Vec<Value>| {
-        let last = life.iter().rfind(|line| line["command"] == MEASURED).expect("a measured telegram");
+    let last_of = |run: &Vec<Value>| {
+        let last = run.iter().rfind(|line| line["command"] == MEASURED_VALUES).expect("a measured telegram");
         at(&hash(&bytes_of(last)))
     };
-    let cut: HashSet<usize> = lives.values().map(|life| last_of(life) + 1).collect();
+    let cut: HashSet<usize> = runs.values().map(|run| last_of(run) + 1).collect();
     let lost: Vec<usize> = span.iter().map(|sent| at(&sent.hash)).collect();
     let lost: Vec<usize> = lost.into_iter().filter(|&sent| !received.contains(&truth[sent].hash)).collect();
     let unexplained = lost.iter().filter(|sent| !cut.contains(sent)).count() as u64;
@@ -76,52 +81,52 @@ fn what_is_sent_while_a_killed_hub_is_replaced_waits_in_the_line() {
     assert!(sorted.is_sorted(), "out of order");
     sorted.dedup();
     assert_eq!(sorted.len(), received.len(), "twice");
-    println!("{} of {} telegrams lost by {} kills", lost.len(), span.len(), KILLS + 1);
-    assert_eq!(env.simulated("front").1, 0, "EEPROM");
+    println!("{} of {} telegrams lost by {} kills", lost.len(), span.len(), KILL_COUNT + 1);
+    assert_eq!(env.simulator_totals("front").1, 0, "EEPROM");
 }
 
 /// Stops `simulator` until `telegrams` has printed all that the line has brought, kills `hub`, and lets the simulator continue.
 /// A part of the last telegram may wait in the simulator for room on the line.
-fn kill_at_rest(env: &TestEnv, hub: Program, simulator: &Program, telegrams: &mut Program) {
+fn kill_between_telegrams(env: &TestEnv, hub: Program, simulator: &Program, telegrams: &mut Program) {
     simulator.signal(Signal::STOP);
     let sent = env.truth("front");
     let last = &sent.iter().rev().filter(|sent| sent.is_intact_scan()).nth(1).expect("scans were sent").hash;
-    until("the last telegram is printed", || {
-        telegrams.is_heard(|line| line["class"] == "telegram" && hash(&bytes_of(line)) == *last)
+    wait_until("the last telegram is printed", || {
+        telegrams.prints(|line| line["class"] == "telegram" && hash(&bytes_of(line)) == *last)
     });
-    assert_eq!(hub.end(KILL).code, None);
+    assert_eq!(hub.end(KILL).exit_code, None);
     simulator.signal(Signal::CONT);
 }
 
 /// Waits for telegrams of a life of the hub that none of `boots` is: those of another one may still wait to be read.
-fn live(telegrams: &mut Program, boots: &mut HashSet<String>) {
+fn await_next_run(telegrams: &mut Program, boots: &mut HashSet<String>) {
     let boot = |line: &Value| line["boot"].as_str().unwrap_or_default().to_owned();
-    let is_new = |line: &Value| line["command"] == MEASURED && !boots.contains(&boot(line));
+    let is_new = |line: &Value| line["command"] == MEASURED_VALUES && !boots.contains(&boot(line));
     let lines = telegrams.await_lines(20, "a measured telegram", is_new);
     boots.insert(boot(&lines[0]));
 }
 
 #[test]
-fn scans_go_on_with_the_first_telegram_of_the_next_hub() {
+fn scans_resume_with_first_telegram_of_the_next_hub() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--seed=8", "--baud=500000"]);
     let mut supervisor = env.supervisor();
     let flags = [env.link("front")];
     let hub = env.service(&mut supervisor, &flags, None).ready();
-    supervisor.hear("FDNAME=front");
+    supervisor.wait_for_message("FDNAME=front");
     let mut samples = env.echo(&["front/telegram", "front/scan"]);
     let scans = samples.await_lines(20, "a scan", is_class("scan"));
     let mut boot = scans[0]["boot"].clone();
     let (mut hub, mut tries) = (hub, 0);
     let (first, scan) = loop {
-        assert_eq!(hub.end(KILL).code, None);
+        assert_eq!(hub.end(KILL).exit_code, None);
         hub = env.service(&mut supervisor, &flags, None).ready();
         let of_next = |line: &Value| line["boot"] != boot;
-        let first =
-            samples.await_line("a measured telegram", |line| of_next(line) && line["command"] == MEASURED);
+        let first = samples
+            .await_line("a measured telegram", |line| of_next(line) && line["command"] == MEASURED_VALUES);
         let scan = samples.await_line("its scan", |line| of_next(line) && line["class"] == "scan");
         // A client on a busy machine may miss the first ones; it reports that.
-        let has_missed = samples.has_said(|line| line["kind"] == "missed");
+        let has_missed = samples.has_printed(|line| line["kind"] == "missed");
         if has_missed || scan["seq"] == first["seq"] {
             break (first, scan);
         }
@@ -141,60 +146,60 @@ fn scans_go_on_with_the_first_telegram_of_the_next_hub() {
     // The hub requests the status anyway; the type is known.
     let info = env.await_info("front", |info| info["counters"]["telegrams"].as_u64() > Some(100));
     assert_eq!((&info["type"], &info["mode"]), (&"LMS200;301063;V02.30".into(), &1.into()), "{info}");
-    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
     drop(samples);
-    assert_eq!(simulator.end(TERM).code, Some(0));
+    assert_eq!(simulator.end(TERM).exit_code, Some(0));
 }
 
 #[test]
-fn a_port_that_went_is_given_back_and_another_link_s_is_not_taken() {
+fn hub_releases_stored_ports_it_cannot_use() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--seed=6", "--baud=500000"]);
     let mut supervisor = env.supervisor();
     let hub = env.service(&mut supervisor, &[env.link("front")], None).ready();
-    supervisor.hear("FDNAME=front");
-    supervisor.hear("READY=1");
-    assert_eq!(hub.end(KILL).code, None);
+    supervisor.wait_for_message("FDNAME=front");
+    supervisor.wait_for_message("READY=1");
+    assert_eq!(hub.end(KILL).exit_code, None);
     // The next one has a link of another name: what was kept is nobody's.
-    let side = format!("--link=side={}", env.word("side"));
+    let side = format!("--link=side={}", env.path_argument("side"));
     let hub = env.service(&mut supervisor, &[side], None).ready();
-    supervisor.hear("FDSTOREREMOVE=1");
-    supervisor.hear("STATUS=sensors: side");
-    assert_eq!(hub.end(TERM).code, Some(0));
+    supervisor.wait_for_message("FDSTOREREMOVE=1");
+    supervisor.wait_for_message("STATUS=sensors: side");
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
     // It was closed: whoever comes finds it free.
     let hub = env.service(&mut supervisor, &[env.link("front")], None).ready();
-    supervisor.hear("FDNAME=front");
+    supervisor.wait_for_message("FDNAME=front");
     env.await_info("front", |info| info["state"] == "streaming");
-    env.kill_simulator(simulator, "front");
-    supervisor.hear("FDSTOREREMOVE=1");
+    env.kill_port_simulator(simulator, "front");
+    supervisor.wait_for_message("FDSTOREREMOVE=1");
     let info = env.await_info("front", |info| info["state"] == "absent");
     assert_eq!(number(&info["counters"], "reconnects"), 1);
-    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
 }
 
 #[test]
-fn a_link_that_got_another_name_goes_on_with_its_port() {
+fn renamed_link_takes_over_its_stored_port() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--seed=7", "--baud=500000"]);
     let mut supervisor = env.supervisor();
     let hub = env.service(&mut supervisor, &[env.link("front")], None).ready();
-    supervisor.hear("FDNAME=front");
-    supervisor.hear("READY=1");
-    assert_eq!(hub.end(KILL).code, None);
+    supervisor.wait_for_message("FDNAME=front");
+    supervisor.wait_for_message("READY=1");
+    assert_eq!(hub.end(KILL).exit_code, None);
     // Whoever keeps it has it locked: it cannot be opened, only taken over.
-    let side = format!("--link=side={}", env.word("front"));
+    let side = format!("--link=side={}", env.path_argument("front"));
     let hub = env.service(&mut supervisor, &[side], None).ready();
-    supervisor.hear("FDSTOREREMOVE=1");
-    supervisor.hear("FDNAME=side");
-    supervisor.hear("READY=1");
-    assert_eq!(hub.end(KILL).code, None);
+    supervisor.wait_for_message("FDSTOREREMOVE=1");
+    supervisor.wait_for_message("FDNAME=side");
+    supervisor.wait_for_message("READY=1");
+    assert_eq!(hub.end(KILL).exit_code, None);
     // The name has another port now: what was kept under it is not kept beside the new one.
-    let side = format!("--link=side={}", env.word("nowhere"));
+    let side = format!("--link=side={}", env.path_argument("nowhere"));
     let hub = env.service(&mut supervisor, &[side], None).ready();
-    supervisor.hear("FDSTOREREMOVE=1");
-    supervisor.hear("STATUS=sensors: side");
-    assert_eq!(hub.end(TERM).code, Some(0));
-    assert_eq!(simulator.end(TERM).code, Some(0));
+    supervisor.wait_for_message("FDSTOREREMOVE=1");
+    supervisor.wait_for_message("STATUS=sensors: side");
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
+    assert_eq!(simulator.end(TERM).exit_code, Some(0));
 }
 
 #[test]
@@ -204,8 +209,8 @@ fn the_watchdog_is_fed_while_links_work() {
     // A port that is not there is no link that hangs.
     let hub = env.service(&mut supervisor, &[env.link("front")], Some(Duration::from_secs(2))).ready();
     for _ in 0..3 {
-        supervisor.hear("WATCHDOG=1");
+        supervisor.wait_for_message("WATCHDOG=1");
     }
-    assert_eq!(hub.end(TERM).code, Some(0));
-    supervisor.hear("STOPPING=1");
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
+    supervisor.wait_for_message("STOPPING=1");
 }

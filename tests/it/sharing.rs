@@ -7,19 +7,19 @@ use std::os::unix::process::CommandExt;
 use std::process::Command;
 
 use crate::testkit;
-use crate::testkit::{INT, Program, TERM, is_class, number, succeeds, until};
+use crate::testkit::{INT, Program, TERM, is_class, number, succeeds, wait_until};
 use serde_json::{Value, json};
 
-const PAGE: &str = include_str!("../../docs/sharing.md");
+const SHARING_PAGE: &str = include_str!("../../docs/sharing.md");
 /// Where the namespaces are made: the test that shall run in them.
-const INSIDE: &str = "SCANHUB_TEST_SHARING";
+const NAMESPACE_VARIABLE: &str = "SCANHUB_TEST_SHARING";
 /// Users that need not be known to the system.
-const HUB: u32 = 65531;
-const OTHER: u32 = 65532;
+const HUB_UID: u32 = 65531;
+const OTHER_UID: u32 = 65532;
 
 /// Runs `test`, which is called `name`, where it can be two users; says so if the system does not allow that.
-fn among_users(name: &str, test: impl FnOnce()) {
-    if std::env::var_os(INSIDE).is_some() {
+fn in_namespace(name: &str, test: impl FnOnce()) {
+    if std::env::var_os(NAMESPACE_VARIABLE).is_some() {
         return test();
     }
     // Where /tmp is hidden the programs may be, too.
@@ -38,12 +38,12 @@ fn among_users(name: &str, test: impl FnOnce()) {
         return;
     }
     let mut inside = unshare(&format!("exec /mnt/test --exact {name} --nocapture"));
-    inside.env(INSIDE, "1").current_dir("/");
-    testkit::run_again(name, inside);
+    inside.env(NAMESPACE_VARIABLE, "1").current_dir("/");
+    testkit::rerun_test(name, inside);
 }
 
 /// A directory of `user` alone, which is there already if `path` is.
-fn own(user: u32, path: &str) {
+fn create_directory_of(user: u32, path: &str) {
     fs::DirBuilder::new().recursive(true).mode(0o700).create(path).expect("a directory");
     chown(path, Some(user), Some(user)).expect("root gives it away");
 }
@@ -53,7 +53,7 @@ fn scanhub(user: u32, arguments: &[&str]) -> Command {
     let mut command = Command::new("/mnt/scanhub");
     command.args(arguments).env_clear().env("SCANHUB_END_WITH_PARENT", "1").current_dir("/");
     command.env("XDG_RUNTIME_DIR", format!("/run/user/{user}")).env("HOME", format!("/tmp/{user}"));
-    if user == HUB {
+    if user == HUB_UID {
         command.env("RUNTIME_DIRECTORY", "/run/scanhub");
     }
     command.uid(user).gid(user);
@@ -65,15 +65,15 @@ fn start(user: u32, arguments: &[&str]) -> Program {
 }
 
 /// The words of the page's line that is so, or else begins so, without the program's name.
-fn of_page(begin: &str) -> Vec<&'static str> {
-    let find = |is_it: &dyn Fn(&str) -> bool| PAGE.lines().find(|line| is_it(line));
+fn arguments_on_page(begin: &str) -> Vec<&'static str> {
+    let find = |is_it: &dyn Fn(&str) -> bool| SHARING_PAGE.lines().find(|line| is_it(line));
     let line = find(&|line| line == begin).or_else(|| find(&|line| line.starts_with(begin)));
     line.unwrap_or_else(|| panic!("no line {begin:?}")).split(' ').skip(1).collect()
 }
 
 /// The same, with JSON and the gateway that is here in the place of the page's.
-fn followed(begin: &str, hub: &str) -> Vec<String> {
-    let words = of_page(begin).into_iter().map(|word| word.replace("5f3a12bc00d1e2f3", hub));
+fn arguments_with_hub(begin: &str, hub: &str) -> Vec<String> {
+    let words = arguments_on_page(begin).into_iter().map(|word| word.replace("5f3a12bc00d1e2f3", hub));
     words.chain(["--json".to_owned()]).collect()
 }
 
@@ -82,62 +82,68 @@ fn words(texts: &[String]) -> Vec<&str> {
 }
 
 #[test]
-fn consumers_under_another_user_get_what_the_page_says() {
-    among_users("sharing::consumers_under_another_user_get_what_the_page_says", || {
+fn commands_of_the_page_work_for_another_user() {
+    in_namespace("sharing::commands_of_the_page_work_for_another_user", || {
         fs::create_dir("/run/user").expect("an empty /run");
-        own(HUB, "/run/scanhub");
-        for user in [HUB, OTHER] {
-            own(user, &format!("/run/user/{user}"));
-            own(user, &format!("/tmp/{user}"));
+        create_directory_of(HUB_UID, "/run/scanhub");
+        for user in [HUB_UID, OTHER_UID] {
+            create_directory_of(user, &format!("/run/user/{user}"));
+            create_directory_of(user, &format!("/tmp/{user}"));
         }
-        let port = format!("/tmp/{HUB}/front");
+        let port = format!("/tmp/{HUB_UID}/front");
         let port_flag = format!("--port={port}");
         let _simulator =
-            start(HUB, &["simulate", "--json", &port_flag, "--seed=61", "--baud=500000"]).ready();
+            start(HUB_UID, &["simulate", "--json", &port_flag, "--seed=61", "--baud=500000"]).ready();
         let link = format!("--link=front={port}");
-        let _hub = start(HUB, &["run", "--json", &link]).ready();
+        let _hub = start(HUB_UID, &["run", "--json", &link]).ready();
         // The other user can do nothing with the hub's memory.
-        let alone = start(OTHER, &["echo", "front/scan", "--json", "-n", "1"]).wait();
-        assert_ne!(alone.code, Some(0), "{alone}");
+        let alone = start(OTHER_UID, &["echo", "front/scan", "--json", "-n", "1"]).wait();
+        assert_ne!(alone.exit_code, Some(0), "{alone}");
 
-        let mut gateway = start(HUB, &[&of_page("scanhub gateway")[..], &["--json"]].concat());
+        let mut gateway = start(HUB_UID, &[&arguments_on_page("scanhub gateway")[..], &["--json"]].concat());
         let begin = gateway.await_line("its begin", is_class("gateway"));
         let hub = begin["hub"].as_str().unwrap_or_default().to_owned();
         let mut listener =
-            start(OTHER, &words(&followed("scanhub listen --publish --interface lo", &hub))).ready();
+            start(OTHER_UID, &words(&arguments_with_hub("scanhub listen --publish --interface lo", &hub)))
+                .ready();
         let published = listener.await_line("a sensor", |line| line["kind"] == "published");
         assert_eq!(published["sensor"], json!(format!("{hub}.front")));
-        let listed = start(OTHER, &words(&followed("scanhub list", &hub))).wait();
+        let listed = start(OTHER_UID, &words(&arguments_with_hub("scanhub list", &hub))).wait();
         let is_scan = |line: &&Value| line["class"] == "topic" && line["topic"] == "scan";
         assert!(listed.lines().iter().any(|line| is_scan(&line)), "{listed}");
-        let mut there = start(HUB, &["echo", "front/scan", "--json"]);
+        let mut there = start(HUB_UID, &["echo", "front/scan", "--json"]);
         there.await_line("a scan", is_class("scan"));
-        let mut echo = start(OTHER, &words(&followed("scanhub echo 5f3a", &hub)));
+        let mut echo = start(OTHER_UID, &words(&arguments_with_hub("scanhub echo 5f3a", &hub)));
         let scan = echo.await_lines(40, "scans", is_class("scan")).pop().expect("forty");
         let same = there.await_line("the same one", |line| line["seq"] == scan["seq"]);
         assert_eq!((&scan["ranges"], &scan["wall_ns"]), (&same["ranges"], &same["wall_ns"]));
         drop(there.end(INT));
         let echoed = echo.end(INT);
-        assert_eq!((echoed.code, number(&echoed.of_class("summary")[0], "missed")), (Some(0), 0), "{echoed}");
-        assert_eq!(listener.end(TERM).code, Some(0));
+        assert_eq!(
+            (echoed.exit_code, number(&echoed.of_class("summary")[0], "missed")),
+            (Some(0), 0),
+            "{echoed}"
+        );
+        assert_eq!(listener.end(TERM).exit_code, Some(0));
 
         // Under a name of its own.
-        let named = followed("scanhub listen --publish --interface lo --name", &hub);
-        let listener = start(OTHER, &words(&named)).ready();
-        until("the name is there", || {
-            let outcome = start(OTHER, &["list", "--json"]).wait();
+        let named = arguments_with_hub("scanhub listen --publish --interface lo --name", &hub);
+        let listener = start(OTHER_UID, &words(&named)).ready();
+        wait_until("the name is there", || {
+            let outcome = start(OTHER_UID, &["list", "--json"]).wait();
             outcome.of_class("topic").iter().any(|line| line["sensor"] == "here.front")
         });
         let echoed =
-            start(OTHER, &[&of_page("scanhub echo here")[..], &["--json", "-n", "3"]].concat()).wait();
-        assert_eq!((echoed.code, echoed.of_class("scan").len()), (Some(0), 3), "{echoed}");
-        assert_eq!(listener.end(TERM).code, Some(0));
-        assert_eq!(gateway.end(TERM).code, Some(0));
+            start(OTHER_UID, &[&arguments_on_page("scanhub echo here")[..], &["--json", "-n", "3"]].concat())
+                .wait();
+        assert_eq!((echoed.exit_code, echoed.of_class("scan").len()), (Some(0), 3), "{echoed}");
+        assert_eq!(listener.end(TERM).exit_code, Some(0));
+        assert_eq!(gateway.end(TERM).exit_code, Some(0));
     });
 }
 
-/// Domain of the hubs that [`names_the_user_whose_hub_runs`] starts. Hubs of other tests are visible in /proc too.
-const DOMAIN: &str = "--domain=whose";
+/// Domain of the hubs that [`reports_the_user_of_a_running_hub`] starts. Hubs of other tests are visible in /proc too.
+const DOMAIN_FLAG: &str = "--domain=whose";
 
 /// The program as sudo starts it: without the variables of a login session.
 fn by_sudo(user: u32, arguments: &[&str]) -> Program {
@@ -148,59 +154,62 @@ fn by_sudo(user: u32, arguments: &[&str]) -> Program {
 
 /// Checks that verbs of `caller` find no hub and suggest a command, and that this command lists the topics of `hub`, which
 /// belongs to `owner`.
-fn follows_the_suggestion(caller: &dyn Fn(&[&str]) -> Program, owner: u32, hub: &Program) {
+fn assert_suggestion_works(caller: &dyn Fn(&[&str]) -> Program, owner: u32, hub: &Program) {
     let sudo = if owner == 0 { "sudo".to_owned() } else { format!("sudo -u '#{owner}'") };
     let suggested = format!("process {}: {sudo} /mnt/scanhub ", hub.pid());
     for verb in [&["list"][..], &["info"], &["control", "front", "pause"], &["echo", "front/scan", "-n", "1"]]
     {
-        let outcome = caller(&[verb, &[DOMAIN]].concat()).wait();
-        assert_eq!(outcome.code, Some(3), "{outcome}");
-        assert!(outcome.errors.contains("no hub of this user in domain whose"), "{outcome}");
-        let rest = outcome.errors.split(&suggested).nth(1).and_then(|rest| rest.split(';').next());
+        let outcome = caller(&[verb, &[DOMAIN_FLAG]].concat()).wait();
+        assert_eq!(outcome.exit_code, Some(3), "{outcome}");
+        assert!(outcome.stderr.contains("no hub of this user in domain whose"), "{outcome}");
+        let rest = outcome.stderr.split(&suggested).nth(1).and_then(|rest| rest.split(';').next());
         let words: Vec<&str> = rest.unwrap_or_else(|| panic!("{suggested}: {outcome}")).split(' ').collect();
         let listed = by_sudo(owner, &words).wait();
-        assert!(listed.code == Some(0) && listed.to_string().contains("front/scan"), "{words:?}: {listed}");
+        assert!(
+            listed.exit_code == Some(0) && listed.to_string().contains("front/scan"),
+            "{words:?}: {listed}"
+        );
     }
     // A verb that waits for a hub names it, too.
-    let mut echo = caller(&["echo", "front/scan", "--json", DOMAIN]);
+    let mut echo = caller(&["echo", "front/scan", "--json", DOMAIN_FLAG]);
     let notice = echo.await_line("no hub", |line| line["kind"] == "hub_gone");
     assert!(notice["hint"].as_str().is_some_and(|hint| hint.contains(&suggested)), "{notice}");
-    assert_eq!(echo.end(INT).code, Some(0));
+    assert_eq!(echo.end(INT).exit_code, Some(0));
 }
 
 #[test]
-fn names_the_user_whose_hub_runs() {
-    among_users("sharing::names_the_user_whose_hub_runs", || {
+fn reports_the_user_of_a_running_hub() {
+    in_namespace("sharing::reports_the_user_of_a_running_hub", || {
         fs::create_dir("/run/user").expect("an empty /run");
-        own(HUB, "/run/scanhub");
-        for user in [HUB, OTHER] {
-            own(user, &format!("/run/user/{user}"));
-            own(user, &format!("/tmp/{user}"));
+        create_directory_of(HUB_UID, "/run/scanhub");
+        for user in [HUB_UID, OTHER_UID] {
+            create_directory_of(user, &format!("/run/user/{user}"));
+            create_directory_of(user, &format!("/tmp/{user}"));
         }
-        let run = ["run", "--json", "--no-system-config", "--link=front=tcp:127.0.0.1:9", DOMAIN];
-        let other = |arguments: &[&str]| start(OTHER, arguments);
+        let run = ["run", "--json", "--no-system-config", "--link=front=tcp:127.0.0.1:9", DOMAIN_FLAG];
+        let other = |arguments: &[&str]| start(OTHER_UID, arguments);
         let root = |arguments: &[&str]| by_sudo(0, arguments);
 
-        let service = start(HUB, &run).ready();
-        follows_the_suggestion(&other, HUB, &service);
-        assert_eq!(service.end(TERM).code, Some(0));
+        let service = start(HUB_UID, &run).ready();
+        assert_suggestion_works(&other, HUB_UID, &service);
+        assert_eq!(service.end(TERM).exit_code, Some(0));
 
         let of_root = by_sudo(0, &run).ready();
-        follows_the_suggestion(&other, 0, &of_root);
-        assert_eq!(of_root.end(TERM).code, Some(0));
+        assert_suggestion_works(&other, 0, &of_root);
+        assert_eq!(of_root.end(TERM).exit_code, Some(0));
 
-        let of_session = start(OTHER, &run).ready();
-        follows_the_suggestion(&root, OTHER, &of_session);
-        assert_eq!(of_session.end(TERM).code, Some(0));
+        let of_session = start(OTHER_UID, &run).ready();
+        assert_suggestion_works(&root, OTHER_UID, &of_session);
+        assert_eq!(of_session.end(TERM).exit_code, Some(0));
 
         // Other users cannot read the variable, so they are not told a domain.
         let mut command = scanhub(0, &run[..run.len() - 1]);
         command.env_remove("XDG_RUNTIME_DIR").env("SCANHUB_DOMAIN", "whose");
         let of_variable = Program::start(command).ready();
         let pid = of_variable.pid();
-        let outcome = other(&["list", DOMAIN]).wait();
+        let outcome = other(&["list", DOMAIN_FLAG]).wait();
         assert!(
-            outcome.code == Some(3) && outcome.errors.contains("in an unknown domain, process "),
+            outcome.exit_code == Some(3) && outcome.stderr.contains("in an unknown domain, process "),
             "{outcome}"
         );
         let listed = by_sudo(0, &["list", "--domains", "--json"]).wait();
@@ -218,24 +227,25 @@ fn names_the_user_whose_hub_runs() {
             (&Value::Null, &json!("root"), &remedy)
         );
         // The terminal of the web server names the hub of the other user.
-        let mut web = other(&["web", "--listen", "127.0.0.1:0", DOMAIN]);
-        web.await_text("no hub of this user in domain whose");
-        assert_eq!(web.end(TERM).code, Some(0));
-        assert_eq!(of_variable.end(TERM).code, Some(0));
+        let mut web = other(&["web", "--listen", "127.0.0.1:0", DOMAIN_FLAG]);
+        web.wait_for_text("no hub of this user in domain whose");
+        assert_eq!(web.end(TERM).exit_code, Some(0));
+        assert_eq!(of_variable.end(TERM).exit_code, Some(0));
 
         // A hub of this user below another directory is listed.
-        let below = start(OTHER, &[&run[..], &["--root", &format!("/tmp/{OTHER}")]].concat()).ready();
+        let below = start(OTHER_UID, &[&run[..], &["--root", &format!("/tmp/{OTHER_UID}")]].concat()).ready();
         let listed = other(&["list", "--domains", "--json"]).wait();
-        let root = json!(format!("/tmp/{OTHER}/whose"));
+        let root = json!(format!("/tmp/{OTHER_UID}/whose"));
         assert!(listed.of_class("domain").iter().any(|line| line["root"] == root), "{listed}");
-        assert_eq!(below.end(TERM).code, Some(0));
+        assert_eq!(below.end(TERM).exit_code, Some(0));
     });
 }
 
 /// What the page says of the service is a configuration that a gateway takes.
 #[test]
 fn the_page_s_configuration_is_one() {
-    let block = PAGE.split("```toml\n").nth(1).and_then(|rest| rest.split("```").next()).expect("a block");
+    let block =
+        SHARING_PAGE.split("```toml\n").nth(1).and_then(|rest| rest.split("```").next()).expect("a block");
     let env = testkit::TestEnv::new();
     let file = env.file("scanhub.toml", block);
     let shown = env.run(&[
@@ -252,14 +262,14 @@ fn the_page_s_configuration_is_one() {
 
 /// The three terminals of docs/tilt.md, in the order of the page: the mount publishes before there is a hub.
 #[test]
-fn mount_and_hub_find_each_other_in_whatever_order_they_start() {
-    among_users("sharing::mount_and_hub_find_each_other_in_whatever_order_they_start", || {
+fn mount_and_hub_find_each_other_in_either_order() {
+    in_namespace("sharing::mount_and_hub_find_each_other_in_either_order", || {
         fs::create_dir("/run/user").expect("an empty /run");
-        for user in [0, OTHER] {
-            own(user, &format!("/run/user/{user}"));
-            own(user, &format!("/tmp/{user}"));
+        for user in [0, OTHER_UID] {
+            create_directory_of(user, &format!("/run/user/{user}"));
+            create_directory_of(user, &format!("/tmp/{user}"));
         }
-        for (user, has_session) in [(0, true), (0, false), (OTHER, true), (OTHER, false)] {
+        for (user, has_session) in [(0, true), (0, false), (OTHER_UID, true), (OTHER_UID, false)] {
             let start: fn(u32, &[&str]) -> Program = if has_session { start } else { by_sudo };
             let port = format!("/tmp/{user}/lms");
             let port_flag = format!("--port={port}");
@@ -281,13 +291,13 @@ fn mount_and_hub_find_each_other_in_whatever_order_they_start() {
             );
             tilt.await_line("a sweep", is_class("obstacles"));
             assert!(!fs::exists("/run/scanhub").expect("/run can be read"), "a service's place is not ours");
-            assert_eq!((tilt.end(INT).code, hub.end(INT).code), (Some(0), Some(0)));
+            assert_eq!((tilt.end(INT).exit_code, hub.end(INT).exit_code), (Some(0), Some(0)));
             // Alone again, it is where the next hub looks for it, too.
             let hub = start(user, &run).ready();
             let mut echo = start(user, &["echo", "mount/tilt", "--json"]);
             echo.await_line("an angle", is_class("tilt"));
-            assert_eq!((echo.end(INT).code, hub.end(INT).code), (Some(0), Some(0)));
-            assert_eq!(simulator.end(INT).code, Some(0));
+            assert_eq!((echo.end(INT).exit_code, hub.end(INT).exit_code), (Some(0), Some(0)));
+            assert_eq!(simulator.end(INT).exit_code, Some(0));
             assert_eq!(testkit::shared_memory("sh_scanhub_"), Vec::<std::path::PathBuf>::new());
         }
     });

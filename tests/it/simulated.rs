@@ -3,10 +3,10 @@
 use std::io::{Read, Write};
 use std::time::Duration;
 
-use crate::testkit::{TERM, TestEnv, is_class, let_pass, number, open_line, until};
+use crate::testkit::{TERM, TestEnv, is_class, number, open_line, wait_at_least, wait_until};
 
 #[test]
-fn a_sensor_with_a_past_tells_it_when_it_is_asked() {
+fn simulator_flags_appear_in_the_probe_result() {
     let env = TestEnv::new();
     let flags = [
         "--permanent-baud=38400",
@@ -20,16 +20,16 @@ fn a_sensor_with_a_past_tells_it_when_it_is_asked() {
         "--short-configuration",
     ];
     let simulator = env.simulator(&["front"], &flags);
-    let outcome = env.search(&["probe", &env.word("front"), "--json"]);
-    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let outcome = env.search(&["probe", &env.path_argument("front"), "--json"]);
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let [found] = &outcome.lines()[..] else { panic!("{outcome}") };
     assert_eq!((number(found, "baud"), number(found, "operating_mode")), (38_400, 0), "{found}");
     assert_eq!((&found["type"], number(found, "unit_mm")), (&"LMS221".into(), 10), "{found}");
     assert_eq!(found["permanent_rate"], true, "{found}");
     assert_eq!(found["errors"].as_array().map(Vec::len), Some(2), "{found}");
     assert_eq!(found["configuration"].as_str().map(str::len), Some(64), "{found}");
-    assert_eq!(simulator.end(TERM).code, Some(0));
-    assert_eq!(env.simulated("front").1, 0);
+    assert_eq!(simulator.end(TERM).exit_code, Some(0));
+    assert_eq!(env.simulator_totals("front").1, 0);
 }
 
 #[test]
@@ -40,36 +40,36 @@ fn faults_are_named_in_the_truth() {
     let hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
     for name in ["truncated", "length", "unread"] {
-        until(name, || {
+        wait_until(name, || {
             let text = std::fs::read_to_string(env.path("truth")).unwrap_or_default();
             text.contains(&format!(r#""fault":"{name}""#))
         });
     }
-    assert_eq!(hub.end(TERM).code, Some(0));
-    assert_eq!(simulator.end(TERM).code, Some(0));
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
+    assert_eq!(simulator.end(TERM).exit_code, Some(0));
 }
 
 #[test]
-fn a_scanner_that_never_listens_speaks_at_once_and_others_are_refused() {
+fn ld_scanner_streams_at_once_and_rejects_bad_flags() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--family=ld", "--model=stl27l", "--world=room"]);
     let mut port = open_line(&env.path("front"), 921_600);
     let mut bytes: Vec<u8> = Vec::new();
-    until("packets", || {
+    wait_until("packets", || {
         let mut buffer = [0; 4_096];
         let len = port.read(&mut buffer).unwrap_or(0);
         bytes.extend(&buffer[..len]);
         bytes.windows(49).any(|packet| packet[..2] == [0x54, 0x2C] && packet[47..] == [0x54, 0x2C])
     });
-    assert_eq!(simulator.end(TERM).code, Some(0));
-    assert_eq!(env.simulated("front").1, 0);
+    assert_eq!(simulator.end(TERM).exit_code, Some(0));
+    assert_eq!(env.simulator_totals("front").1, 0);
     let truth = std::fs::read_to_string(env.path("truth")).expect("a truth");
     assert!(truth.lines().next().is_some_and(|line| line.contains(r#""length":47"#)), "{truth}");
-    let refused = |flags: &[&str], says: &str| {
-        let port = format!("--port={}", env.word("none"));
+    let refused = |flags: &[&str], message: &str| {
+        let port = format!("--port={}", env.path_argument("none"));
         let outcome = env.run(&[&["simulate", &port], flags].concat());
-        assert_eq!(outcome.code, Some(78), "{outcome}");
-        assert!(outcome.errors.contains(says), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(78), "{outcome}");
+        assert!(outcome.stderr.contains(message), "{outcome}");
     };
     for family in ["scip", "cola"] {
         refused(&[&format!("--family={family}")], "one of: lms, ld, rplidar");
@@ -87,15 +87,15 @@ fn a_scanner_that_never_listens_speaks_at_once_and_others_are_refused() {
 }
 
 #[test]
-fn an_rplidar_answers_and_streams_in_the_mode_that_it_was_asked_for() {
+fn rplidar_streams_in_the_requested_mode_and_replies() {
     let env = TestEnv::new();
     let flags = ["--family=rplidar", "--model=a3", "--mode=Stability", "--state=streaming"];
     let simulator = env.simulator(&["front"], &flags);
     let mut port = open_line(&env.path("front"), 256_000);
     let mut bytes: Vec<u8> = Vec::new();
-    let mut read = |what: &str, port: &mut std::fs::File, is_there: &dyn Fn(&[u8]) -> bool| {
+    let mut read = |description: &str, port: &mut std::fs::File, is_there: &dyn Fn(&[u8]) -> bool| {
         bytes.clear();
-        until(what, || {
+        wait_until(description, || {
             let mut buffer = [0; 4_096];
             let len = port.read(&mut buffer).unwrap_or(0);
             bytes.extend(&buffer[..len]);
@@ -109,8 +109,8 @@ fn an_rplidar_answers_and_streams_in_the_mode_that_it_was_asked_for() {
     port.write_all(&[0xA5, 0x84, 4, 0x7C, 0, 0, 0, 0xA5 ^ 0x84 ^ 4 ^ 0x7C]).expect("room");
     let answer = [0xA5, 0x5A, 6, 0, 0, 0, 0x20, 0x7C, 0, 0, 0, 4, 0];
     read("an answer", &mut port, &|bytes| bytes.ends_with(&answer));
-    assert_eq!(simulator.end(TERM).code, Some(0));
-    assert_eq!(env.simulated("front").1, 0);
+    assert_eq!(simulator.end(TERM).exit_code, Some(0));
+    assert_eq!(env.simulator_totals("front").1, 0);
 }
 
 #[test]
@@ -134,7 +134,7 @@ fn a_hub_reads_sensors_behind_tcp() {
         assert!(info["port"] == front.as_str() || info["port"] == side.as_str(), "{info}");
     }
     for program in [hub, lms, ld] {
-        assert_eq!(program.end(TERM).code, Some(0));
+        assert_eq!(program.end(TERM).exit_code, Some(0));
     }
 }
 
@@ -144,16 +144,16 @@ fn packets_that_a_hub_recorded_are_sent_again() {
     let simulator = env.simulator(&["front"], &["--family=ld", "--model=ld19"]);
     let hub = env.hub(&[&env.link("front"), "--set=link.front.family=ld"]);
     env.await_info("front", |info| info["state"] == "streaming");
-    let file = env.word("day.mcap");
+    let file = env.path_argument("day.mcap");
     let outcome = env.run(&["record", "-o", &file, "front/telegram", "-n", "200"]);
-    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     for program in [hub, simulator] {
-        assert_eq!(program.end(TERM).code, Some(0));
+        assert_eq!(program.end(TERM).exit_code, Some(0));
     }
     let sent: Vec<_> = env.truth("front").into_iter().map(|sent| sent.hash).collect();
     let again = env.simulator(&["again"], &["--family=ld", "--replay", &file, "--sensor=front"]);
-    until("packets are sent again", || env.truth("again").len() > 100);
-    assert_eq!(again.end(TERM).code, Some(0));
+    wait_until("packets are sent again", || env.truth("again").len() > 100);
+    assert_eq!(again.end(TERM).exit_code, Some(0));
     let replayed: Vec<_> = env.truth("again").into_iter().map(|sent| sent.hash).collect();
     // In their order, and nothing else.
     let mut rest = sent.iter();
@@ -162,24 +162,24 @@ fn packets_that_a_hub_recorded_are_sent_again() {
 
 /// A host that stopped in the middle of a request and finds no answer is told why.
 #[test]
-fn a_request_that_is_dropped_is_said() {
+fn dropped_request_is_reported_with_its_reason() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--seed=3"]);
     let mut port = open_line(&env.path("front"), 9_600);
     // A status request (Telegram listing, 31h), its second half far too late.
     port.write_all(&[0x02, 0x00, 0x01]).expect("room");
-    let_pass(Duration::from_secs(1));
+    wait_at_least(Duration::from_secs(1));
     port.write_all(&[0x00, 0x31, 0x15, 0x12]).expect("room");
     // A whole one, at once: its ACK says that all before it was heard.
     port.write_all(&[0x02, 0x00, 0x01, 0x00, 0x31, 0x15, 0x12]).expect("room");
     let mut acknowledge = [0];
-    until("an answer", || port.read(&mut acknowledge).is_ok_and(|len| len > 0));
+    wait_until("an answer", || port.read(&mut acknowledge).is_ok_and(|len| len > 0));
     assert_eq!(acknowledge, [0x06]);
     let outcome = simulator.end(TERM);
-    let said = format!(
+    let message = format!(
         "{}: a request was dropped: more than 6 ms of silence after 3 of its bytes",
-        env.word("front")
+        env.path_argument("front")
     );
-    assert_eq!(outcome.code, Some(0));
-    assert!(outcome.errors.contains(&said), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(0));
+    assert!(outcome.stderr.contains(&message), "{outcome}");
 }

@@ -2,45 +2,48 @@
 
 use std::process::{Command, Output};
 
-use crate::testkit::{only, output, own_program, skip, skip_verdict};
+use crate::testkit::{output, own_program, single_test_args, skip, skip_verdict};
 
 /// Set where the test is to be left out.
-const INSIDE: &str = "SCANHUB_TEST_SKIP";
+const RERUN_VARIABLE: &str = "SCANHUB_TEST_SKIP";
 
 #[test]
-fn what_is_required_is_not_left_out() {
-    let said = skip_verdict("", "tmux", "there is none");
-    assert_eq!(said, Ok("skipped for want of tmux: there is none".to_owned()));
+fn required_tool_may_not_be_skipped() {
+    let verdict = skip_verdict("", "tmux", "there is none");
+    assert_eq!(verdict, Ok("skipped for want of tmux: there is none".to_owned()));
     assert!(skip_verdict("cc,tshark", "tmux", "there is none").is_ok());
     for required in ["tmux", "cc,tmux", " cc , tmux ,"] {
-        let said = skip_verdict(required, "tmux", "there is none").expect_err(required);
-        assert_eq!(said, "tmux is required here by SCANHUB_REQUIRE: there is none");
+        let message = skip_verdict(required, "tmux", "there is none").expect_err(required);
+        assert_eq!(message, "tmux is required here by SCANHUB_REQUIRE: there is none");
     }
     // A name with a slip in it would require nothing.
     for (required, need) in [("tmuks", "tmux"), ("", "tmuks"), ("tmux,netn", "cc")] {
-        let said = skip_verdict(required, need, "there is none").expect_err(required);
-        assert!(said.contains("is nothing that a test needs; there are bash, cc, "), "{said}");
+        let message = skip_verdict(required, need, "there is none").expect_err(required);
+        assert!(message.contains("is nothing that a test needs; there are bash, cc, "), "{message}");
     }
 }
 
 #[test]
 fn a_test_that_is_left_out_says_so_or_fails() {
-    if std::env::var_os(INSIDE).is_some() {
+    if std::env::var_os(RERUN_VARIABLE).is_some() {
         return skip("tmux", "as if there were none");
     }
     let again = |required: &str| -> Output {
         let mut command = Command::new(own_program());
         // What passes is not shown by itself.
-        command.args(&only("skips::a_test_that_is_left_out_says_so_or_fails")[..2]);
-        command.env(INSIDE, "1").env("SCANHUB_REQUIRE", required).env_remove("RUST_TEST_NOCAPTURE");
+        command.args(&single_test_args("skips::a_test_that_is_left_out_says_so_or_fails")[..2]);
+        command.env(RERUN_VARIABLE, "1").env("SCANHUB_REQUIRE", required).env_remove("RUST_TEST_NOCAPTURE");
         output(command).expect("it runs")
     };
     let left_out = again("cc");
     assert!(left_out.status.success(), "{left_out:?}");
-    let said = String::from_utf8_lossy(&left_out.stderr).into_owned();
-    assert_eq!(said, "skipped for want of tmux: as if there were none\n");
+    let errors = String::from_utf8_lossy(&left_out.stderr).into_owned();
+    assert_eq!(errors, "skipped for want of tmux: as if there were none\n");
     let failed = again("cc,tmux");
     assert!(!failed.status.success(), "{failed:?}");
-    let said = String::from_utf8_lossy(&failed.stdout).into_owned();
-    assert!(said.contains("tmux is required here by SCANHUB_REQUIRE: as if there were none"), "{said}");
+    let output_text = String::from_utf8_lossy(&failed.stdout).into_owned();
+    assert!(
+        output_text.contains("tmux is required here by SCANHUB_REQUIRE: as if there were none"),
+        "{output_text}"
+    );
 }

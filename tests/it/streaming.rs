@@ -2,11 +2,12 @@
 //! arrives, bit for bit and in order, and all verbs tell the same of it.
 
 use crate::testkit::{
-    INT, MEASURED, REAL_ANSWERS, TERM, TestEnv, bytes_of, hash, is_class, number, sequence,
+    INT, MEASURED_VALUES, REAL_REPLY_TIME, TERM, TestEnv, bytes_of, contiguous_numbers, hash, is_class,
+    number,
 };
 use scanhub_drivers::lms;
-use scanhub_drivers::lms::framer::{Found, Framer};
-use scanhub_drivers::lms::measured::Measured;
+use scanhub_drivers::lms::framer::{Framer, FramerEvent};
+use scanhub_drivers::lms::measured::MeasuredValues;
 use scanhub_drivers::lms::telegram::Telegram;
 use scanhub_schema::Topic;
 use serde_json::Value;
@@ -17,37 +18,37 @@ fn everything_sent_arrives_bit_for_bit_and_in_order() {
     let hub = env.hub(&[env.link("front"), env.link("rear")]);
     let sensors = ["front", "rear"];
     // They listen before anything is sent: nothing may be missing from the very first on.
-    let mut consumers =
+    let mut subscribers =
         sensors.map(|sensor| ["telegram", "scan"].map(|topic| env.echo(&[&format!("{sensor}/{topic}")])));
-    let simulator = env.simulator(&sensors, &["--seed=11", REAL_ANSWERS]);
-    for [telegrams, scans] in &mut consumers {
-        telegrams.await_lines(300, "a measured telegram", |line| line["command"] == MEASURED);
+    let simulator = env.simulator(&sensors, &["--seed=11", REAL_REPLY_TIME]);
+    for [telegrams, scans] in &mut subscribers {
+        telegrams.await_lines(300, "a measured telegram", |line| line["command"] == MEASURED_VALUES);
         scans.await_lines(300, "a scan", is_class("scan"));
     }
-    for (sensor, [telegrams, scans]) in sensors.into_iter().zip(consumers) {
+    for (sensor, [telegrams, scans]) in sensors.into_iter().zip(subscribers) {
         let truth = env.truth(sensor);
         let telegrams = telegrams.end(INT).of_class("telegram");
         let scans = scans.end(INT).of_class("scan");
         let intact: Vec<_> =
             truth.iter().filter(|sent| sent.is_intact_scan()).map(|sent| &sent.hash).collect();
-        let measured: Vec<_> = telegrams.iter().filter(|line| line["command"] == MEASURED).collect();
+        let measured: Vec<_> = telegrams.iter().filter(|line| line["command"] == MEASURED_VALUES).collect();
         let arrived: Vec<_> = measured.iter().map(|line| hash(&bytes_of(line))).collect();
         let span = intact.len().min(arrived.len());
         assert!(span >= 300, "{} sent, {} received", intact.len(), arrived.len());
         assert!(arrived[..span].iter().eq(intact[..span].iter().copied()), "not what {sensor} sent");
-        assert_eq!(sequence(&telegrams, "seq")[0], 0);
-        assert_eq!(sequence(&telegrams, "topic_seq")[0], 0);
-        assert_eq!(sequence(&scans, "topic_seq")[0], 0);
+        assert_eq!(contiguous_numbers(&telegrams, "seq")[0], 0);
+        assert_eq!(contiguous_numbers(&telegrams, "topic_seq")[0], 0);
+        assert_eq!(contiguous_numbers(&scans, "topic_seq")[0], 0);
         for (scan, telegram) in scans.iter().zip(measured) {
             assert_eq!(scan["seq"], telegram["seq"]);
             assert_eq!(scan["stamp_ns"], telegram["stamp_ns"]);
             check_scan(scan, &bytes_of(telegram));
         }
     }
-    assert_eq!(hub.end(TERM).code, Some(0));
-    assert_eq!(simulator.end(TERM).code, Some(0));
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
+    assert_eq!(simulator.end(TERM).exit_code, Some(0));
     for sensor in sensors {
-        let (sent, eeprom_writes) = env.simulated(sensor);
+        let (sent, eeprom_writes) = env.simulator_totals(sensor);
         assert_eq!((sent, eeprom_writes), (env.truth(sensor).len() as u64, 0));
     }
 }
@@ -56,7 +57,7 @@ fn everything_sent_arrives_bit_for_bit_and_in_order() {
 /// says.
 fn check_scan(scan: &Value, telegram: &[u8]) {
     let telegram = Telegram::check(telegram).expect("was checked");
-    let measured = Measured::decode(telegram).expect("a measured telegram");
+    let measured = MeasuredValues::decode(telegram).expect("a measured telegram");
     let values = |key: &str| scan[key].as_array().unwrap_or_else(|| panic!("no {key}: {scan}")).clone();
     let (ranges, levels, mut codes) = (values("ranges"), values("intensities"), values("codes").into_iter());
     assert_eq!((ranges.len(), levels.len()), (measured.count(), measured.count()));
@@ -76,7 +77,7 @@ fn check_scan(scan: &Value, telegram: &[u8]) {
 }
 
 #[test]
-fn the_bytes_themselves_and_what_all_verbs_say_agree() {
+fn verbs_agree_on_rate_state_and_counters() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--seed=12", "--baud=500000"]);
     let hub = env.hub(&[env.link("front")]);
@@ -85,7 +86,7 @@ fn the_bytes_themselves_and_what_all_verbs_say_agree() {
     let rate = env.run(&["hz", "front/scan", "--json", "-n", "60"]);
     let summary = &rate.of_class("summary")[0];
     assert_eq!(
-        (rate.code, number(summary, "received"), number(summary, "missed")),
+        (rate.exit_code, number(summary, "received"), number(summary, "missed")),
         (Some(0), 60, 0),
         "{rate}"
     );
@@ -97,8 +98,8 @@ fn the_bytes_themselves_and_what_all_verbs_say_agree() {
     assert_eq!(number(&listed[0], "subscribers"), 1, "{listed:?}");
     let info = env.await_info("front", |info| info["hz"].as_f64().is_some_and(|hz| hz > 0.0));
     // Two looks at the same stream; neither is exact on a busy machine.
-    let told = info["hz"].as_f64().unwrap_or_default();
-    assert!((told / hz - 1.0).abs() < 0.3, "info says {told}, hz {hz}");
+    let hz_of_info = info["hz"].as_f64().unwrap_or_default();
+    assert!((hz_of_info / hz - 1.0).abs() < 0.3, "info says {hz_of_info}, hz {hz}");
     let facts = ["state", "baud", "mode", "unit_mm", "angle_deg", "last_error"].map(|key| info[key].clone());
     let expected: [Value; 6] =
         ["streaming".into(), 500_000.into(), 1.into(), 1.into(), 180.into(), "".into()];
@@ -114,29 +115,29 @@ fn the_bytes_themselves_and_what_all_verbs_say_agree() {
     assert_eq!((counter("rejected_crc"), counter("loan_failed"), counter("reconnects")), (0, 0, 0));
 
     let outcome = raw.end(INT);
-    assert_eq!(outcome.code, Some(0));
-    let (telegrams, rest) = frame(&outcome.out);
+    assert_eq!(outcome.exit_code, Some(0));
+    let (telegrams, rest) = frame(&outcome.stdout);
     assert!(telegrams >= 40 && rest == 0, "{telegrams} telegrams and {rest} other bytes");
-    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
 }
 
 /// Telegrams in `bytes`, and how many bytes are in none.
 fn frame(mut bytes: &[u8]) -> (u64, u64) {
     let mut framer = Framer::default();
     while !bytes.is_empty() {
-        let spare = framer.spare();
+        let spare = framer.read_buffer();
         let len = spare.len().min(bytes.len());
         spare[..len].copy_from_slice(&bytes[..len]);
         bytes = &bytes[len..];
         framer.commit(len);
         while let Some(found) = framer.poll() {
-            assert!(matches!(found, Found::Telegram(_)));
+            assert!(matches!(found, FramerEvent::Telegram(_)));
         }
     }
     // Nothing follows that could refute the last one.
-    framer.release(lms::framer::VETO_HOLD);
+    framer.release(lms::framer::VETO_HOLD_TIME);
     while framer.poll().is_some() {}
-    let tally = framer.tally();
+    let tally = framer.counters();
     (tally.telegrams, tally.read - tally.in_telegrams)
 }
 

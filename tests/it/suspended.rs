@@ -2,7 +2,9 @@
 //! delivered, what it had no room for is lost and counted, and then it goes on as if nothing had been. And a listener:
 //! what waited for it is not new.
 
-use crate::testkit::{INT, Sender, TERM, TestEnv, bytes_of, hash, in_a_network, is_class, number, until};
+use crate::testkit::{
+    INT, TERM, TestEnv, TestGateway, bytes_of, hash, in_a_network, is_class, number, wait_until,
+};
 use rustix::process::Signal;
 use rustix::time::{ClockId, clock_gettime};
 use scanhub_schema::{Topic, Verdict, Zones};
@@ -13,23 +15,23 @@ fn a_hub_that_was_stopped() {
     let env = TestEnv::new();
     let simulator = env.simulator_on_real_lines(&["front"], &["--seed=31", "--baud=500000"]);
     let hub = env.hub(&[env.lms_link("front")]);
-    let mut consumer = env.echo(&["front/telegram", "front/scan", "front/zones", "front/status"]);
-    consumer.await_lines(20, "a telegram", is_class("telegram"));
-    let stopped = now();
+    let mut subscriber = env.echo(&["front/telegram", "front/scan", "front/zones", "front/status"]);
+    subscriber.await_lines(20, "a telegram", is_class("telegram"));
+    let stopped = now_ns();
     hub.signal(Signal::STOP);
     let lost = |env: &TestEnv| env.truth("front").iter().filter(|sent| sent.fault.is_some()).count();
     let before = lost(&env);
     // The buffer is full, and more than a second passes.
-    until("telegrams are lost", || lost(&env) > before + 50);
-    let continued = now();
+    wait_until("telegrams are lost", || lost(&env) > before + 50);
+    let continued = now_ns();
     hub.signal(Signal::CONT);
-    consumer.await_lines(60, "a telegram", is_class("telegram"));
+    subscriber.await_lines(60, "a telegram", is_class("telegram"));
     let info = env.await_info("front", |info| number(&info["counters"], "bytes_discarded") > 0);
     assert_eq!((&info["state"], number(&info["counters"], "resyncs")), (&"streaming".into(), 0), "{info}");
-    assert_eq!(hub.end(TERM).code, Some(0));
-    assert_eq!(simulator.end(INT).code, Some(0));
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
+    assert_eq!(simulator.end(INT).exit_code, Some(0));
 
-    let outcome = consumer.end(INT);
+    let outcome = subscriber.end(INT);
     let lines = outcome.of_class("telegram");
     let got: Vec<String> = lines.iter().map(|line| hash(&bytes_of(line))).collect();
     let truth = env.truth("front");
@@ -74,38 +76,38 @@ fn a_hub_that_was_stopped() {
 }
 
 /// CLOCK_MONOTONIC, as in the truth and in stamps.
-fn now() -> u64 {
+fn now_ns() -> u64 {
     let now = clock_gettime(ClockId::Monotonic);
     now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
 }
 
 #[test]
-fn what_waited_for_a_listener_that_was_stopped_is_not_new() {
-    in_a_network("suspended::what_waited_for_a_listener_that_was_stopped_is_not_new", || {
+fn datagram_for_a_stopped_listener_keeps_arrival_time() {
+    in_a_network("suspended::datagram_for_a_stopped_listener_keeps_arrival_time", || {
         let env = TestEnv::new();
         let mut listener = env.start(&["listen", "--json"]).ready();
-        let mut sender = Sender::new(0x5f3a_12bc_00d1_e2f3, 7, 2, "front");
+        let mut sender = TestGateway::new(0x5f3a_12bc_00d1_e2f3, 7, 2, "front");
         // Sends to a listener that is stopped for a while; its stamp, and when it was sent.
         let mut stop = || {
             listener.signal(Signal::STOP);
             // Otherwise, a listener that still runs receives the datagram at once.
-            until("the listener is stopped", || listener.is_stopped());
-            let before = now();
+            wait_until("the listener is stopped", || listener.is_stopped());
+            let before = now_ns();
             sender.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
-            let after = now();
-            until("a stamp of later would be wrong", || now() > after + 200_000_000);
+            let after = now_ns();
+            wait_until("a stamp of later would be wrong", || now_ns() > after + 200_000_000);
             listener.signal(Signal::CONT);
             let line = listener.await_line("zones", is_class("zones"));
             // The kernel tells of another clock.
             (line, before - 1_000_000..after + 100_000_000)
         };
         // It begins to look at the clock some time after the first socket of the machine asked for that.
-        until("the kernel stamps what comes", || {
+        wait_until("the kernel stamps what comes", || {
             let (line, possible) = stop();
             possible.contains(&number(&line, "stamp_ns"))
         });
         let (line, possible) = stop();
         assert!(possible.contains(&number(&line, "stamp_ns")), "{line} is not of {possible:?}");
-        assert_eq!(listener.end(INT).code, Some(0));
+        assert_eq!(listener.end(INT).exit_code, Some(0));
     });
 }

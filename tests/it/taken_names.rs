@@ -5,50 +5,51 @@ use std::sync::atomic::{AtomicU32, Ordering};
 
 use serde_json::{Value, json};
 
-use crate::testkit::{INT, KILL, Outcome, Program, TERM, TestEnv, is_class, scan, sequence};
+use crate::testkit::{INT, KILL, Outcome, Program, TERM, TestEnv, contiguous_numbers, is_class, scan};
 
 /// A simulated mount whose angles are published as `name`.
-fn mount(env: &TestEnv, name: &str) -> Program {
+fn start_mount(env: &TestEnv, name: &str) -> Program {
     static NEXT: AtomicU32 = AtomicU32::new(0);
-    let port = format!("--port={}", env.word(&format!("mount-{}", NEXT.fetch_add(1, Ordering::Relaxed))));
+    let port =
+        format!("--port={}", env.path_argument(&format!("mount-{}", NEXT.fetch_add(1, Ordering::Relaxed))));
     env.start(&["simulate", "--json", "--world=tilt", &port, &format!("--angles={name}")])
 }
 
 /// The message of a process that lacks the name, because `holder` has it.
-fn held(name: &str, holder: &Program) -> String {
+fn name_taken_message(name: &str, holder: &Program) -> String {
     format!("the name {name} is published by process {} (scanhub)", holder.pid())
 }
 
 /// Checks that a program was refused the name. Programs whose output is the line `ready` report errors on stderr.
-fn is_refused(outcome: &Outcome, message: &str) {
-    let mut lines = outcome.errors.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
+fn assert_refused(outcome: &Outcome, message: &str) {
+    let mut lines = outcome.stderr.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
     let error = lines.next_back().unwrap_or_default();
     let expected = (Some(75), &json!("name_held"), &json!(message));
-    assert_eq!((outcome.code, &error["kind"], &error["message"]), expected, "{outcome}");
+    assert_eq!((outcome.exit_code, &error["kind"], &error["message"]), expected, "{outcome}");
 }
 
 #[test]
 fn link_waits_for_the_name_that_a_program_has() {
     for signal in [INT, KILL] {
         let env = TestEnv::new();
-        let holder = mount(&env, "front").ready();
+        let holder = start_mount(&env, "front").ready();
         let _simulator = env.simulator(&["front", "rear"], &["--baud=500000"]);
         let mut hub = env.start(&["run", "--json", &env.link("front"), &env.link("rear")]);
         let ready = hub.await_line("ready", is_class("ready"));
         assert!(ready["waiting"].as_array().is_some_and(|names| names.contains(&json!("front"))), "{ready}");
 
-        let words = held("front", &holder);
+        let words = name_taken_message("front", &holder);
         let info = env.info("front");
         let error = info["last_error"].as_str().unwrap_or_default();
         assert!(info["state"] == "absent" && error.starts_with(&words), "{info}");
         let list = env.run(&["list"]);
-        let listed = String::from_utf8_lossy(&list.out).into_owned();
+        let listed = String::from_utf8_lossy(&list.stdout).into_owned();
         assert!(listed.lines().any(|line| line.starts_with(&format!("front: {words}"))), "{list}");
         // The program keeps its topic, and other links stream.
         env.await_info("rear", |info| info["state"] == "streaming");
         env.echo(&["front/tilt"]).await_lines(20, "angles", is_class("tilt"));
         // A second program gets the same answer as the hub.
-        is_refused(&mount(&env, "front").wait(), &words);
+        assert_refused(&start_mount(&env, "front").wait(), &words);
 
         let mut waiting = env.echo(&["front/scan"]);
         drop(holder.end(signal));
@@ -63,29 +64,29 @@ fn link_waits_for_the_name_that_a_program_has() {
         }
         let scans = waiting.of_class("scan");
         assert_eq!(scans[0]["topic_seq"], 0, "{waiting}");
-        sequence(&scans, "topic_seq");
+        contiguous_numbers(&scans, "topic_seq");
 
         // Now the hub has the name.
-        is_refused(&mount(&env, "front").wait(), &held("front", &hub));
+        assert_refused(&start_mount(&env, "front").wait(), &name_taken_message("front", &hub));
         let outcome = hub.end(TERM);
-        assert_eq!(outcome.code, Some(0), "{outcome}");
-        let lines = outcome.errors.lines().filter(|line| line.contains(&format!("front: absent: {words}")));
+        assert_eq!(outcome.exit_code, Some(0), "{outcome}");
+        let lines = outcome.stderr.lines().filter(|line| line.contains(&format!("front: absent: {words}")));
         assert_eq!(lines.count(), 1, "one line for one reason: {outcome}");
         // The last publisher removes everything, including the files of a killed one.
-        assert_eq!(mount(&env, "front").ready().end(INT).code, Some(0));
-        assert!(env.left_behind().is_empty(), "{:?}", env.left_behind());
+        assert_eq!(start_mount(&env, "front").ready().end(INT).exit_code, Some(0));
+        assert!(env.leftover_files().is_empty(), "{:?}", env.leftover_files());
     }
 }
 
 #[test]
 fn ready_line_names_links_that_wait_for_their_name() {
     let env = TestEnv::new();
-    let _holder = mount(&env, "front").ready();
+    let _holder = start_mount(&env, "front").ready();
     let mut hub = env.start(&["run", &env.link("front"), &env.link("rear")]);
     let ready = hub.next_text();
     let end = "sensors: front, rear; waiting for the port of rear; waiting for the name of front";
     assert!(ready.ends_with(end), "{ready}");
-    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
 }
 
 #[test]
@@ -93,34 +94,34 @@ fn killed_hub_does_not_keep_its_names() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--baud=500000"]);
     let hub = env.hub(&[env.link("front")]);
-    assert_eq!(hub.end(KILL).code, None);
+    assert_eq!(hub.end(KILL).exit_code, None);
     let mut hub = env.start(&["run", "--json", &env.link("front")]);
     let ready = hub.await_line("ready", is_class("ready"));
     assert_eq!(ready["waiting"], Value::Array(Vec::new()), "{ready}");
     let outcome = hub.end(TERM);
-    assert!(outcome.code == Some(0) && !outcome.errors.contains("is published by"), "{outcome}");
+    assert!(outcome.exit_code == Some(0) && !outcome.stderr.contains("is published by"), "{outcome}");
     // Nor does a hub that ended.
-    let holder = mount(&env, "front").ready();
-    assert_eq!(holder.end(INT).code, Some(0));
+    let holder = start_mount(&env, "front").ready();
+    assert_eq!(holder.end(INT).exit_code, Some(0));
 }
 
 #[test]
 fn program_is_refused_the_name_of_another_program() {
     let env = TestEnv::new();
-    let first = mount(&env, "mount").ready();
-    is_refused(&mount(&env, "mount").wait(), &held("mount", &first));
-    assert_eq!(first.end(INT).code, Some(0));
-    let second = mount(&env, "mount").ready();
-    assert_eq!(second.end(INT).code, Some(0));
-    assert!(env.left_behind().is_empty(), "{:?}", env.left_behind());
+    let first = start_mount(&env, "mount").ready();
+    assert_refused(&start_mount(&env, "mount").wait(), &name_taken_message("mount", &first));
+    assert_eq!(first.end(INT).exit_code, Some(0));
+    let second = start_mount(&env, "mount").ready();
+    assert_eq!(second.end(INT).exit_code, Some(0));
+    assert!(env.leftover_files().is_empty(), "{:?}", env.leftover_files());
 }
 
 /// The links of a hub that plays play together, so none of them waits.
 #[test]
 fn recording_is_refused_the_name_of_a_program() {
     let env = TestEnv::new();
-    let holder = mount(&env, "front").ready();
+    let holder = start_mount(&env, "front").ready();
     let port = env.file("front.bin", [scan(1), scan(2)].concat());
     let link = format!("--link=front=file:{port},family=lms");
-    is_refused(&env.run(&["run", "--json", &link]), &held("front", &holder));
+    assert_refused(&env.run(&["run", "--json", &link]), &name_taken_message("front", &holder));
 }

@@ -4,15 +4,15 @@
 use std::io::Write as _;
 use std::process::{Command, Output, Stdio};
 
-use scanhub_drivers::lms::command::{Password, Raw, Request, Span, Spans};
+use scanhub_drivers::lms::command::{Password, RawParameters, Request, SubRange, SubRanges};
 use scanhub_drivers::lms::configuration::{self, Configuration};
 use scanhub_drivers::lms::measured;
 use scanhub_drivers::lms::operating::{self, Operating};
-use scanhub_drivers::lms::reply::{self, Health, Reply};
+use scanhub_drivers::lms::reply::{self, Reply, SimulatedStatus};
 use scanhub_drivers::lms::status::Errors;
-use scanhub_drivers::lms::telegram::Encoded;
+use scanhub_drivers::lms::telegram::EncodedTelegram;
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
-use scanhub_lms_configure::eeprom::{PowerOn, Write};
+use scanhub_lms_configure::eeprom::{EepromWrite, PowerOn};
 use serde_json::Value;
 
 use crate::testkit::spawn;
@@ -47,10 +47,10 @@ fn lines(output: &Output) -> Vec<Value> {
 }
 
 /// Every request and the simpler replies, each with a part of its explanation.
-fn telegrams() -> Vec<(Encoded, &'static str)> {
-    let span = |first, last| Span { first, last };
-    let spans = |spans: &[Span]| Spans::new(spans).expect("one to five");
-    let raw = |bytes: &[u8]| Raw::new(bytes).expect("at most 16 bytes");
+fn telegrams() -> Vec<(EncodedTelegram, &'static str)> {
+    let span = |first, last| SubRange { first, last };
+    let spans = |spans: &[SubRange]| SubRanges::new(spans).expect("one to five");
+    let raw = |bytes: &[u8]| RawParameters::new(bytes).expect("at most 16 bytes");
     let requests = [
         (Request::Reset, "10h reset"),
         (Request::Stream, "all values, continuously"),
@@ -99,16 +99,16 @@ fn telegrams() -> Vec<(Encoded, &'static str)> {
         (Operating::Navigation, "records for navigation"),
         (Operating::Reflectivity(span(1, 181)), "ranges, and reflectivities of a sub-range"),
     ];
-    let factory = configuration::factory(Mode(4), Unit::Cm);
+    let factory = configuration::factory_configuration(Mode(4), Unit::Cm);
     let writes = [
-        (Write::Configuration(&factory), "write of the configuration, part 1"),
-        (Write::Configuration2(&[0, 1]), "write of the configuration, part 2"),
-        (Write::PowerOn(PowerOn::KeepBaud), "write of the rate after power-on"),
-        (Write::Field(&[1]), "write of a field"),
-        (Write::Password(&[1]), "change of the password"),
-        (Write::Teach(&[1]), "teaching of a field"),
+        (EepromWrite::Configuration(&factory), "write of the configuration, part 1"),
+        (EepromWrite::Configuration2(&[0, 1]), "write of the configuration, part 2"),
+        (EepromWrite::PowerOn(PowerOn::KeepBaud), "write of the rate after power-on"),
+        (EepromWrite::Field(&[1]), "write of a field"),
+        (EepromWrite::Password(&[1]), "change of the password"),
+        (EepromWrite::Teach(&[1]), "teaching of a field"),
     ];
-    let health = Health {
+    let health = SimulatedStatus {
         software: *b"V02.30 ",
         operating_mode: operating::ON_REQUEST,
         mode: Mode(0),
@@ -142,9 +142,11 @@ fn telegrams() -> Vec<(Encoded, &'static str)> {
         .map(|(request, headline)| (request.encode(0), headline))
         .collect();
     telegrams.extend(writes.map(|(write, headline)| (write.encode(0).expect("short enough"), headline)));
-    telegrams.extend(replies.map(|(reply, headline)| (reply.encode(0, OK).expect("short enough"), headline)));
-    telegrams.push((measured::encode(0, Unit::Cm, &[100, 8191], OK), "2 in cm"));
-    telegrams.push((reply::status(0, &health, OK), "V02.30, values on request"));
+    telegrams.extend(
+        replies.map(|(reply, headline)| (reply.encode(0, STATUS_OK).expect("short enough"), headline)),
+    );
+    telegrams.push((measured::encode(0, Unit::Cm, &[100, 8191], STATUS_OK), "2 in cm"));
+    telegrams.push((reply::status_reply(0, &health, STATUS_OK), "V02.30, values on request"));
     telegrams
 }
 
@@ -177,18 +179,18 @@ fn text_and_bytes_are_the_same() {
     assert_eq!(text(&of_text.stdout), text(&of_bytes.stdout));
     let expected = "       0     7 bytes  31h status, to all sensors\n";
     assert!(text(&of_text.stdout).starts_with(expected), "{}", text(&of_text.stdout));
-    let reply = reply::mode(5, true, OK);
+    let reply = reply::mode_reply(5, true, STATUS_OK);
     let line = &lines(&telegram(&["decode", "--json"], reply.bytes()))[0];
     assert_eq!((&line["from"], &line["address"]), (&"sensor".into(), &5.into()));
 }
 
 #[test]
-fn what_is_between_telegrams_is_told() {
+fn bytes_between_telegrams_are_listed() {
     let mut bytes = vec![0x55, 0x55];
     bytes.extend(Request::Stop.encode(0).bytes());
     bytes.push(0x06);
-    bytes.extend(reply::mode(0, true, OK).bytes());
-    let mut damaged = reply::refused(0, OK).bytes().to_vec();
+    bytes.extend(reply::mode_reply(0, true, STATUS_OK).bytes());
+    let mut damaged = reply::refusal(0, STATUS_OK).bytes().to_vec();
     damaged[7] ^= 0xFF;
     bytes.extend(&damaged);
     let decoded = lines(&telegram(&["decode", "--json"], &bytes));
@@ -201,14 +203,14 @@ fn what_is_between_telegrams_is_told() {
 
 #[test]
 fn values_are_read_as_the_telegrams_tell() {
-    let mut bytes = measured::encode(0, Unit::Mm, &[0x83E8, 200], OK).bytes().to_vec();
+    let mut bytes = measured::encode(0, Unit::Mm, &[0x83E8, 200], STATUS_OK).bytes().to_vec();
     let unknown = lines(&telegram(&["decode", "--json"], &bytes));
     let values = |line: &Value| line["fields"].as_array().expect("fields")[5].clone();
     assert_eq!(values(&unknown[0])["mm"], serde_json::json!([1000, 200]));
     assert!(values(&unknown[0])["words"].as_str().expect("words").contains("mode unknown"));
-    let said = lines(&telegram(&["decode", "--json", "--mode", "0x0F"], &bytes));
-    assert!(values(&said[0])["words"].as_str().expect("words").ends_with("15 bits"));
-    bytes.splice(0..0, reply::configuration(0, Mode(5), Unit::Mm, OK).bytes().iter().copied());
+    let with_mode = lines(&telegram(&["decode", "--json", "--mode", "0x0F"], &bytes));
+    assert!(values(&with_mode[0])["words"].as_str().expect("words").ends_with("15 bits"));
+    bytes.splice(0..0, reply::configuration_reply(0, Mode(5), Unit::Mm, STATUS_OK).bytes().iter().copied());
     let learned = lines(&telegram(&["decode", "--json"], &bytes));
     assert!(
         values(&learned[1])["words"].as_str().expect("words").contains("15 bits and 1 of reflector level")
@@ -239,7 +241,7 @@ fn the_telegrams_inside_a_recording_are_decoded() {
     let chosen = telegram(&["decode", "--json", "--sensor=rear", golden], &[]);
     assert_eq!(chosen.stdout, output.stdout);
 
-    for (words, input, code, told) in [
+    for (words, input, code, message) in [
         (&["decode", golden, "--sensor=left"][..], &b""[..], 3, "has no sensor \"left\""),
         (&["decode", "--sensor=front"], b"", 2, "stdin is not one"),
         (&["decode"], &bytes, 66, "name its file"),
@@ -247,13 +249,13 @@ fn the_telegrams_inside_a_recording_are_decoded() {
         let output = telegram(words, input);
         let errors = text(&output.stderr);
         assert_eq!(output.status.code(), Some(code), "{words:?}: {errors}");
-        assert!(errors.contains(told), "{words:?}: {errors}");
+        assert!(errors.contains(message), "{words:?}: {errors}");
     }
 }
 
 #[test]
 fn refusals_have_a_remedy() {
-    for (words, code, told) in [
+    for (words, code, message) in [
         (&["decode", "/nowhere/at/all"][..], 66, "/nowhere/at/all: No such file"),
         (&["decode", "--mode", "x"], 78, "is not a byte"),
         (&["decode"], 5, "no telegram in 0 bytes"),
@@ -261,7 +263,7 @@ fn refusals_have_a_remedy() {
         let output = telegram(words, &[]);
         let errors = text(&output.stderr);
         assert_eq!(output.status.code(), Some(code), "{words:?}: {errors}");
-        assert!(errors.contains(told), "{words:?}: {errors}");
+        assert!(errors.contains(message), "{words:?}: {errors}");
     }
     let garbled = telegram(&["decode", "--json"], b"02 00 0q");
     assert_eq!(garbled.status.code(), Some(66));
@@ -269,4 +271,4 @@ fn refusals_have_a_remedy() {
 }
 
 /// Status byte of a sensor without a fault.
-const OK: u8 = 0x10;
+const STATUS_OK: u8 = 0x10;

@@ -7,11 +7,11 @@ use crate::testkit::{Outcome, TERM, TestEnv};
 use scanhub_drivers::lms::telegram::Writer;
 
 /// C0, DEL and C1, as a terminal takes them for a command.
-const HOSTILE: &str = "\u{1b}]0;x\u{7}\u{9b}31m\u{7f}\u{85}\u{9d}";
+const CONTROL_CHARACTERS: &str = "\u{1b}]0;x\u{7}\u{9b}31m\u{7f}\u{85}\u{9d}";
 
 /// There is text alone, but for the ends of lines.
-fn is_text(outcome: &Outcome) {
-    for text in [String::from_utf8_lossy(&outcome.out).into_owned(), outcome.errors.clone()] {
+fn assert_printable(outcome: &Outcome) {
+    for text in [String::from_utf8_lossy(&outcome.stdout).into_owned(), outcome.stderr.clone()] {
         let control = text.chars().find(|&c| c.is_control() && c != '\n');
         assert_eq!(control, None, "{:?}", text);
     }
@@ -20,7 +20,7 @@ fn is_text(outcome: &Outcome) {
 #[test]
 fn a_configuration_commands_no_terminal() {
     let env = TestEnv::new();
-    let quoted: String = HOSTILE.chars().map(|c| format!("\\u{:04x}", c as u32)).collect();
+    let quoted: String = CONTROL_CHARACTERS.chars().map(|c| format!("\\u{:04x}", c as u32)).collect();
     let port = format!("/dev/{quoted}");
     let sound = env.file(
         "sound.toml",
@@ -30,7 +30,7 @@ fn a_configuration_commands_no_terminal() {
     let raw = env.file("raw.toml", "[[link]]\nname = \"a\"\npo\u{1b}[2Jrt = 1\n");
     let value = env.file("value.toml", "[[link]]\nname = \"\u{9b}31m\"\nport = \"x\"\n");
     let key = env.file("key.toml", "[[link]]\n\"\u{9b}31m\\u001b\" = 1\n");
-    let name = env.word(&format!("{HOSTILE}.toml"));
+    let name = env.path_argument(&format!("{CONTROL_CHARACTERS}.toml"));
     fs::write(&name, "nothing = 1\n").expect("a file of any name");
     for json in [&[][..], &["--json"]] {
         let with = |words: &[&str]| env.run(&[words, json].concat());
@@ -45,35 +45,35 @@ fn a_configuration_commands_no_terminal() {
             (66, with(&["convert", &name, "x.mcap"])),
             (4, with(&["probe", &name])),
         ] {
-            assert_eq!(outcome.code, Some(code), "{outcome}");
-            is_text(&outcome);
+            assert_eq!(outcome.exit_code, Some(code), "{outcome}");
+            assert_printable(&outcome);
         }
     }
     // JSON says what is there.
     let outcome = env.run(&["config", "check", &sound, "--json"]);
-    assert_eq!(outcome.lines()[0]["links"][0]["port"], format!("/dev/{HOSTILE}"), "{outcome}");
+    assert_eq!(outcome.lines()[0]["links"][0]["port"], format!("/dev/{CONTROL_CHARACTERS}"), "{outcome}");
     // The log of a hub, its status, and who shows that.
     let hub = env.hub(&["--config", &sound]);
     for verb in
         [&["info", "a"][..], &["info", "a", "--json"], &["list"], &["echo", "a/status", "-n1", "--json"]]
     {
         let outcome = env.run(verb);
-        assert_eq!(outcome.code, Some(0), "{outcome}");
-        is_text(&outcome);
+        assert_eq!(outcome.exit_code, Some(0), "{outcome}");
+        assert_printable(&outcome);
     }
     let outcome = hub.end(TERM);
-    assert!(outcome.errors.contains("no such port"), "{outcome}");
-    is_text(&outcome);
+    assert!(outcome.stderr.contains("no such port"), "{outcome}");
+    assert_printable(&outcome);
 }
 
 #[test]
 fn a_line_commands_no_terminal() {
     let env = TestEnv::new();
-    let bytes = Writer::new(0x80, 0xBA).slice(HOSTILE.as_bytes()).byte(0x10).finish();
+    let bytes = Writer::new(0x80, 0xBA).slice(CONTROL_CHARACTERS.as_bytes()).byte(0x10).finish();
     let file = env.file("type.bin", bytes.bytes());
     for flags in [&[][..], &["--all"], &["--json"]] {
         let outcome = env.run(&[&["telegram", "decode", &file], flags].concat());
-        assert_eq!(outcome.code, Some(0), "{outcome}");
-        is_text(&outcome);
+        assert_eq!(outcome.exit_code, Some(0), "{outcome}");
+        assert_printable(&outcome);
     }
 }

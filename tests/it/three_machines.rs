@@ -6,18 +6,18 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use crate::testkit::{
-    INT, KILL, Machine, Outcome, Program, Sitting, TestEnv, can_sit, in_a_network, is_class, number, skip,
-    until,
+    INT, KILL, Machine, Outcome, Program, TerminalSession, TestEnv, can_open_terminal, in_a_network,
+    is_class, number, skip, wait_until,
 };
 
 /// The program `scanhub-bridge`, where it was built: `cargo build` alone does not.
 fn bridge_program() -> Option<PathBuf> {
-    let beside = Path::new(env!("CARGO_BIN_EXE_scanhub")).with_file_name("scanhub-bridge");
-    if !beside.is_file() {
+    let default_path = Path::new(env!("CARGO_BIN_EXE_scanhub")).with_file_name("scanhub-bridge");
+    if !default_path.is_file() {
         skip("bridge", "there is no scanhub-bridge beside the program (cargo build -p scanhub-bridge)");
         return None;
     }
-    Some(beside)
+    Some(default_path)
 }
 
 /// The program with these flags, in the network and domain of `env`.
@@ -47,11 +47,14 @@ fn bridge(env: &TestEnv, flags: &[&str]) -> (Program, String) {
 }
 
 /// What a bridge that is only to be checked finds: the state and the words of each finding.
-fn checked(env: &TestEnv, flags: &[&str]) -> (Option<i32>, Vec<(String, String)>) {
+fn run_check(env: &TestEnv, flags: &[&str]) -> (Option<i32>, Vec<(String, String)>) {
     let outcome: Outcome = Program::start(command(env, &[&["--json", "--check"], flags].concat())).wait();
-    let said = |line: &serde_json::Value, key: &str| line[key].as_str().unwrap_or_default().to_owned();
+    let text_of = |line: &serde_json::Value, key: &str| line[key].as_str().unwrap_or_default().to_owned();
     let findings = outcome.of_class("bridge_check");
-    (outcome.code, findings.iter().map(|line| (said(line, "state"), said(line, "finding"))).collect())
+    (
+        outcome.exit_code,
+        findings.iter().map(|line| (text_of(line, "state"), text_of(line, "finding"))).collect(),
+    )
 }
 
 #[test]
@@ -61,7 +64,8 @@ fn two_rooms_are_watched_from_a_third_machine() {
             return;
         }
         let machines = [2, 3, 4].map(Machine::new);
-        let to: Vec<String> = machines.iter().map(|it| format!("--connect=tcp/{}:7447", it.here())).collect();
+        let to: Vec<String> =
+            machines.iter().map(|it| format!("--connect=tcp/{}:7447", it.test_address())).collect();
         let middle = TestEnv::new();
         let router = || bridge(&middle, &["--listen=tcp/0.0.0.0:7447"]).0;
         let first = router();
@@ -82,7 +86,10 @@ fn two_rooms_are_watched_from_a_third_machine() {
         for room in ["room0.front", "room1.front"] {
             let ages = watcher.run(&["latency", &format!("{room}/scan"), "-n20", "--json"]);
             let line = ages.of_class("latency").pop();
-            assert!(ages.code == Some(0) && line.is_some_and(|line| number(&line, "received") > 0), "{ages}");
+            assert!(
+                ages.exit_code == Some(0) && line.is_some_and(|line| number(&line, "received") > 0),
+                "{ages}"
+            );
         }
         let (mut near, mut far) = (rooms[1].echo(&["front/scan"]), watcher.echo(&["room1.front/scan"]));
         let scan = near.await_lines(10, "a scan", is_class("scan")).pop().expect("ten");
@@ -90,17 +97,17 @@ fn two_rooms_are_watched_from_a_third_machine() {
             |line: &serde_json::Value| line["class"] == "scan" && number(line, "seq") >= number(&scan, "seq");
         let same = far.await_line("the same or a newer scan", is_it);
         assert!(same["seq"] != scan["seq"] || same["ranges"] == scan["ranges"], "{same}");
-        if can_sit() {
-            let watch = Sitting::start(&watcher.command(&["watch"]), (100, 30));
-            watch.await_words("room0.front");
-            watch.await_words("room1.front");
+        if can_open_terminal() {
+            let watch = TerminalSession::start(&watcher.command(&["watch"]), (100, 30));
+            watch.wait_for_text("room0.front");
+            watch.wait_for_text("room1.front");
         }
-        let (code, found) = checked(&watcher, &[&to[2]]);
+        let (code, found) = run_check(&watcher, &[&to[2]]);
         assert!(code == Some(0) && found.len() == 1 && found[0].0 == "ok", "{found:?}");
         assert!(bridges.iter().all(|(_, hub)| found[0].1.contains(hub)), "{found:?}");
 
         // The picture's places are free only after who publishes cleaned up behind it.
-        until("the picture is gone", || watcher.subscribers("room0.front/zones") == 0);
+        wait_until("the picture is gone", || watcher.subscribers("room0.front/zones") == 0);
 
         // Without the router the rooms go on by themselves, and nobody elsewhere believes an old verdict.
         let mut zones = watcher.echo(&["room0.front/zones"]);
@@ -108,7 +115,7 @@ fn two_rooms_are_watched_from_a_third_machine() {
         let mut local = rooms[0].start(&["hz", "--json", "front/scan"]);
         drop(first.end(KILL));
         zones.await_line("nothing is known", |line| line["class"] == "zones" && line["verdict"] == "unknown");
-        let (code, found) = checked(&watcher, &[&to[2]]);
+        let (code, found) = run_check(&watcher, &[&to[2]]);
         assert!(code == Some(5) && found[0].0 == "failed" && found[0].1.contains("no router"), "{found:?}");
         let second = router();
         zones.await_line("a verdict again", |line| line["class"] == "zones" && line["verdict"] != "unknown");
@@ -121,9 +128,11 @@ fn two_rooms_are_watched_from_a_third_machine() {
         }
         for ((program, _), hub) in bridges.into_iter().zip(hubs) {
             drop(program.end(INT));
-            assert_eq!(hub.end(INT).code, Some(0));
+            assert_eq!(hub.end(INT).exit_code, Some(0));
         }
         drop(sensors);
-        until("nothing is left", || rooms.iter().chain([&watcher]).all(|env| env.left_behind().is_empty()));
+        wait_until("nothing is left", || {
+            rooms.iter().chain([&watcher]).all(|env| env.leftover_files().is_empty())
+        });
     });
 }

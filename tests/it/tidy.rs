@@ -5,19 +5,19 @@ mod between;
 mod crates;
 mod eeprom;
 mod families;
+mod inside_files;
 mod keys;
+mod pages;
 mod sources;
 mod topics;
 mod tree;
 mod verbs;
-mod within;
-mod written;
 
-use tree::{Tree, Wall};
+use tree::{Rule, SourceTree};
 
 /// The wall stands in `tree` and would be missed in each of `broken`.
-fn holds(wall: Wall, broken: impl Fn(&Tree) -> Vec<Tree>) {
-    let tree = Tree::load();
+fn assert_rule(wall: Rule, broken: impl Fn(&SourceTree) -> Vec<SourceTree>) {
+    let tree = SourceTree::load();
     let breaches = wall(&tree);
     assert!(breaches.is_empty(), "{}", breaches.join("\n"));
     for (number, broken) in broken(&tree).iter().enumerate() {

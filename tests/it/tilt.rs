@@ -8,15 +8,15 @@ use scanhub_schema::Tilt;
 use scanhub_sim::world::World;
 use serde_json::Value;
 
-use crate::pages::{commands_on, programs_on};
-use crate::publishers::{Mount, languages};
-use crate::recorded_world::{BEGIN_NS, recorded_world};
+use crate::pages::{commands_on, examples_on};
+use crate::publishers::{TestPublisher, languages};
+use crate::recorded_world::{START_NS, recorded_world};
 use crate::testkit::{INT, Outcome, Program, TestEnv, is_class, number};
-use crate::tilted::Made;
+use crate::tilted::TiltedPublisher;
 
 /// A hall with a post ahead of a sensor that swings slowly: how late the hub stamps scans on a busy machine moves
 /// points little.
-const WORLD: &str = "
+const TILT_WORLD: &str = "
 [[sensor]]
 pose = [0, 0, 90]
 [sensor.mount]
@@ -37,28 +37,28 @@ pose = [0, 1500]
 ";
 
 /// The post, as somebody says who wants nothing to stand there.
-pub(crate) const NEAR: &str = "--near=1,2,-0.5,0.5,0.1,0.7";
+pub(crate) const NEAR_FLAG: &str = "--near=1,2,-0.5,0.5,0.1,0.7";
 
-pub(crate) struct Hall {
+pub(crate) struct TiltHub {
     pub(crate) env: TestEnv,
     hub: Program,
     simulator: Option<Program>,
 }
 
-impl Hall {
-    pub(crate) fn new() -> Hall {
-        Hall::of_encoder("mount")
+impl TiltHub {
+    pub(crate) fn new() -> TiltHub {
+        TiltHub::with_encoder("mount")
     }
 
     /// One where the mount's encoder has this name.
-    fn of_encoder(name: &str) -> Hall {
+    fn with_encoder(name: &str) -> TiltHub {
         let env = TestEnv::new();
-        let world = env.file("hall.toml", WORLD);
+        let world = env.file("hall.toml", TILT_WORLD);
         let flags = [format!("--world={world}"), format!("--angles={name}"), "--baud=500000".into()];
         let simulator = env.simulator(&["front"], &flags);
         let hub = env.hub(&[env.link("front")]);
         env.await_info("front", |info| info["state"] == "streaming");
-        Hall { env, hub, simulator: Some(simulator) }
+        TiltHub { env, hub, simulator: Some(simulator) }
     }
 
     pub(crate) fn tilt(&self, more: &[&str]) -> Program {
@@ -72,25 +72,25 @@ fn tilt(env: &TestEnv, more: &[&str]) -> Program {
 }
 
 /// Plays a recording of `world` again and again. Its stamps are exact, however busy the machine is.
-fn replayed(env: &TestEnv, world: &str) -> Program {
+fn replay_tilt(env: &TestEnv, world: &str) -> Program {
     let file = recorded_world(env, &World::of_toml("hall", world).expect("a world"), &["front"], 20);
     env.start(&["replay", &file, "--loop", "--json", "--no-system-config"]).ready()
 }
 
 /// How far a point is from floor, walls and post.
-fn off(point: &[f64]) -> f64 {
+fn distance_from_wall(point: &[f64]) -> f64 {
     let [x, y, z] = point[..] else { panic!("{point:?}") };
     let post = ((x - 1.5).hypot(y) - 0.1).abs();
     let walls = [(x - 4.0).abs(), (x + 2.0).abs(), (y - 3.0).abs(), (y + 3.0).abs()];
     walls.into_iter().chain([post, z.abs()]).fold(f64::INFINITY, f64::min)
 }
 
-fn has_obstacle(line: &Value) -> bool {
+fn has_obstacles(line: &Value) -> bool {
     is_class("obstacles")(line) && line["obstacles"] != Value::Array(Vec::new())
 }
 
 /// Whether it ended with an error that has these words.
-fn is_told(outcome: &Outcome, words: &str) -> bool {
+fn reports_error(outcome: &Outcome, words: &str) -> bool {
     outcome.of_class("error").iter().any(|line| line["message"].to_string().contains(words))
 }
 
@@ -99,12 +99,12 @@ pub(crate) fn numbers(list: &Value) -> Vec<f64> {
 }
 
 #[test]
-fn points_are_where_things_are_and_the_post_is_an_obstacle() {
-    let hall = Hall::new();
-    let mut tilt = hall.tilt(&["--as=hall", NEAR]);
+fn points_match_the_hall_and_the_post_is_an_obstacle() {
+    let hall = TiltHub::new();
+    let mut tilt = hall.tilt(&["--as=hall", NEAR_FLAG]);
     tilt.await_line("a sweep", is_class("obstacles"));
     let mut clouds = hall.env.echo(&["hall/cloud"]);
-    let found = tilt.await_line("the post", has_obstacle);
+    let found = tilt.await_line("the post", has_obstacles);
     assert_eq!(found["sensor"], "hall", "{found}");
     let post = found["obstacles"].as_array().expect("a list").first().expect("the post");
     let [x, y] = ["x_m", "y_m"].map(|key| post[key].as_f64().expect("a number"));
@@ -126,68 +126,68 @@ fn points_are_where_things_are_and_the_post_is_an_obstacle() {
     assert!(firsts == 1 && of_sweep[0]["first"] == true, "{firsts}");
     let points = clouds.iter().flat_map(|line| line["points"].as_array().expect("a list")).map(numbers);
     let points: Vec<Vec<f64>> = points.collect();
-    let mut off: Vec<f64> = points.iter().map(|point| off(point)).collect();
+    let mut off: Vec<f64> = points.iter().map(|point| distance_from_wall(point)).collect();
     off.sort_by(f64::total_cmp);
     // A machine that stands still stamps scans late.
     assert!(off[off.len() * 9 / 10] < 0.08, "{:?}", [off[off.len() / 2], off[off.len() * 9 / 10]]);
     // Beside the others: a mount, a tracker's place, and what is made of both; a name has one publisher.
     let again = hall.tilt(&["--as=hall"]).wait();
     let held = |name: &str, pid: u32| format!("the name {name} is published by process {pid} (scanhub)");
-    assert!(again.code == Some(75) && is_told(&again, &held("hall", tilt.pid())), "{again}");
+    assert!(again.exit_code == Some(75) && reports_error(&again, &held("hall", tilt.pid())), "{again}");
     let taken = hall.tilt(&["--as=front"]).wait();
-    assert!(taken.code == Some(75) && is_told(&taken, &held("front", hall.hub.pid())), "{taken}");
+    assert!(taken.exit_code == Some(75) && reports_error(&taken, &held("front", hall.hub.pid())), "{taken}");
     let outcome = tilt.end(INT);
-    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let sum = &outcome.of_class("summary")[0];
     assert!(
         number(sum, "sweeps") > 2 && number(sum, "points") > 1_000 && number(sum, "angles") > 100,
         "{sum}"
     );
-    ends_well(hall);
+    end_cleanly(hall);
 }
 
 #[test]
 fn the_programs_of_the_page_say_how_a_mount_stands() {
     let page = TestEnv::new();
-    for example in programs_on("docs/tilt.md", "mount", &page) {
+    for example in examples_on("docs/tilt.md", "mount", &page) {
         // An interrupted program leaves its topic in its domain until the next program replaces it.
         let env = TestEnv::new();
         let _hub = env.hub(&[env.link("front")]);
         let mount = Program::start(example.command(&env));
         let mut echo = env.echo(&["mount/tilt"]);
         let angle_deg = |line: &Value| line["angle_deg"].as_f64().expect("a number");
-        let lines = echo.await_lines(50, &example.place, is_class("tilt"));
+        let lines = echo.await_lines(50, &example.location, is_class("tilt"));
         let is_right = |line: &Value| (0.0..28.7).contains(&angle_deg(line)) && line["rate_deg_s"].is_null();
-        assert!(lines.iter().all(is_right), "{}: {lines:?}", example.place);
-        assert!(angle_deg(&lines[0]) != angle_deg(&lines[49]), "{}: it stands", example.place);
+        assert!(lines.iter().all(is_right), "{}: {lines:?}", example.location);
+        assert!(angle_deg(&lines[0]) != angle_deg(&lines[49]), "{}: it stands", example.location);
         let outcome = mount.end(INT);
         // An interrupt ends a program in Python with words.
-        assert!(outcome.errors.is_empty() || outcome.errors.contains("KeyboardInterrupt"), "{outcome}");
+        assert!(outcome.stderr.is_empty() || outcome.stderr.contains("KeyboardInterrupt"), "{outcome}");
     }
 }
 
 /// A servo or an encoder whose program is not in Rust: it hears the encoder of the world, and says it again.
 #[test]
-fn programs_in_other_languages_say_how_a_mount_stands_and_the_post_is_an_obstacle() {
-    let hall = Hall::of_encoder("encoder");
+fn tilt_accepts_angles_of_programs_in_all_languages() {
+    let hall = TiltHub::with_encoder("encoder");
     for start in languages(&hall.env) {
-        let mut mount = Mount::publishing(start("mount"));
-        let mut tilt = hall.tilt(&[NEAR]);
+        let mut mount = TestPublisher::start_and_publish(start("mount"));
+        let mut tilt = hall.tilt(&[NEAR_FLAG]);
         let mut encoder =
-            Subscriber::<Tilt>::builder("encoder").in_domain(&hall.env.place()).open().expect("a name");
-        let mut said = 0;
+            Subscriber::<Tilt>::builder("encoder").in_domain(&hall.env.domain()).open().expect("a name");
+        let mut sent = 0;
         let found = loop {
-            assert!(said < 10_000, "no obstacle in so many angles");
-            said += 1;
+            assert!(sent < 10_000, "no obstacle in so many angles");
+            sent += 1;
             let angle = encoder.next().expect("a domain").expect("without a timeout");
             mount.send(&angle, angle.header().stamp_first_ns);
             drop(angle);
-            if tilt.is_heard(has_obstacle) {
+            if tilt.prints(has_obstacles) {
                 break tilt.end(INT);
             }
         };
-        assert_eq!(mount.end().code, Some(0));
-        let obstacles = found.of_class("obstacles").into_iter().find(has_obstacle).expect("the post");
+        assert_eq!(mount.end().exit_code, Some(0));
+        let obstacles = found.of_class("obstacles").into_iter().find(has_obstacles).expect("the post");
         let [x, y] = ["x_m", "y_m"].map(|key| obstacles["obstacles"][0][key].as_f64().expect("a number"));
         assert!((x - 1.42).abs() < 0.1 && y.abs() < 0.1, "{obstacles}");
         let sum = &found.of_class("summary")[0];
@@ -196,49 +196,49 @@ fn programs_in_other_languages_say_how_a_mount_stands_and_the_post_is_an_obstacl
             ["angles_out_of_order", "angles_in_future", "angles_invalid"].map(|key| number(sum, key));
         assert_eq!(invalid, [0; 3], "{sum}");
     }
-    ends_well(hall);
+    end_cleanly(hall);
 }
 
-pub(crate) fn ends_well(hall: Hall) {
+pub(crate) fn end_cleanly(hall: TiltHub) {
     let outcome = hall.hub.end(INT);
-    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
 }
 
 #[test]
 fn the_page_leads_to_an_obstacle() {
-    let hall = Hall::new();
+    let hall = TiltHub::new();
     let lines = commands_on("docs/tilt.md", &["scanhub tilt front --angles", "scanhub echo hall/"]);
     // `--check` on the page has a test of its own.
     let [tilt, echo, _] = &lines[..] else { panic!("{lines:?}") };
     let start = |words: &[String]| hall.env.start(&[words, &["--json".to_owned()]].concat());
     let mut tilt = start(tilt);
-    tilt.await_line("an obstacle", has_obstacle);
+    tilt.await_line("an obstacle", has_obstacles);
     let mut echo = start(echo);
-    echo.await_line("an obstacle", has_obstacle);
-    assert_eq!((tilt.end(INT).code, echo.end(INT).code), (Some(0), Some(0)));
-    ends_well(hall);
+    echo.await_line("an obstacle", has_obstacles);
+    assert_eq!((tilt.end(INT).exit_code, echo.end(INT).exit_code), (Some(0), Some(0)));
+    end_cleanly(hall);
 }
 
 #[test]
 fn a_recording_has_three_dimensions() {
     let env = TestEnv::new();
-    let file = recorded_world(&env, &World::of_toml("hall", WORLD).expect("a world"), &["front"], 12);
+    let file = recorded_world(&env, &World::of_toml("hall", TILT_WORLD).expect("a world"), &["front"], 12);
     let player = env.start(&["replay", &file, "--paused", "--json", "--no-system-config"]).ready();
     let mut echo = env.echo(&["mount/tilt"]);
-    let mut tilt = tilt(&env, &[NEAR]);
+    let mut tilt = tilt(&env, &[NEAR_FLAG]);
     env.await_info("front", |info| info["state"] == "paused");
-    assert_eq!(env.run(&["control", "front", "resume"]).code, Some(0));
+    assert_eq!(env.run(&["control", "front", "resume"]).exit_code, Some(0));
     let angles = echo.await_lines(100, "angles", is_class("tilt"));
     for pair in angles.windows(2) {
         // At rate 1, the times between stamps are those of the recording.
         assert_eq!(number(&pair[1], "stamp_ns") - number(&pair[0], "stamp_ns"), 10_000_000, "{pair:?}");
         assert_eq!(number(&pair[1], "wall_ns") - number(&pair[0], "wall_ns"), 10_000_000, "{pair:?}");
     }
-    assert!((BEGIN_NS..BEGIN_NS + 12_000_000_000).contains(&number(&angles[0], "wall_ns")), "{}", angles[0]);
+    assert!((START_NS..START_NS + 12_000_000_000).contains(&number(&angles[0], "wall_ns")), "{}", angles[0]);
     assert!(angles[0]["flags"].to_string().contains("replayed"), "{}", angles[0]);
-    tilt.await_line("the post", has_obstacle);
+    tilt.await_line("the post", has_obstacles);
     let played = player.wait();
-    assert_eq!(played.code, Some(0), "{played}");
+    assert_eq!(played.exit_code, Some(0), "{played}");
     let outcome = tilt.end(INT);
     let sum = &outcome.of_class("summary")[0];
     // Four whole sweeps are enough to notice stamps that are 8 ms off.
@@ -252,35 +252,35 @@ fn a_recording_has_three_dimensions() {
 #[test]
 fn a_check_reports_a_wrong_level() {
     let env = TestEnv::new();
-    let world = WORLD.replace("to_deg = 24", "to_deg = 36").replace("deg_s = 12", "deg_s = 36");
-    let player = replayed(&env, &world);
+    let world = TILT_WORLD.replace("to_deg = 24", "to_deg = 36").replace("deg_s = 12", "deg_s = 36");
+    let player = replay_tilt(&env, &world);
     let state = |outcome: &Outcome, name: &str| {
         let lines = outcome.of_class("tilt_check");
         let line = lines.into_iter().find(|line| line["name"] == name);
         line.unwrap_or_else(|| panic!("no {name}: {outcome}"))
     };
     let well = tilt(&env, &["--check"]).wait();
-    assert!(well.code == Some(0) && well.of_class("tilt_check").len() == 4, "{well}");
+    assert!(well.exit_code == Some(0) && well.of_class("tilt_check").len() == 4, "{well}");
     assert!(state(&well, "arm")["state"] == "ok" && well.of_class("obstacles").is_empty(), "{well}");
     let wrong = tilt(&env, &["--check", "--level=0.05"]).wait();
     let level = state(&wrong, "level");
-    assert!(wrong.code == Some(5) && level["state"] == "failed", "{wrong}");
+    assert!(wrong.exit_code == Some(5) && level["state"] == "failed", "{wrong}");
     let remedy = level["remedy"].as_str().and_then(|remedy| remedy.strip_prefix("--level "));
     let right: f64 = remedy.and_then(|number| number.parse().ok()).expect("a number");
     assert!(right.abs() < 0.01, "{level}");
     let short = tilt(&env, &["--check", "--for=1s"]).wait();
-    assert!(short.code == Some(3) && format!("{short}").contains("of 6 whole sweeps"), "{short}");
-    assert_eq!(player.end(INT).code, Some(0));
+    assert!(short.exit_code == Some(3) && format!("{short}").contains("of 6 whole sweeps"), "{short}");
+    assert_eq!(player.end(INT).exit_code, Some(0));
 }
 
 #[test]
-fn a_recorded_mount_whose_name_another_program_has_is_refused() {
+fn replay_refuses_a_mount_name_that_is_in_use() {
     let env = TestEnv::new();
-    let file = recorded_world(&env, &World::of_toml("hall", WORLD).expect("a world"), &["front"], 2);
-    let _made = Made::beside(&env);
+    let file = recorded_world(&env, &World::of_toml("hall", TILT_WORLD).expect("a world"), &["front"], 2);
+    let _made = TiltedPublisher::start_publisher(&env);
     let refused = env.run(&["replay", &file, "--json", "--no-system-config"]);
     assert!(
-        refused.code == Some(75) && format!("{refused}").contains("the name mount is published by"),
+        refused.exit_code == Some(75) && format!("{refused}").contains("the name mount is published by"),
         "{refused}"
     );
 }
@@ -288,9 +288,9 @@ fn a_recorded_mount_whose_name_another_program_has_is_refused() {
 #[test]
 fn stamps_of_angles_that_are_late_are_reported() {
     let fault = r#"faults = [{ kind = "stamps_late", by_s = 0.1 }]"#;
-    let world = WORLD.replace("deg_s = 12", &format!("deg_s = 12\n{fault}"));
+    let world = TILT_WORLD.replace("deg_s = 12", &format!("deg_s = 12\n{fault}"));
     let env = TestEnv::new();
-    let player = replayed(&env, &world);
+    let player = replay_tilt(&env, &world);
     let mut tilt = tilt(&env, &[]);
     let is_late = |line: &Value| is_class("angles")(line) && line["late_ms"] != 0.0;
     let late = tilt.await_line("the delay", is_late);
@@ -298,26 +298,26 @@ fn stamps_of_angles_that_are_late_are_reported() {
     assert!((98.0..102.0).contains(&late_ms) && late["problem"].is_null(), "{late}");
     let outcome = tilt.end(INT);
     assert!(outcome.of_class("summary")[0]["late_ms"].as_f64().expect("a number") > 98.0, "{outcome}");
-    assert_eq!(player.end(INT).code, Some(0));
+    assert_eq!(player.end(INT).exit_code, Some(0));
 }
 
 #[test]
-fn angles_that_stop_are_told_and_a_name_that_is_not_there_too() {
-    let mut hall = Hall::new();
+fn reports_missing_angles_and_bad_arguments() {
+    let mut hall = TiltHub::new();
     let mut tilt = hall.tilt(&[]);
     tilt.await_line("a sweep", is_class("obstacles"));
     // Whoever says how the mount stands goes away with the simulator; the hub's scans go on from another one.
     drop(hall.simulator.take().map(|simulator| simulator.end(INT)));
     hall.simulator = Some(hall.env.simulator(&["front"], &["--world=room", "--baud=500000"]));
-    let said = tilt.await_line("no angles", |line| is_class("angles")(line) && line["problem"] == "silent");
-    assert_eq!(said["sensor"], "tilted", "it publishes nothing");
+    let report = tilt.await_line("no angles", |line| is_class("angles")(line) && line["problem"] == "silent");
+    assert_eq!(report["sensor"], "tilted", "it publishes nothing");
     let outcome = tilt.end(INT);
     let sum = &outcome.of_class("summary")[0];
-    assert!(outcome.code == Some(0) && number(&sum["points_dropped"], "silent") > 0, "{outcome}");
+    assert!(outcome.exit_code == Some(0) && number(&sum["points_dropped"], "silent") > 0, "{outcome}");
     let none = hall.env.run(&["tilt", "front", "--angles=none", "--axis-at=0,0,1", "--timeout=2s"]);
-    assert!(none.code == Some(3) && none.errors.contains("none"), "{none}");
+    assert!(none.exit_code == Some(3) && none.stderr.contains("none"), "{none}");
     let wrong = hall.env.run(&["tilt", "front", "--angles=mount", "--axis-at=0,0"]);
-    assert!(wrong.code == Some(2) && wrong.errors.contains("expected 3 numbers, found 2"), "{wrong}");
+    assert!(wrong.exit_code == Some(2) && wrong.stderr.contains("expected 3 numbers, found 2"), "{wrong}");
     let nowhere = hall.env.run(&["simulate", "--port=x", "--angles=mount"]);
-    assert!(nowhere.code == Some(2) && nowhere.errors.contains("--world tilt"), "{nowhere}");
+    assert!(nowhere.exit_code == Some(2) && nowhere.stderr.contains("--world tilt"), "{nowhere}");
 }

@@ -5,41 +5,44 @@ use std::cell::RefCell;
 use std::path::Path;
 
 use scanhub_client::{Publication, PublishSession, SensorPublisher};
-use scanhub_schema::datagram::Packed;
+use scanhub_schema::datagram::DatagramPayload;
 use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{
-    Cloud, CloudHead, CloudPoint, Header, Maker, Obstacle, Obstacles, PointClass, Tilt, Wake,
+    Cloud, CloudHead, CloudPoint, Header, Obstacle, Obstacles, PointClass, PublisherKind, Tilt, WakeEvent,
 };
 use serde_json::{Value, json};
 
-use crate::testkit::{INT, Outcome, Program, Recording, TestEnv, client_python, in_a_network, number, until};
+use crate::testkit::{
+    INT, Outcome, Program, Recording, TestEnv, client_python, in_a_network, number, wait_until,
+};
 
 /// What turns a mount and what makes points of it, in one program.
-pub(crate) struct Made {
+pub(crate) struct TiltedPublisher {
     tilt: Publication<Tilt>,
     cloud: Publication<Cloud>,
     obstacles: Publication<Obstacles>,
     mount: SensorPublisher,
     room: SensorPublisher,
-    pub(crate) rounds: u32,
+    pub(crate) round_count: u32,
 }
 
 /// Points of a sample: as many as the beams of an LMS, so that a datagram has no room for them.
-const POINTS: u16 = 401;
+const POINT_COUNT: u16 = 401;
 
-impl Made {
-    pub(crate) fn beside(env: &TestEnv) -> Made {
-        let beside = |name: &str, maker: Maker| {
-            PublishSession::beside(&env.place(), name, maker.topics(), TopicLimits::default()).unwrap()
+impl TiltedPublisher {
+    pub(crate) fn start_publisher(env: &TestEnv) -> TiltedPublisher {
+        let open_publisher = |name: &str, maker: PublisherKind| {
+            PublishSession::open_named(&env.domain(), name, maker.topics(), TopicLimits::default()).unwrap()
         };
-        let (mount, room) = (beside("mount", Maker::Mount), beside("room", Maker::Tilted));
+        let (mount, room) =
+            (open_publisher("mount", PublisherKind::Mount), open_publisher("room", PublisherKind::Tilted));
         let (cloud, obstacles) = (room.topic().unwrap(), room.topic().unwrap());
-        Made { tilt: mount.topic().unwrap(), cloud, obstacles, mount, room, rounds: 0 }
+        TiltedPublisher { tilt: mount.topic().unwrap(), cloud, obstacles, mount, room, round_count: 0 }
     }
 
     /// An angle, obstacles and two clouds, different ones each time.
-    pub(crate) fn round(&mut self) {
-        let (sweep, k) = (self.rounds, self.rounds as f32 / 8.0);
+    pub(crate) fn publish_round(&mut self) {
+        let (sweep, k) = (self.round_count, self.round_count as f32 / 8.0);
         let at = |header: Header, sensor| Header { sensor, ..header };
         let angle = Tilt { angle_rad: 0.5 + f64::from(k), rate_rad_s: [f64::NAN, -0.25][sweep as usize % 2] };
         self.tilt.send_with(&at(self.tilt.header(), 200), |sample| *sample = angle).unwrap();
@@ -57,8 +60,12 @@ impl Made {
         }
         self.obstacles.send_with(&at(self.obstacles.header(), 201), |sample| *sample = found).unwrap();
         for flags in [Cloud::FIRST, Cloud::LAST] {
-            let head =
-                CloudHead { sweep, flags: flags | Cloud::COMPLETE, count: POINTS, ..CloudHead::default() };
+            let head = CloudHead {
+                sweep,
+                flags: flags | Cloud::COMPLETE,
+                count: POINT_COUNT,
+                ..CloudHead::default()
+            };
             let fill = |sample: &mut Cloud| {
                 for (point, beam) in sample.begin(head).iter_mut().zip(0..) {
                     let point_class = PointClass::ALL[usize::from(beam % 4)] as u8;
@@ -67,30 +74,30 @@ impl Made {
                 }
             };
             let header = at(self.cloud.header(), 201);
-            self.cloud.send_len_with(&header, Cloud::len(POINTS.into()), fill).unwrap();
+            self.cloud.send_len_with(&header, Cloud::len(POINT_COUNT.into()), fill).unwrap();
         }
-        self.mount.wake(Wake::Telegram).unwrap();
-        self.room.wake(Wake::Telegram).unwrap();
-        self.rounds += 1;
+        self.mount.wake(WakeEvent::Telegram).unwrap();
+        self.room.wake(WakeEvent::Telegram).unwrap();
+        self.round_count += 1;
     }
 
     /// Publishes until each of `programs` has said lines of every class from rounds that began after all of them had said one.
-    fn until_heard(&mut self, programs: &mut [&mut Program]) {
+    fn publish_until_received(&mut self, programs: &mut [&mut Program]) {
         for since in [0, 1] {
-            let since = since * u64::from(self.rounds);
-            until("all say all classes", || {
-                self.round();
-                let is_new = |line: &Value, class| line["class"] == class && round(line) >= since;
+            let since = since * u64::from(self.round_count);
+            wait_until("all say all classes", || {
+                self.publish_round();
+                let is_new = |line: &Value, class| line["class"] == class && round_of(line) >= since;
                 programs
                     .iter_mut()
-                    .all(|program| CLASSES.iter().all(|class| program.is_heard(|line| is_new(line, *class))))
+                    .all(|program| CLASSES.iter().all(|class| program.prints(|line| is_new(line, *class))))
             });
         }
     }
 }
 
 /// The round in which it was published.
-pub(crate) fn round(line: &Value) -> u64 {
+pub(crate) fn round_of(line: &Value) -> u64 {
     match line["angle_deg"].as_f64() {
         Some(angle_deg) => (8.0 * (angle_deg.to_radians() - 0.5)).round() as u64,
         None => number(line, "sweep"),
@@ -106,11 +113,11 @@ pub(crate) fn hub(env: &TestEnv) -> Program {
 }
 
 /// How many lines of `class` one program has said that another one has, too; what they say of `keys` is the same.
-fn same(one: &Outcome, other: &Outcome, class: &str, keys: &[&str]) -> usize {
+fn assert_same_lines(first: &Outcome, other: &Outcome, class: &str, keys: &[&str]) -> usize {
     let others = other.of_class(class);
     let mut same = 0;
-    for line in one.of_class(class) {
-        let is_same = |other: &&Value| round(other) == round(&line) && other["first"] == line["first"];
+    for line in first.of_class(class) {
+        let is_same = |other: &&Value| round_of(other) == round_of(&line) && other["first"] == line["first"];
         if let Some(other) = others.iter().find(is_same) {
             keys.iter().for_each(|key| assert_eq!(line[*key], other[*key], "{key} of {class}"));
             same += 1;
@@ -123,23 +130,23 @@ fn same(one: &Outcome, other: &Outcome, class: &str, keys: &[&str]) -> usize {
 fn echo_python_and_a_recording_say_the_same() {
     let env = TestEnv::new();
     let _hub = hub(&env);
-    let mut made = Made::beside(&env);
+    let mut made = TiltedPublisher::start_publisher(&env);
     let mut echo = env.echo(&TOPICS);
     let scripts = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/python/tests");
-    let mut follower = client_python().map(|mut command| {
-        let place = env.place();
-        let root = place.root().parent().expect("a domain is below its base");
-        command.arg(scripts.join("follow.py")).arg(place.name()).arg(root).args(TOPICS);
+    let mut subscriber = client_python().map(|mut command| {
+        let domain = env.domain();
+        let root = domain.root().parent().expect("a domain is below its base");
+        command.arg(scripts.join("follow.py")).arg(domain.name()).arg(root).args(TOPICS);
         command.env_remove("SCANHUB_DOMAIN");
         Program::start(command)
     });
-    let file = env.word("tilted.mcap");
+    let file = env.path_argument("tilted.mcap");
     let record = env.start(&[&["record", "--json", "-o", &file][..], &TOPICS].concat());
-    let followers = 2 + u64::from(follower.is_some());
-    until("all follow", || TOPICS.iter().all(|topic| env.subscribers(topic) == followers));
-    made.until_heard(&mut std::iter::once(&mut echo).chain(&mut follower).collect::<Vec<_>>());
+    let subscribers = 2 + u64::from(subscriber.is_some());
+    wait_until("all follow", || TOPICS.iter().all(|topic| env.subscribers(topic) == subscribers));
+    made.publish_until_received(&mut std::iter::once(&mut echo).chain(&mut subscriber).collect::<Vec<_>>());
     let (echo, record) = (echo.end(INT), record.end(INT));
-    assert_eq!(record.code, Some(0), "{record}");
+    assert_eq!(record.exit_code, Some(0), "{record}");
     let line = &echo.of_class("cloud")[0];
     let points = line["points"].as_array().expect("points");
     assert_eq!((points.len(), &points[1], &line["classes"][1]), (401, &json!([0.0, 0.016, 0.5]), &json!(1)));
@@ -147,15 +154,15 @@ fn echo_python_and_a_recording_say_the_same() {
         (&line["sensor"], &line["first"], &line["beams"][400]),
         (&json!("room"), &json!(true), &json!(400))
     );
-    if let Some(follower) = follower.map(|follower| follower.end(INT)) {
+    if let Some(subscriber) = subscriber.map(|subscriber| subscriber.end(INT)) {
         for class in CLASSES {
             let line = echo.of_class(class).remove(0);
             let keys: Vec<&str> = line.as_object().expect("an object").keys().map(String::as_str).collect();
-            assert!(same(&echo, &follower, class, &keys) >= 2, "{class}");
+            assert!(assert_same_lines(&echo, &subscriber, class, &keys) >= 2, "{class}");
         }
     }
     // All were there before the first sample, so that what is kept is what was said.
-    let recording = Recording::whole(file.as_ref());
+    let recording = Recording::read_complete(file.as_ref());
     let [tilt, clouds, obstacles] = TOPICS.map(|topic| recording.of(topic));
     for (i, line) in echo.of_class("cloud").iter().enumerate() {
         let mut cloud = Box::<Cloud>::default();
@@ -178,7 +185,7 @@ fn another_machine_says_the_same() {
     in_a_network("tilted::another_machine_says_the_same", || {
         let (env, there) = (TestEnv::new(), TestEnv::new());
         let _hub = hub(&env);
-        let mut made = Made::beside(&env);
+        let mut made = TiltedPublisher::start_publisher(&env);
         let mut listen = there.start(&["listen", "--json", "--publish"]).ready();
         let lines = there.start(&["listen", "--json"]).ready();
         let mut echo = env.echo(&TOPICS);
@@ -188,10 +195,10 @@ fn another_machine_says_the_same() {
         let names = TOPICS.map(|topic| {
             let (name, topic) = topic.split_once('/').expect("a topic");
             let published = RefCell::default();
-            until("it is published", || {
-                made.round();
+            wait_until("it is published", || {
+                made.publish_round();
                 let is_it = |sensor: &str| sensor.ends_with(&format!(".{name}"));
-                listen.is_heard(|line| {
+                listen.prints(|line| {
                     let sensor = line["sensor"].as_str().filter(|sensor| is_it(sensor));
                     let sensor = sensor.filter(|_| line["kind"] == "published");
                     sensor.is_some_and(|sensor| {
@@ -203,13 +210,16 @@ fn another_machine_says_the_same() {
             published.into_inner()
         });
         let mut again = there.echo(&names.each_ref().map(String::as_str));
-        made.until_heard(&mut [&mut echo, &mut again]);
+        made.publish_until_received(&mut [&mut echo, &mut again]);
         let [echo, again, lines] = [echo, again, lines].map(|program| program.end(INT));
         let keys = ["sweep", "generation", "first", "last", "complete", "points", "beams", "classes"];
         for other in [&lines, &again] {
-            assert!(same(&echo, other, "cloud", &keys) >= 2);
-            assert!(same(&echo, other, "tilt", &["angle_deg", "rate_deg_s"]) >= 1);
-            assert!(same(&echo, other, "obstacles", &["sweep", "complete", "obstacles", "dropped"]) >= 1);
+            assert!(assert_same_lines(&echo, other, "cloud", &keys) >= 2);
+            assert!(assert_same_lines(&echo, other, "tilt", &["angle_deg", "rate_deg_s"]) >= 1);
+            assert!(
+                assert_same_lines(&echo, other, "obstacles", &["sweep", "complete", "obstacles", "dropped"])
+                    >= 1
+            );
         }
         assert!(lines.of_class("cloud").iter().all(|line| line["sensor"] == "room"));
     });

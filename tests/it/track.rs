@@ -6,17 +6,19 @@ use std::sync::Arc;
 use std::sync::mpsc::channel;
 use std::thread;
 
-use crate::pages::programs_on;
-use crate::recorded_world::{BEGIN_NS, recorded_world};
-use crate::testkit::{INT, PATIENCE, Program, TERM, TestEnv, in_own_process, is_class, number, until};
+use crate::pages::examples_on;
+use crate::recorded_world::{START_NS, recorded_world};
+use crate::testkit::{
+    INT, Program, TERM, TestEnv, WAIT_TIMEOUT, in_own_process, is_class, number, wait_until,
+};
 use scanhub_config::Sources;
 use scanhub_daemon::{PlaybackOptions, Player, Replay};
-use scanhub_schema::datagram::Packed;
+use scanhub_schema::datagram::DatagramPayload;
 use scanhub_schema::{Event, EventKind, TrackState, Tracks};
 use scanhub_shm::{Node, Payload, Subscriber};
 use scanhub_sim::world::World;
 
-pub(crate) const SITE: &str = r#"
+pub(crate) const SITE_FILE: &str = r#"
 [[sensor]]
 name = "hall"
 pose = { x = 0.1, y = 0.1, yaw = 0.7854 }
@@ -54,32 +56,32 @@ from_s = 12
 "#;
 
 /// What both sensors see over so many seconds.
-pub(crate) fn recorded(env: &TestEnv, seconds: u64) -> String {
-    recorded_of(env, WORLD, seconds)
+pub(crate) fn record_people(env: &TestEnv, seconds: u64) -> String {
+    record_world(env, WORLD, seconds)
 }
 
-fn recorded_of(env: &TestEnv, world: &str, seconds: u64) -> String {
+fn record_world(env: &TestEnv, world: &str, seconds: u64) -> String {
     let world = World::of_toml("world.toml", world).expect("a world");
     recorded_world(env, &world, &["hall", "kitchen"], seconds)
 }
 
-const LEARNING: &str = "--set=background.scans=100";
+const SHORT_LEARNING: &str = "--set=background.scans=100";
 
 /// A hub that will play `file`, once it is told to.
 pub(crate) fn replay(env: &TestEnv, file: &str) -> Program {
-    env.start(&["replay", file, "--json", "--paused", "--hold", LEARNING]).ready()
+    env.start(&["replay", file, "--json", "--paused", "--hold", SHORT_LEARNING]).ready()
 }
 
 #[test]
-fn somebody_goes_from_room_to_room_and_is_counted() {
+fn person_is_tracked_between_rooms_and_counted_once() {
     let env = TestEnv::new();
-    let site = env.file("site.toml", SITE);
-    let _replay = replay(&env, &recorded(&env, 28));
+    let site = env.file("site.toml", SITE_FILE);
+    let _replay = replay(&env, &record_people(&env, 28));
     let mut counts = env.start(&["track", "--site", &site, "--count=middle", "--delay=2s", "--json"]);
-    let (mut track, _record) = follow_and_record(&env, &site, &env.word("tracks.mcap"));
-    let program = programs_on("docs/tracks.md", "house/tracks", &env).pop();
+    let (mut track, _record) = track_and_record(&env, &site, &env.path_argument("tracks.mcap"));
+    let program = examples_on("docs/tracks.md", "house/tracks", &env).pop();
     let program = program.map(|example| Program::start(example.command(&env)));
-    until("the counts are followed", || {
+    wait_until("the counts are followed", || {
         let listed = env.run(&["list", "--json"]).of_class("topic");
         let scans = listed.iter().filter(|line| line["topic"] == "scan" || line["topic"] == "foreground");
         scans.map(|line| number(line, "subscribers")).all(|subscribers| subscribers == 2)
@@ -87,7 +89,7 @@ fn somebody_goes_from_room_to_room_and_is_counted() {
     for name in ["house", "hall"] {
         let refused = env.run(&["track", "--site", &site, "--as", name, "--for=20s"]);
         let words = format!("the name {name} is published by process ");
-        assert!(refused.code == Some(75) && refused.errors.contains(&words), "{refused}");
+        assert!(refused.exit_code == Some(75) && refused.stderr.contains(&words), "{refused}");
     }
     env.run(&["control", "hall", "resume"]);
     let event =
@@ -109,7 +111,7 @@ fn somebody_goes_from_room_to_room_and_is_counted() {
     assert_eq!((&last["class"], &last["sensor"]), (&"tracks".into(), &"house".into()));
     if let Some(mut program) = program {
         while !program.next_text().contains("1 confirmed kitchen") {}
-        assert_eq!(program.end(TERM).errors, "");
+        assert_eq!(program.end(TERM).stderr, "");
     }
     let outcome = track.end(INT);
     let summary = &outcome.of_class("summary")[0];
@@ -120,64 +122,70 @@ fn somebody_goes_from_room_to_room_and_is_counted() {
 }
 
 /// Follows people under the name `house`, until it misses nothing any more, and records telegrams and tracks to `file`.
-fn follow_and_record(env: &TestEnv, site: &str, file: &str) -> (Program, Program) {
+fn track_and_record(env: &TestEnv, site: &str, file: &str) -> (Program, Program) {
     let track = env.start(&["track", "--site", site, "--as=house", "--delay=2s", "--json"]);
-    await_follower(env);
+    await_tracker(env);
     let topics = ["hall/telegram", "kitchen/telegram", "house/tracks", "house/events"];
     let record = env.start(&[&["record", "--json", "-o", file][..], &topics].concat());
     for topic in topics {
-        until("it is recorded", || env.subscribers(topic) > 0);
+        wait_until("it is recorded", || env.subscribers(topic) > 0);
     }
     (track, record)
 }
 
 /// Waits until the tracker `house` publishes and follows the sensors.
-fn await_follower(env: &TestEnv) {
-    until("the tracker publishes", || {
+fn await_tracker(env: &TestEnv) {
+    wait_until("the tracker publishes", || {
         let listed = env.run(&["list", "--json"]).of_class("topic");
         listed.iter().any(|line| line["sensor"] == "house" && line["topic"] == "events")
     });
     for topic in ["hall/scan", "kitchen/scan", "hall/foreground", "kitchen/foreground"] {
-        until("it follows the sensors", || env.subscribers(topic) > 0);
+        wait_until("it follows the sensors", || env.subscribers(topic) > 0);
     }
 }
 
 /// Times of the wall clock and payloads of a tracker's samples.
-type Published = Vec<(u64, Vec<u8>)>;
+type PublishedSamples = Vec<(u64, Vec<u8>)>;
 
 /// Plays `file` to a tracker, and each telegram only when the tracker has nearly caught up: however busy the machine is, it
 /// misses nothing. Returns the tracks and events that it published of the first twenty seconds of the world.
-fn tracked(env: &TestEnv, site: &str, file: &str) -> [Published; 2] {
+fn track_locally_and_remotely(env: &TestEnv, site: &str, file: &str) -> [PublishedSamples; 2] {
     let sources = Sources { set: vec!["background.scans=100".to_owned()], ..Sources::default() };
     let play = PlaybackOptions { is_paused: true, ..PlaybackOptions::default() };
-    let replay =
-        Replay { file: Path::new(file), sensor: None, family: None, sources: &sources, play, holds: true };
-    let domain = env.place();
-    let (tell, ready) = channel();
+    let replay = Replay {
+        file: Path::new(file),
+        sensor: None,
+        family: None,
+        sources: &sources,
+        options: play,
+        holds: true,
+    };
+    let domain = env.domain();
+    let (sender, ready) = channel();
     thread::scope(|scope| {
         let hub = scope.spawn(|| {
-            scanhub_daemon::replay(&replay, &domain, |_, player| tell.send(player.clone()).expect("waits"))
+            scanhub_daemon::replay(&replay, &domain, |_, player| sender.send(player.clone()).expect("waits"))
         });
-        let player = EndsPlayer(ready.recv_timeout(PATIENCE).expect("is up"));
+        let player = StopPlayerOnDrop(ready.recv_timeout(WAIT_TIMEOUT).expect("is up"));
         let delay = format!("--delay={}ms", DELAY_NS / 1_000_000);
         let track = env.start(&["track", "--site", site, "--as=house", &delay, "--json"]);
-        await_follower(env);
+        await_tracker(env);
         let node = scanhub_shm::client_node(&domain).expect("a node");
         let telegrams = ["hall", "kitchen"].map(|sensor| attach::<[u8]>(&node, sensor));
         let (tracks, events) = (attach::<Tracks>(&node, "house"), attach::<Event>(&node, "house"));
-        let (mut published, mut played_ns) = ([Published::new(), Published::new()], 0);
-        while played_ns < BEGIN_NS + END_NS + DELAY_NS + LEAD_NS {
+        let (mut published, mut played_ns) = ([PublishedSamples::new(), PublishedSamples::new()], 0);
+        while played_ns < START_NS + END_NS + DELAY_NS + LEAD_NS {
             let before = player.0.progress().telegrams;
             player.0.step();
-            until("the next telegram is played", || player.0.progress().telegrams > before);
-            until("the tracker catches up", || {
+            wait_until("the next telegram is played", || player.0.progress().telegrams > before);
+            wait_until("the tracker catches up", || {
                 for telegram in &telegrams {
                     take::<[u8]>(telegram, |wall_ns, _| played_ns = played_ns.max(wall_ns));
                 }
                 take::<Tracks>(&tracks, |wall_ns, payload| published[0].push((wall_ns, packed(payload))));
                 take::<Event>(&events, |wall_ns, payload| published[1].push((wall_ns, packed(payload))));
                 let shown_ns = published[0].last().map(|(wall_ns, _)| wall_ns + LEAD_NS);
-                played_ns < shown_ns.unwrap_or(BEGIN_NS + 1_000_000_000 + FIRST_LEAD_NS) + DELAY_NS
+                played_ns < shown_ns.unwrap_or(START_NS + 1_000_000_000 + FIRST_LEAD_NS) + DELAY_NS
             });
         }
         let outcome = track.end(INT);
@@ -185,7 +193,7 @@ fn tracked(env: &TestEnv, site: &str, file: &str) -> [Published; 2] {
         assert!(["missed", "late", "failed"].iter().all(|key| number(summary, key) == 0), "{summary}");
         drop(player);
         hub.join().expect("ends").expect("ends well");
-        published.iter_mut().for_each(|samples| samples.retain(|(wall_ns, _)| *wall_ns <= BEGIN_NS + END_NS));
+        published.iter_mut().for_each(|samples| samples.retain(|(wall_ns, _)| *wall_ns <= START_NS + END_NS));
         published
     })
 }
@@ -202,9 +210,9 @@ const FIRST_LEAD_NS: u64 = 100_000_000;
 const END_NS: u64 = 20_000_000_000;
 
 /// Ends the player even after a panic, because the test joins the hub's thread.
-struct EndsPlayer(Arc<Player>);
+struct StopPlayerOnDrop(Arc<Player>);
 
-impl Drop for EndsPlayer {
+impl Drop for StopPlayerOnDrop {
     fn drop(&mut self) {
         self.0.end();
     }
@@ -221,7 +229,7 @@ fn take<P: Payload + ?Sized>(from: &Subscriber<P>, mut each: impl FnMut(u64, &P)
     }
 }
 
-fn packed(payload: &impl Packed) -> Vec<u8> {
+fn packed(payload: &impl DatagramPayload) -> Vec<u8> {
     let mut room = vec![0; 100_000];
     let len = payload.pack(&mut room).expect("there is room");
     room.truncate(len);
@@ -229,14 +237,14 @@ fn packed(payload: &impl Packed) -> Vec<u8> {
 }
 
 #[test]
-fn a_replay_of_a_recording_gives_the_same_tracks_bit_for_bit() {
-    in_own_process("track::a_replay_of_a_recording_gives_the_same_tracks_bit_for_bit", || {
+fn replay_gives_identical_tracks_and_events() {
+    in_own_process("track::replay_gives_identical_tracks_and_events", || {
         let env = TestEnv::new();
-        let site = env.file("site.toml", SITE);
-        let file = recorded(&env, 22);
-        let [tracks, events] = tracked(&env, &site, &file);
+        let site = env.file("site.toml", SITE_FILE);
+        let file = record_people(&env, 22);
+        let [tracks, events] = track_locally_and_remotely(&env, &site, &file);
         assert!(tracks.len() > 300 && events.len() >= 2, "{} tracks, {} events", tracks.len(), events.len());
-        let [tracks_again, events_again] = tracked(&env, &site, &file);
+        let [tracks_again, events_again] = track_locally_and_remotely(&env, &site, &file);
         assert!(tracks == tracks_again, "{} and {} tracks", tracks.len(), tracks_again.len());
         assert_eq!(events, events_again);
         // And they say what the lines said.
@@ -257,16 +265,16 @@ fn a_replay_of_a_recording_gives_the_same_tracks_bit_for_bit() {
 
 /// What `track` says on its lines, the program of the page says while it goes on.
 #[test]
-fn events_come_to_a_program_in_python_live_in_order_and_none_is_lost() {
+fn python_program_gets_all_events_live_and_in_order() {
     let env = TestEnv::new();
-    let Some(example) = programs_on("docs/tracks.md", "house/events", &env).pop() else { return };
-    let site = env.file("site.toml", SITE);
+    let Some(example) = examples_on("docs/tracks.md", "house/events", &env).pop() else { return };
+    let site = env.file("site.toml", SITE_FILE);
     let to_and_fro =
         WORLD.replace("[9500, 2000, 60]]", "[9500, 2000], [7000, 2500], [5000, 2500]]\nrepeat = true");
-    let _replay = replay(&env, &recorded_of(&env, &to_and_fro, 45));
-    let (mut track, record) = follow_and_record(&env, &site, &env.word("tracks.mcap"));
+    let _replay = replay(&env, &record_world(&env, &to_and_fro, 45));
+    let (mut track, record) = track_and_record(&env, &site, &env.path_argument("tracks.mcap"));
     let mut program = Program::start(example.command(&env));
-    until("both follow the events", || env.subscribers("house/events") == 2);
+    wait_until("both follow the events", || env.subscribers("house/events") == 2);
     env.run(&["control", "hall", "resume"]);
     let mut doors = 0;
     while doors < 3 {
@@ -280,37 +288,37 @@ fn events_come_to_a_program_in_python_live_in_order_and_none_is_lost() {
         doors += usize::from(kind == "door");
         assert_eq!(program.next_text(), format!("0 missed, {id} {kind} {room}{door}"), "{event}");
     }
-    assert!(!track.is_over() && !program.is_over(), "it was live");
+    assert!(!track.has_ended() && !program.has_ended(), "it was live");
     drop((track, record));
 }
 
 #[test]
-fn what_cannot_be_followed_is_told() {
+fn rejects_unknown_doors_sites_and_sensors() {
     let env = TestEnv::new();
-    let site = env.file("site.toml", SITE);
+    let site = env.file("site.toml", SITE_FILE);
     let wrong = env.run(&["track", "--site", &site, "--count=rear"]);
-    assert_eq!(wrong.code, Some(78), "{wrong}");
-    assert!(wrong.errors.contains("rear") && wrong.errors.contains("middle"), "{wrong}");
-    let missing = env.run(&["track", "--site", &env.word("none.toml")]);
-    assert_eq!(missing.code, Some(66), "{missing}");
+    assert_eq!(wrong.exit_code, Some(78), "{wrong}");
+    assert!(wrong.stderr.contains("rear") && wrong.stderr.contains("middle"), "{wrong}");
+    let missing = env.run(&["track", "--site", &env.path_argument("none.toml")]);
+    assert_eq!(missing.exit_code, Some(66), "{missing}");
     let _hub = env.hub(&[env.link("hall")]);
     let unknown = env.run(&["track", "--site", &site, "--for=20s"]);
-    assert_eq!(unknown.code, Some(3), "{unknown}");
-    assert!(unknown.errors.contains("kitchen") && unknown.errors.contains("hall"), "{unknown}");
+    assert_eq!(unknown.exit_code, Some(3), "{unknown}");
+    assert!(unknown.stderr.contains("kitchen") && unknown.stderr.contains("hall"), "{unknown}");
 }
 
 #[test]
 fn a_plan_is_checked_and_drawn_once() {
     let env = TestEnv::new();
-    let (site, svg) = (env.file("site.toml", SITE), env.word("site.svg"));
+    let (site, svg) = (env.file("site.toml", SITE_FILE), env.path_argument("site.svg"));
     let checked = env.run(&["site", "check", &site, "--svg", &svg, "--json"]);
-    assert_eq!(checked.code, Some(0), "{checked}");
+    assert_eq!(checked.exit_code, Some(0), "{checked}");
     assert_eq!(checked.lines()[0]["doors"][0], "middle");
     let drawn = std::fs::read_to_string(&svg).expect("a drawing");
     assert!(drawn.starts_with("<svg ") && drawn.contains(">kitchen<"), "{drawn}");
-    assert_eq!(env.run(&["site", "check", &site, "--svg", &svg]).code, Some(73), "it is there");
-    let overlapping = env.file("bad.toml", SITE.replace("[[6, 0], [12, 0]", "[[5, 0], [12, 0]"));
+    assert_eq!(env.run(&["site", "check", &site, "--svg", &svg]).exit_code, Some(73), "it is there");
+    let overlapping = env.file("bad.toml", SITE_FILE.replace("[[6, 0], [12, 0]", "[[5, 0], [12, 0]"));
     let refused = env.run(&["site", "check", &overlapping]);
-    assert_eq!(refused.code, Some(78), "{refused}");
-    assert!(refused.errors.contains("bad.toml:13:11: rooms hall and kitchen overlap"), "{refused}");
+    assert_eq!(refused.exit_code, Some(78), "{refused}");
+    assert!(refused.stderr.contains("bad.toml:13:11: rooms hall and kitchen overlap"), "{refused}");
 }

@@ -3,7 +3,7 @@
 
 use crate::pages::text_on;
 use crate::recorded_world::recorded_world;
-use crate::testkit::{INT, Program, TERM, TestEnv, in_a_network, is_class, number, until};
+use crate::testkit::{INT, Program, TERM, TestEnv, in_a_network, is_class, number, wait_until};
 use scanhub_sim::world::World;
 
 const PAGE: &str = "docs/tracks.md";
@@ -42,22 +42,22 @@ fn play(env: &TestEnv, file: &str, sensor: &str) -> Program {
 }
 
 #[test]
-fn somebody_goes_from_the_hall_to_the_kitchen_as_the_page_says() {
-    in_a_network("track_page::somebody_goes_from_the_hall_to_the_kitchen_as_the_page_says", || {
+fn commands_of_the_page_print_its_output() {
+    in_a_network("track_page::commands_of_the_page_print_its_output", || {
         let [robot, kitchen] = [TestEnv::new(), TestEnv::new()];
         let site = robot.file("house.toml", text_on(PAGE, "toml", "[[sensor]]"));
         let checked = robot.run(&["site", "check", &site]);
-        assert_eq!(checked.code, Some(0), "{checked}");
+        assert_eq!(checked.exit_code, Some(0), "{checked}");
 
         let world = World::of_toml("world.toml", WORLD).expect("a world");
         let file = recorded_world(&robot, &world, &["front", "rear"], 30);
         let _played = [play(&robot, &file, "front"), play(&kitchen, &file, "rear")];
         // With a key, a sensor is published before it sends anything: the recordings are still paused.
-        let made = robot.run(&["key", "new", &robot.word("key")]);
-        assert_eq!(made.code, Some(0), "{made}");
-        let key = format!("--key-file={}", robot.word("key"));
+        let made = robot.run(&["key", "new", &robot.path_argument("key")]);
+        assert_eq!(made.exit_code, Some(0), "{made}");
+        let key = format!("--key-file={}", robot.path_argument("key"));
         let mut gateway =
-            kitchen.gateway_at(&["--interface=lo", "--topic=*/scan", "--topic=*/foreground", &key]);
+            kitchen.start_gateway(&["--interface=lo", "--topic=*/scan", "--topic=*/foreground", &key]);
         let hub = gateway.await_line("its begin", is_class("gateway"))["hub"].clone();
         let name = format!("--name=kitchen={}", hub.as_str().expect("the number of a hub"));
         let mut listen = robot.start(&["listen", "--publish", "--json", &name, &key]).ready();
@@ -66,23 +66,23 @@ fn somebody_goes_from_the_hall_to_the_kitchen_as_the_page_says() {
         // Twice as the page has them; both wait longer than it says, for a machine that is busy.
         let mut track = robot.start(&["track", "--site", &site, "--delay=2s"]);
         let count = robot.start(&["track", "--site", &site, "--count", "left", "--delay=2s"]);
-        until("they follow all sensors", || {
+        wait_until("they follow all sensors", || {
             let listed = robot.run(&["list", "--json"]).of_class("topic");
-            let followed = listed
+            let subscribed = listed
                 .iter()
                 .filter(|line| ["scan", "foreground"].iter().any(|topic| line["topic"] == *topic));
-            followed.filter(|line| number(line, "subscribers") == 2).count() == 4
+            subscribed.filter(|line| number(line, "subscribers") == 2).count() == 4
         });
         for (env, sensor) in [(&kitchen, "rear"), (&robot, "front")] {
             let resumed = env.run(&["control", sensor, "resume"]);
-            assert_eq!(resumed.code, Some(0), "{resumed}");
+            assert_eq!(resumed.exit_code, Some(0), "{resumed}");
         }
         for line in text_on(PAGE, "text", "1 appeared in hall").lines() {
             assert_eq!(track.next_text(), line);
         }
-        let sum = String::from_utf8(track.end(INT).out).expect("text");
+        let sum = String::from_utf8(track.end(INT).stdout).expect("text");
         assert!(sum.contains("1 people appeared"), "{sum}");
-        let counted = String::from_utf8(count.end(TERM).out).expect("text");
+        let counted = String::from_utf8(count.end(TERM).stdout).expect("text");
         assert!(counted.starts_with("left: 1 forth, 0 back\n"), "{counted}");
     });
 }

@@ -4,17 +4,18 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::testkit::{
-    INT, Machine, Outcome, Program, Relay, Robot, TERM, TestEnv, in_a_network, is_class, number, read, until,
+    INT, Machine, Outcome, Program, Relay, Robot, TERM, TestEnv, decode_datagram, in_a_network, is_class,
+    number, wait_until,
 };
 use scanhub_schema::Topic;
 use scanhub_schema::datagram::Announce;
 use serde_json::Value;
 
 /// Passed on while the network is rough: some seconds.
-const MANY: usize = 2000;
+const ROUGH_DATAGRAMS: usize = 2000;
 
 /// A sensor's number and a topic's.
-type Stream = (u8, u8);
+type StreamKey = (u8, u8);
 
 /// Sends all that two sensors have.
 fn gateway(robot: &Robot) -> Program {
@@ -26,8 +27,8 @@ fn listener(env: &TestEnv, words: &[&str]) -> Program {
 }
 
 /// What a listener says of each stream: received, lost, duplicate, reordered.
-fn said(outcome: &Outcome, names: &BTreeMap<String, u8>) -> BTreeMap<Stream, [u64; 4]> {
-    assert_eq!(outcome.code, Some(0), "{outcome}");
+fn reported_counters(outcome: &Outcome, names: &BTreeMap<String, u8>) -> BTreeMap<StreamKey, [u64; 4]> {
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let refused = outcome.of_class("lan_refused");
     let counts = refused[0].as_object().expect("an object");
     assert!(counts.values().filter_map(Value::as_u64).all(|count| count == 0), "{counts:?}");
@@ -38,16 +39,16 @@ fn said(outcome: &Outcome, names: &BTreeMap<String, u8>) -> BTreeMap<Stream, [u6
     outcome.of_class("lan").into_iter().map(row).collect()
 }
 
-fn stream(line: &Value, names: &BTreeMap<String, u8>) -> Stream {
+fn stream(line: &Value, names: &BTreeMap<String, u8>) -> StreamKey {
     let text = |key: &str| line[key].as_str().unwrap_or_else(|| panic!("no {key}: {line}"));
     let topic = Topic::parse(text("topic")).map_or(Announce::NUMBER, Topic::number);
     (names[text("sensor")], topic)
 }
 
 /// The numbers of the sensors that are announced in `log`.
-fn names(log: &[Vec<u8>]) -> BTreeMap<String, u8> {
+fn announced_names(log: &[Vec<u8>]) -> BTreeMap<String, u8> {
     let announce = |bytes: &Vec<u8>| {
-        let datagram = read(bytes);
+        let datagram = decode_datagram(bytes);
         let is_one = datagram.head.topic == Announce::NUMBER;
         let announce = is_one.then(|| Announce::unpack(datagram.payload)).flatten()?;
         Some((announce.sensor().to_owned(), datagram.head.sensor))
@@ -56,9 +57,9 @@ fn names(log: &[Vec<u8>]) -> BTreeMap<String, u8> {
 }
 
 /// What one who heard `log` has to say of each stream, as docs/datagram.md defines it: with sets, and all at once.
-fn truth(log: &[Vec<u8>]) -> BTreeMap<Stream, [u64; 4]> {
+fn expected_counters(log: &[Vec<u8>]) -> BTreeMap<StreamKey, [u64; 4]> {
     #[derive(Default)]
-    struct Heard {
+    struct StreamLog {
         numbers: BTreeSet<u32>,
         /// The next number that was announced before anything came.
         announced_first: Option<u32>,
@@ -66,16 +67,16 @@ fn truth(log: &[Vec<u8>]) -> BTreeMap<Stream, [u64; 4]> {
         duplicate: u64,
         reordered: u64,
     }
-    let mut streams: BTreeMap<Stream, Heard> = BTreeMap::new();
+    let mut streams: BTreeMap<StreamKey, StreamLog> = BTreeMap::new();
     for bytes in log {
-        let datagram = read(bytes);
+        let datagram = decode_datagram(bytes);
         let (sensor, topic) = (datagram.head.sensor, datagram.head.topic);
-        let heard = streams.entry((sensor, topic)).or_default();
-        let is_overtaken = heard.numbers.last().is_some_and(|last| *last > datagram.head.sequence);
-        match heard.numbers.insert(datagram.head.sequence) {
-            true => heard.reordered += u64::from(is_overtaken),
+        let log_of_stream = streams.entry((sensor, topic)).or_default();
+        let is_overtaken = log_of_stream.numbers.last().is_some_and(|last| *last > datagram.head.sequence);
+        match log_of_stream.numbers.insert(datagram.head.sequence) {
+            true => log_of_stream.reordered += u64::from(is_overtaken),
             false => {
-                heard.duplicate += 1;
+                log_of_stream.duplicate += 1;
                 continue;
             }
         }
@@ -83,26 +84,27 @@ fn truth(log: &[Vec<u8>]) -> BTreeMap<Stream, [u64; 4]> {
             continue;
         }
         for announced in Announce::unpack(datagram.payload).expect("an announcement").topics() {
-            let heard = streams.entry((sensor, announced.topic)).or_default();
-            if heard.numbers.is_empty() {
-                heard.announced_first.get_or_insert(announced.next);
+            let log_of_stream = streams.entry((sensor, announced.topic)).or_default();
+            if log_of_stream.numbers.is_empty() {
+                log_of_stream.announced_first.get_or_insert(announced.next);
             }
-            heard.announced_last = heard.announced_last.max(announced.next);
+            log_of_stream.announced_last = log_of_stream.announced_last.max(announced.next);
         }
     }
-    let account = |(stream, heard): (Stream, Heard)| {
-        let first = heard.announced_first.into_iter().chain(heard.numbers.first().copied()).min()?;
-        let end = heard.numbers.last().map_or(0, |last| last + 1).max(heard.announced_last);
-        let received = heard.numbers.len() as u64;
+    let counters = |(stream, stream_log): (StreamKey, StreamLog)| {
+        let first =
+            stream_log.announced_first.into_iter().chain(stream_log.numbers.first().copied()).min()?;
+        let end = stream_log.numbers.last().map_or(0, |last| last + 1).max(stream_log.announced_last);
+        let received = stream_log.numbers.len() as u64;
         let lost = u64::from(end - first) - received;
-        (end > first).then_some((stream, [received, lost, heard.duplicate, heard.reordered]))
+        (end > first).then_some((stream, [received, lost, stream_log.duplicate, stream_log.reordered]))
     };
-    streams.into_iter().filter_map(account).collect()
+    streams.into_iter().filter_map(counters).collect()
 }
 
 #[test]
-fn every_listener_knows_exactly_what_it_missed() {
-    in_a_network("two_machines::every_listener_knows_exactly_what_it_missed", || {
+fn listeners_count_exactly_the_datagrams_they_lost() {
+    in_a_network("two_machines::listeners_count_exactly_the_datagrams_they_lost", || {
         let (second, third) = (Machine::new(2), Machine::new(3));
         let robot = Robot::new(&["front", "rear"]);
         let relay = Relay::new(&robot.machine, 7);
@@ -110,28 +112,34 @@ fn every_listener_knows_exactly_what_it_missed() {
         let env = TestEnv::on(&second);
         let early = listener(&env, &["--stats"]);
         let gateway = gateway(&robot);
-        until("all topics of both sensors", || truth(&relay.log()).len() == 2 * (Topic::OF_LINKS.len() + 1));
-        let smooth = relay.log().len();
-        relay.set_rough(true);
-        until("half of what is rough", || relay.log().len() > smooth + MANY / 2);
+        wait_until("all topics of both sensors", || {
+            expected_counters(&relay.forwarded()).len() == 2 * (Topic::OF_LINKS.len() + 1)
+        });
+        let smooth = relay.forwarded().len();
+        relay.set_faulty(true);
+        wait_until("half of what is rough", || relay.forwarded().len() > smooth + ROUGH_DATAGRAMS / 2);
         let env = TestEnv::on(&third);
         let late = listener(&env, &["--stats"]);
         let before_late = relay.connect(&third);
-        until("the other half", || relay.log().len() > before_late + MANY / 2);
+        wait_until("the other half", || relay.forwarded().len() > before_late + ROUGH_DATAGRAMS / 2);
         // The last announcement gets through, so that what was lost at the end is known to be.
-        relay.set_rough(false);
+        relay.set_faulty(false);
         let sent = gateway.end(TERM);
-        assert_eq!(sent.code, Some(0), "{sent}");
+        assert_eq!(sent.exit_code, Some(0), "{sent}");
         let sent: BTreeMap<_, _> = last_of_class(&sent, "lan")
             .iter()
-            .map(|line| (stream(line, &names(&relay.log())), number(line, "sent")))
+            .map(|line| (stream(line, &announced_names(&relay.forwarded())), number(line, "sent")))
             .collect();
-        until("all that was sent", || relay.taken().len() as u64 == sent.values().sum::<u64>());
-        let (log, names) = (relay.log(), names(&relay.log()));
+        wait_until("all that was sent", || relay.received().len() as u64 == sent.values().sum::<u64>());
+        let (log, names) = (relay.forwarded(), announced_names(&relay.forwarded()));
         let (early, late) = (early.end(INT), late.end(INT));
-        let said_early = said(&early, &names);
-        assert_eq!(said_early, truth(&log));
-        assert_eq!(said(&late, &names), truth(&log[before_late..]), "counted from when it joined");
+        let said_early = reported_counters(&early, &names);
+        assert_eq!(said_early, expected_counters(&log));
+        assert_eq!(
+            reported_counters(&late, &names),
+            expected_counters(&log[before_late..]),
+            "counted from when it joined"
+        );
         // Who was there from the begin can tell how much was sent.
         assert_eq!(said_early.len(), sent.len());
         for (stream, [received, lost, ..]) in &said_early {
@@ -140,7 +148,11 @@ fn every_listener_knows_exactly_what_it_missed() {
         let sum = |at: usize| said_early.values().map(|numbers| numbers[at]).sum::<u64>();
         let [received, lost, duplicate, reordered] = std::array::from_fn(sum);
         eprintln!("{received} received, {lost} lost, {duplicate} duplicate, {reordered} reordered");
-        assert!(lost > MANY as u64 / 40 && duplicate > MANY as u64 / 100 && reordered > MANY as u64 / 100);
+        assert!(
+            lost > ROUGH_DATAGRAMS as u64 / 40
+                && duplicate > ROUGH_DATAGRAMS as u64 / 100
+                && reordered > ROUGH_DATAGRAMS as u64 / 100
+        );
     });
 }
 
@@ -153,8 +165,8 @@ fn last_of_class(outcome: &Outcome, class: &str) -> Vec<Value> {
 }
 
 #[test]
-fn a_sensor_of_another_machine_is_followed_as_one_here() {
-    in_a_network("two_machines::a_sensor_of_another_machine_is_followed_as_one_here", || {
+fn remote_sensor_works_like_a_local_one() {
+    in_a_network("two_machines::remote_sensor_works_like_a_local_one", || {
         let second = Machine::new(2);
         let mut robot = Robot::new(&["front", "rear"]);
         let relay = Relay::new(&robot.machine, 7);
@@ -162,11 +174,11 @@ fn a_sensor_of_another_machine_is_followed_as_one_here() {
         let gateway = gateway(&robot);
         let env = TestEnv::on(&second);
         let listener = listener(&env, &["--publish"]);
-        until("the first announcement", || !names(&relay.log()).is_empty());
-        let hub = format!("{:016x}", read(&relay.log()[0]).head.hub);
+        wait_until("the first announcement", || !announced_names(&relay.forwarded()).is_empty());
+        let hub = format!("{:016x}", decode_datagram(&relay.forwarded()[0]).head.hub);
         let (front, rear) = (format!("{hub}.front/scan"), format!("{hub}.rear/zones"));
         let topics = || env.run(&["list", "--json"]).of_class("topic").len();
-        until("both sensors are published", || topics() == 2 * Topic::OF_LINKS.len());
+        wait_until("both sensors are published", || topics() == 2 * Topic::OF_LINKS.len());
         let mut hz = env.start(&["hz", "--json", &front]);
         let mut there = robot.env.echo(&["front/scan"]);
         let mut here = env.echo(&[&front, &rear]);
@@ -186,12 +198,12 @@ fn a_sensor_of_another_machine_is_followed_as_one_here() {
         assert_eq!(rate["missed"], 0, "{rate}");
         // Both ends go; who follows is told.
         drop(there.end(INT));
-        assert_eq!(robot.take_hub().end(TERM).code, Some(0));
+        assert_eq!(robot.take_hub().end(TERM).exit_code, Some(0));
         here.await_line("nothing is known any more", |line| line["verdict"] == "unknown");
-        assert_eq!(gateway.end(TERM).code, Some(0));
-        assert_eq!(listener.end(TERM).code, Some(0));
+        assert_eq!(gateway.end(TERM).exit_code, Some(0));
+        assert_eq!(listener.end(TERM).exit_code, Some(0));
         here.await_line("the news", |line| line["kind"] == "hub_gone");
         drop((here.end(INT), hz.end(INT)));
-        assert!(env.left_behind().is_empty(), "{:?}", env.left_behind());
+        assert!(env.leftover_files().is_empty(), "{:?}", env.leftover_files());
     });
 }

@@ -19,7 +19,7 @@ use serde_json::Value;
 use crate::testkit::{Program, python_for};
 
 /// Half a room's extent along x and y in metres, the sensor off its middle, and a pillar: nothing is alike to any side.
-const ROOM: &str = "
+const ROOM_WORLD: &str = "
 [noise]
 sigma_mm = 0
 bias_mm = 0
@@ -38,53 +38,56 @@ box = [300, 300]
 pose = [700, 800]
 ";
 
-/// Metres from a point to the nearest wall of [`ROOM`].
-fn off(x: f64, y: f64) -> f64 {
+/// Metres from a point to the nearest wall of [`ROOM_WORLD`].
+fn distance_from_walls(x: f64, y: f64) -> f64 {
     let walls = [(x + 1.5).abs(), (x - 2.5).abs(), (y + 1.0).abs(), (y - 3.0).abs()];
-    let (beside, before) = ((x - 0.7).abs() - 0.15, (y - 0.8).abs() - 0.15);
-    let pillar = match beside.max(before) {
+    let (side, before) = ((x - 0.7).abs() - 0.15, (y - 0.8).abs() - 0.15);
+    let pillar = match side.max(before) {
         inside if inside < 0.0 => -inside,
-        _ => beside.max(0.0).hypot(before.max(0.0)),
+        _ => side.max(0.0).hypot(before.max(0.0)),
     };
     walls.into_iter().fold(pillar, f64::min)
 }
 
 /// Serves `unit` at the other end of `pty` until `driver` is over.
-fn serve(unit: &mut RplidarSimulator, pty: &Pty, driver: &Program) {
+fn run_simulator(unit: &mut RplidarSimulator, pty: &Pty, driver: &Program) {
     let mut now = 0;
     let mut unread = Vec::new();
-    while !driver.is_over() {
+    while !driver.has_ended() {
         while unread.is_empty()
             && let Some(chunk) = unit.poll_transmit(now)
         {
             unread = chunk.bytes;
         }
         unread.drain(..pty.write(&unread).expect("the pty is there"));
-        let mut said = [0; 64];
-        let said_len = pty.read(&mut said).expect("the pty is there");
-        let is_heard = pty.rate() == unit.rate();
-        said[..said_len].iter().filter(|_| is_heard).for_each(|byte| unit.receive(*byte, Arrival::at(now)));
-        if said_len > 0 {
+        let mut written = [0; 64];
+        let written_len = pty.read(&mut written).expect("the pty is there");
+        let rates_match = pty.rate() == unit.rate();
+        written[..written_len]
+            .iter()
+            .filter(|_| rates_match)
+            .for_each(|byte| unit.receive(*byte, Arrival::at(now)));
+        if written_len > 0 {
             continue;
         }
         match unit.poll_timeout().filter(|_| unread.is_empty()) {
             Some(due) => now = now.max(due),
             // A port that nobody has open need not be waited for: it says so at once.
-            None if !pty.is_open() => thread::sleep(LOOK),
+            None if !pty.is_open() => thread::sleep(POLL_INTERVAL),
             None => {
-                let wanted = if unread.is_empty() { PollFlags::IN } else { PollFlags::IN | PollFlags::OUT };
-                let mut line = [PollFd::from_borrowed_fd(pty.waits_for(), wanted)];
+                let expected = if unread.is_empty() { PollFlags::IN } else { PollFlags::IN | PollFlags::OUT };
+                let mut line = [PollFd::from_borrowed_fd(pty.wait_fd(), expected)];
                 // An interrupted wait is a short one.
-                let _ = poll(&mut line, Some(&Timespec::try_from(LOOK).expect("a time")));
+                let _ = poll(&mut line, Some(&Timespec::try_from(POLL_INTERVAL).expect("a time")));
             }
         }
     }
 }
 
 #[test]
-fn the_vendors_driver_sees_the_simulated_room_in_every_form_of_packet() {
+fn vendor_driver_reads_the_room_in_all_packet_forms() {
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/it/vendor/scans.py");
-    let world = World::of_toml("room.toml", ROOM).expect("a world");
+    let world = World::of_toml("room.toml", ROOM_WORLD).expect("a world");
     for (model, id, mode, points) in [
         (Model::A1, 0x18, "Standard", 266),
         (Model::A2m8, 0x28, "Express", 394),
@@ -99,12 +102,12 @@ fn the_vendors_driver_sees_the_simulated_room_in_every_form_of_packet() {
         let pty = Pty::open().expect("a pty");
         command.arg(script).arg(pty.name()).args([&model.baud().to_string(), "12"]);
         let driver = Program::start(command);
-        serve(&mut unit, &pty, &driver);
+        run_simulator(&mut unit, &pty, &driver);
         let outcome = driver.wait();
-        assert_eq!((outcome.code, unit.eeprom_writes()), (Some(0), 0), "{}: {outcome}", model.name());
-        let said = outcome.lines().pop().expect("a line");
-        assert_eq!(said["model"], id, "{}", model.name());
-        let scans = said["scans"].as_array().expect("scans");
+        assert_eq!((outcome.exit_code, unit.eeprom_writes()), (Some(0), 0), "{}: {outcome}", model.name());
+        let result = outcome.lines().pop().expect("a line");
+        assert_eq!(result["model"], id, "{}", model.name());
+        let scans = result["scans"].as_array().expect("scans");
         assert_eq!(scans.len(), 12, "{}", model.name());
         let numbers = |value: &Value| -> Vec<f64> {
             value.as_array().expect("numbers").iter().map(|number| number.as_f64().expect("one")).collect()
@@ -113,9 +116,10 @@ fn the_vendors_driver_sees_the_simulated_room_in_every_form_of_packet() {
         for scan in &scans[1..] {
             let (angles, ranges) = (numbers(&scan[0]), numbers(&scan[1]));
             // Clockwise from ahead, which is along y.
-            let at = |(angle, range): (&f64, &f64)| off(range * angle.sin(), range * angle.cos());
-            let most = angles.iter().zip(&ranges).map(at).fold(0.0, f64::max);
-            assert!(most < 0.005, "{}: a point is {most} m off", model.name());
+            let at =
+                |(angle, range): (&f64, &f64)| distance_from_walls(range * angle.sin(), range * angle.cos());
+            let max_error_m = angles.iter().zip(&ranges).map(at).fold(0.0, f64::max);
+            assert!(max_error_m < 0.005, "{}: a point is {max_error_m} m off", model.name());
             let count = ranges.len();
             assert!(count.abs_diff(points) * 50 <= points, "{}: {count} points a turn", model.name());
         }
@@ -123,4 +127,4 @@ fn the_vendors_driver_sees_the_simulated_room_in_every_form_of_packet() {
 }
 
 /// How often it is looked whether the driver is over.
-const LOOK: Duration = Duration::from_millis(10);
+const POLL_INTERVAL: Duration = Duration::from_millis(10);

@@ -5,10 +5,10 @@ use std::fs::{self, File};
 use std::process::Command;
 
 use crate::testkit;
-use crate::testkit::{INT, KILL, Sitting, TERM, TestEnv, Tmux, can_sit};
+use crate::testkit::{INT, KILL, TERM, TerminalSession, TestEnv, Tmux, can_open_terminal};
 use rustix::process::Signal;
 
-const SIZE: (u16, u16) = (60, 20);
+const TERMINAL_SIZE: (u16, u16) = (60, 20);
 
 /// A wall ahead, a strip on it, and a post that the robot nearly touches.
 const WORLD: &str =
@@ -16,25 +16,25 @@ const WORLD: &str =
 [[thing]]\nradius_mm = 20\npose = [0, 400]\n
 [[thing]]\nline = [[900, 2000], [1000, 2000]]\nsurface = \"reflector\"\n";
 
-fn sit(env: &TestEnv, arguments: &[&str]) -> Sitting {
+fn start_session(env: &TestEnv, arguments: &[&str]) -> TerminalSession {
     let mut command = env.command(&[&["watch"], arguments].concat());
     command.env_remove("NO_COLOR");
-    Sitting::start(&command, SIZE)
+    TerminalSession::start(&command, TERMINAL_SIZE)
 }
 
-fn is_braille(sign: char) -> bool {
-    ('\u{2801}'..='\u{28ff}').contains(&sign)
+fn is_braille(character: char) -> bool {
+    ('\u{2801}'..='\u{28ff}').contains(&character)
 }
 
 #[test]
 fn files_and_pipes_are_refused() {
     let env = TestEnv::new();
     let outcome = env.run(&["watch", "front"]);
-    assert_eq!((outcome.code, &outcome.out[..]), (Some(2), &b""[..]), "{outcome}");
-    assert!(outcome.errors.contains("scanhub echo front/scan"), "{outcome}");
+    assert_eq!((outcome.exit_code, &outcome.stdout[..]), (Some(2), &b""[..]), "{outcome}");
+    assert!(outcome.stderr.contains("scanhub echo front/scan"), "{outcome}");
     let outcome = env.run(&["watch", "--json"]);
     assert_eq!(
-        (outcome.code, &outcome.of_class("error")[0]["kind"]),
+        (outcome.exit_code, &outcome.of_class("error")[0]["kind"]),
         (Some(2), &"usage".into()),
         "{outcome}"
     );
@@ -42,18 +42,18 @@ fn files_and_pipes_are_refused() {
 
 #[test]
 fn it_follows_the_hub_the_keys_and_the_window() {
-    if !can_sit() {
+    if !can_open_terminal() {
         return;
     }
     let env = TestEnv::new();
-    let mut watch = sit(&env, &[]);
-    watch.await_words("no hub: waiting for it");
+    let mut watch = start_session(&env, &[]);
+    watch.wait_for_text("no hub: waiting for it");
     let world = format!("--world={}", env.file("world", WORLD));
     let _sensor = env.simulator(&["front"], &["--seed=71", "--baud=500000", &world]);
     let hub = env.hub(&[env.link("front")]);
-    watch.await_words("1 front    streaming");
-    watch.await_words(" STOP  front, nearest 0.3");
-    watch.await_words("0.60!");
+    watch.wait_for_text("1 front    streaming");
+    watch.wait_for_text(" STOP  front, nearest 0.3");
+    watch.wait_for_text("0.60!");
     watch.await_rows("picture with a mark", |rows| {
         let picture = || rows[1..17].iter().flat_map(|row| row.chars());
         picture().any(is_braille) && picture().any(|sign| sign == '*')
@@ -67,123 +67,123 @@ fn it_follows_the_hub_the_keys_and_the_window() {
 
     // Layers, help, hold.
     watch.press("m?");
-    watch.await_words("┌ scanhub watch ");
+    watch.wait_for_text("┌ scanhub watch ");
     watch.press("? ");
-    watch.await_words("HELD");
+    watch.wait_for_text("HELD");
     watch.await_rows("picture without marks", |rows| !rows[1..28].concat().contains('*'));
     watch.press(" ");
 
     // Lines are found only while somebody looks at them; a place is read out, and counters are listed.
     assert_eq!(env.subscribers("front/lines"), 0);
     watch.press("e");
-    testkit::until("lines are followed", || env.subscribers("front/lines") == 1);
+    testkit::wait_until("lines are followed", || env.subscribers("front/lines") == 1);
     watch.press("e");
-    testkit::until("nobody follows them", || env.subscribers("front/lines") == 0);
+    testkit::wait_until("nobody follows them", || env.subscribers("front/lines") == 0);
     watch.press("x\x1b[A");
-    watch.await_words(" m from the robot, x ");
+    watch.wait_for_text(" m from the robot, x ");
     watch.press("x");
     watch.await_rows("nothing is read out", |rows| !rows.concat().contains("from the robot"));
     // A click, in SGR's form, reads out the same; Escape ends that.
     watch.press("\x1b[<0;40;12M\x1b[<0;40;12m");
-    watch.await_words(" m from the robot, x ");
+    watch.wait_for_text(" m from the robot, x ");
     watch.press("\x1b");
     watch.await_rows("nothing is read out", |rows| !rows.concat().contains("from the robot"));
     watch.press("n");
-    watch.await_words("damaged on the line, last 10 s");
-    watch.await_words("bytes_in_telegrams");
+    watch.wait_for_text("damaged on the line, last 10 s");
+    watch.wait_for_text("bytes_in_telegrams");
     watch.press("n");
 
     // Requests to the hub, and what came of them.
     watch.press("F");
-    watch.await_words("front: background is frozen");
-    watch.await_words("lost 0  frozen");
+    watch.wait_for_text("front: background is frozen");
+    watch.wait_for_text("lost 0  frozen");
     let model = env.run(&["background", "front", "show"]);
-    assert!(String::from_utf8_lossy(&model.out).contains("frozen"), "{model}");
+    assert!(String::from_utf8_lossy(&model.stdout).contains("frozen"), "{model}");
     watch.press("F");
-    watch.await_words("front: background continues learning");
+    watch.wait_for_text("front: background continues learning");
     watch.press("R");
-    watch.await_words("front: background is learned again");
+    watch.wait_for_text("front: background is learned again");
 
     // Two lives of the hub; also while the picture is held the verdict is that of now.
     watch.press(" ");
-    watch.await_words(" STOP  HELD  front");
+    watch.wait_for_text(" STOP  HELD  front");
     drop(hub.end(KILL));
-    watch.await_words("no hub: waiting for it");
-    watch.await_words(" UNKNOWN  HELD  front");
+    watch.wait_for_text("no hub: waiting for it");
+    watch.wait_for_text(" UNKNOWN  HELD  front");
     watch.press(" ");
-    watch.await_words(" UNKNOWN  front");
+    watch.wait_for_text(" UNKNOWN  front");
     let hub = env.hub(&[env.link("front")]);
-    watch.await_words(" STOP  front");
-    watch.await_words(&format!("hub {}", hub.pid()));
+    watch.wait_for_text(" STOP  front");
+    watch.wait_for_text(&format!("hub {}", hub.pid()));
     watch.press("q");
-    assert_eq!(watch.end(), (Some(0), String::new(), true));
-    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(watch.finish(), (Some(0), String::new(), true));
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
 }
 
 #[test]
 fn the_terminal_is_given_back_however_it_ends() {
-    if !can_sit() {
+    if !can_open_terminal() {
         return;
     }
     let env = TestEnv::new();
     for signal in [INT, TERM, Signal::HUP, Signal::QUIT] {
-        let watch = sit(&env, &[]);
-        watch.await_words("no hub");
+        let watch = start_session(&env, &[]);
+        watch.wait_for_text("no hub");
         watch.signal(signal);
-        assert_eq!(watch.end(), (Some(0), String::new(), true), "{signal:?}");
+        assert_eq!(watch.finish(), (Some(0), String::new(), true), "{signal:?}");
     }
     for key in ["q", "\x1b", "\x03"] {
-        let mut watch = sit(&env, &[]);
-        watch.await_words("no hub");
+        let mut watch = start_session(&env, &[]);
+        watch.wait_for_text("no hub");
         watch.press(key);
-        assert_eq!(watch.end(), (Some(0), String::new(), true), "{key:?}");
+        assert_eq!(watch.finish(), (Some(0), String::new(), true), "{key:?}");
     }
     // As with all that follow: bounded needs a hub.
-    let (code, below, is_whole) = sit(&env, &["--for=5s"]).end();
+    let (code, below, is_whole) = start_session(&env, &["--for=5s"]).finish();
     assert!(code == Some(3) && below.contains("scanhub: no hub in domain") && is_whole, "{code:?} {below:?}");
     let _hub = env.hub(&[env.link("front")]);
-    let mut watch = sit(&env, &["front", "--for=5m"]);
-    watch.await_words("1 front");
+    let mut watch = start_session(&env, &["front", "--for=5m"]);
+    watch.wait_for_text("1 front");
     watch.press("\x03");
-    let (code, _, is_whole) = watch.end();
+    let (code, _, is_whole) = watch.finish();
     assert_eq!((code, is_whole), (Some(130), true));
-    let (code, below, is_whole) = sit(&env, &["side"]).end();
+    let (code, below, is_whole) = start_session(&env, &["side"]).finish();
     assert!(code == Some(3) && below.contains("there are front") && is_whole, "{code:?} {below:?}");
 }
 
 #[test]
 fn without_colours_nothing_is_coloured() {
-    if !can_sit() {
+    if !can_open_terminal() {
         return;
     }
     let env = TestEnv::new();
     let mut command = env.command(&["watch"]);
     command.env("NO_COLOR", "1");
-    let mut watch = Sitting::start(&command, SIZE);
+    let mut watch = TerminalSession::start(&command, TERMINAL_SIZE);
     let world = format!("--world={}", env.file("world", WORLD));
     let _sensor = env.simulator(&["front"], &["--seed=72", "--baud=500000", &world]);
     let _hub = env.hub(&[env.link("front")]);
-    watch.await_words(" STOP  front");
-    watch.await_words("0.60!");
+    watch.wait_for_text(" STOP  front");
+    watch.wait_for_text("0.60!");
     watch.press("q");
     let text = watch.text();
-    assert_eq!(watch.end().0, Some(0));
+    assert_eq!(watch.finish().0, Some(0));
     assert!(!text.contains("\x1b[38;5") && !text.contains("\x1b[48;5"), "{text:?}");
 }
 
 #[test]
 fn a_demonstration_shows_it() {
-    if !can_sit() {
+    if !can_open_terminal() {
         return;
     }
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
     let temporary = tempfile::tempdir().expect("a directory");
     command.args(["demo", "--for=3s"]).env("TMPDIR", temporary.path());
-    let demo = Sitting::start(&command, (80, 30));
+    let demo = TerminalSession::start(&command, (80, 30));
     let name = format!("demo-{}", demo.pid());
-    demo.await_words("1 front    streaming");
-    demo.await_words("2 rear     streaming");
-    let (code, below, is_whole) = demo.end();
+    demo.wait_for_text("1 front    streaming");
+    demo.wait_for_text("2 rear     streaming");
+    let (code, below, is_whole) = demo.finish();
     assert!(code == Some(0) && is_whole, "{code:?} {below:?}");
     assert_eq!(below.matches(" 0 lost in ").count(), 2, "{below:?}");
     assert_eq!(std::fs::read_dir(&temporary).expect("it is there").count(), 0, "its directory is left");
@@ -192,7 +192,7 @@ fn a_demonstration_shows_it() {
 
 #[test]
 fn a_terminal_that_is_closed_is_a_quiet_end() {
-    if !can_sit() {
+    if !can_open_terminal() {
         return;
     }
     let env = TestEnv::new();
@@ -200,20 +200,29 @@ fn a_terminal_that_is_closed_is_a_quiet_end() {
     for streams in [false, true] {
         let _hub = streams.then(|| env.hub(&[env.link("front")]));
         // With SIGHUP, as a shell's terminal sends it, and without anybody who tells it.
-        for told in [true, false] {
+        for has_controlling_terminal in [true, false] {
             let errors = env.path("errors");
             let file = File::create(&errors).expect("a file");
-            let watch = Sitting::start_for_hang_up(&env.command(&["watch"]), SIZE, told, file);
-            watch.await_words(if streams { "1 front    streaming" } else { "no hub: waiting for it" });
+            let watch = TerminalSession::start_for_hang_up(
+                &env.command(&["watch"]),
+                TERMINAL_SIZE,
+                has_controlling_terminal,
+                file,
+            );
+            watch.wait_for_text(if streams { "1 front    streaming" } else { "no hub: waiting for it" });
             let code = watch.hang_up();
             let errors = fs::read_to_string(errors).expect("its errors");
-            assert_eq!((code, errors.as_str()), (Some(0), ""), "told {told}, streams {streams}");
+            assert_eq!(
+                (code, errors.as_str()),
+                (Some(0), ""),
+                "told {has_controlling_terminal}, streams {streams}"
+            );
         }
     }
 }
 
 #[test]
-fn in_tmux_it_is_what_it_is_elsewhere() {
+fn tmux_shows_picture_help_and_narrow_windows() {
     let env = TestEnv::new();
     // Should the test be killed, all of it is over after a while.
     let program = env!("CARGO_BIN_EXE_scanhub");
@@ -236,8 +245,8 @@ fn in_tmux_it_is_what_it_is_elsewhere() {
         fits(rows) && rows.iter().any(|row| row.contains("┌ scanhub watch "))
     });
     tmux.press(&["?"]);
-    let is_gone = |rows: &[String]| !rows.iter().any(|row| row.contains("┌ scanhub watch "));
-    tmux.await_rows("picture in a narrow window", |rows| fits(rows) && is_gone(rows) && both(rows));
+    let is_help_closed = |rows: &[String]| !rows.iter().any(|row| row.contains("┌ scanhub watch "));
+    tmux.await_rows("picture in a narrow window", |rows| fits(rows) && is_help_closed(rows) && both(rows));
     tmux.resize((140, 30));
     tmux.await_rows("a wide window", |rows| !fits(rows) && both(rows));
     tmux.press(&["q"]);

@@ -4,7 +4,7 @@ use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::time::Instant;
 
-use crate::testkit::{INT, PATIENCE, Program, TestEnv, is_class, until};
+use crate::testkit::{INT, Program, TestEnv, WAIT_TIMEOUT, is_class, wait_until};
 use serde_json::{Value, json};
 use tungstenite::client::IntoClientRequest;
 use tungstenite::{Message, WebSocket};
@@ -20,12 +20,12 @@ pub(crate) fn web(env: &TestEnv, flags: &[&str]) -> (Program, String) {
 
 pub(crate) fn connect(host: &str) -> TcpStream {
     let stream = TcpStream::connect(host).expect("the server listens");
-    stream.set_read_timeout(Some(PATIENCE)).expect("a timeout");
+    stream.set_read_timeout(Some(WAIT_TIMEOUT)).expect("a timeout");
     stream
 }
 
 /// What the server answers to `head`; nothing if it says nothing.
-pub(crate) fn ask(host: &str, head: &str) -> String {
+pub(crate) fn send_request(host: &str, head: &str) -> String {
     let mut stream = connect(host);
     stream.write_all(head.as_bytes()).expect("it reads");
     let mut answer = Vec::new();
@@ -33,17 +33,21 @@ pub(crate) fn ask(host: &str, head: &str) -> String {
     String::from_utf8_lossy(&answer).into_owned()
 }
 
-pub(crate) fn status(answer: &str) -> &str {
-    answer.split(' ').nth(1).unwrap_or("none")
+pub(crate) fn status(response: &str) -> &str {
+    response.split(' ').nth(1).unwrap_or("none")
 }
 
 /// A viewer that was let in, or the status with which it was not.
-pub(crate) fn view(host: &str, path: &str, origin: Option<&str>) -> Result<WebSocket<TcpStream>, u16> {
-    view_as(host, path, origin, "foxglove.sdk.v1")
+pub(crate) fn connect_viewer(
+    host: &str,
+    path: &str,
+    origin: Option<&str>,
+) -> Result<WebSocket<TcpStream>, u16> {
+    connect_viewer_with(host, path, origin, "foxglove.sdk.v1")
 }
 
 /// As [`view`], by this name of the protocol.
-pub(crate) fn view_as(
+pub(crate) fn connect_viewer_with(
     host: &str,
     path: &str,
     origin: Option<&str>,
@@ -74,20 +78,23 @@ pub(crate) fn text(socket: &mut WebSocket<TcpStream>) -> Value {
 
 /// The channels of these `topics`, which there will be; messages that come before they are told are not looked at.
 pub(crate) fn channels<const N: usize>(viewer: &mut WebSocket<TcpStream>, topics: [&str; N]) -> [Value; N] {
-    let give_up_at = Instant::now() + PATIENCE;
-    let mut told: Vec<Value> = Vec::new();
-    let of = |told: &[Value], topic: &str| told.iter().find(|channel| channel["topic"] == topic).cloned();
-    while !topics.iter().all(|topic| of(&told, topic).is_some()) {
-        assert!(Instant::now() < give_up_at, "{topics:?} are not all in {told:?}");
-        told.extend(text(viewer)["channels"].as_array().into_iter().flatten().cloned());
+    let give_up_at = Instant::now() + WAIT_TIMEOUT;
+    let mut advertised: Vec<Value> = Vec::new();
+    let of = |advertised: &[Value], topic: &str| {
+        advertised.iter().find(|channel| channel["topic"] == topic).cloned()
+    };
+    while !topics.iter().all(|topic| of(&advertised, topic).is_some()) {
+        assert!(Instant::now() < give_up_at, "{topics:?} are not all in {advertised:?}");
+        advertised.extend(text(viewer)["channels"].as_array().into_iter().flatten().cloned());
     }
-    topics.map(|topic| of(&told, topic).expect("it is there"))
+    topics.map(|topic| of(&advertised, topic).expect("it is there"))
 }
 
 /// Subscribes to channels by their ids, under these numbers.
-pub(crate) fn subscribe(viewer: &mut WebSocket<TcpStream>, wanted: &[(u32, &Value)]) {
-    let wanted: Vec<_> = wanted.iter().map(|(number, id)| json!({ "id": number, "channelId": id })).collect();
-    let wish = json!({ "op": "subscribe", "subscriptions": wanted });
+pub(crate) fn subscribe(viewer: &mut WebSocket<TcpStream>, requested: &[(u32, &Value)]) {
+    let expected: Vec<_> =
+        requested.iter().map(|(number, id)| json!({ "id": number, "channelId": id })).collect();
+    let wish = json!({ "op": "subscribe", "subscriptions": expected });
     viewer.send(Message::text(wish.to_string())).expect("it reads");
 }
 
@@ -96,7 +103,7 @@ fn strangers_stay_outside() {
     let env = TestEnv::new();
     let (_open, host) = web(&env, &[]);
     let get = |host: &str, name: &str, more: &str| {
-        ask(host, &format!("GET / HTTP/1.1\r\nHost: {name}\r\n{more}\r\n"))
+        send_request(host, &format!("GET / HTTP/1.1\r\nHost: {name}\r\n{more}\r\n"))
     };
     let page = get(&host, &host, "");
     assert_eq!(status(&page), "200");
@@ -105,38 +112,41 @@ fn strangers_stay_outside() {
     }
     assert_eq!(status(&get(&host, "evil.example", "")), "403");
     assert_eq!(status(&get(&host, &host, "Origin: http://evil.example\r\n")), "403");
-    assert_eq!(view(&host, "/", Some("https://evil.example")).err(), Some(403));
-    assert!(view(&host, "/", None).is_ok());
-    assert_eq!(view_as(&host, "/", None, "chat").err(), Some(400));
-    assert_eq!(status(&ask(&host, &format!("POST / HTTP/1.1\r\nHost: {host}\r\n\r\n"))), "405");
-    assert_eq!(status(&ask(&host, &format!("GET /etc/passwd HTTP/1.1\r\nHost: {host}\r\n\r\n"))), "404");
-    assert_eq!(ask(&host, "\x16\x03\x01 no request\r\n\r\n"), "");
-    assert_eq!(ask(&host, &format!("GET /{}", "a".repeat(9000))), "");
+    assert_eq!(connect_viewer(&host, "/", Some("https://evil.example")).err(), Some(403));
+    assert!(connect_viewer(&host, "/", None).is_ok());
+    assert_eq!(connect_viewer_with(&host, "/", None, "chat").err(), Some(400));
+    assert_eq!(status(&send_request(&host, &format!("POST / HTTP/1.1\r\nHost: {host}\r\n\r\n"))), "405");
+    assert_eq!(
+        status(&send_request(&host, &format!("GET /etc/passwd HTTP/1.1\r\nHost: {host}\r\n\r\n"))),
+        "404"
+    );
+    assert_eq!(send_request(&host, "\x16\x03\x01 no request\r\n\r\n"), "");
+    assert_eq!(send_request(&host, &format!("GET /{}", "a".repeat(9000))), "");
 
     let (_closed, host) = web(&env, &["--token", "carrot", "--allow-origin", "https://viewer.example"]);
     assert_eq!(status(&get(&host, &host, "")), "401");
     assert_eq!(status(&get(&host, &host, "Authorization: Bearer carrot\r\n")), "200");
-    assert_eq!(view(&host, "/", None).err(), Some(401));
-    assert_eq!(view(&host, "/?token=carro", None).err(), Some(401));
-    assert!(view(&host, "/?token=carrot", Some("https://viewer.example")).is_ok());
+    assert_eq!(connect_viewer(&host, "/", None).err(), Some(401));
+    assert_eq!(connect_viewer(&host, "/?token=carro", None).err(), Some(401));
+    assert!(connect_viewer(&host, "/?token=carrot", Some("https://viewer.example")).is_ok());
 
     let outcome = env.run(&["web", "--listen", "0.0.0.0:0"]);
-    assert_eq!(outcome.code, Some(2), "{outcome}");
-    assert!(outcome.errors.contains("--token"), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(2), "{outcome}");
+    assert!(outcome.stderr.contains("--token"), "{outcome}");
 }
 
 #[test]
-fn viewers_get_the_messages_of_foxglove_whatever_others_send() {
+fn viewer_gets_foxglove_messages_despite_hostile_one() {
     let env = TestEnv::new();
     let _sensor = env.simulator(&["front"], &["--seed=5", "--baud=500000"]);
     let _hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
     let (mut server, host) = web(&env, &[]);
-    let mut viewer = view(&host, "/", None).expect("let in");
+    let mut viewer = connect_viewer(&host, "/", None).expect("let in");
     server.await_line("who came", |line| line["class"] == "viewer" && line["connected"] == true);
     assert_eq!(text(&mut viewer)["op"], "serverInfo");
     // Hostile frames come from the next viewer; this one is not to notice.
-    let mut hostile = view(&host, "/", None).expect("let in");
+    let mut hostile = connect_viewer(&host, "/", None).expect("let in");
     hostile.send(Message::text("[".repeat(60_000))).expect("it reads");
     hostile.send(Message::binary(vec![1; 60_000])).expect("it reads");
     let _ = hostile.send(Message::binary(vec![1; 1 << 20]));
@@ -148,46 +158,46 @@ fn viewers_get_the_messages_of_foxglove_whatever_others_send() {
     );
     assert_eq!([&zones["encoding"], &zones["schemaName"]], ["json", "foxglove.SceneUpdate"]);
     subscribe(&mut viewer, &[(70, &scan["id"]), (71, &zones["id"]), (72, &9999.into())]);
-    let give_up_at = Instant::now() + PATIENCE;
-    let mut seen = [0_u32; 2];
-    while seen.iter().any(|count| *count < 5) {
-        assert!(Instant::now() < give_up_at, "{seen:?}");
+    let give_up_at = Instant::now() + WAIT_TIMEOUT;
+    let mut received = [0_u32; 2];
+    while received.iter().any(|count| *count < 5) {
+        assert!(Instant::now() < give_up_at, "{received:?}");
         let Message::Binary(frame) = viewer.read().expect("the server lives") else { continue };
         let subscription = u32::from_le_bytes(frame[1..5].try_into().expect("four bytes"));
         assert_eq!(frame[0], 1);
         let body = &frame[13..];
         match subscription {
             70 => {
-                let told = scanhub_ros::read(&scanhub_ros::LASER_SCAN, body).expect("a LaserScan");
-                assert_eq!(told.text("header.frame_id"), Some("front"));
-                assert!(told.number("ranges.0").is_some());
-                seen[0] += 1;
+                let message = scanhub_ros::read(&scanhub_ros::LASER_SCAN, body).expect("a LaserScan");
+                assert_eq!(message.text("header.frame_id"), Some("front"));
+                assert!(message.number("ranges.0").is_some());
+                received[0] += 1;
             }
             71 => {
-                let told: Value = serde_json::from_slice(body).expect("a SceneUpdate");
-                seen[1] += u32::from(told["entities"].as_array().is_some_and(|all| all.len() >= 2));
+                let message: Value = serde_json::from_slice(body).expect("a SceneUpdate");
+                received[1] += u32::from(message["entities"].as_array().is_some_and(|all| all.len() >= 2));
             }
             other => panic!("nobody subscribed to {other}"),
         }
     }
     drop(viewer);
     server.await_line("who went", |line| line["class"] == "viewer" && line["connected"] == false);
-    assert_eq!(server.end(INT).code, Some(0));
+    assert_eq!(server.end(INT).exit_code, Some(0));
 }
 
 #[test]
 fn as_many_come_in_as_there_is_room_for() {
     let env = TestEnv::new();
     let (server, host) = web(&env, &[]);
-    let mut viewers: Vec<_> = (0..32).map(|_| view(&host, "/", None).expect("let in")).collect();
-    assert_eq!(view(&host, "/", None).err(), Some(503));
+    let mut viewers: Vec<_> = (0..32).map(|_| connect_viewer(&host, "/", None).expect("let in")).collect();
+    assert_eq!(connect_viewer(&host, "/", None).err(), Some(503));
     // Connections that ask for nothing take no viewer's place, and the page is still served.
     let idle: Vec<_> = (0..20).map(|_| connect(&host)).collect();
-    assert_eq!(status(&ask(&host, &format!("GET / HTTP/1.1\r\nHost: {host}\r\n\r\n"))), "200");
+    assert_eq!(status(&send_request(&host, &format!("GET / HTTP/1.1\r\nHost: {host}\r\n\r\n"))), "200");
     drop(idle);
     let _ = viewers.pop().map(|mut one| one.close(None));
-    until("the place of who went is free", || view(&host, "/", None).is_ok());
-    assert_eq!(server.end(INT).code, Some(0));
+    wait_until("the place of who went is free", || connect_viewer(&host, "/", None).is_ok());
+    assert_eq!(server.end(INT).exit_code, Some(0));
 }
 
 #[test]

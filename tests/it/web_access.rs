@@ -3,14 +3,14 @@
 
 use serde_json::{Value, json};
 
-use crate::browser::{Browser, Look};
-use crate::testkit::{TestEnv, until};
+use crate::browser::{Appearance, Browser};
+use crate::testkit::{TestEnv, wait_until};
 use crate::web::web;
 use crate::web_page::browse;
 
 /// The page of a hub with two sensors.
-fn look_at(env: &TestEnv, look: Look) -> Option<(Browser, Vec<crate::testkit::Program>)> {
-    let mut page = browse(env, look)?;
+fn open_page(env: &TestEnv, appearance: Appearance) -> Option<(Browser, Vec<crate::testkit::Program>)> {
+    let mut page = browse(env, appearance)?;
     let sensors = env.simulator(&["front", "rear"], &["--seed=5", "--baud=500000", "--world=demo"]);
     let hub = env.hub(&[env.link("front"), env.link("rear")]);
     let (server, host) = web(env, &[]);
@@ -21,18 +21,18 @@ fn look_at(env: &TestEnv, look: Look) -> Option<(Browser, Vec<crate::testkit::Pr
 }
 
 /// What has the keyboard, as far as words tell.
-const HOLDER: &str = "(document.activeElement === document.body ? 'BODY' : document.activeElement.getAttribute('aria-label') || document.activeElement.innerText || \
+const FOCUSED_ELEMENT: &str = "(document.activeElement === document.body ? 'BODY' : document.activeElement.getAttribute('aria-label') || document.activeElement.innerText || \
                       document.activeElement.tagName).trim()";
 
 #[test]
 fn the_keyboard_alone_is_enough() {
     let env = TestEnv::new();
-    let Some((mut page, _programs)) = look_at(&env, Look::LAPTOP) else { return };
+    let Some((mut page, _programs)) = open_page(&env, Appearance::LAPTOP) else { return };
     // Once around: whatever can be pressed is reached, and it is seen where the keyboard is.
     let mut reached: Vec<String> = Vec::new();
     for _ in 0..40 {
         page.press("Tab");
-        let holder = page.ask(HOLDER).as_str().unwrap_or_default().to_owned();
+        let holder = page.ask(FOCUSED_ELEMENT).as_str().unwrap_or_default().to_owned();
         if reached.first() == Some(&holder) {
             break;
         }
@@ -52,8 +52,9 @@ fn the_keyboard_alone_is_enough() {
     assert!(all.as_array().is_some_and(|all| all.len() >= 11), "{all}");
 
     // What has the keyboard is pressed by Enter and by the space bar.
-    let pressed =
-        |what: &str| format!("document.querySelector('{what}').getAttribute('aria-pressed') === 'true'");
+    let pressed = |description: &str| {
+        format!("document.querySelector('{description}').getAttribute('aria-pressed') === 'true'")
+    };
     page.ask("document.querySelector('[data-do=hold]').focus()");
     page.press("Enter");
     page.await_true(&pressed("[data-do=hold]"));
@@ -91,7 +92,7 @@ fn the_keyboard_alone_is_enough() {
     page.await_true("document.querySelector('#help').contains(document.activeElement)");
     page.press("Escape");
     page.await_true("document.activeElement.dataset.do === 'layers'");
-    assert!(page.complaints.is_empty(), "{:?}", page.complaints);
+    assert!(page.console_errors.is_empty(), "{:?}", page.console_errors);
 }
 
 /// Roles and names of what a screen reader finds on the page.
@@ -103,23 +104,23 @@ fn tree(page: &mut Browser) -> Vec<(String, String)> {
 }
 
 /// The names of the nodes with `role`.
-fn named<'a>(nodes: &'a [(String, String)], role: &str) -> Vec<&'a str> {
+fn nodes_with_role<'a>(nodes: &'a [(String, String)], role: &str) -> Vec<&'a str> {
     nodes.iter().filter(|node| node.0 == role).map(|node| node.1.as_str()).collect()
 }
 
 #[test]
-fn who_hears_the_page_is_told_names_states_and_the_verdict() {
+fn screen_readers_get_names_states_and_the_verdict() {
     let env = TestEnv::new();
-    let Some((mut page, _programs)) = look_at(&env, Look::LAPTOP) else { return };
+    let Some((mut page, _programs)) = open_page(&env, Appearance::LAPTOP) else { return };
     let words = ["SLOW", "CLEAR", "STOP"];
     // On a busy machine, the verdict may be unknown and a sensor without a status for a moment.
     let mut nodes = Vec::new();
-    until("the tree has a verdict and a sensor that streams", || {
+    wait_until("the tree has a verdict and a sensor that streams", || {
         nodes = tree(&mut page);
-        let texts = named(&nodes, "StaticText");
+        let texts = nodes_with_role(&nodes, "StaticText");
         texts.contains(&"streaming") && words.iter().any(|word| texts.contains(word))
     });
-    let named = |role| named(&nodes, role);
+    let named = |role| nodes_with_role(&nodes, role);
     assert!(named("button").len() >= 11 && named("button").iter().all(|name| !name.is_empty()), "{nodes:?}");
     assert!(named("image").iter().any(|name| name.contains("from above")), "{:?}", named("image"));
     assert!(
@@ -135,9 +136,9 @@ fn who_hears_the_page_is_told_names_states_and_the_verdict() {
 }
 
 #[test]
-fn who_does_not_bear_movement_gets_none() {
+fn reduced_motion_disables_animations() {
     let env = TestEnv::new();
-    let Some((mut page, _programs)) = look_at(&env, Look::LAPTOP) else { return };
+    let Some((mut page, _programs)) = open_page(&env, Appearance::LAPTOP) else { return };
     // How many places the picture has on its way back from a larger one, until it stands for 20 frames.
     let places = "new Promise((done) => {
         const scales = new Set();

@@ -10,11 +10,11 @@ use scanhub_schema::Pose;
 use serde_json::{Value, json};
 use tungstenite::{Message, WebSocket};
 
-use crate::testkit::{INT, Outcome, PATIENCE, TestEnv, is_class, number, wall_ns};
-use crate::web::{text, view_as, web};
+use crate::testkit::{INT, Outcome, TestEnv, WAIT_TIMEOUT, is_class, number, wall_ns};
+use crate::web::{connect_viewer_with, text, web};
 
 /// Where the sensor sits: metres ahead and to the left, and how it is turned, in radians.
-const PLACE: (f64, f64, f64) = (0.3, -0.1, 0.4);
+const SENSOR_POSE: (f64, f64, f64) = (0.3, -0.1, 0.4);
 const TOPICS: [&str; 7] = ["scan", "foreground", "marks", "zones", "lines", "background", "status"];
 /// Somebody comes who is seen before the background, and walks into the circles; a reflector stands in the corner.
 const WORLD: &str =
@@ -23,48 +23,48 @@ const WORLD: &str =
 [[thing]]\nline = [[900, 2000], [1000, 2000]]\nsurface = \"reflector\"\n";
 
 fn pose() -> Pose {
-    Pose { x_m: PLACE.0, y_m: PLACE.1, yaw_rad: PLACE.2, ..Pose::default() }
+    Pose { x_m: SENSOR_POSE.0, y_m: SENSOR_POSE.1, yaw_rad: SENSOR_POSE.2, ..Pose::default() }
 }
 
 /// A message of a channel: when it was, in ns since 1970, and its body.
-type Heard = (u64, Vec<u8>);
+type ChannelMessage = (u64, Vec<u8>);
 
 /// A viewer as npm's `@foxglove/ws-protocol` 0.8.0 is one: subscriptions are numbered from 0 on, and each is a message of its own.
 struct Viewer {
     socket: WebSocket<TcpStream>,
     /// By their subscriptions.
     channels: Vec<Value>,
-    heard: HashMap<String, Vec<Heard>>,
+    messages: HashMap<String, Vec<ChannelMessage>>,
 }
 
 impl Viewer {
     fn new(host: &str, protocol: &str) -> Viewer {
-        let mut socket = view_as(host, "/", None, protocol).expect("let in");
+        let mut socket = connect_viewer_with(host, "/", None, protocol).expect("let in");
         assert_eq!(text(&mut socket)["op"], "serverInfo");
-        Viewer { socket, channels: Vec::new(), heard: HashMap::new() }
+        Viewer { socket, channels: Vec::new(), messages: HashMap::new() }
     }
 
     /// Listens until every channel that was told said so many messages.
-    fn listen(&mut self, wanted: usize) {
-        let give_up_at = Instant::now() + PATIENCE;
-        while self.channels.len() < TOPICS.len() + 1 || self.least() < wanted {
-            assert!(Instant::now() < give_up_at, "{wanted} of each: {:?}", self.counts());
+    fn receive_messages(&mut self, count: usize) {
+        let give_up_at = Instant::now() + WAIT_TIMEOUT;
+        while self.channels.len() < TOPICS.len() + 1 || self.min_count() < count {
+            assert!(Instant::now() < give_up_at, "{count} of each: {:?}", self.counts());
             match self.socket.read().expect("the server lives") {
-                Message::Text(text) => self.hear(&serde_json::from_str(&text).expect("JSON")),
+                Message::Text(text) => self.receive(&serde_json::from_str(&text).expect("JSON")),
                 Message::Binary(frame) => {
                     let subscription = u32::from_le_bytes(frame[1..5].try_into().expect("four bytes"));
                     let stamp = u64::from_le_bytes(frame[5..13].try_into().expect("eight bytes"));
                     assert_eq!(frame[0], 1);
                     let topic = self.channels[subscription as usize]["topic"].as_str().expect("a topic");
-                    self.heard.entry(topic.to_owned()).or_default().push((stamp, frame[13..].to_vec()));
+                    self.messages.entry(topic.to_owned()).or_default().push((stamp, frame[13..].to_vec()));
                 }
                 _ => {}
             }
         }
     }
 
-    fn hear(&mut self, said: &Value) {
-        for channel in said["channels"].as_array().into_iter().flatten() {
+    fn receive(&mut self, message: &Value) {
+        for channel in message["channels"].as_array().into_iter().flatten() {
             let one = json!({ "id": self.channels.len(), "channelId": channel["id"] });
             let wish = json!({ "op": "subscribe", "subscriptions": [one] });
             self.socket.send(Message::text(wish.to_string())).expect("it reads");
@@ -74,7 +74,7 @@ impl Viewer {
 
     fn counts(&self) -> Vec<(&str, usize)> {
         let of = |channel: &Value| {
-            self.heard.get(channel["topic"].as_str().unwrap_or_default()).map_or(0, Vec::len)
+            self.messages.get(channel["topic"].as_str().unwrap_or_default()).map_or(0, Vec::len)
         };
         self.channels
             .iter()
@@ -83,7 +83,7 @@ impl Viewer {
     }
 
     /// Of the channel that said least; what is told once counts as much as all.
-    fn least(&self) -> usize {
+    fn min_count(&self) -> usize {
         let once = ["/tf_static", "/front/background"];
         let enough = |(topic, count): (&str, usize)| {
             if once.contains(&topic) && count > 0 { usize::MAX } else { count }
@@ -91,13 +91,13 @@ impl Viewer {
         self.counts().into_iter().map(enough).min().unwrap_or(0)
     }
 
-    fn of(&self, topic: &str) -> &[Heard] {
-        &self.heard[topic]
+    fn messages_of(&self, topic: &str) -> &[ChannelMessage] {
+        &self.messages[topic]
     }
 }
 
 /// Whether `value` is what `schema` says, as far as this project's schemas say it: types, words, properties and items.
-pub(crate) fn conforms(value: &Value, schema: &Value) -> bool {
+pub(crate) fn matches_schema(value: &Value, schema: &Value) -> bool {
     let is = |kind: &Value| match kind.as_str() {
         Some("object") => value.is_object(),
         Some("array") => value.is_array(),
@@ -115,12 +115,12 @@ pub(crate) fn conforms(value: &Value, schema: &Value) -> bool {
         && words.is_none_or(|words| words.contains(value))
         && properties
             .filter(|_| value.is_object())
-            .all(|(key, of)| value.get(key).is_some_and(|it| conforms(it, of)))
+            .all(|(key, of)| value.get(key).is_some_and(|it| matches_schema(it, of)))
         && value
             .as_array()
             .into_iter()
             .flatten()
-            .all(|item| schema["items"].is_null() || conforms(item, &schema["items"]))
+            .all(|item| schema["items"].is_null() || matches_schema(item, &schema["items"]))
 }
 
 fn close(a: f64, b: f64) -> bool {
@@ -152,50 +152,58 @@ fn by_stamp(lines: &Outcome, class: &str) -> HashMap<u64, Value> {
 }
 
 /// That most of what was heard has its line, each as `is_same` says: a reader may miss a sample, but few.
-fn each_is_a_line(
+fn check_each_equals_a_line(
     topic: &str,
-    heard: &[Heard],
+    messages: &[ChannelMessage],
     lines: &HashMap<u64, Value>,
     is_same: impl Fn(&[u8], &Value) -> bool,
 ) {
-    let met: Vec<_> = heard.iter().filter_map(|(stamp, body)| Some((body, lines.get(stamp)?))).collect();
-    assert!(met.len() * 2 > heard.len(), "{topic}: {} of {} have a line", met.len(), heard.len());
-    for (body, line) in met {
+    let matched: Vec<_> =
+        messages.iter().filter_map(|(stamp, body)| Some((body, lines.get(stamp)?))).collect();
+    assert!(
+        matched.len() * 2 > messages.len(),
+        "{topic}: {} of {} have a line",
+        matched.len(),
+        messages.len()
+    );
+    for (body, line) in matched {
         assert!(is_same(body, line), "{topic}: not what this line says: {line}");
     }
 }
 
 fn is_scan(body: &[u8], line: &Value) -> bool {
-    let told = read(&LASER_SCAN, body).expect("a LaserScan");
-    let ranges = numbers(told.sequence("ranges").expect("ranges"));
-    let said = ranges_m(line, "unit_um", 1e-6);
-    let is_range =
-        |(range, said): (&f64, &Option<f64>)| said.map_or(!range.is_finite(), |said| close(*range, said));
-    told.text("header.frame_id") == Some("front")
-        && close(told.number("angle_min").expect("an angle"), angle_rad(line, 0))
-        && close(told.number("angle_max").expect("an angle"), angle_rad(line, said.len() - 1))
-        && ranges.len() == said.len()
-        && ranges.iter().zip(&said).all(is_range)
+    let message = read(&LASER_SCAN, body).expect("a LaserScan");
+    let ranges = numbers(message.sequence("ranges").expect("ranges"));
+    let expected = ranges_m(line, "unit_um", 1e-6);
+    let is_range = |(range, printed): (&f64, &Option<f64>)| {
+        printed.map_or(!range.is_finite(), |printed| close(*range, printed))
+    };
+    message.text("header.frame_id") == Some("front")
+        && close(message.number("angle_min").expect("an angle"), angle_rad(line, 0))
+        && close(message.number("angle_max").expect("an angle"), angle_rad(line, expected.len() - 1))
+        && ranges.len() == expected.len()
+        && ranges.iter().zip(&expected).all(is_range)
 }
 
 /// Points in the sensor's frame, as `scan` has the angles.
 fn is_foreground(body: &[u8], line: &Value, scan: &Value) -> bool {
-    let told = read(&POINT_CLOUD, body).expect("a PointCloud2");
+    let message = read(&POINT_CLOUD, body).expect("a PointCloud2");
     let bytes: Vec<u8> =
-        numbers(told.sequence("data").expect("data")).iter().map(|byte| *byte as u8).collect();
-    let step = told.number("point_step").expect("a step") as usize;
+        numbers(message.sequence("data").expect("data")).iter().map(|byte| *byte as u8).collect();
+    let step = message.number("point_step").expect("a step") as usize;
     let axis = |bytes: &[u8]| f64::from(f32::from_le_bytes(bytes.try_into().expect("four bytes")));
     let points: Vec<_> = bytes.chunks(step).map(|point| (axis(&point[..4]), axis(&point[4..8]))).collect();
     let beams =
         line["beams"].as_array().expect("beams").iter().map(|beam| beam.as_u64().expect("a beam") as usize);
-    let said: Vec<_> = beams
+    let expected: Vec<_> = beams
         .zip(ranges_m(line, "unit_mm", 1e-3))
         .map(|(beam, range)| {
             let (sin, cos) = angle_rad(scan, beam).sin_cos();
             (range.expect("a range") * cos, range.expect("a range") * sin)
         })
         .collect();
-    points.len() == said.len() && points.iter().zip(&said).all(|(a, b)| close(a.0, b.0) && close(a.1, b.1))
+    points.len() == expected.len()
+        && points.iter().zip(&expected).all(|(a, b)| close(a.0, b.0) && close(a.1, b.1))
 }
 
 fn object(body: &[u8]) -> Value {
@@ -208,7 +216,7 @@ fn all(update: &Value, kind: &str) -> Vec<Value> {
     entities.flat_map(|entity| entity[kind].as_array().expect("a list").clone()).collect()
 }
 
-fn place(of: &Value) -> (f64, f64) {
+fn position_of(of: &Value) -> (f64, f64) {
     (of["x"].as_f64().expect("a number"), of["y"].as_f64().expect("a number"))
 }
 
@@ -223,59 +231,61 @@ fn list<'a>(line: &'a Value, key: &str) -> impl Iterator<Item = &'a Value> {
 
 /// Messages that stand for what was seen last: each that says something is what some line of `class` says, where those lost
 /// nothing; else most.
-fn each_is_some_line(
+fn check_each_equals_some_line(
     class: &str,
-    heard: &[Heard],
+    messages: &[ChannelMessage],
     outcome: &Outcome,
-    says_something: impl Fn(&Value) -> bool,
+    is_relevant: impl Fn(&Value) -> bool,
     is_same: impl Fn(&Value, &Value) -> bool,
 ) {
     let (lines, summaries) = (outcome.of_class(class), outcome.of_class("summary"));
     let missed = summaries.iter().find(|line| line["topic"] == class).map(|line| number(line, "missed"));
-    let told: Vec<_> = heard.iter().map(|(_, body)| object(body)).filter(says_something).collect();
-    assert!(!told.is_empty(), "{class}: nothing was said");
-    let missing: Vec<_> = told.iter().filter(|told| !lines.iter().any(|line| is_same(told, line))).collect();
-    let may_miss = if missed == Some(0) { 0 } else { told.len() / 2 };
+    let messages: Vec<_> = messages.iter().map(|(_, body)| object(body)).filter(is_relevant).collect();
+    assert!(!messages.is_empty(), "{class}: nothing was said");
+    let missing: Vec<_> =
+        messages.iter().filter(|update| !lines.iter().any(|line| is_same(update, line))).collect();
+    let may_miss = if missed == Some(0) { 0 } else { messages.len() / 2 };
     assert!(missing.len() <= may_miss, "{class}: {missed:?} missed, and no line says {missing:?}");
 }
 
-fn marks(told: &Value, line: &Value) -> bool {
-    let spheres = all(told, "spheres");
-    let seen: Vec<_> = spheres.iter().map(|sphere| place(&sphere["pose"]["position"])).collect();
+fn are_same_marks(message: &Value, line: &Value) -> bool {
+    let spheres = all(message, "spheres");
+    let positions: Vec<_> = spheres.iter().map(|sphere| position_of(&sphere["pose"]["position"])).collect();
     let of_mark = |mark: &Value| {
         let (angle, range) = (mark["angle_deg"].as_f64(), mark["range_mm"].as_f64());
         let (x, y) = pose().point_mm(angle.expect("an angle").to_radians(), range.expect("a range"));
         (x / 1e3, y / 1e3)
     };
-    are_same(&seen, &list(line, "marks").map(of_mark).collect::<Vec<_>>())
+    are_same(&positions, &list(line, "marks").map(of_mark).collect::<Vec<_>>())
 }
 
-fn lines(told: &Value, line: &Value) -> bool {
-    let ends: Vec<_> = all(told, "lines")
+fn are_same_lines(message: &Value, line: &Value) -> bool {
+    let ends: Vec<_> = all(message, "lines")
         .iter()
-        .flat_map(|one| list(one, "points").map(place).collect::<Vec<_>>())
+        .flat_map(|one| list(one, "points").map(position_of).collect::<Vec<_>>())
         .collect();
-    let corners: Vec<_> = all(told, "spheres").iter().map(|one| place(&one["pose"]["position"])).collect();
+    let corners: Vec<_> =
+        all(message, "spheres").iter().map(|one| position_of(&one["pose"]["position"])).collect();
     let end = |one: &Value, x: &str, y: &str| {
         (one[x].as_f64().expect("a number"), one[y].as_f64().expect("a number"))
     };
-    let said: Vec<_> =
+    let expected: Vec<_> =
         list(line, "lines").flat_map(|one| [end(one, "x1_m", "y1_m"), end(one, "x2_m", "y2_m")]).collect();
     let said_corners: Vec<_> = list(line, "corners").map(|one| end(one, "x_m", "y_m")).collect();
-    are_same(&ends, &said) && are_same(&corners, &said_corners)
+    are_same(&ends, &expected) && are_same(&corners, &said_corners)
 }
 
-fn zones(told: &Value, line: &Value) -> bool {
+fn are_same_zones(message: &Value, line: &Value) -> bool {
     let metadata = |entity: &Value, key: &str| {
         let mut all = entity["metadata"].as_array().expect("a list").iter();
         all.find(|one| one["key"] == key).map(|one| one["value"].as_str().expect("text").to_owned())
     };
-    let entities =
-        list(told, "entities").filter(|entity| !entity["cylinders"].as_array().expect("a list").is_empty());
+    let entities = list(message, "entities")
+        .filter(|entity| !entity["cylinders"].as_array().expect("a list").is_empty());
     let circles: Vec<_> =
         entities.map(|entity| (metadata(entity, "radius_m"), metadata(entity, "verdict"))).collect();
     let innermost = list(line, "zones").map(|zone| zone["radius_mm"].as_u64()).min().flatten();
-    let said = list(line, "zones").map(|zone| {
+    let expected = list(line, "zones").map(|zone| {
         let verdict = match (zone["violated"].as_bool(), zone["radius_mm"].as_u64() == innermost) {
             (Some(false), _) => "clear",
             (_, true) => "stop",
@@ -284,27 +294,29 @@ fn zones(told: &Value, line: &Value) -> bool {
         let radius_m = zone["radius_mm"].as_f64().map(|radius| format!("{:.3}", radius / 1e3));
         (radius_m, Some(verdict.to_owned()))
     });
-    circles == said.collect::<Vec<_>>()
+    circles == expected.collect::<Vec<_>>()
 }
 
-fn status(told: &Value, line: &Value) -> bool {
+fn is_same_status(message: &Value, line: &Value) -> bool {
     let keys = ["state", "family", "model", "port", "damaged", "lost_on_line"];
-    told["name"] == line["sensor"]
-        && keys.iter().all(|key| told[*key] == line[*key])
-        && ["x_m", "y_m", "yaw_rad", "upside_down"].iter().all(|key| told["pose"][*key] == line["pose"][*key])
+    message["name"] == line["sensor"]
+        && keys.iter().all(|key| message[*key] == line[*key])
+        && ["x_m", "y_m", "yaw_rad", "upside_down"]
+            .iter()
+            .all(|key| message["pose"][*key] == line["pose"][*key])
 }
 
 fn is_background(body: &[u8], line: &Value) -> bool {
-    let told = read(&LASER_SCAN, body).expect("a LaserScan");
-    let ranges = numbers(told.sequence("ranges").expect("ranges"));
-    let said = ranges_m(line, "unit_mm", 1e-3);
+    let message = read(&LASER_SCAN, body).expect("a LaserScan");
+    let ranges = numbers(message.sequence("ranges").expect("ranges"));
+    let expected = ranges_m(line, "unit_mm", 1e-3);
     let far: Vec<_> = list(line, "far").filter_map(Value::as_u64).collect();
-    let is_range = |(beam, (range, said)): (usize, (&f64, &Option<f64>))| match said {
-        Some(said) => close(*range, *said),
+    let is_range = |(beam, (range, printed)): (usize, (&f64, &Option<f64>))| match printed {
+        Some(printed) => close(*range, *printed),
         None if far.contains(&(beam as u64)) => *range == f64::INFINITY,
         None => range.is_nan(),
     };
-    ranges.len() == said.len() && ranges.iter().zip(&said).enumerate().all(is_range)
+    ranges.len() == expected.len() && ranges.iter().zip(&expected).enumerate().all(is_range)
 }
 
 fn compare(viewer: &Viewer, outcome: &Outcome) {
@@ -313,53 +325,72 @@ fn compare(viewer: &Viewer, outcome: &Outcome) {
         if encoding == "json" {
             let schema: Value =
                 serde_json::from_str(channel["schema"].as_str().expect("text")).expect("JSON");
-            for (_, body) in viewer.of(topic) {
-                assert!(conforms(&object(body), &schema), "{topic}: {}", object(body));
+            for (_, body) in viewer.messages_of(topic) {
+                assert!(matches_schema(&object(body), &schema), "{topic}: {}", object(body));
             }
         } else {
             assert_eq!((encoding, &channel["schemaEncoding"]), (&"cdr".into(), &"ros2msg".into()), "{topic}");
         }
     }
     let scans = by_stamp(outcome, "scan");
-    each_is_a_line("scan", viewer.of("/front/scan"), &scans, is_scan);
+    check_each_equals_a_line("scan", viewer.messages_of("/front/scan"), &scans, is_scan);
     let found = by_stamp(outcome, "foreground");
-    each_is_a_line("foreground", viewer.of("/front/foreground"), &found, |body, line| {
+    check_each_equals_a_line("foreground", viewer.messages_of("/front/foreground"), &found, |body, line| {
         let stamp = line["wall_ns"].as_u64().expect("a stamp");
         scans.get(&stamp).is_none_or(|scan| is_foreground(body, line, scan))
     });
-    each_is_some_line("marks", viewer.of("/marks"), outcome, |told| !all(told, "spheres").is_empty(), marks);
-    each_is_some_line("lines", viewer.of("/lines"), outcome, |told| !all(told, "lines").is_empty(), lines);
-    each_is_some_line(
-        "zones",
-        viewer.of("/zones"),
+    check_each_equals_some_line(
+        "marks",
+        viewer.messages_of("/marks"),
         outcome,
-        |told| !all(told, "cylinders").is_empty(),
-        zones,
+        |update| !all(update, "spheres").is_empty(),
+        are_same_marks,
     );
-    let is_heard = |told: &Value| told["state"] != "no status";
-    each_is_some_line("status", viewer.of("/front/status"), outcome, is_heard, status);
+    check_each_equals_some_line(
+        "lines",
+        viewer.messages_of("/lines"),
+        outcome,
+        |update| !all(update, "lines").is_empty(),
+        are_same_lines,
+    );
+    check_each_equals_some_line(
+        "zones",
+        viewer.messages_of("/zones"),
+        outcome,
+        |update| !all(update, "cylinders").is_empty(),
+        are_same_zones,
+    );
+    let is_heard = |update: &Value| update["state"] != "no status";
+    check_each_equals_some_line(
+        "status",
+        viewer.messages_of("/front/status"),
+        outcome,
+        is_heard,
+        is_same_status,
+    );
     let models = outcome.of_class("background");
-    for (_, body) in viewer.of("/front/background") {
+    for (_, body) in viewer.messages_of("/front/background") {
         assert!(models.iter().any(|line| is_background(body, line)), "background: no line says the same");
     }
     let verdicts = outcome.of_class("zones");
-    let robot: Vec<_> = viewer.of("/robot").iter().map(|(_, body)| object(body)).collect();
-    assert!(robot.iter().any(|told| told["hub"] == true), "{robot:?}");
-    for told in robot.iter().filter(|told| told["verdict"] != "unknown") {
-        assert!(verdicts.iter().any(|line| line["verdict"] == told["verdict"]), "{told}");
+    let robot: Vec<_> = viewer.messages_of("/robot").iter().map(|(_, body)| object(body)).collect();
+    assert!(robot.iter().any(|update| update["hub"] == true), "{robot:?}");
+    for update in robot.iter().filter(|update| update["verdict"] != "unknown") {
+        assert!(verdicts.iter().any(|line| line["verdict"] == update["verdict"]), "{update}");
     }
-    let told = read(&TF_MESSAGE, &viewer.of("/tf_static").last().expect("one").1).expect("a TFMessage");
-    let number = |path: &str| told.number(&format!("transforms.0.transform.{path}")).expect("a number");
-    assert!(close(number("translation.x"), PLACE.0) && close(number("translation.y"), PLACE.1));
-    assert!(close(number("rotation.z"), (PLACE.2 / 2.0).sin()));
+    let decoded =
+        read(&TF_MESSAGE, &viewer.messages_of("/tf_static").last().expect("one").1).expect("a TFMessage");
+    let number = |path: &str| decoded.number(&format!("transforms.0.transform.{path}")).expect("a number");
+    assert!(close(number("translation.x"), SENSOR_POSE.0) && close(number("translation.y"), SENSOR_POSE.1));
+    assert!(close(number("rotation.z"), (SENSOR_POSE.2 / 2.0).sin()));
 }
 
 #[test]
-fn every_channel_is_what_echo_says() {
+fn every_channel_equals_the_output_of_echo() {
     let env = TestEnv::new();
     let world = format!("--world={}", env.file("world", WORLD));
     let _sensor = env.simulator(&["front"], &["--seed=71", "--baud=500000", &world]);
-    let places = [("x", PLACE.0), ("y", PLACE.1), ("yaw", PLACE.2)];
+    let places = [("x", SENSOR_POSE.0), ("y", SENSOR_POSE.1), ("yaw", SENSOR_POSE.2)];
     let places = places.map(|(key, value)| format!("--set=link.front.pose.{key}={value}"));
     let _hub = env.hub(&[&[env.link("front")], &places[..]].concat());
     env.await_info("front", |info| info["state"] == "streaming");
@@ -368,7 +399,7 @@ fn every_channel_is_what_echo_says() {
     let (_server, host) = web(&env, &[]);
     let viewers = ["foxglove.sdk.v1", "foxglove.websocket.v1"].map(|protocol| {
         let mut viewer = Viewer::new(&host, protocol);
-        viewer.listen(5);
+        viewer.receive_messages(5);
         viewer
     });
     // What they heard is among the lines before these.

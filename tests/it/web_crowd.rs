@@ -10,34 +10,34 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use crate::testkit::{INT, PATIENCE, Program, TestEnv, is_class, until};
-use crate::web::{channels, connect, status, subscribe, view, web};
+use crate::testkit::{INT, Program, TestEnv, WAIT_TIMEOUT, is_class, wait_until};
+use crate::web::{channels, connect, connect_viewer, status, subscribe, web};
 use rustix::net::sockopt::set_socket_recv_buffer_size;
 use rustix::process::{Pid, Resource, Rlimit, getrlimit, prlimit};
 use serde_json::json;
 use tungstenite::{Message, WebSocket};
 
 /// Subscribes to the channel `topic`, which there will be; messages of it that came meanwhile are not counted.
-fn follow(viewer: &mut WebSocket<TcpStream>, topic: &str) {
+fn subscribe_to(viewer: &mut WebSocket<TcpStream>, topic: &str) {
     let [channel] = channels(viewer, [topic]);
     subscribe(viewer, &[(1, &channel["id"])]);
 }
 
 /// Set when this goes, in a panic too.
-struct Raise<'a>(&'a AtomicBool);
+struct SetOnDrop<'a>(&'a AtomicBool);
 
-impl Drop for Raise<'_> {
+impl Drop for SetOnDrop<'_> {
     fn drop(&mut self) {
         self.0.store(true, Ordering::Relaxed);
     }
 }
 
 /// Waits for so many messages, for each as long as it may take.
-fn await_messages(viewer: &mut WebSocket<TcpStream>, wanted: u32) {
-    for number in 1..=wanted {
-        let give_up_at = Instant::now() + PATIENCE;
+fn await_messages(viewer: &mut WebSocket<TcpStream>, count: u32) {
+    for number in 1..=count {
+        let give_up_at = Instant::now() + WAIT_TIMEOUT;
         while !viewer.read().expect("the server lives").is_binary() {
-            assert!(Instant::now() < give_up_at, "waited in vain for message {number} of {wanted}");
+            assert!(Instant::now() < give_up_at, "waited in vain for message {number} of {count}");
         }
     }
 }
@@ -50,50 +50,50 @@ fn memory(of: &Program) -> u64 {
 }
 
 #[test]
-fn one_who_reads_slowly_and_a_crowd_keep_nobody_from_the_picture() {
+fn slow_viewer_and_full_server_do_not_block_others() {
     let env = TestEnv::new();
     let _sensor = env.simulator(&["front"], &["--seed=5", "--baud=500000"]);
     let _hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
     let (server, host) = web(&env, &[]);
-    let mut well = view(&host, "/", None).expect("let in");
-    follow(&mut well, "/front/scan");
-    let mut slow = view(&host, "/", None).expect("let in");
+    let mut reader = connect_viewer(&host, "/", None).expect("let in");
+    subscribe_to(&mut reader, "/front/scan");
+    let mut slow = connect_viewer(&host, "/", None).expect("let in");
     set_socket_recv_buffer_size(slow.get_ref(), 4096).expect("a small one");
-    follow(&mut slow, "/front/scan");
+    subscribe_to(&mut slow, "/front/scan");
     let before = memory(&server);
-    let rest: Vec<_> = (0..30).map(|_| view(&host, "/", None).expect("let in")).collect();
-    let refused = (0..20).map(|_| view(&host, "/", None).err());
+    let rest: Vec<_> = (0..30).map(|_| connect_viewer(&host, "/", None).expect("let in")).collect();
+    let refused = (0..20).map(|_| connect_viewer(&host, "/", None).err());
     assert!(refused.into_iter().all(|status| status == Some(503)));
     let idle: Vec<_> = (0..148).map(|_| connect(&host)).collect();
     let mut read = 0;
     for _ in 0..8 {
         // 1 kB for each 12 messages, which are 15 kB.
-        await_messages(&mut well, 12);
+        await_messages(&mut reader, 12);
         read += slow.get_mut().read(&mut [0; 1000]).expect("it is not given up");
     }
     assert!(read > 4000, "{read} bytes");
     let grown = memory(&server).saturating_sub(before);
     assert!(grown < 8192, "{grown} kB more with 200 connections");
     drop((slow, rest, idle));
-    assert_eq!(server.end(INT).code, Some(0));
+    assert_eq!(server.end(INT).exit_code, Some(0));
 }
 
 #[test]
-fn hostile_frames_cost_who_sends_them_his_place_and_others_nothing() {
+fn hostile_frames_do_not_disturb_other_viewers() {
     let env = TestEnv::new();
     let _sensor = env.simulator(&["front"], &["--seed=5", "--baud=500000"]);
     let _hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
     let (server, host) = web(&env, &[]);
-    let mut well = view(&host, "/", None).expect("let in");
-    follow(&mut well, "/front/scan");
+    let mut reader = connect_viewer(&host, "/", None).expect("let in");
+    subscribe_to(&mut reader, "/front/scan");
     let before = memory(&server);
 
     // Frames of any bytes; of the client's that are masked or not, whole or cut, of every opcode.
     let mut random = fastrand::Rng::with_seed(25);
     for _ in 0..60 {
-        let mut viewer = view(&host, "/", None).expect("let in");
+        let mut viewer = connect_viewer(&host, "/", None).expect("let in");
         let mut bytes: Vec<u8> = (0..random.usize(1..4000)).map(|_| random.u8(..)).collect();
         if random.bool() {
             bytes[0] = 0x80 | random.u8(0..16);
@@ -101,48 +101,48 @@ fn hostile_frames_cost_who_sends_them_his_place_and_others_nothing() {
         let _ = viewer.get_mut().write_all(&bytes);
     }
     // More subscriptions than there may be, and a message that never ends.
-    let mut greedy = view(&host, "/", None).expect("let in");
-    let wanted: Vec<_> = (0..400).map(|id| json!({ "id": id, "channelId": 1 })).collect();
-    let wish = json!({ "op": "subscribe", "subscriptions": wanted });
+    let mut greedy = connect_viewer(&host, "/", None).expect("let in");
+    let expected: Vec<_> = (0..400).map(|id| json!({ "id": id, "channelId": 1 })).collect();
+    let wish = json!({ "op": "subscribe", "subscriptions": expected });
     greedy.send(Message::text(wish.to_string())).expect("it reads");
     while greedy.read().is_ok() {}
-    let mut endless = view(&host, "/", None).expect("let in");
+    let mut endless = connect_viewer(&host, "/", None).expect("let in");
     let part = [&[0x01, 0xFE, 0x40, 0, 0, 0, 0, 0][..], &[b' '; 0x4000]].concat();
     while endless.get_mut().write_all(&part).is_ok() {}
 
     // Who does not stop talking is heard no more than the others are served.
-    let mut talker = view(&host, "/", None).expect("let in");
-    talker.get_ref().set_write_timeout(Some(PATIENCE)).expect("a timeout");
+    let mut talker = connect_viewer(&host, "/", None).expect("let in");
+    talker.get_ref().set_write_timeout(Some(WAIT_TIMEOUT)).expect("a timeout");
     let is_served = AtomicBool::new(false);
     thread::scope(|scope| {
-        let talk = scope.spawn(|| {
+        let sender = scope.spawn(|| {
             let ping = [0x89, 0x80, 0, 0, 0, 0].repeat(2000);
-            let mut said = 0;
+            let mut sent = 0;
             while !is_served.load(Ordering::Relaxed) && talker.get_mut().write_all(&ping).is_ok() {
-                said += ping.len();
+                sent += ping.len();
             }
-            said
+            sent
         });
-        let end = Raise(&is_served);
-        await_messages(&mut well, 60);
+        let end = SetOnDrop(&is_served);
+        await_messages(&mut reader, 60);
         drop(end);
-        assert!(talk.join().expect("no panic") > 0);
+        assert!(sender.join().expect("no panic") > 0);
     });
     let grown = memory(&server).saturating_sub(before);
     assert!(grown < 8192, "{grown} kB more");
     let outcome = server.end(INT);
-    assert!(outcome.code == Some(0) && !outcome.errors.contains("panicked"), "{outcome}");
+    assert!(outcome.exit_code == Some(0) && !outcome.stderr.contains("panicked"), "{outcome}");
 }
 
 /// Lets it have descriptors below `most` alone, from now on.
-fn limit_descriptors(server: &Program, most: u64) {
+fn limit_descriptors(server: &Program, max: u64) {
     let pid = Pid::from_raw(i32::try_from(server.pid()).expect("a process"));
-    let limit = Rlimit { current: Some(most), maximum: getrlimit(Resource::Nofile).maximum };
+    let limit = Rlimit { current: Some(max), maximum: getrlimit(Resource::Nofile).maximum };
     prlimit(pid, Resource::Nofile, limit).expect("its limit");
 }
 
 /// What the server follows of a sensor when nobody asks for lines.
-const FOLLOWED: [&str; 6] =
+const SERVER_TOPICS: [&str; 6] =
     ["front/scan", "front/marks", "front/zones", "front/foreground", "front/background", "front/status"];
 
 /// The lowest descriptor that it does not have.
@@ -152,7 +152,7 @@ fn next_descriptor(server: &Program) -> u64 {
 }
 
 /// Processor time that it used.
-fn worked(server: &Program) -> Duration {
+fn cpu_time(server: &Program) -> Duration {
     let text = fs::read_to_string(format!("/proc/{}/stat", server.pid())).expect("it lives");
     let fields: Vec<&str> = text.rsplit_once(") ").expect("a name").1.split(' ').collect();
     let ticks: u64 = fields[11..13].iter().map(|field| field.parse::<u64>().expect("a number")).sum();
@@ -161,16 +161,16 @@ fn worked(server: &Program) -> Duration {
 }
 
 #[test]
-fn where_descriptors_are_short_who_is_there_is_served_and_who_comes_waits() {
+fn new_viewer_waits_while_descriptors_are_short() {
     let env = TestEnv::new();
     let _sensor = env.simulator(&["front"], &["--seed=5", "--baud=500000"]);
     let _hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
     let (mut server, host) = web(&env, &[]);
-    let mut viewer = view(&host, "/", None).expect("let in");
-    follow(&mut viewer, "/front/scan");
+    let mut viewer = connect_viewer(&host, "/", None).expect("let in");
+    subscribe_to(&mut viewer, "/front/scan");
     // All that it follows takes descriptors, too.
-    until("it follows all topics", || FOLLOWED.iter().all(|topic| env.subscribers(topic) > 0));
+    wait_until("it follows all topics", || SERVER_TOPICS.iter().all(|topic| env.subscribers(topic) > 0));
     await_messages(&mut viewer, 5);
     limit_descriptors(&server, next_descriptor(&server));
     let mut late = connect(&host);
@@ -178,29 +178,29 @@ fn where_descriptors_are_short_who_is_there_is_served_and_who_comes_waits() {
     let short = server.await_line("what it is short of", is_class("web_short"));
     assert!(short["message"].as_str().is_some_and(|text| text.contains("cannot accept viewers")), "{short}");
     assert!(short["hint"].as_str().is_some_and(|text| text.contains("ulimit -n")), "{short}");
-    let (begun, before) = (Instant::now(), worked(&server));
+    let (started, before) = (Instant::now(), cpu_time(&server));
     await_messages(&mut viewer, 80);
     // One who does not sleep because somebody is at the door works all the time.
-    let (worked, took) = (worked(&server) - before, begun.elapsed());
-    assert!(worked < took / 2, "{worked:?} of {took:?}");
+    let (worked, elapsed) = (cpu_time(&server) - before, started.elapsed());
+    assert!(worked < elapsed / 2, "{worked:?} of {elapsed:?}");
     limit_descriptors(&server, 1024);
     let mut answer = String::new();
     late.read_to_string(&mut answer).expect("the page");
     assert_eq!(status(&answer), "200");
-    assert_eq!(server.end(INT).code, Some(0));
+    assert_eq!(server.end(INT).exit_code, Some(0));
 }
 
 #[test]
-fn where_descriptors_are_short_for_a_topic_the_others_are_served() {
+fn lack_of_descriptors_for_a_topic_spares_the_others() {
     let env = TestEnv::new();
     let _sensor = env.simulator(&["front"], &["--seed=5", "--baud=500000"]);
     let _hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
     let (mut server, host) = web(&env, &[]);
-    let mut viewer = view(&host, "/", None).expect("let in");
+    let mut viewer = connect_viewer(&host, "/", None).expect("let in");
     let [scan, lines] = channels(&mut viewer, ["/front/scan", "/lines"]);
     subscribe(&mut viewer, &[(1, &scan["id"])]);
-    until("it follows all topics", || FOLLOWED.iter().all(|topic| env.subscribers(topic) > 0));
+    wait_until("it follows all topics", || SERVER_TOPICS.iter().all(|topic| env.subscribers(topic) > 0));
     await_messages(&mut viewer, 5);
     limit_descriptors(&server, next_descriptor(&server));
     // Lines are followed as soon as somebody asks for them.
@@ -214,9 +214,9 @@ fn where_descriptors_are_short_for_a_topic_the_others_are_served() {
     await_messages(&mut viewer, 80);
     assert_eq!(env.subscribers("front/lines"), 0);
     limit_descriptors(&server, 1024);
-    until("it follows lines, too", || env.subscribers("front/lines") > 0);
+    wait_until("it follows lines, too", || env.subscribers("front/lines") > 0);
     let outcome = server.end(INT);
-    assert!(outcome.code == Some(0) && outcome.errors.is_empty(), "{outcome}");
+    assert!(outcome.exit_code == Some(0) && outcome.stderr.is_empty(), "{outcome}");
 }
 
 #[test]
@@ -225,12 +225,12 @@ fn where_there_are_no_descriptors_the_server_ends() {
     let _sensor = env.simulator(&["front"], &["--seed=5", "--baud=500000"]);
     let _hub = env.hub(&[env.link("front")]);
     let (server, host) = web(&env, &[]);
-    let mut viewer = view(&host, "/", None).expect("let in");
-    follow(&mut viewer, "/front/scan");
+    let mut viewer = connect_viewer(&host, "/", None).expect("let in");
+    subscribe_to(&mut viewer, "/front/scan");
     await_messages(&mut viewer, 5);
     // It may not even wait any more: better to end than to serve nobody.
     limit_descriptors(&server, 1);
     let outcome = server.wait();
-    assert!(outcome.code.is_some_and(|code| code != 0), "{outcome}");
-    assert!(!outcome.errors.contains("panicked"), "{outcome}");
+    assert!(outcome.exit_code.is_some_and(|code| code != 0), "{outcome}");
+    assert!(!outcome.stderr.contains("panicked"), "{outcome}");
 }

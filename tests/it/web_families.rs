@@ -3,19 +3,19 @@
 
 use serde_json::Value;
 
-use crate::browser::{Browser, Look};
-use crate::testkit::{INT, Sender, TestEnv, in_a_network, number, until};
+use crate::browser::{Appearance, Browser};
+use crate::testkit::{INT, TestEnv, TestGateway, in_a_network, number, wait_until};
 use crate::web::web;
 use crate::web_page::browse;
-use scanhub_schema::{Contents, Header, Pose, Scan, ScanHead, State, Status, Topic, Verdict, Zones};
+use scanhub_schema::{ArrayFlags, Header, Pose, Scan, ScanHead, State, Status, Topic, Verdict, Zones};
 use scanhub_viewer::scene::{PointerPosition, Scene};
 
 /// A hall that is as no mirror shows it.
-const HALL: &str = "[noise]\ntail = 0\n\n[[thing]]\nline = [[3000, -2500], [3500, 4000], [-2000, 3000], [-4000, -3000], [3000, -2500]]\n
+const HALL_WORLD: &str = "[noise]\ntail = 0\n\n[[thing]]\nline = [[3000, -2500], [3500, 4000], [-2000, 3000], [-4000, -3000], [3000, -2500]]\n
 [[thing]]\nradius_mm = 150\npose = [900, 1300]\n";
 
 /// Points of `sensor` on the page, in the robot's frame; not a number where there is none.
-fn drawn(page: &mut Browser, sensor: &str) -> Vec<(f64, f64)> {
+fn drawn_points(page: &mut Browser, sensor: &str) -> Vec<(f64, f64)> {
     let points = page.ask(&format!("scanhub.points('{sensor}')"));
     let numbers: Vec<f64> =
         points.as_array().expect("points").iter().map(|value| value.as_f64().unwrap_or(f64::NAN)).collect();
@@ -28,7 +28,7 @@ fn pair(value: &Value) -> (f64, f64) {
 }
 
 /// Where the beams of a line of class `scan` end for a sensor at `pose`.
-fn measured(scan: &Value, pose: &Pose) -> Vec<(f64, f64)> {
+fn measured_points(scan: &Value, pose: &Pose) -> Vec<(f64, f64)> {
     let unit_mm = number(scan, "unit_um") as f64 / 1000.0;
     let (first, step) =
         (scan["first_angle_deg"].as_f64().expect("a number"), scan["step_deg"].as_f64().expect("a number"));
@@ -44,8 +44,8 @@ fn measured(scan: &Value, pose: &Pose) -> Vec<(f64, f64)> {
 #[test]
 fn every_form_is_drawn_where_it_sees() {
     let env = TestEnv::new();
-    let Some(mut page) = browse(&env, Look::LAPTOP) else { return };
-    let world = format!("--world={}", env.file("world", HALL));
+    let Some(mut page) = browse(&env, Appearance::LAPTOP) else { return };
+    let world = format!("--world={}", env.file("world", HALL_WORLD));
     let _lms = env.simulator(&["front", "flipped"], &["--seed=7", "--baud=500000", &world]);
     let _rplidar = env.simulator(&["top"], &["--family=rplidar", "--model=s2", "--seed=8", &world]);
     let links = [env.link("front"), env.link("flipped"), env.link("top")];
@@ -73,29 +73,32 @@ fn every_form_is_drawn_where_it_sees() {
     ];
     for (sensor, pose) in poses {
         // On a busy machine the scan of a moment may have holes, and one that is too old to be shown is gone.
-        until(&format!("{sensor} stands where it sees"), || {
+        wait_until(&format!("{sensor} stands where it sees"), || {
             let outcome = env.run(&["echo", "--json", "-n", "1", &format!("{sensor}/scan")]);
             let scan = outcome.of_class("scan").pop().unwrap_or_else(|| panic!("no scan: {outcome}"));
-            let (wanted, seen) = (measured(&scan, &pose), drawn(&mut page, sensor));
-            let is_there = |(x, y): &&(f64, f64)| seen.iter().any(|(a, b)| (a - x).hypot(b - y) < 0.1);
-            wanted.len() > 300 && wanted.iter().filter(is_there).count() * 100 >= wanted.len() * 97
+            let (measured_now, drawn_points) =
+                (measured_points(&scan, &pose), drawn_points(&mut page, sensor));
+            let is_there =
+                |(x, y): &&(f64, f64)| drawn_points.iter().any(|(a, b)| (a - x).hypot(b - y) < 0.1);
+            measured_now.len() > 300
+                && measured_now.iter().filter(is_there).count() * 100 >= measured_now.len() * 97
         });
     }
-    assert!(page.complaints.is_empty(), "{:?}", page.complaints);
+    assert!(page.console_errors.is_empty(), "{:?}", page.console_errors);
 }
 
 #[test]
-fn sensors_of_other_machines_stand_in_the_list_and_not_on_this_robot() {
-    in_a_network("web_families::sensors_of_other_machines_stand_in_the_list_and_not_on_this_robot", || {
+fn remote_sensors_are_listed_but_not_on_this_robot() {
+    in_a_network("web_families::remote_sensors_are_listed_but_not_on_this_robot", || {
         let env = TestEnv::new();
-        let Some(mut page) = browse(&env, Look::LAPTOP) else { return };
-        let mut sender = Sender::new(0x5f3a_12bc_00d1_e2f3, 7, 3, "front");
+        let Some(mut page) = browse(&env, Appearance::LAPTOP) else { return };
+        let mut sender = TestGateway::new(0x5f3a_12bc_00d1_e2f3, 7, 3, "front");
         let words = ["listen", "--json", "--publish", "--name=robot1=5f3a12bc00d1e2f3"];
         let mut listener = env.start(&words).ready();
-        let said = [Topic::Zones, Topic::Scan, Topic::Status];
-        sender.await_published(&mut listener, &said);
+        let topics = [Topic::Zones, Topic::Scan, Topic::Status];
+        sender.wait_until_published(&mut listener, &topics);
         // Nothing in this hall comes near.
-        let world = format!("--world={}", env.file("world", HALL));
+        let world = format!("--world={}", env.file("world", HALL_WORLD));
         let _lms = env.simulator(&["rear"], &["--seed=7", "--baud=500000", &world]);
         let _hub = env.hub(&[env.link("rear")]);
         let (_server, host) = web(&env, &[]);
@@ -103,30 +106,30 @@ fn sensors_of_other_machines_stand_in_the_list_and_not_on_this_robot() {
         page.await_true("window.scanhub?.points('rear').length === 722");
         let head = ScanHead {
             intensity_bits: 8,
-            contents: Contents::UPPER,
+            contents: ArrayFlags::UPPER,
             ..ScanHead::lms(181, -90_000, 1000, 1, 13)
         };
         let mut scan = Scan::of(head, &[2000; 181]);
         scan.arrays().upper.fill(77);
         // It announces itself and says something all the time, as remote ones do: however long the rest took, it is there
         // again.
-        let mut say = |page: &mut Browser, wanted: &str| {
-            until(wanted, || {
-                sender.announce(&said);
+        let mut send_until = |page: &mut Browser, measured_now: &str| {
+            wait_until(measured_now, || {
+                sender.announce(&topics);
                 sender.send(Topic::Status, &Status { state: State::Streaming as u8, ..Status::default() });
                 sender.send(Topic::Scan, &*scan);
                 sender.send(Topic::Zones, &Zones { verdict: Verdict::Stop as u8, ..Zones::unknown() });
-                page.ask(wanted) == Value::Bool(true)
+                page.ask(measured_now) == Value::Bool(true)
             });
         };
         let card = "[...document.querySelectorAll('#sensors h2')].some((one) => /robot1\\.front/.test(one.innerText))";
-        say(&mut page, card);
-        say(&mut page, "scanhub.points('robot1.front').length === 362");
+        send_until(&mut page, card);
+        send_until(&mut page, "scanhub.points('robot1.front').length === 362");
         // It sits on another robot, and says nothing of this one.
-        say(&mut page, "scanhub.beams > 300 && scanhub.beams <= 361 && scanhub.verdict === 'clear'");
+        send_until(&mut page, "scanhub.beams > 300 && scanhub.beams <= 361 && scanhub.verdict === 'clear'");
         let number = "[...document.querySelectorAll('#sensors button')].find((one) => /robot1/.test(one.innerText)).click()";
         page.ask(number);
-        say(&mut page, "scanhub.beams === 181");
+        send_until(&mut page, "scanhub.beams === 181");
         // What is read out of it is what the terminal would say of the same place.
         let mut scene = Scene::default();
         scene.sensor("robot1.front").take_status(&Status::default());
@@ -139,13 +142,13 @@ fn sensors_of_other_machines_stand_in_the_list_and_not_on_this_robot() {
             page.mouse("mouseMoved", pixels, false);
             let at_m = pair(&page.ask(&format!("scanhub.place({}, {})", pixels.0, pixels.1)));
             let within_m = 14.0 / page.ask("scanhub.view.scale").as_f64().expect("pixels for a metre");
-            let words = PointerPosition::of(scene.sensors.iter(), at_m, within_m).words();
+            let words = PointerPosition::of(scene.sensors.iter(), at_m, within_m).text_lines();
             let (lines, last) = words.split_at(words.len().min(3));
             let last: String = last.iter().map(|word| format!(", {word}")).collect();
             let text = lines.join("\\n") + &last;
-            say(&mut page, &format!("document.querySelector('#readout').textContent === '{text}'"));
+            send_until(&mut page, &format!("document.querySelector('#readout').textContent === '{text}'"));
         }
         let outcome = listener.end(INT);
-        assert_eq!(outcome.code, Some(0), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     });
 }

@@ -4,18 +4,18 @@ use std::process::Command;
 
 use serde_json::Value;
 
-use crate::browser::{Browser, Look};
+use crate::browser::{Appearance, Browser};
 use crate::recorded_world::recorded_world;
-use crate::testkit::{INT, Program, TestEnv, until};
+use crate::testkit::{INT, Program, TestEnv, wait_until};
 use crate::web::web;
 use crate::web_page::browse;
 use scanhub_sim::world::World;
 
 /// Widths of a phone, a small laptop and a large one, with their heights.
-const SIZES: [(u32, u32); 3] = [(390, 844), (1024, 768), (1440, 900)];
+const WINDOW_SIZES: [(u32, u32); 3] = [(390, 844), (1024, 768), (1440, 900)];
 
 /// Script that returns each pair of boxes that overlap, each box that leaves the window, and each text that is cut.
-const BREACHES: &str = "(() => {
+const BREACHES_SCRIPT: &str = "(() => {
     const names = ['#verdict', '#people', '#swept', '#hub', '#news', '#readout', '#reason', '#layers', '#player', 'nav', 'article'];
     const boxes = names.flatMap((name) => [...document.querySelectorAll(name)].map((element) =>
         ({ name, element, box: element.getBoundingClientRect() }))).filter(({ box }) => box.width * box.height > 0);
@@ -47,45 +47,45 @@ fn demo(world: &str, home: &str) -> (Program, String) {
 }
 
 /// Asserts that the boxes have their places with and without the list of layers.
-fn check(page: &mut Browser, what: &str) {
+fn check(page: &mut Browser, description: &str) {
     for layers in ["", ", with layers"] {
         // A busy browser drops movements of the mouse, so keep moving it.
         let mut x = (0..).map(|step| 330.0 + f64::from(step % 2));
-        until("the read-out is shown", || {
+        wait_until("the read-out is shown", || {
             page.mouse("mouseMoved", (x.next().expect("endless"), 330.0), false);
             page.ask("document.querySelector('#readout').innerText !== ''") == true
         });
         // The report of skipped messages is shown for a moment only.
         let report = "62 messages skipped: the server was too late, its machine may be busy";
-        let script = format!("(document.querySelector('#news').textContent = '{report}', {BREACHES})");
-        assert_eq!(page.ask(&script), Value::Array(Vec::new()), "{what}{layers}");
+        let script = format!("(document.querySelector('#news').textContent = '{report}', {BREACHES_SCRIPT})");
+        assert_eq!(page.ask(&script), Value::Array(Vec::new()), "{description}{layers}");
         page.press("l");
     }
 }
 
 /// Checks the page at all sizes, in light and dark colors.
-fn check_sizes(page: &mut Browser, what: &str) {
-    for (width, height) in SIZES {
+fn check_sizes(page: &mut Browser, description: &str) {
+    for (width, height) in WINDOW_SIZES {
         for scheme in ["light", "dark"] {
-            page.set_look(Look { width, height, scheme, is_phone: width == 390 });
+            page.set_appearance(Appearance { width, height, scheme, is_phone: width == 390 });
             page.await_true(&format!("innerWidth === {width}"));
-            check(page, &format!("{what}, {width} px, {scheme}"));
+            check(page, &format!("{description}, {width} px, {scheme}"));
         }
     }
 }
 
 #[test]
 fn boxes_do_not_overlap_in_any_demo() {
-    for (world, seen, chip) in [
+    for (world, condition, chip) in [
         ("demo", "scanhub.sensors.length === 2 && scanhub.zones === 2", "#verdict"),
         ("house", "scanhub.sensors.length === 4 && scanhub.tracks > 0", "#people"),
         ("tilt", "scanhub.sweeps[0]?.words !== undefined", "#swept"),
     ] {
         let env = TestEnv::new();
-        let Some(mut page) = browse(&env, Look::LAPTOP) else { return };
-        let (demo, url) = demo(world, &env.word("home"));
+        let Some(mut page) = browse(&env, Appearance::LAPTOP) else { return };
+        let (demo, url) = demo(world, &env.path_argument("home"));
         page.open(&url);
-        page.await_true(&format!("window.scanhub?.beams > 0 && {seen}"));
+        page.await_true(&format!("window.scanhub?.beams > 0 && {condition}"));
         page.await_true(&format!("document.querySelector('{chip}').innerText !== ''"));
         check_sizes(&mut page, world);
         if world == "tilt" {
@@ -93,15 +93,15 @@ fn boxes_do_not_overlap_in_any_demo() {
             page.await_true("scanhub.aside && scanhub.swept > 0");
             check_sizes(&mut page, "tilt from the side");
         }
-        assert!(page.complaints.is_empty(), "{:?}", page.complaints);
-        assert_eq!(demo.end(INT).code, Some(0));
+        assert!(page.console_errors.is_empty(), "{:?}", page.console_errors);
+        assert_eq!(demo.end(INT).exit_code, Some(0));
     }
 }
 
 #[test]
 fn boxes_do_not_overlap_without_a_hub() {
     let env = TestEnv::new();
-    let Some(mut page) = browse(&env, Look::LAPTOP) else { return };
+    let Some(mut page) = browse(&env, Appearance::LAPTOP) else { return };
     let (_server, host) = web(&env, &[]);
     page.open(&format!("http://{host}/"));
     page.await_true("window.scanhub?.connected && /no hub/.test(scanhub.reason)");
@@ -111,7 +111,7 @@ fn boxes_do_not_overlap_without_a_hub() {
 #[test]
 fn boxes_do_not_overlap_while_a_recording_plays() {
     let env = TestEnv::new();
-    let Some(mut page) = browse(&env, Look::LAPTOP) else { return };
+    let Some(mut page) = browse(&env, Appearance::LAPTOP) else { return };
     let world: World = "demo".parse().expect("a world");
     let file = recorded_world(&env, &world, &["front", "rear"], 60);
     let (_server, host) = web(&env, &["--replay", &file, "--loop"]);

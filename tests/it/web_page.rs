@@ -2,9 +2,9 @@
 
 use std::path::Path;
 
-use crate::browser::{Browser, Look};
+use crate::browser::{Appearance, Browser};
 use crate::recorded_world::recorded_world;
-use crate::testkit::{INT, KILL, Program, TERM, TestEnv, skip, until};
+use crate::testkit::{INT, KILL, Program, TERM, TestEnv, skip, wait_until};
 use scanhub_sim::world::World;
 
 /// A hall with a reflector.
@@ -13,7 +13,7 @@ const WORLD: &str =
 [[thing]]\nline = [[900, 2000], [1000, 2000]]\nsurface = \"reflector\"\n";
 
 /// A post beside the robot.
-const POST: &str = "\n[[thing]]\nradius_mm = 60\npose = [0, 450]\n";
+const POST_WORLD: &str = "\n[[thing]]\nradius_mm = 60\npose = [0, 450]\n";
 
 /// A scanner in the hall, and with `more` in it.
 fn sensor(env: &TestEnv, more: &str) -> Program {
@@ -22,8 +22,8 @@ fn sensor(env: &TestEnv, more: &str) -> Program {
 }
 
 /// A browser with a page, looking as `look` says; nothing, and why, where there is none.
-pub(crate) fn browse(env: &TestEnv, look: Look) -> Option<Browser> {
-    let browser = Browser::start(env.path("browser"), look);
+pub(crate) fn browse(env: &TestEnv, appearance: Appearance) -> Option<Browser> {
+    let browser = Browser::start(env.path("browser"), appearance);
     if browser.is_none() {
         skip("chromium", "there is no browser (Debian: apt-get install chromium)");
     }
@@ -31,11 +31,11 @@ pub(crate) fn browse(env: &TestEnv, look: Look) -> Option<Browser> {
 }
 
 /// Holds the picture when `seen` is true of it: on a busy machine, that of a moment may be empty.
-pub(crate) fn hold(page: &mut Browser, seen: &str) {
-    until("a picture is held", || {
+pub(crate) fn freeze_page(page: &mut Browser, condition: &str) {
+    wait_until("a picture is held", || {
         page.press(" ");
         page.await_true("document.querySelector('#verdict').innerText.includes('held')");
-        let is_seen = page.ask(seen) == true;
+        let is_seen = page.ask(condition) == true;
         if !is_seen {
             page.press(" ");
         }
@@ -52,38 +52,38 @@ fn web(env: &TestEnv, listen: &str) -> (Program, String) {
 }
 
 /// Of the verdict's word.
-const COLOUR: &str = "getComputedStyle(document.querySelector('#verdict strong')).backgroundColor";
+const COLOR_SCRIPT: &str = "getComputedStyle(document.querySelector('#verdict strong')).backgroundColor";
 
 #[test]
-fn it_shows_what_comes_and_says_why_nothing_does() {
+fn page_shows_samples_or_the_reason_for_their_absence() {
     let env = TestEnv::new();
-    let Some(mut page) = browse(&env, Look::LAPTOP) else { return };
+    let Some(mut page) = browse(&env, Appearance::LAPTOP) else { return };
     let (server, url) = web(&env, "127.0.0.1:0");
     page.open(&url);
     page.await_true("window.scanhub?.connected && /no hub/.test(window.scanhub.reason)");
     assert_eq!(page.ask("scanhub.verdict"), "unknown");
     page.await_true("/scanhub run/.test(scanhub.reason)");
-    let red = page.ask(COLOUR);
+    let red = page.ask(COLOR_SCRIPT);
 
     // One that does not answer yet says where it is looked for, and what looks into that.
     let hub = env.hub(&[env.link("front")]);
     page.await_true("/^front: ./.test(scanhub.reason)");
     let empty_hall = sensor(&env, "");
     page.await_true("scanhub.reason === null && scanhub.verdict === 'clear' && scanhub.beams > 100");
-    page.await_true(&format!("scanhub.verdict === 'clear' && {COLOUR} !== {red}"));
+    page.await_true(&format!("scanhub.verdict === 'clear' && {COLOR_SCRIPT} !== {red}"));
     page.await_true("scanhub.zones === 2 && scanhub.marks > 0 && scanhub.sensors[0].hz > 0");
     page.await_true("document.querySelector('#sensors article').innerText.includes('streaming')");
 
     // The post is new, and nearer than the robot may be.
-    let learned = env.path("state/scanhub").join(env.place().name()).join("front.background.json");
-    until("the background is learned", || learned.exists());
-    assert_eq!(empty_hall.end(TERM).code, Some(0));
-    let _with_post = sensor(&env, POST);
+    let learned = env.path("state/scanhub").join(env.domain().name()).join("front.background.json");
+    wait_until("the background is learned", || learned.exists());
+    assert_eq!(empty_hall.end(TERM).exit_code, Some(0));
+    let _with_post = sensor(&env, POST_WORLD);
     page.await_true("scanhub.verdict === 'stop' && scanhub.foreground > 2");
     page.await_true("document.querySelector('#verdict').innerText.startsWith('STOP')");
-    page.await_true(&format!("scanhub.verdict === 'stop' && {COLOUR} === {red}"));
+    page.await_true(&format!("scanhub.verdict === 'stop' && {COLOR_SCRIPT} === {red}"));
     // Held, the picture stands and the verdict does not.
-    hold(&mut page, "scanhub.beams > 100");
+    freeze_page(&mut page, "scanhub.beams > 100");
     hub.end(KILL);
     page.await_true("scanhub.verdict === 'unknown'");
     page.await_true("/no hub/.test(scanhub.reason)");
@@ -103,13 +103,13 @@ fn it_shows_what_comes_and_says_why_nothing_does() {
     let (_server, again) = web(&env, &address);
     assert_eq!(again, url);
     page.await_true("scanhub.verdict === 'stop' && scanhub.beams > 100 && scanhub.reason === null");
-    assert!(page.complaints.is_empty(), "{:?}", page.complaints);
+    assert!(page.console_errors.is_empty(), "{:?}", page.console_errors);
 }
 
 #[test]
 fn page_drops_sensors_of_previous_server() {
     let (first, second) = (TestEnv::new(), TestEnv::new());
-    let Some(mut page) = browse(&first, Look::LAPTOP) else { return };
+    let Some(mut page) = browse(&first, Appearance::LAPTOP) else { return };
     let simulators = [
         first.simulator(&["front", "rear"], &["--seed=71", "--baud=500000"]),
         second.simulator(&["rear"], &["--seed=72", "--baud=500000"]),
@@ -123,9 +123,9 @@ fn page_drops_sensors_of_previous_server() {
     page.await_true("scanhub.beams > 0 && scanhub.beams <= 361");
 
     // A frozen picture keeps what it shows, but its sensors are no longer reported as streaming.
-    hold(&mut page, "scanhub.beams > 100");
+    freeze_page(&mut page, "scanhub.beams > 100");
     let address = url.trim_start_matches("http://").trim_end_matches('/').to_owned();
-    assert_eq!(server.end(INT).code, Some(0));
+    assert_eq!(server.end(INT).exit_code, Some(0));
     page.await_true("/No connection/.test(scanhub.reason)");
     let (server, _) = web(&second, &address);
     let states = "[...document.querySelectorAll('#sensors article')].map((one) => one.classList[0]).join()";
@@ -135,23 +135,23 @@ fn page_drops_sensors_of_previous_server() {
     page.await_true(&format!("{titles} === '1  rear' && {states} === 'streaming' && scanhub.beams > 100"));
 
     // Without a frozen picture, the sensors are dropped as soon as the page has connected.
-    assert_eq!(server.end(INT).code, Some(0));
+    assert_eq!(server.end(INT).exit_code, Some(0));
     page.await_true("/No connection/.test(scanhub.reason)");
     let (server, _) = web(&first, &address);
     page.await_true(&format!("{titles} === '1  front,2  rear' && scanhub.beams > 600"));
-    assert_eq!(server.end(INT).code, Some(0));
+    assert_eq!(server.end(INT).exit_code, Some(0));
     page.await_true("/No connection/.test(scanhub.reason)");
     let (_server, _) = web(&second, &address);
     page.await_true(&format!("{titles} === '1  rear' && {states} === 'streaming' && scanhub.beams > 100"));
-    assert!(page.complaints.is_empty(), "{:?}", page.complaints);
+    assert!(page.console_errors.is_empty(), "{:?}", page.console_errors);
     drop((simulators, hubs));
 }
 
 #[test]
 fn keys_and_the_mouse_change_the_picture() {
     let env = TestEnv::new();
-    let Some(mut page) = browse(&env, Look::PHONE) else { return };
-    let _sensor = sensor(&env, POST);
+    let Some(mut page) = browse(&env, Appearance::PHONE) else { return };
+    let _sensor = sensor(&env, POST_WORLD);
     let _hub = env.hub(&[env.link("front")]);
     let (_server, url) = web(&env, "127.0.0.1:0");
     page.open(&url);
@@ -170,7 +170,7 @@ fn keys_and_the_mouse_change_the_picture() {
     assert_eq!(env.subscribers("front/lines"), 1);
     page.press("e");
     page.await_true("scanhub.lines === 0");
-    until("nobody follows them", || env.subscribers("front/lines") == 0);
+    wait_until("nobody follows them", || env.subscribers("front/lines") == 0);
     let fits = "document.querySelector('[data-do=fit]').getAttribute('aria-pressed')";
     assert_eq!(page.ask(fits), "true");
     page.mouse("mousePressed", (180.0, 300.0), true);
@@ -181,7 +181,7 @@ fn keys_and_the_mouse_change_the_picture() {
     page.await_true(&format!("{fits} === 'true'"));
     // A busy browser drops movements of the mouse, so keep moving it, as a person does.
     let mut steps = (0..).map(|step| 195.0 + f64::from(step % 2));
-    until("the place under the mouse is read out", || {
+    wait_until("the place under the mouse is read out", || {
         page.mouse("mouseMoved", (steps.next().expect("endless"), 300.0), false);
         page.ask("/from the robot/.test(document.querySelector('#readout').innerText)") == true
     });
@@ -200,15 +200,15 @@ fn keys_and_the_mouse_change_the_picture() {
     // One that is hidden has no height.
     let small = "[...document.querySelectorAll('nav button:not([hidden])')].filter((one) => one.offsetHeight < 40).length";
     assert_eq!(page.ask(small), 0);
-    assert!(page.complaints.is_empty(), "{:?}", page.complaints);
+    assert!(page.console_errors.is_empty(), "{:?}", page.console_errors);
 }
 
 /// Writes the page to a PNG file, without the read-out of the position under the mouse.
-pub(crate) fn photograph(page: &mut Browser, look: Look, path: &Path) {
+pub(crate) fn save_screenshot(page: &mut Browser, appearance: Appearance, path: &Path) {
     // The edge of the buttons' box, between its border and the first button.
-    page.mouse("mouseMoved", (14.0, f64::from(look.height) - 30.0), false);
+    page.mouse("mouseMoved", (14.0, f64::from(appearance.height) - 30.0), false);
     page.await_true("document.querySelector('#readout').innerText === ''");
-    page.photograph(path);
+    page.save_screenshot(path);
 }
 
 /// Returns a script that counts the pixels with the color `name` in the first sensor's curve of damage.
@@ -241,12 +241,15 @@ fn the_picture_of_the_documents() {
     let replay = [["replay", &file, "--json", "--hold"].map(str::to_owned).to_vec(), poses.to_vec()].concat();
     let _hub = env.start(&replay).ready();
     let (_server, url) = web(&env, "127.0.0.1:0");
-    let dark = Look { scheme: "dark", ..Look::LAPTOP };
-    for (name, look) in [("web-light", Look::LAPTOP), ("web-dark", dark), ("web-phone", Look::PHONE)] {
+    let dark = Appearance { scheme: "dark", ..Appearance::LAPTOP };
+    for (name, look) in
+        [("web-light", Appearance::LAPTOP), ("web-dark", dark), ("web-phone", Appearance::PHONE)]
+    {
         let Some(mut page) = browse(&env, look) else { return };
         page.open(&url);
-        let seen = "window.scanhub?.verdict === 'slow' && scanhub.foreground > 20 && scanhub.beams > 600";
-        page.await_true(seen);
+        let condition =
+            "window.scanhub?.verdict === 'slow' && scanhub.foreground > 20 && scanhub.beams > 600";
+        page.await_true(condition);
         page.await_true("scanhub.zones === 2 && scanhub.marks >= 2 && scanhub.sensors.length === 2");
         page.await_true("document.querySelectorAll('#sensors article.streaming').length === 2");
         // The recording has no damage, so the curve of the damage is gray.
@@ -263,12 +266,12 @@ fn the_picture_of_the_documents() {
                 "!document.querySelector('#sensors .lossy') && !document.querySelector('#news').innerText";
             page.ask(&format!(
                 "new Promise((done) => {{
-                    const look = () => ({seen}) && ({quiet}) ? done() : requestAnimationFrame(look);
+                    const look = () => ({condition}) && ({quiet}) ? done() : requestAnimationFrame(look);
                     look();
                 }})"
             ));
-            photograph(&mut page, look, &Path::new(directory).join(format!("{name}.png")));
+            save_screenshot(&mut page, look, &Path::new(directory).join(format!("{name}.png")));
         }
-        assert!(page.complaints.is_empty(), "{:?}", page.complaints);
+        assert!(page.console_errors.is_empty(), "{:?}", page.console_errors);
     }
 }

@@ -1,12 +1,12 @@
 //! A recording in a browser: its time line, pause, single steps and speed, by buttons and by keys, from a hub that nobody else
 //! has and that is gone afterwards.
 
-use crate::browser::Look;
+use crate::browser::Appearance;
 use crate::testkit::{INT, Program, TestEnv, is_class, shared_memory};
 use crate::web_page::browse;
 
 /// Starts what shows `file`, and waits for its address.
-fn show(env: &TestEnv, file: &str, flags: &[&str]) -> (Program, String) {
+fn start_web(env: &TestEnv, file: &str, flags: &[&str]) -> (Program, String) {
     let words = ["web", "--json", "--listen", "127.0.0.1:0", "--replay", file];
     let mut web = env.start(&[&words, flags].concat());
     let ready = web.await_line("its address", is_class("ready"));
@@ -15,7 +15,7 @@ fn show(env: &TestEnv, file: &str, flags: &[&str]) -> (Program, String) {
 }
 
 /// Scans of a log that plays for two minutes, which is longer than a page takes to load.
-const SCANS: u64 = 600;
+const SCAN_COUNT: u64 = 600;
 
 /// A CARMEN log of a wall that comes nearer with every scan, five of them a second.
 fn log(env: &TestEnv, scans: u64) -> String {
@@ -30,8 +30,8 @@ fn log(env: &TestEnv, scans: u64) -> String {
 #[test]
 fn the_keys_of_a_player_are_on_the_page() {
     let env = TestEnv::new();
-    let Some(mut page) = browse(&env, Look::LAPTOP) else { return };
-    let (server, url) = show(&env, &log(&env, SCANS), &[]);
+    let Some(mut page) = browse(&env, Appearance::LAPTOP) else { return };
+    let (server, url) = start_web(&env, &log(&env, SCAN_COUNT), &[]);
     page.open(&url);
     page.await_true("window.scanhub?.beams === 181 && scanhub.player && !scanhub.player.paused");
     let own = format!("sh_web-{}_", server.pid());
@@ -67,30 +67,30 @@ fn the_keys_of_a_player_are_on_the_page() {
     page.press("p");
     page.await_true("scanhub.player.over && /at its end/.test(document.querySelector('#played').innerText)");
     page.await_true(&format!(
-        "document.querySelector('[data-order=step]').disabled && scanhub.player.telegrams === {SCANS}"
+        "document.querySelector('[data-order=step]').disabled && scanhub.player.telegrams === {SCAN_COUNT}"
     ));
     assert_eq!(page.ask("scanhub.beams"), 181, "what was seen last stands");
-    assert!(page.complaints.is_empty(), "{:?}", page.complaints);
+    assert!(page.console_errors.is_empty(), "{:?}", page.console_errors);
     let outcome = server.end(INT);
-    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     assert!(shared_memory(&own).is_empty(), "its domain is left");
 }
 
 #[test]
-fn a_recording_starts_again_and_what_is_none_is_refused() {
+fn recording_loops_and_missing_file_is_refused() {
     let env = TestEnv::new();
-    let Some(mut page) = browse(&env, Look::PHONE) else { return };
-    let (server, url) = show(&env, &log(&env, 8), &["--loop"]);
+    let Some(mut page) = browse(&env, Appearance::PHONE) else { return };
+    let (server, url) = start_web(&env, &log(&env, 8), &["--loop"]);
     page.open(&url);
     page.await_true("window.scanhub?.player?.lap >= 1 && scanhub.beams === 181");
     page.await_true("document.documentElement.scrollWidth <= 390");
-    assert_eq!(server.end(INT).code, Some(0));
-    let outcome = env.run(&["web", "--json", "--replay", &env.word("none.log")]);
+    assert_eq!(server.end(INT).exit_code, Some(0));
+    let outcome = env.run(&["web", "--json", "--replay", &env.path_argument("none.log")]);
     assert_eq!(
-        (outcome.code, &outcome.of_class("error")[0]["kind"]),
+        (outcome.exit_code, &outcome.of_class("error")[0]["kind"]),
         (Some(66), &"input".into()),
         "{outcome}"
     );
     let outcome = env.run(&["web", "--loop"]);
-    assert_eq!(outcome.code, Some(2), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(2), "{outcome}");
 }

@@ -9,44 +9,44 @@ use scanhub_ros::{POINT_CLOUD, Value as Told, read};
 use serde_json::Value;
 use tungstenite::{Message, WebSocket};
 
-use crate::browser::Look;
+use crate::browser::Appearance;
 use crate::pages::commands_on;
-use crate::testkit::{INT, Program, TestEnv, is_class, number, until};
-use crate::tilt::{Hall, NEAR, ends_well, numbers};
-use crate::tilted::{CLASSES, Made, TOPICS, hub, round};
-use crate::web::{channels, subscribe, view, view_as, web};
-use crate::web_channels::conforms;
-use crate::web_page::{browse, hold, photograph};
+use crate::testkit::{INT, Program, TestEnv, is_class, number, wait_until};
+use crate::tilt::{NEAR_FLAG, TiltHub, end_cleanly, numbers};
+use crate::tilted::{CLASSES, TOPICS, TiltedPublisher, hub, round_of};
+use crate::web::{channels, connect_viewer, connect_viewer_with, subscribe, web};
+use crate::web_channels::matches_schema;
+use crate::web_page::{browse, freeze_page, save_screenshot};
 
 /// The messages of a round: an angle, a sweep, and what that has found.
-fn say(made: &mut Made, viewer: &mut WebSocket<TcpStream>) -> [Vec<u8>; 3] {
-    made.round();
-    let mut heard: [Option<Vec<u8>>; 3] = Default::default();
-    while heard.iter().any(Option::is_none) {
+fn publish_round(publisher: &mut TiltedPublisher, viewer: &mut WebSocket<TcpStream>) -> [Vec<u8>; 3] {
+    publisher.publish_round();
+    let mut messages: [Option<Vec<u8>>; 3] = Default::default();
+    while messages.iter().any(Option::is_none) {
         let Message::Binary(frame) = viewer.read().expect("the server lives") else { continue };
         let number = u32::from_le_bytes(frame[1..5].try_into().expect("four bytes"));
-        heard[number as usize] = Some(frame[13..].to_vec());
+        messages[number as usize] = Some(frame[13..].to_vec());
     }
-    heard.map(Option::unwrap_or_default)
+    messages.map(Option::unwrap_or_default)
 }
 
 /// Whether a point cloud has the points of these lines, which are of one sweep.
 fn is_cloud(body: &[u8], lines: &[Value]) -> bool {
-    let told = read(&POINT_CLOUD, body).expect("a PointCloud2");
+    let message = read(&POINT_CLOUD, body).expect("a PointCloud2");
     let byte = |value: &Told| if let Told::Number(byte) = value { *byte as u8 } else { panic!("a byte") };
-    let bytes: Vec<u8> = told.sequence("data").expect("data").iter().map(byte).collect();
+    let bytes: Vec<u8> = message.sequence("data").expect("data").iter().map(byte).collect();
     let list = |key: &str| -> Vec<&Value> {
         lines.iter().flat_map(|line| line[key].as_array().expect("a list")).collect()
     };
     let (points, beams, classes) = (list("points"), list("beams"), list("classes"));
     let is_point = |(n, point): (usize, &[u8; 16])| {
         let axes = point.as_chunks::<4>().0.iter().take(3).map(|axis| f64::from(f32::from_le_bytes(*axis)));
-        axes.zip(numbers(points[n])).all(|(axis, said)| (axis - said).abs() < 6e-4)
+        axes.zip(numbers(points[n])).all(|(axis, expected)| (axis - expected).abs() < 6e-4)
             && beams[n].as_u64() == Some(u16::from_le_bytes([point[12], point[13]]).into())
             && classes[n].as_u64() == Some(point[14].into())
     };
     let all = bytes.as_chunks::<16>().0;
-    told.text("header.frame_id") == Some("base_link")
+    message.text("header.frame_id") == Some("base_link")
         && all.len() == points.len()
         && all.iter().enumerate().all(is_point)
 }
@@ -61,7 +61,7 @@ fn metadata(entity: &Value, key: &str) -> Value {
 /// Whether boxes are the obstacles of this line.
 fn are_obstacles(update: &Value, line: &Value) -> bool {
     let entities = update["entities"].as_array().expect("a list");
-    let said = line["obstacles"].as_array().expect("a list");
+    let expected = line["obstacles"].as_array().expect("a list");
     let is_box = |(entity, one): (&Value, &Value)| {
         let cube = &entity["cubes"][0];
         let is_axis = |(n, axis): (usize, &str)| {
@@ -78,84 +78,85 @@ fn are_obstacles(update: &Value, line: &Value) -> bool {
     metadata(&entities[0], "sweep") == line["sweep"]
         && metadata(&entities[0], "complete") == line["complete"]
         && metadata(&entities[0], "unreliable") == line["unreliable"]
-        && entities.len() == said.len() + 1
-        && entities[1..].iter().zip(said).all(is_box)
+        && entities.len() == expected.len() + 1
+        && entities[1..].iter().zip(expected).all(is_box)
 }
 
 #[test]
-fn channels_of_mounts_and_sweeps_are_what_echo_says() {
+fn channels_of_mount_and_sweep_equal_output_of_echo() {
     for protocol in ["foxglove.sdk.v1", "foxglove.websocket.v1"] {
         let env = TestEnv::new();
         let _hub = hub(&env);
-        let mut made = Made::beside(&env);
+        let mut made = TiltedPublisher::start_publisher(&env);
         let mut echo = env.echo(&TOPICS);
         let (_server, host) = web(&env, &[]);
-        let mut viewer = view_as(&host, "/", None, protocol).expect("let in");
-        let told = channels(&mut viewer, ["/mount/tilt", "/room/cloud", "/room/obstacles"]);
-        until("obstacles are followed at once", || env.subscribers("room/obstacles") == 2);
+        let mut viewer = connect_viewer_with(&host, "/", None, protocol).expect("let in");
+        let advertised = channels(&mut viewer, ["/mount/tilt", "/room/cloud", "/room/obstacles"]);
+        wait_until("obstacles are followed at once", || env.subscribers("room/obstacles") == 2);
         let seldom = ["room/cloud", "mount/tilt"];
         assert_eq!(seldom.map(|topic| env.subscribers(topic)), [1, 1], "nobody looks at them");
-        let wanted: Vec<(u32, &Value)> = (0..).zip(told.iter().map(|channel| &channel["id"])).collect();
-        subscribe(&mut viewer, &wanted);
-        until("all are followed", || seldom.map(|topic| env.subscribers(topic)) == [2, 2]);
-        let heard: Vec<_> = (0..4).map(|_| say(&mut made, &mut viewer)).collect();
+        let expected: Vec<(u32, &Value)> =
+            (0..).zip(advertised.iter().map(|channel| &channel["id"])).collect();
+        subscribe(&mut viewer, &expected);
+        wait_until("all are followed", || seldom.map(|topic| env.subscribers(topic)) == [2, 2]);
+        let rounds: Vec<_> = (0..4).map(|_| publish_round(&mut made, &mut viewer)).collect();
         let is_last =
-            |line: &Value, class| line["class"] == class && line["first"] != true && round(line) == 3;
-        until("echo says all of them, too", || {
-            CLASSES.iter().all(|class| echo.is_heard(|line| is_last(line, *class)))
+            |line: &Value, class| line["class"] == class && line["first"] != true && round_of(line) == 3;
+        wait_until("echo says all of them, too", || {
+            CLASSES.iter().all(|class| echo.prints(|line| is_last(line, *class)))
         });
         let echo = echo.end(INT);
         let lines = |class: &str, of: u64| {
-            echo.of_class(class).into_iter().filter(|line| round(line) == of).collect::<Vec<_>>()
+            echo.of_class(class).into_iter().filter(|line| round_of(line) == of).collect::<Vec<_>>()
         };
         let object = |body: &[u8], channel: &Value| {
             let object = serde_json::from_slice::<Value>(body).expect("JSON");
             let schema = serde_json::from_str(channel["schema"].as_str().expect("text")).expect("JSON");
-            assert!(conforms(&object, &schema), "{object}");
+            assert!(matches_schema(&object, &schema), "{object}");
             object
         };
-        for (number, [tilt, cloud, obstacles]) in (0..).zip(&heard) {
-            let (tilt, said) = (object(tilt, &told[0]), &lines("tilt", number)[0]);
-            let close = |key: &str| match (tilt[key].as_f64(), said[key].as_f64()) {
-                (Some(told), Some(said)) => (told - said).abs() < 1e-4,
-                (told, said) => told.is_none() && said.is_none(),
+        for (number, [tilt, cloud, obstacles]) in (0..).zip(&rounds) {
+            let (tilt, expected) = (object(tilt, &advertised[0]), &lines("tilt", number)[0]);
+            let close = |key: &str| match (tilt[key].as_f64(), expected[key].as_f64()) {
+                (Some(decoded), Some(printed)) => (decoded - printed).abs() < 1e-4,
+                (decoded, printed) => decoded.is_none() && printed.is_none(),
             };
-            assert!(close("angle_deg") && close("rate_deg_s"), "{tilt} {said}");
+            assert!(close("angle_deg") && close("rate_deg_s"), "{tilt} {expected}");
             assert!(is_cloud(cloud, &lines("cloud", number)), "sweep {number}");
-            let found = object(obstacles, &told[2]);
-            let said = &lines("obstacles", number)[0];
-            assert!(are_obstacles(&found, said), "{found} {said}");
+            let found = object(obstacles, &advertised[2]);
+            let expected = &lines("obstacles", number)[0];
+            assert!(are_obstacles(&found, expected), "{found} {expected}");
         }
         // Who does not look any more costs nothing.
         drop(viewer);
-        until("nobody looks", || seldom.map(|topic| env.subscribers(topic)) == [0, 0]);
+        wait_until("nobody looks", || seldom.map(|topic| env.subscribers(topic)) == [0, 0]);
     }
 }
 
-const SIDE: &str = "document.querySelector('[data-do=side]')";
-const SWEPT: &str = "document.querySelector('#swept').innerText";
+const SIDE_BUTTON: &str = "document.querySelector('[data-do=side]')";
+const SWEPT_TEXT: &str = "document.querySelector('#swept').innerText";
 
 #[test]
-fn a_hall_is_seen_from_the_side_while_somebody_looks() {
-    let hall = Hall::new();
-    let Some(mut page) = browse(&hall.env, Look::LAPTOP) else { return };
+fn side_view_shows_sweeps_and_subscribes_to_points() {
+    let hall = TiltHub::new();
+    let Some(mut page) = browse(&hall.env, Appearance::LAPTOP) else { return };
     let (_server, host) = web(&hall.env, &[]);
     page.open(&format!("http://{host}/"));
     page.await_true("window.scanhub?.beams > 100");
     // Where nobody makes sweeps the page is as ever.
     page.press("h");
-    let is_plain = format!("{SIDE}.hidden && !scanhub.aside && {SWEPT} === ''");
+    let is_plain = format!("{SIDE_BUTTON}.hidden && !scanhub.aside && {SWEPT_TEXT} === ''");
     page.await_true(&is_plain);
     page.await_true("scanhub.foreground > 0");
 
-    let tilt = hall.tilt(&["--as=hall", NEAR]);
-    page.await_true(&format!("!{SIDE}.hidden && /^hall: /.test({SWEPT})"));
+    let tilt = hall.tilt(&["--as=hall", NEAR_FLAG]);
+    page.await_true(&format!("!{SIDE_BUTTON}.hidden && /^hall: /.test({SWEPT_TEXT})"));
     page.await_true("scanhub.obstacles > 0 && scanhub.beams > 100");
-    page.await_true(&format!("{SIDE}.offsetHeight >= 40"));
+    page.await_true(&format!("{SIDE_BUTTON}.offsetHeight >= 40"));
     assert_eq!(hall.env.subscribers("hall/cloud"), 0, "points are not seen from above");
     // The floor is in front of a background in two dimensions, whose beams had another angle.
     page.await_true("scanhub.sweeps[0].sweep !== undefined && scanhub.foreground === 0");
-    let most = "new Promise((done) => {
+    let script = "new Promise((done) => {
         const until = scanhub.scans.front + 40;
         let most = 0;
         const look = () => {
@@ -164,13 +165,13 @@ fn a_hall_is_seen_from_the_side_while_somebody_looks() {
         };
         look();
     })";
-    assert_eq!(page.ask(most), 0);
+    assert_eq!(page.ask(script), 0);
     assert_eq!(page.ask("scanhub.axes"), 2);
     page.press("h");
-    page.await_true(&format!("scanhub.aside && {SIDE}.ariaPressed === 'true'"));
+    page.await_true(&format!("scanhub.aside && {SIDE_BUTTON}.ariaPressed === 'true'"));
     page.await_true("scanhub.swept > 1000 && scanhub.obstacles > 0 && scanhub.reason === null");
     assert_eq!(hall.env.subscribers("hall/cloud"), 1);
-    page.await_true(&format!("/^hall: [1-9][0-9]* obstacles?, nearest 1\\.[3-5] m/.test({SWEPT})"));
+    page.await_true(&format!("/^hall: [1-9][0-9]* obstacles?, nearest 1\\.[3-5] m/.test({SWEPT_TEXT})"));
     page.await_true("document.querySelector('#map').ariaLabel.includes('from the side')");
     // The axes have names, and the floor is at the bottom of the free part of the picture.
     page.await_true("scanhub.axes === 2");
@@ -201,7 +202,7 @@ fn a_hall_is_seen_from_the_side_while_somebody_looks() {
     page.press("c");
     page.await_true("scanhub.view.turn === 0");
     // Held, it stands; then it goes on.
-    hold(&mut page, "scanhub.swept > 1000 && scanhub.sweeps[0].sweep != null");
+    freeze_page(&mut page, "scanhub.swept > 1000 && scanhub.sweeps[0].sweep != null");
     let [sweep, points] = ["scanhub.sweeps[0].sweep", "scanhub.swept"].map(|what| page.ask(what));
     page.press("h");
     page.await_true("!scanhub.aside && scanhub.beams > 100");
@@ -213,17 +214,19 @@ fn a_hall_is_seen_from_the_side_while_somebody_looks() {
     page.await_true(&format!("scanhub.sweeps[0].sweep !== {sweep}"));
     // Who comes back waits for points, and nothing is wrong meanwhile.
     let waits = "/^Waiting for the next sweep\\s*$/.test(scanhub.reason)";
-    page.await_true(&format!("scanhub.sweeps[0].sweep && ({SIDE}.click(), {SIDE}.click(), {waits})"));
+    page.await_true(&format!(
+        "scanhub.sweeps[0].sweep && ({SIDE_BUTTON}.click(), {SIDE_BUTTON}.click(), {waits})"
+    ));
     page.await_true("scanhub.swept > 1000 && scanhub.reason === null");
 
     // What makes the sweeps is gone: they are not there any more, and that is said.
-    assert_eq!(tilt.end(INT).code, Some(0));
+    assert_eq!(tilt.end(INT).exit_code, Some(0));
     page.await_true("scanhub.swept === 0 && /hall: no sweep any more/.test(scanhub.reason)");
     page.await_true("/scanhub tilt/.test(scanhub.reason)");
     page.press("h");
     page.await_true("!scanhub.aside && scanhub.beams > 100 && scanhub.reason === null");
-    assert!(page.complaints.is_empty(), "{:?}", page.complaints);
-    ends_well(hall);
+    assert!(page.console_errors.is_empty(), "{:?}", page.console_errors);
+    end_cleanly(hall);
 }
 
 /// The demonstration of a scanner on a mount tells the address of its page, which has sweeps.
@@ -238,15 +241,15 @@ fn the_page_of_the_demonstration_has_sweeps() {
             break host.trim_end_matches('/').to_owned();
         }
     };
-    let mut viewer = view(&host, "/", None).expect("let in");
+    let mut viewer = connect_viewer(&host, "/", None).expect("let in");
     let [cloud] = channels(&mut viewer, ["/hall/cloud"]);
     subscribe(&mut viewer, &[(0, &cloud["id"])]);
     // A busy machine may send only a part of a sweep.
-    until("a cloud", || {
+    wait_until("a cloud", || {
         let Message::Binary(frame) = viewer.read().expect("the server lives") else { return false };
         read(&POINT_CLOUD, &frame[13..]).expect("a PointCloud2").number("width") > Some(100.0)
     });
-    assert_eq!(demo.end(INT).code, Some(0));
+    assert_eq!(demo.end(INT).exit_code, Some(0));
 }
 
 /// As in the documents, by the command that makes those of `web_page`: the hall of `docs/tilt.md`, once all has come that comes.
@@ -254,7 +257,7 @@ fn the_page_of_the_demonstration_has_sweeps() {
 fn the_picture_of_the_documents_from_the_side() {
     let env = TestEnv::new();
     let directory = std::env::var_os("SCANHUB_PICTURES");
-    let look = Look { width: 1200, height: 440, ..Look::LAPTOP };
+    let look = Appearance { width: 1200, height: 440, ..Appearance::LAPTOP };
     let Some(mut page) = browse(&env, look) else { return };
     let _simulator =
         env.simulator(&["front"], &["--world=tilt", "--angles=mount", "--baud=500000", "--seed=3"]);
@@ -265,23 +268,26 @@ fn the_picture_of_the_documents_from_the_side() {
     tilt.await_line("a sweep", is_class("obstacles"));
     let (_server, host) = web(&env, &[]);
     page.open(&format!("http://{host}/"));
-    page.await_true(&format!("{SIDE}?.hidden === false"));
+    page.await_true(&format!("{SIDE_BUTTON}?.hidden === false"));
     page.press("h");
     page.await_true("scanhub.aside && scanhub.swept > 1000 && scanhub.axes === 2");
     if let Some(directory) = &directory {
         // A pole and a box, and whoever walks.
-        let seen = "scanhub.swept > 10_000 && scanhub.axes === 2 && scanhub.sweeps[0].complete === 'true' \
+        let condition = "scanhub.swept > 10_000 && scanhub.axes === 2 && scanhub.sweeps[0].complete === 'true' \
                     && scanhub.sweeps[0].obstacles.filter((one) => one.near === 'true').length >= 2 \
                     && document.querySelector('#sensors article.streaming:not(.lossy)') !== null \
                     && document.querySelector('#news').innerText === ''";
         // Words come a moment after their sweep.
-        let is_told = format!("{SWEPT} === `hall: ${{scanhub.sweeps[0].words}}`");
+        let is_told = format!("{SWEPT_TEXT} === `hall: ${{scanhub.sweeps[0].words}}`");
         page.await_true(&format!(
-            "{seen} && {is_told} && scanhub.obstacles === scanhub.sweeps[0].obstacles.length"
+            "{condition} && {is_told} && scanhub.obstacles === scanhub.sweeps[0].obstacles.length"
         ));
-        photograph(&mut page, look, &Path::new(directory).join("web-side.png"));
+        save_screenshot(&mut page, look, &Path::new(directory).join("web-side.png"));
     }
-    assert!(page.complaints.is_empty(), "{:?}", page.complaints);
+    assert!(page.console_errors.is_empty(), "{:?}", page.console_errors);
     let outcome = tilt.end(INT);
-    assert!(outcome.code == Some(0) && number(&outcome.of_class("summary")[0], "points") > 1000, "{outcome}");
+    assert!(
+        outcome.exit_code == Some(0) && number(&outcome.of_class("summary")[0], "points") > 1000,
+        "{outcome}"
+    );
 }

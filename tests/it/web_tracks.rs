@@ -2,14 +2,14 @@
 
 use serde_json::Value;
 
-use crate::browser::{Browser, Look};
-use crate::testkit::{INT, TestEnv, until};
-use crate::track::{SITE, recorded, replay};
+use crate::browser::{Appearance, Browser};
+use crate::testkit::{INT, TestEnv, wait_until};
+use crate::track::{SITE_FILE, record_people, replay};
 use crate::web::web;
-use crate::web_page::{browse, hold};
+use crate::web_page::{browse, freeze_page};
 
 /// Pixels of the colour of people in a square around where the first one is drawn.
-const GREEN: &str = "(() => {
+const GREEN_SCRIPT: &str = "(() => {
     const [x, y] = scanhub.screen(scanhub.people[0].x, scanhub.people[0].y);
     const probe = document.body.appendChild(document.createElement('i'));
     probe.style.color = 'var(--person)';
@@ -26,20 +26,21 @@ fn number(page: &mut Browser, script: &str) -> f64 {
 }
 
 #[test]
-fn people_stand_in_the_picture_where_the_tracker_sees_them() {
+fn people_are_drawn_at_their_tracked_positions() {
     let env = TestEnv::new();
-    let Some(mut page) = browse(&env, Look::LAPTOP) else { return };
-    let site = env.file("site.toml", SITE);
-    let hub = replay(&env, &recorded(&env, 60));
+    let Some(mut page) = browse(&env, Appearance::LAPTOP) else { return };
+    let site = env.file("site.toml", SITE_FILE);
+    let hub = replay(&env, &record_people(&env, 60));
     let mut track = env.start(&["track", "--site", &site, "--as=house", "--delay=2s", "--json"]);
-    until("the tracker publishes and follows the sensors", || {
+    wait_until("the tracker publishes and follows the sensors", || {
         let listed = env.run(&["list", "--json"]).of_class("topic");
-        let followed = |line: &&Value| line["topic"] == "foreground" && line["subscribers"] == 1;
-        listed.iter().any(|line| line["sensor"] == "house") && listed.iter().filter(followed).count() == 2
+        let is_subscribed = |line: &&Value| line["topic"] == "foreground" && line["subscribers"] == 1;
+        listed.iter().any(|line| line["sensor"] == "house")
+            && listed.iter().filter(is_subscribed).count() == 2
     });
     let (_server, host) = web(&env, &[]);
     page.open(&format!("http://{host}/"));
-    until("the page follows the tracker", || env.subscribers("house/tracks") > 0);
+    wait_until("the page follows the tracker", || env.subscribers("house/tracks") > 0);
     env.run(&["control", "hall", "resume"]);
 
     page.await_true(
@@ -55,8 +56,11 @@ fn people_stand_in_the_picture_where_the_tracker_sees_them() {
     page.await_true("document.querySelector('#verdict').hidden && document.title === 'scanhub'");
     page.await_true("scanhub.tracks === 1 && scanhub.people[0].tail.length > 10");
     // What is held stays to be looked at.
-    hold(&mut page, "scanhub.people[0]?.state === 'confirmed' && scanhub.points('kitchen').length > 100");
-    assert!(number(&mut page, GREEN) > 40.0, "a circle, a tail and a number are drawn");
+    freeze_page(
+        &mut page,
+        "scanhub.people[0]?.state === 'confirmed' && scanhub.points('kitchen').length > 100",
+    );
+    assert!(number(&mut page, GREEN_SCRIPT) > 40.0, "a circle, a tail and a number are drawn");
     let place = ["x", "y"].map(|axis| number(&mut page, &format!("scanhub.people[0].{axis}")));
     let reach = ["x", "y"].map(|axis| number(&mut page, &format!("scanhub.people[0].reach.{axis}")));
     assert!(reach.iter().all(|half| (0.005..0.5).contains(half)), "{reach:?}");
@@ -67,16 +71,16 @@ fn people_stand_in_the_picture_where_the_tracker_sees_them() {
     assert_eq!(page.ask(far), 0);
 
     let id = page.ask("scanhub.people[0].id");
-    let is_told = |line: &Value| {
+    let is_at_drawn_position = |line: &Value| {
         let one = &line["tracks"][0];
-        let near = |key: &str, at: f64| one[key].as_f64().is_some_and(|told| (told - at).abs() < 1e-3);
+        let near = |key: &str, at: f64| one[key].as_f64().is_some_and(|value| (value - at).abs() < 1e-3);
         id == one["id"].to_string().as_str() && near("x_m", place[0]) && near("y_m", place[1])
     };
-    track.await_line("where the page draws the person", is_told);
-    assert_eq!(track.end(INT).code, Some(0));
+    track.await_line("where the page draws the person", is_at_drawn_position);
+    assert_eq!(track.end(INT).exit_code, Some(0));
     // Who is not told of any more is not there.
     page.press(" ");
     page.await_true("scanhub.tracks === 0 && document.querySelector('#people').innerText === ''");
-    assert_eq!(hub.end(INT).code, Some(0));
-    assert!(page.complaints.is_empty(), "{:?}", page.complaints);
+    assert_eq!(hub.end(INT).exit_code, Some(0));
+    assert!(page.console_errors.is_empty(), "{:?}", page.console_errors);
 }

@@ -3,7 +3,7 @@
 //! A child runs in a process group of its own, so that dropping its [`Child`] also ends what it has started, such as
 //! the browser of a shell script that does not `exec`. A descendant may leave the group: a daemon or a program in a
 //! new session does. Two environment variables therefore mark all descendants: [`RUN`] names the test binary, and
-//! [`CHILD`] the child.
+//! [`CHILD_VARIABLE`] the child.
 
 #![allow(clippy::disallowed_methods, reason = "limits of real time; crates of the hub use this file, too")]
 #![allow(dead_code)] // Every user of this file needs a part of it.
@@ -26,25 +26,25 @@ use rustix::process::{
 };
 
 /// Target directory, process ID and start time of the test binary, with colons between. `.ci/run` searches for it, too.
-const RUN: &str = "SCANHUB_TEST_RUN";
+const RUN_VARIABLE: &str = "SCANHUB_TEST_RUN";
 /// The child that a process descends from: process ID and start time of the test binary, and a number. A test that runs
 /// again in another process appends the numbers of its own children.
-const CHILD: &str = "SCANHUB_TEST_CHILD";
+const CHILD_VARIABLE: &str = "SCANHUB_TEST_CHILD";
 /// Set by `.ci/run`: processes of a test binary that started at this time or later are left for its check.
-const SINCE: &str = "SCANHUB_TEST_SINCE";
+const SINCE_VARIABLE: &str = "SCANHUB_TEST_SINCE";
 
 /// Time that a program has to end by itself after TERM.
-const GRACE: Duration = Duration::from_secs(2);
+const TERM_TIMEOUT: Duration = Duration::from_secs(2);
 /// Time in which the kernel ends killed processes, however busy the machine is.
-const KILL_LIMIT: Duration = Duration::from_secs(60);
+const KILL_TIMEOUT: Duration = Duration::from_secs(60);
 /// Time that a process has to load its program. It is short, because the environment of another process may stay empty.
-const EXEC_LIMIT: Duration = Duration::from_millis(200);
+const EXEC_TIMEOUT: Duration = Duration::from_millis(200);
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
 /// A child process of a test. Dropping it ends the child and all its descendants, and waits for their end.
 pub(crate) struct Child {
     process: std::process::Child,
-    /// Value of [`CHILD`] in the environment of the child.
+    /// Value of [`CHILD_VARIABLE`] in the environment of the child.
     mark: String,
 }
 
@@ -57,15 +57,15 @@ pub(crate) struct Child {
 ///
 /// If the program cannot be started.
 pub(crate) fn spawn(mut command: impl BorrowMut<Command>) -> io::Result<Child> {
-    static NEXT: AtomicU32 = AtomicU32::new(0);
+    static NEXT_CHILD: AtomicU32 = AtomicU32::new(0);
     static ONCE: OnceLock<()> = OnceLock::new();
     ONCE.get_or_init(end_earlier_runs);
     let own = std::process::id();
     let started = start_time(own as i32).unwrap_or_default();
-    let mark = format!("{own}.{started}.{}", NEXT.fetch_add(1, Ordering::Relaxed));
-    let mark = std::env::var(CHILD).map_or(mark.clone(), |outer| format!("{outer}/{mark}"));
+    let mark = format!("{own}.{started}.{}", NEXT_CHILD.fetch_add(1, Ordering::Relaxed));
+    let mark = std::env::var(CHILD_VARIABLE).map_or(mark.clone(), |outer| format!("{outer}/{mark}"));
     let command = command.borrow_mut();
-    command.env(RUN, run()).env(CHILD, &mark);
+    command.env(RUN_VARIABLE, run()).env(CHILD_VARIABLE, &mark);
     // `setsid` makes a session and a group with its own process ID. It would fork if it were the leader of a group
     // already.
     if command.get_program() != "setsid" {
@@ -159,37 +159,37 @@ impl Child {
         if !is_reaped {
             // TERM first, so that the program can end its children and remove its files.
             let _ = kill_process(id, Signal::TERM);
-            let give_up_at = Instant::now() + GRACE;
+            let give_up_at = Instant::now() + TERM_TIMEOUT;
             while self.has_ended() == Ok(false) && Instant::now() < give_up_at {
                 thread::sleep(POLL_INTERVAL);
             }
             let _ = kill_process(id, Signal::KILL);
             let _ = kill_process_group(id, Signal::KILL);
         }
-        end_all(|| self.living(!is_reaped));
+        end_all(|| self.living_pids(!is_reaped));
         if !is_reaped {
             let _ = self.process.wait();
         }
     }
 
     /// Returns the command lines of its living descendants, and its own if it lives.
-    pub(crate) fn family(&self) -> Vec<String> {
+    pub(crate) fn living_command_lines(&self) -> Vec<String> {
         let text = |pid| fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
         let line = |pid| String::from_utf8_lossy(&text(pid)).trim_end_matches('\0').replace('\0', " ");
-        self.living(false).into_iter().map(line).collect()
+        self.living_pids(false).into_iter().map(line).collect()
     }
 
     /// Returns the process IDs of its living descendants, and its own if it lives. The group counts if `is_group_ours`.
-    fn living(&self, is_group_ours: bool) -> Vec<i32> {
+    fn living_pids(&self, is_group_ours: bool) -> Vec<i32> {
         let id = self.process.id() as i32;
         // Process IDs ascend until the highest is reached, so a descendant has a higher one unless they began again.
-        let lowest = if newest_process().is_some_and(|newest| newest >= id) { id } else { 1 };
+        let lowest = if newest_process_id().is_some_and(|newest| newest >= id) { id } else { 1 };
         let is_marked = |pid: &i32| {
-            let mark = variable(*pid, CHILD).unwrap_or_default();
+            let mark = variable(*pid, CHILD_VARIABLE).unwrap_or_default();
             mark.strip_prefix(&self.mark).is_some_and(|rest| rest.is_empty() || rest.starts_with('/'))
         };
         let is_in_group = |pid: &i32| is_group_ours && group(*pid) == Some(id);
-        processes().filter(|pid| *pid >= lowest && (is_marked(pid) || is_in_group(pid))).collect()
+        process_ids().filter(|pid| *pid >= lowest && (is_marked(pid) || is_in_group(pid))).collect()
     }
 }
 
@@ -222,7 +222,7 @@ fn read_all(pipe: Option<impl Read>) -> io::Result<Vec<u8>> {
 
 /// Kills the processes that `living` returns, until it returns none.
 fn end_all(living: impl Fn() -> Vec<i32>) {
-    let give_up_at = Instant::now() + KILL_LIMIT;
+    let give_up_at = Instant::now() + KILL_TIMEOUT;
     loop {
         let pids = living();
         if pids.is_empty() {
@@ -242,7 +242,7 @@ fn end_all(living: impl Fn() -> Vec<i32>) {
 
 /// Ends what interrupted runs of this target directory left.
 fn end_earlier_runs() {
-    let since = std::env::var(SINCE).ok().and_then(|text| text.parse().ok()).unwrap_or(u64::MAX);
+    let since = std::env::var(SINCE_VARIABLE).ok().and_then(|text| text.parse().ok()).unwrap_or(u64::MAX);
     end_runs_of(run().rsplitn(3, ':').nth(2).unwrap_or_default(), since);
 }
 
@@ -251,10 +251,10 @@ pub(crate) fn end_runs_of(target: &str, since: u64) {
     let user = geteuid().as_raw();
     let is_left = |pid: &i32| {
         let is_of_user = fs::metadata(format!("/proc/{pid}")).is_ok_and(|it| it.uid() == user);
-        let run = if is_of_user { variable(*pid, RUN) } else { None };
+        let run = if is_of_user { variable(*pid, RUN_VARIABLE) } else { None };
         run.is_some_and(|run| has_ended_before(&run, target, since))
     };
-    end_all(|| processes().filter(is_left).collect());
+    end_all(|| process_ids().filter(is_left).collect());
 }
 
 /// Whether the value `run` of [`RUN`] names a test binary of `target` that started before `since` and has ended.
@@ -266,8 +266,8 @@ fn has_ended_before(run: &str, target: &str, since: u64) -> bool {
 
 /// Returns the value of [`RUN`] for the children of this process.
 fn run() -> &'static str {
-    static RUN: OnceLock<String> = OnceLock::new();
-    RUN.get_or_init(|| {
+    static RUN_VARIABLE: OnceLock<String> = OnceLock::new();
+    RUN_VARIABLE.get_or_init(|| {
         let program = std::env::current_exe().unwrap_or_default();
         // Cargo names a directory in the target directory, but not to unit tests. They are in target/debug/deps.
         let target = option_env!("CARGO_TARGET_TMPDIR").map(Path::new).and_then(Path::parent);
@@ -278,20 +278,20 @@ fn run() -> &'static str {
 }
 
 /// Returns the IDs of all processes.
-fn processes() -> impl Iterator<Item = i32> {
+fn process_ids() -> impl Iterator<Item = i32> {
     let entries = fs::read_dir("/proc").into_iter().flatten().flatten();
     entries.filter_map(|entry| entry.file_name().to_str()?.parse().ok())
 }
 
 /// Returns the process ID that the kernel assigned last.
-fn newest_process() -> Option<i32> {
+fn newest_process_id() -> Option<i32> {
     fs::read_to_string("/proc/loadavg").ok()?.split_whitespace().last()?.parse().ok()
 }
 
 /// Returns the value of a variable in the environment that a process was started with.
 fn variable(pid: i32, name: &str) -> Option<String> {
     let mut environment = environment(pid)?;
-    let give_up_at = Instant::now() + EXEC_LIMIT;
+    let give_up_at = Instant::now() + EXEC_TIMEOUT;
     // A process that starts another program has none for a moment.
     while environment.is_empty() && has_environment(pid) && Instant::now() < give_up_at {
         thread::sleep(Duration::from_millis(1));

@@ -18,7 +18,7 @@ impl Findings {
     pub(crate) fn in_outcome(outcome: &Outcome) -> Findings {
         let findings = Findings(outcome.of_class("check"));
         let failed = findings.0.iter().any(|line| line["state"] == "failed");
-        assert_eq!(outcome.code, Some(if failed { 5 } else { 0 }), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(if failed { 5 } else { 0 }), "{outcome}");
         findings
     }
 
@@ -28,19 +28,20 @@ impl Findings {
     }
 
     /// In `set_up` check `name` must say `state` and a remedy with this word.
-    pub(crate) fn complain(&self, set_up: &str, name: &str, state: &str, word: &str) {
+    pub(crate) fn assert_problem(&self, set_up: &str, name: &str, state: &str, remedy_word: &str) {
         let is_it = |line: &&Value| {
             let remedy = line["remedy"].as_str().unwrap_or_default();
-            line["name"] == name && line["state"] == state && remedy.contains(word)
+            line["name"] == name && line["state"] == state && remedy.contains(remedy_word)
         };
         let line = self.0.iter().find(is_it);
-        let line = line.unwrap_or_else(|| panic!("{set_up}: no {name} {state} with {word}: {:#?}", self.0));
+        let line =
+            line.unwrap_or_else(|| panic!("{set_up}: no {name} {state} with {remedy_word}: {:#?}", self.0));
         let remedy = line["remedy"].as_str().unwrap_or_default();
         println!("{set_up:44} {state:8} {name:13} {remedy}");
     }
 
     /// Nothing may be wrong; what was not looked at has a reason.
-    pub(crate) fn are_silent(&self) {
+    pub(crate) fn assert_no_problem(&self) {
         assert!(!self.0.is_empty());
         for line in &self.0 {
             let state = line["state"].as_str().unwrap_or_default();
@@ -57,12 +58,12 @@ impl Findings {
     }
 
     /// Those that are of no port.
-    pub(crate) fn of_machine(&self) -> Findings {
+    pub(crate) fn without_ports(&self) -> Findings {
         Findings(self.0.iter().filter(|line| line["port"].is_null()).cloned().collect())
     }
 
     /// State and finding of the check `name`, the first if there are several.
-    pub(crate) fn said(&self, name: &str) -> (&str, &str) {
+    pub(crate) fn state_and_text(&self, name: &str) -> (&str, &str) {
         let line = self.0.iter().find(|line| line["name"] == name);
         let line = line.unwrap_or_else(|| panic!("no {name}: {:#?}", self.0));
         (line["state"].as_str().unwrap_or_default(), line["finding"].as_str().unwrap_or_default())

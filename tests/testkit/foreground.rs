@@ -8,7 +8,7 @@ use std::ops::AddAssign;
 
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::variant::{Unit, Variant};
-use scanhub_preprocess::background::{Class, Model, Settings};
+use scanhub_preprocess::background::{BackgroundModel, Class, Settings};
 use scanhub_schema::{Foreground, Scan};
 use scanhub_sim::room::BeamTarget;
 use scanhub_sim::room::Room;
@@ -31,11 +31,11 @@ const SCANS: u64 = 2_000;
 
 /// Correct answer for a beam.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Expected {
+pub(crate) enum ExpectedAnswer {
     /// Foreground: the beam meets a person.
     Foreground,
     /// Not foreground: the beam meets what was there from the start, what was behind an object that has been taken
-    /// away, or an object that was put down or moved more than [`OLD_S`] ago.
+    /// away, or an object that was put down or moved more than [`OLD_AGE_S`] ago.
     Other,
     /// An object that was put down, moved or opened recently. It is foreground until it has been learned, and each
     /// method takes a different time, so both answers matching right.
@@ -45,13 +45,13 @@ pub(crate) enum Expected {
 }
 
 /// Age in seconds from which an object is background: twice the time that the paper's method takes at most.
-const OLD_S: f64 = 20.0;
+const OLD_AGE_S: f64 = 20.0;
 
 /// One scan with the correct answers.
 pub(crate) struct LabeledScan {
     pub(crate) scan: Box<Scan>,
-    pub(crate) expected: Vec<Expected>,
-    pub(crate) met: Vec<BeamTarget>,
+    pub(crate) expected: Vec<ExpectedAnswer>,
+    pub(crate) targets: Vec<BeamTarget>,
 }
 
 /// Returns the scans of `scene` with random numbers from `seed`.
@@ -64,22 +64,22 @@ pub(crate) fn play(scene: &Scene, seed: u64) -> Vec<LabeledScan> {
 }
 
 fn frame(room: &Room, unit: Unit, number: u64) -> LabeledScan {
-    let end_ns = number * Variant::HALF.turns() * lms::variant::MIRROR_TURN;
+    let end_ns = number * Variant::HALF.revolutions() * lms::variant::MIRROR_PERIOD;
     let look = room.labeled_scan(Variant::HALF, unit, decoded_scan::MODE, end_ns);
     let scan = decoded_scan::scan(&look.words, unit);
-    let expected = (0..look.truth.len()).map(|i| expected_of(&scan, i, look.truth[i], end_ns)).collect();
-    LabeledScan { scan, expected, met: look.truth }
+    let expected = (0..look.truth.len()).map(|i| expected_answer(&scan, i, look.truth[i], end_ns)).collect();
+    LabeledScan { scan, expected, targets: look.truth }
 }
 
-fn expected_of(scan: &Scan, i: usize, met: BeamTarget, end_ns: u64) -> Expected {
-    match met {
-        _ if scan.range(i).is_none() => Expected::Neither,
-        BeamTarget::Person => Expected::Foreground,
-        BeamTarget::Box { since_ns } if end_ns.saturating_sub(since_ns) as f64 <= OLD_S * 1e9 => {
-            Expected::New
+fn expected_answer(scan: &Scan, i: usize, target: BeamTarget, end_ns: u64) -> ExpectedAnswer {
+    match target {
+        _ if scan.range(i).is_none() => ExpectedAnswer::Neither,
+        BeamTarget::Person => ExpectedAnswer::Foreground,
+        BeamTarget::Box { since_ns } if end_ns.saturating_sub(since_ns) as f64 <= OLD_AGE_S * 1e9 => {
+            ExpectedAnswer::New
         }
-        BeamTarget::Static { .. } | BeamTarget::Box { .. } => Expected::Other,
-        BeamTarget::Grazed | BeamTarget::Invalid => Expected::Neither,
+        BeamTarget::Static { .. } | BeamTarget::Box { .. } => ExpectedAnswer::Other,
+        BeamTarget::Grazed | BeamTarget::Invalid => ExpectedAnswer::Neither,
     }
 }
 
@@ -91,7 +91,7 @@ pub(crate) trait Detector {
 
 /// A method of the hub.
 pub(crate) struct HubDetector {
-    model: Model,
+    model: BackgroundModel,
     out: Box<Foreground>,
 }
 
@@ -99,7 +99,7 @@ impl HubDetector {
     /// Creates the method with an empty background.
     pub(crate) fn new(settings: Settings) -> HubDetector {
         let beams = Variant::HALF.beams();
-        HubDetector { model: Model::new(settings, beams), out: Foreground::of(beams) }
+        HubDetector { model: BackgroundModel::new(settings, beams), out: Foreground::of(beams) }
     }
 }
 
@@ -130,9 +130,9 @@ impl Score {
             method.update(&frame.scan, &mut foreground);
             for (expected, &is_reported) in frame.expected.iter().zip(&foreground) {
                 match (expected, is_reported) {
-                    (Expected::Foreground, true) => score.found += 1,
-                    (Expected::Foreground, false) => score.missed += 1,
-                    (Expected::Other, true) => score.wrong += 1,
+                    (ExpectedAnswer::Foreground, true) => score.found += 1,
+                    (ExpectedAnswer::Foreground, false) => score.missed += 1,
+                    (ExpectedAnswer::Other, true) => score.wrong += 1,
                     _ => {}
                 }
             }
@@ -166,33 +166,33 @@ impl AddAssign for Score {
 }
 
 /// Number of scans until a surface becomes background: the default for 361 beams.
-const N: usize = 375;
+const LEARNING_SCANS: usize = 375;
 
 /// Beams of two boxes in the room of Fig. 8, over several runs: one is put down, the other is taken away.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Boxes {
     /// Beams that meet box 1, N scans after it was put down. Counts those that matching still foreground.
-    new: Share,
+    new_box: Share,
     /// Beams that met box 2, N and 2N scans after it was taken away. Counts those that would not be foreground if it
     /// stood there again.
-    gone: [Share; 2],
+    removed_box: [Share; 2],
 }
 
 /// A number of beams, and how many of them have a property.
 #[derive(Clone, Copy, Debug, Default)]
 struct Share {
-    of: u64,
+    total: u64,
     matching: u64,
 }
 
 impl Share {
-    fn count(&mut self, is: bool) {
-        self.of += 1;
-        self.matching += u64::from(is);
+    fn count(&mut self, is_matching: bool) {
+        self.total += 1;
+        self.matching += u64::from(is_matching);
     }
 
     fn percent(&self) -> f64 {
-        100.0 * self.matching as f64 / self.of as f64
+        100.0 * self.matching as f64 / self.total as f64
     }
 }
 
@@ -200,48 +200,53 @@ impl Boxes {
     /// Adds a run of `frames`. `make` creates the method with an empty background.
     pub(crate) fn add(&mut self, make: impl Fn() -> Box<dyn Detector>, frames: &[LabeledScan]) {
         let first = |is: fn(&BeamTarget) -> bool| {
-            frames.iter().position(|frame| frame.met.iter().any(is)).expect("boxes come and go in this room")
+            frames
+                .iter()
+                .position(|frame| frame.targets.iter().any(is))
+                .expect("boxes come and go in this room")
         };
-        let at = first(is_new) + N;
+        let at = first(is_new) + LEARNING_SCANS;
         let answers = answers(&mut *make(), &frames[..at], &frames[at].scan);
-        for (i, _) in frames[at].met.iter().enumerate().filter(|(_, met)| is_new(met)) {
-            self.new.count(answers[i]);
+        for (i, _) in frames[at].targets.iter().enumerate().filter(|(_, target)| is_new(target)) {
+            self.new_box.count(answers[i]);
         }
 
-        let taken = first(is_bare);
+        let taken = first(is_where_object_was_removed);
         let stood = &frames[taken - 1];
-        for (gone, at) in self.gone.iter_mut().zip([taken + N, taken + 2 * N]) {
+        for (removed_box, at) in
+            self.removed_box.iter_mut().zip([taken + LEARNING_SCANS, taken + 2 * LEARNING_SCANS])
+        {
             let now = &frames[at];
             // Beams at its edges may have measured what was behind it.
-            let inside = |i: &usize| now.met[i - 1..=i + 1].iter().all(is_bare);
-            let beams: Vec<usize> = (1..stood.met.len() - 1).filter(inside).collect();
+            let inside = |i: &usize| now.targets[i - 1..=i + 1].iter().all(is_where_object_was_removed);
+            let beams: Vec<usize> = (1..stood.targets.len() - 1).filter(inside).collect();
             let mut scan = now.scan.clone();
             let span = beams[0]..=beams[beams.len() - 1];
             scan.arrays().ranges[span.clone()].copy_from_slice(&stood.scan.ranges()[span]);
             let answers = self::answers(&mut *make(), &frames[..at], &scan);
-            let met_box = beams.into_iter().filter(|&i| is_still(&stood.met[i]));
-            met_box.for_each(|i| gone.count(!answers[i]));
+            let met_box = beams.into_iter().filter(|&i| is_still(&stood.targets[i]));
+            met_box.for_each(|i| removed_box.count(!answers[i]));
         }
     }
 
     /// Returns the percentage of box 1 that is foreground N scans after it was put down, and those of box 2 that matching
     /// background N and 2N scans after it was taken away.
     pub(crate) fn percents(&self) -> [f64; 3] {
-        [self.new.percent(), self.gone[0].percent(), self.gone[1].percent()]
+        [self.new_box.percent(), self.removed_box[0].percent(), self.removed_box[1].percent()]
     }
 }
 
-fn is_new(met: &BeamTarget) -> bool {
-    matches!(met, BeamTarget::Box { .. })
+fn is_new(target: &BeamTarget) -> bool {
+    matches!(target, BeamTarget::Box { .. })
 }
 
 /// Whether the beam meets the place from which an object was taken away.
-fn is_bare(met: &BeamTarget) -> bool {
-    matches!(met, BeamTarget::Static { since_ns: 1.. })
+fn is_where_object_was_removed(target: &BeamTarget) -> bool {
+    matches!(target, BeamTarget::Static { since_ns: 1.. })
 }
 
-fn is_still(met: &BeamTarget) -> bool {
-    matches!(met, BeamTarget::Static { since_ns: 0 })
+fn is_still(target: &BeamTarget) -> bool {
+    matches!(target, BeamTarget::Static { since_ns: 0 })
 }
 
 /// Returns the answers of `method` for `scan` after it has seen `before`.

@@ -12,15 +12,15 @@ use rustix::io::{Errno, read, write};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
 
-use super::PATIENCE;
+use super::WAIT_TIMEOUT;
 
 /// The sensor's end.
-pub(crate) struct Line(OwnedFd);
+pub(crate) struct TestLine(OwnedFd);
 
-impl Line {
+impl TestLine {
     /// A raw pty whose other end is found at `place`.
-    pub(crate) fn at(place: &Path) -> Line {
-        let make = || -> Result<Line, Errno> {
+    pub(crate) fn create(path: &Path) -> TestLine {
+        let make = || -> Result<TestLine, Errno> {
             let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC)?;
             grantpt(&master)?;
             unlockpt(&master)?;
@@ -31,15 +31,15 @@ impl Line {
             let mut termios = tcgetattr(&slave)?;
             termios.make_raw();
             tcsetattr(&slave, OptionalActions::Now, &termios)?;
-            rustix::fs::symlink(OsStr::from_bytes(name.as_bytes()), place)?;
-            Ok(Line(master))
+            rustix::fs::symlink(OsStr::from_bytes(name.as_bytes()), path)?;
+            Ok(TestLine(master))
         };
-        make().unwrap_or_else(|error| panic!("no pty at {}: {error}", place.display()))
+        make().unwrap_or_else(|error| panic!("no pty at {}: {error}", path.display()))
     }
 
     /// Waits until the hub has the line open.
-    pub(crate) fn await_open(&self) {
-        super::until("somebody opens the line", || self.is_open());
+    pub(crate) fn wait_until_open(&self) {
+        super::wait_until("somebody opens the line", || self.is_open());
     }
 
     /// Whether the hub has the line open.
@@ -50,15 +50,15 @@ impl Line {
     }
 
     /// Waits for the first request of the hub, and returns its command.
-    pub(crate) fn await_request(&self) -> u8 {
-        let mut said = Vec::new();
-        super::until("a request is said", || {
+    pub(crate) fn wait_for_request(&self) -> u8 {
+        let mut buffer = Vec::new();
+        super::wait_until("a request is said", || {
             let mut bytes = [0; 16];
             let len = read(&self.0, &mut bytes).unwrap_or(0);
-            said.extend(&bytes[..len]);
-            said.len() >= REQUEST
+            buffer.extend(&bytes[..len]);
+            buffer.len() >= REQUEST_LEN
         });
-        said[COMMAND]
+        buffer[COMMAND_OFFSET]
     }
 
     /// Returns the bytes that the other end has sent since the last call.
@@ -77,10 +77,10 @@ impl Line {
 
     /// Sends all of `bytes`, in the pace of whoever reads them; what the other end says meanwhile is not heard.
     pub(crate) fn send(&self, mut bytes: &[u8]) {
-        let give_up_at = Instant::now() + PATIENCE;
+        let give_up_at = Instant::now() + WAIT_TIMEOUT;
         while !bytes.is_empty() {
-            let mut said = [0; 256];
-            while read(&self.0, &mut said).is_ok_and(|len| len > 0) {}
+            let mut buffer = [0; 256];
+            while read(&self.0, &mut buffer).is_ok_and(|len| len > 0) {}
             match write(&self.0, bytes) {
                 Ok(len) => bytes = &bytes[len..],
                 Err(Errno::AGAIN | Errno::INTR) => {
@@ -95,19 +95,19 @@ impl Line {
 }
 
 /// Bytes of a request that asks for something, and which of them says what.
-const REQUEST: usize = 7;
-const COMMAND: usize = 4;
+const REQUEST_LEN: usize = 7;
+const COMMAND_OFFSET: usize = 4;
 
 /// The host's end of the line at `place`, raw, at `rate`; reads and writes do not block.
-pub(crate) fn open_line(place: &Path, rate: u32) -> std::fs::File {
+pub(crate) fn open_line(path: &Path, rate: u32) -> std::fs::File {
     let make = || -> Result<OwnedFd, Errno> {
         let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
-        let line = open(place, flags, Mode::empty())?;
+        let line = open(path, flags, Mode::empty())?;
         let mut termios = tcgetattr(&line)?;
         termios.make_raw();
         termios.set_speed(rate)?;
         tcsetattr(&line, OptionalActions::Now, &termios)?;
         Ok(line)
     };
-    make().unwrap_or_else(|error| panic!("cannot open {}: {error}", place.display())).into()
+    make().unwrap_or_else(|error| panic!("cannot open {}: {error}", path.display())).into()
 }

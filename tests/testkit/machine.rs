@@ -24,8 +24,8 @@ impl Machine {
         let mut unshare = Command::new("unshare");
         unshare.args(["--net", "sh", "-c", "ip link set lo up && echo up && exec cat"]);
         let mut holder = spawn(unshare.stdin(Stdio::piped()).stdout(Stdio::piped())).expect("unshare runs");
-        let mut said = [0; 3];
-        let read = holder.stdout.as_mut().map(|out| out.read_exact(&mut said));
+        let mut buffer = [0; 3];
+        let read = holder.stdout.as_mut().map(|out| out.read_exact(&mut buffer));
         assert!(matches!(read, Some(Ok(()))), "no namespace");
         let machine = Machine { holder, number };
         machine.plug();
@@ -34,33 +34,33 @@ impl Machine {
 
     /// Creates the cable, which must not exist.
     fn plug(&self) {
-        let (end, pid) = (self.end(), self.holder.id());
+        let (end, pid) = (self.test_interface(), self.holder.id());
         ip(&format!("link add {end} type veth peer name eth0 netns {pid}"));
-        ip(&format!("address add {}/24 dev {end}", self.here()));
+        ip(&format!("address add {}/24 dev {end}", self.test_address()));
         ip(&format!("link set {end} up"));
-        self.run(&format!("ip address add {}/24 dev eth0", self.there()));
-        self.run("ip link set eth0 up");
-        self.await_link();
+        self.run_command(&format!("ip address add {}/24 dev eth0", self.machine_address()));
+        self.run_command("ip link set eth0 up");
+        self.wait_for_carrier();
     }
 
     /// Deletes both interfaces of the cable, and creates new ones.
-    pub(crate) fn make_cable_anew(&self) {
-        ip(&format!("link delete {}", self.end()));
+    pub(crate) fn replace_cable(&self) {
+        ip(&format!("link delete {}", self.test_interface()));
         self.plug();
     }
 
     /// Returns the name of the test's interface.
-    pub(crate) fn end(&self) -> String {
+    pub(crate) fn test_interface(&self) -> String {
         format!("to{}", self.number)
     }
 
     /// Returns the address of the test on the cable.
-    pub(crate) fn here(&self) -> Ipv4Addr {
+    pub(crate) fn test_address(&self) -> Ipv4Addr {
         Ipv4Addr::new(10, 76, self.number, 1)
     }
 
     /// Returns the address of the machine.
-    pub(crate) fn there(&self) -> Ipv4Addr {
+    pub(crate) fn machine_address(&self) -> Ipv4Addr {
         Ipv4Addr::new(10, 76, self.number, 2)
     }
 
@@ -75,7 +75,7 @@ impl Machine {
     }
 
     /// Waits until the machine's interface has a carrier, which the kernel reports up to a second late.
-    fn await_link(&self) {
+    fn wait_for_carrier(&self) {
         let give_up_at = Instant::now() + Duration::from_secs(20);
         let mut show = command_in(&self.network(), "ip");
         show.args(["link", "show", "eth0"]);
@@ -86,12 +86,12 @@ impl Machine {
     }
 
     /// Runs a command on the machine.
-    pub(crate) fn run(&self, command: &str) {
-        assert!(self.try_run(command), "{command}");
+    pub(crate) fn run_command(&self, command: &str) {
+        assert!(self.try_run_command(command), "{command}");
     }
 
     /// Runs a command on the machine, and returns whether it succeeded.
-    pub(crate) fn try_run(&self, command: &str) -> bool {
+    pub(crate) fn try_run_command(&self, command: &str) -> bool {
         let mut words = command.split(' ');
         let mut there = command_in(&self.network(), words.next().unwrap_or_default());
         status(there.args(words)).is_ok_and(|status| status.success())

@@ -2,7 +2,6 @@
 //! it ends. Everything is waited for by what it says, with a deadline far beyond what it takes.
 #![allow(dead_code, unused_imports)] // Every test file takes what it needs.
 
-mod again;
 mod child;
 mod findings;
 mod line;
@@ -13,6 +12,7 @@ mod python;
 mod receiver;
 mod recording;
 mod relay;
+mod rerun;
 mod robot;
 mod sender;
 mod side_by_side;
@@ -37,36 +37,39 @@ use scanhub_shm::Domain;
 use serde_json::Value;
 use tempfile::TempDir;
 
-pub(crate) use again::{in_own_process, only, own_program, run_again};
 pub(crate) use child::{Child, end_runs_of, output, spawn, status, succeeds, write_program};
 pub(crate) use findings::Findings;
-pub(crate) use line::{Line, open_line};
+pub(crate) use line::{TestLine, open_line};
 pub(crate) use machine::{Machine, command_in, ip};
 pub(crate) use network::in_a_network;
 pub(crate) use program::{HUP, INT, KILL, Outcome, Program, TERM, USR1};
 pub(crate) use python::{client_python, python, python_for};
-pub(crate) use receiver::{Receiver, read};
-pub(crate) use recording::{Kept, Recording, unbroken};
+pub(crate) use receiver::{Receiver, decode_datagram};
+pub(crate) use recording::{RecordedMessage, Recording, contiguous_topic_seqs};
 pub(crate) use relay::Relay;
+pub(crate) use rerun::{in_own_process, own_program, rerun_test, single_test_args};
 pub(crate) use robot::Robot;
-pub(crate) use sender::{Sender, wall_ns};
-pub(crate) use side_by_side::side_by_side;
+pub(crate) use sender::{TestGateway, wall_ns};
+pub(crate) use side_by_side::run_concurrently;
 pub(crate) use skip::{skip, verdict as skip_verdict};
 pub(crate) use supervisor::Supervisor;
-pub(crate) use telegrams::{MEASURED, Sent, accounted, bytes_of, hash, is_class, number, scan, sequence};
-pub(crate) use terminal::{Sitting, can_sit, terminal};
+pub(crate) use telegrams::{
+    MEASURED_VALUES, SimulatedTelegram, bytes_of, checked_topic_seqs, contiguous_numbers, hash, is_class,
+    number, scan,
+};
+pub(crate) use terminal::{TerminalSession, can_open_terminal, terminal};
 pub(crate) use tmux::Tmux;
 
 /// Limit of every wait. It only bounds a hang: no test depends on how long something takes.
-pub(crate) const PATIENCE: Duration = Duration::from_secs(180);
+pub(crate) const WAIT_TIMEOUT: Duration = Duration::from_secs(180);
 
 /// Flag of a simulator whose sensors take as long to answer as real ones do.
-pub(crate) const REAL_ANSWERS: &str = "--fault=answer=0";
+pub(crate) const REAL_REPLY_TIME: &str = "--fault=answer=0";
 /// Flag of one whose sensors answer after 5 ms.
-const QUICK_ANSWERS: &str = "--fault=answer=0.005";
+const SHORT_REPLY_TIME: &str = "--fault=answer=0.005";
 
 /// Says where the program is, for a test that hides where it was built.
-pub(crate) const PROGRAM: &str = "SCANHUB_TEST_PROGRAM";
+pub(crate) const PROGRAM_PATH_VARIABLE: &str = "SCANHUB_TEST_PROGRAM";
 
 /// A domain and a directory of one test.
 pub(crate) struct TestEnv {
@@ -96,7 +99,7 @@ impl TestEnv {
     }
 
     /// Where its hub is, for consumers in the test itself.
-    pub(crate) fn place(&self) -> Domain {
+    pub(crate) fn domain(&self) -> Domain {
         Domain::at(&self.domain, self.directory.path()).unwrap_or_else(|failure| panic!("{failure}"))
     }
 
@@ -105,19 +108,19 @@ impl TestEnv {
     }
 
     /// `path` as an argument.
-    pub(crate) fn word(&self, name: &str) -> String {
+    pub(crate) fn path_argument(&self, name: &str) -> String {
         self.path(name).display().to_string()
     }
 
     /// Writes a file of this test and returns its path as an argument.
     pub(crate) fn file(&self, name: &str, content: impl AsRef<[u8]>) -> String {
         fs::write(self.path(name), content).unwrap_or_else(|error| panic!("{name}: {error}"));
-        self.word(name)
+        self.path_argument(name)
     }
 
     /// `--link NAME=PORT` for a port in this directory.
     pub(crate) fn link(&self, name: &str) -> String {
-        format!("--link={name}={}", self.word(name))
+        format!("--link={name}={}", self.path_argument(name))
     }
 
     /// Returns the flag for a link with `family = "lms"`. A hub that searches for the scanner would also send requests
@@ -133,7 +136,7 @@ impl TestEnv {
 
     /// As [`TestEnv::command`], with the domain in another directory.
     pub(crate) fn command_at<S: AsRef<str>>(&self, root: &Path, arguments: &[S]) -> Command {
-        let program = std::env::var(PROGRAM).unwrap_or_else(|_| scanhub().into());
+        let program = std::env::var(PROGRAM_PATH_VARIABLE).unwrap_or_else(|_| scanhub().into());
         let mut command = match &self.network {
             Some(network) => command_in(network, &program),
             None => Command::new(program),
@@ -163,12 +166,12 @@ impl TestEnv {
 
     /// A hub with these flags that is up.
     pub(crate) fn hub<S: AsRef<str>>(&self, flags: &[S]) -> Program {
-        self.start(&with(&["run", "--json"], flags)).ready()
+        self.start(&concat_args(&["run", "--json"], flags)).ready()
     }
 
     /// What stands in for a service manager.
     pub(crate) fn supervisor(&self) -> Supervisor {
-        Supervisor::new(self.word("notify"))
+        Supervisor::new(self.path_argument("notify"))
     }
 
     /// Starts a hub with these flags as a service of `supervisor` and with what it keeps; it is not waited for.
@@ -178,57 +181,61 @@ impl TestEnv {
         flags: &[S],
         watchdog: Option<Duration>,
     ) -> Program {
-        let (command, stdin) = supervisor.service(&self.command(&with(&["run", "--json"], flags)), watchdog);
+        let (command, stdin) =
+            supervisor.service(&self.command(&concat_args(&["run", "--json"], flags)), watchdog);
         Program::start_with(command, stdin)
     }
 
     /// A gateway with these flags that has begun; its number is kept in this directory.
     pub(crate) fn gateway<S: AsRef<str>>(&self, flags: &[S]) -> Program {
-        let mut gateway = self.gateway_at(flags);
+        let mut gateway = self.start_gateway(flags);
         gateway.await_line("its begin", is_class("gateway"));
         gateway
     }
 
     /// As [`TestEnv::gateway`], however it begins.
-    pub(crate) fn gateway_at<S: AsRef<str>>(&self, flags: &[S]) -> Program {
-        self.start(&with(&["gateway", "--json", "--no-system-config"], flags))
+    pub(crate) fn start_gateway<S: AsRef<str>>(&self, flags: &[S]) -> Program {
+        self.start(&concat_args(&["gateway", "--json", "--no-system-config"], flags))
     }
 
     /// A simulator with a port of each of these names that is up; its truth is in the file `truth`. Its sensors answer
-    /// soon unless `flags` have faults or [`REAL_ANSWERS`]: few tests are about that wait, and all would wait. A hub
+    /// soon unless `flags` have faults or [`REAL_REPLY_TIME`]: few tests are about that wait, and all would wait. A hub
     /// that does not get a processor loses nothing: the sensors wait for it.
     pub(crate) fn simulator<S: AsRef<str>>(&self, ports: &[&str], flags: &[S]) -> Program {
-        self.simulator_on_real_lines(ports, &with(flags, &["--lossless"]))
+        self.simulator_on_real_lines(ports, &concat_args(flags, &["--lossless"]))
     }
 
     /// Starts a simulator like [`TestEnv::simulator`], on lines that lose what a hub does not read.
     pub(crate) fn simulator_on_real_lines<S: AsRef<str>>(&self, ports: &[&str], flags: &[S]) -> Program {
-        let ports: Vec<_> = ports.iter().map(|port| format!("--port={}", self.word(port))).collect();
-        let truth = format!("--truth={}", self.word("truth"));
+        let ports: Vec<_> = ports.iter().map(|port| format!("--port={}", self.path_argument(port))).collect();
+        let truth = format!("--truth={}", self.path_argument("truth"));
         let has_faults = flags.iter().any(|flag| flag.as_ref().starts_with("--fault"));
-        let soon: &[&str] = if has_faults { &[] } else { &[QUICK_ANSWERS] };
-        let words = with(&with(&["simulate", "--json", &truth, "--force"], soon), &with(&ports, flags));
+        let soon: &[&str] = if has_faults { &[] } else { &[SHORT_REPLY_TIME] };
+        let words = concat_args(
+            &concat_args(&["simulate", "--json", &truth, "--force"], soon),
+            &concat_args(&ports, flags),
+        );
         self.start(&words).ready()
     }
 
     /// Kills the simulator of one port. Its name is removed first: otherwise, the hub could open the name again after
     /// another test's simulator has been given the same terminal.
-    pub(crate) fn kill_simulator(&self, simulator: Program, port: &str) {
+    pub(crate) fn kill_port_simulator(&self, simulator: Program, port: &str) {
         fs::remove_file(self.path(port)).unwrap_or_else(|error| panic!("{port}: {error}"));
-        assert_eq!(simulator.end(KILL).code, None);
+        assert_eq!(simulator.end(KILL).exit_code, None);
     }
 
     /// `echo --json` of these topics, attached to all of them, as soon as there are all of them: those of a remote
     /// sensor come one by one, each with what is first heard of it.
     pub(crate) fn echo(&self, topics: &[&str]) -> Program {
         let mut before = Vec::new();
-        until("all topics are there", || {
+        wait_until("all topics are there", || {
             let listed = self.all_subscribers(topics);
             before = listed.iter().copied().flatten().collect();
             before.len() == topics.len()
         });
-        let program = self.start(&with(&["echo", "--json"], topics));
-        until("the consumer is attached", || {
+        let program = self.start(&concat_args(&["echo", "--json"], topics));
+        wait_until("the consumer is attached", || {
             self.all_subscribers(topics)
                 .iter()
                 .zip(&before)
@@ -260,8 +267,8 @@ impl TestEnv {
     pub(crate) fn search(&self, arguments: &[&str]) -> Outcome {
         const NOT_FOUND: i32 = 3;
         let mut outcome = self.run(arguments);
-        until("a scanner is found", || {
-            let is_found = outcome.code != Some(NOT_FOUND);
+        wait_until("a scanner is found", || {
+            let is_found = outcome.exit_code != Some(NOT_FOUND);
             if !is_found {
                 outcome = self.run(arguments);
             }
@@ -277,26 +284,30 @@ impl TestEnv {
         line.clone()
     }
 
-    /// Waits until `info` of `sensor` says what is `wanted`, and returns it.
-    pub(crate) fn await_info(&self, sensor: &str, wanted: impl Fn(&Value) -> bool) -> Value {
+    /// Waits until `info` of `sensor` says what is `is_expected`, and returns it.
+    pub(crate) fn await_info(&self, sensor: &str, is_expected: impl Fn(&Value) -> bool) -> Value {
         let mut last = Value::Null;
-        until("the status", || {
+        wait_until("the status", || {
             last = self.info(sensor);
-            wanted(&last)
+            is_expected(&last)
         });
         last
     }
 
     /// The telegrams that the simulator has sent so far, those of `port` in their order.
-    pub(crate) fn truth(&self, port: &str) -> Vec<Sent> {
-        let port = self.word(port);
-        self.truth_lines("truth").iter().filter(|line| line["port"] == port.as_str()).map(Sent::of).collect()
+    pub(crate) fn truth(&self, port: &str) -> Vec<SimulatedTelegram> {
+        let port = self.path_argument(port);
+        self.truth_lines("truth")
+            .iter()
+            .filter(|line| line["port"] == port.as_str())
+            .map(SimulatedTelegram::of)
+            .collect()
     }
 
     /// The simulator's last line about `port`: how many telegrams it sent, and how often it would have written the
     /// sensor's EEPROM.
-    pub(crate) fn simulated(&self, port: &str) -> (u64, u64) {
-        let port = self.word(port);
+    pub(crate) fn simulator_totals(&self, port: &str) -> (u64, u64) {
+        let port = self.path_argument(port);
         let lines = self.truth_lines("simulated");
         let line = lines.iter().find(|line| line["port"] == port.as_str());
         let line = line.unwrap_or_else(|| panic!("no account of {port}"));
@@ -312,7 +323,7 @@ impl TestEnv {
     }
 
     /// Files of this domain's shared memory that are longer than what the library always leaves.
-    pub(crate) fn left_behind(&self) -> Vec<PathBuf> {
+    pub(crate) fn leftover_files(&self) -> Vec<PathBuf> {
         shared_memory(&format!("sh_{}_", self.domain))
             .into_iter()
             .filter(|path| fs::metadata(path).is_ok_and(|metadata| metadata.len() > 16))
@@ -352,34 +363,34 @@ pub(crate) fn shared_memory(prefix: &str) -> Vec<PathBuf> {
 }
 
 /// Waits until `is_so`.
-pub(crate) fn until(what: &str, mut is_so: impl FnMut() -> bool) {
-    let give_up_at = Instant::now() + PATIENCE;
+pub(crate) fn wait_until(description: &str, mut is_true: impl FnMut() -> bool) {
+    let give_up_at = Instant::now() + WAIT_TIMEOUT;
     let mut pause = Duration::from_millis(1);
     loop {
-        let begun = Instant::now();
-        if is_so() {
+        let started = Instant::now();
+        if is_true() {
             return;
         }
-        let took = begun.elapsed();
-        assert!(Instant::now() < give_up_at, "waited in vain: {what}");
+        let elapsed = started.elapsed();
+        assert!(Instant::now() < give_up_at, "waited in vain: {description}");
         // A check that starts a program leaves the processors to others for most of the time.
-        thread::sleep(pause.max(2 * took).min(Duration::from_millis(100)));
+        thread::sleep(pause.max(2 * elapsed).min(Duration::from_millis(100)));
         pause = (2 * pause).min(Duration::from_millis(20));
     }
 }
 
 /// Waits until at least `span` has passed, for a program that must notice this by its own clock. No test fails if it
 /// takes longer.
-pub(crate) fn let_pass(span: Duration) {
+pub(crate) fn wait_at_least(span: Duration) {
     thread::sleep(span);
 }
 
 /// Whether anything is at `path`, be it a symlink to nothing.
-pub(crate) fn is_there(path: &Path) -> bool {
+pub(crate) fn exists_or_is_symlink(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok()
 }
 
-fn with<S: AsRef<str>, T: AsRef<str>>(first: &[S], rest: &[T]) -> Vec<String> {
+fn concat_args<S: AsRef<str>, T: AsRef<str>>(first: &[S], rest: &[T]) -> Vec<String> {
     let first = first.iter().map(|word| word.as_ref().to_owned());
     first.chain(rest.iter().map(|word| word.as_ref().to_owned())).collect()
 }

@@ -4,14 +4,14 @@ use std::process::Command;
 use std::sync::OnceLock;
 
 use super::child::succeeds;
-use super::{only, own_program, run_again, skip};
+use super::{own_program, rerun_test, single_test_args, skip};
 
 /// Set in the process that runs in the namespace.
-const INSIDE: &str = "SCANHUB_TEST_NETWORK";
+const NAMESPACE_VARIABLE: &str = "SCANHUB_TEST_NETWORK";
 
 /// Runs `test`, whose name is `name`, in a network namespace of its own. Skips it if the system does not allow that.
 pub(crate) fn in_a_network(name: &str, test: impl FnOnce()) {
-    if std::env::var_os(INSIDE).is_some() {
+    if std::env::var_os(NAMESPACE_VARIABLE).is_some() {
         return test();
     }
     let mut unshare = Command::new("unshare");
@@ -21,12 +21,16 @@ pub(crate) fn in_a_network(name: &str, test: impl FnOnce()) {
     }
     let mut attempt = Command::new("unshare");
     attempt.args(unshare.get_args()).args(["ip", "link", "set", "lo", "up"]);
-    static ALLOWED: OnceLock<bool> = OnceLock::new();
-    if !*ALLOWED.get_or_init(|| succeeds(attempt)) {
+    static IS_ALLOWED: OnceLock<bool> = OnceLock::new();
+    if !*IS_ALLOWED.get_or_init(|| succeeds(attempt)) {
         skip("netns", "this user may not make a network namespace, or there is no `ip`");
         return;
     }
     let up = "ip link set lo up && exec \"$@\"";
-    unshare.args(["sh", "-c", up, "sh"]).arg(own_program()).args(only(name)).env(INSIDE, "1");
-    run_again(name, unshare);
+    unshare
+        .args(["sh", "-c", up, "sh"])
+        .arg(own_program())
+        .args(single_test_args(name))
+        .env(NAMESPACE_VARIABLE, "1");
+    rerun_test(name, unshare);
 }

@@ -10,7 +10,7 @@ use std::time::Instant;
 use rustix::process::Signal;
 use serde_json::Value;
 
-use super::PATIENCE;
+use super::WAIT_TIMEOUT;
 use super::child::{Child, spawn};
 
 pub(crate) const INT: Signal = Signal::INT;
@@ -24,22 +24,22 @@ pub(crate) struct Program {
     name: String,
     process: Child,
     /// Lines of its stdout. The last one may lack its line feed.
-    pieces: Receiver<Vec<u8>>,
-    /// Bytes that were received from `pieces`.
-    out: Vec<u8>,
+    received_lines: Receiver<Vec<u8>>,
+    /// Bytes that were received from `received_lines`.
+    stdout: Vec<u8>,
     errors: Option<JoinHandle<String>>,
 }
 
 /// Result of a program that has ended.
 pub(crate) struct Outcome {
     /// Its exit code; `None` if a signal ended it.
-    pub(crate) code: Option<i32>,
+    pub(crate) exit_code: Option<i32>,
     /// All of its stdout.
-    pub(crate) out: Vec<u8>,
+    pub(crate) stdout: Vec<u8>,
     /// All of its stderr.
-    pub(crate) errors: String,
+    pub(crate) stderr: String,
     /// Command lines of the processes that it left. They have been ended.
-    pub(crate) left: Vec<String>,
+    pub(crate) leftover_processes: Vec<String>,
     name: String,
 }
 
@@ -55,7 +55,7 @@ impl Program {
         let name = words.join(" ");
         command.stdin(stdin).stdout(Stdio::piped()).stderr(Stdio::piped());
         let mut process = spawn(command).unwrap_or_else(|error| panic!("cannot start {name}: {error}"));
-        let (send, pieces) = channel();
+        let (send, received_lines) = channel();
         let stdout = process.stdout.take();
         thread::spawn(move || {
             let Some(mut stdout) = stdout.map(BufReader::new) else { return };
@@ -72,7 +72,7 @@ impl Program {
             let _ = stderr.map(|mut stderr| stderr.read_to_end(&mut text));
             String::from_utf8_lossy(&text).into_owned()
         });
-        Program { name, process, pieces, out: Vec::new(), errors: Some(errors) }
+        Program { name, process, received_lines, stdout: Vec::new(), errors: Some(errors) }
     }
 
     /// Waits for its line of class `ready`.
@@ -87,7 +87,7 @@ impl Program {
     }
 
     /// Returns whether it has ended.
-    pub(crate) fn is_over(&self) -> bool {
+    pub(crate) fn has_ended(&self) -> bool {
         matches!(self.state(), None | Some('Z' | 'X'))
     }
 
@@ -104,81 +104,81 @@ impl Program {
     }
 
     /// Returns whether it ends without any output on stdout.
-    pub(crate) fn is_over_before_it_says(&mut self) -> bool {
-        self.receive(Instant::now() + PATIENCE) == Err(RecvTimeoutError::Disconnected)
+    pub(crate) fn ends_without_output(&mut self) -> bool {
+        self.receive(Instant::now() + WAIT_TIMEOUT) == Err(RecvTimeoutError::Disconnected)
     }
 
-    /// Waits for the next line that is `wanted`, and returns it.
-    pub(crate) fn await_line(&mut self, what: &str, wanted: impl Fn(&Value) -> bool) -> Value {
-        let give_up_at = Instant::now() + PATIENCE;
+    /// Waits for the next line that is `is_expected`, and returns it.
+    pub(crate) fn await_line(&mut self, description: &str, is_expected: impl Fn(&Value) -> bool) -> Value {
+        let give_up_at = Instant::now() + WAIT_TIMEOUT;
         loop {
-            let line = self.next_line(give_up_at).unwrap_or_else(|why| self.give_up(what, why));
-            if wanted(&line) {
+            let line = self.next_line(give_up_at).unwrap_or_else(|why| self.fail_wait(description, why));
+            if is_expected(&line) {
                 return line;
             }
         }
     }
 
-    /// Returns whether a line that was received so far is `wanted`.
-    pub(crate) fn has_said(&self, wanted: impl Fn(&Value) -> bool) -> bool {
-        let lines = self.out.split(|byte| *byte == b'\n');
-        lines.filter_map(|line| serde_json::from_slice(line).ok()).any(|line| wanted(&line))
+    /// Returns whether a line that was received so far is `is_expected`.
+    pub(crate) fn has_printed(&self, is_expected: impl Fn(&Value) -> bool) -> bool {
+        let lines = self.stdout.split(|byte| *byte == b'\n');
+        lines.filter_map(|line| serde_json::from_slice(line).ok()).any(|line| is_expected(&line))
     }
 
-    /// Receives the lines that it has written by now, and returns whether any line is `wanted`.
-    pub(crate) fn is_heard(&mut self, wanted: impl Fn(&Value) -> bool) -> bool {
+    /// Receives the lines that it has written by now, and returns whether any line is `is_expected`.
+    pub(crate) fn prints(&mut self, is_expected: impl Fn(&Value) -> bool) -> bool {
         while self.receive(Instant::now()).is_ok() {}
-        self.has_said(wanted)
+        self.has_printed(is_expected)
     }
 
-    /// Returns the first line that is `wanted` among all that it has printed so far.
-    pub(crate) fn printed(&mut self, wanted: impl Fn(&Value) -> bool) -> Option<Value> {
+    /// Returns the first line that is `is_expected` among all that it has printed so far.
+    pub(crate) fn printed(&mut self, is_expected: impl Fn(&Value) -> bool) -> Option<Value> {
         while self.receive(Instant::now()).is_ok() {}
-        let lines = self.out.split(|byte| *byte == b'\n');
-        lines.filter_map(|line| serde_json::from_slice(line).ok()).find(|line| wanted(line))
+        let lines = self.stdout.split(|byte| *byte == b'\n');
+        lines.filter_map(|line| serde_json::from_slice(line).ok()).find(|line| is_expected(line))
     }
 
-    /// Returns the last line that is `wanted` among all that it has printed so far.
-    pub(crate) fn last_printed(&mut self, wanted: impl Fn(&Value) -> bool) -> Option<Value> {
+    /// Returns the last line that is `is_expected` among all that it has printed so far.
+    pub(crate) fn last_printed(&mut self, is_expected: impl Fn(&Value) -> bool) -> Option<Value> {
         while self.receive(Instant::now()).is_ok() {}
-        let lines = self.out.split(|byte| *byte == b'\n').rev();
-        lines.filter_map(|line| serde_json::from_slice(line).ok()).find(|line| wanted(line))
+        let lines = self.stdout.split(|byte| *byte == b'\n').rev();
+        lines.filter_map(|line| serde_json::from_slice(line).ok()).find(|line| is_expected(line))
     }
 
-    /// Waits for the next `count` lines that are `wanted`, and returns them.
+    /// Waits for the next `count` lines that are `is_expected`, and returns them.
     pub(crate) fn await_lines(
         &mut self,
         count: usize,
-        what: &str,
-        wanted: impl Fn(&Value) -> bool,
+        description: &str,
+        is_expected: impl Fn(&Value) -> bool,
     ) -> Vec<Value> {
-        (0..count).map(|_| self.await_line(what, &wanted)).collect()
+        (0..count).map(|_| self.await_line(description, &is_expected)).collect()
     }
 
     /// Waits for a line that begins with `text`, for programs that do not print JSON.
-    pub(crate) fn await_text(&mut self, text: &str) {
-        let give_up_at = Instant::now() + PATIENCE;
+    pub(crate) fn wait_for_text(&mut self, text: &str) {
+        let give_up_at = Instant::now() + WAIT_TIMEOUT;
         let mut line = Vec::new();
         while !line.starts_with(text.as_bytes()) {
-            let begin = self.out.len();
-            self.receive(give_up_at).unwrap_or_else(|why| self.give_up(text, why));
-            line = self.out[begin..].to_vec();
+            let begin = self.stdout.len();
+            self.receive(give_up_at).unwrap_or_else(|why| self.fail_wait(text, why));
+            line = self.stdout[begin..].to_vec();
         }
     }
 
     /// Waits for the next line, and returns it, for programs that do not print JSON.
     pub(crate) fn next_text(&mut self) -> String {
-        let begin = self.out.len();
-        let give_up_at = Instant::now() + PATIENCE;
-        self.receive(give_up_at).unwrap_or_else(|why| self.give_up("a line", why));
-        String::from_utf8_lossy(&self.out[begin..]).trim_end().to_owned()
+        let begin = self.stdout.len();
+        let give_up_at = Instant::now() + WAIT_TIMEOUT;
+        self.receive(give_up_at).unwrap_or_else(|why| self.fail_wait("a line", why));
+        String::from_utf8_lossy(&self.stdout[begin..]).trim_end().to_owned()
     }
 
     /// Waits until it has written more than `len` bytes in all.
     pub(crate) fn await_bytes(&mut self, len: usize) {
-        let give_up_at = Instant::now() + PATIENCE;
-        while self.out.len() <= len {
-            self.receive(give_up_at).unwrap_or_else(|why| self.give_up("bytes", why));
+        let give_up_at = Instant::now() + WAIT_TIMEOUT;
+        while self.stdout.len() <= len {
+            self.receive(give_up_at).unwrap_or_else(|why| self.fail_wait("bytes", why));
         }
     }
 
@@ -195,7 +195,7 @@ impl Program {
 
     /// Waits for the end.
     pub(crate) fn wait(mut self) -> Outcome {
-        let give_up_at = Instant::now() + PATIENCE;
+        let give_up_at = Instant::now() + WAIT_TIMEOUT;
         let why = loop {
             match self.receive(give_up_at) {
                 Ok(()) => {}
@@ -203,38 +203,41 @@ impl Program {
             }
         };
         if why == RecvTimeoutError::Timeout {
-            self.give_up("its end", why);
+            self.fail_wait("its end", why);
         }
         let status = self.process.wait().unwrap_or_else(|error| panic!("{}: {error}", self.name));
         let errors = self.errors.take().map(JoinHandle::join);
         Outcome {
-            code: status.code(),
-            out: std::mem::take(&mut self.out),
-            errors: errors.and_then(Result::ok).unwrap_or_default(),
-            left: self.process.family(),
+            exit_code: status.code(),
+            stdout: std::mem::take(&mut self.stdout),
+            stderr: errors.and_then(Result::ok).unwrap_or_default(),
+            leftover_processes: self.process.living_command_lines(),
             name: self.name.clone(),
         }
     }
 
-    fn receive(&mut self, give_up_at: Instant) -> Result<(), RecvTimeoutError> {
-        let left = give_up_at.saturating_duration_since(Instant::now());
-        self.pieces.recv_timeout(left).map(|piece| self.out.extend(piece))
+    fn receive(&mut self, deadline: Instant) -> Result<(), RecvTimeoutError> {
+        let left = deadline.saturating_duration_since(Instant::now());
+        self.received_lines.recv_timeout(left).map(|piece| self.stdout.extend(piece))
     }
 
-    fn next_line(&mut self, give_up_at: Instant) -> Result<Value, RecvTimeoutError> {
-        let begin = self.out.len();
-        self.receive(give_up_at)?;
-        let text = String::from_utf8_lossy(&self.out[begin..]);
+    fn next_line(&mut self, deadline: Instant) -> Result<Value, RecvTimeoutError> {
+        let begin = self.stdout.len();
+        self.receive(deadline)?;
+        let text = String::from_utf8_lossy(&self.stdout[begin..]);
         Ok(serde_json::from_str(&text).unwrap_or_else(|error| panic!("{}: {text}: {error}", self.name)))
     }
 
-    fn give_up(&mut self, what: &str, why: RecvTimeoutError) -> ! {
+    fn fail_wait(&mut self, description: &str, why: RecvTimeoutError) -> ! {
         // With its descendants, because any of them keeps stderr open.
         self.process.end();
         let errors = self.errors.take().and_then(|errors| errors.join().ok()).unwrap_or_default();
-        let out = String::from_utf8_lossy(&self.out);
+        let out = String::from_utf8_lossy(&self.stdout);
         let tail: Vec<_> = out.lines().rev().take(5).collect();
-        panic!("scanhub {}: waited in vain ({why}) for {what}; it said last: {tail:#?}\n{errors}", self.name);
+        panic!(
+            "scanhub {}: waited in vain ({why}) for {description}; it said last: {tail:#?}\n{errors}",
+            self.name
+        );
     }
 }
 
@@ -245,8 +248,8 @@ impl Drop for Program {
         let status = self.process.try_wait().ok().flatten();
         let state = status.map_or_else(|| "still running".to_owned(), |status| status.to_string());
         self.process.end();
-        self.out.extend(self.pieces.try_iter().flatten());
-        let out = String::from_utf8_lossy(&self.out);
+        self.stdout.extend(self.received_lines.try_iter().flatten());
+        let out = String::from_utf8_lossy(&self.stdout);
         let tail: Vec<_> = out.lines().rev().take(5).collect();
         let errors = errors.join().unwrap_or_default();
         eprintln!("scanhub {}: {state}; it reported last: {tail:#?}\n{errors}", self.name);
@@ -256,7 +259,7 @@ impl Drop for Program {
 impl Outcome {
     /// Parses its stdout as lines of JSON.
     pub(crate) fn lines(&self) -> Vec<Value> {
-        let text = String::from_utf8_lossy(&self.out);
+        let text = String::from_utf8_lossy(&self.stdout);
         assert!(text.is_empty() || text.ends_with('\n'), "half a line: {self}");
         text.lines()
             .map(|line| serde_json::from_str(line).unwrap_or_else(|error| panic!("{line}: {error}\n{self}")))
@@ -271,7 +274,7 @@ impl Outcome {
 
 impl fmt::Display for Outcome {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Outcome { name, code, out, errors, .. } = self;
-        write!(f, "scanhub {name}: exit {code:?}\n{}\n{errors}", String::from_utf8_lossy(out))
+        let Outcome { name, exit_code, stdout, stderr, .. } = self;
+        write!(f, "scanhub {name}: exit {exit_code:?}\n{}\n{stderr}", String::from_utf8_lossy(stdout))
     }
 }

@@ -33,9 +33,9 @@ pub(crate) fn python_for(need: &str, modules: &str) -> Option<Command> {
 /// Returns a command that starts a Python with the package `scanhub` that was built from these sources. If there is none,
 /// skips the test and returns `None`.
 pub(crate) fn client_python() -> Option<Command> {
-    static FOUND: OnceLock<(String, String)> = OnceLock::new();
+    static CLIENT_PYTHON: OnceLock<(String, String)> = OnceLock::new();
     let command = python_for("python-packages", "numpy")?;
-    let (found, expected) = FOUND.get_or_init(|| {
+    let (found, expected) = CLIENT_PYTHON.get_or_init(|| {
         let mut ask = Command::new(command.get_program());
         ask.args(["-B", "-c", "import scanhub; print(scanhub._scanhub._sources)"]);
         let root = Path::new(env!("CARGO_MANIFEST_DIR"));

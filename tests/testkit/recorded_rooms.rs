@@ -10,8 +10,8 @@ use std::path::Path;
 
 use scanhub_config::{Config, Sources};
 use scanhub_drivers::lms;
-use scanhub_drivers::lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
-use scanhub_schema::datagram::Packed;
+use scanhub_drivers::lms::variant::{MIRROR_PERIOD, Mode, Unit, Variant};
+use scanhub_schema::datagram::DatagramPayload;
 use scanhub_schema::file::Writer;
 use scanhub_schema::{Background, Foreground, Header, Marks, Nanos, Scan, Topic, Zones};
 use scanhub_shm::Domain;
@@ -22,11 +22,11 @@ use scanhub_sim::world::World;
 /// Names of the sensors, and their worlds.
 pub(crate) const SENSORS: [(&str, &str); 2] = [("front", "fig8"), ("rear", "demo")];
 /// Setting with which backgrounds are learned within the recording.
-pub(crate) const LEARNING: &str = "background.scans=40";
+pub(crate) const SHORT_LEARNING: &str = "background.scans=40";
 
 /// Returns the time from one scan to the next.
-pub(crate) fn period() -> Nanos {
-    Variant::HALF.turns() * MIRROR_TURN
+pub(crate) fn scan_period() -> Nanos {
+    Variant::HALF.revolutions() * MIRROR_PERIOD
 }
 
 /// Drives a hub in `domain` in virtual time: a telegram with the mode, and `scans` scans of each sensor. Writes
@@ -37,12 +37,12 @@ pub(crate) fn record(
     file: &Path,
     scans: u64,
     silence: Option<u64>,
-    mut keep: impl FnMut(usize, Published),
+    mut keep: impl FnMut(usize, PublishedSample),
 ) {
     let sources = Sources {
         files: Vec::new(),
         links: SENSORS.map(|(name, _)| format!("{name}=file:nothing")).to_vec(),
-        set: ["link.front.mode=1", "link.rear.mode=1", LEARNING].map(str::to_owned).to_vec(),
+        set: ["link.front.mode=1", "link.rear.mode=1", SHORT_LEARNING].map(str::to_owned).to_vec(),
     };
     let config = Config::load(&sources).expect("a configuration");
     let rooms = SENSORS.map(|(_, name)| Room::new(&name.parse::<World>().expect("a world"), 7));
@@ -52,20 +52,22 @@ pub(crate) fn record(
         let subscribers = SENSORS.map(|(name, _)| Subscribers::attach(&node, name));
         for scan in 0..=scans {
             for (number, room) in rooms.iter().enumerate() {
-                let silent_ns = if silence.is_some_and(|silence| scan >= silence) { SECOND } else { 0 };
-                let at = SECOND + number as u64 * 9_000_000 + scan * period() + silent_ns;
+                let silent_ns = if silence.is_some_and(|silence| scan >= silence) { ONE_SECOND } else { 0 };
+                let at = ONE_SECOND + number as u64 * 9_000_000 + scan * scan_period() + silent_ns;
                 let telegram = if scan == 0 {
-                    lms::reply::configuration(0, Mode(1), Unit::Mm, 0x10)
+                    lms::reply::configuration_reply(0, Mode(1), Unit::Mm, 0x10)
                 } else {
                     let look = room.labeled_scan(Variant::HALF, Unit::Mm, Mode(1), at);
                     lms::measured::encode(0, Unit::Mm, &look.words, 0x10)
                 };
                 links[number].read(at, telegram.bytes());
                 // What the hub publishes at the start does not belong to a telegram.
-                let is_of_one = |sample: &Published| scan > 0 || sample.header.hub_time_ns().is_some();
+                let is_of_one = |sample: &PublishedSample| scan > 0 || sample.header.hub_time_ns().is_some();
                 for sample in subscribers[number].take().into_iter().filter(is_of_one) {
                     let (name, _) = SENSORS[number];
-                    writer.sample(name, sample.topic, &sample.header, &sample.payload).expect("is written");
+                    writer
+                        .write_sample(name, sample.topic, &sample.header, &sample.payload)
+                        .expect("is written");
                     keep(number, sample);
                 }
             }
@@ -80,7 +82,7 @@ pub(crate) fn record(
 
 /// A sample as it was published.
 #[derive(Debug, PartialEq)]
-pub(crate) struct Published {
+pub(crate) struct PublishedSample {
     pub(crate) topic: Topic,
     pub(crate) header: Header,
     pub(crate) payload: Vec<u8>,
@@ -109,7 +111,7 @@ impl Subscribers {
     }
 
     /// Returns the samples that have arrived since the last call, topic by topic.
-    pub(crate) fn take(&self) -> Vec<Published> {
+    pub(crate) fn take(&self) -> Vec<PublishedSample> {
         let mut taken = Vec::new();
         drain::<[u8]>(&self.telegram, &mut taken, |telegram| telegram.to_vec());
         drain::<Scan>(&self.scan, &mut taken, packed);
@@ -126,9 +128,13 @@ fn attach<P: Payload + ?Sized>(node: &Node, sensor: &str) -> Subscriber<P> {
     P::subscriber(node, &service).expect("a place")
 }
 
-fn drain<P: Payload + ?Sized>(from: &Subscriber<P>, to: &mut Vec<Published>, bytes: impl Fn(&P) -> Vec<u8>) {
+fn drain<P: Payload + ?Sized>(
+    from: &Subscriber<P>,
+    to: &mut Vec<PublishedSample>,
+    bytes: impl Fn(&P) -> Vec<u8>,
+) {
     while let Some(sample) = P::receive(from).expect("works") {
-        to.push(Published {
+        to.push(PublishedSample {
             topic: P::TOPIC,
             header: *sample.user_header(),
             payload: bytes(P::read(&sample)),
@@ -136,11 +142,11 @@ fn drain<P: Payload + ?Sized>(from: &Subscriber<P>, to: &mut Vec<Published>, byt
     }
 }
 
-fn packed(payload: &(impl Packed + ?Sized)) -> Vec<u8> {
+fn packed(payload: &(impl DatagramPayload + ?Sized)) -> Vec<u8> {
     let mut room = vec![0; 4096];
     let len = payload.pack(&mut room).expect("there is room");
     room.truncate(len);
     room
 }
 
-const SECOND: Nanos = 1_000 * scanhub_schema::MILLIS;
+const ONE_SECOND: Nanos = 1_000 * scanhub_schema::MILLIS;

@@ -10,14 +10,14 @@ use mcap::records::Record;
 
 /// What stands in a file.
 pub(crate) struct Recording {
-    pub(crate) kept: Vec<Kept>,
+    pub(crate) messages: Vec<RecordedMessage>,
     /// Metadata by name, in their order.
-    pub(crate) notes: Vec<(String, BTreeMap<String, String>)>,
+    pub(crate) metadata: Vec<(String, BTreeMap<String, String>)>,
 }
 
 /// A message.
 #[derive(Clone, Debug)]
-pub(crate) struct Kept {
+pub(crate) struct RecordedMessage {
     pub(crate) topic: String,
     pub(crate) encoding: String,
     pub(crate) schema: String,
@@ -28,20 +28,20 @@ pub(crate) struct Kept {
 
 impl Recording {
     /// That of a recorder that came to its end: it has an index, and that is right.
-    pub(crate) fn whole(path: &Path) -> Recording {
-        let bytes = bytes(path);
+    pub(crate) fn read_complete(path: &Path) -> Recording {
+        let bytes = file_bytes(path);
         let summary =
             mcap::Summary::read(&bytes).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
         let stats = summary.and_then(|summary| summary.stats).expect("an index");
         let recording = Recording::read(&bytes, path);
-        assert_eq!(stats.message_count, recording.kept.len() as u64, "{}", path.display());
+        assert_eq!(stats.message_count, recording.messages.len() as u64, "{}", path.display());
         MessageStream::new(&bytes).expect("it has an end");
         recording
     }
 
     /// That of one that was killed, up to where it ends, which is behind a whole record.
-    pub(crate) fn left(path: &Path) -> Recording {
-        Recording::read(&bytes(path), path)
+    pub(crate) fn read_interrupted(path: &Path) -> Recording {
+        Recording::read(&file_bytes(path), path)
     }
 
     /// As of a file, of bytes that came from `from`.
@@ -50,7 +50,7 @@ impl Recording {
         let options = Options::IgnoreEndMagic.into();
         let messages = MessageStream::new_with_options(bytes, options)
             .unwrap_or_else(|error| panic!("{place}: {error}"));
-        let kept = messages.map_while(Result::ok).map(|message| Kept {
+        let recorded = messages.map_while(Result::ok).map(|message| RecordedMessage {
             topic: message.channel.topic.clone(),
             encoding: message.channel.message_encoding.clone(),
             schema: message.channel.schema.as_ref().map(|schema| schema.name.clone()).unwrap_or_default(),
@@ -64,39 +64,39 @@ impl Recording {
             Record::Metadata(note) => Some((note.name, note.metadata)),
             _ => None,
         });
-        Recording { kept: kept.collect(), notes: notes.collect() }
+        Recording { messages: recorded.collect(), metadata: notes.collect() }
     }
 
     /// The messages of `topic`.
-    pub(crate) fn of(&self, topic: &str) -> Vec<&Kept> {
-        self.kept.iter().filter(|kept| kept.topic == topic).collect()
+    pub(crate) fn of(&self, topic: &str) -> Vec<&RecordedMessage> {
+        self.messages.iter().filter(|message| message.topic == topic).collect()
     }
 
     /// The metadata called `name`.
-    pub(crate) fn notes(&self, name: &str) -> Vec<&BTreeMap<String, String>> {
-        self.notes.iter().filter(|(other, _)| other == name).map(|(_, note)| note).collect()
+    pub(crate) fn metadata(&self, name: &str) -> Vec<&BTreeMap<String, String>> {
+        self.metadata.iter().filter(|(other, _)| other == name).map(|(_, note)| note).collect()
     }
 }
 
-impl Kept {
+impl RecordedMessage {
     /// The number of the telegram that it came from.
     pub(crate) fn seq(&self) -> u64 {
-        self.eight(0)
+        self.u64_at(0)
     }
 
     /// Its number in its topic.
     pub(crate) fn topic_seq(&self) -> u64 {
-        self.eight(8)
+        self.u64_at(8)
     }
 
     /// The wall clock of what it is of.
     pub(crate) fn wall_ns(&self) -> u64 {
-        self.eight(32)
+        self.u64_at(32)
     }
 
     /// The hub's life.
     pub(crate) fn boot(&self) -> u64 {
-        self.eight(40)
+        self.u64_at(40)
     }
 
     /// What stands behind the header.
@@ -104,20 +104,20 @@ impl Kept {
         &self.data[64..]
     }
 
-    fn eight(&self, at: usize) -> u64 {
+    fn u64_at(&self, at: usize) -> u64 {
         u64::from_le_bytes(self.data[at..at + 8].try_into().expect("eight bytes"))
     }
 }
 
 /// The numbers of `kept` in their topic, which have no gap.
-pub(crate) fn unbroken(kept: &[&Kept]) -> Vec<u64> {
-    let numbers: Vec<u64> = kept.iter().map(|kept| kept.topic_seq()).collect();
+pub(crate) fn contiguous_topic_seqs(messages: &[&RecordedMessage]) -> Vec<u64> {
+    let numbers: Vec<u64> = messages.iter().map(|message| message.topic_seq()).collect();
     for pair in numbers.windows(2) {
         assert_eq!(pair[1], pair[0] + 1, "a gap");
     }
     numbers
 }
 
-fn bytes(path: &Path) -> Vec<u8> {
+fn file_bytes(path: &Path) -> Vec<u8> {
     fs::read(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
 }

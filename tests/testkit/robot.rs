@@ -2,7 +2,7 @@
 
 use super::{Machine, Program, TestEnv, is_class};
 
-const STREAM: [&str; 2] = ["--seed=61", "--baud=500000"];
+const STREAM_FLAGS: [&str; 2] = ["--seed=61", "--baud=500000"];
 
 /// Machine number 1, on which a hub streams.
 pub(crate) struct Robot {
@@ -18,7 +18,7 @@ impl Robot {
     pub(crate) fn new(sensors: &[&str]) -> Robot {
         let machine = Machine::new(1);
         let env = TestEnv::on(&machine);
-        let simulator = env.simulator(sensors, &STREAM);
+        let simulator = env.simulator(sensors, &STREAM_FLAGS);
         let links = sensors.iter().map(|sensor| env.link(sensor)).collect();
         let mut robot = Robot { machine, env, hub: None, links, _simulator: simulator };
         robot.start();
@@ -39,7 +39,7 @@ impl Robot {
     pub(crate) fn gateway<S: AsRef<str>>(&self, flags: &[S]) -> Program {
         let flags = flags.iter().map(|flag| flag.as_ref().to_owned());
         let flags: Vec<String> = flags.chain(["--interface=eth0".to_owned()]).collect();
-        let mut gateway = self.env.gateway_at(&flags);
+        let mut gateway = self.env.start_gateway(&flags);
         let begin = gateway.await_line("its begin", is_class("gateway"));
         assert_eq!(begin["interface"], "eth0");
         gateway

@@ -4,15 +4,16 @@ use std::net::{Ipv4Addr, UdpSocket};
 
 use rustix::net::sockopt::set_ip_multicast_if;
 use scanhub_schema::datagram::{
-    Announce, Announced, GROUPS, HEAD, Head, LanFlags, MTU_ETHERNET, PART_LONGEST, PORT, Packed, group,
+    Announce, Announced, DatagramPayload, GROUP_PREFIX, HEADER_LEN, Head, LanFlags, MAX_PART_LEN,
+    MTU_ETHERNET, PORT, group,
 };
 use scanhub_schema::{Family, Status, Topic};
 use serde_json::Value;
 
-use super::{Program, until};
+use super::{Program, wait_until};
 
 /// One sensor of one gateway.
-pub(crate) struct Sender {
+pub(crate) struct TestGateway {
     socket: UdpSocket,
     pub(crate) hub: u64,
     pub(crate) epoch: u32,
@@ -27,59 +28,75 @@ pub(crate) struct Sender {
     pub(crate) counter: u32,
     /// Of what is sent, ns since 1970.
     pub(crate) stamp_ns: u64,
-    /// Samples by [`prove`](Sender::prove) so far. A listener counts them as `unnamed`.
-    pub(crate) proofs: u32,
+    /// Samples by [`prove_delivery`](Sender::prove) so far. A listener counts them as `unnamed`.
+    pub(crate) delivery_proofs: u32,
 }
 
 /// Number of a sensor that is never announced.
-const NAMELESS: u8 = 255;
+const UNANNOUNCED_SENSOR: u8 = 255;
 
-impl Sender {
-    pub(crate) fn new(hub: u64, epoch: u32, sensor: u8, name: &str) -> Sender {
+impl TestGateway {
+    pub(crate) fn new(hub: u64, epoch: u32, sensor: u8, name: &str) -> TestGateway {
         let socket = UdpSocket::bind("127.0.0.1:0").expect("a port");
         set_ip_multicast_if(&socket, &Ipv4Addr::LOCALHOST).expect("the loopback has an address");
         let (boot, next, counter, stamp_ns) = (0xb007, [0; 256], 0, wall_ns());
         let (name, family) = (name.to_owned(), Family::Lms);
-        Sender { socket, hub, epoch, sensor, family, name, boot, next, counter, stamp_ns, proofs: 0 }
+        TestGateway {
+            socket,
+            hub,
+            epoch,
+            sensor,
+            family,
+            name,
+            boot,
+            next,
+            counter,
+            stamp_ns,
+            delivery_proofs: 0,
+        }
     }
 
     /// The next datagram of `topic`.
-    pub(crate) fn make(&mut self, topic: Topic, payload: &(impl Packed + ?Sized)) -> Vec<u8> {
+    pub(crate) fn next_datagram(
+        &mut self,
+        topic: Topic,
+        payload: &(impl DatagramPayload + ?Sized),
+    ) -> Vec<u8> {
         let mut buffer = [0; MTU_ETHERNET];
-        let len = payload.pack(&mut buffer[HEAD..]).expect("it fits");
+        let len = payload.pack(&mut buffer[HEADER_LEN..]).expect("it fits");
         self.seal(topic.number(), &mut buffer, len)
     }
 
     /// The next telegram.
-    pub(crate) fn telegram(&mut self, bytes: &[u8]) -> Vec<u8> {
+    pub(crate) fn next_telegram(&mut self, bytes: &[u8]) -> Vec<u8> {
         let mut buffer = [0; MTU_ETHERNET];
-        buffer[HEAD..HEAD + bytes.len()].copy_from_slice(bytes);
+        buffer[HEADER_LEN..HEADER_LEN + bytes.len()].copy_from_slice(bytes);
         self.seal(Topic::Telegram.number(), &mut buffer, bytes.len())
     }
 
     /// Sends the next sample of `topic`, in parts if it is longer than a datagram.
-    pub(crate) fn send(&mut self, topic: Topic, payload: &(impl Packed + ?Sized)) {
+    pub(crate) fn send(&mut self, topic: Topic, payload: &(impl DatagramPayload + ?Sized)) {
         let mut packed = vec![0; 100_000];
         let len = payload.pack(&mut packed).expect("it fits");
-        let parts = len.div_ceil(PART_LONGEST).max(1);
+        let parts = len.div_ceil(MAX_PART_LEN).max(1);
         let head = self.head(topic.number());
-        for (part, payload) in packed[..len].chunks(PART_LONGEST).enumerate() {
+        for (part, payload) in packed[..len].chunks(MAX_PART_LEN).enumerate() {
             let mut buffer = [0; MTU_ETHERNET];
-            buffer[HEAD..HEAD + payload.len()].copy_from_slice(payload);
+            buffer[HEADER_LEN..HEADER_LEN + payload.len()].copy_from_slice(payload);
             let head = Head { part: part as u8, parts: parts as u8, ..head };
-            self.throw(topic, head.seal(&mut buffer, payload.len()).expect("it fits"));
+            self.send_bytes(topic, head.seal(&mut buffer, payload.len()).expect("it fits"));
         }
     }
 
     /// Sends these bytes to the group of `topic`.
-    pub(crate) fn throw(&self, topic: Topic, bytes: &[u8]) {
-        self.to(group(topic), bytes);
+    pub(crate) fn send_bytes(&self, topic: Topic, bytes: &[u8]) {
+        self.send_to_group(group(topic), bytes);
     }
 
     /// Announces `topics` with their next numbers.
     pub(crate) fn announce(&mut self, topics: &[Topic]) {
         let datagram = self.announcement(topics);
-        self.to(Announce::GROUP, &datagram);
+        self.send_to_group(Announce::GROUP, &datagram);
     }
 
     /// The announcement of `topics` with their next numbers.
@@ -90,7 +107,7 @@ impl Sender {
             announce.add(Announced { topic: topic.number(), group: group(topic), port: PORT, next });
         }
         let mut buffer = [0; MTU_ETHERNET];
-        let len = announce.pack(&mut buffer[HEAD..]).expect("it fits");
+        let len = announce.pack(&mut buffer[HEADER_LEN..]).expect("it fits");
         let stamp_ns = std::mem::replace(&mut self.stamp_ns, wall_ns());
         let datagram = self.seal(Announce::NUMBER, &mut buffer, len);
         self.stamp_ns = stamp_ns;
@@ -99,40 +116,40 @@ impl Sender {
 
     /// Sends a sample of another sensor of the same gateway. Such samples for a second prove that the gateway delivers, and
     /// this sensor has sent nothing.
-    pub(crate) fn prove(&mut self) {
+    pub(crate) fn prove_delivery(&mut self) {
         let status = usize::from(Topic::Status.number());
-        let sensor = std::mem::replace(&mut self.sensor, NAMELESS);
-        let next = std::mem::replace(&mut self.next[status], self.proofs);
+        let sensor = std::mem::replace(&mut self.sensor, UNANNOUNCED_SENSOR);
+        let next = std::mem::replace(&mut self.next[status], self.delivery_proofs);
         self.send(Topic::Status, &Status::default());
-        self.proofs = std::mem::replace(&mut self.next[status], next);
+        self.delivery_proofs = std::mem::replace(&mut self.next[status], next);
         self.sensor = sensor;
     }
 
     /// Announces `topics` until `listener`, which needs no key, publishes the sensor. Returns its notice.
-    pub(crate) fn await_published(&mut self, listener: &mut Program, topics: &[Topic]) -> Value {
+    pub(crate) fn wait_until_published(&mut self, listener: &mut Program, topics: &[Topic]) -> Value {
         let (hub, name) = (format!("{:016x}", self.hub), format!(".{}", self.name));
         let is_it = |line: &Value| {
             let is_named = line["sensor"].as_str().is_some_and(|sensor| sensor.ends_with(&name));
             line["kind"] == "published" && line["hub"] == hub.as_str() && is_named
         };
         let mut notice = Value::Null;
-        until("the sensor is published", || {
+        wait_until("the sensor is published", || {
             self.announce(topics);
-            self.prove();
+            self.prove_delivery();
             listener.printed(is_it).map(|line| notice = line).is_some()
         });
         notice
     }
 
     /// Sends an empty payload of the topic with this number.
-    pub(crate) fn empty(&mut self, number: u8) {
-        let datagram = self.seal(number, &mut [0; HEAD], 0);
-        self.to(Announce::GROUP, &datagram);
+    pub(crate) fn send_empty(&mut self, number: u8) {
+        let datagram = self.seal(number, &mut [0; HEADER_LEN], 0);
+        self.send_to_group(Announce::GROUP, &datagram);
     }
 
     /// Sends these bytes to the group that ends in `group`.
-    pub(crate) fn to(&self, group: u8, bytes: &[u8]) {
-        let [a, b, c] = GROUPS;
+    pub(crate) fn send_to_group(&self, group: u8, bytes: &[u8]) {
+        let [a, b, c] = GROUP_PREFIX;
         let sent = self.socket.send_to(bytes, (Ipv4Addr::new(a, b, c, group), PORT));
         assert_eq!(sent.expect("the loopback takes it"), bytes.len());
     }

@@ -8,14 +8,15 @@ use std::thread;
 /// # Panics
 ///
 /// With the panic of the first call that panicked.
-pub(crate) fn side_by_side<T: Send, R: Send>(
+pub(crate) fn run_concurrently<T: Send, R: Send>(
     items: impl IntoIterator<Item = T>,
     each: impl Fn(T) -> R + Sync,
 ) -> Vec<R> {
     let each = &each;
     thread::scope(|scope| {
-        let begun: Vec<_> = items.into_iter().map(|item| scope.spawn(move || each(item))).collect();
-        let done = begun.into_iter().map(|thread| thread.join().unwrap_or_else(|panic| resume_unwind(panic)));
+        let started: Vec<_> = items.into_iter().map(|item| scope.spawn(move || each(item))).collect();
+        let done =
+            started.into_iter().map(|thread| thread.join().unwrap_or_else(|panic| resume_unwind(panic)));
         done.collect()
     })
 }

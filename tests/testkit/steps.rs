@@ -2,7 +2,7 @@
 //! system calls. Used by `benches/path` and by `tests/it/path_cost.rs`.
 //!
 //! The cost of a telegram starts with the sleep after the previous telegram was published. It ends before the first sleep
-//! after a doorbell has rung for this one. Single steps take so long that the thread may fall behind. [`Stepper::pass`]
+//! after a doorbell has rung for this one. Single steps take so long that the thread may fall behind. [`Stepper::run_past_telegram`]
 //! then runs it until telegrams arrive in time again.
 #![allow(dead_code)] // The test needs a part of it.
 
@@ -22,11 +22,11 @@ use nix::unistd::Pid;
 pub(crate) struct Stepper {
     thread: Pid,
     /// Kind of the instruction at each address that was executed.
-    kinds: HashMap<u64, Kind>,
+    kinds: HashMap<u64, InstructionKind>,
     /// Functions that were called and have not returned, outermost first. Those called before the first step are not in
     /// it.
     calls: Vec<Call>,
-    /// Number of the system call that the thread has entered, after [`Stepper::pass`].
+    /// Number of the system call that the thread has entered, after [`Stepper::run_past_telegram`].
     entered: Option<u64>,
     /// Bytes that were read for the next telegram. Negative if some of an earlier one are missing.
     read: i64,
@@ -48,7 +48,7 @@ pub(crate) struct Call {
 /// Cost of a telegram, without repeated waits. At 9,600 baud a telegram arrives for 0.7 s, and the hub interrupts its wait
 /// every 50 ms to check for requests. At the usual 500,000 baud there is one wait.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Cost {
+pub(crate) struct TelegramCost {
     /// Number of telegrams that the cost is for: more than 1 if the next one was complete before the thread read.
     pub(crate) telegrams: u64,
     pub(crate) instructions: u64,
@@ -61,27 +61,27 @@ pub(crate) struct Cost {
 }
 
 #[derive(Clone, Copy, PartialEq, Eq)]
-enum Kind {
+enum InstructionKind {
     SystemCall,
     Call,
     Other,
 }
 
 /// Bytes of a telegram of 361 beams.
-const TELEGRAM: i64 = 732;
+const TELEGRAM_LEN: i64 = 732;
 /// Result of a system call that has not returned, `-ENOSYS`.
 const NOT_RETURNED: u64 = -38_i64 as u64;
 
 /// Limit for a telegram. It only bounds a hang: on a busy machine, the steps of one take minutes.
-const PATIENCE: Duration = Duration::from_secs(900);
+const TELEGRAM_TIMEOUT: Duration = Duration::from_secs(900);
 
 /// Numbers of system calls on x86-64.
-const READ: u64 = 0;
-const FUTEX: u64 = 202;
+const READ_CALL: u64 = 0;
+const FUTEX_CALL: u64 = 202;
 /// Calls in which a thread of the hub sleeps: poll, nanosleep, clock_nanosleep, ppoll.
-const SLEEPS: [u64; 4] = [7, 35, 230, 271];
+const SLEEP_CALLS: [u64; 4] = [7, 35, 230, 271];
 /// FUTEX_WAKE and FUTEX_WAKE_BITSET.
-const WAKES: [u64; 2] = [1, 10];
+const WAKE_OPERATIONS: [u64; 2] = [1, 10];
 
 impl Stepper {
     /// Stops the thread `thread`.
@@ -109,11 +109,11 @@ impl Stepper {
 
     /// Runs the thread until it has published a telegram that it had to wait for, and sleeps again.
     /// `interval` is the time between two telegrams.
-    pub(crate) fn pass(&mut self, interval: Duration) -> Result<(), String> {
+    pub(crate) fn run_past_telegram(&mut self, interval: Duration) -> Result<(), String> {
         loop {
-            let begun = Instant::now();
-            self.run()?;
-            if begun.elapsed() > interval / 2 {
+            let started = Instant::now();
+            self.run_telegram()?;
+            if started.elapsed() > interval / 2 {
                 self.read = 0;
                 return Ok(());
             }
@@ -122,44 +122,44 @@ impl Stepper {
 
     /// Runs the thread until the end of a telegram, and counts its system calls. This hardly delays the thread, unlike
     /// steps, so that it makes the same calls as usual.
-    pub(crate) fn run(&mut self) -> Result<Cost, String> {
+    pub(crate) fn run_telegram(&mut self) -> Result<TelegramCost, String> {
         self.calls.clear();
-        let (begun, mut signal) = (Instant::now(), None);
-        let mut cost = Cost::default();
+        let (started, mut signal) = (Instant::now(), None);
+        let mut cost = TelegramCost::default();
         if let Some(call) = self.entered.take() {
             cost.system_calls.insert(call, 1);
         }
         loop {
-            check(begun)?;
-            ptrace::syscall(self.thread, signal).map_err(lost)?;
+            check_timeout(started)?;
+            ptrace::syscall(self.thread, signal).map_err(trace_error)?;
             signal = self.wait()?;
-            let registers = ptrace::getregs(self.thread).map_err(lost)?;
+            let registers = ptrace::getregs(self.thread).map_err(trace_error)?;
             if signal.is_some() {
                 continue;
             }
             let call = registers.orig_rax;
             if registers.rax == NOT_RETURNED {
-                cost.telegrams = self.enter(call, registers.rsi);
+                cost.telegrams = self.enter_call(call, registers.rsi);
                 if cost.telegrams > 0 {
                     self.entered = Some(call);
                     return Ok(cost);
                 }
                 *cost.system_calls.entry(call).or_default() += 1;
             } else {
-                self.leave(call, registers.rax);
+                self.leave_call(call, registers.rax);
             }
         }
     }
 
     /// Steps through one telegram. Calls `on_step` before each instruction with its address, the functions that it runs
     /// in, outermost first, and the number of the system call that it makes, if any.
-    pub(crate) fn telegram(
+    pub(crate) fn step_telegram(
         &mut self,
         mut on_step: impl FnMut(u64, &[Call], Option<u64>),
-    ) -> Result<Cost, String> {
-        let mut cost = Cost::default();
-        let begun = Instant::now();
-        let mut last_read = begun;
+    ) -> Result<TelegramCost, String> {
+        let mut cost = TelegramCost::default();
+        let started = Instant::now();
+        let mut last_read = started;
         // Index of the next step, and of the one after the last sleep.
         let (mut index, mut slept) = (0, 0);
         if let Some(call) = self.entered.take() {
@@ -168,29 +168,29 @@ impl Stepper {
             self.step()?;
         }
         loop {
-            let registers = ptrace::getregs(self.thread).map_err(lost)?;
+            let registers = ptrace::getregs(self.thread).map_err(trace_error)?;
             let address = registers.rip;
             while self.calls.last().is_some_and(|call| call.frame < registers.rsp) {
                 self.calls.pop();
             }
             let kind = self.kind(address)?;
-            let call = (kind == Kind::SystemCall).then_some(registers.rax);
+            let call = (kind == InstructionKind::SystemCall).then_some(registers.rax);
             if let Some(call) = call {
-                cost.telegrams = self.enter(call, registers.rsi);
+                cost.telegrams = self.enter_call(call, registers.rsi);
                 if cost.telegrams > 0 {
                     let repeated: u64 = cost.repeats.iter().map(|steps| steps.end - steps.start).sum();
                     cost.instructions = index - repeated;
                     cost.lag = last_read.elapsed();
                     return Ok(cost);
                 }
-                let is_sleep = SLEEPS.contains(&call);
-                if is_sleep && index > 0 && SLEEPS.contains(&self.last_call) {
+                let is_sleep = SLEEP_CALLS.contains(&call);
+                if is_sleep && index > 0 && SLEEP_CALLS.contains(&self.last_call) {
                     cost.repeats.push(slept..index);
                 } else {
                     *cost.system_calls.entry(call).or_default() += 1;
                 }
                 if is_sleep {
-                    check(begun)?;
+                    check_timeout(started)?;
                     slept = index;
                 }
                 self.last_call = call;
@@ -198,13 +198,13 @@ impl Stepper {
             on_step(address, &self.calls, call);
             index += 1;
             self.step()?;
-            if kind == Kind::Other {
+            if kind == InstructionKind::Other {
                 continue;
             }
-            let registers = ptrace::getregs(self.thread).map_err(lost)?;
+            let registers = ptrace::getregs(self.thread).map_err(trace_error)?;
             if let Some(call) = call {
-                self.leave(call, registers.rax);
-                if call == READ {
+                self.leave_call(call, registers.rax);
+                if call == READ_CALL {
                     last_read = Instant::now();
                 }
             } else {
@@ -220,23 +220,23 @@ impl Stepper {
     }
 
     /// Handles the start of a system call. Returns the number of telegrams that end before it.
-    fn enter(&mut self, call: u64, operation: u64) -> u64 {
-        if call == FUTEX && WAKES.contains(&(operation & 0x7f)) {
+    fn enter_call(&mut self, call: u64, operation: u64) -> u64 {
+        if call == FUTEX_CALL && WAKE_OPERATIONS.contains(&(operation & 0x7f)) {
             self.has_rung = true;
         }
         // The thread may have read a part of the next telegram.
-        let telegrams = (self.read + TELEGRAM / 2) / TELEGRAM;
-        if !SLEEPS.contains(&call) || !self.has_rung || telegrams < 1 {
+        let telegrams = (self.read + TELEGRAM_LEN / 2) / TELEGRAM_LEN;
+        if !SLEEP_CALLS.contains(&call) || !self.has_rung || telegrams < 1 {
             return 0;
         }
         self.has_rung = false;
-        self.read -= telegrams * TELEGRAM;
+        self.read -= telegrams * TELEGRAM_LEN;
         telegrams.unsigned_abs()
     }
 
     /// Handles the end of a system call.
-    fn leave(&mut self, call: u64, result: u64) {
-        if call == READ {
+    fn leave_call(&mut self, call: u64, result: u64) {
+        if call == READ_CALL {
             // A negative number is an error.
             self.read += (result as i64).max(0);
         }
@@ -246,7 +246,7 @@ impl Stepper {
     fn step(&mut self) -> Result<(), String> {
         let mut signal = None;
         loop {
-            ptrace::step(self.thread, signal).map_err(lost)?;
+            ptrace::step(self.thread, signal).map_err(trace_error)?;
             signal = self.wait()?;
             if signal.is_none() {
                 return Ok(());
@@ -256,7 +256,7 @@ impl Stepper {
 
     /// Waits until the thread stops. Returns the signal that stopped it, unless it is that of ptrace.
     fn wait(&mut self) -> Result<Option<Signal>, String> {
-        match waitpid(self.thread, Some(WaitPidFlag::__WALL)).map_err(lost)? {
+        match waitpid(self.thread, Some(WaitPidFlag::__WALL)).map_err(trace_error)? {
             WaitStatus::Stopped(_, Signal::SIGTRAP)
             | WaitStatus::PtraceSyscall(_)
             | WaitStatus::PtraceEvent(..) => Ok(None),
@@ -266,17 +266,17 @@ impl Stepper {
     }
 
     /// Returns the kind of the instruction at `address`.
-    fn kind(&mut self, address: u64) -> Result<Kind, String> {
+    fn kind(&mut self, address: u64) -> Result<InstructionKind, String> {
         if let Some(&kind) = self.kinds.get(&address) {
             return Ok(kind);
         }
-        let word = ptrace::read(self.thread, address as ptrace::AddressType).map_err(lost)?;
+        let word = ptrace::read(self.thread, address as ptrace::AddressType).map_err(trace_error)?;
         let kind = match word.to_le_bytes() {
-            [0x0f, 0x05, ..] => Kind::SystemCall,
+            [0x0f, 0x05, ..] => InstructionKind::SystemCall,
             // call rel32, and call r/m64 with and without a prefix.
-            [0xe8, ..] => Kind::Call,
-            [0xff, form, ..] | [0x40..=0x4f, 0xff, form, ..] if form >> 3 & 7 == 2 => Kind::Call,
-            _ => Kind::Other,
+            [0xe8, ..] => InstructionKind::Call,
+            [0xff, form, ..] | [0x40..=0x4f, 0xff, form, ..] if form >> 3 & 7 == 2 => InstructionKind::Call,
+            _ => InstructionKind::Other,
         };
         self.kinds.insert(address, kind);
         Ok(kind)
@@ -284,8 +284,8 @@ impl Stepper {
 }
 
 /// Returns an error if no telegram has arrived since `begun` for far too long.
-fn check(begun: Instant) -> Result<(), String> {
-    if begun.elapsed() > PATIENCE { Err("no telegram was published".to_owned()) } else { Ok(()) }
+fn check_timeout(started: Instant) -> Result<(), String> {
+    if started.elapsed() > TELEGRAM_TIMEOUT { Err("no telegram was published".to_owned()) } else { Ok(()) }
 }
 
 /// Returns the ID of the thread of the link in the hub `pid`, which has the name of its sensor.
@@ -306,6 +306,6 @@ pub(crate) fn link_thread(pid: u32, sensor: &str) -> Result<i32, String> {
     Err(format!("process {pid} has no thread {sensor}"))
 }
 
-fn lost(error: Errno) -> String {
+fn trace_error(error: Errno) -> String {
     format!("the thread is lost: {error}")
 }

@@ -11,25 +11,31 @@ use std::time::Duration;
 use rustix::io::Errno;
 use rustix::net::{RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, recvmsg};
 
-use super::PATIENCE;
+use super::WAIT_TIMEOUT;
 
 /// Bound to a socket of its own.
 pub(crate) struct Supervisor {
     socket: UnixDatagram,
     path: String,
     /// What it keeps, with the name that it was given under.
-    kept: Option<(String, OwnedFd)>,
+    stored_descriptor: Option<(String, OwnedFd)>,
     /// All that was said to it, a line each.
-    pub(crate) heard: Vec<String>,
+    pub(crate) messages: Vec<String>,
     /// Of that what nobody waited for yet, of the last hub: its threads speak in no order.
-    unawaited: Vec<String>,
+    unread_messages: Vec<String>,
 }
 
 impl Supervisor {
     /// One with its socket at `path`.
     pub(crate) fn new(path: String) -> Supervisor {
         let socket = UnixDatagram::bind(&path).unwrap_or_else(|error| panic!("{path}: {error}"));
-        Supervisor { socket, path, kept: None, heard: Vec::new(), unawaited: Vec::new() }
+        Supervisor {
+            socket,
+            path,
+            stored_descriptor: None,
+            messages: Vec::new(),
+            unread_messages: Vec::new(),
+        }
     }
 
     /// The command that starts `hub` as its service, and the stdin by which that is handed what it keeps.
@@ -38,7 +44,7 @@ impl Supervisor {
         self.socket.set_nonblocking(true).expect("a socket");
         while self.receive().is_ok() {}
         self.socket.set_nonblocking(false).expect("a socket");
-        self.unawaited.clear();
+        self.unread_messages.clear();
         // The process id of a program that is not started yet only a shell can tell.
         let mut command = Command::new("/bin/sh");
         command.args([
@@ -52,22 +58,22 @@ impl Supervisor {
         if let Some(every) = watchdog {
             command.env("WATCHDOG_USEC", every.as_micros().to_string());
         }
-        let Some((name, line)) = &self.kept else { return (command, Stdio::null()) };
+        let Some((name, line)) = &self.stored_descriptor else { return (command, Stdio::null()) };
         command.env("LISTEN_FDS", "1").env("LISTEN_FDNAMES", name);
         let line = line.try_clone().unwrap_or_else(|error| panic!("no descriptor: {error}"));
         (command, line.into())
     }
 
-    /// Hears until the hub has said `wanted`, as often as that was asked for.
-    pub(crate) fn hear(&mut self, wanted: &str) {
-        self.socket.set_read_timeout(Some(PATIENCE)).expect("a socket");
-        while !self.unawaited.iter().any(|line| line == wanted) {
+    /// Hears until the hub has said `is_expected`, as often as that was asked for.
+    pub(crate) fn wait_for_message(&mut self, message: &str) {
+        self.socket.set_read_timeout(Some(WAIT_TIMEOUT)).expect("a socket");
+        while !self.unread_messages.iter().any(|line| line == message) {
             if let Err(error) = self.receive() {
-                panic!("waited in vain for {wanted}: {error}; heard {:?}", self.heard);
+                panic!("waited in vain for {message}: {error}; heard {:?}", self.messages);
             }
         }
-        let at = self.unawaited.iter().position(|line| line == wanted).expect("it was said");
-        self.unawaited.remove(at);
+        let at = self.unread_messages.iter().position(|line| line == message).expect("it was said");
+        self.unread_messages.remove(at);
     }
 
     fn receive(&mut self) -> Result<(), Errno> {
@@ -80,14 +86,14 @@ impl Supervisor {
         let name = lines.lines().find_map(|line| line.strip_prefix("FDNAME=")).unwrap_or_default();
         for passed in control.drain() {
             if let RecvAncillaryMessage::ScmRights(lines) = passed {
-                self.kept = lines.last().map(|line| (name.to_owned(), line));
+                self.stored_descriptor = lines.last().map(|line| (name.to_owned(), line));
             }
         }
         if lines.lines().any(|line| line == "FDSTOREREMOVE=1") {
-            self.kept = self.kept.take().filter(|(kept, _)| kept != name);
+            self.stored_descriptor = self.stored_descriptor.take().filter(|(kept, _)| kept != name);
         }
-        self.heard.extend(lines.lines().map(str::to_owned));
-        self.unawaited.extend(lines.lines().map(str::to_owned));
+        self.messages.extend(lines.lines().map(str::to_owned));
+        self.unread_messages.extend(lines.lines().map(str::to_owned));
         Ok(())
     }
 }

@@ -9,11 +9,11 @@ use sha2::{Digest, Sha256};
 use super::Outcome;
 
 /// Command of a measured-value telegram.
-pub(crate) const MEASURED: u64 = 0xB0;
+pub(crate) const MEASURED_VALUES: u64 = 0xB0;
 
 /// A telegram as the simulator tells of it.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Sent {
+pub(crate) struct SimulatedTelegram {
     pub(crate) is_reply: bool,
     pub(crate) hash: String,
     pub(crate) fault: Option<String>,
@@ -21,10 +21,10 @@ pub(crate) struct Sent {
     pub(crate) sent_ns: u64,
 }
 
-impl Sent {
-    pub(crate) fn of(line: &Value) -> Sent {
+impl SimulatedTelegram {
+    pub(crate) fn of(line: &Value) -> SimulatedTelegram {
         let text = |key: &str| line[key].as_str().map(str::to_owned);
-        Sent {
+        SimulatedTelegram {
             is_reply: line["kind"] == "reply",
             hash: text("sha256").unwrap_or_else(|| panic!("no hash: {line}")),
             fault: text("fault"),
@@ -66,7 +66,7 @@ pub(crate) fn number(line: &Value, key: &str) -> u64 {
 }
 
 /// A numbering of lines, which has no gap.
-pub(crate) fn sequence(lines: &[Value], key: &str) -> Vec<u64> {
+pub(crate) fn contiguous_numbers(lines: &[Value], key: &str) -> Vec<u64> {
     let numbers: Vec<u64> = lines.iter().map(|line| number(line, key)).collect();
     for pair in numbers.windows(2) {
         assert_eq!(pair[1], pair[0] + 1, "a gap in {key}");
@@ -76,7 +76,7 @@ pub(crate) fn sequence(lines: &[Value], key: &str) -> Vec<u64> {
 
 /// Returns the numbers of the samples of `topic` that a client printed, after checking that they are in order and that the
 /// client reported every gap as missed. A client on a busy machine may miss some.
-pub(crate) fn accounted(outcome: &Outcome, topic: &str) -> Vec<u64> {
+pub(crate) fn checked_topic_seqs(outcome: &Outcome, topic: &str) -> Vec<u64> {
     let lines = outcome.of_class(topic);
     // A client's own report of a silence has no number.
     let mut numbers: Vec<u64> = lines.iter().filter_map(|line| line["topic_seq"].as_u64()).collect();

@@ -18,7 +18,7 @@ use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::{Termios, Winsize, tcgetattr, tcsetwinsize};
 
 use super::child::{Child, spawn, succeeds};
-use super::{PATIENCE, skip};
+use super::{WAIT_TIMEOUT, skip};
 
 /// Returns both sides of a new terminal: the test's, and the program's.
 pub(crate) fn terminal() -> (File, OwnedFd) {
@@ -32,7 +32,7 @@ pub(crate) fn terminal() -> (File, OwnedFd) {
 }
 
 /// Returns whether a test can start a program in a terminal of its own. Skips the test if not.
-pub(crate) fn can_sit() -> bool {
+pub(crate) fn can_open_terminal() -> bool {
     let can_sit = succeeds(Command::new("setsid").arg("true"));
     if !can_sit {
         skip("setsid", "there is none (Debian: apt-get install util-linux)");
@@ -41,41 +41,46 @@ pub(crate) fn can_sit() -> bool {
 }
 
 /// A program in a terminal of its own.
-pub(crate) struct Sitting {
+pub(crate) struct TerminalSession {
     process: Child,
     /// The test's side of the terminal, until it is closed.
-    keys: Option<File>,
-    screen: OwnedFd,
-    before: Termios,
-    seen: Arc<Mutex<Vec<u8>>>,
+    input: Option<File>,
+    terminal: OwnedFd,
+    initial_modes: Termios,
+    output: Arc<Mutex<Vec<u8>>>,
     /// Reads the output of the program until `closed` is set.
-    eye: Option<JoinHandle<()>>,
+    reader: Option<JoinHandle<()>>,
     closed: Arc<AtomicBool>,
     size: (u16, u16),
 }
 
-impl Sitting {
+impl TerminalSession {
     /// Starts `command` in a terminal of `size`, columns and rows. It is the controlling terminal of a new session.
-    pub(crate) fn start(command: &Command, size: (u16, u16)) -> Sitting {
-        Sitting::begin(command, size, &["-c"], None)
+    pub(crate) fn start(command: &Command, size: (u16, u16)) -> TerminalSession {
+        TerminalSession::begin(command, size, &["-c"], None)
     }
 
-    /// Starts `command` like [`Sitting::start`], with `errors` as its stderr. Unless it is `told`, the terminal is not
+    /// Starts `command` like [`TerminalSession::start`], with `errors` as its stderr. Unless it is `has_controlling_terminal`, the terminal is not
     /// the controlling one, so that closing it sends no signal.
     pub(crate) fn start_for_hang_up(
         command: &Command,
         size: (u16, u16),
-        told: bool,
+        has_controlling_terminal: bool,
         errors: File,
-    ) -> Sitting {
-        Sitting::begin(command, size, if told { &["-c"] } else { &[] }, Some(errors))
+    ) -> TerminalSession {
+        TerminalSession::begin(
+            command,
+            size,
+            if has_controlling_terminal { &["-c"] } else { &[] },
+            Some(errors),
+        )
     }
 
-    fn begin(command: &Command, size: (u16, u16), flags: &[&str], errors: Option<File>) -> Sitting {
-        let (keys, screen) = terminal();
-        resize(&screen, size);
-        let before = tcgetattr(&screen).unwrap();
-        let program = || Stdio::from(screen.try_clone().unwrap());
+    fn begin(command: &Command, size: (u16, u16), flags: &[&str], errors: Option<File>) -> TerminalSession {
+        let (input, terminal) = terminal();
+        resize(&terminal, size);
+        let initial_modes = tcgetattr(&terminal).unwrap();
+        let program = || Stdio::from(terminal.try_clone().unwrap());
         let mut setsid = Command::new("setsid");
         setsid.args(flags).arg(command.get_program()).args(command.get_args());
         for (key, value) in command.get_envs() {
@@ -88,14 +93,14 @@ impl Sitting {
         setsid.stderr(errors.map_or_else(program, Stdio::from));
         let process = spawn(&mut setsid).unwrap();
         drop(setsid);
-        let seen = Arc::new(Mutex::new(Vec::new()));
+        let output = Arc::new(Mutex::new(Vec::new()));
         let closed = Arc::new(AtomicBool::new(false));
-        let (mut from, to, is_over) = (keys.try_clone().unwrap(), seen.clone(), closed.clone());
+        let (mut from, to, is_over) = (input.try_clone().unwrap(), output.clone(), closed.clone());
         let eye = thread::spawn(move || {
             let mut piece = [0; 4096];
             while !is_over.load(Ordering::Relaxed) {
                 let mut fds = [PollFd::new(&from, PollFlags::IN)];
-                if poll(&mut fds, Some(&LOOK)).unwrap() == 0 {
+                if poll(&mut fds, Some(&POLL_INTERVAL)).unwrap() == 0 {
                     continue;
                 }
                 // Reading fails once no process has the terminal open.
@@ -103,7 +108,16 @@ impl Sitting {
                 to.lock().unwrap().extend_from_slice(&piece[..len]);
             }
         });
-        Sitting { process, keys: Some(keys), screen, before, seen, eye: Some(eye), closed, size }
+        TerminalSession {
+            process,
+            input: Some(input),
+            terminal,
+            initial_modes,
+            output,
+            reader: Some(eye),
+            closed,
+            size,
+        }
     }
 
     /// Returns its process ID.
@@ -113,37 +127,37 @@ impl Sitting {
 
     /// Returns all of its output.
     pub(crate) fn text(&self) -> String {
-        String::from_utf8_lossy(&self.seen.lock().unwrap()).into_owned()
+        String::from_utf8_lossy(&self.output.lock().unwrap()).into_owned()
     }
 
     /// Returns the rows of its screen.
     pub(crate) fn rows(&self) -> Vec<String> {
-        shown(&self.text(), self.size.0.into(), self.size.1.into())
+        screen_rows(&self.text(), self.size.0.into(), self.size.1.into())
     }
 
     /// Waits until a row has `words`.
-    pub(crate) fn await_words(&self, words: &str) {
+    pub(crate) fn wait_for_text(&self, words: &str) {
         self.await_rows(words, |rows| rows.iter().any(|row| row.contains(words)));
     }
 
-    /// Waits until the rows are as `wanted`.
-    pub(crate) fn await_rows(&self, what: &str, wanted: impl Fn(&[String]) -> bool) {
-        let give_up_at = Instant::now() + PATIENCE;
-        while !wanted(&self.rows()) {
-            assert!(Instant::now() < give_up_at, "no {what}:\n{}", self.rows().join("\n"));
+    /// Waits until the rows are as `is_expected`.
+    pub(crate) fn await_rows(&self, description: &str, is_expected: impl Fn(&[String]) -> bool) {
+        let give_up_at = Instant::now() + WAIT_TIMEOUT;
+        while !is_expected(&self.rows()) {
+            assert!(Instant::now() < give_up_at, "no {description}:\n{}", self.rows().join("\n"));
             thread::sleep(Duration::from_millis(10));
         }
     }
 
     /// Types.
     pub(crate) fn press(&mut self, keys: &str) {
-        self.keys.as_mut().expect("it is open").write_all(keys.as_bytes()).unwrap();
+        self.input.as_mut().expect("it is open").write_all(keys.as_bytes()).unwrap();
     }
 
     /// Sets the size of the terminal, columns and rows.
     pub(crate) fn resize(&mut self, size: (u16, u16)) {
         self.size = size;
-        resize(&self.screen, size);
+        resize(&self.terminal, size);
     }
 
     /// Sends a signal.
@@ -154,13 +168,13 @@ impl Sitting {
     /// Closes the terminal and waits for the end. Returns the exit code.
     pub(crate) fn hang_up(mut self) -> Option<i32> {
         self.closed.store(true, Ordering::Relaxed);
-        self.eye.take().map(JoinHandle::join).transpose().unwrap();
-        drop(self.keys.take());
+        self.reader.take().map(JoinHandle::join).transpose().unwrap();
+        drop(self.input.take());
         self.wait()
     }
 
     fn wait(&mut self) -> Option<i32> {
-        let give_up_at = Instant::now() + PATIENCE;
+        let give_up_at = Instant::now() + WAIT_TIMEOUT;
         loop {
             if let Some(status) = self.process.try_wait().unwrap() {
                 return status.code();
@@ -172,8 +186,8 @@ impl Sitting {
 
     /// Waits for the end. Returns the exit code, the text below the picture, and whether the terminal has its old
     /// modes.
-    pub(crate) fn end(self) -> (Option<i32>, String, bool) {
-        let (code, text, is_as_before) = self.end_of_lines();
+    pub(crate) fn finish(self) -> (Option<i32>, String, bool) {
+        let (code, text, is_as_before) = self.finish_plain();
         let (picture, below) = text.rsplit_once("\x1b[?1049l").unwrap_or(("", &text));
         let is_shown = below.contains("\x1b[?25h") && !below.contains("\x1b[?25l");
         let is_whole = picture.contains("\x1b[?1049h") && is_shown && is_as_before;
@@ -181,15 +195,19 @@ impl Sitting {
     }
 
     /// Does the same for a program that draws no picture, and returns all of its output.
-    pub(crate) fn end_of_lines(mut self) -> (Option<i32>, String, bool) {
+    pub(crate) fn finish_plain(mut self) -> (Option<i32>, String, bool) {
         let code = self.wait();
-        let give_up_at = Instant::now() + PATIENCE;
-        let after = tcgetattr(&self.screen).unwrap();
+        let give_up_at = Instant::now() + WAIT_TIMEOUT;
+        let after = tcgetattr(&self.terminal).unwrap();
         let is_as_before = (after.input_modes, after.output_modes, after.local_modes)
-            == (self.before.input_modes, self.before.output_modes, self.before.local_modes);
+            == (
+                self.initial_modes.input_modes,
+                self.initial_modes.output_modes,
+                self.initial_modes.local_modes,
+            );
         // A mark behind the output shows that all of it has been read.
         let mark = "\u{1}end";
-        File::from(self.screen.try_clone().unwrap()).write_all(mark.as_bytes()).unwrap();
+        File::from(self.terminal.try_clone().unwrap()).write_all(mark.as_bytes()).unwrap();
         while !self.text().ends_with(mark) {
             assert!(Instant::now() < give_up_at, "the terminal does not return the output");
             thread::sleep(Duration::from_millis(10));
@@ -200,7 +218,7 @@ impl Sitting {
 }
 
 /// Interval at which the reader checks whether the terminal is closed.
-const LOOK: Timespec = Timespec { tv_sec: 0, tv_nsec: 20_000_000 };
+const POLL_INTERVAL: Timespec = Timespec { tv_sec: 0, tv_nsec: 20_000_000 };
 
 fn resize(terminal: impl AsFd, (columns, rows): (u16, u16)) {
     tcsetwinsize(terminal, Winsize { ws_col: columns, ws_row: rows, ws_xpixel: 0, ws_ypixel: 0 }).unwrap();
@@ -208,7 +226,7 @@ fn resize(terminal: impl AsFd, (columns, rows): (u16, u16)) {
 
 /// Returns the rows of a screen after `text` was written to it. Interprets cursor positions (CSI H), clearing (CSI J)
 /// and the alternate screen, and ignores colors.
-fn shown(text: &str, columns: usize, rows: usize) -> Vec<String> {
+fn screen_rows(text: &str, columns: usize, rows: usize) -> Vec<String> {
     let mut screen = vec![vec![' '; columns]; rows];
     let (mut row, mut column) = (0, 0);
     let mut signs = text.chars();

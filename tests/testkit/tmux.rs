@@ -7,7 +7,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use super::child::{Child, output, spawn, succeeds};
-use super::{PATIENCE, TestEnv, skip};
+use super::{TestEnv, WAIT_TIMEOUT, skip};
 
 /// A session with one window.
 pub(crate) struct Tmux {
@@ -35,33 +35,37 @@ impl Tmux {
 
     /// Types keys, by their names in tmux.
     pub(crate) fn press(&self, keys: &[&str]) {
-        self.tell(&[&["send-keys"], keys].concat());
+        self.run_tmux(&[&["send-keys"], keys].concat());
     }
 
     /// Sets the size of the window, columns and rows.
     pub(crate) fn resize(&self, (columns, rows): (u16, u16)) {
-        self.tell(&["resize-window", "-x", &columns.to_string(), "-y", &rows.to_string()]);
+        self.run_tmux(&["resize-window", "-x", &columns.to_string(), "-y", &rows.to_string()]);
     }
 
-    /// Waits until the rows of the window are as `wanted`, and returns them.
-    pub(crate) fn await_rows(&self, what: &str, wanted: impl Fn(&[String]) -> bool) -> Vec<String> {
-        let give_up_at = Instant::now() + PATIENCE;
+    /// Waits until the rows of the window are as `is_expected`, and returns them.
+    pub(crate) fn await_rows(
+        &self,
+        description: &str,
+        is_expected: impl Fn(&[String]) -> bool,
+    ) -> Vec<String> {
+        let give_up_at = Instant::now() + WAIT_TIMEOUT;
         loop {
             let rows = self.rows();
-            if wanted(&rows) {
+            if is_expected(&rows) {
                 return rows;
             }
-            assert!(Instant::now() < give_up_at, "no {what}:\n{}", rows.join("\n"));
+            assert!(Instant::now() < give_up_at, "no {description}:\n{}", rows.join("\n"));
             thread::sleep(Duration::from_millis(50));
         }
     }
 
     fn rows(&self) -> Vec<String> {
-        let output = self.tell(&["capture-pane", "-p"]);
+        let output = self.run_tmux(&["capture-pane", "-p"]);
         String::from_utf8_lossy(&output.stdout).lines().map(str::to_owned).collect()
     }
 
-    fn tell(&self, words: &[&str]) -> Output {
+    fn run_tmux(&self, words: &[&str]) -> Output {
         let output =
             output(command(&self.socket, words)).unwrap_or_else(|error| panic!("tmux {words:?}: {error}"));
         assert!(output.status.success(), "tmux {words:?}: {}", String::from_utf8_lossy(&output.stderr));

@@ -9,20 +9,20 @@ use std::path::Path;
 use std::rc::Rc;
 
 use scanhub_config::Config;
-use scanhub_daemon::platform::{Line, Platform, SavedState, Wait, WakeReason};
+use scanhub_daemon::platform::{Platform, PortIo, SavedState, Wait, WakeReason};
 use scanhub_daemon::{CommandSender, LiveLink};
-use scanhub_port::{Allowance, Alteration, PortError, Source, clock};
+use scanhub_port::{PortError, PortSpec, ReadBudget, SettingsChange, clock};
 use scanhub_schema::limits::TopicLimits;
-use scanhub_schema::{Failure, Nanos, Ring, Wake};
-use scanhub_shm::{Domain, HubLock, shortage};
-use scanhub_shm::{Node, Payload, SharedMemory, Waker};
+use scanhub_schema::{DoorbellWord, Failure, Nanos, WakeEvent};
+use scanhub_shm::{Domain, HubLock, resource_limits};
+use scanhub_shm::{Node, Payload, SharedMemory, WakeSender};
 
 /// A link in virtual time. Its port must be a recording in the configuration: it streams from the start, and its scans
 /// are read in the configured mode.
 pub(crate) struct VirtualLink<'a> {
     platform: &'a VirtualPlatform<'a>,
     link: LiveLink<'a, VirtualPlatform<'a>>,
-    until: Nanos,
+    due_ns: Nanos,
 }
 
 /// Creates the links of `config` in `domain`, whatever their ports are, and passes them to `drive`. They end with it.
@@ -35,7 +35,7 @@ pub(crate) fn virtual_hub<T>(
     domain: &Domain,
     drive: impl FnOnce(&mut [VirtualLink<'_>]) -> T,
 ) -> Result<T, Failure> {
-    shortage::raise_descriptor_limit().expect("a limit can be raised");
+    resource_limits::raise_descriptor_limit().expect("a limit can be raised");
     let _lock = HubLock::acquire(domain.root())?;
     let node = scanhub_shm::hub_node(domain)?;
     let (_commands, queues) = CommandSender::new(config.links.iter().map(|link| link.name.as_str()))?;
@@ -44,8 +44,8 @@ pub(crate) fn virtual_hub<T>(
     let mut links = Vec::with_capacity(config.links.len());
     for (((number, link), platform), queue) in config.links.iter().enumerate().zip(&platform).zip(queues) {
         let mut link = LiveLink::new(link, number as u8, 0, platform, queue)?;
-        let Wait { until, .. } = link.on_wakeup(WakeReason::Timeout);
-        links.push(VirtualLink { platform, link, until });
+        let Wait { until: due_ns, .. } = link.on_wakeup(WakeReason::Timeout);
+        links.push(VirtualLink { platform, link, due_ns });
     }
     scanhub_shm::allocate(domain)?;
     Ok(drive(&mut links))
@@ -56,8 +56,8 @@ impl VirtualLink<'_> {
     /// them. Returns the number of telegrams.
     pub(crate) fn read(&mut self, now: Nanos, bytes: &[u8]) -> usize {
         self.platform.telegrams.set(0);
-        while self.until < now {
-            self.platform.now.set(self.until);
+        while self.due_ns < now {
+            self.platform.now.set(self.due_ns);
             self.turn(WakeReason::Timeout);
         }
         self.platform.now.set(now);
@@ -82,14 +82,14 @@ impl VirtualLink<'_> {
 
     fn turn(&mut self, woken: WakeReason) {
         let Wait { until, .. } = self.link.on_wakeup(woken);
-        self.until = until;
+        self.due_ns = until;
     }
 }
 
 /// The platform of a link: a clock that stands still, bytes, and the shared memory of a domain.
 struct VirtualPlatform<'a> {
     node: &'a Node,
-    waker: Waker,
+    waker: WakeSender,
     now: Cell<Nanos>,
     /// Nanoseconds from the clock to 1970.
     wall_ahead_ns: u64,
@@ -107,7 +107,7 @@ impl<'a> VirtualPlatform<'a> {
         let wall_ahead_ns = clock::wall_ns() - clock::now();
         Ok(VirtualPlatform {
             node,
-            waker: Waker::new(node, sensor)?,
+            waker: WakeSender::new(node, sensor)?,
             now: Cell::new(0),
             wall_ahead_ns,
             line: Bytes::default(),
@@ -117,8 +117,8 @@ impl<'a> VirtualPlatform<'a> {
 }
 
 impl Platform for VirtualPlatform<'_> {
-    type Line = Bytes;
-    type Medium<P: Payload + ?Sized> = SharedMemory<P>;
+    type Port = Bytes;
+    type Transport<P: Payload + ?Sized> = SharedMemory<P>;
 
     fn now(&self) -> Nanos {
         self.now.get()
@@ -134,31 +134,31 @@ impl Platform for VirtualPlatform<'_> {
         Ok(())
     }
 
-    fn open(&self, _: &Source, _: u32) -> Option<Result<Bytes, PortError>> {
+    fn open(&self, _: &PortSpec, _: u32) -> Option<Result<Bytes, PortError>> {
         Some(Ok(self.line.clone()))
     }
 
-    fn explain(&self, error: &PortError, source: &Source) -> Failure {
+    fn explain(&self, error: &PortError, source: &PortSpec) -> Failure {
         error.explain(source)
     }
 
-    fn altering_program(&self, _: &Source) -> Option<String> {
+    fn altering_program(&self, _: &PortSpec) -> Option<String> {
         None
     }
 
-    fn take_kept(&self, _: &str, _: &Source, _: u32) -> Option<Bytes> {
+    fn take_kept_port(&self, _: &str, _: &PortSpec, _: u32) -> Option<Bytes> {
         None
     }
 
-    fn keep(&self, _: &str, _: &Bytes) {}
+    fn keep_open(&self, _: &str, _: &Bytes) {}
 
     fn release(&self, _: &str) {}
 
-    fn medium<P: Payload + ?Sized>(&self, sensor: &str) -> Result<SharedMemory<P>, Failure> {
+    fn transport<P: Payload + ?Sized>(&self, sensor: &str) -> Result<SharedMemory<P>, Failure> {
         SharedMemory::new(self.node, sensor, &TopicLimits::default())
     }
 
-    fn attached(&self) -> Option<u32> {
+    fn attach_count(&self) -> Option<u32> {
         Some(self.waker.attached())
     }
 
@@ -167,15 +167,15 @@ impl Platform for VirtualPlatform<'_> {
         true
     }
 
-    fn ring(&self, ring: Ring) {
+    fn ring(&self, ring: DoorbellWord) {
         self.waker.ring(ring);
     }
 
-    fn notify_event(&self, why: Wake) {
-        if why == Wake::Telegram {
+    fn notify_event(&self, why: WakeEvent) {
+        if why == WakeEvent::Telegram {
             self.telegrams.set(self.telegrams.get() + 1);
         }
-        self.waker.tell(why).expect("subscribers can be woken");
+        self.waker.notify(why).expect("subscribers can be woken");
     }
 
     fn load_record(&self, _: &str, _: &mut [u8]) -> Option<usize> {
@@ -189,7 +189,7 @@ impl Platform for VirtualPlatform<'_> {
     }
 }
 
-impl Line for Bytes {
+impl PortIo for Bytes {
     fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
         let mut bytes = self.0.borrow_mut();
         let len = buffer.len().min(bytes.len());
@@ -207,7 +207,7 @@ impl Line for Bytes {
         Ok(is_rejected.then(|| io::Error::other(format!("the port cannot have {baud} baud"))))
     }
 
-    fn altered(&self) -> io::Result<Option<Alteration>> {
+    fn alteration(&self) -> io::Result<Option<SettingsChange>> {
         Ok(None)
     }
 
@@ -219,11 +219,11 @@ impl Line for Bytes {
         Ok(())
     }
 
-    fn waiting(&self) -> Option<usize> {
+    fn buffered_len(&self) -> Option<usize> {
         None
     }
 
-    fn allowance(&self, _: u32) -> Option<Allowance> {
+    fn read_budget(&self, _: u32) -> Option<ReadBudget> {
         None
     }
 

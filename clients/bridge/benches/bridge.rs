@@ -24,43 +24,45 @@ use std::time::{Duration, Instant};
 
 use scanhub_client::streams::{Session, Source};
 use scanhub_client::{Flags, Topic, clock};
-use scanhub_schema::datagram::{Datagram, HEAD, Head};
+use scanhub_schema::datagram::{Datagram, HEADER_LEN, Head};
 use serde_json::Value;
 use socket2::{Domain, Protocol, Socket, Type};
 use zenoh::Wait;
 
-use stage::{SENSORS, Stage, Times, free_port, listened, percentile, session};
+use stage::{BenchEnvironment, SENSORS, SendTimes, free_port, percentile, session, wait_until_listening};
 use zenoh::sample::Sample;
 
 /// One row of the table.
-struct Row {
-    what: String,
+struct TableRow {
+    name: String,
     value: String,
     /// The target, and whether it was met.
     target: Option<(&'static str, bool)>,
 }
 
-fn row(what: &str, value: impl Into<String>, target: Option<(&'static str, bool)>) -> Row {
-    Row { what: what.to_owned(), value: value.into(), target }
+fn row(name: &str, value: impl Into<String>, target: Option<(&'static str, bool)>) -> TableRow {
+    TableRow { name: name.to_owned(), value: value.into(), target }
 }
 
 fn main() {
     let words: Vec<String> = std::env::args().skip(1).filter(|word| !word.starts_with("--")).collect();
     let minutes = words.iter().find_map(|word| word.parse().ok()).unwrap_or(10.0);
     let is_selected = |part: &str| words.iter().all(|word| word.parse::<f64>().is_ok() || word == part);
-    type Part<'a> = (&'static str, &'a dyn Fn(&Stage) -> Vec<Row>);
-    let parts: [Part<'_>; 6] = [
+    type Measurement<'a> = (&'static str, &'a dyn Fn(&BenchEnvironment) -> Vec<TableRow>);
+    let parts: [Measurement<'_>; 6] = [
         ("hop", &latency),
         ("killed", &killed_router),
         ("slow", &|stage| slow_link(stage, None)),
-        ("stalls", &|stage| slow_link(stage, Some(Stalls { every: STALL_EVERY, length: STALL }))),
+        ("stalls", &|stage| {
+            slow_link(stage, Some(StallPattern { interval: STALL_INTERVAL, length: STALL_TIME }))
+        }),
         ("loss", &|stage| loss(stage, minutes)),
         ("plain", &|stage| plain_router(stage, minutes)),
     ];
     for (name, part) in parts {
         if is_selected(name) || words.iter().any(|word| word == name) {
-            let Some(stage) = Stage::new(name) else { return };
-            for Row { what, value, target } in part(&stage) {
+            let Some(environment) = BenchEnvironment::new(name) else { return };
+            for TableRow { name: what, value, target } in part(&environment) {
                 let target = target.map_or(String::new(), |(target, is_met)| {
                     format!(" ({target}: {})", if is_met { "met" } else { "missed" })
                 });
@@ -71,24 +73,24 @@ fn main() {
 }
 
 /// Number of runs.
-const RUNS: usize = 5;
+const RUN_COUNT: usize = 5;
 /// Length of a run.
-const RUN: Duration = Duration::from_secs(10);
+const RUN_TIME: Duration = Duration::from_secs(10);
 
 /// How long does a scan take from shared memory over a router to a plain client, compared with the same bytes from a
 /// plain publisher over the same router in the same run?
-fn latency(stage: &Stage) -> Vec<Row> {
-    let (robot, between) = (stage.machine("robot"), stage.machine("router"));
+fn latency(environment: &BenchEnvironment) -> Vec<TableRow> {
+    let (robot, between) = (environment.machine("robot"), environment.machine("router"));
     let at = free_port();
-    let _router = between.bridge(&[&format!("--listen=tcp/{at}")]);
-    listened(at);
+    let _router = between.start_bridge(&[&format!("--listen=tcp/{at}")]);
+    wait_until_listening(at);
     let _hub = robot.robot();
-    let _bridge = robot.bridge(&[&format!("--connect=tcp/{at}")]);
-    let (mut memory, mut sources) = robot.follow(SENSORS.map(|sensor| (sensor, Topic::Scan)));
+    let _bridge = robot.start_bridge(&[&format!("--connect=tcp/{at}")]);
+    let (mut memory, mut sources) = robot.subscribe(SENSORS.map(|sensor| (sensor, Topic::Scan)));
 
     // By sensor and number of the telegram: when a scan was in shared memory, on CLOCK_MONOTONIC.
     let mut sent: HashMap<(u8, u32), u64> = HashMap::new();
-    let (through, plain): (Arc<Mutex<Vec<_>>>, Times) = Default::default();
+    let (through, plain): (Arc<Mutex<Vec<_>>>, SendTimes) = Default::default();
     let (listener, speaker) = (session(at), session(at));
     let arrivals = through.clone();
     let _ours = listener
@@ -116,17 +118,17 @@ fn latency(stage: &Stage) -> Vec<Row> {
     thread::sleep(Duration::from_secs(1));
 
     let mut pairs = Vec::new();
-    let mut buffer = vec![0; HEAD + usize::from(u16::MAX)];
-    for _ in 0..RUNS {
-        let begun = Instant::now();
-        while begun.elapsed() < RUN {
-            memory.look().expect("a domain");
+    let mut buffer = vec![0; HEADER_LEN + usize::from(u16::MAX)];
+    for _ in 0..RUN_COUNT {
+        let started = Instant::now();
+        while started.elapsed() < RUN_TIME {
+            memory.check_hub().expect("a domain");
             for source in &mut sources {
                 while let Some(sample) = source.receive(&mut memory).expect("a sample") {
                     let Some(header) = sample.header().copied() else { continue };
                     let sent_ns = header.stamp_last_ns + header.hub_time_ns().unwrap_or_default();
                     sent.insert((header.sensor, header.seq as u32), sent_ns);
-                    let len = sample.pack(&mut buffer[HEAD..]).expect("it fits");
+                    let len = sample.pack(&mut buffer[HEADER_LEN..]).expect("it fits");
                     let head = Head { topic: Topic::Scan.number(), revision: 1, ..Head::default() };
                     let head = Head { stamp_ns: clock::now_ns(), ..head };
                     let bytes = head.seal(&mut buffer, len).expect("it fits");
@@ -142,10 +144,10 @@ fn latency(stage: &Stage) -> Vec<Row> {
         pairs.push(both.map(|mut times: Vec<u64>| [0.5, 0.99].map(|share| percentile(&mut times, share))));
     }
     pairs.sort_by(|a, b| (a[0][0] / a[1][0]).total_cmp(&(b[0][0] / b[1][0])));
-    let [ours, theirs] = pairs[RUNS / 2];
+    let [ours, theirs] = pairs[RUN_COUNT / 2];
     let ratio = |pair: &[[f64; 2]; 2]| pair[0][0] / pair[1][0];
-    let times = ratio(&pairs[RUNS / 2]);
-    let spread = format!("{:.2} to {:.2}", ratio(&pairs[0]), ratio(&pairs[RUNS - 1]));
+    let times = ratio(&pairs[RUN_COUNT / 2]);
+    let spread = format!("{:.2} to {:.2}", ratio(&pairs[0]), ratio(&pairs[RUN_COUNT - 1]));
     let value = |[p50, p99]: [f64; 2]| format!("p50 {p50:.0} us, p99 {p99:.0} us");
     vec![
         row("shared memory over a router to a plain client", value(ours), None),
@@ -159,49 +161,51 @@ fn latency(stage: &Stage) -> Vec<Row> {
 }
 
 /// Number of times that the router is killed.
-const TIMES: usize = 20;
+const KILLS: usize = 20;
 /// Time for which the router is away.
-const AWAY: Duration = Duration::from_millis(700);
+const ROUTER_DOWNTIME: Duration = Duration::from_millis(700);
 
 /// How soon do scans arrive again after a router was killed and started again, and do both ends know what was lost?
-fn killed_router(stage: &Stage) -> Vec<Row> {
-    let [robot, between, desk] = ["robot", "router", "desk"].map(|name| stage.machine(name));
+fn killed_router(environment: &BenchEnvironment) -> Vec<TableRow> {
+    let [robot, between, desk] = ["robot", "router", "desk"].map(|name| environment.machine(name));
     let at = free_port();
     let listen = format!("--listen=tcp/{at}");
-    let mut router = between.bridge(&[&listen]);
-    listened(at);
+    let mut router = between.start_bridge(&[&listen]);
+    wait_until_listening(at);
     let connect = format!("--connect=tcp/{at}");
-    let here = desk.bridge(&[&connect, "--publish"]);
-    here.tells(|line| line["class"] == "bridge_link" && line["state"] == "up");
-    let there = robot.bridge(&[&connect, "--topic=*/*"]);
-    there.tells(|line| line["class"] == "bridge_link" && line["state"] == "up");
+    let here = desk.start_bridge(&[&connect, "--publish"]);
+    here.wait_for_line(|line| line["class"] == "bridge_link" && line["state"] == "up");
+    let there = robot.start_bridge(&[&connect, "--topic=*/*"]);
+    there.wait_for_line(|line| line["class"] == "bridge_link" && line["state"] == "up");
     let _hub = robot.robot();
-    let name =
-        here.tells(|line| line["kind"] == "published")["sensor"].as_str().unwrap_or_default().to_owned();
-    let mut local = robot.follow(SENSORS.map(|sensor| (sensor, Topic::Scan)));
-    let mut remote = desk.follow([(&name, Topic::Scan)]);
-    let (mut missed, mut heard, mut is_first) = (0, 0, true);
+    let name = here.wait_for_line(|line| line["kind"] == "published")["sensor"]
+        .as_str()
+        .unwrap_or_default()
+        .to_owned();
+    let mut local = robot.subscribe(SENSORS.map(|sensor| (sensor, Topic::Scan)));
+    let mut remote = desk.subscribe([(&name, Topic::Scan)]);
+    let (mut missed, mut received, mut is_first) = (0, 0, true);
     let mut look = |local: &mut (Session, [Source; 2])| {
         for source in &mut local.1 {
             while let Some(sample) = source.receive(&mut local.0).expect("a sample") {
                 // Samples that waited here in the meantime do not count.
                 missed += if is_first { 0 } else { sample.missed() };
-                heard += 1;
+                received += 1;
             }
         }
         is_first = false;
     };
     look(&mut local);
     let mut back_ms = Vec::new();
-    for _ in 0..TIMES {
+    for _ in 0..KILLS {
         drop(router);
         let killed = Instant::now();
-        while killed.elapsed() < AWAY {
+        while killed.elapsed() < ROUTER_DOWNTIME {
             look(&mut local);
             newest(&mut remote);
             thread::sleep(Duration::from_millis(10));
         }
-        router = between.bridge(&[&listen]);
+        router = between.start_bridge(&[&listen]);
         let back = Instant::now();
         while !newest(&mut remote) {
             assert!(back.elapsed() < Duration::from_secs(30), "no scan arrives any more");
@@ -221,11 +225,11 @@ fn killed_router(stage: &Stage) -> Vec<Row> {
     thread::sleep(Duration::from_secs(1));
     let totals = compare(&sent, &here.end());
     back_ms.sort_by(f64::total_cmp);
-    let longest = back_ms[TIMES - 1];
+    let longest = back_ms[KILLS - 1];
     vec![
         row(
             "router killed and started 20 times: from its start to the next scan, median and longest",
-            format!("{:.0} ms, {longest:.0} ms", back_ms[TIMES / 2]),
+            format!("{:.0} ms, {longest:.0} ms", back_ms[KILLS / 2]),
             Some(("at most 1000 ms", longest <= 1000.0)),
         ),
         row(
@@ -233,40 +237,45 @@ fn killed_router(stage: &Stage) -> Vec<Row> {
             format!("{}, {}, {}, {}", totals.sent, totals.received, totals.lost, totals.replaced),
             None,
         ),
-        totals.agreement(),
-        row("scans that a local subscriber missed", format!("{missed} of {heard}"), Some(("0", missed == 0))),
+        totals.agreement_row(),
+        row(
+            "scans that a local subscriber missed",
+            format!("{missed} of {received}"),
+            Some(("0", missed == 0)),
+        ),
     ]
 }
 
 /// Takes what has arrived, and returns whether a scan of a remote sensor was among it.
 fn newest((memory, sources): &mut (Session, [Source; 1])) -> bool {
-    let mut came = false;
-    memory.look().expect("a domain");
+    let mut has_new = false;
+    memory.check_hub().expect("a domain");
     for source in sources {
         while let Some(sample) = source.receive(memory).expect("a sample") {
-            came |= sample.header().is_some_and(|header| header.flags & Flags::REMOTE != 0);
+            has_new |= sample.header().is_some_and(|header| header.flags & Flags::REMOTE != 0);
         }
     }
-    came
+    has_new
 }
 
 /// All topics of two sensors over a router for minutes: what is lost, and how busy are the bridges?
-fn loss(stage: &Stage, minutes: f64) -> Vec<Row> {
-    let [robot, between, desk] = ["robot", "router", "desk"].map(|name| stage.machine(name));
+fn loss(environment: &BenchEnvironment, minutes: f64) -> Vec<TableRow> {
+    let [robot, between, desk] = ["robot", "router", "desk"].map(|name| environment.machine(name));
     let at = free_port();
-    let _router = between.bridge(&[&format!("--listen=tcp/{at}")]);
-    listened(at);
-    let here = desk.bridge(&[&format!("--connect=tcp/{at}"), "--publish"]);
-    here.tells(|line| line["class"] == "bridge_link" && line["state"] == "up");
-    let there = robot.bridge(&[&format!("--connect=tcp/{at}"), "--topic=*/*"]);
-    there.tells(|line| line["class"] == "bridge_link" && line["state"] == "up");
+    let _router = between.start_bridge(&[&format!("--listen=tcp/{at}")]);
+    wait_until_listening(at);
+    let here = desk.start_bridge(&[&format!("--connect=tcp/{at}"), "--publish"]);
+    here.wait_for_line(|line| line["class"] == "bridge_link" && line["state"] == "up");
+    let there = robot.start_bridge(&[&format!("--connect=tcp/{at}"), "--topic=*/*"]);
+    there.wait_for_line(|line| line["class"] == "bridge_link" && line["state"] == "up");
     let _hub = robot.robot();
-    here.tells(|line| line["kind"] == "published");
+    here.wait_for_line(|line| line["kind"] == "published");
     thread::sleep(Duration::from_secs(3));
-    let (begun, before) = (Instant::now(), [there.ticks(), here.ticks()]);
+    let (started, before) = (Instant::now(), [there.cpu_ticks(), here.cpu_ticks()]);
     thread::sleep(Duration::from_secs_f64(60.0 * minutes));
-    let seconds = begun.elapsed().as_secs_f64();
-    let busy = [there.ticks() - before[0], here.ticks() - before[1]].map(|ticks| ticks as f64 / seconds);
+    let seconds = started.elapsed().as_secs_f64();
+    let busy =
+        [there.cpu_ticks() - before[0], here.cpu_ticks() - before[1]].map(|ticks| ticks as f64 / seconds);
     let sent = there.end();
     thread::sleep(Duration::from_secs(1));
     let totals = compare(&sent, &here.end());
@@ -284,7 +293,7 @@ fn loss(stage: &Stage, minutes: f64) -> Vec<Row> {
             format!("{} of {all}", totals.replaced + totals.missed),
             None,
         ),
-        totals.agreement(),
+        totals.agreement_row(),
         row("bytes a second", format!("{:.0}", totals.bytes as f64 / seconds), None),
         row(
             "CPU time of the bridge that sends",
@@ -297,11 +306,11 @@ fn loss(stage: &Stage, minutes: f64) -> Vec<Row> {
 
 /// All topics of two sensors for minutes, through a router with Zenoh's own configuration: what does a plain subscriber
 /// to `scanhub/**` lose?
-fn plain_router(stage: &Stage, minutes: f64) -> Vec<Row> {
-    let robot = stage.machine("robot");
+fn plain_router(environment: &BenchEnvironment, minutes: f64) -> Vec<TableRow> {
+    let robot = environment.machine("robot");
     let at = free_port();
     let _router = stage::plain_router(at);
-    listened(at);
+    wait_until_listening(at);
     let received: Arc<Mutex<HashMap<(u8, u8), u64>>> = Arc::default();
     let (counts, listener) = (received.clone(), session(at));
     let _subscriber = listener
@@ -313,8 +322,8 @@ fn plain_router(stage: &Stage, minutes: f64) -> Vec<Row> {
         })
         .wait()
         .expect("a subscriber");
-    let there = robot.bridge(&[&format!("--connect=tcp/{at}"), "--topic=*/*"]);
-    there.tells(|line| line["class"] == "bridge_link" && line["state"] == "up");
+    let there = robot.start_bridge(&[&format!("--connect=tcp/{at}"), "--topic=*/*"]);
+    there.wait_for_line(|line| line["class"] == "bridge_link" && line["state"] == "up");
     let _hub = robot.robot();
     thread::sleep(Duration::from_secs_f64(60.0 * minutes));
     let sent = there.end();
@@ -330,36 +339,38 @@ fn plain_router(stage: &Stage, minutes: f64) -> Vec<Row> {
     )]
 }
 
-const SLOW_RUN: Duration = Duration::from_secs(40);
-const STALLS_RUN: Duration = Duration::from_secs(80);
-const STALL_EVERY: Duration = Duration::from_secs(20);
-const STALL: Duration = Duration::from_secs(2);
-const BYTES_A_SECOND: f64 = 500_000.0 / 8.0;
-const DELAY: Duration = Duration::from_millis(100);
+const SLOW_LINK_TIME: Duration = Duration::from_secs(40);
+const STALLED_LINK_TIME: Duration = Duration::from_secs(80);
+const STALL_INTERVAL: Duration = Duration::from_secs(20);
+const STALL_TIME: Duration = Duration::from_secs(2);
+const BYTES_PER_SECOND: f64 = 500_000.0 / 8.0;
+const LINK_DELAY: Duration = Duration::from_millis(100);
 
 /// A link of 0.5 Mbit/s and 100 ms each way, with all topics of two sensors: how old are scans when they arrive, and do
 /// both ends know what did not arrive?
-fn slow_link(stage: &Stage, stalls: Option<Stalls>) -> Vec<Row> {
-    let [robot, desk] = ["robot", "desk"].map(|name| stage.machine(name));
+fn slow_link(environment: &BenchEnvironment, stalls: Option<StallPattern>) -> Vec<TableRow> {
+    let [robot, desk] = ["robot", "desk"].map(|name| environment.machine(name));
     let at = free_port();
-    let there = robot.bridge(&[&format!("--listen=tcp/{at}"), "--topic=*/*"]);
-    listened(at);
-    let here =
-        desk.bridge(&[&format!("--connect=tcp/{}", relay(at, BYTES_A_SECOND, DELAY, stalls)), "--publish"]);
-    here.tells(|line| line["class"] == "bridge_link" && line["state"] == "up");
+    let there = robot.start_bridge(&[&format!("--listen=tcp/{at}"), "--topic=*/*"]);
+    wait_until_listening(at);
+    let here = desk.start_bridge(&[
+        &format!("--connect=tcp/{}", relay(at, BYTES_PER_SECOND, LINK_DELAY, stalls)),
+        "--publish",
+    ]);
+    here.wait_for_line(|line| line["class"] == "bridge_link" && line["state"] == "up");
     let _hub = robot.robot();
     let published =
-        SENSORS.map(|name| here.tells(|line| line["kind"] == "published" && is_called(line, name)));
+        SENSORS.map(|name| here.wait_for_line(|line| line["kind"] == "published" && has_class(line, name)));
     let names = published.map(|line| line["sensor"].as_str().unwrap_or_default().to_owned());
-    let (mut local, mut beside) = robot.follow(SENSORS.map(|sensor| (sensor, Topic::Scan)));
-    let (mut memory, mut sources) = desk.follow([(&names[0], Topic::Scan), (&names[1], Topic::Scan)]);
+    let (mut local, mut remote) = robot.subscribe(SENSORS.map(|sensor| (sensor, Topic::Scan)));
+    let (mut memory, mut sources) = desk.subscribe([(&names[0], Topic::Scan), (&names[1], Topic::Scan)]);
     thread::sleep(Duration::from_secs(3));
-    let (mut ages, mut missed, mut heard) = (Vec::new(), 0, 0);
+    let (mut ages, mut missed, mut received) = (Vec::new(), 0, 0);
     let mut is_first = true;
-    let begun = Instant::now();
-    let run = if stalls.is_some() { STALLS_RUN } else { SLOW_RUN };
-    while begun.elapsed() < run {
-        memory.look().expect("a domain");
+    let started = Instant::now();
+    let run = if stalls.is_some() { STALLED_LINK_TIME } else { SLOW_LINK_TIME };
+    while started.elapsed() < run {
+        memory.check_hub().expect("a domain");
         for source in &mut sources {
             while let Some(sample) = source.receive(&mut memory).expect("a sample") {
                 let header = sample.header().filter(|header| header.flags & Flags::REMOTE != 0);
@@ -369,10 +380,10 @@ fn slow_link(stage: &Stage, stalls: Option<Stalls>) -> Vec<Row> {
                 }
             }
         }
-        for source in &mut beside {
+        for source in &mut remote {
             while let Some(sample) = source.receive(&mut local).expect("a sample") {
                 missed += if is_first { 0 } else { sample.missed() };
-                heard += 1;
+                received += 1;
             }
         }
         is_first = false;
@@ -382,11 +393,11 @@ fn slow_link(stage: &Stage, stalls: Option<Stalls>) -> Vec<Row> {
     thread::sleep(Duration::from_secs(2));
     let totals = compare(&sent, &here.end());
     let [p50, p95, p99] = [0.5, 0.95, 0.99].map(|share| percentile(&mut ages, share) / 1e3);
-    let way = if stalls.is_some() { ", stalls of 2 s" } else { "" };
+    let suffix = if stalls.is_some() { ", stalls of 2 s" } else { "" };
     vec![
         row(
             &format!(
-                "0.5 Mbit/s, 100 ms each way{way}, all topics of two sensors: age of a scan, median, p95 and p99"
+                "0.5 Mbit/s, 100 ms each way{suffix}, all topics of two sensors: age of a scan, median, p95 and p99"
             ),
             format!("{p50:.0} ms, {p95:.0} ms, {p99:.0} ms, {} scans", ages.len()),
             // What is on the way when a stall begins is more than 1 % of all, and 2 s late.
@@ -397,30 +408,34 @@ fn slow_link(stage: &Stage, stalls: Option<Stalls>) -> Vec<Row> {
             format!("{}, {}, {}, {}", totals.sent, totals.received, totals.lost, totals.replaced),
             None,
         ),
-        totals.agreement(),
-        row("scans that a local subscriber missed", format!("{missed} of {heard}"), Some(("0", missed == 0))),
+        totals.agreement_row(),
+        row(
+            "scans that a local subscriber missed",
+            format!("{missed} of {received}"),
+            Some(("0", missed == 0)),
+        ),
     ]
 }
 
-fn is_called(line: &Value, name: &str) -> bool {
-    line["sensor"].as_str().is_some_and(|said| said.ends_with(&format!(".{name}")))
+fn has_class(line: &Value, name: &str) -> bool {
+    line["sensor"].as_str().is_some_and(|sensor| sensor.ends_with(&format!(".{name}")))
 }
 
 /// Bytes that the sockets of the relay hold at either end.
-const SOCKET: usize = 4096;
+const SOCKET_BUFFER_LEN: usize = 4096;
 /// Bytes that are passed on at once: a packet of a network, not one of the loopback.
-const PACKET: usize = 1448;
+const PACKET_LEN: usize = 1448;
 
 /// A long, slow connection between `to` and programs that connect to the returned address: a number of bytes per
 /// second, each after the same delay, in both directions, and no more in transit than that needs. During `stalls`,
 /// nothing moves. (Kernels with netem and tbf do the same to a network namespace.)
-fn relay(to: SocketAddr, bytes_a_second: f64, delay: Duration, stalls: Option<Stalls>) -> SocketAddr {
+fn relay(to: SocketAddr, bytes_a_second: f64, delay: Duration, stalls: Option<StallPattern>) -> SocketAddr {
     let listener = socket();
     listener.bind(&SocketAddr::from(([127, 0, 0, 1], 0)).into()).expect("a port");
     listener.listen(8).expect("it is bound");
     let listener = TcpListener::from(listener);
     let at = listener.local_addr().expect("it is bound");
-    let begun = Instant::now();
+    let started = Instant::now();
     // The thread ends with the bench.
     thread::spawn(move || {
         for near in listener.incoming().map_while(Result::ok) {
@@ -433,7 +448,7 @@ fn relay(to: SocketAddr, bytes_a_second: f64, delay: Duration, stalls: Option<St
             near.set_nodelay(true).expect("TCP");
             for (from, to) in [(&near, &far), (&far, &near)] {
                 let both = [from, to].map(|stream| stream.try_clone().expect("a descriptor"));
-                thread::spawn(move || pass(both, bytes_a_second, delay, begun, stalls));
+                thread::spawn(move || relay_bytes(both, bytes_a_second, delay, started, stalls));
             }
         }
     });
@@ -443,41 +458,41 @@ fn relay(to: SocketAddr, bytes_a_second: f64, delay: Duration, stalls: Option<St
 /// Returns one end of the connection, with the packets and the buffers of a network.
 fn socket() -> Socket {
     let socket = Socket::new(Domain::IPV4, Type::STREAM, Some(Protocol::TCP)).expect("a socket");
-    socket.set_tcp_mss(PACKET as u32).expect("a size");
-    socket.set_recv_buffer_size(SOCKET).expect("a size");
-    socket.set_send_buffer_size(SOCKET).expect("a size");
+    socket.set_tcp_mss(PACKET_LEN as u32).expect("a size");
+    socket.set_recv_buffer_size(SOCKET_BUFFER_LEN).expect("a size");
+    socket.set_send_buffer_size(SOCKET_BUFFER_LEN).expect("a size");
     socket.set_tcp_nodelay(true).expect("TCP");
     socket
 }
 
 /// The end of each period, in which a link stalls.
 #[derive(Clone, Copy)]
-struct Stalls {
-    every: Duration,
+struct StallPattern {
+    interval: Duration,
     length: Duration,
 }
 
-impl Stalls {
+impl StallPattern {
     /// Returns how long the link still stalls.
-    fn left(self, since: Instant) -> Duration {
-        let phase = since.elapsed().as_nanos() % self.every.as_nanos();
-        let left = self.every.saturating_sub(Duration::from_nanos(phase as u64));
+    fn time_left(self, since: Instant) -> Duration {
+        let phase = since.elapsed().as_nanos() % self.interval.as_nanos();
+        let left = self.interval.saturating_sub(Duration::from_nanos(phase as u64));
         if left > self.length { Duration::ZERO } else { left }
     }
 }
 
-fn pass(
+fn relay_bytes(
     [mut from, mut to]: [TcpStream; 2],
     bytes_a_second: f64,
     delay: Duration,
-    begun: Instant,
-    stalls: Option<Stalls>,
+    started: Instant,
+    stalls: Option<StallPattern>,
 ) {
     let mut in_transit: VecDeque<(Instant, Vec<u8>)> = VecDeque::new();
     let mut room_at = Instant::now();
-    let mut packet = [0; PACKET];
+    let mut packet = [0; PACKET_LEN];
     loop {
-        thread::sleep(stalls.map_or(Duration::ZERO, |stalls| stalls.left(begun)));
+        thread::sleep(stalls.map_or(Duration::ZERO, |stalls| stalls.time_left(started)));
         let now = Instant::now();
         while in_transit.front().is_some_and(|(at, _)| *at <= now)
             && let Some((_, bytes)) = in_transit.pop_front()
@@ -515,7 +530,7 @@ fn pass(
 
 /// Sums over all sensors and topics, without announcements.
 #[derive(Default)]
-struct Totals {
+struct CounterTotals {
     sent: u64,
     bytes: u64,
     missed: u64,
@@ -526,9 +541,9 @@ struct Totals {
     wrong: Vec<String>,
 }
 
-impl Totals {
+impl CounterTotals {
     /// Returns whether both ends report the same.
-    fn agreement(&self) -> Row {
+    fn agreement_row(&self) -> TableRow {
         let first = self.wrong.first().map_or(String::new(), |first| format!(", the first {first}"));
         let value = format!("{}{first}", self.wrong.len());
         row("rows of the statistics in which the two ends differ", value, Some(("0", self.wrong.is_empty())))
@@ -536,9 +551,9 @@ impl Totals {
 }
 
 /// Compares the last statistics of sender and receiver, row by row.
-fn compare(sender: &[Value], receiver: &[Value]) -> Totals {
+fn compare(sender: &[Value], receiver: &[Value]) -> CounterTotals {
     let (there, here) = (last(sender, "sent"), last(receiver, "received"));
-    let mut totals = Totals::default();
+    let mut totals = CounterTotals::default();
     for (name, row) in &there {
         let number = |row: &Value, key: &str| row[key].as_u64().unwrap_or_default();
         let other = here.get(name).cloned().unwrap_or_default();

@@ -16,28 +16,28 @@ use scanhub_client::{Topic, clock};
 use scanhub_ros::{LASER_SCAN, read};
 use zenoh::Wait;
 
-use stage::{SENSORS, Stage, Times, free_port, listened, percentile, session};
+use stage::{BenchEnvironment, SENSORS, SendTimes, free_port, percentile, session, wait_until_listening};
 
 fn main() {
     let seconds = std::env::args().skip(1).find_map(|word| word.parse().ok()).unwrap_or(20);
-    if let Some(stage) = Stage::new("ros2") {
-        measure(&stage, Duration::from_secs(seconds));
+    if let Some(environment) = BenchEnvironment::new("ros2") {
+        measure(&environment, Duration::from_secs(seconds));
     }
 }
 
-fn measure(stage: &Stage, run_for: Duration) {
-    let (robot, between) = (stage.machine("robot"), stage.machine("router"));
+fn measure(environment: &BenchEnvironment, run_for: Duration) {
+    let (robot, between) = (environment.machine("robot"), environment.machine("router"));
     let at = free_port();
     // Both ways lead over it.
-    let _router = between.bridge(&[&format!("--listen=tcp/{at}")]);
-    listened(at);
+    let _router = between.start_bridge(&[&format!("--listen=tcp/{at}")]);
+    wait_until_listening(at);
     let _hub = robot.robot();
-    let bridge = robot.bridge(&[&format!("--connect=tcp/{at}"), "--ros2", "--domain-id=42"]);
-    let (mut memory, mut sources) = robot.follow(SENSORS.map(|sensor| (sensor, Topic::Scan)));
+    let bridge = robot.start_bridge(&[&format!("--connect=tcp/{at}"), "--ros2", "--domain-id=42"]);
+    let (mut memory, mut sources) = robot.subscribe(SENSORS.map(|sensor| (sensor, Topic::Scan)));
 
     // By the stamp of a message: when its scan was in shared memory, on CLOCK_MONOTONIC.
     let mut sent: HashMap<(bool, u64), u64> = HashMap::new();
-    let (through, plain): (Arc<Mutex<Vec<_>>>, Times) = Default::default();
+    let (through, plain): (Arc<Mutex<Vec<_>>>, SendTimes) = Default::default();
     let (listener, speaker) = (session(at), session(at));
     let arrivals = through.clone();
     let _decoded = listener
@@ -68,11 +68,11 @@ fn measure(stage: &Stage, run_for: Duration) {
     let publisher = speaker.declare_publisher("bare/scan").express(true).wait().expect("a publisher");
     thread::sleep(Duration::from_secs(1));
 
-    let (begun, before) = (Instant::now(), bridge.ticks());
+    let (started, before) = (Instant::now(), bridge.cpu_ticks());
     let mut count = 0;
     let mut message = Vec::new();
-    while begun.elapsed() < run_for {
-        memory.look().expect("a domain");
+    while started.elapsed() < run_for {
+        memory.check_hub().expect("a domain");
         for source in &mut sources {
             while let Some(sample) = source.receive(&mut memory).expect("a sample") {
                 let Sample::Scan(scan) = &sample else { continue };
@@ -90,7 +90,7 @@ fn measure(stage: &Stage, run_for: Duration) {
         }
         memory.wait_for(Some(Duration::from_millis(5))).expect("to wait");
     }
-    let (elapsed, busy) = (begun.elapsed(), bridge.ticks() - before);
+    let (elapsed, busy) = (started.elapsed(), bridge.cpu_ticks() - before);
     thread::sleep(Duration::from_millis(200));
     let mut through: Vec<_> = std::mem::take(&mut *through.lock().expect("no panic"))
         .into_iter()

@@ -9,11 +9,11 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use scanhub_network::lan::address::{Address, LIVE, PREFIX, live};
+use scanhub_network::lan::address::{Address, LIVE, PREFIX, parse_live};
 use scanhub_network::now;
 use scanhub_schema::datagram::{Datagram, DatagramError};
 use scanhub_schema::{Failure, Kind, Printable};
-use scanhub_verbs::output::quiet;
+use scanhub_verbs::output::verb_result;
 use serde::Serialize;
 
 use crate::diagnosis::{Diagnosis, UNREACHED};
@@ -31,16 +31,16 @@ struct Finding {
 }
 
 /// So long a router may take to answer, another one where one has refused, and then the hubs behind it.
-const CONNECTED_WITHIN: Duration = Duration::from_secs(5);
-const REFUSED_WITHIN: Duration = Duration::from_secs(1);
-const HEARD_WITHIN: Duration = Duration::from_secs(2);
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
+const REFUSAL_TIMEOUT: Duration = Duration::from_secs(1);
+const ANNOUNCEMENT_TIMEOUT: Duration = Duration::from_secs(2);
 /// Between two looks.
-const LOOK_EVERY: Duration = Duration::from_millis(20);
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
 /// Announcements are stamped when they are made, at most this long ago; what a clock is off beyond it is an error of the
 /// clock. A listener with a key demands as much.
-const CLOCKS_AGREE_NS: u64 = 5_000_000_000;
+const MAX_CLOCK_DIFFERENCE_NS: u64 = 5_000_000_000;
 /// Sensors that are asked: whoever can connect can say that some are there.
-const SENSORS: usize = 256;
+const MAX_SENSORS: usize = 256;
 
 /// Connects as `options` say, and writes to `out` what is found: a line each, of JSON if they say so.
 ///
@@ -60,7 +60,7 @@ pub fn check(options: &BridgeOptions, stop: &AtomicBool, out: &mut dyn Write) ->
                 remedy => writeln!(out, "{:9}{}", "", Printable(remedy)),
             })
         };
-        quiet(written.map_err(Into::into))?;
+        verb_result(written.map_err(Into::into))?;
     }
     match findings.iter().filter(|finding| finding.state == "failed").count() {
         0 => Ok(()),
@@ -78,12 +78,12 @@ fn find(options: &BridgeOptions, stop: &AtomicBool) -> Result<Vec<Finding>, Fail
     let mut reasons = Vec::new();
     let mut is_linked = false;
     let begin = Instant::now();
-    let mut end_at = begin + CONNECTED_WITHIN;
+    let mut end_at = begin + CONNECT_TIMEOUT;
     while !is_linked && Instant::now() < end_at && connection.failure().is_none() {
         if stop.load(Ordering::Relaxed) {
             return Err(Failure::new(Kind::Interrupted, "interrupted", ""));
         }
-        thread::sleep(LOOK_EVERY);
+        thread::sleep(POLL_INTERVAL);
         let event = |event| {
             match event {
                 LinkEvent::Up => is_linked = true,
@@ -95,14 +95,14 @@ fn find(options: &BridgeOptions, stop: &AtomicBool) -> Result<Vec<Finding>, Fail
         let Ok(()) = connection.events(event);
         // Who is refused by one router may still be taken by another, but not by waiting for long.
         if Diagnosis::of(&reasons.join("; ")).is_some_and(|known| known != UNREACHED) {
-            end_at = end_at.min(Instant::now() + REFUSED_WITHIN);
+            end_at = end_at.min(Instant::now() + REFUSAL_TIMEOUT);
         }
     }
     if let Some(failure) = connection.failure() {
         return Ok(vec![Finding::failed(failure.message, failure.hint)]);
     }
     let findings = match connection.session(&AtomicBool::new(true)) {
-        Some(session) if is_linked => hubs(session)?,
+        Some(session) if is_linked => query_hubs(session)?,
         _ if !options.listen.is_empty() => {
             vec![Finding::ok("it can listen; nobody is connected yet".to_owned())]
         }
@@ -114,49 +114,49 @@ fn find(options: &BridgeOptions, stop: &AtomicBool) -> Result<Vec<Finding>, Fail
 
 /// Why nobody is connected, as Zenoh says it.
 fn unreachable(reasons: &[String]) -> Finding {
-    let said = reasons.join("; ");
-    let Diagnosis { finding, remedy } = Diagnosis::of(&said).unwrap_or(UNREACHED);
-    let said = if said.is_empty() { finding.to_owned() } else { format!("{finding}: {said}") };
-    Finding::failed(said, remedy)
+    let message = reasons.join("; ");
+    let Diagnosis { finding, remedy } = Diagnosis::of(&message).unwrap_or(UNREACHED);
+    let message = if message.is_empty() { finding.to_owned() } else { format!("{finding}: {message}") };
+    Finding::failed(message, remedy)
 }
 
 /// What each hub is heard to say: by its number how much our clock is ahead of its, or that it speaks another version.
-type Hubs = BTreeMap<u64, Result<i64, DatagramError>>;
+type HubReplies = BTreeMap<u64, Result<i64, DatagramError>>;
 
 /// Somebody is connected: asks all sensors for their announcements.
-fn hubs(session: &ZenohSession) -> Result<Vec<Finding>, Failure> {
+fn query_hubs(session: &ZenohSession) -> Result<Vec<Finding>, Failure> {
     let live_sensors: Arc<Mutex<Vec<String>>> = Arc::default();
-    let heard: Arc<Mutex<Hubs>> = Arc::default();
+    let replies: Arc<Mutex<HubReplies>> = Arc::default();
     let (tokens, begin) = (live_sensors.clone(), Instant::now());
     let _tokens = session.watch(&format!("{PREFIX}/*/*/{LIVE}"), move |key| {
         let mut tokens = tokens.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some((hub, sensor)) = live(key).filter(|_| tokens.len() < SENSORS) {
+        if let Some((hub, sensor)) = parse_live(key).filter(|_| tokens.len() < MAX_SENSORS) {
             tokens.push(Address { hub, sensor, topic: None }.to_string());
         }
     })?;
-    let mut asked = 0;
-    while begin.elapsed() < HEARD_WITHIN {
-        thread::sleep(LOOK_EVERY);
-        let news = live_sensors.lock().unwrap_or_else(PoisonError::into_inner)[asked..].to_vec();
-        asked += news.len();
-        for key in news {
-            let heard = heard.clone();
+    let mut queried = 0;
+    while begin.elapsed() < ANNOUNCEMENT_TIMEOUT {
+        thread::sleep(POLL_INTERVAL);
+        let new_keys = live_sensors.lock().unwrap_or_else(PoisonError::into_inner)[queried..].to_vec();
+        queried += new_keys.len();
+        for key in new_keys {
+            let replies = replies.clone();
             session.query(&key, usize::from(u16::MAX), move |key, payload| {
                 let Some(Address { hub, .. }) = Address::parse(key) else { return };
                 let ahead_ns = match Datagram::read(&payload.unwrap_or_default()) {
                     Ok(datagram) => Ok(now().wall_ns.wrapping_sub(datagram.head.stamp_ns) as i64),
                     Err(error) => Err(error),
                 };
-                heard.lock().unwrap_or_else(PoisonError::into_inner).insert(hub, ahead_ns);
+                replies.lock().unwrap_or_else(PoisonError::into_inner).insert(hub, ahead_ns);
             })?;
         }
     }
-    let heard = heard.lock().unwrap_or_else(PoisonError::into_inner);
-    Ok(judge(&heard))
+    let replies = replies.lock().unwrap_or_else(PoisonError::into_inner);
+    Ok(check_hubs(&replies))
 }
 
-fn judge(hubs: &Hubs) -> Vec<Finding> {
-    let bad = |(hub, said): (&u64, &Result<i64, DatagramError>)| match said {
+fn check_hubs(hubs: &HubReplies) -> Vec<Finding> {
+    let bad = |(hub, reply): (&u64, &Result<i64, DatagramError>)| match reply {
         Err(DatagramError::Version) => Some(Finding::failed(
             format!("hub {hub:016x} speaks another version"),
             "install the same version of scanhub-bridge on both machines",
@@ -165,7 +165,7 @@ fn judge(hubs: &Hubs) -> Vec<Finding> {
             format!("what hub {hub:016x} announces is refused as `{}`", error.name()),
             "something else sends under its name: see the access control of the router",
         )),
-        Ok(ahead_ns) if ahead_ns.unsigned_abs() > CLOCKS_AGREE_NS => {
+        Ok(ahead_ns) if ahead_ns.unsigned_abs() > MAX_CLOCK_DIFFERENCE_NS => {
             let (seconds, which) =
                 (ahead_ns.unsigned_abs() / 1_000_000_000, if *ahead_ns > 0 { "behind" } else { "ahead of" });
             Some(Finding {
@@ -180,14 +180,14 @@ fn judge(hubs: &Hubs) -> Vec<Finding> {
     };
     let mut findings: Vec<Finding> = hubs.iter().filter_map(bad).collect();
     if findings.is_empty() {
-        let who = match hubs.len() {
+        let text = match hubs.len() {
             0 => "no hub is heard behind it".to_owned(),
             _ => {
                 let names: Vec<String> = hubs.keys().map(|hub| format!("{hub:016x}")).collect();
                 format!("heard: {}; their clocks and versions fit", names.join(", "))
             }
         };
-        findings.push(Finding::ok(format!("connected; {who}")));
+        findings.push(Finding::ok(format!("connected; {text}")));
     }
     findings
 }
@@ -208,11 +208,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn why_nobody_is_connected_has_a_remedy() {
-        let said = unreachable(&["Unable to connect to tls/r:1! invalid peer certificate: Expired".into()]);
-        assert!(said.state == "failed" && said.remedy.contains("renew"), "{said:?}");
+    fn unreachable_router_has_a_finding_and_a_remedy() {
+        let failure =
+            unreachable(&["Unable to connect to tls/r:1! invalid peer certificate: Expired".into()]);
+        assert!(failure.state == "failed" && failure.remedy.contains("renew"), "{failure:?}");
         assert_eq!(
-            said.finding,
+            failure.finding,
             "a certificate has expired: Unable to connect to tls/r:1! invalid peer certificate: Expired"
         );
         assert_eq!(unreachable(&[]).finding, "no router is reached");
@@ -221,7 +222,7 @@ mod tests {
     #[test]
     fn clocks_and_versions_are_judged_hub_by_hub() {
         const SECOND: i64 = 1_000_000_000;
-        let of = |hubs: &[(u64, Result<i64, DatagramError>)]| judge(&hubs.iter().copied().collect());
+        let of = |hubs: &[(u64, Result<i64, DatagramError>)]| check_hubs(&hubs.iter().copied().collect());
         let well = of(&[(1, Ok(SECOND)), (2, Ok(-4 * SECOND))]);
         assert!(
             well.len() == 1 && well[0].state == "ok" && well[0].finding.contains("0000000000000002"),

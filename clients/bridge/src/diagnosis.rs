@@ -13,11 +13,12 @@ impl Diagnosis {
     pub(crate) fn of(words: &str) -> Option<Diagnosis> {
         let words = words.to_lowercase();
         let has_any = |signs: &[&str]| signs.iter().any(|sign| words.contains(sign));
-        let find = |known: &[Row]| known.iter().find(|(signs, _)| has_any(signs)).map(|row| row.1);
+        let find = |known: &[KnownCause]| known.iter().find(|(signs, _)| has_any(signs)).map(|row| row.1);
         // Only the end that connects writes this.
         let connects = words.contains("unable to connect");
-        let of_certificate = || find(CERTIFICATES).map(|known| if connects { known } else { PEER_REFUSED });
-        find(KNOWN).or_else(of_certificate).or(connects.then_some(UNREACHED))
+        let of_certificate =
+            || find(CERTIFICATE_CAUSES).map(|known| if connects { known } else { PEER_REFUSED });
+        find(KNOWN_CAUSES).or_else(of_certificate).or(connects.then_some(UNREACHED))
     }
 }
 
@@ -28,9 +29,9 @@ pub(crate) const UNREACHED: Diagnosis = Diagnosis {
 };
 
 /// Parts of Zenoh's messages in lower case, and their cause. The first match counts.
-type Row = (&'static [&'static str], Diagnosis);
+type KnownCause = (&'static [&'static str], Diagnosis);
 
-const KNOWN: &[Row] = &[
+const KNOWN_CAUSES: &[KnownCause] = &[
     (
         &["recv opensyn. invalid", "recv initsyn. expected"],
         Diagnosis {
@@ -69,7 +70,7 @@ const KNOWN: &[Row] = &[
 ];
 
 /// Bad certificates, as the end that connects reports them.
-const CERTIFICATES: &[Row] = &[
+const CERTIFICATE_CAUSES: &[KnownCause] = &[
     (
         &["expired"],
         Diagnosis {

@@ -19,17 +19,17 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use scanhub_network::lan::outgoing::ANNOUNCE_EVERY;
+use scanhub_network::lan::outgoing::ANNOUNCEMENT_INTERVAL;
 use scanhub_network::now;
 use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Failure, Kind, Topic};
 use scanhub_shm::Domain;
-use scanhub_verbs::output::{End, LossyWriter, Output, quiet};
+use scanhub_verbs::output::{ExitReason, LossyWriter, Output, verb_result};
 
 pub use check::check;
 use report::Report;
 pub use ros2::Ros2Options;
-use sending::{DatagramSender, Sending};
+use sending::{BridgeSender, DatagramSender};
 use session::{CheckedConfig, Connection};
 
 /// What a bridge is asked for.
@@ -58,7 +58,7 @@ pub struct SendOptions {
     /// sensors, as `scanhub gateway` sends them.
     pub topics: Vec<String>,
     /// Where the domain of the hub may be.
-    pub places: Vec<Domain>,
+    pub locations: Vec<Domain>,
 }
 
 /// What comes in.
@@ -79,26 +79,30 @@ pub struct PublishOptions {
 }
 
 /// Carries samples until `stop` is set, whatever becomes of the hub and of the network. The account goes to stdout at the
-/// end and whenever `tell` is set; what is no account to stderr if it is not JSON.
+/// end and whenever `report_requested` is set; what is no account to stderr if it is not JSON.
 ///
 /// # Errors
 ///
 /// [`Kind::Configuration`] if neither a router nor a place to listen is named, or what Zenoh is told cannot be;
 /// [`Kind::Input`] if the file of its configuration cannot be read; [`Kind::Usage`] if there is no such topic;
 /// [`Kind::DomainHeld`] if another listener publishes in the domain; [`Kind::NoTopic`] if the first hub has no such sensor.
-pub fn bridge(options: &BridgeOptions, tell: &AtomicBool, stop: &AtomicBool) -> Result<(), Failure> {
+pub fn bridge(
+    options: &BridgeOptions,
+    report_requested: &AtomicBool,
+    stop: &AtomicBool,
+) -> Result<(), Failure> {
     let config = CheckedConfig::read(options, now_s())?;
     let mut out = stdout();
     let mut notes = stderr();
-    let (mut out, mut notes) = (LossyWriter::around(&mut out, stop), LossyWriter::around(&mut notes, stop));
+    let (mut out, mut notes) = (LossyWriter::new(&mut out, stop), LossyWriter::new(&mut notes, stop));
     let mut report = Report::new(options.json, Output::new(&mut out), Output::new(&mut notes));
-    let sending = options.send.as_ref().map(Sending::open).transpose()?;
+    let sending = options.send.as_ref().map(BridgeSender::open).transpose()?;
     let connection = Arc::new(Connection::open(config)?);
-    quiet(run(options, &connection, sending, &mut report, tell, stop))
+    verb_result(run(options, &connection, sending, &mut report, report_requested, stop))
 }
 
 /// Interval between announcements, and between reports of the statistics.
-const TICK: Duration = ANNOUNCE_EVERY;
+const TICK_INTERVAL: Duration = ANNOUNCEMENT_INTERVAL;
 /// Time without a router after which the bridge reports that it waits.
 const REPORT_WAITING_AFTER: Duration = Duration::from_secs(1);
 /// The longest wait for the hub.
@@ -107,16 +111,17 @@ const MAX_WAIT: Duration = Duration::from_millis(50);
 fn run(
     options: &BridgeOptions,
     connection: &Arc<Connection>,
-    mut sending: Option<Sending>,
+    mut sending: Option<BridgeSender>,
     report: &mut Report<'_>,
-    tell: &AtomicBool,
+    report_requested: &AtomicBool,
     stop: &AtomicBool,
-) -> Result<(), End> {
-    let [tell_in, tell_ros2, is_over] = [(); 3].map(|()| Arc::new(AtomicBool::new(false)));
+) -> Result<(), ExitReason> {
+    let [report_receiving, report_ros2, is_over] = [(); 3].map(|()| Arc::new(AtomicBool::new(false)));
     let json = options.json;
     let receiving = options.publish.clone().map(|publish| {
-        let (connection, tell, is_over) = (connection.clone(), tell_in.clone(), is_over.clone());
-        spawn("receiving", move || receiving::run(&publish, json, &connection, &tell, &is_over))
+        let (connection, report_requested, is_over) =
+            (connection.clone(), report_receiving.clone(), is_over.clone());
+        spawn("receiving", move || receiving::run(&publish, json, &connection, &report_requested, &is_over))
     });
     let datagrams = sending.as_ref().map(|sending| {
         let (queue, connection, is_over) = (sending.queue().clone(), connection.clone(), is_over.clone());
@@ -125,8 +130,9 @@ fn run(
         })
     });
     let ros2 = options.ros2.clone().map(|ros2| {
-        let (connection, tell, is_over) = (connection.clone(), tell_ros2.clone(), is_over.clone());
-        spawn("ros2", move || ros2::run(&ros2, json, &connection, &tell, &is_over))
+        let (connection, report_requested, is_over) =
+            (connection.clone(), report_ros2.clone(), is_over.clone());
+        spawn("ros2", move || ros2::run(&ros2, json, &connection, &report_requested, &is_over))
     });
     let threads =
         (|| Ok::<_, Failure>((receiving.transpose()?, datagrams.transpose()?, ros2.transpose()?)))();
@@ -134,13 +140,23 @@ fn run(
         Ok((receiving, _, ros2)) => {
             let has_ended = || [receiving, ros2].into_iter().flatten().any(|thread| thread.is_finished());
             let is_done = || stop.load(Ordering::Relaxed) || has_ended();
-            carry(options, connection, &mut sending, report, tell, [&tell_in, &tell_ros2], &is_done)
+            run_main_thread(
+                options,
+                connection,
+                &mut sending,
+                report,
+                report_requested,
+                [&report_receiving, &report_ros2],
+                &is_done,
+            )
         }
         Err(failure) => Err(failure.clone().into()),
     };
     is_over.store(true, Ordering::Relaxed);
     let (receiving, datagrams, ros2) = threads?;
-    let join = |thread: JoinHandle<Result<(), End>>| thread.join().unwrap_or_else(|_| Err(died().into()));
+    let join = |thread: JoinHandle<Result<(), ExitReason>>| {
+        thread.join().unwrap_or_else(|_| Err(thread_panicked().into()))
+    };
     let sent = match (datagrams, &sending) {
         (Some(thread), Some(sending)) => queue::join(thread, sending.queue()),
         _ => Ok(()),
@@ -164,11 +180,11 @@ fn spawn<T: Send + 'static>(
 fn report_counts(
     options: &BridgeOptions,
     connection: &Connection,
-    sending: Option<&Sending>,
+    sending: Option<&BridgeSender>,
     report: &mut Report<'_>,
-) -> Result<(), End> {
+) -> Result<(), ExitReason> {
     if let Some(sending) = sending {
-        report.account(sending)?;
+        report.write_counters(sending)?;
     }
     match options.publish {
         Some(_) if connection.is_open() => Ok(()),
@@ -178,15 +194,15 @@ fn report_counts(
 }
 
 /// The work of the main thread until it is done.
-fn carry(
+fn run_main_thread(
     options: &BridgeOptions,
     connection: &Connection,
-    sending: &mut Option<Sending>,
+    sending: &mut Option<BridgeSender>,
     report: &mut Report<'_>,
-    tell: &AtomicBool,
-    tell_others: [&Arc<AtomicBool>; 2],
+    report_requested: &AtomicBool,
+    report_others: [&Arc<AtomicBool>; 2],
     is_done: &impl Fn() -> bool,
-) -> Result<(), End> {
+) -> Result<(), ExitReason> {
     let mut tick_at = Instant::now();
     let (mut wait_until, mut is_ready) = (Some(tick_at + REPORT_WAITING_AFTER), false);
     while !is_done() {
@@ -210,13 +226,13 @@ fn carry(
         let now = Instant::now();
         let is_due = now >= tick_at;
         if is_due {
-            tick_at = now + TICK;
+            tick_at = now + TICK_INTERVAL;
             if let Some(sending) = sending {
                 sending.announce();
             }
         }
-        if tell.swap(false, Ordering::Relaxed) || is_due && report.is_periodic() {
-            tell_others.into_iter().for_each(|tell| tell.store(true, Ordering::Relaxed));
+        if report_requested.swap(false, Ordering::Relaxed) || is_due && report.is_periodic() {
+            report_others.into_iter().for_each(|flag| flag.store(true, Ordering::Relaxed));
             report_counts(options, connection, sending.as_ref(), report)?;
         }
         if !more {
@@ -236,9 +252,9 @@ fn now_s() -> i64 {
 }
 
 fn no_thread(error: &io::Error) -> Failure {
-    Failure::new(Kind::Short, format!("cannot start a thread: {error}"), "")
+    Failure::new(Kind::ResourceExhausted, format!("cannot start a thread: {error}"), "")
 }
 
-fn died() -> Failure {
+fn thread_panicked() -> Failure {
     Failure::new(Kind::Failed, "a thread of the bridge panicked", "")
 }

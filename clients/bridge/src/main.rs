@@ -11,8 +11,8 @@ use std::sync::atomic::AtomicBool;
 use clap::Parser;
 use scanhub_bridge::{BridgeOptions, PublishOptions, Ros2Options, SendOptions, bridge, check};
 use scanhub_network::received_topics;
-use scanhub_ros::Names;
-use scanhub_ros::zenoh_wire::Distro;
+use scanhub_ros::RosNames;
+use scanhub_ros::rmw_zenoh::Distro;
 use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Failure, Kind, Printable};
 use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment, publisher_domain};
@@ -63,7 +63,7 @@ struct Cli {
     #[arg(long, value_name = "NAME", requires = "ros2", default_value = "jazzy", value_parser = distro)]
     ros_distro: Distro,
     /// ROS_DOMAIN_ID of the node, 0 to 232 [default: that of the environment, else 0]
-    #[arg(long, value_name = "N", requires = "ros2", value_parser = clap::value_parser!(u32).range(0..=i64::from(DOMAIN_IDS)))]
+    #[arg(long, value_name = "N", requires = "ros2", value_parser = clap::value_parser!(u32).range(0..=i64::from(MAX_DOMAIN_ID)))]
     domain_id: Option<u32>,
     /// Namespace before all topics of ROS 2, for example robot1
     #[arg(long, value_name = "NAME", requires = "ros2", default_value = "")]
@@ -100,8 +100,8 @@ impl Cli {
         let sends = self.send || !self.publish && !self.ros2;
         let ros2 = self.ros2.then(|| self.ros2(&environment, !sends)).transpose()?;
         let send = sends.then(|| {
-            let places = Domain::candidates(&self.domain, self.root.as_deref(), &environment)?;
-            Ok::<_, Failure>(SendOptions { topics: self.topics.clone(), places })
+            let locations = Domain::candidates(&self.domain, self.root.as_deref(), &environment)?;
+            Ok::<_, Failure>(SendOptions { topics: self.topics.clone(), locations })
         });
         let publish = self.publish.then(|| {
             let domain = publisher_domain(&self.domain, self.root.as_deref(), &environment)?;
@@ -130,7 +130,7 @@ impl Cli {
 }
 
 impl Cli {
-    fn ros2(&self, environment: &Environment, tells_of_hub: bool) -> Result<Ros2Options, Failure> {
+    fn ros2(&self, environment: &Environment, reports_hub: bool) -> Result<Ros2Options, Failure> {
         let frame = |text: &String| {
             let (sensor, frame) = text.split_once('=').ok_or_else(|| no_name("--frame", text))?;
             Ok((sensor.to_owned(), frame.to_owned()))
@@ -147,31 +147,31 @@ impl Cli {
             }
         }
         // One by one, so that the one that is wrong is named.
-        Names::new(&self.namespace, "", Vec::new()).map_err(|name| no_name("--namespace", &name))?;
-        Names::new("", &self.topic_prefix, Vec::new()).map_err(|name| no_name("--topic-prefix", &name))?;
-        let names = Names::new(&self.namespace, &self.topic_prefix, frames)
+        RosNames::new(&self.namespace, "", Vec::new()).map_err(|name| no_name("--namespace", &name))?;
+        RosNames::new("", &self.topic_prefix, Vec::new()).map_err(|name| no_name("--topic-prefix", &name))?;
+        let names = RosNames::new(&self.namespace, &self.topic_prefix, frames)
             .map_err(|name| no_name("--frame", &name))?;
         Ok(Ros2Options {
             topics: self.topics.clone(),
-            places: Domain::candidates(&self.domain, self.root.as_deref(), environment)?,
+            locations: Domain::candidates(&self.domain, self.root.as_deref(), environment)?,
             domain_id: self.domain_id.map_or_else(domain_id, Ok)?,
             distro: self.ros_distro,
             names,
-            tells_of_hub,
+            reports_hub,
         })
     }
 }
 
 /// The greatest number of a domain of ROS 2 on Linux.
-const DOMAIN_IDS: u32 = 232;
+const MAX_DOMAIN_ID: u32 = 232;
 
 /// What the environment of a ROS user says; one who is no node need not know.
 fn domain_id() -> Result<u32, Failure> {
-    let said = std::env::var("ROS_DOMAIN_ID").unwrap_or_default();
-    match said.as_str() {
+    let value = std::env::var("ROS_DOMAIN_ID").unwrap_or_default();
+    match value.as_str() {
         "" => Ok(0),
-        said => said.parse().ok().filter(|number| *number <= DOMAIN_IDS).ok_or_else(|| {
-            let hint = format!("a number from 0 to {DOMAIN_IDS}, or --domain-id, which wins");
+        said => said.parse().ok().filter(|number| *number <= MAX_DOMAIN_ID).ok_or_else(|| {
+            let hint = format!("a number from 0 to {MAX_DOMAIN_ID}, or --domain-id, which wins");
             Failure::new(Kind::Usage, format!("ROS_DOMAIN_ID={said} of the environment is no domain"), hint)
         }),
     }
@@ -211,11 +211,11 @@ fn main() -> ExitCode {
 fn run(cli: Cli) -> Result<(), Failure> {
     let is_check = cli.check;
     let options = cli.options()?;
-    let (stop, tell) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicBool::new(false)));
+    let (stop, report_requested) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicBool::new(false)));
     let signals = [
         (signal_hook::consts::SIGINT, &stop),
         (signal_hook::consts::SIGTERM, &stop),
-        (signal_hook::consts::SIGUSR1, &tell),
+        (signal_hook::consts::SIGUSR1, &report_requested),
     ];
     for (signal, flag) in signals {
         signal_hook::flag::register(signal, flag.clone())
@@ -224,7 +224,7 @@ fn run(cli: Cli) -> Result<(), Failure> {
     if is_check {
         return check(&options, &stop, &mut io::stdout());
     }
-    bridge(&options, &tell, &stop)
+    bridge(&options, &report_requested, &stop)
 }
 
 #[cfg(test)]
@@ -245,7 +245,7 @@ mod tests {
     }
 
     #[test]
-    fn what_scanhub_says_first_is_overridden_by_what_the_user_says() {
+    fn later_domain_overrides_and_endpoints_accumulate() {
         let words =
             ["--domain", "scanhub", "--connect", "tcp/a:1", "--domain", "lab", "--connect", "tcp/b:1"];
         let cli = parse(&words);
@@ -265,7 +265,7 @@ mod tests {
     }
 
     #[test]
-    fn it_sends_unless_it_publishes_and_both_if_both_are_said() {
+    fn sends_by_default_but_not_with_publish_or_ros2() {
         let directions = |words: &[&str]| {
             let options = parse(words).options().unwrap();
             (options.send.is_some(), options.publish.is_some())

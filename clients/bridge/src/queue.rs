@@ -8,35 +8,35 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use scanhub_network::lan::Stamp;
+use scanhub_network::lan::WallTimestamp;
 use scanhub_network::lan::outgoing::Sample;
-use scanhub_network::{Carrier, Forwarder, Selection, now};
+use scanhub_network::{Forwarder, SampleSink, Selection, now};
 use scanhub_schema::{Failure, Topic};
 use scanhub_shm::Domain;
 use scanhub_verbs::follow::Notice;
-use scanhub_verbs::output::End;
+use scanhub_verbs::output::ExitReason;
 
 use crate::session::{Connection, ZenohSession};
 
 /// Messages that wait until they are sent. Newer ones of a topic replace older ones.
-pub(crate) trait Queue: Carrier {
+pub(crate) trait Queue: SampleSink {
     /// Returns whether a message waits.
     fn is_waiting(&self) -> bool;
 
     /// Updates what depends on whether the hub is available. The follower calls it after each poll.
-    fn look(&mut self, hub_is_available: bool, now: Stamp);
+    fn set_hub_available(&mut self, hub_is_available: bool, now: WallTimestamp);
 
     /// Settles the message that was taken last: it was sent, or else it counts as not sent.
     fn settle(&mut self, is_sent: bool);
 }
 
 /// A queue that two threads share.
-pub(crate) struct Shared<Q>(Arc<(Mutex<Q>, Condvar)>);
+pub(crate) struct SharedQueue<Q>(Arc<(Mutex<Q>, Condvar)>);
 
 /// Fills a queue with the samples of a hub.
-pub(crate) struct Follower<Q> {
+pub(crate) struct QueueFiller<Q> {
     forwarder: Forwarder,
-    queue: Shared<Q>,
+    queue: SharedQueue<Q>,
 }
 
 /// Sends the messages of a queue through a session. A message belongs to a topic, which has a number here.
@@ -45,11 +45,11 @@ pub(crate) trait Sender {
     type Queue: Queue;
 
     /// Declares what exists now: tokens, and publishers of new topics.
-    fn declare(&mut self, queue: &Shared<Self::Queue>) -> Result<(), Failure>;
+    fn declare(&mut self, queue: &SharedQueue<Self::Queue>) -> Result<(), Failure>;
 
     /// Writes the message that has waited longest to `message`, counts it as sent until it is
     /// [settled](Queue::settle), and returns its topic.
-    fn take(&mut self, queue: &mut Self::Queue, now: Stamp, message: &mut Vec<u8>) -> Option<usize>;
+    fn take(&mut self, queue: &mut Self::Queue, now: WallTimestamp, message: &mut Vec<u8>) -> Option<usize>;
 
     /// Sends `message`. Returns whether the links had room for it.
     fn send(&mut self, topic: usize, message: &[u8]) -> Result<bool, Failure>;
@@ -65,30 +65,30 @@ const LINK_INTERVAL: Duration = Duration::from_millis(5);
 /// Time in which messages that still wait at the end are sent.
 const FLUSH_TIME: Duration = Duration::from_secs(1);
 
-impl<Q: Queue> Follower<Q> {
-    /// Follows what is selected of the hub in the first live one of `places`.
-    pub(crate) fn new(selection: Selection, places: &[Domain], queue: Q) -> Follower<Q> {
-        let mut queue = Shared(Arc::new((Mutex::new(queue), Condvar::new())));
-        let forwarder = Forwarder::new(selection, places, &mut queue);
-        Follower { forwarder, queue }
+impl<Q: Queue> QueueFiller<Q> {
+    /// Follows what is selected of the hub in the first live one of `locations`.
+    pub(crate) fn new(selection: Selection, locations: &[Domain], queue: Q) -> QueueFiller<Q> {
+        let mut queue = SharedQueue(Arc::new((Mutex::new(queue), Condvar::new())));
+        let forwarder = Forwarder::new(selection, locations, &mut queue);
+        QueueFiller { forwarder, queue }
     }
 
     /// Requires that the hub has `sensor`, whether or not anything is sent of it.
-    pub(crate) fn demand(&mut self, sensor: &str) {
-        self.forwarder.demand(sensor);
+    pub(crate) fn require(&mut self, sensor: &str) {
+        self.forwarder.require(sensor);
     }
 
     /// Queues what the hub published, and polls the hub. Returns whether there may be more.
     pub(crate) fn forward(
         &mut self,
-        report: &mut impl FnMut(Notice) -> Result<(), End>,
-    ) -> Result<bool, End> {
+        report: &mut impl FnMut(Notice) -> Result<(), ExitReason>,
+    ) -> Result<bool, ExitReason> {
         let more = self.forwarder.forward(&mut self.queue)?;
         self.queue.ring();
-        self.forwarder.look(Instant::now(), &mut self.queue, report)?;
+        self.forwarder.check_hub(Instant::now(), &mut self.queue, report)?;
         let is_waiting = {
             let mut queue = self.queue.lock();
-            queue.look(self.forwarder.is_there(), now());
+            queue.set_hub_available(self.forwarder.is_hub_running(), now());
             queue.is_waiting()
         };
         if is_waiting {
@@ -103,12 +103,12 @@ impl<Q: Queue> Follower<Q> {
     }
 
     /// Returns the queue.
-    pub(crate) fn queue(&self) -> &Shared<Q> {
+    pub(crate) fn queue(&self) -> &SharedQueue<Q> {
         &self.queue
     }
 }
 
-impl<Q> Shared<Q> {
+impl<Q> SharedQueue<Q> {
     /// Locks the queue.
     pub(crate) fn lock(&self) -> MutexGuard<'_, Q> {
         // No code panics while it holds the lock; if one did, the messages would still be valid.
@@ -121,19 +121,19 @@ impl<Q> Shared<Q> {
     }
 }
 
-impl<Q> Clone for Shared<Q> {
+impl<Q> Clone for SharedQueue<Q> {
     fn clone(&self) -> Self {
-        Shared(self.0.clone())
+        SharedQueue(self.0.clone())
     }
 }
 
-impl<Q: Queue> Carrier for Shared<Q> {
+impl<Q: Queue> SampleSink for SharedQueue<Q> {
     fn follow(&mut self, name: &str, every: &dyn Fn(Topic) -> Option<NonZeroU64>) -> usize {
         self.lock().follow(name, every)
     }
 
-    fn wants(&self, sensor: usize, topic: Topic) -> bool {
-        self.lock().wants(sensor, topic)
+    fn needs(&self, sensor: usize, topic: Topic) -> bool {
+        self.lock().needs(sensor, topic)
     }
 
     fn sample(&mut self, sensor: usize, sample: &Sample<'_>) {
@@ -149,7 +149,7 @@ impl<Q: Queue> Carrier for Shared<Q> {
 /// The error of the thread, or that it panicked.
 pub(crate) fn join<Q: Queue>(
     thread: JoinHandle<Result<(), Failure>>,
-    queue: &Shared<Q>,
+    queue: &SharedQueue<Q>,
 ) -> Result<(), Failure> {
     let end_at = Instant::now() + FLUSH_TIME + CHECK_INTERVAL;
     while !thread.is_finished() {
@@ -159,13 +159,13 @@ pub(crate) fn join<Q: Queue>(
         }
         thread::sleep(LINK_INTERVAL);
     }
-    thread.join().unwrap_or_else(|_| Err(crate::died()))
+    thread.join().unwrap_or_else(|_| Err(crate::thread_panicked()))
 }
 
 /// Sends the messages of `queue` until `is_over` is set, and then for at most [`FLUSH_TIME`] what still waits. `open` makes
 /// the sender as soon as there is a session.
 pub(crate) fn send<'a, S: Sender>(
-    queue: &Shared<S::Queue>,
+    queue: &SharedQueue<S::Queue>,
     connection: &'a Connection,
     is_over: &AtomicBool,
     open: impl FnOnce(&'a ZenohSession) -> Result<S, Failure>,

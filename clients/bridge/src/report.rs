@@ -3,14 +3,14 @@
 
 use std::io::Write;
 
-use scanhub_network::tell;
+use scanhub_network::report_notice;
 use scanhub_verbs::follow::Notice;
-use scanhub_verbs::output::{End, Output};
+use scanhub_verbs::output::{ExitReason, Output};
 use serde::Serialize;
 
 use crate::BridgeOptions;
 use crate::diagnosis::Diagnosis;
-use crate::sending::Sending;
+use crate::sending::BridgeSender;
 use crate::session::LinkEvent;
 
 /// Writes the reports.
@@ -34,15 +34,19 @@ impl<'a> Report<'a> {
     }
 
     /// Reports that the bridge is ready, its number, and what it does.
-    pub(crate) fn begin(&mut self, options: &BridgeOptions, sending: Option<&Sending>) -> Result<(), End> {
-        let life = sending.map(|sending| &sending.life);
+    pub(crate) fn begin(
+        &mut self,
+        options: &BridgeOptions,
+        sending: Option<&BridgeSender>,
+    ) -> Result<(), ExitReason> {
+        let identity = sending.map(|sending| &sending.identity);
         let publish = options.publish.as_ref().map(|publish| publish.domain.name());
         if self.json {
-            return self.out.json(&Begin {
+            return self.out.json(&ReadyJson {
                 class: "bridge_ready",
-                hub: life.map(|life| format!("{:016x}", life.hub)),
-                epoch: life.map(|life| life.epoch),
-                renumbered: life.is_some_and(|life| life.is_renumbered),
+                hub: identity.map(|identity| format!("{:016x}", identity.hub)),
+                epoch: identity.map(|identity| identity.epoch),
+                renumbered: identity.is_some_and(|identity| identity.is_renumbered),
                 connect: &options.connect,
                 listen: &options.listen,
                 publish,
@@ -51,8 +55,8 @@ impl<'a> Report<'a> {
         }
         self.out.line(|line| {
             write!(line, "bridge")?;
-            if let Some(life) = life {
-                write!(line, " {:016x} epoch {}", life.hub, life.epoch)?;
+            if let Some(identity) = identity {
+                write!(line, " {:016x} epoch {}", identity.hub, identity.epoch)?;
             }
             options.connect.iter().try_for_each(|to| write!(line, ", connects to {to}"))?;
             options.listen.iter().try_for_each(|at| write!(line, ", listens on {at}"))?;
@@ -61,31 +65,31 @@ impl<'a> Report<'a> {
     }
 
     /// Reports an event of the hub.
-    pub(crate) fn hub(&mut self, notice: Notice) -> Result<(), End> {
-        tell(notice, self.json, &mut self.out, &mut self.notes)
+    pub(crate) fn hub(&mut self, notice: Notice) -> Result<(), ExitReason> {
+        report_notice(notice, self.json, &mut self.out, &mut self.notes)
     }
 
     /// Reports that there is no connection yet. The bridge keeps trying.
-    pub(crate) fn waiting(&mut self, options: &BridgeOptions) -> Result<(), End> {
+    pub(crate) fn waiting(&mut self, options: &BridgeOptions) -> Result<(), ExitReason> {
         let message = match &options.connect[..] {
             [] => "waits for the routers that --config names".to_owned(),
             routers => format!("waits for a router: {}", routers.join(", ")),
         };
         if self.json {
-            return self.out.json(&Link { message: Some(&message), ..Link::of("waiting") });
+            return self.out.json(&LinkJson { message: Some(&message), ..LinkJson::of("waiting") });
         }
         self.notes.line(|line| write!(line, "{message}"))
     }
 
     /// Reports an event of the links.
-    pub(crate) fn link(&mut self, event: &LinkEvent) -> Result<(), End> {
+    pub(crate) fn link(&mut self, event: &LinkEvent) -> Result<(), ExitReason> {
         let LinkEvent::Failing(words) = event else {
             let is_up = *event == LinkEvent::Up;
             if is_up {
                 self.reported.clear();
             }
             if self.json {
-                return self.out.json(&Link::of(if is_up { "up" } else { "down" }));
+                return self.out.json(&LinkJson::of(if is_up { "up" } else { "down" }));
             }
             let words = if is_up { "connected" } else { "nobody is connected" };
             return self.notes.line(|line| write!(line, "{words}"));
@@ -93,7 +97,12 @@ impl<'a> Report<'a> {
         let known = Diagnosis::of(words);
         if self.json {
             let (finding, remedy) = (known.map(|known| known.finding), known.map(|known| known.remedy));
-            return self.out.json(&Link { message: Some(words), finding, remedy, ..Link::of("failing") });
+            return self.out.json(&LinkJson {
+                message: Some(words),
+                finding,
+                remedy,
+                ..LinkJson::of("failing")
+            });
         }
         let new = known.filter(|known| !self.reported.contains(known));
         self.reported.extend(new);
@@ -105,14 +114,14 @@ impl<'a> Report<'a> {
     }
 
     /// Reports the statistics of sent samples.
-    pub(crate) fn account(&mut self, sending: &Sending) -> Result<(), End> {
-        sending.account(self.json, &mut self.out)
+    pub(crate) fn write_counters(&mut self, sending: &BridgeSender) -> Result<(), ExitReason> {
+        sending.write_counters(self.json, &mut self.out)
     }
 
     /// Reports how many connections failed or were refused.
-    pub(crate) fn refused(&mut self, connection: u64) -> Result<(), End> {
+    pub(crate) fn refused(&mut self, connection: u64) -> Result<(), ExitReason> {
         if self.json {
-            return self.out.json(&Refused { class: "bridge_refused", connection });
+            return self.out.json(&RefusedJson { class: "bridge_refused", connection });
         }
         match connection {
             0 => Ok(()),
@@ -123,7 +132,7 @@ impl<'a> Report<'a> {
 
 /// Class `bridge_ready`.
 #[derive(Serialize)]
-struct Begin<'a> {
+struct ReadyJson<'a> {
     class: &'static str,
     hub: Option<String>,
     epoch: Option<u32>,
@@ -136,14 +145,14 @@ struct Begin<'a> {
 
 /// Class `bridge_refused` of a bridge that receives nothing.
 #[derive(Serialize)]
-struct Refused {
+struct RefusedJson {
     class: &'static str,
     connection: u64,
 }
 
 /// Class `bridge_link`.
 #[derive(Serialize)]
-struct Link<'a> {
+struct LinkJson<'a> {
     class: &'static str,
     state: &'static str,
     message: Option<&'a str>,
@@ -153,9 +162,9 @@ struct Link<'a> {
     remedy: Option<&'static str>,
 }
 
-impl Link<'_> {
+impl LinkJson<'_> {
     /// A line with nothing but the state.
     fn of(state: &'static str) -> Self {
-        Link { class: "bridge_link", state, message: None, finding: None, remedy: None }
+        LinkJson { class: "bridge_link", state, message: None, finding: None, remedy: None }
     }
 }

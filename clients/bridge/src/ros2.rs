@@ -10,19 +10,19 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;
 
-use scanhub_network::lan::Stamp;
+use scanhub_network::lan::WallTimestamp;
 use scanhub_network::lan::outgoing::Sample;
-use scanhub_network::{Carrier, Selection, now, tell};
-use scanhub_ros::Names;
-use scanhub_ros::zenoh_wire::{self, Distro, Node, Qos};
+use scanhub_network::{SampleSink, Selection, now, report_notice};
+use scanhub_ros::RosNames;
+use scanhub_ros::rmw_zenoh::{self, Distro, Node, Qos};
 use scanhub_schema::{Failure, Topic};
 use scanhub_shm::Domain;
-use scanhub_verbs::output::{End, Output};
+use scanhub_verbs::output::{ExitReason, Output};
 use serde::Serialize;
 
-use crate::queue::{self, Follower, Queue, Sender, Shared};
-use crate::session::{Connection, Publisher, Queryable, Reply, Token, ZenohSession};
-use graph::{Graph, Published};
+use crate::queue::{self, Queue, QueueFiller, Sender, SharedQueue};
+use crate::session::{Connection, DeclaredToken, Publisher, Queryable, Reply, ZenohSession};
+use graph::{Graph, PublishedTopic};
 
 /// Options of the node of ROS 2.
 #[derive(Clone, Debug)]
@@ -30,15 +30,15 @@ pub struct Ros2Options {
     /// `SENSOR/TOPIC`, `*/TOPIC` or `SENSOR/*`, with `:every=N` to thin it. Empty: all topics that ROS has messages for.
     pub topics: Vec<String>,
     /// Possible locations of the hub's domain.
-    pub places: Vec<Domain>,
+    pub locations: Vec<Domain>,
     /// `ROS_DOMAIN_ID`.
     pub domain_id: u32,
     /// The release of ROS 2 whose nodes receive it.
     pub distro: Distro,
     /// Names of topics and frames.
-    pub names: Names,
+    pub names: RosNames,
     /// Whether this part reports events of the hub; otherwise another part of the bridge does.
-    pub tells_of_hub: bool,
+    pub reports_hub: bool,
 }
 
 /// The node's name.
@@ -46,7 +46,7 @@ const NODE: &str = "scanhub";
 /// The longest wait for the hub.
 const MAX_WAIT: Duration = Duration::from_millis(50);
 
-/// Publishes the hub's topics until `is_over` is set. The statistics are written then, and whenever `tell_account` is set.
+/// Publishes the hub's topics until `is_over` is set. The statistics are written then, and whenever `report_requested` is set.
 ///
 /// # Errors
 ///
@@ -55,18 +55,18 @@ pub(crate) fn run(
     options: &Ros2Options,
     json: bool,
     connection: &Arc<Connection>,
-    tell_account: &AtomicBool,
+    report_requested: &AtomicBool,
     is_over: &AtomicBool,
-) -> Result<(), End> {
+) -> Result<(), ExitReason> {
     let (mut out, mut notes) = (stdout(), stderr());
     let (mut out, mut notes) = (Output::new(&mut out), Output::new(&mut notes));
     let all = ["*/*".to_owned()];
     let topics = if options.topics.is_empty() { &all[..] } else { &options.topics };
     let selection = Selection::parse(topics, false)?;
-    let graph = Graph::new(options.names.clone(), selection.names(Topic::Status));
-    let mut follower = Follower::new(selection, &options.places, graph);
-    options.names.framed().for_each(|sensor| follower.demand(sensor));
-    let queue = follower.queue().clone();
+    let graph = Graph::new(options.names.clone(), selection.includes(Topic::Status));
+    let mut filler = QueueFiller::new(selection, &options.locations, graph);
+    options.names.sensors_with_frame().for_each(|sensor| filler.require(sensor));
+    let queue = filler.queue().clone();
     // Set at any end, so that the other thread does not wait for a router any more.
     let is_done = Arc::new(AtomicBool::new(false));
     let work = {
@@ -78,24 +78,24 @@ pub(crate) fn run(
     let sending = sending.map_err(|error| crate::no_thread(&error))?;
     let mut follow = || {
         while !is_over.load(Ordering::Relaxed) && !sending.is_finished() {
-            let more = follower.forward(&mut |notice| match options.tells_of_hub {
-                true => tell(notice, json, &mut out, &mut notes),
+            let more = filler.forward(&mut |notice| match options.reports_hub {
+                true => report_notice(notice, json, &mut out, &mut notes),
                 false => Ok(()),
             })?;
-            if tell_account.swap(false, Ordering::Relaxed) {
-                account(&queue.lock(), json, &mut out)?;
+            if report_requested.swap(false, Ordering::Relaxed) {
+                write_counters(&queue.lock(), json, &mut out)?;
             }
             if !more {
-                follower.wait(MAX_WAIT)?;
+                filler.wait(MAX_WAIT)?;
             }
         }
-        Ok::<_, End>(())
+        Ok::<_, ExitReason>(())
     };
     let end = follow();
     is_done.store(true, Ordering::Relaxed);
     queue.ring();
     let sent = queue::join(sending, &queue);
-    account(&queue.lock(), json, &mut out)?;
+    write_counters(&queue.lock(), json, &mut out)?;
     end.and(Ok(sent?))
 }
 
@@ -104,8 +104,8 @@ impl Queue for Graph {
         Graph::is_waiting(self)
     }
 
-    fn look(&mut self, hub_is_available: bool, now: Stamp) {
-        Graph::look(self, hub_is_available, now);
+    fn set_hub_available(&mut self, hub_is_available: bool, now: WallTimestamp) {
+        Graph::report_silence(self, hub_is_available, now);
     }
 
     fn settle(&mut self, is_sent: bool) {
@@ -113,13 +113,13 @@ impl Queue for Graph {
     }
 }
 
-impl Carrier for Graph {
+impl SampleSink for Graph {
     fn follow(&mut self, name: &str, every: &dyn Fn(Topic) -> Option<NonZeroU64>) -> usize {
         Graph::follow(self, name, every)
     }
 
-    fn wants(&self, sensor: usize, topic: Topic) -> bool {
-        Graph::wants(self, sensor, topic)
+    fn needs(&self, sensor: usize, topic: Topic) -> bool {
+        Graph::needs(self, sensor, topic)
     }
 
     fn sample(&mut self, sensor: usize, sample: &Sample<'_>) {
@@ -133,7 +133,7 @@ struct RosSender<'a> {
     node: Node,
     /// In the order of the graph's topics.
     publishers: Vec<RosPublisher>,
-    _token: Token,
+    _token: DeclaredToken,
 }
 
 /// Payload and attachment of the last message of a latched topic, for late joiners.
@@ -147,7 +147,7 @@ struct RosPublisher {
     /// `None` if the topic is not latched.
     last: Option<LastMessage>,
     _history: Option<Queryable>,
-    _tokens: Vec<Token>,
+    _tokens: Vec<DeclaredToken>,
 }
 
 impl<'a> RosSender<'a> {
@@ -167,29 +167,30 @@ impl<'a> RosSender<'a> {
 impl Sender for RosSender<'_> {
     type Queue = Graph;
 
-    fn declare(&mut self, queue: &Shared<Graph>) -> Result<(), Failure> {
+    fn declare(&mut self, queue: &SharedQueue<Graph>) -> Result<(), Failure> {
         loop {
             let index = self.publishers.len();
             let graph = queue.lock();
-            let Some(&Published { ref name, of, qos, .. }) = graph.topics().get(index) else {
+            let Some(&PublishedTopic { ref name, of, qos, .. }) = graph.topics().get(index) else {
                 return Ok(());
             };
             let name = name.clone();
             drop(graph);
-            let publisher = zenoh_wire::Publisher { number: index as u32 + 1, topic: &name, of: &of, qos };
+            let publisher =
+                rmw_zenoh::Publisher { number: index as u32 + 1, topic: &name, message_type: &of, qos };
             self.publishers.push(RosPublisher::open(self.session, &self.node, &publisher)?);
         }
     }
 
-    fn take(&mut self, graph: &mut Graph, now: Stamp, message: &mut Vec<u8>) -> Option<usize> {
+    fn take(&mut self, graph: &mut Graph, now: WallTimestamp, message: &mut Vec<u8>) -> Option<usize> {
         // A topic that appeared just now has no publisher yet.
         if graph.topics().len() > self.publishers.len() {
             return None;
         }
-        let handed = graph.hand(now)?;
+        let queued = graph.take_next(now)?;
         message.clear();
-        message.extend_from_slice(handed.message);
-        Some(handed.topic)
+        message.extend_from_slice(queued.message);
+        Some(queued.topic)
     }
 
     fn send(&mut self, topic: usize, message: &[u8]) -> Result<bool, Failure> {
@@ -205,7 +206,7 @@ impl RosPublisher {
     fn open(
         session: &ZenohSession,
         node: &Node,
-        of: &zenoh_wire::Publisher<'_>,
+        of: &rmw_zenoh::Publisher<'_>,
     ) -> Result<RosPublisher, Failure> {
         let key = node.key(of);
         let publisher = session.publisher(&key)?;
@@ -232,7 +233,7 @@ impl RosPublisher {
     /// Sends `message`. Returns whether the links had room for it.
     fn send(&mut self, session: &ZenohSession, message: &[u8]) -> bool {
         self.sequence += 1;
-        let attachment = zenoh_wire::attachment(self.sequence, now().wall_ns as i64, self.gid);
+        let attachment = rmw_zenoh::attachment(self.sequence, now().wall_ns as i64, self.gid);
         if let Some(last) = &self.last {
             let kept = Some((message.to_vec(), attachment.to_vec()));
             *last.lock().unwrap_or_else(PoisonError::into_inner) = kept;
@@ -242,11 +243,17 @@ impl RosPublisher {
 }
 
 /// Writes the statistics of each topic.
-fn account(graph: &Graph, json: bool, out: &mut Output<'_>) -> Result<(), End> {
-    for &Published { ref name, of, sent, replaced, failed, .. } in graph.topics() {
+fn write_counters(graph: &Graph, json: bool, out: &mut Output<'_>) -> Result<(), ExitReason> {
+    for &PublishedTopic { ref name, of, sent, replaced, failed, .. } in graph.topics() {
         if json {
-            let line =
-                Line { class: "bridge_ros2", topic: name, of: of.name, sent, replaced, send_failed: failed };
+            let line = Ros2Json {
+                class: "bridge_ros2",
+                topic: name,
+                of: of.name,
+                sent,
+                replaced,
+                send_failed: failed,
+            };
             out.json(&line)?;
         } else {
             out.line(|line| write!(line, "{name}: {sent} sent, {replaced} replaced, {failed} failed"))?;
@@ -257,7 +264,7 @@ fn account(graph: &Graph, json: bool, out: &mut Output<'_>) -> Result<(), End> {
 
 /// Class `bridge_ros2`.
 #[derive(Serialize)]
-struct Line<'a> {
+struct Ros2Json<'a> {
     class: &'static str,
     topic: &'a str,
     #[serde(rename = "type")]

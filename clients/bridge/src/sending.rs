@@ -6,23 +6,23 @@ use std::collections::hash_map::Entry;
 use std::num::NonZeroU64;
 use std::time::Duration;
 
-use scanhub_network::lan::Stamp;
+use scanhub_network::lan::WallTimestamp;
 use scanhub_network::lan::address::{Address, LIVE, PREFIX};
 use scanhub_network::lan::outgoing::{Outgoing, Sample, Transmit};
-use scanhub_network::{Carrier, Life, Selection, account, begin_life, now};
+use scanhub_network::{GatewayIdentity, SampleSink, Selection, begin_run, now, write_counters};
 use scanhub_schema::{Failure, Topic};
 use scanhub_shm::Domain;
-use scanhub_verbs::output::{End, Output};
+use scanhub_verbs::output::{ExitReason, Output};
 
 use crate::SendOptions;
-use crate::queue::{Follower, Queue, Sender, Shared};
+use crate::queue::{Queue, QueueFiller, Sender, SharedQueue};
 use crate::report::Report;
-use crate::session::{Publisher, Queryable, Reply, Token, ZenohSession};
+use crate::session::{DeclaredToken, Publisher, Queryable, Reply, ZenohSession};
 
 /// The sending side of a bridge.
-pub(crate) struct Sending {
-    pub(crate) life: Life,
-    follower: Follower<Datagrams>,
+pub(crate) struct BridgeSender {
+    pub(crate) identity: GatewayIdentity,
+    filler: QueueFiller<Datagrams>,
 }
 
 /// The datagrams that wait, and their statistics.
@@ -39,26 +39,26 @@ pub(crate) struct Datagrams {
 /// Stands for the interface in the name of the file that keeps the bridge's number.
 const INTERFACE: &str = "bridge";
 
-impl Sending {
+impl BridgeSender {
     /// Starts a run of the domain's bridge.
-    pub(crate) fn open(options: &SendOptions) -> Result<Sending, Failure> {
+    pub(crate) fn open(options: &SendOptions) -> Result<BridgeSender, Failure> {
         let selection = Selection::parse(&options.topics, false)?;
-        let domain = options.places.first().map(Domain::name).unwrap_or_default();
-        let life = begin_life(domain, INTERFACE)?;
-        let outgoing = Outgoing::waiting(life.hub, life.epoch);
+        let domain = options.locations.first().map(Domain::name).unwrap_or_default();
+        let identity = begin_run(domain, INTERFACE)?;
+        let outgoing = Outgoing::with_queue(identity.hub, identity.epoch);
         let datagrams =
-            Datagrams { hub: life.hub, outgoing, hub_is_available: false, hub_runs: 0, in_flight: None };
-        Ok(Sending { life, follower: Follower::new(selection, &options.places, datagrams) })
+            Datagrams { hub: identity.hub, outgoing, hub_is_available: false, hub_runs: 0, in_flight: None };
+        Ok(BridgeSender { identity, filler: QueueFiller::new(selection, &options.locations, datagrams) })
     }
 
     /// Queues what the hub published, and polls the hub. Returns whether there may be more.
-    pub(crate) fn forward(&mut self, report: &mut Report<'_>) -> Result<bool, End> {
-        self.follower.forward(&mut |notice| report.hub(notice))
+    pub(crate) fn forward(&mut self, report: &mut Report<'_>) -> Result<bool, ExitReason> {
+        self.filler.forward(&mut |notice| report.hub(notice))
     }
 
     /// Waits for the hub, for at most `at_most`.
     pub(crate) fn wait(&mut self, at_most: Duration) -> Result<(), Failure> {
-        self.follower.wait(at_most)
+        self.filler.wait(at_most)
     }
 
     /// Announces all sensors.
@@ -68,13 +68,13 @@ impl Sending {
     }
 
     /// Writes the statistics of each topic.
-    pub(crate) fn account(&self, json: bool, out: &mut Output<'_>) -> Result<(), End> {
-        account(&self.queue().lock().outgoing, &self.life, "bridge", json, out)
+    pub(crate) fn write_counters(&self, json: bool, out: &mut Output<'_>) -> Result<(), ExitReason> {
+        write_counters(&self.queue().lock().outgoing, &self.identity, "bridge", json, out)
     }
 
     /// Returns the queue, for the thread that sends.
-    pub(crate) fn queue(&self) -> &Shared<Datagrams> {
-        self.follower.queue()
+    pub(crate) fn queue(&self) -> &SharedQueue<Datagrams> {
+        self.filler.queue()
     }
 }
 
@@ -84,15 +84,15 @@ impl Datagrams {
     }
 
     /// Returns the last announcements, statuses and backgrounds whose key is part of a query.
-    fn answers(&mut self, is_queried: &dyn Fn(&str) -> bool) -> Vec<Reply> {
+    fn replies(&mut self, is_queried: &dyn Fn(&str) -> bool) -> Vec<Reply> {
         let Datagrams { hub, outgoing, hub_is_available: true, .. } = self else { return Vec::new() };
-        let kept = outgoing.kept().map(|(sensor, topic)| (sensor.to_owned(), topic));
+        let kept = outgoing.stored_samples().map(|(sensor, topic)| (sensor.to_owned(), topic));
         let kept: Vec<(String, Option<Topic>)> = kept.collect();
         let mut answers = Vec::new();
         for (sensor, topic) in kept {
             let key = Address { hub: *hub, sensor: &sensor, topic }.to_string();
             if is_queried(&key)
-                && let Some(payload) = outgoing.again(&sensor, topic, now())
+                && let Some(payload) = outgoing.resend_last(&sensor, topic, now())
             {
                 answers.push(Reply { key, payload: payload.to_vec(), attachment: None });
             }
@@ -106,29 +106,29 @@ impl Queue for Datagrams {
         self.outgoing.is_waiting()
     }
 
-    fn look(&mut self, hub_is_available: bool, _: Stamp) {
+    fn set_hub_available(&mut self, hub_is_available: bool, _: WallTimestamp) {
         if hub_is_available && !self.hub_is_available {
             self.hub_runs += 1;
             // Sensors of the last run may not exist any more.
-            self.outgoing.forget_kept();
+            self.outgoing.drop_kept();
         }
         self.hub_is_available = hub_is_available;
     }
 
     fn settle(&mut self, is_sent: bool) {
         if let Some((sensor, topic, len)) = self.in_flight.take().filter(|_| !is_sent) {
-            self.outgoing.not_taken(sensor, topic, len);
+            self.outgoing.mark_failed(sensor, topic, len);
         }
     }
 }
 
-impl Carrier for Datagrams {
+impl SampleSink for Datagrams {
     fn follow(&mut self, name: &str, every: &dyn Fn(Topic) -> Option<NonZeroU64>) -> usize {
         self.outgoing.follow(name, every)
     }
 
-    fn wants(&self, sensor: usize, topic: Topic) -> bool {
-        self.outgoing.wants(sensor, topic)
+    fn needs(&self, sensor: usize, topic: Topic) -> bool {
+        self.outgoing.needs(sensor, topic)
     }
 
     fn sample(&mut self, sensor: usize, sample: &Sample<'_>) {
@@ -151,7 +151,7 @@ pub(crate) struct DatagramSender<'a> {
     hub: u64,
     topics: Vec<SentTopic>,
     /// The tokens of the hub and its sensors, by key. Empty while the hub is unavailable.
-    tokens: HashMap<String, Token>,
+    tokens: HashMap<String, DeclaredToken>,
     /// The run of the hub that the tokens announce.
     hub_runs: u64,
     is_finished: bool,
@@ -170,11 +170,11 @@ impl<'a> DatagramSender<'a> {
     /// Opens a sender for `queue`.
     pub(crate) fn open(
         session: &'a ZenohSession,
-        queue: &Shared<Datagrams>,
+        queue: &SharedQueue<Datagrams>,
     ) -> Result<DatagramSender<'a>, Failure> {
         let hub = queue.lock().hub;
         let queue = queue.clone();
-        let answer = move |is_queried: &dyn Fn(&str) -> bool| queue.lock().answers(is_queried);
+        let answer = move |is_queried: &dyn Fn(&str) -> bool| queue.lock().replies(is_queried);
         let _queryable = session.answer(&format!("{PREFIX}/{hub:016x}/*/*"), answer)?;
         Ok(DatagramSender {
             session,
@@ -189,9 +189,9 @@ impl<'a> DatagramSender<'a> {
 
     /// Announces that `key` exists, once.
     fn announce(&mut self, key: String) -> Result<(), Failure> {
-        if let Entry::Vacant(place) = self.tokens.entry(key) {
-            let token = self.session.token(place.key())?;
-            place.insert(token);
+        if let Entry::Vacant(vacant) = self.tokens.entry(key) {
+            let token = self.session.token(vacant.key())?;
+            vacant.insert(token);
         }
         Ok(())
     }
@@ -200,7 +200,7 @@ impl<'a> DatagramSender<'a> {
 impl Sender for DatagramSender<'_> {
     type Queue = Datagrams;
 
-    fn declare(&mut self, queue: &Shared<Datagrams>) -> Result<(), Failure> {
+    fn declare(&mut self, queue: &SharedQueue<Datagrams>) -> Result<(), Failure> {
         let Datagrams { hub_is_available, hub_runs, .. } = *queue.lock();
         if !self.tokens.is_empty() && (!hub_is_available || hub_runs != self.hub_runs) {
             self.tokens.clear();
@@ -213,11 +213,11 @@ impl Sender for DatagramSender<'_> {
         Ok(())
     }
 
-    fn take(&mut self, queue: &mut Datagrams, now: Stamp, message: &mut Vec<u8>) -> Option<usize> {
-        let handed = queue.outgoing.hand(now)?;
+    fn take(&mut self, queue: &mut Datagrams, now: WallTimestamp, message: &mut Vec<u8>) -> Option<usize> {
+        let queued = queue.outgoing.take_next(now)?;
         message.clear();
-        message.extend_from_slice(handed.datagram);
-        let ((number, sensor), topic) = (handed.sensor, handed.topic);
+        message.extend_from_slice(queued.datagram);
+        let ((number, sensor), topic) = (queued.sensor, queued.topic);
         queue.in_flight = Some((number, topic, message.len()));
         let is_same = |it: &SentTopic| (it.number, &*it.sensor, it.topic) == (number, sensor, topic);
         Some(self.topics.iter().position(is_same).unwrap_or_else(|| {

@@ -19,7 +19,7 @@ use zenoh::sample::{Locality, Sample, SampleKind};
 use zenoh::{Session, Wait};
 
 pub(crate) use config::CheckedConfig;
-use log::{Log, without_places};
+use log::{Log, without_locations};
 
 /// A session that opens in the background.
 pub(crate) struct Connection {
@@ -52,7 +52,7 @@ pub(crate) enum LinkEvent {
 /// Interval between attempts to open a session.
 const RETRY_INTERVAL: Duration = Duration::from_millis(300);
 /// Longest time to close a session.
-const CLOSE_TIME: Duration = Duration::from_secs(1);
+const CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
 /// Interval between checks for the session.
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
@@ -72,7 +72,7 @@ impl Connection {
                     }
                     // A session that listens needs no peer, so another attempt fails too.
                     Err(error) if listens => {
-                        let what = format!("Zenoh does not start: {}", without_places(&error.to_string()));
+                        let what = format!("Zenoh does not start: {}", without_locations(&error.to_string()));
                         let failure = Failure::new(Kind::Configuration, what, "see --listen and --config");
                         *shared.failure.lock().unwrap_or_else(PoisonError::into_inner) = Some(failure);
                         return;
@@ -81,7 +81,9 @@ impl Connection {
                 }
             }
         });
-        opening.map_err(|error| Failure::new(Kind::Short, format!("cannot start a thread: {error}"), ""))?;
+        opening.map_err(|error| {
+            Failure::new(Kind::ResourceExhausted, format!("cannot start a thread: {error}"), "")
+        })?;
         Ok(Connection {
             state,
             log,
@@ -99,7 +101,7 @@ impl Connection {
     /// Waits for the session and for [`begin`](Connection::begin). Returns `None` if `is_over` is set first.
     pub(crate) fn session(&self, is_over: &AtomicBool) -> Option<&ZenohSession> {
         loop {
-            if let Some(session) = self.begun() {
+            if let Some(session) = self.ready_session() {
                 return Some(session);
             }
             if is_over.load(Ordering::Relaxed) {
@@ -109,7 +111,7 @@ impl Connection {
         }
     }
 
-    fn begun(&self) -> Option<&ZenohSession> {
+    fn ready_session(&self) -> Option<&ZenohSession> {
         self.state.session.get().filter(|_| self.has_begun.load(Ordering::Relaxed))
     }
 
@@ -136,7 +138,7 @@ impl Connection {
         }
         self.log.take().into_iter().try_for_each(|line| report(LinkEvent::Failing(line)))?;
         let mut was_linked = self.was_linked.lock().unwrap_or_else(PoisonError::into_inner);
-        let Some(session) = self.begun() else { return Ok(()) };
+        let Some(session) = self.ready_session() else { return Ok(()) };
         let is_linked = session.is_linked();
         if was_linked.is_none_or(|before| before != is_linked) && (is_linked || was_linked.is_some()) {
             report(if is_linked { LinkEvent::Up } else { LinkEvent::Down })?;
@@ -157,7 +159,7 @@ impl Connection {
         let closing = thread::Builder::new().name("closing".into()).spawn(move || {
             let _ = session.close().wait();
         });
-        let end_at = Instant::now() + CLOSE_TIME;
+        let end_at = Instant::now() + CLOSE_TIMEOUT;
         while closing.as_ref().is_ok_and(|closing| !closing.is_finished()) && Instant::now() < end_at {
             thread::sleep(POLL_INTERVAL);
         }
@@ -180,7 +182,7 @@ struct Links {
 }
 
 /// Time for which a check is valid while there is a connection.
-const LINKS_VALID: Duration = Duration::from_millis(10);
+const LINK_CHECK_LIFETIME: Duration = Duration::from_millis(10);
 
 /// A key to send under. It is not a publisher of Zenoh: such a publisher loses its first sample while it finds out who
 /// subscribed.
@@ -189,7 +191,7 @@ pub(crate) struct Publisher {
 }
 
 /// Announces that something exists, until it is dropped.
-pub(crate) struct Token {
+pub(crate) struct DeclaredToken {
     _token: LivelinessToken,
 }
 
@@ -219,7 +221,7 @@ impl ZenohSession {
     fn links(&self) -> Links {
         let mut links = self.links.lock().unwrap_or_else(PoisonError::into_inner);
         let now = Instant::now();
-        let is_valid = |checked| now.saturating_duration_since(checked) < LINKS_VALID;
+        let is_valid = |checked| now.saturating_duration_since(checked) < LINK_CHECK_LIFETIME;
         if !links.is_linked || !links.checked.is_some_and(is_valid) {
             let mut transports = self.session.info().transports().wait();
             let first = transports.next();
@@ -260,9 +262,9 @@ impl ZenohSession {
     }
 
     /// Announces that `key` exists.
-    pub(crate) fn token(&self, key: &str) -> Result<Token, Failure> {
+    pub(crate) fn token(&self, key: &str) -> Result<DeclaredToken, Failure> {
         let token = self.session.liveliness().declare_token(key.to_owned()).wait();
-        token.map(|_token| Token { _token }).map_err(|error| failed(key, &error))
+        token.map(|_token| DeclaredToken { _token }).map_err(|error| failed(key, &error))
     }
 
     /// Passes key and payload of each sample that others send under `keys` to `receive`. The payload is `None` if it has
@@ -347,5 +349,5 @@ fn pass(sample: &Sample, max_len: usize, receive: &impl Fn(&str, Option<Vec<u8>>
 }
 
 fn failed(key: &str, error: &dyn std::fmt::Display) -> Failure {
-    Failure::new(Kind::Failed, format!("Zenoh refuses {key}: {}", without_places(&error.to_string())), "")
+    Failure::new(Kind::Failed, format!("Zenoh refuses {key}: {}", without_locations(&error.to_string())), "")
 }

@@ -30,15 +30,15 @@ fn scanhub() -> PathBuf {
 }
 
 /// A temporary directory with a domain in it.
-struct Place(TempDir);
+struct TestDirectory(TempDir);
 
-impl Place {
-    fn new() -> Place {
+impl TestDirectory {
+    fn new() -> TestDirectory {
         let place = TempDir::new().expect("a new directory");
         for part in ["root", "state"] {
             DirBuilder::new().mode(0o700).create(place.path().join(part)).expect("a new directory");
         }
-        Place(place)
+        TestDirectory(place)
     }
 
     fn path(&self, name: &str) -> String {
@@ -46,18 +46,18 @@ impl Place {
     }
 
     /// A program in the domain, which ends with the test.
-    fn start(&self, program: &Path, arguments: &[&str], out: Stdio) -> Running {
+    fn start(&self, program: &Path, arguments: &[&str], out: Stdio) -> RunningProgram {
         let mut command = Command::new(program);
         command.args(arguments).args(["--domain", "ros2", "--root", &self.path("root")]);
         command.env("STATE_DIRECTORY", self.path("state")).env_remove("ROS_DOMAIN_ID");
         command.stdin(Stdio::null()).stdout(out).stderr(Stdio::null());
-        Running(spawn(command).expect("a program"))
+        RunningProgram(spawn(command).expect("a program"))
     }
 }
 
-struct Running(Child);
+struct RunningProgram(Child);
 
-impl Running {
+impl RunningProgram {
     /// Ends it by a signal; returns its exit code.
     fn end(mut self) -> Option<i32> {
         self.0.signal(rustix::process::Signal::TERM).expect("it lives");
@@ -89,64 +89,65 @@ fn others_find_every_topic_and_decode_every_message() {
         return skip("python-packages", "there is no zenoh-ros2-sdk: .ci/run installs it");
     };
     let scanhub = scanhub();
-    let place = Place::new();
-    let (front, rear, port) = (place.path("front"), place.path("rear"), free_port().to_string());
+    let test_domain = TestDirectory::new();
+    let (front, rear, port) = (test_domain.path("front"), test_domain.path("rear"), free_port().to_string());
     let simulate = ["simulate", "--port", &front, "--port", &rear, "--baud=500000", "--seed=5"];
-    let _simulator = place.start(&scanhub, &simulate, Stdio::null());
+    let _simulator = test_domain.start(&scanhub, &simulate, Stdio::null());
     let [front, rear] = [format!("front={front}"), format!("rear={rear}")];
     let run = ["run", "--link", &front, "--link", &rear, "--set=link.front.pose.x=0.3"];
-    let _hub = place.start(&scanhub, &run, Stdio::null());
+    let _hub = test_domain.start(&scanhub, &run, Stdio::null());
     let echoes = ["front", "rear"].map(|sensor| {
-        let path = place.path(&format!("{sensor}.jsonl"));
+        let path = test_domain.path(&format!("{sensor}.jsonl"));
         let file = File::create(&path).expect("a file");
-        (place.start(&scanhub, &["echo", &format!("{sensor}/scan"), "--json"], file.into()), path)
+        (test_domain.start(&scanhub, &["echo", &format!("{sensor}/scan"), "--json"], file.into()), path)
     });
     let listen = format!("--listen=tcp/127.0.0.1:{port}");
     let flags = [&listen, "--ros2", "--domain-id=42", "--topic-prefix=robot1", "--frame=rear=back"];
-    let bridge = place.start(Path::new(BRIDGE), &flags, Stdio::null());
+    let bridge = test_domain.start(Path::new(BRIDGE), &flags, Stdio::null());
     let deadline = Instant::now() + Duration::from_secs(60);
     while !echoes.iter().all(|(_, path)| fs::metadata(path).is_ok_and(|file| file.len() > 0)) {
         assert!(Instant::now() < deadline, "no scans");
         thread::sleep(Duration::from_millis(50));
     }
-    let mut judge = Command::new(python);
-    judge.args(["-B", concat!(env!("CARGO_MANIFEST_DIR"), "/tests/ros2.py"), &port, "42", "5"]);
-    let outcome = output(judge.args(echoes.iter().map(|(_, path)| path))).expect("Python");
-    let (said, why) = (String::from_utf8_lossy(&outcome.stdout), String::from_utf8_lossy(&outcome.stderr));
-    assert!(outcome.status.success(), "{said}{why}");
-    let said: Value = serde_json::from_str(said.lines().last().unwrap_or_default()).expect("an object");
-    check_scans(&said, "front");
-    check_scans(&said, "rear");
-    check_graph(&said);
-    check_others(&said);
+    let mut checker = Command::new(python);
+    checker.args(["-B", concat!(env!("CARGO_MANIFEST_DIR"), "/tests/ros2.py"), &port, "42", "5"]);
+    let outcome = output(checker.args(echoes.iter().map(|(_, path)| path))).expect("Python");
+    let (stdout, stderr) =
+        (String::from_utf8_lossy(&outcome.stdout), String::from_utf8_lossy(&outcome.stderr));
+    assert!(outcome.status.success(), "{stdout}{stderr}");
+    let report: Value = serde_json::from_str(stdout.lines().last().unwrap_or_default()).expect("an object");
+    check_scans(&report, "front");
+    check_scans(&report, "rear");
+    check_graph(&report);
+    check_others(&report);
     assert_eq!(bridge.end(), Some(0));
 }
 
 /// All topics are there as a ROS node would have made them.
-fn check_graph(said: &Value) {
-    let topics = said["topics"].as_object().expect("topics");
+fn check_graph(report: &Value) {
+    let topics = report["topics"].as_object().expect("topics");
     let words = ["foreground", "marks", "scan", "verdict", "zones"];
     let of = |sensor: &str| words.map(|word| format!("/robot1/{sensor}/{word}")).to_vec();
-    let mut wanted = [of("front"), of("rear")].concat();
-    wanted.extend(["/diagnostics".to_owned(), "/tf_static".to_owned()]);
-    wanted.sort();
-    assert_eq!(topics.keys().cloned().collect::<Vec<_>>(), wanted);
+    let mut expected = [of("front"), of("rear")].concat();
+    expected.extend(["/diagnostics".to_owned(), "/tf_static".to_owned()]);
+    expected.sort();
+    assert_eq!(topics.keys().cloned().collect::<Vec<_>>(), expected);
     for (name, topic) in topics {
         assert_eq!((&topic["hash"], &topic["hash"]), (&topic["rosbags_hash"], &topic["sdk_hash"]), "{name}");
         assert_eq!((topic["node"].as_str(), topic["namespace"].as_str()), (Some("scanhub"), Some("/")));
         let qos = ["reliability", "durability"].map(|key| topic[key].as_str().unwrap_or_default());
-        let wanted = match name.as_str() {
+        let expected = match name.as_str() {
             "/diagnostics" => (["RELIABLE", "VOLATILE"], 10),
             "/tf_static" => (["RELIABLE", "TRANSIENT_LOCAL"], 1),
             _ => (["BEST_EFFORT", "VOLATILE"], 5),
         };
-        assert_eq!((qos, topic["depth"].as_i64()), (wanted.0, Some(wanted.1)), "{name}");
+        assert_eq!((qos, topic["depth"].as_i64()), (expected.0, Some(expected.1)), "{name}");
     }
 }
 
 /// What was decoded is what was measured, and nearly all of it came: best effort leaves out what a busy machine is late with.
-fn check_scans(said: &Value, sensor: &str) {
-    let scans = &said["scans"][format!("/robot1/{sensor}/scan")];
+fn check_scans(report: &Value, sensor: &str) {
+    let scans = &report["scans"][format!("/robot1/{sensor}/scan")];
     let number = |key: &str| scans[key].as_u64().unwrap_or_default();
     assert!(number("decoded") > 50, "{sensor}: {scans}");
     assert_eq!(number("matched"), number("decoded"), "{sensor}: {scans}");
@@ -161,20 +162,20 @@ fn check_scans(said: &Value, sensor: &str) {
 }
 
 /// Every other topic said something, and what it should.
-fn check_others(said: &Value) {
-    for (name, count) in said["heard"].as_object().expect("counts") {
-        assert!(count.as_u64() > Some(0), "{name}: {said:#}");
+fn check_others(report: &Value) {
+    for (name, count) in report["heard"].as_object().expect("counts") {
+        assert!(count.as_u64() > Some(0), "{name}: {report:#}");
     }
-    let attachments = &said["attachments"];
+    let attachments = &report["attachments"];
     assert_eq!((&attachments["ascend"], &attachments["gids"]), (&true.into(), &1.into()), "{attachments}");
     assert_eq!(attachments["length"], Value::from([33].as_slice()));
     let frames = serde_json::json!([["base_link", "front"], ["base_link", "back"]]);
-    let mut got = said["frames"].as_array().cloned().unwrap_or_default();
+    let mut got = report["frames"].as_array().cloned().unwrap_or_default();
     got.sort_by_key(|pair| pair[1] != "front");
     assert_eq!(Value::from(got), frames);
     for (name, words) in [("front", "streaming"), ("rear", "streaming"), ("hub", "running")] {
         let line = serde_json::json!([format!("scanhub: {name}"), 0, words]);
-        assert!(said["diagnostics"].as_array().is_some_and(|all| all.contains(&line)), "{said:#}");
+        assert!(report["diagnostics"].as_array().is_some_and(|all| all.contains(&line)), "{report:#}");
     }
 }
 
@@ -187,15 +188,15 @@ fn the_examples_of_the_page_run() {
     assert_eq!(lines.len(), 2, "{lines:?}");
     let (port, mut running) = (free_port().to_string(), Vec::new());
     for line in lines {
-        let place = Place::new();
+        let test_domain = TestDirectory::new();
         let line = line.replace("0.0.0.0", "127.0.0.1").replace("7447", &port);
         let words: Vec<&str> = line.split_whitespace().collect();
-        let mut program = place.start(Path::new(BRIDGE), &words, Stdio::piped());
+        let mut program = test_domain.start(Path::new(BRIDGE), &words, Stdio::piped());
         let mut first = String::new();
         let out = program.0.stdout.take().expect("a pipe");
         BufReader::new(out).read_line(&mut first).expect("a line");
         assert!(first.starts_with("bridge"), "{line}: {first:?}");
-        running.push((program, place));
+        running.push((program, test_domain));
     }
     for (program, _place) in running {
         assert_eq!(program.end(), Some(0));
@@ -203,7 +204,7 @@ fn the_examples_of_the_page_run() {
 }
 
 /// What the program says of `flags` where the environment says `domain`: its exit code and stderr.
-fn said(domain: &str, flags: &[&str]) -> (Option<i32>, String) {
+fn run_bridge(domain: &str, flags: &[&str]) -> (Option<i32>, String) {
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub-bridge"));
     // Nobody is at this port.
     command.args(["--connect=tcp/127.0.0.1:1", "--check"]).args(flags).env("ROS_DOMAIN_ID", domain);
@@ -212,9 +213,9 @@ fn said(domain: &str, flags: &[&str]) -> (Option<i32>, String) {
 }
 
 #[test]
-fn who_is_no_node_need_not_know_a_domain_of_ros() {
+fn ros_settings_are_checked_only_with_ros2() {
     for domain in ["42", "abc"] {
-        let (code, errors) = said(domain, &[]);
+        let (code, errors) = run_bridge(domain, &[]);
         assert!(code != Some(2) && !errors.contains("--ros2"), "{domain:?}: {code:?} {errors}");
     }
     for (domain, flags, words) in [
@@ -224,7 +225,7 @@ fn who_is_no_node_need_not_know_a_domain_of_ros() {
         ("", &["--ros2", "--frame=front=base_link"], "the robot itself"),
         ("", &["--ros2", "--domain-id=233"], "0..=232"),
     ] {
-        let (code, errors) = said(domain, flags);
+        let (code, errors) = run_bridge(domain, flags);
         assert!(code == Some(2) && errors.contains(words), "{flags:?}: {code:?} {errors}");
     }
 }

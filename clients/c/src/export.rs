@@ -9,7 +9,9 @@ use std::time::Duration;
 use scanhub_client::Wait;
 use scanhub_schema::{Tilt, Topic};
 
-use crate::boundary::{CallError, Lent, last_message, optional_place, place, sample, text, write_names};
+use crate::ffi::{
+    BorrowedSample, CallError, last_message, optional_output, output, sample, text, write_names,
+};
 use crate::handle::{Handle, Mount, Opaque, insert, remove, with};
 use crate::silence::{sensors, topics};
 
@@ -23,13 +25,13 @@ pub extern "C" fn scanhub_open(
     wait: c_int,
 ) -> c_int {
     answer(|| {
-        let handle = place(handle)?;
+        let handle = output(handle)?;
         handle.write(std::ptr::null_mut());
         let sensor =
             text(sensor)?.ok_or(CallError::Argument("no sensor is named", "for example \"front\""))?;
         let topic = u8::try_from(topic).ok().and_then(Topic::of_number);
         let topic = topic.ok_or(CallError::Argument("there is no such topic", "one of SCANHUB_TOPIC_.."))?;
-        let opened = Handle::open(text(domain)?, sensor, topic, wait_by(wait)?)?;
+        let opened = Handle::open(text(domain)?, sensor, topic, wait_method(wait)?)?;
         handle.write(insert(opened)?);
         Ok(0)
     })
@@ -64,10 +66,10 @@ fn open_robot(
     wait: c_int,
     early: bool,
 ) -> Result<c_int, CallError> {
-    let handle = place(handle)?;
+    let handle = output(handle)?;
     handle.write(std::ptr::null_mut());
     let sensors: Vec<&str> = text(sensors)?.unwrap_or_default().split_ascii_whitespace().collect();
-    let opened = Handle::open_robot(text(domain)?, &sensors, wait_by(wait)?, early)?;
+    let opened = Handle::open_robot(text(domain)?, &sensors, wait_method(wait)?, early)?;
     handle.write(insert(opened)?);
     Ok(0)
 }
@@ -87,13 +89,13 @@ pub extern "C" fn scanhub_wait(handle: *mut Opaque, timeout_ms: c_int) -> c_int 
 
 /// Lends the next sample. Returns 1 if there was one, and 0 otherwise.
 #[unsafe(no_mangle)]
-pub extern "C" fn scanhub_take(handle: *mut Opaque, taken: *mut Lent) -> c_int {
+pub extern "C" fn scanhub_take(handle: *mut Opaque, taken: *mut BorrowedSample) -> c_int {
     answer(|| {
-        let taken = place(taken)?;
-        taken.write(Lent::none());
+        let taken = output(taken)?;
+        taken.write(BorrowedSample::none());
         match with(handle, Handle::take)? {
-            Some(lent) => {
-                taken.write(Lent { of: handle, ..lent });
+            Some(borrowed) => {
+                taken.write(BorrowedSample { of: handle, ..borrowed });
                 Ok(1)
             }
             None => Ok(0),
@@ -103,16 +105,16 @@ pub extern "C" fn scanhub_take(handle: *mut Opaque, taken: *mut Lent) -> c_int {
 
 /// Takes a sample back. Returns 0.
 #[unsafe(no_mangle)]
-pub extern "C" fn scanhub_release(taken: *mut Lent) -> c_int {
+pub extern "C" fn scanhub_release(taken: *mut BorrowedSample) -> c_int {
     answer(|| {
         let taken = sample(taken)?;
-        let Lent { of, number, .. } = *taken;
+        let BorrowedSample { of, number, .. } = *taken;
         // A sample that was released or never filled needs nothing. After an error, the thread that took it still has
         // it.
         if !of.is_null() {
-            with(of, |handle: &mut Handle| handle.give_back(number))?;
+            with(of, |handle: &mut Handle| handle.release(number))?;
         }
-        *taken = Lent::none();
+        *taken = BorrowedSample::none();
         Ok(0)
     })
 }
@@ -131,7 +133,7 @@ pub extern "C" fn scanhub_publish_tilt(
     name: *const c_char,
 ) -> c_int {
     answer(|| {
-        let publication = place(publication)?;
+        let publication = output(publication)?;
         publication.write(std::ptr::null_mut());
         let name = text(name)?.ok_or(CallError::Argument("no mount is named", "for example \"mount\""))?;
         publication.write(insert(Mount::publish(text(domain)?, name)?)?);
@@ -167,7 +169,7 @@ pub extern "C" fn scanhub_hub_is_running(handle: *mut Opaque) -> c_int {
 #[unsafe(no_mangle)]
 pub extern "C" fn scanhub_silent_for(handle: *mut Opaque, silent_ns: *mut u64) -> c_int {
     answer(|| {
-        let silent_ns = place(silent_ns)?;
+        let silent_ns = output(silent_ns)?;
         silent_ns.write(0);
         let silent_for = with(handle, |handle: &mut Handle| Ok(handle.silent_for()))?;
         silent_ns.write(u64::try_from(silent_for.as_nanos()).unwrap_or(u64::MAX));
@@ -179,7 +181,7 @@ pub extern "C" fn scanhub_silent_for(handle: *mut Opaque, silent_ns: *mut u64) -
 #[unsafe(no_mangle)]
 pub extern "C" fn scanhub_why_silent(handle: *mut Opaque, text: *mut *const c_char) -> c_int {
     answer(|| {
-        let mut text = optional_place(text)?;
+        let mut text = optional_output(text)?;
         if let Some(text) = &mut text {
             text.write(c"".as_ptr());
         }
@@ -222,7 +224,7 @@ const VERSION: &CStr = match CStr::from_bytes_with_nul(concat!(env!("CARGO_PKG_V
     Err(_) => panic!("the version contains a 0"),
 };
 
-fn wait_by(wait: c_int) -> Result<Wait, CallError> {
+fn wait_method(wait: c_int) -> Result<Wait, CallError> {
     match wait {
         0 => Ok(Wait::Doorbell),
         1 => Ok(Wait::Event),

@@ -16,18 +16,18 @@ use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use scanhub_client::{
-    Error, Heard, Payload, PollableSubscriber, Publication, Received, Robot, RobotSubscriber, Silence,
-    Subscribe, Subscriber, SubscriberBuilder, Wait, publish_domain,
+    Error, Payload, PollableSubscriber, Publication, Received, Robot, RobotSubscriber, Silence, Subscribe,
+    Subscriber, SubscriberBuilder, Wait, ZonesUpdate, publish_domain,
 };
 use scanhub_schema::{Failure, Header, Kind, Tilt, Topic, limits};
 
-use crate::boundary::{CallError, Lent};
+use crate::ffi::{BorrowedSample, CallError};
 use crate::silence::{silence_number, silence_text};
 
 /// An open subscription.
 pub(crate) struct Handle {
     // Dropped before the source that lends the samples.
-    lent: [Option<(u64, Held)>; LENT],
+    loans: [Option<(u64, Held)>; MAX_LOANS],
     found: Option<Held>,
     next: u64,
     source: Source,
@@ -36,12 +36,12 @@ pub(crate) struct Handle {
 }
 
 /// Maximum number of samples that are lent at a time: as many as a subscriber can borrow from the hub.
-const LENT: usize = limits::BORROWED;
+const MAX_LOANS: usize = limits::MAX_BORROWED_SAMPLES;
 
 /// Kind of the subscriber of a topic: zones expire, other samples do not.
 macro_rules! kind {
     (Zones $payload:tt) => {
-        Heard
+        ZonesUpdate
     };
     ($topic:ident $payload:tt) => {
         scanhub_schema::payload_type!($payload)
@@ -90,7 +90,7 @@ macro_rules! topics {
     ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
         enum Source { Robot(Port<Robot>), $($topic(Port<kind!($topic $payload)>),)* }
 
-        enum Held { Robot(Told), $($topic(<kind!($topic $payload) as Subscribe>::Item),)* }
+        enum Held { Robot(OwnedVerdict), $($topic(<kind!($topic $payload) as Subscribe>::Item),)* }
 
         impl Source {
             fn open(domain: Option<&str>, sensor: &str, topic: Topic, wait: Wait) -> Result<Source, Error> {
@@ -104,7 +104,7 @@ macro_rules! topics {
 
             fn try_next(&mut self) -> Result<Option<Held>, Error> {
                 Ok(match self {
-                    Source::Robot(robot) => robot.subscriber_mut().try_next()?.map(|robot| Held::Robot(Told::new(&robot))),
+                    Source::Robot(robot) => robot.subscriber_mut().try_next()?.map(|robot| Held::Robot(OwnedVerdict::new(&robot))),
                     $(Source::$topic(topic) => topic.subscriber_mut().try_next()?.map(Held::$topic),)*
                 })
             }
@@ -146,9 +146,9 @@ macro_rules! topics {
         }
 
         impl Held {
-            fn lend(&self) -> Lent {
+            fn lend(&self) -> BorrowedSample {
                 match self {
-                    Held::Robot(told) => Lent::new(None, told.verdict(), size_of_val(told.verdict())),
+                    Held::Robot(told) => BorrowedSample::new(None, told.verdict(), size_of_val(told.verdict())),
                     $(Held::$topic(sample) => sample.lend(),)*
                 }
             }
@@ -160,25 +160,29 @@ scanhub_schema::for_each_topic!(topics);
 
 /// Converts a sample to the struct that a program in C reads.
 trait Lend {
-    fn lend(&self) -> Lent;
+    fn lend(&self) -> BorrowedSample;
 }
 
-impl Lend for Heard {
-    fn lend(&self) -> Lent {
+impl Lend for ZonesUpdate {
+    fn lend(&self) -> BorrowedSample {
         let stale = self.stale.into();
-        Lent {
+        BorrowedSample {
             missed: self.missed,
             stale,
-            ..Lent::new(self.header.as_ref(), &self.zones, size_of_val(&self.zones))
+            ..BorrowedSample::new(self.header.as_ref(), &self.zones, size_of_val(&self.zones))
         }
     }
 }
 
 impl<P: Payload + ?Sized> Lend for Received<P> {
-    fn lend(&self) -> Lent {
+    fn lend(&self) -> BorrowedSample {
         let restarted = self.restarted.into();
         let length = self.bytes().len();
-        Lent { missed: self.missed, restarted, ..Lent::new(Some(self.header()), &**self, length) }
+        BorrowedSample {
+            missed: self.missed,
+            restarted,
+            ..BorrowedSample::new(Some(self.header()), &**self, length)
+        }
     }
 }
 
@@ -207,7 +211,7 @@ impl Handle {
     }
 
     fn of(source: Source) -> Handle {
-        Handle { lent: Default::default(), found: None, next: 1, source, silence: CString::default() }
+        Handle { loans: Default::default(), found: None, next: 1, source, silence: CString::default() }
     }
 
     /// Waits until there is a sample to take, but not longer than `timeout`. Returns whether there is a sample.
@@ -229,15 +233,15 @@ impl Handle {
     }
 
     /// Lends the next sample until it is given back. Returns `None` if no sample has arrived.
-    pub(crate) fn take(&mut self) -> Result<Option<Lent>, CallError> {
-        let place = self.lent.iter_mut().find(|place| place.is_none());
-        let Some(place) = place else {
+    pub(crate) fn take(&mut self) -> Result<Option<BorrowedSample>, CallError> {
+        let slot = self.loans.iter_mut().find(|slot| slot.is_none());
+        let Some(slot) = slot else {
             return Err(CallError::Argument("four samples are lent already", "scanhub_release one of them"));
         };
         let held = match self.found.take() {
             // A verdict has no stamp, and the caller may have waited, so it must be current.
             Some(Held::Robot(found)) => match &mut self.source {
-                Source::Robot(robot) => Held::Robot(Told::new(robot.subscriber_mut().now()?)),
+                Source::Robot(robot) => Held::Robot(OwnedVerdict::new(robot.subscriber_mut().now()?)),
                 _ => Held::Robot(found),
             },
             Some(held) => held,
@@ -248,16 +252,16 @@ impl Handle {
         };
         let number = self.next;
         self.next += 1;
-        let (number, held) = place.insert((number, held));
-        Ok(Some(Lent { number: *number, ..held.lend() }))
+        let (number, held) = slot.insert((number, held));
+        Ok(Some(BorrowedSample { number: *number, ..held.lend() }))
     }
 
     /// Takes back the sample that was lent under `number`.
-    pub(crate) fn give_back(&mut self, number: u64) -> Result<(), CallError> {
-        let is_it =
-            |place: &&mut Option<(u64, Held)>| place.as_ref().is_some_and(|(lent, _)| *lent == number);
-        let place = self.lent.iter_mut().find(is_it);
-        *place.ok_or(CallError::Argument("this sample is not lent", "release each sample once"))? = None;
+    pub(crate) fn release(&mut self, number: u64) -> Result<(), CallError> {
+        let is_loan =
+            |slot: &&mut Option<(u64, Held)>| slot.as_ref().is_some_and(|(loan, _)| *loan == number);
+        let slot = self.loans.iter_mut().find(is_loan);
+        *slot.ok_or(CallError::Argument("this sample is not lent", "release each sample once"))? = None;
         Ok(())
     }
 
@@ -286,13 +290,13 @@ impl Handle {
     }
 }
 
-impl Lent {
-    fn new<P: ?Sized>(header: Option<&Header>, payload: &P, length: usize) -> Lent {
-        Lent {
+impl BorrowedSample {
+    fn new<P: ?Sized>(header: Option<&Header>, payload: &P, length: usize) -> BorrowedSample {
+        BorrowedSample {
             header: header.map_or(ptr::null(), ptr::from_ref),
             payload: ptr::from_ref(payload).cast(),
             length,
-            ..Lent::none()
+            ..BorrowedSample::none()
         }
     }
 }
@@ -305,37 +309,37 @@ struct Verdict {
     worst: *const c_char,
     nearest: *const c_char,
     count: usize,
-    sensors: *const OfSensor,
+    sensors: *const SensorVerdict,
 }
 
 /// `scanhub_robot_sensor` of the header.
 #[repr(C)]
-struct OfSensor {
+struct SensorVerdict {
     name: *const c_char,
     verdict: u8,
     nearest_mm: u32,
 }
 
 /// The verdict of a robot, and the memory that it points to: C may read it while it is lent.
-struct Told {
+struct OwnedVerdict {
     verdict: Verdict,
-    _sensors: Box<[OfSensor]>,
+    _sensors: Box<[SensorVerdict]>,
     _names: Vec<CString>,
 }
 
-impl Told {
-    fn new(robot: &Robot) -> Told {
+impl OwnedVerdict {
+    fn new(robot: &Robot) -> OwnedVerdict {
         // Names have no 0 in them.
         let names: Vec<CString> =
             robot.zones().map(|(name, _)| CString::new(name).unwrap_or_default()).collect();
-        let of_sensor = |((_, zones), name): ((&str, &scanhub_schema::Zones), &CString)| OfSensor {
+        let of_sensor = |((_, zones), name): ((&str, &scanhub_schema::Zones), &CString)| SensorVerdict {
             name: name.as_ptr(),
             verdict: zones.verdict() as u8,
             nearest_mm: zones.nearest().map_or(NOTHING_MM, |(_, mm)| mm),
         };
-        let sensors: Box<[OfSensor]> = robot.zones().zip(&names).map(of_sensor).collect();
-        let called = |wanted: Option<&str>| {
-            let at = robot.zones().position(|(name, _)| Some(name) == wanted);
+        let sensors: Box<[SensorVerdict]> = robot.zones().zip(&names).map(of_sensor).collect();
+        let called = |sensor: Option<&str>| {
+            let at = robot.zones().position(|(name, _)| Some(name) == sensor);
             at.map_or(ptr::null(), |at| names[at].as_ptr())
         };
         let nearest = robot.nearest();
@@ -347,7 +351,7 @@ impl Told {
             count: sensors.len(),
             sensors: sensors.as_ptr(),
         };
-        Told { verdict, _sensors: sensors, _names: names }
+        OwnedVerdict { verdict, _sensors: sensors, _names: names }
     }
 
     /// Returns what is lent. The memory that it points to lives as long as `self`.
@@ -405,14 +409,14 @@ impl Drop for Entry {
         let object = self.object.take();
         if self.process != process::id() {
             // The address is stored, so that a leak checker reports no leak.
-            let mut kept = OF_PARENTS.lock().unwrap_or_else(PoisonError::into_inner);
+            let mut kept = INHERITED.lock().unwrap_or_else(PoisonError::into_inner);
             kept.extend(object.map(|object| Box::into_raw(object).expose_provenance()));
         }
     }
 }
 
 /// Addresses of the objects that a child has copied from its parent.
-static OF_PARENTS: Mutex<Vec<usize>> = Mutex::new(Vec::new());
+static INHERITED: Mutex<Vec<usize>> = Mutex::new(Vec::new());
 
 /// Next number of a handle. A process uses no number twice.
 static NEXT: AtomicUsize = AtomicUsize::new(1);
@@ -422,7 +426,7 @@ pub(crate) fn insert<T: Any>(object: T) -> Result<*mut Opaque, CallError> {
     let number = NEXT.fetch_add(1, Ordering::Relaxed);
     let entry = Entry { number, process: process::id(), object: Some(Box::new(object)) };
     let kept = TABLE.try_with(|table| table.borrow_mut().push(entry));
-    kept.map(|()| ptr::without_provenance_mut(number)).map_err(|_| UNKNOWN)
+    kept.map(|()| ptr::without_provenance_mut(number)).map_err(|_| UNKNOWN_HANDLE)
 }
 
 /// Calls `use_it` with the object of `handle`, if it has this type.
@@ -433,23 +437,23 @@ pub(crate) fn with<T: Any, R>(
     let found = TABLE.try_with(|table| {
         let mut table = table.borrow_mut();
         let entry = table.iter_mut().find(|entry| entry.has_handle(handle));
-        use_it(entry.and_then(|entry| entry.object.as_mut()?.downcast_mut()).ok_or(UNKNOWN)?)
+        use_it(entry.and_then(|entry| entry.object.as_mut()?.downcast_mut()).ok_or(UNKNOWN_HANDLE)?)
     });
-    found.unwrap_or(Err(UNKNOWN))
+    found.unwrap_or(Err(UNKNOWN_HANDLE))
 }
 
 /// Drops the object of `handle` with everything that it holds, if it has this type.
 pub(crate) fn remove<T: Any>(handle: *mut Opaque) -> Result<(), CallError> {
     let removed = TABLE.try_with(|table| {
         let mut table = table.borrow_mut();
-        let is_such = |entry: &Entry| entry.object.as_ref().is_some_and(|object| object.is::<T>());
-        let at = table.iter().position(|entry| entry.has_handle(handle) && is_such(entry));
-        Ok(table.swap_remove(at.ok_or(UNKNOWN)?))
+        let has_type = |entry: &Entry| entry.object.as_ref().is_some_and(|object| object.is::<T>());
+        let at = table.iter().position(|entry| entry.has_handle(handle) && has_type(entry));
+        Ok(table.swap_remove(at.ok_or(UNKNOWN_HANDLE)?))
     });
-    removed.unwrap_or(Err(UNKNOWN)).map(drop)
+    removed.unwrap_or(Err(UNKNOWN_HANDLE)).map(drop)
 }
 
-const UNKNOWN: CallError = CallError::Argument(
+const UNKNOWN_HANDLE: CallError = CallError::Argument(
     "this thread has no such handle",
     "a handle is used from when it was opened until it is closed, by the thread that opened it; a child opens its own",
 );

@@ -4,7 +4,7 @@ use std::ffi::c_int;
 
 use scanhub_client::{Silence, domain_candidates, live_sensors, live_topics};
 
-use crate::boundary::CallError;
+use crate::ffi::CallError;
 
 /// Returns the number of a reason in the header, `SCANHUB_SILENCE_..`.
 pub(crate) fn silence_number(silence: &Silence) -> c_int {

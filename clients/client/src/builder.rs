@@ -4,7 +4,7 @@ use std::marker::PhantomData;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use scanhub_schema::check_followed;
+use scanhub_schema::check_any_sensor;
 use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment};
 
 use crate::error::Error;
@@ -104,9 +104,9 @@ impl<T: Subscribe + ?Sized> SubscriberBuilder<T> {
 
     /// Checks the names of the sensors, and returns the session.
     fn session(&self) -> Result<Session, Error> {
-        self.sensors.iter().try_for_each(|sensor| check_followed(sensor))?;
-        let places = domain_candidates(self.domain.as_deref(), self.root.as_deref())?;
-        Ok(Session::new(places).by(self.wait))
+        self.sensors.iter().try_for_each(|sensor| check_any_sensor(sensor))?;
+        let locations = domain_candidates(self.domain.as_deref(), self.root.as_deref())?;
+        Ok(Session::new(locations).waiting_by(self.wait))
     }
 
     /// Returns the first sensor; the builder of a single sensor has one.

@@ -4,7 +4,7 @@ use rustix::time::{ClockId, Timespec, clock_gettime};
 
 /// One moment on two clocks, in ns.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Moment {
+pub struct Timestamp {
     /// CLOCK_MONOTONIC, the clock of all stamps; it stops while the machine is suspended.
     pub monotonic_ns: u64,
     /// CLOCK_BOOTTIME: the same, but it continues then.
@@ -12,8 +12,8 @@ pub struct Moment {
 }
 
 /// Returns this moment.
-pub fn now() -> Moment {
-    Moment { monotonic_ns: read(ClockId::Monotonic), boottime_ns: read(ClockId::Boottime) }
+pub fn now() -> Timestamp {
+    Timestamp { monotonic_ns: read(ClockId::Monotonic), boottime_ns: read(ClockId::Boottime) }
 }
 
 /// Returns CLOCK_MONOTONIC alone, in ns.

@@ -143,7 +143,7 @@ impl From<Failure> for Error {
             Kind::Interrupted => ErrorKind::Interrupted,
             Kind::DomainHeld => ErrorKind::DomainHeld,
             Kind::NameHeld => ErrorKind::NameHeld,
-            Kind::Short => ErrorKind::ResourceExhausted,
+            Kind::ResourceExhausted => ErrorKind::ResourceExhausted,
             Kind::OtherUser => ErrorKind::OtherUser,
             Kind::Incompatible => ErrorKind::Incompatible,
             _ => ErrorKind::Failed,
@@ -174,7 +174,8 @@ mod tests {
 
     #[test]
     fn an_error_is_a_failure_with_the_same_texts_and_back() {
-        for kind in [Kind::Failed, Kind::Configuration, Kind::NoHub, Kind::NameHeld, Kind::Short] {
+        for kind in [Kind::Failed, Kind::Configuration, Kind::NoHub, Kind::NameHeld, Kind::ResourceExhausted]
+        {
             let failure = Failure::new(kind, "no \x1b port", "try \x07 another");
             let error = Error::from(failure.clone());
             assert_eq!(error.to_string(), failure.to_string());
@@ -189,7 +190,7 @@ mod tests {
         let kind = |kind| Error::new(kind, "", "").kind();
         assert_eq!(kind(Kind::Configuration), ErrorKind::InvalidInput);
         assert_eq!(kind(Kind::Usage), ErrorKind::InvalidInput);
-        assert_eq!(kind(Kind::Short), ErrorKind::ResourceExhausted);
+        assert_eq!(kind(Kind::ResourceExhausted), ErrorKind::ResourceExhausted);
         assert_eq!(kind(Kind::PortBusy), ErrorKind::Failed);
         assert_eq!(kind(Kind::Incompatible), ErrorKind::Incompatible);
         assert_eq!(kind(Kind::OtherUser), ErrorKind::OtherUser);
@@ -201,7 +202,7 @@ mod tests {
 
     #[test]
     fn the_source_is_the_error_of_the_system() {
-        let error = Error::new(Kind::Short, "no descriptor", "");
+        let error = Error::new(Kind::ResourceExhausted, "no descriptor", "");
         assert!(error.source().is_none());
         let error = error.with_source(io::Error::from_raw_os_error(24));
         let source = error.source().and_then(|source| source.downcast_ref::<io::Error>());

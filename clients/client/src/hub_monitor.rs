@@ -28,7 +28,7 @@ pub(crate) struct HubMonitor {
 }
 
 /// Pause after a change that is not of a hub. In a directory such as /tmp, others can create files all the time.
-const PAUSE: Duration = Duration::from_secs(2);
+const UNRELATED_CHANGE_PAUSE: Duration = Duration::from_secs(2);
 
 /// Interval of the looks for a hub if the directories cannot be watched.
 const UNWATCHED_INTERVAL: Duration = Duration::from_secs(2);
@@ -38,7 +38,7 @@ const UNWATCHED_INTERVAL: Duration = Duration::from_secs(2);
 const RECHECK_INTERVAL: Duration = Duration::from_secs(10);
 
 /// Files of a domain's directory that a hub or listener writes when it starts.
-const FILES: [&str; 3] = ["hub.lock", "listen.lock", "prefix"];
+const HUB_FILES: [&str; 3] = ["hub.lock", "listen.lock", "prefix"];
 
 impl HubMonitor {
     pub(crate) fn new(epoll: Arc<OwnedFd>) -> HubMonitor {
@@ -64,7 +64,7 @@ impl HubMonitor {
 
     /// Watches the directories in which a hub would appear at `places`. Returns whether something has changed since the
     /// last call, so that the caller must look for a hub.
-    pub(crate) fn watch_directories(&mut self, places: &[Domain]) -> bool {
+    pub(crate) fn watch_directories(&mut self, locations: &[Domain]) -> bool {
         self.hub = None;
         let (directories, is_new) = match &mut self.directories {
             Some(directories) => (directories, false),
@@ -80,7 +80,7 @@ impl HubMonitor {
             directories.resume(&self.epoll);
         }
         // In this order: a directory that was created after the first look is watched, or found by the next one.
-        directories.watch(places) || is_new || change == Change::Related
+        directories.watch(locations) || is_new || change == Change::Related
     }
 
     /// Returns the time after which the caller must look for a hub although nothing has changed.
@@ -98,14 +98,14 @@ impl HubMonitor {
 /// Directories that are watched by one inotify.
 struct Directories {
     inotify: OwnedFd,
-    watches: Vec<Watch>,
+    watches: Vec<WatchedDirectory>,
     /// Whether each directory that this user may read is watched.
     is_complete: bool,
     paused_until: Option<Instant>,
 }
 
 /// A directory to watch, with its number if it is watched.
-struct Watch {
+struct WatchedDirectory {
     target: Target,
     number: Option<i32>,
 }
@@ -138,8 +138,8 @@ impl Directories {
     }
 
     /// Watches for `places`. Returns whether the directories have changed since the last call.
-    fn watch(&mut self, places: &[Domain]) -> bool {
-        let targets: Vec<Target> = places.iter().map(|place| Target::of(place.root())).collect();
+    fn watch(&mut self, locations: &[Domain]) -> bool {
+        let targets: Vec<Target> = locations.iter().map(|location| Target::of(location.root())).collect();
         if self.watches.iter().map(|watch| &watch.target).eq(&targets) {
             return false;
         }
@@ -160,7 +160,7 @@ impl Directories {
                     None
                 }
             };
-            self.watches.push(Watch { target, number });
+            self.watches.push(WatchedDirectory { target, number });
         }
         for number in old.into_iter().filter_map(|watch| watch.number) {
             if !self.watches.iter().any(|watch| watch.number == Some(number)) {
@@ -180,11 +180,11 @@ impl Directories {
         while let Ok(event) = reader.next() {
             let mut watches = self.watches.iter().filter(|watch| watch.number == Some(event.wd()));
             let name = event.file_name().map(|name| OsStr::from_bytes(name.to_bytes()));
-            if event.events().intersects(LOST) {
+            if event.events().intersects(WATCH_ENDED) {
                 // A watch that was removed on purpose is not in the list any more.
                 is_lost |=
                     event.events().contains(inotify::ReadFlags::QUEUE_OVERFLOW) || watches.next().is_some();
-            } else if watches.any(|watch| watch.target.leads(name)) {
+            } else if watches.any(|watch| watch.target.leads_to_hub(name)) {
                 change = Change::Related;
             } else if change == Change::None {
                 change = Change::Unrelated;
@@ -202,7 +202,7 @@ impl Directories {
         if self.paused_until.is_none_or(|until| until <= Instant::now()) {
             let nothing = epoll::EventFlags::empty();
             let _ = epoll::modify(epoll, &self.inotify, epoll::EventData::new_u64(0), nothing);
-            self.paused_until = Some(Instant::now() + PAUSE);
+            self.paused_until = Some(Instant::now() + UNRELATED_CHANGE_PAUSE);
         }
     }
 
@@ -217,7 +217,7 @@ impl Directories {
 }
 
 /// Events after which a directory may not be watched any more.
-const LOST: inotify::ReadFlags = inotify::ReadFlags::IGNORED
+const WATCH_ENDED: inotify::ReadFlags = inotify::ReadFlags::IGNORED
     .union(inotify::ReadFlags::DELETE_SELF)
     .union(inotify::ReadFlags::MOVE_SELF)
     .union(inotify::ReadFlags::UNMOUNT)
@@ -244,10 +244,10 @@ impl Target {
     }
 
     /// Returns whether the entry `name` leads to a hub.
-    fn leads(&self, name: Option<&OsStr>) -> bool {
+    fn leads_to_hub(&self, name: Option<&OsStr>) -> bool {
         match &self.entry {
             Some(entry) => name == Some(entry),
-            None => name.is_some_and(|name| FILES.iter().any(|file| name == *file)),
+            None => name.is_some_and(|name| HUB_FILES.iter().any(|file| name == *file)),
         }
     }
 }
@@ -269,7 +269,7 @@ mod tests {
     use super::*;
 
     /// Far longer than anything takes on a busy machine.
-    const LONG: Timespec = Timespec { tv_sec: 60, tv_nsec: 0 };
+    const TEST_TIMEOUT: Timespec = Timespec { tv_sec: 60, tv_nsec: 0 };
 
     fn monitor() -> HubMonitor {
         HubMonitor::new(Arc::new(epoll::create(epoll::CreateFlags::CLOEXEC).unwrap()))
@@ -279,81 +279,81 @@ mod tests {
         poll(&mut [PollFd::new(&monitor.epoll, PollFlags::IN)], Some(&within)) == Ok(1)
     }
 
-    const NOW: Timespec = Timespec { tv_sec: 0, tv_nsec: 0 };
+    const NO_WAIT: Timespec = Timespec { tv_sec: 0, tv_nsec: 0 };
 
     #[test]
     fn each_directory_on_the_way_to_a_hub_is_a_change() {
         let base = tempfile::Builder::new().prefix("sh").tempdir_in("/tmp").unwrap();
-        let places = [Domain::at("lab", &base.path().join("a/b")).unwrap()];
+        let locations = [Domain::at("lab", &base.path().join("a/b")).unwrap()];
         let mut monitor = monitor();
-        assert!(monitor.watch_directories(&places), "they are watched from now on");
-        assert!(!monitor.watch_directories(&places) && !becomes_readable(&monitor, NOW));
+        assert!(monitor.watch_directories(&locations), "they are watched from now on");
+        assert!(!monitor.watch_directories(&locations) && !becomes_readable(&monitor, NO_WAIT));
         for path in ["a", "a/b", "a/b/lab", "a/b/lab/hub.lock"] {
             let path = base.path().join(path);
             match path.extension() {
                 None => fs::create_dir(path).unwrap(),
                 Some(_) => fs::write(path, "1").unwrap(),
             }
-            assert!(becomes_readable(&monitor, LONG));
-            assert!(monitor.watch_directories(&places));
-            while monitor.watch_directories(&places) {}
-            assert!(!becomes_readable(&monitor, NOW));
+            assert!(becomes_readable(&monitor, TEST_TIMEOUT));
+            assert!(monitor.watch_directories(&locations));
+            while monitor.watch_directories(&locations) {}
+            assert!(!becomes_readable(&monitor, NO_WAIT));
         }
         fs::remove_dir_all(base.path().join("a")).unwrap();
-        assert!(becomes_readable(&monitor, LONG) && monitor.watch_directories(&places));
-        while monitor.watch_directories(&places) {}
+        assert!(becomes_readable(&monitor, TEST_TIMEOUT) && monitor.watch_directories(&locations));
+        while monitor.watch_directories(&locations) {}
         fs::create_dir_all(base.path().join("a/b/lab")).unwrap();
-        assert!(becomes_readable(&monitor, LONG), "it watches where the directory was");
+        assert!(becomes_readable(&monitor, TEST_TIMEOUT), "it watches where the directory was");
         assert_eq!(monitor.interval(), RECHECK_INTERVAL);
     }
 
     #[test]
-    fn a_directory_that_was_replaced_while_a_file_of_it_is_open_is_watched_again() {
+    fn rewatches_replaced_directory_despite_an_open_file() {
         let base = tempfile::Builder::new().prefix("sh").tempdir_in("/tmp").unwrap();
         let domain = base.path().join("lab");
-        let places = [Domain::at("lab", base.path()).unwrap()];
+        let locations = [Domain::at("lab", base.path()).unwrap()];
         fs::create_dir(&domain).unwrap();
         let _open = fs::File::create(domain.join("other")).unwrap();
         let mut monitor = monitor();
-        while monitor.watch_directories(&places) {}
+        while monitor.watch_directories(&locations) {}
         fs::remove_dir_all(&domain).unwrap();
         fs::create_dir(&domain).unwrap();
         // No change is reported, so the caller looks after the interval.
-        assert!(!becomes_readable(&monitor, NOW));
+        assert!(!becomes_readable(&monitor, NO_WAIT));
         assert!(monitor.interval() <= RECHECK_INTERVAL);
-        assert!(monitor.watch_directories(&places), "it is another directory");
-        while monitor.watch_directories(&places) {}
+        assert!(monitor.watch_directories(&locations), "it is another directory");
+        while monitor.watch_directories(&locations) {}
         fs::write(domain.join("hub.lock"), "1").unwrap();
-        assert!(becomes_readable(&monitor, LONG) && monitor.watch_directories(&places));
+        assert!(becomes_readable(&monitor, TEST_TIMEOUT) && monitor.watch_directories(&locations));
     }
 
     #[test]
     fn files_of_others_make_it_pause() {
         let base = tempfile::Builder::new().prefix("sh").tempdir_in("/tmp").unwrap();
-        let places = [Domain::at("lab", base.path()).unwrap()];
+        let locations = [Domain::at("lab", base.path()).unwrap()];
         let mut monitor = monitor();
-        while monitor.watch_directories(&places) {}
+        while monitor.watch_directories(&locations) {}
         fs::write(base.path().join("other"), "").unwrap();
-        assert!(becomes_readable(&monitor, LONG));
-        assert!(!monitor.watch_directories(&places), "it is not the domain");
+        assert!(becomes_readable(&monitor, TEST_TIMEOUT));
+        assert!(!monitor.watch_directories(&locations), "it is not the domain");
         fs::write(base.path().join("another"), "").unwrap();
-        assert!(!becomes_readable(&monitor, NOW), "it pauses");
+        assert!(!becomes_readable(&monitor, NO_WAIT), "it pauses");
         let interval = monitor.interval();
-        assert!(interval <= PAUSE, "it must look after the pause");
+        assert!(interval <= UNRELATED_CHANGE_PAUSE, "it must look after the pause");
         fs::create_dir(base.path().join("lab")).unwrap();
         std::thread::sleep(interval);
-        assert!(monitor.watch_directories(&places), "nothing is lost by the pause");
+        assert!(monitor.watch_directories(&locations), "nothing is lost by the pause");
     }
 
     #[test]
     fn the_end_of_a_hub_is_a_change_once() {
         let mut monitor = monitor();
         let mut hub = Command::new("sleep").arg("600").spawn().unwrap();
-        assert!(!monitor.watch_hub(hub.id()) && !becomes_readable(&monitor, NOW));
+        assert!(!monitor.watch_hub(hub.id()) && !becomes_readable(&monitor, NO_WAIT));
         hub.kill().unwrap();
-        assert!(becomes_readable(&monitor, LONG));
+        assert!(becomes_readable(&monitor, TEST_TIMEOUT));
         assert!(monitor.watch_hub(hub.id()) && !monitor.watch_hub(hub.id()));
-        assert!(!becomes_readable(&monitor, NOW));
+        assert!(!becomes_readable(&monitor, NO_WAIT));
         hub.wait().unwrap();
     }
 }

@@ -25,13 +25,13 @@ use scanhub_schema::Header;
 /// ```
 #[derive(Debug)]
 pub struct Join<A, B> {
-    first: VecDeque<Waiting<A>>,
-    second: VecDeque<Waiting<B>>,
+    first: VecDeque<WaitingSample<A>>,
+    second: VecDeque<WaitingSample<B>>,
     dropped: u64,
 }
 
 #[derive(Debug)]
-struct Waiting<T> {
+struct WaitingSample<T> {
     boot: u64,
     seq: u64,
     since_ns: u64,
@@ -41,7 +41,7 @@ struct Waiting<T> {
 /// Maximum number of samples of a topic that wait.
 const MAX_WAITING: usize = 64;
 /// Time after which a sample is dropped if the other topic is silent.
-const SILENCE_NS: u64 = 1_000_000_000;
+const PARTNER_TIMEOUT_NS: u64 = 1_000_000_000;
 
 impl<A, B> Default for Join<A, B> {
     fn default() -> Join<A, B> {
@@ -88,8 +88,8 @@ impl<A, B> Join<A, B> {
 
 /// Removes the partner of the sample with this header from `waiting`, and drops the samples before it: the topics are
 /// in order, so the partners of these are lost.
-fn partner<T>(waiting: &mut VecDeque<Waiting<T>>, header: &Header, dropped: &mut u64) -> Option<T> {
-    let is_earlier = |one: &&Waiting<T>| one.boot == header.boot && one.seq < header.seq;
+fn partner<T>(waiting: &mut VecDeque<WaitingSample<T>>, header: &Header, dropped: &mut u64) -> Option<T> {
+    let is_earlier = |one: &&WaitingSample<T>| one.boot == header.boot && one.seq < header.seq;
     let found = waiting.iter().position(|one| (one.boot, one.seq) == (header.boot, header.seq));
     let earlier = found.unwrap_or_else(|| waiting.iter().take_while(is_earlier).count());
     waiting.drain(..earlier);
@@ -97,17 +97,23 @@ fn partner<T>(waiting: &mut VecDeque<Waiting<T>>, header: &Header, dropped: &mut
     found.and_then(|_| waiting.pop_front()).map(|one| one.sample)
 }
 
-fn wait<T>(waiting: &mut VecDeque<Waiting<T>>, header: &Header, sample: T, since_ns: u64, dropped: &mut u64) {
+fn wait<T>(
+    waiting: &mut VecDeque<WaitingSample<T>>,
+    header: &Header,
+    sample: T,
+    since_ns: u64,
+    dropped: &mut u64,
+) {
     if waiting.len() == MAX_WAITING {
         waiting.pop_front();
         *dropped += 1;
     }
-    waiting.push_back(Waiting { boot: header.boot, seq: header.seq, since_ns, sample });
+    waiting.push_back(WaitingSample { boot: header.boot, seq: header.seq, since_ns, sample });
 }
 
 /// Returns the number of dropped samples.
-fn expire<T>(waiting: &mut VecDeque<Waiting<T>>, now_ns: u64) -> u64 {
-    let is_old = |one: &&Waiting<T>| now_ns.saturating_sub(one.since_ns) > SILENCE_NS;
+fn expire<T>(waiting: &mut VecDeque<WaitingSample<T>>, now_ns: u64) -> u64 {
+    let is_old = |one: &&WaitingSample<T>| now_ns.saturating_sub(one.since_ns) > PARTNER_TIMEOUT_NS;
     let old = waiting.iter().take_while(is_old).count();
     waiting.drain(..old);
     old as u64
@@ -133,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn sample_without_partner_is_dropped_when_the_next_partner_arrives() {
+    fn drops_unpaired_sample_when_next_partner_arrives() {
         let mut join = Join::default();
         for seq in 1..=3 {
             assert_eq!(join.first(&header(1, seq), seq, 0), None);
@@ -158,13 +164,13 @@ mod tests {
     }
 
     #[test]
-    fn samples_of_a_silent_topic_are_dropped_by_time_and_number() {
+    fn unpaired_samples_are_dropped_by_age_and_count() {
         let mut join = Join::<u64, u64>::default();
         join.first(&header(1, 1), 1, 0);
         join.first(&header(1, 2), 2, 10);
-        join.expire(SILENCE_NS);
+        join.expire(PARTNER_TIMEOUT_NS);
         assert_eq!(join.dropped(), 0);
-        join.expire(SILENCE_NS + 1);
+        join.expire(PARTNER_TIMEOUT_NS + 1);
         assert_eq!((join.dropped(), join.first.len()), (1, 1));
         for seq in 3..3 + MAX_WAITING as u64 {
             join.first(&header(1, seq), seq, 20);

@@ -12,11 +12,11 @@ use scanhub_shm::Payload;
 use crate::builder::SubscriberBuilder;
 use crate::clock;
 use crate::error::Error;
-use crate::follower::{Follower, Received};
 use crate::session::Session;
 use crate::silence::Silence;
 use crate::subscribe::sealed::Sealed;
 use crate::subscribe::{ItemSource, Subscribe, Subscriber, WithTimeout};
+use crate::topic_reader::{Received, TopicReader};
 
 /// Subscribes to the topics of `sensor` that carry `A` and `B`, in the domain that SCANHUB_DOMAIN names. The samples
 /// come in pairs with the same `seq`. [`JoinedSubscriber::builder`] has options.
@@ -65,34 +65,34 @@ pub type JoinedSubscriber<A, B> = Subscriber<Joined<A, B>>;
 pub struct PairSource<A: Payload + ?Sized, B: Payload + ?Sized> {
     first: Side<A>,
     second: Side<B>,
-    discarded: Discarded,
+    discarded: DiscardedTelegrams,
     /// Whether a pair was returned before.
-    has_begun: bool,
+    has_returned_pair: bool,
 }
 
 /// State of one of the two topics.
 struct Side<P: Payload + ?Sized> {
-    follower: Follower<P>,
+    reader: TopicReader<P>,
     /// Sample without a partner, and CLOCK_MONOTONIC in ns until which it waits.
     waiting: Option<(Received<P>, u64)>,
     /// Samples since the last pair that were missed or have no partner.
-    lost: u64,
+    missed: u64,
     restarted: bool,
 }
 
 /// Telegrams since the last pair with a sample that was dropped because it had no partner.
 #[derive(Default)]
-struct Discarded {
+struct DiscardedTelegrams {
     count: u64,
     /// `boot` and `seq` of the last ones. The partner of a dropped sample can arrive too late, and is dropped, too.
     recent: VecDeque<(u64, u64)>,
 }
 
 /// Number of telegrams after which no sample arrives too late: no topic has a longer queue.
-const RECENT: usize = 128;
+const MAX_RECENT: usize = 128;
 
 /// Wait for the partner of a sample without a period, in ns.
-const NO_PERIOD_NS: u64 = 500_000_000;
+const DEFAULT_WAIT_NS: u64 = 500_000_000;
 
 impl<A: Payload + ?Sized, B: Payload + ?Sized> Sealed for Joined<A, B> {}
 
@@ -105,7 +105,7 @@ impl<A: Payload + ?Sized, B: Payload + ?Sized> Subscribe for Joined<A, B> {
 
     fn source(options: &SubscriberBuilder<Joined<A, B>>) -> PairSource<A, B> {
         let (first, second) = (Side::new(options.sensor()), Side::new(options.sensor()));
-        PairSource { first, second, discarded: Discarded::default(), has_begun: false }
+        PairSource { first, second, discarded: DiscardedTelegrams::default(), has_returned_pair: false }
     }
 }
 
@@ -113,7 +113,7 @@ impl<A: Payload + ?Sized, B: Payload + ?Sized> ItemSource for PairSource<A, B> {
     type Item = Joined<A, B>;
 
     fn subscribed(&self) -> bool {
-        self.first.follower.subscribed() && self.second.follower.subscribed()
+        self.first.reader.subscribed() && self.second.reader.subscribed()
     }
 
     /// Receives until there is a pair, or nothing more to receive.
@@ -136,14 +136,14 @@ impl<A: Payload + ?Sized, B: Payload + ?Sized> ItemSource for PairSource<A, B> {
     }
 
     /// Returns the time until a sample has waited for its partner long enough.
-    fn left(&self) -> Option<Duration> {
+    fn time_left(&self) -> Option<Duration> {
         let overdue = [self.first.overdue_ns(), self.second.overdue_ns()].into_iter().flatten().min()?;
         Some(Duration::from_nanos(overdue.saturating_sub(clock::now_ns())))
     }
 
     fn why_silent(&mut self, session: &mut Session) -> Silence {
-        match self.first.follower.why_silent(session) {
-            Silence::Waiting => self.second.follower.why_silent(session),
+        match self.first.reader.why_silent(session) {
+            Silence::Waiting => self.second.reader.why_silent(session),
             reason => reason,
         }
     }
@@ -153,9 +153,9 @@ impl<A: Payload + ?Sized, B: Payload + ?Sized> PairSource<A, B> {
     fn pair(&mut self) -> Option<Joined<A, B>> {
         let (first, second) = (self.first.waiting.take()?.0, self.second.waiting.take()?.0);
         // A telegram without a sample of one topic may have a sample of the other one, which was dropped.
-        let lost = std::mem::take(&mut self.first.lost).max(std::mem::take(&mut self.second.lost));
+        let lost = std::mem::take(&mut self.first.missed).max(std::mem::take(&mut self.second.missed));
         let lost = lost.max(std::mem::take(&mut self.discarded).count);
-        let missed = if std::mem::replace(&mut self.has_begun, true) { lost } else { 0 };
+        let missed = if std::mem::replace(&mut self.has_returned_pair, true) { lost } else { 0 };
         let restarted =
             std::mem::take(&mut self.first.restarted) | std::mem::take(&mut self.second.restarted);
         Some(Joined { first, second, missed, restarted })
@@ -164,18 +164,18 @@ impl<A: Payload + ?Sized, B: Payload + ?Sized> PairSource<A, B> {
 
 impl<P: Payload + ?Sized> Side<P> {
     fn new(sensor: &str) -> Side<P> {
-        Side { follower: Follower::new(sensor), waiting: None, lost: 0, restarted: false }
+        Side { reader: TopicReader::new(sensor), waiting: None, missed: 0, restarted: false }
     }
 
     /// Receives a sample, if none waits.
     fn fill(&mut self, session: &mut Session) -> Result<(), Error> {
         if self.waiting.is_none()
-            && let Some(sample) = self.follower.receive(session)?
+            && let Some(sample) = self.reader.receive(session)?
         {
-            self.lost += sample.missed;
+            self.missed += sample.missed;
             self.restarted |= sample.restarted;
             let period_ns = match sample.header().period_us {
-                0 => NO_PERIOD_NS,
+                0 => DEFAULT_WAIT_NS,
                 period_us => u64::from(period_us) * 1000,
             };
             self.waiting = Some((sample, clock::now_ns() + period_ns));
@@ -198,18 +198,18 @@ impl<P: Payload + ?Sized> Side<P> {
     /// Drops the sample that waits. Returns `boot` and `seq` of its telegram.
     fn discard(&mut self) -> Option<(u64, u64)> {
         let (sample, _) = self.waiting.take()?;
-        self.lost += 1;
+        self.missed += 1;
         Some((sample.header().boot, sample.header().seq))
     }
 }
 
-impl Discarded {
+impl DiscardedTelegrams {
     /// Counts `telegram` unless it was counted before.
     fn add(&mut self, telegram: (u64, u64)) {
         if self.recent.contains(&telegram) {
             return;
         }
-        if self.recent.len() == RECENT {
+        if self.recent.len() == MAX_RECENT {
             self.recent.pop_front();
         }
         self.recent.push_back(telegram);

@@ -35,12 +35,11 @@ mod builder;
 pub mod clock;
 mod control;
 mod error;
-mod follower;
+mod hub_finder;
 mod hub_monitor;
 mod join;
 mod joined;
 mod pollable;
-mod presence;
 mod publish;
 mod robot;
 mod sample;
@@ -49,28 +48,30 @@ mod silence;
 #[cfg(feature = "tokio")]
 mod stream;
 mod subscribe;
+mod topic_reader;
 mod wait;
 mod zones;
 
 pub use builder::{SubscriberBuilder, domain_candidates};
 pub use control::request;
 pub use error::{Cause, Error, ErrorKind};
-pub use follower::Received;
+pub use hub_finder::{live_sensors, live_topics};
 pub use joined::{Joined, JoinedSubscriber, joined};
 pub use pollable::PollableSubscriber;
-pub use presence::{live_sensors, live_topics};
 pub use publish::{Publication, PublishSession, SensorPublisher, publish, publish_domain};
 pub use robot::{Robot, RobotSubscriber, robot};
 pub use silence::Silence;
 pub use subscribe::{Iter, Subscribe, Subscriber, WithTimeout, subscribe};
+pub use topic_reader::Received;
 pub use wait::Wait;
-pub use zones::{Heard, ZonesSubscriber, zones};
+pub use zones::{ZonesSubscriber, ZonesUpdate, zones};
 
 /// Payload of the topic `telegram`: the bytes of a telegram.
 pub use scanhub_schema::TelegramBytes as Telegram;
 /// Types of topics and payloads, so that a program needs no other dependency.
 pub use scanhub_schema::{
-    Age, Flags, Header, Pose, Quality, ROBOT, Reasons, Request, Shown, Topic, Verb, Wake, payloads::*,
+    Age, Flags, Header, Pose, Quality, ROBOT, Reasons, Request, ResponseModel, Topic, Verb, WakeEvent,
+    payloads::*,
 };
 pub use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment};
 
@@ -122,13 +123,13 @@ impl<P: scanhub_shm::Payload + ?Sized> Payload for P {
 /// }
 /// ```
 pub mod streams {
-    pub use crate::follower::{Follower, Noted, Numbers};
+    pub use crate::hub_finder::{Change, DomainHolder, STARTUP_GRACE, find};
     pub use crate::join::Join;
-    pub use crate::presence::{Change, GRACE, Who, find};
-    pub use crate::robot::{RobotHeard, RobotSource};
+    pub use crate::robot::{RobotSource, RobotUpdate};
     pub use crate::sample::{Sample, Source};
     pub use crate::session::Session;
-    pub use crate::zones::{Freshness, ZonesSource, ZonesState};
+    pub use crate::topic_reader::{SequenceGap, SequenceTracker, TopicReader};
+    pub use crate::zones::{StalenessTimer, ZonesSource, ZonesState};
 }
 
 #[cfg(doctest)]

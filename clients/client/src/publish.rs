@@ -6,11 +6,13 @@ use std::hash::{BuildHasher, RandomState};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 
 use scanhub_schema::limits::TopicLimits;
-use scanhub_schema::{Header, Kind, Maker, Ring, Topic, Wake, check_followed, check_sensor, is_remote};
-use scanhub_shm::shortage::{check_descriptors, check_memory, longest_segment, sensor_bytes};
+use scanhub_schema::{
+    DoorbellWord, Header, Kind, PublisherKind, Topic, WakeEvent, check_any_sensor, check_sensor, is_remote,
+};
+use scanhub_shm::resource_limits::{check_descriptors, check_memory, longest_segment, sensor_bytes};
 use scanhub_shm::{
-    Domain, DueRings, Environment, ListenLock, NameLock, Payload, Role, SharedMemory, ThreadSafeService,
-    TopicPublisher, holder, name_held, publisher_domain,
+    Domain, Environment, ListenLock, NameLock, Payload, PendingWakeups, Role, SharedMemory,
+    ThreadSafeService, TopicPublisher, hub_pid, name_taken, publisher_domain,
 };
 
 use crate::builder::domain_of_process;
@@ -18,7 +20,7 @@ use crate::clock;
 use crate::error::Error;
 
 type Node = scanhub_shm::Node<ThreadSafeService>;
-type Waker = scanhub_shm::Waker<ThreadSafeService>;
+type Waker = scanhub_shm::WakeSender<ThreadSafeService>;
 
 /// Publishes the topic of `name` that carries `P`, in the domain that SCANHUB_DOMAIN names. Programs follow it by
 /// [`subscribe::<P>(name)`](crate::subscribe) while a hub or a listener runs; publishing needs neither.
@@ -32,7 +34,7 @@ type Waker = scanhub_shm::Waker<ThreadSafeService>;
 ///
 /// # Errors
 ///
-/// Returns the errors of [`PublishSession::beside`] or [`PublishSession::open`], of [`PublishSession::sensor`] and
+/// Returns the errors of [`PublishSession::open_named`] or [`PublishSession::open`], of [`PublishSession::sensor`] and
 /// [`SensorPublisher::topic`].
 ///
 /// # Examples
@@ -73,18 +75,18 @@ struct Membership {
     limits: TopicLimits,
     boot: u64,
     /// Wakers by name. A second waker of the same name would disconnect the subscribers of the first one when it ends.
-    sensors: Mutex<Vec<Weak<Awakener>>>,
+    sensors: Mutex<Vec<Weak<NameWaker>>>,
     node: Node,
     // After the node, so that the next holder of the lock finds no node of this process.
-    lock: Place,
+    lock: DomainLock,
 }
 
 /// Lock of the publishing process.
-enum Place {
+enum DomainLock {
     /// For other machines, under names with a dot.
-    Others { _lock: ListenLock },
+    RemoteSensors { _lock: ListenLock },
     /// Under a name of its own.
-    Own { name: String, _lock: NameLock },
+    OwnName { name: String, _lock: NameLock },
 }
 
 /// Checks that there is memory for `topics` of one sensor.
@@ -108,9 +110,9 @@ impl PublishSession {
     /// [`ErrorKind::OtherUser`](crate::ErrorKind) if the directory is another user's.
     pub fn open(domain: &Domain, topics: &[Topic], limits: TopicLimits) -> Result<PublishSession, Error> {
         limits.check()?;
-        let lock = Place::Others { _lock: ListenLock::acquire(domain.root())? };
+        let lock = DomainLock::RemoteSensors { _lock: ListenLock::acquire(domain.root())? };
         check_topics(topics, &limits)?;
-        Ok(PublishSession::with(domain, limits, scanhub_shm::join(domain, Role::Publisher)?, lock))
+        Ok(PublishSession::create(domain, limits, scanhub_shm::join(domain, Role::Publisher)?, lock))
     }
 
     /// Publishes as `name`. A hub or a listener may run in the same domain. Use it for results that a program computes
@@ -123,7 +125,7 @@ impl PublishSession {
     /// whose sensor it is. The message names the process. Returns [`ErrorKind::InvalidInput`](crate::ErrorKind) if the
     /// name is invalid, or if subscribers still wait for a sensor of this name after its hub has ended. Otherwise the
     /// errors of [`open`](Self::open) and [`sensor`](Self::sensor).
-    pub fn beside(
+    pub fn open_named(
         domain: &Domain,
         name: &str,
         topics: &[Topic],
@@ -131,21 +133,24 @@ impl PublishSession {
     ) -> Result<SensorPublisher, Error> {
         limits.check()?;
         check_sensor(name)?;
-        let lock = Place::Own { name: name.to_owned(), _lock: NameLock::acquire(domain.root(), name)? };
+        let lock =
+            DomainLock::OwnName { name: name.to_owned(), _lock: NameLock::acquire(domain.root(), name)? };
         check_topics(topics, &limits)?;
-        let of_hub = |(sensor, topic): &(String, Topic)| sensor == name && topic.maker() == Maker::Link;
-        if scanhub_shm::published(domain)?.iter().any(of_hub) {
+        let of_hub = |(sensor, topic): &(String, Topic)| {
+            sensor == name && topic.publisher_kind() == PublisherKind::Link
+        };
+        if scanhub_shm::published_topics(domain)?.iter().any(of_hub) {
             // A hub that is starting, or that has waited for this name, takes it now.
-            if let Some(pid) = holder(domain.root())? {
-                return Err(name_held(name, pid).into());
+            if let Some(pid) = hub_pid(domain.root())? {
+                return Err(name_taken(name, pid).into());
             }
             let what = format!("{name:?} is no name to publish under: it is a sensor of the hub");
             return Err(Error::new(Kind::Configuration, what, "any other name, for example house"));
         }
-        PublishSession::with(domain, limits, scanhub_shm::join(domain, Role::Publisher)?, lock).sensor(name)
+        PublishSession::create(domain, limits, scanhub_shm::join(domain, Role::Publisher)?, lock).sensor(name)
     }
 
-    fn with(domain: &Domain, limits: TopicLimits, node: Node, lock: Place) -> PublishSession {
+    fn create(domain: &Domain, limits: TopicLimits, node: Node, lock: DomainLock) -> PublishSession {
         node.try_cleanup_dead_nodes();
         let boot = RandomState::new().hash_one(std::process::id());
         let (domain, sensors) = (domain.clone(), Mutex::default());
@@ -177,8 +182,8 @@ impl PublishSession {
     /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory or descriptors are short;
     /// [`ErrorKind::OtherUser`](crate::ErrorKind) if the place is taken by another user.
     pub fn sensor(&self, name: &str) -> Result<SensorPublisher, Error> {
-        check_followed(name)?;
-        let is_own = matches!(&self.0.lock, Place::Own { name: own, .. } if own == name);
+        check_any_sensor(name)?;
+        let is_own = matches!(&self.0.lock, DomainLock::OwnName { name: own, .. } if own == name);
         if !is_own && !is_remote(name) {
             let what = format!("{name:?} is no name to publish under: it may be a sensor of the hub");
             return Err(Error::new(Kind::Configuration, what, "OWNER.NAME, for example tracker.near"));
@@ -191,7 +196,7 @@ impl PublishSession {
         self.check_room(&[])?;
         let waker = Waker::new(&self.0.node, name)?;
         let (name, due) = (name.to_owned(), Mutex::default());
-        let sensor = Arc::new(Awakener { name, waker, due, membership: self.0.clone() });
+        let sensor = Arc::new(NameWaker { name, waker, pending_rings: due, membership: self.0.clone() });
         sensors.push(Arc::downgrade(&sensor));
         Ok(SensorPublisher(sensor))
     }
@@ -203,13 +208,13 @@ impl PublishSession {
 }
 
 /// The topics of one name. They share the waker of their subscribers.
-pub struct SensorPublisher(Arc<Awakener>);
+pub struct SensorPublisher(Arc<NameWaker>);
 
-struct Awakener {
+struct NameWaker {
     name: String,
     waker: Waker,
     /// Rings of the samples that were sent since the last [`SensorPublisher::wake`].
-    due: Mutex<DueRings>,
+    pending_rings: Mutex<PendingWakeups>,
     membership: Arc<Membership>,
 }
 
@@ -233,7 +238,7 @@ impl SensorPublisher {
     /// Returns the errors of [`topic`](Self::topic).
     pub fn topic_for<P: Payload + ?Sized>(&self, limits: &TopicLimits) -> Result<Publication<P>, Error> {
         let Membership { domain, node, .. } = &*self.0.membership;
-        if P::TOPIC.maker() == Maker::Link && !is_remote(&self.0.name) {
+        if P::TOPIC.publisher_kind() == PublisherKind::Link && !is_remote(&self.0.name) {
             let what =
                 format!("only sensors have the topic {}, and {} is not one", P::TOPIC.name(), self.0.name);
             return Err(Error::new(
@@ -261,15 +266,18 @@ impl SensorPublisher {
     /// # Errors
     ///
     /// [`ErrorKind::Failed`](crate::ErrorKind) if some were not woken; these look by themselves ten times a second.
-    pub fn wake(&self, why: Wake) -> Result<(), Error> {
-        let mut due = std::mem::take(&mut *locked(&self.0.due));
-        Ring::ALL.into_iter().filter(|&ring| due.take(ring)).for_each(|ring| self.0.waker.ring(ring));
-        Ok(self.0.waker.tell(why)?)
+    pub fn wake(&self, why: WakeEvent) -> Result<(), Error> {
+        let mut due = std::mem::take(&mut *locked(&self.0.pending_rings));
+        DoorbellWord::ALL
+            .into_iter()
+            .filter(|&ring| due.take_due(ring))
+            .for_each(|ring| self.0.waker.ring(ring));
+        Ok(self.0.waker.notify(why)?)
     }
 
     /// Notes that `reached` subscribers have received a sample of `topic`.
     fn note(&self, topic: Topic, reached: usize) {
-        locked(&self.0.due).note(topic, reached);
+        locked(&self.0.pending_rings).note_sample(topic, reached);
     }
 }
 
@@ -288,10 +296,10 @@ impl<P: Payload + ?Sized> Publication<P> {
     /// Returns the errors of [`publish`](crate::publish).
     pub fn in_domain(domain: &Domain, name: &str) -> Result<Publication<P>, Error> {
         let (topics, limits) = ([P::TOPIC], TopicLimits::default());
-        if P::TOPIC.maker() == Maker::Link {
+        if P::TOPIC.publisher_kind() == PublisherKind::Link {
             return PublishSession::open(domain, &topics, limits)?.sensor(name)?.topic();
         }
-        PublishSession::beside(domain, name, &topics, limits)?.topic()
+        PublishSession::open_named(domain, name, &topics, limits)?.topic()
     }
 
     fn new(
@@ -328,7 +336,7 @@ impl<P: Payload + ?Sized> Publication<P> {
 
     /// Skips `count` numbers without a sample: subscribers count `count` missed samples.
     pub fn skip(&mut self, count: u64) {
-        self.topic.skip(count);
+        self.topic.skip_numbers(count);
     }
 
     /// Returns the number that the next sample will have: from 0, as they are sent.
@@ -363,7 +371,7 @@ impl<P: Payload + ?Sized> Publication<P> {
     pub fn send_len(&mut self, len: usize, fill: impl FnOnce(&mut P)) -> Result<(), Error> {
         let header = self.header();
         self.send_len_with(&header, len, fill)?;
-        self.sensor.wake(Wake::Telegram)
+        self.sensor.wake(WakeEvent::Telegram)
     }
 
     /// Sends as [`send_len`](Self::send_len), with `header` but for the sample's number in the topic, and wakes no
@@ -395,7 +403,7 @@ impl<P: Payload> Publication<P> {
     pub fn send(&mut self, fill: impl FnOnce(&mut P)) -> Result<(), Error> {
         let header = self.header();
         self.send_with(&header, fill)?;
-        self.sensor.wake(Wake::Telegram)
+        self.sensor.wake(WakeEvent::Telegram)
     }
 
     /// Sends as [`send`](Self::send) a sample that was measured at `stamp_ns` on CLOCK_MONOTONIC, such as the angle of
@@ -407,7 +415,7 @@ impl<P: Payload> Publication<P> {
     pub fn send_at(&mut self, stamp_ns: u64, fill: impl FnOnce(&mut P)) -> Result<(), Error> {
         let header = self.header_at(stamp_ns);
         self.send_with(&header, fill)?;
-        self.sensor.wake(Wake::Telegram)
+        self.sensor.wake(WakeEvent::Telegram)
     }
 
     /// Sends as [`send`](Self::send), with `header` but for the sample's number in the topic, and wakes no subscriber.
@@ -430,11 +438,11 @@ impl Publication<[u8]> {
     /// # Errors
     ///
     /// Returns the errors of [`send`](Publication::send), and [`ErrorKind::ResourceExhausted`](crate::ErrorKind) for
-    /// more than [`Telegram::MAX`](scanhub_schema::Telegram::MAX) bytes.
+    /// more than [`Telegram::MAX`](scanhub_schema::Telegram::MAX_LEN) bytes.
     pub fn send_bytes(&mut self, bytes: &[u8]) -> Result<(), Error> {
         let header = self.header();
         self.send_bytes_with(&header, bytes)?;
-        self.sensor.wake(Wake::Telegram)
+        self.sensor.wake(WakeEvent::Telegram)
     }
 
     /// Sends `bytes` with `header`, as [`send_with`](Publication::send_with).
@@ -442,7 +450,7 @@ impl Publication<[u8]> {
     /// # Errors
     ///
     /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if there is no memory for it, or it is longer than
-    /// [`Telegram::MAX`](scanhub_schema::Telegram::MAX).
+    /// [`Telegram::MAX`](scanhub_schema::Telegram::MAX_LEN).
     pub fn send_bytes_with(&mut self, header: &Header, bytes: &[u8]) -> Result<usize, Error> {
         let reached = self.topic.send_bytes(header, bytes)?;
         self.sensor.note(Topic::Telegram, reached);

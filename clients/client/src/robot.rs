@@ -7,12 +7,12 @@ use scanhub_schema::{Verdict, Zones, is_remote};
 use crate::builder::SubscriberBuilder;
 use crate::clock;
 use crate::error::Error;
-use crate::presence::{GRACE, Who};
+use crate::hub_finder::{DomainHolder, STARTUP_GRACE};
 use crate::session::Session;
 use crate::silence::Silence;
 use crate::subscribe::sealed::Sealed;
 use crate::subscribe::{ItemSource, Subscribe, Subscriber};
-use crate::zones::{Freshness, Heard, ZonesSource};
+use crate::zones::{StalenessTimer, ZonesSource, ZonesUpdate};
 
 /// Subscribes to the zones of `sensors` in the domain that SCANHUB_DOMAIN names. Without names, it follows all sensors
 /// of the hub. In a domain without a hub, it follows the sensors of other machines that are published there. The hub
@@ -86,7 +86,7 @@ impl Robot {
     /// # Panics
     ///
     /// If no sensor has this position.
-    pub fn hear(&mut self, position: usize, zones: Zones) {
+    pub fn update(&mut self, position: usize, zones: Zones) {
         self.parts[position].1 = zones;
     }
 }
@@ -112,7 +112,7 @@ impl Subscriber<Robot> {
     ///
     /// Returns the errors of [`next`](Self::next).
     pub fn now(&mut self) -> Result<&Robot, Error> {
-        self.source.hear_all(&mut self.session)?;
+        self.source.drain_and_check(&mut self.session)?;
         Ok(self.source.robot())
     }
 }
@@ -141,12 +141,12 @@ impl ItemSource for RobotSource {
         Ok(self.drain(session)?.then(|| self.robot.clone()))
     }
 
-    fn look(&mut self, session: &mut Session) -> Result<Option<Robot>, Error> {
-        Ok(self.hear_all(session)?.then(|| self.robot.clone()))
+    fn check_and_receive(&mut self, session: &mut Session) -> Result<Option<Robot>, Error> {
+        Ok(self.drain_and_check(session)?.then(|| self.robot.clone()))
     }
 
-    fn left(&self) -> Option<Duration> {
-        self.left()
+    fn time_left(&self) -> Option<Duration> {
+        self.time_left()
     }
 
     fn why_silent(&mut self, session: &mut Session) -> Silence {
@@ -160,48 +160,48 @@ pub struct RobotSource {
     robot: Robot,
     parts: Vec<ZonesSource>,
     /// Index of the sensor that is next in the round, so that no sensor waits for the samples of another one.
-    turn: usize,
+    next_part: usize,
     /// Whether each sensor has sent a sample or missed its deadline once, so that the result includes all of them.
-    begun: bool,
+    is_complete: bool,
     /// Deadline while there are no sensors.
-    nobody: Freshness,
+    no_sensors: StalenessTimer,
     /// Origin of the sensors.
-    whose: Whose,
+    origin: SensorOrigin,
     /// Time of the next search for new sensors, while a hub or a listener publishes.
-    call_at: Option<Instant>,
+    discover_at: Option<Instant>,
     /// Whether early warnings count too.
     early: bool,
 }
 
 /// Origin of the sensors of a robot.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Whose {
+enum SensorOrigin {
     /// The caller named them.
     Named,
     /// All sensors of this publisher: the first one, and the hub as soon as one runs, because the zones of another
     /// robot's sensors are around the center of that robot. After the hub has exited, its sensors are missing; no
     /// others replace them.
-    All(Option<Who>),
+    All(Option<DomainHolder>),
 }
 
 /// A sample or silence of one sensor, and what is known with it.
-pub struct RobotHeard {
+pub struct RobotUpdate {
     /// The zones of all sensors.
     pub robot: Robot,
     /// The sample or silence.
-    pub heard: Heard,
+    pub update: ZonesUpdate,
 }
 
 /// Maximum number of sensors of other machines that are followed: as many as a listener publishes at a time. None is
 /// ever removed, and a sender in its network can announce new ones without end.
-const MOST_REMOTE: usize = 16;
+const MAX_REMOTE_SENSORS: usize = 16;
 
 /// Name of an entry for the sensors of other machines that are not followed. It is always unknown. No sensor can have
 /// this name.
-const OTHERS: &str = "others...";
+const OTHERS_NAME: &str = "others...";
 
 /// Interval at which the source searches for new sensors. A hub that is starting creates its topics one after the other.
-const CALL_EVERY: Duration = Duration::from_secs(1);
+const DISCOVERY_INTERVAL: Duration = Duration::from_secs(1);
 
 impl RobotSource {
     /// Creates a source for the zones of `sensors`. If empty: all sensors, as [`robot`](robot()) does.
@@ -209,11 +209,11 @@ impl RobotSource {
         let mut source = RobotSource {
             robot: Robot::default(),
             parts: Vec::new(),
-            turn: 0,
-            begun: false,
-            nobody: Freshness::new(clock::now()),
-            whose: if sensors.is_empty() { Whose::All(None) } else { Whose::Named },
-            call_at: None,
+            next_part: 0,
+            is_complete: false,
+            no_sensors: StalenessTimer::new(clock::now()),
+            origin: if sensors.is_empty() { SensorOrigin::All(None) } else { SensorOrigin::Named },
+            discover_at: None,
             early: false,
         };
         sensors.iter().for_each(|sensor| source.follow(sensor));
@@ -244,16 +244,16 @@ impl RobotSource {
     /// # Errors
     ///
     /// Returns the errors of [`ZonesSource::receive`].
-    pub fn receive(&mut self, session: &mut Session) -> Result<Option<RobotHeard>, Error> {
-        let heard = self.hear(session)?;
-        Ok(heard.map(|heard| RobotHeard { robot: self.robot.clone(), heard }))
+    pub fn receive(&mut self, session: &mut Session) -> Result<Option<RobotUpdate>, Error> {
+        let update = self.receive_part(session)?;
+        Ok(update.map(|update| RobotUpdate { robot: self.robot.clone(), update }))
     }
 
     /// Returns the time after which [`receive`](Self::receive) returns a silence if no sample arrives.
-    pub fn left(&self) -> Option<Duration> {
+    pub fn time_left(&self) -> Option<Duration> {
         match &self.parts[..] {
-            [] => self.nobody.left(clock::now()),
-            parts => parts.iter().filter_map(ZonesSource::left).min(),
+            [] => self.no_sensors.time_left(clock::now()),
+            parts => parts.iter().filter_map(ZonesSource::time_left).min(),
         }
     }
 
@@ -264,19 +264,19 @@ impl RobotSource {
     /// Returns the errors of [`ZonesSource::receive`].
     pub fn drain(&mut self, session: &mut Session) -> Result<bool, Error> {
         let mut any = false;
-        while self.hear(session)?.is_some() {
+        while self.receive_part(session)?.is_some() {
             any = true;
         }
         Ok(any)
     }
 
     /// Takes all samples and silences, and checks for the hub. Returns whether there were any.
-    fn hear_all(&mut self, session: &mut Session) -> Result<bool, Error> {
+    fn drain_and_check(&mut self, session: &mut Session) -> Result<bool, Error> {
         // Samples that have arrived come first, as with one sensor. But a program that always finds some must also
         // notice a new hub.
-        let heard = self.drain(session)?;
-        session.look()?;
-        Ok(self.drain(session)? || heard)
+        let has_update = self.drain(session)?;
+        session.check_hub()?;
+        Ok(self.drain(session)? || has_update)
     }
 
     /// Returns the reason of the first sensor whose verdict is unknown and that has a reason. Without sensors, it is
@@ -294,70 +294,71 @@ impl RobotSource {
         reasons.find(|reason| *reason != Silence::Waiting).unwrap_or(Silence::Waiting)
     }
 
-    fn hear(&mut self, session: &mut Session) -> Result<Option<Heard>, Error> {
-        if self.gives_way_to(session.publishes()) {
-            return Ok(Some(Heard::nothing()));
+    fn receive_part(&mut self, session: &mut Session) -> Result<Option<ZonesUpdate>, Error> {
+        if self.switch_to_hub(session.domain_holder()) {
+            return Ok(Some(ZonesUpdate::silence()));
         }
         for _ in 0..self.parts.len() {
-            let turn = self.turn;
-            self.turn = (turn + 1) % self.parts.len();
-            if let Some(heard) = self.parts[turn].receive(session)? {
-                self.robot.hear(turn, heard.zones);
-                self.begun = self.begun || self.parts.iter().all(ZonesSource::has_spoken);
-                if self.begun {
-                    return Ok(Some(heard));
+            let part = self.next_part;
+            self.next_part = (part + 1) % self.parts.len();
+            if let Some(update) = self.parts[part].receive(session)? {
+                self.robot.update(part, update.zones);
+                self.is_complete = self.is_complete || self.parts.iter().all(ZonesSource::has_update);
+                if self.is_complete {
+                    return Ok(Some(update));
                 }
             }
         }
         // Last, because it takes longer than everything else.
         self.discover(session)?;
-        let silence = self.parts.is_empty() && self.nobody.silence(clock::now());
-        Ok(silence.then(Heard::nothing))
+        let silence = self.parts.is_empty() && self.no_sensors.silence(clock::now());
+        Ok(silence.then(ZonesUpdate::silence))
     }
 
     /// Forgets the sensors of other machines if a hub has started. Nothing is known until the hub's own sensors send
     /// zones. Returns whether this has just happened.
-    fn gives_way_to(&mut self, who: Option<Who>) -> bool {
-        if (self.whose, who) != (Whose::All(Some(Who::Listener)), Some(Who::Hub)) {
+    fn switch_to_hub(&mut self, holder: Option<DomainHolder>) -> bool {
+        if (self.origin, holder) != (SensorOrigin::All(Some(DomainHolder::Listener)), Some(DomainHolder::Hub))
+        {
             return false;
         }
-        (self.robot, self.parts, self.turn, self.begun) = (Robot::default(), Vec::new(), 0, false);
-        (self.whose, self.call_at) = (Whose::All(Some(Who::Hub)), None);
+        (self.robot, self.parts, self.next_part, self.is_complete) = (Robot::default(), Vec::new(), 0, false);
+        (self.origin, self.discover_at) = (SensorOrigin::All(Some(DomainHolder::Hub)), None);
         true
     }
 
     /// Adds the sensors that exist and are not followed yet. Sensors that no longer exist stay, so that the user sees
     /// that they are missing.
     fn discover(&mut self, session: &Session) -> Result<(), Error> {
-        let (Whose::All(whose), Some(domain)) = (self.whose, session.domain()) else {
-            self.call_at = None;
+        let (SensorOrigin::All(holder), Some(domain)) = (self.origin, session.domain()) else {
+            self.discover_at = None;
             return Ok(());
         };
         let now = Instant::now();
-        if now < *self.call_at.get_or_insert(now + GRACE / 2) {
+        if now < *self.discover_at.get_or_insert(now + STARTUP_GRACE / 2) {
             return Ok(());
         }
-        self.call_at = Some(now + CALL_EVERY);
-        let whose = whose.or(session.publishes());
-        let is_followed = |sensor: &String| is_remote(sensor) == (whose == Some(Who::Listener));
+        self.discover_at = Some(now + DISCOVERY_INTERVAL);
+        let holder = holder.or(session.domain_holder());
+        let is_followed = |sensor: &String| is_remote(sensor) == (holder == Some(DomainHolder::Listener));
         for sensor in scanhub_shm::sensors_with_zones(domain)?.into_iter().filter(is_followed) {
-            self.whose = Whose::All(whose);
-            self.meet(&sensor);
+            self.origin = SensorOrigin::All(holder);
+            self.add_sensor(&sensor);
         }
         Ok(())
     }
 
-    /// Follows `sensor`, if it is not followed yet. If there are too many sensors of other machines, [`OTHERS`]
+    /// Follows `sensor`, if it is not followed yet. If there are too many sensors of other machines, [`OTHERS_NAME`]
     /// represents the rest; it never has data.
-    fn meet(&mut self, sensor: &str) {
+    fn add_sensor(&mut self, sensor: &str) {
         let is_known = |name: &str| self.robot.sensors().any(|(known, _)| known == name);
         if is_known(sensor) {
             return;
         }
-        if !is_remote(sensor) || self.parts.len() < MOST_REMOTE {
+        if !is_remote(sensor) || self.parts.len() < MAX_REMOTE_SENSORS {
             self.follow(sensor);
-        } else if !is_known(OTHERS) {
-            self.robot.expect(OTHERS);
+        } else if !is_known(OTHERS_NAME) {
+            self.robot.expect(OTHERS_NAME);
         }
     }
 
@@ -375,39 +376,42 @@ mod tests {
     #[test]
     fn remote_sensors_without_number_are_one_unknown_part() {
         let mut source = RobotSource::new(&[]);
-        source.whose = Whose::All(Some(Who::Listener));
+        source.origin = SensorOrigin::All(Some(DomainHolder::Listener));
         for n in 0..1000 {
-            source.meet(&format!("robot{n}.front"));
-            source.meet("robot0.front");
+            source.add_sensor(&format!("robot{n}.front"));
+            source.add_sensor("robot0.front");
         }
-        assert_eq!((source.parts.len(), source.robot.parts.len()), (MOST_REMOTE, MOST_REMOTE + 1));
-        for (name, zones) in source.robot.parts.iter_mut().filter(|(name, _)| name != OTHERS) {
+        assert_eq!(
+            (source.parts.len(), source.robot.parts.len()),
+            (MAX_REMOTE_SENSORS, MAX_REMOTE_SENSORS + 1)
+        );
+        for (name, zones) in source.robot.parts.iter_mut().filter(|(name, _)| name != OTHERS_NAME) {
             assert!(is_remote(name));
             zones.verdict = Verdict::Clear as u8;
         }
-        assert_eq!((source.robot.verdict(), source.robot.worst()), (Verdict::Unknown, Some(OTHERS)));
-        assert!(scanhub_schema::check_followed(OTHERS).is_err(), "no sensor has its name");
+        assert_eq!((source.robot.verdict(), source.robot.worst()), (Verdict::Unknown, Some(OTHERS_NAME)));
+        assert!(scanhub_schema::check_any_sensor(OTHERS_NAME).is_err(), "no sensor has its name");
         // A hub's own sensors are as many as its configuration says.
         let mut source = RobotSource::new(&[]);
-        (0..40).for_each(|n| source.meet(&format!("front{n}")));
+        (0..40).for_each(|n| source.add_sensor(&format!("front{n}")));
         assert_eq!(source.parts.len(), 40);
     }
 
     #[test]
-    fn remote_sensors_give_way_to_the_hub_and_never_the_hub_to_them() {
+    fn remote_sensors_yield_to_a_hub_but_not_vice_versa() {
         let mut source = RobotSource::new(&[]);
-        assert!(!source.gives_way_to(Some(Who::Hub)), "nobody is followed yet");
-        source.whose = Whose::All(Some(Who::Listener));
+        assert!(!source.switch_to_hub(Some(DomainHolder::Hub)), "nobody is followed yet");
+        source.origin = SensorOrigin::All(Some(DomainHolder::Listener));
         source.follow("robot1.front");
-        source.begun = true;
-        assert!(!source.gives_way_to(None) && !source.gives_way_to(Some(Who::Listener)));
-        assert!(source.gives_way_to(Some(Who::Hub)));
-        assert!(source.robot().sensors().next().is_none() && !source.begun, "nothing is known");
-        for who in [Some(Who::Hub), None, Some(Who::Listener), Some(Who::Hub)] {
-            assert!(!source.gives_way_to(who));
-            assert_eq!(source.whose, Whose::All(Some(Who::Hub)));
+        source.is_complete = true;
+        assert!(!source.switch_to_hub(None) && !source.switch_to_hub(Some(DomainHolder::Listener)));
+        assert!(source.switch_to_hub(Some(DomainHolder::Hub)));
+        assert!(source.robot().sensors().next().is_none() && !source.is_complete, "nothing is known");
+        for holder in [Some(DomainHolder::Hub), None, Some(DomainHolder::Listener), Some(DomainHolder::Hub)] {
+            assert!(!source.switch_to_hub(holder));
+            assert_eq!(source.origin, SensorOrigin::All(Some(DomainHolder::Hub)));
         }
         let mut named = RobotSource::new(&["robot1.front"]);
-        assert!(!named.gives_way_to(Some(Who::Hub)), "whoever names a sensor means it");
+        assert!(!named.switch_to_hub(Some(DomainHolder::Hub)), "whoever names a sensor means it");
     }
 }

@@ -3,22 +3,22 @@
 use std::time::Duration;
 
 use bytemuck::bytes_of;
-use scanhub_schema::datagram::Packed;
+use scanhub_schema::datagram::DatagramPayload;
 use scanhub_schema::{Header, ROBOT, Topic};
 use scanhub_shm::Payload;
 
 use crate::error::Error;
-use crate::follower::Received;
-use crate::robot::{RobotHeard, RobotSource};
+use crate::robot::{RobotSource, RobotUpdate};
 use crate::session::Session;
 use crate::silence::Silence;
 use crate::subscribe::Subscribe;
-use crate::zones::{Heard, ZonesSource};
+use crate::topic_reader::Received;
+use crate::zones::{ZonesSource, ZonesUpdate};
 
 /// Kind of the subscriber of a topic: zones expire, other samples do not.
 macro_rules! kind {
     (Zones $payload:tt) => {
-        Heard
+        ZonesUpdate
     };
     ($topic:ident $payload:tt) => {
         scanhub_schema::payload_type!($payload)
@@ -32,7 +32,7 @@ macro_rules! samples {
         pub enum Sample {
             $(#[doc = $about] $topic(<kind!($topic $payload) as Subscribe>::Item),)*
             /// The combined zones of a robot's sensors.
-            Robot(RobotHeard),
+            Robot(RobotUpdate),
         }
 
         impl Sample {
@@ -68,7 +68,7 @@ macro_rules! samples {
                 }
             }
 
-            /// Returns why no sample arrives, as [`Follower::why_silent`](crate::streams::Follower::why_silent)
+            /// Returns why no sample arrives, as [`TopicReader::why_silent`](crate::streams::TopicReader::why_silent)
             /// does.
             pub fn why_silent(&mut self, session: &mut Session) -> Silence {
                 match self {
@@ -81,7 +81,7 @@ macro_rules! samples {
             ///
             /// # Errors
             ///
-            /// Returns the errors of [`Follower::receive`](crate::streams::Follower::receive).
+            /// Returns the errors of [`TopicReader::receive`](crate::streams::TopicReader::receive).
             pub fn receive(&mut self, session: &mut Session) -> Result<Option<Sample>, Error> {
                 Ok(match self {
                     $(Source::$topic(source) => source.receive(session)?.map(Sample::$topic),)*
@@ -105,10 +105,10 @@ impl Source {
     }
 
     /// Returns the time after which the source may report a silence. `None` if it reports no silences.
-    pub fn left(&self) -> Option<Duration> {
+    pub fn time_left(&self) -> Option<Duration> {
         match self {
-            Source::Zones(source) => source.left(),
-            Source::Robot(source) => source.left(),
+            Source::Zones(source) => source.time_left(),
+            Source::Robot(source) => source.time_left(),
             _ => None,
         }
     }
@@ -131,7 +131,7 @@ impl Sample {
     }
 
     /// Returns whether the sample was sent before `since_ns` of CLOCK_MONOTONIC, so that it waited for this subscriber.
-    pub fn is_of_before(&self, since_ns: u64) -> bool {
+    pub fn is_older_than(&self, since_ns: u64) -> bool {
         self.header().is_some_and(|header| header.stamp_last_ns < since_ns)
     }
 
@@ -152,9 +152,9 @@ impl Sample {
     }
 
     /// Writes it as [`pack`](Self::pack) does, zones as the hub said them: however old they were on arrival here.
-    pub fn pack_said(&self, room: &mut [u8]) -> Option<usize> {
+    pub fn pack_as_published(&self, room: &mut [u8]) -> Option<usize> {
         match self {
-            Sample::Zones(sample) => sample.said.pack(room),
+            Sample::Zones(sample) => sample.as_published.pack(room),
             other => other.pack(room),
         }
     }
@@ -168,7 +168,7 @@ trait AnySample {
     fn pack(&self, room: &mut [u8]) -> Option<usize>;
 }
 
-impl<P: Payload + Packed + ?Sized> AnySample for Received<P> {
+impl<P: Payload + DatagramPayload + ?Sized> AnySample for Received<P> {
     fn header(&self) -> Option<&Header> {
         Some(self.header())
     }
@@ -186,7 +186,7 @@ impl<P: Payload + Packed + ?Sized> AnySample for Received<P> {
     }
 }
 
-impl AnySample for Heard {
+impl AnySample for ZonesUpdate {
     fn header(&self) -> Option<&Header> {
         self.header.as_ref()
     }
@@ -204,20 +204,20 @@ impl AnySample for Heard {
     }
 }
 
-impl AnySample for RobotHeard {
+impl AnySample for RobotUpdate {
     fn header(&self) -> Option<&Header> {
-        self.heard.header.as_ref()
+        self.update.header.as_ref()
     }
 
     fn missed(&self) -> u64 {
-        self.heard.missed
+        self.update.missed
     }
 
     fn bytes(&self) -> &[u8] {
-        bytes_of(&self.heard.zones)
+        bytes_of(&self.update.zones)
     }
 
     fn pack(&self, room: &mut [u8]) -> Option<usize> {
-        self.heard.zones.pack(room)
+        self.update.zones.pack(room)
     }
 }

@@ -12,41 +12,41 @@ use rustix::time::{
     Itimerspec, TimerfdClockId, TimerfdFlags, TimerfdTimerFlags, Timespec, timerfd_create, timerfd_settime,
 };
 use scanhub_schema::{Kind, Topic};
-use scanhub_shm::{Domain, Node, Payload, Role, Subscriber, ThreadSafeService, holder, is_starting};
+use scanhub_shm::{Domain, Node, Payload, Role, Subscriber, ThreadSafeService, hub_pid, is_starting};
 
 use crate::clock;
 use crate::error::Error;
+use crate::hub_finder::{Change, DomainHolder, HubFinder};
 use crate::hub_monitor::HubMonitor;
-use crate::presence::{Change, Presence, Who};
 use crate::silence::Silence;
 use crate::wait::{Wait, Wakeups};
 
 /// Maximum wait. After it, the session looks for the hub, and the caller can stop.
-const LONGEST_WAIT: Duration = Duration::from_millis(100);
+const MAX_WAIT: Duration = Duration::from_millis(100);
 
 /// Interval at which a program that polls the descriptor checks a running hub. An event reports the next hub.
-const MAKE_SURE_EVERY: Duration = Duration::from_secs(1);
+const HUB_CHECK_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Membership in the first of several domains where a hub runs.
 pub struct Session {
-    presence: Presence,
-    joined: Option<Joined>,
+    finder: HubFinder,
+    joined: Option<JoinedDomain>,
     /// Whether a hub has started, and its shared memory may have other names than those that were joined.
     is_unsure: bool,
-    number: u32,
+    join_count: u32,
     /// Number of hubs or listeners that have started.
-    starts: u32,
+    start_count: u32,
     wait: Wait,
     /// CLOCK_BOOTTIME at the last sample, or at the creation, in ns.
-    heard_ns: u64,
+    last_sample_ns: u64,
     /// For programs that poll the descriptor.
-    readiness: Option<Readiness>,
+    poll_descriptor: Option<PollDescriptor>,
     /// Time until which the caller looks ten times a second: the hub creates its topics one after the other, and sends
     /// samples to late joiners without an event.
     quick_until: Option<Instant>,
 }
 
-struct Joined {
+struct JoinedDomain {
     domain: Domain,
     wakeups: Wakeups,
     node: Node<ThreadSafeService>,
@@ -54,22 +54,22 @@ struct Joined {
 
 impl Session {
     /// Creates a session that joins the first live one of `places`, as soon as there is one.
-    pub fn new(places: Vec<Domain>) -> Session {
+    pub fn new(locations: Vec<Domain>) -> Session {
         Session {
-            presence: Presence::new(places),
+            finder: HubFinder::new(locations),
             joined: None,
             is_unsure: false,
-            number: 0,
-            starts: 0,
+            join_count: 0,
+            start_count: 0,
             wait: Wait::default(),
-            heard_ns: clock::boottime_ns(),
-            readiness: None,
+            last_sample_ns: clock::boottime_ns(),
+            poll_descriptor: None,
             quick_until: None,
         }
     }
 
     /// Sets the method by which the session waits. Call it before anything is followed.
-    pub fn by(self, wait: Wait) -> Session {
+    pub fn waiting_by(self, wait: Wait) -> Session {
         Session { wait, ..self }
     }
 
@@ -79,38 +79,38 @@ impl Session {
     ///
     /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory or descriptors are short. A session that has joined
     /// already continues without this check.
-    pub fn look(&mut self) -> Result<Change, Error> {
-        if self.joined.as_mut().is_some_and(|joined| joined.wakeups.take_rang()) {
-            self.presence.heard();
+    pub fn check_hub(&mut self) -> Result<Change, Error> {
+        if self.joined.as_mut().is_some_and(|joined| joined.wakeups.take_activity()) {
+            self.finder.note_ring();
         }
-        let change = self.presence.look();
+        let change = self.finder.check();
         if let Some(joined) = self.joined.as_mut().filter(|_| change != Change::default()) {
-            joined.wakeups.renew();
+            joined.wakeups.close_doorbells();
         }
-        let Some(domain) = self.presence.domain() else {
-            return match self.presence.short() {
+        let Some(domain) = self.finder.domain() else {
+            return match self.finder.shortage() {
                 Some(short) if self.joined.is_none() => Err(short.into()),
                 _ => Ok(change),
             };
         };
-        if change.back.is_some() {
+        if change.started.is_some() {
             self.is_unsure = true;
-            self.starts += 1;
-            self.quick_until = Some(Instant::now() + 2 * MAKE_SURE_EVERY);
+            self.start_count += 1;
+            self.quick_until = Some(Instant::now() + 2 * HUB_CHECK_INTERVAL);
         }
         let is_here = self.joined.as_ref().is_some_and(|joined| joined.domain == *domain);
         if is_here && !self.is_unsure {
             return Ok(change);
         }
         // If all processes have left the domain, the shared memory of the next hub has other names.
-        let is_member = |joined: &Joined| scanhub_shm::is_member(&joined.node, domain.root());
+        let is_member = |joined: &JoinedDomain| scanhub_shm::is_member(&joined.node, domain.root());
         match self.joined.as_ref().filter(|_| is_here).map(is_member).transpose()? {
             Some(true) => {}
             _ => match scanhub_shm::join(domain, Role::Subscriber) {
                 Ok(node) => {
-                    let (domain, wakeups) = (domain.clone(), Wakeups::by(self.wait));
-                    self.joined = Some(Joined { domain, wakeups, node });
-                    self.number += 1;
+                    let (domain, wakeups) = (domain.clone(), Wakeups::waiting_by(self.wait));
+                    self.joined = Some(JoinedDomain { domain, wakeups, node });
+                    self.join_count += 1;
                 }
                 // It is just starting or ending: the next look decides.
                 Err(failure) if failure.kind == Kind::NoHub => return Ok(change),
@@ -123,28 +123,28 @@ impl Session {
 
     /// Returns the domain of the hub or listener, if one runs.
     pub fn domain(&self) -> Option<&Domain> {
-        self.presence.domain()
+        self.finder.domain()
     }
 
     /// Returns who publishes there, as of the last look.
-    pub fn publishes(&self) -> Option<Who> {
-        self.presence.who()
+    pub fn domain_holder(&self) -> Option<DomainHolder> {
+        self.finder.holder()
     }
 
     /// Notes that a sample was received.
-    pub(crate) fn heard(&mut self) {
-        self.heard_ns = clock::boottime_ns();
+    pub(crate) fn note_sample(&mut self) {
+        self.last_sample_ns = clock::boottime_ns();
     }
 
     /// Returns the time since a sample of any source was received; if there was none, since the session was created.
     /// Time during which the machine was suspended counts.
     pub fn silent_for(&self) -> Duration {
-        Duration::from_nanos(clock::boottime_ns().saturating_sub(self.heard_ns))
+        Duration::from_nanos(clock::boottime_ns().saturating_sub(self.last_sample_ns))
     }
 
     /// Returns whether a hub runs, and not only a listener that publishes the sensors of other machines.
-    pub fn hub_lives(&self) -> bool {
-        self.domain().is_some_and(|domain| matches!(holder(domain.root()), Ok(Some(_))))
+    pub fn hub_is_running(&self) -> bool {
+        self.domain().is_some_and(|domain| matches!(hub_pid(domain.root()), Ok(Some(_))))
     }
 
     /// Returns whether there is a hub that does not have all its topics yet.
@@ -154,27 +154,27 @@ impl Session {
 
     /// Returns the failure for callers that cannot wait for a hub.
     pub fn no_hub(&self) -> Error {
-        self.presence.no_hub()
+        self.finder.no_hub()
     }
 
     /// Returns [`Session::no_hub`] without the hubs of other users and domains, for readers on other machines.
     pub fn no_hub_here(&self) -> Error {
-        self.presence.no_hub_here()
+        self.finder.no_hub_here()
     }
 
     /// Returns why no hub runs, as of the last look.
-    pub(crate) fn absence(&self) -> Silence {
-        self.presence.absence()
+    pub(crate) fn silence_reason(&self) -> Silence {
+        self.finder.silence_reason()
     }
 
     /// Counts the domains joined: ports of an earlier one must be opened again.
-    pub fn number(&self) -> u32 {
-        self.number
+    pub fn join_count(&self) -> u32 {
+        self.join_count
     }
 
     /// Counts the starts of a hub or listener that the looks have shown. A session can stay in the domain meanwhile.
-    pub(crate) fn starts(&self) -> u32 {
-        self.starts
+    pub(crate) fn start_count(&self) -> u32 {
+        self.start_count
     }
 
     /// Returns the node of the domain that the session has joined last.
@@ -193,19 +193,19 @@ impl Session {
         &mut self,
         sensor: &str,
     ) -> Result<Option<Subscriber<P, ThreadSafeService>>, Error> {
-        let (Some(_), Some(joined)) = (self.presence.domain(), &mut self.joined) else {
+        let (Some(_), Some(joined)) = (self.finder.domain(), &mut self.joined) else {
             return Ok(None);
         };
         if !joined.wakeups.add(&joined.node, sensor, P::TOPIC)? {
             return Ok(None);
         }
-        if let Some(readiness) = &self.readiness {
-            joined.wakeups.descriptors().try_for_each(|event| readiness.add(event))?;
+        if let Some(poll_descriptor) = &self.poll_descriptor {
+            joined.wakeups.descriptors().try_for_each(|event| poll_descriptor.add(event))?;
         }
         let subscriber =
             P::open(&joined.node, sensor)?.map(|topic| P::subscriber(&joined.node, &topic)).transpose()?;
         if subscriber.is_some() {
-            self.quick_until = Some(Instant::now() + MAKE_SURE_EVERY);
+            self.quick_until = Some(Instant::now() + HUB_CHECK_INTERVAL);
         }
         Ok(subscriber)
     }
@@ -213,13 +213,13 @@ impl Session {
     /// Returns a value that stays the same until a sample of the `sensor`'s `topic` may have been sent. `None` if that
     /// is unknown. The hub sends samples to late joiners without ringing the bell, so each check for the hub changes
     /// the value.
-    pub fn moment(&self, sensor: &str, topic: Topic) -> Option<(u32, Instant)> {
-        let rung = self.joined.as_ref()?.wakeups.rung(sensor, topic)?;
-        Some((rung, self.presence.looked_at()?))
+    pub fn sample_mark(&self, sensor: &str, topic: Topic) -> Option<(u32, Instant)> {
+        let rung = self.joined.as_ref()?.wakeups.ring_count(sensor, topic)?;
+        Some((rung, self.finder.checked_at()?))
     }
 
     /// Returns a descriptor that is readable while there may be something to receive or to check. The session waits by
-    /// event from now on. The descriptor stays the same when the hub is replaced. Only [`settle`](Self::settle) makes
+    /// event from now on. The descriptor stays the same when the hub is replaced. Only [`rearm_descriptor`](Self::rearm_descriptor) makes
     /// it unreadable. Call this before anything is followed.
     ///
     /// # Errors
@@ -227,9 +227,9 @@ impl Session {
     /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if descriptors have run out.
     pub fn pollable(&mut self) -> Result<Arc<OwnedFd>, Error> {
         self.wait = Wait::Event;
-        let readiness = Readiness::new()?;
-        let descriptor = readiness.descriptor.clone();
-        self.readiness = Some(readiness);
+        let poll_descriptor = PollDescriptor::new()?;
+        let descriptor = poll_descriptor.descriptor.clone();
+        self.poll_descriptor = Some(poll_descriptor);
         Ok(descriptor)
     }
 
@@ -240,23 +240,23 @@ impl Session {
     /// # Errors
     ///
     /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if the system cannot wait.
-    pub fn settle(&mut self, left: Option<Duration>) -> Result<bool, Error> {
-        let Some(readiness) = &mut self.readiness else { return Ok(false) };
-        let is_changed = match self.presence.pid() {
-            Some(pid) => readiness.monitor.watch_hub(pid),
-            None => readiness.monitor.watch_directories(self.presence.places()),
+    pub fn rearm_descriptor(&mut self, left: Option<Duration>) -> Result<bool, Error> {
+        let Some(poll_descriptor) = &mut self.poll_descriptor else { return Ok(false) };
+        let is_changed = match self.finder.pid() {
+            Some(pid) => poll_descriptor.monitor.watch_hub(pid),
+            None => poll_descriptor.monitor.watch_directories(self.finder.locations()),
         };
         if is_changed {
-            self.presence.expire();
+            self.finder.expire();
             return Ok(true);
         }
-        let pace = match self.presence.pid() {
-            Some(_) if self.quick_until.is_some_and(|until| Instant::now() < until) => Some(LONGEST_WAIT),
-            Some(_) => Some(MAKE_SURE_EVERY),
-            None if self.presence.short().is_some() => Some(LONGEST_WAIT),
-            None => Some(readiness.monitor.interval()),
+        let interval = match self.finder.pid() {
+            Some(_) if self.quick_until.is_some_and(|until| Instant::now() < until) => Some(MAX_WAIT),
+            Some(_) => Some(HUB_CHECK_INTERVAL),
+            None if self.finder.shortage().is_some() => Some(MAX_WAIT),
+            None => Some(poll_descriptor.monitor.interval()),
         };
-        readiness.again_in(pace.into_iter().chain(left).min())?;
+        poll_descriptor.set_timer(interval.into_iter().chain(left).min())?;
         Ok(self.joined.as_mut().map_or(Ok(false), |joined| joined.wakeups.take())?)
     }
 
@@ -276,11 +276,11 @@ impl Session {
     ///
     /// Returns the errors of [`wait`](Self::wait).
     pub fn wait_for(&mut self, left: Option<Duration>) -> Result<(), Error> {
-        let left = left.map_or(LONGEST_WAIT, |left| left.min(LONGEST_WAIT));
+        let left = left.map_or(MAX_WAIT, |left| left.min(MAX_WAIT));
         // This takes events that a program that polls has not seen, so the descriptor stays readable until it is
         // settled.
-        if let Some(readiness) = &self.readiness {
-            readiness.again_in(Some(Duration::ZERO))?;
+        if let Some(poll_descriptor) = &self.poll_descriptor {
+            poll_descriptor.set_timer(Some(Duration::ZERO))?;
         }
         match &mut self.joined {
             Some(joined) => Ok(joined.wakeups.wait(&joined.node, left)?),
@@ -294,23 +294,24 @@ impl Session {
 
 /// Descriptor for programs that also wait for other things: an epoll over a timer, the events of each hub, and the
 /// start and end of hubs. It is readable while there may be something to receive or to check.
-struct Readiness {
+struct PollDescriptor {
     descriptor: Arc<OwnedFd>,
-    clock: OwnedFd,
+    timer: OwnedFd,
     monitor: HubMonitor,
 }
 
-impl Readiness {
+impl PollDescriptor {
     /// Creates a descriptor that is readable at once. Fails with [`ErrorKind::ResourceExhausted`](crate::ErrorKind)
     /// without free descriptors.
-    fn new() -> Result<Readiness, Error> {
+    fn new() -> Result<PollDescriptor, Error> {
         let flags = TimerfdFlags::NONBLOCK | TimerfdFlags::CLOEXEC;
-        let clock = timerfd_create(TimerfdClockId::Monotonic, flags).map_err(short)?;
-        let descriptor = Arc::new(epoll::create(epoll::CreateFlags::CLOEXEC).map_err(short)?);
-        let readiness = Readiness { monitor: HubMonitor::new(descriptor.clone()), descriptor, clock };
-        readiness.add(readiness.clock.as_fd())?;
-        readiness.again_in(Some(Duration::ZERO))?;
-        Ok(readiness)
+        let timer = timerfd_create(TimerfdClockId::Monotonic, flags).map_err(shortage)?;
+        let descriptor = Arc::new(epoll::create(epoll::CreateFlags::CLOEXEC).map_err(shortage)?);
+        let poll_descriptor =
+            PollDescriptor { monitor: HubMonitor::new(descriptor.clone()), descriptor, timer };
+        poll_descriptor.add(poll_descriptor.timer.as_fd())?;
+        poll_descriptor.set_timer(Some(Duration::ZERO))?;
+        Ok(poll_descriptor)
     }
 
     /// Adds `event`, if it is new. The kernel removes it when it is closed. Fails with
@@ -319,23 +320,24 @@ impl Readiness {
         let data = epoll::EventData::new_u64(0);
         match epoll::add(&self.descriptor, event, data, epoll::EventFlags::IN) {
             Ok(()) | Err(Errno::EXIST) => Ok(()),
-            Err(error) => Err(short(error)),
+            Err(error) => Err(shortage(error)),
         }
     }
 
     /// Sets the timer: it makes the descriptor readable after `left`, or never.
-    fn again_in(&self, left: Option<Duration>) -> Result<(), Error> {
+    fn set_timer(&self, left: Option<Duration>) -> Result<(), Error> {
         // 0 means never.
         let left = left.map_or(Duration::ZERO, |left| left.max(Duration::from_nanos(1)));
         let it_value = Timespec { tv_sec: left.as_secs() as i64, tv_nsec: left.subsec_nanos().into() };
         let once = Itimerspec { it_interval: Timespec { tv_sec: 0, tv_nsec: 0 }, it_value };
-        timerfd_settime(&self.clock, TimerfdTimerFlags::empty(), &once).map(|_| ()).map_err(short)
+        timerfd_settime(&self.timer, TimerfdTimerFlags::empty(), &once).map(|_| ()).map_err(shortage)
     }
 }
 
-fn short(error: Errno) -> Error {
+fn shortage(error: Errno) -> Error {
     let what = format!("no descriptor to wait on: {error}");
-    Error::new(Kind::Short, what, "`ulimit -n` may be too small").with_source(io::Error::from(error))
+    Error::new(Kind::ResourceExhausted, what, "`ulimit -n` may be too small")
+        .with_source(io::Error::from(error))
 }
 
 #[cfg(test)]
@@ -344,27 +346,27 @@ mod tests {
     use rustix::event::{PollFd, PollFlags, poll};
     use std::io::{Write, pipe};
 
-    fn is_readable(readiness: &Readiness, within: Duration) -> bool {
-        let mut fds = [PollFd::new(&readiness.descriptor, PollFlags::IN)];
+    fn is_readable(poll_descriptor: &PollDescriptor, within: Duration) -> bool {
+        let mut fds = [PollFd::new(&poll_descriptor.descriptor, PollFlags::IN)];
         let within = Timespec { tv_sec: within.as_secs() as i64, tv_nsec: within.subsec_nanos().into() };
         poll(&mut fds, Some(&within)).unwrap() == 1
     }
 
-    const LONG: Duration = Duration::from_secs(20);
+    const TEST_TIMEOUT: Duration = Duration::from_secs(20);
 
     #[test]
     fn the_time_makes_it_readable_once() {
-        let readiness = Readiness::new().unwrap();
-        assert!(is_readable(&readiness, LONG), "nobody has looked yet");
-        readiness.again_in(Some(LONG)).unwrap();
-        assert!(!is_readable(&readiness, Duration::ZERO));
-        readiness.again_in(Some(Duration::from_millis(1))).unwrap();
-        assert!(is_readable(&readiness, LONG));
+        let poll_descriptor = PollDescriptor::new().unwrap();
+        assert!(is_readable(&poll_descriptor, TEST_TIMEOUT), "nobody has looked yet");
+        poll_descriptor.set_timer(Some(TEST_TIMEOUT)).unwrap();
+        assert!(!is_readable(&poll_descriptor, Duration::ZERO));
+        poll_descriptor.set_timer(Some(Duration::from_millis(1))).unwrap();
+        assert!(is_readable(&poll_descriptor, TEST_TIMEOUT));
     }
 
     #[test]
-    fn a_shortage_has_the_error_of_the_system_as_its_source() {
-        let error = short(Errno::MFILE);
+    fn resource_exhaustion_has_the_os_error_as_source() {
+        let error = shortage(Errno::MFILE);
         assert_eq!(error.kind(), crate::ErrorKind::ResourceExhausted);
         let source = std::error::Error::source(&error).and_then(|source| source.downcast_ref::<io::Error>());
         assert_eq!(source.and_then(io::Error::raw_os_error), Some(Errno::MFILE.raw_os_error()));
@@ -372,15 +374,15 @@ mod tests {
 
     #[test]
     fn events_come_and_go() {
-        let readiness = Readiness::new().unwrap();
-        readiness.again_in(Some(LONG)).unwrap();
+        let poll_descriptor = PollDescriptor::new().unwrap();
+        poll_descriptor.set_timer(Some(TEST_TIMEOUT)).unwrap();
         let (read, mut write) = pipe().unwrap();
         for _ in 0..2 {
-            readiness.add(read.as_fd()).unwrap();
+            poll_descriptor.add(read.as_fd()).unwrap();
         }
         write.write_all(b"!").unwrap();
-        assert!(is_readable(&readiness, LONG));
+        assert!(is_readable(&poll_descriptor, TEST_TIMEOUT));
         drop(read);
-        assert!(!is_readable(&readiness, Duration::ZERO));
+        assert!(!is_readable(&poll_descriptor, Duration::ZERO));
     }
 }

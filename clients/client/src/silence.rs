@@ -2,13 +2,13 @@
 
 use std::fmt;
 
-use scanhub_schema::{Failure, Kind, Maker, Printable, State, Status, Topic};
+use scanhub_schema::{Failure, Kind, Printable, PublisherKind, State, Status, Topic};
 use scanhub_shm::{Domain, Node, Payload, PortFactory, ThreadSafeService};
 
 use crate::error::Error;
-use crate::follower::Follower;
-use crate::presence::Who;
+use crate::hub_finder::DomainHolder;
 use crate::session::Session;
+use crate::topic_reader::TopicReader;
 
 /// Reason why a subscriber receives no samples. `Display` writes one line; [`Silence::remedy`] returns what the user
 /// can do about it.
@@ -80,9 +80,9 @@ pub enum Silence {
 impl Silence {
     /// Returns the reason if the hub is missing, or if memory or descriptors are too short to find it.
     pub(crate) fn of_hub(session: &mut Session) -> Option<Silence> {
-        match session.look() {
+        match session.check_hub() {
             Err(error) => Some(Silence::of_shortage(&error)),
-            Ok(_) => session.domain().is_none().then(|| session.absence()),
+            Ok(_) => session.domain().is_none().then(|| session.silence_reason()),
         }
     }
 
@@ -121,9 +121,9 @@ impl Silence {
     /// Returns the reason for a robot that follows all sensors and has found none.
     pub(crate) fn of_all_sensors(session: &Session) -> Silence {
         // A listener publishes a sensor as soon as another machine sends it.
-        let is_complete = session.publishes() == Some(Who::Hub) && !session.hub_is_starting();
+        let is_complete = session.domain_holder() == Some(DomainHolder::Hub) && !session.hub_is_starting();
         let Some(domain) = session.domain().filter(|_| is_complete) else { return Silence::Waiting };
-        match scanhub_shm::published(domain) {
+        match scanhub_shm::published_topics(domain) {
             Ok(published) if published.iter().any(|(_, topic)| *topic == Topic::Zones) => Silence::Waiting,
             Ok(published) => Silence::UnknownSensor { sensor: String::new(), sensors: names(&published) },
             Err(failure) => Silence::of_shortage(&failure.into()),
@@ -184,28 +184,28 @@ pub(crate) struct SilenceCheck {
 
 /// Status of the sensor.
 struct SensorStatus {
-    follower: Follower<Status>,
+    reader: TopicReader<Status>,
     last: Option<Status>,
     /// The session's count of starts with the hub that publishes it.
-    starts: u32,
+    start_count: u32,
 }
 
 impl SilenceCheck {
-    /// Returns why `follower` receives nothing. Never waits.
+    /// Returns why `reader` receives nothing. Never waits.
     pub(crate) fn reason<P: Payload + ?Sized>(
         &mut self,
         session: &mut Session,
-        follower: &Follower<P>,
+        reader: &TopicReader<P>,
     ) -> Silence {
         if let Some(reason) = Silence::of_hub(session) {
             self.status = None;
             return reason;
         }
-        if let Some(error) = follower.refused() {
+        if let Some(error) = reader.refused() {
             return Silence::of_shortage(error);
         }
         let Some(domain) = session.domain() else { return Silence::Waiting };
-        let (sensor, topic) = (follower.sensor(), <P as Payload>::TOPIC);
+        let (sensor, topic) = (reader.sensor(), <P as Payload>::TOPIC);
         // In this order: a hub has all its topics when it is not starting any more.
         let is_starting = session.hub_is_starting();
         // The port of a program that stays in the domain is still open if the next hub lacks the topic.
@@ -214,7 +214,7 @@ impl SilenceCheck {
             Some(Err(failure)) => return Silence::of_shortage(&failure.into()),
             None => false,
         };
-        if !follower.is_attached(session) || !is_served {
+        if !reader.is_attached(session) || !is_served {
             self.status = None;
             if is_starting || is_served {
                 return Silence::Waiting;
@@ -224,16 +224,16 @@ impl SilenceCheck {
                 Err(failure) => Silence::of_shortage(&failure.into()),
             };
         }
-        if topic.maker() != Maker::Link {
+        if topic.publisher_kind() != PublisherKind::Link {
             return Silence::Waiting;
         }
-        let starts = session.starts();
-        self.status.take_if(|status| status.starts != starts);
+        let starts = session.start_count();
+        self.status.take_if(|status| status.start_count != starts);
         let status = self.status.get_or_insert_with(|| {
-            Box::new(SensorStatus { follower: Follower::new(sensor), last: None, starts })
+            Box::new(SensorStatus { reader: TopicReader::new(sensor), last: None, start_count: starts })
         });
         // Without its status, nothing is known of the sensor.
-        while let Ok(Some(received)) = status.follower.receive_quietly(session) {
+        while let Ok(Some(received)) = status.reader.receive_quietly(session) {
             status.last = Some(*received);
         }
         status.last.as_ref().map_or(Silence::Waiting, |status| Silence::of_status(sensor, status))
@@ -241,10 +241,10 @@ impl SilenceCheck {
 }
 
 /// Returns the topics in `domain`, without those of `sensor` that only subscribers keep open. Fails if the directory
-/// belongs to another user, or with [`Kind::Short`] if memory or descriptors are short.
+/// belongs to another user, or with [`Kind::ResourceExhausted`] if memory or descriptors are short.
 fn published(session: &Session, domain: &Domain, sensor: &str) -> Result<Vec<(String, Topic)>, Failure> {
     let mut published = Vec::new();
-    for (name, topic) in scanhub_shm::published(domain)? {
+    for (name, topic) in scanhub_shm::published_topics(domain)? {
         let is_served = match session.node().filter(|_| name == sensor) {
             Some(node) => has_publisher(node, &name, topic)?,
             None => true,
@@ -265,7 +265,7 @@ fn names(published: &[(String, Topic)]) -> Vec<String> {
 macro_rules! has_publisher {
     ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
         /// Returns whether any program publishes the `topic` of `sensor`. A topic of another layout counts. Fails with
-        /// [`Kind::Short`] if memory or descriptors are short.
+        /// [`Kind::ResourceExhausted`] if memory or descriptors are short.
         fn has_publisher(node: &Node<ThreadSafeService>, sensor: &str, topic: Topic) -> Result<bool, Failure> {
             let publishers = match topic {
                 $(Topic::$topic => <scanhub_schema::payload_type!($payload)>::open(node, sensor)
@@ -273,7 +273,7 @@ macro_rules! has_publisher {
             };
             match publishers {
                 Ok(publishers) => Ok(publishers.is_some_and(|publishers| publishers > 0)),
-                Err(failure) if failure.kind == Kind::Short => Err(failure),
+                Err(failure) if failure.kind == Kind::ResourceExhausted => Err(failure),
                 Err(_) => Ok(true),
             }
         }

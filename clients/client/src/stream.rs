@@ -35,7 +35,8 @@ impl Registration {
                 let registered = AsyncFd::with_interest(descriptor.clone(), Interest::READABLE);
                 let registered = registered.map_err(|error| {
                     let what = format!("cannot register the descriptor: {error}");
-                    Error::new(Kind::Short, what, "`ulimit -n` may be too small").with_source(error)
+                    Error::new(Kind::ResourceExhausted, what, "`ulimit -n` may be too small")
+                        .with_source(error)
                 });
                 self.0.insert(registered?)
             }

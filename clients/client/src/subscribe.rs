@@ -7,9 +7,9 @@ use scanhub_shm::Payload;
 
 use crate::builder::SubscriberBuilder;
 use crate::error::Error;
-use crate::follower::{Follower, Received};
 use crate::session::Session;
 use crate::silence::Silence;
+use crate::topic_reader::{Received, TopicReader};
 
 /// Subscribes to the topic of `sensor` that carries `P` ([`Telegram`](crate::Telegram), [`Scan`](crate::Scan),
 /// [`Marks`](crate::Marks) ..), in the domain that SCANHUB_DOMAIN names. The hub may start later. To act on zones, use
@@ -45,7 +45,7 @@ pub struct Subscriber<T: Subscribe + ?Sized> {
 }
 
 /// Kind of a [`Subscriber`]: a payload such as [`Scan`](crate::Scan), [`Joined`](crate::Joined),
-/// [`Heard`](crate::Heard) or [`Robot`](crate::Robot). Other crates cannot implement it.
+/// [`ZonesUpdate`](crate::ZonesUpdate) or [`Robot`](crate::Robot). Other crates cannot implement it.
 pub trait Subscribe: sealed::Sealed {
     /// Names of the sensors: `&str`, or `&[&str]` for a robot.
     type Sensors<'a>: SensorNames;
@@ -93,19 +93,19 @@ pub trait ItemSource {
     fn receive(&mut self, session: &mut Session) -> Result<Option<Self::Item>, Error>;
 
     /// Checks for the hub if necessary, and returns the next item that has arrived.
-    fn look(&mut self, session: &mut Session) -> Result<Option<Self::Item>, Error> {
+    fn check_and_receive(&mut self, session: &mut Session) -> Result<Option<Self::Item>, Error> {
         // Samples that have arrived come first, because the check for the hub takes longer than receiving.
         if self.subscribed()
             && let Some(item) = self.receive(session)?
         {
             return Ok(Some(item));
         }
-        session.look()?;
+        session.check_hub()?;
         self.receive(session)
     }
 
     /// Returns the time after which the source has an item even if no sample arrives. `None` if only samples are items.
-    fn left(&self) -> Option<Duration> {
+    fn time_left(&self) -> Option<Duration> {
         None
     }
 
@@ -136,10 +136,10 @@ impl<T: Subscribe + ?Sized> Subscriber<T> {
     /// Returns the errors of `next`.
     pub fn try_next(&mut self) -> Result<Option<T::Item>, Error> {
         loop {
-            if let Some(item) = self.source.look(&mut self.session)? {
+            if let Some(item) = self.source.check_and_receive(&mut self.session)? {
                 return Ok(Some(item));
             }
-            if !self.session.settle(self.source.left())? {
+            if !self.session.rearm_descriptor(self.source.time_left())? {
                 return Ok(None);
             }
         }
@@ -177,7 +177,7 @@ impl<T: Subscribe + ?Sized> Subscriber<T> {
     ///
     /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if the system cannot wait.
     pub fn wait(&mut self, longest: Duration) -> Result<(), Error> {
-        self.session.wait_for(Some(self.source.left().map_or(longest, |left| left.min(longest))))
+        self.session.wait_for(Some(self.source.time_left().map_or(longest, |left| left.min(longest))))
     }
 
     /// Returns whether a hub or a listener publishes in the domain, as of the last call that found no item.
@@ -288,14 +288,14 @@ impl<P: Payload + ?Sized> WithTimeout for P {}
 impl<P: Payload + ?Sized> Subscribe for P {
     type Sensors<'a> = &'a str;
     type Item = Received<P>;
-    type Source = Follower<P>;
+    type Source = TopicReader<P>;
 
-    fn source(options: &SubscriberBuilder<P>) -> Follower<P> {
-        Follower::new(options.sensor())
+    fn source(options: &SubscriberBuilder<P>) -> TopicReader<P> {
+        TopicReader::new(options.sensor())
     }
 }
 
-impl<P: Payload + ?Sized> ItemSource for Follower<P> {
+impl<P: Payload + ?Sized> ItemSource for TopicReader<P> {
     type Item = Received<P>;
 
     fn subscribed(&self) -> bool {

@@ -7,13 +7,13 @@ use std::time::Duration;
 use scanhub_schema::{Early, Flags, Header, Verdict, Zones};
 
 use crate::builder::SubscriberBuilder;
-use crate::clock::{self, Moment};
+use crate::clock::{self, Timestamp};
 use crate::error::Error;
-use crate::follower::Follower;
 use crate::session::Session;
 use crate::silence::Silence;
 use crate::subscribe::sealed::Sealed;
 use crate::subscribe::{ItemSource, Subscribe, Subscriber};
+use crate::topic_reader::TopicReader;
 
 /// Subscribes to the zones of `sensor` in the domain that SCANHUB_DOMAIN names. The hub may start later.
 ///
@@ -42,7 +42,7 @@ pub fn zones(sensor: &str) -> Result<ZonesSubscriber, Error> {
 
 /// New data of a sensor's zones, or the news that none arrives.
 #[derive(Clone, Copy, Debug)]
-pub struct Heard {
+pub struct ZonesUpdate {
     /// The zones of the sample; [`Zones::unknown`] if it was too old on arrival, and in a silence.
     pub zones: Zones,
     /// The header of the sample; nothing in a silence.
@@ -52,20 +52,26 @@ pub struct Heard {
     /// The zones are unknown because no recent data arrived, not because the hub reports it.
     pub stale: bool,
     /// The zones that the hub sent, however old they were on arrival. Store them, but do not act on them.
-    pub said: Zones,
+    pub as_published: Zones,
 }
 
-impl Heard {
+impl ZonesUpdate {
     /// Returns what is known during a silence.
-    pub(crate) fn nothing() -> Heard {
-        Heard { zones: Zones::unknown(), header: None, missed: 0, stale: true, said: Zones::unknown() }
+    pub(crate) fn silence() -> ZonesUpdate {
+        ZonesUpdate {
+            zones: Zones::unknown(),
+            header: None,
+            missed: 0,
+            stale: true,
+            as_published: Zones::unknown(),
+        }
     }
 }
 
 /// Subscriber of the zones of a sensor.
-pub type ZonesSubscriber = Subscriber<Heard>;
+pub type ZonesSubscriber = Subscriber<ZonesUpdate>;
 
-impl Subscriber<Heard> {
+impl Subscriber<ZonesUpdate> {
     /// Waits for news: the newest sample, or one `unknown` per silence. It returns that two scan periods and 40 ms after
     /// the last sample (for another machine not before half a second), or a second after the start if there was none,
     /// with or without a hub.
@@ -74,42 +80,42 @@ impl Subscriber<Heard> {
     ///
     /// Returns the errors of [`Subscriber::next`](crate::Subscriber::next). The zones are unknown then, too.
     #[allow(clippy::should_implement_trait)] // There is no end that an iterator would have.
-    pub fn next(&mut self) -> Result<Heard, Error> {
+    pub fn next(&mut self) -> Result<ZonesUpdate, Error> {
         self.wait_for_next()
     }
 }
 
-impl Sealed for Heard {}
+impl Sealed for ZonesUpdate {}
 
-impl Subscribe for Heard {
+impl Subscribe for ZonesUpdate {
     type Sensors<'a> = &'a str;
-    type Item = Heard;
+    type Item = ZonesUpdate;
     type Source = ZonesSource;
 
-    fn source(options: &SubscriberBuilder<Heard>) -> ZonesSource {
+    fn source(options: &SubscriberBuilder<ZonesUpdate>) -> ZonesSource {
         ZonesSource::new(options.sensor())
     }
 }
 
 impl ItemSource for ZonesSource {
-    type Item = Heard;
+    type Item = ZonesUpdate;
 
     fn subscribed(&self) -> bool {
         self.subscribed()
     }
 
     /// Returns the last of all samples that have arrived. The skipped ones count as missed.
-    fn receive(&mut self, session: &mut Session) -> Result<Option<Heard>, Error> {
-        let mut newest: Option<Heard> = None;
-        while let Some(mut heard) = self.receive(session)? {
-            heard.missed += newest.map_or(0, |passed| passed.missed + u64::from(passed.header.is_some()));
-            newest = Some(heard);
+    fn receive(&mut self, session: &mut Session) -> Result<Option<ZonesUpdate>, Error> {
+        let mut newest: Option<ZonesUpdate> = None;
+        while let Some(mut update) = self.receive(session)? {
+            update.missed += newest.map_or(0, |passed| passed.missed + u64::from(passed.header.is_some()));
+            newest = Some(update);
         }
         Ok(newest)
     }
 
-    fn left(&self) -> Option<Duration> {
-        self.left()
+    fn time_left(&self) -> Option<Duration> {
+        self.time_left()
     }
 
     fn why_silent(&mut self, session: &mut Session) -> Silence {
@@ -119,37 +125,37 @@ impl ItemSource for ZonesSource {
 
 /// The zones of a sensor, sample by sample and silence by silence, in the caller's session.
 pub struct ZonesSource {
-    follower: Follower<Zones>,
+    reader: TopicReader<Zones>,
     state: ZonesState,
     /// Early warnings, if the caller wants them.
-    early: Option<Box<(Follower<Early>, Warned)>>,
+    early: Option<Box<(TopicReader<Early>, EarlyState)>>,
 }
 
 impl ZonesSource {
     /// Creates a source for the zones of `sensor`.
     pub fn new(sensor: &str) -> ZonesSource {
-        ZonesSource { follower: Follower::new(sensor), state: ZonesState::new(clock::now()), early: None }
+        ZonesSource { reader: TopicReader::new(sensor), state: ZonesState::new(clock::now()), early: None }
     }
 
     /// Takes early warnings of `sensor` too: a warning makes the verdict worse until the zones of its scan arrive, or
     /// until the hub withdraws it.
     pub(crate) fn with_early(self, sensor: &str) -> ZonesSource {
-        ZonesSource { early: Some(Box::new((Follower::new(sensor), Warned::new()))), ..self }
+        ZonesSource { early: Some(Box::new((TopicReader::new(sensor), EarlyState::new()))), ..self }
     }
 
     /// Returns whether the topic has been there at least once.
     pub fn subscribed(&self) -> bool {
-        self.follower.subscribed()
+        self.reader.subscribed()
     }
 
-    /// Returns why no zones arrive, as [`Follower::why_silent`] does.
+    /// Returns why no zones arrive, as [`TopicReader::why_silent`] does.
     pub fn why_silent(&mut self, session: &mut Session) -> Silence {
-        self.follower.why_silent(session)
+        self.reader.why_silent(session)
     }
 
     /// Returns whether the first sample has arrived, or its deadline has passed.
-    pub fn has_spoken(&self) -> bool {
-        self.state.has_spoken()
+    pub fn has_update(&self) -> bool {
+        self.state.has_update()
     }
 
     /// Returns the next sample that has arrived. Returns a silence if there is none and the last sample has just become
@@ -157,31 +163,37 @@ impl ZonesSource {
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`Follower::receive`].
-    pub fn receive(&mut self, session: &mut Session) -> Result<Option<Heard>, Error> {
-        let sample = self.follower.receive(session)?;
+    /// Returns the errors of [`TopicReader::receive`].
+    pub fn receive(&mut self, session: &mut Session) -> Result<Option<ZonesUpdate>, Error> {
+        let sample = self.reader.receive(session)?;
         let now = clock::now();
-        let heard = match sample {
+        let update = match sample {
             Some(sample) => Some(self.state.take(sample.header(), &sample, sample.missed, now)),
             None => self.state.silence(now),
         };
-        let Some((follower, warned)) = self.early.as_deref_mut() else { return Ok(heard) };
-        if let Some(mut heard) = heard {
-            heard.zones = warned.hear(&heard.zones, heard.header.as_ref());
-            return Ok(Some(heard));
+        let Some((reader, early_state)) = self.early.as_deref_mut() else { return Ok(update) };
+        if let Some(mut update) = update {
+            update.zones = early_state.update(&update.zones, update.header.as_ref());
+            return Ok(Some(update));
         }
-        while let Some(early) = follower.receive(session)? {
+        while let Some(early) = reader.receive(session)? {
             let header = *early.header();
-            if let Some(zones) = warned.warn(&early, &header) {
-                return Ok(Some(Heard { zones, header: Some(header), missed: 0, stale: false, said: zones }));
+            if let Some(zones) = early_state.warn(&early, &header) {
+                return Ok(Some(ZonesUpdate {
+                    zones,
+                    header: Some(header),
+                    missed: 0,
+                    stale: false,
+                    as_published: zones,
+                }));
             }
         }
         Ok(None)
     }
 
     /// Returns the time after which [`receive`](Self::receive) returns a silence if no sample arrives.
-    pub fn left(&self) -> Option<Duration> {
-        self.state.left(clock::now())
+    pub fn time_left(&self) -> Option<Duration> {
+        self.state.time_left(clock::now())
     }
 }
 
@@ -209,144 +221,144 @@ impl ZonesSource {
 /// ```
 #[derive(Clone, Debug)]
 pub struct ZonesState {
-    freshness: Freshness,
-    spoken: bool,
+    staleness: StalenessTimer,
+    has_update: bool,
 }
 
 impl ZonesState {
     /// Creates the state of a sensor that the program follows from `now` on.
-    pub fn new(now: Moment) -> ZonesState {
-        ZonesState { freshness: Freshness::new(now), spoken: false }
+    pub fn new(now: Timestamp) -> ZonesState {
+        ZonesState { staleness: StalenessTimer::new(now), has_update: false }
     }
 
     /// Takes a sample that arrived at `now`, and returns what is known with it. `missed` samples before it were not
     /// received.
-    pub fn take(&mut self, header: &Header, zones: &Zones, missed: u64, now: Moment) -> Heard {
-        self.spoken = true;
-        let fresh = self.freshness.heard(header, zones.verdict(), now);
+    pub fn take(&mut self, header: &Header, zones: &Zones, missed: u64, now: Timestamp) -> ZonesUpdate {
+        self.has_update = true;
+        let fresh = self.staleness.update(header, zones.verdict(), now);
         let known = if fresh { *zones } else { Zones::unknown() };
-        Heard { zones: known, header: Some(*header), missed, stale: !fresh, said: *zones }
+        ZonesUpdate { zones: known, header: Some(*header), missed, stale: !fresh, as_published: *zones }
     }
 
     /// Returns a silence if the last sample has become too old: once, until the next sample arrives.
-    pub fn silence(&mut self, now: Moment) -> Option<Heard> {
-        let silence = self.freshness.silence(now).then(Heard::nothing);
-        self.spoken |= silence.is_some();
+    pub fn silence(&mut self, now: Timestamp) -> Option<ZonesUpdate> {
+        let silence = self.staleness.silence(now).then(ZonesUpdate::silence);
+        self.has_update |= silence.is_some();
         silence
     }
 
     /// Returns whether the first sample has arrived, or its deadline has passed.
-    pub fn has_spoken(&self) -> bool {
-        self.spoken
+    pub fn has_update(&self) -> bool {
+        self.has_update
     }
 
     /// Returns the time until the deadline. `None` if it has passed, so that only a sample can change anything.
-    pub fn left(&self, now: Moment) -> Option<Duration> {
-        self.freshness.left(now)
+    pub fn time_left(&self, now: Timestamp) -> Option<Duration> {
+        self.staleness.time_left(now)
     }
 }
 
 /// Deadline of one sensor's verdict. Time is an argument.
 #[derive(Clone, Debug)]
-pub struct Freshness {
-    until: Moment,
+pub struct StalenessTimer {
+    until: Timestamp,
     /// Whether the verdict is unknown already: this silence was reported.
-    said: bool,
+    is_reported: bool,
 }
 
 /// The hub publishes `unknown` two periods and this long after the last scan (`docs/topics.md`).
-const HUB_LIMIT_NS: u64 = 20_000_000;
+const HUB_STALE_AFTER_NS: u64 = 20_000_000;
 
 /// Additional time that a client waits. A live hub then reports the silence first, so that there is one `unknown` per
 /// silence.
-const AFTER_HUB_NS: u64 = 20_000_000;
+const CLIENT_MARGIN_NS: u64 = 20_000_000;
 
 /// Limit of a sample without a period. It is enough for two periods of half degrees at 38400 baud, 0.4 s. It is also
 /// the minimum limit of a sample from another machine, because networks delay data, wireless ones by a tenth of a
 /// second.
-const NO_PERIOD_NS: u64 = 500_000_000;
+const DEFAULT_STALE_AFTER_NS: u64 = 500_000_000;
 
 /// Time limit of the first sample. A running hub sends its last sample to new subscribers ten times a second; a hub
 /// that is starting needs longer.
-const FIRST_WORD_NS: u64 = 1_000_000_000;
+const FIRST_SAMPLE_TIMEOUT_NS: u64 = 1_000_000_000;
 
-impl Freshness {
+impl StalenessTimer {
     /// Creates the deadline of a sensor that the program follows from `now` on.
-    pub fn new(now: Moment) -> Freshness {
-        Freshness { until: later(now, FIRST_WORD_NS), said: false }
+    pub fn new(now: Timestamp) -> StalenessTimer {
+        StalenessTimer { until: add_ns(now, FIRST_SAMPLE_TIMEOUT_NS), is_reported: false }
     }
 
     /// Takes a sample with `header` and `verdict` that arrived at `now`. Returns whether its verdict is valid. The
     /// deadline runs from the stamp or from the arrival, whichever is earlier, so a stamp in the future does not extend
     /// it. `unknown` is valid at any age.
-    pub fn heard(&mut self, header: &Header, verdict: Verdict, now: Moment) -> bool {
+    pub fn update(&mut self, header: &Header, verdict: Verdict, now: Timestamp) -> bool {
         let limit_ns = match header.period_us {
-            0 => NO_PERIOD_NS,
-            period_us => 2000 * u64::from(period_us) + HUB_LIMIT_NS + AFTER_HUB_NS,
+            0 => DEFAULT_STALE_AFTER_NS,
+            period_us => 2000 * u64::from(period_us) + HUB_STALE_AFTER_NS + CLIENT_MARGIN_NS,
         };
         let is_remote = header.flags & Flags::REMOTE != 0;
-        let limit_ns = if is_remote { limit_ns.max(NO_PERIOD_NS) } else { limit_ns };
-        let silent_at = later(now, limit_ns);
-        let aged_at_ns = header.stamp_last_ns.saturating_add(limit_ns);
-        self.until = Moment { monotonic_ns: silent_at.monotonic_ns.min(aged_at_ns), ..silent_at };
+        let limit_ns = if is_remote { limit_ns.max(DEFAULT_STALE_AFTER_NS) } else { limit_ns };
+        let silent_at = add_ns(now, limit_ns);
+        let stale_at_ns = header.stamp_last_ns.saturating_add(limit_ns);
+        self.until = Timestamp { monotonic_ns: silent_at.monotonic_ns.min(stale_at_ns), ..silent_at };
         let is_unknown = verdict == Verdict::Unknown;
         let fresh = now.monotonic_ns < self.until.monotonic_ns;
-        self.said = is_unknown || !fresh;
+        self.is_reported = is_unknown || !fresh;
         is_unknown || fresh
     }
 
     /// Returns whether the verdict has become too old: `true` once, until the next sample.
-    pub fn silence(&mut self, now: Moment) -> bool {
+    pub fn silence(&mut self, now: Timestamp) -> bool {
         let over = now.monotonic_ns >= self.until.monotonic_ns || now.boottime_ns >= self.until.boottime_ns;
-        if self.said || !over {
+        if self.is_reported || !over {
             return false;
         }
-        self.said = true;
+        self.is_reported = true;
         true
     }
 
     /// Returns the time until the deadline. `None` if it has passed, so that only a sample can change anything.
-    pub fn left(&self, now: Moment) -> Option<Duration> {
+    pub fn time_left(&self, now: Timestamp) -> Option<Duration> {
         let left_ns = self.until.monotonic_ns.saturating_sub(now.monotonic_ns);
         let awake_ns = self.until.boottime_ns.saturating_sub(now.boottime_ns);
-        (!self.said).then(|| Duration::from_nanos(left_ns.min(awake_ns)))
+        (!self.is_reported).then(|| Duration::from_nanos(left_ns.min(awake_ns)))
     }
 }
 
-fn later(moment: Moment, by_ns: u64) -> Moment {
-    Moment {
-        monotonic_ns: moment.monotonic_ns.saturating_add(by_ns),
-        boottime_ns: moment.boottime_ns.saturating_add(by_ns),
+fn add_ns(time: Timestamp, by_ns: u64) -> Timestamp {
+    Timestamp {
+        monotonic_ns: time.monotonic_ns.saturating_add(by_ns),
+        boottime_ns: time.boottime_ns.saturating_add(by_ns),
     }
 }
 
 /// Zones of one sensor, combined with the early warning of the scan after them. A warning makes the verdict worse until
 /// the zones of the same scan arrive, or until the hub withdraws it. It never makes the verdict better.
 #[derive(Clone, Debug)]
-struct Warned {
-    known: Zones,
+struct EarlyState {
+    zones: Zones,
     /// `boot` and `seq` of the last scan whose zones are known.
     scan: Option<(u64, u64)>,
     /// The warning that is valid, with `boot` and `seq` of its scan.
     warning: Option<((u64, u64), Early)>,
 }
 
-impl Warned {
-    fn new() -> Warned {
-        Warned { known: Zones::unknown(), scan: None, warning: None }
+impl EarlyState {
+    fn new() -> EarlyState {
+        EarlyState { zones: Zones::unknown(), scan: None, warning: None }
     }
 
     /// Takes the zones of a scan, or a silence, which has no header. Returns them, made worse by the warning of a later
     /// scan.
-    fn hear(&mut self, zones: &Zones, header: Option<&Header>) -> Zones {
-        self.known = *zones;
+    fn update(&mut self, zones: &Zones, header: Option<&Header>) -> Zones {
+        self.zones = *zones;
         let Some(header) = header else {
             self.warning = None;
             return *zones;
         };
         self.scan = Some((header.boot, header.seq));
         self.warning = self.warning.filter(|((boot, seq), _)| *boot == header.boot && *seq > header.seq);
-        self.warning.map_or(*zones, |(_, early)| self.with(&early))
+        self.warning.map_or(*zones, |(_, early)| self.with_warning(&early))
     }
 
     /// Returns the zones with the warning `early`, or `None` if the zones of its scan are known.
@@ -356,15 +368,15 @@ impl Warned {
         }
         if early.is_withdrawn() {
             self.warning = None;
-            return Some(self.known);
+            return Some(self.zones);
         }
         self.warning = Some(((header.boot, header.seq), *early));
-        Some(self.with(early))
+        Some(self.with_warning(early))
     }
 
-    fn with(&self, early: &Early) -> Zones {
-        let mut zones = Zones { verdict: self.known.verdict().worse(warning(early)) as u8, ..self.known };
-        if self.known.nearest().is_none_or(|(_, known_mm)| early.distance_mm < known_mm) {
+    fn with_warning(&self, early: &Early) -> Zones {
+        let mut zones = Zones { verdict: self.zones.verdict().worse(warning(early)) as u8, ..self.zones };
+        if self.zones.nearest().is_none_or(|(_, known_mm)| early.distance_mm < known_mm) {
             (zones.nearest_beam, zones.nearest_mm) = (early.beam, early.distance_mm);
         }
         zones
@@ -386,8 +398,8 @@ mod tests {
     const MS: u64 = 1_000_000;
 
     /// `ms` after the machine's start; it was never suspended.
-    fn at(ms: u64) -> Moment {
-        Moment { monotonic_ns: ms * MS, boottime_ns: ms * MS }
+    fn at(ms: u64) -> Timestamp {
+        Timestamp { monotonic_ns: ms * MS, boottime_ns: ms * MS }
     }
 
     fn header(stamp_ms: u64, period_us: u32) -> Header {
@@ -399,65 +411,65 @@ mod tests {
 
     #[test]
     fn one_word_per_silence() {
-        let mut freshness = Freshness::new(at(0));
-        freshness.heard(&header(100, PERIOD_US), Verdict::Clear, at(100));
-        assert_eq!(freshness.left(at(100)), Some(Duration::from_micros(93_280)));
+        let mut freshness = StalenessTimer::new(at(0));
+        freshness.update(&header(100, PERIOD_US), Verdict::Clear, at(100));
+        assert_eq!(freshness.time_left(at(100)), Some(Duration::from_micros(93_280)));
         assert!(!freshness.silence(at(193)));
         assert!(freshness.silence(at(194)) && !freshness.silence(at(195)) && !freshness.silence(at(90_000)));
-        assert_eq!(freshness.left(at(195)), None);
-        freshness.heard(&header(200, PERIOD_US), Verdict::Stop, at(200));
+        assert_eq!(freshness.time_left(at(195)), None);
+        freshness.update(&header(200, PERIOD_US), Verdict::Stop, at(200));
         assert!(!freshness.silence(at(293)) && freshness.silence(at(294)));
     }
 
     #[test]
-    fn who_was_never_heard_is_unknown_and_one_that_is_unknown_stays_so() {
-        let mut freshness = Freshness::new(at(50));
-        assert_eq!(freshness.left(at(50)), Some(Duration::from_secs(1)));
+    fn silence_is_unknown_once_and_unknown_never_expires() {
+        let mut freshness = StalenessTimer::new(at(50));
+        assert_eq!(freshness.time_left(at(50)), Some(Duration::from_secs(1)));
         assert!(!freshness.silence(at(1049)) && freshness.silence(at(1050)) && !freshness.silence(at(9000)));
         // The hub's own word of the silence.
-        assert!(freshness.heard(&header(2000, PERIOD_US), Verdict::Unknown, at(2000)));
-        assert_eq!((freshness.silence(at(9000)), freshness.left(at(2000))), (false, None));
-        assert!(freshness.heard(&header(2000, PERIOD_US), Verdict::Unknown, at(60_000)), "to a late joiner");
+        assert!(freshness.update(&header(2000, PERIOD_US), Verdict::Unknown, at(2000)));
+        assert_eq!((freshness.silence(at(9000)), freshness.time_left(at(2000))), (false, None));
+        assert!(freshness.update(&header(2000, PERIOD_US), Verdict::Unknown, at(60_000)), "to a late joiner");
     }
 
     #[test]
-    fn what_waited_is_no_news() {
-        let mut freshness = Freshness::new(at(0));
-        assert!(freshness.heard(&header(100, PERIOD_US), Verdict::Clear, at(180)));
+    fn verdict_that_arrives_stale_is_not_accepted() {
+        let mut freshness = StalenessTimer::new(at(0));
+        assert!(freshness.update(&header(100, PERIOD_US), Verdict::Clear, at(180)));
         assert!(!freshness.silence(at(193)) && freshness.silence(at(194)));
-        assert!(!freshness.heard(&header(100, PERIOD_US), Verdict::Clear, at(500)), "too old when it came");
+        assert!(!freshness.update(&header(100, PERIOD_US), Verdict::Clear, at(500)), "too old when it came");
         assert!(!freshness.silence(at(9000)), "which says enough");
-        assert!(freshness.heard(&header(99_999, PERIOD_US), Verdict::Clear, at(600)));
+        assert!(freshness.update(&header(99_999, PERIOD_US), Verdict::Clear, at(600)));
         assert!(!freshness.silence(at(693)) && freshness.silence(at(694)), "a stamp in the future");
     }
 
     #[test]
     fn time_passes_while_the_machine_is_suspended() {
-        let mut freshness = Freshness::new(at(0));
-        freshness.heard(&header(100, PERIOD_US), Verdict::Clear, at(100));
-        let resumed = Moment { boottime_ns: 3_600_000 * MS, ..at(110) };
-        assert_eq!(freshness.left(resumed), Some(Duration::ZERO));
+        let mut freshness = StalenessTimer::new(at(0));
+        freshness.update(&header(100, PERIOD_US), Verdict::Clear, at(100));
+        let resumed = Timestamp { boottime_ns: 3_600_000 * MS, ..at(110) };
+        assert_eq!(freshness.time_left(resumed), Some(Duration::ZERO));
         assert!(freshness.silence(resumed));
     }
 
     #[test]
     fn a_network_has_half_a_second_at_least() {
-        let mut freshness = Freshness::new(at(0));
+        let mut freshness = StalenessTimer::new(at(0));
         for (period_us, limit_ms) in [(0, 500), (PERIOD_US, 500), (230_000, 500), (1_000_000, 2040)] {
             let remote = Header { flags: Flags::REMOTE, ..header(100, period_us) };
-            freshness.heard(&remote, Verdict::Clear, at(100));
-            assert_eq!(freshness.left(at(100)), Some(Duration::from_millis(limit_ms)), "{period_us}");
+            freshness.update(&remote, Verdict::Clear, at(100));
+            assert_eq!(freshness.time_left(at(100)), Some(Duration::from_millis(limit_ms)), "{period_us}");
         }
     }
 
     #[test]
     fn headers_that_say_nonsense() {
-        let mut freshness = Freshness::new(at(0));
-        freshness.heard(&header(100, 0), Verdict::Clear, at(100));
+        let mut freshness = StalenessTimer::new(at(0));
+        freshness.update(&header(100, 0), Verdict::Clear, at(100));
         assert!(!freshness.silence(at(599)) && freshness.silence(at(600)));
         let end = Header { stamp_last_ns: u64::MAX, period_us: u32::MAX, ..Header::default() };
-        let last = Moment { monotonic_ns: u64::MAX, boottime_ns: u64::MAX };
-        assert!(!freshness.heard(&end, Verdict::Clear, last));
+        let last = Timestamp { monotonic_ns: u64::MAX, boottime_ns: u64::MAX };
+        assert!(!freshness.update(&end, Verdict::Clear, last));
     }
 
     fn zones(verdict: u8) -> Zones {
@@ -470,7 +482,7 @@ mod tests {
     /// Vectors that the tests of the Python package use, too.
     const VECTORS: &str = include_str!("../../../tests/vectors/early.txt");
 
-    fn of_scan(scan: &str) -> Header {
+    fn scan_header(scan: &str) -> Header {
         let (boot, seq) = scan.split_once(':').expect("LIFE:NUMBER");
         Header {
             boot: boot.parse().expect("a life"),
@@ -479,22 +491,22 @@ mod tests {
         }
     }
 
-    fn said(zones: &Zones) -> String {
+    fn verdict_text(zones: &Zones) -> String {
         let nearest = zones.nearest().map_or("-".to_owned(), |(_, mm)| mm.to_string());
         format!("{} {nearest}", zones.verdict() as u8)
     }
 
     #[test]
-    fn what_is_known_is_what_the_vectors_say() {
-        let (mut warned, mut steps) = (Warned::new(), 0);
+    fn warnings_and_verdicts_match_the_vectors() {
+        let (mut warned, mut steps) = (EarlyState::new(), 0);
         let lines = VECTORS.lines().zip(1..).filter(|(line, _)| !line.is_empty() && !line.starts_with('#'));
         for (line, number) in lines {
             let (step, known) = line.split_once(" => ").unwrap_or((line, ""));
             let words: Vec<&str> = step.split(' ').collect();
             let verdict = |word: &str| word.parse().expect("a verdict");
-            let told = match words[..] {
+            let result = match words[..] {
                 ["begin"] => {
-                    warned = Warned::new();
+                    warned = EarlyState::new();
                     continue;
                 }
                 ["zones", scan, word, nearest] => {
@@ -502,19 +514,23 @@ mod tests {
                     if let Ok(mm) = nearest.parse() {
                         (zones.nearest_beam, zones.nearest_mm) = (7, mm);
                     }
-                    Some(warned.hear(&zones, Some(&of_scan(scan))))
+                    Some(warned.update(&zones, Some(&scan_header(scan))))
                 }
-                ["silence"] => Some(warned.hear(&Zones::unknown(), None)),
+                ["silence"] => Some(warned.update(&Zones::unknown(), None)),
                 ["early", scan, word, mm] => {
                     let distance_mm = mm.parse().expect("a distance");
-                    warned.warn(&Early { verdict: verdict(word), distance_mm, ..STOP }, &of_scan(scan))
+                    warned.warn(&Early { verdict: verdict(word), distance_mm, ..STOP }, &scan_header(scan))
                 }
                 ["withdrawn", scan] => {
-                    warned.warn(&Early { flags: Early::WITHDRAWN, ..STOP }, &of_scan(scan))
+                    warned.warn(&Early { flags: Early::WITHDRAWN, ..STOP }, &scan_header(scan))
                 }
                 _ => panic!("line {number}: {line}"),
             };
-            assert_eq!(told.as_ref().map_or("old".to_owned(), said), known, "line {number}: {line}");
+            assert_eq!(
+                result.as_ref().map_or("old".to_owned(), verdict_text),
+                known,
+                "line {number}: {line}"
+            );
             steps += 1;
         }
         assert!(steps > 40, "{steps}");
@@ -522,23 +538,23 @@ mod tests {
 
     #[test]
     fn the_nearest_beam_is_that_of_the_nearest_point() {
-        let mut warned = Warned::new();
-        warned.hear(&zones(0), Some(&of_scan("1:7")));
-        let stop = warned.warn(&STOP, &of_scan("1:8")).expect("a warning");
+        let mut warned = EarlyState::new();
+        warned.update(&zones(0), Some(&scan_header("1:7")));
+        let stop = warned.warn(&STOP, &scan_header("1:8")).expect("a warning");
         assert_eq!((stop.verdict(), stop.nearest()), (Verdict::Stop, Some((40, 500))));
         let near = Zones { nearest_beam: 3, nearest_mm: 400, ..zones(0) };
-        assert_eq!(warned.hear(&near, Some(&of_scan("1:7"))).nearest(), Some((3, 400)));
+        assert_eq!(warned.update(&near, Some(&scan_header("1:7"))).nearest(), Some((3, 400)));
     }
 
     #[test]
     fn a_warning_never_makes_it_better() {
-        let mut warned = Warned::new();
+        let mut warned = EarlyState::new();
         let slow = Early { verdict: Verdict::Slow as u8, ..STOP };
         for verdict in Verdict::ALL {
-            warned.hear(&zones(verdict as u8), None);
+            warned.update(&zones(verdict as u8), None);
             for early in [slow, STOP, Early { verdict: 9, ..STOP }, Early { verdict: 0, ..STOP }] {
                 let now =
-                    warned.warn(&early, &of_scan("1:1")).expect("nothing is known of the scan").verdict();
+                    warned.warn(&early, &scan_header("1:1")).expect("nothing is known of the scan").verdict();
                 assert_eq!(now.worse(verdict), now, "{verdict:?} and {early:?}");
             }
         }

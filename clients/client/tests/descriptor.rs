@@ -7,34 +7,34 @@ use std::os::fd::{AsFd, AsRawFd};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use fake::{FakeHub, Place, until};
+use fake::{FakeHub, TestDomain, wait_until};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use scanhub_client::{PollableSubscriber, RobotSubscriber, Subscriber, ZonesSubscriber};
 use scanhub_schema::{Scan, Status, Verdict};
 use scanhub_shm::UpdateConnections;
 
 /// Returns whether `descriptor` becomes readable within `longest`.
-fn is_readable(descriptor: &impl AsFd, longest: Duration) -> bool {
+fn is_readable(descriptor: &impl AsFd, timeout: Duration) -> bool {
     let mut fds = [PollFd::new(descriptor, PollFlags::IN)];
-    let longest = Timespec { tv_sec: longest.as_secs() as i64, tv_nsec: longest.subsec_nanos().into() };
+    let longest = Timespec { tv_sec: timeout.as_secs() as i64, tv_nsec: timeout.subsec_nanos().into() };
     poll(&mut fds, Some(&longest)).unwrap() == 1
 }
 
-fn scans(place: &Place) -> PollableSubscriber<Scan> {
-    Subscriber::<Scan>::builder("front").in_domain(&place.domain).open_pollable().unwrap()
+fn scans(test_domain: &TestDomain) -> PollableSubscriber<Scan> {
+    Subscriber::<Scan>::builder("front").in_domain(&test_domain.domain).open_pollable().unwrap()
 }
 
 /// Far longer than anything takes on a busy machine.
-const LONG: Duration = Duration::from_secs(60);
+const WAIT_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Period with which a verdict is valid for more than a second, in us, so that a busy machine reads it before its end.
 const LONG_PERIOD_US: u32 = 500_000;
 
 /// Polls until there is a scan.
-fn polled(scans: &PollableSubscriber<Scan>) -> (u64, bool, usize) {
-    let give_up_at = Instant::now() + LONG;
+fn await_scan(scans: &PollableSubscriber<Scan>) -> (u64, bool, usize) {
+    let give_up_at = Instant::now() + WAIT_TIMEOUT;
     loop {
-        assert!(is_readable(scans, LONG) && Instant::now() < give_up_at);
+        assert!(is_readable(scans, WAIT_TIMEOUT) && Instant::now() < give_up_at);
         if let Some(scan) = scans.try_next().unwrap() {
             return (scan.header().boot, scan.restarted, scan.beams());
         }
@@ -42,36 +42,36 @@ fn polled(scans: &PollableSubscriber<Scan>) -> (u64, bool, usize) {
 }
 
 #[test]
-fn it_is_readable_until_all_is_taken_and_the_same_over_lives_of_the_hub() {
-    let place = Place::new();
-    let scans = scans(&place);
+fn same_descriptor_is_readable_over_hub_restarts() {
+    let test_domain = TestDomain::new();
+    let scans = scans(&test_domain);
     let number = scans.as_raw_fd();
     for boot in 1..4 {
-        let mut hub = FakeHub::new(&place.domain, &["front"], boot);
-        until("the consumer", || {
-            assert!(is_readable(&scans, LONG), "it looks for a hub by itself");
+        let mut hub = FakeHub::new(&test_domain.domain, &["front"], boot);
+        wait_until("the consumer", || {
+            assert!(is_readable(&scans, WAIT_TIMEOUT), "it looks for a hub by itself");
             assert!(scans.try_next().unwrap().is_none());
-            hub.front().scan.subscribers() == 1
+            hub.front_sensor().scan.subscribers() == 1
         });
         for beams in [5, 6] {
-            hub.front().scan(&vec![1000; beams]);
+            hub.front_sensor().publish_scan(&vec![1000; beams]);
         }
-        assert_eq!(polled(&scans), (boot, boot > 1, 5));
+        assert_eq!(await_scan(&scans), (boot, boot > 1, 5));
         assert!(is_readable(&scans, Duration::ZERO), "there is another one");
-        assert_eq!(polled(&scans), (boot, false, 6));
+        assert_eq!(await_scan(&scans), (boot, false, 6));
         assert!(scans.try_next().unwrap().is_none());
         assert_eq!((scans.as_raw_fd(), scans.as_fd().as_raw_fd()), (number, number));
     }
 }
 
 #[test]
-fn a_hub_that_lives_and_says_nothing_wakes_nobody_but_once_a_second() {
-    let place = Place::new();
-    let scans = scans(&place);
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    until("the consumer", || {
+fn idle_hub_rarely_wakes_the_subscriber() {
+    let test_domain = TestDomain::new();
+    let scans = scans(&test_domain);
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    wait_until("the consumer", || {
         assert!(scans.try_next().unwrap().is_none());
-        hub.front().scan.subscribers() == 1
+        hub.front_sensor().scan.subscribers() == 1
     });
     let (started, mut looks) = (Instant::now(), 0);
     while started.elapsed() < Duration::from_secs(3) {
@@ -85,79 +85,81 @@ fn a_hub_that_lives_and_says_nothing_wakes_nobody_but_once_a_second() {
 }
 
 #[test]
-fn what_a_late_joiner_is_handed_makes_it_readable() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    hub.front().status(|status| status.baud = 500_000);
-    let builder = Subscriber::<Status>::builder("front").in_domain(&place.domain);
+fn history_for_a_late_joiner_makes_it_readable() {
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    hub.front_sensor().publish_status(|status| status.baud = 500_000);
+    let builder = Subscriber::<Status>::builder("front").in_domain(&test_domain.domain);
     let statuses = builder.open_pollable().unwrap();
-    until("the status", || {
-        hub.front().status.publisher.update_connections().unwrap();
-        assert!(is_readable(&statuses, LONG));
+    wait_until("the status", || {
+        hub.front_sensor().status.publisher.update_connections().unwrap();
+        assert!(is_readable(&statuses, WAIT_TIMEOUT));
         statuses.try_next().unwrap().is_some_and(|status| status.baud == 500_000)
     });
 }
 
 #[test]
 fn a_verdict_that_gets_too_old_makes_it_readable() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let zones = ZonesSubscriber::builder("front").in_domain(&place.domain).open_pollable().unwrap();
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    let zones = ZonesSubscriber::builder("front").in_domain(&test_domain.domain).open_pollable().unwrap();
     let polled = || loop {
-        assert!(is_readable(&zones, LONG));
-        if let Some(heard) = zones.try_next().unwrap() {
-            return (heard.zones.verdict(), heard.stale);
+        assert!(is_readable(&zones, WAIT_TIMEOUT));
+        if let Some(update) = zones.try_next().unwrap() {
+            return (update.zones.verdict(), update.stale);
         }
     };
-    until("the consumer", || {
+    wait_until("the consumer", || {
         let _ = zones.try_next().unwrap();
-        hub.front().zones.subscribers() == 1
+        hub.front_sensor().zones.subscribers() == 1
     });
     assert!(zones.hub_is_running());
-    hub.front().period_us = LONG_PERIOD_US;
-    hub.front().zones(Verdict::Clear, 900);
-    until("the verdict", || polled() == (Verdict::Clear, false));
+    hub.front_sensor().period_us = LONG_PERIOD_US;
+    hub.front_sensor().publish_zones(Verdict::Clear, 900);
+    wait_until("the verdict", || polled() == (Verdict::Clear, false));
     assert_eq!(polled(), (Verdict::Unknown, true));
 }
 
 #[test]
-fn a_pollable_robot_is_readable_when_its_verdict_changes() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let robot = RobotSubscriber::builder(&["front"]).in_domain(&place.domain).open_pollable().unwrap();
-    until("the subscriber", || {
+fn pollable_robot_is_readable_on_a_verdict_change() {
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    let robot = RobotSubscriber::builder(&["front"]).in_domain(&test_domain.domain).open_pollable().unwrap();
+    wait_until("the subscriber", || {
         let _ = robot.try_next().unwrap();
-        hub.front().zones.subscribers() == 1
+        hub.front_sensor().zones.subscribers() == 1
     });
-    hub.front().period_us = LONG_PERIOD_US;
-    hub.front().zones(Verdict::Clear, 900);
+    hub.front_sensor().period_us = LONG_PERIOD_US;
+    hub.front_sensor().publish_zones(Verdict::Clear, 900);
     let verdict = || loop {
-        assert!(is_readable(&robot, LONG));
+        assert!(is_readable(&robot, WAIT_TIMEOUT));
         if let Some(now) = robot.try_next().unwrap() {
             return now.verdict();
         }
     };
-    until("the verdict", || verdict() == Verdict::Clear);
-    until("the silence", || verdict() == Verdict::Unknown);
+    wait_until("the verdict", || verdict() == Verdict::Clear);
+    wait_until("the silence", || verdict() == Verdict::Unknown);
 }
 
 #[test]
 fn it_is_closed_on_exec() {
-    let place = Place::new();
-    let scans = scans(&place);
+    let test_domain = TestDomain::new();
+    let scans = scans(&test_domain);
     let flags = rustix::io::fcntl_getfd(&scans).unwrap();
     assert!(flags.contains(rustix::io::FdFlags::CLOEXEC));
 }
 
 #[test]
 fn samples_are_taken_while_the_descriptor_is_borrowed() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let scans = scans(&place);
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    let scans = scans(&test_domain);
     let mut fds = [PollFd::new(&scans, PollFlags::IN)];
-    until("the subscriber", || scans.try_next().unwrap().is_none() && hub.front().scan.subscribers() == 1);
-    hub.front().scan(&[1000]);
-    until("the scan", || {
+    wait_until("the subscriber", || {
+        scans.try_next().unwrap().is_none() && hub.front_sensor().scan.subscribers() == 1
+    });
+    hub.front_sensor().publish_scan(&[1000]);
+    wait_until("the scan", || {
         poll(&mut fds, None).unwrap();
         scans.try_next().unwrap().is_some()
     });
@@ -165,13 +167,13 @@ fn samples_are_taken_while_the_descriptor_is_borrowed() {
 
 #[test]
 fn a_pollable_subscriber_can_wait_too() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let mut scans = scans(&place);
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    let mut scans = scans(&test_domain);
     assert!(scans.try_next().unwrap().is_none());
-    hub.front().scan(&[1000]);
+    hub.front_sensor().publish_scan(&[1000]);
     assert_eq!(scans.subscriber_mut().next().unwrap().expect("a scan").beams(), 1);
-    assert!(is_readable(&scans, LONG), "the event is still to be taken");
+    assert!(is_readable(&scans, WAIT_TIMEOUT), "the event is still to be taken");
 }
 
 /// Counts the wake-ups in 5 s as a program that takes everything has them, and the timeouts of `poll`.
@@ -189,9 +191,9 @@ fn wake_ups_and_timeouts(scans: &PollableSubscriber<Scan>) -> (u32, u32) {
 
 #[test]
 fn without_a_hub_poll_times_out() {
-    let place = Place::new();
-    let scans = scans(&place);
-    assert!(is_readable(&scans, LONG), "it must look for a hub first");
+    let test_domain = TestDomain::new();
+    let scans = scans(&test_domain);
+    assert!(is_readable(&scans, WAIT_TIMEOUT), "it must look for a hub first");
     assert!(scans.try_next().unwrap().is_none());
     // The monitor looks every 2 s if it cannot watch the directories. Nothing is taken here, so one look would last.
     assert!(!is_readable(&scans, Duration::from_secs(5)), "no timer wakes it");
@@ -199,8 +201,8 @@ fn without_a_hub_poll_times_out() {
 
 #[test]
 fn files_of_others_wake_it_at_most_once_a_second() {
-    let place = Place::new();
-    let scans = scans(&place);
+    let test_domain = TestDomain::new();
+    let scans = scans(&test_domain);
     assert!(scans.try_next().unwrap().is_none());
     let is_done = AtomicBool::new(false);
     std::thread::scope(|scope| {
@@ -209,7 +211,7 @@ fn files_of_others_wake_it_at_most_once_a_second() {
                 if is_done.load(Ordering::Relaxed) {
                     break;
                 }
-                std::fs::write(place.base.join(format!("other{number}")), "").unwrap();
+                std::fs::write(test_domain.base.join(format!("other{number}")), "").unwrap();
                 std::thread::sleep(Duration::from_millis(20));
             }
         });
@@ -221,22 +223,22 @@ fn files_of_others_wake_it_at_most_once_a_second() {
 
 #[test]
 fn a_hub_that_starts_makes_it_readable() {
-    let place = Place::new();
-    let scans = scans(&place);
+    let test_domain = TestDomain::new();
+    let scans = scans(&test_domain);
     assert!(scans.try_next().unwrap().is_none() && !is_readable(&scans, Duration::ZERO));
-    let _hub = FakeHub::new(&place.domain, &["front"], 1);
+    let _hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     assert!(is_readable(&scans, Duration::ZERO), "without a timer");
-    until("the hub", || {
-        assert!(is_readable(&scans, LONG));
+    wait_until("the hub", || {
+        assert!(is_readable(&scans, WAIT_TIMEOUT));
         scans.try_next().unwrap().is_none() && scans.hub_is_running()
     });
 }
 
 #[test]
-fn a_sensor_that_does_not_exist_wakes_it_once_a_second() {
-    let place = Place::new();
-    let _hub = FakeHub::new(&place.domain, &["front"], 1);
-    let scans = Subscriber::<Scan>::builder("frnot").in_domain(&place.domain).open_pollable().unwrap();
+fn unknown_sensor_rarely_wakes_the_subscriber() {
+    let test_domain = TestDomain::new();
+    let _hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    let scans = Subscriber::<Scan>::builder("frnot").in_domain(&test_domain.domain).open_pollable().unwrap();
     // In the first seconds, the hub may still create the topic.
     let started = Instant::now();
     while started.elapsed() < Duration::from_secs(3) {
@@ -249,15 +251,17 @@ fn a_sensor_that_does_not_exist_wakes_it_once_a_second() {
 
 #[test]
 fn a_silence_is_measured_from_the_last_sample() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let scans = scans(&place);
-    until("the subscriber", || scans.try_next().unwrap().is_none() && hub.front().scan.subscribers() == 1);
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    let scans = scans(&test_domain);
+    wait_until("the subscriber", || {
+        scans.try_next().unwrap().is_none() && hub.front_sensor().scan.subscribers() == 1
+    });
     let before = scans.silent_for();
     std::thread::sleep(Duration::from_millis(20));
     assert!(scans.silent_for() >= before + Duration::from_millis(20), "since it was opened");
     let sent = Instant::now();
-    hub.front().scan(&[1000]);
-    let _scan = polled(&scans);
+    hub.front_sensor().publish_scan(&[1000]);
+    let _scan = await_scan(&scans);
     assert!(scans.silent_for() <= sent.elapsed());
 }

@@ -4,7 +4,7 @@ mod fake;
 
 use std::time::{Duration, Instant};
 
-use fake::{FakeHub, Place, until};
+use fake::{FakeHub, TestDomain, wait_until};
 use scanhub_client::streams::find;
 use scanhub_client::{
     ErrorKind, Marks, Publication, RobotSubscriber, Scan, Silence, Subscriber, Tilt, Verdict, ZonesSubscriber,
@@ -13,19 +13,19 @@ use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Failure, Kind, State, Topic, Zones};
 use scanhub_shm::{Payload, PortFactory};
 
-fn scans(place: &Place, sensor: &str) -> Subscriber<Scan> {
-    let builder = Subscriber::<Scan>::builder(sensor).in_domain(&place.domain);
+fn scans(test_domain: &TestDomain, sensor: &str) -> Subscriber<Scan> {
+    let builder = Subscriber::<Scan>::builder(sensor).in_domain(&test_domain.domain);
     builder.timeout(Duration::from_millis(100)).open().unwrap()
 }
 
 /// Returns the reason after two seconds at most, as a program that calls `next` has it.
-fn reason(scans: &mut Subscriber<Scan>, is_it: impl Fn(&Silence) -> bool) -> Silence {
+fn await_reason(scans: &mut Subscriber<Scan>, is_expected: impl Fn(&Silence) -> bool) -> Silence {
     let started = Instant::now();
     loop {
         assert!(scans.next().unwrap().is_none(), "nothing was sent");
         let silence = scans.why_silent();
         // The bound is generous on a busy machine.
-        if is_it(&silence) || started.elapsed() > Duration::from_secs(20) {
+        if is_expected(&silence) || started.elapsed() > Duration::from_secs(20) {
             return silence;
         }
     }
@@ -33,36 +33,36 @@ fn reason(scans: &mut Subscriber<Scan>, is_it: impl Fn(&Silence) -> bool) -> Sil
 
 #[test]
 fn without_a_hub_it_says_so() {
-    let place = Place::new();
-    let mut scans = scans(&place, "front");
+    let test_domain = TestDomain::new();
+    let mut scans = scans(&test_domain, "front");
     let silence = scans.why_silent();
     assert!(matches!(silence, Silence::NoHub { .. }), "{silence}");
-    assert!(silence.to_string().contains(place.domain.name()), "{silence}");
+    assert!(silence.to_string().contains(test_domain.domain.name()), "{silence}");
     assert!(silence.remedy().contains("scanhub run"), "{}", silence.remedy());
 }
 
 #[test]
-fn a_mistyped_sensor_is_unknown_and_the_names_are_the_remedy() {
-    let place = Place::new();
-    let _hub = FakeHub::new(&place.domain, &["rear", "front"], 1);
-    let mut scans = scans(&place, "frnot");
-    let silence = reason(&mut scans, |silence| matches!(silence, Silence::UnknownSensor { .. }));
+fn mistyped_sensor_is_unknown_and_remedy_lists_names() {
+    let test_domain = TestDomain::new();
+    let _hub = FakeHub::new(&test_domain.domain, &["rear", "front"], 1);
+    let mut scans = scans(&test_domain, "frnot");
+    let silence = await_reason(&mut scans, |silence| matches!(silence, Silence::UnknownSensor { .. }));
     let Silence::UnknownSensor { sensor, sensors, .. } = &silence else { panic!("{silence}") };
     assert_eq!((&sensor[..], &sensors[..]), ("frnot", &["front".to_owned(), "rear".to_owned()][..]));
     assert_eq!(silence.remedy(), "the sensors are front, rear");
-    let mut zones = ZonesSubscriber::builder("frnot").in_domain(&place.domain).open().unwrap();
+    let mut zones = ZonesSubscriber::builder("frnot").in_domain(&test_domain.domain).open().unwrap();
     assert!(matches!(zones.why_silent(), Silence::UnknownSensor { .. }));
 }
 
 #[test]
 fn the_state_of_the_link_is_the_reason() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let mut scans = scans(&place, "front");
-    assert_eq!(reason(&mut scans, |silence| *silence == Silence::Waiting), Silence::Waiting);
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    let mut scans = scans(&test_domain, "front");
+    assert_eq!(await_reason(&mut scans, |silence| *silence == Silence::Waiting), Silence::Waiting);
     let mut is = |state: State, expected: &dyn Fn(&Silence) -> bool| {
-        until("the reason", || {
-            hub.front().status(|status| {
+        wait_until("the reason", || {
+            hub.front_sensor().publish_status(|status| {
                 status.state = state as u8;
                 status.set_last_error("no such port");
             });
@@ -78,39 +78,40 @@ fn the_state_of_the_link_is_the_reason() {
     });
     is(State::Streaming, &|silence| *silence == Silence::Waiting);
     // The status follows only during a silence, and is not a sample of the topic.
-    assert_eq!(hub.front().status.subscribers(), 1);
+    assert_eq!(hub.front_sensor().status.subscribers(), 1);
     let silent_for = scans.silent_for();
-    hub.front().status(|_| {});
+    hub.front_sensor().publish_status(|_| {});
     assert!(scans.try_next().unwrap().is_none() && scans.silent_for() >= silent_for);
-    hub.front().scan(&[1000]);
+    hub.front_sensor().publish_scan(&[1000]);
     assert!(scans.next().unwrap().is_some());
-    assert_eq!(hub.front().status.subscribers(), 0);
+    assert_eq!(hub.front_sensor().status.subscribers(), 0);
 }
 
 #[test]
 fn a_robot_has_the_reason_of_its_first_unknown_sensor() {
-    let place = Place::new();
-    let robot = |sensors: &[&str]| RobotSubscriber::builder(sensors).in_domain(&place.domain).open().unwrap();
+    let test_domain = TestDomain::new();
+    let robot =
+        |sensors: &[&str]| RobotSubscriber::builder(sensors).in_domain(&test_domain.domain).open().unwrap();
     let (mut all, mut mistyped) = (robot(&[]), robot(&["front", "frnot"]));
     for robot in [&mut all, &mut mistyped] {
         assert!(matches!(robot.why_silent(), Silence::NoHub { .. }));
     }
-    let mut hub = FakeHub::new(&place.domain, &["front", "rear"], 1);
+    let mut hub = FakeHub::new(&test_domain.domain, &["front", "rear"], 1);
     hub.sensors[0].period_us = 60_000_000;
     hub.sensors[1].period_us = 60_000_000;
-    until("the zones", || {
-        hub.sensors[0].zones(Verdict::Clear, 900);
+    wait_until("the zones", || {
+        hub.sensors[0].publish_zones(Verdict::Clear, 900);
         [&mut all, &mut mistyped]
             .iter_mut()
             .all(|robot| robot.now().unwrap().sensors().any(|part| part == ("front", Verdict::Clear)))
     });
-    until("the reason", || matches!(mistyped.why_silent(), Silence::UnknownSensor { .. }));
-    until("the state of the other sensor", || {
-        hub.sensors[1].status(|status| status.state = State::Paused as u8);
+    wait_until("the reason", || matches!(mistyped.why_silent(), Silence::UnknownSensor { .. }));
+    wait_until("the state of the other sensor", || {
+        hub.sensors[1].publish_status(|status| status.state = State::Paused as u8);
         all.why_silent().to_string() == "rear is paused"
     });
-    until("its zones", || {
-        hub.sensors[1].zones(Verdict::Clear, 900);
+    wait_until("its zones", || {
+        hub.sensors[1].publish_zones(Verdict::Clear, 900);
         all.now().unwrap().verdict() == Verdict::Clear
     });
     assert_eq!(all.why_silent(), Silence::Waiting);
@@ -118,11 +119,11 @@ fn a_robot_has_the_reason_of_its_first_unknown_sensor() {
 
 #[test]
 fn a_robot_of_a_hub_without_zones_says_so() {
-    let place = Place::new();
-    let mut robot = RobotSubscriber::builder(&[]).in_domain(&place.domain).open().unwrap();
-    let lock = scanhub_shm::HubLock::acquire(place.domain.root()).unwrap();
-    let node = scanhub_shm::hub_node(&place.domain).unwrap();
-    until("the hub", || robot.why_silent() == Silence::Waiting);
+    let test_domain = TestDomain::new();
+    let mut robot = RobotSubscriber::builder(&[]).in_domain(&test_domain.domain).open().unwrap();
+    let lock = scanhub_shm::HubLock::acquire(test_domain.domain.root()).unwrap();
+    let node = scanhub_shm::hub_node(&test_domain.domain).unwrap();
+    wait_until("the hub", || robot.why_silent() == Silence::Waiting);
     lock.report_ready().unwrap();
     let silence = robot.why_silent();
     assert_eq!(silence.to_string(), "the hub has no sensor with zones");
@@ -138,15 +139,15 @@ fn a_robot_of_a_hub_without_zones_says_so() {
 
 #[test]
 fn a_topic_that_the_hub_does_not_publish_is_unknown() {
-    let place = Place::new();
-    let lock = scanhub_shm::HubLock::acquire(place.domain.root()).unwrap();
-    let node = scanhub_shm::hub_node(&place.domain).unwrap();
-    let _waker = scanhub_shm::Waker::new(&node, "front").unwrap();
+    let test_domain = TestDomain::new();
+    let lock = scanhub_shm::HubLock::acquire(test_domain.domain.root()).unwrap();
+    let node = scanhub_shm::hub_node(&test_domain.domain).unwrap();
+    let _waker = scanhub_shm::WakeSender::new(&node, "front").unwrap();
     let limits = TopicLimits::default();
     let scan = Scan::create(&node, "front", &limits).unwrap();
     let _publisher = Scan::publisher(&scan, &limits).unwrap();
     lock.report_ready().unwrap();
-    let mut marks = Subscriber::<Marks>::builder("front").in_domain(&place.domain).open().unwrap();
+    let mut marks = Subscriber::<Marks>::builder("front").in_domain(&test_domain.domain).open().unwrap();
     let silence = marks.why_silent();
     let Silence::UnknownTopic { topic, topics, .. } = &silence else { panic!("{silence}") };
     assert_eq!((&topic[..], &topics[..]), ("front/marks", &[Topic::Scan.name().to_owned()][..]));
@@ -154,48 +155,48 @@ fn a_topic_that_the_hub_does_not_publish_is_unknown() {
 
 #[test]
 fn a_restarted_hub_without_the_sensor_is_the_reason() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let mut scans = scans(&place, "front");
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    let mut scans = scans(&test_domain, "front");
     // Ports of the same program keep topics of the sensor open.
-    let builder = Subscriber::<Marks>::builder("front").in_domain(&place.domain);
+    let builder = Subscriber::<Marks>::builder("front").in_domain(&test_domain.domain);
     let mut marks = builder.open().unwrap();
-    until("the state", || {
-        hub.front().status(|status| status.state = State::Paused as u8);
+    wait_until("the state", || {
+        hub.front_sensor().publish_status(|status| status.state = State::Paused as u8);
         assert!(marks.try_next().unwrap().is_none() && scans.try_next().unwrap().is_none());
         matches!(scans.why_silent(), Silence::Paused { .. })
     });
-    assert_eq!((hub.front().scan.subscribers(), hub.front().marks.subscribers()), (1, 1));
+    assert_eq!((hub.front_sensor().scan.subscribers(), hub.front_sensor().marks.subscribers()), (1, 1));
     drop(hub);
-    until("the end", || matches!(scans.why_silent(), Silence::NoHub { .. }));
-    let hub = FakeHub::new(&place.domain, &["rear"], 2);
+    wait_until("the end", || matches!(scans.why_silent(), Silence::NoHub { .. }));
+    let hub = FakeHub::new(&test_domain.domain, &["rear"], 2);
     let is_unknown = |silence: &Silence| matches!(silence, Silence::UnknownSensor { .. });
-    let silence = reason(&mut scans, is_unknown);
+    let silence = await_reason(&mut scans, is_unknown);
     assert!(is_unknown(&silence), "{silence}");
     assert_eq!(silence.remedy(), "the sensors are rear");
     drop(hub);
-    let _hub = FakeHub::new(&place.domain, &["front"], 3);
-    assert_eq!(reason(&mut scans, |silence| *silence == Silence::Waiting), Silence::Waiting);
+    let _hub = FakeHub::new(&test_domain.domain, &["front"], 3);
+    assert_eq!(await_reason(&mut scans, |silence| *silence == Silence::Waiting), Silence::Waiting);
 }
 
 #[test]
 fn the_state_of_the_last_hub_is_not_the_reason() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let mut scans = scans(&place, "front");
-    until("the state", || {
-        hub.front().status(|status| status.state = State::Paused as u8);
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    let mut scans = scans(&test_domain, "front");
+    wait_until("the state", || {
+        hub.front_sensor().publish_status(|status| status.state = State::Paused as u8);
         assert!(scans.try_next().unwrap().is_none());
         matches!(scans.why_silent(), Silence::Paused { .. })
     });
     // The program never calls `why_silent` while no hub runs.
     drop(hub);
-    until("the end", || {
+    wait_until("the end", || {
         assert!(scans.try_next().unwrap().is_none());
         !scans.hub_is_running()
     });
-    let _hub = FakeHub::new(&place.domain, &["front"], 2);
-    until("the next hub", || {
+    let _hub = FakeHub::new(&test_domain.domain, &["front"], 2);
+    wait_until("the next hub", || {
         assert!(scans.try_next().unwrap().is_none());
         scans.hub_is_running()
     });
@@ -205,24 +206,24 @@ fn the_state_of_the_last_hub_is_not_the_reason() {
 
 #[test]
 fn a_topic_without_a_place_is_full() {
-    let place = Place::new();
-    let lock = scanhub_shm::HubLock::acquire(place.domain.root()).unwrap();
-    let node = scanhub_shm::hub_node(&place.domain).unwrap();
-    let _waker = scanhub_shm::Waker::new(&node, "front").unwrap();
+    let test_domain = TestDomain::new();
+    let lock = scanhub_shm::HubLock::acquire(test_domain.domain.root()).unwrap();
+    let node = scanhub_shm::hub_node(&test_domain.domain).unwrap();
+    let _waker = scanhub_shm::WakeSender::new(&node, "front").unwrap();
     let limits = TopicLimits { subscribers: 1, ..TopicLimits::default() };
     let scan = Scan::create(&node, "front", &limits).unwrap();
     let _publisher = Scan::publisher(&scan, &limits).unwrap();
     lock.report_ready().unwrap();
-    let mut first = scans(&place, "front");
+    let mut first = scans(&test_domain, "front");
     assert!(first.try_next().unwrap().is_none());
     assert_eq!(scan.dynamic_config().number_of_subscribers(), 1);
-    let mut second = scans(&place, "front");
+    let mut second = scans(&test_domain, "front");
     assert!(second.try_next().is_err());
     let silence = second.why_silent();
     assert!(matches!(silence, Silence::Full { .. }), "{silence}");
     assert!(silence.remedy().contains("limits.subscribers"), "{}", silence.remedy());
     drop(first);
-    until("the place", || {
+    wait_until("the place", || {
         second.try_next().is_ok_and(|scan| scan.is_none()) && second.why_silent() == Silence::Waiting
     });
 }
@@ -233,26 +234,26 @@ fn a_domain_of_another_user_is_named() {
         eprintln!("skipped: only root can make a directory of another user");
         return;
     }
-    let place = Place::new();
-    std::fs::create_dir(place.domain.root()).unwrap();
-    std::os::unix::fs::chown(place.domain.root(), Some(65_534), Some(65_534)).unwrap();
-    let silence = scans(&place, "front").why_silent();
+    let test_domain = TestDomain::new();
+    std::fs::create_dir(test_domain.domain.root()).unwrap();
+    std::os::unix::fs::chown(test_domain.domain.root(), Some(65_534), Some(65_534)).unwrap();
+    let silence = scans(&test_domain, "front").why_silent();
     assert!(matches!(silence, Silence::OtherUser { .. }), "{silence:?}");
     assert!(silence.to_string().contains("belongs to user"), "{silence}");
     assert!(silence.remedy().contains("run as user"), "{}", silence.remedy());
-    let error = find(std::slice::from_ref(&place.domain)).unwrap_err();
+    let error = find(std::slice::from_ref(&test_domain.domain)).unwrap_err();
     assert_eq!(error.kind(), ErrorKind::OtherUser, "{error}");
     assert_eq!(Failure::from(error).kind, Kind::NoHub, "the exit code is that of a missing hub");
-    let error = Publication::<Tilt>::in_domain(&place.domain, "mount").err();
+    let error = Publication::<Tilt>::in_domain(&test_domain.domain, "mount").err();
     assert_eq!(error.map(|error| error.kind()), Some(ErrorKind::OtherUser));
 }
 
 #[test]
 fn it_is_cheap_enough_for_once_a_second() {
-    let place = Place::new();
-    let _hub = FakeHub::new(&place.domain, &["front"], 1);
-    let [mut known, mut unknown] = ["front", "frnot"].map(|sensor| scans(&place, sensor));
-    let elsewhere = Place::new();
+    let test_domain = TestDomain::new();
+    let _hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    let [mut known, mut unknown] = ["front", "frnot"].map(|sensor| scans(&test_domain, sensor));
+    let elsewhere = TestDomain::new();
     let mut absent = scans(&elsewhere, "front");
     for (name, scans) in [("known", &mut known), ("unknown", &mut unknown), ("no hub", &mut absent)] {
         scans.why_silent();

@@ -4,25 +4,25 @@ mod fake;
 
 use std::time::Duration;
 
-use fake::{FakeHub, Place, until};
+use fake::{FakeHub, TestDomain, wait_until};
 use scanhub_client::{Error, ErrorKind, Scan, Subscriber, SubscriberBuilder, Telegram, Wait};
-use scanhub_schema::limits::BORROWED;
+use scanhub_schema::limits::MAX_BORROWED_SAMPLES;
 
 /// Far longer than anything takes on a busy machine.
-const LONG: Duration = Duration::from_secs(60);
+const WAIT_TIMEOUT: Duration = Duration::from_secs(60);
 
 #[test]
 fn a_builder_finds_the_hub_by_domain_and_root() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     for wait in [Wait::Doorbell, Wait::Event, Wait::Spin] {
-        let builder = Subscriber::<Scan>::builder("front").timeout(LONG).wait(wait);
-        let mut scans = builder.domain(place.domain.name()).root(&place.base).open().unwrap();
+        let builder = Subscriber::<Scan>::builder("front").timeout(WAIT_TIMEOUT).wait(wait);
+        let mut scans = builder.domain(test_domain.domain.name()).root(&test_domain.base).open().unwrap();
         assert!(scans.try_next().unwrap().is_none() && scans.hub_is_running());
-        hub.front().scan(&[1000, 2000]);
+        hub.front_sensor().publish_scan(&[1000, 2000]);
         assert_eq!(scans.next().unwrap().expect("a scan").beams(), 2, "{wait:?}");
     }
-    let elsewhere = Subscriber::<Scan>::builder("front").domain(place.domain.name()).root("/nowhere");
+    let elsewhere = Subscriber::<Scan>::builder("front").domain(test_domain.domain.name()).root("/nowhere");
     let mut scans = elsewhere.timeout(Duration::from_millis(1)).open().unwrap();
     assert!(scans.next().unwrap().is_none() && !scans.hub_is_running());
 }
@@ -36,30 +36,30 @@ fn a_builder_refuses_impossible_names() {
 
 #[test]
 fn telegrams_are_bytes() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let builder = Subscriber::<Telegram>::builder("front").in_domain(&place.domain);
-    let mut telegrams = builder.timeout(LONG).open().unwrap();
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    let builder = Subscriber::<Telegram>::builder("front").in_domain(&test_domain.domain);
+    let mut telegrams = builder.timeout(WAIT_TIMEOUT).open().unwrap();
     assert!(telegrams.try_next().unwrap().is_none());
-    hub.front().telegram(&[2, 0x80, 7]);
+    hub.front_sensor().publish_telegram(&[2, 0x80, 7]);
     let telegram = telegrams.next().unwrap().expect("a telegram");
     assert_eq!((telegram.bytes(), telegram.len()), (&[2, 0x80, 7][..], 3));
 }
 
 #[test]
-fn samples_are_held_over_waits_and_the_fifth_is_too_many() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+fn four_samples_can_be_held_and_the_fifth_is_refused() {
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     for wait in [Wait::Doorbell, Wait::Event] {
-        let builder = Subscriber::<Scan>::builder("front").in_domain(&place.domain);
-        let mut scans = builder.timeout(LONG).wait(wait).open().unwrap();
+        let builder = Subscriber::<Scan>::builder("front").in_domain(&test_domain.domain);
+        let mut scans = builder.timeout(WAIT_TIMEOUT).wait(wait).open().unwrap();
         assert!(scans.try_next().unwrap().is_none());
         let mut held = Vec::new();
-        for beams in 1..=BORROWED {
-            hub.front().scan(&vec![1000; beams]);
+        for beams in 1..=MAX_BORROWED_SAMPLES {
+            hub.front_sensor().publish_scan(&vec![1000; beams]);
             held.push(scans.iter().next().expect("a scan").unwrap());
         }
-        hub.front().scan(&[7]);
+        hub.front_sensor().publish_scan(&[7]);
         for _ in 0..2 {
             let error = scans.iter().next().expect("an error").map(drop).unwrap_err();
             assert!(matches!(error, Error::TooManyHeld), "{error}");
@@ -74,33 +74,36 @@ fn samples_are_held_over_waits_and_the_fifth_is_too_many() {
 
 #[test]
 fn a_held_sample_stays_valid_after_the_hub_has_ended() {
-    let place = Place::new();
-    let mut scans =
-        Subscriber::<Scan>::builder("front").in_domain(&place.domain).timeout(LONG).open().unwrap();
+    let test_domain = TestDomain::new();
+    let mut scans = Subscriber::<Scan>::builder("front")
+        .in_domain(&test_domain.domain)
+        .timeout(WAIT_TIMEOUT)
+        .open()
+        .unwrap();
     let mut held = Vec::new();
     for boot in 1..=2 {
-        let mut hub = FakeHub::new(&place.domain, &["front"], boot);
-        until("the subscriber", || {
+        let mut hub = FakeHub::new(&test_domain.domain, &["front"], boot);
+        wait_until("the subscriber", || {
             assert!(scans.try_next().unwrap().is_none());
-            hub.front().scan.subscribers() == 1
+            hub.front_sensor().scan.subscribers() == 1
         });
-        hub.front().scan(&vec![1000; boot as usize]);
+        hub.front_sensor().publish_scan(&vec![1000; boot as usize]);
         held.push(scans.next().unwrap().expect("a scan"));
     }
-    let seen: Vec<_> = held.iter().map(|scan| (scan.header().boot, scan.beams())).collect();
-    assert_eq!(seen, [(1, 1), (2, 2)]);
+    let observed: Vec<_> = held.iter().map(|scan| (scan.header().boot, scan.beams())).collect();
+    assert_eq!(observed, [(1, 1), (2, 2)]);
     assert!(held[1].restarted);
 }
 
 #[test]
 fn an_iterator_ends_after_a_silence_and_continues() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let builder = Subscriber::<Scan>::builder("front").in_domain(&place.domain);
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    let builder = Subscriber::<Scan>::builder("front").in_domain(&test_domain.domain);
     let mut scans = builder.timeout(Duration::from_millis(20)).open().unwrap();
     for _ in 0..2 {
         assert!(scans.iter().next().is_none());
-        (0..3).for_each(|_| hub.front().scan(&[1000]));
+        (0..3).for_each(|_| hub.front_sensor().publish_scan(&[1000]));
         let mut count = 0;
         for scan in &mut scans {
             count += scan.unwrap().beams();

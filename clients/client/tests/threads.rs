@@ -6,16 +6,16 @@ use std::sync::mpsc;
 use std::thread;
 use std::time::Duration;
 
-use fake::{FakeHub, Place, until};
+use fake::{FakeHub, TestDomain, wait_until};
 use scanhub_client::{
     Marks, Publication, PublishSession, Received, RobotSubscriber, Scan, SensorPublisher, Subscriber,
     Telegram, ZonesSubscriber, streams,
 };
-use scanhub_schema::limits::BORROWED;
+use scanhub_schema::limits::MAX_BORROWED_SAMPLES;
 use scanhub_shm::{LocalService, Payload, Role, Service, ThreadSafeService};
 
 /// Far longer than anything takes on a busy machine.
-const LONG: Duration = Duration::from_secs(60);
+const WAIT_TIMEOUT: Duration = Duration::from_secs(60);
 
 fn is_send<T: Send>() {}
 
@@ -34,8 +34,8 @@ fn all_types_of_the_interface_are_send() {
 }
 
 /// Attaches to the scans of `front` with ports of kind `S`.
-fn attach<S: Service>(place: &Place) -> (scanhub_shm::Node<S>, scanhub_shm::Subscriber<Scan, S>) {
-    let node = scanhub_shm::join::<S>(&place.domain, Role::Subscriber).unwrap();
+fn attach<S: Service>(test_domain: &TestDomain) -> (scanhub_shm::Node<S>, scanhub_shm::Subscriber<Scan, S>) {
+    let node = scanhub_shm::join::<S>(&test_domain.domain, Role::Subscriber).unwrap();
     let topic = Scan::open(&node, "front").unwrap().expect("the hub made it");
     let subscriber = Scan::subscriber(&node, &topic).unwrap();
     (node, subscriber)
@@ -43,13 +43,13 @@ fn attach<S: Service>(place: &Place) -> (scanhub_shm::Node<S>, scanhub_shm::Subs
 
 #[test]
 fn both_kinds_of_service_attach_to_one_hub() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let local = attach::<LocalService>(&place);
-    let shared = attach::<ThreadSafeService>(&place);
-    assert_eq!(hub.front().scan.subscribers(), 2);
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    let local = attach::<LocalService>(&test_domain);
+    let shared = attach::<ThreadSafeService>(&test_domain);
+    assert_eq!(hub.front_sensor().scan.subscribers(), 2);
     for beams in 1..=3 {
-        hub.front().scan(&vec![1000; beams]);
+        hub.front_sensor().publish_scan(&vec![1000; beams]);
         let of_local = Scan::receive(&local.1).unwrap().expect("one was sent");
         let of_shared = Scan::receive(&shared.1).unwrap().expect("one was sent");
         for beams_received in [Scan::read(&of_local).beams(), Scan::read(&of_shared).beams()] {
@@ -57,42 +57,48 @@ fn both_kinds_of_service_attach_to_one_hub() {
         }
     }
     drop((local, shared));
-    until("no subscribers", || hub.front().scan.subscribers() == 0);
+    wait_until("no subscribers", || hub.front_sensor().scan.subscribers() == 0);
 }
 
 #[test]
 fn a_subscriber_and_its_samples_move_between_threads() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let mut scans =
-        Subscriber::<Scan>::builder("front").in_domain(&place.domain).timeout(LONG).open().unwrap();
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    let mut scans = Subscriber::<Scan>::builder("front")
+        .in_domain(&test_domain.domain)
+        .timeout(WAIT_TIMEOUT)
+        .open()
+        .unwrap();
     assert!(scans.try_next().unwrap().is_none());
     let (give, take) = mpsc::channel();
     let thread = thread::spawn(move || {
-        for _ in 0..3 * BORROWED {
+        for _ in 0..3 * MAX_BORROWED_SAMPLES {
             let Some(scan) = scans.next().unwrap() else { panic!("no scan") };
             give.send(scan).unwrap();
         }
         scans
     });
-    for beams in 1..=3 * BORROWED {
-        hub.front().scan(&vec![1000; beams]);
+    for beams in 1..=3 * MAX_BORROWED_SAMPLES {
+        hub.front_sensor().publish_scan(&vec![1000; beams]);
         // Dropped in this thread, so the slot is free again for the other one.
-        let scan = take.recv_timeout(LONG).expect("a scan");
+        let scan = take.recv_timeout(WAIT_TIMEOUT).expect("a scan");
         assert_eq!((scan.beams(), scan.missed), (beams, 0));
     }
     let mut scans = thread.join().unwrap();
-    hub.front().scan(&[7]);
+    hub.front_sensor().publish_scan(&[7]);
     assert_eq!(scans.next().unwrap().expect("a scan").beams(), 1);
 }
 
 #[test]
 fn a_publication_moves_to_another_thread() {
-    let place = Place::new();
-    let mut near = Publication::<Marks>::in_domain(&place.domain, "tracker.near").unwrap();
-    let mut marks =
-        Subscriber::<Marks>::builder("tracker.near").in_domain(&place.domain).timeout(LONG).open().unwrap();
-    until("the subscriber", || marks.try_next().unwrap().is_none() && near.subscribers() == 1);
+    let test_domain = TestDomain::new();
+    let mut near = Publication::<Marks>::in_domain(&test_domain.domain, "tracker.near").unwrap();
+    let mut marks = Subscriber::<Marks>::builder("tracker.near")
+        .in_domain(&test_domain.domain)
+        .timeout(WAIT_TIMEOUT)
+        .open()
+        .unwrap();
+    wait_until("the subscriber", || marks.try_next().unwrap().is_none() && near.subscribers() == 1);
     let near = thread::spawn(move || {
         near.send(|sample| *sample = Marks::default()).unwrap();
         near

@@ -12,7 +12,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use fake::{FakeHub, Place, until};
+use fake::{FakeHub, TestDomain, wait_until};
 use futures::StreamExt;
 use rustix::process::{Pid, Signal, kill_process};
 use scanhub_client::{PollableSubscriber, Scan, Subscriber, ZonesSubscriber};
@@ -22,38 +22,38 @@ use tokio::io::unix::AsyncFd;
 use tokio::time::timeout;
 
 /// Far longer than anything takes on a busy machine.
-const LONG: Duration = Duration::from_secs(60);
+const WAIT_TIMEOUT: Duration = Duration::from_secs(60);
 
-fn scans(place: &Place) -> PollableSubscriber<Scan> {
-    Subscriber::<Scan>::builder("front").in_domain(&place.domain).open_pollable().unwrap()
+fn scans(test_domain: &TestDomain) -> PollableSubscriber<Scan> {
+    Subscriber::<Scan>::builder("front").in_domain(&test_domain.domain).open_pollable().unwrap()
 }
 
 /// Sends scans from another thread while the waits are canceled: before a scan, while it is sent, and after it.
 #[test]
 fn a_thousand_cancelled_waits_lose_no_sample() {
-    let place = Place::new();
+    let test_domain = TestDomain::new();
     let (is_done, received) = (AtomicBool::new(false), AtomicU64::new(0));
-    let mut scans = scans(&place);
+    let mut scans = scans(&test_domain);
     thread::scope(|scope| {
         let sender = scope.spawn(|| {
-            let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-            until("the subscriber", || hub.front().scan.subscribers() == 1);
+            let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+            wait_until("the subscriber", || hub.front_sensor().scan.subscribers() == 1);
             let started = Instant::now();
-            while !is_done.load(Ordering::Relaxed) && started.elapsed() < LONG {
+            while !is_done.load(Ordering::Relaxed) && started.elapsed() < WAIT_TIMEOUT {
                 // The queue has room for 64.
-                if hub.front().scan.topic_seq < received.load(Ordering::Relaxed) + 30 {
-                    hub.front().scan(&[1000]);
+                if hub.front_sensor().scan.topic_seq < received.load(Ordering::Relaxed) + 30 {
+                    hub.front_sensor().publish_scan(&[1000]);
                 }
                 thread::sleep(Duration::from_micros(300));
             }
-            let sent = hub.front().scan.topic_seq;
-            until("the last scan", || received.load(Ordering::Relaxed) == sent);
+            let sent = hub.front_sensor().scan.topic_seq;
+            wait_until("the last scan", || received.load(Ordering::Relaxed) == sent);
             sent
         });
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         runtime.block_on(async {
             let (mut cancelled, mut round, started) = (0, 0, Instant::now());
-            while !sender.is_finished() && started.elapsed() < LONG {
+            while !sender.is_finished() && started.elapsed() < WAIT_TIMEOUT {
                 is_done.store(cancelled >= 1000, Ordering::Relaxed);
                 round += 1;
                 match timeout(Duration::from_millis(round % 2), scans.next()).await {
@@ -75,10 +75,12 @@ fn a_thousand_cancelled_waits_lose_no_sample() {
 
 #[tokio::test]
 async fn a_stream_in_another_task_wakes_for_each_sample() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let mut scans = scans(&place);
-    until("the subscriber", || scans.try_next().unwrap().is_none() && hub.front().scan.subscribers() == 1);
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    let mut scans = scans(&test_domain);
+    wait_until("the subscriber", || {
+        scans.try_next().unwrap().is_none() && hub.front_sensor().scan.subscribers() == 1
+    });
     let (give, mut take) = tokio::sync::mpsc::channel(1);
     let task = tokio::spawn(async move {
         while let Some(scan) = scans.next().await {
@@ -89,25 +91,28 @@ async fn a_stream_in_another_task_wakes_for_each_sample() {
         }
     });
     for beams in 1..=20 {
-        hub.front().scan(&vec![1000; beams]);
-        let scan = timeout(LONG, take.recv()).await.expect("it wakes").expect("a scan");
+        hub.front_sensor().publish_scan(&vec![1000; beams]);
+        let scan = timeout(WAIT_TIMEOUT, take.recv()).await.expect("it wakes").expect("a scan");
         assert_eq!(scan.beams(), beams);
     }
     task.abort();
 }
 
 #[tokio::test]
-async fn samples_are_taken_while_an_async_fd_borrows_the_subscriber() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let scans = scans(&place);
-    until("the subscriber", || scans.try_next().unwrap().is_none() && hub.front().scan.subscribers() == 1);
+async fn receives_while_an_async_fd_borrows_the_subscriber() {
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    let scans = scans(&test_domain);
+    wait_until("the subscriber", || {
+        scans.try_next().unwrap().is_none() && hub.front_sensor().scan.subscribers() == 1
+    });
     #[allow(deprecated)] // Its replacement is unsafe. The descriptor outlives the registration.
     let descriptor = AsyncFd::new(&scans).unwrap();
     for beams in 1..=5 {
-        hub.front().scan(&vec![1000; beams]);
+        hub.front_sensor().publish_scan(&vec![1000; beams]);
         let scan = loop {
-            let mut ready = timeout(LONG, descriptor.readable()).await.expect("it is readable").unwrap();
+            let mut ready =
+                timeout(WAIT_TIMEOUT, descriptor.readable()).await.expect("it is readable").unwrap();
             if let Some(scan) = scans.try_next().unwrap() {
                 break scan;
             }
@@ -119,35 +124,37 @@ async fn samples_are_taken_while_an_async_fd_borrows_the_subscriber() {
 
 #[tokio::test]
 async fn zones_are_a_stream_with_silences() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let mut zones = ZonesSubscriber::builder("front").in_domain(&place.domain).open_pollable().unwrap();
-    until("the subscriber", || {
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    let mut zones = ZonesSubscriber::builder("front").in_domain(&test_domain.domain).open_pollable().unwrap();
+    wait_until("the subscriber", || {
         let _ = zones.try_next().unwrap();
-        hub.front().zones.subscribers() == 1
+        hub.front_sensor().zones.subscribers() == 1
     });
     // The verdict is valid for more than a second, so that a busy machine reads it before its end.
-    hub.front().period_us = 500_000;
-    hub.front().zones(Verdict::Clear, 900);
+    hub.front_sensor().period_us = 500_000;
+    hub.front_sensor().publish_zones(Verdict::Clear, 900);
     let mut verdicts = Vec::new();
     while verdicts != [Verdict::Clear, Verdict::Unknown] {
-        let heard = timeout(LONG, zones.next()).await.expect("news").expect("no end").unwrap();
-        verdicts.extend((!heard.stale || verdicts == [Verdict::Clear]).then(|| heard.zones.verdict()));
+        let sample = timeout(WAIT_TIMEOUT, zones.next()).await.expect("news").expect("no end").unwrap();
+        verdicts.extend((!sample.stale || verdicts == [Verdict::Clear]).then(|| sample.zones.verdict()));
     }
 }
 
 #[test]
 fn a_stream_moves_to_another_runtime() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let mut scans = scans(&place);
-    until("the subscriber", || scans.try_next().unwrap().is_none() && hub.front().scan.subscribers() == 1);
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    let mut scans = scans(&test_domain);
+    wait_until("the subscriber", || {
+        scans.try_next().unwrap().is_none() && hub.front_sensor().scan.subscribers() == 1
+    });
     for beams in 1..=3 {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         let scan = runtime.block_on(async {
             assert!(timeout(Duration::from_millis(1), scans.next()).await.is_err(), "nothing was sent");
-            hub.front().scan(&vec![1000; beams]);
-            timeout(LONG, scans.next()).await.expect("it wakes")
+            hub.front_sensor().publish_scan(&vec![1000; beams]);
+            timeout(WAIT_TIMEOUT, scans.next()).await.expect("it wakes")
         });
         assert_eq!(scan.expect("no end").unwrap().beams(), beams);
     }
@@ -155,8 +162,8 @@ fn a_stream_moves_to_another_runtime() {
 
 #[test]
 fn a_stream_without_a_runtime_says_so() {
-    let place = Place::new();
-    let mut scans = scans(&place);
+    let test_domain = TestDomain::new();
+    let mut scans = scans(&test_domain);
     let waker = std::task::Waker::noop();
     let polled = scans.poll_next_unpin(&mut std::task::Context::from_waker(waker));
     let std::task::Poll::Ready(Some(Err(error))) = polled else { panic!("it waits for nothing") };
@@ -164,33 +171,33 @@ fn a_stream_without_a_runtime_says_so() {
 }
 
 /// Set in the process that runs the example.
-const EXAMPLE: &str = "SCANHUB_TEST_EXAMPLE";
+const EXAMPLE_VARIABLE: &str = "SCANHUB_TEST_EXAMPLE";
 
 #[test]
 fn the_example_runs_until_ctrl_c() {
-    if std::env::var_os(EXAMPLE).is_some() {
+    if std::env::var_os(EXAMPLE_VARIABLE).is_some() {
         return example::main().unwrap();
     }
-    let place = Place::new();
-    let base = place.base.join("scanhub");
+    let test_domain = TestDomain::new();
+    let base = test_domain.base.join("scanhub");
     std::fs::create_dir(&base).unwrap();
-    let domain = Domain::at(place.domain.name(), &base).unwrap();
+    let domain = Domain::at(test_domain.domain.name(), &base).unwrap();
     let mut hub = FakeHub::new(&domain, &["front", "rear"], 1);
     let mut child = Command::new(std::env::current_exe().unwrap())
         .args(["--exact", "the_example_runs_until_ctrl_c", "--nocapture"])
-        .envs([(EXAMPLE, Path::new("1")), ("SCANHUB_DOMAIN", Path::new(domain.name()))])
-        .envs([("XDG_RUNTIME_DIR", &place.base)])
+        .envs([(EXAMPLE_VARIABLE, Path::new("1")), ("SCANHUB_DOMAIN", Path::new(domain.name()))])
+        .envs([("XDG_RUNTIME_DIR", &test_domain.base)])
         .stdout(Stdio::piped())
         .spawn()
         .unwrap();
-    until("both sensors", || hub.sensors.iter().all(|sensor| sensor.scan.subscribers() == 1));
+    wait_until("both sensors", || hub.sensors.iter().all(|sensor| sensor.scan.subscribers() == 1));
     let mut lines = BufReader::new(child.stdout.take().unwrap()).lines().map(Result::unwrap);
-    hub.sensors[0].scan(&[1000; 5]);
-    hub.sensors[1].scan(&[1000; 7]);
-    let mut wanted = vec!["front: 5 beams", "rear: 7 beams", "front: silent; there is a hub: true"];
-    while !wanted.is_empty() {
+    hub.sensors[0].publish_scan(&[1000; 5]);
+    hub.sensors[1].publish_scan(&[1000; 7]);
+    let mut expected = vec!["front: 5 beams", "rear: 7 beams", "front: silent; there is a hub: true"];
+    while !expected.is_empty() {
         let line = lines.next().expect("the example ended");
-        wanted.retain(|wanted| !line.ends_with(wanted));
+        expected.retain(|expected| !line.ends_with(expected));
     }
     kill_process(Pid::from_child(&child), Signal::INT).unwrap();
     assert!(lines.any(|line| line == "end"));

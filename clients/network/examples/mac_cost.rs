@@ -7,20 +7,20 @@ use std::hint::black_box;
 use std::time::Instant;
 
 use scanhub_network::lan::Key;
-use scanhub_schema::datagram::{Datagram, HEAD, Head, MAC, MTU_SAFE};
+use scanhub_schema::datagram::{Datagram, HEADER_LEN, Head, MAC_LEN, MTU_SAFE};
 
 /// Scans in a run, and runs.
-const SCANS: u32 = 200;
-const RUNS: usize = 40;
+const SCAN_COUNT: u32 = 200;
+const RUN_COUNT: usize = 40;
 
 /// Returns the datagrams of a payload of `len` bytes, each with a MAC.
 fn datagrams(key: &Key, len: usize) -> Vec<Vec<u8>> {
-    let room = MTU_SAFE - HEAD - MAC;
+    let room = MTU_SAFE - HEADER_LEN - MAC_LEN;
     let payload: Vec<u8> = (0..len).map(|at| (at * 7) as u8).collect();
     let parts = len.div_ceil(room) as u8;
     let part = |(part, payload): (usize, &[u8])| {
         let mut buffer = [0; MTU_SAFE];
-        buffer[HEAD..HEAD + payload.len()].copy_from_slice(payload);
+        buffer[HEADER_LEN..HEADER_LEN + payload.len()].copy_from_slice(payload);
         let head = Head { topic: 2, revision: 1, part: part as u8, parts, ..Head::default() };
         head.seal_with(&mut buffer, payload.len(), |covered| key.mac(covered)).expect("room").to_vec()
     };
@@ -31,12 +31,12 @@ fn datagrams(key: &Key, len: usize) -> Vec<Vec<u8>> {
 fn min_ns(datagrams: &[Vec<u8>], work: impl Fn(&[u8])) -> f64 {
     let run = |_| {
         let begin = Instant::now();
-        for _ in 0..SCANS {
+        for _ in 0..SCAN_COUNT {
             datagrams.iter().for_each(|bytes| work(black_box(bytes)));
         }
-        begin.elapsed().as_nanos() as f64 / f64::from(SCANS)
+        begin.elapsed().as_nanos() as f64 / f64::from(SCAN_COUNT)
     };
-    (0..RUNS).map(run).fold(f64::INFINITY, f64::min)
+    (0..RUN_COUNT).map(run).fold(f64::INFINITY, f64::min)
 }
 
 fn main() {

@@ -7,27 +7,27 @@ use std::io::Write;
 use std::num::NonZeroU64;
 use std::time::{Duration, Instant};
 
-use scanhub_client::streams::{GRACE, Sample, Session, Source};
+use scanhub_client::streams::{STARTUP_GRACE, Sample, Session, Source};
 use scanhub_schema::{Failure, Topic, check_sensor};
 use scanhub_shm::Domain;
 use scanhub_verbs::discovery::Discovery;
 use scanhub_verbs::follow::Notice;
 use scanhub_verbs::names::no_sensor;
-use scanhub_verbs::output::{End, Output};
+use scanhub_verbs::output::{ExitReason, Output};
 use serde::Serialize;
 
-use crate::gateway_identity::Life;
-use crate::lan::outgoing::{self, Outgoing, PayloadRef, Row};
+use crate::gateway_identity::GatewayIdentity;
+use crate::lan::outgoing::{self, Outgoing, PayloadRef, TopicStats};
 pub use selection::Selection;
 
 /// A network that takes samples.
-pub trait Carrier {
+pub trait SampleSink {
     /// Adds the sensor called `name`. `every` is the thinning factor of each topic, or `None` if it is not sent.
     /// Returns the sensor's position.
     fn follow(&mut self, name: &str, every: &dyn Fn(Topic) -> Option<NonZeroU64>) -> usize;
 
     /// Returns whether samples of this topic are needed.
-    fn wants(&self, sensor: usize, topic: Topic) -> bool;
+    fn needs(&self, sensor: usize, topic: Topic) -> bool;
 
     /// Sends a sample of the sensor at this position.
     fn sample(&mut self, sensor: usize, sample: &outgoing::Sample<'_>);
@@ -40,38 +40,38 @@ pub struct Forwarder {
     sensors: Vec<Sensor>,
     started: Instant,
     discovery: Discovery,
-    is_there: bool,
+    is_hub_running: bool,
     /// Further sensors that must exist, even if nothing of them is sent.
-    demanded: Vec<String>,
+    required: Vec<String>,
     /// Whether the named sensors were found in a hub.
     is_checked: bool,
-    waiting_said: bool,
+    is_waiting_reported: bool,
 }
 
 impl Forwarder {
     /// Subscribes to the selected topics of the hub in the first live one of `places`.
-    pub fn new(selection: Selection, places: &[Domain], carrier: &mut impl Carrier) -> Forwarder {
-        let named = selection.named().into_iter().map(|name| {
-            let maker = selection.maker_of(name);
-            Sensor::new(name, |topic| topic.maker() == maker, &selection, carrier)
+    pub fn new(selection: Selection, locations: &[Domain], sink: &mut impl SampleSink) -> Forwarder {
+        let named = selection.named_sensors().into_iter().map(|name| {
+            let publisher_kind = selection.publisher_kind(name);
+            Sensor::new(name, |topic| topic.publisher_kind() == publisher_kind, &selection, sink)
         });
         let sensors = named.collect();
         Forwarder {
             sensors,
             selection,
-            session: Session::new(places.to_vec()),
+            session: Session::new(locations.to_vec()),
             started: Instant::now(),
             discovery: Discovery::default(),
-            is_there: false,
-            demanded: Vec::new(),
+            is_hub_running: false,
+            required: Vec::new(),
             is_checked: false,
-            waiting_said: false,
+            is_waiting_reported: false,
         }
     }
 
     /// Requires that `sensor` exists, which the user named for another purpose.
-    pub fn demand(&mut self, sensor: &str) {
-        self.demanded.push(sensor.to_owned());
+    pub fn require(&mut self, sensor: &str) {
+        self.required.push(sensor.to_owned());
     }
 
     /// Passes waiting samples of all sensors to `carrier`. Returns whether there may be more.
@@ -79,10 +79,10 @@ impl Forwarder {
     /// # Errors
     ///
     /// Returns [`Kind::Short`](scanhub_schema::Kind) if descriptors or memory are short.
-    pub fn forward(&mut self, carrier: &mut impl Carrier) -> Result<bool, Failure> {
+    pub fn forward(&mut self, sink: &mut impl SampleSink) -> Result<bool, Failure> {
         let (mut more, mut subscribed) = (false, false);
         for sensor in &mut self.sensors {
-            more |= sensor.forward(&mut self.session, carrier, &mut subscribed)?;
+            more |= sensor.forward(&mut self.session, sink, &mut subscribed)?;
         }
         Ok(more)
     }
@@ -93,31 +93,32 @@ impl Forwarder {
     /// # Errors
     ///
     /// Returns [`Kind::NoTopic`](scanhub_schema::Kind) if the first hub lacks a named sensor, and the errors of `tell`.
-    pub fn look(
+    pub fn check_hub(
         &mut self,
         now: Instant,
-        carrier: &mut impl Carrier,
-        tell: &mut impl FnMut(Notice) -> Result<(), End>,
-    ) -> Result<(), End> {
-        let change = self.session.look()?;
-        if change.gone.is_some() && self.is_there {
-            self.is_there = false;
-            self.discovery.end();
-            tell(Notice::HubGone)?;
+        sink: &mut impl SampleSink,
+        report: &mut impl FnMut(Notice) -> Result<(), ExitReason>,
+    ) -> Result<(), ExitReason> {
+        let change = self.session.check_hub()?;
+        if change.ended.is_some() && self.is_hub_running {
+            self.is_hub_running = false;
+            self.discovery.on_hub_ended();
+            report(Notice::HubGone)?;
         }
         // Another process may publish sensors of other machines, which are not sent again.
-        if change.back.is_some() && self.session.hub_lives() {
-            if self.discovery.has_begun() || self.waiting_said {
-                tell(Notice::HubBack)?;
+        if change.started.is_some() && self.session.hub_is_running() {
+            if self.discovery.has_seen_hub() || self.is_waiting_reported {
+                report(Notice::HubBack)?;
             }
-            self.is_there = true;
-            self.discovery.begin(now);
+            self.is_hub_running = true;
+            self.discovery.on_hub_started(now);
         }
-        if !self.discovery.has_begun() && !self.waiting_said && now - self.started >= GRACE {
-            self.waiting_said = true;
-            tell(Notice::NoHub(self.session.no_hub().into()))?;
+        if !self.discovery.has_seen_hub() && !self.is_waiting_reported && now - self.started >= STARTUP_GRACE
+        {
+            self.is_waiting_reported = true;
+            report(Notice::NoHub(self.session.no_hub().into()))?;
         }
-        Ok(self.discover(now, carrier)?)
+        Ok(self.discover(now, sink)?)
     }
 
     /// Waits for a sample or an event, but no longer than `at_most`.
@@ -126,21 +127,21 @@ impl Forwarder {
     ///
     /// Returns [`Kind::Failed`](scanhub_schema::Kind) if the system cannot wait.
     pub fn wait(&mut self, at_most: Duration) -> Result<(), Failure> {
-        let left = self.sensors.iter().filter_map(Sensor::left).chain(self.discovery.left());
+        let left = self.sensors.iter().filter_map(Sensor::time_left).chain(self.discovery.time_left());
         self.session.wait_for(Some(left.fold(at_most, Duration::min)))?;
         Ok(())
     }
 
     /// Returns whether the hub is running.
-    pub fn is_there(&self) -> bool {
-        self.is_there
+    pub fn is_hub_running(&self) -> bool {
+        self.is_hub_running
     }
 
     /// Subscribes to new sensors of the hub if all are selected. The first hub must have all named sensors.
-    fn discover(&mut self, now: Instant, carrier: &mut impl Carrier) -> Result<(), Failure> {
-        let Some(domain) = self.session.domain().filter(|_| self.is_there) else { return Ok(()) };
-        let Some(called) = self.discovery.call(domain, now)? else { return Ok(()) };
-        if self.selection.wants_all() {
+    fn discover(&mut self, now: Instant, carrier: &mut impl SampleSink) -> Result<(), Failure> {
+        let Some(domain) = self.session.domain().filter(|_| self.is_hub_running) else { return Ok(()) };
+        let Some(called) = self.discovery.poll(domain, now)? else { return Ok(()) };
+        if self.selection.includes_unnamed() {
             for name in &called.sensors {
                 // The name of a remote sensor has another form.
                 let is_known = self.sensors.iter().any(|sensor| sensor.name == *name);
@@ -150,11 +151,11 @@ impl Forwarder {
                 }
             }
         }
-        if !self.is_checked && called.age >= GRACE && !self.session.hub_is_starting() {
+        if !self.is_checked && called.age >= STARTUP_GRACE && !self.session.hub_is_starting() {
             let is_there = |name: &&str| called.sensors.iter().any(|it| it == name);
-            let demanded = self.demanded.iter().map(String::as_str);
+            let demanded = self.required.iter().map(String::as_str);
             if let Some(name) =
-                self.selection.named().into_iter().chain(demanded).find(|name| !is_there(name))
+                self.selection.named_sensors().into_iter().chain(demanded).find(|name| !is_there(name))
             {
                 return Err(no_sensor(name, &called.sensors));
             }
@@ -169,8 +170,13 @@ impl Forwarder {
 /// # Errors
 ///
 /// Returns the reason why output cannot be written.
-pub fn tell(notice: Notice, json: bool, out: &mut Output<'_>, notes: &mut Output<'_>) -> Result<(), End> {
-    notice.tell(&[], json, out, notes)
+pub fn report_notice(
+    notice: Notice,
+    json: bool,
+    out: &mut Output<'_>,
+    notes: &mut Output<'_>,
+) -> Result<(), ExitReason> {
+    notice.report(&[], json, out, notes)
 }
 
 /// A subscribed sensor.
@@ -191,13 +197,12 @@ impl Sensor {
         name: &str,
         may_have: impl Fn(Topic) -> bool,
         selection: &Selection,
-        carrier: &mut impl Carrier,
+        sink: &mut impl SampleSink,
     ) -> Sensor {
         let every = |topic| selection.every(name, topic).filter(|_| may_have(topic));
-        let position = carrier.follow(name, &every);
-        let wanted =
-            Topic::ALL.into_iter().filter(|topic| may_have(*topic) && carrier.wants(position, *topic));
-        let sources = wanted.map(|topic| Source::new(name, topic)).collect();
+        let position = sink.follow(name, &every);
+        let needed = Topic::ALL.into_iter().filter(|topic| may_have(*topic) && sink.needs(position, *topic));
+        let sources = needed.map(|topic| Source::new(name, topic)).collect();
         Sensor { name: name.to_owned(), position, sources }
     }
 
@@ -210,7 +215,7 @@ impl Sensor {
     fn forward(
         &mut self,
         session: &mut Session,
-        carrier: &mut impl Carrier,
+        sink: &mut impl SampleSink,
         subscribed: &mut bool,
     ) -> Result<bool, Failure> {
         let mut more = false;
@@ -220,10 +225,10 @@ impl Sensor {
                 more = true;
                 continue;
             }
-            for turn in 0..BATCH_SIZE {
+            for taken in 0..BATCH_SIZE {
                 let Some(sample) = source.receive(session)? else { break };
-                more |= turn + 1 == BATCH_SIZE;
-                carrier.sample(self.position, &borrowed(&sample));
+                more |= taken + 1 == BATCH_SIZE;
+                sink.sample(self.position, &borrowed(&sample));
             }
             *subscribed |= is_new && source.subscribed();
         }
@@ -231,8 +236,8 @@ impl Sensor {
     }
 
     /// Returns the time after which there may be a sample to send although the hub sends nothing.
-    fn left(&self) -> Option<Duration> {
-        self.sources.iter().filter_map(Source::left).min()
+    fn time_left(&self) -> Option<Duration> {
+        self.sources.iter().filter_map(Source::time_left).min()
     }
 }
 
@@ -242,7 +247,7 @@ macro_rules! payloads {
         fn payload(sample: &Sample) -> PayloadRef<'_> {
             match sample {
                 $(Sample::$topic(sample) => PayloadRef::$topic(payloads!($topic sample)),)*
-                Sample::Robot(sample) => PayloadRef::Zones(&sample.heard.zones),
+                Sample::Robot(sample) => PayloadRef::Zones(&sample.update.zones),
             }
         }
     };
@@ -266,21 +271,21 @@ fn borrowed(sample: &Sample) -> outgoing::Sample<'_> {
 /// # Errors
 ///
 /// Returns the reason why output cannot be written.
-pub fn account(
+pub fn write_counters(
     outgoing: &Outgoing,
-    life: &Life,
+    identity: &GatewayIdentity,
     class: &'static str,
     json: bool,
     out: &mut Output<'_>,
-) -> Result<(), End> {
-    let hub = format!("{:016x}", life.hub);
-    for sensor in outgoing.account() {
-        for (topic, row) in sensor.used() {
+) -> Result<(), ExitReason> {
+    let hub = format!("{:016x}", identity.hub);
+    for sensor in outgoing.counters() {
+        for (topic, row) in sensor.used_topics() {
             let topic = topic.map_or("announce", Topic::name);
-            let Row { sent, failed, bytes, missed, .. } = *row;
-            let replaced = outgoing.tells_replaced().then_some(row.replaced);
+            let TopicStats { sent, failed, bytes, missed, .. } = *row;
+            let replaced = outgoing.announces_replaced().then_some(row.replaced);
             if json {
-                let (hub, epoch, sensor) = (&hub, life.epoch, &sensor.name);
+                let (hub, epoch, sensor) = (&hub, identity.epoch, &sensor.name);
                 let send_failed = failed;
                 out.json(&SentLine {
                     class,

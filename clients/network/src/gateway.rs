@@ -14,19 +14,19 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use clap::Args;
-use scanhub_schema::datagram::{Announce, GROUPS, MTU_SAFE, PORT, group};
+use scanhub_schema::datagram::{Announce, GROUP_PREFIX, MTU_SAFE, PORT, group};
 use scanhub_schema::{Failure, Kind, Topic};
 use scanhub_shm::Domain;
 use scanhub_verbs::context::Context;
 use scanhub_verbs::duration;
 use scanhub_verbs::follow::Notice;
-use scanhub_verbs::output::{End, LossyWriter, Output, quiet};
+use scanhub_verbs::output::{ExitReason, LossyWriter, Output, verb_result};
 use serde::Serialize;
 
 use crate::forward::{self, Forwarder, Selection};
-use crate::gateway_identity::begin_life;
+use crate::gateway_identity::begin_run;
 use crate::lan::Key;
-use crate::lan::outgoing::{ANNOUNCE_EVERY, Form};
+use crate::lan::outgoing::{ANNOUNCEMENT_INTERVAL, Form};
 use crate::{key_file, now};
 use interface_monitor::InterfaceMonitor;
 use network::{Groups, Network};
@@ -81,20 +81,20 @@ impl GatewayArgs {
     ///   another value is not valid, or the key file contains no key that only this user can read,
     /// - [`Kind::Usage`] if there is no such topic,
     /// - [`Kind::NoTopic`] if the first hub has no such sensor,
-    /// - [`Kind::Short`] if descriptors or memory are short,
+    /// - [`Kind::ResourceExhausted`] if descriptors or memory are short,
     /// - [`Kind::Interrupted`] if a signal stops the run before all hosts are resolved.
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
-        let (tell, stop) = (context.signals.report()?, context.signals.stop()?);
+        let (report_requested, stop) = (context.signals.report()?, context.signals.stop()?);
         let display = match (context.json, context.is_terminal) {
             (true, _) => Display::Json,
             (false, true) => Display::Terminal,
             (false, false) => Display::Lines,
         };
-        let mut gateway = Gateway::open(self, &context.domain.places()?, &stop)?;
+        let mut gateway = Gateway::open(self, &context.domain.locations()?, &stop)?;
         let (mut out, mut notes) =
-            (LossyWriter::around(&mut context.out, &stop), LossyWriter::around(&mut context.notes, &stop));
+            (LossyWriter::new(&mut context.out, &stop), LossyWriter::new(&mut context.notes, &stop));
         let mut report = Report::new(display, &mut out, &mut notes);
-        quiet(gateway.run(&mut report, &tell, &stop))
+        verb_result(gateway.run(&mut report, &report_requested, &stop))
     }
 
     /// Checks everything that needs neither network nor hub: the topics, and which options exclude each other.
@@ -145,18 +145,18 @@ struct Gateway<'a> {
 const HOSTS: &str = "hosts";
 
 /// Interval between announcements, and between reports of the counters.
-const TICK_INTERVAL: Duration = ANNOUNCE_EVERY;
+const TICK_INTERVAL: Duration = ANNOUNCEMENT_INTERVAL;
 
 impl<'a> Gateway<'a> {
-    fn open(args: &'a GatewayArgs, places: &[Domain], stop: &AtomicBool) -> Result<Gateway<'a>, Failure> {
+    fn open(args: &'a GatewayArgs, locations: &[Domain], stop: &AtomicBool) -> Result<Gateway<'a>, Failure> {
         let selection = args.selection()?;
         if args.interface.is_none() && args.to.is_empty() {
             return Err(interface_monitor::no_destination());
         }
         let key = args.key_file.as_deref().map(key_file::read).transpose()?;
         let interface = args.interface.as_deref().map(InterfaceMonitor::open).transpose()?;
-        let domain = places.first().map(Domain::name).unwrap_or_default();
-        let life = begin_life(domain, interface.as_ref().map_or(HOSTS, InterfaceMonitor::name))?;
+        let domain = locations.first().map(Domain::name).unwrap_or_default();
+        let identity = begin_run(domain, interface.as_ref().map_or(HOSTS, InterfaceMonitor::name))?;
         let key_name = key.as_ref().map(Key::name);
         let form = match key {
             Some(key) => Form::Authenticated(key),
@@ -164,23 +164,33 @@ impl<'a> Gateway<'a> {
             None => Form::Sealed,
         };
         let (ttl, longest) = (args.ttl.unwrap_or(1), args.mtu.unwrap_or(MTU_SAFE));
-        let mut network = Network::open(life, interface, &args.to, form, ttl, longest, stop)?;
-        let forwarder = Forwarder::new(selection, places, &mut network);
+        let mut network = Network::open(identity, interface, &args.to, form, ttl, longest, stop)?;
+        let forwarder = Forwarder::new(selection, locations, &mut network);
         Ok(Gateway { args, key_name, forwarder, network, tick_at: Instant::now() })
     }
 
-    fn run(&mut self, report: &mut Report<'_>, tell: &AtomicBool, stop: &AtomicBool) -> Result<(), End> {
+    fn run(
+        &mut self,
+        report: &mut Report<'_>,
+        report_requested: &AtomicBool,
+        stop: &AtomicBool,
+    ) -> Result<(), ExitReason> {
         report.begin(&self.network, self.args.bare, self.key_name.as_deref())?;
         if self.network.destinations.groups.as_ref().is_some_and(|groups| !groups.interface.is_up()) {
             report.interface(&self.network)?;
         }
-        let end = self.forward(report, tell, stop);
+        let end = self.forward(report, report_requested, stop);
         // The last announcement contains the final numbers, so that listeners can count lost samples.
         self.announce();
-        end.and_then(|()| report.account(&self.network))
+        end.and_then(|()| report.write_counters(&self.network))
     }
 
-    fn forward(&mut self, report: &mut Report<'_>, tell: &AtomicBool, stop: &AtomicBool) -> Result<(), End> {
+    fn forward(
+        &mut self,
+        report: &mut Report<'_>,
+        report_requested: &AtomicBool,
+        stop: &AtomicBool,
+    ) -> Result<(), ExitReason> {
         while !stop.load(Ordering::Relaxed) {
             if self.network.destinations.update() {
                 report.interface(&self.network)?;
@@ -188,10 +198,10 @@ impl<'a> Gateway<'a> {
             // Send waiting samples before checking the hub, which takes longer.
             let more = self.forwarder.forward(&mut self.network)?;
             let now = Instant::now();
-            self.forwarder.look(now, &mut self.network, &mut |notice| report.hub(notice))?;
+            self.forwarder.check_hub(now, &mut self.network, &mut |notice| report.hub(notice))?;
             self.tick(report, now)?;
-            if tell.swap(false, Ordering::Relaxed) {
-                report.account(&self.network)?;
+            if report_requested.swap(false, Ordering::Relaxed) {
+                report.write_counters(&self.network)?;
             }
             if !more {
                 self.forwarder.wait(self.tick_at.saturating_duration_since(now))?;
@@ -201,7 +211,7 @@ impl<'a> Gateway<'a> {
     }
 
     /// Does the periodic work once a second: announcements, backgrounds, and reports about destinations.
-    fn tick(&mut self, report: &mut Report<'_>, now: Instant) -> Result<(), End> {
+    fn tick(&mut self, report: &mut Report<'_>, now: Instant) -> Result<(), ExitReason> {
         if now < self.tick_at {
             return Ok(());
         }
@@ -219,10 +229,10 @@ impl<'a> Gateway<'a> {
                 report.destination(&destination.name, &event)?;
             }
         }
-        if let Some(what) = self.network.outgoing.misfit() {
-            report.misfit(&what, self.network.outgoing.longest())?;
+        if let Some(what) = self.network.outgoing.take_oversized() {
+            report.oversized(&what, self.network.outgoing.max_datagram_len())?;
         }
-        report.periodic(&self.network, self.forwarder.is_there())
+        report.periodic(&self.network, self.forwarder.is_hub_running())
     }
 
     fn announce(&mut self) {
@@ -247,47 +257,47 @@ impl<'a> Report<'a> {
     }
 
     /// Reports the gateway's identity, its destinations and its key.
-    fn begin(&mut self, network: &Network, bare: bool, key: Option<&str>) -> Result<(), End> {
+    fn begin(&mut self, network: &Network, bare: bool, key: Option<&str>) -> Result<(), ExitReason> {
         let to: Vec<_> = network.destinations.copies.iter().map(|copy| copy.name.as_str()).collect();
         if self.display == Display::Json {
-            return self.out.json(&Begin {
+            return self.out.json(&GatewayJson {
                 class: "gateway",
                 hub: id(network),
-                epoch: network.life.epoch,
+                epoch: network.identity.epoch,
                 interface: network.destinations.groups.as_ref().map(|groups| groups.interface.name()),
                 to,
                 bare,
                 key,
-                longest: network.outgoing.longest(),
-                renumbered: network.life.is_renumbered,
+                longest: network.outgoing.max_datagram_len(),
+                renumbered: network.identity.is_renumbered,
             });
         }
-        if network.life.is_renumbered {
-            self.notes.line(|line| write!(line, "{}: {RENUMBERED}", id(network)))?;
+        if network.identity.is_renumbered {
+            self.notes.line(|line| write!(line, "{}: {RENUMBERED_REASON}", id(network)))?;
         }
         self.out.line(|line| {
-            write!(line, "gateway {} epoch {}", id(network), network.life.epoch)?;
+            write!(line, "gateway {} epoch {}", id(network), network.identity.epoch)?;
             if let Some(groups) = &network.destinations.groups {
                 write!(line, " on {}", groups.interface.name())?;
             }
             to.iter().try_for_each(|to| write!(line, ", copies to {to}"))?;
-            write!(line, ", datagrams of {} bytes at most", network.outgoing.longest())?;
+            write!(line, ", datagrams of {} bytes at most", network.outgoing.max_datagram_len())?;
             key.map_or(Ok(()), |key| write!(line, ", key {key}"))
         })?;
         if key.is_none() && !bare {
-            self.notes.line(|line| write!(line, "no key: {NO_KEY}"))?;
+            self.notes.line(|line| write!(line, "no key: {NO_KEY_NOTE}"))?;
         }
         Ok(())
     }
 
     /// Reports a notice about the hub.
-    fn hub(&mut self, notice: Notice) -> Result<(), End> {
+    fn hub(&mut self, notice: Notice) -> Result<(), ExitReason> {
         self.clear_line()?;
-        forward::tell(notice, self.display == Display::Json, &mut self.out, &mut self.notes)
+        forward::report_notice(notice, self.display == Display::Json, &mut self.out, &mut self.notes)
     }
 
     /// Reports a new state of the interface.
-    fn interface(&mut self, network: &Network) -> Result<(), End> {
+    fn interface(&mut self, network: &Network) -> Result<(), ExitReason> {
         let Some(Groups { interface, .. }) = &network.destinations.groups else { return Ok(()) };
         match interface.is_up() {
             true => self.link(interface.name(), "up", None),
@@ -296,55 +306,63 @@ impl<'a> Report<'a> {
     }
 
     /// Reports a state change of a destination.
-    fn destination(&mut self, destination: &str, event: &DestinationEvent) -> Result<(), End> {
+    fn destination(&mut self, destination: &str, event: &DestinationEvent) -> Result<(), ExitReason> {
         match event {
-            DestinationEvent::Failing(why) => self.link(destination, "failing", Some(why)),
-            DestinationEvent::Well => self.link(destination, "recovered", None),
+            DestinationEvent::Failing(reason) => self.link(destination, "failing", Some(reason)),
+            DestinationEvent::Recovered => self.link(destination, "recovered", None),
         }
     }
 
     /// Reports the new address of a destination.
-    fn moved(&mut self, destination: &str, address: SocketAddr) -> Result<(), End> {
+    fn moved(&mut self, destination: &str, address: SocketAddr) -> Result<(), ExitReason> {
         self.link(destination, "moved", Some(&format!("its address is now {address}")))
     }
 
     /// Reports that samples of `topic` do not fit into the maximum number of datagrams.
-    fn misfit(&mut self, topic: &str, longest: usize) -> Result<(), End> {
+    fn oversized(&mut self, topic: &str, longest: usize) -> Result<(), ExitReason> {
         let message =
             format!("does not fit into {longest} bytes: --mtu, or the interface's own, is too small");
         self.link(topic, "failing", Some(&message))
     }
 
     /// Prints the periodic report: JSON lines with all counters, or a status line on a terminal.
-    fn periodic(&mut self, network: &Network, is_hub_running: bool) -> Result<(), End> {
+    fn periodic(&mut self, network: &Network, is_hub_running: bool) -> Result<(), ExitReason> {
         match self.display {
-            Display::Json => self.account(network),
+            Display::Json => self.write_counters(network),
             Display::Lines => Ok(()),
             Display::Terminal => self.draw(network, is_hub_running),
         }
     }
 
     /// Prints all counters.
-    fn account(&mut self, network: &Network) -> Result<(), End> {
+    fn write_counters(&mut self, network: &Network) -> Result<(), ExitReason> {
         self.clear_line()?;
         let json = self.display == Display::Json;
-        forward::account(&network.outgoing, &network.life, "lan", json, &mut self.out)?;
-        if network.outgoing.unfit() > 0 && self.display != Display::Json {
-            let longest = network.outgoing.longest();
+        forward::write_counters(&network.outgoing, &network.identity, "lan", json, &mut self.out)?;
+        if network.outgoing.oversized_samples() > 0 && self.display != Display::Json {
+            let longest = network.outgoing.max_datagram_len();
             self.out.line(|line| {
-                write!(line, "too long for {longest} bytes: {}, see --mtu", network.outgoing.unfit())
+                write!(
+                    line,
+                    "too long for {longest} bytes: {}, see --mtu",
+                    network.outgoing.oversized_samples()
+                )
             })?;
         }
         network.destinations.all().try_for_each(|destination| self.write_destination(network, destination))
     }
 
-    fn write_destination(&mut self, network: &Network, destination: &UdpDestination) -> Result<(), End> {
+    fn write_destination(
+        &mut self,
+        network: &Network,
+        destination: &UdpDestination,
+    ) -> Result<(), ExitReason> {
         let UdpDestination { name, sent, failed, reported, .. } = destination;
         if self.display == Display::Json {
-            return self.out.json(&To {
+            return self.out.json(&DestinationJson {
                 class: "lan_to",
                 hub: id(network),
-                epoch: network.life.epoch,
+                epoch: network.identity.epoch,
                 to: name,
                 sent: *sent,
                 send_failed: *failed,
@@ -354,9 +372,9 @@ impl<'a> Report<'a> {
         self.out.line(|line| write!(line, "to {name}: {sent} sent, {failed} failed, {reported} reported"))
     }
 
-    fn link(&mut self, to: &str, state: &'static str, message: Option<&str>) -> Result<(), End> {
+    fn link(&mut self, to: &str, state: &'static str, message: Option<&str>) -> Result<(), ExitReason> {
         if self.display == Display::Json {
-            return self.out.json(&Link { class: "lan_link", to, state, message });
+            return self.out.json(&LinkJson { class: "lan_link", to, state, message });
         }
         self.clear_line()?;
         self.notes.line(|line| match message {
@@ -366,7 +384,7 @@ impl<'a> Report<'a> {
     }
 
     /// Draws the status line over the previous one.
-    fn draw(&mut self, network: &Network, is_hub_running: bool) -> Result<(), End> {
+    fn draw(&mut self, network: &Network, is_hub_running: bool) -> Result<(), ExitReason> {
         // Disable wrapping, because a wrapped line could not be drawn over.
         let mut line = [CLEAR_LINE, b"\x1b[?7l"].concat();
         write_status(&mut line, network, is_hub_running, self.sent)?;
@@ -376,7 +394,7 @@ impl<'a> Report<'a> {
     }
 
     /// Clears the status line on a terminal.
-    fn clear_line(&mut self) -> Result<(), End> {
+    fn clear_line(&mut self) -> Result<(), ExitReason> {
         match self.display {
             Display::Terminal => self.out.raw(CLEAR_LINE),
             Display::Json | Display::Lines => Ok(()),
@@ -407,12 +425,12 @@ fn write_status(
         }
     }
     let missed: u64 =
-        network.outgoing.account().flat_map(|sensor| sensor.used()).map(|(_, row)| row.missed).sum();
+        network.outgoing.counters().flat_map(|sensor| sensor.used_topics()).map(|(_, row)| row.missed).sum();
     if missed > 0 {
         write!(line, "; {missed} missed")?;
     }
-    if network.outgoing.unfit() > 0 {
-        write!(line, "; {} too long", network.outgoing.unfit())
+    if network.outgoing.oversized_samples() > 0 {
+        write!(line, "; {} too long", network.outgoing.oversized_samples())
     } else {
         Ok(())
     }
@@ -425,12 +443,12 @@ fn first(network: &Network) -> (u64, &str) {
 
 /// Returns the gateway's number as in all output.
 fn id(network: &Network) -> String {
-    format!("{:016x}", network.life.hub)
+    format!("{:016x}", network.identity.hub)
 }
 
 /// Class `gateway`.
 #[derive(Serialize)]
-struct Begin<'a> {
+struct GatewayJson<'a> {
     class: &'static str,
     hub: String,
     epoch: u32,
@@ -444,7 +462,7 @@ struct Begin<'a> {
 
 /// Class `lan_to`.
 #[derive(Serialize)]
-struct To<'a> {
+struct DestinationJson<'a> {
     class: &'static str,
     hub: String,
     epoch: u32,
@@ -456,7 +474,7 @@ struct To<'a> {
 
 /// Class `lan_link`.
 #[derive(Serialize)]
-struct Link<'a> {
+struct LinkJson<'a> {
     class: &'static str,
     to: &'a str,
     state: &'static str,
@@ -464,9 +482,10 @@ struct Link<'a> {
 }
 
 /// Reason for which a gateway has another number than the stored one.
-const RENUMBERED: &str = "a new number, because the one that is kept here was drawn on another machine";
+const RENUMBERED_REASON: &str =
+    "a new number, because the one that is kept here was drawn on another machine";
 /// Note of a gateway without a key.
-const NO_KEY: &str = "receivers cannot know who sends; see `scanhub key new` and --key-file";
+const NO_KEY_NOTE: &str = "receivers cannot know who sends; see `scanhub key new` and --key-file";
 /// Moves the cursor to the start of the line, and clears it (ECMA-48).
 const CLEAR_LINE: &[u8] = b"\r\x1b[K";
 
@@ -489,7 +508,7 @@ fn groups_and_topics() -> Vec<(String, String)> {
     for topic in Topic::ALL {
         groups.entry(group(topic)).or_default().push(topic.name());
     }
-    let [a, b, c] = GROUPS;
+    let [a, b, c] = GROUP_PREFIX;
     let row = |(last, topics): (u8, Vec<&str>)| (format!("{a}.{b}.{c}.{last}"), topics.join(", "));
     groups.into_iter().map(row).collect()
 }
@@ -499,7 +518,7 @@ mod tests {
     use super::*;
 
     /// Reads a file of this repository, without line breaks, backquotes and comment marks.
-    fn words_of(path: &str) -> String {
+    fn page_text(path: &str) -> String {
         let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").join(path);
         let text = std::fs::read_to_string(path).unwrap().replace(['`'], "").replace("///", "");
         text.split_whitespace().collect::<Vec<_>>().join(" ")
@@ -514,7 +533,7 @@ mod tests {
         let sentence = format!("all topics except {} and {last}", first.join(", "));
         let pages = ["docs/configuration.md", "docs/datagram.md", "docs/bridge.md"];
         for path in pages.iter().chain(&["clients/network/src/gateway.rs", "clients/bridge/src/main.rs"]) {
-            assert!(words_of(path).contains(&sentence), "{path} does not say: {sentence}");
+            assert!(page_text(path).contains(&sentence), "{path} does not say: {sentence}");
         }
     }
 

@@ -8,13 +8,13 @@ use std::os::unix::fs::{FileExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
 use scanhub_client::clock;
-use scanhub_files::regular;
+use scanhub_files::regular_file;
 use scanhub_schema::{Failure, Kind};
 use scanhub_shm::{Directory, StateDirectory};
 
 /// Identity of a gateway in one run. No other process has its number while this value exists.
 #[derive(Debug)]
-pub struct Life {
+pub struct GatewayIdentity {
     /// Number of the gateway.
     pub hub: u64,
     /// Seconds since 1970 at its start, or one more than the last epoch of it.
@@ -25,7 +25,7 @@ pub struct Life {
     _file: File,
 }
 
-impl Life {
+impl GatewayIdentity {
     /// Begins a run of the gateway of `domain` on `interface` (or another word for its destination), or of another one
     /// if that one is running. The number is kept in a file in `directory`, which is created if it does not exist.
     /// `now_s` is seconds since 1970. A number that was kept on another `machine`, if that is known, belongs to another
@@ -41,21 +41,21 @@ impl Life {
         interface: &str,
         now_s: u64,
         machine: Option<u64>,
-    ) -> Result<Life, Failure> {
+    ) -> Result<GatewayIdentity, Failure> {
         let unkept = |failure: Failure| {
             let message = format!("cannot keep the gateway's number: {}", failure.message);
             Failure { kind: Kind::Output, message, ..failure }
         };
-        let place = Directory::make_state(directory, 1).map_err(unkept)?;
+        let state_directory = Directory::create_state(directory, 1).map_err(unkept)?;
         for number in 1..=MAX_GATEWAYS {
             let name = format!("gateway-{domain}-{interface}-{number}");
-            let file = place.file_or_new(&name).map_err(unkept)?;
+            let file = state_directory.open_or_create(&name).map_err(unkept)?;
             let unusable = |error: io::Error| {
                 let what = format!("{}: {error}", directory.join(&name).display());
                 unkept(Failure::new(Kind::Output, what, "the file system must have locks and free space"))
             };
             match file.try_lock() {
-                Ok(()) => return Life::of(file, now_s, machine).map_err(unusable),
+                Ok(()) => return GatewayIdentity::of(file, now_s, machine).map_err(unusable),
                 Err(std::fs::TryLockError::WouldBlock) => {}
                 Err(std::fs::TryLockError::Error(error)) => return Err(unusable(error)),
             }
@@ -65,50 +65,54 @@ impl Life {
     }
 
     /// Begins a run with the number in `file`, or with a new one.
-    fn of(file: File, now_s: u64, machine: Option<u64>) -> io::Result<Life> {
+    fn of(file: File, now_s: u64, machine: Option<u64>) -> io::Result<GatewayIdentity> {
         let now = u32::try_from(now_s).unwrap_or(u32::MAX);
-        let kept = Kept::read(&file);
-        let is_copy =
-            |kept: &Kept| kept.machine.is_some_and(|there| machine.is_some_and(|here| here != there));
-        let is_renumbered = kept.as_ref().is_some_and(is_copy);
+        let stored = StoredIdentity::read(&file);
+        let is_copy = |stored: &StoredIdentity| {
+            stored.machine.is_some_and(|there| machine.is_some_and(|here| here != there))
+        };
+        let is_renumbered = stored.as_ref().is_some_and(is_copy);
         // An invalid line, or one without a next epoch, makes it another gateway.
-        let last = kept.filter(|kept| !is_copy(kept)).and_then(|kept| {
+        let last = stored.filter(|stored| !is_copy(stored)).and_then(|kept| {
             let epoch = kept.epoch.checked_add(1)?.max(now);
-            Some(Kept { epoch, machine: machine.or(kept.machine), ..kept })
+            Some(StoredIdentity { epoch, machine: machine.or(kept.machine), ..kept })
         });
-        let kept =
-            last.unwrap_or_else(|| Kept { hub: RandomState::new().hash_one(now_s), epoch: now, machine });
-        let line = kept.line();
+        let stored = last.unwrap_or_else(|| StoredIdentity {
+            hub: RandomState::new().hash_one(now_s),
+            epoch: now,
+            machine,
+        });
+        let line = stored.line();
         // Earlier versions let others read it.
         file.set_permissions(Permissions::from_mode(0o600))?;
         file.write_all_at(line.as_bytes(), 0)?;
         file.set_len(line.len() as u64)?;
         file.sync_data()?;
-        Ok(Life { hub: kept.hub, epoch: kept.epoch, is_renumbered, _file: file })
+        Ok(GatewayIdentity { hub: stored.hub, epoch: stored.epoch, is_renumbered, _file: file })
     }
 }
 
 /// Content of the file: 16 hex digits, 10 digits, and 16 hex digits for the machine if that is known.
-struct Kept {
+struct StoredIdentity {
     hub: u64,
     epoch: u32,
     machine: Option<u64>,
 }
 
-impl Kept {
+impl StoredIdentity {
     /// Reads the file. `None` if its content is not valid.
-    fn read(file: &File) -> Option<Kept> {
+    fn read(file: &File) -> Option<StoredIdentity> {
         let mut bytes = [0; 64];
         let len = file.read_at(&mut bytes, 0).ok()?;
         let mut words = str::from_utf8(&bytes[..len]).ok()?.strip_suffix('\n')?.split(' ');
         let mut word = |digits: usize| words.next().filter(|word| word.len() == digits);
         let hex = |word: &str| u64::from_str_radix(word, 16).ok();
         let (hub, epoch) = (hex(word(16)?)?, word(10)?.parse().ok()?);
-        Some(Kept { hub, epoch, machine: word(16).and_then(hex) })
+        Some(StoredIdentity { hub, epoch, machine: word(16).and_then(hex) })
     }
 
     fn line(&self) -> String {
-        let Kept { hub, epoch, machine } = self;
+        let StoredIdentity { hub, epoch, machine } = self;
         let machine = machine.map(|machine| format!(" {machine:016x}")).unwrap_or_default();
         format!("{hub:016x} {epoch:010}{machine}\n")
     }
@@ -134,17 +138,17 @@ const MAX_GATEWAYS: u32 = 16;
 ///
 /// # Errors
 ///
-/// Returns the same errors as `Life::begin`, and [`Kind::Configuration`] if the environment names no directory for its
+/// Returns the same errors as `GatewayIdentity::begin`, and [`Kind::Configuration`] if the environment names no directory for its
 /// number.
-pub fn begin_life(domain: &str, way: &str) -> Result<Life, Failure> {
+pub fn begin_run(domain: &str, destination: &str) -> Result<GatewayIdentity, Failure> {
     let now_s = clock::wall_ns() / 1_000_000_000;
-    Life::begin(&directory()?, domain, way, now_s, machine(Path::new(MACHINE_ID)))
+    GatewayIdentity::begin(&directory()?, domain, destination, now_s, machine(Path::new(MACHINE_ID)))
 }
 
 /// Returns a number that identifies this machine, a hash of its ID because the ID itself is confidential
 /// (machine-id(5)). `None` if the file at `path` is missing or contains no such ID.
 fn machine(path: &Path) -> Option<u64> {
-    let text = regular::read_text(path, regular::LONGEST).ok()?;
+    let text = regular_file::read_text(path, regular_file::MAX_FILE_BYTES).ok()?;
     let id = text.trim_end();
     let is_id = id.len() == 32 && id.bytes().all(|byte| byte.is_ascii_hexdigit());
     is_id.then(|| hash(id))
@@ -165,78 +169,78 @@ mod tests {
 
     use super::*;
 
-    struct Place(TempDir);
+    struct TestDirectory(TempDir);
 
-    impl Place {
-        fn new() -> Place {
-            Place(TempDir::new().unwrap())
+    impl TestDirectory {
+        fn new() -> TestDirectory {
+            TestDirectory(TempDir::new().unwrap())
         }
 
-        fn begin(&self, interface: &str, now_s: u64) -> Life {
+        fn begin(&self, interface: &str, now_s: u64) -> GatewayIdentity {
             self.begin_on(interface, now_s, None)
         }
 
-        fn begin_on(&self, interface: &str, now_s: u64, machine: Option<u64>) -> Life {
-            Life::begin(self.0.path(), "d", interface, now_s, machine).unwrap()
+        fn begin_on(&self, interface: &str, now_s: u64, machine: Option<u64>) -> GatewayIdentity {
+            GatewayIdentity::begin(self.0.path(), "d", interface, now_s, machine).unwrap()
         }
     }
 
     #[test]
     fn each_run_has_a_higher_epoch() {
-        let place = Place::new();
+        let directory = TestDirectory::new();
         let (hub, epoch) = {
-            let life = place.begin("eth0", 1000);
-            (life.hub, life.epoch)
+            let identity = directory.begin("eth0", 1000);
+            (identity.hub, identity.epoch)
         };
         assert_eq!(epoch, 1000);
         for (now_s, epoch) in [(1000, 1001), (5, 1002), (2000, 2000), (0, 2001)] {
-            let life = place.begin("eth0", now_s);
-            assert_eq!((life.hub, life.epoch), (hub, epoch));
+            let identity = directory.begin("eth0", now_s);
+            assert_eq!((identity.hub, identity.epoch), (hub, epoch));
         }
     }
 
     #[test]
     fn concurrent_gateways_have_different_numbers() {
-        let place = Place::new();
-        let first = place.begin("eth0", 1);
-        let (second, elsewhere) = (place.begin("eth0", 1), place.begin("wlan0", 1));
+        let directory = TestDirectory::new();
+        let first = directory.begin("eth0", 1);
+        let (second, elsewhere) = (directory.begin("eth0", 1), directory.begin("wlan0", 1));
         assert!(first.hub != second.hub && first.hub != elsewhere.hub && second.hub != elsewhere.hub);
         let (first_hub, second_hub) = (first.hub, second.hub);
         drop((first, second));
-        let (first, second) = (place.begin("eth0", 1), place.begin("eth0", 1));
+        let (first, second) = (directory.begin("eth0", 1), directory.begin("eth0", 1));
         assert_eq!((first.hub, second.hub), (first_hub, second_hub));
     }
 
     #[test]
     fn copy_on_another_machine_gets_a_new_number() {
-        let place = Place::new();
-        let of = |life: Life| (life.hub, life.epoch, life.is_renumbered);
+        let directory = TestDirectory::new();
+        let of = |identity: GatewayIdentity| (identity.hub, identity.epoch, identity.is_renumbered);
         // The number was stored without a machine, by an earlier version or on a machine without an ID.
-        let (hub, ..) = of(place.begin("eth0", 7));
-        assert_eq!(of(place.begin_on("eth0", 7, Some(0xa))), (hub, 8, false));
-        assert_eq!(of(place.begin("eth0", 7)), (hub, 9, false));
-        assert_eq!(of(place.begin_on("eth0", 7, Some(0xa))), (hub, 10, false));
-        let (copy, epoch, is_renumbered) = of(place.begin_on("eth0", 7, Some(0xb)));
+        let (hub, ..) = of(directory.begin("eth0", 7));
+        assert_eq!(of(directory.begin_on("eth0", 7, Some(0xa))), (hub, 8, false));
+        assert_eq!(of(directory.begin("eth0", 7)), (hub, 9, false));
+        assert_eq!(of(directory.begin_on("eth0", 7, Some(0xa))), (hub, 10, false));
+        let (copy, epoch, is_renumbered) = of(directory.begin_on("eth0", 7, Some(0xb)));
         assert!(copy != hub && epoch == 7 && is_renumbered);
-        assert_eq!(of(place.begin_on("eth0", 7, Some(0xb))), (copy, 8, false), "reported once");
+        assert_eq!(of(directory.begin_on("eth0", 7, Some(0xb))), (copy, 8, false), "reported once");
     }
 
     #[test]
     fn replaces_invalid_number() {
-        let place = Place::new();
-        let hub = place.begin("eth0", 7).hub;
-        let path = place.0.path().join("gateway-d-eth0-1");
+        let directory = TestDirectory::new();
+        let hub = directory.begin("eth0", 7).hub;
+        let path = directory.0.path().join("gateway-d-eth0-1");
         for torn in ["", "0123", "0123456789abcdef 4294967295\n", "0123456789abcdef 12\n", &"x".repeat(60)] {
             std::fs::write(&path, torn).unwrap();
-            let life = place.begin("eth0", 8);
-            assert!(life.hub != hub && life.epoch == 8, "{torn}");
+            let identity = directory.begin("eth0", 8);
+            assert!(identity.hub != hub && identity.epoch == 8, "{torn}");
             assert_eq!(std::fs::metadata(&path).unwrap().len(), 28);
         }
     }
 
     #[test]
     fn refuses_unwritable_directory() {
-        let refused = Life::begin(Path::new("/dev/null/x"), "d", "eth0", 1, None).unwrap_err();
+        let refused = GatewayIdentity::begin(Path::new("/dev/null/x"), "d", "eth0", 1, None).unwrap_err();
         assert_eq!(refused.kind, Kind::Output);
         assert!(refused.message.contains("number: /dev/null: "), "{refused}");
     }

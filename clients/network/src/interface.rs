@@ -56,7 +56,7 @@ pub(crate) fn interfaces() -> Result<Vec<Interface>, Failure> {
 /// # Errors
 ///
 /// Returns [`Kind::Configuration`], with a list of all interfaces, if it does not exist.
-pub(crate) fn named(name: &str) -> Result<Interface, Failure> {
+pub(crate) fn by_name(name: &str) -> Result<Interface, Failure> {
     let mut all = interfaces()?;
     if let Some(at) = all.iter().position(|interface| interface.name == name) {
         return Ok(all.swap_remove(at));
@@ -71,12 +71,12 @@ pub(crate) fn named(name: &str) -> Result<Interface, Failure> {
 
 /// Returns whether a sender with `address` is on this machine. `false` if the system cannot list its addresses.
 pub(crate) fn is_of_this_machine(address: IpAddr) -> bool {
-    let is_it = |entry: &InterfaceAddress| ipv4(entry).is_some_and(|own| own == address);
+    let has_address = |entry: &InterfaceAddress| ipv4(entry).is_some_and(|own| own == address);
     // A datagram to a group has no source address if it is sent by loopback on a machine without another address. None
     // with such an address arrives from outside.
     address.is_loopback()
         || address.is_unspecified()
-        || getifaddrs().is_ok_and(|mut all| all.any(|entry| is_it(&entry)))
+        || getifaddrs().is_ok_and(|mut all| all.any(|entry| has_address(&entry)))
 }
 
 /// Returns the interface of `entry`. `None` if it was removed in the meantime.
@@ -264,7 +264,7 @@ mod tests {
 
     #[test]
     fn finds_loopback_and_lists_interfaces() {
-        let lo = named("lo").unwrap();
+        let lo = by_name("lo").unwrap();
         assert!(lo.loopback && lo.multicast && lo.index > 0, "{lo:?}");
         let own = interfaces().unwrap().into_iter().filter_map(|interface| interface.address);
         assert!(
@@ -273,7 +273,7 @@ mod tests {
         );
         // Reserved for documentation (RFC 5737).
         assert!(!is_of_this_machine(Ipv4Addr::new(192, 0, 2, 1).into()));
-        let failure = named("no-such").unwrap_err();
+        let failure = by_name("no-such").unwrap_err();
         assert_eq!(failure.kind, Kind::Configuration);
         assert!(failure.message.contains("no-such") && failure.hint.contains("lo"), "{failure}");
     }

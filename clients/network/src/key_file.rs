@@ -8,10 +8,10 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand};
 use rustix::rand::{GetRandomFlags, getrandom};
-use scanhub_files::output::{PRIVATE, Target, unwritable};
-use scanhub_files::regular;
+use scanhub_files::output::{PRIVATE_MODE, Target, unwritable};
+use scanhub_files::regular_file;
 use scanhub_schema::{Failure, Kind};
-use scanhub_verbs::output::{Output, quiet};
+use scanhub_verbs::output::{Output, verb_result};
 use serde_json::json;
 
 use crate::lan::Key;
@@ -64,12 +64,12 @@ fn new_key(path: &Path, json: bool, out: &mut dyn Write) -> Result<(), Failure> 
     if target.check(true)?.is_some() {
         return Err(Failure::new(Kind::Output, format!("{} exists", path.display()), KEY_EXISTS));
     }
-    let mut file = target.create_new(false, PRIVATE)?;
+    let mut file = target.create_new(false, PRIVATE_MODE)?;
     let written = file.write_all(text.as_bytes()).and_then(|()| file.sync_all());
     written.map_err(|error| unwritable(path, &error))?;
     let (path, name) = (path.display().to_string(), Key::new(&bytes).name());
     let mut out = Output::new(out);
-    quiet(match json {
+    verb_result(match json {
         true => out.json(&json!({ "class": "key", "file": path, "key": name })),
         false => out.line(|line| {
             write!(
@@ -94,7 +94,7 @@ pub(crate) fn read(path: &Path) -> Result<Key, Failure> {
         let hint = "`scanhub key new FILE` makes one; this user must be able to read it";
         Failure::new(Kind::Input, format!("key file {}: {error}", path.display()), hint)
     };
-    let mut file: File = regular::open(path).map_err(unreadable)?;
+    let mut file: File = regular_file::open(path).map_err(unreadable)?;
     let about = file.metadata().map_err(unreadable)?;
     let (mode, owner, user) = (about.mode() & 0o777, about.uid(), rustix::process::geteuid().as_raw());
     if owner != user {
@@ -105,7 +105,7 @@ pub(crate) fn read(path: &Path) -> Result<Key, Failure> {
         let what = format!("its mode is {mode:04o}, so others can use the key");
         return Err(refuse(what, "`chmod 600` it; if others may have read it, make a new one"));
     }
-    let bytes = regular::read_all(&mut file, MAX_FILE_LEN).map_err(unreadable)?;
+    let bytes = regular_file::read_all(&mut file, MAX_FILE_LEN).map_err(unreadable)?;
     let key = parse(&bytes).ok_or_else(|| {
         refuse(
             format!("its {} bytes are no key", about.len()),

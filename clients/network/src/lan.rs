@@ -14,16 +14,16 @@ mod senders;
 mod sequence;
 
 use hmac::{Hmac, KeyInit, Mac};
-use scanhub_schema::datagram::{MAC, covered};
+use scanhub_schema::datagram::{MAC_LEN, mac_input};
 use sha2::Sha256;
 
 pub(crate) use gateways::MAX_EPOCHS;
 pub use gateways::{EvictedTotals, GatewayTable, MAX_ROWS, MAX_RUNS};
-pub use sequence::{Fresh, Row, WINDOW};
+pub use sequence::{SequenceStatus, StreamCounters, WINDOW_LEN};
 
 /// Timestamp of two clocks, in ns.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Stamp {
+pub struct WallTimestamp {
     /// Time of a clock that is never set, such as CLOCK_MONOTONIC.
     pub monotonic_ns: u64,
     /// Time of the wall clock, since 1970.
@@ -49,15 +49,15 @@ impl Key {
 
     /// Returns the MAC of `covered`, which is header and payload with a checksum of 0. It is the first half of
     /// HMAC-SHA256.
-    pub fn mac(&self, covered: &[u8]) -> [u8; MAC] {
+    pub fn mac(&self, covered: &[u8]) -> [u8; MAC_LEN] {
         let whole = self.0.clone().chain_update(covered).finalize().into_bytes();
         std::array::from_fn(|at| whole[at])
     }
 
     /// Returns whether `mac` was computed with this key for the datagram `bytes`, whose header is valid.
-    pub fn is_of(&self, bytes: &[u8], mac: &[u8; MAC]) -> bool {
+    pub fn is_of(&self, bytes: &[u8], mac: &[u8; MAC_LEN]) -> bool {
         let digest =
-            covered(bytes).into_iter().fold(self.0.clone(), |digest, piece| digest.chain_update(piece));
+            mac_input(bytes).into_iter().fold(self.0.clone(), |digest, piece| digest.chain_update(piece));
         digest.verify_truncated_left(mac).is_ok()
     }
 
@@ -75,7 +75,7 @@ impl std::fmt::Debug for Key {
 
 #[cfg(test)]
 mod tests {
-    use scanhub_schema::datagram::{Datagram, HEAD, Head};
+    use scanhub_schema::datagram::{Datagram, HEADER_LEN, Head};
 
     use super::*;
 
@@ -83,15 +83,15 @@ mod tests {
     fn mac_belongs_to_one_key() {
         let (key, other) = (Key::new(&[7; 32]), Key::new(&[8; 32]));
         let mut buffer = [0; 200];
-        buffer[HEAD..HEAD + 3].copy_from_slice(b"abc");
+        buffer[HEADER_LEN..HEADER_LEN + 3].copy_from_slice(b"abc");
         let bytes =
             Head { hub: 3, ..Head::default() }.seal_with(&mut buffer, 3, |covered| key.mac(covered)).unwrap();
         let mac = *Datagram::read(bytes).unwrap().mac.unwrap();
         assert!(key.is_of(bytes, &mac) && !other.is_of(bytes, &mac));
         let mut other = bytes.to_vec();
-        other[HEAD] ^= 1;
+        other[HEADER_LEN] ^= 1;
         assert!(!key.is_of(&other, &mac));
-        assert!(!key.is_of(bytes, &[0; MAC]));
+        assert!(!key.is_of(bytes, &[0; MAC_LEN]));
     }
 
     #[test]

@@ -11,16 +11,16 @@ mod interface;
 mod key_file;
 pub mod lan;
 mod listen;
-mod reception;
+mod remote_receiver;
 
-pub use forward::{Carrier, Forwarder, Selection, account, tell};
+pub use forward::{Forwarder, SampleSink, Selection, report_notice, write_counters};
 pub use gateway::GatewayArgs;
-pub use gateway_identity::{Life, begin_life};
+pub use gateway_identity::{GatewayIdentity, begin_run};
 pub use key_file::KeyArgs;
 pub use listen::ListenArgs;
-pub use reception::{Origin, Reception, Wanted, Words, received_topics};
+pub use remote_receiver::{ClassNames, Origin, ReceiverConfig, RemoteReceiver, received_topics};
 
 /// Returns this moment on both clocks.
-pub fn now() -> lan::Stamp {
-    lan::Stamp { monotonic_ns: clock::now_ns(), wall_ns: clock::wall_ns() }
+pub fn now() -> lan::WallTimestamp {
+    lan::WallTimestamp { monotonic_ns: clock::now_ns(), wall_ns: clock::wall_ns() }
 }

@@ -1,7 +1,7 @@
 //! `scanhub listen`: receives samples from gateways, prints or publishes them, and counts those that did not arrive.
 //!
 //! With `--publish`, a datagram takes this path. `Listener::receive_batch` reads the socket and calls
-//! `Reception::take`, which runs all other steps in this order. Subscribers are woken after each batch.
+//! `RemoteReceiver::take`, which runs all other steps in this order. Subscribers are woken after each batch.
 //!
 //! | step | code | work |
 //! |---|---|---|
@@ -9,7 +9,7 @@
 //! | header | `Incoming::receive_named` | checks length, checksum and `--hub`, then the MAC if there is a key |
 //! | parts | `Incoming::complete` | waits for all parts of a sample, and continues with the last one |
 //! | gateway | `GatewayTable::take` | checks run, sender, sequence number and payload, and counts the sample |
-//! | sample | `Reception::on_sample` | prints the sample, or passes it on |
+//! | sample | `RemoteReceiver::on_sample` | prints the sample, or passes it on |
 //! | publisher | `Republisher::sample` | copies it into the topic of its sensor |
 
 mod multicast_receiver;
@@ -25,12 +25,12 @@ use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Failure, Kind, Topic};
 use scanhub_shm::{Domain, StateDirectory};
 use scanhub_verbs::context::Context;
-use scanhub_verbs::follow::Bounds;
-use scanhub_verbs::output::{End, Output, quiet};
+use scanhub_verbs::follow::RunLimits;
+use scanhub_verbs::output::{ExitReason, Output, verb_result};
 
 use self::multicast_receiver::{MAX_DATAGRAM_LEN, MulticastReceiver};
 use crate::key_file;
-use crate::reception::{Origin, Reception, Wanted, Words};
+use crate::remote_receiver::{ClassNames, Origin, ReceiverConfig, RemoteReceiver};
 
 /// Receive what gateways of other machines send, and show what was lost
 #[derive(Args, Debug)]
@@ -67,7 +67,7 @@ pub struct ListenArgs {
     #[arg(long, value_name = "MB", requires = "publish", default_value_t = 64, value_parser = clap::value_parser!(u32).range(1..))]
     memory: u32,
     #[command(flatten)]
-    bounds: Bounds,
+    limits: RunLimits,
 }
 
 /// Signals, for the end of the help.
@@ -91,19 +91,22 @@ impl ListenArgs {
     /// - [`Kind::Usage`] if there is no such topic,
     /// - [`Kind::Configuration`] if there is no such interface, or a name or hub is not valid,
     /// - [`Kind::DomainHeld`] if another listener publishes in the domain,
-    /// - [`Kind::Short`] if there is too little memory for that,
+    /// - [`Kind::ResourceExhausted`] if there is too little memory for that,
     /// - [`Kind::Failed`] if the port is not available,
     /// - [`Kind::Timeout`], or [`Kind::Interrupted`] if a signal stops the run before the bounds are reached.
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
-        let (tell, stop) = (context.signals.report()?, context.signals.stop()?);
+        let (report_requested, stop) = (context.signals.report()?, context.signals.stop()?);
         let publish = self.publish.then(|| context.domain.of_publisher()).transpose()?;
         let is_drawn = self.stats && !context.json && context.is_terminal;
         let topics = topics(&self.topics)?;
         let key = self.key_file.as_deref().map(key_file::read).transpose()?;
         let (groups, now) = (groups(&topics), Instant::now());
-        let wanted = Wanted {
+        let config = ReceiverConfig {
             // Announcements of topics whose group is not joined would count their samples as lost.
-            heard: Topic::ALL.into_iter().filter(|&topic| groups.contains(&group(topic))).collect(),
+            announced_topics: Topic::ALL
+                .into_iter()
+                .filter(|&topic| groups.contains(&group(topic)))
+                .collect(),
             topics,
             names: &self.names,
             hubs: &self.hubs,
@@ -116,11 +119,11 @@ impl ListenArgs {
             stats: self.stats,
         };
         let (out, notes) = (Output::new(&mut context.out), Output::new(&mut context.notes));
-        let reception = Reception::open(wanted, context.json, Words::LAN, out, notes)?;
+        let remote_receiver = RemoteReceiver::open(config, context.json, ClassNames::LAN, out, notes)?;
         let receiver = MulticastReceiver::open(self.interface.as_deref(), &groups, now)?;
         let mut listener =
-            Listener { args: self, publish, is_drawn, receiver, reception, started: now, draw_at: now };
-        quiet(listener.listen(&tell, &stop))
+            Listener { args: self, publish, is_drawn, receiver, remote_receiver, started: now, draw_at: now };
+        verb_result(listener.listen(&report_requested, &stop))
     }
 }
 
@@ -131,7 +134,7 @@ struct Listener<'a> {
     /// Whether the counters are drawn on a terminal.
     is_drawn: bool,
     receiver: MulticastReceiver,
-    reception: Reception<'a>,
+    remote_receiver: RemoteReceiver<'a>,
     started: Instant,
     draw_at: Instant,
 }
@@ -147,38 +150,40 @@ const DRAW_INTERVAL: Duration = Duration::from_secs(1);
 
 impl Listener<'_> {
     /// Runs the listener, with its first and last output.
-    fn listen(&mut self, tell: &AtomicBool, stop: &AtomicBool) -> Result<(), End> {
-        self.reception.report.ready(&self.receiver.interfaces(), self.publish.as_ref())?;
-        self.reception.begin()?;
-        let end = self.run(tell, stop);
-        if !matches!(end, Err(End::ReaderGone)) {
-            self.reception.tell(&[])?;
+    fn listen(&mut self, report_requested: &AtomicBool, stop: &AtomicBool) -> Result<(), ExitReason> {
+        self.remote_receiver.report.ready(&self.receiver.interfaces(), self.publish.as_ref())?;
+        self.remote_receiver.begin()?;
+        let end = self.run(report_requested, stop);
+        if !matches!(end, Err(ExitReason::ReaderClosed)) {
+            self.remote_receiver.report_counters(&[])?;
         }
         end
     }
 
     /// Receives until the bounds are reached or `stop` is set.
-    fn run(&mut self, tell: &AtomicBool, stop: &AtomicBool) -> Result<(), End> {
+    fn run(&mut self, report_requested: &AtomicBool, stop: &AtomicBool) -> Result<(), ExitReason> {
         let mut buffer = vec![0; MAX_DATAGRAM_LEN];
         loop {
             let may_have_more = self.receive_batch(&mut buffer)?;
-            self.reception.wake();
-            let (now, bounds) = (Instant::now(), &self.args.bounds);
-            if self.has_enough() {
+            self.remote_receiver.wake();
+            let (now, limits) = (Instant::now(), &self.args.limits);
+            if self.has_all_samples() {
                 return Ok(());
             }
             if stop.load(Ordering::Relaxed) {
                 return self.end_of_stop();
             }
-            if bounds.run_for.is_some_and(|limit| now - self.started >= limit) {
+            if limits.run_for.is_some_and(|limit| now - self.started >= limit) {
                 return self.end_of_time();
             }
-            if let Some(limit) = bounds.timeout.filter(|&limit| now - self.reception.last_sample >= limit) {
+            if let Some(limit) =
+                limits.timeout.filter(|&limit| now - self.remote_receiver.last_sample >= limit)
+            {
                 return Err(nothing_arrived(limit).into());
             }
             self.do_periodic_work(now, may_have_more)?;
-            if tell.swap(false, Ordering::Relaxed) {
-                self.reception.tell(&[])?;
+            if report_requested.swap(false, Ordering::Relaxed) {
+                self.remote_receiver.report_counters(&[])?;
             }
             if !may_have_more {
                 self.receiver.wait(self.time_to_sleep(now));
@@ -187,7 +192,7 @@ impl Listener<'_> {
     }
 
     /// Handles waiting datagrams, up to a batch. Returns whether there may be more.
-    fn receive_batch(&mut self, buffer: &mut [u8]) -> Result<bool, End> {
+    fn receive_batch(&mut self, buffer: &mut [u8]) -> Result<bool, ExitReason> {
         for _ in 0..BATCH_SIZE {
             let Some(datagram) = self.receiver.receive(buffer)? else { return Ok(false) };
             let origin = Origin {
@@ -196,8 +201,8 @@ impl Listener<'_> {
                 name: None,
                 arrival: datagram.arrival,
             };
-            self.reception.take(datagram.bytes, origin)?;
-            if self.has_enough() {
+            self.remote_receiver.handle_datagram(datagram.bytes, origin)?;
+            if self.has_all_samples() {
                 return Ok(true);
             }
         }
@@ -205,47 +210,47 @@ impl Listener<'_> {
     }
 
     /// Returns whether the requested number of samples has arrived.
-    fn has_enough(&self) -> bool {
-        self.args.bounds.count.is_some_and(|count| self.reception.received >= count)
+    fn has_all_samples(&self) -> bool {
+        self.args.limits.count.is_some_and(|count| self.remote_receiver.received >= count)
     }
 
     /// Does what is due at `now`: interfaces, silent sensors, reports and the drawn counters.
-    fn do_periodic_work(&mut self, now: Instant, may_have_more: bool) -> Result<(), End> {
+    fn do_periodic_work(&mut self, now: Instant, may_have_more: bool) -> Result<(), ExitReason> {
         self.receiver.update_interfaces(now);
         if let Some(what) = self.receiver.take_problem() {
-            self.reception.problem(&what)?;
+            self.remote_receiver.problem(&what)?;
         }
-        self.reception.look(now, may_have_more)?;
+        self.remote_receiver.do_periodic_work(now, may_have_more)?;
         if self.is_drawn && now >= self.draw_at {
             self.draw_at = now + DRAW_INTERVAL;
-            self.reception.draw()?;
+            self.remote_receiver.draw()?;
         }
         Ok(())
     }
 
     /// Returns the time until a bound is reached, at most [`MAX_SLEEP`].
     fn time_to_sleep(&self, now: Instant) -> Duration {
-        let bounds = &self.args.bounds;
-        let end = bounds.run_for.and_then(|limit| self.started.checked_add(limit));
-        let silence = bounds.timeout.and_then(|limit| self.reception.last_sample.checked_add(limit));
+        let limits = &self.args.limits;
+        let end = limits.run_for.and_then(|limit| self.started.checked_add(limit));
+        let silence = limits.timeout.and_then(|limit| self.remote_receiver.last_sample.checked_add(limit));
         let first = [end, silence].into_iter().flatten().min();
         first.map_or(MAX_SLEEP, |at| at.saturating_duration_since(now).min(MAX_SLEEP))
     }
 
     /// Returns the result of a run that `stop` has ended.
-    fn end_of_stop(&self) -> Result<(), End> {
-        if self.args.bounds.bounded() {
+    fn end_of_stop(&self) -> Result<(), ExitReason> {
+        if self.args.limits.is_bounded() {
             return Err(Failure::new(Kind::Interrupted, "interrupted before it was done", "").into());
         }
         Ok(())
     }
 
     /// Returns the result of a run whose time has elapsed.
-    fn end_of_time(&self) -> Result<(), End> {
-        match self.args.bounds.count {
+    fn end_of_time(&self) -> Result<(), ExitReason> {
+        match self.args.limits.count {
             Some(count) => {
-                let what = format!("{} of {count} samples arrived in time", self.reception.received);
-                Err(Failure::new(Kind::Timeout, what, NOTHING_ARRIVED).into())
+                let what = format!("{} of {count} samples arrived in time", self.remote_receiver.received);
+                Err(Failure::new(Kind::Timeout, what, NOTHING_ARRIVED_HINT).into())
             }
             None => Ok(()),
         }
@@ -258,11 +263,11 @@ fn sender_id(from: SocketAddrV4) -> u64 {
 }
 
 fn nothing_arrived(limit: Duration) -> Failure {
-    Failure::new(Kind::Timeout, format!("nothing arrived for {limit:?}"), NOTHING_ARRIVED)
+    Failure::new(Kind::Timeout, format!("nothing arrived for {limit:?}"), NOTHING_ARRIVED_HINT)
 }
 
 /// Hint for a timeout.
-const NOTHING_ARRIVED: &str = "is `scanhub gateway` running in the same network? `scanhub listen --stats` counts what is \
+const NOTHING_ARRIVED_HINT: &str = "is `scanhub gateway` running in the same network? `scanhub listen --stats` counts what is \
                             refused, --interface names another interface";
 
 /// Returns the topics with these names, or all if there are none.

@@ -4,28 +4,28 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use fastrand::Rng;
-use scanhub_network::lan::{EvictedTotals, Fresh, GatewayTable, MAX_ROWS, MAX_RUNS, WINDOW};
-use scanhub_schema::datagram::{Announce, Announced, DatagramError, HEAD, Head, Packed};
+use scanhub_network::lan::{EvictedTotals, GatewayTable, MAX_ROWS, MAX_RUNS, SequenceStatus, WINDOW_LEN};
+use scanhub_schema::datagram::{Announce, Announced, DatagramError, DatagramPayload, HEADER_LEN, Head};
 use scanhub_schema::{Background, Marks, Topic, Zones};
 
 /// Hub, epoch, sensor, topic.
-type Key = (u64, u32, u8, u8);
+type StreamKey = (u64, u32, u8, u8);
 
 /// A datagram with its content, whose numbers do not wrap.
 #[derive(Clone)]
-struct Sent {
-    key: Key,
+struct SentDatagram {
+    key: StreamKey,
     number: u64,
     /// Next number of each topic in an announcement.
     next: Vec<(u8, u64)>,
     bytes: Vec<u8>,
 }
 
-impl Sent {
-    fn new(key: Key, number: u64, next: Vec<(u8, u64)>) -> Sent {
+impl SentDatagram {
+    fn new(key: StreamKey, number: u64, next: Vec<(u8, u64)>) -> SentDatagram {
         let (hub, epoch, sensor, topic) = key;
         let mut buffer = [0; 200];
-        let room = &mut buffer[HEAD..];
+        let room = &mut buffer[HEADER_LEN..];
         let len = match Topic::of_number(topic) {
             None => {
                 let mut announce = Announce::new(1, "front", "");
@@ -41,13 +41,13 @@ impl Sent {
         let head =
             Head { topic, hub, epoch, sequence: number as u32, sensor, revision: 1, ..Head::default() };
         let bytes = head.seal(&mut buffer, len.unwrap()).unwrap().to_vec();
-        Sent { key, number, next, bytes }
+        SentDatagram { key, number, next, bytes }
     }
 }
 
 /// All numbers of one stream.
 #[derive(Default)]
-struct Numbers {
+struct ExpectedCounters {
     arrived: BTreeSet<u64>,
     expected: BTreeSet<u64>,
     duplicate: u64,
@@ -56,8 +56,8 @@ struct Numbers {
 
 /// Table of gateways that keeps everything.
 #[derive(Default)]
-struct Model {
-    rows: BTreeMap<Key, Numbers>,
+struct TableModel {
+    rows: BTreeMap<StreamKey, ExpectedCounters>,
     /// Highest epoch of each hub.
     active: BTreeMap<u64, u32>,
     /// For each active run, the times of its last datagram, and of its first and last sample, in ms.
@@ -68,8 +68,8 @@ struct Model {
     refused: BTreeMap<&'static str, u64>,
 }
 
-impl Model {
-    fn receive(&mut self, sent: &Sent, now_ms: u64) -> Result<Fresh, DatagramError> {
+impl TableModel {
+    fn receive(&mut self, sent: &SentDatagram, now_ms: u64) -> Result<SequenceStatus, DatagramError> {
         let result = self.take(sent, now_ms);
         if let Err(refusal) = result {
             *self.refused.entry(refusal.name()).or_default() += 1;
@@ -77,7 +77,7 @@ impl Model {
         result
     }
 
-    fn take(&mut self, sent: &Sent, now_ms: u64) -> Result<Fresh, DatagramError> {
+    fn take(&mut self, sent: &SentDatagram, now_ms: u64) -> Result<SequenceStatus, DatagramError> {
         let (hub, epoch, sensor, topic) = sent.key;
         let delivers = topic != Announce::NUMBER;
         let before = self.active.get(&hub).copied();
@@ -85,7 +85,7 @@ impl Model {
             return Err(DatagramError::Epoch);
         }
         let highest = self.rows.get(&sent.key).and_then(|row| row.arrived.last().copied());
-        if highest.is_some_and(|highest| highest >= sent.number + WINDOW as u64) {
+        if highest.is_some_and(|highest| highest >= sent.number + WINDOW_LEN as u64) {
             return Err(DatagramError::Stale);
         }
         let is_new = before != Some(epoch);
@@ -105,20 +105,20 @@ impl Model {
             }
             self.active.insert(hub, epoch);
         }
-        let (heard, delivered) = self.times.entry(hub).or_default();
-        *heard = now_ms;
+        let (received_at, delivered) = self.times.entry(hub).or_default();
+        *received_at = now_ms;
         if delivers {
             *delivered = Some((delivered.map_or(now_ms, |(first, _)| first), now_ms));
         }
         assert!(self.has_room(sent.key, delivers, now_ms));
         let row = self.rows.entry(sent.key).or_default();
         let fresh = match highest {
-            _ if row.arrived.contains(&sent.number) => Fresh::Duplicate,
-            Some(highest) if highest > sent.number => Fresh::Late,
-            _ => Fresh::New,
+            _ if row.arrived.contains(&sent.number) => SequenceStatus::Duplicate,
+            Some(highest) if highest > sent.number => SequenceStatus::Late,
+            _ => SequenceStatus::New,
         };
-        row.duplicate += u64::from(fresh == Fresh::Duplicate);
-        row.reordered += u64::from(fresh == Fresh::Late);
+        row.duplicate += u64::from(fresh == SequenceStatus::Duplicate);
+        row.reordered += u64::from(fresh == SequenceStatus::Late);
         row.arrived.insert(sent.number);
         row.expect(sent.number, sent.number + 1);
         for &(topic, next) in &sent.next {
@@ -131,34 +131,34 @@ impl Model {
     }
 
     /// Returns whether there is a row or room for one. Evicts another run if necessary.
-    fn has_room(&mut self, key: Key, delivers: bool, now_ms: u64) -> bool {
+    fn has_room(&mut self, key: StreamKey, is_delivering: bool, now_ms: u64) -> bool {
         if !self.rows.contains_key(&key) && self.rows.len() == MAX_ROWS {
-            self.evict(key.0, delivers, now_ms);
+            self.evict(key.0, is_delivering, now_ms);
         }
         self.rows.contains_key(&key) || self.rows.len() < MAX_ROWS
     }
 
     /// Returns the active gateway that makes room for a datagram of `hub` if no run is retired.
-    fn next_evicted(&self, hub: u64, delivers: bool, now_ms: u64) -> Option<u64> {
-        let mut least: Option<(u64, u64)> = None;
-        for (&other, &(heard, delivered)) in &self.times {
-            let (mut kept_until, mut is_proven, mut is_busy) = (heard, false, false);
+    fn next_evicted(&self, hub: u64, is_delivering: bool, now_ms: u64) -> Option<u64> {
+        let mut minimum: Option<(u64, u64)> = None;
+        for (&other, &(received_at, delivered)) in &self.times {
+            let (mut kept_until, mut is_proven, mut is_busy) = (received_at, false, false);
             if let Some((first, last)) = delivered {
                 is_proven = last >= first + 1_000;
                 is_busy = now_ms < last + 3_000;
                 kept_until = last + if is_proven { 60_000 } else { 3_000 };
             }
-            let may_go = other != hub && if delivers { !is_busy || !is_proven } else { !is_busy };
-            if may_go && least.is_none_or(|(until, _)| kept_until < until) {
-                least = Some((kept_until, other));
+            let may_go = other != hub && if is_delivering { !is_busy || !is_proven } else { !is_busy };
+            if may_go && minimum.is_none_or(|(until, _)| kept_until < until) {
+                minimum = Some((kept_until, other));
             }
         }
-        least.map(|(_, other)| other)
+        minimum.map(|(_, other)| other)
     }
 
-    fn evict(&mut self, hub: u64, delivers: bool, now_ms: u64) {
+    fn evict(&mut self, hub: u64, is_delivering: bool, now_ms: u64) {
         let evicted = if self.retired.is_empty() {
-            let Some(other) = self.next_evicted(hub, delivers, now_ms) else { return };
+            let Some(other) = self.next_evicted(hub, is_delivering, now_ms) else { return };
             self.times.remove(&other);
             self.evicted.evicted_active += 1;
             (other, self.active.remove(&other).unwrap())
@@ -181,7 +181,7 @@ impl Model {
     }
 
     /// Returns the received, lost, duplicate and reordered numbers of each stream.
-    fn figures(&self) -> BTreeMap<Key, [u64; 4]> {
+    fn counters(&self) -> BTreeMap<StreamKey, [u64; 4]> {
         let all = self.rows.iter().map(|(&key, row)| {
             let received = row.arrived.len() as u64;
             (key, [received, row.sent() - received, row.duplicate, row.reordered])
@@ -190,7 +190,7 @@ impl Model {
     }
 }
 
-impl Numbers {
+impl ExpectedCounters {
     /// Records that the numbers from `first` to `next` were sent. Numbers before the first announcement are unknown.
     fn expect(&mut self, first: u64, next: u64) {
         let known_first = self.expected.first().copied().unwrap_or(first);
@@ -204,7 +204,7 @@ impl Numbers {
     }
 }
 
-fn figures(table: &GatewayTable) -> BTreeMap<Key, [u64; 4]> {
+fn table_counters(table: &GatewayTable) -> BTreeMap<StreamKey, [u64; 4]> {
     let rows = table.rows();
     rows.map(|row| {
         let key = (row.hub, row.epoch, row.sensor, row.topic);
@@ -214,22 +214,22 @@ fn figures(table: &GatewayTable) -> BTreeMap<Key, [u64; 4]> {
 }
 
 /// Gateways that send, restart and announce, and a network.
-struct World {
+struct SimulatedNetwork {
     random: Rng,
     now: u64,
     /// Hub, epoch, sensor, and the next number of each topic, announcements first.
     gateways: Vec<(u64, u32, u8, Vec<u64>)>,
     /// By time of arrival.
-    underway: BTreeMap<(u64, u64), Sent>,
+    in_transit: BTreeMap<(u64, u64), SentDatagram>,
     count: u64,
     /// Number of datagrams of the gateways for each one of a stranger.
-    strangers: u8,
+    unknown_hubs: u8,
     /// Number of strangers.
-    crowd: u64,
+    gateway_count: u64,
 }
 
-impl World {
-    fn new(seed: u64) -> World {
+impl SimulatedNetwork {
+    fn new(seed: u64) -> SimulatedNetwork {
         let mut random = Rng::with_seed(seed);
         let start = |random: &mut Rng| {
             // Some start close to the end of 32 bits.
@@ -242,12 +242,20 @@ impl World {
                 gateways.push((hub, 1, sensor, (0..4).map(|_| (1 << 33) + start(&mut random)).collect()));
             }
         }
-        let (strangers, crowd) = ([60, 5][random.usize(..2)], [30, 70][random.usize(..2)]);
-        World { random, now: 0, gateways, underway: BTreeMap::new(), count: 0, strangers, crowd }
+        let (unknown_hubs, gateway_count) = ([60, 5][random.usize(..2)], [30, 70][random.usize(..2)]);
+        SimulatedNetwork {
+            random,
+            now: 0,
+            gateways,
+            in_transit: BTreeMap::new(),
+            count: 0,
+            unknown_hubs,
+            gateway_count,
+        }
     }
 
     /// Sends one datagram. Returns all datagrams that arrive in the meantime.
-    fn step(&mut self) -> Vec<Sent> {
+    fn step(&mut self) -> Vec<SentDatagram> {
         self.now += 1;
         let at = self.random.usize(..self.gateways.len());
         let restart = self.random.u32(..12_000);
@@ -259,33 +267,33 @@ impl World {
         let topic = self.random.usize(..4);
         let key = (*hub, *epoch, *sensor, TOPICS[topic]);
         let announced: Vec<(u8, u64)> = TOPICS.into_iter().zip(next.iter().copied()).skip(1).collect();
-        let sent = Sent::new(key, next[topic], if topic == 0 { announced } else { Vec::new() });
+        let sent = SentDatagram::new(key, next[topic], if topic == 0 { announced } else { Vec::new() });
         next[topic] += 1;
         if self.random.u8(..20) > 0 {
-            self.carry(sent.clone());
+            self.transmit(sent.clone());
         }
         if self.random.u8(..20) == 0 {
-            self.carry(sent);
+            self.transmit(sent);
         }
         // A stranger sends, too.
-        if self.random.u8(..self.strangers) == 0 {
+        if self.random.u8(..self.unknown_hubs) == 0 {
             let topic = [Announce::NUMBER, 4, 4, 4][self.random.usize(..4)];
-            let hub = 100 + self.random.u64(..self.crowd);
+            let hub = 100 + self.random.u64(..self.gateway_count);
             let key = (hub, self.random.u32(1..3), self.random.u8(..), topic);
-            self.carry(Sent::new(key, 1 << 33, Vec::new()));
+            self.transmit(SentDatagram::new(key, 1 << 33, Vec::new()));
         }
-        let later = self.underway.split_off(&(self.now, 0));
-        std::mem::replace(&mut self.underway, later).into_values().collect()
+        let later = self.in_transit.split_off(&(self.now, 0));
+        std::mem::replace(&mut self.in_transit, later).into_values().collect()
     }
 
-    fn carry(&mut self, sent: Sent) {
+    fn transmit(&mut self, sent: SentDatagram) {
         let delay = match self.random.u8(..100) {
             0 => self.random.u64(..20_000),
             1..10 => self.random.u64(..100),
             _ => 0,
         };
         self.count += 1;
-        self.underway.insert((self.now + delay, self.count), sent);
+        self.in_transit.insert((self.now + delay, self.count), sent);
     }
 }
 
@@ -293,8 +301,8 @@ impl World {
 fn table_agrees_with_a_model_that_keeps_everything() {
     let (mut refused, mut full, mut evicted, mut displaced) = (BTreeMap::new(), 0, 0, 0);
     for seed in 0..20 {
-        let mut world = World::new(seed);
-        let (mut table, mut model) = (GatewayTable::new(&Topic::ALL), Model::default());
+        let mut world = SimulatedNetwork::new(seed);
+        let (mut table, mut model) = (GatewayTable::new(&Topic::ALL), TableModel::default());
         // With the short tick, all delivering gateways are busy. With the long one, hardly any is.
         let (mut ticks, tick_ms) = (0, [1, 40][seed as usize % 2]);
         for step in 0..16_000 {
@@ -311,13 +319,17 @@ fn table_agrees_with_a_model_that_keeps_everything() {
                 );
             }
             if step % 1_000 == 0 {
-                assert_eq!(figures(&table), model.figures(), "seed {seed}, step {step}");
+                assert_eq!(table_counters(&table), model.counters(), "seed {seed}, step {step}");
             }
         }
         full += u32::from(model.rows.len() == MAX_ROWS);
         evicted += model.evicted.runs;
         displaced += model.evicted.evicted_active;
-        assert_eq!((figures(&table), table.evicted()), (model.figures(), model.evicted), "seed {seed}");
+        assert_eq!(
+            (table_counters(&table), table.evicted()),
+            (model.counters(), model.evicted),
+            "seed {seed}"
+        );
         for refusal in DatagramError::ALL {
             let count = model.refused.get(refusal.name()).copied().unwrap_or_default();
             assert_eq!(table.refused(refusal), count, "seed {seed}, {}", refusal.name());
@@ -335,17 +347,17 @@ fn table_agrees_with_a_model_that_keeps_everything() {
 /// Sends an announcement first and another one last, so that exactly the dropped samples count as lost.
 #[test]
 fn counters_agree_with_the_log_of_a_relay() {
-    const SENT: u64 = 5_000;
+    const DATAGRAM_COUNT: u64 = 5_000;
     let topic = Topic::Zones.number();
     for seed in 0..50 {
         let mut random = Rng::with_seed(seed);
-        let first = (1 << 33) - random.u64(..2 * SENT);
+        let first = (1 << 33) - random.u64(..2 * DATAGRAM_COUNT);
         let announce =
-            |number: u64, next| Sent::new((1, 1, 0, Announce::NUMBER), number, vec![(topic, next)]);
+            |number: u64, next| SentDatagram::new((1, 1, 0, Announce::NUMBER), number, vec![(topic, next)]);
         let (mut dropped, mut doubled) = (0, 0);
         let mut arrivals = Vec::new();
-        for number in first..first + SENT {
-            let sent = Sent::new((1, 1, 0, topic), number, Vec::new());
+        for number in first..first + DATAGRAM_COUNT {
+            let sent = SentDatagram::new((1, 1, 0, topic), number, Vec::new());
             let late = if random.u8(..20) == 0 { random.u64(..1_000) } else { 0 };
             match random.u8(..100) {
                 0..5 => dropped += 1,
@@ -365,9 +377,9 @@ fn counters_agree_with_the_log_of_a_relay() {
             below += u64::from(arrived.insert(sent.number) && sent.number < highest);
             highest = highest.max(sent.number);
         }
-        table.receive(&announce(1, first + SENT).bytes, 1, 0).unwrap();
-        let expected = [SENT - dropped, dropped, doubled, below];
-        assert_eq!(figures(&table)[&(1, 1, 0, topic)], expected, "seed {seed}");
+        table.receive(&announce(1, first + DATAGRAM_COUNT).bytes, 1, 0).unwrap();
+        let expected = [DATAGRAM_COUNT - dropped, dropped, doubled, below];
+        assert_eq!(table_counters(&table)[&(1, 1, 0, topic)], expected, "seed {seed}");
         assert!(dropped > 100 && doubled > 30 && below > 100);
     }
 }

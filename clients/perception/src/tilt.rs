@@ -20,8 +20,8 @@ use serde::{Serialize, Serializer};
 
 pub use self::angles::{Angle, DropReason};
 use self::angles::{AngleLookup, AngleUpdate, Angles, ReversalDetector, SwingEvent};
-use self::delay::{Delay, MOST_S};
-pub use self::mount::{Check, Floor, Mount, Wall};
+use self::delay::{Delay, MAX_DELAY_S};
+pub use self::mount::{Floor, Mount, MountCheck, Wall};
 use self::sweep::{Ray, SweepAnalyzer};
 
 /// The examples of the page.
@@ -30,11 +30,11 @@ use self::sweep::{Ray, SweepAnalyzer};
 struct Page;
 
 /// Maximum number of scans that wait for angles. One more makes the scanner take the oldest at once.
-const WAITING: usize = 64;
+const MAX_WAITING_SCANS: usize = 64;
 /// Maximum number of beams of a sweep. It then ends without a reversal.
-const RAYS: usize = 262_144;
+const MAX_RAYS: usize = 262_144;
 /// Difference from the last stamp at which a clock is taken to have been set back.
-const JUMP_NS: u64 = 1_000_000_000;
+const CLOCK_JUMP_NS: u64 = 1_000_000_000;
 /// Counters since the start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Counts {
@@ -70,7 +70,7 @@ fn by_reason<S: Serializer>(counts: &[u64; DropReason::COUNT], serializer: S) ->
     serializer.collect_map([Silent, Jumped, Inconsistent, Standing].into_iter().zip(counts))
 }
 
-struct Waiting {
+struct PendingScan {
     stamp_ns: u64,
     /// Stamp of the last beam.
     until_ns: u64,
@@ -79,10 +79,10 @@ struct Waiting {
 
 /// End of a sweep.
 #[derive(Clone, Copy)]
-struct End {
+struct SweepEnd {
     stamp_ns: u64,
     /// Whether the mount reversed. Otherwise its angle is unknown from here on.
-    is_turn: bool,
+    is_reversal: bool,
 }
 
 /// A scanner on a mount.
@@ -90,15 +90,15 @@ pub struct TiltScanner {
     settings: Settings,
     angles: Angles,
     reversals: ReversalDetector,
-    waiting: VecDeque<Waiting>,
-    spare: Vec<Box<Scan>>,
+    waiting: VecDeque<PendingScan>,
+    spare_scans: Vec<Box<Scan>>,
     /// Stamp of the last scan.
     scan_ns: Option<u64>,
     /// Stamp of the last beam that was taken.
     taken_ns: u64,
-    ends: VecDeque<End>,
+    ends: VecDeque<SweepEnd>,
     rays: Vec<Ray>,
-    later: Vec<Ray>,
+    next_rays: Vec<Ray>,
     analyzer: SweepAnalyzer,
     delay: Delay,
     /// Number of beams, first angle and step of the scans.
@@ -116,13 +116,13 @@ impl TiltScanner {
             settings,
             angles: Angles::new(),
             reversals: ReversalDetector::default(),
-            waiting: VecDeque::with_capacity(WAITING + 1),
-            spare: Vec::new(),
+            waiting: VecDeque::with_capacity(MAX_WAITING_SCANS + 1),
+            spare_scans: Vec::new(),
             scan_ns: None,
             taken_ns: 0,
             ends: VecDeque::new(),
             rays: Vec::new(),
-            later: Vec::new(),
+            next_rays: Vec::new(),
             analyzer: SweepAnalyzer::new(mount, settings),
             delay: Delay::default(),
             shape: (0, 0.0, 0.0),
@@ -155,28 +155,33 @@ impl TiltScanner {
         let before_ns = self.angles.last_ns();
         match self.angles.take(angle, self.scan_ns, &self.settings, &mut self.counts) {
             AngleUpdate::Dropped => return,
-            AngleUpdate::Torn => {
-                self.reversals.forget();
+            AngleUpdate::Interrupted => {
+                self.reversals.reset();
                 if self.angles.problem() == Some(DropReason::Jumped) {
-                    self.analyzer.distrust();
+                    self.analyzer.mark_unreliable();
                 }
                 self.interrupt_sweep(before_ns.unwrap_or(self.angles.true_ns(angle.stamp_ns)));
             }
-            AngleUpdate::On => match self.reversals.take(angle.stamp_ns, angle.angle_rad, &self.settings) {
-                SwingEvent::Nothing => {}
-                SwingEvent::Turned(stamp_ns) => {
-                    self.ends.push_back(End { stamp_ns: self.angles.true_ns(stamp_ns), is_turn: true });
+            AngleUpdate::Moved => {
+                match self.reversals.take(angle.stamp_ns, angle.angle_rad, &self.settings) {
+                    SwingEvent::Nothing => {}
+                    SwingEvent::Reversed(stamp_ns) => {
+                        self.ends.push_back(SweepEnd {
+                            stamp_ns: self.angles.true_ns(stamp_ns),
+                            is_reversal: true,
+                        });
+                    }
+                    SwingEvent::Standing(stamp_ns) => {
+                        self.angles.mark_standing(stamp_ns);
+                        let since_ns = self.angles.true_ns(stamp_ns);
+                        let before = self.rays.len();
+                        self.rays.retain(|ray| ray.time_ns <= since_ns);
+                        self.counts.points_dropped[DropReason::Standing as usize] +=
+                            (before - self.rays.len()) as u64;
+                        self.interrupt_sweep(since_ns);
+                    }
                 }
-                SwingEvent::Stands(stamp_ns) => {
-                    self.angles.stand_since(stamp_ns);
-                    let since_ns = self.angles.true_ns(stamp_ns);
-                    let before = self.rays.len();
-                    self.rays.retain(|ray| ray.time_ns <= since_ns);
-                    self.counts.points_dropped[DropReason::Standing as usize] +=
-                        (before - self.rays.len()) as u64;
-                    self.interrupt_sweep(since_ns);
-                }
-            },
+            }
         }
         self.counts.angles += 1;
         self.advance(&mut show);
@@ -185,7 +190,7 @@ impl TiltScanner {
     /// Takes the next scan with its header's first stamp, and passes each complete sweep to `show`.
     pub fn take_scan(&mut self, stamp_ns: u64, scan: &Scan, mut show: impl FnMut(&Sweep<'_>)) {
         if let Some(last_ns) = self.scan_ns.filter(|&last_ns| stamp_ns <= last_ns) {
-            if last_ns - stamp_ns < JUMP_NS {
+            if last_ns - stamp_ns < CLOCK_JUMP_NS {
                 self.counts.out_of_order += 1;
                 return;
             }
@@ -193,21 +198,25 @@ impl TiltScanner {
         }
         self.fit(scan);
         self.scan_ns = Some(stamp_ns);
-        let mut copy = self.spare.pop().unwrap_or_else(|| scan.boxed());
+        let mut copy = self.spare_scans.pop().unwrap_or_else(|| scan.boxed());
         Scan::grow(&mut copy, scan.bytes().len());
         copy.copy_from(scan.bytes());
         let times = (0..scan.beams()).map(|beam| stamp_ns.saturating_add_signed(scan.beam_ns(beam)));
-        self.waiting.push_back(Waiting { stamp_ns, until_ns: times.max().unwrap_or(stamp_ns), scan: copy });
+        self.waiting.push_back(PendingScan {
+            stamp_ns,
+            until_ns: times.max().unwrap_or(stamp_ns),
+            scan: copy,
+        });
         self.advance(&mut show);
     }
 
     /// Restarts after the clock was set back.
     fn reset(&mut self) {
-        self.spare.extend(self.waiting.drain(..).map(|one| one.scan));
+        self.spare_scans.extend(self.waiting.drain(..).map(|one| one.scan));
         self.rays.clear();
         self.ends.clear();
-        self.reversals.forget();
-        self.delay.forget();
+        self.reversals.reset();
+        self.delay.reset();
         (self.taken_ns, self.is_whole) = (0, false);
     }
 
@@ -216,10 +225,10 @@ impl TiltScanner {
         let shape = (scan.beams(), scan.first_angle, scan.step);
         if shape != self.shape {
             self.analyzer.begin(shape.0, self.shape.0 == 0);
-            self.delay.forget();
+            self.delay.reset();
             // Beams of the old shape have other directions.
             self.rays.clear();
-            self.spare.extend(self.waiting.drain(..).map(|one| one.scan));
+            self.spare_scans.extend(self.waiting.drain(..).map(|one| one.scan));
             self.is_whole = false;
             self.shape = shape;
         }
@@ -227,21 +236,22 @@ impl TiltScanner {
 
     /// Ends the sweep at `stamp_ns`, from which on the angle is unknown.
     fn interrupt_sweep(&mut self, stamp_ns: u64) {
-        if self.ends.back().is_none_or(|end| end.is_turn || end.stamp_ns < stamp_ns) {
-            self.ends.push_back(End { stamp_ns, is_turn: false });
+        if self.ends.back().is_none_or(|end| end.is_reversal || end.stamp_ns < stamp_ns) {
+            self.ends.push_back(SweepEnd { stamp_ns, is_reversal: false });
         }
     }
 
     fn advance(&mut self, show: &mut impl FnMut(&Sweep<'_>)) {
         while let Some(first) = self.waiting.front() {
             let newest_ns = self.scan_ns.unwrap_or(first.stamp_ns);
-            let is_over = newest_ns - first.stamp_ns > self.settings.delay_ns || self.waiting.len() > WAITING;
+            let is_over =
+                newest_ns - first.stamp_ns > self.settings.delay_ns || self.waiting.len() > MAX_WAITING_SCANS;
             if !is_over && self.angles.at(first.until_ns) == AngleLookup::Open {
                 break;
             }
             if let Some(one) = self.waiting.pop_front() {
-                self.look_at(&one);
-                self.spare.push(one.scan);
+                self.assign_angles(&one);
+                self.spare_scans.push(one.scan);
             }
             self.finish(show);
         }
@@ -249,7 +259,7 @@ impl TiltScanner {
     }
 
     /// Gives the beams of a scan their angles.
-    fn look_at(&mut self, one: &Waiting) {
+    fn assign_angles(&mut self, one: &PendingScan) {
         let unit_m = f64::from(one.scan.unit_um) * 1e-6;
         for (beam, &value) in one.scan.ranges().iter().enumerate() {
             let is_far = value == one.scan.no_return || value == one.scan.beyond;
@@ -259,21 +269,21 @@ impl TiltScanner {
                 None => continue,
             };
             let time_ns = one.stamp_ns.saturating_add_signed(one.scan.beam_ns(beam));
-            let why = match self.angles.at(time_ns) {
+            let reason = match self.angles.at(time_ns) {
                 AngleLookup::Known(angle_rad) => {
                     let beam_rad = one.scan.angle(beam);
                     self.rays.push(Ray { time_ns, angle_rad, beam_rad, range_m, beam: beam as u16 });
                     continue;
                 }
-                AngleLookup::Never(why) => why,
+                AngleLookup::Never(reason) => reason,
                 AngleLookup::Open => DropReason::Silent,
             };
             self.is_whole = false;
-            self.counts.points_dropped[why as usize] += u64::from(!is_far);
+            self.counts.points_dropped[reason as usize] += u64::from(!is_far);
         }
         self.counts.scans += 1;
         self.taken_ns = self.taken_ns.max(one.until_ns);
-        if self.rays.len() > RAYS {
+        if self.rays.len() > MAX_RAYS {
             self.interrupt_sweep(self.taken_ns);
         } else if self.angles.last_ns().is_some_and(|last_ns| last_ns < one.until_ns) {
             // It has waited for angles that did not arrive.
@@ -285,13 +295,13 @@ impl TiltScanner {
     fn finish(&mut self, show: &mut impl FnMut(&Sweep<'_>)) {
         while let Some(end) = self.ends.front().copied().filter(|end| end.stamp_ns <= self.taken_ns) {
             self.ends.pop_front();
-            let TiltScanner { rays, later, .. } = self;
+            let TiltScanner { rays, next_rays: later, .. } = self;
             later.clear();
             later.extend(rays.iter().filter(|ray| ray.time_ns > end.stamp_ns));
             rays.retain(|ray| ray.time_ns <= end.stamp_ns);
             let is_next_whole = self.rays.is_empty() || self.show(end, show);
-            std::mem::swap(&mut self.rays, &mut self.later);
-            (self.from_ns, self.is_whole) = (end.stamp_ns, end.is_turn && is_next_whole);
+            std::mem::swap(&mut self.rays, &mut self.next_rays);
+            (self.from_ns, self.is_whole) = (end.stamp_ns, end.is_reversal && is_next_whole);
         }
     }
 
@@ -300,7 +310,7 @@ impl TiltScanner {
     /// the last ones may not have arrived.
     fn correct(&mut self, more_ns: i64) -> [bool; 2] {
         self.angles.correct(more_ns);
-        let TiltScanner { angles, rays, later, ends, counts, .. } = self;
+        let TiltScanner { angles, rays, next_rays: later, ends, counts, .. } = self;
         let is_whole = [rays, later].map(|rays| {
             let before = rays.len();
             rays.retain_mut(|ray| match angles.at(ray.time_ns) {
@@ -314,32 +324,32 @@ impl TiltScanner {
             before == rays.len()
         });
         ends.iter_mut().for_each(|end| end.stamp_ns = end.stamp_ns.saturating_add_signed(-more_ns));
-        self.delay.forget();
+        self.delay.reset();
         self.analyzer.correct();
         is_whole
     }
 
     /// Passes the sweep until `end` to `show`. Returns whether the next sweep has all beams so far.
-    fn show(&mut self, end: End, show: &mut impl FnMut(&Sweep<'_>)) -> bool {
+    fn show(&mut self, end: SweepEnd, show: &mut impl FnMut(&Sweep<'_>)) -> bool {
         let mut is_next_whole = true;
         let mut sweep = Sweep {
             number: self.counts.sweeps as u32,
             from_ns: self.from_ns,
             until_ns: end.stamp_ns,
-            is_complete: self.is_whole && end.is_turn,
+            is_complete: self.is_whole && end.is_reversal,
             ..Sweep::default()
         };
         let span = (sweep.from_ns, sweep.until_ns);
         if let Some(late_s) = self.delay.take(&self.rays, self.shape.0, span, sweep.is_complete) {
             let more_ns = (late_s * 1e9) as i64;
             let all_s = 1e-9 * (self.angles.late_ns() + more_ns) as f64;
-            if all_s.abs() < MOST_S {
+            if all_s.abs() < MAX_DELAY_S {
                 let [is_whole, is_whole_next] = self.correct(more_ns);
                 (sweep.is_complete, is_next_whole) = (sweep.is_complete && is_whole, is_whole_next);
             }
         }
         sweep.late_ns = self.angles.late_ns();
-        let sweep = self.analyzer.look(&self.rays, sweep);
+        let sweep = self.analyzer.analyze(&self.rays, sweep);
         self.counts.points += sweep.points.len() as u64;
         self.counts.sweeps += 1;
         self.counts.incomplete += u64::from(!sweep.is_complete);
@@ -396,14 +406,14 @@ pub struct Settings {
     /// Maximum time between two angles that can be interpolated, in ns.
     pub gap_ns: u64,
     /// Maximum speed of a mount in rad/s. A faster change is a jump of its encoder.
-    pub fastest_rad_s: f64,
+    pub max_speed_rad_s: f64,
     /// Maximum difference between the speed that two angles show and the rates in their samples, in rad/s.
     pub rate_rad_s: f64,
     /// Time without a jump after which angles are reliable again, in ns.
     pub settle_ns: u64,
     /// Minimum change of the angle in the other direction that makes a reversal, in radians.
-    pub turn_rad: f64,
-    /// The mount stands if its angle changes by less than a tenth of [`turn_rad`](Self::turn_rad) in this time, in
+    pub reversal_rad: f64,
+    /// The mount stands if its angle changes by less than a tenth of [`turn_rad`](Self::reversal_rad) in this time, in
     /// ns.
     pub standing_ns: u64,
     /// Width of a cell of the background, in radians of the mount's angle.
@@ -413,10 +423,10 @@ pub struct Settings {
     /// Sweeps in which a surface must be seen before it is background.
     pub sweeps: u16,
     /// Maximum share of the known background that may be elsewhere in a sweep. More contradicts its angles.
-    pub doubt: f64,
+    pub max_displaced_share: f64,
     /// Maximum error of the angles in a part of a sweep that the floor shows, in radians. More contradicts the
     /// angles.
-    pub off_rad: f64,
+    pub max_error_rad: f64,
     /// Minimum number of points of an obstacle.
     pub points: usize,
     /// Width of the cubes that connect the points of an obstacle, in meters.
@@ -431,16 +441,16 @@ impl Default for Settings {
         Settings {
             delay_ns: 300_000_000,
             gap_ns: 100_000_000,
-            fastest_rad_s: 180_f64.to_radians(),
+            max_speed_rad_s: 180_f64.to_radians(),
             rate_rad_s: 10_f64.to_radians(),
             settle_ns: 500_000_000,
-            turn_rad: 2_f64.to_radians(),
+            reversal_rad: 2_f64.to_radians(),
             standing_ns: 400_000_000,
             bin_rad: 1_f64.to_radians(),
             threshold_m: 0.06,
             sweeps: 5,
-            doubt: 0.3,
-            off_rad: 0.25_f64.to_radians(),
+            max_displaced_share: 0.3,
+            max_error_rad: 0.25_f64.to_radians(),
             points: 8,
             cube_m: 0.15,
             near: None,

@@ -1,7 +1,7 @@
 //! Tracks people across the sensors and rooms of a site, from the foregrounds of several sensors to people with an identity.
 //!
 //! A [`Site`] describes sensors, rooms and doors. [`PeopleTracker`] takes scans with their foregrounds and returns
-//! [`Picture`]s: the tracks at one time, and the events before it. It takes the scans of all sensors in the order of their
+//! [`Snapshot`]s: the tracks at one time, and the events before it. It takes the scans of all sensors in the order of their
 //! stamps, with a bounded wait for the latest, and estimates the offsets between the clocks that stamped them.
 //!
 //! There is neither clock nor I/O here. Time is that of the samples (`wall_ns`), so a recording gives the same tracks at any
@@ -24,21 +24,21 @@ use serde::Serialize;
 use self::geometry::Point;
 use self::site::Sensor;
 pub use self::site::Site;
-pub use self::tracker::PICTURE_NS;
-use self::tracker::{PERSONS, Tracker};
+pub use self::tracker::SNAPSHOT_INTERVAL_NS;
+use self::tracker::{MAX_PEOPLE, Tracker};
 
 /// Maximum number of waiting scans of a sensor. One more makes the tracker take the oldest at once.
-const WAITING: usize = 64;
+const MAX_WAITING_SCANS: usize = 64;
 /// Difference from all other stamps at which a clock is taken to have jumped.
-const JUMP_NS: u64 = 2_000_000_000;
+const CLOCK_JUMP_NS: u64 = 2_000_000_000;
 /// After this number of such stamps in a row, they are the time.
-const JUMPS: u32 = 50;
+const MAX_JUMPS: u32 = 50;
 /// Share of an offset that one correction removes.
-const GAIN: f64 = 0.05;
+const CORRECTION_GAIN: f64 = 0.05;
 /// Minimum weight of the observations before an offset is corrected, in (m/s)2.
-const ENOUGH: f64 = 40.0;
+const MIN_WEIGHT: f64 = 40.0;
 /// Maximum offset between the clocks of two hubs.
-const MOST_OFFSET_NS: f64 = 250e6;
+const MAX_OFFSET_NS: f64 = 250e6;
 
 /// Counters since the start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
@@ -53,7 +53,7 @@ pub struct Counts {
     pub invalid: u64,
 }
 
-struct Waiting {
+struct WaitingScan {
     /// As stamped. It is corrected when the scan is taken.
     wall_ns: u64,
     scan: Box<Scan>,
@@ -65,7 +65,7 @@ pub struct PeopleTracker {
     tracker: Tracker,
     delay_ns: u64,
     /// Scans of each sensor in the order of their stamps.
-    queues: Vec<VecDeque<Waiting>>,
+    queues: Vec<VecDeque<WaitingScan>>,
     /// Hub of each sensor, as the index of the hub's first sensor.
     hub_of: Vec<usize>,
     /// Offset of each hub's clock from the clock of the first hub, in ns. The index is that of the hub's first
@@ -75,13 +75,13 @@ pub struct PeopleTracker {
     latest_ns: u64,
     /// Stamp of the last scan that was taken.
     taken_ns: u64,
-    next_picture_ns: u64,
+    next_snapshot_ns: u64,
     jumps: u32,
     counts: Counts,
     /// Late scans of each sensor.
     late: Vec<u64>,
-    picture: Picture,
-    spare: Vec<Waiting>,
+    snapshot: Snapshot,
+    spare_scans: Vec<WaitingScan>,
 }
 
 impl PeopleTracker {
@@ -96,17 +96,17 @@ impl PeopleTracker {
         PeopleTracker {
             tracker: Tracker::new(site),
             delay_ns,
-            queues: (0..count).map(|_| VecDeque::with_capacity(WAITING)).collect(),
+            queues: (0..count).map(|_| VecDeque::with_capacity(MAX_WAITING_SCANS)).collect(),
             hub_of,
             offsets: vec![0.0; count],
             latest_ns: 0,
             taken_ns: 0,
-            next_picture_ns: 0,
+            next_snapshot_ns: 0,
             jumps: 0,
             counts: Counts::default(),
             late: vec![0; count],
-            picture: Picture::default(),
-            spare: Vec::new(),
+            snapshot: Snapshot::default(),
+            spare_scans: Vec::new(),
         }
     }
 
@@ -139,14 +139,14 @@ impl PeopleTracker {
         wall_ns: u64,
         scan: &Scan,
         foreground: &Foreground,
-        mut show: impl FnMut(&Picture),
+        mut show: impl FnMut(&Snapshot),
     ) {
         if sensor >= self.queues.len() || usize::from(foreground.count) != scan.beams() || scan.beams() == 0 {
             self.counts.invalid += 1;
             return;
         }
         let at_ns = self.corrected(sensor, wall_ns);
-        if self.latest_ns > 0 && at_ns.abs_diff(self.latest_ns) > JUMP_NS && !self.is_new_time(at_ns) {
+        if self.latest_ns > 0 && at_ns.abs_diff(self.latest_ns) > CLOCK_JUMP_NS && !self.is_new_time(at_ns) {
             self.counts.jumped += 1;
             return;
         }
@@ -157,7 +157,7 @@ impl PeopleTracker {
         }
         self.jumps = 0;
         self.latest_ns = self.latest_ns.max(at_ns);
-        let mut one = self.spare.pop().unwrap_or_else(|| Waiting {
+        let mut one = self.spare_scans.pop().unwrap_or_else(|| WaitingScan {
             wall_ns,
             scan: scan.boxed(),
             foreground: foreground.boxed(),
@@ -168,14 +168,14 @@ impl PeopleTracker {
         one.scan.copy_from(scan.bytes());
         one.foreground.copy_from(foreground.bytes());
         let queue = &mut self.queues[sensor];
-        let place = queue.partition_point(|other| other.wall_ns <= wall_ns);
-        queue.insert(place, one);
+        let index = queue.partition_point(|other| other.wall_ns <= wall_ns);
+        queue.insert(index, one);
         let until_ns = self.latest_ns.saturating_sub(self.delay_ns);
         self.advance(until_ns, &mut show);
     }
 
     /// Takes all waiting scans, at the end of a recording.
-    pub fn finish(&mut self, mut show: impl FnMut(&Picture)) {
+    pub fn finish(&mut self, mut show: impl FnMut(&Snapshot)) {
         self.advance(u64::MAX, &mut show);
     }
 
@@ -184,59 +184,59 @@ impl PeopleTracker {
         wall_ns.saturating_add_signed(-(self.offsets[self.hub_of[sensor]] as i64))
     }
 
-    fn advance(&mut self, until_ns: u64, show: &mut impl FnMut(&Picture)) {
+    fn advance(&mut self, until_ns: u64, show: &mut impl FnMut(&Snapshot)) {
         loop {
-            let first = |sensor: usize, queue: &VecDeque<Waiting>| {
+            let first = |sensor: usize, queue: &VecDeque<WaitingScan>| {
                 queue.front().map(|one| self.corrected(sensor, one.wall_ns))
             };
             let fronts = self.queues.iter().enumerate().filter_map(|(i, queue)| Some((first(i, queue)?, i)));
             let Some((at_ns, sensor)) = fronts.min() else { break };
-            let is_full = self.queues.iter().any(|queue| queue.len() > WAITING);
+            let is_full = self.queues.iter().any(|queue| queue.len() > MAX_WAITING_SCANS);
             if at_ns > until_ns && !is_full {
                 break;
             }
             // A corrected clock may step back.
             let at_ns = at_ns.max(self.taken_ns + 1);
-            if self.next_picture_ns == 0 {
-                self.next_picture_ns = (at_ns / PICTURE_NS + 1) * PICTURE_NS;
+            if self.next_snapshot_ns == 0 {
+                self.next_snapshot_ns = (at_ns / SNAPSHOT_INTERVAL_NS + 1) * SNAPSHOT_INTERVAL_NS;
             }
-            self.pictures_until(at_ns, show);
+            self.snapshots_until(at_ns, show);
             if let Some(one) = self.queues[sensor].pop_front() {
                 self.tracker.take(sensor, at_ns, &one.scan, &one.foreground);
-                self.spare.push(one);
+                self.spare_scans.push(one);
                 self.counts.scans += 1;
                 self.taken_ns = at_ns;
                 self.compare_clocks();
             }
         }
         // No scan that may still arrive changes these.
-        if until_ns < u64::MAX && self.next_picture_ns > 0 && self.next_picture_ns <= until_ns {
-            self.pictures_until(until_ns + 1, show);
-            self.taken_ns = self.taken_ns.max(self.next_picture_ns - PICTURE_NS);
+        if until_ns < u64::MAX && self.next_snapshot_ns > 0 && self.next_snapshot_ns <= until_ns {
+            self.snapshots_until(until_ns + 1, show);
+            self.taken_ns = self.taken_ns.max(self.next_snapshot_ns - SNAPSHOT_INTERVAL_NS);
         }
     }
 
     /// Passes the pictures before `at_ns` to `show`.
-    fn pictures_until(&mut self, at_ns: u64, show: &mut impl FnMut(&Picture)) {
-        if at_ns.saturating_sub(self.next_picture_ns) > JUMP_NS {
-            self.next_picture_ns = (at_ns / PICTURE_NS) * PICTURE_NS;
+    fn snapshots_until(&mut self, at_ns: u64, show: &mut impl FnMut(&Snapshot)) {
+        if at_ns.saturating_sub(self.next_snapshot_ns) > CLOCK_JUMP_NS {
+            self.next_snapshot_ns = (at_ns / SNAPSHOT_INTERVAL_NS) * SNAPSHOT_INTERVAL_NS;
         }
-        while self.next_picture_ns < at_ns {
-            self.tracker.show(self.next_picture_ns, &mut self.picture);
-            show(&self.picture);
-            self.next_picture_ns += PICTURE_NS;
+        while self.next_snapshot_ns < at_ns {
+            self.tracker.write_snapshot(self.next_snapshot_ns, &mut self.snapshot);
+            show(&self.snapshot);
+            self.next_snapshot_ns += SNAPSHOT_INTERVAL_NS;
         }
     }
 
     /// Counts a stamp that is far from the time so far. Returns whether the clock has been set: then all stamps are.
     fn is_new_time(&mut self, at_ns: u64) -> bool {
         self.jumps += 1;
-        let is_new = self.jumps > JUMPS;
+        let is_new = self.jumps > MAX_JUMPS;
         if is_new {
             self.jumps = 0;
             self.latest_ns = at_ns;
             self.taken_ns = at_ns - 1;
-            self.next_picture_ns = 0;
+            self.next_snapshot_ns = 0;
             self.queues.iter_mut().for_each(VecDeque::clear);
         }
         is_new
@@ -254,13 +254,13 @@ impl PeopleTracker {
                 all.fold((0.0, 0.0), |sum, ((a, b), _)| (sum.0 + a, sum.1 + b))
             };
             let (own, others) = (sum(&|of| of == hub), sum(&|of| of == 0));
-            if own.1 < ENOUGH || others.1 < ENOUGH {
+            if own.1 < MIN_WEIGHT || others.1 < MIN_WEIGHT {
                 continue;
             }
             let ahead_s = own.0 / own.1 - others.0 / others.1;
-            let gain = GAIN;
-            self.offsets[hub] =
-                (self.offsets[hub] - gain * 1e9 * ahead_s * FEEDBACK).clamp(-MOST_OFFSET_NS, MOST_OFFSET_NS);
+            let gain = CORRECTION_GAIN;
+            self.offsets[hub] = (self.offsets[hub] - gain * 1e9 * ahead_s * OFFSET_FEEDBACK)
+                .clamp(-MAX_OFFSET_NS, MAX_OFFSET_NS);
             for (of, lateness) in self.hub_of.iter().zip(&mut self.tracker.lateness) {
                 if *of == hub || *of == 0 {
                     *lateness = (0.0, 0.0);
@@ -271,7 +271,7 @@ impl PeopleTracker {
 }
 
 /// Factor for the offset that shows. The filter follows each sensor in part, so only a part of the offset shows.
-const FEEDBACK: f64 = 3.0;
+const OFFSET_FEEDBACK: f64 = 3.0;
 
 /// A person at one time.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -281,7 +281,7 @@ pub struct Track {
     /// State of the track.
     pub state: TrackState,
     /// Middle between the legs, in meters in the map.
-    pub place: Point,
+    pub position: Point,
     /// Velocity in m/s.
     pub velocity: Point,
     /// Covariance of the position in m2: xx, xy, yy.
@@ -330,18 +330,18 @@ pub struct Event {
 /// A sensor that is not at its position in the site, compared with another one that sees the same people. The tracker
 /// corrects its position from then on.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Misplaced {
+pub struct MisplacedSensor {
     /// Index of the sensor in the site.
     pub sensor: usize,
     /// Index of the other sensor.
     pub other: usize,
     /// Offset of the people that it sees from those that the other one sees, in meters in the map.
-    pub off: Point,
+    pub offset: Point,
 }
 
 /// All people at one time, and the events since the last picture.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Picture {
+pub struct Snapshot {
     /// Time of all positions, in ns since 1970.
     pub wall_ns: u64,
     /// Tracks by ID.
@@ -349,10 +349,10 @@ pub struct Picture {
     /// Events in their order.
     pub events: Vec<Event>,
     /// Sensors that were found misplaced since the last picture.
-    pub misplaced: Vec<Misplaced>,
+    pub misplaced: Vec<MisplacedSensor>,
 }
 
-impl Picture {
+impl Snapshot {
     /// Returns the picture as it is published, with the names in `site`.
     pub fn payload(&self, site: &Site) -> Tracks {
         let mut tracks = Tracks::default();
@@ -364,7 +364,7 @@ impl Picture {
 
 impl Sensor {
     fn payload(&self) -> TrackSensor {
-        let [x_m, y_m] = self.place;
+        let [x_m, y_m] = self.position;
         let upside_down = u8::from(self.is_upside_down);
         let pose = Pose { x_m, y_m, yaw_rad: self.yaw_rad, upside_down, ..Pose::default() };
         TrackSensor::new(&self.name, &pose)
@@ -375,8 +375,8 @@ impl Track {
     fn payload(&self, site: &Site) -> scanhub_schema::Track {
         let mut track = scanhub_schema::Track {
             id: self.id,
-            x_m: self.place[0] as f32,
-            y_m: self.place[1] as f32,
+            x_m: self.position[0] as f32,
+            y_m: self.position[1] as f32,
             vx_m_s: self.velocity[0] as f32,
             vy_m_s: self.velocity[1] as f32,
             covariance: self.covariance.map(|value| value as f32),
@@ -401,20 +401,21 @@ impl Event {
             Kind::Left => of(EventKind::Left),
             Kind::Door { door, from, to } => {
                 let name = site.doors.get(door).map_or("", |door| &door.name);
-                of(EventKind::Door).through(name, site.room_name(from), site.room_name(to))
+                of(EventKind::Door).with_door(name, site.room_name(from), site.room_name(to))
             }
         }
     }
 }
 
-const _: () =
-    assert!(PERSONS == scanhub_schema::MAX_TRACKS && site::SENSORS == scanhub_schema::TRACK_SENSORS);
+const _: () = assert!(
+    MAX_PEOPLE == scanhub_schema::MAX_TRACKS && site::MAX_SENSORS == scanhub_schema::MAX_TRACK_SENSORS
+);
 
 #[cfg(test)]
 mod tests {
     use std::collections::BTreeSet;
 
-    use scanhub_preprocess::background::{Model, Settings};
+    use scanhub_preprocess::background::{BackgroundModel, Settings};
     use scanhub_schema::ScanHead;
 
     use super::*;
@@ -432,8 +433,8 @@ polygon = [[0, 0], [6, 0], [6, 6], [0, 6]]
 
     fn capacity(people: &PeopleTracker) -> usize {
         let queues: usize = people.queues.iter().map(VecDeque::capacity).sum();
-        let picture = people.picture.tracks.capacity() + people.picture.events.capacity();
-        people.tracker.capacity() + queues + people.spare.capacity() + picture
+        let picture = people.snapshot.tracks.capacity() + people.snapshot.events.capacity();
+        people.tracker.capacity() + queues + people.spare_scans.capacity() + picture
     }
 
     /// A scan of a sensor that sees a wall 3 m around it, and two legs around a beam 2 m before it.
@@ -453,21 +454,21 @@ polygon = [[0, 0], [6, 0], [6, 6], [0, 6]]
     }
 
     #[test]
-    fn memory_does_not_grow_and_no_identity_comes_again_however_many_come_and_go() {
+    fn memory_is_constant_and_track_ids_are_never_reused() {
         let site = Site::parse("room.toml", ROOM).expect("a room");
         let mut people = PeopleTracker::new(site, 80_000_000);
-        let mut model = Model::new(Settings::default(), BEAMS);
+        let mut model = BackgroundModel::new(Settings::default(), BEAMS);
         let (mut foreground, mut now_ns) = (Foreground::of(BEAMS), 1_700_000_000_000_000_000);
-        let (mut gone, mut here) = (BTreeSet::new(), BTreeSet::new());
+        let (mut deleted, mut present) = (BTreeSet::new(), BTreeSet::new());
         let mut turn = |people: &mut PeopleTracker, legs: Option<usize>| {
             let scan = scan(legs);
             model.update(&scan, &mut foreground);
-            now_ns += PICTURE_NS;
+            now_ns += SNAPSHOT_INTERVAL_NS;
             people.take(0, now_ns, &scan, &foreground, |picture| {
                 let now: BTreeSet<u64> = picture.tracks.iter().map(|track| track.id).collect();
-                gone.extend(here.difference(&now).copied());
-                assert!(now.is_disjoint(&gone), "{now:?} after {gone:?}");
-                here = now;
+                deleted.extend(present.difference(&now).copied());
+                assert!(now.is_disjoint(&deleted), "{now:?} after {deleted:?}");
+                present = now;
             });
         };
         (0..300).for_each(|_| turn(&mut people, None));
@@ -482,19 +483,19 @@ polygon = [[0, 0], [6, 0], [6, 6], [0, 6]]
         let begin = capacity(&people);
         (100..300).for_each(|number| visit(&mut people, number));
         assert_eq!(capacity(&people), begin);
-        assert!(gone.len() >= 200, "{}", gone.len());
+        assert!(deleted.len() >= 200, "{}", deleted.len());
         assert_eq!(people.counts().late, 0);
     }
 
     #[test]
-    fn a_picture_comes_as_soon_as_nothing_before_it_is_waited_for() {
+    fn samples_are_published_when_the_delay_has_elapsed() {
         const MS: u64 = 1_000_000;
         const BEGIN: u64 = 1_700_000_000_000_000_000;
         let mut people = PeopleTracker::new(Site::parse("room.toml", ROOM).expect("a room"), 80 * MS);
         let (scan, foreground) = (scan(None), Foreground::of(BEAMS));
         let mut take = |after_ms: u64| {
             let mut pictures = Vec::new();
-            let show = |picture: &Picture| pictures.push((picture.wall_ns - BEGIN) / MS);
+            let show = |picture: &Snapshot| pictures.push((picture.wall_ns - BEGIN) / MS);
             people.take(0, BEGIN + after_ms * MS, &scan, &foreground, show);
             (pictures, people.counts().late)
         };

@@ -6,7 +6,7 @@ mod fake;
 use std::ffi::OsStr;
 
 use clap::Parser;
-use fake::{FakeHub, Place, Verb, until};
+use fake::{FakeHub, RunningVerb, TestDomain, wait_until};
 use scanhub_perception::verbs::TrackArgs;
 use scanhub_verbs::context::{Context, DomainOptions};
 
@@ -32,14 +32,15 @@ const RANGES: [u16; 4] = [300; 4];
 
 /// Runs `track`, sends scans of `rear` that are half a second late until a line with `text` reports one, and ends it. Returns
 /// the lines, and the notes.
-fn reported(json: bool, text: &str) -> (String, String) {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front", "rear"], 7);
-    let site = place.base.join("site.toml");
+fn run_with_late_scans(json: bool, text: &str) -> (String, String) {
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front", "rear"], 7);
+    let site = test_domain.base.join("site.toml");
     std::fs::write(&site, SITE).unwrap();
     let args = Arguments::parse_from([OsStr::new("track"), OsStr::new("--site"), site.as_os_str()]).track;
-    let domain = DomainOptions { name: place.domain.name().to_owned(), root: Some(place.base.clone()) };
-    let verb = Verb::start(move |out, notes, stop| {
+    let domain =
+        DomainOptions { name: test_domain.domain.name().to_owned(), root: Some(test_domain.base.clone()) };
+    let verb = RunningVerb::start(move |out, notes, stop| {
         args.run(&mut Context::new(json, domain, (out, notes), Box::new(stop)))
     });
     for sensor in &hub.sensors {
@@ -47,13 +48,13 @@ fn reported(json: bool, text: &str) -> (String, String) {
         sensor.foreground.await_subscribers(1);
     }
     for seq in [1_000 * MS, 1_200 * MS, 1_400 * MS] {
-        hub.sensors[0].scan_with_foreground(seq, &RANGES);
+        hub.sensors[0].publish_scan_with_foreground(seq, &RANGES);
     }
     // A scan is late only if the tracker has received a later one of `front` before it, so several may be needed.
     let mut seq = 700 * MS;
-    until("a late scan is reported", || {
+    wait_until("a late scan is reported", || {
         seq += 1;
-        hub.sensors[1].scan_with_foreground(seq, &RANGES);
+        hub.sensors[1].publish_scan_with_foreground(seq, &RANGES);
         [&verb.out, &verb.notes].iter().any(|lines| lines.text().contains(text))
     });
     verb.stop();
@@ -69,8 +70,8 @@ fn number(line: &str, key: &str) -> u64 {
 }
 
 #[test]
-fn late_scans_are_lines_with_the_sensor_and_their_number() {
-    let (out, notes) = reported(true, r#""class":"late""#);
+fn json_reports_late_scans_by_sensor_and_count() {
+    let (out, notes) = run_with_late_scans(true, r#""class":"late""#);
     assert_eq!(notes, "");
     let late: Vec<&str> = out.lines().filter(|line| line.contains(r#""class":"late""#)).collect();
     let first = r#"{"class":"late","sensor":"people","wall_ns":"#;
@@ -88,7 +89,7 @@ fn late_scans_are_lines_with_the_sensor_and_their_number() {
 
 #[test]
 fn late_scans_are_notes_with_a_remedy() {
-    let (out, notes) = reported(false, "arrived late");
+    let (out, notes) = run_with_late_scans(false, "arrived late");
     let line = notes.lines().find(|line| line.contains("arrived late")).expect("a note");
     assert!(
         line.starts_with("rear: ") && line.ends_with("arrived late: set --delay longer than 80ms"),

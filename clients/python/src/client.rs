@@ -28,7 +28,7 @@ use crate::sample::{Memory, Sample};
 type ClientError = scanhub_client::Error;
 
 /// Maximum time of one wait. After it, the caller handles signals.
-const LONGEST_WAIT: Duration = Duration::from_millis(100);
+const MAX_WAIT: Duration = Duration::from_millis(100);
 
 /// Time after which the program gets a warning of topics without a first sample, if there is a reason for the silence.
 const WARN_AFTER: Duration = Duration::from_secs(2);
@@ -45,12 +45,12 @@ pub(crate) struct Name {
 
 /// Domain as the program names it.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Place {
+pub(crate) struct DomainOptions {
     pub(crate) domain: Option<String>,
     pub(crate) root: Option<PathBuf>,
 }
 
-impl Place {
+impl DomainOptions {
     /// Returns the locations in which the domain may be.
     pub(crate) fn candidates(&self) -> Result<Vec<Domain>, Error> {
         let base = self.root.as_deref().map(std::path::absolute).transpose();
@@ -59,12 +59,12 @@ impl Place {
     }
 
     /// Returns the location of the running hub.
-    pub(crate) fn live(&self) -> Result<Domain, Error> {
+    pub(crate) fn live_domain(&self) -> Result<Domain, Error> {
         Ok(find(&self.candidates()?)?)
     }
 
     /// Returns the location in which a program publishes.
-    fn home(&self) -> Result<Domain, Error> {
+    fn publish_domain(&self) -> Result<Domain, Error> {
         match self.root {
             Some(_) => Ok(self.candidates()?.remove(0)),
             None => Ok(scanhub_client::publish_domain(self.domain.as_deref())?),
@@ -74,19 +74,19 @@ impl Place {
 
 /// Value that stays where it is used by one thread at a time, and that a child after `fork` neither uses nor drops, because it
 /// belongs to the parent.
-pub(crate) struct Confined<T> {
+pub(crate) struct ForkSafeCell<T> {
     value: Mutex<Option<T>>,
     process: u32,
     busy: AtomicBool,
 }
 
-impl<T> Confined<T> {
-    pub(crate) fn new(value: T) -> Confined<T> {
-        Confined { value: Mutex::new(Some(value)), process: process::id(), busy: AtomicBool::new(false) }
+impl<T> ForkSafeCell<T> {
+    pub(crate) fn new(value: T) -> ForkSafeCell<T> {
+        ForkSafeCell { value: Mutex::new(Some(value)), process: process::id(), busy: AtomicBool::new(false) }
     }
 
     /// Reserves the value for one thread until the result is dropped.
-    pub(crate) fn reserve(&self) -> Result<Reserved<'_>, Error> {
+    pub(crate) fn reserve(&self) -> Result<Reservation<'_>, Error> {
         if !self.is_own() {
             let remedy = "a child process after a fork makes its own";
             return Err(Error::new("Failure", "this object belongs to the parent process", remedy));
@@ -95,7 +95,7 @@ impl<T> Confined<T> {
             let remedy = "make one for each thread";
             return Err(Error::new("Failure", "another thread or task uses this object", remedy));
         }
-        Ok(Reserved(&self.busy))
+        Ok(Reservation(&self.busy))
     }
 
     /// Returns whether this process created the value.
@@ -119,7 +119,7 @@ impl<T> Confined<T> {
     }
 }
 
-impl<T> Drop for Confined<T> {
+impl<T> Drop for ForkSafeCell<T> {
     fn drop(&mut self) {
         if !self.is_own() {
             mem::forget(self.value.get_mut().unwrap_or_else(PoisonError::into_inner).take());
@@ -127,17 +127,17 @@ impl<T> Drop for Confined<T> {
     }
 }
 
-/// Reservation of a [`Confined`] value.
-pub(crate) struct Reserved<'a>(&'a AtomicBool);
+/// Reservation of a [`ForkSafeCell`] value.
+pub(crate) struct Reservation<'a>(&'a AtomicBool);
 
-impl Drop for Reserved<'_> {
+impl Drop for Reservation<'_> {
     fn drop(&mut self) {
         self.0.store(false, Ordering::Release);
     }
 }
 
 /// A source of items, with or without a descriptor to poll.
-pub(crate) trait Follow: Sized + Send {
+pub(crate) trait PollableSource: Sized + Send {
     /// Received item.
     type Item;
 
@@ -198,9 +198,9 @@ pub(crate) trait Follow: Sized + Send {
 /// Subscription to one or more topics.
 pub(crate) struct Topics {
     session: Session,
-    sources: Vec<Followed>,
+    sources: Vec<TopicState>,
     /// Index of the source that is next in the round, so that no topic waits for the samples of another one.
-    turn: usize,
+    next_source: usize,
     wait: Option<Wait>,
     /// Descriptor to poll, if the subscription waits by event.
     descriptor: Option<Arc<OwnedFd>>,
@@ -211,7 +211,7 @@ pub(crate) struct Topics {
     has_left: bool,
 }
 
-struct Followed {
+struct TopicState {
     name: Name,
     source: Source,
     last: Header,
@@ -220,15 +220,15 @@ struct Followed {
 }
 
 impl Topics {
-    pub(crate) fn new(names: Vec<Name>, place: &Place) -> Result<Topics, Error> {
+    pub(crate) fn new(names: Vec<Name>, domain_options: &DomainOptions) -> Result<Topics, Error> {
         let sources = names.into_iter().map(|name| {
             let source = Source::new(&name.sensor, name.topic);
-            Followed { name, source, last: Header::default(), is_first: true }
+            TopicState { name, source, last: Header::default(), is_first: true }
         });
         Ok(Topics {
-            session: Session::new(place.candidates()?),
+            session: Session::new(domain_options.candidates()?),
             sources: sources.collect(),
-            turn: 0,
+            next_source: 0,
             wait: None,
             descriptor: None,
             notices: VecDeque::new(),
@@ -237,7 +237,7 @@ impl Topics {
         })
     }
 
-    fn look_and_receive(&mut self) -> Result<Option<(usize, AnySample)>, Error> {
+    fn check_and_receive(&mut self) -> Result<Option<(usize, AnySample)>, Error> {
         loop {
             // A callback that fails must not lose a sample, so the program gets the notices first.
             if !self.notices.is_empty() {
@@ -247,7 +247,7 @@ impl Topics {
             if let Some(received) = self.receive(true)? {
                 return Ok(Some(received));
             }
-            self.look()?;
+            self.check_hub()?;
             if self.session.domain().is_none() {
                 let error = self.session.no_hub_here();
                 if error.kind() == ErrorKind::OtherUser {
@@ -260,24 +260,24 @@ impl Topics {
             if let Some(received) = self.receive(false)? {
                 return Ok(Some(received));
             }
-            if self.wait != Some(Wait::Event) || !self.session.settle(self.left())? {
+            if self.wait != Some(Wait::Event) || !self.session.rearm_descriptor(self.left())? {
                 return Ok(None);
             }
         }
     }
 
     /// Checks for the hub, and notes its changes.
-    fn look(&mut self) -> Result<(), Error> {
-        let Change { gone, back } = self.session.look()?;
-        self.notices.extend(gone.map(|_| "hub_gone"));
-        self.notices.extend(back.map(|_| "hub_back"));
+    fn check_hub(&mut self) -> Result<(), Error> {
+        let Change { ended, started } = self.session.check_hub()?;
+        self.notices.extend(ended.map(|_| "hub_gone"));
+        self.notices.extend(started.map(|_| "hub_back"));
         Ok(())
     }
 
     fn receive(&mut self, only_subscribed: bool) -> Result<Option<(usize, AnySample)>, Error> {
         for _ in 0..self.sources.len() {
-            let index = self.turn;
-            self.turn = (index + 1) % self.sources.len();
+            let index = self.next_source;
+            self.next_source = (index + 1) % self.sources.len();
             let source = &mut self.sources[index].source;
             if only_subscribed && !source.subscribed() {
                 continue;
@@ -309,14 +309,14 @@ impl Topics {
     }
 
     fn left(&self) -> Option<Duration> {
-        self.sources.iter().filter_map(|followed| followed.source.left()).min()
+        self.sources.iter().filter_map(|followed| followed.source.time_left()).min()
     }
 
     /// Returns the reasons for the silence of the sources for which `is_checked`, each once.
-    fn reasons(&mut self, is_checked: impl Fn(&Followed) -> bool) -> Vec<Silence> {
+    fn reasons(&mut self, is_checked: impl Fn(&TopicState) -> bool) -> Vec<Silence> {
         let mut reasons = Vec::new();
         // The sources check for the hub, too, and would not note its changes. They return the same errors.
-        let _ = self.look();
+        let _ = self.check_hub();
         for followed in self.sources.iter_mut().filter(|followed| is_checked(followed)) {
             match followed.source.why_silent(&mut self.session) {
                 Silence::Waiting => {}
@@ -330,7 +330,7 @@ impl Topics {
     }
 }
 
-impl Follow for Topics {
+impl PollableSource for Topics {
     type Item = Sample;
 
     fn leave(&mut self) {
@@ -349,7 +349,7 @@ impl Follow for Topics {
         if self.wait.is_none() {
             self.begin(Wait::Doorbell);
         }
-        let Some((index, sample)) = self.look_and_receive()? else { return Ok(None) };
+        let Some((index, sample)) = self.check_and_receive()? else { return Ok(None) };
         let followed = &mut self.sources[index];
         let header = sample.header().copied();
         let restarted = header.is_some_and(|header| !followed.is_first && header.boot != followed.last.boot);
@@ -358,7 +358,7 @@ impl Follow for Topics {
         }
         let (name, header) = (followed.name.clone(), followed.last);
         self.warn_at.take_if(|_| self.sources.iter().all(|followed| !followed.is_first));
-        let (missed, stale) = (sample.missed(), matches!(&sample, AnySample::Zones(heard) if heard.stale));
+        let (missed, stale) = (sample.missed(), matches!(&sample, AnySample::Zones(update) if update.stale));
         let memory = match &sample {
             // The client library has a copy already.
             AnySample::Zones(_) => Memory::copy_of(sample.bytes()),
@@ -372,14 +372,19 @@ impl Follow for Topics {
                         | AnySample::Background(_)
                         | AnySample::Cloud(_)
                 );
-                Memory::Hub(Held { address, len, is_of_words, _sample: Confined::new(sample) })
+                Memory::Hub(SharedPayload {
+                    address,
+                    len,
+                    is_slice: is_of_words,
+                    _sample: ForkSafeCell::new(sample),
+                })
             }
         };
         Ok(Some(Sample { name, header, missed, restarted, stale, memory: Arc::new(memory) }))
     }
 
     fn wait(&mut self, longest: Duration) -> Result<(), Error> {
-        let longest = longest.min(LONGEST_WAIT);
+        let longest = longest.min(MAX_WAIT);
         Ok(self.session.wait_for(Some(self.left().map_or(longest, |left| left.min(longest))))?)
     }
 
@@ -421,7 +426,7 @@ impl Follow for Topics {
         let names = self
             .sources
             .iter()
-            .map(|Followed { name: Name { sensor, topic }, .. }| format!("{sensor}/{}", topic.name()));
+            .map(|TopicState { name: Name { sensor, topic }, .. }| format!("{sensor}/{}", topic.name()));
         let mut names: Vec<String> = names.collect();
         names.sort();
         let what = format!("nothing of {} in {timeout} s", names.join(", "));
@@ -437,16 +442,16 @@ impl Follow for Topics {
 }
 
 /// Payload of a sample in shared memory. The sample is released when this is dropped, except in a child after `fork`.
-pub(crate) struct Held {
+pub(crate) struct SharedPayload {
     /// Address of the payload.
     address: usize,
     len: usize,
     /// Whether the payload has a variable length.
-    is_of_words: bool,
-    _sample: Confined<AnySample>,
+    is_slice: bool,
+    _sample: ForkSafeCell<AnySample>,
 }
 
-impl Held {
+impl SharedPayload {
     /// Returns the used bytes of the payload.
     pub(crate) fn bytes(&self) -> &[u8] {
         &self.words()[..self.len]
@@ -454,7 +459,7 @@ impl Held {
 
     /// Returns the used bytes, and those that fill the last word of a payload of variable length.
     pub(crate) fn words(&self) -> &[u8] {
-        let len = if self.is_of_words { self.len.next_multiple_of(8) } else { self.len };
+        let len = if self.is_slice { self.len.next_multiple_of(8) } else { self.len };
         // SAFETY: `_sample` is kept until `self` is dropped. Until then, its payload in shared memory does not move, and
         // the hub does not write it. A payload of variable length consists of whole words of 8 bytes.
         unsafe { std::slice::from_raw_parts(ptr::with_exposed_provenance(self.address), len) }
@@ -464,7 +469,7 @@ impl Held {
 /// Subscription to the verdict of a robot.
 pub(crate) struct Verdicts {
     sensors: Vec<String>,
-    place: Place,
+    domain_options: DomainOptions,
     early: bool,
     /// `None` after it has left.
     robot: Option<RobotSubscriber>,
@@ -491,11 +496,15 @@ impl Default for Verdict {
 }
 
 impl Verdicts {
-    pub(crate) fn new(sensors: &[&str], place: &Place, early: bool) -> Result<Verdicts, Error> {
-        let robot = Some(builder(sensors, place, early).open()?);
+    pub(crate) fn new(
+        sensors: &[&str],
+        domain_options: &DomainOptions,
+        early: bool,
+    ) -> Result<Verdicts, Error> {
+        let robot = Some(builder(sensors, domain_options, early).open()?);
         let sensors = sensors.iter().map(|&sensor| sensor.to_owned()).collect();
-        let (place, warn_at) = (place.clone(), Some(Instant::now() + WARN_AFTER));
-        Ok(Verdicts { sensors, place, early, robot, pollable: None, wait: None, warn_at })
+        let (domain_options, warn_at) = (domain_options.clone(), Some(Instant::now() + WARN_AFTER));
+        Ok(Verdicts { sensors, domain_options, early, robot, pollable: None, wait: None, warn_at })
     }
 
     /// Returns what is known now. Never waits.
@@ -518,7 +527,7 @@ impl Verdicts {
     }
 }
 
-impl Follow for Verdicts {
+impl PollableSource for Verdicts {
     type Item = Verdict;
 
     fn leave(&mut self) {
@@ -538,7 +547,7 @@ impl Follow for Verdicts {
     }
 
     fn wait(&mut self, longest: Duration) -> Result<(), Error> {
-        self.subscriber().map_or(Ok(()), |robot| Ok(robot.wait(longest.min(LONGEST_WAIT))?))
+        self.subscriber().map_or(Ok(()), |robot| Ok(robot.wait(longest.min(MAX_WAIT))?))
     }
 
     fn descriptor(&mut self) -> Result<i32, Error> {
@@ -546,7 +555,7 @@ impl Follow for Verdicts {
             // Nothing was received, so another subscriber misses nothing.
             if self.robot.is_some() {
                 let sensors: Vec<&str> = self.sensors.iter().map(String::as_str).collect();
-                self.pollable = Some(builder(&sensors, &self.place, self.early).open_pollable()?);
+                self.pollable = Some(builder(&sensors, &self.domain_options, self.early).open_pollable()?);
                 self.robot = None;
             }
             self.wait = Some(Wait::Event);
@@ -578,12 +587,12 @@ impl Follow for Verdicts {
     }
 }
 
-fn builder(sensors: &[&str], place: &Place, early: bool) -> SubscriberBuilder<Robot> {
+fn builder(sensors: &[&str], domain_options: &DomainOptions, early: bool) -> SubscriberBuilder<Robot> {
     let mut builder = RobotSubscriber::builder(sensors);
-    if let Some(domain) = &place.domain {
+    if let Some(domain) = &domain_options.domain {
         builder = builder.domain(domain);
     }
-    if let Some(root) = &place.root {
+    if let Some(root) = &domain_options.root {
         builder = builder.root(root);
     }
     if early { builder.early() } else { builder }
@@ -602,8 +611,8 @@ fn verdict(robot: &Robot) -> Verdict {
 pub(crate) struct Mount(Publication<Tilt>);
 
 impl Mount {
-    pub(crate) fn new(name: &str, place: &Place) -> Result<Mount, Error> {
-        Ok(Mount(Publication::in_domain(&place.home()?, name)?))
+    pub(crate) fn new(name: &str, domain_options: &DomainOptions) -> Result<Mount, Error> {
+        Ok(Mount(Publication::in_domain(&domain_options.publish_domain()?, name)?))
     }
 
     /// Publishes the angle at `stamp_ns` of CLOCK_MONOTONIC. `None` means now.
@@ -623,8 +632,8 @@ impl Mount {
 }
 
 /// Returns the topics of the running hub, sorted.
-pub(crate) fn topics(place: &Place) -> Result<Vec<(String, String)>, Error> {
-    let names = scanhub_client::live_topics(&[place.live()?]);
+pub(crate) fn topics(domain_options: &DomainOptions) -> Result<Vec<(String, String)>, Error> {
+    let names = scanhub_client::live_topics(&[domain_options.live_domain()?]);
     let names = names.iter().filter_map(|name| name.split_once('/'));
     Ok(names.map(|(sensor, topic)| (sensor.to_owned(), topic.to_owned())).collect())
 }

@@ -21,9 +21,9 @@ use std::time::Duration;
 
 use pyo3::prelude::*;
 use scanhub_client::{Request, Tilt, Topic, Verb};
-use scanhub_schema::{check_followed, is_remote};
+use scanhub_schema::{check_any_sensor, is_remote};
 
-use client::{Confined, Mount, Name, Place};
+use client::{DomainOptions, ForkSafeCell, Mount, Name};
 use error::Error;
 use sample::Sample;
 
@@ -54,7 +54,7 @@ fn parse(text: &str) -> Result<Name, Error> {
         let remedy = format!("write SENSOR/TOPIC, as front/scan; topics are {}", names.join(", "));
         Error::new("NoTopic", format!("no topic {text:?}"), remedy)
     })?;
-    check_followed(sensor)?;
+    check_any_sensor(sensor)?;
     Ok(Name { sensor: sensor.into(), topic })
 }
 
@@ -66,7 +66,7 @@ fn topic_names(
     domain: Option<String>,
     root: Option<PathBuf>,
 ) -> PyResult<Vec<(String, String)>> {
-    Ok(py.detach(|| client::topics(&Place { domain, root }))?)
+    Ok(py.detach(|| client::topics(&DomainOptions { domain, root }))?)
 }
 
 /// Sends a request to the hub, and returns the background model of its answer.
@@ -79,15 +79,15 @@ fn request(
     domain: Option<String>,
     root: Option<PathBuf>,
 ) -> PyResult<Option<Py<PyAny>>> {
-    check_followed(sensor).map_err(Error::from)?;
+    check_any_sensor(sensor).map_err(Error::from)?;
     let invalid = || Error::new("Impossible", format!("no order {order:?}"), "docs/python.md lists them");
     let verb = Verb::parse(order).ok_or_else(invalid)?;
     let (request, stop) = (Request::new(sensor, verb), Arc::new(AtomicBool::new(false)));
-    let place = Place { domain, root };
+    let domain_options = DomainOptions { domain, root };
     let answer = interruptible(py, {
         let stop = Arc::clone(&stop);
         move || {
-            place.live().and_then(|domain| {
+            domain_options.live_domain().and_then(|domain| {
                 scanhub_client::request(&[domain], &request, &stop).map_err(Error::of_request)
             })
         }
@@ -123,7 +123,7 @@ const SIGNAL_INTERVAL: Duration = Duration::from_millis(50);
 
 /// Published angles of a mount.
 #[pyclass(frozen, module = "scanhub")]
-struct Publication(Confined<Mount>);
+struct Publication(ForkSafeCell<Mount>);
 
 #[pymethods]
 impl Publication {
@@ -146,7 +146,8 @@ impl Publication {
             return Err(Error::new("Impossible", what, "one without a dot, for example mount").into());
         }
         // A publication is created and used by one thread at a time.
-        let mount = py.detach(|| Mount::new(&sensor, &Place { domain, root }).map(Confined::new))?;
+        let mount =
+            py.detach(|| Mount::new(&sensor, &DomainOptions { domain, root }).map(ForkSafeCell::new))?;
         Ok(Publication(mount))
     }
 

@@ -6,12 +6,12 @@ use std::time::Instant;
 use bytemuck::cast_slice;
 use pyo3::prelude::*;
 use pyo3::types::PyTuple;
-use scanhub_client::{Contents, Scan, Topic};
+use scanhub_client::{ArrayFlags, Scan, Topic};
 use scanhub_config::Sources;
 use scanhub_daemon::{ReadOptions, ReadSample, RecordingReader};
 use scanhub_schema::{Failure, Family, Kind};
 
-use crate::client::{Confined, Name};
+use crate::client::{ForkSafeCell, Name};
 use crate::error::{Error, value};
 use crate::sample::{Memory, Sample, array, shaped};
 use crate::{SIGNAL_INTERVAL, interruptible, topics};
@@ -19,7 +19,7 @@ use crate::{SIGNAL_INTERVAL, interruptible, topics};
 /// Samples of a recording. Iterate over it.
 #[pyclass(frozen, module = "scanhub")]
 pub(crate) struct Recording {
-    reader: Confined<RecordingReader>,
+    reader: ForkSafeCell<RecordingReader>,
     file: PathBuf,
     topics: Vec<Topic>,
     sensors: Vec<String>,
@@ -53,7 +53,7 @@ impl Recording {
             Family::parse(&name).ok_or_else(unknown)
         });
         let family = family.transpose()?;
-        let (place, read) = (file.clone(), topics.clone());
+        let (path, read) = (file.clone(), topics.clone());
         let opened = interruptible(py, move || {
             // The same default as `scanhub replay`.
             let named = || std::env::var_os("SCANHUB_CONFIG").filter(|file| !file.is_empty());
@@ -61,13 +61,13 @@ impl Recording {
             files.extend(config.or_else(|| named().map(PathBuf::from)));
             let sources = Sources { files, set, ..Sources::default() };
             let sensor = sensor.as_deref();
-            let options = ReadOptions { file: &place, sensor, family, sources: &sources, topics: &read };
+            let options = ReadOptions { file: &path, sensor, family, sources: &sources, topics: &read };
             RecordingReader::open(&options)
         })?;
         let reader = opened.map_err(refusal)?;
         let sensors = reader.sensors().into_iter().map(str::to_owned).collect();
         let problems = reader.problems().iter().map(|problem| in_python(problem)).collect();
-        Ok(Recording { reader: Confined::new(reader), file, topics, sensors, problems })
+        Ok(Recording { reader: ForkSafeCell::new(reader), file, topics, sensors, problems })
     }
 
     /// Names of the sensors that are read.
@@ -100,14 +100,14 @@ impl Recording {
     /// Returns all scans that were not read yet, as arrays.
     fn to_numpy(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
         let _reserved = self.reader.reserve()?;
-        let place = self.file.display();
+        let path = self.file.display();
         if self.sensors.len() > 1 {
-            let what = format!("{place} has several sensors: {}", self.sensors.join(", "));
+            let what = format!("{path} has several sensors: {}", self.sensors.join(", "));
             let remedy = format!("read one of them: sensor={:?}", self.sensors[0]);
             return Err(Error::new("Impossible", what, remedy).into());
         }
         if !self.topics.contains(&Topic::Scan) {
-            let what = format!("{place} is read without its scans");
+            let what = format!("{path} is read without its scans");
             return Err(Error::new("Impossible", what, "add \"scan\" to topics").into());
         }
         let mut scans = Scans::default();
@@ -118,7 +118,7 @@ impl Recording {
             true
         })?;
         if !is_open {
-            let what = format!("the recording {place} is closed");
+            let what = format!("the recording {path} is closed");
             return Err(Error::new("Failure", what, "call scanhub.read again").into());
         }
         scans.into_numpy(py).map(Bound::unbind)
@@ -147,7 +147,7 @@ impl Recording {
     /// Passes samples to `take` until it returns false, or to the end. Handles signals in between. Returns false if the
     /// recording is closed. Fails once if the file has become shorter.
     fn read(&self, py: Python<'_>, mut take: impl FnMut(ReadSample) -> bool + Send) -> PyResult<bool> {
-        let mut read_for_a_while = |reader: &mut RecordingReader| {
+        let mut read_slice = |reader: &mut RecordingReader| {
             let until = Instant::now() + SIGNAL_INTERVAL;
             loop {
                 while let Some(sample) = reader.pop() {
@@ -164,7 +164,7 @@ impl Recording {
             }
         };
         loop {
-            let Some(continues) = py.detach(|| self.reader.with(&mut read_for_a_while)) else {
+            let Some(continues) = py.detach(|| self.reader.with(&mut read_slice)) else {
                 return Ok(false);
             };
             if !continues.map_err(refusal)? {
@@ -210,12 +210,12 @@ fn in_python(text: &str) -> String {
     for part in parts {
         // A key, and maybe its value.
         let len = part.find([' ', ',', ';', ':']).unwrap_or(part.len());
-        let (setting, rest) = part.split_at(len);
-        let (value, rest) = match rest.strip_prefix(" = \"").and_then(|rest| rest.split_once('"')) {
-            Some((value, rest)) => (format!("={value}"), rest),
-            None => ((if setting.contains('=') { "" } else { "=VALUE" }).to_owned(), rest),
+        let (setting, remainder) = part.split_at(len);
+        let (value, remainder) = match remainder.strip_prefix(" = \"").and_then(|rest| rest.split_once('"')) {
+            Some((value, remainder)) => (format!("={value}"), remainder),
+            None => ((if setting.contains('=') { "" } else { "=VALUE" }).to_owned(), remainder),
         };
-        python += &format!("set=[\"link.{setting}{value}\"]{rest}");
+        python += &format!("set=[\"link.{setting}{value}\"]{remainder}");
     }
     python
 }
@@ -246,7 +246,7 @@ impl Scans {
         self.stamps.push(stamp_ns as i64);
         self.beams.push(beams);
         self.ranges.push(beams, (0..beams).map(|i| scan.distance_m(i).unwrap_or(f64::NAN)));
-        let is_exact = scan.contents & Contents::ANGLES != 0;
+        let is_exact = scan.contents & ArrayFlags::ANGLES != 0;
         let angles = (0..beams).map(|i| scan.angle(i));
         match &mut self.angles {
             Angles::PerScan(rows) => rows.push(beams, angles),

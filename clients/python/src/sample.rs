@@ -10,14 +10,14 @@ use pyo3::sync::PyOnceLock;
 use pyo3::types::{PyBytes, PyDict, PyFrozenSet, PyTuple};
 use scanhub_client::{Background, Flags, Header, Reasons, Topic};
 
-use crate::client::{Held, Name};
+use crate::client::{Name, SharedPayload};
 use crate::topics;
 
 /// Payload of a sample.
 #[expect(clippy::large_enum_variant, reason = "it is always behind an `Arc`")]
 pub(crate) enum Memory {
     /// In shared memory.
-    Hub(Held),
+    Hub(SharedPayload),
     /// A copy of this number of bytes.
     Copy(Vec<u64>, usize),
 }
@@ -113,7 +113,7 @@ getters! {
     quality: &'static str = if header.quality == 0 { "clean" } else { "suspect" };
     /// Reasons why the telegram is suspect.
     reasons: PyResult<Bound<'py, PyTuple>> = PyTuple::new(slf.py(), Reasons::names(header.reasons).collect::<Vec<_>>());
-    /// Flags that are set: `simulated`, `replayed`, `stamp_estimated`, `remote`.
+    /// Flags that are set: `simulated`, `replayed`, `stamp_estimated`, `remote_machines`.
     flags: PyResult<Bound<'py, PyFrozenSet>> = PyFrozenSet::new(slf.py(), Flags::names(header.flags));
     /// Nominal period of the scans in microseconds; None if unknown.
     period_us: Option<u32> = Some(header.period_us).filter(|period_us| *period_us != 0);

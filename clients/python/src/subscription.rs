@@ -7,14 +7,14 @@ use std::time::{Duration, Instant};
 use pyo3::prelude::*;
 use pyo3::types::{PyAny, PyDict};
 
-use crate::client::{Confined, Follow, Place, Topics, Verdict, Verdicts};
+use crate::client::{DomainOptions, ForkSafeCell, PollableSource, Topics, Verdict, Verdicts};
 use crate::error::{Error, value};
 use crate::{parse, topics};
 
 /// Returns the next item, after a wait if none has arrived. `None` if the subscription is closed.
-fn next<F: Follow>(
+fn next<F: PollableSource>(
     py: Python<'_>,
-    this: &Arc<Confined<F>>,
+    this: &Arc<ForkSafeCell<F>>,
     timeout: Option<f64>,
     notice: Option<&Py<PyAny>>,
 ) -> PyResult<Option<F::Item>> {
@@ -32,15 +32,15 @@ fn next<F: Follow>(
         if left.is_zero() {
             return Err(silence(this, timeout).into());
         }
-        py.detach(|| this.with(|follower| follower.wait(left)).transpose())?;
+        py.detach(|| this.with(|source| source.wait(left)).transpose())?;
         py.check_signals()?;
     }
 }
 
 /// Returns the next item that has arrived, after the notices before it.
-fn poll<F: Follow>(
+fn poll<F: PollableSource>(
     py: Python<'_>,
-    this: &Arc<Confined<F>>,
+    this: &Arc<ForkSafeCell<F>>,
     notice: Option<&Py<PyAny>>,
 ) -> PyResult<Option<F::Item>> {
     // The callback may close the subscription.
@@ -56,35 +56,35 @@ fn poll<F: Follow>(
 }
 
 /// Calls the program with each notice. Returns whether there was one. If the call fails, the others stay.
-fn notify<F: Follow>(
+fn notify<F: PollableSource>(
     py: Python<'_>,
-    this: &Arc<Confined<F>>,
+    this: &Arc<ForkSafeCell<F>>,
     callback: Option<&Py<PyAny>>,
 ) -> PyResult<bool> {
     let mut any = false;
-    while let Some(notice) = this.with(Follow::next_notice).flatten() {
+    while let Some(notice) = this.with(PollableSource::next_notice).flatten() {
         callback.map_or(Ok(()), |callback| callback.call1(py, (notice,)).map(drop))?;
         any = true;
     }
     Ok(any)
 }
 
-fn warn<F: Follow>(py: Python<'_>, this: &Arc<Confined<F>>) -> PyResult<()> {
-    this.with(Follow::warning).flatten().map_or(Ok(()), |reason| reason.warn(py))
+fn warn<F: PollableSource>(py: Python<'_>, this: &Arc<ForkSafeCell<F>>) -> PyResult<()> {
+    this.with(PollableSource::warning).flatten().map_or(Ok(()), |reason| reason.warn(py))
 }
 
-fn is_open<F: Follow>(this: &Arc<Confined<F>>) -> bool {
-    this.with(|follower| !follower.has_left()).unwrap_or_default()
+fn is_open<F: PollableSource>(this: &Arc<ForkSafeCell<F>>) -> bool {
+    this.with(|source| !source.has_left()).unwrap_or_default()
 }
 
-fn silence<F: Follow>(this: &Arc<Confined<F>>, timeout: Option<f64>) -> Error {
-    let silence = this.with(|follower| follower.silence(timeout.unwrap_or_default()));
+fn silence<F: PollableSource>(this: &Arc<ForkSafeCell<F>>, timeout: Option<f64>) -> Error {
+    let silence = this.with(|source| source.silence(timeout.unwrap_or_default()));
     silence.unwrap_or_else(closed)
 }
 
-fn descriptor<F: Follow>(this: &Arc<Confined<F>>) -> Result<i32, Error> {
+fn descriptor<F: PollableSource>(this: &Arc<ForkSafeCell<F>>) -> Result<i32, Error> {
     let _reserved = this.reserve()?;
-    this.with(Follow::descriptor).unwrap_or_else(|| Err(closed()))
+    this.with(PollableSource::descriptor).unwrap_or_else(|| Err(closed()))
 }
 
 fn closed() -> Error {
@@ -109,7 +109,7 @@ macro_rules! follower {
 
             /// Leaves the domain. Samples that the program keeps stay readable.
             fn close(&self, py: Python<'_>) {
-                py.detach(|| self.source.with(Follow::leave));
+                py.detach(|| self.source.with(PollableSource::leave));
             }
 
             /// Whether a hub or listener publishes in the domain, as of the last look.
@@ -121,7 +121,7 @@ macro_rules! follower {
 
             /// Seconds since the last sample; if there was none, since the start. Time in suspend counts.
             fn silent_for(&self, py: Python<'_>) -> Result<f64, Error> {
-                let silent_for = |source: &mut _| (!Follow::has_left(source)).then(|| Follow::silent_for(source));
+                let silent_for = |source: &mut _| (!PollableSource::has_left(source)).then(|| PollableSource::silent_for(source));
                 let silent_for = py.detach(|| self.source.with(silent_for)).flatten();
                 silent_for.map(|time| time.as_secs_f64()).ok_or_else(closed)
             }
@@ -162,7 +162,7 @@ macro_rules! follower {
 /// Subscription to topics. Iterate over it, with `for` or with `async for`.
 #[pyclass(subclass, frozen, module = "scanhub._scanhub")]
 pub(crate) struct Subscriber {
-    source: Arc<Confined<Topics>>,
+    source: Arc<ForkSafeCell<Topics>>,
     timeout: Option<f64>,
     notice: Option<Py<PyAny>>,
 }
@@ -188,7 +188,7 @@ follower! {
         if unique.is_empty() {
             return Err(Error::new("NoTopic", "no topic is named", "write SENSOR/TOPIC, as front/scan").into());
         }
-        let source = Arc::new(Confined::new(Topics::new(unique, &Place { domain, root })?));
+        let source = Arc::new(ForkSafeCell::new(Topics::new(unique, &DomainOptions { domain, root })?));
         Ok(Subscriber { source, timeout, notice: on_notice })
     }
 }
@@ -196,7 +196,7 @@ follower! {
 /// Subscription to the verdict of a robot. Iterate over it, with `for` or with `async for`.
 #[pyclass(subclass, frozen, module = "scanhub._scanhub")]
 pub(crate) struct RobotSubscriber {
-    source: Arc<Confined<Verdicts>>,
+    source: Arc<ForkSafeCell<Verdicts>>,
     timeout: Option<f64>,
     notice: Option<Py<PyAny>>,
 }
@@ -212,8 +212,8 @@ follower! {
         early: bool,
     ) -> PyResult<RobotSubscriber> {
         let sensors: Vec<&str> = sensors.iter().map(String::as_str).collect();
-        let verdicts = Verdicts::new(&sensors, &Place { domain, root }, early)?;
-        Ok(RobotSubscriber { source: Arc::new(Confined::new(verdicts)), timeout: None, notice: None })
+        let verdicts = Verdicts::new(&sensors, &DomainOptions { domain, root }, early)?;
+        Ok(RobotSubscriber { source: Arc::new(ForkSafeCell::new(verdicts)), timeout: None, notice: None })
     }
 
     /// Returns what is known now. Never waits.

@@ -66,7 +66,7 @@ classes! {
 /// A numpy array or another object.
 type Object<'py> = PyResult<Bound<'py, PyAny>>;
 /// An object, or None.
-type Maybe<'py> = PyResult<Option<Bound<'py, PyAny>>>;
+type OptionalObject<'py> = PyResult<Option<Bound<'py, PyAny>>>;
 /// A tuple of named tuples.
 type List<'py> = PyResult<Bound<'py, PyTuple>>;
 
@@ -149,12 +149,12 @@ getters! {
     /// Ranges in device units, with codes: a view. Calculate with `ranges_m`.
     ranges: Object<'py> = view(slf.py(), sample, scan.ranges());
     /// Exact angles in radians, NaN if nothing was measured: a view. None if the scanner does not report them.
-    exact_angles: Maybe<'py> = {
-        let has_angles = scan.contents & client::Contents::ANGLES != 0;
+    exact_angles: OptionalObject<'py> = {
+        let has_angles = scan.contents & client::ArrayFlags::ANGLES != 0;
         has_angles.then(|| view(slf.py(), sample, scan.exact_angles())).transpose()
     };
     /// Intensities of the beams, one or two bytes: a view. None if the scanner does not send them.
-    intensities: Maybe<'py> = {
+    intensities: OptionalObject<'py> = {
         let intensities = || match scan.intensities() {
             Intensities::Narrow(bytes) => view(slf.py(), sample, bytes),
             Intensities::Wide(words) => view(slf.py(), sample, words),
@@ -162,8 +162,8 @@ getters! {
         (scan.intensity_bits != 0).then(intensities).transpose()
     };
     /// Bytes next to the ranges, intensities or field bits: a view. None if the scanner does not send them.
-    upper: Maybe<'py> = {
-        let has_upper = scan.contents & client::Contents::UPPER != 0;
+    upper: OptionalObject<'py> = {
+        let has_upper = scan.contents & client::ArrayFlags::UPPER != 0;
         has_upper.then(|| view(slf.py(), sample, scan.upper())).transpose()
     };
 }
@@ -226,23 +226,23 @@ fn matrix<'py>(py: Python<'py>, elements: &[f32; 9]) -> PyResult<Bound<'py, PyAn
 getters! {
     Motion(slf, sample: slf.as_super().get(), motion) = fixed::<client::Motion>(sample);
     /// Method by which the step was found: `first`, `refused`, `beams`, `points`, `lines` or `both`.
-    method: &'static str = motion.how().name();
+    method: &'static str = motion.method().name();
     /// Step from the previous scan; None if there is none.
-    step: Maybe<'py> = {
+    step: OptionalObject<'py> = {
         let fields = (motion.dx_m, motion.dy_m, motion.dyaw_rad);
         motion.has_step().then(|| value(slf.py(), "Step", fields)).transpose()
     };
     /// Covariance of the step, 3 x 3; None if there is none.
-    covariance: Maybe<'py> = motion.has_step().then(|| matrix(slf.py(), &motion.covariance)).transpose();
+    covariance: OptionalObject<'py> = motion.has_step().then(|| matrix(slf.py(), &motion.covariance)).transpose();
     /// Share of the readings that are on surfaces of the previous scan; None if there is no step.
     overlap: Option<f32> = Some(motion.overlap).filter(|_| motion.has_step());
     /// Sum of all steps; None if it is unknown.
-    place: Maybe<'py> = {
+    place: OptionalObject<'py> = {
         let fields = (motion.x_m, motion.y_m, motion.yaw_rad);
         motion.has_pose().then(|| value(slf.py(), "Place", fields)).transpose()
     };
     /// Covariance of `place`, 3 x 3; None if it is unknown.
-    pose_covariance: Maybe<'py> = motion.sum_covariance().map(|covariance| matrix(slf.py(), covariance)).transpose();
+    pose_covariance: OptionalObject<'py> = motion.sum_covariance().map(|covariance| matrix(slf.py(), covariance)).transpose();
     /// Whether `place` is known, and contains no degenerate step.
     valid: bool = motion.has_valid_pose();
     /// Whether the surroundings leave a direction open, as a corridor does.
@@ -342,7 +342,7 @@ getters! {
     /// Angle from one beam to the next in radians; None before the first scan.
     step: Option<f64> = Some(background.step).filter(|step| *step != 0.0);
     /// Angles of the beams in radians: computed. None before the first scan.
-    angles: Maybe<'py> = {
+    angles: OptionalObject<'py> = {
         let angle = |i: usize| background.first_angle + i as f64 * background.step;
         let angles = || array(slf.py(), (0..background.ranges().len()).map(angle).collect::<Vec<f64>>());
         (background.step != 0.0).then(angles).transpose()
@@ -351,7 +351,7 @@ getters! {
 
 getters! {
     Status(slf, sample: slf.as_super().get(), status) = fixed::<client::Status>(sample);
-    /// `absent`, `probing`, `switching`, `starting`, `streaming`, `silent` or `paused`.
+    /// `missing_topics`, `probing`, `switching`, `starting`, `streaming_bench`, `silent_switches` or `paused_time`.
     state: &'static str = status.state().map_or("unknown", client::State::name);
     /// Stamp of the start of the state, in ns of `time.monotonic_ns()`.
     since_ns: u64 = status.since_ns;
@@ -380,11 +380,11 @@ getters! {
     /// Counters by their names in docs/output.md.
     counters: PyResult<Bound<'py, PyDict>> = {
         let counters = PyDict::new(slf.py());
-        status.counters.named().try_for_each(|(name, count)| counters.set_item(name, count))?;
+        status.counters.named_values().try_for_each(|(name, count)| counters.set_item(name, count))?;
         Ok(counters)
     };
     /// Share of damaged bytes in the last 10 s, 0 to 1.
-    damaged: f64 = status.damaged();
+    damaged: f64 = status.damaged_share();
     /// Number of scans that were lost on the line; None if unknown.
     lost_on_line: Option<u64> = status.lost_on_line();
     /// Pose of the sensor, as configured.
@@ -406,7 +406,7 @@ getters! {
     /// The tracks in the order of their IDs.
     tracks: List<'py> = {
         values(slf.py(), tracks.tracks().iter(), |track| {
-            let sensors = PyTuple::new(slf.py(), tracks.seen_by(track).collect::<Vec<_>>())?;
+            let sensors = PyTuple::new(slf.py(), tracks.sensor_names_of(track).collect::<Vec<_>>())?;
             let (position, speed) = ((track.x_m, track.y_m), (track.vx_m_s, track.vy_m_s));
             let [xx, xy, yy] = track.covariance;
             let fields = (
@@ -452,7 +452,7 @@ getters! {
 }
 
 /// Bytes of a point.
-const POINT: usize = size_of::<client::CloudPoint>();
+const POINT_LEN: usize = size_of::<client::CloudPoint>();
 
 getters! {
     Cloud(slf, sample: slf.as_super().get(), cloud) = client::Cloud::of_words(cast_slice(sample.memory.words()));
@@ -473,7 +473,7 @@ getters! {
     /// Rows of x, y and z in the robot's frame, in meters: a view.
     points: Object<'py> = {
         let points = cloud.points();
-        strided(slf.py(), sample, points, "<f4", vec![points.len(), 3], Some(vec![POINT, 4]))
+        strided(slf.py(), sample, points, "<f4", vec![points.len(), 3], Some(vec![POINT_LEN, 4]))
     };
     /// Index of each point's beam in the scan: a view.
     beams: Object<'py> = part_of_points(slf.py(), sample, cloud.points(), std::mem::offset_of!(client::CloudPoint, beam), "<u2");
@@ -491,7 +491,7 @@ fn part_of_points<'py>(
 ) -> Object<'py> {
     let bytes: &[u8] = cast_slice(points);
     let from = bytes.get(offset..).unwrap_or_default();
-    strided(py, sample, from, kind, vec![points.len()], Some(vec![POINT]))
+    strided(py, sample, from, kind, vec![points.len()], Some(vec![POINT_LEN]))
 }
 
 getters! {

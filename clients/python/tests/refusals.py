@@ -228,7 +228,7 @@ def duration_of_a_silence() -> None:
     os.close(lock)
 
 
-def what_is_short() -> None:
+def finds_resource_shortages() -> None:
     lock = hub_without_topics()
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     mount = publish("other")
@@ -271,7 +271,7 @@ for check in (
     warnings_in_asyncio,
     warnings_of_a_robot,
     duration_of_a_silence,
-    what_is_short,
+    finds_resource_shortages,
 ):
     check()
     print(check.__name__, flush=True)

@@ -8,16 +8,17 @@ use std::time::{Duration, SystemTime};
 use clap::{Args, Subcommand};
 use scanhub_client::request;
 use scanhub_files::output::{self, Target};
-use scanhub_files::regular;
+use scanhub_files::regular_file;
 use scanhub_schema::{
-    Age, Background, BackgroundHead, Failure, Kind, Request, SavedModel, Shown, Verb, as_json, check_sensor,
+    Age, Background, BackgroundFile, BackgroundHead, Failure, Kind, Request, ResponseModel, Verb, as_json,
+    check_sensor,
 };
 use serde::Serialize;
 
 use crate::context::Context;
 use crate::control::confirm;
-use crate::names::as_word;
-use crate::output::{Output, quiet};
+use crate::names::as_argument;
+use crate::output::{Output, verb_result};
 use crate::text;
 
 /// Show, reset, freeze, save or load the background model of a sensor
@@ -28,12 +29,12 @@ pub struct BackgroundArgs {
     pub sensor: String,
     /// Request about its model.
     #[command(subcommand)]
-    pub order: ModelOrder,
+    pub order: ModelRequest,
 }
 
 /// Request about a background model.
 #[derive(Clone, Debug, PartialEq, Eq, Subcommand)]
-pub enum ModelOrder {
+pub enum ModelRequest {
     /// Show how many beams are known; with --json, every range
     #[command(after_help = "Example:\n  scanhub background front show")]
     Show,
@@ -79,23 +80,23 @@ impl BackgroundArgs {
     /// - The errors of [`ControlArgs::run`](crate::control::ControlArgs::run).
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
         let json = context.json;
-        let places = context.domain.places()?;
+        let locations = context.domain.locations()?;
         let sensor = &self.sensor;
         let loaded = match &self.order {
-            ModelOrder::Load { file, any_sensor } => {
+            ModelRequest::Load { file, any_sensor } => {
                 Some(saved_model(file, sensor, *any_sensor, &mut io::stdin())?)
             }
             _ => None,
         };
         let stop = context.signals.stop()?;
-        as_word(check_sensor(sensor))?;
-        let ask = |verb| request(&places, &Request::new(sensor, verb), &stop);
+        as_argument(check_sensor(sensor))?;
+        let send = |verb| request(&locations, &Request::new(sensor, verb), &stop);
         let mut output = Output::new(&mut context.out);
         let verb = match &self.order {
-            ModelOrder::Show => {
-                let Shown { model, kept_wall_ns } = shown(sensor, ask(Verb::Show)?)?;
-                return quiet(if json {
-                    output.json(&Kept { model: as_json(sensor, &model), kept_wall_ns })
+            ModelRequest::Show => {
+                let ResponseModel { model, kept_wall_ns } = shown(sensor, send(Verb::Show)?)?;
+                return verb_result(if json {
+                    output.json(&StoredModel { model: as_json(sensor, &model), kept_wall_ns })
                 } else {
                     output.line(|line| {
                         write!(line, "{sensor}: ")?;
@@ -107,27 +108,27 @@ impl BackgroundArgs {
                     })
                 });
             }
-            ModelOrder::Save { file, force } => {
-                if file != Path::new(STANDARD) {
+            ModelRequest::Save { file, force } => {
+                if file != Path::new(STANDARD_STREAM) {
                     Target::open(file)?.check(*force)?;
                 }
-                let Shown { model, .. } = shown(sensor, ask(Verb::Show)?)?;
+                let ResponseModel { model, .. } = shown(sensor, send(Verb::Show)?)?;
                 return save(file, *force, sensor, &model, json, &mut output);
             }
-            ModelOrder::Reset => Verb::Reset,
-            ModelOrder::Freeze => Verb::Freeze,
-            ModelOrder::Thaw => Verb::Thaw,
-            ModelOrder::Load { .. } => Verb::Load,
+            ModelRequest::Reset => Verb::Reset,
+            ModelRequest::Freeze => Verb::Freeze,
+            ModelRequest::Thaw => Verb::Thaw,
+            ModelRequest::Load { .. } => Verb::Load,
         };
         match &loaded {
-            Some(model) => request(&places, &Request::load(sensor, model), &stop)?,
-            None => ask(verb)?,
+            Some(model) => request(&locations, &Request::load(sensor, model), &stop)?,
+            None => send(verb)?,
         };
-        let is_frozen = verb == Verb::Reset && !json && shown(sensor, ask(Verb::Show)?)?.model.is_frozen();
+        let is_frozen = verb == Verb::Reset && !json && shown(sensor, send(Verb::Show)?)?.model.is_frozen();
         confirm(&mut output, json, sensor, verb)?;
         if is_frozen {
             let hint = format!("it is frozen: nothing is learned until `scanhub background {sensor} thaw`");
-            quiet(output.line(|line| write!(line, "{hint}")))?;
+            verb_result(output.line(|line| write!(line, "{hint}")))?;
         }
         Ok(())
     }
@@ -135,7 +136,7 @@ impl BackgroundArgs {
 
 /// What is shown: a model, and when it was kept for the next hub.
 #[derive(Serialize)]
-struct Kept<M> {
+struct StoredModel<M> {
     #[serde(flatten)]
     model: M,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -147,7 +148,7 @@ fn wall() -> Duration {
     SystemTime::UNIX_EPOCH.elapsed().unwrap_or_default()
 }
 
-fn shown(sensor: &str, shown: Option<Shown>) -> Result<Shown, Failure> {
+fn shown(sensor: &str, shown: Option<ResponseModel>) -> Result<ResponseModel, Failure> {
     let hint = "client and hub are of different versions";
     shown.ok_or_else(|| {
         Failure::new(Kind::Failed, format!("the hub answered without a model of {sensor}"), hint)
@@ -179,31 +180,31 @@ fn save(
         ));
     }
     let object = as_json(sensor, model);
-    if file == Path::new(STANDARD) {
-        return quiet(printed.json(&object));
+    if file == Path::new(STANDARD_STREAM) {
+        return verb_result(printed.json(&object));
     }
     let mut content = serde_json::to_vec(&object)
         .map_err(|error| Failure::new(Kind::Failed, format!("the model is no JSON: {error}"), ""))?;
     content.push(b'\n');
     output::write(file, &content, force)?;
-    let (BackgroundHead { known_beams, count, generation, .. }, place) = (**model, file.display());
-    quiet(if json {
-        printed.json(&Saved {
+    let (BackgroundHead { known_beams, count, generation, .. }, path_text) = (**model, file.display());
+    verb_result(if json {
+        printed.json(&SavedJson {
             class: "saved",
             sensor,
-            file: place.to_string(),
+            file: path_text.to_string(),
             generation,
             known_beams,
             count,
         })
     } else {
-        printed.line(|line| write!(line, "{sensor}: {known_beams} of {count} beams saved to {place}"))
+        printed.line(|line| write!(line, "{sensor}: {known_beams} of {count} beams saved to {path_text}"))
     })
 }
 
 /// Class `saved`.
 #[derive(Serialize)]
-struct Saved<'a> {
+struct SavedJson<'a> {
     class: &'static str,
     sensor: &'a str,
     file: String,
@@ -222,24 +223,29 @@ pub fn saved_model(
     any_sensor: bool,
     input: &mut dyn Read,
 ) -> Result<Box<Background>, Failure> {
-    let (text, place) = if file == Path::new(STANDARD) {
+    let (text, path_text) = if file == Path::new(STANDARD_STREAM) {
         (
-            regular::read_all(input, LONGEST).map_err(|error| regular::unreadable("stdin", &error))?,
+            regular_file::read_all(input, MAX_FILE_LEN)
+                .map_err(|error| regular_file::unreadable("stdin", &error))?,
             "stdin".to_owned(),
         )
     } else {
         let place = file.display().to_string();
-        (regular::read(file, LONGEST).map_err(|error| regular::unreadable(&place, &error))?, place)
+        (
+            regular_file::read(file, MAX_FILE_LEN)
+                .map_err(|error| regular_file::unreadable(&place, &error))?,
+            place,
+        )
     };
-    let saved = SavedModel::parse(&text, &place)?;
+    let saved = BackgroundFile::parse(&text, &path_text)?;
     if saved.sensor == sensor || any_sensor {
         return Ok(saved.model);
     }
-    let message = format!("{place} is the background of {}, not of {sensor}", saved.sensor);
+    let message = format!("{path_text} is the background of {}, not of {sensor}", saved.sensor);
     Err(Failure::new(Kind::Configuration, message, "--any-sensor accepts it anyway"))
 }
 
 /// The file that is stdin or stdout.
-const STANDARD: &str = "-";
+const STANDARD_STREAM: &str = "-";
 /// Far more bytes than a model of 401 beams has as text, and as it would be if people had laid it out.
-const LONGEST: u64 = 1 << 20;
+const MAX_FILE_LEN: u64 = 1 << 20;

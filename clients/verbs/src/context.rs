@@ -53,7 +53,7 @@ impl DomainOptions {
     /// # Errors
     ///
     /// Returns [`Kind::Configuration`](scanhub_schema::Kind) if the name is not valid.
-    pub fn places(&self) -> Result<Vec<Domain>, Failure> {
+    pub fn locations(&self) -> Result<Vec<Domain>, Failure> {
         Domain::candidates(&self.name, self.root.as_deref(), &Environment::of_process())
     }
 
@@ -61,7 +61,7 @@ impl DomainOptions {
     ///
     /// # Errors
     ///
-    /// As for [`places`](Self::places).
+    /// As for [`places`](Self::locations).
     pub fn of_hub(&self) -> Result<Domain, Failure> {
         Domain::of_hub(&self.name, self.root.as_deref(), &Environment::of_process())
     }
@@ -70,7 +70,7 @@ impl DomainOptions {
     ///
     /// # Errors
     ///
-    /// As for [`places`](Self::places).
+    /// As for [`places`](Self::locations).
     pub fn of_publisher(&self) -> Result<Domain, Failure> {
         scanhub_shm::publisher_domain(&self.name, self.root.as_deref(), &Environment::of_process())
     }
@@ -83,7 +83,7 @@ pub trait Signals {
     fn stop(&self) -> Result<Arc<AtomicBool>, Failure>;
     /// Returns a flag for all signals that ask a process to end, including those of a terminal that is closed. A verb uses it if
     /// it must restore or finish something in any case.
-    fn any_end(&self) -> Result<Arc<AtomicBool>, Failure>;
+    fn any_stop(&self) -> Result<Arc<AtomicBool>, Failure>;
     /// Returns a flag for SIGUSR1, which requests a report.
     fn report(&self) -> Result<Arc<AtomicBool>, Failure>;
 }
@@ -94,7 +94,7 @@ impl Signals for Arc<AtomicBool> {
         Ok(self.clone())
     }
 
-    fn any_end(&self) -> Result<Arc<AtomicBool>, Failure> {
+    fn any_stop(&self) -> Result<Arc<AtomicBool>, Failure> {
         Ok(self.clone())
     }
 

@@ -10,8 +10,8 @@ use scanhub_schema::{Failure, Request, Verb, check_sensor};
 
 use crate::context::Context;
 use crate::json;
-use crate::names::as_word;
-use crate::output::{Output, quiet};
+use crate::names::as_argument;
+use crate::output::{Output, verb_result};
 
 /// Pause a sensor, resume it, or restart its session
 #[derive(Args, Clone, Debug)]
@@ -36,24 +36,24 @@ impl ControlArgs {
     ///
     /// Returns the errors of [`request`], and [`Kind::Usage`](scanhub_schema::Kind) if the sensor's name is not valid.
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
-        let (places, stop) = (context.domain.places()?, context.signals.stop()?);
-        as_word(check_sensor(&self.sensor))?;
-        request(&places, &Request::new(&self.sensor, self.verb), &stop)?;
+        let (locations, stop) = (context.domain.locations()?, context.signals.stop()?);
+        as_argument(check_sensor(&self.sensor))?;
+        request(&locations, &Request::new(&self.sensor, self.verb), &stop)?;
         confirm(&mut Output::new(&mut context.out), context.json, &self.sensor, self.verb)
     }
 }
 
 /// Writes the line that confirms an accepted request.
 pub(crate) fn confirm(output: &mut Output<'_>, json: bool, sensor: &str, verb: Verb) -> Result<(), Failure> {
-    quiet(if json {
+    verb_result(if json {
         output.json(&json::control(sensor, verb))
     } else {
-        output.line(|line| write!(line, "{sensor}: {}", done(verb)))
+        output.line(|line| write!(line, "{sensor}: {}", past_form(verb)))
     })
 }
 
 /// Returns the past form of `verb`.
-fn done(verb: Verb) -> &'static str {
+fn past_form(verb: Verb) -> &'static str {
     match verb {
         Verb::Pause => "paused",
         Verb::Resume => "resumed",

@@ -6,7 +6,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::thread;
 use std::time::{Duration, Instant, SystemTime};
 
-use scanhub_schema::{Failure, Maker, Topic};
+use scanhub_schema::{Failure, PublisherKind, Topic};
 use scanhub_shm::Domain;
 
 /// The calls of the sensors of a hub that came.
@@ -15,77 +15,81 @@ pub struct Discovery {
     /// When the hub came, and how often its sensors were called.
     hub: Option<(Instant, usize)>,
     /// The call that is under way, and how long after the hub it began.
-    call: Option<(BackgroundTask<Answer>, Duration)>,
+    task: Option<(BackgroundTask<Answer>, Duration)>,
     /// They answered once.
-    is_answered: bool,
+    has_reply: bool,
     /// The last change of the services that the call under way includes, and that the last answer includes.
-    called: Option<SystemTime>,
-    answered: Option<SystemTime>,
+    task_change: Option<SystemTime>,
+    reply_change: Option<SystemTime>,
 }
 
 type Answer = Result<Vec<(String, Topic)>, Failure>;
 
 /// What was answered.
-pub struct Called {
+pub struct DiscoveryReply {
     /// The sensors that have topics, sorted.
     pub sensors: Vec<String>,
     /// Who has made their topics.
-    makers: Vec<(String, Maker)>,
+    publisher_kinds: Vec<(String, PublisherKind)>,
     /// So long after the hub came it was asked.
     pub age: Duration,
 }
 
 /// When the sensors of a hub that came are called: it makes their topics one after the other.
-const CALLS: [Duration; 4] =
+const DISCOVERY_TIMES: [Duration; 4] =
     [Duration::ZERO, Duration::from_millis(200), Duration::from_secs(1), Duration::from_secs(5)];
 /// And so often from then on: a tracker, or a sensor of another machine, comes when it likes.
-const LATER: Duration = Duration::from_secs(10);
+const REPEAT_INTERVAL: Duration = Duration::from_secs(10);
 
 /// How long after the hub came it is called when it was called so often.
-fn due(calls: usize) -> Duration {
-    let last = CALLS[CALLS.len() - 1];
-    let more = u32::try_from((calls + 1).saturating_sub(CALLS.len())).unwrap_or(u32::MAX);
-    CALLS.get(calls).copied().unwrap_or_else(|| last.saturating_add(LATER.saturating_mul(more)))
+fn due_after(calls: usize) -> Duration {
+    let last = DISCOVERY_TIMES[DISCOVERY_TIMES.len() - 1];
+    let more = u32::try_from((calls + 1).saturating_sub(DISCOVERY_TIMES.len())).unwrap_or(u32::MAX);
+    DISCOVERY_TIMES
+        .get(calls)
+        .copied()
+        .unwrap_or_else(|| last.saturating_add(REPEAT_INTERVAL.saturating_mul(more)))
 }
 
 /// Directory of a domain that contains a file for each service, and its age from which on all its files are complete.
-const SERVICES: &str = "services";
-const COMPLETE: Duration = Duration::from_secs(5);
+const SERVICES_DIRECTORY: &str = "services";
+const COMPLETE_AFTER: Duration = Duration::from_secs(5);
 
 /// Every sixth list is made even if nothing has changed: a list lacks services that could not be opened, as without
 /// descriptors.
-const RELIST: usize = 6;
+const RELIST_PERIOD: usize = 6;
 
 /// So often an answer is looked for.
-const LOOK_EVERY: Duration = Duration::from_millis(5);
+const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
-impl Called {
-    fn of(published: &[(String, Topic)], age: Duration) -> Called {
+impl DiscoveryReply {
+    fn of(published: &[(String, Topic)], age: Duration) -> DiscoveryReply {
         let mut sensors: Vec<String> = published.iter().map(|(name, _)| name.clone()).collect();
         sensors.dedup();
-        let makers = published.iter().map(|(name, topic)| (name.clone(), topic.maker())).collect();
-        Called { sensors, makers, age }
+        let publisher_kinds =
+            published.iter().map(|(name, topic)| (name.clone(), topic.publisher_kind())).collect();
+        DiscoveryReply { sensors, publisher_kinds, age }
     }
 
     /// Whether `sensor` has `topic`, now or when all its topics are made: a name has all topics of the maker of one.
     pub fn may_have(&self, sensor: &str, topic: Topic) -> bool {
-        self.makers.iter().any(|(name, maker)| name == sensor && *maker == topic.maker())
+        self.publisher_kinds.iter().any(|(name, kind)| name == sensor && *kind == topic.publisher_kind())
     }
 }
 
 impl Discovery {
     /// A hub came; answers about the one before are of no use.
-    pub fn begin(&mut self, now: Instant) {
+    pub fn on_hub_started(&mut self, now: Instant) {
         *self = Discovery { hub: Some((now, 0)), ..Discovery::default() };
     }
 
     /// The hub is gone: nobody waits for what it has.
-    pub fn end(&mut self) {
-        self.call = None;
+    pub fn on_hub_ended(&mut self) {
+        self.task = None;
     }
 
     /// There was a hub.
-    pub fn has_begun(&self) -> bool {
+    pub fn has_seen_hub(&self) -> bool {
         self.hub.is_some()
     }
 
@@ -96,48 +100,48 @@ impl Discovery {
     /// # Errors
     ///
     /// Returns [`Kind::Failed`](scanhub_schema::Kind) if no list succeeded yet. A later failure keeps the known sensors.
-    pub fn call(&mut self, domain: &Domain, now: Instant) -> Result<Option<Called>, Failure> {
-        if let Some((task, age)) = &self.call {
+    pub fn poll(&mut self, domain: &Domain, now: Instant) -> Result<Option<DiscoveryReply>, Failure> {
+        if let Some((task, age)) = &self.task {
             let Some(answer) = task.result() else { return Ok(None) };
-            let called = answer.map(|published| Called::of(&published, *age));
-            self.call = None;
-            if self.is_answered && called.is_err() {
+            let reply = answer.map(|published| DiscoveryReply::of(&published, *age));
+            self.task = None;
+            if self.has_reply && reply.is_err() {
                 return Ok(None);
             }
-            self.is_answered = true;
-            self.answered = self.called.filter(|_| called.is_ok());
-            return called.map(Some);
+            self.has_reply = true;
+            self.reply_change = self.task_change.filter(|_| reply.is_ok());
+            return reply.map(Some);
         }
-        let Some((came, calls)) = &mut self.hub else { return Ok(None) };
-        let age = now - *came;
-        if age >= due(*calls) {
+        let Some((started, calls)) = &mut self.hub else { return Ok(None) };
+        let age = now - *started;
+        if age >= due_after(*calls) {
             let changed = last_change(domain);
             // The first answers also tell callers that a sensor is missing.
-            let may_skip = *calls > CALLS.len() && !calls.is_multiple_of(RELIST);
-            if may_skip && changed.is_some() && changed == self.answered {
+            let may_skip = *calls > DISCOVERY_TIMES.len() && !calls.is_multiple_of(RELIST_PERIOD);
+            if may_skip && changed.is_some() && changed == self.reply_change {
                 *calls += 1;
                 return Ok(None);
             }
             let domain = domain.clone();
-            self.call =
-                BackgroundTask::begin(move || scanhub_shm::published(&domain)).map(|task| (task, age));
-            *calls += usize::from(self.call.is_some());
-            self.called = changed;
+            self.task =
+                BackgroundTask::begin(move || scanhub_shm::published_topics(&domain)).map(|task| (task, age));
+            *calls += usize::from(self.task.is_some());
+            self.task_change = changed;
         }
         Ok(None)
     }
 
     /// After which time there may be an answer.
-    pub fn left(&self) -> Option<Duration> {
-        self.call.as_ref().map(|_| LOOK_EVERY)
+    pub fn time_left(&self) -> Option<Duration> {
+        self.task.as_ref().map(|_| POLL_INTERVAL)
     }
 }
 
 /// Returns the time at which a service of `domain` was last created or removed. `None` if the time is unknown, or so
 /// recent that a service may still be incomplete, which a list does not include.
 fn last_change(domain: &Domain) -> Option<SystemTime> {
-    let changed = std::fs::metadata(domain.root().join(SERVICES)).ok()?.modified().ok()?;
-    changed.elapsed().is_ok_and(|age| age >= COMPLETE).then_some(changed)
+    let changed = std::fs::metadata(domain.root().join(SERVICES_DIRECTORY)).ok()?.modified().ok()?;
+    changed.elapsed().is_ok_and(|age| age >= COMPLETE_AFTER).then_some(changed)
 }
 
 /// Slow work in a thread of its own, so that a sending thread waits only for samples. Dropped, it loses its result.
@@ -179,10 +183,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_link_has_the_topics_of_links_and_a_tracker_its_own() {
+    fn link_and_tracker_have_different_topics() {
         let published = [("front", Topic::Scan), ("front", Topic::Status), ("house", Topic::Tracks)];
         let published = published.map(|(sensor, topic)| (sensor.to_owned(), topic));
-        let called = Called::of(&published, Duration::ZERO);
+        let called = DiscoveryReply::of(&published, Duration::ZERO);
         assert_eq!(called.sensors, ["front", "house"]);
         assert!(called.may_have("front", Topic::Marks) && !called.may_have("front", Topic::Events));
         assert!(called.may_have("house", Topic::Events) && !called.may_have("house", Topic::Scan));
@@ -190,7 +194,7 @@ mod tests {
 
     #[test]
     fn it_is_called_soon_and_then_again_and_again() {
-        let due: Vec<u64> = (0..6).map(|calls| due(calls).as_secs()).collect();
+        let due: Vec<u64> = (0..6).map(|calls| due_after(calls).as_secs()).collect();
         assert_eq!(due, [0, 0, 1, 5, 15, 25]);
     }
 
@@ -198,17 +202,17 @@ mod tests {
     fn services_that_did_not_change_are_not_listed_again() {
         let place = tempfile::tempdir().unwrap();
         let domain = Domain::at("answers", place.path()).unwrap();
-        let services = domain.root().join(SERVICES);
+        let services = domain.root().join(SERVICES_DIRECTORY);
         std::fs::create_dir_all(&services).unwrap();
         let began = Instant::now();
         let mut discovery = Discovery::default();
-        discovery.begin(began);
+        discovery.on_hub_started(began);
         let mut lists_at = |seconds: u64| {
             let now = began + Duration::from_secs(seconds);
-            let called = discovery.call(&domain, now).unwrap();
-            let is_listed = discovery.call.is_some();
-            while discovery.call.is_some() {
-                discovery.call(&domain, now).unwrap();
+            let called = discovery.poll(&domain, now).unwrap();
+            let is_listed = discovery.task.is_some();
+            while discovery.task.is_some() {
+                discovery.poll(&domain, now).unwrap();
             }
             assert!(called.is_none());
             is_listed
@@ -223,37 +227,39 @@ mod tests {
     }
 
     #[test]
-    fn who_knows_the_sensors_goes_on_where_asking_fails() {
+    fn listing_error_is_ignored_once_sensors_are_known() {
         let mut discovery = Discovery::default();
         let domain = Domain::at("answers", std::path::Path::new("/tmp")).unwrap();
         let mut answer = |answer: Answer| {
-            discovery.call = BackgroundTask::begin(|| answer).map(|task| (task, Duration::ZERO));
+            discovery.task = BackgroundTask::begin(|| answer).map(|task| (task, Duration::ZERO));
             loop {
-                let called = discovery.call(&domain, Instant::now());
-                if discovery.call.is_none() {
+                let called = discovery.poll(&domain, Instant::now());
+                if discovery.task.is_none() {
                     return called.map(|called| called.map(|called| called.sensors));
                 }
             }
         };
-        let short = || Err(Failure::new(scanhub_schema::Kind::Short, "no descriptor is left", "ulimit -n"));
+        let short = || {
+            Err(Failure::new(scanhub_schema::Kind::ResourceExhausted, "no descriptor is left", "ulimit -n"))
+        };
         assert!(answer(short()).is_err());
         assert_eq!(answer(Ok(vec![("front".to_owned(), Topic::Scan)])), Ok(Some(vec!["front".to_owned()])));
         assert_eq!(answer(short()), Ok(None));
     }
 
     #[test]
-    fn nobody_looks_for_an_answer_about_a_hub_that_is_gone() {
+    fn no_poll_is_due_after_the_hub_has_ended() {
         let mut discovery = Discovery::default();
-        discovery.begin(Instant::now());
-        assert_eq!(discovery.left(), None);
-        discovery.call = BackgroundTask::begin(|| Ok(Vec::new())).map(|task| (task, Duration::ZERO));
-        assert_eq!(discovery.left(), Some(LOOK_EVERY));
-        discovery.end();
-        assert!(discovery.left().is_none() && discovery.has_begun());
+        discovery.on_hub_started(Instant::now());
+        assert_eq!(discovery.time_left(), None);
+        discovery.task = BackgroundTask::begin(|| Ok(Vec::new())).map(|task| (task, Duration::ZERO));
+        assert_eq!(discovery.time_left(), Some(POLL_INTERVAL));
+        discovery.on_hub_ended();
+        assert!(discovery.time_left().is_none() && discovery.has_seen_hub());
     }
 
     #[test]
-    fn nobody_waits_for_it() {
+    fn polling_a_background_task_does_not_block() {
         let (go, hold) = channel();
         let task = BackgroundTask::begin(move || hold.recv()).unwrap();
         assert_eq!(task.result(), None);
@@ -270,7 +276,7 @@ mod tests {
     }
 
     #[test]
-    fn who_waits_for_it_can_be_stopped() {
+    fn waiting_for_a_background_task_can_be_stopped() {
         let (go, hold) = channel();
         let task = BackgroundTask::begin(move || hold.recv()).unwrap();
         assert_eq!(task.wait(&AtomicBool::new(true)), None);

@@ -22,13 +22,13 @@ pub fn parse(text: &str) -> Result<Duration, String> {
         _ => return Err(wrong()),
     };
     match Duration::try_from_secs_f64(number * seconds) {
-        Ok(duration) if duration <= LONGEST => Ok(duration),
+        Ok(duration) if duration <= MAX_DURATION => Ok(duration),
         _ => Err(format!("{text:?} is too long: a year, 8760h, at most")),
     }
 }
 
 /// Longest duration, a year. It can be added to any time without an overflow.
-const LONGEST: Duration = Duration::from_secs(365 * 24 * 3600);
+const MAX_DURATION: Duration = Duration::from_secs(365 * 24 * 3600);
 
 #[cfg(test)]
 mod tests {

@@ -6,9 +6,9 @@ use scanhub_schema::csv::ScanColumns;
 use scanhub_schema::{Failure, Header, Kind, Scan, Topic};
 
 use crate::context::Context;
-use crate::follow::{Bounds, Event, Following};
+use crate::follow::{Event, RunLimits, TopicRun};
 use crate::names::{Selection, TopicName};
-use crate::output::{End, Output, quiet};
+use crate::output::{ExitReason, Output, verb_result};
 use crate::receive_stats::ReceiveStats;
 use crate::{json, show, text};
 
@@ -34,7 +34,7 @@ pub struct EchoArgs {
     pub raw: bool,
     /// Limits of the run.
     #[command(flatten)]
-    pub bounds: Bounds,
+    pub limits: RunLimits,
 }
 
 const EXAMPLES: &str = "\
@@ -54,7 +54,7 @@ impl EchoArgs {
     /// - [`Kind::NoHub`] if the run is bounded and no hub runs at its start.
     /// - [`Kind::Timeout`], and [`Kind::Interrupted`] if a signal stopped a bounded run before its end.
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
-        let (places, stop) = (context.domain.places()?, context.signals.stop()?);
+        let (locations, stop) = (context.domain.locations()?, context.signals.stop()?);
         let Selection { named, of_all } = Selection::parse(&self.topics)?;
         let format = match (context.json, self.csv, self.raw) {
             (true, ..) => Format::Json,
@@ -69,9 +69,9 @@ impl EchoArgs {
             notes: Output::new(&mut context.notes),
             beams: None,
         };
-        let mut following = Following::new(&named, &of_all, &places, &self.bounds, &stop).with_lines();
+        let mut following = TopicRun::new(&named, &of_all, &locations, &self.limits, &stop).with_lines();
         let end = echo.run(&mut following);
-        quiet(following.finish(end, |name, stats| echo.summary(name, stats)))
+        verb_result(following.finish(end, |name, stats| echo.summary(name, stats)))
     }
 }
 
@@ -97,12 +97,12 @@ struct Echo<'a> {
 }
 
 impl Echo<'_> {
-    fn run(&mut self, following: &mut Following<'_>) -> Result<(), End> {
+    fn run(&mut self, following: &mut TopicRun<'_>) -> Result<(), ExitReason> {
         while let Some(event) = following.next(None)? {
             match event {
                 Event::Sample(name, sample, _) => self.sample(&name, &sample)?,
                 Event::Notice(names, notice) => {
-                    notice.tell(&names, self.format == Format::Json, &mut self.out, &mut self.notes)?;
+                    notice.report(&names, self.format == Format::Json, &mut self.out, &mut self.notes)?;
                 }
                 _ => {}
             }
@@ -110,7 +110,7 @@ impl Echo<'_> {
         Ok(())
     }
 
-    fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
+    fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), ExitReason> {
         match (self.format, sample) {
             (Format::Text, _) => self.out.line(|line| text::sample(line, name, sample)),
             (Format::Raw, _) => self.out.raw(sample.bytes()),
@@ -120,7 +120,7 @@ impl Echo<'_> {
         }
     }
 
-    fn summary(&mut self, name: &TopicName, stats: &ReceiveStats) -> Result<(), End> {
+    fn summary(&mut self, name: &TopicName, stats: &ReceiveStats) -> Result<(), ExitReason> {
         match self.format {
             Format::Json => self.out.json(&json::summary(name, stats)),
             Format::Text => self.out.line(|line| text::summary(line, name, stats)),
@@ -129,12 +129,12 @@ impl Echo<'_> {
     }
 
     /// A line of columns; the names of the columns first, and again if their number changes.
-    fn csv(&mut self, columns: ScanColumns, header: &Header, scan: &Scan) -> Result<(), End> {
+    fn csv(&mut self, columns: ScanColumns, header: &Header, scan: &Scan) -> Result<(), ExitReason> {
         if self.beams != Some(scan.beams()) {
             self.beams = Some(scan.beams());
-            self.out.line(|line| columns.names(line, scan.beams()))?;
+            self.out.line(|line| columns.write_header(line, scan.beams()))?;
         }
-        self.out.line(|line| columns.row(line, header, scan))
+        self.out.line(|line| columns.write_row(line, header, scan))
     }
 }
 

@@ -1,25 +1,25 @@
-//! Receives the topics of a verb: [`Following`] returns what arrives, one [`Event`] after the other, until the bounds are reached.
+//! Receives the topics of a verb: [`TopicRun`] returns what arrives, one [`Event`] after the other, until the bounds are reached.
 
 use std::collections::VecDeque;
 use std::rc::Rc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use scanhub_client::streams::{Follower, GRACE, Sample, Session, Source, Who};
+use scanhub_client::streams::{DomainHolder, STARTUP_GRACE, Sample, Session, Source, TopicReader};
 use scanhub_client::{Wait, clock};
 use scanhub_schema::{Failure, Kind, Status, Topic, is_remote};
 use scanhub_shm::Domain;
 
 use crate::discovery::Discovery;
 use crate::names::{TopicName, no_sensor, no_such_topic};
-use crate::output::{End, Output};
+use crate::output::{ExitReason, Output};
 pub use crate::receive_stats::ReceiveStats;
-use crate::receive_stats::{Line, Loss};
+use crate::receive_stats::{LineLossCounter, Loss};
 use crate::{json, text};
 
 /// Limits after which a verb ends by itself: arguments of every verb that follows topics.
 #[derive(clap::Args, Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Bounds {
+pub struct RunLimits {
     /// Stop after this number of samples
     #[arg(short = 'n', value_name = "COUNT", value_parser = clap::value_parser!(u64).range(1..))]
     pub count: Option<u64>,
@@ -31,9 +31,9 @@ pub struct Bounds {
     pub timeout: Option<Duration>,
 }
 
-impl Bounds {
+impl RunLimits {
     /// Returns whether the run ends by itself. Then it fails if there is no hub at its start, or if it is interrupted.
-    pub fn bounded(&self) -> bool {
+    pub fn is_bounded(&self) -> bool {
         self.count.is_some() || self.run_for.is_some()
     }
 }
@@ -45,7 +45,7 @@ impl Bounds {
 )]
 pub enum Event {
     /// The run follows this topic from now on.
-    Begun(Rc<TopicName>),
+    Added(Rc<TopicName>),
     /// The hub has the topic. The run receives what is sent from now on.
     Subscribed(Rc<TopicName>),
     /// A sample, or one that stands for a silence and does not count. Drop it before the next event.
@@ -53,9 +53,9 @@ pub enum Event {
     /// Something went wrong, or right again, in these topics. If there are none, nothing is known of the topics yet.
     Notice(Vec<Rc<TopicName>>, Notice),
     /// The run cannot follow this topic for lack of memory, descriptors or places, and will try again
-    /// ([`Following::despite_shortage`]).
-    Short(Rc<TopicName>, Failure),
-    /// A status of a sensor ([`Following::with_lines`]).
+    /// ([`TopicRun::tolerating_shortage`]).
+    ResourceExhausted(Rc<TopicName>, Failure),
+    /// A status of a sensor ([`TopicRun::with_lines`]).
     Line(String, Box<Status>),
     /// Comes after each round of samples, and about ten times a second if there are none.
     Tick(Instant),
@@ -88,13 +88,13 @@ pub enum Notice {
 
 impl Notice {
     /// Writes the notice for `names`, or for the domain if `names` is empty: lines of JSON to `out`, or text to `notes`.
-    pub fn tell(
+    pub fn report(
         &self,
         names: &[Rc<TopicName>],
         is_json: bool,
         out: &mut Output<'_>,
         notes: &mut Output<'_>,
-    ) -> Result<(), End> {
+    ) -> Result<(), ExitReason> {
         match is_json {
             true => json::notices(out, names, self),
             false => notes.line(|line| text::notice(line, names, self)),
@@ -103,35 +103,35 @@ impl Notice {
 }
 
 /// The topics that a verb follows, in the first of several domains in which a hub runs.
-pub struct Following<'a> {
+pub struct TopicRun<'a> {
     session: Session,
-    topics: Vec<Followed>,
+    topics: Vec<TopicState>,
     /// The lines of the followed sensors, for a run with lines.
-    lines: Option<Vec<FollowedLine>>,
+    lines: Option<Vec<LineState>>,
     /// Number of `topics` whose lines are followed.
     topics_with_line: usize,
     /// Which topics of each sensor of the hub the run follows.
-    of_all_sensors: &'a [Topic],
-    unwanted: Vec<Topic>,
+    all_sensor_topics: &'a [Topic],
+    paused_topics: Vec<Topic>,
     discovery: Discovery,
     /// Whether the run receives samples before it looks for the hub.
-    closely: bool,
-    despite_shortage: bool,
-    bounds: &'a Bounds,
+    receives_first: bool,
+    tolerates_shortage: bool,
+    limits: &'a RunLimits,
     stop: &'a AtomicBool,
-    stage: Stage,
+    next_step: Step,
     round: Round,
     events: VecDeque<Event>,
     /// Result of a run that has ended. `next` returns it after all `events`.
-    end: Option<Result<(), End>>,
+    end: Option<Result<(), ExitReason>>,
     started: Instant,
     last_sample: Instant,
-    hub_seen: Option<Instant>,
+    hub_started_at: Option<Instant>,
     /// Time at which the run first saw a hub, and not only a listener.
-    hub_lives_since: Option<Instant>,
+    hub_running_since: Option<Instant>,
     /// When the run looked last which sensors there are.
-    asked_at: Option<Instant>,
-    waiting_said: bool,
+    listed_at: Option<Instant>,
+    is_waiting_reported: bool,
     received: u64,
     /// End of the pause in which the run subscribes to no topic, because memory, descriptors or places are short.
     short_until: Option<Instant>,
@@ -139,9 +139,9 @@ pub struct Following<'a> {
 
 /// The next step of a run.
 #[derive(Clone, Copy, PartialEq)]
-enum Stage {
+enum Step {
     Start,
-    Look,
+    CheckHub,
     Receive,
     AfterRound,
     Check,
@@ -169,7 +169,7 @@ impl Round {
 }
 
 /// A topic of a sensor.
-struct Followed {
+struct TopicState {
     name: Rc<TopicName>,
     source: Source,
     stats: ReceiveStats,
@@ -178,68 +178,68 @@ struct Followed {
 }
 
 /// The serial line of a sensor. Bounds do not count its statuses, and the run does not fail without them.
-struct FollowedLine {
+struct LineState {
     sensor: String,
     /// `None` if its statuses cannot be received.
-    source: Option<Follower<Status>>,
-    line: Line,
+    source: Option<TopicReader<Status>>,
+    losses: LineLossCounter,
 }
 
 /// Samples taken from one topic before the next one has its turn.
-const TURN: usize = 32;
+const BATCH_SIZE: usize = 32;
 /// Time in which a listener announces the sensors of other machines. It announces them once a second.
-const ANNOUNCED: Duration = Duration::from_secs(3);
+const ANNOUNCEMENT_TIMEOUT: Duration = Duration::from_secs(3);
 /// Interval at which the run lists the sensors while one is missing. A look takes milliseconds, in which samples wait.
-const ASK_EVERY: Duration = Duration::from_millis(500);
+const LIST_INTERVAL: Duration = Duration::from_millis(500);
 /// Pause after a shortage, in which the run subscribes to no topic: a try takes as long as receiving a thousand samples.
 const SHORTAGE_PAUSE: Duration = Duration::from_secs(1);
 
-impl<'a> Following<'a> {
+impl<'a> TopicRun<'a> {
     /// Makes a run that follows `names`, and the topics `of_all` of each sensor that the hub has, in the first live one of `places`,
     /// until `bounds` are reached or `stop` is set.
     pub fn new(
         names: &[TopicName],
         of_all: &'a [Topic],
-        places: &[Domain],
-        bounds: &'a Bounds,
+        locations: &[Domain],
+        limits: &'a RunLimits,
         stop: &'a AtomicBool,
-    ) -> Following<'a> {
+    ) -> TopicRun<'a> {
         let now = Instant::now();
-        let topics: Vec<_> = names.iter().map(|name| Followed::new(Rc::new(name.clone()))).collect();
-        Following {
-            session: Session::new(places.to_vec()),
-            events: topics.iter().map(|topic| Event::Begun(topic.name.clone())).collect(),
+        let topics: Vec<_> = names.iter().map(|name| TopicState::new(Rc::new(name.clone()))).collect();
+        TopicRun {
+            session: Session::new(locations.to_vec()),
+            events: topics.iter().map(|topic| Event::Added(topic.name.clone())).collect(),
             topics,
             lines: None,
             topics_with_line: 0,
-            of_all_sensors: of_all,
-            unwanted: Vec::new(),
+            all_sensor_topics: of_all,
+            paused_topics: Vec::new(),
             discovery: Discovery::default(),
-            closely: false,
-            despite_shortage: false,
-            bounds,
+            receives_first: false,
+            tolerates_shortage: false,
+            limits,
             stop,
-            stage: Stage::Start,
+            next_step: Step::Start,
             round: Round::default(),
             end: None,
             started: now,
             last_sample: now,
-            hub_seen: None,
-            hub_lives_since: None,
-            asked_at: None,
-            waiting_said: false,
+            hub_started_at: None,
+            hub_running_since: None,
+            listed_at: None,
+            is_waiting_reported: false,
             received: 0,
             short_until: None,
         }
     }
 
     /// Follows the statuses of the sensors, too. They count the losses on the serial lines.
-    pub fn with_lines(self) -> Following<'a> {
-        Following { lines: Some(Vec::new()), ..self }
+    pub fn with_lines(self) -> TopicRun<'a> {
+        TopicRun { lines: Some(Vec::new()), ..self }
     }
 
     /// Receives zones with the early warnings of their sensors.
-    pub fn with_early(mut self) -> Following<'a> {
+    pub fn with_early(mut self) -> TopicRun<'a> {
         for topic in self.topics.iter_mut().filter(|topic| topic.name.topic == Topic::Zones) {
             topic.source = Source::zones_with_early(&topic.name.sensor);
         }
@@ -247,21 +247,21 @@ impl<'a> Following<'a> {
     }
 
     /// Is woken by `wait`, for the shortest latency: the run receives before it looks for the hub, which takes longer.
-    pub fn closely(self, wait: Wait) -> Following<'a> {
-        Following { session: self.session.by(wait), closely: true, ..self }
+    pub fn receiving_first(self, wait: Wait) -> TopicRun<'a> {
+        TopicRun { session: self.session.waiting_by(wait), receives_first: true, ..self }
     }
 
-    /// Goes on if it cannot follow a topic for lack of memory, descriptors or places, with [`Event::Short`]. Otherwise, the run
+    /// Goes on if it cannot follow a topic for lack of memory, descriptors or places, with [`Event::ResourceExhausted`]. Otherwise, the run
     /// fails.
-    pub fn despite_shortage(self) -> Following<'a> {
-        Following { despite_shortage: true, ..self }
+    pub fn tolerating_shortage(self) -> TopicRun<'a> {
+        TopicRun { tolerates_shortage: true, ..self }
     }
 
     /// Subscribes to `topic` again, or ends its subscriptions until it is wanted again.
-    pub fn want(&mut self, topic: Topic, is_wanted: bool) {
-        self.unwanted.retain(|unwanted| *unwanted != topic);
-        if !is_wanted {
-            self.unwanted.push(topic);
+    pub fn set_subscribed(&mut self, topic: Topic, is_subscribed: bool) {
+        self.paused_topics.retain(|paused| *paused != topic);
+        if !is_subscribed {
+            self.paused_topics.push(topic);
         }
     }
 
@@ -275,8 +275,8 @@ impl<'a> Following<'a> {
     /// # Errors
     ///
     /// [`Kind::NoTopic`] with the names of the sensors; [`Kind::NoHub`] if the run is bounded and no hub runs at its start;
-    /// [`Kind::Timeout`]; [`Kind::Interrupted`] if it is bounded and was stopped before; [`Kind::Short`].
-    pub fn next(&mut self, wake_at: Option<Instant>) -> Result<Option<Event>, End> {
+    /// [`Kind::Timeout`]; [`Kind::Interrupted`] if it is bounded and was stopped before; [`Kind::ResourceExhausted`].
+    pub fn next(&mut self, wake_at: Option<Instant>) -> Result<Option<Event>, ExitReason> {
         loop {
             if let Some(event) = self.events.pop_front() {
                 return Ok(Some(event));
@@ -298,10 +298,10 @@ impl<'a> Following<'a> {
     /// Those of `summary`, or else `end`.
     pub fn finish(
         mut self,
-        end: Result<(), End>,
-        mut summary: impl FnMut(&TopicName, &ReceiveStats) -> Result<(), End>,
-    ) -> Result<(), End> {
-        if !matches!(end, Err(End::ReaderGone)) {
+        end: Result<(), ExitReason>,
+        mut summary: impl FnMut(&TopicName, &ReceiveStats) -> Result<(), ExitReason>,
+    ) -> Result<(), ExitReason> {
+        if !matches!(end, Err(ExitReason::ReaderClosed)) {
             self.receive_lines();
             for topic in &self.topics {
                 let mut stats = topic.stats.clone();
@@ -312,88 +312,90 @@ impl<'a> Following<'a> {
         end
     }
 
-    fn step(&mut self, wake_at: Option<Instant>) -> Result<(), End> {
-        self.stage = match self.stage {
-            Stage::Start => {
-                self.look()?;
-                Stage::Look
+    fn step(&mut self, wake_at: Option<Instant>) -> Result<(), ExitReason> {
+        self.next_step = match self.next_step {
+            Step::Start => {
+                self.check_hub()?;
+                Step::CheckHub
             }
-            Stage::Look => {
-                if !self.closely {
-                    self.look()?;
+            Step::CheckHub => {
+                if !self.receives_first {
+                    self.check_hub()?;
                 }
                 self.round = Round::default();
-                Stage::Receive
+                Step::Receive
             }
-            Stage::Receive if self.round.topic < self.topics.len() => {
+            Step::Receive if self.round.topic < self.topics.len() => {
                 self.receive()?;
-                Stage::Receive
+                Step::Receive
             }
-            Stage::Receive => {
+            Step::Receive => {
                 self.events.push_back(Event::Tick(Instant::now()));
-                Stage::AfterRound
+                Step::AfterRound
             }
-            Stage::AfterRound => {
+            Step::AfterRound => {
                 let is_stopped = self.stop.load(Ordering::Relaxed);
-                let is_in_time = self.bounds.run_for.is_none_or(|limit| self.started.elapsed() < limit);
+                let is_in_time = self.limits.run_for.is_none_or(|limit| self.started.elapsed() < limit);
                 if self.round.more && !is_stopped && is_in_time {
                     self.round = Round::default();
-                    Stage::Receive
+                    Step::Receive
                 } else {
-                    Stage::Check
+                    Step::Check
                 }
             }
-            Stage::Check => {
+            Step::Check => {
                 self.check()?;
-                Stage::Wait
+                Step::Wait
             }
-            Stage::Wait => {
+            Step::Wait => {
                 self.session.wait(self.wake_at().into_iter().chain(wake_at).min())?;
-                Stage::Look
+                Step::CheckHub
             }
         };
         Ok(())
     }
 
     /// Looks for news of the hub, and for the sensors of a new one.
-    fn look(&mut self) -> Result<(), End> {
-        let change = self.session.look()?;
-        if let Some(who) = change.gone {
-            self.discovery.end();
-            self.notice(Notice::HubGone, |name| is_of(name, who));
+    fn check_hub(&mut self) -> Result<(), ExitReason> {
+        let change = self.session.check_hub()?;
+        if let Some(holder) = change.ended {
+            self.discovery.on_hub_ended();
+            self.notice(Notice::HubGone, |name| publishes(name, holder));
         }
-        if let Some(who) = change.back {
-            if self.hub_seen.is_some() || self.waiting_said {
-                self.notice(Notice::HubBack, |name| is_of(name, who));
+        if let Some(holder) = change.started {
+            if self.hub_started_at.is_some() || self.is_waiting_reported {
+                self.notice(Notice::HubBack, |name| publishes(name, holder));
             }
-            self.hub_seen = Some(Instant::now());
+            self.hub_started_at = Some(Instant::now());
             // Samples that the new hub sent before this moment waited for the run, and arrive late.
             let now_ns = clock::now_ns();
             for topic in self.topics.iter_mut().filter(|topic| topic.source.subscribed()) {
                 topic.since_ns = now_ns;
             }
-            self.discovery.begin(Instant::now());
+            self.discovery.on_hub_started(Instant::now());
         }
         self.discover()
     }
 
     /// Follows the sensors of the hub that are not followed yet, if the run follows all.
-    fn discover(&mut self) -> Result<(), End> {
-        let Some(domain) = self.session.domain().filter(|_| !self.of_all_sensors.is_empty()) else {
+    fn discover(&mut self) -> Result<(), ExitReason> {
+        let Some(domain) = self.session.domain().filter(|_| !self.all_sensor_topics.is_empty()) else {
             return Ok(());
         };
-        let called = match self.discovery.call(domain, Instant::now()) {
-            Err(failure) if failure.kind == Kind::Short && self.despite_shortage => return Ok(()),
+        let called = match self.discovery.poll(domain, Instant::now()) {
+            Err(failure) if failure.kind == Kind::ResourceExhausted && self.tolerates_shortage => {
+                return Ok(());
+            }
             called => called?,
         };
         let Some(called) = called else { return Ok(()) };
         for sensor in &called.sensors {
-            for &topic in self.of_all_sensors.iter().filter(|topic| called.may_have(sensor, **topic)) {
+            for &topic in self.all_sensor_topics.iter().filter(|topic| called.may_have(sensor, **topic)) {
                 let name = TopicName { sensor: sensor.clone(), topic };
                 if self.topics.iter().all(|topic| *topic.name != name) {
                     let name = Rc::new(name);
-                    self.events.push_back(Event::Begun(name.clone()));
-                    self.topics.push(Followed::new(name));
+                    self.events.push_back(Event::Added(name.clone()));
+                    self.topics.push(TopicState::new(name));
                 }
             }
         }
@@ -401,12 +403,12 @@ impl<'a> Following<'a> {
     }
 
     /// Receives one sample of the topic that has its turn, or ends its turn.
-    fn receive(&mut self) -> Result<(), End> {
+    fn receive(&mut self) -> Result<(), ExitReason> {
         let is_short = self.is_short();
         let round = &mut self.round;
         let topic = &mut self.topics[round.topic];
         let was_subscribed = topic.source.subscribed();
-        if self.unwanted.contains(&topic.name.topic) {
+        if self.paused_topics.contains(&topic.name.topic) {
             topic.unsubscribe();
             round.next_topic();
             return Ok(());
@@ -418,9 +420,9 @@ impl<'a> Following<'a> {
             return Ok(());
         }
         let received = match topic.source.receive(&mut self.session).map_err(Failure::from) {
-            Err(failure) if failure.kind == Kind::Short && self.despite_shortage => {
+            Err(failure) if failure.kind == Kind::ResourceExhausted && self.tolerates_shortage => {
                 self.short_until = Some(Instant::now() + SHORTAGE_PAUSE);
-                self.events.push_back(Event::Short(topic.name.clone(), failure));
+                self.events.push_back(Event::ResourceExhausted(topic.name.clone(), failure));
                 None
             }
             received => received?,
@@ -437,7 +439,7 @@ impl<'a> Following<'a> {
         let arrival = Arrival { monotonic_ns: clock::now_ns(), wall_ns: clock::wall_ns() };
         if !sample.is_silence() {
             let (now, missed) = (Instant::now(), sample.missed());
-            topic.stats.count(now, missed, sample.period_us(), sample.is_of_before(topic.since_ns));
+            topic.stats.count(now, missed, sample.period_us(), sample.is_older_than(topic.since_ns));
             if missed > 0 {
                 self.events.push_back(Event::Notice(vec![topic.name.clone()], Notice::Missed(missed)));
             }
@@ -446,13 +448,13 @@ impl<'a> Following<'a> {
             }
             self.last_sample = now;
             self.received += 1;
-            if self.bounds.count.is_some_and(|count| self.received >= count) {
+            if self.limits.count.is_some_and(|count| self.received >= count) {
                 self.end = Some(Ok(()));
             }
         }
         self.events.push_back(Event::Sample(topic.name.clone(), sample, arrival));
         round.taken += 1;
-        if round.taken == TURN {
+        if round.taken == BATCH_SIZE {
             round.more = true;
             round.next_topic();
         }
@@ -466,9 +468,9 @@ impl<'a> Following<'a> {
             follow_line(lines, &topic.name.sensor);
         }
         self.topics_with_line = self.topics.len();
-        for FollowedLine { sensor, source, line } in lines {
-            while let Some(follower) = source {
-                match follower.receive(&mut self.session) {
+        for LineState { sensor, source, losses: line } in lines {
+            while let Some(reader) = source {
+                match reader.receive(&mut self.session) {
                     Ok(None) => break,
                     Ok(Some(status)) => {
                         line.note(status.header().boot, &status.counters);
@@ -484,52 +486,52 @@ impl<'a> Following<'a> {
     /// Returns what the line of `sensor` took away in the run.
     fn loss(&self, sensor: &str) -> Loss {
         let line = self.lines.iter().flatten().find(|line| line.sensor == sensor);
-        line.map(|line| line.line.loss()).unwrap_or_default()
+        line.map(|line| line.losses.loss()).unwrap_or_default()
     }
 
     /// Ends the run at its bounds, and finds the reason for a silence.
-    fn check(&mut self) -> Result<(), End> {
-        if self.bounds.count == Some(0) {
+    fn check(&mut self) -> Result<(), ExitReason> {
+        if self.limits.count == Some(0) {
             self.end = Some(Ok(()));
             return Ok(());
         }
-        if self.closely {
-            self.look()?;
+        if self.receives_first {
+            self.check_hub()?;
         }
         self.receive_lines();
         let now = Instant::now();
         if self.session.domain().is_some() {
             for topic in &mut self.topics {
-                if topic.stats.stale(now) {
+                if topic.stats.take_silence(now) {
                     self.events.push_back(Event::Notice(vec![topic.name.clone()], Notice::Stale));
                 }
             }
         }
-        match self.hub_seen {
-            None if now - self.started >= GRACE => {
-                if self.bounds.bounded() {
+        match self.hub_started_at {
+            None if now - self.started >= STARTUP_GRACE => {
+                if self.limits.is_bounded() {
                     return Err(self.session.no_hub().into());
                 }
-                if !self.waiting_said {
-                    self.waiting_said = true;
+                if !self.is_waiting_reported {
+                    self.is_waiting_reported = true;
                     self.notice(Notice::NoHub(self.session.no_hub().into()), |_| true);
                 }
             }
-            Some(seen) if now - seen >= GRACE => self.check_sensors()?,
+            Some(seen) if now - seen >= STARTUP_GRACE => self.check_sensors()?,
             _ => {}
         }
-        if let Some(limit) = self.bounds.timeout.filter(|limit| now - self.last_sample >= *limit) {
+        if let Some(limit) = self.limits.timeout.filter(|limit| now - self.last_sample >= *limit) {
             let has_hub = self.session.domain().is_some();
             let hint = if has_hub { "`scanhub info` shows why" } else { "there is no hub" };
             return Err(Failure::new(Kind::Timeout, format!("nothing arrived for {limit:?}"), hint).into());
         }
         if self.stop.load(Ordering::Relaxed) {
-            if self.bounds.bounded() {
+            if self.limits.is_bounded() {
                 return Err(Failure::new(Kind::Interrupted, "interrupted before it was done", "").into());
             }
             self.end = Some(Ok(()));
-        } else if self.bounds.run_for.is_some_and(|limit| now - self.started >= limit) {
-            if let Some(count) = self.bounds.count {
+        } else if self.limits.run_for.is_some_and(|limit| now - self.started >= limit) {
+            if let Some(count) = self.limits.count {
                 let what = format!("{} of {count} samples arrived in time", self.received);
                 return Err(Failure::new(Kind::Timeout, what, "`scanhub info` shows why").into());
             }
@@ -539,11 +541,11 @@ impl<'a> Following<'a> {
     }
 
     /// Fails if the run follows a sensor that the hub does not have: a hub that is up has all its topics.
-    fn check_sensors(&mut self) -> Result<(), End> {
+    fn check_sensors(&mut self) -> Result<(), ExitReason> {
         // A topic that is not wanted now is not missing: asking costs more than following.
-        let (unwanted, topics) = (&self.unwanted, &self.topics);
+        let (paused_topics, topics) = (&self.paused_topics, &self.topics);
         let is_missing =
-            |topic: &Followed| !unwanted.contains(&topic.name.topic) && !topic.source.subscribed();
+            |topic: &TopicState| !paused_topics.contains(&topic.name.topic) && !topic.source.subscribed();
         if !topics.is_empty() && !topics.iter().any(is_missing) {
             return Ok(());
         }
@@ -551,29 +553,33 @@ impl<'a> Following<'a> {
         if self.session.domain().is_none() || self.is_short() {
             return Ok(());
         }
-        if self.asked_at.is_some_and(|at| at.elapsed() < ASK_EVERY) {
+        if self.listed_at.is_some_and(|at| at.elapsed() < LIST_INTERVAL) {
             return Ok(());
         }
-        self.asked_at = Some(Instant::now());
+        self.listed_at = Some(Instant::now());
         // On a busy machine, a hub may take seconds to create its topics.
         if self.session.hub_is_starting() {
             return Ok(());
         }
         // A hub that starts after a listener creates its topics first.
-        let lives = self.session.hub_lives();
-        self.hub_lives_since = if lives { self.hub_lives_since.or(Some(Instant::now())) } else { None };
-        let published = match self.session.domain().map(scanhub_shm::published).transpose() {
+        let is_hub_running = self.session.hub_is_running();
+        self.hub_running_since =
+            if is_hub_running { self.hub_running_since.or(Some(Instant::now())) } else { None };
+        let published = match self.session.domain().map(scanhub_shm::published_topics).transpose() {
             // Since the pause after the last shortage, the run has not tried to subscribe again.
-            Err(failure) if failure.kind == Kind::Short && self.despite_shortage => return Ok(()),
+            Err(failure) if failure.kind == Kind::ResourceExhausted && self.tolerates_shortage => {
+                return Ok(());
+            }
             published => published?.unwrap_or_default(),
         };
         let mut sensors: Vec<String> = published.iter().map(|(sensor, _)| sensor.clone()).collect();
         sensors.dedup();
         let wants_all = topics.iter().all(|topic| topic.name.is_robot());
         // Those of the hub, or without a hub those of other machines.
-        let may_come = self.may_come(if lives { Who::Hub } else { Who::Listener });
-        if wants_all && !may_come && sensors.iter().all(|sensor| is_remote(sensor) == lives) {
-            let (what, hint) = match lives {
+        let may_come =
+            self.may_start(if is_hub_running { DomainHolder::Hub } else { DomainHolder::Listener });
+        if wants_all && !may_come && sensors.iter().all(|sensor| is_remote(sensor) == is_hub_running) {
+            let (what, hint) = match is_hub_running {
                 true => ("the hub has no sensors", "scanhub run --link NAME=PORT"),
                 false => {
                     ("no sensor of another machine is published here", "`scanhub listen` shows who sends")
@@ -584,14 +590,15 @@ impl<'a> Following<'a> {
         for topic in topics {
             let sensor = &topic.name.sensor;
             let is_there =
-                topic.name.is_robot() || sensors.contains(sensor) || self.may_come(publisher(sensor));
+                topic.name.is_robot() || sensors.contains(sensor) || self.may_start(holder_of(sensor));
             if is_missing(topic) && !is_there {
                 return Err(no_sensor(sensor, &sensors).into());
             }
             let of_sensor: Vec<Topic> =
                 published.iter().filter(|(of, _)| of == sensor).map(|(_, topic)| *topic).collect();
-            let maker = topic.name.topic.maker();
-            if !of_sensor.is_empty() && of_sensor.iter().all(|other| other.maker() != maker) {
+            let publisher_kind = topic.name.topic.publisher_kind();
+            if !of_sensor.is_empty() && of_sensor.iter().all(|other| other.publisher_kind() != publisher_kind)
+            {
                 return Err(no_such_topic(&topic.name, &of_sensor).into());
             }
         }
@@ -599,11 +606,13 @@ impl<'a> Following<'a> {
     }
 
     /// Returns whether `who` may still start: another machine at any time, or the hub after a listener.
-    fn may_come(&self, who: Who) -> bool {
-        let unbounded = !self.bounds.bounded();
-        match who {
-            Who::Listener => unbounded || self.started.elapsed() < ANNOUNCED,
-            Who::Hub => unbounded && self.hub_lives_since.is_none_or(|since| since.elapsed() < GRACE),
+    fn may_start(&self, holder: DomainHolder) -> bool {
+        let unbounded = !self.limits.is_bounded();
+        match holder {
+            DomainHolder::Listener => unbounded || self.started.elapsed() < ANNOUNCEMENT_TIMEOUT,
+            DomainHolder::Hub => {
+                unbounded && self.hub_running_since.is_none_or(|since| since.elapsed() < STARTUP_GRACE)
+            }
         }
     }
 
@@ -621,18 +630,18 @@ impl<'a> Following<'a> {
     }
 
     fn wake_at(&self) -> Option<Instant> {
-        let end = self.bounds.run_for.and_then(|limit| self.started.checked_add(limit));
-        let silence = self.bounds.timeout.and_then(|limit| self.last_sample.checked_add(limit));
-        let left = self.topics.iter().filter_map(|topic| topic.source.left()).min();
-        let left = left.into_iter().chain(self.discovery.left()).min();
-        let unheard = left.and_then(|left| Instant::now().checked_add(left));
-        [end, silence, unheard].into_iter().flatten().min()
+        let end = self.limits.run_for.and_then(|limit| self.started.checked_add(limit));
+        let silence = self.limits.timeout.and_then(|limit| self.last_sample.checked_add(limit));
+        let left = self.topics.iter().filter_map(|topic| topic.source.time_left()).min();
+        let left = left.into_iter().chain(self.discovery.time_left()).min();
+        let wake = left.and_then(|left| Instant::now().checked_add(left));
+        [end, silence, wake].into_iter().flatten().min()
     }
 }
 
-impl Followed {
-    fn new(name: Rc<TopicName>) -> Followed {
-        Followed {
+impl TopicState {
+    fn new(name: Rc<TopicName>) -> TopicState {
+        TopicState {
             source: Source::new(&name.sensor, name.topic),
             stats: ReceiveStats::new(name.topic),
             name,
@@ -643,33 +652,33 @@ impl Followed {
     /// Ends the subscription.
     fn unsubscribe(&mut self) {
         if self.source.subscribed() {
-            *self = Followed::new(self.name.clone());
+            *self = TopicState::new(self.name.clone());
         }
     }
 }
 
 /// Follows the lines of the sensors of a verdict over several.
-fn follow_parts(lines: &mut Vec<FollowedLine>, sample: &Sample) {
-    if let Sample::Robot(heard) = sample
-        && heard.robot.sensors().count() != lines.len()
+fn follow_parts(lines: &mut Vec<LineState>, sample: &Sample) {
+    if let Sample::Robot(update) = sample
+        && update.robot.sensors().count() != lines.len()
     {
-        heard.robot.sensors().for_each(|(sensor, _)| follow_line(lines, sensor));
+        update.robot.sensors().for_each(|(sensor, _)| follow_line(lines, sensor));
     }
 }
 
-fn follow_line(lines: &mut Vec<FollowedLine>, sensor: &str) {
+fn follow_line(lines: &mut Vec<LineState>, sensor: &str) {
     if lines.iter().all(|line| line.sensor != sensor) {
-        let source = Some(Follower::new(sensor));
-        lines.push(FollowedLine { sensor: sensor.to_owned(), source, line: Line::default() });
+        let source = Some(TopicReader::new(sensor));
+        lines.push(LineState { sensor: sensor.to_owned(), source, losses: LineLossCounter::default() });
     }
 }
 
 /// Returns who publishes the sensor that is called so.
-fn publisher(sensor: &str) -> Who {
-    if is_remote(sensor) { Who::Listener } else { Who::Hub }
+fn holder_of(sensor: &str) -> DomainHolder {
+    if is_remote(sensor) { DomainHolder::Listener } else { DomainHolder::Hub }
 }
 
 /// Returns whether `who` publishes `name`. The sensors of a robot may come from any publisher.
-fn is_of(name: &TopicName, who: Who) -> bool {
-    name.is_robot() || publisher(&name.sensor) == who
+fn publishes(name: &TopicName, holder: DomainHolder) -> bool {
+    name.is_robot() || holder_of(&name.sensor) == holder
 }

@@ -11,9 +11,9 @@ use scanhub_schema::{Failure, Status, Topic};
 use serde::Serialize;
 
 use crate::context::Context;
-use crate::follow::{Bounds, Event, Following, Notice};
+use crate::follow::{Event, Notice, RunLimits, TopicRun};
 use crate::names::{Selection, TopicName};
-use crate::output::{End, Output, quiet};
+use crate::output::{ExitReason, Output, verb_result};
 use crate::receive_stats::ReceiveStats;
 use crate::{duration, json, text};
 
@@ -29,7 +29,7 @@ pub struct HzArgs {
     pub window: Duration,
     /// Limits of the run.
     #[command(flatten)]
-    pub bounds: Bounds,
+    pub limits: RunLimits,
 }
 
 /// Parses the time span of a line. A shorter one could never hold two samples that are far enough apart for a rate.
@@ -50,7 +50,7 @@ impl HzArgs {
     ///
     /// Returns the errors of [`EchoArgs::run`](crate::echo::EchoArgs::run).
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
-        let (places, stop) = (context.domain.places()?, context.signals.stop()?);
+        let (locations, stop) = (context.domain.locations()?, context.signals.stop()?);
         let Selection { named, of_all } = Selection::parse(&self.topics)?;
         let of_all = if self.topics.is_empty() { Topic::ALL.to_vec() } else { of_all };
         let mut hz = Hz {
@@ -58,22 +58,22 @@ impl HzArgs {
             length: self.window,
             windows: Vec::new(),
             lines: Vec::new(),
-            next: Instant::now() + EVERY,
+            next: Instant::now() + LINE_INTERVAL,
             out: Output::new(&mut context.out),
             notes: Output::new(&mut context.notes),
         };
-        let mut following = Following::new(&named, &of_all, &places, &self.bounds, &stop).with_lines();
+        let mut following = TopicRun::new(&named, &of_all, &locations, &self.limits, &stop).with_lines();
         let end = hz.run(&mut following);
-        quiet(following.finish(end, |name, stats| hz.summary(name, stats)))
+        verb_result(following.finish(end, |name, stats| hz.summary(name, stats)))
     }
 }
 
-const EVERY: Duration = Duration::from_secs(1);
+const LINE_INTERVAL: Duration = Duration::from_secs(1);
 
 struct Hz<'a> {
     json: bool,
     length: Duration,
-    windows: Vec<Followed>,
+    windows: Vec<TopicWindow>,
     lines: Vec<LineWindow>,
     next: Instant,
     out: Output<'a>,
@@ -82,36 +82,36 @@ struct Hz<'a> {
 
 /// A topic, and since when of CLOCK_MONOTONIC its samples are received as they are sent, in ns: what it keeps for late
 /// joiners comes before that, and at no rate.
-struct Followed {
+struct TopicWindow {
     name: Rc<TopicName>,
     since_ns: u64,
     window: Window,
 }
 
 impl Hz<'_> {
-    fn run(&mut self, following: &mut Following<'_>) -> Result<(), End> {
+    fn run(&mut self, following: &mut TopicRun<'_>) -> Result<(), ExitReason> {
         while let Some(event) = following.next(None)? {
             match event {
-                Event::Begun(name) => {
+                Event::Added(name) => {
                     let window = Window::new(self.length);
-                    self.windows.push(Followed { name, since_ns: u64::MAX, window });
+                    self.windows.push(TopicWindow { name, since_ns: u64::MAX, window });
                 }
                 Event::Subscribed(name) => self.begin(&name),
                 Event::Sample(name, sample, _) if !sample.is_silence() => {
                     let followed = self.windows.iter_mut().find(|followed| followed.name == name);
-                    if let Some(followed) = followed.filter(|it| !sample.is_of_before(it.since_ns)) {
-                        followed.window.arrived(Instant::now(), sample.missed());
+                    if let Some(followed) = followed.filter(|it| !sample.is_older_than(it.since_ns)) {
+                        followed.window.add(Instant::now(), sample.missed());
                     }
                 }
                 Event::Notice(names, notice) => {
                     if notice == Notice::HubBack {
                         names.iter().for_each(|name| self.begin(name));
                     }
-                    notice.tell(&names, self.json, &mut self.out, &mut self.notes)?;
+                    notice.report(&names, self.json, &mut self.out, &mut self.notes)?;
                 }
                 Event::Line(sensor, status) => self.line(&sensor, &status),
                 Event::Tick(now) => self.tick(now)?,
-                Event::Sample(..) | Event::Short(..) => {}
+                Event::Sample(..) | Event::ResourceExhausted(..) => {}
             }
         }
         Ok(())
@@ -132,17 +132,17 @@ impl Hz<'_> {
         }
     }
 
-    fn tick(&mut self, now: Instant) -> Result<(), End> {
+    fn tick(&mut self, now: Instant) -> Result<(), ExitReason> {
         if now < self.next {
             return Ok(());
         }
         while self.next <= now {
-            self.next += EVERY;
+            self.next += LINE_INTERVAL;
         }
-        for Followed { name, window, .. } in &mut self.windows {
+        for TopicWindow { name, window, .. } in &mut self.windows {
             window.slide(now);
             let lost = self.lines.iter().find(|line| line.sensor == name.sensor);
-            let line = Line::new(name, window, lost);
+            let line = HzJson::new(name, window, lost);
             if self.json {
                 self.out.json(&line)?;
             } else {
@@ -152,7 +152,7 @@ impl Hz<'_> {
         Ok(())
     }
 
-    fn summary(&mut self, name: &TopicName, stats: &ReceiveStats) -> Result<(), End> {
+    fn summary(&mut self, name: &TopicName, stats: &ReceiveStats) -> Result<(), ExitReason> {
         if self.json {
             return self.out.json(&json::summary(name, stats));
         }
@@ -194,7 +194,7 @@ impl LineWindow {
 
 /// Class `hz`. Rate, jitter and extremes are null while the arrivals span less than [`scanhub_schema::MIN_RATE_SPAN`].
 #[derive(Serialize)]
-struct Line<'a> {
+struct HzJson<'a> {
     class: &'static str,
     sensor: &'a str,
     topic: &'static str,
@@ -211,10 +211,10 @@ struct Line<'a> {
     loss: Option<String>,
 }
 
-impl<'a> Line<'a> {
-    fn new(name: &'a TopicName, window: &Window, line: Option<&LineWindow>) -> Line<'a> {
+impl<'a> HzJson<'a> {
+    fn new(name: &'a TopicName, window: &Window, line: Option<&LineWindow>) -> HzJson<'a> {
         let rate = window.rate();
-        Line {
+        HzJson {
             class: "hz",
             sensor: &name.sensor,
             topic: name.topic.name(),
@@ -225,7 +225,7 @@ impl<'a> Line<'a> {
             received: window.received(),
             missed: window.missed(),
             window_s: window.span().as_secs_f64(),
-            damaged: line.map(|line| line.status.damaged()),
+            damaged: line.map(|line| line.status.damaged_share()),
             lost_on_line: line.and_then(LineWindow::lost_on_line),
             loss: line.and_then(|line| line.status.line_loss()),
         }
@@ -271,7 +271,7 @@ impl Window {
     }
 
     /// Something arrived, `missed` before it did not.
-    fn arrived(&mut self, now: Instant, missed: u64) {
+    fn add(&mut self, now: Instant, missed: u64) {
         self.arrivals.push_back((now, missed));
     }
 
@@ -333,11 +333,11 @@ mod tests {
         assert_eq!(window.rate(), None);
         let mut burst = Window::new(Duration::from_secs(1));
         for at_us in [0, 1, 3] {
-            burst.arrived(start + Duration::from_micros(at_us), 0);
+            burst.add(start + Duration::from_micros(at_us), 0);
         }
         assert_eq!((burst.received(), burst.rate()), (3, None));
         for (at_ms, missed) in [(0, 9), (500, 0), (600, 1), (800, 0), (1200, 0)] {
-            window.arrived(start + Duration::from_millis(at_ms), missed);
+            window.add(start + Duration::from_millis(at_ms), missed);
         }
         window.slide(start + Duration::from_millis(1200));
         assert_eq!((window.received(), window.missed()), (4, 1));

@@ -5,14 +5,14 @@ use std::time::{Duration, Instant};
 
 use clap::Args;
 use scanhub_client::clock;
-use scanhub_client::streams::{Follower, GRACE, Session, find};
-use scanhub_schema::{Counter, Failure, Family, Kind, Pose, Status, check_followed};
+use scanhub_client::streams::{STARTUP_GRACE, Session, TopicReader, find};
+use scanhub_schema::{Counter, Failure, Family, Kind, Pose, Status, check_any_sensor};
 use scanhub_shm::{Domain, is_starting};
 
 use crate::context::Context;
 use crate::json;
-use crate::names::{as_word, no_sensor};
-use crate::output::{Output, quiet, table};
+use crate::names::{as_argument, no_sensor};
+use crate::output::{Output, table, verb_result};
 
 /// Show state, settings and counters of sensors
 #[derive(Args, Clone, Debug)]
@@ -32,10 +32,10 @@ impl InfoArgs {
     /// - [`Kind::Timeout`] if a sensor's status does not arrive.
     /// - [`Kind::Interrupted`] if a signal stops the run.
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
-        let (places, stop) = (context.domain.places()?, context.signals.stop()?);
-        self.sensor.iter().try_for_each(|sensor| as_word(check_followed(sensor)))?;
-        let domain = find(&places)?;
-        let sensors = wanted(self.sensor.as_deref(), &domain)?;
+        let (locations, stop) = (context.domain.locations()?, context.signals.stop()?);
+        self.sensor.iter().try_for_each(|sensor| as_argument(check_any_sensor(sensor)))?;
+        let domain = find(&locations)?;
+        let sensors = selected_sensors(self.sensor.as_deref(), &domain)?;
         let now_ns = clock::now().monotonic_ns;
         let mut output = Output::new(&mut context.out);
         for (sensor, status) in statuses(&domain, &sensors, &stop)? {
@@ -43,7 +43,7 @@ impl InfoArgs {
                 let hint = "the hub is there and does not publish: look at its log";
                 return Err(Failure::new(Kind::Timeout, format!("no status of {sensor} arrived"), hint));
             };
-            quiet(if context.json {
+            verb_result(if context.json {
                 output.json(&json::status(&sensor, &status))
             } else {
                 table(&mut output, &properties(&sensor, &status, now_ns))
@@ -55,17 +55,17 @@ impl InfoArgs {
 }
 
 /// The sensors to tell of. One that is not there may belong to a hub that is just starting.
-fn wanted(sensor: Option<&str>, domain: &Domain) -> Result<Vec<String>, Failure> {
-    let give_up_at = Instant::now() + GRACE;
+fn selected_sensors(sensor: Option<&str>, domain: &Domain) -> Result<Vec<String>, Failure> {
+    let deadline = Instant::now() + STARTUP_GRACE;
     loop {
         let sensors = scanhub_shm::links(domain)?;
         match sensor {
             None => return Ok(sensors),
             Some(sensor) if sensors.iter().any(|it| it == sensor) => return Ok(vec![sensor.to_owned()]),
-            Some(sensor) if Instant::now() >= give_up_at && !is_starting(domain.root())? => {
+            Some(sensor) if Instant::now() >= deadline && !is_starting(domain.root())? => {
                 return Err(no_sensor(sensor, &sensors));
             }
-            Some(_) => std::thread::sleep(ASK_AGAIN),
+            Some(_) => std::thread::sleep(RETRY_INTERVAL),
         }
     }
 }
@@ -76,43 +76,46 @@ pub(crate) fn statuses(
     sensors: &[String],
     stop: &AtomicBool,
 ) -> Result<Vec<(String, Option<Status>)>, Failure> {
-    let give_up_at = Instant::now() + PATIENCE;
+    let deadline = Instant::now() + STATUS_TIMEOUT;
     let mut session = Session::new(vec![domain.clone()]);
-    let mut followers: Vec<_> = sensors.iter().map(|sensor| Follower::<Status>::new(sensor)).collect();
+    let mut followers: Vec<_> = sensors.iter().map(|sensor| TopicReader::<Status>::new(sensor)).collect();
     let mut found: Vec<_> = sensors.iter().map(|sensor| (sensor.clone(), None)).collect();
     loop {
-        session.look()?;
-        for (follower, (_, status)) in followers.iter_mut().zip(&mut found) {
-            while let Some(sample) = follower.receive(&mut session)? {
+        session.check_hub()?;
+        for (reader, (_, status)) in followers.iter_mut().zip(&mut found) {
+            while let Some(sample) = reader.receive(&mut session)? {
                 *status = Some(*sample);
             }
         }
-        if found.iter().all(|(_, status)| status.is_some()) || Instant::now() >= give_up_at {
+        if found.iter().all(|(_, status)| status.is_some()) || Instant::now() >= deadline {
             return Ok(found);
         }
         if stop.load(Ordering::Relaxed) {
             return Err(Failure::new(Kind::Interrupted, "interrupted", ""));
         }
-        session.wait(Some((Instant::now() + ASK_AGAIN).min(give_up_at)))?;
+        session.wait(Some((Instant::now() + RETRY_INTERVAL).min(deadline)))?;
     }
 }
 
 /// Maximum wait for a status. The hub gives the last one to a new subscriber within 100 ms, unless the machine is busy.
-const PATIENCE: Duration = Duration::from_secs(5);
+const STATUS_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// The history comes without a wake-up.
-const ASK_AGAIN: Duration = Duration::from_millis(10);
+const RETRY_INTERVAL: Duration = Duration::from_millis(10);
 
 fn properties(sensor: &str, status: &Status, now_ns: u64) -> Vec<Vec<String>> {
     let seconds = now_ns.saturating_sub(status.since_ns) as f64 / 1e9;
     let state = status.state().map_or("unknown", |state| state.name());
     let step_deg = f64::from(status.resolution_cdeg) / 100.0;
     let known = |text: String, known: bool| if known { text } else { "unknown".into() };
-    let row = |label: &str, value: String| vec![format!("{label:<WIDTH$}"), value];
+    let row = |label: &str, value: String| vec![format!("{label:<LABEL_WIDTH$}"), value];
     let mut rows = vec![
         row(sensor, format!("{state} for {seconds:.1} s")),
         row("  family", status.family().map_or("unknown", |family| family.name()).into()),
-        row("  model", status.model().map_or_else(|| "unknown".into(), |model| Status::shown_model(&model))),
+        row(
+            "  model",
+            status.model().map_or_else(|| "unknown".into(), |model| Status::display_model(&model)),
+        ),
         row("  type", known(status.sensor_type().into(), !status.sensor_type().is_empty())),
         row("  port", status.port().into()),
         row("  baud rate", known(format!("{} Bd", status.baud), status.baud != 0)),
@@ -139,25 +142,29 @@ fn properties(sensor: &str, status: &Status, now_ns: u64) -> Vec<Vec<String>> {
 fn mode(status: &Status) -> Option<String> {
     match status.mode {
         Status::MODE_UNKNOWN if status.family() == Some(Family::Lms) => Some("unknown".into()),
-        Status::MODE_UNKNOWN => status.way().map(str::to_owned),
+        Status::MODE_UNKNOWN => status.mode_name().map(str::to_owned),
         mode => Some(format!("{mode:02x}h")),
     }
 }
 
 /// What the line takes away: lately, and since the hub's start.
 fn line(status: &Status) -> String {
-    if let Some((discarded, read)) = status.mostly_discarded() {
+    if let Some((discarded, read)) = status.discarded_and_read() {
         return format!("{discarded} of {read} bytes were in no intact telegram, and no scans arrive");
     }
     let percent = |share: f64| format!("{:.2} %", 100.0 * share);
     let lost = match (status.lost_on_line(), status.lost_share()) {
         (Some(lost), Some(share)) => {
             let due = status.counters[Counter::DueOnLine];
-            format!("{} of the {} lost in 10 s, {lost} of {due} in all", percent(share), status.sent())
+            format!(
+                "{} of the {} lost in 10 s, {lost} of {due} in all",
+                percent(share),
+                status.transmission_name()
+            )
         }
         _ => "the loss is not known".to_owned(),
     };
-    format!("{} of the bytes damaged, {lost}", percent(status.damaged()))
+    format!("{} of the bytes damaged, {lost}", percent(status.damaged_share()))
 }
 
 fn pose(pose: &Pose) -> String {
@@ -183,10 +190,10 @@ fn marks(sensor: &str, status: &Status) -> String {
 fn counters(status: &Status) -> Vec<Vec<String>> {
     status
         .counters
-        .named()
-        .map(|(name, value)| vec![format!("  {name:<0$}", WIDTH - 2), value.to_string()])
+        .named_values()
+        .map(|(name, value)| vec![format!("  {name:<0$}", LABEL_WIDTH - 2), value.to_string()])
         .collect()
 }
 
 /// Of the labels: the longest counter's name and its indent.
-const WIDTH: usize = 21;
+const LABEL_WIDTH: usize = 21;

@@ -12,7 +12,7 @@ use std::rc::Rc;
 
 use crate::follow::Notice;
 use crate::names::TopicName;
-use crate::output::{End, Output};
+use crate::output::{ExitReason, Output};
 use crate::receive_stats::ReceiveStats;
 
 pub use results::*;
@@ -21,7 +21,7 @@ pub(crate) use scanhub_schema::as_json as background;
 
 /// What all samples of telegrams begin with.
 #[derive(Serialize)]
-struct Stamp<'a> {
+struct SampleKeys<'a> {
     class: &'static str,
     sensor: &'a str,
     seq: Option<u64>,
@@ -35,9 +35,9 @@ struct Stamp<'a> {
     reasons: Vec<&'static str>,
 }
 
-impl<'a> Stamp<'a> {
-    fn new(class: &'static str, sensor: &'a str, header: &Header) -> Stamp<'a> {
-        Stamp {
+impl<'a> SampleKeys<'a> {
+    fn new(class: &'static str, sensor: &'a str, header: &Header) -> SampleKeys<'a> {
+        SampleKeys {
             class,
             sensor,
             seq: Some(header.seq),
@@ -51,32 +51,32 @@ impl<'a> Stamp<'a> {
     }
 
     /// Of no telegram.
-    fn unheard(class: &'static str, sensor: &'a str) -> Stamp<'a> {
+    fn for_silence(class: &'static str, sensor: &'a str) -> SampleKeys<'a> {
         let (seq, topic_seq, stamp_ns, wall_ns, boot, quality) = (None, None, None, None, None, None);
-        Stamp { class, sensor, seq, topic_seq, stamp_ns, wall_ns, boot, quality, reasons: Vec::new() }
+        SampleKeys { class, sensor, seq, topic_seq, stamp_ns, wall_ns, boot, quality, reasons: Vec::new() }
     }
 }
 
 /// What they end with: which flags are set, if any is.
 #[derive(Serialize)]
-pub struct Words {
+pub struct FlagNames {
     #[serde(skip_serializing_if = "Vec::is_empty")]
     flags: Vec<&'static str>,
 }
 
-impl Words {
+impl FlagNames {
     /// Returns the names of the flags in `header`.
-    pub fn of(header: &Header) -> Words {
-        Words { flags: Flags::names(header.flags).collect() }
+    pub fn of(header: &Header) -> FlagNames {
+        FlagNames { flags: Flags::names(header.flags).collect() }
     }
 }
 
 /// Class `telegram`.
 pub(crate) fn telegram<'a>(sensor: &'a str, header: &Header, bytes: &'a [u8]) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct Line<'a> {
+    struct TelegramJson<'a> {
         #[serde(flatten)]
-        stamp: Stamp<'a>,
+        stamp: SampleKeys<'a>,
         #[serde(skip_serializing_if = "Option::is_none")]
         family: Option<&'static str>,
         #[serde(skip_serializing_if = "Option::is_none")]
@@ -94,30 +94,30 @@ pub(crate) fn telegram<'a>(sensor: &'a str, header: &Header, bytes: &'a [u8]) ->
         #[serde(serialize_with = "hex")]
         data: &'a [u8],
         #[serde(flatten)]
-        flags: Words,
+        flags: FlagNames,
     }
     let telegram = Telegram { family: header.family(), bytes };
-    let (is_lms, facts) = (telegram.is_lms(), telegram.packets());
-    Line {
-        stamp: Stamp::new("telegram", sensor, header),
+    let (is_lms, packets) = (telegram.is_lms(), telegram.packets());
+    TelegramJson {
+        stamp: SampleKeys::new("telegram", sensor, header),
         family: (!is_lms).then(|| header.family().map_or("unknown", Family::name)),
         address: is_lms.then(|| telegram.address()),
         command: is_lms.then(|| telegram.command()),
-        kind: facts.map(|facts| facts.kind),
-        checked: facts.map(|facts| facts.checked),
-        packets: facts.map(|facts| facts.packets),
+        kind: packets.map(|packets| packets.kind),
+        checked: packets.map(|packets| packets.checked),
+        packets: packets.map(|packets| packets.packets),
         length: if is_lms { telegram.length().into() } else { bytes.len() },
         data: bytes,
-        flags: Words::of(header),
+        flags: FlagNames::of(header),
     }
 }
 
 /// Class `scan`.
 pub(crate) fn scan<'a>(sensor: &'a str, header: &Header, scan: &'a Scan) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct Line<'a> {
+    struct TelegramJson<'a> {
         #[serde(flatten)]
-        stamp: Stamp<'a>,
+        stamp: SampleKeys<'a>,
         family: &'static str,
         unit_um: u32,
         count: usize,
@@ -137,10 +137,10 @@ pub(crate) fn scan<'a>(sensor: &'a str, header: &Header, scan: &'a Scan) -> impl
         #[serde(skip_serializing_if = "std::ops::Not::not")]
         incomplete: bool,
         #[serde(flatten)]
-        flags: Words,
+        flags: FlagNames,
     }
-    Line {
-        stamp: Stamp::new("scan", sensor, header),
+    TelegramJson {
+        stamp: SampleKeys::new("scan", sensor, header),
         family: Family::of_number(scan.family).map_or("unknown", Family::name),
         unit_um: scan.unit_um,
         count: scan.beams(),
@@ -154,13 +154,13 @@ pub(crate) fn scan<'a>(sensor: &'a str, header: &Header, scan: &'a Scan) -> impl
         // What comes without exact angles was on no grid.
         collisions: (!has_grid_only(scan)).then_some(scan.collisions),
         incomplete: scan.is_incomplete(),
-        flags: Words::of(header),
+        flags: FlagNames::of(header),
     }
 }
 
 /// A pose, in a status.
 #[derive(Serialize)]
-struct Place {
+struct PoseJson {
     x_m: f64,
     y_m: f64,
     yaw_rad: f64,
@@ -169,7 +169,7 @@ struct Place {
 
 /// Whether topic `marks` is available, in a status, and the command or setting that makes it so.
 #[derive(Serialize)]
-struct MarksOffer {
+struct MarksAvailability {
     available: Option<bool>,
     remedy: Option<String>,
 }
@@ -177,7 +177,7 @@ struct MarksOffer {
 /// Class `status`; what is not known is null.
 pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct Line<'a> {
+    struct TelegramJson<'a> {
         class: &'static str,
         sensor: &'a str,
         state: &'static str,
@@ -196,8 +196,8 @@ pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize 
         #[serde(serialize_with = "counters")]
         counters: &'a Counters,
         last_error: &'a str,
-        pose: Place,
-        marks: MarksOffer,
+        pose: PoseJson,
+        marks: MarksAvailability,
         damaged: f64,
         lost_on_line: Option<u64>,
     }
@@ -207,14 +207,16 @@ pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize 
         Number(u8),
         Name(&'a str),
     }
-    Line {
+    TelegramJson {
         class: "status",
         sensor,
         state: status.state().map_or("unknown", |state| state.name()),
         family: status.family().map(Family::name),
         model: status.model(),
         baud: known(status.baud, 0),
-        mode: known(status.mode, Status::MODE_UNKNOWN).map(Mode::Number).or(status.way().map(Mode::Name)),
+        mode: known(status.mode, Status::MODE_UNKNOWN)
+            .map(Mode::Number)
+            .or(status.mode_name().map(Mode::Name)),
         sensor_type: status.sensor_type(),
         unit_mm: known(status.unit_mm, 0),
         angle_deg: known(status.angle_deg, 0),
@@ -224,14 +226,14 @@ pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize 
         since_ns: status.since_ns,
         counters: &status.counters,
         last_error: status.last_error(),
-        pose: Place {
+        pose: PoseJson {
             x_m: status.pose.x_m,
             y_m: status.pose.y_m,
             yaw_rad: status.pose.yaw_rad,
             upside_down: status.pose.upside_down != 0,
         },
-        marks: MarksOffer { available: status.has_marks(), remedy: marks_remedy(sensor, status) },
-        damaged: status.damaged(),
+        marks: MarksAvailability { available: status.has_marks(), remedy: marks_remedy(sensor, status) },
+        damaged: status.damaged_share(),
         lost_on_line: status.lost_on_line(),
     }
 }
@@ -250,9 +252,13 @@ pub(crate) fn marks_remedy(sensor: &str, status: &Status) -> Option<String> {
 }
 
 /// Class `notice`: a line for each of `names`, or one without a name.
-pub(crate) fn notices(output: &mut Output<'_>, names: &[Rc<TopicName>], notice: &Notice) -> Result<(), End> {
+pub(crate) fn notices(
+    output: &mut Output<'_>,
+    names: &[Rc<TopicName>],
+    notice: &Notice,
+) -> Result<(), ExitReason> {
     #[derive(Serialize)]
-    struct Line<'a> {
+    struct TelegramJson<'a> {
         class: &'static str,
         kind: &'static str,
         sensor: Option<&'a str>,
@@ -269,18 +275,18 @@ pub(crate) fn notices(output: &mut Output<'_>, names: &[Rc<TopicName>], notice: 
         Notice::HubBack => ("hub_back", 0, None),
     };
     if names.is_empty() {
-        return output.json(&Line { class: "notice", kind, sensor: None, topic: None, missed, hint });
+        return output.json(&TelegramJson { class: "notice", kind, sensor: None, topic: None, missed, hint });
     }
     names.iter().try_for_each(|name| {
         let (sensor, topic) = (Some(name.sensor.as_str()), Some(name.topic.name()));
-        output.json(&Line { class: "notice", kind, sensor, topic, missed, hint })
+        output.json(&TelegramJson { class: "notice", kind, sensor, topic, missed, hint })
     })
 }
 
 /// Class `summary`.
 pub(crate) fn summary<'a>(name: &'a TopicName, stats: &ReceiveStats) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct Line<'a> {
+    struct TelegramJson<'a> {
         class: &'static str,
         sensor: &'a str,
         topic: &'static str,
@@ -291,7 +297,7 @@ pub(crate) fn summary<'a>(name: &'a TopicName, stats: &ReceiveStats) -> impl Ser
         damaged: Option<f64>,
         lost_on_line: Option<u64>,
     }
-    Line {
+    TelegramJson {
         class: "summary",
         sensor: &name.sensor,
         topic: name.topic.name(),
@@ -307,26 +313,30 @@ pub(crate) fn summary<'a>(name: &'a TopicName, stats: &ReceiveStats) -> impl Ser
 /// Class `control`.
 pub(crate) fn control<'a>(sensor: &'a str, verb: Verb) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct Line<'a> {
+    struct TelegramJson<'a> {
         class: &'static str,
         sensor: &'a str,
         verb: &'static str,
         outcome: &'static str,
     }
-    Line { class: "control", sensor, verb: verb.name(), outcome: "taken" }
+    TelegramJson { class: "control", sensor, verb: verb.name(), outcome: "taken" }
 }
 
 /// Class `error`, as the line that a program writes when a verb failed; without its end.
 pub fn error(failure: &Failure) -> String {
     #[derive(Serialize)]
-    struct Line<'a> {
+    struct TelegramJson<'a> {
         class: &'a str,
         kind: &'a str,
         message: &'a str,
         hint: &'a str,
     }
-    let line =
-        Line { class: "error", kind: failure.kind.name(), message: &failure.message, hint: &failure.hint };
+    let line = TelegramJson {
+        class: "error",
+        kind: failure.kind.name(),
+        message: &failure.message,
+        hint: &failure.hint,
+    };
     scanhub_schema::json_line(serde_json::to_string(&line).unwrap_or_default())
 }
 
@@ -350,8 +360,8 @@ fn ranges<S: Serializer>(scan: &Scan, serializer: S) -> Result<S::Ok, S::Error> 
 }
 
 fn codes<S: Serializer>(scan: &Scan, serializer: S) -> Result<S::Ok, S::Error> {
-    let told = |i| Some((i, scan.code(i).filter(|code| *code != Code::NotMeasured)?.name()));
-    serializer.collect_seq((0..scan.beams()).filter_map(told))
+    let code = |i| Some((i, scan.code(i).filter(|code| *code != Code::NotMeasured)?.name()));
+    serializer.collect_seq((0..scan.beams()).filter_map(code))
 }
 
 fn intensities<S: Serializer>(intensities: &Intensities<'_>, serializer: S) -> Result<S::Ok, S::Error> {
@@ -370,7 +380,7 @@ fn has_grid_only(scan: &Scan) -> bool {
 
 fn counters<S: Serializer>(counters: &Counters, serializer: S) -> Result<S::Ok, S::Error> {
     let mut map = serializer.serialize_map(None)?;
-    for (name, value) in counters.named() {
+    for (name, value) in counters.named_values() {
         map.serialize_entry(name, &value)?;
     }
     map.end()
@@ -378,7 +388,7 @@ fn counters<S: Serializer>(counters: &Counters, serializer: S) -> Result<S::Ok, 
 
 #[cfg(test)]
 mod tests {
-    use scanhub_schema::{Code, Contents, Family, Flags, Header, Pose, Reasons, Scan, ScanHead, Status};
+    use scanhub_schema::{ArrayFlags, Code, Family, Flags, Header, Pose, Reasons, Scan, ScanHead, Status};
 
     fn header() -> Header {
         Header {
@@ -424,7 +434,7 @@ mod tests {
             collisions: 2,
             family: Family::Ld as u8,
             flags: Scan::INCOMPLETE,
-            contents: Contents::ANGLES | Contents::WIDE,
+            contents: ArrayFlags::ANGLES | ArrayFlags::WIDE,
             intensity_bits: 16,
             ..ScanHead::default()
         };

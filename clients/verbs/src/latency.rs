@@ -21,9 +21,9 @@ use thread_priority::{
 
 use self::spans::{Quantiles, Span, Spans};
 use crate::context::Context;
-use crate::follow::{Arrival, Bounds, Event, Following, Notice};
+use crate::follow::{Arrival, Event, Notice, RunLimits, TopicRun};
 use crate::names::TopicName;
-use crate::output::{End, Output, quiet, table};
+use crate::output::{ExitReason, Output, table, verb_result};
 use crate::receive_stats::ReceiveStats;
 use crate::{duration, json, text};
 
@@ -39,16 +39,16 @@ pub struct LatencyArgs {
     max_p99: Option<Duration>,
     /// How to wait for samples
     #[arg(long, value_enum, default_value = "doorbell")]
-    wait: WaitBy,
+    wait: WaitMethod,
     /// Do not ask for real-time priority and locked memory
     #[arg(long)]
     no_realtime: bool,
     #[command(flatten)]
-    bounds: Bounds,
+    limits: RunLimits,
 }
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
-enum WaitBy {
+enum WaitMethod {
     /// Sleep on a word in shared memory; one call of the hub wakes all
     Doorbell,
     /// Sleep on the event; the hub sends one message to each consumer
@@ -78,7 +78,7 @@ impl LatencyArgs {
     /// - [`Kind::Check`] if a topic is older than `--max-p99` permits, or its age is unknown.
     /// - The errors of [`echo`](crate::echo::EchoArgs::run).
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
-        let (places, stop) = (context.domain.places()?, context.signals.stop()?);
+        let (locations, stop) = (context.domain.locations()?, context.signals.stop()?);
         let mut names: Vec<TopicName> = Vec::new();
         for text in &self.topics {
             let name = TopicName::parse(text)?;
@@ -87,9 +87,9 @@ impl LatencyArgs {
             }
         }
         let wait = match self.wait {
-            WaitBy::Doorbell => Wait::Doorbell,
-            WaitBy::Event => Wait::Event,
-            WaitBy::Spin => Wait::Spin,
+            WaitMethod::Doorbell => Wait::Doorbell,
+            WaitMethod::Event => Wait::Event,
+            WaitMethod::Spin => Wait::Spin,
         };
         let mut latency = Latency {
             is_json: context.json,
@@ -100,12 +100,12 @@ impl LatencyArgs {
             notes: Output::new(&mut context.notes),
         };
         let written = latency.conditions(&Conditions::take(wait, !self.no_realtime));
-        let mut following = Following::new(&names, &[], &places, &self.bounds, &stop).closely(wait);
+        let mut following = TopicRun::new(&names, &[], &locations, &self.limits, &stop).receiving_first(wait);
         let end = written.and_then(|()| {
             let end = latency.run(&mut following);
             following.finish(end, |name, stats| latency.summary(name, stats))
         });
-        quiet(end.and_then(|()| self.max_p99.map_or(Ok(()), |limit| Ok(latency.check(limit)?))))
+        verb_result(end.and_then(|()| self.max_p99.map_or(Ok(()), |limit| Ok(latency.check(limit)?))))
     }
 }
 
@@ -119,7 +119,7 @@ struct Latency<'a> {
 }
 
 impl Latency<'_> {
-    fn conditions(&mut self, conditions: &Conditions) -> Result<(), End> {
+    fn conditions(&mut self, conditions: &Conditions) -> Result<(), ExitReason> {
         if self.is_json { self.out.json(conditions) } else { conditions.text(&mut self.notes) }
     }
 
@@ -127,7 +127,7 @@ impl Latency<'_> {
         for (name, spans) in &self.topics {
             let Some(age) = spans.ages(Span::Age).quantiles() else {
                 if spans.received == 0 {
-                    let (what, hint) = (format!("{name}: {NOTHING_CAME}"), why_nothing(name));
+                    let (what, hint) = (format!("{name}: {NO_SAMPLES}"), no_samples_reason(name));
                     return Err(Failure::new(Kind::Check, what, hint));
                 }
                 let what = format!("{name}: no sample with a known age arrived");
@@ -148,7 +148,7 @@ impl Latency<'_> {
         Ok(())
     }
 
-    fn run(&mut self, following: &mut Following<'_>) -> Result<(), End> {
+    fn run(&mut self, following: &mut TopicRun<'_>) -> Result<(), ExitReason> {
         while let Some(event) = following.next(None)? {
             match event {
                 Event::Subscribed(name) => {
@@ -163,10 +163,10 @@ impl Latency<'_> {
                         let now_ns = clock::now_ns();
                         self.topics.iter_mut().for_each(|(_, spans)| spans.begin(now_ns));
                     }
-                    notice.tell(&names, self.is_json, &mut self.out, &mut self.notes)?;
+                    notice.report(&names, self.is_json, &mut self.out, &mut self.notes)?;
                 }
                 Event::Tick(now) => self.tick(now)?,
-                Event::Begun(_) | Event::Short(..) | Event::Line(..) => {}
+                Event::Added(_) | Event::ResourceExhausted(..) | Event::Line(..) => {}
             }
         }
         Ok(())
@@ -182,7 +182,7 @@ impl Latency<'_> {
         }
     }
 
-    fn tick(&mut self, now: Instant) -> Result<(), End> {
+    fn tick(&mut self, now: Instant) -> Result<(), ExitReason> {
         if now < self.next {
             return Ok(());
         }
@@ -199,7 +199,7 @@ impl Latency<'_> {
         Ok(())
     }
 
-    fn summary(&mut self, name: &TopicName, stats: &ReceiveStats) -> Result<(), End> {
+    fn summary(&mut self, name: &TopicName, stats: &ReceiveStats) -> Result<(), ExitReason> {
         let Some((_, spans)) = self.topics.iter().find(|(known, _)| known == name) else { return Ok(()) };
         if self.is_json {
             self.out.json(&result(name, spans))?;
@@ -213,7 +213,7 @@ impl Latency<'_> {
 /// Returns the line of class `latency`. A span without a known time is null. The keys are a contract: add, never change.
 fn result<'a>(name: &'a TopicName, spans: &Spans) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct Line<'a> {
+    struct LatencyJson<'a> {
         class: &'static str,
         sensor: &'a str,
         topic: &'static str,
@@ -229,7 +229,7 @@ fn result<'a>(name: &'a TopicName, spans: &Spans) -> impl Serialize + 'a {
         network: Option<Quantiles>,
     }
     let of = |span| spans.ages(span).quantiles();
-    Line {
+    LatencyJson {
         class: "latency",
         sensor: &name.sensor,
         topic: name.topic.name(),
@@ -259,14 +259,14 @@ fn brief(line: &mut Vec<u8>, name: &TopicName, spans: &Spans) -> io::Result<()> 
             us(age.max_ns)
         ),
         None if spans.received == 0 => {
-            write!(line, "{topic:<16}       - age, {NOTHING_CAME}; {}", why_nothing(name))
+            write!(line, "{topic:<16}       - age, {NO_SAMPLES}; {}", no_samples_reason(name))
         }
         None => write!(line, "{topic:<16}       - age, {} received", spans.received),
     }
 }
 
 /// Writes the result of a topic: a row for each span with a known time, and the ages as bars if `has_bars`.
-fn full(out: &mut Output<'_>, name: &TopicName, spans: &Spans, has_bars: bool) -> Result<(), End> {
+fn full(out: &mut Output<'_>, name: &TopicName, spans: &Spans, has_bars: bool) -> Result<(), ExitReason> {
     let heads = ["us", "count", "min", "p50", "p90", "p99", "p99.9", "max"].map(str::to_owned).to_vec();
     let row = |span: Span| {
         let Quantiles { count, min_ns, p50_ns, p90_ns, p99_ns, p999_ns, max_ns } =
@@ -287,7 +287,7 @@ fn full(out: &mut Output<'_>, name: &TopicName, spans: &Spans, has_bars: bool) -
 fn remarks(name: &TopicName, spans: &Spans) -> Vec<String> {
     let mut remarks = Vec::new();
     if spans.received == 0 {
-        remarks.push(format!("{name}: {NOTHING_CAME}; {}", why_nothing(name)));
+        remarks.push(format!("{name}: {NO_SAMPLES}; {}", no_samples_reason(name)));
     }
     if spans.before > 0 {
         let word = if spans.before == 1 { "was" } else { "were" };
@@ -311,9 +311,9 @@ fn remarks(name: &TopicName, spans: &Spans) -> Vec<String> {
     remarks
 }
 
-const NOTHING_CAME: &str = "no sample arrived";
+const NO_SAMPLES: &str = "no sample arrived";
 
-fn why_nothing(name: &TopicName) -> String {
+fn no_samples_reason(name: &TopicName) -> String {
     if name.is_robot() {
         "`scanhub info` shows why".into()
     } else {
@@ -321,12 +321,12 @@ fn why_nothing(name: &TopicName) -> String {
     }
 }
 
-fn bars(out: &mut Output<'_>, spans: &Spans) -> Result<(), End> {
-    let bars = spans.ages(Span::Age).bars();
+fn bars(out: &mut Output<'_>, spans: &Spans) -> Result<(), ExitReason> {
+    let bars = spans.ages(Span::Age).bins();
     let most = bars.iter().map(|bar| bar.count).max().unwrap_or_default().max(1);
     for bar in bars {
         // Every bar that is not empty is visible.
-        let length = (bar.count * LONGEST_BAR).div_ceil(most) as usize;
+        let length = (bar.count * MAX_BAR_LEN).div_ceil(most) as usize;
         out.line(|line| {
             let (from, to) = (time(bar.from_ns), time(bar.to_ns));
             write!(line, "{from:>7} .. {to:<7} {:>7}", bar.count)?;
@@ -336,7 +336,7 @@ fn bars(out: &mut Output<'_>, spans: &Spans) -> Result<(), End> {
     Ok(())
 }
 
-const LONGEST_BAR: u64 = 40;
+const MAX_BAR_LEN: u64 = 40;
 
 fn us(ns: u64) -> String {
     format!("{:.1}", ns as f64 / 1e3)
@@ -402,7 +402,7 @@ impl Conditions {
     }
 
     /// Writes the conditions for users.
-    fn text(&self, notes: &mut Output<'_>) -> Result<(), End> {
+    fn text(&self, notes: &mut Output<'_>) -> Result<(), ExitReason> {
         notes.line(|line| {
             let priority = if self.realtime { "real-time priority" } else { "normal priority" };
             let locked = if self.memory_locked { "locked" } else { "not locked" };

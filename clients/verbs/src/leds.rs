@@ -12,15 +12,15 @@ use std::time::{Duration, Instant};
 
 use clap::Args;
 use scanhub_client::clock;
-use scanhub_client::streams::{Freshness, Sample};
-use scanhub_schema::{Failure, Kind, ROBOT, Status, Topic, Verdict, check_followed};
+use scanhub_client::streams::{Sample, StalenessTimer};
+use scanhub_schema::{Failure, Kind, ROBOT, Status, Topic, Verdict, check_any_sensor};
 use serde::Serialize;
 
-use self::device::{Device, News};
+use self::device::{Device, DeviceEvent};
 use crate::context::Context;
-use crate::follow::{Bounds, Event, Following, Notice};
-use crate::names::{TopicName, as_word};
-use crate::output::{End, Output, colors, quiet};
+use crate::follow::{Event, Notice, RunLimits, TopicRun};
+use crate::names::{TopicName, as_argument};
+use crate::output::{ExitReason, Output, colors, verb_result};
 use crate::{duration, json, text};
 
 /// Show the zone verdict and the marks as lights, in the terminal and on LEDs of this machine
@@ -43,7 +43,7 @@ pub struct LedsArgs {
     #[arg(long)]
     early: bool,
     #[command(flatten)]
-    bounds: Bounds,
+    limits: RunLimits,
 }
 
 const AFTER_HELP: &str = "\
@@ -64,40 +64,40 @@ impl LedsArgs {
     /// - [`Kind::Failed`] if an LED may not be switched.
     /// - The errors of [`echo`](crate::echo::EchoArgs::run).
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
-        let (places, stop) = (context.domain.places()?, context.signals.stop()?);
+        let (locations, stop) = (context.domain.locations()?, context.signals.stop()?);
         let sensor = &self.sensor;
         let topics = if sensor == ROBOT { &[Topic::Zones][..] } else { &[Topic::Zones, Topic::Marks] };
         if sensor != ROBOT {
-            as_word(check_followed(sensor))?;
+            as_argument(check_any_sensor(sensor))?;
         }
         let names: Vec<_> = topics.iter().map(|&topic| TopicName { sensor: sensor.clone(), topic }).collect();
-        let wanted = self.wanted()?;
-        let mut board = Board {
+        let selected = self.selected_leds()?;
+        let mut panel = LightPanel {
             sensor,
-            look: match (context.json, context.is_terminal) {
-                (true, _) => Look::Json,
-                (false, true) => Look::Terminal { colors: colors() },
-                (false, false) => Look::Lines,
+            display: match (context.json, context.is_terminal) {
+                (true, _) => LightDisplay::Json,
+                (false, true) => LightDisplay::Terminal { colors: colors() },
+                (false, false) => LightDisplay::Lines,
             },
-            lamps: Lamps::UNKNOWN,
-            verdict: Hold::new(self.hold),
-            marks: Freshness::new(clock::now()),
+            states: LightStates::UNKNOWN,
+            verdict: WorstVerdictHold::new(self.hold),
+            marks: StalenessTimer::new(clock::now()),
             losses: Vec::new(),
             devices: Vec::new(),
             out: Output::new(&mut context.out),
             notes: Output::new(&mut context.notes),
         };
-        let mut following = Following::new(&names, &[], &places, &self.bounds, &stop).with_lines();
+        let mut following = TopicRun::new(&names, &[], &locations, &self.limits, &stop).with_lines();
         if self.early {
             following = following.with_early();
         }
-        let end = board.open(self, &wanted).and_then(|()| board.run(&mut following));
-        quiet(end.and(board.leave()))
+        let end = panel.open(self, &selected).and_then(|()| panel.run(&mut following));
+        verb_result(end.and(panel.show_unwatched()))
     }
 
     /// Returns the light and the name of each `--led`. Each name is unique: an LED for two lights would be ambiguous.
-    fn wanted(&self) -> Result<Vec<(Light, &str)>, Failure> {
-        let mut wanted: Vec<(Light, &str)> = Vec::new();
+    fn selected_leds(&self) -> Result<Vec<(Light, &str)>, Failure> {
+        let mut selected: Vec<(Light, &str)> = Vec::new();
         for led in &self.leds {
             let refuse = |hint: &str| {
                 Err(Failure::new(Kind::Configuration, format!("--led {led} cannot be shown"), hint))
@@ -109,15 +109,15 @@ impl LedsArgs {
             if light == Light::Mark && self.sensor == ROBOT {
                 return refuse("marks belong to one sensor: name the sensor");
             }
-            if let Some((other, _)) = wanted.iter().find(|(_, taken)| *taken == name) {
+            if let Some((other, _)) = selected.iter().find(|(_, taken)| *taken == name) {
                 return refuse(&format!(
                     "{name} already shows {}: each light has its own LEDs",
                     other.name()
                 ));
             }
-            wanted.push((light, name));
+            selected.push((light, name));
         }
-        Ok(wanted)
+        Ok(selected)
     }
 }
 
@@ -125,7 +125,7 @@ const LED_FORM: &str = "green=NAME, yellow=NAME, red=NAME or mark=NAME, with a N
 
 /// Form of the lights on stdout.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Look {
+enum LightDisplay {
     /// A line of text for each change.
     Lines,
     /// A JSON object for each change.
@@ -138,13 +138,13 @@ enum Look {
 }
 
 /// The lights and their state.
-struct Board<'a> {
+struct LightPanel<'a> {
     sensor: &'a str,
-    look: Look,
-    lamps: Lamps,
-    verdict: Hold,
+    display: LightDisplay,
+    states: LightStates,
+    verdict: WorstVerdictHold,
     /// Age of the mark count, which does not depend on the zones.
-    marks: Freshness,
+    marks: StalenessTimer,
     /// Text on the loss of each sensor whose line loses data.
     losses: Vec<(String, String)>,
     devices: Vec<(Light, String, Device)>,
@@ -152,76 +152,76 @@ struct Board<'a> {
     notes: Output<'a>,
 }
 
-impl Board<'_> {
+impl LightPanel<'_> {
     /// Opens the LEDs, and shows that nothing is known yet.
-    fn open(&mut self, args: &LedsArgs, wanted: &[(Light, &str)]) -> Result<(), End> {
-        for &(light, name) in wanted {
+    fn open(&mut self, args: &LedsArgs, selected: &[(Light, &str)]) -> Result<(), ExitReason> {
+        for &(light, name) in selected {
             let (device, trigger) = Device::open(&args.led_root, name)?;
             self.devices.push((light, name.to_owned(), device));
             if let Some(trigger) = trigger {
                 self.note(&format!("{name} was lit by {trigger}, now it shows {}", light.name()))?;
             }
         }
-        self.show(Lamps::UNKNOWN, true)
+        self.show(LightStates::UNKNOWN, true)
     }
 
     /// Shows the held verdict and the number of marks.
-    fn show_known(&mut self, marks: Option<usize>, now: Instant) -> Result<(), End> {
+    fn show_known(&mut self, marks: Option<usize>, now: Instant) -> Result<(), ExitReason> {
         let (verdict, worst) = self.verdict.shown(now).clone();
-        self.show(Lamps { verdict, marks, worst }, false)
+        self.show(LightStates { verdict, marks, worst }, false)
     }
 
-    /// Shows `lamps` if they differ from those that are shown, or `always`.
-    fn show(&mut self, lamps: Lamps, always: bool) -> Result<(), End> {
-        if self.lamps == lamps && !always {
+    /// Shows `states` if they differ from those that are shown, or `always`.
+    fn show(&mut self, states: LightStates, always: bool) -> Result<(), ExitReason> {
+        if self.states == states && !always {
             return Ok(());
         }
-        self.lamps = lamps;
+        self.states = states;
         // The LEDs come first: output may be slow.
         self.switch(Instant::now())?;
         self.draw()
     }
 
-    fn switch(&mut self, now: Instant) -> Result<(), End> {
+    fn switch(&mut self, now: Instant) -> Result<(), ExitReason> {
         let mut changes = Vec::new();
         for (light, name, device) in &mut self.devices {
-            if let Some(news) = device.show(self.lamps.lit(*light), now) {
-                changes.push((*light, name.clone(), news));
+            if let Some(event) = device.show(self.states.is_on(*light), now) {
+                changes.push((*light, name.clone(), event));
             }
         }
-        changes.into_iter().try_for_each(|(light, name, news)| self.report(light, &name, news))
+        changes.into_iter().try_for_each(|(light, name, event)| self.report(light, &name, event))
     }
 
     /// Reports that an LED failed or is back.
-    fn report(&mut self, light: Light, name: &str, news: News) -> Result<(), End> {
-        let (state, failure) = match news {
-            News::Failed(failure) => ("failed", Some(failure)),
-            News::Back => ("recovered", None),
+    fn report(&mut self, light: Light, name: &str, event: DeviceEvent) -> Result<(), ExitReason> {
+        let (state, failure) = match event {
+            DeviceEvent::Failed(failure) => ("failed", Some(failure)),
+            DeviceEvent::Recovered => ("recovered", None),
         };
-        if self.look == Look::Json {
+        if self.display == LightDisplay::Json {
             let (message, hint) = failure.map(|it| (it.message, it.hint)).unzip();
-            return self.out.json(&Led { class: "led", light: light.name(), name, state, message, hint });
+            return self.out.json(&LedJson { class: "led", light: light.name(), name, state, message, hint });
         }
         self.note(&failure.map_or(format!("{name} has recovered"), |failure| failure.to_string()))
     }
 
     /// Writes a line to `notes`. The lights are redrawn below it.
-    fn note(&mut self, what: &str) -> Result<(), End> {
-        self.wipe()?;
+    fn note(&mut self, what: &str) -> Result<(), ExitReason> {
+        self.clear_line()?;
         self.notes.line(|line| write!(line, "{what}"))
     }
 
-    fn draw(&mut self) -> Result<(), End> {
+    fn draw(&mut self) -> Result<(), ExitReason> {
         let reason = self.reason();
-        let Board { sensor, lamps, .. } = self;
+        let LightPanel { sensor, states, .. } = self;
         let (sensor, reason) = (*sensor, reason.as_deref());
-        match self.look {
-            Look::Json => self.out.json(&Line::new(sensor, lamps, reason)),
-            Look::Lines => self.out.line(|line| lamps.line(line, sensor, reason, false)),
-            Look::Terminal { colors } => {
+        match self.display {
+            LightDisplay::Json => self.out.json(&LedsJson::new(sensor, states, reason)),
+            LightDisplay::Lines => self.out.line(|line| states.line(line, sensor, reason, false)),
+            LightDisplay::Terminal { colors } => {
                 // A line that wraps could not be redrawn, so the terminal cuts it.
-                let mut line = [WIPE, b"\x1b[?7l"].concat();
-                lamps.line(&mut line, sensor, reason, colors)?;
+                let mut line = [CLEAR_LINE, b"\x1b[?7l"].concat();
+                states.line(&mut line, sensor, reason, colors)?;
                 line.extend(b"\x1b[?7h");
                 self.out.raw(&line)
             }
@@ -230,32 +230,32 @@ impl Board<'_> {
 
     /// Returns a possible reason of the verdict: the loss on the line of the sensor whose verdict it is, or of any other.
     fn reason(&self) -> Option<String> {
-        let whose = self.lamps.worst.as_deref();
-        let of_worst = self.losses.iter().find(|(sensor, _)| Some(sensor.as_str()) == whose);
+        let sensor_name = self.states.worst.as_deref();
+        let of_worst = self.losses.iter().find(|(sensor, _)| Some(sensor.as_str()) == sensor_name);
         let (sensor, loss) = of_worst.or(self.losses.first())?;
-        let is_plain = sensor == self.sensor || Some(sensor.as_str()) == whose;
+        let is_plain = sensor == self.sensor || Some(sensor.as_str()) == sensor_name;
         Some(if is_plain { loss.clone() } else { format!("{sensor}: {loss}") })
     }
 
-    fn wipe(&mut self) -> Result<(), End> {
-        match self.look {
-            Look::Terminal { .. } => self.out.raw(WIPE),
-            Look::Json | Look::Lines => Ok(()),
+    fn clear_line(&mut self) -> Result<(), ExitReason> {
+        match self.display {
+            LightDisplay::Terminal { .. } => self.out.raw(CLEAR_LINE),
+            LightDisplay::Json | LightDisplay::Lines => Ok(()),
         }
     }
 
     /// Turns the red light on, because the sensor is not watched from now on.
-    fn leave(&mut self) -> Result<(), End> {
-        self.show(Lamps::UNKNOWN, false)?;
+    fn show_unwatched(&mut self) -> Result<(), ExitReason> {
+        self.show(LightStates::UNKNOWN, false)?;
         // An LED may have failed when it was switched.
         self.switch(Instant::now())?;
-        match self.look {
-            Look::Terminal { .. } => self.out.raw(b"\n"),
-            Look::Json | Look::Lines => Ok(()),
+        match self.display {
+            LightDisplay::Terminal { .. } => self.out.raw(b"\n"),
+            LightDisplay::Json | LightDisplay::Lines => Ok(()),
         }
     }
 
-    fn run(&mut self, following: &mut Following<'_>) -> Result<(), End> {
+    fn run(&mut self, following: &mut TopicRun<'_>) -> Result<(), ExitReason> {
         while let Some(event) = following.next(self.verdict.changes_at())? {
             match event {
                 Event::Sample(_, sample, _) => self.sample(&sample)?,
@@ -268,18 +268,18 @@ impl Board<'_> {
         Ok(())
     }
 
-    fn sample(&mut self, sample: &Sample) -> Result<(), End> {
+    fn sample(&mut self, sample: &Sample) -> Result<(), ExitReason> {
         let now = Instant::now();
-        let mut marks = self.lamps.marks;
+        let mut marks = self.states.marks;
         match sample {
-            Sample::Zones(heard) => self.verdict.take((heard.zones.verdict(), None), now),
-            Sample::Robot(heard) => {
-                let worst = heard.robot.worst().map(str::to_owned);
-                self.verdict.take((heard.robot.verdict(), worst), now);
+            Sample::Zones(update) => self.verdict.take((update.zones.verdict(), None), now),
+            Sample::Robot(update) => {
+                let worst = update.robot.worst().map(str::to_owned);
+                self.verdict.take((update.robot.verdict(), worst), now);
             }
             Sample::Marks(sample) => {
                 // A number of marks expires like a verdict that is known.
-                let fresh = self.marks.heard(sample.header(), Verdict::Clear, clock::now());
+                let fresh = self.marks.update(sample.header(), Verdict::Clear, clock::now());
                 marks = (fresh && sample.is_available()).then(|| sample.marks().len());
             }
             _ => {}
@@ -288,38 +288,38 @@ impl Board<'_> {
     }
 
     /// Redraws when a line starts or stops to lose data, but not when the amount changes.
-    fn line(&mut self, sensor: &str, status: &Status) -> Result<(), End> {
+    fn line(&mut self, sensor: &str, status: &Status) -> Result<(), ExitReason> {
         let known = self.losses.iter().position(|(name, _)| name == sensor);
         let loss = status.line_loss();
-        let is_news = known.is_some() != loss.is_some();
+        let has_changed = known.is_some() != loss.is_some();
         match (known, loss) {
             (Some(at), Some(loss)) => self.losses[at].1 = loss,
             (Some(at), None) => drop(self.losses.remove(at)),
             (None, Some(loss)) => self.losses.push((sensor.to_owned(), loss)),
             (None, None) => {}
         }
-        if is_news { self.draw() } else { Ok(()) }
+        if has_changed { self.draw() } else { Ok(()) }
     }
 
-    fn notice(&mut self, names: &[Rc<TopicName>], notice: Notice) -> Result<(), End> {
+    fn notice(&mut self, names: &[Rc<TopicName>], notice: Notice) -> Result<(), ExitReason> {
         // Only the newest sample counts.
         if matches!(notice, Notice::Missed(_)) {
             return Ok(());
         }
-        if self.look == Look::Json {
+        if self.display == LightDisplay::Json {
             return json::notices(&mut self.out, names, &notice);
         }
-        self.wipe()?;
+        self.clear_line()?;
         self.notes.line(|line| text::notice(line, names, &notice))?;
-        match self.look {
-            Look::Terminal { .. } => self.draw(),
-            Look::Json | Look::Lines => Ok(()),
+        match self.display {
+            LightDisplay::Terminal { .. } => self.draw(),
+            LightDisplay::Json | LightDisplay::Lines => Ok(()),
         }
     }
 
     /// Turns off marks that are too old, shows a verdict that has lasted, and tries LEDs again that failed.
-    fn tick(&mut self, now: Instant) -> Result<(), End> {
-        let marks = if self.marks.silence(clock::now()) { None } else { self.lamps.marks };
+    fn tick(&mut self, now: Instant) -> Result<(), ExitReason> {
+        let marks = if self.marks.silence(clock::now()) { None } else { self.states.marks };
         self.show_known(marks, now)?;
         self.switch(now)
     }
@@ -327,7 +327,7 @@ impl Board<'_> {
 
 /// Line of class `leds`.
 #[derive(Serialize)]
-struct Line<'a> {
+struct LedsJson<'a> {
     class: &'static str,
     sensor: &'a str,
     stamp_ns: u64,
@@ -344,20 +344,20 @@ struct Line<'a> {
     reason: Option<&'a str>,
 }
 
-impl<'a> Line<'a> {
-    fn new(sensor: &'a str, lamps: &'a Lamps, reason: Option<&'a str>) -> Line<'a> {
-        Line {
+impl<'a> LedsJson<'a> {
+    fn new(sensor: &'a str, states: &'a LightStates, reason: Option<&'a str>) -> LedsJson<'a> {
+        LedsJson {
             class: "leds",
             sensor,
             stamp_ns: clock::now().monotonic_ns,
             wall_ns: clock::wall_ns(),
-            verdict: lamps.verdict.name(),
-            marks: lamps.marks,
-            green: lamps.lit(Light::Green),
-            yellow: lamps.lit(Light::Yellow),
-            red: lamps.lit(Light::Red),
-            mark: lamps.lit(Light::Mark),
-            worst: lamps.worst.as_deref(),
+            verdict: states.verdict.name(),
+            marks: states.marks,
+            green: states.is_on(Light::Green),
+            yellow: states.is_on(Light::Yellow),
+            red: states.is_on(Light::Red),
+            mark: states.is_on(Light::Mark),
+            worst: states.worst.as_deref(),
             reason,
         }
     }
@@ -365,7 +365,7 @@ impl<'a> Line<'a> {
 
 /// Line of class `led`: an LED failed, or is back.
 #[derive(Serialize)]
-struct Led<'a> {
+struct LedJson<'a> {
     class: &'static str,
     light: &'static str,
     name: &'a str,
@@ -375,7 +375,7 @@ struct Led<'a> {
 }
 
 /// Moves the cursor to the start of the line, and erases it (ECMA-48).
-const WIPE: &[u8] = b"\r\x1b[K";
+const CLEAR_LINE: &[u8] = b"\r\x1b[K";
 
 /// A light.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -417,7 +417,7 @@ impl Light {
 
 /// Known state of a sensor, which decides what lights are on.
 #[derive(Clone, Debug, PartialEq, Eq)]
-struct Lamps {
+struct LightStates {
     /// Verdict of the zones.
     verdict: Verdict,
     /// Number of marks in the last scan; `None` if it is unknown.
@@ -426,12 +426,12 @@ struct Lamps {
     worst: Option<String>,
 }
 
-impl Lamps {
+impl LightStates {
     /// No sensor is watched: the red light is on.
-    const UNKNOWN: Lamps = Lamps { verdict: Verdict::Unknown, marks: None, worst: None };
+    const UNKNOWN: LightStates = LightStates { verdict: Verdict::Unknown, marks: None, worst: None };
 
     /// Returns whether `light` is on. An unknown verdict counts as stop.
-    fn lit(&self, light: Light) -> bool {
+    fn is_on(&self, light: Light) -> bool {
         match light {
             Light::Green => self.verdict == Verdict::Clear,
             Light::Yellow => self.verdict == Verdict::Slow,
@@ -444,7 +444,7 @@ impl Lamps {
     fn line(&self, line: &mut Vec<u8>, sensor: &str, reason: Option<&str>, colors: bool) -> io::Result<()> {
         write!(line, "{sensor}")?;
         for light in Light::ALL {
-            let (name, lit) = (light.name(), self.lit(light));
+            let (name, lit) = (light.name(), self.is_on(light));
             let sign = if lit { '●' } else { '○' };
             match (lit, colors) {
                 (true, true) => write!(line, "  \x1b[1;{}m{sign} {name}\x1b[0m", light.color())?,
@@ -472,41 +472,44 @@ type SensorVerdict = (Verdict, Option<String>);
 
 /// Holds a verdict for some time, so that the lights do not flicker. It shows the worst verdict of that time: a worse one at
 /// once, a better one after it has lasted.
-struct Hold {
+struct WorstVerdictHold {
     hold: Duration,
     current: SensorVerdict,
     /// Worse verdicts before, with the time of their last end.
-    before: Vec<(SensorVerdict, Instant)>,
+    previous: Vec<(SensorVerdict, Instant)>,
 }
 
-impl Hold {
+impl WorstVerdictHold {
     /// A verdict counts for `hold` after its end. The first one is unknown.
-    fn new(hold: Duration) -> Hold {
-        Hold { hold, current: (Verdict::Unknown, None), before: Vec::new() }
+    fn new(hold: Duration) -> WorstVerdictHold {
+        WorstVerdictHold { hold, current: (Verdict::Unknown, None), previous: Vec::new() }
     }
 
     /// Takes a new verdict at `now`.
-    fn take(&mut self, said: SensorVerdict, now: Instant) {
-        let is_worse = |verdict: Verdict| verdict != said.0 && verdict.worse(said.0) == verdict;
-        self.before.retain(|((verdict, _), _)| is_worse(*verdict));
-        let ended = mem::replace(&mut self.current, said);
+    fn take(&mut self, new_verdict: SensorVerdict, now: Instant) {
+        let is_worse = |verdict: Verdict| verdict != new_verdict.0 && verdict.worse(new_verdict.0) == verdict;
+        self.previous.retain(|((verdict, _), _)| is_worse(*verdict));
+        let ended = mem::replace(&mut self.current, new_verdict);
         if ended.0 != self.current.0 && ended.0.worse(self.current.0) == ended.0 {
-            self.before.retain(|((verdict, _), _)| *verdict != ended.0);
-            self.before.push((ended, now));
+            self.previous.retain(|((verdict, _), _)| *verdict != ended.0);
+            self.previous.push((ended, now));
         }
     }
 
     /// Returns the verdict to show at `now`.
     fn shown(&mut self, now: Instant) -> &SensorVerdict {
         let hold = self.hold;
-        self.before.retain(|(_, until)| now.saturating_duration_since(*until) < hold);
-        let said = self.before.iter().map(|(said, _)| said);
-        said.fold(&self.current, |worst, said| if worst.0.worse(said.0) == said.0 { said } else { worst })
+        self.previous.retain(|(_, until)| now.saturating_duration_since(*until) < hold);
+        let verdicts = self.previous.iter().map(|(verdict, _)| verdict);
+        verdicts.fold(
+            &self.current,
+            |worst, verdict| if worst.0.worse(verdict.0) == verdict.0 { verdict } else { worst },
+        )
     }
 
     /// Returns when it may change without a new verdict.
     fn changes_at(&self) -> Option<Instant> {
-        self.before.iter().filter_map(|(_, until)| until.checked_add(self.hold)).min()
+        self.previous.iter().filter_map(|(_, until)| until.checked_add(self.hold)).min()
     }
 }
 
@@ -516,8 +519,8 @@ mod tests {
 
     use super::*;
 
-    fn lamps(verdict: Verdict, marks: Option<usize>) -> Lamps {
-        Lamps { verdict, marks, worst: None }
+    fn states(verdict: Verdict, marks: Option<usize>) -> LightStates {
+        LightStates { verdict, marks, worst: None }
     }
 
     #[test]
@@ -529,32 +532,32 @@ mod tests {
             (Verdict::Unknown, Light::Red),
         ] {
             for (marks, is_lit) in [(None, false), (Some(0), false), (Some(1), true), (Some(12), true)] {
-                let lamps = lamps(verdict, marks);
+                let states = states(verdict, marks);
                 for one in [Light::Green, Light::Yellow, Light::Red] {
-                    assert_eq!(lamps.lit(one), one == light, "{lamps:?}");
+                    assert_eq!(states.is_on(one), one == light, "{states:?}");
                 }
-                assert_eq!(lamps.lit(Light::Mark), is_lit);
+                assert_eq!(states.is_on(Light::Mark), is_lit);
             }
         }
-        assert!(Lamps::UNKNOWN.lit(Light::Red));
+        assert!(LightStates::UNKNOWN.is_on(Light::Red));
     }
 
     #[test]
     fn lines() {
-        let text = |lamps: &Lamps, colors| {
+        let text = |states: &LightStates, colors| {
             let mut line = Vec::new();
-            lamps.line(&mut line, "front", None, colors).unwrap();
+            states.line(&mut line, "front", None, colors).unwrap();
             String::from_utf8(line).unwrap()
         };
-        let stop = Lamps { worst: Some("rear".into()), ..lamps(Verdict::Stop, None) };
+        let stop = LightStates { worst: Some("rear".into()), ..states(Verdict::Stop, None) };
         assert_eq!(text(&stop, false), "front  ○ green  ○ yellow  ● red  ○ mark  stop rear");
-        let clear = lamps(Verdict::Clear, Some(1));
+        let clear = states(Verdict::Clear, Some(1));
         assert_eq!(text(&clear, false), "front  ● green  ○ yellow  ○ red  ● mark  clear, 1 mark");
         assert_eq!(
             text(&clear, true),
             "front  \x1b[1;32m● green\x1b[0m  ○ yellow  ○ red  \x1b[1;36m● mark\x1b[0m  clear, 1 mark"
         );
-        assert!(text(&lamps(Verdict::Slow, Some(0)), false).ends_with("  slow, 0 marks"));
+        assert!(text(&states(Verdict::Slow, Some(0)), false).ends_with("  slow, 0 marks"));
         let mut line = Vec::new();
         stop.line(&mut line, "robot", Some("41 % lost on the line"), false).unwrap();
         assert!(line.ends_with(b"  stop rear, 41 % lost on the line"));
@@ -563,11 +566,11 @@ mod tests {
     const HOLD_MS: u64 = 300;
 
     /// What is shown after each of these times and verdicts, and at each time without one.
-    fn shown(steps: &[(u64, Option<Verdict>)]) -> Vec<Verdict> {
-        let (mut hold, start) = (Hold::new(Duration::from_millis(HOLD_MS)), Instant::now());
+    fn shown_verdicts(steps: &[(u64, Option<Verdict>)]) -> Vec<Verdict> {
+        let (mut hold, start) = (WorstVerdictHold::new(Duration::from_millis(HOLD_MS)), Instant::now());
         let at = |ms| start + Duration::from_millis(ms);
-        let step = |&(ms, said): &(u64, Option<Verdict>)| {
-            if let Some(verdict) = said {
+        let step = |&(ms, verdict): &(u64, Option<Verdict>)| {
+            if let Some(verdict) = verdict {
                 hold.take((verdict, None), at(ms));
             }
             hold.shown(at(ms)).0
@@ -576,30 +579,30 @@ mod tests {
     }
 
     #[test]
-    fn a_worse_verdict_is_shown_at_once_and_a_better_one_after_it_has_stood() {
+    fn worse_verdict_shows_at_once_better_after_the_hold() {
         let steps = [(0, Some(Clear)), (299, None), (300, None), (400, Some(Slow)), (401, Some(Stop))];
-        assert_eq!(shown(&steps), [Unknown, Unknown, Clear, Slow, Stop]);
+        assert_eq!(shown_verdicts(&steps), [Unknown, Unknown, Clear, Slow, Stop]);
         let steps = [(0, Some(Stop)), (100, Some(Clear)), (399, Some(Clear)), (400, None)];
-        assert_eq!(shown(&steps), [Stop, Stop, Stop, Clear]);
+        assert_eq!(shown_verdicts(&steps), [Stop, Stop, Stop, Clear]);
     }
 
     #[test]
-    fn whoever_flickers_stays_worst() {
+    fn flickering_verdict_stays_at_the_worst() {
         let steps: Vec<_> = (0..20).map(|n| (n * 200, Some(if n % 2 == 0 { Stop } else { Clear }))).collect();
-        assert!(shown(&steps).iter().all(|verdict| *verdict == Stop));
+        assert!(shown_verdicts(&steps).iter().all(|verdict| *verdict == Stop));
     }
 
     #[test]
     fn it_gets_better_by_steps() {
         let steps =
             [(0, Some(Stop)), (10, Some(Slow)), (110, Some(Clear)), (309, None), (310, None), (409, None)];
-        assert_eq!(shown(&steps), [Stop, Stop, Stop, Stop, Slow, Slow]);
-        assert_eq!(shown(&[&steps[..], &[(410, None)]].concat()).last(), Some(&Clear));
+        assert_eq!(shown_verdicts(&steps), [Stop, Stop, Stop, Stop, Slow, Slow]);
+        assert_eq!(shown_verdicts(&[&steps[..], &[(410, None)]].concat()).last(), Some(&Clear));
     }
 
     #[test]
-    fn what_is_shown_is_of_the_sensor_that_said_it_and_its_end_is_known() {
-        let (mut hold, now) = (Hold::new(Duration::from_millis(HOLD_MS)), Instant::now());
+    fn held_verdict_keeps_its_sensor_until_the_hold_ends() {
+        let (mut hold, now) = (WorstVerdictHold::new(Duration::from_millis(HOLD_MS)), Instant::now());
         hold.take((Stop, Some("rear".into())), now);
         assert_eq!(hold.changes_at(), None);
         hold.take((Clear, Some("front".into())), now);
@@ -610,8 +613,8 @@ mod tests {
     }
 
     #[test]
-    fn without_a_hold_all_is_shown_as_it_is_said() {
-        let (mut hold, now) = (Hold::new(Duration::ZERO), Instant::now());
+    fn without_a_hold_every_verdict_is_shown_at_once() {
+        let (mut hold, now) = (WorstVerdictHold::new(Duration::ZERO), Instant::now());
         for verdict in [Clear, Stop, Slow, Clear, Unknown, Clear] {
             hold.take((verdict, None), now);
             assert_eq!(hold.shown(now).0, verdict);

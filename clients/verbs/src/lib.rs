@@ -25,6 +25,6 @@ pub mod show;
 pub mod text;
 pub mod zones;
 
-pub use follow::Bounds;
+pub use follow::RunLimits;
 pub use json::error as error_line;
 pub use renamed_flag::with_new_name;

@@ -6,14 +6,14 @@ use std::sync::atomic::AtomicBool;
 
 use clap::Args;
 use scanhub_client::streams::find;
-use scanhub_schema::{Failure, Family, Pace, State, Status, Topic};
-use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment, RunningHub, publisher};
+use scanhub_schema::{Failure, Family, PublishRate, State, Status, Topic};
+use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment, RunningHub, publisher_pid};
 use scanhub_shm::{Node, Payload, PortFactory};
 use serde::{Serialize, Serializer};
 
 use crate::context::Context;
 use crate::info::statuses;
-use crate::output::{Output, quiet, table};
+use crate::output::{Output, table, verb_result};
 
 /// List the sensors and topics of the running hub
 #[derive(Args, Clone, Debug)]
@@ -39,7 +39,7 @@ impl ListArgs {
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
         let (json, out) = (context.json, &mut context.out);
         match (self.domains, &context.domain.root) {
-            (false, _) => topics(json, &context.domain.places()?, out, &*context.signals.stop()?),
+            (false, _) => topics(json, &context.domain.locations()?, out, &*context.signals.stop()?),
             (true, Some(root)) => domains(json, &[root.to_owned()], &[], out),
             (true, None) => {
                 let hubs = RunningHub::all(Path::new("/"));
@@ -49,8 +49,8 @@ impl ListArgs {
     }
 }
 
-fn topics(json: bool, places: &[Domain], out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
-    let domain = find(places)?;
+fn topics(json: bool, locations: &[Domain], out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
+    let domain = find(locations)?;
     let node = scanhub_shm::client_node(&domain)?;
     let sensors = scanhub_shm::sensors(&domain)?;
     let (mut lines, mut problems) = (Vec::new(), Vec::new());
@@ -58,8 +58,9 @@ fn topics(json: bool, places: &[Domain], out: &mut dyn Write, stop: &AtomicBool)
         of_sensor(&node, sensor, &mut lines)?;
     }
     for (sensor, status) in statuses(&domain, &scanhub_shm::links(&domain)?, stop)? {
-        for line in
-            lines.iter_mut().filter(|line| line.sensor == sensor && line.topic.row().pace == Pace::Scan)
+        for line in lines
+            .iter_mut()
+            .filter(|line| line.sensor == sensor && line.topic.spec().publish_rate == PublishRate::Scan)
         {
             // Of families other than LMS a telegram is no scan, and how many come is told by `hz`.
             let is_of_scans =
@@ -77,11 +78,11 @@ fn topics(json: bool, places: &[Domain], out: &mut dyn Write, stop: &AtomicBool)
     }
     let mut output = Output::new(out);
     if json {
-        return quiet(lines.iter().try_for_each(|line| output.json(line)));
+        return verb_result(lines.iter().try_for_each(|line| output.json(line)));
     }
     let mut rows = vec![["TOPIC", "HZ", "SUBSCRIBERS", "PAYLOAD", "REVISION"].map(String::from).to_vec()];
-    rows.extend(lines.iter().map(Line::row));
-    quiet(
+    rows.extend(lines.iter().map(TopicJson::row));
+    verb_result(
         table(&mut output, &rows).and_then(|()| {
             problems.iter().try_for_each(|problem| output.line(|line| write!(line, "{problem}")))
         }),
@@ -92,7 +93,7 @@ fn topics(json: bool, places: &[Domain], out: &mut dyn Write, stop: &AtomicBool)
 /// follow.
 fn domains(json: bool, bases: &[PathBuf], hubs: &[RunningHub], out: &mut dyn Write) -> Result<(), Failure> {
     #[derive(Serialize)]
-    struct Line {
+    struct DomainJson {
         class: &'static str,
         domain: String,
         root: PathBuf,
@@ -100,7 +101,7 @@ fn domains(json: bool, bases: &[PathBuf], hubs: &[RunningHub], out: &mut dyn Wri
     }
     /// A hub whose files this user cannot read, or does not find.
     #[derive(Serialize)]
-    struct Unreachable<'a> {
+    struct UnreachableHubJson<'a> {
         class: &'static str,
         domain: Option<&'a str>,
         pid: u32,
@@ -114,9 +115,9 @@ fn domains(json: bool, bases: &[PathBuf], hubs: &[RunningHub], out: &mut dyn Wri
                 continue;
             };
             // Another user's domain is not one of this user's.
-            if let Ok(Some(pid)) = publisher(domain.root()) {
+            if let Ok(Some(pid)) = publisher_pid(domain.root()) {
                 let root = domain.root().to_owned();
-                lines.push(Line { class: "domain", domain: domain.name().to_owned(), root, pid });
+                lines.push(DomainJson { class: "domain", domain: domain.name().to_owned(), root, pid });
             }
         }
     }
@@ -126,14 +127,19 @@ fn domains(json: bool, bases: &[PathBuf], hubs: &[RunningHub], out: &mut dyn Wri
         if lines.iter().any(|line| line.pid == hub.pid) {
             continue;
         }
-        let place = hub.domain.as_ref().zip(hub.base.as_ref());
-        let place = place.and_then(|(domain, base)| Domain::at(domain, base).ok());
-        match place {
-            Some(place) if publisher(place.root()) == Ok(Some(hub.pid)) => {
+        let location = hub.domain.as_ref().zip(hub.base.as_ref());
+        let location = location.and_then(|(domain, base)| Domain::at(domain, base).ok());
+        match location {
+            Some(place) if publisher_pid(place.root()) == Ok(Some(hub.pid)) => {
                 let root = place.root().to_owned();
-                lines.push(Line { class: "domain", domain: place.name().to_owned(), root, pid: hub.pid });
+                lines.push(DomainJson {
+                    class: "domain",
+                    domain: place.name().to_owned(),
+                    root,
+                    pid: hub.pid,
+                });
             }
-            place => unreachable.push(Unreachable {
+            place => unreachable.push(UnreachableHubJson {
                 class: "unreachable",
                 domain: hub.domain.as_deref(),
                 pid: hub.pid,
@@ -151,7 +157,7 @@ fn domains(json: bool, bases: &[PathBuf], hubs: &[RunningHub], out: &mut dyn Wri
     lines.sort_by(|a, b| a.root.cmp(&b.root));
     let mut output = Output::new(out);
     if json {
-        return quiet(
+        return verb_result(
             lines
                 .iter()
                 .try_for_each(|line| output.json(line))
@@ -162,8 +168,8 @@ fn domains(json: bool, bases: &[PathBuf], hubs: &[RunningHub], out: &mut dyn Wri
     rows.extend(
         lines.iter().map(|it| vec![it.domain.clone(), it.pid.to_string(), it.root.display().to_string()]),
     );
-    quiet(table(&mut output, &rows).and_then(|()| {
-        unreachable.iter().try_for_each(|Unreachable { domain, pid, user, remedy, .. }| {
+    verb_result(table(&mut output, &rows).and_then(|()| {
+        unreachable.iter().try_for_each(|UnreachableHubJson { domain, pid, user, remedy, .. }| {
             let domain = domain.map_or_else(String::new, |domain| format!(" in domain {domain}"));
             output.line(|line| write!(line, "user {user} runs a hub{domain}, process {pid}: {remedy}"))
         })
@@ -173,7 +179,7 @@ fn domains(json: bool, bases: &[PathBuf], hubs: &[RunningHub], out: &mut dyn Wri
 /// Class `topic`; the rate is the hub's own measurement of the scans, null where it does not say one and for topics that
 /// come at their own time. Marks and foreground are sent while somebody listens.
 #[derive(Serialize)]
-struct Line {
+struct TopicJson {
     class: &'static str,
     sensor: String,
     #[serde(serialize_with = "name")]
@@ -184,7 +190,7 @@ struct Line {
     subscribers: usize,
 }
 
-impl Line {
+impl TopicJson {
     fn row(&self) -> Vec<String> {
         vec![
             format!("{}/{}", self.sensor, self.topic.name()),
@@ -199,7 +205,7 @@ impl Line {
 macro_rules! lines {
     ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
         /// Adds a line for each topic of `sensor`.
-        fn of_sensor(node: &Node, sensor: &str, lines: &mut Vec<Line>) -> Result<(), Failure> {
+        fn of_sensor(node: &Node, sensor: &str, lines: &mut Vec<TopicJson>) -> Result<(), Failure> {
             $(lines.extend(line::<scanhub_schema::payload_type!($payload)>(node, sensor)?);)*
             Ok(())
         }
@@ -208,9 +214,9 @@ macro_rules! lines {
 
 scanhub_schema::for_each_topic!(lines);
 
-fn line<P: Payload + ?Sized>(node: &Node, sensor: &str) -> Result<Option<Line>, Failure> {
+fn line<P: Payload + ?Sized>(node: &Node, sensor: &str) -> Result<Option<TopicJson>, Failure> {
     let topic = P::TOPIC;
-    Ok(P::open(node, sensor)?.map(|service| Line {
+    Ok(P::open(node, sensor)?.map(|service| TopicJson {
         class: "topic",
         sensor: sensor.to_owned(),
         topic,

@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use scanhub_schema::{Failure, Kind, Maker, ROBOT, Topic, check_followed};
+use scanhub_schema::{Failure, Kind, PublisherKind, ROBOT, Topic, check_any_sensor};
 
 /// One topic of one sensor.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -34,7 +34,7 @@ impl TopicName {
             return Err(Failure::new(Kind::Usage, format!("no topic {text:?}"), hint));
         }
         if !name.is_robot() {
-            as_word(check_followed(sensor))?;
+            as_argument(check_any_sensor(sensor))?;
         }
         Ok(name)
     }
@@ -53,13 +53,13 @@ impl fmt::Display for TopicName {
 
 /// Returns the index of a program that publishes as `name` next to a hub. Links of a hub have indexes below 128.
 pub fn position(name: &str) -> u8 {
-    const FIRST: u8 = 128;
+    const FIRST_INDEX: u8 = 128;
     let sum = name.bytes().fold(0u32, |sum, byte| sum.wrapping_mul(31).wrapping_add(byte.into()));
-    FIRST + (sum % u32::from(u8::MAX - FIRST)) as u8
+    FIRST_INDEX + (sum % u32::from(u8::MAX - FIRST_INDEX)) as u8
 }
 
 /// Returns the result of a check of a name on the command line. Its error is [`Kind::Usage`].
-pub fn as_word(checked: Result<(), Failure>) -> Result<(), Failure> {
+pub fn as_argument(checked: Result<(), Failure>) -> Result<(), Failure> {
     checked.map_err(|failure| Failure { kind: Kind::Usage, ..failure })
 }
 
@@ -70,27 +70,27 @@ fn topics() -> String {
 
 /// Returns a hint with the topic that `word` may be a misspelling of. Empty if there is none.
 fn nearest(sensor: &str, word: &str) -> String {
-    let topic = near(word, Topic::ALL.into_iter().map(Topic::name));
+    let topic = most_similar(word, Topic::ALL.into_iter().map(Topic::name));
     topic.map_or(String::new(), |topic| format!("did you mean {sensor}/{topic}? "))
 }
 
 /// Returns the most similar name in `known`, if `word` may be a misspelling of it.
-fn near<'a>(word: &str, known: impl Iterator<Item = &'a str>) -> Option<&'a str> {
+fn most_similar<'a>(word: &str, known: impl Iterator<Item = &'a str>) -> Option<&'a str> {
     let near = |known: &str| strsim::jaro_winkler(known, word);
-    known.max_by(|a, b| near(a).total_cmp(&near(b))).filter(|known| near(known) > NEAR)
+    known.max_by(|a, b| near(a).total_cmp(&near(b))).filter(|known| near(known) > MIN_SIMILARITY)
 }
 
 /// Similarity above which a word may be a misspelling of another: 1 is equal, 0 has nothing in common.
-const NEAR: f64 = 0.8;
+const MIN_SIMILARITY: f64 = 0.8;
 
 /// Returns the failure that the sensor of `name` has only other `topics`, now and later.
 pub fn no_such_topic(name: &TopicName, topics: &[Topic]) -> Failure {
     let names = topics.iter().map(|topic| format!("{}/{}", name.sensor, topic.name()));
     let hint = format!("there are {}", names.collect::<Vec<_>>().join(", "));
-    let who = topics
+    let publisher = topics
         .first()
-        .map_or(String::new(), |topic| format!(": {} is {}", name.sensor, topic.maker().name()));
-    Failure::new(Kind::NoTopic, format!("there is no topic {name}{who}"), hint)
+        .map_or(String::new(), |topic| format!(": {} is {}", name.sensor, topic.publisher_kind().name()));
+    Failure::new(Kind::NoTopic, format!("there is no topic {name}{publisher}"), hint)
 }
 
 /// Returns the failure that the hub has no `sensor`, with its `sensors`.
@@ -98,7 +98,7 @@ pub fn no_sensor(sensor: &str, sensors: &[String]) -> Failure {
     let hint = match sensors {
         [] => "it has no sensors: `scanhub run --link NAME=PORT`".to_owned(),
         some => {
-            let near = near(sensor, some.iter().map(String::as_str));
+            let near = most_similar(sensor, some.iter().map(String::as_str));
             let near = near.map_or(String::new(), |near| format!("did you mean {near}? "));
             format!("{near}there are {}", some.join(", "))
         }
@@ -108,43 +108,43 @@ pub fn no_sensor(sensor: &str, sensors: &[String]) -> Failure {
 
 /// Selection of topics by one word of the command line.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Word {
+pub struct TopicPattern {
     /// The sensor; `None` for all sensors.
     pub sensor: Option<String>,
     /// The topic; `None` for all topics.
     pub topic: Option<Topic>,
 }
 
-impl Word {
+impl TopicPattern {
     /// Parses `SENSOR/TOPIC`, `*/TOPIC`, `SENSOR/*` or `*/*`. `robot/zones` is the combined verdict of all sensors.
     ///
     /// # Errors
     ///
     /// As for [`TopicName::parse`].
-    pub fn parse(text: &str) -> Result<Word, Failure> {
+    pub fn parse(text: &str) -> Result<TopicPattern, Failure> {
         let (sensor, topic) = text.split_once('/').unwrap_or((text, ""));
         match (sensor, topic) {
-            (ALL, ALL) => Ok(Word { sensor: None, topic: None }),
-            (ALL, topic) => match Topic::parse(topic) {
-                Some(topic) => Ok(Word { sensor: None, topic: Some(topic) }),
+            (WILDCARD, WILDCARD) => Ok(TopicPattern { sensor: None, topic: None }),
+            (WILDCARD, topic) => match Topic::parse(topic) {
+                Some(topic) => Ok(TopicPattern { sensor: None, topic: Some(topic) }),
                 None => {
-                    let hint = format!("{}{}", nearest(ALL, topic), topics());
+                    let hint = format!("{}{}", nearest(WILDCARD, topic), topics());
                     Err(Failure::new(Kind::Usage, format!("no topic {text:?}"), hint))
                 }
             },
-            (ROBOT, ALL) => {
+            (ROBOT, WILDCARD) => {
                 let hint = format!(
                     "*/* names all topics of all sensors, {ROBOT}/zones the verdict over all sensors"
                 );
                 Err(Failure::new(Kind::Usage, format!("{text} is not possible"), hint))
             }
-            (sensor, ALL) => {
-                as_word(check_followed(sensor))?;
-                Ok(Word { sensor: Some(sensor.to_owned()), topic: None })
+            (sensor, WILDCARD) => {
+                as_argument(check_any_sensor(sensor))?;
+                Ok(TopicPattern { sensor: Some(sensor.to_owned()), topic: None })
             }
             _ => {
                 let TopicName { sensor, topic } = TopicName::parse(text)?;
-                Ok(Word { sensor: Some(sensor), topic: Some(topic) })
+                Ok(TopicPattern { sensor: Some(sensor), topic: Some(topic) })
             }
         }
     }
@@ -169,13 +169,14 @@ impl Selection {
         let mut named: Vec<TopicName> = Vec::new();
         let mut of_all = Vec::new();
         for text in texts {
-            let word = Word::parse(text)?;
+            let pattern = TopicPattern::parse(text)?;
             // The maker of a named sensor is unknown until its topics exist, so `SENSOR/*` selects the topics of a
             // link.
-            let may_have = |topic: Topic| word.sensor.is_none() || topic.maker() == Maker::Link;
-            let is_meant = |topic: &Topic| word.topic.map_or(may_have(*topic), |known| known == *topic);
+            let may_have =
+                |topic: Topic| pattern.sensor.is_none() || topic.publisher_kind() == PublisherKind::Link;
+            let is_meant = |topic: &Topic| pattern.topic.map_or(may_have(*topic), |known| known == *topic);
             let meant = Topic::ALL.into_iter().filter(is_meant);
-            match &word.sensor {
+            match &pattern.sensor {
                 None => of_all.extend(meant),
                 Some(sensor) => named.extend(meant.map(|topic| TopicName { sensor: sensor.clone(), topic })),
             }
@@ -192,7 +193,7 @@ impl Selection {
 }
 
 /// Word for all sensors, or all topics.
-const ALL: &str = "*";
+const WILDCARD: &str = "*";
 
 #[cfg(test)]
 mod tests {
@@ -224,7 +225,7 @@ mod tests {
         assert_eq!(hint("frnt"), "did you mean front? there are front, rear");
         assert_eq!(hint("side"), "there are front, rear");
         let name = TopicName { sensor: "house".to_owned(), topic: Topic::Scan };
-        let failure = no_such_topic(&name, Maker::Tracker.topics());
+        let failure = no_such_topic(&name, PublisherKind::Tracker.topics());
         assert_eq!(failure.message, "there is no topic house/scan: house is a tracker");
         assert_eq!(failure.hint, "there are house/tracks, house/events");
     }
@@ -251,7 +252,7 @@ mod tests {
 
     #[test]
     fn refuses_unknown_topics_with_suggestions() {
-        let refused = |text: &str| Word::parse(text).unwrap_err();
+        let refused = |text: &str| TopicPattern::parse(text).unwrap_err();
         for bad in [
             "*",
             "*/",

@@ -12,31 +12,31 @@ use serde::Serialize;
 
 /// Reason for the early end of a verb.
 #[derive(Debug)]
-pub enum End {
+pub enum ExitReason {
     /// The reader of the output closed it.
-    ReaderGone,
+    ReaderClosed,
     /// The verb failed.
     Failure(Failure),
 }
 
-impl From<Failure> for End {
-    fn from(failure: Failure) -> End {
-        End::Failure(failure)
+impl From<Failure> for ExitReason {
+    fn from(failure: Failure) -> ExitReason {
+        ExitReason::Failure(failure)
     }
 }
 
-impl From<scanhub_client::Error> for End {
-    fn from(error: scanhub_client::Error) -> End {
-        End::Failure(error.into())
+impl From<scanhub_client::Error> for ExitReason {
+    fn from(error: scanhub_client::Error) -> ExitReason {
+        ExitReason::Failure(error.into())
     }
 }
 
-impl From<io::Error> for End {
-    fn from(error: io::Error) -> End {
+impl From<io::Error> for ExitReason {
+    fn from(error: io::Error) -> ExitReason {
         if error.kind() == ErrorKind::BrokenPipe {
-            return End::ReaderGone;
+            return ExitReason::ReaderClosed;
         }
-        End::Failure(Failure::new(Kind::Failed, format!("cannot write: {error}"), ""))
+        ExitReason::Failure(Failure::new(Kind::Failed, format!("cannot write: {error}"), ""))
     }
 }
 
@@ -46,10 +46,10 @@ impl From<io::Error> for End {
 /// # Errors
 ///
 /// Returns the failure of any other end.
-pub fn quiet(result: Result<(), End>) -> Result<(), Failure> {
+pub fn verb_result(result: Result<(), ExitReason>) -> Result<(), Failure> {
     match result {
-        Ok(()) | Err(End::ReaderGone) => Ok(()),
-        Err(End::Failure(failure)) => Err(failure),
+        Ok(()) | Err(ExitReason::ReaderClosed) => Ok(()),
+        Err(ExitReason::Failure(failure)) => Err(failure),
     }
 }
 
@@ -69,8 +69,8 @@ impl<'a> Output<'a> {
     ///
     /// # Errors
     ///
-    /// Returns [`End`] if the line cannot be written.
-    pub fn json(&mut self, value: &impl Serialize) -> Result<(), End> {
+    /// Returns [`ExitReason`] if the line cannot be written.
+    pub fn json(&mut self, value: &impl Serialize) -> Result<(), ExitReason> {
         self.line.clear();
         serde_json::to_writer(&mut self.line, value).map_err(io::Error::from)?;
         escape_json(&mut self.line);
@@ -82,11 +82,11 @@ impl<'a> Output<'a> {
     ///
     /// # Errors
     ///
-    /// Returns the error of `build`, and [`End`] if the line cannot be written.
-    pub fn line(&mut self, build: impl FnOnce(&mut Vec<u8>) -> io::Result<()>) -> Result<(), End> {
+    /// Returns the error of `build`, and [`ExitReason`] if the line cannot be written.
+    pub fn line(&mut self, build: impl FnOnce(&mut Vec<u8>) -> io::Result<()>) -> Result<(), ExitReason> {
         self.line.clear();
         build(&mut self.line)?;
-        disarm(&mut self.line);
+        escape_controls(&mut self.line);
         self.end()
     }
 
@@ -94,13 +94,13 @@ impl<'a> Output<'a> {
     ///
     /// # Errors
     ///
-    /// Returns [`End`] if they cannot be written.
-    pub fn raw(&mut self, bytes: &[u8]) -> Result<(), End> {
+    /// Returns [`ExitReason`] if they cannot be written.
+    pub fn raw(&mut self, bytes: &[u8]) -> Result<(), ExitReason> {
         self.out.write_all(bytes)?;
         Ok(self.out.flush()?)
     }
 
-    fn end(&mut self) -> Result<(), End> {
+    fn end(&mut self) -> Result<(), ExitReason> {
         self.line.push(b'\n');
         self.out.write_all(&self.line)?;
         Ok(self.out.flush()?)
@@ -109,7 +109,7 @@ impl<'a> Output<'a> {
 
 /// Replaces each byte of a control character in UTF-8 `text` by `?`: C0, DEL and C1 (ECMA-48). A line feed becomes a
 /// space.
-fn disarm(text: &mut [u8]) {
+fn escape_controls(text: &mut [u8]) {
     let mut before = 0;
     for at in 0..text.len() {
         let byte = text[at];
@@ -129,8 +129,8 @@ fn disarm(text: &mut [u8]) {
 ///
 /// # Errors
 ///
-/// Returns [`End`] if a row cannot be written.
-pub fn table(output: &mut Output<'_>, rows: &[Vec<String>]) -> Result<(), End> {
+/// Returns [`ExitReason`] if a row cannot be written.
+pub fn table(output: &mut Output<'_>, rows: &[Vec<String>]) -> Result<(), ExitReason> {
     let columns = rows.iter().map(Vec::len).max().unwrap_or_default();
     let width =
         |column: usize| rows.iter().filter_map(|row| row.get(column)).map(|cell| cell.chars().count()).max();
@@ -184,31 +184,30 @@ pub fn fitting(mut parts: Vec<(u8, String)>, columns: usize) -> String {
 /// writes each piece at once or not at all.
 pub struct LossyWriter<'a, W> {
     to: &'a mut W,
-    /// Whether the verb ends. Then no samples can be delayed, and the writer waits for the reader up to `patience`.
+    /// Whether the verb ends. Then no samples can be delayed, and the writer waits for the reader up to `wait_budget`.
     stop: &'a AtomicBool,
     /// Time for which the writer may still wait.
-    patience: Duration,
+    wait_budget: Duration,
 }
 
 /// Maximum delay of the end by a reader, over all lines. It is enough for a reader that reads at all.
-const PATIENCE: Duration = Duration::from_secs(1);
+const MAX_READER_DELAY: Duration = Duration::from_secs(1);
 
 impl<'a, W: Write + AsFd> LossyWriter<'a, W> {
     /// Creates a writer to `to`, which waits for its reader only after `stop` is set.
-    pub fn around(to: &'a mut W, stop: &'a AtomicBool) -> LossyWriter<'a, W> {
-        LossyWriter { to, stop, patience: PATIENCE }
+    pub fn new(to: &'a mut W, stop: &'a AtomicBool) -> LossyWriter<'a, W> {
+        LossyWriter { to, stop, wait_budget: MAX_READER_DELAY }
     }
 
     /// Returns whether a piece can be written without waiting. The system reports a pipe as writable if a page is free,
     /// which is more than a line has (pipe(7), PIPE_BUF). The result is also true if the write will return an error.
     fn has_room(&mut self) -> bool {
-        let patience = if self.stop.load(Ordering::Relaxed) { self.patience } else { Duration::ZERO };
-        let began = Instant::now();
-        let timeout =
-            Timespec { tv_sec: patience.as_secs() as i64, tv_nsec: i64::from(patience.subsec_nanos()) };
+        let budget = if self.stop.load(Ordering::Relaxed) { self.wait_budget } else { Duration::ZERO };
+        let started = Instant::now();
+        let timeout = Timespec { tv_sec: budget.as_secs() as i64, tv_nsec: i64::from(budget.subsec_nanos()) };
         let ready = poll(&mut [PollFd::new(&*self.to, PollFlags::OUT)], Some(&timeout));
-        if !patience.is_zero() {
-            self.patience = patience.saturating_sub(began.elapsed());
+        if !budget.is_zero() {
+            self.wait_budget = budget.saturating_sub(started.elapsed());
         }
         ready.is_ok_and(|count| count > 0)
     }
@@ -278,7 +277,7 @@ mod tests {
     fn drops_whole_lines_without_room() {
         let (mut reader, mut writer) = io::pipe().unwrap();
         let stop = AtomicBool::new(false);
-        let mut lossy = LossyWriter::around(&mut writer, &stop);
+        let mut lossy = LossyWriter::new(&mut writer, &stop);
         let line = [b'x'; 1000];
         for _ in 0..1000 {
             lossy.write_all(&line).unwrap();
@@ -288,7 +287,7 @@ mod tests {
         for _ in 0..1000 {
             lossy.write_all(&line).unwrap();
         }
-        assert_eq!(lossy.patience, Duration::ZERO);
+        assert_eq!(lossy.wait_budget, Duration::ZERO);
         drop(writer);
         let mut all = Vec::new();
         reader.read_to_end(&mut all).unwrap();
@@ -300,7 +299,7 @@ mod tests {
     fn reports_full_disk_of_log_at_end() {
         let mut full = std::fs::File::options().write(true).open("/dev/full").unwrap();
         let stop = AtomicBool::new(false);
-        let mut lossy = LossyWriter::around(&mut full, &stop);
+        let mut lossy = LossyWriter::new(&mut full, &stop);
         lossy.write_all(b"x").unwrap();
         stop.store(true, Ordering::Relaxed);
         assert_eq!(lossy.write_all(b"x").unwrap_err().kind(), ErrorKind::StorageFull);
@@ -311,7 +310,7 @@ mod tests {
         let (reader, mut writer) = io::pipe().unwrap();
         drop(reader);
         let stop = AtomicBool::new(false);
-        let error = LossyWriter::around(&mut writer, &stop).write_all(b"x").unwrap_err();
+        let error = LossyWriter::new(&mut writer, &stop).write_all(b"x").unwrap_err();
         assert_eq!(error.kind(), ErrorKind::BrokenPipe);
     }
 }

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use scanhub_schema::{Counter, Counters, Pace, Topic};
+use scanhub_schema::{Counter, Counters, PublishRate, Topic};
 
 /// Counts of one topic in one run.
 #[derive(Clone, Debug)]
@@ -19,7 +19,7 @@ pub struct ReceiveStats {
     first: Option<Instant>,
     last: Option<Instant>,
     period: Duration,
-    stale_said: bool,
+    is_stale_reported: bool,
 }
 
 impl ReceiveStats {
@@ -34,7 +34,7 @@ impl ReceiveStats {
             first: None,
             last: None,
             period: Duration::ZERO,
-            stale_said: false,
+            is_stale_reported: false,
         }
     }
 
@@ -49,7 +49,7 @@ impl ReceiveStats {
         self.first.get_or_insert(now);
         self.last = Some(now);
         self.period = Duration::from_micros(period_us.into());
-        self.stale_said = false;
+        self.is_stale_reported = false;
     }
 
     /// Time between the first and the last sample.
@@ -68,33 +68,33 @@ impl ReceiveStats {
     }
 
     /// The silence since the last sample became too long just now; said once per silence.
-    pub(crate) fn stale(&mut self, now: Instant) -> bool {
+    pub(crate) fn take_silence(&mut self, now: Instant) -> bool {
         let Some(last) = self.last else { return false };
-        if self.stale_said || now - last < self.deadline() {
+        if self.is_stale_reported || now - last < self.deadline() {
             return false;
         }
-        self.stale_said = true;
+        self.is_stale_reported = true;
         true
     }
 
     /// What comes each second may be late by two; of scans ten may be missing before it is worth a word.
     fn deadline(&self) -> Duration {
-        match self.topic.row().pace {
-            Pace::Second => Duration::from_secs(3),
+        match self.topic.spec().publish_rate {
+            PublishRate::Second => Duration::from_secs(3),
             // It comes when there is a new one.
-            Pace::Change => Duration::MAX,
-            Pace::Scan => (self.period * 10).max(Duration::from_secs(1)),
+            PublishRate::Change => Duration::MAX,
+            PublishRate::Scan => (self.period * 10).max(Duration::from_secs(1)),
         }
     }
 }
 
 /// Losses on the line of a sensor in one run, from the counters of its statuses. They start at 0 when the hub restarts.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Line {
+pub(crate) struct LineLossCounter {
     /// The hub's `boot`, its counters when the run first received them, and the last ones.
-    life: Option<(u64, Counters, Counters)>,
+    current_run: Option<(u64, Counters, Counters)>,
     /// Sums of the hubs before that one.
-    past: Sums,
+    previous_runs: Sums,
 }
 
 /// Losses on a line in a run; `None` if they are not known.
@@ -114,17 +114,17 @@ struct Sums {
     is_known: bool,
 }
 
-impl Line {
+impl LineLossCounter {
     /// Takes the counters of a status from the hub with this `boot`.
     pub(crate) fn note(&mut self, boot: u64, counters: &Counters) {
-        match &mut self.life {
+        match &mut self.current_run {
             Some((life, _, last)) if *life == boot => *last = *counters,
             Some(_) => {
-                self.past = self.sums();
+                self.previous_runs = self.sums();
                 // The hub started during the run, so all its counts belong to the run.
-                self.life = Some((boot, Counters::default(), *counters));
+                self.current_run = Some((boot, Counters::default(), *counters));
             }
-            None => self.life = Some((boot, *counters, *counters)),
+            None => self.current_run = Some((boot, *counters, *counters)),
         }
     }
 
@@ -136,13 +136,13 @@ impl Line {
     }
 
     fn sums(&self) -> Sums {
-        let Some((_, first, last)) = &self.life else { return self.past };
+        let Some((_, first, last)) = &self.current_run else { return self.previous_runs };
         let grown = |counter| last[counter].saturating_sub(first[counter]);
         Sums {
-            read: self.past.read + grown(Counter::BytesRead),
-            damaged: self.past.damaged + grown(Counter::BytesDamaged),
-            lost: self.past.lost + grown(Counter::LostOnLine),
-            is_known: self.past.is_known || last[Counter::DueOnLine] > 0,
+            read: self.previous_runs.read + grown(Counter::BytesRead),
+            damaged: self.previous_runs.damaged + grown(Counter::BytesDamaged),
+            lost: self.previous_runs.lost + grown(Counter::LostOnLine),
+            is_known: self.previous_runs.is_known || last[Counter::DueOnLine] > 0,
         }
     }
 }
@@ -155,18 +155,18 @@ mod tests {
     fn rate_and_silence() {
         let mut stats = ReceiveStats::new(Topic::Scan);
         let start = Instant::now();
-        assert!(!stats.stale(start + Duration::from_secs(9)));
+        assert!(!stats.take_silence(start + Duration::from_secs(9)));
         for i in 0..5 {
             stats.count(start + Duration::from_millis(500 * i), i, 0, false);
         }
         assert_eq!((stats.received, stats.missed, stats.seconds(), stats.hz()), (5, 10, 2.0, Some(2.0)));
-        assert!(!stats.stale(start + Duration::from_millis(2900)));
-        assert!(stats.stale(start + Duration::from_millis(3000)));
-        assert!(!stats.stale(start + Duration::from_millis(9000)));
+        assert!(!stats.take_silence(start + Duration::from_millis(2900)));
+        assert!(stats.take_silence(start + Duration::from_millis(3000)));
+        assert!(!stats.take_silence(start + Duration::from_millis(9000)));
     }
 
     #[test]
-    fn what_a_topic_keeps_for_late_joiners_has_no_rate() {
+    fn history_for_late_joiners_has_no_rate() {
         let mut stats = ReceiveStats::new(Topic::Status);
         let start = Instant::now();
         stats.count(start, 0, 0, true);
@@ -190,8 +190,8 @@ mod tests {
     }
 
     #[test]
-    fn a_run_has_what_grew_while_it_went_on() {
-        let mut line = Line::default();
+    fn loss_is_the_growth_of_counters_across_hub_runs() {
+        let mut line = LineLossCounter::default();
         assert_eq!(line.loss(), Loss::default());
         line.note(1, &counters(1000, 500, 0, 0));
         assert_eq!(line.loss(), Loss { damaged: None, lost_on_line: None });

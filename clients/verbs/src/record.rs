@@ -12,8 +12,8 @@
 
 mod disk;
 mod files;
-mod part;
 mod queue;
+mod recording_file;
 mod report;
 
 use std::collections::BTreeMap;
@@ -34,15 +34,15 @@ use scanhub_schema::file::Compression;
 use scanhub_schema::{Failure, Kind, Topic};
 use scanhub_shm::Domain;
 
-use self::disk::{Destination, Disk};
+use self::disk::{Destination, DiskWriter};
 use self::files::{Files, Split};
-use self::part::{Form, Style};
-use self::queue::{Entry, Gap, News, Queue, WriterProgress};
-use self::report::{Look, Report};
+use self::queue::{Entry, Gap, Queue, WriterEvent, WriterProgress};
+use self::recording_file::{FileOptions, Form};
+use self::report::{Report, ReportForm};
 use crate::context::Context;
-use crate::follow::{Bounds, Event, Following};
+use crate::follow::{Event, RunLimits, TopicRun};
 use crate::names::{Selection, TopicName};
-use crate::output::{End, LossyWriter, quiet};
+use crate::output::{ExitReason, LossyWriter, verb_result};
 use crate::receive_stats::ReceiveStats;
 
 /// Record what the hub publishes in MCAP files
@@ -75,7 +75,7 @@ pub struct RecordArgs {
     #[arg(long, value_name = "COUNT", requires = "split", value_parser = clap::value_parser!(u32).range(1..))]
     keep: Option<u32>,
     #[command(flatten)]
-    bounds: Bounds,
+    limits: RunLimits,
 }
 
 const AFTER_HELP: &str = "\
@@ -102,7 +102,7 @@ const DEFAULT_TOPICS: [Topic; 9] = [
 ];
 
 /// Interval at which the receiving thread reads the progress of the disk thread.
-const LOOK_INTERVAL: Duration = Duration::from_millis(50);
+const POLL_INTERVAL: Duration = Duration::from_millis(50);
 
 /// Hint for a file that has no end.
 const REPAIR: &str = "what is in the file can be read; `scanhub convert` gives it an index";
@@ -121,48 +121,48 @@ impl RecordArgs {
     /// # Errors
     ///
     /// - [`Kind::Usage`] if the topics or stdout cannot be recorded.
-    /// - [`Kind::Output`] if no file can be made, and [`Kind::Failed`] if its end cannot be written; [`Kind::Short`] if either
+    /// - [`Kind::Output`] if no file can be made, and [`Kind::Failed`] if its end cannot be written; [`Kind::ResourceExhausted`] if either
     ///   is for lack of space.
     /// - The errors of [`echo`](crate::echo::EchoArgs::run).
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
         // The file is finished, no matter which signal ends the run.
-        let (places, stop) = (context.domain.places()?, context.signals.any_end()?);
+        let (locations, stop) = (context.domain.locations()?, context.signals.any_stop()?);
         let stderr = self.is_to_stdout().then(|| context.notes.try_clone()).transpose();
         let mut stderr = stderr.map_err(no_stderr)?;
         let (names, topics) = selection(&self.topics, self.all, self.ros2)?;
         let queue = Arc::new(Queue::new());
-        let disk = self.create_file(&places, &queue)?;
+        let disk = self.create_file(&locations, &queue)?;
         let (file, surplus) = (disk.path(), disk.surplus_older());
 
         let out = stderr.as_mut().unwrap_or(&mut context.out);
-        let look = Look::of(context.json, out.is_terminal());
+        let form = ReportForm::of(context.json, out.is_terminal());
         let terminal = out.as_fd().try_clone_to_owned().ok();
-        let over = AtomicBool::new(false);
-        let mut out = LossyWriter::around(out, &over);
-        let mut notes = LossyWriter::around(&mut context.notes, &over);
-        let mut report = Report::new(look, &mut out, &mut notes, terminal);
-        let begun = report.begin(&file, surplus);
+        let is_over = AtomicBool::new(false);
+        let mut out = LossyWriter::new(out, &is_over);
+        let mut notes = LossyWriter::new(&mut context.notes, &is_over);
+        let mut report = Report::new(form, &mut out, &mut notes, terminal);
+        let started = report.begin(&file, surplus);
 
-        let mut recorder = Recorder::start(queue, disk, report, &over)?;
-        let mut following = Following::new(&names, &topics, &places, &self.bounds, &stop).with_lines();
-        let end = begun.and_then(|()| {
+        let mut recorder = Recorder::start(queue, disk, report, &is_over)?;
+        let mut following = TopicRun::new(&names, &topics, &locations, &self.limits, &stop).with_lines();
+        let end = started.and_then(|()| {
             let end = recorder.run(&mut following);
             following.finish(end, |name, stats| recorder.summary(name, stats))
         });
 
         // The recording is kept if the hub or the reader of the lines went away.
-        let stays = recorder.pushed > 0 || !matches!(end, Err(End::Failure(_)));
-        let finished = recorder.finish(stays, &stop);
-        if !stays && !self.is_to_stdout() {
+        let is_kept = recorder.pushed > 0 || !matches!(end, Err(ExitReason::Failure(_)));
+        let finished = recorder.finish(is_kept, &stop);
+        if !is_kept && !self.is_to_stdout() {
             // Without the hub or sensor, the run leaves no file.
             files::discard(&file);
         }
-        quiet(end).and(quiet(finished))
+        verb_result(end).and(verb_result(finished))
     }
 
     /// Creates the first file, or takes stdout in its place. Returns the disk thread that writes the samples of `queue`
     /// to it.
-    fn create_file(&self, places: &[Domain], queue: &Arc<Queue>) -> Result<Disk, Failure> {
+    fn create_file(&self, locations: &[Domain], queue: &Arc<Queue>) -> Result<DiskWriter, Failure> {
         let wall_ns = clock::wall_ns();
         let default = files::default_name(wall_ns);
         let path = self.output.as_deref().unwrap_or(&default);
@@ -171,10 +171,16 @@ impl RecordArgs {
             false => Destination::Files(self.files(path, wall_ns)?),
         };
         let form = if self.ros2 { Form::Ros2 } else { Form::Hub };
-        let style = Style { form, compression: self.compression };
-        let disk = Disk::begin(queue.clone(), destination, self.split, style, facts(places, wall_ns));
+        let options = FileOptions { form, compression: self.compression };
+        let disk = DiskWriter::begin(
+            queue.clone(),
+            destination,
+            self.split,
+            options,
+            description(locations, wall_ns),
+        );
         disk.map_err(|error| match error.kind() {
-            ErrorKind::BrokenPipe => reader_gone(0),
+            ErrorKind::BrokenPipe => reader_closed(0),
             _ => no_file(path, self.split.is_some(), &error),
         })
     }
@@ -225,9 +231,9 @@ fn selection(
             (false, false) => DEFAULT_TOPICS.to_vec(),
         };
     }
-    if let Some(fold) = chosen.named.iter().find(|name| name.is_robot()) {
+    if let Some(robot) = chosen.named.iter().find(|name| name.is_robot()) {
         let hint = "`*/zones` records the zones of each sensor";
-        return Err(Failure::new(Kind::Usage, format!("{fold} is computed by the consumer"), hint));
+        return Err(Failure::new(Kind::Usage, format!("{robot} is computed by the consumer"), hint));
     }
     if ros2 {
         let named = chosen.named.iter().map(|name| name.topic);
@@ -255,23 +261,23 @@ fn no_message(what: &str) -> Failure {
 }
 
 /// Returns the description of the run in the recording.
-fn facts(places: &[Domain], wall_ns: u64) -> BTreeMap<String, String> {
+fn description(locations: &[Domain], wall_ns: u64) -> BTreeMap<String, String> {
     let host = fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
-    let domain = places.first().map(Domain::name).unwrap_or_default();
-    let facts = [
+    let domain = locations.first().map(Domain::name).unwrap_or_default();
+    let fields = [
         ("domain", domain),
         ("host", host.trim()),
         ("version", env!("CARGO_PKG_VERSION")),
         ("started", &files::iso(wall_ns)),
         ("started_ns", &wall_ns.to_string()),
     ];
-    facts.map(|(key, value)| (key.to_owned(), value.to_owned())).into()
+    fields.map(|(key, value)| (key.to_owned(), value.to_owned())).into()
 }
 
 /// Receiving side of a run: passes samples to the queue, and reports what the disk thread does.
 struct Recorder<'a> {
     queue: Arc<Queue>,
-    writing: JoinHandle<io::Result<()>>,
+    writer_thread: JoinHandle<io::Result<()>>,
     progress: Arc<WriterProgress>,
     /// Topics of the recording, by their numbers in the queue.
     tracks: Vec<TopicName>,
@@ -283,24 +289,25 @@ struct Recorder<'a> {
     tick_at: Instant,
     report: Report<'a>,
     /// Set at the end, when the run may wait for readers of its lines.
-    over: &'a AtomicBool,
+    is_over: &'a AtomicBool,
 }
 
 impl<'a> Recorder<'a> {
     /// Starts the disk thread.
     fn start(
         queue: Arc<Queue>,
-        disk: Disk,
+        disk: DiskWriter,
         report: Report<'a>,
-        over: &'a AtomicBool,
+        is_over: &'a AtomicBool,
     ) -> Result<Recorder<'a>, Failure> {
         let progress = disk.progress();
         let writing = thread::Builder::new().name("disk".into()).spawn(move || disk.run());
-        let writing = writing
-            .map_err(|error| Failure::new(Kind::Short, format!("no thread: {error}"), "see `ulimit -u`"))?;
+        let writing = writing.map_err(|error| {
+            Failure::new(Kind::ResourceExhausted, format!("no thread: {error}"), "see `ulimit -u`")
+        })?;
         Ok(Recorder {
             queue,
-            writing,
+            writer_thread: writing,
             progress,
             tracks: Vec::new(),
             pushed: 0,
@@ -308,23 +315,23 @@ impl<'a> Recorder<'a> {
             gap: None,
             tick_at: Instant::now(),
             report,
-            over,
+            is_over,
         })
     }
 
     /// Passes samples on until the run ends.
-    fn run(&mut self, following: &mut Following<'_>) -> Result<(), End> {
+    fn run(&mut self, following: &mut TopicRun<'_>) -> Result<(), ExitReason> {
         while let Some(event) = following.next(None)? {
             match event {
-                Event::Begun(name) => {
+                Event::Added(name) => {
                     self.queue.note(Entry::Track(TopicName::clone(&name)));
                     self.tracks.push(TopicName::clone(&name));
                 }
                 Event::Sample(name, sample, _) => self.sample(&name, &sample)?,
                 Event::Notice(names, notice) => self.report.hub(&names, notice)?,
                 Event::Tick(now) if now >= self.tick_at => {
-                    self.tick_at = now + LOOK_INTERVAL;
-                    self.look()?;
+                    self.tick_at = now + POLL_INTERVAL;
+                    self.report_progress()?;
                 }
                 _ => {}
             }
@@ -333,24 +340,24 @@ impl<'a> Recorder<'a> {
     }
 
     /// Passes `sample` to the disk thread. After a gap, it first waits until there is room for many samples.
-    fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
+    fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), ExitReason> {
         let Some(header) = sample.header() else { return Ok(()) };
         if self.gap.is_some() {
             if !self.queue.is_roomy() {
-                return self.leave_out(name);
+                return self.drop_sample(name);
             }
             self.end_gap()?;
         }
         let Some(track) = self.tracks.iter().position(|track| track == name) else { return Ok(()) };
-        if !self.queue.push(track, header, sample.bytes().len(), |room| sample.pack_said(room)) {
-            return self.leave_out(name);
+        if !self.queue.push(track, header, sample.bytes().len(), |room| sample.pack_as_published(room)) {
+            return self.drop_sample(name);
         }
         self.pushed += 1;
         Ok(())
     }
 
     /// Leaves out a sample for which there is no room, and all that follow until there is room for many.
-    fn leave_out(&mut self, name: &TopicName) -> Result<(), End> {
+    fn drop_sample(&mut self, name: &TopicName) -> Result<(), ExitReason> {
         self.dropped += 1;
         let is_first = self.gap.is_none();
         let now_ns = clock::wall_ns();
@@ -363,61 +370,61 @@ impl<'a> Recorder<'a> {
     }
 
     /// Ends the gap, and notes it in the file.
-    fn end_gap(&mut self) -> Result<(), End> {
+    fn end_gap(&mut self) -> Result<(), ExitReason> {
         let Some(mut gap) = self.gap.take() else { return Ok(()) };
         gap.to_ns = clock::wall_ns();
-        let told = self.report.gap_ends(&gap);
+        let reported = self.report.gap_ends(&gap);
         self.queue.note(Entry::Gap(gap));
-        told
+        reported
     }
 
     /// Reports progress and news of the disk thread.
-    fn look(&mut self) -> Result<(), End> {
-        let stats = self.progress.look();
-        for news in stats.news.iter() {
-            if *news == News::ReaderGone {
-                return Err(reader_gone(stats.samples).into());
+    fn report_progress(&mut self) -> Result<(), ExitReason> {
+        let stats = self.progress.take_stats();
+        for event in stats.events.iter() {
+            if *event == WriterEvent::ReaderClosed {
+                return Err(reader_closed(stats.samples).into());
             }
-            self.report.disk(news)?;
+            self.report.disk(event)?;
         }
         self.report.progress(&stats, self.dropped)
     }
 
     /// Reports what was received of a topic, at the end of the run.
-    fn summary(&mut self, name: &TopicName, stats: &ReceiveStats) -> Result<(), End> {
-        self.over.store(true, Ordering::Relaxed);
+    fn summary(&mut self, name: &TopicName, stats: &ReceiveStats) -> Result<(), ExitReason> {
+        self.is_over.store(true, Ordering::Relaxed);
         self.report.topic(name, stats)
     }
 
     /// Waits until everything is written, and reports the result if the recording `stays`. A second request to stop ends the
     /// wait.
-    fn finish(mut self, stays: bool, stop: &AtomicBool) -> Result<(), End> {
-        self.over.store(true, Ordering::Relaxed);
+    fn finish(mut self, is_kept: bool, stop: &AtomicBool) -> Result<(), ExitReason> {
+        self.is_over.store(true, Ordering::Relaxed);
         stop.store(false, Ordering::Relaxed);
-        let told = self.end_gap();
+        let reported = self.end_gap();
         self.queue.end();
         let mut second = SecondStop::default();
-        while !self.writing.is_finished() {
+        while !self.writer_thread.is_finished() {
             if second.poll(stop.swap(false, Ordering::Relaxed)) {
                 let what = "the disk had not stored the end of the recording when a second signal came";
                 return Err(Failure::new(Kind::Failed, what, REPAIR).into());
             }
-            thread::sleep(LOOK_INTERVAL);
+            thread::sleep(POLL_INTERVAL);
         }
-        let written = self.writing.join();
+        let written = self.writer_thread.join();
         let written = written.unwrap_or_else(|_| Err(io::Error::other("the writing thread panicked")));
-        let stats = self.progress.look();
+        let stats = self.progress.take_stats();
         if let Err(error) = written {
             if error.kind() == ErrorKind::BrokenPipe {
-                return Err(reader_gone(stats.samples).into());
+                return Err(reader_closed(stats.samples).into());
             }
             let missing = self.pushed - stats.samples;
             let what =
                 format!("the end of the recording cannot be written: {error}; {missing} samples are missing");
             return Err(Failure::new(kind(&error), what, REPAIR).into());
         }
-        told.and_then(|()| stats.news.iter().try_for_each(|news| self.report.disk(news)))?;
-        if stays { self.report.end(&stats, self.dropped) } else { Ok(()) }
+        reported.and_then(|()| stats.events.iter().try_for_each(|event| self.report.disk(event)))?;
+        if is_kept { self.report.end(&stats, self.dropped) } else { Ok(()) }
     }
 }
 
@@ -431,19 +438,21 @@ struct SecondStop {
 
 impl SecondStop {
     /// Polls that take the signals of one request.
-    const SAME_REQUEST: u32 = 20;
+    const POLLS_PER_REQUEST: u32 = 20;
 
     /// Counts a poll. Returns whether a signal since the last poll is a second request to stop.
     fn poll(&mut self, is_signaled: bool) -> bool {
         self.polls += 1;
-        is_signaled && self.polls > Self::SAME_REQUEST
+        is_signaled && self.polls > Self::POLLS_PER_REQUEST
     }
 }
 
 /// Returns the kind of failure for the error of a write. It is temporary if the disk or a quota is full.
 fn kind(error: &io::Error) -> Kind {
     match error.kind() {
-        ErrorKind::StorageFull | ErrorKind::QuotaExceeded | ErrorKind::FileTooLarge => Kind::Short,
+        ErrorKind::StorageFull | ErrorKind::QuotaExceeded | ErrorKind::FileTooLarge => {
+            Kind::ResourceExhausted
+        }
         _ => Kind::Failed,
     }
 }
@@ -475,7 +484,7 @@ fn no_stderr(error: io::Error) -> Failure {
 }
 
 /// Returns the failure that the reader of stdout went away. It has an incomplete recording.
-fn reader_gone(samples: u64) -> Failure {
+fn reader_closed(samples: u64) -> Failure {
     let what = format!("the reader of the recording is gone: it has at most {samples} samples");
     let hint = "see why the program or the connection behind the pipe ended; `scanhub convert` writes a copy with an index";
     Failure::new(Kind::Failed, what, hint)
@@ -486,13 +495,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn distinguishes_second_request_from_signals_of_the_first() {
+    fn second_stop_request_differs_from_repeated_signals() {
         let mut second = SecondStop::default();
         // A signal at every poll, however long each of them takes.
-        assert!((0..SecondStop::SAME_REQUEST).all(|_| !second.poll(true)));
+        assert!((0..SecondStop::POLLS_PER_REQUEST).all(|_| !second.poll(true)));
         assert!(!second.poll(false));
         assert!(second.poll(true));
-        assert!(LOOK_INTERVAL * SecondStop::SAME_REQUEST >= Duration::from_secs(1));
+        assert!(POLL_INTERVAL * SecondStop::POLLS_PER_REQUEST >= Duration::from_secs(1));
     }
 
     fn selected(texts: &[&str], everything: bool, ros2: bool) -> Result<(Vec<String>, Vec<Topic>), Failure> {

@@ -5,23 +5,23 @@
 
 use std::io;
 
-use scanhub_client::streams::{RobotHeard, Sample};
-use scanhub_client::{Heard, Received};
+use scanhub_client::streams::{RobotUpdate, Sample};
+use scanhub_client::{Received, ZonesUpdate};
 use scanhub_schema::{Background, Event, Header, Status, Zones};
 use scanhub_shm::Payload;
 use serde::Serialize;
 
-use crate::output::{End, Output};
+use crate::output::{ExitReason, Output};
 use crate::{json, text};
 
 /// Takes the keys of one line.
 pub trait Keys {
     /// Writes them.
-    fn take(self, keys: impl Serialize) -> Result<(), End>;
+    fn take(self, keys: impl Serialize) -> Result<(), ExitReason>;
 }
 
 impl Keys for &mut Output<'_> {
-    fn take(self, keys: impl Serialize) -> Result<(), End> {
+    fn take(self, keys: impl Serialize) -> Result<(), ExitReason> {
         self.json(&keys)
     }
 }
@@ -29,7 +29,7 @@ impl Keys for &mut Output<'_> {
 /// The payload of a topic.
 pub trait Show {
     /// The line of JSON, given to `to`.
-    fn json(&self, sensor: &str, header: &Header, to: impl Keys) -> Result<(), End>;
+    fn json(&self, sensor: &str, header: &Header, to: impl Keys) -> Result<(), ExitReason>;
 
     /// What stands behind the topic's name on a line for people.
     fn text(&self, header: &Header, line: &mut Vec<u8>) -> io::Result<()>;
@@ -51,7 +51,7 @@ macro_rules! shown {
     };
     (@impl $payload:ty, $function:ident($($header:ident)?)) => {
         impl Show for $payload {
-            fn json(&self, sensor: &str, _header: &Header, to: impl Keys) -> Result<(), End> {
+            fn json(&self, sensor: &str, _header: &Header, to: impl Keys) -> Result<(), ExitReason> {
                 to.take(json::$function(sensor, $(shown!(@ $header _header),)? self))
             }
 
@@ -67,27 +67,27 @@ scanhub_schema::for_each_topic!(shown);
 
 /// Shows the zones as they were received. The caller has checked their age.
 impl Show for Zones {
-    fn json(&self, sensor: &str, header: &Header, to: impl Keys) -> Result<(), End> {
-        to.take(json::zones(sensor, &heard(self, header)))
+    fn json(&self, sensor: &str, header: &Header, to: impl Keys) -> Result<(), ExitReason> {
+        to.take(json::zones(sensor, &zones_update(self, header)))
     }
 
     fn text(&self, header: &Header, line: &mut Vec<u8>) -> io::Result<()> {
-        text::zones(line, &heard(self, header))
+        text::zones(line, &zones_update(self, header))
     }
 }
 
-fn heard(zones: &Zones, header: &Header) -> Heard {
-    Heard { zones: *zones, header: Some(*header), missed: 0, stale: false, said: *zones }
+fn zones_update(zones: &Zones, header: &Header) -> ZonesUpdate {
+    ZonesUpdate { zones: *zones, header: Some(*header), missed: 0, stale: false, as_published: *zones }
 }
 
 /// What was received.
 trait ShowSample {
-    fn json(&self, sensor: &str, to: impl Keys) -> Result<(), End>;
+    fn json(&self, sensor: &str, to: impl Keys) -> Result<(), ExitReason>;
     fn text(&self, line: &mut Vec<u8>) -> io::Result<()>;
 }
 
 impl<P: Payload + Show + ?Sized> ShowSample for Received<P> {
-    fn json(&self, sensor: &str, to: impl Keys) -> Result<(), End> {
+    fn json(&self, sensor: &str, to: impl Keys) -> Result<(), ExitReason> {
         Show::json(&**self, sensor, self.header(), to)
     }
 
@@ -96,8 +96,8 @@ impl<P: Payload + Show + ?Sized> ShowSample for Received<P> {
     }
 }
 
-impl ShowSample for Heard {
-    fn json(&self, sensor: &str, to: impl Keys) -> Result<(), End> {
+impl ShowSample for ZonesUpdate {
+    fn json(&self, sensor: &str, to: impl Keys) -> Result<(), ExitReason> {
         to.take(json::zones(sensor, self))
     }
 
@@ -106,9 +106,9 @@ impl ShowSample for Heard {
     }
 }
 
-impl ShowSample for RobotHeard {
-    fn json(&self, _sensor: &str, to: impl Keys) -> Result<(), End> {
-        to.take(json::robot(&self.robot, &self.heard))
+impl ShowSample for RobotUpdate {
+    fn json(&self, _sensor: &str, to: impl Keys) -> Result<(), ExitReason> {
+        to.take(json::robot(&self.robot, &self.update))
     }
 
     fn text(&self, line: &mut Vec<u8>) -> io::Result<()> {
@@ -119,7 +119,7 @@ impl ShowSample for RobotHeard {
 macro_rules! samples {
     ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
         /// The line of JSON of a sample of `sensor`.
-        pub fn json(sample: &Sample, sensor: &str, to: impl Keys) -> Result<(), End> {
+        pub fn json(sample: &Sample, sensor: &str, to: impl Keys) -> Result<(), ExitReason> {
             match sample {
                 $(Sample::$topic(sample) => sample.json(sensor, to),)*
                 Sample::Robot(sample) => sample.json(sensor, to),

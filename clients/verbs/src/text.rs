@@ -6,10 +6,10 @@ use std::io::{self, Write};
 use std::rc::Rc;
 
 use scanhub_client::streams::Sample;
-use scanhub_client::{Heard, Robot};
+use scanhub_client::{Robot, ZonesUpdate};
 use scanhub_schema::{
     Background, BackgroundHead, Cloud, Early, Event, EventKind, Failure, Flags, Foreground, Header, Lines,
-    Marks, Motion, Obstacle, Obstacles, PacketFacts, PointClass, Reasons, Scan, Status, Telegram, Tilt,
+    Marks, Motion, Obstacle, Obstacles, PacketInfo, PointClass, Reasons, Scan, Status, Telegram, Tilt,
     Tracks, Verdict, in_degrees,
 };
 
@@ -85,20 +85,20 @@ fn numbers(line: &mut Vec<u8>, header: &Header) -> io::Result<()> {
 
 /// What follows the name of a sample of topic `telegram`.
 pub(crate) fn telegram(line: &mut Vec<u8>, header: &Header, bytes: &[u8]) -> io::Result<()> {
-    const SHOWN: usize = 16;
+    const MAX_BYTES_SHOWN: usize = 16;
     numbers(line, header)?;
     let telegram = Telegram { family: header.family(), bytes };
     if telegram.is_lms() {
         write!(line, " address {:02x} command {:02x}", telegram.address(), telegram.command())?;
     }
     match telegram.packets() {
-        Some(PacketFacts { kind, packets: 1, .. }) => write!(line, " {kind} of 1 packet")?,
-        Some(PacketFacts { kind, packets, .. }) => write!(line, " {kind} of {packets} packets")?,
+        Some(PacketInfo { kind, packets: 1, .. }) => write!(line, " {kind} of 1 packet")?,
+        Some(PacketInfo { kind, packets, .. }) => write!(line, " {kind} of {packets} packets")?,
         None => {}
     }
     write!(line, " {} bytes ", bytes.len())?;
-    write!(line, "{}", Hex(&bytes[..bytes.len().min(SHOWN)]))?;
-    if bytes.len() > SHOWN { write!(line, "...") } else { Ok(()) }
+    write!(line, "{}", Hex(&bytes[..bytes.len().min(MAX_BYTES_SHOWN)]))?;
+    if bytes.len() > MAX_BYTES_SHOWN { write!(line, "...") } else { Ok(()) }
 }
 
 /// What follows the name of a sample of topic `scan`.
@@ -188,7 +188,7 @@ pub(crate) fn lines(line: &mut Vec<u8>, header: &Header, lines: &Lines) -> io::R
 
 pub(crate) fn motion(line: &mut Vec<u8>, header: &Header, motion: &Motion) -> io::Result<()> {
     numbers(line, header)?;
-    write!(line, " {}", motion.how())?;
+    write!(line, " {}", motion.method())?;
     if motion.has_step() {
         let Motion { dx_m, dy_m, dyaw_rad, .. } = motion;
         let [sd_x, sd_y, sd_yaw] = [0, 4, 8].map(|at| motion.covariance[at].max(0.0).sqrt());
@@ -221,13 +221,13 @@ pub(crate) fn early(line: &mut Vec<u8>, header: &Header, early: &Early) -> io::R
     write!(line, " {verdict} {distance_mm} mm, beam {beam}, after {bytes_seen} bytes")
 }
 
-pub(crate) fn zones(line: &mut Vec<u8>, heard: &Heard) -> io::Result<()> {
-    let Heard { zones, header, .. } = heard;
+pub(crate) fn zones(line: &mut Vec<u8>, update: &ZonesUpdate) -> io::Result<()> {
+    let ZonesUpdate { zones, header, .. } = update;
     let Some(header) = header else {
         return write!(line, "unknown: no recent data");
     };
     numbers(line, header)?;
-    if heard.stale {
+    if update.stale {
         return write!(line, " unknown: too old");
     }
     write!(line, " {}", zones.verdict().name())?;
@@ -299,7 +299,7 @@ pub(crate) fn tracks(line: &mut Vec<u8>, header: &Header, tracks: &Tracks) -> io
 pub(crate) fn event(line: &mut Vec<u8>, header: &Header, event: &Event) -> io::Result<()> {
     numbers(line, header)?;
     write!(line, " ")?;
-    event_words(line, event)
+    event_text(line, event)
 }
 
 /// Writes an event as a sentence.
@@ -307,7 +307,7 @@ pub(crate) fn event(line: &mut Vec<u8>, header: &Header, event: &Event) -> io::R
 /// # Errors
 ///
 /// Returns the error of the write.
-pub fn event_words(line: &mut Vec<u8>, event: &Event) -> io::Result<()> {
+pub fn event_text(line: &mut Vec<u8>, event: &Event) -> io::Result<()> {
     let (id, room) = (event.id, event.room_name().unwrap_or("no room"));
     match (event.kind(), event.door()) {
         (_, Some((door, from, to))) => write!(line, "{id} went from {from} to {to} through {door}"),
@@ -337,7 +337,7 @@ pub(crate) fn cloud(line: &mut Vec<u8>, header: &Header, cloud: &Cloud) -> io::R
     if cloud.has(Cloud::LAST) {
         write!(line, ", the last")?;
     }
-    sweep_words(line, cloud.has(Cloud::COMPLETE), cloud.has(Cloud::UNRELIABLE))
+    sweep_text(line, cloud.has(Cloud::COMPLETE), cloud.has(Cloud::UNRELIABLE))
 }
 
 /// Writes number and stamp of a sweep, and its obstacles.
@@ -359,10 +359,10 @@ pub fn obstacles(line: &mut Vec<u8>, header: &Header, found: &Obstacles) -> io::
     if found.dropped > 0 {
         write!(line, ", {} dropped", found.dropped)?;
     }
-    sweep_words(line, found.has(Obstacles::COMPLETE), found.has(Obstacles::UNRELIABLE))
+    sweep_text(line, found.has(Obstacles::COMPLETE), found.has(Obstacles::UNRELIABLE))
 }
 
-fn sweep_words(line: &mut Vec<u8>, is_complete: bool, is_unreliable: bool) -> io::Result<()> {
+fn sweep_text(line: &mut Vec<u8>, is_complete: bool, is_unreliable: bool) -> io::Result<()> {
     if !is_complete {
         write!(line, ", incomplete")?;
     }
@@ -375,12 +375,16 @@ mod tests {
     use scanhub_schema::Zones;
 
     #[test]
-    fn what_is_not_known_is_not_called_far() {
+    fn unknown_verdict_is_printed_without_a_distance() {
         let text = |verdict: Verdict| {
             let zones = Zones { verdict: verdict as u8, ..Zones::unknown() };
             let mut line = Vec::new();
             let header = Some(Header::default());
-            super::zones(&mut line, &Heard { zones, header, missed: 0, stale: false, said: zones }).unwrap();
+            super::zones(
+                &mut line,
+                &ZonesUpdate { zones, header, missed: 0, stale: false, as_published: zones },
+            )
+            .unwrap();
             String::from_utf8(line).unwrap()
         };
         assert!(text(Verdict::Clear).ends_with(" clear nothing near"));

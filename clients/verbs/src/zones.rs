@@ -1,7 +1,7 @@
 //! `scanhub zones SENSOR mask`: learns what a sensor sees of its own robot, and prints a configuration with which the
 //! hub ignores it. `body` decides what belongs to the robot. Printing changes nothing by itself.
 
-mod body;
+mod body_mask;
 
 use std::fmt::Write as _;
 use std::fs::File;
@@ -14,11 +14,11 @@ use scanhub_client::streams::Sample;
 use scanhub_schema::{Failure, Kind, Pose, Quality, Topic, check_sensor};
 use serde::Serialize;
 
-use self::body::{Body, Mask, SLICES, Sector};
+use self::body_mask::{Body, Mask, SLICE_COUNT, Sector};
 use crate::context::Context;
-use crate::follow::{Bounds, Event, Following, Notice};
-use crate::names::{TopicName, as_word};
-use crate::output::{End, Output, quiet};
+use crate::follow::{Event, Notice, RunLimits, TopicRun};
+use crate::names::{TopicName, as_argument};
+use crate::output::{ExitReason, Output, verb_result};
 use crate::{duration, text};
 
 /// Learn which part of a sensor's view is the robot itself
@@ -28,11 +28,11 @@ pub struct ZonesArgs {
     /// The sensor
     sensor: String,
     #[command(subcommand)]
-    order: Order,
+    order: ZonesCommand,
 }
 
 #[derive(Clone, Debug, Subcommand)]
-enum Order {
+enum ZonesCommand {
     /// Learn what the sensor sees of its own robot, and print it as configuration. Place the robot in an open area with
     /// nobody near it
     #[command(after_help = "Example:\n  scanhub zones front mask --for 10s")]
@@ -59,10 +59,10 @@ impl ZonesArgs {
     /// - [`Kind::Failed`] if the hub went away, or the sensor's settings changed meanwhile.
     /// - [`Kind::Interrupted`] if a signal stops the run.
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
-        let (places, stop) = (context.domain.places()?, context.signals.stop()?);
-        let (sensor, Order::Mask { run_for, within }) = (&self.sensor, &self.order);
-        as_word(check_sensor(sensor))?;
-        if let Some(within_m) = within.filter(|metres| !(0.001..=FARTHEST_M).contains(metres)) {
+        let (locations, stop) = (context.domain.locations()?, context.signals.stop()?);
+        let (sensor, ZonesCommand::Mask { run_for, within }) = (&self.sensor, &self.order);
+        as_argument(check_sensor(sensor))?;
+        if let Some(within_m) = within.filter(|metres| !(0.001..=MAX_DISTANCE_M).contains(metres)) {
             let message = format!("--within {within_m} is no radius");
             return Err(Failure::new(
                 Kind::Configuration,
@@ -77,8 +77,8 @@ impl ZonesArgs {
         let topics = [Topic::Status, Topic::Zones, Topic::Scan];
         let names: Vec<_> =
             topics.into_iter().map(|topic| TopicName { sensor: sensor.clone(), topic }).collect();
-        let bounds = Bounds { run_for: Some(*run_for), ..Bounds::default() };
-        let mut look = Look {
+        let limits = RunLimits { run_for: Some(*run_for), ..RunLimits::default() };
+        let mut observation = Observation {
             run_for: *run_for,
             since: Instant::now(),
             pose: None,
@@ -88,19 +88,21 @@ impl ZonesArgs {
             body: None,
             is_shown: context.notes.is_terminal().then_some(false),
             notes: &mut context.notes,
-            told: 0,
+            shown_seconds: 0,
         };
-        let end = quiet(look.run(&mut Following::new(&names, &[], &places, &bounds, &stop)));
-        look.clear();
+        let end = verb_result(observation.run(&mut TopicRun::new(&names, &[], &locations, &limits, &stop)));
+        observation.clear();
         end?;
-        let (body, within_mm) = look.seen(sensor)?;
+        let (body, within_mm) = observation.result(sensor)?;
         let (scans, mask) = (body.scans(), body.mask());
-        let is_violated = look.is_violated();
-        let found = Found { sensor, run_for: *run_for, within_mm, scans, mask, is_violated };
+        let is_violated = observation.is_violated();
+        let found = MaskReport { sensor, run_for: *run_for, within_mm, scans, mask, is_violated };
         let mut notes = Output::new(&mut context.notes);
-        quiet(found.doubts().iter().try_for_each(|doubt| notes.line(|line| write!(line, "{doubt}"))))?;
+        verb_result(
+            found.warnings().iter().try_for_each(|warning| notes.line(|line| write!(line, "{warning}"))),
+        )?;
         let mut output = Output::new(&mut context.out);
-        quiet(if context.json {
+        verb_result(if context.json {
             output.json(&found.object())
         } else {
             found.toml().lines().try_for_each(|text| output.line(|line| write!(line, "{text}")))
@@ -109,7 +111,7 @@ impl ZonesArgs {
 }
 
 /// What comes in while one looks.
-struct Look<'a> {
+struct Observation<'a> {
     run_for: Duration,
     since: Instant,
     pose: Option<Pose>,
@@ -123,12 +125,12 @@ struct Look<'a> {
     /// Whether the line of progress is shown; `None` if `notes` is not a terminal, which never has the line.
     is_shown: Option<bool>,
     /// Number of seconds whose progress was shown.
-    told: u64,
+    shown_seconds: u64,
 }
 
-impl Look<'_> {
+impl Observation<'_> {
     /// What was seen, if it is enough to tell a body from noise.
-    fn seen(&self, sensor: &str) -> Result<(&Body, f64), Failure> {
+    fn result(&self, sensor: &str) -> Result<(&Body, f64), Failure> {
         let few = |message: String, hint: String| Err(Failure::new(Kind::Timeout, message, hint));
         let see = format!("`scanhub info {sensor}` shows its state");
         if self.pose.is_none() {
@@ -139,10 +141,10 @@ impl Look<'_> {
         };
         match &self.body {
             None => few(format!("no scan of {sensor} arrived in {:?}", self.run_for), see),
-            Some(body) if body.scans() < LEAST_SCANS || 2 * body.seen_slices() < SLICES => {
+            Some(body) if body.scans() < MIN_SCANS || 2 * body.slice_count() < SLICE_COUNT => {
                 let message =
                     format!("only {} scans of {sensor} arrived in {:?}", body.scans(), self.run_for);
-                few(message, format!("{LEAST_SCANS} are needed, spread over the time: use a longer --for"))
+                few(message, format!("{MIN_SCANS} are needed, spread over the time: use a longer --for"))
             }
             Some(body) => Ok((body, within_mm)),
         }
@@ -150,15 +152,15 @@ impl Look<'_> {
 
     /// The largest circle is violated all the while.
     fn is_violated(&self) -> bool {
-        self.verdicts > 0 && f64::from(self.violated) >= ALL_THE_WHILE * f64::from(self.verdicts)
+        self.verdicts > 0 && f64::from(self.violated) >= MIN_VIOLATED_SHARE * f64::from(self.verdicts)
     }
 
     fn slice(&self) -> usize {
         let share = self.since.elapsed().as_secs_f64() / self.run_for.as_secs_f64();
-        ((share * SLICES as f64) as usize).min(SLICES - 1)
+        ((share * SLICE_COUNT as f64) as usize).min(SLICE_COUNT - 1)
     }
 
-    fn run(&mut self, following: &mut Following<'_>) -> Result<(), End> {
+    fn run(&mut self, following: &mut TopicRun<'_>) -> Result<(), ExitReason> {
         while let Some(event) = following.next(None)? {
             match event {
                 Event::Sample(name, sample, _) => self.sample(&name, &sample)?,
@@ -170,11 +172,11 @@ impl Look<'_> {
         Ok(())
     }
 
-    fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
+    fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), ExitReason> {
         match sample {
             Sample::Status(status) => self.pose = Some(status.pose),
-            Sample::Zones(heard) => {
-                let Some(largest) = heard.zones.zones().first() else { return Ok(()) };
+            Sample::Zones(update) => {
+                let Some(largest) = update.zones.zones().first() else { return Ok(()) };
                 self.within_mm.get_or_insert(f64::from(largest.radius_mm));
                 self.verdicts += 1;
                 self.violated += u32::from(largest.violated != 0);
@@ -195,7 +197,7 @@ impl Look<'_> {
         Ok(())
     }
 
-    fn notice(&mut self, names: &[Rc<TopicName>], notice: Notice) -> Result<(), End> {
+    fn notice(&mut self, names: &[Rc<TopicName>], notice: Notice) -> Result<(), ExitReason> {
         if notice == Notice::HubGone {
             return Err(Failure::new(Kind::Failed, "the hub went away", "try again when it is back").into());
         }
@@ -205,8 +207,8 @@ impl Look<'_> {
 
     fn tick(&mut self, now: Instant) {
         let seconds = (now - self.since).as_secs();
-        if seconds >= self.told {
-            self.told = seconds + 1;
+        if seconds >= self.shown_seconds {
+            self.shown_seconds = seconds + 1;
             let scans = self.body.as_ref().map_or(0, Body::scans);
             if let Some(is_shown) = &mut self.is_shown {
                 let _ = write!(
@@ -229,7 +231,7 @@ impl Look<'_> {
 }
 
 /// What was found, to be told.
-struct Found<'a> {
+struct MaskReport<'a> {
     sensor: &'a str,
     run_for: Duration,
     within_mm: f64,
@@ -239,11 +241,11 @@ struct Found<'a> {
     is_violated: bool,
 }
 
-impl Found<'_> {
+impl MaskReport<'_> {
     /// What a person should check before using the mask.
-    fn doubts(&self) -> Vec<String> {
-        let within = metres(self.within_mm as u32);
-        let mut doubts = Vec::new();
+    fn warnings(&self) -> Vec<String> {
+        let within = meters(self.within_mm as u32);
+        let mut warnings = Vec::new();
         if self.mask.sectors.is_empty() {
             let so = if self.is_violated {
                 // The hub adds zones.margin to its circles, and keeps it to itself.
@@ -252,23 +254,23 @@ impl Found<'_> {
             } else {
                 "no mask is needed"
             };
-            doubts.push(format!("nothing of the robot is seen within {within} m of its centre: {so}"));
+            warnings.push(format!("nothing of the robot is seen within {within} m of its centre: {so}"));
         }
         for Sector { from_mdeg, to_mdeg, range_mm, .. } in &self.mask.moving {
             let (from, to) = (degrees(*from_mdeg), degrees(*to_mdeg));
-            doubts.push(format!(
+            warnings.push(format!(
                 "from {from} to {to} degrees something moved, at {} m and farther: left out. Try again with nobody near",
-                metres(*range_mm)
+                meters(*range_mm)
             ));
         }
-        if self.beams() * MOST_SHARE > self.mask.of_beams {
-            doubts.push(format!(
+        if self.beams() * HIDDEN_VIEW_DIVISOR > self.mask.of_beams {
+            warnings.push(format!(
                 "{} of {} beams are hidden: the hub will be blind there. Try in an open area, with nothing else within {within} m",
                 self.beams(),
                 self.mask.of_beams
             ));
         }
-        doubts
+        warnings
     }
 
     fn beams(&self) -> usize {
@@ -277,10 +279,10 @@ impl Found<'_> {
 
     /// The section of the link that masks the body.
     fn toml(&self) -> String {
-        let Found { sensor, run_for, scans, mask, .. } = self;
+        let MaskReport { sensor, run_for, scans, mask, .. } = self;
         let mut text = format!(
             "# What {sensor} sees of its own robot within {} m of the centre: {} of {} beams, from {scans} scans in {run_for:?}.\n",
-            metres(self.within_mm as u32),
+            meters(self.within_mm as u32),
             self.beams(),
             mask.of_beams
         );
@@ -291,7 +293,7 @@ impl Found<'_> {
         }
         text += "body_mask = [\n";
         for Sector { from_mdeg, to_mdeg, range_mm, .. } in &mask.sectors {
-            let (from, to, range) = (degrees(*from_mdeg), degrees(*to_mdeg), metres(*range_mm));
+            let (from, to, range) = (degrees(*from_mdeg), degrees(*to_mdeg), meters(*range_mm));
             let _ = writeln!(text, "    {{ from_deg = {from}, to_deg = {to}, range = {range} }},");
         }
         text + "]\n"
@@ -300,7 +302,7 @@ impl Found<'_> {
     /// Class `mask`.
     fn object(&self) -> impl Serialize {
         #[derive(Serialize)]
-        struct Line<'a> {
+        struct MaskJson<'a> {
             class: &'static str,
             sensor: &'a str,
             seconds: f64,
@@ -323,7 +325,7 @@ impl Found<'_> {
             to_deg: f64::from(sector.to_mdeg) / 1000.0,
             range: f64::from(sector.range_mm) / 1000.0,
         };
-        Line {
+        MaskJson {
             class: "mask",
             sensor: self.sensor,
             seconds: self.run_for.as_secs_f64(),
@@ -338,7 +340,7 @@ impl Found<'_> {
 }
 
 /// As TOML has it: 1000 is 1.0.
-fn metres(mm: u32) -> String {
+fn meters(mm: u32) -> String {
     format!("{:?}", f64::from(mm) / 1000.0)
 }
 
@@ -347,10 +349,10 @@ fn degrees(mdeg: i32) -> String {
 }
 
 /// Fewer tell little of noise: five in each slice.
-const LEAST_SCANS: u32 = 50;
+const MIN_SCANS: u32 = 50;
 /// Of the zones' samples, so that one scan without a reading changes nothing.
-const ALL_THE_WHILE: f64 = 0.9;
+const MIN_VIOLATED_SHARE: f64 = 0.9;
 /// As large as a circle of the zones may be.
-const FARTHEST_M: f64 = 65.0;
+const MAX_DISTANCE_M: f64 = 65.0;
 /// A robot hides at most the third part of its sensor's view; more will be the room around it.
-const MOST_SHARE: usize = 3;
+const HIDDEN_VIEW_DIVISOR: usize = 3;

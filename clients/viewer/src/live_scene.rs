@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use scanhub_client::streams::{Join, Sample};
 use scanhub_client::{clock, live_topics};
-use scanhub_schema::{Foreground, Header, Maker, Scan, Topic};
+use scanhub_schema::{Foreground, Header, PublisherKind, Scan, Topic};
 use scanhub_shm::Domain;
 use scanhub_verbs::follow::Notice;
 use scanhub_verbs::names::TopicName;
@@ -30,25 +30,26 @@ pub(crate) const TOPICS: [Topic; 8] = [
 /// Returns the topics in `wanted` of the named `sensors`, and the topics of every sensor. Without names, these are all
 /// sensors of a hub and all programs that publish. If a name belongs to a program, in the first live domain of
 /// `places`, the sensors are followed too.
-pub(crate) fn followed(
+pub(crate) fn topics_to_follow(
     sensors: &[String],
-    wanted: &[Topic],
-    places: &[Domain],
+    requested: &[Topic],
+    locations: &[Domain],
 ) -> (Vec<TopicName>, Vec<Topic>) {
-    let live = live_topics(places);
-    let maker = |sensor: &str| {
+    let live = live_topics(locations);
+    let publisher_kind = |sensor: &str| {
         let is_live = |topic: &&Topic| live.contains(&format!("{sensor}/{}", topic.name()));
-        wanted.iter().find(is_live).map_or(Maker::Link, |topic| topic.maker())
+        requested.iter().find(is_live).map_or(PublisherKind::Link, |topic| topic.publisher_kind())
     };
     let named = |sensor: &String| {
-        let maker = maker(sensor);
-        let of = wanted.iter().filter(move |topic| topic.maker() == maker);
+        let kind = publisher_kind(sensor);
+        let of = requested.iter().filter(move |topic| topic.publisher_kind() == kind);
         of.map(|topic| TopicName { sensor: sensor.clone(), topic: *topic }).collect::<Vec<_>>()
     };
     let names: Vec<_> = sensors.iter().flat_map(named).collect();
-    let has_other = names.iter().any(|name| name.topic.maker() != Maker::Link);
-    let of_all = |topic: &&Topic| names.is_empty() || has_other && topic.maker() == Maker::Link;
-    let of_all = wanted.iter().filter(of_all).copied().collect();
+    let has_other = names.iter().any(|name| name.topic.publisher_kind() != PublisherKind::Link);
+    let of_all =
+        |topic: &&Topic| names.is_empty() || has_other && topic.publisher_kind() == PublisherKind::Link;
+    let of_all = requested.iter().filter(of_all).copied().collect();
     (names, of_all)
 }
 
@@ -70,7 +71,7 @@ pub(crate) type Pair = (StampedScan, Box<Foreground>);
 impl LiveScene {
     /// Adds the sensor of a link's topic that will be followed.
     pub(crate) fn begin(&mut self, name: &TopicName) {
-        if name.topic.maker() == Maker::Link {
+        if name.topic.publisher_kind() == PublisherKind::Link {
             self.scene.sensor(&name.sensor);
         }
     }
@@ -82,14 +83,14 @@ impl LiveScene {
             self.scene.take_tracks(&name.sensor, tracks, now_ns);
             return None;
         }
-        let sensor = self.scene.heard(&name.sensor, sample.header());
+        let sensor = self.scene.sensor_of_sample(&name.sensor, sample.header());
         match sample {
             Sample::Scan(scan) => return self.take_scan(&name.sensor, scan.header(), scan, now_ns),
             Sample::Foreground(found) => {
                 return self.take_foreground(&name.sensor, found.header(), found, now_ns);
             }
             Sample::Marks(marks) => sensor.marks = marks.is_available().then_some(**marks),
-            Sample::Zones(heard) => sensor.zones = heard.zones,
+            Sample::Zones(update) => sensor.zones = update.zones,
             Sample::Background(model) => sensor.background = Some(model.boxed()),
             Sample::Lines(lines) => sensor.lines = Some(Box::new(**lines)),
             Sample::Status(status) => sensor.take_status(status),
@@ -128,23 +129,23 @@ impl LiveScene {
     }
 
     /// Takes a notice about the streams of `names`.
-    pub(crate) fn note(&mut self, names: &[Rc<TopicName>], notice: &Notice) {
+    pub(crate) fn take_notice(&mut self, names: &[Rc<TopicName>], notice: &Notice) {
         match (notice, names) {
             (Notice::Missed(missed), [name]) if name.topic == Topic::Scan => {
                 self.scene.sensor(&name.sensor).lost += *missed;
             }
             (Notice::NoHub(_) | Notice::HubGone, _) => {
                 self.joins.clear();
-                self.scene.hub_gone();
+                self.scene.on_hub_exit();
             }
-            (Notice::HubBack, _) => self.scene.hub_lives = true,
+            (Notice::HubBack, _) => self.scene.hub_is_running = true,
             _ => {}
         }
     }
 
     /// Deletes data that is too old. Returns whether there was any.
-    pub(crate) fn age(&mut self) -> bool {
-        self.scene.age(clock::now_ns())
+    pub(crate) fn expire(&mut self) -> bool {
+        self.scene.expire(clock::now_ns())
     }
 
     /// Drops samples whose partners do not come. Call it when all samples that have arrived were taken.
@@ -178,9 +179,9 @@ impl CpuUsage {
         if self.pid != pid {
             *self = CpuUsage { pid, samples: VecDeque::new() };
         }
-        if self.samples.back().is_none_or(|(at, _)| now - *at >= INTERVAL) {
+        if self.samples.back().is_none_or(|(at, _)| now - *at >= MEASUREMENT_INTERVAL) {
             self.samples.push_back((now, used_ns(pid)?));
-            while self.samples.len() > SAMPLES {
+            while self.samples.len() > MAX_MEASUREMENTS {
                 self.samples.pop_front();
             }
         }
@@ -206,9 +207,9 @@ fn used_ns(pid: u32) -> Option<u64> {
 const TICK_NS: u64 = 10_000_000;
 
 /// Minimum interval between measurements.
-const INTERVAL: Duration = Duration::from_secs(1);
+const MEASUREMENT_INTERVAL: Duration = Duration::from_secs(1);
 /// Number of measurements that are kept.
-const SAMPLES: usize = 6;
+const MAX_MEASUREMENTS: usize = 6;
 
 #[cfg(test)]
 mod tests {
@@ -216,7 +217,7 @@ mod tests {
     use scanhub_schema::{ForegroundHead, ScanHead, Status};
 
     #[test]
-    fn scan_is_shown_at_once_and_leaves_a_trail_with_its_foreground() {
+    fn scan_is_shown_at_once_and_foreground_as_a_trail() {
         let mut live = LiveScene::default();
         live.scene.sensor("front").take_status(&Status::default());
         let header = |seq| Header { seq, ..Header::default() };
@@ -235,7 +236,7 @@ mod tests {
         let ((joined, _), _) = live.take_scan("front", &header(5), &scan, 2).expect("a pair");
         assert_eq!((joined.seq, count(&live)), (5, (9, 2)));
         live.take_scan("front", &header(6), &scan, 3);
-        live.note(&[], &Notice::HubGone);
+        live.take_notice(&[], &Notice::HubGone);
         assert!(live.take_foreground("front", &header(6), &found, 4).is_none(), "the hub has exited");
     }
 
@@ -250,7 +251,7 @@ mod tests {
         while used_ns(me).unwrap() == before && begin.elapsed() < Duration::from_secs(20) {
             sum = std::hint::black_box(sum + 1);
         }
-        assert!(cpu.measure(me, begin + INTERVAL).unwrap() > 0.0);
+        assert!(cpu.measure(me, begin + MEASUREMENT_INTERVAL).unwrap() > 0.0);
         assert_eq!(cpu.measure(u32::MAX, begin), None);
     }
 }

@@ -47,7 +47,7 @@ pub struct Scene {
     /// People of each tracker, by the tracker's name.
     pub trackers: Vec<(String, People)>,
     /// Whether a hub runs.
-    pub hub_lives: bool,
+    pub hub_is_running: bool,
     /// Process ID of the hub; 0 if it is unknown, or if the hub runs on another machine.
     pub hub_pid: u32,
     /// CPU time of the hub in percent of one processor.
@@ -66,9 +66,9 @@ impl Scene {
 
     /// Returns the sensor from which a sample with this `header` arrived. A header proves that a hub runs, and names
     /// its process unless the sensor is remote.
-    pub fn heard(&mut self, name: &str, header: Option<&Header>) -> &mut Sensor {
+    pub fn sensor_of_sample(&mut self, name: &str, header: Option<&Header>) -> &mut Sensor {
         if let Some(header) = header {
-            self.hub_lives = true;
+            self.hub_is_running = true;
             if !is_remote(name) {
                 self.hub_pid = header.hub_pid;
             }
@@ -109,27 +109,27 @@ impl Scene {
     }
 
     /// Deletes scans, trails and people that are too old at `now_ns`. Returns whether there were any.
-    pub fn age(&mut self, now_ns: u64) -> bool {
+    pub fn expire(&mut self, now_ns: u64) -> bool {
         let mut any = false;
         for sensor in &mut self.sensors {
-            any |= sensor.age(now_ns);
+            any |= sensor.expire(now_ns);
         }
         for (_, people) in &mut self.trackers {
-            any |= people.age(now_ns);
+            any |= people.expire(now_ns);
         }
         any
     }
 
     /// Deletes the line features, when no one looks at them any more.
-    pub fn forget_lines(&mut self) {
+    pub fn delete_lines(&mut self) {
         self.sensors.iter_mut().for_each(|sensor| sensor.lines = None);
     }
 
     /// Deletes all data of a hub that has exited, except for the background, which is only drawn.
-    pub fn hub_gone(&mut self) {
-        (self.hub_lives, self.hub_pid, self.hub_percent) = (false, 0, None);
+    pub fn on_hub_exit(&mut self) {
+        (self.hub_is_running, self.hub_pid, self.hub_percent) = (false, 0, None);
         self.trackers.clear();
-        self.sensors.iter_mut().for_each(Sensor::hub_gone);
+        self.sensors.iter_mut().for_each(Sensor::on_hub_exit);
     }
 }
 
@@ -203,19 +203,19 @@ mod tests {
     use scanhub_schema::{Scan, ScanHead, Status, Track, TrackSensor, Zones};
 
     #[test]
-    fn deletes_old_scans_and_the_verdict_of_a_hub_that_exited() {
-        let mut scene = Scene { hub_lives: true, ..Scene::default() };
+    fn deletes_old_scans_and_verdicts_of_an_exited_hub() {
+        let mut scene = Scene { hub_is_running: true, ..Scene::default() };
         let sensor = scene.sensor("front");
         sensor.take_scan(&Header { period_us: 500_000, ..Header::default() }, &Box::<Scan>::default(), 7);
         sensor.zones = Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() };
-        assert!(!scene.age(1_500_000_006) && scene.age(1_500_000_007) && !scene.age(u64::MAX));
+        assert!(!scene.expire(1_500_000_006) && scene.expire(1_500_000_007) && !scene.expire(u64::MAX));
         assert!(scene.sensors[0].scan.is_none());
         let trail = |scene: &Scene| scene.sensors[0].trail.points().count();
         assert_eq!(trail(&scene), 0, "nothing stood before the background");
         assert_eq!(verdict(scene.sensors.iter()).0, Verdict::Clear, "the verdict expires separately");
-        scene.hub_gone();
+        scene.on_hub_exit();
         assert_eq!(verdict(scene.sensors.iter()), (Verdict::Unknown, Some("front"), None));
-        assert!(!scene.hub_lives);
+        assert!(!scene.hub_is_running);
     }
 
     #[test]
@@ -238,7 +238,7 @@ mod tests {
         assert_eq!(scene.sensors.len(), 1, "a tracker is not a sensor");
         scene.sensor("rear").take_status(&status);
         assert_eq!(scene.sensors[1].placement, SensorPlacement::OnRobot(status.pose));
-        assert!(scene.age(2_000_000_000) && scene.people().count() == 0);
+        assert!(scene.expire(2_000_000_000) && scene.people().count() == 0);
     }
 
     #[test]
@@ -263,7 +263,7 @@ mod tests {
     }
 
     #[test]
-    fn circle_has_the_worst_verdict_of_all_sensors_and_the_points_inside() {
+    fn circle_has_worst_verdict_and_the_points_inside() {
         let mut scene = Scene::default();
         for (name, range_mm) in [("front", 900), ("rear", 300)] {
             let mut zones = Zones { count: 2, ..Zones::unknown() };
@@ -276,11 +276,11 @@ mod tests {
             let scan = Scan::of(ScanHead::lms(3, 0, 1000, 1, 13), &[range_mm, 8000, 1]);
             sensor.take_scan(&Header::default(), &scan, 0);
         }
-        let around = circles(scene.sensors.iter());
-        let verdicts: Vec<_> = around.iter().map(|circle| (circle.radius_m, circle.verdict)).collect();
+        let zone_circles = circles(scene.sensors.iter());
+        let verdicts: Vec<_> = zone_circles.iter().map(|circle| (circle.radius_m, circle.verdict)).collect();
         assert_eq!(verdicts, [(1.0, Verdict::Slow), (0.5, Verdict::Stop)]);
         let inside = |n: usize, of: usize| {
-            around[n].inside(&scene.sensors[of]).map(|point| point.beam).collect::<Vec<_>>()
+            zone_circles[n].inside(&scene.sensors[of]).map(|point| point.beam).collect::<Vec<_>>()
         };
         assert_eq!((inside(0, 0), inside(0, 1)), (vec![0, 2], vec![0, 2]));
         assert!(inside(1, 0).is_empty(), "not violated in its view, however near one beam is");
@@ -291,6 +291,6 @@ mod tests {
             Verdict::Clear,
             "the other sensor is not on the robot"
         );
-        assert_eq!(around[1].inside(&scene.sensors[1]).count(), 0);
+        assert_eq!(zone_circles[1].inside(&scene.sensors[1]).count(), 0);
     }
 }

@@ -34,9 +34,9 @@ pub use http::AccessPolicy;
 /// Maximum number of connections, including those that only fetch the page.
 const MAX_CONNECTIONS: usize = 64;
 /// Number of ports after the configured one that are tried if it is in use.
-const PORTS: u16 = 20;
+const PORT_ATTEMPTS: u16 = 20;
 /// Size of the kernel's send buffer in bytes. It is small, because data in it grows old if the client is slow.
-const SEND_BUFFER: usize = 64 << 10;
+const SEND_BUFFER_LEN: usize = 64 << 10;
 /// Time without accepting connections after descriptors ran out. Otherwise, the waiting connection would keep the
 /// thread busy.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(200);
@@ -54,7 +54,7 @@ pub enum Event {
     /// A viewer connected or disconnected.
     Viewer(ViewerEvent),
     /// Connections cannot be accepted, because the system is short of something.
-    Short(io::Error),
+    ResourceExhausted(io::Error),
 }
 
 /// A viewer connected or disconnected.
@@ -86,7 +86,7 @@ impl Server {
     ///
     /// Returns [`Kind::Failed`] if no port is free, or if the address does not belong to this machine.
     pub fn bind(address: SocketAddr, policy: AccessPolicy) -> Result<Server, Failure> {
-        let last = if address.port() == 0 { 0 } else { address.port().saturating_add(PORTS) };
+        let last = if address.port() == 0 { 0 } else { address.port().saturating_add(PORT_ATTEMPTS) };
         let mut in_use = None;
         for port in address.port()..=last {
             match TcpListener::bind(SocketAddr::new(address.ip(), port)) {
@@ -152,7 +152,7 @@ impl Server {
                 paused_until = Some(now + ACCEPT_PAUSE);
                 if report_at.is_none_or(|at| now >= at) {
                     report_at = Some(now + REPORT_INTERVAL);
-                    let _ = events.send(Event::Short(error));
+                    let _ = events.send(Event::ResourceExhausted(error));
                 }
             }
         }
@@ -210,7 +210,7 @@ impl Server {
                 connections.remove(silent);
             }
             let _ = stream.set_nodelay(true);
-            let _ = set_socket_send_buffer_size(&stream, SEND_BUFFER);
+            let _ = set_socket_send_buffer_size(&stream, SEND_BUFFER_LEN);
             connections.push(Connection::new(stream, address, now));
         }
     }

@@ -14,15 +14,15 @@ use std::time::{Duration, Instant};
 
 use clap::Args;
 use scanhub_client::request;
-use scanhub_schema::{Background, Failure, Kind, Request, Topic, Verb, check_followed, is_remote};
+use scanhub_schema::{Background, Failure, Kind, Request, Topic, Verb, check_any_sensor, is_remote};
 use scanhub_shm::Domain;
-use scanhub_verbs::Bounds;
+use scanhub_verbs::RunLimits;
 use scanhub_verbs::context::Context;
-use scanhub_verbs::follow::{Event, Following, Notice};
-use scanhub_verbs::names::as_word;
-use scanhub_verbs::output::{End, colors, quiet};
+use scanhub_verbs::follow::{Event, Notice, TopicRun};
+use scanhub_verbs::names::as_argument;
+use scanhub_verbs::output::{ExitReason, colors, verb_result};
 
-use crate::live_scene::{LiveScene, TOPICS, followed};
+use crate::live_scene::{LiveScene, TOPICS, topics_to_follow};
 use crate::scene::Scene;
 use terminal::{Input, Key, Terminal};
 use view::{View, ViewCommand};
@@ -35,7 +35,7 @@ pub struct WatchArgs {
     #[arg(value_name = "SENSOR")]
     sensors: Vec<String>,
     #[command(flatten)]
-    limits: Bounds,
+    limits: RunLimits,
 }
 
 const AFTER_HELP: &str = "\
@@ -64,7 +64,7 @@ impl WatchArgs {
     /// - [`Kind::NoHub`], [`Kind::NoTopic`] and [`Kind::Timeout`] as for `echo`.
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
         // Every signal that ends the run must restore the terminal.
-        let (places, stop) = (context.domain.places()?, context.signals.any_end()?);
+        let (locations, stop) = (context.domain.locations()?, context.signals.any_stop()?);
         let json = context.json;
         if json || !can_show_pictures() {
             let sensor = self.sensors.first().map_or("robot/zones".to_owned(), |name| format!("{name}/scan"));
@@ -72,7 +72,7 @@ impl WatchArgs {
             let what = if json { "a picture is no JSON" } else { "the picture needs a terminal" };
             return Err(Failure::new(Kind::Usage, what, hint));
         }
-        self.show("", &places, &mut context.out, &stop)
+        self.show("", &locations, &mut context.out, &stop)
     }
 
     /// Does the same as [`run`](Self::run) with a `note` next to the keys, and without checking for a terminal.
@@ -83,18 +83,18 @@ impl WatchArgs {
     pub fn show(
         &self,
         note: &str,
-        places: &[Domain],
+        locations: &[Domain],
         out: &mut dyn Write,
         stop: &AtomicBool,
     ) -> Result<(), Failure> {
-        self.sensors.iter().try_for_each(|sensor| as_word(check_followed(sensor)))?;
-        let (names, topics) = followed(&self.sensors, &TOPICS, places);
+        self.sensors.iter().try_for_each(|sensor| as_argument(check_any_sensor(sensor)))?;
+        let (names, topics) = topics_to_follow(&self.sensors, &TOPICS, locations);
         let end = Terminal::new(out).and_then(|terminal| {
             let mut watcher = Watcher {
-                places,
-                is_bounded: self.limits.bounded(),
+                locations,
+                is_bounded: self.limits.is_bounded(),
                 live: LiveScene::default(),
-                held: None,
+                held_scene: None,
                 view: View { note: note.to_owned(), ..View::new(colors()) },
                 terminal,
                 request: BackgroundRequest::default(),
@@ -102,10 +102,10 @@ impl WatchArgs {
                 draw_at: Instant::now(),
                 message_until: None,
             };
-            let following = Following::new(&names, &topics, places, &self.limits, stop);
-            watcher.follow(&mut following.despite_shortage())
+            let following = TopicRun::new(&names, &topics, locations, &self.limits, stop);
+            watcher.follow(&mut following.tolerating_shortage())
         });
-        quiet(end)
+        verb_result(end)
     }
 }
 
@@ -116,12 +116,12 @@ pub fn can_show_pictures() -> bool {
 
 struct Watcher<'a> {
     /// Locations where the domain may be.
-    places: &'a [Domain],
+    locations: &'a [Domain],
     /// Whether the run ends by itself, so that Ctrl-C is a failure.
     is_bounded: bool,
     live: LiveScene,
     /// Scene of the frozen picture. Its verdict and the lines of sensors are still live.
-    held: Option<Scene>,
+    held_scene: Option<Scene>,
     view: View,
     terminal: Terminal<'a>,
     request: BackgroundRequest,
@@ -134,14 +134,14 @@ struct Watcher<'a> {
 
 impl Watcher<'_> {
     /// Shows a message in place of the keys.
-    fn say(&mut self, message: String, now: Instant) {
+    fn show_message(&mut self, message: String, now: Instant) {
         self.view.message = message;
         self.message_until = Some(now + MESSAGE_TIME);
         self.changed = true;
     }
 
     /// Handles keys, the mouse, and a new size of the terminal.
-    fn handle_input(&mut self, now: Instant) -> Result<(), End> {
+    fn handle_input(&mut self, now: Instant) -> Result<(), ExitReason> {
         while let Some(input) = self.terminal.input()? {
             self.changed = true;
             // Keys are answered at once, but a mouse sends more than can be drawn.
@@ -151,18 +151,18 @@ impl Watcher<'_> {
             let Input::Key(key) = input else { continue };
             let command = self.view.key(key, &self.live.scene);
             if !self.view.lines {
-                self.live.scene.forget_lines();
+                self.live.scene.delete_lines();
             }
-            match (self.view.paused, &self.held) {
-                (true, None) => self.held = Some(self.live.scene.clone()),
-                (false, Some(_)) => self.held = None,
+            match (self.view.paused, &self.held_scene) {
+                (true, None) => self.held_scene = Some(self.live.scene.clone()),
+                (false, Some(_)) => self.held_scene = None,
                 _ => {}
             }
             match command {
                 Some(ViewCommand::Interrupt) if self.is_bounded => {
                     return Err(Failure::new(Kind::Interrupted, "interrupted before it was done", "").into());
                 }
-                Some(ViewCommand::Quit | ViewCommand::Interrupt) => return Err(End::ReaderGone),
+                Some(ViewCommand::Quit | ViewCommand::Interrupt) => return Err(ExitReason::ReaderClosed),
                 Some(ViewCommand::Reset) => self.request(Verb::Reset, now),
                 Some(ViewCommand::Freeze) => self.request(Verb::Freeze, now),
                 None => {}
@@ -178,16 +178,16 @@ impl Watcher<'_> {
         let is_frozen = !own.is_empty() && own.iter().all(|(_, sensor)| sensor.is_frozen());
         let sensors: Vec<_> = own.into_iter().map(|(_, sensor)| sensor.name.clone()).collect();
         if sensors.is_empty() {
-            return self.say("no sensor of this machine is shown".into(), now);
+            return self.show_message("no sensor of this machine is shown".into(), now);
         }
         let verb = if verb == Verb::Freeze && is_frozen { Verb::Thaw } else { verb };
-        if !self.request.start(self.places, sensors, verb) {
-            self.say("the hub still works on the last request".into(), now);
+        if !self.request.start(self.locations, sensors, verb) {
+            self.show_message("the hub still works on the last request".into(), now);
         }
     }
 
-    fn draw(&mut self, now: Instant) -> Result<(), End> {
-        let (scene, held, view) = (&self.live.scene, self.held.as_ref(), &mut self.view);
+    fn draw(&mut self, now: Instant) -> Result<(), ExitReason> {
+        let (scene, held, view) = (&self.live.scene, self.held_scene.as_ref(), &mut self.view);
         let bytes = self.terminal.draw(|frame| {
             view.map = draw::map_area(frame.area(), scene);
             view.fit(held.unwrap_or(scene));
@@ -200,26 +200,26 @@ impl Watcher<'_> {
 }
 
 impl Watcher<'_> {
-    fn follow(&mut self, following: &mut Following<'_>) -> Result<(), End> {
+    fn follow(&mut self, following: &mut TopicRun<'_>) -> Result<(), ExitReason> {
         loop {
-            following.want(Topic::Lines, self.view.lines);
+            following.set_subscribed(Topic::Lines, self.view.lines);
             let Some(event) = following.next(self.changed.then_some(self.draw_at))? else { return Ok(()) };
             match event {
-                Event::Begun(name) => self.live.begin(&name),
+                Event::Added(name) => self.live.begin(&name),
                 Event::Sample(name, sample, _) => {
                     self.live.take(&name, &sample);
                     self.changed = true;
                 }
                 Event::Notice(names, notice) => {
-                    self.live.note(&names, &notice);
+                    self.live.take_notice(&names, &notice);
                     self.changed = true;
                     if let Notice::NoHub(Failure { message, hint, .. }) = notice {
-                        self.say(format!("{message}: {hint}"), Instant::now());
+                        self.show_message(format!("{message}: {hint}"), Instant::now());
                     }
                 }
                 // The topics that are followed already stay.
-                Event::Short(name, Failure { message, hint, .. }) => {
-                    self.say(format!("{name} is not shown: {message}; {hint}"), Instant::now());
+                Event::ResourceExhausted(name, Failure { message, hint, .. }) => {
+                    self.show_message(format!("{name} is not shown: {message}; {hint}"), Instant::now());
                 }
                 Event::Tick(now) => {
                     if following.is_caught_up() {
@@ -232,20 +232,20 @@ impl Watcher<'_> {
         }
     }
 
-    fn tick(&mut self, now: Instant) -> Result<(), End> {
+    fn tick(&mut self, now: Instant) -> Result<(), ExitReason> {
         self.handle_input(now)?;
         if let Some(outcome) = self.request.outcome() {
             for (sensor, model) in outcome.models {
                 self.live.scene.sensor(&sensor).background = Some(model);
             }
-            self.say(outcome.message, now);
+            self.show_message(outcome.message, now);
         }
         if self.message_until.is_some_and(|until| now >= until) {
             self.message_until = None;
             self.view.message.clear();
             self.changed = true;
         }
-        self.changed |= self.live.age();
+        self.changed |= self.live.expire();
         self.changed |= self.live.measure_hub(now);
         if self.changed && now >= self.draw_at {
             self.draw(now)?;
@@ -271,12 +271,12 @@ struct RequestOutcome {
 
 impl BackgroundRequest {
     /// Sends `verb` to the hub for each of `sensors`. Returns false if the last request is still running.
-    fn start(&mut self, places: &[Domain], sensors: Vec<String>, verb: Verb) -> bool {
+    fn start(&mut self, locations: &[Domain], sensors: Vec<String>, verb: Verb) -> bool {
         if self.running.is_some() {
             return false;
         }
-        let (places, stop) = (places.to_vec(), self.stop.clone());
-        self.running = Some(std::thread::spawn(move || send_request(&places, &sensors, verb, &stop)));
+        let (locations, stop) = (locations.to_vec(), self.stop.clone());
+        self.running = Some(std::thread::spawn(move || send_request(&locations, &sensors, verb, &stop)));
         true
     }
 
@@ -294,11 +294,11 @@ impl Drop for BackgroundRequest {
     }
 }
 
-fn send_request(places: &[Domain], sensors: &[String], verb: Verb, stop: &AtomicBool) -> RequestOutcome {
+fn send_request(locations: &[Domain], sensors: &[String], verb: Verb, stop: &AtomicBool) -> RequestOutcome {
     let mut models = Vec::new();
     let mut send = |sensor: &String| -> Result<(), Failure> {
-        request(places, &Request::new(sensor, verb), stop)?;
-        let shown = request(places, &Request::new(sensor, Verb::Show), stop)?;
+        request(locations, &Request::new(sensor, verb), stop)?;
+        let shown = request(locations, &Request::new(sensor, Verb::Show), stop)?;
         models.extend(shown.map(|shown| (sensor.clone(), shown.model)));
         Ok(())
     };

@@ -17,16 +17,16 @@ use std::time::{Duration, Instant};
 use clap::Args;
 use nix::ifaddrs::getifaddrs;
 use nix::net::if_::InterfaceFlags;
-use scanhub_files::regular;
-use scanhub_schema::{Failure, Kind, Maker, check_followed};
+use scanhub_files::regular_file;
+use scanhub_schema::{Failure, Kind, PublisherKind, check_any_sensor};
 use scanhub_shm::Domain;
-use scanhub_verbs::Bounds;
-use scanhub_verbs::follow::Following;
-use scanhub_verbs::names::{TopicName, as_word};
-use scanhub_verbs::output::{End, Output, quiet};
+use scanhub_verbs::RunLimits;
+use scanhub_verbs::follow::TopicRun;
+use scanhub_verbs::names::{TopicName, as_argument};
+use scanhub_verbs::output::{ExitReason, Output, verb_result};
 use serde::Serialize;
 
-use crate::live_scene::{TOPICS, followed};
+use crate::live_scene::{TOPICS, topics_to_follow};
 use crate::server::player::Playback;
 use crate::server::{AccessPolicy, ChannelStore, Event, Server, ViewerEvent};
 use feed::Feed;
@@ -64,7 +64,7 @@ pub struct WebArgs {
     #[arg(long = "loop", requires = "replay")]
     pub is_looped: bool,
     #[command(flatten)]
-    limits: Bounds,
+    limits: RunLimits,
 }
 
 const AFTER_HELP: &str = "\
@@ -110,14 +110,14 @@ impl WebArgs {
     /// - [`Kind::NoHub`], [`Kind::NoTopic`], [`Kind::Timeout`] and [`Kind::Interrupted`] as for `echo`.
     pub fn run(
         &self,
-        places: &[Domain],
+        locations: &[Domain],
         json: bool,
         player: Option<&dyn Playback>,
         out: &mut dyn Write,
         stop: &AtomicBool,
     ) -> Result<(), Failure> {
         let token = self.token()?;
-        self.sensors.iter().try_for_each(|sensor| as_word(check_followed(sensor)))?;
+        self.sensors.iter().try_for_each(|sensor| as_argument(check_any_sensor(sensor)))?;
         if !self.listen.ip().is_loopback() && token.is_none() && !self.open {
             let what = format!("other machines could watch at {}", self.listen);
             let hint = "set a token for viewers (--token WORD), or allow everyone (--open)";
@@ -129,12 +129,13 @@ impl WebArgs {
         let server = Server::bind(self.listen, policy.clone())?;
         let channels = ChannelStore::new()?;
         let (report, events) = mpsc::channel();
-        let mut reporter = Reporter { output: Output::new(out), events, json, short_at: None };
+        let mut reporter = Reporter { output: Output::new(out), events, json, next_shortage_report: None };
         if let Err(end) = reporter.ready(&urls(server.address()), self) {
-            return quiet(Err(end));
+            return verb_result(Err(end));
         }
-        let wanted = [&TOPICS[..], Maker::Mount.topics(), Maker::Tilted.topics()].concat();
-        let (names, topics) = followed(&self.sensors, &wanted, places);
+        let requested_topics =
+            [&TOPICS[..], PublisherKind::Mount.topics(), PublisherKind::Tilted.topics()].concat();
+        let (names, topics) = topics_to_follow(&self.sensors, &requested_topics, locations);
         let is_over = AtomicBool::new(false);
         thread::scope(|scope| {
             let served = thread::Builder::new()
@@ -144,14 +145,14 @@ impl WebArgs {
                     let (server, channels, is_over) = (&server, &channels, &is_over);
                     move || server.run(channels, player, &report, is_over)
                 })
-                .map_err(|error| Failure::new(Kind::Short, format!("no thread: {error}"), ""))?;
+                .map_err(|error| Failure::new(Kind::ResourceExhausted, format!("no thread: {error}"), ""))?;
             let closing = StopServer { is_over: &is_over, channels: &channels };
-            let mut feed = Feed::new(&channels, places, player, reporter);
-            let following = Following::new(&names, &topics, places, &self.limits, stop);
-            let end = feed.follow(&mut following.despite_shortage());
+            let mut feed = Feed::new(&channels, locations, player, reporter);
+            let following = TopicRun::new(&names, &topics, locations, &self.limits, stop);
+            let end = feed.follow(&mut following.tolerating_shortage());
             drop(closing);
             match served.join() {
-                Ok(Ok(())) => quiet(end),
+                Ok(Ok(())) => verb_result(end),
                 Ok(Err(failure)) => Err(failure),
                 // The panic has printed its reason.
                 Err(_) => Err(Failure::new(Kind::Failed, "what serves the viewers ended", "start it again")),
@@ -195,17 +196,17 @@ fn token(text: &str) -> Result<String, String> {
 ///
 /// [`Kind::Input`] if it cannot be read, [`Kind::Configuration`] if it contains no token, or if others can use it.
 fn read_token(file: &Path) -> Result<String, Failure> {
-    let place = file.display().to_string();
-    let unreadable = |error: std::io::Error| regular::unreadable(&place, &error);
-    let text = regular::read_text(file, MAX_TOKEN_FILE).map_err(unreadable)?;
+    let path_text = file.display().to_string();
+    let unreadable = |error: std::io::Error| regular_file::unreadable(&path_text, &error);
+    let text = regular_file::read_text(file, MAX_TOKEN_FILE).map_err(unreadable)?;
     let mode = file.metadata().map_err(unreadable)?.mode() & 0o777;
     if mode & 0o077 != 0 {
-        let message = format!("{place} has mode {mode:04o}, so others can use the token");
+        let message = format!("{path_text} has mode {mode:04o}, so others can use the token");
         return Err(Failure::new(Kind::Configuration, message, "`chmod 600` it"));
     }
     token(text.trim_end()).map_err(|expected| {
         let hint = format!("one line with one word: {expected}");
-        Failure::new(Kind::Configuration, format!("{place} contains no token"), hint)
+        Failure::new(Kind::Configuration, format!("{path_text} contains no token"), hint)
     })
 }
 
@@ -263,15 +264,15 @@ struct Reporter<'a> {
     events: Receiver<Event>,
     json: bool,
     /// Earliest time of the next report of a topic that is not served.
-    short_at: Option<Instant>,
+    next_shortage_report: Option<Instant>,
 }
 
 impl Reporter<'_> {
     /// Prints the URLs of the page. As text, prints also what a user should know about access: with a local address the
     /// flags for other machines, and with `--open` a warning.
-    fn ready(&mut self, urls: &[String], args: &WebArgs) -> Result<(), End> {
+    fn ready(&mut self, urls: &[String], args: &WebArgs) -> Result<(), ExitReason> {
         #[derive(Serialize)]
-        struct Ready<'a> {
+        struct ReadyJson<'a> {
             class: &'static str,
             url: &'a str,
             urls: &'a [String],
@@ -279,7 +280,7 @@ impl Reporter<'_> {
         }
         let url = urls.first().map_or("", String::as_str);
         if self.json {
-            return self.output.json(&Ready { class: "ready", url, urls, pid: std::process::id() });
+            return self.output.json(&ReadyJson { class: "ready", url, urls, pid: std::process::id() });
         }
         self.output.line(|line| write!(line, "ready {url}"))?;
         if let [_, others @ ..] = urls
@@ -307,7 +308,7 @@ impl Reporter<'_> {
 
     /// Prints why there is no hub to serve yet, and the command that reaches another one. With JSON, viewers alone get
     /// the reason.
-    fn no_hub(&mut self, failure: &Failure) -> Result<(), End> {
+    fn no_hub(&mut self, failure: &Failure) -> Result<(), ExitReason> {
         match self.json {
             true => Ok(()),
             false => self.output.line(|line| write!(line, "{}; {}", failure.message, failure.hint)),
@@ -318,22 +319,22 @@ impl Reporter<'_> {
     ///
     /// # Errors
     ///
-    /// Returns [`End::ReaderGone`] if the server has ended. Its thread has the reason.
-    fn report_events(&mut self) -> Result<(), End> {
+    /// Returns [`End::ReaderClosed`] if the server has ended. Its thread has the reason.
+    fn report_events(&mut self) -> Result<(), ExitReason> {
         loop {
             match self.events.try_recv() {
                 Ok(Event::Viewer(event)) => self.viewer(&event)?,
-                Ok(Event::Short(error)) => {
+                Ok(Event::ResourceExhausted(error)) => {
                     let hint = "raise the limit of descriptors: ulimit -n";
-                    self.short(&format!("cannot accept viewers: {error}"), hint)?;
+                    self.shortage(&format!("cannot accept viewers: {error}"), hint)?;
                 }
                 Err(TryRecvError::Empty) => return Ok(()),
-                Err(TryRecvError::Disconnected) => return Err(End::ReaderGone),
+                Err(TryRecvError::Disconnected) => return Err(ExitReason::ReaderClosed),
             }
         }
     }
 
-    fn viewer(&mut self, event: &ViewerEvent) -> Result<(), End> {
+    fn viewer(&mut self, event: &ViewerEvent) -> Result<(), ExitReason> {
         #[derive(Serialize)]
         struct Viewer {
             class: &'static str,
@@ -359,24 +360,24 @@ impl Reporter<'_> {
     }
 
     /// Prints that a topic is not served, because the system is short of something, unless that was just printed.
-    fn not_served(&mut self, name: &TopicName, failure: &Failure) -> Result<(), End> {
+    fn not_served(&mut self, name: &TopicName, failure: &Failure) -> Result<(), ExitReason> {
         let now = Instant::now();
-        if self.short_at.is_some_and(|at| now < at) {
+        if self.next_shortage_report.is_some_and(|at| now < at) {
             return Ok(());
         }
-        self.short_at = Some(now + REPORT_INTERVAL);
-        self.short(&format!("{name} is not served: {}", failure.message), &failure.hint)
+        self.next_shortage_report = Some(now + REPORT_INTERVAL);
+        self.shortage(&format!("{name} is not served: {}", failure.message), &failure.hint)
     }
 
-    fn short(&mut self, message: &str, hint: &str) -> Result<(), End> {
+    fn shortage(&mut self, message: &str, hint: &str) -> Result<(), ExitReason> {
         #[derive(Serialize)]
-        struct Short<'a> {
+        struct ShortageJson<'a> {
             class: &'static str,
             message: &'a str,
             hint: &'a str,
         }
         match self.json {
-            true => self.output.json(&Short { class: "web_short", message, hint }),
+            true => self.output.json(&ShortageJson { class: "web_short", message, hint }),
             false => self.output.line(|line| write!(line, "{message}; {hint}")),
         }
     }
@@ -401,7 +402,7 @@ mod tests {
             origins: Vec::new(),
             replay: None,
             is_looped: false,
-            limits: Bounds::default(),
+            limits: RunLimits::default(),
         }
     }
 
@@ -494,7 +495,7 @@ mod tests {
     }
 
     #[test]
-    fn ends_with_a_failure_if_the_thread_of_the_server_panics() {
+    fn server_panic_ends_the_verb_with_a_failure() {
         let (lines, received) = mpsc::channel();
         let stop = AtomicBool::new(false);
         let (sent, end) = thread::scope(|scope| {

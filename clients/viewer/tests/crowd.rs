@@ -17,10 +17,10 @@ use tungstenite::{Message, WebSocket};
 /// Far longer than a message takes.
 const TIMEOUT: Duration = Duration::from_secs(60);
 /// Number of messages; together they are longer than the buffers of the system.
-const MESSAGES: u32 = 400;
-const LENGTH: usize = 20_000;
+const MESSAGE_COUNT: u32 = 400;
+const MESSAGE_LEN: usize = 20_000;
 /// Number of viewers that read.
-const READERS: usize = 16;
+const READER_COUNT: usize = 16;
 
 fn channel(topic: &str, is_kept: bool) -> Channel {
     Channel {
@@ -33,7 +33,7 @@ fn channel(topic: &str, is_kept: bool) -> Channel {
     }
 }
 
-fn view(address: SocketAddr) -> WebSocket<TcpStream> {
+fn connect_viewer(address: SocketAddr) -> WebSocket<TcpStream> {
     let mut request = format!("ws://{address}/").into_client_request().unwrap();
     request.headers_mut().insert("Sec-WebSocket-Protocol", "foxglove.sdk.v1".parse().unwrap());
     let stream = TcpStream::connect(address).unwrap();
@@ -42,7 +42,7 @@ fn view(address: SocketAddr) -> WebSocket<TcpStream> {
 }
 
 /// Subscription and body of the next message.
-fn next(viewer: &mut WebSocket<TcpStream>) -> (u32, Vec<u8>) {
+fn next_message(viewer: &mut WebSocket<TcpStream>) -> (u32, Vec<u8>) {
     loop {
         if let Message::Binary(frame) = viewer.read().unwrap() {
             return (u32::from_le_bytes(frame[1..5].try_into().unwrap()), frame[13..].to_vec());
@@ -55,12 +55,12 @@ fn subscribe(viewer: &mut WebSocket<TcpStream>) {
     let both: Vec<_> = (1..=2).map(|id| json!({ "id": id, "channelId": id })).collect();
     let wish = json!({ "op": "subscribe", "subscriptions": both });
     viewer.send(Message::text(wish.to_string())).unwrap();
-    assert_eq!(next(viewer).0, 2);
+    assert_eq!(next_message(viewer).0, 2);
 }
 
 /// Publishes message `number` of `scans`.
-fn put(channels: &ChannelStore, scans: ChannelPublisher<'_>, number: u32) {
-    let mut payload = vec![0; LENGTH];
+fn publish(channels: &ChannelStore, scans: ChannelPublisher<'_>, number: u32) {
+    let mut payload = vec![0; MESSAGE_LEN];
     payload[..4].copy_from_slice(&number.to_le_bytes());
     scans.publish(1, &payload);
     channels.wake_if_new();
@@ -73,9 +73,9 @@ fn number((subscription, body): (u32, Vec<u8>)) -> u32 {
 }
 
 /// Ends the server even if the test fails.
-struct Close<'a>(&'a AtomicBool, &'a ChannelStore);
+struct CloseOnDrop<'a>(&'a AtomicBool, &'a ChannelStore);
 
-impl Drop for Close<'_> {
+impl Drop for CloseOnDrop<'_> {
     fn drop(&mut self) {
         self.0.store(true, Ordering::Relaxed);
         self.1.wake();
@@ -83,7 +83,7 @@ impl Drop for Close<'_> {
 }
 
 #[test]
-fn readers_get_every_message_despite_a_slow_viewer_and_many_connections() {
+fn readers_get_every_message_despite_a_slow_viewer() {
     let (channels, stop) = (ChannelStore::new().unwrap(), AtomicBool::new(false));
     let scans = channels.open(channel("/front/scan", false));
     let status = channels.open(channel("/front/status", true));
@@ -92,39 +92,48 @@ fn readers_get_every_message_despite_a_slow_viewer_and_many_connections() {
     let (tell, events) = mpsc::channel();
     thread::scope(|scope| {
         let served = scope.spawn(|| server.run(&channels, None, &tell, &stop));
-        let closing = Close(&stop, &channels);
-        let mut slow = view(server.address());
+        let closing = CloseOnDrop(&stop, &channels);
+        let mut slow = connect_viewer(server.address());
         subscribe(&mut slow);
-        let mut readers: Vec<_> = (0..READERS).map(|_| view(server.address())).collect();
+        let mut readers: Vec<_> = (0..READER_COUNT).map(|_| connect_viewer(server.address())).collect();
         readers.iter_mut().for_each(subscribe);
-        let _rest: Vec<_> = (readers.len() + 1..MAX_VIEWERS).map(|_| view(server.address())).collect();
+        let _rest: Vec<_> =
+            (readers.len() + 1..MAX_VIEWERS).map(|_| connect_viewer(server.address())).collect();
         let _idle: Vec<_> = (0..150).map(|_| TcpStream::connect(server.address()).unwrap()).collect();
-        for sent in 1..=MESSAGES {
-            put(&channels, scans, sent);
+        for sent in 1..=MESSAGE_COUNT {
+            publish(&channels, scans, sent);
             for reader in &mut readers {
-                assert_eq!(number(next(reader)), sent);
+                assert_eq!(number(next_message(reader)), sent);
             }
         }
         // The slow viewer gets the last message, and misses most of the others.
-        let mut got = vec![number(next(&mut slow))];
-        while got.last() != Some(&MESSAGES) {
-            got.push(number(next(&mut slow)));
+        let mut got = vec![number(next_message(&mut slow))];
+        while got.last() != Some(&MESSAGE_COUNT) {
+            got.push(number(next_message(&mut slow)));
         }
-        assert!(got.is_sorted() && got.len() < MESSAGES as usize / 2, "{} of {MESSAGES}", got.len());
+        assert!(
+            got.is_sorted() && got.len() < MESSAGE_COUNT as usize / 2,
+            "{} of {MESSAGE_COUNT}",
+            got.len()
+        );
         drop((slow, readers));
         let skipped = || events.recv_timeout(TIMEOUT).unwrap();
-        let mut gone = Vec::new();
-        while gone.len() <= READERS {
+        let mut skipped_counts = Vec::new();
+        while skipped_counts.len() <= READER_COUNT {
             if let Event::Viewer(visit) = skipped()
                 && !visit.connected
             {
-                gone.push(visit.replaced);
+                skipped_counts.push(visit.replaced);
             }
         }
-        gone.sort_unstable();
-        let told = gone.pop();
-        assert_eq!(told, Some(u64::from(MESSAGES) - got.len() as u64), "skipped messages are counted");
-        assert!(gone.iter().all(|skipped| *skipped == 0), "{gone:?}");
+        skipped_counts.sort_unstable();
+        let slow_viewer_skipped = skipped_counts.pop();
+        assert_eq!(
+            slow_viewer_skipped,
+            Some(u64::from(MESSAGE_COUNT) - got.len() as u64),
+            "skipped messages are counted"
+        );
+        assert!(skipped_counts.iter().all(|skipped| *skipped == 0), "{skipped_counts:?}");
         drop(closing);
         served.join().unwrap().unwrap();
     });
@@ -139,10 +148,10 @@ fn every_server_has_its_own_session() {
             let (tell, _events) = mpsc::channel();
             thread::scope(|scope| {
                 scope.spawn(|| server.run(&channels, None, &tell, &stop));
-                let _closing = Close(&stop, &channels);
-                let said = view(server.address()).read().unwrap().to_string();
-                let said: serde_json::Value = serde_json::from_str(&said).unwrap();
-                said["sessionId"].as_str().unwrap().to_owned()
+                let _closing = CloseOnDrop(&stop, &channels);
+                let text = connect_viewer(server.address()).read().unwrap().to_string();
+                let server_info: serde_json::Value = serde_json::from_str(&text).unwrap();
+                server_info["sessionId"].as_str().unwrap().to_owned()
             })
         })
         .collect();

@@ -9,7 +9,7 @@ use serde_json::{Value as Json, json};
 
 use crate::gateway::{Gateway, LimitsKeys};
 use crate::link::{Link, LinkKeys};
-use crate::load::{Merged, MergedLink};
+use crate::load::{MergedConfig, MergedLink};
 use crate::processing::has_key;
 use crate::section::{Key, Section};
 use crate::sources::Sources;
@@ -32,25 +32,25 @@ pub struct Value {
 /// Returns [`scanhub_schema::Kind::Configuration`] with place, value and remedy if a value is not valid.
 pub fn values(sources: &Sources) -> Result<Vec<Value>, Failure> {
     let sources = sources.read();
-    let merged = Merged::of(&sources)?;
+    let merged = MergedConfig::of(&sources)?;
     let config = merged.config()?;
     let gateway = merged.gateway()?;
     let limits: LimitsKeys = merged.section("limits")?;
     let of_links =
         config.links.iter().zip(&merged.links).flat_map(|(link, keys)| of_link(&merged, link, keys));
-    let general = [("limits", limits.values()), ("gateway", gateway.shown())];
+    let general = [("limits", limits.values()), ("gateway", gateway.effective_values())];
     let general = general.into_iter().flat_map(|(section, values)| {
         values.into_iter().map(move |(key, value)| (format!("{section}.{key}"), value))
     });
     let general = general.map(|(key, value)| {
-        let origin = merged.place(&key).unwrap_or_else(|| DEFAULT.to_owned());
+        let origin = merged.location(&key).unwrap_or_else(|| DEFAULT.to_owned());
         Value { class: CLASS, key, value, origin }
     });
     Ok(of_links.chain(general).collect())
 }
 
 /// Returns the values of one link.
-fn of_link(merged: &Merged<'_>, link: &Link, read: &MergedLink<'_>) -> Vec<Value> {
+fn of_link(merged: &MergedConfig<'_>, link: &Link, merged_link: &MergedLink<'_>) -> Vec<Value> {
     let Link { name, port, scanner, .. } = link;
     let family = link.family();
     let mut values = vec![
@@ -58,7 +58,7 @@ fn of_link(merged: &Merged<'_>, link: &Link, read: &MergedLink<'_>) -> Vec<Value
         ("family".to_owned(), json!(family.map_or(AUTO, Family::name))),
     ];
     values.extend(scanner.values().map(|(key, value)| (key.to_owned(), value)));
-    for (section, keys) in read.keys.sections() {
+    for (section, keys) in merged_link.keys.sections() {
         let keys = keys.values().into_iter().map(|(key, value)| (format!("{section}.{key}"), value));
         values.extend(keys.filter(|(key, _)| has_key(family, key)));
     }
@@ -70,7 +70,7 @@ fn of_link(merged: &Merged<'_>, link: &Link, read: &MergedLink<'_>) -> Vec<Value
         _ => DEFAULT.to_owned(),
     };
     let value = |(key, value): (String, Json)| {
-        let origin = merged.place_of(read, &key).unwrap_or_else(|| default(&key));
+        let origin = merged.location_of(merged_link, &key).unwrap_or_else(|| default(&key));
         Value { class: CLASS, key: format!("link.{name}.{key}"), value, origin }
     };
     values.into_iter().map(value).collect()
@@ -87,7 +87,7 @@ pub fn keys() -> Vec<(&'static str, Vec<(Key, String)>)> {
     all.extend(link.sections().map(|(name, section)| (name, keys_of(section, section.values()))));
     all.extend([
         ("limits", keys_of(&limits, limits.values())),
-        ("gateway", keys_of(&gateway, gateway.shown())),
+        ("gateway", keys_of(&gateway, gateway.effective_values())),
     ]);
     all
 }

@@ -4,7 +4,7 @@
 
 use std::path::PathBuf;
 
-use scanhub_schema::datagram::{MTU_ETHERNET, MTU_LEAST, MTU_SAFE};
+use scanhub_schema::datagram::{MIN_MTU, MTU_ETHERNET, MTU_SAFE};
 use scanhub_schema::limits::TopicLimits;
 use serde_json::{Value as Json, json};
 
@@ -50,8 +50,8 @@ section! {
         background_every: Option<String> = None, example "\"10s\"";
         /// longest datagram in bytes, 576 to 1472
         mtu: Option<i64> = None, check optional(whole_or(
-            MTU_LEAST as i64..=MTU_ETHERNET as i64,
-            format!("{MTU_LEAST} to {MTU_ETHERNET} bytes, which an Ethernet carries"),
+            MIN_MTU as i64..=MTU_ETHERNET as i64,
+            format!("{MIN_MTU} to {MTU_ETHERNET} bytes, which an Ethernet carries"),
         ));
     }
 }
@@ -63,7 +63,7 @@ impl Gateway {
     pub const MTU: i64 = MTU_SAFE as i64;
 
     /// Returns keys and values in effect.
-    pub(crate) fn shown(&self) -> Vec<(&'static str, Json)> {
+    pub(crate) fn effective_values(&self) -> Vec<(&'static str, Json)> {
         let mut values = self.values();
         for (key, value) in values.iter_mut().filter(|(_, value)| value.is_null()) {
             *value = match *key {

@@ -12,7 +12,7 @@ mod sources;
 
 pub use effective::{Value, keys, values};
 pub use gateway::Gateway;
-pub use link::{Config, Link, needs};
+pub use link::{Config, Link, resource_estimate};
 pub use processing::{Background, Processing};
 pub use scanner::Scanner;
 pub use section::Key;

@@ -1,7 +1,7 @@
 //! The links of a hub, each with its port and the settings of its sensor: keys of the sources and values in effect.
 
 use scanhub_drivers::{Features, Settings, scan_heads};
-use scanhub_port::Source;
+use scanhub_port::PortSpec;
 use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Background, Failure, Family, ScanHead, check_sensor};
 
@@ -9,7 +9,7 @@ use crate::processing::{
     BackgroundKeys, EarlyKeys, LinesKeys, MarksKeys, MotionKeys, PoseKeys, Processing, ZonesKeys,
 };
 use crate::scanner::Scanner;
-use crate::section::{Checked, Section, optional, refused, section};
+use crate::section::{CheckResult, Section, invalid_value, optional, section};
 
 /// The effective configuration.
 #[derive(Clone, Debug, PartialEq)]
@@ -48,7 +48,7 @@ pub struct Link {
     /// The sensor's name in topics.
     pub name: String,
     /// The source of its bytes.
-    pub port: Source,
+    pub port: PortSpec,
     /// Family and settings of its scanner.
     pub scanner: Scanner,
     /// How its scans are processed.
@@ -73,7 +73,7 @@ impl Link {
 
     /// Returns the limits of its topics. `all` are those of all links.
     pub fn limits(&self, all: &TopicLimits) -> TopicLimits {
-        let &Features { contents, max_telegram, .. } = self.scanner.features();
+        let &Features { array_flags: contents, max_telegram, .. } = self.scanner.features();
         TopicLimits { beams: self.max_beams(), contents, telegram: max_telegram, ..*all }
     }
 
@@ -100,7 +100,7 @@ impl Link {
 
     /// Returns the settings of a session at its port. Nothing can be sent to a recording.
     pub fn settings(&self) -> Settings {
-        self.scanner.settings_at(&self.port, matches!(self.port, Source::File { .. }))
+        self.scanner.settings_at(&self.port, matches!(self.port, PortSpec::File { .. }))
     }
 
     /// Checks whether `model` may belong to its sensor, as far as that is known.
@@ -108,7 +108,7 @@ impl Link {
     /// # Errors
     ///
     /// Returns the beams and the unit that such a model has, as text.
-    pub fn fits(&self, model: &Background) -> Result<(), String> {
+    pub fn check_background(&self, model: &Background) -> Result<(), String> {
         let heads = self.scan_heads();
         let count = heads[0].count;
         let (fits, beams) = match self.scanner.is_auto() {
@@ -209,34 +209,34 @@ impl LinkKeys {
     }
 }
 
-fn name(_: &str, name: &str) -> Checked {
-    check_sensor(name).map_err(|failure| refused(failure.message, failure.hint))
+fn name(_: &str, name: &str) -> CheckResult {
+    check_sensor(name).map_err(|failure| invalid_value(failure.message, failure.hint))
 }
 
-fn port(_: &str, port: &str) -> Checked {
+fn port(_: &str, port: &str) -> CheckResult {
     let remedy = "name a tty, tcp:HOST:PORT, or file:PATH, which may end with ?rate=max";
-    Source::parse(port).map(drop).map_err(|what| refused(what, remedy))
+    PortSpec::parse(port).map(drop).map_err(|what| invalid_value(what, remedy))
 }
 
 /// Maximum number of links of one hub.
 pub(crate) const MAX_LINKS: usize = 256;
 
 /// Shared memory and descriptors that links need.
-pub mod needs {
+pub mod resource_estimate {
     use scanhub_schema::Topic;
     use scanhub_schema::limits::TopicLimits;
-    use scanhub_shm::shortage::{self, sensor_bytes};
+    use scanhub_shm::resource_limits::{self, sensor_bytes};
 
     /// Returns the number of bytes of shared memory for links with topics for `limits`, and their first subscribers.
     pub fn memory(limits: &[TopicLimits]) -> u64 {
-        limits.iter().map(|limits| sensor_bytes(&Topic::OF_LINKS, limits)).sum::<u64>() + REST
+        limits.iter().map(|limits| sensor_bytes(&Topic::OF_LINKS, limits)).sum::<u64>() + BASE_MEMORY
     }
 
     /// Returns the number of bytes of their longest shared-memory segment.
     pub fn longest_segment(limits: &[TopicLimits]) -> u64 {
         limits
             .iter()
-            .map(|limits| shortage::longest_segment(&Topic::OF_LINKS, limits))
+            .map(|limits| resource_limits::longest_segment(&Topic::OF_LINKS, limits))
             .max()
             .unwrap_or_default()
     }
@@ -253,5 +253,5 @@ pub mod needs {
     /// port, the lock of its name, and a first subscriber.
     const LINK_DESCRIPTORS: u64 = 4 * (Topic::OF_LINKS.len() as u64 + 1) + 7;
     /// Bytes of the control service, of everything else that belongs to no link, and of the first subscribers.
-    const REST: u64 = 512 * 1024;
+    const BASE_MEMORY: u64 = 512 * 1024;
 }

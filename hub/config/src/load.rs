@@ -4,7 +4,7 @@
 use std::ops::Range;
 use std::path::Path;
 
-use scanhub_port::{Source, is_same_line};
+use scanhub_port::{PortSpec, is_same_line};
 use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Failure, Kind};
 use serde::Deserialize;
@@ -69,7 +69,7 @@ fn check_section(
 }
 
 /// All sources, merged.
-pub(crate) struct Merged<'a> {
+pub(crate) struct MergedConfig<'a> {
     sources: &'a SourceMap,
     /// Values for all links, of limits and of the gateway.
     pub(crate) general: DeTable<'a>,
@@ -82,7 +82,7 @@ pub(crate) struct Merged<'a> {
 /// One link of all sources.
 pub(crate) struct MergedLink<'a> {
     /// Place where the link starts.
-    place: String,
+    location: String,
     /// Values for this link only.
     own: DeTable<'a>,
     /// Values for this link and for all links. Those for this link take precedence, whichever source they are from.
@@ -91,15 +91,16 @@ pub(crate) struct MergedLink<'a> {
     pub(crate) keys: LinkKeys,
 }
 
-impl<'a> Merged<'a> {
+impl<'a> MergedConfig<'a> {
     /// Parses and merges `sources`.
-    pub(crate) fn of(sources: &'a SourceMap) -> Result<Merged<'a>, Failure> {
-        let mut merged = Merged { sources, general: DeTable::new(), links: Vec::new(), gateway: Ok(()) };
+    pub(crate) fn of(sources: &'a SourceMap) -> Result<MergedConfig<'a>, Failure> {
+        let mut merged =
+            MergedConfig { sources, general: DeTable::new(), links: Vec::new(), gateway: Ok(()) };
         let (settings, others): (Vec<_>, Vec<_>) =
             sources.layers()?.into_iter().partition(|(kind, ..)| *kind == SourceKind::Setting);
         let mut flags = Vec::new();
         for (kind, table, document) in others {
-            merged.add(kind, table, document, &mut flags)?;
+            merged.add_source(kind, table, document, &mut flags)?;
         }
         if merged.links.is_empty() {
             let remedy =
@@ -107,7 +108,7 @@ impl<'a> Merged<'a> {
             return Err(Failure::new(Kind::Configuration, "no link is configured", remedy));
         }
         for (kind, table, document) in settings {
-            merged.add(kind, table, document, &mut flags)?;
+            merged.add_source(kind, table, document, &mut flags)?;
         }
         for link in &mut merged.links {
             link.table = merged.general.clone();
@@ -121,7 +122,7 @@ impl<'a> Merged<'a> {
     }
 
     /// Adds one source, whose values take precedence. `flags` are the names of links of `--link` so far.
-    fn add(
+    fn add_source(
         &mut self,
         kind: SourceKind,
         mut table: DeTable<'a>,
@@ -137,13 +138,19 @@ impl<'a> Merged<'a> {
             return Ok(());
         };
         overlay(&mut self.general, table);
-        let mut seen = Vec::new();
+        let mut earlier_names = Vec::new();
         for (keys, link) in document.link.into_iter().zip(links) {
             let span = link.span();
             let DeValue::Table(link) = link.into_inner() else {
                 return Err(self.sources.refuse(span, "a link is a list", "write it as [[link]]"));
             };
-            self.add_link(kind, keys, link, span, if kind == SourceKind::Link { flags } else { &mut seen })?;
+            self.add_link(
+                kind,
+                keys,
+                link,
+                span,
+                if kind == SourceKind::Link { flags } else { &mut earlier_names },
+            )?;
         }
         Ok(())
     }
@@ -154,7 +161,7 @@ impl<'a> Merged<'a> {
         keys: LinkKeys,
         table: DeTable<'a>,
         span: Range<usize>,
-        seen: &mut Vec<String>,
+        earlier_names: &mut Vec<String>,
     ) -> Result<(), Failure> {
         let sources = self.sources;
         let Some(span) = table.get("name").map(Spanned::span) else {
@@ -166,14 +173,14 @@ impl<'a> Merged<'a> {
         }
         ScannerRequest::of(&keys, &table, sources)?;
         let name = keys.name;
-        if seen.contains(&name) {
+        if earlier_names.contains(&name) {
             let remedy = match kind {
                 SourceKind::Link => "give each link its own name",
                 _ => "give each link its own name, or put its keys into the section of the first one",
             };
             return Err(sources.refuse(span, format!("a second link {name}"), remedy));
         }
-        seen.push(name.clone());
+        earlier_names.push(name.clone());
         if let Some(link) = self.links.iter_mut().find(|link| link.keys.name == name) {
             overlay(&mut link.own, table);
             return Ok(());
@@ -189,8 +196,8 @@ impl<'a> Merged<'a> {
             return Err(sources.refuse(span, what, format!("{MAX_LINKS} links for one hub")));
         }
         let keys = LinkKeys { name, ..LinkKeys::default() };
-        let place = sources.place(span);
-        self.links.push(MergedLink { place, own: table, table: DeTable::new(), keys });
+        let location = sources.location(span);
+        self.links.push(MergedLink { location, own: table, table: DeTable::new(), keys });
         Ok(())
     }
 
@@ -204,8 +211,9 @@ impl<'a> Merged<'a> {
     }
 
     /// Merges the section of the gateway alone.
-    fn of_gateway(sources: &'a SourceMap) -> Result<Merged<'a>, Failure> {
-        let mut merged = Merged { sources, general: DeTable::new(), links: Vec::new(), gateway: Ok(()) };
+    fn of_gateway(sources: &'a SourceMap) -> Result<MergedConfig<'a>, Failure> {
+        let mut merged =
+            MergedConfig { sources, general: DeTable::new(), links: Vec::new(), gateway: Ok(()) };
         for (_, table, document) in sources.layers::<Document>()? {
             check_section("gateway", &document.gateway, &table, sources)?;
             overlay(&mut merged.general, table);
@@ -226,45 +234,45 @@ impl<'a> Merged<'a> {
     }
 
     /// Returns the place where `key` is set that belongs to no link.
-    pub(crate) fn place(&self, key: &str) -> Option<String> {
-        find(&self.general, key).map(|value| self.sources.place(value.span()))
+    pub(crate) fn location(&self, key: &str) -> Option<String> {
+        find(&self.general, key).map(|value| self.sources.location(value.span()))
     }
 
     /// Returns the place where `key` of `link` is set.
-    pub(crate) fn place_of(&self, link: &MergedLink<'_>, key: &str) -> Option<String> {
-        find(&link.table, key).map(|value| self.sources.place(value.span()))
+    pub(crate) fn location_of(&self, link: &MergedLink<'_>, key: &str) -> Option<String> {
+        find(&link.table, key).map(|value| self.sources.location(value.span()))
     }
 }
 
 impl MergedLink<'_> {
     /// Returns the link.
     fn finish(&self, sources: &SourceMap) -> Result<Link, Failure> {
-        let MergedLink { place, own, table, keys } = self;
+        let MergedLink { location, own, table, keys } = self;
         let name = keys.name.clone();
-        let refuse = |place: Option<String>, what: String, remedy: &str| {
-            let place = place.as_ref().unwrap_or(&self.place);
-            Failure::new(Kind::Configuration, format!("{place}: link {name}: {what}"), remedy)
+        let refuse = |location: Option<String>, what: String, remedy: &str| {
+            let location = location.as_ref().unwrap_or(&self.location);
+            Failure::new(Kind::Configuration, format!("{location}: link {name}: {what}"), remedy)
         };
         let no_port = || refuse(None, "no port".into(), "add port = \"/dev/ttyUSB0\"");
-        let port = keys.port.as_deref().and_then(|port| Source::parse(port).ok()).ok_or_else(no_port)?;
+        let port = keys.port.as_deref().and_then(|port| PortSpec::parse(port).ok()).ok_or_else(no_port)?;
         let request = ScannerRequest::of(keys, table, sources)?;
         let scanner = request.finish(refuse)?;
-        let is_live = !matches!(port, Source::File { .. });
-        if let Some(place) = request.mode_number_place().filter(|_| is_live) {
+        let is_live = !matches!(port, PortSpec::File { .. });
+        if let Some(location) = request.mode_number_location().filter(|_| is_live) {
             let what = format!("the mode of {} is read from the sensor", port.name());
             let remedy = "mode is only for recordings, port = \"file:PATH\"; leave it out";
-            return Err(refuse(Some(place), what, remedy));
+            return Err(refuse(Some(location), what, remedy));
         }
         let mut link = Link { name: name.clone(), port, scanner, processing: Processing::of(keys) };
-        check_coverage(&link, table, place, sources)?;
+        check_coverage(&link, table, location, sources)?;
         if let Some(family) = link.family() {
             check_family(own, sources, family)?;
         }
         let mut background = link.processing.background.clone();
         background.read(&link).map_err(|failure| {
             let start = find(table, "background.start");
-            let place = start.map(|start| sources.place(start.span())).unwrap_or_default();
-            Failure::new(failure.kind, format!("{place}: {}", failure.message), failure.hint)
+            let location = start.map(|start| sources.location(start.span())).unwrap_or_default();
+            Failure::new(failure.kind, format!("{location}: {}", failure.message), failure.hint)
         })?;
         link.processing.background = background;
         Ok(link)
@@ -301,7 +309,7 @@ impl Config {
     ///
     /// As those of [`load`](Self::load).
     pub fn of(sources: &SourceMap) -> Result<Config, Failure> {
-        Merged::of(sources)?.config()
+        MergedConfig::of(sources)?.config()
     }
 }
 
@@ -312,20 +320,20 @@ impl Gateway {
     ///
     /// Returns [`scanhub_schema::Kind::Configuration`] with place, value and remedy if a value is not valid.
     pub fn of(sources: &SourceMap) -> Result<Gateway, Failure> {
-        Merged::of_gateway(sources)?.section("gateway")
+        MergedConfig::of_gateway(sources)?.section("gateway")
     }
 
     /// Returns the place in `sources` where `background_every` is set.
-    pub fn background_every_place(sources: &SourceMap) -> Option<String> {
-        Merged::of_gateway(sources).ok()?.place("gateway.background_every")
+    pub fn background_every_location(sources: &SourceMap) -> Option<String> {
+        MergedConfig::of_gateway(sources).ok()?.location("gateway.background_every")
     }
 }
 
 /// Refuses two links at one line, also where it goes by two names at this moment.
 fn check_ports(links: &[Link]) -> Result<(), Failure> {
-    let is_same = |a: &Source, b: &Source| match (a, b) {
-        (Source::File { .. }, _) => false,
-        (Source::Tty(a), Source::Tty(b)) => is_same_line(a, b),
+    let is_same = |a: &PortSpec, b: &PortSpec| match (a, b) {
+        (PortSpec::File { .. }, _) => false,
+        (PortSpec::Tty(a), PortSpec::Tty(b)) => is_same_line(a, b),
         // No name of a server is resolved to read a configuration.
         _ => a == b,
     };
@@ -336,7 +344,7 @@ fn check_ports(links: &[Link]) -> Result<(), Failure> {
                 (one, another) => format!("{one} is {another}"),
             };
             let message = format!("links {} and {} have the same port: {names}", other.name, link.name);
-            let is_by_id = |port: &Source| matches!(port, Source::Tty(path) if is_by_serial_number(path));
+            let is_by_id = |port: &PortSpec| matches!(port, PortSpec::Tty(path) if is_by_serial_number(path));
             let hint = if other.port != link.port && (is_by_id(&other.port) || is_by_id(&link.port)) {
                 "adapters with the same serial number share their name in by-id: use the names in /dev/serial/by-path, which \
                  scanhub probe lists"
@@ -371,7 +379,7 @@ mod tests {
     }
 
     #[test]
-    fn no_port_is_opened_that_nobody_named() {
+    fn refuses_missing_and_duplicate_links() {
         let none = |set: &[&str]| {
             let sources = Sources { links: Vec::new(), ..sources(set, &[]) };
             Config::load(&sources).expect_err("no link").to_string()
@@ -400,7 +408,7 @@ mod tests {
         let settings = &config.links[0].scanner.settings;
         assert_eq!((settings.view, settings.unit_mm), (Some((100, 25)), Some(10)));
         assert_eq!(config.links[1].rate(), 38_400);
-        assert_eq!(config.links[1].port, Source::File { path: "/tmp/a b.bin".into(), paced: false });
+        assert_eq!(config.links[1].port, PortSpec::File { path: "/tmp/a b.bin".into(), paced: false });
     }
 
     #[test]
@@ -410,8 +418,8 @@ mod tests {
             ("tcp:10.0.0.7:23", "10.0.0.7", 23),
             ("tcp:[::1]:4001", "::1", 4001),
         ] {
-            let source = Source::parse(text).unwrap();
-            assert_eq!((source.name().as_str(), &source), (text, &Source::Tcp { host: host.into(), port }));
+            let source = PortSpec::parse(text).unwrap();
+            assert_eq!((source.name().as_str(), &source), (text, &PortSpec::Tcp { host: host.into(), port }));
         }
     }
 
@@ -438,7 +446,7 @@ mod tests {
     }
 
     #[test]
-    fn only_a_recording_is_told_its_mode() {
+    fn only_recordings_accept_a_mode_number() {
         let config = Config::load(&sources(&["link.a.mode=0x01"], &["a=file:x"])).unwrap();
         assert_eq!(config.links[0].scanner.settings.mode_number, Some(1));
         let live = refusal(&["link.front.mode=0x01"], &["front=/dev/x"]);
@@ -455,7 +463,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_type_cannot_do_is_refused() {
+    fn refuses_settings_the_type_does_not_support() {
         let of = |set: &[&str]| Config::load(&sources(set, &[])).map(|config| config.links[0].clone());
         let scanner = of(&["link.front.type=lms211"]).unwrap().scanner;
         assert_eq!(

@@ -4,19 +4,19 @@
 use std::path::PathBuf;
 
 use scanhub_drivers::features;
-use scanhub_files::regular;
+use scanhub_files::regular_file;
 use scanhub_preprocess::background::{Candidate, Method, Settings as Learning, Start};
-use scanhub_preprocess::zones::{Check, SECTORS, Sector};
+use scanhub_preprocess::zones::{MAX_SECTORS, Sector, ZoneChecker};
 use scanhub_preprocess::{lines, marks, motion, zones};
 use scanhub_schema::{
-    Failure, Family, Kind, MAX_BEAMS, MAX_LINES, MAX_ZONES, Pose, SavedModel, Scan, ScanHead,
+    BackgroundFile, Failure, Family, Kind, MAX_BEAMS, MAX_LINES, MAX_ZONES, Pose, Scan, ScanHead,
 };
 use serde::{Deserialize, Serialize};
 use toml::Spanned;
 use toml::de::DeTable;
 
 use crate::link::{Link, LinkKeys};
-use crate::section::{Checked, each, find, meters, optional, refused, section, whole, within};
+use crate::section::{CheckResult, each, find, invalid_value, meters, optional, section, whole, within};
 use crate::sources::SourceMap;
 
 /// Settings for processing the scans of one link.
@@ -42,22 +42,22 @@ pub struct Processing {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Early {
     /// Number of reads per LMS telegram while the topic has a subscriber, 2 to 8.
-    pub pieces: u8,
+    pub reads_per_telegram: u8,
 }
 
 /// Values of section `[background]`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Background {
     /// Whether the hub keeps a background. Otherwise it publishes neither foreground nor background.
-    pub is_kept: bool,
+    pub is_enabled: bool,
     /// Settings of learning.
     pub learning: Learning,
     /// File that the background starts with.
     pub file: Option<PathBuf>,
     /// Whether the start was set explicitly, so that a background of an earlier hub is not used.
-    pub start_is_said: bool,
+    pub is_start_set: bool,
     /// Whether the learned background is saved for the next hub, which starts with it.
-    pub is_handed_on: bool,
+    pub is_saved: bool,
     /// Background to start with: the contents of the file, or the background of an earlier hub.
     pub model: Option<Box<scanhub_schema::Background>>,
     /// Whether the model is published with every scan, and not only for a new generation and after a period of
@@ -72,28 +72,29 @@ impl Background {
     /// Returns [`Kind::Configuration`] with file and reason if it does not fit.
     pub(crate) fn read(&mut self, link: &Link) -> Result<(), Failure> {
         let sensor = &link.name;
-        let Some(file) = self.file.as_ref().filter(|_| self.is_kept) else { return Ok(()) };
-        let place = file.display().to_string();
+        let Some(file) = self.file.as_ref().filter(|_| self.is_enabled) else { return Ok(()) };
+        let path = file.display().to_string();
         let refuse = |what: String, hint: &str| {
-            let message = format!("link {sensor}: background.start = {place}: {what}");
+            let message = format!("link {sensor}: background.start = {path}: {what}");
             Err(Failure::new(Kind::Configuration, message, hint))
         };
-        let text = match regular::read(file, regular::LONGEST) {
+        let text = match regular_file::read(file, regular_file::MAX_FILE_BYTES) {
             Ok(text) => text,
-            Err(error) => return refuse(error.to_string(), START),
+            Err(error) => return refuse(error.to_string(), START_VALUES),
         };
-        let SavedModel { sensor: of, model } = SavedModel::parse(&text, &place).map_err(|failure| {
-            let message = format!("link {sensor}: background.start: {}", failure.message);
-            Failure::new(Kind::Configuration, message, failure.hint)
-        })?;
+        let BackgroundFile { sensor: of, model } =
+            BackgroundFile::parse(&text, &path).map_err(|failure| {
+                let message = format!("link {sensor}: background.start: {}", failure.message);
+                Failure::new(Kind::Configuration, message, failure.hint)
+            })?;
         if of != *sensor {
             let hint = "name the file of each sensor by background.start of its link";
             return refuse(format!("the model is that of sensor {of}"), hint);
         }
-        if let Err(wanted) = link.fits(&model) {
+        if let Err(expected) = link.check_background(&model) {
             let (beams, unit_mm) = (model.count, model.unit_um / 1000);
             let what = format!(
-                "the model has {beams} beams in units of {unit_mm} mm, the link is configured for {wanted}"
+                "the model has {beams} beams in units of {unit_mm} mm, the link is configured for {expected}"
             );
             return refuse(what, "use \"empty\", and save a new model of the sensor");
         }
@@ -103,16 +104,16 @@ impl Background {
 }
 
 /// Values of `start`.
-pub(crate) const START: &str =
+pub(crate) const START_VALUES: &str =
     "\"empty\", \"first-scan\", or a file that `scanhub background SENSOR save` has written";
 
 section! {
     /// Keys of section `pose` of a link.
     pub(crate) struct PoseKeys: "where the sensor sits, as { x = 0.3, y = 0.0, yaw = 1.5708 }" {
         /// meters ahead of the robot's center, at most 100
-        x: f64 = 0.0, check within(-100.0..=100.0, OFFSET);
+        x: f64 = 0.0, check within(-100.0..=100.0, OFFSET_REMEDY);
         /// meters to the left of the robot's center, at most 100
-        y: f64 = 0.0, check within(-100.0..=100.0, OFFSET);
+        y: f64 = 0.0, check within(-100.0..=100.0, OFFSET_REMEDY);
         /// radians, counterclockwise from ahead
         ///
         /// Direction in which the sensor looks, in radians counterclockwise from ahead, at most one turn.
@@ -366,7 +367,7 @@ impl Processing {
                 min_overlap: motion.min_overlap,
             },
             background: background.values(),
-            early: Early { pieces: early.pieces as u8 },
+            early: Early { reads_per_telegram: early.pieces as u8 },
         }
     }
 
@@ -399,7 +400,7 @@ impl BackgroundKeys {
             Some(file) => (Start::Empty, Some(file.into())),
         };
         Background {
-            is_kept: self.method != MethodKey::Off,
+            is_enabled: self.method != MethodKey::Off,
             learning: Learning {
                 method: match self.method {
                     MethodKey::Multi | MethodKey::Off => Method::Multi,
@@ -417,8 +418,8 @@ impl BackgroundKeys {
                 no_return_is_far: self.no_return_is_far,
             },
             file,
-            start_is_said: self.start.is_some(),
-            is_handed_on: self.keep,
+            is_start_set: self.start.is_some(),
+            is_saved: self.keep,
             model: None,
             every_scan: self.publish == PublishKey::EveryScan,
         }
@@ -470,8 +471,8 @@ fn in_mm(meters: f64) -> u16 {
     (meters * 1000.0).round() as u16
 }
 
-fn radii(key: &str, radii: &[f64]) -> Checked {
-    let refuse = |remedy: &str| Err(refused(format!("{key} = {radii:?}"), remedy));
+fn radii(key: &str, radii: &[f64]) -> CheckResult {
+    let refuse = |remedy: &str| Err(invalid_value(format!("{key} = {radii:?}"), remedy));
     if !(1..=MAX_ZONES).contains(&radii.len()) {
         return refuse("1 to 8 radii, the largest first, for example [1.0, 0.6]");
     }
@@ -484,15 +485,15 @@ fn radii(key: &str, radii: &[f64]) -> Checked {
     }
 }
 
-fn sectors(key: &str, sectors: &[SectorKeys]) -> Checked {
-    if sectors.len() > SECTORS {
+fn sectors(key: &str, sectors: &[SectorKeys]) -> CheckResult {
+    if sectors.len() > MAX_SECTORS {
         let what = format!("{key} has {} sectors", sectors.len());
-        return Err(refused(what, format!("at most {SECTORS}: merge neighbours")));
+        return Err(invalid_value(what, format!("at most {MAX_SECTORS}: merge neighbours")));
     }
     each(sector)(key, sectors)
 }
 
-fn sector(key: &str, sector: &SectorKeys) -> Checked {
+fn sector(key: &str, sector: &SectorKeys) -> CheckResult {
     let (from, to, range) = match *sector {
         SectorKeys { from_deg: Some(from), to_deg: Some(to), range, from: None, to: None } => {
             (from, to, range)
@@ -505,15 +506,15 @@ fn sector(key: &str, sector: &SectorKeys) -> Checked {
             let remedy = format!(
                 "angles are counted from ahead now: {{ from_deg = {now_from:?}, to_deg = {now_to:?}, range = {range:?} }}"
             );
-            return Err(refused(what, remedy));
+            return Err(invalid_value(what, remedy));
         }
         _ => {
             let remedy = "give it both angles, as { from_deg = -77.5, to_deg = -60.0, range = 0.42 }";
-            return Err(refused(format!("{key} has a sector without its two angles"), remedy));
+            return Err(invalid_value(format!("{key} has a sector without its two angles"), remedy));
         }
     };
     let refuse = |remedy: &str| {
-        Err(refused(format!("{key} = {{ from_deg = {from}, to_deg = {to}, range = {range} }}"), remedy))
+        Err(invalid_value(format!("{key} = {{ from_deg = {from}, to_deg = {to}, range = {range} }}"), remedy))
     };
     if !(-180.0..=180.0).contains(&from) || !(from..=180.0).contains(&to) {
         return refuse(
@@ -534,11 +535,11 @@ impl SectorKeys {
     }
 }
 
-fn start(key: &str, start: &str) -> Checked {
-    if start.is_empty() { Err(refused(format!("{key} = \"\""), START)) } else { Ok(()) }
+fn start(key: &str, start: &str) -> CheckResult {
+    if start.is_empty() { Err(invalid_value(format!("{key} = \"\""), START_VALUES)) } else { Ok(()) }
 }
 
-const OFFSET: &str = "metres from the robot's centre, at most 100";
+const OFFSET_REMEDY: &str = "metres from the robot's centre, at most 100";
 /// A radius in mm must fit into 16 bits.
 const MAX_RADIUS_M: f64 = 65.0;
 /// A larger yaw, in either direction, was written in degrees by mistake.
@@ -552,7 +553,7 @@ const FULL_CIRCLE: f64 = 2.0 * std::f64::consts::PI;
 pub(crate) fn check_coverage(
     link: &Link,
     table: &DeTable<'_>,
-    place: &str,
+    location: &str,
     sources: &SourceMap,
 ) -> Result<(), Failure> {
     let processing = &link.processing;
@@ -562,8 +563,8 @@ pub(crate) fn check_coverage(
         let spans = keys.iter().filter_map(|key| find(table, key).map(Spanned::span));
         // The first key of the last source.
         let last = spans.rev().max_by_key(|span| sources.index(span));
-        let place = last.map_or(place.to_owned(), |span| sources.place(span));
-        let message = format!("{place}: link {}: {what}", link.name);
+        let location = last.map_or(location.to_owned(), |span| sources.location(span));
+        let message = format!("{location}: link {}: {what}", link.name);
         Err(Failure::new(Kind::Configuration, message, remedy.replace("NAME", &link.name)))
     };
     if usize::from(min_beams) > beams {
@@ -571,28 +572,28 @@ pub(crate) fn check_coverage(
         return refuse(&["zones.min_beams"], what, "the default is one beam");
     }
     // The maximum number of beams that can detect something in the largest zone.
-    let detecting = |settings: &zones::Settings| {
+    let effective_beams = |settings: &zones::Settings| {
         let of_head = |head: &ScanHead| {
             let beams = usize::from(head.count);
-            let mut check = Check::new(processing.pose, settings, beams);
+            let mut check = ZoneChecker::new(processing.pose, settings, beams);
             check.update(&Scan::of(*head, &vec![0; beams]), &mut scanhub_schema::Zones::unknown());
-            check.telling()
+            check.effective_beams()
         };
         link.scan_heads().iter().map(of_head).max().unwrap_or_default()
     };
-    let seeing = detecting(settings);
-    if seeing >= min_beams {
+    let max_effective_beams = effective_beams(settings);
+    if max_effective_beams >= min_beams {
         return Ok(());
     }
     let circle_m = f64::from(settings.radii_mm.first().copied().unwrap_or_default()) / 1000.0;
-    if detecting(&zones::Settings { body_mask: Vec::new(), ..settings.clone() }) == 0 {
+    if effective_beams(&zones::Settings { body_mask: Vec::new(), ..settings.clone() }) == 0 {
         return refuse(
             &["pose.x", "pose.y", "pose.yaw"],
             format!("no beam sees into the circle of {circle_m} m"),
             "correct the sensor's pose, or set a circle that it sees: link.NAME.zones.radii",
         );
     }
-    if seeing == 0 {
+    if max_effective_beams == 0 {
         return refuse(
             &["zones.body_mask"],
             format!("body_mask covers every beam up to the circle of {circle_m} m"),
@@ -601,7 +602,7 @@ pub(crate) fn check_coverage(
     }
     refuse(
         &["zones.min_beams"],
-        format!("min_beams = {min_beams}, and {seeing} can see the circle of {circle_m} m"),
+        format!("min_beams = {min_beams}, and {max_effective_beams} can see the circle of {circle_m} m"),
         "set fewer beams, a larger circle, or another pose or body_mask",
     )
 }

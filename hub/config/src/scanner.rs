@@ -2,9 +2,10 @@
 //! settings; this module knows where each one is set.
 
 use scanhub_drivers::{
-    ANY, AUTO, Features, Key, Model, Refusal, Settings, SettingsRequest, Value, auto_or, family_of, features,
+    ANY_FAMILY, AUTO, Features, Key, Model, Refusal, Settings, SettingsRequest, Value, auto_or, family_of,
+    features,
 };
-use scanhub_port::Source;
+use scanhub_port::PortSpec;
 use scanhub_schema::{Failure, Family};
 use serde_json::Value as Json;
 use toml::Spanned;
@@ -37,14 +38,14 @@ impl Eq for Scanner {}
 impl Scanner {
     /// Returns the models and settings of the family, or of all families if it is searched for.
     pub fn features(&self) -> &'static Features {
-        self.family.map_or(&ANY, features)
+        self.family.map_or(&ANY_FAMILY, features)
     }
 
     /// Returns the model, or the values for an unknown one if the session must detect it.
     pub fn model(&self) -> Model {
         let features = self.features();
         let named = features.models.iter().find(|model| Some(model.name) == self.settings.model);
-        named.copied().unwrap_or(features.auto)
+        named.copied().unwrap_or(features.defaults)
     }
 
     /// Returns whether the session must detect the model, and with it the number of beams.
@@ -62,7 +63,7 @@ impl Scanner {
         }
         // A scanner that reports its model has its own number of beams.
         let own = Family::ALL.into_iter().map(features).filter(|features| features.models.is_empty());
-        own.map(|features| features.auto.beams).max().unwrap_or(beams).max(beams)
+        own.map(|features| features.defaults.beams).max().unwrap_or(beams).max(beams)
     }
 
     /// Returns the rate at which a tty is opened, in bits per second.
@@ -74,20 +75,20 @@ impl Scanner {
     fn max_rate(&self) -> u32 {
         let families =
             self.family.map_or(Family::ALL.to_vec(), |family| vec![family]).into_iter().map(features);
-        let all = families.flat_map(|features| features.models.iter().chain([&features.auto]));
+        let all = families.flat_map(|features| features.models.iter().chain([&features.defaults]));
         let all = all.map(|model| model.baud);
         if self.is_auto() { all.max().unwrap_or(self.rate()) } else { self.rate() }
     }
 
     /// Returns the highest rate that the scanner can have at `port`. A serial server has its own rate, whatever is
     /// configured here.
-    pub fn max_rate_at(&self, port: &Source) -> u32 {
-        if matches!(port, Source::Tty(_)) { self.rate() } else { self.max_rate() }
+    pub fn max_rate_at(&self, port: &PortSpec) -> u32 {
+        if matches!(port, PortSpec::Tty(_)) { self.rate() } else { self.max_rate() }
     }
 
     /// Returns the settings of a session at `port`. `listen_only` is whether nothing may be sent.
-    pub fn settings_at(&self, port: &Source, listen_only: bool) -> Settings {
-        let fixed_rate = !matches!(port, Source::Tty(_));
+    pub fn settings_at(&self, port: &PortSpec, listen_only: bool) -> Settings {
+        let fixed_rate = !matches!(port, PortSpec::Tty(_));
         let is_found = self.family.is_none() || self.settings.is_found;
         Settings { max_beams: Some(self.max_beams()), fixed_rate, listen_only, is_found, ..self.settings }
     }
@@ -182,9 +183,9 @@ impl<'a> ScannerRequest<'a> {
     }
 
     /// Returns the place of the number of a measuring mode, if one is set.
-    pub(crate) fn mode_number_place(&self) -> Option<String> {
+    pub(crate) fn mode_number_location(&self) -> Option<String> {
         self.request.mode_number?;
-        self.place("mode")
+        self.location("mode")
     }
 
     /// Returns the scanner. `refuse` creates the failure for a place, a problem and a remedy. Without a place, it is that
@@ -194,7 +195,7 @@ impl<'a> ScannerRequest<'a> {
         refuse: impl Fn(Option<String>, String, &str) -> Failure,
     ) -> Result<Scanner, Failure> {
         let refused = |Refusal { keys, what, remedy }: Refusal| {
-            refuse(keys.iter().find_map(|key| self.place(key.name())), what, &remedy)
+            refuse(keys.iter().find_map(|key| self.location(key.name())), what, &remedy)
         };
         let set = self.family.flatten();
         let named = if set.is_some() { None } else { self.named_family(&refuse)? };
@@ -203,11 +204,11 @@ impl<'a> ScannerRequest<'a> {
             (Some(model), Some(family)) => {
                 if let Some(implied) = family_of(model).filter(|implied| *implied != family) {
                     let [implied, family] = [implied.name(), family.name()];
-                    let place = self.place("family").unwrap_or_default();
+                    let location = self.location("family").unwrap_or_default();
                     let what =
-                        format!("model = \"{model}\" is of family {implied}, but {place} says {family}");
+                        format!("model = \"{model}\" is of family {implied}, but {location} says {family}");
                     let remedy = format!("leave `family` out, or set family = \"{implied}\"");
-                    return Err(refuse(self.place(Key::Model.name()), what, &remedy));
+                    return Err(refuse(self.location(Key::Model.name()), what, &remedy));
                 }
             }
             (_, None) => self.request.check_model().map_err(refused)?,
@@ -218,7 +219,7 @@ impl<'a> ScannerRequest<'a> {
             Some(family) => self.request.check(family).map_err(refused)?,
             None => Settings { beams: self.request.beams, ..Settings::default() },
         };
-        let keys = self.request.naming().map(|(key, ..)| key.name());
+        let keys = self.request.family_keys().map(|(key, ..)| key.name());
         let mut named_by: Vec<_> = set.map(|_| "family").into_iter().chain(keys).collect();
         named_by.dedup();
         Ok(Scanner { family, settings, named_by })
@@ -229,17 +230,17 @@ impl<'a> ScannerRequest<'a> {
         &self,
         refuse: impl Fn(Option<String>, String, &str) -> Failure,
     ) -> Result<Option<Family>, Failure> {
-        let mut all = self.request.naming();
+        let mut all = self.request.family_keys();
         let Some((first_key, first, first_what)) = all.next() else { return Ok(None) };
         if let Some((key, other, what)) = all.find(|(_, other, _)| *other != first) {
             let what = format!(
                 "{what} is of family {}, but {first_what} at {} is of family {}",
                 other.name(),
-                self.place(first_key.name()).unwrap_or_default(),
+                self.location(first_key.name()).unwrap_or_default(),
                 first.name()
             );
             return Err(refuse(
-                self.place(key.name()),
+                self.location(key.name()),
                 what,
                 "set only keys of the family that the scanner has",
             ));
@@ -248,7 +249,7 @@ impl<'a> ScannerRequest<'a> {
     }
 
     /// Returns the place where `key` is set.
-    fn place(&self, key: &str) -> Option<String> {
-        find(self.table, key).map(|value| self.sources.place(value.span()))
+    fn location(&self, key: &str) -> Option<String> {
+        find(self.table, key).map(|value| self.sources.location(value.span()))
     }
 }

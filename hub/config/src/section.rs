@@ -55,7 +55,7 @@ macro_rules! section {
                 serde_json::to_value(self).unwrap_or_default()
             }
 
-            fn refused(&self) -> Option<(&'static str, $crate::section::Refused)> {
+            fn find_invalid(&self) -> Option<(&'static str, $crate::section::InvalidValue)> {
                 $($(
                     let name = stringify!($field);
                     if let Err(refused) = ($check)(name, &self.$field) {
@@ -82,7 +82,7 @@ pub struct Key {
 
 /// A value that is not valid.
 #[derive(Debug)]
-pub(crate) struct Refused {
+pub(crate) struct InvalidValue {
     what: String,
     remedy: String,
     /// Index of the invalid element of a list.
@@ -90,7 +90,7 @@ pub(crate) struct Refused {
 }
 
 /// Result of a check of one value.
-pub(crate) type Checked = Result<(), Refused>;
+pub(crate) type CheckResult = Result<(), InvalidValue>;
 
 pub(crate) trait Section {
     /// Returns its keys in their order.
@@ -100,7 +100,7 @@ pub(crate) trait Section {
     fn json(&self) -> Json;
 
     /// Returns the first key whose value is not valid, and why.
-    fn refused(&self) -> Option<(&'static str, Refused)>;
+    fn find_invalid(&self) -> Option<(&'static str, InvalidValue)>;
 
     /// Returns keys and values in their order.
     fn values(&self) -> Vec<(&'static str, Json)> {
@@ -112,7 +112,7 @@ pub(crate) trait Section {
     ///
     /// Returns [`scanhub_schema::Kind::Configuration`] with place, value and remedy if one is not valid.
     fn check(&self, table: &DeTable<'_>, sources: &SourceMap) -> Result<(), Failure> {
-        let Some((key, Refused { what, remedy, at })) = self.refused() else { return Ok(()) };
+        let Some((key, InvalidValue { what, remedy, at })) = self.find_invalid() else { return Ok(()) };
         let list = find(table, key);
         let element = || list?.get_ref().as_array()?.get(at?);
         let span = element().or(list).map(Spanned::span).unwrap_or_default();
@@ -129,50 +129,51 @@ pub(crate) fn find<'t, 'i>(table: &'t DeTable<'i>, path: &str) -> Option<&'t Spa
 }
 
 /// Returns the refusal of `value`. `remedy` states the valid values.
-pub(crate) fn refused(what: impl Into<String>, remedy: impl Into<String>) -> Refused {
-    Refused { what: what.into(), remedy: remedy.into(), at: None }
+pub(crate) fn invalid_value(what: impl Into<String>, remedy: impl Into<String>) -> InvalidValue {
+    InvalidValue { what: what.into(), remedy: remedy.into(), at: None }
 }
 
 /// Returns the check of a number in `allowed`; `remedy` states the range.
-pub(crate) fn within(allowed: RangeInclusive<f64>, remedy: &str) -> impl Fn(&str, &f64) -> Checked {
+pub(crate) fn within(allowed: RangeInclusive<f64>, remedy: &str) -> impl Fn(&str, &f64) -> CheckResult {
     // NaN is not within any range.
     move |key, value| match allowed.contains(value) {
         true => Ok(()),
-        false => Err(refused(format!("{key} = {value}"), remedy)),
+        false => Err(invalid_value(format!("{key} = {value}"), remedy)),
     }
 }
 
 /// Returns the check of a length in meters.
-pub(crate) fn meters(allowed: RangeInclusive<f64>) -> impl Fn(&str, &f64) -> Checked {
+pub(crate) fn meters(allowed: RangeInclusive<f64>) -> impl Fn(&str, &f64) -> CheckResult {
     let remedy = format!("metres, from {} to {}", allowed.start(), allowed.end());
     move |key, value| within(allowed.clone(), &remedy)(key, value)
 }
 
 /// Returns the check of a whole number.
-pub(crate) fn whole(allowed: RangeInclusive<i64>) -> impl Fn(&str, &i64) -> Checked {
+pub(crate) fn whole(allowed: RangeInclusive<i64>) -> impl Fn(&str, &i64) -> CheckResult {
     let remedy = format!("a whole number from {} to {}", allowed.start(), allowed.end());
     whole_or(allowed, remedy)
 }
 
 /// Returns the check of a whole number with its own `remedy`.
-pub(crate) fn whole_or(allowed: RangeInclusive<i64>, remedy: String) -> impl Fn(&str, &i64) -> Checked {
+pub(crate) fn whole_or(allowed: RangeInclusive<i64>, remedy: String) -> impl Fn(&str, &i64) -> CheckResult {
     move |key, value| match allowed.contains(value) {
         true => Ok(()),
-        false => Err(refused(format!("{key} = {value}"), &remedy)),
+        false => Err(invalid_value(format!("{key} = {value}"), &remedy)),
     }
 }
 
 /// Returns the check of a value that may be missing.
 pub(crate) fn optional<T: Borrow<U>, U: ?Sized>(
-    check: impl Fn(&str, &U) -> Checked,
-) -> impl Fn(&str, &Option<T>) -> Checked {
+    check: impl Fn(&str, &U) -> CheckResult,
+) -> impl Fn(&str, &Option<T>) -> CheckResult {
     move |key, value| value.as_ref().map_or(Ok(()), |value| check(key, value.borrow()))
 }
 
 /// Returns the check of each element of a list.
-pub(crate) fn each<T>(check: impl Fn(&str, &T) -> Checked) -> impl Fn(&str, &[T]) -> Checked {
+pub(crate) fn each<T>(check: impl Fn(&str, &T) -> CheckResult) -> impl Fn(&str, &[T]) -> CheckResult {
     move |key, values| {
-        let checked = |(at, value)| check(key, value).map_err(|refused| Refused { at: Some(at), ..refused });
+        let checked =
+            |(at, value)| check(key, value).map_err(|invalid| InvalidValue { at: Some(at), ..invalid });
         values.iter().enumerate().try_for_each(checked)
     }
 }

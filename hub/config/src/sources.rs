@@ -4,7 +4,7 @@
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use scanhub_files::regular;
+use scanhub_files::regular_file;
 use scanhub_schema::{Failure, Kind, renamed};
 use serde::de::DeserializeOwned;
 use toml::Spanned;
@@ -45,7 +45,7 @@ impl Sources {
 
     fn read_into(&self, map: &mut SourceMap) -> Result<(), Failure> {
         for path in &self.files {
-            let text = regular::read_text(path, regular::LONGEST).map_err(|error| {
+            let text = regular_file::read_text(path, regular_file::MAX_FILE_BYTES).map_err(|error| {
                 let message = format!("{}: {error}", path.display());
                 Failure::new(Kind::Input, message, "name a readable TOML file")
             })?;
@@ -140,7 +140,7 @@ impl SourceMap {
     }
 
     /// Returns the place of `span`: `FILE:LINE:COLUMN`, or the flag.
-    pub(crate) fn place(&self, span: Range<usize>) -> String {
+    pub(crate) fn location(&self, span: Range<usize>) -> String {
         let Source { kind, name, span: own } = &self.sources[self.index(&span)];
         if *kind != SourceKind::File {
             return name.clone();
@@ -158,7 +158,7 @@ impl SourceMap {
         what: impl std::fmt::Display,
         remedy: impl Into<String>,
     ) -> Failure {
-        Failure::new(Kind::Configuration, format!("{}: {what}", self.place(span)), remedy)
+        Failure::new(Kind::Configuration, format!("{}: {what}", self.location(span)), remedy)
     }
 
     /// Returns the failure for an error of the TOML parser in a text that starts at `begin`. For an unknown key or word, it
@@ -170,8 +170,8 @@ impl SourceMap {
         let names: Vec<&str> = message.split('`').skip(1).step_by(2).collect();
         let unknown =
             [("unknown field", "unknown key", "Known"), ("unknown variant", "not possible:", "Possible")];
-        let said = unknown.into_iter().find(|(said, ..)| message.starts_with(said));
-        if let (Some((_, what, those)), [unknown, known @ ..]) = (said, &names[..]) {
+        let known_error = unknown.into_iter().find(|(prefix, ..)| message.starts_with(prefix));
+        if let (Some((_, what, label)), [unknown, known @ ..]) = (known_error, &names[..]) {
             let is_here = |key: &&str| key.rsplit('.').next().is_some_and(|last| known.contains(&last));
             if let Some(new) = renamed(unknown).filter(is_here) {
                 return self.refuse(span, format!("{what} `{unknown}`"), format!("its new name is `{new}`"));
@@ -180,7 +180,7 @@ impl SourceMap {
                 .iter()
                 .max_by(|a, b| strsim::jaro_winkler(a, unknown).total_cmp(&strsim::jaro_winkler(b, unknown)));
             let remedy = nearest.map_or(String::new(), |nearest| {
-                format!("did you mean `{nearest}`? {those} here: {}", known.join(", "))
+                format!("did you mean `{nearest}`? {label} here: {}", known.join(", "))
             });
             return self.refuse(span, format!("{what} `{unknown}`"), remedy);
         }
@@ -199,7 +199,7 @@ impl SourceMap {
             let what = "[link] is one section, and there may be several links";
             return Some(self.refuse(span, what, "write [[link]], with two brackets"));
         }
-        let (wanted, remedy) = match expected {
+        let (number_kind, remedy) = match expected {
             "a string" => ("text", format!("{key} = \"{bare}\", with quotes")),
             "a boolean" if ["true", "false"].contains(&bare) => ("a switch", without_quotes(key, bare)),
             "a boolean" => ("a switch", format!("{key} = true, or {key} = false")),
@@ -213,7 +213,7 @@ impl SourceMap {
             "a sequence" => ("a list", format!("{key} = [{value}], with brackets")),
             _ => return None,
         };
-        (!key.is_empty()).then(|| self.refuse(span, format!("{key} = {value} is not {wanted}"), remedy))
+        (!key.is_empty()).then(|| self.refuse(span, format!("{key} = {value} is not {number_kind}"), remedy))
     }
 }
 

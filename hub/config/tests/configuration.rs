@@ -11,20 +11,20 @@ use scanhub_schema::{Background, BackgroundHead, Family, Kind, as_json};
 use tempfile::TempPath;
 
 /// A temporary file.
-struct Scratch(TempPath);
+struct TempConfig(TempPath);
 
-impl Scratch {
-    fn new(name: &str, text: impl AsRef<[u8]>) -> Scratch {
+impl TempConfig {
+    fn new(name: &str, text: impl AsRef<[u8]>) -> TempConfig {
         let file = tempfile::Builder::new().suffix(name).tempfile().expect("a file");
         fs::write(&file, text).expect("a writable file");
-        Scratch(file.into_temp_path())
+        TempConfig(file.into_temp_path())
     }
 }
 
 /// Where no file says which there are.
 const LINKS: [&str; 2] = ["front=/dev/ttyUSB0,family=lms", "rear=/dev/ttyUSB1,family=lms"];
 
-fn load(files: &[&Scratch], set: &[&str]) -> Result<Config, String> {
+fn load(files: &[&TempConfig], set: &[&str]) -> Result<Config, String> {
     let sources = Sources {
         files: files.iter().map(|file| file.0.to_path_buf()).collect(),
         set: set.iter().map(|flag| (*flag).to_owned()).collect(),
@@ -36,7 +36,7 @@ fn load(files: &[&Scratch], set: &[&str]) -> Result<Config, String> {
     })
 }
 
-fn processing(files: &[&Scratch], set: &[&str], link: usize) -> Processing {
+fn processing(files: &[&TempConfig], set: &[&str], link: usize) -> Processing {
     load(files, set).unwrap().links[link].processing.clone()
 }
 
@@ -45,7 +45,7 @@ fn the_page_holds() {
     let page = include_str!("../../../docs/configuration.md");
     let example =
         page.split("```toml\n").nth(1).and_then(|rest| rest.split("```").next()).expect("an example");
-    let file = Scratch::new("page.toml", example);
+    let file = TempConfig::new("page.toml", example);
     let config = load(&[&file], &[]).unwrap();
     let [front, rear, side, top] = &config.links[..] else { panic!("{config:?}") };
     assert_eq!((front.processing.pose.x_m, rear.processing.pose.upside_down), (0.3, 1));
@@ -74,7 +74,7 @@ fn the_default_has_a_section_for_each_family() {
         .lines()
         .map(|line| line.strip_prefix("# ").filter(is_setting).unwrap_or(line))
         .collect();
-    let file = Scratch::new("default.toml", all.join("\n"));
+    let file = TempConfig::new("default.toml", all.join("\n"));
     let config = load(&[&file], &[]).unwrap_or_else(|refusal| panic!("{refusal}"));
     let families: Vec<Family> = config.links.iter().filter_map(scanhub_config::Link::family).collect();
     // The last one is a recording.
@@ -89,7 +89,7 @@ fn the_default_has_a_section_for_each_family() {
 
 #[test]
 fn a_scanner_is_refused_at_its_place() {
-    let file = Scratch::new(
+    let file = TempConfig::new(
         "family.toml",
         "[[link]]\nname = \"a\"\nport = \"x\"\nfamily = \"ld\"\nmodel = \"ld20\"\n",
     );
@@ -98,13 +98,13 @@ fn a_scanner_is_refused_at_its_place() {
 }
 
 #[test]
-fn a_link_wins_over_all_links_and_the_later_source_over_the_earlier() {
-    let first = Scratch::new(
+fn link_settings_and_later_sources_take_precedence() {
+    let first = TempConfig::new(
         "first.toml",
         "[[link]]\nname = \"a\"\nport = \"/dev/x\"\npose = { x = 0.3, yaw = 1.5 }\n\
          [link.zones]\nmargin = 0.05\n\n[[link]]\nname = \"b\"\nport = \"/dev/y\"\n",
     );
-    let second = Scratch::new(
+    let second = TempConfig::new(
         "second.toml",
         "[zones]\nmargin = 0.01\nradii = [2.0]\nbody_mask = [{ from_deg = -77.5, to_deg = -60, range = 0.42 }]\n\
          [background]\nmethod = \"paper\"\ncandidate = \"latest\"\nthreshold_mm = 40\nscans = 100\n\
@@ -134,7 +134,10 @@ fn a_link_wins_over_all_links_and_the_later_source_over_the_earlier() {
         (Method::Paper, Candidate::Latest, Start::FirstScan)
     );
     assert_eq!((learning.threshold_mm, learning.candidate_mm, learning.scans), (Some(40), None, Some(100)));
-    assert_eq!((a.background.is_kept, b.background.is_kept, a.background.every_scan), (true, false, true));
+    assert_eq!(
+        (a.background.is_enabled, b.background.is_enabled, a.background.every_scan),
+        (true, false, true)
+    );
     assert_eq!((a.marks.max_range_step_mm, a.marks.min_level, a.marks.max_gap), (200, 2, 1));
     assert_eq!((a.lines.max, a.lines.min_points, a.lines.refine), (20, 5, true));
     assert_eq!((a.motion.max_step_m, a.motion.max_turn_deg, a.motion.min_overlap), (0.8, 30.0, 0.4));
@@ -143,7 +146,7 @@ fn a_link_wins_over_all_links_and_the_later_source_over_the_earlier() {
 }
 
 #[test]
-fn what_cannot_be_is_refused_with_place_value_and_remedy() {
+fn refusal_names_place_value_and_remedy() {
     for (setting, words) in [
         ("link.front.pose.x=nan", "x = NaN\n  metres"),
         ("link.front.pose=[1, 2]", "pose is a list\n  write it as [pose]"),
@@ -219,20 +222,20 @@ fn what_cannot_be_is_refused_with_place_value_and_remedy() {
     let refusal = load(&[], &[&format!("zones.body_mask=[{many}]")]).unwrap_err();
     assert!(refusal.contains("body_mask has 65 sectors\n  at most 64"), "{refusal}");
     let deep =
-        Scratch::new("deep.toml", "[[link]]\nname = \"a\"\nport = \"x\"\n[link.marks]\nmin_levle = 1\n");
+        TempConfig::new("deep.toml", "[[link]]\nname = \"a\"\nport = \"x\"\n[link.marks]\nmin_levle = 1\n");
     let refusal = load(&[&deep], &[]).unwrap_err();
     assert!(
         refusal.contains("deep.toml:5:1: unknown key `min_levle`\n  did you mean `min_level`?"),
         "{refusal}"
     );
     let nowhere = "[[link]]\nname = \"a\"\nport = \"x\"\n[background]\nstart = \"/nope.json\"\n";
-    let nowhere = Scratch::new("nowhere.toml", nowhere);
+    let nowhere = TempConfig::new("nowhere.toml", nowhere);
     let refusal = load(&[&nowhere], &[]).unwrap_err();
     assert!(
         refusal.contains("nowhere.toml:5:9: link a: background.start = /nope.json: No such"),
         "{refusal}"
     );
-    let place = Scratch::new(
+    let place = TempConfig::new(
         "place.toml",
         "[[link]]\nname = \"a\"\nport = \"x\"\n[zones]\nmargin = 0.1\nradii = [0.6, 1.0]\n",
     );
@@ -257,14 +260,14 @@ fn a_circle_that_the_sensor_cannot_see_is_refused() {
         "link rear: min_beams = 300, and a scan has 181",
     );
     // Two metres ahead it looks away; turned about, it sees the circle. 30 degrees of it: 61 beams.
-    let away = "link.front.pose.x=2";
+    let facing_away = "link.front.pose.x=2";
     refused(
-        &[away, "link.front.pose.y=0"],
+        &[facing_away, "link.front.pose.y=0"],
         "--set link.front.pose.y=0: link front: no beam sees into the circle of 1 m\n  correct the sensor's pose, or set a \
          circle that it sees: link.front.zones.radii",
     );
-    assert_eq!(set(&[away, "link.front.zones.radii=[2.5,1]"]), Ok(()));
-    let back = [away, "link.front.pose.yaw=3.1416", "link.front.zones.min_beams=100"];
+    assert_eq!(set(&[facing_away, "link.front.zones.radii=[2.5,1]"]), Ok(()));
+    let back = [facing_away, "link.front.pose.yaw=3.1416", "link.front.zones.min_beams=100"];
     assert_eq!(set(&back), Ok(()));
     refused(
         &[&back[..], &["zones.radii=[0.5]"]].concat(),
@@ -280,7 +283,7 @@ fn a_circle_that_the_sensor_cannot_see_is_refused() {
         &[&body("1.0")],
         "link rear: body_mask covers every beam up to the circle of 1 m\n  shorten body_mask",
     );
-    let file = Scratch::new(
+    let file = TempConfig::new(
         "away.toml",
         "[[link]]\nname = \"a\"\nport = \"x\"\nangle = 180\n[link.pose]\nyaw = 0.1\nx = 2\n",
     );
@@ -300,10 +303,10 @@ fn a_background_begins_with_a_model_of_its_own_sensor() {
     let mut model = Background::of(head, &[0; 361]);
     model.ranges_mut()[7] = 1234;
     let text = serde_json::to_string(&as_json("front", &model)).unwrap();
-    let file = Scratch::new("model.json", &text);
+    let file = TempConfig::new("model.json", &text);
     let start = format!("link.front.background.start={}", file.0.display());
-    let begun = processing(&[], &[&start], 0).background;
-    assert_eq!((begun.model.as_deref(), begun.learning.start), (Some(&*model), Start::Empty));
+    let started = processing(&[], &[&start], 0).background;
+    assert_eq!((started.model.as_deref(), started.learning.start), (Some(&*model), Start::Empty));
     assert_eq!(processing(&[], &[&start, "link.front.background.start=empty"], 0).background.model, None);
     // Of no use to who keeps none.
     assert!(load(&[], &[&start, "background.method=off"]).is_ok());
@@ -316,7 +319,7 @@ fn a_background_begins_with_a_model_of_its_own_sensor() {
     assert!(refusal.contains("configured for 181 beams"), "{refusal}");
     let refusal = load(&[], &[&start, "link.front.unit=cm"]).unwrap_err();
     assert!(refusal.contains("361 beams in units of 10 mm"), "{refusal}");
-    let cut = Scratch::new("cut.json", &text[..900]);
+    let cut = TempConfig::new("cut.json", &text[..900]);
     let refusal = load(&[], &[&format!("link.front.background.start={}", cut.0.display())]).unwrap_err();
     assert!(refusal.contains(": link front: background.start: "), "{refusal}");
     assert!(refusal.contains("cut.json is no background model: it is cut short"), "{refusal}");
@@ -330,17 +333,17 @@ fn topics_have_places_for_as_many_subscribers_as_are_configured() {
         assert_eq!(places(&[set]), Ok(subscribers));
     }
     let file =
-        Scratch::new("limits.toml", "[limits]\nsubscribers = 40\n[[link]]\nname = \"a\"\nport = \"x\"\n");
+        TempConfig::new("limits.toml", "[limits]\nsubscribers = 40\n[[link]]\nname = \"a\"\nport = \"x\"\n");
     let of_file = |set: &[&str]| load(&[&file], set).map(|config| config.limits.subscribers);
     assert_eq!((of_file(&[]), of_file(&["limits.subscribers=50"])), (Ok(40), Ok(50)));
-    for (set, said) in [
+    for (set, message) in [
         ("limits.subscribers=0", "subscribers = 0\n  1 to 250"),
         ("limits.subscribers=251", "subscribers = 251\n  1 to 250"),
         ("limits.subscribers=-1", "subscribers = -1\n  1 to 250"),
         ("limits.subscriber=1", "did you mean `subscribers`?"),
     ] {
         let error = places(&[set]).unwrap_err();
-        assert!(error.starts_with(&format!("--set {set}: ")) && error.contains(said), "{error}");
+        assert!(error.starts_with(&format!("--set {set}: ")) && error.contains(message), "{error}");
     }
 }
 
@@ -353,7 +356,7 @@ fn old_names_are_errors_that_state_the_new_names() {
         ("[limits]\nconsumers = 40", "limits.subscribers"),
         ("[link.zones]\nself_min = []", "zones.body_mask"),
     ] {
-        let file = Scratch::new("old.toml", format!("[[link]]\nname = \"a\"\nport = \"x\"\n{old}\n"));
+        let file = TempConfig::new("old.toml", format!("[[link]]\nname = \"a\"\nport = \"x\"\n{old}\n"));
         let error = load(&[&file], &[]).unwrap_err();
         let key = old.split(['\n', ' ']).nth(1).unwrap();
         let expected = format!("old.toml:5:1: unknown key `{key}`\n  its new name is `{new}`");
@@ -365,12 +368,12 @@ fn old_names_are_errors_that_state_the_new_names() {
 
 #[test]
 fn the_gateway_has_a_section_that_needs_no_links() {
-    let first = Scratch::new(
+    let first = TempConfig::new(
         "gateway-1.toml",
         "[gateway]\ninterface = \"eth0\"\nttl = 2\nkey_file = \"/k\"\ntopics = [\"a/scan\"]\n",
     );
-    let second = Scratch::new("gateway-2.toml", "[gateway]\nbackground_every = \"10s\"\ntopics = []\n");
-    let gateway = |files: &[&Scratch], set: &[&str]| {
+    let second = TempConfig::new("gateway-2.toml", "[gateway]\nbackground_every = \"10s\"\ntopics = []\n");
+    let gateway = |files: &[&TempConfig], set: &[&str]| {
         let sources = Sources {
             files: files.iter().map(|file| file.0.to_path_buf()).collect(),
             set: set.iter().map(|flag| (*flag).to_owned()).collect(),
@@ -378,7 +381,7 @@ fn the_gateway_has_a_section_that_needs_no_links() {
         };
         let sources = sources.read();
         let gateway = Gateway::of(&sources).map_err(|failure| failure.to_string())?;
-        Ok::<_, String>((gateway, Gateway::background_every_place(&sources)))
+        Ok::<_, String>((gateway, Gateway::background_every_location(&sources)))
     };
     let place = format!("{}:2:20", second.0.display());
     assert_eq!(
@@ -399,15 +402,15 @@ fn the_gateway_has_a_section_that_needs_no_links() {
     );
     assert_eq!(gateway(&[], &[]).unwrap(), (Gateway::default(), None));
     // A hub takes the same files.
-    let links = Scratch::new("gateway-links.toml", "[[link]]\nname = \"a\"\nport = \"x\"\n");
+    let links = TempConfig::new("gateway-links.toml", "[[link]]\nname = \"a\"\nport = \"x\"\n");
     assert_eq!(load(&[&first, &links], &[]).unwrap().links.len(), 1);
-    for (set, said) in [
+    for (set, message) in [
         ("gateway.ttl=256", "ttl = 256\n  0 to 255"),
         ("gateway.mtu=575", "mtu = 575\n  576 to 1472"),
         ("gateway.mtu=-1", "mtu = -1"),
         ("gateway.tll=1", "did you mean `ttl`?"),
     ] {
         let error = gateway(&[], &[set]).unwrap_err();
-        assert!(error.starts_with(&format!("--set {set}: ")) && error.contains(said), "{error}");
+        assert!(error.starts_with(&format!("--set {set}: ")) && error.contains(message), "{error}");
     }
 }

@@ -10,7 +10,7 @@ fn sources(set: &[&str]) -> Sources {
 }
 
 #[test]
-fn what_is_said_for_all_links_is_for_those_that_have_it() {
+fn shared_settings_apply_to_links_that_support_them() {
     let set = ["marks.level=240", "marks.min_level=2", "link.side.marks.level=250"];
     let config = Config::load(&sources(&set)).unwrap();
     let marks = |link: &Link| (link.processing.marks.min_level, link.processing.marks.level);
@@ -24,7 +24,7 @@ fn what_is_said_for_all_links_is_for_those_that_have_it() {
 }
 
 #[test]
-fn what_does_not_fit_is_refused() {
+fn refuses_out_of_range_and_unsupported_settings() {
     for (setting, words) in [
         ("marks.level=0", "level = 0\n  a whole number from 1 to 65535"),
         ("marks.level=65536", "level = 65536\n  a whole number from 1 to 65535"),

@@ -9,7 +9,7 @@ use scanhub_drivers::{AUTO, Features, features};
 use scanhub_schema::Family;
 
 /// Head of the default configuration.
-const HEAD: &str = "\
+const PAGE_HEAD: &str = "\
 # Made with: scanhub config default > scanhub.toml. Every key is here, with its default; docs/configuration.md explains
 # them. Keys behind a # have no default, or an automatic one.
 # `scanhub probe PORT` finds the scanner at a port, and `scanhub probe PORT --toml` prints its section.
@@ -58,21 +58,23 @@ fn with_default(key: &Key, default: &str) -> String {
     line(&setting, &paragraphs(key)[0])
 }
 
-fn or(names: &[&str]) -> String {
+fn join_with_or(names: &[&str]) -> String {
     let (last, others) = names.split_last().expect("a name");
     format!("{} or {last}", others.join(", "))
 }
 
 /// Returns the keys of a scanner that the link of `family` shows, each with an example and its comment.
-fn shown(family: Family, key: &Key) -> Option<(String, String)> {
+fn value_and_source(family: Family, key: &Key) -> Option<(String, String)> {
     let Features { models, modes, keys, .. } = features(family);
     let models: Vec<_> = [AUTO].into_iter().chain(models.iter().map(|model| model.name)).collect();
     let comment = paragraphs(key)[0].clone();
     let own = keys.iter().any(|own| own.name() == key.name);
     Some(match key.name {
-        "model" if models.len() > 1 => (key.example.to_owned(), or(&models)),
+        "model" if models.len() > 1 => (key.example.to_owned(), join_with_or(&models)),
         "beams" if family == Family::Ld => (key.example.to_owned(), comment),
-        "mode" if !modes.is_empty() => (format!("\"{AUTO}\""), format!("auto: the fastest; {}", or(modes))),
+        "mode" if !modes.is_empty() => {
+            (format!("\"{AUTO}\""), format!("auto: the fastest; {}", join_with_or(modes)))
+        }
         "type" if own => ("\"lms291\"".to_owned(), comment),
         "mode" | "model" | "beams" => return None,
         _ if own => (key.example.to_owned(), comment),
@@ -80,19 +82,22 @@ fn shown(family: Family, key: &Key) -> Option<(String, String)> {
     })
 }
 
-fn default_configuration() -> String {
+fn reference_file() -> String {
     let keys_of_link = keys_of("link");
     let key =
         |name: &str| keys_of_link.iter().map(|(key, _)| key).find(|key| key.name == name).expect("a key");
-    let mut text = HEAD.to_owned();
+    let mut text = PAGE_HEAD.to_owned();
     for (title, name, port, family) in LINKS {
         let mut lines =
             vec!["[[link]]".to_owned(), format!("name = \"{name}\""), format!("port = \"{port}\"")];
         if title.is_empty() {
             lines[1] = line(&lines[1], &paragraphs(key("name"))[0]);
             lines[2] = line(&lines[2], &paragraphs(key("port"))[0]);
-            let families =
-                format!("{}; or {}", paragraphs(key("family"))[0], or(&Family::ALL.map(Family::name)));
+            let families = format!(
+                "{}; or {}",
+                paragraphs(key("family"))[0],
+                join_with_or(&Family::ALL.map(Family::name))
+            );
             lines.push(line(&format!("family = \"{AUTO}\""), &families));
             let pose: Vec<_> =
                 keys_of("pose").iter().map(|(key, default)| format!("{} = {default}", key.name)).collect();
@@ -103,7 +108,9 @@ fn default_configuration() -> String {
         match family {
             Some(family) => {
                 lines.push(format!("family = \"{}\"", family.name()));
-                let shown = keys_of_link.iter().filter_map(|(key, _)| Some((key.name, shown(family, key)?)));
+                let shown = keys_of_link
+                    .iter()
+                    .filter_map(|(key, _)| Some((key.name, value_and_source(family, key)?)));
                 let settings = shown.map(|(key, (example, comment))| {
                     line(&format!("# {key} = {example}"), &comment).split_off(2)
                 });
@@ -166,7 +173,7 @@ fn compare(path: &str, generated: &str) {
 
 #[test]
 fn default_configuration_is_generated() {
-    compare("src/default.toml", &default_configuration());
+    compare("src/default.toml", &reference_file());
 }
 
 #[test]

@@ -18,16 +18,16 @@ fn load(set: &[&str]) -> Result<Config, String> {
 }
 
 /// Family, model and beams of a scanner whose head turns.
-fn set_of(link: &Link) -> Option<(&'static str, &'static str, Option<usize>)> {
+fn scanner_settings(link: &Link) -> Option<(&'static str, &'static str, Option<usize>)> {
     let scanner = &link.scanner;
     let family = scanner.family.filter(|family| *family != Family::Lms)?;
     Some((family.name(), scanner.model().name, scanner.settings.beams))
 }
 
 #[test]
-fn a_link_has_a_family_and_what_its_family_needs() {
+fn family_determines_rate_beams_and_valid_settings() {
     let front = |set: &[&str]| load(set).map(|mut config| config.links.swap_remove(0));
-    let known = |link: &Link| (set_of(link), link.rate(), link.max_beams());
+    let known = |link: &Link| (scanner_settings(link), link.rate(), link.max_beams());
     let family = "link.front.family=ld";
     let set = |model, beams| Some(("ld", model, beams));
     for (setting, scanner, rate, beams) in [
@@ -172,12 +172,12 @@ fn a_mode_and_rest_are_for_those_that_have_them() {
         (scanner.model().name, mode, stop_when_idle)
     };
     assert_eq!(set(&[]), ("auto", None, false));
-    let said = ["link.front.model=s2", "link.front.mode=denseboost", "link.front.idle=stop"];
-    assert_eq!(set(&said), ("s2", Some("denseboost"), true));
-    let shouted = ["link.front.model=S2", "link.front.mode=DenseBoost", "link.front.idle=stop"];
-    assert_eq!(set(&shouted), set(&said));
+    let settings = ["link.front.model=s2", "link.front.mode=denseboost", "link.front.idle=stop"];
+    assert_eq!(set(&settings), ("s2", Some("denseboost"), true));
+    let uppercase = ["link.front.model=S2", "link.front.mode=DenseBoost", "link.front.idle=stop"];
+    assert_eq!(set(&uppercase), set(&settings));
     assert_eq!(set(&["link.front.model=Auto"]).0, "auto");
-    let link = front(&said).unwrap();
+    let link = front(&settings).unwrap();
     assert_eq!((link.rate(), link.max_beams()), (1_000_000, 3200));
     // The later source wins, also over the number of an LMS.
     assert_eq!(set(&["link.front.mode=1", "link.front.mode=express"]), ("auto", Some("express"), false));
@@ -204,7 +204,7 @@ fn keys_of_a_link_may_follow_its_port() {
     };
     let link = load("side=/dev/ttyUSB2,family=ld,model=ld19,beams=300").unwrap();
     assert_eq!((link.name.as_str(), link.port.name().as_str()), ("side", "/dev/ttyUSB2"));
-    assert_eq!(set_of(&link), Some(("ld", "ld19", Some(300))));
+    assert_eq!(scanner_settings(&link), Some(("ld", "ld19", Some(300))));
     assert_eq!(load("a=tcp:10.0.0.7:4001,angle=100,unit=cm").unwrap().scanner.settings.view, Some((100, 50)));
     // A comma may be in the name of a port.
     assert_eq!(load("a=file:/tmp/a,b.bin").unwrap().port.name(), "file:/tmp/a,b.bin");
@@ -229,7 +229,8 @@ fn a_family_may_be_searched_for() {
     for family in Family::ALL.into_iter().map(features) {
         assert!(family.models.iter().all(|model| model.beams <= limits.beams));
         assert!(
-            family.max_telegram <= limits.telegram && limits.contents & family.contents == family.contents
+            family.max_telegram <= limits.telegram
+                && limits.contents & family.array_flags == family.array_flags
         );
     }
     // Keys of every link, and automatic values, name no family.
@@ -237,7 +238,8 @@ fn a_family_may_be_searched_for() {
         assert_eq!(front(set).unwrap().family(), None, "{set:?}");
     }
     let remedy = "family = \"auto\" needs the most: set link.front.family to one of lms, ld, rplidar";
-    let short = || scanhub_schema::Failure::new(Kind::Short, "shared memory is short", "free some of it");
+    let short =
+        || scanhub_schema::Failure::new(Kind::ResourceExhausted, "shared memory is short", "free some of it");
     assert_eq!(load(&[]).unwrap().with_remedy(short()).hint, format!("free some of it; {remedy}"));
     let named = load(&["link.front.family=ld", "link.rear.family=lms"]).unwrap();
     assert_eq!(named.with_remedy(short()), short());

@@ -7,10 +7,10 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use scanhub_config::Processing;
 use scanhub_drivers::PortSession;
-use scanhub_drivers::line::{Control, Session as _};
-use scanhub_schema::{Background, Failure, Kind, Nanos, Response, Shown, Verb};
-use scanhub_shm::shortage;
-use scanhub_shm::{Asked, Node};
+use scanhub_drivers::line::{Control, ScannerSession as _};
+use scanhub_schema::{Background, Failure, Kind, Nanos, Response, ResponseModel, Verb};
+use scanhub_shm::resource_limits;
+use scanhub_shm::{IncomingRequest, Node};
 
 use crate::player::Player;
 use crate::process::EventFd;
@@ -20,7 +20,7 @@ pub(crate) struct ControlServer {
     server: scanhub_shm::ControlServer,
     pub(crate) commands: CommandSender,
     /// Requests whose link has not reported an outcome yet, with their numbers.
-    open: Vec<(u64, Asked)>,
+    pending: Vec<(u64, IncomingRequest)>,
 }
 
 /// Queues to the threads of all links, and the outcomes that these threads report.
@@ -35,7 +35,7 @@ pub struct CommandSender {
 struct LinkQueue {
     sensor: String,
     queue: SyncSender<QueuedRequest>,
-    changed: PendingSettings,
+    settings: PendingSettings,
     event: Arc<EventFd>,
 }
 
@@ -43,12 +43,12 @@ struct LinkQueue {
 type PendingSettings = Arc<Mutex<Option<Box<Processing>>>>;
 
 /// Outcome of a request: the background model if the request asked for it, or the reason of a failure.
-pub type Outcome = Result<Option<Box<Shown>>, Failure>;
+pub type Outcome = Result<Option<Box<ResponseModel>>, Failure>;
 
 /// A request in the queue of a link.
 pub(crate) struct QueuedRequest {
     /// Identifies the request in its [`Outcome`].
-    pub(crate) number: u64,
+    pub(crate) id: u64,
     pub(crate) verb: Verb,
     /// The model of [`Verb::Load`]; empty for the other verbs.
     pub(crate) model: Box<Background>,
@@ -59,7 +59,7 @@ impl CommandSender {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`] if no descriptors are left.
+    /// [`Kind::ResourceExhausted`] if no descriptors are left.
     pub fn new<'a>(
         sensors: impl Iterator<Item = &'a str>,
     ) -> Result<(CommandSender, Vec<ControlQueue>), Failure> {
@@ -68,18 +68,18 @@ impl CommandSender {
         let (mut links, mut ends) = (Vec::new(), Vec::new());
         for sensor in sensors {
             let (sender, queue) = sync_channel(QUEUE_CAPACITY);
-            let (own, changed) = (Arc::new(EventFd::new()?), PendingSettings::default());
+            let (own, settings) = (Arc::new(EventFd::new()?), PendingSettings::default());
             links.push(LinkQueue {
                 sensor: sensor.to_owned(),
                 queue: sender,
-                changed: changed.clone(),
+                settings: settings.clone(),
                 event: own.clone(),
             });
             ends.push(ControlQueue {
                 sensor: sensor.to_owned(),
                 paused: false,
                 queue,
-                changed,
+                settings,
                 event: own,
                 outcomes: outcome_sender.clone(),
                 server: event.clone(),
@@ -92,8 +92,8 @@ impl CommandSender {
     /// yet.
     pub fn change(&self, sensor: &str, processing: &Processing) {
         if let Some(link) = self.links.iter().find(|link| link.sensor == sensor) {
-            let mut changed = link.changed.lock().unwrap_or_else(PoisonError::into_inner);
-            *changed = Some(Box::new(processing.clone()));
+            let mut pending = link.settings.lock().unwrap_or_else(PoisonError::into_inner);
+            *pending = Some(Box::new(processing.clone()));
             link.event.signal();
         }
     }
@@ -103,19 +103,19 @@ impl CommandSender {
     ///
     /// # Errors
     ///
-    /// [`Kind::NoTopic`] if there is no such link, [`Kind::Short`] if too many requests wait for it, [`Kind::Failed`] if it
+    /// [`Kind::NoTopic`] if there is no such link, [`Kind::ResourceExhausted`] if too many requests wait for it, [`Kind::Failed`] if it
     /// has ended.
-    pub fn ask(&mut self, sensor: &str, verb: Verb, model: Box<Background>) -> Result<u64, Failure> {
+    pub fn enqueue(&mut self, sensor: &str, verb: Verb, model: Box<Background>) -> Result<u64, Failure> {
         let link = self.links.iter().find(|link| link.sensor == sensor).ok_or_else(|| {
             let sensors: Vec<_> = self.links.iter().map(|link| link.sensor.as_str()).collect();
             let hint = format!("there are {}", sensors.join(", "));
             Failure::new(Kind::NoTopic, format!("the hub has no sensor {sensor}"), hint)
         })?;
-        match link.queue.try_send(QueuedRequest { number: self.next, verb, model }) {
+        match link.queue.try_send(QueuedRequest { id: self.next, verb, model }) {
             Ok(()) => {}
             Err(TrySendError::Full(_)) => {
                 let message = format!("{sensor} already has {QUEUE_CAPACITY} waiting requests");
-                return Err(Failure::new(Kind::Short, message, "try again in a moment"));
+                return Err(Failure::new(Kind::ResourceExhausted, message, "try again in a moment"));
             }
             Err(TrySendError::Disconnected(_)) => {
                 return Err(Failure::new(Kind::Failed, format!("the link {sensor} has ended"), ""));
@@ -144,7 +144,7 @@ impl ControlServer {
     ) -> Result<(ControlServer, Vec<ControlQueue>), Failure> {
         let server = scanhub_shm::ControlServer::create(node)?;
         let (commands, queues) = CommandSender::new(sensors)?;
-        Ok((ControlServer { server, commands, open: Vec::new() }, queues))
+        Ok((ControlServer { server, commands, pending: Vec::new() }, queues))
     }
 
     /// Descriptors that become readable when [`serve`](Self::serve) has something to do.
@@ -156,51 +156,51 @@ impl ControlServer {
     pub(crate) fn serve(&mut self) {
         self.commands.event.clear();
         while let Some((number, outcome)) = self.commands.outcome() {
-            if let Some(at) = self.open.iter().position(|(open, _)| *open == number) {
-                let (_, asked) = self.open.swap_remove(at);
-                self.answer(asked, outcome);
+            if let Some(at) = self.pending.iter().position(|(open, _)| *open == number) {
+                let (_, request) = self.pending.swap_remove(at);
+                self.reply(request, outcome);
             }
         }
-        self.open.retain(|(_, asked)| asked.is_waited_for());
+        self.pending.retain(|(_, request)| request.is_client_waiting());
         let mut was_signaled = scanhub_shm::take_wakeups(&[self.server.requests()]).is_ok_and(|rang| rang);
         loop {
             match self.server.receive() {
-                Ok(Some(asked)) => {
+                Ok(Some(request)) => {
                     was_signaled = false;
-                    self.forward(asked);
+                    self.forward(request);
                 }
                 Ok(None) => break,
                 Err(failure) => return tracing::warn!(%failure, "a request was not received"),
             }
         }
         // iceoryx2 skips a client for whose connection no descriptors are left.
-        if was_signaled && let Err(failure) = shortage::check_descriptors(CLIENT_DESCRIPTORS) {
+        if was_signaled && let Err(failure) = resource_limits::check_descriptors(CLIENT_DESCRIPTORS) {
             tracing::warn!("a request was not received: {}; {}", failure.message, failure.hint);
         }
     }
 
     /// Queues `asked`, or replies that it is refused.
-    fn forward(&mut self, asked: Asked) {
-        match self.queue(&asked) {
-            Ok(number) => self.open.push((number, asked)),
-            Err(refusal) => self.answer(asked, Err(refusal)),
+    fn forward(&mut self, incoming: IncomingRequest) {
+        match self.enqueue(&incoming) {
+            Ok(number) => self.pending.push((number, incoming)),
+            Err(refusal) => self.reply(incoming, Err(refusal)),
         }
     }
 
     /// Puts `asked` into the queue of its link, and returns its number.
-    fn queue(&mut self, asked: &Asked) -> Result<u64, Failure> {
+    fn enqueue(&mut self, incoming: &IncomingRequest) -> Result<u64, Failure> {
         let request =
-            asked.request().and_then(|request| Some((request.sensor, request.verb?, request.model)));
+            incoming.request().and_then(|request| Some((request.sensor, request.verb?, request.model)));
         let (sensor, verb, model) = request.ok_or_else(|| {
             let hint = "client and hub are of different versions";
             Failure::new(Kind::Failed, "the request is not known to this hub", hint)
         })?;
-        self.commands.ask(&sensor, verb, model.unwrap_or_default())
+        self.commands.enqueue(&sensor, verb, model.unwrap_or_default())
     }
 
-    fn answer(&self, asked: Asked, outcome: Outcome) {
+    fn reply(&self, incoming: IncomingRequest, outcome: Outcome) {
         let response = Response(outcome.map(|shown| shown.map(|shown| *shown)));
-        if let Err(failure) = self.server.answer(asked, &response) {
+        if let Err(failure) = self.server.respond(incoming, &response) {
             tracing::debug!(%failure, "a client was not answered");
         }
     }
@@ -212,7 +212,7 @@ pub struct ControlQueue {
     /// Whether a user has paused the sensor.
     paused: bool,
     queue: Receiver<QueuedRequest>,
-    changed: PendingSettings,
+    settings: PendingSettings,
     event: Arc<EventFd>,
     outcomes: Sender<(u64, Outcome)>,
     server: Arc<EventFd>,
@@ -263,9 +263,9 @@ impl ControlQueue {
     }
 
     /// Takes the new settings of the processors, if they were changed since the last call.
-    pub(crate) fn changed(&self) -> Option<Box<Processing>> {
+    pub(crate) fn take_settings(&self) -> Option<Box<Processing>> {
         self.event.clear();
-        self.changed.lock().unwrap_or_else(PoisonError::into_inner).take()
+        self.settings.lock().unwrap_or_else(PoisonError::into_inner).take()
     }
 
     /// Takes the next request from the queue.
@@ -275,16 +275,16 @@ impl ControlQueue {
     }
 
     /// Reports the outcome of request `number` to the server.
-    pub(crate) fn answer(&self, number: u64, outcome: Outcome) {
+    pub(crate) fn report_outcome(&self, id: u64, outcome: Outcome) {
         // Without a server, no client waits.
-        if self.outcomes.send((number, outcome)).is_ok() {
+        if self.outcomes.send((id, outcome)).is_ok() {
             self.server.signal();
         }
     }
 
-    fn refusal(&self, why: &str) -> Failure {
+    fn refusal(&self, reason: &str) -> Failure {
         let hint = format!("`scanhub info {}` shows its state", self.sensor);
-        Failure::new(Kind::Failed, format!("{}: {why}", self.sensor), hint)
+        Failure::new(Kind::Failed, format!("{}: {reason}", self.sensor), hint)
     }
 }
 

@@ -12,9 +12,9 @@
 use std::path::Path;
 
 use scanhub_config::Link;
-use scanhub_drivers::line::{Notice, Session as _};
-use scanhub_drivers::{PortSession, Trouble, line, search};
-use scanhub_port::{Alteration, Source};
+use scanhub_drivers::line::{Notice, ScannerSession as _};
+use scanhub_drivers::{PortSession, Problem, line, search};
+use scanhub_port::{PortSpec, SettingsChange};
 use scanhub_schema::{Family, MILLIS, Nanos, State, Status};
 
 use crate::link_stats::LineHealth;
@@ -23,7 +23,7 @@ use crate::link_stats::LineHealth;
 pub(crate) struct Diagnosis<'a> {
     link: &'a Link,
     /// Findings that the message was made from; `None` if it must be made again.
-    facts: Option<Facts>,
+    findings: Option<Findings>,
     /// Message about the problem; empty if there is none.
     message: String,
     /// Message that the last connection closed without delivering a byte; otherwise empty.
@@ -45,7 +45,7 @@ pub(crate) struct Diagnosis<'a> {
     /// Time of the last update.
     now: Nanos,
     /// Settings of the port that another process changed.
-    altered: Option<Altered>,
+    settings_change: Option<ReportedChange>,
     /// Whether the port delivers more than its line can carry.
     is_flooded: bool,
     /// Share of the bytes that the line damages, in percent, while it damages most of them.
@@ -61,8 +61,8 @@ pub(crate) struct Diagnosis<'a> {
 }
 
 /// A change of the port's settings by another process, and the message about it.
-struct Altered {
-    alteration: Alteration,
+struct ReportedChange {
+    change: SettingsChange,
     message: String,
     /// Time until which the message is shown.
     until: Nanos,
@@ -70,9 +70,9 @@ struct Altered {
 
 /// Findings that a message is made from.
 #[derive(Clone, Copy, PartialEq)]
-struct Facts {
+struct Findings {
     state: State,
-    problem: Option<Trouble>,
+    problem: Option<Problem>,
     /// Rate of the bytes that arrive while the session is [missing](line::Session::missing) something, or was
     /// interrupted.
     bytes_per_second: Option<u64>,
@@ -88,7 +88,7 @@ impl<'a> Diagnosis<'a> {
     pub(crate) fn new(link: &'a Link) -> Self {
         Diagnosis {
             link,
-            facts: None,
+            findings: None,
             message: String::new(),
             empty_connection: String::new(),
             device: None,
@@ -99,7 +99,7 @@ impl<'a> Diagnosis<'a> {
             has_streamed: false,
             exchange: String::new(),
             now: 0,
-            altered: None,
+            settings_change: None,
             is_flooded: false,
             damaged_percent: None,
             restarts: 0,
@@ -111,33 +111,33 @@ impl<'a> Diagnosis<'a> {
 
     /// Updates the diagnosis from `session` at `now`. Returns the state of the link, and whether anything has changed.
     pub(crate) fn update(&mut self, session: &PortSession, now: Nanos) -> (State, bool) {
-        if self.altered.take_if(|altered| now >= altered.until).is_some() {
-            self.facts = None;
+        if self.settings_change.take_if(|altered| now >= altered.until).is_some() {
+            self.findings = None;
         }
         self.now = now;
-        let bytes_per_second = self.measure(session, now);
+        let bytes_per_second = self.measure_byte_rate(session, now);
         let state = if self.may_disconnect(session) { State::Absent } else { state_of(session) };
-        let facts = Facts {
+        let findings = Findings {
             state,
-            problem: session.trouble(),
+            problem: session.problem(),
             bytes_per_second,
             is_exchanged: self.is_exchanged(session, bytes_per_second),
-            other_model: session.other_model().map(|model| model.name),
+            other_model: session.unexpected_model().map(|model| model.name),
             unit_mm: session.unit_mm(),
             notice: session.notice(),
         };
-        let is_new = self.facts != Some(facts);
+        let is_new = self.findings != Some(findings);
         if is_new {
             // A notice that is not a fault only goes to the log.
-            if let Some(notice) = facts.notice.filter(|notice| !notice.is_fault)
-                && self.facts.is_none_or(|before| before.notice != Some(notice))
+            if let Some(notice) = findings.notice.filter(|notice| !notice.is_fault)
+                && self.findings.is_none_or(|before| before.notice != Some(notice))
             {
                 tracing::info!("{}: {}", self.link.name, notice.text);
             }
-            self.facts = Some(facts);
+            self.findings = Some(findings);
             self.message = self.problem(session);
-            if let Some(rate) = facts.bytes_per_second.filter(|_| facts.is_exchanged) {
-                self.exchange = self.bytes_of_another_kind(session, rate);
+            if let Some(rate) = findings.bytes_per_second.filter(|_| findings.is_exchanged) {
+                self.exchange = self.bytes_of_other_scanner(session, rate);
             } else if self.family.is_some() {
                 self.exchange.clear();
             }
@@ -147,8 +147,8 @@ impl<'a> Diagnosis<'a> {
 
     /// Measures the rate of the bytes that arrive at `now`. Returns it while the session is missing something, or was
     /// interrupted.
-    fn measure(&mut self, session: &PortSession, now: Nanos) -> Option<u64> {
-        let account = session.account();
+    fn measure_byte_rate(&mut self, session: &PortSession, now: Nanos) -> Option<u64> {
+        let stats = session.stats();
         if session.family() != self.family {
             (self.family, self.last_telegram, self.has_streamed) = (session.family(), None, false);
         }
@@ -158,9 +158,9 @@ impl<'a> Diagnosis<'a> {
             self.byte_rate = ByteRate::default();
             return None;
         }
-        self.byte_rate.note(now, account.read);
-        let is_shown = self.is_silent_for(SILENCE) || session.missing().is_some();
-        if is_shown { self.byte_rate.shown(now, account.read) } else { None }
+        self.byte_rate.note(now, stats.read);
+        let is_shown = self.is_silent_for(MIN_SILENCE) || session.missing_transmission().is_some();
+        if is_shown { self.byte_rate.reported_rate(now, stats.read) } else { None }
     }
 
     /// Returns whether telegrams have arrived, and then none for at least `span`.
@@ -173,13 +173,13 @@ impl<'a> Diagnosis<'a> {
     fn is_exchanged(&self, session: &PortSession, bytes_per_second: Option<u64>) -> bool {
         session.state() != line::State::Paused
             && self.has_streamed
-            && self.is_silent_for(EXCHANGED_AFTER)
+            && self.is_silent_for(MIN_EXCHANGE_SILENCE)
             && self.damaged_percent.is_none()
-            && bytes_per_second.is_some_and(|rate| rate >= STREAM_BYTES)
+            && bytes_per_second.is_some_and(|rate| rate >= MIN_STREAM_RATE)
     }
 
     /// Handles that the port has been opened, as `device` if that is known.
-    pub(crate) fn open(&mut self, device: Option<&Path>) {
+    pub(crate) fn on_port_opened(&mut self, device: Option<&Path>) {
         self.device = device.map(|device| device.display().to_string());
         self.byte_rate = ByteRate::default();
         (self.last_telegram, self.new_telegram, self.has_streamed) = (None, None, false);
@@ -188,23 +188,23 @@ impl<'a> Diagnosis<'a> {
         self.damaged_percent = None;
     }
 
-    /// Notes the `alteration` that the hub has undone at `now`. `program` searches for the program that made it. A
-    /// message that already names the alteration stays: a program that keeps changing the port does not cause a
+    /// Notes the `change` that the hub has undone at `now`. `program` searches for the program that made it. A
+    /// message that already names the change stays: a program that keeps changing the port does not cause a
     /// search each time.
-    pub(crate) fn note_altered(
+    pub(crate) fn note_settings_change(
         &mut self,
-        alteration: Alteration,
+        change: SettingsChange,
         program: impl FnOnce() -> Option<String>,
         now: Nanos,
     ) {
-        let message = match self.altered.take() {
-            Some(altered) if altered.alteration == alteration => altered.message,
+        let message = match self.settings_change.take() {
+            Some(reported) if reported.change == change => reported.message,
             _ => {
-                self.facts = None;
-                program().map_or_else(|| alteration.to_string(), |program| format!("{alteration}; {program}"))
+                self.findings = None;
+                program().map_or_else(|| change.to_string(), |program| format!("{change}; {program}"))
             }
         };
-        self.altered = Some(Altered { alteration, message, until: now + ALTERED_SHOWN });
+        self.settings_change = Some(ReportedChange { change, message, until: now + SETTINGS_CHANGE_TIME });
     }
 
     /// Notes a telegram that arrived at `now`.
@@ -214,7 +214,7 @@ impl<'a> Diagnosis<'a> {
 
     /// Returns whether the message must be made again.
     pub(crate) fn is_outdated(&self) -> bool {
-        self.facts.is_none()
+        self.findings.is_none()
     }
 
     /// Returns the message about the problem; an empty string if there is none.
@@ -224,7 +224,7 @@ impl<'a> Diagnosis<'a> {
 
     /// Handles the end of the session. The next one has its own problems.
     pub(crate) fn end_session(&mut self) {
-        self.facts = None;
+        self.findings = None;
     }
 
     /// Notes `message` if the last connection closed without delivering a byte; otherwise it is empty. While the next
@@ -236,7 +236,7 @@ impl<'a> Diagnosis<'a> {
     /// Notes whether the port delivers more than its line can carry.
     pub(crate) fn note_flood(&mut self, is_flooded: bool) {
         if std::mem::replace(&mut self.is_flooded, is_flooded) != is_flooded {
-            self.facts = None;
+            self.findings = None;
         }
     }
 
@@ -248,22 +248,22 @@ impl<'a> Diagnosis<'a> {
     /// Notes the state of the line in the last ten seconds. Called once per status.
     pub(crate) fn note_line(&mut self, line: LineHealth) {
         // Where scans do not arrive, bytes of a scanner that was received count too, unless nothing is wrong.
-        let has_problem = self.facts.is_some_and(|facts| facts.problem.is_some());
-        let is_received = has_problem && line.telegrams >= FEW_TELEGRAMS;
+        let has_problem = self.findings.is_some_and(|findings| findings.problem.is_some());
+        let is_received = has_problem && line.telegrams >= MIN_TELEGRAMS;
         let share = if is_received { line.damaged.max(line.discarded) } else { line.damaged };
         let percent = (100.0 * share).round() as u32;
         let damaged_percent = match self.damaged_percent {
             // Another scanner may have sent bytes without any telegram among them.
-            None if self.family.is_none() || self.is_silent_for(SILENCE) => None,
-            None => Some(percent).filter(|&percent| percent >= MOST_DAMAGED),
+            None if self.family.is_none() || self.is_silent_for(MIN_SILENCE) => None,
+            None => Some(percent).filter(|&percent| percent >= UNRELIABLE_PERCENT),
             // A number that changes every second would be logged every second.
-            Some(before) if before.abs_diff(percent) < COARSE => Some(before),
-            Some(_) => Some(percent).filter(|&percent| percent >= MOST_DAMAGED - COARSE),
+            Some(before) if before.abs_diff(percent) < PERCENT_STEP => Some(before),
+            Some(_) => Some(percent).filter(|&percent| percent >= UNRELIABLE_PERCENT - PERCENT_STEP),
         };
         let restarts = if line.restarts == 0 { 0 } else { self.restarts.max(line.restarts) };
         if (damaged_percent, restarts) != (self.damaged_percent, self.restarts) {
             (self.damaged_percent, self.restarts) = (damaged_percent, restarts);
-            self.facts = None;
+            self.findings = None;
         }
     }
 
@@ -272,11 +272,13 @@ impl<'a> Diagnosis<'a> {
         let before = self.starved_statuses;
         self.starved = starved;
         self.starved_statuses = if starved > 0 { before.saturating_add(1) } else { 0 };
-        if self.starved_statuses == STARVED_LIMIT || before >= STARVED_LIMIT && self.starved_statuses == 0 {
+        if self.starved_statuses == MAX_STARVED_STATUSES
+            || before >= MAX_STARVED_STATUSES && self.starved_statuses == 0
+        {
             // The subscribers that do receive something read it in the status.
-            self.facts = None;
+            self.findings = None;
         }
-        if self.starved_statuses == STARVED_LIMIT {
+        if self.starved_statuses == MAX_STARVED_STATUSES {
             tracing::warn!("{}: {}", self.link.name, self.starved_message());
         }
     }
@@ -296,7 +298,7 @@ impl<'a> Diagnosis<'a> {
     /// Returns whether the port may close again before it delivers anything, as it did the last time. A serial server
     /// that serves another client accepts each connection and closes it.
     fn may_disconnect(&self, session: &PortSession) -> bool {
-        let is_silent = session.account().read == 0 && session.trouble().is_none();
+        let is_silent = session.stats().read == 0 && session.problem().is_none();
         !self.empty_connection.is_empty() && is_silent && session.state() == line::State::Probing
     }
 
@@ -312,7 +314,7 @@ impl<'a> Diagnosis<'a> {
                 self.link.max_rate()
             );
         }
-        if let Some(altered) = &self.altered {
+        if let Some(altered) = &self.settings_change {
             return altered.message.clone();
         }
         // Damage and restarts explain most other findings, so they come first.
@@ -328,36 +330,38 @@ impl<'a> Diagnosis<'a> {
                 return format!("the scanner restarted {count} times in 10 s: is its supply strong enough?");
             }
         }
-        let rate = self.facts.and_then(|facts| facts.bytes_per_second);
-        if let Some(rate) = rate.filter(|_| self.facts.is_some_and(|facts| facts.is_exchanged)) {
-            return self.bytes_of_another_kind(session, rate);
+        let rate = self.findings.and_then(|findings| findings.bytes_per_second);
+        if let Some(rate) = rate.filter(|_| self.findings.is_some_and(|findings| findings.is_exchanged)) {
+            return self.bytes_of_other_scanner(session, rate);
         }
-        let account = session.account();
-        let is_damaged = self.last_telegram.is_some() && account.discarded > account.read / 2;
+        let stats = session.stats();
+        let is_damaged = self.last_telegram.is_some() && stats.discarded > stats.read / 2;
         if let Some(rate) = rate.filter(|_| is_damaged && !self.has_streamed) {
             return format!(
                 "{} bytes/s arrive, but few telegrams of the {} are intact: check the cable, its ground and termination, \
                  and the adapter",
                 with_commas(rate),
-                scanner_of(session)
+                scanner_name(session)
             );
         }
-        if let Some((missing, rate)) = session.missing().zip(rate) {
-            return self.other_bytes(missing, rate);
+        if let Some((missing, rate)) = session.missing_transmission().zip(rate) {
+            return self.unrecognized_bytes(missing, rate);
         }
         // Soon the rate of the bytes gives a better message than "no answer".
-        if session.missing().is_some() && self.byte_rate.is_settling(self.now, account.read) {
+        if session.missing_transmission().is_some() && self.byte_rate.is_settling(self.now, stats.read) {
             return self.message.clone();
         }
-        match session.trouble() {
+        match session.problem() {
             // Another family's scanner may be connected, or one at a rate that this family does not have.
-            Some(Trouble::Search(problem)) => self.search_problem(problem),
+            Some(Problem::Search(problem)) => self.search_problem(problem),
             // The search has just begun.
             Some(_) if self.family.is_none() && !self.exchange.is_empty() => self.exchange.clone(),
-            Some(problem) if session.missing().is_some() => self.silence(&problem.to_string()),
+            Some(problem) if session.missing_transmission().is_some() => {
+                self.without_reply(&problem.to_string())
+            }
             Some(problem) => problem.to_string(),
             None => self.mismatch(session).unwrap_or_else(|| match session.notice() {
-                _ if self.starved_statuses >= STARVED_LIMIT => self.starved_message(),
+                _ if self.starved_statuses >= MAX_STARVED_STATUSES => self.starved_message(),
                 Some(notice) if notice.is_fault => notice.text.to_owned(),
                 _ => String::new(),
             }),
@@ -365,42 +369,42 @@ impl<'a> Diagnosis<'a> {
     }
 
     /// Returns the message that `rate` bytes per second arrive, but none of the `missing` transmissions.
-    fn other_bytes(&self, missing: &str, rate: u64) -> String {
-        let is_server = matches!(self.link.port, Source::Tcp { .. });
+    fn unrecognized_bytes(&self, missing: &str, rate: u64) -> String {
+        let is_server = matches!(self.link.port, PortSpec::Tcp { .. });
         let other_rate = if is_server { ", or does the server use another rate" } else { "" };
         let bytes = with_commas(rate);
-        let words = format!("{bytes} bytes/s arrive, but no {missing}; is it another scanner{other_rate}?");
-        self.with_remedy(&words)
+        let text = format!("{bytes} bytes/s arrive, but no {missing}; is it another scanner{other_rate}?");
+        self.with_remedy(&text)
     }
 
     /// Returns the message that `rate` bytes per second arrive that are not of the scanner of `session`, which has
     /// streamed before.
-    fn bytes_of_another_kind(&self, session: &PortSession, rate: u64) -> String {
-        let name = scanner_of(session);
-        let is_server = matches!(self.link.port, Source::Tcp { .. });
+    fn bytes_of_other_scanner(&self, session: &PortSession, rate: u64) -> String {
+        let name = scanner_name(session);
+        let is_server = matches!(self.link.port, PortSpec::Tcp { .. });
         // The bytes are the same in both cases.
         let other = if is_server { "another rate of the server" } else { "a damaged line" };
         let bytes = with_commas(rate);
-        let words =
+        let text =
             format!("{bytes} bytes/s arrive, but nothing from the {name}: another scanner, or {other}?");
         if self.link.family().is_none() {
-            return format!("{words} The search begins after 10 s without it");
+            return format!("{text} The search begins after 10 s without it");
         }
-        self.with_remedy(&words)
+        self.with_remedy(&text)
     }
 
     /// Returns `words` about a scanner that does not reply, and how to find out whether it belongs to another family,
     /// if the family is configured and both fit into a status. `scanhub probe` cannot search the port while the hub
     /// has it.
-    fn silence(&self, words: &str) -> String {
-        let Some(keys) = self.family_keys() else { return words.to_owned() };
-        let words = format!("{words} Another scanner?");
+    fn without_reply(&self, text: &str) -> String {
+        let Some(keys) = self.family_keys() else { return text.to_owned() };
+        let text = format!("{text} Another scanner?");
         let name = &self.link.name;
         let both = |port: &str| {
-            format!("{words} Remove {keys} from link {name}, or stop the hub and try: scanhub probe {port}")
+            format!("{text} Remove {keys} from link {name}, or stop the hub and try: scanhub probe {port}")
         };
-        let probe = |port: &str| format!("{words} Stop the hub and try: scanhub probe {port}");
-        self.with_port(both).or_else(|| self.with_port(probe)).unwrap_or_else(|| self.with_remedy(&words))
+        let probe = |port: &str| format!("{text} Stop the hub and try: scanhub probe {port}");
+        self.with_port(both).or_else(|| self.with_port(probe)).unwrap_or_else(|| self.with_remedy(&text))
     }
 
     /// Returns the keys of the link that name the family, as text. `None` if there are none, or if the link plays a
@@ -410,26 +414,26 @@ impl<'a> Diagnosis<'a> {
             [keys @ .., last] if !keys.is_empty() => format!("{} and {last}", keys.join(", ")),
             keys => keys.concat(),
         };
-        (!keys.is_empty() && !matches!(self.link.port, Source::File { .. })).then_some(keys)
+        (!keys.is_empty() && !matches!(self.link.port, PortSpec::File { .. })).then_some(keys)
     }
 
     /// Returns `words` and the remedy, if the family is configured and they fit into a status: the scanner may belong
     /// to another family.
-    fn with_remedy(&self, words: &str) -> String {
-        let Some(keys) = self.family_keys() else { return words.to_owned() };
+    fn with_remedy(&self, text: &str) -> String {
+        let Some(keys) = self.family_keys() else { return text.to_owned() };
         let name = &self.link.name;
         let remedies = [
             format!("Remove {keys} from link {name} and restart the hub: it finds the scanner"),
             format!("Remove {keys} from link {name}, restart the hub"),
             format!("Remove {keys} from the link"),
         ];
-        let mut messages = remedies.into_iter().map(|remedy| format!("{words} {remedy}"));
+        let mut messages = remedies.into_iter().map(|remedy| format!("{text} {remedy}"));
         let message = messages.find(|message| message.len() <= Status::MAX_ERROR_LEN);
-        message.unwrap_or_else(|| words.to_owned())
+        message.unwrap_or_else(|| text.to_owned())
     }
 
     /// Returns why the search finds no scanner, with the port if the message then fits into a status.
-    fn search_problem(&self, problem: search::Trouble) -> String {
+    fn search_problem(&self, problem: search::Problem) -> String {
         self.with_port(|port| problem.message(port)).unwrap_or_else(|| problem.to_string())
     }
 
@@ -437,7 +441,7 @@ impl<'a> Diagnosis<'a> {
     /// no message fits into a status.
     fn with_port(&self, message: impl Fn(&str) -> String) -> Option<String> {
         let ports = match self.link.port {
-            Source::Tty(_) | Source::Tcp { .. } => vec![Some(self.link.port.name()), self.device.clone()],
+            PortSpec::Tty(_) | PortSpec::Tcp { .. } => vec![Some(self.link.port.name()), self.device.clone()],
             _ => Vec::new(),
         };
         let mut messages = ports.into_iter().flatten().map(|port| message(&port));
@@ -454,7 +458,7 @@ impl<'a> Diagnosis<'a> {
                  EEPROM, which the hub never writes"
             ));
         }
-        if let Some(is) = session.other_model() {
+        if let Some(is) = session.unexpected_model() {
             return Some(format!(
                 "model {} is configured, but the scanner is a {} or compatible with it: set link.{name}.model",
                 scanner.model().name,
@@ -487,12 +491,12 @@ struct ByteRate {
     window: Option<(Nanos, u64)>,
     /// Result of the last complete window, in bytes per second; `None` before there is one, or if almost nothing
     /// arrived.
-    last: Option<u64>,
+    last_rate: Option<u64>,
     is_complete: bool,
     /// Consecutive windows in which almost nothing arrived.
-    quiet: u32,
+    quiet_windows: u32,
     /// Rate in the last message, in bytes per second.
-    shown: u64,
+    reported: u64,
 }
 
 impl ByteRate {
@@ -505,11 +509,11 @@ impl ByteRate {
             return;
         }
         if now >= since + RATE_WINDOW {
-            let rate = self.of_window(now, read);
-            self.quiet = if rate.is_some() { 0 } else { self.quiet + 1 };
+            let rate = self.window_rate(now, read);
+            self.quiet_windows = if rate.is_some() { 0 } else { self.quiet_windows + 1 };
             // Noise near the limit must not change the message with every window: each change is a log line.
-            if rate.is_some() || self.quiet >= QUIET_WINDOWS {
-                self.last = rate;
+            if rate.is_some() || self.quiet_windows >= MAX_QUIET_WINDOWS {
+                self.last_rate = rate;
             }
             self.is_complete = true;
             self.window = Some((now, read));
@@ -519,30 +523,30 @@ impl ByteRate {
     /// Returns the rate in bytes per second, rounded for a message; `None` if almost nothing arrives, or while the rate
     /// [settles](Self::is_settling). The session has read `read` bytes at `now`. A rate that varies a little is
     /// returned unchanged, because a new message is a new log line.
-    fn shown(&mut self, now: Nanos, read: u64) -> Option<u64> {
-        let rate = if self.is_complete { self.last } else { self.of_window(now, read) }?;
-        if !(self.shown / 2..=self.shown * 2).contains(&rate) {
-            self.shown = rounded(rate);
+    fn reported_rate(&mut self, now: Nanos, read: u64) -> Option<u64> {
+        let rate = if self.is_complete { self.last_rate } else { self.window_rate(now, read) }?;
+        if !(self.reported / 2..=self.reported * 2).contains(&rate) {
+            self.reported = rounded(rate);
         }
-        Some(self.shown)
+        Some(self.reported)
     }
 
     /// Returns whether bytes have begun to arrive, but not long enough for a rate.
     fn is_settling(&self, now: Nanos, read: u64) -> bool {
-        let is_begun = |(since, before)| read > before + NOISE_BYTES && now < since + FIRST_RATE_AFTER;
+        let is_begun = |(since, before)| read > before + MAX_NOISE_BYTES && now < since + MIN_RATE_TIME;
         !self.is_complete && self.window.is_some_and(is_begun)
     }
 
-    fn of_window(&self, now: Nanos, read: u64) -> Option<u64> {
+    fn window_rate(&self, now: Nanos, read: u64) -> Option<u64> {
         let (since, before) = self.window?;
         let bytes = read.saturating_sub(before);
-        (bytes > NOISE_BYTES && now >= since + FIRST_RATE_AFTER)
+        (bytes > MAX_NOISE_BYTES && now >= since + MIN_RATE_TIME)
             .then(|| (bytes * 1_000 * MILLIS).div_ceil(now - since))
     }
 }
 
 /// Returns the name of the scanner of `session`: that of its model, or of its family if the model is unknown.
-fn scanner_of(session: &PortSession) -> String {
+fn scanner_name(session: &PortSession) -> String {
     let family = session.family().map_or("", |family| family.name());
     session.model().map_or_else(|| format!("{family} scanner"), |model| model.name.to_owned())
 }
@@ -579,30 +583,30 @@ fn with_commas(number: u64) -> String {
 }
 
 /// Minimum share of damaged bytes, in percent, at which the others prove nothing.
-const MOST_DAMAGED: u32 = 50;
+const UNRELIABLE_PERCENT: u32 = 50;
 /// Steps in which that share is reported.
-const COARSE: u32 = 10;
+const PERCENT_STEP: u32 = 10;
 /// Minimum silence of a scanner after which damage is not concluded from bytes alone.
-const SILENCE: Nanos = 1_000 * MILLIS;
+const MIN_SILENCE: Nanos = 1_000 * MILLIS;
 /// Minimum silence of a scanner after which other bytes are reported as those of another scanner.
-const EXCHANGED_AFTER: Nanos = 2_000 * MILLIS;
+const MIN_EXCHANGE_SILENCE: Nanos = 2_000 * MILLIS;
 /// Minimum number of bytes per second of a stream: an LMS at 9,600 baud sends twice that. A boot message is shorter.
-const STREAM_BYTES: u64 = 500;
+const MIN_STREAM_RATE: u64 = 500;
 /// Fewer telegrams in 10 s may be chance matches in the bytes of another scanner.
-const FEW_TELEGRAMS: u64 = 3;
+const MIN_TELEGRAMS: u64 = 3;
 /// Time for which a status reports that another process changed the port's settings.
-const ALTERED_SHOWN: Nanos = 10_000 * MILLIS;
+const SETTINGS_CHANGE_TIME: Nanos = 10_000 * MILLIS;
 /// Number of statuses after which subscribers without samples do not count as just attaching any more.
-const STARVED_LIMIT: u32 = 3;
+const MAX_STARVED_STATUSES: u32 = 3;
 /// Longer than a search at all rates, so that the rate of the host's port does not change the result.
 const RATE_WINDOW: Nanos = 5_000 * MILLIS;
 /// Time before the first rate. A scanner that returns is found within this time, and the rate of a shorter time changes
 /// quickly: each change is a log line.
-const FIRST_RATE_AFTER: Nanos = 2_000 * MILLIS;
+const MIN_RATE_TIME: Nanos = 2_000 * MILLIS;
 /// Windows without bytes after which there is no rate any more.
-const QUIET_WINDOWS: u32 = 3;
+const MAX_QUIET_WINDOWS: u32 = 3;
 /// Number of bytes that an adapter may deliver when a cable is plugged in.
-const NOISE_BYTES: u64 = 64;
+const MAX_NOISE_BYTES: u64 = 64;
 
 #[cfg(test)]
 mod tests {
@@ -620,7 +624,7 @@ mod tests {
             let now = tenth * 100 * MILLIS;
             read += rate(tenth) / 10;
             bytes.note(now, read);
-            bytes.shown(now, read)
+            bytes.reported_rate(now, read)
         });
         let mut all: Vec<_> = rates.collect();
         all.dedup();
@@ -628,7 +632,7 @@ mod tests {
     }
 
     #[test]
-    fn rate_is_known_before_the_first_window_ends_and_stays() {
+    fn shows_byte_rate_within_first_window_and_keeps_it() {
         let mut bytes = ByteRate::default();
         let steady = shown(&mut bytes, (0, 60), |tenth| if tenth % 2 == 0 { 12_000 } else { 12_840 });
         assert_eq!(steady.first(), Some(&None), "nothing was measured yet");
@@ -637,7 +641,7 @@ mod tests {
     }
 
     #[test]
-    fn bytes_that_begin_or_end_are_noticed_within_a_few_windows() {
+    fn detects_start_and_end_of_bytes_in_a_few_windows() {
         let mut bytes = ByteRate::default();
         assert_eq!(shown(&mut bytes, (0, 3_600), |_| 0), [None]);
         assert_eq!(shown(&mut bytes, (3_600, 10), |_| 17_625).last(), Some(&Some(17_600)));

@@ -4,8 +4,8 @@
 //! refutes it.
 
 use scanhub_drivers::line::RawScan;
-use scanhub_preprocess::zones::{Check, Warning};
-use scanhub_schema::{Contents, Early, Scan, Verdict};
+use scanhub_preprocess::zones::{Warning, ZoneChecker};
+use scanhub_schema::{ArrayFlags, Early, Scan, Verdict};
 
 /// Warns of objects in the scan that is arriving.
 pub(crate) struct EarlyWarner {
@@ -32,7 +32,7 @@ pub(crate) struct EarlyMessage {
 impl EarlyWarner {
     /// Creates a warner for scans of at most `beams` beams.
     pub(crate) fn new(beams: usize) -> EarlyWarner {
-        EarlyWarner { scan: Scan::zeroed(Scan::len(beams, Contents::TURNING)), warning: None }
+        EarlyWarner { scan: Scan::zeroed(Scan::len(beams, ArrayFlags::REVOLUTION)), warning: None }
     }
 
     /// Checks an incomplete scan. Returns the withdrawal of an earlier warning that no longer holds, and a new warning
@@ -40,7 +40,7 @@ impl EarlyWarner {
     pub(crate) fn update(
         &mut self,
         partial: &RawScan<'_>,
-        check: &mut Check,
+        check: &mut ZoneChecker,
         next_seq: u64,
     ) -> [Option<EarlyMessage>; 2] {
         let early = self.warning(partial, check);
@@ -58,10 +58,10 @@ impl EarlyWarner {
     }
 
     /// Returns the warning that an incomplete scan gives rise to.
-    fn warning(&mut self, partial: &RawScan<'_>, check: &mut Check) -> Option<Early> {
+    fn warning(&mut self, partial: &RawScan<'_>, check: &mut ZoneChecker) -> Option<Early> {
         let scan = &mut self.scan;
         partial.write(scan);
-        let warning = check.early(scan.beams(), scan.unit_um, scan.ranges(), scan.exact_angles())?;
+        let warning = check.check_partial(scan.beams(), scan.unit_um, scan.ranges(), scan.exact_angles())?;
         let beams_seen = scan.ranges().iter().filter(|range| **range != Scan::NOT_MEASURED).count();
         let Warning { verdict, beam, distance_mm } = warning;
         let (bytes_seen, beams_seen) = (partial.bytes as u16, beams_seen as u16);
@@ -115,17 +115,17 @@ mod tests {
         let mut points: Vec<(usize, Point)> = (0..count)
             .map(|i| {
                 let clockwise = i as f32 / count as f32 * std::f32::consts::TAU - 0.03;
-                let is_at = |place: &&(f32, f32, u16)| (clockwise - place.0).abs() < place.1;
-                let found = near.iter().find(is_at).map_or(5000, |place| place.2 + random.u16(..30));
+                let is_at = |object: &&(f32, f32, u16)| (clockwise - object.0).abs() < object.1;
+                let found = near.iter().find(is_at).map_or(5000, |object| object.2 + random.u16(..30));
                 let range = if random.u8(..20) == 0 { NO_RETURN } else { found };
                 (i + random.usize(..=late), Point { angle: -clockwise, range, intensity: 9 })
             })
             .collect();
-        points.sort_by_key(|(place, _)| *place);
+        points.sort_by_key(|(index, _)| *index);
         points.into_iter().map(|(_, point)| point).collect()
     }
 
-    fn turn(number: u64, points: &[Point]) -> RawScan<'_> {
+    fn revolution(number: u64, points: &[Point]) -> RawScan<'_> {
         // Each revolution has another period.
         let (period, per_second) = (100_000_000 + 1_000 * number, 900.0);
         RawScan {
@@ -141,9 +141,9 @@ mod tests {
     }
 
     /// The zones of a whole revolution.
-    fn zones(check: &mut Check, turn: &RawScan<'_>) -> Zones {
-        let mut scan = Scan::zeroed(turn.payload_len());
-        turn.write(&mut scan);
+    fn zones(check: &mut ZoneChecker, revolution: &RawScan<'_>) -> Zones {
+        let mut scan = Scan::zeroed(revolution.payload_len());
+        revolution.write(&mut scan);
         let mut zones = Zones::unknown();
         check.update(&scan, &mut zones);
         zones
@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn a_warning_that_is_not_withdrawn_is_confirmed_by_its_scan() {
+    fn unwithdrawn_warning_is_confirmed_by_its_scan() {
         let mut random = Rng::with_seed(28);
         let (mut subscriber, mut confirmed, mut packets) = (Subscriber::default(), 0, 0);
         for _ in 0..400 {
@@ -203,32 +203,32 @@ mod tests {
             let (x_m, y_m) = (2.0 * random.f64() - 1.0, 2.0 * random.f64() - 1.0);
             let upside_down = random.bool().into();
             let pose = Pose { x_m, y_m, yaw_rad: 6.0 * random.f64(), upside_down, ..Pose::default() };
-            let mut check = Check::new(pose, &settings, BEAMS);
+            let mut check = ZoneChecker::new(pose, &settings, BEAMS);
             let mut warner = EarlyWarner::new(BEAMS);
             let late = if random.bool() { 0 } else { 20 };
-            let again = points(&mut random, late);
+            let other = points(&mut random, late);
             for number in 1..9 {
                 // Most revolutions see the same objects as the one before.
-                let points = if random.u8(..3) == 0 { points(&mut random, late) } else { again.clone() };
+                let points = if random.u8(..3) == 0 { points(&mut random, late) } else { other.clone() };
                 let is_over = random.u8(..4) > 0;
                 let end = if is_over { points.len() - 1 } else { random.usize(..points.len()) };
-                let mut seen = 0;
-                while seen < end {
-                    (seen, packets) = ((seen + random.usize(1..24)).min(end), packets + 1);
+                let mut received = 0;
+                while received < end {
+                    (received, packets) = ((received + random.usize(1..24)).min(end), packets + 1);
                     warner.withdraw(Some(number)).into_iter().for_each(|message| subscriber.receive(message));
-                    let begun = turn(number, &points[..seen]);
-                    let messages = warner.update(&begun, &mut check, packets);
+                    let partial = revolution(number, &points[..received]);
+                    let messages = warner.update(&partial, &mut check, packets);
                     messages.into_iter().flatten().for_each(|message| subscriber.receive(message));
                 }
                 if is_over {
                     // The packet that ends the revolution has some of its points.
                     packets += 1;
                     if warner.has_warned() {
-                        let begun = turn(number, &points);
-                        let messages = warner.update(&begun, &mut check, packets);
+                        let partial = revolution(number, &points);
+                        let messages = warner.update(&partial, &mut check, packets);
                         messages.into_iter().flatten().for_each(|message| subscriber.receive(message));
                     }
-                    let zones = zones(&mut check, &turn(number, &points));
+                    let zones = zones(&mut check, &revolution(number, &points));
                     warner.confirm(number);
                     let warning = subscriber.warning.take();
                     assert!(
@@ -256,14 +256,14 @@ mod tests {
         let at = |degrees: f32, range| Point { angle: -degrees.to_radians(), range, intensity: 9 };
         let own = [Sector { from_mdeg: -95_000, to_mdeg: -85_000, range_mm: 300 }];
         let settings = Settings { body_mask: own.to_vec(), ..Settings::default() };
-        let mut check = Check::new(Pose::default(), &settings, BEAMS);
+        let mut check = ZoneChecker::new(Pose::default(), &settings, BEAMS);
         let mut warner = EarlyWarner::new(BEAMS);
-        zones(&mut check, &turn(1, &[at(10.0, 5000)]));
+        zones(&mut check, &revolution(1, &[at(10.0, 5000)]));
         // Beam 22 points 88 degrees to the right. Its nearest point counts, and that is on the robot.
         let mut turned: Vec<Point> = (0..BEAMS).map(|beam| at(4.0 * beam as f32, 5000)).collect();
         turned.splice(22..23, [at(87.5, 500), at(88.5, 200)]);
         turned[60].range = 800;
-        let mut update = |seen: usize| warner.update(&turn(2, &turned[..seen]), &mut check, 7);
+        let mut update = |received: usize| warner.update(&revolution(2, &turned[..received]), &mut check, 7);
         assert_eq!(update(22), [None, None]);
         let [None, Some(stop)] = update(23) else { panic!("no warning") };
         let Early { verdict, beam, distance_mm, bytes_seen, beams_seen, flags } = stop.early;
@@ -274,6 +274,6 @@ mod tests {
         assert_eq!(update(24), [Some(withdrawn), None]);
         let [None, Some(slow)] = update(BEAMS) else { panic!("no warning") };
         assert_eq!(slow.early.verdict(), Verdict::Slow);
-        assert_eq!(zones(&mut check, &turn(2, &turned)).verdict(), Verdict::Slow);
+        assert_eq!(zones(&mut check, &revolution(2, &turned)).verdict(), Verdict::Slow);
     }
 }

@@ -39,4 +39,4 @@ pub use replay::{RecordedAngle, RecordedMount};
 pub use replay_hub::{Replay, replay};
 pub use saved_state::{KnownRate, KnownScanner, SaveQueue, SaveSlot, StateSaver, StateStore};
 pub use service::Service;
-pub use supervise::{Ready, run};
+pub use supervise::{StartReport, run};

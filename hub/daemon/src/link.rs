@@ -2,19 +2,19 @@
 //! deadlines for publishing without new bytes.
 
 use scanhub_config::{Link, Processing};
-use scanhub_drivers::line::{Control, RawScan, Received, Session as _};
-use scanhub_drivers::{PortSession, Trouble};
-use scanhub_schema::{Failure, MILLIS, Nanos, Shown, State, Verb, Wake};
+use scanhub_drivers::line::{Control, RawScan, ReceivedTelegram, ScannerSession as _};
+use scanhub_drivers::{PortSession, Problem};
+use scanhub_schema::{Failure, MILLIS, Nanos, ResponseModel, State, Verb, WakeEvent};
 
 use crate::control::{ControlQueue, PauseTarget};
 use crate::diagnosis::Diagnosis;
-use crate::link_output::{LinkOutput, Published, RecordedMetadata};
+use crate::link_output::{LinkOutput, PublishOutcome, RecordedMetadata};
 use crate::link_stats::LinkStats;
 use crate::platform::{Platform, SavedState, WakeReason};
 use crate::topics::Topics;
 
 /// The parts of a link.
-pub(crate) struct LinkCore<'a, S: Platform> {
+pub(crate) struct LinkState<'a, S: Platform> {
     pub(crate) link: &'a Link,
     pub(crate) platform: &'a S,
     pub(crate) output: LinkOutput<'a, S>,
@@ -27,7 +27,7 @@ pub(crate) struct LinkCore<'a, S: Platform> {
     next_status: Nanos,
 }
 
-impl<'a, S: Platform> LinkCore<'a, S> {
+impl<'a, S: Platform> LinkState<'a, S> {
     /// Creates the parts of `link`, which is number `number` in the configuration, and its topics. `boot` identifies the run
     /// of the hub. The first sample follows with [`begin`](Self::begin).
     ///
@@ -44,7 +44,7 @@ impl<'a, S: Platform> LinkCore<'a, S> {
         let now = platform.now();
         let mut topics = Topics::new(platform, &link.name, number, boot)?;
         topics.set_family(link.family());
-        Ok(LinkCore {
+        Ok(LinkState {
             link,
             platform,
             output: LinkOutput::new(link, platform, topics),
@@ -70,7 +70,7 @@ impl<'a, S: Platform> LinkCore<'a, S> {
     pub(crate) fn close(&mut self, session: &PortSession) {
         self.diagnosis.end_flood();
         self.output.update_early_warning(None);
-        self.stats.close(session);
+        self.stats.close_session(session);
     }
 
     /// Returns whether the scanner's motor stops while the topics have no subscriber.
@@ -82,13 +82,13 @@ impl<'a, S: Platform> LinkCore<'a, S> {
     /// the verdict on the scan stays valid.
     pub(crate) fn publish(
         &mut self,
-        received: &Received<'_>,
+        received: &ReceivedTelegram<'_>,
         recorded: &RecordedMetadata,
         is_backlogged: bool,
     ) -> Option<Nanos> {
-        let published = match &received.whole {
-            Some(whole) => self.output.telegram(received, whole, recorded, is_backlogged),
-            None => self.output.packets(received, recorded),
+        let published = match &received.contents {
+            Some(whole) => self.output.publish_telegram(received, whole, recorded, is_backlogged),
+            None => self.output.publish_packets(received, recorded),
         };
         self.stats.note(published);
         published.verdict_lifetime
@@ -102,9 +102,9 @@ impl<'a, S: Platform> LinkCore<'a, S> {
         recorded: &RecordedMetadata,
         is_backlogged: bool,
     ) -> Nanos {
-        let verdict_lifetime = self.output.revolution(scan, recorded, is_backlogged);
+        let verdict_lifetime = self.output.publish_revolution(scan, recorded, is_backlogged);
         self.stats
-            .note(Published { is_suspect: scan.reasons != 0, verdict_lifetime: Some(verdict_lifetime) });
+            .note(PublishOutcome { is_suspect: scan.reasons != 0, verdict_lifetime: Some(verdict_lifetime) });
         verdict_lifetime
     }
 
@@ -120,28 +120,33 @@ impl<'a, S: Platform> LinkCore<'a, S> {
 
     /// Publishes the status if it has changed or is due, and gives new subscribers the history. `error` is the message of
     /// the status. Returns whether a status was published.
-    pub(crate) fn show(&mut self, session: Option<&PortSession>, state: State, error: &str) -> bool {
+    pub(crate) fn publish_status(
+        &mut self,
+        session: Option<&PortSession>,
+        state: State,
+        error: &str,
+    ) -> bool {
         let now = self.platform.now();
         let changed = update(&mut self.stats, self.link, state, error, now);
-        self.publish_status(session, state, changed, now)
+        self.publish_due_status(session, state, changed, now)
     }
 
-    /// Does the same as [`show`](Self::show) for a `session` that was examined, with the message of [`Diagnosis`].
-    pub(crate) fn show_session(&mut self, session: &PortSession, state: State) -> bool {
+    /// Does the same as [`publish_status`](Self::show) for a `session` that was examined, with the message of [`Diagnosis`].
+    pub(crate) fn publish_session_status(&mut self, session: &PortSession, state: State) -> bool {
         let now = self.platform.now();
         let error = self.diagnosis.message();
         if session.family().is_some() {
             self.stats.next_search_log = 0;
         }
-        let changed = if matches!(session.trouble(), Some(Trouble::Search(_))) {
+        let changed = if matches!(session.problem(), Some(Problem::Search(_))) {
             update_search(&mut self.stats, self.link, state, error, now)
         } else {
             update(&mut self.stats, self.link, state, error, now)
         };
-        self.publish_status(Some(session), state, changed, now)
+        self.publish_due_status(Some(session), state, changed, now)
     }
 
-    fn publish_status(
+    fn publish_due_status(
         &mut self,
         session: Option<&PortSession>,
         state: State,
@@ -152,9 +157,9 @@ impl<'a, S: Platform> LinkCore<'a, S> {
         if is_due {
             self.next_status = now.saturating_add(STATUS_PERIOD);
             let status = self.stats.status(session, self.output.topics.loan_failed(), now);
-            self.output.topics.status(status, now);
+            self.output.topics.publish_status(status, now);
             if changed || state != State::Streaming {
-                self.output.topics.wake(Wake::Status);
+                self.output.topics.wake(WakeEvent::Status);
             }
             self.save_background(false);
             self.diagnosis.note_line(self.stats.health());
@@ -186,20 +191,20 @@ impl<'a, S: Platform> LinkCore<'a, S> {
     /// Publishes what is due, and returns when the wait must end: at `until`, or earlier if the link itself has
     /// something to do. Some drivers report the loss of a port only to a thread that waits for bytes, so a line whose
     /// bytes are `left_alone` is polled every 40 ms.
-    pub(crate) fn next_deadline(&mut self, until: Nanos, left_alone: bool) -> Nanos {
+    pub(crate) fn next_deadline(&mut self, until: Nanos, is_unread: bool) -> Nanos {
         let now = self.platform.now();
         self.output.expire_verdict(now, until);
         // A new subscriber to a silent sensor also gets the history in time.
         let history = if self.stats.is_streaming() { until } else { self.next_history.max(now) };
-        let poll = if left_alone { now + POLL_INTERVAL } else { until };
+        let poll = if is_unread { now + POLL_INTERVAL } else { until };
         until.min(history).min(self.output.stale_at()).min(poll)
     }
 
     /// Returns whether a wait `until` ends now, for the reason `woken`. Otherwise only the history was due, which this
     /// function delivers.
-    pub(crate) fn is_over(&mut self, woken: WakeReason, until: Nanos) -> bool {
+    pub(crate) fn is_over(&mut self, wake_reason: WakeReason, until: Nanos) -> bool {
         self.stats.wakeups += 1;
-        if woken != WakeReason::Timeout {
+        if wake_reason != WakeReason::Timeout {
             return true;
         }
         let now = self.platform.now();
@@ -211,7 +216,7 @@ impl<'a, S: Platform> LinkCore<'a, S> {
 
     /// Handles the requests of users, and applies changed settings.
     pub(crate) fn handle_requests(&mut self, mut target: PauseTarget<'_>) {
-        if let Some(processing) = self.control.changed() {
+        if let Some(processing) = self.control.take_settings() {
             self.change(&processing);
         }
         while let Some(request) = self.control.take() {
@@ -225,13 +230,13 @@ impl<'a, S: Platform> LinkCore<'a, S> {
             let outcome = match control {
                 Some(control) => self.control.control(control, &mut target, now).map(|()| None),
                 None => {
-                    let shown = self.output.handle(request.verb, &request.model);
+                    let background = self.output.handle(request.verb, &request.model);
                     let kept_wall_ns = self.platform.saved_state().and_then(SavedState::saved_wall_ns);
-                    shown.map(|model| model.map(|model| Box::new(Shown { model, kept_wall_ns })))
+                    background.map(|model| model.map(|model| Box::new(ResponseModel { model, kept_wall_ns })))
                 }
             };
             self.output.publish_background(now);
-            self.control.answer(request.number, outcome);
+            self.control.report_outcome(request.id, outcome);
         }
     }
 

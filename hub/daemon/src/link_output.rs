@@ -7,9 +7,10 @@
 //! such as a background that only learns. Nothing on this path allocates, locks or logs.
 
 use scanhub_config::{Link, Processing};
-use scanhub_drivers::line::{RawScan, Received, Whole};
+use scanhub_drivers::line::{RawScan, ReceivedTelegram, TelegramContents};
 use scanhub_schema::{
-    Background, Contents, Failure, Flags, Foreground, Header, Nanos, Pose, Ring, Scan, Verb, Wake, Zones,
+    ArrayFlags, Background, DoorbellWord, Failure, Flags, Foreground, Header, Nanos, Pose, Scan, Verb,
+    WakeEvent, Zones,
 };
 
 use crate::early::{EarlyMessage, EarlyWarner};
@@ -43,7 +44,7 @@ impl RecordedMetadata {
 
 /// Result of publishing a telegram, packets or a revolution.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Published {
+pub(crate) struct PublishOutcome {
     /// Whether it was marked as suspect.
     pub(crate) is_suspect: bool,
     /// Time for which the verdict on its scan is valid; `None` without a scan.
@@ -74,7 +75,7 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
             link,
             platform,
             topics,
-            scan: Scan::zeroed(Scan::len(beams, Contents::TURNING)),
+            scan: Scan::zeroed(Scan::len(beams, ArrayFlags::REVOLUTION)),
             pipeline: Pipeline::new(&link.processing, beams),
             early: EarlyWarner::new(beams),
             stale_at: Nanos::MAX,
@@ -92,41 +93,45 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
 
     /// Publishes a telegram and the scan that it contains, if it can be decoded. Then wakes the subscribers. Values in
     /// `recorded` replace those of the session. A telegram that `is_backlogged` was buffered for an unknown time.
-    pub(crate) fn telegram(
+    pub(crate) fn publish_telegram(
         &mut self,
-        received: &Received<'_>,
-        whole: &Whole<'_>,
+        received: &ReceivedTelegram<'_>,
+        whole: &TelegramContents<'_>,
         recorded: &RecordedMetadata,
         is_backlogged: bool,
-    ) -> Published {
+    ) -> PublishOutcome {
         let period_us = recorded.period_us.unwrap_or_else(|| micros(whole.period)).max(recorded.gap_us);
         let period_us = recorded.stretched(period_us);
         self.set_recorded_time(recorded);
         // A withdrawal has the sequence number that this telegram gets.
         self.withdraw(Some(whole.number));
-        self.topics.telegram(received, period_us);
+        self.topics.publish_telegram(received, period_us);
         self.topics.end_stage(Stage::Telegram);
         let measured_ns = recorded.measured_ns;
         let publish = |scan| self.publish_scan(scan, measured_ns, period_us, is_backlogged);
         let verdict_lifetime = whole.scan.as_ref().map(publish);
         if verdict_lifetime.is_none() {
-            self.topics.wake(Wake::Telegram);
+            self.topics.wake(WakeEvent::Telegram);
         }
-        Published { is_suspect: received.reasons != 0, verdict_lifetime }
+        PublishOutcome { is_suspect: received.reasons != 0, verdict_lifetime }
     }
 
     /// Publishes packets that arrived together, and wakes their subscribers.
-    pub(crate) fn packets(&mut self, received: &Received<'_>, recorded: &RecordedMetadata) -> Published {
+    pub(crate) fn publish_packets(
+        &mut self,
+        received: &ReceivedTelegram<'_>,
+        recorded: &RecordedMetadata,
+    ) -> PublishOutcome {
         self.set_recorded_time(recorded);
         // A packet has no period, only its scan has.
-        self.topics.telegram(received, 0);
+        self.topics.publish_telegram(received, 0);
         self.topics.wake_for_packets();
-        Published { is_suspect: received.reasons != 0, verdict_lifetime: None }
+        PublishOutcome { is_suspect: received.reasons != 0, verdict_lifetime: None }
     }
 
     /// Publishes the scan of a revolution, whose packets were published, and wakes the subscribers. One that
     /// `is_backlogged` was buffered for an unknown time. Returns how long the verdict on it is valid.
-    pub(crate) fn revolution(
+    pub(crate) fn publish_revolution(
         &mut self,
         scan: &RawScan<'_>,
         recorded: &RecordedMetadata,
@@ -169,16 +174,16 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         // Zones.
         let mut zones = topics.publishers.zones.loan(0);
         // A backlogged scan does not show the current surroundings of the robot.
-        pipeline.zones.doubt(is_backlogged);
+        pipeline.zones.set_backlogged(is_backlogged);
         pipeline.check_zones(scan, zones.payload_mut());
         topics.publishers.zones.send(zones, &header, &mut topics.due);
         topics.end_stage(Stage::Zones);
         // A subscriber that attached during this scan may have received the zones.
-        topics.ring(Ring::First);
+        topics.ring(DoorbellWord::First);
 
         // Marks, lines and motion.
         let measured_ns = measured_ns.unwrap_or(header.stamp_first_ns);
-        if topics.awaits(Stage::Results) {
+        if topics.is_awaited(Stage::Results) {
             self.publish_results(raw, measured_ns, &header);
         } else {
             pipeline.process(scan, measured_ns, raw.period, ResultBuffers::default());
@@ -192,7 +197,7 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         self.topics.end_stage(Stage::Background);
         // A subscriber that attached during this scan may have received a background, which has a history.
         if self.topics.is_ring_due() {
-            self.topics.wake(Wake::Telegram);
+            self.topics.wake(WakeEvent::Telegram);
         }
         self.note_published(raw, period_us)
     }
@@ -222,7 +227,7 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         if !self.pipeline.has_background() {
             return;
         }
-        let reset = if self.topics.awaits(Stage::Background) {
+        let reset = if self.topics.is_awaited(Stage::Background) {
             self.publish_foreground(header)
         } else {
             self.topics.publishers.foreground.skip();
@@ -277,8 +282,8 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
     }
 
     /// Returns the number of reads per telegram: 1, unless early warnings have a subscriber.
-    pub(crate) fn pieces(&self) -> u8 {
-        if self.topics.has_early_subscribers() { self.pipeline.pieces() } else { 1 }
+    pub(crate) fn reads_per_telegram(&self) -> u8 {
+        if self.topics.has_early_subscribers() { self.pipeline.reads_per_telegram() } else { 1 }
     }
 
     /// Publishes a warning if the `partial` scan gives one and warnings have a subscriber. Withdraws a warning of
@@ -290,7 +295,7 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         self.publish_withdrawal(withdrawn);
         if let Some(warning) = worse {
             let &RawScan { first, last, reasons, period, .. } = partial;
-            self.topics.early(&warning, first, last, reasons, micros(period));
+            self.topics.publish_early(&warning, first, last, reasons, micros(period));
         }
     }
 
@@ -308,7 +313,7 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
     fn publish_withdrawal(&mut self, withdrawn: Option<EarlyMessage>) {
         if let Some(message) = withdrawn {
             let now = self.platform.now();
-            self.topics.early(&message, now, now, 0, 0);
+            self.topics.publish_early(&message, now, now, 0, 0);
         }
     }
 
@@ -329,13 +334,13 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
     pub(crate) fn publish_stale(&mut self, now: Nanos) {
         self.withdraw(None);
         self.send_unknown_zones(now);
-        self.topics.wake(Wake::Status);
+        self.topics.wake(WakeEvent::Status);
     }
 
     /// Publishes the background as of `now` if it has changed, and wakes the subscribers.
     pub(crate) fn publish_background(&mut self, now: Nanos) {
         if self.send_changed_background(now) {
-            self.topics.wake(Wake::Status);
+            self.topics.wake(WakeEvent::Status);
         }
     }
 
@@ -363,7 +368,7 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         self.reset();
         self.stale_at = until;
         self.publish_start(now);
-        self.topics.wake(Wake::Status);
+        self.topics.wake(WakeEvent::Status);
     }
 
     /// Resets the processors without publishing anything.
@@ -379,7 +384,7 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
             self.send_unknown_zones(now);
         }
         self.send_changed_background(now);
-        self.topics.wake(Wake::Status);
+        self.topics.wake(WakeEvent::Status);
     }
 
     /// Handles a user's request for the background. Returns the model for [`Verb::Show`].
@@ -446,10 +451,10 @@ pub(crate) fn micros(period: Nanos) -> u32 {
 
 /// Returns how long after a scan the verdict on it is valid, if scans arrive every `period_us`.
 pub(crate) fn verdict_lifetime(period_us: u32) -> Nanos {
-    if period_us == 0 { UNKNOWN_PERIOD_LIFETIME } else { 2000 * Nanos::from(period_us) + GRACE }
+    if period_us == 0 { UNKNOWN_PERIOD_LIFETIME } else { 2000 * Nanos::from(period_us) + LIFETIME_MARGIN }
 }
 
 /// A verdict is valid for two scan periods and this time.
-const GRACE: Nanos = 20 * scanhub_schema::MILLIS;
-/// Validity of a verdict without a known scan period: two LMS scans of 361 beams at 38,400 baud, and [`GRACE`].
+const LIFETIME_MARGIN: Nanos = 20 * scanhub_schema::MILLIS;
+/// Validity of a verdict without a known scan period: two LMS scans of 361 beams at 38,400 baud, and [`LIFETIME_MARGIN`].
 const UNKNOWN_PERIOD_LIFETIME: Nanos = 480 * scanhub_schema::MILLIS;

@@ -4,10 +4,10 @@ use std::collections::VecDeque;
 
 use scanhub_config::{Link, Processing};
 use scanhub_drivers::PortSession;
-use scanhub_drivers::line::Session as _;
+use scanhub_drivers::line::ScannerSession as _;
 use scanhub_schema::{Counter, Counters, Family, MILLIS, MIN_RATE_SPAN, Nanos, State, Status};
 
-use crate::link_output::Published;
+use crate::link_output::PublishOutcome;
 
 /// Statistics of a link, across all sessions on its port.
 pub(crate) struct LinkStats {
@@ -15,7 +15,7 @@ pub(crate) struct LinkStats {
     /// Configured measuring mode, which is reported while no reply has reported it.
     mode: Option<u8>,
     /// Counters of the sessions that have ended.
-    past: Counters,
+    closed_sessions: Counters,
     window: LossWindow,
     /// State of the line as of the last status.
     health: LineHealth,
@@ -51,12 +51,12 @@ impl LinkStats {
     /// Creates the statistics of `link`, which exists since `now`.
     pub(crate) fn new(link: &Link, now: Nanos) -> Self {
         let mut status = Status { since_ns: now, ..Status::default() };
-        status.family = number_of(link.family());
+        status.family = family_number(link.family());
         status.set_port(&link.port.name());
         let mut stats = LinkStats {
             status,
             mode: link.scanner.settings.mode_number,
-            past: Counters::default(),
+            closed_sessions: Counters::default(),
             window: LossWindow::new(),
             health: LineHealth::default(),
             measured_at: None,
@@ -86,7 +86,7 @@ impl LinkStats {
 
     /// Returns the status as of `now`, with the values of `session`.
     pub(crate) fn status(&mut self, session: Option<&PortSession>, loan_failed: u64, now: Nanos) -> &Status {
-        let mut counters = self.past;
+        let mut counters = self.closed_sessions;
         let was_searched = self.status.family == Family::UNKNOWN;
         match session {
             Some(session) => {
@@ -116,7 +116,7 @@ impl LinkStats {
     }
 
     /// Counts what was published.
-    pub(crate) fn note(&mut self, published: Published) {
+    pub(crate) fn note(&mut self, published: PublishOutcome) {
         self.suspect += u64::from(published.is_suspect);
         self.scans += u64::from(published.verdict_lifetime.is_some());
     }
@@ -128,9 +128,9 @@ impl LinkStats {
 
     /// Counts a whole telegram of a recording, of `len` bytes.
     pub(crate) fn note_recorded(&mut self, len: usize) {
-        self.past[Counter::BytesRead] += len as u64;
-        self.past[Counter::BytesInTelegrams] += len as u64;
-        self.past[Counter::Telegrams] += 1;
+        self.closed_sessions[Counter::BytesRead] += len as u64;
+        self.closed_sessions[Counter::BytesInTelegrams] += len as u64;
+        self.closed_sessions[Counter::Telegrams] += 1;
     }
 
     /// Sets the family of a recording.
@@ -159,15 +159,15 @@ impl LinkStats {
     }
 
     /// Handles the end of `session`, whose counters are kept.
-    pub(crate) fn close(&mut self, session: &PortSession) {
+    pub(crate) fn close_session(&mut self, session: &PortSession) {
         self.describe(session);
-        session.add_counters(&mut self.past);
-        self.past[Counter::BytesDiscarded] += session.account().buffered;
-        self.past[Counter::BytesBuffered] = 0;
+        session.add_counters(&mut self.closed_sessions);
+        self.closed_sessions[Counter::BytesDiscarded] += session.stats().buffered;
+        self.closed_sessions[Counter::BytesBuffered] = 0;
     }
 
     fn describe(&mut self, session: &PortSession) {
-        self.status.family = number_of(session.family());
+        self.status.family = family_number(session.family());
         let known_rate = matches!(self.status.state(), Some(State::Streaming | State::Starting));
         self.status.baud = if known_rate { session.rate() } else { 0 };
         session.describe(&mut self.status);
@@ -196,7 +196,7 @@ impl LossWindow {
 
     /// Sets the gauges of `counters`, which are those of `now`, and returns the state of the line.
     fn update(&mut self, now: Nanos, counters: &mut Counters) -> LineHealth {
-        while self.samples.get(1).is_some_and(|(at, _)| now.saturating_sub(*at) >= WINDOW) {
+        while self.samples.get(1).is_some_and(|(at, _)| now.saturating_sub(*at) >= LOSS_WINDOW) {
             self.samples.pop_front();
         }
         let zero = Counters::default();
@@ -222,17 +222,17 @@ impl LossWindow {
 }
 
 /// Returns the number of `family` in a status.
-fn number_of(family: Option<Family>) -> u8 {
+fn family_number(family: Option<Family>) -> u8 {
     family.map_or(Family::UNKNOWN, |family| family as u8)
 }
 
 /// Time after which the measurement of the scan rate starts again.
 const RATE_WINDOW: Nanos = 5_000_000_000;
 /// Length of the window.
-const WINDOW: Nanos = 10_000 * MILLIS;
+const LOSS_WINDOW: Nanos = 10_000 * MILLIS;
 const SAMPLE_INTERVAL: Nanos = 1_000 * MILLIS;
 /// The samples of the window, one before it, and one at its end.
-const MAX_SAMPLES: usize = (WINDOW / SAMPLE_INTERVAL) as usize + 2;
+const MAX_SAMPLES: usize = (LOSS_WINDOW / SAMPLE_INTERVAL) as usize + 2;
 
 #[cfg(test)]
 mod tests {

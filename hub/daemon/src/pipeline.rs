@@ -4,18 +4,18 @@
 use std::fmt;
 
 use scanhub_config::Processing;
-use scanhub_preprocess::background::{Method, Mismatch, Model};
+use scanhub_preprocess::background::{BackgroundModel, Method, Mismatch};
 use scanhub_preprocess::lines::LineFinder;
 use scanhub_preprocess::marks::MarkDetector;
 use scanhub_preprocess::motion::MotionEstimator;
 use scanhub_preprocess::segments::Segmenter;
-use scanhub_preprocess::zones::Check;
+use scanhub_preprocess::zones::ZoneChecker;
 use scanhub_schema::{Background, Failure, Foreground, Kind, Lines, Marks, Motion, Pose, Scan, Verb, Zones};
 
 /// The processors of one link. They process suspect scans like clean ones: a suspected obstacle counts, and a
 /// background needs hundreds of scans in agreement, so that a bad one among them does no harm.
 pub(crate) struct Pipeline {
-    pub(crate) zones: Check,
+    pub(crate) zones: ZoneChecker,
     marks: MarkDetector,
     lines: LineFinder,
     motion: MotionEstimator,
@@ -30,13 +30,13 @@ pub(crate) struct Pipeline {
 
 /// The background model, and which of its states were published and saved.
 struct BackgroundStage {
-    model: Model,
-    cutter: Segmenter,
+    model: BackgroundModel,
+    segmenter: Segmenter,
     every_scan: bool,
     /// Generation that was published last.
     published: Option<u32>,
     /// Scans that the model has learned from since then.
-    learned: u32,
+    scans_since_publish: u32,
     /// Generation that was saved last, and the scans that the model has learned from since then.
     saved: (u32, u32),
     /// Number of beams and unit in micrometers of the model, if anything was learned or loaded.
@@ -80,11 +80,11 @@ impl Pipeline {
     pub(crate) fn new(processing: &Processing, beams: usize) -> Pipeline {
         let Processing { pose, zones, marks, lines, motion, background, early: _ } = processing;
         Pipeline {
-            zones: Check::new(*pose, zones, beams),
+            zones: ZoneChecker::new(*pose, zones, beams),
             marks: MarkDetector::new(*marks),
             lines: LineFinder::new(*pose, *lines, beams),
             motion: MotionEstimator::new(*pose, *motion, beams),
-            background: background.is_kept.then(|| BackgroundStage::new(processing, beams)),
+            background: background.is_enabled.then(|| BackgroundStage::new(processing, beams)),
             processing: processing.clone(),
             beams,
             scratch: ScratchPayloads {
@@ -106,20 +106,20 @@ impl Pipeline {
         let before = std::mem::replace(&mut self.processing, processing.clone());
         let Processing { pose, zones, marks, lines, motion, background, early: _ } = &self.processing;
         if (pose, zones) != (&before.pose, &before.zones) {
-            self.zones = Check::new(*pose, zones, self.beams);
+            self.zones = ZoneChecker::new(*pose, zones, self.beams);
         }
         self.marks = MarkDetector::new(*marks);
         self.lines.change(*pose, *lines);
         self.motion.change(*pose, *motion);
         match &mut self.background {
-            Some(kept) if background.is_kept => {
-                kept.cutter = Segmenter::new(*pose, self.beams);
-                kept.every_scan = background.every_scan;
+            Some(stage) if background.is_enabled => {
+                stage.segmenter = Segmenter::new(*pose, self.beams);
+                stage.every_scan = background.every_scan;
                 if background.learning != before.background.learning {
-                    kept.model.change(background.learning);
+                    stage.model.change(background.learning);
                 }
             }
-            kept => *kept = background.is_kept.then(|| BackgroundStage::new(processing, self.beams)),
+            kept => *kept = background.is_enabled.then(|| BackgroundStage::new(processing, self.beams)),
         }
     }
 
@@ -145,11 +145,11 @@ impl Pipeline {
             self.lines.update(scan, lines);
         }
         match motion {
-            None => self.motion.forget(),
+            None => self.motion.reset(),
             Some(motion) => {
                 self.motion.update(scan, stamp_ns, period_ns, motion);
-                if let Some(kept) = &mut self.background {
-                    kept.model.follow(&self.processing.pose, motion, &self.motion.velocity());
+                if let Some(stage) = &mut self.background {
+                    stage.model.set_motion(&self.processing.pose, motion, &self.motion.velocity());
                 }
             }
         }
@@ -167,13 +167,13 @@ impl Pipeline {
     }
 
     /// Returns the number of reads per telegram while early warnings have a subscriber.
-    pub(crate) fn pieces(&self) -> u8 {
-        self.processing.early.pieces
+    pub(crate) fn reads_per_telegram(&self) -> u8 {
+        self.processing.early.reads_per_telegram
     }
 
     /// Writes the zones for a time without scans: unknown.
     pub(crate) fn mark_zones_unknown(&mut self, out: &mut Zones) {
-        self.zones.stale(out);
+        self.zones.write_stale(out);
     }
 
     /// Returns whether there is a background model.
@@ -183,30 +183,31 @@ impl Pipeline {
 
     /// Returns whether the model is published with every scan.
     pub(crate) fn publishes_every_scan(&self) -> bool {
-        self.background.as_ref().is_some_and(|kept| kept.every_scan)
+        self.background.as_ref().is_some_and(|stage| stage.every_scan)
     }
 
     /// Returns whether the model is worth publishing: its generation was not published yet, or it has learned since
     /// then from as many scans as it needs for a new object.
     pub(crate) fn is_background_due(&self) -> bool {
-        let is_new = |kept: &BackgroundStage| kept.published != Some(kept.model.generation());
-        let has_learned = |kept: &BackgroundStage| kept.learned >= u32::from(kept.model.scans());
+        let is_unpublished = |stage: &BackgroundStage| stage.published != Some(stage.model.generation());
+        let has_learned =
+            |stage: &BackgroundStage| stage.scans_since_publish >= u32::from(stage.model.scans());
         self.background
             .as_ref()
-            .is_some_and(|kept| kept.shape.is_some() && (is_new(kept) || has_learned(kept)))
+            .is_some_and(|stage| stage.shape.is_some() && (is_unpublished(stage) || has_learned(stage)))
     }
 
     /// Returns the size of the model in bytes, 0 without one.
     pub(crate) fn background_len(&self) -> usize {
-        self.background.as_ref().map_or(0, |kept| Background::len(kept.model.beams()))
+        self.background.as_ref().map_or(0, |stage| Background::len(stage.model.beams()))
     }
 
     /// Writes the model into `out`, and counts it as published.
     pub(crate) fn write_background(&mut self, out: &mut Background) {
-        if let Some(kept) = &mut self.background {
-            kept.model.show(out);
-            kept.published = Some(out.generation);
-            kept.learned = 0;
+        if let Some(stage) = &mut self.background {
+            stage.model.write(out);
+            stage.published = Some(out.generation);
+            stage.scans_since_publish = 0;
         }
     }
 
@@ -215,14 +216,14 @@ impl Pipeline {
     /// one scan is enough.
     pub(crate) fn take_background_to_save(&mut self, is_last: bool) -> Option<(Pose, Box<Background>)> {
         let Processing { pose, background, .. } = &self.processing;
-        let kept = self.background.as_mut().filter(|kept| background.is_handed_on && !kept.is_moving())?;
-        let (generation, learned) = kept.saved;
-        let enough = if is_last { 1 } else { u32::from(kept.model.scans()) };
-        if learned < enough && generation == kept.model.generation() {
+        let stage = self.background.as_mut().filter(|stage| background.is_saved && !stage.is_moving())?;
+        let (generation, learned) = stage.saved;
+        let min_scans = if is_last { 1 } else { u32::from(stage.model.scans()) };
+        if learned < min_scans && generation == stage.model.generation() {
             return None;
         }
-        kept.saved = (kept.model.generation(), 0);
-        Some((*pose, kept.shown()))
+        stage.saved = (stage.model.generation(), 0);
+        Some((*pose, stage.copy()))
     }
 
     /// Handles a user's request for the background of `sensor`. Returns the model for [`Verb::Show`]. `model` is the model of
@@ -237,22 +238,22 @@ impl Pipeline {
         verb: Verb,
         model: &Background,
     ) -> Result<Option<Box<Background>>, Failure> {
-        let Some(kept) = &mut self.background else {
+        let Some(stage) = &mut self.background else {
             let message = format!("{sensor}: background.method is \"off\", no background is kept");
             let hint = format!("run the hub with --set link.{sensor}.background.method=multi, or paper");
             return Err(Failure::new(Kind::Configuration, message, hint));
         };
         match verb {
-            Verb::Show => return Ok(Some(kept.shown())),
-            Verb::Reset => kept.model.reset(),
-            Verb::Freeze => kept.model.freeze(),
-            Verb::Thaw => kept.model.thaw(),
-            Verb::Load if kept.is_moving() => {
+            Verb::Show => return Ok(Some(stage.copy())),
+            Verb::Reset => stage.model.reset(),
+            Verb::Freeze => stage.model.freeze(),
+            Verb::Thaw => stage.model.thaw(),
+            Verb::Load if stage.is_moving() => {
                 let message = format!("{sensor}: background.method is \"moving\": a model is of one place");
                 let hint = "load models of sensors that stand: of methods multi and paper";
                 return Err(Failure::new(Kind::Configuration, message, hint));
             }
-            Verb::Load => kept.load(model).map_err(|mismatch| {
+            Verb::Load => stage.load(model).map_err(|mismatch| {
                 let hint =
                     "a model fits scans of its own resolution and unit: save one of this sensor as it is now";
                 Failure::new(Kind::Configuration, format!("{sensor}: {mismatch}"), hint)
@@ -267,21 +268,21 @@ impl Pipeline {
 impl BackgroundStage {
     fn new(processing: &Processing, beams: usize) -> BackgroundStage {
         let background = &processing.background;
-        let mut kept = BackgroundStage {
-            model: Model::new(background.learning, beams),
-            cutter: Segmenter::new(processing.pose, beams),
+        let mut stage = BackgroundStage {
+            model: BackgroundModel::new(background.learning, beams),
+            segmenter: Segmenter::new(processing.pose, beams),
             every_scan: background.every_scan,
             published: None,
-            learned: 0,
+            scans_since_publish: 0,
             saved: (0, 0),
             shape: None,
         };
-        if let Some(model) = background.model.as_ref().filter(|_| !kept.is_moving()) {
+        if let Some(model) = background.model.as_ref().filter(|_| !stage.is_moving()) {
             // Before the first scan, every model fits.
-            let _ = kept.load(model);
-            kept.saved.0 = kept.model.generation();
+            let _ = stage.load(model);
+            stage.saved.0 = stage.model.generation();
         }
-        kept
+        stage
     }
 
     /// Returns whether the model is a map that the robot moves in.
@@ -296,32 +297,32 @@ impl BackgroundStage {
     }
 
     /// Returns a copy of the model.
-    fn shown(&self) -> Box<Background> {
-        let mut shown = Background::zeroed(Background::len(self.model.beams()));
-        self.model.show(&mut shown);
-        shown
+    fn copy(&self) -> Box<Background> {
+        let mut copy = Background::zeroed(Background::len(self.model.beams()));
+        self.model.write(&mut copy);
+        copy
     }
 
     fn update(
         &mut self,
         scan: &Scan,
         out: Option<&mut Foreground>,
-        spare: &mut Foreground,
+        scratch: &mut Foreground,
     ) -> Option<BackgroundReset> {
         let before = self.model.generation();
         match out {
             Some(out) => {
                 self.model.update(scan, out);
-                self.cutter.update(scan, out);
+                self.segmenter.update(scan, out);
             }
             // Segments of the next scan need the points of this one.
             None => {
-                self.model.update(scan, spare);
-                self.cutter.pass(scan, spare);
+                self.model.update(scan, scratch);
+                self.segmenter.pass(scan, scratch);
             }
         }
         let scans = u32::from(!self.model.is_frozen());
-        self.learned = self.learned.saturating_add(scans);
+        self.scans_since_publish = self.scans_since_publish.saturating_add(scans);
         self.saved.1 = self.saved.1.saturating_add(scans);
         let sensor = (scan.beams() as u16, scan.unit_um);
         let model = self.shape.replace(sensor).filter(|shape| *shape != sensor);
@@ -359,7 +360,7 @@ mod tests {
     }
 
     #[test]
-    fn the_background_learns_and_zones_warn_without_subscribers() {
+    fn learns_and_checks_zones_without_subscribers() {
         let mut pipeline = pipeline(&processing(|_| {}));
         let mut zones = Zones::default();
         for _ in 0..20 {
@@ -383,9 +384,9 @@ mod tests {
         pipeline.learn(&wall(361, 1, 3000), None);
         assert!(pipeline.is_background_due());
         assert_eq!((shown(&mut pipeline).generation, pipeline.is_background_due()), (0, false));
-        for (verb, is_news) in [(Verb::Freeze, false), (Verb::Thaw, false), (Verb::Reset, true)] {
+        for (verb, is_due) in [(Verb::Freeze, false), (Verb::Thaw, false), (Verb::Reset, true)] {
             assert_eq!(pipeline.handle("a", verb, &Box::<Background>::default()), Ok(None));
-            assert_eq!(pipeline.is_background_due(), is_news, "{verb:?}");
+            assert_eq!(pipeline.is_background_due(), is_due, "{verb:?}");
         }
         assert_eq!(shown(&mut pipeline).generation, 1);
         let asked = pipeline
@@ -415,13 +416,13 @@ mod tests {
     }
 
     #[test]
-    fn a_model_that_does_not_fit_is_refused_or_starts_again() {
+    fn mismatched_background_is_refused_or_reset() {
         let head = BackgroundHead { unit_um: 10_000, ..BackgroundHead::default() };
         let model = Background::of(head, &[300; 181]);
         let kept = model.clone();
         let mut pipeline = pipeline(&processing(|processing| processing.background.model = Some(kept)));
-        let (first, is_news) = (shown(&mut pipeline), pipeline.is_background_due());
-        assert_eq!((first.generation, first.known_beams, first.ranges()[180], is_news), (1, 181, 300, false));
+        let (first, is_due) = (shown(&mut pipeline), pipeline.is_background_due());
+        assert_eq!((first.generation, first.known_beams, first.ranges()[180], is_due), (1, 181, 300, false));
         let reason = pipeline.learn(&wall(361, 10, 300), None);
         assert_eq!(
             reason,
@@ -446,25 +447,32 @@ mod tests {
         for _ in 0..20 {
             pipeline.learn(&wall(361, 1, 3000), None);
         }
-        let told = |pipeline: &mut Pipeline, range| {
+        let verdict_and_foreground = |pipeline: &mut Pipeline, range| {
             let (mut zones, mut foreground) = (Zones::default(), Foreground::of(361));
             pipeline.check_zones(&wall(361, 1, range), Some(&mut zones));
             assert_eq!(pipeline.learn(&wall(361, 1, range), Some(&mut foreground)), None);
             (zones.verdict(), foreground.beams)
         };
         let known = shown(&mut pipeline);
-        assert_eq!((told(&mut pipeline, 2000), known.known_beams), ((Verdict::Clear, 361), 361));
+        assert_eq!(
+            (verdict_and_foreground(&mut pipeline, 2000), known.known_beams),
+            ((Verdict::Clear, 361), 361)
+        );
         pipeline.change(&processing(|processing| processing.zones.radii_mm = vec![2500]));
         assert!(!pipeline.is_background_due(), "the background is not concerned");
-        assert_eq!(told(&mut pipeline, 2000), (Verdict::Stop, 361));
+        assert_eq!(verdict_and_foreground(&mut pipeline, 2000), (Verdict::Stop, 361));
         pipeline.change(&processing(|processing| {
             processing.background.learning.method = scanhub_preprocess::background::Method::Paper;
             processing.background.learning.threshold_mm = Some(1500);
         }));
         let changed = shown(&mut pipeline);
         assert_eq!((changed.generation, changed.ranges()), (known.generation + 1, known.ranges()));
-        assert_eq!(told(&mut pipeline, 2000), (Verdict::Clear, 0), "the threshold is another one");
-        pipeline.change(&processing(|processing| processing.background.is_kept = false));
+        assert_eq!(
+            verdict_and_foreground(&mut pipeline, 2000),
+            (Verdict::Clear, 0),
+            "the threshold is another one"
+        );
+        pipeline.change(&processing(|processing| processing.background.is_enabled = false));
         assert!(!pipeline.has_background());
         pipeline.change(&processing(|_| {}));
         assert_eq!((pipeline.has_background(), shown(&mut pipeline).known_beams), (true, 0));
@@ -472,7 +480,7 @@ mod tests {
 
     #[test]
     fn a_request_without_a_background_names_the_key() {
-        let mut pipeline = pipeline(&processing(|processing| processing.background.is_kept = false));
+        let mut pipeline = pipeline(&processing(|processing| processing.background.is_enabled = false));
         pipeline.learn(&wall(361, 1, 3000), None);
         assert!(
             !pipeline.has_background() && !pipeline.is_background_due() && !pipeline.publishes_every_scan()

@@ -6,9 +6,9 @@
 use std::io;
 use std::path::Path;
 
-use scanhub_port::{Allowance, Alteration, PortError, Source};
-use scanhub_schema::{Background, Failure, Nanos, Pose, Ring, Wake};
-use scanhub_shm::{Medium, Payload};
+use scanhub_port::{PortError, PortSpec, ReadBudget, SettingsChange};
+use scanhub_schema::{Background, DoorbellWord, Failure, Nanos, Pose, WakeEvent};
+use scanhub_shm::{Payload, SampleTransport};
 
 use crate::control::ControlQueue;
 use crate::saved_state::{KnownRate, KnownScanner};
@@ -16,9 +16,9 @@ use crate::saved_state::{KnownRate, KnownScanner};
 /// Environment of one link.
 pub trait Platform {
     /// Open line to a scanner.
-    type Line: Line;
+    type Port: PortIo;
     /// Transport of the samples of a topic.
-    type Medium<P: Payload + ?Sized>: Medium<P>;
+    type Transport<P: Payload + ?Sized>: SampleTransport<P>;
 
     /// Returns CLOCK_MONOTONIC, the clock of every stamp and deadline, in ns.
     fn now(&self) -> Nanos;
@@ -43,22 +43,22 @@ pub trait Platform {
     /// # Errors
     ///
     /// Returns the reason without its circumstances, which [`explain`](Self::explain) adds.
-    fn open(&self, source: &Source, baud: u32) -> Option<Result<Self::Line, PortError>>;
+    fn open(&self, source: &PortSpec, baud: u32) -> Option<Result<Self::Port, PortError>>;
 
     /// Returns the message for `error`, with its circumstances and a remedy.
-    fn explain(&self, error: &PortError, source: &Source) -> Failure;
+    fn explain(&self, error: &PortError, source: &PortSpec) -> Failure;
 
     /// Returns the program that may have changed the settings of the port at `source`, as the end of a message;
     /// `None` if none is known.
-    fn altering_program(&self, source: &Source) -> Option<String>;
+    fn altering_program(&self, source: &PortSpec) -> Option<String>;
 
     /// Returns the line at `source` that was kept open for link `name` when the previous hub was killed.
-    fn take_kept(&self, name: &str, source: &Source, baud: u32) -> Option<Self::Line>;
+    fn take_kept_port(&self, name: &str, source: &PortSpec, baud: u32) -> Option<Self::Port>;
 
     /// Keeps `line` of link `name` open even if this hub is killed.
-    fn keep(&self, name: &str, line: &Self::Line);
+    fn keep_open(&self, name: &str, line: &Self::Port);
 
-    /// Ends the effect of [`keep`](Self::keep).
+    /// Ends the effect of [`keep`](Self::keep_open).
     fn release(&self, name: &str);
 
     /// Creates the topic of `sensor` with payload `P`.
@@ -66,20 +66,20 @@ pub trait Platform {
     /// # Errors
     ///
     /// Returns the errors of [`SharedMemory::new`](scanhub_shm::SharedMemory::new).
-    fn medium<P: Payload + ?Sized>(&self, sensor: &str) -> Result<Self::Medium<P>, Failure>;
+    fn transport<P: Payload + ?Sized>(&self, sensor: &str) -> Result<Self::Transport<P>, Failure>;
 
     /// Returns a number that changes when a subscriber or listener of the link may have attached. It may miss those of
     /// other libraries than this project's. `None` if it is unknown.
-    fn attached(&self) -> Option<u32>;
+    fn attach_count(&self) -> Option<u32>;
 
     /// Returns whether the event of the link has a listener.
     fn has_listeners(&self) -> bool;
 
     /// Rings the doorbell word `ring` of the link, which wakes the subscribers that sleep there.
-    fn ring(&self, ring: Ring);
+    fn ring(&self, word: DoorbellWord);
 
     /// Wakes the subscribers that listen to the event of the link.
-    fn notify_event(&self, why: Wake);
+    fn notify_event(&self, event: WakeEvent);
 
     /// Reads the last record that this hub or the previous one has [stored](Self::store_record) for link `name` into
     /// `record`. Returns its length; `None` if there is none. A record outlives a killed hub, but not a restart of
@@ -116,7 +116,7 @@ pub trait SavedState {
 }
 
 /// Open line. No function waits.
-pub trait Line {
+pub trait PortIo {
     /// Reads the available bytes into `buffer`. Returns their number.
     ///
     /// # Errors
@@ -144,7 +144,7 @@ pub trait Line {
     /// # Errors
     ///
     /// Returns an error if the line is lost.
-    fn altered(&self) -> io::Result<Option<Alteration>>;
+    fn alteration(&self) -> io::Result<Option<SettingsChange>>;
 
     /// Restores the hub's settings, at `baud`, and discards the bytes that arrived with others.
     ///
@@ -161,10 +161,10 @@ pub trait Line {
     fn set_dtr(&self, on: bool) -> io::Result<()>;
 
     /// Returns the number of bytes in the tty's input buffer; `None` for a network port.
-    fn waiting(&self) -> Option<usize>;
+    fn buffered_len(&self) -> Option<usize>;
 
     /// Returns the read budget of a network port for a line of `baud`; `None` for a tty, which is never throttled.
-    fn allowance(&self, baud: u32) -> Option<Allowance>;
+    fn read_budget(&self, baud: u32) -> Option<ReadBudget>;
 
     /// Returns the errors that the driver counted since the last call.
     fn line_errors(&self) -> u64;
@@ -181,7 +181,7 @@ pub struct Wait<'a, L> {
     /// Requests of users. One of them ends the wait.
     pub requests: &'a ControlQueue,
     /// Source that ends the wait when it is ready.
-    pub on: WaitSource<'a, L>,
+    pub source: WaitSource<'a, L>,
     /// Deadline.
     pub until: Nanos,
 }

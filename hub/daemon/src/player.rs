@@ -106,11 +106,11 @@ impl Default for PlaybackRate {
 }
 
 impl PlaybackRate {
-    /// Returns twice this rate. More than [`FASTEST`](Self::FASTEST) is [`Max`](Self::Max).
+    /// Returns twice this rate. More than [`MAX_FACTOR`](Self::FASTEST) is [`Max`](Self::Max).
     fn doubled(self) -> PlaybackRate {
         match self {
-            PlaybackRate::Times(rate) if rate < PlaybackRate::FASTEST => {
-                PlaybackRate::Times((2.0 * rate).min(PlaybackRate::FASTEST))
+            PlaybackRate::Times(rate) if rate < PlaybackRate::MAX_FACTOR => {
+                PlaybackRate::Times((2.0 * rate).min(PlaybackRate::MAX_FACTOR))
             }
             _ => PlaybackRate::Max,
         }
@@ -119,15 +119,15 @@ impl PlaybackRate {
     /// Returns half this rate.
     fn halved(self) -> PlaybackRate {
         match self {
-            PlaybackRate::Times(rate) => PlaybackRate::Times((rate / 2.0).max(PlaybackRate::SLOWEST)),
-            PlaybackRate::Max => PlaybackRate::Times(PlaybackRate::FASTEST),
+            PlaybackRate::Times(rate) => PlaybackRate::Times((rate / 2.0).max(PlaybackRate::MIN_FACTOR)),
+            PlaybackRate::Max => PlaybackRate::Times(PlaybackRate::MAX_FACTOR),
         }
     }
 
     /// Minimum rate.
-    pub const SLOWEST: f64 = 1.0 / 64.0;
+    pub const MIN_FACTOR: f64 = 1.0 / 64.0;
     /// Maximum rate at which playback waits at all.
-    pub const FASTEST: f64 = 64.0;
+    pub const MAX_FACTOR: f64 = 64.0;
 }
 
 impl Player {
@@ -168,8 +168,8 @@ impl Player {
     }
 
     /// Returns how the recording is played.
-    pub(crate) fn play(&self) -> PlaybackOptions {
-        *self.lock().play()
+    pub(crate) fn options(&self) -> PlaybackOptions {
+        *self.lock().options()
     }
 
     /// Returns the number of restarts.
@@ -200,7 +200,7 @@ impl Player {
     /// Pauses or resumes playback.
     pub fn toggle(&self) {
         self.change(|playback, now, position| {
-            let is_paused = playback.play().is_paused;
+            let is_paused = playback.options().is_paused;
             playback.pause(!is_paused, now, position);
         });
     }
@@ -213,14 +213,14 @@ impl Player {
     /// Doubles the rate.
     pub fn speed_up(&self) {
         self.change(|playback, now, position| {
-            playback.set_rate(playback.play().rate.doubled(), now, position);
+            playback.set_rate(playback.options().rate.doubled(), now, position);
         });
     }
 
     /// Halves the rate.
     pub fn slow_down(&self) {
         self.change(|playback, now, position| {
-            playback.set_rate(playback.play().rate.halved(), now, position);
+            playback.set_rate(playback.options().rate.halved(), now, position);
         });
     }
 
@@ -233,7 +233,7 @@ impl Player {
     /// Returns the progress.
     pub fn progress(&self) -> Progress {
         let playback = self.lock();
-        let length_ns = playback.play().end_ns.into_iter().chain(self.length_ns).min();
+        let length_ns = playback.options().end_ns.into_iter().chain(self.length_ns).min();
         let now = clock::now();
         let is_over = playback.is_over();
         let position = self.position();
@@ -242,13 +242,13 @@ impl Player {
         Progress {
             position_ns: if is_over { position } else { media },
             length_ns,
-            rate: playback.play().rate,
-            is_paused: playback.play().is_paused,
+            rate: playback.options().rate,
+            is_paused: playback.options().is_paused,
             is_over,
             lap: playback.lap(),
             telegrams: self.links.iter().map(|link| link.telegrams.load(Ordering::Relaxed)).sum(),
-            took_ns: playback.took(now),
-            paused_ns: playback.paused(now),
+            took_ns: playback.elapsed(now),
+            paused_ns: playback.paused_time(now),
             now_ns: now,
         }
     }
@@ -308,7 +308,7 @@ impl PlayerHandle<'_> {
 
     /// Returns the next action of the link, whose next telegram has time `media`.
     pub(crate) fn next_action(self, media: Nanos, now: Nanos) -> PlaybackAction {
-        self.ask(|playback| playback.next_action(self.number, media, now))
+        self.query(|playback| playback.next_action(self.number, media, now))
     }
 
     /// Handles that the link is at the end of lap number `lap`. Returns the next action of the link.
@@ -317,7 +317,7 @@ impl PlayerHandle<'_> {
         progress.has_ended.store(true, Ordering::Relaxed);
         let telegrams = progress.telegrams.load(Ordering::Relaxed);
         let has_played = progress.telegrams_of_laps.swap(telegrams, Ordering::Relaxed) < telegrams;
-        let action = self.ask(|playback| {
+        let action = self.query(|playback| {
             playback.has_played |= has_played;
             playback.end(self.number, lap, now)
         });
@@ -329,7 +329,7 @@ impl PlayerHandle<'_> {
     }
 
     /// Notes that the link has published a telegram of time `media`.
-    pub(crate) fn played(self, media: Nanos) {
+    pub(crate) fn note_played(self, media: Nanos) {
         let progress = self.progress();
         progress.media.store(media, Ordering::Relaxed);
         progress.has_ended.store(false, Ordering::Relaxed);
@@ -337,13 +337,13 @@ impl PlayerHandle<'_> {
     }
 
     /// Returns how the recording is played.
-    pub(crate) fn play(self) -> PlaybackOptions {
-        *self.player.lock().play()
+    pub(crate) fn options(self) -> PlaybackOptions {
+        *self.player.lock().options()
     }
 
     /// Returns whether the player is paused.
     pub(crate) fn is_paused(self) -> bool {
-        self.player.lock().play().is_paused
+        self.player.lock().options().is_paused
     }
 
     /// Returns the event that is readable when the next action of the link may have changed.
@@ -351,9 +351,9 @@ impl PlayerHandle<'_> {
         &self.progress().event
     }
 
-    fn ask(self, question: impl FnOnce(&mut Playback) -> PlaybackAction) -> PlaybackAction {
+    fn query(self, query: impl FnOnce(&mut Playback) -> PlaybackAction) -> PlaybackAction {
         let mut playback = self.player.lock();
-        let action = question(&mut playback);
+        let action = query(&mut playback);
         self.player.notify(playback);
         action
     }
@@ -367,7 +367,7 @@ impl PlayerHandle<'_> {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum PlaybackAction {
     /// Plays its next telegram now.
-    Now(Due),
+    Now(DueTime),
     /// Waits until this time.
     At(Nanos),
     /// Waits until the player changes.
@@ -382,29 +382,29 @@ pub(crate) enum PlaybackAction {
 
 /// Time at which a telegram is played.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Due {
+pub(crate) struct DueTime {
     /// Time at which it was due, CLOCK_MONOTONIC in ns.
     pub(crate) at: Nanos,
     /// Factor by which the time to the next telegram is longer than in the recording.
     pub(crate) stretch: f64,
 }
 
-impl Due {
+impl DueTime {
     /// Creates the time of a telegram that does not wait.
-    pub(crate) fn at_once(now: Nanos) -> Due {
-        Due { at: now, stretch: 1.0 }
+    pub(crate) fn at_once(now: Nanos) -> DueTime {
+        DueTime { at: now, stretch: 1.0 }
     }
 }
 
 /// Clock of a recording, for all of its links.
 #[derive(Clone, Debug)]
 struct Playback {
-    play: PlaybackOptions,
+    options: PlaybackOptions,
     /// Whether playback has been started.
     is_begun: bool,
     /// A time and its media time; `None` until every link has reported its first telegram.
     anchor: Option<(Nanos, Nanos)>,
-    links: Vec<Next>,
+    links: Vec<NextTelegram>,
     /// Number of restarts.
     lap: u32,
     /// Whether this lap had a telegram, including those of links that played without a query.
@@ -425,7 +425,7 @@ struct Playback {
 
 /// Next telegram of a link.
 #[derive(Clone, Copy, Debug, PartialEq)]
-enum Next {
+enum NextTelegram {
     /// The link has not reported it yet.
     Unknown,
     /// A telegram with this media time.
@@ -436,10 +436,10 @@ enum Next {
 impl Playback {
     fn new(play: PlaybackOptions, links: usize) -> Playback {
         Playback {
-            play,
+            options: play,
             is_begun: false,
             anchor: None,
-            links: vec![Next::Unknown; links],
+            links: vec![NextTelegram::Unknown; links],
             lap: 0,
             has_played: false,
             began_at: None,
@@ -455,27 +455,33 @@ impl Playback {
     /// Starts playback.
     fn begin(&mut self, now: Nanos) {
         self.is_begun = true;
-        self.start(now);
+        self.start_clock(now);
     }
 
     /// Returns the next action of `link`, whose next telegram has time `media`.
     fn next_action(&mut self, link: usize, media: Nanos, now: Nanos) -> PlaybackAction {
-        self.links[link] = Next::At(media);
-        self.start(now);
+        self.links[link] = NextTelegram::At(media);
+        self.start_clock(now);
         self.apply_step();
         let Some((since, from)) = self.anchor else { return PlaybackAction::Wait };
-        if self.play.is_paused {
-            return if media < from { self.play_now(link, Due::at_once(now)) } else { PlaybackAction::Wait };
+        if self.options.is_paused {
+            return if media < from {
+                self.play_now(link, DueTime::at_once(now))
+            } else {
+                PlaybackAction::Wait
+            };
         }
-        let PlaybackRate::Times(rate) = self.play.rate else { return self.play_now(link, Due::at_once(now)) };
+        let PlaybackRate::Times(rate) = self.options.rate else {
+            return self.play_now(link, DueTime::at_once(now));
+        };
         if self.skip_silence(now) {
             return self.next_action(link, media, now);
         }
-        let due = due(since, from, media, rate);
+        let due = due_time(since, from, media, rate);
         if due > now {
             return PlaybackAction::At(due);
         }
-        self.play_now(link, Due { at: due, stretch: (1.0 / rate).max(1.0) })
+        self.play_now(link, DueTime { at: due, stretch: (1.0 / rate).max(1.0) })
     }
 
     /// Returns when a sample of time `media` is due that belongs to no link. `position` is the media time at maximum
@@ -485,14 +491,14 @@ impl Playback {
             return PlaybackAction::Skipped;
         }
         let at_once =
-            |is_due| if is_due { PlaybackAction::Now(Due::at_once(now)) } else { PlaybackAction::Wait };
-        match (self.anchor, self.play.rate) {
+            |is_due| if is_due { PlaybackAction::Now(DueTime::at_once(now)) } else { PlaybackAction::Wait };
+        match (self.anchor, self.options.rate) {
             (None, _) => PlaybackAction::Wait,
-            (Some((_, from)), _) if self.play.is_paused => at_once(media < from),
+            (Some((_, from)), _) if self.options.is_paused => at_once(media < from),
             (_, PlaybackRate::Max) => at_once(media <= position),
-            (Some((since, from)), PlaybackRate::Times(rate)) => match due(since, from, media, rate) {
+            (Some((since, from)), PlaybackRate::Times(rate)) => match due_time(since, from, media, rate) {
                 at if at > now => PlaybackAction::At(at),
-                at => PlaybackAction::Now(Due { at, stretch: (1.0 / rate).max(1.0) }),
+                at => PlaybackAction::Now(DueTime { at, stretch: (1.0 / rate).max(1.0) }),
             },
         }
     }
@@ -505,20 +511,20 @@ impl Playback {
         if self.is_over() {
             return PlaybackAction::Over;
         }
-        self.links[link] = Next::Ended;
-        self.start(now);
+        self.links[link] = NextTelegram::Ended;
+        self.start_clock(now);
         if !self.is_over() {
             self.apply_step();
             return PlaybackAction::Wait;
         }
         self.has_changed = true;
         // An empty recording would restart forever.
-        if !(self.play.is_looped && self.has_played) {
+        if !(self.options.is_looped && self.has_played) {
             self.over_at = Some(now);
             return PlaybackAction::Over;
         }
         self.lap += 1;
-        self.links.fill(Next::Unknown);
+        self.links.fill(NextTelegram::Unknown);
         (self.anchor, self.has_played, self.skipped_until) = (None, false, 0);
         PlaybackAction::Restart(self.lap)
     }
@@ -541,11 +547,11 @@ impl Playback {
     /// Continues at another rate.
     fn set_rate(&mut self, rate: PlaybackRate, now: Nanos, position: Nanos) {
         self.set_anchor(now, position);
-        self.play.rate = rate;
+        self.options.rate = rate;
     }
 
-    fn play(&self) -> &PlaybackOptions {
-        &self.play
+    fn options(&self) -> &PlaybackOptions {
+        &self.options
     }
 
     fn lap(&self) -> u32 {
@@ -554,31 +560,31 @@ impl Playback {
 
     /// Returns whether every telegram is due at once until something changes.
     fn is_unthrottled(&self) -> bool {
-        self.anchor.is_some() && !self.play.is_paused && self.play.rate == PlaybackRate::Max
+        self.anchor.is_some() && !self.options.is_paused && self.options.rate == PlaybackRate::Max
     }
 
     /// Returns whether everything was played.
     fn is_over(&self) -> bool {
-        self.links.iter().all(|next| *next == Next::Ended)
+        self.links.iter().all(|next| *next == NextTelegram::Ended)
     }
 
     /// Returns how long it has played, without pauses.
-    fn took(&self, now: Nanos) -> Nanos {
+    fn elapsed(&self, now: Nanos) -> Nanos {
         let until = self.over_at.unwrap_or(now);
         let since_start = self.began_at.map_or(0, |began_at| until.saturating_sub(began_at));
-        since_start.saturating_sub(self.paused(now))
+        since_start.saturating_sub(self.paused_time(now))
     }
 
     /// Returns how long it has been paused since everything was ready to play.
-    fn paused(&self, now: Nanos) -> Nanos {
+    fn paused_time(&self, now: Nanos) -> Nanos {
         let until = self.over_at.unwrap_or(now);
         self.paused + self.paused_at.map_or(0, |paused_at| until.saturating_sub(paused_at))
     }
 
     /// Sets whether it is paused. A pause counts from the moment at which playback could have run.
     fn set_paused(&mut self, is_paused: bool, now: Nanos) {
-        self.paused = self.paused(now);
-        self.play.is_paused = is_paused;
+        self.paused = self.paused_time(now);
+        self.options.is_paused = is_paused;
         self.paused_at = self.began_at.filter(|_| is_paused).map(|_| now);
     }
 
@@ -589,9 +595,9 @@ impl Playback {
 
     /// Returns the media time at `now`: `position` at maximum rate.
     fn media(&self, now: Nanos, position: Nanos) -> Nanos {
-        let Some((since, from)) = self.anchor else { return self.play.start_ns };
-        match self.play.rate {
-            _ if self.play.is_paused => from,
+        let Some((since, from)) = self.anchor else { return self.options.start_ns };
+        match self.options.rate {
+            _ if self.options.is_paused => from,
             PlaybackRate::Max => position.max(from),
             PlaybackRate::Times(rate) => {
                 from.saturating_add((now.saturating_sub(since) as f64 * rate) as Nanos)
@@ -600,17 +606,17 @@ impl Playback {
     }
 
     /// Lets `link` play. Its next telegram is unknown until it reports it.
-    fn play_now(&mut self, link: usize, due: Due) -> PlaybackAction {
+    fn play_now(&mut self, link: usize, due: DueTime) -> PlaybackAction {
         self.has_played = true;
-        self.links[link] = Next::Unknown;
+        self.links[link] = NextTelegram::Unknown;
         PlaybackAction::Now(due)
     }
 
     /// Lets the next telegram play in a pause, if a step is pending and all links have reported theirs.
     fn apply_step(&mut self) {
         if self.is_step_pending
-            && !self.links.contains(&Next::Unknown)
-            && let Some(((_, media), next)) = self.anchor.as_mut().zip(next_of(&self.links))
+            && !self.links.contains(&NextTelegram::Unknown)
+            && let Some(((_, media), next)) = self.anchor.as_mut().zip(next_media(&self.links))
         {
             let before = *media;
             *media = before.max(next.saturating_add(1));
@@ -622,12 +628,12 @@ impl Playback {
     }
 
     /// Starts the clock once all links have reported their first telegram.
-    fn start(&mut self, now: Nanos) {
-        if self.is_begun && self.anchor.is_none() && !self.links.contains(&Next::Unknown) {
-            self.anchor = Some((now, self.play.start_ns));
+    fn start_clock(&mut self, now: Nanos) {
+        if self.is_begun && self.anchor.is_none() && !self.links.contains(&NextTelegram::Unknown) {
+            self.anchor = Some((now, self.options.start_ns));
             if self.began_at.is_none() {
                 self.began_at = Some(now);
-                self.set_paused(self.play.is_paused, now);
+                self.set_paused(self.options.is_paused, now);
             }
             self.has_changed = true;
         }
@@ -645,7 +651,7 @@ impl Playback {
     /// Shortens a silence of all links, in which the recording was interrupted. Returns whether it has.
     fn skip_silence(&mut self, now: Nanos) -> bool {
         let media = self.media(now, 0);
-        match next_of(&self.links).filter(|_| !self.links.contains(&Next::Unknown)) {
+        match next_media(&self.links).filter(|_| !self.links.contains(&NextTelegram::Unknown)) {
             Some(next) if next > media.saturating_add(MAX_SILENCE) => {
                 self.anchor = Some((now, next - MAX_SILENCE));
                 self.has_changed = true;
@@ -658,13 +664,13 @@ impl Playback {
 }
 
 /// Returns when `media` is due at this rate, if the media time was `from` at `since`.
-fn due(since: Nanos, from: Nanos, media: Nanos, rate: f64) -> Nanos {
+fn due_time(since: Nanos, from: Nanos, media: Nanos, rate: f64) -> Nanos {
     since.saturating_add_signed(((media as f64 - from as f64) / rate) as i64)
 }
 
 /// Returns the media time of the next telegram of all links.
-fn next_of(links: &[Next]) -> Option<Nanos> {
-    let next = |next: &Next| if let Next::At(media) = next { Some(*media) } else { None };
+fn next_media(links: &[NextTelegram]) -> Option<Nanos> {
+    let next = |next: &NextTelegram| if let NextTelegram::At(media) = next { Some(*media) } else { None };
     links.iter().filter_map(next).min()
 }
 
@@ -737,7 +743,7 @@ mod tests {
         let PlaybackAction::Now(due) = playback.next_action(0, 8 * SECOND, 111 * SECOND) else {
             panic!("not due")
         };
-        assert_eq!(due, Due { at: 110 * SECOND, stretch: 2.0 });
+        assert_eq!(due, DueTime { at: 110 * SECOND, stretch: 2.0 });
         playback.set_rate(PlaybackRate::Max, 112 * SECOND, 0);
         assert!(playback.is_unthrottled());
         assert!(is_now(playback.next_action(0, 9999 * SECOND, 112 * SECOND), 112 * SECOND));
@@ -746,7 +752,7 @@ mod tests {
     }
 
     #[test]
-    fn pause_takes_no_media_time_and_step_plays_one_telegram_of_all_links() {
+    fn pause_stops_media_time_and_step_plays_one_telegram() {
         let mut playback = begun(2, PlaybackOptions { is_paused: true, ..PlaybackOptions::default() });
         assert_eq!(playback.next_action(0, 0, 101 * SECOND), PlaybackAction::Wait);
         assert_eq!(
@@ -777,8 +783,9 @@ mod tests {
         // Time before the start does not count at all.
         playback.pause(true, 95 * SECOND, 0);
         playback.begin(100 * SECOND);
-        let times =
-            |playback: &Playback, at: Nanos| (playback.took(at * SECOND), playback.paused(at * SECOND));
+        let times = |playback: &Playback, at: Nanos| {
+            (playback.elapsed(at * SECOND), playback.paused_time(at * SECOND))
+        };
         assert_eq!(times(&playback, 130), (0, 30 * SECOND));
         playback.pause(false, 160 * SECOND, 0);
         assert_eq!(times(&playback, 162), (2 * SECOND, 60 * SECOND));
@@ -814,7 +821,7 @@ mod tests {
     }
 
     #[test]
-    fn times_between_telegrams_are_exact_after_years_of_uptime() {
+    fn telegram_intervals_are_exact_after_long_uptime() {
         let (mut playback, up) = (Playback::new(PlaybackOptions::default(), 1), 100_000_000 * SECOND + 1);
         playback.begin(up);
         for media in (0..100).map(|scan| scan * 26_640_001) {
@@ -823,7 +830,7 @@ mod tests {
     }
 
     #[test]
-    fn restarts_when_all_links_are_at_the_end_and_a_telegram_was_played() {
+    fn restarts_when_all_links_end_and_one_has_played() {
         let mut playback =
             begun(2, PlaybackOptions { is_looped: true, start_ns: SECOND, ..PlaybackOptions::default() });
         assert_eq!(playback.next_action(0, SECOND, 100 * SECOND), PlaybackAction::Wait);

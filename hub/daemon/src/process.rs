@@ -12,10 +12,10 @@ use std::os::unix::net::UnixStream;
 use rustix::event::{EventfdFlags, eventfd};
 use rustix::fs::{Mode, OFlags, open};
 use rustix::stdio::{stderr, stdout};
-use scanhub_config::needs;
+use scanhub_config::resource_estimate;
 use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Failure, Kind};
-use scanhub_shm::shortage;
+use scanhub_shm::resource_limits;
 use signal_hook::consts::{SIGBUS, SIGHUP, SIGINT, SIGTERM};
 use signal_hook::low_level;
 use signal_hook::low_level::pipe::register;
@@ -87,7 +87,11 @@ impl EventFd {
     pub(crate) fn new() -> Result<EventFd, Failure> {
         let created = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK);
         created.map(EventFd).map_err(|error| {
-            Failure::new(Kind::Short, format!("cannot get an eventfd: {error}"), "raise `ulimit -n`")
+            Failure::new(
+                Kind::ResourceExhausted,
+                format!("cannot get an eventfd: {error}"),
+                "raise `ulimit -n`",
+            )
         })
     }
 
@@ -108,7 +112,7 @@ impl AsFd for EventFd {
     }
 }
 
-/// Makes SIGBUS end the process with the exit code of [`Kind::Short`], after one message: text to stderr, or with
+/// Makes SIGBUS end the process with the exit code of [`Kind::ResourceExhausted`], after one message: text to stderr, or with
 /// `json` an object of class `error` to stdout. If stdout `is_taken`, the object goes to stderr.
 #[allow(unsafe_code)]
 pub fn explain_bus_error(json: bool, is_taken: bool) {
@@ -119,7 +123,7 @@ pub fn explain_bus_error(json: bool, is_taken: bool) {
     };
     let handler = move || {
         let _ = rustix::io::write(output(), message);
-        low_level::exit(i32::from(Kind::Short.exit_code()));
+        low_level::exit(i32::from(Kind::ResourceExhausted.exit_code()));
     };
     // SAFETY: the handler only calls write(2) and _exit(2), both async-signal-safe.
     if let Err(error) = unsafe { low_level::register(SIGBUS, handler) } {
@@ -129,7 +133,7 @@ pub fn explain_bus_error(json: bool, is_taken: bool) {
 
 /// Raises the limit of open descriptors to the hard limit of the process.
 pub(crate) fn raise_descriptor_limit() {
-    if let Err(error) = shortage::raise_descriptor_limit() {
+    if let Err(error) = resource_limits::raise_descriptor_limit() {
         tracing::warn!(%error, "cannot raise the limit of open descriptors: fewer consumers can attach");
     }
 }
@@ -141,9 +145,9 @@ pub(crate) fn raise_descriptor_limit() {
 ///
 /// Returns [`Kind::Short`] with the free and the needed size.
 pub(crate) fn check_memory(limits: &[TopicLimits]) -> Result<(), Failure> {
-    let needed = needs::memory(limits);
-    shortage::check_address_space(needed + limits.len() as u64 * THREAD_ADDRESS_SPACE)?;
-    shortage::check_memory(needed, needs::longest_segment(limits))
+    let needed = resource_estimate::memory(limits);
+    resource_limits::check_address_space(needed + limits.len() as u64 * THREAD_ADDRESS_SPACE)?;
+    resource_limits::check_memory(needed, resource_estimate::longest_segment(limits))
 }
 
 /// Checks that `links` links, and a first subscriber of each, have enough descriptors.
@@ -152,12 +156,12 @@ pub(crate) fn check_memory(limits: &[TopicLimits]) -> Result<(), Failure> {
 ///
 /// Returns [`Kind::Short`] with the limit and the needed number.
 pub(crate) fn check_descriptors(links: usize) -> Result<(), Failure> {
-    shortage::check_descriptors(needs::descriptors(links))
+    resource_limits::check_descriptors(resource_estimate::descriptors(links))
 }
 
 /// Returns the failure that `resource` is not available now.
 pub(crate) fn no_resource(resource: &str, error: &dyn std::fmt::Display) -> Failure {
-    Failure::new(Kind::Short, format!("cannot get {resource}: {error}"), "try again later")
+    Failure::new(Kind::ResourceExhausted, format!("cannot get {resource}: {error}"), "try again later")
 }
 
 /// Returns whether the process has a terminal, whose end the kernel would report. A terminal that was closed cannot be
@@ -190,7 +194,7 @@ mod tests {
         assert!(check_memory(&[TopicLimits::default(); 2]).is_ok());
         let huge = TopicLimits { telegram: 1 << 50, ..TopicLimits::default() };
         let failure = check_memory(&[huge]).unwrap_err();
-        assert_eq!(failure.kind, Kind::Short);
+        assert_eq!(failure.kind, Kind::ResourceExhausted);
         assert!(failure.message.contains("kB needed"), "{failure}");
     }
 }

@@ -7,16 +7,16 @@
 
 use std::fmt::Debug;
 
-use scanhub_schema::limits::history;
+use scanhub_schema::limits::history_len;
 use scanhub_schema::{Failure, Header};
-use scanhub_shm::{DueRings, Medium, Payload, TopicPublisher};
+use scanhub_shm::{Payload, PendingWakeups, SampleTransport, TopicPublisher};
 
 use crate::platform::Platform;
 
 /// Publisher of one topic, which takes a loan before the sample arrives.
 ///
 /// A topic without a history is not sent while it has no subscriber, and its number is skipped.
-pub(crate) struct PreparedPublisher<P: Payload + ?Sized, M: Medium<P>> {
+pub(crate) struct PreparedPublisher<P: Payload + ?Sized, M: SampleTransport<P>> {
     topic: TopicPublisher<P, M>,
     /// Number of subscribers at the last look.
     subscribers: usize,
@@ -28,31 +28,31 @@ pub(crate) struct PreparedPublisher<P: Payload + ?Sized, M: Medium<P>> {
 }
 
 /// Loan of a sample.
-pub(crate) enum Loan<P: Payload + ?Sized, M: Medium<P>> {
+pub(crate) enum Loan<P: Payload + ?Sized, M: SampleTransport<P>> {
     /// Memory that the sample is written into.
     Taken(M::Loan),
     /// There is no memory for the sample.
-    Lacking,
+    NoMemory,
     /// The topic has no subscriber.
-    Unwanted,
+    NoSubscriber,
 }
 
-impl<P: Payload + ?Sized, M: Medium<P>> PreparedPublisher<P, M> {
+impl<P: Payload + ?Sized, M: SampleTransport<P>> PreparedPublisher<P, M> {
     /// Opens the topic of `sensor`.
     ///
     /// # Errors
     ///
     /// Returns [`Kind::Short`](scanhub_schema::Kind::Short) if no memory or descriptors are left.
-    pub(crate) fn new(platform: &impl Platform<Medium<P> = M>, sensor: &str) -> Result<Self, Failure> {
-        let topic = TopicPublisher::over(platform.medium::<P>(sensor)?);
+    pub(crate) fn new(platform: &impl Platform<Transport<P> = M>, sensor: &str) -> Result<Self, Failure> {
+        let topic = TopicPublisher::with_transport(platform.transport::<P>(sensor)?);
         Ok(PreparedPublisher { topic, subscribers: 0, reached: 0, prepared: None, last_len: 0 })
     }
 
     /// Counts the subscribers of the topic, and connects new ones. Those of a topic with a history are connected
     /// by [`connect`](Self::connect) or with the next sample.
-    pub(crate) fn look(&mut self) {
+    pub(crate) fn find_subscribers(&mut self) {
         self.subscribers = self.topic.subscribers();
-        if self.subscribers > 0 && history(P::TOPIC) == 0 {
+        if self.subscribers > 0 && history_len(P::TOPIC) == 0 {
             self.connect();
         }
     }
@@ -60,44 +60,44 @@ impl<P: Payload + ?Sized, M: Medium<P>> PreparedPublisher<P, M> {
     /// Takes a loan for the sample that is about to arrive, as long as the last one, if the topic has a subscriber. This
     /// also brings the slots of the subscribers into the cache.
     pub(crate) fn prepare(&mut self) {
-        if self.prepared.is_none() && self.is_wanted() {
+        if self.prepared.is_none() && self.is_sent() {
             self.prepared = self.topic.loan(self.last_len).ok();
         }
     }
 
     /// Takes a loan for the next sample. `len` is its size in bytes if the payload has no fixed size.
     pub(crate) fn loan(&mut self, len: usize) -> Loan<P, M> {
-        if !self.is_wanted() {
-            return Loan::Unwanted;
+        if !self.is_sent() {
+            return Loan::NoSubscriber;
         }
         if self.last_len != len {
             self.last_len = len;
             self.prepared = None;
         }
-        self.prepared.take().or_else(|| self.topic.loan(len).ok()).map_or(Loan::Lacking, Loan::Taken)
+        self.prepared.take().or_else(|| self.topic.loan(len).ok()).map_or(Loan::NoMemory, Loan::Taken)
     }
 
     /// Sends a sample from [`loan`](Self::loan), and notes in `due` which doorbell has to ring.
-    pub(crate) fn send(&mut self, loan: Loan<P, M>, header: &Header, due: &mut DueRings) {
+    pub(crate) fn send(&mut self, loan: Loan<P, M>, header: &Header, due: &mut PendingWakeups) {
         match loan {
             Loan::Taken(loan) => {
                 // The topic counts a failure.
                 if let Ok(reached) = self.topic.send_loan(loan, header) {
                     self.reached = reached;
-                    due.note(P::TOPIC, reached);
+                    due.note_sample(P::TOPIC, reached);
                     if reached < self.subscribers {
                         self.note_departure();
                     }
                 }
             }
-            Loan::Lacking => self.topic.fail(),
-            Loan::Unwanted => self.skip(),
+            Loan::NoMemory => self.topic.count_failed(),
+            Loan::NoSubscriber => self.skip(),
         }
     }
 
     /// Skips the number of a sample that is not sent, because the topic has no subscriber.
     pub(crate) fn skip(&mut self) {
-        self.topic.skip(1);
+        self.topic.skip_numbers(1);
         self.reached = 0;
     }
 
@@ -130,8 +130,8 @@ impl<P: Payload + ?Sized, M: Medium<P>> PreparedPublisher<P, M> {
     }
 
     /// Returns whether samples are sent: the topic has a subscriber, or a history for later ones.
-    pub(crate) fn is_wanted(&self) -> bool {
-        history(P::TOPIC) > 0 || self.subscribers > 0
+    pub(crate) fn is_sent(&self) -> bool {
+        history_len(P::TOPIC) > 0 || self.subscribers > 0
     }
 
     /// Counts the subscribers again, because one did not get a sample: it has left, or cannot be connected.
@@ -141,9 +141,9 @@ impl<P: Payload + ?Sized, M: Medium<P>> PreparedPublisher<P, M> {
     }
 }
 
-impl<M: Medium<[u8]>> PreparedPublisher<[u8], M> {
+impl<M: SampleTransport<[u8]>> PreparedPublisher<[u8], M> {
     /// Publishes `bytes` if the topic has a subscriber.
-    pub(crate) fn send_bytes(&mut self, bytes: &[u8], header: &Header, due: &mut DueRings) {
+    pub(crate) fn send_bytes(&mut self, bytes: &[u8], header: &Header, due: &mut PendingWakeups) {
         let mut loan = self.loan(bytes.len());
         if let Some(payload) = loan.payload_mut() {
             payload.copy_from_slice(bytes);
@@ -152,12 +152,12 @@ impl<M: Medium<[u8]>> PreparedPublisher<[u8], M> {
     }
 }
 
-impl<P: Payload + ?Sized, M: Medium<P>> Loan<P, M> {
+impl<P: Payload + ?Sized, M: SampleTransport<P>> Loan<P, M> {
     /// Returns the payload, if there is memory for it.
     pub(crate) fn payload_mut(&mut self) -> Option<&mut P> {
         match self {
             Loan::Taken(loan) => Some(M::payload_mut(loan)),
-            Loan::Lacking | Loan::Unwanted => None,
+            Loan::NoMemory | Loan::NoSubscriber => None,
         }
     }
 }
@@ -191,7 +191,7 @@ mod tests {
         }
     }
 
-    impl Medium<Marks> for CountingMedium {
+    impl SampleTransport<Marks> for CountingMedium {
         type Loan = Box<Marks>;
 
         fn subscribers(&self) -> usize {
@@ -222,20 +222,20 @@ mod tests {
     #[test]
     fn uses_a_topic_only_while_it_has_a_subscriber() {
         let medium = CountingMedium::default();
-        let topic = TopicPublisher::over(medium.clone());
+        let topic = TopicPublisher::with_transport(medium.clone());
         let mut publisher =
             PreparedPublisher { topic, subscribers: 0, reached: 0, prepared: None, last_len: 0 };
         let publish = |publisher: &mut PreparedPublisher<Marks, CountingMedium>| {
-            let mut due = DueRings::default();
+            let mut due = PendingWakeups::default();
             publisher.prepare();
             let loan = publisher.loan(0);
             publisher.send(loan, &Header::default(), &mut due);
             medium.calls.take()
         };
-        publisher.look();
+        publisher.find_subscribers();
         assert_eq!((medium.calls.take(), publish(&mut publisher)), (1, 0));
         medium.subscribers.set(2);
-        publisher.look();
+        publisher.find_subscribers();
         assert_eq!((medium.calls.take(), publish(&mut publisher)), (2, 2), "one loan, one send");
         assert_eq!((publisher.reached, publisher.undelivered()), (2, 0));
         medium.subscribers.set(0);

@@ -17,17 +17,19 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use bytemuck::cast_slice_mut;
 use scanhub_config::{Config, Link, Sources};
-use scanhub_port::{Allowance, Alteration, PortError, Source};
+use scanhub_port::{PortError, PortSpec, ReadBudget, SettingsChange};
 use scanhub_recording::Recording;
-use scanhub_schema::{Failure, Family, Header, Kind, Nanos, Ring, Topic, Wake};
-use scanhub_shm::{LoanError, Medium, Payload, SendError};
+use scanhub_schema::{DoorbellWord, Failure, Family, Header, Kind, Nanos, Topic, WakeEvent};
+use scanhub_shm::{LoanError, Payload, SampleTransport, SendError};
 use self_cell::self_cell;
 
 use crate::control::CommandSender;
-use crate::link::LinkCore;
-use crate::platform::{Line, Platform, SavedState};
-use crate::player::Due;
-use crate::replay::{self, BEGIN, LATEST, Lap, Pace, Recorded, ReplayLink, Shown};
+use crate::link::LinkState;
+use crate::platform::{Platform, PortIo, SavedState};
+use crate::player::DueTime;
+use crate::replay::{
+    self, CLOCK_START, Lap, LinkDescription, MAX_STAMP, RecordedSensor, ReplayLink, ReplayTiming,
+};
 use crate::replay_hub::RecordedSet;
 
 /// Options of a [`RecordingReader`].
@@ -51,7 +53,7 @@ pub struct ReadOptions<'a> {
 /// the first one. A recording without stamps starts at 10 s.
 pub struct RecordingReader {
     links: OwnedLinks,
-    queue: Arc<Queue>,
+    queue: Arc<SampleQueue>,
     recording: Recording,
 }
 
@@ -81,7 +83,7 @@ self_cell!(
 /// Values that the links borrow.
 struct Parts {
     config: Config,
-    recorded: Vec<Recorded>,
+    recorded: Vec<RecordedSensor>,
     platforms: Vec<MemoryPlatform>,
 }
 
@@ -99,7 +101,7 @@ impl RecordingReader {
     ///
     /// Returns [`Kind::Input`] if the recording cannot be read, [`Kind::NoTopic`] if it has no such sensor or a topic is
     /// not computed from telegrams, and [`Kind::Configuration`] if it contradicts the configuration. Returns
-    /// [`Kind::Short`] if no descriptors are left.
+    /// [`Kind::ResourceExhausted`] if no descriptors are left.
     pub fn open(options: &ReadOptions<'_>) -> Result<RecordingReader, Failure> {
         for topic in options.topics {
             check(*topic)?;
@@ -108,9 +110,9 @@ impl RecordingReader {
         let RecordedSet { recording, config, parts, origin, .. } =
             RecordedSet::new(recording, options.sensor, options.sources)?;
         check_family(options.family, &recording, &config, &parts)?;
-        let queue = Arc::new(Queue::default());
-        let (boot, begin) = origin.and_then(|origin| origin.run).unwrap_or((0, BEGIN));
-        let begin = begin.min(LATEST);
+        let queue = Arc::new(SampleQueue::default());
+        let (boot, begin) = origin.and_then(|origin| origin.run).unwrap_or((0, CLOCK_START));
+        let begin = begin.min(MAX_STAMP);
         let begin_wall_ns = origin.map_or(begin, |origin| origin.wall_ns);
         let platform = |name: &str| MemoryPlatform {
             sensor: name.into(),
@@ -149,16 +151,16 @@ impl RecordingReader {
     pub fn take_shortfall(&mut self) -> Option<Failure> {
         let lacks: Vec<_> = self.links.with_dependent_mut(|parts, links| {
             let of_links = parts.config.links.iter().zip(links);
-            let lacks = |(link, read): (&Link, &mut ReadLink<'_>)| {
-                read.shortfall.take().map(|shortfall| format!("{} lacks {shortfall}", link.name))
+            let lacks = |(link, read_link): (&Link, &mut ReadLink<'_>)| {
+                read_link.shortfall.take().map(|shortfall| format!("{} lacks {shortfall}", link.name))
             };
             of_links.filter_map(lacks).collect()
         });
         if lacks.is_empty() {
             return None;
         }
-        let (place, lacks) = (self.recording.path().display(), lacks.join(", "));
-        let message = format!("recording {place} became shorter while it was read: {lacks}");
+        let (path, lacks) = (self.recording.path().display(), lacks.join(", "));
+        let message = format!("recording {path} became shorter while it was read: {lacks}");
         Some(Failure::new(Kind::Input, message, "read it again when no program writes the file"))
     }
 
@@ -209,14 +211,14 @@ fn check_family(
     named: Option<Family>,
     recording: &Recording,
     config: &Config,
-    parts: &[Recorded],
+    parts: &[RecordedSensor],
 ) -> Result<(), Failure> {
     let mut of_links = config.links.iter().zip(parts);
     let other = of_links.find(|(_, part)| named.is_some_and(|named| named != part.family()));
     let (Some(named), Some((link, part))) = (named, other) else { return Ok(()) };
-    let (place, family) = (recording.path().display(), part.family().name());
+    let (path, family) = (recording.path().display(), part.family().name());
     let message = format!(
-        "the scanner of {} in recording {place} is of family {family}, and not {}",
+        "the scanner of {} in recording {path} is of family {family}, and not {}",
         link.name,
         named.name()
     );
@@ -230,9 +232,9 @@ fn links(parts: &Parts, boot: u64) -> Result<Links<'_>, Failure> {
     for (number, ((link, queue), (recorded, platform))) in
         config.links.iter().zip(queues).zip(recorded.iter().zip(platforms)).enumerate()
     {
-        let mut core = LinkCore::new(link, number as u8, boot, platform, queue)?;
+        let mut core = LinkState::new(link, number as u8, boot, platform, queue)?;
         replay::begin(&mut core);
-        let mut replay = ReplayLink::new(core, recorded, AtOnce);
+        let mut replay = ReplayLink::new(core, recorded, ImmediateTiming);
         replay.set_begin(recorded);
         let lap = Lap::new(&replay, recorded)?;
         links.push(ReadLink { replay, phase: Phase::Playing(lap), shortfall: None });
@@ -242,7 +244,7 @@ fn links(parts: &Parts, boot: u64) -> Result<Links<'_>, Failure> {
 
 /// Link of one sensor.
 struct ReadLink<'a> {
-    replay: ReplayLink<'a, MemoryPlatform, AtOnce>,
+    replay: ReplayLink<'a, MemoryPlatform, ImmediateTiming>,
     phase: Phase<'a>,
     /// Data that the file contained when it was opened, and lacked at the end of the reading.
     shortfall: Option<String>,
@@ -290,39 +292,39 @@ impl ReadLink<'_> {
 }
 
 /// Pace at which every telegram is due at once, at its recorded time.
-struct AtOnce;
+struct ImmediateTiming;
 
-impl Pace<MemoryPlatform> for AtOnce {
-    fn part(&self) -> (Nanos, Option<Nanos>) {
+impl ReplayTiming<MemoryPlatform> for ImmediateTiming {
+    fn range(&self) -> (Nanos, Option<Nanos>) {
         (0, None)
     }
 
-    fn wait_turn(
+    fn wait_until_due(
         &mut self,
-        link: &mut LinkCore<'_, MemoryPlatform>,
+        link: &mut LinkState<'_, MemoryPlatform>,
         media: Nanos,
-        _: Shown<'_>,
-    ) -> Option<Due> {
-        Some(Due::at_once(link.platform.advance(media)))
+        _: LinkDescription<'_>,
+    ) -> Option<DueTime> {
+        Some(DueTime::at_once(link.platform.advance(media)))
     }
 
-    fn pass(&mut self, _: &mut LinkCore<'_, MemoryPlatform>, _: &str) -> bool {
+    fn continue_skipping(&mut self, _: &mut LinkState<'_, MemoryPlatform>, _: &str) -> bool {
         true
     }
 
-    fn played(&mut self, _: Nanos) {}
+    fn note_played(&mut self, _: Nanos) {}
 }
 
 /// Samples that were published and not taken.
 #[derive(Default)]
-struct Queue(Mutex<VecDeque<ReadSample>>);
+struct SampleQueue(Mutex<VecDeque<ReadSample>>);
 
 /// Platform of a link whose topics are in the memory of this process, and whose clock is that of the recording.
 struct MemoryPlatform {
     sensor: Arc<str>,
     /// Topics that have a subscriber.
     topics: Vec<Topic>,
-    queue: Arc<Queue>,
+    queue: Arc<SampleQueue>,
     /// Both clocks at media time 0.
     begin: Nanos,
     begin_wall_ns: u64,
@@ -332,15 +334,15 @@ struct MemoryPlatform {
 impl MemoryPlatform {
     /// Sets the clock to media time `media`, unless it is later already. Returns its time.
     fn advance(&self, media: Nanos) -> Nanos {
-        let now = self.begin.saturating_add(media).min(LATEST).max(self.now());
+        let now = self.begin.saturating_add(media).min(MAX_STAMP).max(self.now());
         self.now.store(now, Ordering::Relaxed);
         now
     }
 }
 
 impl Platform for MemoryPlatform {
-    type Line = Infallible;
-    type Medium<P: Payload + ?Sized> = MemoryTopic<P>;
+    type Port = Infallible;
+    type Transport<P: Payload + ?Sized> = MemoryTopic<P>;
 
     fn now(&self) -> Nanos {
         self.now.load(Ordering::Relaxed)
@@ -356,32 +358,32 @@ impl Platform for MemoryPlatform {
         Ok(())
     }
 
-    fn open(&self, _: &Source, _: u32) -> Option<Result<Infallible, PortError>> {
+    fn open(&self, _: &PortSpec, _: u32) -> Option<Result<Infallible, PortError>> {
         None
     }
 
-    fn explain(&self, error: &PortError, source: &Source) -> Failure {
+    fn explain(&self, error: &PortError, source: &PortSpec) -> Failure {
         error.explain(source)
     }
 
-    fn altering_program(&self, _: &Source) -> Option<String> {
+    fn altering_program(&self, _: &PortSpec) -> Option<String> {
         None
     }
 
-    fn take_kept(&self, _: &str, _: &Source, _: u32) -> Option<Infallible> {
+    fn take_kept_port(&self, _: &str, _: &PortSpec, _: u32) -> Option<Infallible> {
         None
     }
 
-    fn keep(&self, _: &str, _: &Infallible) {}
+    fn keep_open(&self, _: &str, _: &Infallible) {}
 
     fn release(&self, _: &str) {}
 
-    fn medium<P: Payload + ?Sized>(&self, _: &str) -> Result<MemoryTopic<P>, Failure> {
+    fn transport<P: Payload + ?Sized>(&self, _: &str) -> Result<MemoryTopic<P>, Failure> {
         let queue = self.topics.contains(&P::TOPIC).then(|| self.queue.clone());
         Ok(MemoryTopic { sensor: self.sensor.clone(), queue, payload: PhantomData })
     }
 
-    fn attached(&self) -> Option<u32> {
+    fn attach_count(&self) -> Option<u32> {
         // The subscribers are the same from the start.
         Some(0)
     }
@@ -390,9 +392,9 @@ impl Platform for MemoryPlatform {
         false
     }
 
-    fn ring(&self, _: Ring) {}
+    fn ring(&self, _: DoorbellWord) {}
 
-    fn notify_event(&self, _: Wake) {}
+    fn notify_event(&self, _: WakeEvent) {}
 
     fn load_record(&self, _: &str, _: &mut [u8]) -> Option<usize> {
         None
@@ -409,11 +411,11 @@ impl Platform for MemoryPlatform {
 struct MemoryTopic<P: ?Sized> {
     sensor: Arc<str>,
     /// Queue of the only subscriber; `None` without a subscriber.
-    queue: Option<Arc<Queue>>,
+    queue: Option<Arc<SampleQueue>>,
     payload: PhantomData<fn(&P)>,
 }
 
-impl<P: Payload + ?Sized> Medium<P> for MemoryTopic<P> {
+impl<P: Payload + ?Sized> SampleTransport<P> for MemoryTopic<P> {
     type Loan = P::Owned;
 
     fn subscribers(&self) -> usize {
@@ -447,7 +449,7 @@ impl<P: Payload + ?Sized> Medium<P> for MemoryTopic<P> {
 }
 
 /// A recording has no line.
-impl Line for Infallible {
+impl PortIo for Infallible {
     fn read(&self, _: &mut [u8]) -> io::Result<usize> {
         match *self {}
     }
@@ -460,7 +462,7 @@ impl Line for Infallible {
         match *self {}
     }
 
-    fn altered(&self) -> io::Result<Option<Alteration>> {
+    fn alteration(&self) -> io::Result<Option<SettingsChange>> {
         match *self {}
     }
 
@@ -472,11 +474,11 @@ impl Line for Infallible {
         match *self {}
     }
 
-    fn waiting(&self) -> Option<usize> {
+    fn buffered_len(&self) -> Option<usize> {
         match *self {}
     }
 
-    fn allowance(&self, _: u32) -> Option<Allowance> {
+    fn read_budget(&self, _: u32) -> Option<ReadBudget> {
         match *self {}
     }
 
@@ -524,7 +526,7 @@ mod tests {
     /// Writes a recording of sensors, each with the times of its scans. The first telegram of a sensor has its mode.
     fn write_mcap(file: &Path, sensors: &[(&str, Vec<Times>)]) {
         let mut writer = Writer::begin(File::create(file).unwrap(), "", BTreeMap::new()).unwrap();
-        let mode = lms::reply::configuration(0, Mode(1), Unit::Mm, 0x10);
+        let mode = lms::reply::configuration_reply(0, Mode(1), Unit::Mm, 0x10);
         let scan = lms::measured::encode(0, Unit::Mm, &[1000; 181], 0x10);
         for (number, (name, scans)) in sensors.iter().enumerate() {
             for (seq, (first_ms, last_ms)) in scans.iter().enumerate() {
@@ -541,7 +543,7 @@ mod tests {
                 };
                 header.set_sent_at(last_ms.saturating_mul(MILLIS).saturating_add(100_000));
                 let telegram = if seq == 0 { &mode } else { &scan };
-                writer.sample(name, Topic::Telegram, &header, telegram.bytes()).unwrap();
+                writer.write_sample(name, Topic::Telegram, &header, telegram.bytes()).unwrap();
                 if seq % 100 == 99 {
                     writer.close_chunk().unwrap();
                 }
@@ -634,7 +636,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_left_out_is_a_problem() {
+    fn reports_unencodable_ranges_as_a_problem() {
         let folder = TempDir::new().unwrap();
         let file = folder.path().join("a.log");
         std::fs::write(&file, format!("FLASER 180{} 0 0 0 0 0 0 1 host 1\n", " 900.0".repeat(180))).unwrap();

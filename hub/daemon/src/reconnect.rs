@@ -5,21 +5,21 @@
 use std::io;
 
 use scanhub_drivers::PortSession;
-use scanhub_drivers::line::{Control, Identity, Protocol as _, Session as _};
-use scanhub_port::{PortError, Source};
+use scanhub_drivers::line::{Control, Identity, Protocol as _, ScannerSession as _};
+use scanhub_port::{PortError, PortSpec};
 use scanhub_schema::{Failure, Flags, Kind, MILLIS, Nanos, State};
 
 use crate::control::{ControlQueue, PauseTarget};
-use crate::link::LinkCore;
-use crate::platform::{Line, Platform, Wait, WaitSource, WakeReason};
+use crate::link::LinkState;
+use crate::platform::{Platform, PortIo, Wait, WaitSource, WakeReason};
 use crate::session_driver::{OpenLine, SessionDriver};
 
 /// A link to a port that may disappear and come back. It is a state machine: [`on_wakeup`](Self::on_wakeup) takes the
 /// reason why a wait ended and returns what to wait for next.
 pub struct LiveLink<'a, S: Platform> {
-    core: LinkCore<'a, S>,
+    core: LinkState<'a, S>,
     driver: SessionDriver<'a, S>,
-    phase: Phase<S::Line>,
+    phase: Phase<S::Port>,
     /// Consecutive connections that closed without delivering a byte.
     empty_connections: u32,
     has_begun: bool,
@@ -60,8 +60,8 @@ impl<'a, S: Platform> LiveLink<'a, S> {
     /// # Errors
     ///
     /// Returns an error of kind [`PortNotTty`](scanhub_schema::Kind::PortNotTty) if the port is not a serial line at all, an
-    /// error of kind [`Short`](scanhub_schema::Kind::Short) if descriptors or memory run out, and those of
-    /// [`Platform::medium`]. The link waits for a port that is missing, in use or forbidden, or that cannot have the
+    /// error of kind [`Short`](scanhub_schema::Kind::ResourceExhausted) if descriptors or memory run out, and those of
+    /// [`Platform::transport`]. The link waits for a port that is missing, in use or forbidden, or that cannot have the
     /// rate, and for a name that another process has.
     pub fn new(
         link: &'a scanhub_config::Link,
@@ -71,19 +71,19 @@ impl<'a, S: Platform> LiveLink<'a, S> {
         control: ControlQueue,
     ) -> Result<Self, Failure> {
         // Before the topics: a subscriber that finds a topic sleeps at the doorbell.
-        let taken = match platform.take_name() {
+        let name_failure = match platform.take_name() {
             Ok(()) => None,
             Err(failure) if failure.kind == Kind::NameHeld => Some(failure),
             Err(failure) => return Err(failure),
         };
-        let mut core = LinkCore::new(link, number, boot, platform, control)?;
+        let mut core = LinkState::new(link, number, boot, platform, control)?;
         core.begin();
         let driver = SessionDriver::new(&core);
         let saved_identity = driver.saved_identity(platform.now());
         let phase = Phase::unavailable(PortUnavailable::default(), 0);
-        let lacks_name = taken.is_some();
+        let lacks_name = name_failure.is_some();
         let mut live = LiveLink { core, driver, phase, empty_connections: 0, has_begun: false, lacks_name };
-        if let Some(failure) = taken {
+        if let Some(failure) = name_failure {
             live.schedule_retry(PortUnavailable::without_name(failure));
             return Ok(live);
         }
@@ -105,7 +105,7 @@ impl<'a, S: Platform> LiveLink<'a, S> {
                 let hint = format!("{}, or file:PATH for a recording", failure.hint);
                 Err(Failure { hint, ..failure })
             }
-            Err(error @ PortError::Short(_)) => Err(platform.explain(&error, &link.port)),
+            Err(error @ PortError::ResourceExhausted(_)) => Err(platform.explain(&error, &link.port)),
             Err(error) => {
                 let mut reason = PortUnavailable::default();
                 reason.update(&error, platform.now(), |error| one_line(platform.explain(error, &link.port)));
@@ -136,31 +136,31 @@ impl<'a, S: Platform> LiveLink<'a, S> {
     }
 
     /// Handles the end of a wait, for the reason `woken`. Returns what to wait for next.
-    pub fn on_wakeup(&mut self, woken: WakeReason) -> Wait<'_, S::Line> {
+    pub fn on_wakeup(&mut self, wake_reason: WakeReason) -> Wait<'_, S::Port> {
         let (_, until) = self.phase.wait();
         if !std::mem::replace(&mut self.has_begun, true) {
             self.begin();
-        } else if self.core.is_over(woken, until) {
+        } else if self.core.is_over(wake_reason, until) {
             match &mut self.phase {
                 Phase::Open(open) => {
-                    if let Err(error) = self.driver.on_wakeup(&mut self.core, open, woken) {
+                    if let Err(error) = self.driver.on_wakeup(&mut self.core, open, wake_reason) {
                         self.on_line_lost(&error);
                     }
                 }
                 Phase::Unavailable { retry_at, .. } => {
                     let retry_at = *retry_at;
-                    self.keep_waiting(woken);
+                    self.keep_waiting(wake_reason);
                     if self.core.platform.now() >= retry_at {
                         self.try_open();
                     }
                 }
-                Phase::Opening { .. } if woken == WakeReason::Ready => self.try_open(),
-                Phase::Opening { .. } => self.keep_waiting(woken),
+                Phase::Opening { .. } if wake_reason == WakeReason::Ready => self.try_open(),
+                Phase::Opening { .. } => self.keep_waiting(wake_reason),
             }
         }
         let (on, until) = self.phase.wait();
         let until = self.core.next_deadline(until, matches!(on, WaitSource::Loss(_)));
-        Wait { requests: &self.core.control, on, until }
+        Wait { requests: &self.core.control, source: on, until }
     }
 
     /// Ends the session and saves the state of the link, because the hub ends.
@@ -174,9 +174,9 @@ impl<'a, S: Platform> LiveLink<'a, S> {
     }
 
     /// Opens the port at the start of the hub. Returns `None` if that needs a connection.
-    fn open_first(&mut self) -> Result<Option<OpenedPort<S::Line>>, PortError> {
+    fn open_first(&mut self) -> Result<Option<OpenedPort<S::Port>>, PortError> {
         let (source, baud) = (&self.core.link.port, self.driver.opening_rate(&self.core));
-        if let Source::Tcp { .. } = source {
+        if let PortSpec::Tcp { .. } = source {
             return Ok(None);
         }
         match self.take_kept(baud) {
@@ -186,18 +186,18 @@ impl<'a, S: Platform> LiveLink<'a, S> {
     }
 
     /// Returns the port that the service manager kept open while the previous hub was killed.
-    fn take_kept(&self, baud: u32) -> Option<OpenedPort<S::Line>> {
-        let LinkCore { link, platform, .. } = self.core;
+    fn take_kept(&self, baud: u32) -> Option<OpenedPort<S::Port>> {
+        let LinkState { link, platform, .. } = self.core;
         let (name, source) = (&link.name, &link.port);
-        let line = platform.take_kept(name, source, baud)?;
+        let line = platform.take_kept_port(name, source, baud)?;
         tracing::info!("{name}: continues with {}, which the service manager kept open", source.name());
         Some(OpenedPort { line, has_rate: true, is_kept: true })
     }
 
     /// Opens the port at `baud`. A search skips a rate that the port rejects, so the port is then opened at another
     /// rate. Returns `None` while a connection is being made.
-    fn open(&mut self, baud: u32) -> Option<Result<OpenedPort<S::Line>, PortError>> {
-        let LinkCore { link, platform, .. } = self.core;
+    fn open(&mut self, baud: u32) -> Option<Result<OpenedPort<S::Port>, PortError>> {
+        let LinkState { link, platform, .. } = self.core;
         let (opened, has_rate) = match platform.open(&link.port, baud) {
             Some(Err(error @ PortError::Rate { .. })) if link.family().is_none() => {
                 self.driver.log_rejected_rate(&self.core, baud, &error);
@@ -237,13 +237,13 @@ impl<'a, S: Platform> LiveLink<'a, S> {
     /// at once.
     fn start_session(
         &mut self,
-        OpenedPort { line, has_rate, .. }: OpenedPort<S::Line>,
+        OpenedPort { line, has_rate, .. }: OpenedPort<S::Port>,
         identity: Option<Identity>,
     ) {
         let core = &mut self.core;
         let now = core.platform.now();
-        core.platform.keep(&core.link.name, &line);
-        core.diagnosis.open(line.device());
+        core.platform.keep_open(&core.link.name, &line);
+        core.diagnosis.on_port_opened(line.device());
         core.output.topics.set_flags(if line.is_simulated() { Flags::SIMULATED } else { 0 });
         let (family, memory) = (core.link.family(), self.driver.memory(core));
         let mut session = PortSession::begin(family, &core.link.settings(), memory, now);
@@ -289,7 +289,7 @@ impl<'a, S: Platform> LiveLink<'a, S> {
             return;
         };
         self.core.close(&open.session);
-        let has_received = open.session.account().read > 0;
+        let has_received = open.session.stats().read > 0;
         // Close the port now, because it cannot be opened again while it is open.
         drop(open);
         self.core.platform.release(&self.core.link.name);
@@ -304,20 +304,20 @@ impl<'a, S: Platform> LiveLink<'a, S> {
     /// Publishes that the port is unavailable, and schedules the next attempt to open it.
     fn schedule_retry(&mut self, reason: PortUnavailable) {
         self.core.diagnosis.end_session();
-        self.core.show(None, State::Absent, &reason.message);
+        self.core.publish_status(None, State::Absent, &reason.message);
         let retry_at = self.core.platform.now() + reason.retry_interval();
         let until = retry_at.min(self.core.next_status());
         self.phase = Phase::Unavailable { reason, retry_at, until };
     }
 
     /// Handles the end of a wait without a port, and sets the next deadline.
-    fn keep_waiting(&mut self, woken: WakeReason) {
+    fn keep_waiting(&mut self, wake_reason: WakeReason) {
         let core = &mut self.core;
         let (Phase::Unavailable { reason, .. } | Phase::Opening { reason, .. }) = &self.phase else { return };
-        if woken == WakeReason::Request {
+        if wake_reason == WakeReason::Request {
             core.handle_requests(PauseTarget::NoPort);
         } else {
-            core.show(None, State::Absent, &reason.message);
+            core.publish_status(None, State::Absent, &reason.message);
         }
         match &mut self.phase {
             Phase::Open(_) => {}
@@ -327,7 +327,7 @@ impl<'a, S: Platform> LiveLink<'a, S> {
     }
 }
 
-impl<L: Line> Phase<L> {
+impl<L: PortIo> Phase<L> {
     fn unavailable(reason: PortUnavailable, retry_at: Nanos) -> Phase<L> {
         Phase::Unavailable { reason, retry_at, until: retry_at }
     }
@@ -415,7 +415,7 @@ mod tests {
 
     #[test]
     fn message_is_made_once_per_change_of_the_error() {
-        let source = Source::Tty("/dev/no-such-port".into());
+        let source = PortSpec::Tty("/dev/no-such-port".into());
         let explain = |error: &PortError| one_line(error.explain(&source));
         let mut reason = PortUnavailable::missing("it went".to_owned());
         reason.update(&PortError::Missing, 1, explain);

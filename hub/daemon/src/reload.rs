@@ -14,7 +14,7 @@ pub type ConfigLoader<'a> = &'a dyn Fn() -> Result<Config, Failure>;
 /// Running configuration of the hub, and the loader of the new one.
 pub struct Reload<'a> {
     running: Config,
-    read: ConfigLoader<'a>,
+    loader: ConfigLoader<'a>,
     service: &'a Service,
 }
 
@@ -29,16 +29,16 @@ struct Differences {
 
 impl<'a> Reload<'a> {
     /// Creates the reload of a hub that runs with `running`.
-    pub fn new(running: &Config, read: ConfigLoader<'a>, service: &'a Service) -> Reload<'a> {
-        Reload { running: running.clone(), read, service }
+    pub fn new(running: &Config, loader: ConfigLoader<'a>, service: &'a Service) -> Reload<'a> {
+        Reload { running: running.clone(), loader, service }
     }
 
     /// Reads the configuration at `now`, sends the links their new settings by `commands`, and logs the result.
     pub fn reload(&mut self, commands: &CommandSender, now: Nanos) {
-        self.service.reloading(now);
-        let refused = match (self.read)() {
-            Ok(read) => {
-                self.take(read, commands);
+        self.service.notify_reloading(now);
+        let refused = match (self.loader)() {
+            Ok(config) => {
+                self.apply(config, commands);
                 None
             }
             Err(failure) => {
@@ -51,11 +51,11 @@ impl<'a> Reload<'a> {
             }
         };
         let sensors: Vec<_> = self.running.links.iter().map(|link| link.name.clone()).collect();
-        self.service.ready(&sensors, refused.as_deref());
+        self.service.notify_ready(&sensors, refused.as_deref());
     }
 
-    fn take(&mut self, read: Config, commands: &CommandSender) {
-        let Differences { now, later } = Differences::between(&self.running, &read);
+    fn apply(&mut self, config: Config, commands: &CommandSender) {
+        let Differences { now, later } = Differences::between(&self.running, &config);
         if now.is_empty() && later.is_empty() {
             tracing::info!("the configuration has not changed");
         }
@@ -87,17 +87,17 @@ fn postponed(changes: &[&str]) -> String {
 }
 
 impl Differences {
-    fn between(running: &Config, read: &Config) -> Differences {
+    fn between(running: &Config, loaded: &Config) -> Differences {
         let mut differences = Differences::default();
         let named = |config: &'_ Config, name: &str| config.links.iter().position(|link| link.name == name);
         for old in &running.links {
-            match named(read, &old.name) {
-                Some(at) => differences.of_link(old, &read.links[at]),
+            match named(loaded, &old.name) {
+                Some(at) => differences.of_link(old, &loaded.links[at]),
                 None => differences.later.push((old.name.clone(), vec!["link removed"])),
             }
         }
-        let added = read.links.iter().filter(|link| named(running, &link.name).is_none());
-        if running.limits != read.limits {
+        let added = loaded.links.iter().filter(|link| named(running, &link.name).is_none());
+        if running.limits != loaded.limits {
             differences.later.push(("limits".to_owned(), vec!["subscribers"]));
         }
         differences.later.extend(added.map(|link| (link.name.clone(), vec!["link added"])));
@@ -105,19 +105,19 @@ impl Differences {
     }
 
     fn of_link(&mut self, old: &Link, new: &Link) {
-        let taken = merged(&old.processing, &new.processing);
-        let sections = old.processing.differences(&taken);
+        let settings = merged(&old.processing, &new.processing);
+        let sections = old.processing.differences(&settings);
         let start = |link: &Link| {
             let background = &link.processing.background;
             (background.learning.start, background.file.clone())
         };
-        let has_started = old.processing.background.is_kept && new.processing.background.is_kept;
+        let has_started = old.processing.background.is_enabled && new.processing.background.is_enabled;
         let mut waiting = old.differences(new);
         if has_started && start(old) != start(new) {
             waiting.push("background.start");
         }
         if !sections.is_empty() {
-            self.now.push((old.name.clone(), taken, sections));
+            self.now.push((old.name.clone(), settings, sections));
         }
         if !waiting.is_empty() {
             self.later.push((old.name.clone(), waiting));
@@ -128,14 +128,14 @@ impl Differences {
 /// Returns the settings that a link with `old` settings takes over from `new` ones: all but the start of its
 /// background.
 fn merged(old: &Processing, new: &Processing) -> Processing {
-    let mut taken = new.clone();
-    if old.background.is_kept {
-        let Background { learning, file, model, start_is_said, .. } = &old.background;
-        taken.background.learning.start = learning.start;
-        taken.background.start_is_said = *start_is_said;
-        (taken.background.file, taken.background.model) = (file.clone(), model.clone());
+    let mut settings = new.clone();
+    if old.background.is_enabled {
+        let Background { learning, file, model, is_start_set: start_is_said, .. } = &old.background;
+        settings.background.learning.start = learning.start;
+        settings.background.is_start_set = *start_is_said;
+        (settings.background.file, settings.background.model) = (file.clone(), model.clone());
     }
-    taken
+    settings
 }
 
 #[cfg(test)]

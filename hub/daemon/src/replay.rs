@@ -2,7 +2,7 @@
 //! they can be read. The hub sends no requests, because nothing could reply to them.
 //!
 //! `recorded.rs` opens recordings and computes the media time of their telegrams. Recordings with stamps are played by
-//! `frames.rs`, and a stream of bytes by `bytes.rs`. A [`Pace`] defines when a telegram is due: [`PlayerPace`] waits for
+//! `frames.rs`, and a stream of bytes by `bytes.rs`. A [`ReplayTiming`] defines when a telegram is due: [`PlayerTiming`] waits for
 //! the player of a hub, and `reader.rs` has one that never waits.
 //!
 //! [`RecordedMount`] plays the angles of a mount. Another program publishes them, because a hub has no topic for them.
@@ -23,27 +23,27 @@ use scanhub_recording::{Frame, MountRecord, Recording};
 use scanhub_schema::{Failure, Flags, Header, MILLIS, Nanos, State, Tilt};
 
 use crate::control::PauseTarget;
-use crate::link::LinkCore;
+use crate::link::LinkState;
 use crate::platform::{Platform, WakeReason};
-use crate::player::{Due, PlaybackAction, PlaybackOptions, PlaybackRate, Player, PlayerHandle};
+use crate::player::{DueTime, PlaybackAction, PlaybackOptions, PlaybackRate, Player, PlayerHandle};
 use crate::system::System;
 
 use bytes::BytesLap;
-pub(crate) use frames::BEGIN;
+pub(crate) use frames::CLOCK_START;
 use frames::FramesLap;
 use recorded::Timeline;
-pub(crate) use recorded::{Origin, Recorded, log_damage};
+pub(crate) use recorded::{Origin, RecordedSensor, log_damage};
 
 /// Part of a recording that a link plays together with other links.
 pub(crate) struct ReplayPart<'a> {
-    pub(crate) recorded: Recorded,
+    pub(crate) recorded: RecordedSensor,
     pub(crate) handle: PlayerHandle<'a>,
 }
 
 /// Plays `part`, or the recording at `path` alone, into the topics of `link`, and then stays silent until the hub ends.
 /// `report` is called once, with the result of opening the recording.
 pub(crate) fn run<'a>(
-    mut link: LinkCore<'a, System<'a>>,
+    mut link: LinkState<'a, System<'a>>,
     part: Option<ReplayPart<'_>>,
     path: &Path,
     paced: bool,
@@ -52,13 +52,13 @@ pub(crate) fn run<'a>(
     begin(&mut link);
     if let Some(ReplayPart { recorded, handle }) = part {
         report(Ok(()));
-        let mut replay = ReplayLink::new(link, &recorded, PlayerPace::new(handle));
+        let mut replay = ReplayLink::new(link, &recorded, PlayerTiming::new(handle));
         replay.play(&recorded);
         return replay.link.end();
     }
     let rate = if paced { PlaybackRate::default() } else { PlaybackRate::Max };
     let alone = || {
-        let recorded = Recorded::open(path, link.link)?;
+        let recorded = RecordedSensor::open(path, link.link)?;
         let player =
             Player::new(PlaybackOptions { rate, ..PlaybackOptions::default() }, 1, recorded.length())?;
         Ok((recorded, player))
@@ -66,8 +66,8 @@ pub(crate) fn run<'a>(
     match alone() {
         Ok((recorded, player)) => {
             report(Ok(()));
-            let pace = PlayerPace::new(PlayerHandle { player: &player, number: 0 });
-            let mut replay = ReplayLink::new(link, &recorded, pace);
+            let timing = PlayerTiming::new(PlayerHandle { player: &player, number: 0 });
+            let mut replay = ReplayLink::new(link, &recorded, timing);
             if replay.await_subscriber() != WakeReason::Stop {
                 player.begin();
                 replay.play(&recorded);
@@ -82,55 +82,60 @@ pub(crate) fn run<'a>(
 }
 
 /// Publishes the state of `link` before the first telegram of a recording.
-pub(crate) fn begin<S: Platform>(link: &mut LinkCore<'_, S>) {
+pub(crate) fn begin<S: Platform>(link: &mut LinkState<'_, S>) {
     link.output.topics.set_flags(Flags::REPLAYED);
     link.begin();
 }
 
 /// Times at which the telegrams of a recording are due.
-pub(crate) trait Pace<S: Platform> {
+pub(crate) trait ReplayTiming<S: Platform> {
     /// Returns the start of the played part, and its end if it is not that of the recording, as media times.
-    fn part(&self) -> (Nanos, Option<Nanos>);
+    fn range(&self) -> (Nanos, Option<Nanos>);
 
     /// Waits until a telegram of time `media` is due. Meanwhile, `link` publishes the status that `shown` describes.
     /// Returns `None` if the hub must end.
-    fn wait_turn(&mut self, link: &mut LinkCore<'_, S>, media: Nanos, shown: Shown<'_>) -> Option<Due>;
+    fn wait_until_due(
+        &mut self,
+        link: &mut LinkState<'_, S>,
+        media: Nanos,
+        description: LinkDescription<'_>,
+    ) -> Option<DueTime>;
 
     /// Handles requests while telegrams are skipped. Returns whether to continue.
-    fn pass(&mut self, link: &mut LinkCore<'_, S>, problem: &str) -> bool;
+    fn continue_skipping(&mut self, link: &mut LinkState<'_, S>, problem: &str) -> bool;
 
     /// Notes that a telegram of time `media` was published.
-    fn played(&mut self, media: Nanos);
+    fn note_played(&mut self, media: Nanos);
 }
 
 /// Description of a link for its status.
 #[derive(Clone, Copy)]
-pub(crate) struct Shown<'a> {
+pub(crate) struct LinkDescription<'a> {
     session: Option<&'a PortSession>,
     state: State,
     /// Message about a problem; otherwise empty.
     problem: &'a str,
 }
 
-/// A link that plays a recording at a [`Pace`].
+/// A link that plays a recording at a [`ReplayTiming`].
 pub(crate) struct ReplayLink<'a, S: Platform, P> {
-    pub(crate) link: LinkCore<'a, S>,
-    pub(crate) pace: P,
+    pub(crate) link: LinkState<'a, S>,
+    pub(crate) timing: P,
     /// Message about a problem of the recording; otherwise empty.
     problem: String,
 }
 
-impl<'a, S: Platform, P: Pace<S>> ReplayLink<'a, S, P> {
-    pub(crate) fn new(mut link: LinkCore<'a, S>, recorded: &Recorded, pace: P) -> Self {
+impl<'a, S: Platform, P: ReplayTiming<S>> ReplayLink<'a, S, P> {
+    pub(crate) fn new(mut link: LinkState<'a, S>, recorded: &RecordedSensor, timing: P) -> Self {
         link.output.topics.set_family(Some(recorded.family()));
         link.stats.set_family(recorded.family());
         link.stats.status_mut().set_sensor_type(recorded.sensor_type().unwrap_or_default());
         let problem = recorded.problem(&link.link.name);
-        ReplayLink { link, pace, problem }
+        ReplayLink { link, timing, problem }
     }
 
     /// Sets the wall clock to that of the start of `recorded`.
-    pub(crate) fn set_begin(&mut self, recorded: &Recorded) {
+    pub(crate) fn set_begin(&mut self, recorded: &RecordedSensor) {
         if let Some(wall_ns) = recorded.begin_ns() {
             self.link.output.topics.set_recorded_time(wall_ns, Flags::REPLAYED);
         }
@@ -143,14 +148,19 @@ impl<'a, S: Platform, P: Pace<S>> ReplayLink<'a, S, P> {
 
     /// Waits until a telegram of time `media` is due. Meanwhile, the link publishes `state`. Returns `None` if the
     /// hub must end.
-    fn wait_turn(&mut self, session: Option<&PortSession>, media: Nanos, state: State) -> Option<Due> {
-        let shown = Shown { session, state, problem: &self.problem };
-        self.pace.wait_turn(&mut self.link, media, shown)
+    fn wait_until_due(
+        &mut self,
+        session: Option<&PortSession>,
+        media: Nanos,
+        state: State,
+    ) -> Option<DueTime> {
+        let description = LinkDescription { session, state, problem: &self.problem };
+        self.timing.wait_until_due(&mut self.link, media, description)
     }
 
     /// Handles requests while telegrams are skipped. Returns whether to continue.
-    fn pass(&mut self) -> bool {
-        self.pace.pass(&mut self.link, &self.problem)
+    fn continue_skipping(&mut self) -> bool {
+        self.timing.continue_skipping(&mut self.link, &self.problem)
     }
 }
 
@@ -167,12 +177,12 @@ impl<'f> Lap<'f> {
     ///
     /// Returns [`Kind::Input`](scanhub_schema::Kind) if the file cannot be opened.
     pub(crate) fn new<S: Platform>(
-        replay: &ReplayLink<'_, S, impl Pace<S>>,
-        recorded: &'f Recorded,
+        replay: &ReplayLink<'_, S, impl ReplayTiming<S>>,
+        recorded: &'f RecordedSensor,
     ) -> Result<Lap<'f>, Failure> {
         Ok(match recorded {
-            Recorded::Stream(stream) => Lap::Bytes(Box::new(BytesLap::new(replay, stream)?)),
-            Recorded::Frames(frames) => Lap::Frames(Box::new(FramesLap::new(replay, frames)?)),
+            RecordedSensor::Stream(stream) => Lap::Bytes(Box::new(BytesLap::new(replay, stream)?)),
+            RecordedSensor::Frames(frames) => Lap::Frames(Box::new(FramesLap::new(replay, frames)?)),
         })
     }
 
@@ -186,7 +196,10 @@ impl<'f> Lap<'f> {
 
     /// Plays the next telegram, or the next few bytes of a stream. If the last verdict becomes stale before the next
     /// telegram ends, only publishes that. Returns `None` if the hub must end.
-    pub(crate) fn step<S: Platform>(&mut self, replay: &mut ReplayLink<'_, S, impl Pace<S>>) -> Option<()> {
+    pub(crate) fn step<S: Platform>(
+        &mut self,
+        replay: &mut ReplayLink<'_, S, impl ReplayTiming<S>>,
+    ) -> Option<()> {
         match self {
             Lap::Bytes(lap) => lap.step(replay),
             Lap::Frames(lap) => lap.step(replay),
@@ -204,7 +217,7 @@ impl<'f> Lap<'f> {
     }
 
     /// Ends the pass. The last verdict stays valid for a while.
-    pub(crate) fn end<S: Platform>(&self, replay: &mut ReplayLink<'_, S, impl Pace<S>>) {
+    pub(crate) fn end<S: Platform>(&self, replay: &mut ReplayLink<'_, S, impl ReplayTiming<S>>) {
         let lifetime = match self {
             Lap::Bytes(lap) => lap.end(replay),
             Lap::Frames(lap) => lap.end(replay),
@@ -214,12 +227,12 @@ impl<'f> Lap<'f> {
 }
 
 /// Keeps the last verdict valid for `lifetime` from now on. `None` means that there was none.
-fn expire_after<S: Platform>(replay: &mut ReplayLink<'_, S, impl Pace<S>>, lifetime: Option<Nanos>) {
+fn expire_after<S: Platform>(replay: &mut ReplayLink<'_, S, impl ReplayTiming<S>>, lifetime: Option<Nanos>) {
     let now = replay.link.platform.now();
     replay.link.output.extend_verdict(lifetime.map_or(Nanos::MAX, |lifetime| now.saturating_add(lifetime)));
 }
 
-impl<'a> ReplayLink<'a, System<'a>, PlayerPace<'_>> {
+impl<'a> ReplayLink<'a, System<'a>, PlayerTiming<'_>> {
     /// Waits for a short time until a subscriber is attached: a user who starts a hub and a subscriber together wants
     /// the recording from its beginning.
     fn await_subscriber(&mut self) -> WakeReason {
@@ -230,9 +243,9 @@ impl<'a> ReplayLink<'a, System<'a>, PlayerPace<'_>> {
                 // A program subscribes to several topics, and others may start with it.
                 until = until.min(clock::now() + OTHER_TOPICS_TIME);
             }
-            self.link.show(None, State::Starting, "");
+            self.link.publish_status(None, State::Starting, "");
             let next = (clock::now() + POLL_INTERVAL).min(until);
-            if self.pace.rest(&mut self.link, next) == WakeReason::Stop {
+            if self.timing.wait(&mut self.link, next) == WakeReason::Stop {
                 return WakeReason::Stop;
             }
         }
@@ -240,11 +253,11 @@ impl<'a> ReplayLink<'a, System<'a>, PlayerPace<'_>> {
     }
 
     /// Plays `recorded`, lap by lap, until the hub ends.
-    fn play(&mut self, recorded: &Recorded) {
+    fn play(&mut self, recorded: &RecordedSensor) {
         let mut number = 0;
         self.set_begin(recorded);
         loop {
-            self.pace.check_at = 0;
+            self.timing.check_at = 0;
             match Lap::new(self, recorded) {
                 Ok(mut lap) => {
                     while lap.next_media().is_some() {
@@ -260,34 +273,34 @@ impl<'a> ReplayLink<'a, System<'a>, PlayerPace<'_>> {
                 }
             }
             loop {
-                if let PlaybackAction::Restart(next) = self.pace.handle.end(number, clock::now()) {
+                if let PlaybackAction::Restart(next) = self.timing.handle.end(number, clock::now()) {
                     number = next;
                     self.restart();
                     break;
                 }
-                if self.pace.rest(&mut self.link, clock::now() + IDLE_INTERVAL) == WakeReason::Stop {
+                if self.timing.wait(&mut self.link, clock::now() + IDLE_STATUS_INTERVAL) == WakeReason::Stop {
                     return;
                 }
-                self.link.show(None, State::Silent, "the recording is at its end");
+                self.link.publish_status(None, State::Silent, "the recording is at its end");
             }
         }
     }
 }
 
 /// Pace of the player of a hub.
-struct PlayerPace<'p> {
+struct PlayerTiming<'p> {
     handle: PlayerHandle<'p>,
     /// Time of the next check for requests while the link plays without a wait.
     check_at: Nanos,
 }
 
-impl<'p> PlayerPace<'p> {
+impl<'p> PlayerTiming<'p> {
     fn new(handle: PlayerHandle<'p>) -> Self {
-        PlayerPace { handle, check_at: 0 }
+        PlayerTiming { handle, check_at: 0 }
     }
 
     /// Waits until `until`, the end of the hub, or a change of the player.
-    fn rest(&mut self, link: &mut LinkCore<'_, System<'_>>, until: Nanos) -> WakeReason {
+    fn wait(&mut self, link: &mut LinkState<'_, System<'_>>, until: Nanos) -> WakeReason {
         let event = self.handle.event();
         match link.wait(event.as_fd(), until) {
             WakeReason::Request => link.handle_requests(PauseTarget::Recording(self.handle.player)),
@@ -299,53 +312,53 @@ impl<'p> PlayerPace<'p> {
     }
 }
 
-impl<'a> Pace<System<'a>> for PlayerPace<'_> {
-    fn part(&self) -> (Nanos, Option<Nanos>) {
-        let play = self.handle.play();
+impl<'a> ReplayTiming<System<'a>> for PlayerTiming<'_> {
+    fn range(&self) -> (Nanos, Option<Nanos>) {
+        let play = self.handle.options();
         (play.start_ns, play.end_ns)
     }
 
-    fn wait_turn(
+    fn wait_until_due(
         &mut self,
-        link: &mut LinkCore<'_, System<'a>>,
+        link: &mut LinkState<'_, System<'a>>,
         media: Nanos,
-        shown: Shown<'_>,
-    ) -> Option<Due> {
+        shown: LinkDescription<'_>,
+    ) -> Option<DueTime> {
         loop {
             let now = clock::now();
             if self.handle.is_unthrottled() && now < self.check_at {
-                return Some(Due::at_once(now));
+                return Some(DueTime::at_once(now));
             }
             let until = match self.handle.next_action(media, now) {
                 PlaybackAction::Now(due) if now < self.check_at => return Some(due),
                 PlaybackAction::Now(_) => 0,
-                PlaybackAction::At(at) => at.min(now + IDLE_INTERVAL),
+                PlaybackAction::At(at) => at.min(now + IDLE_STATUS_INTERVAL),
                 PlaybackAction::Wait
                 | PlaybackAction::Restart(_)
                 | PlaybackAction::Skipped
-                | PlaybackAction::Over => now + IDLE_INTERVAL,
+                | PlaybackAction::Over => now + IDLE_STATUS_INTERVAL,
             };
-            if self.rest(link, until) == WakeReason::Stop {
+            if self.wait(link, until) == WakeReason::Stop {
                 return None;
             }
             self.check_at = clock::now() + POLL_INTERVAL;
             let state = if self.handle.is_paused() { State::Paused } else { shown.state };
-            link.show(shown.session, state, shown.problem);
+            link.publish_status(shown.session, state, shown.problem);
         }
     }
 
-    fn pass(&mut self, link: &mut LinkCore<'_, System<'a>>, problem: &str) -> bool {
+    fn continue_skipping(&mut self, link: &mut LinkState<'_, System<'a>>, problem: &str) -> bool {
         let now = clock::now();
         if now < self.check_at {
             return true;
         }
         self.check_at = now + POLL_INTERVAL;
-        link.show(None, State::Starting, problem);
-        self.rest(link, 0) != WakeReason::Stop
+        link.publish_status(None, State::Starting, problem);
+        self.wait(link, 0) != WakeReason::Stop
     }
 
-    fn played(&mut self, media: Nanos) {
-        self.handle.played(media);
+    fn note_played(&mut self, media: Nanos) {
+        self.handle.note_played(media);
     }
 }
 
@@ -384,7 +397,7 @@ impl RecordedMount {
 
     /// Passes each angle to `publish` when it is due, lap by lap, until `stop` is set.
     pub fn play(&self, player: &Player, stop: &AtomicBool, mut publish: impl FnMut(RecordedAngle)) {
-        let play = player.play();
+        let play = player.options();
         while !stop.load(Ordering::Relaxed) {
             let lap = player.lap();
             let is_current = || player.lap() == lap && !stop.load(Ordering::Relaxed);
@@ -403,7 +416,7 @@ impl RecordedMount {
                         continue;
                     }
                 };
-                let media = timeline.media_beside(&header);
+                let media = timeline.media_of_sample(&header);
                 let Some(media) = media.filter(|media| *media >= play.start_ns) else { continue };
                 if play.end_ns.is_some_and(|end_ns| media >= end_ns) {
                     break;
@@ -439,11 +452,11 @@ fn wait(player: &Player, media: Nanos, is_current: &impl Fn() -> bool) -> Playba
 /// Validity of a verdict while a recording plays: until the next verdict, even while the player waits.
 const VALID_UNTIL_NEXT: Nanos = Nanos::MAX - 1;
 /// Latest stamp. A later one in a file counts as this one, so that sums with durations do not overflow.
-pub(crate) const LATEST: Nanos = i64::MAX as Nanos - (1 << 56);
+pub(crate) const MAX_STAMP: Nanos = i64::MAX as Nanos - (1 << 56);
 /// Maximum recorded period that is accepted.
 const MAX_GAP: Nanos = 10_000 * MILLIS;
 /// Interval of the statuses while nothing plays.
-const IDLE_INTERVAL: Nanos = 100 * MILLIS;
+const IDLE_STATUS_INTERVAL: Nanos = 100 * MILLIS;
 /// Time after which the recording of a link begins without a subscriber.
 const FIRST_SUBSCRIBER_TIMEOUT: Nanos = 1_000 * MILLIS;
 /// Time that a subscriber to the first topic has for the others.

@@ -6,14 +6,14 @@ use std::sync::Arc;
 
 use scanhub_config::{Config, Sources};
 use scanhub_drivers::Model;
-use scanhub_port::Source;
+use scanhub_port::PortSpec;
 use scanhub_recording::Recording;
 use scanhub_schema::{Failure, Family, Kind, Nanos, check_sensor};
 use scanhub_shm::Domain;
 
 use crate::player::{PlaybackOptions, Player, Progress};
-use crate::replay::{Origin, Recorded, RecordedMount, log_damage};
-use crate::supervise::{self, Ready, ReplaySet};
+use crate::replay::{Origin, RecordedMount, RecordedSensor, log_damage};
+use crate::supervise::{self, ReplaySet, StartReport};
 
 /// Options of a replay.
 #[derive(Clone, Debug)]
@@ -27,7 +27,7 @@ pub struct Replay<'a> {
     /// Configuration of its sensors.
     pub sources: &'a Sources,
     /// Options of the player.
-    pub play: PlaybackOptions,
+    pub options: PlaybackOptions,
     /// Whether the hub continues after everything was played.
     pub holds: bool,
 }
@@ -44,12 +44,13 @@ pub struct Replay<'a> {
 pub fn replay(
     replay: &Replay<'_>,
     domain: &Domain,
-    on_ready: impl FnOnce(&Ready, &Arc<Player>),
+    on_ready: impl FnOnce(&StartReport, &Arc<Player>),
 ) -> Result<Progress, Failure> {
     let Replay { file, sources, .. } = *replay;
     let recording = Recording::open_as(file, replay.family)?;
     let set = RecordedSet::new(recording, replay.sensor, sources)?;
-    let (links, left_out) = (set.config.links.len(), left_out(sources, &set.sensors, &set.config)?);
+    let (links, left_out) =
+        (set.config.links.len(), links_without_sensor(sources, &set.sensors, &set.config)?);
     for name in left_out {
         tracing::info!("{name}: not in the recording, left out");
     }
@@ -58,8 +59,8 @@ pub fn replay(
         None => Vec::new(),
     };
     let RecordedSet { sensors, config, parts, .. } = set;
-    let length = parts.iter().filter_map(Recorded::length).max();
-    let start_ns = replay.play.start_ns;
+    let length = parts.iter().filter_map(RecordedSensor::length).max();
+    let start_ns = replay.options.start_ns;
     if length.is_some_and(|length| start_ns > length) {
         // The length is by wall clocks, and one of them may have been set. Read the recording to be sure.
         let mut ends = Vec::with_capacity(links);
@@ -71,10 +72,10 @@ pub fn replay(
             return Err(start_after_end(file, start_ns, end));
         }
     }
-    let player = Arc::new(Player::new(replay.play, links, length)?.with_mounts(mounts));
-    let read = || configuration(sources, &sensors, file);
+    let player = Arc::new(Player::new(replay.options, links, length)?.with_mounts(mounts));
+    let load = || configuration(sources, &sensors, file);
     let set = ReplaySet { player: &player, parts, holds: replay.holds };
-    supervise::serve(&read, config, Some(set), domain, |ready| on_ready(ready, &player))?;
+    supervise::serve(&load, config, Some(set), domain, |ready| on_ready(ready, &player))?;
     Ok(player.progress())
 }
 
@@ -91,7 +92,7 @@ pub(crate) struct RecordedSet {
     sensors: Vec<Sensor>,
     pub(crate) config: Config,
     /// Recording of each link.
-    pub(crate) parts: Vec<Recorded>,
+    pub(crate) parts: Vec<RecordedSensor>,
     /// Start of the media time; `None` without stamps.
     pub(crate) origin: Option<Origin>,
 }
@@ -117,9 +118,9 @@ impl RecordedSet {
                 Some(name) => recording.of(name)?,
                 None => recording.clone(),
             };
-            parts.push(Recorded::new(part, link)?);
+            parts.push(RecordedSensor::new(part, link)?);
         }
-        let origin = parts.iter().filter_map(Recorded::origin).reduce(Origin::earlier);
+        let origin = parts.iter().filter_map(RecordedSensor::origin).reduce(Origin::earlier);
         if let Some(origin) = origin {
             parts.iter_mut().for_each(|part| part.set_origin(origin));
         }
@@ -139,36 +140,37 @@ struct Sensor {
     model: Result<Option<Model>, Failure>,
     beams: Option<usize>,
     /// Name of the measuring mode.
-    way: Option<&'static str>,
+    mode_name: Option<&'static str>,
 }
 
 impl Sensor {
     /// Creates the only sensor of `recording`, which `link` plays.
     fn new(recorded: Option<String>, link: String, recording: &Recording) -> Sensor {
-        let (model, beams, way) = (recording.model(), recording.beams(), recording.contents().way);
-        Sensor { recorded, link, family: recording.family(), model, beams, way }
+        let (model, beams, mode_name) =
+            (recording.model(), recording.beams(), recording.contents().mode_name);
+        Sensor { recorded, link, family: recording.family(), model, beams, mode_name }
     }
 }
 
-fn sensors(recording: &Recording, wanted: Option<&str>) -> Result<Vec<Sensor>, Failure> {
+fn sensors(recording: &Recording, chosen: Option<&str>) -> Result<Vec<Sensor>, Failure> {
     let names = &recording.contents().sensors;
     if names.is_empty() {
-        let link = wanted.unwrap_or(UNNAMED).to_owned();
+        let link = chosen.unwrap_or(DEFAULT_NAME).to_owned();
         check_sensor(&link).map_err(|failure| Failure { kind: Kind::Usage, ..failure })?;
         return Ok(vec![Sensor::new(None, link, recording)]);
     }
-    let wanted = match wanted {
+    let chosen = match chosen {
         // Messages name the link of a remote sensor.
-        Some(wanted) if !names.iter().any(|name| name == wanted) => {
-            let recorded = names.iter().find(|name| link_name(name) == wanted);
-            Some(recorded.map_or(wanted, String::as_str))
+        Some(chosen) if !names.iter().any(|name| name == chosen) => {
+            let recorded = names.iter().find(|name| link_name(name) == chosen);
+            Some(recorded.map_or(chosen, String::as_str))
         }
-        wanted => wanted,
+        chosen => chosen,
     };
-    if let Some(wanted) = wanted {
-        recording.of(wanted)?;
+    if let Some(chosen) = chosen {
+        recording.of(chosen)?;
     }
-    let played = names.iter().filter(|name| wanted.is_none_or(|wanted| wanted == name.as_str()));
+    let played = names.iter().filter(|name| chosen.is_none_or(|chosen| chosen == name.as_str()));
     let sensor = |name: &String| -> Result<Sensor, Failure> {
         Ok(Sensor::new(Some(name.clone()), link_name(name), &recording.of(name)?))
     };
@@ -225,16 +227,16 @@ fn configuration(sources: &Sources, sensors: &[Sensor], file: &Path) -> Result<C
     let mut config = Config::load(&sources)?;
     config.links.retain(|link| sensors.iter().any(|sensor| sensor.link == link.name));
     for link in &mut config.links {
-        link.port = Source::File { path: file.to_owned(), paced: true };
+        link.port = PortSpec::File { path: file.to_owned(), paced: true };
         link.scanner.settings.is_found = searched.contains(&link.name);
         let of = sensors.iter().find(|sensor| sensor.link == link.name);
         // The recording supplies the settings that are not configured.
-        if let Some(Sensor { model, beams, way, .. }) = of.filter(|_| link.scanner.is_auto()) {
+        if let Some(Sensor { model, beams, mode_name, .. }) = of.filter(|_| link.scanner.is_auto()) {
             let settings = &mut link.scanner.settings;
             if settings.mode.is_none() {
                 settings.model = model.clone()?.map(|model| model.name);
             }
-            settings.mode = settings.mode.or(*way);
+            settings.mode = settings.mode.or(*mode_name);
             settings.beams = *beams;
         }
     }
@@ -262,7 +264,11 @@ fn with_links(sources: &Sources, sensors: &[Sensor]) -> Result<(Sources, Vec<Str
 }
 
 /// Returns the configured links that are not in `config`.
-fn left_out(sources: &Sources, sensors: &[Sensor], config: &Config) -> Result<Vec<String>, Failure> {
+fn links_without_sensor(
+    sources: &Sources,
+    sensors: &[Sensor],
+    config: &Config,
+) -> Result<Vec<String>, Failure> {
     if sources.files.is_empty() {
         return Ok(Vec::new());
     }
@@ -271,7 +277,7 @@ fn left_out(sources: &Sources, sensors: &[Sensor], config: &Config) -> Result<Ve
 }
 
 /// Name of a sensor that has none in the recording.
-const UNNAMED: &str = "front";
+const DEFAULT_NAME: &str = "front";
 /// Maximum length of a sensor's name in bytes.
 const MAX_NAME_LEN: usize = 24;
 
@@ -294,24 +300,24 @@ mod tests {
             family: Some(Family::Lms),
             model: Ok(None),
             beams: None,
-            way: None,
+            mode_name: None,
         }
     }
 
     #[test]
-    fn sensors_of_the_recording_become_links_as_configured() {
+    fn recorded_sensors_become_configured_links() {
         let sources = Sources { set: vec!["link.front.angle=100".into()], ..Sources::default() };
         let file = Path::new("/tmp/a?b=c.mcap");
         let config = configuration(&sources, &[sensor("front"), sensor("left")], file).unwrap();
         let named: Vec<_> =
             config.links.iter().map(|link| (link.name.as_str(), link.scanner.settings.view)).collect();
         assert_eq!(named, [("front", Some((100, 50))), ("left", Some((180, 50)))]);
-        assert_eq!(config.links[1].port, Source::File { path: file.to_owned(), paced: true });
+        assert_eq!(config.links[1].port, PortSpec::File { path: file.to_owned(), paced: true });
         let place = tempfile::NamedTempFile::new().unwrap().into_temp_path();
         std::fs::write(&place, "[[link]]\nname = \"rear\"\nport = \"/dev/x\"\nbaud = 38400\n[[link]]\nname = \"up\"\nport = \"y\"\n").unwrap();
         let sources = Sources { files: vec![place.to_path_buf()], ..Sources::default() };
         let config = configuration(&sources, &[sensor("rear")], file).unwrap();
-        let left_out = left_out(&sources, &[sensor("rear")], &config).unwrap();
+        let left_out = links_without_sensor(&sources, &[sensor("rear")], &config).unwrap();
         assert_eq!(
             (config.links.len(), config.links[0].rate(), left_out),
             (1, 38_400, vec!["up".to_owned()])
@@ -324,7 +330,7 @@ mod tests {
         let mut writer = Writer::begin(File::create(&place).unwrap(), "", BTreeMap::new()).unwrap();
         let telegram = lms::measured::encode(0, Unit::Mm, &[1000; 181], 0x10);
         for name in ["robot1.front", "a.b", "a-b"] {
-            writer.sample(name, Topic::Telegram, &Header::default(), telegram.bytes()).unwrap();
+            writer.write_sample(name, Topic::Telegram, &Header::default(), telegram.bytes()).unwrap();
         }
         writer.finish().unwrap();
         let recording = Recording::open(place.to_path_buf()).unwrap();

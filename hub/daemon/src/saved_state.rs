@@ -14,12 +14,12 @@ use std::time::Duration;
 
 use rustix::event::{PollFd, PollFlags, poll};
 use scanhub_config::{Config, Link};
-use scanhub_drivers::line::BEAMS;
+use scanhub_drivers::line::BEAM_RANGE;
 pub use scanhub_drivers::line::KnownRate;
 use scanhub_drivers::search::Memory;
 use scanhub_drivers::{Model, features};
-use scanhub_port::{Source, clock};
-use scanhub_schema::{Age, Background, Failure, Family, Kind, MILLIS, Nanos, Pose, SavedModel, as_json};
+use scanhub_port::{PortSpec, clock};
+use scanhub_schema::{Age, Background, BackgroundFile, Failure, Family, Kind, MILLIS, Nanos, Pose, as_json};
 use scanhub_shm::StateDirectory;
 use serde::{Deserialize, Serialize};
 
@@ -81,13 +81,13 @@ pub struct StateSaver<F> {
 
 /// State that all links have handed over.
 pub struct SaveQueue {
-    slots: Vec<Slot>,
+    slots: Vec<LinkSlot>,
     /// Readable when a link has handed something over.
     event: EventFd,
 }
 
 /// State of one link.
-struct Slot {
+struct LinkSlot {
     sensor: String,
     /// The newest background that was not taken yet.
     background: Mutex<Option<(Pose, Box<Background>)>>,
@@ -103,7 +103,7 @@ struct Slot {
 #[derive(Clone, Copy)]
 pub struct SaveSlot<'a> {
     queue: &'a SaveQueue,
-    slot: &'a Slot,
+    slot: &'a LinkSlot,
 }
 
 /// Schedule of the writes to the background file of one link.
@@ -112,7 +112,7 @@ struct BackgroundWrites {
     /// Generation that this hub has written last.
     generation: Option<u32>,
     /// Background that is written at `due`.
-    waiting: Option<(Pose, Box<Background>)>,
+    pending: Option<(Pose, Box<Background>)>,
     due: Nanos,
     /// Whether the log has a failure to write.
     is_failure_logged: bool,
@@ -125,19 +125,19 @@ impl<F: StateStore> StateSaver<F> {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`] if no descriptors are left.
+    /// Returns [`Kind::ResourceExhausted`] if no descriptors are left.
     pub fn load(
         mut config: Config,
         store: F,
         wall_ns: u64,
     ) -> Result<(Config, Option<StateSaver<F>>), Failure> {
-        let is_live = |link: &&mut Link| !matches!(link.port, Source::File { .. });
-        let slot = |link: &mut Link| Slot {
+        let is_live = |link: &&mut Link| !matches!(link.port, PortSpec::File { .. });
+        let slot = |link: &mut Link| LinkSlot {
             sensor: link.name.clone(),
             background: Mutex::default(),
             saved_wall_ns: AtomicU64::new(load_background(link, &store, wall_ns)),
             // Only the rate of a tty can be changed.
-            rate: SavedRecord::load(&link.name, &store, matches!(link.port, Source::Tty(_))),
+            rate: SavedRecord::load(&link.name, &store, matches!(link.port, PortSpec::Tty(_))),
             scanner: SavedRecord::load(&link.name, &store, link.family().is_none()),
         };
         let slots: Vec<_> = config.links.iter_mut().filter(is_live).map(slot).collect();
@@ -161,8 +161,8 @@ impl<F: StateStore> StateSaver<F> {
         for (slot, writes) in self.queue.slots.iter().zip(&mut self.backgrounds) {
             slot.rate.write(&slot.sensor, &self.store);
             slot.scanner.write(&slot.sensor, &self.store);
-            writes.waiting = lock(&slot.background).take().or(writes.waiting.take());
-            let Some((pose, model)) = &writes.waiting else { continue };
+            writes.pending = lock(&slot.background).take().or(writes.pending.take());
+            let Some((pose, model)) = &writes.pending else { continue };
             if !is_last && writes.generation == Some(model.generation) && now < writes.due {
                 next = next.min(writes.due);
                 continue;
@@ -173,7 +173,7 @@ impl<F: StateStore> StateSaver<F> {
                 tracing::warn!("{}: {}; {}", slot.sensor, failure.message, failure.hint);
             }
             (writes.generation, writes.due) = (Some(model.generation), now + WRITE_INTERVAL);
-            writes.waiting = None;
+            writes.pending = None;
         }
         next
     }
@@ -198,11 +198,11 @@ impl SavedState for SaveSlot<'_> {
     }
 
     fn rate(&self, port: &str) -> Option<KnownRate> {
-        self.slot.rate.of(port)
+        self.slot.rate.for_port(port)
     }
 
     fn scanner(&self, port: &str) -> Option<KnownScanner> {
-        self.slot.scanner.of(port)
+        self.slot.scanner.for_port(port)
     }
 
     fn save_scanner(&self, port: &str, scanner: KnownScanner) {
@@ -218,7 +218,7 @@ impl SavedState for SaveSlot<'_> {
     }
 }
 
-impl Slot {
+impl LinkSlot {
     /// Writes `model` into the background file. A model without a known beam removes the file, because the saved one is
     /// outdated.
     fn write_background(
@@ -262,11 +262,11 @@ impl StateWriter {
                 thread_queue.event.clear();
                 let is_last = thread_is_ending.load(Ordering::Relaxed);
                 let now = clock::now();
-                let next = saver.flush_due(now, clock::wall(now, now), is_last);
+                let next = saver.flush_due(now, clock::to_wall_ns(now, now), is_last);
                 if is_last {
                     return;
                 }
-                let span = (next < Nanos::MAX).then(|| clock::span(now, next));
+                let span = (next < Nanos::MAX).then(|| clock::poll_timeout(now, next));
                 // The queue is checked after every wait, whatever has ended it.
                 let _ = poll(&mut [PollFd::new(&thread_queue.event, PollFlags::IN)], span.as_ref());
             }
@@ -307,7 +307,7 @@ impl KnownScanner {
     pub(crate) fn beams_of_model(&self) -> Option<(Model, usize)> {
         let models = features(self.memory.family).models;
         let model = models.iter().find(|model| self.model.as_deref() == Some(model.name))?;
-        Some((*model, self.beams.filter(|beams| BEAMS.contains(beams))?))
+        Some((*model, self.beams.filter(|beams| BEAM_RANGE.contains(beams))?))
     }
 }
 
@@ -320,18 +320,18 @@ trait PortRecord: Clone + PartialEq {
     /// Extension of the file's name.
     const EXTENSION: &'static str;
     /// Number of words.
-    const WORDS: usize;
+    const FIELD_COUNT: usize;
 
     /// Returns the words, with a space between two of them.
     fn fields(&self) -> String;
 
     /// Parses the words. Returns `None` if they are damaged.
-    fn parse(words: &[&str]) -> Option<Self>;
+    fn parse(fields: &[&str]) -> Option<Self>;
 }
 
 impl PortRecord for KnownScanner {
     const EXTENSION: &'static str = "scanner";
-    const WORDS: usize = 5;
+    const FIELD_COUNT: usize = 5;
 
     fn fields(&self) -> String {
         let KnownScanner { memory: Memory { family, stream_rate, reply_rate }, model, beams } = self;
@@ -341,8 +341,8 @@ impl PortRecord for KnownScanner {
         format!("{} {model} {stream_rate} {reply_rate} {beams}", family.name())
     }
 
-    fn parse(words: &[&str]) -> Option<KnownScanner> {
-        let &[family, model, stream_rate, reply_rate, beams] = words else { return None };
+    fn parse(fields: &[&str]) -> Option<KnownScanner> {
+        let &[family, model, stream_rate, reply_rate, beams] = fields else { return None };
         let (stream_rate, reply_rate) = (stream_rate.parse().ok()?, reply_rate.parse().ok()?);
         let beams = if beams == UNKNOWN { None } else { Some(beams.parse().ok()?) };
         let memory = Memory { family: Family::parse(family)?, stream_rate, reply_rate };
@@ -352,18 +352,18 @@ impl PortRecord for KnownScanner {
 
 impl PortRecord for KnownRate {
     const EXTENSION: &'static str = "rate";
-    const WORDS: usize = 1;
+    const FIELD_COUNT: usize = 1;
 
     fn fields(&self) -> String {
         match self.silent_switches {
             0 => self.baud.to_string(),
-            count => format!("{}{SILENT}{count}", self.baud),
+            count => format!("{}{SILENT_SWITCHES_KEY}{count}", self.baud),
         }
     }
 
-    fn parse(words: &[&str]) -> Option<KnownRate> {
-        let &[rate] = words else { return None };
-        let (baud, silent_switches) = rate.split_once(SILENT).unwrap_or((rate, "0"));
+    fn parse(fields: &[&str]) -> Option<KnownRate> {
+        let &[rate] = fields else { return None };
+        let (baud, silent_switches) = rate.split_once(SILENT_SWITCHES_KEY).unwrap_or((rate, "0"));
         Some(KnownRate { baud: baud.parse().ok()?, silent_switches: silent_switches.parse().ok()? })
     }
 }
@@ -373,7 +373,7 @@ struct SavedRecord<K>(Mutex<RecordState<K>>);
 
 struct RecordState<K> {
     /// The record and the port that it belongs to.
-    known: Option<(K, String)>,
+    record: Option<(K, String)>,
     /// Whether it must be written.
     is_new: bool,
 }
@@ -386,23 +386,23 @@ impl<K: PortRecord> SavedRecord<K> {
             tracing::warn!("{sensor}: {}; {}", failure.message, failure.hint);
             None
         });
-        let known = text.flatten().as_deref().and_then(read_record);
-        SavedRecord(Mutex::new(RecordState { known, is_new: false }))
+        let record = text.flatten().as_deref().and_then(parse_record);
+        SavedRecord(Mutex::new(RecordState { record, is_new: false }))
     }
 
     /// Returns the record, if it belongs to `port`.
-    fn of(&self, port: &str) -> Option<K> {
-        let RecordState { known, .. } = &*lock(&self.0);
+    fn for_port(&self, port: &str) -> Option<K> {
+        let RecordState { record: known, .. } = &*lock(&self.0);
         known.as_ref().filter(|(_, of)| of == port).map(|(known, _)| known.clone())
     }
 
     /// Replaces the record. Returns whether it was different.
-    fn replace(&self, port: &str, known: K) -> bool {
-        let known = Some((known, port.to_owned()));
+    fn replace(&self, port: &str, record: K) -> bool {
+        let record = Some((record, port.to_owned()));
         let mut state = lock(&self.0);
-        let is_new = state.known != known;
+        let is_new = state.record != record;
         if is_new {
-            *state = RecordState { known, is_new };
+            *state = RecordState { record, is_new };
         }
         is_new
     }
@@ -413,7 +413,7 @@ impl<K: PortRecord> SavedRecord<K> {
         let text = {
             let mut state = lock(&self.0);
             let is_new = std::mem::take(&mut state.is_new);
-            state.known.as_ref().filter(|_| is_new).map(|(known, port)| record_text(known, port))
+            state.record.as_ref().filter(|_| is_new).map(|(known, port)| record_text(known, port))
         };
         if let Some(text) = text
             && let Err(failure) = store.write(&record_file::<K>(sensor), &text)
@@ -424,14 +424,14 @@ impl<K: PortRecord> SavedRecord<K> {
 }
 
 /// Returns the line for the record of the scanner at `port`.
-fn record_text<K: PortRecord>(known: &K, port: &str) -> String {
-    format!("{} {port}\n", known.fields())
+fn record_text<K: PortRecord>(record: &K, port: &str) -> String {
+    format!("{} {port}\n", record.fields())
 }
 
 /// Returns the record and the port in `text`. Returns `None` if it is damaged.
-fn read_record<K: PortRecord>(text: &str) -> Option<(K, String)> {
-    let words: Vec<_> = text.strip_suffix('\n')?.splitn(K::WORDS + 1, ' ').collect();
-    let (port, known) = words.split_last().filter(|_| words.iter().all(|word| !word.is_empty()))?;
+fn parse_record<K: PortRecord>(text: &str) -> Option<(K, String)> {
+    let fields: Vec<_> = text.strip_suffix('\n')?.splitn(K::FIELD_COUNT + 1, ' ').collect();
+    let (port, known) = fields.split_last().filter(|_| fields.iter().all(|word| !word.is_empty()))?;
     Some((K::parse(known)?, (*port).to_owned()))
 }
 
@@ -468,7 +468,7 @@ struct PoseText {
 fn load_background(link: &mut Link, store: &impl StateStore, now_wall_ns: u64) -> u64 {
     let name = &link.name;
     let background = &mut link.processing.background;
-    if !background.is_kept || !background.is_handed_on || background.start_is_said {
+    if !background.is_enabled || !background.is_saved || background.is_start_set {
         return 0;
     }
     let file = background_file(name);
@@ -515,14 +515,14 @@ fn background_text(sensor: &str, pose: Pose, model: &Background, wall_ns: u64) -
 ///
 /// Returns the reason if `text` is damaged, or if `link` cannot start with this background.
 fn read_background(text: &str, location: &str, link: &Link) -> Result<(Box<Background>, u64), String> {
-    let SavedModel { sensor, model, .. } =
-        SavedModel::parse(text.as_bytes(), location).map_err(|failure| failure.message)?;
+    let BackgroundFile { sensor, model, .. } =
+        BackgroundFile::parse(text.as_bytes(), location).map_err(|failure| failure.message)?;
     let BackgroundContext { pose, wall_ns } = serde_json::from_str(text)
         .map_err(|error| format!("{location} does not contain its time: {error}"))?;
     if sensor != link.name {
         return Err(format!("{location} is the background of {sensor}"));
     }
-    if let Err(expected) = link.fits(&model) {
+    if let Err(expected) = link.check_background(&model) {
         let (count, unit_mm) = (model.count, model.unit_um / 1000);
         return Err(format!(
             "{location} has {count} beams in units of {unit_mm} mm, the link is configured for {expected}"
@@ -559,7 +559,7 @@ const POSE_TOLERANCE: f64 = 1e-9;
 /// Stands for a model, or a number of beams, that is not known.
 const UNKNOWN: &str = "-";
 /// Stands before the number of switches that were followed by silence.
-const SILENT: &str = ",silent=";
+const SILENT_SWITCHES_KEY: &str = ",silent=";
 
 #[cfg(test)]
 mod tests {
@@ -630,9 +630,9 @@ mod tests {
     fn check<K: PortRecord + std::fmt::Debug>(known: &K, line: &str) {
         let text = record_text(known, PORT);
         assert_eq!(text, format!("{line} {PORT}\n"));
-        assert_eq!(read_record(&text), Some((known.clone(), PORT.to_owned())));
+        assert_eq!(parse_record(&text), Some((known.clone(), PORT.to_owned())));
         for len in 0..text.len() {
-            assert_eq!(read_record::<K>(&text[..len]), None, "cut after {len} bytes");
+            assert_eq!(parse_record::<K>(&text[..len]), None, "cut after {len} bytes");
         }
     }
 
@@ -648,10 +648,10 @@ mod tests {
             check(&KnownRate { baud: 38_400, silent_switches }, line);
         }
         for damaged in ["sick - 1 2 - /x\n", "ld - x 2 - /x\n", "ld - 1 2 - \n", "ld  1 2 - /x\n"] {
-            assert_eq!(read_record::<KnownScanner>(damaged), None, "{damaged:?}");
+            assert_eq!(parse_record::<KnownScanner>(damaged), None, "{damaged:?}");
         }
         for damaged in ["", "9600\n", "x /dev/x\n", " /dev/x\n", "\n\n", "9600,silent= /x\n"] {
-            assert_eq!(read_record::<KnownRate>(damaged), None, "{damaged:?}");
+            assert_eq!(parse_record::<KnownRate>(damaged), None, "{damaged:?}");
         }
     }
 
@@ -678,14 +678,14 @@ mod tests {
     const WALL_NS: u64 = 1_790_000_000_123_456_789;
 
     #[test]
-    fn background_round_trips_for_the_same_sensor_and_pose() {
+    fn background_round_trips_for_same_sensor_and_pose() {
         let set =
             ["link.front.pose.x=0.1", "link.front.pose.yaw=-1.5708", "link.front.pose.upside_down=true"];
         let own = link(&set);
         let model = background();
         let text = background_text("front", own.processing.pose, &model, WALL_NS).unwrap();
         assert_eq!(read_background(&text, "f", &own), Ok((model, WALL_NS)));
-        let saved = SavedModel::parse(text.as_bytes(), "f").unwrap();
+        let saved = BackgroundFile::parse(text.as_bytes(), "f").unwrap();
         assert_eq!((saved.sensor.as_str(), saved.model.known_beams), ("front", 2), "a user can load it");
         for (change, why) in [
             ("link.front.pose.x=0.101", "another pose"),

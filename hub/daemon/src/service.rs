@@ -14,7 +14,7 @@ use sd_notify::NotifyState;
 #[derive(Default)]
 pub struct Service {
     /// Ports that the previous hub passed to it, with the name of the link.
-    kept: Mutex<Vec<(String, OwnedFd)>>,
+    kept_ports: Mutex<Vec<(String, OwnedFd)>>,
     /// Interval at which it expects a report that the hub works.
     watchdog: Option<Nanos>,
 }
@@ -32,27 +32,27 @@ impl Service {
             fcntl_setfd(&line, FdFlags::CLOEXEC).is_ok().then_some((name, line))
         };
         let watchdog = sd_notify::watchdog_enabled().map(|span| span.as_nanos() as Nanos);
-        Service { kept: Mutex::new(named.filter_map(own).collect()), watchdog }
+        Service { kept_ports: Mutex::new(named.filter_map(own).collect()), watchdog }
     }
 
     /// Assigns each kept port to the link that has it now, according to `owner`. A port without a link is not kept any
     /// longer. Must be called before a port is kept again, because forgetting a name forgets all ports with it.
     pub(crate) fn assign(&self, owner: impl Fn(&OwnedFd) -> Option<String>) {
-        let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
-        for (name, line) in std::mem::take(&mut *kept) {
+        let mut kept_ports = self.kept_ports.lock().unwrap_or_else(PoisonError::into_inner);
+        for (name, line) in std::mem::take(&mut *kept_ports) {
             let owner = owner(&line);
             if owner.as_ref() != Some(&name) {
-                self.forget(&name);
+                self.release(&name);
             }
-            kept.extend(owner.map(|owner| (owner, line)));
+            kept_ports.extend(owner.map(|owner| (owner, line)));
         }
     }
 
     /// Takes a port that was kept under `name`.
     pub(crate) fn take(&self, name: &str) -> Option<OwnedFd> {
-        let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
-        let at = kept.iter().position(|(known, _)| known == name)?;
-        Some(kept.swap_remove(at).1)
+        let mut kept_ports = self.kept_ports.lock().unwrap_or_else(PoisonError::into_inner);
+        let at = kept_ports.iter().position(|(known, _)| known == name)?;
+        Some(kept_ports.swap_remove(at).1)
     }
 
     /// Keeps `line` under `name` until it is forgotten, hangs up, or the service is stopped.
@@ -62,26 +62,26 @@ impl Service {
     }
 
     /// Closes the ports that are kept under `name`.
-    pub(crate) fn forget(&self, name: &str) {
+    pub(crate) fn release(&self, name: &str) {
         log_failure(sd_notify::notify(&[NotifyState::FdStoreRemove, NotifyState::FdName(name)]));
     }
 
     /// Reports that the hub reads its configuration again, as of `now`. [`ready`](Self::ready) must follow in any case.
-    pub(crate) fn reloading(&self, now: Nanos) {
+    pub(crate) fn notify_reloading(&self, now: Nanos) {
         let micros = NotifyState::MonotonicUsec(i128::from(now / 1_000));
         log_failure(sd_notify::notify(&[NotifyState::Reloading, micros]));
     }
 
     /// Reports that the hub is ready with `sensors`, at its start or after a reload. If the new configuration was
     /// `refused`, the old one stays.
-    pub(crate) fn ready(&self, sensors: &[String], refused: Option<&str>) {
+    pub(crate) fn notify_ready(&self, sensors: &[String], refused: Option<&str>) {
         let refused = refused.map(|why| format!("; configuration refused: {why}")).unwrap_or_default();
         let status = format!("sensors: {}{refused}", sensors.join(", "));
         log_failure(sd_notify::notify(&[NotifyState::Ready, NotifyState::Status(&status)]));
     }
 
     /// Reports that the hub ends as requested.
-    pub(crate) fn stopping(&self) {
+    pub(crate) fn notify_stopping(&self) {
         log_failure(sd_notify::notify(&[NotifyState::Stopping]));
     }
 }
@@ -89,16 +89,16 @@ impl Service {
 /// Reports to the service manager that the hub works, if every link has finished something since the last report. A
 /// timer alone would not prove that.
 pub(crate) struct Watchdog<'a> {
-    worked: &'a [AtomicBool],
+    activity: &'a [AtomicBool],
     interval: Nanos,
     next: Nanos,
 }
 
 impl<'a> Watchdog<'a> {
     /// Creates the watchdog of the links that set `worked`; `None` if the service manager expects no reports.
-    pub(crate) fn new(service: &Service, worked: &'a [AtomicBool], now: Nanos) -> Option<Watchdog<'a>> {
+    pub(crate) fn new(service: &Service, activity: &'a [AtomicBool], now: Nanos) -> Option<Watchdog<'a>> {
         let interval = service.watchdog? / REPORTS_PER_INTERVAL;
-        Some(Watchdog { worked, interval, next: now + interval })
+        Some(Watchdog { activity, interval, next: now + interval })
     }
 
     /// Sends a report if one is due and all links have worked. Must be called more often than the service manager
@@ -110,9 +110,9 @@ impl<'a> Watchdog<'a> {
     }
 
     fn is_due(&mut self, now: Nanos) -> bool {
-        let is_due = now >= self.next && self.worked.iter().all(|worked| worked.load(Ordering::Relaxed));
+        let is_due = now >= self.next && self.activity.iter().all(|worked| worked.load(Ordering::Relaxed));
         if is_due {
-            self.worked.iter().for_each(|worked| worked.store(false, Ordering::Relaxed));
+            self.activity.iter().for_each(|worked| worked.store(false, Ordering::Relaxed));
             self.next = now + self.interval;
         }
         is_due
@@ -135,7 +135,7 @@ mod tests {
 
     #[test]
     fn watchdog_reports_only_if_all_links_worked() {
-        let service = Service { kept: Mutex::default(), watchdog: Some(40) };
+        let service = Service { kept_ports: Mutex::default(), watchdog: Some(40) };
         let worked = [AtomicBool::new(true), AtomicBool::new(false)];
         let mut watchdog = Watchdog::new(&service, &worked, 100).expect("one is wanted");
         assert!(!watchdog.is_due(110), "one link did nothing");
@@ -145,7 +145,7 @@ mod tests {
         assert!(!watchdog.is_due(200), "nothing was done since");
         worked.iter().for_each(|worked| worked.store(true, Ordering::Relaxed));
         assert!(watchdog.is_due(200));
-        let none = Service { kept: Mutex::default(), watchdog: None };
+        let none = Service { kept_ports: Mutex::default(), watchdog: None };
         assert!(Watchdog::new(&none, &worked, 0).is_none());
     }
 
@@ -153,7 +153,7 @@ mod tests {
     fn kept_port_is_taken_once() {
         let line = || OwnedFd::from(std::fs::File::open("/dev/null").unwrap());
         let kept = vec![("front".to_owned(), line()), ("rear".to_owned(), line())];
-        let service = Service { kept: Mutex::new(kept), watchdog: None };
+        let service = Service { kept_ports: Mutex::new(kept), watchdog: None };
         assert!(service.take("rear").is_some() && service.take("rear").is_none());
         assert!(service.take("side").is_none() && service.take("front").is_some());
     }
@@ -163,7 +163,7 @@ mod tests {
         let line = |path| OwnedFd::from(std::fs::File::open(path).unwrap());
         let kept = [("front", "/dev/null"), ("rear", "/dev/zero"), ("side", "/dev/full")];
         let kept = kept.map(|(name, path)| (name.to_owned(), line(path)));
-        let service = Service { kept: Mutex::new(kept.into()), watchdog: None };
+        let service = Service { kept_ports: Mutex::new(kept.into()), watchdog: None };
         let device = |line: &OwnedFd| rustix::fs::fstat(line).unwrap().st_rdev;
         let [null, zero] = ["/dev/null", "/dev/zero"].map(|path| device(&line(path)));
         // Two links have swapped their ports, and the third port has no link.

@@ -13,16 +13,16 @@
 use std::fmt;
 use std::io;
 
-use scanhub_drivers::line::{self, Event, Identity, Output, Protocol as _, Session as _, suspect};
+use scanhub_drivers::line::{self, Action, Event, Identity, Protocol as _, ScannerSession as _, suspect};
 use scanhub_drivers::search::{Memory, Search};
 use scanhub_drivers::{Model, PortSession};
-use scanhub_port::{Allowance, LineErrors, Source};
+use scanhub_port::{LineErrors, PortSpec, ReadBudget};
 use scanhub_schema::{MILLIS, Nanos, State, Status, line_time};
 
 use crate::control::PauseTarget;
-use crate::link::LinkCore;
+use crate::link::LinkState;
 use crate::link_output::RecordedMetadata;
-use crate::platform::{Line, Platform, SavedState, WaitSource, WakeReason};
+use crate::platform::{Platform, PortIo, SavedState, WaitSource, WakeReason};
 use crate::saved_state::{KnownRate, KnownScanner};
 
 /// State that outlives a session and is used by the next one on the same port.
@@ -53,7 +53,7 @@ pub(crate) struct OpenLine<L> {
     pub(crate) line: L,
     pub(crate) session: PortSession,
     /// Read budget of a network port; `None` for a tty, which is never throttled.
-    allowance: Option<Allowance>,
+    allowance: Option<ReadBudget>,
     /// Bytes that were already buffered when the port was opened, until they have been read.
     backlog: Option<Backlog>,
     settings_check: SettingsCheck,
@@ -65,13 +65,13 @@ pub(crate) struct OpenLine<L> {
     throttled_until: Option<Nanos>,
 }
 
-impl<L: Line> OpenLine<L> {
+impl<L: PortIo> OpenLine<L> {
     /// Creates the state for `line`, which was opened at `now`. A network port may read at most twice what a line of
     /// `baud` can carry.
     pub(crate) fn new(line: L, session: PortSession, baud: u32, now: Nanos) -> OpenLine<L> {
         OpenLine {
-            allowance: line.allowance(baud),
-            backlog: Backlog::new(line.waiting().unwrap_or(0), now),
+            allowance: line.read_budget(baud),
+            backlog: Backlog::new(line.buffered_len().unwrap_or(0), now),
             settings_check: SettingsCheck::default(),
             line,
             session,
@@ -91,7 +91,7 @@ impl<L: Line> OpenLine<L> {
 
 impl<'a, S: Platform> SessionDriver<'a, S> {
     /// Creates the state for the port of `core`.
-    pub(crate) fn new(core: &LinkCore<'a, S>) -> SessionDriver<'a, S> {
+    pub(crate) fn new(core: &LinkState<'a, S>) -> SessionDriver<'a, S> {
         let scanner =
             core.platform.saved_state().and_then(|saved_state| saved_state.scanner(&core.link.port.name()));
         SessionDriver {
@@ -120,8 +120,8 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
     /// Returns an error if the line is lost.
     pub(crate) fn begin(
         &mut self,
-        core: &mut LinkCore<'a, S>,
-        open: &mut OpenLine<S::Line>,
+        core: &mut LinkState<'a, S>,
+        open: &mut OpenLine<S::Port>,
     ) -> io::Result<()> {
         self.backlog_read_at = None;
         self.drain(core, open)
@@ -129,13 +129,13 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
 
     /// Returns the rate to try first when searching for the scanner: the one at which this hub, or a previous one,
     /// found it last.
-    pub(crate) fn known_rate(&self, core: &LinkCore<'a, S>) -> Option<KnownRate> {
+    pub(crate) fn known_rate(&self, core: &LinkState<'a, S>) -> Option<KnownRate> {
         let saved_rate = || saved_rates(core)?.rate(&core.link.port.name());
         self.found_rate.or_else(saved_rate).filter(|_| is_tty(core))
     }
 
     /// Returns the scanner with which a search begins.
-    pub(crate) fn memory(&self, core: &LinkCore<'a, S>) -> Option<Memory> {
+    pub(crate) fn memory(&self, core: &LinkState<'a, S>) -> Option<Memory> {
         self.scanner.as_ref().filter(|_| core.link.family().is_none()).map(|scanner| scanner.memory)
     }
 
@@ -146,7 +146,7 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
     }
 
     /// Returns the rate at which to open the port of `core`.
-    pub(crate) fn opening_rate(&self, core: &LinkCore<'a, S>) -> u32 {
+    pub(crate) fn opening_rate(&self, core: &LinkState<'a, S>) -> u32 {
         match core.link.family() {
             Some(_) => core.link.rate(),
             None => Search::opening_rate(self.memory(core)),
@@ -160,11 +160,11 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
     /// Returns an error if the line is lost.
     pub(crate) fn on_wakeup(
         &mut self,
-        core: &mut LinkCore<'a, S>,
-        open: &mut OpenLine<S::Line>,
-        woken: WakeReason,
+        core: &mut LinkState<'a, S>,
+        open: &mut OpenLine<S::Port>,
+        wake_reason: WakeReason,
     ) -> io::Result<()> {
-        if woken == WakeReason::Request {
+        if wake_reason == WakeReason::Request {
             core.handle_requests(PauseTarget::Session(&mut open.session));
         } else {
             self.read(core, open)?;
@@ -177,27 +177,27 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
     /// # Errors
     ///
     /// Returns an error if the line is lost.
-    pub(crate) fn end(&self, core: &LinkCore<'a, S>, open: &mut OpenLine<S::Line>) -> io::Result<()> {
+    pub(crate) fn end(&self, core: &LinkState<'a, S>, open: &mut OpenLine<S::Port>) -> io::Result<()> {
         let OpenLine { line, session, .. } = open;
         if !session.end(core.platform.now()) {
             return Ok(());
         }
         loop {
-            match session.poll_output() {
-                Output::SetDtr(on) => line.set_dtr(on)?,
-                Output::Transmit { bytes, not_before } => {
+            match session.poll_action() {
+                Action::SetDtr(on) => line.set_dtr(on)?,
+                Action::Transmit { bytes, not_before } => {
                     core.platform.pause(not_before);
                     line.write(bytes)?;
-                    session.transmitted(core.platform.now());
+                    session.handle_transmitted(core.platform.now());
                 }
                 // The hub is shutting down, so nothing is published any more.
-                Output::SetRate(_) | Output::Event(_) => {}
-                Output::Rest(_) | Output::Wait { .. } => return Ok(()),
+                Action::SetRate(_) | Action::Event(_) => {}
+                Action::SleepUntil(_) | Action::Wait { .. } => return Ok(()),
             }
         }
     }
 
-    fn read(&mut self, core: &mut LinkCore<'a, S>, open: &mut OpenLine<S::Line>) -> io::Result<()> {
+    fn read(&mut self, core: &mut LinkState<'a, S>, open: &mut OpenLine<S::Port>) -> io::Result<()> {
         let OpenLine { line, session, allowance, backlog, settings_check, waits_for_bytes, deadline, .. } =
             open;
         let platform = core.platform;
@@ -208,12 +208,12 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
         }
         if *waits_for_bytes
             && session.can_defer_read()
-            && let Some(waiting) = line.waiting()
+            && let Some(waiting) = line.buffered_len()
             && session.defer_read(platform.now(), waiting)
         {
             return Ok(());
         }
-        let mut buffer = session.spare();
+        let mut buffer = session.read_buffer();
         if let Some(allowance) = &allowance {
             let max_len = buffer.len().min(allowance.bytes(platform.now()).max(1));
             buffer = &mut buffer[..max_len];
@@ -226,15 +226,15 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
             settings_check.note_bytes(now);
         }
         if let Some(pending) = backlog {
-            if pending.take(len, session.rate(), now) {
+            if pending.note_read(len, session.rate(), now) {
                 self.backlog_read_at = Some(now);
             } else {
                 *backlog = None;
             }
         }
         if let Some(allowance) = allowance {
-            allowance.take(len, room, now);
-            self.backlog_read_at = allowance.is_behind(now).then_some(now);
+            allowance.record_read(len, room, now);
+            self.backlog_read_at = allowance.is_backlogged(now).then_some(now);
             core.diagnosis.note_flood(allowance.is_flooded(now));
         }
         if len == 0 && now >= *deadline {
@@ -244,35 +244,35 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
     }
 
     /// Carries out the session's actions until it asks to wait.
-    fn drain(&mut self, core: &mut LinkCore<'a, S>, open: &mut OpenLine<S::Line>) -> io::Result<()> {
+    fn drain(&mut self, core: &mut LinkState<'a, S>, open: &mut OpenLine<S::Port>) -> io::Result<()> {
         let OpenLine { line, session, .. } = open;
         let platform = core.platform;
         let recorded = RecordedMetadata::default();
-        let (mut published, mut has_reply, mut is_scan) = (false, false, !core.stats.is_streaming());
+        let (mut published, mut has_reply, mut is_new_scan) = (false, false, !core.stats.is_streaming());
         (open.waits_for_bytes, open.deadline) = loop {
-            match session.poll_output() {
-                Output::SetRate(baud) => {
+            match session.poll_action() {
+                Action::SetRate(baud) => {
                     self.change_rate(core, line, session, baud)?;
                     // Changing the rate discards buffered input.
                     open.backlog = None;
-                    open.settings_check.pass();
+                    open.settings_check.reset();
                 }
-                Output::SetDtr(on) => line.set_dtr(on)?,
-                Output::Transmit { bytes, not_before } => {
+                Action::SetDtr(on) => line.set_dtr(on)?,
+                Action::Transmit { bytes, not_before } => {
                     platform.pause(not_before);
                     line.write(bytes)?;
-                    session.transmitted(platform.now());
+                    session.handle_transmitted(platform.now());
                 }
-                Output::Event(Event::Telegram(mut received)) => {
+                Action::Event(Event::Telegram(mut received)) => {
                     let new_errors = line.line_errors();
                     core.stats.line_errors += new_errors;
-                    let may_be_damaged = self.line_errors.note(new_errors);
+                    let may_be_damaged = self.line_errors.note_telegram(new_errors);
                     let is_backlogged = self.is_backlogged(received.last);
                     received.estimated |= is_backlogged;
                     received.reasons |= if may_be_damaged { suspect::LINE_ERROR } else { 0 };
-                    if received.whole.is_some() {
+                    if received.contents.is_some() {
                         self.note_silence(core, received.last, is_backlogged);
-                        is_scan = true;
+                        is_new_scan = true;
                     }
                     has_reply |= received.is_reply;
                     if let Some(lifetime) = core.publish(&received, &recorded, is_backlogged) {
@@ -284,16 +284,16 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
                     }
                     published = true;
                 }
-                Output::Event(Event::Scan(scan)) => {
+                Action::Event(Event::Scan(scan)) => {
                     let is_backlogged = self.is_backlogged(scan.last);
                     self.note_silence(core, scan.last, is_backlogged);
                     let lifetime = core.publish_scan(&scan, &recorded, is_backlogged);
                     self.consecutive_until =
                         if is_backlogged { 0 } else { scan.last.saturating_add(lifetime) };
-                    (published, is_scan) = (true, true);
+                    (published, is_new_scan) = (true, true);
                 }
-                Output::Rest(until) => break (false, until),
-                Output::Wait { until, .. } => {
+                Action::SleepUntil(until) => break (false, until),
+                Action::Wait { until, .. } => {
                     if !session.advance() {
                         break (true, until);
                     }
@@ -303,8 +303,8 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
         };
         let now = platform.now();
         if published {
-            self.line_errors.wait();
-            open.settings_check.pass();
+            self.line_errors.note_read();
+            open.settings_check.reset();
             core.diagnosis.note_telegram(now);
         }
         let is_altered =
@@ -313,8 +313,8 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
             open.backlog = None;
         }
         // The number of reads changes only between two scans.
-        if is_scan {
-            self.reads_per_telegram = core.output.pieces();
+        if is_new_scan {
+            self.reads_per_telegram = core.output.reads_per_telegram();
         }
         session.set_partial_reads(self.reads_per_telegram);
         if self.reads_per_telegram > 1 || core.output.has_warned() {
@@ -332,14 +332,16 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
         if has_reply || is_altered || !is_streaming || core.is_due(now) || core.diagnosis.is_outdated() {
             self.report(core, open, now);
         }
-        open.throttled_until =
-            open.allowance.as_mut().and_then(|allowance| allowance.rest(platform.now(), open.deadline));
+        open.throttled_until = open
+            .allowance
+            .as_mut()
+            .and_then(|allowance| allowance.throttled_until(platform.now(), open.deadline));
         Ok(())
     }
 
     /// Examines the session, and publishes and saves what has changed or is due.
     #[inline(never)]
-    fn report(&mut self, core: &mut LinkCore<'a, S>, open: &mut OpenLine<S::Line>, now: Nanos) {
+    fn report(&mut self, core: &mut LinkState<'a, S>, open: &mut OpenLine<S::Port>, now: Nanos) {
         let platform = core.platform;
         let session = &mut open.session;
         self.identity.save_once_known(session);
@@ -348,7 +350,7 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
             self.found_rate = Some(rate);
             saved_rates(core).iter().for_each(|rates| rates.save_rate(&core.link.port.name(), rate));
         }
-        if (has_changed || core.is_due(now)) && core.show_session(session, state) {
+        if (has_changed || core.is_due(now)) && core.publish_session_status(session, state) {
             self.identity.save(session, platform.now());
             self.note_scanner(core, session, now);
             if core.stops_when_idle() {
@@ -369,7 +371,7 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
 
     /// Handles a scan or reply whose last byte arrived at `last`. A hub that was stopped could not report the silence
     /// before it, so detect it by the stamps.
-    fn note_silence(&self, core: &mut LinkCore<'a, S>, last: Nanos, is_backlogged: bool) {
+    fn note_silence(&self, core: &mut LinkState<'a, S>, last: Nanos, is_backlogged: bool) {
         if !is_backlogged && last > self.consecutive_until {
             core.output.note_silence();
         }
@@ -379,8 +381,8 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
     #[cold]
     fn change_rate(
         &mut self,
-        core: &mut LinkCore<'a, S>,
-        line: &S::Line,
+        core: &mut LinkState<'a, S>,
+        line: &S::Port,
         session: &mut PortSession,
         baud: u32,
     ) -> io::Result<()> {
@@ -394,7 +396,7 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
     }
 
     /// Logs once why the port rejects this rate.
-    pub(crate) fn log_rejected_rate(&mut self, core: &LinkCore<'a, S>, baud: u32, error: &dyn fmt::Display) {
+    pub(crate) fn log_rejected_rate(&mut self, core: &LinkState<'a, S>, baud: u32, error: &dyn fmt::Display) {
         if !self.rejected_rates.contains(&baud) {
             self.rejected_rates.push(baud);
             tracing::warn!("{}: {error}", core.link.name);
@@ -403,7 +405,7 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
 
     /// Saves the scanner that a search has found and that streams, and logs it once its model is known.
     #[cold]
-    fn note_scanner(&mut self, core: &LinkCore<'a, S>, session: &PortSession, now: Nanos) {
+    fn note_scanner(&mut self, core: &LinkState<'a, S>, session: &PortSession, now: Nanos) {
         let Some(memory) = session.memory() else { return };
         let (link, status) = (core.link, core.stats.last());
         let before = self.scanner.as_ref();
@@ -425,9 +427,9 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
             before.is_some() && (!is_same_family || known_model.is_some() && known_model != scanner.model);
         if is_reported && (is_exchanged || !self.is_scanner_logged) {
             self.is_scanner_logged = true;
-            let name = name_of(&scanner);
+            let name = scanner_name(&scanner);
             match before.filter(|_| is_exchanged) {
-                Some(before) => tracing::info!("{}: was {}, is now {name}", link.name, name_of(before)),
+                Some(before) => tracing::info!("{}: was {}, is now {name}", link.name, scanner_name(before)),
                 None if is_tty(core) => {
                     tracing::info!("{}: found {name} at {} baud", link.name, session.rate());
                 }
@@ -456,7 +458,7 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
 
 /// Returns the name of the model, or of the family if the model is unknown. A model that scanhub does not know has only
 /// a number.
-fn name_of(scanner: &KnownScanner) -> String {
+fn scanner_name(scanner: &KnownScanner) -> String {
     let family = scanner.memory.family.name();
     match &scanner.model {
         Some(number) if Status::is_model_number(number) => format!("{family} model {number} (unknown)"),
@@ -467,22 +469,22 @@ fn name_of(scanner: &KnownScanner) -> String {
 
 /// Restores the hub's settings of `line`, at `baud`, if another process has changed them. Returns whether it has.
 #[cold]
-fn restore<S: Platform>(core: &mut LinkCore<'_, S>, line: &S::Line, baud: u32) -> io::Result<bool> {
-    let Some(alteration) = line.altered()? else { return Ok(false) };
+fn restore<S: Platform>(core: &mut LinkState<'_, S>, line: &S::Port, baud: u32) -> io::Result<bool> {
+    let Some(alteration) = line.alteration()? else { return Ok(false) };
     line.restore(baud)?;
     let program = || core.platform.altering_program(&core.link.port);
-    core.diagnosis.note_altered(alteration, program, core.platform.now());
+    core.diagnosis.note_settings_change(alteration, program, core.platform.now());
     Ok(true)
 }
 
 /// Returns the store of baud rates, if the link has one.
-fn saved_rates<'a, S: Platform>(core: &LinkCore<'a, S>) -> Option<&'a dyn SavedState> {
+fn saved_rates<'a, S: Platform>(core: &LinkState<'a, S>) -> Option<&'a dyn SavedState> {
     core.platform.saved_state().filter(|_| is_tty(core))
 }
 
 /// Returns whether the port is a tty, whose rate can be changed.
-fn is_tty<S: Platform>(core: &LinkCore<'_, S>) -> bool {
-    matches!(core.link.port, Source::Tty(_))
+fn is_tty<S: Platform>(core: &LinkState<'_, S>) -> bool {
+    matches!(core.link.port, PortSpec::Tty(_))
 }
 
 /// Bytes that were already buffered in a tty when the hub opened it, for example because the previous hub was killed.
@@ -495,28 +497,28 @@ struct Backlog {
     /// Time of the last read.
     read_at: Nanos,
     /// Time since when the bytes have arrived no faster than the line can carry them.
-    calm_since: Option<Nanos>,
+    idle_since: Option<Nanos>,
     /// Maximum number of buffered bytes that are left.
-    left: usize,
+    remaining: usize,
 }
 
 impl Backlog {
     /// Creates the backlog of a port that is opened at `now`, whose driver reports `waiting` bytes. `None` if there are
     /// none.
     fn new(waiting: usize, now: Nanos) -> Option<Backlog> {
-        (waiting > 0).then_some(Backlog { read_at: now, calm_since: None, left: MAX_BACKLOG })
+        (waiting > 0).then_some(Backlog { read_at: now, idle_since: None, remaining: MAX_BACKLOG })
     }
 
     /// Notes that `len` bytes were read at `now` from a line of `baud`. Returns whether they may have been buffered, or
     /// more buffered bytes may follow.
-    fn take(&mut self, len: usize, baud: u32, now: Nanos) -> bool {
+    fn note_read(&mut self, len: usize, baud: u32, now: Nanos) -> bool {
         let elapsed = now.saturating_sub(std::mem::replace(&mut self.read_at, now));
-        self.left = self.left.saturating_sub(len);
-        if line_time(len, baud) > elapsed + BURST {
-            self.calm_since = None;
+        self.remaining = self.remaining.saturating_sub(len);
+        if line_time(len, baud) > elapsed + MAX_BURST_TIME {
+            self.idle_since = None;
         }
-        let calm_since = *self.calm_since.get_or_insert(now);
-        self.left > 0 && now < calm_since + CALM_TIME
+        let calm_since = *self.idle_since.get_or_insert(now);
+        self.remaining > 0 && now < calm_since + IDLE_TIME
     }
 }
 
@@ -536,7 +538,7 @@ impl SettingsCheck {
     }
 
     /// Notes a telegram, or that the session has set the rate: the port has the hub's settings.
-    fn pass(&mut self) {
+    fn reset(&mut self) {
         self.bytes_since = None;
     }
 
@@ -546,7 +548,7 @@ impl SettingsCheck {
         let is_silent = state == line::State::Silent;
         let has_stopped = is_silent && !self.was_silent;
         self.was_silent = is_silent;
-        let is_due = has_stopped || self.bytes_since.is_some_and(|since| now >= since + CHECK_AFTER);
+        let is_due = has_stopped || self.bytes_since.is_some_and(|since| now >= since + TELEGRAM_TIMEOUT);
         if is_due {
             self.bytes_since = None;
         }
@@ -620,11 +622,11 @@ const MODEL_TIMEOUT: Nanos = 10_000 * MILLIS;
 /// Maximum length of a backlog in bytes: more than a native port (64 kB) and its line discipline (4 kB) hold.
 const MAX_BACKLOG: usize = 70_000;
 /// Time whose bytes an adapter may deliver at once.
-const BURST: Nanos = 20 * MILLIS;
+const MAX_BURST_TIME: Nanos = 20 * MILLIS;
 /// Maximum time that a driver takes to move buffered bytes from one of its buffers to the next.
-const CALM_TIME: Nanos = 10 * MILLIS;
+const IDLE_TIME: Nanos = 10 * MILLIS;
 /// Longer than any scanner takes for a telegram, except an LMS at 9600 and 19200 baud, where a check is wasted.
-const CHECK_AFTER: Nanos = 300 * MILLIS;
+const TELEGRAM_TIMEOUT: Nanos = 300 * MILLIS;
 /// Length of a stamp in bytes.
 const STAMP_LEN: usize = size_of::<Nanos>();
 /// Maximum age of a saved identity. After this time, a different scanner may be connected. The record is written every
@@ -649,7 +651,7 @@ mod tests {
             // A driver that has just moved its buffers returns few bytes for a moment.
             let (len, left_behind) = if read == 2 && left > 0 { (40, len - 40) } else { (len, 0) };
             left += left_behind;
-            if !backlog.take(len, BAUD, now) {
+            if !backlog.note_read(len, BAUD, now) {
                 return backlogged;
             }
             backlogged += len;
@@ -669,7 +671,7 @@ mod tests {
     #[test]
     fn backlog_of_a_line_faster_than_its_rate_ends() {
         let mut backlog = Backlog::new(100, 0).expect("bytes wait");
-        let reads = (1..1_000).take_while(|read| backlog.take(1_500, BAUD, read * MILLIS)).count();
+        let reads = (1..1_000).take_while(|read| backlog.note_read(1_500, BAUD, read * MILLIS)).count();
         assert!((40..50).contains(&reads), "{reads}");
     }
 
@@ -681,7 +683,7 @@ mod tests {
                 let now = ms * MILLIS;
                 check.note_bytes(now);
                 if ms % telegram_every == 0 {
-                    check.pass();
+                    check.reset();
                 }
                 check.is_due(line::State::Streaming, now)
             });

@@ -10,13 +10,13 @@ use std::thread::{self, Scope, ScopedJoinHandle};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use scanhub_config::{Config, Link};
-use scanhub_port::{Port, Source, clock};
+use scanhub_port::{Port, PortSpec, clock};
 use scanhub_schema::{Failure, Kind, MILLIS, Nanos};
 use scanhub_shm::Node;
 use scanhub_shm::{Domain, HubLock, StateDirectory};
 
 use crate::control::{ControlQueue, ControlServer};
-use crate::link::LinkCore;
+use crate::link::LinkState;
 use crate::platform::Platform as _;
 use crate::player::{Player, PlayerHandle};
 use crate::process::{
@@ -25,14 +25,14 @@ use crate::process::{
 use crate::reconnect::LiveLink;
 use crate::reload::{ConfigLoader, Reload};
 use crate::replay;
-use crate::replay::{Recorded, ReplayPart};
+use crate::replay::{RecordedSensor, ReplayPart};
 use crate::saved_state::{StateSaver, StateWriter};
 use crate::service::{Service, Watchdog};
 use crate::system::{LinkResources, System};
 
 /// Report that the hub is ready.
 #[derive(Clone, Debug)]
-pub struct Ready {
+pub struct StartReport {
     /// Random ID of this run of the hub.
     pub boot: u64,
     /// Names of the sensors.
@@ -48,14 +48,14 @@ pub struct Ready {
 pub(crate) struct ReplaySet<'a> {
     pub(crate) player: &'a Player,
     /// Recording of each link.
-    pub(crate) parts: Vec<Recorded>,
+    pub(crate) parts: Vec<RecordedSensor>,
     /// Whether the hub continues after everything was played.
     pub(crate) holds: bool,
 }
 
 /// Outcome of the start of a link.
 #[derive(PartialEq)]
-enum Start {
+enum LinkStart {
     /// With an open port, or with a recording.
     Open,
     /// Without its port, which cannot be opened yet, or to which no connection is made yet.
@@ -93,26 +93,26 @@ impl EndOfPlayback<'_> {
 ///
 /// Returns the error of `read` at the start. Returns [`Kind::DomainHeld`] if another hub has the domain, and
 /// [`Kind::NameHeld`] if another process publishes under the name of a link that plays a recording. Returns
-/// [`Kind::Short`] if memory or descriptors are short, [`Kind::PortNotTty`] if a port is not a serial line, and
+/// [`Kind::ResourceExhausted`] if memory or descriptors are short, [`Kind::PortNotTty`] if a port is not a serial line, and
 /// [`Kind::Failed`] if shared memory refuses. The hub waits for a port that cannot be opened for another reason, and
 /// for a name that another process has.
 pub fn run(
-    read: &dyn Fn() -> Result<Config, Failure>,
+    load_config: &dyn Fn() -> Result<Config, Failure>,
     domain: &Domain,
-    on_ready: impl FnOnce(&Ready),
+    on_ready: impl FnOnce(&StartReport),
 ) -> Result<(), Failure> {
-    let config = read()?;
-    serve(read, config, None, domain, on_ready)
+    let config = load_config()?;
+    serve(load_config, config, None, domain, on_ready)
 }
 
 /// Runs a hub that starts with `config`. If there is a `set`, all links play its recordings, and the hub ends with
 /// them.
 pub(crate) fn serve(
-    read: ConfigLoader<'_>,
+    load_config: ConfigLoader<'_>,
     config: Config,
     set: Option<ReplaySet<'_>>,
     domain: &Domain,
-    on_ready: impl FnOnce(&Ready),
+    on_ready: impl FnOnce(&StartReport),
 ) -> Result<(), Failure> {
     let service = Service::of_process();
     raise_descriptor_limit();
@@ -144,13 +144,13 @@ pub(crate) fn serve(
     };
     let player = end_of_playback.as_ref().map(|end_of_playback| end_of_playback.player);
     let hub = Hub {
-        boot: random(),
+        boot: random_id(),
         root: domain.root(),
         node: &node,
         service: &service,
         player,
         stop: EventFd::new()?,
-        worked: config.links.iter().map(|_| AtomicBool::new(true)).collect(),
+        activity: config.links.iter().map(|_| AtomicBool::new(true)).collect(),
         config,
         writer,
     };
@@ -163,18 +163,18 @@ pub(crate) fn serve(
             scanhub_shm::allocate(domain)?;
             lock.report_ready()?;
             on_ready(&ready);
-            service.ready(&ready.sensors, None);
+            service.notify_ready(&ready.sensors, None);
             player.iter().for_each(|player| player.begin());
             let is_alive = || threads.iter().all(|thread| !thread.is_finished());
-            let watchdog = Watchdog::new(&service, &hub.worked, clock::now());
-            let reload = Reload::new(&hub.config, read, &service);
+            let watchdog = Watchdog::new(&service, &hub.activity, clock::now());
+            let reload = Reload::new(&hub.config, load_config, &service);
             run_supervisor(&node, &signals, reload, &mut control, watchdog, end_of_playback, is_alive)
         });
-        service.stopping();
+        service.notify_stopping();
         hub.stop.signal();
         // Joined one by one, a thread that panicked is a failure of this function, not a panic of its own.
         let ended = threads.into_iter().map(|thread| thread.join()).collect::<Result<Vec<()>, _>>();
-        outcome.and(ended.map(drop).map_err(|_| broken_thread()))
+        outcome.and(ended.map(drop).map_err(|_| thread_failure()))
     })
 }
 
@@ -192,7 +192,7 @@ struct Hub<'a> {
     /// Ends the threads of the links.
     stop: EventFd,
     /// Set by each link when it has finished something.
-    worked: Vec<AtomicBool>,
+    activity: Vec<AtomicBool>,
     /// Ends after the links, and writes their last state.
     writer: Option<StateWriter>,
 }
@@ -204,8 +204,8 @@ impl Hub<'_> {
         &'s self,
         scope: &'s Scope<'s, '_>,
         queues: Vec<ControlQueue>,
-        parts: Vec<Recorded>,
-        report: &Sender<(usize, Result<Start, Failure>)>,
+        parts: Vec<RecordedSensor>,
+        report: &Sender<(usize, Result<LinkStart, Failure>)>,
         threads: &mut Vec<ScopedJoinHandle<'s, ()>>,
     ) -> Result<(), Failure> {
         let mut parts = parts.into_iter();
@@ -225,7 +225,7 @@ impl Hub<'_> {
             let report = report.clone();
             let body = move || {
                 let report = |outcome| drop(report.send((number, outcome)));
-                let system = System::new(resources, &link.name, &self.worked[number], save_slot);
+                let system = System::new(resources, &link.name, &self.activity[number], save_slot);
                 run_link(link, number as u8, self.boot, &system, queue, part, report);
             };
             let thread = thread::Builder::new().name(link.name.clone()).spawn_scoped(scope, body);
@@ -235,21 +235,24 @@ impl Hub<'_> {
     }
 
     /// Waits until all links have started.
-    fn await_starts(&self, reports: &Receiver<(usize, Result<Start, Failure>)>) -> Result<Ready, Failure> {
+    fn await_starts(
+        &self,
+        reports: &Receiver<(usize, Result<LinkStart, Failure>)>,
+    ) -> Result<StartReport, Failure> {
         let links = &self.config.links;
         // In the order of the links, although they report in any order.
         let reports = reports.iter().take(links.len());
         let starts: BTreeMap<_, _> =
             reports.map(|(number, start)| Ok((number, start?))).collect::<Result<_, Failure>>()?;
-        let names = |is_counted: fn(&Start) -> bool| {
+        let names = |is_counted: fn(&LinkStart) -> bool| {
             let counted = starts.iter().filter(|(_, start)| is_counted(start));
             counted.map(|(&number, _)| links[number].name.clone()).collect()
         };
-        Ok(Ready {
+        Ok(StartReport {
             boot: self.boot,
             sensors: links.iter().map(|link| link.name.clone()).collect(),
-            waiting: names(|start| *start != Start::Open),
-            taken: names(|start| *start == Start::Taken),
+            waiting: names(|start| *start != LinkStart::Open),
+            taken: names(|start| *start == LinkStart::Taken),
         })
     }
 }
@@ -273,27 +276,29 @@ fn run_link(
     system: &System<'_>,
     queue: ControlQueue,
     part: Option<ReplayPart<'_>>,
-    report: impl FnOnce(Result<Start, Failure>),
+    report: impl FnOnce(Result<LinkStart, Failure>),
 ) {
     match &link.port {
         // A recording does not wait for its name: the other links of the hub may play with it.
-        Source::File { path, paced } => {
-            match system.take_name().and_then(|()| LinkCore::new(link, number, boot, system, queue)) {
+        PortSpec::File { path, paced } => {
+            match system.take_name().and_then(|()| LinkState::new(link, number, boot, system, queue)) {
                 Ok(core) => {
-                    replay::run(core, part, path, *paced, |outcome| report(outcome.map(|()| Start::Open)));
+                    replay::run(core, part, path, *paced, |outcome| {
+                        report(outcome.map(|()| LinkStart::Open))
+                    });
                 }
                 Err(failure) => report(Err(failure)),
             }
         }
-        Source::Tty(_) | Source::Tcp { .. } => match LiveLink::new(link, number, boot, system, queue) {
+        PortSpec::Tty(_) | PortSpec::Tcp { .. } => match LiveLink::new(link, number, boot, system, queue) {
             Ok(live) => {
-                system.drive(live, |live| {
+                system.run_link(live, |live| {
                     report(Ok(if live.lacks_name() {
-                        Start::Taken
+                        LinkStart::Taken
                     } else if live.is_waiting() {
-                        Start::Waiting
+                        LinkStart::Waiting
                     } else {
-                        Start::Open
+                        LinkStart::Open
                     }));
                 });
             }
@@ -321,7 +326,7 @@ fn run_supervisor(
         let mut fds =
             [end, hangup, requests, outcomes, over].map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN));
         let until = end_of_playback.as_ref().and_then(|end_of_playback| end_of_playback.ends_at);
-        let span = until.map_or(CHECK_INTERVAL, |until| clock::span(clock::now(), until));
+        let span = until.map_or(CHECK_INTERVAL, |until| clock::poll_timeout(clock::now(), until));
         // A signal ends the wait with an error, and is taken below.
         let _ = poll(&mut fds, Some(&span));
         match signals.take() {
@@ -332,7 +337,7 @@ fn run_supervisor(
         // Even without a wake-up: requests after one that could not be received were announced together with it.
         control.serve();
         if !is_alive() {
-            return Err(broken_thread());
+            return Err(thread_failure());
         }
         let now = clock::now();
         if end_of_playback.as_mut().is_some_and(|end_of_playback| end_of_playback.has_ended(now)) {
@@ -346,7 +351,7 @@ fn run_supervisor(
     }
 }
 
-fn broken_thread() -> Failure {
+fn thread_failure() -> Failure {
     Failure::new(
         Kind::Failed,
         "a link's thread ended",
@@ -354,7 +359,7 @@ fn broken_thread() -> Failure {
     )
 }
 
-fn random() -> u64 {
+fn random_id() -> u64 {
     use std::hash::{BuildHasher, RandomState};
     RandomState::new().hash_one(std::process::id())
 }

@@ -10,15 +10,15 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use rustix::event::{PollFd, PollFlags, poll};
-use scanhub_port::{Allowance, Alteration, Dial, Port, PortError, Source, clock};
+use scanhub_port::{PendingConnection, Port, PortError, PortSpec, ReadBudget, SettingsChange, clock};
 use scanhub_schema::limits::TopicLimits;
-use scanhub_schema::{Failure, MILLIS, Nanos, Ring, Wake};
+use scanhub_schema::{DoorbellWord, Failure, MILLIS, Nanos, WakeEvent};
 use scanhub_shm::{Directory, NameLock};
-use scanhub_shm::{Node, Payload, SharedMemory, Waker};
+use scanhub_shm::{Node, Payload, SharedMemory, WakeSender};
 
 use crate::control::ControlQueue;
-use crate::link::LinkCore;
-use crate::platform::{Line, Platform, SavedState, Wait, WaitSource, WakeReason};
+use crate::link::LinkState;
+use crate::platform::{Platform, PortIo, SavedState, Wait, WaitSource, WakeReason};
 use crate::process::EventFd;
 use crate::reconnect::LiveLink;
 use crate::saved_state::SaveSlot;
@@ -26,15 +26,15 @@ use crate::service::Service;
 
 /// Platform of one link. It stays in the thread of the link.
 pub(crate) struct System<'a> {
-    hub: LinkResources<'a>,
+    resources: LinkResources<'a>,
     sensor: &'a str,
     /// Empty while another process has the sensor's name.
     name: OnceCell<HeldName>,
     /// Set whenever the link has finished something.
-    worked: &'a AtomicBool,
+    activity: &'a AtomicBool,
     save_slot: Option<SaveSlot<'a>>,
     /// The connection that is being made.
-    dial: RefCell<Option<Dial>>,
+    pending_connection: RefCell<Option<PendingConnection>>,
     /// Time of the last poll for requests, the end of the hub, and the line.
     polled_at: Cell<Nanos>,
     /// File of the record that outlives a killed hub; `None` if it cannot be written. The next hub then has to identify
@@ -44,7 +44,7 @@ pub(crate) struct System<'a> {
 
 /// The name of the sensor, which only this hub publishes under.
 struct HeldName {
-    waker: Waker,
+    waker: WakeSender,
     // Dropped last: the next process with this name creates its own doorbell.
     _lock: NameLock,
 }
@@ -67,50 +67,61 @@ impl<'a> System<'a> {
     /// Creates the platform of the link of `sensor` from the resources of `hub`. The link sets `worked` whenever it
     /// has finished something, and hands state over to `save_slot`.
     pub(crate) fn new(
-        hub: LinkResources<'a>,
+        resources: LinkResources<'a>,
         sensor: &'a str,
-        worked: &'a AtomicBool,
+        activity: &'a AtomicBool,
         save_slot: Option<SaveSlot<'a>>,
     ) -> System<'a> {
-        let (dial, polled_at, record) = (RefCell::default(), Cell::default(), OnceCell::new());
-        System { hub, sensor, name: OnceCell::new(), worked, save_slot, dial, polled_at, record }
+        let (pending_connection, polled_at, record) = (RefCell::default(), Cell::default(), OnceCell::new());
+        System {
+            resources,
+            sensor,
+            name: OnceCell::new(),
+            activity,
+            save_slot,
+            pending_connection,
+            polled_at,
+            record,
+        }
     }
 
     /// Runs `link` until the hub ends. Calls `on_start` once with the link: as soon as it has tried to open its port,
     /// but not later than [`START_TIMEOUT`].
-    pub(crate) fn drive(&self, mut link: LiveLink<'_, Self>, on_start: impl FnOnce(&LiveLink<'_, Self>)) {
-        let mut woken = WakeReason::Timeout;
+    pub(crate) fn run_link(&self, mut link: LiveLink<'_, Self>, on_start: impl FnOnce(&LiveLink<'_, Self>)) {
+        let mut wake_reason = WakeReason::Timeout;
         let (mut on_start, start_by) = (Some(on_start), clock::now() + START_TIMEOUT);
-        while woken != WakeReason::Stop {
+        while wake_reason != WakeReason::Stop {
             if let Some(on_start) = on_start.take_if(|_| link.has_tried() || clock::now() >= start_by) {
                 on_start(&link);
             }
-            let Wait { requests, on, until } = link.on_wakeup(woken);
+            let Wait { requests, source, until } = link.on_wakeup(wake_reason);
             let until = if on_start.is_some() { until.min(start_by) } else { until };
             let now = clock::now();
-            let dial = self.dial.borrow();
-            let port = match on {
+            let pending_connection = self.pending_connection.borrow();
+            let port = match source {
                 WaitSource::Nothing => None,
-                WaitSource::Opening => dial.as_ref().map(|dial| (dial.as_fd(), PollFlags::IN)),
+                WaitSource::Opening => pending_connection
+                    .as_ref()
+                    .map(|pending_connection| (pending_connection.as_fd(), PollFlags::IN)),
                 WaitSource::Bytes(line) => Some((line.as_fd(), PollFlags::IN)),
-                WaitSource::Loss(_) if self.sleeps(now, until) => {
-                    woken = WakeReason::Timeout;
+                WaitSource::Loss(_) if self.try_sleep(now, until) => {
+                    wake_reason = WakeReason::Timeout;
                     continue;
                 }
                 WaitSource::Loss(line) => Some((line.as_fd(), PollFlags::empty())),
             };
-            woken = self.wait(requests, port, now, until);
+            wake_reason = self.wait(requests, port, now, until);
         }
         link.end();
     }
 
     /// Sleeps from `now` until `until` instead of polling, if that is soon and the last poll was a moment ago. Returns
     /// whether it has. A poll of several descriptors, one of them a tty, costs more than the sleep.
-    fn sleeps(&self, now: Nanos, until: Nanos) -> bool {
+    fn try_sleep(&self, now: Nanos, until: Nanos) -> bool {
         let is_soon = until <= now + MAX_SLEEP && now < self.polled_at.get() + MAX_POLL_INTERVAL;
         if is_soon {
             std::thread::sleep(Duration::from_nanos(until.saturating_sub(now)));
-            self.worked.store(true, Ordering::Relaxed);
+            self.activity.store(true, Ordering::Relaxed);
         }
         is_soon
     }
@@ -124,14 +135,14 @@ impl<'a> System<'a> {
         until: Nanos,
     ) -> WakeReason {
         self.polled_at.set(now);
-        let span = clock::span(now, until);
-        let stop = self.hub.stop.as_fd();
+        let span = clock::poll_timeout(now, until);
+        let stop = self.resources.stop.as_fd();
         // Without a port, a second entry for `stop` that waits for nothing.
         let (port, events) = port.unwrap_or((stop, PollFlags::empty()));
         let mut fds = [(stop, PollFlags::IN), (requests.as_fd(), PollFlags::IN), (port, events)]
             .map(|(fd, events)| PollFd::from_borrowed_fd(fd, events));
         let ready = poll(&mut fds, Some(&span)).map(|_| fds.each_ref().map(|fd| !fd.revents().is_empty()));
-        self.worked.store(true, Ordering::Relaxed);
+        self.activity.store(true, Ordering::Relaxed);
         match ready {
             Ok([true, ..]) => WakeReason::Stop,
             Ok([_, true, _]) => WakeReason::Request,
@@ -142,8 +153,8 @@ impl<'a> System<'a> {
 
     fn record(&self, name: &str) -> Option<&File> {
         let open = || {
-            let file = match Directory::open(self.hub.root) {
-                Ok(Some(directory)) => directory.file_or_new(&format!("{name}.sensor")).map(Some),
+            let file = match Directory::open(self.resources.root) {
+                Ok(Some(directory)) => directory.open_or_create(&format!("{name}.sensor")).map(Some),
                 missing => missing.map(|_| None),
             };
             let log = |error: &_| tracing::debug!(%error, "{name}: the learned state cannot be saved");
@@ -153,7 +164,7 @@ impl<'a> System<'a> {
     }
 }
 
-impl LinkCore<'_, System<'_>> {
+impl LinkState<'_, System<'_>> {
     /// Waits until `event` is readable, for a request, or the end of the hub, at most until `until`. Meanwhile,
     /// publishes what is due.
     pub(crate) fn wait(&mut self, event: BorrowedFd<'_>, until: Nanos) -> WakeReason {
@@ -169,8 +180,8 @@ impl LinkCore<'_, System<'_>> {
 }
 
 impl Platform for System<'_> {
-    type Line = Port;
-    type Medium<P: Payload + ?Sized> = SharedMemory<P>;
+    type Port = Port;
+    type Transport<P: Payload + ?Sized> = SharedMemory<P>;
 
     fn now(&self) -> Nanos {
         clock::now()
@@ -189,74 +200,74 @@ impl Platform for System<'_> {
 
     fn take_name(&self) -> Result<(), Failure> {
         if self.name.get().is_none() {
-            let lock = NameLock::acquire(self.hub.root, self.sensor)?;
-            let waker = Waker::new(self.hub.node, self.sensor)?;
+            let lock = NameLock::acquire(self.resources.root, self.sensor)?;
+            let waker = WakeSender::new(self.resources.node, self.sensor)?;
             let _ = self.name.set(HeldName { waker, _lock: lock });
         }
         Ok(())
     }
 
-    fn open(&self, source: &Source, baud: u32) -> Option<Result<Port, PortError>> {
-        if let Some(dial) = self.dial.take() {
+    fn open(&self, source: &PortSpec, baud: u32) -> Option<Result<Port, PortError>> {
+        if let Some(dial) = self.pending_connection.take() {
             return Some(dial.finish());
         }
-        match Port::dial(source) {
-            None => Some(Port::attempt(source, baud, &AtomicBool::new(false))),
+        match Port::connect(source) {
+            None => Some(Port::try_open(source, baud, &AtomicBool::new(false))),
             Some(Err(error)) => Some(Err(error)),
             Some(Ok(dial)) => {
-                self.dial.replace(Some(dial));
+                self.pending_connection.replace(Some(dial));
                 None
             }
         }
     }
 
-    fn explain(&self, error: &PortError, source: &Source) -> Failure {
+    fn explain(&self, error: &PortError, source: &PortSpec) -> Failure {
         error.explain(source)
     }
 
-    fn altering_program(&self, source: &Source) -> Option<String> {
+    fn altering_program(&self, source: &PortSpec) -> Option<String> {
         match source {
-            Source::Tty(path) => scanhub_port::altering_program(path),
-            Source::Tcp { .. } | Source::File { .. } => None,
+            PortSpec::Tty(path) => scanhub_port::altering_program(path),
+            PortSpec::Tcp { .. } | PortSpec::File { .. } => None,
         }
     }
 
-    fn take_kept(&self, name: &str, source: &Source, baud: u32) -> Option<Port> {
+    fn take_kept_port(&self, name: &str, source: &PortSpec, baud: u32) -> Option<Port> {
         let mut adopted = None;
-        while let Some(line) = self.hub.service.take(name) {
+        while let Some(line) = self.resources.service.take(name) {
             match Port::adopt(line, source, baud).filter(|_| adopted.is_none()) {
                 Some(port) => adopted = Some(port),
                 // The port is unusable. Otherwise, the service manager would pass it to the next hub again.
-                None => self.hub.service.forget(name),
+                None => self.resources.service.release(name),
             }
         }
         adopted
     }
 
-    fn keep(&self, name: &str, line: &Port) {
+    fn keep_open(&self, name: &str, line: &Port) {
         if let Port::Tty(_) = line {
-            self.hub.service.keep(name, line);
+            self.resources.service.keep(name, line);
         }
     }
 
     fn release(&self, name: &str) {
-        self.hub.service.forget(name);
+        self.resources.service.release(name);
     }
 
-    fn medium<P: Payload + ?Sized>(&self, sensor: &str) -> Result<SharedMemory<P>, Failure> {
-        let (wanted, topic) = (self.hub.limits.subscribers, P::TOPIC.name());
-        let medium = SharedMemory::new(self.hub.node, sensor, &self.hub.limits)?;
-        let places = medium.places();
-        if places < wanted {
+    fn transport<P: Payload + ?Sized>(&self, sensor: &str) -> Result<SharedMemory<P>, Failure> {
+        let (max_subscribers, topic) = (self.resources.limits.subscribers, P::TOPIC.name());
+        let medium = SharedMemory::new(self.resources.node, sensor, &self.resources.limits)?;
+        let slots = medium.subscriber_capacity();
+        if slots < max_subscribers {
             tracing::warn!(
-                "{sensor}/{topic} has places for {places} subscribers, not for {wanted}: those of an earlier hub keep it; stop \
+                "{sensor}/{topic} has places for {slots} subscribers, not for {max_subscribers}: those of an earlier hub keep it; stop \
                  them, then start the hub again"
             );
         }
         Ok(medium)
     }
 
-    fn attached(&self) -> Option<u32> {
+    fn attach_count(&self) -> Option<u32> {
         self.name.get().map(|name| name.waker.attached())
     }
 
@@ -264,14 +275,14 @@ impl Platform for System<'_> {
         self.name.get().is_some_and(|name| name.waker.has_listeners())
     }
 
-    fn ring(&self, ring: Ring) {
+    fn ring(&self, ring: DoorbellWord) {
         if let Some(name) = self.name.get() {
             name.waker.ring(ring);
         }
     }
 
-    fn notify_event(&self, why: Wake) {
-        if let Some(Err(failure)) = self.name.get().map(|name| name.waker.tell(why)) {
+    fn notify_event(&self, why: WakeEvent) {
+        if let Some(Err(failure)) = self.name.get().map(|name| name.waker.notify(why)) {
             log_unnotified(&failure);
         }
     }
@@ -291,7 +302,7 @@ impl Platform for System<'_> {
     }
 }
 
-impl Line for Port {
+impl PortIo for Port {
     fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
         self.read(buffer)
     }
@@ -304,8 +315,8 @@ impl Line for Port {
         self.try_baud(baud)
     }
 
-    fn altered(&self) -> io::Result<Option<Alteration>> {
-        self.altered()
+    fn alteration(&self) -> io::Result<Option<SettingsChange>> {
+        self.changed_settings()
     }
 
     fn restore(&self, baud: u32) -> io::Result<()> {
@@ -316,12 +327,12 @@ impl Line for Port {
         self.set_dtr(on)
     }
 
-    fn waiting(&self) -> Option<usize> {
-        self.waiting()
+    fn buffered_len(&self) -> Option<usize> {
+        self.buffered_bytes()
     }
 
-    fn allowance(&self, baud: u32) -> Option<Allowance> {
-        self.allowance(baud)
+    fn read_budget(&self, baud: u32) -> Option<ReadBudget> {
+        self.read_budget(baud)
     }
 
     fn line_errors(&self) -> u64 {
@@ -333,7 +344,7 @@ impl Line for Port {
     }
 
     fn is_simulated(&self) -> bool {
-        self.simulated()
+        self.is_simulated()
     }
 }
 

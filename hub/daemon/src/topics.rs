@@ -4,13 +4,13 @@
 //! [`Publishers`] has one publisher for each topic of a link, from the table of topics. `link_output.rs` fills and sends
 //! the samples of a scan.
 
-use scanhub_drivers::line::Received;
-use scanhub_schema::limits::history;
+use scanhub_drivers::line::ReceivedTelegram;
+use scanhub_schema::limits::history_len;
 use scanhub_schema::{
-    Background, Failure, Family, Flags, Header, MILLIS, Nanos, Pace, Quality, Ring, Status, Topic, Wake,
-    Zones,
+    Background, DoorbellWord, Failure, Family, Flags, Header, MILLIS, Nanos, PublishRate, Quality, Status,
+    Topic, WakeEvent, Zones,
 };
-use scanhub_shm::DueRings;
+use scanhub_shm::PendingWakeups;
 
 use crate::early::EarlyMessage;
 use crate::platform::Platform;
@@ -33,12 +33,12 @@ macro_rules! publishers {
 
             /// Checks which topics have subscribers, and connects new ones.
             fn look(&mut self) {
-                $(self.$name.look();)*
+                $(self.$name.find_subscribers();)*
             }
 
             /// Gives new subscribers the history of the topics that have one.
             fn deliver_history(&self) {
-                $(if history(Topic::$topic) > 0 {
+                $(if history_len(Topic::$topic) > 0 {
                     self.$name.connect();
                 })*
             }
@@ -78,7 +78,7 @@ impl<S: Platform> Publishers<S> {
         }
     }
 
-    /// Returns the last stage before the doorbell [`Ring::First`] whose topics had a subscriber at the last look;
+    /// Returns the last stage before the doorbell [`DoorbellWord::First`] whose topics had a subscriber at the last look;
     /// `Telegram` if none had one.
     fn first_awaited(&self) -> Stage {
         if self.zones.has_subscribers() {
@@ -118,14 +118,14 @@ pub(crate) enum Stage {
 }
 
 /// Publisher of one topic.
-type Publisher<P, S> = PreparedPublisher<P, <S as Platform>::Medium<P>>;
+type Publisher<P, S> = PreparedPublisher<P, <S as Platform>::Transport<P>>;
 
 /// The topics of one sensor. They belong to the thread of its link.
 pub(crate) struct Topics<'a, S: Platform> {
     platform: &'a S,
     pub(crate) publishers: Publishers<S>,
     /// Doorbells that have to ring for samples that were sent.
-    pub(crate) due: DueRings,
+    pub(crate) due: PendingWakeups,
     /// Template for the header of the next sample.
     header: Header,
     /// Whether `header.wall_ns` comes from a recording.
@@ -134,10 +134,10 @@ pub(crate) struct Topics<'a, S: Platform> {
     last_revolution: LastStamps,
     next_seq: u64,
     /// [`Platform::attached`] at the last look for subscribers.
-    attached: Option<u32>,
+    attach_count: Option<u32>,
     /// Whether the event of the link had a listener at the last look.
     has_listeners: bool,
-    /// Stage after which [`Ring::First`] rings, as of the last look.
+    /// Stage after which [`DoorbellWord::First`] rings, as of the last look.
     first_awaited: Stage,
     /// Stage after which all doorbells ring and the event is sent, as of the last look.
     last_awaited: Stage,
@@ -154,13 +154,13 @@ impl<'a, S: Platform> Topics<'a, S> {
         Ok(Topics {
             platform,
             publishers: Publishers::new(platform, sensor)?,
-            due: DueRings::default(),
+            due: PendingWakeups::default(),
             header,
             is_recorded: false,
             last_telegram: LastStamps::default(),
             last_revolution: LastStamps::default(),
             next_seq: 0,
-            attached: None,
+            attach_count: None,
             has_listeners: false,
             first_awaited: Stage::Telegram,
             last_awaited: Stage::Scan,
@@ -185,18 +185,18 @@ impl<'a, S: Platform> Topics<'a, S> {
     /// Looks for subscribers if any may have attached since the last look. Called when a header is made, before its
     /// samples are loaned and sent: a new subscriber gets the next sample, and without one, this is one look at one word
     /// for all topics.
-    fn note_attached(&mut self) {
-        let attached = self.platform.attached();
-        if attached.is_none() || attached != self.attached {
-            self.attached = attached;
-            self.look();
+    fn find_new_subscribers(&mut self) {
+        let attached = self.platform.attach_count();
+        if attached.is_none() || attached != self.attach_count {
+            self.attach_count = attached;
+            self.find_subscribers();
         }
     }
 
     /// Looks for the subscribers of all topics and the listeners of the event. Subscribers that were attached by another
     /// library than this project's are found only here.
     #[cold]
-    pub(crate) fn look(&mut self) {
+    pub(crate) fn find_subscribers(&mut self) {
         self.publishers.look();
         self.has_listeners = self.platform.has_listeners();
         self.first_awaited = self.publishers.first_awaited();
@@ -206,36 +206,36 @@ impl<'a, S: Platform> Topics<'a, S> {
     /// Takes loans for a telegram that is about to arrive, if it is as long as the last one, and for the results of its
     /// scan. Connects new subscribers now instead of while the telegram waits.
     pub(crate) fn prepare(&mut self) {
-        self.note_attached();
+        self.find_new_subscribers();
         self.publishers.prepare(self.last_awaited);
     }
 
     /// Returns whether a topic of `stage` or of a later one had a subscriber at the last look.
-    pub(crate) fn awaits(&self, stage: Stage) -> bool {
+    pub(crate) fn is_awaited(&self, stage: Stage) -> bool {
         self.last_awaited >= stage
     }
 
     /// Wakes the subscribers that wait for no later stage than `stage`, whose samples were sent.
     pub(crate) fn end_stage(&mut self, stage: Stage) {
         if stage == self.last_awaited {
-            self.wake(Wake::Telegram);
+            self.wake(WakeEvent::Telegram);
         } else if stage == self.first_awaited {
-            self.ring(Ring::First);
+            self.ring(DoorbellWord::First);
         }
     }
 
     /// Publishes a telegram, or packets, whose period is 0. Later samples have its number and its stamps, until the next
     /// telegram.
-    pub(crate) fn telegram(&mut self, received: &Received<'_>, period_us: u32) {
+    pub(crate) fn publish_telegram(&mut self, received: &ReceivedTelegram<'_>, period_us: u32) {
         self.begin_telegram(received, period_us);
         self.publishers.telegram.send_bytes(received.bytes, &self.header, &mut self.due);
     }
 
-    fn begin_telegram(&mut self, received: &Received<'_>, period_us: u32) {
+    fn begin_telegram(&mut self, received: &ReceivedTelegram<'_>, period_us: u32) {
         self.header.seq = self.next_seq;
         self.next_seq += 1;
         self.begin(received.first, received.last, received.reasons, period_us);
-        let is_moved = self.last_telegram.order(&mut self.header);
+        let is_moved = self.last_telegram.make_increasing(&mut self.header);
         self.header.flags |= if received.estimated || is_moved { Flags::STAMP_ESTIMATED } else { 0 };
     }
 
@@ -243,12 +243,12 @@ impl<'a, S: Platform> Topics<'a, S> {
     /// `first` and `last` are the times of its first and last beam.
     pub(crate) fn begin_revolution(&mut self, first: Nanos, last: Nanos, reasons: u8, period_us: u32) {
         self.begin(first, last, reasons, period_us);
-        let is_moved = self.last_revolution.order(&mut self.header);
+        let is_moved = self.last_revolution.make_increasing(&mut self.header);
         self.header.flags |= if is_moved { Flags::STAMP_ESTIMATED } else { 0 };
     }
 
     fn begin(&mut self, first: Nanos, last: Nanos, reasons: u8, period_us: u32) {
-        self.note_attached();
+        self.find_new_subscribers();
         let now = self.platform.now();
         (self.header.stamp_first_ns, self.header.stamp_last_ns) = (first, last);
         if !self.is_recorded {
@@ -275,7 +275,7 @@ impl<'a, S: Platform> Topics<'a, S> {
 
     /// Publishes an early warning and wakes its subscribers. `first` and `last` are the times of the measured part of
     /// the scan. `reasons` are the [`Reasons`](scanhub_schema::Reasons) so far.
-    pub(crate) fn early(
+    pub(crate) fn publish_early(
         &mut self,
         message: &EarlyMessage,
         first: Nanos,
@@ -301,9 +301,9 @@ impl<'a, S: Platform> Topics<'a, S> {
             *payload = message.early;
         }
         self.publishers.early.send(early, &header, &mut self.due);
-        if self.due.take(Ring::Early) {
-            self.platform.ring(Ring::Early);
-            self.notify_event(Wake::Early);
+        if self.due.take_due(DoorbellWord::Early) {
+            self.platform.ring(DoorbellWord::Early);
+            self.notify_event(WakeEvent::Early);
         }
     }
 
@@ -331,7 +331,7 @@ impl<'a, S: Platform> Topics<'a, S> {
     }
 
     /// Publishes the status as of `now`.
-    pub(crate) fn status(&mut self, status: &Status, now: u64) {
+    pub(crate) fn publish_status(&mut self, status: &Status, now: u64) {
         let header = self.header_at(now);
         let mut sample = self.publishers.status.loan(0);
         if let Some(payload) = sample.payload_mut() {
@@ -342,55 +342,55 @@ impl<'a, S: Platform> Topics<'a, S> {
 
     /// Wakes the subscribers that have received samples since they were last woken. Called once per telegram, after its
     /// last sample.
-    pub(crate) fn wake(&mut self, why: Wake) {
-        for ring in Ring::ALL {
+    pub(crate) fn wake(&mut self, event: WakeEvent) {
+        for ring in DoorbellWord::ALL {
             self.ring(ring);
         }
-        self.notify_event(why);
+        self.notify_event(event);
     }
 
-    fn notify_event(&self, why: Wake) {
+    fn notify_event(&self, event: WakeEvent) {
         // A listener may have attached since the last look, with a subscriber that the last sample reached.
-        if self.has_listeners || self.platform.attached() != self.attached {
-            self.platform.notify_event(why);
+        if self.has_listeners || self.platform.attach_count() != self.attach_count {
+            self.platform.notify_event(event);
         }
     }
 
     /// Wakes the subscribers of the packets that were just published. Subscribers of scans alone are not woken.
     pub(crate) fn wake_for_packets(&mut self) {
         if self.publishers.telegram.has_reached() {
-            self.wake(Wake::Telegram);
+            self.wake(WakeEvent::Telegram);
         }
     }
 
     /// Rings the doorbell `ring` if samples were sent since the last time, to save the system call otherwise.
-    pub(crate) fn ring(&mut self, ring: Ring) {
-        if self.due.take(ring) {
-            self.platform.ring(ring);
+    pub(crate) fn ring(&mut self, word: DoorbellWord) {
+        if self.due.take_due(word) {
+            self.platform.ring(word);
         }
     }
 
     /// Returns whether a sample was sent whose doorbell has not rung yet.
     pub(crate) fn is_ring_due(&self) -> bool {
-        self.due != DueRings::default()
+        self.due != PendingWakeups::default()
     }
 
     /// Looks for subscribers, and gives new ones the history that they would otherwise get with the next sample.
     #[cold]
     pub(crate) fn deliver_history(&mut self) {
-        self.look();
+        self.find_subscribers();
         self.publishers.deliver_history();
     }
 
     /// Looks for subscribers, and returns whether any topic has one.
     pub(crate) fn has_subscribers(&mut self) -> bool {
-        self.look();
+        self.find_subscribers();
         self.publishers.has_subscribers(|_| true)
     }
 
     /// Looks for subscribers, and returns whether any topic other than `status` has one. Otherwise the scanner may stop.
     pub(crate) fn has_data_subscribers(&mut self) -> bool {
-        self.look();
+        self.find_subscribers();
         self.publishers.has_subscribers(|topic| topic != Topic::Status)
     }
 
@@ -408,17 +408,17 @@ impl<'a, S: Platform> Topics<'a, S> {
     /// their descriptors or those of the hub ran out. (Sending succeeds nevertheless.) The topics of scans count only
     /// while scans arrive (`streaming`). Topics that are published after a change never count, because that is seldom.
     pub(crate) fn starved_subscribers(&self, streaming: bool) -> usize {
-        self.publishers.undelivered(|topic| match topic.row().pace {
-            Pace::Scan => streaming,
-            Pace::Second => true,
-            Pace::Change => false,
+        self.publishers.undelivered(|topic| match topic.spec().publish_rate {
+            PublishRate::Scan => streaming,
+            PublishRate::Second => true,
+            PublishRate::Change => false,
         })
     }
 
     /// Returns the header of a sample that is published at `now` without a telegram. Called before its loan is taken,
     /// because it looks for new subscribers.
     pub(crate) fn header_at(&mut self, now: u64) -> Header {
-        self.note_attached();
+        self.find_new_subscribers();
         let wall_ns = if self.is_recorded {
             self.header.wall_ns
         } else {
@@ -439,14 +439,14 @@ struct LastStamps {
 impl LastStamps {
     /// Moves the stamps of `header` if they are not later than the last ones: to the last one plus 1 ns. Stamps of a
     /// replay are not changed. Returns whether a stamp was moved.
-    fn order(&mut self, header: &mut Header) -> bool {
+    fn make_increasing(&mut self, header: &mut Header) -> bool {
         if header.flags & Flags::REPLAYED != 0 {
             return false;
         }
         let (first_ns, wall_ns) = (header.stamp_first_ns, header.wall_ns);
-        header.stamp_first_ns = later(first_ns, self.first_ns);
+        header.stamp_first_ns = make_later(first_ns, self.first_ns);
         header.stamp_last_ns = header.stamp_last_ns.max(header.stamp_first_ns);
-        header.wall_ns = later(wall_ns, self.wall_ns);
+        header.wall_ns = make_later(wall_ns, self.wall_ns);
         (self.first_ns, self.wall_ns) = (header.stamp_first_ns, header.wall_ns);
         (self.first_ns, self.wall_ns) != (first_ns, wall_ns)
     }
@@ -454,7 +454,7 @@ impl LastStamps {
 
 /// Returns `stamp`, or `last` plus 1 ns if that is later. A clock that was set back by more than [`MAX_REVERSAL`] is
 /// accepted.
-fn later(stamp: u64, last: u64) -> u64 {
+fn make_later(stamp: u64, last: u64) -> u64 {
     if last.saturating_sub(stamp) > MAX_REVERSAL { stamp } else { stamp.max(last + 1) }
 }
 
@@ -491,7 +491,7 @@ mod tests {
         let mut order = |first: u64, wall: u64| {
             let mut header =
                 Header { stamp_first_ns: first, stamp_last_ns: first, wall_ns: wall, ..Header::default() };
-            let is_moved = last.order(&mut header);
+            let is_moved = last.make_increasing(&mut header);
             (header.stamp_first_ns, header.stamp_last_ns, header.wall_ns, is_moved)
         };
         let wall = 1_000 * MILLIS;
@@ -509,7 +509,7 @@ mod tests {
     }
 
     #[test]
-    fn a_sample_without_a_telegram_does_not_inherit_its_doubts() {
+    fn sample_without_telegram_does_not_inherit_quality() {
         let flags = Flags::SIMULATED | Flags::STAMP_ESTIMATED;
         let last = Header {
             seq: 7,

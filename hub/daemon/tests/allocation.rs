@@ -13,7 +13,7 @@ use std::sync::mpsc::channel;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use counting::{HELD, TAKEN, WATCHED};
+use counting::{ALLOCATIONS, HELD_BYTES, WATCHED_THREAD};
 use rustix::fs::{OFlags, fcntl_setfl};
 use rustix::io::Errno;
 use rustix::process::{Signal, getpid, kill_process};
@@ -22,8 +22,8 @@ use rustix::termios::tcgetattr;
 use scanhub_config::{Config, Sources};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::command::Request;
-use scanhub_drivers::lms::reply::{self, Health};
-use scanhub_drivers::lms::telegram::{ACK, Encoded, FRAME, MAX_TELEGRAM, STX, Telegram};
+use scanhub_drivers::lms::reply::{self, SimulatedStatus};
+use scanhub_drivers::lms::telegram::{ACK, EncodedTelegram, FRAME_LEN, MAX_TELEGRAM, STX, Telegram};
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
 use scanhub_schema::{Foreground, Marks, Scan};
 use scanhub_shm::Domain;
@@ -31,15 +31,15 @@ use scanhub_shm::{Payload, Subscriber};
 
 /// A scanner at the other end of a pty. Like a real one, it neither sends nor receives anything while the hub's port
 /// has another rate, and it streams until it gets a request to stop.
-struct Sensor {
+struct PtyScanner {
     line: OwnedFd,
-    heard: Vec<u8>,
-    streams: bool,
+    received: Vec<u8>,
+    is_streaming: bool,
     scans: u64,
 }
 
-impl Sensor {
-    fn new() -> (Sensor, String) {
+impl PtyScanner {
+    fn new() -> (PtyScanner, String) {
         let make = || -> rustix::io::Result<_> {
             let line = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY)?;
             grantpt(&line)?;
@@ -50,11 +50,11 @@ impl Sensor {
         };
         let (line, name) = make().expect("a pty");
         let name = name.into_string().expect("a name of ASCII");
-        (Sensor { line, heard: Vec::new(), streams: true, scans: 0 }, name)
+        (PtyScanner { line, received: Vec::new(), is_streaming: true, scans: 0 }, name)
     }
 
     /// Writes all of it, however long a busy machine keeps the hub from reading.
-    fn say(&self, mut bytes: &[u8]) {
+    fn send(&self, mut bytes: &[u8]) {
         let give_up_at = Instant::now() + Duration::from_secs(60);
         while !bytes.is_empty() {
             match rustix::io::write(&self.line, bytes) {
@@ -66,30 +66,30 @@ impl Sensor {
         }
     }
 
-    fn is_tuned(&self) -> bool {
+    fn has_matching_rate(&self) -> bool {
         tcgetattr(&self.line).is_ok_and(|termios| termios.output_speed() == Baud::B500000.rate())
     }
 
     fn send_scan(&mut self) {
-        if self.streams && self.is_tuned() {
+        if self.is_streaming && self.has_matching_rate() {
             self.scans += 1;
             let words = [1000 + (self.scans % 1000) as u16; 361];
-            self.say(lms::measured::encode(0, Unit::Mm, &words, 0x10).bytes());
+            self.send(lms::measured::encode(0, Unit::Mm, &words, 0x10).bytes());
         }
     }
 
     /// Replies to all requests that have arrived.
-    fn answer(&mut self) {
+    fn reply_to_all(&mut self) {
         let mut buffer = [0; 64];
         while let Ok(len @ 1..) = rustix::io::read(&self.line, &mut buffer) {
-            self.heard.extend(&buffer[..len]);
+            self.received.extend(&buffer[..len]);
         }
-        if !self.is_tuned() {
-            self.heard.clear();
+        if !self.has_matching_rate() {
+            self.received.clear();
         }
         while let Some(request) = self.next_request() {
             if let Some(reply) = self.reply(request) {
-                self.say(&[&[ACK], reply.bytes()].concat());
+                self.send(&[&[ACK], reply.bytes()].concat());
             }
         }
     }
@@ -97,41 +97,43 @@ impl Sensor {
     /// Takes the next request out of the bytes that have arrived, once all of it has.
     fn next_request(&mut self) -> Option<Request> {
         loop {
-            let begin = self.heard.iter().position(|&byte| byte == STX).unwrap_or(self.heard.len());
-            self.heard.drain(..begin);
-            let [_, _, low, high, ..] = self.heard[..] else { return None };
-            let len = usize::from(u16::from_le_bytes([low, high])) + FRAME;
-            if len <= MAX_TELEGRAM && self.heard.len() < len {
+            let begin = self.received.iter().position(|&byte| byte == STX).unwrap_or(self.received.len());
+            self.received.drain(..begin);
+            let [_, _, low, high, ..] = self.received[..] else { return None };
+            let len = usize::from(u16::from_le_bytes([low, high])) + FRAME_LEN;
+            if len <= MAX_TELEGRAM && self.received.len() < len {
                 return None;
             }
-            let telegram = self.heard.get(..len).and_then(Telegram::check);
+            let telegram = self.received.get(..len).and_then(Telegram::check);
             let request = telegram.and_then(Request::decode);
             // A request that the hub broke off hides no later one.
-            self.heard.drain(..if telegram.is_some() { len } else { 1 });
+            self.received.drain(..if telegram.is_some() { len } else { 1 });
             if request.is_some() {
                 return request;
             }
         }
     }
 
-    fn reply(&mut self, request: Request) -> Option<Encoded> {
-        let health = Health {
+    fn reply(&mut self, request: Request) -> Option<EncodedTelegram> {
+        let health = SimulatedStatus {
             software: *b"V02.30 ",
-            operating_mode: if self.streams { 0x24 } else { 0x25 },
+            operating_mode: if self.is_streaming { 0x24 } else { 0x25 },
             mode: Mode(1),
             variant: Variant::HALF,
             unit: Unit::Mm,
             baud: Baud::B500000,
         };
         match request {
-            Request::Status => Some(reply::status(0, &health, 0x10)),
-            Request::Type => Some(reply::kind(0, b"LMS200;301063;V02.30 ", 0x10)),
-            Request::Configuration => Some(reply::configuration(0, Mode(1), Unit::Mm, 0x10)),
-            Request::Variant(variant) => Some(reply::variant(0, variant == Variant::HALF, variant, 0x10)),
-            Request::Baud(baud) => Some(reply::mode(0, baud == Baud::B500000, 0x10)),
+            Request::Status => Some(reply::status_reply(0, &health, 0x10)),
+            Request::Type => Some(reply::type_reply(0, b"LMS200;301063;V02.30 ", 0x10)),
+            Request::Configuration => Some(reply::configuration_reply(0, Mode(1), Unit::Mm, 0x10)),
+            Request::Variant(variant) => {
+                Some(reply::variant_reply(0, variant == Variant::HALF, variant, 0x10))
+            }
+            Request::Baud(baud) => Some(reply::mode_reply(0, baud == Baud::B500000, 0x10)),
             Request::Stop | Request::Stream => {
-                self.streams = request == Request::Stream;
-                Some(reply::mode(0, true, 0x10))
+                self.is_streaming = request == Request::Stream;
+                Some(reply::mode_reply(0, true, 0x10))
             }
             _ => None,
         }
@@ -139,10 +141,10 @@ impl Sensor {
 }
 
 /// Sends scans until `count` more were published.
-fn stream(sensor: &mut Sensor, subscriber: &Subscriber<Scan>, count: u64) {
+fn stream(sensor: &mut PtyScanner, subscriber: &Subscriber<Scan>, count: u64) {
     for number in 0..count {
         let give_up_at = Instant::now() + Duration::from_secs(60);
-        sensor.answer();
+        sensor.reply_to_all();
         sensor.send_scan();
         let mut next_scan = Instant::now() + Duration::from_millis(50);
         while !matches!(Scan::receive(subscriber), Ok(Some(_))) {
@@ -150,11 +152,11 @@ fn stream(sensor: &mut Sensor, subscriber: &Subscriber<Scan>, count: u64) {
                 Instant::now() < give_up_at,
                 "scan {number} of {count} was not published; the scanner streams: {}, the port has its rate: {}, {} bytes of \
                  a request wait",
-                sensor.streams,
-                sensor.is_tuned(),
-                sensor.heard.len()
+                sensor.is_streaming,
+                sensor.has_matching_rate(),
+                sensor.received.len()
             );
-            sensor.answer();
+            sensor.reply_to_all();
             if Instant::now() > next_scan {
                 // Until the sensor was asked for its mode a scan cannot be read, and is none.
                 sensor.send_scan();
@@ -166,20 +168,20 @@ fn stream(sensor: &mut Sensor, subscriber: &Subscriber<Scan>, count: u64) {
 }
 
 /// Waits until the link rests: it has given back what the last loans took, and taken those for the next telegram.
-fn settle() {
-    let (mut held, mut same) = (HELD.load(Relaxed), 0);
+fn wait_until_idle() {
+    let (mut held, mut same) = (HELD_BYTES.load(Relaxed), 0);
     while same < 20 {
         thread::sleep(Duration::from_millis(10));
-        let now = HELD.load(Relaxed);
+        let now = HELD_BYTES.load(Relaxed);
         same = if now == held { same + 1 } else { 0 };
         held = now;
     }
 }
 
 /// A domain that goes with the test, however it ends.
-struct Place(Domain);
+struct TestDomain(Domain);
 
-impl Drop for Place {
+impl Drop for TestDomain {
     fn drop(&mut self) {
         let _ = self.0.root().parent().map(fs::remove_dir_all);
         for entry in fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
@@ -200,22 +202,22 @@ fn thread_named(name: &str) -> i32 {
 }
 
 /// Allocations of the link during a window of scans.
-struct Window {
+struct AllocationWindow {
     scans: u64,
     seconds: u64,
     /// Pieces of memory.
-    taken: u64,
+    allocations: u64,
     /// Bytes that were kept.
-    held: i64,
+    held_bytes: i64,
 }
 
 /// Returns what the link of a hub with these settings takes for four windows of scans. With `follow_all`, marks and
 /// foreground have subscribers too.
-fn windows(letter: char, follow_all: bool, set: &[&str]) -> [Window; 4] {
+fn windows(letter: char, follow_all: bool, set: &[&str]) -> [AllocationWindow; 4] {
     let name = format!("{letter}{}", std::process::id());
-    let place = Place(Domain::at(&name, format!("/tmp/{name}").as_ref()).expect("a domain"));
-    let domain = &place.0;
-    let (mut sensor, port) = Sensor::new();
+    let test_domain = TestDomain(Domain::at(&name, format!("/tmp/{name}").as_ref()).expect("a domain"));
+    let domain = &test_domain.0;
+    let (mut sensor, port) = PtyScanner::new();
     let sources = Sources {
         // On a busy machine, a search would begin again.
         links: vec![format!("heap={port},family=lms")],
@@ -234,7 +236,7 @@ fn windows(letter: char, follow_all: bool, set: &[&str]) -> [Window; 4] {
     let node = scanhub_shm::client_node(domain).expect("a node");
     let topic = Scan::open(&node, "heap").expect("a topic").expect("is there");
     let subscriber = Scan::subscriber(&node, &topic).expect("a subscriber");
-    let followers = follow_all.then(|| {
+    let subscribers = follow_all.then(|| {
         let marks = Marks::open(&node, "heap").expect("a topic").expect("is there");
         let foreground = Foreground::open(&node, "heap").expect("a topic").expect("is there");
         (
@@ -244,27 +246,28 @@ fn windows(letter: char, follow_all: bool, set: &[&str]) -> [Window; 4] {
     });
     // The rate, both questions, and what is made once.
     stream(&mut sensor, &subscriber, 50);
-    WATCHED.store(thread_named("heap"), Relaxed);
+    WATCHED_THREAD.store(thread_named("heap"), Relaxed);
     stream(&mut sensor, &subscriber, 50);
-    settle();
+    wait_until_idle();
     let windows = [50, 400, 50, 400].map(|count| {
-        let (scans, taken, held) = (sensor.scans, TAKEN.load(Relaxed), HELD.load(Relaxed));
-        let begun = Instant::now();
+        let (scans, allocations, held_bytes) =
+            (sensor.scans, ALLOCATIONS.load(Relaxed), HELD_BYTES.load(Relaxed));
+        let started = Instant::now();
         stream(&mut sensor, &subscriber, count);
-        settle();
-        Window {
+        wait_until_idle();
+        AllocationWindow {
             scans: sensor.scans - scans,
-            seconds: begun.elapsed().as_secs(),
-            taken: TAKEN.load(Relaxed) - taken,
-            held: HELD.load(Relaxed) - held,
+            seconds: started.elapsed().as_secs(),
+            allocations: ALLOCATIONS.load(Relaxed) - allocations,
+            held_bytes: HELD_BYTES.load(Relaxed) - held_bytes,
         }
     });
-    WATCHED.store(0, Relaxed);
-    if let Some((marks, foreground)) = &followers {
+    WATCHED_THREAD.store(0, Relaxed);
+    if let Some((marks, foreground)) = &subscribers {
         assert!(matches!(Marks::receive(marks), Ok(Some(_))), "marks came");
         assert!(matches!(Foreground::receive(foreground), Ok(Some(_))), "foreground came");
     }
-    drop((followers, subscriber, topic, node));
+    drop((subscribers, subscriber, topic, node));
     kill_process(getpid(), Signal::TERM).expect("a signal");
     assert_eq!(hub.join().expect("no panic"), Ok(()));
     windows
@@ -278,17 +281,21 @@ fn a_scan_takes_nothing_from_the_heap() {
         ('a', false, &["background.method=paper"][..], 2),
         ('b', true, &["background.publish=every-scan"][..], 5),
     ] {
-        for Window { scans, seconds, taken, held } in windows(letter, follow_all, set) {
+        for AllocationWindow { scans, seconds, allocations, held_bytes } in windows(letter, follow_all, set) {
             // Each topic takes a loan for a scan. There are more for a silence, and for a status each second and when the
             // state changes. If the scanner has sent a scan twice, the hub may have missed the first one.
-            let loans = topics * (scans - UNHEARD)..=topics * scans + OTHERS + 4 * seconds;
-            assert!(loans.contains(&taken), "{taken} pieces of memory for {scans} scans and {topics} topics");
-            assert_eq!(held, 0, "bytes kept of {scans} scans and {topics} topics");
+            let loans =
+                topics * (scans - MAX_MISSED_SCANS)..=topics * scans + MAX_OTHER_ALLOCATIONS + 4 * seconds;
+            assert!(
+                loans.contains(&allocations),
+                "{allocations} pieces of memory for {scans} scans and {topics} topics"
+            );
+            assert_eq!(held_bytes, 0, "bytes kept of {scans} scans and {topics} topics");
         }
     }
 }
 
 /// Scans in a window that may go unheard on a busy machine.
-const UNHEARD: u64 = 15;
+const MAX_MISSED_SCANS: u64 = 15;
 /// Loans for what is no scan: fewer than scans in a window.
-const OTHERS: u64 = 20;
+const MAX_OTHER_ALLOCATIONS: u64 = 20;

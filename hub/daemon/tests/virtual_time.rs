@@ -20,16 +20,16 @@ use tracing::{Event, Metadata, Subscriber};
 use virtual_hub::virtual_hub;
 
 /// A domain that goes with the test, however it ends.
-struct Place(Domain);
+struct TestDomain(Domain);
 
-impl Place {
-    fn new(letter: char) -> Place {
+impl TestDomain {
+    fn new(letter: char) -> TestDomain {
         let name = format!("{letter}{}", std::process::id());
-        Place(Domain::at(&name, format!("/tmp/test-memory-{name}").as_ref()).expect("a domain"))
+        TestDomain(Domain::at(&name, format!("/tmp/test-memory-{name}").as_ref()).expect("a domain"))
     }
 }
 
-impl Drop for Place {
+impl Drop for TestDomain {
     fn drop(&mut self) {
         let _ = fs::remove_dir_all(self.0.root());
         for entry in fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
@@ -52,9 +52,9 @@ fn two_links() -> Config {
 
 #[test]
 fn bytes_with_times_become_samples_with_stamps() {
-    let place = Place::new('m');
-    let received = virtual_hub(&two_links(), &place.0, |links| {
-        let node = scanhub_shm::client_node(&place.0).expect("a node");
+    let test_domain = TestDomain::new('m');
+    let received = virtual_hub(&two_links(), &test_domain.0, |links| {
+        let node = scanhub_shm::client_node(&test_domain.0).expect("a node");
         let service = Scan::open(&node, "b").expect("a topic").expect("is there");
         let subscriber = Scan::subscriber(&node, &service).expect("a subscriber");
         let mut received = Vec::new();
@@ -77,15 +77,15 @@ fn bytes_with_times_become_samples_with_stamps() {
         }
         received
     });
-    let told = |number: u64| (1, number - 1, number * 26_640_000, 100 * number as u16);
-    assert_eq!(received, Ok([1, 2, 3].map(told).to_vec()));
+    let expected = |number: u64| (1, number - 1, number * 26_640_000, 100 * number as u16);
+    assert_eq!(received, Ok([1, 2, 3].map(expected).to_vec()));
 }
 
 #[test]
-fn what_nobody_follows_is_not_made_and_a_status_tells_that_it_streams() {
-    let place = Place::new('n');
-    let outcome = virtual_hub(&two_links(), &place.0, |links| {
-        let node = scanhub_shm::client_node(&place.0).expect("a node");
+fn marks_need_a_subscriber_and_status_is_streaming() {
+    let test_domain = TestDomain::new('n');
+    let outcome = virtual_hub(&two_links(), &test_domain.0, |links| {
+        let node = scanhub_shm::client_node(&test_domain.0).expect("a node");
         let telegram = lms::measured::encode(0, Unit::Mm, &[500; 361], 0x10);
         assert_eq!(links[0].read(1, telegram.bytes()), 1);
         let marks = Marks::open(&node, "a").expect("a topic").expect("is there");
@@ -108,9 +108,9 @@ fn what_nobody_follows_is_not_made_and_a_status_tells_that_it_streams() {
 
 /// Collects the messages of the log.
 #[derive(Clone, Default)]
-struct Log(Arc<Mutex<Vec<String>>>);
+struct LogCollector(Arc<Mutex<Vec<String>>>);
 
-impl Subscriber for Log {
+impl Subscriber for LogCollector {
     fn enabled(&self, _: &Metadata<'_>) -> bool {
         true
     }
@@ -143,10 +143,10 @@ impl Subscriber for Log {
 }
 
 #[test]
-fn a_subscriber_that_does_not_announce_itself_is_found_within_a_tenth_of_a_second() {
-    let place = Place::new('f');
-    let outcome = virtual_hub(&two_links(), &place.0, |links| {
-        let node = scanhub_shm::client_node(&place.0).expect("a node");
+fn finds_unannounced_subscriber_within_154_ms() {
+    let test_domain = TestDomain::new('f');
+    let outcome = virtual_hub(&two_links(), &test_domain.0, |links| {
+        let node = scanhub_shm::client_node(&test_domain.0).expect("a node");
         let telegram = lms::measured::encode(0, Unit::Mm, &[500; 361], 0x10);
         assert_eq!(links[0].read(1, telegram.bytes()), 1);
         let scans = Scan::open(&node, "a").expect("a topic").expect("is there");
@@ -166,14 +166,14 @@ fn a_subscriber_that_does_not_announce_itself_is_found_within_a_tenth_of_a_secon
 }
 
 #[test]
-fn a_rate_that_the_port_rejects_is_logged_once_and_the_scanner_is_found() {
-    let place = Place::new('r');
+fn rejected_rate_is_logged_once_and_scanner_is_found() {
+    let test_domain = TestDomain::new('r');
     let sources = Sources { links: vec!["a=/dev/none,family=auto".to_owned()], ..Sources::default() };
     let config = Config::load(&sources).expect("a configuration");
-    let log = Log::default();
+    let log = LogCollector::default();
     let outcome = tracing::subscriber::with_default(log.clone(), || {
-        virtual_hub(&config, &place.0, |links| {
-            let node = scanhub_shm::client_node(&place.0).expect("a node");
+        virtual_hub(&config, &test_domain.0, |links| {
+            let node = scanhub_shm::client_node(&test_domain.0).expect("a node");
             let status = Status::open(&node, "a").expect("a topic").expect("is there");
             let status = Status::subscriber(&node, &status).expect("a subscriber");
             links[0].reject(&[500_000, 921_600, 256_000]);

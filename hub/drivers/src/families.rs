@@ -4,7 +4,8 @@ use std::fmt;
 
 use crate::line::family::{Features, Model, Probe};
 use crate::line::{
-    self, Account, Control, Identity, Introduction, KnownRate, Notice, Output, RawScan, Received, State,
+    self, Action, Control, DeviceInfo, Identity, KnownRate, Notice, RawScan, ReceivedTelegram, SessionStats,
+    State,
 };
 use crate::lms::Inquiry;
 use crate::settings::{Refusal, Settings, SettingsRequest};
@@ -13,20 +14,20 @@ use scanhub_schema::{Counters, Family, Nanos, ScanHead, Status};
 
 /// Declares the families, each with its name and its module, in the order in which the search looks for them.
 macro_rules! families {
-    ($($Family:ident $family:ident,)*) => {
+    ($($Family:ident $family:ident $Session:ident,)*) => {
         /// A session with a scanner of one of the families.
         #[expect(clippy::large_enum_variant, reason = "there is one per open port")]
         #[derive(Clone, Debug)]
         pub enum Session {
-            $(#[doc = concat!("Of family ", stringify!($family), ".")] $Family($family::Session),)*
+            $(#[doc = concat!("Of family ", stringify!($family), ".")] $Family($family::$Session),)*
         }
 
         /// Reason why a session does not stream as it should. Its text is the family's.
         #[derive(Clone, Copy, Debug, PartialEq)]
-        pub enum Trouble {
-            $(#[doc = concat!("Of family ", stringify!($family), ".")] $Family($family::Trouble),)*
+        pub enum Problem {
+            $(#[doc = concat!("Of family ", stringify!($family), ".")] $Family($family::Problem),)*
             /// The search has found no scanner.
-            Search(search::Trouble),
+            Search(search::Problem),
         }
 
         /// Returns the models and settings of `family`.
@@ -43,7 +44,7 @@ macro_rules! families {
             /// Creates a session with a scanner of `family`, on a port that is open at the rate of `settings`, or else
             /// of the model.
             pub fn begin(family: Family, settings: &Settings, now: Nanos) -> Session {
-                match family { $(Family::$Family => Session::$Family($family::Session::new((*settings).into(), now)),)* }
+                match family { $(Family::$Family => Session::$Family($family::$Session::new((*settings).into(), now)),)* }
             }
 
             /// Returns the family.
@@ -53,15 +54,15 @@ macro_rules! families {
         }
 
         /// Returns the trouble of a session of any family.
-        fn trouble(session: &Session) -> Option<Trouble> {
-            match session { $(Session::$Family(session) => line::Session::trouble(session).map(Trouble::$Family),)* }
+        fn problem(session: &Session) -> Option<Problem> {
+            match session { $(Session::$Family(session) => line::ScannerSession::problem(session).map(Problem::$Family),)* }
         }
 
-        impl fmt::Display for Trouble {
+        impl fmt::Display for Problem {
             fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
                 match self {
-                    $(Trouble::$Family(trouble) => trouble.fmt(f),)*
-                    Trouble::Search(trouble) => trouble.fmt(f),
+                    $(Problem::$Family(trouble) => trouble.fmt(f),)*
+                    Problem::Search(trouble) => trouble.fmt(f),
                 }
             }
         }
@@ -76,9 +77,9 @@ macro_rules! families {
 }
 
 families! {
-    Ld ld,
-    Lms lms,
-    Rplidar rplidar,
+    Ld ld LdSession,
+    Lms lms LmsSession,
+    Rplidar rplidar RplidarSession,
 }
 
 /// Returns the possible scan heads of a scanner of `family`, as far as `settings` and the family determine them. They have
@@ -87,8 +88,8 @@ pub fn scan_heads(family: Family, settings: &Settings) -> Vec<ScanHead> {
     match family {
         Family::Lms => lms::scan_heads(settings),
         Family::Ld | Family::Rplidar => {
-            let beams = settings.beams.or(settings.max_beams).unwrap_or(features(family).auto.beams);
-            vec![ScanHead::turning(family, beams)]
+            let beams = settings.beams.or(settings.max_beams).unwrap_or(features(family).defaults.beams);
+            vec![ScanHead::of_revolution(family, beams)]
         }
     }
 }
@@ -111,24 +112,24 @@ pub fn inquiry(family: Family, rate: Option<u32>, now: Nanos) -> Option<Inquiry>
 }
 
 /// Features of a link whose family is searched for: space for every scanner.
-pub const ANY: Features = {
+pub const ANY_FAMILY: Features = {
     let mut any = Features {
         models: &[],
         // Enough for every model.
-        auto: Model { name: "auto", baud: FIRST_RATE, beams: 3_240 },
+        defaults: Model { name: "auto", baud: FIRST_RATE, beams: 3_240 },
         modes: &[],
         keys: &[],
-        can_rest: false,
-        speaks_unasked: false,
+        can_stop_motor: false,
+        streams_unrequested: false,
         has_whole_telegrams: true,
         has_inquiry: false,
-        contents: 0,
+        array_flags: 0,
         max_telegram: 0,
     };
     let mut at = 0;
     while at < Family::ALL.len() {
         let features = features(Family::ALL[at]);
-        any.contents |= features.contents;
+        any.array_flags |= features.array_flags;
         if features.max_telegram > any.max_telegram {
             any.max_telegram = features.max_telegram;
         }
@@ -160,20 +161,20 @@ macro_rules! delegate {
 
 impl line::Protocol for Session {
     delegate! { Protocol &mut
-        fn spare() -> &mut [u8];
+        fn read_buffer() -> &mut [u8];
         fn commit(now: Nanos, len: usize);
         fn handle_timeout(now: Nanos);
-        fn transmitted(now: Nanos);
+        fn handle_transmitted(now: Nanos);
         fn reject_rate(now: Nanos);
-        fn poll_output() -> Output<'_>;
+        fn poll_action() -> Action<'_>;
     }
 }
 
-impl line::Session for Session {
-    type Trouble = Trouble;
+impl line::ScannerSession for Session {
+    type Problem = Problem;
 
-    fn trouble(&self) -> Option<Trouble> {
-        trouble(self)
+    fn problem(&self) -> Option<Problem> {
+        problem(self)
     }
 
     fn read_recorded<'a>(
@@ -181,11 +182,11 @@ impl line::Session for Session {
         telegram: &'a [u8],
         is_readable: bool,
         status: Option<&mut Status>,
-    ) -> Option<Received<'a>> {
-        each!(self, session => line::Session::read_recorded(session, telegram, is_readable, status))
+    ) -> Option<ReceivedTelegram<'a>> {
+        each!(self, session => line::ScannerSession::read_recorded(session, telegram, is_readable, status))
     }
 
-    delegate! { Session &mut
+    delegate! { ScannerSession &mut
         fn control(control: Control, now: Nanos);
         fn defer_read(now: Nanos, waiting: usize) -> bool;
         fn set_has_subscribers(now: Nanos, has_subscribers: bool);
@@ -198,25 +199,25 @@ impl line::Session for Session {
         fn mark_suspect(reasons: u8);
     }
 
-    delegate! { Session &
+    delegate! { ScannerSession &
         fn state() -> State;
-        fn missing() -> Option<&'static str>;
+        fn missing_transmission() -> Option<&'static str>;
         fn rate() -> u32;
-        fn account() -> Account;
+        fn stats() -> SessionStats;
         fn can_defer_read() -> bool;
         fn identity() -> Option<Identity>;
         fn known_rate() -> Option<KnownRate>;
         fn partial_scan() -> Option<RawScan<'_>>;
         fn model() -> Option<Model>;
         fn beams() -> Option<usize>;
-        fn other_model() -> Option<Model>;
+        fn unexpected_model() -> Option<Model>;
         fn unit_mm() -> Option<u8>;
         fn notice() -> Option<Notice>;
         fn missing_setting() -> Option<&'static str>;
         fn model_text() -> Option<String>;
-        fn stream_head(reported: &str, beams: Option<usize>) -> Vec<u8>;
+        fn stream_responses(reported: &str, beams: Option<usize>) -> Vec<u8>;
         fn write_details(text: &mut dyn fmt::Write);
-        fn introduction() -> Option<Introduction>;
+        fn device_info() -> Option<DeviceInfo>;
         fn scanner_time() -> Option<Nanos>;
         fn describe(status: &mut Status);
         fn add_counters(counters: &mut Counters);

@@ -7,39 +7,39 @@ mod point_count;
 mod sequence;
 mod session;
 
-use scanhub_schema::{Contents, Family, MILLIS, Nanos};
+use scanhub_schema::{ArrayFlags, Family, MILLIS, Nanos};
 
-use crate::ld::packet::{Framer, LEN, Packet};
-use crate::ld::sequence::{Place, Sequence};
-use crate::line::family::{self, Approach, Evidence, Features, Listen, named, table};
+use crate::ld::packet::{Framer, PACKET_LEN, Packet};
+use crate::ld::sequence::{PacketPosition, PacketSequencer};
+use crate::line::family::{self, Approach, Evidence, Features, ListenStep, named, table};
 use crate::line::framing::fill;
 use crate::settings::Settings;
 
-pub use crate::line::{Tally, TurnCounts};
-pub use session::{Session, Trouble};
+pub use crate::line::{ByteCounters, RevolutionCounts};
+pub use session::{LdSession, Problem};
 
 /// Models and settings of the family.
 pub const FEATURES: Features = Features {
     models: &MODELS,
     // Enough for all models but the STL27L.
-    auto: family::Model { name: "auto", baud: Model::Ld19.baud(), beams: 720 },
+    defaults: family::Model { name: "auto", baud: Model::Ld19.baud(), beams: 720 },
     modes: &[],
     keys: &[],
-    can_rest: false,
-    speaks_unasked: true,
+    can_stop_motor: false,
+    streams_unrequested: true,
     has_whole_telegrams: false,
     has_inquiry: false,
-    contents: Contents::TURNING,
-    max_telegram: session::MOST * LEN,
+    array_flags: ArrayFlags::REVOLUTION,
+    max_telegram: session::MAX_PACKETS_PER_SAMPLE * PACKET_LEN,
 };
 
 /// Describes a model for the configuration.
-const fn described(model: Model) -> family::Model {
+const fn describe(model: Model) -> family::Model {
     family::Model { name: model.name(), baud: model.baud(), beams: model.beams() }
 }
 
 /// All models, described for the configuration.
-const MODELS: [family::Model; Model::ALL.len()] = table!(Model::ALL, described);
+const MODELS: [family::Model; Model::ALL.len()] = table!(Model::ALL, describe);
 
 named! {
     /// A scanner of the family.
@@ -59,13 +59,13 @@ named! {
 
 impl Model {
     /// Returns the model called `name`.
-    pub fn named(name: &str) -> Option<Model> {
+    pub fn from_name(name: &str) -> Option<Model> {
         Model::ALL.into_iter().find(|model| model.name() == name)
     }
 
     /// Returns the model of `settings`.
     pub(crate) fn of(settings: &Settings) -> Option<Model> {
-        settings.model.and_then(Model::named)
+        settings.model.and_then(Model::from_name)
     }
 
     /// Returns the rate of its line, in bits per second.
@@ -86,7 +86,7 @@ impl Model {
     }
 
     /// Returns the number of revolutions per second of a new scanner.
-    pub const fn turns_per_second(self) -> u32 {
+    pub const fn revolutions_per_second(self) -> u32 {
         match self {
             Model::Ld14p => 6,
             _ => 10,
@@ -116,14 +116,14 @@ impl Model {
 #[derive(Clone, Debug)]
 pub struct Probe {
     framer: Framer,
-    sequence: Sequence,
+    sequence: PacketSequencer,
     /// Packets in sequence.
     packets: u32,
 }
 
 impl Default for Probe {
     fn default() -> Self {
-        Probe { framer: Framer::default(), sequence: Sequence::new(), packets: 0 }
+        Probe { framer: Framer::default(), sequence: PacketSequencer::new(), packets: 0 }
     }
 }
 
@@ -132,10 +132,10 @@ impl Probe {
     fn count(&mut self) {
         while let Some(span) = self.framer.advance(1) {
             let packet = self.framer.bytes(span).first_chunk().and_then(|bytes| Packet::check(bytes).ok());
-            match packet.map(|packet| self.sequence.place(&packet)) {
-                Some(Place::First { .. }) => self.packets = 1,
-                Some(Place::Next { .. }) => self.packets += 1,
-                Some(Place::Again | Place::Odd) | None => {}
+            match packet.map(|packet| self.sequence.locate(&packet)) {
+                Some(PacketPosition::First { .. }) => self.packets = 1,
+                Some(PacketPosition::Next { .. }) => self.packets += 1,
+                Some(PacketPosition::Repeated | PacketPosition::Outlier) | None => {}
             }
         }
     }
@@ -152,7 +152,7 @@ impl crate::line::family::Probe for Probe {
 
     fn receive(&mut self, mut bytes: &[u8]) {
         while !bytes.is_empty() {
-            let len = fill(self.framer.buffer.spare(), &mut bytes);
+            let len = fill(self.framer.buffer.read_buffer(), &mut bytes);
             self.framer.buffer.commit(len);
             self.count();
         }
@@ -170,7 +170,7 @@ impl crate::line::family::Probe for Probe {
     fn evidence(&self) -> Evidence {
         match self.packets {
             0 => Evidence::None,
-            1..PROOF => Evidence::Begun,
+            1..MIN_PROOF_PACKETS => Evidence::Partial,
             _ => Evidence::Found(None),
         }
     }
@@ -178,15 +178,15 @@ impl crate::line::family::Probe for Probe {
 
 const APPROACH: Approach = Approach {
     family: Family::Ld,
-    listens: &[
-        Listen { rate: Model::Ld19.baud(), span: 150 * MILLIS, needs_bytes: false },
-        Listen { rate: Model::Stl27l.baud(), span: 100 * MILLIS, needs_bytes: true },
+    listen_steps: &[
+        ListenStep { rate: Model::Ld19.baud(), duration: 150 * MILLIS, needs_bytes: false },
+        ListenStep { rate: Model::Stl27l.baud(), duration: 100 * MILLIS, needs_bytes: true },
     ],
-    asks: None,
+    request_steps: None,
     boot_rate: None,
-    max_transmission: LEN,
+    max_transmission: PACKET_LEN,
     advice: "it streams by itself once it has 5 V and its head rotates",
 };
 /// Packets in sequence that prove an LDROBOT. Each has a header and a checksum of 24 bits, and its angles and its clock have
 /// to continue those of the packet before.
-const PROOF: u32 = 4;
+const MIN_PROOF_PACKETS: u32 = 4;

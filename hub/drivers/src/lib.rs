@@ -14,7 +14,7 @@ pub mod rplidar;
 pub mod search;
 mod settings;
 
-pub use families::{ANY, Session, Trouble, features, inquiry, scan_heads};
+pub use families::{ANY_FAMILY, Problem, Session, features, inquiry, scan_heads};
 pub use line::family::{Features, Model};
 pub use lms::inquiry::{Inquiry, Report};
 pub use port_session::PortSession;

@@ -2,27 +2,27 @@
 //! scanners with a rotating head also packets, revolutions, and the grid that a revolution is put on. This module names
 //! no family.
 
-mod arrival;
+mod arrival_time;
 pub mod family;
 pub mod framing;
+mod revolutions;
 mod scan;
 mod sensor_clock;
 mod session;
 mod stream;
-mod turns;
 
 use scanhub_schema::Reasons;
 
-pub use arrival::{Arrivals, Flow};
-pub use framing::{Buffer, Tally};
-pub use scan::{BEAMS, Grid, NO_RETURN, NOT_MEASURED, Point, RawScan, Values, revolution_head};
+pub use arrival_time::{ReadLog, StreamTiming};
+pub use framing::{Buffer, ByteCounters};
+pub use revolutions::{ClosedRevolution, RevolutionAssembler, RevolutionCounts, RotationRate};
+pub use scan::{BEAM_RANGE, Grid, NO_RETURN, NOT_MEASURED, Point, RawScan, Values, revolution_head};
 pub use sensor_clock::SensorClock;
 pub use session::{
-    Account, Condition, Control, Event, Identity, Introduction, KnownRate, Notice, Output, Protocol,
-    Received, Session, State, Whole,
+    Action, Control, DeviceInfo, Event, HealthStatus, Identity, KnownRate, Notice, Protocol,
+    ReceivedTelegram, ScannerSession, SessionStats, State, TelegramContents,
 };
-pub use stream::{Reads, StreamCounters, Watchdog};
-pub use turns::{Closed, Pace, TurnCounts, Turns};
+pub use stream::{ReadScheduler, StreamCounters, Watchdog};
 
 /// Reasons why a telegram or packet is suspect: bits of `reasons`. A family sets those that it can detect.
 pub mod suspect {

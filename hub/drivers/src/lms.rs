@@ -3,21 +3,21 @@
 //!
 //! Here is what the family declares: its settings, and its recognizer.
 
-mod arrival;
-mod cadence;
+mod arrival_time;
 pub mod command;
 pub mod configuration;
-mod dialogue;
-pub mod exchange;
 pub mod explain;
-pub mod family;
 pub mod framer;
 pub mod header;
 pub mod inquiry;
+pub mod lms_model;
 pub mod measured;
 pub mod operating;
+mod protocol_state;
 mod rate;
 pub mod reply;
+pub mod request_channel;
+mod scan_schedule;
 mod sensor;
 pub mod session;
 mod start;
@@ -25,22 +25,22 @@ pub mod status;
 pub mod telegram;
 pub mod variant;
 
-use scanhub_schema::{Contents, Family, MICROS, MILLIS, Nanos, ScanHead};
+use scanhub_schema::{ArrayFlags, Family, MICROS, MILLIS, Nanos, ScanHead};
 
-use crate::line::family::{Approach, Asks, Evidence, Features, Listen, Model};
-use crate::lms::family::Family as Type;
-use crate::lms::framer::{Advance, Framer};
+use crate::line::family::{Approach, Evidence, Features, ListenStep, Model, RequestSteps};
+use crate::lms::framer::{FoundItem, Framer};
 use crate::lms::header::{Reject, State};
+use crate::lms::lms_model::LmsModel as Type;
 use crate::lms::reply::Reply;
 use crate::lms::telegram::MAX_TELEGRAM;
 use crate::lms::variant::{Baud, MAX_BEAMS, Mode, Unit, Variant};
-use crate::settings::{self, Key, Refusal, SettingsRequest, Value, refused};
+use crate::settings::{self, Key, Refusal, SettingsRequest, Value, refusal};
 
-pub use arrival::Lead;
-pub use dialogue::SILENCE;
+pub use arrival_time::WakeLead;
 pub use inquiry::Inquiry;
-pub use sensor::{Notice, Sensor, Trouble};
-pub use session::{Session, Settings};
+pub use protocol_state::SILENCE_TIMEOUT;
+pub use sensor::{Notice, Problem, Sensor};
+pub use session::{LmsSession, Settings};
 
 /// Recognizer of LMS telegrams.
 #[derive(Clone, Debug, Default)]
@@ -52,15 +52,15 @@ pub struct Probe {
 }
 
 impl Probe {
-    fn check(&mut self) {
+    fn check_bytes(&mut self) {
         while let Some(found) = self.framer.advance() {
             self.is_acknowledged = false;
             match found {
-                Advance::Telegram(span) => {
-                    self.is_found |= Reply::decode(self.framer.view(span).telegram).is_some();
+                FoundItem::Telegram(span) => {
+                    self.is_found |= Reply::decode(self.framer.telegram_at(span).telegram).is_some();
                 }
-                Advance::Ack => self.is_acknowledged = true,
-                Advance::Nak => {}
+                FoundItem::Ack => self.is_acknowledged = true,
+                FoundItem::Nak => {}
             }
         }
     }
@@ -76,16 +76,16 @@ impl crate::line::family::Probe for Probe {
     }
 
     fn expect_reply(&mut self, is_expected: bool) {
-        self.framer.await_acknowledge(is_expected);
+        self.framer.expect_acknowledge(is_expected);
         self.is_acknowledged = false;
     }
 
     fn receive(&mut self, bytes: &[u8]) {
         for byte in bytes {
-            self.framer.spare()[0] = *byte;
+            self.framer.read_buffer()[0] = *byte;
             self.framer.commit(1);
             self.is_acknowledged = false;
-            self.check();
+            self.check_bytes();
         }
     }
 
@@ -95,7 +95,7 @@ impl crate::line::family::Probe for Probe {
 
     fn release(&mut self, idle: Nanos) {
         self.framer.release(idle);
-        self.check();
+        self.check_bytes();
     }
 
     fn evidence(&self) -> Evidence {
@@ -103,8 +103,8 @@ impl crate::line::family::Probe for Probe {
         if self.is_found {
             Evidence::Found(None)
         } else if is_begun || self.is_acknowledged {
-            Evidence::Begun
-        } else if self.framer.tally().rejected[Reject::Crc as usize] > 0 {
+            Evidence::Partial
+        } else if self.framer.counters().rejected[Reject::Crc as usize] > 0 {
             Evidence::Damaged
         } else {
             Evidence::None
@@ -115,11 +115,11 @@ impl crate::line::family::Probe for Probe {
 const APPROACH: Approach = Approach {
     family: Family::Lms,
     // Only at this rate does a listening step contain several telegrams of a stream.
-    listens: &[Listen { rate: 500_000, span: 120 * MILLIS, needs_bytes: true }],
-    asks: Some(Asks {
+    listen_steps: &[ListenStep { rate: 500_000, duration: 120 * MILLIS, needs_bytes: true }],
+    request_steps: Some(RequestSteps {
         // At power-on, after a hub, and the rest.
         rates: &[9_600, 500_000, 38_400, 19_200],
-        settle: 20 * MILLIS,
+        settle_time: 20 * MILLIS,
         stop: None,
         requests: &[
             &[0x02, 0x00, 0x01, 0x00, command::TYPE, 0x1E, 0x12],
@@ -128,10 +128,10 @@ const APPROACH: Approach = Approach {
         // At least 55 us and at most 6 ms (Telegram listing 4.3), less the time of the write.
         gap: Some((120 * MICROS, 5 * MILLIS)),
         // The acknowledgement arrives within 60 ms (Telegram listing 4.3), and captured replies began within 150 ms.
-        reply: 150 * MILLIS,
-        patience: 250 * MILLIS,
+        reply_timeout: 150 * MILLIS,
+        extra_reply_time: 250 * MILLIS,
         // The rest of the captured times, and a status at 9,600 baud.
-        extension: 300 * MILLIS,
+        extra_partial_time: 300 * MILLIS,
         repeats: 1,
     }),
     // Without another setting in its EEPROM, the scanner starts at this rate (Telegram listing 7.1).
@@ -145,14 +145,14 @@ const _: () = assert!(Baud::ALL.len() == 4);
 /// Models and settings of the family.
 pub const FEATURES: Features = Features {
     models: &[],
-    auto: Model { name: "auto", baud: 500_000, beams: MAX_BEAMS },
+    defaults: Model { name: "auto", baud: 500_000, beams: MAX_BEAMS },
     modes: &[],
     keys: &[Key::Type, Key::Angle, Key::Resolution, Key::Unit, Key::ModeNumber, Key::Baud],
-    can_rest: false,
-    speaks_unasked: false,
+    can_stop_motor: false,
+    streams_unrequested: false,
     has_whole_telegrams: true,
     has_inquiry: true,
-    contents: Contents::UPPER,
+    array_flags: ArrayFlags::UPPER,
     max_telegram: MAX_TELEGRAM,
 };
 
@@ -161,36 +161,36 @@ pub(crate) fn set(request: &mut SettingsRequest, key: Key, value: Value<'_>) -> 
     match (key, value) {
         (Key::Type, Value::Text(name)) => {
             let family = Type::of_name(name)
-                .ok_or_else(|| refused(Key::Type, value, "lms200, lms211, lms221 or lms291"))?;
+                .ok_or_else(|| refusal(Key::Type, value, "lms200, lms211, lms221 or lms291"))?;
             request.expected_type = Some(family.name());
         }
         (Key::Angle, Value::Number(angle)) => {
             let known = Variant::ALL.map(|variant| variant.angle_deg);
             let known = known.into_iter().find(|&deg| f64::from(deg) == angle);
-            request.angle_deg = Some(known.ok_or_else(|| refused(Key::Angle, value, "100 or 180"))?);
+            request.angle_deg = Some(known.ok_or_else(|| refusal(Key::Angle, value, "100 or 180"))?);
         }
         (Key::Resolution, Value::Number(step)) => {
             let known = Variant::ALL.map(|variant| variant.resolution_cdeg);
             let known = known.into_iter().find(|&cdeg| f64::from(cdeg) == step * 100.0);
             request.resolution_cdeg =
-                Some(known.ok_or_else(|| refused(Key::Resolution, value, "0.25, 0.5 or 1"))?);
+                Some(known.ok_or_else(|| refusal(Key::Resolution, value, "0.25, 0.5 or 1"))?);
         }
         (Key::Unit, Value::Text("mm")) => request.unit_mm = Some(Unit::Mm.mm()),
         (Key::Unit, Value::Text("cm")) => request.unit_mm = Some(Unit::Cm.mm()),
-        (Key::Unit, _) => return Err(refused(Key::Unit, value, "\"mm\" or \"cm\"")),
+        (Key::Unit, _) => return Err(refusal(Key::Unit, value, "\"mm\" or \"cm\"")),
         (Key::Baud, Value::Whole(rate)) => {
             const REMEDY: &str =
                 "500000, 38400, 19200 or 9600; it is of an LMS, and the rate of others is the model's";
             let known = u32::try_from(rate).ok().and_then(Baud::of_rate);
-            request.baud = Some(known.ok_or_else(|| refused(Key::Baud, value, REMEDY))?.rate());
+            request.baud = Some(known.ok_or_else(|| refusal(Key::Baud, value, REMEDY))?.rate());
         }
         (Key::ModeNumber, _) => {
             let number = if let Value::Whole(number) = value { u8::try_from(number).ok() } else { None };
             let known = number.filter(|&number| Mode(number).has_ranges());
-            request.mode_number = Some(known.ok_or_else(|| refused(Key::ModeNumber, value, MODES))?);
+            request.mode_number = Some(known.ok_or_else(|| refusal(Key::ModeNumber, value, MODES))?);
             request.mode = None;
         }
-        _ => return Err(refused(key, value, "a value of another kind")),
+        _ => return Err(refusal(key, value, "a value of another kind")),
     }
     Ok(())
 }
@@ -228,7 +228,7 @@ pub(crate) fn check(request: &SettingsRequest) -> Result<settings::Settings, Ref
         let what = format!("an {} does not scan {angle_deg} degrees: {why}", family.name());
         return Err(Refusal::new(&[Key::Angle, Key::Type], what, "angle = 100"));
     }
-    Ok(settings::Settings { view: Some((angle_deg, resolution_cdeg)), ..request.checked() })
+    Ok(settings::Settings { view: Some((angle_deg, resolution_cdeg)), ..request.unchecked_settings() })
 }
 
 /// Modes whose values are ranges (Telegram listing, 77h block D).
@@ -255,7 +255,7 @@ mod tests {
 
     #[test]
     fn requests_are_those_for_type_and_status() {
-        let asks = APPROACH.asks.unwrap();
+        let asks = APPROACH.request_steps.unwrap();
         assert_eq!(asks.requests[0], Request::Type.encode(0).bytes());
         assert_eq!(asks.requests[1], Request::Status.encode(0).bytes());
         assert!(asks.rates.iter().all(|&rate| Baud::of_rate(rate).is_some()));

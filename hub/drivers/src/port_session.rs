@@ -7,13 +7,13 @@ use core::fmt;
 
 use scanhub_schema::{Counter, Counters, Family, MILLIS, Nanos, Status};
 
-use crate::families::{Session, Trouble, features};
+use crate::families::{Problem, Session, features};
 use crate::line::family::{Features, Model};
 use crate::line::{
-    self, Account, Control, Identity, Introduction, KnownRate, Notice, Output, Protocol as _, RawScan,
-    Received, Session as _, State,
+    self, Action, Control, DeviceInfo, Identity, KnownRate, Notice, Protocol as _, RawScan, ReceivedTelegram,
+    ScannerSession as _, SessionStats, State,
 };
-use crate::search::{Found, Memory, PortKind, Search};
+use crate::search::{FoundScanner, Memory, PortKind, Search};
 use crate::settings::Settings;
 
 /// A session on an open port.
@@ -22,7 +22,7 @@ pub struct PortSession {
     settings: Settings,
     /// Whether the family is searched for.
     is_auto: bool,
-    stage: Stage,
+    phase: Phase,
     /// Reads of the search that the session of the found scanner has not handled yet, the oldest at the end.
     captured: Vec<(Nanos, Vec<u8>)>,
     memory: Option<Memory>,
@@ -34,7 +34,7 @@ pub struct PortSession {
     /// Family, model and number of beams of the last scanner.
     last: Option<(Family, Model, usize)>,
     /// Trouble of the last session, until the search has its own.
-    trouble: Option<Trouble>,
+    problem: Option<Problem>,
     /// Whether a user has paused the search.
     is_paused: bool,
     now: Nanos,
@@ -46,13 +46,13 @@ pub struct PortSession {
     /// Bytes that were read by searches that have ended, or during a pause.
     searched: u64,
     /// Counters of sessions that have ended.
-    past: Account,
+    past_stats: SessionStats,
     past_counters: Counters,
 }
 
 #[expect(clippy::large_enum_variant, reason = "there is one per open port")]
 #[derive(Debug)]
-enum Stage {
+enum Phase {
     Searching(Box<Search>),
     Found(Session),
 }
@@ -67,40 +67,40 @@ impl PortSession {
         memory: Option<Memory>,
         now: Nanos,
     ) -> PortSession {
-        let stage = match family {
-            Some(family) => Stage::Found(Session::begin(family, settings, now)),
-            None => Stage::Searching(Box::new(Search::new(port_kind(settings), memory, now))),
+        let phase = match family {
+            Some(family) => Phase::Found(Session::begin(family, settings, now)),
+            None => Phase::Searching(Box::new(Search::new(port_kind(settings), memory, now))),
         };
         PortSession {
             settings: *settings,
             is_auto: family.is_none(),
-            stage,
+            phase,
             captured: Vec::new(),
             memory,
             found_rate: None,
             identity: None,
             known_rate: None,
             last: None,
-            trouble: None,
+            problem: None,
             is_paused: false,
             now,
             session_now: now,
             received_at: now,
             partial_reads: 1,
             searched: 0,
-            past: Account::default(),
+            past_stats: SessionStats::default(),
             past_counters: Counters::default(),
         }
     }
 
     /// Returns the session with the scanner. `None` while it is searched for.
     fn session(&self) -> Option<&Session> {
-        if let Stage::Found(session) = &self.stage { Some(session) } else { None }
+        if let Phase::Found(session) = &self.phase { Some(session) } else { None }
     }
 
     /// Does the same as [`session`](Self::session), to change it.
     fn session_mut(&mut self) -> Option<&mut Session> {
-        if let Stage::Found(session) = &mut self.stage { Some(session) } else { None }
+        if let Phase::Found(session) = &mut self.phase { Some(session) } else { None }
     }
 
     /// Returns the family. `None` while it is searched for.
@@ -115,7 +115,7 @@ impl PortSession {
 
     /// Returns the scanner that the search has found, for the next search. `None` until it streams.
     pub fn memory(&self) -> Option<Memory> {
-        let Stage::Found(session) = &self.stage else { return None };
+        let Phase::Found(session) = &self.phase else { return None };
         if !self.is_auto || session.state() != State::Streaming {
             return None;
         }
@@ -127,23 +127,23 @@ impl PortSession {
         Some(Memory { family, stream_rate, reply_rate })
     }
 
-    /// Continues when [`poll_output`](line::Protocol::poll_output) has returned a wait. Returns whether there is more
+    /// Continues when [`poll_action`](line::Protocol::poll_action) has returned a wait. Returns whether there is more
     /// to drain: the search has found a scanner, or it begins again.
     pub fn advance(&mut self) -> bool {
         if !self.is_auto {
             return false;
         }
-        match &mut self.stage {
-            Stage::Searching(search) => {
+        match &mut self.phase {
+            Phase::Searching(search) => {
                 let found = search.found().filter(|_| !self.is_paused);
                 found.is_some_and(|found| {
-                    self.meet(found);
+                    self.begin_session(found);
                     true
                 })
             }
-            Stage::Found(session) => {
+            Phase::Found(session) => {
                 if let Some((at, bytes)) = self.captured.pop() {
-                    let spare = session.spare();
+                    let spare = session.read_buffer();
                     let len = bytes.len().min(spare.len());
                     spare[..len].copy_from_slice(&bytes[..len]);
                     self.session_now = self.session_now.max(at);
@@ -157,9 +157,9 @@ impl PortSession {
                     self.received_at = self.now;
                 }
                 self.memory = self.memory().or(self.memory);
-                let is_lost = self.now >= self.received_at + LOST_AFTER;
+                let is_lost = self.now >= self.received_at + LOSS_TIMEOUT;
                 if is_lost {
-                    self.lose();
+                    self.restart_search();
                 }
                 is_lost
             }
@@ -167,12 +167,12 @@ impl PortSession {
     }
 
     /// Begins a session with the scanner that the search has found.
-    fn meet(&mut self, found: Found) {
-        let Stage::Searching(search) = &self.stage else { return };
-        let Found { family, rate, model: _ } = found;
+    fn begin_session(&mut self, found: FoundScanner) {
+        let Phase::Searching(search) = &self.phase else { return };
+        let FoundScanner { family, rate, model: _ } = found;
         self.captured = search.reads().map(|(at, bytes)| (at, bytes.to_vec())).collect();
         self.captured.reverse();
-        self.searched += search.account().discarded;
+        self.searched += search.stats().discarded;
         let begins = self.captured.last().map_or(self.now, |(at, _)| *at);
         let settings = Settings { is_found: true, ..self.settings };
         let mut session = Session::begin(family, &settings, begins);
@@ -192,20 +192,20 @@ impl PortSession {
         }
         session.set_partial_reads(self.partial_reads);
         (self.session_now, self.received_at) = (begins, self.now);
-        (self.found_rate, self.trouble) = (rate, None);
-        self.stage = Stage::Found(session);
+        (self.found_rate, self.problem) = (rate, None);
+        self.phase = Phase::Found(session);
     }
 
     /// Ends the session, because nothing of its scanner arrives any more, and searches again.
-    fn lose(&mut self) {
-        let Stage::Found(session) = &self.stage else { return };
-        let account = session.account();
+    fn restart_search(&mut self) {
+        let Phase::Found(session) = &self.phase else { return };
+        let stats = session.stats();
         session.add_counters(&mut self.past_counters);
-        self.past_counters[Counter::BytesDiscarded] += account.buffered;
+        self.past_counters[Counter::BytesDiscarded] += stats.buffered;
         self.past_counters[Counter::BytesBuffered] = 0;
-        let ended = Account { discarded: account.discarded + account.buffered, buffered: 0, ..account };
-        self.past = sum(self.past, ended);
-        self.trouble = session.trouble();
+        let past = SessionStats { discarded: stats.discarded + stats.buffered, buffered: 0, ..stats };
+        self.past_stats = sum(self.past_stats, past);
+        self.problem = session.problem();
         self.known_rate = session.known_rate().or(self.known_rate);
         let beams = session.model().zip(session.beams());
         self.last = beams.map(|(model, beams)| (session.family(), model, beams)).or(self.last);
@@ -214,74 +214,74 @@ impl PortSession {
 
     /// Starts a search on a port that is open at any rate.
     fn search(&mut self) {
-        if let Stage::Searching(search) = &self.stage {
-            self.searched += search.account().read;
+        if let Phase::Searching(search) = &self.phase {
+            self.searched += search.stats().read;
         }
         self.captured.clear();
         let search = Search::new(port_kind(&self.settings), self.memory, self.now);
-        self.stage = Stage::Searching(Box::new(search.at_another_rate()));
+        self.phase = Phase::Searching(Box::new(search.with_rate_change()));
     }
 }
 
 impl line::Protocol for PortSession {
-    fn spare(&mut self) -> &mut [u8] {
-        match &mut self.stage {
-            Stage::Searching(search) => search.spare(),
-            Stage::Found(session) => session.spare(),
+    fn read_buffer(&mut self) -> &mut [u8] {
+        match &mut self.phase {
+            Phase::Searching(search) => search.read_buffer(),
+            Phase::Found(session) => session.read_buffer(),
         }
     }
 
     fn commit(&mut self, now: Nanos, len: usize) {
         (self.now, self.session_now) = (now, now);
-        match &mut self.stage {
-            Stage::Searching(_) if self.is_paused => self.searched += len as u64,
-            Stage::Searching(search) => search.commit(now, len),
-            Stage::Found(session) => session.commit(now, len),
+        match &mut self.phase {
+            Phase::Searching(_) if self.is_paused => self.searched += len as u64,
+            Phase::Searching(search) => search.commit(now, len),
+            Phase::Found(session) => session.commit(now, len),
         }
     }
 
     fn handle_timeout(&mut self, now: Nanos) {
         (self.now, self.session_now) = (now, now);
-        match &mut self.stage {
-            Stage::Searching(_) if self.is_paused => {}
-            Stage::Searching(search) => search.handle_timeout(now),
-            Stage::Found(session) => session.handle_timeout(now),
+        match &mut self.phase {
+            Phase::Searching(_) if self.is_paused => {}
+            Phase::Searching(search) => search.handle_timeout(now),
+            Phase::Found(session) => session.handle_timeout(now),
         }
     }
 
-    fn transmitted(&mut self, now: Nanos) {
+    fn handle_transmitted(&mut self, now: Nanos) {
         (self.now, self.session_now) = (now, now);
-        match &mut self.stage {
-            Stage::Searching(search) => {
+        match &mut self.phase {
+            Phase::Searching(search) => {
                 // A scanner that replies may be another one.
                 self.identity = None;
-                search.transmitted(now);
+                search.handle_transmitted(now);
             }
-            Stage::Found(session) => session.transmitted(now),
+            Phase::Found(session) => session.handle_transmitted(now),
         }
     }
 
     fn reject_rate(&mut self, now: Nanos) {
         self.now = now;
-        match &mut self.stage {
-            Stage::Searching(search) => search.reject_rate(now),
-            Stage::Found(session) => session.reject_rate(now),
+        match &mut self.phase {
+            Phase::Searching(search) => search.reject_rate(now),
+            Phase::Found(session) => session.reject_rate(now),
         }
     }
 
-    fn poll_output(&mut self) -> Output<'_> {
-        match &mut self.stage {
-            Stage::Searching(_) if self.is_paused => Output::Wait { until: Nanos::MAX },
-            Stage::Searching(search) => search.poll_output(),
-            Stage::Found(session) => {
+    fn poll_action(&mut self) -> Action<'_> {
+        match &mut self.phase {
+            Phase::Searching(_) if self.is_paused => Action::Wait { until: Nanos::MAX },
+            Phase::Searching(search) => search.poll_action(),
+            Phase::Found(session) => {
                 let may_search = self.is_auto && session.state() != State::Paused;
-                let lost_at = if may_search { self.received_at + LOST_AFTER } else { Nanos::MAX };
-                match session.poll_output() {
-                    Output::Event(event) => {
+                let lost_at = if may_search { self.received_at + LOSS_TIMEOUT } else { Nanos::MAX };
+                match session.poll_action() {
+                    Action::Event(event) => {
                         self.received_at = self.now;
-                        Output::Event(event)
+                        Action::Event(event)
                     }
-                    Output::Wait { until } => Output::Wait { until: until.min(lost_at) },
+                    Action::Wait { until } => Action::Wait { until: until.min(lost_at) },
                     output => output,
                 }
             }
@@ -293,74 +293,75 @@ impl line::Protocol for PortSession {
 macro_rules! found {
     ($(fn $name:ident($($arg:ident: $Arg:ty),*) -> $Ret:ty = $searching:expr;)*) => {
         $(fn $name(&self $(, $arg: $Arg)*) -> $Ret {
-            match &self.stage {
-                Stage::Searching(_) => $searching,
-                Stage::Found(session) => line::Session::$name(session $(, $arg)*),
+            match &self.phase {
+                Phase::Searching(_) => $searching,
+                Phase::Found(session) => line::ScannerSession::$name(session $(, $arg)*),
             }
         })*
     };
 }
 
-impl line::Session for PortSession {
-    type Trouble = Trouble;
+impl line::ScannerSession for PortSession {
+    type Problem = Problem;
 
     fn control(&mut self, control: Control, now: Nanos) {
         (self.now, self.session_now, self.received_at) = (now, now, now);
-        if let Stage::Found(session) = &mut self.stage {
+        if let Phase::Found(session) = &mut self.phase {
             return session.control(control, now);
         }
-        self.past.resyncs += u64::from(control == Control::Resync);
+        self.past_stats.resyncs += u64::from(control == Control::Resync);
         self.past_counters[Counter::Resyncs] += u64::from(control == Control::Resync);
         match control {
             Control::Pause => self.is_paused = true,
             Control::Resume if !self.is_paused => {}
             Control::Resume | Control::Resync => {
-                (self.is_paused, self.trouble) = (false, None);
+                (self.is_paused, self.problem) = (false, None);
                 self.search();
             }
         }
     }
 
     fn state(&self) -> State {
-        match &self.stage {
-            Stage::Searching(_) if self.is_paused => State::Paused,
-            Stage::Searching(_) => State::Probing,
-            Stage::Found(session) => session.state(),
+        match &self.phase {
+            Phase::Searching(_) if self.is_paused => State::Paused,
+            Phase::Searching(_) => State::Probing,
+            Phase::Found(session) => session.state(),
         }
     }
 
-    fn trouble(&self) -> Option<Trouble> {
-        match &self.stage {
-            Stage::Searching(_) if self.is_paused => None,
-            Stage::Searching(search) => search.trouble().map(Trouble::Search).or(self.trouble),
-            Stage::Found(session) => session.trouble(),
+    fn problem(&self) -> Option<Problem> {
+        match &self.phase {
+            Phase::Searching(_) if self.is_paused => None,
+            Phase::Searching(search) => search.problem().map(Problem::Search).or(self.problem),
+            Phase::Found(session) => session.problem(),
         }
     }
 
     fn rate(&self) -> u32 {
-        match &self.stage {
-            Stage::Searching(search) => search.rate().unwrap_or(SLOWEST),
-            Stage::Found(session) => session.rate(),
+        match &self.phase {
+            Phase::Searching(search) => search.rate().unwrap_or(FALLBACK_RATE),
+            Phase::Found(session) => session.rate(),
         }
     }
 
-    fn account(&self) -> Account {
-        let now = match &self.stage {
-            Stage::Searching(search) => search.account(),
-            Stage::Found(session) => {
-                let account = session.account();
+    fn stats(&self) -> SessionStats {
+        let current = match &self.phase {
+            Phase::Searching(search) => search.stats(),
+            Phase::Found(session) => {
+                let stats = session.stats();
                 let captured = self.captured.iter().map(|(_, bytes)| bytes.len() as u64).sum::<u64>();
-                Account { read: account.read + captured, buffered: account.buffered + captured, ..account }
+                SessionStats { read: stats.read + captured, buffered: stats.buffered + captured, ..stats }
             }
         };
-        let searched = Account { read: self.searched, discarded: self.searched, ..Account::default() };
-        sum(sum(self.past, searched), now)
+        let searched =
+            SessionStats { read: self.searched, discarded: self.searched, ..SessionStats::default() };
+        sum(sum(self.past_stats, searched), current)
     }
 
     fn defer_read(&mut self, now: Nanos, waiting: usize) -> bool {
-        match &mut self.stage {
-            Stage::Searching(_) => false,
-            Stage::Found(session) => {
+        match &mut self.phase {
+            Phase::Searching(_) => false,
+            Phase::Found(session) => {
                 (self.now, self.session_now) = (now, now);
                 session.defer_read(now, waiting)
             }
@@ -368,7 +369,7 @@ impl line::Session for PortSession {
     }
 
     fn set_has_subscribers(&mut self, now: Nanos, has_subscribers: bool) {
-        if let Stage::Found(session) = &mut self.stage {
+        if let Phase::Found(session) = &mut self.phase {
             session.set_has_subscribers(now, has_subscribers);
         }
     }
@@ -378,35 +379,35 @@ impl line::Session for PortSession {
     }
 
     fn restore_identity(&mut self, identity: Identity) {
-        match &mut self.stage {
-            Stage::Searching(_) => self.identity = Some(identity),
-            Stage::Found(session) => session.restore_identity(identity),
+        match &mut self.phase {
+            Phase::Searching(_) => self.identity = Some(identity),
+            Phase::Found(session) => session.restore_identity(identity),
         }
     }
 
     fn hint_rate(&mut self, known: KnownRate) {
-        match &mut self.stage {
-            Stage::Searching(_) => self.known_rate = Some(known),
-            Stage::Found(session) => session.hint_rate(known),
+        match &mut self.phase {
+            Phase::Searching(_) => self.known_rate = Some(known),
+            Phase::Found(session) => session.hint_rate(known),
         }
     }
 
     fn restore_beams(&mut self, model: Model, beams: usize) {
-        match &mut self.stage {
-            Stage::Searching(_) => self.last = self.memory.map(|memory| (memory.family, model, beams)),
-            Stage::Found(session) => session.restore_beams(model, beams),
+        match &mut self.phase {
+            Phase::Searching(_) => self.last = self.memory.map(|memory| (memory.family, model, beams)),
+            Phase::Found(session) => session.restore_beams(model, beams),
         }
     }
 
     fn set_partial_reads(&mut self, count: u8) {
         self.partial_reads = count;
-        if let Stage::Found(session) = &mut self.stage {
+        if let Phase::Found(session) = &mut self.phase {
             session.set_partial_reads(count);
         }
     }
 
     fn mark_suspect(&mut self, reasons: u8) {
-        if let Stage::Found(session) = &mut self.stage {
+        if let Phase::Found(session) = &mut self.phase {
             session.mark_suspect(reasons);
         }
     }
@@ -416,36 +417,36 @@ impl line::Session for PortSession {
         telegram: &'a [u8],
         is_readable: bool,
         status: Option<&mut Status>,
-    ) -> Option<Received<'a>> {
+    ) -> Option<ReceivedTelegram<'a>> {
         self.session_mut()?.read_recorded(telegram, is_readable, status)
     }
 
     found! {
-        fn missing() -> Option<&'static str> = None;
+        fn missing_transmission() -> Option<&'static str> = None;
         fn can_defer_read() -> bool = false;
         fn identity() -> Option<Identity> = None;
         fn known_rate() -> Option<KnownRate> = None;
         fn partial_scan() -> Option<RawScan<'_>> = None;
         fn model() -> Option<Model> = None;
         fn beams() -> Option<usize> = None;
-        fn other_model() -> Option<Model> = None;
+        fn unexpected_model() -> Option<Model> = None;
         fn unit_mm() -> Option<u8> = None;
         fn notice() -> Option<Notice> = None;
         fn missing_setting() -> Option<&'static str> = None;
         fn write_details(text: &mut dyn fmt::Write) -> () = { let _ = text; };
-        fn introduction() -> Option<Introduction> = None;
+        fn device_info() -> Option<DeviceInfo> = None;
         fn scanner_time() -> Option<Nanos> = None;
     }
 
     /// A search removes what an earlier scanner has reported.
     fn describe(&self, status: &mut Status) {
-        match &self.stage {
-            Stage::Searching(_) => {
+        match &self.phase {
+            Phase::Searching(_) => {
                 status.mode = Status::MODE_UNKNOWN;
                 (status.unit_mm, status.angle_deg, status.resolution_cdeg) = (0, 0, 0);
                 status.set_sensor_type("");
             }
-            Stage::Found(session) => session.describe(status),
+            Phase::Found(session) => session.describe(status),
         }
     }
 
@@ -455,9 +456,9 @@ impl line::Session for PortSession {
         }
         counters[Counter::BytesRead] += self.searched;
         counters[Counter::BytesDiscarded] += self.searched;
-        match &self.stage {
-            Stage::Searching(search) => search.account().add_to(counters),
-            Stage::Found(session) => {
+        match &self.phase {
+            Phase::Searching(search) => search.stats().add_to(counters),
+            Phase::Found(session) => {
                 session.add_counters(counters);
                 let captured = self.captured.iter().map(|(_, bytes)| bytes.len() as u64).sum::<u64>();
                 counters[Counter::BytesRead] += captured;
@@ -476,8 +477,8 @@ fn port_kind(settings: &Settings) -> PortKind {
     }
 }
 
-fn sum(a: Account, b: Account) -> Account {
-    Account {
+fn sum(a: SessionStats, b: SessionStats) -> SessionStats {
+    SessionStats {
         read: a.read + b.read,
         in_telegrams: a.in_telegrams + b.in_telegrams,
         acknowledge: a.acknowledge + b.acknowledge,
@@ -490,12 +491,12 @@ fn sum(a: Account, b: Account) -> Account {
         rejected_checksum: a.rejected_checksum + b.rejected_checksum,
         resyncs: a.resyncs + b.resyncs,
         restarts: a.restarts + b.restarts,
-        began_with_a_cut: a.began_with_a_cut || b.began_with_a_cut,
+        first_frame_truncated: a.first_frame_truncated || b.first_frame_truncated,
     }
 }
 
 /// After this time without anything of a found scanner, the search begins again. Until then, the session of the family
 /// handles silence and power cycles.
-const LOST_AFTER: Nanos = 10_000 * MILLIS;
+const LOSS_TIMEOUT: Nanos = 10_000 * MILLIS;
 /// Stands for an unknown rate of the port, in bits per second.
-const SLOWEST: u32 = 9_600;
+const FALLBACK_RATE: u32 = 9_600;

@@ -3,26 +3,26 @@
 use scanhub_schema::{Family, MILLIS, Nanos};
 
 use crate::line::framing::fill;
-use crate::line::{Event, Output, Protocol as _, Session as _};
-use crate::lms::framer::{Framer, VETO_HOLD};
+use crate::line::{Action, Event, Protocol as _, ScannerSession as _};
+use crate::lms::framer::{Framer, VETO_HOLD_TIME};
 use crate::{Session, Settings, features};
 
 /// Number of bytes at the beginning of a stream that are examined.
-pub const EXAMINED: usize = 64 * 1024;
+pub const EXAMINED_BYTES: usize = 64 * 1024;
 
-/// Returns the family whose telegrams or packets take most of the first [`EXAMINED`] bytes of `bytes`, and at least half of
+/// Returns the family whose telegrams or packets take most of the first [`EXAMINED_BYTES`] bytes of `bytes`, and at least half of
 /// them. `None` if there is no such family.
 pub fn family_of(bytes: &[u8]) -> Option<Family> {
-    let examined = bytes.len().min(EXAMINED);
-    let [(first, most), ..] = bytes_by_family(bytes);
-    (most > 0 && 2 * most >= examined).then_some(first)
+    let examined = bytes.len().min(EXAMINED_BYTES);
+    let [(first, max_bytes), ..] = bytes_by_family(bytes);
+    (max_bytes > 0 && 2 * max_bytes >= examined).then_some(first)
 }
 
-/// Returns each family with the number of bytes in its telegrams or packets, among the first [`EXAMINED`] bytes of `bytes`.
+/// Returns each family with the number of bytes in its telegrams or packets, among the first [`EXAMINED_BYTES`] bytes of `bytes`.
 /// The family with the most bytes is first.
 pub fn bytes_by_family(bytes: &[u8]) -> [(Family, usize); Family::ALL.len()] {
-    let bytes = &bytes[..bytes.len().min(EXAMINED)];
-    let mut counts = Family::ALL.map(|family| (family, accepted(family, bytes)));
+    let bytes = &bytes[..bytes.len().min(EXAMINED_BYTES)];
+    let mut counts = Family::ALL.map(|family| (family, accepted_bytes(family, bytes)));
     counts.sort_by_key(|(_, accepted)| core::cmp::Reverse(*accepted));
     counts
 }
@@ -30,24 +30,24 @@ pub fn bytes_by_family(bytes: &[u8]) -> [(Family, usize); Family::ALL.len()] {
 /// Returns the name of a scan mode that defines how to split `bytes` into packets of `family`. `None` if the bytes define it
 /// themselves. Packets of some modes look alike, so another mode may be the right one to decode them.
 pub fn framing_mode(family: Family, bytes: &[u8]) -> Option<&'static str> {
-    packets(family, &bytes[..bytes.len().min(EXAMINED)])?.1
+    bytes_in_mode(family, &bytes[..bytes.len().min(EXAMINED_BYTES)])?.1
 }
 
 /// Returns the number of bytes in telegrams or packets of `family`.
-fn accepted(family: Family, bytes: &[u8]) -> usize {
-    match packets(family, bytes) {
-        None => in_telegrams(bytes),
-        Some((len, _)) if len > BY_CHANCE => len,
+fn accepted_bytes(family: Family, bytes: &[u8]) -> usize {
+    match bytes_in_mode(family, bytes) {
+        None => bytes_in_telegrams(bytes),
+        Some((len, _)) if len > MAX_CHANCE_BYTES => len,
         Some(_) => 0,
     }
 }
 
 /// Returns the number of bytes in packets of `family`, and the [mode](framing_mode) in which they are packets. `None` if the
 /// family does not send packets.
-fn packets(family: Family, bytes: &[u8]) -> Option<(usize, Option<&'static str>)> {
+fn bytes_in_mode(family: Family, bytes: &[u8]) -> Option<(usize, Option<&'static str>)> {
     let in_mode = |mode| {
         let settings = Settings { mode, fixed_rate: true, listen_only: true, ..Settings::default() };
-        in_packets(Session::begin(family, &settings, 0), bytes)
+        bytes_in_packets(Session::begin(family, &settings, 0), bytes)
     };
     if features(family).has_whole_telegrams {
         return None;
@@ -61,52 +61,52 @@ fn packets(family: Family, bytes: &[u8]) -> Option<(usize, Option<&'static str>)
     lengths.max_by_key(|(len, _)| *len).filter(|(best, _)| *best > len).or(Some((len, None)))
 }
 
-fn in_telegrams(mut bytes: &[u8]) -> usize {
+fn bytes_in_telegrams(mut bytes: &[u8]) -> usize {
     let mut framer = Framer::default();
     loop {
         while framer.poll().is_some() {}
         if bytes.is_empty() {
             break;
         }
-        let len = fill(framer.spare(), &mut bytes);
+        let len = fill(framer.read_buffer(), &mut bytes);
         framer.commit(len);
     }
     // No more bytes can refute a telegram that is held back.
-    framer.release(VETO_HOLD);
+    framer.release(VETO_HOLD_TIME);
     while framer.poll().is_some() {}
-    framer.tally().in_telegrams as usize
+    framer.counters().in_telegrams as usize
 }
 
 /// Returns the number of bytes in packets, and whether the session cannot tell their kind.
-fn in_packets(mut session: Session, mut bytes: &[u8]) -> (usize, bool) {
+fn bytes_in_packets(mut session: Session, mut bytes: &[u8]) -> (usize, bool) {
     let mut accepted = 0;
     let mut is_ended = false;
     loop {
         loop {
-            match session.poll_output() {
-                Output::Event(Event::Telegram(received)) => accepted += received.bytes.len(),
-                Output::Transmit { .. } => session.transmitted(0),
-                Output::Event(Event::Scan(_)) | Output::SetRate(_) | Output::SetDtr(_) => {}
-                Output::Rest(_) | Output::Wait { .. } => break,
+            match session.poll_action() {
+                Action::Event(Event::Telegram(received)) => accepted += received.bytes.len(),
+                Action::Transmit { .. } => session.handle_transmitted(0),
+                Action::Event(Event::Scan(_)) | Action::SetRate(_) | Action::SetDtr(_) => {}
+                Action::SleepUntil(_) | Action::Wait { .. } => break,
             }
         }
         if is_ended {
             return (accepted, session.missing_setting().is_some());
         }
-        let len = fill(session.spare(), &mut bytes);
+        let len = fill(session.read_buffer(), &mut bytes);
         session.commit(0, len);
         if len == 0 {
             is_ended = true;
             // No more bytes can refute packets that are held back.
-            session.handle_timeout(IDLE);
+            session.handle_timeout(HOLD_TIMEOUT);
         }
     }
 }
 
 /// Time after which a session no longer holds packets back.
-const IDLE: Nanos = 100 * MILLIS;
+const HOLD_TIMEOUT: Nanos = 100 * MILLIS;
 /// Number of bytes up to which packets may be noise that passed a short checksum.
-const BY_CHANCE: usize = 100;
+const MAX_CHANCE_BYTES: usize = 100;
 
 #[cfg(test)]
 mod tests {
@@ -135,8 +135,8 @@ mod tests {
 
     #[test]
     fn only_the_first_bytes_count() {
-        let (telegrams, noise) = (telegrams(400), vec![0x42; EXAMINED]);
-        assert!(telegrams.len() > EXAMINED);
+        let (telegrams, noise) = (telegrams(400), vec![0x42; EXAMINED_BYTES]);
+        assert!(telegrams.len() > EXAMINED_BYTES);
         assert_eq!(family_of(&[&telegrams[..], &noise, &noise, &noise].concat()), Some(Family::Lms));
         assert_eq!(family_of(&[&noise[..], &telegrams].concat()), None);
     }

@@ -10,41 +10,41 @@ mod sequence;
 mod session;
 mod stream;
 
-use scanhub_schema::{Contents, Family, MILLIS};
+use scanhub_schema::{ArrayFlags, Family, MILLIS};
 
-use crate::line::family::{self, Approach, Asks, Evidence, Features, Stop, named, table};
+use crate::line::family::{self, Approach, Evidence, Features, RequestSteps, StopRequest, named, table};
 use crate::line::framing::fill;
-use crate::rplidar::framer::{Expect, Found, Framer};
-use crate::rplidar::packet::Kind;
-use crate::rplidar::request::{Answer, Head};
+use crate::rplidar::framer::{ExpectedBytes, Framer, FramerEvent};
+use crate::rplidar::packet::PacketFormat;
+use crate::rplidar::request::{ResponseDescriptor, ResponseType};
 use crate::settings::{Key, Settings};
 
-pub use crate::line::{Tally, TurnCounts};
+pub use crate::line::{ByteCounters, RevolutionCounts};
 pub use request::{Health, Info};
-pub use session::{Session, Trouble};
+pub use session::{Problem, RplidarSession};
 
 /// Models and settings of the family.
 pub const FEATURES: Features = Features {
     models: &MODELS,
     // Enough for all models but the S2 and the S3.
-    auto: family::Model { name: "auto", baud: Model::A1.baud(), beams: 2_048 },
+    defaults: family::Model { name: "auto", baud: Model::A1.baud(), beams: 2_048 },
     modes: &MODES,
     keys: &[Key::ModeName, Key::Idle],
-    can_rest: true,
-    speaks_unasked: false,
+    can_stop_motor: true,
+    streams_unrequested: false,
     has_whole_telegrams: false,
     has_inquiry: false,
-    contents: Contents::TURNING,
+    array_flags: ArrayFlags::REVOLUTION,
     max_telegram: stream::MAX_SAMPLE_LEN,
 };
 
 /// Describes a model for the configuration.
-const fn described(model: Model) -> family::Model {
+const fn describe(model: Model) -> family::Model {
     family::Model { name: model.name(), baud: model.baud(), beams: model.beams() }
 }
 
 /// All models, described for the configuration.
-const MODELS: [family::Model; Model::ALL.len()] = table!(Model::ALL, described);
+const MODELS: [family::Model; Model::ALL.len()] = table!(Model::ALL, describe);
 
 /// Names of all modes.
 const MODES: [&str; Mode::ALL.len()] = table!(Mode::ALL, Mode::name);
@@ -84,13 +84,13 @@ pub(crate) enum Motor {
 
 impl Model {
     /// The model of this name.
-    pub fn named(name: &str) -> Option<Model> {
+    pub fn from_name(name: &str) -> Option<Model> {
         Model::ALL.into_iter().find(|model| model.name() == name)
     }
 
     /// Returns the model of `settings`.
     pub(crate) fn of(settings: &Settings) -> Option<Model> {
-        settings.model.and_then(Model::named)
+        settings.model.and_then(Model::from_name)
     }
 
     /// The model that says `id` of itself: its series in the upper half.
@@ -145,7 +145,7 @@ impl Model {
     }
 
     /// Turns in a second.
-    pub const fn turns_per_second(self) -> f32 {
+    pub const fn revolutions_per_second(self) -> f32 {
         match self {
             Model::A1 => 7.3,
             _ => 10.0,
@@ -159,20 +159,20 @@ impl Model {
 
     /// Beams of a turn where so many points are measured in a second.
     const fn beams_of(self, points_per_second: f32) -> usize {
-        (points_per_second / self.turns_per_second() + 0.5) as usize
+        (points_per_second / self.revolutions_per_second() + 0.5) as usize
     }
 
     /// Returns the number of beams for a mode in which the scanner measures `points_per_second`: that of the model's fastest
     /// mode, if it is close.
     pub(crate) fn beams_in_mode(self, points_per_second: f32) -> usize {
         let (beams, fastest) = (self.beams_of(points_per_second), self.beams());
-        let is_close = (beams as f64 / fastest as f64 - 1.0).abs() <= CLOSE;
+        let is_close = (beams as f64 / fastest as f64 - 1.0).abs() <= MAX_BEAM_DEVIATION;
         if is_close { fastest } else { beams }
     }
 }
 
 /// Share by which a number of beams may differ from that of the model's fastest mode, and still counts as the same.
-const CLOSE: f64 = 0.03;
+const MAX_BEAM_DEVIATION: f64 = 0.03;
 
 named! {
     /// A way of measuring that a model may offer.
@@ -196,17 +196,17 @@ named! {
 
 impl Mode {
     /// The mode of this name.
-    pub fn named(name: &str) -> Option<Mode> {
-        Mode::said(name.as_bytes())
+    pub fn from_name(name: &str) -> Option<Mode> {
+        Mode::from_device_name(name.as_bytes())
     }
 
     /// Returns the mode of `settings`.
     pub(crate) fn of(settings: &Settings) -> Option<Mode> {
-        settings.mode.and_then(Mode::named)
+        settings.mode.and_then(Mode::from_name)
     }
 
     /// The mode that a scanner calls `name`: in capitals, with spaces, ended by a zero, as it likes.
-    pub(crate) fn said(name: &[u8]) -> Option<Mode> {
+    pub(crate) fn from_device_name(name: &[u8]) -> Option<Mode> {
         Mode::ALL.into_iter().find(|mode| {
             let letters = name.iter().filter(|byte| byte.is_ascii_alphanumeric());
             letters.map(u8::to_ascii_lowercase).eq(mode.name().bytes())
@@ -218,7 +218,7 @@ impl Mode {
 #[derive(Clone, Debug)]
 pub struct Probe {
     framer: Framer,
-    is_asked: bool,
+    is_reply_expected: bool,
     /// Whether packets have arrived.
     is_stream: bool,
     /// The identity that the scanner has reported.
@@ -227,7 +227,12 @@ pub struct Probe {
 
 impl Default for Probe {
     fn default() -> Self {
-        Probe { framer: Framer::new(Expect::Anything(None)), is_asked: false, is_stream: false, info: None }
+        Probe {
+            framer: Framer::new(ExpectedBytes::AnyPackets(None)),
+            is_reply_expected: false,
+            is_stream: false,
+            info: None,
+        }
     }
 }
 
@@ -242,24 +247,24 @@ impl crate::line::family::Probe for Probe {
 
     // A fragment of an earlier reply would take the descriptor of the next one along, so nothing of it is kept.
     fn expect_reply(&mut self, is_expected: bool) {
-        let expect = if is_expected { Expect::Answers } else { Expect::Anything(None) };
-        *self = Probe { framer: Framer::new(expect), is_asked: is_expected, ..Probe::default() };
+        let expect = if is_expected { ExpectedBytes::Responses } else { ExpectedBytes::AnyPackets(None) };
+        *self = Probe { framer: Framer::new(expect), is_reply_expected: is_expected, ..Probe::default() };
     }
 
     fn receive(&mut self, mut bytes: &[u8]) {
         while !bytes.is_empty() {
-            let len = fill(self.framer.buffer.spare(), &mut bytes);
+            let len = fill(self.framer.buffer.read_buffer(), &mut bytes);
             self.framer.buffer.commit(len);
             while let Some(found) = self.framer.advance(1) {
                 match found {
-                    Found::Reply(Answer::Info, span) => {
-                        self.info = Info::parse(&self.framer.bytes(span)[Head::LEN..]);
+                    FramerEvent::Reply(ResponseType::Info, span) => {
+                        self.info = Info::parse(&self.framer.bytes(span)[ResponseDescriptor::LEN..]);
                     }
-                    Found::Packets(..) | Found::Stream(_) => self.is_stream = true,
-                    Found::Reply(..) | Found::Greeting { .. } => {}
+                    FramerEvent::Packets(..) | FramerEvent::Stream(_) => self.is_stream = true,
+                    FramerEvent::Reply(..) | FramerEvent::BootMessage { .. } => {}
                 }
             }
-            self.is_stream |= self.framer.is_alike();
+            self.is_stream |= self.framer.is_ambiguous();
         }
     }
 
@@ -267,7 +272,9 @@ impl crate::line::family::Probe for Probe {
         match self.info {
             Some(info) => Evidence::Found(info.model().map(|model| model.name())),
             None if self.is_stream => Evidence::Stream,
-            None if self.is_asked && !self.framer.buffer.open().is_empty() => Evidence::Begun,
+            None if self.is_reply_expected && !self.framer.buffer.open_bytes().is_empty() => {
+                Evidence::Partial
+            }
             None => Evidence::None,
         }
     }
@@ -275,21 +282,21 @@ impl crate::line::family::Probe for Probe {
 
 const APPROACH: Approach = Approach {
     family: Family::Rplidar,
-    listens: &[],
-    asks: Some(Asks {
+    listen_steps: &[],
+    request_steps: Some(RequestSteps {
         rates: &[115_200, 256_000, 460_800, 1_000_000],
-        settle: 0,
-        stop: Some(Stop { request: &[0xA5, 0x25], quiet: 15 * MILLIS, at_most: 60 * MILLIS }),
+        settle_time: 0,
+        stop: Some(StopRequest { request: &[0xA5, 0x25], quiet_time: 15 * MILLIS, max_wait: 60 * MILLIS }),
         requests: &[&[0xA5, 0x50]],
         gap: None,
         // A reply takes some milliseconds, and an adapter that collects bytes adds 16, twice.
-        reply: 70 * MILLIS,
-        patience: 0,
-        extension: 20 * MILLIS,
+        reply_timeout: 70 * MILLIS,
+        extra_reply_time: 0,
+        extra_partial_time: 20 * MILLIS,
         repeats: 2,
     }),
     boot_rate: None,
-    max_transmission: Kind::LONGEST,
+    max_transmission: PacketFormat::MAX_LEN,
     advice: "it needs 5 V for the scanner and its motor",
 };
 
@@ -305,7 +312,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mode_has_the_beams_of_the_fastest_one_if_they_are_close() {
+    fn mode_close_to_the_fastest_one_has_its_beam_count() {
         // The scanner reports 127 us per point, and its data sheet 8,000 points per second.
         assert_eq!(Model::A2m8.beams_in_mode(1e6 / 127.0), 800);
         assert_eq!(Model::A2m12.beams_in_mode(1e6 / 63.0), 1_600);
@@ -315,7 +322,7 @@ mod tests {
 
     #[test]
     fn requests_are_those_to_stop_and_for_the_identity() {
-        let asks = APPROACH.asks.unwrap();
+        let asks = APPROACH.request_steps.unwrap();
         assert_eq!(asks.stop.unwrap().request, Request::STOP.bytes());
         assert_eq!(asks.requests, [Request::INFO.bytes()]);
     }

@@ -21,12 +21,12 @@ use core::fmt;
 use scanhub_schema::{Family, MILLIS, Nanos, line_time};
 
 use crate::families::probes;
-use crate::line::family::{Approach, Asks, Evidence, Probe};
-use crate::line::{Account, Output, Protocol};
+use crate::line::family::{Approach, Evidence, Probe, RequestSteps};
+use crate::line::{Action, Protocol, SessionStats};
 
 /// Result of a search.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Found {
+pub struct FoundScanner {
     /// Family of the scanner.
     pub family: Family,
     /// Name of the model, if the scanner has reported it.
@@ -53,13 +53,13 @@ pub struct Memory {
     pub family: Family,
     /// Rate of its stream, in bits per second.
     pub stream_rate: u32,
-    /// Rate at which it replied when it did not stream: that of [`Found`].
+    /// Rate at which it replied when it did not stream: that of [`FoundScanner`].
     pub reply_rate: u32,
 }
 
 /// Reason why no scanner is found.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Trouble {
+pub enum Problem {
     /// No byte arrives.
     Silent {
         /// Duration of the search in seconds, rounded down to 10, 100, 300, 600, ..
@@ -100,14 +100,14 @@ pub struct Search {
     steps: Vec<Step>,
     entered: usize,
     /// Whether a request to the remembered scanner was sent in this round.
-    is_memory_asked: bool,
+    is_memory_requested: bool,
     rate: Option<u32>,
     change_rate: bool,
     /// Rates that the port cannot have.
     rejected: Vec<u32>,
     capture: Capture,
     /// Number of the first captured byte that may belong to a reply.
-    asked_at: usize,
+    reply_offset: usize,
     opened_at: Nanos,
     now: Nanos,
     last_byte: Nanos,
@@ -118,37 +118,37 @@ pub struct Search {
     step_began: Nanos,
     round_began: Nanos,
     /// Bytes per second of the last step that listened and received any in this round.
-    listened: Option<u32>,
+    step_bytes_per_second: Option<u32>,
     /// Bytes per second of the last complete round. `None` if no byte arrived in it.
     bytes_per_second: Option<u32>,
-    found: Option<Found>,
+    found: Option<FoundScanner>,
 }
 
 #[derive(Clone, Copy, Debug)]
 struct Step {
-    condition: Condition,
+    condition: StepCondition,
     /// `None` if the port has no rate that can be set.
     rate: Option<u32>,
-    action: Action,
+    action: StepAction,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Condition {
+enum StepCondition {
     Always,
     /// Bytes have arrived in this round, or the search has not listened in it because the port cannot have the rates.
     Bytes,
     /// The line looks like that of the remembered scanner, or is silent.
-    Familiar,
+    KnownScanner,
     /// No request to the remembered scanner was sent in this round.
-    NotAsked,
+    NotRequested,
 }
 
 #[derive(Clone, Copy, Debug)]
-enum Action {
+enum StepAction {
     /// Listens for this time, and longer by the second time if a transmission has begun.
     Listen(Nanos, Nanos),
     /// Sends the request of the probe with this number.
-    Ask(usize),
+    Request(usize),
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -156,22 +156,22 @@ enum Phase {
     /// Waits for bytes until `until`, or for the end of a transmission that has begun until `at_most`.
     Listening { until: Nanos, at_most: Nanos },
     /// Waits until the request of `ask` may be sent.
-    Settling { ask: Ask, until: Nanos },
+    Settling { ask: RequestState, until: Nanos },
     /// The bytes of the request leave.
-    Sending { ask: Ask, outgoing: Outgoing },
+    Sending { ask: RequestState, outgoing: OutgoingRequest },
     /// Waits for the end of the stream that the request has stopped.
-    Draining { ask: Ask, until: Nanos, at_most: Nanos },
+    Draining { ask: RequestState, until: Nanos, at_most: Nanos },
     /// Waits for the reply, as [`Phase::Listening`].
-    Awaiting { ask: Ask, until: Nanos, at_most: Nanos },
+    Awaiting { ask: RequestState, until: Nanos, at_most: Nanos },
     /// Waits between two rounds. A byte ends the pause.
     Pausing { until: Nanos },
 }
 
 /// Requests of one step.
 #[derive(Clone, Copy, Debug)]
-struct Ask {
+struct RequestState {
     probe: usize,
-    asks: &'static Asks,
+    steps: &'static RequestSteps,
     /// Number of repetitions of the request that are left.
     repeats: u8,
     /// Number of repetitions that are left for damaged replies.
@@ -182,12 +182,12 @@ struct Ask {
 
 /// A request, and the number of its bytes that were sent. They are sent one by one if the scanner requires gaps.
 #[derive(Clone, Copy, Debug)]
-struct Outgoing {
+struct OutgoingRequest {
     request: &'static [u8],
     sent: usize,
     not_before: Nanos,
     /// Time of the last byte.
-    left_at: Nanos,
+    sent_at: Nanos,
     restarts: u8,
 }
 
@@ -195,7 +195,8 @@ impl Search {
     /// Returns the rate at which the port has to be open, in bits per second.
     pub fn opening_rate(memory: Option<Memory>) -> u32 {
         let probes = probes();
-        let first = probes.iter().find_map(|probe| probe.approach().listens.first().map(|step| step.rate));
+        let first =
+            probes.iter().find_map(|probe| probe.approach().listen_steps.first().map(|step| step.rate));
         let memory = memory.and_then(|memory| memory.checked(&probes));
         memory.map(|memory| memory.stream_rate).or(first).unwrap_or(BOOT_RATE)
     }
@@ -211,12 +212,12 @@ impl Search {
             round: 0,
             steps: Vec::new(),
             entered: 0,
-            is_memory_asked: false,
+            is_memory_requested: false,
             rate: (port == PortKind::Serial).then(|| Search::opening_rate(memory)),
             change_rate: false,
             rejected: Vec::new(),
             capture: Capture::default(),
-            asked_at: 0,
+            reply_offset: 0,
             opened_at: now,
             now,
             last_byte: now,
@@ -225,7 +226,7 @@ impl Search {
             step_read: 0,
             step_began: now,
             round_began: now,
-            listened: None,
+            step_bytes_per_second: None,
             bytes_per_second: None,
             found: None,
         };
@@ -234,20 +235,20 @@ impl Search {
     }
 
     /// Requests the [`opening_rate`](Self::opening_rate) first, because the port is open at another rate.
-    pub fn at_another_rate(mut self) -> Search {
+    pub fn with_rate_change(mut self) -> Search {
         self.change_rate = self.rate.is_some();
         self
     }
 
     /// Restricts a new search to scanners of `family`.
-    pub fn only(mut self, family: Family) -> Search {
+    pub fn restricted_to(mut self, family: Family) -> Search {
         self.probes.retain(|probe| probe.approach().family == family);
         self.begin_round();
         self
     }
 
     /// Returns the scanner, once it is found.
-    pub fn found(&self) -> Option<Found> {
+    pub fn found(&self) -> Option<FoundScanner> {
         self.found
     }
 
@@ -269,8 +270,10 @@ impl Search {
 
     /// Returns the rates at which it searches for each family, in the order of [`Family::ALL`].
     pub fn coverage(&self) -> Vec<Coverage> {
-        let of = |family| self.probes.iter().map(|probe| probe.approach()).find(|it| it.family == family);
-        let approaches = Family::ALL.into_iter().filter_map(of);
+        let approach_of = |family| {
+            self.probes.iter().map(|probe| probe.approach()).find(|approach| approach.family == family)
+        };
+        let approaches = Family::ALL.into_iter().filter_map(approach_of);
         let coverage = approaches.map(|approach| {
             let (rejected, rates) =
                 approach.rates().into_iter().partition(|rate| self.rejected.contains(rate));
@@ -280,61 +283,71 @@ impl Search {
     }
 
     /// Returns the counters. The bytes in [`reads`](Self::reads) count as buffered.
-    pub fn account(&self) -> Account {
+    pub fn stats(&self) -> SessionStats {
         let buffered = self.capture.len() as u64;
-        Account { read: self.read, discarded: self.read - buffered, buffered, ..Account::default() }
+        SessionStats { read: self.read, discarded: self.read - buffered, buffered, ..SessionStats::default() }
     }
 
     /// Returns why no scanner is found yet. `None` in the first two rounds.
-    pub fn trouble(&self) -> Option<Trouble> {
+    pub fn problem(&self) -> Option<Problem> {
         if self.round < 2 || self.found.is_some() {
             return None;
         }
         if let Some(bytes_per_second) = self.bytes_per_second {
-            return Some(Trouble::Unrecognized { bytes_per_second });
+            return Some(Problem::Unrecognized { bytes_per_second });
         }
         let seconds = (self.now.saturating_sub(self.opened_at) / (1_000 * MILLIS)) as u32;
-        let seconds = SECONDS.into_iter().rev().find(|&step| step <= seconds)?;
+        let seconds = MESSAGE_SECONDS.into_iter().rev().find(|&step| step <= seconds)?;
         let coverage = self.coverage();
         let has_rates = |family| coverage.iter().any(|it| it.family == family && !it.rates.is_empty());
-        Some(Trouble::Silent { seconds, is_possible: Family::ALL.map(has_rates) })
+        Some(Problem::Silent { seconds, is_possible: Family::ALL.map(has_rates) })
     }
 
     /// Ends the search if a family recognizes its scanner.
-    fn conclude(&mut self) {
+    fn check_evidence(&mut self) {
         for probe in &self.probes {
             let approach = probe.approach();
             let Evidence::Found(model) = probe.evidence() else { continue };
-            self.found = Some(Found { family: approach.family, model, rate: self.rate });
-            if approach.asks.is_some_and(|asks| asks.stop.is_some()) && self.port != PortKind::Recording {
-                self.capture.discard(self.asked_at);
+            self.found = Some(FoundScanner { family: approach.family, model, rate: self.rate });
+            if approach.request_steps.is_some_and(|asks| asks.stop.is_some())
+                && self.port != PortKind::Recording
+            {
+                self.capture.discard(self.reply_offset);
             }
             return;
         }
     }
 
     /// Handles the deadline of the phase.
-    fn expire(&mut self) {
+    fn handle_deadline(&mut self) {
         let phase = self.phase;
         match phase {
             Phase::Listening { until, at_most } if self.extend(until, at_most) => {}
             Phase::Awaiting { until, at_most, .. } if self.extend(until, at_most) => {}
             Phase::Settling { ask, .. } => self.send(ask),
-            Phase::Draining { ask, .. } => self.send(Ask { is_stop: false, ..ask }),
+            Phase::Draining { ask, .. } => self.send(RequestState { is_stop: false, ..ask }),
             Phase::Awaiting { ask, .. } if ask.retries > 0 && self.is_damaged(ask.probe) => {
-                self.send(Ask { retries: ask.retries - 1, is_stop: ask.asks.stop.is_some(), ..ask });
+                self.send(RequestState {
+                    retries: ask.retries - 1,
+                    is_stop: ask.steps.stop.is_some(),
+                    ..ask
+                });
             }
             Phase::Awaiting { ask, .. } if ask.repeats > 0 => {
-                self.send(Ask { repeats: ask.repeats - 1, is_stop: ask.asks.stop.is_some(), ..ask });
+                self.send(RequestState {
+                    repeats: ask.repeats - 1,
+                    is_stop: ask.steps.stop.is_some(),
+                    ..ask
+                });
             }
             Phase::Sending { .. } => {}
             Phase::Listening { .. } => {
-                self.note_listened();
+                self.note_rate();
                 self.advance();
             }
             Phase::Awaiting { .. } => self.advance(),
             Phase::Pausing { .. } => {
-                self.note_listened();
+                self.note_rate();
                 self.begin_round();
             }
         }
@@ -342,16 +355,16 @@ impl Search {
 
     /// Whether a reply to the request of this probe may have been damaged. The end of one that has begun is missing.
     fn is_damaged(&self, probe: usize) -> bool {
-        matches!(self.probes[probe].evidence(), Evidence::Damaged | Evidence::Begun)
+        matches!(self.probes[probe].evidence(), Evidence::Damaged | Evidence::Partial)
     }
 
     /// Waits a little longer, but no longer than `at_most`, if a transmission has begun. Returns whether it has.
     fn extend(&mut self, until: Nanos, at_most: Nanos) -> bool {
         let mut probes = self.probes.iter().filter(|probe| listens_at(probe.approach(), self.rate));
-        if self.now >= at_most || !probes.any(|probe| probe.evidence() == Evidence::Begun) {
+        if self.now >= at_most || !probes.any(|probe| probe.evidence() == Evidence::Partial) {
             return false;
         }
-        let later = (until.max(self.now) + EXTENSION).min(at_most);
+        let later = (until.max(self.now) + EXTENSION_INTERVAL).min(at_most);
         if let Phase::Listening { until, .. } | Phase::Awaiting { until, .. } = &mut self.phase {
             *until = later;
         }
@@ -359,10 +372,10 @@ impl Search {
     }
 
     /// Stores the bytes per second of a step that listened.
-    fn note_listened(&mut self) {
+    fn note_rate(&mut self) {
         let bytes = self.read - self.step_read;
         if bytes > 0 {
-            self.listened = Some(per_second(bytes, self.now.saturating_sub(self.step_began)));
+            self.step_bytes_per_second = Some(per_second(bytes, self.now.saturating_sub(self.step_began)));
         }
     }
 
@@ -383,10 +396,10 @@ impl Search {
         let is_possible = step.rate.is_none_or(|rate| !self.rejected.contains(&rate));
         is_possible
             && match step.condition {
-                Condition::Always => true,
-                Condition::Bytes => has_bytes || self.now == self.round_began,
-                Condition::Familiar => self.is_memory_asked || !has_bytes || is_stream(),
-                Condition::NotAsked => !self.is_memory_asked,
+                StepCondition::Always => true,
+                StepCondition::Bytes => has_bytes || self.now == self.round_began,
+                StepCondition::KnownScanner => self.is_memory_requested || !has_bytes || is_stream(),
+                StepCondition::NotRequested => !self.is_memory_requested,
             }
     }
 
@@ -394,32 +407,43 @@ impl Search {
         self.set_rate(step.rate);
         self.begin_step();
         match step.action {
-            Action::Listen(span, extension) => {
+            StepAction::Listen(span, extension) => {
                 let until = self.now.saturating_add(span);
                 self.phase = Phase::Listening { until, at_most: until.saturating_add(extension) };
             }
-            Action::Ask(probe) => {
-                let Some(asks) = self.probes[probe].approach().asks.as_ref() else { return };
-                self.is_memory_asked |= step.condition == Condition::Familiar;
-                let repeats = if self.is_patient() { asks.repeats.saturating_sub(1) } else { 0 };
-                let ask = Ask { probe, asks, repeats, retries: MAX_RETRIES, is_stop: asks.stop.is_some() };
-                let settled = if self.change_rate { self.now + asks.settle } else { self.now };
-                self.phase = Phase::Settling { ask, until: settled.max(self.opened_at + SILENT_AFTER_OPEN) };
+            StepAction::Request(probe) => {
+                let Some(asks) = self.probes[probe].approach().request_steps.as_ref() else { return };
+                self.is_memory_requested |= step.condition == StepCondition::KnownScanner;
+                let repeats = if self.is_slow_round() { asks.repeats.saturating_sub(1) } else { 0 };
+                let ask = RequestState {
+                    probe,
+                    steps: asks,
+                    repeats,
+                    retries: MAX_RETRIES,
+                    is_stop: asks.stop.is_some(),
+                };
+                let ready_at = if self.change_rate { self.now + asks.settle_time } else { self.now };
+                self.phase = Phase::Settling { ask, until: ready_at.max(self.opened_at + SILENT_AFTER_OPEN) };
             }
         }
     }
 
     /// Starts to send the request of `ask`.
-    fn send(&mut self, ask: Ask) {
-        let requests = ask.asks.requests;
-        let question = requests[self.round % requests.len()];
-        let request = ask.asks.stop.filter(|_| ask.is_stop).map_or(question, |stop| stop.request);
+    fn send(&mut self, ask: RequestState) {
+        let requests = ask.steps.requests;
+        let reply_request = requests[self.round % requests.len()];
+        let request = ask.steps.stop.filter(|_| ask.is_stop).map_or(reply_request, |stop| stop.request);
         if !ask.is_stop {
             self.probes[ask.probe].expect_reply(true);
-            self.asked_at = self.capture.len();
+            self.reply_offset = self.capture.len();
         }
-        let outgoing =
-            Outgoing { request, sent: 0, not_before: self.now, left_at: self.now, restarts: MAX_RESTARTS };
+        let outgoing = OutgoingRequest {
+            request,
+            sent: 0,
+            not_before: self.now,
+            sent_at: self.now,
+            restarts: MAX_RESTARTS,
+        };
         self.phase = Phase::Sending { ask, outgoing };
     }
 
@@ -434,13 +458,13 @@ impl Search {
         }
         (self.rate, self.change_rate) = (rate, true);
         self.capture.discard(self.capture.len());
-        self.asked_at = 0;
+        self.reply_offset = 0;
         self.probes.iter_mut().for_each(|probe| probe.clear());
     }
 
     fn begin_round(&mut self) {
         self.plan_round();
-        (self.entered, self.is_memory_asked, self.listened) = (0, false, None);
+        (self.entered, self.is_memory_requested, self.step_bytes_per_second) = (0, false, None);
         (self.round_began, self.round_read) = (self.now, self.read);
         self.advance();
     }
@@ -449,10 +473,10 @@ impl Search {
     fn end_round(&mut self) {
         let bytes = self.read - self.round_read;
         let mean = per_second(bytes, self.now.saturating_sub(self.round_began));
-        let new = (bytes > 0).then_some(self.listened.unwrap_or(mean));
+        let measured = (bytes > 0).then_some(self.step_bytes_per_second.unwrap_or(mean));
         // A number that is about the same stays, so that its message does.
-        let is_same = |old: &u32| new.is_some_and(|new| new / 3 <= old / 2 && old / 3 <= new / 2);
-        self.bytes_per_second = self.bytes_per_second.filter(is_same).or(new);
+        let is_same = |old: &u32| measured.is_some_and(|new| new / 3 <= old / 2 && old / 3 <= new / 2);
+        self.bytes_per_second = self.bytes_per_second.filter(is_same).or(measured);
         let pause = if bytes == 0 { PAUSES[self.round.min(PAUSES.len() - 1)] } else { 0 };
         self.round += 1;
         let boot_rate = self.probes.iter().find_map(|probe| probe.approach().boot_rate);
@@ -467,15 +491,15 @@ impl Search {
     }
 
     /// Whether slow scanners have more time in this round.
-    fn is_patient(&self) -> bool {
+    fn is_slow_round(&self) -> bool {
         self.round % 2 == 1
     }
 
-    fn reply_time(&self, asks: &Asks) -> Nanos {
+    fn reply_timeout(&self, asks: &RequestSteps) -> Nanos {
         match self.port {
-            PortKind::Serial if self.is_patient() => asks.reply + asks.patience,
-            PortKind::Serial => asks.reply,
-            PortKind::Server | PortKind::Recording => SERVER_STEP,
+            PortKind::Serial if self.is_slow_round() => asks.reply_timeout + asks.extra_reply_time,
+            PortKind::Serial => asks.reply_timeout,
+            PortKind::Server | PortKind::Recording => SERVER_STEP_TIME,
         }
     }
 
@@ -483,17 +507,18 @@ impl Search {
         let mut steps = Vec::new();
         let mut push = |condition, rate, action| steps.push(Step { condition, rate, action });
         match self.port {
-            PortKind::Recording => push(Condition::Always, None, Action::Listen(Nanos::MAX, 0)),
+            PortKind::Recording => push(StepCondition::Always, None, StepAction::Listen(Nanos::MAX, 0)),
             PortKind::Server => {
-                push(Condition::Always, None, Action::Listen(SERVER_STEP, SERVER_STEP));
+                push(StepCondition::Always, None, StepAction::Listen(SERVER_STEP_TIME, SERVER_STEP_TIME));
                 let is_other =
                     |number: &usize| Some(self.family(*number)) != self.memory.map(|memory| memory.family);
                 let mut numbers: Vec<usize> = (0..self.probes.len()).collect();
                 numbers.sort_by_key(is_other);
-                for number in
-                    numbers.into_iter().filter(|&number| self.probes[number].approach().asks.is_some())
+                for number in numbers
+                    .into_iter()
+                    .filter(|&number| self.probes[number].approach().request_steps.is_some())
                 {
-                    push(Condition::Always, None, Action::Ask(number));
+                    push(StepCondition::Always, None, StepAction::Request(number));
                 }
             }
             PortKind::Serial => {
@@ -504,31 +529,39 @@ impl Search {
                 {
                     let approach = self.probes[number].approach();
                     let telegrams = 2 * line_time(approach.max_transmission, stream_rate);
-                    push(Condition::Always, Some(stream_rate), Action::Listen(SILENT_AFTER_OPEN, telegrams));
-                    if approach.asks.is_some() {
+                    push(
+                        StepCondition::Always,
+                        Some(stream_rate),
+                        StepAction::Listen(SILENT_AFTER_OPEN, telegrams),
+                    );
+                    if approach.request_steps.is_some() {
                         remembered.push((number, reply_rate));
                         remembered.extend((stream_rate != reply_rate).then_some((number, stream_rate)));
                     }
                 }
                 for &(number, rate) in &remembered {
-                    push(Condition::Familiar, Some(rate), Action::Ask(number));
+                    push(StepCondition::KnownScanner, Some(rate), StepAction::Request(number));
                 }
                 for needs_bytes in [false, true] {
-                    let condition = if needs_bytes { Condition::Bytes } else { Condition::Always };
-                    let listens = self.probes.iter().flat_map(|probe| probe.approach().listens);
+                    let condition = if needs_bytes { StepCondition::Bytes } else { StepCondition::Always };
+                    let listens = self.probes.iter().flat_map(|probe| probe.approach().listen_steps);
                     for listen in listens.filter(|listen| listen.needs_bytes == needs_bytes) {
                         if memory.is_none_or(|memory| memory.stream_rate != listen.rate) {
-                            push(condition, Some(listen.rate), Action::Listen(listen.span, listen.span));
+                            push(
+                                condition,
+                                Some(listen.rate),
+                                StepAction::Listen(listen.duration, listen.duration),
+                            );
                         }
                     }
                 }
                 for &(number, rate) in &remembered {
-                    push(Condition::NotAsked, Some(rate), Action::Ask(number));
+                    push(StepCondition::NotRequested, Some(rate), StepAction::Request(number));
                 }
                 for number in 0..self.probes.len() {
                     for rate in self.rates(number) {
                         if !remembered.contains(&(number, rate)) {
-                            push(Condition::Always, Some(rate), Action::Ask(number));
+                            push(StepCondition::Always, Some(rate), StepAction::Request(number));
                         }
                     }
                 }
@@ -544,7 +577,7 @@ impl Search {
     /// Returns the rates at which the search sends requests of a family, the remembered ones first.
     fn rates(&self, number: usize) -> Vec<u32> {
         let approach = self.probes[number].approach();
-        let mut rates = approach.asks.map_or_else(Vec::new, |asks| asks.rates.to_vec());
+        let mut rates = approach.request_steps.map_or_else(Vec::new, |asks| asks.rates.to_vec());
         if let Some(memory) = self.memory.filter(|memory| memory.family == approach.family) {
             let order = [memory.reply_rate, memory.stream_rate];
             rates.sort_by_key(|rate| order.iter().position(|first| first == rate).unwrap_or(order.len()));
@@ -554,8 +587,8 @@ impl Search {
 }
 
 impl Protocol for Search {
-    fn spare(&mut self) -> &mut [u8] {
-        self.capture.spare()
+    fn read_buffer(&mut self) -> &mut [u8] {
+        self.capture.read_buffer()
     }
 
     fn commit(&mut self, now: Nanos, len: usize) {
@@ -564,11 +597,13 @@ impl Protocol for Search {
             return;
         }
         let removed = self.capture.commit(now, len);
-        self.asked_at = self.asked_at.saturating_sub(removed);
+        self.reply_offset = self.reply_offset.saturating_sub(removed);
         (self.last_byte, self.read) = (now, self.read + len as u64);
         match &mut self.phase {
-            Phase::Pausing { until } => *until = (*until).min(now + END_OF_PAUSE),
-            Phase::Draining { ask, until, .. } => *until = now + ask.asks.stop.map_or(0, |stop| stop.quiet),
+            Phase::Pausing { until } => *until = (*until).min(now + BOOT_MESSAGE_TIME),
+            Phase::Draining { ask, until, .. } => {
+                *until = now + ask.steps.stop.map_or(0, |stop| stop.quiet_time)
+            }
             _ => {}
         }
         for probe in &mut self.probes {
@@ -576,14 +611,14 @@ impl Protocol for Search {
                 probe.receive(self.capture.last(len));
             }
         }
-        self.conclude();
+        self.check_evidence();
     }
 
     fn handle_timeout(&mut self, now: Nanos) {
         self.now = now;
         let idle = now.saturating_sub(self.last_byte);
         self.probes.iter_mut().for_each(|probe| probe.release(idle));
-        self.conclude();
+        self.check_evidence();
     }
 
     fn reject_rate(&mut self, now: Nanos) {
@@ -594,21 +629,21 @@ impl Protocol for Search {
         }
     }
 
-    fn transmitted(&mut self, now: Nanos) {
+    fn handle_transmitted(&mut self, now: Nanos) {
         self.now = now;
         // The rate of a server is unknown, so its bytes are sent at the slowest pace.
         let byte_time = line_time(1, self.rate.unwrap_or(BOOT_RATE));
         let Phase::Sending { ask, outgoing } = &mut self.phase else { return };
-        outgoing.transmitted(now, byte_time, ask.asks.gap);
+        outgoing.transmitted(now, byte_time, ask.steps.gap);
         if outgoing.sent < outgoing.request.len() {
             return;
         }
-        let (ask, stop) = (*ask, ask.asks.stop.filter(|_| ask.is_stop));
+        let (ask, stop) = (*ask, ask.steps.stop.filter(|_| ask.is_stop));
         self.phase = match stop {
-            Some(stop) => Phase::Draining { ask, until: now + stop.quiet, at_most: now + stop.at_most },
+            Some(stop) => Phase::Draining { ask, until: now + stop.quiet_time, at_most: now + stop.max_wait },
             None => {
-                let until = now + self.reply_time(ask.asks);
-                Phase::Awaiting { ask, until, at_most: until + ask.asks.extension }
+                let until = now + self.reply_timeout(ask.steps);
+                Phase::Awaiting { ask, until, at_most: until + ask.steps.extra_partial_time }
             }
         };
     }
@@ -617,20 +652,20 @@ impl Protocol for Search {
         self.found.is_some()
     }
 
-    fn poll_output(&mut self) -> Output<'_> {
+    fn poll_action(&mut self) -> Action<'_> {
         if self.is_done() {
-            return Output::Wait { until: self.now };
+            return Action::Wait { until: self.now };
         }
         loop {
             if core::mem::take(&mut self.change_rate)
                 && let Some(rate) = self.rate
             {
-                return Output::SetRate(rate);
+                return Action::SetRate(rate);
             }
             let until = match &self.phase {
                 Phase::Sending { ask, outgoing } if outgoing.not_before <= self.now + TRANSMIT_AHEAD => {
-                    let bytes = outgoing.next(ask.asks.gap);
-                    return Output::Transmit { bytes, not_before: outgoing.not_before };
+                    let bytes = outgoing.next(ask.steps.gap);
+                    return Action::Transmit { bytes, not_before: outgoing.not_before };
                 }
                 Phase::Sending { outgoing, .. } => outgoing.not_before,
                 Phase::Draining { until, at_most, .. } => *until.min(at_most),
@@ -642,9 +677,9 @@ impl Protocol for Search {
             if until > self.now {
                 let holds = self.probes.iter().filter_map(|probe| probe.hold());
                 let held_until = holds.map(|hold| self.last_byte + hold).filter(|&at| at > self.now).min();
-                return Output::Wait { until: until.min(held_until.unwrap_or(Nanos::MAX)) };
+                return Action::Wait { until: until.min(held_until.unwrap_or(Nanos::MAX)) };
             }
-            self.expire();
+            self.handle_deadline();
         }
     }
 }
@@ -661,7 +696,7 @@ impl Memory {
     }
 }
 
-impl Outgoing {
+impl OutgoingRequest {
     /// Returns the bytes to write next.
     fn next(&self, gap: Option<(Nanos, Nanos)>) -> &'static [u8] {
         let end = if gap.is_some() { self.sent + 1 } else { self.request.len() };
@@ -675,8 +710,8 @@ impl Outgoing {
             self.sent = self.request.len();
             return;
         };
-        let is_late = self.sent > 0 && now.saturating_sub(self.left_at) > byte_time + max_gap;
-        self.left_at = now;
+        let is_late = self.sent > 0 && now.saturating_sub(self.sent_at) > byte_time + max_gap;
+        self.sent_at = now;
         if is_late && self.restarts > 0 {
             (self.sent, self.restarts) = (0, self.restarts - 1);
             self.not_before = now + byte_time + 2 * max_gap;
@@ -698,16 +733,16 @@ struct Capture {
 }
 
 impl Capture {
-    fn spare(&mut self) -> &mut [u8] {
-        self.bytes.resize(CAPTURE + READ, 0);
-        &mut self.bytes[self.len..self.len + READ]
+    fn read_buffer(&mut self) -> &mut [u8] {
+        self.bytes.resize(CAPTURE_LEN + READ_LEN, 0);
+        &mut self.bytes[self.len..self.len + READ_LEN]
     }
 
     /// Adds a read of `len` bytes, and returns how many old ones were removed to make room for the next read.
     fn commit(&mut self, now: Nanos, len: usize) -> usize {
         self.len += len;
         self.reads.push((self.len, now));
-        let surplus = if self.len > CAPTURE { self.len - CAPTURE / 2 } else { 0 };
+        let surplus = if self.len > CAPTURE_LEN { self.len - CAPTURE_LEN / 2 } else { 0 };
         self.discard(surplus);
         surplus
     }
@@ -737,23 +772,23 @@ impl Capture {
     }
 }
 
-impl Trouble {
+impl Problem {
     /// Returns the message for the user of `port`.
     pub fn message(self, port: &str) -> String {
         match self {
-            Trouble::Silent { .. } => self.to_string(),
-            Trouble::Unrecognized { .. } => format!("{self}: stop the hub, then: scanhub probe {port}"),
+            Problem::Silent { .. } => self.to_string(),
+            Problem::Unrecognized { .. } => format!("{self}: stop the hub, then: scanhub probe {port}"),
         }
     }
 }
 
-impl fmt::Display for Trouble {
+impl fmt::Display for Problem {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Trouble::Silent { seconds, is_possible } => {
-                let names = |wanted: bool| {
+            Problem::Silent { seconds, is_possible } => {
+                let names = |possible: bool| {
                     let families = Family::ALL.into_iter().zip(*is_possible);
-                    let names = families.filter(|(_, is_possible)| *is_possible == wanted);
+                    let names = families.filter(|(_, is_possible)| *is_possible == possible);
                     names.map(|(family, _)| family.name()).collect::<Vec<_>>().join(", ")
                 };
                 write!(f, "no scanner replies (looked for {} for {seconds} s", names(true))?;
@@ -762,7 +797,7 @@ impl fmt::Display for Trouble {
                 }
                 f.write_str("): power, cable?")
             }
-            Trouble::Unrecognized { bytes_per_second } => {
+            Problem::Unrecognized { bytes_per_second } => {
                 match (bytes_per_second / 1_000, bytes_per_second % 1_000) {
                     (0, ones) => write!(f, "{ones}")?,
                     (thousands, ones) => write!(f, "{thousands},{ones:03}")?,
@@ -775,8 +810,8 @@ impl fmt::Display for Trouble {
 
 /// Returns whether scanners of a family may use `rate`. All may at a port whose rate is unknown.
 fn listens_at(approach: &Approach, rate: Option<u32>) -> bool {
-    let asks = approach.asks.map_or(&[][..], |asks| asks.rates);
-    let mut rates = approach.listens.iter().map(|listen| listen.rate).chain(asks.iter().copied());
+    let asks = approach.request_steps.map_or(&[][..], |asks| asks.rates);
+    let mut rates = approach.listen_steps.iter().map(|listen| listen.rate).chain(asks.iter().copied());
     rate.is_none_or(|rate| rates.any(|known| known == rate))
 }
 
@@ -790,13 +825,13 @@ fn per_second(bytes: u64, span: Nanos) -> u32 {
 /// Time after the open in which no byte is sent, so that a scanner that streams can be recognized first.
 const SILENT_AFTER_OPEN: Nanos = 150 * MILLIS;
 /// Duration of each step on a serial server.
-const SERVER_STEP: Nanos = 500 * MILLIS;
+const SERVER_STEP_TIME: Nanos = 500 * MILLIS;
 /// Pauses after rounds without a byte, by the number of the round.
 const PAUSES: [Nanos; 4] = [0, 500 * MILLIS, 1_000 * MILLIS, 1_500 * MILLIS];
 /// Time from the first byte in a pause to the end of the pause: that of a boot message.
-const END_OF_PAUSE: Nanos = 60 * MILLIS;
+const BOOT_MESSAGE_TIME: Nanos = 60 * MILLIS;
 /// Interval at which the search checks whether a transmission that has begun is complete.
-const EXTENSION: Nanos = 20 * MILLIS;
+const EXTENSION_INTERVAL: Nanos = 20 * MILLIS;
 /// A byte that may leave within this time is passed to the driver at once.
 const TRANSMIT_AHEAD: Nanos = 5 * MILLIS;
 /// Number of times that a request is sent again because its reply may have been damaged.
@@ -808,22 +843,22 @@ const BOOT_RATE: u32 = 9_600;
 /// Stands for the rate of a port that has rejected a rate.
 const UNKNOWN_RATE: u32 = 0;
 /// Bytes of one step that are kept. The longest telegram has 814.
-const CAPTURE: usize = 16 * 1_024;
+const CAPTURE_LEN: usize = 16 * 1_024;
 /// Bytes of one read: as many as a tty returns at once.
-const READ: usize = 4_096;
+const READ_LEN: usize = 4_096;
 /// Durations in messages. They are more than a minute apart, because each new message is logged.
-const SECONDS: [u32; 7] = [10, 100, 300, 600, 1_800, 3_600, 36_000];
+const MESSAGE_SECONDS: [u32; 7] = [10, 100, 300, 600, 1_800, 3_600, 36_000];
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn a_request_whose_next_byte_is_late_starts_over() {
+    fn late_byte_restarts_the_request_once() {
         const BYTE: Nanos = 1_000_000;
         let gap = Some((MILLIS / 10, 5 * MILLIS));
         let request = &[1, 2, 3];
-        let mut outgoing = Outgoing { request, sent: 0, not_before: 0, left_at: 0, restarts: 1 };
+        let mut outgoing = OutgoingRequest { request, sent: 0, not_before: 0, sent_at: 0, restarts: 1 };
         outgoing.transmitted(0, BYTE, gap);
         outgoing.transmitted(BYTE + 5 * MILLIS, BYTE, gap);
         assert_eq!(outgoing.sent, 2, "in time");
@@ -837,7 +872,7 @@ mod tests {
     }
 
     #[test]
-    fn a_memory_never_leads_to_a_request_at_a_rate_of_another_family() {
+    fn memory_is_limited_to_rates_of_its_family() {
         for (family, stream_rate, reply_rate, expected) in [
             (Family::Lms, 500_000, 9_600, Some((500_000, 9_600))),
             (Family::Lms, 500_000, 115_200, Some((500_000, 500_000))),
@@ -852,7 +887,7 @@ mod tests {
     }
 
     #[test]
-    fn families_whose_rates_the_port_rejects_are_not_looked_for() {
+    fn skips_families_with_only_rejected_rates() {
         let mut search = Search::new(PortKind::Serial, None, 0);
         let (ld, lms) = (crate::ld::Probe::default(), crate::lms::Probe::default());
         let rates = |probe: &dyn Probe| probe.approach().rates();
@@ -863,18 +898,18 @@ mod tests {
         assert_eq!(of(Family::Lms).rates, [9_600, 19_200, 38_400]);
         assert_eq!((&of(Family::Lms).rejected[..], rates(&lms).len()), (&[500_000][..], 4));
         (search.round, search.now) = (2, 10_000 * MILLIS);
-        let message = search.trouble().expect("it is silent").to_string();
+        let message = search.problem().expect("it is silent").to_string();
         let expected = "no scanner replies (looked for lms, rplidar for 10 s; the port cannot have the rates of ld): \
                         power, cable?";
         assert_eq!(message, expected);
-        let only = Search::new(PortKind::Serial, None, 0).only(Family::Rplidar).coverage();
+        let only = Search::new(PortKind::Serial, None, 0).restricted_to(Family::Rplidar).coverage();
         assert_eq!(only.iter().map(|it| it.family).collect::<Vec<_>>(), [Family::Rplidar]);
     }
 
     #[test]
     fn messages_name_the_pace_and_the_port() {
         let messages = [999, 1_000, 12_400]
-            .map(|bytes_per_second| Trouble::Unrecognized { bytes_per_second }.message("/dev/ttyUSB0"));
+            .map(|bytes_per_second| Problem::Unrecognized { bytes_per_second }.message("/dev/ttyUSB0"));
         let rest = "bytes/s arrive, but scanhub does not recognize the scanner: stop the hub, then: scanhub probe \
                     /dev/ttyUSB0";
         assert_eq!(messages, ["999", "1,000", "12,400"].map(|pace| format!("{pace} {rest}")));

@@ -141,7 +141,7 @@ pub struct Settings {
     pub fixed_rate: bool,
     /// Whether nothing can be sent, because the bytes are from a recording.
     pub listen_only: bool,
-    /// Whether the motor stops while there are no subscribers, if it [can](Features::can_rest).
+    /// Whether the motor stops while there are no subscribers, if it [can](Features::can_stop_motor).
     pub stop_when_idle: bool,
     /// Whether a search has found the scanner. Its number of beams then follows what it reports.
     pub is_found: bool,
@@ -161,15 +161,15 @@ impl SettingsRequest {
                 (self.mode, self.mode_number) = ((!is_auto).then(|| mode.to_owned()), None);
             }
             (Key::Beams, Value::Whole(number)) => {
-                let beams = usize::try_from(number).ok().filter(|beams| line::BEAMS.contains(beams));
-                let (least, most) = (line::BEAMS.start(), line::BEAMS.end());
-                let remedy = || format!("a whole number from {least} to {most}");
-                self.beams = Some(beams.ok_or_else(|| refused(Key::Beams, value, remedy()))?);
+                let beams = usize::try_from(number).ok().filter(|beams| line::BEAM_RANGE.contains(beams));
+                let (min, max) = (line::BEAM_RANGE.start(), line::BEAM_RANGE.end());
+                let remedy = || format!("a whole number from {min} to {max}");
+                self.beams = Some(beams.ok_or_else(|| refusal(Key::Beams, value, remedy()))?);
             }
             (Key::Idle, Value::Text(text)) => {
-                let known = IDLE.iter().find(|(word, _)| *word == text);
-                let remedy = || format!("one of: {}", IDLE.map(|(word, _)| word).join(", "));
-                self.stop_when_idle = Some(known.ok_or_else(|| refused(Key::Idle, value, remedy()))?.1);
+                let known = IDLE_VALUES.iter().find(|(word, _)| *word == text);
+                let remedy = || format!("one of: {}", IDLE_VALUES.map(|(word, _)| word).join(", "));
+                self.stop_when_idle = Some(known.ok_or_else(|| refusal(Key::Idle, value, remedy()))?.1);
             }
             _ => lms::set(self, key, value)?,
         }
@@ -178,12 +178,12 @@ impl SettingsRequest {
 
     /// Returns the keys that name a family, because only one has them. Each comes with its family and with its text in a
     /// message.
-    pub fn naming(&self) -> impl Iterator<Item = (Key, Family, String)> {
+    pub fn family_keys(&self) -> impl Iterator<Item = (Key, Family, String)> {
         Key::ALL.into_iter().filter_map(|key| {
             let (family, what) = match (key, &self.model, &self.mode) {
                 (Key::Model, Some(model), _) => (family_of(model)?, format!("model = \"{model}\"")),
-                (Key::ModeName, _, Some(mode)) => (owner(key)?, format!("mode = \"{mode}\"")),
-                _ => (owner(key).filter(|_| self.has(key))?, key.name().to_owned()),
+                (Key::ModeName, _, Some(mode)) => (owning_family(key)?, format!("mode = \"{mode}\"")),
+                _ => (owning_family(key).filter(|_| self.has(key))?, key.name().to_owned()),
             };
             Some((key, family, what))
         })
@@ -200,13 +200,13 @@ impl SettingsRequest {
         };
         let all = || Family::ALL.into_iter().map(|family| (family, features(family)));
         let names = auto_or(all().flat_map(|(_, features)| features.models).map(|model| model.name));
-        let without: Vec<_> = all()
+        let without_models: Vec<_> = all()
             .filter(|(_, features)| features.models.is_empty())
             .map(|(family, _)| family.name().to_uppercase())
             .collect();
         let remedy = format!(
             "{names}; leave it out for an {}, which reports its model; `type` is the expected one",
-            without.join(" or ")
+            without_models.join(" or ")
         );
         Err(Refusal::new(&[Key::Model], format!("model = \"{model}\""), remedy))
     }
@@ -217,7 +217,7 @@ impl SettingsRequest {
     ///
     /// Returns a refusal if the family does not have a setting, or not with this value.
     pub fn check(&self, family: Family) -> Result<Settings, Refusal> {
-        if self.stop_when_idle == Some(true) && !features(family).can_rest {
+        if self.stop_when_idle == Some(true) && !features(family).can_stop_motor {
             let what = format!("idle = \"stop\", and an {} cannot be told to rest", family.name());
             return Err(Refusal::new(&[Key::Idle], what, "leave it out"));
         }
@@ -230,7 +230,7 @@ impl SettingsRequest {
     fn check_keys(&self, family: Family, features: &Features) -> Result<(), Refusal> {
         let is_foreign = |key: &Key| self.has(*key) && !key.has_default() && !features.keys.contains(key);
         let Some(key) = Key::ALL.into_iter().find(is_foreign) else { return Ok(()) };
-        let owner = owner(key).unwrap_or(family).name();
+        let owner = owning_family(key).unwrap_or(family).name();
         let what =
             format!("{} is of family {owner}; a scanner of another family has no such setting", key.name());
         let remedy = match (key, features.modes) {
@@ -243,7 +243,7 @@ impl SettingsRequest {
 
     /// Returns the settings of a scanner of `family`, which has `features` with models.
     pub(crate) fn check_models(&self, family: Family, features: &Features) -> Result<Settings, Refusal> {
-        let mut settings = self.checked();
+        let mut settings = self.unchecked_settings();
         if let Some(model) = &self.model {
             let known = features.models.iter().find(|known| known.name.eq_ignore_ascii_case(model));
             settings.model = Some(known.map(|known| known.name).ok_or_else(|| {
@@ -268,7 +268,7 @@ impl SettingsRequest {
     }
 
     /// Returns the settings that need no further check.
-    pub(crate) fn checked(&self) -> Settings {
+    pub(crate) fn unchecked_settings(&self) -> Settings {
         Settings {
             beams: self.beams,
             expected_type: self.expected_type,
@@ -295,7 +295,7 @@ impl Settings {
             Key::Model => Some(Value::Text(self.model.unwrap_or(AUTO))),
             Key::Beams => self.beams.map(|beams| whole(beams as u32)),
             Key::ModeName => Some(Value::Text(self.mode.unwrap_or(AUTO))),
-            Key::Idle => IDLE
+            Key::Idle => IDLE_VALUES
                 .iter()
                 .find(|(_, stops)| *stops == self.stop_when_idle)
                 .map(|(word, _)| Value::Text(word)),
@@ -304,7 +304,7 @@ impl Settings {
 }
 
 /// Returns the family that alone has `key`.
-fn owner(key: Key) -> Option<Family> {
+fn owning_family(key: Key) -> Option<Family> {
     Family::ALL.into_iter().find(|&family| features(family).keys.contains(&key))
 }
 
@@ -316,10 +316,10 @@ pub fn family_of(model: &str) -> Option<Family> {
 }
 
 /// Values of `idle`, and whether the motor then stops while there are no subscribers.
-const IDLE: [(&str, bool); 2] = [("run", false), ("stop", true)];
+const IDLE_VALUES: [(&str, bool); 2] = [("run", false), ("stop", true)];
 
 /// Returns the refusal of a value that no scanner can have.
-pub(crate) fn refused(key: Key, value: Value<'_>, remedy: impl Into<String>) -> Refusal {
+pub(crate) fn refusal(key: Key, value: Value<'_>, remedy: impl Into<String>) -> Refusal {
     Refusal::new(&[key], format!("{} = {value}", key.name()), remedy)
 }
 

@@ -5,28 +5,30 @@
 //! The only code that sends a request of [`crate::eeprom`], and it needs [`Consent`]. A write that was not
 //! acknowledged is not simply repeated: first the configuration is read, to see whether it was done.
 
-use scanhub_drivers::line::{Output, Protocol};
+use scanhub_drivers::line::{Action, Protocol};
 use scanhub_drivers::lms::command::{self, Request};
-use scanhub_drivers::lms::exchange::{Exchange, Heard, MODE_TIMEOUT, MORE_TRIES, Say, TRIES};
 use scanhub_drivers::lms::framer::TelegramSpan;
 use scanhub_drivers::lms::operating::{ON_REQUEST, Operating, PARTIAL, STREAM};
 use scanhub_drivers::lms::reply::Reply;
-use scanhub_drivers::lms::telegram::Encoded;
+use scanhub_drivers::lms::request_channel::{
+    ChannelEvent, ESSENTIAL_TRIES, EncodeRequest, MODE_TIMEOUT, RequestChannel, TRIES,
+};
+use scanhub_drivers::lms::telegram::EncodedTelegram;
 use scanhub_schema::{MILLIS, Nanos};
 
-use crate::eeprom::{PowerOn, Write};
+use crate::eeprom::{EepromWrite, PowerOn};
 use crate::plan::{Consent, OwnedConfiguration, Plan};
 
 /// A change under way; it cannot be copied, as consent is to one.
 #[derive(Debug)]
 pub struct Change {
     plan: Plan,
-    exchange: Exchange<Saying>,
+    channel: RequestChannel<CurrentRequest>,
     step: Step,
     /// How often more the configuration may be written.
     writes_left: u8,
     /// The sensor sends nothing unasked. Before that the rest of a scan may look like a NAK.
-    is_quiet: bool,
+    is_stopped: bool,
     outcome: Outcome,
 }
 
@@ -59,7 +61,7 @@ pub enum Step {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Outcome {
     /// The step that failed first, and how; `None` if all went well.
-    pub failed: Option<(Step, Failing)>,
+    pub failed: Option<(Step, ChangeError)>,
     /// Whether a write may have reached the sensor.
     pub written: bool,
     /// The configuration as it was read back.
@@ -72,39 +74,39 @@ pub struct Outcome {
 
 /// How a step failed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Failing {
+pub enum ChangeError {
     /// No reply, or none that can be read.
     Unanswered,
     /// The sensor refused; at [`Step::Enter`]: the password is wrong.
     Refused,
     /// The settings read back differ from those written; at [`Step::Compare`]: from those of the plan.
-    Differs,
+    Mismatch,
 }
 
 #[derive(Clone, Debug)]
-enum Saying {
-    Ask(Request),
-    Keep(OwnedConfiguration),
-    PowerOn(PowerOn),
+enum CurrentRequest {
+    Request(Request),
+    WriteConfiguration(OwnedConfiguration),
+    WritePowerOn(PowerOn),
 }
 
-impl Saying {
+impl CurrentRequest {
     /// What of it is written.
-    fn write(&self) -> Option<Write<'_>> {
+    fn write(&self) -> Option<EepromWrite<'_>> {
         match self {
-            Saying::Ask(_) => None,
-            Saying::Keep(new) => Some(Write::Configuration(new.bytes())),
-            Saying::PowerOn(power_on) => Some(Write::PowerOn(*power_on)),
+            CurrentRequest::Request(_) => None,
+            CurrentRequest::WriteConfiguration(new) => Some(EepromWrite::Configuration(new.bytes())),
+            CurrentRequest::WritePowerOn(power_on) => Some(EepromWrite::PowerOn(*power_on)),
         }
     }
 }
 
-impl Say for Saying {
-    fn encode(&self, address: u8) -> Encoded {
+impl EncodeRequest for CurrentRequest {
+    fn encode(&self, address: u8) -> EncodedTelegram {
         let request = match self {
-            Saying::Ask(request) => *request,
+            CurrentRequest::Request(request) => *request,
             // Which configuration there is does no harm to ask; but none is longer than a write may be.
-            Saying::Keep(_) | Saying::PowerOn(_) => Request::Configuration,
+            CurrentRequest::WriteConfiguration(_) | CurrentRequest::WritePowerOn(_) => Request::Configuration,
         };
         let write = self.write().and_then(|write| write.encode(address));
         write.unwrap_or_else(|| request.encode(address))
@@ -112,27 +114,27 @@ impl Say for Saying {
 
     fn command(&self) -> u8 {
         match self {
-            Saying::Ask(request) => request.command(),
-            Saying::Keep(new) => Write::Configuration(new.bytes()).command(),
-            Saying::PowerOn(power_on) => Write::PowerOn(*power_on).command(),
+            CurrentRequest::Request(request) => request.command(),
+            CurrentRequest::WriteConfiguration(new) => EepromWrite::Configuration(new.bytes()).command(),
+            CurrentRequest::WritePowerOn(power_on) => EepromWrite::PowerOn(*power_on).command(),
         }
     }
 
-    fn work(&self) -> Nanos {
+    fn reply_timeout(&self) -> Nanos {
         match self {
-            Saying::Ask(request) if request.command() == command::MODE => MODE_TIMEOUT,
-            Saying::Ask(request) => request.work(),
-            Saying::Keep(_) | Saying::PowerOn(_) => WRITE_TIMEOUT,
+            CurrentRequest::Request(request) if request.command() == command::MODE => MODE_TIMEOUT,
+            CurrentRequest::Request(request) => request.reply_timeout(),
+            CurrentRequest::WriteConfiguration(_) | CurrentRequest::WritePowerOn(_) => WRITE_TIMEOUT,
         }
     }
 
     /// A sensor that writes, or changes its mode, may have acknowledged unheard, behind a scan that it broke off: it is
     /// waited for as long.
-    fn sign(&self) -> Nanos {
+    fn acknowledge_timeout(&self) -> Nanos {
         match self {
-            Saying::Ask(request) if request.command() == command::MODE => MODE_TIMEOUT,
-            Saying::Ask(request) => request.sign(),
-            Saying::Keep(_) | Saying::PowerOn(_) => WRITE_TIMEOUT,
+            CurrentRequest::Request(request) if request.command() == command::MODE => MODE_TIMEOUT,
+            CurrentRequest::Request(request) => request.acknowledge_timeout(),
+            CurrentRequest::WriteConfiguration(_) | CurrentRequest::WritePowerOn(_) => WRITE_TIMEOUT,
         }
     }
 }
@@ -141,17 +143,18 @@ impl Change {
     /// Carries out the plan that somebody consented to, on a port that is open at its rate.
     pub fn new(consent: Consent, now: Nanos) -> Self {
         let plan = consent.into_plan();
-        let mut exchange = Exchange::new(plan.baud, now);
+        let mut exchange = RequestChannel::new(plan.baud, now);
         exchange.address = plan.address;
         let (step, outcome) = (Step::Compare, Outcome::default());
-        let mut change = Change { plan, exchange, step, writes_left: TRIES, is_quiet: false, outcome };
+        let mut change =
+            Change { plan, channel: exchange, step, writes_left: TRIES, is_stopped: false, outcome };
         change.begin(Step::Compare);
         change
     }
 
     /// As a change on the line of a serial server, which may pack a reply before it sends it.
-    pub fn behind_server(mut self) -> Self {
-        self.exchange.behind_server = true;
+    pub fn with_server(mut self) -> Self {
+        self.channel.is_behind_server = true;
         self
     }
 
@@ -169,41 +172,41 @@ impl Change {
     fn begin(&mut self, step: Step) {
         self.step = step;
         let plan = self.plan;
-        let ask = |request| Some((Saying::Ask(request), TRIES));
+        let send = |request| Some((CurrentRequest::Request(request), TRIES));
         // A wrong or lost request does nothing; it is for the next step to find out.
-        let once = |saying| Some((saying, 1));
-        let said = match step {
-            Step::Enter => ask(Request::Operate(Operating::Installation(plan.password))),
+        let send_once = |request| Some((request, 1));
+        let next_request = match step {
+            Step::Enter => send(Request::Operate(Operating::Installation(plan.password))),
             Step::Write if plan.old == plan.new => None,
-            Step::Write => once(Saying::Keep(plan.new)),
-            Step::Compare | Step::Check | Step::ReadBack => ask(Request::Configuration),
-            Step::PowerOn => plan.power_on.map(Saying::PowerOn).and_then(once),
-            Step::Leave => Some((Saying::Ask(Request::Stop), MORE_TRIES)),
+            Step::Write => send_once(CurrentRequest::WriteConfiguration(plan.new)),
+            Step::Compare | Step::Check | Step::ReadBack => send(Request::Configuration),
+            Step::PowerOn => plan.power_on.map(CurrentRequest::WritePowerOn).and_then(send_once),
+            Step::Leave => Some((CurrentRequest::Request(Request::Stop), ESSENTIAL_TRIES)),
             Step::ReadStatus if plan.power_on.is_none() => None,
-            Step::ReadStatus => ask(Request::Status),
+            Step::ReadStatus => send(Request::Status),
             // It may still be in installation mode.
             Step::Restore if self.outcome.operating_mode.is_none() => {
-                Some((Saying::Ask(Request::Stop), MORE_TRIES))
+                Some((CurrentRequest::Request(Request::Stop), ESSENTIAL_TRIES))
             }
             Step::Restore => match plan.operating_mode {
-                STREAM => ask(Request::Stream),
-                PARTIAL => ask(Request::Operate(Operating::Partial)),
+                STREAM => send(Request::Stream),
+                PARTIAL => send(Request::Operate(Operating::Partial)),
                 // What other modes need beside their byte nobody tells.
                 _ => None,
             },
             Step::Done => return,
         };
-        match said {
-            Some((saying, tries)) => {
-                self.outcome.written |= saying.write().is_some();
-                self.exchange.ask(saying, self.exchange.now, tries);
+        match next_request {
+            Some((request, tries)) => {
+                self.outcome.written |= request.write().is_some();
+                self.channel.send_request(request, self.channel.now, tries);
             }
-            None => self.begin(following(step)),
+            None => self.begin(next_step(step)),
         }
     }
 
     fn on_telegram(&mut self, span: TelegramSpan) {
-        let telegram = self.exchange.view(span);
+        let telegram = self.channel.view(span);
         let reply = Reply::decode(telegram);
         let configuration = match &reply {
             Some(Reply::Configuration(it) | Reply::ConfigurationWritten { configuration: it, .. }) => {
@@ -224,21 +227,23 @@ impl Change {
             _ => None,
         };
         let command = telegram.command();
-        if self.exchange.answered(command).is_none() {
+        if self.channel.take_answered(command).is_none() {
             return;
         }
-        self.is_quiet |= is_changed;
+        self.is_stopped |= is_changed;
         match self.step {
-            _ if done == Some(false) => self.fail(Failing::Refused),
+            _ if done == Some(false) => self.handle_failure(ChangeError::Refused),
             // An answer that cannot be read says no more than none.
-            Step::Write if done.is_none() => self.ask_what_is_kept(),
-            _ if done.is_none() => self.fail(Failing::Unanswered),
-            Step::Compare if configuration != Some(self.plan.old) => self.fail(Failing::Differs),
+            Step::Write if done.is_none() => self.check_written(),
+            _ if done.is_none() => self.handle_failure(ChangeError::Unanswered),
+            Step::Compare if configuration != Some(self.plan.old) => {
+                self.handle_failure(ChangeError::Mismatch)
+            }
             Step::Check if configuration == Some(self.plan.new) => self.begin(Step::PowerOn),
             Step::Check if self.writes_left > 0 => self.begin(Step::Write),
             Step::Check => {
                 self.step = Step::Write;
-                self.fail(Failing::Unanswered);
+                self.handle_failure(ChangeError::Unanswered);
             }
             Step::Leave => {
                 self.outcome.operating_mode = Some(ON_REQUEST);
@@ -247,15 +252,15 @@ impl Change {
             Step::ReadBack => {
                 self.outcome.configuration = configuration;
                 if configuration != Some(self.plan.new) {
-                    self.note(Failing::Differs);
+                    self.record_failure(ChangeError::Mismatch);
                 }
                 self.begin(Step::ReadStatus);
             }
             Step::ReadStatus => {
                 self.outcome.permanent_baud = permanent;
-                let wanted = self.plan.power_on.map(|power_on| power_on == PowerOn::KeepBaud);
-                if wanted != permanent {
-                    self.note(Failing::Differs);
+                let expected = self.plan.power_on.map(|power_on| power_on == PowerOn::KeepBaud);
+                if expected != permanent {
+                    self.record_failure(ChangeError::Mismatch);
                 }
                 self.begin(Step::Restore);
             }
@@ -267,27 +272,27 @@ impl Change {
                 self.outcome.operating_mode = Some(self.plan.operating_mode);
                 self.begin(Step::Done);
             }
-            step => self.begin(following(step)),
+            step => self.begin(next_step(step)),
         }
     }
 
-    fn on_silence(&mut self) {
-        if self.exchange.again(self.exchange.now) {
+    fn on_no_reply(&mut self) {
+        if self.channel.retry(self.channel.now) {
             return;
         }
         match self.step {
-            Step::Write => self.ask_what_is_kept(),
-            _ => self.fail(Failing::Unanswered),
+            Step::Write => self.check_written(),
+            _ => self.handle_failure(ChangeError::Unanswered),
         }
     }
 
-    fn ask_what_is_kept(&mut self) {
+    fn check_written(&mut self) {
         self.writes_left = self.writes_left.saturating_sub(1);
         self.begin(Step::Check);
     }
 
-    fn fail(&mut self, failing: Failing) {
-        self.note(failing);
+    fn handle_failure(&mut self, error: ChangeError) {
+        self.record_failure(error);
         match self.step {
             // Nothing was said that changes anything.
             Step::Compare => {
@@ -297,65 +302,66 @@ impl Change {
             // Whether it heard that or not, it may be in installation mode.
             Step::Enter | Step::Write | Step::Check | Step::PowerOn => self.begin(Step::Leave),
             Step::Leave => self.begin(Step::ReadBack),
-            step => self.begin(following(step)),
+            step => self.begin(next_step(step)),
         }
     }
 
     /// The first failure is the cause of the others.
-    fn note(&mut self, failing: Failing) {
-        self.outcome.failed.get_or_insert((self.step, failing));
+    fn record_failure(&mut self, error: ChangeError) {
+        self.outcome.failed.get_or_insert((self.step, error));
     }
 }
 
 impl Protocol for Change {
-    fn spare(&mut self) -> &mut [u8] {
-        self.exchange.spare()
+    fn read_buffer(&mut self) -> &mut [u8] {
+        self.channel.read_buffer()
     }
 
     fn commit(&mut self, now: Nanos, len: usize) {
-        self.exchange.commit(now, len);
+        self.channel.commit(now, len);
     }
 
     fn handle_timeout(&mut self, now: Nanos) {
-        if self.exchange.handle_timeout(now) {
-            self.on_silence();
+        if self.channel.handle_timeout(now) {
+            self.on_no_reply();
         }
     }
 
     fn restart_if_late(&mut self, now: Nanos) -> bool {
-        self.exchange.restart_if_late(now)
+        self.channel.restart_if_late(now)
     }
 
-    fn transmitted(&mut self, now: Nanos) {
-        self.exchange.transmitted(now);
+    fn handle_transmitted(&mut self, now: Nanos) {
+        self.channel.handle_transmitted(now);
     }
 
     fn is_done(&self) -> bool {
         self.step == Step::Done
     }
 
-    fn poll_output(&mut self) -> Output<'_> {
-        while let Some(heard) = self.exchange.advance() {
-            match heard {
-                Heard::Telegram(span) => self.on_telegram(span),
+    fn poll_action(&mut self) -> Action<'_> {
+        while let Some(event) = self.channel.advance() {
+            match event {
+                ChannelEvent::Telegram(span) => self.on_telegram(span),
                 // While it may be writing, only time says no: noise is not worth a second write.
-                Heard::Nak if !self.is_quiet || matches!(self.step, Step::Write | Step::PowerOn) => {}
-                Heard::Nak => {
-                    if self.exchange.refused_checksum() == Some(false) {
-                        self.on_silence();
+                ChannelEvent::Nak if !self.is_stopped || matches!(self.step, Step::Write | Step::PowerOn) => {
+                }
+                ChannelEvent::Nak => {
+                    if self.channel.on_nak() == Some(false) {
+                        self.on_no_reply();
                     }
                 }
             }
         }
         match self.step {
-            Step::Done => Output::Wait { until: Nanos::MAX },
-            _ => self.exchange.output(Nanos::MAX),
+            Step::Done => Action::Wait { until: Nanos::MAX },
+            _ => self.channel.poll_action(Nanos::MAX),
         }
     }
 }
 
 /// The step after one that went as it should.
-fn following(step: Step) -> Step {
+fn next_step(step: Step) -> Step {
     match step {
         Step::Compare => Step::Enter,
         Step::Enter => Step::Write,

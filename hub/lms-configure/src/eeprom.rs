@@ -1,11 +1,11 @@
 //! Requests that write a sensor's EEPROM, which wears out after a few thousand writes. They work in installation mode
 //! only (Telegram listing 7-1). This module encodes and decodes them, and sends none.
 
-use scanhub_drivers::lms::telegram::{Encoded, MAX_LENGTH, Telegram, Writer};
+use scanhub_drivers::lms::telegram::{EncodedTelegram, MAX_LENGTH, Telegram, Writer};
 
 /// A request that writes the EEPROM.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Write<'a> {
+pub enum EepromWrite<'a> {
     /// 40h: a field. The parameters as they are: their layout is not known here.
     Field(&'a [u8]),
     /// 42h: the password of the installation mode. The parameters as they are.
@@ -20,36 +20,36 @@ pub enum Write<'a> {
     Configuration2(&'a [u8]),
 }
 
-impl<'a> Write<'a> {
+impl<'a> EepromWrite<'a> {
     /// The telegram that says it to the sensor at `address`; `None` if its bytes are more than such a request may have.
-    pub fn encode(self, address: u8) -> Option<Encoded> {
+    pub fn encode(self, address: u8) -> Option<EncodedTelegram> {
         let data = match &self {
-            Write::PowerOn(power_on) => core::slice::from_ref(power_on.as_byte()),
-            Write::Field(data)
-            | Write::Password(data)
-            | Write::Teach(data)
-            | Write::Configuration(data)
-            | Write::Configuration2(data) => data,
+            EepromWrite::PowerOn(power_on) => core::slice::from_ref(power_on.as_byte()),
+            EepromWrite::Field(data)
+            | EepromWrite::Password(data)
+            | EepromWrite::Teach(data)
+            | EepromWrite::Configuration(data)
+            | EepromWrite::Configuration2(data) => data,
         };
         self.fits(data.len()).then(|| Writer::new(address, self.command()).slice(data).finish())
     }
 
     /// The write that `telegram` asks for; `None` if it is none, or longer or shorter than it may be.
-    pub fn decode(telegram: Telegram<'a>) -> Option<Write<'a>> {
+    pub fn decode(telegram: Telegram<'a>) -> Option<EepromWrite<'a>> {
         if telegram.is_reply() {
             return None;
         }
         let data = telegram.data();
         let write = match telegram.command() {
-            FIELD => Write::Field(data),
-            PASSWORD => Write::Password(data),
-            TEACH => Write::Teach(data),
+            FIELD => EepromWrite::Field(data),
+            PASSWORD => EepromWrite::Password(data),
+            TEACH => EepromWrite::Teach(data),
             POWER_ON_RATE => match data {
-                &[byte] => Write::PowerOn(PowerOn::of_byte(byte)?),
+                &[byte] => EepromWrite::PowerOn(PowerOn::of_byte(byte)?),
                 _ => return None,
             },
-            CONFIGURATION => Write::Configuration(data),
-            CONFIGURATION_2 => Write::Configuration2(data),
+            CONFIGURATION => EepromWrite::Configuration(data),
+            CONFIGURATION_2 => EepromWrite::Configuration2(data),
             _ => return None,
         };
         write.fits(data.len()).then_some(write)
@@ -58,21 +58,21 @@ impl<'a> Write<'a> {
     /// The command byte.
     pub fn command(self) -> u8 {
         match self {
-            Write::Field(_) => FIELD,
-            Write::Password(_) => PASSWORD,
-            Write::Teach(_) => TEACH,
-            Write::PowerOn(_) => POWER_ON_RATE,
-            Write::Configuration(_) => CONFIGURATION,
-            Write::Configuration2(_) => CONFIGURATION_2,
+            EepromWrite::Field(_) => FIELD,
+            EepromWrite::Password(_) => PASSWORD,
+            EepromWrite::Teach(_) => TEACH,
+            EepromWrite::PowerOn(_) => POWER_ON_RATE,
+            EepromWrite::Configuration(_) => CONFIGURATION,
+            EepromWrite::Configuration2(_) => CONFIGURATION_2,
         }
     }
 
     fn fits(&self, len: usize) -> bool {
         match self {
-            Write::Configuration(_) => (1..=CONFIGURATION_LEN).contains(&len),
-            Write::Configuration2(_) => (1..=CONFIGURATION_2_LEN).contains(&len),
-            Write::PowerOn(_) => len == 1,
-            Write::Field(_) | Write::Password(_) | Write::Teach(_) => len < MAX_LENGTH,
+            EepromWrite::Configuration(_) => (1..=CONFIGURATION_LEN).contains(&len),
+            EepromWrite::Configuration2(_) => (1..=CONFIGURATION_2_LEN).contains(&len),
+            EepromWrite::PowerOn(_) => len == 1,
+            EepromWrite::Field(_) | EepromWrite::Password(_) | EepromWrite::Teach(_) => len < MAX_LENGTH,
         }
     }
 }
@@ -141,42 +141,42 @@ mod tests {
 
     #[test]
     fn printed_writes_both_ways() {
-        let configuration = Write::Configuration(&PRINTED).encode(0).unwrap();
+        let configuration = EepromWrite::Configuration(&PRINTED).encode(0).unwrap();
         assert_eq!(configuration.bytes()[..5], [0x02, 0, 0x23, 0, 0x77]);
         assert_eq!(configuration.bytes()[39..], [0x7B, 0x4B]);
-        assert_eq!(Write::decode(configuration.telegram()), Some(Write::Configuration(&PRINTED)));
-        let factory = Write::PowerOn(PowerOn::Baud9600).encode(0).unwrap();
+        assert_eq!(EepromWrite::decode(configuration.telegram()), Some(EepromWrite::Configuration(&PRINTED)));
+        let factory = EepromWrite::PowerOn(PowerOn::Baud9600).encode(0).unwrap();
         assert_eq!(factory.bytes(), [0x02, 0, 2, 0, 0x66, 0, 0x9C, 0x4E]);
-        let keep = Write::PowerOn(PowerOn::KeepBaud).encode(0).unwrap();
+        let keep = EepromWrite::PowerOn(PowerOn::KeepBaud).encode(0).unwrap();
         assert_eq!(keep.bytes(), [0x02, 0, 2, 0, 0x66, 1, 0x9D, 0x4E]);
     }
 
     #[test]
     fn every_write_both_ways_and_none_is_a_request() {
         let all = [
-            Write::Field(&[1, 2, 3]),
-            Write::Password(b"SICK_LMSSICK_LMS"),
-            Write::Teach(&[1]),
-            Write::PowerOn(PowerOn::KeepType),
-            Write::Configuration(&PRINTED[..7]),
-            Write::Configuration2(&[0; 84]),
+            EepromWrite::Field(&[1, 2, 3]),
+            EepromWrite::Password(b"SICK_LMSSICK_LMS"),
+            EepromWrite::Teach(&[1]),
+            EepromWrite::PowerOn(PowerOn::KeepType),
+            EepromWrite::Configuration(&PRINTED[..7]),
+            EepromWrite::Configuration2(&[0; 84]),
         ];
         for (write, command) in all.into_iter().zip(EEPROM_WRITES) {
             assert_eq!(write.command(), command);
             let encoded = write.encode(5).unwrap();
-            assert_eq!(Write::decode(encoded.telegram()), Some(write));
+            assert_eq!(EepromWrite::decode(encoded.telegram()), Some(write));
             assert_eq!(Request::decode(encoded.telegram()), None);
         }
     }
 
     #[test]
-    fn what_is_too_long_is_none() {
-        assert!(Write::Configuration(&[0; 35]).encode(0).is_none());
-        assert!(Write::Configuration2(&[]).encode(0).is_none());
-        assert!(Write::Field(&[0; 808]).encode(0).is_none());
+    fn does_not_encode_or_decode_invalid_writes() {
+        assert!(EepromWrite::Configuration(&[0; 35]).encode(0).is_none());
+        assert!(EepromWrite::Configuration2(&[]).encode(0).is_none());
+        assert!(EepromWrite::Field(&[0; 808]).encode(0).is_none());
         let three = Writer::new(0, POWER_ON_RATE).byte(3).finish();
-        assert_eq!(Write::decode(three.telegram()), None);
+        assert_eq!(EepromWrite::decode(three.telegram()), None);
         let reply = Writer::new(0x80, CONFIGURATION).byte(0).byte(0x10).finish();
-        assert_eq!(Write::decode(reply.telegram()), None);
+        assert_eq!(EepromWrite::decode(reply.telegram()), None);
     }
 }

@@ -9,5 +9,5 @@ mod change;
 pub mod eeprom;
 mod plan;
 
-pub use change::{Change, Failing, Outcome, Step};
+pub use change::{Change, ChangeError, Outcome, Step};
 pub use plan::{Consent, OwnedConfiguration, Plan};

@@ -2,7 +2,7 @@
 //! only with consent, which is for one plan as it was shown.
 
 use scanhub_drivers::lms::command::Password;
-use scanhub_drivers::lms::configuration::{Configuration, ITEMS, Item, LEN};
+use scanhub_drivers::lms::configuration::{CONFIGURATION_LEN, Configuration, ITEMS, Item};
 use scanhub_drivers::lms::inquiry::Report;
 use scanhub_drivers::lms::variant::Baud;
 
@@ -11,7 +11,7 @@ use crate::eeprom::PowerOn;
 /// The first part of a configuration with its own storage: 34 bytes, 32 with older firmware.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct OwnedConfiguration {
-    bytes: [u8; LEN],
+    bytes: [u8; CONFIGURATION_LEN],
     len: usize,
 }
 
@@ -19,7 +19,7 @@ impl OwnedConfiguration {
     /// A copy of `bytes`; `None` if they are no configuration.
     pub fn new(bytes: &[u8]) -> Option<OwnedConfiguration> {
         Configuration::new(bytes)?;
-        let mut configuration = OwnedConfiguration { bytes: [0; LEN], len: bytes.len() };
+        let mut configuration = OwnedConfiguration { bytes: [0; CONFIGURATION_LEN], len: bytes.len() };
         configuration.bytes.get_mut(..bytes.len())?.copy_from_slice(bytes);
         Some(configuration)
     }
@@ -31,8 +31,8 @@ impl OwnedConfiguration {
 
     /// Sets one byte; beyond its end nothing.
     pub fn set(&mut self, at: usize, byte: u8) {
-        if let Some(place) = self.bytes[..self.len].get_mut(at) {
-            *place = byte;
+        if let Some(slot) = self.bytes[..self.len].get_mut(at) {
+            *slot = byte;
         }
     }
 
@@ -66,7 +66,7 @@ pub struct Plan {
 
 impl Plan {
     /// No change of the sensor that told `report`; `None` if it did not tell all that is needed.
-    pub fn of(report: &Report) -> Option<Plan> {
+    pub fn from_report(report: &Report) -> Option<Plan> {
         let old = OwnedConfiguration::new(report.configuration()?.bytes())?;
         Some(Plan {
             baud: report.baud?,
@@ -92,7 +92,7 @@ pub struct Consent(Plan);
 
 impl Consent {
     /// A person at a terminal saw `plan` and confirmed it.
-    pub fn of_a_person(plan: Plan) -> Consent {
+    pub fn confirmed_by_person(plan: Plan) -> Consent {
         Consent(plan)
     }
 
@@ -104,21 +104,21 @@ impl Consent {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use scanhub_drivers::lms::configuration::factory;
+    use scanhub_drivers::lms::configuration::factory_configuration;
     use scanhub_drivers::lms::variant::{Mode, Unit};
     use std::vec::Vec;
 
     #[test]
-    fn differences_are_told_by_item() {
-        let old = OwnedConfiguration::new(&factory(Mode(1), Unit::Mm)).unwrap();
+    fn differences_are_listed_by_item() {
+        let old = OwnedConfiguration::new(&factory_configuration(Mode(1), Unit::Mm)).unwrap();
         let mut new = old;
         assert_eq!(old.differences(&new).count(), 0);
         new.set(5, 4);
         new.set(1, 1);
-        new.set(LEN, 9);
+        new.set(CONFIGURATION_LEN, 9);
         let names: Vec<_> = old.differences(&new).map(|item| item.name).collect();
         assert_eq!(names, ["blanking", "measuring mode"]);
-        assert_eq!(new.bytes().len(), LEN);
+        assert_eq!(new.bytes().len(), CONFIGURATION_LEN);
         assert_eq!(
             OwnedConfiguration::new(&old.bytes()[..32]).map(|configuration| configuration.bytes().len()),
             Some(32)

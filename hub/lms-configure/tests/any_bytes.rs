@@ -4,10 +4,10 @@
 use proptest::prelude::*;
 use scanhub_drivers::lms::command::Request;
 use scanhub_drivers::lms::explain::explain;
-use scanhub_drivers::lms::telegram::{Encoded, Telegram, Writer};
-use scanhub_lms_configure::eeprom::{PowerOn, Write};
+use scanhub_drivers::lms::telegram::{EncodedTelegram, Telegram, Writer};
+use scanhub_lms_configure::eeprom::{EepromWrite, PowerOn};
 
-fn telegram(address: u8, command: u8, data: &[u8]) -> Encoded {
+fn telegram(address: u8, command: u8, data: &[u8]) -> EncodedTelegram {
     Writer::new(address, command).slice(data).finish()
 }
 
@@ -37,7 +37,7 @@ proptest! {
     #[test]
     fn bytes_without_a_checksum(bytes in proptest::collection::vec(any::<u8>(), 0..900)) {
         if let Some(telegram) = Telegram::check(&bytes) {
-            let _ = Write::decode(telegram);
+            let _ = EepromWrite::decode(telegram);
         }
     }
 
@@ -46,9 +46,9 @@ proptest! {
         let encoded = telegram(address, command, &data);
         let telegram = encoded.telegram();
         if Request::decode(telegram).is_some() {
-            prop_assert_eq!(Write::decode(telegram), None);
+            prop_assert_eq!(EepromWrite::decode(telegram), None);
         }
-        if let Some(write) = Write::decode(telegram) {
+        if let Some(write) = EepromWrite::decode(telegram) {
             let again = write.encode(address);
             prop_assert_eq!(again.as_ref().map(|again| again.bytes()), Some(telegram.bytes()));
         }
@@ -60,11 +60,11 @@ fn the_rate_after_power_on_is_explained() {
     for (power_on, words) in
         PowerOn::ALL.into_iter().zip(["9600", "the present rate is kept", "the type is kept"])
     {
-        let encoded = Write::PowerOn(power_on).encode(0).expect("one byte fits");
-        let mut said = String::new();
+        let encoded = EepromWrite::PowerOn(power_on).encode(0).expect("one byte fits");
+        let mut output = String::new();
         explain(encoded.telegram(), None, &mut |field| {
-            said += &field.words.map(|words| words.to_string()).unwrap_or_default();
+            output += &field.meaning.map(|words| words.to_string()).unwrap_or_default();
         });
-        assert!(said.contains(words), "{power_on:?}: {said}");
+        assert!(output.contains(words), "{power_on:?}: {output}");
     }
 }

@@ -13,7 +13,7 @@ use rustix::process::{getegid, geteuid, getgroups};
 
 /// Everything that decides whether this process may open a port.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Rights {
+pub struct PortPermissions {
     /// Owner, group and mode of the port; `None` if they cannot be read.
     pub port: Option<Ownership>,
     /// User ID of this process.
@@ -39,9 +39,9 @@ pub struct Ownership {
     pub mode: u32,
 }
 
-impl Rights {
+impl PortPermissions {
     /// Reads the permissions of this process at `path`.
-    pub fn of(path: &Path) -> Rights {
+    pub fn of(path: &Path) -> PortPermissions {
         let port = fs::metadata(path).ok().map(|metadata| Ownership {
             uid: metadata.uid(),
             gid: metadata.gid(),
@@ -51,34 +51,34 @@ impl Rights {
         let mut groups: Vec<u32> =
             getgroups().unwrap_or_default().iter().map(|group| group.as_raw()).collect();
         groups.push(getegid().as_raw());
-        let user = entry("/etc/passwd", uid).map_or(uid.to_string(), |words| words[0].clone());
+        let user = database_entry("/etc/passwd", uid).map_or(uid.to_string(), |fields| fields[0].clone());
         let gid = port.map_or(0, |port| port.gid);
-        let listed = entry("/etc/group", gid);
-        let is_listed = listed
+        let group_entry = database_entry("/etc/group", gid);
+        let is_listed = group_entry
             .as_ref()
             .and_then(|words| words.get(3))
             .is_some_and(|members| members.split(',').any(|member| member == user));
-        let group = listed.map_or(gid.to_string(), |words| words[0].clone());
-        Rights { port, uid, groups, user, group, is_listed }
+        let group = group_entry.map_or(gid.to_string(), |words| words[0].clone());
+        PortPermissions { port, uid, groups, user, group, is_listed }
     }
 
     /// Returns the reason for a refusal, and the remedy.
     pub fn explain(&self, path: &Path) -> (String, String) {
-        let Rights { user, group, .. } = self;
+        let PortPermissions { user, group, .. } = self;
         let path = path.display();
         let Some(Ownership { uid, gid, mode }) = self.port else {
             let remedy = "a directory above it is closed: check its parents with ls -ld".to_owned();
             return (format!("{path}: no permission for user {user} to look at it"), remedy);
         };
         let what = format!("{path}: no permission for user {user}: group {group}, mode {mode:03o}");
-        let remedy = if uid == self.uid && mode & RW << 6 != RW << 6 {
+        let remedy = if uid == self.uid && mode & RW_BITS << 6 != RW_BITS << 6 {
             format!("you own it, but its mode denies access: chmod u+rw {path}")
         } else if uid == self.uid
-            || mode & RW == RW
-            || (self.groups.contains(&gid) && mode & RW << 3 == RW << 3)
+            || mode & RW_BITS == RW_BITS
+            || (self.groups.contains(&gid) && mode & RW_BITS << 3 == RW_BITS << 3)
         {
             format!("owner and mode allow it, so an access list or a container forbids it: getfacl {path}")
-        } else if gid == 0 || mode & RW << 3 != RW << 3 {
+        } else if gid == 0 || mode & RW_BITS << 3 != RW_BITS << 3 {
             // A new device is in this state for a moment, until udev has processed it.
             "no group may use it; a udev rule gives it to one: SUBSYSTEM==\"tty\", GROUP=\"dialout\", MODE=\"0660\""
                 .to_owned()
@@ -92,11 +92,11 @@ impl Rights {
 }
 
 /// Read and write permission, as the last digit of a mode.
-const RW: u32 = 0o6;
+const RW_BITS: u32 = 0o6;
 
 /// Returns the fields of the line whose third field is `id`, in a file like `/etc/group`. There are at least three
 /// fields.
-fn entry(file: &str, id: u32) -> Option<Vec<String>> {
+fn database_entry(file: &str, id: u32) -> Option<Vec<String>> {
     let text = fs::read_to_string(file).ok()?;
     let id = id.to_string();
     let words = |line: &str| line.split(':').map(str::to_owned).collect::<Vec<_>>();
@@ -161,10 +161,12 @@ pub fn altering_program(path: &Path) -> Option<String> {
 }
 
 /// Returns whether this process has `path` open, apart from descriptors that it inherited from its parent.
-pub(super) fn is_own(path: &Path) -> bool {
+pub(super) fn is_opened_here(path: &Path) -> bool {
     let open = fs::read_dir("/proc/self/fd").into_iter().flatten().flatten();
-    let given = |entry: &fs::DirEntry| ["0", "1", "2"].iter().any(|number| entry.file_name() == *number);
-    let mut targets = open.filter(|entry| !given(entry)).filter_map(|entry| fs::read_link(entry.path()).ok());
+    let is_standard =
+        |entry: &fs::DirEntry| ["0", "1", "2"].iter().any(|number| entry.file_name() == *number);
+    let mut targets =
+        open.filter(|entry| !is_standard(entry)).filter_map(|entry| fs::read_link(entry.path()).ok());
     path.canonicalize().is_ok_and(|device| targets.any(|target| target == device))
 }
 
@@ -176,9 +178,10 @@ pub(super) fn holders(devices: &[&Path]) -> Vec<Vec<Holder>> {
         let open = fs::read_dir(format!("/proc/{pid}/fd")).into_iter().flatten().flatten();
         for target in open.filter_map(|entry| fs::read_link(entry.path()).ok()) {
             let at = devices.iter().position(|&device| device == target);
-            let known = at.and_then(|at| found.get_mut(at));
+            let found_holders = at.and_then(|at| found.get_mut(at));
             // List a process once, even if it has several descriptors of the device.
-            if let Some(known) = known.filter(|known| known.last().is_none_or(|last| last.pid != pid)) {
+            if let Some(known) = found_holders.filter(|known| known.last().is_none_or(|last| last.pid != pid))
+            {
                 known.push(Holder { pid, program: name_of(pid) });
             }
         }
@@ -212,7 +215,7 @@ mod tests {
 
     #[test]
     fn each_reason_has_its_remedy() {
-        let robot = Rights {
+        let robot = PortPermissions {
             port: Some(Ownership { uid: 0, gid: 20, mode: 0o660 }),
             uid: 1000,
             groups: vec![1000],
@@ -220,16 +223,17 @@ mod tests {
             group: "dialout".to_owned(),
             is_listed: false,
         };
-        let port = |uid, gid, mode| Rights { port: Some(Ownership { uid, gid, mode }), ..robot.clone() };
+        let port =
+            |uid, gid, mode| PortPermissions { port: Some(Ownership { uid, gid, mode }), ..robot.clone() };
         for (rights, says) in [
             (robot.clone(), "sudo usermod -aG dialout robot, then log in again"),
-            (Rights { is_listed: true, ..robot.clone() }, "is in group dialout, but was not"),
-            (Rights { groups: vec![1000, 20], ..robot.clone() }, "getfacl /dev/ttyUSB0"),
+            (PortPermissions { is_listed: true, ..robot.clone() }, "is in group dialout, but was not"),
+            (PortPermissions { groups: vec![1000, 20], ..robot.clone() }, "getfacl /dev/ttyUSB0"),
             (port(0, 0, 0o600), "udev rule"),
             (port(0, 20, 0o640), "udev rule"),
             (port(1000, 20, 0o440), "chmod u+rw /dev/ttyUSB0"),
             (port(1000, 20, 0o660), "getfacl"),
-            (Rights { port: None, ..robot.clone() }, "directory above it"),
+            (PortPermissions { port: None, ..robot.clone() }, "directory above it"),
         ] {
             let (what, remedy) = rights.explain(Path::new("/dev/ttyUSB0"));
             assert!(remedy.contains(says), "{rights:?}: {remedy}");
@@ -241,7 +245,7 @@ mod tests {
 
     #[test]
     fn the_rights_of_this_process() {
-        let rights = Rights::of(Path::new("/dev/null"));
+        let rights = PortPermissions::of(Path::new("/dev/null"));
         assert_eq!(rights.uid, geteuid().as_raw());
         assert_eq!(rights.port.map(|port| port.uid), Some(0));
         assert!(rights.groups.contains(&getegid().as_raw()));

@@ -17,14 +17,14 @@ pub fn wall_ns() -> u64 {
 }
 
 /// Nanoseconds since 1970 of the moment that CLOCK_MONOTONIC called `stamp`; `now` was read just now.
-pub fn wall(stamp: Nanos, now: Nanos) -> u64 {
+pub fn to_wall_ns(stamp: Nanos, now: Nanos) -> u64 {
     wall_ns().saturating_sub(now.saturating_sub(stamp))
 }
 
 /// The time from `now` to `until` as poll wants it; nothing if `until` is past, at least a nanosecond otherwise.
-pub fn span(now: Nanos, until: Nanos) -> Timespec {
-    let left = until.saturating_sub(now);
-    Timespec { tv_sec: (left / 1_000_000_000) as i64, tv_nsec: (left % 1_000_000_000) as i64 }
+pub fn poll_timeout(now: Nanos, until: Nanos) -> Timespec {
+    let remaining = until.saturating_sub(now);
+    Timespec { tv_sec: (remaining / 1_000_000_000) as i64, tv_nsec: (remaining % 1_000_000_000) as i64 }
 }
 
 fn nanos(time: Timespec) -> Nanos {

@@ -2,9 +2,9 @@
 //! use them only through [`Port`].
 
 mod access;
-mod candidates;
 pub mod clock;
 mod port_error;
+mod serial_ports;
 mod tcp;
 mod tty;
 
@@ -17,18 +17,18 @@ use std::sync::atomic::AtomicBool;
 use rustix::io::Errno;
 use scanhub_schema::Failure;
 
-pub use access::{Holder, Ownership, Rights, all_holders, altering_program, holder};
-pub use candidates::{
-    Candidate, PROMPT_MS, PortlessAdapter, Reason, candidates, check_tty, found_in, is_same_line, is_tty,
-    latency_ms,
-};
+pub use access::{Holder, Ownership, PortPermissions, all_holders, altering_program, holder};
 pub use port_error::PortError;
-pub use tcp::{Allowance, Dial, Tcp};
-pub use tty::{Alteration, Counts, LineErrors, Tty};
+pub use serial_ports::{
+    MAX_LATENCY_MS, NoPortReason, PortlessAdapter, SerialPortInfo, check_tty, is_same_line, is_tty,
+    latency_ms, serial_ports, serial_ports_in,
+};
+pub use tcp::{PendingConnection, ReadBudget, Tcp};
+pub use tty::{LineErrors, SettingsChange, Tty, UartCounters};
 
 /// Source of a link's bytes, as it is written in a configuration.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Source {
+pub enum PortSpec {
     /// A serial line.
     Tty(PathBuf),
     /// A line behind a serial server (`tcp:HOST:PORT`), which must be set to the link's rate.
@@ -47,24 +47,24 @@ pub enum Source {
     },
 }
 
-impl Source {
+impl PortSpec {
     /// Returns the source as it is written in a configuration.
     pub fn name(&self) -> String {
         match self {
-            Source::Tty(path) => path.display().to_string(),
-            Source::Tcp { host, port } if host.contains(':') => format!("tcp:[{host}]:{port}"),
-            Source::Tcp { host, port } => format!("tcp:{host}:{port}"),
-            Source::File { path, paced: true } => format!("file:{}", path.display()),
-            Source::File { path, paced: false } => format!("file:{}?rate=max", path.display()),
+            PortSpec::Tty(path) => path.display().to_string(),
+            PortSpec::Tcp { host, port } if host.contains(':') => format!("tcp:[{host}]:{port}"),
+            PortSpec::Tcp { host, port } => format!("tcp:{host}:{port}"),
+            PortSpec::File { path, paced: true } => format!("file:{}", path.display()),
+            PortSpec::File { path, paced: false } => format!("file:{}?rate=max", path.display()),
         }
     }
 
     /// Returns whether `other` names the same port: the same serial line, or the same address of a serial server. Two names of
     /// a server with the same port number are resolved, which may take some seconds.
-    pub fn is_same_port(&self, other: &Source) -> bool {
+    pub fn is_same_port(&self, other: &PortSpec) -> bool {
         match (self, other) {
-            (Source::Tty(a), Source::Tty(b)) => is_same_line(a, b),
-            (Source::Tcp { host: a, port: a_port }, Source::Tcp { host: b, port: b_port }) => {
+            (PortSpec::Tty(a), PortSpec::Tty(b)) => is_same_line(a, b),
+            (PortSpec::Tcp { host: a, port: a_port }, PortSpec::Tcp { host: b, port: b_port }) => {
                 let addresses = |host: &str| -> Vec<SocketAddr> {
                     (host, *a_port).to_socket_addrs().map_or_else(|_| Vec::new(), Iterator::collect)
                 };
@@ -83,22 +83,22 @@ impl Source {
     /// # Errors
     ///
     /// Returns a message if it is not valid.
-    pub fn parse(text: &str) -> Result<Source, &'static str> {
+    pub fn parse(text: &str) -> Result<PortSpec, &'static str> {
         if let Some(server) = text.strip_prefix("tcp:") {
             let (host, port) = server.rsplit_once(':').ok_or("tcp: without a port: write tcp:HOST:PORT")?;
             let port =
                 port.parse().ok().filter(|&port| port > 0).ok_or("tcp: the port is a number to 65535")?;
-            let bare = host.strip_prefix('[').and_then(|host| host.strip_suffix(']'));
-            return match bare.unwrap_or(host) {
+            let bracketed = host.strip_prefix('[').and_then(|host| host.strip_suffix(']'));
+            return match bracketed.unwrap_or(host) {
                 "" => Err("tcp: without a host: write tcp:HOST:PORT"),
-                host if bare.is_none() && host.contains(':') => {
+                host if bracketed.is_none() && host.contains(':') => {
                     Err("an IPv6 address stands in brackets: tcp:[ADDRESS]:PORT")
                 }
-                host => Ok(Source::Tcp { host: host.to_owned(), port }),
+                host => Ok(PortSpec::Tcp { host: host.to_owned(), port }),
             };
         }
         let Some(file) = text.strip_prefix("file:") else {
-            return if text.is_empty() { Err("the port is empty") } else { Ok(Source::Tty(text.into())) };
+            return if text.is_empty() { Err("the port is empty") } else { Ok(PortSpec::Tty(text.into())) };
         };
         let (path, paced) = match file.split_once('?') {
             None => (file, true),
@@ -108,7 +108,7 @@ impl Source {
         if path.is_empty() {
             Err("the file has no name")
         } else {
-            Ok(Source::File { path: path.into(), paced })
+            Ok(PortSpec::File { path: path.into(), paced })
         }
     }
 }
@@ -125,43 +125,43 @@ impl Port {
     /// Opens `source` at `baud`. Waits for a serial server for some seconds at most, or until `stop` is set.
     ///
     /// Returns a failure of one of the kinds for ports, with its remedy. The kind is `short` without descriptors,
-    /// `configuration` for a recording, and `interrupted` if `stop` is set.
-    pub fn open(source: &Source, baud: u32, stop: &AtomicBool) -> Result<Port, Failure> {
-        Port::attempt(source, baud, stop).map_err(|refusal| refusal.explain(source))
+    /// `configuration_reply` for a recording, and `interrupted` if `stop` is set.
+    pub fn open(spec: &PortSpec, baud: u32, stop: &AtomicBool) -> Result<Port, Failure> {
+        Port::try_open(spec, baud, stop).map_err(|error| error.explain(spec))
     }
 
     /// Does the same as [`Port::open`], for repeated attempts. It returns only the reason, without looking up details.
-    pub fn attempt(source: &Source, baud: u32, stop: &AtomicBool) -> Result<Port, PortError> {
-        match source {
-            Source::Tty(path) => Tty::open(path, baud).map(Port::Tty),
-            Source::Tcp { host, port } => Tcp::open(host, *port, stop).map(Port::Tcp),
-            Source::File { .. } => Err(PortError::Recording),
+    pub fn try_open(spec: &PortSpec, baud: u32, stop: &AtomicBool) -> Result<Port, PortError> {
+        match spec {
+            PortSpec::Tty(path) => Tty::open(path, baud).map(Port::Tty),
+            PortSpec::Tcp { host, port } => Tcp::open(host, *port, stop).map(Port::Tcp),
+            PortSpec::File { .. } => Err(PortError::Recording),
         }
     }
 
     /// Continues with `line`, which an earlier hub had opened, if `source` still names it.
-    pub fn adopt(line: OwnedFd, source: &Source, baud: u32) -> Option<Port> {
-        match source {
-            Source::Tty(path) => Tty::adopt(line, path, baud).ok().map(Port::Tty),
+    pub fn adopt(line: OwnedFd, spec: &PortSpec, baud: u32) -> Option<Port> {
+        match spec {
+            PortSpec::Tty(path) => Tty::adopt(line, path, baud).ok().map(Port::Tty),
             // Bytes in a connection that no program reads become old, and the server may have closed it.
-            Source::Tcp { .. } | Source::File { .. } => None,
+            PortSpec::Tcp { .. } | PortSpec::File { .. } => None,
         }
     }
 
     /// Returns whether `source` names the open `line`.
-    pub fn is_at(line: &OwnedFd, source: &Source) -> bool {
-        matches!(source, Source::Tty(path) if Tty::is_at(line, path))
+    pub fn is_at(line: &OwnedFd, spec: &PortSpec) -> bool {
+        matches!(spec, PortSpec::Tty(path) if Tty::is_at(line, path))
     }
 
     /// Returns whether another program simulates the sensor.
-    pub fn simulated(&self) -> bool {
+    pub fn is_simulated(&self) -> bool {
         self.tty().is_some_and(Tty::is_simulated)
     }
 
-    /// Starts to open `source` if that takes time. `None` if [`Port::attempt`] returns at once.
-    pub fn dial(source: &Source) -> Option<Result<Dial, PortError>> {
-        match source {
-            Source::Tcp { host, port } => Some(Dial::start(host, *port)),
+    /// Starts to open `source` if that takes time. `None` if [`Port::try_open`] returns at once.
+    pub fn connect(spec: &PortSpec) -> Option<Result<PendingConnection, PortError>> {
+        match spec {
+            PortSpec::Tcp { host, port } => Some(PendingConnection::start(host, *port)),
             _ => None,
         }
     }
@@ -201,20 +201,20 @@ impl Port {
     pub fn discard_input(&self, baud: u32) -> io::Result<()> {
         match self {
             Port::Tty(tty) => tty.set_baud(baud),
-            Port::Tcp(tcp) => tcp.forget(),
+            Port::Tcp(tcp) => tcp.discard_input(),
         }
     }
 
     /// Returns the number of bytes in the tty's input buffer, or `None` for a network port.
-    pub fn waiting(&self) -> Option<usize> {
-        self.tty()?.waiting()
+    pub fn buffered_bytes(&self) -> Option<usize> {
+        self.tty()?.buffered_bytes()
     }
 
     /// Returns the read budget of a network port. `None` for a tty, which is never throttled.
-    pub fn allowance(&self, baud: u32) -> Option<Allowance> {
+    pub fn read_budget(&self, baud: u32) -> Option<ReadBudget> {
         match self {
             Port::Tty(_) => None,
-            Port::Tcp(_) => Some(Allowance::new(baud, clock::now())),
+            Port::Tcp(_) => Some(ReadBudget::new(baud, clock::now())),
         }
     }
 
@@ -241,8 +241,8 @@ impl Port {
     }
 
     /// Returns the driver's counters since it was loaded, if it has any.
-    pub fn counts(&self) -> Option<Counts> {
-        self.tty()?.counts()
+    pub fn uart_counters(&self) -> Option<UartCounters> {
+        self.tty()?.uart_counters()
     }
 
     /// Returns the settings that another process has changed. `None` if they are unchanged, or if the settings are made
@@ -251,8 +251,8 @@ impl Port {
     /// # Errors
     ///
     /// Returns an error if the line is lost.
-    pub fn altered(&self) -> io::Result<Option<Alteration>> {
-        self.tty().map_or(Ok(None), Tty::altered)
+    pub fn changed_settings(&self) -> io::Result<Option<SettingsChange>> {
+        self.tty().map_or(Ok(None), Tty::changed_settings)
     }
 
     /// Restores the settings of this process, at `baud`, and discards the input that arrived with others. If the driver
@@ -315,7 +315,7 @@ mod tests {
     }
 
     #[test]
-    fn a_full_line_gets_the_beginning_of_what_is_written() {
+    fn writes_only_a_prefix_to_a_full_line() {
         let (line, mut end) = UnixStream::pair().unwrap();
         line.set_nonblocking(true).unwrap();
         let bytes: Vec<u8> = (0..10_000_000_u32).map(|i| (i % 251) as u8).collect();
@@ -333,7 +333,7 @@ mod tests {
         let link = directory.path().join("lidar");
         std::os::unix::fs::symlink("/dev/null", &link).unwrap();
         let is_same = |a: &str, b: &str| {
-            let [a, b] = [a, b].map(|text| Source::parse(text).unwrap());
+            let [a, b] = [a, b].map(|text| PortSpec::parse(text).unwrap());
             assert_eq!(a.is_same_port(&b), b.is_same_port(&a));
             a.is_same_port(&b)
         };
@@ -351,14 +351,14 @@ mod tests {
     static NEVER: AtomicBool = AtomicBool::new(false);
 
     fn refused(text: &str) -> Failure {
-        let source = Source::parse(text).unwrap();
+        let source = PortSpec::parse(text).unwrap();
         Port::open(&source, 500_000, &NEVER).err().expect("cannot be opened")
     }
 
     #[test]
     fn a_rate_that_cannot_be_had_is_no_port_that_is_gone() {
         let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
-        let source = Source::parse(&format!("tcp:{}", listener.local_addr().unwrap())).unwrap();
+        let source = PortSpec::parse(&format!("tcp:{}", listener.local_addr().unwrap())).unwrap();
         let port = Port::open(&source, 9600, &NEVER).unwrap();
         assert!(port.try_baud(38_400).unwrap().is_some());
     }

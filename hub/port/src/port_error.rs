@@ -8,9 +8,9 @@ use std::path::Path;
 use rustix::io::Errno;
 use scanhub_schema::{Failure, Kind};
 
-use super::access::{Holder, Rights, holder, is_own, lock_owner};
-use super::candidates::{Candidate, PortlessAdapter, candidates};
-use crate::Source;
+use super::access::{Holder, PortPermissions, holder, is_opened_here, lock_owner};
+use super::serial_ports::{PortlessAdapter, SerialPortInfo, serial_ports};
+use crate::PortSpec;
 
 /// Only the reason; equal as long as nothing changes.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -20,19 +20,19 @@ pub enum PortError {
     /// Something exists, but it is not a terminal.
     NotTty,
     /// This user has no permission.
-    Denied,
+    PermissionDenied,
     /// Another process has it.
     Busy,
     /// The name exists, but no device behind it.
-    Dead,
+    NoDevice,
     /// This process has no descriptor or thread left, or the kernel no memory.
-    Short(Errno),
+    ResourceExhausted(Errno),
     /// The driver sets another rate than the wanted one.
     Rate {
         /// The wanted rate, in Bd.
-        wanted: u32,
+        requested: u32,
         /// The rate that the driver sets instead.
-        given: u32,
+        actual: u32,
     },
     /// The serial server's name cannot be looked up.
     NoHost(String),
@@ -56,35 +56,44 @@ impl PortError {
     }
 
     /// The reason with its circumstances at `source`, as they are now.
-    pub fn explain(&self, source: &Source) -> Failure {
-        let name = source.name();
+    pub fn explain(&self, spec: &PortSpec) -> Failure {
+        let name = spec.name();
         let path = Path::new(&name);
-        let told = self.to_string();
-        let failure = |kind, hint: &str| Failure::new(kind, format!("{name}: {told}"), hint);
+        let reason = self.to_string();
+        let failure = |kind, hint: &str| Failure::new(kind, format!("{name}: {reason}"), hint);
         match self {
-            PortError::Missing => missing(path, &candidates(), &portless()),
-            PortError::Denied => {
-                let (what, remedy) = Rights::of(path).explain(path);
+            PortError::Missing => missing_failure(path, &serial_ports(), &portless_adapters()),
+            PortError::PermissionDenied => {
+                let (what, remedy) = PortPermissions::of(path).explain(path);
                 Failure::new(Kind::PortPermission, what, remedy)
             }
             // The owner of the lock is certain; a program that only has the port open may be harmless.
             PortError::Busy => match lock_owner(path).or_else(|| holder(path)) {
-                None if is_own(path) => Failure::new(
+                None if is_opened_here(path) => Failure::new(
                     Kind::PortBusy,
                     format!("{name}: in use by another link of this hub"),
                     "name the port of each sensor",
                 ),
-                holder => busy(path, holder),
+                holder => busy_failure(path, holder),
             },
             PortError::NotTty if path.is_dir() => {
-                let hint = format!("it is a directory; {}", instead(&name, &candidates(), &portless()));
+                let hint = format!(
+                    "it is a directory; {}",
+                    alternatives(&name, &serial_ports(), &portless_adapters())
+                );
                 failure(Kind::PortNotTty, &hint)
             }
             PortError::NotTty => failure(Kind::PortNotTty, "name a tty, or tcp:HOST:PORT"),
-            PortError::Dead => failure(Kind::PortMissing, &instead(&name, &candidates(), &portless())),
-            PortError::Short(Errno::AGAIN) => failure(Kind::Short, "raise the limit of threads (ulimit -u)"),
-            PortError::Short(_) => failure(Kind::Short, "raise the limit of open descriptors (ulimit -n)"),
-            PortError::Rate { wanted, .. } => failure(Kind::PortRate, remedy_of_rate(*wanted)),
+            PortError::NoDevice => {
+                failure(Kind::PortMissing, &alternatives(&name, &serial_ports(), &portless_adapters()))
+            }
+            PortError::ResourceExhausted(Errno::AGAIN) => {
+                failure(Kind::ResourceExhausted, "raise the limit of threads (ulimit -u)")
+            }
+            PortError::ResourceExhausted(_) => {
+                failure(Kind::ResourceExhausted, "raise the limit of open descriptors (ulimit -n)")
+            }
+            PortError::Rate { requested: wanted, .. } => failure(Kind::PortRate, rate_remedy(*wanted)),
             PortError::NoHost(_) => {
                 failure(Kind::PortMissing, "correct the name, or give the address instead")
             }
@@ -117,11 +126,11 @@ impl fmt::Display for PortError {
         match self {
             PortError::Missing => f.write_str("no such port"),
             PortError::NotTty => f.write_str("not a serial line"),
-            PortError::Denied => f.write_str("no permission"),
+            PortError::PermissionDenied => f.write_str("no permission"),
             PortError::Busy => f.write_str("in use"),
-            PortError::Dead => f.write_str("no such port: the name exists, but no line behind it"),
-            PortError::Short(errno) => write!(f, "cannot be opened: {errno}"),
-            PortError::Rate { wanted, given } => {
+            PortError::NoDevice => f.write_str("no such port: the name exists, but no line behind it"),
+            PortError::ResourceExhausted(errno) => write!(f, "cannot be opened: {errno}"),
+            PortError::Rate { requested: wanted, actual: given } => {
                 write!(f, "{wanted} Bd is not possible here, the driver gives {given} Bd")
             }
             PortError::NoHost(why) => write!(f, "no such host: {why}"),
@@ -139,23 +148,23 @@ impl From<Errno> for PortError {
     fn from(errno: Errno) -> PortError {
         match errno {
             Errno::NOENT => PortError::Missing,
-            Errno::ACCESS | Errno::PERM => PortError::Denied,
+            Errno::ACCESS | Errno::PERM => PortError::PermissionDenied,
             Errno::BUSY => PortError::Busy,
             Errno::NOTTY | Errno::ISDIR | Errno::NOTDIR => PortError::NotTty,
             // A UART that the board does not have, an adapter that was pulled out a moment ago, half a pty.
-            Errno::IO | Errno::NXIO | Errno::NODEV => PortError::Dead,
-            Errno::MFILE | Errno::NFILE | Errno::NOMEM => PortError::Short(errno),
+            Errno::IO | Errno::NXIO | Errno::NODEV => PortError::NoDevice,
+            Errno::MFILE | Errno::NFILE | Errno::NOMEM => PortError::ResourceExhausted(errno),
             errno => PortError::Other(errno),
         }
     }
 }
 
 /// The adapters of this machine that have no port.
-fn portless() -> Vec<PortlessAdapter> {
+fn portless_adapters() -> Vec<PortlessAdapter> {
     PortlessAdapter::all(Path::new("/"))
 }
 
-fn missing(path: &Path, there: &[Candidate], portless: &[PortlessAdapter]) -> Failure {
+fn missing_failure(path: &Path, ports: &[SerialPortInfo], portless: &[PortlessAdapter]) -> Failure {
     let name = path.display().to_string();
     let what = match path.read_link() {
         Ok(target) => format!("{name}: no such port: it points to {}, which is not there", target.display()),
@@ -164,29 +173,29 @@ fn missing(path: &Path, there: &[Candidate], portless: &[PortlessAdapter]) -> Fa
         }
         Err(_) => format!("{name}: no such port"),
     };
-    Failure::new(Kind::PortMissing, what, instead(&name, there, portless))
+    Failure::new(Kind::PortMissing, what, alternatives(&name, ports, portless))
 }
 
 /// Returns what to do where `name` does not exist: an adapter without a port may be the one, otherwise the ports of this machine
 /// are named, the most similar names first.
-fn instead(name: &str, there: &[Candidate], portless: &[PortlessAdapter]) -> String {
-    let mut there: Vec<&Candidate> = there.iter().collect();
-    there.sort_by_key(|candidate| {
+fn alternatives(name: &str, ports: &[SerialPortInfo], portless: &[PortlessAdapter]) -> String {
+    let mut sorted: Vec<&SerialPortInfo> = ports.iter().collect();
+    sorted.sort_by_key(|candidate| {
         let names = [&candidate.name, &candidate.device];
         names.map(|known| strsim::levenshtein(name, &known.to_string_lossy())).into_iter().min()
     });
     let mut hints: Vec<String> =
         portless.iter().map(|adapter| format!("{adapter}; {}", adapter.remedy())).collect();
-    if !there.is_empty() {
-        let names: Vec<String> = there.iter().map(|candidate| candidate.to_string()).collect();
+    if !sorted.is_empty() {
+        let names: Vec<String> = sorted.iter().map(|candidate| candidate.to_string()).collect();
         hints.push(format!("there are: {}", names.join(", ")));
     }
     if hints.is_empty() { "no serial line is plugged in".to_owned() } else { hints.join("; ") }
 }
 
-fn busy(path: &Path, holder: Option<Holder>) -> Failure {
+fn busy_failure(path: &Path, holder: Option<Holder>) -> Failure {
     let name = path.display();
-    let (who, remedy) = match holder {
+    let (owner, remedy) = match holder {
         None => {
             ("another process".to_owned(), format!("stop it first; sudo fuser -v {name} shows which it is"))
         }
@@ -208,11 +217,11 @@ fn busy(path: &Path, holder: Option<Holder>) -> Failure {
             (holder.to_string(), remedy.to_owned())
         }
     };
-    Failure::new(Kind::PortBusy, format!("{name}: in use by {who}"), remedy)
+    Failure::new(Kind::PortBusy, format!("{name}: in use by {owner}"), remedy)
 }
 
-fn remedy_of_rate(wanted: u32) -> &'static str {
-    if wanted == 500_000 {
+fn rate_remedy(requested: u32) -> &'static str {
+    if requested == 500_000 {
         "adapters with an FT232R, FT232H or FT4232H do it exactly; a UART clocked with 1.8432 MHz cannot: baud = 38400"
     } else {
         "set another rate: baud = 38400, 19200 or 9600"
@@ -222,37 +231,37 @@ fn remedy_of_rate(wanted: u32) -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::candidates::Reason;
+    use crate::serial_ports::NoPortReason;
 
     #[test]
-    fn what_the_kernel_says_and_what_it_means() {
-        let source = Source::Tty("/dev/full".into());
-        for (refusal, kind, says) in [
+    fn explains_kernel_errors_with_kind_and_hint() {
+        let source = PortSpec::Tty("/dev/full".into());
+        for (refusal, kind, text) in [
             (Errno::NOTTY.into(), Kind::PortNotTty, "name a tty, or tcp:HOST:PORT"),
             (Errno::IO.into(), Kind::PortMissing, "no line behind it"),
             (Errno::NXIO.into(), Kind::PortMissing, "no line behind it"),
-            (Errno::MFILE.into(), Kind::Short, "ulimit -n"),
-            (PortError::Short(Errno::AGAIN), Kind::Short, "ulimit -u"),
+            (Errno::MFILE.into(), Kind::ResourceExhausted, "ulimit -n"),
+            (PortError::ResourceExhausted(Errno::AGAIN), Kind::ResourceExhausted, "ulimit -u"),
             (Errno::LOOP.into(), Kind::PortNotTty, "its symbolic links form a loop"),
             (Errno::INVAL.into(), Kind::PortNotTty, "the kernel refuses it"),
             (Errno::PERM.into(), Kind::PortPermission, "/dev/full"),
             (Errno::BUSY.into(), Kind::PortBusy, "stop it first"),
             (
-                PortError::Rate { wanted: 500_000, given: 115_200 },
+                PortError::Rate { requested: 500_000, actual: 115_200 },
                 Kind::PortRate,
                 "/dev/full: 500000 Bd is not possible here, the driver gives 115200 Bd\n  adapters with an FT232R",
             ),
-            (PortError::Rate { wanted: 9600, given: 0 }, Kind::PortRate, "set another rate"),
+            (PortError::Rate { requested: 9600, actual: 0 }, Kind::PortRate, "set another rate"),
         ] {
             let failure = PortError::explain(&refusal, &source);
             assert_eq!(failure.kind, kind, "{failure}");
-            assert!(failure.to_string().contains(says) && !failure.hint.is_empty(), "{failure}");
+            assert!(failure.to_string().contains(text) && !failure.hint.is_empty(), "{failure}");
         }
     }
 
     #[test]
-    fn what_is_called_alike_stands_first() {
-        let candidate = |name: &str, device: &str| Candidate {
+    fn suggests_the_most_similar_port_first() {
+        let candidate = |name: &str, device: &str| SerialPortInfo {
             name: name.into(),
             device: device.into(),
             shared_name: None,
@@ -261,37 +270,40 @@ mod tests {
             holder: None,
             is_permitted: true,
         };
-        let there = [
+        let candidates = [
             candidate("/dev/serial/by-id/usb-FTDI-A-if00-port0", "/dev/ttyUSB1"),
             candidate("/dev/serial/by-id/usb-Prolific-if00-port0", "/dev/ttyUSB0"),
             candidate("/dev/ttyS0", "/dev/ttyS0"),
         ];
         let first = |name: &str| {
-            let hint = missing(Path::new(name), &there, &[]).hint;
+            let hint = missing_failure(Path::new(name), &candidates, &[]).hint;
             hint.split([' ', ',']).nth(2).map(str::to_owned).unwrap_or_default()
         };
         assert_eq!(first("/dev/ttyUSB1"), "/dev/serial/by-id/usb-FTDI-A-if00-port0");
-        assert_eq!(first("/dev/serial/by-id/usb-Prolific-if00-port1"), there[1].name.display().to_string());
+        assert_eq!(
+            first("/dev/serial/by-id/usb-Prolific-if00-port1"),
+            candidates[1].name.display().to_string()
+        );
         assert_eq!(first("/dev/ttyS1"), "/dev/ttyS0");
         let adapter = PortlessAdapter {
             usb: "1-1".to_owned(),
             id: "1a86:7523".to_owned(),
             chip: "CH340",
             module: "ch341",
-            reason: Reason::NotLoaded,
+            reason: NoPortReason::NotLoaded,
         };
-        let hint = missing(Path::new("/dev/ttyUSB7"), &there[2..], &[adapter]).hint;
+        let hint = missing_failure(Path::new("/dev/ttyUSB7"), &candidates[2..], &[adapter]).hint;
         assert!(hint.starts_with("USB adapter 1-1 (CH340, 1a86:7523) has no port: "), "{hint}");
         assert!(
             hint.contains("sudo modprobe ch341") && hint.ends_with("; there are: /dev/ttyS0 (ftdi_sio)"),
             "{hint}"
         );
-        assert_eq!(missing(Path::new("/dev/x"), &[], &[]).hint, "no serial line is plugged in");
+        assert_eq!(missing_failure(Path::new("/dev/x"), &[], &[]).hint, "no serial line is plugged in");
     }
 
     #[test]
-    fn who_has_it_and_how_to_get_it_back() {
-        for (program, says) in [
+    fn busy_error_names_the_holder_and_the_remedy() {
+        for (program, text) in [
             ("ModemManager", "systemctl stop ModemManager"),
             ("brltty", "apt remove brltty"),
             ("agetty", "serial-getty"),
@@ -299,10 +311,11 @@ mod tests {
             ("systemd", "systemctl stop scanhub"),
             ("minicom", "stop it first"),
         ] {
-            let failure = busy(Path::new("/dev/x"), Some(Holder { pid: 7, program: program.to_owned() }));
+            let failure =
+                busy_failure(Path::new("/dev/x"), Some(Holder { pid: 7, program: program.to_owned() }));
             assert!(failure.message.ends_with(&format!("in use by process 7 ({program})")), "{failure}");
-            assert!(failure.hint.contains(says), "{failure}");
+            assert!(failure.hint.contains(text), "{failure}");
         }
-        assert!(busy(Path::new("/dev/x"), None).hint.contains("sudo fuser -v /dev/x"));
+        assert!(busy_failure(Path::new("/dev/x"), None).hint.contains("sudo fuser -v /dev/x"));
     }
 }

@@ -20,7 +20,7 @@ use rustix::net::sockopt::{
     set_tcp_user_timeout,
 };
 use scanhub_schema::{MILLIS, Nanos, line_time};
-use scanhub_shm::shortage;
+use scanhub_shm::resource_limits;
 
 use crate::{Port, PortError, write_all};
 
@@ -32,9 +32,9 @@ pub struct Tcp {
 impl Tcp {
     /// Connects to `port` of `host`, and waits for the result, or until `stop` is set.
     pub(crate) fn open(host: &str, port: u16, stop: &AtomicBool) -> Result<Tcp, PortError> {
-        let dial = Dial::start(host, port)?;
+        let pending = PendingConnection::start(host, port)?;
         for _ in 0..MAX_POLLS {
-            match dial.outcome.recv_timeout(POLL_INTERVAL) {
+            match pending.outcome.recv_timeout(POLL_INTERVAL) {
                 Ok(outcome) => return outcome,
                 Err(_) if stop.load(Ordering::Relaxed) => return Err(PortError::Interrupted),
                 Err(_) => {}
@@ -52,7 +52,7 @@ impl Tcp {
     }
 
     /// Discards the bytes that have arrived.
-    pub(crate) fn forget(&self) -> io::Result<()> {
+    pub(crate) fn discard_input(&self) -> io::Result<()> {
         let mut buffer = [0; 4096];
         // The loop is bounded, because the server may send as fast as this reads.
         for _ in 0..MAX_DISCARDED / buffer.len() {
@@ -88,26 +88,26 @@ impl AsFd for Tcp {
 }
 
 /// A connection attempt. Its descriptor is ready when the attempt has ended.
-pub struct Dial {
+pub struct PendingConnection {
     outcome: Receiver<Result<Tcp, PortError>>,
     /// Readable once the thread has dropped the other end.
     ready: PipeReader,
 }
 
-impl Dial {
+impl PendingConnection {
     /// Starts an attempt.
-    pub(crate) fn start(host: &str, port: u16) -> Result<Dial, PortError> {
+    pub(crate) fn start(host: &str, port: u16) -> Result<PendingConnection, PortError> {
         let (ready, open_end) = io::pipe().map_err(|error| PortError::of_io(&error))?;
         let (send, outcome) = channel();
         let host = host.to_owned();
-        let body = move || report(connect(&host, port), &send, open_end);
+        let body = move || send_outcome(connect(&host, port), &send, open_end);
         // The system refuses a thread with AGAIN.
-        let refuse = |error: io::Error| match PortError::of_io(&error) {
-            PortError::Other(Errno::AGAIN) => PortError::Short(Errno::AGAIN),
-            refusal => refusal,
+        let thread_error = |error: io::Error| match PortError::of_io(&error) {
+            PortError::Other(Errno::AGAIN) => PortError::ResourceExhausted(Errno::AGAIN),
+            error => error,
         };
-        thread::Builder::new().name("dial".to_owned()).spawn(body).map_err(refuse)?;
-        Ok(Dial { outcome, ready })
+        thread::Builder::new().name("dial".to_owned()).spawn(body).map_err(thread_error)?;
+        Ok(PendingConnection { outcome, ready })
     }
 
     /// Returns the result, or an error if the attempt has not ended.
@@ -116,13 +116,17 @@ impl Dial {
     }
 }
 
-impl AsFd for Dial {
+impl AsFd for PendingConnection {
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.ready.as_fd()
     }
 }
 
-fn report(outcome: Result<Tcp, PortError>, send: &Sender<Result<Tcp, PortError>>, open_end: PipeWriter) {
+fn send_outcome(
+    outcome: Result<Tcp, PortError>,
+    send: &Sender<Result<Tcp, PortError>>,
+    open_end: PipeWriter,
+) {
     // A caller that has stopped waiting does not need the result.
     let _ = send.send(outcome);
     drop(open_end);
@@ -132,10 +136,10 @@ fn connect(host: &str, port: u16) -> Result<Tcp, PortError> {
     let addresses: Vec<SocketAddr> = match (host, port).to_socket_addrs() {
         Ok(addresses) => addresses.collect(),
         // Without descriptors, a lookup reports that the host does not exist.
-        Err(_) if shortage::check_descriptors(LOOKUP_DESCRIPTORS).is_err() => {
-            return Err(PortError::Short(Errno::MFILE));
+        Err(_) if resource_limits::check_descriptors(LOOKUP_DESCRIPTORS).is_err() => {
+            return Err(PortError::ResourceExhausted(Errno::MFILE));
         }
-        Err(error) => return Err(failed(&error, PortError::NoHost)),
+        Err(error) => return Err(connection_error(&error, PortError::NoHost)),
     };
     let mut last = PortError::NoHost("it has no address".to_owned());
     for address in addresses {
@@ -143,7 +147,7 @@ fn connect(host: &str, port: u16) -> Result<Tcp, PortError> {
             Ok(stream) => return Ok(Tcp::new(stream)?),
             Err(error) if error.kind() == ErrorKind::TimedOut => last = PortError::TimedOut,
             Err(error) if error.kind() == ErrorKind::ConnectionRefused => last = PortError::Refused,
-            Err(error) => last = failed(&error, PortError::Network),
+            Err(error) => last = connection_error(&error, PortError::Network),
         }
     }
     Err(last)
@@ -151,9 +155,9 @@ fn connect(host: &str, port: u16) -> Result<Tcp, PortError> {
 
 /// Returns the reason for `error`. If this machine is short of something, neither the network nor the server is the
 /// cause. Otherwise `otherwise` creates the reason.
-fn failed(error: &io::Error, otherwise: fn(String) -> PortError) -> PortError {
+fn connection_error(error: &io::Error, otherwise: fn(String) -> PortError) -> PortError {
     match PortError::of_io(error) {
-        short @ PortError::Short(_) => short,
+        short @ PortError::ResourceExhausted(_) => short,
         _ => otherwise(error.to_string()),
     }
 }
@@ -171,72 +175,73 @@ const MAX_POLLS: u32 = 60;
 
 /// Read budget of a network port. The clock is an argument.
 #[derive(Clone, Debug)]
-pub struct Allowance {
+pub struct ReadBudget {
     /// Time that a byte costs.
     byte_ns: Nanos,
     /// Time until which the budget is spent.
-    spent: Nanos,
+    spent_until: Nanos,
     /// First and last time of the current period in which the budget was exhausted.
-    short: Option<(Nanos, Nanos)>,
+    exhausted: Option<(Nanos, Nanos)>,
     /// Whether the last read filled its buffer, so that more bytes may be available.
-    is_full: bool,
+    has_more: bool,
 }
 
-impl Allowance {
+impl ReadBudget {
     /// Creates a full budget at time `now`, for a line of `baud`.
-    pub fn new(baud: u32, now: Nanos) -> Allowance {
+    pub fn new(baud: u32, now: Nanos) -> ReadBudget {
         let byte_ns = line_time(1, baud) / BUDGET_FACTOR;
-        Allowance { byte_ns, spent: now.saturating_sub(BURST), short: None, is_full: false }
+        ReadBudget { byte_ns, spent_until: now.saturating_sub(MAX_BURST), exhausted: None, has_more: false }
     }
 
     /// Returns the number of bytes that may be read at `now`.
     pub fn bytes(&self, now: Nanos) -> usize {
-        (now.saturating_sub(self.begin(now)) / self.byte_ns) as usize
+        (now.saturating_sub(self.unspent_since(now)) / self.byte_ns) as usize
     }
 
     /// Records that `len` bytes were read at `now` into a buffer of `room` bytes.
-    pub fn take(&mut self, len: usize, room: usize, now: Nanos) {
-        self.is_full = len > 0 && len == room;
-        self.spent = self.begin(now) + len as Nanos * self.byte_ns;
+    pub fn record_read(&mut self, len: usize, buffer_len: usize, now: Nanos) {
+        self.has_more = len > 0 && len == buffer_len;
+        self.spent_until = self.unspent_since(now) + len as Nanos * self.byte_ns;
     }
 
     /// Returns when reading may resume, if the budget at `now` is too small to pay off. Until then, the caller only
     /// waits for this time. `until` is the caller's next deadline, for which a single byte may be read.
-    pub fn rest(&mut self, now: Nanos, until: Nanos) -> Option<Nanos> {
-        let (any_at, enough_at) = (self.spent + self.byte_ns, self.spent + PORTION);
-        if now >= enough_at {
+    pub fn throttled_until(&mut self, now: Nanos, until: Nanos) -> Option<Nanos> {
+        let (byte_at, resume_at) = (self.spent_until + self.byte_ns, self.spent_until + MIN_REFILL);
+        if now >= resume_at {
             return None;
         }
         let since =
-            self.short.filter(|&(_, last)| now < last + RECOVERY_TIME).map_or(now, |(since, _)| since);
-        self.short = Some((since, now));
+            self.exhausted.filter(|&(_, last)| now < last + RECOVERY_TIME).map_or(now, |(since, _)| since);
+        self.exhausted = Some((since, now));
         // An overdue action waits for the end of the available bytes, which was not reached.
-        Some(if until > now { until.clamp(any_at, enough_at) } else { enough_at })
+        Some(if until > now { until.clamp(byte_at, resume_at) } else { resume_at })
     }
 
     /// Returns whether more bytes than the budget have been arriving for a while, as of `now`.
     pub fn is_flooded(&self, now: Nanos) -> bool {
-        self.short.is_some_and(|(since, last)| now < last + RECOVERY_TIME && last >= since + FLOOD_THRESHOLD)
+        self.exhausted
+            .is_some_and(|(since, last)| now < last + RECOVERY_TIME && last >= since + FLOOD_THRESHOLD)
     }
 
     /// Returns whether the last bytes read may have been buffered in the connection, as of `now`: there were more bytes
     /// than could be read, now or a moment ago.
-    pub fn is_behind(&self, now: Nanos) -> bool {
-        self.is_full || self.short.is_some_and(|(_, last)| now < last + SETTLE_TIME)
+    pub fn is_backlogged(&self, now: Nanos) -> bool {
+        self.has_more || self.exhausted.is_some_and(|(_, last)| now < last + SETTLE_TIME)
     }
 
     /// Returns the time from which the budget is still unspent.
-    fn begin(&self, now: Nanos) -> Nanos {
-        self.spent.max(now.saturating_sub(BURST))
+    fn unspent_since(&self, now: Nanos) -> Nanos {
+        self.spent_until.max(now.saturating_sub(MAX_BURST))
     }
 }
 
 /// Factor between the budget and the rate of the line.
 const BUDGET_FACTOR: Nanos = 2;
 /// Maximum time for which unspent budget accumulates.
-const BURST: Nanos = 1_000 * MILLIS;
+const MAX_BURST: Nanos = 1_000 * MILLIS;
 /// Amount of budget to wait for when it is exhausted.
-const PORTION: Nanos = 20 * MILLIS;
+const MIN_REFILL: Nanos = 20 * MILLIS;
 /// Minimum duration of a flood. Bytes that a network delayed are normally read within a second.
 const FLOOD_THRESHOLD: Nanos = 1_500 * MILLIS;
 /// Time without exhaustion after which bytes count as new. A network that catches up delivers bytes in bursts.
@@ -249,27 +254,27 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_short_here_is_not_blamed_on_the_network() {
-        let of = |errno: Errno| failed(&errno.into(), PortError::Network);
-        assert_eq!(of(Errno::MFILE), PortError::Short(Errno::MFILE));
-        assert_eq!(of(Errno::NFILE), PortError::Short(Errno::NFILE));
+    fn local_exhaustion_is_not_a_network_error() {
+        let of = |errno: Errno| connection_error(&errno.into(), PortError::Network);
+        assert_eq!(of(Errno::MFILE), PortError::ResourceExhausted(Errno::MFILE));
+        assert_eq!(of(Errno::NFILE), PortError::ResourceExhausted(Errno::NFILE));
         assert!(matches!(of(Errno::HOSTUNREACH), PortError::Network(_)));
         let unknown = io::Error::other("Name or service not known");
-        assert!(matches!(failed(&unknown, PortError::NoHost), PortError::NoHost(_)));
+        assert!(matches!(connection_error(&unknown, PortError::NoHost), PortError::NoHost(_)));
     }
 
     const BAUD: u32 = 500_000;
     const SECOND: Nanos = 1_000 * MILLIS;
 
     /// Reads from `begin` to `end` while more bytes are always available. Returns the number of bytes and of reads.
-    fn flooded(allowance: &mut Allowance, begin: Nanos, end: Nanos) -> (usize, u32) {
+    fn flooded(allowance: &mut ReadBudget, begin: Nanos, end: Nanos) -> (usize, u32) {
         let (mut now, mut read, mut reads) = (begin, 0, 0);
         while now < end {
-            match allowance.rest(now, Nanos::MAX) {
+            match allowance.throttled_until(now, Nanos::MAX) {
                 Some(until) => now = until,
                 None => {
                     let len = allowance.bytes(now).min(900);
-                    allowance.take(len, len, now);
+                    allowance.record_read(len, len, now);
                     (read, reads) = (read + len, reads + 1);
                     now += 1;
                 }
@@ -281,7 +286,7 @@ mod tests {
     #[test]
     fn a_flood_is_twice_the_line_behind_a_second_at_once() {
         for baud in [500_000, 38_400, 9_600] {
-            let mut allowance = Allowance::new(baud, 9 * SECOND);
+            let mut allowance = ReadBudget::new(baud, 9 * SECOND);
             let second = baud as usize / 10 * 2;
             let (read, _) = flooded(&mut allowance, 9 * SECOND, 10 * SECOND);
             assert!((2 * second - second / 40..=2 * second).contains(&read), "{baud}: {read}");
@@ -298,46 +303,46 @@ mod tests {
     }
 
     #[test]
-    fn a_line_as_it_should_be_is_read_whenever_it_brings_something() {
-        let mut allowance = Allowance::new(BAUD, SECOND);
+    fn normal_line_is_never_throttled() {
+        let mut allowance = ReadBudget::new(BAUD, SECOND);
         for now in (SECOND..60 * SECOND).step_by(MILLIS as usize) {
-            assert_eq!(allowance.rest(now, Nanos::MAX), None);
-            allowance.take(50, 900, now);
-            assert!(!allowance.is_behind(now));
+            assert_eq!(allowance.throttled_until(now, Nanos::MAX), None);
+            allowance.record_read(50, 900, now);
+            assert!(!allowance.is_backlogged(now));
         }
         // Half a second of bytes was buffered in the network.
         assert!(allowance.bytes(60 * SECOND) > 25_000);
-        allowance.take(25_000, 25_000, 60 * SECOND);
-        assert!(allowance.is_behind(60 * SECOND), "more may be there");
-        allowance.take(10, 900, 60 * SECOND);
-        assert_eq!(allowance.rest(60 * SECOND, Nanos::MAX), None);
-        assert!(!allowance.is_flooded(60 * SECOND) && !allowance.is_behind(60 * SECOND));
+        allowance.record_read(25_000, 25_000, 60 * SECOND);
+        assert!(allowance.is_backlogged(60 * SECOND), "more may be there");
+        allowance.record_read(10, 900, 60 * SECOND);
+        assert_eq!(allowance.throttled_until(60 * SECOND, Nanos::MAX), None);
+        assert!(!allowance.is_flooded(60 * SECOND) && !allowance.is_backlogged(60 * SECOND));
     }
 
     #[test]
-    fn whoever_reads_what_waited_is_behind_until_it_has_caught_up() {
+    fn reader_is_backlogged_until_it_catches_up() {
         for (standstill, longest_ms) in [(1, 1), (5, 3_500), (20, 19_000)] {
             // The line sends all the time.
             let arrived = |now: Nanos| (now / 20_000) as usize;
-            let mut allowance = Allowance::new(BAUD, 0);
+            let mut allowance = ReadBudget::new(BAUD, 0);
             let (mut now, mut read) = (standstill * SECOND, 0);
             let mut caught_up = None;
             while now < 60 * SECOND {
-                if let Some(until) = allowance.rest(now, Nanos::MAX) {
+                if let Some(until) = allowance.throttled_until(now, Nanos::MAX) {
                     now = until;
                     continue;
                 }
                 let room = allowance.bytes(now).clamp(1, 900);
                 let len = room.min(arrived(now) - read);
-                allowance.take(len, room, now);
+                allowance.record_read(len, room, now);
                 // Age of the first byte that was read.
                 let age = now - read as Nanos * 20_000;
                 read += len;
-                assert!(allowance.is_behind(now) || age <= 40 * MILLIS, "{age} ns old at {now}");
+                assert!(allowance.is_backlogged(now) || age <= 40 * MILLIS, "{age} ns old at {now}");
                 match caught_up {
-                    None if !allowance.is_behind(now) => caught_up = Some(now - standstill * SECOND),
+                    None if !allowance.is_backlogged(now) => caught_up = Some(now - standstill * SECOND),
                     None => {}
-                    Some(_) => assert!(!allowance.is_behind(now), "once it has caught up"),
+                    Some(_) => assert!(!allowance.is_backlogged(now), "once it has caught up"),
                 }
                 now += if len < room { MILLIS } else { 1 };
             }
@@ -347,15 +352,15 @@ mod tests {
     }
 
     #[test]
-    fn what_is_due_is_done_and_nobody_spins() {
-        let mut allowance = Allowance::new(BAUD, SECOND);
-        allowance.take(100_000, 100_000, SECOND);
+    fn throttled_read_waits_for_deadline_or_portion() {
+        let mut allowance = ReadBudget::new(BAUD, SECOND);
+        allowance.record_read(100_000, 100_000, SECOND);
         assert_eq!(allowance.bytes(SECOND), 0);
-        let (byte, portion) = (SECOND + 10_000, SECOND + PORTION);
-        assert_eq!(allowance.rest(SECOND, SECOND + 1), Some(byte), "a byte has to be allowed");
-        assert_eq!(allowance.rest(SECOND, 0), Some(portion), "it is overdue");
-        assert_eq!(allowance.rest(SECOND, byte + 5), Some(byte + 5));
-        assert_eq!(allowance.rest(SECOND, Nanos::MAX), Some(portion));
+        let (byte, portion) = (SECOND + 10_000, SECOND + MIN_REFILL);
+        assert_eq!(allowance.throttled_until(SECOND, SECOND + 1), Some(byte), "a byte has to be allowed");
+        assert_eq!(allowance.throttled_until(SECOND, 0), Some(portion), "it is overdue");
+        assert_eq!(allowance.throttled_until(SECOND, byte + 5), Some(byte + 5));
+        assert_eq!(allowance.throttled_until(SECOND, Nanos::MAX), Some(portion));
         assert_eq!((allowance.bytes(byte), allowance.bytes(portion)), (1, 2_000));
         assert!(!allowance.is_flooded(portion), "it was short once");
     }

@@ -28,7 +28,7 @@ use rustix::termios::{
 };
 use serialport::{ClearBuffer, DataBits, FlowControl, SerialPort, StopBits, TTYPort};
 
-use crate::candidates::{PROMPT_MS, check_tty, is_tty, latency_ms};
+use crate::serial_ports::{MAX_LATENCY_MS, check_tty, is_tty, latency_ms};
 use crate::{PortError, write_all};
 
 /// An open serial line, exclusive and raw. Reads and writes never block.
@@ -79,14 +79,14 @@ impl Tty {
             tracing::debug!(%error, "{}: no low latency", path.display());
         }
         tty.configure(termios, baud)?;
-        if let Some(ms) = latency_ms(path).filter(|&ms| ms > PROMPT_MS) {
+        if let Some(ms) = latency_ms(path).filter(|&ms| ms > MAX_LATENCY_MS) {
             tracing::warn!(
                 "{}: the adapter collects bytes for {ms} ms, so stamps are off by as much; a udev rule ends that: \
                  ACTION==\"add\", SUBSYSTEM==\"usb-serial\", DRIVER==\"ftdi_sio\", ATTR{{latency_timer}}=\"1\"",
                 path.display()
             );
         }
-        tty.errors.set(tty.counts().map(|counts| counts.errors()));
+        tty.errors.set(tty.uart_counters().map(|counts| counts.errors()));
         Ok(tty)
     }
 
@@ -107,11 +107,11 @@ impl Tty {
     /// # Errors
     ///
     /// Returns an error if the line is lost.
-    pub(crate) fn altered(&self) -> io::Result<Option<Alteration>> {
-        let (own, now) = (self.settings.get(), Settings::of(&tcgetattr(&self.line)?));
-        Ok((now != own).then_some(match now.speed {
-            speed if speed != own.speed => Alteration::Rate(speed),
-            _ => Alteration::Settings,
+    pub(crate) fn changed_settings(&self) -> io::Result<Option<SettingsChange>> {
+        let (own, current) = (self.settings.get(), Settings::of(&tcgetattr(&self.line)?));
+        Ok((current != own).then_some(match current.speed {
+            speed if speed != own.speed => SettingsChange::Rate(speed),
+            _ => SettingsChange::Settings,
         }))
     }
 
@@ -123,7 +123,7 @@ impl Tty {
     /// Returns an error if the line is lost.
     pub(crate) fn restore(&self, baud: u32) -> io::Result<()> {
         let configured = self.configure(tcgetattr(&self.line)?, baud);
-        clear_input(&self.line).map_err(|_| self.gone())?;
+        clear_input(&self.line).map_err(|_| self.lost_line_error())?;
         // With other settings, every byte counts as an error.
         self.line_errors();
         match configured {
@@ -143,8 +143,8 @@ impl Tty {
     }
 
     /// Returns the driver's counters since it was loaded, if it has any.
-    pub(crate) fn counts(&self) -> Option<Counts> {
-        Counts::of(&self.line).ok()
+    pub(crate) fn uart_counters(&self) -> Option<UartCounters> {
+        UartCounters::of(&self.line).ok()
     }
 
     /// Returns the rate that the driver reports.
@@ -155,7 +155,7 @@ impl Tty {
     /// Returns the errors that the driver counted since the last call. A change of the rate also counts as a call.
     pub(crate) fn line_errors(&self) -> u64 {
         let Some(before) = self.errors.get() else { return 0 };
-        let now = self.counts().map_or(before, |counts| counts.errors());
+        let now = self.uart_counters().map_or(before, |counts| counts.errors());
         self.errors.set(Some(now));
         u64::from(now.wrapping_sub(before))
     }
@@ -165,11 +165,11 @@ impl Tty {
         if let Some(speed) = self.baud() {
             self.settings.set(Settings { speed, ..self.settings.get() });
         }
-        clear_input(&self.line).map_err(|_| self.gone())?;
+        clear_input(&self.line).map_err(|_| self.lost_line_error())?;
         // At a wrong rate, every byte counts as an error.
         self.line_errors();
-        applied.map_err(|refusal| match refusal {
-            PortError::Rate { .. } => io::Error::new(ErrorKind::Unsupported, refusal.to_string()),
+        applied.map_err(|error| match error {
+            PortError::Rate { .. } => io::Error::new(ErrorKind::Unsupported, error.to_string()),
             refusal => io::Error::other(refusal.to_string()),
         })
     }
@@ -181,13 +181,13 @@ impl Tty {
         termios.control_modes.set(ControlModes::HUPCL, !on);
         tcsetattr(&self.line, OptionalActions::Now, &termios)?;
         match apply_dtr(&self.line, on) {
-            Err(_) if self.baud().is_none() => Err(self.gone()),
+            Err(_) if self.baud().is_none() => Err(self.lost_line_error()),
             _ => Ok(()),
         }
     }
 
     /// Returns the number of bytes in the input buffer, if the driver reports it.
-    pub(crate) fn waiting(&self) -> Option<usize> {
+    pub(crate) fn buffered_bytes(&self) -> Option<usize> {
         rustix::io::ioctl_fionread(&self.line).ok().map(|waiting| waiting as usize)
     }
 
@@ -195,7 +195,7 @@ impl Tty {
         match rustix::io::read(&self.line, buffer) {
             // With VMIN = 0, which some programs set, an empty buffer reads like the end of the line.
             Ok(0) if self.baud().is_some() => Ok(0),
-            Ok(0) | Err(Errno::IO) => Err(hung_up()),
+            Ok(0) | Err(Errno::IO) => Err(hangup_error()),
             Err(Errno::AGAIN | Errno::INTR) => Ok(0),
             other => Ok(other?),
         }
@@ -203,19 +203,19 @@ impl Tty {
 
     pub(crate) fn write(&self, bytes: &[u8]) -> io::Result<()> {
         let written = write_all(&self.line, bytes);
-        written.map_err(|error| if error == Errno::IO { hung_up() } else { error.into() })
+        written.map_err(|error| if error == Errno::IO { hangup_error() } else { error.into() })
     }
 
     /// Checks the result of changing settings by the rate that the driver has set instead of `wanted`. A lost line
     /// reports an error when its settings are read. Otherwise the driver rejected the settings, and the library does
     /// not keep the number of the error.
-    fn check(&self, told: serialport::Result<()>, wanted: u32) -> Result<(), PortError> {
-        let given = tcgetattr(&self.line)?.output_speed();
-        judge(told.map_err(|_| Errno::INVAL), given, wanted)
+    fn check(&self, result: serialport::Result<()>, requested: u32) -> Result<(), PortError> {
+        let actual = tcgetattr(&self.line)?.output_speed();
+        check_rate(result.map_err(|_| Errno::INVAL), actual, requested)
     }
 
     /// Returns the error of a line whose settings cannot be read.
-    fn gone(&self) -> io::Error {
+    fn lost_line_error(&self) -> io::Error {
         tcgetattr(&self.line).err().unwrap_or(Errno::IO).into()
     }
 }
@@ -252,7 +252,7 @@ impl Settings {
             speed: termios.output_speed(),
             input: termios.input_modes,
             output: termios.output_modes,
-            control: termios.control_modes & CHARACTER,
+            control: termios.control_modes & CHARACTER_MODES,
             local: termios.local_modes,
             min: termios.special_codes[SpecialCodeIndex::VMIN],
         }
@@ -261,24 +261,24 @@ impl Settings {
 
 /// A change of an open line's settings by another process.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Alteration {
+pub enum SettingsChange {
     /// The rate in bits per second, possibly with other settings.
     Rate(u32),
     /// Settings other than the rate.
     Settings,
 }
 
-impl fmt::Display for Alteration {
+impl fmt::Display for SettingsChange {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Alteration::Rate(baud) => write!(f, "the port was set to {baud} baud by another process"),
-            Alteration::Settings => f.write_str("the port's settings were changed by another process"),
+            SettingsChange::Rate(baud) => write!(f, "the port was set to {baud} baud by another process"),
+            SettingsChange::Settings => f.write_str("the port's settings were changed by another process"),
         }
     }
 }
 
 /// Control modes that matter, except the rate, which has a separate field. HUPCL only matters when the line is closed.
-const CHARACTER: ControlModes = ControlModes::CSIZE
+const CHARACTER_MODES: ControlModes = ControlModes::CSIZE
     .union(ControlModes::CSTOPB)
     .union(ControlModes::CREAD)
     .union(ControlModes::PARENB)
@@ -288,23 +288,25 @@ const CHARACTER: ControlModes = ControlModes::CSIZE
     .union(ControlModes::CRTSCTS);
 
 /// Returns the error of a read if the adapter was unplugged, the other end of a pty was closed, or the line hung up.
-fn hung_up() -> io::Error {
+fn hangup_error() -> io::Error {
     io::Error::new(ErrorKind::UnexpectedEof, "the line hung up")
 }
 
 /// Checks the rate that a driver has `given` after it was set to `wanted`. Some drivers set another rate, and some
 /// reject a rate that they do not support.
-fn judge(told: Result<(), Errno>, given: u32, wanted: u32) -> Result<(), PortError> {
-    match told {
-        Ok(()) | Err(Errno::INVAL) if !is_near(given, wanted) => Err(PortError::Rate { wanted, given }),
+fn check_rate(result: Result<(), Errno>, actual: u32, requested: u32) -> Result<(), PortError> {
+    match result {
+        Ok(()) | Err(Errno::INVAL) if !is_near(actual, requested) => {
+            Err(PortError::Rate { requested, actual })
+        }
         told => Ok(told?),
     }
 }
 
 /// Returns whether a UART at `given` can receive from one at `wanted`. In the middle of the last bit, both ends
 /// together may be off by half a bit, so each of them by at most 3 %.
-fn is_near(given: u32, wanted: u32) -> bool {
-    u64::from(given.abs_diff(wanted)) * 100 <= u64::from(wanted) * 3
+fn is_near(actual: u32, requested: u32) -> bool {
+    u64::from(actual.abs_diff(requested)) * 100 <= u64::from(requested) * 3
 }
 
 /// Sets 8 data bits, 1 stop bit, no handshake (Telegram listing 4), and `baud`.
@@ -374,7 +376,7 @@ fn with_library<T>(
 
 /// Counters of a line since its driver was loaded. All of them wrap.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Counts {
+pub struct UartCounters {
     /// Bytes received.
     pub received: u32,
     /// Bytes without a stop bit.
@@ -389,52 +391,55 @@ pub struct Counts {
     pub buffer: u32,
 }
 
-impl Counts {
+impl UartCounters {
     /// Reads the counters of the driver of `line`.
-    pub(crate) fn of(line: impl AsFd) -> Result<Counts, Errno> {
-        let mut words = [0; WORDS];
-        call::<TIOCGICOUNT>(line.as_fd(), &mut words)?;
-        Ok(Counts::in_words(&words))
+    pub(crate) fn of(line: impl AsFd) -> Result<UartCounters, Errno> {
+        let mut words = [0; STRUCT_WORDS];
+        ioctl_words::<TIOCGICOUNT>(line.as_fd(), &mut words)?;
+        Ok(UartCounters::from_words(&words))
     }
 
     /// Returns the total of all errors.
     pub fn errors(self) -> u32 {
-        let Counts { received: _, framing, overrun, parity, breaks, buffer } = self;
+        let UartCounters { received: _, framing, overrun, parity, breaks, buffer } = self;
         [framing, overrun, parity, breaks, buffer].into_iter().fold(0, u32::wrapping_add)
     }
 
     /// Reads a `serial_icounter_struct`: cts dsr rng dcd rx tx frame overrun parity brk buf_overrun.
-    fn in_words(words: &[u32; WORDS]) -> Counts {
+    fn from_words(words: &[u32; STRUCT_WORDS]) -> UartCounters {
         let [_, _, _, _, received, _, framing, overrun, parity, breaks, buffer, ..] = *words;
-        Counts { received, framing, overrun, parity, breaks, buffer }
+        UartCounters { received, framing, overrun, parity, breaks, buffer }
     }
 }
 
 /// Sets the driver to low latency, so that an FTDI adapter delivers bytes every millisecond instead of every 16. Also
 /// removes a custom divisor that an old `setserial` may have left, which replaces the rate 38400 by another one.
 pub(super) fn set_low_latency(line: impl AsFd) -> Result<(), Errno> {
-    let mut serial = [0; WORDS];
-    call::<TIOCGSERIAL>(line.as_fd(), &mut serial)?;
-    let flags = serial[FLAGS];
-    serial[FLAGS] = prompt(flags);
-    if serial[FLAGS] == flags { Ok(()) } else { call::<TIOCSSERIAL>(line.as_fd(), &mut serial) }
+    let mut serial = [0; STRUCT_WORDS];
+    ioctl_words::<TIOCGSERIAL>(line.as_fd(), &mut serial)?;
+    let flags = serial[FLAGS_INDEX];
+    serial[FLAGS_INDEX] = low_latency_flags(flags);
+    if serial[FLAGS_INDEX] == flags { Ok(()) } else { ioctl_words::<TIOCSSERIAL>(line.as_fd(), &mut serial) }
 }
 
 /// Returns `flags` of a `serial_struct` with low latency and without a custom divisor.
-fn prompt(flags: u32) -> u32 {
+fn low_latency_flags(flags: u32) -> u32 {
     (flags | ASYNC_LOW_LATENCY) & !ASYNC_SPD_MASK
 }
 
-fn call<const OPCODE: Opcode>(line: BorrowedFd<'_>, words: &mut [u32; WORDS]) -> Result<(), Errno> {
+fn ioctl_words<const OPCODE: Opcode>(
+    line: BorrowedFd<'_>,
+    words: &mut [u32; STRUCT_WORDS],
+) -> Result<(), Errno> {
     // SAFETY: each opcode below makes the kernel read or write one structure at `words`. All fields of these structures
     // are plain numbers, and the longest has 80 bytes (linux/serial.h), which is the size of `words`.
     unsafe { ioctl(line, Updater::<OPCODE, _>::new(words)) }
 }
 
 /// Length of a `serial_icounter_struct` in words. A `serial_struct` is shorter.
-const WORDS: usize = 20;
+const STRUCT_WORDS: usize = 20;
 /// Index of the flags in a `serial_struct`.
-const FLAGS: usize = 4;
+const FLAGS_INDEX: usize = 4;
 /// Bits of the flags (linux/tty_flags.h).
 const ASYNC_LOW_LATENCY: u32 = 1 << 13;
 const ASYNC_SPD_MASK: u32 = 1 << 12 | 1 << 5 | 1 << 4;
@@ -447,22 +452,22 @@ const TIOCGICOUNT: Opcode = 0x545D;
 #[derive(Debug, Default)]
 pub struct LineErrors {
     /// Whether the driver counted errors since the last wait for bytes.
-    moved: bool,
+    is_current: bool,
     /// Whether it counted errors in the period before that.
-    before: bool,
+    was_previous: bool,
 }
 
 impl LineErrors {
     /// Records that a telegram was read, and that the driver counted `errors` since the previous one. Returns whether
     /// they may be in this telegram.
-    pub fn note(&mut self, errors: u64) -> bool {
-        self.moved |= errors > 0;
-        self.moved || self.before
+    pub fn note_telegram(&mut self, errors: u64) -> bool {
+        self.is_current |= errors > 0;
+        self.is_current || self.was_previous
     }
 
     /// Records that all telegrams of a read, at least one, were noted.
-    pub fn wait(&mut self) {
-        self.before = std::mem::take(&mut self.moved);
+    pub fn note_read(&mut self) {
+        self.was_previous = std::mem::take(&mut self.is_current);
     }
 }
 
@@ -486,7 +491,7 @@ mod tests {
             let mut termios = tcgetattr(&other).expect("a terminal");
             change(&mut termios);
             tcsetattr(&other, OptionalActions::Now, &termios).expect("a terminal");
-            tty.altered().expect("it is connected")
+            tty.changed_settings().expect("it is connected")
         };
         assert_eq!(change(&|_| {}), None);
         tty.set_baud(38_400).expect("a pty takes every rate");
@@ -496,18 +501,18 @@ mod tests {
         let parity = |termios: &mut Termios| termios.input_modes.insert(InputModes::ISTRIP);
         let lines = |termios: &mut Termios| termios.local_modes.insert(LocalModes::ICANON);
         for (by, alteration) in [
-            (&rate as &dyn Fn(&mut Termios), Alteration::Rate(9600)),
-            (&parity, Alteration::Settings),
-            (&lines, Alteration::Settings),
+            (&rate as &dyn Fn(&mut Termios), SettingsChange::Rate(9600)),
+            (&parity, SettingsChange::Settings),
+            (&lines, SettingsChange::Settings),
         ] {
             assert_eq!(change(by), Some(alteration));
             tty.restore(38_400).expect("it is connected");
-            assert_eq!((tty.altered().expect("it is connected"), tty.baud()), (None, Some(38_400)));
+            assert_eq!((tty.changed_settings().expect("it is connected"), tty.baud()), (None, Some(38_400)));
         }
     }
 
     #[test]
-    fn an_empty_read_is_no_hang_up_unless_the_line_is_lost() {
+    fn empty_read_is_a_hang_up_only_if_line_is_lost() {
         let (other, path) = pty();
         let tty = Tty::open(&path, 500_000).expect("it is free");
         let mut termios = tcgetattr(&other).expect("a terminal");
@@ -519,37 +524,37 @@ mod tests {
     }
 
     #[test]
-    fn a_rate_that_is_refused_is_not_had_and_a_line_that_is_gone_is_gone() {
-        let no_rate = |given| Err(PortError::Rate { wanted: 500_000, given });
-        assert_eq!(judge(Ok(()), 500_000, 500_000), Ok(()));
-        assert_eq!(judge(Ok(()), 460_800, 500_000), no_rate(460_800));
-        assert_eq!(judge(Err(Errno::INVAL), 38_400, 500_000), no_rate(38_400));
+    fn distinguishes_a_refused_rate_from_a_dead_line() {
+        let no_rate = |given| Err(PortError::Rate { requested: 500_000, actual: given });
+        assert_eq!(check_rate(Ok(()), 500_000, 500_000), Ok(()));
+        assert_eq!(check_rate(Ok(()), 460_800, 500_000), no_rate(460_800));
+        assert_eq!(check_rate(Err(Errno::INVAL), 38_400, 500_000), no_rate(38_400));
         // The driver has the rate, but rejects another setting.
-        assert_eq!(judge(Err(Errno::INVAL), 500_000, 500_000), Err(PortError::Other(Errno::INVAL)));
-        assert_eq!(judge(Err(Errno::IO), 38_400, 500_000), Err(PortError::Dead));
+        assert_eq!(check_rate(Err(Errno::INVAL), 500_000, 500_000), Err(PortError::Other(Errno::INVAL)));
+        assert_eq!(check_rate(Err(Errno::IO), 38_400, 500_000), Err(PortError::NoDevice));
     }
 
     #[test]
-    fn errors_are_what_the_line_did_wrong() {
-        let mut words = [0; WORDS];
+    fn sums_the_line_error_counters() {
+        let mut words = [0; STRUCT_WORDS];
         words[..11].copy_from_slice(&[9, 9, 9, 9, 1_000_000, 500, 1, 20, 300, 4000, 50_000]);
-        let counts = Counts::in_words(&words);
+        let counts = UartCounters::from_words(&words);
         assert_eq!((counts.received, counts.errors()), (1_000_000, 54_321));
         assert_eq!((counts.overrun, counts.buffer), (20, 50_000));
-        assert_eq!(Counts { framing: u32::MAX, ..counts }.errors(), 54_319);
+        assert_eq!(UartCounters { framing: u32::MAX, ..counts }.errors(), 54_319);
     }
 
     #[test]
     fn flags_that_matter() {
         // ASYNC_SKIP_TEST and ASYNC_SPD_CUST, as setserial leaves them.
-        assert_eq!(prompt(0x40 | 0x30), 0x2040);
-        assert_eq!(prompt(0x2040), 0x2040);
+        assert_eq!(low_latency_flags(0x40 | 0x30), 0x2040);
+        assert_eq!(low_latency_flags(0x2040), 0x2040);
     }
 
     #[test]
     fn a_line_that_has_none() {
         let (_, slave) = std::io::pipe().unwrap();
-        assert_eq!(Counts::of(&slave), Err(Errno::NOTTY));
+        assert_eq!(UartCounters::of(&slave), Err(Errno::NOTTY));
         assert_eq!(set_low_latency(&slave), Err(Errno::NOTTY));
     }
 
@@ -557,8 +562,8 @@ mod tests {
     fn this_telegram_and_the_next_one() {
         let mut errors = LineErrors::default();
         let mut read = |counts: &[u64]| {
-            let marked: Vec<bool> = counts.iter().map(|&count| errors.note(count)).collect();
-            errors.wait();
+            let marked: Vec<bool> = counts.iter().map(|&count| errors.note_telegram(count)).collect();
+            errors.note_read();
             marked
         };
         assert_eq!(read(&[0]), [false]);

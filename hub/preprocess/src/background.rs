@@ -1,6 +1,6 @@
 //! Decides which beams of a scan hit the permanent surroundings, and which hit something in front of them.
 //!
-//! A [`Model`] of the surroundings is learned from the scans: beam by beam by one of two methods (`fixed`), or as a map
+//! A [`BackgroundModel`] of the surroundings is learned from the scans: beam by beam by one of two methods (`fixed`), or as a map
 //! around a sensor that moves (`moving`).
 
 mod fixed;
@@ -13,8 +13,8 @@ use scanhub_schema::{
     Background, BackgroundHead, Foreground, ForegroundArrays, ForegroundHead, Motion, Pose, Scan, ScanHead,
 };
 
-use fixed::{BLOCK, Multi, Paper};
-use moving::Moving;
+use fixed::{BLOCK_LEN, MultiSurface, SingleSurface};
+use moving::OccupancyMap;
 
 use crate::search::position;
 use crate::velocity::Velocity;
@@ -52,7 +52,7 @@ pub enum Method {
     #[default]
     Multi,
     /// A map of the surroundings of a robot that moves. Beams that end in space that was seen free are in the
-    /// foreground. Each scan needs the robot's position, see [`Model::follow`].
+    /// foreground. Each scan needs the robot's position, see [`BackgroundModel::set_motion`].
     Moving,
 }
 
@@ -83,7 +83,7 @@ struct Limits {
     threshold: u16,
     /// In device units.
     candidate: u16,
-    /// 1 to [`MOST_SCANS`].
+    /// 1 to [`MAX_SCANS`].
     scans: u16,
     latest: bool,
     no_return_is_far: bool,
@@ -100,13 +100,13 @@ const THRESHOLD_CM_MODE_MM: u16 = 60;
 /// The same in dm mode, where surfaces 30 mm apart are read as at most one unit apart.
 const THRESHOLD_DM_MODE_MM: u16 = 100;
 /// 750 mirror revolutions of an LMS: this number of scans at 1 degree, half of them at half degrees.
-const TEN_SECONDS_NS: f64 = 9.99e9;
+const LEARNING_TIME_NS: f64 = 9.99e9;
 /// Maximum that the weights of `multi` have room for: eight per scan in 16 bits.
-const MOST_SCANS: u32 = 8191;
+const MAX_SCANS: u32 = 8191;
 /// Maximum difference of two ranges. [`scanhub_schema::Background::FAR`] differs by more from all of them.
-const FARTHEST: u32 = 0x7FFF;
+const MAX_DIFFERENCE: u32 = 0x7FFF;
 /// Maximum rounding error of a quotient: a whole number stays that number.
-const ROUNDING: f64 = 1e-6;
+const ROUNDING_ERROR: f64 = 1e-6;
 
 impl Limits {
     fn of(settings: &Settings, scan: &ScanHead) -> Limits {
@@ -118,16 +118,16 @@ impl Limits {
         };
         // With less than a unit, a reading between two of them would belong to no surface.
         let units = |mm: Option<u16>| {
-            (1000 * u32::from(mm.unwrap_or(default_mm)) / unit_um).clamp(1, FARTHEST) as u16
+            (1000 * u32::from(mm.unwrap_or(default_mm)) / unit_um).clamp(1, MAX_DIFFERENCE) as u16
         };
         let turn_ns = f64::from(scan.beam_time_ns) * TAU / scan.step.abs();
         // Without revolutions, there is no number of scans for 10 s.
         let ten_seconds =
-            (TEN_SECONDS_NS / (turn_ns * f64::from(scan.turns.max(1))) - ROUNDING).ceil() as u32;
+            (LEARNING_TIME_NS / (turn_ns * f64::from(scan.turns.max(1))) - ROUNDING_ERROR).ceil() as u32;
         Limits {
             threshold: units(settings.threshold_mm),
             candidate: units(settings.candidate_mm),
-            scans: settings.scans.unwrap_or(ten_seconds).clamp(1, MOST_SCANS) as u16,
+            scans: settings.scans.unwrap_or(ten_seconds).clamp(1, MAX_SCANS) as u16,
             latest: settings.candidate == Candidate::Latest,
             no_return_is_far: settings.no_return_is_far.unwrap_or(settings.method == Method::Multi),
             step_mdeg: (scan.step.abs().to_degrees() * 1000.0).round() as u32,
@@ -157,12 +157,12 @@ pub enum Class {
 /// A scan with another shape than the previous one (number of beams, unit, angles) resets it. A reading of 0 is like
 /// any other, but as a background it cannot be distinguished from an unknown one.
 #[derive(Clone)]
-pub struct Model {
+pub struct BackgroundModel {
     settings: Settings,
     limits: Limits,
-    learner: Learner,
+    method_state: MethodState,
     /// Maximum number of beams of a scan. More are ignored.
-    most: usize,
+    max_beams: usize,
     /// Number of beams and unit in micrometers of the last scan or of the loaded model; (0, 0) before both.
     shape: (u16, u32),
     /// First angle and step of the last scan or of the loaded model; 0 before both.
@@ -170,9 +170,9 @@ pub struct Model {
     /// Whether a scan has arrived, so that the limits are in its units.
     is_fitted: bool,
     generation: u32,
-    frozen: bool,
+    is_frozen: bool,
     /// Whether nothing has been learned or loaded since the last reset.
-    fresh: bool,
+    is_empty: bool,
     /// Classes of the beams of the last scan, in whole blocks.
     classes: Box<[Class]>,
     /// Readings of the beams in whole blocks, while a scan is processed.
@@ -181,31 +181,31 @@ pub struct Model {
 
 /// State of the method.
 #[derive(Clone)]
-enum Learner {
-    Paper(Paper),
-    Multi(Multi),
-    Moving(Moving),
+enum MethodState {
+    Paper(SingleSurface),
+    Multi(MultiSurface),
+    Moving(OccupancyMap),
 }
 
 /// Value of a beam without a reading. It lies between the ranges and [`Background::FAR`].
 const INVALID: u16 = Background::FAR - 1;
 
-impl Model {
+impl BackgroundModel {
     /// Creates an empty model for scans of at most `beams` beams. It allocates all the memory that it ever needs.
-    pub fn new(settings: Settings, beams: usize) -> Model {
-        Model {
+    pub fn new(settings: Settings, beams: usize) -> BackgroundModel {
+        BackgroundModel {
             settings,
             limits: Limits::of(&settings, &ScanHead::default()),
-            learner: Learner::new(settings.method, beams),
-            most: beams,
+            method_state: MethodState::new(settings.method, beams),
+            max_beams: beams,
             shape: (0, 0),
             angles: (0.0, 0.0),
             is_fitted: false,
             generation: 0,
-            frozen: false,
-            fresh: true,
-            classes: vec![Class::Invalid; beams.next_multiple_of(BLOCK)].into(),
-            readings: vec![INVALID; beams.next_multiple_of(BLOCK)].into(),
+            is_frozen: false,
+            is_empty: true,
+            classes: vec![Class::Invalid; beams.next_multiple_of(BLOCK_LEN)].into(),
+            readings: vec![INVALID; beams.next_multiple_of(BLOCK_LEN)].into(),
         }
     }
 
@@ -217,35 +217,35 @@ impl Model {
     /// Panics if `out` has no memory for as many beams.
     pub fn update(&mut self, scan: &Scan, out: &mut Foreground) {
         self.fit(scan);
-        let count = scan.beams().min(self.most);
-        let whole = count.next_multiple_of(BLOCK);
+        let count = scan.beams().min(self.max_beams);
+        let padded_count = count.next_multiple_of(BLOCK_LEN);
         measure(scan, self.limits.no_return_is_far, &mut self.readings[..count]);
-        self.readings[count..whole].fill(INVALID);
+        self.readings[count..padded_count].fill(INVALID);
         let (readings, classes) = (&self.readings[..count], &mut self.classes[..count]);
-        let learn = !self.frozen;
-        match &mut self.learner {
-            Learner::Paper(paper) => paper.update(readings, &self.limits, learn, classes),
-            Learner::Multi(multi) => {
-                let (readings, classes) = (&self.readings[..whole], &mut self.classes[..whole]);
+        let learn = !self.is_frozen;
+        match &mut self.method_state {
+            MethodState::Paper(paper) => paper.update(readings, &self.limits, learn, classes),
+            MethodState::Multi(multi) => {
+                let (readings, classes) = (&self.readings[..padded_count], &mut self.classes[..padded_count]);
                 multi.update(readings, &self.limits, learn, classes);
             }
-            Learner::Moving(moving) => moving.update(scan, readings, &self.limits, learn, classes),
+            MethodState::Moving(moving) => moving.update(scan, readings, &self.limits, learn, classes),
         }
-        if learn && self.fresh {
+        if learn && self.is_empty {
             if self.settings.start == Start::FirstScan {
-                self.learner.adopt(readings);
+                self.method_state.adopt(readings);
             }
-            self.fresh = false;
+            self.is_empty = false;
         }
-        write(scan, self.generation, &self.classes[..count], out);
+        write_foreground(scan, self.generation, &self.classes[..count], out);
     }
 
     /// Sets the robot's position at the next scan, as in `motion`, and its `velocity` during that scan, for a sensor at
     /// `pose` and [`Method::Moving`]. If the motion restarts or is refused, the model forgets everything.
-    pub fn follow(&mut self, pose: &Pose, motion: &Motion, velocity: &Velocity) {
-        if let Learner::Moving(moving) = &mut self.learner
-            && !moving.follow(pose, motion, velocity)
-            && !self.fresh
+    pub fn set_motion(&mut self, pose: &Pose, motion: &Motion, velocity: &Velocity) {
+        if let MethodState::Moving(moving) = &mut self.method_state
+            && !moving.set_motion(pose, motion, velocity)
+            && !self.is_empty
         {
             self.reset();
         }
@@ -266,19 +266,19 @@ impl Model {
     /// # Panics
     ///
     /// Panics if `out` has no memory for as many beams.
-    pub fn show(&self, out: &mut Background) {
+    pub fn write(&self, out: &mut Background) {
         let ranges = out.begin(BackgroundHead {
             first_angle: self.angles.0,
             step: self.angles.1,
             generation: self.generation,
             unit_um: self.shape.1,
             count: self.shape.0,
-            flags: if self.frozen { Background::FROZEN } else { 0 },
+            flags: if self.is_frozen { Background::FROZEN } else { 0 },
             ..BackgroundHead::default()
         });
         let mut known_beams = 0;
         for (i, range) in ranges.iter_mut().enumerate() {
-            *range = self.learner.background(i, &self.limits);
+            *range = self.method_state.background(i, &self.limits);
             known_beams += u16::from(*range != Background::UNKNOWN);
         }
         out.known_beams = known_beams;
@@ -302,29 +302,29 @@ impl Model {
 
     /// Returns whether learning is stopped.
     pub fn is_frozen(&self) -> bool {
-        self.frozen
+        self.is_frozen
     }
 
     /// Forgets everything. A frozen model stays frozen, and is empty until it is thawed.
     pub fn reset(&mut self) {
-        match &mut self.learner {
-            Learner::Paper(paper) if self.settings.method == Method::Paper => paper.forget(),
-            Learner::Multi(multi) if self.settings.method == Method::Multi => multi.forget(),
-            Learner::Moving(moving) if self.settings.method == Method::Moving => moving.forget(),
-            other => *other = Learner::new(self.settings.method, self.most),
+        match &mut self.method_state {
+            MethodState::Paper(paper) if self.settings.method == Method::Paper => paper.reset(),
+            MethodState::Multi(multi) if self.settings.method == Method::Multi => multi.reset(),
+            MethodState::Moving(moving) if self.settings.method == Method::Moving => moving.reset(),
+            other => *other = MethodState::new(self.settings.method, self.max_beams),
         }
         self.generation = self.generation.wrapping_add(1);
-        self.fresh = true;
+        self.is_empty = true;
     }
 
     /// Stops learning; scans are compared as before.
     pub fn freeze(&mut self) {
-        self.frozen = true;
+        self.is_frozen = true;
     }
 
     /// Resumes learning.
     pub fn thaw(&mut self) {
-        self.frozen = false;
+        self.is_frozen = false;
     }
 
     /// Uses the ranges of `model` as the background. Candidates are forgotten. Generation and flags of `model` are
@@ -335,7 +335,7 @@ impl Model {
     pub fn load(&mut self, model: &Background) -> Result<(), Mismatch> {
         let ranges = model.ranges();
         let shape = (ranges.len() as u16, model.unit_um);
-        if self.is_fitted && shape != self.shape || ranges.len() > self.most {
+        if self.is_fitted && shape != self.shape || ranges.len() > self.max_beams {
             return Err(Mismatch { model: shape, sensor: self.shape });
         }
         self.shape = shape;
@@ -343,8 +343,8 @@ impl Model {
             self.angles = (model.first_angle, model.step);
         }
         self.reset();
-        self.learner.adopt(ranges);
-        self.fresh = false;
+        self.method_state.adopt(ranges);
+        self.is_empty = false;
         Ok(())
     }
 
@@ -354,20 +354,20 @@ impl Model {
         // Between two scans, there are no readings.
         let beams = self.beams();
         for (i, range) in self.readings[..beams].iter_mut().enumerate() {
-            *range = self.learner.background(i, &self.limits);
+            *range = self.method_state.background(i, &self.limits);
         }
-        let was_fresh = self.fresh;
+        let was_fresh = self.is_empty;
         self.settings = settings;
         self.reset();
-        self.learner.adopt(&self.readings[..beams]);
-        self.fresh = was_fresh;
+        self.method_state.adopt(&self.readings[..beams]);
+        self.is_empty = was_fresh;
         // The next scan defines the units of the settings.
         self.is_fitted = false;
     }
 
     /// Adapts the model to scans such as `scan`.
     fn fit(&mut self, scan: &Scan) {
-        let shape = (scan.beams().min(self.most) as u16, scan.unit_um);
+        let shape = (scan.beams().min(self.max_beams) as u16, scan.unit_um);
         let angles = (scan.first_angle, scan.step);
         if self.is_fitted && (shape, angles) == (self.shape, self.angles) {
             return;
@@ -382,12 +382,12 @@ impl Model {
     }
 }
 
-impl Learner {
-    fn new(method: Method, beams: usize) -> Learner {
+impl MethodState {
+    fn new(method: Method, beams: usize) -> MethodState {
         match method {
-            Method::Paper => Learner::Paper(Paper::new(beams)),
-            Method::Multi => Learner::Multi(Multi::new(beams)),
-            Method::Moving => Learner::Moving(Moving::new(beams)),
+            Method::Paper => MethodState::Paper(SingleSurface::new(beams)),
+            Method::Multi => MethodState::Multi(MultiSurface::new(beams)),
+            Method::Moving => MethodState::Moving(OccupancyMap::new(beams)),
         }
     }
 
@@ -396,10 +396,10 @@ impl Learner {
         for (i, &range) in ranges.iter().enumerate() {
             if range != INVALID && range != Background::UNKNOWN {
                 match self {
-                    Learner::Paper(paper) => paper.adopt(i, range),
-                    Learner::Multi(multi) => multi.adopt(i, range),
+                    MethodState::Paper(paper) => paper.adopt(i, range),
+                    MethodState::Multi(multi) => multi.adopt(i, range),
                     // Ranges from one position are not a map.
-                    Learner::Moving(_) => {}
+                    MethodState::Moving(_) => {}
                 }
             }
         }
@@ -408,9 +408,9 @@ impl Learner {
     /// Returns the background of beam `i` in device units, [`Background::UNKNOWN`] or [`Background::FAR`].
     fn background(&self, i: usize, limits: &Limits) -> u16 {
         match self {
-            Learner::Paper(paper) => paper.background(i),
-            Learner::Multi(multi) => multi.background(i, limits),
-            Learner::Moving(moving) => moving.background(i, limits),
+            MethodState::Paper(paper) => paper.background(i),
+            MethodState::Multi(multi) => multi.background(i, limits),
+            MethodState::Moving(moving) => moving.background(i, limits),
         }
     }
 }
@@ -429,7 +429,7 @@ fn measure(scan: &Scan, no_return_is_far: bool, readings: &mut [u16]) {
 }
 
 /// Writes everything except the segments.
-fn write(scan: &Scan, generation: u32, classes: &[Class], out: &mut Foreground) {
+fn write_foreground(scan: &Scan, generation: u32, classes: &[Class], out: &mut Foreground) {
     let head = ForegroundHead {
         generation,
         unit_um: scan.unit_um,
@@ -439,12 +439,12 @@ fn write(scan: &Scan, generation: u32, classes: &[Class], out: &mut Foreground) 
     let ForegroundArrays { bits, ranges, .. } = out.begin(head);
     bits.fill(0);
     let values = scan.ranges();
-    let (mut beams, mut behind) = (0, 0);
-    while let Some(beam) = position(classes, behind, is_foreground) {
+    let (mut beams, mut end) = (0, 0);
+    while let Some(beam) = position(classes, end, is_foreground) {
         bits[beam / 8] |= 1 << (beam % 8);
         ranges[beams] = values[beam];
         beams += 1;
-        behind = beam + 1;
+        end = beam + 1;
     }
     ranges[beams..].fill(0);
     out.beams = beams as u16;
@@ -480,26 +480,26 @@ impl std::error::Error for Mismatch {}
 /// Decides how many neighboring beams, in how many scans, count as an object. Noise and mixed readings at edges are
 /// single beams. People cover several, unless they are far away.
 #[derive(Clone)]
-struct Runs {
+struct RunFilter {
     /// Readings of beams of the last scan that were nearer than their background; [`INVALID`] for the others.
-    seen: Box<[u16]>,
+    foreground: Box<[u16]>,
     /// Those of them that counted as an object.
-    told: Box<[u16]>,
+    objects: Box<[u16]>,
     /// The same for the current scan.
     next: [Box<[u16]>; 2],
 }
 
-impl Runs {
+impl RunFilter {
     /// Creates the state for at most `beams` beams.
-    fn new(beams: usize) -> Runs {
+    fn new(beams: usize) -> RunFilter {
         let none = || vec![INVALID; beams].into_boxed_slice();
-        Runs { seen: none(), told: none(), next: [none(), none()] }
+        RunFilter { foreground: none(), objects: none(), next: [none(), none()] }
     }
 
     /// Restores the initial state.
-    fn forget(&mut self) {
-        self.seen.fill(INVALID);
-        self.told.fill(INVALID);
+    fn reset(&mut self) {
+        self.foreground.fill(INVALID);
+        self.objects.fill(INVALID);
     }
 
     /// Keeps runs of foreground beams in `classes` that count as objects. Beams of other runs become unknown. Beams
@@ -508,58 +508,63 @@ impl Runs {
     /// A run of three beams counts at once. A shorter one counts if the last scan had a foreground beam of an object
     /// there. It also counts if it is as long as a leg is wide at its range, and the last scan had any foreground beam
     /// there. There means among or next to its own beams, within 200 mm of its nearest range.
-    fn keep(&mut self, readings: &[u16], limits: &Limits, classes: &mut [Class]) {
-        let most = self.seen.len();
-        let [seen, told] = &mut self.next;
-        seen.fill(INVALID);
-        told.fill(INVALID);
+    fn retain_objects(&mut self, readings: &[u16], limits: &Limits, classes: &mut [Class]) {
+        let beam_count = self.foreground.len();
+        let [foreground, objects] = &mut self.next;
+        foreground.fill(INVALID);
+        objects.fill(INVALID);
         let mut begin = 0;
         while let Some(first) = position(classes, begin, is_foreground) {
-            let (mut behind, mut beams, mut nearest) = (first, 0, INVALID);
+            let (mut end, mut beams, mut nearest) = (first, 0, INVALID);
             for (i, class) in classes.iter().enumerate().skip(first) {
                 match class {
                     Class::Foreground => {
-                        (behind, beams, nearest) = (i + 1, beams + 1, nearest.min(readings[i]));
-                        seen[i] = readings[i];
+                        (end, beams, nearest) = (i + 1, beams + 1, nearest.min(readings[i]));
+                        foreground[i] = readings[i];
                     }
                     Class::Invalid => {}
                     _ => break,
                 }
             }
-            let around = first.saturating_sub(1)..(behind + 1).min(most);
-            let reach = (1000 * REACH_MM / limits.unit_um).min(u16::MAX.into()) as u16;
-            let there = |before: &[u16]| {
-                let mut before = before[around.clone()].iter();
-                before.any(|&range| range != INVALID && range.abs_diff(nearest) <= reach)
+            let neighbors = first.saturating_sub(1)..(end + 1).min(beam_count);
+            let reach = (1000 * MAX_MOVEMENT_MM / limits.unit_um).min(u16::MAX.into()) as u16;
+            let has_near = |earlier: &[u16]| {
+                let mut earlier = earlier[neighbors.clone()].iter();
+                earlier.any(|&range| range != INVALID && range.abs_diff(nearest) <= reach)
             };
-            let run = &mut classes[first..behind];
-            if beams >= ENOUGH || there(&self.told) || beams >= leg(nearest, limits) && there(&self.seen) {
-                told[first..behind].copy_from_slice(&seen[first..behind]);
+            let run = &mut classes[first..end];
+            if beams >= MIN_OBJECT_BEAMS
+                || has_near(&self.objects)
+                || beams >= leg_beams(nearest, limits) && has_near(&self.foreground)
+            {
+                objects[first..end].copy_from_slice(&foreground[first..end]);
             } else {
                 run.iter_mut().filter(|class| **class == Class::Foreground).for_each(|c| *c = Class::Unknown);
             }
-            begin = behind;
+            begin = end;
         }
-        std::mem::swap(&mut self.seen, seen);
-        std::mem::swap(&mut self.told, told);
+        std::mem::swap(&mut self.foreground, foreground);
+        std::mem::swap(&mut self.objects, objects);
     }
 }
 
-/// Returns the number of beams that a leg covers at `range`, at least one and at most [`ENOUGH`].
-fn leg(range: u16, limits: &Limits) -> u64 {
+/// Returns the number of beams that a leg covers at `range`, at least one and at most [`MIN_OBJECT_BEAMS`].
+fn leg_beams(range: u16, limits: &Limits) -> u64 {
     let apart_um = u64::from(range) * u64::from(limits.unit_um);
     let apart = apart_um.saturating_mul(limits.step_mdeg.into());
-    (1000 * LEG_MM * MDEG_PER_RADIAN).checked_div(apart).map_or(ENOUGH, |beams| beams.clamp(1, ENOUGH))
+    (1000 * LEG_WIDTH_MM * MDEG_PER_RADIAN)
+        .checked_div(apart)
+        .map_or(MIN_OBJECT_BEAMS, |beams| beams.clamp(1, MIN_OBJECT_BEAMS))
 }
 
 /// Number of beams that are never noise. More are not required, however near an object is.
-const ENOUGH: u64 = 3;
+const MIN_OBJECT_BEAMS: u64 = 3;
 /// Width of a leg with its trousers and of a beam. Among 120, 135 and 150 mm, it has the best recall that costs no
 /// precision in the room of Fig. 8.
-const LEG_MM: u64 = 135;
+const LEG_WIDTH_MM: u64 = 135;
 const MDEG_PER_RADIAN: u64 = 57_296;
 /// Maximum movement of an object between two scans, and its depth: 5 m/s at 37.5 Hz is 133 mm.
-const REACH_MM: u32 = 200;
+const MAX_MOVEMENT_MM: u32 = 200;
 
 #[cfg(test)]
 mod tests {

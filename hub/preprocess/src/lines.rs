@@ -18,7 +18,7 @@ use scanhub_schema::{Corner, Line, Lines, MAX_BEAMS, MAX_LINES, Pose, Scan};
 use crate::directions::Directions;
 
 use fit::{Information, Ray};
-use pieces::{Bounds, Cutter, Piece};
+use pieces::{Bounds, Piece, ScanPartitioner};
 
 /// Settings of a line finder.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -31,12 +31,12 @@ pub struct Settings {
     /// that fit worst are dropped.
     pub refine: bool,
     /// Condition that ends the joining of lines.
-    pub stop: Stop,
+    pub stop: StopCriterion,
 }
 
 /// Condition that ends the joining of lines.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Stop {
+pub enum StopCriterion {
     /// One line less would explain the scan worse than its noise does. Points more than one meter apart are never
     /// joined. The paper has this distance for real scans.
     Likelihood,
@@ -47,7 +47,7 @@ pub enum Stop {
 
 impl Default for Settings {
     fn default() -> Self {
-        Settings { max: MAX_LINES as u8, min_points: 5, refine: false, stop: Stop::Likelihood }
+        Settings { max: MAX_LINES as u8, min_points: 5, refine: false, stop: StopCriterion::Likelihood }
     }
 }
 
@@ -63,7 +63,7 @@ pub struct LineFinder {
     ends: Box<[u16]>,
     /// Memory for estimating the noise.
     steps: Box<[[f64; 2]]>,
-    cutter: Cutter,
+    partitioner: ScanPartitioner,
 }
 
 impl LineFinder {
@@ -78,7 +78,7 @@ impl LineFinder {
             beams: vec![0; beams].into(),
             ends: vec![0; beams].into(),
             steps: vec![[0.0; 2]; beams].into(),
-            cutter: Cutter::new(beams),
+            partitioner: ScanPartitioner::new(beams),
         }
     }
 
@@ -96,16 +96,16 @@ impl LineFinder {
         (out.readings, out.noise_m) = (rays as u16, noise as f32);
         let bounds = self.bounds(rays, noise);
         let rays = &self.rays[..rays];
-        let pieces = self.cutter.cut(rays, &self.ends[..groups], &bounds);
+        let pieces = self.partitioner.partition(rays, &self.ends[..groups], &bounds);
         if pieces.is_full {
             out.flags = Lines::OVERFLOW;
         }
         let mut count = 0;
         for piece in pieces.list {
-            if let (Some(place), Some(line)) =
+            if let (Some(slot), Some(line)) =
                 (out.line_array.get_mut(count), line(&self.pose, rays, &self.beams, piece, noise))
             {
-                *place = line;
+                *slot = line;
                 out.on_lines += line.points;
                 count += 1;
             }
@@ -128,13 +128,13 @@ impl LineFinder {
 
     /// Groups the rays where points are too far apart for one line, and returns the number of groups.
     fn group(&mut self, rays: usize) -> usize {
-        let most = match self.settings.stop {
-            Stop::Likelihood => GAP_M,
-            Stop::Number(most) => most,
+        let max_gap_m = match self.settings.stop {
+            StopCriterion::Likelihood => MAX_GAP_M,
+            StopCriterion::Number(max_gap_m) => max_gap_m,
         };
         let mut groups = 0;
         for i in 1..=rays {
-            if i == rays || self.rays[i - 1].apart(&self.rays[i]) > most {
+            if i == rays || self.rays[i - 1].distance(&self.rays[i]) > max_gap_m {
                 self.ends[groups] = i as u16;
                 groups += 1;
             }
@@ -150,10 +150,10 @@ impl LineFinder {
         let steps = self.steps.as_flattened_mut();
         for &end in &self.ends[..groups] {
             let rays = &self.rays[first..end.into()];
-            for apart in [1, 2] {
-                for (i, ray) in rays.iter().enumerate().skip(apart) {
-                    let Some(after) = rays.get(i + apart) else { break };
-                    let inverse = fit::Line::through(&rays[i - apart], after).inverse(ray);
+            for offset in [1, 2] {
+                for (i, ray) in rays.iter().enumerate().skip(offset) {
+                    let Some(after) = rays.get(i + offset) else { break };
+                    let inverse = fit::LineEquation::through(&rays[i - offset], after).inverse(ray);
                     let off = (ray.range - 1.0 / inverse).abs();
                     if off.is_finite() && inverse > 0.0 {
                         steps[count] = off;
@@ -163,22 +163,24 @@ impl LineFinder {
             }
             first = end.into();
         }
-        let least = f64::from(scan.unit_um) * 1e-6 / 12_f64.sqrt();
-        let Some(steps) = steps.get_mut(..count).filter(|steps| !steps.is_empty()) else { return least };
+        let minimum = f64::from(scan.unit_um) * 1e-6 / 12_f64.sqrt();
+        let Some(steps) = steps.get_mut(..count).filter(|steps| !steps.is_empty()) else { return minimum };
         let (_, median, _) = steps.select_nth_unstable_by(count / 2, f64::total_cmp);
         // The median of the absolute value is .6745 deviations; that of one range and the mean of two others has the
         // variance 1 + 1/2.
-        (*median / (0.6745 * 1.5_f64.sqrt())).max(least)
+        (*median / (0.6745 * 1.5_f64.sqrt())).max(minimum)
     }
 
     fn bounds(&self, rays: usize, noise: f64) -> Bounds {
         let Settings { max, min_points, refine, stop } = self.settings;
-        let penalty = NUMBERS * (rays.max(2) as f64).ln() * noise * noise;
+        let penalty = PARAMETERS_PER_LINE * (rays.max(2) as f64).ln() * noise * noise;
         // If no distance separates points, all of them end on a line.
         let (penalty, variance, loss) = match stop {
-            Stop::Likelihood => (penalty, noise * noise, LOSS_M * LOSS_M),
-            Stop::Number(gap_m) if gap_m.is_finite() => (0.0, f64::INFINITY, LOSS_M * LOSS_M),
-            Stop::Number(_) => (0.0, f64::INFINITY, f64::INFINITY),
+            StopCriterion::Likelihood => (penalty, noise * noise, BEAM_LOSS_M * BEAM_LOSS_M),
+            StopCriterion::Number(gap_m) if gap_m.is_finite() => {
+                (0.0, f64::INFINITY, BEAM_LOSS_M * BEAM_LOSS_M)
+            }
+            StopCriterion::Number(_) => (0.0, f64::INFINITY, f64::INFINITY),
         };
         Bounds {
             max: usize::from(max).min(MAX_LINES),
@@ -196,22 +198,22 @@ impl LineFinder {
 
 /// Number of parameters of a line: its two numbers, and the cut to the next line, which counts twice, as in the
 /// criterion of Zhang and Siegmund (2007) for points of change.
-const NUMBERS: f64 = 4.0;
+const PARAMETERS_PER_LINE: f64 = 4.0;
 /// Maximum distance of neighboring points of one line in meters. PLE uses it for real scans.
-const GAP_M: f64 = 1.0;
+const MAX_GAP_M: f64 = 1.0;
 /// Error in meters that dropping a beam counts as, if there are more lines than allowed. On logs of four sensors (aces,
 /// Freiburg, Intel, Orebro: `cargo bench --bench perception`), ten vertices then cover more beams than those of RANSAC,
 /// and fit better.
-const LOSS_M: f64 = 0.2;
+const BEAM_LOSS_M: f64 = 0.2;
 /// Lines are neighbors if fewer beams than this are between them.
-const NEIGHBORS: f32 = 4.5;
+const MAX_NEIGHBOR_GAP: f32 = 4.5;
 /// Number of steps of Newton's method to the likeliest line.
-const STEPS: usize = 3;
+const NEWTON_STEPS: usize = 3;
 
 /// Returns the likeliest line of `piece`; `None` if its rays do not define one.
 fn line(pose: &Pose, rays: &[Ray], beams: &[u16], piece: &Piece, noise: f64) -> Option<Line> {
     let inside = &rays[piece.first..piece.end];
-    let (fit, error) = piece.line().refined(inside, STEPS);
+    let (fit, error) = piece.line().refined(inside, NEWTON_STEPS);
     let information = Information::of(&fit, inside)?;
     let free = inside.len().saturating_sub(2).max(1) as f64;
     let (aa, ab, bb) = information.inverse((error / free).max(noise * noise))?;
@@ -258,19 +260,20 @@ fn corners(out: &mut Lines, pose: &Pose, step: f32) {
     let count = usize::from(out.count);
     // In a full revolution, the last line is a neighbor of the first one.
     let pairs = if count > 2 { count } else { count.saturating_sub(1) };
-    let looks = |x: f32, y: f32| (y - pose.y_m as f32).atan2(x - pose.x_m as f32);
+    let direction = |x: f32, y: f32| (y - pose.y_m as f32).atan2(x - pose.x_m as f32);
     let turned = |from: f32, to: f32| (to - from + PI).rem_euclid(TAU) - PI;
     let mut corners = 0;
     for first in 0..pairs {
         let second = (first + 1) % count;
         let (one, two) = (&out.line_array[first], &out.line_array[second]);
-        let Some((x_m, y_m)) = meeting(one, two) else { continue };
-        let last = looks(one.x2_m, one.y2_m);
-        let gap = turned(last, looks(two.x1_m, two.y1_m));
+        let Some((x_m, y_m)) = intersection(one, two) else { continue };
+        let last = direction(one.x2_m, one.y2_m);
+        let gap = turned(last, direction(two.x1_m, two.y1_m));
         let middle = last + gap / 2.0;
         let range = (x_m - pose.x_m as f32).hypot(y_m - pose.y_m as f32);
         let unsure = 1.5 * step + 3.0 * out.noise_m / range;
-        if gap.abs() <= NEIGHBORS * step && turned(middle, looks(x_m, y_m)).abs() <= gap.abs() / 2.0 + unsure
+        if gap.abs() <= MAX_NEIGHBOR_GAP * step
+            && turned(middle, direction(x_m, y_m)).abs() <= gap.abs() / 2.0 + unsure
         {
             out.corner_array[corners] =
                 Corner { x_m, y_m, first_line: first as u16, second_line: second as u16 };
@@ -281,7 +284,7 @@ fn corners(out: &mut Lines, pose: &Pose, step: f32) {
 }
 
 /// Returns the point at which two lines meet, if they are certainly not parallel.
-fn meeting(one: &Line, two: &Line) -> Option<(f32, f32)> {
+fn intersection(one: &Line, two: &Line) -> Option<(f32, f32)> {
     let sine = (two.alpha_rad - one.alpha_rad).sin();
     if sine.abs() <= 3.0 * one.sd_alpha_rad.hypot(two.sd_alpha_rad) {
         return None;

@@ -3,7 +3,7 @@
 
 use std::f64::consts::{PI, TAU};
 
-use scanhub_schema::{Contents, Family, Intensities, MAX_MARKS, Mark, Marks, Scan, in_degrees};
+use scanhub_schema::{ArrayFlags, Family, Intensities, MAX_MARKS, Mark, Marks, Scan, in_degrees};
 
 use crate::directions::exact_angle;
 use crate::search::position;
@@ -46,17 +46,17 @@ impl MarkDetector {
     /// Writes the marks of `scan` into `out`, every byte of it.
     pub fn update(&mut self, scan: &Scan, out: &mut Marks) {
         (out.count, out.flags, out.reserved) = (0, 0, 0);
-        match self.least(scan) {
-            Ok(least) => self.find(scan, least, out),
+        match self.min_intensity(scan) {
+            Ok(min_intensity) => self.find(scan, min_intensity, out),
             Err(unavailable) => out.flags = unavailable,
         }
         out.mark_array[usize::from(out.count)..].fill(Mark::default());
     }
 
     /// Returns the minimum intensity of a mark of `scan`, or the reason why there can be no marks, as flags.
-    fn least(&self, scan: &Scan) -> Result<u16, u8> {
+    fn min_intensity(&self, scan: &Scan) -> Result<u16, u8> {
         // The scanner's mode must have intensities, and the scan must contain them.
-        if scan.intensity_bits == 0 || scan.contents & (Contents::UPPER | Contents::WIDE) == 0 {
+        if scan.intensity_bits == 0 || scan.contents & (ArrayFlags::UPPER | ArrayFlags::WIDE) == 0 {
             return Err(Marks::UNAVAILABLE);
         }
         if Family::of_number(scan.family).is_some_and(Family::has_reflector_levels) {
@@ -65,10 +65,10 @@ impl MarkDetector {
         self.settings.level.map(|level| level.max(1)).ok_or(Marks::UNAVAILABLE | Marks::NO_LEVEL)
     }
 
-    /// Writes the marks, whose beams have at least the intensity `least`.
-    fn find(&self, scan: &Scan, least: u16, out: &mut Marks) {
+    /// Writes the marks, whose beams have at least the intensity `min_intensity`.
+    fn find(&self, scan: &Scan, min_intensity: u16, out: &mut Marks) {
         let (mut count, mut overflow) = (0, false);
-        let mut push = |open: &Open| match out.mark_array.get_mut(count) {
+        let mut push = |open: &OpenMark| match out.mark_array.get_mut(count) {
             Some(mark) => {
                 *mark = open.mark(scan);
                 count += 1;
@@ -77,18 +77,19 @@ impl MarkDetector {
         };
         let unit_um = scan.unit_um;
         let intensities = scan.intensities();
-        let mut open: Option<Open> = None;
+        let mut open: Option<OpenMark> = None;
         let mut next = 0;
-        while let Some(i) = if open.is_some() { Some(next) } else { first_bright(&intensities, next, least) }
+        while let Some(i) =
+            if open.is_some() { Some(next) } else { first_bright(&intensities, next, min_intensity) }
             && let Some(intensity) = intensities.get(i)
         {
             next = i + 1;
-            match (scan.range(i).filter(|_| intensity >= least), &mut open) {
+            match (scan.range(i).filter(|_| intensity >= min_intensity), &mut open) {
                 (Some(value), Some(mark)) if mark.is_near(value, unit_um, &self.settings) => {
                     mark.join(scan, i, value, intensity);
                 }
                 (Some(value), _) => {
-                    open.replace(Open::at(scan, i, value, intensity)).inspect(&mut push);
+                    open.replace(OpenMark::at(scan, i, value, intensity)).inspect(&mut push);
                 }
                 (None, Some(mark)) => {
                     mark.gap += 1;
@@ -105,26 +106,26 @@ impl MarkDetector {
     }
 }
 
-/// Returns the first beam from `from` on that has at least the intensity `least`.
-fn first_bright(intensities: &Intensities<'_>, from: usize, least: u16) -> Option<usize> {
+/// Returns the first beam from `from` on that has at least the intensity `min_intensity`.
+fn first_bright(intensities: &Intensities<'_>, from: usize, min_intensity: u16) -> Option<usize> {
     match intensities {
         Intensities::Narrow(values) => {
-            let least = u8::try_from(least).ok()?;
-            position(values, from, |value| value >= least)
+            let min_intensity = u8::try_from(min_intensity).ok()?;
+            position(values, from, |value| value >= min_intensity)
         }
-        Intensities::Wide(values) => position(values, from, |value| value >= least),
+        Intensities::Wide(values) => position(values, from, |value| value >= min_intensity),
     }
 }
 
 /// A mark that may get more beams: sums over its beams, in integers, so that they are the same on every machine.
 #[derive(Clone, Copy, Default)]
-struct Open {
+struct OpenMark {
     /// Sum of w.
     weight: u64,
     /// Sum of w * i.
     beams: u64,
     /// Sum of w times the difference of the exact angle from that of the beam, in millionths of a degree.
-    off_udeg: i64,
+    offset_udeg: i64,
     /// Sum of w * r in device units.
     ranges: u64,
     last_range: u16,
@@ -134,9 +135,9 @@ struct Open {
     last_beam: usize,
 }
 
-impl Open {
-    fn at(scan: &Scan, i: usize, range: u16, intensity: u16) -> Open {
-        let mut open = Open { first_beam: i, ..Open::default() };
+impl OpenMark {
+    fn at(scan: &Scan, i: usize, range: u16, intensity: u16) -> OpenMark {
+        let mut open = OpenMark { first_beam: i, ..OpenMark::default() };
         open.join(scan, i, range, intensity);
         open
     }
@@ -150,7 +151,7 @@ impl Open {
         let weight = u64::from(intensity);
         self.weight += weight;
         self.beams += weight * i as u64;
-        self.off_udeg += i64::from(intensity) * off_udeg(scan, i);
+        self.offset_udeg += i64::from(intensity) * offset_udeg(scan, i);
         self.ranges += weight * u64::from(range);
         self.peak = self.peak.max(intensity);
         (self.last_range, self.last_beam, self.gap) = (range, i, 0);
@@ -163,7 +164,7 @@ impl Open {
             [scan.first_angle, scan.step].map(|angle| (1e6 * in_degrees(angle)).round() as i128);
         let weight = 1000 * i128::from(self.weight);
         let of_beams = first_udeg * i128::from(self.weight) + step_udeg * i128::from(self.beams);
-        let angle = 2 * (of_beams + i128::from(self.off_udeg)) + weight;
+        let angle = 2 * (of_beams + i128::from(self.offset_udeg)) + weight;
         let last = scan.beams() - 1;
         Mark {
             angle_mdeg: in_range_mdeg(angle.div_euclid(2 * weight)),
@@ -184,7 +185,7 @@ fn in_range_mdeg(mdeg: i128) -> i32 {
 
 /// Returns the difference of the exact angle of beam `i` from that of the beam, in millionths of a degree; 0 without an
 /// exact angle. The angles may differ by whole revolutions.
-fn off_udeg(scan: &Scan, i: usize) -> i64 {
+fn offset_udeg(scan: &Scan, i: usize) -> i64 {
     let Some(exact) = exact_angle(scan.exact_angles(), i) else { return 0 };
     let off = exact - (scan.first_angle + i as f64 * scan.step);
     let off = (off + PI).rem_euclid(TAU) - PI;

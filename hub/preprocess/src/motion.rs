@@ -16,11 +16,11 @@ use std::f64::consts::{FRAC_PI_2, PI};
 use scanhub_schema::{Corner, Line, Lines, MAX_BEAMS, Motion, MotionMethod, Pose, Scan};
 
 use crate::lines::{self, LineFinder};
-pub use crate::velocity::Rigid;
+pub use crate::velocity::Pose2;
 use crate::velocity::{UndistortedScan, Velocity, times};
 
 use covariance::Square;
-use matching::{Match, Matcher, SPACING_M, View};
+use matching::{MAX_SPACING_M, Match, PreparedScan, ScanMatcher};
 
 /// Limits of the steps that are accepted.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -40,7 +40,7 @@ impl Default for Settings {
 }
 
 impl Settings {
-    fn allow(&self, step: &Rigid) -> bool {
+    fn allows(&self, step: &Pose2) -> bool {
         step.x.hypot(step.y) <= self.max_step_m && step.yaw.abs() <= self.max_turn_deg.to_radians()
     }
 }
@@ -50,11 +50,11 @@ pub struct MotionEstimator {
     pose: Pose,
     settings: Settings,
     /// The scan that others are compared with, and the current one.
-    kept: View,
-    now: View,
-    matcher: Matcher,
+    reference: PreparedScan,
+    current: PreparedScan,
+    matcher: ScanMatcher,
     /// `None` before the first scan.
-    track: Option<Track>,
+    odometry: Option<OdometryState>,
     /// Stamp of the last scan, in ns.
     stamp_ns: u64,
     velocity: Velocity,
@@ -67,14 +67,14 @@ pub struct MotionEstimator {
 
 /// Position of the robot, and its last step.
 #[derive(Clone, Copy, Default)]
-struct Track {
+struct OdometryState {
     /// Position at the kept scan, since the start, and its covariance.
-    origin: Rigid,
+    origin: Pose2,
     of_origin: Square,
     /// Position at the last scan, in the frame of the kept one.
-    last: Rigid,
+    last: Pose2,
     /// Covariance of that position by the last scan's own noise; `None` if that is the kept one.
-    unsure: Option<Square>,
+    extra_covariance: Option<Square>,
     /// Covariance of that position by all causes.
     of_last: Square,
     /// Whether the surroundings left a direction of that position open.
@@ -82,7 +82,7 @@ struct Track {
     /// Whether the sum of all steps contains a degenerate one.
     is_open: bool,
     /// The last step.
-    step: Rigid,
+    step: Pose2,
     refused_steps: u16,
 }
 
@@ -93,10 +93,10 @@ impl MotionEstimator {
         MotionEstimator {
             pose,
             settings,
-            kept: View::new(beams),
-            now: View::new(beams),
-            matcher: Matcher::new(beams),
-            track: None,
+            reference: PreparedScan::new(beams),
+            current: PreparedScan::new(beams),
+            matcher: ScanMatcher::new(beams),
+            odometry: None,
             stamp_ns: 0,
             velocity: Velocity::default(),
             rejected: None,
@@ -109,15 +109,15 @@ impl MotionEstimator {
     /// Continues with these `settings` for a sensor at `pose`. If the pose has changed, the estimator restarts.
     pub fn change(&mut self, pose: Pose, settings: Settings) {
         if self.pose != pose {
-            self.forget();
+            self.reset();
             self.finder.change(pose, lines::Settings::default());
         }
         (self.pose, self.settings) = (pose, settings);
     }
 
     /// Forgets the motion so far. The next scan is the first one.
-    pub fn forget(&mut self) {
-        self.track = None;
+    pub fn reset(&mut self) {
+        self.odometry = None;
     }
 
     /// Returns the velocity during the last scan.
@@ -131,44 +131,45 @@ impl MotionEstimator {
         *out = Motion::default();
         let elapsed_ns = stamp_ns.saturating_sub(std::mem::replace(&mut self.stamp_ns, stamp_ns));
         let seconds = 1e-9 * without_jitter(elapsed_ns, period_ns) as f64;
-        let is_timed = self.track.is_some()
-            && (SHORTEST_S..LONGEST_S).contains(&seconds)
-            && times(scan).iter().all(|time| time.abs() < LONGEST_S);
+        let is_timed = self.odometry.is_some()
+            && (MIN_INTERVAL_S..MAX_INTERVAL_S).contains(&seconds)
+            && times(scan).iter().all(|time| time.abs() < MAX_INTERVAL_S);
         if !is_timed {
             self.velocity = Velocity::default();
         }
         self.take(scan);
-        let Some(track) = self.track else {
-            self.matcher.trust_all();
-            self.keep(Track::default());
+        let Some(odometry) = self.odometry else {
+            self.matcher.reset();
+            self.set_reference(OdometryState::default());
             return;
         };
-        let first = self.find(&track, None);
+        let first = self.find(&odometry, None);
         let (found, offset) = match first {
             Some(first) if is_timed => {
-                let (found, offset) = self.correct(scan, &track, first, seconds);
+                let (found, offset) = self.correct(scan, &odometry, first, seconds);
                 (Some(found), offset)
             }
             _ => (first, [0.0; 3]),
         };
         match found {
             Some((found, step)) => {
-                let of_place = covariance_in_kept(&track, &found, &step, &offset);
-                write(&track, &found, &step, &offset, &of_place, out);
-                let next = Track {
-                    last: found.place,
-                    unsure: Some(found.own),
-                    of_last: of_place,
+                let pose_covariance = covariance_in_reference(&odometry, &found, &step, &offset);
+                write(&odometry, &found, &step, &offset, &pose_covariance, out);
+                let next = OdometryState {
+                    last: found.pose,
+                    extra_covariance: Some(found.own),
+                    of_last: pose_covariance,
                     is_degenerate: found.is_degenerate,
-                    is_open: track.is_open || found.is_degenerate,
+                    is_open: odometry.is_open || found.is_degenerate,
                     step,
-                    ..track
+                    ..odometry
                 };
-                let is_away = found.place.x.hypot(found.place.y) > AWAY_M || found.place.yaw.abs() > AWAY_RAD;
-                if is_away || found.overlap < ENOUGH {
-                    self.keep(next);
+                let is_away = found.pose.x.hypot(found.pose.y) > MAX_REFERENCE_DISTANCE_M
+                    || found.pose.yaw.abs() > MAX_REFERENCE_ANGLE_RAD;
+                if is_away || found.overlap < MIN_REFERENCE_OVERLAP {
+                    self.set_reference(next);
                 } else {
-                    self.track = Some(next);
+                    self.odometry = Some(next);
                 }
             }
             None => {
@@ -177,10 +178,10 @@ impl MotionEstimator {
                     self.velocity = Velocity::default();
                     self.take(scan);
                 }
-                self.matcher.trust_all();
-                let refused_steps = track.refused_steps.saturating_add(1);
+                self.matcher.reset();
+                let refused_steps = odometry.refused_steps.saturating_add(1);
                 (out.method, out.refused_steps) = (MotionMethod::Refused as u8, refused_steps);
-                self.keep(Track { step: Rigid::default(), refused_steps, ..track });
+                self.set_reference(OdometryState { step: Pose2::default(), refused_steps, ..odometry });
             }
         }
     }
@@ -190,10 +191,10 @@ impl MotionEstimator {
     fn correct(
         &mut self,
         scan: &Scan,
-        track: &Track,
-        first: (Match, Rigid),
+        odometry: &OdometryState,
+        first: (Match, Pose2),
         seconds: f64,
-    ) -> ((Match, Rigid), [f64; 3]) {
+    ) -> ((Match, Pose2), [f64; 3]) {
         let expected = self.velocity;
         let (mut found, mut corrections) = (first, 0);
         loop {
@@ -206,17 +207,17 @@ impl MotionEstimator {
                 // No robot does that: the step is an error, or the sensor was carried. If the next step agrees, it was
                 // right.
                 self.rejected = Some(measured);
-                return (self.stop_or_continue(scan, track, found), offset);
+                return (self.stop_or_continue(scan, odometry, found), offset);
             }
             self.rejected = None;
-            if corrections == CORRECTIONS || !change.distorts(scan, CHANGED_M) {
+            if corrections == MAX_CORRECTIONS || !change.distorts(scan, MIN_DISTORTION_CHANGE_M) {
                 self.velocity.approach(&measured);
                 return (found, offset);
             }
             corrections += 1;
             self.velocity = measured;
             self.take(scan);
-            match self.find(track, Some(before.place)) {
+            match self.find(odometry, Some(before.pose)) {
                 Some(again) => found = again,
                 None => {
                     // The correction was wrong, and the step without it is the best one.
@@ -231,55 +232,62 @@ impl MotionEstimator {
     /// Decides after a rejected velocity whether the robot stands, because the sensor was carried, or continues as
     /// before, because the `found` step is an error. The scan fits better with the right velocity. Returns the position
     /// and the step.
-    fn stop_or_continue(&mut self, scan: &Scan, track: &Track, found: (Match, Rigid)) -> (Match, Rigid) {
+    fn stop_or_continue(
+        &mut self,
+        scan: &Scan,
+        odometry: &OdometryState,
+        found: (Match, Pose2),
+    ) -> (Match, Pose2) {
         let moving = std::mem::take(&mut self.velocity);
-        if !moving.distorts(scan, DISTORTED_M) {
+        if !moving.distorts(scan, MIN_DISTORTION_M) {
             return found;
         }
         self.take(scan);
-        let begin = Some(found.0.place);
-        if let Some(standing) = self.find(track, begin).filter(|standing| standing.0.weight > found.0.weight)
+        let begin = Some(found.0.pose);
+        if let Some(standing) =
+            self.find(odometry, begin).filter(|standing| standing.0.weight > found.0.weight)
         {
             return standing;
         }
         self.velocity = moving;
         self.take(scan);
-        self.find(track, begin).unwrap_or(found)
+        self.find(odometry, begin).unwrap_or(found)
     }
 
     /// Takes the current scan as if it had been measured at one moment.
     fn take(&mut self, scan: &Scan) {
-        let scan = match self.velocity.distorts(scan, DISTORTED_M) {
+        let scan = match self.velocity.distorts(scan, MIN_DISTORTION_M) {
             true => self.undistorted.compute(scan, &self.velocity.of_sensor(&self.pose)),
             false => scan,
         };
         self.finder.update(scan, &mut self.lines);
-        self.now.take(&self.pose, scan, &self.lines);
+        self.current.take(&self.pose, scan, &self.lines);
     }
 
     /// Returns the robot's position and its step, if they are within the limits. The search starts at `begin`, if that
     /// is known.
-    fn find(&mut self, track: &Track, begin: Option<Rigid>) -> Option<(Match, Rigid)> {
+    fn find(&mut self, odometry: &OdometryState, begin: Option<Pose2>) -> Option<(Match, Pose2)> {
         let settings = self.settings;
-        let begin = begin.unwrap_or_else(|| initial_guess(&self.kept, &self.now, track, &settings));
-        let found = self.matcher.find(&self.kept, &self.now, begin, settings.max_step_m)?;
-        let step = track.last.inverse().then(&found.place);
-        (settings.allow(&step) && found.overlap >= settings.min_overlap).then_some((found, step))
+        let begin =
+            begin.unwrap_or_else(|| initial_guess(&self.reference, &self.current, odometry, &settings));
+        let found = self.matcher.find(&self.reference, &self.current, begin, settings.max_step_m)?;
+        let step = odometry.last.inverse().then(&found.pose);
+        (settings.allows(&step) && found.overlap >= settings.min_overlap).then_some((found, step))
     }
 
     /// Keeps the current scan, with which later ones are compared.
-    fn keep(&mut self, track: Track) {
-        self.now.doubt(self.matcher.doubts());
-        std::mem::swap(&mut self.kept, &mut self.now);
-        let Track { origin, of_origin, last, of_last, .. } = track;
-        self.track = Some(Track {
+    fn set_reference(&mut self, odometry: OdometryState) {
+        self.current.set_ignored_scans(self.matcher.ignored_scans());
+        std::mem::swap(&mut self.reference, &mut self.current);
+        let OdometryState { origin, of_origin, last, of_last, .. } = odometry;
+        self.odometry = Some(OdometryState {
             origin: origin.then(&last),
             of_origin: covariance::of_both(&of_origin, &of_last, &origin, &last),
-            last: Rigid::default(),
-            unsure: None,
+            last: Pose2::default(),
+            extra_covariance: None,
             of_last: Square::default(),
             is_degenerate: false,
-            ..track
+            ..odometry
         });
     }
 }
@@ -291,85 +299,116 @@ fn without_jitter(elapsed_ns: u64, period_ns: u64) -> u64 {
 }
 
 /// Writes `step`, which leads to `found`. The beams may be off by `offset` because of a changing velocity.
-fn write(track: &Track, found: &Match, step: &Rigid, offset: &[f64; 3], of_place: &Square, out: &mut Motion) {
+fn write(
+    odometry: &OdometryState,
+    found: &Match,
+    step: &Pose2,
+    offset: &[f64; 3],
+    pose_covariance: &Square,
+    out: &mut Motion,
+) {
     (out.dx_m, out.dy_m, out.dyaw_rad) = (step.x as f32, step.y as f32, step.yaw as f32);
     // Both scans have their own noise. That of the kept one moves both positions alike.
-    let before = track.unsure.unwrap_or(found.of_kept);
-    let mut covariance = covariance::of_step(&found.own, &before, &track.last, step);
-    add_doubts(&mut covariance, track, found, step, offset);
+    let reference_covariance = odometry.extra_covariance.unwrap_or(found.of_reference);
+    let mut covariance = covariance::of_step(&found.own, &reference_covariance, &odometry.last, step);
+    add_uncertainty(&mut covariance, odometry, found, step, offset);
     out.covariance = covariance::rows(&covariance);
     out.overlap = found.overlap as f32;
     // The covariance of a step contains that of both positions.
-    let is_degenerate = found.is_degenerate || track.is_degenerate;
+    let is_degenerate = found.is_degenerate || odometry.is_degenerate;
     out.flags = if is_degenerate { Motion::DEGENERATE } else { 0 };
-    out.flags |= if is_degenerate || track.is_open { Motion::OPEN } else { 0 };
+    out.flags |= if is_degenerate || odometry.is_open { Motion::OPEN } else { 0 };
     out.method = match (found.has_corners, found.has_lines) {
         (true, true) => MotionMethod::Both,
         (true, false) => MotionMethod::Points,
         (false, true) => MotionMethod::Lines,
         (false, false) => MotionMethod::Beams,
     } as u8;
-    let place = track.origin.then(&found.place);
-    (out.x_m, out.y_m, out.yaw_rad) = (place.x, place.y, place.yaw);
-    out.refused_steps = track.refused_steps;
+    let pose = odometry.origin.then(&found.pose);
+    (out.x_m, out.y_m, out.yaw_rad) = (pose.x, pose.y, pose.yaw);
+    out.refused_steps = odometry.refused_steps;
     if out.has_valid_pose() {
-        let covariance = covariance::of_both(&track.of_origin, of_place, &track.origin, &found.place);
+        let covariance =
+            covariance::of_both(&odometry.of_origin, pose_covariance, &odometry.origin, &found.pose);
         out.pose_covariance = covariance::rows(&covariance);
     }
 }
 
 /// Returns the covariance of the position that `step` leads to, in the frame of the kept scan. All positions in that
 /// frame are found independently of each other, so the covariances of the steps between them are not summed.
-fn covariance_in_kept(track: &Track, found: &Match, step: &Rigid, offset: &[f64; 3]) -> Square {
+fn covariance_in_reference(
+    odometry: &OdometryState,
+    found: &Match,
+    step: &Pose2,
+    offset: &[f64; 3],
+) -> Square {
     let mut of_step = Square::default();
-    add_doubts(&mut of_step, track, found, step, offset);
-    let of_step = covariance::turned(&of_step, &track.last);
-    covariance::sum(&covariance::sum(&found.own, &found.of_kept), &of_step)
+    add_uncertainty(&mut of_step, odometry, found, step, offset);
+    let of_step = covariance::turned(&of_step, &odometry.last);
+    covariance::sum(&covariance::sum(&found.own, &found.of_reference), &of_step)
 }
 
 /// Adds the causes other than noise to the `covariance` of `step`.
-fn add_doubts(covariance: &mut Square, track: &Track, found: &Match, step: &Rigid, offset: &[f64; 3]) {
+fn add_uncertainty(
+    covariance: &mut Square,
+    odometry: &OdometryState,
+    found: &Match,
+    step: &Pose2,
+    offset: &[f64; 3],
+) {
     // Readings on no surface contradict this step: according to them, the robot moved as before.
-    let other = [step.x - track.step.x, step.y - track.step.y, step.yaw - track.step.yaw];
+    let other = [step.x - odometry.step.x, step.y - odometry.step.y, step.yaw - odometry.step.yaw];
     covariance::add_outer(covariance, &other, 1.0 - found.overlap);
     covariance::add_outer(covariance, offset, 1.0);
 }
 
 /// Distortion of a scan that is corrected, in meters from its first to its last beam, and change of the distortion
 /// after which the correction is repeated. A repeated correction adds the noise of the last step.
-const DISTORTED_M: f64 = 0.003;
-const CHANGED_M: f64 = 0.01;
+const MIN_DISTORTION_M: f64 = 0.003;
+const MIN_DISTORTION_CHANGE_M: f64 = 0.01;
 /// Maximum number of corrections after a change of velocity. Each one leaves less than half of the error.
-const CORRECTIONS: u8 = 4;
+const MAX_CORRECTIONS: u8 = 4;
 /// Time between two scans from which a velocity is computed, in seconds.
-const SHORTEST_S: f64 = 0.005;
-const LONGEST_S: f64 = 1.0;
+const MIN_INTERVAL_S: f64 = 0.005;
+const MAX_INTERVAL_S: f64 = 1.0;
 /// Distance from the kept scan at which another one is kept. Its surfaces are still seen from about the same side.
-const AWAY_M: f64 = 0.15;
-const AWAY_RAD: f64 = 0.15;
+const MAX_REFERENCE_DISTANCE_M: f64 = 0.15;
+const MAX_REFERENCE_ANGLE_RAD: f64 = 0.15;
 /// Minimum share of readings on surfaces of the kept scan. With less, another scan is kept.
-const ENOUGH: f64 = 0.5;
+const MIN_REFERENCE_OVERLAP: f64 = 0.5;
 
 /// Returns the position in `kept`, at which the matching of `now` starts: the one that most beams agree with. Corners
 /// and lines of the two scans that may be the same propose positions, and a few beams choose among them.
-fn initial_guess(kept: &View, now: &View, track: &Track, settings: &Settings) -> Rigid {
-    let mut best =
-        Guess { kept, now, track, settings, place: track.last.then(&track.step), score: 0, tries: 0 };
-    best.score = best.score(&best.place);
-    best.try_place(track.last);
+fn initial_guess(
+    reference: &PreparedScan,
+    current: &PreparedScan,
+    odometry: &OdometryState,
+    settings: &Settings,
+) -> Pose2 {
+    let mut best = Guess {
+        reference,
+        current,
+        odometry,
+        settings,
+        pose: odometry.last.then(&odometry.step),
+        score: 0,
+        tries: 0,
+    };
+    best.score = best.score(&best.pose);
+    best.try_pose(odometry.last);
     best.try_corners();
     if best.score < best.beams() * 4 / 5 {
         best.try_lines();
     }
-    best.place
+    best.pose
 }
 
 struct Guess<'a> {
-    kept: &'a View,
-    now: &'a View,
-    track: &'a Track,
+    reference: &'a PreparedScan,
+    current: &'a PreparedScan,
+    odometry: &'a OdometryState,
     settings: &'a Settings,
-    place: Rigid,
+    pose: Pose2,
     score: usize,
     tries: usize,
 }
@@ -377,58 +416,58 @@ struct Guess<'a> {
 impl Guess<'_> {
     /// Returns the number of beams that are sampled.
     fn beams(&self) -> usize {
-        self.now.points().len().div_ceil(self.stride())
+        self.current.points().len().div_ceil(self.stride())
     }
 
     fn stride(&self) -> usize {
-        self.now.points().len().div_ceil(ASKED).max(1)
+        self.current.points().len().div_ceil(SAMPLED_BEAMS).max(1)
     }
 
     /// Returns the number of sampled beams that end on a surface.
-    fn score(&self, place: &Rigid) -> usize {
-        let width = WIDTH * self.kept.noise.hypot(self.now.noise) + WIDTH_M;
+    fn score(&self, pose: &Pose2) -> usize {
+        let width = MAX_DEVIATIONS * self.reference.noise.hypot(self.current.noise) + EXTRA_DISTANCE_M;
         let fits = |point: &&(f64, f64)| {
-            let point = place.point(**point);
-            let on = self.kept.nearest(point, width + SPACING_M);
-            let surface = on.and_then(|nearest| self.kept.readings()[nearest].surface);
-            surface.is_some_and(|surface| surface.off(point).abs() <= width)
+            let point = pose.point(**point);
+            let on = self.reference.nearest(point, width + MAX_SPACING_M);
+            let surface = on.and_then(|nearest| self.reference.readings()[nearest].surface);
+            surface.is_some_and(|surface| surface.distance(point).abs() <= width)
         };
-        self.now.points().iter().step_by(self.stride()).filter(fits).count()
+        self.current.points().iter().step_by(self.stride()).filter(fits).count()
     }
 
     /// Uses `place` if the robot can be there and more beams agree with it.
-    fn try_place(&mut self, place: Rigid) {
-        let step = self.track.last.inverse().then(&place);
-        if !self.settings.allow(&step) || self.tries >= TRIES {
+    fn try_pose(&mut self, pose: Pose2) {
+        let step = self.odometry.last.inverse().then(&pose);
+        if !self.settings.allows(&step) || self.tries >= MAX_TRIES {
             return;
         }
         self.tries += 1;
-        let score = self.score(&place);
+        let score = self.score(&pose);
         if score > self.score {
-            (self.place, self.score) = (place, score);
+            (self.pose, self.score) = (pose, score);
         }
     }
 
     /// Tries the positions at which corners coincide. Corners that open alike may be the same.
     fn try_corners(&mut self) {
-        let (kept, now) = (self.kept, self.now);
-        let opening = |view: &View, corner: &Corner| {
+        let (reference, current) = (self.reference, self.current);
+        let opening = |view: &PreparedScan, corner: &Corner| {
             let line = |number: u16| view.lines.lines().get(usize::from(number));
             let (one, two) = (line(corner.first_line)?, line(corner.second_line)?);
             Some((f64::from(one.alpha_rad), f64::from(two.alpha_rad)))
         };
-        for corner in now.lines.corners() {
-            let Some((first, second)) = opening(now, corner) else { continue };
-            for other in kept.lines.corners() {
-                let Some((of_first, of_second)) = opening(kept, other) else { continue };
+        for corner in current.lines.corners() {
+            let Some((first, second)) = opening(current, corner) else { continue };
+            for other in reference.lines.corners() {
+                let Some((of_first, of_second)) = opening(reference, other) else { continue };
                 let (one, two) = (turned(first, of_first), turned(second, of_second));
-                if (one - two).abs() > ALIKE_RAD {
+                if (one - two).abs() > MAX_OPENING_DIFFERENCE_RAD {
                     continue;
                 }
                 let yaw = (one + two) / 2.0;
-                let turn = Rigid::new(0.0, 0.0, yaw);
+                let turn = Pose2::new(0.0, 0.0, yaw);
                 let (x, y) = turn.point((corner.x_m.into(), corner.y_m.into()));
-                self.try_place(Rigid::new(f64::from(other.x_m) - x, f64::from(other.y_m) - y, yaw));
+                self.try_pose(Pose2::new(f64::from(other.x_m) - x, f64::from(other.y_m) - y, yaw));
             }
         }
     }
@@ -436,11 +475,11 @@ impl Guess<'_> {
     /// Tries the positions at which lines coincide. A line defines how far the robot turned, and how far it moved
     /// across the line.
     fn try_lines(&mut self) {
-        let (kept, now) = (self.kept, self.now);
-        let expected = self.track.last.then(&self.track.step);
-        let is_long = |line: &&Line| line.points >= LONG;
-        for line in now.lines.lines().iter().filter(is_long) {
-            for other in kept.lines.lines().iter().filter(is_long) {
+        let (reference, current) = (self.reference, self.current);
+        let expected = self.odometry.last.then(&self.odometry.step);
+        let is_long = |line: &&Line| line.points >= MIN_LINE_BEAMS;
+        for line in current.lines.lines().iter().filter(is_long) {
+            for other in reference.lines.lines().iter().filter(is_long) {
                 let (alpha, of_other) = (f64::from(line.alpha_rad), f64::from(other.alpha_rad));
                 let yaw = turned(alpha, of_other);
                 let (sin, cos) = of_other.sin_cos();
@@ -448,7 +487,7 @@ impl Guess<'_> {
                 let is_same_side = (alpha + yaw - of_other).cos() > 0.0;
                 let r = f64::from(if is_same_side { line.r_m } else { -line.r_m });
                 let across = f64::from(other.r_m) - r - (cos * expected.x + sin * expected.y);
-                self.try_place(Rigid::new(expected.x + cos * across, expected.y + sin * across, yaw));
+                self.try_pose(Pose2::new(expected.x + cos * across, expected.y + sin * across, yaw));
             }
         }
     }
@@ -460,13 +499,13 @@ fn turned(from: f64, to: f64) -> f64 {
 }
 
 /// Number of beams that are sampled.
-const ASKED: usize = 48;
+const SAMPLED_BEAMS: usize = 48;
 /// Maximum number of positions that are tried.
-const TRIES: usize = 64;
+const MAX_TRIES: usize = 64;
 /// Maximum distance of a beam's end from a surface, in standard deviations, and in addition to that in meters.
-const WIDTH: f64 = 3.0;
-const WIDTH_M: f64 = 0.01;
+const MAX_DEVIATIONS: f64 = 3.0;
+const EXTRA_DISTANCE_M: f64 = 0.01;
 /// Maximum difference of the opening of equal corners: 5 degrees.
-const ALIKE_RAD: f64 = 0.09;
+const MAX_OPENING_DIFFERENCE_RAD: f64 = 0.09;
 /// Minimum number of beams of a line whose direction is reliable.
-const LONG: u16 = 10;
+const MIN_LINE_BEAMS: u16 = 10;

@@ -16,23 +16,23 @@ pub struct Segmenter {
     pose: Pose,
     directions: Directions,
     /// Limits for two neighboring beams.
-    step: Step,
+    step_limit: StepLimit,
     /// Foreground of the previous scan.
-    before: Points,
+    previous: Points,
     /// Memory for that of the next scan.
-    room: Points,
+    scratch: Points,
 }
 
 /// Points relative to the sensor, along the axes of the robot's frame, in mm.
 #[derive(Default)]
 struct Points {
-    places: Box<[(f64, f64)]>,
-    used: usize,
+    points: Box<[(f64, f64)]>,
+    count: usize,
 }
 
 /// Limits that follow from the angle between two points.
 #[derive(Clone, Copy, Default)]
-struct Step {
+struct StepLimit {
     /// 2 (1 - cos step), of the law of cosines.
     spread: f64,
     /// Maximum distance of two points of one surface, per mm of range.
@@ -40,19 +40,25 @@ struct Step {
 }
 
 /// Minimum angle at which a surface is seen as one segment.
-const FLATTEST_DEG: f64 = 10.0;
+const MIN_INCIDENCE_DEG: f64 = 10.0;
 /// Additional distance for the noise of two ranges, in mm.
-const NOISE_MM: f64 = 15.0;
+const NOISE_MARGIN_MM: f64 = 15.0;
 /// Maximum distance of a point of the previous scan that supports a single beam, in mm. A person who runs at 3 m/s
 /// moves by this distance in one revolution of a scanner at 10 Hz.
-const REACH_MM: f64 = 300.0;
+const MAX_SUPPORT_DISTANCE_MM: f64 = 300.0;
 
 impl Segmenter {
     /// Creates a segmenter for a sensor at `pose` with at most `beams` beams.
     pub fn new(pose: Pose, beams: usize) -> Segmenter {
         let points = || vec![(0.0, 0.0); beams].into();
-        let [before, room] = [points(), points()].map(|places| Points { places, used: 0 });
-        Segmenter { pose, directions: Directions::new(beams), step: Step::default(), before, room }
+        let [before, room] = [points(), points()].map(|places| Points { points: places, count: 0 });
+        Segmenter {
+            pose,
+            directions: Directions::new(beams),
+            step_limit: StepLimit::default(),
+            previous: before,
+            scratch: room,
+        }
     }
 
     /// Fills in the segments of `foreground`, which was made from `scan`, and writes every byte of them.
@@ -69,26 +75,26 @@ impl Segmenter {
         let head = **foreground;
         let ForegroundArrays { segments: places, bits, ranges } = foreground.begin(head);
         let (mut segments, mut dropped, mut supported) = (0, 0_u16, 0_u64);
-        let (before, mut now) = (&self.before, take(&mut self.room));
-        now.used = 0;
-        let mut put = |open: &Open, pose: &Pose| match places.get_mut(segments) {
+        let (previous, mut now) = (&self.previous, take(&mut self.scratch));
+        now.count = 0;
+        let mut put = |open: &OpenSegment, pose: &Pose| match places.get_mut(segments) {
             Some(segment) => {
                 *segment = open.close(pose, unit_mm);
-                let has_support = open.first < open.last || before.reach(open.first_point);
+                let has_support = open.first < open.last || previous.has_near(open.first_point);
                 supported |= u64::from(has_support) << segments;
                 segments += 1;
             }
             None => dropped = dropped.saturating_add(1),
         };
-        let mut open: Option<Open> = None;
-        self.each_point(scan, bits, ranges, |beam, range, seen, point| {
+        let mut open: Option<OpenSegment> = None;
+        self.each_point(scan, bits, ranges, |beam, range, measured, point| {
             now.add(point);
             match &mut open {
-                Some(open) if open.last + 1 == beam && self.joins(open, seen) => {
-                    open.add(beam, range, seen, point);
+                Some(open) if open.last + 1 == beam && self.joins(open, measured) => {
+                    open.add(beam, range, measured, point);
                 }
                 _ => {
-                    if let Some(done) = open.replace(Open::new(beam, range, seen, point)) {
+                    if let Some(done) = open.replace(OpenSegment::new(beam, range, measured, point)) {
                         put(&done, &self.pose);
                     }
                 }
@@ -101,19 +107,19 @@ impl Segmenter {
         foreground.segments = segments as u16;
         foreground.dropped = dropped;
         foreground.supported = supported;
-        self.room = replace(&mut self.before, now);
+        self.scratch = replace(&mut self.previous, now);
     }
 
     /// Stores the points of a `foreground` that support the next segments, like [`update`](Self::update), but finds no
     /// segments.
     pub fn pass(&mut self, scan: &Scan, foreground: &mut Foreground) {
         self.fit(scan);
-        let mut now = take(&mut self.room);
-        now.used = 0;
+        let mut now = take(&mut self.scratch);
+        now.count = 0;
         let head = **foreground;
         let ForegroundArrays { bits, ranges, .. } = foreground.begin(head);
         self.each_point(scan, bits, ranges, |_, _, _, point| now.add(point));
-        self.room = replace(&mut self.before, now);
+        self.scratch = replace(&mut self.previous, now);
     }
 
     /// Calls `visit` with each beam whose bit is set: its number, its range in device units, its range in mm with its
@@ -145,17 +151,18 @@ impl Segmenter {
 
     /// Returns whether a point at `next_mm` on the next beam, with this `exact` angle, belongs to the same segment as
     /// the last point of `open`.
-    fn joins(&self, open: &Open, (next_mm, exact): (f64, Option<f64>)) -> bool {
+    fn joins(&self, open: &OpenSegment, (next_mm, exact): (f64, Option<f64>)) -> bool {
         let range_mm = open.last_mm;
-        let step = open.last_exact.zip(exact).map_or(self.step, |(last, next)| Step::of(next - last));
-        let most = range_mm * step.slope + NOISE_MM;
-        (range_mm - next_mm) * (range_mm - next_mm) + range_mm * next_mm * step.spread <= most * most
+        let step =
+            open.last_exact.zip(exact).map_or(self.step_limit, |(last, next)| StepLimit::of(next - last));
+        let limit_mm = range_mm * step.slope + NOISE_MARGIN_MM;
+        (range_mm - next_mm) * (range_mm - next_mm) + range_mm * next_mm * step.spread <= limit_mm * limit_mm
     }
 
     /// Adapts the directions and the step to scans such as `scan`.
     fn fit(&mut self, scan: &Scan) {
         if self.directions.fit(&self.pose, scan) {
-            self.step = Step::of(scan.step);
+            self.step_limit = StepLimit::of(scan.step);
         }
     }
 }
@@ -163,36 +170,38 @@ impl Segmenter {
 impl Points {
     /// Adds a point. There is memory for one of each beam.
     fn add(&mut self, point: (f64, f64)) {
-        if let Some(place) = self.places.get_mut(self.used) {
-            *place = point;
-            self.used += 1;
+        if let Some(slot) = self.points.get_mut(self.count) {
+            *slot = point;
+            self.count += 1;
         }
     }
 
     /// Returns whether one of the points is near enough to `point` to support it.
-    fn reach(&self, point: (f64, f64)) -> bool {
-        let apart = |other: &(f64, f64)| {
+    fn has_near(&self, point: (f64, f64)) -> bool {
+        let square_distance = |other: &(f64, f64)| {
             let (dx, dy) = (other.0 - point.0, other.1 - point.1);
             dx * dx + dy * dy
         };
-        self.places[..self.used].iter().any(|other| apart(other) <= REACH_MM * REACH_MM)
+        self.points[..self.count]
+            .iter()
+            .any(|other| square_distance(other) <= MAX_SUPPORT_DISTANCE_MM * MAX_SUPPORT_DISTANCE_MM)
     }
 }
 
-impl Step {
+impl StepLimit {
     /// Returns the limits for two points that are `radians` apart in either direction, perhaps plus whole revolutions.
-    fn of(radians: f64) -> Step {
+    fn of(radians: f64) -> StepLimit {
         let step = ((radians + PI).rem_euclid(TAU) - PI).abs();
         let spread = 2.0 * (1.0 - step.cos());
         // No scanner has steps of 10 degrees or more. Only the noise can join them.
-        let flattest = FLATTEST_DEG.to_radians();
+        let flattest = MIN_INCIDENCE_DEG.to_radians();
         let slope = if step < flattest { step.sin() / (flattest - step).sin() } else { 0.0 };
-        Step { spread, slope }
+        StepLimit { spread, slope }
     }
 }
 
 /// A segment that may get more beams.
-struct Open {
+struct OpenSegment {
     first: usize,
     last: usize,
     nearest: u16,
@@ -204,9 +213,9 @@ struct Open {
     sum: (f64, f64),
 }
 
-impl Open {
-    fn new(beam: usize, range: u16, (range_mm, exact): (f64, Option<f64>), point: (f64, f64)) -> Open {
-        Open {
+impl OpenSegment {
+    fn new(beam: usize, range: u16, (range_mm, exact): (f64, Option<f64>), point: (f64, f64)) -> OpenSegment {
+        OpenSegment {
             first: beam,
             last: beam,
             nearest: range,

@@ -3,7 +3,7 @@
 
 use std::f64::consts::{PI, TAU};
 
-use scanhub_schema::{Contents, Pose, Scan, ScanHead, ScanWord};
+use scanhub_schema::{ArrayFlags, Pose, Scan, ScanHead, ScanWord};
 
 /// Velocity of a robot or of a sensor, in its own frame.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -22,7 +22,7 @@ impl Velocity {
     pub fn of_step((x, y, yaw): (f64, f64, f64), seconds: f64) -> Velocity {
         // The step is the chord of an arc.
         let half = yaw / 2.0;
-        let arc = if half.abs() > STRAIGHT_RAD { half / half.sin() } else { 1.0 } / seconds;
+        let arc = if half.abs() > MIN_ARC_RAD { half / half.sin() } else { 1.0 } / seconds;
         let (sin, cos) = half.sin_cos();
         Velocity { x: arc * (cos * x + sin * y), y: arc * (cos * y - sin * x), yaw: yaw / seconds }
     }
@@ -33,7 +33,7 @@ impl Velocity {
     pub fn position(&self, seconds: f64) -> (f64, f64, f64) {
         let half = self.yaw * seconds / 2.0;
         let (sin, cos) = half.sin_cos();
-        let chord = if half.abs() > STRAIGHT_RAD { sin / half } else { 1.0 } * seconds;
+        let chord = if half.abs() > MIN_ARC_RAD { sin / half } else { 1.0 } * seconds;
         (chord * (cos * self.x - sin * self.y), chord * (sin * self.x + cos * self.y), 2.0 * half)
     }
 
@@ -56,7 +56,8 @@ impl Velocity {
     /// Moves a part of the way to the `measured` velocity, which has noise.
     pub(crate) fn approach(&mut self, measured: &Velocity) {
         let Velocity { x, y, yaw } = self.difference(measured);
-        (self.x, self.y, self.yaw) = (self.x + GAIN * x, self.y + GAIN * y, self.yaw + GAIN * yaw);
+        (self.x, self.y, self.yaw) =
+            (self.x + FILTER_GAIN * x, self.y + FILTER_GAIN * y, self.yaw + FILTER_GAIN * yaw);
     }
 
     /// Returns whether a robot with this velocity moves by more than `limit_m`, or turns by more than a fifth of it in
@@ -64,7 +65,7 @@ impl Velocity {
     pub(crate) fn distorts(&self, scan: &Scan, limit_m: f64) -> bool {
         let [first_s, last_s] = times(scan);
         let span_s = last_s - first_s;
-        span_s * self.x.hypot(self.y) > limit_m || span_s * self.yaw.abs() > limit_m / FAR_M
+        span_s * self.x.hypot(self.y) > limit_m || span_s * self.yaw.abs() > limit_m / WALL_DISTANCE_M
     }
 
     /// Returns whether a robot can change its velocity by this one from one scan to the next.
@@ -83,7 +84,7 @@ impl Velocity {
 /// A position and a direction in some frame: meters, and radians counterclockwise from -pi to pi. Also the transform
 /// from the frame of a robot there into that frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Rigid {
+pub struct Pose2 {
     /// Ahead.
     pub x: f64,
     /// To the left.
@@ -94,29 +95,29 @@ pub struct Rigid {
     sin: f64,
 }
 
-impl Default for Rigid {
+impl Default for Pose2 {
     fn default() -> Self {
-        Rigid { x: 0.0, y: 0.0, yaw: 0.0, cos: 1.0, sin: 0.0 }
+        Pose2 { x: 0.0, y: 0.0, yaw: 0.0, cos: 1.0, sin: 0.0 }
     }
 }
 
-impl Rigid {
+impl Pose2 {
     /// Creates the transform of position `x`, `y` and direction `yaw`.
-    pub fn new(x: f64, y: f64, yaw: f64) -> Rigid {
+    pub fn new(x: f64, y: f64, yaw: f64) -> Pose2 {
         let (sin, cos) = yaw.sin_cos();
-        Rigid { x, y, yaw: (yaw + PI).rem_euclid(TAU) - PI, cos, sin }
+        Pose2 { x, y, yaw: (yaw + PI).rem_euclid(TAU) - PI, cos, sin }
     }
 
     /// Returns this transform followed by `next`, which is given in the frame of this one.
-    pub fn then(&self, next: &Rigid) -> Rigid {
+    pub fn then(&self, next: &Pose2) -> Pose2 {
         let (x, y) = self.point((next.x, next.y));
-        Rigid::new(x, y, self.yaw + next.yaw)
+        Pose2::new(x, y, self.yaw + next.yaw)
     }
 
     /// Returns the inverse transform.
-    pub fn inverse(&self) -> Rigid {
+    pub fn inverse(&self) -> Pose2 {
         let (x, y) = self.turned_back((-self.x, -self.y));
-        Rigid::new(x, y, -self.yaw)
+        Pose2::new(x, y, -self.yaw)
     }
 
     /// Transforms a point out of this frame.
@@ -164,7 +165,7 @@ impl UndistortedScan {
             no_return: NO_RETURN,
             beyond: NO_RETURN,
             count: count as u16,
-            contents: Contents::ANGLES,
+            contents: ArrayFlags::ANGLES,
             turns: 1,
             intensity_bits: 0,
             ..**scan
@@ -223,14 +224,14 @@ pub(crate) fn is_whole(beams: usize, step: f64) -> bool {
 /// Value of a beam without a reading in an undistorted scan.
 const NO_RETURN: u16 = u16::MAX;
 /// Half the turn of a step below which an arc equals its chord.
-const STRAIGHT_RAD: f64 = 1e-6;
+const MIN_ARC_RAD: f64 = 1e-6;
 /// Part of the way to the measured velocity, per scan.
-const GAIN: f64 = 0.3;
+const FILTER_GAIN: f64 = 0.3;
 /// Maximum change of velocity from one scan to the next. A robot brakes and turns less hard.
 const MAX_CHANGE_M_S: f64 = 2.0;
 const MAX_CHANGE_RAD_S: f64 = 6.0;
 /// Distance of walls that a turn moves as far as the same motion, in meters.
-const FAR_M: f64 = 5.0;
+const WALL_DISTANCE_M: f64 = 5.0;
 
 #[cfg(test)]
 mod tests {

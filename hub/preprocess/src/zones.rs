@@ -1,7 +1,7 @@
 //! Checks whether something is near the robot: the minimal distance check of the paper, with circles around the robot's
 //! center.
 //!
-//! A [`Check`] counts violations over scans. Its table has, for each beam, the ranges that lie inside each circle. It
+//! A [`ZoneChecker`] counts violations over scans. Its table has, for each beam, the ranges that lie inside each circle. It
 //! is computed once per layout of the scans, in floating point and millimeters. A scan then costs only comparisons of
 //! integers in device units.
 
@@ -23,7 +23,7 @@ pub struct Sector {
 }
 
 /// Maximum number of sectors of a sensor. More are ignored.
-pub const SECTORS: usize = 64;
+pub const MAX_SECTORS: usize = 64;
 
 /// Settings of a check.
 #[derive(Clone, Debug, PartialEq)]
@@ -84,46 +84,46 @@ pub struct Warning {
 /// - If fewer beams are relevant than a violation takes, no zone can ever be violated, so the verdict is unknown. This
 ///   includes an empty scan, no circle at all, a pose that is not finite, and a sensor that looks past the largest
 ///   circle.
-pub struct Check {
+pub struct ZoneChecker {
     min_beams: u16,
     min_scans: u16,
     table: Table,
     /// Number of scans since the start, a silence, a scan with too many invalid beams or a change of the layout.
-    seen: u16,
+    scan_count: u16,
     /// Number of consecutive scans in which enough beams met something, by circle.
     streaks: [u16; MAX_ZONES],
     /// Whether scans may be older than they seem.
-    is_late: bool,
+    is_backlogged: bool,
 }
 
-impl Check {
+impl ZoneChecker {
     /// Creates a check for a sensor at `pose` with at most `beams` beams. More are ignored.
-    pub fn new(pose: Pose, settings: &Settings, beams: usize) -> Check {
-        Check {
+    pub fn new(pose: Pose, settings: &Settings, beams: usize) -> ZoneChecker {
+        ZoneChecker {
             min_beams: settings.min_beams.max(1),
             min_scans: settings.min_scans.max(1),
             table: Table::new(pose, settings, beams),
-            seen: 0,
+            scan_count: 0,
             streaks: [0; MAX_ZONES],
-            is_late: false,
+            is_backlogged: false,
         }
     }
 
     /// Writes the result for `scan` into `out`, every byte of it. Only the first scan of a layout costs the computation
     /// of a table.
     pub fn update(&mut self, scan: &Scan, out: &mut Zones) {
-        let layout = Layout::of(scan, self.table.most());
+        let layout = Layout::of(scan, self.table.max_beams());
         if self.table.layout != layout {
-            self.table.make(layout);
-            self.forget();
+            self.table.compute(layout);
+            self.reset();
         }
-        self.seen = self.seen.saturating_add(1);
-        let ranges = &scan.ranges()[..scan.beams().min(self.table.most())];
-        let invalid = self.table.invalid(ranges, scan.spacing);
-        let Met { inside, nearest } = self.table.met(ranges, scan.exact_angles());
-        let is_enough = self.seen >= self.min_scans && !self.is_blind();
-        let is_valid = invalid <= self.table.most_invalid;
-        let is_known = is_enough && !self.is_late && is_valid;
+        self.scan_count = self.scan_count.saturating_add(1);
+        let ranges = &scan.ranges()[..scan.beams().min(self.table.max_beams())];
+        let invalid = self.table.invalid_beams(ranges, scan.spacing);
+        let ZoneHits { inside, nearest } = self.table.hits(ranges, scan.exact_angles());
+        let is_enough = self.scan_count >= self.min_scans && !self.is_blind();
+        let is_valid = invalid <= self.table.max_invalid_beams;
+        let is_known = is_enough && !self.is_backlogged && is_valid;
         for (streak, &beams) in self.streaks.iter_mut().zip(&inside).take(self.table.circles) {
             *streak = if beams >= self.min_beams { streak.saturating_add(1) } else { 0 };
         }
@@ -134,7 +134,7 @@ impl Check {
         self.write_circles(&inside, out);
         if !is_valid {
             // The scan may have ended the streak of a zone whose object is still there.
-            self.seen = 0;
+            self.scan_count = 0;
         }
     }
 
@@ -142,12 +142,18 @@ impl Check {
     /// are its first ranges. For a scan with exact `angles`, they are all of its ranges, and a nearer point may still
     /// replace one of them. Returns the zone that the scan violates if no more points arrive, or `None`. Before the
     /// first complete scan, the result is `None`.
-    pub fn early(&mut self, count: usize, unit_um: u32, ranges: &[u16], angles: &[f32]) -> Option<Warning> {
+    pub fn check_partial(
+        &mut self,
+        count: usize,
+        unit_um: u32,
+        ranges: &[u16],
+        angles: &[f32],
+    ) -> Option<Warning> {
         if !self.table.layout.is_of(count, unit_um) || self.is_blind() {
             return None;
         }
-        let ranges = &ranges[..ranges.len().min(count).min(self.table.most())];
-        let Met { inside, nearest } = self.table.met(ranges, angles);
+        let ranges = &ranges[..ranges.len().min(count).min(self.table.max_beams())];
+        let ZoneHits { inside, nearest } = self.table.hits(ranges, angles);
         let will_be = |zone: &usize| {
             inside[*zone] >= self.min_beams && self.streaks[*zone].saturating_add(1) >= self.min_scans
         };
@@ -160,30 +166,30 @@ impl Check {
 
     /// Writes the result of missing scans into `out`: only the circles are known. Scans have to be consecutive again
     /// afterwards.
-    pub fn stale(&mut self, out: &mut Zones) {
-        self.forget();
+    pub fn write_stale(&mut self, out: &mut Zones) {
+        self.reset();
         *out = Zones { count: self.table.circles as u8, ..Zones::unknown() };
         self.write_circles(&[0; MAX_ZONES], out);
     }
 
     /// Sets whether scans may be older than they seem from now on. Points of such a scan in the smallest circle count.
     /// Otherwise, the verdict is unknown.
-    pub fn doubt(&mut self, is_late: bool) {
-        self.is_late = is_late;
+    pub fn set_backlogged(&mut self, is_backlogged: bool) {
+        self.is_backlogged = is_backlogged;
     }
 
     /// Returns the number of relevant beams of the last scan's layout; 0 before the first scan.
-    pub fn telling(&self) -> u16 {
-        self.table.telling
+    pub fn effective_beams(&self) -> u16 {
+        self.table.effective_beams
     }
 
     /// Returns whether fewer beams are relevant than a violation takes. The verdict is then always unknown.
     pub fn is_blind(&self) -> bool {
-        self.telling() < self.min_beams
+        self.effective_beams() < self.min_beams
     }
 
-    fn forget(&mut self) {
-        self.seen = 0;
+    fn reset(&mut self) {
+        self.scan_count = 0;
         self.streaks = [0; MAX_ZONES];
     }
 
@@ -203,7 +209,7 @@ impl Check {
     }
 
     fn write_circles(&self, beams: &[u16; MAX_ZONES], out: &mut Zones) {
-        out.flags = if self.seen < self.min_scans { Zones::PROVISIONAL } else { 0 };
+        out.flags = if self.scan_count < self.min_scans { Zones::PROVISIONAL } else { 0 };
         out.reserved = 0;
         for (zone, circle) in out.zone_array.iter_mut().enumerate() {
             *circle = Zone {
@@ -230,9 +236,9 @@ struct Layout {
 
 impl Layout {
     /// Returns the layout of `scan`. At most `most` beams are used.
-    fn of(scan: &Scan, most: usize) -> Layout {
+    fn of(scan: &Scan, max_beams: usize) -> Layout {
         let ScanHead { unit_um, valid_to, no_return, beyond, first_angle, step, .. } = **scan;
-        let count = scan.beams().min(most);
+        let count = scan.beams().min(max_beams);
         Layout { count, unit_um, valid_to, no_return, beyond, first_angle, step }
     }
 
@@ -255,7 +261,7 @@ struct Table {
     /// Radii of the circles; 0 for unused ones.
     radii_mm: [u16; MAX_ZONES],
     /// The robot's own body: the sectors, and their number.
-    sectors: ([Sector; SECTORS], usize),
+    sectors: ([Sector; MAX_SECTORS], usize),
     margin_mm: u16,
     exact: bool,
     no_return_is_far: bool,
@@ -266,16 +272,16 @@ struct Table {
     inside: [Spans; MAX_ZONES],
     nearest: Nearest,
     /// 1 for relevant beams: a reading of them may lie inside the largest circle.
-    tells: Box<[u16]>,
+    is_effective: Box<[u16]>,
     /// Number of relevant beams.
-    telling: u16,
+    effective_beams: u16,
     /// Maximum number of invalid beams with which the verdict does not become unknown.
-    most_invalid: u16,
+    max_invalid_beams: u16,
 }
 
 /// Points of a scan inside the circles.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-struct Met {
+struct ZoneHits {
     /// Number of beams that met something inside each circle.
     inside: [u16; MAX_ZONES],
     /// Beam whose point is nearest to the robot's center, and its distance in mm, rounded down. The first one of
@@ -289,8 +295,8 @@ impl Table {
         let circles = settings.radii_mm.len().min(MAX_ZONES);
         let mut radii_mm = [0; MAX_ZONES];
         radii_mm[..circles].copy_from_slice(&settings.radii_mm[..circles]);
-        let mut sectors = [Sector { from_mdeg: 0, to_mdeg: -1, range_mm: 0 }; SECTORS];
-        let count = settings.body_mask.len().min(SECTORS);
+        let mut sectors = [Sector { from_mdeg: 0, to_mdeg: -1, range_mm: 0 }; MAX_SECTORS];
+        let count = settings.body_mask.len().min(MAX_SECTORS);
         sectors[..count].copy_from_slice(&settings.body_mask[..count]);
         let mut table = Table {
             pose,
@@ -304,44 +310,44 @@ impl Table {
             layout: Layout::default(),
             inside: std::array::from_fn(|zone| Spans::none(if zone < circles { beams } else { 0 })),
             nearest: Nearest::none(beams),
-            tells: vec![0; beams].into(),
-            telling: 0,
-            most_invalid: 0,
+            is_effective: vec![0; beams].into(),
+            effective_beams: 0,
+            max_invalid_beams: 0,
         };
-        table.make(Layout::default());
+        table.compute(Layout::default());
         table
     }
 
     /// Returns the maximum number of beams of a scan.
-    fn most(&self) -> usize {
-        self.tells.len()
+    fn max_beams(&self) -> usize {
+        self.is_effective.len()
     }
 
     /// Computes the table for `layout`.
-    fn make(&mut self, layout: Layout) {
+    fn compute(&mut self, layout: Layout) {
         self.layout = layout;
         self.inside.iter_mut().for_each(Spans::clear);
-        self.nearest.seen.clear();
+        self.nearest.measurable.clear();
         self.nearest.twice_q.fill(0.0);
-        self.tells.fill(0);
+        self.is_effective.fill(0);
         for i in 0..layout.count {
-            self.make_beam(i, layout.first_angle + i as f64 * layout.step);
+            self.compute_beam(i, layout.first_angle + i as f64 * layout.step);
         }
         self.nearest.finish();
-        self.telling = self.tells.iter().sum();
-        self.most_invalid = floor(self.max_invalid * f64::from(self.telling)) as u16;
+        self.effective_beams = self.is_effective.iter().sum();
+        self.max_invalid_beams = floor(self.max_invalid * f64::from(self.effective_beams)) as u16;
     }
 
-    fn make_beam(&mut self, i: usize, angle: f64) {
+    fn compute_beam(&mut self, i: usize, angle: f64) {
         let beam = self.beam(angle);
         let beyond_ranges = self.layout.valid_to.saturating_add(1);
-        self.nearest.seen.set(i, beam.own, beyond_ranges);
+        self.nearest.measurable.set(i, beam.own, beyond_ranges);
         self.nearest.twice_q[i] = 2.0 * beam.q / self.layout.unit_mm();
         for zone in 0..self.circles {
             let (from, below) = self.span(&beam, zone);
             self.inside[zone].set(i, from, below.min(u64::from(beyond_ranges)) as u16);
             if zone == 0 {
-                self.tells[i] = u16::from(self.inside[zone].has_any(i));
+                self.is_effective[i] = u16::from(self.inside[zone].has_any(i));
             }
         }
     }
@@ -369,22 +375,23 @@ impl Table {
 
     /// Returns the number of relevant beams without a reading. A beam that was not measured counts if nothing was
     /// measured over more than two spacings of the sensor's own points, which are `spacing` radians.
-    fn invalid(&self, ranges: &[u16], spacing: f32) -> u16 {
+    fn invalid_beams(&self, ranges: &[u16], spacing: f32) -> u16 {
         let Layout { valid_to, no_return, beyond, .. } = self.layout;
         let is_invalid = |value: u16| {
             let is_no_return = self.no_return_is_far & (value == no_return);
             let is_beyond = (value == beyond) & (beyond != no_return);
             (value > valid_to) & !is_beyond & !is_no_return
         };
-        let beams = ranges.iter().zip(&self.tells);
-        let invalid: u16 = beams.map(|(&value, &tells)| u16::from(is_invalid(value)) & tells).sum();
+        let beams = ranges.iter().zip(&self.is_effective);
+        let invalid: u16 =
+            beams.map(|(&value, &is_effective)| u16::from(is_invalid(value)) & is_effective).sum();
         // Every beam of an LMS is measured.
         let is_complete = invalid == 0 || !ranges.contains(&Scan::NOT_MEASURED);
-        if is_complete { invalid } else { invalid - self.looked_past(ranges, spacing) }
+        if is_complete { invalid } else { invalid - self.unmeasured_between(ranges, spacing) }
     }
 
     /// Returns the number of relevant beams that were not measured, but have measured ones near enough on both sides.
-    fn looked_past(&self, ranges: &[u16], spacing: f32) -> u16 {
+    fn unmeasured_between(&self, ranges: &[u16], spacing: f32) -> u16 {
         let is_measured = |value: &u16| *value != Scan::NOT_MEASURED;
         let (Some(first), Some(last)) =
             (ranges.iter().position(is_measured), ranges.iter().rposition(is_measured))
@@ -392,46 +399,47 @@ impl Table {
             return 0;
         };
         let step = self.layout.step.abs();
-        let most = (2.0 * f64::from(spacing) / step * (1.0 + ROUNDING)) as usize;
+        let max_beams_between = (2.0 * f64::from(spacing) / step * (1.0 + ROUNDING_ERROR)) as usize;
         // In a full revolution, the first beam follows the last one.
         let is_whole_turn = (ranges.len() as f64 * step - TAU).abs() < step / 2.0;
         let across = if is_whole_turn { first + ranges.len() - 1 - last } else { usize::MAX - 1 };
-        let told = |run: &[u16], tells: &[u16]| -> u16 { tells[..run.len()].iter().sum() };
-        let mut past = 0;
-        if across < most {
-            past += told(&ranges[..first], &self.tells) + told(&ranges[last + 1..], &self.tells[last + 1..]);
+        let effective = |run: &[u16], is_effective: &[u16]| -> u16 { is_effective[..run.len()].iter().sum() };
+        let mut unmeasured = 0;
+        if across < max_beams_between {
+            unmeasured += effective(&ranges[..first], &self.is_effective)
+                + effective(&ranges[last + 1..], &self.is_effective[last + 1..]);
         }
         let mut begin = first;
         while begin < last {
-            let behind = begin + 1 + ranges[begin + 1..].iter().position(is_measured).unwrap_or(0);
-            if behind - begin - 1 < most {
-                past += told(&ranges[begin + 1..behind], &self.tells[begin + 1..]);
+            let next_measured = begin + 1 + ranges[begin + 1..].iter().position(is_measured).unwrap_or(0);
+            if next_measured - begin - 1 < max_beams_between {
+                unmeasured += effective(&ranges[begin + 1..next_measured], &self.is_effective[begin + 1..]);
             }
-            begin = behind;
+            begin = next_measured;
         }
-        past
+        unmeasured
     }
 
     /// Returns the points inside the circles for these `ranges`, the first ones of a scan of the table's layout. If
     /// there are `angles`, the exact points count.
-    fn met(&mut self, ranges: &[u16], angles: &[f32]) -> Met {
+    fn hits(&mut self, ranges: &[u16], angles: &[f32]) -> ZoneHits {
         if !angles.is_empty() {
-            return self.met_exactly(ranges, angles);
+            return self.exact_hits(ranges, angles);
         }
         let nearest = self.nearest.find(ranges).map(|(beam, square)| self.at_distance(beam, square));
         let shortest = &self.nearest.shortest;
-        Met { inside: std::array::from_fn(|zone| self.inside[zone].count(ranges, shortest)), nearest }
+        ZoneHits { inside: std::array::from_fn(|zone| self.inside[zone].count(ranges, shortest)), nearest }
     }
 
     /// Returns the points inside the circles of a scan with exact angles. Only points that are near enough to be inside
     /// a circle, or the nearest one, are computed.
-    fn met_exactly(&self, ranges: &[u16], angles: &[f32]) -> Met {
+    fn exact_hits(&self, ranges: &[u16], angles: &[f32]) -> ZoneHits {
         let unit_mm = self.layout.unit_mm();
         let (sx, sy) = self.sensor_mm();
-        let away = (sx * sx + sy * sy).sqrt();
+        let sensor_distance_mm = (sx * sx + sy * sy).sqrt();
         let radius_mm = self.radii_mm[..self.circles].iter().max().map_or(0.0, |&radius| f64::from(radius));
-        let reach = (away + radius_mm + f64::from(self.margin_mm) + 1.0) / unit_mm;
-        let (mut met, mut best) = (Met::default(), (f64::INFINITY, None));
+        let reach = (sensor_distance_mm + radius_mm + f64::from(self.margin_mm) + 1.0) / unit_mm;
+        let (mut zone_hits, mut best) = (ZoneHits::default(), (f64::INFINITY, None));
         // A greater range is neither inside a circle nor nearer than the nearest point so far.
         let mut limit = self.layout.valid_to;
         let mut next = 0;
@@ -446,19 +454,20 @@ impl Table {
             }
             let value = f64::from(range);
             let square = value * (value + 2.0 * beam.q / unit_mm);
-            let distance_mm = (square * unit_mm * unit_mm + away * away).max(0.0).sqrt();
+            let distance_mm =
+                (square * unit_mm * unit_mm + sensor_distance_mm * sensor_distance_mm).max(0.0).sqrt();
             if distance_mm < best.0 {
                 best = (distance_mm, Some((i, square)));
-                let farthest = ((distance_mm + away) / unit_mm).max(reach) as u16;
+                let farthest = ((distance_mm + sensor_distance_mm) / unit_mm).max(reach) as u16;
                 limit = limit.min(farthest.saturating_add(1));
             }
-            for (zone, inside) in met.inside.iter_mut().enumerate().take(self.circles) {
+            for (zone, inside) in zone_hits.inside.iter_mut().enumerate().take(self.circles) {
                 let (from, below) = self.span(&beam, zone);
                 *inside += u16::from((from..below).contains(&u64::from(range)));
             }
         }
-        met.nearest = best.1.map(|(beam, square)| self.at_distance(beam, square));
-        met
+        zone_hits.nearest = best.1.map(|(beam, square)| self.at_distance(beam, square));
+        zone_hits
     }
 
     /// Returns beam and distance in mm of a point. `square` is the square of its distance without that of the sensor,
@@ -482,8 +491,8 @@ impl Table {
             return 0;
         }
         let angle_mdeg = in_sector_mdeg(angle);
-        let here = |sector: &&Sector| (sector.from_mdeg..=sector.to_mdeg).contains(&angle_mdeg);
-        sectors.iter().filter(here).map(|sector| u64::from(sector.range_mm)).max().unwrap_or(0)
+        let is_in_sector = |sector: &&Sector| (sector.from_mdeg..=sector.to_mdeg).contains(&angle_mdeg);
+        sectors.iter().filter(is_in_sector).map(|sector| u64::from(sector.range_mm)).max().unwrap_or(0)
     }
 
     /// Returns the ranges in mm between which a beam is inside a circle; 0 and 0 if it never is. `q` is s.u and
@@ -518,30 +527,30 @@ fn in_units(mm: f64, unit_mm: f64) -> u64 {
 }
 
 /// Maximum rounding error of a quotient.
-const ROUNDING: f64 = 1e-6;
+const ROUNDING_ERROR: f64 = 1e-6;
 
 /// Values within this number of mm of a whole number count as that number. Rounding is never towards clear, but an
 /// object exactly on a circle is outside, whatever sine and cosine lose.
-const WHOLE_MM: f64 = 1e-6;
+const ROUNDING_MM: f64 = 1e-6;
 
 fn floor(value: f64) -> f64 {
-    if (value - value.round()).abs() <= WHOLE_MM { value.round() } else { value.floor() }
+    if (value - value.round()).abs() <= ROUNDING_MM { value.round() } else { value.floor() }
 }
 
 fn ceil(value: f64) -> f64 {
-    if (value - value.round()).abs() <= WHOLE_MM { value.round() } else { value.ceil() }
+    if (value - value.round()).abs() <= ROUNDING_MM { value.round() } else { value.ceil() }
 }
 
 /// Finds the reading that is nearest to the robot's center, exact to the millimeter (rounded down), while only a few
 /// beams are computed one by one.
 struct Nearest {
     /// Readings that count: valid ones beyond the robot's own body.
-    seen: Spans,
+    measurable: Spans,
     /// Twice s.u for each beam, in device units, with the sensor's position s and the beam's direction u.
     twice_q: Box<[f64]>,
     /// For each block of beams: the minimum of `twice_q`, the shortest reading that counts in the current scan, and the
     /// lower bound of its readings.
-    least_twice_q: Box<[f64]>,
+    min_twice_q: Box<[f64]>,
     shortest: Box<[u16]>,
     bounds: Box<[f64]>,
 }
@@ -550,18 +559,18 @@ impl Nearest {
     /// Creates the search for at most `beams` beams. There are none yet.
     fn none(beams: usize) -> Nearest {
         Nearest {
-            seen: Spans::none(beams),
+            measurable: Spans::none(beams),
             twice_q: vec![0.0; beams].into(),
-            least_twice_q: vec![0.0; beams.div_ceil(BLOCK)].into(),
-            shortest: vec![u16::MAX; beams.div_ceil(BLOCK)].into(),
-            bounds: vec![0.0; beams.div_ceil(BLOCK)].into(),
+            min_twice_q: vec![0.0; beams.div_ceil(BLOCK_LEN)].into(),
+            shortest: vec![u16::MAX; beams.div_ceil(BLOCK_LEN)].into(),
+            bounds: vec![0.0; beams.div_ceil(BLOCK_LEN)].into(),
         }
     }
 
     /// Completes the blocks. Call it when all beams are set.
     fn finish(&mut self) {
-        for (block, least) in self.twice_q.chunks(BLOCK).zip(&mut self.least_twice_q) {
-            *least = block.iter().copied().fold(f64::INFINITY, f64::min);
+        for (block, min_value) in self.twice_q.chunks(BLOCK_LEN).zip(&mut self.min_twice_q) {
+            *min_value = block.iter().copied().fold(f64::INFINITY, f64::min);
         }
     }
 
@@ -569,7 +578,7 @@ impl Nearest {
     /// without that of the sensor: r^2 + 2qr, in device units.
     fn find(&mut self, ranges: &[u16]) -> Option<(usize, f64)> {
         self.bound(ranges);
-        let bounds = &self.bounds[..ranges.len().div_ceil(BLOCK)];
+        let bounds = &self.bounds[..ranges.len().div_ceil(BLOCK_LEN)];
         let best =
             (1..bounds.len()).fold(0, |best, block| if bounds[block] < bounds[best] { block } else { best });
         let mut nearest = self.nearer(best, ranges, (f64::INFINITY, usize::MAX));
@@ -584,8 +593,8 @@ impl Nearest {
 
     /// Computes the lower bound of each block: its shortest reading that counts, along its most favorable beam.
     fn bound(&mut self, ranges: &[u16]) {
-        let (blocks, rest) = ranges.as_chunks::<BLOCK>();
-        let (from_blocks, from_rest) = self.seen.from[..ranges.len()].as_chunks::<BLOCK>();
+        let (blocks, rest) = ranges.as_chunks::<BLOCK_LEN>();
+        let (from_blocks, from_rest) = self.measurable.from[..ranges.len()].as_chunks::<BLOCK_LEN>();
         // A code is greater than any range, so it does no harm here.
         let shortest = |ranges: &[u16], from: &[u16]| {
             ranges.iter().zip(from).map(|(&range, &from)| range.max(from)).fold(u16::MAX, u16::min)
@@ -597,7 +606,7 @@ impl Nearest {
             *value = shortest(rest, from_rest);
         }
         for ((bound, &shortest), &twice_q) in
-            self.bounds.iter_mut().zip(&self.shortest).zip(&self.least_twice_q)
+            self.bounds.iter_mut().zip(&self.shortest).zip(&self.min_twice_q)
         {
             let (shortest, turn) = (f64::from(shortest), -0.5 * twice_q);
             let value = if shortest > turn { shortest } else { turn };
@@ -608,11 +617,11 @@ impl Nearest {
     /// Returns `nearest`, or a reading of the block that is nearer.
     fn nearer(&self, block: usize, ranges: &[u16], nearest: (f64, usize)) -> (f64, usize) {
         let mut nearest = nearest;
-        for (i, &range) in ranges.iter().enumerate().skip(block * BLOCK).take(BLOCK) {
+        for (i, &range) in ranges.iter().enumerate().skip(block * BLOCK_LEN).take(BLOCK_LEN) {
             let value = f64::from(range);
             let square = value * (value + self.twice_q[i]);
             let is_nearer = square < nearest.0 || (square == nearest.0 && i < nearest.1);
-            if is_nearer && self.seen.has(i, range) {
+            if is_nearer && self.measurable.has(i, range) {
                 nearest = (square, i);
             }
         }
@@ -621,7 +630,7 @@ impl Nearest {
 }
 
 /// Number of beams of a block. Their directions differ little, and there are few blocks.
-const BLOCK: usize = 32;
+const BLOCK_LEN: usize = 32;
 
 /// The values `from..from + len` of each beam, tested by one comparison of integers in device units.
 #[derive(Clone)]
@@ -636,7 +645,7 @@ struct Spans {
 impl Spans {
     /// Creates empty spans of `beams` beams.
     fn none(beams: usize) -> Spans {
-        let ends = vec![0; beams.div_ceil(BLOCK)].into();
+        let ends = vec![0; beams.div_ceil(BLOCK_LEN)].into();
         Spans { from: vec![u16::MAX; beams].into(), len: vec![0; beams].into(), ends }
     }
 
@@ -651,7 +660,7 @@ impl Spans {
     fn set(&mut self, i: usize, from: u64, below: u16) {
         self.from[i] = from.min(u64::from(u16::MAX)) as u16;
         self.len[i] = below.saturating_sub(self.from[i]);
-        self.ends[i / BLOCK] = self.ends[i / BLOCK].max(below);
+        self.ends[i / BLOCK_LEN] = self.ends[i / BLOCK_LEN].max(below);
     }
 
     /// Returns whether the value counts.
@@ -669,14 +678,14 @@ impl Spans {
     /// In most rooms, those of most blocks are too long.
     fn count(&self, ranges: &[u16], shortest: &[u16]) -> u16 {
         let may_count = |&block: &usize| shortest[block] < self.ends[block];
-        let blocks = (0..ranges.len().div_ceil(BLOCK).min(self.ends.len())).filter(may_count);
+        let blocks = (0..ranges.len().div_ceil(BLOCK_LEN).min(self.ends.len())).filter(may_count);
         blocks.map(|block| self.count_in(block, ranges)).sum()
     }
 
     /// Returns the number of beams of a block whose value counts.
     #[inline(never)]
     fn count_in(&self, block: usize, ranges: &[u16]) -> u16 {
-        let beams = block * BLOCK..ranges.len().min((block + 1) * BLOCK);
+        let beams = block * BLOCK_LEN..ranges.len().min((block + 1) * BLOCK_LEN);
         let spans = self.from[beams.clone()].iter().zip(&self.len[beams.clone()]);
         let values = spans.zip(&ranges[beams]);
         values.map(|((&from, &len), &value)| u16::from(value.wrapping_sub(from) < len)).sum()

@@ -7,20 +7,20 @@ mod surroundings;
 use std::hint::black_box;
 use std::sync::atomic::Ordering::Relaxed;
 
-use counting::{TAKEN, WATCHED};
+use counting::{ALLOCATIONS, WATCHED_THREAD};
 use rustix::thread::gettid;
-use scanhub_preprocess::background::{self, Method, Model};
+use scanhub_preprocess::background::{self, BackgroundModel, Method};
 use scanhub_preprocess::segments::Segmenter;
 use scanhub_preprocess::{lines, marks, motion, zones};
 use scanhub_schema::{Background, Foreground, Lines, Marks, Motion, Pose, Scan, Zones};
-use surroundings::{BEAMS, Shape, Surroundings};
+use surroundings::{MAX_TEST_BEAMS, RandomSurroundings, Shape};
 
 #[test]
 fn a_scan_takes_nothing_from_the_heap() {
     let mut random = fastrand::Rng::with_seed(1);
     let mut scans: Vec<Box<Scan>> = Vec::new();
     for seed in 0..20 {
-        let mut surroundings = Surroundings::new(Shape::any(&mut random), seed);
+        let mut surroundings = RandomSurroundings::new(Shape::any(&mut random), seed);
         scans.extend((0..50).map(|_| surroundings.next()));
     }
     for scan in &mut scans {
@@ -28,25 +28,26 @@ fn a_scan_takes_nothing_from_the_heap() {
         scan.arrays().upper.iter_mut().for_each(|intensity| *intensity = random.u8(..8));
     }
     let pose = Pose { x_m: 0.3, yaw_rad: 1.0, ..Pose::default() };
-    let mut check = zones::Check::new(pose, &zones::Settings::default(), BEAMS);
+    let mut check = zones::ZoneChecker::new(pose, &zones::Settings::default(), MAX_TEST_BEAMS);
     let mut finder = marks::MarkDetector::new(marks::Settings::default());
     let of_form = |refine| lines::Settings { refine, ..lines::Settings::default() };
-    let mut line_finders = [false, true].map(|refine| lines::LineFinder::new(pose, of_form(refine), BEAMS));
+    let mut line_finders =
+        [false, true].map(|refine| lines::LineFinder::new(pose, of_form(refine), MAX_TEST_BEAMS));
     let mut found_lines = Lines::default();
     let settings = |method| background::Settings { method, scans: Some(10), ..Default::default() };
-    let mut models =
-        [Method::Paper, Method::Multi, Method::Moving].map(|method| Model::new(settings(method), BEAMS));
-    let mut estimator = motion::MotionEstimator::new(pose, motion::Settings::default(), BEAMS);
+    let mut models = [Method::Paper, Method::Multi, Method::Moving]
+        .map(|method| BackgroundModel::new(settings(method), MAX_TEST_BEAMS));
+    let mut estimator = motion::MotionEstimator::new(pose, motion::Settings::default(), MAX_TEST_BEAMS);
     let (mut found_motion, mut stamp_ns) = (Motion::default(), 0);
-    let mut cutter = Segmenter::new(pose, BEAMS);
+    let mut cutter = Segmenter::new(pose, MAX_TEST_BEAMS);
     let (mut zones, mut marks) = (Zones::default(), Marks::default());
-    let mut foreground = Foreground::of(BEAMS);
-    let mut background = Background::zeroed(Background::len(BEAMS));
+    let mut foreground = Foreground::of(MAX_TEST_BEAMS);
+    let mut background = Background::zeroed(Background::len(MAX_TEST_BEAMS));
     let (mut segments, mut lines_found) = (0, 0);
 
-    WATCHED.store(gettid().as_raw_nonzero().get(), Relaxed);
+    WATCHED_THREAD.store(gettid().as_raw_nonzero().get(), Relaxed);
     drop(black_box(Box::new(0)));
-    let before = TAKEN.load(Relaxed);
+    let before = ALLOCATIONS.load(Relaxed);
     for scan in &scans {
         check.update(scan, &mut zones);
         finder.update(scan, &mut marks);
@@ -57,16 +58,16 @@ fn a_scan_takes_nothing_from_the_heap() {
         stamp_ns += 26_640_000;
         estimator.update(scan, stamp_ns, 0, &mut found_motion);
         for model in &mut models {
-            model.follow(&pose, &found_motion, &estimator.velocity());
+            model.set_motion(&pose, &found_motion, &estimator.velocity());
             model.update(scan, &mut foreground);
             cutter.update(scan, &mut foreground);
-            model.show(&mut background);
+            model.write(&mut background);
             segments += foreground.segments().len();
         }
     }
-    check.stale(&mut zones);
-    let taken = TAKEN.load(Relaxed) - before;
-    WATCHED.store(0, Relaxed);
+    check.write_stale(&mut zones);
+    let taken = ALLOCATIONS.load(Relaxed) - before;
+    WATCHED_THREAD.store(0, Relaxed);
     assert_eq!((before, taken), (1, 0), "one piece was taken before, to see that it is counted");
     assert!(marks.count > 0 && segments > 0 && lines_found > 0, "there was something to do");
 }

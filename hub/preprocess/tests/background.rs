@@ -3,12 +3,12 @@
 
 mod surroundings;
 
-use scanhub_preprocess::background::{Candidate, Class, Method, Mismatch, Model, Settings, Start};
+use scanhub_preprocess::background::{BackgroundModel, Candidate, Class, Method, Mismatch, Settings, Start};
 use scanhub_preprocess::segments::Segmenter;
 use scanhub_schema::{Background, BackgroundHead, Foreground, Pose, Scan, ScanHead};
 use surroundings::{
-    BEAMS, Shape, Surroundings, any_choice, any_model, apart_at_most_mm, check_scan, ranges_mm, reading_mm,
-    unit_mm,
+    MAX_TEST_BEAMS, RandomSurroundings, Shape, any_choice, any_model, check_scan, max_difference_mm,
+    ranges_mm, reading_mm, unit_mm,
 };
 
 /// One beam as the paper has it.
@@ -20,37 +20,42 @@ struct Beam {
     run_mm: Vec<f64>,
 }
 
-struct SlowPaper {
+struct ReferencePaper {
     settings: Settings,
     beams: Vec<Beam>,
-    frozen: bool,
-    fresh: bool,
+    is_frozen: bool,
+    is_fresh: bool,
 }
 
 /// Two readings that may be infinite.
-fn apart_mm(a: f64, b: f64) -> f64 {
+fn distance_mm(a: f64, b: f64) -> f64 {
     if a == b { 0.0 } else { (a - b).abs() }
 }
 
-impl SlowPaper {
-    fn new(settings: Settings, count: u16) -> SlowPaper {
-        SlowPaper { settings, beams: vec![Beam::default(); usize::from(count)], frozen: false, fresh: true }
+impl ReferencePaper {
+    fn new(settings: Settings, count: u16) -> ReferencePaper {
+        ReferencePaper {
+            settings,
+            beams: vec![Beam::default(); usize::from(count)],
+            is_frozen: false,
+            is_fresh: true,
+        }
     }
 
     fn reset(&mut self, count: u16) {
         self.beams = vec![Beam::default(); usize::from(count)];
-        self.fresh = true;
+        self.is_fresh = true;
     }
 
     fn load(&mut self, ranges_mm: &[f64]) {
         self.beams = ranges_mm.iter().map(|&mm| Beam { background_mm: mm, run_mm: vec![] }).collect();
-        self.fresh = false;
+        self.is_fresh = false;
     }
 
     fn update(&mut self, scan: &Scan) -> Vec<Class> {
         let far = self.settings.no_return_is_far.unwrap_or(false);
-        let threshold_mm = apart_at_most_mm(self.settings.threshold_mm, scan);
-        let candidate_mm = apart_at_most_mm(self.settings.candidate_mm, scan);
+        let threshold_mm = max_difference_mm(self.settings.threshold_mm, scan);
+        let candidate_mm = max_difference_mm(self.settings.candidate_mm, scan);
         let ten_seconds = (10.0 * 75.0 * (1000.0 * scan.step.to_degrees()).round() / 1000.0).ceil();
         let scans = self.settings.scans.map_or(ten_seconds, f64::from);
         let classes = self
@@ -62,7 +67,7 @@ impl SlowPaper {
                     return Class::Invalid;
                 };
                 let before = beam.clone();
-                let stands = beam.background_mm != 0.0 && apart_mm(mm, beam.background_mm) <= threshold_mm;
+                let stands = beam.background_mm != 0.0 && distance_mm(mm, beam.background_mm) <= threshold_mm;
                 if stands {
                     beam.run_mm.clear();
                 } else {
@@ -70,7 +75,7 @@ impl SlowPaper {
                         Candidate::First => beam.run_mm.first(),
                         Candidate::Latest => beam.run_mm.last(),
                     };
-                    if candidate.is_some_and(|&candidate| apart_mm(mm, candidate) > candidate_mm) {
+                    if candidate.is_some_and(|&candidate| distance_mm(mm, candidate) > candidate_mm) {
                         beam.run_mm.clear();
                     }
                     beam.run_mm.push(mm);
@@ -78,10 +83,10 @@ impl SlowPaper {
                         *beam = Beam { background_mm: mm, run_mm: vec![] };
                     }
                 }
-                if self.fresh && self.settings.start == Start::FirstScan && mm != 0.0 {
+                if self.is_fresh && self.settings.start == Start::FirstScan && mm != 0.0 {
                     *beam = Beam { background_mm: mm, run_mm: vec![] };
                 }
-                if self.frozen {
+                if self.is_frozen {
                     *beam = before.clone();
                 }
                 match before.background_mm {
@@ -92,7 +97,7 @@ impl SlowPaper {
                 }
             })
             .collect();
-        self.fresh &= self.frozen;
+        self.is_fresh &= self.is_frozen;
         classes
     }
 }
@@ -113,14 +118,14 @@ fn any_settings(random: &mut fastrand::Rng) -> Settings {
 
 #[test]
 fn paper_is_identical_beam_by_beam() {
-    let mut seen = [0_u64; 5];
+    let mut class_counts = [0_u64; 5];
     let mut adopted = 0_u64;
     for seed in 0..16 {
         let mut random = fastrand::Rng::with_seed(seed);
         let settings = any_settings(&mut random);
-        let mut surroundings = Surroundings::new(Shape::any(&mut random), seed);
-        let mut model = Model::new(settings, BEAMS);
-        let mut slow = SlowPaper::new(settings, surroundings.shape.count);
+        let mut surroundings = RandomSurroundings::new(Shape::any(&mut random), seed);
+        let mut model = BackgroundModel::new(settings, MAX_TEST_BEAMS);
+        let mut slow = ReferencePaper::new(settings, surroundings.shape.count);
         let mut generation = 0;
         for number in 0..2_000 {
             match random.u16(..1_500) {
@@ -139,7 +144,7 @@ fn paper_is_identical_beam_by_beam() {
                     let other = Shape::any(&mut random);
                     let same = (other.count, other.unit_mm)
                         == (surroundings.shape.count, surroundings.shape.unit_mm);
-                    surroundings = Surroundings::new(other, seed);
+                    surroundings = RandomSurroundings::new(other, seed);
                     if !same {
                         slow.reset(other.count);
                         generation += 1;
@@ -147,11 +152,11 @@ fn paper_is_identical_beam_by_beam() {
                 }
                 3 => {
                     model.freeze();
-                    slow.frozen = true;
+                    slow.is_frozen = true;
                 }
                 4..8 => {
                     model.thaw();
-                    slow.frozen = false;
+                    slow.is_frozen = false;
                 }
                 _ => {}
             }
@@ -160,120 +165,128 @@ fn paper_is_identical_beam_by_beam() {
             let dirt = random.u8(..);
             let place = &format_args!("seed {seed}, scan {number}, {settings:?}");
             check_scan(&mut model, &scan, &classes, generation, dirt, place);
-            classes.iter().for_each(|&class| seen[class as usize] += 1);
+            classes.iter().for_each(|&class| class_counts[class as usize] += 1);
         }
-        let mut shown = Background::zeroed(Background::len(BEAMS));
-        model.show(&mut shown);
+        let mut shown = Background::zeroed(Background::len(MAX_TEST_BEAMS));
+        model.write(&mut shown);
         assert_eq!(ranges_mm(&shown), slow.beams.iter().map(|b| b.background_mm).collect::<Vec<_>>());
-        assert_eq!((shown.generation, shown.is_frozen()), (generation, slow.frozen));
+        assert_eq!((shown.generation, shown.is_frozen()), (generation, slow.is_frozen));
         assert_eq!(usize::from(shown.known_beams), shown.ranges().iter().filter(|&&r| r != 0).count());
         adopted += u64::from(shown.known_beams);
     }
-    assert!(seen.iter().all(|&n| n > 10_000) && adopted > 2_000, "{seen:?}, {adopted}: nothing was tried");
+    assert!(
+        class_counts.iter().all(|&n| n > 10_000) && adopted > 2_000,
+        "{class_counts:?}, {adopted}: nothing was tried"
+    );
 }
 
 /// A surface as a beam remembers it.
 #[derive(Clone, Copy, Debug)]
-struct Surface {
+struct SlowSurface {
     /// In device units.
-    at: f64,
+    range: f64,
     /// In scans.
     weight: f64,
 }
 
-impl Surface {
+impl SlowSurface {
     fn is_background(&self, scans: f64) -> bool {
         self.weight >= scans * 5.0 / 8.0
     }
 }
 
 /// A far range in device units.
-const FAR: f64 = 1e9;
-const NOTHING: Surface = Surface { at: -FAR, weight: 0.0 };
+const FAR_RANGE: f64 = 1e9;
+const NO_SURFACE: SlowSurface = SlowSurface { range: -FAR_RANGE, weight: 0.0 };
 
-struct SlowMulti {
+struct ReferenceMulti {
     settings: Settings,
-    beams: Vec<[Surface; 3]>,
+    beams: Vec<[SlowSurface; 3]>,
     /// Times in a row that each beam, whenever it told anything, told that nothing came back.
-    lost: Vec<u32>,
+    lost_scans: Vec<u32>,
     /// Foreground beams of the last scan with their readings: all of them, and the reported ones.
-    seen: Vec<(usize, f64)>,
-    told: Vec<(usize, f64)>,
-    frozen: bool,
-    fresh: bool,
+    foreground: Vec<(usize, f64)>,
+    reported: Vec<(usize, f64)>,
+    is_frozen: bool,
+    is_fresh: bool,
     /// Scans that are set, for the last scan.
     scans: f64,
 }
 
-impl SlowMulti {
-    fn new(settings: Settings, count: u16) -> SlowMulti {
-        let beams = vec![[NOTHING; 3]; usize::from(count)];
-        let lost = vec![0; usize::from(count)];
-        SlowMulti {
+impl ReferenceMulti {
+    fn new(settings: Settings, count: u16) -> ReferenceMulti {
+        let beams = vec![[NO_SURFACE; 3]; usize::from(count)];
+        let lost_scans = vec![0; usize::from(count)];
+        ReferenceMulti {
             settings,
             beams,
-            lost,
-            seen: vec![],
-            told: vec![],
-            frozen: false,
-            fresh: true,
+            lost_scans,
+            foreground: vec![],
+            reported: vec![],
+            is_frozen: false,
+            is_fresh: true,
             scans: 0.0,
         }
     }
 
     fn reset(&mut self, count: u16) {
-        *self = SlowMulti { frozen: self.frozen, scans: self.scans, ..SlowMulti::new(self.settings, count) };
+        *self = ReferenceMulti {
+            is_frozen: self.is_frozen,
+            scans: self.scans,
+            ..ReferenceMulti::new(self.settings, count)
+        };
     }
 
     fn load(&mut self, model: &Background) {
         self.reset(model.count);
-        let far = |mm: f64| if mm.is_infinite() { FAR } else { mm / unit_mm(model.unit_um) };
+        let far = |mm: f64| if mm.is_infinite() { FAR_RANGE } else { mm / unit_mm(model.unit_um) };
         ranges_mm(model).into_iter().enumerate().for_each(|(i, mm)| self.adopt(i, far(mm)));
-        self.fresh = false;
+        self.is_fresh = false;
     }
 
-    fn adopt(&mut self, i: usize, at: f64) {
-        if at != 0.0 {
-            self.beams[i] = [Surface { at, weight: f64::INFINITY }, NOTHING, NOTHING];
+    fn adopt(&mut self, i: usize, range: f64) {
+        if range != 0.0 {
+            self.beams[i] = [SlowSurface { range, weight: f64::INFINITY }, NO_SURFACE, NO_SURFACE];
         }
     }
 
     fn nearest(&self, i: usize, scans: f64) -> Option<f64> {
         let known = self.beams[i].iter().filter(|surface| surface.is_background(scans));
-        known.map(|surface| surface.at).min_by(f64::total_cmp)
+        known.map(|surface| surface.range).min_by(f64::total_cmp)
     }
 
     fn update(&mut self, scan: &Scan) -> Vec<Class> {
         let unit_mm = unit_mm(scan.unit_um);
         let far = self.settings.no_return_is_far.unwrap_or(true);
-        let threshold = (apart_at_most_mm(self.settings.threshold_mm, scan) / unit_mm).floor();
+        let threshold = (max_difference_mm(self.settings.threshold_mm, scan) / unit_mm).floor();
         let scans = (750.0 * (1000.0 * scan.step.to_degrees()).round() / 1000.0).ceil();
         let scans = self.settings.scans.map_or(scans, f64::from);
         self.scans = scans;
-        let readings: Vec<Option<f64>> =
-            (0..self.beams.len()).map(|i| Some((reading_mm(scan, i, far)? / unit_mm).min(FAR))).collect();
+        let readings: Vec<Option<f64>> = (0..self.beams.len())
+            .map(|i| Some((reading_mm(scan, i, far)? / unit_mm).min(FAR_RANGE)))
+            .collect();
         let mut classes: Vec<Class> =
             (0..readings.len()).map(|i| self.class(i, readings[i], threshold, scans)).collect();
-        self.believe(&mut classes, &readings, unit_mm, (1000.0 * scan.step.to_degrees()).round());
-        if !self.frozen {
+        self.remove_unconfirmed(&mut classes, &readings, unit_mm, (1000.0 * scan.step.to_degrees()).round());
+        if !self.is_frozen {
             for (i, reading) in readings.iter().enumerate() {
                 let Some(reading) = *reading else { continue };
-                let lost = if reading == FAR { 0 } else { std::mem::take(&mut self.lost[i]) };
-                self.lost[i] += u32::from(reading == FAR);
+                let lost = if reading == FAR_RANGE { 0 } else { std::mem::take(&mut self.lost_scans[i]) };
+                self.lost_scans[i] += u32::from(reading == FAR_RANGE);
                 let gain = f64::from(lost + 1).min((scans / 16.0).floor().clamp(1.0, 16.0));
                 learn(&mut self.beams[i], reading, gain, threshold, scans);
-                if self.fresh && self.settings.start == Start::FirstScan {
+                if self.is_fresh && self.settings.start == Start::FirstScan {
                     self.adopt(i, reading);
                 }
             }
-            self.fresh = false;
+            self.is_fresh = false;
         }
         classes
     }
 
     fn class(&self, i: usize, reading: Option<f64>, threshold: f64, scans: f64) -> Class {
         let Some(reading) = reading else { return Class::Invalid };
-        let meets = |surface: &&Surface| (surface.at - reading).abs() <= threshold;
+        let meets = |surface: &&SlowSurface| (surface.range - reading).abs() <= threshold;
         if let Some(nearest) = self.nearest(i, scans) {
             return match reading {
                 _ if self.beams[i].iter().filter(meets).any(|surface| surface.is_background(scans)) => {
@@ -295,60 +308,67 @@ impl SlowMulti {
     }
 
     /// Removes foreground that is not confirmed.
-    fn believe(&mut self, classes: &mut [Class], readings: &[Option<f64>], unit_mm: f64, step_mdeg: f64) {
-        let seen: Vec<(usize, f64)> = (0..classes.len())
+    fn remove_unconfirmed(
+        &mut self,
+        classes: &mut [Class],
+        readings: &[Option<f64>],
+        unit_mm: f64,
+        step_mdeg: f64,
+    ) {
+        let foreground: Vec<(usize, f64)> = (0..classes.len())
             .filter(|&i| classes[i] == Class::Foreground)
             .map(|i| (i, readings[i].expect("only readings are in the foreground")))
             .collect();
-        let mut told = Vec::new();
+        let mut reported = Vec::new();
         // Two belong to one run if there is nothing but codes between them.
         let codes = |from: usize, to: usize| (from + 1..to).all(|i| readings[i].is_none());
-        for run in seen.chunk_by(|a, b| codes(a.0, b.0)) {
+        for run in foreground.chunk_by(|a, b| codes(a.0, b.0)) {
             let (first, last) = (run[0].0, run[run.len() - 1].0);
-            let nearest = run.iter().map(|beam| beam.1).fold(FAR, f64::min);
-            let there = |before: &[(usize, f64)]| {
+            let nearest = run.iter().map(|beam| beam.1).fold(FAR_RANGE, f64::min);
+            let continues = |before: &[(usize, f64)]| {
                 before.iter().any(|&(i, range)| {
                     i + 1 >= first && i <= last + 1 && (range - nearest).abs() * unit_mm <= 200.0
                 })
             };
             let beam_mm = nearest * unit_mm * step_mdeg / 57_296.0;
             let leg = (135.0 / beam_mm).floor().clamp(1.0, 3.0);
-            let is_believed =
-                run.len() >= 3 || there(&self.told) || run.len() as f64 >= leg && there(&self.seen);
-            match is_believed {
-                true => told.extend_from_slice(run),
+            let is_confirmed = run.len() >= 3
+                || continues(&self.reported)
+                || run.len() as f64 >= leg && continues(&self.foreground);
+            match is_confirmed {
+                true => reported.extend_from_slice(run),
                 false => run.iter().for_each(|&(i, _)| classes[i] = Class::Unknown),
             }
         }
-        (self.seen, self.told) = (seen, told);
+        (self.foreground, self.reported) = (foreground, reported);
     }
 }
 
-fn learn(surfaces: &mut [Surface; 3], reading: f64, gain: f64, threshold: f64, scans: f64) {
+fn learn(surfaces: &mut [SlowSurface; 3], reading: f64, gain: f64, threshold: f64, scans: f64) {
     surfaces.iter_mut().for_each(|surface| surface.weight = surface.weight.min(scans));
-    let apart = |number: &usize| (surfaces[*number].at - reading).abs();
+    let apart = |number: &usize| (surfaces[*number].range - reading).abs();
     let met = (0..3).filter(|number| apart(number) <= threshold).min_by(|a, b| apart(a).total_cmp(&apart(b)));
     for (number, surface) in surfaces.iter_mut().enumerate() {
         if Some(number) == met {
             surface.weight = (surface.weight + gain).min(scans);
-            surface.at += ((reading - surface.at) / 16.0).trunc();
+            surface.range += ((reading - surface.range) / 16.0).trunc();
         } else {
-            let leak = if reading > surface.at { 0.5 } else { 0.125 };
+            let leak = if reading > surface.range { 0.5 } else { 0.125 };
             surface.weight = (surface.weight - leak).max(0.0);
             if surface.weight == 0.0 {
-                *surface = NOTHING;
+                *surface = NO_SURFACE;
             }
         }
     }
-    let least = (0..3).min_by(|&a, &b| surfaces[a].weight.total_cmp(&surfaces[b].weight)).expect("three");
-    if met.is_none() && surfaces[least].weight < scans / 4.0 {
-        surfaces[least] = Surface { at: reading, weight: gain };
+    let weakest = (0..3).min_by(|&a, &b| surfaces[a].weight.total_cmp(&surfaces[b].weight)).expect("three");
+    if met.is_none() && surfaces[weakest].weight < scans / 4.0 {
+        surfaces[weakest] = SlowSurface { range: reading, weight: gain };
     }
 }
 
 #[test]
 fn multi_is_identical_beam_by_beam() {
-    let mut seen = [0_u64; 5];
+    let mut class_counts = [0_u64; 5];
     for seed in 0..12 {
         let mut random = fastrand::Rng::with_seed(seed);
         let settings = Settings {
@@ -359,9 +379,9 @@ fn multi_is_identical_beam_by_beam() {
             no_return_is_far: any_choice(&mut random),
             ..Settings::default()
         };
-        let mut surroundings = Surroundings::new(Shape::any(&mut random), seed);
-        let mut model = Model::new(settings, BEAMS);
-        let mut slow = SlowMulti::new(settings, surroundings.shape.count);
+        let mut surroundings = RandomSurroundings::new(Shape::any(&mut random), seed);
+        let mut model = BackgroundModel::new(settings, MAX_TEST_BEAMS);
+        let mut slow = ReferenceMulti::new(settings, surroundings.shape.count);
         let mut generation = 0;
         for number in 0..2_000 {
             match random.u16(..1_500) {
@@ -378,11 +398,11 @@ fn multi_is_identical_beam_by_beam() {
                 }
                 2 => {
                     model.freeze();
-                    slow.frozen = true;
+                    slow.is_frozen = true;
                 }
                 3..7 => {
                     model.thaw();
-                    slow.frozen = false;
+                    slow.is_frozen = false;
                 }
                 _ => {}
             }
@@ -391,19 +411,19 @@ fn multi_is_identical_beam_by_beam() {
             let dirt = random.u8(..);
             let place = &format_args!("seed {seed}, scan {number}, {settings:?}");
             check_scan(&mut model, &scan, &classes, generation, dirt, place);
-            classes.iter().for_each(|&class| seen[class as usize] += 1);
+            classes.iter().for_each(|&class| class_counts[class as usize] += 1);
         }
-        let mut shown = Background::zeroed(Background::len(BEAMS));
-        model.show(&mut shown);
+        let mut shown = Background::zeroed(Background::len(MAX_TEST_BEAMS));
+        model.write(&mut shown);
         for (i, &range) in shown.ranges().iter().enumerate() {
             let known: Vec<f64> =
-                slow.beams[i].iter().filter(|s| s.is_background(slow.scans)).map(|s| s.at).collect();
-            let at = if range == Background::FAR { FAR } else { f64::from(range) };
+                slow.beams[i].iter().filter(|s| s.is_background(slow.scans)).map(|s| s.range).collect();
+            let at = if range == Background::FAR { FAR_RANGE } else { f64::from(range) };
             // A surface at 0 looks like none.
             assert!(known.contains(&at) || range == 0 && known.is_empty(), "beam {i}: {range}, {known:?}");
         }
     }
-    assert!(seen.iter().all(|&n| n > 10_000), "{seen:?}: nothing was tried");
+    assert!(class_counts.iter().all(|&n| n > 10_000), "{class_counts:?}: nothing was tried");
 }
 
 /// Both methods that learn a background.
@@ -413,13 +433,13 @@ fn scan(count: usize, unit_mm: u32, range: u16) -> Box<Scan> {
     Scan::of(ScanHead::lms(count, 0, 500, unit_mm, 13), &vec![range; count])
 }
 
-fn model(method: Method) -> Model {
-    Model::new(Settings { method, scans: Some(8), ..Settings::default() }, BEAMS)
+fn model(method: Method) -> BackgroundModel {
+    BackgroundModel::new(Settings { method, scans: Some(8), ..Settings::default() }, MAX_TEST_BEAMS)
 }
 
-fn shown(model: &Model) -> Box<Background> {
-    let mut background = Background::of_bytes(&[0xA5; Background::len(BEAMS)]);
-    model.show(&mut background);
+fn background_of(model: &BackgroundModel) -> Box<Background> {
+    let mut background = Background::of_bytes(&[0xA5; Background::len(MAX_TEST_BEAMS)]);
+    model.write(&mut background);
     background
 }
 
@@ -431,7 +451,7 @@ fn with(model: &Background, change: impl FnOnce(&mut BackgroundHead)) -> Box<Bac
 }
 
 /// Passes `scan` to `model` this number of times, and returns the last foreground.
-fn look(model: &mut Model, scan: &Scan, times: usize) -> Box<Foreground> {
+fn update_times(model: &mut BackgroundModel, scan: &Scan, times: usize) -> Box<Foreground> {
     let mut out = Foreground::of(scan.beams());
     (0..times).for_each(|_| model.update(scan, &mut out));
     out
@@ -441,34 +461,37 @@ fn look(model: &mut Model, scan: &Scan, times: usize) -> Box<Foreground> {
 fn learned_compared_frozen_thawed_and_reset() {
     for method in METHODS {
         let mut model = model(method);
-        assert_eq!((model.classes(), shown(&model)), (&[][..], Box::default()));
-        look(&mut model, &scan(361, 1, 3_000), 8);
-        let known = shown(&model);
+        assert_eq!((model.classes(), background_of(&model)), (&[][..], Box::default()));
+        update_times(&mut model, &scan(361, 1, 3_000), 8);
+        let known = background_of(&model);
         assert_eq!((known.count, known.known_beams, known.generation, known.unit_um), (361, 361, 0, 1000));
         assert!(known.ranges().iter().all(|&range| range == 3_000) && known.ranges().len() == 361);
 
         model.freeze();
-        let out = look(&mut model, &scan(361, 1, 2_000), 100);
+        let out = update_times(&mut model, &scan(361, 1, 2_000), 100);
         assert_eq!((out.beams, out.ranges()[360], out.ranges().len()), (361, 2_000, 361));
-        assert_eq!(shown(&model), with(&known, |head| head.flags = Background::FROZEN));
-        look(&mut model, &scan(361, 1, 4_000), 1);
+        assert_eq!(background_of(&model), with(&known, |head| head.flags = Background::FROZEN));
+        update_times(&mut model, &scan(361, 1, 4_000), 1);
         assert!(model.is_frozen() && model.classes().iter().all(|&class| class == Class::Behind));
         model.thaw();
-        look(&mut model, &scan(361, 1, 2_000), 8);
-        assert_eq!(look(&mut model, &scan(361, 1, 2_000), 1).beams, 0);
+        update_times(&mut model, &scan(361, 1, 2_000), 8);
+        assert_eq!(update_times(&mut model, &scan(361, 1, 2_000), 1).beams, 0);
 
         model.reset();
-        assert_eq!((model.generation(), shown(&model).known_beams, shown(&model).count), (1, 0, 361));
-        assert_eq!(look(&mut model, &scan(361, 1, 1_000), 1).generation, 1);
+        assert_eq!(
+            (model.generation(), background_of(&model).known_beams, background_of(&model).count),
+            (1, 0, 361)
+        );
+        assert_eq!(update_times(&mut model, &scan(361, 1, 1_000), 1).generation, 1);
         assert!(model.classes().iter().all(|&class| class == Class::Unknown));
     }
 }
 
 #[test]
-fn another_shape_begins_anew() {
+fn changed_scan_layout_resets_the_background() {
     for method in METHODS {
         let mut model = model(method);
-        look(&mut model, &scan(361, 1, 3_000), 20);
+        update_times(&mut model, &scan(361, 1, 3_000), 20);
         let mut generation = 0;
         let mut finer = scan(361, 1, 3_000);
         finer.step /= 2.0;
@@ -476,10 +499,10 @@ fn another_shape_begins_anew() {
         turned.first_angle = -1.0;
         for other in [scan(181, 1, 3_000), scan(181, 10, 300), scan(361, 1, 3_000), finer, turned] {
             generation += 1;
-            assert_eq!(look(&mut model, &other, 1).generation, generation);
-            assert_eq!((shown(&model).known_beams, shown(&model).count), (0, other.count));
-            look(&mut model, &other, 20);
-            assert_eq!((model.generation(), shown(&model).known_beams), (generation, other.count));
+            assert_eq!(update_times(&mut model, &other, 1).generation, generation);
+            assert_eq!((background_of(&model).known_beams, background_of(&model).count), (0, other.count));
+            update_times(&mut model, &other, 20);
+            assert_eq!((model.generation(), background_of(&model).known_beams), (generation, other.count));
         }
     }
 }
@@ -495,53 +518,58 @@ fn a_saved_model_is_taken_if_it_fits() {
         // Before the first scan.
         let mut early = model(method);
         early.load(&saved).unwrap();
-        assert_eq!(shown(&early), with(&saved, |head| (head.generation, head.known_beams) = (1, 360)));
-        let out = look(&mut early, &scan(361, 1, 1_000), 1);
+        assert_eq!(
+            background_of(&early),
+            with(&saved, |head| (head.generation, head.known_beams) = (1, 360))
+        );
+        let out = update_times(&mut early, &scan(361, 1, 1_000), 1);
         assert_eq!((out.generation, out.beams), (1, 360));
 
         // It does not fit the first scan, so the model drops it.
         let mut wrong = model(method);
         wrong.load(&saved).unwrap();
-        assert_eq!(look(&mut wrong, &scan(181, 1, 1_000), 1).generation, 2);
-        assert_eq!((shown(&wrong).known_beams, shown(&wrong).count), (0, 181));
+        assert_eq!(update_times(&mut wrong, &scan(181, 1, 1_000), 1).generation, 2);
+        assert_eq!((background_of(&wrong).known_beams, background_of(&wrong).count), (0, 181));
 
         // Later it is refused, and the model stays what it was.
-        let before = shown(&wrong);
+        let before = background_of(&wrong);
         let refusal = wrong.load(&saved).unwrap_err();
         assert_eq!(refusal, Mismatch { model: (361, 1000), sensor: (181, 1000) });
         assert_eq!(
             wrong.load(&short(10_000)).unwrap_err().to_string(),
             "the model has 181 beams in units of 10 mm, the sensor's scans have 181 beams in units of 1 mm"
         );
-        assert_eq!(shown(&wrong), before);
+        assert_eq!(background_of(&wrong), before);
         wrong.load(&short(1000)).unwrap();
-        assert_eq!((wrong.generation(), shown(&wrong).known_beams), (3, 180));
+        assert_eq!((wrong.generation(), background_of(&wrong).known_beams), (3, 180));
     }
 }
 
 #[test]
 fn the_first_scan_may_be_the_background() {
     for method in METHODS {
-        let mut model =
-            Model::new(Settings { method, start: Start::FirstScan, ..Settings::default() }, BEAMS);
-        look(&mut model, &scan(361, 1, 3_000), 1);
+        let mut model = BackgroundModel::new(
+            Settings { method, start: Start::FirstScan, ..Settings::default() },
+            MAX_TEST_BEAMS,
+        );
+        update_times(&mut model, &scan(361, 1, 3_000), 1);
         assert!(
             model.classes().iter().all(|&class| class == Class::Unknown),
             "compared before it is learned"
         );
-        assert_eq!(shown(&model).known_beams, 361);
-        assert_eq!(look(&mut model, &scan(361, 1, 2_000), 1).beams, 361);
+        assert_eq!(background_of(&model).known_beams, 361);
+        assert_eq!(update_times(&mut model, &scan(361, 1, 2_000), 1).beams, 361);
         model.reset();
-        look(&mut model, &scan(361, 1, 2_000), 1);
-        assert_eq!(look(&mut model, &scan(361, 1, 2_000), 1).beams, 0, "after a reset as well");
-        assert!(shown(&model).ranges().iter().all(|&range| range == 2_000));
+        update_times(&mut model, &scan(361, 1, 2_000), 1);
+        assert_eq!(update_times(&mut model, &scan(361, 1, 2_000), 1).beams, 0, "after a reset as well");
+        assert!(background_of(&model).ranges().iter().all(|&range| range == 2_000));
     }
 }
 
 /// A wall that returns 15 % of the beams is learned in 20 s. A person who stands there for 5 s is not, even if some
 /// beams that meet the person are lost.
 #[test]
-fn a_wall_seldom_seen_is_learned_and_who_stands_there_is_not() {
+fn learns_faint_wall_but_not_a_standing_person() {
     let mut random = fastrand::Rng::with_seed(3);
     let mut some = |share: f64, range: u16| {
         let mut scan = scan(361, 1, 8191);
@@ -550,16 +578,16 @@ fn a_wall_seldom_seen_is_learned_and_who_stands_there_is_not() {
         }
         scan
     };
-    let mut model = Model::new(Settings::default(), BEAMS);
-    (0..750).for_each(|_| _ = look(&mut model, &some(0.15, 5_000), 1));
-    let wall = look(&mut model, &some(1.0, 5_000), 1).beams;
-    let before_it = look(&mut model, &some(1.0, 3_000), 1).beams;
+    let mut model = BackgroundModel::new(Settings::default(), MAX_TEST_BEAMS);
+    (0..750).for_each(|_| _ = update_times(&mut model, &some(0.15, 5_000), 1));
+    let wall = update_times(&mut model, &some(1.0, 5_000), 1).beams;
+    let before_it = update_times(&mut model, &some(1.0, 3_000), 1).beams;
     assert!(wall < 10 && before_it == 361, "{wall} beams of the wall, {before_it} before it");
 
-    let mut model = Model::new(Settings::default(), BEAMS);
-    look(&mut model, &some(0.0, 0), 600);
-    (0..187).for_each(|_| _ = look(&mut model, &some(0.97, 3_000), 1));
-    let standing = look(&mut model, &some(1.0, 3_000), 1).beams;
+    let mut model = BackgroundModel::new(Settings::default(), MAX_TEST_BEAMS);
+    update_times(&mut model, &some(0.0, 0), 600);
+    (0..187).for_each(|_| _ = update_times(&mut model, &some(0.97, 3_000), 1));
+    let standing = update_times(&mut model, &some(1.0, 3_000), 1).beams;
     assert!(standing > 355, "{standing} beams");
 }
 
@@ -579,25 +607,26 @@ fn no_scan_makes_it_panic() {
                 no_return_is_far: Some(random.bool()),
                 ..Settings::default()
             };
-            let mut model = Model::new(settings, BEAMS);
-            let mut cutter = Segmenter::new(Pose { x_m: f64::NAN, y_m: f64::MAX, ..Pose::default() }, BEAMS);
-            let mut bytes = [0_u8; Scan::len(BEAMS + 20, 1)];
+            let mut model = BackgroundModel::new(settings, MAX_TEST_BEAMS);
+            let mut cutter =
+                Segmenter::new(Pose { x_m: f64::NAN, y_m: f64::MAX, ..Pose::default() }, MAX_TEST_BEAMS);
+            let mut bytes = [0_u8; Scan::len(MAX_TEST_BEAMS + 20, 1)];
             for _ in 0..40 {
                 // A sensor keeps the shape of its scans for a while, however odd it is.
                 let from = if random.u8(..8) == 0 { 0 } else { Scan::HEAD };
                 random.fill(&mut bytes[from..]);
                 let scan = Scan::of_bytes(&bytes);
-                let dirty = || Foreground::of_bytes(&[0xFF; Foreground::len(BEAMS)]);
+                let dirty = || Foreground::of_bytes(&[0xFF; Foreground::len(MAX_TEST_BEAMS)]);
                 let mut out = dirty();
                 model.update(&scan, &mut out);
-                assert_eq!(model.classes().len(), scan.beams().min(BEAMS));
+                assert_eq!(model.classes().len(), scan.beams().min(MAX_TEST_BEAMS));
                 assert_eq!(out.readings().count(), usize::from(out.beams));
                 cutter.update(&scan, &mut out);
                 let mut foreign = dirty();
-                foreign.count = BEAMS as u16;
+                foreign.count = MAX_TEST_BEAMS as u16;
                 cutter.update(&scan, &mut foreign);
                 let _ = model.load(&Background::of_bytes(&bytes));
-                shown(&model);
+                background_of(&model);
             }
         }
     }

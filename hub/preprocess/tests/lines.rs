@@ -3,8 +3,8 @@
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
 use fastrand::Rng;
-use scanhub_preprocess::lines::{LineFinder, Settings, Stop};
-use scanhub_schema::{Code, Contents, Line, Lines, Pose, Scan, ScanHead};
+use scanhub_preprocess::lines::{LineFinder, Settings, StopCriterion};
+use scanhub_schema::{ArrayFlags, Code, Line, Lines, Pose, Scan, ScanHead};
 
 fn head(count: usize, first_angle: f64, step: f64) -> ScanHead {
     let no_return = Code::NoReturn.value();
@@ -112,7 +112,7 @@ fn slow_line(beams: &[(f64, f64)]) -> f64 {
 }
 
 /// The least sum of squares of `count` lines: all cuts are tried.
-fn slow(scan: &Scan, count: usize) -> f64 {
+fn reference_match(scan: &Scan, count: usize) -> f64 {
     let beams: Vec<(f64, f64)> =
         (0..scan.beams()).filter_map(|i| Some((scan.angle(i), scan.distance_m(i)?))).collect();
     let n = beams.len();
@@ -132,7 +132,7 @@ fn slow(scan: &Scan, count: usize) -> f64 {
 }
 
 /// The sum of squares of what was found, and beams on it.
-fn error(scan: &Scan, lines: &Lines) -> (f64, usize) {
+fn fit_error(scan: &Scan, lines: &Lines) -> (f64, usize) {
     let (mut sum, mut beams) = (0.0, 0);
     for line in lines.lines() {
         for beam in usize::from(line.first)..=line.last.into() {
@@ -150,17 +150,17 @@ fn all_cuts_find_little_better() {
     let (mut plain, mut refined, mut best) = (0.0, 0.0, 0.0);
     for seed in 0..12 {
         let scan = star(seed, 60);
-        let stop = Stop::Number(f64::INFINITY);
+        let stop = StopCriterion::Number(f64::INFINITY);
         let settings = Settings { max: 8, min_points: 2, refine: false, stop };
-        let (of_plain, beams) = error(&scan, &find(&scan, Pose::default(), settings));
+        let (of_plain, beams) = fit_error(&scan, &find(&scan, Pose::default(), settings));
         assert_eq!(beams, 60, "all end on a line");
         let refine = Settings { refine: true, ..settings };
-        let (of_refined, beams) = error(&scan, &find(&scan, Pose::default(), refine));
+        let (of_refined, beams) = fit_error(&scan, &find(&scan, Pose::default(), refine));
         assert!(
             beams >= 57 && of_refined <= 1.000_1 * of_plain,
             "one in twenty may be left out, {beams} are not: {of_refined} of {of_plain}"
         );
-        let of_best = slow(&scan, 8);
+        let of_best = reference_match(&scan, 8);
         assert!(of_plain >= 0.999 * of_best, "nothing is better than the best: {of_plain}, {of_best}");
         plain += of_plain.sqrt();
         refined += of_refined.sqrt();
@@ -169,7 +169,7 @@ fn all_cuts_find_little_better() {
     assert!(plain < 1.25 * best && refined < 1.1 * best, "{plain}, {refined}, best {best}");
 }
 
-fn near(one: f32, two: f64, tolerance: f64) -> bool {
+fn is_near(one: f32, two: f64, tolerance: f64) -> bool {
     (f64::from(one) - two).abs() < tolerance
 }
 
@@ -192,7 +192,7 @@ fn a_room_has_four_lines_and_its_corners() {
             let lines = find(&scan, pose, Settings { refine, ..Settings::default() });
             // The wall that beam 0 looks at is cut there.
             assert_eq!((lines.lines().len(), lines.corners().len()), (5, 4), "{lines:?}");
-            assert!(near(lines.noise_m, 0.01, 0.002), "{}", lines.noise_m);
+            assert!(is_near(lines.noise_m, 0.01, 0.002), "{}", lines.noise_m);
             assert!(usize::from(lines.on_lines) >= 98 * count / 100 && usize::from(lines.readings) == count);
             for corner in lines.corners() {
                 // Back into the sensor's frame.
@@ -238,9 +238,9 @@ fn a_line_says_how_well_it_is_known() {
         let mean = found.iter().map(|line| f64::from(of(line))).sum::<f64>() / count;
         (found.iter().map(|line| (f64::from(of(line)) - mean).powi(2)).sum::<f64>() / (count - 1.0)).sqrt()
     };
-    let said = |of: fn(&Line) -> f32| found.iter().map(|line| f64::from(of(line))).sum::<f64>() / count;
+    let reported = |of: fn(&Line) -> f32| found.iter().map(|line| f64::from(of(line))).sum::<f64>() / count;
     let (r, alpha) = (spread(|line| line.r_m), spread(|line| line.alpha_rad));
-    let (said_r, said_alpha) = (said(|line| line.sd_r_m), said(|line| line.sd_alpha_rad));
+    let (said_r, said_alpha) = (reported(|line| line.sd_r_m), reported(|line| line.sd_alpha_rad));
     assert!((0.8..1.25).contains(&(said_r / r)), "{said_r} m, and it is {r}");
     assert!((0.8..1.25).contains(&(said_alpha / alpha)), "{said_alpha}, and it is {alpha}");
 }
@@ -249,7 +249,7 @@ fn a_line_says_how_well_it_is_known() {
 #[test]
 fn exact_angles_are_those_that_count() {
     let mut random = Rng::with_seed(5);
-    let head = ScanHead { contents: Contents::ANGLES, ..head(450, 0.0, -TAU / 450.0) };
+    let head = ScanHead { contents: ArrayFlags::ANGLES, ..head(450, 0.0, -TAU / 450.0) };
     let exact: Vec<f32> =
         (0..450).map(|i| (head.step * (f64::from(i) + 0.8 * (random.f64() - 0.5))) as f32).collect();
     let ranges: Vec<u16> = exact.iter().map(|&angle| (1000.0 * room(angle.into())).round() as u16).collect();
@@ -277,10 +277,13 @@ fn keys_are_kept_to() {
     assert!(!long.lines().is_empty() && long.lines().len() < all.lines().len(), "{long:?}");
 }
 
-fn is_sound(lines: &Lines, scan: &Scan, settings: &Settings) {
+fn assert_sound(lines: &Lines, scan: &Scan, settings: &Settings) {
     let payload = &mut [0; 4096];
-    let len = scanhub_schema::datagram::Packed::pack(lines, payload).unwrap();
-    assert!(<Lines as scanhub_schema::datagram::Packed>::room(&payload[..len]).is_some(), "{lines:?}");
+    let len = scanhub_schema::datagram::DatagramPayload::pack(lines, payload).unwrap();
+    assert!(
+        <Lines as scanhub_schema::datagram::DatagramPayload>::room(&payload[..len]).is_some(),
+        "{lines:?}"
+    );
     assert!(lines.count <= settings.max && usize::from(lines.readings) <= scan.beams());
     assert_eq!(lines.lines().iter().map(|line| line.points).sum::<u16>(), lines.on_lines);
     assert!(lines.lines().windows(2).all(|pair| pair[0].last < pair[1].first));
@@ -309,7 +312,7 @@ fn input_that_says_nothing() {
             (0..361).map(|_| (random.u8(..10) == 0).then(|| 0.5 + 20.0 * random.f64())).collect();
         let scan = scan(wide, |angle| ranges[((angle + FRAC_PI_2) / wide.step).round() as usize]);
         let lines = find(&scan, Pose::default(), settings);
-        is_sound(&lines, &scan, &settings);
+        assert_sound(&lines, &scan, &settings);
         assert_eq!(lines.count, 0, "{lines:?}");
     }
     // Noise: no line is known to better than its points are.
@@ -318,14 +321,14 @@ fn input_that_says_nothing() {
         let ranges: Vec<f64> = (0..361).map(|_| 3.0 + random.f64()).collect();
         let scan = scan(wide, |angle| Some(ranges[((angle + FRAC_PI_2) / wide.step).round() as usize]));
         let lines = find(&scan, Pose::default(), settings);
-        is_sound(&lines, &scan, &settings);
+        assert_sound(&lines, &scan, &settings);
         assert!(lines.noise_m > 0.1, "{}", lines.noise_m);
         assert!(lines.lines().iter().all(|line| line.sd_r_m > 0.02), "{lines:?}");
     }
     // All at the same distance: a circle, of which short lines are parts.
     let circle = scan(wide, |_| Some(5.0));
     let lines = find(&circle, Pose::default(), settings);
-    is_sound(&lines, &circle, &settings);
+    assert_sound(&lines, &circle, &settings);
     assert!(lines.lines().iter().all(|line| (f64::from(line.r_m) - 5.0).abs() < 0.02), "{lines:?}");
 }
 
@@ -343,7 +346,7 @@ fn any_scan() {
         any.unit_um = [0, 1, 250, 1000, 10_000, u32::MAX][random.usize(..6)];
         any.valid_to = [0xFFEF, 100, 0][random.usize(..3)];
         if random.bool() {
-            any.contents = Contents::ANGLES;
+            any.contents = ArrayFlags::ANGLES;
         }
         if random.u8(..10) == 0 {
             any.step = 0.0;
@@ -379,6 +382,6 @@ fn any_scan() {
         };
         let pose = Pose { x_m: random.f64() - 0.5, yaw_rad: random.f64(), ..Pose::default() };
         let lines = find(&scan, pose, settings);
-        is_sound(&lines, &scan, &settings);
+        assert_sound(&lines, &scan, &settings);
     }
 }

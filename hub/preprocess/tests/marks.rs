@@ -43,7 +43,7 @@ fn assert_mark(scan: &Scan, group: &[Hit], mark: &Mark) {
     let angle: f64 = sum(&|hit| 1000.0 * (scan.first_angle + hit.beam as f64 * scan.step).to_degrees());
     let range: f64 = sum(&|hit| hit.range_mm);
     // The nearest thousandth of a degree and tenth of a millimetre; halves go up.
-    let nearest = |exact: f64, said: f64| (-0.5 - 1e-6..0.5 + 1e-6).contains(&(exact - said));
+    let nearest = |exact: f64, reported: f64| (-0.5 - 1e-6..0.5 + 1e-6).contains(&(exact - reported));
     assert!(nearest(angle / weight, f64::from(mark.angle_mdeg)), "{} {mark:?}", angle / weight);
     assert!(nearest(10.0 * range / weight, f64::from(mark.range_dmm)), "{} {mark:?}", range / weight);
     assert_eq!(f64::from(mark.weight), weight);
@@ -110,7 +110,7 @@ fn marks_are_those_of_the_definition() {
 }
 
 /// Eleven beams at 1 m, a degree apart.
-fn lit(intensities: &[(usize, u8)]) -> Box<Scan> {
+fn scan_with_intensities(intensities: &[(usize, u8)]) -> Box<Scan> {
     let head = ScanHead { intensity_bits: 3, ..ScanHead::lms(11, -1000, 1000, 1, 13) };
     let mut scan = Scan::of(head, &[1000; 11]);
     for &(i, intensity) in intensities {
@@ -127,19 +127,19 @@ fn find(scan: &Scan, settings: Settings) -> Marks {
 
 #[test]
 fn halves_are_rounded_up() {
-    let mut scan = lit(&[(4, 1), (5, 1)]);
+    let mut scan = scan_with_intensities(&[(4, 1), (5, 1)]);
     scan.arrays().ranges[4] = 1001;
     scan.step = 0.001_f64.to_radians();
     let mark = find(&scan, Settings::default()).mark_array[0];
     assert_eq!((mark.angle_mdeg, mark.range_dmm), (-1000 + 5, 10_005));
     // 8/3 and 7/3 degrees after the first.
-    let angle = |beams| find(&lit(beams), Settings::default()).mark_array[0].angle_mdeg;
+    let angle = |beams| find(&scan_with_intensities(beams), Settings::default()).mark_array[0].angle_mdeg;
     assert_eq!((angle(&[(2, 1), (3, 2)]), angle(&[(2, 2), (3, 1)])), (1667, 1333));
 }
 
 #[test]
-fn a_gap_is_counted_anew_after_every_beam_that_joins() {
-    let scan = lit(&[(2, 3), (4, 1), (6, 3), (9, 1)]);
+fn each_joining_beam_restarts_the_gap_count() {
+    let scan = scan_with_intensities(&[(2, 3), (4, 1), (6, 3), (9, 1)]);
     let count = |max_gap| find(&scan, Settings { max_gap, ..Settings::default() }).count;
     assert_eq!((count(0), count(1), count(2)), (4, 2, 1));
     let mark = find(&scan, Settings { max_gap: 1, ..Settings::default() }).mark_array[0];
@@ -148,20 +148,20 @@ fn a_gap_is_counted_anew_after_every_beam_that_joins() {
 
 #[test]
 fn without_reflector_bits_nothing_is_known() {
-    let mut scan = lit(&[(4, 1)]);
+    let mut scan = scan_with_intensities(&[(4, 1)]);
     scan.intensity_bits = 0;
     let out = find(&scan, Settings::default());
     assert_eq!((out.count, out.is_available()), (0, false));
     scan.intensity_bits = 3;
     scan.contents = 0;
     assert!(!find(&scan, Settings::default()).is_available());
-    let nothing = find(&lit(&[]), Settings::default());
+    let nothing = find(&scan_with_intensities(&[]), Settings::default());
     assert_eq!((nothing.count, nothing.is_available()), (0, true), "nothing there is something known");
 }
 
 /// A turn of eight beams at 1 m, with these intensities, each an eighth of a beam behind its middle.
-fn turn(intensities: [u8; 8]) -> Box<Scan> {
-    let mut scan = Scan::of(ScanHead::turning(Family::Ld, 8), &[1000; 8]);
+fn revolution(intensities: [u8; 8]) -> Box<Scan> {
+    let mut scan = Scan::of(ScanHead::of_revolution(Family::Ld, 8), &[1000; 8]);
     let step = scan.step;
     let arrays = scan.arrays();
     arrays.upper.copy_from_slice(&intensities);
@@ -174,7 +174,7 @@ fn turn(intensities: [u8; 8]) -> Box<Scan> {
 
 #[test]
 fn counts_of_any_surface_are_marks_from_a_level_on() {
-    let scan = turn([3, 90, 240, 255, 241, 239, 0, 7]);
+    let scan = revolution([3, 90, 240, 255, 241, 239, 0, 7]);
     let none = find(&scan, Settings::default());
     assert_eq!((none.count, none.is_available(), none.lacks_level()), (0, false, true));
     let settings = Settings { level: Some(240), min_level: 7, ..Settings::PAPER };
@@ -183,16 +183,16 @@ fn counts_of_any_surface_are_marks_from_a_level_on() {
     let mark = found.mark_array[0];
     assert_eq!((mark.first_beam, mark.last_beam, mark.peak, mark.weight), (2, 4, 255, 240 + 255 + 241));
     // A level is not for reflector levels, and these are not for it.
-    let lms = find(&lit(&[(4, 3)]), Settings { level: Some(5), ..Settings::PAPER });
+    let lms = find(&scan_with_intensities(&[(4, 3)]), Settings { level: Some(5), ..Settings::PAPER });
     assert_eq!((lms.count, lms.is_available(), lms.lacks_level()), (1, true, false));
-    assert_eq!(find(&lit(&[(4, 3)]), settings).count, 0);
+    assert_eq!(find(&scan_with_intensities(&[(4, 3)]), settings).count, 0);
 }
 
 #[test]
 fn a_mark_is_at_the_exact_angles() {
     let angle = |intensities| {
         let settings = Settings { level: Some(100), ..Settings::PAPER };
-        f64::from(find(&turn(intensities), settings).mark_array[0].angle_mdeg) / 1000.0
+        f64::from(find(&revolution(intensities), settings).mark_array[0].angle_mdeg) / 1000.0
     };
     let near = |angle: f64, expected: f64| assert!((angle - expected).abs() < 1e-3, "{angle} {expected}");
     near(angle([0, 0, 100, 100, 0, 0, 0, 0]), -45.0 * (2.5 + 0.125));

@@ -7,40 +7,40 @@ use std::f64::consts::PI;
 
 use drives::{Drive, beams_at, normal, scan};
 use fastrand::Rng;
-use scanhub_preprocess::motion::{MotionEstimator, Rigid, Settings};
-use scanhub_schema::{Contents, Motion, MotionMethod, Pose, Scan};
+use scanhub_preprocess::motion::{MotionEstimator, Pose2, Settings};
+use scanhub_schema::{ArrayFlags, Motion, MotionMethod, Pose, Scan};
 
 /// What is said of each of `scans`; what was in the payload before does not stay.
-fn follow(scans: &[Box<Scan>], pose: Pose, settings: Settings) -> Vec<Motion> {
+fn estimate_motion(scans: &[Box<Scan>], pose: Pose, settings: Settings) -> Vec<Motion> {
     let beams = scans.iter().map(|scan| scan.beams()).max().unwrap_or(0);
     let mut estimator = MotionEstimator::new(pose, settings, beams);
-    let say = |(number, scan): (usize, &Scan)| {
+    let estimate = |(number, scan): (usize, &Scan)| {
         let mut motion: Motion = bytemuck::Zeroable::zeroed();
         bytemuck::bytes_of_mut(&mut motion).fill(0xA5);
         estimator.update(scan, drives::stamp_ns(number), 0, &mut motion);
         motion
     };
-    scans.iter().map(|scan| &**scan).enumerate().map(say).collect()
+    scans.iter().map(|scan| &**scan).enumerate().map(estimate).collect()
 }
 
-fn step(motion: &Motion) -> Rigid {
-    Rigid::new(motion.dx_m.into(), motion.dy_m.into(), motion.dyaw_rad.into())
+fn step(motion: &Motion) -> Pose2 {
+    Pose2::new(motion.dx_m.into(), motion.dy_m.into(), motion.dyaw_rad.into())
 }
 
 /// Metres and radians apart.
-fn apart(one: &Rigid, other: &Rigid) -> (f64, f64) {
+fn pose_difference(one: &Pose2, other: &Pose2) -> (f64, f64) {
     let between = one.inverse().then(other);
     (between.x.hypot(between.y), between.yaw.abs())
 }
 
 /// The place of `now` on `kept` by all pairs of points: each point is drawn to the line through the nearest one and its
 /// neighbours, near ones more than far ones.
-fn slow(kept: &Scan, now: &Scan) -> Rigid {
+fn reference_match(reference: &Scan, now: &Scan) -> Pose2 {
     let points = |scan: &Scan| -> Vec<(f64, f64)> {
         let of = |i: usize| Some((scan.distance_m(i)?, scan.angle(i)));
         (0..scan.beams()).filter_map(of).map(|(r, a)| (r * a.cos(), r * a.sin())).collect()
     };
-    let (kept, now) = (points(kept), points(now));
+    let (kept, now) = (points(reference), points(now));
     // Through seven neighbours each: the direction of least spread, found by trying many.
     let normal_at = |at: usize| -> (f64, f64) {
         let near = &kept[at.saturating_sub(3)..(at + 4).min(kept.len())];
@@ -54,7 +54,7 @@ fn slow(kept: &Scan, now: &Scan) -> Rigid {
         (best.cos(), best.sin())
     };
     let normals: Vec<(f64, f64)> = (0..kept.len()).map(normal_at).collect();
-    let cost = |place: &Rigid| -> f64 {
+    let cost = |place: &Pose2| -> f64 {
         let off = |point: &(f64, f64)| {
             let (x, y) = place.point(*point);
             let square = |at: usize| (kept[at].0 - x).powi(2) + (kept[at].1 - y).powi(2);
@@ -65,7 +65,7 @@ fn slow(kept: &Scan, now: &Scan) -> Rigid {
         };
         now.iter().map(off).sum()
     };
-    let (mut place, mut width) = (Rigid::default(), 0.05);
+    let (mut place, mut width) = (Pose2::default(), 0.05);
     let mut best = cost(&place);
     while width > 2e-5 {
         let mut is_better = false;
@@ -77,7 +77,7 @@ fn slow(kept: &Scan, now: &Scan) -> Rigid {
             (0.0, 0.0, 0.4),
             (0.0, 0.0, -0.4),
         ] {
-            let next = Rigid::new(place.x + width * x, place.y + width * y, place.yaw + width * yaw);
+            let next = Pose2::new(place.x + width * x, place.y + width * y, place.yaw + width * yaw);
             let of_next = cost(&next);
             if of_next < best {
                 (place, best, is_better) = (next, of_next, true);
@@ -94,33 +94,33 @@ fn slow(kept: &Scan, now: &Scan) -> Rigid {
 fn steps_are_those_of_a_slow_version_and_of_the_truth() {
     for seed in 0..4 {
         let drive = Drive::through_a_room(seed, 181, 2, 0.01);
-        let found = follow(&drive.scans, Pose::default(), Settings::default());
-        let truth = drive.places[0].inverse().then(&drive.places[1]);
-        let (slow, found) = (slow(&drive.scans[0], &drive.scans[1]), step(&found[1]));
-        let (of_slow, of_truth) = (apart(&slow, &found), apart(&truth, &found));
+        let found = estimate_motion(&drive.scans, Pose::default(), Settings::default());
+        let truth = drive.poses[0].inverse().then(&drive.poses[1]);
+        let (slow, found) = (reference_match(&drive.scans[0], &drive.scans[1]), step(&found[1]));
+        let (of_slow, of_truth) = (pose_difference(&slow, &found), pose_difference(&truth, &found));
         assert!(of_slow.0 < 0.01 && of_slow.1 < 0.004, "{seed}: {slow:?} {found:?}");
         assert!(of_truth.0 < 0.008 && of_truth.1 < 0.003, "{seed}: {truth:?} {found:?}");
     }
 }
 
 #[test]
-fn steps_add_up_to_the_pose_and_their_errors_are_as_great_as_is_said() {
+fn steps_sum_to_the_pose_with_right_covariance() {
     let (mut squares, mut steps) = (0.0, 0);
     for seed in 0..5 {
         let drive = Drive::through_a_room(seed, 361, 150, 0.01);
-        let found = follow(&drive.scans, Pose::default(), Settings::default());
-        assert_eq!((found[0].how(), found[0].has_pose()), (MotionMethod::First, true));
-        let mut sum = Rigid::default();
+        let found = estimate_motion(&drive.scans, Pose::default(), Settings::default());
+        assert_eq!((found[0].method(), found[0].has_pose()), (MotionMethod::First, true));
+        let mut sum = Pose2::default();
         for (at, motion) in found.iter().enumerate().skip(1) {
             assert!(
                 motion.has_step() && motion.overlap > 0.6 && !motion.is_degenerate(),
                 "{seed} {at}: {motion:?}"
             );
             sum = sum.then(&step(motion));
-            let pose = Rigid::new(motion.x_m, motion.y_m, motion.yaw_rad);
-            let (metres, radians) = apart(&sum, &pose);
+            let pose = Pose2::new(motion.x_m, motion.y_m, motion.yaw_rad);
+            let (metres, radians) = pose_difference(&sum, &pose);
             assert!(metres < 1e-4 && radians < 1e-4, "{seed} {at}: {sum:?} {pose:?}");
-            let truth = drive.places[at - 1].inverse().then(&drive.places[at]);
+            let truth = drive.poses[at - 1].inverse().then(&drive.poses[at]);
             let off = step(motion);
             let off = [off.x - truth.x, off.y - truth.y, off.yaw - truth.yaw];
             for (k, off) in off.iter().enumerate() {
@@ -128,8 +128,8 @@ fn steps_add_up_to_the_pose_and_their_errors_are_as_great_as_is_said() {
                 steps += 1;
             }
         }
-        let truth = drive.places[0].inverse().then(&drive.places[drive.places.len() - 1]);
-        let (metres, radians) = apart(&truth, &sum);
+        let truth = drive.poses[0].inverse().then(&drive.poses[drive.poses.len() - 1]);
+        let (metres, radians) = pose_difference(&truth, &sum);
         assert!(metres < 0.08 && radians < 0.03, "{seed}: {truth:?} {sum:?}");
     }
     let mean = squares / f64::from(steps);
@@ -138,7 +138,7 @@ fn steps_add_up_to_the_pose_and_their_errors_are_as_great_as_is_said() {
 
 /// Returns the square of `off` in standard deviations of `covariance`. Its mean is 3 if the covariance is right. It is NaN if the
 /// covariance is not positive definite.
-fn normalized(off: [f64; 3], covariance: &[f32; 9]) -> f64 {
+fn normalized(error: [f64; 3], covariance: &[f32; 9]) -> f64 {
     let (mut lower, mut whitened) = ([[0.0; 3]; 3], [0.0; 3]);
     for i in 0..3 {
         for j in 0..=i {
@@ -147,7 +147,7 @@ fn normalized(off: [f64; 3], covariance: &[f32; 9]) -> f64 {
             lower[i][j] = if i == j { rest.sqrt() } else { rest / lower[j][j] };
         }
         let sum: f64 = (0..i).map(|k| lower[i][k] * whitened[k]).sum();
-        whitened[i] = (off[i] - sum) / lower[i][i];
+        whitened[i] = (error[i] - sum) / lower[i][i];
     }
     whitened.iter().map(|value| value * value).sum()
 }
@@ -157,11 +157,11 @@ fn normalized(off: [f64; 3], covariance: &[f32; 9]) -> f64 {
 fn errors_of_sums(drives: impl Iterator<Item = Drive>) -> (f64, f64) {
     let (mut squares, mut within, mut count) = (0.0, 0.0, 0.0);
     for drive in drives {
-        let found = follow(&drive.scans, Pose::default(), Settings::default());
+        let found = estimate_motion(&drive.scans, Pose::default(), Settings::default());
         let last = found.last().unwrap();
         let covariance = last.sum_covariance().expect("a valid sum");
-        let truth = drive.places[0].inverse().then(&drive.places[drive.places.len() - 1]);
-        let yaw = Rigid::new(0.0, 0.0, last.yaw_rad - truth.yaw).yaw;
+        let truth = drive.poses[0].inverse().then(&drive.poses[drive.poses.len() - 1]);
+        let yaw = Pose2::new(0.0, 0.0, last.yaw_rad - truth.yaw).yaw;
         let off = [last.x_m - truth.x, last.y_m - truth.y, yaw];
         squares += normalized(off, covariance) / 3.0;
         let is_within =
@@ -174,10 +174,10 @@ fn errors_of_sums(drives: impl Iterator<Item = Drive>) -> (f64, f64) {
 
 /// All positions of a robot that stands are found on the same scan, so the covariance does not grow with the number of steps.
 #[test]
-fn covariance_of_the_sum_is_right_for_a_robot_that_stands() {
+fn pose_covariance_is_right_while_standing() {
     let standing = (1000..1100).map(|seed| {
         let mut drive = Drive::through_a_room(seed, 361, 1, 0.01);
-        drive.stand(30);
+        drive.stand_still(30);
         drive
     });
     let (square, within) = errors_of_sums(standing);
@@ -189,7 +189,7 @@ fn covariance_of_the_sum_is_right_for_a_robot_that_stands() {
 }
 
 #[test]
-fn covariance_of_the_sum_is_not_too_small_for_a_robot_that_drives() {
+fn pose_covariance_is_not_too_small_while_driving() {
     for (name, drive) in [
         ("room", (|seed| Drive::through_a_room(seed, 361, 50, 0.01)) as fn(u64) -> Drive),
         ("furniture", |seed| Drive::through_furniture(seed, 50, 3, 0.02)),
@@ -204,17 +204,17 @@ fn covariance_of_the_sum_is_not_too_small_for_a_robot_that_drives() {
 #[test]
 fn a_turn_during_the_scans_is_measured() {
     for (seed, deg_per_s) in [(101, 45.0), (102, 90.0), (103, 180.0)] {
-        let count = (270.0 / deg_per_s / drives::PERIOD_S) as usize;
+        let count = (270.0 / deg_per_s / drives::SCAN_PERIOD_S) as usize;
         let drive = Drive::on_the_spot(seed, count, deg_per_s);
-        let found = follow(&drive.scans, Pose::default(), Settings::default());
+        let found = estimate_motion(&drive.scans, Pose::default(), Settings::default());
         let (mut sum, mut truth) = (0.0, 0.0);
         let mut errors = Vec::new();
         for (at, motion) in found.iter().enumerate().skip(1) {
             assert!(motion.has_step(), "{deg_per_s} {at}: {motion:?}");
-            let turn = drive.places[at - 1].inverse().then(&drive.places[at]).yaw.to_degrees();
+            let yaw_deg = drive.poses[at - 1].inverse().then(&drive.poses[at]).yaw.to_degrees();
             let of_scan = f64::from(motion.dyaw_rad).to_degrees();
-            (sum, truth) = (sum + of_scan, truth + turn);
-            errors.push((of_scan - turn).abs());
+            (sum, truth) = (sum + of_scan, truth + yaw_deg);
+            errors.push((of_scan - yaw_deg).abs());
         }
         errors.sort_by(f64::total_cmp);
         let median = errors[errors.len() / 2];
@@ -227,13 +227,13 @@ fn a_turn_during_the_scans_is_measured() {
 #[test]
 fn a_robot_that_is_already_fast_is_corrected_too() {
     let mut drive = Drive::through_furniture(7, 0, 0, 0.0);
-    drive.on(40, 0.08);
+    drive.drive_on(40, 0.08);
     drive.scans.remove(0);
-    drive.places.remove(0);
-    let found = follow(&drive.scans, Pose::default(), Settings::default());
+    drive.poses.remove(0);
+    let found = estimate_motion(&drive.scans, Pose::default(), Settings::default());
     let off = |at: usize| {
-        let truth = drive.places[at - 1].inverse().then(&drive.places[at]);
-        let (metres, _) = apart(&truth, &step(&found[at]));
+        let truth = drive.poses[at - 1].inverse().then(&drive.poses[at]);
+        let (metres, _) = pose_difference(&truth, &step(&found[at]));
         metres
     };
     let mut errors: Vec<f64> = (4..found.len()).map(off).collect();
@@ -245,16 +245,16 @@ fn a_robot_that_is_already_fast_is_corrected_too() {
 /// A robot turns at 120 degrees/s, and moves by 0.2 m between two scans. Either a person has carried it and it stands now, or it
 /// was pushed and still turns. Both scans must be corrected by the right velocity, because the later steps use them.
 #[test]
-fn a_robot_that_was_carried_or_pushed_is_corrected_by_the_right_velocity() {
+fn carried_or_pushed_robot_uses_the_right_velocity() {
     for deg_per_s in [0.0, 120.0] {
         for seed in 0..20 {
             let mut drive = Drive::turning(seed, 30, 120.0);
-            drive.carry(Rigid::new(0.14, 0.14, 0.0), deg_per_s);
+            drive.move_by(Pose2::new(0.14, 0.14, 0.0), deg_per_s);
             drive.turn(10, deg_per_s);
-            let found = follow(&drive.scans, Pose::default(), Settings::default());
+            let found = estimate_motion(&drive.scans, Pose::default(), Settings::default());
             for (at, motion) in found.iter().enumerate().skip(30) {
-                let truth = drive.places[at - 1].inverse().then(&drive.places[at]);
-                let (meters, radians) = apart(&truth, &step(motion));
+                let truth = drive.poses[at - 1].inverse().then(&drive.poses[at]);
+                let (meters, radians) = pose_difference(&truth, &step(motion));
                 let degrees = radians.to_degrees();
                 assert!(
                     motion.has_step() && meters < 0.02 && degrees < 0.3,
@@ -266,9 +266,9 @@ fn a_robot_that_was_carried_or_pushed_is_corrected_by_the_right_velocity() {
 }
 
 #[test]
-fn a_sensor_anywhere_on_the_robot_tells_the_same() {
+fn motion_does_not_depend_on_the_mounting_pose() {
     let drive = Drive::through_a_room(7, 361, 30, 0.002);
-    let own = follow(&drive.scans, Pose::default(), Settings::default());
+    let own = estimate_motion(&drive.scans, Pose::default(), Settings::default());
     let mut random = Rng::with_seed(1);
     for _ in 0..6 {
         let pose = Pose {
@@ -279,15 +279,15 @@ fn a_sensor_anywhere_on_the_robot_tells_the_same() {
             ..Pose::default()
         };
         // What the sensor turns and moves, as seen from the robot that it sits on.
-        let seat = Rigid::new(pose.x_m, pose.y_m, pose.yaw_rad);
-        let found = follow(&drive.scans, pose, Settings::default());
+        let seat = Pose2::new(pose.x_m, pose.y_m, pose.yaw_rad);
+        let found = estimate_motion(&drive.scans, pose, Settings::default());
         for (one, other) in own.iter().zip(&found).skip(1) {
             let mut of_sensor = step(one);
             if pose.upside_down != 0 {
-                of_sensor = Rigid::new(of_sensor.x, -of_sensor.y, -of_sensor.yaw);
+                of_sensor = Pose2::new(of_sensor.x, -of_sensor.y, -of_sensor.yaw);
             }
             let expected = seat.then(&of_sensor).then(&seat.inverse());
-            let (metres, radians) = apart(&expected, &step(other));
+            let (metres, radians) = pose_difference(&expected, &step(other));
             assert!(metres < 0.004 && radians < 0.003, "{pose:?}: {expected:?} {other:?}");
         }
     }
@@ -296,8 +296,8 @@ fn a_sensor_anywhere_on_the_robot_tells_the_same() {
 #[test]
 fn a_robot_that_stands_does_not_drift() {
     let mut drive = Drive::through_a_room(3, 361, 1, 0.01);
-    drive.stand(600);
-    let found = follow(&drive.scans, Pose::default(), Settings::default());
+    drive.stand_still(600);
+    let found = estimate_motion(&drive.scans, Pose::default(), Settings::default());
     let last = found.last().unwrap();
     assert!(last.x_m.hypot(last.y_m) < 0.006 && last.yaw_rad.abs() < 0.003, "{last:?}");
 }
@@ -305,7 +305,7 @@ fn a_robot_that_stands_does_not_drift() {
 #[test]
 fn a_corridor_leaves_its_direction_open() {
     let drive = Drive::along_a_corridor(5, 361, 60);
-    let found = follow(&drive.scans, Pose::default(), Settings::default());
+    let found = estimate_motion(&drive.scans, Pose::default(), Settings::default());
     for motion in &found[1..] {
         assert!(motion.has_step() && motion.is_degenerate(), "{motion:?}");
         let [along, across] = [0, 4].map(|at| motion.covariance[at].sqrt());
@@ -314,13 +314,13 @@ fn a_corridor_leaves_its_direction_open() {
 }
 
 #[test]
-fn a_jump_is_refused_and_what_follows_goes_on() {
+fn refuses_a_jump_and_continues_afterwards() {
     for seed in 0..5 {
         let mut drive = Drive::through_a_room(seed, 361, 40, 0.01);
         let mut other = Drive::through_a_room(seed + 100, 361, 40, 0.01);
         drive.scans.append(&mut other.scans);
-        let found = follow(&drive.scans, Pose::default(), Settings::default());
-        let methods: Vec<MotionMethod> = found.iter().map(Motion::how).collect();
+        let found = estimate_motion(&drive.scans, Pose::default(), Settings::default());
+        let methods: Vec<MotionMethod> = found.iter().map(Motion::method).collect();
         let refused: Vec<usize> =
             (0..found.len()).filter(|&at| methods[at] == MotionMethod::Refused).collect();
         assert_eq!(refused, [40], "{seed}: {methods:?}");
@@ -343,11 +343,11 @@ fn people_around_the_robot_do_not_carry_it_away() {
     for seed in 0..4 {
         for (of, people) in off.iter_mut().zip([0, 7]) {
             let drive = Drive::among_people(seed, 361, 80, people);
-            let found = follow(&drive.scans, Pose::default(), Settings::default());
+            let found = estimate_motion(&drive.scans, Pose::default(), Settings::default());
             for (at, motion) in found.iter().enumerate().skip(1) {
                 assert!(motion.has_step(), "{seed} {people} {at}: {motion:?}");
-                let truth = drive.places[at - 1].inverse().then(&drive.places[at]);
-                of.push(apart(&truth, &step(motion)).0);
+                let truth = drive.poses[at - 1].inverse().then(&drive.poses[at]);
+                of.push(pose_difference(&truth, &step(motion)).0);
             }
         }
     }
@@ -359,7 +359,7 @@ fn people_around_the_robot_do_not_carry_it_away() {
 }
 
 #[test]
-fn what_says_nothing_is_refused_and_never_sure() {
+fn uninformative_scans_are_refused_or_uncertain() {
     let drive = Drive::through_a_room(2, 361, 60, 0.01);
     let mut random = Rng::with_seed(9);
     // Nine of ten beams have no reading, then all, then the robot is lifted: everything is near, then elsewhere.
@@ -381,13 +381,13 @@ fn what_says_nothing_is_refused_and_never_sure() {
             }
         }
     }
-    let found = follow(&scans, Pose::default(), Settings::default());
+    let found = estimate_motion(&scans, Pose::default(), Settings::default());
     for (at, motion) in found.iter().enumerate().take(41).skip(20) {
-        assert_eq!(motion.how(), MotionMethod::Refused, "{at}: {motion:?}");
+        assert_eq!(motion.method(), MotionMethod::Refused, "{at}: {motion:?}");
     }
     for at in (1..20).chain(42..60) {
         if found[at].has_step() {
-            let truth = drive.places[at - 1].inverse().then(&drive.places[at]);
+            let truth = drive.poses[at - 1].inverse().then(&drive.poses[at]);
             let off = step(&found[at]);
             for (k, off) in [off.x - truth.x, off.y - truth.y, off.yaw - truth.yaw].into_iter().enumerate() {
                 let variance = f64::from(found[at].covariance[4 * k]);
@@ -408,7 +408,7 @@ fn a_step_from_an_open_position_is_open_too() {
         let ranges = drive.scans[30].arrays().ranges;
         ranges[..120].fill(no_return);
         ranges[150..].fill(no_return);
-        let found = follow(&drive.scans, Pose::default(), Settings::default());
+        let found = estimate_motion(&drive.scans, Pose::default(), Settings::default());
         if !found[30].is_degenerate() || !found[31].has_step() {
             continue;
         }
@@ -436,7 +436,7 @@ fn any_scan_is_answered_with_numbers() {
         let scans: Vec<Box<Scan>> = (0..6)
             .map(|_| {
                 let count = random.usize(..300);
-                let contents = if random.bool() { Contents::ANGLES } else { 0 };
+                let contents = if random.bool() { ArrayFlags::ANGLES } else { 0 };
                 let step = [0.0, 0.01, -0.02, 0.3, f64::MIN_POSITIVE][random.usize(..5)];
                 let head =
                     scanhub_schema::ScanHead { contents, ..beams_at(count, 3.0 * random.f64() - 1.5, step) };
@@ -449,7 +449,7 @@ fn any_scan_is_answered_with_numbers() {
                 scan
             })
             .collect();
-        for motion in follow(&scans, pose, Settings::default()) {
+        for motion in estimate_motion(&scans, pose, Settings::default()) {
             let numbers = [motion.x_m, motion.y_m, motion.yaw_rad];
             assert!(numbers.iter().all(|number| number.is_finite()), "{motion:?}");
             let numbers = [motion.dx_m, motion.dy_m, motion.dyaw_rad, motion.overlap];
@@ -461,7 +461,7 @@ fn any_scan_is_answered_with_numbers() {
 }
 
 #[test]
-fn a_turn_by_one_beam_is_seen_by_a_scanner_of_a_whole_turn() {
+fn full_circle_scanner_detects_turn_by_one_beam() {
     let mut random = Rng::with_seed(4);
     let at = |yaw: f64, random: &mut Rng| {
         scan(beams_at(360, -PI, PI / 180.0), |angle| {
@@ -472,8 +472,8 @@ fn a_turn_by_one_beam_is_seen_by_a_scanner_of_a_whole_turn() {
         })
     };
     let scans: Vec<Box<Scan>> = (0..20).map(|i| at(f64::from(i) * PI / 180.0, &mut random)).collect();
-    for motion in &follow(&scans, Pose::default(), Settings::default())[1..] {
-        let (metres, radians) = apart(&Rigid::new(0.0, 0.0, PI / 180.0), &step(motion));
+    for motion in &estimate_motion(&scans, Pose::default(), Settings::default())[1..] {
+        let (metres, radians) = pose_difference(&Pose2::new(0.0, 0.0, PI / 180.0), &step(motion));
         assert!(metres < 0.006 && radians < 0.003, "{motion:?}");
     }
 }

@@ -8,14 +8,14 @@ use std::collections::{HashMap, HashSet};
 
 use drives::Drive;
 use fastrand::Rng;
-use scanhub_preprocess::background::{Candidate, Class, Method, Model, Settings, Start};
+use scanhub_preprocess::background::{BackgroundModel, Candidate, Class, Method, Settings, Start};
 use scanhub_preprocess::lines::LineFinder;
-use scanhub_preprocess::motion::{MotionEstimator, Rigid};
+use scanhub_preprocess::motion::{MotionEstimator, Pose2};
 use scanhub_preprocess::velocity::Velocity;
 use scanhub_preprocess::{lines, motion};
 use scanhub_schema::{Background, Foreground, Lines, Motion, MotionMethod, Pose, Scan};
 
-const SETTINGS: Settings = Settings {
+const MAP_SETTINGS: Settings = Settings {
     method: Method::Moving,
     threshold_mm: None,
     candidate_mm: None,
@@ -26,40 +26,40 @@ const SETTINGS: Settings = Settings {
 };
 
 /// Returns the motion of a robot at `place`.
-fn at(place: &Rigid, is_first: bool) -> Motion {
+fn motion_at(pose: &Pose2, is_first: bool) -> Motion {
     let method = if is_first { MotionMethod::First } else { MotionMethod::Both };
-    Motion { x_m: place.x, y_m: place.y, yaw_rad: place.yaw, method: method as u8, ..Motion::default() }
+    Motion { x_m: pose.x, y_m: pose.y, yaw_rad: pose.yaw, method: method as u8, ..Motion::default() }
 }
 
 /// The robot's velocity during the scan with this number.
 fn velocity(drive: &Drive, number: usize) -> Velocity {
-    let step = drive.places[number.saturating_sub(1)].inverse().then(&drive.places[number]);
-    Velocity::of_step((step.x, step.y, step.yaw), drives::PERIOD_S)
+    let step = drive.poses[number.saturating_sub(1)].inverse().then(&drive.poses[number]);
+    Velocity::of_step((step.x, step.y, step.yaw), drives::SCAN_PERIOD_S)
 }
 
 /// The same method, square by square in a map without an end.
 #[derive(Default)]
-struct Slow {
+struct ReferenceModel {
     /// Hits and free of each square.
     squares: HashMap<(i32, i32), (i32, i32)>,
 }
 
-impl Slow {
+impl ReferenceModel {
     fn square(x: f64, y: f64) -> (i32, i32) {
         ((x / 0.05).floor() as i32, (y / 0.05).floor() as i32)
     }
 
-    fn of(&self, (x, y): (i32, i32), (dx, dy): (i32, i32)) -> (i32, i32) {
+    fn count_near(&self, (x, y): (i32, i32), (dx, dy): (i32, i32)) -> (i32, i32) {
         self.squares.get(&(x + dx, y + dy)).copied().unwrap_or_default()
     }
 
     /// What each beam is, without a look at its neighbours.
-    fn update(&mut self, place: &Rigid, velocity: &Velocity, scan: &Scan) -> Vec<Class> {
-        let around =
+    fn update(&mut self, pose: &Pose2, velocity: &Velocity, scan: &Scan) -> Vec<Class> {
+        let neighbors =
             |reach: i32| (-reach..=reach).flat_map(move |dx| (-reach..=reach).map(move |dy| (dx, dy)));
         let place_of = |beam: usize| {
             let (x, y, yaw) = velocity.position(1e-9 * scan.beam_ns(beam) as f64);
-            place.then(&Rigid::new(x, y, yaw))
+            pose.then(&Pose2::new(x, y, yaw))
         };
         let ends: Vec<Option<(f64, f64)>> = (0..scan.beams())
             .map(|i| {
@@ -69,18 +69,20 @@ impl Slow {
             .collect();
         let class = |end: &Option<(f64, f64)>| {
             let Some((x, y)) = *end else { return Class::Invalid };
-            let end = Slow::square(x, y);
+            let end = ReferenceModel::square(x, y);
             let stands = |(hits, free): (i32, i32)| hits >= 3 && free < 5 || hits >= 100;
-            if around(2).any(|near| stands(self.of(end, near))) {
+            if neighbors(2).any(|near| stands(self.count_near(end, near))) {
                 return Class::Background;
             }
-            let is_free = self.of(end, (0, 0)).1 >= 5 && around(1).all(|near| self.of(end, near).1 >= 2);
+            let is_free = self.count_near(end, (0, 0)).1 >= 5
+                && neighbors(1).all(|near| self.count_near(end, near).1 >= 2);
             if is_free { Class::Foreground } else { Class::Unknown }
         };
         let classes = ends.iter().map(class).collect();
-        let hit: HashSet<(i32, i32)> = ends.iter().flatten().map(|(x, y)| Slow::square(*x, *y)).collect();
+        let hit: HashSet<(i32, i32)> =
+            ends.iter().flatten().map(|(x, y)| ReferenceModel::square(*x, *y)).collect();
         let near: HashSet<(i32, i32)> =
-            hit.iter().flat_map(|(x, y)| around(1).map(move |(dx, dy)| (x + dx, y + dy))).collect();
+            hit.iter().flat_map(|(x, y)| neighbors(1).map(move |(dx, dy)| (x + dx, y + dy))).collect();
         for at in &hit {
             let (hits, free) = self.squares.entry(*at).or_default();
             *hits = (*hits + 1).min(100);
@@ -93,7 +95,7 @@ impl Slow {
             let length = dx.hypot(dy);
             for step in 1..=((length / 0.05 - 2.5).max(0.0) as u32) {
                 let far = 0.05 * f64::from(step) / length;
-                through.insert(Slow::square(place.x + far * dx, place.y + far * dy));
+                through.insert(ReferenceModel::square(place.x + far * dx, place.y + far * dy));
             }
         }
         for at in through.difference(&near) {
@@ -109,13 +111,13 @@ impl Slow {
 fn classes_are_those_of_a_slow_version() {
     for (seed, speed) in [(0, 0.02), (1, 0.02), (2, 0.02), (3, 0.2), (4, 0.2)] {
         let drive = Drive::with_walkers(seed, 361, 160, 3, speed);
-        let (mut model, mut slow) = (Model::new(SETTINGS, 361), Slow::default());
+        let (mut model, mut slow) = (BackgroundModel::new(MAP_SETTINGS, 361), ReferenceModel::default());
         let mut out = Foreground::of(361);
         let (mut same, mut all, mut foreground) = (0, 0, 0);
-        for (number, (scan, place)) in drive.scans.iter().zip(&drive.places).enumerate() {
+        for (number, (scan, place)) in drive.scans.iter().zip(&drive.poses).enumerate() {
             let expected = slow.update(place, &velocity(&drive, number), scan);
             let velocity = velocity(&drive, number);
-            model.follow(&Pose::default(), &at(place, number == 0), &velocity);
+            model.set_motion(&Pose::default(), &motion_at(place, number == 0), &velocity);
             model.update(scan, &mut out);
             for (one, other) in model.classes().iter().zip(&expected) {
                 // Which of the short runs are believed is the runs' business.
@@ -132,14 +134,14 @@ fn classes_are_those_of_a_slow_version() {
 }
 
 /// What is told of persons, what is not, and what else is, from scan `from` on.
-fn told(drive: &Drive, from: usize) -> (usize, usize, usize) {
+fn count_moving(drive: &Drive, from: usize) -> (usize, usize, usize) {
     let mut estimator = MotionEstimator::new(Pose::default(), motion::Settings::default(), 361);
-    let mut model = Model::new(Settings { scans: None, ..SETTINGS }, 361);
+    let mut model = BackgroundModel::new(Settings { scans: None, ..MAP_SETTINGS }, 361);
     let (mut motion, mut out) = (Motion::default(), Foreground::of(361));
     let (mut found, mut missed, mut wrong) = (0, 0, 0);
     for (number, scan) in drive.scans.iter().enumerate() {
         estimator.update(scan, drives::stamp_ns(number), 0, &mut motion);
-        model.follow(&Pose::default(), &motion, &estimator.velocity());
+        model.set_motion(&Pose::default(), &motion, &estimator.velocity());
         model.update(scan, &mut out);
         for (class, person) in model.classes().iter().zip(&drive.people[number]).filter(|_| number >= from) {
             match (person, *class == Class::Foreground) {
@@ -154,10 +156,10 @@ fn told(drive: &Drive, from: usize) -> (usize, usize, usize) {
 }
 
 #[test]
-fn who_walks_is_told_from_a_robot_that_drives() {
+fn distinguishes_walkers_from_a_driving_robot() {
     for seed in 20..22 {
         let drive = Drive::with_walkers(seed, 361, 600, 3, 0.02);
-        let (found, missed, wrong) = told(&drive, 300);
+        let (found, missed, wrong) = count_moving(&drive, 300);
         assert!(found as f64 > 0.8 * (found + missed) as f64, "{seed}: {found} {missed}, edges and all");
         assert!(found as f64 > 0.95 * (found + wrong) as f64, "{seed}: {found} {wrong}");
     }
@@ -168,36 +170,36 @@ fn who_walks_is_told_from_a_robot_that_drives() {
 fn legs_of_chairs_stand_while_people_walk() {
     for seed in 200..203 {
         let drive = Drive::through_furniture(seed, 900, 3, 0.02);
-        let (found, missed, wrong) = told(&drive, 450);
+        let (found, missed, wrong) = count_moving(&drive, 450);
         assert!(found as f64 > 0.8 * (found + missed) as f64, "{seed}: {found} {missed}, edges and all");
         assert!(found as f64 > 0.97 * (found + wrong) as f64, "{seed}: {found} {wrong}");
     }
 }
 
 #[test]
-fn nothing_is_told_where_nobody_walks() {
+fn reports_almost_nothing_in_a_static_scene() {
     let drive = Drive::with_walkers(31, 361, 500, 0, 0.02);
-    let (found, missed, wrong) = told(&drive, 0);
+    let (found, missed, wrong) = count_moving(&drive, 0);
     assert_eq!((found, missed), (0, 0));
     assert!(wrong < 25, "{wrong} in 500 scans");
 }
 
 #[test]
-fn a_place_that_is_not_known_leaves_all_unknown_and_a_new_one_begins_anew() {
+fn unusable_or_new_pose_resets_the_background() {
     let mut drive = Drive::with_walkers(3, 361, 40, 2, 0.0);
-    drive.stand(40);
-    let mut model = Model::new(SETTINGS, 361);
+    drive.stand_still(40);
+    let mut model = BackgroundModel::new(MAP_SETTINGS, 361);
     let mut out = Foreground::of(361);
-    let place = drive.places[0];
+    let place = drive.poses[0];
     for (number, scan) in drive.scans.iter().enumerate() {
         let generation = model.generation();
         let motion = match number {
             20 => Motion { method: MotionMethod::Refused as u8, ..Motion::default() },
-            50 => Motion { x_m: f64::NAN, ..at(&place, false) },
-            70 => at(&place, true),
-            _ => at(&place, number == 0),
+            50 => Motion { x_m: f64::NAN, ..motion_at(&place, false) },
+            70 => motion_at(&place, true),
+            _ => motion_at(&place, number == 0),
         };
-        model.follow(&Pose::default(), &motion, &Velocity::default());
+        model.set_motion(&Pose::default(), &motion, &Velocity::default());
         model.update(scan, &mut out);
         let is_anew = [20, 50, 70].contains(&number);
         assert_eq!(model.generation() != generation, is_anew, "{number}");
@@ -208,17 +210,17 @@ fn a_place_that_is_not_known_leaves_all_unknown_and_a_new_one_begins_anew() {
 }
 
 #[test]
-fn what_it_shows_is_what_stands() {
+fn shows_the_static_scene_as_background() {
     let mut drive = Drive::through_a_room(4, 361, 1, 0.003);
-    drive.stand(30);
-    let mut model = Model::new(SETTINGS, 361);
+    drive.stand_still(30);
+    let mut model = BackgroundModel::new(MAP_SETTINGS, 361);
     let mut out = Foreground::of(361);
     for (number, scan) in drive.scans.iter().enumerate() {
-        model.follow(&Pose::default(), &at(&drive.places[0], number == 0), &Velocity::default());
+        model.set_motion(&Pose::default(), &motion_at(&drive.poses[0], number == 0), &Velocity::default());
         model.update(scan, &mut out);
     }
     let mut shown = Background::zeroed(Background::len(361));
-    model.show(&mut shown);
+    model.write(&mut shown);
     let scan = &drive.scans[0];
     let near = |i: &usize| {
         let (shown, range) = (shown.ranges()[*i], scan.ranges()[*i]);
@@ -236,7 +238,7 @@ fn what_it_shows_is_what_stands() {
 #[test]
 fn any_place_and_any_scan_are_taken() {
     let mut random = Rng::with_seed(5);
-    let mut model = Model::new(SETTINGS, 300);
+    let mut model = BackgroundModel::new(MAP_SETTINGS, 300);
     let mut out = Foreground::of(300);
     for _ in 0..400 {
         let count = random.usize(..=300);
@@ -249,20 +251,20 @@ fn any_place_and_any_scan_are_taken() {
         let (x_m, y_m, yaw_rad) = (number(), number(), number());
         let velocity = Velocity { x: number(), y: number(), yaw: number() };
         let motion = Motion { x_m, y_m, yaw_rad, method: random.u8(..7), ..Motion::default() };
-        model.follow(&Pose { x_m: random.f64(), ..Pose::default() }, &motion, &velocity);
+        model.set_motion(&Pose { x_m: random.f64(), ..Pose::default() }, &motion, &velocity);
         model.update(&scan, &mut out);
         let mut shown = Background::zeroed(Background::len(300));
-        model.show(&mut shown);
+        model.write(&mut shown);
         assert!(usize::from(out.beams) <= count);
     }
 }
 
 /// Ten seconds of an LMS. The default depends on the time of a scan.
-const TEN_SECONDS: Settings = Settings { scans: Some(375), ..SETTINGS };
+const TEN_SECONDS: Settings = Settings { scans: Some(375), ..MAP_SETTINGS };
 
 /// All results of a scan.
 #[derive(PartialEq)]
-struct Said {
+struct ScanResult {
     lines: Lines,
     motion: Motion,
     classes: Vec<Class>,
@@ -270,26 +272,26 @@ struct Said {
 }
 
 /// Returns the results of all scans, in the order of the hub.
-fn follow(scans: &[Box<Scan>]) -> Vec<Said> {
+fn estimate_motion(scans: &[Box<Scan>]) -> Vec<ScanResult> {
     let beams = scans.iter().map(|scan| scan.beams()).max().unwrap_or(0);
     let mut finder = LineFinder::new(Pose::default(), lines::Settings::default(), beams);
     let mut estimator = MotionEstimator::new(Pose::default(), motion::Settings::default(), beams);
-    let mut model = Model::new(TEN_SECONDS, beams);
+    let mut model = BackgroundModel::new(TEN_SECONDS, beams);
     let mut out = Foreground::of(beams);
-    let say = |(number, scan): (usize, &Scan)| {
+    let process = |(number, scan): (usize, &Scan)| {
         let (mut lines, mut motion) = (Lines::default(), Motion::default());
         finder.update(scan, &mut lines);
         estimator.update(scan, drives::stamp_ns(number), 0, &mut motion);
-        model.follow(&Pose::default(), &motion, &estimator.velocity());
+        model.set_motion(&Pose::default(), &motion, &estimator.velocity());
         model.update(scan, &mut out);
         let classes = model.classes().to_vec();
-        Said { lines, motion, classes, foreground: usize::from(out.beams) }
+        ScanResult { lines, motion, classes, foreground: usize::from(out.beams) }
     };
-    scans.iter().map(|scan| &**scan).enumerate().map(say).collect()
+    scans.iter().map(|scan| &**scan).enumerate().map(process).collect()
 }
 
 /// Returns the largest error of the step's three numbers, in reported standard deviations.
-fn deviations(truth: &Rigid, motion: &Motion) -> f64 {
+fn deviations(truth: &Pose2, motion: &Motion) -> f64 {
     let off = [
         f64::from(motion.dx_m) - truth.x,
         f64::from(motion.dy_m) - truth.y,
@@ -300,7 +302,7 @@ fn deviations(truth: &Rigid, motion: &Motion) -> f64 {
 }
 
 /// Each range as `change` says of it and its beam.
-fn changed(scan: &mut Scan, mut change: impl FnMut(usize, f64) -> f64) {
+fn change_ranges(scan: &mut Scan, mut change: impl FnMut(usize, f64) -> f64) {
     let valid_to = scan.valid_to;
     for (i, range) in scan.arrays().ranges.iter_mut().enumerate().filter(|(_, range)| **range <= valid_to) {
         *range = change(i, f64::from(*range)).clamp(1.0, valid_to.into()) as u16;
@@ -309,30 +311,32 @@ fn changed(scan: &mut Scan, mut change: impl FnMut(usize, f64) -> f64) {
 
 /// Higher up a sensor sees other things at other ranges; tilted, less on the one side and more on the other.
 #[test]
-fn who_is_lifted_is_refused_or_unsure() {
+fn lifting_the_scanner_is_refused_or_uncertain() {
     for seed in 0..6 {
         for factor in [0.5, 0.8, 0.95, 1.05, 1.2, 1.6] {
             for tilt in [0.0, 0.4] {
                 let mut drive = Drive::through_a_room(seed, 361, 1, 0.01);
-                drive.stand(59);
+                drive.stand_still(59);
                 for scan in &mut drive.scans[20..30] {
-                    changed(scan, |i, range| range * (factor + tilt * (i as f64 / 360.0 - 0.5)));
+                    change_ranges(scan, |i, range| range * (factor + tilt * (i as f64 / 360.0 - 0.5)));
                 }
-                let said = follow(&drive.scans);
+                let results = estimate_motion(&drive.scans);
                 let place = format!("seed {seed}, {factor} as far, tilt {tilt}");
-                for (at, said) in said.iter().enumerate().skip(1).filter(|(_, said)| said.motion.has_step()) {
-                    let off = deviations(&Rigid::default(), &said.motion);
-                    assert!(off < 5.0, "{place}, scan {at}: off by {off} deviations, {:?}", said.motion);
+                for (at, result) in
+                    results.iter().enumerate().skip(1).filter(|(_, result)| result.motion.has_step())
+                {
+                    let off = deviations(&Pose2::default(), &result.motion);
+                    assert!(off < 5.0, "{place}, scan {at}: off by {off} deviations, {:?}", result.motion);
                 }
-                assert!(said[..20].iter().all(|said| said.foreground == 0), "{place}");
+                assert!(results[..20].iter().all(|result| result.foreground == 0), "{place}");
                 // Where the ranges are quite other ones, there is nothing to be unsure of.
                 if (factor - 1.0_f64).abs() > 0.3 {
                     for at in [20, 30] {
-                        assert_eq!(said[at].motion.how(), MotionMethod::Refused, "{place}, scan {at}");
+                        assert_eq!(results[at].motion.method(), MotionMethod::Refused, "{place}, scan {at}");
                     }
-                    assert!(said.iter().all(|said| said.foreground == 0), "{place}");
+                    assert!(results.iter().all(|result| result.foreground == 0), "{place}");
                 }
-                let last = said.last().unwrap();
+                let last = results.last().unwrap();
                 assert!(last.motion.has_step() && last.motion.overlap > 0.9, "it goes on: {place}");
             }
         }
@@ -353,20 +357,20 @@ fn where_little_returns_nothing_moves() {
                 .filter(|_| random.u8(..10) != 0)
                 .for_each(|range| *range = no_return);
         }
-        let said = follow(&drive.scans);
-        for (at, said) in said.iter().enumerate().skip(1) {
-            if said.motion.has_step() {
-                let truth = drive.places[at - 1].inverse().then(&drive.places[at]);
-                let off = deviations(&truth, &said.motion);
-                assert!(off < 6.0, "{seed} {at}: off by {off} deviations, {:?}", said.motion);
+        let results = estimate_motion(&drive.scans);
+        for (at, result) in results.iter().enumerate().skip(1) {
+            if result.motion.has_step() {
+                let truth = drive.poses[at - 1].inverse().then(&drive.poses[at]);
+                let off = deviations(&truth, &result.motion);
+                assert!(off < 6.0, "{seed} {at}: off by {off} deviations, {:?}", result.motion);
             }
             assert!(
-                usize::from(said.lines.readings) <= 361 && said.foreground <= 4,
+                usize::from(result.lines.readings) <= 361 && result.foreground <= 4,
                 "{seed} {at}: {}",
-                said.foreground
+                result.foreground
             );
         }
-        assert!(said[100..].iter().all(|said| said.motion.has_step()), "{seed}: it goes on");
+        assert!(results[100..].iter().all(|result| result.motion.has_step()), "{seed}: it goes on");
     }
 }
 
@@ -380,11 +384,12 @@ fn impossible_times_of_beams_are_ignored() {
         (scan.beam_time_ns, scan.turn_ns) = (random.u32(..), random.u32(..));
         scan.first_beam_ns = random.i32(..);
     }
-    let said = follow(&jumping.scans);
-    for (at, said) in said.iter().enumerate().skip(1) {
-        let truth = drive.places[at - 1].inverse().then(&drive.places[at]);
-        let off = truth.inverse().then(&Rigid::new(said.motion.dx_m.into(), said.motion.dy_m.into(), 0.0));
-        assert!(said.motion.has_step() && off.x.hypot(off.y) < 0.03, "{at}: {truth:?} {:?}", said.motion);
+    let results = estimate_motion(&jumping.scans);
+    for (at, result) in results.iter().enumerate().skip(1) {
+        let truth = drive.poses[at - 1].inverse().then(&drive.poses[at]);
+        let off =
+            truth.inverse().then(&Pose2::new(result.motion.dx_m.into(), result.motion.dy_m.into(), 0.0));
+        assert!(result.motion.has_step() && off.x.hypot(off.y) < 0.03, "{at}: {truth:?} {:?}", result.motion);
     }
-    assert!(said.iter().any(|said| said.foreground > 0));
+    assert!(results.iter().any(|result| result.foreground > 0));
 }

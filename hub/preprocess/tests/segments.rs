@@ -1,16 +1,16 @@
 //! Segments against a slow version of them: every point by sine and cosine, every distance from two points.
 
 use scanhub_preprocess::segments::Segmenter;
-use scanhub_schema::{Contents, Foreground, ForegroundHead, MAX_SEGMENTS, Pose, Scan, ScanHead, Segment};
+use scanhub_schema::{ArrayFlags, Foreground, ForegroundHead, MAX_SEGMENTS, Pose, Scan, ScanHead, Segment};
 
 /// Beams of every scan here.
-const BEAMS: usize = 401;
+const BEAM_COUNT: usize = 401;
 
 /// A foreground with the beams `ranges`, in the order of the beams.
 fn foreground(ranges: &[(usize, u16)]) -> Box<Foreground> {
-    let mut foreground = Foreground::of_bytes(&vec![0xA5; Foreground::len(BEAMS)]);
+    let mut foreground = Foreground::of_bytes(&vec![0xA5; Foreground::len(BEAM_COUNT)]);
     let head =
-        ForegroundHead { count: BEAMS as u16, beams: ranges.len() as u16, ..ForegroundHead::default() };
+        ForegroundHead { count: BEAM_COUNT as u16, beams: ranges.len() as u16, ..ForegroundHead::default() };
     let arrays = foreground.begin(head);
     arrays.bits.fill(0);
     arrays.ranges.fill(0);
@@ -30,23 +30,23 @@ fn point(scan: &Scan, pose: &Pose, i: usize, range: u16) -> (f64, f64) {
     (1000.0 * pose.x_m + range_mm * angle.cos(), 1000.0 * pose.y_m + range_mm * angle.sin())
 }
 
-fn apart(a: (f64, f64), b: (f64, f64)) -> f64 {
+fn pose_difference(a: (f64, f64), b: (f64, f64)) -> f64 {
     (a.0 - b.0).hypot(a.1 - b.1)
 }
 
 #[test]
 fn segments_are_those_of_the_formula() {
     let mut random = fastrand::Rng::with_seed(3);
-    let mut most = 0;
+    let mut maximum = 0;
     // Of those where it makes a difference.
     let mut others = 0;
     for round in 0..3_000 {
         let is_exact = round % 2 == 1;
         let step_mdeg = [250, 500, 1000][random.usize(..3)];
         let unit_mm = [1, 10, 100][random.usize(..3)];
-        let head = ScanHead::lms(BEAMS, random.i32(-180_000..0), step_mdeg, unit_mm, 13);
-        let contents = head.contents | if is_exact { Contents::ANGLES } else { 0 };
-        let mut scan = Scan::of(ScanHead { contents, ..head }, &[0; BEAMS]);
+        let head = ScanHead::lms(BEAM_COUNT, random.i32(-180_000..0), step_mdeg, unit_mm, 13);
+        let contents = head.contents | if is_exact { ArrayFlags::ANGLES } else { 0 };
+        let mut scan = Scan::of(ScanHead { contents, ..head }, &[0; BEAM_COUNT]);
         let (first_angle, step) = (scan.first_angle, scan.step);
         for (i, exact) in scan.arrays().angles.iter_mut().enumerate() {
             let turns = f64::from(random.i32(-1..=1)) * std::f64::consts::TAU;
@@ -61,7 +61,7 @@ fn segments_are_those_of_the_formula() {
         };
         let (mut range_mm, share) = (2_000.0, 0.3 + 0.7 * random.f64());
         let mut ranges = Vec::new();
-        for i in 0..BEAMS {
+        for i in 0..BEAM_COUNT {
             // Mostly a surface with noise, at times a step that may or may not divide it.
             let step_mm = if random.u8(..8) == 0 { 600.0 } else { 30.0 };
             range_mm = (range_mm + step_mm * (random.f64() - 0.5)).clamp(50.0, 8_000.0);
@@ -76,19 +76,19 @@ fn segments_are_those_of_the_formula() {
             let step = (scan.angle(b.0) - scan.angle(a.0)).rem_euclid(std::f64::consts::TAU);
             let step = if is_exact { step } else { even };
             let range_mm = f64::from(a.1) * f64::from(unit_mm);
-            let apart_mm = apart(point(&scan, &pose, a.0, a.1), point(&scan, &pose, b.0, b.1));
+            let apart_mm = pose_difference(point(&scan, &pose, a.0, a.1), point(&scan, &pose, b.0, b.1));
             a.0 + 1 == b.0 && apart_mm <= limit_mm(range_mm, step)
         };
         let expected: Vec<_> = ranges.chunk_by(together).collect();
-        most = most.max(expected.len());
+        maximum = maximum.max(expected.len());
         if is_exact {
             let mut of_grid = foreground(&ranges);
-            Segmenter::new(pose, BEAMS).update(&Scan::of(head, &[0; BEAMS]), &mut of_grid);
+            Segmenter::new(pose, BEAM_COUNT).update(&Scan::of(head, &[0; BEAM_COUNT]), &mut of_grid);
             others += usize::from(usize::from(of_grid.segments) != expected.len().min(MAX_SEGMENTS));
         }
 
         let mut out = foreground(&ranges);
-        Segmenter::new(pose, BEAMS).update(&scan, &mut out);
+        Segmenter::new(pose, BEAM_COUNT).update(&scan, &mut out);
         assert_eq!(usize::from(out.segments), expected.len().min(MAX_SEGMENTS), "round {round}");
         assert_eq!(usize::from(out.dropped), expected.len().saturating_sub(MAX_SEGMENTS));
         let (used, head) = (out.segments().len(), **out);
@@ -99,26 +99,26 @@ fn segments_are_those_of_the_formula() {
             assert_eq!(Some(segment.nearest), beams.iter().map(|beam| beam.1).min());
             let points = || beams.iter().map(|&(i, range)| point(&scan, &pose, i, range));
             let mean = |part: fn((f64, f64)) -> f64| points().map(part).sum::<f64>() / beams.len() as f64;
-            let width =
-                apart(point(&scan, &pose, first, a), point(&scan, &pose, last, b)) / f64::from(unit_mm);
-            for (told, exact) in [
+            let width = pose_difference(point(&scan, &pose, first, a), point(&scan, &pose, last, b))
+                / f64::from(unit_mm);
+            for (reported, exact) in [
                 (f64::from(segment.width), width),
                 (f64::from(segment.x_mm), mean(|point| point.0)),
                 (f64::from(segment.y_mm), mean(|point| point.1)),
             ] {
-                assert!((told - exact).abs() < 0.5 + 1e-6, "round {round}: {told}, {exact}");
+                assert!((reported - exact).abs() < 0.5 + 1e-6, "round {round}: {reported}, {exact}");
             }
         }
     }
-    assert!(most > MAX_SEGMENTS, "{most} segments at most: none was left out");
+    assert!(maximum > MAX_SEGMENTS, "{maximum} segments at most: none was left out");
     assert!(others > 100, "{others} differ from those of an even grid");
 }
 
 #[test]
-fn other_angles_are_pointed_anew() {
-    let mut cutter = Segmenter::new(Pose::default(), BEAMS);
+fn segment_points_follow_a_change_of_angles() {
+    let mut cutter = Segmenter::new(Pose::default(), BEAM_COUNT);
     let mut x_mm = |first_angle_mdeg, step_mdeg| {
-        let scan = Scan::of(ScanHead::lms(BEAMS, first_angle_mdeg, step_mdeg, 1, 13), &[0; BEAMS]);
+        let scan = Scan::of(ScanHead::lms(BEAM_COUNT, first_angle_mdeg, step_mdeg, 1, 13), &[0; BEAM_COUNT]);
         let mut out = foreground(&[(180, 1_000)]);
         cutter.update(&scan, &mut out);
         (out.segments()[0].x_mm, out.segments()[0].y_mm)
@@ -132,15 +132,15 @@ fn other_angles_are_pointed_anew() {
 #[test]
 fn several_beams_or_the_scan_before_support_a_segment() {
     let mut random = fastrand::Rng::with_seed(27);
-    let (mut supported, mut lonely) = (0, 0);
+    let (mut supported, mut unsupported) = (0, 0);
     for unit_mm in [1, 10] {
         let pose = Pose { x_m: 0.3, y_m: -0.2, yaw_rad: 2.5, ..Pose::default() };
-        let scan = Scan::of(ScanHead::lms(BEAMS, -100_000, 500, unit_mm, 13), &[0; BEAMS]);
-        let mut cutter = Segmenter::new(pose, BEAMS);
+        let scan = Scan::of(ScanHead::lms(BEAM_COUNT, -100_000, 500, unit_mm, 13), &[0; BEAM_COUNT]);
+        let mut cutter = Segmenter::new(pose, BEAM_COUNT);
         let mut before: Vec<(f64, f64)> = Vec::new();
         for round in 0..2_000 {
             let mut ranges = Vec::new();
-            for i in (0..BEAMS).filter(|i| i % 3 != 2) {
+            for i in (0..BEAM_COUNT).filter(|i| i % 3 != 2) {
                 // A beam in two has a neighbour, at a range of its own or at that of a wall.
                 let range_mm = if random.bool() { 2_000 } else { random.u32(500..8_000) };
                 if random.u8(..10) == 0 {
@@ -155,7 +155,8 @@ fn several_beams_or_the_scan_before_support_a_segment() {
             let points: Vec<_> = ranges.iter().map(|&(i, range)| point(&scan, &pose, i, range)).collect();
             for (i, segment) in out.segments().iter().enumerate() {
                 let beam = ranges.iter().position(|&(beam, _)| beam == usize::from(segment.first)).unwrap();
-                let nearest_mm = before.iter().map(|&other| apart(points[beam], other)).reduce(f64::min);
+                let nearest_mm =
+                    before.iter().map(|&other| pose_difference(points[beam], other)).reduce(f64::min);
                 let is_near = nearest_mm.is_some_and(|nearest_mm| nearest_mm < 300.0);
                 // Sine and cosine are not those of the fast one.
                 if nearest_mm.is_some_and(|nearest_mm| (nearest_mm - 300.0).abs() < 1e-6) {
@@ -164,11 +165,14 @@ fn several_beams_or_the_scan_before_support_a_segment() {
                 let expected = segment.first < segment.last || is_near;
                 assert_eq!(out.has_support(i), expected, "{unit_mm} mm, round {round}: {segment:?}");
                 supported += usize::from(expected && segment.first == segment.last);
-                lonely += usize::from(!expected);
+                unsupported += usize::from(!expected);
             }
             assert_eq!(out.supported.checked_shr(out.segments.into()).unwrap_or(0), 0);
             before = points;
         }
     }
-    assert!(supported > 1_000 && lonely > 1_000, "{supported} single beams with support, {lonely} without");
+    assert!(
+        supported > 1_000 && unsupported > 1_000,
+        "{supported} single beams with support, {unsupported} without"
+    );
 }

@@ -6,7 +6,7 @@ mod decoded_scan;
 
 use fastrand::Rng;
 use scanhub_drivers::lms::variant::{Unit, Variant};
-use scanhub_preprocess::background::{Model, Settings as BackgroundSettings};
+use scanhub_preprocess::background::{BackgroundModel, Settings as BackgroundSettings};
 use scanhub_preprocess::lines::{LineFinder, Settings as LineSettings};
 use scanhub_preprocess::marks::{MarkDetector, Settings as MarkSettings};
 use scanhub_preprocess::segments::Segmenter;
@@ -16,7 +16,7 @@ use scanhub_sim::room::BeamTarget;
 use scanhub_sim::room::Room;
 use scanhub_sim::world::World;
 
-const SCAN_NS: u64 = 26_640_000;
+const SCAN_PERIOD_NS: u64 = 26_640_000;
 
 const WORLDS: [&str; 5] = ["room", "fig8", "crowd", "house", "demo"];
 /// A seed that nothing was tuned on.
@@ -34,8 +34,8 @@ fn wide_and_narrow(name: &str) -> [Room; 2] {
 }
 
 /// Returns the scan that the hub publishes, and what its beams met.
-fn look(room: &Room, number: u64) -> (Box<Scan>, Vec<BeamTarget>) {
-    let look = room.labeled_scan(Variant::HALF, Unit::Mm, decoded_scan::MODE, number * SCAN_NS);
+fn update_times(room: &Room, number: u64) -> (Box<Scan>, Vec<BeamTarget>) {
+    let look = room.labeled_scan(Variant::HALF, Unit::Mm, decoded_scan::MODE, number * SCAN_PERIOD_NS);
     (decoded_scan::scan(&look.words, Unit::Mm), look.truth)
 }
 
@@ -43,17 +43,17 @@ fn look(room: &Room, number: u64) -> (Box<Scan>, Vec<BeamTarget>) {
 /// that was put down, moved or taken away.
 fn false_segments(room: &Room) -> [usize; 2] {
     let beams = Variant::HALF.beams();
-    let mut model = Model::new(BackgroundSettings::default(), beams);
+    let mut model = BackgroundModel::new(BackgroundSettings::default(), beams);
     let (mut segmenter, mut foreground) = (Segmenter::new(Pose::default(), beams), Foreground::of(beams));
     let (mut all, mut supported) = (0, 0);
     for number in 1..2_000 {
-        let (scan, met) = look(room, number);
+        let (scan, target) = update_times(room, number);
         model.update(&scan, &mut foreground);
         segmenter.update(&scan, &mut foreground);
         // First, the background is learned.
         for (i, segment) in foreground.segments().iter().enumerate().filter(|_| number >= 600) {
-            let met = &met[usize::from(segment.first)..=usize::from(segment.last)];
-            if met.iter().all(|met| *met == (BeamTarget::Static { since_ns: 0 })) {
+            let target = &target[usize::from(segment.first)..=usize::from(segment.last)];
+            if target.iter().all(|target| *target == (BeamTarget::Static { since_ns: 0 })) {
                 all += 1;
                 supported += usize::from(foreground.has_support(i));
             }
@@ -89,13 +89,13 @@ fn false_lines(room: &Room, exact: &Room) -> [usize; 3] {
     let mut lines = Lines::default();
     let mut counts = [0; 3];
     for number in (1..2_000).step_by(20) {
-        let ((scan, met), (exact, _)) = (look(room, number), look(exact, number));
+        let ((scan, target), (exact, _)) = (update_times(room, number), update_times(exact, number));
         finder.update(&scan, &mut lines);
         for line in lines.lines() {
             let beams = usize::from(line.first)..=usize::from(line.last);
-            if !met[beams.clone()]
+            if !target[beams.clone()]
                 .iter()
-                .all(|met| matches!(met, BeamTarget::Static { .. } | BeamTarget::Invalid))
+                .all(|target| matches!(target, BeamTarget::Static { .. } | BeamTarget::Invalid))
             {
                 continue;
             }
@@ -151,9 +151,9 @@ fn mark_errors(width_mm: f64, range_mm: f64, layers: NoiseModel, random: &mut Rn
     let mut detector = MarkDetector::new(MarkSettings::default());
     let mut marks = Marks::default();
     let (mut of_angle, mut of_range, mut missing) = (0.0, 0.0, 0);
-    for seed in 0..u64::from(TRIALS) {
+    for seed in 0..u64::from(TRIAL_COUNT) {
         let angle_deg = -70.0 + 140.0 * random.f64();
-        let (scan, _) = look(&strip(width_mm, range_mm, angle_deg, layers, seed), 1);
+        let (scan, _) = update_times(&strip(width_mm, range_mm, angle_deg, layers, seed), 1);
         detector.update(&scan, &mut marks);
         match marks.marks() {
             [] => missing += 1,
@@ -164,16 +164,16 @@ fn mark_errors(width_mm: f64, range_mm: f64, layers: NoiseModel, random: &mut Rn
             marks => panic!("{} marks at {range_mm} mm", marks.len()),
         }
     }
-    let rms = |sum: f64| (sum / f64::from(TRIALS - missing)).sqrt();
+    let rms = |sum: f64| (sum / f64::from(TRIAL_COUNT - missing)).sqrt();
     (rms(of_angle), rms(of_range), missing)
 }
 
-const TRIALS: u32 = 1000;
+const TRIAL_COUNT: u32 = 1000;
 
 #[test]
-fn marks_are_exact_to_a_tenth_of_a_degree_and_to_five_millimetres() {
+fn marks_are_accurate_to_0_14_degrees_and_5_mm() {
     let mut random = Rng::with_seed(1);
-    println!("RMS errors of marks and scans without one, {TRIALS} scans each; beams without width");
+    println!("RMS errors of marks and scans without one, {TRIAL_COUNT} scans each; beams without width");
     for range_m in 1..=8 {
         for width_mm in [50.0, 100.0] {
             let layers = NoiseModel::default();

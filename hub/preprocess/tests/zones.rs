@@ -5,8 +5,8 @@
 mod scans;
 
 use fastrand::Rng;
-use scanhub_preprocess::zones::{Check, Sector, Settings, Warning};
-use scanhub_schema::{Code, Contents, Pose, Scan, ScanHead, Verdict, Zones};
+use scanhub_preprocess::zones::{Sector, Settings, Warning, ZoneChecker};
+use scanhub_schema::{ArrayFlags, Code, Pose, Scan, ScanHead, Verdict, Zones};
 
 /// One random configuration.
 struct Case {
@@ -36,8 +36,8 @@ impl Case {
         Case { pose: scans::pose(random), settings }
     }
 
-    fn check(&self) -> Check {
-        Check::new(self.pose, &self.settings, 401)
+    fn check(&self) -> ZoneChecker {
+        ZoneChecker::new(self.pose, &self.settings, 401)
     }
 
     /// Direction of a beam and what the robot's own body takes of it, in mm.
@@ -72,14 +72,14 @@ impl Case {
     }
 
     /// A reading by the formula is inside.
-    fn violates(&self, u: [f64; 2], own: f64, range: f64, radius: f64) -> bool {
+    fn violates(&self, u: [f64; 2], own_range: f64, range: f64, radius: f64) -> bool {
         let (lo, hi) = self.chord(u, radius);
-        range >= own && range < hi && (!self.settings.exact || lo == 0.0 || range > lo)
+        range >= own_range && range < hi && (!self.settings.exact || lo == 0.0 || range > lo)
     }
 
     /// There is a reading of the scan's kind that would be inside the largest circle: the shortest one beyond the
     /// robot's own body and the circle's near side, if any.
-    fn tells(&self, scan: &Scan, u: [f64; 2], own: f64) -> bool {
+    fn can_violate(&self, scan: &Scan, u: [f64; 2], own: f64) -> bool {
         let (unit, radius) = (scans::unit_mm(scan), f64::from(self.settings.radii_mm[0]));
         let shortest = (own.max(self.chord(u, radius).0) / unit).floor();
         let values = [shortest, shortest + 1.0].into_iter().filter(|value| *value < f64::from(max(scan) - 8));
@@ -125,37 +125,37 @@ fn max(scan: &Scan) -> u16 {
 }
 
 /// What a beam tells, from its word: a range in mm, that nothing is near, or nothing.
-enum Told {
+enum BeamReading {
     Range(f64),
     Far,
     Nothing,
 }
 
-fn told(scan: &Scan, i: usize, no_return_is_far: bool) -> Told {
+fn count_moving(scan: &Scan, i: usize, no_return_is_far: bool) -> BeamReading {
     match max(scan) - scan.ranges()[i] {
-        8 => Told::Far,
-        0 if no_return_is_far => Told::Far,
-        0..8 => Told::Nothing,
-        _ => Told::Range(f64::from(scan.ranges()[i]) * scans::unit_mm(scan)),
+        8 => BeamReading::Far,
+        0 if no_return_is_far => BeamReading::Far,
+        0..8 => BeamReading::Nothing,
+        _ => BeamReading::Range(f64::from(scan.ranges()[i]) * scans::unit_mm(scan)),
     }
 }
 
 /// The formula and geometry over one scan: asserts what `out` says of it, but for the verdict.
-fn compare(case: &Case, scan: &Scan, out: &Zones) -> Tally {
-    let mut tally = Tally::default();
+fn compare(case: &Case, scan: &Scan, out: &Zones) -> CaseTally {
+    let mut tally = CaseTally::default();
     let mut beams = vec![0; case.settings.radii_mm.len()];
     let mut geometric = vec![(0, 0); case.settings.radii_mm.len()];
     let (mut invalid, mut telling) = (0_u16, 0_u16);
     let mut nearest: Option<(f64, usize)> = None;
     for i in 0..usize::from(scan.count) {
         let (u, own) = case.beam(scan, i);
-        let tells = case.tells(scan, u, own);
-        telling += u16::from(tells);
-        let range = match told(scan, i, case.settings.no_return_is_far) {
-            Told::Range(range) => range,
-            Told::Far => continue,
-            Told::Nothing => {
-                invalid += u16::from(tells);
+        let can_violate = case.can_violate(scan, u, own);
+        telling += u16::from(can_violate);
+        let range = match count_moving(scan, i, case.settings.no_return_is_far) {
+            BeamReading::Range(range) => range,
+            BeamReading::Far => continue,
+            BeamReading::Nothing => {
+                invalid += u16::from(can_violate);
                 continue;
             }
         };
@@ -168,14 +168,17 @@ fn compare(case: &Case, scan: &Scan, out: &Zones) -> Tally {
         }
         let [x, y] = case.sensor_mm();
         let distance = (x + range * u[0]).hypot(y + range * u[1]);
-        if range >= own && nearest.is_none_or(|(least, _)| distance < least) {
+        if range >= own && nearest.is_none_or(|(smallest, _)| distance < smallest) {
             nearest = Some((distance, i));
         }
     }
     for (zone, (&beams, &(surely, perhaps))) in beams.iter().zip(&geometric).enumerate() {
-        let said = out.zones()[zone].beams;
-        assert_eq!(said, beams, "circle {zone}");
-        assert!((surely..=perhaps).contains(&said), "circle {zone}: {said}, not {surely} to {perhaps}");
+        let reported = out.zones()[zone].beams;
+        assert_eq!(reported, beams, "circle {zone}");
+        assert!(
+            (surely..=perhaps).contains(&reported),
+            "circle {zone}: {reported}, not {surely} to {perhaps}"
+        );
         tally.sure += u32::from(surely == perhaps);
         tally.close += u32::from(surely != perhaps);
     }
@@ -185,13 +188,16 @@ fn compare(case: &Case, scan: &Scan, out: &Zones) -> Tally {
     tally.unknown = tally.blind || tally.invalid;
     match (nearest, out.nearest()) {
         (None, None) => {}
-        (Some((distance, i)), Some((beam, said))) => {
-            assert_eq!(f64::from(said), (distance + 1e-6).floor(), "nearest");
+        (Some((distance, i)), Some((beam, reported))) => {
+            assert_eq!(f64::from(reported), (distance + 1e-6).floor(), "nearest");
             let [x, y] = case.sensor_mm();
             let (u, _) = case.beam(scan, usize::from(beam));
             let range = f64::from(scan.ranges()[usize::from(beam)]) * scans::unit_mm(scan);
-            let there = (x + range * u[0]).hypot(y + range * u[1]);
-            assert!((there - distance).abs() < 1e-6, "beam {beam} at {there}, beam {i} at {distance}");
+            let reported_distance = (x + range * u[0]).hypot(y + range * u[1]);
+            assert!(
+                (reported_distance - distance).abs() < 1e-6,
+                "beam {beam} at {reported_distance}, beam {i} at {distance}"
+            );
         }
         wrong => panic!("nearest: {wrong:?}"),
     }
@@ -200,7 +206,7 @@ fn compare(case: &Case, scan: &Scan, out: &Zones) -> Tally {
 
 /// What one scan was good for.
 #[derive(Default)]
-struct Tally {
+struct CaseTally {
     sure: u32,
     close: u32,
     unknown: bool,
@@ -215,17 +221,17 @@ fn zones_are_those_of_the_formula_and_of_geometry() {
     let mut random = Rng::with_seed(1);
     let mut verdicts = [0; 4];
     let (mut sure, mut close, mut blind) = (0, 0, 0);
-    for _ in 0..CASES {
+    for _ in 0..CASE_COUNT {
         let case = Case::new(&mut random);
         let mut check = case.check();
-        let mut out = dirty();
+        let mut out = uninitialized_zones();
         // Another unit is another layout, and all begins anew.
         for unit_mm in [1, 10, 100] {
             let mut scan = scans::layout(&mut random, unit_mm);
             let mut streaks = vec![0; case.settings.radii_mm.len()];
-            let mut seen = 0;
-            for _ in 0..SCANS {
-                seen += 1;
+            let mut scans_checked = 0;
+            for _ in 0..SCANS_PER_CASE {
+                scans_checked += 1;
                 case.fill(&mut random, &mut scan);
                 check.update(&scan, &mut out);
                 let tally = compare(&case, &scan, &out);
@@ -235,7 +241,7 @@ fn zones_are_those_of_the_formula_and_of_geometry() {
                     *streak = if zone.beams >= case.settings.min_beams { *streak + 1 } else { 0 };
                     assert_eq!(zone.violated == 1, *streak >= case.settings.min_scans);
                 }
-                let is_new = seen < case.settings.min_scans;
+                let is_new = scans_checked < case.settings.min_scans;
                 let violated: Vec<bool> = out.zones().iter().map(|zone| zone.violated == 1).collect();
                 let expected = match (violated.last(), violated.contains(&true)) {
                     (Some(true), _) => Verdict::Stop,
@@ -248,7 +254,7 @@ fn zones_are_those_of_the_formula_and_of_geometry() {
                 assert!(violated.is_sorted_by(|outer, inner| outer >= inner), "nested");
                 verdicts[expected as usize] += 1;
                 if tally.invalid {
-                    seen = 0;
+                    scans_checked = 0;
                 }
             }
         }
@@ -256,21 +262,21 @@ fn zones_are_those_of_the_formula_and_of_geometry() {
     println!(
         "clear, slow, stop, unknown: {verdicts:?}; circles {sure} sure, {close} within 1 mm; blind {blind}"
     );
-    assert!(verdicts.iter().all(|&verdicts| verdicts > CASES / 10), "{verdicts:?}");
+    assert!(verdicts.iter().all(|&verdicts| verdicts > CASE_COUNT / 10), "{verdicts:?}");
     assert!(close > 1000 && sure > 10_000 && blind > 100, "{close} {sure} {blind}");
 }
 
 /// An object stays inside the circle, and one scan in between cannot show it.
 #[test]
-fn after_an_invalid_scan_the_verdict_is_not_clear_before_it_is_proven() {
+fn invalid_scan_delays_a_clear_verdict() {
     let settings = Settings { radii_mm: vec![1000, 600], min_scans: 2, ..Settings::default() };
-    let mut check = Check::new(Pose::default(), &settings, 181);
+    let mut check = ZoneChecker::new(Pose::default(), &settings, 181);
     let head = ScanHead::lms(181, -90_000, 1000, 1, 13);
     let scan = |range: u16| Scan::of(head, &[range; 181]);
     let scans = [scan(300), scan(4000), scan(head.no_return - 1)];
     let [near, far, invalid]: [&Scan; 3] = scans.each_ref().map(|scan| &**scan);
     let mut verdict = |scan: &Scan| {
-        let mut out = dirty();
+        let mut out = uninitialized_zones();
         check.update(scan, &mut out);
         out.verdict()
     };
@@ -293,21 +299,22 @@ fn on_a_circle_is_outside_wherever_it_is_seen_from() {
         ([-1.0, 0.0], 0, 2000),
     ];
     for (place, lo_mm, hi_mm) in places {
-        for turn in 0..200 {
+        for round in 0..200 {
             // The robot turned about its centre: nothing changes for the beam.
-            let yaw_rad = if turn < 4 { f64::from(turn).to_radians() * 90.0 } else { 7.0 * random.f64() };
+            let yaw_rad = if round < 4 { f64::from(round).to_radians() * 90.0 } else { 7.0 * random.f64() };
             let (sin, cos) = yaw_rad.sin_cos();
             let pose = Pose {
                 x_m: place[0] * cos - place[1] * sin,
                 y_m: place[0] * sin + place[1] * cos,
                 yaw_rad,
-                upside_down: turn as u8 & 1,
+                upside_down: round as u8 & 1,
                 ..Pose::default()
             };
-            let mut check = Check::new(pose, &Settings { radii_mm: vec![1000], ..Settings::default() }, 1);
+            let mut check =
+                ZoneChecker::new(pose, &Settings { radii_mm: vec![1000], ..Settings::default() }, 1);
             let mut is_inside = |unit_mm: u16, range_mm: u16| {
                 let scan = Scan::of(ScanHead::lms(1, 0, 500, unit_mm.into(), 13), &[range_mm / unit_mm]);
-                let mut out = dirty();
+                let mut out = uninitialized_zones();
                 check.update(&scan, &mut out);
                 assert_eq!(out.zones()[0].beams == 1, out.verdict() == Verdict::Stop);
                 out.zones()[0].beams == 1
@@ -315,24 +322,24 @@ fn on_a_circle_is_outside_wherever_it_is_seen_from() {
             for unit_mm in [1, 10] {
                 assert!(
                     !is_inside(unit_mm, hi_mm) && is_inside(unit_mm, hi_mm - unit_mm),
-                    "{place:?} {turn}"
+                    "{place:?} {round}"
                 );
-                assert!(is_inside(unit_mm, lo_mm + unit_mm), "{place:?} {turn}");
-                assert!(lo_mm == 0 || !is_inside(unit_mm, lo_mm), "{place:?} {turn}");
+                assert!(is_inside(unit_mm, lo_mm + unit_mm), "{place:?} {round}");
+                assert!(lo_mm == 0 || !is_inside(unit_mm, lo_mm), "{place:?} {round}");
             }
         }
     }
 }
 
 /// As a loan comes.
-fn dirty() -> Zones {
+fn uninitialized_zones() -> Zones {
     bytemuck::pod_read_unaligned(&[0xA5; size_of::<Zones>()])
 }
 
-const CASES: u32 = 600;
-const SCANS: u16 = 6;
+const CASE_COUNT: u32 = 600;
+const SCANS_PER_CASE: u16 = 6;
 
-const INVALID: u16 = 0x1FFF - 5;
+const INVALID_CODE: u16 = 0x1FFF - 5;
 
 /// A hundred beams of 180 degrees: nothing within 5 m but what is named.
 fn scan(beams: &[(usize, u16)]) -> Box<Scan> {
@@ -341,14 +348,14 @@ fn scan(beams: &[(usize, u16)]) -> Box<Scan> {
     scan
 }
 
-fn zones_after(check: &mut Check, scan: &Scan) -> Zones {
+fn zones_after(check: &mut ZoneChecker, scan: &Scan) -> Zones {
     let mut out = Zones::unknown();
     check.update(scan, &mut out);
     out
 }
 
 fn verdict(settings: &Settings, scan: &Scan) -> Verdict {
-    zones_after(&mut Check::new(Pose::default(), settings, 100), scan).verdict()
+    zones_after(&mut ZoneChecker::new(Pose::default(), settings, 100), scan).verdict()
 }
 
 #[test]
@@ -359,17 +366,17 @@ fn the_two_circles_of_the_paper() {
     assert_eq!(verdict(&settings, &scan(&[(7, 999)])), Verdict::Slow);
     assert_eq!(verdict(&settings, &scan(&[(7, 600)])), Verdict::Slow);
     assert_eq!(verdict(&settings, &scan(&[(7, 599), (9, 0)])), Verdict::Stop);
-    let mut check = Check::new(Pose::default(), &settings, 100);
-    let out = zones_after(&mut check, &scan(&[(7, 599), (9, 0), (12, 700), (13, INVALID)]));
+    let mut check = ZoneChecker::new(Pose::default(), &settings, 100);
+    let out = zones_after(&mut check, &scan(&[(7, 599), (9, 0), (12, 700), (13, INVALID_CODE)]));
     assert_eq!((out.nearest(), out.invalid_beams, out.flags), (Some((9, 0)), 1, 0));
     let circles = out.zones().iter().map(|zone| (zone.radius_mm, zone.beams, zone.violated));
     assert!(circles.eq([(1000, 3, 1), (600, 2, 1)]));
 }
 
 #[test]
-fn a_violation_takes_enough_beams_in_enough_scans_and_a_start_is_unknown() {
+fn violation_needs_enough_beams_in_enough_scans() {
     let settings = Settings { min_beams: 2, min_scans: 3, ..Settings::default() };
-    let mut check = Check::new(Pose::default(), &settings, 100);
+    let mut check = ZoneChecker::new(Pose::default(), &settings, 100);
     let (near, single) = (scan(&[(7, 700), (8, 500), (9, 500)]), scan(&[(7, 500)]));
     let mut next = |scan: &Scan| {
         let out = zones_after(&mut check, scan);
@@ -386,13 +393,13 @@ fn a_violation_takes_enough_beams_in_enough_scans_and_a_start_is_unknown() {
 }
 
 #[test]
-fn a_silence_is_unknown_and_scans_follow_each_other_anew() {
+fn stale_verdict_is_unknown_and_restarts_counting() {
     let settings = Settings { min_scans: 2, ..Settings::default() };
-    let mut check = Check::new(Pose::default(), &settings, 100);
+    let mut check = ZoneChecker::new(Pose::default(), &settings, 100);
     let near = scan(&[(7, 500)]);
     assert_eq!([(); 2].map(|()| zones_after(&mut check, &near).verdict()), [Verdict::Unknown, Verdict::Stop]);
     let mut out = zones_after(&mut check, &near);
-    check.stale(&mut out);
+    check.write_stale(&mut out);
     assert_eq!((out.verdict(), out.nearest(), out.flags), (Verdict::Unknown, None, Zones::PROVISIONAL));
     let circles = out.zones().iter().map(|zone| (zone.radius_mm, zone.beams, zone.violated));
     assert!(circles.eq([(1000, 0, 0), (600, 0, 0)]));
@@ -401,7 +408,7 @@ fn a_silence_is_unknown_and_scans_follow_each_other_anew() {
 
 #[test]
 fn too_many_invalid_beams_hide_all_but_a_stop() {
-    let invalid: Vec<_> = (0..11).map(|i| (i, INVALID)).collect();
+    let invalid: Vec<_> = (0..11).map(|i| (i, INVALID_CODE)).collect();
     let settings = Settings::default();
     assert_eq!(verdict(&settings, &scan(&invalid[..10])), Verdict::Clear, "a tenth is not too many");
     assert_eq!(verdict(&settings, &scan(&invalid)), Verdict::Unknown);
@@ -420,13 +427,13 @@ fn the_robot_itself_is_neither_near_nor_invalid() {
     let partly = [Sector { from_mdeg: -90_000, to_mdeg: -72_000, range_mm: 400 }];
     let wholly = [Sector { range_mm: 1000, ..partly[0] }, partly[0]];
     let body: Vec<_> = (0..12).map(|i| (i, 399)).collect();
-    let blind: Vec<_> = (0..11).map(|i| (i, INVALID)).collect();
+    let blind: Vec<_> = (0..11).map(|i| (i, INVALID_CODE)).collect();
     for (body_mask, of_blind) in [(&partly[..], Verdict::Unknown), (&wholly[..], Verdict::Clear)] {
         let settings = Settings { body_mask: body_mask.to_vec(), ..Settings::default() };
         assert_eq!(verdict(&settings, &scan(&body[..11])), Verdict::Clear);
         assert_eq!(verdict(&settings, &scan(&body)), Verdict::Stop, "beam 11 is none of the body's");
         assert_eq!(verdict(&settings, &scan(&blind)), of_blind);
-        let mut check = Check::new(Pose::default(), &settings, 100);
+        let mut check = ZoneChecker::new(Pose::default(), &settings, 100);
         assert_eq!(zones_after(&mut check, &scan(&body[..11])).nearest(), Some((11, 5000)));
     }
     let settings = Settings { body_mask: partly.to_vec(), ..Settings::default() };
@@ -434,22 +441,22 @@ fn the_robot_itself_is_neither_near_nor_invalid() {
 }
 
 #[test]
-fn who_is_told_nothing_knows_nothing() {
+fn verdict_is_unknown_without_usable_input() {
     let settings = Settings::default();
     assert_eq!(verdict(&settings, &Box::<Scan>::default()), Verdict::Unknown);
     let no_circles = Settings { radii_mm: Vec::new(), ..Settings::default() };
     assert_eq!(verdict(&no_circles, &scan(&[(7, 500)])), Verdict::Unknown);
     for (x_m, yaw_rad) in [(f64::NAN, 0.0), (0.0, f64::INFINITY), (f64::INFINITY, 0.0)] {
-        let mut check = Check::new(Pose { x_m, yaw_rad, ..Pose::default() }, &settings, 100);
+        let mut check = ZoneChecker::new(Pose { x_m, yaw_rad, ..Pose::default() }, &settings, 100);
         assert_eq!(zones_after(&mut check, &scan(&[])).verdict(), Verdict::Unknown);
     }
 }
 
 #[test]
 fn an_old_scan_is_never_clear() {
-    let mut check = Check::new(Pose::default(), &Settings::default(), 100);
+    let mut check = ZoneChecker::new(Pose::default(), &Settings::default(), 100);
     let mut of = |is_late, scan: &Scan| {
-        check.doubt(is_late);
+        check.set_backlogged(is_late);
         zones_after(&mut check, scan).verdict()
     };
     assert_eq!(of(false, &scan(&[])), Verdict::Clear);
@@ -463,16 +470,16 @@ fn an_old_scan_is_never_clear() {
 fn a_circle_that_cannot_be_violated_is_never_clear() {
     let settings = Settings::default();
     let of = |pose: Pose, settings: &Settings, scan: &Scan| {
-        let mut check = Check::new(pose, settings, 100);
-        (zones_after(&mut check, scan).verdict(), check.telling(), check.is_blind())
+        let mut check = ZoneChecker::new(pose, settings, 100);
+        (zones_after(&mut check, scan).verdict(), check.effective_beams(), check.is_blind())
     };
     let whole = Pose::default();
-    let most = Settings { min_beams: 100, ..settings.clone() };
-    assert_eq!(of(whole, &most, &scan(&[])), (Verdict::Clear, 100, false));
+    let strict = Settings { min_beams: 100, ..settings.clone() };
+    assert_eq!(of(whole, &strict, &scan(&[])), (Verdict::Clear, 100, false));
     let more = Settings { min_beams: 101, ..settings.clone() };
     assert_eq!(of(whole, &more, &scan(&[(7, 0)])), (Verdict::Unknown, 100, true));
     let body = [Sector { from_mdeg: -90_000, to_mdeg: -72_000, range_mm: 1000 }];
-    let masked = Settings { body_mask: body.to_vec(), ..most.clone() };
+    let masked = Settings { body_mask: body.to_vec(), ..strict.clone() };
     assert_eq!(of(whole, &masked, &scan(&[])), (Verdict::Unknown, 89, true));
     let all = [Sector { to_mdeg: 90_000, ..body[0] }];
     assert_eq!(
@@ -480,9 +487,9 @@ fn a_circle_that_cannot_be_violated_is_never_clear() {
         Verdict::Unknown
     );
     // 2 m ahead of the center, the sensor looks away from the circle; turned by 180 degrees, into it.
-    let away = Pose { x_m: 2.0, ..Pose::default() };
-    assert_eq!(of(away, &settings, &scan(&[])), (Verdict::Unknown, 0, true));
-    let back = Pose { yaw_rad: std::f64::consts::PI, ..away };
+    let facing_away = Pose { x_m: 2.0, ..Pose::default() };
+    assert_eq!(of(facing_away, &settings, &scan(&[])), (Verdict::Unknown, 0, true));
+    let back = Pose { yaw_rad: std::f64::consts::PI, ..facing_away };
     assert_eq!(of(back, &settings, &scan(&[])).0, Verdict::Clear);
     // So far away that 13 bits of mm do not reach it; those of cm do.
     let far = Pose { x_m: 9.2, ..back };
@@ -494,7 +501,7 @@ fn a_circle_that_cannot_be_violated_is_never_clear() {
 
 /// A clockwise turn of 200 bins of 1.8 degrees, of a sensor whose own points are 1.8 degrees apart: nothing within 5 m but
 /// what is named, at its exact angle in degrees.
-fn turn(beams: &[(usize, u16, f32)]) -> Box<Scan> {
+fn revolution(beams: &[(usize, u16, f32)]) -> Box<Scan> {
     let head = ScanHead {
         step: -1.8_f64.to_radians(),
         spacing: 1.8_f32.to_radians(),
@@ -502,7 +509,7 @@ fn turn(beams: &[(usize, u16, f32)]) -> Box<Scan> {
         valid_to: 0xFFEF,
         no_return: Code::NoReturn.value(),
         beyond: Code::NoReturn.value(),
-        contents: Contents::ANGLES,
+        contents: ArrayFlags::ANGLES,
         ..ScanHead::default()
     };
     let mut scan = Scan::of(head, &[5000; 200]);
@@ -516,38 +523,48 @@ fn turn(beams: &[(usize, u16, f32)]) -> Box<Scan> {
     scan
 }
 
-fn of_turn(pose: Pose, settings: &Settings, scan: &Scan) -> Zones {
-    zones_after(&mut Check::new(pose, settings, 200), scan)
+fn zones_of_revolution(pose: Pose, settings: &Settings, scan: &Scan) -> Zones {
+    zones_after(&mut ZoneChecker::new(pose, settings, 200), scan)
 }
 
 #[test]
 fn the_exact_point_counts_where_there_is_one() {
     let settings = Settings::default();
-    assert_eq!(of_turn(Pose::default(), &settings, &turn(&[])).verdict(), Verdict::Clear);
-    let near = of_turn(Pose::default(), &settings, &turn(&[(7, 700, -12.0), (190, 999, 17.5)]));
+    assert_eq!(zones_of_revolution(Pose::default(), &settings, &revolution(&[])).verdict(), Verdict::Clear);
+    let near =
+        zones_of_revolution(Pose::default(), &settings, &revolution(&[(7, 700, -12.0), (190, 999, 17.5)]));
     assert_eq!((near.verdict(), near.nearest()), (Verdict::Slow, Some((7, 700))));
     assert_eq!((near.zones()[0].beams, near.zones()[1].beams), (2, 0));
     // 2 m ahead of the center, an object straight behind at 1001 mm is just inside, and one half a bin to the side is
     // not.
     let ahead = Pose { x_m: 2.0, ..Pose::default() };
-    assert_eq!(of_turn(ahead, &settings, &turn(&[(100, 1001, -180.0)])).zones()[0].beams, 1);
-    assert_eq!(of_turn(ahead, &settings, &turn(&[(100, 1000, -180.0)])).zones()[0].beams, 0);
-    assert_eq!(of_turn(ahead, &settings, &turn(&[(100, 1001, -182.6)])).zones()[0].beams, 0);
+    assert_eq!(
+        zones_of_revolution(ahead, &settings, &revolution(&[(100, 1001, -180.0)])).zones()[0].beams,
+        1
+    );
+    assert_eq!(
+        zones_of_revolution(ahead, &settings, &revolution(&[(100, 1000, -180.0)])).zones()[0].beams,
+        0
+    );
+    assert_eq!(
+        zones_of_revolution(ahead, &settings, &revolution(&[(100, 1001, -182.6)])).zones()[0].beams,
+        0
+    );
     // The middle of bin 99 is beside the robot's body, a point in it may not be.
     let body = [Sector { from_mdeg: -180_000, to_mdeg: -179_000, range_mm: 2000 }];
     let masked = Settings { body_mask: body.to_vec(), ..settings };
-    assert_eq!(of_turn(ahead, &masked, &turn(&[(99, 1500, -178.3)])).zones()[0].beams, 1);
-    assert_eq!(of_turn(ahead, &masked, &turn(&[(99, 1500, -179.3)])).zones()[0].beams, 0);
+    assert_eq!(zones_of_revolution(ahead, &masked, &revolution(&[(99, 1500, -178.3)])).zones()[0].beams, 1);
+    assert_eq!(zones_of_revolution(ahead, &masked, &revolution(&[(99, 1500, -179.3)])).zones()[0].beams, 0);
 }
 
 #[test]
-fn what_was_not_measured_is_looked_past_where_its_neighbours_were() {
+fn skips_unmeasured_beams_between_measured_ones() {
     let settings = Settings { max_invalid: 0.0, ..Settings::default() };
     let without = |beams: &[usize], spacing_deg: f32| {
-        let mut scan = turn(&[]);
+        let mut scan = revolution(&[]);
         beams.iter().for_each(|&i| scan.arrays().ranges[i] = Scan::NOT_MEASURED);
         scan.spacing = spacing_deg.to_radians();
-        let out = of_turn(Pose::default(), &settings, &scan);
+        let out = zones_of_revolution(Pose::default(), &settings, &scan);
         (out.invalid_beams, out.verdict())
     };
     assert_eq!(without(&[5, 90, 198], 1.8), (0, Verdict::Clear));
@@ -560,11 +577,11 @@ fn what_was_not_measured_is_looked_past_where_its_neighbours_were() {
 }
 
 #[test]
-fn scans_of_a_head_that_changes_its_speed_follow_each_other() {
+fn changing_speed_does_not_interrupt_scan_counting() {
     let settings = Settings { min_scans: 3, max_invalid: 0.0, ..Settings::default() };
-    let mut check = Check::new(Pose::default(), &settings, 200);
+    let mut check = ZoneChecker::new(Pose::default(), &settings, 200);
     let mut next = |range: u16, spacing_deg: f32| {
-        let mut scan = turn(&[(7, range, -12.6)]);
+        let mut scan = revolution(&[(7, range, -12.6)]);
         [90, 91].iter().for_each(|&i| scan.arrays().ranges[i] = Scan::NOT_MEASURED);
         scan.spacing = spacing_deg.to_radians();
         let out = zones_after(&mut check, &scan);
@@ -576,19 +593,19 @@ fn scans_of_a_head_that_changes_its_speed_follow_each_other() {
     assert_eq!(next(5000, 1.8), (Verdict::Unknown, 2), "its points are as near to each other as its beams");
 }
 
-const BEAMS: usize = 100;
-const FAR: u16 = 5000;
+const BEAM_COUNT: usize = 100;
+const FAR_RANGE: u16 = 5000;
 
 /// A scan of 180 degrees: nothing near but in `near` beams.
 fn random_scan(random: &mut Rng, near: usize) -> Box<Scan> {
-    let mut scan = Scan::of(ScanHead::lms(BEAMS, -90_000, 1800, 1, 13), &[FAR; BEAMS]);
-    (0..near).for_each(|_| scan.arrays().ranges[random.usize(..BEAMS)] = random.u16(..1200));
+    let mut scan = Scan::of(ScanHead::lms(BEAM_COUNT, -90_000, 1800, 1, 13), &[FAR_RANGE; BEAM_COUNT]);
+    (0..near).for_each(|_| scan.arrays().ranges[random.usize(..BEAM_COUNT)] = random.u16(..1200));
     scan
 }
 
 /// Returns the zones of the last of `scans` by a new check that has seen the others.
 fn zones_of(pose: Pose, settings: &Settings, scans: &[Box<Scan>]) -> Zones {
-    let (mut check, mut out) = (Check::new(pose, settings, BEAMS), Zones::unknown());
+    let (mut check, mut out) = (ZoneChecker::new(pose, settings, BEAM_COUNT), Zones::unknown());
     scans.iter().for_each(|scan| check.update(scan, &mut out));
     out
 }
@@ -602,35 +619,36 @@ fn worst(zones: &Zones) -> Option<Verdict> {
 }
 
 #[test]
-fn a_part_of_a_scan_warns_of_what_it_shows_and_the_whole_confirms_it() {
+fn partial_scan_warns_and_complete_scan_confirms() {
     let mut random = Rng::with_seed(28);
     let (mut warned, mut silent) = (0, 0);
     for _ in 0..200 {
         let (min_beams, min_scans) = (random.u16(1..4), random.u16(1..4));
         let settings = Settings { min_beams, min_scans, exact: random.bool(), ..Settings::default() };
         let pose = Pose { x_m: 0.4 * random.f64(), yaw_rad: random.f64(), ..Pose::default() };
-        let mut check = Check::new(pose, &settings, BEAMS);
+        let mut check = ZoneChecker::new(pose, &settings, BEAM_COUNT);
         let mut scans: Vec<Box<Scan>> = Vec::new();
         for _ in 0..6 {
             let near = random.usize(..9);
             let whole = random_scan(&mut random, near);
             let mut before = None;
-            for seen in [0, 1, random.usize(..BEAMS), random.usize(..BEAMS), BEAMS] {
-                let early = check.early(BEAMS, 1000, &whole.ranges()[..seen], &[]);
+            for received in [0, 1, random.usize(..BEAM_COUNT), random.usize(..BEAM_COUNT), BEAM_COUNT] {
+                let early = check.check_partial(BEAM_COUNT, 1000, &whole.ranges()[..received], &[]);
                 let mut part = whole.clone();
-                part.arrays().ranges[seen..].fill(FAR);
+                part.arrays().ranges[received..].fill(FAR_RANGE);
                 scans.push(part);
                 let zones = zones_of(pose, &settings, &scans);
                 scans.pop();
                 // The first scan of a layout makes the table: there is nothing to judge by before it.
                 let expected = worst(&zones).filter(|_| !scans.is_empty());
-                assert_eq!(early.map(|warning| warning.verdict), expected, "{seen} of {near}");
+                assert_eq!(early.map(|warning| warning.verdict), expected, "{received} of {near}");
                 if let Some(Warning { beam, distance_mm, .. }) = early {
                     assert_eq!(Some((beam, distance_mm)), zones.nearest());
                 }
                 (warned, silent) =
                     (warned + usize::from(early.is_some()), silent + usize::from(early.is_none()));
-                before = before.max(early.map(|warning| warning.verdict as u8).filter(|_| seen == BEAMS));
+                before =
+                    before.max(early.map(|warning| warning.verdict as u8).filter(|_| received == BEAM_COUNT));
             }
             let mut out = Zones::unknown();
             check.update(&whole, &mut out);
@@ -643,32 +661,35 @@ fn a_part_of_a_scan_warns_of_what_it_shows_and_the_whole_confirms_it() {
 
 #[test]
 fn scans_of_another_form_warn_of_nothing() {
-    let mut check = Check::new(Pose::default(), &Settings::default(), BEAMS);
-    let near = [300; BEAMS];
-    assert_eq!(check.early(BEAMS, 1000, &near, &[]), None, "nothing is known of the sensor");
+    let mut check = ZoneChecker::new(Pose::default(), &Settings::default(), BEAM_COUNT);
+    let near = [300; BEAM_COUNT];
+    assert_eq!(check.check_partial(BEAM_COUNT, 1000, &near, &[]), None, "nothing is known of the sensor");
     check.update(&random_scan(&mut Rng::with_seed(1), 0), &mut Zones::unknown());
-    assert_eq!(check.early(BEAMS, 1000, &near, &[]).map(|warning| warning.verdict), Some(Verdict::Stop));
-    assert_eq!(check.early(BEAMS + 1, 1000, &near, &[]), None, "more beams");
-    assert_eq!(check.early(BEAMS, 10_000, &near, &[]), None, "another unit");
-    check.stale(&mut Zones::unknown());
-    assert_eq!(check.early(BEAMS, 1000, &[], &[]), None);
+    assert_eq!(
+        check.check_partial(BEAM_COUNT, 1000, &near, &[]).map(|warning| warning.verdict),
+        Some(Verdict::Stop)
+    );
+    assert_eq!(check.check_partial(BEAM_COUNT + 1, 1000, &near, &[]), None, "more beams");
+    assert_eq!(check.check_partial(BEAM_COUNT, 10_000, &near, &[]), None, "another unit");
+    check.write_stale(&mut Zones::unknown());
+    assert_eq!(check.check_partial(BEAM_COUNT, 1000, &[], &[]), None);
 }
 
 /// A turn of a head: a second of arc more or less in how far its own points are apart does not make another sensor of it.
 #[test]
-fn turns_of_which_none_takes_as_long_as_another_are_counted_in_a_row() {
+fn slightly_uneven_revolutions_count_in_a_row() {
     let settings = Settings { min_scans: 2, ..Settings::default() };
-    let mut check = Check::new(Pose::default(), &settings, BEAMS);
-    let mut turn = Scan::zeroed(Scan::len(BEAMS, scanhub_schema::Contents::TURNING));
+    let mut check = ZoneChecker::new(Pose::default(), &settings, BEAM_COUNT);
+    let mut turn = Scan::zeroed(Scan::len(BEAM_COUNT, scanhub_schema::ArrayFlags::REVOLUTION));
     let mut verdicts = Vec::new();
     for number in 0..3 {
-        let head = ScanHead::turning(scanhub_schema::Family::Ld, BEAMS);
+        let head = ScanHead::of_revolution(scanhub_schema::Family::Ld, BEAM_COUNT);
         let arrays = turn.begin(ScanHead { spacing: head.spacing + number as f32 * 5e-6, ..head });
         arrays.ranges.fill(500);
         arrays.upper.fill(0);
         let step = head.step;
         arrays.angles.iter_mut().enumerate().for_each(|(i, angle)| *angle = (i as f64 * step) as f32);
-        let early = check.early(BEAMS, 1000, turn.ranges(), turn.exact_angles());
+        let early = check.check_partial(BEAM_COUNT, 1000, turn.ranges(), turn.exact_angles());
         let mut out = Zones::unknown();
         check.update(&turn, &mut out);
         verdicts.push((early.map(|warning| warning.verdict), out.verdict()));

@@ -1,9 +1,9 @@
 //! CARMEN logs: text files in which lines that start with `FLASER n r1 .. rn ..`, `ROBOTLASER1` and `RAWLASER1` are scans in
 //! meters.
 //!
-//! [`Log`] reads the scans, [`RangeStats`] chooses the unit and the bits in which their ranges are whole values, and
+//! [`LogReader`] reads the scans, [`RangeStats`] chooses the unit and the bits in which their ranges are whole values, and
 //! [`LogScan::frame`] turns a scan into the telegram that an LMS 2xx would have sent. In the other direction, [`scan_line`] writes a
-//! telegram as a line. Poses and all other lines are not read, but counted ([`Unread`]).
+//! telegram as a line. Poses and all other lines are not read, but counted ([`UnreadLines`]).
 
 use std::fmt;
 use std::io::{self, BufRead, Read};
@@ -11,7 +11,7 @@ use std::path::Path;
 
 use scanhub_drivers::lms::measured;
 #[cfg(feature = "mcap")]
-use scanhub_drivers::lms::measured::Measured;
+use scanhub_drivers::lms::measured::MeasuredValues;
 #[cfg(feature = "mcap")]
 use scanhub_drivers::lms::reply::{self, Reply};
 #[cfg(feature = "mcap")]
@@ -20,7 +20,7 @@ use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
 
 use scanhub_schema::{Failure, Kind};
 
-use crate::open::{is_end, unreadable};
+use crate::open::{is_truncation, unreadable};
 use crate::{Contents, Encoding, Form, Frame};
 
 /// A scan of a log.
@@ -39,7 +39,7 @@ pub(crate) struct LogScan {
 
 /// Data of a log that no other format holds, so that a conversion loses it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Unread {
+pub struct UnreadLines {
     /// Scans with a pose other than 0.
     pub poses: u64,
     /// Lines of odometry.
@@ -62,7 +62,7 @@ pub(crate) enum LineForm {
 }
 
 /// Lists the counts that are not 0.
-impl fmt::Display for Unread {
+impl fmt::Display for UnreadLines {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let parts = [
             (self.poses, "pose", "poses"),
@@ -112,7 +112,9 @@ impl LogScan {
         let Some(variant) = variant(count) else {
             return Err(format!("{count} beams, which no LMS 2xx sends"));
         };
-        if let Some(view_deg) = view.filter(|view| (view - f64::from(variant.angle_deg)).abs() > VIEW_DEG) {
+        if let Some(view_deg) =
+            view.filter(|view| (view - f64::from(variant.angle_deg)).abs() > VIEW_TOLERANCE_DEG)
+        {
             return Err(format!("{count} beams over {view_deg:.1} degrees, which no LMS 2xx sends"));
         }
         let ranges_m = (0..count)
@@ -131,9 +133,9 @@ impl LogScan {
             LogScan { form, ranges_m, time_ns: None, has_pose: false, has_remissions: remissions > Some(0) };
         let Some(remissions) = remissions else { return Ok(Some(log_scan)) };
         let mut rest = fields.skip(remissions);
-        let poses: Vec<&str> = rest.by_ref().take(numbers).take(POSES).collect();
+        let poses: Vec<&str> = rest.by_ref().take(numbers).take(POSE_FIELDS).collect();
         log_scan.has_pose = poses.iter().any(|field| field.parse().is_ok_and(|number: f64| number != 0.0));
-        log_scan.time_ns = rest.nth(numbers.saturating_sub(POSES)).and_then(nanoseconds);
+        log_scan.time_ns = rest.nth(numbers.saturating_sub(POSE_FIELDS)).and_then(nanoseconds);
         Ok(Some(log_scan))
     }
 
@@ -144,7 +146,7 @@ impl LogScan {
 
     /// Returns the value words in `encoding`, for a log whose ranges are encoded as `own`: its codes stay the same codes. A
     /// range that does not fit into `encoding` is rounded, or becomes the code of a range beyond it. NaN, infinite and negative
-    /// ranges become "no return". Logs of 180 and 360 beams lack the last beam, which becomes [`LEFT_OUT`].
+    /// ranges become "no return". Logs of 180 and 360 beams lack the last beam, which becomes [`MISSING_BEAM_OFFSET`].
     pub(crate) fn words(&self, own: Encoding, encoding: Encoding) -> Vec<u16> {
         let greatest = encoding.mode.max_value();
         let word = |&range_m: &f64| {
@@ -153,18 +155,18 @@ impl LogScan {
             }
             match code(range_m, own) {
                 Some(below_greatest) => greatest - below_greatest,
-                None => (units(range_m, encoding.unit) as u16).min(greatest - BEYOND),
+                None => (units(range_m, encoding.unit) as u16).min(greatest - BEYOND_RANGE_OFFSET),
             }
         };
         let mut words: Vec<u16> = self.ranges_m.iter().map(word).collect();
-        words.resize(self.variant().map_or(words.len(), Variant::beams), greatest - LEFT_OUT);
+        words.resize(self.variant().map_or(words.len(), Variant::beams), greatest - MISSING_BEAM_OFFSET);
         words
     }
 
     /// Returns the telegram that a scanner with address 0 would have sent; see [`words`](Self::words).
     pub(crate) fn frame(&self, own: Encoding, encoding: Encoding) -> Frame {
         let words = self.words(own, encoding);
-        let telegram = measured::encode(0, encoding.unit, &words, STATUS).bytes().to_vec();
+        let telegram = measured::encode(0, encoding.unit, &words, HEALTHY_STATUS).bytes().to_vec();
         Frame { telegram, wall_ns: self.time_ns, ..Frame::default() }
     }
 }
@@ -172,12 +174,12 @@ impl LogScan {
 /// Returns the nanoseconds in `text`, a number of seconds; `None` if it is not positive. A double has only a quarter of a
 /// microsecond at today's times, so the decimals are read as they are.
 fn nanoseconds(text: &str) -> Option<u64> {
-    let (whole, fraction) = text.split_once('.').unwrap_or((text, ""));
+    let (integer, fraction) = text.split_once('.').unwrap_or((text, ""));
     let is_digits = |text: &str| text.bytes().all(|byte| byte.is_ascii_digit());
-    let ns = if !whole.is_empty() && is_digits(whole) && is_digits(fraction) {
+    let ns = if !integer.is_empty() && is_digits(integer) && is_digits(fraction) {
         let decimals: u64 = format!("{fraction:0<9.9}").parse().ok()?;
         let rounded_up = fraction.as_bytes().get(9).is_some_and(|digit| *digit >= b'5');
-        let seconds: u64 = whole.parse().ok()?;
+        let seconds: u64 = integer.parse().ok()?;
         seconds.checked_mul(1_000_000_000)?.checked_add(decimals + u64::from(rounded_up))?
     } else {
         // Such as 1.07e9.
@@ -188,7 +190,7 @@ fn nanoseconds(text: &str) -> Option<u64> {
 
 /// Returns whether `telegram` is the [`configuration`] reply that stands for the encoding of a log, and that no scanner sent.
 #[cfg(feature = "mcap")]
-pub(crate) fn is_made_up(telegram: &[u8]) -> bool {
+pub(crate) fn is_synthetic(telegram: &[u8]) -> bool {
     let reply = Telegram::check(telegram).and_then(Reply::decode);
     let Some(Reply::Configuration(reply)) = reply else { return false };
     reply.unit().is_some_and(|unit| configuration(Encoding { unit, mode: reply.mode() }) == telegram)
@@ -197,7 +199,7 @@ pub(crate) fn is_made_up(telegram: &[u8]) -> bool {
 /// Returns the reply in which a scanner reports that its values have this encoding.
 #[cfg(feature = "mcap")]
 pub(crate) fn configuration(encoding: Encoding) -> Vec<u8> {
-    reply::configuration(0, encoding.mode, encoding.unit, STATUS).bytes().to_vec()
+    reply::configuration_reply(0, encoding.mode, encoding.unit, HEALTHY_STATUS).bytes().to_vec()
 }
 
 /// Returns a range in units, rounded.
@@ -208,7 +210,7 @@ fn units(range_m: f64, unit: Unit) -> f64 {
 /// Returns the distance of a range from the maximum value, if it is small enough for a code.
 fn code(range_m: f64, encoding: Encoding) -> Option<u16> {
     let below = f64::from(encoding.mode.max_value()) - units(range_m, encoding.unit);
-    (0.0..=f64::from(BEYOND)).contains(&below).then_some(below as u16)
+    (0.0..=f64::from(BEYOND_RANGE_OFFSET)).contains(&below).then_some(below as u16)
 }
 
 fn count(field: Option<&str>) -> Result<usize, String> {
@@ -223,22 +225,22 @@ fn remissions(field: Option<&str>) -> Option<usize> {
 
 fn variant(beams: usize) -> Option<Variant> {
     // 180 and 360: the last beam is missing.
-    let whole = if matches!(beams, 180 | 360) { beams + 1 } else { beams };
-    Variant::of_beams(whole)
+    let beam_count = if matches!(beams, 180 | 360) { beams + 1 } else { beams };
+    Variant::of_beams(beam_count)
 }
 
 /// Reads the scans of a log in their order. If the log has each scan in several kinds of lines, only those of the first kind are
 /// used.
-pub(crate) struct Log<R> {
+pub(crate) struct LogReader<R> {
     reader: R,
     /// Number of the last line, from 1.
     pub(crate) line: u64,
     /// Kind of line of the first scan.
     form: Option<LineForm>,
     /// Encoding that the log names itself.
-    pub(crate) told: Option<Encoding>,
+    pub(crate) stated_encoding: Option<Encoding>,
     /// Data of the lines so far that the scans do not contain.
-    pub(crate) unread: Unread,
+    pub(crate) unread: UnreadLines,
 }
 
 /// Reason why no scan can be returned.
@@ -250,9 +252,9 @@ pub(crate) enum LogError {
     File(io::Error),
 }
 
-impl<R: BufRead> Log<R> {
+impl<R: BufRead> LogReader<R> {
     pub(crate) fn new(reader: R) -> Self {
-        Log { reader, line: 0, form: None, told: None, unread: Unread::default() }
+        LogReader { reader, line: 0, form: None, stated_encoding: None, unread: UnreadLines::default() }
     }
 
     /// Returns the next scan. A last line without its end that is not a scan is where the recording broke off, not a mistake.
@@ -273,8 +275,8 @@ impl<R: BufRead> Log<R> {
             self.line += 1;
             let is_last = bytes.last() != Some(&b'\n') && bytes.len() < MAX_LINE_LEN as usize;
             let line = String::from_utf8_lossy(&bytes);
-            if let Some(encoding) = told(&line) {
-                self.told = self.told.or(Some(encoding));
+            if let Some(encoding) = parse_encoding_line(&line) {
+                self.stated_encoding = self.stated_encoding.or(Some(encoding));
             }
             match LogScan::parse(&line) {
                 Ok(None) => match line.split_ascii_whitespace().next() {
@@ -291,13 +293,13 @@ impl<R: BufRead> Log<R> {
                     return Ok(Some(log_scan));
                 }
                 Err(_) if is_last => return Ok(None),
-                Err(wrong) => return Err(LogError::Line(wrong)),
+                Err(message) => return Err(LogError::Line(message)),
             }
         }
     }
 
     /// Returns the next scan of a log that was read before: wrong lines are skipped, and it ends where the file cannot be read.
-    pub(crate) fn following(&mut self) -> Option<LogScan> {
+    pub(crate) fn next_valid(&mut self) -> Option<LogScan> {
         loop {
             match self.next() {
                 Ok(log_scan) => return log_scan,
@@ -311,11 +313,11 @@ impl<R: BufRead> Log<R> {
 /// Returns the line in which a log names the encoding of its ranges. Other programs ignore it.
 #[cfg(feature = "mcap")]
 pub(crate) fn encoding_line(encoding: Encoding) -> String {
-    format!("{TOLD} {} mm, {} bits\n", encoding.unit.mm(), encoding.mode.range_bits())
+    format!("{ENCODING_PREFIX} {} mm, {} bits\n", encoding.unit.mm(), encoding.mode.range_bits())
 }
 
-fn told(line: &str) -> Option<Encoding> {
-    let mut fields = line.strip_prefix(TOLD)?.split([' ', ',']).filter(|field| !field.is_empty());
+fn parse_encoding_line(line: &str) -> Option<Encoding> {
+    let mut fields = line.strip_prefix(ENCODING_PREFIX)?.split([' ', ',']).filter(|field| !field.is_empty());
     let (mm, bits) = (fields.next()?, fields.nth(1)?);
     let unit = [Unit::Mm, Unit::Cm, Unit::Dm].into_iter().find(|unit| unit.mm().to_string() == mm)?;
     let mode = MODES.into_iter().find(|mode: &Mode| mode.range_bits().to_string() == bits)?;
@@ -329,7 +331,7 @@ fn told(line: &str) -> Option<Encoding> {
 /// Returns [`Kind::Input`] if it cannot be read, or if none of its lines is a valid scan.
 pub(crate) fn survey(path: &Path, reader: impl BufRead) -> Result<Contents, Failure> {
     let mut contents = Contents { form: Form::Carmen, ..Contents::default() };
-    let (mut log, mut stats, mut refusal) = (Log::new(reader), RangeStats::default(), None);
+    let (mut log, mut stats, mut refusal) = (LogReader::new(reader), RangeStats::default(), None);
     loop {
         match log.next() {
             Ok(Some(log_scan)) => {
@@ -337,22 +339,22 @@ pub(crate) fn survey(path: &Path, reader: impl BufRead) -> Result<Contents, Fail
                 stats.note(&log_scan.ranges_m);
             }
             Ok(None) => break,
-            Err(LogError::File(error)) if is_end(&error) && contents.scans > 0 => {
-                contents.damage.is_cut = true;
+            Err(LogError::File(error)) if is_truncation(&error) && contents.scans > 0 => {
+                contents.damage.is_truncated = true;
                 break;
             }
             Err(LogError::File(error)) => return Err(unreadable(path, &error)),
-            Err(LogError::Line(wrong)) => {
-                let message = format!("{}:{}: {wrong}", path.display(), log.line);
+            Err(LogError::Line(message)) => {
+                let message = format!("{}:{}: {message}", path.display(), log.line);
                 let hint = "a scan is: FLASER 361 RANGE... in meters";
                 refusal.get_or_insert(Failure::new(Kind::Input, message, hint));
                 contents.damage.telegrams += 1;
-                contents.damage.is_harmed = true;
+                contents.damage.is_damaged = true;
             }
         }
     }
     contents.unread = log.unread;
-    let (encoding, unencodable) = stats.encoding(log.told);
+    let (encoding, unencodable) = stats.encoding(log.stated_encoding);
     (contents.unit, contents.mode, contents.unencodable) =
         (Some(encoding.unit), Some(encoding.mode), unencodable);
     // If no line is right, the format is wrong, not the file.
@@ -372,11 +374,11 @@ pub(crate) fn is_log(head: &[u8]) -> bool {
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct RangeStats {
     /// Number of ranges that are not whole centimeters, and that are not whole millimeters.
-    finer: [u64; 2],
+    inexact: [u64; 2],
     /// Longest range that a value can hold.
-    farthest_m: f64,
+    max_range_m: f64,
     /// Number of ranges that no value can hold.
-    beyond: u64,
+    unencodable: u64,
 }
 
 /// Ranges of a log that no LMS 2xx could have sent together.
@@ -392,14 +394,14 @@ impl RangeStats {
     /// Counts a scan.
     pub(crate) fn note(&mut self, ranges_m: &[f64]) {
         for &range_m in ranges_m.iter().filter(|range_m| range_m.is_finite() && **range_m >= 0.0) {
-            if units(range_m, COARSEST.unit) > f64::from(COARSEST.mode.max_value()) {
-                self.beyond += 1;
+            if units(range_m, COARSEST_ENCODING.unit) > f64::from(COARSEST_ENCODING.mode.max_value()) {
+                self.unencodable += 1;
                 continue;
             }
-            self.farthest_m = self.farthest_m.max(range_m);
-            for (finer, unit) in self.finer.iter_mut().zip([Unit::Cm, Unit::Mm]) {
+            self.max_range_m = self.max_range_m.max(range_m);
+            for (finer, unit) in self.inexact.iter_mut().zip([Unit::Cm, Unit::Mm]) {
                 let range = range_m * 1000.0 / f64::from(unit.mm());
-                *finer += u64::from((range - range.round()).abs() > WHOLE);
+                *finer += u64::from((range - range.round()).abs() > UNIT_TOLERANCE);
             }
         }
     }
@@ -407,25 +409,25 @@ impl RangeStats {
     /// Chooses the encoding, and counts the ranges that do not fit into it. The encoding is the one that the log names itself
     /// (`told`) if all ranges fit into it. Otherwise it is centimeters if all ranges are whole centimeters, or millimeters, with
     /// as few bits as the longest range needs.
-    pub(crate) fn encoding(&self, told: Option<Encoding>) -> (Encoding, UnencodableRanges) {
-        let order = if self.finer[0] == 0 { [Unit::Cm, Unit::Mm] } else { [Unit::Mm, Unit::Cm] };
+    pub(crate) fn encoding(&self, stated: Option<Encoding>) -> (Encoding, UnencodableRanges) {
+        let order = if self.inexact[0] == 0 { [Unit::Cm, Unit::Mm] } else { [Unit::Mm, Unit::Cm] };
         let of_unit = |unit: Unit| MODES.map(|mode| Encoding { unit, mode });
-        let all = told.into_iter().chain(order.into_iter().flat_map(of_unit));
+        let all = stated.into_iter().chain(order.into_iter().flat_map(of_unit));
         let fits = |encoding: &Encoding| self.reaches(*encoding) && self.is_whole(encoding.unit);
         let encoding = all.clone().find(fits).or_else(|| all.clone().find(|it| self.reaches(*it)));
-        let encoding = encoding.unwrap_or(COARSEST);
-        let rounded = self.finer[usize::from(encoding.unit == Unit::Mm)];
-        (encoding, UnencodableRanges { rounded, beyond: self.beyond })
+        let encoding = encoding.unwrap_or(COARSEST_ENCODING);
+        let rounded = self.inexact[usize::from(encoding.unit == Unit::Mm)];
+        (encoding, UnencodableRanges { rounded, beyond: self.unencodable })
     }
 
     fn reaches(&self, encoding: Encoding) -> bool {
-        units(self.farthest_m, encoding.unit) <= f64::from(encoding.mode.max_value())
+        units(self.max_range_m, encoding.unit) <= f64::from(encoding.mode.max_value())
     }
 
     fn is_whole(&self, unit: Unit) -> bool {
         match unit {
-            Unit::Cm => self.finer[0] == 0,
-            Unit::Mm => self.finer[1] == 0,
+            Unit::Cm => self.inexact[0] == 0,
+            Unit::Mm => self.inexact[1] == 0,
             // Not counted: only a log that names decimeters itself has them.
             Unit::Dm => true,
         }
@@ -456,7 +458,7 @@ impl fmt::Display for UnencodableRanges {
 /// scan. A code is written as the range that its value would be, as in logs of the scanner. A line cannot hold reflector levels,
 /// field bits, address and status: they are lost.
 pub(crate) fn scan_line(telegram: &[u8], mode: Mode, at_ns: u64, first_ns: u64) -> Option<String> {
-    let measured = Measured::decode(Telegram::check(telegram)?)?;
+    let measured = MeasuredValues::decode(Telegram::check(telegram)?)?;
     if measured.partial().is_some() || Variant::of_beams(measured.count()).is_none() {
         return None;
     }
@@ -469,7 +471,11 @@ pub(crate) fn scan_line(telegram: &[u8], mode: Mode, at_ns: u64, first_ns: u64) 
     let ranges: Vec<u16> = measured.words().map(|word| word & greatest).collect();
     let ranges = match &ranges[..] {
         // A scan from a log without a last beam has none in a new log either.
-        [ranges @ .., last] if *last == greatest - LEFT_OUT && matches!(ranges.len(), 180 | 360) => ranges,
+        [ranges @ .., last]
+            if *last == greatest - MISSING_BEAM_OFFSET && matches!(ranges.len(), 180 | 360) =>
+        {
+            ranges
+        }
         ranges => ranges,
     };
     let mut line = format!("FLASER {}", ranges.len());
@@ -488,30 +494,30 @@ pub(crate) fn scan_line(telegram: &[u8], mode: Mode, at_ns: u64, first_ns: u64) 
 const FIRST_WORDS: [&[u8]; 6] =
     [b"FLASER ", b"ROBOTLASER1 ", b"RAWLASER1 ", b"PARAM ", b"ODOM ", b"# message formats"];
 /// Beginning of the line that names the encoding of the ranges.
-const TOLD: &str = "# LMS 2xx values:";
+const ENCODING_PREFIX: &str = "# LMS 2xx values:";
 /// Maximum length of a line in bytes.
 const MAX_LINE_LEN: u64 = 1 << 20;
 /// Measuring modes without reflector levels, by the bits of a range: 13, 14, 15.
 const MODES: [Mode; 3] = [Mode(0x00), Mode(0x04), Mode(0x06)];
 /// Encoding with the longest maximum range.
-const COARSEST: Encoding = Encoding { unit: Unit::Cm, mode: Mode(0x06) };
+const COARSEST_ENCODING: Encoding = Encoding { unit: Unit::Cm, mode: Mode(0x06) };
 /// Tolerance for a whole number of units. The text has the exact value; the error of a double is smaller.
-const WHOLE: f64 = 1e-6;
+const UNIT_TOLERANCE: f64 = 1e-6;
 /// Number of fields of two poses.
-const POSES: usize = 6;
+const POSE_FIELDS: usize = 6;
 /// Distance from the maximum value of the code for a range beyond the mode's (Telegram listing 10.8).
-pub const BEYOND: u16 = 8;
+pub const BEYOND_RANGE_OFFSET: u16 = 8;
 /// Distance of the code for a last beam that the log lacks. The code has no meaning, and no scanner sends it.
-pub(crate) const LEFT_OUT: u16 = 7;
+pub(crate) const MISSING_BEAM_OFFSET: u16 = 7;
 /// Tolerance of the field of view, in degrees: logs round it to a step more or less.
-const VIEW_DEG: f64 = 1.5;
+const VIEW_TOLERANCE_DEG: f64 = 1.5;
 /// Status byte of a healthy LMS type 6 (Telegram listing 8).
-const STATUS: u8 = 0x10;
+const HEALTHY_STATUS: u8 = 0x10;
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use scanhub_drivers::lms::measured::Measured;
+    use scanhub_drivers::lms::measured::MeasuredValues;
     use scanhub_drivers::lms::telegram::Telegram;
     use scanhub_drivers::lms::variant::Mode;
 
@@ -531,13 +537,13 @@ mod tests {
         let mm = encoding(Unit::Mm, 1);
         let frame = log_scan.frame(mm, mm);
         assert_eq!(frame.wall_ns, Some(1_071_078_720_500_000_000));
-        let measured = Measured::decode(Telegram::check(&frame.telegram).unwrap()).unwrap();
+        let measured = MeasuredValues::decode(Telegram::check(&frame.telegram).unwrap()).unwrap();
         let words: Vec<u16> = measured.words().collect();
         assert_eq!((words.len(), words[0], words[179], words[180]), (181, 2500, 2500, 8184));
     }
 
     #[test]
-    fn ranges_are_rounded_and_what_is_too_far_has_its_code() {
+    fn rounds_ranges_and_encodes_too_far_ones_as_codes() {
         // Of a log that can say all of them.
         let word = |range: &str, unit, mode| {
             let log_scan = LogScan::parse(&line(361, range)).unwrap().unwrap();
@@ -589,7 +595,7 @@ mod tests {
     }
 
     #[test]
-    fn a_wrong_line_says_what_is_wrong() {
+    fn malformed_line_error_names_the_cause() {
         assert_eq!(LogScan::parse("ODOM 1 2 3"), Ok(None));
         assert!(LogScan::parse("FLASER x").unwrap_err().contains("not a number of beams"));
         assert!(LogScan::parse("FLASER 17 1").unwrap_err().contains("17 beams"));
@@ -638,10 +644,10 @@ mod tests {
         assert_eq!(has(&format!("RAWLASER1 {sensor} 181 {ranges} 1 9 12.25 host 1")), (false, true));
     }
 
-    fn chosen(ranges_m: &[f64], told: Option<Encoding>) -> (u8, u8, UnencodableRanges) {
+    fn chosen(ranges_m: &[f64], stated: Option<Encoding>) -> (u8, u8, UnencodableRanges) {
         let mut stats = RangeStats::default();
         stats.note(ranges_m);
-        let (encoding, unencodable) = stats.encoding(told);
+        let (encoding, unencodable) = stats.encoding(stated);
         (encoding.unit.mm(), encoding.mode.range_bits(), unencodable)
     }
 
@@ -659,7 +665,7 @@ mod tests {
     }
 
     #[test]
-    fn what_no_sensor_sends_is_counted() {
+    fn counts_ranges_that_cannot_be_encoded() {
         assert_eq!(chosen(&[1.234, 2.0, 81.91], None), (10, 13, UnencodableRanges { rounded: 1, beyond: 0 }));
         assert_eq!(
             chosen(&[1.23456, 9.0, 9.001], None),
@@ -674,7 +680,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_log_says_itself_holds_if_it_can() {
+    fn uses_the_encoding_of_the_log_if_possible() {
         let mm = |mode| Some(Encoding { unit: Unit::Mm, mode: Mode(mode) });
         assert_eq!(chosen(&[8.185], mm(0x04)), (1, 14, UnencodableRanges::default()));
         assert_eq!(chosen(&[8.185], None), (1, 13, UnencodableRanges::default()));
@@ -702,15 +708,15 @@ mod tests {
         assert_eq!(log_scan.ranges_m[..4], [5.0, 81.91, 81.83, 12.34]);
         let cm = Encoding { unit: Unit::Cm, mode: Mode(0) };
         assert_eq!(log_scan.words(cm, cm)[..4], [500, 8191, 8183, 1234]);
-        words[180] = 8191 - LEFT_OUT;
+        words[180] = 8191 - MISSING_BEAM_OFFSET;
         let line = scan_line(measured::encode(0, Unit::Cm, &words, 0x10).bytes(), Mode(1), 1, 1).unwrap();
         assert!(line.starts_with("FLASER 180 5.00 81.91 81.83 12.34"), "{line}");
     }
 
     #[cfg(feature = "mcap")]
     #[test]
-    fn what_is_no_whole_scan_has_no_line() {
-        assert_eq!(scan_line(reply::mode(0, true, 0x10).bytes(), Mode(0), 1, 0), None);
+    fn partial_scans_and_replies_have_no_log_line() {
+        assert_eq!(scan_line(reply::mode_reply(0, true, 0x10).bytes(), Mode(0), 1, 0), None);
         let part = measured::encode(0, Unit::Cm, &[7; 61], 0x10);
         assert_eq!(scan_line(part.bytes(), Mode(0), 1, 0), None);
     }

@@ -14,9 +14,9 @@ use scanhub_drivers::lms::variant::{Mode, Unit};
 use scanhub_files::output::{OutputFile, unwritable};
 use scanhub_schema::csv::{MarkColumns, ScanColumns};
 use scanhub_schema::file::Compression;
-use scanhub_schema::{Failure, Family, Kind, Topic, check_followed};
+use scanhub_schema::{Failure, Family, Kind, Topic, check_any_sensor};
 
-use crate::{Damage, Encoding, Form, Frame, Recording, Unread};
+use crate::{Damage, Encoding, Form, Frame, Recording, UnreadLines};
 use writers::{Csv, Ros2};
 
 /// Options of a conversion.
@@ -50,7 +50,7 @@ pub struct ConvertOptions {
 
 /// Result of a conversion.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Converted {
+pub struct ConversionResult {
     /// Formats of the input and of the output.
     pub forms: (Form, Target),
     /// How the ranges of a log are encoded as values; `None` for other formats.
@@ -67,10 +67,10 @@ pub struct Converted {
     /// contains the encoding of a log does not count.
     pub dropped: u64,
     /// Data of a log that no telegram holds.
-    pub unread: Unread,
+    pub unread: UnreadLines,
     /// Time from the first telegram to the last one in ns, by the stamps of the recording or by generated ones; `None` if there
     /// are neither.
-    pub took_ns: Option<u64>,
+    pub duration_ns: Option<u64>,
     /// Data that could not be read.
     pub damage: Damage,
     /// Whether the reader of stdout closed it before the end.
@@ -115,14 +115,14 @@ pub fn convert(
     options: &ConvertOptions,
     stop: &AtomicBool,
     mut progress: impl FnMut(u64, u64),
-) -> Result<Converted, Failure> {
+) -> Result<ConversionResult, Failure> {
     let (target, chosen) = target_of(options)?;
     let whole = Recording::open_as(&options.input, options.family)?;
     let output = Output::create(&options.output, &options.input, options.force)?;
     let recording = match chosen {
         Some(sensor) if whole.contents().form == Form::Mcap => whole.of(sensor)?,
         Some(sensor) => {
-            let named = check_followed(sensor).map(|()| whole);
+            let named = check_any_sensor(sensor).map(|()| whole);
             named.map_err(|failure| Failure { kind: Kind::Usage, ..failure })?
         }
         None => whole,
@@ -141,13 +141,13 @@ pub fn convert(
     let mut conversion = Conversion {
         recording: &recording,
         options,
-        sensor: chosen.unwrap_or(SENSOR),
+        sensor: chosen.unwrap_or(DEFAULT_SENSOR),
         encoding,
         stop,
         progress: &mut progress,
-        done: 0,
+        telegram_count: 0,
         first_ns: None,
-        converted: Converted {
+        converted: ConversionResult {
             forms: (contents.form, target),
             encoding: recording.encoding().filter(|_| contents.form == Form::Carmen),
             sensors: contents.sensors.clone(),
@@ -156,41 +156,41 @@ pub fn convert(
             marks: None,
             dropped: 0,
             unread: contents.unread,
-            took_ns: None,
+            duration_ns: None,
             damage: contents.damage,
             is_closed: false,
         },
     };
-    let mut file = BufWriter::with_capacity(BUFFER, output);
+    let mut file = BufWriter::with_capacity(BUFFER_LEN, output);
     let written = conversion.write(target, &mut file);
     let written = written.and_then(|()| Ok(file.into_inner().map_err(IntoInnerError::into_error)?));
     let converted = conversion.converted;
     match written {
         Ok(output) => output.commit().map(|()| converted),
-        Err(Ended::Unwritable(error)) if Output::is_closed(&options.output, &error) => {
-            Ok(Converted { is_closed: true, ..converted })
+        Err(ConversionError::Unwritable(error)) if Output::is_closed(&options.output, &error) => {
+            Ok(ConversionResult { is_closed: true, ..converted })
         }
-        Err(Ended::Unwritable(error)) => Err(unwritable(&options.output, &error)),
-        Err(Ended::Failed(failure)) => Err(failure),
+        Err(ConversionError::Unwritable(error)) => Err(unwritable(&options.output, &error)),
+        Err(ConversionError::Failed(failure)) => Err(failure),
     }
 }
 
 /// Reason why a conversion ended early.
-enum Ended {
+enum ConversionError {
     /// The output cannot be written.
     Unwritable(io::Error),
     Failed(Failure),
 }
 
-impl From<io::Error> for Ended {
-    fn from(error: io::Error) -> Ended {
-        Ended::Unwritable(error)
+impl From<io::Error> for ConversionError {
+    fn from(error: io::Error) -> ConversionError {
+        ConversionError::Unwritable(error)
     }
 }
 
-impl From<Failure> for Ended {
-    fn from(failure: Failure) -> Ended {
-        Ended::Failed(failure)
+impl From<Failure> for ConversionError {
+    fn from(failure: Failure) -> ConversionError {
+        ConversionError::Failed(failure)
     }
 }
 
@@ -204,15 +204,15 @@ struct Conversion<'a> {
     stop: &'a AtomicBool,
     progress: &'a mut dyn FnMut(u64, u64),
     /// Telegrams so far, written or not.
-    done: u64,
+    telegram_count: u64,
     /// Time of the first telegram.
     first_ns: Option<u64>,
-    converted: Converted,
+    converted: ConversionResult,
 }
 
 impl Conversion<'_> {
     /// Writes the recording into `file` in the format `target`.
-    fn write(&mut self, target: Target, file: &mut impl Write) -> Result<(), Ended> {
+    fn write(&mut self, target: Target, file: &mut impl Write) -> Result<(), ConversionError> {
         let options = self.options;
         let &ConvertOptions { meters, intensities, .. } = options;
         match target {
@@ -226,14 +226,16 @@ impl Conversion<'_> {
             }
             Target::Csv => {
                 let columns = ScanColumns { meters, intensities };
-                writers::write_scans(self, Csv::begin(Packing::of(&options.output, file), columns))
+                writers::write_scans(self, Csv::begin(OutputEncoder::of(&options.output, file), columns))
             }
             Target::MarksCsv => {
-                writers::write_marks(self, MarkColumns { meters }, Packing::of(&options.output, file))
+                writers::write_marks(self, MarkColumns { meters }, OutputEncoder::of(&options.output, file))
             }
-            Target::Recording(Form::Carmen) => writers::write_log(self, Packing::of(&options.output, file)),
+            Target::Recording(Form::Carmen) => {
+                writers::write_log(self, OutputEncoder::of(&options.output, file))
+            }
             Target::Recording(Form::Telegrams) => {
-                writers::write_stream(self, Packing::of(&options.output, file))
+                writers::write_stream(self, OutputEncoder::of(&options.output, file))
             }
         }
     }
@@ -243,18 +245,18 @@ impl Conversion<'_> {
     /// # Errors
     ///
     /// Returns [`Kind::Interrupted`] if the conversion was stopped.
-    fn count(&mut self, written: Written, at_ns: Option<u64>) -> Result<(), Ended> {
+    fn count(&mut self, item: WrittenItem, at_ns: Option<u64>) -> Result<(), ConversionError> {
         let converted = &mut self.converted;
-        if let Some(at_ns) = at_ns.filter(|_| !matches!(written, Written::Added | Written::LeftOut)) {
+        if let Some(at_ns) = at_ns.filter(|_| !matches!(item, WrittenItem::Added | WrittenItem::Dropped)) {
             let since_ns = at_ns.saturating_sub(*self.first_ns.get_or_insert(at_ns));
-            converted.took_ns = converted.took_ns.max(Some(since_ns));
+            converted.duration_ns = converted.duration_ns.max(Some(since_ns));
         }
-        converted.telegrams += u64::from(matches!(written, Written::Scan | Written::Other));
-        converted.scans += u64::from(matches!(written, Written::Scan | Written::Marks));
-        converted.dropped += u64::from(written == Written::LeftOut);
-        self.done += 1;
-        if self.done.is_multiple_of(PROGRESS_INTERVAL) {
-            (self.progress)(self.done, self.recording.contents().telegrams);
+        converted.telegrams += u64::from(matches!(item, WrittenItem::Scan | WrittenItem::Other));
+        converted.scans += u64::from(matches!(item, WrittenItem::Scan | WrittenItem::Marks));
+        converted.dropped += u64::from(item == WrittenItem::Dropped);
+        self.telegram_count += 1;
+        if self.telegram_count.is_multiple_of(PROGRESS_INTERVAL) {
+            (self.progress)(self.telegram_count, self.recording.contents().telegrams);
         }
         if self.stop.load(Ordering::Relaxed) {
             return Err(Failure::new(Kind::Interrupted, "interrupted before the end", "").into());
@@ -265,24 +267,28 @@ impl Conversion<'_> {
 
 /// Form in which a telegram was written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Written {
+enum WrittenItem {
     Scan,
     Other,
     /// The marks of a scan.
     Marks,
     /// A reply that the recording itself does not contain, such as one with the encoding of a log's values.
     Added,
-    LeftOut,
+    Dropped,
 }
 
-impl Written {
-    fn of(is_scan: bool) -> Written {
-        if is_scan { Written::Scan } else { Written::Other }
+impl WrittenItem {
+    fn of(is_scan: bool) -> WrittenItem {
+        if is_scan { WrittenItem::Scan } else { WrittenItem::Other }
     }
 
     /// Returns how `frame` was written, number `number` of those that [`writers::frames`] returns for a recording of `form`.
-    fn of_frame(form: Form, number: usize, frame: &Frame) -> Written {
-        if form == Form::Carmen && number == 0 { Written::Added } else { Written::of(frame.is_scan()) }
+    fn of_frame(form: Form, number: usize, frame: &Frame) -> WrittenItem {
+        if form == Form::Carmen && number == 0 {
+            WrittenItem::Added
+        } else {
+            WrittenItem::of(frame.is_scan())
+        }
     }
 }
 
@@ -330,7 +336,7 @@ fn encoding(recording: &Recording, target: Target) -> Result<Encoding, Failure> 
         let message = format!("{place} is of a scanner of family number {number}, which is not known here");
         return Err(Failure::new(Kind::Input, message, "a later version of scanhub recorded it: use that"));
     }
-    let mode = contents.readable();
+    let mode = contents.readable_mode();
     if mode.is_none() && target == Target::Recording(Form::Carmen) {
         let message = format!("{} does not contain its measuring mode", recording.path().display());
         let hint = "`scanhub replay --set link.front.mode=0x04` plays it, and `scanhub record` records it with its mode";
@@ -400,7 +406,7 @@ fn usage<T>(message: &str, hint: &str) -> Result<T, Failure> {
 
 /// Returns the format that the file's name and `--ros2` select.
 fn format_of(options: &ConvertOptions) -> Result<Target, Failure> {
-    let target = ending(&options.output)?;
+    let target = target_of_ending(&options.output)?;
     if options.points && !options.ros2 {
         return usage("--points is for ROS 2", "scanhub convert IN OUT.mcap --ros2 --points");
     }
@@ -420,7 +426,7 @@ fn format_of(options: &ConvertOptions) -> Result<Target, Failure> {
 }
 
 /// Returns the format that the ending of a file selects.
-fn ending(path: &Path) -> Result<Target, Failure> {
+fn target_of_ending(path: &Path) -> Result<Target, Failure> {
     let name = path.file_name().map(|name| name.to_string_lossy().to_lowercase()).unwrap_or_default();
     let plain = name.strip_suffix(".gz").unwrap_or(&name);
     match plain.rsplit_once('.') {
@@ -506,39 +512,39 @@ impl Write for Output {
 }
 
 /// Output that is compressed by gzip if the name of the file ends with `.gz`.
-enum Packing<W: Write> {
+enum OutputEncoder<W: Write> {
     Plain(W),
     Gzip(GzEncoder<W>),
 }
 
-impl<W: Write> Packing<W> {
+impl<W: Write> OutputEncoder<W> {
     fn of(path: &Path, file: W) -> Self {
         match path.extension() {
             Some(ending) if ending.eq_ignore_ascii_case("gz") => {
-                Packing::Gzip(GzEncoder::new(file, flate2::Compression::default()))
+                OutputEncoder::Gzip(GzEncoder::new(file, flate2::Compression::default()))
             }
-            _ => Packing::Plain(file),
+            _ => OutputEncoder::Plain(file),
         }
     }
 
     fn write_all(&mut self, bytes: &[u8]) -> io::Result<()> {
         match self {
-            Packing::Plain(file) => file.write_all(bytes),
-            Packing::Gzip(encoder) => encoder.write_all(bytes),
+            OutputEncoder::Plain(file) => file.write_all(bytes),
+            OutputEncoder::Gzip(encoder) => encoder.write_all(bytes),
         }
     }
 
     fn finish(self) -> io::Result<()> {
         match self {
-            Packing::Plain(_) => Ok(()),
-            Packing::Gzip(encoder) => encoder.finish().map(drop),
+            OutputEncoder::Plain(_) => Ok(()),
+            OutputEncoder::Gzip(encoder) => encoder.finish().map(drop),
         }
     }
 }
 
 /// Sensor of a stream or a log, unless an option names it.
-const SENSOR: &str = "front";
+const DEFAULT_SENSOR: &str = "front";
 /// Size of the buffer before the output, in bytes.
-const BUFFER: usize = 1 << 20;
+const BUFFER_LEN: usize = 1 << 20;
 /// Number of telegrams between two reports of progress.
 const PROGRESS_INTERVAL: u64 = 512;

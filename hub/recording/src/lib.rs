@@ -15,13 +15,13 @@ mod stream;
 
 use std::fmt;
 
-use scanhub_drivers::lms::measured::{MEASURED, Measured, nominal_period};
+use scanhub_drivers::lms::measured::{MEASURED, MeasuredValues, nominal_period};
 use scanhub_drivers::lms::reply::Reply;
 use scanhub_drivers::lms::telegram::Telegram;
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
 use scanhub_schema::{Family, Nanos};
 
-pub use carmen::{BEYOND, UnencodableRanges, Unread};
+pub use carmen::{BEYOND_RANGE_OFFSET, UnencodableRanges, UnreadLines};
 pub use open::Recording;
 pub use stream::VirtualTime;
 
@@ -59,7 +59,7 @@ impl Frame {
     }
 
     /// Returns whether it reports the measuring mode, or that the mode is no longer known.
-    pub fn tells_mode(&self) -> bool {
+    pub fn has_mode(&self) -> bool {
         let reply = Telegram::check(&self.telegram).and_then(Reply::decode);
         reply.is_some_and(|reply| reply.mode().is_some())
     }
@@ -129,7 +129,7 @@ pub struct Contents {
     /// Name of the model of a rotating scanner, if a status reports it.
     pub model: Option<&'static str>,
     /// Name of the scan mode of a rotating scanner, if a status reports it.
-    pub way: Option<&'static str>,
+    pub mode_name: Option<&'static str>,
     /// Number of the sensor's family, and its type, as in the first status that has a type.
     pub sensor_type: Option<(u8, String)>,
     /// Angle between two beams of a rotating scanner, in 1/100 degree, if a status reports it.
@@ -146,7 +146,7 @@ pub struct Contents {
     /// Ranges of a log that its unit and mode cannot encode.
     pub unencodable: UnencodableRanges,
     /// Data of a log that its scans do not contain.
-    pub unread: Unread,
+    pub unread: UnreadLines,
     /// Data that could not be read. [`telegrams`](Recording::telegrams) returns the rest.
     pub damage: Damage,
 }
@@ -154,15 +154,15 @@ pub struct Contents {
 impl Contents {
     /// Returns the measuring mode for reading the values: the one in the recording, or else the mode of 13 bits if no value has a
     /// higher bit, because then the modes agree. Returns `None` if the values could be split in several ways.
-    pub fn readable(&self) -> Option<Mode> {
+    pub fn readable_mode(&self) -> Option<Mode> {
         let plain = Mode(0x00);
         self.mode.or((self.bits <= plain.max_value()).then_some(plain))
     }
 
     /// Returns the number of the measuring mode for reading the values: the one in the recording, or else `configured`, or else
-    /// the [readable](Self::readable) one.
+    /// the [readable](Self::readable_mode) one.
     pub fn mode_or(&self, configured: Option<u8>) -> Option<u8> {
-        self.mode.map(|mode| mode.0).or(configured).or(self.readable().map(|mode| mode.0))
+        self.mode.map(|mode| mode.0).or(configured).or(self.readable_mode().map(|mode| mode.0))
     }
 
     /// Returns the encoding of values in the measuring mode with the number `mode`.
@@ -199,7 +199,7 @@ impl Contents {
         if let Some(Reply::Configuration(configuration)) = Reply::decode(telegram) {
             self.mode = self.mode.or(Some(configuration.mode()));
         }
-        if let Some(measured) = Measured::decode(telegram) {
+        if let Some(measured) = MeasuredValues::decode(telegram) {
             self.scans += 1;
             self.variant = self.variant.or(Variant::of_beams(measured.count()));
             self.unit = self.unit.or(Some(measured.unit()));
@@ -236,9 +236,9 @@ pub struct Damage {
     /// Chunks that were skipped because the file contains them twice.
     pub repeats: u64,
     /// Whether the file ends without its index, as after a kill.
-    pub is_cut: bool,
+    pub is_truncated: bool,
     /// Whether the file was changed after it was written: a checksum or a length is wrong.
-    pub is_harmed: bool,
+    pub is_damaged: bool,
 }
 
 impl Damage {
@@ -261,10 +261,10 @@ impl fmt::Display for Damage {
             counted(self.chunks, "chunk", "chunks"),
             counted(self.repeats, "chunk that the file has twice", "chunks that the file has twice"),
             counted(self.bytes, "byte that could not be used", "bytes that could not be used"),
-            self.is_cut.then(|| "the end of the file, with its index".to_owned()),
+            self.is_truncated.then(|| "the end of the file, with its index".to_owned()),
         ];
         let parts: Vec<_> = parts.into_iter().flatten().collect();
-        match (&parts[..], self.is_harmed) {
+        match (&parts[..], self.is_damaged) {
             ([], true) => f.write_str("no telegram, but a checksum is wrong"),
             ([], false) => f.write_str("nothing"),
             _ => f.write_str(&parts.join(", ")),
@@ -277,12 +277,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lists_what_is_missing() {
+    fn damage_lists_missing_parts() {
         assert_eq!(Damage::default().to_string(), "nothing");
-        let damage = Damage { telegrams: 2, chunks: 1, is_cut: true, ..Damage::default() };
+        let damage = Damage { telegrams: 2, chunks: 1, is_truncated: true, ..Damage::default() };
         let words = "2 telegrams, 1 chunk, the end of the file, with its index";
         assert_eq!(damage.to_string(), words);
-        let damage = Damage { is_harmed: true, ..Damage::default() };
+        let damage = Damage { is_damaged: true, ..Damage::default() };
         assert_eq!(damage.to_string(), "no telegram, but a checksum is wrong");
     }
 }

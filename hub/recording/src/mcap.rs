@@ -10,13 +10,15 @@ use mcap::records::{Channel, MessageHeader, Record as Parsed, op};
 use scanhub_drivers::features;
 use scanhub_drivers::lms::telegram::Telegram;
 use scanhub_drivers::lms::variant::Mode;
-use scanhub_schema::datagram::Packed;
+use scanhub_schema::datagram::DatagramPayload;
 use scanhub_schema::file::{self, ENCODING, ENCODING_V1, METADATA};
-use scanhub_schema::{Family, Foreground, Header, Maker, Pace, Scan, Status, Tilt, Topic, check_followed};
+use scanhub_schema::{
+    Family, Foreground, Header, PublishRate, PublisherKind, Scan, Status, Tilt, Topic, check_any_sensor,
+};
 
 use crate::{Contents, Damage, Frame, MountRecord};
 use records::Records;
-pub(crate) use records::{Record, has_border};
+pub(crate) use records::{Record, has_record_boundary};
 
 /// A part of a file.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -77,17 +79,18 @@ impl<R: Read> Reader<R> {
             return header.family == Family::Lms as u8 && Telegram::check(telegram).is_none();
         }
         record.message().is_some_and(|(message, data)| {
-            let is_ours = matches!(self.catalog.place(message.channel_id), Some(Some(_)));
+            let is_ours = matches!(self.catalog.channel_topic(message.channel_id), Some(Some(_)));
             is_ours && split_sample(&message, data).is_none()
         })
     }
 
     fn telegram(&mut self, record: &Record) -> Option<Sample> {
         let (message, data) = record.message()?;
-        let (sensor, (header, telegram)) = match self.catalog.place(message.channel_id) {
-            Some(place) => {
-                let place = place.filter(|place| place.topic == Topic::Telegram)?;
-                (place.sensor.clone(), split_sample(&message, data)?)
+        let (sensor, (header, telegram)) = match self.catalog.channel_topic(message.channel_id) {
+            Some(channel_topic) => {
+                let channel_topic =
+                    channel_topic.filter(|channel_topic| channel_topic.topic == Topic::Telegram)?;
+                (channel_topic.sensor.clone(), split_sample(&message, data)?)
             }
             // The channel's record is lost. A telegram of an LMS shows by itself that it is one.
             None => {
@@ -110,7 +113,7 @@ pub(crate) struct Survey {
     /// Header of each sensor's last telegram.
     last: BTreeMap<String, Header>,
     /// Number of the first telegram that the hub processed further, by sensor and run of the hub.
-    understood: BTreeMap<String, BTreeMap<u64, u64>>,
+    first_understood: BTreeMap<String, BTreeMap<u64, u64>>,
     /// Number of pairs of sensor and run in it.
     runs: usize,
 }
@@ -227,8 +230,8 @@ impl Survey {
 
     /// Returns the number of the first telegram of `sensor` that the hub with this `boot` processed further; `None` if the
     /// file does not contain it, or is damaged.
-    pub(crate) fn understood(&self, sensor: &str, boot: u64) -> Option<u64> {
-        self.understood.get(sensor)?.get(&boot).copied().filter(|_| !self.whole.damage.is_harmed)
+    pub(crate) fn first_understood(&self, sensor: &str, boot: u64) -> Option<u64> {
+        self.first_understood.get(sensor)?.get(&boot).copied().filter(|_| !self.whole.damage.is_damaged)
     }
 
     fn note(&mut self, sample: &Sample) {
@@ -256,13 +259,14 @@ impl Survey {
 
     /// Takes over what statuses say about the scanner, and which telegrams the hub processed further.
     fn note_record(&mut self, catalog: &Catalog, record: &Record) {
-        let Some((place, header, payload)) = catalog.message(record) else { return };
-        let is_of_scan = place.topic.row().pace == Pace::Scan && place.topic != Topic::Telegram;
+        let Some((channel_topic, header, payload)) = catalog.message(record) else { return };
+        let is_of_scan = channel_topic.topic.spec().publish_rate == PublishRate::Scan
+            && channel_topic.topic != Topic::Telegram;
         // A sample without a hub time was not caused by a telegram.
         if is_of_scan && header.hub_time_ns().is_some() {
-            let runs = match self.understood.get_mut(&place.sensor) {
+            let runs = match self.first_understood.get_mut(&channel_topic.sensor) {
                 Some(runs) => runs,
-                None => self.understood.entry(place.sensor.clone()).or_default(),
+                None => self.first_understood.entry(channel_topic.sensor.clone()).or_default(),
             };
             match runs.get_mut(&header.boot) {
                 Some(first) => *first = header.seq.min(*first),
@@ -274,25 +278,25 @@ impl Survey {
             }
         }
         if header.family != Family::Lms as u8 {
-            let of_sensor = of_sensor(&mut self.sensors, &place.sensor);
+            let of_sensor = of_sensor(&mut self.sensors, &channel_topic.sensor);
             if of_sensor.beams.is_none() {
-                of_sensor.beams = beams_of(place, payload);
+                of_sensor.beams = beams_of(channel_topic, payload);
                 self.whole.beams = self.whole.beams.or(of_sensor.beams);
             }
         }
         let mut status = Status::default();
-        if place.topic == Topic::Status && status.unpack(payload) {
+        if channel_topic.topic == Topic::Status && status.unpack(payload) {
             let mode = (status.mode != Status::MODE_UNKNOWN).then_some(Mode(status.mode));
-            let rotating = if place.is_old { None } else { rotating(&status) };
+            let rotating = if channel_topic.is_old { None } else { rotating(&status) };
             let name = Some(status.sensor_type()).filter(|name| !name.is_empty());
-            for contents in [&mut self.whole, of_sensor(&mut self.sensors, &place.sensor)] {
+            for contents in [&mut self.whole, of_sensor(&mut self.sensors, &channel_topic.sensor)] {
                 contents.mode = contents.mode.or(mode);
                 if contents.sensor_type.is_none() {
                     contents.sensor_type = name.map(|name| (status.family, name.to_owned()));
                 }
-                if let Some((model, way)) = rotating {
+                if let Some((model, mode_name)) = rotating {
                     contents.model = contents.model.or(model);
-                    contents.way = contents.way.or(way);
+                    contents.mode_name = contents.mode_name.or(mode_name);
                     contents.step_cdeg = contents.step_cdeg.or(Some(status.resolution_cdeg));
                 }
             }
@@ -301,9 +305,9 @@ impl Survey {
 }
 
 /// Returns the number of beams of the scan that `payload` is, or that it was computed from. `None` for another topic.
-fn beams_of(place: &ChannelTopic, payload: &[u8]) -> Option<u16> {
-    match place.topic {
-        _ if place.is_old => None,
+fn beams_of(channel_topic: &ChannelTopic, payload: &[u8]) -> Option<u16> {
+    match channel_topic.topic {
+        _ if channel_topic.is_old => None,
         Topic::Scan => {
             let mut scan = Box::<Scan>::default();
             Scan::unpack_into(&mut scan, payload).then(|| scan.beams() as u16)
@@ -324,8 +328,8 @@ fn rotating(status: &Status) -> Option<(Option<&'static str>, Option<&'static st
     let features = features(Family::of_number(status.family)?);
     let name = status.model().filter(|_| !features.has_whole_telegrams)?;
     let model = features.models.iter().map(|model| model.name).find(|known| *known == name);
-    let way = features.modes.iter().copied().find(|known| status.way() == Some(known));
-    Some((model, way))
+    let mode_name = features.modes.iter().copied().find(|known| status.mode_name() == Some(known));
+    Some((model, mode_name))
 }
 
 fn of_sensor<'a>(sensors: &'a mut BTreeMap<String, Contents>, sensor: &str) -> &'a mut Contents {
@@ -351,8 +355,9 @@ impl ChannelTopic {
     fn of(channel: &Channel) -> Option<ChannelTopic> {
         let (sensor, topic) = channel.topic.rsplit_once('/')?;
         let is_old = channel.message_encoding == ENCODING_V1;
-        let is_ours = (is_old || channel.message_encoding == ENCODING) && check_followed(sensor).is_ok();
-        let topic = Topic::parse(topic).filter(|topic| is_ours && topic.maker() == Maker::Link)?;
+        let is_ours = (is_old || channel.message_encoding == ENCODING) && check_any_sensor(sensor).is_ok();
+        let topic =
+            Topic::parse(topic).filter(|topic| is_ours && topic.publisher_kind() == PublisherKind::Link)?;
         Some(ChannelTopic { sensor: sensor.to_owned(), topic, is_old })
     }
 
@@ -371,7 +376,7 @@ pub(crate) struct Catalog {
     /// Profile of the file, such as `ros2`.
     pub(crate) profile: String,
     /// Description of the recording: domain, host, version ([`METADATA`]).
-    pub(crate) facts: BTreeMap<String, String>,
+    pub(crate) metadata: BTreeMap<String, String>,
     schemas: BTreeMap<u16, Schema>,
     channels: BTreeMap<u16, (Channel, Option<ChannelTopic>)>,
     sensors: HashSet<String>,
@@ -391,25 +396,25 @@ impl Catalog {
         }
         match record.parse() {
             Some(Parsed::Header(header)) => self.profile = header.profile,
-            Some(Parsed::Metadata(metadata)) if metadata.name == METADATA && self.facts.is_empty() => {
-                self.facts = metadata.metadata;
+            Some(Parsed::Metadata(metadata)) if metadata.name == METADATA && self.metadata.is_empty() => {
+                self.metadata = metadata.metadata;
             }
             Some(Parsed::Schema { header, data }) if !self.schemas.contains_key(&header.id) => {
-                self.bytes += record.body.len() + OVERHEAD;
+                self.bytes += record.body.len() + RECORD_OVERHEAD;
                 self.schemas.insert(header.id, (header.name, header.encoding, data.into_owned()));
             }
             Some(Parsed::Channel(channel)) if !self.channels.contains_key(&channel.id) => {
-                self.bytes += record.body.len() + OVERHEAD * (1 + channel.metadata.len());
-                let place = ChannelTopic::of(&channel);
-                self.sensors.extend(place.iter().map(|place| place.sensor.clone()));
-                self.channels.insert(channel.id, (channel, place));
+                self.bytes += record.body.len() + RECORD_OVERHEAD * (1 + channel.metadata.len());
+                let channel_topic = ChannelTopic::of(&channel);
+                self.sensors.extend(channel_topic.iter().map(|channel_topic| channel_topic.sensor.clone()));
+                self.channels.insert(channel.id, (channel, channel_topic));
             }
             _ => {}
         }
         let what = if self.sensors.len() > MAX_SENSORS {
             format!("it names more than {MAX_SENSORS} sensors")
-        } else if self.bytes > MAX_BYTES {
-            format!("its channels and schemas take more than {} MB", MAX_BYTES >> 20)
+        } else if self.bytes > MAX_CATALOG_BYTES {
+            format!("its channels and schemas take more than {} MB", MAX_CATALOG_BYTES >> 20)
         } else {
             return Ok(());
         };
@@ -424,30 +429,34 @@ impl Catalog {
 
     /// Returns the topic of the channel with this number: `Some(None)` if another program made it, `None` if the channel is
     /// unknown.
-    pub(crate) fn place(&self, id: u16) -> Option<Option<&ChannelTopic>> {
-        self.channels.get(&id).map(|(_, place)| place.as_ref())
+    pub(crate) fn channel_topic(&self, id: u16) -> Option<Option<&ChannelTopic>> {
+        self.channels.get(&id).map(|(_, channel_topic)| channel_topic.as_ref())
     }
 
     /// Returns the topic of a message of the hub, its header and its payload; `None` for any other record.
     pub(crate) fn message<'a>(&self, record: &'a Record) -> Option<(&ChannelTopic, Header, &'a [u8])> {
         let (message, data) = record.message()?;
-        let place = self.place(message.channel_id)??;
+        let channel_topic = self.channel_topic(message.channel_id)??;
         let (header, payload) = split_sample(&message, data)?;
-        Some((place, header, payload))
+        Some((channel_topic, header, payload))
     }
 
     /// Returns the sensors that channels name, in the order of the channels' numbers.
     pub(crate) fn sensors(&self) -> Vec<String> {
-        let mut seen = HashSet::new();
-        let places = self.channels.values().filter_map(|(_, place)| place.as_ref());
-        places.map(|place| &place.sensor).filter(|sensor| seen.insert(*sensor)).cloned().collect()
+        let mut known = HashSet::new();
+        let channel_topics = self.channels.values().filter_map(|(_, channel_topic)| channel_topic.as_ref());
+        channel_topics
+            .map(|channel_topic| &channel_topic.sensor)
+            .filter(|sensor| known.insert(*sensor))
+            .cloned()
+            .collect()
     }
 
     /// Returns the mounts whose angles have a channel, in the order of the channels' numbers.
     pub(crate) fn mounts(&self) -> Vec<String> {
-        let mut seen = HashSet::new();
+        let mut known = HashSet::new();
         let names = self.channels.values().filter_map(|(channel, _)| mount_of(channel));
-        names.filter(|name| seen.insert(*name)).map(str::to_owned).collect()
+        names.filter(|name| known.insert(*name)).map(str::to_owned).collect()
     }
 
     /// Returns the angle of `mount` that `record` contains. `None` if it contains anything else.
@@ -464,21 +473,22 @@ impl Catalog {
 
     /// Returns whether a channel has scans of `sensor`.
     pub(crate) fn has_scans(&self, sensor: &str) -> bool {
-        let mut places = self.channels.values().filter_map(|(_, place)| place.as_ref());
-        places.any(|place| place.sensor == sensor && place.has_scans())
+        let mut channel_topics =
+            self.channels.values().filter_map(|(_, channel_topic)| channel_topic.as_ref());
+        channel_topics.any(|channel_topic| channel_topic.sensor == sensor && channel_topic.has_scans())
     }
 }
 
 /// Returns the name of the mount whose angles `channel` has.
 fn mount_of(channel: &Channel) -> Option<&str> {
     let (mount, topic) = channel.topic.rsplit_once('/')?;
-    let is_ours = channel.message_encoding == ENCODING && check_followed(mount).is_ok();
+    let is_ours = channel.message_encoding == ENCODING && check_any_sensor(mount).is_ok();
     (is_ours && Topic::parse(topic) == Some(Topic::Tilt)).then_some(mount)
 }
 
 /// Returns header and payload of a message of the hub; `None` if the header contradicts the message that contains it.
 pub(crate) fn split_sample<'a>(message: &MessageHeader, data: &'a [u8]) -> Option<(Header, &'a [u8])> {
-    let (header, payload) = file::parts(data)?;
+    let (header, payload) = file::split_message(data)?;
     let is_same = (header.topic_seq as u32, header.wall_ns) == (message.sequence, message.log_time);
     is_same.then_some((header, payload))
 }
@@ -488,6 +498,6 @@ const MAX_RUNS: usize = 50_000;
 /// Maximum number of sensors: those of sixteen hubs, each with as many as one can have.
 const MAX_SENSORS: usize = 4096;
 /// Maximum memory of channels and schemas. Files of many sensors have some hundred channels, and a megabyte of schemas.
-const MAX_BYTES: usize = 20 << 20;
+const MAX_CATALOG_BYTES: usize = 20 << 20;
 /// Memory that a record takes in addition to its text.
-const OVERHEAD: usize = 128;
+const RECORD_OVERHEAD: usize = 128;

@@ -5,13 +5,13 @@ use std::io::{self, BufRead, BufReader, ErrorKind, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 use flate2::bufread::MultiGzDecoder;
-use scanhub_drivers::line::Session as _;
-use scanhub_drivers::recognize::{EXAMINED, bytes_by_family, family_of};
+use scanhub_drivers::line::ScannerSession as _;
+use scanhub_drivers::recognize::{EXAMINED_BYTES, bytes_by_family, family_of};
 use scanhub_drivers::{Model, Session, Settings, features};
-use scanhub_files::regular;
+use scanhub_files::regular_file;
 use scanhub_schema::{Failure, Family, Kind};
 
-use crate::carmen::{self, Log};
+use crate::carmen::{self, LogReader};
 #[cfg(feature = "mcap")]
 use crate::mcap::{Catalog, Reader};
 use crate::stream::{self, StreamReader};
@@ -36,7 +36,7 @@ impl Recording {
     /// # Errors
     ///
     /// Returns [`Kind::Input`] if the file is neither an MCAP file nor a CARMEN log, and has no telegram. The same holds for a
-    /// stream file if no family takes at least half of the [first bytes](scanhub_drivers::recognize::EXAMINED).
+    /// stream file if no family takes at least half of the [first bytes](scanhub_drivers::recognize::EXAMINED_BYTES).
     pub fn open(path: impl Into<PathBuf>) -> Result<Recording, Failure> {
         Recording::open_as(path, None)
     }
@@ -48,7 +48,7 @@ impl Recording {
     /// Returns the errors of [`open`](Self::open).
     pub fn open_as(path: impl Into<PathBuf>, family: Option<Family>) -> Result<Recording, Failure> {
         let path = path.into();
-        let recording = Recording::open_line(&path, family)?;
+        let recording = Recording::open_stream(&path, family)?;
         if recording.contents.form == Form::Telegrams && recording.contents.telegrams == 0 {
             return Err(without_telegram(&path));
         }
@@ -61,20 +61,20 @@ impl Recording {
     /// # Errors
     ///
     /// Returns the errors of [`open`](Self::open).
-    pub fn open_line(path: impl Into<PathBuf>, family: Option<Family>) -> Result<Recording, Failure> {
+    pub fn open_stream(path: impl Into<PathBuf>, family: Option<Family>) -> Result<Recording, Failure> {
         let path = path.into();
         let mut reader = reader(&path)?;
         let head = reader.fill_buf().map_err(|error| unreadable(&path, &error))?;
         if head.is_empty() {
-            return Err(refused(&path, "is empty"));
+            return Err(unusable(&path, "is empty"));
         }
-        if head.starts_with(MCAP) {
+        if head.starts_with(MCAP_MAGIC) {
             return Recording::open_mcap(path);
         }
         let form = if carmen::is_log(head) { Form::Carmen } else { Form::Telegrams };
-        if let Some(piece) = piece_of_mcap(&path).map_err(|error| unreadable(&path, &error))? {
+        if let Some(fragment) = mcap_fragment(&path).map_err(|error| unreadable(&path, &error))? {
             let message =
-                format!("recording {} is {piece} of an MCAP file, without its beginning", path.display());
+                format!("recording {} is {fragment} of an MCAP file, without its beginning", path.display());
             return Err(Failure::new(
                 Kind::Input,
                 message,
@@ -86,7 +86,7 @@ impl Recording {
             _ => survey_stream(&path, family)?,
         };
         if form == Form::Carmen && contents.telegrams == 0 {
-            return Err(refused(&path, "is a CARMEN log without a scan"));
+            return Err(unusable(&path, "is a CARMEN log without a scan"));
         }
         Ok(Recording {
             path,
@@ -112,7 +112,7 @@ impl Recording {
 
     /// Returns whether a file that starts with `head` is a container with telegrams inside: MCAP or gzip.
     pub fn is_framed(head: &[u8]) -> bool {
-        head.starts_with(MCAP) || head.starts_with(GZIP)
+        head.starts_with(MCAP_MAGIC) || head.starts_with(GZIP_MAGIC)
     }
 
     /// Returns the part of the recording that belongs to `sensor`.
@@ -122,14 +122,14 @@ impl Recording {
     /// Returns [`Kind::NoTopic`] with the existing sensors if there is no such sensor, and [`Kind::Usage`] if the recording names no
     /// sensor.
     pub fn of(&self, sensor: &str) -> Result<Recording, Failure> {
-        let place = self.path.display();
+        let path = self.path.display();
         if self.contents.sensors.is_empty() {
-            let message = format!("recording {place} does not name its sensor, so {sensor} cannot be chosen");
+            let message = format!("recording {path} does not name its sensor, so {sensor} cannot be chosen");
             return Err(Failure::new(Kind::Usage, message, "leave the sensor out"));
         }
         if !self.contents.sensors.iter().any(|name| name == sensor) {
-            let message = format!("recording {place} has no sensor {sensor:?}");
-            return Err(Failure::new(Kind::NoTopic, message, self.choice()));
+            let message = format!("recording {path} has no sensor {sensor:?}");
+            return Err(Failure::new(Kind::NoTopic, message, self.sensor_choice()));
         }
         let mut chosen = self.clone();
         #[cfg(feature = "mcap")]
@@ -142,9 +142,9 @@ impl Recording {
 
     /// Returns the number of the first telegram of the only sensor that the hub with this `boot` processed further. From there on,
     /// the hub knew the meaning of the values. Returns `None` if the recording does not contain it; only MCAP does.
-    pub fn understood(&self, boot: u64) -> Option<u64> {
+    pub fn first_understood(&self, boot: u64) -> Option<u64> {
         #[cfg(feature = "mcap")]
-        return self.survey.understood(self.contents.sensors.first()?, boot);
+        return self.survey.first_understood(self.contents.sensors.first()?, boot);
         #[cfg(not(feature = "mcap"))]
         {
             let _ = boot;
@@ -183,7 +183,7 @@ impl Recording {
             }
         }
         let missing = session.session().missing_setting();
-        if let Some(missing) = missing.filter(|_| model.is_none() && self.contents.way.is_none()) {
+        if let Some(missing) = missing.filter(|_| model.is_none() && self.contents.mode_name.is_none()) {
             return Err(Failure::new(
                 Kind::Input,
                 format!("recording {} does not tell of which kind its packets are", self.path.display()),
@@ -200,7 +200,7 @@ impl Recording {
             let (step, features) = (self.contents.step_cdeg?, features(self.family()?));
             let model = features.models.iter().find(|model| Some(model.name) == self.contents.model);
             let is_reported = |beams: &usize| (36_000.0 / *beams as f64).round() == f64::from(step);
-            [model.map(|model| model.beams), Some(features.auto.beams)]
+            [model.map(|model| model.beams), Some(features.defaults.beams)]
                 .into_iter()
                 .flatten()
                 .find(is_reported)
@@ -214,7 +214,7 @@ impl Recording {
     /// Returns the errors of [`model`](Self::model).
     pub fn session_settings(&self) -> Result<Settings, Failure> {
         let model = self.model()?.map(|model| model.name);
-        let (mode, beams) = (self.contents.way, self.beams());
+        let (mode, beams) = (self.contents.mode_name, self.beams());
         Ok(Settings { model, mode, beams, fixed_rate: true, listen_only: true, ..Settings::default() })
     }
 
@@ -254,11 +254,12 @@ impl Recording {
         let reader = reader(&self.path)?;
         Ok(match self.contents.form {
             Form::Carmen => {
-                let (mut log, own) = (Log::new(reader), self.encoding().unwrap_or(encoding));
-                Box::new(std::iter::from_fn(move || Some(log.following()?.frame(own, encoding))))
+                let (mut log, own) = (LogReader::new(reader), self.encoding().unwrap_or(encoding));
+                Box::new(std::iter::from_fn(move || Some(log.next_valid()?.frame(own, encoding))))
             }
             Form::Telegrams => {
-                let head = head(&self.path, EXAMINED).map_err(|error| unreadable(&self.path, &error))?;
+                let head =
+                    head(&self.path, EXAMINED_BYTES).map_err(|error| unreadable(&self.path, &error))?;
                 let mut stream = StreamReader::new(self.family().unwrap_or(Family::Lms), &head, reader);
                 Box::new(std::iter::from_fn(move || stream.next().ok()?))
             }
@@ -276,7 +277,7 @@ impl Recording {
             (None, []) => return Ok(Box::new(std::iter::empty())),
             (None, _) => {
                 let message = format!("recording {} has several sensors", self.path.display());
-                return Err(Failure::new(Kind::Usage, message, self.choice()));
+                return Err(Failure::new(Kind::Usage, message, self.sensor_choice()));
             }
         };
         Ok(Box::new(self.survey.frames(reader, sensor)))
@@ -324,31 +325,31 @@ impl Recording {
 
     /// Returns the sensor that [`of`](Self::of) selected.
     #[cfg(feature = "mcap")]
-    pub(crate) fn chosen(&self) -> Option<&String> {
+    pub(crate) fn selected_sensor(&self) -> Option<&String> {
         self.sensor.as_ref()
     }
 
     /// Returns the time at which the file was last written, in ns since 1970, or 0 if it is unknown.
     #[cfg(feature = "mcap")]
-    pub(crate) fn written_ns(&self) -> u64 {
-        let written = std::fs::metadata(&self.path).and_then(|metadata| metadata.modified()).ok();
-        let since = written.and_then(|written| written.duration_since(std::time::UNIX_EPOCH).ok());
+    pub(crate) fn modified_ns(&self) -> u64 {
+        let modified = std::fs::metadata(&self.path).and_then(|metadata| metadata.modified()).ok();
+        let since = modified.and_then(|modified| modified.duration_since(std::time::UNIX_EPOCH).ok());
         since.map_or(0, |since| since.as_nanos() as u64)
     }
 
     /// Returns the failure of a file that has become unreadable.
     #[cfg(feature = "mcap")]
-    pub(crate) fn broken(&self, error: &io::Error) -> Failure {
+    pub(crate) fn read_failure(&self, error: &io::Error) -> Failure {
         unreadable(&self.path, error)
     }
 
-    fn choice(&self) -> String {
+    fn sensor_choice(&self) -> String {
         let sensors = &self.contents.sensors;
-        let more = match sensors.len().saturating_sub(MAX_NAMES) {
+        let more = match sensors.len().saturating_sub(MAX_NAMED_SENSORS) {
             0 => String::new(),
             more => format!(" and {more} more"),
         };
-        format!("choose one: {}{more}", sensors[..sensors.len().min(MAX_NAMES)].join(", "))
+        format!("choose one: {}{more}", sensors[..sensors.len().min(MAX_NAMED_SENSORS)].join(", "))
     }
 }
 
@@ -359,7 +360,7 @@ impl Recording {
 ///
 /// Returns [`Kind::Input`] if it cannot be read, or if its family is neither named nor recognized.
 fn survey_stream(path: &Path, named: Option<Family>) -> Result<Contents, Failure> {
-    let head = head(path, EXAMINED).map_err(|error| unreadable(path, &error))?;
+    let head = head(path, EXAMINED_BYTES).map_err(|error| unreadable(path, &error))?;
     let survey = |family| stream::survey(path, family, &head);
     let of_named = named.map(survey).transpose()?;
     if let Some(contents) = of_named.as_ref().filter(|contents| contents.telegrams > 0) {
@@ -377,7 +378,7 @@ fn survey_stream(path: &Path, named: Option<Family>) -> Result<Contents, Failure
 fn head(path: &Path, len: usize) -> io::Result<Vec<u8>> {
     let mut head = Vec::new();
     match open(path)?.take(len as u64).read_to_end(&mut head) {
-        Err(error) if !is_end(&error) => Err(error),
+        Err(error) if !is_truncation(&error) => Err(error),
         _ => Ok(head),
     }
 }
@@ -405,11 +406,11 @@ fn without_telegram(path: &Path) -> Failure {
         "recording {} is neither an MCAP file nor a CARMEN log, and there is no telegram in it",
         path.display()
     );
-    Failure::new(Kind::Input, message, format!("{FORMS}; a link to a file of noise needs family=NAME"))
+    Failure::new(Kind::Input, message, format!("{FORMS_REMEDY}; a link to a file of noise needs family=NAME"))
 }
 
 /// Returns whether `error` means that a packed file ends early or is damaged, and not that the disk failed.
-pub(crate) fn is_end(error: &io::Error) -> bool {
+pub(crate) fn is_truncation(error: &io::Error) -> bool {
     use io::ErrorKind::{InvalidData, InvalidInput, UnexpectedEof};
     matches!(error.kind(), InvalidData | InvalidInput | UnexpectedEof)
 }
@@ -419,25 +420,25 @@ pub(crate) fn reader(path: &Path) -> Result<Box<dyn BufRead + Send>, Failure> {
 }
 
 fn open(path: &Path) -> io::Result<Box<dyn BufRead + Send>> {
-    let mut file = BufReader::with_capacity(BUFFER, regular::open(path)?);
-    if file.fill_buf()?.starts_with(GZIP) {
-        return Ok(Box::new(BufReader::with_capacity(BUFFER, GzipReader::new(file))));
+    let mut file = BufReader::with_capacity(BUFFER_LEN, regular_file::open(path)?);
+    if file.fill_buf()?.starts_with(GZIP_MAGIC) {
+        return Ok(Box::new(BufReader::with_capacity(BUFFER_LEN, GzipReader::new(file))));
     }
     Ok(Box::new(file))
 }
 
 /// Returns which piece of an MCAP file the file at `path` is, if it is one. Its telegrams would otherwise look like a stream.
-fn piece_of_mcap(path: &Path) -> io::Result<Option<&'static str>> {
-    let mut file = regular::open(path)?;
-    let end = file.metadata()?.len().saturating_sub(MCAP.len() as u64);
+fn mcap_fragment(path: &Path) -> io::Result<Option<&'static str>> {
+    let mut file = regular_file::open(path)?;
+    let end = file.metadata()?.len().saturating_sub(MCAP_MAGIC.len() as u64);
     file.seek(SeekFrom::Start(end))?;
     let mut tail = Vec::new();
     file.read_to_end(&mut tail)?;
-    if tail == MCAP {
+    if tail == MCAP_MAGIC {
         return Ok(Some("the end"));
     }
     #[cfg(feature = "mcap")]
-    if crate::mcap::has_border(&head(path, SEARCHED)?) {
+    if crate::mcap::has_record_boundary(&head(path, SEARCH_LEN)?) {
         return Ok(Some("a piece"));
     }
     Ok(None)
@@ -453,32 +454,32 @@ pub(crate) fn unreadable(path: &Path, error: &io::Error) -> Failure {
             "`zcat FILE > WHOLE` unpacks a packed file; `mcap filter --output-compression none IN -o OUT` (of mcap.dev) \
              writes short chunks, and with -y TOPIC only some topics"
         }
-        _ => FORMS,
+        _ => FORMS_REMEDY,
     };
     Failure::new(Kind::Input, format!("cannot read recording {}: {error}", path.display()), hint)
 }
 
-fn refused(path: &Path, what: &str) -> Failure {
-    Failure::new(Kind::Input, format!("recording {} {what}", path.display()), FORMS)
+fn unusable(path: &Path, what: &str) -> Failure {
+    Failure::new(Kind::Input, format!("recording {} {what}", path.display()), FORMS_REMEDY)
 }
 
 /// Reader of a gzip file, with a limit. A kilobyte can unpack to a megabyte of the same byte, so a file that cannot be a recording
 /// is rejected early.
 struct GzipReader<R> {
-    decoder: MultiGzDecoder<Counted<R>>,
+    decoder: MultiGzDecoder<CountingReader<R>>,
     /// Number of unpacked bytes.
     unpacked: u64,
 }
 
 /// Reader that counts the bytes that are read.
-struct Counted<R> {
+struct CountingReader<R> {
     input: R,
     read: u64,
 }
 
 impl<R: BufRead> GzipReader<R> {
     fn new(input: R) -> Self {
-        GzipReader { decoder: MultiGzDecoder::new(Counted { input, read: 0 }), unpacked: 0 }
+        GzipReader { decoder: MultiGzDecoder::new(CountingReader { input, read: 0 }), unpacked: 0 }
     }
 }
 
@@ -487,7 +488,7 @@ impl<R: BufRead> Read for GzipReader<R> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         let len = self.decoder.read(buffer)?;
         self.unpacked += len as u64;
-        let max = self.decoder.get_ref().read.saturating_mul(MAX_RATIO).max(UNLIMITED);
+        let max = self.decoder.get_ref().read.saturating_mul(MAX_RATIO).max(MIN_LIMITED_LEN);
         if self.unpacked > max {
             let what =
                 format!("it unpacks to more than {MAX_RATIO} times its length, which no recording does");
@@ -497,7 +498,7 @@ impl<R: BufRead> Read for GzipReader<R> {
     }
 }
 
-impl<R: BufRead> Read for Counted<R> {
+impl<R: BufRead> Read for CountingReader<R> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         let len = self.input.read(buffer)?;
         self.read += len as u64;
@@ -505,7 +506,7 @@ impl<R: BufRead> Read for Counted<R> {
     }
 }
 
-impl<R: BufRead> BufRead for Counted<R> {
+impl<R: BufRead> BufRead for CountingReader<R> {
     fn fill_buf(&mut self) -> io::Result<&[u8]> {
         self.input.fill_buf()
     }
@@ -517,23 +518,24 @@ impl<R: BufRead> BufRead for Counted<R> {
 }
 
 /// Maximum number of sensors that a failure names.
-const MAX_NAMES: usize = 32;
-const FORMS: &str = "a recording is an MCAP file, a stream of telegrams or a CARMEN log, plain or gzipped";
+const MAX_NAMED_SENSORS: usize = 32;
+const FORMS_REMEDY: &str =
+    "a recording is an MCAP file, a stream of telegrams or a CARMEN log, plain or gzipped";
 /// First bytes of a gzip file.
-const GZIP: &[u8] = &[0x1F, 0x8B];
+const GZIP_MAGIC: &[u8] = &[0x1F, 0x8B];
 /// First bytes of an MCAP file.
-const MCAP: &[u8] = b"\x89MCAP0\r\n";
+const MCAP_MAGIC: &[u8] = b"\x89MCAP0\r\n";
 /// Bytes at the beginning of a file in which records of MCAP are searched for: several samples of any topic.
 #[cfg(feature = "mcap")]
-const SEARCHED: usize = 256 * 1024;
+const SEARCH_LEN: usize = 256 * 1024;
 /// Size of a read buffer in bytes. A CARMEN log is detected by the lines in the first one.
-const BUFFER: usize = 64 * 1024;
+const BUFFER_LEN: usize = 64 * 1024;
 /// Number of frames after which the packets of every model have shown it.
 const MODEL_FRAMES: usize = 500;
 /// Maximum ratio of unpacked to packed bytes. A stream of equal telegrams has 100; the format allows 1,000.
 const MAX_RATIO: u64 = 400;
 /// Number of unpacked bytes up to which there is no limit.
-const UNLIMITED: u64 = 32 << 20;
+const MIN_LIMITED_LEN: u64 = 32 << 20;
 
 #[cfg(test)]
 mod tests {
@@ -567,7 +569,7 @@ mod tests {
 
     #[test]
     fn rejects_gzip_bomb_early() {
-        let max = UNLIMITED as usize;
+        let max = MIN_LIMITED_LEN as usize;
         assert_eq!(unpacked(&packed(|_| 0, max)), (max, Ok(())), "short enough for any ratio");
         let (len, end) = unpacked(&packed(|_| 0, 3 * max));
         assert!(len <= max && end == Err(ErrorKind::FileTooLarge), "{len} {end:?}");

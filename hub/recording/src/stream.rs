@@ -4,13 +4,13 @@
 use std::io::{self, Read};
 use std::path::Path;
 
-use scanhub_drivers::line::{Event, Output, Protocol, Session as _};
-use scanhub_drivers::lms::framer::{Found, Framer, VETO_HOLD};
+use scanhub_drivers::line::{Action, Event, Protocol, ScannerSession as _};
+use scanhub_drivers::lms::framer::{Framer, FramerEvent, VETO_HOLD_TIME};
 use scanhub_drivers::recognize::framing_mode;
 use scanhub_drivers::{Session, Settings, features};
 use scanhub_schema::{Failure, Family, MILLIS, Nanos, line_time};
 
-use crate::open::{is_end, reader, unreadable};
+use crate::open::{is_truncation, reader, unreadable};
 use crate::{Contents, Form, Frame};
 
 /// Reads the telegrams of an LMS or the packets of a rotating scanner from a stream, and counts the bytes outside them.
@@ -25,16 +25,16 @@ pub(crate) struct StreamReader<R> {
 
 enum Framing {
     Telegrams(Box<Framer>),
-    Packets(Box<Packets>),
+    Packets(Box<PacketReader>),
 }
 
-struct Packets {
+struct PacketReader {
     session: Session,
     family: Family,
     /// The scanner's clock at the last packets.
     last: Option<Nanos>,
     /// Time since the first packets.
-    passed: Nanos,
+    elapsed: Nanos,
 }
 
 impl<R: Read> StreamReader<R> {
@@ -46,7 +46,7 @@ impl<R: Read> StreamReader<R> {
             let mode = framing_mode(family, head);
             let settings = Settings { mode, fixed_rate: true, listen_only: true, ..Settings::default() };
             let session = Session::begin(family, &settings, 0);
-            Framing::Packets(Box::new(Packets { session, family, last: None, passed: 0 }))
+            Framing::Packets(Box::new(PacketReader { session, family, last: None, elapsed: 0 }))
         };
         StreamReader { reader, framing, read_len: 0, is_ended: false }
     }
@@ -54,10 +54,10 @@ impl<R: Read> StreamReader<R> {
     /// Returns the number of bytes so far outside telegrams and packets. It is complete at the end.
     fn discarded(&self) -> u64 {
         let (discarded, buffered) = match &self.framing {
-            Framing::Telegrams(framer) => (framer.tally().discarded, framer.buffered() as u64),
+            Framing::Telegrams(framer) => (framer.counters().discarded, framer.buffered() as u64),
             Framing::Packets(packets) => {
-                let account = packets.session.account();
-                (account.discarded, account.buffered)
+                let stats = packets.session.stats();
+                (stats.discarded, stats.buffered)
             }
         };
         discarded + if self.is_ended { buffered } else { 0 }
@@ -77,11 +77,11 @@ impl<R: Read> StreamReader<R> {
             if frame.is_some() || self.is_ended {
                 return Ok(frame);
             }
-            let spare = match &mut self.framing {
-                Framing::Telegrams(framer) => framer.spare(),
-                Framing::Packets(packets) => packets.session.spare(),
+            let buffer = match &mut self.framing {
+                Framing::Telegrams(framer) => framer.read_buffer(),
+                Framing::Packets(packets) => packets.session.read_buffer(),
             };
-            let len = match self.reader.read(spare) {
+            let len = match self.reader.read(buffer) {
                 Ok(len) => len,
                 Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
                 Err(error) => return Err(error),
@@ -89,13 +89,13 @@ impl<R: Read> StreamReader<R> {
             self.read_len += len as u64;
             self.is_ended = len == 0;
             match &mut self.framing {
-                Framing::Telegrams(framer) if self.is_ended => framer.release(VETO_HOLD),
+                Framing::Telegrams(framer) if self.is_ended => framer.release(VETO_HOLD_TIME),
                 Framing::Telegrams(framer) => framer.commit(len),
                 Framing::Packets(packets) => {
                     packets.session.commit(0, len);
                     if self.is_ended {
                         // No more bytes can refute packets that are held back.
-                        packets.session.handle_timeout(IDLE);
+                        packets.session.handle_timeout(IDLE_TIME);
                     }
                 }
             }
@@ -105,42 +105,42 @@ impl<R: Read> StreamReader<R> {
 
 fn next_telegram(framer: &mut Framer) -> Option<Frame> {
     loop {
-        if let Found::Telegram(framed) = framer.poll()? {
+        if let FramerEvent::Telegram(framed) = framer.poll()? {
             return Some(Frame { telegram: framed.telegram.bytes().to_vec(), ..Frame::default() });
         }
     }
 }
 
-impl Packets {
+impl PacketReader {
     fn next(&mut self) -> Option<Frame> {
         let (telegram, reasons) = loop {
-            match self.session.poll_output() {
-                Output::Event(Event::Telegram(received)) => {
+            match self.session.poll_action() {
+                Action::Event(Event::Telegram(received)) => {
                     break (received.bytes.to_vec(), received.reasons);
                 }
-                Output::Transmit { .. } => self.session.transmitted(0),
-                Output::Event(Event::Scan(_)) | Output::SetRate(_) | Output::SetDtr(_) => {}
-                Output::Rest(_) | Output::Wait { .. } => return None,
+                Action::Transmit { .. } => self.session.handle_transmitted(0),
+                Action::Event(Event::Scan(_)) | Action::SetRate(_) | Action::SetDtr(_) => {}
+                Action::SleepUntil(_) | Action::Wait { .. } => return None,
             }
         };
-        let took = line_time(telegram.len(), self.session.rate());
-        let scanner_ns = Some(self.pass(took));
+        let duration = line_time(telegram.len(), self.session.rate());
+        let scanner_ns = Some(self.advance_clock(duration));
         Some(Frame { telegram, family: self.family as u8, scanner_ns, reasons, ..Frame::default() })
     }
 
     /// Returns the time of the last packets, which took this long on the line, since the first ones. It never goes back.
-    fn pass(&mut self, took: Nanos) -> Nanos {
+    fn advance_clock(&mut self, duration: Nanos) -> Nanos {
         let Some(at) = self.session.scanner_time() else {
-            self.passed += took;
-            return self.passed;
+            self.elapsed += duration;
+            return self.elapsed;
         };
-        self.passed += match self.last {
+        self.elapsed += match self.last {
             None => 0,
             // A clock that went back belongs to a scanner that restarted.
-            Some(last) => at.checked_sub(last).unwrap_or(took),
+            Some(last) => at.checked_sub(last).unwrap_or(duration),
         };
         self.last = Some(at);
-        self.passed
+        self.elapsed
     }
 }
 
@@ -159,8 +159,8 @@ pub(crate) fn survey(path: &Path, family: Family, head: &[u8]) -> Result<Content
                 contents.scanner_ns = frame.scanner_ns;
             }
             Ok(None) => break,
-            Err(error) if is_end(&error) && contents.telegrams > 0 => {
-                contents.damage.is_cut = true;
+            Err(error) if is_truncation(&error) && contents.telegrams > 0 => {
+                contents.damage.is_truncated = true;
                 break;
             }
             Err(error) => return Err(unreadable(path, &error)),
@@ -204,7 +204,7 @@ impl<S: Protocol> VirtualTime<S> {
         self.until = self.until.max(now.saturating_sub(MAX_SILENCE));
         while self.until < now {
             self.now = self.until.max(self.now);
-            self.session.spare();
+            self.session.read_buffer();
             self.session.commit(self.now, 0);
             self.session.handle_timeout(self.now);
             self.drain(&mut handle);
@@ -214,7 +214,7 @@ impl<S: Protocol> VirtualTime<S> {
         self.now = now;
         let mut bytes = bytes;
         while !bytes.is_empty() {
-            let room = self.session.spare();
+            let room = self.session.read_buffer();
             let (taken, rest) = bytes.split_at(bytes.len().min(room.len()));
             room[..taken.len()].copy_from_slice(taken);
             self.session.commit(now, taken.len());
@@ -225,18 +225,18 @@ impl<S: Protocol> VirtualTime<S> {
 
     fn drain(&mut self, handle: &mut impl FnMut(Event<'_>)) {
         self.until = loop {
-            let is_sent = match self.session.poll_output() {
-                Output::Transmit { .. } => true,
-                Output::Event(event) => {
+            let is_sent = match self.session.poll_action() {
+                Action::Transmit { .. } => true,
+                Action::Event(event) => {
                     handle(event);
                     false
                 }
-                Output::SetRate(_) | Output::SetDtr(_) => false,
-                Output::Rest(until) | Output::Wait { until, .. } => break until,
+                Action::SetRate(_) | Action::SetDtr(_) => false,
+                Action::SleepUntil(until) | Action::Wait { until, .. } => break until,
             };
             // A recording does not reply.
             if is_sent {
-                self.session.transmitted(self.now);
+                self.session.handle_transmitted(self.now);
             }
         };
     }
@@ -245,7 +245,7 @@ impl<S: Protocol> VirtualTime<S> {
 /// Longest silence in which the timers of a session expire. It has nothing new to do after that.
 const MAX_SILENCE: Nanos = 3_600_000 * MILLIS;
 /// Time after which a session no longer holds packets back.
-const IDLE: Nanos = 100 * MILLIS;
+const IDLE_TIME: Nanos = 100 * MILLIS;
 
 #[cfg(test)]
 mod tests {

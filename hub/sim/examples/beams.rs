@@ -2,7 +2,7 @@
 //! and what share of the bins stays empty, against the number of bins; and how long a turn takes to be put there. The
 //! tables of docs/measured.md: `cargo run --release -p scanhub-sim --example beams`.
 
-use scanhub_drivers::line::{Event, Output, Session};
+use scanhub_drivers::line::{Action, Event, ScannerSession};
 use scanhub_drivers::line::{Grid, NOT_MEASURED, Point};
 use scanhub_drivers::{Settings, ld, rplidar};
 use scanhub_schema::{MILLIS, Nanos, line_time};
@@ -21,18 +21,18 @@ fn room() -> Room {
 }
 
 /// The whole turns that `session` makes of what `device` sends in `seconds`, and the beams that it has by itself.
-fn turns<S>(mut session: S, mut device: impl Device, seconds: u64) -> (Vec<Vec<Point>>, usize)
+fn revolutions<S>(mut session: S, mut device: impl Device, seconds: u64) -> (Vec<Vec<Point>>, usize)
 where
-    S: Session,
+    S: ScannerSession,
 {
-    let (mut now, mut turns): (Nanos, Vec<Vec<Point>>) = (0, Vec::new());
+    let (mut now, mut revolutions): (Nanos, Vec<Vec<Point>>) = (0, Vec::new());
     while now < seconds * 1_000 * MILLIS {
         now += MILLIS;
         let mut bytes = Vec::new();
         while let Some(chunk) = device.poll_transmit(now) {
             bytes.extend(chunk.bytes);
         }
-        let spare = session.spare();
+        let spare = session.read_buffer();
         let len = bytes.len().min(spare.len());
         spare[..len].copy_from_slice(&bytes[..len]);
         session.commit(now, len);
@@ -40,11 +40,11 @@ where
             session.handle_timeout(now);
         }
         loop {
-            match session.poll_output() {
-                Output::Event(Event::Scan(turn)) if !turn.is_incomplete() => {
-                    turns.push(turn.points().to_vec())
+            match session.poll_action() {
+                Action::Event(Event::Scan(revolution)) if !revolution.is_incomplete() => {
+                    revolutions.push(revolution.points().to_vec())
                 }
-                Output::Transmit { bytes, .. } => {
+                Action::Transmit { bytes, .. } => {
                     let bytes = bytes.to_vec();
                     for byte in bytes {
                         now += line_time(1, device.rate());
@@ -53,28 +53,28 @@ where
                             device.receive(byte, Arrival::at(now));
                         }
                     }
-                    session.transmitted(now);
+                    session.handle_transmitted(now);
                 }
-                Output::Event(_) | Output::SetRate(_) | Output::SetDtr(_) => {}
-                Output::Rest(_) | Output::Wait { .. } => break,
+                Action::Event(_) | Action::SetRate(_) | Action::SetDtr(_) => {}
+                Action::SleepUntil(_) | Action::Wait { .. } => break,
             }
         }
     }
-    (turns, session.beams().expect("it was heard"))
+    (revolutions, session.beams().expect("it was heard"))
 }
 
 /// A grid and the slices that it fills.
-struct Sheet {
+struct GridSheet {
     grid: Grid,
     ranges: Vec<u16>,
     intensities: Vec<u8>,
     angles: Vec<f32>,
 }
 
-impl Sheet {
-    fn new(beams: usize) -> Sheet {
+impl GridSheet {
+    fn new(beams: usize) -> GridSheet {
         let grid = Grid::new(beams);
-        Sheet { grid, ranges: vec![0; beams], intensities: vec![0; beams], angles: vec![0.0; beams] }
+        GridSheet { grid, ranges: vec![0; beams], intensities: vec![0; beams], angles: vec![0.0; beams] }
     }
 
     /// How many of `points` collapsed, and how many beams were not measured.
@@ -86,18 +86,18 @@ impl Sheet {
 }
 
 /// The rows of one model, which measures so many points in a turn.
-fn rows(name: &str, a_turn: usize, turns: &[Vec<Point>], percents: &[usize]) {
-    let points: usize = turns.iter().map(Vec::len).sum();
+fn rows(name: &str, points_per_revolution: usize, revolutions: &[Vec<Point>], percents: &[usize]) {
+    let points: usize = revolutions.iter().map(Vec::len).sum();
     for percent in percents {
-        let mut sheet = Sheet::new(a_turn * percent / 100);
+        let mut sheet = GridSheet::new(points_per_revolution * percent / 100);
         let (mut collapsed, mut empty) = (0, 0);
-        for turn in turns {
-            let placed = sheet.fill(turn);
+        for revolution in revolutions {
+            let placed = sheet.fill(revolution);
             (collapsed, empty) = (collapsed + placed.0, empty + placed.1);
         }
         let beams = sheet.grid.beams();
         let collapsed = 100.0 * f64::from(collapsed) / points as f64;
-        let empty = 100.0 * f64::from(empty) / (beams * turns.len()) as f64;
+        let empty = 100.0 * f64::from(empty) / (beams * revolutions.len()) as f64;
         println!("| {name} | {beams} | {collapsed:.1} % | {empty:.1} % |");
     }
 }
@@ -105,22 +105,27 @@ fn rows(name: &str, a_turn: usize, turns: &[Vec<Point>], percents: &[usize]) {
 fn main() {
     println!("| model | beams | of points collapsed | of beams not measured |\n|---|---|---|---|");
     for model in [ld::Model::Ld19, ld::Model::Stl27l, ld::Model::Ld14p] {
-        let session = ld::Session::new(Settings { model: Some(model.name()), ..Settings::default() }, 0);
+        let session = ld::LdSession::new(Settings { model: Some(model.name()), ..Settings::default() }, 0);
         let head = LdSimulator::new(LdSettings::of(model), room());
-        let a_turn = model.points_per_second() / model.turns_per_second();
+        let a_turn = model.points_per_second() / model.revolutions_per_second();
         let percents = [67, 80, 90, 95, 99, 100, 101, 105, 110, 120, 133];
-        rows(model.name(), a_turn as usize, &turns(session, head, 30).0, &percents);
+        rows(model.name(), a_turn as usize, &revolutions(session, head, 30).0, &percents);
     }
     for simulated in scanhub_sim::rplidar::Model::ALL {
         for mode in simulated.modes() {
             let settings = Settings {
                 model: Some(simulated.name()),
-                mode: rplidar::Mode::named(mode.name).map(rplidar::Mode::name),
+                mode: rplidar::Mode::from_name(mode.name).map(rplidar::Mode::name),
                 ..Settings::default()
             };
             let unit = RplidarSimulator::new(RplidarSettings::of(simulated), room());
-            let (turns, beams) = turns(rplidar::Session::new(settings, 0), unit, 30);
-            rows(&format!("{} {}", simulated.name(), mode.name), beams, &turns, &[80, 90, 100, 110, 120]);
+            let (revolutions, beams) = revolutions(rplidar::RplidarSession::new(settings, 0), unit, 30);
+            rows(
+                &format!("{} {}", simulated.name(), mode.name),
+                beams,
+                &revolutions,
+                &[80, 90, 100, 110, 120],
+            );
         }
     }
     let mut random = fastrand::Rng::with_seed(1);
@@ -131,13 +136,13 @@ fn main() {
             intensity: 9,
         })
         .collect();
-    let mut sheet = Sheet::new(2_160);
+    let mut sheet = GridSheet::new(2_160);
     for order in ["in their order", "in any order"] {
         let mut times: Vec<_> = (0..2_000)
             .map(|_| {
-                let begun = now_ns();
+                let started = now_ns();
                 std::hint::black_box(sheet.fill(std::hint::black_box(&points)));
-                now_ns() - begun
+                now_ns() - started
             })
             .collect();
         times.sort();

@@ -2,7 +2,7 @@
 //! `cargo run --release -p scanhub-sim --example edges -- WORLD..`
 //! World `board` is a board in front of a wall.
 //!
-//! At an edge, three beams in a row are on one surface and three on another one. Between them are at most [`MOST`] beams, all
+//! At an edge, three beams in a row are on one surface and three on another one. Between them are at most [`MAX_BETWEEN`] beams, all
 //! of them with values between. Beams without width would have other values there, so an oblique surface does not count as an edge.
 
 use std::collections::BTreeMap;
@@ -27,17 +27,17 @@ struct Edge {
 fn edges(ranges: &[Option<f64>]) -> Vec<Edge> {
     let surface = |beams: Range<usize>| -> Option<()> {
         let ranges = ranges.get(beams)?.iter().copied().collect::<Option<Vec<f64>>>()?;
-        ranges.windows(2).all(|pair| (pair[0] - pair[1]).abs() < MARGIN_MM).then_some(())
+        ranges.windows(2).all(|pair| (pair[0] - pair[1]).abs() < MIN_MARGIN_MM).then_some(())
     };
     let edge = |beam: usize| -> Option<Edge> {
-        surface(beam.checked_sub(RUN)?..beam)?;
+        surface(beam.checked_sub(MIN_SURFACE_BEAMS)?..beam)?;
         let one = ranges[beam - 1]?;
-        (0..=MOST).find_map(|count| {
+        (0..=MAX_BETWEEN).find_map(|count| {
             let other = ranges.get(beam + count).copied().flatten()?;
             let between = ranges[beam..beam + count].iter().copied().collect::<Option<Vec<f64>>>()?;
             let (near, far) = (one.min(other), one.max(other));
-            let is_between = |range: &f64| near + MARGIN_MM < *range && *range < far - MARGIN_MM;
-            surface(beam + count..beam + count + RUN)?;
+            let is_between = |range: &f64| near + MIN_MARGIN_MM < *range && *range < far - MIN_MARGIN_MM;
+            surface(beam + count..beam + count + MIN_SURFACE_BEAMS)?;
             (DEPTHS_MM.contains(&(far - near)) && between.iter().all(is_between)).then(|| Edge {
                 beam,
                 near: if one < other { beam - 1 } else { beam + count },
@@ -70,8 +70,8 @@ impl Counts {
 }
 
 /// Median of the standard deviations of the values between, of edges that have one at the same beam in a tenth of the scans.
-fn spread(places: &BTreeMap<(u64, usize, usize), Vec<f64>>) -> String {
-    let often = places.values().filter(|shares| shares.len() >= SCANS as usize / 10);
+fn median_deviation(edges_by_beam: &BTreeMap<(u64, usize, usize), Vec<f64>>) -> String {
+    let often = edges_by_beam.values().filter(|shares| shares.len() >= SCAN_COUNT as usize / 10);
     let mut deviations: Vec<f64> = often
         .map(|shares| {
             let mean = shares.iter().sum::<f64>() / shares.len() as f64;
@@ -84,31 +84,31 @@ fn spread(places: &BTreeMap<(u64, usize, usize), Vec<f64>>) -> String {
 
 /// Counts of edges in the scans of a world.
 #[derive(Default)]
-struct World {
+struct EdgeCounts {
     all: Counts,
     /// Edges whose nearer side is a leg of a person.
     legs: Counts,
     /// For each seed, sensor and beam, the values between at an edge that does not move and has one value between.
-    places: BTreeMap<(u64, usize, usize), Vec<f64>>,
+    edges_by_beam: BTreeMap<(u64, usize, usize), Vec<f64>>,
 }
 
-impl World {
-    fn measure(world: &scanhub_sim::world::World) -> World {
-        let mut found = World::default();
+impl EdgeCounts {
+    fn measure(world: &scanhub_sim::world::World) -> EdgeCounts {
+        let mut found = EdgeCounts::default();
         let layers = NoiseModel { spot: false, ..world.noise().unwrap_or_default() };
         let without_width = world.clone().with_noise(layers);
-        for seed in 1..=SEEDS {
+        for seed in 1..=SEED_COUNT {
             for sensor in 0..world.sensors() {
                 let [wide, narrow] =
                     [world, &without_width].map(|world| Room::of_port(world, seed, sensor as u64));
-                for scan in 1..=SCANS {
-                    let end_ns = SPACING * scan * SCAN_NS;
+                for scan in 1..=SCAN_COUNT {
+                    let end_ns = SCAN_SPACING * scan * SCAN_PERIOD_NS;
                     let look = wide.labeled_scan(Variant::HALF, Unit::Mm, Mode(1), end_ns);
                     let ranges = ranges_mm(&look.words);
                     let exact = ranges_mm(&narrow.scan(Variant::HALF, Unit::Mm, Mode(1), end_ns));
                     let is_off = |beam: usize| {
                         let pair = ranges[beam].zip(exact[beam]);
-                        pair.is_none_or(|(range, exact)| (range - exact).abs() > MARGIN_MM)
+                        pair.is_none_or(|(range, exact)| (range - exact).abs() > MIN_MARGIN_MM)
                     };
                     let is_mixed = |edge: &Edge| (edge.beam..edge.beam + edge.between.len()).all(is_off);
                     for edge in edges(&ranges).into_iter().filter(is_mixed) {
@@ -116,7 +116,7 @@ impl World {
                         if look.truth[edge.near] == BeamTarget::Person {
                             found.legs.add(&edge);
                         } else if let [share] = edge.between[..] {
-                            found.places.entry((seed, sensor, edge.beam)).or_default().push(share);
+                            found.edges_by_beam.entry((seed, sensor, edge.beam)).or_default().push(share);
                         }
                     }
                 }
@@ -128,19 +128,19 @@ impl World {
 
 fn main() {
     let names: Vec<String> = std::env::args().skip(1).collect();
-    let names = if names.is_empty() { USUAL.map(str::to_owned).to_vec() } else { names };
+    let names = if names.is_empty() { DEFAULT_WORLDS.map(str::to_owned).to_vec() } else { names };
     println!(
         "| world | edges | with a value between | with several | of legs | with one | with several | spread |"
     );
     println!("|---|---|---|---|---|---|---|---|");
     for name in names {
         let world: Result<scanhub_sim::world::World, _> = match &*name {
-            "board" => scanhub_sim::world::World::of_toml(&name, BOARD),
+            "board" => scanhub_sim::world::World::of_toml(&name, BOARD_WORLD),
             _ => name.parse(),
         };
         let world = world.unwrap_or_else(|failure| panic!("{failure}"));
-        let found = World::measure(&world);
-        let (all, legs, spread) = (found.all.row(), found.legs.row(), spread(&found.places));
+        let found = EdgeCounts::measure(&world);
+        let (all, legs, spread) = (found.all.row(), found.legs.row(), median_deviation(&found.edges_by_beam));
         println!("| {name} | {all} | {legs} | {spread} |");
     }
 }
@@ -150,9 +150,9 @@ fn ranges_mm(words: &[u16]) -> Vec<Option<f64>> {
     words.iter().map(|word| Some(word & 8191).filter(|range| *range < 8183).map(f64::from)).collect()
 }
 
-const USUAL: [&str; 5] = ["board", "room", "crowd", "house", "demo"];
+const DEFAULT_WORLDS: [&str; 5] = ["board", "room", "crowd", "house", "demo"];
 /// A board in front of a wall.
-const BOARD: &str = "
+const BOARD_WORLD: &str = "
 [[thing]]
 line = [[-6000, 3500], [6000, 3500]]
 [[thing]]
@@ -162,13 +162,13 @@ jitter_mm = 200
 ";
 const DEPTHS_MM: std::ops::RangeInclusive<f64> = 300.0..=1_500.0;
 /// Beams in a row that make a surface, and the maximum distance of neighbors. Values between are farther from both surfaces.
-const RUN: usize = 3;
-const MARGIN_MM: f64 = 60.0;
+const MIN_SURFACE_BEAMS: usize = 3;
+const MIN_MARGIN_MM: f64 = 60.0;
 /// Maximum number of values between.
-const MOST: usize = 3;
+const MAX_BETWEEN: usize = 3;
 /// Number of seeds, and of scans for each of them and each sensor: 53 s.
-const SEEDS: u64 = 20;
-const SCANS: u64 = 200;
+const SEED_COUNT: u64 = 20;
+const SCAN_COUNT: u64 = 200;
 /// Number of scans from one that is measured to the next one, and the time of one.
-const SPACING: u64 = 10;
-const SCAN_NS: u64 = 26_640_000;
+const SCAN_SPACING: u64 = 10;
+const SCAN_PERIOD_NS: u64 = 26_640_000;

@@ -13,7 +13,7 @@ use scanhub_schema::Nanos;
 use crate::room::BeamTarget;
 use crate::scene::Surface;
 use crate::shape::Shape;
-use crate::view::{Face, Hit, Kind, RAY_STEP, REACH, View};
+use crate::view::{Face, Hit, Kind, RAY_STEP, SPOT_RAYS, View};
 
 /// Strength of each layer of noise. A share or a length of 0 switches the layer off.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -22,7 +22,7 @@ pub struct NoiseModel {
     pub bias_mm: f64,
     /// Standard deviation of a range, in millimeters.
     pub sigma_mm: f64,
-    /// Share of the readings at edges whose standard deviation is [`TAIL_MM`] instead. In a recording of a scanner at rest,
+    /// Share of the readings at edges whose standard deviation is [`TAIL_SIGMA_MM`] instead. In a recording of a scanner at rest,
     /// 316 of 348 beams were never off by 30 mm, and 22 were off in more than one scan of a hundred. So the tail belongs to
     /// a few beams.
     pub tail: f64,
@@ -111,7 +111,7 @@ impl BeamRng {
 impl NoiseModel {
     /// Returns the deviation of a reading in millimeters, without the constant error. It is larger at an `edge`.
     pub(crate) fn deviation_mm(&self, edge: bool, rng: &BeamRng) -> f64 {
-        rng.deviation * if edge && rng.tail < self.tail { TAIL_MM } else { self.sigma_mm }
+        rng.deviation * if edge && rng.tail < self.tail { TAIL_SIGMA_MM } else { self.sigma_mm }
     }
 
     /// Returns the code that a beam reports although it could report a range, counted down from the maximum.
@@ -124,7 +124,7 @@ impl NoiseModel {
     /// spot is `torn`, a share of the beams between the two surfaces is lost.
     pub(crate) fn loses(&self, signal: f64, torn: bool, rng: &BeamRng) -> bool {
         let faint = self.weak && rng.weak > signal / MIN_SIGNAL - 1.0;
-        faint || torn && rng.weak < WEAK_AT_EDGES
+        faint || torn && rng.weak < EDGE_LOSS_SHARE
     }
 
     /// Returns whether the sun dazzles this beam. It dazzles `share` of the beams in its direction.
@@ -133,9 +133,9 @@ impl NoiseModel {
     }
 
     /// Returns the start of mirror turn `turn` of `turns` in a scan that ended at `end_ns`.
-    pub(crate) fn turn_ns(&self, turn: u64, turns: u64, end_ns: Nanos) -> Nanos {
-        let before_end = if self.comb { turns - turn } else { 1 };
-        end_ns.saturating_sub(before_end * lms::variant::MIRROR_TURN)
+    pub(crate) fn revolution_ns(&self, revolution: u64, revolutions: u64, end_ns: Nanos) -> Nanos {
+        let before_end = if self.comb { revolutions - revolution } else { 1 };
+        end_ns.saturating_sub(before_end * lms::variant::MIRROR_PERIOD)
     }
 }
 
@@ -171,31 +171,31 @@ pub(crate) struct Echo {
     /// Share of such beams that have an echo.
     pub(crate) returns: f64,
     /// Share of the light that fell on reflectors.
-    pub(crate) bright: f64,
+    pub(crate) reflector_share: f64,
     /// Whether a beam with the width of a real one hits two surfaces at different distances, and no reflector.
-    pub(crate) edge: bool,
+    pub(crate) is_edge: bool,
     /// Whether this spot hit two surfaces that are far apart, and no reflector.
-    pub(crate) torn: bool,
+    pub(crate) is_torn: bool,
     /// The true target.
-    pub(crate) met: BeamTarget,
+    pub(crate) target: BeamTarget,
 }
 
 /// The part of a spot on one face.
 #[derive(Clone, Copy)]
-struct Part<'a> {
+struct SpotPart<'a> {
     face: Option<&'a Face>,
     hit: Hit,
     weight: f64,
 }
 
-impl Part<'_> {
+impl SpotPart<'_> {
     fn is_reflector(&self) -> bool {
         self.face.is_some_and(|face| face.surface == Surface::Reflector)
     }
 
     /// Returns the strength of its echo relative to the other parts of the spot.
     fn echo(&self) -> f64 {
-        self.weight * if self.is_reflector() { OUTSHINES } else { 1.0 }
+        self.weight * if self.is_reflector() { REFLECTOR_BRIGHTNESS } else { 1.0 }
     }
 
     /// Returns the target of a beam that hits only this part. An object that moved away counts as an uncovered surface: it is
@@ -210,17 +210,17 @@ impl Part<'_> {
 
 /// Returns the echo of the beam at `angle_mdeg`. The beam is a line without width, unless `wide` is set.
 pub(crate) fn echo(view: &View, angle_mdeg: i32, wide: bool, rng: &BeamRng) -> Echo {
-    let rays = view.around(angle_mdeg);
+    let rays = view.rays_around(angle_mdeg);
     let spread = spread(view, rays, rng);
-    let middle = [part(view, &rays[REACH], 1.0)];
-    let parts: &[Part] = if wide { &spread } else { &middle };
+    let middle = [part(view, &rays[SPOT_RAYS], 1.0)];
+    let parts: &[SpotPart] = if wide { &spread } else { &middle };
     let total: f64 = parts.iter().map(|part| part.weight).sum();
     let nearest_mm = parts.iter().map(|part| part.hit.range_mm).fold(f64::INFINITY, f64::min);
-    let is_near = |part: &&Part| part.hit.range_mm <= nearest_mm + CONTINUOUS_MM;
-    let near_echo: f64 = parts.iter().filter(is_near).map(Part::echo).sum();
+    let is_near = |part: &&SpotPart| part.hit.range_mm <= nearest_mm + MAX_STEP_MM;
+    let near_echo: f64 = parts.iter().filter(is_near).map(SpotPart::echo).sum();
     let near = heaviest(parts.iter().filter(is_near));
     let far = heaviest(parts.iter().filter(|part| !is_near(part)));
-    let all_echo: f64 = parts.iter().map(Part::echo).sum();
+    let all_echo: f64 = parts.iter().map(SpotPart::echo).sum();
     let (face, range_mm) = reported_surface(near, far, near_echo / all_echo, rng);
     let lit = parts.iter().filter(|part| part.is_reflector());
     let bright = lit.map(|part| part.weight).sum::<f64>() / total;
@@ -229,17 +229,18 @@ pub(crate) fn echo(view: &View, angle_mdeg: i32, wide: bool, rng: &BeamRng) -> E
     Echo {
         range_mm,
         signal: face.map_or(0.0, |face| signal(face, range_mm, angle_mdeg)),
-        returns: face.map_or(1.0, |face| if face.surface == Surface::Faint { FAINT_RETURNS } else { 1.0 }),
-        bright,
-        edge: dull
-            && spread.iter().any(|part| (part.hit.range_mm - spread[0].hit.range_mm).abs() > CONTINUOUS_MM),
-        torn: dull && far.is_some_and(|far| far.1 - nearest_mm > MERGED_MM),
-        met: met(parts),
+        returns: face
+            .map_or(1.0, |face| if face.surface == Surface::Faint { FAINT_RETURN_SHARE } else { 1.0 }),
+        reflector_share: bright,
+        is_edge: dull
+            && spread.iter().any(|part| (part.hit.range_mm - spread[0].hit.range_mm).abs() > MAX_STEP_MM),
+        is_torn: dull && far.is_some_and(|far| far.1 - nearest_mm > MAX_MERGE_DISTANCE_MM),
+        target: true_target(parts),
     }
 }
 
 /// Returns face and range of the part with the strongest echo.
-fn heaviest<'a>(parts: impl Iterator<Item = &'a Part<'a>>) -> Option<(Option<&'a Face>, f64)> {
+fn heaviest<'a>(parts: impl Iterator<Item = &'a SpotPart<'a>>) -> Option<(Option<&'a Face>, f64)> {
     parts.max_by(|a, b| a.echo().total_cmp(&b.echo())).map(|part| (part.face, part.hit.range_mm))
 }
 
@@ -253,10 +254,10 @@ fn reported_surface<'a>(
 ) -> (Option<&'a Face>, f64) {
     let near = near.unwrap_or((None, f64::INFINITY));
     let Some(far) = far else { return near };
-    let leans = (share - 0.5) / (1.0 - 2.0 * CLEAR) + 0.5;
+    let leans = (share - 0.5) / (1.0 - 2.0 * MIN_REPORTED_SHARE) + 0.5;
     let reported = if rng.surface < leans { near } else { far };
     let depth_mm = far.1 - near.1;
-    if (0.0..1.0).contains(&leans) && depth_mm <= MERGED_MM && rng.between < MIXED {
+    if (0.0..1.0).contains(&leans) && depth_mm <= MAX_MERGE_DISTANCE_MM && rng.between < MIXED_SHARE {
         (reported.0, far.1 - depth_mm * leans)
     } else {
         reported
@@ -264,19 +265,19 @@ fn reported_surface<'a>(
 }
 
 /// Returns the parts of the spot on each face. The spot has a Gaussian profile, and ends at 1/e^2 of the maximum.
-fn spread<'a>(view: &'a View, rays: &'a [Hit], rng: &BeamRng) -> Vec<Part<'a>> {
-    if rays.iter().all(|hit| hit.is_of(&rays[REACH])) {
-        return vec![part(view, &rays[REACH], 1.0)];
+fn spread<'a>(view: &'a View, rays: &'a [Hit], rng: &BeamRng) -> Vec<SpotPart<'a>> {
+    if rays.iter().all(|hit| hit.is_of(&rays[SPOT_RAYS])) {
+        return vec![part(view, &rays[SPOT_RAYS], 1.0)];
     }
-    let mut parts: Vec<Part> = Vec::with_capacity(2);
-    let off = MIRROR_STEPS * rng.mirror;
+    let mut parts: Vec<SpotPart> = Vec::with_capacity(2);
+    let off = MIRROR_SIGMA_RAYS * rng.mirror;
     // From the middle outwards, so that the ray nearest to the middle represents a face.
     for number in 0..rays.len() {
-        let aside = number.div_ceil(2);
-        let ray = if number % 2 == 0 { REACH + aside } else { REACH - aside };
+        let offset = number.div_ceil(2);
+        let ray = if number % 2 == 0 { SPOT_RAYS + offset } else { SPOT_RAYS - offset };
         let hit = &rays[ray];
-        let angle = (ray as f64 - REACH as f64 - off) * RAY_STEP;
-        let within = angle.abs() / (SPOT_MM / hit.range_mm + SPOT_PER_MM) * 2.0;
+        let angle = (ray as f64 - SPOT_RAYS as f64 - off) * RAY_STEP;
+        let within = angle.abs() / (SPOT_DIAMETER_MM / hit.range_mm + SPOT_GROWTH) * 2.0;
         if within > 1.0 {
             continue;
         }
@@ -287,18 +288,18 @@ fn spread<'a>(view: &'a View, rays: &'a [Hit], rng: &BeamRng) -> Vec<Part<'a>> {
         }
     }
     if parts.is_empty() {
-        parts.push(part(view, &rays[REACH], 1.0));
+        parts.push(part(view, &rays[SPOT_RAYS], 1.0));
     }
     parts
 }
 
-fn part<'a>(view: &'a View, hit: &Hit, weight: f64) -> Part<'a> {
-    Part { face: view.face(hit), hit: *hit, weight }
+fn part<'a>(view: &'a View, hit: &Hit, weight: f64) -> SpotPart<'a> {
+    SpotPart { face: view.face(hit), hit: *hit, weight }
 }
 
 /// Returns the true target of a spot with these `parts`.
-fn met(parts: &[Part]) -> BeamTarget {
-    let kinds = || parts.iter().map(Part::kind);
+fn true_target(parts: &[SpotPart]) -> BeamTarget {
+    let kinds = || parts.iter().map(SpotPart::kind);
     let since_ns = parts.iter().map(|part| part.hit.since_ns).max().unwrap_or(0);
     let youngest = kinds().filter_map(|kind| match kind {
         Kind::Box { since_ns } => Some(since_ns),
@@ -335,11 +336,11 @@ fn signal(face: &Face, range_mm: f64, angle_mdeg: i32) -> f64 {
 
 /// Standard deviation of the readings in the tail, in millimeters. Most of them differ by more than 30 mm, which algorithms
 /// take for a change.
-pub const TAIL_MM: f64 = 60.0;
+pub const TAIL_SIGMA_MM: f64 = 60.0;
 /// Minimum signal for a range, relative to a white surface at 1 m: 10 % of white at 18 m.
 const MIN_SIGNAL: f64 = 0.0003;
 /// Share of the beams between two surfaces far apart whose signal is too weak.
-const WEAK_AT_EDGES: f64 = 0.15;
+const EDGE_LOSS_SHARE: f64 = 0.15;
 // Codes are counted down from the maximum (Telegram listing 10.8).
 pub(crate) const NO_RETURN: u16 = 0;
 pub(crate) const DAZZLE: u16 = 1;
@@ -349,27 +350,27 @@ const OVERFLOW: u16 = 2;
 /// beams that reported a range in at least 16 of 20 scans.
 const CODES: [(f64, u16); 3] = [(0.57, NO_RETURN), (0.94, TOO_WEAK), (1.0, OVERFLOW)];
 /// Diameter of the spot at the window in millimeters, and its growth per millimeter of range.
-const SPOT_MM: f64 = 10.0;
-const SPOT_PER_MM: f64 = 0.0045;
+const SPOT_DIAMETER_MM: f64 = 10.0;
+const SPOT_GROWTH: f64 = 0.0045;
 /// Standard deviation of a beam's direction, in rays: 0.0025 degrees. The value between two surfaces then has a standard
 /// deviation of about 0.01 of their distance, without the other layers. In recordings of scanners that stand, it is 0.004
 /// to 0.03 in total.
-const MIRROR_STEPS: f64 = 0.04;
+const MIRROR_SIGMA_RAYS: f64 = 0.04;
 /// Maximum distance of surfaces that count as one, such as the two sides of a corner.
-const CONTINUOUS_MM: f64 = 40.0;
+const MAX_STEP_MM: f64 = 40.0;
 /// Maximum distance of two surfaces whose echoes the scanner takes for one. It separates the echoes of surfaces that are
 /// farther apart, or loses them. Recordings have hardly any value between for edges deeper than 1.25 m, and hardly any lost
 /// beam for edges below 1 m.
-const MERGED_MM: f64 = 1_000.0;
+const MAX_MERGE_DISTANCE_MM: f64 = 1_000.0;
 /// Brightness of a reflector relative to other surfaces. In recordings, beams that only touch one report its range.
-const OUTSHINES: f64 = 100.0;
+const REFLECTOR_BRIGHTNESS: f64 = 100.0;
 /// Minimum share of the light on a surface that is reported.
-const CLEAR: f64 = 0.17;
+const MIN_REPORTED_SHARE: f64 = 0.17;
 /// Share of the beams on a faint surface that have an echo.
-const FAINT_RETURNS: f64 = 0.15;
+const FAINT_RETURN_SHARE: f64 = 0.15;
 /// Share of the readings at an edge that are values between the two surfaces. In recordings of an LMS 200, it was 203 of 205
 /// for beams with at least one such value.
-const MIXED: f64 = 0.98;
+const MIXED_SHARE: f64 = 0.98;
 
 #[cfg(test)]
 mod tests {
@@ -395,7 +396,7 @@ mod tests {
         for angle_deg in -80..80 {
             let cos = f64::from(angle_deg).to_radians().cos();
             let echo = echo(&view, 1_000 * angle_deg, true, &RNG);
-            assert!((echo.range_mm - 500.0 / cos).abs() < 1e-6 && !echo.torn, "{angle_deg}: {echo:?}");
+            assert!((echo.range_mm - 500.0 / cos).abs() < 1e-6 && !echo.is_torn, "{angle_deg}: {echo:?}");
         }
     }
 
@@ -411,16 +412,16 @@ mod tests {
     fn edge_reports_one_surface_or_value_between() {
         let range = |far_y, surface, between| {
             let echo = echo(&edge(1.0, far_y), 0, true, &BeamRng { surface, between, ..RNG });
-            assert!(echo.torn == (far_y > 4_000.0) && echo.met == BeamTarget::Grazed, "{echo:?}");
+            assert!(echo.is_torn == (far_y > 4_000.0) && echo.target == BeamTarget::Grazed, "{echo:?}");
             echo.range_mm.round()
         };
-        assert_eq!((range(3_990.0, 0.1, MIXED), range(3_990.0, 0.9, MIXED)), (3_000.0, 3_990.0));
+        assert_eq!((range(3_990.0, 0.1, MIXED_SHARE), range(3_990.0, 0.9, MIXED_SHARE)), (3_000.0, 3_990.0));
         assert!((3_100.0..3_900.0).contains(&range(3_990.0, 0.1, 0.0)));
         assert_eq!((range(4_010.0, 0.1, 0.0), range(4_010.0, 0.9, 0.0)), (3_000.0, 4_010.0));
         let view = edge(1.0, 4_000.0);
         assert_eq!(echo(&view, 0, false, &RNG).range_mm.round(), 3_000.0);
-        assert_eq!(echo(&view, 2_000, true, &RNG).met, BeamTarget::Person);
-        assert_eq!(echo(&view, -2_000, true, &RNG).met, BeamTarget::Static { since_ns: 0 });
+        assert_eq!(echo(&view, 2_000, true, &RNG).target, BeamTarget::Person);
+        assert_eq!(echo(&view, -2_000, true, &RNG).target, BeamTarget::Static { since_ns: 0 });
     }
 
     #[test]
@@ -445,7 +446,7 @@ mod tests {
             (wall(-25.0, 25.0, 4_000.0), Surface::Reflector, Kind::Static),
             (wall(-900.0, 900.0, 4_010.0), Surface::Plain, Kind::Static),
         ]);
-        let bright = |angle_mdeg| echo(&view, angle_mdeg, true, &RNG).bright;
+        let bright = |angle_mdeg| echo(&view, angle_mdeg, true, &RNG).reflector_share;
         assert!(bright(0) > 0.95 && bright(500) > 0.0 && bright(500) < 0.5 && bright(1_000) == 0.0);
     }
 

@@ -6,10 +6,10 @@
 
 use std::collections::VecDeque;
 
-use scanhub_drivers::lms::variant::{BYTES_PER_TURN, MIRROR_TURN};
+use scanhub_drivers::lms::variant::{BYTES_PER_REVOLUTION, MIRROR_PERIOD};
 use scanhub_schema::{Nanos, line_time};
 
-use crate::request_decoder::{Arrival, Dropped};
+use crate::request_decoder::{Arrival, DroppedRequest};
 
 /// A simulated scanner.
 pub trait Device {
@@ -31,7 +31,7 @@ pub trait Device {
     }
 
     /// Breaks off the current telegram. A stream continues with a whole telegram.
-    fn break_off(&mut self, now: Nanos);
+    fn abort(&mut self, now: Nanos);
 
     /// Returns the rate of the line in bits per second.
     fn rate(&self) -> u32;
@@ -45,7 +45,7 @@ pub trait Device {
     }
 
     /// Returns the last request that the scanner dropped because of its gaps. Returns it once.
-    fn take_dropped(&mut self) -> Option<Dropped> {
+    fn take_dropped(&mut self) -> Option<DroppedRequest> {
         None
     }
 
@@ -65,23 +65,23 @@ pub struct Chunk {
     /// Whether the line is idle after them.
     pub idle_after: bool,
     /// Position in the telegram.
-    pub part: Part,
+    pub part: ChunkKind,
 }
 
 /// The position of a chunk in its telegram.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Part {
+pub enum ChunkKind {
     /// A single ACK or NAK.
     Acknowledge,
     /// Bytes of a telegram, without its last byte.
     Telegram,
     /// The last bytes of a telegram.
-    End(Sent),
+    End(SentTelegram),
 }
 
 /// A telegram that was sent.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Sent {
+pub struct SentTelegram {
     /// Whether it is a reply, and not data of the stream.
     pub is_reply: bool,
     /// The intact telegram.
@@ -114,8 +114,8 @@ impl ChunkSize {
 pub(crate) struct Transmission<T> {
     bytes: Vec<u8>,
     /// Number of bytes to send: all, or fewer if the transmission was broken off.
-    leaving: usize,
-    handed: usize,
+    send_len: usize,
+    taken_len: usize,
     start_ns: Nanos,
     rate: u32,
     chunk: usize,
@@ -127,17 +127,17 @@ impl<T> Transmission<T> {
     /// Creates a transmission of `bytes` (at least one) from `start_ns` on.
     pub(crate) fn new(bytes: Vec<u8>, start_ns: Nanos, rate: u32, chunk: ChunkSize, tag: T) -> Self {
         let leaving = bytes.len();
-        Transmission { bytes, leaving, handed: 0, start_ns, rate, chunk: chunk.bytes(), tag }
+        Transmission { bytes, send_len: leaving, taken_len: 0, start_ns, rate, chunk: chunk.bytes(), tag }
     }
 
     /// Returns the time at which the next chunk is complete.
     pub(crate) fn next_chunk_ns(&self) -> Nanos {
-        self.through_ns(self.chunk_end())
+        self.end_of_bytes_ns(self.chunk_end())
     }
 
     /// Returns the end of the last byte.
     pub(crate) fn end_ns(&self) -> Nanos {
-        self.through_ns(self.leaving)
+        self.end_of_bytes_ns(self.send_len)
     }
 
     /// Returns the start of the first byte.
@@ -161,26 +161,27 @@ impl<T> Transmission<T> {
         if self.next_chunk_ns() > now {
             return None;
         }
-        let (from, to) = (self.handed, self.chunk_end());
-        self.handed = to;
-        Some((&self.bytes[from..to], to == self.leaving || to % BYTES_PER_TURN == 0))
+        let (from, to) = (self.taken_len, self.chunk_end());
+        self.taken_len = to;
+        Some((&self.bytes[from..to], to == self.send_len || to % BYTES_PER_REVOLUTION == 0))
     }
 
     /// Returns whether every byte to send was taken.
     pub(crate) fn is_done(&self) -> bool {
-        self.handed == self.leaving
+        self.taken_len == self.send_len
     }
 
     /// Returns whether the transmission was broken off before its last byte.
-    pub(crate) fn is_broken(&self) -> bool {
-        self.leaving < self.bytes.len()
+    pub(crate) fn is_aborted(&self) -> bool {
+        self.send_len < self.bytes.len()
     }
 
     /// Ends the transmission with the byte that is in the transmitter at `now`.
-    pub(crate) fn break_off(&mut self, now: Nanos) {
+    pub(crate) fn abort(&mut self, now: Nanos) {
         let byte_ns = line_time(1, self.rate);
-        let begun = (0..self.leaving).take_while(|&i| self.through_ns(i + 1) - byte_ns <= now).count();
-        self.leaving = begun.max(self.handed).max(1);
+        let started =
+            (0..self.send_len).take_while(|&i| self.end_of_bytes_ns(i + 1) - byte_ns <= now).count();
+        self.send_len = started.max(self.taken_len).max(1);
     }
 
     /// Returns all bytes, including those that were not sent, and the tag.
@@ -190,16 +191,18 @@ impl<T> Transmission<T> {
 
     /// Returns the end of the first `count` (at least 1) bytes. If 508 bytes need less time than a turn of the mirror,
     /// the rest waits for the next turn.
-    fn through_ns(&self, count: usize) -> Nanos {
+    fn end_of_bytes_ns(&self, count: usize) -> Nanos {
         let rate = self.rate;
-        let turns = (count - 1) / BYTES_PER_TURN;
-        let turn_ns = MIRROR_TURN.max(line_time(BYTES_PER_TURN, rate));
-        self.start_ns + turns as Nanos * turn_ns + line_time(count - turns * BYTES_PER_TURN, rate)
+        let revolutions = (count - 1) / BYTES_PER_REVOLUTION;
+        let revolution_ns = MIRROR_PERIOD.max(line_time(BYTES_PER_REVOLUTION, rate));
+        self.start_ns
+            + revolutions as Nanos * revolution_ns
+            + line_time(count - revolutions * BYTES_PER_REVOLUTION, rate)
     }
 
     fn chunk_end(&self) -> usize {
-        let turn_end = (self.handed / BYTES_PER_TURN + 1) * BYTES_PER_TURN;
-        (self.handed + self.chunk).min(turn_end).min(self.leaving)
+        let revolution_end = (self.taken_len / BYTES_PER_REVOLUTION + 1) * BYTES_PER_REVOLUTION;
+        (self.taken_len + self.chunk).min(revolution_end).min(self.send_len)
     }
 }
 
@@ -234,12 +237,17 @@ impl TxQueue {
         let (bytes, idle_after) = front.take_chunk(now)?;
         let bytes = bytes.to_vec();
         if !front.is_done() {
-            return Some(Chunk { bytes, rate, idle_after, part: Part::Telegram });
+            return Some(Chunk { bytes, rate, idle_after, part: ChunkKind::Telegram });
         }
         let front = self.queue.pop_front()?;
-        let aborted = front.is_broken();
+        let aborted = front.is_aborted();
         let (telegram, is_reply) = front.into_parts();
-        Some(Chunk { bytes, rate, idle_after, part: Part::End(Sent { is_reply, telegram, aborted }) })
+        Some(Chunk {
+            bytes,
+            rate,
+            idle_after,
+            part: ChunkKind::End(SentTelegram { is_reply, telegram, aborted }),
+        })
     }
 
     /// Returns the time at which the next chunk is complete, or `None` if the queue is empty.
@@ -253,20 +261,20 @@ impl TxQueue {
     }
 
     /// Breaks off the current telegram and drops the rest. Returns whether a telegram was broken off.
-    pub(crate) fn break_off(&mut self, now: Nanos) -> bool {
+    pub(crate) fn abort(&mut self, now: Nanos) -> bool {
         self.queue.retain(|transmission| transmission.start_ns() <= now);
         let mut broken = false;
         self.free_ns = now;
         for transmission in &mut self.queue {
-            transmission.break_off(now);
-            broken |= transmission.is_broken();
+            transmission.abort(now);
+            broken |= transmission.is_aborted();
             self.free_ns = transmission.end_ns().max(now);
         }
         broken
     }
 
     /// Drops the data whose transmission has not started.
-    pub(crate) fn forget_data(&mut self, now: Nanos) {
+    pub(crate) fn drop_data(&mut self, now: Nanos) {
         self.queue.retain(|transmission| transmission.tag || transmission.start_ns() <= now);
         self.free_ns = self.queue.back().map_or(now, Transmission::end_ns);
     }
@@ -318,10 +326,10 @@ mod tests {
     fn breaks_off_after_byte_in_transmitter() {
         let mut transmission = Transmission::new(vec![7; 732], 0, 500_000, ChunkSize::Uart, ());
         assert!(transmission.take_chunk(320 * MICROS).is_some());
-        transmission.break_off(405 * MICROS);
+        transmission.abort(405 * MICROS);
         // Byte 20 began at 400 us.
         assert_eq!(transmission.end_ns(), 420 * MICROS);
         assert_eq!(transmission.take_chunk(420 * MICROS), Some((&[7; 5][..], true)));
-        assert!(transmission.is_done() && transmission.is_broken());
+        assert!(transmission.is_done() && transmission.is_aborted());
     }
 }

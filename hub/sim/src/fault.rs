@@ -1,14 +1,14 @@
 //! Injected faults. A user writes them as `loss=0.00135,burst=1.89`, and one table has the keys with their meaning and
 //! range for the parser, the printer and the help.
 //!
-//! [`crate::wire`] applies the faults between the scanner and the port, except the scanner's own deviations from the
+//! [`crate::line_model`] applies the faults between the scanner and the port, except the scanner's own deviations from the
 //! protocol:
 //!
 //! - Damage to bytes. A byte is lost, flipped or doubled, or has random bytes before it. The random numbers of each byte
 //!   are drawn in any case, so that the same seed damages the same bytes in every run, for any size of chunks.
 //! - Damage to telegrams. A telegram is truncated, broken off or sent twice, or has another length field. Its random
 //!   numbers are drawn at its start.
-//! - Faults at a time, in time of the scanner: `Schedule` has points in time, `Window` spans of time, `Extra`
+//! - Faults at a time, in time of the scanner: `Schedule` has points in time, `FaultWindow` spans of time, `Garbage`
 //!   garbage between or inside telegrams, and `Delay` the delays of chunks.
 
 use std::fmt;
@@ -79,7 +79,7 @@ impl Fault {
 }
 
 /// A row of the table.
-struct Key {
+struct FaultKey {
     name: &'static str,
     meaning: &'static str,
     min: f64,
@@ -104,7 +104,7 @@ macro_rules! faults {
             }
         }
 
-        const TABLE: &[Key] = &[$(Key {
+        const TABLE: &[FaultKey] = &[$(FaultKey {
             name: stringify!($name),
             meaning: $meaning,
             min: $min,
@@ -171,7 +171,7 @@ impl Faults {
     /// Returns each key, and its meaning, range and default as text.
     pub fn keys() -> impl Iterator<Item = (&'static str, String)> {
         TABLE.iter().map(|key| {
-            let Key { name, meaning, min, max, default, .. } = key;
+            let FaultKey { name, meaning, min, max, default, .. } = key;
             (*name, format!("{meaning}, {min} to {max} [{default}]"))
         })
     }
@@ -179,18 +179,18 @@ impl Faults {
     /// Returns the faults that are deviations of the scanner from the protocol.
     pub fn quirks(&self) -> ProtocolQuirks {
         ProtocolQuirks {
-            overlooks: self.overlook,
-            naks: self.nak,
-            doubles: self.twice,
+            overlooked_share: self.overlook,
+            nak_share: self.nak,
+            doubled_share: self.twice,
             late_acknowledge_ns: (self.late_ack * 1e9) as Nanos,
             late_reply_ns: (self.late * 1e9) as Nanos,
             late_mode_ns: (self.late_mode * 1e9) as Nanos,
             late_write_ns: (self.late_write * 1e9) as Nanos,
-            strict: self.strict > 0.0,
-            strict_gap: self.strict_gap > 0.0,
-            answer_ns: (self.answer * 1e9) as Nanos,
-            refuses: if self.refuse > 0.0 { vec![self.refuse as u8] } else { Vec::new() },
-            mute: self.mute > 0.0,
+            is_strict: self.strict > 0.0,
+            checks_gaps: self.strict_gap > 0.0,
+            reply_delay_ns: (self.answer * 1e9) as Nanos,
+            refused_commands: if self.refuse > 0.0 { vec![self.refuse as u8] } else { Vec::new() },
+            is_mute: self.mute > 0.0,
         }
     }
 }
@@ -202,16 +202,17 @@ impl FromStr for Faults {
         let mut faults = Faults::default();
         for part in text.split(',').filter(|part| !part.is_empty()) {
             let (name, value) =
-                part.split_once('=').ok_or_else(|| wrong(part, "is not KEY=VALUE", names()))?;
+                part.split_once('=').ok_or_else(|| invalid_fault(part, "is not KEY=VALUE", key_names()))?;
             let key = TABLE.iter().find(|key| key.name == name);
-            let Key { min, max, field, .. } = key.ok_or_else(|| wrong(part, "names no fault", names()))?;
+            let FaultKey { min, max, field, .. } =
+                key.ok_or_else(|| invalid_fault(part, "names no fault", key_names()))?;
             let number = match value.strip_prefix("0x") {
                 Some(digits) => u8::from_str_radix(digits, 16).ok().map(f64::from),
                 None => value.parse().ok(),
             };
             *field(&mut faults) =
                 number.filter(|number| (*min..=*max).contains(number)).ok_or_else(|| {
-                    wrong(part, "is out of range", format!("{name} is a number from {min} to {max}"))
+                    invalid_fault(part, "is out of range", format!("{name} is a number from {min} to {max}"))
                 })?;
         }
         Ok(faults)
@@ -230,11 +231,11 @@ impl fmt::Display for Faults {
     }
 }
 
-fn wrong(part: &str, what: &str, hint: String) -> Failure {
+fn invalid_fault(part: &str, what: &str, hint: String) -> Failure {
     Failure::new(Kind::Configuration, format!("fault {part:?} {what}"), hint)
 }
 
-fn names() -> String {
+fn key_names() -> String {
     format!("keys: {}", TABLE.iter().map(|key| key.name).collect::<Vec<_>>().join(", "))
 }
 
@@ -248,10 +249,10 @@ fn random(seed: u64, kind: u64) -> fastrand::Rng {
 #[derive(Clone, Debug)]
 pub struct Loss {
     /// Probability that a burst begins after a byte that arrived.
-    begin: f64,
+    begin_share: f64,
     /// Probability that a burst continues.
-    continues: f64,
-    inside: bool,
+    continue_share: f64,
+    is_in_burst: bool,
     random: fastrand::Rng,
 }
 
@@ -260,9 +261,9 @@ impl Loss {
     pub fn new(faults: Faults, seed: u64) -> Self {
         Loss {
             // Bursts of mean b and, between them, runs of mean 1/begin: their share is b / (b + 1/begin).
-            begin: faults.loss / (faults.burst * (1.0 - faults.loss)),
-            continues: 1.0 - 1.0 / faults.burst,
-            inside: false,
+            begin_share: faults.loss / (faults.burst * (1.0 - faults.loss)),
+            continue_share: 1.0 - 1.0 / faults.burst,
+            is_in_burst: false,
             random: fastrand::Rng::with_seed(seed),
         }
     }
@@ -276,12 +277,12 @@ impl Loss {
 
     /// Returns whether the next byte is lost.
     fn next(&mut self) -> bool {
-        if self.begin == 0.0 {
+        if self.begin_share == 0.0 {
             return false;
         }
-        let chance = if self.inside { self.continues } else { self.begin };
-        self.inside = self.random.f64() < chance;
-        self.inside
+        let chance = if self.is_in_burst { self.continue_share } else { self.begin_share };
+        self.is_in_burst = self.random.f64() < chance;
+        self.is_in_burst
     }
 }
 
@@ -289,11 +290,11 @@ impl Loss {
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(crate) struct ByteOutcome {
     /// Inserted bytes before this one.
-    pub(crate) before: Vec<u8>,
-    pub(crate) lost: bool,
+    pub(crate) inserted: Vec<u8>,
+    pub(crate) is_lost: bool,
     /// Mask of the flipped bits.
-    pub(crate) flipped: u8,
-    pub(crate) doubled: bool,
+    pub(crate) flip_mask: u8,
+    pub(crate) is_doubled: bool,
 }
 
 /// The faults of single bytes.
@@ -331,31 +332,31 @@ impl Noise {
     /// Returns the damage to the next byte.
     pub(crate) fn next(&mut self) -> ByteOutcome {
         ByteOutcome {
-            before: self.inserted(),
-            lost: self.loss.next(),
-            flipped: self.flipped(),
-            doubled: happens(&mut self.doubles, self.double),
+            inserted: self.inserted_bytes(),
+            is_lost: self.loss.next(),
+            flip_mask: self.flip_mask(),
+            is_doubled: draw(&mut self.doubles, self.double),
         }
     }
 
     /// Returns the mask of flipped bits. The lowest bit is sent first, so a run continues in the low bits of the next
     /// byte.
-    fn flipped(&mut self) -> u8 {
+    fn flip_mask(&mut self) -> u8 {
         let mut first = 0;
         if self.bits_left == 0 {
-            if !happens(&mut self.flips, self.flip) {
+            if !draw(&mut self.flips, self.flip) {
                 return 0;
             }
             first = self.flips.u32(..8);
             self.bits_left = geometric(&mut self.flips, self.flip_bits);
         }
-        let here = self.bits_left.min(8 - first);
-        self.bits_left -= here;
-        (((1u16 << here) - 1) << first) as u8
+        let run_bits = self.bits_left.min(8 - first);
+        self.bits_left -= run_bits;
+        (((1u16 << run_bits) - 1) << first) as u8
     }
 
-    fn inserted(&mut self) -> Vec<u8> {
-        if !happens(&mut self.inserts, self.insert) {
+    fn inserted_bytes(&mut self) -> Vec<u8> {
+        if !draw(&mut self.inserts, self.insert) {
             return Vec::new();
         }
         let count = geometric(&mut self.inserts, self.insert_burst);
@@ -364,14 +365,14 @@ impl Noise {
 }
 
 /// Returns whether an event with the probability `share` happens. Draws no number if `share` is 0.
-fn happens(random: &mut fastrand::Rng, share: f64) -> bool {
+fn draw(random: &mut fastrand::Rng, share: f64) -> bool {
     share > 0.0 && random.f64() < share
 }
 
 /// Returns a number from a geometric distribution: 1 or more, `mean` on average.
 fn geometric(random: &mut fastrand::Rng, mean: f64) -> u32 {
     let mut count = 1;
-    while happens(random, 1.0 - 1.0 / mean) {
+    while draw(random, 1.0 - 1.0 / mean) {
         count += 1;
     }
     count
@@ -386,15 +387,15 @@ pub(crate) struct TelegramFaults {
     abort: f64,
     random: fastrand::Rng,
     /// Share of the bytes that arrive, if the telegram is truncated.
-    arrives: Option<f64>,
+    arriving_share: Option<f64>,
     /// Mask of the flipped bits of the length field; 0 if there are none.
-    mask: u16,
-    repeats: bool,
+    length_mask: u16,
+    is_repeated: bool,
     /// Share of the bytes after which the scanner breaks off the telegram.
-    breaks: Option<f64>,
+    abort_share: Option<f64>,
     /// Length of the telegram, as far as its bytes have announced it.
     len: usize,
-    announces: bool,
+    has_length_field: bool,
 }
 
 impl TelegramFaults {
@@ -405,12 +406,12 @@ impl TelegramFaults {
             repeat: faults.repeat,
             abort: faults.abort,
             random: random(seed, 4),
-            arrives: None,
-            mask: 0,
-            repeats: false,
-            breaks: None,
+            arriving_share: None,
+            length_mask: 0,
+            is_repeated: false,
+            abort_share: None,
             len: 0,
-            announces: true,
+            has_length_field: true,
         }
     }
 
@@ -420,46 +421,46 @@ impl TelegramFaults {
         // Half of the changed lengths are valid.
         let masks = [self.random.u16(1..0x0400), self.random.u16(1..)];
         let mask = masks[usize::from(self.random.bool())];
-        self.arrives = happens(&mut self.random, self.truncate).then_some(shares[0]);
-        self.mask = if happens(&mut self.random, self.length) { mask } else { 0 };
-        self.repeats = happens(&mut self.random, self.repeat);
-        self.breaks = happens(&mut self.random, self.abort).then_some(shares[1]);
-        self.len = len.unwrap_or(lms::telegram::FRAME);
-        self.announces = len.is_none();
+        self.arriving_share = draw(&mut self.random, self.truncate).then_some(shares[0]);
+        self.length_mask = if draw(&mut self.random, self.length) { mask } else { 0 };
+        self.is_repeated = draw(&mut self.random, self.repeat);
+        self.abort_share = draw(&mut self.random, self.abort).then_some(shares[1]);
+        self.len = len.unwrap_or(lms::telegram::FRAME_LEN);
+        self.has_length_field = len.is_none();
     }
 
     /// Returns the byte that arrives for `byte` at `position`, or `None` if it is lost, and the fault.
     pub(crate) fn apply(&mut self, position: usize, byte: u8) -> (Option<u8>, Option<Fault>) {
-        let [low, high] = self.mask.to_le_bytes();
+        let [low, high] = self.length_mask.to_le_bytes();
         // Telegrams of a fixed length have it in the byte after the first one.
-        let flipped = match (self.announces, position) {
+        let flipped = match (self.has_length_field, position) {
             (true, 2) | (false, 1) => low,
             (true, 3) => high,
             _ => 0,
         };
         match position {
-            2 if self.announces => self.len += usize::from(byte),
-            3 if self.announces => self.len += usize::from(byte) << 8,
+            2 if self.has_length_field => self.len += usize::from(byte),
+            3 if self.has_length_field => self.len += usize::from(byte) << 8,
             _ => {}
         }
-        if position > 3 && self.arrives.is_some_and(|share| position >= self.place(share)) {
+        if position > 3 && self.arriving_share.is_some_and(|share| position >= self.position_at(share)) {
             return (None, Some(Fault::Truncated));
         }
         (Some(byte ^ flipped), (flipped != 0).then_some(Fault::Length))
     }
 
     /// Returns whether the scanner breaks off the telegram after `position` bytes.
-    pub(crate) fn breaks_at(&self, position: usize) -> bool {
-        position > 4 && self.breaks.is_some_and(|share| position >= self.place(share))
+    pub(crate) fn aborts_at(&self, position: usize) -> bool {
+        position > 4 && self.abort_share.is_some_and(|share| position >= self.position_at(share))
     }
 
     /// Returns whether the telegram is sent twice.
-    pub(crate) fn repeats(&self) -> bool {
-        self.repeats
+    pub(crate) fn is_repeated(&self) -> bool {
+        self.is_repeated
     }
 
     /// Returns the position at `share` of the length, after the first byte and within the telegram.
-    fn place(&self, share: f64) -> usize {
+    fn position_at(&self, share: f64) -> usize {
         1 + (share * (self.len - 1) as f64) as usize
     }
 }
@@ -475,13 +476,13 @@ pub(crate) struct Schedule {
 impl Schedule {
     /// Creates a schedule. The first time is `at_s`, and each next time is `every_s` later on average, in seconds. If
     /// `every_s` is 0, there is only the first time. If `at_s` is 0, the first time is drawn like the others, or is
-    /// [`ONCE_S`] if there are no others.
+    /// [`DEFAULT_FAULT_TIME_S`] if there are no others.
     pub(crate) fn new(at_s: f64, every_s: f64, random: fastrand::Rng) -> Schedule {
         let mut schedule = Schedule { every_s, next_ns: 0, random };
         schedule.next_ns = match (at_s > 0.0, every_s > 0.0) {
             (true, _) => nanos(at_s),
             (false, true) => schedule.interval_ns(),
-            (false, false) => nanos(ONCE_S),
+            (false, false) => nanos(DEFAULT_FAULT_TIME_S),
         };
         schedule
     }
@@ -525,43 +526,43 @@ impl Schedule {
 
 /// Spans of time in which a fault is present.
 #[derive(Clone, Debug)]
-pub(crate) struct Window {
+pub(crate) struct FaultWindow {
     begins: Schedule,
     span_ns: Nanos,
     /// End of the span that has begun last.
     until_ns: Nanos,
 }
 
-impl Window {
+impl FaultWindow {
     /// Creates spans of `span_s` seconds that begin at the times of [`Schedule::new`]. There are none if `span_s` is 0.
-    pub(crate) fn new(span_s: f64, at_s: f64, every_s: f64, random: fastrand::Rng) -> Window {
+    pub(crate) fn new(span_s: f64, at_s: f64, every_s: f64, random: fastrand::Rng) -> FaultWindow {
         let begins = if span_s > 0.0 { Schedule::new(at_s, every_s, random) } else { Schedule::never() };
-        Window { begins, span_ns: nanos(span_s), until_ns: 0 }
+        FaultWindow { begins, span_ns: nanos(span_s), until_ns: 0 }
     }
 
     /// Creates a single span, which begins at `begin_ns`.
-    pub(crate) fn once(begin_ns: Nanos, span_ns: Nanos) -> Window {
+    pub(crate) fn once(begin_ns: Nanos, span_ns: Nanos) -> FaultWindow {
         let begins = Schedule { next_ns: begin_ns, ..Schedule::never() };
-        Window { begins, span_ns, until_ns: 0 }
+        FaultWindow { begins, span_ns, until_ns: 0 }
     }
 
     /// Returns the times at which no byte arrives.
-    pub(crate) fn silences(faults: &Faults, seed: u64) -> Window {
-        Window::new(faults.silence, faults.silence_at, faults.silence_every, random(seed, 8))
+    pub(crate) fn silences(faults: &Faults, seed: u64) -> FaultWindow {
+        FaultWindow::new(faults.silence, faults.silence_at, faults.silence_every, random(seed, 8))
     }
 
     /// Returns the times at which the port is unplugged.
-    pub(crate) fn unplugs(faults: &Faults, seed: u64) -> Window {
-        Window::new(faults.unplug, faults.unplug_at, faults.unplug_every, random(seed, 9))
+    pub(crate) fn unplugs(faults: &Faults, seed: u64) -> FaultWindow {
+        FaultWindow::new(faults.unplug, faults.unplug_at, faults.unplug_every, random(seed, 9))
     }
 
     /// Returns the times at which something holds the head of the scanner.
-    pub(crate) fn held(faults: &Faults, seed: u64) -> Window {
-        Window::new(faults.hold, faults.hold_at, faults.hold_every, random(seed, 13))
+    pub(crate) fn stalls(faults: &Faults, seed: u64) -> FaultWindow {
+        FaultWindow::new(faults.hold, faults.hold_at, faults.hold_every, random(seed, 13))
     }
 
     /// Returns whether the fault is present at `now`. Time must not go backwards.
-    pub(crate) fn holds(&mut self, now: Nanos) -> bool {
+    pub(crate) fn is_active(&mut self, now: Nanos) -> bool {
         while let Some(begin_ns) = self.begins.take(now) {
             self.until_ns = begin_ns + self.span_ns;
         }
@@ -570,7 +571,7 @@ impl Window {
 
     /// Returns the end of the span at `now`, or `now` if there is none.
     pub(crate) fn end_ns(&mut self, now: Nanos) -> Nanos {
-        if self.holds(now) { self.until_ns } else { now }
+        if self.is_active(now) { self.until_ns } else { now }
     }
 
     /// Returns the time of the next change after `now`.
@@ -581,39 +582,47 @@ impl Window {
 
 /// Garbage that arrives now and then, between telegrams or inside one.
 #[derive(Clone, Debug)]
-pub(crate) struct Extra {
+pub(crate) struct Garbage {
     pub(crate) fault: Fault,
     schedule: Schedule,
     len: usize,
-    inside: f64,
+    inside_share: f64,
     random: fastrand::Rng,
     /// Whether the next garbage arrives inside a telegram.
-    wants_inside: bool,
+    is_next_inside: bool,
     /// Number of bytes of the telegram before the garbage.
-    passes: usize,
+    bytes_to_pass: usize,
 }
 
-impl Extra {
+impl Garbage {
     /// Creates floods of random bytes.
-    pub(crate) fn floods(faults: &Faults, seed: u64) -> Extra {
-        Extra::new(Fault::Flood, faults.flood, faults.flood_every, faults.inside, random(seed, 5))
+    pub(crate) fn floods(faults: &Faults, seed: u64) -> Garbage {
+        Garbage::new(Fault::Flood, faults.flood, faults.flood_every, faults.inside, random(seed, 5))
     }
 
     /// Creates walls of start bytes.
-    pub(crate) fn walls(faults: &Faults, seed: u64) -> Extra {
-        Extra::new(Fault::Wall, faults.wall, faults.wall_every, faults.inside, random(seed, 6))
+    pub(crate) fn walls(faults: &Faults, seed: u64) -> Garbage {
+        Garbage::new(Fault::Wall, faults.wall, faults.wall_every, faults.inside, random(seed, 6))
     }
 
-    fn new(fault: Fault, len: f64, every_s: f64, inside: f64, mut random: fastrand::Rng) -> Extra {
+    fn new(fault: Fault, len: f64, every_s: f64, inside: f64, mut random: fastrand::Rng) -> Garbage {
         let happens = len >= 1.0;
         let schedule = if happens { Schedule::new(0.0, every_s, random.fork()) } else { Schedule::never() };
         let wants_inside = random.f64() < inside;
-        Extra { fault, schedule, len: len as usize, inside, random, wants_inside, passes: 0 }
+        Garbage {
+            fault,
+            schedule,
+            len: len as usize,
+            inside_share: inside,
+            random,
+            is_next_inside: wants_inside,
+            bytes_to_pass: 0,
+        }
     }
 
     /// Returns the time of the next garbage, for a line between two telegrams, or inside one if `inside` is set.
     pub(crate) fn due_ns(&self, inside: bool) -> Nanos {
-        if inside == self.wants_inside { self.schedule.next_ns() } else { Nanos::MAX }
+        if inside == self.is_next_inside { self.schedule.next_ns() } else { Nanos::MAX }
     }
 
     /// Returns the garbage, if it is due before the byte that ends at `now`. `header` has the first bytes of the
@@ -622,13 +631,13 @@ impl Extra {
         if self.due_ns(inside) > now {
             return None;
         }
-        if inside && self.passes > 0 {
-            self.passes -= 1;
+        if inside && self.bytes_to_pass > 0 {
+            self.bytes_to_pass -= 1;
             return None;
         }
         self.schedule.take(now)?;
-        self.wants_inside = self.random.f64() < self.inside;
-        self.passes = self.random.usize(..64);
+        self.is_next_inside = self.random.f64() < self.inside_share;
+        self.bytes_to_pass = self.random.usize(..64);
         if self.fault == Fault::Flood {
             return Some((0..self.len).map(|_| self.random.u8(..)).collect());
         }
@@ -647,7 +656,7 @@ fn nanos(seconds: f64) -> Nanos {
 /// Delays of chunks: a line that is stuck for a while, and random delays. The order of the chunks never changes.
 #[derive(Clone, Debug)]
 pub(crate) struct Delay {
-    stall: Window,
+    stall: FaultWindow,
     /// Maximum random delay.
     delay_ns: Nanos,
     random: fastrand::Rng,
@@ -658,7 +667,7 @@ pub(crate) struct Delay {
 impl Delay {
     pub(crate) fn new(faults: &Faults, seed: u64) -> Delay {
         Delay {
-            stall: Window::new(faults.stall, faults.stall_at, faults.stall_every, random(seed, 10)),
+            stall: FaultWindow::new(faults.stall, faults.stall_at, faults.stall_every, random(seed, 10)),
             delay_ns: (faults.delay * 1e9) as Nanos,
             random: random(seed, 11),
             last_ns: 0,
@@ -679,7 +688,7 @@ impl Delay {
 }
 
 /// Time of a single fault without a configured time, in seconds. A session streams by then.
-const ONCE_S: f64 = 5.0;
+const DEFAULT_FAULT_TIME_S: f64 = 5.0;
 
 #[cfg(test)]
 mod tests {
@@ -691,7 +700,7 @@ mod tests {
         assert_eq!(faults, Faults { loss: 0.00135, burst: 1.89, ..Faults::default() });
         assert_eq!(faults.to_string(), "loss=0.00135,burst=1.89");
         assert_eq!(("".parse(), Faults::default().to_string()), (Ok(Faults::default()), String::new()));
-        for (text, says) in [
+        for (text, message) in [
             ("los=0.1", "loss, burst"),
             ("loss", "loss, burst"),
             ("loss=2", "from 0 to 0.5"),
@@ -701,14 +710,14 @@ mod tests {
             ("refuse=0x100", "from 0 to 255"),
         ] {
             let failure = text.parse::<Faults>().unwrap_err();
-            assert!(failure.hint.contains(says), "{text}: {failure}");
+            assert!(failure.hint.contains(message), "{text}: {failure}");
             assert!(failure.message.contains(text), "{text}: {failure}");
             assert_eq!(failure.kind.exit_code(), 78);
         }
     }
 
     #[test]
-    fn every_key_is_printed_and_parsed_and_is_off_by_default() {
+    fn every_fault_key_round_trips_and_is_off_by_default() {
         for key in TABLE {
             let mut faults = Faults::default();
             assert_eq!(*(key.field)(&mut faults), key.default);
@@ -717,10 +726,10 @@ mod tests {
             assert_eq!((text.parse(), text), (Ok(faults), format!("{}={}", key.name, key.max)));
         }
         let quirks = "overlook=0.5,late=1.5,refuse=0x3B,mute=1".parse::<Faults>().unwrap().quirks();
-        assert_eq!((quirks.overlooks, quirks.late_reply_ns), (0.5, 1_500_000_000));
-        assert_eq!((quirks.refuses, quirks.mute), (vec![0x3B], true));
+        assert_eq!((quirks.overlooked_share, quirks.late_reply_ns), (0.5, 1_500_000_000));
+        assert_eq!((quirks.refused_commands, quirks.is_mute), (vec![0x3B], true));
         let quirks = "strict_gap=1,answer=0.06".parse::<Faults>().unwrap().quirks();
-        assert_eq!((quirks.strict_gap, quirks.answer_ns), (true, 60_000_000));
+        assert_eq!((quirks.checks_gaps, quirks.reply_delay_ns), (true, 60_000_000));
         let quirks = "late_mode=2.5,late_write=6".parse::<Faults>().unwrap().quirks();
         assert_eq!((quirks.late_mode_ns, quirks.late_write_ns), (2_500_000_000, 6_000_000_000));
         assert_eq!(Faults::default().quirks(), ProtocolQuirks::default());
@@ -766,21 +775,21 @@ mod tests {
         let faults = Faults { double: 0.03, ..faults };
         let mut noise = Noise::new(&faults, 1);
         let outcomes: Vec<ByteOutcome> = (0..100_000).map(|_| noise.next()).collect();
-        let bits: u32 = outcomes.iter().map(|outcome| outcome.flipped.count_ones()).sum();
-        let inserted: usize = outcomes.iter().map(|outcome| outcome.before.len()).sum();
-        let doubled = outcomes.iter().filter(|outcome| outcome.doubled).count();
+        let bits: u32 = outcomes.iter().map(|outcome| outcome.flip_mask.count_ones()).sum();
+        let inserted: usize = outcomes.iter().map(|outcome| outcome.inserted.len()).sum();
+        let doubled = outcomes.iter().filter(|outcome| outcome.is_doubled).count();
         assert!((2_700..3_300).contains(&bits), "{bits}");
         assert!((7_300..8_700).contains(&inserted), "{inserted}");
         assert!((2_800..3_200).contains(&doubled), "{doubled}");
         let mut alone = Noise::new(&Faults { double: 0.03, ..Faults::default() }, 1);
-        assert!(outcomes.iter().all(|outcome| alone.next().doubled == outcome.doubled));
+        assert!(outcomes.iter().all(|outcome| alone.next().is_doubled == outcome.is_doubled));
         let mut nothing = Noise::new(&Faults::default(), 1);
         assert_eq!(nothing.next(), ByteOutcome::default());
     }
 
     #[test]
     fn truncates_telegrams_and_changes_lengths() {
-        let telegram = lms::reply::mode(0, true, 0x10).bytes().to_vec();
+        let telegram = lms::reply::mode_reply(0, true, 0x10).bytes().to_vec();
         let mut cuts = std::collections::HashSet::new();
         let mut telegram_faults = TelegramFaults::new(&Faults { truncate: 1.0, ..Faults::default() }, 3);
         for _ in 0..200 {
@@ -810,14 +819,14 @@ mod tests {
 
     #[test]
     fn spans_begin_and_end_at_their_times() {
-        let mut window = Window::new(1.5, 3.0, 0.0, random(1, 1));
-        assert_eq!((window.next_ns(0), window.holds(3 * S - 1)), (3 * S, false));
-        assert!(window.holds(3 * S) && window.holds(4 * S));
+        let mut window = FaultWindow::new(1.5, 3.0, 0.0, random(1, 1));
+        assert_eq!((window.next_ns(0), window.is_active(3 * S - 1)), (3 * S, false));
+        assert!(window.is_active(3 * S) && window.is_active(4 * S));
         assert_eq!(window.next_ns(4 * S), 4 * S + S / 2);
-        assert!(!window.holds(4 * S + S / 2) && !window.holds(100 * S));
+        assert!(!window.is_active(4 * S + S / 2) && !window.is_active(100 * S));
         assert_eq!(window.next_ns(100 * S), Nanos::MAX);
-        assert!(!Window::new(0.0, 3.0, 1.0, random(1, 1)).holds(50 * S));
-        assert!(Window::new(1.0, 0.0, 0.0, random(1, 1)).holds(5 * S));
+        assert!(!FaultWindow::new(0.0, 3.0, 1.0, random(1, 1)).is_active(50 * S));
+        assert!(FaultWindow::new(1.0, 0.0, 0.0, random(1, 1)).is_active(5 * S));
     }
 
     #[test]

@@ -4,7 +4,9 @@
 use std::path::Path;
 
 pub use scanhub_drivers::ld::Model;
-use scanhub_drivers::ld::packet::{CLOCK_TURN, Contents, LEN, POINTS, Packet, TURN};
+use scanhub_drivers::ld::packet::{
+    CLOCK_PERIOD_MS, FULL_CIRCLE, PACKET_LEN, POINTS_PER_PACKET, Packet, PacketContents,
+};
 use scanhub_drivers::lms::variant::{Mode, Unit};
 use scanhub_recording::{Encoding, Recording};
 use scanhub_schema::{Failure, Family, Kind, MILLIS, Nanos};
@@ -14,7 +16,7 @@ use crate::device::TxQueue;
 use crate::device::{Chunk, Device};
 use crate::request_decoder::Arrival;
 use crate::room::Room;
-use crate::rotating::{Beams, Rotation, ahead_deg};
+use crate::rotating::{BeamSampler, Rotation, counterclockwise_deg};
 
 pub use crate::rotating::TruePoint;
 
@@ -24,11 +26,11 @@ pub struct LdSettings {
     /// The model.
     pub model: Model,
     /// Mean revolutions per second; by default those of the model.
-    pub turns_per_second: f64,
+    pub revolutions_per_second: f64,
     /// Points per second; by default those of the model.
     pub points_per_second: f64,
     /// Share by which the speed varies. Real scanners stay within 1 %.
-    pub wander: f64,
+    pub speed_variation: f64,
     /// Time constant of the spin-up after power-on, in seconds; 0 means full speed at once.
     pub spin_up_s: f64,
     /// Time from power-on to the first packet.
@@ -44,9 +46,9 @@ impl LdSettings {
     pub fn of(model: Model) -> LdSettings {
         LdSettings {
             model,
-            turns_per_second: f64::from(model.turns_per_second()),
+            revolutions_per_second: f64::from(model.revolutions_per_second()),
             points_per_second: f64::from(model.points_per_second()),
-            wander: 0.005,
+            speed_variation: 0.005,
             spin_up_s: 0.0,
             boot_ns: 2_000 * MILLIS,
             chunk: ChunkSize::Uart,
@@ -62,7 +64,7 @@ pub struct LdSimulator {
     /// Time of power-on.
     power_ns: Nanos,
     /// Time from which on the head rotates.
-    turns_ns: Nanos,
+    rotates_from_ns: Nanos,
     /// Number of packets since then.
     sent: u64,
     rotation: Rotation,
@@ -72,39 +74,40 @@ pub struct LdSimulator {
 /// Source of the packets that a scanner sends.
 enum Source {
     /// The scanner measures a room.
-    Room(Beams),
+    Room(BeamSampler),
     /// The scanner repeats recorded packets.
     Recorded {
-        packets: Vec<[u8; LEN]>,
+        packets: Vec<[u8; PACKET_LEN]>,
         /// Whether they restart at their end.
-        looped: bool,
+        is_looped: bool,
         /// Time since the first packet by the clock of the recorded scanner, in milliseconds.
-        passed_ms: u64,
+        elapsed_ms: u64,
     },
 }
 
 impl LdSimulator {
     /// Creates the scanner that `settings` describe in `room`, at time 0. Its head rotates already.
     pub fn new(settings: LdSettings, room: Room) -> LdSimulator {
-        LdSimulator::of(settings, Source::Room(Beams::new(room)))
+        LdSimulator::of(settings, Source::Room(BeamSampler::new(room)))
     }
 
     /// Creates a scanner that repeats recorded `packets` instead of measuring, once or in a loop.
-    pub fn repeating(settings: LdSettings, packets: Vec<[u8; LEN]>, looped: bool) -> LdSimulator {
-        LdSimulator::of(settings, Source::Recorded { packets, looped, passed_ms: 0 })
+    pub fn repeating(settings: LdSettings, packets: Vec<[u8; PACKET_LEN]>, looped: bool) -> LdSimulator {
+        LdSimulator::of(settings, Source::Recorded { packets, is_looped: looped, elapsed_ms: 0 })
     }
 
     fn of(settings: LdSettings, source: Source) -> LdSimulator {
-        let LdSettings { turns_per_second, wander, seed, .. } = settings;
+        let LdSettings { revolutions_per_second: turns_per_second, speed_variation: wander, seed, .. } =
+            settings;
         let rotation = Rotation::new(turns_per_second, wander, 0.0, seed);
         let tx_queue = TxQueue::new(settings.model.baud(), settings.chunk);
-        LdSimulator { settings, source, power_ns: 0, turns_ns: 0, sent: 0, rotation, tx_queue }
+        LdSimulator { settings, source, power_ns: 0, rotates_from_ns: 0, sent: 0, rotation, tx_queue }
     }
 
     /// Changes the speed from the next packet on. The caller has to simulate the inertia of a real head, whose speed differs
     /// by at most 5 % between two consecutive packets.
-    pub fn set_speed(&mut self, turns_per_second: f64) {
-        self.rotation.set_speed(self.seconds(self.sent * POINTS as u64), turns_per_second);
+    pub fn set_speed(&mut self, revolutions_per_second: f64) {
+        self.rotation.set_speed(self.seconds(self.sent * POINTS_PER_PACKET as u64), revolutions_per_second);
     }
 
     /// Returns the number of packets of a room since the head rotates, including the current one. Each has twelve points.
@@ -115,9 +118,9 @@ impl LdSimulator {
     /// Returns point number `point` since the head rotates, without noise. It must not be before the last
     /// [`set_speed`](Self::set_speed). A recording has no true points.
     pub fn truth(&mut self, point: u64) -> TruePoint {
-        let (at_ns, clockwise_deg) = self.place(point);
+        let (at_ns, clockwise_deg) = self.time_and_angle(point);
         let range_mm = match &mut self.source {
-            Source::Room(beams) => beams.measure(at_ns, ahead_deg(clockwise_deg)).exact_mm,
+            Source::Room(beams) => beams.measure(at_ns, counterclockwise_deg(clockwise_deg)).exact_mm,
             Source::Recorded { .. } => None,
         };
         TruePoint { at_ns, clockwise_deg, range_mm }
@@ -125,13 +128,13 @@ impl LdSimulator {
 
     /// Returns the clockwise angle of point number `point` from the head's zero, 0 to 360 degrees.
     pub fn clockwise_deg(&self, point: u64) -> f64 {
-        self.place(point).1
+        self.time_and_angle(point).1
     }
 
     /// Returns time and clockwise angle of point number `point`.
-    fn place(&self, point: u64) -> (Nanos, f64) {
+    fn time_and_angle(&self, point: u64) -> (Nanos, f64) {
         let seconds = self.seconds(point);
-        (self.turns_ns + (seconds * 1e9) as Nanos, self.rotation.turns(seconds).fract() * 360.0)
+        (self.rotates_from_ns + (seconds * 1e9) as Nanos, self.rotation.revolutions(seconds).fract() * 360.0)
     }
 
     /// Returns the time of point number `point`, in seconds since the head rotates.
@@ -141,58 +144,60 @@ impl LdSimulator {
 
     /// Restarts the scanner at `now`; packets follow after `boot_ns`. Returns whether a packet was broken off.
     fn restart(&mut self, now: Nanos, boot_ns: Nanos, spin_up_s: f64) -> bool {
-        let broken = self.tx_queue.break_off(now);
+        let broken = self.tx_queue.abort(now);
         self.power_ns = now;
-        self.turns_ns = now + boot_ns;
-        let LdSettings { turns_per_second, wander, seed, .. } = self.settings;
+        self.rotates_from_ns = now + boot_ns;
+        let LdSettings { revolutions_per_second: turns_per_second, speed_variation: wander, seed, .. } =
+            self.settings;
         (self.rotation, self.sent) = (Rotation::new(turns_per_second, wander, spin_up_s, seed), 0);
-        if let Source::Recorded { passed_ms, .. } = &mut self.source {
+        if let Source::Recorded { elapsed_ms: passed_ms, .. } = &mut self.source {
             *passed_ms = 0;
         }
         broken
     }
 
     /// Returns packet number `number` of a room.
-    fn measure(&mut self, number: u64) -> [u8; LEN] {
-        let first = number * POINTS as u64;
-        let places: [(Nanos, f64); POINTS] = std::array::from_fn(|i| self.place(first + i as u64));
+    fn measure(&mut self, number: u64) -> [u8; PACKET_LEN] {
+        let first = number * POINTS_PER_PACKET as u64;
+        let times_and_angles: [(Nanos, f64); POINTS_PER_PACKET] =
+            std::array::from_fn(|i| self.time_and_angle(first + i as u64));
         let model = self.settings.model;
-        let Source::Room(beams) = &mut self.source else { return [0; LEN] };
-        let points = places.map(|(at_ns, clockwise_deg)| {
-            let beam = beams.measure(at_ns, ahead_deg(clockwise_deg));
+        let Source::Room(beams) = &mut self.source else { return [0; PACKET_LEN] };
+        let points = times_and_angles.map(|(at_ns, clockwise_deg)| {
+            let beam = beams.measure(at_ns, counterclockwise_deg(clockwise_deg));
             match beam.range_mm.filter(|range_mm| reach_mm(model).contains(range_mm)) {
                 Some(range_mm) => (range_mm.round() as u16, beam.intensity),
                 None => (0, 0),
             }
         });
-        let hundredths = |degrees: f64| (degrees / 360.0 * f64::from(TURN)) as u16;
-        let (last_ns, last_deg) = places[POINTS - 1];
-        let millis = (last_ns - self.power_ns) / MILLIS % Nanos::from(CLOCK_TURN);
+        let hundredths = |degrees: f64| (degrees / 360.0 * f64::from(FULL_CIRCLE)) as u16;
+        let (last_ns, last_deg) = times_and_angles[POINTS_PER_PACKET - 1];
+        let millis = (last_ns - self.power_ns) / MILLIS % Nanos::from(CLOCK_PERIOD_MS);
         let speed = (360.0 * self.rotation.speed(self.seconds(first))).round() as u16;
-        let (start, end) = (hundredths(places[0].1), hundredths(last_deg));
-        Contents { speed, start, points, end, millis: millis as u16 }.encode()
+        let (start, end) = (hundredths(times_and_angles[0].1), hundredths(last_deg));
+        PacketContents { speed, start, points, end, millis: millis as u16 }.encode()
     }
 
     /// Returns the time at which packet number `number` is complete; `None` at the end of a recording.
     fn due_ns(&self, number: u64) -> Option<Nanos> {
         match &self.source {
-            Source::Room(_) => Some(self.place((number + 1) * POINTS as u64).0),
-            Source::Recorded { packets, looped, passed_ms } => {
+            Source::Room(_) => Some(self.time_and_angle((number + 1) * POINTS_PER_PACKET as u64).0),
+            Source::Recorded { packets, is_looped: looped, elapsed_ms: passed_ms } => {
                 let exists = (number as usize) < packets.len() || *looped && !packets.is_empty();
-                exists.then(|| (self.turns_ns + passed_ms * MILLIS).max(self.tx_queue.free_ns()))
+                exists.then(|| (self.rotates_from_ns + passed_ms * MILLIS).max(self.tx_queue.free_ns()))
             }
         }
     }
 
     /// Returns packet number `number`, which is sent now.
-    fn take(&mut self, number: u64) -> [u8; LEN] {
-        let Source::Recorded { packets, passed_ms, .. } = &mut self.source else {
+    fn take(&mut self, number: u64) -> [u8; PACKET_LEN] {
+        let Source::Recorded { packets, elapsed_ms: passed_ms, .. } = &mut self.source else {
             return self.measure(number);
         };
         let at = number as usize % packets.len();
         let millis = |at: usize| Packet::check(&packets[at]).map_or(0, |packet| packet.millis());
         let next = (at + 1) % packets.len();
-        let passed = (millis(next) + CLOCK_TURN - millis(at)) % CLOCK_TURN;
+        let passed = (millis(next) + CLOCK_PERIOD_MS - millis(at)) % CLOCK_PERIOD_MS;
         // The clock does not define the time from the last packet to the first.
         *passed_ms += if next == 0 { 1 } else { u64::from(passed.min(1_000)) };
         packets[at]
@@ -225,8 +230,8 @@ impl Device for LdSimulator {
         self.restart(now, RESTART_NS, 0.0)
     }
 
-    fn break_off(&mut self, now: Nanos) {
-        self.tx_queue.break_off(now);
+    fn abort(&mut self, now: Nanos) {
+        self.tx_queue.abort(now);
     }
 
     fn rate(&self) -> u32 {
@@ -238,7 +243,7 @@ impl Device for LdSimulator {
     }
 
     fn telegram_len(&self) -> Option<usize> {
-        Some(LEN)
+        Some(PACKET_LEN)
     }
 }
 
@@ -247,8 +252,8 @@ impl Device for LdSimulator {
 /// # Errors
 ///
 /// Returns [`Kind::Input`] if it cannot be read or has no packet, and the errors of [`Recording::of`].
-pub fn recorded(path: &Path, sensor: Option<&str>) -> Result<Vec<[u8; LEN]>, Failure> {
-    let whole = Recording::open_line(path, Some(Family::Ld))?;
+pub fn recorded_packets(path: &Path, sensor: Option<&str>) -> Result<Vec<[u8; PACKET_LEN]>, Failure> {
+    let whole = Recording::open_stream(path, Some(Family::Ld))?;
     let recording = sensor.map_or(Ok(whole.clone()), |sensor| whole.of(sensor))?;
     // Packets are sent unchanged, so the encoding is not used.
     let frames = recording.telegrams(Encoding { unit: Unit::Mm, mode: Mode(1) })?;

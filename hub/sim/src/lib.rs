@@ -4,7 +4,7 @@
 //!   time is an argument.
 //! - [`world`] describes their surroundings, [`room`] measures them and has the true values, and [`mount`] tilts a
 //!   scanner.
-//! - [`wire`] and [`fault`] simulate the line.
+//! - [`line_model`] and [`fault`] simulate the line.
 //! - [`port`] is the only file that reads a clock.
 //! - [`simulate()`] is the command.
 
@@ -12,6 +12,7 @@ pub mod beam;
 pub mod device;
 pub mod fault;
 pub mod ld;
+pub mod line_model;
 pub mod machine;
 pub mod mount;
 pub mod operating;
@@ -25,10 +26,9 @@ mod scene;
 mod shape;
 pub mod simulate;
 mod view;
-pub mod wire;
 pub mod world;
 
 pub use device::ChunkSize;
-pub use request_decoder::{Arrival, Dropped};
+pub use request_decoder::{Arrival, DroppedRequest};
 pub use shape::{Point, Shape};
-pub use simulate::{Event, Ready, simulate, simulate_with};
+pub use simulate::{Event, SimulatedPort, simulate, simulate_with};

@@ -1,5 +1,5 @@
 //! A simulated LMS, without I/O: bytes of the host and times go in, and chunks of bytes with the time of their
-//! transmission come out. It is driven as a [`Device`]; [`Source`] provides its measured values, and [`crate::wire`]
+//! transmission come out. It is driven as a [`Device`]; [`ScanSource`] provides its measured values, and [`crate::line_model`]
 //! damages the bytes later.
 //!
 //! It supports every request on the way to a stream, every mode that sends measured values, and the part of the
@@ -11,20 +11,20 @@ use std::collections::VecDeque;
 use std::ops::Range;
 
 use scanhub_drivers::lms::command::{self, EEPROM_WRITES, Password, Request};
-use scanhub_drivers::lms::configuration::{OLD_LEN, REAL_TIME_INDICES, factory};
-use scanhub_drivers::lms::family::Family;
+use scanhub_drivers::lms::configuration::{OLD_CONFIGURATION_LEN, REAL_TIME_INDICES, factory_configuration};
+use scanhub_drivers::lms::lms_model::LmsModel;
 use scanhub_drivers::lms::operating::Operating as Asked;
-use scanhub_drivers::lms::reply::{self, Health};
-use scanhub_drivers::lms::telegram::{ACK, Encoded, NAK, REPLY, Telegram, Writer};
-use scanhub_drivers::lms::variant::{Baud, MIRROR_TURN, Mode, Unit, Variant};
-use scanhub_lms_configure::eeprom::{self, PowerOn, Write};
+use scanhub_drivers::lms::reply::{self, SimulatedStatus};
+use scanhub_drivers::lms::telegram::{ACK, EncodedTelegram, NAK, REPLY, Telegram, Writer};
+use scanhub_drivers::lms::variant::{Baud, MIRROR_PERIOD, Mode, Unit, Variant};
+use scanhub_lms_configure::eeprom::{self, EepromWrite, PowerOn};
 use scanhub_schema::{MILLIS, Nanos};
 
-use crate::device::{Chunk, Device, Part, Sent};
+use crate::device::{Chunk, ChunkKind, Device, SentTelegram};
 use crate::device::{ChunkSize, Transmission};
-use crate::operating::Source;
-use crate::operating::{MeasuredValues, Operating};
-use crate::request_decoder::{Arrival, DecodedRequest, Dropped, RequestDecoder};
+use crate::operating::ScanSource;
+use crate::operating::{MeasuredValues, OperatingMode};
+use crate::request_decoder::{Arrival, DecodedRequest, DroppedRequest, RequestDecoder};
 
 /// A scanner at time 0: its type, its EEPROM, the state in which an earlier host left it, and the hardware at the
 /// host's end of its line.
@@ -49,7 +49,7 @@ pub struct Settings {
     /// Bytes of the configuration: 34, or 32 with older firmware.
     pub configuration_len: usize,
     /// State in which an earlier host left the scanner.
-    pub start: Start,
+    pub start: StartState,
     /// Time from power-on to the boot message 90h. A real scanner takes up to 60 s.
     pub boot_ns: Nanos,
     /// The byte that ends each reply: 10h for a healthy scanner, 11h after some events (Telegram listing 8).
@@ -82,7 +82,7 @@ impl Default for Settings {
             mode: Mode(1),
             availability: 0,
             configuration_len: 34,
-            start: Start::In(Operating::OnRequest),
+            start: StartState::Operating(OperatingMode::OnRequest),
             boot_ns: 2_000 * MILLIS,
             status: 0x10,
             errors: Vec::new(),
@@ -97,9 +97,9 @@ impl Default for Settings {
 
 /// State of a scanner at time 0.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Start {
+pub enum StartState {
     /// The start-up is complete, and the scanner is in this operating mode.
-    In(Operating),
+    Operating(OperatingMode),
     /// The power is switched on now. After a silence, the scanner sends the boot message.
     PowerOn,
 }
@@ -108,11 +108,11 @@ pub enum Start {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ProtocolQuirks {
     /// Share of the requests that the scanner overlooks while its mirror rotates.
-    pub overlooks: f64,
+    pub overlooked_share: f64,
     /// Share of the intact requests that the scanner answers with NAK.
-    pub naks: f64,
+    pub nak_share: f64,
     /// Share of the replies that the scanner sends twice.
-    pub doubles: f64,
+    pub doubled_share: f64,
     /// Additional delay of an ACK.
     pub late_acknowledge_ns: Nanos,
     /// Additional delay of a reply. It is sent even if the next request arrives before.
@@ -124,24 +124,24 @@ pub struct ProtocolQuirks {
     pub late_write_ns: Nanos,
     /// Whether the scanner refuses to measure in installation mode, with 92h. It must first enter the monitoring mode
     /// (Telegram listing 6.3.2; its table 7-1 allows measuring).
-    pub strict: bool,
+    pub is_strict: bool,
     /// Whether the scanner drops requests whose bytes arrive less than 55 us apart (Telegram listing 4.3). Most hosts
     /// ignore that limit.
-    pub strict_gap: bool,
+    pub checks_gaps: bool,
     /// Time from each ACK to the reply; 0 selects a random time as of real scanners.
-    pub answer_ns: Nanos,
+    pub reply_delay_ns: Nanos,
     /// Commands that the scanner refuses with 92h.
-    pub refuses: Vec<u8>,
+    pub refused_commands: Vec<u8>,
     /// Whether the scanner sends no replies. A stream continues.
-    pub mute: bool,
+    pub is_mute: bool,
 }
 
 /// A simulated LMS.
 pub struct LmsSimulator {
     pub(crate) settings: Settings,
-    pub(crate) source: Source,
+    pub(crate) source: ScanSource,
     eeprom: Eeprom,
-    pub(crate) operating: Operating,
+    pub(crate) operating: OperatingMode,
     pub(crate) variant: Variant,
     baud: Baud,
     decoder: RequestDecoder,
@@ -165,8 +165,8 @@ enum Tag {
     Scan,
     Reply {
         /// Whether the reply is sent even if another request arrives before.
-        late: bool,
-        after: After,
+        is_late: bool,
+        effect: ReplyEffect,
     },
 }
 
@@ -175,12 +175,12 @@ struct Reply {
     telegram: Vec<u8>,
     /// Minimum time from the ACK to the reply.
     delay_ns: Nanos,
-    after: After,
+    effect: ReplyEffect,
 }
 
 /// Action after a reply.
 #[derive(Clone, Copy, Debug)]
-enum After {
+enum ReplyEffect {
     Nothing,
     /// Changes the rate of the line.
     Baud(Baud),
@@ -190,13 +190,13 @@ enum After {
 
 impl LmsSimulator {
     /// Creates the scanner that `settings` describe, at time 0.
-    pub fn new(settings: Settings, source: Source) -> Self {
+    pub fn new(settings: Settings, source: ScanSource) -> Self {
         let mut machine = LmsSimulator {
             eeprom: Eeprom::new(&settings),
-            operating: Operating::OnRequest,
+            operating: OperatingMode::OnRequest,
             variant: settings.variant,
             baud: settings.baud,
-            decoder: RequestDecoder::new(settings.speed, settings.quirks.strict_gap),
+            decoder: RequestDecoder::new(settings.speed, settings.quirks.checks_gaps),
             random: fastrand::Rng::with_seed(settings.seed),
             quirks: fastrand::Rng::with_seed(!settings.seed),
             settings,
@@ -208,11 +208,11 @@ impl LmsSimulator {
             partials: 0,
         };
         match machine.settings.start.clone() {
-            Start::In(operating) => {
+            StartState::Operating(operating) => {
                 machine.next_scan_ns = operating.streams().then_some(0);
                 machine.operating = operating;
             }
-            Start::PowerOn => machine.boot(0),
+            StartState::PowerOn => machine.boot(0),
         }
         machine
     }
@@ -223,25 +223,26 @@ impl LmsSimulator {
     }
 
     /// Returns the present operating mode.
-    pub fn operating(&self) -> &Operating {
+    pub fn operating(&self) -> &OperatingMode {
         &self.operating
     }
 
     /// Changes the deviations from now on.
     pub fn set_quirks(&mut self, quirks: ProtocolQuirks) {
-        self.decoder.is_strict = quirks.strict_gap;
+        self.decoder.is_strict = quirks.checks_gaps;
         self.settings.quirks = quirks;
     }
 
     /// Returns a telegram of measured values for a scanner in `operating`, with a scan that ended at `at_ns`.
-    fn measure(&mut self, operating: &Operating, at_ns: Nanos) -> Option<Vec<u8>> {
+    fn measure(&mut self, operating: &OperatingMode, at_ns: Nanos) -> Option<Vec<u8>> {
         let (variant, unit, mode) = (self.variant, self.eeprom.unit(), self.eeprom.mode());
         let Settings { address, status, .. } = self.settings;
         let index = self.eeprom.has_indices().then_some(self.scans as u8);
-        let turn = self.partials;
+        let revolution = self.partials;
         self.scans += 1;
-        self.partials += u64::from(*operating == Operating::Partial);
-        let shot = |room| MeasuredValues { room, variant, unit, mode, at_ns, address, status, index, turn };
+        self.partials += u64::from(*operating == OperatingMode::Partial);
+        let shot =
+            |room| MeasuredValues { room, variant, unit, mode, at_ns, address, status, index, revolution };
         self.source.telegram(operating, shot)
     }
 
@@ -258,26 +259,26 @@ impl LmsSimulator {
     }
 
     /// Removes the finished transmission from the queue, and carries out the action after it.
-    fn finish_front(&mut self, part: Part) -> Part {
+    fn finish_front(&mut self, part: ChunkKind) -> ChunkKind {
         let Some(front) = self.queue.pop_front() else { return part };
-        let (end_ns, aborted) = (front.end_ns(), front.is_broken());
+        let (end_ns, aborted) = (front.end_ns(), front.is_aborted());
         match front.tag {
-            Tag::Reply { after: After::Baud(baud), .. } => self.baud = baud,
-            Tag::Reply { after: After::Reset, .. } => self.boot(end_ns + RESET_NS),
+            Tag::Reply { effect: ReplyEffect::Baud(baud), .. } => self.baud = baud,
+            Tag::Reply { effect: ReplyEffect::Reset, .. } => self.boot(end_ns + RESET_NS),
             _ => {}
         }
         if let Some(next) = self.queue.front_mut() {
             next.start_no_earlier(end_ns);
         } else if self.operating.streams() && (aborted || !matches!(front.tag, Tag::Scan)) {
             // The stream continues with a complete scan, when the mirror starts one.
-            let scan_ns = self.operating.turns(self.variant) * MIRROR_TURN;
+            let scan_ns = self.operating.revolutions(self.variant) * MIRROR_PERIOD;
             self.next_scan_ns = Some(end_ns.next_multiple_of(scan_ns));
         }
         let (telegram, tag) = front.into_parts();
         match tag {
             Tag::Acknowledge => part,
             Tag::Scan | Tag::Reply { .. } => {
-                Part::End(Sent { is_reply: matches!(tag, Tag::Reply { .. }), telegram, aborted })
+                ChunkKind::End(SentTelegram { is_reply: matches!(tag, Tag::Reply { .. }), telegram, aborted })
             }
         }
     }
@@ -289,36 +290,40 @@ impl LmsSimulator {
         let mut is_first = true;
         self.queue.retain(|transmission| {
             let on_line = std::mem::take(&mut is_first) && transmission.start_ns() <= now;
-            on_line || matches!(transmission.tag, Tag::Reply { late: true, .. })
+            on_line || matches!(transmission.tag, Tag::Reply { is_late: true, .. })
         });
         let Some(front) = self.queue.front_mut().filter(|front| front.start_ns() <= now) else { return now };
-        front.break_off(now);
+        front.abort(now);
         front.end_ns().max(now)
     }
 
     /// Begins a start-up at `now`. The boot message is the first transmission.
     fn boot(&mut self, now: Nanos) {
         self.next_scan_ns = None;
-        self.operating = Operating::OnRequest;
+        self.operating = OperatingMode::OnRequest;
         self.variant = self.settings.variant;
         self.baud = self.eeprom.power_on_baud();
         self.scans = 0;
         self.partials = 0;
         self.started_ns = now + self.settings.boot_ns;
-        self.decoder = RequestDecoder::new(self.settings.speed, self.settings.quirks.strict_gap);
-        self.send(self.boot_message(), self.started_ns, Tag::Reply { late: false, after: After::Nothing });
+        self.decoder = RequestDecoder::new(self.settings.speed, self.settings.quirks.checks_gaps);
+        self.send(
+            self.boot_message(),
+            self.started_ns,
+            Tag::Reply { is_late: false, effect: ReplyEffect::Nothing },
+        );
     }
 
     /// Queues `bytes` from `start_ns` on, before transmissions that start later. Returns the end of the last byte.
     fn send(&mut self, bytes: Vec<u8>, start_ns: Nanos, tag: Tag) -> Nanos {
         let transmission = Transmission::new(bytes, start_ns, self.baud.rate(), self.settings.chunk, tag);
         let end_ns = transmission.end_ns();
-        let place = self.queue.partition_point(|other| other.start_ns() <= start_ns);
-        self.queue.insert(place, transmission);
+        let index = self.queue.partition_point(|other| other.start_ns() <= start_ns);
+        self.queue.insert(index, transmission);
         end_ns
     }
 
-    fn chance(&mut self, share: f64) -> bool {
+    fn draw(&mut self, share: f64) -> bool {
         share > 0.0 && self.quirks.f64() < share
     }
 
@@ -328,54 +333,59 @@ impl LmsSimulator {
     }
 
     /// Carries out `request` at `now`, and returns the reply.
-    fn answer(&mut self, request: Telegram<'_>, now: Nanos) -> Reply {
+    fn reply_to(&mut self, request: Telegram<'_>, now: Nanos) -> Reply {
         if EEPROM_WRITES.contains(&request.command()) {
             self.eeprom.writes += 1;
         }
         let command = request.command();
-        let is_refused = self.settings.quirks.refuses.contains(&command);
+        let is_refused = self.settings.quirks.refused_commands.contains(&command);
         if is_refused || self.family().and_then(|family| family.refuses_command(command)).is_some() {
             return self.refusal();
         }
         let (address, status) = (self.settings.address, self.settings.status);
         match Request::decode(request) {
-            Some(Request::Status) => answer(&self.status(), self.thinking_ns()),
-            Some(Request::Type) => {
-                answer(&reply::kind(address, self.settings.type_name.as_bytes(), status), self.thinking_ns())
-            }
+            Some(Request::Status) => delayed_reply(&self.status(), self.reply_delay_ns()),
+            Some(Request::Type) => delayed_reply(
+                &reply::type_reply(address, self.settings.type_name.as_bytes(), status),
+                self.reply_delay_ns(),
+            ),
             Some(Request::Configuration) => {
                 let reply = self.reply(command::CONFIGURATION | REPLY, self.eeprom.configuration());
-                answer(&reply, self.thinking_ns())
+                delayed_reply(&reply, self.reply_delay_ns())
             }
             Some(Request::Errors) => {
                 let pairs: Vec<u8> =
                     self.settings.errors.iter().flat_map(|&(kind, number)| [kind, number]).collect();
-                answer(&self.reply(command::ERRORS | REPLY, &pairs), self.thinking_ns())
+                delayed_reply(&self.reply(command::ERRORS | REPLY, &pairs), self.reply_delay_ns())
             }
             Some(Request::Counters) => self.counters(),
             Some(Request::Reset) => {
                 self.settings.errors.clear();
                 let announced = self.reply(reply::RESET, &[]);
-                Reply { after: After::Reset, ..answer(&announced, self.thinking_ns()) }
+                Reply { effect: ReplyEffect::Reset, ..delayed_reply(&announced, self.reply_delay_ns()) }
             }
             Some(Request::Variant(variant)) => {
-                let done = self.source.variant().is_none_or(|fixed| fixed == variant) && self.can(variant);
+                let done =
+                    self.source.variant().is_none_or(|fixed| fixed == variant) && self.supports(variant);
                 if done {
                     self.variant = variant;
                 }
-                answer(&reply::variant(address, done, self.variant, status), self.mode_ns())
+                delayed_reply(
+                    &reply::variant_reply(address, done, self.variant, status),
+                    self.mode_delay_ns(),
+                )
             }
             Some(Request::Baud(baud)) => {
-                let changed = reply::mode(address, true, status);
-                Reply { after: After::Baud(baud), ..answer(&changed, self.mode_ns()) }
+                let changed = reply::mode_reply(address, true, status);
+                Reply { effect: ReplyEffect::Baud(baud), ..delayed_reply(&changed, self.mode_delay_ns()) }
             }
             Some(Request::Operate(Asked::Installation(password))) => match password {
-                Password::FACTORY => self.change_mode(Operating::Installation),
-                _ => answer(&reply::mode(address, false, status), self.mode_ns()),
+                Password::FACTORY => self.change_mode(OperatingMode::Installation),
+                _ => delayed_reply(&reply::mode_reply(address, false, status), self.mode_delay_ns()),
             },
-            Some(asked) => match Operating::of_request(asked, self.variant) {
-                Some(operating) if self.source.can(&operating) && self.may(&operating) => {
-                    if asked.command() == command::MODE {
+            Some(mode_request) => match OperatingMode::of_request(mode_request, self.variant) {
+                Some(operating) if self.source.supports(&operating) && self.can_start(&operating) => {
+                    if mode_request.command() == command::MODE {
                         self.change_mode(operating)
                     } else {
                         self.measure_once(&operating, now)
@@ -383,7 +393,7 @@ impl LmsSimulator {
                 }
                 _ => self.refusal(),
             },
-            None => self.answer_other(request),
+            None => self.reply_to_other(request),
         }
     }
 
@@ -393,23 +403,26 @@ impl LmsSimulator {
     }
 
     /// Carries out a request that writes the EEPROM, or that [`Request`] does not decode.
-    fn answer_other(&mut self, request: Telegram<'_>) -> Reply {
+    fn reply_to_other(&mut self, request: Telegram<'_>) -> Reply {
         let (address, status) = (self.settings.address, self.settings.status);
-        let is_installation = self.operating == Operating::Installation;
-        match Write::decode(request) {
-            Some(Write::Configuration(data)) if is_installation => return self.write_configuration(data),
-            Some(Write::PowerOn(set @ (PowerOn::Baud9600 | PowerOn::KeepBaud))) if is_installation => {
+        let is_installation = self.operating == OperatingMode::Installation;
+        match EepromWrite::decode(request) {
+            Some(EepromWrite::Configuration(data)) if is_installation => {
+                return self.write_configuration(data);
+            }
+            Some(EepromWrite::PowerOn(set @ (PowerOn::Baud9600 | PowerOn::KeepBaud))) if is_installation => {
                 self.eeprom.permanent_baud = (set == PowerOn::KeepBaud).then(|| self.baud());
                 let done = self.reply(eeprom::POWER_ON_RATE | REPLY, &[0, set.byte()]);
-                return answer(&done, self.write_ns(false));
+                return delayed_reply(&done, self.write_delay_ns(false));
             }
             _ => {}
         }
         match (request.command(), request.data()) {
             // An invalid variant.
-            (command::VARIANT, [_, _, _, _]) => {
-                answer(&reply::variant(address, false, self.variant, status), self.mode_ns())
-            }
+            (command::VARIANT, [_, _, _, _]) => delayed_reply(
+                &reply::variant_reply(address, false, self.variant, status),
+                self.mode_delay_ns(),
+            ),
             // The listing allows a word without a meaning.
             (command::COUNTERS, [0, 0]) => self.counters(),
             _ => self.refusal(),
@@ -417,43 +430,46 @@ impl LmsSimulator {
     }
 
     fn counters(&mut self) -> Reply {
-        answer(&self.reply(command::COUNTERS | REPLY, &COUNTED), self.thinking_ns())
+        delayed_reply(&self.reply(command::COUNTERS | REPLY, &OPERATING_COUNTERS), self.reply_delay_ns())
     }
 
-    fn measure_once(&mut self, operating: &Operating, now: Nanos) -> Reply {
-        let delay_ns = operating.turns(self.variant) * MIRROR_TURN;
+    fn measure_once(&mut self, operating: &OperatingMode, now: Nanos) -> Reply {
+        let delay_ns = operating.revolutions(self.variant) * MIRROR_PERIOD;
         let single =
             self.source.variant().is_none().then(|| self.measure(operating, now + delay_ns)).flatten();
         match single {
-            Some(telegram) => Reply { telegram, delay_ns, after: After::Nothing },
+            Some(telegram) => Reply { telegram, delay_ns, effect: ReplyEffect::Nothing },
             None => self.refusal(),
         }
     }
 
-    fn change_mode(&mut self, operating: Operating) -> Reply {
+    fn change_mode(&mut self, operating: OperatingMode) -> Reply {
         self.operating = operating;
         self.partials = 0;
-        answer(&reply::mode(self.settings.address, true, self.settings.status), self.mode_ns())
+        delayed_reply(
+            &reply::mode_reply(self.settings.address, true, self.settings.status),
+            self.mode_delay_ns(),
+        )
     }
 
     /// Writes the configuration (77h in installation mode), as many bytes as `data` has. Unit and mode of a recording
     /// cannot change.
     fn write_configuration(&mut self, data: &[u8]) -> Reply {
         let (unit, mode) = (self.eeprom.unit(), self.eeprom.mode());
-        let written = self.eeprom.rewritten(data).filter(|written| {
-            self.source.variant().is_none() || (written.unit() == unit && written.mode() == mode)
+        let eeprom = self.eeprom.with_configuration(data).filter(|eeprom| {
+            self.source.variant().is_none() || (eeprom.unit() == unit && eeprom.mode() == mode)
         });
-        let done = written.is_some();
-        self.eeprom = written.unwrap_or_else(|| self.eeprom.clone());
-        let delay_ns = self.write_ns(self.eeprom.unit() != unit);
+        let done = eeprom.is_some();
+        self.eeprom = eeprom.unwrap_or_else(|| self.eeprom.clone());
+        let delay_ns = self.write_delay_ns(self.eeprom.unit() != unit);
         let outcome = [&[u8::from(done)], self.eeprom.configuration()].concat();
-        answer(&self.reply(eeprom::CONFIGURATION | REPLY, &outcome), delay_ns)
+        delayed_reply(&self.reply(eeprom::CONFIGURATION | REPLY, &outcome), delay_ns)
     }
 
     /// Returns the status B1h: that of a healthy scanner, with the settings and the errors of this one.
-    fn status(&self) -> Encoded {
+    fn status(&self) -> EncodedTelegram {
         let firmware = self.settings.type_name.rsplit(';').next().unwrap_or_default().as_bytes();
-        let health = Health {
+        let health = SimulatedStatus {
             software: std::array::from_fn(|at| firmware.get(at).copied().unwrap_or(b' ')),
             operating_mode: self.operating.code(),
             mode: self.eeprom.mode(),
@@ -461,12 +477,12 @@ impl LmsSimulator {
             unit: self.eeprom.unit(),
             baud: self.baud(),
         };
-        let healthy = reply::status(self.settings.address, &health, self.settings.status);
+        let healthy = reply::status_reply(self.settings.address, &health, self.settings.status);
         let mut data = healthy.telegram().data().to_vec();
         // Offsets in the data of B1h, which begin after the command byte (Telegram listing 7-5).
-        data[8] = u8::from(self.settings.errors.iter().any(|&(kind, _)| kind == FATAL));
-        let pollution = POLLUTION_CLEAN / 100 * self.settings.pollution_percent;
-        for (at, words, value) in [(18, 12, pollution), (42, 12, POLLUTION_CLEAN)] {
+        data[8] = u8::from(self.settings.errors.iter().any(|&(kind, _)| kind == FATAL_ERROR));
+        let pollution = CLEAN_POLLUTION / 100 * self.settings.pollution_percent;
+        for (at, words, value) in [(18, 12, pollution), (42, 12, CLEAN_POLLUTION)] {
             data[at..at + 2 * words].copy_from_slice(&value.to_le_bytes().repeat(words));
         }
         data[118] = u8::from(self.eeprom.permanent_baud.is_some());
@@ -475,47 +491,47 @@ impl LmsSimulator {
     }
 
     /// Returns the time from ACK to reply if nothing changes.
-    fn thinking_ns(&mut self) -> Nanos {
-        self.delay_ns(THINKING_NS)
+    fn reply_delay_ns(&mut self) -> Nanos {
+        self.quirk_delay_ns(REPLY_DELAY_NS)
     }
 
     /// Returns the time from ACK to A0h or BBh.
-    fn mode_ns(&mut self) -> Nanos {
-        self.delay_ns(MODE_NS) + self.settings.quirks.late_mode_ns
+    fn mode_delay_ns(&mut self) -> Nanos {
+        self.quirk_delay_ns(MODE_CHANGE_NS) + self.settings.quirks.late_mode_ns
     }
 
-    fn delay_ns(&mut self, usual: Range<Nanos>) -> Nanos {
+    fn quirk_delay_ns(&mut self, usual: Range<Nanos>) -> Nanos {
         let random_ns = self.random.u64(usual);
-        match self.settings.quirks.answer_ns {
+        match self.settings.quirks.reply_delay_ns {
             0 => random_ns,
             answer_ns => answer_ns,
         }
     }
 
     /// Returns the time from ACK to F7h or E6h.
-    fn write_ns(&self, is_other_unit: bool) -> Nanos {
-        let usual_ns = if is_other_unit { UNIT_NS } else { SAME_NS };
+    fn write_delay_ns(&self, is_other_unit: bool) -> Nanos {
+        let usual_ns = if is_other_unit { UNIT_CHANGE_NS } else { WRITE_NS };
         usual_ns + self.settings.quirks.late_write_ns
     }
 
-    fn may(&self, operating: &Operating) -> bool {
+    fn can_start(&self, operating: &OperatingMode) -> bool {
         let is_measuring = operating.streams();
-        !(self.settings.quirks.strict && is_measuring) || self.operating != Operating::Installation
+        !(self.settings.quirks.is_strict && is_measuring) || self.operating != OperatingMode::Installation
     }
 
-    fn family(&self) -> Option<Family> {
-        Family::of_type(self.settings.type_name.as_bytes())
+    fn family(&self) -> Option<LmsModel> {
+        LmsModel::of_type(self.settings.type_name.as_bytes())
     }
 
-    fn can(&self, variant: Variant) -> bool {
+    fn supports(&self, variant: Variant) -> bool {
         self.family().and_then(|family| family.refuses_variant(variant)).is_none()
     }
 
     fn refusal(&mut self) -> Reply {
-        answer(&reply::refused(self.settings.address, self.settings.status), self.thinking_ns())
+        delayed_reply(&reply::refusal(self.settings.address, self.settings.status), self.reply_delay_ns())
     }
 
-    fn reply(&self, command: u8, data: &[u8]) -> Encoded {
+    fn reply(&self, command: u8, data: &[u8]) -> EncodedTelegram {
         Writer::new(self.reply_address(), command).slice(data).byte(self.settings.status).finish()
     }
 }
@@ -530,8 +546,8 @@ impl Device for LmsSimulator {
         let (bytes, idle_after) = front.take_chunk(now)?;
         let bytes = bytes.to_vec();
         let part = match front.tag {
-            Tag::Acknowledge => Part::Acknowledge,
-            Tag::Scan | Tag::Reply { .. } => Part::Telegram,
+            Tag::Acknowledge => ChunkKind::Acknowledge,
+            Tag::Scan | Tag::Reply { .. } => ChunkKind::Telegram,
         };
         let part = if front.is_done() { self.finish_front(part) } else { part };
         Some(Chunk { bytes, rate, idle_after, part })
@@ -549,26 +565,26 @@ impl Device for LmsSimulator {
             return;
         };
         let is_mine = bytes[1] == 0 || bytes[1] == self.settings.address;
-        if !is_mine || self.settings.quirks.mute || self.chance(self.settings.quirks.overlooks) {
+        if !is_mine || self.settings.quirks.is_mute || self.draw(self.settings.quirks.overlooked_share) {
             return;
         }
         let free_ns = self.interrupt(at);
         let late_ns = self.settings.quirks.late_acknowledge_ns;
         let first_ns = free_ns + late_ns + self.random.u64(2 * MILLIS..8 * MILLIS);
-        let request = Telegram::check(&bytes).filter(|_| !self.chance(self.settings.quirks.naks));
+        let request = Telegram::check(&bytes).filter(|_| !self.draw(self.settings.quirks.nak_share));
         let Some(request) = request else {
             self.send(vec![NAK], first_ns, Tag::Acknowledge);
             return;
         };
-        let Reply { telegram: reply, delay_ns, after } = self.answer(request, first_ns);
+        let Reply { telegram: reply, delay_ns, effect: after } = self.reply_to(request, first_ns);
         let acknowledged_ns = self.send(vec![ACK], first_ns, Tag::Acknowledge);
         let late_ns = self.settings.quirks.late_reply_ns;
         let reply_ns = acknowledged_ns + delay_ns + late_ns;
         let late = late_ns > 0;
-        let end_ns = self.send(reply.clone(), reply_ns, Tag::Reply { late, after });
-        if self.chance(self.settings.quirks.doubles) {
+        let end_ns = self.send(reply.clone(), reply_ns, Tag::Reply { is_late: late, effect: after });
+        if self.draw(self.settings.quirks.doubled_share) {
             let again_ns = end_ns + self.quirks.u64(..20 * MILLIS);
-            self.send(reply, again_ns, Tag::Reply { late, after: After::Nothing });
+            self.send(reply, again_ns, Tag::Reply { is_late: late, effect: ReplyEffect::Nothing });
         }
     }
 
@@ -580,10 +596,10 @@ impl Device for LmsSimulator {
         self.queue.truncate(1);
         let mut broken = false;
         if let Some(front) = self.queue.front_mut() {
-            front.break_off(now);
-            broken = front.is_broken();
-            if let Tag::Reply { after, .. } = &mut front.tag {
-                *after = After::Nothing;
+            front.abort(now);
+            broken = front.is_aborted();
+            if let Tag::Reply { effect: after, .. } = &mut front.tag {
+                *after = ReplyEffect::Nothing;
             }
         }
         self.boot(now);
@@ -592,7 +608,7 @@ impl Device for LmsSimulator {
 
     /// Breaks off the current transmission, as if for a request that the scanner then ignored. A stream continues with
     /// a complete scan.
-    fn break_off(&mut self, now: Nanos) {
+    fn abort(&mut self, now: Nanos) {
         if self.queue.front().is_some_and(|front| front.start_ns() <= now) {
             self.interrupt(now);
         }
@@ -603,7 +619,7 @@ impl Device for LmsSimulator {
         self.eeprom.writes
     }
 
-    fn take_dropped(&mut self) -> Option<Dropped> {
+    fn take_dropped(&mut self) -> Option<DroppedRequest> {
         self.decoder.take_dropped()
     }
 
@@ -616,8 +632,8 @@ impl Device for LmsSimulator {
     }
 }
 
-fn answer(reply: &Encoded, delay_ns: Nanos) -> Reply {
-    Reply { telegram: reply.bytes().to_vec(), delay_ns, after: After::Nothing }
+fn delayed_reply(reply: &EncodedTelegram, delay_ns: Nanos) -> Reply {
+    Reply { telegram: reply.bytes().to_vec(), delay_ns, effect: ReplyEffect::Nothing }
 }
 
 /// The part of the EEPROM that the simulation uses. It outlives a power cycle.
@@ -634,9 +650,9 @@ struct Eeprom {
 impl Eeprom {
     /// Creates an EEPROM with factory settings, except those in `settings` (Telegram listing, 77h).
     fn new(settings: &Settings) -> Eeprom {
-        let mut configuration = factory(settings.mode, settings.unit).to_vec();
+        let mut configuration = factory_configuration(settings.mode, settings.unit).to_vec();
         configuration[AVAILABILITY] = settings.availability;
-        configuration.truncate(settings.configuration_len.max(OLD_LEN));
+        configuration.truncate(settings.configuration_len.max(OLD_CONFIGURATION_LEN));
         Eeprom { configuration, permanent_baud: settings.permanent_baud, writes: 0 }
     }
 
@@ -650,7 +666,7 @@ impl Eeprom {
     }
 
     fn unit(&self) -> Unit {
-        // `rewritten` accepts only known units.
+        // `with_configuration` accepts only known units.
         Unit::of_code(self.configuration[UNIT]).unwrap_or(Unit::Mm)
     }
 
@@ -665,32 +681,33 @@ impl Eeprom {
 
     /// Returns the EEPROM with `data` as the leading bytes of its configuration, without excess bytes. Returns `None`
     /// if a scanner does not accept these settings.
-    fn rewritten(&self, data: &[u8]) -> Option<Eeprom> {
-        let mut written = self.clone();
+    fn with_configuration(&self, data: &[u8]) -> Option<Eeprom> {
+        let mut eeprom = self.clone();
         let len = data.len().min(self.configuration.len());
-        written.configuration[..len].copy_from_slice(&data[..len]);
-        let known = MODES.contains(&written.mode().0) && Unit::of_code(written.configuration[UNIT]).is_some();
-        known.then_some(written)
+        eeprom.configuration[..len].copy_from_slice(&data[..len]);
+        let is_known =
+            MODES.contains(&eeprom.mode().0) && Unit::of_code(eeprom.configuration[UNIT]).is_some();
+        is_known.then_some(eeprom)
     }
 }
 
 /// Time from 91h to the announced reset (Telegram listing, 10h).
 const RESET_NS: Nanos = 10 * MILLIS;
 /// Type of a present fatal error.
-const FATAL: u8 = 4;
+const FATAL_ERROR: u8 = 4;
 /// Counters of a scanner that is some years old: hours (unit 2 h) and power-ons.
-const COUNTED: [u8; 4] = [0x10, 0x27, 0x2C, 0x01];
+const OPERATING_COUNTERS: [u8; 4] = [0x10, 0x27, 0x2C, 0x01];
 /// Reading of the pollution sensors of a clean window. Only the ratio to it matters.
-const POLLUTION_CLEAN: u16 = 1_000;
+const CLEAN_POLLUTION: u16 = 1_000;
 /// Time from ACK to reply if nothing changes. Captured exchanges took 70 to 158 ms at 38400. Request and reply took 10
 /// to 45 ms of this time.
-const THINKING_NS: Range<Nanos> = 55 * MILLIS..145 * MILLIS;
+const REPLY_DELAY_NS: Range<Nanos> = 55 * MILLIS..145 * MILLIS;
 /// Time from ACK to A0h or BBh. Captured exchanges took 66 to 94 ms; the listing allows 3 s.
-const MODE_NS: Range<Nanos> = 55 * MILLIS..85 * MILLIS;
+const MODE_CHANGE_NS: Range<Nanos> = 55 * MILLIS..85 * MILLIS;
 /// Time from ACK to F7h. A captured exchange took 130 ms.
-const SAME_NS: Nanos = 110 * MILLIS;
+const WRITE_NS: Nanos = 110 * MILLIS;
 /// Time from ACK to F7h if the unit changes. SICK's quick manual allows 7 s.
-const UNIT_NS: Nanos = 1_000 * MILLIS;
+const UNIT_CHANGE_NS: Nanos = 1_000 * MILLIS;
 /// Indices in the configuration (Telegram listing, 77h).
 const AVAILABILITY: usize = 4;
 const MODE: usize = 5;

@@ -44,19 +44,19 @@ pub struct Fault {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum FaultKind {
     /// The motor stops, and the encoder reports it. Afterwards the motion continues.
-    Halts,
+    Halt,
     /// The encoder sends no reports.
-    Silent,
+    Silence,
     /// The encoder reports a constant angle, while the mount swings.
     Stuck,
     /// The encoder is suddenly off by this number of degrees.
-    Jumps(f64),
+    Jump(f64),
     /// The error of the encoder grows to this number of degrees at 2 degrees per second, and shrinks again.
-    Lies(f64),
+    Drift(f64),
     /// Reports arrive this number of seconds later, with correct stamps.
-    Late(f64),
+    Delay(f64),
     /// The stamps are this many seconds later than the angles; earlier if negative.
-    StampsLate(f64),
+    StampDelay(f64),
 }
 
 /// A report of the encoder.
@@ -65,7 +65,7 @@ pub struct Report {
     /// Time of the angle.
     pub stamp_ns: Nanos,
     /// Time at which the report arrives.
-    pub arrives_ns: Nanos,
+    pub arrival_ns: Nanos,
     /// Angle in radians.
     pub angle_rad: f64,
     /// Change of the angle in radians per second.
@@ -92,15 +92,15 @@ impl Encoder {
     pub(crate) fn poll(&mut self, now_ns: Nanos) -> Option<Report> {
         while self.next_report_ns() <= now_ns {
             self.pending.extend(self.mount.report(self.number));
-            self.pending.sort_by_key(|report| Reverse(report.arrives_ns));
+            self.pending.sort_by_key(|report| Reverse(report.arrival_ns));
             self.number += 1;
         }
-        self.pending.pop_if(|report| report.arrives_ns <= now_ns)
+        self.pending.pop_if(|report| report.arrival_ns <= now_ns)
     }
 
     /// Returns the time of the next poll.
     pub(crate) fn poll_timeout(&self) -> Nanos {
-        let arrives_ns = self.pending.last().map_or(Nanos::MAX, |report| report.arrives_ns);
+        let arrives_ns = self.pending.last().map_or(Nanos::MAX, |report| report.arrival_ns);
         arrives_ns.min(self.next_report_ns())
     }
 
@@ -121,27 +121,27 @@ impl Mount {
         let mut at_s = time_s;
         let mut off_deg = 0.0;
         let (mut late_s, mut stamp_s) = (0.0, time_s);
-        for fault in self.faults.iter().filter(|fault| fault.is_on(time_s)) {
+        for fault in self.faults.iter().filter(|fault| fault.is_active(time_s)) {
             match fault.kind {
-                FaultKind::Halts => {}
-                FaultKind::Silent => return None,
+                FaultKind::Halt => {}
+                FaultKind::Silence => return None,
                 FaultKind::Stuck => at_s = fault.from_s,
-                FaultKind::Jumps(by_deg) => off_deg += by_deg,
-                FaultKind::Lies(by_deg) => {
+                FaultKind::Jump(by_deg) => off_deg += by_deg,
+                FaultKind::Drift(by_deg) => {
                     let edge_s = (time_s - fault.from_s).min(fault.until_s - time_s);
-                    off_deg += by_deg.signum() * (LIE_DEG_S * edge_s).min(by_deg.abs());
+                    off_deg += by_deg.signum() * (DRIFT_DEG_S * edge_s).min(by_deg.abs());
                 }
-                FaultKind::Late(by_s) => late_s += by_s,
-                FaultKind::StampsLate(by_s) => stamp_s += by_s,
+                FaultKind::Delay(by_s) => late_s += by_s,
+                FaultKind::StampDelay(by_s) => stamp_s += by_s,
             }
         }
-        let stands = at_s != time_s || self.faults.iter().any(|fault| fault.halts(time_s));
-        let rate_deg_s = if stands { 0.0 } else { self.deg_s * self.direction(time_s) };
+        let is_stopped = at_s != time_s || self.faults.iter().any(|fault| fault.is_halting(time_s));
+        let rate_deg_s = if is_stopped { 0.0 } else { self.deg_s * self.direction(time_s) };
         let nanos = |time_s: f64| (time_s * 1e9).round() as Nanos;
         Some(Report {
             stamp_ns: nanos(stamp_s),
             // A program that stamps an angle at its arrival stamps it late.
-            arrives_ns: nanos(stamp_s.max(time_s) + late_s),
+            arrival_ns: nanos(stamp_s.max(time_s) + late_s),
             angle_rad: (self.angle_deg(at_s) + off_deg).to_radians(),
             rate_rad_s: rate_deg_s / 180.0 * PI,
         })
@@ -168,24 +168,24 @@ impl Mount {
 
     /// Returns the degrees since the mount was at `from_deg` last.
     fn travel_deg(&self, time_s: f64) -> f64 {
-        let stood = self.faults.iter().filter(|fault| fault.kind == FaultKind::Halts);
-        let stood_s: f64 = stood.map(|fault| (time_s.min(fault.until_s) - fault.from_s).max(0.0)).sum();
-        (self.deg_s * (time_s - stood_s)).rem_euclid(2.0 * (self.to_deg - self.from_deg))
+        let halts = self.faults.iter().filter(|fault| fault.kind == FaultKind::Halt);
+        let halted_s: f64 = halts.map(|fault| (time_s.min(fault.until_s) - fault.from_s).max(0.0)).sum();
+        (self.deg_s * (time_s - halted_s)).rem_euclid(2.0 * (self.to_deg - self.from_deg))
     }
 }
 
 impl Fault {
-    fn is_on(&self, time_s: f64) -> bool {
+    fn is_active(&self, time_s: f64) -> bool {
         (self.from_s..self.until_s).contains(&time_s)
     }
 
-    fn halts(&self, time_s: f64) -> bool {
-        self.kind == FaultKind::Halts && self.is_on(time_s)
+    fn is_halting(&self, time_s: f64) -> bool {
+        self.kind == FaultKind::Halt && self.is_active(time_s)
     }
 }
 
-/// Speed at which the error of [`FaultKind::Lies`] grows, in degrees per second. No step of it differs from the mount's motion.
-const LIE_DEG_S: f64 = 2.0;
+/// Speed at which the error of [`FaultKind::Drift`] grows, in degrees per second. No step of it differs from the mount's motion.
+const DRIFT_DEG_S: f64 = 2.0;
 
 #[cfg(test)]
 mod tests {
@@ -211,7 +211,7 @@ mod tests {
     fn it_swings_to_and_fro_and_stands_while_it_halts() {
         let swings = mount(&[]);
         assert_eq!([0.0, 1.0, 2.0, 3.0, 4.0].map(|s| deg(&swings, s)), [-10.0, 20.0, 50.0, 20.0, -10.0]);
-        let halted = mount(&[Fault { kind: FaultKind::Halts, from_s: 1.0, until_s: 5.0 }]);
+        let halted = mount(&[Fault { kind: FaultKind::Halt, from_s: 1.0, until_s: 5.0 }]);
         assert_eq!([1.0, 3.0, 5.0, 6.0].map(|s| deg(&halted, s)), [20.0, 20.0, 20.0, 50.0]);
         let report = halted.report(300).expect("it says so");
         assert_eq!((report.angle_rad.to_degrees().round(), report.rate_rad_s), (20.0, 0.0));
@@ -219,7 +219,7 @@ mod tests {
 
     #[test]
     fn reports_come_when_they_arrive() {
-        let late = Fault { kind: FaultKind::Late(0.015), from_s: 0.01, until_s: 0.02 };
+        let late = Fault { kind: FaultKind::Delay(0.015), from_s: 0.01, until_s: 0.02 };
         let mut encoder = Encoder::new(mount(&[late]));
         let mut come = Vec::new();
         for ms in 0..50 {
@@ -235,24 +235,27 @@ mod tests {
     }
 
     #[test]
-    fn the_encoder_says_what_is_so_but_for_its_faults() {
-        let says =
+    fn encoder_reports_the_angle_except_for_its_faults() {
+        let report_with_fault =
             |kind: FaultKind, number: u64| mount(&[Fault { kind, from_s: 0.5, until_s: 1.5 }]).report(number);
-        let deg = |kind, number| says(kind, number).map(|report| report.angle_rad.to_degrees().round());
-        assert_eq!(deg(FaultKind::Jumps(8.0), 100), Some(28.0));
-        assert_eq!(deg(FaultKind::Jumps(8.0), 200), Some(50.0));
+        let deg = |kind, number| {
+            report_with_fault(kind, number).map(|report| report.angle_rad.to_degrees().round())
+        };
+        assert_eq!(deg(FaultKind::Jump(8.0), 100), Some(28.0));
+        assert_eq!(deg(FaultKind::Jump(8.0), 200), Some(50.0));
         assert_eq!(deg(FaultKind::Stuck, 100), Some(5.0));
-        assert_eq!(deg(FaultKind::Silent, 100), None);
+        assert_eq!(deg(FaultKind::Silence, 100), None);
         assert_eq!(
-            [50, 75, 100, 149].map(|n| deg(FaultKind::Lies(-1.0), n)),
+            [50, 75, 100, 149].map(|n| deg(FaultKind::Drift(-1.0), n)),
             [5.0, 12.0, 19.0, 35.0].map(Some)
         );
-        let late = says(FaultKind::Late(0.2), 100).expect("it says so");
-        assert_eq!((late.stamp_ns, late.arrives_ns), (1_000_000_000, 1_200_000_000));
+        let late = report_with_fault(FaultKind::Delay(0.2), 100).expect("it says so");
+        assert_eq!((late.stamp_ns, late.arrival_ns), (1_000_000_000, 1_200_000_000));
         assert!((late.rate_rad_s.to_degrees() - 30.0).abs() < 1e-9);
-        let stamped = [0.03, -0.03].map(|by_s| says(FaultKind::StampsLate(by_s), 100).expect("it says so"));
+        let stamped = [0.03, -0.03]
+            .map(|by_s| report_with_fault(FaultKind::StampDelay(by_s), 100).expect("it says so"));
         assert_eq!(stamped.map(|report| report.stamp_ns / 1_000_000), [1030, 970]);
-        assert_eq!(stamped.map(|report| report.arrives_ns / 1_000_000), [1030, 1000]);
+        assert_eq!(stamped.map(|report| report.arrival_ns / 1_000_000), [1030, 1000]);
         assert_eq!(stamped.map(|report| report.angle_rad.to_degrees().round()), [20.0; 2]);
     }
 }

@@ -1,19 +1,19 @@
 //! Operating modes of an LMS: the telegrams that a scanner sends continuously after a request 20h, or once after the
-//! request for one value (Telegram listing, 20h, 30h to 3Fh and 75h). [`Source`] provides the measured values: a room, or
+//! request for one value (Telegram listing, 20h, 30h to 3Fh and 75h). [`ScanSource`] provides the measured values: a room, or
 //! a recording.
 
 use scanhub_drivers::lms::command::Request;
-use scanhub_drivers::lms::measured::{Frame, encode_with};
+use scanhub_drivers::lms::measured::{ScanFrame, encode_with};
 use scanhub_drivers::lms::operating::{self as mode, Operating as Asked};
 use scanhub_drivers::lms::telegram::{REPLY, Writer};
-use scanhub_drivers::lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
+use scanhub_drivers::lms::variant::{MIRROR_PERIOD, Mode, Unit, Variant};
 use scanhub_schema::{Nanos, line_time};
 
 use crate::room::Room;
 
 /// Operating mode of a scanner.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Operating {
+pub enum OperatingMode {
     /// 00h: installation, the only mode in which the EEPROM can be written.
     Installation,
     /// 24h: all values of every scan, B0h.
@@ -46,50 +46,50 @@ pub(crate) struct MeasuredValues<'a> {
     /// Number of the telegram; `None` if real-time indices are off.
     pub(crate) index: Option<u8>,
     /// Number of the partial scan.
-    pub(crate) turn: u64,
+    pub(crate) revolution: u64,
 }
 
-impl Operating {
+impl OperatingMode {
     /// Returns the byte after 20h.
     pub fn code(&self) -> u8 {
         match self {
-            Operating::Installation => mode::INSTALLATION,
-            Operating::All => mode::STREAM,
-            Operating::OnRequest => mode::ON_REQUEST,
-            Operating::Means(_) => mode::MEANS,
-            Operating::Range(..) => mode::RANGE,
-            Operating::MeanRange(..) => mode::RANGE_MEANS,
-            Operating::Fields(..) => mode::RANGE_FIELDS,
-            Operating::Partial => mode::PARTIAL,
-            Operating::Reflectivity(_) => mode::REFLECTIVITIES,
+            OperatingMode::Installation => mode::INSTALLATION,
+            OperatingMode::All => mode::STREAM,
+            OperatingMode::OnRequest => mode::ON_REQUEST,
+            OperatingMode::Means(_) => mode::MEANS,
+            OperatingMode::Range(..) => mode::RANGE,
+            OperatingMode::MeanRange(..) => mode::RANGE_MEANS,
+            OperatingMode::Fields(..) => mode::RANGE_FIELDS,
+            OperatingMode::Partial => mode::PARTIAL,
+            OperatingMode::Reflectivity(_) => mode::REFLECTIVITIES,
         }
     }
 
     /// Returns whether telegrams are sent continuously.
     pub fn streams(&self) -> bool {
-        !matches!(self, Operating::Installation | Operating::OnRequest)
+        !matches!(self, OperatingMode::Installation | OperatingMode::OnRequest)
     }
 
     /// Returns the mode that `request` selects, once or from now on, if a scanner in `variant` supports it. It is never the
     /// installation mode, which needs a password.
-    pub(crate) fn of_request(request: Request, variant: Variant) -> Option<Operating> {
+    pub(crate) fn of_request(request: Request, variant: Variant) -> Option<OperatingMode> {
         let operating = match request {
-            Request::Stream | Request::Values(1) => Operating::All,
-            Request::Stop => Operating::OnRequest,
-            Request::Operate(Asked::Partial) | Request::Values(8) => Operating::Partial,
-            Request::Operate(Asked::Means(shots)) | Request::Means(shots) => Operating::Means(shots),
+            Request::Stream | Request::Values(1) => OperatingMode::All,
+            Request::Stop => OperatingMode::OnRequest,
+            Request::Operate(Asked::Partial) | Request::Values(8) => OperatingMode::Partial,
+            Request::Operate(Asked::Means(shots)) | Request::Means(shots) => OperatingMode::Means(shots),
             Request::Operate(Asked::Range(span)) | Request::Range(span) => {
-                Operating::Range(span.first, span.last)
+                OperatingMode::Range(span.first, span.last)
             }
             Request::Operate(Asked::RangeMeans(shots, span)) | Request::RangeMeans(shots, span) => {
-                Operating::MeanRange(shots, span.first, span.last)
+                OperatingMode::MeanRange(shots, span.first, span.last)
             }
             Request::Operate(Asked::RangeFields(span)) | Request::RangeFields(span) => {
-                Operating::Fields(span.first, span.last)
+                OperatingMode::Fields(span.first, span.last)
             }
             Request::Operate(Asked::Reflectivities(spans)) | Request::Reflectivities(spans) => {
                 let ranges = spans.as_slice().iter().map(|span| (span.first, span.last));
-                Operating::Reflectivity(ranges.collect())
+                OperatingMode::Reflectivity(ranges.collect())
             }
             _ => return None,
         };
@@ -100,11 +100,11 @@ impl Operating {
         let within =
             |first: u16, last: u16| 1 <= first && first <= last && usize::from(last) <= variant.beams();
         match self {
-            Operating::Means(shots) => *shots >= 2,
-            Operating::Range(first, last) => within(*first, *last),
-            Operating::MeanRange(shots, first, last) => *shots >= 2 && within(*first, *last),
-            Operating::Fields(first, last) => within(*first, *last) && last - first < 100,
-            Operating::Reflectivity(ranges) => {
+            OperatingMode::Means(shots) => *shots >= 2,
+            OperatingMode::Range(first, last) => within(*first, *last),
+            OperatingMode::MeanRange(shots, first, last) => *shots >= 2 && within(*first, *last),
+            OperatingMode::Fields(first, last) => within(*first, *last) && last - first < 100,
+            OperatingMode::Reflectivity(ranges) => {
                 let pairs: usize =
                     ranges.iter().map(|(first, last)| usize::from(last.abs_diff(*first)) + 1).sum();
                 // The maximum of LENGTH: 808 less command, number of ranges, their heads, and status.
@@ -116,54 +116,56 @@ impl Operating {
     }
 
     /// Returns the minimum number of mirror turns from one telegram to the next.
-    pub(crate) fn turns(&self, variant: Variant) -> u64 {
+    pub(crate) fn revolutions(&self, variant: Variant) -> u64 {
         match self {
-            Operating::Partial => 1,
-            Operating::Means(shots) | Operating::MeanRange(shots, ..) => variant.turns() * u64::from(*shots),
-            _ => variant.turns(),
+            OperatingMode::Partial => 1,
+            OperatingMode::Means(shots) | OperatingMode::MeanRange(shots, ..) => {
+                variant.revolutions() * u64::from(*shots)
+            }
+            _ => variant.revolutions(),
         }
     }
 
     /// Returns the time from one telegram of `len` bytes to the next at `rate`: the number of whole scans that the line
     /// needs (Telegram listing, table 10-17).
     pub(crate) fn period(&self, variant: Variant, len: usize, rate: u32) -> Nanos {
-        let scan = self.turns(variant) * MIRROR_TURN;
+        let scan = self.revolutions(variant) * MIRROR_PERIOD;
         scan * line_time(len, rate).div_ceil(scan).max(1)
     }
 
     /// Returns the telegram with `values`; `None` in a mode that sends none.
     pub(crate) fn telegram(&self, values: &MeasuredValues<'_>) -> Option<Vec<u8>> {
-        let whole = |words: &[u16]| words.len() as u16 | u16::from(values.unit.code()) << 14;
+        let count_word = |words: &[u16]| words.len() as u16 | u16::from(values.unit.code()) << 14;
         let begin = |command| Writer::new(values.address | REPLY, command);
         let writer = match self {
-            Operating::Installation | Operating::OnRequest => return None,
-            Operating::All => return Some(values.scan(None, &values.words())),
-            Operating::Partial => {
-                let step = 4 / values.variant.turns();
-                let quarter = (values.turn % values.variant.turns() * step) as u8;
-                let words = values.room.partial(quarter, values.unit, values.mode, values.at_ns);
+            OperatingMode::Installation | OperatingMode::OnRequest => return None,
+            OperatingMode::All => return Some(values.scan(None, &values.words())),
+            OperatingMode::Partial => {
+                let step = 4 / values.variant.revolutions();
+                let quarter = (values.revolution % values.variant.revolutions() * step) as u8;
+                let words = values.room.partial_scan(quarter, values.unit, values.mode, values.at_ns);
                 return Some(values.scan(Some(quarter), &words));
             }
-            Operating::Means(shots) => {
+            OperatingMode::Means(shots) => {
                 let words = values.means(*shots);
-                append(begin(0xB6).byte(*shots).word(whole(&words)), &words)
+                append(begin(0xB6).byte(*shots).word(count_word(&words)), &words)
             }
-            Operating::Range(first, last) => {
-                let words = beams(&values.words(), *first, *last);
-                append(begin(0xB7).word(*first).word(*last).word(whole(&words)), &words)
+            OperatingMode::Range(first, last) => {
+                let words = select_beams(&values.words(), *first, *last);
+                append(begin(0xB7).word(*first).word(*last).word(count_word(&words)), &words)
             }
-            Operating::MeanRange(shots, first, last) => {
-                let words = beams(&values.means(*shots), *first, *last);
-                let writer = begin(0xBF).byte(*shots).word(*first).word(*last).word(whole(&words));
+            OperatingMode::MeanRange(shots, first, last) => {
+                let words = select_beams(&values.means(*shots), *first, *last);
+                let writer = begin(0xBF).byte(*shots).word(*first).word(*last).word(count_word(&words));
                 return Some(append(writer, &words).byte(values.status).finish().bytes().to_vec());
             }
-            Operating::Fields(first, last) => {
-                let words = beams(&values.words(), *first, *last);
-                let head = begin(0xBE).word(*first).word(*last).word(whole(&words));
+            OperatingMode::Fields(first, last) => {
+                let words = select_beams(&values.words(), *first, *last);
+                let head = begin(0xBE).word(*first).word(*last).word(count_word(&words));
                 let writer = words.iter().fold(head, |writer, &word| append(writer, &[word, 0, 0, 0]));
                 return Some(writer.byte(values.status).finish().bytes().to_vec());
             }
-            Operating::Reflectivity(ranges) => {
+            OperatingMode::Reflectivity(ranges) => {
                 let pairs = values.pairs();
                 ranges.iter().fold(begin(0xF5).word(ranges.len() as u16), |writer, &(first, last)| {
                     let pairs = &pairs[usize::from(first) - 1..usize::from(last)];
@@ -184,13 +186,13 @@ impl Operating {
 impl MeasuredValues<'_> {
     /// Returns the telegram B0h of `words`: a whole scan, or a partial one with this offset in quarters of a degree.
     fn scan(&self, partial: Option<u8>, words: &[u16]) -> Vec<u8> {
-        let frame = Frame { unit: self.unit, partial, indices: self.indices() };
+        let frame = ScanFrame { unit: self.unit, partial, indices: self.indices() };
         encode_with(self.address, frame, words, self.status).bytes().to_vec()
     }
 
     /// Returns the numbers of the mirror turn and of the telegram, if real-time indices are on.
     fn indices(&self) -> Option<(u8, u8)> {
-        self.index.map(|index| ((self.at_ns / MIRROR_TURN) as u8, index))
+        self.index.map(|index| ((self.at_ns / MIRROR_PERIOD) as u8, index))
     }
 
     fn words(&self) -> Vec<u16> {
@@ -200,13 +202,13 @@ impl MeasuredValues<'_> {
     /// Returns ranges without levels, each the mean of `shots` scans. A beam without a range in a fifth of them has the code
     /// for overflow.
     fn means(&self, shots: u8) -> Vec<u16> {
-        let (greatest, scan) = (self.mode.max_value(), self.variant.turns() * MIRROR_TURN);
+        let (greatest, scan) = (self.mode.max_value(), self.variant.revolutions() * MIRROR_PERIOD);
         let mut sums = vec![(0u32, 0u32); self.variant.beams()];
         for scan_number in 0..u64::from(shots) {
             let at_ns = self.at_ns + scan_number * scan;
             let words = self.room.scan(self.variant, self.unit, self.mode, at_ns);
             for (sum, range) in sums.iter_mut().zip(words.iter().map(|word| word & greatest)) {
-                if range < greatest - scanhub_recording::BEYOND {
+                if range < greatest - scanhub_recording::BEYOND_RANGE_OFFSET {
                     *sum = (sum.0 + u32::from(range), sum.1 + 1);
                 }
             }
@@ -223,7 +225,7 @@ impl MeasuredValues<'_> {
         let levels = Mode(1);
         let words = self.room.scan(self.variant, self.unit, levels, self.at_ns);
         let pair = |word: u16| match word & levels.max_value() {
-            range if range < levels.max_value() - scanhub_recording::BEYOND => {
+            range if range < levels.max_value() - scanhub_recording::BEYOND_RANGE_OFFSET => {
                 [range, 400 + 2_000 * (word >> 13)]
             }
             code => [code, 0],
@@ -233,7 +235,7 @@ impl MeasuredValues<'_> {
 }
 
 /// A source of measured-value telegrams.
-pub enum Source {
+pub enum ScanSource {
     /// A simulated room.
     Room(Room),
     /// Whole telegrams, sent as they are.
@@ -245,35 +247,35 @@ pub enum Source {
     },
 }
 
-impl Source {
+impl ScanSource {
     /// Returns the next telegram of a scanner in `operating`, with the values that `measure` takes from the room. Returns
     /// `None` at the end of a recording, and in a mode that sends nothing.
     pub(crate) fn telegram<'a>(
         &'a mut self,
-        operating: &Operating,
+        operating: &OperatingMode,
         measure: impl FnOnce(&'a Room) -> MeasuredValues<'a>,
     ) -> Option<Vec<u8>> {
         match self {
-            Source::Room(room) => operating.telegram(&measure(room)),
-            Source::Recorded { telegrams, .. } => telegrams.next(),
+            ScanSource::Room(room) => operating.telegram(&measure(room)),
+            ScanSource::Recorded { telegrams, .. } => telegrams.next(),
         }
     }
 
     /// Returns the only supported variant, or `None` if all are supported.
     pub(crate) fn variant(&self) -> Option<Variant> {
         match self {
-            Source::Room(_) => None,
-            Source::Recorded { variant, .. } => Some(*variant),
+            ScanSource::Room(_) => None,
+            ScanSource::Recorded { variant, .. } => Some(*variant),
         }
     }
 
     /// Returns whether `operating` is supported: a recording streams whole scans, each of them once.
-    pub(crate) fn can(&self, operating: &Operating) -> bool {
-        matches!(self, Source::Room(_)) || *operating == Operating::All || !operating.streams()
+    pub(crate) fn supports(&self, operating: &OperatingMode) -> bool {
+        matches!(self, ScanSource::Room(_)) || *operating == OperatingMode::All || !operating.streams()
     }
 }
 
-fn beams(words: &[u16], first: u16, last: u16) -> Vec<u16> {
+fn select_beams(words: &[u16], first: u16, last: u16) -> Vec<u16> {
     words[usize::from(first) - 1..usize::from(last)].to_vec()
 }
 

@@ -5,14 +5,14 @@ use std::str::FromStr;
 use std::time::Duration;
 
 use scanhub_drivers::ld;
-use scanhub_drivers::lms::family::Family;
+use scanhub_drivers::lms::lms_model::LmsModel;
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
 use scanhub_schema::{Failure, Kind};
 
 use crate::device::ChunkSize;
 use crate::fault::Faults;
-use crate::machine::Start;
-use crate::operating::Operating;
+use crate::machine::StartState;
+use crate::operating::OperatingMode;
 use crate::port;
 use crate::rplidar;
 use crate::world::World;
@@ -29,7 +29,7 @@ pub struct SimulateOptions {
     /// Address of the scanners, 0 to 127.
     pub address: u8,
     /// State in which an earlier host left the scanners.
-    pub state: Start,
+    pub state: StartState,
     /// Time from power-on to the boot message.
     pub boot: Duration,
     /// The byte that ends each reply.
@@ -62,7 +62,7 @@ pub struct SimulateOptions {
     /// Whether to replace an existing truth file.
     pub force: bool,
     /// Type that the scanners report, which limits what they support.
-    pub family: Family,
+    pub family: LmsModel,
     /// Angle and resolution; `None` selects those of the recording, or else of the type.
     pub variant: Option<Variant>,
     /// Unit; `None` selects that of the recording, or else of the type.
@@ -109,7 +109,7 @@ impl Default for SimulateOptions {
             baud: None,
             permanent_baud: None,
             address: 0,
-            state: Start::In(Operating::OnRequest),
+            state: StartState::Operating(OperatingMode::OnRequest),
             boot: Duration::from_secs(2),
             status: 0x10,
             errors: Vec::new(),
@@ -125,7 +125,7 @@ impl Default for SimulateOptions {
             faults: Faults::default(),
             truth: None,
             force: false,
-            family: Family::Lms200,
+            family: LmsModel::Lms200,
             variant: None,
             unit: None,
             mode: None,
@@ -143,31 +143,35 @@ impl SimulateOptions {
     ///
     /// Returns [`Kind::Configuration`] if they do not.
     pub(crate) fn check(&self) -> Result<(), Failure> {
-        let wrong = |message: String, hint: &str| Err(Failure::new(Kind::Configuration, message, hint));
+        let invalid = |message: String, hint: &str| Err(Failure::new(Kind::Configuration, message, hint));
         if self.ports.is_empty() {
-            return wrong("no port to simulate".into(), "name one with --port PATH or --tcp HOST:PORT");
+            return invalid("no port to simulate".into(), "name one with --port PATH or --tcp HOST:PORT");
         }
         for (number, port) in self.ports.iter().enumerate() {
             let is_any = port::server(port).is_some_and(|address| address.ends_with(":0"));
             if self.ports[..number].contains(port) && !is_any {
-                return wrong(
+                return invalid(
                     format!("port {} is named twice", port.display()),
                     "each sensor needs its own path",
                 );
             }
         }
         if !(0.01..=100.0).contains(&self.speed) {
-            return wrong(format!("speed {} is out of range", self.speed), "a number from 0.01 to 100");
+            return invalid(format!("speed {} is out of range", self.speed), "a number from 0.01 to 100");
         }
         if self.address > 127 {
-            return wrong(format!("address {} is out of range", self.address), "a number from 0 to 127");
+            return invalid(format!("address {} is out of range", self.address), "a number from 0 to 127");
         }
         if self.pollution > 100 {
-            return wrong(format!("pollution {} is out of range", self.pollution), "percent, 0 to 100");
+            return invalid(format!("pollution {} is out of range", self.pollution), "percent, 0 to 100");
         }
         if let Some(scanner) = self.scanner {
             let talks = matches!(scanner, Scanner::Rplidar { .. });
-            let states = [Start::In(Operating::OnRequest), Start::In(Operating::All), Start::PowerOn];
+            let states = [
+                StartState::Operating(OperatingMode::OnRequest),
+                StartState::Operating(OperatingMode::All),
+                StartState::PowerOn,
+            ];
             let lms = [
                 ("baud", self.baud.is_some() || self.permanent_baud.is_some()),
                 ("variant", self.variant.is_some()),
@@ -189,7 +193,7 @@ impl SimulateOptions {
                     "state" if talks => "use idle, streaming or starting, or --family lms",
                     _ => "leave it out, or use --family lms",
                 };
-                return wrong(message, hint);
+                return invalid(message, hint);
             }
         }
         if let (Some(variant), family) = (self.variant, self.family)
@@ -201,34 +205,34 @@ impl SimulateOptions {
                 family.name(),
                 f64::from(resolution_cdeg) / 100.0
             );
-            return wrong(message, reason);
+            return invalid(message, reason);
         }
-        let tells_all = |start: &Start| match start {
-            Start::In(operating) => *operating == Operating::All || !operating.streams(),
-            Start::PowerOn => true,
+        let tells_all = |start: &StartState| match start {
+            StartState::Operating(operating) => *operating == OperatingMode::All || !operating.streams(),
+            StartState::PowerOn => true,
         };
         if self.replay.is_some() && !tells_all(&self.state) {
-            return wrong(
+            return invalid(
                 "a recording is sent in whole scans only".into(),
                 "leave --state out, or use idle, streaming, installation or starting",
             );
         }
         if !self.sensors.is_empty() && self.replay.is_none() {
-            return wrong("--sensor without a recording".into(), "name one with --replay FILE");
+            return invalid("--sensor without a recording".into(), "name one with --replay FILE");
         }
         if self.sensors.len() > 1 && self.sensors.len() != self.ports.len() {
             let message = format!("{} sensors for {} ports", self.sensors.len(), self.ports.len());
-            return wrong(message, "name one --sensor for all ports, or one for each");
+            return invalid(message, "name one --sensor for all ports, or one for each");
         }
         if self.looped && self.replay.is_none() {
-            return wrong("--loop without a recording".into(), "name one with --replay FILE");
+            return invalid("--loop without a recording".into(), "name one with --replay FILE");
         }
         Ok(())
     }
 }
 
 /// Returns type, number and firmware as a scanner of `family` reports them: 21 characters (Telegram listing, BAh).
-pub fn type_name(family: Family) -> String {
+pub fn type_name(family: LmsModel) -> String {
     format!("{};301063;V02.30 ", family.name().to_uppercase())
 }
 
@@ -239,12 +243,12 @@ pub fn parse_family(
     model: Option<&str>,
     mode: Option<&str>,
 ) -> Result<Option<Scanner>, Failure> {
-    let wrong = |message: String, hint: &str| Err(Failure::new(Kind::Configuration, message, hint));
+    let invalid = |message: String, hint: &str| Err(Failure::new(Kind::Configuration, message, hint));
     let model = model.map(str::to_lowercase);
     match one_of("family", family, &["lms", "ld", "rplidar"].map(|name| (name, name)))? {
         "ld" => {
             if let Some(mode) = mode {
-                return wrong(
+                return invalid(
                     format!("mode {mode:?} of family \"ld\""),
                     "its scanners have one way to measure",
                 );
@@ -262,7 +266,7 @@ pub fn parse_family(
                 Some((_, Some(mode))) => mode,
                 Some((mode, None)) => {
                     let hint = format!("one of: {}", modes.join(", "));
-                    return wrong(format!("a scanner {} has no mode {mode:?}", model.name()), &hint);
+                    return invalid(format!("a scanner {} has no mode {mode:?}", model.name()), &hint);
                 }
             };
             Ok(Some(Scanner::Rplidar { model, mode }))
@@ -271,32 +275,32 @@ pub fn parse_family(
             None => Ok(None),
             Some(model) => {
                 let hint = "--type says which LMS; the families ld and rplidar have models";
-                wrong(format!("model {model:?} of family \"lms\""), hint)
+                invalid(format!("model {model:?} of family \"lms\""), hint)
             }
         },
     }
 }
 
 /// Parses `lms200` and the other types that support the values of [`Variant`].
-pub fn parse_type(text: &str) -> Result<Family, Failure> {
-    let families = Family::ALL.into_iter().filter(|family| family.factory_variant().is_some());
+pub fn parse_type(text: &str) -> Result<LmsModel, Failure> {
+    let families = LmsModel::ALL.into_iter().filter(|family| family.factory_variant().is_some());
     one_of("type", text, &families.map(|family| (family.name(), family)).collect::<Vec<_>>())
 }
 
 /// Parses the state in which an earlier host left the scanner: `idle`, `streaming`, another mode that streams,
 /// `installation`, or `starting` for a scanner that is switched on now.
-pub fn parse_state(text: &str) -> Result<Start, Failure> {
+pub fn parse_state(text: &str) -> Result<StartState, Failure> {
     let known = [
-        ("idle", Start::In(Operating::OnRequest)),
-        ("streaming", Start::In(Operating::All)),
-        ("partial", Start::In(Operating::Partial)),
-        ("means", Start::In(Operating::Means(10))),
-        ("range", Start::In(Operating::Range(31, 91))),
-        ("mean-range", Start::In(Operating::MeanRange(10, 31, 91))),
-        ("fields", Start::In(Operating::Fields(1, 100))),
-        ("reflectivity", Start::In(Operating::Reflectivity(vec![(1, 101)]))),
-        ("installation", Start::In(Operating::Installation)),
-        ("starting", Start::PowerOn),
+        ("idle", StartState::Operating(OperatingMode::OnRequest)),
+        ("streaming", StartState::Operating(OperatingMode::All)),
+        ("partial", StartState::Operating(OperatingMode::Partial)),
+        ("means", StartState::Operating(OperatingMode::Means(10))),
+        ("range", StartState::Operating(OperatingMode::Range(31, 91))),
+        ("mean-range", StartState::Operating(OperatingMode::MeanRange(10, 31, 91))),
+        ("fields", StartState::Operating(OperatingMode::Fields(1, 100))),
+        ("reflectivity", StartState::Operating(OperatingMode::Reflectivity(vec![(1, 101)]))),
+        ("installation", StartState::Operating(OperatingMode::Installation)),
+        ("starting", StartState::PowerOn),
     ];
     one_of("state", text, &known)
 }
@@ -399,12 +403,12 @@ mod tests {
         assert!(parse_family("lms", Some("ld19"), None).unwrap_err().hint.contains("--type"));
         assert!(parse_family("ld", None, Some("boost")).is_err());
         assert_eq!("usb".parse::<ChunkSize>().unwrap().bytes(), 62);
-        for family in [Family::Lms200, Family::Lms211, Family::Lms221, Family::Lms291] {
+        for family in [LmsModel::Lms200, LmsModel::Lms211, LmsModel::Lms221, LmsModel::Lms291] {
             let name = type_name(family);
-            assert_eq!((Family::of_type(name.as_bytes()), name.len()), (Some(family), 21));
+            assert_eq!((LmsModel::of_type(name.as_bytes()), name.len()), (Some(family), 21));
             assert_eq!(parse_type(family.name()).unwrap(), family);
         }
-        assert_eq!(parse_state("partial").unwrap(), Start::In(Operating::Partial));
+        assert_eq!(parse_state("partial").unwrap(), StartState::Operating(OperatingMode::Partial));
         assert_eq!((parse_error("0x84:22").unwrap(), parse_byte("status", "0x11").unwrap()), ((132, 22), 17));
         for failure in [parse_error("22").unwrap_err(), parse_byte("status", "256").unwrap_err()] {
             assert!(failure.kind.exit_code() == 78 && !failure.hint.is_empty(), "{failure}");

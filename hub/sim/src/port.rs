@@ -103,10 +103,10 @@ impl SimPort {
 
     /// Returns the descriptor to wait for. A pty that no host has open is not waited for, because it would be ready all
     /// the time.
-    pub(crate) fn waits_for(&self, is_open: bool) -> Option<BorrowedFd<'_>> {
+    pub(crate) fn wait_fd(&self, is_open: bool) -> Option<BorrowedFd<'_>> {
         match self {
-            SimPort::Pty { pty, .. } => is_open.then(|| pty.waits_for()),
-            SimPort::Tcp(server) => Some(server.waits_for()),
+            SimPort::Pty { pty, .. } => is_open.then(|| pty.wait_fd()),
+            SimPort::Tcp(server) => Some(server.wait_fd()),
         }
     }
 }
@@ -190,7 +190,7 @@ impl Server {
     }
 
     /// Returns the descriptor to wait for: that of the connection, or else that of the listener.
-    pub(crate) fn waits_for(&self) -> BorrowedFd<'_> {
+    pub(crate) fn wait_fd(&self) -> BorrowedFd<'_> {
         match &self.host {
             Some(host) => host.as_fd(),
             None => self.listener.as_fd(),
@@ -214,7 +214,7 @@ pub struct Pty {
 
 /// Reason for the end of a wait.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Wake {
+pub(crate) enum WaitResult {
     /// Time, bytes, or the host's side was closed.
     Line,
     /// One of the stop descriptors is readable.
@@ -226,7 +226,7 @@ impl Pty {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`] if a pty cannot be created.
+    /// Returns [`Kind::ResourceExhausted`] if a pty cannot be created.
     pub fn open() -> Result<Pty, Failure> {
         let make = || -> io::Result<Pty> {
             let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC)?;
@@ -244,7 +244,7 @@ impl Pty {
         };
         make().map_err(|errno| {
             Failure::new(
-                Kind::Short,
+                Kind::ResourceExhausted,
                 format!("cannot make a pty: {errno}"),
                 "see /proc/sys/kernel/pty/nr and max",
             )
@@ -274,7 +274,7 @@ impl Pty {
             Ok(count) => Ok(count),
             // EIO: the host's side is closed and everything was read.
             Err(Errno::AGAIN | Errno::IO | Errno::INTR) => Ok(0),
-            Err(errno) => Err(broken("read from", &self.name, errno)),
+            Err(errno) => Err(pty_failure("read from", &self.name, errno)),
         }
     }
 
@@ -286,14 +286,14 @@ impl Pty {
                 Ok(count) => rest = &rest[count..],
                 Err(Errno::INTR) => {}
                 Err(Errno::AGAIN | Errno::IO) => break,
-                Err(errno) => return Err(broken("write to", &self.name, errno)),
+                Err(errno) => return Err(pty_failure("write to", &self.name, errno)),
             }
         }
         Ok(bytes.len() - rest.len())
     }
 
     /// Returns the descriptor that becomes readable when a host has written, and writable when it has read.
-    pub fn waits_for(&self) -> BorrowedFd<'_> {
+    pub fn wait_fd(&self) -> BorrowedFd<'_> {
         self.master.as_fd()
     }
 
@@ -312,17 +312,21 @@ impl Pty {
 }
 
 /// Waits for bytes at `line`, for `deadline_ns` of the clock, or for one of the `stops`.
-pub(crate) fn wait(stops: [BorrowedFd<'_>; 2], line: Option<BorrowedFd<'_>>, deadline_ns: Nanos) -> Wake {
+pub(crate) fn wait(
+    stops: [BorrowedFd<'_>; 2],
+    line: Option<BorrowedFd<'_>>,
+    deadline_ns: Nanos,
+) -> WaitResult {
     let left = deadline_ns.saturating_sub(now_ns());
     let timeout = Timespec { tv_sec: (left / 1_000_000_000) as _, tv_nsec: (left % 1_000_000_000) as _ };
     let mut fds =
         [stops[0], stops[1], line.unwrap_or(stops[0])].map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN));
     // An interrupted wait only ends early.
     let _ = poll(&mut fds, Some(&timeout));
-    if fds[..2].iter().any(|fd| !fd.revents().is_empty()) { Wake::Stop } else { Wake::Line }
+    if fds[..2].iter().any(|fd| !fd.revents().is_empty()) { WaitResult::Stop } else { WaitResult::Line }
 }
 
-fn broken(what: &str, name: &Path, errno: Errno) -> Failure {
+fn pty_failure(what: &str, name: &Path, errno: Errno) -> Failure {
     Failure::new(Kind::Failed, format!("cannot {what} the pty {}: {errno}", name.display()), "")
 }
 
@@ -343,18 +347,18 @@ impl PtySymlink {
     /// there, and [`Kind::PortMissing`], [`Kind::PortPermission`] or [`Kind::Failed`] if the symlink cannot be created.
     pub(crate) fn new(path: &Path, target: &Path) -> Result<PtySymlink, Failure> {
         match fs::symlink_metadata(path) {
-            Ok(there) if there.is_symlink() && is_left_behind(path) => {
+            Ok(metadata) if metadata.is_symlink() && is_stale(path) => {
                 fs::remove_file(path).map_err(|error| failure(path, &error))?;
             }
-            Ok(there) if there.is_symlink() && is_terminal(path) => {
+            Ok(metadata) if metadata.is_symlink() && is_terminal(path) => {
                 return Err(Failure::new(
                     Kind::PortBusy,
                     format!("port {} belongs to another simulator, which still runs", path.display()),
                     "name another path, or end that one first",
                 ));
             }
-            Ok(there) => {
-                let kind = if there.is_symlink() { "a symlink to something else" } else { "no symlink" };
+            Ok(metadata) => {
+                let kind = if metadata.is_symlink() { "a symlink to something else" } else { "no symlink" };
                 return Err(Failure::new(
                     Kind::PortNotTty,
                     format!("port {} exists and is {kind}", path.display()),
@@ -380,7 +384,7 @@ impl Drop for PtySymlink {
 
 /// Returns whether a killed simulator left the symlink at `path`. A terminal that is older than the symlink still
 /// belongs to the simulator that created the symlink. A younger terminal only has the same number.
-fn is_left_behind(path: &Path) -> bool {
+fn is_stale(path: &Path) -> bool {
     let (Ok(terminal), Ok(link)) = (fs::metadata(path), fs::symlink_metadata(path)) else { return true };
     let since = |metadata: &Metadata| (metadata.ctime(), metadata.ctime_nsec());
     is_terminal(path) && since(&terminal) > since(&link)

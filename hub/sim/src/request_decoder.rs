@@ -4,7 +4,7 @@
 
 use std::fmt;
 
-use scanhub_drivers::lms::telegram::{FRAME, MAX_LENGTH, STX};
+use scanhub_drivers::lms::telegram::{FRAME_LEN, MAX_LENGTH, STX};
 use scanhub_schema::{MICROS, MILLIS, Nanos, line_time};
 
 /// Time at which the host wrote a byte, as far as it is known.
@@ -25,7 +25,7 @@ impl Arrival {
 
 /// Reason for which a request was dropped.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Dropped {
+pub enum DroppedRequest {
     /// A gap of more than 6 ms inside the request.
     LongGap {
         /// Number of bytes before the gap.
@@ -35,13 +35,13 @@ pub enum Dropped {
     ShortGap,
 }
 
-impl fmt::Display for Dropped {
+impl fmt::Display for DroppedRequest {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Dropped::LongGap { after } => {
+            DroppedRequest::LongGap { after } => {
                 write!(f, "a request was dropped: more than 6 ms of silence after {after} of its bytes")
             }
-            Dropped::ShortGap => f.write_str(
+            DroppedRequest::ShortGap => f.write_str(
                 "a request was dropped: less than 55 us between its bytes, which strict_gap=1 demands",
             ),
         }
@@ -64,28 +64,28 @@ pub(crate) struct RequestDecoder {
     /// Time at which the line carried the last byte, if every gap before it was valid; `None` before the first byte.
     last: Option<Arrival>,
     /// Whether a gap of the request was too short.
-    broken: bool,
+    is_broken: bool,
     /// Whether the host itself must leave the minimum gap.
     pub(crate) is_strict: bool,
     /// Speed of the simulation's time relative to that of the host, which measures the gaps by its own clock.
     speed: f64,
-    dropped: Option<Dropped>,
+    dropped: Option<DroppedRequest>,
 }
 
 impl RequestDecoder {
     pub(crate) fn new(speed: f64, is_strict: bool) -> Self {
-        RequestDecoder { bytes: Vec::new(), last: None, broken: false, is_strict, speed, dropped: None }
+        RequestDecoder { bytes: Vec::new(), last: None, is_broken: false, is_strict, speed, dropped: None }
     }
 
     /// Returns the last request that was dropped. Returns it once.
-    pub(crate) fn take_dropped(&mut self) -> Option<Dropped> {
+    pub(crate) fn take_dropped(&mut self) -> Option<DroppedRequest> {
         self.dropped.take()
     }
 
     /// Adds a byte on a line at `baud` bits per second. Returns the request that it completes, unless its gaps were certainly
     /// wrong.
     pub(crate) fn receive(&mut self, byte: u8, arrival: Arrival, baud: u32) -> Option<DecodedRequest> {
-        let possible = self.place(arrival, baud);
+        let possible = self.narrow_arrival(arrival, baud);
         self.last = Some(possible);
         if self.bytes.is_empty() && byte != STX {
             return None;
@@ -94,16 +94,16 @@ impl RequestDecoder {
         let [_, _, low, high, ..] = self.bytes[..] else { return None };
         let length = usize::from(u16::from_le_bytes([low, high]));
         if !(1..=MAX_LENGTH).contains(&length) {
-            self.forget();
+            self.take_bytes();
             return None;
         }
-        if self.bytes.len() < length + FRAME {
+        if self.bytes.len() < length + FRAME_LEN {
             return None;
         }
-        let is_broken = self.broken;
-        let bytes = self.forget();
+        let is_broken = self.is_broken;
+        let bytes = self.take_bytes();
         if is_broken {
-            self.dropped = Some(Dropped::ShortGap);
+            self.dropped = Some(DroppedRequest::ShortGap);
             return None;
         }
         Some(DecodedRequest { bytes, at: possible.not_before.max(arrival.not_after) })
@@ -111,7 +111,7 @@ impl RequestDecoder {
 
     /// Returns the time at which the line can have carried a byte that the host wrote at `arrival`. Drops the present request
     /// if the byte is too late for it.
-    fn place(&mut self, arrival: Arrival, baud: u32) -> Arrival {
+    fn narrow_arrival(&mut self, arrival: Arrival, baud: u32) -> Arrival {
         let Some(last) = self.last else { return arrival };
         let scaled = |span: Nanos| (span as f64 * self.speed) as Nanos;
         let byte_ns = scaled(line_time(1, baud));
@@ -121,26 +121,26 @@ impl RequestDecoder {
         let latest = last.not_after + byte_ns + scaled(MAX_GAP);
         if arrival.not_before > latest {
             if !self.bytes.is_empty() {
-                self.dropped = Some(Dropped::LongGap { after: self.bytes.len() });
+                self.dropped = Some(DroppedRequest::LongGap { after: self.bytes.len() });
             }
-            self.forget();
+            self.take_bytes();
             return arrival;
         }
         let is_host_s = self.is_strict && !self.bytes.is_empty();
         if is_host_s && earliest > arrival.not_after {
-            self.broken = true;
+            self.is_broken = true;
             return arrival;
         }
         // Otherwise the UART sends it after the byte before it.
-        let carried = if is_host_s { 0 } else { last.not_after + byte_ns };
+        let uart_time = if is_host_s { 0 } else { last.not_after + byte_ns };
         Arrival {
             not_before: arrival.not_before.max(earliest),
-            not_after: arrival.not_after.max(carried).min(latest),
+            not_after: arrival.not_after.max(uart_time).min(latest),
         }
     }
 
-    fn forget(&mut self) -> Vec<u8> {
-        self.broken = false;
+    fn take_bytes(&mut self) -> Vec<u8> {
+        self.is_broken = false;
         std::mem::take(&mut self.bytes)
     }
 }
@@ -218,7 +218,11 @@ mod tests {
         ] {
             let mut decoder = RequestDecoder::new(1.0, false);
             assert_eq!(heard(&mut decoder, 1_000 * MILLIS, gap, width), expected, "{gap} {width}");
-            assert_eq!(decoder.take_dropped(), (!expected).then_some(Dropped::LongGap { after: 1 }), "{gap}");
+            assert_eq!(
+                decoder.take_dropped(),
+                (!expected).then_some(DroppedRequest::LongGap { after: 1 }),
+                "{gap}"
+            );
             assert!(heard(&mut decoder, 2_000 * MILLIS, 100 * MICROS, 0), "not heard again after {gap}");
             assert_eq!(decoder.take_dropped(), None);
         }
@@ -232,7 +236,7 @@ mod tests {
             let heard =
                 tail.iter().filter_map(|&byte| decoder.receive(byte, Arrival::at(pause), 9_600)).count();
             assert_eq!(heard == 1, expected, "{pause}");
-            assert_eq!(decoder.take_dropped(), (!expected).then_some(Dropped::LongGap { after: 4 }));
+            assert_eq!(decoder.take_dropped(), (!expected).then_some(DroppedRequest::LongGap { after: 4 }));
         }
     }
 
@@ -252,7 +256,8 @@ mod tests {
         ] {
             let mut decoder = RequestDecoder::new(1.0, true);
             assert_eq!(heard(&mut decoder, 1_000 * MILLIS, gap, width), expected, "{gap} {width}");
-            let dropped = if gap < MIN_GAP { Dropped::ShortGap } else { Dropped::LongGap { after: 1 } };
+            let dropped =
+                if gap < MIN_GAP { DroppedRequest::ShortGap } else { DroppedRequest::LongGap { after: 1 } };
             assert_eq!(decoder.take_dropped(), (!expected).then_some(dropped), "{gap} {width}");
             assert!(heard(&mut decoder, 2_000 * MILLIS, 100 * MICROS, 0), "not heard again after {gap}");
         }

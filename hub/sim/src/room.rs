@@ -4,7 +4,7 @@
 
 use std::sync::Arc;
 
-use scanhub_drivers::lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
+use scanhub_drivers::lms::variant::{MIRROR_PERIOD, Mode, Unit, Variant};
 use scanhub_schema::{Nanos, Scan, ScanHead};
 
 use crate::beam::{self, BeamRng};
@@ -71,12 +71,12 @@ impl Room {
 
     /// Returns the values of [`Room::scan`] with their true targets.
     pub fn labeled_scan(&self, variant: Variant, unit: Unit, mode: Mode, end_ns: Nanos) -> LabeledScan {
-        self.measure(angles_mdeg(variant), variant.turns(), unit, mode, end_ns, &|_| Vec::new())
+        self.measure(angles_mdeg(variant), variant.revolutions(), unit, mode, end_ns, &|_| Vec::new())
     }
 
     /// Returns the values of the partial scan whose mirror turn ended at `end_ns`: 181 beams on whole degrees, or 180 that are
     /// `quarter` quarters of a degree after them.
-    pub(crate) fn partial(&self, quarter: u8, unit: Unit, mode: Mode, end_ns: Nanos) -> Vec<u16> {
+    pub(crate) fn partial_scan(&self, quarter: u8, unit: Unit, mode: Mode, end_ns: Nanos) -> Vec<u16> {
         let beams = if quarter > 0 { 180 } else { 181 };
         let angles_mdeg = (0..beams).map(|beam| 1_000 * beam + 250 * i32::from(quarter) - 90_000).collect();
         self.measure(angles_mdeg, 1, unit, mode, end_ns, &|_| Vec::new()).words
@@ -93,7 +93,7 @@ impl Room {
         mode: Mode,
         end_ns: Nanos,
     ) -> Vec<u16> {
-        self.measure(angles_mdeg(variant), variant.turns(), unit, mode, end_ns, shapes).words
+        self.measure(angles_mdeg(variant), variant.revolutions(), unit, mode, end_ns, shapes).words
     }
 
     /// Returns the middle of each reflector that is visible at `time_ns`.
@@ -109,7 +109,7 @@ impl Room {
     fn measure(
         &self,
         angles_mdeg: Vec<i32>,
-        turns: u64,
+        revolutions: u64,
         unit: Unit,
         mode: Mode,
         end_ns: Nanos,
@@ -122,11 +122,11 @@ impl Room {
             RoomView::Value(value) => vec![*value; beams],
             RoomView::Random => (0..beams).map(|_| random.u16(..) & !mode.forbidden()).collect(),
             RoomView::Scene(world) => {
-                return measure(world, &angles_mdeg, turns, unit, mode, end_ns, shapes, &mut random);
+                return measure(world, &angles_mdeg, revolutions, unit, mode, end_ns, shapes, &mut random);
             }
             RoomView::PrecomputedScans(series, changes) => {
                 let room = series.room(changes, end_ns);
-                return room.measure(angles_mdeg, turns, unit, mode, end_ns, shapes);
+                return room.measure(angles_mdeg, revolutions, unit, mode, end_ns, shapes);
             }
         };
         let truth = words.iter().map(|&word| truth(word, BeamTarget::Static { since_ns: 0 }, mode)).collect();
@@ -146,7 +146,7 @@ fn angles_mdeg(variant: Variant) -> Vec<i32> {
 fn measure(
     world: &WorldView,
     angles_mdeg: &[i32],
-    turns: u64,
+    revolutions: u64,
     unit: Unit,
     mode: Mode,
     end_ns: Nanos,
@@ -156,13 +156,22 @@ fn measure(
     if world.is_tilted() {
         return measure_tilted(world, angles_mdeg, unit, mode, end_ns, random);
     }
-    let times: Vec<Nanos> = (0..turns).map(|turn| world.noise.turn_ns(turn, turns, end_ns)).collect();
+    let times: Vec<Nanos> = (0..revolutions)
+        .map(|revolution| world.noise.revolution_ns(revolution, revolutions, end_ns))
+        .collect();
     let views: Vec<View> = times.iter().map(|&time_ns| world.view_with(time_ns, &shapes(time_ns))).collect();
     let mut scan = LabeledScan::default();
     for (beam, &angle_mdeg) in angles_mdeg.iter().enumerate() {
         // The beams between whole degrees are measured in the turns after the first.
-        let turn = beam % turns as usize;
-        measure_beam(world, &views[turn], (angle_mdeg, times[turn]), (unit, mode), random, &mut scan);
+        let revolution = beam % revolutions as usize;
+        measure_beam(
+            world,
+            &views[revolution],
+            (angle_mdeg, times[revolution]),
+            (unit, mode),
+            random,
+            &mut scan,
+        );
     }
     scan
 }
@@ -187,7 +196,7 @@ fn measure_tilted(
     for (beam, &angle_mdeg) in angles_mdeg.iter().enumerate() {
         let off_ns = if world.noise.comb { times.beam_ns(beam) } else { 0 };
         let at_ns = end_ns.saturating_add_signed(off_ns);
-        world.look_along(&mut view, f64::from(angle_mdeg) / 1e3, at_ns);
+        world.show_beam(&mut view, f64::from(angle_mdeg) / 1e3, at_ns);
         measure_beam(world, &view, (angle_mdeg, at_ns), (unit, mode), random, &mut scan);
     }
     scan
@@ -209,7 +218,7 @@ fn measure_beam(
     let sun = world.suns.iter().map(|sun| sun.share(angle_mdeg, time_s)).fold(0.0, f64::max);
     let word = word(world, &echo, sun, unit, mode, &rng);
     scan.words.push(word);
-    scan.truth.push(truth(word, echo.met, mode));
+    scan.truth.push(truth(word, echo.target, mode));
 }
 
 /// Returns the value of a beam with this `echo`. The sun dazzles `sun` of such beams.
@@ -230,18 +239,18 @@ pub(crate) fn reported_range(world: &WorldView, echo: &Echo, sun: f64, rng: &Bea
         Err(beam::DAZZLE)
     } else if echo.range_mm.is_infinite() || rng.code >= echo.returns {
         Err(beam::NO_RETURN)
-    } else if world.noise.loses(echo.signal, echo.torn, rng) {
+    } else if world.noise.loses(echo.signal, echo.is_torn, rng) {
         Err(beam::TOO_WEAK)
     } else if let Some(error) = world.noise.error(rng) {
         Err(error)
     } else {
-        Ok(echo.range_mm + world.bias_mm + world.noise.deviation_mm(echo.edge, rng))
+        Ok(echo.range_mm + world.bias_mm + world.noise.deviation_mm(echo.is_edge, rng))
     }
 }
 
 /// Returns the truth for a beam that hit `target` and reported `word`.
 fn truth(word: u16, target: BeamTarget, mode: Mode) -> BeamTarget {
-    if word & mode.max_value() >= mode.max_value() - scanhub_recording::BEYOND {
+    if word & mode.max_value() >= mode.max_value() - scanhub_recording::BEYOND_RANGE_OFFSET {
         BeamTarget::Invalid
     } else {
         target
@@ -250,19 +259,19 @@ fn truth(word: u16, target: BeamTarget, mode: Mode) -> BeamTarget {
 
 /// Returns the range value of `units` (any number), or the code for a range beyond the maximum.
 fn range_value(units: f64, mode: Mode) -> u16 {
-    let beyond = mode.max_value() - scanhub_recording::BEYOND;
+    let beyond = mode.max_value() - scanhub_recording::BEYOND_RANGE_OFFSET;
     (units.round().max(0.0) as u16).min(beyond)
 }
 
 /// Returns the level of a reflector.
 fn level(echo: &Echo, mode: Mode, rng: &BeamRng) -> u16 {
-    if echo.bright == 0.0 {
+    if echo.reflector_share == 0.0 {
         return 0;
     }
     let max = f64::from((1u16 << mode.intensity_bits()) - 1);
     // Real recordings have 0 to 5 of 7.
     let top = (max * 0.75).round();
-    (top * echo.bright + LEVEL_DEVIATION * rng.bright).round().clamp(0.0, max) as u16
+    (top * echo.reflector_share + LEVEL_DEVIATION * rng.bright).round().clamp(0.0, max) as u16
 }
 
 /// A scan, and the true targets of its beams.
@@ -311,7 +320,7 @@ pub struct Mark {
 }
 
 /// Some scans of each of a few rooms, between which the view changes at fixed times. No two scans within
-/// [`PrecomputedScans::CYCLE`] mirror turns are equal, because the first beam counts them.
+/// [`PrecomputedScans::COUNT_CYCLE`] mirror turns are equal, because the first beam counts them.
 #[derive(Clone, Debug)]
 pub struct PrecomputedScans {
     settings: (Variant, Unit, Mode),
@@ -324,7 +333,7 @@ pub struct Changes(Vec<(Nanos, usize)>);
 
 impl PrecomputedScans {
     /// Number of mirror turns after which the count of the first beam restarts: 54 s.
-    pub const CYCLE: u64 = 4_096;
+    pub const COUNT_CYCLE: u64 = 4_096;
 
     /// Measures `count` scans (at least one) of each of `rooms` (at least one) with `variant`, `unit` and `mode`. For a sensor
     /// with other settings, each scan is measured on demand.
@@ -347,10 +356,10 @@ impl PrecomputedScans {
         if (variant, unit, mode) != self.settings {
             return room.scan(variant, unit, mode, end_ns);
         }
-        let turn = end_ns / MIRROR_TURN;
-        let mixed = turn.wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 32;
+        let revolution = end_ns / MIRROR_PERIOD;
+        let mixed = revolution.wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 32;
         let mut words = scans[(mixed % scans.len() as u64) as usize].clone();
-        words[0] = COUNT_START + (turn % PrecomputedScans::CYCLE) as u16;
+        words[0] = COUNT_START + (revolution % PrecomputedScans::COUNT_CYCLE) as u16;
         words
     }
 
@@ -382,8 +391,8 @@ impl Changes {
     }
 
     fn at(&self, time_ns: Nanos) -> usize {
-        let begun = self.0.partition_point(|&(from, _)| from <= time_ns);
-        begun.checked_sub(1).map_or(0, |last| self.0[last].1)
+        let started = self.0.partition_point(|&(from, _)| from <= time_ns);
+        started.checked_sub(1).map_or(0, |last| self.0[last].1)
     }
 }
 
@@ -409,7 +418,7 @@ mod tests {
     }
 
     #[test]
-    fn the_same_seed_and_time_give_the_same_scan_and_truth() {
+    fn same_seed_and_time_give_same_scan_and_truth() {
         let (a, b) = (room("room", 7), room("room", 7));
         let look = |room: &Room, end_ns| room.labeled_scan(MM.0, MM.1, MM.2, end_ns);
         assert_eq!(look(&a, 5_000_000_000), look(&b, 5_000_000_000));

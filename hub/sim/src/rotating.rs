@@ -14,8 +14,8 @@ use crate::view::View;
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Rotation {
     /// Mean revolutions per second.
-    pub(crate) turns_per_second: f64,
-    wander: f64,
+    pub(crate) revolutions_per_second: f64,
+    speed_variation: f64,
     /// Time constant of the spin-up, in seconds; 0 means full speed at once.
     pub(crate) spin_up_s: f64,
     /// Angular frequency of the variation of the speed, in radians per second.
@@ -41,59 +41,65 @@ impl Rotation {
     /// Creates the rotation of a head with a mean speed of `turns_per_second` that varies by the share `wander`. The
     /// spin-up has a time constant of `spin_up_s` seconds; 0 means full speed at once. `seed` selects the first angle
     /// and the phase of the variation.
-    pub(crate) fn new(turns_per_second: f64, wander: f64, spin_up_s: f64, seed: u64) -> Rotation {
+    pub(crate) fn new(
+        revolutions_per_second: f64,
+        speed_variation: f64,
+        spin_up_s: f64,
+        seed: u64,
+    ) -> Rotation {
         let phase = TAU * fastrand::Rng::with_seed(seed).f64();
         // A head does not start at its zero.
         Rotation {
-            turns_per_second,
-            wander,
+            revolutions_per_second,
+            speed_variation,
             spin_up_s,
-            angular_frequency: TAU / WANDER_S,
+            angular_frequency: TAU / SPEED_VARIATION_PERIOD_S,
             phase,
             since: (0.0, phase / TAU),
         }
     }
 
     /// Changes the mean speed from `seconds` on. Earlier angles can no longer be queried.
-    pub(crate) fn set_speed(&mut self, seconds: f64, turns_per_second: f64) {
-        self.since = (seconds, self.turns(seconds));
-        self.turns_per_second = turns_per_second;
+    pub(crate) fn set_speed(&mut self, seconds: f64, revolutions_per_second: f64) {
+        self.since = (seconds, self.revolutions(seconds));
+        self.revolutions_per_second = revolutions_per_second;
     }
 
     /// Returns the number of revolutions until `seconds`, counted from the head's zero.
-    pub(crate) fn turns(&self, seconds: f64) -> f64 {
-        let (since, turned) = self.since;
+    pub(crate) fn revolutions(&self, seconds: f64) -> f64 {
+        let (since, revolutions_before) = self.since;
         let angle = |seconds: f64| (self.angular_frequency * seconds + self.phase).sin();
         let swing = (angle(seconds) - angle(since)) / self.angular_frequency;
-        let missed = self.spin_up_s * (self.still(since) - self.still(seconds));
-        self.turns_per_second * (seconds - since - missed + self.wander * swing) + turned
+        let missed = self.spin_up_s * (self.missing_share(since) - self.missing_share(seconds));
+        self.revolutions_per_second * (seconds - since - missed + self.speed_variation * swing)
+            + revolutions_before
     }
 
     /// Returns the revolutions per second at `seconds`.
     pub(crate) fn speed(&self, seconds: f64) -> f64 {
-        let wander = self.wander * (self.angular_frequency * seconds + self.phase).cos();
-        self.turns_per_second * (1.0 - self.still(seconds) + wander)
+        let wander = self.speed_variation * (self.angular_frequency * seconds + self.phase).cos();
+        self.revolutions_per_second * (1.0 - self.missing_share(seconds) + wander)
     }
 
     /// Returns the share of the speed that is still missing at `seconds`.
-    fn still(&self, seconds: f64) -> f64 {
+    fn missing_share(&self, seconds: f64) -> f64 {
         if self.spin_up_s > 0.0 { (-seconds / self.spin_up_s).exp() } else { 0.0 }
     }
 }
 
 /// Converts a clockwise angle from the head's zero to a counterclockwise angle: 0 is ahead, -180 to 180 degrees.
-pub(crate) fn ahead_deg(clockwise_deg: f64) -> f64 {
+pub(crate) fn counterclockwise_deg(clockwise_deg: f64) -> f64 {
     if clockwise_deg > 180.0 { 360.0 - clockwise_deg } else { -clockwise_deg }
 }
 
 /// Measures a room beam by beam.
 #[derive(Clone, Debug)]
-pub(crate) struct Beams {
+pub(crate) struct BeamSampler {
     room: Room,
     /// The static surroundings of the last beam. Each beam draws over it.
     view: Option<View>,
     /// The beams of each room of a series.
-    rooms: Vec<Beams>,
+    rooms: Vec<BeamSampler>,
 }
 
 /// Result of one beam.
@@ -109,15 +115,15 @@ pub(crate) struct BeamReading {
     pub(crate) signal: f64,
 }
 
-impl Beams {
-    pub(crate) fn new(room: Room) -> Beams {
+impl BeamSampler {
+    pub(crate) fn new(room: Room) -> BeamSampler {
         let rooms = match &room.view {
             RoomView::PrecomputedScans(series, _) => {
-                series.rooms().map(|room| Beams::new(room.clone())).collect()
+                series.rooms().map(|room| BeamSampler::new(room.clone())).collect()
             }
             _ => Vec::new(),
         };
-        Beams { room, view: None, rooms }
+        BeamSampler { room, view: None, rooms }
     }
 
     /// Measures the beam at `angle_deg` (0 ahead, counterclockwise, -180 to 180) at `at_ns`.
@@ -130,7 +136,7 @@ impl Beams {
         let all = |range_mm: Option<f64>| BeamReading {
             range_mm,
             exact_mm: range_mm,
-            intensity: PLAIN as u8,
+            intensity: PLAIN_INTENSITY as u8,
             signal: f64::INFINITY,
         };
         let world = match &self.room.view {
@@ -142,7 +148,7 @@ impl Beams {
             RoomView::Random => return all(Some(f64::from(random.u16(..12_000)))),
         };
         let view = self.view.get_or_insert_with(|| world.still().clone());
-        world.look_along(view, angle_deg, at_ns);
+        world.show_beam(view, angle_deg, at_ns);
         let angle_mdeg = (angle_deg * 1e3) as i32;
         let echo = echo(view, angle_mdeg, world.noise.spot, &rng);
         let (ray_mm, exact_mm) = view.exact(angle_deg);
@@ -152,16 +158,20 @@ impl Beams {
         let time_s = at_ns as f64 / 1e9;
         let sun = world.suns.iter().map(|sun| sun.share(angle_mdeg, time_s)).fold(0.0, f64::max);
         let range_mm = reported_range(world, &echo, sun, &rng).ok().map(|range_mm| range_mm + off_mm);
-        let plain = PLAIN * echo.signal.min(1.0).powf(0.25);
-        let intensity = if echo.bright > 0.0 { plain.max(REFLECTOR * echo.bright) } else { plain };
+        let plain = PLAIN_INTENSITY * echo.signal.min(1.0).powf(0.25);
+        let intensity = if echo.reflector_share > 0.0 {
+            plain.max(REFLECTOR_INTENSITY * echo.reflector_share)
+        } else {
+            plain
+        };
         let signal = if world.noise != NoiseModel::NONE { echo.signal } else { f64::INFINITY };
         BeamReading { range_mm, exact_mm, intensity: range_mm.map_or(0, |_| intensity as u8), signal }
     }
 }
 
 /// Period of the variation of the speed, in seconds.
-const WANDER_S: f64 = 7.3;
+const SPEED_VARIATION_PERIOD_S: f64 = 7.3;
 /// Intensity of a plain surface nearby. The manual of the LD06 has 228 to 233 at 0.2 m.
-const PLAIN: f64 = 230.0;
+const PLAIN_INTENSITY: f64 = 230.0;
 /// Intensity of a reflector.
-const REFLECTOR: f64 = 255.0;
+const REFLECTOR_INTENSITY: f64 = 255.0;

@@ -15,13 +15,13 @@ use scanhub_schema::{MILLIS, Nanos};
 
 use crate::device::{Chunk, Device};
 use crate::device::{ChunkSize, TxQueue};
-use crate::fault::{Faults, Window};
+use crate::fault::{FaultWindow, Faults};
 use crate::machine::ProtocolQuirks;
 use crate::request_decoder::Arrival;
 use crate::room::Room;
-use crate::rotating::{BeamReading, Beams, Rotation, TruePoint, ahead_deg};
+use crate::rotating::{BeamReading, BeamSampler, Rotation, TruePoint, counterclockwise_deg};
 use protocol::{Decoder, Motor, Reading, Request};
-pub use protocol::{Form, Mode, Model};
+pub use protocol::{Mode, Model, PacketFormat};
 
 /// Settings of a scanner at the start of a simulation.
 #[derive(Clone, Debug)]
@@ -33,9 +33,9 @@ pub struct RplidarSettings {
     /// Number of the mode that the scanner recommends; by default that of the model.
     pub typical: usize,
     /// Mean revolutions per second; by default those of the model.
-    pub turns_per_second: f64,
+    pub revolutions_per_second: f64,
     /// Share by which the speed varies.
-    pub wander: f64,
+    pub speed_variation: f64,
     /// State at time 0.
     pub start: RplidarStart,
     /// Time from power-on to the boot message.
@@ -43,7 +43,7 @@ pub struct RplidarSettings {
     /// Status and code that the scanner reports. A status of 2 is an error, in which it does not measure.
     pub health: (u8, u16),
     /// Whether the status remains after a RESET.
-    pub stubborn: bool,
+    pub keeps_health: bool,
     /// Deviations from the manual. Those that only an LMS has are ignored.
     pub quirks: ProtocolQuirks,
     /// Faults of the scanner: times at which something holds its head.
@@ -72,12 +72,12 @@ impl RplidarSettings {
             model,
             id: model.id(),
             typical: model.typical(),
-            turns_per_second: model.turns_per_second(),
-            wander: 0.005,
+            revolutions_per_second: model.revolutions_per_second(),
+            speed_variation: 0.005,
             start: RplidarStart::Idle,
             boot_ns: 2_000 * MILLIS,
             health: (0, 0),
-            stubborn: false,
+            keeps_health: false,
             quirks: ProtocolQuirks::default(),
             faults: Faults::default(),
             chunk: ChunkSize::Uart,
@@ -98,12 +98,12 @@ pub struct RplidarSimulator {
     stream: Option<Stream>,
     health: (u8, u16),
     /// Time of the boot message; `None` after the start-up.
-    boots_ns: Option<Nanos>,
+    boot_at_ns: Option<Nanos>,
     /// Time from which on the scanner receives requests.
     receives_from_ns: Nanos,
-    stalls: Window,
+    stalls: FaultWindow,
     /// Motion of the motor to resume, while something holds the head.
-    held: Option<Option<Motion>>,
+    held_motion: Option<Option<Motion>>,
     writes: u64,
 }
 
@@ -119,10 +119,10 @@ impl RplidarSimulator {
             motor: None,
             stream: None,
             health,
-            boots_ns: None,
+            boot_at_ns: None,
             receives_from_ns: 0,
-            stalls: Window::held(&settings.faults, seed),
-            held: None,
+            stalls: FaultWindow::stalls(&settings.faults, seed),
+            held_motion: None,
             writes: 0,
             settings,
         };
@@ -135,7 +135,7 @@ impl RplidarSimulator {
                 simulator.motor = turns.then(|| Motion { steady_ns: 0, ..simulator.motion(0, 1.0) });
                 simulator.motor.iter_mut().for_each(|motion| motion.rotation.spin_up_s = 0.0);
                 if start == RplidarStart::Streaming {
-                    simulator.measure(model.modes()[simulator.settings.typical], false, 0);
+                    simulator.start_stream(model.modes()[simulator.settings.typical], false, 0);
                 }
             }
         }
@@ -144,7 +144,7 @@ impl RplidarSimulator {
 
     /// Returns point number `point` of the present stream, without noise. Returns `None` before the first point.
     pub fn truth(&mut self, point: u64) -> Option<TruePoint> {
-        let (at_ns, head_deg) = self.stream?.place(point, self.motor)?;
+        let (at_ns, head_deg) = self.stream?.time_and_angle(point, self.motor)?;
         Some(self.optics.truth(at_ns, head_deg))
     }
 
@@ -166,17 +166,17 @@ impl RplidarSimulator {
     }
 
     /// Returns the mean revolutions per second of the motor, or `None` while it is off.
-    pub fn turns_per_second(&self) -> Option<f64> {
-        Some(self.motor?.rotation.turns_per_second)
+    pub fn revolutions_per_second(&self) -> Option<f64> {
+        Some(self.motor?.rotation.revolutions_per_second)
     }
 
     /// Changes the speed of a motor that is on, from the next packet of the stream on. The caller has to simulate the
     /// inertia of a real head.
-    pub fn set_speed(&mut self, turns_per_second: f64) {
+    pub fn set_speed(&mut self, revolutions_per_second: f64) {
         let next = self.stream.and_then(|stream| stream.next_ns(self.motor));
         if let (Some(motor), Some(next_ns)) = (&mut self.motor, next) {
             let seconds = next_ns.saturating_sub(motor.since_ns) as f64 / 1e9;
-            motor.rotation.set_speed(seconds, turns_per_second);
+            motor.rotation.set_speed(seconds, revolutions_per_second);
         }
     }
 
@@ -187,53 +187,55 @@ impl RplidarSimulator {
 
     /// Holds the head from `now` on for `span`.
     pub fn hold(&mut self, now: Nanos, span: Nanos) {
-        self.stalls = Window::once(now, span);
+        self.stalls = FaultWindow::once(now, span);
     }
 
     /// Changes the reported status and code. They remain after a RESET if `stubborn` is set. A status of 2 ends a
     /// stream.
     pub fn set_health(&mut self, now: Nanos, health: (u8, u16), stubborn: bool) {
-        (self.health, self.settings.stubborn) = (health, stubborn);
-        if health.0 == ERROR {
+        (self.health, self.settings.keeps_health) = (health, stubborn);
+        if health.0 == HEALTH_ERROR {
             self.end_stream(now);
         }
     }
 
     /// Returns the motion of a motor that starts at `now`, with this share of its usual speed.
     fn motion(&self, now: Nanos, share: f64) -> Motion {
-        let RplidarSettings { turns_per_second, wander, seed, .. } = self.settings;
+        let RplidarSettings {
+            revolutions_per_second: turns_per_second, speed_variation: wander, seed, ..
+        } = self.settings;
         let turns_per_second = turns_per_second * share;
-        let rotation = Rotation::new(turns_per_second, wander, SPIN_UP_S, seed);
-        Motion { since_ns: now, steady_ns: now + STEADY_NS, rotation }
+        let rotation = Rotation::new(turns_per_second, wander, SPIN_UP_TIME_S, seed);
+        Motion { since_ns: now, steady_ns: now + SETTLE_TIME_NS, rotation }
     }
 
     /// Changes the motion of the motor. The present stream restarts.
-    fn turn(&mut self, motion: Option<Motion>) {
+    fn set_motion(&mut self, motion: Option<Motion>) {
         self.motor = motion;
         if let Some(stream) = self.stream.filter(|stream| !stream.forced) {
-            self.measure(stream.mode, false, stream.asked_ns);
+            self.start_stream(stream.mode, false, stream.requested_ns);
         }
     }
 
-    /// Starts a stream in `mode` that was requested at `asked_ns`, as soon as the speed of the motor is steady.
-    fn measure(&mut self, mode: Mode, forced: bool, asked_ns: Nanos) {
-        self.stream = Some(Stream::new(self.settings.model, mode, forced, asked_ns, self.motor));
+    /// Starts a stream in `mode` that was requested at `requested_ns`, as soon as the speed of the motor is steady.
+    fn start_stream(&mut self, mode: Mode, forced: bool, requested_ns: Nanos) {
+        self.stream = Some(Stream::new(self.settings.model, mode, forced, requested_ns, self.motor));
     }
 
     fn end_stream(&mut self, now: Nanos) {
         if self.stream.take().is_some() {
-            self.tx_queue.forget_data(now);
+            self.tx_queue.drop_data(now);
         }
     }
 
     /// Restarts the scanner. The boot message is sent after `span`.
     fn restart(&mut self, now: Nanos, span: Nanos) -> bool {
-        let broken = self.tx_queue.break_off(now);
+        let broken = self.tx_queue.abort(now);
         self.stream = None;
         self.decoder.forget();
-        self.boots_ns = Some(now + span);
+        self.boot_at_ns = Some(now + span);
         self.receives_from_ns = Nanos::MAX;
-        if !self.settings.stubborn {
+        if !self.settings.keeps_health {
             self.health = (0, 0);
         }
         broken
@@ -241,21 +243,22 @@ impl RplidarSimulator {
 
     /// Carries out everything that is due by `now`.
     fn advance(&mut self, now: Nanos) {
-        if self.boots_ns.is_some_and(|at| at <= now) {
-            let at_ns = self.boots_ns.take().unwrap_or(now);
+        if self.boot_at_ns.is_some_and(|at| at <= now) {
+            let at_ns = self.boot_at_ns.take().unwrap_or(now);
             self.tx_queue.send(protocol::boot_message(self.settings.model, self.settings.id), at_ns, true);
             self.receives_from_ns = self.tx_queue.free_ns() + BOOT_TO_REQUEST_NS;
         }
-        match (self.stalls.holds(now), self.held) {
+        match (self.stalls.is_active(now), self.held_motion) {
             (true, None) => {
-                self.held = Some(self.motor);
-                self.turn(None);
+                self.held_motion = Some(self.motor);
+                self.set_motion(None);
             }
-            (false, Some(before)) => {
-                self.held = None;
-                let usual = self.settings.turns_per_second;
-                let again = before.map(|before| self.motion(now, before.rotation.turns_per_second / usual));
-                self.turn(again);
+            (false, Some(previous)) => {
+                self.held_motion = None;
+                let usual = self.settings.revolutions_per_second;
+                let motion = previous
+                    .map(|previous| self.motion(now, previous.rotation.revolutions_per_second / usual));
+                self.set_motion(motion);
             }
             _ => {}
         }
@@ -269,7 +272,7 @@ impl RplidarSimulator {
     }
 
     fn reply(&mut self, telegram: Vec<u8>, now: Nanos) {
-        let ProtocolQuirks { late_reply_ns, doubles, .. } = self.settings.quirks;
+        let ProtocolQuirks { late_reply_ns, doubled_share: doubles, .. } = self.settings.quirks;
         let copies = if self.random.f64() < doubles { 2 } else { 1 };
         for _ in 0..copies {
             self.tx_queue.send(telegram.clone(), now + RESPONSE_DELAY_NS + late_reply_ns, true);
@@ -289,17 +292,18 @@ impl RplidarSimulator {
             Request::Reset => {
                 self.restart(now, RESTART_NS);
             }
-            Request::Scan => self.begin(0, false, now),
-            Request::Force => self.begin(0, true, now),
+            Request::Scan => self.start_mode(0, false, now),
+            Request::Force => self.start_mode(0, true, now),
             // Number 0 selects the first express mode, for hosts without support for other modes.
             Request::Express(0) => {
-                let first = model.modes().iter().position(|mode| mode.form == Form::Express);
-                self.begin(first.unwrap_or(1), false, now);
+                let first = model.modes().iter().position(|mode| mode.form == PacketFormat::Express);
+                self.start_mode(first.unwrap_or(1), false, now);
             }
-            Request::Express(number) => self.begin(usize::from(number), false, now),
+            Request::Express(number) => self.start_mode(usize::from(number), false, now),
             Request::Info => self.reply(protocol::info(model, self.settings.id, self.settings.seed), now),
             Request::Health => {
-                let (status, code) = if self.held.is_some() { (ERROR, HELD) } else { self.health };
+                let (status, code) =
+                    if self.held_motion.is_some() { (HEALTH_ERROR, HELD_CODE) } else { self.health };
                 self.reply(protocol::health(status, code), now);
             }
             Request::SampleRate => self.reply(protocol::sample_rate(model), now),
@@ -310,44 +314,44 @@ impl RplidarSimulator {
             }
             Request::SetConfiguration(key) => {
                 self.writes += 1;
-                self.reply(protocol::is_set(key), now);
+                self.reply(protocol::configuration_stored(key), now);
             }
             Request::Pwm(duty) if model.motor() == Motor::Pwm => {
-                self.steer(f64::from(duty) / f64::from(protocol::PWM), now);
+                self.set_speed_share(f64::from(duty) / f64::from(protocol::DEFAULT_PWM), now);
             }
             Request::Rpm(rpm) if model.motor() == Motor::Rpm => {
-                self.steer(f64::from(rpm) / (60.0 * model.turns_per_second()), now);
+                self.set_speed_share(f64::from(rpm) / (60.0 * model.revolutions_per_second()), now);
             }
             Request::Pwm(_) | Request::Rpm(_) => {}
             Request::Board => {
                 if model.motor() != Motor::Rpm {
-                    self.reply(protocol::board(model.motor() == Motor::Pwm), now);
+                    self.reply(protocol::accessory_board(model.motor() == Motor::Pwm), now);
                 }
             }
         }
     }
 
     /// Starts a stream in mode `number`, if the model has this mode and the scanner is not in error.
-    fn begin(&mut self, number: usize, forced: bool, now: Nanos) {
+    fn start_mode(&mut self, number: usize, forced: bool, now: Nanos) {
         let Some(&mode) = self.settings.model.modes().get(number) else { return };
-        if self.health.0 == ERROR {
+        if self.health.0 == HEALTH_ERROR {
             return;
         }
         self.reply(protocol::stream_descriptor(&mode), now);
-        self.measure(mode, forced, self.tx_queue.free_ns());
+        self.start_stream(mode, forced, self.tx_queue.free_ns());
     }
 
     /// Sets the speed of the motor to this share of its usual speed.
-    fn steer(&mut self, share: f64, now: Nanos) {
-        let wanted = (share > 0.0).then(|| self.motion(now, share));
-        let speed = |motion: Motion| motion.rotation.turns_per_second;
-        let motor = self.held.unwrap_or(self.motor);
-        if wanted.map(speed) == motor.map(speed) {
+    fn set_speed_share(&mut self, share: f64, now: Nanos) {
+        let motion = (share > 0.0).then(|| self.motion(now, share));
+        let speed = |motion: Motion| motion.rotation.revolutions_per_second;
+        let motor = self.held_motion.unwrap_or(self.motor);
+        if motion.map(speed) == motor.map(speed) {
             return;
         }
-        match &mut self.held {
-            Some(held) => *held = wanted,
-            None => self.turn(wanted),
+        match &mut self.held_motion {
+            Some(held) => *held = motion,
+            None => self.set_motion(motion),
         }
     }
 }
@@ -361,8 +365,8 @@ impl Device for RplidarSimulator {
     fn poll_timeout(&self) -> Option<Nanos> {
         let data_ns = self.tx_queue.next_ns().or_else(|| self.stream?.due_ns(self.motor));
         // While the head is held, the end of the window is still ahead.
-        let held_ns = self.stalls.next_ns(if self.held.is_some() { 0 } else { Nanos::MAX });
-        let times = [data_ns, self.boots_ns, Some(held_ns)];
+        let held_ns = self.stalls.next_ns(if self.held_motion.is_some() { 0 } else { Nanos::MAX });
+        let times = [data_ns, self.boot_at_ns, Some(held_ns)];
         times.into_iter().flatten().filter(|&at| at < Nanos::MAX).min()
     }
 
@@ -372,7 +376,7 @@ impl Device for RplidarSimulator {
             return;
         }
         let Some(request) = self.decoder.receive(byte) else { return };
-        let ProtocolQuirks { mute, overlooks, .. } = self.settings.quirks;
+        let ProtocolQuirks { is_mute: mute, overlooked_share: overlooks, .. } = self.settings.quirks;
         let is_overlooked = self.random.f64() < overlooks;
         if !mute && !is_overlooked {
             self.handle_request(request, now);
@@ -383,7 +387,7 @@ impl Device for RplidarSimulator {
         let broken = self.restart(now, self.settings.boot_ns);
         let turns = self.settings.model.motor() != Motor::Pwm;
         let motion = turns.then(|| self.motion(now, 1.0));
-        match &mut self.held {
+        match &mut self.held_motion {
             Some(held) => *held = motion,
             None => self.motor = motion,
         }
@@ -395,8 +399,8 @@ impl Device for RplidarSimulator {
         self.restart(now, RESTART_NS)
     }
 
-    fn break_off(&mut self, now: Nanos) {
-        self.tx_queue.break_off(now);
+    fn abort(&mut self, now: Nanos) {
+        self.tx_queue.abort(now);
     }
 
     fn rate(&self) -> u32 {
@@ -433,7 +437,7 @@ struct Stream {
     /// Whether the scanner measures at any speed of the motor.
     forced: bool,
     /// Time of the request.
-    asked_ns: Nanos,
+    requested_ns: Nanos,
     /// Time of the first point; `None` while the motor is off.
     begin_ns: Option<Nanos>,
     /// Time from one point to the next.
@@ -443,21 +447,22 @@ struct Stream {
 }
 
 impl Stream {
-    /// Creates a stream of `model` in `mode` that was requested at `asked_ns`. It starts as soon as `motor` is steady,
+    /// Creates a stream of `model` in `mode` that was requested at `requested_ns`. It starts as soon as `motor` is steady,
     /// or at once if it is `forced`.
-    fn new(model: Model, mode: Mode, forced: bool, asked_ns: Nanos, motor: Option<Motion>) -> Stream {
+    fn new(model: Model, mode: Mode, forced: bool, requested_ns: Nanos, motor: Option<Motion>) -> Stream {
         let steady_ns = if forced { Some(0) } else { motor.map(|motion| motion.steady_ns) };
-        let begin_ns = steady_ns.map(|steady_ns| steady_ns.max(asked_ns));
-        let sample_ns = 1e3 * mode.sample_us * model.slowness();
-        Stream { mode, forced, asked_ns, begin_ns, sample_ns, sent: 0 }
+        let begin_ns = steady_ns.map(|steady_ns| steady_ns.max(requested_ns));
+        let sample_ns = 1e3 * mode.sample_us * model.clock_ratio();
+        Stream { mode, forced, requested_ns, begin_ns, sample_ns, sent: 0 }
     }
 
     /// Returns the time of point number `point`, and the clockwise angle of the head from its zero at this time, in
     /// degrees.
-    fn place(&self, point: u64, motor: Option<Motion>) -> Option<(Nanos, f64)> {
+    fn time_and_angle(&self, point: u64, motor: Option<Motion>) -> Option<(Nanos, f64)> {
         let at_ns = self.begin_ns? + (point as f64 * self.sample_ns) as Nanos;
-        let turns = motor
-            .map_or(0.0, |motion| motion.rotation.turns(at_ns.saturating_sub(motion.since_ns) as f64 / 1e9));
+        let turns = motor.map_or(0.0, |motion| {
+            motion.rotation.revolutions(at_ns.saturating_sub(motion.since_ns) as f64 / 1e9)
+        });
         Some((at_ns, turns.fract() * 360.0))
     }
 
@@ -468,15 +473,15 @@ impl Stream {
 
     /// Returns the time of the first point of the next packet.
     fn next_ns(&self, motor: Option<Motion>) -> Option<Nanos> {
-        self.place(self.sent * self.mode.form.points() as u64, motor).map(|(at_ns, _)| at_ns)
+        self.time_and_angle(self.sent * self.mode.form.points() as u64, motor).map(|(at_ns, _)| at_ns)
     }
 
     /// Returns the time at which the next packet has all its points.
     fn due_ns(&self, motor: Option<Motion>) -> Option<Nanos> {
         let points = self.mode.form.points() as u64 * (self.sent + 1);
         // Ranges that are sent as a difference from the first range of the next packet wait for it.
-        let last = if self.mode.form == Form::Ultra { points } else { points - 1 };
-        self.place(last, motor).map(|(at_ns, _)| at_ns)
+        let last = if self.mode.form == PacketFormat::Ultra { points } else { points - 1 };
+        self.time_and_angle(last, motor).map(|(at_ns, _)| at_ns)
     }
 
     /// Returns the next packet, with points that `optics` measures.
@@ -486,23 +491,23 @@ impl Stream {
         let first = self.sent * form.points() as u64;
         let mut readings = Vec::with_capacity(form.points() + 1);
         for point in first..=first + form.points() as u64 {
-            let (at_ns, head_deg) = self.place(point, motor)?;
-            let before = point.checked_sub(1).and_then(|point| self.place(point, motor));
+            let (at_ns, head_deg) = self.time_and_angle(point, motor)?;
+            let before = point.checked_sub(1).and_then(|point| self.time_and_angle(point, motor));
             let begins_turn = before.is_some_and(|(_, before_deg)| before_deg > head_deg);
-            let is_needed = form == Form::Ultra || readings.len() < form.points();
+            let is_needed = form == PacketFormat::Ultra || readings.len() < form.points();
             let reading =
                 if is_needed { optics.measure(at_ns, head_deg, reach_m) } else { Reading::default() };
-            readings.push(Reading { begins_turn, ..reading });
+            readings.push(Reading { begins_revolution: begins_turn, ..reading });
         }
         let next = readings.pop()?;
         let is_first = self.sent == 0;
         self.sent += 1;
         Some(match form {
-            Form::Standard => protocol::standard(&readings[0]),
-            Form::Express => protocol::express(is_first, &readings),
-            Form::Ultra => protocol::ultra(is_first, &readings, &next),
-            Form::Dense => protocol::dense(is_first, &readings),
-            Form::UltraDense => protocol::ultra_dense(is_first, clock_us, &readings),
+            PacketFormat::Standard => protocol::standard(&readings[0]),
+            PacketFormat::Express => protocol::express(is_first, &readings),
+            PacketFormat::Ultra => protocol::ultra(is_first, &readings, &next),
+            PacketFormat::Dense => protocol::dense(is_first, &readings),
+            PacketFormat::UltraDense => protocol::ultra_dense(is_first, clock_us, &readings),
         })
     }
 }
@@ -511,28 +516,28 @@ impl Stream {
 /// strongly that reflects.
 struct Optics {
     model: Model,
-    beams: Beams,
+    beams: BeamSampler,
     seed: u64,
 }
 
 impl Optics {
     pub(crate) fn new(model: Model, room: Room, seed: u64) -> Optics {
-        Optics { model, beams: Beams::new(room), seed }
+        Optics { model, beams: BeamSampler::new(room), seed }
     }
 
     /// Returns the point at `at_ns` with the head at `head_deg`, without noise.
     pub(crate) fn truth(&mut self, at_ns: Nanos, head_deg: f64) -> TruePoint {
-        let (clockwise_deg, beam) = self.meet(at_ns, head_deg);
+        let (clockwise_deg, beam) = self.hit(at_ns, head_deg);
         TruePoint { at_ns, clockwise_deg, range_mm: beam.and_then(|beam| beam.exact_mm) }
     }
 
     /// Returns the reading at `at_ns` with the head at `head_deg`, in a mode with a maximum range of `reach_m` meters.
     pub(crate) fn measure(&mut self, at_ns: Nanos, head_deg: f64, reach_m: f64) -> Reading {
-        let (clockwise_deg, beam) = self.meet(at_ns, head_deg);
+        let (clockwise_deg, beam) = self.hit(at_ns, head_deg);
         let shift_deg = self.shift_without_return_deg(at_ns);
         let no_return =
             Reading { head_deg, clockwise_deg: (head_deg - shift_deg + 360.0) % 360.0, ..Reading::default() };
-        let Some(beam) = beam.filter(|beam| self.returns(at_ns, clockwise_deg, beam)) else {
+        let Some(beam) = beam.filter(|beam| self.has_return(at_ns, clockwise_deg, beam)) else {
             return no_return;
         };
         let is_in_reach = |mm: &f64| self.model.reach_mm().contains(mm) && *mm <= 1e3 * reach_m;
@@ -544,22 +549,22 @@ impl Optics {
 
     /// Returns the clockwise angle of the point that the laser hits, in degrees from the head's zero, and its reading.
     /// There is no reading if the formula has no solution.
-    fn meet(&mut self, at_ns: Nanos, head_deg: f64) -> (f64, Option<BeamReading>) {
-        let mut measure = |clockwise_deg: f64| self.beams.measure(at_ns, ahead_deg(clockwise_deg));
+    fn hit(&mut self, at_ns: Nanos, head_deg: f64) -> (f64, Option<BeamReading>) {
+        let mut measure = |clockwise_deg: f64| self.beams.measure(at_ns, counterclockwise_deg(clockwise_deg));
         if !self.model.triangulates() {
             return (head_deg, Some(measure(head_deg)));
         }
-        let behind = |range_mm: Option<f64>| (head_deg - shift_deg(range_mm) + 360.0) % 360.0;
-        let mut clockwise_deg = behind(Some(FAR_MM));
+        let angle_behind = |range_mm: Option<f64>| (head_deg - shift_deg(range_mm) + 360.0) % 360.0;
+        let mut clockwise_deg = angle_behind(Some(START_RANGE_MM));
         for _ in 0..MAX_ITERATIONS {
             let beam = measure(clockwise_deg);
-            let met_deg = behind(beam.exact_mm);
-            if met_deg == clockwise_deg {
+            let hit_deg = angle_behind(beam.exact_mm);
+            if hit_deg == clockwise_deg {
                 return (clockwise_deg, Some(beam));
             }
-            clockwise_deg = met_deg;
+            clockwise_deg = hit_deg;
         }
-        (behind(None), None)
+        (angle_behind(None), None)
     }
 
     /// Returns the reported shift of a point without a return, in degrees. A real A1 reports 12 % of its points out of
@@ -569,19 +574,19 @@ impl Optics {
             return 0.0;
         }
         let mut random = fastrand::Rng::with_seed(!self.seed ^ at_ns);
-        if random.f64() < ASTRAY { 2.0 + 7.0 * random.f64() } else { shift_deg(None) }
+        if random.f64() < STRAY_SHARE { 2.0 + 7.0 * random.f64() } else { shift_deg(None) }
     }
 
     /// Returns whether the echo is strong enough. Indoors, scanners that triangulate lose most points: those of dark, far
     /// or oblique surfaces. The direction of a patch of surface determines how dark it is.
-    fn returns(&self, at_ns: Nanos, clockwise_deg: f64, beam: &BeamReading) -> bool {
+    fn has_return(&self, at_ns: Nanos, clockwise_deg: f64, beam: &BeamReading) -> bool {
         if !self.model.triangulates() {
             return true;
         }
         let patch = (clockwise_deg / PATCH_DEG) as u64;
         let dark = fastrand::Rng::with_seed(self.seed ^ patch.wrapping_mul(0x9E37_79B9_7F4A_7C15)).f64();
-        let dice = fastrand::Rng::with_seed(self.seed ^ at_ns).f64();
-        beam.signal * (0.75 + 0.5 * dice) > MIN_SIGNAL * DARKEST.powf(dark)
+        let noise = fastrand::Rng::with_seed(self.seed ^ at_ns).f64();
+        beam.signal * (0.75 + 0.5 * noise) > MIN_SIGNAL * MAX_DARKNESS.powf(dark)
     }
 }
 
@@ -599,9 +604,9 @@ fn shift_deg(range_mm: Option<f64>) -> f64 {
 }
 
 /// Health status of a scanner that does not measure.
-const ERROR: u8 = 2;
+const HEALTH_ERROR: u8 = 2;
 /// Health code while something holds the head. It is invented, because the real ones are not published.
-const HELD: u16 = 0x0001;
+const HELD_CODE: u16 = 0x0001;
 /// Time from RESET to the boot message, as measured on a real A1.
 const RESTART_NS: Nanos = 671 * MILLIS;
 /// Time from the boot message to the first request that the scanner receives, as measured on a real A1.
@@ -609,18 +614,18 @@ const BOOT_TO_REQUEST_NS: Nanos = 4 * MILLIS;
 /// Time from a request to its response.
 const RESPONSE_DELAY_NS: Nanos = MILLIS;
 /// Time constant of the motor's spin-up, in seconds.
-const SPIN_UP_S: f64 = 0.4;
+const SPIN_UP_TIME_S: f64 = 0.4;
 /// Time after which the speed of the motor is steady enough to measure.
-const STEADY_NS: Nanos = 1_600 * MILLIS;
+const SETTLE_TIME_NS: Nanos = 1_600 * MILLIS;
 /// Share of the points without a return that are reported anywhere from 2 to 9 degrees behind the head.
-const ASTRAY: f64 = 0.27;
+const STRAY_SHARE: f64 = 0.27;
 /// Range at which the search for a point begins, in millimeters.
-const FAR_MM: f64 = 3_000.0;
+const START_RANGE_MM: f64 = 3_000.0;
 /// Maximum number of steps of this search.
 const MAX_ITERATIONS: usize = 6;
 /// Width of a patch of surface that is equally dark, in degrees.
 const PATCH_DEG: f64 = 2.0;
 /// Minimum signal for a return from the brightest surfaces, relative to a white surface at 1 m. The darkest surfaces
-/// need [`DARKEST`] times as much. With these values, 61 to 84 % of the points indoors are invalid, as on a real A1.
+/// need [`MAX_DARKNESS`] times as much. With these values, 61 to 84 % of the points indoors are invalid, as on a real A1.
 const MIN_SIGNAL: f64 = 0.003;
-const DARKEST: f64 = 20_000.0;
+const MAX_DARKNESS: f64 = 20_000.0;

@@ -15,7 +15,7 @@ pub struct Scene {
     pub(crate) sensors: Vec<Sensor>,
     pub(crate) noise: NoiseModel,
     pub(crate) objects: Vec<Object>,
-    pub(crate) people: Vec<Plan>,
+    pub(crate) people: Vec<PersonSpec>,
     pub(crate) suns: Vec<Sun>,
 }
 
@@ -54,7 +54,7 @@ pub(crate) struct Object {
     pub(crate) from_s: f64,
     pub(crate) until_s: f64,
     /// Moves while the object is present, in the order of time. They do not overlap.
-    pub(crate) moves: Vec<Move>,
+    pub(crate) moves: Vec<Movement>,
     /// Time after which all moves start again, in seconds. They end where they began, and within this time.
     pub(crate) repeat_s: Option<f64>,
     /// Maximum distance by which the seed moves the object along each axis.
@@ -63,10 +63,10 @@ pub(crate) struct Object {
 
 /// A move of an object, at a constant speed from one time to another.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Move {
+pub(crate) struct Movement {
     pub(crate) from_s: f64,
     pub(crate) until_s: f64,
-    pub(crate) by: Pose,
+    pub(crate) offset: Pose,
 }
 
 /// A sun that dazzles a sector of a sensor.
@@ -97,7 +97,7 @@ impl Object {
     /// the object has been there from the start, and `time_s` while it moves.
     pub(crate) fn at(&self, time_s: f64) -> Option<Presence> {
         let start = Presence { pose: self.pose, since_s: self.from_s.max(0.0) };
-        let last = |_, way: Presence| way;
+        let last = |_, presence: Presence| presence;
         (self.from_s..self.until_s)
             .contains(&time_s)
             .then(|| self.poses(time_s, self.round(time_s)).fold(start, last))
@@ -105,19 +105,19 @@ impl Object {
 
     /// Returns the poses that the object had before `time_s` and has left. If the moves repeat, only the present and
     /// the last round count.
-    pub(crate) fn left(&self, time_s: f64) -> Vec<Presence> {
+    pub(crate) fn previous_presences(&self, time_s: f64) -> Vec<Presence> {
         let round = self.round(time_s);
         let rounds = if round > 0.0 { vec![round - 1.0, round] } else { vec![round] };
-        let mut left = Vec::new();
+        let mut presences = Vec::new();
         let mut pose = self.pose;
         for next in rounds.into_iter().flat_map(|round| self.poses(time_s, round)) {
-            left.push(Presence { pose, since_s: next.since_s });
+            presences.push(Presence { pose, since_s: next.since_s });
             pose = next.pose;
         }
         if self.until_s <= time_s {
-            left.push(Presence { pose, since_s: self.until_s });
+            presences.push(Presence { pose, since_s: self.until_s });
         }
-        left
+        presences
     }
 
     /// Returns how often the moves have been repeated at `time_s`.
@@ -132,22 +132,22 @@ impl Object {
     /// each of them: `time_s` for a move that is not over.
     fn poses(&self, time_s: f64, round: f64) -> impl Iterator<Item = Presence> {
         let offset_s = round * self.repeat_s.unwrap_or(0.0);
-        let begun = self.moves.iter().take_while(move |way| way.from_s + offset_s <= time_s);
-        begun.scan(self.pose, move |pose, way| {
-            *pose = moved(*pose, way, time_s - offset_s);
-            Some(Presence { pose: *pose, since_s: (way.until_s + offset_s).min(time_s) })
+        let started = self.moves.iter().take_while(move |movement| movement.from_s + offset_s <= time_s);
+        started.scan(self.pose, move |pose, movement| {
+            *pose = moved(*pose, movement, time_s - offset_s);
+            Some(Presence { pose: *pose, since_s: (movement.until_s + offset_s).min(time_s) })
         })
     }
 }
 
 /// Returns the pose at `time_s` of an object that was at `pose` before the move `way`.
-fn moved(pose: Pose, way: &Move, time_s: f64) -> Pose {
-    let lasts_s = way.until_s - way.from_s;
-    let share = if lasts_s > 0.0 { ((time_s - way.from_s) / lasts_s).clamp(0.0, 1.0) } else { 1.0 };
+fn moved(pose: Pose, movement: &Movement, time_s: f64) -> Pose {
+    let lasts_s = movement.until_s - movement.from_s;
+    let share = if lasts_s > 0.0 { ((time_s - movement.from_s) / lasts_s).clamp(0.0, 1.0) } else { 1.0 };
     Pose {
-        x_mm: pose.x_mm + share * way.by.x_mm,
-        y_mm: pose.y_mm + share * way.by.y_mm,
-        turn_deg: pose.turn_deg + share * way.by.turn_deg,
+        x_mm: pose.x_mm + share * movement.offset.x_mm,
+        y_mm: pose.y_mm + share * movement.offset.y_mm,
+        turn_deg: pose.turn_deg + share * movement.offset.turn_deg,
     }
 }
 
@@ -163,9 +163,9 @@ impl Sun {
 
 /// Description of a person in a scene.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Plan {
+pub(crate) struct PersonSpec {
     /// Path of the person.
-    pub(crate) way: Way,
+    pub(crate) path: WalkPath,
     /// Time at which the person appears.
     pub(crate) from_s: f64,
     /// Time at which the person disappears.
@@ -178,7 +178,7 @@ pub(crate) struct Plan {
 
 /// Path of a person.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) enum Way {
+pub(crate) enum WalkPath {
     /// A closed curve within `reach` of `centre` that the seed selects.
     Roam { centre: Point, reach: Point },
     /// A polyline of corners, with a rest at each. After the last corner, the person disappears, or walks to the first
@@ -191,7 +191,7 @@ pub(crate) enum Way {
 pub(crate) struct Corner {
     pub(crate) point: Point,
     /// Time that the person spends there, in seconds.
-    pub(crate) rest_s: f64,
+    pub(crate) pause_s: f64,
     /// Direction that the person faces if they sit there, in degrees counterclockwise from x.
     pub(crate) seat_deg: Option<f64>,
 }
@@ -202,7 +202,7 @@ pub(crate) enum Speed {
     /// The seed draws a speed between two bounds, in millimeters per second.
     Between(f64, f64),
     /// The person reaches the end of the path, after all rests, when they have to disappear.
-    InTime,
+    ToEnd,
 }
 
 /// A person whose path a seed has drawn.
@@ -219,7 +219,7 @@ pub(crate) struct Person {
 #[derive(Clone, Debug)]
 enum Course {
     /// `pace` is the number of cycles per second along the two axes.
-    Roam { centre: Point, reach: Point, pace: Point, phase: Point },
+    Roam { centre: Point, reach: Point, frequency: Point, phase: Point },
     /// Time, position and distance walked at each corner, before and after the rest. If the path `repeats`, those of
     /// one lap.
     Path { knots: Vec<(f64, Point, f64)>, seats: Vec<Seat>, repeats: bool },
@@ -242,9 +242,9 @@ impl Seat {
 
 /// Pose of a body.
 struct BodyPose {
-    place: Point,
+    position: Point,
     /// Direction that the person faces, as a unit vector.
-    ahead: Point,
+    heading: Point,
     /// Number of double steps so far.
     step: f64,
     /// 0 if the person stands or walks, 1 if they sit, and a value between while they sit down or stand up.
@@ -253,39 +253,40 @@ struct BodyPose {
 
 impl Person {
     /// Creates the person of `plan`, with random parts from `random`.
-    pub(crate) fn new(plan: &Plan, random: &mut fastrand::Rng) -> Person {
+    pub(crate) fn new(plan: &PersonSpec, random: &mut fastrand::Rng) -> Person {
         let phase = random.f64();
-        let Plan { from_s, until_s, jitter_mm, leg_mm, .. } = *plan;
-        let course = match plan.way {
-            Way::Roam { centre, reach } => {
+        let PersonSpec { from_s, until_s, jitter_mm, leg_mm, .. } = *plan;
+        let course = match plan.path {
+            WalkPath::Roam { centre, reach } => {
                 // Peak speed is 2 pi * reach * pace: 0.5 to 1.3 m/s, as people indoors walk.
-                let mut pace = |reach: f64| (500.0 + 800.0 * random.f64()) / (TAU * reach);
-                let pace = (pace(reach.0), pace(reach.1));
-                Course::Roam { centre, reach, pace, phase: (random.f64(), random.f64()) }
+                let mut frequency = |reach: f64| (500.0 + 800.0 * random.f64()) / (TAU * reach);
+                let frequency = (frequency(reach.0), frequency(reach.1));
+                Course::Roam { centre, reach, frequency, phase: (random.f64(), random.f64()) }
             }
-            Way::Path { ref corners, speed, repeats } => {
+            WalkPath::Path { ref corners, speed, repeats } => {
                 let mut corners = corners.clone();
                 for corner in &mut corners {
                     corner.point = jittered(corner.point, jitter_mm, random);
                 }
                 if repeats {
-                    corners.push(Corner { rest_s: 0.0, seat_deg: None, ..corners[0] });
+                    corners.push(Corner { pause_s: 0.0, seat_deg: None, ..corners[0] });
                 }
-                let rest_s: f64 = corners.iter().map(|corner| corner.rest_s).sum();
+                let rest_s: f64 = corners.iter().map(|corner| corner.pause_s).sum();
                 let length = length(&corners);
                 let speed = match speed {
                     Speed::Between(slowest, fastest) => slowest + (fastest - slowest) * random.f64(),
-                    Speed::InTime => length / (until_s - from_s - rest_s),
+                    Speed::ToEnd => length / (until_s - from_s - rest_s),
                 };
                 let knots = course(&corners, from_s, speed);
                 Course::Path { seats: seats(&corners, &knots), knots, repeats }
             }
         };
         // A person with a speed disappears at the end of the path.
-        let until_s = match (&plan.way, &course) {
-            (Way::Path { speed: Speed::Between(..), .. }, Course::Path { knots, repeats: false, .. }) => {
-                knots.last().map_or(until_s, |knot| knot.0)
-            }
+        let until_s = match (&plan.path, &course) {
+            (
+                WalkPath::Path { speed: Speed::Between(..), .. },
+                Course::Path { knots, repeats: false, .. },
+            ) => knots.last().map_or(until_s, |knot| knot.0),
             _ => until_s,
         };
         Person { from_s, until_s, leg_mm, phase, course }
@@ -294,17 +295,17 @@ impl Person {
     /// Returns both legs at `time_s`, as a sensor at the height of the shins sees them. Returns `None` while the person
     /// is not present.
     pub(crate) fn legs(&self, time_s: f64) -> Option<[Shape; 2]> {
-        self.stand(time_s).map(|stand| self.legs_of(&stand))
+        self.body_pose(time_s).map(|pose| self.legs_of(&pose))
     }
 
     /// Returns legs, trunk and head at `time_s`, with their heights.
     pub(crate) fn body(&self, time_s: f64) -> Option<[(Shape, Heights); 4]> {
-        let stand = self.stand(time_s)?;
-        let [left, right] = self.legs_of(&stand);
+        let pose = self.body_pose(time_s)?;
+        let [left, right] = self.legs_of(&pose);
         let part = |shape, from_mm, to_mm| (shape, Heights { from_mm, to_mm });
-        let upper = |radius| Shape::Post { centre: stand.place, radius };
+        let upper = |radius| Shape::Post { centre: pose.position, radius };
         let [crotch, neck, crown] =
-            [CROTCH_MM, NECK_MM, CROWN_MM].map(|height| height - stand.seated * (CROTCH_MM - SEAT_MM));
+            [CROTCH_MM, NECK_MM, CROWN_MM].map(|height| height - pose.seated * (CROTCH_MM - SEAT_MM));
         Some([
             part(left, 0.0, crotch),
             part(right, 0.0, crotch),
@@ -313,19 +314,19 @@ impl Person {
         ])
     }
 
-    fn stand(&self, time_s: f64) -> Option<BodyPose> {
-        (self.from_s..self.until_s).contains(&time_s).then(|| self.course.stand(time_s))
+    fn body_pose(&self, time_s: f64) -> Option<BodyPose> {
+        (self.from_s..self.until_s).contains(&time_s).then(|| self.course.body_pose(time_s))
     }
 
-    fn legs_of(&self, stand: &BodyPose) -> [Shape; 2] {
-        let BodyPose { place, ahead, step, seated } = *stand;
+    fn legs_of(&self, pose: &BodyPose) -> [Shape; 2] {
+        let BodyPose { position, heading, step, seated } = *pose;
         let stride = (1.0 - seated) * STRIDE_MM * (TAU * (step + self.phase)).sin();
         [1.0, -1.0].map(|side| {
-            let (along, aside) = (seated * FEET_AHEAD_MM + side * stride, side * HIP_MM);
+            let (along, across) = (seated * FEET_AHEAD_MM + side * stride, side * HIP_MM);
             Shape::Post {
                 centre: (
-                    place.0 + along * ahead.0 - aside * ahead.1,
-                    place.1 + along * ahead.1 + aside * ahead.0,
+                    position.0 + along * heading.0 - across * heading.1,
+                    position.1 + along * heading.1 + across * heading.0,
                 ),
                 radius: self.leg_mm,
             }
@@ -334,15 +335,15 @@ impl Person {
 }
 
 impl Course {
-    fn stand(&self, time_s: f64) -> BodyPose {
+    fn body_pose(&self, time_s: f64) -> BodyPose {
         match self {
-            Course::Roam { centre, reach, pace, phase } => {
-                let turn = |pace: f64, phase: f64| (TAU * (pace * time_s + phase)).sin_cos();
-                let (sin_x, cos_x) = turn(pace.0, phase.0);
-                let (sin_y, cos_y) = turn(pace.1, phase.1);
-                let heading = (pace.0 * reach.0 * cos_x, pace.1 * reach.1 * cos_y);
-                let place = (centre.0 + reach.0 * sin_x, centre.1 + reach.1 * sin_y);
-                BodyPose { place, ahead: unit(heading), step: STEPS_HZ * time_s, seated: 0.0 }
+            Course::Roam { centre, reach, frequency, phase } => {
+                let cycle = |frequency: f64, phase: f64| (TAU * (frequency * time_s + phase)).sin_cos();
+                let (sin_x, cos_x) = cycle(frequency.0, phase.0);
+                let (sin_y, cos_y) = cycle(frequency.1, phase.1);
+                let heading = (frequency.0 * reach.0 * cos_x, frequency.1 * reach.1 * cos_y);
+                let position = (centre.0 + reach.0 * sin_x, centre.1 + reach.1 * sin_y);
+                BodyPose { position, heading: unit(heading), step: STEPS_HZ * time_s, seated: 0.0 }
             }
             Course::Path { knots, seats, repeats } => {
                 let (first, last) = (knots[0], knots[knots.len() - 1]);
@@ -355,18 +356,18 @@ impl Course {
                 let seat = seats.iter().find(|seat| (seat.from_s..seat.until_s).contains(&time_s));
                 // A person who rests looks along the path, and at its end back to where the path came from. A person
                 // who sits down turns from the previous part of the path to the seat, and later to the next part.
-                let came = seat.is_some_and(|seat| time_s < (seat.from_s + seat.until_s) / 2.0);
+                let is_arriving = seat.is_some_and(|seat| time_s < (seat.from_s + seat.until_s) / 2.0);
                 let before = || knots[..next].windows(2).rev();
                 let after = || knots[next - 1..].windows(2);
-                let is_way = |pair: &&[(f64, Point, f64)]| pair[0].1 != pair[1].1;
-                let leg = if came { before().find(is_way) } else { None };
-                let leg = leg.or_else(|| after().chain(knots.windows(2).rev()).find(is_way));
-                let ahead =
+                let is_moving = |pair: &&[(f64, Point, f64)]| pair[0].1 != pair[1].1;
+                let leg = if is_arriving { before().find(is_moving) } else { None };
+                let leg = leg.or_else(|| after().chain(knots.windows(2).rev()).find(is_moving));
+                let heading =
                     leg.map_or((0.0, 1.0), |pair| (pair[1].1.0 - pair[0].1.0, pair[1].1.1 - pair[0].1.1));
                 let seated = seat.map_or(0.0, |seat| seat.share(time_s));
                 BodyPose {
-                    place: (a.0 + (b.0 - a.0) * share, a.1 + (b.1 - a.1) * share),
-                    ahead: seat.map_or(unit(ahead), |seat| turned(ahead, seat.faces_deg, seated)),
+                    position: (a.0 + (b.0 - a.0) * share, a.1 + (b.1 - a.1) * share),
+                    heading: seat.map_or(unit(heading), |seat| turned(heading, seat.faces_deg, seated)),
                     step: (laps * last.2 + s0 + (s1 - s0) * share) / DOUBLE_STEP_MM,
                     seated,
                 }
@@ -381,10 +382,10 @@ fn course(corners: &[Corner], from_s: f64, speed: f64) -> Vec<(f64, Point, f64)>
     let (mut time_s, mut walked) = (from_s, 0.0);
     let mut before = corners[0].point;
     let mut knots = Vec::new();
-    for &Corner { point, rest_s, .. } in corners {
-        let way = distance(before, point);
-        walked += way;
-        time_s += if way > 0.0 { way / speed } else { 0.0 };
+    for &Corner { point, pause_s: rest_s, .. } in corners {
+        let walk_mm = distance(before, point);
+        walked += walk_mm;
+        time_s += if walk_mm > 0.0 { walk_mm / speed } else { 0.0 };
         knots.push((time_s, point, walked));
         time_s += rest_s;
         knots.push((time_s, point, walked));
@@ -412,8 +413,8 @@ pub(crate) fn length(corners: &[Corner]) -> f64 {
 }
 
 /// Returns the direction of `way`, turned by `share` of the angle to `to_deg`, the shorter way round.
-fn turned(way: Point, to_deg: f64, share: f64) -> Point {
-    let from = way.1.atan2(way.0);
+fn turned(direction: Point, to_deg: f64, share: f64) -> Point {
+    let from = direction.1.atan2(direction.0);
     let angle = (to_deg.to_radians() - from + TAU / 2.0).rem_euclid(TAU) - TAU / 2.0;
     let (sin, cos) = (from + share * angle).sin_cos();
     (cos, sin)
@@ -429,9 +430,9 @@ pub(crate) fn distance(a: Point, b: Point) -> f64 {
     (a.0 - b.0).hypot(a.1 - b.1)
 }
 
-fn unit(way: Point) -> Point {
-    let length = way.0.hypot(way.1).max(1e-9);
-    (way.0 / length, way.1 / length)
+fn unit(vector: Point) -> Point {
+    let length = vector.0.hypot(vector.1).max(1e-9);
+    (vector.0 / length, vector.1 / length)
 }
 
 /// Half of the distance between the legs, across the path.
@@ -461,7 +462,7 @@ mod tests {
 
     const HERE: Pose = Pose { x_mm: 100.0, y_mm: 200.0, turn_deg: 0.0 };
 
-    fn object(from_s: f64, until_s: f64, moves: &[Move]) -> Object {
+    fn object(from_s: f64, until_s: f64, moves: &[Movement]) -> Object {
         let shapes = vec![Shape::Post { centre: (0.0, 0.0), radius: 10.0 }];
         let moves = moves.to_vec();
         let (heights, is_box) = (Heights::ALL, false);
@@ -482,29 +483,37 @@ mod tests {
     #[test]
     fn box_appears_and_disappears() {
         let object = object(15.0, 20.0, &[]);
-        assert!(object.at(14.9).is_none() && object.left(14.9).is_empty() && !object.is_still());
+        assert!(
+            object.at(14.9).is_none() && object.previous_presences(14.9).is_empty() && !object.is_still()
+        );
         assert_eq!(object.at(16.0).map(|presence| presence.since_s), Some(15.0));
         assert!(object.at(20.0).is_none());
-        assert_eq!(object.left(30.0).iter().map(|presence| presence.since_s).collect::<Vec<_>>(), [20.0]);
+        assert_eq!(
+            object.previous_presences(30.0).iter().map(|presence| presence.since_s).collect::<Vec<_>>(),
+            [20.0]
+        );
     }
 
     #[test]
     fn door_rotates_and_leaves_its_pose() {
         let by = Pose { x_mm: 0.0, y_mm: 0.0, turn_deg: 90.0 };
-        let object = object(0.0, f64::INFINITY, &[Move { from_s: 10.0, until_s: 12.0, by }]);
+        let object = object(0.0, f64::INFINITY, &[Movement { from_s: 10.0, until_s: 12.0, offset: by }]);
         let state = |time_s| object.at(time_s).map(|presence| (presence.pose.turn_deg, presence.since_s));
         assert_eq!(state(9.0), Some((0.0, 0.0)));
         assert_eq!(state(11.0), Some((45.0, 11.0)));
         assert_eq!(state(20.0), Some((90.0, 12.0)));
-        assert!(object.left(9.0).is_empty());
-        assert_eq!(object.left(20.0).iter().map(|s| (s.pose, s.since_s)).collect::<Vec<_>>(), [(HERE, 12.0)]);
+        assert!(object.previous_presences(9.0).is_empty());
+        assert_eq!(
+            object.previous_presences(20.0).iter().map(|s| (s.pose, s.since_s)).collect::<Vec<_>>(),
+            [(HERE, 12.0)]
+        );
     }
 
     #[test]
     fn door_opens_and_closes_again_and_again() {
         let by = |turn_deg| Pose { x_mm: 0.0, y_mm: 0.0, turn_deg };
-        let opens = Move { from_s: 10.0, until_s: 12.0, by: by(90.0) };
-        let closes = Move { from_s: 15.0, until_s: 16.0, by: by(-90.0) };
+        let opens = Movement { from_s: 10.0, until_s: 12.0, offset: by(90.0) };
+        let closes = Movement { from_s: 15.0, until_s: 16.0, offset: by(-90.0) };
         let door = Object { repeat_s: Some(20.0), ..object(0.0, f64::INFINITY, &[opens, closes]) };
         let state = |time_s| door.at(time_s).map(|presence| (presence.pose.turn_deg, presence.since_s));
         assert_eq!((state(9.0), state(29.0)), (Some((0.0, 0.0)), Some((0.0, 16.0))));
@@ -515,7 +524,10 @@ mod tests {
             assert_eq!(state(17.0 + round_s), Some((0.0, 16.0 + round_s)));
         }
         let left = |time_s| -> Vec<_> {
-            door.left(time_s).iter().map(|presence| (presence.pose.turn_deg, presence.since_s)).collect()
+            door.previous_presences(time_s)
+                .iter()
+                .map(|presence| (presence.pose.turn_deg, presence.since_s))
+                .collect()
         };
         assert_eq!(left(17.0), [(0.0, 12.0), (90.0, 16.0)]);
         assert_eq!(left(34.0), [(0.0, 12.0), (90.0, 16.0), (0.0, 32.0)]);
@@ -523,17 +535,17 @@ mod tests {
     }
 
     fn corner(x: f64, y: f64, rest_s: f64) -> Corner {
-        Corner { point: (x, y), rest_s, seat_deg: None }
+        Corner { point: (x, y), pause_s: rest_s, seat_deg: None }
     }
 
-    fn person(way: Way, from_s: f64, until_s: f64) -> Person {
-        let plan = Plan { way, from_s, until_s, jitter_mm: 0.0, leg_mm: 60.0 };
+    fn person(way: WalkPath, from_s: f64, until_s: f64) -> Person {
+        let plan = PersonSpec { path: way, from_s, until_s, jitter_mm: 0.0, leg_mm: 60.0 };
         Person::new(&plan, &mut fastrand::Rng::with_seed(1))
     }
 
     fn body(person: &Person, time_s: f64) -> Point {
         let [a, b] =
-            person.legs(time_s).expect("somebody is there").map(|leg| leg.placed(|p| p).front_of_post());
+            person.legs(time_s).expect("somebody is there").map(|leg| leg.transformed(|p| p).front_of_post());
         ((a.0 + b.0) / 2.0, (a.1 + b.1) / 2.0)
     }
 
@@ -548,7 +560,7 @@ mod tests {
 
     #[test]
     fn roaming_person_walks_within_reach() {
-        let way = Way::Roam { centre: (0.0, 3000.0), reach: (1500.0, 800.0) };
+        let way = WalkPath::Roam { centre: (0.0, 3000.0), reach: (1500.0, 800.0) };
         let walker = person(way, 0.0, f64::INFINITY);
         let mut fastest = 0.0f64;
         for step in 0..6000 {
@@ -564,7 +576,7 @@ mod tests {
     fn person_walks_path_with_rests() {
         let corners = vec![corner(0.0, 0.0, 0.0), corner(0.0, 2000.0, 3.0), corner(1000.0, 2000.0, 0.0)];
         let walker = person(
-            Way::Path { corners, speed: Speed::Between(500.0, 500.0), repeats: false },
+            WalkPath::Path { corners, speed: Speed::Between(500.0, 500.0), repeats: false },
             10.0,
             f64::INFINITY,
         );
@@ -583,7 +595,7 @@ mod tests {
     fn person_walks_repeating_path_forever() {
         let corners = vec![corner(0.0, 0.0, 1.0), corner(0.0, 2000.0, 3.0)];
         let walker = person(
-            Way::Path { corners, speed: Speed::Between(500.0, 500.0), repeats: true },
+            WalkPath::Path { corners, speed: Speed::Between(500.0, 500.0), repeats: true },
             10.0,
             f64::INFINITY,
         );
@@ -597,7 +609,7 @@ mod tests {
         }
         // Neither legs nor body jump from a lap to the next one.
         let (before, after) =
-            (walker.stand(21.999).expect("is there"), walker.stand(22.001).expect("is there"));
+            (walker.body_pose(21.999).expect("is there"), walker.body_pose(22.001).expect("is there"));
         assert!((before.step - after.step).abs() < 0.001, "{} and {}", before.step, after.step);
     }
 
@@ -607,7 +619,7 @@ mod tests {
         let seat = Corner { seat_deg: Some(180.0), ..corner(0.0, 2000.0, 10.0) };
         let corners = vec![corner(0.0, 0.0, 0.0), seat, corner(1000.0, 2000.0, 0.0)];
         let speed = Speed::Between(500.0, 500.0);
-        let sits = person(Way::Path { corners, speed, repeats: false }, 0.0, f64::INFINITY);
+        let sits = person(WalkPath::Path { corners, speed, repeats: false }, 0.0, f64::INFINITY);
         let feet = |time_s: f64| sits.legs(time_s).expect("is there").map(|leg| leg.front_of_post());
         for time_s in [4.0 + SIT_DOWN_S, 9.0, 14.0 - SIT_DOWN_S] {
             let [left, right] = feet(time_s);
@@ -623,15 +635,15 @@ mod tests {
         let crown = |time_s| sits.body(time_s).map(|body| body[3].1.to_mm);
         assert_eq!((crown(3.0), crown(9.0)), (Some(CROWN_MM), Some(CROWN_MM - 370.0)));
         // A person with one corner sits all the time.
-        let corners = vec![Corner { rest_s: 0.0, ..seat }];
-        let stays = person(Way::Path { corners, speed: Speed::InTime, repeats: false }, 0.0, 20.0);
+        let corners = vec![Corner { pause_s: 0.0, ..seat }];
+        let stays = person(WalkPath::Path { corners, speed: Speed::ToEnd, repeats: false }, 0.0, 20.0);
         assert_eq!((stays.legs(0.0), stays.legs(19.9)), (sits.legs(9.0), sits.legs(9.0)));
     }
 
     #[test]
     fn person_sits_down_in_each_lap() {
         let seat = Corner { seat_deg: Some(-90.0), ..corner(0.0, 2000.0, 5.0) };
-        let way = Way::Path {
+        let way = WalkPath::Path {
             corners: vec![corner(0.0, 0.0, 0.0), seat],
             speed: Speed::Between(500.0, 500.0),
             repeats: true,
@@ -639,7 +651,7 @@ mod tests {
         let walker = person(way, 10.0, f64::INFINITY);
         // A lap takes 13 s: 4 s each way and the rest.
         for lap_s in [0.0, 13.0, 13_000.0] {
-            let share = |time_s| walker.stand(lap_s + time_s).map(|stand| stand.seated);
+            let share = |time_s| walker.body_pose(lap_s + time_s).map(|stand| stand.seated);
             assert_eq!((share(12.0), share(16.5), share(20.0)), (Some(0.0), Some(1.0), Some(0.0)));
         }
     }
@@ -664,7 +676,7 @@ mod tests {
             for time_s in (0..10_000).map(|tick| f64::from(tick) / 20.0) {
                 let presence = leaves[0].at(time_s).expect("a leaf stays");
                 let Shape::Wall { from, to } =
-                    leaves[0].shapes[0].placed(|point| presence.pose.outward(point))
+                    leaves[0].shapes[0].transformed(|point| presence.pose.outward(point))
                 else {
                     panic!("a leaf is a wall");
                 };
@@ -682,19 +694,19 @@ mod tests {
     #[test]
     fn person_stands_or_arrives_in_time() {
         let stands = person(
-            Way::Path { corners: vec![corner(5.0, 7.0, 0.0)], speed: Speed::InTime, repeats: false },
+            WalkPath::Path { corners: vec![corner(5.0, 7.0, 0.0)], speed: Speed::ToEnd, repeats: false },
             0.0,
             20.0,
         );
         assert_eq!(stands.legs(0.0), stands.legs(19.9));
         assert!(stands.legs(20.0).is_none());
         let corners = vec![corner(0.0, 0.0, 1.0), corner(0.0, 2000.0, 0.0)];
-        let walks = person(Way::Path { corners, speed: Speed::InTime, repeats: false }, 2.0, 7.0);
+        let walks = person(WalkPath::Path { corners, speed: Speed::ToEnd, repeats: false }, 2.0, 7.0);
         assert!(distance(body(&walks, 5.0), (0.0, 1000.0)) < 1.0);
         assert!(walks.legs(6.99).is_some() && walks.legs(7.0).is_none());
         // No way at all is in time as well.
         let corners = vec![corner(5.0, 7.0, 1.0), corner(5.0, 7.0, 0.0)];
-        let waits = person(Way::Path { corners, speed: Speed::InTime, repeats: false }, 2.0, 7.0);
+        let waits = person(WalkPath::Path { corners, speed: Speed::ToEnd, repeats: false }, 2.0, 7.0);
         assert_eq!((waits.legs(2.0), waits.legs(7.0)), (waits.legs(6.99), None));
         assert_eq!(body(&waits, 6.99), (5.0, 7.0));
     }

@@ -97,10 +97,10 @@ impl Shape {
     }
 
     /// Returns the shape with `place` applied to every point.
-    pub(crate) fn placed(&self, place: impl Fn(Point) -> Point) -> Shape {
+    pub(crate) fn transformed(&self, transform: impl Fn(Point) -> Point) -> Shape {
         match *self {
-            Shape::Wall { from, to } => Shape::Wall { from: place(from), to: place(to) },
-            Shape::Post { centre, radius } => Shape::Post { centre: place(centre), radius },
+            Shape::Wall { from, to } => Shape::Wall { from: transform(from), to: transform(to) },
+            Shape::Post { centre, radius } => Shape::Post { centre: transform(centre), radius },
         }
     }
 }
@@ -170,7 +170,7 @@ impl Plane {
     /// Calls `each` with the cut of each surface of an object with the outline `shapes`. Posts have lids, and so has an
     /// object that `is_box`.
     pub(crate) fn cut(&self, shapes: &[Shape], heights: Heights, is_box: bool, mut each: impl FnMut(Shape)) {
-        let (bottom, top) = (heights.from_mm.min(HIGHEST_MM), heights.to_mm.min(HIGHEST_MM));
+        let (bottom, top) = (heights.from_mm.min(MAX_DISTANCE_MM), heights.to_mm.min(MAX_DISTANCE_MM));
         let mut wall = |from: Point, to: Point| {
             let corners = [raised(from, bottom), raised(to, bottom), raised(to, top), raised(from, top)];
             self.cut_panel(&corners).into_iter().for_each(&mut each);
@@ -179,8 +179,8 @@ impl Plane {
             match *shape {
                 Shape::Wall { from, to } => wall(from, to),
                 Shape::Post { centre, radius } => {
-                    let around = around(centre, radius);
-                    (0..SIDES).for_each(|i| wall(around[i], around[(i + 1) % SIDES]));
+                    let outline = polygon(centre, radius);
+                    (0..SIDES).for_each(|i| wall(outline[i], outline[(i + 1) % SIDES]));
                 }
             }
         }
@@ -203,7 +203,7 @@ impl Plane {
             }
             for shape in shapes {
                 if let Shape::Post { centre, radius } = *shape {
-                    lid(&around(centre, radius));
+                    lid(&polygon(centre, radius));
                 }
             }
         }
@@ -211,7 +211,7 @@ impl Plane {
 
     /// Returns the cut of the floor.
     pub(crate) fn cut_floor(&self) -> Option<Shape> {
-        let far = HIGHEST_MM;
+        let far = MAX_DISTANCE_MM;
         self.cut_panel(&[(-far, -far, 0.0), (far, -far, 0.0), (far, far, 0.0), (-far, far, 0.0)])
     }
 
@@ -221,11 +221,11 @@ impl Plane {
         let mut count = 0;
         for (i, &a) in corners.iter().enumerate() {
             let b = corners[(i + 1) % corners.len()];
-            let (over_a, over_b) = (self.over(a), self.over(b));
+            let (over_a, over_b) = (self.height_above(a), self.height_above(b));
             if (over_a >= 0.0) != (over_b >= 0.0) && count < 2 {
                 let share = over_a / (over_a - over_b);
                 let between = |a: f64, b: f64| a + share * (b - a);
-                ends[count] = self.within((between(a.0, b.0), between(a.1, b.1), between(a.2, b.2)));
+                ends[count] = self.in_plane((between(a.0, b.0), between(a.1, b.1), between(a.2, b.2)));
                 count += 1;
             }
         }
@@ -233,12 +233,12 @@ impl Plane {
     }
 
     /// Returns the height of a point above the plane.
-    fn over(&self, (_, y, z): Corner) -> f64 {
+    fn height_above(&self, (_, y, z): Corner) -> f64 {
         (y - self.eye.0) * self.sin + (z - self.eye.1) * self.cos
     }
 
     /// Transforms a point of the plane to the plane's own frame, with the scanner at the origin.
-    fn within(&self, (x, y, z): Corner) -> Point {
+    fn in_plane(&self, (x, y, z): Corner) -> Point {
         (x, (y - self.eye.0) * self.cos - (z - self.eye.1) * self.sin)
     }
 }
@@ -247,7 +247,7 @@ fn raised((x, y): Point, height: f64) -> Corner {
     (x, y, height)
 }
 
-fn around(centre: Point, radius: f64) -> [Point; SIDES] {
+fn polygon(centre: Point, radius: f64) -> [Point; SIDES] {
     std::array::from_fn(|i| {
         let (sin, cos) = (TAU * i as f64 / SIDES as f64).sin_cos();
         (centre.0 + radius * cos, centre.1 + radius * sin)
@@ -257,7 +257,7 @@ fn around(centre: Point, radius: f64) -> [Point; SIDES] {
 /// Number of sides of a round post. For a radius of 100 mm, they are off by 2 mm.
 const SIDES: usize = 16;
 /// Maximum distance and height of everything that is measured, in millimeters.
-const HIGHEST_MM: f64 = 100_000.0;
+const MAX_DISTANCE_MM: f64 = 100_000.0;
 
 #[cfg(test)]
 mod tests {

@@ -18,24 +18,24 @@ use scanhub_schema::{Failure, Family, Kind, MILLIS, Nanos};
 use serde_json::json;
 use sha2::{Digest, Sha256};
 
-use crate::device::{Device, Part};
+use crate::device::{ChunkKind, Device};
 use crate::fault::{Fault, Faults};
-use crate::ld::{LdSettings, LdSimulator, recorded};
-use crate::machine::{LmsSimulator, Settings, Start};
+use crate::ld::{LdSettings, LdSimulator, recorded_packets};
+use crate::line_model::BaudMismatch;
+use crate::line_model::{Delivery, LineModel};
+use crate::machine::{LmsSimulator, Settings, StartState};
 use crate::mount::{Encoder, Report};
-use crate::operating::Source;
+use crate::operating::ScanSource;
 use crate::options::{Scanner, SimulateOptions, type_name};
 use crate::port::SimPort;
-use crate::port::{Wake, now_ns, wait};
+use crate::port::{WaitResult, now_ns, wait};
 use crate::request_decoder::Arrival;
 use crate::room::Room;
 use crate::rplidar::{RplidarSettings, RplidarSimulator, RplidarStart};
-use crate::wire::BaudMismatch;
-use crate::wire::{Delivery, LineModel};
 
 /// A port that is ready to be opened.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Ready {
+pub struct SimulatedPort {
     /// The symlink as the user named it; for a TCP server `tcp:HOST:PORT`, which a hub opens.
     pub port: PathBuf,
     /// The pty; `None` for a TCP server.
@@ -48,7 +48,7 @@ pub struct Ready {
 pub fn simulate(
     options: &SimulateOptions,
     stop: impl AsFd,
-    on_ready: impl FnOnce(&[Ready]),
+    on_ready: impl FnOnce(&[SimulatedPort]),
     on_record: impl Fn(&Record) + Sync,
 ) -> Result<Vec<Summary>, Failure> {
     simulate_with(options, stop, on_ready, on_record, |_| None, |_, _| {})
@@ -59,7 +59,7 @@ pub fn simulate(
 pub fn simulate_with(
     options: &SimulateOptions,
     stop: impl AsFd,
-    on_ready: impl FnOnce(&[Ready]),
+    on_ready: impl FnOnce(&[SimulatedPort]),
     on_record: impl Fn(&Record) + Sync,
     event: impl Fn(&Path) -> Option<Event> + Sync,
     on_report: impl Fn(usize, Report) + Sync,
@@ -75,13 +75,13 @@ pub fn simulate_with(
     };
     let mut ready = Vec::new();
     let mut threads = Vec::new();
-    let time = Time { zero_ns: now_ns(), speed: options.speed };
+    let time = ScaledClock { zero_ns: now_ns(), speed: options.speed };
     for (number, port) in options.ports.iter().enumerate() {
         let seed = options.seed.wrapping_add(number as u64);
         let machine = device(options, recording.as_ref(), number)?;
         let sim_port = SimPort::new(port)?;
         let port = sim_port.found(port);
-        ready.push(Ready { port: port.clone(), pty: sim_port.pty().map(Path::to_owned) });
+        ready.push(SimulatedPort { port: port.clone(), pty: sim_port.pty().map(Path::to_owned) });
         let wire = LineModel::new(&options.faults, seed);
         let sim_port = Some(sim_port);
         let encoder = options.world.mount(number % options.world.sensors()).cloned().map(Encoder::new);
@@ -90,7 +90,7 @@ pub fn simulate_with(
             port,
             sim_port,
             machine,
-            wire,
+            line: wire,
             time,
             on_record: &on_record,
             event: &event,
@@ -101,7 +101,7 @@ pub fn simulate_with(
             fault: None,
             mismatch: BaudMismatch::default(),
             sent: 0,
-            held: Vec::new(),
+            unsent: Vec::new(),
         });
     }
     on_ready(&ready);
@@ -116,8 +116,9 @@ pub fn simulate_with(
 
 /// Runs each port in a separate thread. If one fails, the others end too.
 fn run(threads: Vec<PortThread<'_>>, stop: BorrowedFd<'_>) -> Result<Vec<Summary>, Failure> {
-    let failed: OwnedFd = eventfd(0, EventfdFlags::CLOEXEC)
-        .map_err(|errno| Failure::new(Kind::Short, format!("cannot make an eventfd: {errno}"), ""))?;
+    let failed: OwnedFd = eventfd(0, EventfdFlags::CLOEXEC).map_err(|errno| {
+        Failure::new(Kind::ResourceExhausted, format!("cannot make an eventfd: {errno}"), "")
+    })?;
     std::thread::scope(|scope| {
         let threads: Vec<_> = threads
             .into_iter()
@@ -167,7 +168,9 @@ fn device(
         Some(Scanner::Ld(model)) => {
             let settings = LdSettings { chunk, boot_ns, seed, ..LdSettings::of(model) };
             Box::new(match &options.replay {
-                Some(path) => LdSimulator::repeating(settings, recorded(path, sensor)?, options.looped),
+                Some(path) => {
+                    LdSimulator::repeating(settings, recorded_packets(path, sensor)?, options.looped)
+                }
                 None => LdSimulator::new(settings, room()),
             })
         }
@@ -177,12 +180,12 @@ fn device(
                 id: if faults.id > 0.0 { faults.id as u8 } else { model.id() },
                 typical: mode,
                 start: match &options.state {
-                    Start::PowerOn => RplidarStart::PowerOn,
-                    Start::In(operating) if operating.streams() => RplidarStart::Streaming,
-                    Start::In(_) => RplidarStart::Idle,
+                    StartState::PowerOn => RplidarStart::PowerOn,
+                    StartState::Operating(operating) if operating.streams() => RplidarStart::Streaming,
+                    StartState::Operating(_) => RplidarStart::Idle,
                 },
                 health: (faults.health as u8, u16::from(faults.health > 0.0)),
-                stubborn: faults.stubborn > 0.0,
+                keeps_health: faults.stubborn > 0.0,
                 quirks: faults.quirks(),
                 faults,
                 chunk,
@@ -202,7 +205,7 @@ fn lms(
     recording: Option<&Recording>,
     seed: u64,
     room: impl FnOnce() -> Room,
-) -> Result<(Settings, Source), Failure> {
+) -> Result<(Settings, ScanSource), Failure> {
     let contents = recording.map(Recording::contents);
     let factory = options.family.factory_variant().unwrap_or(Variant::HALF);
     let variant = options.variant.or(contents.and_then(|c| c.variant)).unwrap_or(factory);
@@ -229,10 +232,10 @@ fn lms(
         seed,
     };
     let source = match recording {
-        None => Source::Room(room()),
+        None => ScanSource::Room(room()),
         Some(recording) => {
             let telegrams = scans(recording, Encoding { unit, mode }, options.looped)?;
-            Source::Recorded { variant, telegrams }
+            ScanSource::Recorded { variant, telegrams }
         }
     };
     Ok((settings, source))
@@ -274,8 +277,8 @@ struct PortThread<'a> {
     /// The port that a host opens; `None` while the adapter is unplugged.
     sim_port: Option<SimPort>,
     pub(crate) machine: Box<dyn Device + Send>,
-    pub(crate) wire: LineModel,
-    pub(crate) time: Time,
+    pub(crate) line: LineModel,
+    pub(crate) time: ScaledClock,
     /// Receives each telegram that was sent.
     pub(crate) on_record: &'a (dyn Fn(&Record) -> Result<(), Failure> + Sync),
     /// Returns the next event for this port.
@@ -295,7 +298,7 @@ struct PortThread<'a> {
     /// Number of telegrams that were sent.
     sent: u64,
     /// Bytes that wait for room in the host's buffer; only on a lossless line.
-    held: Vec<u8>,
+    unsent: Vec<u8>,
 }
 
 /// An event that a test causes while a scanner runs.
@@ -311,12 +314,12 @@ pub enum Event {
 
 /// Time of the scanner: it starts at 0, and is `speed` times as fast as the clock.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Time {
+pub(crate) struct ScaledClock {
     zero_ns: Nanos,
     pub(crate) speed: f64,
 }
 
-impl Time {
+impl ScaledClock {
     fn of_machine(self, clock_ns: Nanos) -> Nanos {
         (clock_ns.saturating_sub(self.zero_ns) as f64 * self.speed) as Nanos
     }
@@ -344,14 +347,17 @@ impl PortThread<'_> {
             }
             while let Some(report) = self.encoder.as_mut().and_then(|encoder| encoder.poll(machine_ns)) {
                 let [stamp_ns, arrives_ns] =
-                    [report.stamp_ns, report.arrives_ns].map(|at| self.time.of_clock(at));
+                    [report.stamp_ns, report.arrival_ns].map(|at| self.time.of_clock(at));
                 let rate_rad_s = report.rate_rad_s * self.time.speed;
-                (self.on_report)(self.number, Report { stamp_ns, arrives_ns, rate_rad_s, ..report });
+                (self.on_report)(
+                    self.number,
+                    Report { stamp_ns, arrival_ns: arrives_ns, rate_rad_s, ..report },
+                );
             }
-            while let Some(delivery) = self.wire.poll_transmit(&mut *self.machine, machine_ns) {
-                self.hand_over(delivery)?;
+            while let Some(delivery) = self.line.poll_transmit(&mut *self.machine, machine_ns) {
+                self.deliver(delivery)?;
             }
-            if self.wait_for_room(stops)? == Wake::Stop {
+            if self.wait_for_room(stops)? == WaitResult::Stop {
                 return Ok(self.summary());
             }
             if count > 0 && self.is_tuned() {
@@ -360,7 +366,7 @@ impl PortThread<'_> {
                     not_after: self.time.of_machine(now_ns),
                 };
                 for &byte in &buffer[..count] {
-                    self.wire.receive(&mut *self.machine, byte, arrival);
+                    self.line.receive(&mut *self.machine, byte, arrival);
                     if let Some(dropped) = self.machine.take_dropped() {
                         tracing::warn!("{}: {dropped}", self.port.display());
                     }
@@ -369,17 +375,17 @@ impl PortThread<'_> {
             if count == 0 {
                 quiet_ns = read_ns;
             }
-            if self.wire.is_plugged() != self.sim_port.is_some() {
+            if self.line.is_plugged() != self.sim_port.is_some() {
                 self.sim_port = None;
                 self.is_open = false;
-                self.sim_port = self.wire.is_plugged().then(|| SimPort::new(&self.port)).transpose()?;
+                self.sim_port = self.line.is_plugged().then(|| SimPort::new(&self.port)).transpose()?;
             }
-            let due = self.wire.poll_timeout(&*self.machine, machine_ns);
+            let due = self.line.poll_timeout(&*self.machine, machine_ns);
             let due = due.into_iter().chain(self.encoder.as_ref().map(Encoder::poll_timeout)).min();
             let due_ns = due.map_or(Nanos::MAX, |at| self.time.of_clock(at));
             let poll_ns = if self.sim_port.is_some() { now_ns + POLL_INTERVAL_NS } else { Nanos::MAX };
-            let watched = self.sim_port.as_ref().and_then(|sim_port| sim_port.waits_for(self.is_open));
-            if wait(stops, watched, due_ns.min(poll_ns)) == Wake::Stop {
+            let watched = self.sim_port.as_ref().and_then(|sim_port| sim_port.wait_fd(self.is_open));
+            if wait(stops, watched, due_ns.min(poll_ns)) == WaitResult::Stop {
                 return Ok(self.summary());
             }
         }
@@ -390,35 +396,35 @@ impl PortThread<'_> {
     }
 
     /// Waits until the host has read all held bytes or has closed its side. The time of the scanner stands still.
-    fn wait_for_room(&mut self, stops: [BorrowedFd<'_>; 2]) -> Result<Wake, Failure> {
+    fn wait_for_room(&mut self, stops: [BorrowedFd<'_>; 2]) -> Result<WaitResult, Failure> {
         let begun_ns = now_ns();
-        while !self.held.is_empty() {
+        while !self.unsent.is_empty() {
             let Some(sim_port) = self.sim_port.as_mut().filter(|_| self.is_open) else { break };
-            let taken = sim_port.write(&self.held)?;
-            self.held.drain(..taken);
-            if self.held.is_empty() {
+            let written = sim_port.write(&self.unsent)?;
+            self.unsent.drain(..written);
+            if self.unsent.is_empty() {
                 break;
             }
-            if wait(stops, None, now_ns() + ROOM_CHECK_INTERVAL_NS) == Wake::Stop {
-                return Ok(Wake::Stop);
+            if wait(stops, None, now_ns() + ROOM_CHECK_INTERVAL_NS) == WaitResult::Stop {
+                return Ok(WaitResult::Stop);
             }
             self.is_open = sim_port.is_open(true);
         }
-        self.held.clear();
+        self.unsent.clear();
         self.time.zero_ns += now_ns() - begun_ns;
-        Ok(Wake::Line)
+        Ok(WaitResult::Line)
     }
 
     /// Carries out an event.
     fn handle_event(&mut self, event: Event, machine_ns: Nanos) {
         match event {
-            Event::PowerCycle => self.wire.cycle_power(&mut *self.machine, machine_ns),
-            Event::Unplug(span_ns) => self.wire.unplug(machine_ns, span_ns),
+            Event::PowerCycle => self.line.cycle_power(&mut *self.machine, machine_ns),
+            Event::Unplug(span_ns) => self.line.unplug(machine_ns, span_ns),
             Event::Faults(mut faults, seed) => {
                 let now_s = machine_ns as f64 / 1e9;
                 let times = [&mut faults.silence_at, &mut faults.stall_at, &mut faults.power_at];
                 times.into_iter().filter(|at| **at > 0.0).for_each(|at| *at += now_s);
-                self.wire.set_faults(&faults, seed);
+                self.line.set_faults(&faults, seed);
             }
         }
     }
@@ -440,13 +446,13 @@ impl PortThread<'_> {
     /// once than it can carry.
     fn limit_lag(&mut self, now_ns: Nanos) {
         let machine_ns = self.time.of_machine(now_ns);
-        let Some(due_ns) = self.wire.poll_timeout(&*self.machine, machine_ns) else { return };
+        let Some(due_ns) = self.line.poll_timeout(&*self.machine, machine_ns) else { return };
         let latest_ns = self.time.of_clock(due_ns + MAX_LAG_NS);
         self.time.zero_ns += now_ns.saturating_sub(latest_ns);
     }
 
     /// Writes bytes that arrive at the host, and reports a telegram that ends with them.
-    fn hand_over(&mut self, delivery: Delivery) -> Result<(), Failure> {
+    fn deliver(&mut self, delivery: Delivery) -> Result<(), Failure> {
         let is_telegram = delivery.is_telegram();
         let Delivery { mut bytes, rate, idle_after, part, mut fault } = delivery;
         match self.sim_port.as_mut().filter(|_| self.is_open) {
@@ -459,9 +465,9 @@ impl PortThread<'_> {
                     bytes = self.mismatch.receive(rates, &bytes, idle_after);
                 }
                 if self.lossless {
-                    self.held.append(&mut bytes);
-                    let taken = sim_port.write(&self.held)?;
-                    self.held.drain(..taken);
+                    self.unsent.append(&mut bytes);
+                    let written = sim_port.write(&self.unsent)?;
+                    self.unsent.drain(..written);
                 } else if sim_port.write(&bytes)? < bytes.len() {
                     fault = fault.or(Some(Fault::Overrun));
                 }
@@ -473,7 +479,7 @@ impl PortThread<'_> {
         if is_telegram {
             self.fault = self.fault.or(fault);
         }
-        if let Some(Part::End(sent)) = part {
+        if let Some(ChunkKind::End(sent)) = part {
             (self.on_record)(&Record {
                 port: self.port.clone(),
                 index: self.sent,
@@ -569,7 +575,7 @@ impl Truth {
     pub fn create(path: &Path, force: bool) -> Result<Self, Failure> {
         let is_stdout = path == Path::new("-");
         let file =
-            if is_stdout { None } else { Some(Target::open(path)?.create_new(force, output::PUBLIC)?) };
+            if is_stdout { None } else { Some(Target::open(path)?.create_new(force, output::PUBLIC_MODE)?) };
         Ok(Truth { path: path.to_owned(), file: file.map(Mutex::new) })
     }
 

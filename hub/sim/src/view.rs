@@ -37,8 +37,8 @@ impl WorldView {
         let people = scene.people.iter().map(|plan| Person::new(plan, &mut random)).collect();
         let mut objects = scene.objects.clone();
         for object in &mut objects {
-            let place = (object.pose.x_mm, object.pose.y_mm);
-            (object.pose.x_mm, object.pose.y_mm) = jittered(place, object.jitter_mm, &mut random);
+            let position = (object.pose.x_mm, object.pose.y_mm);
+            (object.pose.x_mm, object.pose.y_mm) = jittered(position, object.jitter_mm, &mut random);
         }
         let (still_objects, changing): (Vec<_>, Vec<_>) = objects.into_iter().partition(Object::is_still);
         let bias = fastrand::Rng::with_seed(!seed ^ sensor << 32).f64();
@@ -59,7 +59,7 @@ impl WorldView {
             return world;
         }
         for object in still_objects {
-            for shape in world.seen(&object, object.pose) {
+            for shape in world.visible_shapes(&object, object.pose) {
                 if object.surface == Surface::Reflector {
                     world.still_reflectors.push(shape);
                 }
@@ -70,13 +70,13 @@ impl WorldView {
     }
 
     /// Returns the shapes of `object` at `pose`, in the frame of the scanner.
-    fn seen(&self, object: &Object, pose: Pose) -> Vec<Shape> {
-        let place = |point| self.eye(pose.outward(point));
-        object.shapes.iter().map(|shape| shape.placed(place)).collect()
+    fn visible_shapes(&self, object: &Object, pose: Pose) -> Vec<Shape> {
+        let transform = |point| self.in_scanner_frame(pose.outward(point));
+        object.shapes.iter().map(|shape| shape.transformed(transform)).collect()
     }
 
     /// Transforms a point of the world to the frame of the scanner: x to its right, y ahead.
-    fn eye(&self, point: (f64, f64)) -> (f64, f64) {
+    fn in_scanner_frame(&self, point: (f64, f64)) -> (f64, f64) {
         let (ahead, left) = self.sensor.inward(point);
         (-left, ahead)
     }
@@ -88,12 +88,12 @@ impl WorldView {
         for object in &self.changing {
             let Some(presence) = object.at(time_s) else { continue };
             let kind = Kind::since(nanos(presence.since_s));
-            let shapes = self.seen(object, presence.pose);
+            let shapes = self.visible_shapes(object, presence.pose);
             faces.extend(shapes.into_iter().map(|shape| Face { shape, surface: object.surface, kind }));
         }
         for legs in self.people.iter().filter_map(|person| person.legs(time_s)) {
             let leg = |leg: Shape| Face {
-                shape: leg.placed(|point| self.eye(point)),
+                shape: leg.transformed(|point| self.in_scanner_frame(point)),
                 surface: Surface::Plain,
                 kind: Kind::Person,
             };
@@ -118,7 +118,7 @@ impl WorldView {
     pub(crate) fn view_with(&self, time_ns: Nanos, shapes: &[Shape]) -> View {
         let mut view = self.view(time_ns);
         for shape in shapes {
-            let shape = shape.placed(|point| self.eye(point));
+            let shape = shape.transformed(|point| self.in_scanner_frame(point));
             view.draw(Face { shape, surface: Surface::Plain, kind: Kind::Person });
         }
         view
@@ -131,7 +131,7 @@ impl WorldView {
 
     /// Changes `view` to the surroundings of the beam at `angle_deg` at `time_ns`. At first, `view` must be a clone of
     /// [`WorldView::still`].
-    pub(crate) fn look_along(&self, view: &mut View, angle_deg: f64, time_ns: Nanos) {
+    pub(crate) fn show_beam(&self, view: &mut View, angle_deg: f64, time_ns: Nanos) {
         view.narrow(&self.still, angle_deg);
         self.draw(view, time_ns);
     }
@@ -144,8 +144,8 @@ impl WorldView {
             view.draw(face);
         }
         for object in &self.changing {
-            for presence in object.left(time_ns as f64 / 1e9) {
-                for shape in self.seen(object, presence.pose) {
+            for presence in object.previous_presences(time_ns as f64 / 1e9) {
+                for shape in self.visible_shapes(object, presence.pose) {
                     view.uncover(&shape, nanos(presence.since_s));
                 }
             }
@@ -162,18 +162,18 @@ impl WorldView {
         for object in self.still_objects.iter().chain(&self.changing) {
             let Some(presence) = object.at(time_s) else { continue };
             let kind = Kind::since(nanos(presence.since_s));
-            let shapes = self.seen(object, presence.pose);
+            let shapes = self.visible_shapes(object, presence.pose);
             plane.cut(&shapes, object.heights, object.is_box, |cut| {
                 view.draw(face(cut, object.surface, kind))
             });
         }
         for (part, heights) in self.people.iter().filter_map(|person| person.body(time_s)).flatten() {
-            let part = part.placed(|point| self.eye(point));
+            let part = part.transformed(|point| self.in_scanner_frame(point));
             plane.cut(&[part], heights, false, |cut| view.draw(face(cut, Surface::Plain, Kind::Person)));
         }
         for object in &self.changing {
-            for presence in object.left(time_s) {
-                let shapes = self.seen(object, presence.pose);
+            for presence in object.previous_presences(time_s) {
+                let shapes = self.visible_shapes(object, presence.pose);
                 let since_ns = nanos(presence.since_s);
                 plane.cut(&shapes, object.heights, object.is_box, |cut| view.uncover(&cut, since_ns));
             }
@@ -192,7 +192,7 @@ impl WorldView {
             let (right, ahead) = shape.front();
             Mark { angle_deg: (-right).atan2(ahead).to_degrees(), range_mm: right.hypot(ahead) }
         });
-        marks.filter(|mark| view.reaches(mark.angle_deg, mark.range_mm)).collect()
+        marks.filter(|mark| view.is_visible(mark.angle_deg, mark.range_mm)).collect()
     }
 }
 
@@ -266,7 +266,7 @@ impl View {
     /// Returns the half of the view that is ahead.
     pub(crate) fn ahead(&self) -> View {
         const RIGHT: usize = 90 * RAYS_PER_DEGREE as usize;
-        const RAYS: usize = 180 * RAYS_PER_DEGREE as usize + 1 + 2 * REACH;
+        const RAYS: usize = 180 * RAYS_PER_DEGREE as usize + 1 + 2 * SPOT_RAYS;
         let from = RIGHT - self.first;
         View { faces: self.faces.clone(), hits: self.hits[from..from + RAYS].to_vec(), first: RIGHT }
     }
@@ -274,20 +274,20 @@ impl View {
     /// Copies the rays of `still` around the beam at `angle_deg`. Drops all faces that are not in `still`. The first
     /// faces must be those of `still`.
     pub(crate) fn narrow(&mut self, still: &View, angle_deg: f64) {
-        let middle = middle((angle_deg * 1e3) as i32) - still.first;
+        let middle = ray_index((angle_deg * 1e3) as i32) - still.first;
         self.faces.truncate(still.faces.len());
         self.hits.clear();
-        self.hits.extend_from_slice(&still.hits[middle - REACH..=middle + REACH]);
-        self.first = still.first + middle - REACH;
+        self.hits.extend_from_slice(&still.hits[middle - SPOT_RAYS..=middle + SPOT_RAYS]);
+        self.first = still.first + middle - SPOT_RAYS;
     }
 
     /// Draws `face` over the present rays. The nearest face wins.
     pub(crate) fn draw(&mut self, face: Face) {
         let number = self.faces.len() as u32;
-        for ray in rays(&face.shape, self.numbers()) {
+        for ray in rays(&face.shape, self.ray_range()) {
             let direction = DIRECTIONS[ray];
             let hit = &mut self.hits[ray - self.first];
-            if face.surface == Surface::Glass && face.shape.squareness(direction) < GLASS_SHINES {
+            if face.surface == Surface::Glass && face.shape.squareness(direction) < MIN_GLASS_COSINE {
                 continue;
             }
             if let Some(range_mm) = face.shape.distance(direction)
@@ -301,7 +301,7 @@ impl View {
 
     /// Marks the surfaces that `shape` hid until `since_ns`. Call it after everything is drawn.
     pub(crate) fn uncover(&mut self, shape: &Shape, since_ns: Nanos) {
-        for ray in rays(shape, self.numbers()) {
+        for ray in rays(shape, self.ray_range()) {
             let hit = &mut self.hits[ray - self.first];
             if shape.distance(DIRECTIONS[ray]).is_some_and(|range_mm| range_mm < hit.range_mm) {
                 hit.since_ns = hit.since_ns.max(since_ns);
@@ -309,27 +309,27 @@ impl View {
         }
     }
 
-    /// Returns the ray at the scanner's angle `angle_mdeg` (0 ahead), with [`REACH`] rays to each side.
-    pub(crate) fn around(&self, angle_mdeg: i32) -> &[Hit] {
-        let middle = middle(angle_mdeg) - self.first;
-        &self.hits[middle - REACH..=middle + REACH]
+    /// Returns the ray at the scanner's angle `angle_mdeg` (0 ahead), with [`SPOT_RAYS`] rays to each side.
+    pub(crate) fn rays_around(&self, angle_mdeg: i32) -> &[Hit] {
+        let middle = ray_index(angle_mdeg) - self.first;
+        &self.hits[middle - SPOT_RAYS..=middle + SPOT_RAYS]
     }
 
     /// Returns whether a point at the scanner's angle `angle_deg` and `range_mm` is visible: within the field of view,
     /// and not hidden by a surface.
-    pub(crate) fn reaches(&self, angle_deg: f64, range_mm: f64) -> bool {
-        let ray = ((angle_deg + 180.0) * f64::from(RAYS_PER_DEGREE)).round() as usize + REACH;
+    pub(crate) fn is_visible(&self, angle_deg: f64, range_mm: f64) -> bool {
+        let ray = ((angle_deg + 180.0) * f64::from(RAYS_PER_DEGREE)).round() as usize + SPOT_RAYS;
         (-90.0..=90.0).contains(&angle_deg) && self.hits[ray - self.first].range_mm > range_mm - 1.0
     }
 
     /// Returns the range of the nearest ray to `angle_deg`, and the exact range of its face at this angle.
     pub(crate) fn exact(&self, angle_deg: f64) -> (f64, Option<f64>) {
-        let hit = &self.hits[middle((angle_deg * 1e3) as i32) - self.first];
+        let hit = &self.hits[ray_index((angle_deg * 1e3) as i32) - self.first];
         let face = self.face(hit).filter(|_| hit.range_mm.is_finite());
         (hit.range_mm, face.map(|face| face.shape.distance(direction(angle_deg)).unwrap_or(hit.range_mm)))
     }
 
-    fn numbers(&self) -> Range<usize> {
+    fn ray_range(&self) -> Range<usize> {
         self.first..self.first + self.hits.len()
     }
 
@@ -340,8 +340,8 @@ impl View {
 }
 
 /// Returns the index of the ray at the scanner's angle `angle_mdeg`, -180 to 180 degrees.
-fn middle(angle_mdeg: i32) -> usize {
-    REACH + ((angle_mdeg + 180_000) * RAYS_PER_DEGREE / 1000) as usize
+fn ray_index(angle_mdeg: i32) -> usize {
+    SPOT_RAYS + ((angle_mdeg + 180_000) * RAYS_PER_DEGREE / 1000) as usize
 }
 
 /// Returns the indices in `range` of the rays that can meet `shape`.
@@ -350,35 +350,37 @@ fn rays(shape: &Shape, range: Range<usize>) -> impl Iterator<Item = usize> + use
     // A span may reach in from both ends.
     [-360.0, 0.0, 360.0].into_iter().flat_map(move |turn| {
         let Some((first, width)) = span else { return 0..0 };
-        let ray = |angle_deg: f64| (angle_deg + turn - BEHIND) * f64::from(RAYS_PER_DEGREE) + REACH as f64;
+        let ray = |angle_deg: f64| {
+            (angle_deg + turn - FIRST_RAY_DEG) * f64::from(RAYS_PER_DEGREE) + SPOT_RAYS as f64
+        };
         let first_ray = ray(first).floor().max(0.0) as usize;
-        let behind = (ray(first + width).ceil() + 1.0).max(0.0) as usize;
-        first_ray.max(range.start)..behind.min(range.end)
+        let end = (ray(first + width).ceil() + 1.0).max(0.0) as usize;
+        first_ray.max(range.start)..end.min(range.end)
     })
 }
 
 /// Number of rays per degree. They are 4 mm apart at 4 m, and each beam of each variant is on one.
 const RAYS_PER_DEGREE: i32 = 16;
 /// Number of rays to each side that the widest spot covers: more than a degree.
-pub(crate) const REACH: usize = 20;
+pub(crate) const SPOT_RAYS: usize = 20;
 /// Angle between two rays in radians.
 pub(crate) const RAY_STEP: f64 = std::f64::consts::PI / 180.0 / RAYS_PER_DEGREE as f64;
 /// Minimum cosine of the angle of incidence at which glass reflects a beam back: within 3 degrees of a right angle.
-const GLASS_SHINES: f64 = 0.9986;
+const MIN_GLASS_COSINE: f64 = 0.9986;
 
 /// Angle of the first ray: behind the scanner, in degrees counterclockwise from its right.
-const BEHIND: f64 = -90.0;
+const FIRST_RAY_DEG: f64 = -90.0;
 
-/// Unit vectors of all rays, for a full circle from behind the scanner, with [`REACH`] more rays at both ends.
+/// Unit vectors of all rays, for a full circle from behind the scanner, with [`SPOT_RAYS`] more rays at both ends.
 static DIRECTIONS: LazyLock<Vec<Point>> = LazyLock::new(|| {
-    let count = 360 * RAYS_PER_DEGREE + 1 + 2 * REACH as i32;
-    let angle = |ray: i32| f64::from(ray - REACH as i32) / f64::from(RAYS_PER_DEGREE) - 180.0;
+    let count = 360 * RAYS_PER_DEGREE + 1 + 2 * SPOT_RAYS as i32;
+    let angle = |ray: i32| f64::from(ray - SPOT_RAYS as i32) / f64::from(RAYS_PER_DEGREE) - 180.0;
     (0..count).map(|ray| direction(angle(ray))).collect()
 });
 
 /// Returns the unit vector at the scanner's angle `angle_deg`.
 fn direction(angle_deg: f64) -> Point {
-    let from_right = (angle_deg - BEHIND).to_radians();
+    let from_right = (angle_deg - FIRST_RAY_DEG).to_radians();
     (from_right.cos(), from_right.sin())
 }
 
@@ -387,7 +389,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_ray_ends_at_the_nearest_shape_wherever_it_stands() {
+    fn every_ray_ends_at_the_nearest_shape() {
         let mut random = fastrand::Rng::with_seed(5);
         let mut point = || (6000.0 * random.f64() - 3000.0, 6000.0 * random.f64() - 3000.0);
         let shapes: Vec<Shape> = (0..40)
@@ -403,8 +405,8 @@ mod tests {
             let nearest = shapes.iter().filter_map(|shape| shape.distance(DIRECTIONS[ray]));
             assert_eq!(hit.range_mm, nearest.fold(f64::INFINITY, f64::min), "ray {ray}");
         }
-        assert_eq!(view.around(0)[REACH].range_mm, view.hits[REACH + 2880].range_mm);
-        assert!(DIRECTIONS[REACH + 2880].0.abs() < 1e-12);
+        assert_eq!(view.rays_around(0)[SPOT_RAYS].range_mm, view.hits[SPOT_RAYS + 2880].range_mm);
+        assert!(DIRECTIONS[SPOT_RAYS + 2880].0.abs() < 1e-12);
     }
 
     #[test]
@@ -412,7 +414,7 @@ mod tests {
         let mut view = View::empty();
         let shape = Shape::Wall { from: (-3000.0, 2000.0), to: (3000.0, 2000.0) };
         view.draw(Face { shape, surface: Surface::Glass, kind: Kind::Static });
-        assert!((view.around(0)[REACH].range_mm - 2000.0).abs() < 1e-9);
-        assert!(view.around(-10_000)[REACH].range_mm.is_infinite());
+        assert!((view.rays_around(0)[SPOT_RAYS].range_mm - 2000.0).abs() < 1e-9);
+        assert!(view.rays_around(-10_000)[SPOT_RAYS].range_mm.is_infinite());
     }
 }

@@ -8,14 +8,16 @@ use std::path::Path;
 use std::str::FromStr;
 use std::sync::Arc;
 
-use scanhub_files::regular;
+use scanhub_files::regular_file;
 use scanhub_schema::{Failure, Kind};
 use serde::Deserialize;
 use toml::Spanned;
 
 use crate::beam::NoiseModel;
 use crate::mount::{Fault, FaultKind, Mount};
-use crate::scene::{Corner, Move, Object, Plan, SIT_DOWN_S, Scene, Sensor, Speed, Sun, Surface, Way, length};
+use crate::scene::{
+    Corner, Movement, Object, PersonSpec, SIT_DOWN_S, Scene, Sensor, Speed, Sun, Surface, WalkPath, length,
+};
 use crate::shape::{Heights, Point, Pose, Shape};
 
 /// The surroundings of the simulated scanners.
@@ -132,7 +134,7 @@ impl FromStr for World {
 }
 
 fn read(path: &str) -> Result<String, Failure> {
-    regular::read_text(Path::new(path), regular::LONGEST).map_err(|error| {
+    regular_file::read_text(Path::new(path), regular_file::MAX_FILE_BYTES).map_err(|error| {
         let names: Vec<_> = World::names().collect();
         let message = format!("world {path:?} is not known, and as a file: {error}");
         Failure::new(Kind::Input, message, format!("a TOML file, or one of: {}", names.join(", ")))
@@ -154,7 +156,7 @@ fn parse_scene(name: &str, text: &str) -> Result<Scene, Failure> {
     };
     let sensors = file.sensor.iter().map(sensor).collect::<Result<Vec<_>, _>>()?;
     Ok(Scene {
-        sensors: if sensors.is_empty() { vec![Sensor { pose: MIDDLE, mount: None }] } else { sensors },
+        sensors: if sensors.is_empty() { vec![Sensor { pose: PAGE_POSE, mount: None }] } else { sensors },
         noise: file.noise.model(&origin)?,
         objects: file
             .thing
@@ -164,14 +166,14 @@ fn parse_scene(name: &str, text: &str) -> Result<Scene, Failure> {
         people: file
             .person
             .iter()
-            .map(|person| person.get_ref().plan(person.span(), &origin))
+            .map(|person| person.get_ref().person_spec(person.span(), &origin))
             .collect::<Result<_, _>>()?,
         suns: file.sun.iter().map(|sun| sun.sun(&origin)).collect::<Result<_, _>>()?,
     })
 }
 
 /// Pose in the middle of the world, with y ahead, so that angles are those of a page.
-const MIDDLE: Pose = Pose { x_mm: 0.0, y_mm: 0.0, turn_deg: 90.0 };
+const PAGE_POSE: Pose = Pose { x_mm: 0.0, y_mm: 0.0, turn_deg: 90.0 };
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -291,10 +293,10 @@ impl NoiseFile {
 impl ThingFile {
     fn object(&self, span: Range<usize>, origin: &Origin) -> Result<Object, Failure> {
         let (from_s, until_s) = origin.interval(&self.from_s, &self.until_s)?;
-        let mut moves: Vec<Move> = Vec::new();
+        let mut moves: Vec<Movement> = Vec::new();
         for file in &self.moves {
             let (start_s, end_s) = (*file.from_s.get_ref(), *file.until_s.get_ref());
-            let earliest_s = moves.last().map_or(from_s, |way| way.until_s);
+            let earliest_s = moves.last().map_or(from_s, |movement| movement.until_s);
             if !(earliest_s <= start_s && start_s <= end_s) {
                 let what = format!("a move from {start_s} s until {end_s} s, after {earliest_s} s");
                 let remedy = "moves one after the other once it is put down, each with from_s <= until_s";
@@ -304,13 +306,16 @@ impl ThingFile {
                 let what = format!("a move until {end_s} s of what is taken away at {until_s} s");
                 return Err(origin.refuse(file.until_s.span(), what, "moves while it is there"));
             }
-            moves.push(Move { from_s: start_s, until_s: end_s, by: pose(origin, &file.by)? });
+            moves.push(Movement { from_s: start_s, until_s: end_s, offset: pose(origin, &file.by)? });
         }
         Ok(Object {
             shapes: self.shapes(span, origin)?,
             heights: self.heights(origin)?,
             is_box: self.sides.is_some(),
-            pose: self.pose.as_ref().map_or(Ok(Pose { turn_deg: 0.0, ..MIDDLE }), |at| pose(origin, at))?,
+            pose: self
+                .pose
+                .as_ref()
+                .map_or(Ok(Pose { turn_deg: 0.0, ..PAGE_POSE }), |at| pose(origin, at))?,
             surface: self.surface.as_ref().map_or(Ok(Surface::Plain), |name| surface(origin, name))?,
             from_s,
             until_s,
@@ -321,10 +326,11 @@ impl ThingFile {
     }
 
     /// Returns the time after which `moves` start again.
-    fn repeat_s(&self, moves: &[Move], origin: &Origin) -> Result<Option<f64>, Failure> {
+    fn repeat_s(&self, moves: &[Movement], origin: &Origin) -> Result<Option<f64>, Failure> {
         let Some(repeat) = &self.repeat_s else { return Ok(None) };
         let repeat_s = origin.number(&self.repeat_s, 0.0, 0.1..=1e6)?;
-        let sum = |part: fn(&Pose) -> f64| moves.iter().map(|way| part(&way.by)).sum::<f64>().abs();
+        let sum =
+            |part: fn(&Pose) -> f64| moves.iter().map(|movement| part(&movement.offset)).sum::<f64>().abs();
         let returns =
             [sum(|by| by.x_mm), sum(|by| by.y_mm), sum(|by| by.turn_deg)].iter().all(|sum| *sum < 1e-6);
         let lasts_s = moves.first().zip(moves.last()).map(|(first, last)| last.until_s - first.from_s);
@@ -379,10 +385,10 @@ impl ThingFile {
 }
 
 impl PersonFile {
-    fn plan(&self, span: Range<usize>, origin: &Origin) -> Result<Plan, Failure> {
+    fn person_spec(&self, span: Range<usize>, origin: &Origin) -> Result<PersonSpec, Failure> {
         let (from_s, until_s) = origin.interval(&self.from_s, &self.until_s)?;
-        Ok(Plan {
-            way: self.way(span, origin, from_s, until_s)?,
+        Ok(PersonSpec {
+            path: self.path(span, origin, from_s, until_s)?,
             from_s,
             until_s,
             jitter_mm: origin.number(&self.jitter_mm, 0.0, 0.0..=10_000.0)?,
@@ -390,10 +396,16 @@ impl PersonFile {
         })
     }
 
-    fn way(&self, span: Range<usize>, origin: &Origin, from_s: f64, until_s: f64) -> Result<Way, Failure> {
+    fn path(
+        &self,
+        span: Range<usize>,
+        origin: &Origin,
+        from_s: f64,
+        until_s: f64,
+    ) -> Result<WalkPath, Failure> {
         let (path, speed) = match (&self.path, self.centre, self.reach, &self.speed_mm_s) {
             (None, Some(centre), Some(reach), None) if self.repeat.is_none() => {
-                return Ok(Way::Roam { centre: point(centre), reach: (reach.0.0, reach.1.0) });
+                return Ok(WalkPath::Roam { centre: point(centre), reach: (reach.0.0, reach.1.0) });
             }
             (Some(path), None, None, speed) => (path, speed),
             _ => {
@@ -409,7 +421,7 @@ impl PersonFile {
                 [rest_s, seat_deg] => (rest_s.0, Some(seat_deg.0)),
                 _ => return None,
             };
-            (rest_s >= 0.0).then_some(Corner { point: (x.0, y.0), rest_s, seat_deg })
+            (rest_s >= 0.0).then_some(Corner { point: (x.0, y.0), pause_s: rest_s, seat_deg })
         };
         let corners = path.get_ref().iter().map(corner).collect::<Option<Vec<_>>>();
         let Some(corners) = corners.filter(|corners| !corners.is_empty()) else {
@@ -417,21 +429,21 @@ impl PersonFile {
                           in millimeters";
             return Err(origin.refuse(path.span(), "a path without points", remedy));
         };
-        let is_short = |corner: &&Corner| corner.seat_deg.is_some() && corner.rest_s < 2.0 * SIT_DOWN_S;
+        let is_short = |corner: &&Corner| corner.seat_deg.is_some() && corner.pause_s < 2.0 * SIT_DOWN_S;
         if let Some(corner) = corners.iter().find(is_short).filter(|_| corners.len() > 1) {
-            let what = format!("a person who sits for {} s", corner.rest_s);
+            let what = format!("a person who sits for {} s", corner.pause_s);
             let least_s = 2.0 * SIT_DOWN_S;
             let remedy = format!("{least_s} s or more: to sit down and to stand up take {SIT_DOWN_S} s each");
             return Err(origin.refuse(path.span(), what, remedy));
         }
-        let rest_s: f64 = corners.iter().map(|corner| corner.rest_s).sum();
+        let rest_s: f64 = corners.iter().map(|corner| corner.pause_s).sum();
         if corners.len() > 1 && rest_s >= until_s - from_s {
             let what = format!("{rest_s} s of rest from {from_s} s until {until_s} s");
             return Err(origin.refuse(path.span(), what, "rests that leave time to walk"));
         }
         let speed = match (speed, corners.len()) {
-            (None, 1) => Speed::InTime,
-            (None, _) if until_s.is_finite() => Speed::InTime,
+            (None, 1) => Speed::ToEnd,
+            (None, _) if until_s.is_finite() => Speed::ToEnd,
             (Some(speed), 2..) if until_s.is_infinite() => {
                 let (slowest, fastest) = match *speed.get_ref() {
                     SpeedFile::Always(speed) => (speed, speed),
@@ -450,11 +462,11 @@ impl PersonFile {
             }
         };
         let repeats = self.repeat.as_ref().filter(|repeat| *repeat.get_ref());
-        if let Some(repeat) = repeats.filter(|_| speed == Speed::InTime || length(&corners) == 0.0) {
+        if let Some(repeat) = repeats.filter(|_| speed == Speed::ToEnd || length(&corners) == 0.0) {
             let remedy = "repeat = true only beside a path with several corners and speed_mm_s";
             return Err(origin.refuse(repeat.span(), "a path that cannot be walked again and again", remedy));
         }
-        Ok(Way::Path { corners, speed, repeats: repeats.is_some() })
+        Ok(WalkPath::Path { corners, speed, repeats: repeats.is_some() })
     }
 }
 
@@ -589,13 +601,13 @@ impl FaultFile {
         let (from_s, until_s) = origin.interval(&self.from_s, &self.until_s)?;
         let by_deg = || origin.number(&self.by_deg, 8.0, -80.0..=80.0);
         let kind = match self.kind.as_str() {
-            "halts" => FaultKind::Halts,
-            "silent" => FaultKind::Silent,
+            "halts" => FaultKind::Halt,
+            "silent" => FaultKind::Silence,
             "stuck" => FaultKind::Stuck,
-            "jumps" => FaultKind::Jumps(by_deg()?),
-            "lies" => FaultKind::Lies(by_deg()?),
-            "late" => FaultKind::Late(origin.number(&self.by_s, 0.3, 0.0..=10.0)?),
-            "stamps_late" => FaultKind::StampsLate(origin.number(&self.by_s, 0.03, -1.0..=1.0)?),
+            "jumps" => FaultKind::Jump(by_deg()?),
+            "lies" => FaultKind::Drift(by_deg()?),
+            "late" => FaultKind::Delay(origin.number(&self.by_s, 0.3, 0.0..=10.0)?),
+            "stamps_late" => FaultKind::StampDelay(origin.number(&self.by_s, 0.03, -1.0..=1.0)?),
             other => {
                 let remedy = "halts, silent, stuck, jumps or lies with by_deg, late or stamps_late with by_s";
                 return Err(origin.refuse(span, format!("kind = \"{other}\""), remedy));

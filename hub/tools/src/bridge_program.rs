@@ -12,11 +12,11 @@ use crate::doctor::Finding;
 /// Name of the program.
 pub const PROGRAM: &str = "scanhub-bridge";
 /// Remedy if the program is missing.
-const INSTALL: &str = "in the directory of scanhub's source: cargo install --path clients/bridge";
+const INSTALL_REMEDY: &str = "in the directory of scanhub's source: cargo install --path clients/bridge";
 
 /// Returns the directories in which the program may be, in the order of the search: that of this program, and those of
 /// PATH.
-pub fn places() -> Vec<PathBuf> {
+pub fn search_directories() -> Vec<PathBuf> {
     let own = std::env::current_exe().ok().and_then(|path| path.parent().map(Path::to_owned));
     let path = std::env::var_os("PATH").unwrap_or_default();
     own.into_iter().chain(std::env::split_paths(&path)).collect()
@@ -27,21 +27,23 @@ pub fn places() -> Vec<PathBuf> {
 /// # Errors
 ///
 /// Returns [`Kind::Configuration`] if there is none, if it does not run, or if it has another version.
-pub fn find(places: &[PathBuf]) -> Result<PathBuf, Failure> {
+pub fn find(directories: &[PathBuf]) -> Result<PathBuf, Failure> {
     let refuse = |what: String, hint: &str| Err(Failure::new(Kind::Configuration, what, hint));
-    let Some(program) = places.iter().map(|place| place.join(PROGRAM)).find(|path| path.is_file()) else {
-        return refuse(format!("{PROGRAM} is not installed"), INSTALL);
+    let Some(program) =
+        directories.iter().map(|directory| directory.join(PROGRAM)).find(|path| path.is_file())
+    else {
+        return refuse(format!("{PROGRAM} is not installed"), INSTALL_REMEDY);
     };
     let own = env!("CARGO_PKG_VERSION");
     match version(&program) {
         Ok(version) if version == own => Ok(program),
         Ok(version) => {
             let what = format!("{} has version {version}, this program {own}", program.display());
-            refuse(what, &format!("install both of one version, {INSTALL}"))
+            refuse(what, &format!("install both of one version, {INSTALL_REMEDY}"))
         }
         Err(why) => {
             let what = format!("{} does not run: {why}", program.display());
-            refuse(what, &format!("install it again, {INSTALL}"))
+            refuse(what, &format!("install it again, {INSTALL_REMEDY}"))
         }
     }
 }
@@ -62,8 +64,8 @@ pub struct Bridge {
     pub connect: Vec<String>,
     /// A file of Zenoh's own configuration.
     pub config: Option<PathBuf>,
-    /// Directories in which the program may be, in the order of the search. If it is empty, those of [`places`].
-    pub places: Vec<PathBuf>,
+    /// Directories in which the program may be, in the order of the search. If it is empty, those of [`search_directories`].
+    pub directories: Vec<PathBuf>,
 }
 
 impl Bridge {
@@ -72,8 +74,9 @@ impl Bridge {
         if self.connect.is_empty() && self.config.is_none() {
             return vec![Finding::skipped(CHECK, "no router is named; --bridge tcp/HOST:7447 does")];
         }
-        let places = if self.places.is_empty() { places() } else { self.places.clone() };
-        match find(&places) {
+        let directories =
+            if self.directories.is_empty() { search_directories() } else { self.directories.clone() };
+        match find(&directories) {
             Ok(program) => self.check_with(&program),
             Err(failure) => vec![Finding::failed(CHECK, failure.message, failure.hint)],
         }
@@ -146,8 +149,11 @@ mod tests {
         if let Some(script) = script {
             write_program(place.path().join(PROGRAM), format!("#!/bin/sh\n{script}\n"));
         }
-        let bridge =
-            Bridge { connect: vec!["tcp/r:1".into()], config: None, places: vec![place.path().to_owned()] };
+        let bridge = Bridge {
+            connect: vec!["tcp/r:1".into()],
+            config: None,
+            directories: vec![place.path().to_owned()],
+        };
         bridge.check().into_iter().map(|it| (it.state, it.finding, it.remedy)).collect()
     }
 

@@ -1,7 +1,7 @@
 //! `scanhub configure`: changes the EEPROM settings of an LMS. Reads the settings, shows each difference, asks a
 //! person, writes, reads back, and reports the settings and the state of the scanner, above all after a failure.
 //!
-//! `ask_person` is the only place that creates consent: nothing is written into a scanner unless a person has typed
+//! `request_consent` is the only place that creates consent: nothing is written into a scanner unless a person has typed
 //! `yes`.
 
 use std::fmt;
@@ -14,20 +14,20 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::termios::{QueueSelector, tcflush};
 use scanhub_drivers::Inquiry;
 use scanhub_drivers::lms::command::Password;
-use scanhub_drivers::lms::configuration::{Item, availability_words};
-use scanhub_drivers::lms::family::Family;
+use scanhub_drivers::lms::configuration::{Item, availability_text};
 use scanhub_drivers::lms::inquiry::Report;
+use scanhub_drivers::lms::lms_model::LmsModel;
 use scanhub_drivers::lms::operating;
 use scanhub_drivers::lms::variant::{Mode, Unit};
 use scanhub_lms_configure::eeprom::PowerOn;
-use scanhub_lms_configure::{Change, Consent, Failing, Outcome, OwnedConfiguration, Plan, Step};
-use scanhub_port::{Source, clock};
+use scanhub_lms_configure::{Change, ChangeError, Consent, Outcome, OwnedConfiguration, Plan, Step};
+use scanhub_port::{PortSpec, clock};
 use scanhub_schema::{Failure, Kind};
 use scanhub_shm::Domain;
 use serde::Serialize;
 
-use crate::driver::{Procedure, drive};
-use crate::probe::{check_unused, hex, measuring, open, request_report, source};
+use crate::driver::{Procedure, run_protocol};
+use crate::probe::{check_unused, describe_mode, hex, open, request_report, source};
 use crate::terminal::{Progress, print};
 
 /// Change a sensor's EEPROM settings: shows the difference and asks first
@@ -55,7 +55,7 @@ A person must confirm. If stdin or stderr is not a terminal, the difference is \
                            shown, nothing is written, and the exit code is 2";
 
 impl ConfigureArgs {
-    /// Changes the settings, and prints differences and the result to `out`. `places` are the locations in which a client
+    /// Changes the settings, and prints differences and the result to `out`. `locations` are the locations in which a client
     /// would search for the domain of a hub, which may use the port.
     ///
     /// # Errors
@@ -70,16 +70,16 @@ impl ConfigureArgs {
     pub fn run(
         &self,
         json: bool,
-        places: &[Domain],
+        locations: &[Domain],
         out: &mut (impl Write + AsFd),
         stop: &AtomicBool,
     ) -> Result<(), Failure> {
         // The person who confirms must see the differences, even if stdout is redirected.
         let repeats = !out.as_fd().is_terminal() && stderr().is_terminal();
         let mut progress = Progress::on_stderr();
-        let result = self.configure(json, places, out, repeats, &mut progress, stop);
+        let result = self.configure(json, locations, out, repeats, &mut progress, stop);
         if result.is_err() {
-            progress.leave();
+            progress.keep_text();
         }
         result
     }
@@ -89,7 +89,7 @@ impl ConfigureArgs {
     fn configure(
         &self,
         json: bool,
-        places: &[Domain],
+        locations: &[Domain],
         out: &mut dyn Write,
         repeats: bool,
         progress: &mut Progress,
@@ -98,15 +98,15 @@ impl ConfigureArgs {
         let source = source(&self.port)?;
         let requested = SettingsRequest::parse(&self.settings)?;
         let password = parse_password(&self.password)?;
-        check_unused(&source, places)?;
+        check_unused(&source, locations)?;
         let (port, first) = open(&source, stop)?;
-        let rate = if let Source::Tcp { .. } = source { None } else { Some(first) };
+        let rate = if let PortSpec::Tcp { .. } = source { None } else { Some(first) };
         let inquiry = Inquiry::begin(rate, clock::now());
         let report = request_report(&port, first, inquiry, (&source, true), stop, |rate| {
             progress.show(&format!("looking at {rate} Bd"))
         })?;
         let name = source.name();
-        let Some(mut plan) = Plan::of(&report) else {
+        let Some(mut plan) = Plan::from_report(&report) else {
             return Err(Failure::new(
                 Kind::Timeout,
                 format!("{name}: the sensor does not report its configuration"),
@@ -114,11 +114,11 @@ impl ConfigureArgs {
             ));
         };
         plan.password = password;
-        let family = report.kind().and_then(Family::of_type);
+        let family = report.kind().and_then(LmsModel::of_type);
         requested.apply(&mut plan, family, &report)?;
         if plan.is_empty() {
             progress.clear();
-            let nothing = Configured::nothing(&name, &plan);
+            let nothing = ConfigureReport::nothing(&name, &plan);
             let _ = print(out, json, &nothing, || nothing.to_string());
             return Ok(());
         }
@@ -130,12 +130,12 @@ impl ConfigureArgs {
                 let _ = print(&mut stderr(), false, &difference, || difference.to_string());
             }
         }
-        let consent = ask_person(plan, stop)?;
+        let consent = request_consent(plan, stop)?;
         // A scanner that streams has filled the input buffer in the meantime.
         port.discard_input(plan.baud.rate()).map_err(|error| lost_before_writing(&name, &error))?;
         let mut change = Change::new(consent, clock::now());
-        if let Source::Tcp { .. } = source {
-            change = change.behind_server();
+        if let PortSpec::Tcp { .. } = source {
+            change = change.with_server();
         }
         let mut shown = None;
         // An interrupt would leave the change incomplete. It takes seconds, and ends in any case.
@@ -147,9 +147,9 @@ impl ConfigureArgs {
             }
             true
         });
-        let result = drive(&port, &mut change, &mut procedure, &never_stop);
+        let result = run_protocol(&port, &mut change, &mut procedure, &never_stop);
         result.map_err(|failure| lost_while_writing(&name, &change, &failure))?;
-        let configured = Configured::of(&name, &plan, was_permanent, change.outcome())?;
+        let configured = ConfigureReport::of(&name, &plan, was_permanent, change.outcome())?;
         progress.clear();
         let _ = print(out, json, &configured, || configured.to_string());
         Ok(())
@@ -179,7 +179,12 @@ impl Difference {
     /// Returns everything that `plan` changes in the scanner at `port`.
     ///
     /// `was_permanent` states whether the scanner has started at another rate than 9600 Bd so far, if it reported that.
-    fn all(port: &str, plan: &Plan, family: Option<Family>, was_permanent: Option<bool>) -> Vec<Difference> {
+    fn all(
+        port: &str,
+        plan: &Plan,
+        family: Option<LmsModel>,
+        was_permanent: Option<bool>,
+    ) -> Vec<Difference> {
         let difference = |item, offset, before, after| Difference {
             class: "difference",
             port: port.to_owned(),
@@ -215,7 +220,7 @@ impl Difference {
 
 /// Result of a change that succeeded, or that had nothing to change; class `configured`.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct Configured {
+pub struct ConfigureReport {
     class: &'static str,
     port: String,
     /// Whether anything was written.
@@ -257,10 +262,10 @@ impl UndoSettings {
     }
 }
 
-impl Configured {
+impl ConfigureReport {
     /// Creates the result of a plan that changes nothing.
-    fn nothing(port: &str, plan: &Plan) -> Configured {
-        Configured {
+    fn nothing(port: &str, plan: &Plan) -> ConfigureReport {
+        ConfigureReport {
             class: "configured",
             port: port.to_owned(),
             written: false,
@@ -283,23 +288,23 @@ impl Configured {
         plan: &Plan,
         was_permanent: Option<bool>,
         outcome: &Outcome,
-    ) -> Result<Configured, Failure> {
+    ) -> Result<ConfigureReport, Failure> {
         if let Some((step, failing)) = outcome.failed {
             return Err(failure(port, plan, outcome, step, failing));
         }
-        Ok(Configured {
+        Ok(ConfigureReport {
             written: true,
             after: hex(outcome.configuration.as_ref().map_or(&[], OwnedConfiguration::bytes)),
             operating_mode: outcome.operating_mode.unwrap_or_default(),
             undo: UndoSettings::of(plan, was_permanent),
-            ..Configured::nothing(port, plan)
+            ..ConfigureReport::nothing(port, plan)
         })
     }
 }
 
-impl fmt::Display for Configured {
+impl fmt::Display for ConfigureReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Configured { port, undo, .. } = self;
+        let ConfigureReport { port, undo, .. } = self;
         if !self.written {
             return write!(f, "{port}: nothing to change, nothing was written");
         }
@@ -345,15 +350,15 @@ fn describe_step(step: Step) -> &'static str {
 }
 
 /// Returns the value of `item` in hex, with its meaning if it has one.
-fn describe_value(item: Item, bytes: &[u8], family: Option<Family>) -> String {
+fn describe_value(item: Item, bytes: &[u8], family: Option<LmsModel>) -> String {
     let value = bytes.get(item.at..item.at + item.len).unwrap_or_default();
     let byte = value.first().copied().unwrap_or_default();
     let meaning = match item.at {
-        SENSITIVITY if family == Some(Family::Lms291) => {
+        SENSITIVITY if family == Some(LmsModel::Lms291) => {
             SENSITIVITIES.get(usize::from(byte)).map_or(String::new(), |name| (*name).to_owned())
         }
-        AVAILABILITY => availability_words(byte).to_owned(),
-        MODE => measuring(Mode(byte)),
+        AVAILABILITY => availability_text(byte).to_owned(),
+        MODE => describe_mode(Mode(byte)),
         UNIT => Unit::of_code(byte).map_or(String::new(), |unit| format!("{} mm", unit.mm())),
         _ => String::new(),
     };
@@ -362,20 +367,22 @@ fn describe_value(item: Item, bytes: &[u8], family: Option<Family>) -> String {
 }
 
 /// Returns the failure of a change in `step`, with the state of the scanner.
-fn failure(port: &str, plan: &Plan, outcome: &Outcome, step: Step, failing: Failing) -> Failure {
+fn failure(port: &str, plan: &Plan, outcome: &Outcome, step: Step, failing: ChangeError) -> Failure {
     let what = match (step, failing) {
-        (Step::Enter, Failing::Refused) => "the sensor refuses the installation mode: wrong password?".into(),
-        (Step::Compare, Failing::Differs) => {
+        (Step::Enter, ChangeError::Refused) => {
+            "the sensor refuses the installation mode: wrong password?".into()
+        }
+        (Step::Compare, ChangeError::Mismatch) => {
             "its settings changed since you confirmed: is this another sensor?".into()
         }
-        (_, Failing::Differs) => "the settings read back differ from those written".into(),
-        (step, Failing::Refused) => format!("{}: the sensor refuses", describe_step(step)),
-        (step, Failing::Unanswered) => format!("{}: no answer", describe_step(step)),
+        (_, ChangeError::Mismatch) => "the settings read back differ from those written".into(),
+        (step, ChangeError::Refused) => format!("{}: the sensor refuses", describe_step(step)),
+        (step, ChangeError::Unanswered) => format!("{}: no answer", describe_step(step)),
     };
     if step == Step::Compare {
         return Failure::new(Kind::Failed, format!("{port}: {what}"), "nothing was written");
     }
-    let kept = match outcome.configuration {
+    let eeprom_state = match outcome.configuration {
         _ if !outcome.written => "nothing was written".into(),
         None => format!("the settings in the EEPROM are not known now; before: {}", hex(plan.old.bytes())),
         Some(kept) if kept == plan.old && plan.old != plan.new => {
@@ -388,7 +395,7 @@ fn failure(port: &str, plan: &Plan, outcome: &Outcome, step: Step, failing: Fail
         Some(mode) => format!("it is at: {}", operating::name(mode)),
         None => UNKNOWN_MODE.to_owned(),
     };
-    Failure::new(Kind::Failed, format!("{port}: {what}"), format!("{kept}; {mode}"))
+    Failure::new(Kind::Failed, format!("{port}: {what}"), format!("{eeprom_state}; {mode}"))
 }
 
 /// Returns the failure for a port that failed before anything was sent.
@@ -398,13 +405,13 @@ fn lost_before_writing(port: &str, error: &std::io::Error) -> Failure {
 
 /// Returns the failure for a port that disappeared during `change`.
 fn lost_while_writing(port: &str, change: &Change, failure: &Failure) -> Failure {
-    let kept = if change.outcome().written {
+    let eeprom_state = if change.outcome().written {
         "whether it was written is not known: scanhub probe shows it"
     } else {
         "nothing was written"
     };
     let what = format!("{port}: {}: {}", describe_step(change.step()), failure.message);
-    Failure::new(failure.kind, what, format!("{kept}; {UNKNOWN_MODE}"))
+    Failure::new(failure.kind, what, format!("{eeprom_state}; {UNKNOWN_MODE}"))
 }
 
 /// All settings that the command line requests.
@@ -443,7 +450,7 @@ impl SettingsRequest {
     /// # Errors
     ///
     /// Returns [`Kind::Configuration`] if this scanner does not support a setting.
-    fn apply(&self, plan: &mut Plan, family: Option<Family>, report: &Report) -> Result<(), Failure> {
+    fn apply(&self, plan: &mut Plan, family: Option<LmsModel>, report: &Report) -> Result<(), Failure> {
         let bits = |plan: &mut Plan, mask: u8, bits: u8| {
             let byte = plan.new.bytes().get(AVAILABILITY).copied().unwrap_or_default();
             plan.new.set(AVAILABILITY, byte & !mask | bits);
@@ -536,7 +543,7 @@ fn parse_mode(value: &str) -> Option<u8> {
 ///
 /// Returns [`Kind::Usage`] if stdin, or stderr with the question, is not a terminal, [`Kind::Interrupted`] if `stop` is
 /// set, and [`Kind::Failed`] if the answer is not `yes`.
-fn ask_person(plan: Plan, stop: &AtomicBool) -> Result<Consent, Failure> {
+fn request_consent(plan: Plan, stop: &AtomicBool) -> Result<Consent, Failure> {
     let input = stdin();
     if !input.is_terminal() || !stderr().is_terminal() {
         return Err(Failure::new(
@@ -567,7 +574,7 @@ fn ask_person(plan: Plan, stop: &AtomicBool) -> Result<Consent, Failure> {
         let _ = stderr().write_all(b"\n");
     }
     if read.is_ok() && answer.trim() == "yes" {
-        return Ok(Consent::of_a_person(plan));
+        return Ok(Consent::confirmed_by_person(plan));
     }
     Err(Failure::new(Kind::Failed, "not confirmed: nothing was written", "to write, answer: yes"))
 }
@@ -635,13 +642,13 @@ const STOP_CHECK_INTERVAL: Timespec = Timespec { tv_sec: 0, tv_nsec: 100_000_000
 
 #[cfg(test)]
 mod tests {
-    use scanhub_drivers::lms::configuration::factory;
+    use scanhub_drivers::lms::configuration::factory_configuration;
     use scanhub_drivers::lms::variant::Baud;
 
     use super::*;
 
     fn plan() -> Plan {
-        let old = OwnedConfiguration::new(&factory(Mode(1), Unit::Mm)).unwrap();
+        let old = OwnedConfiguration::new(&factory_configuration(Mode(1), Unit::Mm)).unwrap();
         Plan {
             baud: Baud::B9600,
             address: 0,
@@ -653,7 +660,7 @@ mod tests {
         }
     }
 
-    fn applied(settings: &[&str], family: Option<Family>) -> Result<Plan, Failure> {
+    fn applied(settings: &[&str], family: Option<LmsModel>) -> Result<Plan, Failure> {
         let settings: Vec<String> = settings.iter().map(|setting| (*setting).to_owned()).collect();
         let mut plan = plan();
         SettingsRequest::parse(&settings)?.apply(&mut plan, family, &Report::default())?;
@@ -663,7 +670,7 @@ mod tests {
     #[test]
     fn each_key_changes_its_byte() {
         let byte = |setting: &str, at: usize| {
-            let plan = applied(&[setting], Some(Family::Lms291)).unwrap();
+            let plan = applied(&[setting], Some(LmsModel::Lms291)).unwrap();
             plan.new.bytes()[at]
         };
         assert_eq!((byte("unit=cm", 6), byte("unit=mm", 6)), (0, 1));
@@ -696,7 +703,7 @@ mod tests {
             ("configuration=00", "32 or 34 bytes"),
             ("sensitivity=high", "only the LMS 291"),
         ] {
-            let text = refusal(setting, Some(Family::Lms200));
+            let text = refusal(setting, Some(LmsModel::Lms200));
             assert!(text.contains(words), "{setting}: {text}");
         }
         assert!(refusal("sensitivity=low", None).contains("not known"));

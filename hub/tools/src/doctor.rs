@@ -18,7 +18,7 @@ use std::sync::atomic::AtomicBool;
 
 use clap::Args;
 use scanhub_config::{Config, Gateway, Link, Sources};
-use scanhub_port::{Candidate, PortlessAdapter, Source, candidates};
+use scanhub_port::{PortSpec, PortlessAdapter, SerialPortInfo, serial_ports};
 use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Failure, Kind, Printable};
 use scanhub_shm::Domain;
@@ -29,7 +29,7 @@ use crate::probe::source;
 use crate::terminal::print;
 pub(crate) use hub::Hub;
 pub use installation::System;
-use machine::Facts;
+use machine::MachineState;
 
 /// Check the setup and show how to fix what is wrong
 #[derive(Args, Debug)]
@@ -52,7 +52,7 @@ pub struct DoctorArgs {
 
 impl DoctorArgs {
     /// Makes all checks, and prints each finding as soon as it is known. The configuration is that of `sources`. A hub would
-    /// create `domain`, and a client would search for it in `places`.
+    /// create `domain`, and a client would search for it in `locations`.
     ///
     /// # Errors
     ///
@@ -60,7 +60,7 @@ impl DoctorArgs {
     pub fn run(
         &self,
         sources: &Sources,
-        (domain, places): (Domain, Vec<Domain>),
+        (domain, locations): (Domain, Vec<Domain>),
         json: bool,
         out: &mut dyn Write,
         stop: &AtomicBool,
@@ -74,8 +74,8 @@ impl DoctorArgs {
                 .then(|| Config::of(&read).and_then(|config| gateway.clone().map(|_| config))),
             gateway: gateway.clone().unwrap_or_default(),
             domain,
-            places,
-            system: System::this(),
+            locations,
+            system: System::local(),
             bridge: Bridge {
                 connect: self.bridge.clone(),
                 config: self.bridge_config.clone(),
@@ -106,7 +106,7 @@ impl DoctorArgs {
 pub struct CheckTargets {
     /// Ports as the user named them, or names of links of the running hub. If it is empty, those of the configuration and of
     /// the running hub.
-    pub ports: Vec<Source>,
+    pub ports: Vec<PortSpec>,
     /// The configuration, or the reason why it is invalid; `None` if there is none.
     pub config: Option<Result<Config, Failure>>,
     /// The gateway's section of the configuration.
@@ -114,7 +114,7 @@ pub struct CheckTargets {
     /// The domain that a hub would create.
     pub domain: Domain,
     /// The locations in which a client would search for the domain.
-    pub places: Vec<Domain>,
+    pub locations: Vec<Domain>,
     /// The machine's files.
     pub system: System,
     /// Connection of a bridge to other machines.
@@ -124,12 +124,12 @@ pub struct CheckTargets {
 }
 
 /// A port to check, and its link in the configuration.
-pub(crate) struct Subject {
-    pub(crate) source: Source,
+pub(crate) struct PortTarget {
+    pub(crate) source: PortSpec,
     pub(crate) link: Option<Link>,
     /// Whether the user or the configuration named the port. Another port may belong to any device, so nothing is sent
     /// to it.
-    pub(crate) named: bool,
+    pub(crate) is_named: bool,
 }
 
 /// The names of all checks, in their order. docs/doctor.md has a line for each.
@@ -259,7 +259,7 @@ impl fmt::Display for Finding {
     }
 }
 
-/// Makes all checks, and calls `tell` with each finding as soon as it is known.
+/// Makes all checks, and calls `report` with each finding as soon as it is known.
 ///
 /// # Errors
 ///
@@ -267,52 +267,59 @@ impl fmt::Display for Finding {
 pub fn run_checks(
     targets: &CheckTargets,
     stop: &AtomicBool,
-    tell: &mut dyn FnMut(&Finding),
+    report: &mut dyn FnMut(&Finding),
 ) -> Result<(), Failure> {
     let mut failed = 0;
-    let mut tell = |finding: Finding| {
+    let mut report = |finding: Finding| {
         failed += usize::from(finding.state == State::Failed);
-        tell(&finding);
+        report(&finding);
     };
-    let there = candidates();
-    let home = targets.places.iter().find(|place| matches!(scanhub_shm::holder(place.root()), Ok(Some(_))));
-    let domain = home.unwrap_or(&targets.domain);
+    let serial_ports = serial_ports();
+    let hub_location = targets
+        .locations
+        .iter()
+        .find(|location| matches!(scanhub_shm::hub_pid(location.root()), Ok(Some(_))));
+    let domain = hub_location.unwrap_or(&targets.domain);
     let hub = Hub::find(domain);
     let portless = PortlessAdapter::all(&targets.system.path("/"));
-    let ports = choose(targets, &there, &portless, hub.as_ref(), &mut tell);
+    let ports = select_ports(targets, &serial_ports, &portless, hub.as_ref(), &mut report);
     for adapter in &portless {
-        tell(line::without_port(adapter, ports.is_empty()));
+        report(line::without_port(adapter, ports.is_empty()));
     }
     let (system, pid) = (&targets.system, hub.as_ref().map(|hub| hub.pid));
     if targets.clean {
-        let elsewhere = targets.places.iter().filter(|place| place.root() != domain.root());
-        let places: Vec<&Domain> = std::iter::once(domain).chain(elsewhere).collect();
-        tell(shared_memory::clean(&places, system.user()));
+        let elsewhere = targets.locations.iter().filter(|location| location.root() != domain.root());
+        let locations: Vec<&Domain> = std::iter::once(domain).chain(elsewhere).collect();
+        report(shared_memory::clean(&locations, system.user()));
     }
-    tell(installation::version(system, pid));
-    tell(installation::service(system, pid));
-    tell(installation::rules(system, &there));
+    report(installation::version(system, pid));
+    report(installation::service(system, pid));
+    report(installation::rules(system, &serial_ports));
     let limits = match &targets.config {
         Some(Ok(config)) => config.topic_limits(),
         _ => vec![TopicLimits::default(); ports.len().max(1)],
     };
-    let facts = Facts::gather(domain, &targets.places, limits, hub.as_ref());
+    let facts = MachineState::gather(domain, &targets.locations, limits, hub.as_ref());
     let config = targets.config.as_ref().and_then(|config| config.as_ref().ok());
-    tell(machine::memory(&facts, config.and_then(scanhub_config::Config::memory_remedy)));
-    tell(machine::domain(&facts));
-    tell(machine::hubs(&facts, |user| system.name_of(user)));
-    tell(shared_memory::strangers(&scanhub_shm::strangers(domain.root()), |user| system.name_of(user)));
-    tell(shared_memory::leftovers(&facts));
-    tell(machine::descriptors(&facts));
-    tell(machine::file_size(&facts));
-    tell(installation::logout(system, pid.and_then(installation::user_of).unwrap_or(system.user())));
-    tell(machine::multicast(system, targets.gateway.interface.as_deref()));
-    targets.bridge.check().into_iter().for_each(&mut tell);
+    report(machine::memory(&facts, config.and_then(scanhub_config::Config::memory_remedy)));
+    report(machine::domain(&facts));
+    report(machine::hubs(&facts, |user| system.name_of(user)));
+    report(shared_memory::strangers(&scanhub_shm::foreign_segments(domain.root()), |user| {
+        system.name_of(user)
+    }));
+    report(shared_memory::leftovers(&facts));
+    report(machine::descriptors(&facts));
+    report(machine::file_size(&facts));
+    report(installation::logout(system, pid.and_then(installation::user_of).unwrap_or(system.user())));
+    report(machine::multicast(system, targets.gateway.interface.as_deref()));
+    targets.bridge.check().into_iter().for_each(&mut report);
     for subject in &ports {
         let link = subject.link.as_ref().map(|link| link.name.as_str());
         let of_hub = || hub.as_ref().and_then(|hub| hub.link(&subject.source)).map(|(name, _)| name);
         let (port, link) = (subject.source.name(), link.or_else(of_hub));
-        line::examine(subject, &there, hub.as_ref(), stop, &mut |finding| tell(finding.at(&port, link)))?;
+        line::check_port(subject, &serial_ports, hub.as_ref(), stop, &mut |finding| {
+            report(finding.at(&port, link))
+        })?;
     }
     match failed {
         0 => Ok(()),
@@ -327,59 +334,65 @@ pub fn run_checks(
 
 /// Returns the ports that the user named. If there are none, those of the configuration, or all ports of the machine, with
 /// the ports of the running hub.
-fn choose(
+fn select_ports(
     targets: &CheckTargets,
-    there: &[Candidate],
+    serial_ports: &[SerialPortInfo],
     portless: &[PortlessAdapter],
     hub: Option<&Hub>,
-    tell: &mut impl FnMut(Finding),
-) -> Vec<Subject> {
+    report: &mut impl FnMut(Finding),
+) -> Vec<PortTarget> {
     const NAME: &str = "configuration";
     let links = match &targets.config {
         Some(Ok(config)) => {
             let names: Vec<&str> = config.links.iter().map(|link| link.name.as_str()).collect();
-            tell(Finding::ok(NAME, format!("links {}", names.join(", "))));
+            report(Finding::ok(NAME, format!("links {}", names.join(", "))));
             &config.links[..]
         }
         Some(Err(failure)) => {
-            tell(Finding::failed(NAME, failure.message.clone(), failure.hint.clone()));
+            report(Finding::failed(NAME, failure.message.clone(), failure.hint.clone()));
             &[]
         }
         None => &[],
     };
-    let of_link = |source: &Source| links.iter().find(|link| link.port.is_same_port(source)).cloned();
+    let of_link = |source: &PortSpec| links.iter().find(|link| link.port.is_same_port(source)).cloned();
     if !targets.ports.is_empty() {
         let named = targets.ports.iter();
         return named
             .map(|source| hub.and_then(|hub| hub.port_of(source)).unwrap_or_else(|| source.clone()))
-            .map(|source| Subject { link: of_link(&source), source, named: true })
+            .map(|source| PortTarget { link: of_link(&source), source, is_named: true })
             .collect();
     }
     // The hub may have other links than this configuration, and ports that are not lines of this machine. A port that it
     // waits for stays unopened.
-    let add_links_of_hub = |mut ports: Vec<Subject>| {
+    let add_links_of_hub = |mut ports: Vec<PortTarget>| {
         for source in hub.map(Hub::ports).unwrap_or_default() {
             if !ports.iter().any(|subject| subject.source.is_same_port(&source)) {
-                ports.push(Subject { source, link: None, named: false });
+                ports.push(PortTarget { source, link: None, is_named: false });
             }
         }
         ports
     };
     if !links.is_empty() {
         let ports = links.iter();
-        let ports =
-            ports.map(|link| Subject { source: link.port.clone(), link: Some(link.clone()), named: true });
+        let ports = ports.map(|link| PortTarget {
+            source: link.port.clone(),
+            link: Some(link.clone()),
+            is_named: true,
+        });
         return add_links_of_hub(ports.collect());
     }
-    if there.is_empty() && portless.is_empty() && hub.is_none_or(|hub| hub.ports().is_empty()) {
-        tell(Finding::failed(
+    if serial_ports.is_empty() && portless.is_empty() && hub.is_none_or(|hub| hub.ports().is_empty()) {
+        report(Finding::failed(
             "ports",
             "no serial line on this machine",
             "plug an adapter in, or name a port",
         ));
     }
-    let ports = there.iter();
-    let ports =
-        ports.map(|port| Subject { source: Source::Tty(port.name.clone()), link: None, named: false });
+    let ports = serial_ports.iter();
+    let ports = ports.map(|port| PortTarget {
+        source: PortSpec::Tty(port.name.clone()),
+        link: None,
+        is_named: false,
+    });
     add_links_of_hub(ports.collect())
 }

@@ -1,4 +1,4 @@
-//! Runs protocol state machines on an open port, for a user at a terminal: [`drive`] runs any of them. With it,
+//! Runs protocol state machines on an open port, for a user at a terminal: [`run_protocol`] runs any of them. With it,
 //! [`search`] finds the scanner, and [`detect`] identifies one that rotates. A thread of the hub does the same for a
 //! link, without an end.
 
@@ -9,9 +9,9 @@ use std::time::Duration;
 
 use rustix::event::{PollFd, PollFlags, poll};
 use scanhub_drivers::line::{
-    Account, Condition, Event, Introduction, Output, Protocol, Session as _, Values,
+    Action, DeviceInfo, Event, HealthStatus, Protocol, ScannerSession as _, SessionStats, Values,
 };
-use scanhub_drivers::search::{Coverage, Found, PortKind, Search};
+use scanhub_drivers::search::{Coverage, FoundScanner, PortKind, Search};
 use scanhub_drivers::{Model, Session, Settings, features};
 use scanhub_port::{Port, clock};
 use scanhub_schema::{Failure, Family, Kind, MILLIS, Nanos};
@@ -26,38 +26,42 @@ pub(crate) struct DetectedScanner {
     pub(crate) model_text: Option<String>,
     /// Rate of the line, in bits per second.
     pub(crate) rate: u32,
-    pub(crate) account: Account,
+    pub(crate) stats: SessionStats,
     /// The scanner's reply to a request for its identity and health; `None` if it streams without a request.
-    pub(crate) said: Option<Introduction>,
+    pub(crate) introduction: Option<DeviceInfo>,
     /// Number of packets with measured data.
     pub(crate) packets: u64,
     /// Points per second; 0 before the first complete revolution.
     pub(crate) points_per_second: f64,
     /// Revolutions per second; 0 before the first complete one.
-    pub(crate) turns_per_second: f64,
+    pub(crate) revolutions_per_second: f64,
     /// Problem of the scanner, as text.
-    pub(crate) trouble: Option<String>,
+    pub(crate) problem: Option<String>,
 }
 
 impl DetectedScanner {
     /// Returns the number of points per revolution.
     pub(crate) fn points(&self) -> f64 {
-        if self.turns_per_second > 0.0 { self.points_per_second / self.turns_per_second } else { 0.0 }
+        if self.revolutions_per_second > 0.0 {
+            self.points_per_second / self.revolutions_per_second
+        } else {
+            0.0
+        }
     }
 
     /// Returns the share of bytes that belong to no packet, 0 to 1. A fragment at the start of the stream does not
     /// count.
     pub(crate) fn damaged(&self) -> f64 {
-        self.account.damaged as f64 / (self.account.in_telegrams + self.account.damaged).max(1) as f64
+        self.stats.damaged as f64 / (self.stats.in_telegrams + self.stats.damaged).max(1) as f64
     }
 
     /// Returns whether the line damages most bytes, which makes every conclusion from the others unreliable.
     pub(crate) fn is_unreliable(&self) -> bool {
-        self.damaged() > MOST_DAMAGED
+        self.damaged() > UNRELIABLE_DAMAGE
     }
 
     /// Returns what the line does to the bytes and what to do about it, if it damages more than one in a hundred.
-    pub(crate) fn line_trouble(&self) -> Option<String> {
+    pub(crate) fn line_problem(&self) -> Option<String> {
         let damaged = self.damaged();
         (damaged > MAX_DAMAGED)
             .then(|| format!("{:.0} % of the bytes are damaged on the line: {LINE_REMEDY}", 100.0 * damaged))
@@ -89,25 +93,25 @@ pub(crate) fn search(
     port: &Port,
     only: Option<Family>,
     stop: &AtomicBool,
-    mut look: impl FnMut(u32),
-) -> Result<Result<Found, NotFound>, Failure> {
+    mut on_rate: impl FnMut(u32),
+) -> Result<Result<FoundScanner, NotFound>, Failure> {
     let kind = if port.baud().is_none() { PortKind::Server } else { PortKind::Serial };
-    let begun = clock::now();
-    let mut search = Search::new(kind, None, begun).at_another_rate();
+    let start = clock::now();
+    let mut search = Search::new(kind, None, start).with_rate_change();
     if let Some(family) = only {
-        search = search.only(family);
+        search = search.restricted_to(family);
     }
-    let mut shown = None;
+    let mut shown_rate = None;
     let mut procedure = Procedure::new(|search: &Search| {
-        if shown != search.rate() {
-            shown = search.rate();
-            shown.into_iter().for_each(&mut look);
+        if shown_rate != search.rate() {
+            shown_rate = search.rate();
+            shown_rate.into_iter().for_each(&mut on_rate);
         }
-        let rounds = if search.account().read == 0 { SILENT_ROUNDS } else { ROUNDS };
-        search.rounds() < rounds || clock::now() < begun + MIN_SEARCH_TIME
+        let rounds = if search.stats().read == 0 { MAX_SILENT_ROUNDS } else { MAX_ROUNDS };
+        search.rounds() < rounds || clock::now() < start + MIN_SEARCH_TIME
     });
-    drive(port, &mut search, &mut procedure, stop)?;
-    let not_found = || NotFound { bytes: search.account().read, coverage: search.coverage() };
+    run_protocol(port, &mut search, &mut procedure, stop)?;
+    let not_found = || NotFound { bytes: search.stats().read, coverage: search.coverage() };
     Ok(search.found().ok_or_else(not_found))
 }
 
@@ -122,66 +126,66 @@ pub(crate) fn search(
 /// Returns [`Kind::PortMissing`] if the port disappears, and [`Kind::Interrupted`] if `stop` is set.
 pub(crate) fn detect(
     port: &Port,
-    found: Found,
+    found: FoundScanner,
     stop: &AtomicBool,
 ) -> Result<Result<DetectedScanner, u64>, Failure> {
-    let listen_only = features(found.family).speaks_unasked;
+    let listen_only = features(found.family).streams_unrequested;
     let settings = Settings { fixed_rate: found.rate.is_none(), listen_only, ..Settings::default() };
-    let begun = clock::now();
-    let mut session = Session::begin(found.family, &settings, begun);
+    let start = clock::now();
+    let mut session = Session::begin(found.family, &settings, start);
     if let Some(rate) = found.rate {
-        session.begin_at(rate, begun);
+        session.begin_at(rate, start);
     }
     let mut detection = Detection {
-        begun,
+        start,
         packets: 0,
         measures_since: None,
-        turns: 0,
+        revolutions: 0,
         period: 0,
         points_per_second: 0.0,
-        said: None,
-        said_at: 0,
+        introduction: None,
+        introduced_at: 0,
         dtr: None,
     };
-    let driven = drive(port, &mut session, &mut detection, stop);
-    let mut trouble = session.trouble().map(|trouble| trouble.to_string());
-    let Detection { packets, period, points_per_second, said, .. } = detection;
-    let is_error = |said: &Introduction| said.condition == Condition::Error;
-    if packets == 0 && said.as_ref().is_some_and(|said| !is_error(said)) {
-        trouble.get_or_insert_with(|| "it answers, but does not begin to measure".to_owned());
+    let driven = run_protocol(port, &mut session, &mut detection, stop);
+    let mut problem = session.problem().map(|trouble| trouble.to_string());
+    let Detection { packets, period, points_per_second, introduction, .. } = detection;
+    let is_error = |introduction: &DeviceInfo| introduction.condition == HealthStatus::Error;
+    if packets == 0 && introduction.as_ref().is_some_and(|introduction| !is_error(introduction)) {
+        problem.get_or_insert_with(|| "it answers, but does not begin to measure".to_owned());
     }
-    let (account, model) = (session.account(), session.model());
+    let (stats, model) = (session.stats(), session.model());
     let model_text = session.model_text().map(|text| text.to_lowercase());
     // Stops a scanner that measures on request, and its motor, as a hub does when it exits.
-    let measures = said.as_ref().is_some_and(|said| !is_error(said));
+    let measures = introduction.as_ref().is_some_and(|introduction| !is_error(introduction));
     let ended = match &driven {
         Err(failure) if failure.kind != Kind::Interrupted => Ok(0),
-        _ if measures && session.end(clock::now()) => drain(port, &mut session, &mut End),
+        _ if measures && session.end(clock::now()) => drain(port, &mut session, &mut EndTask),
         _ => Ok(0),
     };
     driven?;
     ended.map_err(|error| port_lost(port, &error))?;
-    if packets < MIN_PACKETS && said.is_none() {
-        return Ok(Err(account.read));
+    if packets < MIN_PACKETS && introduction.is_none() {
+        return Ok(Err(stats.read));
     }
     Ok(Ok(DetectedScanner {
         family: found.family,
         model,
         model_text,
         rate: session.rate(),
-        account,
-        said,
+        stats,
+        introduction,
         packets,
         points_per_second: f64::from(points_per_second),
-        turns_per_second: if period > 0 { 1e9 / period as f64 } else { 0.0 },
-        trouble,
+        revolutions_per_second: if period > 0 { 1e9 / period as f64 } else { 0.0 },
+        problem,
     }))
 }
 
 /// Returns the failure for a port called `name` at which a search has found a scanner, but which then sent only `bytes`
 /// bytes and too few packets.
-pub(crate) fn not_detected(name: &str, found: Found, bytes: u64) -> Failure {
-    let Found { family, rate, .. } = found;
+pub(crate) fn not_detected(name: &str, found: FoundScanner, bytes: u64) -> Failure {
+    let FoundScanner { family, rate, .. } = found;
     let rate = rate.map_or(String::new(), |rate| format!(" at {rate} Bd"));
     let what = format!(
         "{name}: a scanner of family {}{rate} was found, but then {bytes} bytes without its packets arrived",
@@ -192,16 +196,16 @@ pub(crate) fn not_detected(name: &str, found: Found, bytes: u64) -> Failure {
 
 /// Detection of a rotating scanner: decides when enough was received.
 struct Detection {
-    begun: Nanos,
+    start: Nanos,
     packets: u64,
     /// Time of the first packet.
     measures_since: Option<Nanos>,
-    turns: u32,
+    revolutions: u32,
     /// Period of the last revolution.
     period: Nanos,
     points_per_second: f32,
-    said: Option<Introduction>,
-    said_at: Nanos,
+    introduction: Option<DeviceInfo>,
+    introduced_at: Nanos,
     /// State of the line DTR that the session requested last.
     dtr: Option<bool>,
 }
@@ -210,13 +214,13 @@ impl Task<Session> for Detection {
     /// Takes over what the scanner has reported of itself. From then on its motor is controlled. If it reports an
     /// error, the session would restart it next.
     fn may_continue(&mut self, port: &Port, session: &Session) -> io::Result<bool> {
-        if self.said.is_some() {
+        if self.introduction.is_some() {
             return Ok(true);
         }
-        self.said = session.introduction();
-        self.said_at = clock::now();
-        match (&self.said, self.dtr) {
-            (Some(said), _) if said.condition == Condition::Error => Ok(false),
+        self.introduction = session.device_info();
+        self.introduced_at = clock::now();
+        match (&self.introduction, self.dtr) {
+            (Some(said), _) if said.condition == HealthStatus::Error => Ok(false),
             (Some(_), Some(on)) => port.set_dtr(on).map(|()| true),
             _ => Ok(true),
         }
@@ -225,7 +229,7 @@ impl Task<Session> for Detection {
     /// Before the scanner has replied, its motor stays as it is.
     fn set_dtr(&mut self, port: &Port, on: bool) -> io::Result<()> {
         self.dtr = Some(on);
-        if self.said.is_some() { port.set_dtr(on) } else { Ok(()) }
+        if self.introduction.is_some() { port.set_dtr(on) } else { Ok(()) }
     }
 
     fn on_event(&mut self, event: Event<'_>) {
@@ -236,7 +240,7 @@ impl Task<Session> for Detection {
             }
             Event::Telegram(_) => {}
             Event::Scan(scan) => {
-                self.turns += 1;
+                self.revolutions += 1;
                 self.period = scan.period;
                 if let Values::Points { per_second, .. } = scan.values {
                     self.points_per_second = per_second;
@@ -245,24 +249,26 @@ impl Task<Session> for Detection {
         }
     }
 
-    fn limit(&mut self, _: &Session, now: Nanos) -> Option<Nanos> {
+    fn deadline(&mut self, _: &Session, now: Nanos) -> Option<Nanos> {
         let is_detected = self.packets >= MIN_PACKETS;
-        let limit = match (&self.said, self.measures_since) {
-            (Some(said), _) if said.condition == Condition::Error => now,
+        let limit = match (&self.introduction, self.measures_since) {
+            (Some(said), _) if said.condition == HealthStatus::Error => now,
             (Some(_), Some(since)) => since + MEASURING_TIME,
-            (Some(_), None) => self.said_at + SPIN_UP_TIMEOUT,
-            (None, Some(since)) if is_detected && self.turns >= MIN_REVOLUTIONS => since + MEASURING_TIME,
-            (None, _) if is_detected => self.begun + REVOLUTIONS_TIMEOUT,
-            (None, _) => self.begun + FIRST_TIMEOUT,
+            (Some(_), None) => self.introduced_at + SPIN_UP_TIMEOUT,
+            (None, Some(since)) if is_detected && self.revolutions >= MIN_REVOLUTIONS => {
+                since + MEASURING_TIME
+            }
+            (None, _) if is_detected => self.start + REVOLUTIONS_TIMEOUT,
+            (None, _) => self.start + FIRST_TIMEOUT,
         };
         (now < limit).then_some(limit)
     }
 }
 
 /// Task at the end of a session. It ignores all events.
-struct End;
+struct EndTask;
 
-impl Task<Session> for End {}
+impl Task<Session> for EndTask {}
 
 /// A procedure with an end, such as requests to an LMS. Calls `progress` before each wait, and ends early if it returns
 /// false. Logs each rate once that the port cannot have; a search leaves it out.
@@ -278,7 +284,7 @@ impl<F> Procedure<F> {
 }
 
 impl<P, F: FnMut(&P) -> bool> Task<P> for Procedure<F> {
-    fn limit(&mut self, protocol: &P, _: Nanos) -> Option<Nanos> {
+    fn deadline(&mut self, protocol: &P, _: Nanos) -> Option<Nanos> {
         (self.progress)(protocol).then_some(Nanos::MAX)
     }
 
@@ -300,12 +306,12 @@ pub(crate) const LINE_REMEDY: &str =
 /// Maximum share of damaged bytes on a good line.
 const MAX_DAMAGED: f64 = 0.01;
 /// Share of damaged bytes that makes conclusions from the others unreliable.
-pub(crate) const MOST_DAMAGED: f64 = 0.5;
+pub(crate) const UNRELIABLE_DAMAGE: f64 = 0.5;
 
 /// Number of rounds of a search on a silent line.
-const SILENT_ROUNDS: usize = 2;
+const MAX_SILENT_ROUNDS: usize = 2;
 /// Number of rounds of a search if bytes have arrived. A scanner may miss a request, and the line may damage the reply.
-const ROUNDS: usize = 4;
+const MAX_ROUNDS: usize = 4;
 /// Minimum time of a search. Rounds are short if the family is known.
 const MIN_SEARCH_TIME: Nanos = 1_000 * MILLIS;
 /// Minimum number of packets of a scanner. Other bytes pass a checksum of 8 bits now and then, but not that often.
@@ -321,7 +327,7 @@ const SPIN_UP_TIMEOUT: Nanos = 7_000 * MILLIS;
 /// Timeout for [`MIN_REVOLUTIONS`]. It is long enough for a head that makes two revolutions per second.
 const REVOLUTIONS_TIMEOUT: Nanos = 4_000 * MILLIS;
 
-/// Reactions of a program to a protocol that [`drive`] does the I/O for.
+/// Reactions of a program to a protocol that [`run_protocol`] does the I/O for.
 pub(crate) trait Task<P> {
     /// Called before each action. Returns whether to carry it out; if not, the driver waits.
     fn may_continue(&mut self, port: &Port, protocol: &P) -> io::Result<bool> {
@@ -345,7 +351,7 @@ pub(crate) trait Task<P> {
     }
 
     /// Called before each wait. Returns its latest end, or `None` to end.
-    fn limit(&mut self, protocol: &P, now: Nanos) -> Option<Nanos> {
+    fn deadline(&mut self, protocol: &P, now: Nanos) -> Option<Nanos> {
         let _ = (protocol, now);
         None
     }
@@ -356,7 +362,7 @@ pub(crate) trait Task<P> {
 /// # Errors
 ///
 /// Returns [`Kind::PortMissing`] if the port disappears, and [`Kind::Interrupted`] if `stop` is set.
-pub(crate) fn drive<P: Protocol>(
+pub(crate) fn run_protocol<P: Protocol>(
     port: &Port,
     protocol: &mut P,
     task: &mut impl Task<P>,
@@ -367,15 +373,15 @@ pub(crate) fn drive<P: Protocol>(
         if protocol.is_done() {
             return Ok(());
         }
-        let Some(limit) = task.limit(protocol, clock::now()) else { return Ok(()) };
+        let Some(limit) = task.deadline(protocol, clock::now()) else { return Ok(()) };
         if stop.load(Ordering::Relaxed) {
             return Err(Failure::new(Kind::Interrupted, "interrupted", ""));
         }
         let (now, until) = (clock::now(), until.min(limit));
         let mut fds = [PollFd::new(port, PollFlags::IN)];
         // An interrupted wait only ends early.
-        let _ = poll(&mut fds, Some(&clock::span(now, until.min(now + STOP_CHECK_INTERVAL))));
-        let len = port.read(protocol.spare()).map_err(|error| port_lost(port, &error))?;
+        let _ = poll(&mut fds, Some(&clock::poll_timeout(now, until.min(now + STOP_CHECK_INTERVAL))));
+        let len = port.read(protocol.read_buffer()).map_err(|error| port_lost(port, &error))?;
         let now = clock::now();
         protocol.commit(now, len);
         if len == 0 && now >= until {
@@ -387,29 +393,29 @@ pub(crate) fn drive<P: Protocol>(
 /// Carries out the actions of `protocol` until it waits. Returns the end of the wait.
 fn drain<P: Protocol>(port: &Port, protocol: &mut P, task: &mut impl Task<P>) -> io::Result<Nanos> {
     while task.may_continue(port, protocol)? {
-        match protocol.poll_output() {
-            Output::SetRate(rate) => {
+        match protocol.poll_action() {
+            Action::SetRate(rate) => {
                 if let Some(error) = port.try_baud(rate)? {
                     task.on_refused(port, rate, &error);
                     protocol.reject_rate(clock::now());
                 }
             }
-            Output::SetDtr(on) => task.set_dtr(port, on)?,
-            Output::Transmit { not_before, .. } => {
+            Action::SetDtr(on) => task.set_dtr(port, on)?,
+            Action::Transmit { not_before, .. } => {
                 sleep_until(not_before);
                 if !protocol.restart_if_late(clock::now())
-                    && let Output::Transmit { bytes, .. } = protocol.poll_output()
+                    && let Action::Transmit { bytes, .. } = protocol.poll_action()
                 {
                     port.write(bytes)?;
-                    protocol.transmitted(clock::now());
+                    protocol.handle_transmitted(clock::now());
                 }
             }
-            Output::Event(event) => task.on_event(event),
-            Output::Rest(until) => {
+            Action::Event(event) => task.on_event(event),
+            Action::SleepUntil(until) => {
                 sleep_until(until);
                 return Ok(until);
             }
-            Output::Wait { until } => return Ok(until),
+            Action::Wait { until } => return Ok(until),
         }
     }
     Ok(clock::now())

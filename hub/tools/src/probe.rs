@@ -13,18 +13,19 @@ use clap::Args;
 use scanhub_drivers::search::{self, Coverage};
 use scanhub_drivers::{Inquiry, Report, features, inquiry};
 use scanhub_port::{
-    Candidate, Port, PortError, PortlessAdapter, Source, all_holders, candidates, check_tty, clock, found_in,
+    Port, PortError, PortSpec, PortlessAdapter, SerialPortInfo, all_holders, check_tty, clock, serial_ports,
+    serial_ports_in,
 };
 use scanhub_schema::{Failure, Family, Kind};
 use scanhub_shm::Domain;
 use serde::Serialize;
 
 use crate::doctor::Hub;
-use crate::driver::{self, DetectedScanner, NotFound, Procedure, detect, drive, not_detected};
+use crate::driver::{self, DetectedScanner, NotFound, Procedure, detect, not_detected, run_protocol};
 use crate::terminal::{Progress, print};
 use description::link_settings;
-use description::{Description, Found, Turning};
-pub(crate) use description::{hex, measuring};
+use description::{Description, FoundDescription, RotatingDescription};
+pub(crate) use description::{describe_mode, hex};
 
 /// Show the sensor at a port; without a port, list the ports
 #[derive(Args, Debug)]
@@ -45,7 +46,7 @@ Examples:
   scanhub probe /dev/ttyUSB0 --toml >> scanhub.toml";
 
 impl ProbeArgs {
-    /// Prints the scanner at the port, or the ports of this machine without opening any. `places` returns the locations in
+    /// Prints the scanner at the port, or the ports of this machine without opening any. `locations` returns the locations in
     /// which a client would search for the domain of a hub.
     ///
     /// # Errors
@@ -56,17 +57,17 @@ impl ProbeArgs {
     pub fn run(
         &self,
         json: bool,
-        places: impl FnOnce() -> Result<Vec<Domain>, Failure>,
+        locations: impl FnOnce() -> Result<Vec<Domain>, Failure>,
         out: &mut dyn Write,
         stop: &AtomicBool,
     ) -> Result<(), Failure> {
         let Some(port) = &self.port else { return list_ports(json, out) };
-        let places = places()?;
+        let locations = locations()?;
         let mut progress = Progress::on_stderr();
         let found =
-            probe(&source(port)?, &places, stop, |rate| progress.show(&format!("looking at {rate} Bd")));
+            probe(&source(port)?, &locations, stop, |rate| progress.show(&format!("looking at {rate} Bd")));
         if found.is_err() {
-            progress.leave();
+            progress.keep_text();
         }
         drop(progress);
         let found = found?;
@@ -81,7 +82,7 @@ impl ProbeArgs {
 fn list_ports(json: bool, out: &mut dyn Write) -> Result<(), Failure> {
     const PLUG_IN: &str =
         "plug in an adapter for RS-422 (500 kBd) or RS-232; `dmesg` shows whether the kernel saw it";
-    let (candidates, portless) = (candidates(), PortlessAdapter::all(Path::new("/")));
+    let (candidates, portless) = (serial_ports(), PortlessAdapter::all(Path::new("/")));
     for candidate in &candidates {
         print(out, json, &CandidateLine::of(candidate), || describe(candidate))?;
     }
@@ -115,7 +116,7 @@ struct CandidateLine<'a> {
 }
 
 impl<'a> CandidateLine<'a> {
-    fn of(candidate: &'a Candidate) -> CandidateLine<'a> {
+    fn of(candidate: &'a SerialPortInfo) -> CandidateLine<'a> {
         let (caution, remedy) = caution(candidate).unzip();
         CandidateLine {
             class: "candidate",
@@ -160,12 +161,12 @@ impl<'a> AdapterLine<'a> {
 }
 
 /// Returns the caution about a port, including one about the name that it shares.
-fn caution(candidate: &Candidate) -> Option<(String, String)> {
+fn caution(candidate: &SerialPortInfo) -> Option<(String, String)> {
     candidate.caution(candidate.shared_name.as_ref().unwrap_or(&candidate.name))
 }
 
-fn describe(candidate: &Candidate) -> String {
-    let Candidate { name, device, driver, product, holder, is_permitted, .. } = candidate;
+fn describe(candidate: &SerialPortInfo) -> String {
+    let SerialPortInfo { name, device, driver, product, holder, is_permitted, .. } = candidate;
     let state = match (holder, is_permitted) {
         (Some(holder), _) => format!("in use by {holder}"),
         (None, true) => "free".to_owned(),
@@ -180,9 +181,9 @@ fn describe(candidate: &Candidate) -> String {
 
 /// Scanner at a port, with the link that a configuration needs for it; class `probe`.
 #[derive(Clone, Debug, Serialize)]
-struct Probed {
+struct ProbeResult {
     #[serde(flatten)]
-    found: Found,
+    found: FoundDescription,
     /// Value of `--link`.
     #[serde(rename = "link")]
     flag: String,
@@ -194,13 +195,13 @@ struct Probed {
     caution: Option<(String, String)>,
 }
 
-impl Probed {
-    fn new(found: Found, link: SuggestedLink, caution: Option<(String, String)>) -> Probed {
-        Probed { found, flag: link.flag(), link, caution }
+impl ProbeResult {
+    fn new(found: FoundDescription, link: SuggestedLink, caution: Option<(String, String)>) -> ProbeResult {
+        ProbeResult { found, flag: link.flag(), link, caution }
     }
 }
 
-impl fmt::Display for Probed {
+impl fmt::Display for ProbeResult {
     /// Writes the rows, and then the next command.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}", self.found)?;
@@ -214,45 +215,48 @@ impl fmt::Display for Probed {
 /// Finds the scanner at `source`. Until its family is known, it gets only the requests of the search. Calls `look` with
 /// each rate at which it searches.
 fn probe(
-    source: &Source,
-    places: &[Domain],
+    source: &PortSpec,
+    locations: &[Domain],
     stop: &AtomicBool,
-    look: impl FnMut(u32),
-) -> Result<Probed, Failure> {
-    check_unused(source, places)?;
+    on_rate: impl FnMut(u32),
+) -> Result<ProbeResult, Failure> {
+    check_unused(source, locations)?;
     let (port, first) = open(source, stop)?;
-    let there = found_in(Path::new("/"));
-    let caution = candidate_of(source, &there).and_then(|port| port.caution(Path::new(&source.name())));
-    let answer = find(&port, first, source, None, stop, look).map_err(|failure| match &caution {
-        Some((what, remedy)) if failure.kind == Kind::Timeout => {
-            Failure { hint: format!("it is {what}; {remedy}; or {}", failure.hint), ..failure }
-        }
-        _ => failure,
-    })?;
-    Ok(match answer {
-        Answer::Asked(report) => {
+    let serial_ports = serial_ports_in(Path::new("/"));
+    let caution =
+        candidate_of(source, &serial_ports).and_then(|port| port.caution(Path::new(&source.name())));
+    let found_scanner =
+        find(&port, first, source, None, stop, on_rate).map_err(|failure| match &caution {
+            Some((what, remedy)) if failure.kind == Kind::Timeout => {
+                Failure { hint: format!("it is {what}; {remedy}; or {}", failure.hint), ..failure }
+            }
+            _ => failure,
+        })?;
+    Ok(match found_scanner {
+        FoundScanner::Inquiry(report) => {
             // The rate of a serial server is set there.
             let rate = if is_server(source) { report.baud.map(|baud| baud.rate()) } else { None };
             let settings = link_settings(&report, rate.unwrap_or(first));
-            let found = Found::Asked(Box::new(Description::new(source.name(), &report)));
-            Probed::new(found, SuggestedLink::new(source, &there, settings), caution)
+            let found = FoundDescription::Inquiry(Box::new(Description::new(source.name(), &report)));
+            ProbeResult::new(found, SuggestedLink::new(source, &serial_ports, settings), caution)
         }
-        Answer::Detected(heard) => {
-            let found = Found::Turning(Box::new(Turning::new(source.name(), &heard)));
-            let family = ("family", heard.family.name().to_owned());
-            let model = heard.model.map(|model| ("model", model.name.to_owned()));
+        FoundScanner::Rotating(scanner) => {
+            let found =
+                FoundDescription::Rotating(Box::new(RotatingDescription::new(source.name(), &scanner)));
+            let family = ("family", scanner.family.name().to_owned());
+            let model = scanner.model.map(|model| ("model", model.name.to_owned()));
             let settings = std::iter::once(family).chain(model).collect();
-            Probed::new(found, SuggestedLink::new(source, &there, settings), caution)
+            ProbeResult::new(found, SuggestedLink::new(source, &serial_ports, settings), caution)
         }
     })
 }
 
 /// The scanner that was found.
-pub(crate) enum Answer {
+pub(crate) enum FoundScanner {
     /// A scanner that reports its settings on request, with its replies.
-    Asked(Box<Report>),
+    Inquiry(Box<Report>),
     /// A rotating scanner.
-    Detected(Box<DetectedScanner>),
+    Rotating(Box<DetectedScanner>),
 }
 
 /// Finds the scanner at `port`, whose highest possible rate is `first`, in bits per second. The scanner may be of any
@@ -264,44 +268,44 @@ pub(crate) enum Answer {
 pub(crate) fn find(
     port: &Port,
     first: u32,
-    source: &Source,
+    source: &PortSpec,
     only: Option<Family>,
     stop: &AtomicBool,
-    mut look: impl FnMut(u32),
-) -> Result<Answer, Failure> {
+    mut on_rate: impl FnMut(u32),
+) -> Result<FoundScanner, Failure> {
     // An inquiry finds the rate, too.
     let known = only.filter(|&family| features(family).has_inquiry);
     let found = match known {
-        Some(family) => search::Found { family, model: None, rate: None },
-        None => driver::search(port, only, stop, &mut look)?
+        Some(family) => search::FoundScanner { family, model: None, rate: None },
+        None => driver::search(port, only, stop, &mut on_rate)?
             .map_err(|not_found| nothing_found(source, only.is_some(), &not_found))?,
     };
     let rate = (!is_server(source)).then_some(found.rate.unwrap_or(first));
     if let Some(inquiry) = inquiry(found.family, rate, clock::now()) {
-        let report = request_report(port, first, inquiry, (source, only.is_some()), stop, look)?;
-        return Ok(Answer::Asked(Box::new(report)));
+        let report = request_report(port, first, inquiry, (source, only.is_some()), stop, on_rate)?;
+        return Ok(FoundScanner::Inquiry(Box::new(report)));
     }
     let detected = detect(port, found, stop)?;
-    let heard = detected.map_err(|bytes| not_detected(&source.name(), found, bytes))?;
-    Ok(Answer::Detected(Box::new(heard)))
+    let scanner = detected.map_err(|bytes| not_detected(&source.name(), found, bytes))?;
+    Ok(FoundScanner::Rotating(Box::new(scanner)))
 }
 
 /// Returns the failure for a port at which a search has found no scanner. The message lists the families and rates of the
 /// search, and the hint what to check at a scanner of each family. If a family was named, the scanner may belong to another one.
-fn nothing_found(source: &Source, is_named: bool, NotFound { bytes, coverage }: &NotFound) -> Failure {
+fn nothing_found(source: &PortSpec, is_named: bool, NotFound { bytes, coverage }: &NotFound) -> Failure {
     let (possible, impossible): (Vec<_>, Vec<_>) = coverage.iter().partition(|it| !it.rates.is_empty());
-    let at_rates = |it: &&Coverage| format!("{} at {} Bd", it.family.name(), listed(&it.rates));
-    let looked_for: Vec<String> = possible.iter().map(at_rates).collect();
+    let at_rates = |it: &&Coverage| format!("{} at {} Bd", it.family.name(), or_list(&it.rates));
+    let searched: Vec<String> = possible.iter().map(at_rates).collect();
     let arrived = match bytes {
         0 => "no byte arrived".to_owned(),
         bytes => format!("{bytes} bytes arrived that scanhub does not recognize"),
     };
     let mut message = format!("{}: no scanner replies; {arrived}", source.name());
-    if !looked_for.is_empty() {
-        message += &format!("; looked for {}", looked_for.join(", "));
+    if !searched.is_empty() {
+        message += &format!("; looked for {}", searched.join(", "));
     }
     let mut remedies = vec![match (source, bytes) {
-        (Source::Tcp { .. }, _) => {
+        (PortSpec::Tcp { .. }, _) => {
             "set the serial server to the scanner's rate, 8 bits, no parity; a server that has another client already may \
              let this one wait: end that program first; check power and cable"
         }
@@ -314,7 +318,7 @@ fn nothing_found(source: &Source, is_named: bool, NotFound { bytes, coverage }: 
     }
     remedies.extend(possible.iter().map(|it| format!("{}: {}", it.family.name(), it.advice)));
     for it in impossible {
-        let (family, rates) = (it.family.name(), listed(&it.rejected));
+        let (family, rates) = (it.family.name(), or_list(&it.rejected));
         message += &format!(
             "; this port cannot have {rates} Bd, so scanners of family {family} cannot be found here"
         );
@@ -324,12 +328,12 @@ fn nothing_found(source: &Source, is_named: bool, NotFound { bytes, coverage }: 
 }
 
 /// Returns the remedy for a port at which no scanner of the named family replies.
-fn other_scanner(source: &Source) -> String {
+fn other_scanner(source: &PortSpec) -> String {
     format!("is it another scanner? Try: scanhub probe {}", scanhub_shm::shell_word(&source.name()))
 }
 
 /// Lists `rates`, as in "9600, 19200 or 38400".
-fn listed(rates: &[u32]) -> String {
+fn or_list(rates: &[u32]) -> String {
     let mut words: Vec<String> = rates.iter().map(u32::to_string).collect();
     let last = words.pop().unwrap_or_default();
     if words.is_empty() { last } else { format!("{} or {last}", words.join(", ")) }
@@ -340,8 +344,8 @@ fn listed(rates: &[u32]) -> String {
 /// # Errors
 ///
 /// Returns [`Kind::Configuration`] if `text` does not name a port.
-pub(crate) fn source(text: &str) -> Result<Source, Failure> {
-    Source::parse(text).map_err(|what| {
+pub(crate) fn source(text: &str) -> Result<PortSpec, Failure> {
+    PortSpec::parse(text).map_err(|what| {
         Failure::new(
             Kind::Configuration,
             format!("{text}: {what}"),
@@ -351,20 +355,20 @@ pub(crate) fn source(text: &str) -> Result<Source, Failure> {
 }
 
 /// Checks that no other process has `source` open, whether or not it has locked it: each of the two would get only a
-/// part of the bytes. `places` are the locations in which a client would search for the domain of a hub.
+/// part of the bytes. `locations` are the locations in which a client would search for the domain of a hub.
 ///
 /// # Errors
 ///
 /// Returns [`Kind::PortBusy`] with the process. If it is a hub, the failure states what the hub reports about its link.
-pub(crate) fn check_unused(source: &Source, places: &[Domain]) -> Result<(), Failure> {
+pub(crate) fn check_unused(source: &PortSpec, locations: &[Domain]) -> Result<(), Failure> {
     let holders = match source {
         // Many processes have a device such as /dev/null open. The failure to open it is the reason.
-        Source::Tty(path) if check_tty(path).is_err() => return Ok(()),
-        Source::Tty(path) => all_holders(path),
+        PortSpec::Tty(path) if check_tty(path).is_err() => return Ok(()),
+        PortSpec::Tty(path) => all_holders(path),
         // Another process may be connected to the server from anywhere. Only a hub of this machine reports it.
-        Source::Tcp { .. } | Source::File { .. } => Vec::new(),
+        PortSpec::Tcp { .. } | PortSpec::File { .. } => Vec::new(),
     };
-    match Hub::at(source, &holders, places) {
+    match Hub::at(source, &holders, locations) {
         Some(hub) => Err(hub.refuse(source, &holders)),
         None if holders.is_empty() => Ok(()),
         None => Err(PortError::Busy.explain(source)),
@@ -372,10 +376,10 @@ pub(crate) fn check_unused(source: &Source, places: &[Domain]) -> Result<(), Fai
 }
 
 /// Opens `source` at the highest rate of an inquiry that it supports, in bits per second, unless `stop` is set before it is open.
-pub(crate) fn open(source: &Source, stop: &AtomicBool) -> Result<(Port, u32), Failure> {
+pub(crate) fn open(source: &PortSpec, stop: &AtomicBool) -> Result<(Port, u32), Failure> {
     let open = |rate: u32| Port::open(source, rate, stop).map(|port| (port, rate));
     let (port, rate) = open(HIGHEST_RATE).or_else(|failure| match failure.kind {
-        Kind::PortRate => open(RATE_OF_EVERY_PORT),
+        Kind::PortRate => open(COMMON_RATE),
         _ => Err(failure),
     })?;
     // Bytes in the input buffer may be older than the scanner's last power-on. Setting the rate discards them.
@@ -393,47 +397,47 @@ pub(crate) fn request_report(
     port: &Port,
     first: u32,
     mut inquiry: Inquiry,
-    (source, is_named): (&Source, bool),
+    (source, is_named): (&PortSpec, bool),
     stop: &AtomicBool,
-    mut look: impl FnMut(u32),
+    mut on_rate: impl FnMut(u32),
 ) -> Result<Report, Failure> {
-    let mut shown = None;
+    let mut shown_rate = None;
     let mut procedure = Procedure::new(|inquiry: &Inquiry| {
-        if shown != Some(inquiry.baud()) && !is_server(source) {
-            shown = Some(inquiry.baud());
-            look(inquiry.baud().rate());
+        if shown_rate != Some(inquiry.baud()) && !is_server(source) {
+            shown_rate = Some(inquiry.baud());
+            on_rate(inquiry.baud().rate());
         }
         true
     });
-    drive(port, &mut inquiry, &mut procedure, stop)?;
+    run_protocol(port, &mut inquiry, &mut procedure, stop)?;
     let report = inquiry.report().clone();
     let streams_at = report.baud.map(|baud| baud.rate());
-    if report.answers() {
+    if report.has_replied() {
         return Ok(report);
     }
-    let failure = silence(source, first, streams_at, report.bytes);
+    let failure = no_reply(source, first, streams_at, report.bytes);
     let may_be_other = is_named && streams_at.is_none();
     let hint =
         if may_be_other { format!("{}; {}", other_scanner(source), failure.hint) } else { failure.hint };
     Err(Failure { hint, ..failure })
 }
 
-fn is_server(source: &Source) -> bool {
-    matches!(source, Source::Tcp { .. })
+fn is_server(source: &PortSpec) -> bool {
+    matches!(source, PortSpec::Tcp { .. })
 }
 
 /// Returns the failure for a scanner that did not reply to an inquiry, with possible reasons, after `bytes` bytes arrived.
 /// It may stream at `streams_at`. The highest rate of the port is `first`. Rates are in bits per second.
-fn silence(source: &Source, first: u32, streams_at: Option<u32>, bytes: u64) -> Failure {
+fn no_reply(source: &PortSpec, first: u32, streams_at: Option<u32>, bytes: u64) -> Failure {
     let name = source.name();
-    let came = match bytes {
+    let received_text = match bytes {
         0 => "no byte arrived".to_owned(),
         bytes => format!("{bytes} bytes arrived, without a telegram"),
     };
     let lower: Vec<_> = Inquiry::RATES.iter().filter(|&&rate| rate < first).map(u32::to_string).collect();
     let rates = format!("{} or {first} Bd", lower.join(", "));
     let (what, remedy) = match (streams_at, source) {
-        (Some(_), Source::Tcp { .. }) => (
+        (Some(_), PortSpec::Tcp { .. }) => (
             format!("{name}: a sensor streams but does not answer"),
             "it does not receive from the serial server: check the wire to its receiver",
         ),
@@ -441,17 +445,17 @@ fn silence(source: &Source, first: u32, streams_at: Option<u32>, bytes: u64) -> 
             format!("{name}: a sensor streams at {rate} Bd but does not answer"),
             "it does not receive from this port: check the wire to its receiver",
         ),
-        (None, Source::Tcp { .. }) => (
-            format!("{name}: connected, but no answer; {came}"),
+        (None, PortSpec::Tcp { .. }) => (
+            format!("{name}: connected, but no answer; {received_text}"),
             "set the serial server to the sensor's rate, 8 bits, no parity; check power and cable; a server that has another \
              client already may let this one wait: end that program first",
         ),
         (None, _) if bytes == 0 => (
-            format!("{name}: no answer at {rates}; {came}"),
+            format!("{name}: no answer at {rates}; {received_text}"),
             "check power, cable, jumper 7-8 for RS-422; after power-on a sensor takes up to a minute",
         ),
         (None, _) => (
-            format!("{name}: no answer at {rates}; {came}"),
+            format!("{name}: no answer at {rates}; {received_text}"),
             "another device, a line that damages the bytes (ground, RS-232 instead of RS-422), or a missing wire?",
         ),
     };
@@ -470,17 +474,17 @@ struct SuggestedLink {
 impl SuggestedLink {
     /// Creates the link for a scanner at `source`, with keys and values besides name and port.
     pub(crate) fn new(
-        source: &Source,
-        there: &[Candidate],
+        source: &PortSpec,
+        serial_ports: &[SerialPortInfo],
         settings: Vec<(&'static str, String)>,
     ) -> SuggestedLink {
-        SuggestedLink { port: permanent_name(source, there), settings }
+        SuggestedLink { port: permanent_name(source, serial_ports), settings }
     }
 
     /// Returns the value of `--link`.
     fn flag(&self) -> String {
         let settings = self.settings.iter().map(|(key, value)| format!(",{key}={value}"));
-        format!("{NAME}={}{}", self.port, settings.collect::<String>())
+        format!("{SENSOR_NAME}={}{}", self.port, settings.collect::<String>())
     }
 
     /// Returns the command that runs a hub for this scanner, as a shell takes it.
@@ -490,7 +494,7 @@ impl SuggestedLink {
 
     /// Returns the section of a configuration file, without the end of its last line.
     fn toml(&self) -> String {
-        let mut text = format!("[[link]]\nname = \"{NAME}\"\nport = {}", toml_string(&self.port));
+        let mut text = format!("[[link]]\nname = \"{SENSOR_NAME}\"\nport = {}", toml_string(&self.port));
         for (key, value) in &self.settings {
             let is_number = value.parse::<u32>().is_ok();
             text += &format!("\n{key} = {}", if is_number { value.clone() } else { toml_string(value) });
@@ -500,17 +504,17 @@ impl SuggestedLink {
 }
 
 /// Returns the serial line of this machine that `source` names.
-fn candidate_of<'a>(source: &Source, there: &'a [Candidate]) -> Option<&'a Candidate> {
-    let Source::Tty(path) = source else { return None };
+fn candidate_of<'a>(source: &PortSpec, serial_ports: &'a [SerialPortInfo]) -> Option<&'a SerialPortInfo> {
+    let PortSpec::Tty(path) = source else { return None };
     let device = path.canonicalize().ok()?;
-    there.iter().find(|candidate| candidate.device == device)
+    serial_ports.iter().find(|candidate| candidate.device == device)
 }
 
 /// Returns the name by which a configuration should name `source`: the one that stays, whatever is plugged in next.
-fn permanent_name(source: &Source, there: &[Candidate]) -> String {
-    let Source::Tty(path) = source else { return source.name() };
+fn permanent_name(source: &PortSpec, serial_ports: &[SerialPortInfo]) -> String {
+    let PortSpec::Tty(path) = source else { return source.name() };
     let path: PathBuf = std::path::absolute(path).unwrap_or_else(|_| path.clone());
-    let name = match candidate_of(source, there) {
+    let name = match candidate_of(source, serial_ports) {
         // A link elsewhere was made by the user, who knows what it stands for.
         Some(candidate) if path == candidate.device || is_by_udev(&path) => &candidate.name,
         _ => &path,
@@ -539,19 +543,19 @@ fn toml_string(text: &str) -> String {
 /// Highest rate of an inquiry, in bits per second.
 pub(crate) const HIGHEST_RATE: u32 = Inquiry::RATES[Inquiry::RATES.len() - 1];
 /// Highest rate of an inquiry that every serial port supports, in bits per second.
-const RATE_OF_EVERY_PORT: u32 = Inquiry::RATES[Inquiry::RATES.len() - 2];
+const COMMON_RATE: u32 = Inquiry::RATES[Inquiry::RATES.len() - 2];
 /// Name of the sensor; the user may choose another one.
-const NAME: &str = "front";
+const SENSOR_NAME: &str = "front";
 
 #[cfg(test)]
 mod tests {
     use scanhub_config::{Config, Link, Sources};
-    use scanhub_drivers::lms::family::Family as Type;
+    use scanhub_drivers::lms::lms_model::LmsModel as Type;
 
     use super::*;
 
     #[test]
-    fn a_search_without_result_states_what_it_looked_for_and_what_to_check() {
+    fn failed_probe_lists_searched_rates_and_remedies() {
         let coverage = |rejected: &[u32]| {
             let port = search::PortKind::Serial;
             let mut coverage = search::Search::new(port, None, 0).coverage();
@@ -562,7 +566,7 @@ mod tests {
         };
         let failure = |source: &str, bytes, rejected: &[u32]| {
             let not_found = NotFound { bytes, coverage: coverage(rejected) };
-            nothing_found(&Source::parse(source).expect("a port"), false, &not_found)
+            nothing_found(&PortSpec::parse(source).expect("a port"), false, &not_found)
         };
         let silent = failure("/dev/ttyUSB0", 0, &[]);
         let looked_for = "/dev/ttyUSB0: no scanner replies; no byte arrived; looked for lms at 9600, 19200, 38400 or 500000 \
@@ -586,16 +590,16 @@ mod tests {
         let mut only = coverage(&[230_400, 921_600]);
         only.retain(|it| it.family == Family::Ld);
         let not_found = NotFound { bytes: 0, coverage: only };
-        let only = nothing_found(&Source::Tty("/dev/ttyS0".into()), true, &not_found);
+        let only = nothing_found(&PortSpec::Tty("/dev/ttyS0".into()), true, &not_found);
         assert!(only.hint.starts_with("is it another scanner? Try: scanhub probe /dev/ttyS0; "), "{only}");
         assert_eq!(only.message, format!("/dev/ttyS0: no scanner replies; no byte arrived{cannot}"));
     }
 
     #[test]
     fn names_only_rates_that_the_port_has() {
-        let message = |first| silence(&Source::Tty("/dev/ttyS0".into()), first, None, 0).message;
+        let message = |first| no_reply(&PortSpec::Tty("/dev/ttyS0".into()), first, None, 0).message;
         assert!(message(HIGHEST_RATE).contains("38400 or 500000 Bd; no byte"));
-        assert!(message(RATE_OF_EVERY_PORT).contains("no answer at 9600, 19200 or 38400 Bd; no byte"));
+        assert!(message(COMMON_RATE).contains("no answer at 9600, 19200 or 38400 Bd; no byte"));
     }
 
     fn link(port: &str, settings: &[(&'static str, &str)]) -> SuggestedLink {
@@ -664,7 +668,7 @@ mod tests {
         for link in [&by_id, &by_path, &root.join("lidar")] {
             std::os::unix::fs::symlink(&device, link).unwrap();
         }
-        let mut there = [Candidate {
+        let mut candidates = [SerialPortInfo {
             name: by_id.clone(),
             device: device.clone(),
             shared_name: None,
@@ -673,13 +677,14 @@ mod tests {
             holder: None,
             is_permitted: true,
         }];
-        let name = |path: &Path, there: &[Candidate]| permanent_name(&Source::Tty(path.to_owned()), there);
-        assert_eq!(name(&device, &there), by_id.display().to_string());
+        let name =
+            |path: &Path, there: &[SerialPortInfo]| permanent_name(&PortSpec::Tty(path.to_owned()), there);
+        assert_eq!(name(&device, &candidates), by_id.display().to_string());
         let own = root.join("lidar");
-        assert_eq!(name(&own, &there), own.display().to_string(), "the user's own name stays");
+        assert_eq!(name(&own, &candidates), own.display().to_string(), "the user's own name stays");
         // Another adapter has the same serial number.
-        (there[0].name, there[0].shared_name) = (by_path.clone(), Some(by_id.clone()));
-        assert_eq!(name(&by_id, &there), by_path.display().to_string());
-        assert_eq!(name(Path::new("/dev/no-such-port"), &there), "/dev/no-such-port");
+        (candidates[0].name, candidates[0].shared_name) = (by_path.clone(), Some(by_id.clone()));
+        assert_eq!(name(&by_id, &candidates), by_path.display().to_string());
+        assert_eq!(name(Path::new("/dev/no-such-port"), &candidates), "/dev/no-such-port");
     }
 }

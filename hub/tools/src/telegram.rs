@@ -17,7 +17,7 @@ use scanhub_drivers::lms::explain::{Field, Headline, Value, explain};
 use scanhub_drivers::lms::reply::Reply;
 use scanhub_drivers::lms::telegram::{REPLY, Telegram};
 use scanhub_drivers::lms::variant::{Mode, Unit};
-use scanhub_files::regular;
+use scanhub_files::regular_file;
 use scanhub_recording::{Encoding, Form, Frame, Recording};
 use scanhub_schema::{Failure, Family, Kind, Printable};
 use serde::Serialize;
@@ -81,7 +81,9 @@ fn decode(args: &DecodeArgs, json: bool, out: &mut dyn Write) -> Result<(), Fail
         (Some(path), sensor) if sensor.is_some() || is_framed(path) => {
             open_recording(path, sensor.as_deref())?
         }
-        (Some(path), _) => (Box::new(regular::open(path).map_err(|error| unreadable(&name, &error))?), None),
+        (Some(path), _) => {
+            (Box::new(regular_file::open(path).map_err(|error| unreadable(&name, &error))?), None)
+        }
         (None, None) => (Box::new(io::stdin()), None),
         (None, Some(_)) => {
             let hint = "for example `scanhub telegram decode walk.mcap --sensor front`";
@@ -151,7 +153,7 @@ pub(crate) struct Input {
     reader: Box<dyn Read>,
     buffer: Vec<u8>,
     /// Number of bytes in the buffer that were read ahead.
-    ahead: usize,
+    read_ahead: usize,
     is_text: bool,
 }
 
@@ -162,9 +164,9 @@ impl Input {
     ///
     /// Returns [`ErrorKind::Unsupported`] if the input is an MCAP or gzip file.
     pub(crate) fn new(reader: Box<dyn Read>) -> io::Result<Input> {
-        let mut input = Input { reader, buffer: vec![0; PIECE], ahead: 0, is_text: false };
-        input.ahead = input.read()?;
-        let head = &input.buffer[..input.ahead];
+        let mut input = Input { reader, buffer: vec![0; CHUNK_LEN], read_ahead: 0, is_text: false };
+        input.read_ahead = input.read()?;
+        let head = &input.buffer[..input.read_ahead];
         if Recording::is_framed(head) {
             let what = "telegrams inside MCAP or gzip cannot be read from a pipe";
             return Err(io::Error::new(ErrorKind::Unsupported, what));
@@ -180,7 +182,7 @@ impl Input {
     ///
     /// Returns [`ErrorKind::InvalidData`], with the line, if a word of hexadecimal text is not a byte.
     pub(crate) fn next(&mut self) -> io::Result<Option<&[u8]>> {
-        let mut len = match std::mem::take(&mut self.ahead) {
+        let mut len = match std::mem::take(&mut self.read_ahead) {
             0 => self.read()?,
             len => len,
         };
@@ -242,7 +244,7 @@ fn parse_hex(text: &str) -> Result<Vec<u8>, String> {
 }
 
 /// Bytes, and the measuring mode of their values if the recording has it.
-type Unpacked = (Box<dyn Read>, Option<Mode>);
+type RecordingInput = (Box<dyn Read>, Option<Mode>);
 
 /// Returns whether the file at `path` is an MCAP or gzip file. Does not read a pipe, whose bytes would be lost.
 fn is_framed(path: &Path) -> bool {
@@ -261,7 +263,7 @@ fn is_framed(path: &Path) -> bool {
 ///
 /// Returns [`Kind::Input`] if the file cannot be read or has no telegrams, [`Kind::NoTopic`] if it does not have this
 /// sensor, and [`Kind::Usage`] if a name is missing, or is given although the file has none.
-fn open_recording(path: &Path, sensor: Option<&str>) -> Result<Unpacked, Failure> {
+fn open_recording(path: &Path, sensor: Option<&str>) -> Result<RecordingInput, Failure> {
     let mut recording = Recording::open_as(path, Some(Family::Lms))?;
     if let Some(sensor) = sensor {
         recording = recording.of(sensor)?;
@@ -284,7 +286,8 @@ fn open_recording(path: &Path, sensor: Option<&str>) -> Result<Unpacked, Failure
             let mode = contents.mode;
             // The recording has telegrams, so the encoding is not used.
             let encoding = Encoding { unit: Unit::Mm, mode: mode.unwrap_or(Mode(0)) };
-            let bytes = Bytes { telegrams: recording.telegrams(encoding)?, left: VecDeque::new() };
+            let bytes =
+                TelegramReader { telegrams: recording.telegrams(encoding)?, remaining: VecDeque::new() };
             Ok((Box::new(bytes), mode))
         }
         Form::Carmen => {
@@ -296,17 +299,17 @@ fn open_recording(path: &Path, sensor: Option<&str>) -> Result<Unpacked, Failure
 }
 
 /// Reader of the bytes of telegrams.
-struct Bytes {
+struct TelegramReader {
     telegrams: Box<dyn Iterator<Item = Frame> + Send>,
-    left: VecDeque<u8>,
+    remaining: VecDeque<u8>,
 }
 
-impl Read for Bytes {
-    fn read(&mut self, room: &mut [u8]) -> io::Result<usize> {
-        if self.left.is_empty() {
-            self.left = self.telegrams.next().map(|frame| frame.telegram.into()).unwrap_or_default();
+impl Read for TelegramReader {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        if self.remaining.is_empty() {
+            self.remaining = self.telegrams.next().map(|frame| frame.telegram.into()).unwrap_or_default();
         }
-        self.left.read(room)
+        self.remaining.read(buffer)
     }
 }
 
@@ -347,7 +350,7 @@ struct Summary {
 
 /// Class `decoded`.
 #[derive(Default, Serialize)]
-struct Line {
+struct ItemLine {
     class: &'static str,
     offset: u64,
     kind: &'static str,
@@ -400,7 +403,7 @@ impl<'o> ItemPrinter<'o> {
 
     /// Writes an item that starts at byte `offset` of the stream.
     pub(crate) fn item(&mut self, offset: u64, item: Item<'_>) -> io::Result<()> {
-        let mut line = Line { class: "decoded", offset, ..Line::default() };
+        let mut line = ItemLine { class: "decoded", offset, ..ItemLine::default() };
         let bytes: &[u8] = match item {
             Item::Telegram(telegram) => {
                 self.summary.telegrams += 1;
@@ -510,8 +513,8 @@ impl<'o> ItemPrinter<'o> {
     }
 }
 
-fn words_of(field: &Field<'_>) -> Option<String> {
-    field.words.map(|words| words.to_string()).filter(|words| !words.is_empty())
+fn describe_field(field: &Field<'_>) -> Option<String> {
+    field.meaning.map(|words| words.to_string()).filter(|words| !words.is_empty())
 }
 
 fn json(field: &Field<'_>) -> FieldLine {
@@ -529,21 +532,21 @@ fn json(field: &Field<'_>) -> FieldLine {
             }
         }
         Value::Ranges(ranges) => {
-            mm = Some(ranges.millimetres().map(Result::ok).collect());
+            mm = Some(ranges.millimeters().map(Result::ok).collect());
             ranges.raw().collect()
         }
     };
     let Field { name, offset, bytes, .. } = *field;
-    FieldLine { name, offset, length: bytes.len(), value, mm, words: words_of(field) }
+    FieldLine { name, offset, length: bytes.len(), value, mm, words: describe_field(field) }
 }
 
 /// Returns a field as a line of text, or as several lines for a list.
 fn text(field: &Field<'_>, all: bool) -> String {
     let mut text = format!("\n          {:>4}  {:<20}  {}", field.offset, hex(field.bytes, 6), field.name);
-    let words = words_of(field).map_or(String::new(), |words| format!(" ({words})"));
+    let words = describe_field(field).map_or(String::new(), |words| format!(" ({words})"));
     let _ = match field.value {
         // A number that means nothing to people.
-        Value::Number(_) if FRAME.contains(&field.name) => match words_of(field) {
+        Value::Number(_) if FRAME_FIELDS.contains(&field.name) => match describe_field(field) {
             Some(words) => write!(text, ": {words}"),
             None => Ok(()),
         },
@@ -554,7 +557,7 @@ fn text(field: &Field<'_>, all: bool) -> String {
         Value::Rows { bytes, columns } => rows(&mut text, bytes, columns, all),
         Value::Ranges(ranges) => {
             let _ = write!(text, ": {} values{words}", ranges.raw().len());
-            let rows = ranges.raw().zip(ranges.millimetres()).zip(ranges.upper()).enumerate();
+            let rows = ranges.raw().zip(ranges.millimeters()).zip(ranges.upper()).enumerate();
             for (beam, ((raw, range), upper)) in rows.take(if all { usize::MAX } else { 0 }) {
                 let range = range.map_or_else(|code| code.to_string(), |mm| format!("{mm} mm"));
                 let _ = write!(text, "\n                {beam:>4}  {raw:04X}  {range}, bits above {upper}");
@@ -587,9 +590,9 @@ fn hex(bytes: &[u8], max: usize) -> String {
 }
 
 /// Length of a piece that is read at once.
-const PIECE: usize = 16 * 1024;
+const CHUNK_LEN: usize = 16 * 1024;
 /// Fields whose bytes or text people read, and not the number.
-const FRAME: [&str; 6] = ["STX", "address", "command", "error", "status", "checksum"];
+const FRAME_FIELDS: [&str; 6] = ["STX", "address", "command", "error", "status", "checksum"];
 
 #[cfg(test)]
 mod tests {

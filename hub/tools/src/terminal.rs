@@ -55,7 +55,7 @@ impl Progress {
     }
 
     /// Keeps the last text on its own line, because that step failed and its reason is printed next.
-    pub(crate) fn leave(&mut self) {
+    pub(crate) fn keep_text(&mut self) {
         if std::mem::take(&mut self.is_shown) {
             let _ = writeln!(stderr());
         }

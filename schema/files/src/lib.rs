@@ -7,4 +7,4 @@
 pub mod output;
 #[cfg(feature = "path_walk")]
 pub mod path_walk;
-pub mod regular;
+pub mod regular_file;

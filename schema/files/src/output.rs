@@ -20,7 +20,7 @@ use rustix::fs::{AtFlags, FileType, Mode, OFlags, Stat, openat, readlinkat, stat
 use rustix::io::Errno;
 use tempfile::NamedTempFile;
 
-use crate::path_walk::{LinkPolicy, PathWalk, WalkError, components_of, named, user};
+use crate::path_walk::{LinkPolicy, PathWalk, WalkError, components_of, describe_user, effective_uid};
 use scanhub_schema::{Failure, Kind};
 
 /// Writes all of `content` to the file at `path`; replaces an existing one if `force`.
@@ -81,7 +81,7 @@ impl OutputFile {
     pub fn commit(self) -> Result<(), Failure> {
         let OutputFile { target, file, force } = self;
         let old = target.check(force)?;
-        let put = || {
+        let persist = || {
             let permissions = match old {
                 // Only root may give a file away. This clears some permissions, so they are set afterwards.
                 Some(old) => match fchown(file.as_file(), Some(old.st_uid), Some(old.st_gid)) {
@@ -89,7 +89,7 @@ impl OutputFile {
                     // The permissions were meant for another owner or group.
                     Err(_) => old.st_mode & 0o600,
                 },
-                None => PUBLIC & !umask(),
+                None => PUBLIC_MODE & !umask(),
             };
             file.as_file().set_permissions(Permissions::from_mode(permissions))?;
             file.as_file().sync_all()?;
@@ -97,8 +97,8 @@ impl OutputFile {
             let persisted = if force { file.persist(path) } else { file.persist_noclobber(path) };
             persisted.map(drop).map_err(|failed| failed.error)
         };
-        put().map_err(|error| match error.kind() {
-            ErrorKind::AlreadyExists => exists(&target.path),
+        persist().map_err(|error| match error.kind() {
+            ErrorKind::AlreadyExists => already_exists(&target.path),
             _ => unwritable(&target.path, &error),
         })
     }
@@ -154,7 +154,7 @@ impl Target {
         };
         let (what, hint) = match FileType::from_raw_mode(stat.st_mode) {
             FileType::RegularFile if force => return Ok(Some(stat)),
-            FileType::RegularFile => return Err(exists(&self.path)),
+            FileType::RegularFile => return Err(already_exists(&self.path)),
             FileType::Symlink => {
                 let target = readlinkat(&self.directory, &self.name, Vec::new()).unwrap_or_default();
                 let target = PathBuf::from(OsString::from_vec(target.into_bytes()));
@@ -188,14 +188,18 @@ impl Target {
     ///
     /// The system's error: [`ErrorKind::AlreadyExists`] if there is a file and `reuse` is not set, and always for a link.
     pub fn create(&self, reuse: bool) -> io::Result<File> {
-        self.open_file(reuse, PUBLIC)
+        self.open_file(reuse, PUBLIC_MODE)
     }
 
     fn open_file(&self, reuse: bool, mode: u32) -> io::Result<File> {
-        let how = if reuse { OFlags::empty() } else { OFlags::EXCL };
+        let exclusive = if reuse { OFlags::empty() } else { OFlags::EXCL };
         // Without NONBLOCK, opening a pipe would wait for its reader.
-        let flags =
-            OFlags::WRONLY | OFlags::CREATE | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC | how;
+        let flags = OFlags::WRONLY
+            | OFlags::CREATE
+            | OFlags::NOFOLLOW
+            | OFlags::NONBLOCK
+            | OFlags::CLOEXEC
+            | exclusive;
         let file = File::from(openat(&self.directory, &self.name, flags, Mode::from_raw_mode(mode))?);
         let metadata = file.metadata()?;
         if !metadata.is_file() {
@@ -221,7 +225,7 @@ impl Target {
             removed.map_err(|error| unwritable(&self.path, &error.into()))?;
         }
         self.open_file(false, mode).map_err(|error| match error.kind() {
-            ErrorKind::AlreadyExists => exists(&self.path),
+            ErrorKind::AlreadyExists => already_exists(&self.path),
             _ => unwritable(&self.path, &error),
         })
     }
@@ -234,26 +238,30 @@ impl Target {
 
 /// Opens `directory`, on the way to the output `path`. With `make`, missing directories are created with these permissions.
 fn open_directory(path: &Path, directory: &Path, make: Option<Mode>) -> Result<OwnedFd, Failure> {
-    let reached = PathWalk::begin(path, LinkPolicy::NotPlanted, user()).and_then(|mut walk| {
+    let reached = PathWalk::begin(path, LinkPolicy::AllButSticky, effective_uid()).and_then(|mut walk| {
         let exists = walk.enter(components_of(directory), make)?;
         if exists { Ok(walk) } else { Err(WalkError::System(directory.to_owned(), Errno::NOENT)) }
     });
     let error = match reached {
         Ok(walk) => return Ok(walk.into_parts().0),
         // The usual case needs no second path.
-        Err(WalkError::System(at, error)) if at == directory => error.into(),
-        Err(WalkError::System(at, error)) => {
-            io::Error::other(format!("{}: {}", at.display(), io::Error::from(error)))
+        Err(WalkError::System(failed_at, error)) if failed_at == directory => error.into(),
+        Err(WalkError::System(failed_at, error)) => {
+            io::Error::other(format!("{}: {}", failed_at.display(), io::Error::from(error)))
         }
-        Err(WalkError::Foreign(at, owner, mode)) => {
+        Err(WalkError::Foreign(failed_at, owner, mode)) => {
             let mode = mode & 0o7777;
-            let what = format!("{} belongs to user {} with mode {mode:04o}", at.display(), named(owner));
+            let what = format!(
+                "{} belongs to user {} with mode {mode:04o}",
+                failed_at.display(),
+                describe_user(owner)
+            );
             io::Error::other(what)
         }
         // Only directories of this user's own are checked for that.
-        Err(WalkError::Writable(at, _)) => return Err(unwritable(&at, &Errno::PERM.into())),
-        Err(WalkError::Planted(at, what)) => {
-            let message = format!("cannot write {}: {} {what}", path.display(), at.display());
+        Err(WalkError::Writable(failed_at, _)) => return Err(unwritable(&failed_at, &Errno::PERM.into())),
+        Err(WalkError::Untrusted(failed_at, what)) => {
+            let message = format!("cannot write {}: {} {what}", path.display(), failed_at.display());
             return Err(Failure::new(Kind::Output, message, "name it without that link, or another one"));
         }
     };
@@ -265,9 +273,9 @@ fn open_directory(path: &Path, directory: &Path, make: Option<Mode>) -> Result<O
 }
 
 /// Permissions of a new file, before the umask takes some away.
-pub const PUBLIC: u32 = 0o666;
+pub const PUBLIC_MODE: u32 = 0o666;
 /// Permissions of a new file that only this user may read.
-pub const PRIVATE: u32 = 0o600;
+pub const PRIVATE_MODE: u32 = 0o600;
 
 /// Returns the failure of a write to the file at `path`.
 pub fn unwritable(path: &Path, error: &io::Error) -> Failure {
@@ -278,7 +286,7 @@ pub fn unwritable(path: &Path, error: &io::Error) -> Failure {
     Failure::new(Kind::Output, format!("cannot write {}: {error}", path.display()), hint)
 }
 
-fn exists(path: &Path) -> Failure {
+fn already_exists(path: &Path) -> Failure {
     Failure::new(Kind::Output, format!("{} exists", path.display()), "--force replaces it")
 }
 
@@ -299,7 +307,7 @@ mod tests {
 
     use super::*;
 
-    fn names(directory: &Path) -> Vec<String> {
+    fn file_names(directory: &Path) -> Vec<String> {
         let entries = fs::read_dir(directory).unwrap();
         let mut names: Vec<_> = entries.map(|it| it.unwrap().file_name().into_string().unwrap()).collect();
         names.sort();
@@ -312,22 +320,22 @@ mod tests {
         let path = directory.path().join("a.json");
         let mut file = OutputFile::create(&path, false).unwrap();
         file.write_all(b"half").unwrap();
-        assert_eq!(names(directory.path()).len(), 1);
+        assert_eq!(file_names(directory.path()).len(), 1);
         assert!(!path.exists());
-        let temporary = fs::metadata(directory.path().join(&names(directory.path())[0])).unwrap();
+        let temporary = fs::metadata(directory.path().join(&file_names(directory.path())[0])).unwrap();
         assert_eq!(temporary.mode() & 0o7777, 0o600);
         drop(file);
-        assert_eq!(names(directory.path()), [""; 0]);
+        assert_eq!(file_names(directory.path()), [""; 0]);
         write(&path, b"whole", false).unwrap();
         assert_eq!(
-            (names(directory.path()), fs::read(&path).unwrap()),
+            (file_names(directory.path()), fs::read(&path).unwrap()),
             (vec!["a.json".into()], b"whole".into())
         );
         assert_eq!(fs::metadata(&path).unwrap().mode() & 0o7777, 0o666 & !umask());
     }
 
     #[test]
-    fn an_existing_file_is_replaced_by_force_alone_and_keeps_its_permissions() {
+    fn only_force_replaces_a_file_and_permissions_stay() {
         let directory = TempDir::new().unwrap();
         let path = directory.path().join("a");
         let file = OutputFile::create(&path, false).unwrap();
@@ -342,7 +350,7 @@ mod tests {
         write(&path, b"new", true).unwrap();
         assert_eq!(fs::read(&path).unwrap(), b"new");
         assert_eq!(fs::metadata(&path).unwrap().mode() & 0o7777, 0o640);
-        assert_eq!(names(directory.path()), ["a"]);
+        assert_eq!(file_names(directory.path()), ["a"]);
     }
 
     #[test]
@@ -362,7 +370,7 @@ mod tests {
             ("/dev/null".into(), "it is a device"),
         ] {
             for force in [false, true] {
-                let create = |target: Target| target.create_new(force, PUBLIC);
+                let create = |target: Target| target.create_new(force, PUBLIC_MODE);
                 let growing = Target::open(&path).and_then(create).unwrap_err();
                 let failure = write(&path, b"new", force).unwrap_err();
                 assert!(failure.message.ends_with(what) && !failure.hint.is_empty(), "{failure}");
@@ -385,7 +393,7 @@ mod tests {
         fs::hard_link(&path, &backup).unwrap();
         let target = Target::open(&path).unwrap();
         assert!(target.create(true).unwrap_err().to_string().contains("2 names"));
-        target.create_new(true, PUBLIC).unwrap().write_all(b"new").unwrap();
+        target.create_new(true, PUBLIC_MODE).unwrap().write_all(b"new").unwrap();
         assert_eq!((fs::read(&path).unwrap(), fs::read(&backup).unwrap()), (b"new".into(), b"old".into()));
     }
 
@@ -396,7 +404,7 @@ mod tests {
         for _ in 0..2 {
             create_directory(&at("a/b/../c")).unwrap();
             assert_eq!(
-                (names(directory.path()), names(&at("a"))),
+                (file_names(directory.path()), file_names(&at("a"))),
                 (vec!["a".into()], vec!["b".into(), "c".into()])
             );
         }
@@ -408,7 +416,7 @@ mod tests {
         fs::write(at("file"), "").unwrap();
         symlink("a", at("link")).unwrap();
         create_directory(&at("link/d")).unwrap();
-        assert_eq!(names(&at("a")), ["b", "c", "d"]);
+        assert_eq!(file_names(&at("a")), ["b", "c", "d"]);
         for name in ["file", "file/below"] {
             let failure = create_directory(&at(name)).unwrap_err();
             assert!(failure.kind == Kind::Output && failure.message.contains("Not a directory"), "{failure}");
@@ -417,7 +425,7 @@ mod tests {
     }
 
     #[test]
-    fn links_on_the_way_are_followed_but_not_those_of_others_in_a_sticky_directory() {
+    fn follows_links_except_foreign_ones_in_sticky_dirs() {
         let directory = TempDir::new().unwrap();
         let at = |name: &str| directory.path().join(name);
         fs::create_dir_all(at("real/below")).unwrap();
@@ -427,11 +435,11 @@ mod tests {
         for mode in [0o700, 0o777, 0o1777] {
             fs::set_permissions(at("shared"), Permissions::from_mode(mode)).unwrap();
             write(&at("shared/link/below/../a"), b"x", true).unwrap();
-            assert_eq!(names(&at("real")), ["a", "below"]);
+            assert_eq!(file_names(&at("real")), ["a", "below"]);
             write(&at("relative/a"), b"x", true).unwrap();
-            assert_eq!(names(&at("real/below")), ["a"]);
+            assert_eq!(file_names(&at("real/below")), ["a"]);
         }
-        if user() == 0 {
+        if effective_uid() == 0 {
             std::os::unix::fs::lchown(at("shared/link"), Some(12_345), None).unwrap();
             let failure = write(&at("shared/link/b"), b"x", true).unwrap_err();
             assert!(failure.message.contains("link is a link of user 12345"), "{failure}");

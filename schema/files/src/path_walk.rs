@@ -14,7 +14,7 @@ pub struct PathWalk {
     user: u32,
     policy: LinkPolicy,
     /// The last component that was opened.
-    at: OwnedFd,
+    directory: OwnedFd,
     path: PathBuf,
     /// Number of links that were followed.
     links: usize,
@@ -27,7 +27,7 @@ pub enum LinkPolicy {
     /// No others.
     Own,
     /// All but those of other users in a sticky directory, such as /tmp.
-    NotPlanted,
+    AllButSticky,
 }
 
 /// Reason for not opening a directory.
@@ -36,7 +36,7 @@ pub enum WalkError {
     /// The system refuses it.
     System(PathBuf, Errno),
     /// Another user may have put something at this path. The text continues a sentence that begins with the path.
-    Planted(PathBuf, String),
+    Untrusted(PathBuf, String),
     /// Owner and mode of a directory that belongs to another user.
     Foreign(PathBuf, u32, u32),
     /// Mode of a directory that other users can write to.
@@ -52,10 +52,10 @@ impl PathWalk {
     /// [`WalkError::System`] if that cannot be opened.
     pub fn begin(path: &Path, policy: LinkPolicy, user: u32) -> Result<PathWalk, WalkError> {
         let start = Path::new(if path.is_absolute() { "/" } else { "." });
-        let at = openat(CWD, start, OPEN_DIRECTORY | OFlags::PATH, Mode::empty());
-        let at = at.map_err(|error| WalkError::System(start.to_owned(), error))?;
+        let directory = openat(CWD, start, OPEN_DIRECTORY | OFlags::PATH, Mode::empty());
+        let at = directory.map_err(|error| WalkError::System(start.to_owned(), error))?;
         let path = if path.is_absolute() { start.to_owned() } else { PathBuf::new() };
-        Ok(PathWalk { user, policy, at, path, links: 0 })
+        Ok(PathWalk { user, policy, directory: at, path, links: 0 })
     }
 
     /// Opens the `components` in this order, and follows links as the policy permits. With `make`, a missing directory is
@@ -64,20 +64,26 @@ impl PathWalk {
     /// # Errors
     ///
     /// [`WalkError`] if a component cannot be opened or is not to be trusted.
-    pub fn enter(&mut self, mut components: Vec<OsString>, make: Option<Mode>) -> Result<bool, WalkError> {
+    pub fn enter(
+        &mut self,
+        mut components: Vec<OsString>,
+        create_mode: Option<Mode>,
+    ) -> Result<bool, WalkError> {
         components.reverse();
         while let Some(component) = components.pop() {
-            match self.step(&component, make, OFlags::PATH)? {
-                Step::Made => {}
-                Step::Absent => return Ok(false),
-                Step::NoDirectory => components.extend(self.follow(&component)?.into_iter().rev()),
+            match self.open_component(&component, create_mode, OFlags::PATH)? {
+                ComponentResult::Entered => {}
+                ComponentResult::Absent => return Ok(false),
+                ComponentResult::NotDirectory => {
+                    components.extend(self.read_link(&component)?.into_iter().rev())
+                }
             }
         }
         Ok(true)
     }
 
     /// Opens one component, which must be a directory of this user that no other user can write to.
-    /// A link is not followed. `how` has flags for opening it.
+    /// A link is not followed. `flags` has flags for opening it.
     ///
     /// # Errors
     ///
@@ -85,22 +91,22 @@ impl PathWalk {
     pub fn enter_own(
         &mut self,
         component: &OsStr,
-        make: Option<Mode>,
-        how: OFlags,
+        create_mode: Option<Mode>,
+        flags: OFlags,
     ) -> Result<bool, WalkError> {
-        match self.step(component, make, how)? {
-            Step::Made => {}
-            Step::Absent => return Ok(false),
-            Step::NoDirectory => {
-                let stat = statat(&self.at, component, AtFlags::SYMLINK_NOFOLLOW)
+        match self.open_component(component, create_mode, flags)? {
+            ComponentResult::Entered => {}
+            ComponentResult::Absent => return Ok(false),
+            ComponentResult::NotDirectory => {
+                let stat = statat(&self.directory, component, AtFlags::SYMLINK_NOFOLLOW)
                     .map_err(|error| self.system(error))?;
                 let is_link = FileType::from_raw_mode(stat.st_mode) == FileType::Symlink;
                 let kind = if is_link { "a link" } else { "no directory, but a file" };
-                let what = format!("is {kind} of user {}", named(stat.st_uid));
-                return Err(WalkError::Planted(self.path.join(component), what));
+                let what = format!("is {kind} of user {}", describe_user(stat.st_uid));
+                return Err(WalkError::Untrusted(self.path.join(component), what));
             }
         }
-        let stat = fstat(&self.at).map_err(|error| self.system(error))?;
+        let stat = fstat(&self.directory).map_err(|error| self.system(error))?;
         if stat.st_uid != self.user {
             return Err(WalkError::Foreign(self.path.clone(), stat.st_uid, stat.st_mode));
         }
@@ -112,32 +118,38 @@ impl PathWalk {
 
     /// Returns the directory that was reached, and its path.
     pub fn into_parts(self) -> (OwnedFd, PathBuf) {
-        (self.at, self.path)
+        (self.directory, self.path)
     }
 
-    fn step(&mut self, name: &OsStr, make: Option<Mode>, how: OFlags) -> Result<Step, WalkError> {
-        let open = |at: &OwnedFd| openat(at, name, OPEN_DIRECTORY | how, Mode::empty());
-        let mut opened = open(&self.at);
-        if let (Err(Errno::NOENT), Some(mode)) = (&opened, make) {
-            match mkdirat(&self.at, name, mode) {
-                Ok(()) | Err(Errno::EXIST) => opened = open(&self.at),
+    fn open_component(
+        &mut self,
+        name: &OsStr,
+        create_mode: Option<Mode>,
+        flags: OFlags,
+    ) -> Result<ComponentResult, WalkError> {
+        let open = |at: &OwnedFd| openat(at, name, OPEN_DIRECTORY | flags, Mode::empty());
+        let mut opened = open(&self.directory);
+        if let (Err(Errno::NOENT), Some(mode)) = (&opened, create_mode) {
+            match mkdirat(&self.directory, name, mode) {
+                Ok(()) | Err(Errno::EXIST) => opened = open(&self.directory),
                 Err(error) => return Err(WalkError::System(self.path.join(name), error)),
             }
         }
         match opened {
             Ok(fd) => {
-                self.at = fd;
+                self.directory = fd;
                 self.path.push(name);
-                Ok(Step::Made)
+                Ok(ComponentResult::Entered)
             }
-            Err(Errno::NOENT) => Ok(Step::Absent),
-            Err(Errno::NOTDIR | Errno::LOOP) => Ok(Step::NoDirectory),
+            Err(Errno::NOENT) => Ok(ComponentResult::Absent),
+            Err(Errno::NOTDIR | Errno::LOOP) => Ok(ComponentResult::NotDirectory),
             // A directory without read permission still has a visible owner.
             Err(Errno::ACCESS) => {
-                let component = statat(&self.at, name, AtFlags::SYMLINK_NOFOLLOW);
+                let component = statat(&self.directory, name, AtFlags::SYMLINK_NOFOLLOW);
                 let component = component.map(|stat| (self.path.join(name), stat));
-                let seen = component.or_else(|_| fstat(&self.at).map(|stat| (self.path.clone(), stat)));
-                let (path, stat) = seen.map_err(|error| self.system(error))?;
+                let found =
+                    component.or_else(|_| fstat(&self.directory).map(|stat| (self.path.clone(), stat)));
+                let (path, stat) = found.map_err(|error| self.system(error))?;
                 Err(WalkError::Foreign(path, stat.st_uid, stat.st_mode))
             }
             Err(error) => Err(WalkError::System(self.path.join(name), error)),
@@ -145,21 +157,24 @@ impl PathWalk {
     }
 
     /// Returns the components that the link `name` stands for.
-    fn follow(&mut self, name: &OsStr) -> Result<Vec<OsString>, WalkError> {
+    fn read_link(&mut self, name: &OsStr) -> Result<Vec<OsString>, WalkError> {
         let path = self.path.join(name);
         let broken = |error| WalkError::System(path.clone(), error);
-        let Ok(target) = readlinkat(&self.at, name, Vec::new()) else { return Err(broken(Errno::NOTDIR)) };
-        let owner = statat(&self.at, name, AtFlags::SYMLINK_NOFOLLOW).map_err(broken)?.st_uid;
-        let mode = fstat(&self.at).map_err(broken)?.st_mode;
+        let Ok(target) = readlinkat(&self.directory, name, Vec::new()) else {
+            return Err(broken(Errno::NOTDIR));
+        };
+        let owner = statat(&self.directory, name, AtFlags::SYMLINK_NOFOLLOW).map_err(broken)?.st_uid;
+        let mode = fstat(&self.directory).map_err(broken)?.st_mode;
         let is_trusted = owner == 0 || owner == self.user;
         let is_followed = match self.policy {
             LinkPolicy::Own => is_trusted && mode & OTHERS_WRITE == 0,
-            LinkPolicy::NotPlanted => is_trusted || mode & STICKY == 0,
+            LinkPolicy::AllButSticky => is_trusted || mode & STICKY == 0,
         };
         if !is_followed {
             let mode = mode & 0o7777;
-            let what = format!("is a link of user {} in a directory of mode {mode:04o}", named(owner));
-            return Err(WalkError::Planted(path, what));
+            let what =
+                format!("is a link of user {} in a directory of mode {mode:04o}", describe_user(owner));
+            return Err(WalkError::Untrusted(path, what));
         }
         self.links += 1;
         if self.links > MAX_LINKS {
@@ -167,7 +182,8 @@ impl PathWalk {
         }
         let target = PathBuf::from(OsString::from_vec(target.into_bytes()));
         if target.is_absolute() {
-            self.at = openat(&self.at, "/", OPEN_DIRECTORY | OFlags::PATH, Mode::empty()).map_err(broken)?;
+            self.directory =
+                openat(&self.directory, "/", OPEN_DIRECTORY | OFlags::PATH, Mode::empty()).map_err(broken)?;
             self.path = PathBuf::from("/");
         }
         Ok(components_of(&target))
@@ -179,11 +195,11 @@ impl PathWalk {
 }
 
 /// Result of opening a component.
-enum Step {
-    Made,
+enum ComponentResult {
+    Entered,
     Absent,
     /// A link, or something else that is not entered.
-    NoDirectory,
+    NotDirectory,
 }
 
 /// Returns the components of `path` without its root.
@@ -198,13 +214,13 @@ pub fn components_of(path: &Path) -> Vec<OsString> {
 }
 
 /// Returns the number of `user`, and the name if it has one.
-pub fn named(user: u32) -> String {
-    let known = nix::unistd::User::from_uid(user.into()).ok().flatten();
-    known.map_or_else(|| user.to_string(), |known| format!("{user} ({})", known.name))
+pub fn describe_user(user: u32) -> String {
+    let entry = nix::unistd::User::from_uid(user.into()).ok().flatten();
+    entry.map_or_else(|| user.to_string(), |known| format!("{user} ({})", known.name))
 }
 
 /// Returns the user of this process.
-pub fn user() -> u32 {
+pub fn effective_uid() -> u32 {
     rustix::process::geteuid().as_raw()
 }
 

@@ -3,12 +3,12 @@
 
 use std::io::{self, Write};
 
-use scanhub_schema::file::{Foreign, Writer};
+use scanhub_schema::file::{ForeignChannel, Writer};
 use scanhub_schema::{Header, Pose, Scan};
 
 use crate::{
-    LASER_SCAN, Names, POINT_CLOUD, TF_MESSAGE, TF_STATIC, Type, frame, laser_scan, scan_cloud, scan_topic,
-    static_transforms,
+    LASER_SCAN, POINT_CLOUD, RosNames, TF_MESSAGE, TF_STATIC, Type, frame, laser_scan, scan_cloud,
+    scan_topic, static_transforms,
 };
 
 /// Profile of a file that has only ROS messages.
@@ -16,7 +16,7 @@ pub const PROFILE: &str = "ros2";
 
 /// Channels and transforms of a file.
 #[derive(Debug, Default)]
-pub struct Bag {
+pub struct BagWriter {
     /// Channels of scans and of points, by topic.
     channels: Vec<(String, u16)>,
     transforms: Option<Transforms>,
@@ -31,16 +31,16 @@ struct Transforms {
     channel: u16,
     /// Number and minimum time of the next message. The latest message must be the one with the most poses.
     number: u32,
-    from_ns: u64,
+    min_ns: u64,
 }
 
-impl Bag {
+impl BagWriter {
     /// Writes a scan of `sensor` as a LaserScan. The log time is the wall clock of its telegram.
     ///
     /// # Errors
     ///
     /// Returns the writer's error.
-    pub fn scan<W: Write>(
+    pub fn write_scan<W: Write>(
         &mut self,
         writer: &mut Writer<W>,
         sensor: &str,
@@ -48,7 +48,7 @@ impl Bag {
         scan: &Scan,
     ) -> io::Result<()> {
         let write = |message: &mut Vec<u8>| laser_scan(message, frame(sensor), header, scan);
-        self.write(writer, scan_topic(sensor), &LASER_SCAN, header, write)
+        self.write_message(writer, scan_topic(sensor), &LASER_SCAN, header, write)
     }
 
     /// Writes a scan of `sensor` as a PointCloud2, with the log time of its LaserScan.
@@ -56,7 +56,7 @@ impl Bag {
     /// # Errors
     ///
     /// Returns the writer's error.
-    pub fn points<W: Write>(
+    pub fn write_points<W: Write>(
         &mut self,
         writer: &mut Writer<W>,
         sensor: &str,
@@ -64,33 +64,33 @@ impl Bag {
         scan: &Scan,
     ) -> io::Result<()> {
         let write = |message: &mut Vec<u8>| scan_cloud(message, frame(sensor), header, scan);
-        self.write(writer, Names::default().topic(sensor, "points"), &POINT_CLOUD, header, write)
+        self.write_message(writer, RosNames::default().topic(sensor, "points"), &POINT_CLOUD, header, write)
     }
 
-    fn write<W: Write>(
+    fn write_message<W: Write>(
         &mut self,
         writer: &mut Writer<W>,
         topic: String,
-        of: &Type,
+        message_type: &Type,
         header: &Header,
         write: impl FnOnce(&mut Vec<u8>),
     ) -> io::Result<()> {
         let channel = match self.channels.iter().find(|(known, _)| *known == topic) {
             Some(&(_, channel)) => channel,
             None => {
-                let channel = channel(writer, &topic, of, EVERY_SCAN)?;
+                let channel = add_channel(writer, &topic, message_type, SCAN_QOS)?;
                 self.channels.push((topic, channel));
                 channel
             }
         };
         self.message.clear();
         write(&mut self.message);
-        writer.message(channel, header.topic_seq as u32, header.wall_ns, &self.message)
+        writer.write_message(channel, header.topic_seq as u32, header.wall_ns, &self.message)
     }
 
     /// Writes the poses of all known sensors if `pose` of `sensor` is new. Log time and stamp are `wall_ns` (since
     /// 1970), or just after the previous message.
-    pub fn pose<W: Write>(
+    pub fn write_pose<W: Write>(
         &mut self,
         writer: &mut Writer<W>,
         sensor: &str,
@@ -98,34 +98,39 @@ impl Bag {
         pose: &Pose,
     ) -> io::Result<()> {
         let frame = frame(sensor);
-        match self.poses.iter_mut().find(|(of, _)| of == frame) {
+        match self.poses.iter_mut().find(|(known_frame, _)| known_frame == frame) {
             Some((_, known)) if known == pose => return Ok(()),
             Some((_, known)) => *known = *pose,
             None => self.poses.push((frame.to_owned(), *pose)),
         }
-        let Transforms { channel, number, from_ns } = match self.transforms {
+        let Transforms { channel, number, min_ns } = match self.transforms {
             Some(known) => known,
             None => Transforms {
-                channel: channel(writer, TF_STATIC, &TF_MESSAGE, LATCHED)?,
+                channel: add_channel(writer, TF_STATIC, &TF_MESSAGE, LATCHED_QOS)?,
                 number: 0,
-                from_ns: 0,
+                min_ns: 0,
             },
         };
-        let at_ns = wall_ns.max(from_ns);
+        let at_ns = wall_ns.max(min_ns);
         self.transforms =
-            Some(Transforms { channel, number: number.wrapping_add(1), from_ns: at_ns.saturating_add(1) });
+            Some(Transforms { channel, number: number.wrapping_add(1), min_ns: at_ns.saturating_add(1) });
         self.message.clear();
         static_transforms(&mut self.message, at_ns, &self.poses);
-        writer.message(channel, number, at_ns, &self.message)
+        writer.write_message(channel, number, at_ns, &self.message)
     }
 }
 
-fn channel<W: Write>(writer: &mut Writer<W>, topic: &str, of: &Type, offered: &str) -> io::Result<u16> {
-    writer.channel(&Foreign {
+fn add_channel<W: Write>(
+    writer: &mut Writer<W>,
+    topic: &str,
+    message_type: &Type,
+    qos: &str,
+) -> io::Result<u16> {
+    writer.add_channel(&ForeignChannel {
         topic,
         encoding: Type::ENCODING,
-        schema: (of.name, of.text, Type::LANGUAGE),
-        metadata: &[("offered_qos_profiles", offered)],
+        schema: (message_type.name, message_type.text, Type::LANGUAGE),
+        metadata: &[("offered_qos_profiles", qos)],
     })
 }
 
@@ -146,6 +151,6 @@ macro_rules! offered {
 }
 
 /// A player offers this quality of service, and it is compatible with every subscriber.
-const EVERY_SCAN: &str = offered!(5, 2);
+const SCAN_QOS: &str = offered!(5, 2);
 /// Subscribers to transforms request this quality of service.
-const LATCHED: &str = offered!(1, 1);
+const LATCHED_QOS: &str = offered!(1, 1);

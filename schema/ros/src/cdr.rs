@@ -1,7 +1,7 @@
 //! Writes and reads messages in little-endian CDR (OMG XCDR1): values in order, each at a multiple of its size from the
 //! start of the body.
 
-use crate::types::{Field, Layout, Type};
+use crate::types::{Field, MessageDef, Type};
 
 /// Writes a message.
 pub(crate) struct Cdr<'a> {
@@ -119,17 +119,17 @@ impl Value {
 }
 
 /// Returns the value of `message`, which has type `of`. `None` if it has fewer or more bytes than the type.
-pub fn read(of: &Type, message: &[u8]) -> Option<Value> {
+pub fn read(message_type: &Type, message: &[u8]) -> Option<Value> {
     let body = message.strip_prefix(&[0, 1, 0, 0])?;
-    let layout = Layout::of(of);
+    let layout = MessageDef::of(message_type);
     let mut reader = Reader { layout: &layout, body, at: 0 };
-    let value = reader.fields(layout.fields(of.name)?)?;
+    let value = reader.fields(layout.fields(message_type.name)?)?;
     (reader.at == body.len()).then_some(value)
 }
 
 /// A position in a message.
 struct Reader<'a> {
-    layout: &'a Layout<'a>,
+    layout: &'a MessageDef<'a>,
     body: &'a [u8],
     at: usize,
 }
@@ -142,14 +142,14 @@ impl Reader<'_> {
 
     fn field(&mut self, field: &Field<'_>) -> Option<Value> {
         if !field.is_sequence {
-            return self.one(field.of);
+            return self.value_of(field.type_name);
         }
         let count = self.count()?;
-        (0..count).map(|_| self.one(field.of)).collect::<Option<_>>().map(Value::Sequence)
+        (0..count).map(|_| self.value_of(field.type_name)).collect::<Option<_>>().map(Value::Sequence)
     }
 
-    fn one(&mut self, of: &str) -> Option<Value> {
-        Some(Value::Number(match of {
+    fn value_of(&mut self, type_name: &str) -> Option<Value> {
+        Some(Value::Number(match type_name {
             "bool" | "byte" | "uint8" => u8::from_le_bytes(self.take()?).into(),
             "int32" => i32::from_le_bytes(self.take()?).into(),
             "uint32" => u32::from_le_bytes(self.take()?).into(),

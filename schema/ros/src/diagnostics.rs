@@ -6,7 +6,7 @@ use scanhub_schema::{State, Status, Verdict};
 use crate::cdr::Cdr;
 
 /// Appends the name of `verdict` to `message`: `clear`, `slow`, `stop` or `unknown`.
-pub fn verdict_word(message: &mut Vec<u8>, verdict: Verdict) {
+pub fn verdict_message(message: &mut Vec<u8>, verdict: Verdict) {
     Cdr::begin(message).text(verdict.name());
 }
 
@@ -19,16 +19,16 @@ pub fn diagnosis(
     status: Option<&Status>,
     age_ns: Option<u64>,
 ) {
-    let (level, words) = status.map_or((STALE, NO_HUB.to_owned()), judged);
+    let (level, summary) = status.map_or((STALE, NO_HUB.to_owned()), assess);
     let hardware = status.map_or("", |status| status.sensor_type().trim());
     let values = status.map_or(Vec::new(), |status| values(status, age_ns));
-    write(message, now_ns, level, [sensor, &words, hardware], &values);
+    write(message, now_ns, level, [sensor, &summary, hardware], &values);
 }
 
 /// Appends the diagnostics of the hub at `now_ns` (since 1970) to `message`. They report whether the hub runs.
-pub fn hub_diagnosis(message: &mut Vec<u8>, now_ns: u64, is_there: bool) {
-    let (level, words) = if is_there { (OK, "running") } else { (STALE, NO_HUB) };
-    write(message, now_ns, level, ["hub", words, ""], &[]);
+pub fn hub_diagnosis(message: &mut Vec<u8>, now_ns: u64, is_running: bool) {
+    let (level, summary) = if is_running { (OK, "running") } else { (STALE, NO_HUB) };
+    write(message, now_ns, level, ["hub", summary, ""], &[]);
 }
 
 /// Writes an array of one status.
@@ -36,7 +36,7 @@ fn write(
     message: &mut Vec<u8>,
     now_ns: u64,
     level: u8,
-    [name, words, hardware]: [&str; 3],
+    [name, summary, hardware]: [&str; 3],
     values: &[(&str, String)],
 ) {
     let mut cdr = Cdr::begin(message);
@@ -44,7 +44,7 @@ fn write(
     cdr.u32(1);
     cdr.u8(level);
     cdr.text(&format!("scanhub: {name}"));
-    cdr.text(words);
+    cdr.text(summary);
     cdr.text(hardware);
     cdr.u32(values.len() as u32);
     for (key, value) in values {
@@ -54,7 +54,7 @@ fn write(
 }
 
 /// Returns level and message of a status.
-fn judged(status: &Status) -> (u8, String) {
+fn assess(status: &Status) -> (u8, String) {
     let state = status.state();
     let name = state.map_or("unknown state", State::name);
     let loss = status.line_loss();
@@ -71,7 +71,7 @@ fn values(status: &Status, age_ns: Option<u64>) -> Vec<(&'static str, String)> {
     let mut values = vec![
         ("state", status.state().map_or("unknown", State::name).to_owned()),
         ("rate_hz", (f64::from(status.rate_mhz) / 1e3).to_string()),
-        ("damaged", status.damaged().to_string()),
+        ("damaged", status.damaged_share().to_string()),
     ];
     values.extend(status.lost_share().map(|share| ("lost", share.to_string())));
     values.extend(age_ns.map(|age| ("age_s", (age as f64 / 1e9).to_string())));
@@ -101,11 +101,11 @@ mod tests {
     #[test]
     fn a_verdict_is_a_word() {
         let mut message = Vec::new();
-        verdict_word(&mut message, Verdict::Unknown);
+        verdict_message(&mut message, Verdict::Unknown);
         assert_eq!(read(&STRING, &message).unwrap().text("data"), Some("unknown"));
     }
 
-    fn told(status: Option<&Status>, age_ns: Option<u64>) -> Value {
+    fn diagnosis_of(status: Option<&Status>, age_ns: Option<u64>) -> Value {
         let mut message = Vec::new();
         diagnosis(&mut message, "front", 9_000_000_001, status, age_ns);
         read(&DIAGNOSTIC_ARRAY, &message).unwrap()
@@ -118,7 +118,7 @@ mod tests {
         let mut judge = |state: State, damaged_ppm: u64| {
             status.state = state as u8;
             status.counters[Counter::DamagedPpm] = damaged_ppm;
-            let told = told(Some(&status), Some(250_000_000));
+            let told = diagnosis_of(Some(&status), Some(250_000_000));
             (told.number("status.0.level").unwrap() as u8, told.text("status.0.message").unwrap().to_owned())
         };
         assert_eq!(judge(State::Streaming, 0), (0, "streaming".to_owned()));
@@ -126,7 +126,7 @@ mod tests {
         assert_eq!(judge(State::Probing, 0), (1, "probing".to_owned()));
         assert_eq!(judge(State::Silent, 0), (2, "silent".to_owned()));
         assert_eq!(judge(State::Absent, 0), (2, "absent".to_owned()));
-        let told = told(Some(&status), Some(250_000_000));
+        let told = diagnosis_of(Some(&status), Some(250_000_000));
         assert_eq!(
             (told.number("header.stamp.sec"), told.number("header.stamp.nanosec")),
             (Some(9.0), Some(1.0))
@@ -147,7 +147,7 @@ mod tests {
 
     #[test]
     fn without_a_hub_nothing_is_known() {
-        let told = told(None, None);
+        let told = diagnosis_of(None, None);
         assert_eq!(
             (told.number("status.0.level"), told.text("status.0.message")),
             (Some(3.0), Some("no hub"))

@@ -22,8 +22,8 @@ pub fn zone_markers(message: &mut Vec<u8>, header: &Header, zones: &Zones) {
         let shape = Shape {
             namespace: "zones",
             id: index as u32,
-            position: [0.0, 0.0, DISC * index as f64],
-            scale: [diameter, diameter, DISC],
+            position: [0.0, 0.0, DISC_HEIGHT_M * index as f64],
+            scale: [diameter, diameter, DISC_HEIGHT_M],
             color,
             ..Shape::new(header, BASE_FRAME)
         };
@@ -40,7 +40,7 @@ pub fn mark_markers(message: &mut Vec<u8>, frame: &str, header: &Header, marks: 
         namespace: "marks",
         kind: SPHERE_LIST,
         action: if marks.marks().is_empty() { DELETE } else { ADD },
-        scale: [SPHERE; 3],
+        scale: [MARK_DIAMETER_M; 3],
         color: YELLOW,
         ..Shape::new(header, frame)
     };
@@ -56,25 +56,25 @@ pub fn mark_markers(message: &mut Vec<u8>, frame: &str, header: &Header, marks: 
 /// message.
 pub fn people_markers(message: &mut Vec<u8>, frame: &str, header: &Header, tracks: &Tracks) {
     let mut cdr = Cdr::begin(message);
-    cdr.u32(2 * known(tracks).count() as u32);
-    for track in known(tracks) {
+    cdr.u32(2 * established_tracks(tracks).count() as u32);
+    for track in established_tracks(tracks) {
         let id = track.id.to_string();
         let at = |z: f64| [track.x_m.into(), track.y_m.into(), z];
         let column = Shape {
             namespace: "people",
             // The ID of a marker is an int32.
             id: (track.id & 0x7FFF_FFFF) as u32,
-            position: at(PERSON / 2.0),
-            scale: [SHOULDERS, SHOULDERS, PERSON],
+            position: at(PERSON_HEIGHT_M / 2.0),
+            scale: [PERSON_DIAMETER_M, PERSON_DIAMETER_M, PERSON_HEIGHT_M],
             color: if track.state() == TrackState::Confirmed { BLUE } else { GRAY },
             ..Shape::new(header, frame)
         };
         column.write(&mut cdr, [].into_iter());
         let label = Shape {
             namespace: "numbers",
-            kind: TEXT,
-            position: at(PERSON + LETTERS),
-            scale: [0.0, 0.0, LETTERS],
+            kind: TEXT_VIEW_FACING,
+            position: at(PERSON_HEIGHT_M + LABEL_HEIGHT_M),
+            scale: [0.0, 0.0, LABEL_HEIGHT_M],
             color: WHITE,
             text: &id,
             ..column
@@ -88,17 +88,17 @@ pub fn people_markers(message: &mut Vec<u8>, frame: &str, header: &Header, track
 pub fn people_poses(message: &mut Vec<u8>, frame: &str, header: &Header, tracks: &Tracks) {
     let mut cdr = Cdr::begin(message);
     cdr.header(header.wall_ns, frame);
-    cdr.u32(known(tracks).count() as u32);
-    for track in known(tracks) {
+    cdr.u32(established_tracks(tracks).count() as u32);
+    for track in established_tracks(tracks) {
         let [x, y, vx, vy] = [track.x_m, track.y_m, track.vx_m_s, track.vy_m_s].map(f64::from);
-        let walks = vx.hypot(vy) >= WALKING_M_S;
+        let walks = vx.hypot(vy) >= MIN_WALKING_SPEED_M_S;
         let (sin, cos) = if walks { (vy.atan2(vx) / 2.0).sin_cos() } else { (0.0, 1.0) };
         [x, y, 0.0, 0.0, 0.0, sin, cos].into_iter().for_each(|value| cdr.f64(value));
     }
 }
 
 /// Returns the tracks that are not tentative.
-fn known(tracks: &Tracks) -> impl Iterator<Item = &Track> {
+fn established_tracks(tracks: &Tracks) -> impl Iterator<Item = &Track> {
     tracks.tracks().iter().filter(|track| track.state() != TrackState::Tentative)
 }
 
@@ -114,7 +114,7 @@ struct Shape<'a> {
     position: [f64; 3],
     scale: [f64; 3],
     color: [f32; 4],
-    /// Text of a shape of kind [`TEXT`].
+    /// Text of a shape of kind [`TEXT_VIEW_FACING`].
     text: &'a str,
 }
 
@@ -165,17 +165,17 @@ impl<'a> Shape<'a> {
 
 const CYLINDER: u32 = 3;
 const SPHERE_LIST: u32 = 7;
-const TEXT: u32 = 9;
+const TEXT_VIEW_FACING: u32 = 9;
 const ADD: u32 = 0;
 const DELETE: u32 = 2;
 /// Height of a disc in meters.
-const DISC: f64 = 0.01;
+const DISC_HEIGHT_M: f64 = 0.01;
 /// Diameter of a mark in meters.
-const SPHERE: f64 = 0.1;
+const MARK_DIAMETER_M: f64 = 0.1;
 /// Height and diameter of a person, and height of the ID above, in meters.
-const PERSON: f64 = 1.7;
-const SHOULDERS: f64 = 0.4;
-const LETTERS: f64 = 0.3;
+const PERSON_HEIGHT_M: f64 = 1.7;
+const PERSON_DIAMETER_M: f64 = 0.4;
+const LABEL_HEIGHT_M: f64 = 0.3;
 const BLUE: [f32; 4] = [0.1, 0.4, 0.9, 0.8];
 const WHITE: [f32; 4] = [1.0; 4];
 const GREEN: [f32; 4] = [0.1, 0.7, 0.2, 0.25];
@@ -183,7 +183,7 @@ const RED: [f32; 4] = [0.9, 0.1, 0.1, 0.4];
 const GRAY: [f32; 4] = [0.5, 0.5, 0.5, 0.25];
 const YELLOW: [f32; 4] = [1.0, 0.8, 0.0, 1.0];
 /// Minimum speed of a person who walks.
-const WALKING_M_S: f64 = 0.2;
+const MIN_WALKING_SPEED_M_S: f64 = 0.2;
 
 #[cfg(test)]
 mod tests {
@@ -206,11 +206,11 @@ mod tests {
             zone_markers(&mut message, &header(), zones);
             read(&MARKER_ARRAY, &message).unwrap()
         };
-        let told = drawn(&zones);
-        assert_eq!(told.sequence("markers").map(<[Value]>::len), Some(2));
+        let decoded = drawn(&zones);
+        assert_eq!(decoded.sequence("markers").map(<[Value]>::len), Some(2));
         for (place, across, red) in [(0, 3.0, 0.9_f32), (1, 1.0, 0.1)] {
-            let number = |path: &str| told.number(&format!("markers.{place}.{path}"));
-            assert_eq!(told.text(&format!("markers.{place}.header.frame_id")), Some("base_link"));
+            let number = |path: &str| decoded.number(&format!("markers.{place}.{path}"));
+            assert_eq!(decoded.text(&format!("markers.{place}.header.frame_id")), Some("base_link"));
             assert_eq!((number("header.stamp.sec"), number("header.stamp.nanosec")), (Some(3.0), Some(5.0)));
             assert_eq!(
                 (number("id"), number("type"), number("action")),
@@ -221,10 +221,10 @@ mod tests {
             assert_eq!(number("color.r"), Some(red.into()));
         }
         zones.verdict = Verdict::Unknown as u8;
-        let told = drawn(&zones);
+        let decoded = drawn(&zones);
         let gray = f64::from(GRAY[0]);
         assert_eq!(
-            (told.number("markers.0.color.r"), told.number("markers.1.color.r")),
+            (decoded.number("markers.0.color.r"), decoded.number("markers.1.color.r")),
             (Some(RED[0].into()), Some(gray))
         );
     }
@@ -239,17 +239,20 @@ mod tests {
         let mut marks = Marks { count: 2, ..Marks::default() };
         marks.mark_array[0] = Mark { angle_mdeg: 0, range_dmm: 20_000, ..Mark::default() };
         marks.mark_array[1] = Mark { angle_mdeg: 90_000, range_dmm: 15_000, ..Mark::default() };
-        let told = drawn(&marks);
-        assert_eq!((told.number("markers.0.type"), told.number("markers.0.action")), (Some(7.0), Some(0.0)));
-        assert_eq!(told.text("markers.0.header.frame_id"), Some("rear"));
-        assert_eq!(told.sequence("markers.0.points").map(<[Value]>::len), Some(2));
+        let decoded = drawn(&marks);
         assert_eq!(
-            (told.number("markers.0.points.0.x"), told.number("markers.0.points.0.y")),
+            (decoded.number("markers.0.type"), decoded.number("markers.0.action")),
+            (Some(7.0), Some(0.0))
+        );
+        assert_eq!(decoded.text("markers.0.header.frame_id"), Some("rear"));
+        assert_eq!(decoded.sequence("markers.0.points").map(<[Value]>::len), Some(2));
+        assert_eq!(
+            (decoded.number("markers.0.points.0.x"), decoded.number("markers.0.points.0.y")),
             (Some(2.0), Some(0.0))
         );
-        assert_eq!(told.number("markers.0.points.1.y"), Some(1.5));
-        let told = drawn(&Marks::default());
-        assert_eq!(told.number("markers.0.action"), Some(2.0));
+        assert_eq!(decoded.number("markers.0.points.1.y"), Some(1.5));
+        let decoded = drawn(&Marks::default());
+        assert_eq!(decoded.number("markers.0.action"), Some(2.0));
     }
 
     #[test]
@@ -260,40 +263,40 @@ mod tests {
         }
         let mut message = Vec::new();
         people_markers(&mut message, "house", &header(), &tracks);
-        let told = read(&MARKER_ARRAY, &message).unwrap();
-        assert_eq!(told.sequence("markers").map(<[Value]>::len), Some(4), "nobody who is tentative");
+        let decoded = read(&MARKER_ARRAY, &message).unwrap();
+        assert_eq!(decoded.sequence("markers").map(<[Value]>::len), Some(4), "nobody who is tentative");
         for (place, id, kind, text) in
             [(0, 5.0, 3.0, ""), (1, 5.0, 9.0, "5"), (2, 7.0, 3.0, ""), (3, 7.0, 9.0, "7")]
         {
-            let number = |path: &str| told.number(&format!("markers.{place}.{path}"));
+            let number = |path: &str| decoded.number(&format!("markers.{place}.{path}"));
             assert_eq!((number("id"), number("type"), number("action")), (Some(id), Some(kind), Some(0.0)));
             assert_eq!((number("pose.position.x"), number("pose.position.y")), (Some(id), Some(-1.0)));
-            assert_eq!(told.text(&format!("markers.{place}.text")), Some(text));
-            assert_eq!(told.text(&format!("markers.{place}.header.frame_id")), Some("house"));
+            assert_eq!(decoded.text(&format!("markers.{place}.text")), Some(text));
+            assert_eq!(decoded.text(&format!("markers.{place}.header.frame_id")), Some("house"));
         }
     }
 
     #[test]
-    fn poses_of_people_have_the_direction_in_which_they_walk() {
+    fn poses_of_people_face_their_walking_direction() {
         let mut tracks = Tracks::default();
         for (state, vy_m_s) in [(1, 1.0), (0, 1.0), (2, 0.1)] {
             tracks.push(Track { x_m: 2.0, y_m: -0.5, vy_m_s, state, ..Track::default() });
         }
         let mut message = Vec::new();
         people_poses(&mut message, "house", &header(), &tracks);
-        let told = read(&POSE_ARRAY, &message).unwrap();
-        assert_eq!(told.sequence("poses").map(<[Value]>::len), Some(2), "nobody who is tentative");
-        assert_eq!(told.text("header.frame_id"), Some("house"));
+        let decoded = read(&POSE_ARRAY, &message).unwrap();
+        assert_eq!(decoded.sequence("poses").map(<[Value]>::len), Some(2), "nobody who is tentative");
+        assert_eq!(decoded.text("header.frame_id"), Some("house"));
         assert_eq!(
-            (told.number("poses.0.position.x"), told.number("poses.0.position.y")),
+            (decoded.number("poses.0.position.x"), decoded.number("poses.0.position.y")),
             (Some(2.0), Some(-0.5))
         );
         // A quarter turn to the left.
         let half = std::f64::consts::FRAC_1_SQRT_2;
         for axis in ["z", "w"] {
-            let value = told.number(&format!("poses.0.orientation.{axis}")).unwrap();
+            let value = decoded.number(&format!("poses.0.orientation.{axis}")).unwrap();
             assert!((value - half).abs() < 1e-12, "{axis}: {value}");
         }
-        assert_eq!(told.number("poses.1.orientation.w"), Some(1.0));
+        assert_eq!(decoded.number("poses.1.orientation.w"), Some(1.0));
     }
 }

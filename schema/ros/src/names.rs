@@ -18,14 +18,14 @@ pub fn frame(sensor: &str) -> &str {
     sensor
 }
 
-/// Returns the topic of `sensor`'s scans, with the default [`Names`]. A remote sensor has its own namespace.
+/// Returns the topic of `sensor`'s scans, with the default [`RosNames`]. A remote sensor has its own namespace.
 pub fn scan_topic(sensor: &str) -> String {
-    Names::default().topic(sensor, "scan")
+    RosNames::default().topic(sensor, "scan")
 }
 
 /// Names of topics and frames.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Names {
+pub struct RosNames {
     /// Start of every topic: empty, or names that each follow a slash.
     namespace: String,
     /// The part between the namespace and the topics of sensors, in the same form.
@@ -34,19 +34,21 @@ pub struct Names {
     frames: Vec<(String, String)>,
 }
 
-impl Names {
+impl RosNames {
     /// Creates names with `namespace` at the start of every topic, `prefix` after it in topics of sensors, and a frame
     /// for each sensor in `frames`. The slash before the first name is optional.
     ///
     /// # Errors
     ///
     /// Returns the name that is not valid in ROS (<https://design.ros2.org/articles/topic_and_service_names.html>).
-    pub fn new(namespace: &str, prefix: &str, frames: Vec<(String, String)>) -> Result<Names, String> {
-        if let Some((_, bad)) = frames.iter().find(|(_, frame)| frame.is_empty() || words(frame).is_none()) {
-            return Err(bad.clone());
+    pub fn new(namespace: &str, prefix: &str, frames: Vec<(String, String)>) -> Result<RosNames, String> {
+        if let Some((_, invalid)) =
+            frames.iter().find(|(_, frame)| frame.is_empty() || to_path(frame).is_none())
+        {
+            return Err(invalid.clone());
         }
-        let path = |text: &str| words(text).ok_or_else(|| text.to_owned());
-        Ok(Names { namespace: path(namespace)?, prefix: path(prefix)?, frames })
+        let path = |text: &str| to_path(text).ok_or_else(|| text.to_owned());
+        Ok(RosNames { namespace: path(namespace)?, prefix: path(prefix)?, frames })
     }
 
     /// Returns the namespace: empty, or names that each follow a slash.
@@ -55,7 +57,7 @@ impl Names {
     }
 
     /// Returns the topic `word` of `sensor`. Its names have letters, digits and `_`, and do not start with a digit.
-    pub fn topic(&self, sensor: &str, word: &str) -> String {
+    pub fn topic(&self, sensor: &str, name: &str) -> String {
         let mut topic = [self.namespace(), &self.prefix].concat();
         for part in sensor.split('.') {
             topic.push('/');
@@ -64,22 +66,25 @@ impl Names {
             }
             topic.extend(part.chars().map(|sign| if sign.is_ascii_alphanumeric() { sign } else { '_' }));
         }
-        topic + "/" + word
+        topic + "/" + name
     }
 
     /// Returns the topic `name`, such as [`TF_STATIC`], in the namespace.
-    pub fn shared(&self, name: &str) -> String {
+    pub fn global_topic(&self, name: &str) -> String {
         [self.namespace(), name].concat()
     }
 
     /// Returns the sensors that were given a frame.
-    pub fn framed(&self) -> impl Iterator<Item = &str> {
+    pub fn sensors_with_frame(&self) -> impl Iterator<Item = &str> {
         self.frames.iter().map(|(sensor, _)| &**sensor)
     }
 
     /// Returns the frame in which `sensor` measures.
     pub fn frame<'a>(&'a self, sensor: &'a str) -> &'a str {
-        self.frames.iter().find(|(of, _)| of == sensor).map_or(frame(sensor), |(_, frame)| frame)
+        self.frames
+            .iter()
+            .find(|(known_sensor, _)| known_sensor == sensor)
+            .map_or(frame(sensor), |(_, frame)| frame)
     }
 }
 
@@ -107,7 +112,7 @@ fn rotation(pose: &Pose) -> [f64; 4] {
 }
 
 /// Returns `text` with a slash before each of its names; `None` if one of them is not valid in ROS.
-fn words(text: &str) -> Option<String> {
+fn to_path(text: &str) -> Option<String> {
     let text = text.strip_prefix('/').unwrap_or(text);
     if text.is_empty() {
         return Some(String::new());
@@ -133,16 +138,16 @@ mod tests {
     #[test]
     fn names_stand_in_namespaces() {
         let frames = vec![("front".to_owned(), "laser".to_owned())];
-        let names = Names::new("robot1/base", "/lidars", frames).unwrap();
+        let names = RosNames::new("robot1/base", "/lidars", frames).unwrap();
         assert_eq!(names.topic("front", "zones"), "/robot1/base/lidars/front/zones");
-        assert_eq!(names.shared(TF_STATIC), "/robot1/base/tf_static");
+        assert_eq!(names.global_topic(TF_STATIC), "/robot1/base/tf_static");
         assert_eq!((names.frame("front"), names.frame("rear")), ("laser", "rear"));
-        assert_eq!(Names::new("", "/", Vec::new()), Ok(Names::default()));
-        assert!(Names::new("", "", vec![("front".to_owned(), String::new())]).is_err());
+        assert_eq!(RosNames::new("", "/", Vec::new()), Ok(RosNames::default()));
+        assert!(RosNames::new("", "", vec![("front".to_owned(), String::new())]).is_err());
         for bad in ["robot 1", "1st", "a//b", "a/", "a-b", "//a"] {
-            assert_eq!(Names::new(bad, "", Vec::new()), Err(bad.to_owned()));
-            assert_eq!(Names::new("", bad, Vec::new()), Err(bad.to_owned()));
-            assert!(Names::new("", "", vec![("front".to_owned(), bad.to_owned())]).is_err());
+            assert_eq!(RosNames::new(bad, "", Vec::new()), Err(bad.to_owned()));
+            assert_eq!(RosNames::new("", bad, Vec::new()), Err(bad.to_owned()));
+            assert!(RosNames::new("", "", vec![("front".to_owned(), bad.to_owned())]).is_err());
         }
     }
 

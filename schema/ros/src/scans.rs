@@ -88,8 +88,8 @@ pub fn scan_cloud(message: &mut Vec<u8>, frame: &str, header: &Header, scan: &Sc
     let points = || (0..scan.beams()).filter_map(|i| Some((i, scan.distance_m(i)?)));
     let width = points().count();
     let intensities = scan.intensities();
-    let point = OF_SCANS.len() as u32 * 4;
-    let mut cdr = begin(message, stamp_ns(header, scan), frame, &OF_SCANS, (point, width));
+    let point_len = SCAN_FIELDS.len() as u32 * 4;
+    let mut cdr = begin(message, stamp_ns(header, scan), frame, &SCAN_FIELDS, (point_len, width));
     for (i, meters) in points() {
         let (sin, cos) = scan.angle(i).sin_cos();
         let intensity = intensities.get(i).map_or(0.0, f64::from);
@@ -114,7 +114,7 @@ pub fn foreground_cloud(
         foreground.readings().filter(is_point)
     };
     let width = points().count();
-    let mut cdr = begin(message, stamp_ns(header, scan), frame, &AXES, (POINT, width));
+    let mut cdr = begin(message, stamp_ns(header, scan), frame, &AXIS_FIELDS, (POINT_LEN, width));
     for (i, range) in points() {
         let meters = f64::from(range) * f64::from(foreground.unit_um) / 1e6;
         let (sin, cos) = scan.angle(i).sin_cos();
@@ -130,8 +130,8 @@ pub fn foreground_cloud(
 /// (its number in the scan, 16 bits) and class (8 bits: 0 unknown, 1 background, 2 foreground, 3 behind the background). The
 /// stamp is that of `header`, which belongs to the last point.
 pub fn sweep_cloud(message: &mut Vec<u8>, header: &Header, points: &[CloudPoint]) {
-    let point = size_of::<CloudPoint>() as u32;
-    let mut cdr = begin(message, header.wall_ns, BASE_FRAME, &OF_SWEEPS, (point, points.len()));
+    let point_len = size_of::<CloudPoint>() as u32;
+    let mut cdr = begin(message, header.wall_ns, BASE_FRAME, &SWEEP_FIELDS, (point_len, points.len()));
     for CloudPoint { at, beam, point_class, .. } in points {
         cdr.bytes(at.map(f32::to_le_bytes).as_flattened());
         cdr.bytes(&beam.to_le_bytes());
@@ -168,14 +168,15 @@ fn begin<'a>(
     cdr
 }
 
-const AXES: [(&str, u32, u8); 3] = [("x", 0, FLOAT32), ("y", 4, FLOAT32), ("z", 8, FLOAT32)];
-const OF_SCANS: [(&str, u32, u8); 4] = [AXES[0], AXES[1], AXES[2], ("intensity", 12, FLOAT32)];
+const AXIS_FIELDS: [(&str, u32, u8); 3] = [("x", 0, FLOAT32), ("y", 4, FLOAT32), ("z", 8, FLOAT32)];
+const SCAN_FIELDS: [(&str, u32, u8); 4] =
+    [AXIS_FIELDS[0], AXIS_FIELDS[1], AXIS_FIELDS[2], ("intensity", 12, FLOAT32)];
 /// Size of a foreground point in bytes.
-const POINT: u32 = 12;
-const OF_SWEEPS: [(&str, u32, u8); 5] = [
-    AXES[0],
-    AXES[1],
-    AXES[2],
+const POINT_LEN: u32 = 12;
+const SWEEP_FIELDS: [(&str, u32, u8); 5] = [
+    AXIS_FIELDS[0],
+    AXIS_FIELDS[1],
+    AXIS_FIELDS[2],
     ("beam", offset_of!(CloudPoint, beam) as u32, UINT16),
     ("class", offset_of!(CloudPoint, point_class) as u32, UINT8),
 ];
@@ -196,7 +197,7 @@ mod tests {
     }
 
     /// The numbers behind a frame of four letters, whose end makes three bytes of padding.
-    fn numbers(message: &[u8]) -> Vec<f32> {
+    fn read_floats(message: &[u8]) -> Vec<f32> {
         let body = &message[4..];
         assert_eq!(body[8..20], [5, 0, 0, 0, b'r', b'e', b'a', b'r', 0, 0, 0, 0]);
         body[20..].chunks_exact(4).map(|four| f32::from_le_bytes(four.try_into().unwrap())).collect()
@@ -215,46 +216,48 @@ mod tests {
         let nanosec = 1_000_000_000 - 5 * 37_000;
         assert_eq!(message[4..8], 1_700_000_000_i32.to_le_bytes());
         assert_eq!(message[8..12], (nanosec as u32).to_le_bytes());
-        let told = numbers(&message);
+        let values = read_floats(&message);
         let near = |a: f32, b: f32| (a - b).abs() < 1e-6;
-        assert!(near(told[0], -std::f32::consts::FRAC_PI_2) && near(told[1], 5_f32.to_radians() + told[0]));
-        assert!(near(told[2], 1_f32.to_radians()) && near(told[3], 37e-6) && near(told[4], 0.01332));
+        assert!(
+            near(values[0], -std::f32::consts::FRAC_PI_2) && near(values[1], 5_f32.to_radians() + values[0])
+        );
+        assert!(near(values[2], 1_f32.to_radians()) && near(values[3], 37e-6) && near(values[4], 0.01332));
         // The maximum range is within the limit of the message.
-        assert_eq!((told[5], told[6], told[13]), (0.01, 81.82, 81.82));
-        assert_eq!(told[7].to_bits(), 6);
+        assert_eq!((values[5], values[6], values[13]), (0.01, 81.82, 81.82));
+        assert_eq!(values[7].to_bits(), 6);
         assert_eq!(
-            (told[8], told[9], told[10], told[12]),
+            (values[8], values[9], values[10], values[12]),
             (1.0, f32::INFINITY, f32::INFINITY, f32::NEG_INFINITY)
         );
-        assert!(told[11].is_nan());
-        assert_eq!(told[14].to_bits(), 6);
-        assert_eq!(told[15..], [0.0, 7.0, 0.0, 0.0, 0.0, 0.0]);
+        assert!(values[11].is_nan());
+        assert_eq!(values[14].to_bits(), 6);
+        assert_eq!(values[15..], [0.0, 7.0, 0.0, 0.0, 0.0, 0.0]);
     }
 
     #[test]
-    fn beams_of_several_turns_have_no_one_time_between_them() {
+    fn scan_of_several_revolutions_has_no_time_increment() {
         let mut message = Vec::new();
         let between = scan(&[100; 9], 500);
         laser_scan(&mut message, "rear", &Header { wall_ns: 1 << 60, ..Header::default() }, &between);
-        let told = numbers(&message);
-        assert_eq!((told[3], told[7].to_bits(), told[17].to_bits(), told.len()), (0.0, 9, 0, 18));
+        let values = read_floats(&message);
+        assert_eq!((values[3], values[7].to_bits(), values[17].to_bits(), values.len()), (0.0, 9, 0, 18));
     }
 
     #[test]
-    fn angles_ascend_also_of_a_scanner_that_turns_clockwise() {
-        let mut head = ScanHead::turning(Family::Ld, 4);
+    fn angles_of_a_clockwise_scanner_ascend() {
+        let mut head = ScanHead::of_revolution(Family::Ld, 4);
         (head.beam_time_ns, head.first_beam_ns) = (25_000_000, 0);
         let mut it = Scan::of(head, &[1000, 2000, 3000, 4000]);
         it.arrays().upper.copy_from_slice(&[1, 2, 3, 4]);
         let mut message = Vec::new();
         laser_scan(&mut message, "rear", &Header { wall_ns: 5_000_000_000, ..Header::default() }, &it);
-        let told = numbers(&message);
+        let values = read_floats(&message);
         let quarter = std::f32::consts::FRAC_PI_2;
         // The grid begins ahead and turns to the right; its last beam looks left and was measured 75 ms after the first.
         assert_eq!(message[4..12], [5, 0, 0, 0, 0xC0, 0x68, 0x78, 0x04]);
-        assert_eq!(told[..5], [-3.0 * quarter, 0.0, quarter, -0.025, 0.1]);
-        assert_eq!(told[8..12], [4.0, 3.0, 2.0, 1.0]);
-        assert_eq!(told[13..], [4.0, 3.0, 2.0, 1.0]);
+        assert_eq!(values[..5], [-3.0 * quarter, 0.0, quarter, -0.025, 0.1]);
+        assert_eq!(values[8..12], [4.0, 3.0, 2.0, 1.0]);
+        assert_eq!(values[13..], [4.0, 3.0, 2.0, 1.0]);
     }
 
     #[test]
@@ -268,19 +271,19 @@ mod tests {
         let header = Header { wall_ns: 7_000_000_000, ..Header::default() };
         let mut message = Vec::new();
         foreground_cloud(&mut message, "front", &header, &scan, &foreground);
-        let told = read(&POINT_CLOUD, &message).unwrap();
+        let decoded = read(&POINT_CLOUD, &message).unwrap();
         // The second of them, ahead and too near, is no point.
         let wanted =
             [[0.0, -1.0], [2.0 * 1_f64.to_radians().cos(), 2.0 * 1_f64.to_radians().sin()], [0.0, 3.0]];
-        assert_eq!((told.number("height"), told.number("width")), (Some(1.0), Some(3.0)));
-        assert_eq!((told.number("point_step"), told.number("row_step")), (Some(12.0), Some(36.0)));
-        assert_eq!((told.text("header.frame_id"), told.number("is_dense")), (Some("front"), Some(1.0)));
+        assert_eq!((decoded.number("height"), decoded.number("width")), (Some(1.0), Some(3.0)));
+        assert_eq!((decoded.number("point_step"), decoded.number("row_step")), (Some(12.0), Some(36.0)));
+        assert_eq!((decoded.text("header.frame_id"), decoded.number("is_dense")), (Some("front"), Some(1.0)));
         for (axis, name) in ["x", "y", "z"].into_iter().enumerate() {
-            assert_eq!(told.text(&format!("fields.{axis}.name")), Some(name));
-            assert_eq!(told.number(&format!("fields.{axis}.offset")), Some(4.0 * axis as f64));
-            assert_eq!(told.number(&format!("fields.{axis}.datatype")), Some(7.0));
+            assert_eq!(decoded.text(&format!("fields.{axis}.name")), Some(name));
+            assert_eq!(decoded.number(&format!("fields.{axis}.offset")), Some(4.0 * axis as f64));
+            assert_eq!(decoded.number(&format!("fields.{axis}.datatype")), Some(7.0));
         }
-        let data: Vec<u8> = (0..36).map(|i| told.number(&format!("data.{i}")).unwrap() as u8).collect();
+        let data: Vec<u8> = (0..36).map(|i| decoded.number(&format!("data.{i}")).unwrap() as u8).collect();
         for (point, [x, y]) in data.as_chunks::<12>().0.iter().zip(wanted) {
             let [got_x, got_y, got_z] =
                 std::array::from_fn(|axis| f32::from_le_bytes(point.as_chunks().0[axis]));
@@ -291,8 +294,8 @@ mod tests {
             assert_eq!(got_z, 0.0);
         }
         // As late as the scan's first beam.
-        let nanoseconds =
-            1e9 * told.number("header.stamp.sec").unwrap() + told.number("header.stamp.nanosec").unwrap();
+        let nanoseconds = 1e9 * decoded.number("header.stamp.sec").unwrap()
+            + decoded.number("header.stamp.nanosec").unwrap();
         assert_eq!(nanoseconds, (7_000_000_000 + scan.beam_ns(0)) as f64);
     }
 
@@ -324,21 +327,21 @@ mod tests {
         let header = Header { wall_ns: 7_000_000_009, ..Header::default() };
         let mut message = Vec::new();
         sweep_cloud(&mut message, &header, &[CloudPoint::default(), point]);
-        let told = read(&POINT_CLOUD, &message).unwrap();
-        assert_eq!((told.number("width"), told.number("row_step")), (Some(2.0), Some(32.0)));
+        let decoded = read(&POINT_CLOUD, &message).unwrap();
+        assert_eq!((decoded.number("width"), decoded.number("row_step")), (Some(2.0), Some(32.0)));
         assert_eq!(
-            (told.text("header.frame_id"), told.number("point_step")),
+            (decoded.text("header.frame_id"), decoded.number("point_step")),
             (Some("base_link"), Some(16.0))
         );
-        assert_eq!(told.number("header.stamp.nanosec"), Some(9.0));
+        assert_eq!(decoded.number("header.stamp.nanosec"), Some(9.0));
         let fields = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("beam", 12, 4), ("class", 14, 2)];
         for (i, (name, offset, kind)) in fields.into_iter().enumerate() {
-            assert_eq!(told.text(&format!("fields.{i}.name")), Some(name));
-            assert_eq!(told.number(&format!("fields.{i}.offset")), Some(offset.into()));
-            assert_eq!(told.number(&format!("fields.{i}.datatype")), Some(kind.into()));
+            assert_eq!(decoded.text(&format!("fields.{i}.name")), Some(name));
+            assert_eq!(decoded.number(&format!("fields.{i}.offset")), Some(offset.into()));
+            assert_eq!(decoded.number(&format!("fields.{i}.datatype")), Some(kind.into()));
         }
-        let data: Vec<u8> = (16..32).map(|i| told.number(&format!("data.{i}")).unwrap() as u8).collect();
+        let data: Vec<u8> = (16..32).map(|i| decoded.number(&format!("data.{i}")).unwrap() as u8).collect();
         assert_eq!(data, [0, 0, 0xC0, 0x3F, 0, 0, 0, 0xC0, 0, 0, 0x80, 0x3E, 44, 1, 2, 0]);
-        assert_eq!(told.number("is_dense"), Some(1.0));
+        assert_eq!(decoded.number("is_dense"), Some(1.0));
     }
 }

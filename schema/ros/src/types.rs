@@ -21,16 +21,19 @@ impl Type {
     /// Language of [`Type::text`].
     pub const LANGUAGE: &str = "ros2msg";
     /// Separator between two types in [`Type::text`].
-    const LINE: &str =
+    const SEPARATOR: &str =
         "================================================================================\nMSG: ";
 
     /// Returns the type's hash: SHA-256 of its description in JSON (REP 2016, `rosidl`), such as `RIHS01_64c1..`, with
     /// 64 hex digits after the version.
     pub fn hash(&self) -> String {
-        Sha256::digest(description(&Layout::of(self))).iter().fold(PREFIX.to_owned(), |mut hash, byte| {
-            let _ = write!(hash, "{byte:02x}");
-            hash
-        })
+        Sha256::digest(description(&MessageDef::of(self))).iter().fold(
+            HASH_VERSION.to_owned(),
+            |mut hash, byte| {
+                let _ = write!(hash, "{byte:02x}");
+                hash
+            },
+        )
     }
 }
 
@@ -151,7 +154,7 @@ pub const TF_MESSAGE: Type = Type {
 
 /// A parsed definition: a type and those that it contains.
 #[derive(Clone, Debug)]
-pub(crate) struct Layout<'a> {
+pub(crate) struct MessageDef<'a> {
     /// Types by name, first the type itself. The names of the others have no `msg`, such as `std_msgs/Header`.
     types: Vec<(&'a str, Vec<Field<'a>>)>,
 }
@@ -161,43 +164,46 @@ pub(crate) struct Layout<'a> {
 pub(crate) struct Field<'a> {
     pub(crate) name: &'a str,
     /// Name of a primitive type or of a contained type.
-    pub(crate) of: &'a str,
+    pub(crate) type_name: &'a str,
     /// Whether it is a sequence of any length.
     pub(crate) is_sequence: bool,
 }
 
-impl<'a> Layout<'a> {
+impl<'a> MessageDef<'a> {
     /// Parses the definition of `of`. The names of contained types must include the package.
-    pub(crate) fn of(of: &'a Type) -> Layout<'a> {
-        let types = of.text.split(Type::LINE).enumerate().map(|(place, text)| {
-            let (name, fields) =
-                if place == 0 { (of.name, text) } else { text.split_once('\n').unwrap_or((text, "")) };
+    pub(crate) fn of(message_type: &'a Type) -> MessageDef<'a> {
+        let types = message_type.text.split(Type::SEPARATOR).enumerate().map(|(index, text)| {
+            let (name, fields) = if index == 0 {
+                (message_type.name, text)
+            } else {
+                text.split_once('\n').unwrap_or((text, ""))
+            };
             (name, fields.lines().filter_map(field).collect())
         });
-        Layout { types: types.collect() }
+        MessageDef { types: types.collect() }
     }
 
     /// Returns the fields of the type `name`; `None` for a primitive type.
     pub(crate) fn fields(&self, name: &str) -> Option<&[Field<'a>]> {
-        self.types.iter().find(|(of, _)| *of == name).map(|(_, fields)| &fields[..])
+        self.types.iter().find(|(type_name, _)| *type_name == name).map(|(_, fields)| &fields[..])
     }
 }
 
 /// Parses a line: type, name, and perhaps a default, which is not part of messages.
 fn field(line: &str) -> Option<Field<'_>> {
     let mut words = line.split_whitespace();
-    let (of, name) = (words.next()?, words.next()?);
-    let single = of.strip_suffix("[]");
-    Some(Field { name, of: single.unwrap_or(of), is_sequence: single.is_some() })
+    let (type_name, name) = (words.next()?, words.next()?);
+    let element_type = type_name.strip_suffix("[]");
+    Some(Field { name, type_name: element_type.unwrap_or(type_name), is_sequence: element_type.is_some() })
 }
 
 /// Returns the description of the type and of those that it contains, sorted by name. The spaces are part of the hash.
-fn description(layout: &Layout<'_>) -> String {
+fn description(layout: &MessageDef<'_>) -> String {
     let mut types: Vec<String> =
         layout.types.iter().map(|(name, fields)| type_description(name, fields)).collect();
-    let itself = types.remove(0);
+    let main_type = types.remove(0);
     types.sort_unstable();
-    format!(r#"{{"type_description": {itself}, "referenced_type_descriptions": [{}]}}"#, types.join(", "))
+    format!(r#"{{"type_description": {main_type}, "referenced_type_descriptions": [{}]}}"#, types.join(", "))
 }
 
 fn type_description(name: &str, fields: &[Field<'_>]) -> String {
@@ -206,11 +212,11 @@ fn type_description(name: &str, fields: &[Field<'_>]) -> String {
 }
 
 fn field_description(field: &Field<'_>) -> String {
-    let (number, nested) = match number(field.of) {
+    let (number, nested) = match primitive_type_id(field.type_name) {
         Some(number) => (number, String::new()),
-        None => (NESTED, full_name(field.of)),
+        None => (NESTED_TYPE_ID, full_name(field.type_name)),
     };
-    let number = if field.is_sequence { number + SEQUENCE } else { number };
+    let number = if field.is_sequence { number + SEQUENCE_OFFSET } else { number };
     format!(
         r#"{{"name": "{}", "type": {{"type_id": {number}, "capacity": 0, "string_capacity": 0, "nested_type_name": "{nested}"}}}}"#,
         field.name
@@ -226,8 +232,8 @@ fn full_name(name: &str) -> String {
 }
 
 /// Returns the number of a primitive type (`type_description_interfaces/msg/FieldType`).
-fn number(word: &str) -> Option<u8> {
-    let words = [
+fn primitive_type_id(type_name: &str) -> Option<u8> {
+    let types = [
         ("uint8", 3),
         ("int32", 6),
         ("uint32", 7),
@@ -237,15 +243,15 @@ fn number(word: &str) -> Option<u8> {
         ("byte", 16),
         ("string", 17),
     ];
-    words.into_iter().find(|(of, _)| *of == word).map(|(_, number)| number)
+    types.into_iter().find(|(of, _)| *of == type_name).map(|(_, number)| number)
 }
 
 /// Version of the hash.
-const PREFIX: &str = "RIHS01_";
+const HASH_VERSION: &str = "RIHS01_";
 /// Number of a type that has its own description.
-const NESTED: u8 = 1;
+const NESTED_TYPE_ID: u8 = 1;
 /// Offset of the number for a sequence of any length.
-const SEQUENCE: u8 = 144;
+const SEQUENCE_OFFSET: u8 = 144;
 
 #[cfg(test)]
 mod tests {
@@ -273,10 +279,10 @@ mod tests {
     #[test]
     fn every_contained_type_is_there_once() {
         for (of, _) in GOLDEN {
-            let layout = Layout::of(&of);
+            let layout = MessageDef::of(&of);
             let fields = layout.types.iter().flat_map(|(_, fields)| fields);
             let used: std::collections::BTreeSet<_> =
-                fields.map(|field| field.of).filter(|of| number(of).is_none()).collect();
+                fields.map(|field| field.type_name).filter(|of| primitive_type_id(of).is_none()).collect();
             let there: Vec<_> = layout.types.iter().skip(1).map(|(name, _)| *name).collect();
             assert_eq!(there.len(), used.len(), "{}", of.name);
             assert!(there.iter().all(|name| used.contains(name)), "{}: {there:?}", of.name);

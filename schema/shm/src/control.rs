@@ -14,8 +14,8 @@ use iceoryx2::service::port_factory::request_response;
 use scanhub_schema::{CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE, Failure, Kind, Request, Response, limits};
 
 use crate::processes::Node;
-use crate::service::{OpenFailure, create, full, name, no_port, open};
-use crate::shortage::{CONTROL_DESCRIPTORS, check_descriptors};
+use crate::resource_limits::{CONTROL_DESCRIPTORS, check_descriptors};
+use crate::service::{OpenFailure, clients_full, create, name, open, port_failure};
 use crate::wake::{Listener, Notifier, WakeService, create_listener, notifier, open_event, take_wakeups};
 
 /// The hub's end. Its listener [`requests`](Self::requests) is woken by each request.
@@ -24,11 +24,11 @@ pub struct ControlServer {
     requests: Listener,
     responses: Notifier,
     control: ControlService,
-    _bells: [WakeService; 2],
+    _events: [WakeService; 2],
 }
 
 /// A request that has no response yet. If it is dropped, it gets none.
-pub struct Asked(ActiveRequest<LocalService, [u8], (), [u8], ()>);
+pub struct IncomingRequest(ActiveRequest<LocalService, [u8], (), [u8], ()>);
 
 /// A client's end.
 pub struct ControlClient {
@@ -36,11 +36,11 @@ pub struct ControlClient {
     requests: Notifier,
     responses: Listener,
     _control: ControlService,
-    _bells: [WakeService; 2],
+    _events: [WakeService; 2],
 }
 
 /// A request that was sent. Dropping it cancels the request.
-pub struct Pending(PendingResponse<LocalService, [u8], (), [u8], ()>);
+pub struct SentRequest(PendingResponse<LocalService, [u8], (), [u8], ()>);
 
 type ControlService = request_response::PortFactory<LocalService, [u8], (), [u8], ()>;
 
@@ -49,16 +49,16 @@ impl ControlServer {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`] if memory or descriptors are short, or if another hub is its server, and
+    /// Returns [`Kind::ResourceExhausted`] if memory or descriptors are short, or if another hub is its server, and
     /// [`Kind::Incompatible`] if the service has another layout.
     pub fn create(node: &Node) -> Result<ControlServer, Failure> {
         let service = name(CONTROL)?;
         let control = create(node, &service, || {
             let builder = node.service_builder(&service).request_response::<[u8], [u8]>();
             builder
-                .max_servers(limits::PUBLISHERS)
-                .max_clients(limits::CONTROL_CLIENTS)
-                .max_nodes(limits::CONTROL_NODES)
+                .max_servers(limits::MAX_PUBLISHERS)
+                .max_clients(limits::MAX_CONTROL_CLIENTS)
+                .max_nodes(limits::MAX_CONTROL_NODES)
                 .max_active_requests_per_client(1)
                 .max_loaned_requests(1)
                 .max_response_buffer_size(1)
@@ -66,15 +66,16 @@ impl ControlServer {
                 .open_or_create()
                 .map_err(OpenFailure::from)
         })?;
-        let (asked, answered) = (bell(node, CONTROL_REQUEST)?, bell(node, CONTROL_RESPONSE)?);
+        let (request_event, response_event) =
+            (create_event(node, CONTROL_REQUEST)?, create_event(node, CONTROL_RESPONSE)?);
         let server = control
             .server_builder()
-            .initial_max_slice_len(Response::MAX)
+            .initial_max_slice_len(Response::MAX_LEN)
             .allocation_strategy(AllocationStrategy::PowerOfTwo)
             .create()
-            .map_err(|error| no_port(&service, &error))?;
-        let (requests, responses) = (create_listener(&asked)?, notifier(&answered, EVENT)?);
-        Ok(ControlServer { server, requests, responses, control, _bells: [asked, answered] })
+            .map_err(|error| port_failure(&service, &error))?;
+        let (requests, responses) = (create_listener(&request_event)?, notifier(&response_event, EVENT_ID)?);
+        Ok(ControlServer { server, requests, responses, control, _events: [request_event, response_event] })
     }
 
     /// Returns the listener that requests wake.
@@ -86,40 +87,43 @@ impl ControlServer {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`] if the client cannot be connected.
-    pub fn receive(&self) -> Result<Option<Asked>, Failure> {
+    /// Returns [`Kind::ResourceExhausted`] if the client cannot be connected.
+    pub fn receive(&self) -> Result<Option<IncomingRequest>, Failure> {
         take_wakeups(&[&self.requests])?;
         let received = self.server.receive();
-        received.map(|asked| asked.map(Asked)).map_err(|error| no_port(self.control.name(), &error))
+        received
+            .map(|request| request.map(IncomingRequest))
+            .map_err(|error| port_failure(self.control.name(), &error))
     }
 
     /// Sends `response` to the client of `asked`, if it still waits.
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`] if the response cannot be sent.
-    pub fn answer(&self, asked: Asked, response: &Response) -> Result<(), Failure> {
-        if !asked.is_waited_for() {
+    /// Returns [`Kind::ResourceExhausted`] if the response cannot be sent.
+    pub fn respond(&self, request: IncomingRequest, response: &Response) -> Result<(), Failure> {
+        if !request.is_client_waiting() {
             return Ok(());
         }
         let bytes = response.encode();
-        let unsent =
-            |error: &dyn Debug| Failure::new(Kind::Short, format!("cannot answer a client: {error:?}"), "");
-        let loan = asked.0.loan_slice_uninit(bytes.len()).map_err(|error| unsent(&error))?;
+        let unsent = |error: &dyn Debug| {
+            Failure::new(Kind::ResourceExhausted, format!("cannot answer a client: {error:?}"), "")
+        };
+        let loan = request.0.loan_slice_uninit(bytes.len()).map_err(|error| unsent(&error))?;
         loan.write_from_slice(&bytes).send().map_err(|error| unsent(&error))?;
-        drop(asked);
+        drop(request);
         self.responses.notify().map(drop).map_err(|error| unsent(&error))
     }
 }
 
-impl Asked {
+impl IncomingRequest {
     /// Returns the request, or `None` if it cannot be decoded.
     pub fn request(&self) -> Option<Request> {
         Request::decode(self.0.payload())
     }
 
     /// Returns whether the client still waits for the response.
-    pub fn is_waited_for(&self) -> bool {
+    pub fn is_client_waiting(&self) -> bool {
         self.0.is_connected()
     }
 }
@@ -129,32 +133,40 @@ impl ControlClient {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`] if there are too many clients at once, or if descriptors are short.
+    /// Returns [`Kind::ResourceExhausted`] if there are too many clients at once, or if descriptors are short.
     pub fn open(node: &Node) -> Result<Option<ControlClient>, Failure> {
         check_descriptors(CONTROL_DESCRIPTORS)?;
         let service = name(CONTROL)?;
         let builder = node.service_builder(&service).request_response::<[u8], [u8]>();
         let Some(control) = open(node, &service, builder.open())? else { return Ok(None) };
-        let Some(asked) = open_event(node, CONTROL_REQUEST)? else { return Ok(None) };
-        let Some(answered) = open_event(node, CONTROL_RESPONSE)? else { return Ok(None) };
-        let (requests, responses) = (notifier(&asked, EVENT)?, create_listener(&answered)?);
-        let builder = control.client_builder().initial_max_slice_len(REQUEST);
+        let Some(request_event) = open_event(node, CONTROL_REQUEST)? else { return Ok(None) };
+        let Some(response_event) = open_event(node, CONTROL_RESPONSE)? else { return Ok(None) };
+        let (requests, responses) = (notifier(&request_event, EVENT_ID)?, create_listener(&response_event)?);
+        let builder = control.client_builder().initial_max_slice_len(RESERVED_REQUEST_LEN);
         let builder = builder.allocation_strategy(AllocationStrategy::PowerOfTwo);
         let client = builder.create().map_err(|error| match error {
-            ClientCreateError::ExceedsMaxSupportedClients => full(&service, limits::CONTROL_CLIENTS),
-            other => no_port(&service, &other),
+            ClientCreateError::ExceedsMaxSupportedClients => {
+                clients_full(&service, limits::MAX_CONTROL_CLIENTS)
+            }
+            other => port_failure(&service, &other),
         })?;
-        Ok(Some(ControlClient { client, requests, responses, _control: control, _bells: [asked, answered] }))
+        Ok(Some(ControlClient {
+            client,
+            requests,
+            responses,
+            _control: control,
+            _events: [request_event, response_event],
+        }))
     }
 
     /// Sends `request` and wakes the hub.
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`] if it cannot be sent, and [`Kind::NoHub`] if no hub receives it.
-    pub fn ask(&self, request: &Request) -> Result<Pending, Failure> {
+    /// Returns [`Kind::ResourceExhausted`] if it cannot be sent, and [`Kind::NoHub`] if no hub receives it.
+    pub fn send(&self, request: &Request) -> Result<SentRequest, Failure> {
         let unsent = |error: &dyn Debug| {
-            Failure::new(Kind::Short, format!("cannot ask the hub: {error:?}"), "try again later")
+            Failure::new(Kind::ResourceExhausted, format!("cannot ask the hub: {error:?}"), "try again later")
         };
         let bytes = request.encode();
         let loan = self.client.loan_slice_uninit(bytes.len()).map_err(|error| unsent(&error))?;
@@ -163,7 +175,7 @@ impl ControlClient {
             return Err(Failure::new(Kind::NoHub, "no hub takes requests", "start one with `scanhub run`"));
         }
         self.requests.notify().map_err(|error| unsent(&error))?;
-        Ok(Pending(pending))
+        Ok(SentRequest(pending))
     }
 
     /// Returns the listener that responses wake, including those to other clients.
@@ -172,18 +184,18 @@ impl ControlClient {
     }
 }
 
-impl Pending {
+impl SentRequest {
     /// Returns the response, or `None` if it has not arrived.
     ///
     /// # Errors
     ///
     /// Returns [`Kind::Failed`] if it cannot be received or decoded.
-    pub fn response(&self) -> Result<Option<Response>, Failure> {
-        let garbled = |error: &dyn Debug| {
+    pub fn try_receive(&self) -> Result<Option<Response>, Failure> {
+        let unreadable = |error: &dyn Debug| {
             Failure::new(Kind::Failed, format!("the hub's answer cannot be read: {error:?}"), "")
         };
-        let Some(received) = self.0.receive().map_err(|error| garbled(&error))? else { return Ok(None) };
-        Response::decode(received.payload()).map(Some).ok_or_else(|| garbled(&received.payload()))
+        let Some(received) = self.0.receive().map_err(|error| unreadable(&error))? else { return Ok(None) };
+        Response::decode(received.payload()).map(Some).ok_or_else(|| unreadable(&received.payload()))
     }
 
     /// Returns whether the hub still has the request: it runs and has not dropped it.
@@ -193,21 +205,21 @@ impl Pending {
 }
 
 /// Returns an event of the control service, which is created if it does not exist.
-fn bell(node: &Node, service: &str) -> Result<WakeService, Failure> {
+fn create_event(node: &Node, service: &str) -> Result<WakeService, Failure> {
     let service = name(service)?;
     create(node, &service, || {
         let builder = node.service_builder(&service).event();
         builder
-            .max_notifiers(limits::CONTROL_CLIENTS)
-            .max_listeners(limits::CONTROL_CLIENTS)
-            .max_nodes(limits::CONTROL_NODES)
-            .event_id_max_value(EVENT)
+            .max_notifiers(limits::MAX_CONTROL_CLIENTS)
+            .max_listeners(limits::MAX_CONTROL_CLIENTS)
+            .max_nodes(limits::MAX_CONTROL_NODES)
+            .event_id_max_value(EVENT_ID)
             .open_or_create()
             .map_err(OpenFailure::from)
     })
 }
 
 /// Bytes that are reserved for a request. Most have no model.
-const REQUEST: usize = 64;
+const RESERVED_REQUEST_LEN: usize = 64;
 /// ID of both events.
-const EVENT: usize = 1;
+const EVENT_ID: usize = 1;

@@ -20,11 +20,13 @@ use nix::libc::{self, flock};
 use rustix::fs::{AtFlags, Dir, FileType, Mode, OFlags, Stat, fstat, openat, renameat, statat, unlinkat};
 use rustix::io::Errno;
 
-use scanhub_files::path_walk::{LinkPolicy, PathWalk, STICKY, WalkError, components_of, named, user};
+use scanhub_files::path_walk::{
+    LinkPolicy, PathWalk, STICKY, WalkError, components_of, describe_user, effective_uid,
+};
 use scanhub_schema::{Failure, Kind};
 
 use crate::domain::first_path;
-use crate::shortage;
+use crate::resource_limits;
 
 /// An open directory that belongs to this user and that no other user can write to.
 #[derive(Debug)]
@@ -49,10 +51,10 @@ impl Directory {
     /// # Errors
     ///
     /// Returns [`Kind::Failed`] with the path, its owner and the remedy if base or domain belongs to another user, can
-    /// be written to by others, or is reached by a link that another user could have made. Returns [`Kind::Short`] if
+    /// be written to by others, or is reached by a link that another user could have made. Returns [`Kind::ResourceExhausted`] if
     /// descriptors run out.
     pub fn open(root: &Path) -> Result<Option<Directory>, Failure> {
-        Directory::walk(root, 2, Purpose::Domain, user(), false)
+        Directory::walk(root, 2, Purpose::Domain, effective_uid(), false)
     }
 
     /// Returns the directory `root` of a domain. Missing directories are created for this user only.
@@ -60,8 +62,8 @@ impl Directory {
     /// # Errors
     ///
     /// Returns the errors of [`open`](Self::open), and [`Kind::Failed`] if the directory cannot be created.
-    pub fn make(root: &Path) -> Result<Directory, Failure> {
-        Directory::made(root, 2, Purpose::Domain)
+    pub fn create(root: &Path) -> Result<Directory, Failure> {
+        Directory::create_directory(root, 2, Purpose::Domain)
     }
 
     /// Returns the directory `path`, in which programs keep files across restarts. This user must own its last `own`
@@ -69,9 +71,9 @@ impl Directory {
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`make`](Self::make).
-    pub fn make_state(path: &Path, own: usize) -> Result<Directory, Failure> {
-        Directory::made(path, own, Purpose::State)
+    /// Returns the errors of [`make`](Self::create).
+    pub fn create_state(path: &Path, owned_components: usize) -> Result<Directory, Failure> {
+        Directory::create_directory(path, owned_components, Purpose::State)
     }
 
     /// Returns the file `name`, or `None` if it does not exist.
@@ -83,7 +85,7 @@ impl Directory {
     pub fn file(&self, name: &str) -> Result<Option<File>, Failure> {
         match self.open_file(name, OFlags::RDONLY) {
             Err(Errno::NOENT) => Ok(None),
-            opened => self.checked(name, opened).map(Some),
+            opened => self.check_file(name, opened).map(Some),
         }
     }
 
@@ -92,9 +94,9 @@ impl Directory {
     /// # Errors
     ///
     /// Returns the errors of [`file`](Self::file), and [`Kind::Failed`] if the file cannot be created.
-    pub fn file_or_new(&self, name: &str) -> Result<File, Failure> {
+    pub fn open_or_create(&self, name: &str) -> Result<File, Failure> {
         let opened = self.open_file(name, OFlags::RDWR | OFlags::CREATE);
-        self.checked(name, opened)
+        self.check_file(name, opened)
     }
 
     /// Replaces the content of the file `name` in one step: a reader, or the next process after a crash, finds the old
@@ -102,17 +104,17 @@ impl Directory {
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`file_or_new`](Self::file_or_new), and [`Kind::Failed`] if the file cannot be written.
+    /// Returns the errors of [`open_or_create`](Self::file_or_new), and [`Kind::Failed`] if the file cannot be written.
     pub(crate) fn replace(&self, name: &str, content: &[u8]) -> Result<(), Failure> {
-        let beside = format!("{name}.new");
+        let temporary = format!("{name}.new");
         // A crash may have left such a file.
-        self.remove(OsStr::new(&beside));
-        let opened = self.open_file(&beside, OFlags::WRONLY | OFlags::CREATE | OFlags::EXCL);
-        let mut file = self.checked(&beside, opened)?;
+        self.remove(OsStr::new(&temporary));
+        let opened = self.open_file(&temporary, OFlags::WRONLY | OFlags::CREATE | OFlags::EXCL);
+        let mut file = self.check_file(&temporary, opened)?;
         let written = file.write_all(content).and_then(|()| file.sync_data());
-        let renamed = written.and_then(|()| Ok(renameat(&self.fd, &beside, &self.fd, name)?));
+        let renamed = written.and_then(|()| Ok(renameat(&self.fd, &temporary, &self.fd, name)?));
         renamed.map_err(|error| {
-            self.remove(OsStr::new(&beside));
+            self.remove(OsStr::new(&temporary));
             self.purpose.unusable(&self.path.join(name), error)
         })
     }
@@ -149,74 +151,78 @@ impl Directory {
     }
 
     /// Returns the directory `name` in this one. `None` if it does not exist, is a link, or belongs to another user.
-    pub(crate) fn below(&self, name: &str) -> Option<Directory> {
-        let how = OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::CLOEXEC | OFlags::RDONLY;
-        let fd = openat(&self.fd, name, how, Mode::empty()).ok()?;
-        let is_own = fstat(&fd).is_ok_and(|stat| stat.st_uid == user());
+    pub(crate) fn subdirectory(&self, name: &str) -> Option<Directory> {
+        let flags = OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::CLOEXEC | OFlags::RDONLY;
+        let fd = openat(&self.fd, name, flags, Mode::empty()).ok()?;
+        let is_own = fstat(&fd).is_ok_and(|stat| stat.st_uid == effective_uid());
         is_own.then(|| Directory { fd, path: self.path.join(name), purpose: self.purpose })
     }
 
     /// Removes the directory if it is empty and still has its path. Returns whether it is removed.
     pub(crate) fn remove_itself(&self) -> bool {
-        let there = self.path.symlink_metadata().map(|it| (it.dev(), it.ino()));
-        let is_here =
-            fstat(&self.fd).is_ok_and(|stat| there.is_ok_and(|there| there == (stat.st_dev, stat.st_ino)));
-        if is_here {
+        let at_path = self.path.symlink_metadata().map(|it| (it.dev(), it.ino()));
+        let is_at_path =
+            fstat(&self.fd).is_ok_and(|stat| at_path.is_ok_and(|there| there == (stat.st_dev, stat.st_ino)));
+        if is_at_path {
             let _ = unlinkat(rustix::fs::CWD, &self.path, AtFlags::REMOVEDIR);
         }
         fstat(&self.fd).is_ok_and(|stat| stat.st_nlink == 0)
     }
 
-    fn open_file(&self, name: &str, how: OFlags) -> Result<OwnedFd, Errno> {
+    fn open_file(&self, name: &str, flags: OFlags) -> Result<OwnedFd, Errno> {
         let mode = Mode::RUSR | Mode::WUSR;
-        openat(&self.fd, name, how | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC, mode)
+        openat(&self.fd, name, flags | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC, mode)
     }
 
-    fn checked(&self, name: &str, opened: Result<OwnedFd, Errno>) -> Result<File, Failure> {
+    fn check_file(&self, name: &str, opened: Result<OwnedFd, Errno>) -> Result<File, Failure> {
         let path = self.path.join(name);
         let fd = opened.map_err(|error| match error {
-            Errno::LOOP => self.purpose.planted(&path, "is a link"),
+            Errno::LOOP => self.purpose.untrusted(&path, "is a link"),
             error => self.purpose.unusable(&path, error),
         })?;
         let stat = fstat(&fd).map_err(|error| self.purpose.unusable(&path, error))?;
         if FileType::from_raw_mode(stat.st_mode) != FileType::RegularFile {
-            return Err(self.purpose.planted(&path, "is no regular file"));
+            return Err(self.purpose.untrusted(&path, "is no regular file"));
         }
-        if stat.st_uid != user() {
-            let what = format!("belongs to user {}", named(stat.st_uid));
-            return Err(Failure { kind: Kind::OtherUser, ..self.purpose.planted(&path, &what) });
+        if stat.st_uid != effective_uid() {
+            let what = format!("belongs to user {}", describe_user(stat.st_uid));
+            return Err(Failure { kind: Kind::OtherUser, ..self.purpose.untrusted(&path, &what) });
         }
         Ok(File::from(fd))
     }
 
-    fn made(path: &Path, own: usize, purpose: Purpose) -> Result<Directory, Failure> {
-        let made = Directory::walk(path, own, purpose, user(), true)?;
-        made.ok_or_else(|| purpose.unusable(path, Errno::NOENT))
+    fn create_directory(
+        path: &Path,
+        owned_components: usize,
+        purpose: Purpose,
+    ) -> Result<Directory, Failure> {
+        let created = Directory::walk(path, owned_components, purpose, effective_uid(), true)?;
+        created.ok_or_else(|| purpose.unusable(path, Errno::NOENT))
     }
 
     /// Opens `path`, whose last `own` components must belong to `user`.
     fn walk(
         path: &Path,
-        own: usize,
+        owned_components: usize,
         purpose: Purpose,
         user: u32,
-        make: bool,
+        create: bool,
     ) -> Result<Option<Directory>, Failure> {
         let path = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
         let mut components = components_of(&path);
-        if components.len() < own {
+        if components.len() < owned_components {
             return Err(purpose.unusable(&path, Errno::INVAL));
         }
-        let owned = components.split_off(components.len() - own);
-        let make = make.then_some(Mode::RWXU);
+        let components_to_own = components.split_off(components.len() - owned_components);
+        let make = create.then_some(Mode::RWXU);
         let reached = PathWalk::begin(&path, LinkPolicy::Own, user).and_then(|mut walk| {
             if !walk.enter(components, make)? {
                 return Ok(None);
             }
-            for (number, component) in owned.iter().enumerate() {
+            for (number, component) in components_to_own.iter().enumerate() {
                 // Only the directory itself is read.
-                let how = if number + 1 == own { OFlags::RDONLY } else { OFlags::PATH };
-                if !walk.enter_own(component, make, how)? {
+                let flags = if number + 1 == owned_components { OFlags::RDONLY } else { OFlags::PATH };
+                if !walk.enter_own(component, make, flags)? {
                     return Ok(None);
                 }
             }
@@ -232,9 +238,9 @@ impl Purpose {
     fn failure(self, error: WalkError, user: u32) -> Failure {
         match error {
             WalkError::System(path, error) => self.unusable(&path, error),
-            WalkError::Planted(path, what) => self.planted(&path, &what),
+            WalkError::Untrusted(path, what) => self.untrusted(&path, &what),
             WalkError::Foreign(path, owner, mode) => {
-                let (path, owner, user) = (path.display(), named(owner), named(user));
+                let (path, owner, user) = (path.display(), describe_user(owner), describe_user(user));
                 let mode = mode & 0o7777;
                 let what =
                     format!("{path} belongs to user {owner} with mode {mode:04o}, this is user {user}");
@@ -244,7 +250,7 @@ impl Purpose {
                          hub of user {owner}: `scanhub gateway --interface lo` as that user, `scanhub listen --publish \
                          --interface lo` as this one"
                     ),
-                    Purpose::State => format!("run as user {owner}, with sudo without -E, or {SET_STATE}"),
+                    Purpose::State => format!("run as user {owner}, with sudo without -E, or {STATE_REMEDY}"),
                 };
                 Failure::new(Kind::OtherUser, what, hint)
             }
@@ -255,8 +261,8 @@ impl Purpose {
                     Purpose::Domain if mode & STICKY != 0 => {
                         format!("choose your own directory, for example --root {path}/NAME")
                     }
-                    Purpose::State if mode & STICKY != 0 => SET_STATE.to_owned(),
-                    _ => format!("chmod go-w {path}, or {}", self.other()),
+                    Purpose::State if mode & STICKY != 0 => STATE_REMEDY.to_owned(),
+                    _ => format!("chmod go-w {path}, or {}", self.alternative()),
                 };
                 let what = format!("{path} has mode {mode:04o}: others can put files there");
                 Failure::new(Kind::Failed, what, hint)
@@ -265,32 +271,32 @@ impl Purpose {
     }
 
     /// Returns the failure of a `path` that another user may have put there.
-    fn planted(self, path: &Path, what: &str) -> Failure {
+    fn untrusted(self, path: &Path, what: &str) -> Failure {
         let path = path.display();
         Failure::new(
             Kind::Failed,
             format!("{path} {what}: scanhub opens nothing in it"),
-            format!("look at it with `ls -ld {path}` and remove it, or {}", self.other()),
+            format!("look at it with `ls -ld {path}` and remove it, or {}", self.alternative()),
         )
     }
 
     fn unusable(self, path: &Path, error: impl Into<io::Error>) -> Failure {
         let error = error.into();
-        shortage::found(path).unwrap_or_else(|| {
-            Failure::new(Kind::Failed, format!("{}: {error}", path.display()), self.other())
+        resource_limits::find_shortage(path).unwrap_or_else(|| {
+            Failure::new(Kind::Failed, format!("{}: {error}", path.display()), self.alternative())
         })
     }
 
     /// Returns how to use another directory.
-    fn other(self) -> &'static str {
+    fn alternative(self) -> &'static str {
         match self {
             Purpose::Domain => "choose another --root",
-            Purpose::State => SET_STATE,
+            Purpose::State => STATE_REMEDY,
         }
     }
 }
 
-const SET_STATE: &str = "set STATE_DIRECTORY or XDG_STATE_HOME to a directory of this user";
+const STATE_REMEDY: &str = "set STATE_DIRECTORY or XDG_STATE_HOME to a directory of this user";
 
 /// A lock on a file of a domain's directory. It ends with its process. The file has the ID of the process, because the
 /// kernel does not report it.
@@ -310,15 +316,15 @@ impl FileLock {
     pub(crate) fn acquire(
         root: &Path,
         name: &str,
-        held: impl Fn(u32) -> Failure,
+        on_held: impl Fn(u32) -> Failure,
     ) -> Result<FileLock, Failure> {
         let file = loop {
-            let file = Directory::make(root)?.file_or_new(name)?;
+            let file = Directory::create(root)?.open_or_create(name)?;
             match fcntl(file.as_raw_fd(), FcntlArg::F_OFD_SETLK(&whole_file(libc::F_WRLCK))) {
                 // The previous holder may have removed the domain, and the next one would lock another file.
                 Ok(_) if file.metadata().is_ok_and(|metadata| metadata.nlink() == 0) => {}
                 Ok(_) => break file,
-                Err(nix::Error::EAGAIN | nix::Error::EACCES) => return Err(held(pid_in(&file))),
+                Err(nix::Error::EAGAIN | nix::Error::EACCES) => return Err(on_held(pid_in(&file))),
                 Err(error) => return Err(Purpose::Domain.unusable(root, error)),
             }
         };
@@ -344,17 +350,17 @@ impl Drop for FileLock {
 }
 
 /// Lock of a process that creates services in a domain, or removes unfinished ones.
-pub(crate) struct MakingLock {
+pub(crate) struct ServiceCreationLock {
     _lock: FileLock,
 }
 
-impl MakingLock {
+impl ServiceCreationLock {
     /// Waits for the lock. A process holds it only while it creates one service.
-    pub(crate) fn wait(root: &Path) -> Result<MakingLock, Failure> {
-        let file = Directory::make(root)?.file_or_new(MAKING)?;
+    pub(crate) fn wait(root: &Path) -> Result<ServiceCreationLock, Failure> {
+        let file = Directory::create(root)?.open_or_create(CREATION_LOCK_FILE)?;
         loop {
             match fcntl(file.as_raw_fd(), FcntlArg::F_OFD_SETLKW(&whole_file(libc::F_WRLCK))) {
-                Ok(_) => return Ok(MakingLock { _lock: FileLock { file } }),
+                Ok(_) => return Ok(ServiceCreationLock { _lock: FileLock { file } }),
                 Err(nix::Error::EINTR) => {}
                 Err(error) => return Err(Purpose::Domain.unusable(root, error)),
             }
@@ -367,7 +373,7 @@ impl MakingLock {
 /// # Errors
 ///
 /// Returns the errors of [`Directory::open`] and [`Directory::file`].
-pub(crate) fn held_file(root: &Path, name: &str) -> Result<Option<(Directory, File)>, Failure> {
+pub(crate) fn locked_file(root: &Path, name: &str) -> Result<Option<(Directory, File)>, Failure> {
     let Some(directory) = Directory::open(root)? else { return Ok(None) };
     let Some(file) = directory.file(name)? else { return Ok(None) };
     let mut lock = whole_file(libc::F_RDLCK);
@@ -378,11 +384,11 @@ pub(crate) fn held_file(root: &Path, name: &str) -> Result<Option<(Directory, Fi
 
 /// Returns the process ID in the file of a lock; 0 if it has none.
 pub(crate) fn pid_in(file: &File) -> u32 {
-    content(file).lines().next().and_then(|pid| pid.parse().ok()).unwrap_or_default()
+    lock_text(file).lines().next().and_then(|pid| pid.parse().ok()).unwrap_or_default()
 }
 
 /// Returns the text in the file of a lock.
-pub(crate) fn content(file: &File) -> String {
+pub(crate) fn lock_text(file: &File) -> String {
     let mut bytes = [0; 32];
     let length = file.read_at(&mut bytes, 0).unwrap_or_default();
     String::from_utf8_lossy(&bytes[..length]).into_owned()
@@ -399,7 +405,7 @@ fn whole_file(kind: libc::c_int) -> flock {
     }
 }
 
-const MAKING: &str = "making.lock";
+const CREATION_LOCK_FILE: &str = "making.lock";
 
 /// Directory of the small text files that a domain keeps across restarts: `$STATE_DIRECTORY/DOMAIN`, otherwise
 /// `$XDG_STATE_HOME/scanhub/DOMAIN`, otherwise `~/.local/state/scanhub/DOMAIN`.
@@ -449,10 +455,10 @@ impl StateDirectory {
     ///
     /// Returns the errors of [`check`](Self::check). Returns [`Kind::Failed`] if the file cannot be read, is not a
     /// regular file of this user that no other user can write, has more than `most` bytes, or is not UTF-8.
-    pub fn read(&self, name: &str, most: u64) -> Result<Option<String>, Failure> {
+    pub fn read(&self, name: &str, max_bytes: u64) -> Result<Option<String>, Failure> {
         let Some(directory) = self.open()? else { return Ok(None) };
         let Some(file) = directory.file(name)? else { return Ok(None) };
-        read(&file, most).map(Some).map_err(|error| {
+        read(&file, max_bytes).map(Some).map_err(|error| {
             let what = format!("cannot use {}: {error}", self.path(name).display());
             Failure::new(Kind::Failed, what, "delete it; its content is learned again")
         })
@@ -466,7 +472,7 @@ impl StateDirectory {
     /// Returns the errors of [`check`](Self::check), and [`Kind::Failed`] if the file cannot be written. It then keeps
     /// its content.
     pub fn write(&self, name: &str, text: &str) -> Result<(), Failure> {
-        self.make()?.replace(name, text.as_bytes()).map_err(unkept)
+        self.create()?.replace(name, text.as_bytes()).map_err(not_saved)
     }
 
     /// Waits for the lock that a process holds between reading and writing the file `name`, and returns it. The lock
@@ -477,7 +483,7 @@ impl StateDirectory {
     /// Returns the errors of [`write`](Self::write).
     pub fn lock(&self, name: &str) -> Result<File, Failure> {
         let name = format!("{name}.lock");
-        let file = self.make()?.file_or_new(&name).map_err(unkept)?;
+        let file = self.create()?.open_or_create(&name).map_err(not_saved)?;
         let locked = file.lock().map(|()| file);
         locked.map_err(|error| {
             let what = format!("cannot lock {}: {error}", self.path(&name).display());
@@ -499,19 +505,19 @@ impl StateDirectory {
     }
 
     fn open(&self) -> Result<Option<Directory>, Failure> {
-        Directory::walk(&self.path, OWN, Purpose::State, user(), false)
+        Directory::walk(&self.path, OWNED_COMPONENTS, Purpose::State, effective_uid(), false)
     }
 
-    fn make(&self) -> Result<Directory, Failure> {
-        Directory::make_state(&self.path, OWN).map_err(unkept)
+    fn create(&self) -> Result<Directory, Failure> {
+        Directory::create_state(&self.path, OWNED_COMPONENTS).map_err(not_saved)
     }
 }
 
 /// The directory of the domain, and the one of all domains above it.
-const OWN: usize = 2;
+const OWNED_COMPONENTS: usize = 2;
 
 /// Adds to the message that nothing can be kept.
-fn unkept(failure: Failure) -> Failure {
+fn not_saved(failure: Failure) -> Failure {
     Failure { message: format!("nothing can be kept: {}", failure.message), ..failure }
 }
 
@@ -521,7 +527,7 @@ fn base_in(variable: impl Fn(&str) -> Option<OsString>) -> Option<PathBuf> {
     path("STATE_DIRECTORY").or_else(|| Some(user()?.join("scanhub")))
 }
 
-fn read(file: &File, most: u64) -> io::Result<String> {
+fn read(file: &File, max_bytes: u64) -> io::Result<String> {
     let refused = |what| io::Error::new(io::ErrorKind::InvalidData, what);
     let metadata = file.metadata()?;
     let (owner, mode) = (metadata.uid(), metadata.mode() & 0o7777);
@@ -529,8 +535,12 @@ fn read(file: &File, most: u64) -> io::Result<String> {
         return Err(refused(format!("others can write it: owner {owner}, mode {mode:04o}")));
     }
     let mut text = String::new();
-    let len = file.take(most + 1).read_to_string(&mut text)?;
-    if len as u64 > most { Err(refused(format!("it has more than {most} bytes"))) } else { Ok(text) }
+    let len = file.take(max_bytes + 1).read_to_string(&mut text)?;
+    if len as u64 > max_bytes {
+        Err(refused(format!("it has more than {max_bytes} bytes")))
+    } else {
+        Ok(text)
+    }
 }
 
 #[cfg(test)]
@@ -543,12 +553,12 @@ mod tests {
     use super::*;
 
     /// `HERE/base/domain`, each with mode 0700.
-    struct Here(TempDir);
+    struct TestDirectory(TempDir);
 
-    impl Here {
-        fn new() -> Here {
-            let here = Here(TempDir::new().unwrap());
-            Directory::make(&here.at("base/domain")).unwrap();
+    impl TestDirectory {
+        fn new() -> TestDirectory {
+            let here = TestDirectory(TempDir::new().unwrap());
+            Directory::create(&here.at("base/domain")).unwrap();
             here
         }
 
@@ -568,13 +578,13 @@ mod tests {
     }
 
     #[test]
-    fn what_is_missing_is_nothing_or_made_for_this_user_alone() {
-        let here = Here::new();
+    fn missing_directory_is_none_or_made_private() {
+        let here = TestDirectory::new();
         assert!(Directory::open(&here.at("base/domain")).unwrap().is_some());
         for absent in ["base/other", "other/domain", "a/b/c"] {
             assert!(Directory::open(&here.at(absent)).unwrap().is_none(), "{absent}");
         }
-        Directory::make(&here.at("a/b/c")).unwrap();
+        Directory::create(&here.at("a/b/c")).unwrap();
         for made in ["a", "a/b", "a/b/c"] {
             assert_eq!(fs::metadata(here.at(made)).unwrap().permissions().mode() & 0o7777, 0o700, "{made}");
         }
@@ -582,19 +592,22 @@ mod tests {
 
     #[test]
     fn base_and_domain_are_this_users_alone() {
-        let here = Here::new();
+        let here = TestDirectory::new();
         let path = here.at("base/domain");
-        let own = user();
-        let said = refusal(Directory::walk(&path, 2, Purpose::Domain, own + 1, false));
-        assert!(said.starts_with(&format!("{} belongs to user {own}", here.at("base").display())), "{said}");
-        assert!(said.contains("with mode 0700, this is user"), "{said}");
+        let own = effective_uid();
+        let message = refusal(Directory::walk(&path, 2, Purpose::Domain, own + 1, false));
+        assert!(
+            message.starts_with(&format!("{} belongs to user {own}", here.at("base").display())),
+            "{message}"
+        );
+        assert!(message.contains("with mode 0700, this is user"), "{message}");
         for open in ["base", "base/domain"] {
             for mode in [0o720, 0o702, 0o1777] {
                 here.mode(open, mode);
-                let said = refusal(Directory::open(&path));
+                let message = refusal(Directory::open(&path));
                 assert!(
-                    said.starts_with(&format!("{} has mode {mode:04o}", here.at(open).display())),
-                    "{said}"
+                    message.starts_with(&format!("{} has mode {mode:04o}", here.at(open).display())),
+                    "{message}"
                 );
                 let hint = Directory::open(&path).unwrap_err().hint;
                 assert_eq!(hint.contains("chmod go-w"), mode & STICKY == 0, "{hint}");
@@ -605,25 +618,30 @@ mod tests {
     }
 
     #[test]
-    fn links_are_followed_above_the_base_where_nobody_else_makes_them() {
-        let here = Here::new();
+    fn links_above_the_base_need_a_trusted_owner() {
+        let here = TestDirectory::new();
         symlink(here.at("base"), here.at("link")).unwrap();
         symlink("domain", here.at("base/alias")).unwrap();
         for (path, link) in [("link/domain", "link"), ("base/alias", "base/alias")] {
-            let said = refusal(Directory::open(&here.at(path)));
-            assert!(said.starts_with(&format!("{} is a link", here.at(link).display())), "{said}");
+            let message = refusal(Directory::open(&here.at(path)));
+            assert!(message.starts_with(&format!("{} is a link", here.at(link).display())), "{message}");
         }
-        Directory::make(&here.at("base/x/domain")).unwrap();
+        Directory::create(&here.at("base/x/domain")).unwrap();
         assert!(Directory::open(&here.at("link/x/domain")).unwrap().is_some());
         here.mode("", 0o1777);
-        let said = refusal(Directory::open(&here.at("link/x/domain")));
-        assert!(said.contains("is a link of user") && said.contains("mode 1777"), "{said}");
+        let message = refusal(Directory::open(&here.at("link/x/domain")));
+        assert!(message.contains("is a link of user") && message.contains("mode 1777"), "{message}");
         here.mode("", 0o700);
         // For another user, only links of root are followed.
-        if user() != 0 {
-            let said =
-                refusal(Directory::walk(&here.at("link/x/domain"), 2, Purpose::Domain, user() + 1, false));
-            assert!(said.contains("is a link of user"), "{said}");
+        if effective_uid() != 0 {
+            let message = refusal(Directory::walk(
+                &here.at("link/x/domain"),
+                2,
+                Purpose::Domain,
+                effective_uid() + 1,
+                false,
+            ));
+            assert!(message.contains("is a link of user"), "{message}");
         }
         symlink("circle", here.at("circle")).unwrap();
         assert!(Directory::open(&here.at("circle/x/domain")).is_err());
@@ -633,10 +651,10 @@ mod tests {
 
     #[test]
     fn files_are_regular_ones() {
-        let here = Here::new();
-        let directory = Directory::make(&here.at("base/domain")).unwrap();
+        let here = TestDirectory::new();
+        let directory = Directory::create(&here.at("base/domain")).unwrap();
         assert!(directory.file("hub.lock").unwrap().is_none());
-        directory.file_or_new("hub.lock").unwrap();
+        directory.open_or_create("hub.lock").unwrap();
         let mode = fs::metadata(here.at("base/domain/hub.lock")).unwrap().permissions().mode();
         assert_eq!(mode & 0o7777, 0o600);
         assert!(directory.file("hub.lock").unwrap().is_some());
@@ -646,7 +664,7 @@ mod tests {
         let fifo = here.at("base/domain/fifo");
         rustix::fs::mknodat(rustix::fs::CWD, &fifo, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).unwrap();
         for (name, word) in [("link", "is a link"), ("fifo", "is no regular file")] {
-            for failure in [directory.file(name).unwrap_err(), directory.file_or_new(name).unwrap_err()] {
+            for failure in [directory.file(name).unwrap_err(), directory.open_or_create(name).unwrap_err()] {
                 assert!(failure.message.contains(word), "{name}: {failure}");
             }
         }
@@ -656,13 +674,16 @@ mod tests {
     }
 
     /// Path of a directory that does not exist yet, below a temporary one.
-    struct Place(PathBuf, #[expect(dead_code, reason = "it is removed when it is dropped")] TempDir);
+    struct TempStateDirectory(
+        PathBuf,
+        #[expect(dead_code, reason = "it is removed when it is dropped")] TempDir,
+    );
 
-    impl Place {
-        fn new() -> (Place, StateDirectory) {
+    impl TempStateDirectory {
+        fn new() -> (TempStateDirectory, StateDirectory) {
             let parent = TempDir::new().unwrap();
             let path = parent.path().join("a");
-            (Place(path.clone(), parent), StateDirectory::at(path))
+            (TempStateDirectory(path.clone(), parent), StateDirectory::at(path))
         }
     }
 
@@ -685,8 +706,8 @@ mod tests {
     }
 
     #[test]
-    fn what_was_written_is_read_by_this_user_alone() {
-        let (place, state) = Place::new();
+    fn state_file_round_trips_with_private_permissions() {
+        let (place, state) = TempStateDirectory::new();
         assert_eq!(state.read("f", 9), Ok(None));
         for text in ["first", "second", ""] {
             state.write("f", text).unwrap();
@@ -697,8 +718,8 @@ mod tests {
     }
 
     #[test]
-    fn what_a_crash_left_is_replaced() {
-        let (place, state) = Place::new();
+    fn temporary_file_left_by_a_crash_is_replaced() {
+        let (place, state) = TempStateDirectory::new();
         fs::create_dir_all(&place.0).unwrap();
         let other = place.0.join("other");
         fs::write(&other, "untouched").unwrap();
@@ -710,8 +731,8 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_ours_is_not_believed() {
-        let (place, state) = Place::new();
+    fn untrusted_or_invalid_state_files_are_refused() {
+        let (place, state) = TempStateDirectory::new();
         state.write("f", "12345").unwrap();
         let refused = |state: &StateDirectory, name, says: &str| {
             let failure = state.read(name, 5).unwrap_err();
@@ -732,7 +753,7 @@ mod tests {
     }
 
     #[test]
-    fn where_nothing_can_be_written_the_remedy_is_told() {
+    fn unwritable_state_directory_has_a_remedy() {
         let state = StateDirectory::at("/dev/null/x");
         let failures = [state.read("f", 9).map(drop).unwrap_err(), state.write("f", "text").unwrap_err()];
         let [_, failure] = failures;
@@ -742,7 +763,7 @@ mod tests {
 
     #[test]
     fn a_name_that_is_taken_by_a_directory_stays_as_it_is() {
-        let (place, state) = Place::new();
+        let (place, state) = TempStateDirectory::new();
         fs::create_dir_all(state.path("f").join("full")).unwrap();
         state.write("f", "text").unwrap_err();
         assert_eq!(fs::read_dir(&place.0).unwrap().count(), 1, "nothing is left beside it");

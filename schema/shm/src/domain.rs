@@ -16,10 +16,10 @@ pub const DEFAULT_DOMAIN: &str = "scanhub";
 
 /// Root and prefix, with its random part, must have fewer bytes than this. The path of a listener's socket has at most
 /// 107 bytes (unix(7)), and contains a number of up to 35 digits and 7 other bytes.
-const PLACE_LIMIT: usize = 66;
+const LOCATION_LEN_LIMIT: usize = 66;
 
 /// Bytes that are added to the prefix (`segments.rs`): five random letters, and `_`.
-const RANDOM: usize = 6;
+const RANDOM_LEN: usize = 6;
 
 /// Directory that systemd creates for the service. Clients outside of the service search it too.
 const SERVICE_BASE: &str = "/run/scanhub";
@@ -41,8 +41,8 @@ impl Domain {
         check_name(name)?;
         let base = std::path::absolute(base).unwrap_or_else(|_| base.to_owned());
         let domain = Domain { name: name.to_owned(), root: base.join(name) };
-        let length = domain.root.as_os_str().len() + domain.prefix().len() + RANDOM;
-        if length < PLACE_LIMIT {
+        let length = domain.root.as_os_str().len() + domain.prefix().len() + RANDOM_LEN;
+        if length < LOCATION_LEN_LIMIT {
             return Ok(domain);
         }
         Err(Failure::new(
@@ -51,7 +51,7 @@ impl Domain {
                 "domain {name} at {} is too long: root and prefix {}xxxxx_ have {length} bytes, at most {} are possible",
                 domain.root.display(),
                 domain.prefix(),
-                PLACE_LIMIT - 1
+                LOCATION_LEN_LIMIT - 1
             ),
             "choose a shorter --root or --domain",
         ))
@@ -237,15 +237,15 @@ impl RunningHub {
     }
 
     /// Returns who runs the hub, and the command that reaches it, for a client of `caller` that has asked for `domain`.
-    pub fn whereabouts(&self, verb: &str, domain: &str, caller: &Environment) -> String {
-        let whose =
+    pub fn describe(&self, verb: &str, domain: &str, caller: &Environment) -> String {
+        let owner =
             if self.uid == caller.uid { "this user".to_owned() } else { format!("user {}", self.user) };
         let of_domain = match &self.domain {
             Some(own) if own == domain => String::new(),
             Some(own) => format!(" in domain {own}"),
             None => " in an unknown domain".to_owned(),
         };
-        format!("{whose} runs one{of_domain}, process {}: {}", self.pid, self.command(verb, domain, caller))
+        format!("{owner} runs one{of_domain}, process {}: {}", self.pid, self.command(verb, domain, caller))
     }
 
     /// Returns the command with which the user of `caller` runs `verb` in the domain of this hub. `domain` is the one
@@ -290,8 +290,9 @@ impl CommandLine {
         let mut words = text.split(|&byte| byte == 0).map(|word| String::from_utf8_lossy(word));
         let program = Path::new(&*words.next()?).to_owned();
         // A program on the usual path needs no directory.
-        let is_usual =
-            program.parent().is_some_and(|directory| USUAL.iter().any(|usual| directory == Path::new(usual)));
+        let is_usual = program.parent().is_some_and(|directory| {
+            USUAL_DIRECTORIES.iter().any(|directory_name| directory == Path::new(directory_name))
+        });
         let name = if is_usual { program.file_name()?.into() } else { program.into_os_string() };
         let mut command = CommandLine { program: name.into_string().ok()?, ..CommandLine::default() };
         let mut verb = None;
@@ -324,7 +325,8 @@ pub fn shell_word(word: &str) -> String {
 }
 
 /// Directories that sudo looks for programs in (sudoers(5), `secure_path`).
-const USUAL: [&str; 6] = ["/usr/local/sbin", "/usr/local/bin", "/usr/sbin", "/usr/bin", "/sbin", "/bin"];
+const USUAL_DIRECTORIES: [&str; 6] =
+    ["/usr/local/sbin", "/usr/local/bin", "/usr/sbin", "/usr/bin", "/sbin", "/bin"];
 
 /// Checks that a domain's name is `[a-z0-9-]{1,16}`.
 fn check_name(name: &str) -> Result<(), Failure> {

@@ -1,4 +1,4 @@
-//! The doorbell of a sensor: three futex words in shared memory, one for each [`Ring`], at which subscribers sleep. One
+//! The doorbell of a sensor: three futex words in shared memory, one for each [`DoorbellWord`], at which subscribers sleep. One
 //! system call of the hub wakes all threads that sleep at a word; an event needs one message for each subscriber.
 //!
 //! The page is in /dev/shm under the domain's prefix. Subscribers map it read-only. A killed hub leaves the page, and
@@ -26,16 +26,16 @@ use rustix::io::Errno;
 use rustix::thread::futex::{self, WaitFlags, WaitPtr, WaitvFlags};
 use rustix::time::{ClockId, Timespec};
 
-use scanhub_schema::{Failure, Kind, Ring};
+use scanhub_schema::{DoorbellWord, Failure, Kind};
 
 use crate::processes::Node;
-use crate::segments::{Segment, in_the_way};
-use crate::shortage::{SHARED_MEMORY, memory};
+use crate::resource_limits::{SHARED_MEMORY_DIRECTORY, memory_failure};
+use crate::segments::{Segment, name_conflict};
 
 /// The hub's end of a doorbell. Dropping it closes the doorbell and wakes all subscribers once more.
 #[derive(Debug)]
 pub(crate) struct DoorbellRinger {
-    page: Page,
+    mapping: PageMapping,
     path: PathBuf,
 }
 
@@ -44,15 +44,18 @@ impl DoorbellRinger {
     /// one.
     ///
     /// Returns [`Kind::Short`] if there is no memory for it, and [`Kind::Failed`] if another user's file has its name.
-    pub(crate) fn hang<S: Service>(node: &Node<S>, sensor: &str) -> Result<DoorbellRinger, Failure> {
+    pub(crate) fn open_or_create<S: Service>(
+        node: &Node<S>,
+        sensor: &str,
+    ) -> Result<DoorbellRinger, Failure> {
         let path = path(node, sensor);
         match DoorbellRinger::open(&path) {
-            Ok(page) => Ok(DoorbellRinger { page, path }),
-            Err(Refused::Foreign(segment)) => Err(in_the_way(&segment)),
-            Err(Refused::System(error)) if Errno::from_io_error(&error) == Some(Errno::NOSPC) => {
-                Err(memory(&format!("no room for {}: {} kB", path.display(), PAGE / 1024)))
+            Ok(page) => Ok(DoorbellRinger { mapping: page, path }),
+            Err(OpenError::Foreign(segment)) => Err(name_conflict(&segment)),
+            Err(OpenError::System(error)) if Errno::from_io_error(&error) == Some(Errno::NOSPC) => {
+                Err(memory_failure(&format!("no room for {}: {} kB", path.display(), PAGE_LEN / 1024)))
             }
-            Err(Refused::System(error)) => {
+            Err(OpenError::System(error)) => {
                 let what = format!("{}: {error}", path.display());
                 Err(Failure::new(Kind::Failed, what, "remove it, or choose another --domain"))
             }
@@ -60,23 +63,23 @@ impl DoorbellRinger {
     }
 
     /// Wakes all subscribers that sleep at `word`.
-    pub(crate) fn ring(&self, word: Ring) {
-        ring(self.page.words().of(word));
+    pub(crate) fn ring(&self, word: DoorbellWord) {
+        ring(self.mapping.page().word(word));
     }
 
     /// Returns how often a program has attached to a service of the sensor, modulo 2^32. The services have all
     /// subscribers and listeners that were counted.
     pub(crate) fn attached(&self) -> u32 {
-        rung(&self.page.words().attached)
+        read_count(&self.mapping.page().attached)
     }
 
-    fn open(path: &Path) -> Result<Page, Refused> {
+    fn open(path: &Path) -> Result<PageMapping, OpenError> {
         loop {
             let mut options = OpenOptions::new();
-            let file = own(options.read(true).write(true).create(true).truncate(false), path)?;
-            fallocate(&file, FallocateFlags::empty(), 0, PAGE as u64)?;
-            let page = Page(MmapOptions::new().len(PAGE).map_raw(&file)?);
-            if page.words().closed.load(Ordering::Relaxed) == 0 {
+            let file = open_own(options.read(true).write(true).create(true).truncate(false), path)?;
+            fallocate(&file, FallocateFlags::empty(), 0, PAGE_LEN as u64)?;
+            let page = PageMapping(MmapOptions::new().len(PAGE_LEN).map_raw(&file)?);
+            if page.page().closed.load(Ordering::Relaxed) == 0 {
                 return Ok(page);
             }
             // Its hub was killed while it ended. No subscriber may sleep at this page any more.
@@ -88,10 +91,10 @@ impl DoorbellRinger {
 impl Drop for DoorbellRinger {
     fn drop(&mut self) {
         // A hub that is killed in between leaves no page that looks alive and has no name.
-        let words = self.page.words();
-        close(&words.closed, words.of(Ring::First));
-        ring(words.of(Ring::Last));
-        ring(words.of(Ring::Early));
+        let words = self.mapping.page();
+        close(&words.closed, words.word(DoorbellWord::First));
+        ring(words.word(DoorbellWord::Last));
+        ring(words.word(DoorbellWord::Early));
         let _ = std::fs::remove_file(&self.path);
     }
 }
@@ -99,42 +102,42 @@ impl Drop for DoorbellRinger {
 /// Counts at the doorbell of `sensor` that this process has attached to one of the sensor's services, so that the hub
 /// sends it the next sample. If the doorbell does not exist or cannot be written, the hub finds the subscriber when it
 /// starts, or after a tenth of a second.
-pub(crate) fn note_attached<S: Service>(node: &Node<S>, sensor: &str) {
+pub(crate) fn count_attached<S: Service>(node: &Node<S>, sensor: &str) {
     let path = path(node, sensor);
-    if let Ok(file) = own(OpenOptions::new().read(true).write(true), &path)
-        && file.metadata().is_ok_and(|metadata| metadata.len() >= PAGE as u64)
-        && let Ok(page) = MmapOptions::new().len(PAGE).map_raw(&file)
+    if let Ok(file) = open_own(OpenOptions::new().read(true).write(true), &path)
+        && file.metadata().is_ok_and(|metadata| metadata.len() >= PAGE_LEN as u64)
+        && let Ok(page) = MmapOptions::new().len(PAGE_LEN).map_raw(&file)
     {
-        note(&Page(page).words().attached);
+        increment(&PageMapping(page).page().attached);
     }
 }
 
 /// A subscriber's end of a doorbell, mapped read-only.
 #[derive(Debug)]
-pub struct Bell(Page);
+pub struct Doorbell(PageMapping);
 
-impl Bell {
+impl Doorbell {
     /// Returns the doorbell of `sensor`, or `None` if no hub has created it yet.
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`] if memory or descriptors are short, and [`Kind::Failed`] if the file belongs to another
+    /// Returns [`Kind::ResourceExhausted`] if memory or descriptors are short, and [`Kind::Failed`] if the file belongs to another
     /// user.
-    pub fn open<S: Service>(node: &Node<S>, sensor: &str) -> Result<Option<Bell>, Failure> {
+    pub fn open<S: Service>(node: &Node<S>, sensor: &str) -> Result<Option<Doorbell>, Failure> {
         let path = path(node, sensor);
-        let mapped = own(OpenOptions::new().read(true), &path).and_then(|file| {
-            let is_made = file.metadata()?.len() >= PAGE as u64;
-            let mapped = is_made.then(|| MmapOptions::new().len(PAGE).map_raw_read_only(&file));
-            Ok(mapped.transpose()?.map(|mapped| Bell(Page(mapped))))
+        let mapped = open_own(OpenOptions::new().read(true), &path).and_then(|file| {
+            let is_complete = file.metadata()?.len() >= PAGE_LEN as u64;
+            let mapped = is_complete.then(|| MmapOptions::new().len(PAGE_LEN).map_raw_read_only(&file));
+            Ok(mapped.transpose()?.map(|mapped| Doorbell(PageMapping(mapped))))
         });
         match mapped {
-            Ok(bell) => Ok(bell),
-            Err(Refused::Foreign(segment)) => Err(in_the_way(&segment)),
-            Err(Refused::System(error)) if error.kind() == io::ErrorKind::NotFound => Ok(None),
-            Err(Refused::System(error)) => {
-                let short = [Errno::MFILE, Errno::NFILE, Errno::NOMEM].map(|errno| errno.raw_os_error());
-                let is_short = error.raw_os_error().is_some_and(|errno| short.contains(&errno));
-                let kind = if is_short { Kind::Short } else { Kind::Failed };
+            Ok(doorbell) => Ok(doorbell),
+            Err(OpenError::Foreign(segment)) => Err(name_conflict(&segment)),
+            Err(OpenError::System(error)) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+            Err(OpenError::System(error)) => {
+                let shortages = [Errno::MFILE, Errno::NFILE, Errno::NOMEM].map(|errno| errno.raw_os_error());
+                let is_short = error.raw_os_error().is_some_and(|errno| shortages.contains(&errno));
+                let kind = if is_short { Kind::ResourceExhausted } else { Kind::Failed };
                 let hint = if is_short { "`ulimit -n` may be too small" } else { "is it another user's?" };
                 Err(Failure::new(kind, format!("{}: {error}", path.display()), hint))
             }
@@ -143,124 +146,127 @@ impl Bell {
 
     /// Returns how often the hub has rung `ring`, modulo 2^32. A subscriber that receives after this call gets
     /// everything that was sent before.
-    pub fn rung(&self, ring: Ring) -> u32 {
-        rung(self.0.words().of(ring))
+    pub fn ring_count(&self, word: DoorbellWord) -> u32 {
+        read_count(self.0.page().word(word))
     }
 
     /// Returns whether its hub has ended and does not ring any more.
     pub fn is_closed(&self) -> bool {
-        self.0.words().closed.load(Ordering::Relaxed) != 0
+        self.0.page().closed.load(Ordering::Relaxed) != 0
     }
 }
 
 /// The system cannot wait for several words at once (Linux before 5.16, some containers).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Unsupported;
+pub struct WaitUnsupported;
 
 /// Sleeps until one of `bells` has rung more often than its given count, a signal arrives, or CLOCK_MONOTONIC reaches
 /// `until_ns`.
 ///
 /// # Errors
 ///
-/// Returns [`Unsupported`] if the system cannot wait for several words at once.
-pub fn sleep_at_bells(bells: &[(&Bell, Ring, u32)], until_ns: u64) -> Result<(), Unsupported> {
+/// Returns [`WaitUnsupported`] if the system cannot wait for several words at once.
+pub fn wait_on_doorbells(
+    doorbells: &[(&Doorbell, DoorbellWord, u32)],
+    until_ns: u64,
+) -> Result<(), WaitUnsupported> {
     let until =
         Timespec { tv_sec: (until_ns / 1_000_000_000) as i64, tv_nsec: (until_ns % 1_000_000_000) as i64 };
-    let woken = match bells {
-        [(bell, ring, rung)] => {
-            let word = bell.0.words().of(*ring);
-            futex::wait_bitset(word, futex::Flags::empty(), *rung, Some(&until), NonZeroU32::MAX)
+    let woken = match doorbells {
+        [(bell, ring, count)] => {
+            let word = bell.0.page().word(*ring);
+            futex::wait_bitset(word, futex::Flags::empty(), *count, Some(&until), NonZeroU32::MAX)
         }
         _ => {
-            let wait = |(bell, ring, rung): &(&Bell, Ring, u32)| {
+            let wait = |(bell, ring, count): &(&Doorbell, DoorbellWord, u32)| {
                 let mut wait = futex::Wait::new();
-                wait.val = u64::from(*rung);
-                wait.uaddr = WaitPtr::new(bell.0.words().of(*ring).as_ptr().cast());
+                wait.val = u64::from(*count);
+                wait.uaddr = WaitPtr::new(bell.0.page().word(*ring).as_ptr().cast());
                 wait.flags = WaitFlags::SIZE_U32;
                 wait
             };
-            let all: Vec<_> = bells.iter().map(wait).collect();
+            let all: Vec<_> = doorbells.iter().map(wait).collect();
             futex::waitv(&all, WaitvFlags::empty(), Some(&until), ClockId::Monotonic).map(|_| ())
         }
     };
     match woken {
         Ok(()) | Err(Errno::AGAIN | Errno::TIMEDOUT | Errno::INTR) => Ok(()),
-        Err(_) => Err(Unsupported),
+        Err(_) => Err(WaitUnsupported),
     }
 }
 
 /// Words of the page, each on a separate cache line. Only `attached` is next to `first`, because the hub uses both for
 /// each telegram, and `attached` seldom changes.
 #[repr(C)]
-struct Words {
+struct DoorbellPage {
     first: AtomicU32,
     attached: AtomicU32,
-    _apart: [u32; 14],
+    _padding: [u32; 14],
     closed: AtomicU32,
-    _far: [u32; 15],
+    _padding2: [u32; 15],
     last: AtomicU32,
-    _beyond: [u32; 15],
+    _padding3: [u32; 15],
     early: AtomicU32,
 }
 
-impl Words {
-    fn of(&self, ring: Ring) -> &AtomicU32 {
-        match ring {
-            Ring::First => &self.first,
-            Ring::Last => &self.last,
-            Ring::Early => &self.early,
+impl DoorbellPage {
+    fn word(&self, word: DoorbellWord) -> &AtomicU32 {
+        match word {
+            DoorbellWord::First => &self.first,
+            DoorbellWord::Last => &self.last,
+            DoorbellWord::Early => &self.early,
         }
     }
 }
 
 /// The page. It is mapped until this is dropped.
 #[derive(Debug)]
-struct Page(MmapRaw);
+struct PageMapping(MmapRaw);
 
-impl Page {
-    fn words(&self) -> &Words {
+impl PageMapping {
+    fn page(&self) -> &DoorbellPage {
         // SAFETY: the page is mapped while it is borrowed, starts at a page boundary, is longer than the words, and any
         // bytes are valid words. The file belongs to this user alone, and no process truncates it.
         unsafe { &*self.0.as_ptr().cast() }
     }
 }
 
-const PAGE: usize = 4096;
+const PAGE_LEN: usize = 4096;
 
 fn path<S: Service>(node: &Node<S>, sensor: &str) -> PathBuf {
-    Path::new(SHARED_MEMORY).join(format!("{}{sensor}.bell", node.config().global.prefix))
+    Path::new(SHARED_MEMORY_DIRECTORY).join(format!("{}{sensor}.bell", node.config().global.prefix))
 }
 
 /// Opens the file at `path` if it belongs to this user alone. Any user can create a file there, or a pipe that would
 /// block.
-fn own(options: &mut OpenOptions, path: &Path) -> Result<File, Refused> {
+fn open_own(options: &mut OpenOptions, path: &Path) -> Result<File, OpenError> {
     if let Some(segment) = Segment::at(path).filter(Segment::is_foreign) {
-        return Err(Refused::Foreign(segment));
+        return Err(OpenError::Foreign(segment));
     }
     let flags = OFlags::NOFOLLOW | OFlags::NONBLOCK;
     let file = options.mode(0o600).custom_flags(flags.bits() as i32).open(path)?;
     // Another user may have created it after the first check.
     match Segment::of(path, &file.metadata()?) {
-        segment if segment.is_foreign() => Err(Refused::Foreign(segment)),
+        segment if segment.is_foreign() => Err(OpenError::Foreign(segment)),
         _ => Ok(file),
     }
 }
 
 /// Reason why the page cannot be used.
-enum Refused {
+enum OpenError {
     System(io::Error),
     Foreign(Segment),
 }
 
-impl From<io::Error> for Refused {
-    fn from(error: io::Error) -> Refused {
-        Refused::System(error)
+impl From<io::Error> for OpenError {
+    fn from(error: io::Error) -> OpenError {
+        OpenError::System(error)
     }
 }
 
-impl From<Errno> for Refused {
-    fn from(error: Errno) -> Refused {
-        Refused::System(error.into())
+impl From<Errno> for OpenError {
+    fn from(error: Errno) -> OpenError {
+        OpenError::System(error.into())
     }
 }
 
@@ -276,29 +282,29 @@ trait FutexWord {
 
 /// Increments the counter `rung` and wakes all threads that sleep at it. A thread that sees the new count also sees
 /// everything that was sent before.
-fn ring(rung: &impl FutexWord) {
-    rung.fetch_add(1, Ordering::Release);
-    rung.wake();
+fn ring(counter: &impl FutexWord) {
+    counter.fetch_add(1, Ordering::Release);
+    counter.wake();
 }
 
 /// Increments the counter `attached`. A hub that sees the new count also sees what was attached before.
-fn note(attached: &impl FutexWord) {
-    attached.fetch_add(1, Ordering::Release);
+fn increment(counter: &impl FutexWord) {
+    counter.fetch_add(1, Ordering::Release);
 }
 
 /// Returns the counter `rung`. Everything that was sent before it was incremented can be received after this call.
-fn rung<W: FutexWord>(rung: &W) -> u32 {
+fn read_count<W: FutexWord>(counter: &W) -> u32 {
     // Only a relaxed load may touch memory that is mapped read-only.
-    let number = rung.load(Ordering::Relaxed);
+    let count = counter.load(Ordering::Relaxed);
     W::fence(Ordering::Acquire);
-    number
+    count
 }
 
 /// Sets the word `closed` and wakes all threads once more. A thread that sees the new count also sees that the doorbell
 /// is closed.
-fn close<W: FutexWord>(closed: &W, rung: &W) {
+fn close<W: FutexWord>(closed: &W, counter: &W) {
     closed.store(1, Ordering::Relaxed);
-    ring(rung);
+    ring(counter);
 }
 
 impl FutexWord for AtomicU32 {

@@ -15,7 +15,7 @@ use rustix::fs::OFlags;
 ///
 /// Returns false if the answer is unknown, for example for a file of another user. A process that opens the file during
 /// this call waits until the call returns.
-pub fn is_unheld(path: &Path) -> bool {
+pub fn is_unused(path: &Path) -> bool {
     let flags = OFlags::NOFOLLOW | OFlags::NONBLOCK;
     let opened = OpenOptions::new().read(true).custom_flags(flags.bits() as i32).open(path);
     let Ok(file) = opened else { return false };
@@ -41,12 +41,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn whoever_has_it_open_or_mapped_holds_it() {
-        let path = Path::new(crate::shortage::SHARED_MEMORY).join(format!("shu{}", std::process::id()));
-        assert!(!is_unheld(&path), "it is not there");
+    fn open_or_mapped_file_is_in_use() {
+        let path = Path::new(crate::resource_limits::SHARED_MEMORY_DIRECTORY)
+            .join(format!("shu{}", std::process::id()));
+        assert!(!is_unused(&path), "it is not there");
         let made = File::create_new(&path).unwrap();
         made.set_len(4096).unwrap();
-        let is_unheld = || is_unheld(&path);
+        let is_unheld = || is_unused(&path);
         let written = is_unheld();
         drop(made);
         let free = is_unheld();

@@ -3,7 +3,7 @@
 //!
 //! The modules form layers. Each one uses only modules that are before it in this list:
 //!
-//! - locations and files of a domain: `domain`, `shortage`, `directory`, `file_in_use`, `segments`
+//! - locations and files of a domain: `domain`, `resource_limits`, `directory`, `file_in_use`, `segments`
 //! - processes: `processes`
 //! - services: `service`, `doorbell`, `topic_service`, `wake`, `control`
 
@@ -13,17 +13,17 @@ mod domain;
 mod doorbell;
 mod file_in_use;
 mod processes;
+pub mod resource_limits;
 mod segments;
 mod service;
-pub mod shortage;
 mod topic_service;
 mod wake;
 
-pub use control::{Asked, ControlClient, ControlServer, Pending};
+pub use control::{ControlClient, ControlServer, IncomingRequest, SentRequest};
 pub use directory::{Directory, StateDirectory};
 pub use domain::{DEFAULT_DOMAIN, Domain, Environment, RunningHub, shell_word};
-pub use doorbell::{Bell, Unsupported, sleep_at_bells};
-pub use file_in_use::is_unheld;
+pub use doorbell::{Doorbell, WaitUnsupported, wait_on_doorbells};
+pub use file_in_use::is_unused;
 pub use iceoryx2::port::update_connections::UpdateConnections;
 pub use iceoryx2::port::{LoanError, ReceiveError, SendError};
 /// Shared memory between processes, with ports that stay in their thread; nodes and services may move. The hub uses
@@ -36,15 +36,17 @@ pub use iceoryx2::prelude::{CallbackProgression, PortFactory, ZeroCopySend};
 /// Kind of shared memory: [`LocalService`] or [`ThreadSafeService`].
 pub use iceoryx2::service::Service;
 pub use processes::{
-    Cleaned, HubLock, LIBRARY, ListenLock, NameLock, Node, Nodes, Role, clean, client_node, holder, hub_node,
-    is_member, is_starting, join, name_held, nodes, publisher, publisher_domain,
+    CleanupReport, HubLock, LIBRARY_VERSION, ListenLock, NameLock, Node, NodeCounts, Role, clean_up,
+    client_node, hub_node, hub_pid, is_member, is_starting, join, name_taken, nodes, publisher_domain,
+    publisher_pid,
 };
-pub use segments::{Segment, allocate, strangers};
-pub use service::{links, published, sensors, sensors_with_zones};
+pub use segments::{Segment, allocate, foreign_segments};
+pub use service::{links, published_topics, sensors, sensors_with_zones};
 pub use topic_service::{
-    Medium, Payload, Publisher, Sample, SampleMut, SharedMemory, Subscriber, TopicPublisher, TopicService,
-    payload_revision, places,
+    Payload, Publisher, Sample, SampleMut, SampleTransport, SharedMemory, Subscriber, TopicPublisher,
+    TopicService, payload_revision, subscriber_capacity,
 };
 pub use wake::{
-    DueRings, Listener, Notifier, WakeService, Waker, descriptor, listener, open_wake, sleep, take_wakeups,
+    Listener, Notifier, PendingWakeups, WakeSender, WakeService, descriptor, listener, open_wake, sleep,
+    take_wakeups,
 };

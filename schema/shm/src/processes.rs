@@ -22,12 +22,14 @@ use iceoryx2::service::Service;
 use rustix::fs::FileType;
 use scanhub_schema::{Failure, Kind};
 
-use crate::directory::{Directory, FileLock, MakingLock, content, held_file, pid_in};
+use crate::directory::{Directory, FileLock, ServiceCreationLock, lock_text, locked_file, pid_in};
 use crate::domain::{Domain, Environment};
-use crate::segments::{access_failure, ensure_node_counter, ensure_prefix, forget, prefix_of, read_prefix};
+use crate::segments::{
+    access_failure, ensure_node_counter, ensure_prefix, prefix_of, read_prefix, remove_prefix,
+};
 
 /// Version of the shared-memory library. Processes with another version are refused.
-pub const LIBRARY: &str = "iceoryx2 0.10.0";
+pub const LIBRARY_VERSION: &str = "iceoryx2 0.10.0";
 
 /// Membership of a process in a domain.
 pub type Node<S = LocalService> = iceoryx2::node::Node<S>;
@@ -69,15 +71,15 @@ pub fn client_node(domain: &Domain) -> Result<Node, Failure> {
 pub fn join<S: Service>(domain: &Domain, role: Role) -> Result<Node<S>, Failure> {
     set_log_level_from_env_or(LogLevel::Error);
     let (root, cleanup) = (domain.root(), role == Role::Publisher);
-    let _making = if cleanup {
-        let making = MakingLock::wait(root)?;
-        ensure_prefix(root, &making)?;
+    let _lock = if cleanup {
+        let lock = ServiceCreationLock::wait(root)?;
+        ensure_prefix(root, &lock)?;
         remove_unfinished_services(root);
-        Some(making)
+        Some(lock)
     } else {
         None
     };
-    let no_names = || {
+    let no_prefix = || {
         let hint = "its hub is just starting or ending, or has another version";
         Failure::new(
             Kind::NoHub,
@@ -85,7 +87,7 @@ pub fn join<S: Service>(domain: &Domain, role: Role) -> Result<Node<S>, Failure>
             hint,
         )
     };
-    let mut config = config(root)?.ok_or_else(no_names)?;
+    let mut config = config(root)?.ok_or_else(no_prefix)?;
     ensure_node_counter(&config.global.prefix.to_string())?;
     config.global.node.cleanup_dead_nodes_on_creation = cleanup;
     config.global.node.cleanup_dead_nodes_on_destruction = false;
@@ -113,7 +115,7 @@ pub fn is_member<S: Service>(node: &Node<S>, root: &Path) -> Result<bool, Failur
 
 /// Processes that have joined a domain.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Nodes {
+pub struct NodeCounts {
     /// Running processes.
     pub alive: usize,
     /// Processes that ended without cleaning up. Their files still exist.
@@ -125,13 +127,13 @@ pub struct Nodes {
 /// # Errors
 ///
 /// Returns [`Kind::Failed`] with owner, mode and remedy if the directory belongs to another user.
-pub fn nodes(domain: &Domain) -> Result<Nodes, Failure> {
+pub fn nodes(domain: &Domain) -> Result<NodeCounts, Failure> {
     nodes_at(domain.root())
 }
 
 /// Returns the number of processes in the domain in `root`.
-fn nodes_at(root: &Path) -> Result<Nodes, Failure> {
-    let mut nodes = Nodes::default();
+fn nodes_at(root: &Path) -> Result<NodeCounts, Failure> {
+    let mut nodes = NodeCounts::default();
     let Some(config) = config(root)? else { return Ok(nodes) };
     let listed = Node::<LocalService>::list(&config, |state| {
         match state {
@@ -148,7 +150,7 @@ fn nodes_at(root: &Path) -> Result<Nodes, Failure> {
 /// Lock of a hub on its domain. It ends with the value or with the process, however that ends. Drop it after the hub's
 /// node.
 #[derive(Debug)]
-pub struct HubLock(Publishing);
+pub struct HubLock(PublisherLock);
 
 impl HubLock {
     /// Creates the directory `root` for this user only, takes the lock, and writes this process's ID into it.
@@ -158,7 +160,7 @@ impl HubLock {
     /// Returns [`Kind::DomainHeld`] if another hub has the lock; the message names its process. Returns
     /// [`Kind::Failed`] if the directory belongs to another user or cannot be created.
     pub fn acquire(root: &Path) -> Result<HubLock, Failure> {
-        Publishing::acquire(root, HUB, |pid| held(root, "hub", pid)).map(HubLock)
+        PublisherLock::acquire(root, HUB_LOCK_FILE, |pid| domain_held(root, "hub", pid)).map(HubLock)
     }
 
     /// Reports to clients that all topics exist. Until then, [`is_starting`] is true.
@@ -167,14 +169,14 @@ impl HubLock {
     ///
     /// Returns [`Kind::Failed`] if the lock's file cannot be written.
     pub fn report_ready(&self) -> Result<(), Failure> {
-        self.0.lock.write(&self.0.root, &format!("{}\n{READY}\n", std::process::id()))
+        self.0.lock.write(&self.0.root, &format!("{}\n{READY_LINE}\n", std::process::id()))
     }
 }
 
 /// Lock of the listener that publishes remote sensors. It ends like a hub's lock, and both can exist in one domain.
 #[derive(Debug)]
 pub struct ListenLock {
-    _publishing: Publishing,
+    _lock: PublisherLock,
 }
 
 impl ListenLock {
@@ -184,8 +186,9 @@ impl ListenLock {
     ///
     /// Returns the errors of [`HubLock::acquire`], with another listener instead of another hub.
     pub fn acquire(root: &Path) -> Result<ListenLock, Failure> {
-        let publishing = Publishing::acquire(root, LISTENER, |pid| held(root, "listener", pid))?;
-        Ok(ListenLock { _publishing: publishing })
+        let lock =
+            PublisherLock::acquire(root, LISTENER_LOCK_FILE, |pid| domain_held(root, "listener", pid))?;
+        Ok(ListenLock { _lock: lock })
     }
 }
 
@@ -193,7 +196,7 @@ impl ListenLock {
 /// Doorbell and services of the name belong to this process alone. A hub is not necessary.
 #[derive(Debug)]
 pub struct NameLock {
-    _publishing: Publishing,
+    _lock: PublisherLock,
 }
 
 impl NameLock {
@@ -204,49 +207,49 @@ impl NameLock {
     /// Returns [`Kind::NameHeld`] if another process publishes under `name`; the message names it. Otherwise the
     /// errors of [`HubLock::acquire`].
     pub fn acquire(root: &Path, name: &str) -> Result<NameLock, Failure> {
-        let publishing = Publishing::acquire(root, &format!("name.{name}.lock"), |pid| name_held(name, pid))?;
-        Ok(NameLock { _publishing: publishing })
+        let lock = PublisherLock::acquire(root, &format!("name.{name}.lock"), |pid| name_taken(name, pid))?;
+        Ok(NameLock { _lock: lock })
     }
 }
 
 /// Returns the failure if process `pid` publishes under `name`.
-pub fn name_held(name: &str, pid: u32) -> Failure {
+pub fn name_taken(name: &str, pid: u32) -> Failure {
     let process = match fs::read_to_string(format!("/proc/{pid}/comm")) {
         _ if pid == 0 => "another process".to_owned(),
         Ok(program) => format!("process {pid} ({})", program.trim_end()),
         Err(_) => format!("process {pid}"),
     };
-    let what = format!("the name {name} is published by {process}");
-    Failure::new(Kind::NameHeld, what, "end it, or choose another name")
+    let message = format!("the name {name} is published by {process}");
+    Failure::new(Kind::NameHeld, message, "end it, or choose another name")
 }
 
 /// Lock of a process that publishes, with the cleanup at its end.
 #[derive(Debug)]
-struct Publishing {
+struct PublisherLock {
     root: PathBuf,
     name: String,
     lock: FileLock,
 }
 
-impl Publishing {
+impl PublisherLock {
     /// Takes the lock `name`, chooses a prefix if the domain has none, and writes this process's ID into the lock's
     /// file. `held` returns the failure if another process has the lock.
-    fn acquire(root: &Path, name: &str, held: impl Fn(u32) -> Failure) -> Result<Publishing, Failure> {
-        let lock = FileLock::acquire(root, name, held)?;
+    fn acquire(root: &Path, name: &str, on_held: impl Fn(u32) -> Failure) -> Result<PublisherLock, Failure> {
+        let lock = FileLock::acquire(root, name, on_held)?;
         // A reader that finds a process ID relies on the prefix.
-        ensure_prefix(root, &MakingLock::wait(root)?)?;
+        ensure_prefix(root, &ServiceCreationLock::wait(root)?)?;
         lock.write(root, &format!("{}\n", std::process::id()))?;
-        Ok(Publishing { root: root.to_owned(), name: name.to_owned(), lock })
+        Ok(PublisherLock { root: root.to_owned(), name: name.to_owned(), lock })
     }
 }
 
-impl Drop for Publishing {
+impl Drop for PublisherLock {
     /// Removes the names while the lock is still held, if no other process uses them. The next hub chooses other names.
     fn drop(&mut self) {
         // The holder of another lock uses the names, or is about to join under them.
-        let mut others = [HUB, LISTENER].into_iter().filter(|other| *other != self.name);
-        if others.all(|other| matches!(holder_of(&self.root, other), Ok(None))) {
-            forget_names(&self.root);
+        let mut others = [HUB_LOCK_FILE, LISTENER_LOCK_FILE].into_iter().filter(|other| *other != self.name);
+        if others.all(|other| matches!(lock_holder(&self.root, other), Ok(None))) {
+            remove_names(&self.root);
         }
     }
 }
@@ -257,28 +260,28 @@ impl Drop for Publishing {
 /// # Errors
 ///
 /// Returns [`Kind::Failed`] if the directory belongs to another user.
-pub fn holder(root: &Path) -> Result<Option<u32>, Failure> {
-    holder_of(root, HUB)
+pub fn hub_pid(root: &Path) -> Result<Option<u32>, Failure> {
+    lock_holder(root, HUB_LOCK_FILE)
 }
 
 /// Returns whether a hub in `root` does not have all its topics yet, and started at most a minute ago.
 ///
 /// # Errors
 ///
-/// Returns the errors of [`holder`].
+/// Returns the errors of [`hub_pid`].
 pub fn is_starting(root: &Path) -> Result<bool, Failure> {
-    let held = held_file(root, HUB)?;
-    Ok(held.is_some_and(|(_, file)| content(&file).lines().nth(1) != Some(READY) && is_recent(&file)))
+    let held = locked_file(root, HUB_LOCK_FILE)?;
+    Ok(held.is_some_and(|(_, file)| lock_text(&file).lines().nth(1) != Some(READY_LINE) && is_recent(&file)))
 }
 
-/// Returns the process that publishes in `root`: the hub, or otherwise a listener. 0 as for [`holder`].
+/// Returns the process that publishes in `root`: the hub, or otherwise a listener. 0 as for [`hub_pid`].
 ///
 /// # Errors
 ///
-/// Returns the errors of [`holder`].
-pub fn publisher(root: &Path) -> Result<Option<u32>, Failure> {
-    match holder_of(root, HUB)? {
-        None => holder_of(root, LISTENER),
+/// Returns the errors of [`hub_pid`].
+pub fn publisher_pid(root: &Path) -> Result<Option<u32>, Failure> {
+    match lock_holder(root, HUB_LOCK_FILE)? {
+        None => lock_holder(root, LISTENER_LOCK_FILE),
         hub => Ok(hub),
     }
 }
@@ -295,22 +298,22 @@ pub fn publisher_domain(
     base: Option<&Path>,
     environment: &Environment,
 ) -> Result<Domain, Failure> {
-    let is_live = |domain: &Domain| matches!(publisher(domain.root()), Ok(Some(_)));
+    let is_live = |domain: &Domain| matches!(publisher_pid(domain.root()), Ok(Some(_)));
     match Domain::candidates(name, base, environment)?.into_iter().find(is_live) {
         Some(live) => Ok(live),
         None => Domain::of_hub(name, base, environment),
     }
 }
 
-fn holder_of(root: &Path, name: &str) -> Result<Option<u32>, Failure> {
-    let Some((directory, file)) = held_file(root, name)? else { return Ok(None) };
+fn lock_holder(root: &Path, name: &str) -> Result<Option<u32>, Failure> {
+    let Some((directory, file)) = locked_file(root, name)? else { return Ok(None) };
     // A process that just starts or ends has the lock, and the file may have the ID of an earlier process.
     Ok(Some(if read_prefix(&directory, root)?.is_some() { pid_in(&file) } else { 0 }))
 }
 
 /// Result of a cleanup.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Cleaned {
+pub struct CleanupReport {
     /// Processes that had ended without cleaning up.
     pub dead: usize,
     /// Processes that still run. Nothing that belongs to them was removed.
@@ -326,9 +329,9 @@ pub struct Cleaned {
 ///
 /// Returns [`Kind::DomainHeld`](scanhub_schema::Kind) if a hub or a listener publishes there, because it cleans up by
 /// itself. Returns [`Kind::Failed`](scanhub_schema::Kind) if the directory belongs to another user.
-pub fn clean(domain: &Domain) -> Result<Cleaned, Failure> {
+pub fn clean_up(domain: &Domain) -> Result<CleanupReport, Failure> {
     let root = domain.root();
-    let Some(directory) = Directory::open(root)? else { return Ok(Cleaned::default()) };
+    let Some(directory) = Directory::open(root)? else { return Ok(CleanupReport::default()) };
     // No process can start to publish while these locks are held.
     let _hub = HubLock::acquire(root)?;
     let _listener = ListenLock::acquire(root)?;
@@ -338,14 +341,14 @@ pub fn clean(domain: &Domain) -> Result<Cleaned, Failure> {
     drop(node);
     let after = nodes(domain)?;
     let root = after.alive == 0 && after.dead == 0 && remove_domain(&directory, root);
-    Ok(Cleaned { dead: before.dead.saturating_sub(after.dead), alive: after.alive, root })
+    Ok(CleanupReport { dead: before.dead.saturating_sub(after.dead), alive: after.alive, root })
 }
 
 /// Removes the domain's `directory` at `root` with everything that only running processes need: empty directories,
 /// locks, names, and the saved state of sensors. Returns whether the directory was removed. It stays if it contains
 /// anything else.
 fn remove_domain(directory: &Directory, root: &Path) -> bool {
-    forget(directory, root);
+    remove_prefix(directory, root);
     for (name, stat) in directory.entries() {
         let extension = Path::new(&name).extension();
         match FileType::from_raw_mode(stat.st_mode) {
@@ -361,12 +364,12 @@ fn remove_domain(directory: &Directory, root: &Path) -> bool {
 
 /// Removes the names of the domain in `root` if no process is left. The next hub chooses names that no other user can
 /// have seen.
-pub(crate) fn forget_names(root: &Path) {
+pub(crate) fn remove_names(root: &Path) {
     let Ok(Some(directory)) = Directory::open(root) else { return };
     // Not while another process joins to publish.
-    let Ok(_making) = MakingLock::wait(root) else { return };
-    if nodes_at(root).is_ok_and(|nodes| nodes == Nodes::default()) {
-        forget(&directory, root);
+    let Ok(_lock) = ServiceCreationLock::wait(root) else { return };
+    if nodes_at(root).is_ok_and(|nodes| nodes == NodeCounts::default()) {
+        remove_prefix(&directory, root);
     }
 }
 
@@ -386,14 +389,14 @@ pub(crate) fn config(root: &Path) -> Result<Option<Config>, Failure> {
 /// a service. The library waits for them forever and cleans up only finished ones, so no later hub could create that
 /// service again.
 ///
-/// The caller must hold the [`MakingLock`]. Then no process creates services, and no process has opened an unfinished
+/// The caller must hold the [`ServiceCreationLock`]. Then no process creates services, and no process has opened an unfinished
 /// one. Finished descriptions are read-only.
 fn remove_unfinished_services(root: &Path) {
     let Ok(Some(directory)) = Directory::open(root) else { return };
-    let Some(services) = directory.below(SERVICES) else { return };
+    let Some(services) = directory.subdirectory(SERVICES_DIRECTORY) else { return };
     for (name, stat) in services.entries() {
         let finished = stat.st_mode & 0o200 == 0;
-        if !finished && name.to_string_lossy().ends_with(SUFFIX) {
+        if !finished && name.to_string_lossy().ends_with(SERVICE_SUFFIX) {
             services.remove(&name);
         }
     }
@@ -402,29 +405,29 @@ fn remove_unfinished_services(root: &Path) {
 /// Returns whether the file was written in the last minute. A clock that was set back does not count.
 fn is_recent(file: &File) -> bool {
     let written = file.metadata().and_then(|metadata| metadata.modified());
-    written.is_ok_and(|written| written.elapsed().is_ok_and(|age| age < MAX_START))
+    written.is_ok_and(|written| written.elapsed().is_ok_and(|age| age < MAX_START_TIME))
 }
 
-fn held(root: &Path, who: &str, pid: u32) -> Failure {
+fn domain_held(root: &Path, program: &str, pid: u32) -> Failure {
     Failure::new(
         Kind::DomainHeld,
-        format!("another {who} holds {}: pid {pid}", root.display()),
+        format!("another {program} holds {}: pid {pid}", root.display()),
         "stop it, or choose another --domain",
     )
 }
 
-const HUB: &str = "hub.lock";
-const LISTENER: &str = "listen.lock";
+const HUB_LOCK_FILE: &str = "hub.lock";
+const LISTENER_LOCK_FILE: &str = "listen.lock";
 /// Maximum duration of a hub's start for clients. After it, a hub of a version that never reports that it is ready is
 /// up.
-const MAX_START: Duration = Duration::from_secs(60);
+const MAX_START_TIME: Duration = Duration::from_secs(60);
 /// Second line of the file of a hub's lock once all topics exist.
-const READY: &str = "ready";
+const READY_LINE: &str = "ready";
 
 /// The library's directory of service descriptions, below the root.
-const SERVICES: &str = "services";
+const SERVICES_DIRECTORY: &str = "services";
 
-const SUFFIX: &str = ".service";
+const SERVICE_SUFFIX: &str = ".service";
 /// Maximum wait for another process that is cleaning up after the same dead process.
 const CLEANUP_TIMEOUT: Duration = Duration::from_secs(1);
 
@@ -435,10 +438,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_not_a_domains_stays() {
+    fn foreign_files_of_a_domain_directory_remain() {
         let base = tempfile::tempdir().unwrap();
         let root = base.path().join("a");
-        let directory = Directory::make(&root).unwrap();
+        let directory = Directory::create(&root).unwrap();
         fs::create_dir(root.join("nodes")).unwrap();
         symlink(root.join("full"), root.join("link.lock")).unwrap();
         fs::create_dir(root.join("full")).unwrap();

@@ -20,24 +20,24 @@ use std::sync::atomic::{AtomicU32, Ordering};
 
 use rustix::fs::{CWD, FallocateFlags, OFlags, RenameFlags, fallocate, renameat_with};
 use rustix::io::Errno;
-use scanhub_files::path_walk::named;
+use scanhub_files::path_walk::describe_user;
 use scanhub_schema::{Failure, Kind};
 
-use crate::directory::{Directory, MakingLock};
+use crate::directory::{Directory, ServiceCreationLock};
 use crate::domain::Domain;
-use crate::shortage::{self, SHARED_MEMORY, memory};
+use crate::resource_limits::{self, SHARED_MEMORY_DIRECTORY, memory_failure};
 
 /// Returns the reason for a failure in the domain in `root`: another user's directory or file with owner, mode and
 /// remedy, otherwise a shortage if there is one, otherwise `what`.
-pub(crate) fn access_failure(root: &Path, what: impl Into<String>) -> Failure {
+pub(crate) fn access_failure(root: &Path, message: impl Into<String>) -> Failure {
     let directory = Directory::open(root).err();
     directory
-        .or_else(|| shortage::found(root))
-        .or_else(|| strangers(root).first().map(in_the_way))
+        .or_else(|| resource_limits::find_shortage(root))
+        .or_else(|| foreign_segments(root).first().map(name_conflict))
         .unwrap_or_else(|| {
             Failure::new(
                 Kind::Failed,
-                what,
+                message,
                 "IOX2_LOG_LEVEL=debug shows the messages of the shared-memory library",
             )
         })
@@ -90,7 +90,7 @@ impl Segment {
 
 /// Returns the files under the names of the domain in `root` that do not belong to this user alone, sorted by path.
 /// Empty if the domain has no names.
-pub fn strangers(root: &Path) -> Vec<Segment> {
+pub fn foreign_segments(root: &Path) -> Vec<Segment> {
     let Ok(Some(prefix)) = prefix_of(root) else { return Vec::new() };
     let segments = entries(&prefix).filter_map(|path| Segment::at(&path));
     let mut found: Vec<_> = segments.filter(Segment::is_foreign).collect();
@@ -99,8 +99,8 @@ pub fn strangers(root: &Path) -> Vec<Segment> {
 }
 
 /// Returns the failure to report if `segment` has a name that this process needs.
-pub(crate) fn in_the_way(segment: &Segment) -> Failure {
-    let (path, owner, mode) = (segment.path.display(), named(segment.owner), segment.mode);
+pub(crate) fn name_conflict(segment: &Segment) -> Failure {
+    let (path, owner, mode) = (segment.path.display(), describe_user(segment.owner), segment.mode);
     let is_file = if segment.is_file { "" } else { " and is no file" };
     let own = rustix::process::geteuid().as_raw();
     Failure::new(
@@ -116,7 +116,7 @@ pub(crate) fn in_the_way(segment: &Segment) -> Failure {
 
 /// Returns the files in shared memory whose names start with `prefix`.
 fn entries(prefix: &str) -> impl Iterator<Item = PathBuf> {
-    let entries = fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();
+    let entries = fs::read_dir(SHARED_MEMORY_DIRECTORY).into_iter().flatten().flatten();
     let named = entries.filter(move |entry| entry.file_name().to_string_lossy().starts_with(prefix));
     named.map(|entry| entry.path())
 }
@@ -125,7 +125,7 @@ fn entries(prefix: &str) -> impl Iterator<Item = PathBuf> {
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Short`] if there is not enough memory.
+/// Returns [`Kind::ResourceExhausted`] if there is not enough memory.
 pub fn allocate(domain: &Domain) -> Result<(), Failure> {
     let Some(prefix) = prefix_of(domain.root())? else { return Ok(()) };
     for path in entries(&prefix) {
@@ -139,7 +139,7 @@ pub fn allocate(domain: &Domain) -> Result<(), Failure> {
         // After any other error, the allocation may succeed later. An empty segment has nothing to allocate.
         if fallocate(&segment, FallocateFlags::empty(), 0, bytes) == Err(Errno::NOSPC) {
             let name = path.file_name().unwrap_or_default().to_string_lossy();
-            return Err(memory(&format!("no room for {name}: {} kB", bytes / 1024)));
+            return Err(memory_failure(&format!("no room for {name}: {} kB", bytes / 1024)));
         }
     }
     Ok(())
@@ -162,8 +162,8 @@ pub(crate) fn prefix_of(root: &Path) -> Result<Option<String>, Failure> {
 /// # Errors
 ///
 /// Returns the errors of [`prefix_of`], and an error if the file cannot be written.
-pub(crate) fn ensure_prefix(root: &Path, _making: &MakingLock) -> Result<String, Failure> {
-    let directory = Directory::make(root)?;
+pub(crate) fn ensure_prefix(root: &Path, _lock: &ServiceCreationLock) -> Result<String, Failure> {
+    let directory = Directory::create(root)?;
     if let Some(prefix) = read_prefix(&directory, root)? {
         return Ok(prefix);
     }
@@ -173,7 +173,8 @@ pub(crate) fn ensure_prefix(root: &Path, _making: &MakingLock) -> Result<String,
     let prefixes = words.by_ref().map(|word| format!("{}{word}_", prefix_start(root)));
     let prefix =
         prefixes.take(MAX_ATTEMPTS).find(|prefix| entries(prefix).next().is_none()).ok_or_else(|| {
-            let what = format!("{SHARED_MEMORY} is full of files that start with {}", prefix_start(root));
+            let what =
+                format!("{SHARED_MEMORY_DIRECTORY} is full of files that start with {}", prefix_start(root));
             Failure::new(Kind::Failed, what, "have them removed, or choose another --domain")
         })?;
     directory.replace(PREFIX_FILE, format!("{prefix}\n").as_bytes())?;
@@ -182,11 +183,11 @@ pub(crate) fn ensure_prefix(root: &Path, _making: &MakingLock) -> Result<String,
 
 fn random_word(mut random: u64) -> String {
     let letters = std::iter::repeat_with(|| {
-        let letter = LETTERS[(random % LETTERS.len() as u64) as usize];
-        random /= LETTERS.len() as u64;
+        let letter = ALPHABET[(random % ALPHABET.len() as u64) as usize];
+        random /= ALPHABET.len() as u64;
         letter as char
     });
-    letters.take(RANDOM_LETTERS).collect()
+    letters.take(RANDOM_WORD_LEN).collect()
 }
 
 /// Returns the prefix in the open `directory` of `root`. A prefix of another form was not written here, and counts as
@@ -199,11 +200,12 @@ pub(crate) fn read_prefix(directory: &Directory, root: &Path) -> Result<Option<S
     let Some(file) = directory.file(PREFIX_FILE)? else { return Ok(None) };
     let mut text = String::new();
     let read = file.take(MAX_PREFIX_FILE_BYTES).read_to_string(&mut text);
-    let is_one = |prefix: &str| {
+    let is_valid = |prefix: &str| {
         let random = prefix.strip_prefix(&prefix_start(root)).and_then(|rest| rest.strip_suffix('_'));
-        random.is_some_and(|it| it.len() == RANDOM_LETTERS && it.bytes().all(|byte| LETTERS.contains(&byte)))
+        random
+            .is_some_and(|it| it.len() == RANDOM_WORD_LEN && it.bytes().all(|byte| ALPHABET.contains(&byte)))
     };
-    Ok(read.ok().and_then(|_| text.strip_suffix('\n')).filter(|prefix| is_one(prefix)).map(str::to_owned))
+    Ok(read.ok().and_then(|_| text.strip_suffix('\n')).filter(|prefix| is_valid(prefix)).map(str::to_owned))
 }
 
 fn prefix_start(root: &Path) -> String {
@@ -220,7 +222,7 @@ pub(crate) fn ensure_node_counter(prefix: &str) -> Result<(), Failure> {
     let path = node_counter_path(prefix);
     loop {
         match Segment::at(&path) {
-            Some(segment) if !segment.is_own() => return Err(in_the_way(&segment)),
+            Some(segment) if !segment.is_own() => return Err(name_conflict(&segment)),
             // It is the library's own counter, or an unfinished one that the library would wait for forever.
             Some(segment) if segment.is_foreign() || segment.bytes != NODE_COUNTER_CONTENT.len() as u64 => {
                 remove_node_counter(prefix)
@@ -237,7 +239,7 @@ fn remove_node_counter(prefix: &str) {
 }
 
 /// Removes what only a running process needs of the names: the node counter, and the prefix in `directory`.
-pub(crate) fn forget(directory: &Directory, root: &Path) {
+pub(crate) fn remove_prefix(directory: &Directory, root: &Path) {
     if let Ok(Some(prefix)) = read_prefix(directory, root) {
         remove_node_counter(&prefix);
     }
@@ -247,25 +249,25 @@ pub(crate) fn forget(directory: &Directory, root: &Path) {
 /// Creates the file with its content in one step, unless another process is faster.
 fn create_node_counter(path: &Path) -> Result<(), Failure> {
     // Threads of one process may create it at the same time.
-    static MADE: AtomicU32 = AtomicU32::new(0);
-    let number = MADE.fetch_add(1, Ordering::Relaxed);
-    let beside = path.with_extension(format!("new-{}-{number}", std::process::id()));
-    let written = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&beside);
+    static FILE_COUNT: AtomicU32 = AtomicU32::new(0);
+    let number = FILE_COUNT.fetch_add(1, Ordering::Relaxed);
+    let temporary = path.with_extension(format!("new-{}-{number}", std::process::id()));
+    let written = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&temporary);
     let written = written.and_then(|mut file: File| file.write_all(&NODE_COUNTER_CONTENT));
-    let placed =
-        written.and_then(|()| match renameat_with(CWD, &beside, CWD, path, RenameFlags::NOREPLACE) {
+    let renamed =
+        written.and_then(|()| match renameat_with(CWD, &temporary, CWD, path, RenameFlags::NOREPLACE) {
             Err(Errno::EXIST) => Ok(()),
             placed => Ok(placed?),
         });
-    let _ = fs::remove_file(&beside);
-    placed.map_err(|error| match Errno::from_io_error(&error) {
-        Some(Errno::NOSPC) => memory(&format!("no room for {}: 16 bytes", path.display())),
+    let _ = fs::remove_file(&temporary);
+    renamed.map_err(|error| match Errno::from_io_error(&error) {
+        Some(Errno::NOSPC) => memory_failure(&format!("no room for {}: 16 bytes", path.display())),
         _ => Failure::new(Kind::Failed, format!("{}: {error}", path.display()), "scanhub doctor --clean"),
     })
 }
 
 fn node_counter_path(prefix: &str) -> PathBuf {
-    Path::new(SHARED_MEMORY).join(format!("{prefix}{NODE_COUNTER_NAME}"))
+    Path::new(SHARED_MEMORY_DIRECTORY).join(format!("{prefix}{NODE_COUNTER_NAME}"))
 }
 
 /// Name with the hash of a type, as iceoryx2 0.10.0 computes it (`DynamicStorageConfiguration::path_for_with_type`).
@@ -286,8 +288,8 @@ const NODE_COUNTER_CONTENT: [u8; 16] = {
 /// Name of the prefix's file in the domain's directory.
 const PREFIX_FILE: &str = "prefix";
 /// Length of the random word: 60 million words.
-const RANDOM_LETTERS: usize = 5;
-const LETTERS: &[u8] = b"0123456789abcdefghijklmnopqrstuvwxyz";
+const RANDOM_WORD_LEN: usize = 5;
+const ALPHABET: &[u8] = b"0123456789abcdefghijklmnopqrstuvwxyz";
 const MAX_PREFIX_FILE_BYTES: u64 = 64;
 /// Number of random words to try. If all are taken, this is not by chance.
 const MAX_ATTEMPTS: usize = 16;
@@ -352,7 +354,7 @@ mod tests {
         let base = tempfile::tempdir().unwrap();
         let root = base.path().join("a-1");
         assert_eq!(prefix_of(&root), Ok(None), "there is no such directory");
-        let ensure_prefix = |root: &Path| ensure_prefix(root, &MakingLock::wait(root).unwrap());
+        let ensure_prefix = |root: &Path| ensure_prefix(root, &ServiceCreationLock::wait(root).unwrap());
         let first = ensure_prefix(&root).unwrap();
         assert!(first.starts_with("sh_a-1_") && first.len() == 13, "{first}");
         assert_eq!((ensure_prefix(&root), prefix_of(&root)), (Ok(first.clone()), Ok(Some(first.clone()))));

@@ -19,13 +19,13 @@ use iceoryx2::service::builder::{ServiceCreateError, ServiceOpenError};
 use iceoryx2::service::service_name::ServiceName;
 
 use scanhub_schema::limits::TopicLimits;
-use scanhub_schema::{Failure, Kind, Maker, Topic, is_remote, of_service};
+use scanhub_schema::{Failure, Kind, PublisherKind, Topic, is_remote, parse_service_name};
 
-use crate::directory::MakingLock;
+use crate::directory::ServiceCreationLock;
 use crate::domain::Domain;
 use crate::processes::{Node, config};
+use crate::resource_limits;
 use crate::segments::access_failure;
-use crate::shortage;
 
 /// Class of an error.
 pub(crate) enum OpenFailure {
@@ -113,15 +113,15 @@ pub(crate) fn create<T, S: Service>(
     service: &ServiceName,
     make: impl Fn() -> Result<T, OpenFailure>,
 ) -> Result<T, Failure> {
-    let give_up_at = Instant::now() + Duration::from_secs(2);
+    let deadline = Instant::now() + Duration::from_secs(2);
     let root = node.config().global.root_path().to_string();
     loop {
-        let making = MakingLock::wait(Path::new(&root))?;
-        let made = make();
-        drop(making);
-        match made {
+        let lock = ServiceCreationLock::wait(Path::new(&root))?;
+        let created = make();
+        drop(lock);
+        match created {
             Ok(made) => return Ok(made),
-            Err(OpenFailure::Absent) if Instant::now() < give_up_at => sleep(Duration::from_millis(10)),
+            Err(OpenFailure::Absent) if Instant::now() < deadline => sleep(Duration::from_millis(10)),
             Err(failed) => return Err(failure(node, service, failed)),
         }
     }
@@ -147,31 +147,31 @@ where
 ///
 /// # Errors
 ///
-/// Returns the errors of [`published`].
+/// Returns the errors of [`published_topics`].
 pub fn sensors(domain: &Domain) -> Result<Vec<String>, Failure> {
-    sensors_with(domain, |_| true)
+    sensors_with_topic(domain, |_| true)
 }
 
 /// Returns those of [`sensors`] that have a link, here or on another machine. A tracker has no link.
 ///
 /// # Errors
 ///
-/// Returns the errors of [`published`].
+/// Returns the errors of [`published_topics`].
 pub fn links(domain: &Domain) -> Result<Vec<String>, Failure> {
-    sensors_with(domain, |topic| topic.maker() == Maker::Link)
+    sensors_with_topic(domain, |topic| topic.publisher_kind() == PublisherKind::Link)
 }
 
 /// Returns those of [`sensors`] that have zones. A robot's combined verdict is computed from them.
 ///
 /// # Errors
 ///
-/// Returns the errors of [`published`].
+/// Returns the errors of [`published_topics`].
 pub fn sensors_with_zones(domain: &Domain) -> Result<Vec<String>, Failure> {
-    sensors_with(domain, |topic| topic == Topic::Zones)
+    sensors_with_topic(domain, |topic| topic == Topic::Zones)
 }
 
-fn sensors_with(domain: &Domain, is_wanted: impl Fn(Topic) -> bool) -> Result<Vec<String>, Failure> {
-    let topics = published(domain)?.into_iter().filter(|(_, topic)| is_wanted(*topic));
+fn sensors_with_topic(domain: &Domain, is_match: impl Fn(Topic) -> bool) -> Result<Vec<String>, Failure> {
+    let topics = published_topics(domain)?.into_iter().filter(|(_, topic)| is_match(*topic));
     let mut sensors: Vec<String> = topics.map(|(sensor, _)| sensor).collect();
     sensors.dedup();
     Ok(sensors)
@@ -183,11 +183,11 @@ fn sensors_with(domain: &Domain, is_wanted: impl Fn(Topic) -> bool) -> Result<Ve
 /// # Errors
 ///
 /// Returns [`Kind::Failed`] with owner, mode and remedy if the directory belongs to another user.
-pub fn published(domain: &Domain) -> Result<Vec<(String, Topic)>, Failure> {
+pub fn published_topics(domain: &Domain) -> Result<Vec<(String, Topic)>, Failure> {
     let mut topics = Vec::new();
     let Some(config) = config(domain.root())? else { return Ok(topics) };
     let listed = LocalService::list(&config, |service| {
-        if let Some((sensor, Some(topic))) = of_service(service.static_details.name().as_str()) {
+        if let Some((sensor, Some(topic))) = parse_service_name(service.static_details.name().as_str()) {
             topics.push((sensor.to_owned(), topic));
         }
         CallbackProgression::Continue
@@ -198,7 +198,7 @@ pub fn published(domain: &Domain) -> Result<Vec<(String, Topic)>, Failure> {
 }
 
 /// Returns the failure for a publisher that cannot be created.
-pub(crate) fn no_publisher(service: &ServiceName, error: PublisherCreateError) -> Failure {
+pub(crate) fn publisher_failure(service: &ServiceName, error: PublisherCreateError) -> Failure {
     match error {
         PublisherCreateError::ExceedsMaxSupportedPublishers => Failure::new(
             Kind::DomainHeld,
@@ -206,53 +206,53 @@ pub(crate) fn no_publisher(service: &ServiceName, error: PublisherCreateError) -
             "stop the other hub, or choose another --domain",
         ),
         PublisherCreateError::UnableToCreateDataSegment => Failure::new(
-            Kind::Short,
+            Kind::ResourceExhausted,
             format!("no shared memory for {service}"),
             "free some of /dev/shm and file descriptors",
         ),
-        other => no_port(service, &other),
+        other => port_failure(service, &other),
     }
 }
 
 /// Returns the failure if all `limit` places for subscribers of the topic `service` are taken.
-pub(crate) fn no_place(service: &ServiceName, limit: usize) -> Failure {
-    let (start, key) = match of_service(service.as_str()) {
+pub(crate) fn subscribers_full(service: &ServiceName, limit: usize) -> Failure {
+    let (start, key) = match parse_service_name(service.as_str()) {
         Some((sensor, _)) if is_remote(sensor) => ("start what publishes it", "--subscribers"),
         _ => ("configure the hub", "limits.subscribers"),
     };
-    let most = TopicLimits::SUBSCRIBERS.end();
+    let max = TopicLimits::SUBSCRIBERS.end();
     let hint = format!(
-        "{start} with a greater {key}, up to {most}, or stop some; the places of those that crashed are free again within \
+        "{start} with a greater {key}, up to {max}, or stop some; the places of those that crashed are free again within \
          seconds"
     );
-    Failure { hint, ..full(service, limit) }
+    Failure { hint, ..clients_full(service, limit) }
 }
 
 /// Returns the failure if all `limit` places for subscribers or clients of `service` are taken.
-pub(crate) fn full(service: &ServiceName, limit: usize) -> Failure {
+pub(crate) fn clients_full(service: &ServiceName, limit: usize) -> Failure {
     Failure::new(
-        Kind::Short,
+        Kind::ResourceExhausted,
         format!("{service} has {limit} subscribers, the most that are possible"),
         "stop some of them; the places of those that crashed are free again within seconds",
     )
 }
 
 /// Returns the failure for any other port that cannot be created. As a rule, descriptors or places are short.
-pub(crate) fn no_port(service: &ServiceName, error: &dyn Debug) -> Failure {
-    shortage::found(Path::new(shortage::SHARED_MEMORY)).unwrap_or_else(|| {
+pub(crate) fn port_failure(service: &ServiceName, error: &dyn Debug) -> Failure {
+    resource_limits::find_shortage(Path::new(resource_limits::SHARED_MEMORY_DIRECTORY)).unwrap_or_else(|| {
         let hint = "too many subscribers, or `ulimit -n` is too small: about 4 descriptors for each";
-        Failure::new(Kind::Short, format!("no port at {service}: {error:?}"), hint)
+        Failure::new(Kind::ResourceExhausted, format!("no port at {service}: {error:?}"), hint)
     })
 }
 
-fn failure<S: Service>(node: &Node<S>, service: &ServiceName, failed: OpenFailure) -> Failure {
+fn failure<S: Service>(node: &Node<S>, service: &ServiceName, error: OpenFailure) -> Failure {
     let in_domain = |what: &str| {
         let root = node.config().global.root_path().to_string();
         access_failure(Path::new(&root), format!("{service}: {what}"))
     };
-    match failed {
+    match error {
         OpenFailure::Full => Failure::new(
-            Kind::Short,
+            Kind::ResourceExhausted,
             format!("{service} has no place for another process"),
             "stop some subscribers",
         ),

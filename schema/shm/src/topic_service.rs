@@ -18,12 +18,12 @@ use iceoryx2::service::builder::publish_subscribe::{
 use iceoryx2::service::port_factory::publish_subscribe;
 
 use scanhub_schema::limits::TopicLimits;
-use scanhub_schema::{Failure, Header, Kind, TelegramBytes, Topic, limits, of_service};
+use scanhub_schema::{Failure, Header, Kind, TelegramBytes, Topic, limits, parse_service_name};
 
-use crate::doorbell::note_attached;
+use crate::doorbell::count_attached;
 use crate::processes::Node;
-use crate::service::{OpenFailure, create, name, no_place, no_port, no_publisher, open};
-use crate::shortage::check_client;
+use crate::resource_limits::check_client;
+use crate::service::{OpenFailure, create, name, open, port_failure, publisher_failure, subscribers_full};
 
 /// A topic of one sensor.
 pub type TopicService<P, S = LocalService> =
@@ -50,7 +50,7 @@ pub trait Payload: sealed::Sealed + Debug + 'static {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`] if memory or descriptors are short, and [`Kind::Incompatible`] if it exists with another
+    /// Returns [`Kind::ResourceExhausted`] if memory or descriptors are short, and [`Kind::Incompatible`] if it exists with another
     /// layout.
     fn create<S: Service>(
         node: &Node<S>,
@@ -62,7 +62,7 @@ pub trait Payload: sealed::Sealed + Debug + 'static {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`] if memory or descriptors are short, and [`Kind::Incompatible`] if it has another layout.
+    /// Returns [`Kind::ResourceExhausted`] if memory or descriptors are short, and [`Kind::Incompatible`] if it has another layout.
     fn open<S: Service>(node: &Node<S>, sensor: &str) -> Result<Option<TopicService<Self, S>>, Failure>;
 
     /// Returns the publisher of a topic, with memory for the longest samples that `limits` allow.
@@ -79,7 +79,7 @@ pub trait Payload: sealed::Sealed + Debug + 'static {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`] if memory, descriptors or places for subscribers are short.
+    /// Returns [`Kind::ResourceExhausted`] if memory, descriptors or places for subscribers are short.
     fn subscriber<S: Service>(
         node: &Node<S>,
         topic: &TopicService<Self, S>,
@@ -89,7 +89,7 @@ pub trait Payload: sealed::Sealed + Debug + 'static {
     ///
     /// # Errors
     ///
-    /// Returns [`ReceiveError::ExceedsMaxBorrows`] if [`limits::BORROWED`] samples are held, and
+    /// Returns [`ReceiveError::ExceedsMaxBorrows`] if [`limits::MAX_BORROWED_SAMPLES`] samples are held, and
     /// [`ReceiveError::ConnectionFailure`] if the publisher's memory cannot be mapped.
     fn receive<S: Service>(subscriber: &Subscriber<Self, S>)
     -> Result<Option<Sample<Self, S>>, ReceiveError>;
@@ -145,12 +145,12 @@ macro_rules! payload {
                         builder.user_header::<Header>()
                     };
                     let made = builder()
-                        .max_publishers(limits::PUBLISHERS)
+                        .max_publishers(limits::MAX_PUBLISHERS)
                         .max_subscribers(limits.subscribers)
-                        .max_nodes(limits::NODES)
-                        .subscriber_max_buffer_size(limits::buffer($topic))
-                        .subscriber_max_borrowed_samples(limits::BORROWED)
-                        .history_size(limits::history($topic))
+                        .max_nodes(limits::MAX_NODES)
+                        .subscriber_max_buffer_size(limits::queue_len($topic))
+                        .subscriber_max_borrowed_samples(limits::MAX_BORROWED_SAMPLES)
+                        .history_size(limits::history_len($topic))
                         .enable_safe_overflow(true)
                         .open_or_create_with_attributes(&revision);
                     match made {
@@ -175,12 +175,12 @@ macro_rules! payload {
                 topic: &TopicService<Self, S>,
                 $limits: &TopicLimits,
             ) -> Result<Publisher<Self, S>, Failure> {
-                let samples = limits::samples($topic, places::<Self, S>(topic));
+                let samples = limits::sample_count($topic, subscriber_capacity::<Self, S>(topic));
                 let $builder = topic
                     .publisher_builder()
-                    .max_loaned_samples(limits::LOANED)
+                    .max_loaned_samples(limits::MAX_LOANED_SAMPLES)
                     .override_sample_preallocation(move |_| samples);
-                $sized.create().map_err(|error| no_publisher(topic.name(), error))
+                $sized.create().map_err(|error| publisher_failure(topic.name(), error))
             }
 
             fn subscriber<S: Service>(
@@ -190,12 +190,12 @@ macro_rules! payload {
                 check_client()?;
                 let subscriber = topic.subscriber_builder().create().map_err(|error| match error {
                     SubscriberCreateError::ExceedsMaxSupportedSubscribers => {
-                        no_place(topic.name(), places::<Self, S>(topic))
+                        subscribers_full(topic.name(), subscriber_capacity::<Self, S>(topic))
                     }
-                    other => no_port(topic.name(), &other),
+                    other => port_failure(topic.name(), &other),
                 })?;
-                if let Some((sensor, _)) = of_service(topic.name().as_str()) {
-                    note_attached(node, sensor);
+                if let Some((sensor, _)) = parse_service_name(topic.name().as_str()) {
+                    count_attached(node, sensor);
                 }
                 Ok(subscriber)
             }
@@ -256,7 +256,7 @@ macro_rules! payloads {
             scanhub_schema::$payload, Topic::$topic, [scanhub_schema::$word], len,
             Box<scanhub_schema::$payload>, scanhub_schema::$payload::zeroed(len),
             |builder, limits| {
-                let longest = Topic::$topic.longest(limits);
+                let longest = Topic::$topic.max_payload_len(limits);
                 builder.initial_max_slice_len(scanhub_schema::$payload::words(longest))
             },
             |publisher| publisher.loan_slice(scanhub_schema::$payload::words(len)),
@@ -291,28 +291,28 @@ payload!(
 );
 
 /// Returns the number of places for subscribers that `topic` was created with.
-pub fn places<P: Payload + ?Sized, S: Service>(topic: &TopicService<P, S>) -> usize {
+pub fn subscriber_capacity<P: Payload + ?Sized, S: Service>(topic: &TopicService<P, S>) -> usize {
     topic.static_config().max_subscribers()
 }
 
 /// Returns the payload's revision that the publisher wrote into the `attributes` of a service; 0 if there is none.
 pub fn payload_revision(attributes: &AttributeSet) -> u32 {
-    let revision = attributes.iter().find(|attribute| attribute.key().as_bytes() == REVISION.as_bytes());
+    let revision = attributes.iter().find(|attribute| attribute.key().as_bytes() == REVISION_KEY.as_bytes());
     revision.and_then(|attribute| attribute.value().to_string().parse().ok()).unwrap_or_default()
 }
 
-const REVISION: &str = "revision";
+const REVISION_KEY: &str = "revision";
 
 fn revision(topic: Topic) -> Result<AttributeVerifier, Failure> {
     let impossible = |_| Failure::new(Kind::Failed, "the payload's revision is no attribute", "");
     let value = topic.revision().to_string();
-    let key = REVISION.try_into().map_err(|_| impossible(()))?;
+    let key = REVISION_KEY.try_into().map_err(|_| impossible(()))?;
     let value = value.as_str().try_into().map_err(|_| impossible(()))?;
     AttributeVerifier::new().require(&key, &value).map_err(|_| impossible(()))
 }
 
 /// Transport of a topic's samples: [`SharedMemory`], or in a simulation the memory of the process.
-pub trait Medium<P: Payload + ?Sized> {
+pub trait SampleTransport<P: Payload + ?Sized> {
     /// A loaned sample.
     type Loan;
 
@@ -353,11 +353,11 @@ pub struct SharedMemory<P: Payload + ?Sized, S: Service = LocalService> {
 
 impl<P: Payload + ?Sized, S: Service> SharedMemory<P, S> {
     /// Creates the topic of `sensor` with payload `P` and `limits`, or takes over the topic of a dead process. The
-    /// [`Waker`](crate::Waker) of the sensor must exist before.
+    /// [`WakeSender`](crate::WakeSender) of the sensor must exist before.
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::DomainHeld`] if another process publishes the topic, [`Kind::Short`] if memory or descriptors
+    /// Returns [`Kind::DomainHeld`] if another process publishes the topic, [`Kind::ResourceExhausted`] if memory or descriptors
     /// are short, and [`Kind::Incompatible`] if the topic exists with another layout.
     pub fn new(node: &Node<S>, sensor: &str, limits: &TopicLimits) -> Result<Self, Failure> {
         let service = P::create(node, sensor, limits)?;
@@ -366,12 +366,12 @@ impl<P: Payload + ?Sized, S: Service> SharedMemory<P, S> {
 
     /// Returns the number of places for subscribers. A topic that was taken over may have another number than its
     /// limits.
-    pub fn places(&self) -> usize {
-        places::<P, S>(&self.service)
+    pub fn subscriber_capacity(&self) -> usize {
+        subscriber_capacity::<P, S>(&self.service)
     }
 }
 
-impl<P: Payload + ?Sized, S: Service> Medium<P> for SharedMemory<P, S> {
+impl<P: Payload + ?Sized, S: Service> SampleTransport<P> for SharedMemory<P, S> {
     type Loan = SampleMut<P, S>;
 
     fn subscribers(&self) -> usize {
@@ -400,27 +400,27 @@ impl<P: Payload + ?Sized, S: Service> Medium<P> for SharedMemory<P, S> {
 /// before they could be sent.
 #[derive(Debug)]
 pub struct TopicPublisher<P: Payload + ?Sized, M = SharedMemory<P>> {
-    medium: M,
+    transport: M,
     next: u64,
     failed: u64,
     payload: PhantomData<fn(&P)>,
 }
 
 impl<P: Payload + ?Sized, S: Service> TopicPublisher<P, SharedMemory<P, S>> {
-    /// Creates a publisher into shared memory. Otherwise the same as [`over`](TopicPublisher::over).
+    /// Creates a publisher into shared memory. Otherwise the same as [`with_transport`](TopicPublisher::with_transport).
     ///
     /// # Errors
     ///
     /// Returns the errors of [`SharedMemory::new`].
     pub fn new(node: &Node<S>, sensor: &str, limits: &TopicLimits) -> Result<Self, Failure> {
-        SharedMemory::new(node, sensor, limits).map(TopicPublisher::over)
+        SharedMemory::new(node, sensor, limits).map(TopicPublisher::with_transport)
     }
 }
 
-impl<P: Payload + ?Sized, M: Medium<P>> TopicPublisher<P, M> {
-    /// Creates a publisher over `medium`. The first sample has number 0.
-    pub fn over(medium: M) -> Self {
-        TopicPublisher { medium, next: 0, failed: 0, payload: PhantomData }
+impl<P: Payload + ?Sized, M: SampleTransport<P>> TopicPublisher<P, M> {
+    /// Creates a publisher over `transport`. The first sample has number 0.
+    pub fn with_transport(transport: M) -> Self {
+        TopicPublisher { transport, next: 0, failed: 0, payload: PhantomData }
     }
 
     /// Returns the number of the next sample.
@@ -429,13 +429,13 @@ impl<P: Payload + ?Sized, M: Medium<P>> TopicPublisher<P, M> {
     }
 
     /// Skips `count` numbers, so that subscribers count `count` missing samples.
-    pub fn skip(&mut self, count: u64) {
+    pub fn skip_numbers(&mut self, count: u64) {
         self.next += count;
     }
 
     /// Returns the number of subscribers of the topic.
     pub fn subscribers(&self) -> usize {
-        self.medium.subscribers()
+        self.transport.subscribers()
     }
 
     /// Connects new subscribers, and sends them the history of the topic. A subscriber that cannot be connected is
@@ -445,7 +445,7 @@ impl<P: Payload + ?Sized, M: Medium<P>> TopicPublisher<P, M> {
     ///
     /// Returns the reason why one of them could not be connected.
     pub fn connect(&self) -> Result<(), impl Debug + use<P, M>> {
-        self.medium.connect()
+        self.transport.connect()
     }
 
     /// Returns the number of samples that were not sent for lack of memory.
@@ -459,9 +459,9 @@ impl<P: Payload + ?Sized, M: Medium<P>> TopicPublisher<P, M> {
     /// # Errors
     ///
     /// Returns the library's error if there is no memory, or if bytes are longer than
-    /// [`Telegram::MAX`](scanhub_schema::Telegram::MAX).
+    /// [`Telegram::MAX`](scanhub_schema::Telegram::MAX_LEN).
     pub fn loan(&self, len: usize) -> Result<M::Loan, LoanError> {
-        self.medium.loan(len)
+        self.transport.loan(len)
     }
 
     /// Sends `loan` with `header` and the next number of the topic. Returns the number of subscribers that received it.
@@ -472,11 +472,11 @@ impl<P: Payload + ?Sized, M: Medium<P>> TopicPublisher<P, M> {
     pub fn send_loan(&mut self, loan: M::Loan, header: &Header) -> Result<usize, SendError> {
         let header = Header { topic_seq: self.next, ..*header };
         self.next += 1;
-        self.medium.send(loan, &header).inspect_err(|_| self.failed += 1)
+        self.transport.send(loan, &header).inspect_err(|_| self.failed += 1)
     }
 
     /// Uses a number for a sample that there is no memory for.
-    pub fn fail(&mut self) {
+    pub fn count_failed(&mut self) {
         self.next += 1;
         self.failed += 1;
     }
@@ -486,7 +486,7 @@ impl<P: Payload + ?Sized, M: Medium<P>> TopicPublisher<P, M> {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`] if there is no memory for it, or if it is longer than the topic was created for. Its
+    /// Returns [`Kind::ResourceExhausted`] if there is no memory for it, or if it is longer than the topic was created for. Its
     /// number is then used.
     pub fn send_len(
         &mut self,
@@ -495,39 +495,39 @@ impl<P: Payload + ?Sized, M: Medium<P>> TopicPublisher<P, M> {
         fill: impl FnOnce(&mut P),
     ) -> Result<usize, Failure> {
         let mut loan = self.loan(len).map_err(|error| {
-            self.fail();
-            short(P::TOPIC, &error)
+            self.count_failed();
+            send_failure(P::TOPIC, &error)
         })?;
         fill(M::payload_mut(&mut loan));
-        self.send_loan(loan, header).map_err(|error| short(P::TOPIC, &error))
+        self.send_loan(loan, header).map_err(|error| send_failure(P::TOPIC, &error))
     }
 }
 
-impl<P: Payload, M: Medium<P>> TopicPublisher<P, M> {
+impl<P: Payload, M: SampleTransport<P>> TopicPublisher<P, M> {
     /// Sends a sample that `fill` writes in place, starting with a default payload. Otherwise the same as
     /// [`send_loan`](TopicPublisher::send_loan).
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`] if there is no memory for it. Its number is then used.
+    /// Returns [`Kind::ResourceExhausted`] if there is no memory for it. Its number is then used.
     pub fn send(&mut self, header: &Header, fill: impl FnOnce(&mut P)) -> Result<usize, Failure> {
         self.send_len(header, 0, fill)
     }
 }
 
-impl<M: Medium<[u8]>> TopicPublisher<[u8], M> {
+impl<M: SampleTransport<[u8]>> TopicPublisher<[u8], M> {
     /// Sends `bytes` as a sample. Otherwise the same as [`send`](TopicPublisher::send).
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`] if there is no memory for it, or if it is longer than
-    /// [`Telegram::MAX`](scanhub_schema::Telegram::MAX).
+    /// Returns [`Kind::ResourceExhausted`] if there is no memory for it, or if it is longer than
+    /// [`Telegram::MAX`](scanhub_schema::Telegram::MAX_LEN).
     pub fn send_bytes(&mut self, header: &Header, bytes: &[u8]) -> Result<usize, Failure> {
         self.send_len(header, bytes.len(), |sample| sample.copy_from_slice(bytes))
     }
 }
 
-fn short(topic: Topic, error: &dyn Debug) -> Failure {
+fn send_failure(topic: Topic, error: &dyn Debug) -> Failure {
     let what = format!("a sample of {} was not sent: {error:?}", topic.name());
-    Failure::new(Kind::Short, what, "drop samples that are held, or free some of /dev/shm")
+    Failure::new(Kind::ResourceExhausted, what, "drop samples that are held, or free some of /dev/shm")
 }

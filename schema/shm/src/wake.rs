@@ -17,12 +17,12 @@ use iceoryx2::service::port_factory::event;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 
-use scanhub_schema::{Failure, Kind, Ring, Topic, Wake, limits, of_service};
+use scanhub_schema::{DoorbellWord, Failure, Kind, Topic, WakeEvent, limits, parse_service_name};
 
-use crate::doorbell::{DoorbellRinger, note_attached};
+use crate::doorbell::{DoorbellRinger, count_attached};
 use crate::processes::Node;
-use crate::service::{OpenFailure, create, full, name, no_port, open};
-use crate::shortage::check_client;
+use crate::resource_limits::check_client;
+use crate::service::{OpenFailure, clients_full, create, name, open, port_failure};
 
 /// Event service that wakes the subscribers of one sensor.
 pub type WakeService<S = LocalService> = event::PortFactory<S>;
@@ -31,30 +31,30 @@ pub type Notifier<S = LocalService> = port::notifier::Notifier<S>;
 /// Sleeps until it is woken.
 pub type Listener<S = LocalService> = port::listener::Listener<S>;
 
-/// The hub's end. It wakes subscribers with [`Wake::HubUp`] when it is created, and with [`Wake::HubDown`] when it is
+/// The hub's end. It wakes subscribers with [`WakeEvent::HubUp`] when it is created, and with [`WakeEvent::HubDown`] when it is
 /// dropped.
-pub struct Waker<S: Service = LocalService> {
+pub struct WakeSender<S: Service = LocalService> {
     ringer: DoorbellRinger,
     notifier: Notifier<S>,
     service: WakeService<S>,
 }
 
-impl<S: Service> Waker<S> {
+impl<S: Service> WakeSender<S> {
     /// Creates the waker of `sensor`. Create it before the sensor's topics, because a subscriber that finds a topic
     /// sleeps at it.
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`] if memory is short, and [`Kind::Incompatible`] if the service has another layout.
-    pub fn new(node: &Node<S>, sensor: &str) -> Result<Waker<S>, Failure> {
-        let ringer = DoorbellRinger::hang(node, sensor)?;
+    /// Returns [`Kind::ResourceExhausted`] if memory is short, and [`Kind::Incompatible`] if the service has another layout.
+    pub fn new(node: &Node<S>, sensor: &str) -> Result<WakeSender<S>, Failure> {
+        let ringer = DoorbellRinger::open_or_create(node, sensor)?;
         let service = create_service(node, sensor)?;
-        Ok(Waker { ringer, notifier: notifier(&service, Wake::Telegram as usize)?, service })
+        Ok(WakeSender { ringer, notifier: notifier(&service, WakeEvent::Telegram as usize)?, service })
     }
 
     /// Wakes all threads that sleep at the doorbell word `ring`, with one system call.
-    pub fn ring(&self, ring: Ring) {
-        self.ringer.ring(ring);
+    pub fn ring(&self, word: DoorbellWord) {
+        self.ringer.ring(word);
     }
 
     /// Returns a number that changes when a subscriber or listener of the sensor attaches by a library of this project.
@@ -73,12 +73,13 @@ impl<S: Service> Waker<S> {
     /// # Errors
     ///
     /// Returns [`Kind::Failed`] if it could not be sent to some of them.
-    pub fn tell(&self, why: Wake) -> Result<(), Failure> {
+    pub fn notify(&self, event: WakeEvent) -> Result<(), Failure> {
         if !self.has_listeners() {
             return Ok(());
         }
-        let told = self.notifier.notify_with_custom_event_id(EventId::new(why as usize));
-        told.map(|_| ())
+        let notified = self.notifier.notify_with_custom_event_id(EventId::new(event as usize));
+        notified
+            .map(|_| ())
             .map_err(|error| Failure::new(Kind::Failed, format!("cannot wake consumers: {error:?}"), ""))
     }
 
@@ -86,10 +87,10 @@ impl<S: Service> Waker<S> {
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`tell`](Waker::tell).
-    pub fn wake(&self, why: Wake) -> Result<(), Failure> {
-        Ring::ALL.into_iter().for_each(|ring| self.ring(ring));
-        self.tell(why)
+    /// Returns the errors of [`notify`](WakeSender::notify).
+    pub fn wake(&self, event: WakeEvent) -> Result<(), Failure> {
+        DoorbellWord::ALL.into_iter().for_each(|word| self.ring(word));
+        self.notify(event)
     }
 
     /// Returns the event service.
@@ -100,32 +101,32 @@ impl<S: Service> Waker<S> {
 
 /// Doorbell words to ring: a subscriber has received a sample of one of their topics since they were last rung.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct DueRings([bool; Ring::ALL.len()]);
+pub struct PendingWakeups([bool; DoorbellWord::ALL.len()]);
 
-impl DueRings {
+impl PendingWakeups {
     /// Records that `reached` subscribers received a sample of `topic`.
-    pub fn note(&mut self, topic: Topic, reached: usize) {
-        self.0[topic.row().ring as usize] |= reached > 0;
+    pub fn note_sample(&mut self, topic: Topic, receivers: usize) {
+        self.0[topic.spec().doorbell_word as usize] |= receivers > 0;
     }
 
     /// Returns whether `ring` must be rung, and records it as rung.
-    pub fn take(&mut self, ring: Ring) -> bool {
-        std::mem::take(&mut self.0[ring as usize])
+    pub fn take_due(&mut self, word: DoorbellWord) -> bool {
+        std::mem::take(&mut self.0[word as usize])
     }
 }
 
 fn create_service<S: Service>(node: &Node<S>, sensor: &str) -> Result<WakeService<S>, Failure> {
-    let service = name(&Wake::service(sensor))?;
+    let service = name(&WakeEvent::service(sensor))?;
     create(node, &service, || {
         let builder = node.service_builder(&service).event();
         builder
-            .max_notifiers(limits::NOTIFIERS)
-            .max_listeners(limits::LISTENERS)
-            .max_nodes(limits::NODES)
-            .event_id_max_value(limits::EVENT_ID)
-            .notifier_created_event(EventId::new(Wake::HubUp as usize))
-            .notifier_dropped_event(EventId::new(Wake::HubDown as usize))
-            .notifier_dead_event(EventId::new(Wake::HubDown as usize))
+            .max_notifiers(limits::MAX_NOTIFIERS)
+            .max_listeners(limits::MAX_LISTENERS)
+            .max_nodes(limits::MAX_NODES)
+            .event_id_max_value(limits::MAX_EVENT_ID)
+            .notifier_created_event(EventId::new(WakeEvent::HubUp as usize))
+            .notifier_dropped_event(EventId::new(WakeEvent::HubDown as usize))
+            .notifier_dead_event(EventId::new(WakeEvent::HubDown as usize))
             .open_or_create()
             .map_err(OpenFailure::from)
     })
@@ -135,10 +136,10 @@ fn create_service<S: Service>(node: &Node<S>, sensor: &str) -> Result<WakeServic
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Short`] if memory or descriptors are short, and [`Kind::Incompatible`] if the service has another
+/// Returns [`Kind::ResourceExhausted`] if memory or descriptors are short, and [`Kind::Incompatible`] if the service has another
 /// layout.
 pub fn open_wake<S: Service>(node: &Node<S>, sensor: &str) -> Result<Option<WakeService<S>>, Failure> {
-    open_event(node, &Wake::service(sensor))
+    open_event(node, &WakeEvent::service(sensor))
 }
 
 /// Returns the event service `service`; `None` if it does not exist.
@@ -153,18 +154,18 @@ pub(crate) fn open_event<S: Service>(
 /// Returns a notifier of the event whose default event ID is `event`.
 pub(crate) fn notifier<S: Service>(service: &WakeService<S>, event: usize) -> Result<Notifier<S>, Failure> {
     let builder = service.notifier_builder().default_event_id(EventId::new(event));
-    builder.create().map_err(|error| no_port(service.name(), &error))
+    builder.create().map_err(|error| port_failure(service.name(), &error))
 }
 
 /// Returns a listener of the event of a sensor, and announces it to the hub, which notifies it from the next event on.
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Short`] if memory, descriptors or places for subscribers are short.
+/// Returns [`Kind::ResourceExhausted`] if memory, descriptors or places for subscribers are short.
 pub fn listener<S: Service>(node: &Node<S>, wake: &WakeService<S>) -> Result<Listener<S>, Failure> {
     let listener = create_listener(wake)?;
-    if let Some((sensor, _)) = of_service(wake.name().as_str()) {
-        note_attached(node, sensor);
+    if let Some((sensor, _)) = parse_service_name(wake.name().as_str()) {
+        count_attached(node, sensor);
     }
     Ok(listener)
 }
@@ -173,8 +174,8 @@ pub fn listener<S: Service>(node: &Node<S>, wake: &WakeService<S>) -> Result<Lis
 pub(crate) fn create_listener<S: Service>(wake: &WakeService<S>) -> Result<Listener<S>, Failure> {
     check_client()?;
     wake.listener_builder().create().map_err(|error| match error {
-        ListenerCreateError::ExceedsMaxSupportedListeners => full(wake.name(), limits::LISTENERS),
-        other => no_port(wake.name(), &other),
+        ListenerCreateError::ExceedsMaxSupportedListeners => clients_full(wake.name(), limits::MAX_LISTENERS),
+        other => port_failure(wake.name(), &other),
     })
 }
 
@@ -183,7 +184,7 @@ pub(crate) fn create_listener<S: Service>(wake: &WakeService<S>) -> Result<Liste
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Short`] if the system cannot wait.
+/// Returns [`Kind::ResourceExhausted`] if the system cannot wait.
 pub fn sleep<S: Service>(listeners: &[&Listener<S>], timeout: Duration) -> Result<(), Failure>
 where
     Listener<S>: FileDescriptorBased,
@@ -195,7 +196,7 @@ where
     let timeout = Timespec { tv_sec: timeout.as_secs() as i64, tv_nsec: i64::from(timeout.subsec_nanos()) };
     match poll(&mut fds, Some(&timeout)) {
         Ok(_) | Err(Errno::INTR) => Ok(()),
-        Err(error) => Err(broken(&error)),
+        Err(error) => Err(wait_failure(&error)),
     }
 }
 
@@ -214,18 +215,22 @@ where
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Short`] if a listener does not work.
+/// Returns [`Kind::ResourceExhausted`] if a listener does not work.
 pub fn take_wakeups<S: Service>(listeners: &[&Listener<S>]) -> Result<bool, Failure> {
     let mut any = false;
     for listener in listeners {
         match listener.try_wait(|_| any = true) {
             Ok(_) | Err(ListenerWaitError::InterruptSignal) => {}
-            Err(error) => return Err(broken(&error)),
+            Err(error) => return Err(wait_failure(&error)),
         }
     }
     Ok(any)
 }
 
-fn broken(error: &dyn std::fmt::Debug) -> Failure {
-    Failure::new(Kind::Short, format!("cannot wait for the hub: {error:?}"), "`ulimit -n` may be too small")
+fn wait_failure(error: &dyn std::fmt::Debug) -> Failure {
+    Failure::new(
+        Kind::ResourceExhausted,
+        format!("cannot wait for the hub: {error:?}"),
+        "`ulimit -n` may be too small",
+    )
 }

@@ -1,6 +1,6 @@
 //! What a datagram says, in the words of the list of golden datagrams.
 
-use scanhub_schema::datagram::{Announce, Datagram, MTU_SAFE, Packed};
+use scanhub_schema::datagram::{Announce, Datagram, DatagramPayload, MTU_SAFE};
 use scanhub_schema::{
     Background, Cloud, Code, Early, Event, Family, Foreground, Lines, MAX_BEAMS, Marks, Motion, Obstacle,
     Obstacles, Scan, Status, Tilt, Topic, Tracks, Zones,
@@ -43,7 +43,7 @@ pub(crate) fn payload(datagram: &Datagram<'_>) -> Value {
     }
 }
 
-fn unpacked<T: Packed + ?Sized>(mut value: Box<T>, payload: &[u8]) -> Box<T> {
+fn unpacked<T: DatagramPayload + ?Sized>(mut value: Box<T>, payload: &[u8]) -> Box<T> {
     assert!(value.unpack(payload));
     value
 }
@@ -111,7 +111,7 @@ fn motion(motion: &Motion) -> Value {
     json!({
         "x_m": motion.x_m, "y_m": motion.y_m, "yaw_rad": motion.yaw_rad, "dx_m": motion.dx_m, "dy_m": motion.dy_m,
         "dyaw_rad": motion.dyaw_rad, "covariance": motion.covariance, "overlap": motion.overlap,
-        "method": motion.how().name(), "valid": motion.has_valid_pose(), "degenerate": motion.is_degenerate(), "refused_steps": motion.refused_steps,
+        "method": motion.method().name(), "valid": motion.has_valid_pose(), "degenerate": motion.is_degenerate(), "refused_steps": motion.refused_steps,
         "pose_covariance": motion.pose_covariance,
     })
 }
@@ -218,7 +218,7 @@ fn background(model: &Background) -> Value {
 
 fn status(status: &Status) -> Value {
     let counters: Map<String, Value> =
-        status.counters.named().map(|(name, count)| (name.to_owned(), count.into())).collect();
+        status.counters.named_values().map(|(name, count)| (name.to_owned(), count.into())).collect();
     let pose = status.pose;
     json!({
         "state": status.state().map(|state| state.name()), "mode": status.mode, "unit_mm": status.unit_mm,

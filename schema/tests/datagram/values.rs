@@ -1,19 +1,19 @@
 //! Values of the golden datagrams.
 
 use bytemuck::Zeroable;
-use scanhub_schema::datagram::{Announce, Announced, Head, LanFlags, Packed};
+use scanhub_schema::datagram::{Announce, Announced, DatagramPayload, Head, LanFlags};
 use scanhub_schema::{
-    Background, BackgroundHead, COUNTERS, Cloud, CloudHead, CloudPoint, Code, Contents, Corner, Counter,
-    Counters, Early, Event, EventKind, Family, Foreground, ForegroundHead, Line, Lines, Mark, Marks, Motion,
-    MotionMethod, Obstacle, Obstacles, PointClass, Pose, Scan, ScanHead, Segment, State, Status, Tilt, Topic,
-    Track, TrackSensor, TrackState, Tracks, Verdict, Zone, Zones,
+    ArrayFlags, Background, BackgroundHead, Cloud, CloudHead, CloudPoint, Code, Corner, Counter, Counters,
+    Early, Event, EventKind, Family, Foreground, ForegroundHead, Line, Lines, MAX_COUNTERS, Mark, Marks,
+    Motion, MotionMethod, Obstacle, Obstacles, PointClass, Pose, Scan, ScanHead, Segment, State, Status,
+    Tilt, Topic, Track, TrackSensor, TrackState, Tracks, Verdict, Zone, Zones,
 };
 
 /// Name of the file, header, and what writes the payload.
-pub(crate) type Golden = (&'static str, Head, fn(&mut [u8]) -> Option<usize>);
+pub(crate) type GoldenDatagram = (&'static str, Head, fn(&mut [u8]) -> Option<usize>);
 
 /// Those that a gateway of this version sends.
-pub(crate) const ALL: [Golden; 22] = [
+pub(crate) const GOLDEN_DATAGRAMS: [GoldenDatagram; 22] = [
     ("announce", Head { sequence: 7, counter: 0, ..head(None) }, announce),
     ("telegram", Head { sequence: u32::MAX, ..head(Some(Topic::Telegram)) }, telegram),
     ("packets", Head { sequence: 5, family: Family::Ld as u8, ..head(Some(Topic::Telegram)) }, packets),
@@ -26,11 +26,11 @@ pub(crate) const ALL: [Golden; 22] = [
         |room| scan(401, -50_000, 250, 3).pack(room),
     ),
     ("scan_turn", Head { sequence: 3, family: Family::Ld as u8, ..head(Some(Topic::Scan)) }, |room| {
-        turn().pack(room)
+        full_circle_scan().pack(room)
     }),
     ("marks", head(Some(Topic::Marks)), |room| marks().pack(room)),
-    ("zones", ZONES, |room| zones().pack(room)),
-    ("zones_unknown", Head { sequence: 5001, ..ZONES }, |room| {
+    ("zones", ZONES_HEAD, |room| zones().pack(room)),
+    ("zones_unknown", Head { sequence: 5001, ..ZONES_HEAD }, |room| {
         Zones { invalid_beams: 361, flags: Zones::PROVISIONAL, ..Zones::unknown() }.pack(room)
     }),
     ("foreground", head(Some(Topic::Foreground)), |room| foreground().pack(room)),
@@ -44,13 +44,13 @@ pub(crate) const ALL: [Golden; 22] = [
     ),
     ("lines", head(Some(Topic::Lines)), |room| lines().pack(room)),
     ("motion", Head { revision: 2, ..head(Some(Topic::Motion)) }, |room| motion().pack(room)),
-    ("early", head(Some(Topic::Early)), |room| EARLY.pack(room)),
+    ("early", head(Some(Topic::Early)), |room| EARLY_WARNING.pack(room)),
     ("early_withdrawn", head(Some(Topic::Early)), |room| {
-        Early { flags: Early::WITHDRAWN, ..EARLY }.pack(room)
+        Early { flags: Early::WITHDRAWN, ..EARLY_WARNING }.pack(room)
     }),
     ("tracks", head(Some(Topic::Tracks)), |room| tracks().pack(room)),
     ("events", head(Some(Topic::Events)), |room| {
-        Event::new(EventKind::Door, 3, Some("kitchen")).through("left", "hall", "kitchen").pack(room)
+        Event::new(EventKind::Door, 3, Some("kitchen")).with_door("left", "hall", "kitchen").pack(room)
     }),
     ("tilt", head(Some(Topic::Tilt)), |room| Tilt { angle_rad: -0.40625, rate_rad_s: 0.53125 }.pack(room)),
     ("tilt_no_rate", Head { sequence: 2, ..head(Some(Topic::Tilt)) }, |room| {
@@ -96,7 +96,7 @@ fn tracks() -> Tracks {
     tracks
 }
 
-const EARLY: Early = Early {
+const EARLY_WARNING: Early = Early {
     verdict: Verdict::Slow as u8,
     flags: 0,
     beam: 117,
@@ -106,7 +106,7 @@ const EARLY: Early = Early {
 };
 
 /// The header of `zones`.
-pub(crate) const ZONES: Head = Head { sequence: 5000, ..head(Some(Topic::Zones)) };
+pub(crate) const ZONES_HEAD: Head = Head { sequence: 5000, ..head(Some(Topic::Zones)) };
 
 const fn head(topic: Option<Topic>) -> Head {
     Head {
@@ -128,30 +128,30 @@ const fn head(topic: Option<Topic>) -> Head {
     }
 }
 
-const KIND: &str = "LMS200;301063;V02.30";
+const SCANNER_TYPE: &str = "LMS200;301063;V02.30";
 
-fn announce(room: &mut [u8]) -> Option<usize> {
-    let mut announce = Announce::new(0x99AA_BBCC_DDEE_FF00, "front", KIND);
+fn announce(buffer: &mut [u8]) -> Option<usize> {
+    let mut announce = Announce::new(0x99AA_BBCC_DDEE_FF00, "front", SCANNER_TYPE);
     for (topic, next) in [(Topic::Scan, u32::MAX - 1), (Topic::Zones, 5001), (Topic::Status, 3)] {
         let group = scanhub_schema::datagram::group(topic);
         announce.add(Announced { topic: topic.number(), group, port: 22_200, next });
     }
-    announce.pack(room)
+    announce.pack(buffer)
 }
 
 /// The packet that the manual of the LD06 explains, twice.
-fn packets(room: &mut [u8]) -> Option<usize> {
+fn packets(buffer: &mut [u8]) -> Option<usize> {
     const PACKET: [u8; 47] = [
         0x54, 0x2C, 0x68, 0x08, 0xAB, 0x7E, 0xE0, 0x00, 0xE4, 0xDC, 0x00, 0xE2, 0xD9, 0x00, 0xE5, 0xD5, 0x00,
         0xE3, 0xD3, 0x00, 0xE4, 0xD0, 0x00, 0xE9, 0xCD, 0x00, 0xE4, 0xCA, 0x00, 0xE2, 0xC7, 0x00, 0xE9, 0xC5,
         0x00, 0xE5, 0xC2, 0x00, 0xE5, 0xC0, 0x00, 0xE5, 0xBE, 0x82, 0x3A, 0x1A, 0x50,
     ];
-    [PACKET, PACKET].concat().pack(room)
+    [PACKET, PACKET].concat().pack(buffer)
 }
 
-fn telegram(room: &mut [u8]) -> Option<usize> {
+fn telegram(buffer: &mut [u8]) -> Option<usize> {
     let telegram = [0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A];
-    room[..telegram.len()].copy_from_slice(&telegram);
+    buffer[..telegram.len()].copy_from_slice(&telegram);
     Some(telegram.len())
 }
 
@@ -168,7 +168,7 @@ fn scan(count: u16, first_angle_mdeg: i32, step_mdeg: u32, intensity_bits: u8) -
 }
 
 /// Eight bins of a clockwise turn with all arrays: a code in each second, the first of them not measured.
-fn turn() -> Box<Scan> {
+fn full_circle_scan() -> Box<Scan> {
     let head = ScanHead {
         first_angle: -0.375,
         step: -0.75,
@@ -182,7 +182,7 @@ fn turn() -> Box<Scan> {
         collisions: 5,
         family: Family::Ld as u8,
         flags: Scan::INCOMPLETE,
-        contents: Contents::ALL,
+        contents: ArrayFlags::ALL,
         intensity_bits: 16,
         turns: 1,
         ..ScanHead::default()
@@ -349,7 +349,7 @@ fn background() -> Box<Background> {
 }
 
 fn status() -> Status {
-    let mut counters = [0; COUNTERS];
+    let mut counters = [0; MAX_COUNTERS];
     // Those that came later are 0 in it.
     for (i, counter) in counters[..=Counter::LineErrors as usize].iter_mut().enumerate() {
         *counter = 1_000_000_000_000_000 + i as u64;
@@ -367,7 +367,7 @@ fn status() -> Status {
         pose: Pose { x_m: 0.25, y_m: -0.125, yaw_rad: 1.5, upside_down: 1, ..Pose::zeroed() },
         ..Status::default()
     };
-    status.set_sensor_type(KIND);
+    status.set_sensor_type(SCANNER_TYPE);
     status.set_port("/dev/ttyUSB0");
     status.set_last_error("größer");
     status

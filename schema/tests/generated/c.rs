@@ -7,7 +7,7 @@ use scanhub_schema::Topic;
 use super::description::{Description, Field, Kind, Layout, Set, snake};
 use super::{rules, wrap};
 
-const WIDTH: usize = 120;
+const MAX_LINE_WIDTH: usize = 120;
 
 /// Returns the numbers of the topics, the structs, and the constants that their fields can have.
 pub(crate) fn structs(description: &Description) -> String {
@@ -27,12 +27,12 @@ pub(crate) fn structs(description: &Description) -> String {
     let mut written = Vec::new();
     for layout in &description.layouts {
         for set in layout.fields.iter().filter_map(|field| field.set.as_ref()) {
-            if !written.contains(set) && shared(set).is_none() {
+            if !written.contains(set) && shared_prefix(set).is_none() {
                 text += &constants(set, &description.sets[set], layout);
                 written.push(set.clone());
             }
         }
-        text += &one(layout);
+        text += &declaration_of(layout);
     }
     text
 }
@@ -45,7 +45,7 @@ pub(crate) fn type_name(name: &str) -> String {
 /// Returns the start of the names of a set's constants.
 fn prefix(set: &str) -> String {
     let name = match set {
-        "Contents" => "scan".to_owned(),
+        "ArrayFlags" => "scan".to_owned(),
         "Scan" => "scan_flag".to_owned(),
         "Flags" => "flag".to_owned(),
         "Reasons" => "reason".to_owned(),
@@ -60,7 +60,7 @@ fn prefix(set: &str) -> String {
 }
 
 /// Returns the set that already has constants for the values of this one, if there is one.
-fn shared(set: &str) -> Option<&'static str> {
+fn shared_prefix(set: &str) -> Option<&'static str> {
     (set == "Obstacles").then_some("Cloud")
 }
 
@@ -70,28 +70,28 @@ fn constants(name: &str, set: &Set, layout: &Layout) -> String {
         "" => format!("Flags of struct {}.", type_name(&layout.name)),
         doc => doc.to_owned(),
     };
-    let mut text = format!("\n{}", above("", &doc));
+    let mut text = format!("\n{}", comment_above("", &doc));
     if name == "Counter" {
         text += "enum scanhub_counter {\n";
         let last = set.values.last().map(|value| value.number);
         for value in &set.values {
             let comma = if Some(value.number) == last { "" } else { "," };
-            text += &commented(&format!("    {prefix}{}{comma}", value.name.to_uppercase()), &value.doc);
+            text += &with_comment(&format!("    {prefix}{}{comma}", value.name.to_uppercase()), &value.doc);
         }
         return text + "};\n";
     }
     let longest = set.values.iter().map(|value| value.name.len()).max().unwrap_or_default();
     for value in &set.values {
         let name = value.name.to_uppercase();
-        text += &commented(&format!("#define {prefix}{name:<longest$} {}", value.number), &value.doc);
+        text += &with_comment(&format!("#define {prefix}{name:<longest$} {}", value.number), &value.doc);
     }
     text
 }
 
-fn one(layout: &Layout) -> String {
+fn declaration_of(layout: &Layout) -> String {
     let name = type_name(&layout.name);
     let mut doc = layout.doc.clone();
-    let arrays = rules::tail(&layout.name).iter().map(|array| {
+    let arrays = rules::arrays_of(&layout.name).iter().map(|array| {
         let kind = if array.kind.starts_with(char::is_uppercase) {
             format!("struct {}", type_name(array.kind))
         } else {
@@ -104,9 +104,9 @@ fn one(layout: &Layout) -> String {
         doc +=
             &format!(" The arrays that follow: {}. Use the functions below to read them.", arrays.join(", "));
     }
-    let mut text = format!("\n{}struct {name} {{\n", above("", &doc));
+    let mut text = format!("\n{}struct {name} {{\n", comment_above("", &doc));
     for field in &layout.fields {
-        text += &commented(&declaration(field), &comment(field));
+        text += &with_comment(&declaration(field), &comment(field));
     }
     text + "};\n"
 }
@@ -152,31 +152,36 @@ fn comment(field: &Field) -> String {
 }
 
 /// Returns a line with its comment, which is above it if it is too long.
-pub(crate) fn commented(line: &str, comment: &str) -> String {
+pub(crate) fn with_comment(line: &str, comment: &str) -> String {
     let indent = &line[..line.len() - line.trim_start().len()];
-    let beside = format!("{line} /* {comment} */");
+    let on_same_line = format!("{line} /* {comment} */");
     if comment.is_empty() {
         format!("{line}\n")
-    } else if beside.len() <= WIDTH {
-        format!("{beside}\n")
+    } else if on_same_line.len() <= MAX_LINE_WIDTH {
+        format!("{on_same_line}\n")
     } else {
-        above(indent, comment) + line + "\n"
+        comment_above(indent, comment) + line + "\n"
     }
 }
 
 /// Returns a comment in lines of its own.
-pub(crate) fn above(indent: &str, comment: &str) -> String {
+pub(crate) fn comment_above(indent: &str, comment: &str) -> String {
     // Keep the end of the comment on the same line as its text.
-    let lines = wrap(&format!("{indent}/* "), &format!("{indent} * "), &format!("{comment}\u{1}*/"), WIDTH);
+    let lines =
+        wrap(&format!("{indent}/* "), &format!("{indent} * "), &format!("{comment}\u{1}*/"), MAX_LINE_WIDTH);
     lines.replace('\u{1}', " ")
 }
 
 /// Returns the sizes of arrays whose length depends on counts: those of a scan by its contents, and the segments.
 pub(crate) fn arrays(description: &Description) -> String {
-    let segments = rules::tail("Foreground").iter().find(|array| array.kind == "Segment").expect("segments");
-    let ranges =
-        (1 + rules::tail("Scan").iter().filter_map(|array| array.only_if).map(|(_, bit)| bit).sum::<u64>())
-            .next_power_of_two();
+    let segments =
+        rules::arrays_of("Foreground").iter().find(|array| array.kind == "Segment").expect("segments");
+    let ranges = (1 + rules::arrays_of("Scan")
+        .iter()
+        .filter_map(|array| array.only_if)
+        .map(|(_, bit)| bit)
+        .sum::<u64>())
+    .next_power_of_two();
     let mut text = format!(
         "/* Segments that a foreground has room for. */\n#define SCANHUB_FOREGROUND_SEGMENTS {}\n\n\
          /* Stands for the ranges, which every scan has, in addition to the bits of `contents`. */\n\
@@ -185,8 +190,8 @@ pub(crate) fn arrays(description: &Description) -> String {
          static inline size_t scanhub_scan_width(unsigned contents)\n{{\n    return ",
         segments.count
     );
-    let contents = &description.sets["Contents"].values;
-    let widths = rules::tail("Scan").iter().map(|array| {
+    let contents = &description.sets["ArrayFlags"].values;
+    let widths = rules::arrays_of("Scan").iter().map(|array| {
         let name = match array.only_if {
             Some((_, bit)) => {
                 contents.iter().find(|value| value.number == bit).expect("a bit").name.to_uppercase()
@@ -206,7 +211,7 @@ pub(crate) fn checks(description: &Description) -> String {
         let name = type_name(&layout.name);
         writeln!(text, "SCANHUB_SIZE({name}, {});", layout.size).expect("a String");
         for field in &layout.fields {
-            writeln!(text, "SCANHUB_AT({name}, {}, {});", field.name, field.at).expect("a String");
+            writeln!(text, "SCANHUB_AT({name}, {}, {});", field.name, field.offset).expect("a String");
         }
     }
     text

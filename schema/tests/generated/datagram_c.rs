@@ -5,13 +5,13 @@ use std::fmt::Write as _;
 use scanhub_schema::Topic;
 use scanhub_schema::datagram::Announce;
 
-use super::c::{above, commented, number_name};
+use super::c::{comment_above, number_name, with_comment};
 use super::description::{Description, Field, Kind, Layout, snake};
-use super::readers::{self, Check, How, Run, Shown};
+use super::readers::{self, BoundsCheck, FieldSource, FloatRun, ShownField};
 use super::rules;
 
 /// Enums whose values have names in this header, with their names.
-const ENUMS: [(&str, &str, &str); 6] = [
+const ENUM_NAMES: [(&str, &str, &str); 6] = [
     ("Family", "family", ""),
     ("Verdict", "verdict", ""),
     ("MotionMethod", "method", "MOTION_"),
@@ -22,21 +22,22 @@ const ENUMS: [(&str, &str, &str); 6] = [
 
 /// Returns the numbers of topics, and the values of fields.
 pub(crate) fn values(description: &Description) -> String {
-    let mut text = above("", "Topics, and the groups that they are sent to.") + "enum scanhub_topic {\n";
-    text += &commented("    SCANHUB_ANNOUNCE = 0,", &format!("239.255.76.{}", Announce::GROUP));
+    let mut text =
+        comment_above("", "Topics, and the groups that they are sent to.") + "enum scanhub_topic {\n";
+    text += &with_comment("    SCANHUB_ANNOUNCE = 0,", &format!("239.255.76.{}", Announce::GROUP));
     for topic in Topic::ALL {
         let comma = if topic == Topic::ALL[Topic::ALL.len() - 1] { "" } else { "," };
         let line = format!("    SCANHUB_{} = {}{comma}", topic.name().to_uppercase(), topic.number());
-        text += &commented(&line, &format!("239.255.76.{}", topic.row().group));
+        text += &with_comment(&line, &format!("239.255.76.{}", topic.spec().group));
     }
     text += "};\n";
-    for (set, name, prefix) in ENUMS {
+    for (set, name, prefix) in ENUM_NAMES {
         let set = &description.sets[set];
-        write!(text, "\n{}enum scanhub_{name} {{\n", above("", &set.doc)).expect("a String");
+        write!(text, "\n{}enum scanhub_{name} {{\n", comment_above("", &set.doc)).expect("a String");
         for (index, value) in set.values.iter().enumerate() {
             let comma = if index + 1 < set.values.len() { "," } else { "" };
             let line = format!("    SCANHUB_{prefix}{} = {}{comma}", value.name.to_uppercase(), value.number);
-            text += &commented(&line, &value.doc);
+            text += &with_comment(&line, &value.doc);
         }
         text += "};\n";
     }
@@ -55,7 +56,7 @@ pub(crate) fn payloads(description: &Description) -> String {
             .replace(", before the arrays", "")
             .replace(", before the ranges", "");
         let doc = doc.replace(", before the points", "");
-        write!(text, "\n{}struct scanhub_{} {{\n", above("", &doc), topic.name()).expect("a String");
+        write!(text, "\n{}struct scanhub_{} {{\n", comment_above("", &doc), topic.name()).expect("a String");
         text += &members(description, layout);
         for array in &arrays {
             let what = match array.element {
@@ -65,7 +66,7 @@ pub(crate) fn payloads(description: &Description) -> String {
             };
             let none = if array.only_if.is_some() { " NULL if the scan does not have them." } else { "" };
             let comment = format!("{}{none} {what}", array.doc);
-            text += &commented(&format!("    const uint8_t *{};", array.name), comment.trim_end());
+            text += &with_comment(&format!("    const uint8_t *{};", array.name), comment.trim_end());
         }
         text += "};\n";
         for array in &arrays {
@@ -94,7 +95,7 @@ struct Array<'a> {
 
 /// Returns the arrays that follow the head in a datagram.
 fn arrays<'a>(description: &'a Description, layout: &'a Layout) -> Vec<Array<'a>> {
-    let fields = layout.fields[rules::head(layout).fields..].iter().map(|field| {
+    let fields = layout.fields[rules::fixed_part(layout).fields..].iter().map(|field| {
         let Kind::Layout(rust) = &field.kind else { panic!("an array of structs") };
         let doc = field.doc("");
         let doc = doc.split("; 0 beyond").next().unwrap_or_default().trim_end_matches('.');
@@ -108,7 +109,7 @@ fn arrays<'a>(description: &'a Description, layout: &'a Layout) -> Vec<Array<'a>
             rule: &field.name,
         }
     });
-    let tail = rules::packed_tail(&layout.name).iter().map(|tail| {
+    let tail = rules::packed_arrays_of(&layout.name).iter().map(|tail| {
         let element = description.layouts.iter().find(|layout| layout.rust == tail.kind);
         let count = tail.count.split_inclusive(' ').map(|word| {
             let name = word.trim_matches(['(', ')', ' ']);
@@ -146,23 +147,28 @@ fn element_name(element: &Layout) -> String {
 }
 
 /// Returns the fields of the head that the struct has, with those of structs in it.
-fn shown<'a>(description: &'a Description, layout: &'a Layout) -> Vec<(usize, &'a Layout, Shown<'a>)> {
+fn shown_layouts<'a>(
+    description: &'a Description,
+    layout: &'a Layout,
+) -> Vec<(usize, &'a Layout, ShownField<'a>)> {
     let mut all = Vec::new();
-    for shown in readers::shown(layout, &description.sets) {
+    for shown in readers::shown_fields(layout, &description.sets) {
         match &shown.field.kind {
             Kind::Layout(rust) => {
-                let inner = self::shown(description, description.layout(rust));
-                all.extend(inner.into_iter().map(|(at, layout, inner)| (at + shown.field.at, layout, inner)));
+                let inner = self::shown_layouts(description, description.layout(rust));
+                all.extend(
+                    inner.into_iter().map(|(at, layout, inner)| (at + shown.field.offset, layout, inner)),
+                );
             }
             _ if shown.name == "contents" => {}
-            _ => all.push((shown.field.at, layout, shown)),
+            _ => all.push((shown.field.offset, layout, shown)),
         }
     }
     all
 }
 
 /// Returns the name of a field in this header.
-fn name(layout: &Layout, shown: &Shown) -> String {
+fn name(layout: &Layout, shown: &ShownField) -> String {
     match (layout.name.as_str(), shown.name.as_str()) {
         (_, "site_x_m") => "x_m".to_owned(),
         (_, "site_y_m") => "y_m".to_owned(),
@@ -174,12 +180,14 @@ fn name(layout: &Layout, shown: &Shown) -> String {
 
 fn members(description: &Description, layout: &Layout) -> String {
     let mut text = String::new();
-    for (_, of, shown) in shown(description, layout) {
+    for (_, of, shown) in shown_layouts(description, layout) {
         let field = shown.field;
         let name = name(of, &shown);
-        let line = match (&shown.how, &field.kind) {
-            (How::Bit(..) | How::Bool | How::Computed(_), _) => format!("    uint8_t {name};"),
-            (How::Element(_), Kind::Number(kind)) => format!("    {} {name};", number_name(kind)),
+        let line = match (&shown.source, &field.kind) {
+            (FieldSource::Bit(..) | FieldSource::Bool | FieldSource::Computed(_), _) => {
+                format!("    uint8_t {name};")
+            }
+            (FieldSource::Element(_), Kind::Number(kind)) => format!("    {} {name};", number_name(kind)),
             (_, Kind::Text) => format!("    char {name}[{}];", field.len.unwrap_or(1) + 1),
             (_, Kind::Number(kind)) => {
                 let len = field.len.map_or(String::new(), |len| format!("[{len}]"));
@@ -187,24 +195,24 @@ fn members(description: &Description, layout: &Layout) -> String {
             }
             (_, Kind::Layout(_)) => panic!("its fields are shown"),
         };
-        let comment = match &shown.how {
-            How::Bit(_, doc) => format!("1: {doc}"),
-            How::Element(doc) => super::description::upper_first(doc) + ".",
-            How::Computed(doc) => doc.replacen("Whether", "1:", 1),
-            How::Plain | How::Bool => match field.set.as_deref() {
-                Some(set) => match ENUMS.iter().find(|(of, ..)| *of == set) {
+        let comment = match &shown.source {
+            FieldSource::Bit(_, doc) => format!("1: {doc}"),
+            FieldSource::Element(doc) => super::description::upper_first(doc) + ".",
+            FieldSource::Computed(doc) => doc.replacen("Whether", "1:", 1),
+            FieldSource::Plain | FieldSource::Bool => match field.set.as_deref() {
+                Some(set) => match ENUM_NAMES.iter().find(|(of, ..)| *of == set) {
                     Some((_, name, _)) => field.doc(&format!("enum scanhub_{name}")),
                     None => description.doc(field),
                 },
                 None => field.doc(""),
             },
         };
-        text += &commented(&line, &comment);
+        text += &with_comment(&line, &comment);
     }
     if layout.name == "Segment" {
         let doc =
             "1 if it is supported: it has several beams, or the foreground of the previous scan was near it.";
-        text += &commented("    uint8_t support;", doc);
+        text += &with_comment("    uint8_t support;", doc);
     }
     text
 }
@@ -224,26 +232,26 @@ fn number(kind: &str, base: &str, at: usize) -> String {
 fn field_number(layout: &Layout, name: &str, base: &str) -> String {
     let field = layout.fields.iter().find(|field| field.name == name).expect("a field");
     let Kind::Number(kind) = field.kind else { panic!("{name} is not a number") };
-    number(kind, base, field.at)
+    number(kind, base, field.offset)
 }
 
 /// Returns the statements that read all fields to `out`.
 fn statements(description: &Description, layout: &Layout, out: &str) -> String {
     let mut text = String::new();
-    for (at, of, shown) in shown(description, layout) {
+    for (at, of, shown) in shown_layouts(description, layout) {
         let field = shown.field;
         let name = format!("{out}{}", name(of, &shown));
         let kind = if let Kind::Number(kind) = field.kind { kind } else { "u8" };
         let value = number(kind, "at", at);
-        let line = match (&shown.how, &field.kind) {
-            (How::Bit(1, _), _) => format!("{name} = {value} & 1;"),
-            (How::Bit(bit, _), _) => format!("{name} = {value} >> {} & 1;", bit.trailing_zeros()),
-            (How::Bool, _) => format!("{name} = {value} == 1;"),
-            (How::Element(_), _) => {
+        let line = match (&shown.source, &field.kind) {
+            (FieldSource::Bit(1, _), _) => format!("{name} = {value} & 1;"),
+            (FieldSource::Bit(bit, _), _) => format!("{name} = {value} >> {} & 1;", bit.trailing_zeros()),
+            (FieldSource::Bool, _) => format!("{name} = {value} == 1;"),
+            (FieldSource::Element(_), _) => {
                 format!("{name} = {};", number(kind, "at", at + field.element * shown.index))
             }
             // Flag 2 is `open`.
-            (How::Computed(_), _) => {
+            (FieldSource::Computed(_), _) => {
                 let method = field_number(layout, "method", "at");
                 format!(
                     "{name} = {method} <= SCANHUB_MOTION_BOTH && {method} != SCANHUB_MOTION_REFUSED \
@@ -272,15 +280,17 @@ fn statements(description: &Description, layout: &Layout, out: &str) -> String {
 }
 
 fn has_loop(description: &Description, layout: &Layout) -> bool {
-    shown(description, layout).iter().any(|(_, _, shown)| {
-        matches!(shown.how, How::Plain) && shown.field.len.is_some() && shown.field.kind != Kind::Text
+    shown_layouts(description, layout).iter().any(|(_, _, shown)| {
+        matches!(shown.source, FieldSource::Plain)
+            && shown.field.len.is_some()
+            && shown.field.kind != Kind::Text
     })
 }
 
 /// Returns the struct of an array's elements, and the function that reads one.
 fn accessor(description: &Description, topic: Topic, array: &Array, element: &Layout) -> String {
     let (name, payload) = (element_name(element), topic.name());
-    let mut text = format!("{}struct scanhub_{name} {{\n", above("", &element.doc));
+    let mut text = format!("{}struct scanhub_{name} {{\n", comment_above("", &element.doc));
     text += &members(description, element);
     let count = array.count.trim_start_matches("out->");
     write!(
@@ -302,25 +312,27 @@ fn accessor(description: &Description, topic: Topic, array: &Array, element: &La
 }
 
 /// Returns conditions that are true if a number is not finite. Neighboring numbers are checked together.
-fn not_finite(layout: &Layout, base: &str, fields: usize) -> Vec<String> {
+fn non_finite_conditions(layout: &Layout, base: &str, fields: usize) -> Vec<String> {
     let infinite =
         readers::may_be_nan(layout, fields).map(|field| format!("isinf({})", number_of(field, base)));
-    let runs = readers::finite_runs(layout, fields).into_iter().map(|Run { at, size, count, .. }| match at {
-        0 => format!("!scanhub_are_finite({base}, {size}, {count})"),
-        at => format!("!scanhub_are_finite({base} + {at}, {size}, {count})"),
-    });
+    let runs = readers::finite_runs(layout, fields).into_iter().map(
+        |FloatRun { offset: at, size, count, .. }| match at {
+            0 => format!("!scanhub_are_finite({base}, {size}, {count})"),
+            at => format!("!scanhub_are_finite({base} + {at}, {size}, {count})"),
+        },
+    );
     infinite.chain(runs).collect()
 }
 
 fn number_of(field: &Field, base: &str) -> String {
     let Kind::Number(kind) = field.kind else { panic!("{} is not a number", field.name) };
-    number(kind, base, field.at)
+    number(kind, base, field.offset)
 }
 
 /// Returns the function that reads a payload. That of a foreground is called by one that also checks its bits.
 fn reader(description: &Description, topic: Topic, layout: &Layout, arrays: &[Array]) -> String {
     let name = topic.name();
-    let head = rules::head(layout);
+    let head = rules::fixed_part(layout);
     let first = rules::first_revision(&layout.name);
     let function = if layout.name == "Foreground" { "foreground_arrays" } else { name };
     let mut text = format!(
@@ -337,13 +349,13 @@ fn reader(description: &Description, topic: Topic, layout: &Layout, arrays: &[Ar
     let mut loops = String::new();
     for array in arrays {
         let Some(element) = array.element else { continue };
-        let mut conditions = not_finite(element, "at", element.fields.len());
+        let mut conditions = non_finite_conditions(element, "at", element.fields.len());
         for check in readers::checks(&layout.name) {
             match check {
-                Check::Below { array: of, field, count } if *of == array.rule => {
+                BoundsCheck::Below { array: of, field, count } if *of == array.rule => {
                     conditions.push(format!("{} >= out->{count}", field_number(element, field, "at")));
                 }
-                Check::Bits { array: of, field, count } if *of == array.rule => {
+                BoundsCheck::Bits { array: of, field, count } if *of == array.rule => {
                     let count = count_name(layout, count);
                     conditions
                         .push(format!("(uint64_t){} >> out->{count}", field_number(element, field, "at")));
@@ -383,10 +395,10 @@ fn reader(description: &Description, topic: Topic, layout: &Layout, arrays: &[Ar
     text += &statements(description, layout, "out->");
     let mut conditions: Vec<String> = rules::counts(layout)
         .iter()
-        .map(|(count, most)| format!("{} > {most}", field_number(layout, count, "at")))
+        .map(|(count, maximum)| format!("{} > {maximum}", field_number(layout, count, "at")))
         .collect();
     for check in readers::checks(&layout.name) {
-        if let Check::Within { field, from, to } = check {
+        if let BoundsCheck::Within { field, from, to } = check {
             let value = field_number(layout, field, "at");
             if *from > 0 {
                 conditions.push(format!("{value} < {from}"));
@@ -408,7 +420,7 @@ fn reader(description: &Description, topic: Topic, layout: &Layout, arrays: &[Ar
     if !arrays.is_empty() {
         conditions.push(format!("datagram->payload_len < {}", lengths.join("\n            + ")));
     }
-    conditions.extend(not_finite(layout, "at", head.fields));
+    conditions.extend(non_finite_conditions(layout, "at", head.fields));
     if !conditions.is_empty() {
         let conditions = conditions.join("\n        || ");
         writeln!(text, "    if ({conditions})\n        return SCANHUB_BAD_PAYLOAD;").expect("a String");

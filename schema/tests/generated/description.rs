@@ -39,7 +39,7 @@ pub(crate) struct Layout {
 pub(crate) struct Field {
     pub(crate) name: String,
     /// Offset in bytes.
-    pub(crate) at: usize,
+    pub(crate) offset: usize,
     pub(crate) kind: Kind,
     /// Number of elements of an array.
     pub(crate) len: Option<usize>,
@@ -73,7 +73,7 @@ pub(crate) struct Value {
     pub(crate) doc: String,
 }
 
-const NUMBERS: [(&str, usize); 10] = [
+const NUMBER_TYPES: [(&str, usize); 10] = [
     ("u8", 1),
     ("u16", 2),
     ("u32", 4),
@@ -87,12 +87,12 @@ const NUMBERS: [(&str, usize); 10] = [
 ];
 
 /// Stands in a comment for the values of the field's set.
-const VALUES: char = '\u{1}';
+const VALUES_MARK: char = '\u{1}';
 
 impl Field {
     /// Returns the comment, with `values` in place of the values that the field can have.
     pub(crate) fn doc(&self, values: &str) -> String {
-        self.doc.replace(VALUES, values)
+        self.doc.replace(VALUES_MARK, values)
     }
 
     /// Returns the size in bytes.
@@ -143,7 +143,7 @@ impl Description {
             writeln!(text, "scanhub.{rust}.v2 {size} {align} {doc}").expect("a String");
             for field in fields {
                 let doc = self.doc(field);
-                writeln!(text, "  {} {} {} {doc}", field.name, field.at, field.kind_name())
+                writeln!(text, "  {} {} {} {doc}", field.name, field.offset, field.kind_name())
                     .expect("a String");
                 for Value { number, name, doc } in field.set.iter().flat_map(|set| &self.sets[set].values) {
                     writeln!(text, "    {number} {name} {doc}").expect("a String");
@@ -163,7 +163,9 @@ impl Description {
         for topic in Topic::ALL {
             let Some(name) = topic.payload().strip_prefix("scanhub.") else { continue };
             let name = name.strip_suffix(".v2").expect("a version");
-            for element in rules::tail(name).iter().filter(|tail| sources.structs.contains_key(tail.kind)) {
+            for element in
+                rules::arrays_of(name).iter().filter(|tail| sources.structs.contains_key(tail.kind))
+            {
                 description.add(element.kind, &sources);
             }
             let head = format!("{name}Head");
@@ -198,7 +200,7 @@ impl Description {
             }
             let (element, align) = match &kind {
                 Kind::Number(number) => {
-                    let size = NUMBERS.iter().find(|(name, _)| name == number).expect("a number").1;
+                    let size = NUMBER_TYPES.iter().find(|(name, _)| name == number).expect("a number").1;
                     (size, size)
                 }
                 Kind::Text => (1, 1),
@@ -213,7 +215,7 @@ impl Description {
             if let Some(set) = &set {
                 self.sets.entry(set.clone()).or_insert_with(|| sources.set(set));
             }
-            let field = Field { name, at: layout.size, kind, len, element, doc, set };
+            let field = Field { name, offset: layout.size, kind, len, element, doc, set };
             layout.size += field.size();
             layout.align = layout.align.max(align);
             layout.fields.push(field);
@@ -316,7 +318,7 @@ impl Sources {
             }
             Type::Path(path) => {
                 let name = path.path.require_ident().expect("a plain type").to_string();
-                if let Some((number, _)) = NUMBERS.iter().find(|(number, _)| *number == name) {
+                if let Some((number, _)) = NUMBER_TYPES.iter().find(|(number, _)| *number == name) {
                     return (Kind::Number(number), None);
                 }
                 // A struct around an array is that array.
@@ -351,11 +353,11 @@ impl Sources {
                     || self.structs.get(&target).is_some_and(|of| matches!(of.fields, syn::Fields::Unit));
                 if is_set {
                     set = Some(target.clone());
-                    text.push(VALUES);
+                    text.push(VALUES_MARK);
                 } else if let Some((number, about)) = self.consts.get(&target) {
                     if about.starts_with("Flag") {
                         set = Some(target.split("::").next().expect("a type").to_owned());
-                        text.push(VALUES);
+                        text.push(VALUES_MARK);
                     } else {
                         text += &number.to_string();
                     }
@@ -372,8 +374,9 @@ impl Sources {
             }
             text += rest;
             for between in [", ", " and "] {
-                while text.contains(&format!("{VALUES}{between}{VALUES}")) {
-                    text = text.replace(&format!("{VALUES}{between}{VALUES}"), &VALUES.to_string());
+                while text.contains(&format!("{VALUES_MARK}{between}{VALUES_MARK}")) {
+                    text = text
+                        .replace(&format!("{VALUES_MARK}{between}{VALUES_MARK}"), &VALUES_MARK.to_string());
                 }
             }
             kept.push(text);

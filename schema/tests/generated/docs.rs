@@ -4,20 +4,20 @@ use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
 use scanhub_schema::datagram::Announce;
-use scanhub_schema::{Maker, Topic};
+use scanhub_schema::{PublisherKind, Topic};
 
 use super::description::{Description, Field, Kind, Layout, Value, first_sentence, lower_first};
-use super::rules::{self, Tail};
+use super::rules::{self, ArrayRule};
 
 /// A field with more values has only their names.
 const MAX_VALUES: usize = 10;
-const HEAD: &str = "| offset | type | field |\n|---|---|---|\n";
+const TABLE_HEAD: &str = "| offset | type | field |\n|---|---|---|\n";
 
 /// Returns the tables of the layout, of the layouts in it, and of the elements of its arrays.
 pub(crate) fn tables(description: &Description, layout: &Layout) -> String {
-    let tail = rules::tail(&layout.name);
+    let tail = rules::arrays_of(&layout.name);
     let what = if tail.is_empty() { "" } else { " and arrays" };
-    let mut text = format!("\n`scanhub.{}.v2`, {} bytes{what}:\n\n{HEAD}", layout.name, layout.size);
+    let mut text = format!("\n`scanhub.{}.v2`, {} bytes{what}:\n\n{TABLE_HEAD}", layout.name, layout.size);
     let mut inner = rows(description, layout, &mut text);
     let mut at = Some(layout.size);
     for array in tail {
@@ -39,7 +39,8 @@ pub(crate) fn tables(description: &Description, layout: &Layout) -> String {
     }
     text += &values(description, layout);
     for layout in inner {
-        write!(text, "\n`scanhub.{}.v2`, {} bytes:\n\n{HEAD}", layout.name, layout.size).expect("a String");
+        write!(text, "\n`scanhub.{}.v2`, {} bytes:\n\n{TABLE_HEAD}", layout.name, layout.size)
+            .expect("a String");
         rows(description, layout, &mut text);
         text += &values(description, layout);
     }
@@ -58,14 +59,14 @@ fn rows<'a>(description: &'a Description, layout: &Layout, text: &mut String) ->
             (Kind::Text, Some(len)) => format!("char[{len}]"),
             _ => field.kind_name(),
         };
-        let about = about(description, field);
-        writeln!(text, "| {} | {kind} | {about} |", field.at).expect("a String");
+        let about = field_text(description, field);
+        writeln!(text, "| {} | {kind} | {about} |", field.offset).expect("a String");
     }
     inner
 }
 
 /// Returns name and meaning of a field. Its values are in a table below, unless they are too many.
-fn about(description: &Description, field: &Field) -> String {
+fn field_text(description: &Description, field: &Field) -> String {
     let set = field.set.as_ref().map(|set| &description.sets[set].values);
     let names = set.filter(|values| values.len() > MAX_VALUES).into_iter().flatten();
     let doc = field.doc(&names.map(|value| value.name.as_str()).collect::<Vec<_>>().join(", "));
@@ -100,14 +101,14 @@ pub(crate) fn payloads(description: &Description) -> String {
     for topic in Topic::ALL {
         let Some(layout) = description.payload(topic) else { continue };
         let name = format!("`scanhub.{}.v2`", layout.name);
-        let head = rules::head(layout);
+        let head = rules::fixed_part(layout);
         let arrays: Vec<_> = layout.fields[head.fields..].iter().collect();
-        let tail = rules::packed_tail(&layout.name);
+        let tail = rules::packed_arrays_of(&layout.name);
         let whole = arrays.is_empty() && tail.is_empty();
         let what = if whole { name } else { format!("head of {name}") };
         let counts = rules::counts(layout);
         let limits: String =
-            counts.iter().map(|(count, most)| format!("; `{count}` is at most {most}")).collect();
+            counts.iter().map(|(count, maximum)| format!("; `{count}` is at most {maximum}")).collect();
         writeln!(text, "| {} | 0 | {} | {what}{limits} |", topic.name(), head.size).expect("a String");
         let mut at = format!(" {}", head.size);
         let mut row = |size: String, about: String| {
@@ -118,7 +119,7 @@ pub(crate) fn payloads(description: &Description) -> String {
             let count = rules::count_of(layout, field);
             row(format!("{} {count}", field.element), format!("the used elements of `{}`", field.name));
         }
-        for Tail { name, kind, count, only_if, .. } in tail {
+        for ArrayRule { name, kind, count, only_if, .. } in tail {
             let (element, of) = match description.layouts.iter().find(|layout| layout.rust == *kind) {
                 Some(layout) => (layout.size, format!("`scanhub.{}.v2`", layout.name)),
                 None => (rules::number_size(kind), (*kind).to_owned()),
@@ -136,22 +137,26 @@ pub(crate) fn payloads(description: &Description) -> String {
 pub(crate) fn services() -> String {
     let mut text = "\n| service | pattern, payload | history | buffer |\n|---|---|---|---|\n".to_owned();
     for topic in Topic::ALL {
-        let owner = match topic.maker() {
-            Maker::Link => "SENSOR",
-            Maker::Tracker => "TRACKER",
-            Maker::Mount => "MOUNT",
-            Maker::Tilted => "NAME",
+        let owner = match topic.publisher_kind() {
+            PublisherKind::Link => "SENSOR",
+            PublisherKind::Tracker => "TRACKER",
+            PublisherKind::Mount => "MOUNT",
+            PublisherKind::Tilted => "NAME",
         };
         let payload =
             match (topic.payload(), topic.payload().trim_start_matches("scanhub.").trim_end_matches(".v2")) {
-                ("u8[]", _) => format!("`[u8]`, at most {}", scanhub_schema::Telegram::MAX),
-                (payload, name) if rules::tail(name).is_empty() => format!("`{payload}`"),
+                ("u8[]", _) => format!("`[u8]`, at most {}", scanhub_schema::Telegram::MAX_LEN),
+                (payload, name) if rules::arrays_of(name).is_empty() => format!("`{payload}`"),
                 (payload, _) => format!("`[{payload}]`"),
             };
-        let row = topic.row();
+        let row = topic.spec();
         let service = topic.service(owner);
-        writeln!(text, "| `{service}` | publish-subscribe, {payload} | {} | {} |", row.kept, row.waiting)
-            .expect("a String");
+        writeln!(
+            text,
+            "| `{service}` | publish-subscribe, {payload} | {} | {} |",
+            row.history_len, row.queue_len
+        )
+        .expect("a String");
     }
     text + "\n"
 }
@@ -160,7 +165,7 @@ pub(crate) fn services() -> String {
 pub(crate) fn groups() -> String {
     let mut text = "\n| group, port 22200 | topics with their numbers |\n|---|---|\n".to_owned();
     let announce = (Announce::GROUP, format!("{} announce", Announce::NUMBER));
-    let topics = Topic::ALL.map(|topic| (topic.row().group, format!("{} {}", topic.number(), topic.name())));
+    let topics = Topic::ALL.map(|topic| (topic.spec().group, format!("{} {}", topic.number(), topic.name())));
     let all: Vec<_> = [announce].into_iter().chain(topics).collect();
     let groups: BTreeSet<u8> = all.iter().map(|(group, _)| *group).collect();
     for group in groups {

@@ -5,10 +5,10 @@ use std::fmt::Write as _;
 use scanhub_schema::Topic;
 
 use super::description::{Description, Field, Kind, Layout, first_sentence, snake, upper_first};
-use super::readers::{self, Check, Finite, HEADS, How, Shown, names_of};
+use super::readers::{self, BoundsCheck, FieldSource, FiniteRule, ShownField, VARIABLE_PAYLOADS, names_of};
 use super::{rules, topics_by_number, wrap};
 
-const WIDTH: usize = 120;
+const MAX_LINE_WIDTH: usize = 120;
 
 /// Returns the names of topics and of values.
 pub(crate) fn values(description: &Description) -> String {
@@ -25,11 +25,11 @@ pub(crate) fn values(description: &Description) -> String {
 fn table(name: &str, first: &str, values: impl Iterator<Item = String>) -> String {
     let values: Vec<_> = values.map(|value| format!("\"{value}\"")).collect();
     let line = format!("local {name} = {{ {first}{} }}\n", values.join(", "));
-    if line.len() <= WIDTH {
+    if line.len() <= MAX_LINE_WIDTH {
         return line;
     }
     let values = format!("{first}{},", values.join(", "));
-    format!("local {name} = {{\n{}}}\n", wrap("    ", "    ", &values, WIDTH))
+    format!("local {name} = {{\n{}}}\n", wrap("    ", "    ", &values, MAX_LINE_WIDTH))
 }
 
 /// Returns the declarations of the fields of all payloads.
@@ -37,14 +37,14 @@ pub(crate) fn fields(description: &Description) -> String {
     let mut text = String::new();
     for (topic, layout) in payloads(description) {
         for layout in [layout].into_iter().chain(elements(description, layout)) {
-            for shown in all(description, layout) {
+            for shown in shown_fields(description, layout) {
                 text += &declaration(topic, layout, &shown);
             }
         }
         for tail in arrays_of_numbers(description, layout) {
             let (kind, label) = (proto(&Kind::Number(tail.kind)), first_sentence(tail.doc));
             let label = label.split(';').next().unwrap_or_default();
-            writeln!(text, "field(\"{}.{}\", \"{kind}\", \"{label}\")", topic.name(), single(tail.name))
+            writeln!(text, "field(\"{}.{}\", \"{kind}\", \"{label}\")", topic.name(), singular(tail.name))
                 .expect("a String");
         }
     }
@@ -58,32 +58,33 @@ fn payloads(description: &Description) -> impl Iterator<Item = (Topic, &Layout)>
 /// Returns the layouts of the elements of a payload's arrays.
 fn elements<'a>(description: &'a Description, layout: &Layout) -> Vec<&'a Layout> {
     let of_fields =
-        layout.fields[rules::head(layout).fields..].iter().filter_map(|field| match &field.kind {
+        layout.fields[rules::fixed_part(layout).fields..].iter().filter_map(|field| match &field.kind {
             Kind::Layout(rust) => Some(rust.as_str()),
             _ => None,
         });
-    let of_tail = rules::packed_tail(&layout.name).iter().map(|tail| tail.kind);
+    let of_tail = rules::packed_arrays_of(&layout.name).iter().map(|tail| tail.kind);
     let names = of_fields.chain(of_tail.filter(|kind| kind.starts_with(char::is_uppercase)));
     names.map(|rust| description.layout(rust)).collect()
 }
 
-fn arrays_of_numbers(description: &Description, layout: &Layout) -> Vec<&'static rules::Tail> {
-    let is_number = |tail: &&rules::Tail| description.layouts.iter().all(|layout| layout.rust != tail.kind);
-    let by_hand = HEADS.contains(&layout.name.as_str());
-    rules::packed_tail(&layout.name).iter().filter(|_| !by_hand).filter(is_number).collect()
+fn arrays_of_numbers(description: &Description, layout: &Layout) -> Vec<&'static rules::ArrayRule> {
+    let is_number =
+        |tail: &&rules::ArrayRule| description.layouts.iter().all(|layout| layout.rust != tail.kind);
+    let by_hand = VARIABLE_PAYLOADS.contains(&layout.name.as_str());
+    rules::packed_arrays_of(&layout.name).iter().filter(|_| !by_hand).filter(is_number).collect()
 }
 
 /// Returns the fields before the first array, with those of structs in it.
-fn all<'a>(description: &'a Description, layout: &'a Layout) -> Vec<Shown<'a>> {
+fn shown_fields<'a>(description: &'a Description, layout: &'a Layout) -> Vec<ShownField<'a>> {
     let mut all = Vec::new();
     let counts = rules::counts(layout);
-    for shown in readers::shown(layout, &description.sets) {
+    for shown in readers::shown_fields(layout, &description.sets) {
         let is_count = counts.iter().any(|(count, _)| *count == shown.field.name);
         if is_count && shown.field.name != "count" && layout.name != "Foreground" {
             continue;
         }
         match &shown.field.kind {
-            Kind::Layout(rust) => all.extend(self::all(description, description.layout(rust))),
+            Kind::Layout(rust) => all.extend(self::shown_fields(description, description.layout(rust))),
             _ => all.push(shown),
         }
     }
@@ -91,7 +92,7 @@ fn all<'a>(description: &'a Description, layout: &'a Layout) -> Vec<Shown<'a>> {
 }
 
 /// Returns the name of a field after that of the topic.
-fn name<'a>(shown: &'a Shown) -> &'a str {
+fn name<'a>(shown: &'a ShownField) -> &'a str {
     match shown.name.as_str() {
         "from_room" => "from",
         "to_room" => "to",
@@ -100,7 +101,7 @@ fn name<'a>(shown: &'a Shown) -> &'a str {
     }
 }
 
-fn single(name: &str) -> &str {
+fn singular(name: &str) -> &str {
     name.strip_suffix('s').unwrap_or(name)
 }
 
@@ -114,7 +115,7 @@ fn proto(kind: &Kind) -> String {
     }
 }
 
-fn declaration(topic: Topic, layout: &Layout, shown: &Shown) -> String {
+fn declaration(topic: Topic, layout: &Layout, shown: &ShownField) -> String {
     let field = shown.field;
     let topic = topic.name();
     if field.set.as_deref() == Some("Counter") {
@@ -122,11 +123,13 @@ fn declaration(topic: Topic, layout: &Layout, shown: &Shown) -> String {
             "for _, name in ipairs(COUNTERS) do\n    field(\"{topic}.\" .. name, \"uint64\", name)\nend\n"
         );
     }
-    let (label, more) = match &shown.how {
-        How::Bit(bit, _) => (upper_first(&shown.name.replace('_', " ")), format!(", base.DEC, nil, {bit}")),
-        How::Element(doc) => (upper_first(doc), String::new()),
-        How::Computed(doc) => (first_sentence(doc), String::new()),
-        How::Plain | How::Bool => {
+    let (label, more) = match &shown.source {
+        FieldSource::Bit(bit, _) => {
+            (upper_first(&shown.name.replace('_', " ")), format!(", base.DEC, nil, {bit}"))
+        }
+        FieldSource::Element(doc) => (upper_first(doc), String::new()),
+        FieldSource::Computed(doc) => (first_sentence(doc), String::new()),
+        FieldSource::Plain | FieldSource::Bool => {
             let more = match field.set.as_deref() {
                 Some(_) => match readers::enum_of(field) {
                     Some(set) => format!(", base.DEC, {}", names_of(set)),
@@ -142,7 +145,7 @@ fn declaration(topic: Topic, layout: &Layout, shown: &Shown) -> String {
         }
     };
     let call = format!("field(\"{topic}.{}\", \"{}\", \"{label}\"{more})\n", name(shown), proto(&field.kind));
-    if call.len() <= WIDTH + 1 {
+    if call.len() <= MAX_LINE_WIDTH + 1 {
         call
     } else {
         call.replace("\", \"", "\",\n    \"").replacen("\",\n    \"", "\", \"", 1)
@@ -159,7 +162,7 @@ pub(crate) fn functions(description: &Description) -> String {
             text += &additions(description, topic, element, "at");
             text += "end\n";
         }
-        if HEADS.contains(&layout.name.as_str()) {
+        if VARIABLE_PAYLOADS.contains(&layout.name.as_str()) {
             text += &head(description, topic, layout);
         } else {
             text += &function(description, topic, layout);
@@ -187,7 +190,7 @@ fn head(description: &Description, topic: Topic, layout: &Layout) -> String {
 
 /// Returns the expression of a number.
 fn number(field: &Field, at: &str) -> String {
-    format!("payload({}, {}):le_uint()", offset(at, field.at), field.element)
+    format!("payload({}, {}):le_uint()", offset(at, field.offset), field.element)
 }
 
 fn offset(base: &str, at: usize) -> String {
@@ -200,21 +203,21 @@ fn offset(base: &str, at: usize) -> String {
 
 /// Returns the conditions that a head meets, apart from the lengths of its arrays.
 fn conditions(layout: &Layout) -> String {
-    let size = rules::first_revision(&layout.name).unwrap_or(rules::head(layout).size);
+    let size = rules::first_revision(&layout.name).unwrap_or(rules::fixed_part(layout).size);
     let mut text = format!("    if payload:len() < {size} then return nil end\n");
     let mut refuse =
         |condition: String| writeln!(text, "    if {condition} then return nil end").expect("a String");
-    for (count, most) in rules::counts(layout) {
-        refuse(format!("{} > {most}", number(field(layout, count), "")));
+    for (count, maximum) in rules::counts(layout) {
+        refuse(format!("{} > {maximum}", number(field(layout, count), "")));
     }
     for check in readers::checks(&layout.name) {
-        if let Check::Within { field: name, from, to } = check {
+        if let BoundsCheck::Within { field: name, from, to } = check {
             let value = number(field(layout, name), "");
             let low = if *from > 0 { format!("{value} < {from} or ") } else { String::new() };
             refuse(format!("{low}{value} > {to}"));
         }
     }
-    for condition in finite(layout, "", rules::head(layout).fields) {
+    for condition in finite_conditions(layout, "", rules::fixed_part(layout).fields) {
         refuse(condition);
     }
     text
@@ -226,26 +229,26 @@ fn field<'a>(layout: &'a Layout, name: &str) -> &'a Field {
 }
 
 /// Returns conditions that are true if a number is not finite. Neighboring numbers are checked together.
-fn finite(layout: &Layout, base: &str, fields: usize) -> Vec<String> {
+fn finite_conditions(layout: &Layout, base: &str, fields: usize) -> Vec<String> {
     let mut conditions = Vec::new();
     let mut runs: Vec<(usize, usize, usize)> = Vec::new();
     for field in &layout.fields[..fields] {
         let len = field.len.unwrap_or(1);
         match (readers::finite(layout, field), runs.last_mut()) {
-            (Finite::Must, Some((at, size, count)))
-                if *size == field.element && *at + *size * *count == field.at =>
+            (FiniteRule::Required, Some((at, size, count)))
+                if *size == field.element && *at + *size * *count == field.offset =>
             {
                 *count += len;
             }
-            (Finite::Must, _) => runs.push((field.at, field.element, len)),
-            (Finite::MayBeNan, _) => {
+            (FiniteRule::Required, _) => runs.push((field.offset, field.element, len)),
+            (FiniteRule::MayBeNan, _) => {
                 conditions.push(format!(
                     "is_infinite(payload({}, {}):le_float())",
-                    offset(base, field.at),
+                    offset(base, field.offset),
                     field.element
                 ));
             }
-            (Finite::NotChecked, _) => {}
+            (FiniteRule::NotChecked, _) => {}
         }
     }
     let run = |(at, size, count)| {
@@ -267,20 +270,21 @@ fn is_later(layout: &Layout, at: usize) -> bool {
 /// Returns calls that add all fields to a tree.
 fn additions(description: &Description, topic: Topic, layout: &Layout, base: &str) -> String {
     let mut text = String::new();
-    for shown in readers::shown(layout, &description.sets) {
+    for shown in readers::shown_fields(layout, &description.sets) {
         if let Kind::Layout(rust) = &shown.field.kind {
-            text += &additions(description, topic, description.layout(rust), &offset(base, shown.field.at));
+            text +=
+                &additions(description, topic, description.layout(rust), &offset(base, shown.field.offset));
         }
     }
-    let kept = all(description, layout);
+    let kept = shown_fields(description, layout);
     for shown in
         kept.iter().filter(|shown| layout.fields.iter().any(|field| std::ptr::eq(field, shown.field)))
     {
         let shown_field = shown.field;
-        let (at, len) = (offset(base, shown_field.at), shown_field.element);
+        let (at, len) = (offset(base, shown_field.offset), shown_field.element);
         let name = format!("{}.{}", topic.name(), name(shown));
-        let line = match (&shown.how, &shown_field.kind) {
-            (How::Computed(_), _) => {
+        let line = match (&shown.source, &shown_field.kind) {
+            (FieldSource::Computed(_), _) => {
                 // Method 1 is `refused`, and flag 2 is `open`.
                 let method = number(field(layout, "method"), base);
                 format!(
@@ -290,8 +294,8 @@ fn additions(description: &Description, topic: Topic, layout: &Layout, base: &st
                     number(shown_field, base)
                 )
             }
-            (How::Element(_), _) => {
-                let at = offset(base, shown_field.at + len * shown.index);
+            (FieldSource::Element(_), _) => {
+                let at = offset(base, shown_field.offset + len * shown.index);
                 format!("    tree:add_le(f[\"{name}\"], payload({at}, {len}))")
             }
             (_, Kind::Text) => {
@@ -308,7 +312,7 @@ fn additions(description: &Description, topic: Topic, layout: &Layout, base: &st
                 "    for i, name in ipairs(COUNTERS) do\n        \
                  tree:add_le(f[\"{}.\" .. name], payload({} + {len} * i, {len}))\n    end",
                 topic.name(),
-                offset(base, shown_field.at - len)
+                offset(base, shown_field.offset - len)
             ),
             _ => match shown_field.len {
                 Some(count) => format!(
@@ -319,7 +323,7 @@ fn additions(description: &Description, topic: Topic, layout: &Layout, base: &st
                 None => format!("    tree:add_le(f[\"{name}\"], payload({at}, {len}))"),
             },
         };
-        if is_later(layout, shown_field.at) {
+        if is_later(layout, shown_field.offset) {
             writeln!(
                 text,
                 "    if payload:len() >= {} then\n    {}\n    end",
@@ -340,19 +344,19 @@ fn function(description: &Description, topic: Topic, layout: &Layout) -> String 
     text += &conditions(layout);
     // Name, layout, variable with the number of elements, and offset.
     let mut arrays = Vec::new();
-    let mut begin = rules::head(layout).size.to_string();
+    let mut begin = rules::fixed_part(layout).size.to_string();
     let mut add = |text: &mut String, name: String, element: Option<&'_ Layout>, size: usize, count: &str| {
         let variable = if count == "count" { "count".to_owned() } else { format!("{count}_count") };
         writeln!(text, "    local {variable} = {}", number(field(layout, count), "")).expect("a String");
         arrays.push((name, element.map(|layout| layout.rust.clone()), size, variable.clone(), begin.clone()));
         begin += &format!(" + {size} * {variable}");
     };
-    for array in &layout.fields[rules::head(layout).fields..] {
+    for array in &layout.fields[rules::fixed_part(layout).fields..] {
         let Kind::Layout(rust) = &array.kind else { panic!("an array of structs") };
         let count = rules::count_of(layout, array);
         add(&mut text, array.name.clone(), Some(description.layout(rust)), array.element, count);
     }
-    for tail in rules::packed_tail(&layout.name) {
+    for tail in rules::packed_arrays_of(&layout.name) {
         let element = description.layouts.iter().find(|layout| layout.rust == tail.kind);
         let size = element.map_or_else(|| rules::number_size(tail.kind), |layout| layout.size);
         add(&mut text, tail.name.to_owned(), element, size, tail.count);
@@ -362,13 +366,13 @@ fn function(description: &Description, topic: Topic, layout: &Layout) -> String 
     }
     for (name, element, size, count, begin) in &arrays {
         let Some(element) = element.as_ref().map(|rust| description.layout(rust)) else { continue };
-        let mut conditions = finite(element, "at", element.fields.len());
+        let mut conditions = finite_conditions(element, "at", element.fields.len());
         for check in readers::checks(&layout.name) {
             match check {
-                Check::Below { array, field: of, count } if array == name => {
+                BoundsCheck::Below { array, field: of, count } if array == name => {
                     conditions.push(format!("{} >= {count}", number(field(element, of), "at")));
                 }
-                Check::Bits { array, field: of, count } if array == name => {
+                BoundsCheck::Bits { array, field: of, count } if array == name => {
                     conditions.push(format!("{} >= 2 ^ {count}_count", number(field(element, of), "at")));
                 }
                 _ => {}
@@ -393,7 +397,7 @@ fn function(description: &Description, topic: Topic, layout: &Layout) -> String 
                 writeln!(text, "        add_{}({item}, payload, at)", snake(&element.name))
             }
             None => {
-                let field = format!("f[\"{}.{}\"]", topic.name(), single(name));
+                let field = format!("f[\"{}.{}\"]", topic.name(), singular(name));
                 writeln!(text, "        tree:add_le({field}, payload(at, {size})):prepend_text(i .. \": \")")
             }
         }
@@ -411,7 +415,7 @@ fn function(description: &Description, topic: Topic, layout: &Layout) -> String 
 /// flags that are set.
 fn summary(description: &Description, layout: &Layout, arrays: &[(&str, &str)]) -> String {
     let mut parts = Vec::new();
-    let fields = layout.fields[..rules::head(layout).fields].iter();
+    let fields = layout.fields[..rules::fixed_part(layout).fields].iter();
     let mut enums = fields.filter_map(|field| Some((field, readers::enum_of(field)?)));
     if let Some((field, set)) = enums.find(|(_, set)| !["Counter", "Family"].contains(set)) {
         let other = readers::other_value(set).unwrap_or("unknown");
@@ -425,8 +429,8 @@ fn summary(description: &Description, layout: &Layout, arrays: &[(&str, &str)]) 
         parts.push(format!("{comma}{count} .. \" {name}\""));
     }
     let mut text = format!("    local words = {}\n", parts.join(" .. "));
-    for shown in readers::shown(layout, &description.sets) {
-        if let How::Bit(bit, _) = shown.how {
+    for shown in readers::shown_fields(layout, &description.sets) {
+        if let FieldSource::Bit(bit, _) = shown.source {
             let (value, name) = (number(shown.field, ""), shown.name.replace('_', " "));
             writeln!(text, "    if {value} % {} >= {bit} then words = words .. \", {name}\" end", 2 * bit)
                 .expect("a String");

@@ -31,7 +31,7 @@ use description::Description;
 use scanhub_schema::Topic;
 use scanhub_schema::limits::TopicLimits;
 
-const COMMAND: &str = "SCANHUB_WRITE=1 cargo test -p scanhub-schema --test generated";
+const WRITE_COMMAND: &str = "SCANHUB_WRITE=1 cargo test -p scanhub-schema --test generated";
 
 /// Returns all topics in the order of their numbers, which start at 1 and have no gaps.
 fn topics_by_number() -> [Topic; Topic::ALL.len()] {
@@ -46,7 +46,7 @@ fn check(path: &str, text: &str) {
     if fs::read_to_string(&file).expect("a committed file") == text {
         return;
     }
-    assert!(env::var_os("SCANHUB_WRITE").is_some(), "{path} is not up to date: {COMMAND}");
+    assert!(env::var_os("SCANHUB_WRITE").is_some(), "{path} is not up to date: {WRITE_COMMAND}");
     fs::write(file, text).expect("a writable file");
 }
 
@@ -56,7 +56,7 @@ fn check_blocks(path: &str, blocks: &[(&str, String)]) {
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(path);
     let mut text = fs::read_to_string(file).expect("a committed file");
     for (name, block) in blocks {
-        let begin = format!("{COMMAND}: {name}");
+        let begin = format!("{WRITE_COMMAND}: {name}");
         let line = |of: &str, from: usize| {
             let at = from + text[from..].find(of).unwrap_or_else(|| panic!("{path} has no line with {of:?}"));
             (text[..at].rfind('\n').map_or(0, |at| at + 1), at + text[at..].find('\n').expect("an end") + 1)
@@ -95,10 +95,11 @@ fn sizes_are_those_of_the_structs() {
     let limits = TopicLimits { beams: 0, contents: 0, ..TopicLimits::default() };
     for topic in Topic::ALL {
         let Some(layout) = description.payload(topic) else { continue };
-        let fixed =
-            |tail: &rules::Tail| Some(tail.count.parse::<usize>().ok()? * description.layout(tail.kind).size);
-        let arrays: usize = rules::tail(&layout.name).iter().filter_map(fixed).sum();
-        assert_eq!(layout.size + arrays, topic.longest(&limits), "{}", topic.name());
+        let fixed = |tail: &rules::ArrayRule| {
+            Some(tail.count.parse::<usize>().ok()? * description.layout(tail.kind).size)
+        };
+        let arrays: usize = rules::arrays_of(&layout.name).iter().filter_map(fixed).sum();
+        assert_eq!(layout.size + arrays, topic.max_payload_len(&limits), "{}", topic.name());
     }
 }
 

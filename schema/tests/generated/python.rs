@@ -5,13 +5,13 @@ use std::fmt::Write as _;
 use scanhub_schema::Topic;
 
 use super::description::{Description, Field, Kind, Layout, upper_first};
-use super::readers::{self, Check, HEADS, How, Shown, layouts, names_of};
+use super::readers::{self, BoundsCheck, FieldSource, ShownField, VARIABLE_PAYLOADS, layouts, names_of};
 use super::{rules, topics_by_number, wrap};
 
-const WIDTH: usize = 120;
+const MAX_LINE_WIDTH: usize = 120;
 
 /// Order of fields in the dataclasses where it is not that of the memory. Other fields follow.
-const ORDER: [(&str, &[&str]); 6] = [
+const PARAMETER_ORDER: [(&str, &[&str]); 6] = [
     (
         "Scan",
         &[
@@ -45,7 +45,7 @@ fn class(layout: &Layout) -> String {
     match layout.name.as_str() {
         "TrackSensor" => "Site".to_owned(),
         "CloudPoint" => "Point".to_owned(),
-        name if HEADS.contains(&name) => format!("_{name}Head"),
+        name if VARIABLE_PAYLOADS.contains(&name) => format!("_{name}Head"),
         name => name.to_owned(),
     }
 }
@@ -62,7 +62,7 @@ fn array_name(field: &Field) -> String {
 pub(crate) fn constants(description: &Description) -> String {
     let topics = ["announce"].into_iter().chain(topics_by_number().map(Topic::name));
     let mut text = tuple("TOPICS", topics.map(str::to_owned));
-    let groups = topics_by_number().map(|topic| topic.row().group);
+    let groups = topics_by_number().map(|topic| topic.spec().group);
     let groups = [scanhub_schema::datagram::Announce::GROUP].into_iter().chain(groups);
     text +=
         &format!("_GROUPS = ({})\n", groups.map(|group| group.to_string()).collect::<Vec<_>>().join(", "));
@@ -76,10 +76,10 @@ pub(crate) fn constants(description: &Description) -> String {
 fn tuple(name: &str, values: impl Iterator<Item = String>) -> String {
     let values: Vec<_> = values.map(|value| format!("\"{value}\"")).collect();
     let line = format!("{name} = ({})\n", values.join(", "));
-    if line.len() <= WIDTH {
+    if line.len() <= MAX_LINE_WIDTH {
         return line;
     }
-    format!("{name} = (\n{})\n", wrap("    ", "    ", &format!("{},", values.join(", ")), WIDTH))
+    format!("{name} = (\n{})\n", wrap("    ", "    ", &format!("{},", values.join(", ")), MAX_LINE_WIDTH))
 }
 
 /// Returns the classes of all payloads and array elements.
@@ -88,11 +88,11 @@ pub(crate) fn classes(description: &Description) -> String {
     for layout in layouts(description) {
         let doc = format!("{}\"\"\"", layout.doc);
         write!(text, "\n@dataclass(frozen=True)\nclass {}:\n", class(layout)).expect("a String");
-        text += &wrap("    \"\"\"", "    ", &doc, WIDTH);
+        text += &wrap("    \"\"\"", "    ", &doc, MAX_LINE_WIDTH);
         text.push('\n');
         for (name, kind, doc) in members(description, layout) {
             writeln!(text, "    {name}: {kind}").expect("a String");
-            text += &wrap("    \"\"\"", "    ", &format!("{doc}\"\"\""), WIDTH);
+            text += &wrap("    \"\"\"", "    ", &format!("{doc}\"\"\""), MAX_LINE_WIDTH);
         }
         text.push('\n');
     }
@@ -109,7 +109,7 @@ fn members(description: &Description, layout: &Layout) -> Vec<(String, String, S
         let doc = "Whether it has several beams, or the foreground of the previous scan was near it.";
         members.push(("support".to_owned(), "bool".to_owned(), doc.to_owned()));
     }
-    let mut arrays: Vec<_> = layout.fields[rules::head(layout).fields..].iter().collect();
+    let mut arrays: Vec<_> = layout.fields[rules::fixed_part(layout).fields..].iter().collect();
     arrays.reverse();
     if layout.name != "Tracks" {
         arrays.reverse();
@@ -121,8 +121,8 @@ fn members(description: &Description, layout: &Layout) -> Vec<(String, String, S
         let kind = format!("\"tuple[{}, ...]\"", class(description.layout(rust)));
         members.push((array_name(field), kind, format!("{doc}.")));
     }
-    if !HEADS.contains(&layout.name.as_str()) {
-        for tail in rules::packed_tail(&layout.name) {
+    if !VARIABLE_PAYLOADS.contains(&layout.name.as_str()) {
+        for tail in rules::packed_arrays_of(&layout.name) {
             let element = description.layouts.iter().find(|layout| layout.rust == tail.kind).map(class);
             let kind = format!("\"tuple[{}, ...]\"", element.as_deref().unwrap_or("int"));
             members.push((tail.name.to_owned(), kind, tail.doc.to_owned()));
@@ -132,8 +132,8 @@ fn members(description: &Description, layout: &Layout) -> Vec<(String, String, S
 }
 
 /// Returns the fields of the head that a class has, in its order.
-fn ordered<'a>(description: &Description, layout: &'a Layout) -> Vec<Shown<'a>> {
-    let mut shown = readers::shown(layout, &description.sets);
+fn ordered<'a>(description: &Description, layout: &'a Layout) -> Vec<ShownField<'a>> {
+    let mut shown = readers::shown_fields(layout, &description.sets);
     // The number of elements is the length of a tuple.
     let counts = rules::counts(layout);
     shown.retain(|shown| {
@@ -147,7 +147,7 @@ fn ordered<'a>(description: &Description, layout: &'a Layout) -> Vec<Shown<'a>> 
         "Scan" => shown.name != "contents",
         _ => true,
     });
-    if let Some((_, order)) = ORDER.iter().find(|(name, _)| *name == layout.name) {
+    if let Some((_, order)) = PARAMETER_ORDER.iter().find(|(name, _)| *name == layout.name) {
         shown.sort_by_key(|shown| order.iter().position(|name| *name == shown.name).unwrap_or(order.len()));
     }
     shown
@@ -157,12 +157,12 @@ fn is_float(field: &Field) -> bool {
     matches!(field.kind, Kind::Number(kind) if kind.starts_with('f'))
 }
 
-fn kind(layout: &Layout, shown: &Shown) -> String {
+fn kind(layout: &Layout, shown: &ShownField) -> String {
     let field = shown.field;
     let number = if is_float(field) { "float" } else { "int" };
-    match (&shown.how, &field.kind) {
-        (How::Bit(..) | How::Bool | How::Computed(_), _) => "bool".to_owned(),
-        (How::Element(_), _) => number.to_owned(),
+    match (&shown.source, &field.kind) {
+        (FieldSource::Bit(..) | FieldSource::Bool | FieldSource::Computed(_), _) => "bool".to_owned(),
+        (FieldSource::Element(_), _) => number.to_owned(),
         (_, Kind::Text) => "str".to_owned(),
         (_, Kind::Layout(rust)) => rust.clone(),
         _ => match readers::enum_of(field) {
@@ -177,14 +177,14 @@ fn kind(layout: &Layout, shown: &Shown) -> String {
     }
 }
 
-fn comment(description: &Description, shown: &Shown) -> String {
+fn comment(description: &Description, shown: &ShownField) -> String {
     let field = shown.field;
-    match &shown.how {
-        How::Bit(_, doc) => doc.clone(),
-        How::Element(doc) => format!("{}.", upper_first(doc)),
-        How::Computed(doc) => (*doc).to_owned(),
-        How::Bool => description.doc(field).replacen("1 if", "True if", 1),
-        How::Plain => match readers::enum_of(field) {
+    match &shown.source {
+        FieldSource::Bit(_, doc) => doc.clone(),
+        FieldSource::Element(doc) => format!("{}.", upper_first(doc)),
+        FieldSource::Computed(doc) => (*doc).to_owned(),
+        FieldSource::Bool => description.doc(field).replacen("1 if", "True if", 1),
+        FieldSource::Plain => match readers::enum_of(field) {
             Some("Counter") => "Counters by name: those of COUNTERS.".to_owned(),
             Some(set) => {
                 let none =
@@ -209,7 +209,10 @@ pub(crate) fn union(description: &Description) -> String {
     let names =
         payloads.map(|layout| class(layout).trim_start_matches('_').trim_end_matches("Head").to_owned());
     let names: Vec<_> = ["Announce", "Telegram"].map(str::to_owned).into_iter().chain(names).collect();
-    format!("Payload = Union[\n{}]\n", wrap("    ", "    ", &format!("{},", names.join(", ")), WIDTH))
+    format!(
+        "Payload = Union[\n{}]\n",
+        wrap("    ", "    ", &format!("{},", names.join(", ")), MAX_LINE_WIDTH)
+    )
 }
 
 /// Returns the functions that read payloads and elements of arrays.
@@ -231,27 +234,36 @@ pub(crate) fn functions(description: &Description) -> String {
 
 fn function_name(layout: &Layout) -> String {
     let name = super::description::snake(&layout.name);
-    if HEADS.contains(&layout.name.as_str()) { format!("_{name}_head") } else { format!("_{name}") }
+    if VARIABLE_PAYLOADS.contains(&layout.name.as_str()) {
+        format!("_{name}_head")
+    } else {
+        format!("_{name}")
+    }
 }
 
 /// A head in the form of Python's `struct`, with the position of each field in the values.
-struct Values {
+struct StructFormat {
     format: String,
     positions: Vec<(String, usize, usize)>,
 }
 
-impl Values {
-    fn of(description: &Description, layout: &Layout) -> Values {
-        let mut values = Values { format: "<".to_owned(), positions: Vec::new() };
+impl StructFormat {
+    fn of_layout(description: &Description, layout: &Layout) -> StructFormat {
+        let mut values = StructFormat { format: "<".to_owned(), positions: Vec::new() };
         let mut next = 0;
-        for field in &layout.fields[..rules::head(layout).fields] {
+        for field in &layout.fields[..rules::fixed_part(layout).fields] {
             let len = field.len.unwrap_or(1);
             let (format, count) = match &field.kind {
                 _ if field.name.starts_with("reserved") => (format!("{}x", field.size()), 0),
                 Kind::Text => (format!("{len}s"), 1),
-                Kind::Number(kind) => {
-                    (format!("{}{}", field.len.map_or(String::new(), |len| len.to_string()), code(kind)), len)
-                }
+                Kind::Number(kind) => (
+                    format!(
+                        "{}{}",
+                        field.len.map_or(String::new(), |len| len.to_string()),
+                        format_code(kind)
+                    ),
+                    len,
+                ),
                 Kind::Layout(rust) => {
                     // A struct in a struct is read by its own function.
                     (format!("{}x", description.layout(rust).size), 0)
@@ -271,7 +283,7 @@ impl Values {
     }
 }
 
-pub(crate) fn code(kind: &str) -> char {
+pub(crate) fn format_code(kind: &str) -> char {
     match kind {
         "u8" => 'B',
         "u16" => 'H',
@@ -287,8 +299,8 @@ pub(crate) fn code(kind: &str) -> char {
 }
 
 fn function(description: &Description, layout: &Layout) -> String {
-    let values = Values::of(description, layout);
-    let is_head = HEADS.contains(&layout.name.as_str());
+    let values = StructFormat::of_layout(description, layout);
+    let is_head = VARIABLE_PAYLOADS.contains(&layout.name.as_str());
     let is_payload = Topic::ALL
         .into_iter()
         .any(|topic| description.payload(topic).is_some_and(|payload| payload.rust == layout.rust));
@@ -310,10 +322,10 @@ fn function(description: &Description, layout: &Layout) -> String {
     writeln!(text, "    v = struct.unpack_from(\"{}\", payload{at})", values.format).expect("a String");
     let mut limit = |condition: String| writeln!(text, "    _limit({condition})").expect("a String");
     let counts = rules::counts(layout);
-    for (count, most) in &counts {
-        limit(format!("{} <= {most}", values.of_field(count)));
+    for (count, maximum) in &counts {
+        limit(format!("{} <= {maximum}", values.of_field(count)));
     }
-    let fields = rules::head(layout).fields;
+    let fields = rules::fixed_part(layout).fields;
     for field in readers::may_be_nan(layout, fields) {
         limit(format!("not math.isinf({})", values.of_field(&field.name)));
     }
@@ -334,7 +346,7 @@ fn function(description: &Description, layout: &Layout) -> String {
         });
     }
     for check in readers::checks(&layout.name) {
-        if let Check::Within { field, from, to } = check {
+        if let BoundsCheck::Within { field, from, to } = check {
             limit(format!("{from} <= {} <= {to}", values.of_field(field)));
         }
     }
@@ -349,12 +361,12 @@ fn function(description: &Description, layout: &Layout) -> String {
         let raw = layout.fields.iter().filter(|field| !field.name.starts_with("reserved"));
         let raw: Vec<_> = raw.map(|field| field.name.as_str()).collect();
         text += "    names = (\n";
-        text += &wrap("        \"", "        \"", &format!("{}\"", raw.join(" ")), WIDTH)
+        text += &wrap("        \"", "        \"", &format!("{}\"", raw.join(" ")), MAX_LINE_WIDTH)
             .replace("\n        \"", " \"\n        \"");
         text += "    ).split()\n";
     }
-    let mut begin = rules::head(layout).size.to_string();
-    for field in &layout.fields[rules::head(layout).fields..] {
+    let mut begin = rules::fixed_part(layout).size.to_string();
+    for field in &layout.fields[rules::fixed_part(layout).fields..] {
         let Kind::Layout(rust) = &field.kind else { panic!("an array of structs") };
         let (name, read) = (array_name(field), function_name(description.layout(rust)));
         let count = values.of_field(rules::count_of(layout, field));
@@ -365,7 +377,7 @@ fn function(description: &Description, layout: &Layout) -> String {
         members.push((name.clone(), name));
     }
     if !is_head {
-        for tail in rules::packed_tail(&layout.name) {
+        for tail in rules::packed_arrays_of(&layout.name) {
             let (name, count) = (tail.name, values.of_field(tail.count));
             let element = description.layouts.iter().find(|layout| layout.rust == tail.kind);
             match element {
@@ -375,7 +387,7 @@ fn function(description: &Description, layout: &Layout) -> String {
                     writeln!(text, "    {name} = tuple({read}(payload, {at}) for i in range({count}))")
                 }
                 None => {
-                    let form = format!("f\"<{{{count}}}{}\"", code(tail.kind));
+                    let form = format!("f\"<{{{count}}}{}\"", format_code(tail.kind));
                     writeln!(text, "    {name} = struct.unpack_from({form}, payload, {begin})")
                 }
             }
@@ -385,13 +397,13 @@ fn function(description: &Description, layout: &Layout) -> String {
     }
     for check in readers::checks(&layout.name) {
         let (array, condition) = match check {
-            Check::Below { array, field, count } => {
+            BoundsCheck::Below { array, field, count } => {
                 (array, format!("one.{field} < {}", values.of_field(count)))
             }
-            Check::Bits { array, field, count } => {
+            BoundsCheck::Bits { array, field, count } => {
                 (array, format!("not one.{field} >> {}", values.of_field(count)))
             }
-            Check::Within { .. } => continue,
+            BoundsCheck::Within { .. } => continue,
         };
         let array = layout.fields.iter().find(|field| field.name == *array).expect("an array");
         writeln!(text, "    _limit(all({condition} for one in {}))", array_name(array)).expect("a String");
@@ -409,18 +421,18 @@ fn function(description: &Description, layout: &Layout) -> String {
 }
 
 /// Returns the expression of a member.
-fn value(description: &Description, layout: &Layout, values: &Values, shown: &Shown) -> String {
+fn value(description: &Description, layout: &Layout, values: &StructFormat, shown: &ShownField) -> String {
     let field = shown.field;
     let raw = || values.of_field(&field.name);
-    match (&shown.how, &field.kind) {
-        (How::Bit(bit, _), _) => format!("bool({} & {bit})", raw()),
-        (How::Bool, _) => format!("{} == 1", raw()),
-        (How::Element(_), _) => {
+    match (&shown.source, &field.kind) {
+        (FieldSource::Bit(bit, _), _) => format!("bool({} & {bit})", raw()),
+        (FieldSource::Bool, _) => format!("{} == 1", raw()),
+        (FieldSource::Element(_), _) => {
             let (_, at, _) = values.positions.iter().find(|(name, ..)| *name == field.name).expect("a field");
             format!("v[{}]", at + shown.index)
         }
         // Method 1 is `refused`, and flag 2 is `open`.
-        (How::Computed(_), _) => {
+        (FieldSource::Computed(_), _) => {
             format!(
                 "_name(METHODS, {}, \"refused\") != \"refused\" and not {} & 2",
                 values.of_field("method"),
@@ -432,7 +444,7 @@ fn value(description: &Description, layout: &Layout, values: &Values, shown: &Sh
             None => format!("_text({})", raw()),
         },
         (_, Kind::Layout(rust)) => {
-            format!("{}(payload, {})", function_name(description.layout(rust)), field.at)
+            format!("{}(payload, {})", function_name(description.layout(rust)), field.offset)
         }
         _ => match readers::enum_of(field) {
             Some("Counter") => format!("dict(zip(COUNTERS, {}))", raw()),

@@ -3,19 +3,19 @@
 use std::collections::BTreeMap;
 
 use super::description::{Description, Field, Kind, Layout, Set, snake};
-use super::rules::head;
+use super::rules::fixed_part;
 
 /// A field as the readers of datagrams show it.
-pub(crate) struct Shown<'a> {
+pub(crate) struct ShownField<'a> {
     /// Name in Python and Lua, and in C unless [`name_in_c`] has another one.
     pub(crate) name: String,
     pub(crate) field: &'a Field,
     /// Index of the first element in the field.
     pub(crate) index: usize,
-    pub(crate) how: How,
+    pub(crate) source: FieldSource,
 }
 
-pub(crate) enum How {
+pub(crate) enum FieldSource {
     /// As it is: a number, a text, an array of numbers, or a struct.
     Plain,
     /// 1 if it is true.
@@ -29,13 +29,13 @@ pub(crate) enum How {
 }
 
 /// Fields that are 1 if they are true.
-const BOOLS: [(&str, &str); 3] =
+const BOOL_FIELDS: [(&str, &str); 3] =
     [("Pose", "upside_down"), ("TrackSensor", "upside_down"), ("Zone", "violated")];
 
 /// Flags that the readers do not show.
-const HIDDEN: [(&str, &str); 2] = [("Marks", "no_level"), ("Motion", "open")];
+const HIDDEN_FIELDS: [(&str, &str); 2] = [("Marks", "no_level"), ("Motion", "open")];
 
-const NAMES: [(&str, &str, &str); 6] = [
+const RENAMED_FIELDS: [(&str, &str, &str); 6] = [
     ("TrackSensor", "x_m", "site_x_m"),
     ("TrackSensor", "y_m", "site_y_m"),
     ("Event", "from", "from_room"),
@@ -45,53 +45,63 @@ const NAMES: [(&str, &str, &str); 6] = [
 ];
 
 /// Arrays of coordinates that are shown as three fields.
-const POSITIONS: [(&str, &str); 2] = [("CloudPoint", "at"), ("Obstacle", "middle")];
-const COORDINATES: [(&str, &str); 3] = [
+const POSITION_FIELDS: [(&str, &str); 2] = [("CloudPoint", "at"), ("Obstacle", "middle")];
+const COORDINATE_NAMES: [(&str, &str); 3] = [
     ("x_m", "meters ahead of the robot's center"),
     ("y_m", "meters to the left of the center"),
     ("z_m", "meters above the floor"),
 ];
 
 /// Values that are computed from others, in place of flags: layout, name and comment.
-pub(crate) const COMPUTED: [(&str, &str, &str); 1] =
+pub(crate) const COMPUTED_FIELDS: [(&str, &str, &str); 1] =
     [("Motion", "valid", "Whether the summed pose is known, and none of its steps was degenerate.")];
 
 /// Returns the fields before the first array, as the readers show them.
-pub(crate) fn shown<'a>(layout: &'a Layout, sets: &BTreeMap<String, Set>) -> Vec<Shown<'a>> {
+pub(crate) fn shown_fields<'a>(layout: &'a Layout, sets: &BTreeMap<String, Set>) -> Vec<ShownField<'a>> {
     let rust = layout.rust.as_str();
     let mut shown = Vec::new();
     for field in
-        layout.fields[..head(layout).fields].iter().filter(|field| !field.name.starts_with("reserved"))
+        layout.fields[..fixed_part(layout).fields].iter().filter(|field| !field.name.starts_with("reserved"))
     {
         let name = field.name.strip_suffix("_text").unwrap_or(&field.name);
-        let plain = |how| {
-            let renamed = NAMES.iter().find(|(of, from, _)| *of == rust && *from == name);
-            Shown { name: renamed.map_or(name, |(_, _, to)| to).to_owned(), field, index: 0, how }
+        let plain = |source| {
+            let renamed = RENAMED_FIELDS.iter().find(|(of, from, _)| *of == rust && *from == name);
+            ShownField { name: renamed.map_or(name, |(_, _, to)| to).to_owned(), field, index: 0, source }
         };
-        if POSITIONS.contains(&(rust, name)) {
-            for (index, (name, doc)) in COORDINATES.into_iter().enumerate() {
-                shown.push(Shown { name: name.to_owned(), field, index, how: How::Element(doc) });
+        if POSITION_FIELDS.contains(&(rust, name)) {
+            for (index, (name, doc)) in COORDINATE_NAMES.into_iter().enumerate() {
+                shown.push(ShownField {
+                    name: name.to_owned(),
+                    field,
+                    index,
+                    source: FieldSource::Element(doc),
+                });
             }
         } else if name == "flags" {
-            for (_, name, doc) in COMPUTED.iter().filter(|(of, ..)| *of == rust) {
-                shown.push(Shown { name: (*name).to_owned(), field, index: 0, how: How::Computed(doc) });
+            for (_, name, doc) in COMPUTED_FIELDS.iter().filter(|(of, ..)| *of == rust) {
+                shown.push(ShownField {
+                    name: (*name).to_owned(),
+                    field,
+                    index: 0,
+                    source: FieldSource::Computed(doc),
+                });
             }
             let flags = field.set.as_ref().map_or(&[][..], |set| &sets[set].values);
-            for value in flags.iter().filter(|value| !HIDDEN.contains(&(rust, &value.name))) {
-                let how = How::Bit(value.number, value.doc.clone());
-                shown.push(Shown { name: value.name.clone(), field, index: 0, how });
+            for value in flags.iter().filter(|value| !HIDDEN_FIELDS.contains(&(rust, &value.name))) {
+                let source = FieldSource::Bit(value.number, value.doc.clone());
+                shown.push(ShownField { name: value.name.clone(), field, index: 0, source });
             }
-        } else if BOOLS.contains(&(rust, name)) {
-            shown.push(plain(How::Bool));
+        } else if BOOL_FIELDS.contains(&(rust, name)) {
+            shown.push(plain(FieldSource::Bool));
         } else {
-            shown.push(plain(How::Plain));
+            shown.push(plain(FieldSource::Plain));
         }
     }
     shown
 }
 
 /// A condition that a valid payload meets, besides its length, the limits of its counts and that numbers are finite.
-pub(crate) enum Check {
+pub(crate) enum BoundsCheck {
     /// Each element of an array has a field below a count of the head.
     Below { array: &'static str, field: &'static str, count: &'static str },
     /// Each element of an array has no bit at or above a count of the head.
@@ -101,46 +111,46 @@ pub(crate) enum Check {
 }
 
 /// Returns the conditions of a payload.
-pub(crate) fn checks(payload: &str) -> &'static [Check] {
+pub(crate) fn checks(payload: &str) -> &'static [BoundsCheck] {
     match payload {
-        "Scan" => &[Check::Within { field: "contents", from: 0, to: 7 }],
+        "Scan" => &[BoundsCheck::Within { field: "contents", from: 0, to: 7 }],
         "Lines" => &[
-            Check::Below { array: "corner_array", field: "first_line", count: "count" },
-            Check::Below { array: "corner_array", field: "second_line", count: "count" },
+            BoundsCheck::Below { array: "corner_array", field: "first_line", count: "count" },
+            BoundsCheck::Below { array: "corner_array", field: "second_line", count: "count" },
         ],
-        "Early" => &[Check::Within { field: "verdict", from: 1, to: 2 }],
-        "Tracks" => &[Check::Bits { array: "track_array", field: "sensors", count: "sensors" }],
-        "Event" => &[Check::Within { field: "kind", from: 0, to: 2 }],
+        "Early" => &[BoundsCheck::Within { field: "verdict", from: 1, to: 2 }],
+        "Tracks" => &[BoundsCheck::Bits { array: "track_array", field: "sensors", count: "sensors" }],
+        "Event" => &[BoundsCheck::Within { field: "kind", from: 0, to: 2 }],
         _ => &[],
     }
 }
 
 /// Which numbers of a field must not be infinite or NaN.
 #[derive(Clone, Copy, PartialEq)]
-pub(crate) enum Finite {
-    Must,
+pub(crate) enum FiniteRule {
+    Required,
     /// NaN means unknown.
     MayBeNan,
     NotChecked,
 }
 
 /// Returns the condition for the numbers of a field.
-pub(crate) fn finite(layout: &Layout, field: &Field) -> Finite {
+pub(crate) fn finite(layout: &Layout, field: &Field) -> FiniteRule {
     match (layout.rust.as_str(), &field.kind) {
-        (_, Kind::Number(kind)) if !kind.starts_with('f') => Finite::NotChecked,
-        ("Pose", _) => Finite::NotChecked,
-        ("Tilt", _) if field.name == "rate_rad_s" => Finite::MayBeNan,
-        (_, Kind::Number(_)) => Finite::Must,
-        _ => Finite::NotChecked,
+        (_, Kind::Number(kind)) if !kind.starts_with('f') => FiniteRule::NotChecked,
+        ("Pose", _) => FiniteRule::NotChecked,
+        ("Tilt", _) if field.name == "rate_rad_s" => FiniteRule::MayBeNan,
+        (_, Kind::Number(_)) => FiniteRule::Required,
+        _ => FiniteRule::NotChecked,
     }
 }
 
 /// Neighboring numbers of one size that must be finite.
-pub(crate) struct Run {
+pub(crate) struct FloatRun {
     /// Index of the first field.
     pub(crate) field: usize,
     /// Offset in bytes.
-    pub(crate) at: usize,
+    pub(crate) offset: usize,
     /// Size of a number in bytes.
     pub(crate) size: usize,
     /// Number of numbers.
@@ -148,19 +158,19 @@ pub(crate) struct Run {
 }
 
 /// Returns the numbers that must be finite among the first `fields` fields.
-pub(crate) fn finite_runs(layout: &Layout, fields: usize) -> Vec<Run> {
-    let mut runs: Vec<Run> = Vec::new();
+pub(crate) fn finite_runs(layout: &Layout, fields: usize) -> Vec<FloatRun> {
+    let mut runs: Vec<FloatRun> = Vec::new();
     for (index, field) in layout.fields[..fields].iter().enumerate() {
-        if finite(layout, field) != Finite::Must {
+        if finite(layout, field) != FiniteRule::Required {
             continue;
         }
         let count = field.len.unwrap_or(1);
         match runs
             .last_mut()
-            .filter(|run| run.size == field.element && run.at + run.size * run.count == field.at)
+            .filter(|run| run.size == field.element && run.offset + run.size * run.count == field.offset)
         {
             Some(run) => run.count += count,
-            None => runs.push(Run { field: index, at: field.at, size: field.element, count }),
+            None => runs.push(FloatRun { field: index, offset: field.offset, size: field.element, count }),
         }
     }
     runs
@@ -168,7 +178,7 @@ pub(crate) fn finite_runs(layout: &Layout, fields: usize) -> Vec<Run> {
 
 /// Returns the fields among the first `fields` fields that may be NaN, but not infinite.
 pub(crate) fn may_be_nan(layout: &Layout, fields: usize) -> impl Iterator<Item = &Field> {
-    layout.fields[..fields].iter().filter(|field| finite(layout, field) == Finite::MayBeNan)
+    layout.fields[..fields].iter().filter(|field| finite(layout, field) == FiniteRule::MayBeNan)
 }
 
 /// Returns the enum whose values a field has; `None` if it has bits, or any number.
@@ -205,7 +215,7 @@ pub(crate) fn names_of(set: &str) -> String {
 }
 
 /// Payloads whose arrays depend on each other, so that Python and Lua read them by hand. Only their heads are generated.
-pub(crate) const HEADS: [&str; 2] = ["Scan", "Foreground"];
+pub(crate) const VARIABLE_PAYLOADS: [&str; 2] = ["Scan", "Foreground"];
 
 /// Returns the field and the value of it with which a field is unknown.
 pub(crate) fn unknown_if(layout: &Layout, field: &Field) -> Option<(&'static str, u64)> {

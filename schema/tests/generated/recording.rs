@@ -3,16 +3,16 @@
 use scanhub_schema::{Header, Topic};
 
 use super::description::{Description, Field, Kind, Layout, first_sentence, lower_first};
-use super::rules::{self, Tail};
+use super::rules::{self, ArrayRule};
 use super::wrap;
 
-const WIDTH: usize = 120;
+const MAX_LINE_WIDTH: usize = 120;
 /// Column of the text after the name of a type.
-const COLUMN: usize = 25;
+const NAME_COLUMN: usize = 25;
 /// A set of more values is not listed.
 const MAX_VALUES: usize = 10;
 /// Stands for a space at which a line does not end.
-const JOIN: &str = "\u{1}";
+const JOIN_MARK: &str = "\u{1}";
 
 /// Returns the description: the header, and a paragraph for each topic.
 pub(crate) fn layout(description: &Description) -> String {
@@ -27,8 +27,8 @@ pub(crate) fn layout(description: &Description) -> String {
             values if values.is_empty() => about,
             values => format!("{}: {values}", about.split(':').next().unwrap_or_default()),
         };
-        let name = format!("{:>3} {} {}", field.at, kind(field), field.name);
-        text += &wrap(&format!("{name:<COLUMN$}"), &" ".repeat(COLUMN), &about, WIDTH);
+        let name = format!("{:>3} {} {}", field.offset, kind(field), field.name);
+        text += &wrap(&format!("{name:<NAME_COLUMN$}"), &" ".repeat(NAME_COLUMN), &about, MAX_LINE_WIDTH);
     }
     text.push('\n');
     for topic in Topic::ALL {
@@ -42,21 +42,21 @@ pub(crate) fn layout(description: &Description) -> String {
             ),
         };
         let name = format!("scanhub.{name}.v2");
-        text += &wrap(&format!("{name:<COLUMN$}"), &" ".repeat(COLUMN), &about, WIDTH);
+        text += &wrap(&format!("{name:<NAME_COLUMN$}"), &" ".repeat(NAME_COLUMN), &about, MAX_LINE_WIDTH);
     }
-    text.replace(JOIN, " ")
+    text.replace(JOIN_MARK, " ")
 }
 
 /// Returns all fields of a payload as a recording has them: without the unused elements of arrays.
 fn payload(description: &Description, layout: &Layout) -> String {
-    let head = rules::head(layout).fields;
+    let head = rules::fixed_part(layout).fields;
     let mut parts: Vec<String> = layout.fields[..head].iter().map(|field| item(description, field)).collect();
     for array in &layout.fields[head..] {
         let Kind::Layout(rust) = &array.kind else { panic!("an array of structs") };
         let count = rules::count_of(layout, array);
         parts.push(format!("{count} of {}", elements(description, rust)));
     }
-    for Tail { name, kind, count, only_if, .. } in rules::packed_tail(&layout.name) {
+    for ArrayRule { name, kind, count, only_if, .. } in rules::packed_arrays_of(&layout.name) {
         let condition = only_if.map_or(String::new(), |(field, bit)| format!("if {field} has bit {bit}: "));
         parts.push(match description.layouts.iter().any(|layout| layout.rust == *kind) {
             true => format!("{condition}{count} of {}", elements(description, kind)),
@@ -77,15 +77,15 @@ fn elements(description: &Description, rust: &str) -> String {
 /// Returns type and name of a field, with the values that it can have.
 fn item(description: &Description, field: &Field) -> String {
     if field.name.starts_with("reserved") {
-        return format!("{}{JOIN}0", kind(field));
+        return format!("{}{JOIN_MARK}0", kind(field));
     }
     let name = field.name.strip_suffix("_text").unwrap_or(&field.name);
     if let Kind::Layout(rust) = &field.kind {
-        return format!("{name}{JOIN}{}", elements(description, rust));
+        return format!("{name}{JOIN_MARK}{}", elements(description, rust));
     }
     match values(description, field) {
-        values if values.is_empty() => format!("{}{JOIN}{name}", kind(field)),
-        values => format!("{}{JOIN}{name} ({values})", kind(field)),
+        values if values.is_empty() => format!("{}{JOIN_MARK}{name}", kind(field)),
+        values => format!("{}{JOIN_MARK}{name} ({values})", kind(field)),
     }
 }
 
@@ -101,5 +101,5 @@ fn kind(field: &Field) -> String {
 fn values(description: &Description, field: &Field) -> String {
     let set = field.set.as_ref().map(|set| &description.sets[set].values);
     let values = set.into_iter().filter(|values| values.len() <= MAX_VALUES).flatten();
-    values.map(|value| format!("{}{JOIN}{}", value.number, value.name)).collect::<Vec<_>>().join(", ")
+    values.map(|value| format!("{}{JOIN_MARK}{}", value.number, value.name)).collect::<Vec<_>>().join(", ")
 }

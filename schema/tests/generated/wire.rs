@@ -2,9 +2,9 @@
 
 use std::fmt::Write as _;
 
-use super::c::{above, commented};
+use super::c::{comment_above, with_comment};
 use super::description::{Description, Field, Kind, Layout, first_sentence, lower_first, snake};
-use super::python::code;
+use super::python::format_code;
 
 /// Returns the name that starts all names of a layout: `DATAGRAM`, `ANNOUNCE` or `ANNOUNCED`.
 fn prefix(layout: &Layout) -> String {
@@ -16,21 +16,21 @@ pub(crate) fn c(description: &Description) -> String {
     let mut text = String::new();
     for layout in &description.datagram {
         let (name, prefix) = (snake(&layout.name), prefix(layout));
-        text += &above("", &format!("Offsets in bytes. {}.", first_sentence(&layout.doc)));
+        text += &comment_above("", &format!("Offsets in bytes. {}.", first_sentence(&layout.doc)));
         writeln!(text, "enum scanhub_{name}_at {{").expect("a String");
         for field in layout.fields.iter().filter(|field| !field.name.starts_with("reserved")) {
             let name = field.name.strip_suffix("_text").unwrap_or(&field.name).to_uppercase();
-            let line = format!("    SCANHUB_{prefix}_AT_{name} = {},", field.at);
-            text += &commented(&line, &format!("{}.", first_sentence(&description.doc(field))));
+            let line = format!("    SCANHUB_{prefix}_AT_{name} = {},", field.offset);
+            text += &with_comment(&line, &format!("{}.", first_sentence(&description.doc(field))));
         }
         write!(text, "    SCANHUB_{prefix}_AT_END = {}\n}};\n\n", layout.size).expect("a String");
     }
-    text += &(above("", "Bits of `flags`.") + "enum scanhub_flag {\n");
+    text += &(comment_above("", "Bits of `flags`.") + "enum scanhub_flag {\n");
     let flags = &description.sets["LanFlags"].values;
     for (index, flag) in flags.iter().enumerate() {
         let comma = if index + 1 < flags.len() { "," } else { "" };
         let line = format!("    SCANHUB_{} = {}{comma}", flag.name.to_uppercase(), flag.number);
-        text += &commented(&line, &flag.doc);
+        text += &with_comment(&line, &flag.doc);
     }
     text + "};\n"
 }
@@ -44,7 +44,7 @@ pub(crate) fn python(description: &Description) -> String {
         writeln!(text, "_{prefix} = struct.Struct(\"<{format}\")").expect("a String");
     }
     let crc = description.datagram[0].fields.iter().find(|field| field.name == "crc").expect("a checksum");
-    writeln!(text, "_CRC_AT = {}", crc.at).expect("a String");
+    writeln!(text, "_CRC_AT = {}", crc.offset).expect("a String");
     for rust in ["ScanHead", "ForegroundHead", "Segment"] {
         writeln!(text, "_{} = {}", snake(rust).to_uppercase(), description.layout(rust).size)
             .expect("a String");
@@ -61,7 +61,7 @@ fn python_format(field: &Field) -> String {
         _ if field.name.starts_with("reserved") => format!("{}x", field.size()),
         Kind::Number(kind) => match field.len {
             Some(len) => format!("{len}s"),
-            None => code(kind).to_string(),
+            None => format_code(kind).to_string(),
         },
         Kind::Text => format!("{}s", field.size()),
         Kind::Layout(_) => panic!("it has no structs"),
@@ -75,7 +75,7 @@ pub(crate) fn lua(description: &Description) -> String {
         writeln!(text, "local {} = {{", prefix(layout)).expect("a String");
         for field in layout.fields.iter().filter(|field| !field.name.starts_with("reserved")) {
             let name = field.name.strip_suffix("_text").unwrap_or(&field.name);
-            writeln!(text, "    {name} = {{ {}, {} }},", field.at, field.size()).expect("a String");
+            writeln!(text, "    {name} = {{ {}, {} }},", field.offset, field.size()).expect("a String");
         }
         write!(text, "    size = {},\n}}\n", layout.size).expect("a String");
     }
@@ -93,7 +93,8 @@ pub(crate) fn header(description: &Description) -> String {
         let doc = description.doc(field);
         let doc = lower_first(doc.trim_end_matches('.'));
         let doc = doc.strip_prefix(&format!("{}: ", field.name)).unwrap_or(&doc);
-        writeln!(text, "| {} | {} | `{}`: {doc} |", field.at, field.size(), field.name).expect("a String");
+        writeln!(text, "| {} | {} | `{}`: {doc} |", field.offset, field.size(), field.name)
+            .expect("a String");
     }
     text + "\n"
 }

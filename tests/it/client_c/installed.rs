@@ -10,7 +10,7 @@ use std::sync::OnceLock;
 use crate::testkit::{TestEnv, output, skip};
 
 /// A place where the library and its header are.
-pub(crate) struct Installed {
+pub(crate) struct InstalledLibrary {
     pub(crate) prefix: PathBuf,
     /// Where it was installed from.
     pub(crate) library: PathBuf,
@@ -19,35 +19,35 @@ pub(crate) struct Installed {
 }
 
 /// As strictly as it goes.
-const STRICT: [&str; 5] = ["-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"];
+const STRICT_FLAGS: [&str; 5] = ["-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"];
 
-impl Installed {
+impl InstalledLibrary {
     /// The one that all tests share; nothing where there is no C compiler.
-    pub(crate) fn once() -> Option<&'static Installed> {
-        static ONCE: OnceLock<Installed> = OnceLock::new();
-        if !is_there("cc") {
+    pub(crate) fn installed() -> Option<&'static InstalledLibrary> {
+        static INSTALLED: OnceLock<InstalledLibrary> = OnceLock::new();
+        if !is_installed("cc") {
             return None;
         }
-        Some(ONCE.get_or_init(|| {
+        Some(INSTALLED.get_or_init(|| {
             let here = Path::new(env!("CARGO_TARGET_TMPDIR")).join("client_c");
             let _ = std::fs::remove_dir_all(&here);
             let (prefix, library) = (here.join("prefix"), here.join("library"));
             std::fs::create_dir_all(&library).expect("a directory");
             // Not the one for linking into programs, which has 100 MB.
             let shared = "libscanhub.so";
-            std::os::unix::fs::symlink(built().join(shared), library.join(shared))
+            std::os::unix::fs::symlink(build_directory().join(shared), library.join(shared))
                 .expect("a place for a link");
-            let mut command = Command::new(top().join("clients/c/install.sh"));
+            let mut command = Command::new(repository().join("clients/c/install.sh"));
             command.arg("--prefix").arg(&prefix).arg("--library").arg(&library).env_remove("DESTDIR");
             let messages = output(command).expect("a shell");
-            let messages = done(&messages).unwrap_or_else(|errors| panic!("{errors}"));
-            Installed { prefix, library, messages }
+            let messages = stdout_if_success(&messages).unwrap_or_else(|errors| panic!("{errors}"));
+            InstalledLibrary { prefix, library, messages }
         }))
     }
 
     /// The program of `source`, against the shared library.
     pub(crate) fn compile(&self, env: &TestEnv, source: &Path, flags: &[&str]) -> PathBuf {
-        self.try_compile(env, source, flags).unwrap_or_else(|said| panic!("{said}"))
+        self.try_compile(env, source, flags).unwrap_or_else(|message| panic!("{message}"))
     }
 
     /// As [`compile`](Self::compile); what the compiler says if it does not.
@@ -64,49 +64,49 @@ impl Installed {
     /// The program of `source` in C++; nothing where there is no compiler for it.
     pub(crate) fn compile_cpp(&self, env: &TestEnv, source: &Path) -> Option<PathBuf> {
         let built = self.try_compile_cpp(env, source)?;
-        Some(built.unwrap_or_else(|said| panic!("{said}")))
+        Some(built.unwrap_or_else(|message| panic!("{message}")))
     }
 
     /// Returns the program of `source` in C++20. `None` if there is no compiler for it.
     pub(crate) fn compile_cpp20(&self, env: &TestEnv, source: &Path) -> Option<PathBuf> {
         let built =
-            is_there("c++").then(|| self.build("c++", env, source, &["-std=c++20"], &self.shared()))?;
+            is_installed("c++").then(|| self.build("c++", env, source, &["-std=c++20"], &self.shared()))?;
         Some(built.unwrap_or_else(|errors| panic!("{errors}")))
     }
 
     /// As [`compile_cpp`](Self::compile_cpp); what the compiler says if it does not.
     pub(crate) fn try_compile_cpp(&self, env: &TestEnv, source: &Path) -> Option<Result<PathBuf, String>> {
-        is_there("c++").then(|| self.build("c++", env, source, &["-std=c++11"], &self.shared()))
+        is_installed("c++").then(|| self.build("c++", env, source, &["-std=c++11"], &self.shared()))
     }
 
     /// The program of `source` with the library in it; nothing where pkg-config does not say how.
     pub(crate) fn compile_static(&self, env: &TestEnv, source: &Path) -> Option<PathBuf> {
         let mut ask = self.with_packages(Command::new("pkg-config"));
-        let Ok(said) = output(ask.args(["--static", "--libs-only-l", "scanhub"])) else {
+        let Ok(pkg_config) = output(ask.args(["--static", "--libs-only-l", "scanhub"])) else {
             skip("pkg-config", "there is none, which says how the library gets into a program");
             return None;
         };
-        let said = done(&said).unwrap_or_else(|said| panic!("{said}"));
-        let mut libraries = vec![built().join("libscanhub.a").display().to_string()];
+        let said = stdout_if_success(&pkg_config).unwrap_or_else(|said| panic!("{said}"));
+        let mut libraries = vec![build_directory().join("libscanhub.a").display().to_string()];
         libraries.extend(said.split_whitespace().filter(|word| *word != "-lscanhub").map(str::to_owned));
         let program = self.build("cc", env, source, &["-std=c99"], &libraries);
-        Some(program.unwrap_or_else(|said| panic!("{said}")))
+        Some(program.unwrap_or_else(|message| panic!("{message}")))
     }
 
     /// Builds the project `source` with CMake in each way in which the package is found, and returns the build
     /// directories. Empty if a tool is missing.
     pub(crate) fn cmake(&self, env: &TestEnv, source: &Path) -> Vec<PathBuf> {
-        if !["cmake", "c++"].into_iter().all(is_there) {
+        if !["cmake", "c++"].into_iter().all(is_installed) {
             return Vec::new();
         }
         // A package that names its own prefix does not work after this.
         let moved = env.path("moved");
         let mut copy = Command::new("cp");
         copy.arg("-a").arg(&self.prefix).arg(&moved);
-        done(&output(copy).expect("cp")).unwrap_or_else(|errors| panic!("{errors}"));
+        stdout_if_success(&output(copy).expect("cp")).unwrap_or_else(|errors| panic!("{errors}"));
         let sources = vec![
-            format!("-Dscanhub_DIR={}", top().join("clients/c/cmake").display()),
-            format!("-Dscanhub_LIBRARY_DIR={}", built().display()),
+            format!("-Dscanhub_DIR={}", repository().join("clients/c/cmake").display()),
+            format!("-Dscanhub_LIBRARY_DIR={}", build_directory().display()),
         ];
         let ways =
             [("prefix", vec![format!("-DCMAKE_PREFIX_PATH={}", moved.display())]), ("sources", sources)];
@@ -115,7 +115,8 @@ impl Installed {
             let mut configure = Command::new("cmake");
             configure.arg("-S").arg(source).arg("-B").arg(&build).args(flags);
             for command in [&mut configure, Command::new("cmake").arg("--build").arg(&build)] {
-                done(&output(command).expect("CMake")).unwrap_or_else(|errors| panic!("{errors}"));
+                stdout_if_success(&output(command).expect("CMake"))
+                    .unwrap_or_else(|errors| panic!("{errors}"));
             }
             build
         };
@@ -128,7 +129,7 @@ impl Installed {
         let flags =
             output(self.with_packages(Command::new("pkg-config")).args(["--cflags", "--libs", "scanhub"]));
         let flags = flags.inspect_err(|_| is_missing()).ok()?;
-        let flags = done(&flags).unwrap_or_else(|errors| panic!("{errors}"));
+        let flags = stdout_if_success(&flags).unwrap_or_else(|errors| panic!("{errors}"));
         let mut flags: Vec<String> = flags.split_whitespace().map(str::to_owned).collect();
         flags.extend(self.shared().pop());
         Some(self.build("cc", env, source, &["-std=c99"], &flags).unwrap_or_else(|errors| panic!("{errors}")))
@@ -145,9 +146,9 @@ impl Installed {
         let name = source.file_stem().expect("a file");
         let program = env.path(&format!("{}-{}", name.display(), flags.concat().len() + libraries.len()));
         let mut command = Command::new(compiler);
-        command.args(STRICT).args(flags).arg("-I").arg(self.prefix.join("include")).arg(source);
+        command.args(STRICT_FLAGS).args(flags).arg("-I").arg(self.prefix.join("include")).arg(source);
         command.args(libraries).arg("-o").arg(&program);
-        done(&output(command).expect("a compiler")).map(|_| program)
+        stdout_if_success(&output(command).expect("a compiler")).map(|_| program)
     }
 
     fn shared(&self) -> Vec<String> {
@@ -162,7 +163,7 @@ impl Installed {
 }
 
 /// Whether there is such a tool; says so if not.
-pub(crate) fn is_there(name: &str) -> bool {
+pub(crate) fn is_installed(name: &str) -> bool {
     let found = output(Command::new(name).arg("--version")).is_ok();
     if !found {
         skip(name, "there is none");
@@ -172,25 +173,25 @@ pub(crate) fn is_there(name: &str) -> bool {
 
 /// A program in C of these tests.
 pub(crate) fn source(name: &str) -> PathBuf {
-    top().join("tests/it/client_c").join(name)
+    repository().join("tests/it/client_c").join(name)
 }
 
 /// Where the header is, in the project.
 pub(crate) fn header_directory() -> PathBuf {
-    top().join("clients/c/include")
+    repository().join("clients/c/include")
 }
 
-fn top() -> &'static Path {
+fn repository() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
 /// Cargo builds the library for this test, and puts it beside the test's own program.
-fn built() -> PathBuf {
+fn build_directory() -> PathBuf {
     let own = std::env::current_exe().expect("the path of this test");
     own.parent().expect("a directory").to_owned()
 }
 
-fn done(output: &Output) -> Result<String, String> {
+fn stdout_if_success(output: &Output) -> Result<String, String> {
     let text = |bytes| String::from_utf8_lossy(bytes).into_owned();
     match output.status.success() {
         true => Ok(text(&output.stdout)),

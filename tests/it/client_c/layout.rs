@@ -1,6 +1,6 @@
 //! The layouts of all payloads, and a program that reports the layouts of C: offset and size of every field.
 
-use scanhub_schema::{Contents, Counter, Family, Header, Scan, ScanHead};
+use scanhub_schema::{ArrayFlags, Counter, Family, Header, Scan, ScanHead};
 
 struct Layout {
     /// Name in C.
@@ -81,7 +81,9 @@ pub(crate) fn scans() -> Vec<Box<Scan>> {
         Scan::of(ScanHead { intensity_bits: bits - 13, ..head }, &ranges(count.into(), (1 << bits) - 1))
     };
     let mut scans = vec![lms(361, 13, 500, 1), lms(181, 14, 1000, 10), lms(401, 15, 250, 100)];
-    for contents in [0, Contents::UPPER, Contents::WIDE, Contents::ANGLES | Contents::WIDE, Contents::ALL] {
+    for contents in
+        [0, ArrayFlags::UPPER, ArrayFlags::WIDE, ArrayFlags::ANGLES | ArrayFlags::WIDE, ArrayFlags::ALL]
+    {
         let head = ScanHead {
             first_angle: 3.0,
             step: -0.0125,
@@ -111,7 +113,7 @@ pub(crate) fn scans() -> Vec<Box<Scan>> {
 
 /// A program that computes what the header does, of all beams of `scan` and three more; and of a sample that is none, and of
 /// one that is cut short, that nothing leads outside of it.
-pub(crate) fn computes(header: &Header, scan: &Scan) -> String {
+pub(crate) fn computed_values_c(header: &Header, scan: &Scan) -> String {
     let bytes = scan.bytes();
     let list: Vec<String> = bytes.iter().map(u8::to_string).collect();
     format!(

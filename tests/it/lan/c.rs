@@ -34,11 +34,11 @@ fn reader() -> Option<PathBuf> {
 }
 
 #[test]
-fn the_header_reads_what_schema_reads() {
+fn header_reads_the_same_datagrams_as_schema() {
     let Some(program) = reader() else { return };
     let mut reader = Reader::start(&mut Command::new(program));
-    readers::golden(&mut reader);
-    readers::keyed(&mut reader);
-    readers::damaged(&mut reader, 5_000);
+    readers::check_vectors(&mut reader);
+    readers::check_keyed_vectors(&mut reader);
+    readers::check_damaged(&mut reader, 5_000);
     reader.end();
 }

@@ -2,7 +2,7 @@
 
 use fastrand::Rng;
 use scanhub_schema::Topic;
-use scanhub_schema::datagram::{Announce, Datagram, HEAD, Head, MTU_ETHERNET};
+use scanhub_schema::datagram::{Announce, Datagram, HEADER_LEN, Head, MTU_ETHERNET};
 use serde_json::{Value, json};
 
 use super::{says, vectors};
@@ -74,6 +74,6 @@ fn damage(random: &mut Rng, datagram: &Datagram<'_>) -> Vec<u8> {
         head.topic = [1, 2, 3, 4, 5, 6, 8, 255][random.usize(..8)];
     }
     let mut buffer = [0; MTU_ETHERNET];
-    buffer[HEAD..HEAD + payload.len()].copy_from_slice(&payload);
+    buffer[HEADER_LEN..HEADER_LEN + payload.len()].copy_from_slice(&payload);
     head.seal(&mut buffer, payload.len()).expect("it fits").to_vec()
 }

@@ -6,7 +6,7 @@ use std::path::Path;
 use serde_json::Value;
 
 /// What came, in this order.
-pub(crate) struct Keyed {
+pub(crate) struct KeyedVectors {
     /// The key of the receiver, as hex digits.
     pub(crate) key: String,
     /// The datagrams.
@@ -28,7 +28,7 @@ pub(crate) struct Step {
 }
 
 /// All of them.
-pub(crate) fn keyed() -> Keyed {
+pub(crate) fn read_vectors() -> KeyedVectors {
     let list: Value = serde_json::from_str(&text()).expect("JSON");
     let word = |step: &Value, key: &str| step[key].as_str().unwrap_or_else(|| panic!("no {key}")).to_owned();
     let step = |step: &Value| Step {
@@ -39,7 +39,7 @@ pub(crate) fn keyed() -> Keyed {
         outcome: word(step, "outcome"),
     };
     let steps = list["steps"].as_array().expect("a list").iter().map(step).collect();
-    Keyed { key: word(&list, "key"), steps }
+    KeyedVectors { key: word(&list, "key"), steps }
 }
 
 /// The file.

@@ -24,11 +24,11 @@ fn reader() -> Option<Reader> {
 }
 
 #[test]
-fn the_module_reads_what_schema_reads() {
+fn module_reads_the_same_datagrams_as_schema() {
     let Some(mut reader) = reader() else { return };
-    readers::golden(&mut reader);
-    readers::keyed(&mut reader);
-    readers::damaged(&mut reader, 5_000);
+    readers::check_vectors(&mut reader);
+    readers::check_keyed_vectors(&mut reader);
+    readers::check_damaged(&mut reader, 5_000);
     reader.end();
 }
 
@@ -57,14 +57,14 @@ fn the_module_puts_parts_together() {
 #[test]
 fn the_module_knows_keys() {
     let Some(mut reader) = reader() else { return };
-    let list = vectors::list();
+    let list = vectors::read_list();
     let key = list["key"].as_str().expect("a key");
     for vector in vectors::vectors() {
-        let said = reader.read(Some(key), &vector.bytes);
-        if vector.says["with_key"] == true {
-            assert_eq!(said["refusal"], vector.says["refusal"], "{}", vector.name);
+        let message = reader.read(Some(key), &vector.bytes);
+        if vector.description["with_key"] == true {
+            assert_eq!(message["refusal"], vector.description["refusal"], "{}", vector.name);
         }
-        assert_eq!(said["authenticated"] == true, vector.name == "authenticated", "{}", vector.name);
+        assert_eq!(message["authenticated"] == true, vector.name == "authenticated", "{}", vector.name);
     }
     reader.end();
 }

@@ -4,7 +4,7 @@
 use std::io::{BufRead, BufReader, Write};
 use std::process::{ChildStdin, ChildStdout, Command, Stdio};
 
-use scanhub_schema::datagram::{Datagram, Packed};
+use scanhub_schema::datagram::{Datagram, DatagramPayload};
 use scanhub_schema::{Counter, Scan};
 use serde_json::{Map, Value, json};
 
@@ -29,10 +29,10 @@ impl Reader {
     /// What it says of a datagram; `key` as hex digits.
     pub(crate) fn read(&mut self, key: Option<&str>, datagram: &[u8]) -> Value {
         let digits: String = datagram.iter().map(|byte| format!("{byte:02x}")).collect();
-        self.ask(&key.map_or(digits.clone(), |key| format!("{key}:{digits}")))
+        self.request(&key.map_or(digits.clone(), |key| format!("{key}:{digits}")))
     }
 
-    fn ask(&mut self, line: &str) -> Value {
+    fn request(&mut self, line: &str) -> Value {
         writeln!(self.input, "{line}").expect("it reads");
         let mut answer = String::new();
         self.output.read_line(&mut answer).expect("it answers");
@@ -47,52 +47,52 @@ impl Reader {
 }
 
 /// Every golden datagram is what the list says. What depends on those before it, or on a key, is sound by itself.
-pub(crate) fn golden(reader: &mut Reader) {
+pub(crate) fn check_vectors(reader: &mut Reader) {
     for vector in vectors::vectors() {
-        let says = vector.says.as_object().expect("an object");
+        let says = vector.description.as_object().expect("an object");
         let by_itself =
             !["after", "after_hubs", "from_another", "with_key"].iter().any(|key| says.contains_key(*key));
-        let expected = if by_itself { vector.says.clone() } else { damaged::expected(&vector.bytes) };
-        same(&vector.name, &vector.bytes, reader.read(None, &vector.bytes), &expected);
+        let expected = if by_itself { vector.description.clone() } else { damaged::expected(&vector.bytes) };
+        assert_same(&vector.name, &vector.bytes, reader.read(None, &vector.bytes), &expected);
     }
 }
 
 /// With the key they take, and refuse, what the receiving end in Rust does: also what is sent again.
-pub(crate) fn keyed(reader: &mut Reader) {
-    let keyed = keyed_vectors::keyed();
+pub(crate) fn check_keyed_vectors(reader: &mut Reader) {
+    let keyed = keyed_vectors::read_vectors();
     for step in keyed.steps {
         let digits: String = step.bytes.iter().map(|byte| format!("{byte:02x}")).collect();
-        let said = reader.ask(&format!("{}@{}:{digits}", keyed.key, step.at_s));
-        assert_eq!(said["outcome"], step.outcome, "{}", step.name);
+        let reported = reader.request(&format!("{}@{}:{digits}", keyed.key, step.at_s));
+        assert_eq!(reported["outcome"], step.outcome, "{}", step.name);
     }
 }
 
 /// Whatever a payload says, they agree on whether it is sound and on what it says.
-pub(crate) fn damaged(reader: &mut Reader, count: u32) {
+pub(crate) fn check_damaged(reader: &mut Reader, count: u32) {
     for (datagram, expected) in damaged::datagrams(count) {
-        same("a damaged one", &datagram, reader.read(None, &datagram), &expected);
+        assert_same("a damaged one", &datagram, reader.read(None, &datagram), &expected);
     }
 }
 
-fn same(name: &str, bytes: &[u8], mut said: Value, expected: &Value) {
-    if let Some(metres) = said["payload"].as_object_mut().and_then(|payload| payload.remove("m")) {
+fn assert_same(name: &str, bytes: &[u8], mut reported: Value, expected: &Value) {
+    if let Some(metres) = reported["payload"].as_object_mut().and_then(|payload| payload.remove("m")) {
         let mut scan = Scan::zeroed(bytes.len());
         assert!(scan.unpack(Datagram::read(bytes).expect("it was read").payload));
         let expected: Vec<_> = (0..scan.beams()).map(|i| scan.distance_m(i)).collect();
-        assert_eq!(metres, as_read(&json!(expected)), "{name}: {bytes:02x?}");
+        assert_eq!(metres, as_read_from_json(&json!(expected)), "{name}: {bytes:02x?}");
     }
     // A language without names for them.
-    if let Some(counters) = said["payload"]["counters"].as_array() {
+    if let Some(counters) = reported["payload"]["counters"].as_array() {
         let names = Counter::ALL.iter().map(|counter| counter.name().to_owned());
         let named: Map<String, Value> = names.zip(counters.iter().cloned()).collect();
-        said["payload"]["counters"] = named.into();
+        reported["payload"]["counters"] = named.into();
     }
     for key in ["head", "payload", "refusal"] {
-        assert_eq!(said[key], as_read(&expected[key]), "{key} of {name}: {bytes:02x?}");
+        assert_eq!(reported[key], as_read_from_json(&expected[key]), "{key} of {name}: {bytes:02x?}");
     }
 }
 
 /// The same as text and back, which a number of many digits does not outlive to its last bit.
-fn as_read(value: &Value) -> Value {
+fn as_read_from_json(value: &Value) -> Value {
     serde_json::from_str(&value.to_string()).expect("JSON")
 }

@@ -12,12 +12,12 @@ pub(crate) struct Vector {
     /// `head` and `payload` of an accepted datagram; otherwise `refusal` and, if the receiver needs a history, `with_key`,
     /// `after` (names of datagrams that it received before), `after_hubs` (number of other hubs that delivered for a second
     /// before), or `from_another` (a sender other than that of the datagrams before).
-    pub(crate) says: Value,
+    pub(crate) description: Value,
 }
 
 /// Returns all datagrams in the order of the list.
 pub(crate) fn vectors() -> Vec<Vector> {
-    list()["vectors"].as_array().expect("a list").iter().map(vector).collect()
+    read_list()["vectors"].as_array().expect("a list").iter().map(vector).collect()
 }
 
 /// Returns the datagram with this name.
@@ -26,9 +26,9 @@ pub(crate) fn bytes(name: &str) -> Vec<u8> {
     found.unwrap_or_else(|| panic!("no datagram {name}")).bytes
 }
 
-fn vector(says: &Value) -> Vector {
-    let text = |key: &str| says[key].as_str().unwrap_or_else(|| panic!("no {key}"));
-    Vector { name: text("name").to_owned(), bytes: unhex(text("bytes")), says: says.clone() }
+fn vector(description: &Value) -> Vector {
+    let text = |key: &str| description[key].as_str().unwrap_or_else(|| panic!("no {key}"));
+    Vector { name: text("name").to_owned(), bytes: unhex(text("bytes")), description: description.clone() }
 }
 
 fn unhex(text: &str) -> Vec<u8> {
@@ -37,7 +37,7 @@ fn unhex(text: &str) -> Vec<u8> {
 }
 
 /// Returns the whole list: `vectors`, and `key`, the key of the datagrams that have a MAC, as hex digits.
-pub(crate) fn list() -> Value {
+pub(crate) fn read_list() -> Value {
     // Crates at several depths read them.
     let mut above = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors();
     let top = above.find(|folder| folder.join("tests/vectors").is_dir()).expect("the top");

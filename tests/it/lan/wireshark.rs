@@ -6,19 +6,19 @@ use std::collections::{BTreeMap, BTreeSet};
 use super::capture::{Capture, has_tshark};
 use super::{damaged, keyed_vectors, vectors};
 use crate::testkit::TestEnv;
-use scanhub_schema::datagram::{HEAD, Head, Packed};
+use scanhub_schema::datagram::{DatagramPayload, HEADER_LEN, Head};
 use scanhub_schema::{EventKind, Family, PointClass, State, Topic, TrackState, Verdict, Zones};
 use serde_json::Value;
 
 /// What the list says of a payload, in the names and the words of the dissector: the values of each field, in their order.
-fn fields(topic: &str, says: &Value) -> BTreeMap<String, Vec<String>> {
+fn fields(topic: &str, description: &Value) -> BTreeMap<String, Vec<String>> {
     let mut fields = BTreeMap::new();
-    flatten(topic, "", says, &mut fields);
+    flatten(topic, "", description, &mut fields);
     fields
 }
 
-fn flatten(topic: &str, name: &str, says: &Value, fields: &mut BTreeMap<String, Vec<String>>) {
-    match says {
+fn flatten(topic: &str, name: &str, description: &Value, fields: &mut BTreeMap<String, Vec<String>>) {
+    match description {
         // Computed of fields that are shown.
         Value::Object(items) => items
             .iter()
@@ -42,12 +42,12 @@ fn flatten(topic: &str, name: &str, says: &Value, fields: &mut BTreeMap<String, 
                 "telegram" => "scanhub.telegram".to_owned(),
                 name => format!("scanhub.{topic}.{name}"),
             };
-            fields.entry(field).or_default().push(word(name, value));
+            fields.entry(field).or_default().push(shown_field(name, value));
         }
     }
 }
 
-fn word(name: &str, value: &Value) -> String {
+fn shown_field(name: &str, value: &Value) -> String {
     let number = |of: Option<usize>| of.expect("a known name").to_string();
     match (name, value) {
         ("verdict", Value::String(name)) => {
@@ -74,7 +74,7 @@ fn word(name: &str, value: &Value) -> String {
 }
 
 /// Angles, and the numbers of lines and motions, have as many digits as the tool likes.
-fn as_shown(name: &str, values: &str) -> String {
+fn shown_value(name: &str, values: &str) -> String {
     let is_angle = ["angle", "step", "spacing"].iter().any(|word| name.ends_with(word))
         || ["lines", "motion", "tracks", "tilt", "cloud", "obstacles"]
             .iter()
@@ -100,45 +100,45 @@ fn golden_datagrams_are_shown_field_by_field() {
     // Field by vector.
     let mut expected: Vec<BTreeMap<String, Vec<String>>> = Vec::new();
     for vector in &vectors {
-        let mut wanted = BTreeMap::new();
-        match vector.says["refusal"].as_str() {
+        let mut target = BTreeMap::new();
+        match vector.description["refusal"].as_str() {
             None => {
-                let head = &vector.says["head"];
+                let head = &vector.description["head"];
                 let topic = head["topic"].as_u64().expect("a number");
                 let topic = Topic::of_number(topic as u8).map_or("announce", Topic::name);
-                wanted = fields(topic, &vector.says["payload"]);
+                target = fields(topic, &vector.description["payload"]);
                 for (key, value) in head.as_object().expect("an object") {
                     let key = if key == "payload_len" { "payload_length" } else { key };
-                    wanted.insert(format!("scanhub.{key}"), vec![word(key, value)]);
+                    target.insert(format!("scanhub.{key}"), vec![shown_field(key, value)]);
                 }
-                wanted.insert("scanhub.refused".to_owned(), Vec::new());
-                wanted.insert("scanhub.crc_status".to_owned(), vec!["good".to_owned()]);
+                target.insert("scanhub.refused".to_owned(), Vec::new());
+                target.insert("scanhub.crc_status".to_owned(), vec!["good".to_owned()]);
             }
             // A part is shown as one; what it is a part of is not.
             Some("payload") if vector.name.starts_with("scan_part_") => {
                 let part = vector.name.trim_start_matches("scan_part_");
                 for (field, value) in [("part", part), ("parts", "3"), ("crc_status", "good")] {
-                    wanted.insert(format!("scanhub.{field}"), vec![value.to_owned()]);
+                    target.insert(format!("scanhub.{field}"), vec![value.to_owned()]);
                 }
-                wanted.insert("scanhub.refused".to_owned(), Vec::new());
+                target.insert("scanhub.refused".to_owned(), Vec::new());
             }
             // A capture has no key, and other datagrams before it.
             Some("unauthenticated" | "mac" | "epoch" | "twin" | "stale" | "capacity") => {}
             Some(refusal) => {
-                wanted.insert("scanhub.refused".to_owned(), vec![refusal.to_owned()]);
+                target.insert("scanhub.refused".to_owned(), vec![refusal.to_owned()]);
             }
         }
-        expected.push(wanted);
+        expected.push(target);
     }
     let names: BTreeSet<&String> = expected.iter().flat_map(BTreeMap::keys).collect();
     let names: Vec<String> = names.into_iter().cloned().collect();
     let shown = capture.fields("golden", &names);
     assert_eq!(shown.len(), vectors.len());
-    for ((vector, wanted), shown) in vectors.iter().zip(&expected).zip(&shown) {
-        for (name, values) in wanted {
+    for ((vector, target), shown) in vectors.iter().zip(&expected).zip(&shown) {
+        for (name, values) in target {
             assert_eq!(
-                as_shown(name, &shown[name]),
-                as_shown(name, &values.join(",")),
+                shown_value(name, &shown[name]),
+                shown_value(name, &values.join(",")),
                 "{name} of {}",
                 vector.name
             );
@@ -173,7 +173,7 @@ fn macs_are_checked() {
     if !has_tshark() {
         return;
     }
-    let keyed = keyed_vectors::keyed();
+    let keyed = keyed_vectors::read_vectors();
     let mut capture = Capture::default();
     keyed.steps.iter().for_each(|step| capture.add(&step.bytes));
     let env = TestEnv::new();
@@ -192,7 +192,7 @@ fn macs_are_checked() {
             assert_eq!(shown["scanhub.refused"], refused, "{}", step.name);
         }
     }
-    let (missing, short) = (env.word("missing"), env.file("short", "00ff"));
+    let (missing, short) = (env.path_argument("missing"), env.file("short", "00ff"));
     for (name, file) in [("without", ""), ("missing", &missing), ("short", &short)] {
         for (step, shown) in keyed.steps.iter().zip(shown(name, file)) {
             let status = &shown["scanhub.mac_status"];
@@ -236,7 +236,7 @@ fn gaps_are_flagged_per_hub_epoch_sensor_and_topic() {
     let mut capture = Capture::default();
     for (head, _) in sent {
         let mut buffer = [0; 100];
-        let len = Zones::unknown().pack(&mut buffer[HEAD..]).expect("room");
+        let len = Zones::unknown().pack(&mut buffer[HEADER_LEN..]).expect("room");
         capture.add(head.seal(&mut buffer, len).expect("room"));
     }
     let flags = ["lost", "reordered", "duplicate", "stale", "retired"];

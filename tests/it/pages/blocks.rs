@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Block {
     /// The page and the line on which it begins, as compilers write it.
-    pub(crate) place: String,
+    pub(crate) location: String,
     /// What is written behind the fence: sh, rust, python ..
     pub(crate) language: String,
     /// Its lines, each with a line feed.
@@ -27,20 +27,20 @@ pub(crate) fn blocks() -> Vec<Block> {
     pages.sort();
     let read = |page: &PathBuf| {
         let name = page.strip_prefix(top).expect("below the top").display().to_string();
-        of_page(&name, &fs::read_to_string(page).expect("a page"))
+        blocks_of_page(&name, &fs::read_to_string(page).expect("a page"))
     };
     pages.iter().flat_map(read).collect()
 }
 
 /// The blocks of one page.
-pub(crate) fn of_page(name: &str, text: &str) -> Vec<Block> {
+pub(crate) fn blocks_of_page(name: &str, text: &str) -> Vec<Block> {
     let mut blocks = Vec::new();
     let mut open: Option<Block> = None;
     for (number, line) in text.lines().enumerate() {
         match (&mut open, line.trim_start().strip_prefix("```")) {
             (None, Some(language)) => {
-                let place = format!("{name}:{}", number + 1);
-                open = Some(Block { place, language: language.trim().to_owned(), text: String::new() });
+                let location = format!("{name}:{}", number + 1);
+                open = Some(Block { location, language: language.trim().to_owned(), text: String::new() });
             }
             (Some(_), Some(_)) => blocks.extend(open.take()),
             (Some(block), None) => block.text.extend([line, "\n"]),
@@ -55,10 +55,10 @@ pub(crate) fn of_page(name: &str, text: &str) -> Vec<Block> {
 fn blocks_have_a_place_and_a_language() {
     let page = "words\n```sh\none\n\ntwo\n```\n- item\n  ```\n  three\n  ```\n";
     let block = |place: &str, language: &str, text: &str| Block {
-        place: place.into(),
+        location: place.into(),
         language: language.into(),
         text: text.into(),
     };
-    let wanted = [block("p.md:2", "sh", "one\n\ntwo\n"), block("p.md:8", "", "  three\n")];
-    assert_eq!(of_page("p.md", page), wanted);
+    let expected = [block("p.md:2", "sh", "one\n\ntwo\n"), block("p.md:8", "", "  three\n")];
+    assert_eq!(blocks_of_page("p.md", page), expected);
 }

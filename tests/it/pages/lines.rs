@@ -10,12 +10,14 @@ use rustix::process::{Pid, Signal, kill_process_group};
 
 use super::blocks::blocks;
 use super::shell::{commands, lines};
-use crate::testkit::{Program, Sender, TestEnv, in_a_network, side_by_side, until, write_program};
+use crate::testkit::{
+    Program, TestEnv, TestGateway, in_a_network, run_concurrently, wait_until, write_program,
+};
 use scanhub_schema::Topic;
 
 /// Commands that are not run, by how their line begins or what is in it, and what makes sure of them. Those of the
 /// program are read by `hub/cli.rs`.
-const NOT_RUN: [(&str, &str); 18] = [
+const SKIPPED_COMMANDS: [(&str, &str); 18] = [
     ("sudo ", "changes the machine; tests/it/dist.rs and tests/it/client_c.rs install elsewhere"),
     ("sudoedit ", "an editor"),
     ("curl ", "installs Rust, which built this test"),
@@ -36,29 +38,29 @@ const NOT_RUN: [(&str, &str); 18] = [
     ("scanhub echo hall/", "follows what that makes; the same"),
 ];
 /// The same of what is in the middle of a line.
-const NOT_RUN_WITH: [(&str, &str); 1] = [("| ssh ", "needs another machine")];
+const NOT_RUN_IF_CONTAINS: [(&str, &str); 1] = [("| ssh ", "needs another machine")];
 
 /// Whether `line` is not run.
-fn is_left_out(line: &str) -> bool {
-    NOT_RUN.iter().any(|(begin, _)| line.starts_with(begin))
-        || NOT_RUN_WITH.iter().any(|(part, _)| line.contains(part))
+fn is_excluded(line: &str) -> bool {
+    SKIPPED_COMMANDS.iter().any(|(begin, _)| line.starts_with(begin))
+        || NOT_RUN_IF_CONTAINS.iter().any(|(part, _)| line.contains(part))
 }
 
 /// Whether `line` has to do with a network.
-fn is_of_a_network(line: &str) -> bool {
+fn needs_network(line: &str) -> bool {
     ["scanhub listen", "scanhub gateway", "robot1."].iter().any(|part| line.contains(part))
 }
 
 /// All lines of all pages with their places.
-fn all() -> Vec<(String, String)> {
+fn command_lines() -> Vec<(String, String)> {
     let blocks = blocks().into_iter().filter(|block| block.language == "sh");
-    let lines =
-        blocks.flat_map(|block| lines(&block.text).into_iter().map(move |line| (block.place.clone(), line)));
+    let lines = blocks
+        .flat_map(|block| lines(&block.text).into_iter().map(move |line| (block.location.clone(), line)));
     lines.collect()
 }
 
 /// What the pages take for granted.
-struct Desk {
+struct ShellEnv {
     env: TestEnv,
     /// Of lines that were run.
     count: AtomicUsize,
@@ -67,23 +69,23 @@ struct Desk {
 /// Recordings of `front` under these names.
 const RECORDINGS: [&str; 5] = ["walk.mcap", "day-0001.mcap", "cut.mcap", "killed.mcap", "robot.mcap"];
 /// A part of a recording that lasts longer than the one here, and the like of this one.
-const MINUTES: (&str, &str) = ("--start 1m --end 90s", "--start 200ms --end 500ms");
+const SHORTENED_RANGE: (&str, &str) = ("--start 1m --end 90s", "--start 200ms --end 500ms");
 /// Ports that pages name.
 const PORTS: [&str; 3] = ["/dev/serial/by-id/usb-FTDI...", "/dev/ttyUSB0", "/tmp/lms"];
 
-impl Desk {
+impl ShellEnv {
     /// With what runs beside it, the simulator and the hub.
-    fn new() -> (Desk, [Program; 2]) {
+    fn new() -> (ShellEnv, [Program; 2]) {
         let env = TestEnv::new();
         let simulator = env.simulator(&["front", "spare"], &["--seed=82", "--baud=500000"]);
         let hub = env.hub(&[env.link("front")]);
         env.await_info("front", |info| info["state"] == "streaming");
-        let recorded = env.run(&["record", "-o", &env.word("one.mcap"), "--for=1s"]);
-        assert_eq!(recorded.code, Some(0), "{recorded}");
+        let recorded = env.run(&["record", "-o", &env.path_argument("one.mcap"), "--for=1s"]);
+        assert_eq!(recorded.exit_code, Some(0), "{recorded}");
         let stream = env.run(&["echo", "front/telegram", "--raw", "-n", "5"]);
         fs::create_dir(env.path("bin")).expect("a directory");
         // One domain is not enough for two hubs.
-        let (name, root) = (env.place().name().to_owned(), env.path("").display().to_string());
+        let (name, root) = (env.domain().name().to_owned(), env.path("").display().to_string());
         let script = format!(
             "#!/bin/sh\ncase $1 in run | replay) other=x ;; esac\n\
              if [ \"$1 $2\" = 'web --replay' ]; then exec '{program}' \"$@\"; fi\n\
@@ -91,15 +93,15 @@ impl Desk {
             program = env!("CARGO_BIN_EXE_scanhub"),
         );
         write_program(env.path("bin/scanhub"), script);
-        env.file("capture.bin", stream.out);
-        (Desk { env, count: AtomicUsize::new(0) }, [simulator, hub])
+        env.file("capture.bin", stream.stdout);
+        (ShellEnv { env, count: AtomicUsize::new(0) }, [simulator, hub])
     }
 
     /// Runs `line`, and returns the problem, if there is one. A search for a scanner runs again while it finds none: on a busy machine,
     /// the simulated scanner may reply too late.
     fn run(&self, line: &str) -> Option<String> {
         let mut wrong = self.run_once(line);
-        until(line, || {
+        wait_until(line, || {
             let finds_none =
                 |wrong: &String| line.starts_with("scanhub probe") && wrong.contains("exit Some(3)");
             let is_late = wrong.as_ref().is_some_and(finds_none);
@@ -128,28 +130,29 @@ impl Desk {
         }
         let typed = PORTS.iter().fold(line.to_owned(), |line, port| {
             let is_made = line.starts_with("scanhub simulate");
-            line.replace(port, &if is_made { "lms".into() } else { self.env.word("spare") })
+            line.replace(port, &if is_made { "lms".into() } else { self.env.path_argument("spare") })
         });
-        let typed = typed.replace(MINUTES.0, MINUTES.1);
+        let typed = typed.replace(SHORTENED_RANGE.0, SHORTENED_RANGE.1);
         let mut shell = Command::new("sh");
         // A single command is the shell's own process, so that what ends it ends that.
         let exec = if commands(line).len() == 1 { "exec " } else { "" };
-        let path = format!("{}:{}", self.env.word("bin"), std::env::var("PATH").unwrap_or_default());
+        let path = format!("{}:{}", self.env.path_argument("bin"), std::env::var("PATH").unwrap_or_default());
         shell.arg("-c").arg(format!("{exec}{typed}")).current_dir(&here).env("PATH", path);
         shell.env("HOME", &here).env("XDG_STATE_HOME", here.join("state")).env_remove("STATE_DIRECTORY");
         shell.env("SCANHUB_END_WITH_PARENT", "1").env("SCANHUB_LOG", "error").env_remove("SCANHUB_CONFIG");
         let program = Program::start(shell);
         let group = Pid::from_raw(program.pid() as i32).expect("a process");
         let mut words = line.split_whitespace();
-        let ends = words.next() == Some("scanhub") && words.next().is_some_and(|verb| ENDING.contains(&verb));
+        let ends =
+            words.next() == Some("scanhub") && words.next().is_some_and(|verb| ENDING_VERBS.contains(&verb));
         // Any other may last. It is ended when it can be, and has had time for something to go wrong.
-        until(line, || program.is_over() || !ends && catches_interrupts(group));
-        let begun = Instant::now();
-        until(line, || program.is_over() || begun.elapsed() > TIME_TO_FAIL);
-        let is_ended = !program.is_over() && kill_process_group(group, Signal::INT).is_ok();
+        wait_until(line, || program.has_ended() || !ends && catches_interrupts(group));
+        let started = Instant::now();
+        wait_until(line, || program.has_ended() || started.elapsed() > TIME_TO_FAIL);
+        let is_ended = !program.has_ended() && kill_process_group(group, Signal::INT).is_ok();
         let outcome = program.wait();
         let is_bounded = [" --for ", " -n "].iter().any(|flag| line.contains(flag));
-        let is_right = match outcome.code {
+        let is_right = match outcome.exit_code {
             Some(0) => true,
             // A bounded run that is interrupted says so.
             Some(130) => is_ended && is_bounded,
@@ -162,7 +165,7 @@ impl Desk {
 }
 
 /// Commands that end by themselves, however long that takes on this machine.
-const ENDING: [&str; 6] = ["doctor", "probe", "list", "info", "convert", "key"];
+const ENDING_VERBS: [&str; 6] = ["doctor", "probe", "list", "info", "convert", "key"];
 
 /// Time in which a command that lasts may fail. A longer or shorter time does not let a right one fail.
 const TIME_TO_FAIL: Duration = Duration::from_millis(1200);
@@ -186,11 +189,11 @@ fn catches_interrupts(group: Pid) -> bool {
 }
 
 /// What is wrong with those of `lines` that can be run.
-fn wrong_with(desk: &Desk, lines: &[(String, String)]) -> Vec<String> {
-    let wrong = |(place, line): &(String, String)| Some(format!("{place}: {}", desk.run(line)?));
+fn failures(environment: &ShellEnv, lines: &[(String, String)]) -> Vec<String> {
+    let wrong = |(place, line): &(String, String)| Some(format!("{place}: {}", environment.run(line)?));
     // There is one spare sensor, one domain for another hub, one place for a listener, and one sensor to be told what
     // to do; the rest mostly waits.
-    const IN_TURN: [&str; 6] = [
+    const SEQUENTIAL_COMMANDS: [&str; 6] = [
         "scanhub run",
         "scanhub replay",
         "scanhub control",
@@ -198,55 +201,56 @@ fn wrong_with(desk: &Desk, lines: &[(String, String)]) -> Vec<String> {
         "scanhub listen",
         "scanhub gateway",
     ];
-    let (in_turn, others): (Vec<_>, Vec<_>) =
-        lines.iter().partition(|(_, line)| PORTS.iter().chain(&IN_TURN).any(|part| line.contains(part)));
+    let (in_turn, others): (Vec<_>, Vec<_>) = lines
+        .iter()
+        .partition(|(_, line)| PORTS.iter().chain(&SEQUENTIAL_COMMANDS).any(|part| line.contains(part)));
     let rows = others.chunks(others.len().div_ceil(3).max(1)).map(<[_]>::to_vec).chain([in_turn]);
-    let wrong = side_by_side(rows, |row| row.into_iter().filter_map(wrong).collect::<Vec<_>>());
+    let wrong = run_concurrently(rows, |row| row.into_iter().filter_map(wrong).collect::<Vec<_>>());
     wrong.concat()
 }
 
 #[test]
 fn every_line_for_a_shell_runs() {
     let lines: Vec<_> =
-        all().into_iter().filter(|(_, line)| !is_left_out(line) && !is_of_a_network(line)).collect();
+        command_lines().into_iter().filter(|(_, line)| !is_excluded(line) && !needs_network(line)).collect();
     assert!(lines.len() > 25, "{lines:#?}");
-    let (desk, _running) = Desk::new();
-    let wrong = wrong_with(&desk, &lines);
+    let (desk, _running) = ShellEnv::new();
+    let wrong = failures(&desk, &lines);
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
 }
 
 #[test]
 fn every_line_about_a_network_runs() {
     in_a_network("pages::lines::every_line_about_a_network_runs", || {
-        let lines: Vec<_> = all().into_iter().filter(|(_, line)| is_of_a_network(line)).collect();
+        let lines: Vec<_> = command_lines().into_iter().filter(|(_, line)| needs_network(line)).collect();
         assert!(lines.len() > 3, "{lines:#?}");
-        let (desk, _running) = Desk::new();
+        let (desk, _running) = ShellEnv::new();
         // One after the other, each with what the one before it leaves running on the page.
         let (alone, follows): (Vec<_>, Vec<_>) = lines
             .into_iter()
             .partition(|(_, line)| line.contains("scanhub listen") || line.contains("gateway"));
-        let mut wrong = wrong_with(&desk, &alone);
+        let mut wrong = failures(&desk, &alone);
         let name = "--name=robot1=5f3a12bc00d1e2f3";
         let mut listener = desk.env.start(&["listen", "--json", "--publish", name, "--interface=lo"]).ready();
-        let mut sender = Sender::new(0x5f3a_12bc_00d1_e2f3, 7, 0, "front");
-        sender.await_published(&mut listener, &[Topic::Scan, Topic::Zones]);
-        wrong.extend(wrong_with(&desk, &follows));
+        let mut sender = TestGateway::new(0x5f3a_12bc_00d1_e2f3, 7, 0, "front");
+        sender.wait_until_published(&mut listener, &[Topic::Scan, Topic::Zones]);
+        wrong.extend(failures(&desk, &follows));
         assert!(wrong.is_empty(), "{}", wrong.join("\n"));
     });
 }
 
 /// What is not run is still a command that exists, with files that exist.
 #[test]
-fn what_is_not_run_is_little_and_names_what_there_is() {
-    let lines = all();
-    for (begin, reason) in NOT_RUN {
+fn excluded_shell_lines_exist_and_name_existing_files() {
+    let lines = command_lines();
+    for (begin, reason) in SKIPPED_COMMANDS {
         assert!(lines.iter().any(|(_, line)| line.starts_with(begin)), "{begin} is on no page: {reason}");
     }
-    for (part, reason) in NOT_RUN_WITH {
+    for (part, reason) in NOT_RUN_IF_CONTAINS {
         assert!(lines.iter().any(|(_, line)| line.contains(part)), "{part} is on no page: {reason}");
     }
     let top = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));
-    for (place, line) in lines.iter().filter(|(_, line)| is_left_out(line)) {
+    for (place, line) in lines.iter().filter(|(_, line)| is_excluded(line)) {
         for word in commands(line).concat() {
             let path = word.trim_start_matches("./").trim_start_matches("../scanhub/");
             let is_ours =
@@ -258,7 +262,7 @@ fn what_is_not_run_is_little_and_names_what_there_is() {
 
 #[test]
 fn a_line_that_does_not_run_is_found() {
-    let (desk, _running) = Desk::new();
+    let (desk, _running) = ShellEnv::new();
     for line in
         ["scanhub ecko front/scan", "scanhub info rear", "scanhub convert none.mcap x.mcap", "scnahub list"]
     {

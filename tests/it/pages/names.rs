@@ -93,8 +93,8 @@ fn of_configuration() -> Vec<Used> {
 fn of_help(env: &TestEnv) -> Vec<Used> {
     let help = |arguments: &[&str]| {
         let outcome = env.run(arguments);
-        assert_eq!(outcome.code, Some(0), "{outcome}");
-        String::from_utf8(outcome.out).expect("text")
+        assert_eq!(outcome.exit_code, Some(0), "{outcome}");
+        String::from_utf8(outcome.stdout).expect("text")
     };
     let all = help(&["--help"]);
     let rows = all.lines().skip_while(|line| *line != "Commands:").skip(1).take_while(|row| !row.is_empty());

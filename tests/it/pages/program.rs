@@ -9,13 +9,13 @@ use std::sync::OnceLock;
 use serde_json::Value;
 
 use super::blocks::Block;
-use crate::client_c::installed::Installed;
+use crate::client_c::installed::InstalledLibrary;
 use crate::testkit::{TestEnv, client_python, output, python};
 
 /// Something to start.
 pub(crate) struct Example {
     /// The page and the line.
-    pub(crate) place: String,
+    pub(crate) location: String,
     /// As it stands there.
     pub(crate) text: String,
     program: PathBuf,
@@ -27,17 +27,17 @@ impl Example {
     ///
     /// The words of the compiler if it refuses.
     pub(crate) fn build(block: &Block, env: &TestEnv) -> Result<Option<Example>, String> {
-        let name = block.place.replace(['/', '.', ':'], "_");
+        let name = block.location.replace(['/', '.', ':'], "_");
         let source = |ending: &str, text: &str| PathBuf::from(env.file(&format!("{name}.{ending}"), text));
         let program = match block.language.as_str() {
-            "python" => return Ok(of_python(block, &source("py", &block.text))),
-            "rust" => Some(of_rust(&source("rs", &whole(block)), env)?),
-            "c" => of_c(&source("c", &whole(block)), env)?,
-            "cpp" => of_cpp(&source("cpp", &whole(block)), env)?,
-            other => return Err(format!("{}: {other} is no language of programs", block.place)),
+            "python" => return Ok(python_example(block, &source("py", &block.text))),
+            "rust" => Some(compile_rust(&source("rs", &with_main(block)), env)?),
+            "c" => compile_c(&source("c", &with_main(block)), env)?,
+            "cpp" => compile_cpp(&source("cpp", &with_main(block)), env)?,
+            other => return Err(format!("{}: {other} is no language of programs", block.location)),
         };
-        let (place, text) = (block.place.clone(), block.text.clone());
-        Ok(program.map(|program| Example { place, text, program, arguments: Vec::new() }))
+        let (location, text) = (block.location.clone(), block.text.clone());
+        Ok(program.map(|program| Example { location, text, program, arguments: Vec::new() }))
     }
 
     /// The program, to be run in `env` and with the hub there.
@@ -45,54 +45,58 @@ impl Example {
         let mut command = Command::new(&self.program);
         // Warnings are errors, except that the hub is still starting.
         command.args(&self.arguments).current_dir(env.path("")).env_remove("XDG_RUNTIME_DIR");
-        command.env("SCANHUB_DOMAIN", env.place().name()).env("PYTHONWARNINGS", "error,default:nothing yet");
-        command.env("RUNTIME_DIRECTORY", env.place().root().parent().expect("it has one"));
+        command.env("SCANHUB_DOMAIN", env.domain().name()).env("PYTHONWARNINGS", "error,default:nothing yet");
+        command.env("RUNTIME_DIRECTORY", env.domain().root().parent().expect("it has one"));
         command.env("PYTHONUNBUFFERED", "1").env("PYTHONDONTWRITEBYTECODE", "1");
         command
     }
 }
 
 /// The block, with a main function around it where it has none.
-fn whole(block: &Block) -> String {
+fn with_main(block: &Block) -> String {
     let Block { language, text, .. } = block;
     match language.as_str() {
         "rust" if !text.contains("fn main") => {
             format!("fn main() -> Result<(), scanhub_client::Error> {{\n{text}}}\n")
         }
-        "c" if !text.contains("int main") => format!("{C}int main(void)\n{{\n{LINES}{text}return 0;\n}}\n"),
-        "cpp" if !text.contains("int main") => format!("{CPP}int main()\n{{\n{LINES}{text}}}\n"),
+        "c" if !text.contains("int main") => {
+            format!("{C_PRELUDE}int main(void)\n{{\n{LINE_BUFFERING}{text}return 0;\n}}\n")
+        }
+        "cpp" if !text.contains("int main") => {
+            format!("{CPP_PRELUDE}int main()\n{{\n{LINE_BUFFERING}{text}}}\n")
+        }
         _ => text.clone(),
     }
 }
 
-fn of_python(block: &Block, source: &Path) -> Option<Example> {
+fn python_example(block: &Block, source: &Path) -> Option<Example> {
     let python = match &block.text {
         text if text.contains("rosbags") => python("rosbags"),
         text if text.contains("mcap") => python("mcap, mcap_ros2"),
         _ => client_python(),
     }?;
-    let (place, text) = (block.place.clone(), block.text.clone());
+    let (location, text) = (block.location.clone(), block.text.clone());
     let program = PathBuf::from(python.get_program());
-    Some(Example { place, text, program, arguments: vec![source.to_owned()] })
+    Some(Example { location, text, program, arguments: vec![source.to_owned()] })
 }
 
-fn of_c(source: &Path, env: &TestEnv) -> Result<Option<PathBuf>, String> {
-    Installed::once().map(|installed| installed.try_compile(env, source, &[])).transpose()
+fn compile_c(source: &Path, env: &TestEnv) -> Result<Option<PathBuf>, String> {
+    InstalledLibrary::installed().map(|installed| installed.try_compile(env, source, &[])).transpose()
 }
 
-fn of_cpp(source: &Path, env: &TestEnv) -> Result<Option<PathBuf>, String> {
-    Installed::once().and_then(|installed| installed.try_compile_cpp(env, source)).transpose()
+fn compile_cpp(source: &Path, env: &TestEnv) -> Result<Option<PathBuf>, String> {
+    InstalledLibrary::installed().and_then(|installed| installed.try_compile_cpp(env, source)).transpose()
 }
 
 /// By the compiler itself, with the library that Cargo makes.
-fn of_rust(source: &Path, env: &TestEnv) -> Result<PathBuf, String> {
+fn compile_rust(source: &Path, env: &TestEnv) -> Result<PathBuf, String> {
     let program = env.path(&format!("{}-rust", source.file_stem().expect("a name").display()));
     let mut command = Command::new(std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into()));
     command.args(["--edition=2024", "-Dwarnings", "-o"]).arg(&program).arg(source);
     let library = library();
     let directory = library.parent().expect("a directory");
     command.arg(format!("-Ldependency={}", directory.join("deps").display()));
-    command.arg(format!("--extern={LIBRARY}={}", library.display()));
+    command.arg(format!("--extern={LIBRARY_NAME}={}", library.display()));
     let output = output(command).expect("a compiler");
     if !output.status.success() {
         return Err(String::from_utf8_lossy(&output.stderr).into_owned());
@@ -101,13 +105,13 @@ fn of_rust(source: &Path, env: &TestEnv) -> Result<PathBuf, String> {
 }
 
 /// What a consumer depends on.
-const LIBRARY: &str = "scanhub_client";
+const LIBRARY_NAME: &str = "scanhub_client";
 
 /// The one library of this project that a consumer depends on. Built alone: this test and the program, which run, are not made
 /// again.
 fn library() -> &'static Path {
-    static BUILT: OnceLock<PathBuf> = OnceLock::new();
-    BUILT.get_or_init(build_library)
+    static LIBRARY_PATH: OnceLock<PathBuf> = OnceLock::new();
+    LIBRARY_PATH.get_or_init(build_library)
 }
 
 fn build_library() -> PathBuf {
@@ -124,7 +128,7 @@ fn build_library() -> PathBuf {
     let library = |message: Value| {
         let files = message["filenames"].as_array()?;
         let library = files.iter().filter_map(Value::as_str).find(|file| file.ends_with(".rlib"))?;
-        (message["target"]["name"] == LIBRARY).then(|| fs::canonicalize(library).expect("a file"))
+        (message["target"]["name"] == LIBRARY_NAME).then(|| fs::canonicalize(library).expect("a file"))
     };
     let libraries: Vec<_> = messages.filter_map(library).collect();
     let [library] = &libraries[..] else { panic!("{libraries:?}") };
@@ -132,7 +136,7 @@ fn build_library() -> PathBuf {
 }
 
 /// What stands before each example in C that is a part of a program.
-const C: &str = "#include <errno.h>\n#include <poll.h>\n#include <scanhub/attach.h>\n#include <stdio.h>\n#include <unistd.h>\n";
-const CPP: &str = "#include <cmath>\n#include <cstdio>\n#include <scanhub/attach.hpp>\n";
+const C_PRELUDE: &str = "#include <errno.h>\n#include <poll.h>\n#include <scanhub/attach.h>\n#include <stdio.h>\n#include <unistd.h>\n";
+const CPP_PRELUDE: &str = "#include <cmath>\n#include <cstdio>\n#include <scanhub/attach.hpp>\n";
 /// What is printed is to be seen by a test, too.
-const LINES: &str = "setvbuf(stdout, NULL, _IOLBF, BUFSIZ);\n";
+const LINE_BUFFERING: &str = "setvbuf(stdout, NULL, _IOLBF, BUFSIZ);\n";

@@ -23,7 +23,7 @@ pub(crate) fn commands(line: &str) -> Vec<Vec<String>> {
 }
 
 /// The words of each `scanhub` in a line, also of those that Cargo runs; an example is another program.
-pub(crate) fn of_the_program(line: &str) -> Vec<Vec<String>> {
+pub(crate) fn scanhub_commands(line: &str) -> Vec<Vec<String>> {
     let of_cargo = |words: &[String]| {
         let at = words
             .iter()
@@ -96,14 +96,14 @@ fn words(line: &str) -> Vec<(String, bool)> {
 fn lines_are_read_as_a_shell_does() {
     assert_eq!(lines("# no\na b   # c\n\nd '# e'#f\n"), ["a b", "d '# e'#f"]);
     let line = "scanhub a 'b c' \"d|e\" | scanhub f > g && x; cargo run --release -- h i # j";
-    let wanted: [&[&str]; 4] = [
+    let expected: [&[&str]; 4] = [
         &["scanhub", "a", "b c", "d|e"],
         &["scanhub", "f"],
         &["x"],
         &["cargo", "run", "--release", "--", "h", "i"],
     ];
-    assert_eq!(commands(line), wanted);
-    assert_eq!(of_the_program(line), [wanted[0], wanted[1], &["scanhub", "h", "i"]]);
+    assert_eq!(commands(line), expected);
+    assert_eq!(scanhub_commands(line), [expected[0], expected[1], &["scanhub", "h", "i"]]);
     assert_eq!(commands(""), [[""; 0]]);
     let line = "scanhub a 'x[1]' \"*\" b=[2] c? d '*'e* # f*";
     assert_eq!(patterns(line), ["b=[2]", "c?", "e*"]);

@@ -17,7 +17,7 @@ use scanhub_sim::room::Room;
 use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 
-use super::{check, passed};
+use super::{assert_success, check};
 use crate::pages::text_on;
 use crate::recorded_world::recorded_world;
 use crate::replayed::recorded_rooms::{self, SENSORS};
@@ -25,7 +25,7 @@ use crate::replayed::step_through;
 use crate::testkit::{Program, TestEnv, client_python, in_own_process, python_for};
 
 /// Settings with which backgrounds are learned within a recording, and zones are violated.
-const SETTINGS: &str = r#"
+const READ_SETTINGS: &str = r#"
 background.scans = 40
 zones.radii = [2.5, 1.5]
 [[link]]
@@ -36,7 +36,7 @@ zones.radii = [3.0, 2.0]
 
 /// Samples of all topics that do not depend on the time of the run, as `read.py` prints them.
 #[derive(Default)]
-struct Published {
+struct PublishedSamples {
     samples: Vec<Value>,
     telegrams: u64,
 }
@@ -53,7 +53,7 @@ macro_rules! subscribers {
                 Subscribers { sensor: sensor.to_owned(), $($name: attach::<$payload>(node, sensor),)* }
             }
 
-            fn take(&self, published: &mut Published) {
+            fn take(&self, published: &mut PublishedSamples) {
                 $(while let Some(sample) = <$payload as Payload>::receive(&self.$name).expect("works") {
                     let bytes = Payload::bytes(<$payload as Payload>::read(&sample));
                     published.note(&self.sensor, <$payload as Payload>::TOPIC, sample.user_header(), bytes);
@@ -73,7 +73,7 @@ fn attach<P: Payload + ?Sized>(node: &Node, sensor: &str) -> Subscriber<P> {
     P::subscriber(node, &service).expect("a place")
 }
 
-impl Published {
+impl PublishedSamples {
     fn note(&mut self, sensor: &str, topic: Topic, header: &Header, payload: &[u8]) {
         self.telegrams += u64::from(topic == Topic::Telegram);
         let reasons: Vec<_> = Reasons::names(header.reasons).collect();
@@ -102,7 +102,7 @@ impl Published {
 
 /// Samples in the order of sensor, topic and number. Those before the first telegram are left out, because a subscriber comes too
 /// late for them. Clocks of a recording without stamps are those of the run.
-fn in_order(samples: Vec<Value>, has_stamps: bool) -> Vec<Value> {
+fn sorted(samples: Vec<Value>, has_stamps: bool) -> Vec<Value> {
     let mut samples: Vec<Value> = samples
         .into_iter()
         .filter(|it| it[1] != "status" && (&it[1], &it[2]) != (&"zones".into(), &0.into()))
@@ -130,12 +130,12 @@ fn compare(
         sensor: None,
         family: None,
         sources: &sources,
-        play: PlaybackOptions { rate: PlaybackRate::Max, ..PlaybackOptions::default() },
+        options: PlaybackOptions { rate: PlaybackRate::Max, ..PlaybackOptions::default() },
         holds: true,
     };
-    let mut published = Published::default();
+    let mut published = PublishedSamples::default();
     step_through(
-        &env.place(),
+        &env.domain(),
         &replay,
         |node| sensors.iter().map(|name| Subscribers::attach(node, name)).collect::<Vec<_>>(),
         |subscribers| {
@@ -143,9 +143,9 @@ fn compare(
             published.telegrams
         },
     );
-    let replayed = in_order(published.samples, has_stamps);
+    let replayed = sorted(published.samples, has_stamps);
     let is_same = |samples: Vec<Value>| {
-        let samples = in_order(samples, has_stamps);
+        let samples = sorted(samples, has_stamps);
         for (sample, replayed) in samples.iter().zip(&replayed) {
             assert_eq!(sample, replayed, "{file}");
         }
@@ -153,7 +153,7 @@ fn compare(
     };
     let topics: Vec<_> = RecordingReader::topics().collect();
     let options = ReadOptions { file: place, sensor: None, family: None, sources: &sources, topics: &topics };
-    let mut computed = Published::default();
+    let mut computed = PublishedSamples::default();
     for ReadSample { sensor, topic, header, words, len } in
         RecordingReader::open(&options).expect("a recording")
     {
@@ -164,13 +164,13 @@ fn compare(
         let mut read = Command::new(command.get_program());
         read.args(command.get_args()).args(["dump", file, config]).env_remove("SCANHUB_CONFIG");
         let outcome = Program::start(read).wait();
-        assert_eq!(outcome.code, Some(0), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(0), "{outcome}");
         is_same(outcome.lines());
     }
     for topic in ["telegram", "scan", "zones", "marks", "lines", "motion", "foreground", "background"] {
         let count = replayed.iter().filter(|it| it[1] == topic).count();
-        let wanted = if topic == "background" { 2 } else { 20 };
-        assert!(count >= wanted, "{file}: {count} samples of {topic}");
+        let expected = if topic == "background" { 2 } else { 20 };
+        assert!(count >= expected, "{file}: {count} samples of {topic}");
     }
 }
 
@@ -180,10 +180,10 @@ fn it_equals_a_replay_bit_for_bit() {
         let read = check("read");
         let read = read.as_ref();
         let env = TestEnv::new();
-        let config = env.file("robot.toml", SETTINGS);
+        let config = env.file("robot.toml", READ_SETTINGS);
         let rooms = env.path("rooms.mcap");
-        recorded_rooms::record(&env.place(), &rooms, 110, Some(70), |_, _| {});
-        compare(&env, read, &env.word("rooms.mcap"), &config, &SENSORS.map(|(name, _)| name), true);
+        recorded_rooms::record(&env.domain(), &rooms, 110, Some(70), |_, _| {});
+        compare(&env, read, &env.path_argument("rooms.mcap"), &config, &SENSORS.map(|(name, _)| name), true);
         compare(&env, read, &log(&env), &config, &["front"], true);
         compare(&env, read, &stream(&env), &config, &["front"], false);
         let config = env.file("other.toml", "background.scans = 40\n");
@@ -201,7 +201,7 @@ fn arrays_and_errors() {
     env.file("no_mode.bin", lms::measured::encode(0, Unit::Mm, &[0x2345; 181], 0x10).bytes().repeat(9));
     let two = recorded_world(&env, &world, &["front", "rear"], 4);
     read.args(["check", &two, &log(&env), &packets(&env)]).arg(env.path(""));
-    passed(read);
+    assert_success(read);
 }
 
 #[test]
@@ -210,12 +210,12 @@ fn the_program_on_the_page_runs() {
     let env = TestEnv::new();
     let file = recorded_world(&env, &"room".parse().expect("a world"), &["front", "rear"], 4);
     std::fs::rename(file, env.path("walk.mcap")).expect("a file");
-    env.file("robot.toml", SETTINGS);
+    env.file("robot.toml", READ_SETTINGS);
     let text = text_on("docs/python.md", "python,no_run", "import scanhub");
     program.args(["-c", &text]).current_dir(env.path(""));
     let outcome = Program::start(program).wait();
-    assert_eq!(outcome.code, Some(0), "{outcome}");
-    let words = String::from_utf8_lossy(&outcome.out).into_owned();
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
+    let words = String::from_utf8_lossy(&outcome.stdout).into_owned();
     assert!(words.contains("front 5 ") && words.trim_end().ends_with(" s"), "{words}");
 }
 
@@ -228,8 +228,8 @@ fn the_example_plots_a_recording() {
     let env = TestEnv::new();
     let file = recorded_world(&env, &"room".parse().expect("a world"), &["front"], 8);
     let example = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/python/examples/plot_recording.py");
-    plot.arg(example).args([&file, "--out", &env.word("picture.png")]);
-    passed(plot);
+    plot.arg(example).args([&file, "--out", &env.path_argument("picture.png")]);
+    assert_success(plot);
     let picture = std::fs::read(env.path("picture.png")).expect("a picture");
     assert!(picture.starts_with(b"\x89PNG"));
 }
@@ -251,9 +251,9 @@ fn log(env: &TestEnv) -> String {
 /// Telegrams of a room, with damaged bytes between them.
 fn stream(env: &TestEnv) -> String {
     let room = Room::new(&"demo".parse().expect("a world"), 8);
-    let mut bytes = lms::reply::configuration(0, Mode(1), Unit::Mm, 0x10).bytes().to_vec();
+    let mut bytes = lms::reply::configuration_reply(0, Mode(1), Unit::Mm, 0x10).bytes().to_vec();
     for scan in 0..110 {
-        let at = scan * recorded_rooms::period();
+        let at = scan * recorded_rooms::scan_period();
         let look = room.labeled_scan(Variant::HALF, Unit::Mm, Mode(1), at);
         let telegram = lms::measured::encode(0, Unit::Mm, &look.words, 0x10);
         bytes.extend(telegram.bytes());

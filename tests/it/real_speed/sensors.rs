@@ -12,7 +12,7 @@ use scanhub_sim::options::SimulateOptions;
 use scanhub_sim::simulate::{Record, Summary};
 use scanhub_sim::{Event, simulate_with};
 
-use crate::testkit::{PATIENCE, TestEnv};
+use crate::testkit::{TestEnv, WAIT_TIMEOUT};
 
 /// The names of sensors and their ports.
 pub(super) const SENSORS: [&str; 2] = ["s0", "s1"];
@@ -35,29 +35,29 @@ impl Sensors {
         let options = SimulateOptions { ports: ports.to_vec(), seed, ..SimulateOptions::default() };
         let (stop, stopped) = UnixStream::pair().expect("a pair of sockets");
         let events: Events = Arc::new(Mutex::new(ports.map(|port| (port, VecDeque::new())).into()));
-        let (told, records) = channel();
+        let (record_sender, records) = channel();
         let (say_ready, is_ready) = channel();
-        let asked = events.clone();
+        let event_queue = events.clone();
         let thread = thread::spawn(move || {
-            let told = Mutex::new(told);
+            let record_sender = Mutex::new(record_sender);
             simulate_with(
                 &options,
                 &stopped,
                 |_| say_ready.send(()).expect("somebody waits"),
                 |record| {
                     // Who has enough of them has ended.
-                    let _ = told.lock().expect("whole").send(record.clone());
+                    let _ = record_sender.lock().expect("whole").send(record.clone());
                 },
-                |port| asked.lock().expect("whole").get_mut(port)?.pop_front(),
+                |port| event_queue.lock().expect("whole").get_mut(port)?.pop_front(),
                 |_, _| {},
             )
         });
-        is_ready.recv_timeout(PATIENCE).expect("ports can be opened");
+        is_ready.recv_timeout(WAIT_TIMEOUT).expect("ports can be opened");
         Sensors { stop, events, thread, records }
     }
 
     /// Does `event` to sensor number `sensor`.
-    pub(super) fn suffer(&self, env: &TestEnv, sensor: usize, event: Event) {
+    pub(super) fn inject(&self, env: &TestEnv, sensor: usize, event: Event) {
         let mut events = self.events.lock().expect("whole");
         events.get_mut(&env.path(SENSORS[sensor])).expect("a sensor").push_back(event);
     }

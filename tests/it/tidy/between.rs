@@ -1,10 +1,10 @@
 //! The walls between the crates: who knows whom, and of what each is built.
 
-use super::{crates, holds};
+use super::{assert_rule, crates};
 
 #[test]
-fn schema_knows_nobody() {
-    holds(crates::schema_knows_nobody, |tree| {
+fn schema_depends_on_no_other_crate() {
+    assert_rule(crates::schema_depends_on_no_other_crate, |tree| {
         vec![
             tree.with_line("schema/Cargo.toml", "[dependencies]", "scanhub-drivers.workspace = true"),
             tree.with_line("schema/Cargo.toml", "[dev-dependencies]", "scanhub-drivers.workspace = true"),
@@ -14,7 +14,7 @@ fn schema_knows_nobody() {
 
 #[test]
 fn schema_uses_no_operating_system() {
-    holds(crates::schema_uses_no_operating_system, |tree| {
+    assert_rule(crates::schema_uses_no_operating_system, |tree| {
         let (manifest, lib) = ("schema/Cargo.toml", "schema/src/lib.rs");
         let planted = |code: &str| tree.with("schema/src/planted.rs", &format!("//! So.\n{code}\n"));
         vec![
@@ -33,7 +33,7 @@ fn schema_uses_no_operating_system() {
 
 #[test]
 fn shm_and_files_know_only_schema() {
-    holds(crates::shm_and_files_know_only_schema, |tree| {
+    assert_rule(crates::shm_and_files_know_only_schema, |tree| {
         let (files, shm) = ("schema/files/Cargo.toml", "schema/shm/Cargo.toml");
         vec![
             tree.with_line(files, "[dependencies]", "scanhub-shm.workspace = true"),
@@ -41,13 +41,13 @@ fn shm_and_files_know_only_schema() {
             tree.with_line(shm, "[dev-dependencies]", "scanhub-client.workspace = true"),
         ]
     });
-    let crates = crates::built_from("scanhub-files", &["--all-features"]);
+    let crates = crates::dependency_tree("scanhub-files", &["--all-features"]);
     assert!(!crates.iter().any(|name| name.starts_with("iceoryx2")), "{crates:?}");
 }
 
 #[test]
 fn modules_of_shm_form_layers() {
-    holds(crates::modules_of_shm_form_layers, |tree| {
+    assert_rule(crates::modules_of_shm_form_layers, |tree| {
         let planted = |module: &str, code: &str| {
             tree.with(&format!("schema/shm/src/{module}.rs"), &format!("//! So.\n{code}\n"))
         };
@@ -64,15 +64,15 @@ fn modules_of_shm_form_layers() {
 
 #[test]
 fn schema_without_ipc_needs_no_shared_memory() {
-    let lan = crates::built_from("scanhub-schema", &["--no-default-features"]);
+    let lan = crates::dependency_tree("scanhub-schema", &["--no-default-features"]);
     assert!(!lan.iter().any(|name| name.starts_with("iceoryx2")), "{lan:?}");
-    let ipc = crates::built_from("scanhub-schema", &["--no-default-features", "--features", "ipc"]);
+    let ipc = crates::dependency_tree("scanhub-schema", &["--no-default-features", "--features", "ipc"]);
     assert!(ipc.iter().any(|name| name.starts_with("iceoryx2")), "{ipc:?}");
 }
 
 #[test]
 fn drivers_only_compute() {
-    holds(crates::drivers_only_compute, |tree| {
+    assert_rule(crates::drivers_only_compute, |tree| {
         let (manifest, lib) = ("hub/drivers/Cargo.toml", "hub/drivers/src/lib.rs");
         let planted =
             |code: &str| tree.with("hub/drivers/src/lms/planted.rs", &format!("//! A driver.\n{code}\n"));
@@ -91,7 +91,7 @@ fn drivers_only_compute() {
 
 #[test]
 fn no_family_names_another() {
-    holds(crates::no_family_names_another, |tree| {
+    assert_rule(crates::no_family_names_another, |tree| {
         let planted = |path: &str, code: &str| tree.with(path, &format!("//! A driver.\n{code}\n"));
         vec![
             planted("hub/drivers/src/ld/planted.rs", "use crate::lms::telegram::Telegram;"),
@@ -105,7 +105,7 @@ fn no_family_names_another() {
 
 #[test]
 fn the_rplidar_simulator_is_independent() {
-    holds(crates::the_rplidar_simulator_is_independent, |tree| {
+    assert_rule(crates::the_rplidar_simulator_is_independent, |tree| {
         let planted =
             |code: &str| tree.with("hub/sim/src/rplidar/planted.rs", &format!("//! A unit.\n{code}\n"));
         vec![
@@ -121,7 +121,7 @@ fn the_rplidar_simulator_is_independent() {
 
 #[test]
 fn preprocess_only_computes() {
-    holds(crates::preprocess_only_computes, |tree| {
+    assert_rule(crates::preprocess_only_computes, |tree| {
         let planted = |code: &str| tree.with("hub/preprocess/src/planted.rs", &format!("//! So.\n{code}\n"));
         let lib = tree.text("hub/preprocess/src/lib.rs");
         vec![
@@ -142,7 +142,7 @@ fn preprocess_only_computes() {
 
 #[test]
 fn no_processor_uses_another() {
-    holds(crates::no_processor_uses_another, |tree| {
+    assert_rule(crates::no_processor_uses_another, |tree| {
         let planted = |path: &str, code: &str| tree.with(path, &format!("//! So.\n{code}\n"));
         vec![
             planted("hub/preprocess/src/zones.rs", "use crate::marks::MarkDetector;"),
@@ -154,7 +154,7 @@ fn no_processor_uses_another() {
 
 #[test]
 fn clients_know_only_schema() {
-    holds(crates::clients_know_only_schema, |tree| {
+    assert_rule(crates::clients_know_only_schema, |tree| {
         let (client, verbs) = ("clients/client/Cargo.toml", "clients/verbs/Cargo.toml");
         vec![
             tree.with_line(client, "[dependencies]", "scanhub-drivers.workspace = true"),
@@ -167,7 +167,7 @@ fn clients_know_only_schema() {
 
 #[test]
 fn ros_knows_only_schema() {
-    holds(crates::ros_knows_only_schema, |tree| {
+    assert_rule(crates::ros_knows_only_schema, |tree| {
         let (manifest, lib) = ("schema/ros/Cargo.toml", "schema/ros/src/lib.rs");
         vec![
             tree.with_line(manifest, "[dependencies]", "scanhub-client.workspace = true"),
@@ -180,7 +180,7 @@ fn ros_knows_only_schema() {
 
 #[test]
 fn the_scene_only_computes() {
-    holds(crates::the_scene_only_computes, |tree| {
+    assert_rule(crates::the_scene_only_computes, |tree| {
         let planted =
             |code: &str| tree.with("clients/viewer/src/scene/planted.rs", &format!("//! So.\n{code}\n"));
         vec![
@@ -198,7 +198,7 @@ fn the_scene_only_computes() {
 
 #[test]
 fn perception_only_computes() {
-    holds(crates::perception_only_computes, |tree| {
+    assert_rule(crates::perception_only_computes, |tree| {
         let lib = "clients/perception/src/lib.rs";
         let planted = |path: &str, code: &str| {
             tree.with(&format!("clients/perception/src/{path}"), &format!("//! So.\n{code}\n"))
@@ -224,7 +224,7 @@ fn perception_only_computes() {
 
 #[test]
 fn the_server_knows_no_hub() {
-    holds(crates::the_server_knows_no_hub, |tree| {
+    assert_rule(crates::the_server_knows_no_hub, |tree| {
         let lib = "clients/viewer/src/lib.rs";
         let planted =
             |code: &str| tree.with("clients/viewer/src/server/planted.rs", &format!("//! So.\n{code}\n"));
@@ -250,7 +250,7 @@ fn the_server_knows_no_hub() {
 
 #[test]
 fn the_ends_of_a_network_only_compute() {
-    holds(crates::the_ends_of_a_network_only_compute, |tree| {
+    assert_rule(crates::the_ends_of_a_network_only_compute, |tree| {
         let lib = "clients/network/src/lib.rs";
         let planted =
             |code: &str| tree.with("clients/network/src/lan/planted.rs", &format!("//! So.\n{code}\n"));
@@ -273,7 +273,7 @@ fn the_ends_of_a_network_only_compute() {
 
 #[test]
 fn the_libraries_for_c_and_python_know_clients() {
-    holds(crates::the_libraries_for_c_and_python_know_clients, |tree| {
+    assert_rule(crates::the_libraries_for_c_and_python_know_clients, |tree| {
         let python = "clients/python/Cargo.toml";
         vec![
             tree.with_line(python, "[dependencies]", "scanhub-drivers.workspace = true"),
@@ -291,7 +291,7 @@ fn the_libraries_for_c_and_python_know_clients() {
 
 #[test]
 fn the_daemon_knows_neither_clients_nor_sim() {
-    holds(crates::the_daemon_knows_neither_clients_nor_sim, |tree| {
+    assert_rule(crates::the_daemon_knows_neither_clients_nor_sim, |tree| {
         vec![
             tree.with_line("hub/daemon/Cargo.toml", "[dependencies]", "scanhub-client.workspace = true"),
             tree.with_line("hub/daemon/Cargo.toml", "[dependencies]", "scanhub-verbs.workspace = true"),
@@ -305,7 +305,7 @@ fn the_daemon_knows_neither_clients_nor_sim() {
 
 #[test]
 fn only_the_program_sees_all() {
-    holds(crates::only_the_program_sees_all, |tree| {
+    assert_rule(crates::only_the_program_sees_all, |tree| {
         let python = "clients/python/Cargo.toml";
         vec![
             tree.with_line("hub/sim/Cargo.toml", "[dependencies]", "scanhub-daemon.workspace = true"),
@@ -319,7 +319,7 @@ fn only_the_program_sees_all() {
 
 #[test]
 fn every_crate_is_tested_from_the_top() {
-    holds(crates::every_crate_is_tested_from_the_top, |tree| {
+    assert_rule(crates::every_crate_is_tested_from_the_top, |tree| {
         let manifest = tree.text("Cargo.toml");
         vec![tree.with("Cargo.toml", &manifest.replacen("members = [", "members = [\"new\", ", 1))]
     });
@@ -327,7 +327,7 @@ fn every_crate_is_tested_from_the_top() {
 
 #[test]
 fn every_crate_obeys_the_lints() {
-    holds(crates::every_crate_obeys_the_lints, |tree| {
+    assert_rule(crates::every_crate_obeys_the_lints, |tree| {
         let (top, sim) = (tree.text("Cargo.toml"), tree.text("hub/sim/Cargo.toml"));
         vec![
             tree.with("Cargo.toml", &top.replace("unsafe_code = \"deny\"", "unsafe_code = \"warn\"")),
@@ -338,7 +338,7 @@ fn every_crate_obeys_the_lints() {
 
 #[test]
 fn shared_memory_is_pinned() {
-    holds(crates::shared_memory_is_pinned, |tree| {
+    assert_rule(crates::shared_memory_is_pinned, |tree| {
         vec![tree.with("Cargo.toml", &tree.text("Cargo.toml").replace("version = \"=0.", "version = \"0."))]
     });
 }
@@ -346,7 +346,7 @@ fn shared_memory_is_pinned() {
 /// A hub is small: most of its crates come with shared memory; serialport brings three.
 #[test]
 fn the_daemon_is_built_from_few_crates() {
-    let mut crates = crates::built_from("scanhub-daemon", &[]);
+    let mut crates = crates::dependency_tree("scanhub-daemon", &[]);
     crates.retain(|name| !name.starts_with("scanhub-"));
     eprintln!("daemon: {} crates of others", crates.len());
     assert!(crates.len() <= 82, "{} crates: {crates:#?}", crates.len());
@@ -355,9 +355,9 @@ fn the_daemon_is_built_from_few_crates() {
 /// A client pays for shared memory and for little besides: for no verb, and for nothing that only verbs need.
 #[test]
 fn the_client_is_built_from_few_crates() {
-    let mut crates = crates::built_from("scanhub-client", &[]);
+    let mut crates = crates::dependency_tree("scanhub-client", &[]);
     // Cargo lists a crate that is not of this workspace only if it has downloaded everything, the bridge's crates included.
-    let shared_memory = crates::built_from("scanhub-shm", &[]);
+    let shared_memory = crates::dependency_tree("scanhub-shm", &[]);
     crates.retain(|name| !shared_memory.contains(name));
     eprintln!("client: {} crates besides those of shared memory", crates.len());
     assert!(crates.len() <= 3, "{} crates: {crates:#?}", crates.len());
@@ -373,14 +373,14 @@ fn the_client_is_built_from_few_crates() {
     ];
     let of_verbs = |name: &&String| OF_VERBS.iter().any(|verb| name.split(' ').next() == Some(verb));
     assert_eq!(crates.iter().find(of_verbs), None);
-    assert!(crates::built_from("scanhub-verbs", &[]).iter().any(|name| of_verbs(&name)));
+    assert!(crates::dependency_tree("scanhub-verbs", &[]).iter().any(|name| of_verbs(&name)));
 }
 
 /// What needs a C compiler comes with recordings alone.
 #[test]
 fn clients_that_do_not_record_need_no_c_compiler() {
     let in_c = |package: &str, features: &[&str]| {
-        let crates = crates::built_from(package, features);
+        let crates = crates::dependency_tree(package, features);
         // The exception is the kernel's interface in Rust.
         let is_in_c = |name: &String| name.contains("-sys ") && !name.starts_with("linux-raw-sys");
         crates.into_iter().filter(is_in_c).collect::<Vec<_>>()

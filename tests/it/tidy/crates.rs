@@ -1,12 +1,12 @@
 //! Who may know whom: walls between the crates, read from the manifests and from what Cargo makes of them.
 
-use super::tree::{Tree, code, find};
+use super::tree::{SourceTree, code, find};
 use crate::testkit::output;
 use std::collections::BTreeSet;
 use std::process::Command;
 
 /// Names of the crates of this project that a manifest names under `section`, such as `dependencies`.
-fn ours(manifest: &toml::Table, sections: &[&str]) -> BTreeSet<String> {
+fn own_dependencies(manifest: &toml::Table, sections: &[&str]) -> BTreeSet<String> {
     let mut found = BTreeSet::new();
     for section in sections {
         let names =
@@ -19,17 +19,17 @@ fn ours(manifest: &toml::Table, sections: &[&str]) -> BTreeSet<String> {
 const ALL: [&str; 3] = ["dependencies", "dev-dependencies", "build-dependencies"];
 const NORMAL: [&str; 1] = ["dependencies"];
 
-pub(crate) fn schema_knows_nobody(tree: &Tree) -> Vec<String> {
-    ours(&tree.members()["scanhub-schema"], &ALL).into_iter().collect()
+pub(crate) fn schema_depends_on_no_other_crate(tree: &SourceTree) -> Vec<String> {
+    own_dependencies(&tree.members()["scanhub-schema"], &ALL).into_iter().collect()
 }
 
 /// Finds names of the operating system in `schema`. Payloads and names are the same on every machine.
-pub(crate) fn schema_uses_no_operating_system(tree: &Tree) -> Vec<String> {
+pub(crate) fn schema_uses_no_operating_system(tree: &SourceTree) -> Vec<String> {
     const OF_STD: [&str; 7] = ["env", "fs", "net", "os", "process", "thread", "time"];
     const CRATES: [&str; 4] = ["memmap2", "nix", "rustix", "tempfile"];
     let known = ["bytemuck", "crc", "iceoryx2", "mcap", "serde", "serde_json"];
-    let mut breaches = built_of(tree, "scanhub-schema", &known);
-    breaches.extend(lacks(tree, "schema/src/lib.rs", &["#![forbid(unsafe_code)]"]));
+    let mut breaches = dependencies_beyond(tree, "scanhub-schema", &known);
+    breaches.extend(missing_attributes(tree, "schema/src/lib.rs", &["#![forbid(unsafe_code)]"]));
     for (path, text) in tree.sources().filter(|(path, _)| path.starts_with("schema/src/")) {
         // One line, because a list of names may have several.
         let text: String = code(text).map(|(_, line)| format!("{line} ")).collect();
@@ -54,14 +54,14 @@ fn words(text: &str) -> impl Iterator<Item = &str> {
 }
 
 /// Finds what `shm` and `files` use of this project besides `schema`.
-pub(crate) fn shm_and_files_know_only_schema(tree: &Tree) -> Vec<String> {
+pub(crate) fn shm_and_files_know_only_schema(tree: &SourceTree) -> Vec<String> {
     let known: [(&str, &[&str]); 2] =
         [("scanhub-files", &["scanhub-schema"]), ("scanhub-shm", &["scanhub-files", "scanhub-schema"])];
-    knows_others(tree, &known)
+    forbidden_dependencies(tree, &known)
 }
 
 /// Names of all crates that a manifest names for what is built, tests left out.
-fn built_with(manifest: &toml::Table) -> impl Iterator<Item = &String> {
+fn built_dependencies(manifest: &toml::Table) -> impl Iterator<Item = &String> {
     let sections = ["dependencies", "build-dependencies"].into_iter();
     let tables = sections.filter_map(|section| manifest.get(section).and_then(toml::Value::as_table));
     tables.flat_map(toml::Table::keys)
@@ -69,15 +69,15 @@ fn built_with(manifest: &toml::Table) -> impl Iterator<Item = &String> {
 
 /// Finds what is more than computation in the drivers: time and bytes are arguments, so that the same code runs on a port, on a
 /// recording and in virtual time.
-pub(crate) fn drivers_only_compute(tree: &Tree) -> Vec<String> {
-    let mut breaches = built_of(tree, "scanhub-drivers", &["scanhub-schema"]);
-    breaches.extend(lacks(tree, "hub/drivers/src/lib.rs", &["#![forbid(unsafe_code)]"]));
-    breaches.extend(outside(tree, "hub/drivers/src/"));
+pub(crate) fn drivers_only_compute(tree: &SourceTree) -> Vec<String> {
+    let mut breaches = dependencies_beyond(tree, "scanhub-drivers", &["scanhub-schema"]);
+    breaches.extend(missing_attributes(tree, "hub/drivers/src/lib.rs", &["#![forbid(unsafe_code)]"]));
+    breaches.extend(forbidden_paths(tree, "hub/drivers/src/"));
     breaches
 }
 
 /// Finds names of one family in the code of another, and names of families in the code that they share.
-pub(crate) fn no_family_names_another(tree: &Tree) -> Vec<String> {
+pub(crate) fn no_family_names_another(tree: &SourceTree) -> Vec<String> {
     const FAMILIES: [&str; 3] = ["ld", "lms", "rplidar"];
     let mut breaches = Vec::new();
     for own in ["ld", "line", "lms", "rplidar"] {
@@ -99,7 +99,7 @@ pub(crate) fn no_family_names_another(tree: &Tree) -> Vec<String> {
 
 /// Finds names of the RPLIDAR's driver in the simulator. If both used one description of the protocol, an error in it would stay
 /// unnoticed.
-pub(crate) fn the_rplidar_simulator_is_independent(tree: &Tree) -> Vec<String> {
+pub(crate) fn the_rplidar_simulator_is_independent(tree: &SourceTree) -> Vec<String> {
     let mut breaches = Vec::new();
     for (path, text) in tree.sources().filter(|(path, _)| path.starts_with("hub/sim/src/")) {
         let text: String = code(text).map(|(_, line)| format!("{line} ")).collect();
@@ -118,7 +118,7 @@ pub(crate) fn the_rplidar_simulator_is_independent(tree: &Tree) -> Vec<String> {
 }
 
 /// Finds names of the operating system in the code below `folder`: clocks, sockets, files, threads, processes.
-fn outside(tree: &Tree, folder: &str) -> Vec<String> {
+fn forbidden_paths(tree: &SourceTree, folder: &str) -> Vec<String> {
     const HARMLESS: [&str; 4] = ["std::f32", "std::f64", "std::fmt", "std::ops"];
     let below = |path: &str| path.starts_with(folder);
     let mut breaches = find(tree, &["extern crate", "println!", "eprint"], below);
@@ -131,35 +131,37 @@ fn outside(tree: &Tree, folder: &str) -> Vec<String> {
 }
 
 /// Finds what is more than computation in the crate that encodes EEPROM writes.
-pub(crate) fn what_writes_the_eeprom_is_protocol_alone(tree: &Tree) -> Vec<String> {
-    let mut breaches = built_of(tree, "scanhub-lms-configure", &["scanhub-drivers", "scanhub-schema"]);
-    breaches.extend(lacks(tree, "hub/lms-configure/src/lib.rs", &["#![forbid(unsafe_code)]"]));
-    breaches.extend(outside(tree, "hub/lms-configure/src/"));
+pub(crate) fn eeprom_writer_only_computes(tree: &SourceTree) -> Vec<String> {
+    let mut breaches =
+        dependencies_beyond(tree, "scanhub-lms-configure", &["scanhub-drivers", "scanhub-schema"]);
+    breaches.extend(missing_attributes(tree, "hub/lms-configure/src/lib.rs", &["#![forbid(unsafe_code)]"]));
+    breaches.extend(forbidden_paths(tree, "hub/lms-configure/src/"));
     breaches
 }
 
 /// Cargo keeps requests that write the EEPROM from all crates but these: the one where a person is asked, and the
 /// simulator, which is the sensor. Tests of others may have them.
-pub(crate) fn few_crates_can_write_the_eeprom(tree: &Tree) -> Vec<String> {
-    const MAY: [&str; 2] = ["scanhub-tools", "scanhub-sim"];
+pub(crate) fn few_crates_can_write_the_eeprom(tree: &SourceTree) -> Vec<String> {
+    const ALLOWED_CRATES: [&str; 2] = ["scanhub-tools", "scanhub-sim"];
     let top = ("scanhub".to_owned(), tree.manifest("Cargo.toml"));
-    let others = tree.members().into_iter().chain([top]).filter(|(name, _)| !MAY.contains(&name.as_str()));
+    let others =
+        tree.members().into_iter().chain([top]).filter(|(name, _)| !ALLOWED_CRATES.contains(&name.as_str()));
     // The fuzzer's crate is a test.
     let built = others.filter(|(name, _)| name != "scanhub-fuzz");
     built
-        .filter(|(_, manifest)| built_with(manifest).any(|name| name == "scanhub-lms-configure"))
+        .filter(|(_, manifest)| built_dependencies(manifest).any(|name| name == "scanhub-lms-configure"))
         .map(|(name, _)| format!("{name} is built with what writes the EEPROM"))
         .collect()
 }
 
-fn lacks(tree: &Tree, path: &str, attributes: &[&str]) -> Vec<String> {
+fn missing_attributes(tree: &SourceTree, path: &str, attributes: &[&str]) -> Vec<String> {
     let has = |attribute: &str| tree.text(path).lines().any(|line| line == attribute);
     let missing = attributes.iter().filter(|attribute| !has(attribute));
     missing.map(|attribute| format!("{path} lacks {attribute}")).collect()
 }
 
 /// From payloads to payloads: no telegram, no shared memory, nothing of the system, no heap.
-pub(crate) fn preprocess_only_computes(tree: &Tree) -> Vec<String> {
+pub(crate) fn preprocess_only_computes(tree: &SourceTree) -> Vec<String> {
     const HEAP: [&str; 12] = [
         "Vec<",
         "Vec::",
@@ -184,8 +186,8 @@ pub(crate) fn preprocess_only_computes(tree: &Tree) -> Vec<String> {
     let ours = |path: &str| path.starts_with("hub/preprocess/src/") && !is_of_tests(path);
     let manifest = &tree.members()["scanhub-preprocess"];
     let mut breaches: Vec<String> =
-        built_with(manifest).filter(|name| *name != "scanhub-schema").cloned().collect();
-    breaches.extend(lacks(tree, "hub/preprocess/src/lib.rs", &["#![forbid(unsafe_code)]"]));
+        built_dependencies(manifest).filter(|name| *name != "scanhub-schema").cloned().collect();
+    breaches.extend(missing_attributes(tree, "hub/preprocess/src/lib.rs", &["#![forbid(unsafe_code)]"]));
     let mut on_heap = find(tree, &HEAP, ours);
     // For as many beams as its sensor has, or cells of a map, each processor takes its memory once. Settings with lists of circles
     // and sectors are made before that.
@@ -212,7 +214,7 @@ pub(crate) fn preprocess_only_computes(tree: &Tree) -> Vec<String> {
 }
 
 /// Checks that the result of a processor does not depend on which others run. Motion has its own line finder.
-pub(crate) fn no_processor_uses_another(tree: &Tree) -> Vec<String> {
+pub(crate) fn no_processor_uses_another(tree: &SourceTree) -> Vec<String> {
     const BELOW: &str = "hub/preprocess/src/";
     const PROCESSORS: [&str; 6] = ["zones", "marks", "lines", "motion", "background", "segments"];
     let mut breaches = Vec::new();
@@ -233,7 +235,7 @@ pub(crate) fn no_processor_uses_another(tree: &Tree) -> Vec<String> {
 /// A consumer's program has nothing of ours below it but the library and the words. The verbs stand on it as others do; the
 /// words of ROS come with them where they record. The viewer, the gateway, the listener and the perception of people and points
 /// stand on the verbs.
-pub(crate) fn clients_know_only_schema(tree: &Tree) -> Vec<String> {
+pub(crate) fn clients_know_only_schema(tree: &SourceTree) -> Vec<String> {
     let known: [(&str, &[&str]); 4] = [
         // Its tests name it to enable its features.
         ("scanhub-client", &["scanhub-client", "scanhub-schema", "scanhub-shm"]),
@@ -257,11 +259,11 @@ pub(crate) fn clients_know_only_schema(tree: &Tree) -> Vec<String> {
             ],
         ),
     ];
-    knows_others(tree, &known)
+    forbidden_dependencies(tree, &known)
 }
 
 /// Finds modules of `shm` that use one that is not before them in the list at the start of the crate.
-pub(crate) fn modules_of_shm_form_layers(tree: &Tree) -> Vec<String> {
+pub(crate) fn modules_of_shm_form_layers(tree: &SourceTree) -> Vec<String> {
     const FOLDER: &str = "schema/shm/src/";
     let lib = tree.text("schema/shm/src/lib.rs");
     let list = lib.lines().filter_map(|line| line.strip_prefix("//! - "));
@@ -288,32 +290,34 @@ pub(crate) fn modules_of_shm_form_layers(tree: &Tree) -> Vec<String> {
 }
 
 /// Crates of this project that a crate names besides those that it may know.
-fn knows_others(tree: &Tree, known: &[(&str, &[&str])]) -> Vec<String> {
+fn forbidden_dependencies(tree: &SourceTree, known: &[(&str, &[&str])]) -> Vec<String> {
     let members = tree.members();
     let others = known.iter().flat_map(|(name, known)| {
-        let names = ours(&members[*name], &ALL).into_iter().filter(|other| !known.contains(&other.as_str()));
+        let names = own_dependencies(&members[*name], &ALL)
+            .into_iter()
+            .filter(|other| !known.contains(&other.as_str()));
         names.map(move |other| format!("{name} knows {other}"))
     });
     others.collect()
 }
 
 /// From payloads to messages: nothing of the system, nothing of others, so that anybody can call it.
-pub(crate) fn ros_knows_only_schema(tree: &Tree) -> Vec<String> {
-    let mut breaches = built_of(tree, "scanhub-ros", &["scanhub-schema", "sha2"]);
-    breaches.extend(lacks(tree, "schema/ros/src/lib.rs", &["#![forbid(unsafe_code)]"]));
+pub(crate) fn ros_knows_only_schema(tree: &SourceTree) -> Vec<String> {
+    let mut breaches = dependencies_beyond(tree, "scanhub-ros", &["scanhub-schema", "sha2"]);
+    breaches.extend(missing_attributes(tree, "schema/ros/src/lib.rs", &["#![forbid(unsafe_code)]"]));
     let ours = |path: &str| path.starts_with("schema/ros/src/");
     breaches.extend(find(tree, &["std::time", "std::net", "std::fs", "extern crate"], ours));
     breaches
 }
 
 /// From samples to datagrams and back: bytes and time are arguments, so that a simulation runs what sockets run.
-pub(crate) fn the_ends_of_a_network_only_compute(tree: &Tree) -> Vec<String> {
+pub(crate) fn the_ends_of_a_network_only_compute(tree: &SourceTree) -> Vec<String> {
     const FOLDER: &str = "clients/network/src/lan";
     const OF_STD: [&str; 8] = ["array", "cmp", "collections", "fmt", "mem", "num", "ops", "time::Duration"];
     const CRATES: [&str; 3] = ["hmac", "scanhub-schema", "sha2"];
-    let mut breaches = lacks(tree, "clients/network/src/lib.rs", &["#![forbid(unsafe_code)]"]);
+    let mut breaches = missing_attributes(tree, "clients/network/src/lib.rs", &["#![forbid(unsafe_code)]"]);
     let manifest = tree.manifest("clients/network/Cargo.toml");
-    let others = built_with(&manifest).filter(|name| !CRATES.contains(&name.as_str()));
+    let others = built_dependencies(&manifest).filter(|name| !CRATES.contains(&name.as_str()));
     let others: Vec<_> = others.map(|name| name.replace('-', "_")).collect();
     for (path, text) in tree.sources().filter(|(path, _)| path.starts_with(FOLDER)) {
         // Tests at the end of a file may use more.
@@ -335,22 +339,23 @@ pub(crate) fn the_ends_of_a_network_only_compute(tree: &Tree) -> Vec<String> {
 
 /// Finds in the scene what is more than computation: samples and times are its arguments, so that a terminal and a
 /// browser show the same.
-pub(crate) fn the_scene_only_computes(tree: &Tree) -> Vec<String> {
+pub(crate) fn the_scene_only_computes(tree: &SourceTree) -> Vec<String> {
     const HARMLESS: [&str; 5] =
         ["std::collections", "std::fmt", "std::iter", "std::mem", "std::time::Duration"];
     let is_harmless = |place: &String| {
         let harmless: usize = HARMLESS.iter().map(|name| place.matches(name).count()).sum();
         place.matches("std::").count() == harmless
     };
-    let mut breaches = names_others(tree, &VIEWER, "scene", &["scanhub-schema"], &[]);
-    breaches
-        .extend(outside(tree, "clients/viewer/src/scene").into_iter().filter(|place| !is_harmless(place)));
+    let mut breaches = forbidden_names(tree, &VIEWER, "scene", &["scanhub-schema"], &[]);
+    breaches.extend(
+        forbidden_paths(tree, "clients/viewer/src/scene").into_iter().filter(|place| !is_harmless(place)),
+    );
     breaches
 }
 
 /// Finds clocks, sockets, files and threads in the code that computes people and points. Time is an argument there, so a
 /// recording gives what was live.
-pub(crate) fn perception_only_computes(tree: &Tree) -> Vec<String> {
+pub(crate) fn perception_only_computes(tree: &SourceTree) -> Vec<String> {
     const OUTSIDE: [&str; 17] = [
         "Instant",
         "SystemTime",
@@ -370,7 +375,7 @@ pub(crate) fn perception_only_computes(tree: &Tree) -> Vec<String> {
         "scanhub_verbs",
         "crate::verbs",
     ];
-    const KNOWN: [&str; 11] = [
+    const KNOWN_CRATES: [&str; 11] = [
         "clap",
         "nalgebra",
         "pathfinding",
@@ -383,8 +388,8 @@ pub(crate) fn perception_only_computes(tree: &Tree) -> Vec<String> {
         "strsim",
         "toml",
     ];
-    let mut breaches = built_of(tree, "scanhub-perception", &KNOWN);
-    breaches.extend(lacks(tree, "clients/perception/src/lib.rs", &["#![forbid(unsafe_code)]"]));
+    let mut breaches = dependencies_beyond(tree, "scanhub-perception", &KNOWN_CRATES);
+    breaches.extend(missing_attributes(tree, "clients/perception/src/lib.rs", &["#![forbid(unsafe_code)]"]));
     for module in ["tilt", "track"] {
         let (file, folder) =
             (format!("clients/perception/src/{module}.rs"), format!("clients/perception/src/{module}/"));
@@ -397,7 +402,7 @@ pub(crate) fn perception_only_computes(tree: &Tree) -> Vec<String> {
 
 /// Finds in the web server what could reach a hub, a file or a process: input of strangers ends in it. It has an
 /// allowlist of crates and of modules, so that it cannot follow a hub through another module of its crate either.
-pub(crate) fn the_server_knows_no_hub(tree: &Tree) -> Vec<String> {
+pub(crate) fn the_server_knows_no_hub(tree: &SourceTree) -> Vec<String> {
     const CRATES: [&str; 9] = [
         "data-encoding",
         "httparse",
@@ -421,8 +426,8 @@ pub(crate) fn the_server_knows_no_hub(tree: &Tree) -> Vec<String> {
         "rustix::process",
         "rustix::{",
     ];
-    let mut breaches = names_others(tree, &VIEWER, "server", &CRATES, &["scene"]);
-    breaches.extend(lacks(tree, "clients/viewer/src/lib.rs", &["#![forbid(unsafe_code)]"]));
+    let mut breaches = forbidden_names(tree, &VIEWER, "server", &CRATES, &["scene"]);
+    breaches.extend(missing_attributes(tree, "clients/viewer/src/lib.rs", &["#![forbid(unsafe_code)]"]));
     breaches.extend(find(tree, &OUTSIDE, |path| path.starts_with("clients/viewer/src/server")));
     breaches
 }
@@ -437,9 +442,15 @@ const VIEWER: Sources = Sources { name: "scanhub-viewer", folder: "clients/viewe
 
 /// Finds what `module`, a file with a folder of the same name, names of its crate besides itself and `modules`, and
 /// which dependencies of the crate it names besides `crates`.
-fn names_others(tree: &Tree, of: &Sources, module: &str, crates: &[&str], modules: &[&str]) -> Vec<String> {
+fn forbidden_names(
+    tree: &SourceTree,
+    of: &Sources,
+    module: &str,
+    crates: &[&str],
+    modules: &[&str],
+) -> Vec<String> {
     let manifest = &tree.members()[of.name];
-    let others: Vec<String> = built_with(manifest)
+    let others: Vec<String> = built_dependencies(manifest)
         .filter(|name| !crates.contains(&name.as_str()))
         .map(|name| name.replace('-', "_"))
         .collect();
@@ -466,15 +477,15 @@ fn names_others(tree: &Tree, of: &Sources, module: &str, crates: &[&str], module
 }
 
 /// What `package` is built with beside `known`.
-fn built_of(tree: &Tree, package: &str, known: &[&str]) -> Vec<String> {
+fn dependencies_beyond(tree: &SourceTree, package: &str, known: &[&str]) -> Vec<String> {
     let members = tree.members();
-    let others = built_with(&members[package]).filter(|name| !known.contains(&name.as_str()));
+    let others = built_dependencies(&members[package]).filter(|name| !known.contains(&name.as_str()));
     others.map(|name| format!("{package} is built with {name}")).collect()
 }
 
 /// Removes the crates of the hub that the Python package is built with for its feature `read` alone, which computes what a replay
 /// publishes. They stay if they are not optional, or if another feature names them.
-fn leave_out_read(manifest: &mut toml::Table) {
+fn remove_feature_read(manifest: &mut toml::Table) {
     const OF_READ: [&str; 3] = ["scanhub-config", "scanhub-daemon", "scanhub-recording"];
     let features = manifest.get("features").and_then(toml::Value::as_table).cloned().unwrap_or_default();
     let names = |feature: &toml::Value, name: &str| {
@@ -496,33 +507,37 @@ fn leave_out_read(manifest: &mut toml::Table) {
 }
 
 /// Finds what the libraries for C and for Python use besides the client library, and crates that are built with them.
-pub(crate) fn the_libraries_for_c_and_python_know_clients(tree: &Tree) -> Vec<String> {
+pub(crate) fn the_libraries_for_c_and_python_know_clients(tree: &SourceTree) -> Vec<String> {
     let mut members = tree.members();
-    members.entry("scanhub-python".to_owned()).and_modify(leave_out_read);
+    members.entry("scanhub-python".to_owned()).and_modify(remove_feature_read);
     let mut breaches = Vec::new();
     for (own, others) in [("scanhub-c", &[][..]), ("scanhub-python", &["bytemuck", "pyo3"])] {
         let known = [&["scanhub-client", "scanhub-schema"], others].concat();
         let is_known = |name: &&String| known.contains(&name.as_str());
-        breaches.extend(built_with(&members[own]).filter(|name| !is_known(name)).cloned());
+        breaches.extend(built_dependencies(&members[own]).filter(|name| !is_known(name)).cloned());
         let top = ("scanhub".to_owned(), tree.manifest("Cargo.toml"));
         let all = members.clone().into_iter().chain([top]);
         breaches.extend(all.filter_map(|(name, manifest)| {
-            built_with(&manifest).any(|known| known == own).then(|| format!("{name} is built with {own}"))
+            built_dependencies(&manifest)
+                .any(|known| known == own)
+                .then(|| format!("{name} is built with {own}"))
         }));
     }
     breaches
 }
 
 /// Nor anything that writes the EEPROM.
-pub(crate) fn the_daemon_knows_neither_clients_nor_sim(tree: &Tree) -> Vec<String> {
+pub(crate) fn the_daemon_knows_neither_clients_nor_sim(tree: &SourceTree) -> Vec<String> {
     let members = tree.members();
     let mut reached = BTreeSet::new();
     let mut open = vec!["scanhub-daemon".to_owned()];
     while let Some(name) = open.pop() {
-        open.extend(ours(&members[&name], &NORMAL).into_iter().filter(|name| !reached.contains(name)));
+        open.extend(
+            own_dependencies(&members[&name], &NORMAL).into_iter().filter(|name| !reached.contains(name)),
+        );
         reached.insert(name);
     }
-    const STRANGERS: [&str; 8] = [
+    const NON_DEPENDENCIES: [&str; 8] = [
         "scanhub-client",
         "scanhub-network",
         "scanhub-perception",
@@ -532,11 +547,11 @@ pub(crate) fn the_daemon_knows_neither_clients_nor_sim(tree: &Tree) -> Vec<Strin
         "scanhub-tools",
         "scanhub-lms-configure",
     ];
-    reached.into_iter().filter(|name| STRANGERS.contains(&name.as_str())).collect()
+    reached.into_iter().filter(|name| NON_DEPENDENCIES.contains(&name.as_str())).collect()
 }
 
 /// The daemon, the clients, the simulator and the tools meet nowhere but in the program: no crate has two of them.
-pub(crate) fn only_the_program_sees_all(tree: &Tree) -> Vec<String> {
+pub(crate) fn only_the_program_sees_all(tree: &SourceTree) -> Vec<String> {
     let ends: [&[&str]; 4] = [
         &["scanhub-daemon"],
         &["scanhub-client", "scanhub-network", "scanhub-perception", "scanhub-verbs", "scanhub-viewer"],
@@ -549,9 +564,9 @@ pub(crate) fn only_the_program_sees_all(tree: &Tree) -> Vec<String> {
             continue;
         }
         if name == "scanhub-python" {
-            leave_out_read(&mut manifest);
+            remove_feature_read(&mut manifest);
         }
-        let mut known = ours(&manifest, &NORMAL);
+        let mut known = own_dependencies(&manifest, &NORMAL);
         known.insert(name.clone());
         let met = ends.iter().filter(|end| end.iter().any(|name| known.contains(*name))).count();
         if met > 1 {
@@ -560,7 +575,7 @@ pub(crate) fn only_the_program_sees_all(tree: &Tree) -> Vec<String> {
         }
     }
     let all = tree.members().into_values().chain([tree.manifest("Cargo.toml")]);
-    if all.into_iter().any(|manifest| ours(&manifest, &NORMAL).contains(WORLD)) {
+    if all.into_iter().any(|manifest| own_dependencies(&manifest, &NORMAL).contains(WORLD)) {
         breaches.push(format!("{WORLD} is for tests alone"));
     }
     breaches
@@ -570,22 +585,22 @@ pub(crate) fn only_the_program_sees_all(tree: &Tree) -> Vec<String> {
 const WORLD: &str = "scanhub-world";
 
 /// Without it `cargo test` at the top would leave a crate out.
-pub(crate) fn every_crate_is_tested_from_the_top(tree: &Tree) -> Vec<String> {
+pub(crate) fn every_crate_is_tested_from_the_top(tree: &SourceTree) -> Vec<String> {
     let manifest = tree.manifest("Cargo.toml");
     let list = |key: &str| -> BTreeSet<String> {
         let list = manifest["workspace"].get(key).and_then(toml::Value::as_array).into_iter().flatten();
         list.filter_map(toml::Value::as_str).map(str::to_owned).collect()
     };
-    let mut wanted = list("members");
-    wanted.insert(".".to_owned());
+    let mut expected = list("members");
+    expected.insert(".".to_owned());
     // The hub is built without Zenoh, and without Python.
-    let apart = ["clients/bridge", "clients/python"].map(|member| wanted.take(member));
-    let mut breaches: Vec<String> = wanted
+    let apart = ["clients/bridge", "clients/python"].map(|member| expected.take(member));
+    let mut breaches: Vec<String> = expected
         .difference(&list("default-members"))
         .map(|member| format!("{member} is no default member"))
         .collect();
     if apart.iter().all(Option::is_some) {
-        breaches.extend(lacks(tree, ".ci/run", &["step cargo test --package scanhub-bridge"]));
+        breaches.extend(missing_attributes(tree, ".ci/run", &["step cargo test --package scanhub-bridge"]));
         // The tests of the package use what this builds.
         if !tree.text(".ci/run").contains("step clients/python/build.sh") {
             breaches.push(".ci/run does not build clients/python".to_owned());
@@ -595,7 +610,7 @@ pub(crate) fn every_crate_is_tested_from_the_top(tree: &Tree) -> Vec<String> {
 }
 
 /// Every crate takes over the workspace's lints, which deny unsafe code.
-pub(crate) fn every_crate_obeys_the_lints(tree: &Tree) -> Vec<String> {
+pub(crate) fn every_crate_obeys_the_lints(tree: &SourceTree) -> Vec<String> {
     let top = tree.manifest("Cargo.toml");
     let mut breaches = Vec::new();
     if top["workspace"]["lints"]["rust"]["unsafe_code"].as_str() != Some("deny") {
@@ -611,14 +626,14 @@ pub(crate) fn every_crate_obeys_the_lints(tree: &Tree) -> Vec<String> {
 }
 
 /// Hub and clients with two versions of it refuse each other.
-pub(crate) fn shared_memory_is_pinned(tree: &Tree) -> Vec<String> {
+pub(crate) fn shared_memory_is_pinned(tree: &SourceTree) -> Vec<String> {
     let manifest = tree.manifest("Cargo.toml");
     let version = manifest["workspace"]["dependencies"]["iceoryx2"]["version"].as_str().unwrap_or_default();
     if version.starts_with('=') { Vec::new() } else { vec![format!("iceoryx2 {version:?}")] }
 }
 
 /// Names of the crates that `package` is built from, itself included, as Cargo resolves it on this machine.
-pub(crate) fn built_from(package: &str, features: &[&str]) -> BTreeSet<String> {
+pub(crate) fn dependency_tree(package: &str, features: &[&str]) -> BTreeSet<String> {
     let mut cargo = Command::new(env!("CARGO"));
     cargo.current_dir(env!("CARGO_MANIFEST_DIR")).args(["tree", "--offline", "--edges", "normal"]);
     cargo.args(["--prefix", "none", "--format", "{p}", "--package", package]).args(features);

@@ -1,10 +1,10 @@
 //! The walls around a sensor's EEPROM: who can name a request that writes it, who can make one, and who can consent to it.
 
-use super::{crates, holds, sources};
+use super::{assert_rule, crates, sources};
 
 #[test]
-fn what_writes_the_eeprom_is_protocol_alone() {
-    holds(crates::what_writes_the_eeprom_is_protocol_alone, |tree| {
+fn eeprom_writer_only_computes() {
+    assert_rule(crates::eeprom_writer_only_computes, |tree| {
         let (manifest, lib) = ("hub/lms-configure/Cargo.toml", "hub/lms-configure/src/lib.rs");
         vec![
             tree.with_line(manifest, "[dependencies]", "scanhub-port.workspace = true"),
@@ -16,7 +16,7 @@ fn what_writes_the_eeprom_is_protocol_alone() {
 
 #[test]
 fn few_crates_can_write_the_eeprom() {
-    holds(crates::few_crates_can_write_the_eeprom, |tree| {
+    assert_rule(crates::few_crates_can_write_the_eeprom, |tree| {
         let line = "scanhub-lms-configure.workspace = true";
         ["hub/port/Cargo.toml", "hub/drivers/Cargo.toml", "clients/client/Cargo.toml", "Cargo.toml"]
             .map(|manifest| tree.with_line(manifest, "[dependencies]", line))
@@ -25,8 +25,8 @@ fn few_crates_can_write_the_eeprom() {
 }
 
 #[test]
-fn nobody_writes_the_eeprom() {
-    holds(sources::nobody_writes_the_eeprom, |tree| {
+fn only_configure_may_write_the_eeprom() {
+    assert_rule(sources::only_configure_may_write_the_eeprom, |tree| {
         vec![
             tree.with(
                 "hub/daemon/src/planted.rs",
@@ -39,10 +39,10 @@ fn nobody_writes_the_eeprom() {
                 "//! Writes.\nlet telegram = Writer::new(address, 0x66);\n",
             ),
             tree.with("hub/drivers/src/lms/explain.rs", "//! Writes.\nlet telegram = Writer::new(0, SET);\n"),
-            tree.with("hub/drivers/src/lms/dialogue.rs", "//! Talks.\nuse crate::eeprom::Write;\n"),
+            tree.with("hub/drivers/src/lms/protocol_state.rs", "//! Talks.\nuse crate::eeprom::Write;\n"),
             tree.with("hub/drivers/src/lms/session.rs", "//! Talks.\nuse crate::{Nanos, eeprom};\n"),
             tree.with(
-                "hub/drivers/src/lms/exchange.rs",
+                "hub/drivers/src/lms/request_channel.rs",
                 "//! Sends.\nlet request = crate::eeprom::Write::Field(&[]);\n",
             ),
             tree.with("hub/daemon/src/link.rs", "//! A link.\nuse scanhub_lms_configure::Change;\n"),
@@ -57,7 +57,7 @@ fn nobody_writes_the_eeprom() {
 
 #[test]
 fn consent_is_given_by_persons() {
-    holds(sources::consent_is_given_by_persons, |tree| {
+    assert_rule(sources::consent_is_given_by_persons, |tree| {
         let planted = "//! Writes.\nlet consent = Consent::of_a_person(plan);\n";
         let ask = tree.text("hub/tools/src/configure.rs");
         let plan = tree.text("hub/lms-configure/src/plan.rs");

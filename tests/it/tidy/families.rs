@@ -1,11 +1,11 @@
 //! How many files name a family of scanners: one more family is a module of the drivers, one of the simulator, and a line in
 //! each of these.
 
-use super::holds;
-use super::tree::{Tree, code};
+use super::assert_rule;
+use super::tree::{SourceTree, code};
 
 /// What names a family, but for its driver, its simulator, tests, benches and pages; each says why.
-const MAY: [&str; 9] = [
+const ALLOWED_FILES: [&str; 9] = [
     // The modules of the drivers.
     "hub/drivers/src/lib.rs",
     // The list of the families.
@@ -22,14 +22,14 @@ const MAY: [&str; 9] = [
 ];
 
 /// Words for a family, beside the name of its module.
-const FAMILIES: [(&str, &[&str]); 2] = [
+const FAMILY_WORDS: [(&str, &[&str]); 2] = [
     ("ld", &["ldrobot", "ld06", "ld19", "stl19p", "stl27l", "ld14p"]),
     ("rplidar", &["slamtec", "a1m8", "a2m8", "a2m12"]),
 ];
 
 /// Sources of the hub, its configuration, its tools and the program. Files directly in `hub/` count, too. They name no family, not
 /// even the LMS. Recordings and clients name the LMS, because its telegrams are a format of files and topics.
-const HUB: [&str; 5] = ["hub/config/", "hub/daemon/", "hub/tools/", "hub/cli/", "hub/demo/"];
+const HUB_FOLDERS: [&str; 5] = ["hub/config/", "hub/daemon/", "hub/tools/", "hub/cli/", "hub/demo/"];
 
 /// Sources of the hub that name the LMS, each with the reason.
 const MAY_NAME_LMS: [&str; 4] = [
@@ -43,17 +43,17 @@ const MAY_NAME_LMS: [&str; 4] = [
 ];
 
 /// Sources of the hub that name the LMS and may not.
-fn hub_names_no_lms(tree: &Tree) -> Vec<String> {
+fn hub_names_no_lms(tree: &SourceTree) -> Vec<String> {
     let others =
         hub_sources_with_lms(tree).filter(|path| !MAY_NAME_LMS.iter().any(|may| path.starts_with(may)));
     others.map(|path| format!("{path} names the LMS: call what the drivers have for every family")).collect()
 }
 
 /// Sources of the hub that name the LMS.
-fn hub_sources_with_lms(tree: &Tree) -> impl Iterator<Item = &str> {
+fn hub_sources_with_lms(tree: &SourceTree) -> impl Iterator<Item = &str> {
     let is_program = |path: &str| path.strip_prefix("hub/").is_some_and(|file| !file.contains('/'));
     let is_hub = move |path: &str| {
-        !path.contains("tests") && (is_program(path) || HUB.iter().any(|hub| path.starts_with(hub)))
+        !path.contains("tests") && (is_program(path) || HUB_FOLDERS.iter().any(|hub| path.starts_with(hub)))
     };
     let names_it = |line: &str| {
         let line = line.to_lowercase();
@@ -64,14 +64,14 @@ fn hub_sources_with_lms(tree: &Tree) -> impl Iterator<Item = &str> {
 }
 
 /// Files that name a family and may not.
-fn few_files_name_a_family(tree: &Tree) -> Vec<String> {
-    let named = FAMILIES.iter().flat_map(|(name, words)| named(tree, name, words));
-    let others = named.filter(|path| !MAY.contains(path));
+fn few_files_name_a_family(tree: &SourceTree) -> Vec<String> {
+    let named = FAMILY_WORDS.iter().flat_map(|(name, words)| files_with_words(tree, name, words));
+    let others = named.filter(|path| !ALLOWED_FILES.contains(path));
     others.map(|path| format!("{path} names a family: what it needs of all belongs into a list")).collect()
 }
 
 /// Files that name the family `name`, or say one of `words`.
-fn named<'a>(tree: &'a Tree, name: &str, words: &[&str]) -> Vec<&'a str> {
+fn files_with_words<'a>(tree: &'a SourceTree, name: &str, words: &[&str]) -> Vec<&'a str> {
     const OWN: [&str; 7] = [".ci/", "hub/sim/", "tests/", "benches/", "docs/", "README.md", "CHANGELOG.md"];
     let own = |path: &str| {
         OWN.iter().any(|own| path.starts_with(own))
@@ -97,7 +97,7 @@ fn named<'a>(tree: &'a Tree, name: &str, words: &[&str]) -> Vec<&'a str> {
 
 #[test]
 fn the_hub_names_no_lms() {
-    holds(hub_names_no_lms, |tree| {
+    assert_rule(hub_names_no_lms, |tree| {
         vec![
             tree.with(
                 "hub/daemon/src/session_driver.rs",
@@ -110,7 +110,7 @@ fn the_hub_names_no_lms() {
             tree.with("hub/cli/planted.rs", "//! Options.\nlms_type: String,\n"),
         ]
     });
-    let tree = Tree::load();
+    let tree = SourceTree::load();
     for may in MAY_NAME_LMS {
         let is_used = hub_sources_with_lms(&tree).any(|path| path.starts_with(may));
         assert!(is_used, "{may} does not name the LMS: it need not be in the list");
@@ -119,7 +119,7 @@ fn the_hub_names_no_lms() {
 
 #[test]
 fn a_family_is_a_line_in_few_files() {
-    holds(few_files_name_a_family, |tree| {
+    assert_rule(few_files_name_a_family, |tree| {
         vec![
             tree.with(
                 "hub/daemon/src/session_driver.rs",
@@ -134,10 +134,10 @@ fn a_family_is_a_line_in_few_files() {
             tree.with("clients/c/planted.h", "#define FAMILY_LD 1\n"),
         ]
     });
-    let tree = Tree::load();
-    for (name, words) in FAMILIES {
-        let named = named(&tree, name, words);
-        for path in MAY {
+    let tree = SourceTree::load();
+    for (name, words) in FAMILY_WORDS {
+        let named = files_with_words(&tree, name, words);
+        for path in ALLOWED_FILES {
             assert!(named.contains(&path), "{path} does not name {name}: it need not be in the list");
         }
     }

@@ -1,11 +1,11 @@
 //! Number of files that name a key of the configuration: one with its field, and those that use it. Files that name a
 //! processor: those of `hub/preprocess`, and the pipeline.
 
-use super::holds;
-use super::tree::{Tree, code};
+use super::assert_rule;
+use super::tree::{SourceTree, code};
 
 /// Keys of sections and of scanners, as the beginning of a name that nothing else has.
-const KEYS: [&str; 7] = [
+const CHECKED_KEYS: [&str; 7] = [
     "max_turn",
     "min_overlap",
     "max_invalid",
@@ -16,10 +16,10 @@ const KEYS: [&str; 7] = [
 ];
 
 /// Maximum number of product files that name a key.
-const MOST: usize = 3;
+const MAX_FILES: usize = 3;
 
 /// Keys that too many files name.
-fn few_files_name_a_key(tree: &Tree) -> Vec<String> {
+fn few_files_name_a_key(tree: &SourceTree) -> Vec<String> {
     let is_product = |path: &str| {
         ["hub/", "clients/", "schema/"].iter().any(|top| path.starts_with(top)) && !path.contains("tests")
     };
@@ -29,18 +29,18 @@ fn few_files_name_a_key(tree: &Tree) -> Vec<String> {
             .filter(|(path, text)| is_product(path) && code(text).any(|(_, line)| line.contains(key)));
         named.map(|(path, _)| path).collect()
     };
-    let keys = KEYS.into_iter().map(|key| (key, naming(key)));
-    let many = keys.filter(|(_, paths)| paths.len() > MOST || paths.is_empty());
+    let keys = CHECKED_KEYS.into_iter().map(|key| (key, naming(key)));
+    let many = keys.filter(|(_, paths)| paths.len() > MAX_FILES || paths.is_empty());
     many.map(|(key, paths)| format!("{} files name the key {key}: {}", paths.len(), paths.join(", ")))
         .collect()
 }
 
 #[test]
 fn a_key_is_in_few_files() {
-    holds(few_files_name_a_key, |tree| {
+    assert_rule(few_files_name_a_key, |tree| {
         let use_it =
             |number: usize| (format!("hub/daemon/src/planted{number}.rs"), "settings.stop_when_idle;\n");
-        let planted = (0..MOST).fold(tree.clone(), |tree, number| {
+        let planted = (0..MAX_FILES).fold(tree.clone(), |tree, number| {
             let (path, text) = use_it(number);
             tree.with(&path, text)
         });
@@ -52,28 +52,28 @@ fn a_key_is_in_few_files() {
 const PROCESSORS: [&str; 4] = ["MarkDetector", "LineFinder", "MotionEstimator", "Segmenter"];
 
 /// The file that calls all processors.
-const PIPELINE: &str = "hub/daemon/src/pipeline.rs";
+const PIPELINE_FILE: &str = "hub/daemon/src/pipeline.rs";
 
 /// Product files that name a processor and may not.
-fn only_the_pipeline_names_a_processor(tree: &Tree) -> Vec<String> {
+fn only_the_pipeline_names_a_processor(tree: &SourceTree) -> Vec<String> {
     let is_outside = |path: &str| {
         path.starts_with("hub/")
             && !path.starts_with("hub/preprocess/")
             && !path.contains("tests")
-            && path != PIPELINE
+            && path != PIPELINE_FILE
     };
     let named = |processor: &'static str| {
         let others = tree.files(".rs").filter(move |(path, text)| {
             is_outside(path) && code(text).any(|(_, line)| line.contains(processor))
         });
-        others.map(move |(path, _)| format!("{path} names {processor}: call it in {PIPELINE}"))
+        others.map(move |(path, _)| format!("{path} names {processor}: call it in {PIPELINE_FILE}"))
     };
     PROCESSORS.into_iter().flat_map(named).collect()
 }
 
 #[test]
 fn only_the_pipeline_calls_processors() {
-    holds(only_the_pipeline_names_a_processor, |tree| {
+    assert_rule(only_the_pipeline_names_a_processor, |tree| {
         vec![tree.with("hub/daemon/src/link.rs", "//! A link.\nlet marks = MarkDetector::new(settings);\n")]
     });
 }

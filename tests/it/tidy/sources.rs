@@ -1,6 +1,6 @@
 //! Rules for what a source may contain: unsafe code, shared memory, the scanner's EEPROM, and the shape of a file.
 
-use super::tree::{Tree, code, find};
+use super::tree::{SourceTree, code, find};
 
 /// Integration tests and benches may do as they like with telegrams.
 fn is_test(path: &str) -> bool {
@@ -9,7 +9,7 @@ fn is_test(path: &str) -> bool {
 
 /// Finds clocks in the program. Clippy holds this for the crates below `hub/` and `schema/`, but the program has the folder of all
 /// crates, also of those that may read a clock.
-pub(crate) fn only_the_demonstration_of_the_program_reads_clocks(tree: &Tree) -> Vec<String> {
+pub(crate) fn only_the_demonstration_of_the_program_reads_clocks(tree: &SourceTree) -> Vec<String> {
     find(tree, &["Instant::now", "SystemTime::now", "clock_gettime"], |path| {
         let in_hub = path.strip_prefix("hub/");
         let is_program = in_hub.is_some_and(|file| {
@@ -20,7 +20,7 @@ pub(crate) fn only_the_demonstration_of_the_program_reads_clocks(tree: &Tree) ->
 }
 
 /// Files that may hold unsafe code, each for something that no safe crate offers.
-const UNSAFE: [&str; 9] = [
+const UNSAFE_FILES: [&str; 9] = [
     // A page that hub and consumers map.
     "schema/shm/src/doorbell.rs",
     // The descriptors that wake consumers.
@@ -33,7 +33,7 @@ const UNSAFE: [&str; 9] = [
     // lines.
     "hub/port/src/tty.rs",
     // Addresses that programs in C bring.
-    "clients/c/src/boundary.rs",
+    "clients/c/src/ffi.rs",
     // Names of functions as the linker of such programs looks for them; no block.
     "clients/c/src/export.rs",
     // A subscription that moves between threads of Python, and views of its samples.
@@ -42,11 +42,11 @@ const UNSAFE: [&str; 9] = [
     "hub/daemon/tests/counting/mod.rs",
 ];
 /// In what is shipped: tests and benches are listed and explained like all, and not counted.
-const MOST_UNSAFE_BLOCKS: usize = 12;
+const MAX_UNSAFE_BLOCKS: usize = 12;
 
-pub(crate) fn unsafe_code_is_rare_and_explained(tree: &Tree) -> Vec<String> {
+pub(crate) fn unsafe_code_is_rare_and_explained(tree: &SourceTree) -> Vec<String> {
     let mut breaches =
-        find(tree, &["allow(unsafe_code)", "expect(unsafe_code)"], |path| !UNSAFE.contains(&path));
+        find(tree, &["allow(unsafe_code)", "expect(unsafe_code)"], |path| !UNSAFE_FILES.contains(&path));
     let mut blocks = 0;
     for (path, text) in tree.sources() {
         let lines: Vec<&str> = text.lines().collect();
@@ -59,19 +59,19 @@ pub(crate) fn unsafe_code_is_rare_and_explained(tree: &Tree) -> Vec<String> {
             }
             blocks += usize::from(!is_test(path));
             let before = &lines[number.saturating_sub(6)..number];
-            if !UNSAFE.contains(&path) || !before.iter().any(|line| line.contains("// SAFETY:")) {
+            if !UNSAFE_FILES.contains(&path) || !before.iter().any(|line| line.contains("// SAFETY:")) {
                 breaches.push(format!("{path}:{number}: {}", line.trim()));
             }
         }
     }
-    if blocks > MOST_UNSAFE_BLOCKS {
+    if blocks > MAX_UNSAFE_BLOCKS {
         breaches.push(format!("{blocks} unsafe blocks"));
     }
     breaches
 }
 
 /// Services are built in one crate. Payloads in schema derive one trait of the library.
-pub(crate) fn shared_memory_is_built_in_one_crate(tree: &Tree) -> Vec<String> {
+pub(crate) fn shared_memory_is_built_in_one_crate(tree: &SourceTree) -> Vec<String> {
     // Messages longer than any payload are compared with sockets by a service that no topic has.
     let may_build = |path: &str| path.starts_with("schema/shm/src/") || path == "benches/compare/topic.rs";
     let mut places = find(tree, &["iceoryx2::"], |path| !may_build(path));
@@ -82,7 +82,7 @@ pub(crate) fn shared_memory_is_built_in_one_crate(tree: &Tree) -> Vec<String> {
 }
 
 /// Words of the wire become ranges in a unit in one file, between the protocol and what consumers see.
-pub(crate) fn ranges_are_born_in_one_file(tree: &Tree) -> Vec<String> {
+pub(crate) fn ranges_are_born_in_one_file(tree: &SourceTree) -> Vec<String> {
     find(tree, &[".words()", "range_array", "upper_array"], |path| {
         path.starts_with("hub/daemon/src/") || path.starts_with("hub/tools/src/")
     })
@@ -92,17 +92,18 @@ pub(crate) fn ranges_are_born_in_one_file(tree: &Tree) -> Vec<String> {
 /// else. Those that write the EEPROM have their own crate, which most crates do not depend on. In the crates that do, only
 /// these files may name it: those that ask a person before a request is sent, and the simulator, which counts, executes and
 /// refuses such requests.
-pub(crate) fn nobody_writes_the_eeprom(tree: &Tree) -> Vec<String> {
-    const WRITES: [&str; 6] = ["0x40", "0x42", "0x46", "0x66", "0x77", "0x7C"];
-    const MAY_NAME: [&str; 3] = ["hub/sim/", "hub/lms-configure/", "hub/tools/src/configure"];
-    const MAY_SAY: [&str; 3] = ["hub/sim/", "hub/drivers/src/lms/", "hub/lms-configure/src/"];
+pub(crate) fn only_configure_may_write_the_eeprom(tree: &SourceTree) -> Vec<String> {
+    const WRITE_COMMANDS: [&str; 6] = ["0x40", "0x42", "0x46", "0x66", "0x77", "0x7C"];
+    const MAY_NAME_COMMANDS: [&str; 3] = ["hub/sim/", "hub/lms-configure/", "hub/tools/src/configure"];
+    const MAY_USE_BYTES: [&str; 3] = ["hub/sim/", "hub/drivers/src/lms/", "hub/lms-configure/src/"];
     /// Here requests are explained, and none is made.
-    const EXPLAINS: &str = "hub/drivers/src/lms/explain";
-    let may_name = |path: &str| is_test(path) || MAY_NAME.iter().any(|allowed| path.starts_with(allowed));
+    const EXPLAIN_FOLDER: &str = "hub/drivers/src/lms/explain";
+    let may_name =
+        |path: &str| is_test(path) || MAY_NAME_COMMANDS.iter().any(|allowed| path.starts_with(allowed));
     let mut breaches = find(tree, &["Writer::new", "EEPROM_WRITES"], |path| {
-        !is_test(path) && !MAY_SAY.iter().any(|allowed| path.starts_with(allowed))
+        !is_test(path) && !MAY_USE_BYTES.iter().any(|allowed| path.starts_with(allowed))
     });
-    breaches.extend(find(tree, &["Writer::new", ".encode("], |path| path.starts_with(EXPLAINS)));
+    breaches.extend(find(tree, &["Writer::new", ".encode("], |path| path.starts_with(EXPLAIN_FOLDER)));
     // Files and lines of text are written too, by writers of longer names.
     breaches.retain(|place| {
         let mut writers = place.match_indices("Writer::new");
@@ -115,9 +116,11 @@ pub(crate) fn nobody_writes_the_eeprom(tree: &Tree) -> Vec<String> {
     for (path, text) in tree.sources().filter(|(path, _)| lms(path)) {
         for (number, line) in code(text) {
             let constant = line.split_once(": u8 = ").map(|(_, value)| value.trim_end_matches(';'));
-            let said = line.split_once("Writer::new(").map(|(_, arguments)| arguments);
-            if constant.is_some_and(|value| WRITES.contains(&value) && !path.starts_with(EXPLAINS))
-                || said.is_some_and(|arguments| WRITES.iter().any(|command| arguments.contains(command)))
+            let writer_arguments = line.split_once("Writer::new(").map(|(_, arguments)| arguments);
+            if constant
+                .is_some_and(|value| WRITE_COMMANDS.contains(&value) && !path.starts_with(EXPLAIN_FOLDER))
+                || writer_arguments
+                    .is_some_and(|arguments| WRITE_COMMANDS.iter().any(|command| arguments.contains(command)))
             {
                 breaches.push(format!("{path}:{number}: {}", line.trim()));
             }
@@ -127,26 +130,26 @@ pub(crate) fn nobody_writes_the_eeprom(tree: &Tree) -> Vec<String> {
 }
 
 /// Only where a person is asked is consent made, without which nothing that writes the EEPROM leaves for a port.
-pub(crate) fn consent_is_given_by_persons(tree: &Tree) -> Vec<String> {
-    const ASKS: &str = "hub/tools/src/configure.rs";
-    const TAKES: &str = "hub/lms-configure/src/";
+pub(crate) fn consent_is_given_by_persons(tree: &SourceTree) -> Vec<String> {
+    const CONSENT_FILE: &str = "hub/tools/src/configure.rs";
+    const CONSENT_USER: &str = "hub/lms-configure/src/";
     let mut breaches = find(tree, &["of_a_person", "Consent("], |path| {
-        !is_test(path) && path != ASKS && !path.starts_with(TAKES)
+        !is_test(path) && path != CONSENT_FILE && !path.starts_with(CONSENT_USER)
     });
-    let asks = find(tree, &["of_a_person"], |path| path == ASKS);
-    let makers = find(tree, &["Consent("], |path| path.starts_with(TAKES));
+    let asks = find(tree, &["of_a_person"], |path| path == CONSENT_FILE);
+    let makers = find(tree, &["Consent("], |path| path.starts_with(CONSENT_USER));
     if asks.len() != 1 {
-        breaches.push(format!("{ASKS} gives consent in {} places", asks.len()));
+        breaches.push(format!("{CONSENT_FILE} gives consent in {} places", asks.len()));
     }
     // The type and its one constructor.
     if makers.len() != 2 {
-        breaches.push(format!("{TAKES} makes consent in {} places", makers.len()));
+        breaches.push(format!("{CONSENT_USER} makes consent in {} places", makers.len()));
     }
     breaches
 }
 
 /// Finds tests that start children themselves. The testkit ends its children with all their descendants.
-pub(crate) fn tests_start_children_in_one_file(tree: &Tree) -> Vec<String> {
+pub(crate) fn tests_start_children_in_one_file(tree: &SourceTree) -> Vec<String> {
     // The second file is a program and not a test. The third one runs an example in its own process and ends it.
     const ALLOWED: [&str; 3] =
         ["tests/testkit/child.rs", "tests/world/src/main.rs", "clients/client/tests/tokio.rs"];
@@ -162,7 +165,7 @@ pub(crate) fn tests_start_children_in_one_file(tree: &Tree) -> Vec<String> {
 
 /// Tests that sleep: what stands in for a device or a person, or plays a list of actions at real speed. All others wait for an
 /// event, by `until` and its like of the test kits. Each says why.
-const SLEEPS: [&str; 16] = [
+const SLEEP_CALLS: [&str; 16] = [
     // Waits for events: the kits of the programs, of the library, of the simulator and of its other tests.
     "tests/testkit/",
     "tests/it/browser.rs",
@@ -190,7 +193,7 @@ const SLEEPS: [&str; 16] = [
 
 /// Tests that compare a time that passed with a number. They fail on a busy machine, unless the number is one that the
 /// program may not fall below.
-const COMPARES: [&str; 4] = [
+const TIME_COMPARISONS: [&str; 4] = [
     // Share of a processor, and bytes in a second: a busy machine makes both less.
     "tests/it/flood.rs",
     "tests/it/web_crowd.rs",
@@ -201,33 +204,33 @@ const COMPARES: [&str; 4] = [
 ];
 
 /// Tests wait for events, never for a time, and hold no program to a time on a machine that others use too.
-pub(crate) fn tests_do_not_depend_on_time(tree: &Tree) -> Vec<String> {
+pub(crate) fn tests_do_not_depend_on_time(tree: &SourceTree) -> Vec<String> {
     let is_of = |path: &str, listed: &[&str]| listed.iter().any(|listed| path.starts_with(listed));
     let is_held =
         |path: &str| is_test(path) && !path.starts_with("benches/") && !path.starts_with("tests/it/tidy");
     let mut breaches =
-        find(tree, &["thread::sleep", "sleep(Duration"], |path| is_held(path) && !is_of(path, &SLEEPS));
+        find(tree, &["thread::sleep", "sleep(Duration"], |path| is_held(path) && !is_of(path, &SLEEP_CALLS));
     breaches.extend(find(tree, &[".elapsed()"], |path| {
-        is_held(path) && !is_of(path, &SLEEPS) && !is_of(path, &COMPARES)
+        is_held(path) && !is_of(path, &SLEEP_CALLS) && !is_of(path, &TIME_COMPARISONS)
     }));
     breaches
 }
 
-pub(crate) fn files_begin_with_a_description(tree: &Tree) -> Vec<String> {
+pub(crate) fn files_begin_with_a_description(tree: &SourceTree) -> Vec<String> {
     let described = |text: &str| text.starts_with("//! ");
     let files = tree.files(".rs").filter(|(_, text)| !described(text));
     files.map(|(path, _)| format!("{path} does not begin with a description of the module")).collect()
 }
 
 /// Names that say nothing.
-pub(crate) fn names_say_something(tree: &Tree) -> Vec<String> {
-    const EMPTY: [&str; 7] = ["manager", "util", "utils", "helper", "helpers", "common", "misc"];
+pub(crate) fn names_say_something(tree: &SourceTree) -> Vec<String> {
+    const EMPTY_NAMES: [&str; 7] = ["manager", "util", "utils", "helper", "helpers", "common", "misc"];
     let empty = |name: &str| {
         let spread: String = name
             .chars()
             .flat_map(|c| if c.is_uppercase() { vec!['_', c.to_ascii_lowercase()] } else { vec![c] })
             .collect();
-        spread.split('_').any(|part| EMPTY.contains(&part))
+        spread.split('_').any(|part| EMPTY_NAMES.contains(&part))
     };
     let mut breaches = Vec::new();
     for (path, text) in tree.sources() {
@@ -247,7 +250,7 @@ pub(crate) fn names_say_something(tree: &Tree) -> Vec<String> {
 }
 
 /// This is no safety device, and nothing may read as if it were one. Only README says what it is not at length.
-pub(crate) fn nothing_promises_safety(tree: &Tree) -> Vec<String> {
+pub(crate) fn nothing_promises_safety(tree: &SourceTree) -> Vec<String> {
     let mut breaches = Vec::new();
     for ending in [".rs", ".md", ".toml", ".service", ".rules", ".run"] {
         for (path, text) in tree.files(ending) {

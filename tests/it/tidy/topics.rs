@@ -1,11 +1,11 @@
 //! Number of files that name a topic. Topic `motion` stands for all: a hub publishes it for each link, and no client uses it
 //! but to show it.
 
-use super::holds;
-use super::tree::{Tree, code};
+use super::assert_rule;
+use super::tree::{SourceTree, code};
 
 /// Files that a topic touches, each with the reason. `docs/design.md` has the same list.
-const TOUCHED: [&str; 6] = [
+const TOPIC_FILES: [&str; 6] = [
     // Its row in the table of topics.
     "schema/src/topic.rs",
     // Its payload.
@@ -20,7 +20,7 @@ const TOUCHED: [&str; 6] = [
 ];
 
 /// Other files that name this topic for a reason that not every topic has.
-const ALSO: [&str; 3] = [
+const OTHER_FILES: [&str; 3] = [
     // The processor that computes it. `keys.rs` counts the files of a processor.
     "hub/preprocess/",
     "hub/daemon/src/pipeline.rs",
@@ -29,12 +29,13 @@ const ALSO: [&str; 3] = [
 ];
 
 /// Product files that name the topic, and are neither pages nor generated. The Python package reads shared memory on its own.
-fn naming(tree: &Tree) -> Vec<&str> {
-    const OTHERS: [&str; 3] = ["clients/python/", "schema/src/file/layout.txt", "hub/sim/src/rplidar.rs"];
+fn files_with_topic(tree: &SourceTree) -> Vec<&str> {
+    const EXCLUDED_FILES: [&str; 3] =
+        ["clients/python/", "schema/src/file/layout.txt", "hub/sim/src/rplidar.rs"];
     let is_product = |path: &str| {
         ["hub/", "clients/", "schema/"].iter().any(|top| path.starts_with(top))
             && !path.contains("tests")
-            && !OTHERS.iter().any(|other| path.starts_with(other))
+            && !EXCLUDED_FILES.iter().any(|other| path.starts_with(other))
     };
     let is_word =
         |line: &str| line.split(|c: char| !c.is_alphanumeric() && c != '_').any(|word| word == "Motion");
@@ -45,25 +46,26 @@ fn naming(tree: &Tree) -> Vec<&str> {
 }
 
 /// Files that name the topic and may not.
-fn few_files_name_a_topic(tree: &Tree) -> Vec<String> {
-    let may = |path: &str| TOUCHED.contains(&path) || ALSO.iter().any(|also| path.starts_with(also));
-    let others = naming(tree).into_iter().filter(|path| !may(path));
+fn few_files_name_a_topic(tree: &SourceTree) -> Vec<String> {
+    let may =
+        |path: &str| TOPIC_FILES.contains(&path) || OTHER_FILES.iter().any(|also| path.starts_with(also));
+    let others = files_with_topic(tree).into_iter().filter(|path| !may(path));
     let ask = "a topic is to touch no further file: derive this from the table of topics (`for_each_topic!`)";
     others.map(|path| format!("{path} names topic motion, but {ask}")).collect()
 }
 
 /// Files of the list that `docs/design.md` does not mention under "A topic".
-fn the_page_lists_the_files_of_a_topic(tree: &Tree) -> Vec<String> {
+fn the_page_lists_the_files_of_a_topic(tree: &SourceTree) -> Vec<String> {
     let page = tree.text("docs/design.md");
     let entry = page.split("- **A topic**").nth(1).unwrap_or_default();
     let entry = entry.split("\n- ").next().unwrap_or_default().split("\n## ").next().unwrap_or_default();
-    let missing = TOUCHED.iter().filter(|path| !entry.contains(&format!("`{path}`")));
+    let missing = TOPIC_FILES.iter().filter(|path| !entry.contains(&format!("`{path}`")));
     missing.map(|path| format!("docs/design.md does not say that a topic touches {path}")).collect()
 }
 
 #[test]
 fn a_topic_is_in_few_files() {
-    holds(few_files_name_a_topic, |tree| {
+    assert_rule(few_files_name_a_topic, |tree| {
         vec![
             tree.with("hub/daemon/src/topics.rs", "//! Topics.\nif topic == Topic::Motion {\n"),
             tree.with("schema/src/payload.rs", "//! Payloads.\nimpl Packed for Motion {\n"),
@@ -71,16 +73,16 @@ fn a_topic_is_in_few_files() {
             tree.with("hub/daemon/src/link.rs", "//! A link.\ntopics.publishers.motion.prepare();\n"),
         ]
     });
-    let tree = Tree::load();
-    let naming = naming(&tree);
-    for path in TOUCHED {
+    let tree = SourceTree::load();
+    let naming = files_with_topic(&tree);
+    for path in TOPIC_FILES {
         assert!(naming.contains(&path), "{path} does not name topic motion: it need not be in the list");
     }
 }
 
 #[test]
 fn the_design_says_which_files_a_topic_touches() {
-    holds(the_page_lists_the_files_of_a_topic, |tree| {
+    assert_rule(the_page_lists_the_files_of_a_topic, |tree| {
         vec![tree.with(
             "docs/design.md",
             &tree.text("docs/design.md").replace("`schema/src/topic.rs`", "the table"),

@@ -6,31 +6,31 @@ use std::path::Path;
 
 /// Files by their path below the top, with `/` between its parts.
 #[derive(Clone)]
-pub(crate) struct Tree {
+pub(crate) struct SourceTree {
     files: BTreeMap<String, String>,
 }
 
 /// A check: what breaks the wall, one line each.
-pub(crate) type Wall = fn(&Tree) -> Vec<String>;
+pub(crate) type Rule = fn(&SourceTree) -> Vec<String>;
 
-impl Tree {
+impl SourceTree {
     /// Everything that people wrote: sources, manifests, pages, units, scripts.
-    pub(crate) fn load() -> Tree {
-        let mut tree = Tree { files: BTreeMap::new() };
+    pub(crate) fn load() -> SourceTree {
+        let mut tree = SourceTree { files: BTreeMap::new() };
         tree.add(Path::new(env!("CARGO_MANIFEST_DIR")), "");
         assert!(tree.files.len() > 30, "the project is not where it should be");
         tree
     }
 
     /// The same with one file more, or another one in its place.
-    pub(crate) fn with(&self, path: &str, text: &str) -> Tree {
+    pub(crate) fn with(&self, path: &str, text: &str) -> SourceTree {
         let mut tree = self.clone();
         tree.files.insert(path.to_owned(), text.to_owned());
         tree
     }
 
     /// The same with `line` as first line of a section of a manifest.
-    pub(crate) fn with_line(&self, path: &str, section: &str, line: &str) -> Tree {
+    pub(crate) fn with_line(&self, path: &str, section: &str, line: &str) -> SourceTree {
         let text = self.text(path);
         let changed = if text.contains(section) {
             text.replacen(section, &format!("{section}\n{line}"), 1)
@@ -46,10 +46,10 @@ impl Tree {
     }
 
     /// All files with this ending.
-    pub(crate) fn files(&self, ending: &str) -> impl Iterator<Item = (&str, &str)> {
+    pub(crate) fn files(&self, suffix: &str) -> impl Iterator<Item = (&str, &str)> {
         self.files
             .iter()
-            .filter(move |(path, _)| path.ends_with(ending))
+            .filter(move |(path, _)| path.ends_with(suffix))
             .map(|(path, text)| (path.as_str(), text.as_str()))
     }
 
@@ -74,11 +74,11 @@ impl Tree {
             .collect()
     }
 
-    fn add(&mut self, directory: &Path, below: &str) {
+    fn add(&mut self, directory: &Path, relative: &str) {
         for entry in std::fs::read_dir(directory).expect("a readable directory") {
             let entry = entry.expect("an entry");
             let name = entry.file_name().into_string().expect("a name in UTF-8");
-            let path = format!("{below}{name}");
+            let path = format!("{relative}{name}");
             let hidden = name.starts_with('.') && name != ".ci";
             if entry.file_type().expect("a type").is_dir() {
                 if !hidden && name != "target" {
@@ -101,7 +101,7 @@ pub(crate) fn code(text: &str) -> impl Iterator<Item = (usize, &str)> {
 }
 
 /// Places in the code of the sources that `select` wants where one of `needles` stands.
-pub(crate) fn find(tree: &Tree, needles: &[&str], select: impl Fn(&str) -> bool) -> Vec<String> {
+pub(crate) fn find(tree: &SourceTree, needles: &[&str], select: impl Fn(&str) -> bool) -> Vec<String> {
     let mut places = Vec::new();
     for (path, text) in tree.sources().filter(|(path, _)| select(path)) {
         for (number, line) in code(text) {

@@ -1,10 +1,10 @@
 //! Number of files that name a verb. Verb `hz` stands for all.
 
-use super::holds;
-use super::tree::{Tree, code};
+use super::assert_rule;
+use super::tree::{SourceTree, code};
 
 /// Files that a verb touches, each with the reason. `docs/design.md` has the same list.
-const TOUCHED: [&str; 3] = [
+const VERB_FILES: [&str; 3] = [
     // Its arguments with help and examples, its run, and its text and JSON.
     "clients/verbs/src/hz.rs",
     // The line of its module.
@@ -14,7 +14,7 @@ const TOUCHED: [&str; 3] = [
 ];
 
 /// Product files that name the verb.
-fn naming(tree: &Tree) -> Vec<&str> {
+fn files_with_verb(tree: &SourceTree) -> Vec<&str> {
     let is_product = |path: &str| {
         ["hub/", "clients/", "schema/"].iter().any(|top| path.starts_with(top)) && !path.contains("tests")
     };
@@ -28,40 +28,40 @@ fn naming(tree: &Tree) -> Vec<&str> {
 }
 
 /// Files that name the verb and may not.
-fn few_files_name_a_verb(tree: &Tree) -> Vec<String> {
-    let others = naming(tree).into_iter().filter(|path| !TOUCHED.contains(path));
+fn few_files_name_a_verb(tree: &SourceTree) -> Vec<String> {
+    let others = files_with_verb(tree).into_iter().filter(|path| !VERB_FILES.contains(path));
     let ask = "a verb touches no further file: its `run` takes the whole `Context`";
     others.map(|path| format!("{path} names verb hz, but {ask}")).collect()
 }
 
 /// Files of the list that `docs/design.md` does not mention under "A verb".
-fn the_page_lists_the_files_of_a_verb(tree: &Tree) -> Vec<String> {
+fn the_page_lists_the_files_of_a_verb(tree: &SourceTree) -> Vec<String> {
     let page = tree.text("docs/design.md");
     let entry = page.split("- **A verb**").nth(1).unwrap_or_default();
     let entry = entry.split("\n- ").next().unwrap_or_default().split("\n## ").next().unwrap_or_default();
-    let missing = TOUCHED.iter().filter(|path| !entry.contains(&format!("`{path}`")));
+    let missing = VERB_FILES.iter().filter(|path| !entry.contains(&format!("`{path}`")));
     missing.map(|path| format!("docs/design.md does not say that a verb touches {path}")).collect()
 }
 
 #[test]
 fn a_verb_is_in_few_files() {
-    holds(few_files_name_a_verb, |tree| {
+    assert_rule(few_files_name_a_verb, |tree| {
         vec![
             tree.with("hub/main.rs", "//! The program.\nVerb::Hz(hz) => hz.run(json, &places),\n"),
             tree.with("hub/cli/examples.rs", "//! Examples.\n(\"hz\", &[\"scanhub hz front/scan\"]),\n"),
             tree.with("clients/verbs/src/follow.rs", "//! Follows topics.\npub use crate::hz::HzArgs;\n"),
         ]
     });
-    let tree = Tree::load();
-    let naming = naming(&tree);
-    for path in TOUCHED {
+    let tree = SourceTree::load();
+    let naming = files_with_verb(&tree);
+    for path in VERB_FILES {
         assert!(naming.contains(&path), "{path} does not name verb hz: it need not be in the list");
     }
 }
 
 #[test]
 fn the_design_says_which_files_a_verb_touches() {
-    holds(the_page_lists_the_files_of_a_verb, |tree| {
+    assert_rule(the_page_lists_the_files_of_a_verb, |tree| {
         let page = tree.text("docs/design.md").replace("`hub/cli.rs`", "the table");
         vec![tree.with("docs/design.md", &page)]
     });

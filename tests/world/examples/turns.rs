@@ -5,11 +5,11 @@
 
 use std::fmt::Write as _;
 
-use scanhub_world::{Detail, Figures, Plan, run};
+use scanhub_world::{Detail, RevolutionFigures, Scenario, run};
 
-const LD: [&str; 5] = ["ld06", "ld19", "stl19p", "stl27l", "ld14p"];
+const LD_MODELS: [&str; 5] = ["ld06", "ld19", "stl19p", "stl27l", "ld14p"];
 /// Each mode of each model of RPLIDAR.
-const RPLIDAR: [(&str, &[&str]); 8] = [
+const RPLIDAR_MODELS: [(&str, &[&str]); 8] = [
     ("a1", &["standard", "express", "boost", "sensitivity", "stability"]),
     ("a2m8", &["standard", "express", "boost", "sensitivity", "stability"]),
     ("a2m12", &["standard", "express", "boost", "sensitivity", "stability"]),
@@ -20,26 +20,27 @@ const RPLIDAR: [(&str, &[&str]); 8] = [
     ("c1", &["standard", "denseboost"]),
 ];
 /// One of each kind of packets.
-const KINDS: [&str; 5] = ["a1:standard", "a1:express", "a1:boost", "s1:denseboost", "s3:ultradense"];
+const PACKET_KINDS: [&str; 5] = ["a1:standard", "a1:express", "a1:boost", "s1:denseboost", "s3:ultradense"];
 
 /// The tables that are wanted.
 struct Tables(Vec<String>);
 
 impl Tables {
-    /// All that `plans` of `seconds` with `actions` come to, and what the judges say of them.
-    fn judge(&self, table: &str, model: &str, seeds: std::ops::Range<u64>, seconds: u64, actions: &str) {
-        if !self.0.is_empty() && !self.0.iter().any(|wanted| table.starts_with(wanted.as_str())) {
+    /// All that `scenarios` of `seconds` with `actions` come to, and what the judges say of them.
+    fn measure(&self, table: &str, model: &str, seeds: std::ops::Range<u64>, seconds: u64, actions: &str) {
+        if !self.0.is_empty() && !self.0.iter().any(|expected| table.starts_with(expected.as_str())) {
             return;
         }
-        let (mut figures, mut broken, worlds) = (Figures::default(), Vec::new(), seeds.end - seeds.start);
+        let (mut figures, mut broken, worlds) =
+            (RevolutionFigures::default(), Vec::new(), seeds.end - seeds.start);
         for seed in seeds {
             let text = format!("seed {seed} seconds {seconds} {model}\n{actions}");
-            let plan: Plan = text.parse().expect("a plan");
-            let outcome = run(&plan, Detail::Nothing);
+            let scenario: Scenario = text.parse().expect("a plan");
+            let outcome = run(&scenario, Detail::Nothing);
             figures.add(&outcome.figures);
             broken.extend(outcome.violations.into_iter().map(|violation| format!("{seed}: {violation}")));
         }
-        let Figures { scans, incomplete, points, angle_deg, range_mm, wrong, lost, .. } = figures;
+        let RevolutionFigures { scans, incomplete, points, angle_deg, range_mm, wrong, lost, .. } = figures;
         let ms = |ns: u64| ns as f64 / 1e6;
         println!(
             "{table}, {model}: {worlds} worlds, {scans} scans, {incomplete} incomplete, {lost} packets lost, {points} points, \
@@ -56,7 +57,7 @@ impl Tables {
 }
 
 /// Again and again what `action` says, every so many milliseconds for a minute.
-fn often(every_ms: u64, action: &str) -> String {
+fn repeated_action(every_ms: u64, action: &str) -> String {
     let mut actions = String::new();
     for at_ms in (3_000..48_000).step_by(every_ms as usize) {
         let _ = writeln!(actions, "{at_ms} {action}");
@@ -66,27 +67,28 @@ fn often(every_ms: u64, action: &str) -> String {
 
 fn main() {
     let tables = Tables(std::env::args().skip(1).collect());
-    for model in LD {
-        tables.judge("ld ten minutes", model, 1..2, 600, "");
+    for model in LD_MODELS {
+        tables.measure("ld ten minutes", model, 1..2, 600, "");
     }
-    for (model, modes) in RPLIDAR {
+    for (model, modes) in RPLIDAR_MODELS {
         for mode in modes {
-            tables.judge("rplidar ten minutes", &format!("{model}:{mode}"), 1..2, 600, "");
+            tables.measure("rplidar ten minutes", &format!("{model}:{mode}"), 1..2, 600, "");
         }
     }
-    let loss = often(10_000, "noise sensor=0 loss=135 flip=0 insert=0 double=0 burst=2 span_ms=9900");
-    tables.judge("ld burst loss", "ld19", 0..100, 60, &loss);
-    KINDS.iter().for_each(|model| tables.judge("rplidar burst loss", model, 0..100, 60, &loss));
-    let stalls = often(5_000, "stall span_ms=500");
-    tables.judge("ld hub stands still for 0.5 s", "ld19", 0..100, 60, &stalls);
-    for model in KINDS {
-        tables.judge("rplidar hub stands still for 0.5 s", model, 0..20, 60, &stalls);
+    let loss =
+        repeated_action(10_000, "noise sensor=0 loss=135 flip=0 insert=0 double=0 burst=2 span_ms=9900");
+    tables.measure("ld burst loss", "ld19", 0..100, 60, &loss);
+    PACKET_KINDS.iter().for_each(|model| tables.measure("rplidar burst loss", model, 0..100, 60, &loss));
+    let stalls = repeated_action(5_000, "stall span_ms=500");
+    tables.measure("ld hub stands still for 0.5 s", "ld19", 0..100, 60, &stalls);
+    for model in PACKET_KINDS {
+        tables.measure("rplidar hub stands still for 0.5 s", model, 0..20, 60, &stalls);
     }
-    let stalls = often(6_000, "stall span_ms=2000");
-    tables.judge("ld hub stands still for 2 s", "ld19", 0..100, 60, &stalls);
-    for (model, _) in RPLIDAR {
+    let stalls = repeated_action(6_000, "stall span_ms=2000");
+    tables.measure("ld hub stands still for 2 s", "ld19", 0..100, 60, &stalls);
+    for (model, _) in RPLIDAR_MODELS {
         for state in ["idle", "streaming", "off", "error"] {
-            tables.judge("rplidar start", &format!("{model}::{state}"), 0..20, 5, "");
+            tables.measure("rplidar start", &format!("{model}::{state}"), 0..20, 5, "");
         }
     }
 }

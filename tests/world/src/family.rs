@@ -19,7 +19,7 @@ use scanhub_sim::room::Room;
 use scanhub_sim::room::{Changes, PrecomputedScans};
 use scanhub_sim::world::World as Scene;
 
-use crate::plan::Action;
+use crate::scenario::Action;
 
 /// A scanner of a world and its link, as the seed has them.
 pub(crate) trait Family {
@@ -33,19 +33,19 @@ pub(crate) trait Family {
     fn families(&self) -> Vec<scanhub_schema::Family>;
 
     /// Returns the rates that the line may have, in bits per second.
-    fn rates(&self) -> Vec<u32>;
+    fn baud_rates(&self) -> Vec<u32>;
 
     /// The longest time between two scans, and from when something is measured until the scan that tells it has left.
-    fn times(&self) -> (Nanos, Nanos);
+    fn scan_times(&self) -> (Nanos, Nanos);
 
     /// The scanner as it is found, whose view changes as `changes` say.
-    fn found(&self, changes: Changes) -> Box<dyn Scanner>;
+    fn initial_scanner(&self, changes: Changes) -> Box<dyn Scanner>;
 
     /// What it sent one by one, of the bytes of a sample of telegrams.
-    fn units<'a>(&self, sample: &'a [u8]) -> Vec<&'a [u8]>;
+    fn telegrams<'a>(&self, sample: &'a [u8]) -> Vec<&'a [u8]>;
 
     /// So many of them are in a sample at the most.
-    fn most_units(&self) -> usize;
+    fn max_telegrams(&self) -> usize;
 
     /// Whether `unit` is measured values, and no reply.
     fn is_data(&self, unit: &[u8]) -> bool;
@@ -58,59 +58,59 @@ pub(crate) trait Family {
     fn is_collision(&self, got: &[u8], damaged: &mut dyn Iterator<Item = &[u8]>) -> bool;
 
     /// Whether its head turns all around, and its scans are turns of points whose truth is known.
-    fn turns(&self) -> bool {
+    fn is_rotating(&self) -> bool {
         false
     }
 
     /// Where the points of `unit` begin, if it has any and its head turns.
-    fn begin(&self, unit: &[u8]) -> Option<Begin> {
+    fn first_point(&self, unit: &[u8]) -> Option<FirstPoint> {
         let _ = unit;
         None
     }
 
     /// How exactly `unit` tells points.
-    fn exactness(&self, unit: &[u8]) -> Exactness {
+    fn point_accuracy(&self, unit: &[u8]) -> PointAccuracy {
         let _ = unit;
-        Exactness::default()
+        PointAccuracy::default()
     }
 }
 
 /// The points of a packet.
-pub(crate) struct Begin {
+pub(crate) struct FirstPoint {
     /// Where the first one is.
     pub(crate) clockwise_deg: f64,
     /// How many there are, one after the other.
     pub(crate) points: usize,
     /// How long the packet is on the line after the last one.
-    pub(crate) on_line: Nanos,
+    pub(crate) line_time: Nanos,
 }
 
 /// How exactly a packet tells points, and how much may be missing without a mark.
 #[derive(Clone, Copy)]
-pub(crate) struct Exactness {
+pub(crate) struct PointAccuracy {
     pub(crate) angle_deg: f64,
     pub(crate) range_mm: f64,
     /// Where nothing came back, the angle says little.
-    pub(crate) nothing_deg: f64,
+    pub(crate) no_return_deg: f64,
     /// Points of a turn.
     pub(crate) points: usize,
     /// Packets before and behind damaged bytes that may be lost with them: of what has a checksum only the one before
     /// them, and only that which follows could tell how its points are.
-    pub(crate) neighbours: usize,
+    pub(crate) neighbors: usize,
     /// Whether packets have a time of their own. Without one it takes a while until it is known how the scanner's clock
     /// goes, and over a long gap nobody can know how many packets there were.
     pub(crate) has_clock: bool,
 }
 
-impl Default for Exactness {
+impl Default for PointAccuracy {
     /// Packets that tell angles and ranges as they are, and everything by themselves.
-    fn default() -> Exactness {
-        Exactness {
+    fn default() -> PointAccuracy {
+        PointAccuracy {
             angle_deg: 0.05,
             range_mm: 2.0,
-            nothing_deg: 0.05,
+            no_return_deg: 0.05,
             points: 2,
-            neighbours: 0,
+            neighbors: 0,
             has_clock: true,
         }
     }
@@ -136,12 +136,12 @@ pub(crate) trait Scanner {
     fn misbehave(&mut self, action: Option<&Action>);
 
     /// Something happens to it that only some scanners know.
-    fn suffer(&mut self, ailment: Ailment, now: Nanos) {
-        let _ = (ailment, now);
+    fn inject_fault(&mut self, fault: ScannerFault, now: Nanos) {
+        let _ = (fault, now);
     }
 
     /// Its head turns at this share of its usual speed, as soon as it gets there.
-    fn set_pace(&mut self, share: f64) {
+    fn set_speed(&mut self, share: f64) {
         let _ = share;
     }
 
@@ -153,13 +153,13 @@ pub(crate) trait Scanner {
 
 /// What happens to a scanner beside its line.
 #[derive(Clone, Copy, Debug)]
-pub(crate) enum Ailment {
+pub(crate) enum ScannerFault {
     /// Something holds its head for so long.
-    Held { span: Nanos },
+    HeadHeld { span: Nanos },
     /// It says that it is well (0), may not be for long (1), or is not (2); if it is stubborn, also after it booted.
-    Unwell { status: u8, is_stubborn: bool },
+    Unhealthy { status: u8, is_stubborn: bool },
     /// While it measures it hears nothing; or it hears again.
-    Deaf(bool),
+    IgnoresRequests(bool),
 }
 
 /// The scanners that `random` draws.
@@ -184,20 +184,20 @@ pub(crate) fn either(first: Rc<dyn Family>, random: &mut fastrand::Rng) -> Rc<dy
         _ => return first,
     };
     let second = second.auto();
-    Rc::new(either::Either { first, second })
+    Rc::new(either::TwoFamilies { first, second })
 }
 
 /// Returns whether these bytes look like a packet of an LDROBOT.
 pub(crate) fn is_ld_packet(bytes: &[u8]) -> bool {
-    bytes.len() == scanhub_drivers::ld::packet::LEN && bytes.starts_with(&[0x54, 0x2C])
+    bytes.len() == scanhub_drivers::ld::packet::PACKET_LEN && bytes.starts_with(&[0x54, 0x2C])
 }
 
 /// The scanner that a plan calls so, otherwise as `random` draws it; nothing if there is none: `ld19`, `a1`,
 /// `a1:boost`, `a1:boost:streaming`.
-pub(crate) fn named(text: &str, random: &mut fastrand::Rng) -> Option<Rc<dyn Family>> {
-    match scanhub_drivers::ld::Model::named(text) {
+pub(crate) fn from_name(text: &str, random: &mut fastrand::Rng) -> Option<Rc<dyn Family>> {
+    match scanhub_drivers::ld::Model::from_name(text) {
         Some(model) => Some(Rc::new(ld::Ld::of(model, random))),
-        None => Some(Rc::new(rplidar::Rplidar::named(text, random)?)),
+        None => Some(Rc::new(rplidar::Rplidar::from_name(text, random)?)),
     }
 }
 
@@ -205,28 +205,28 @@ pub(crate) fn named(text: &str, random: &mut fastrand::Rng) -> Option<Rc<dyn Fam
 fn quirks(action: &Action) -> ProtocolQuirks {
     let share = |name| action.value(name) as f64 / 1e2;
     ProtocolQuirks {
-        overlooks: share("overlooks"),
-        naks: share("naks"),
-        doubles: share("doubles"),
+        overlooked_share: share("overlooks"),
+        nak_share: share("naks"),
+        doubled_share: share("doubles"),
         late_reply_ns: action.value("late_ms") * MILLIS,
-        mute: action.value("mute") > 0,
+        is_mute: action.value("mute") > 0,
         ..ProtocolQuirks::default()
     }
 }
 
 /// The rooms without any noise, for all worlds. No LMS tells its scans of them.
 fn still_rooms() -> Arc<PrecomputedScans> {
-    static SERIES: LazyLock<Arc<PrecomputedScans>> = LazyLock::new(|| {
+    static SCANS: LazyLock<Arc<PrecomputedScans>> = LazyLock::new(|| {
         let rooms = rooms(|scene| scene.with_noise(NoiseModel::NONE));
         Arc::new(PrecomputedScans::new(rooms, 1, Variant::HALF, Unit::Mm, Mode(1)))
     });
-    SERIES.clone()
+    SCANS.clone()
 }
 
 /// A head that is slowed down turns at this share of its speed.
-const SLOWEST: f64 = 0.6;
+const MIN_SPEED: f64 = 0.6;
 /// The most by which a head gets faster or slower in a second, as a share of its usual speed.
-const INERTIA: f64 = 0.4;
+const MAX_SPEED_CHANGE: f64 = 0.4;
 
 /// What scanners see in all worlds: a room without anything near, the same with a post 0.8 m ahead, and with one 0.4 m
 /// ahead.
@@ -234,14 +234,14 @@ fn rooms(layers: impl Fn(Scene) -> Scene) -> Vec<Room> {
     let rooms = [None, Some(800), Some(400)].map(|ahead_mm: Option<u32>| {
         let post =
             ahead_mm.map_or(String::new(), |mm| format!("[[thing]]\nradius_mm = 100\npose = [0, {mm}]\n"));
-        let scene = Scene::of_toml("world", &format!("{WALLS}{post}")).expect("a scene");
+        let scene = Scene::of_toml("world", &format!("{WORLD_CONFIG}{post}")).expect("a scene");
         Room::new(&layers(scene), 1)
     });
     rooms.to_vec()
 }
 
 /// Four walls, and noise as a real sensor has it, but no codes: what is near is seen by every scan.
-const WALLS: &str = "
+const WORLD_CONFIG: &str = "
 [noise]
 tail = 0
 errors = 0

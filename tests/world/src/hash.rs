@@ -3,33 +3,33 @@
 
 /// Takes bytes and numbers one after the other.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct History(u64);
+pub(crate) struct HistoryHash(u64);
 
-impl History {
-    pub(crate) fn new() -> History {
-        History(0x9E37_79B9_7F4A_7C15)
+impl HistoryHash {
+    pub(crate) fn new() -> HistoryHash {
+        HistoryHash(0x9E37_79B9_7F4A_7C15)
     }
 
     /// Takes a number.
-    pub(crate) fn number(&mut self, value: u64) {
+    pub(crate) fn add_number(&mut self, value: u64) {
         let mixed = (self.0 ^ value).wrapping_mul(0xFF51_AFD7_ED55_8CCD);
         self.0 = mixed ^ (mixed >> 32);
     }
 
     /// Takes bytes, and how many they are.
-    pub(crate) fn bytes(&mut self, bytes: &[u8]) {
+    pub(crate) fn add_bytes(&mut self, bytes: &[u8]) {
         let (words, rest) = bytes.as_chunks::<8>();
-        words.iter().for_each(|word| self.number(u64::from_le_bytes(*word)));
+        words.iter().for_each(|word| self.add_number(u64::from_le_bytes(*word)));
         let mut last = [0; 8];
         last[..rest.len()].copy_from_slice(rest);
-        self.number(u64::from_le_bytes(last));
-        self.number(bytes.len() as u64);
+        self.add_number(u64::from_le_bytes(last));
+        self.add_number(bytes.len() as u64);
     }
 
     /// Of these bytes alone.
-    pub(crate) fn of(bytes: &[u8]) -> u64 {
-        let mut history = History::new();
-        history.bytes(bytes);
+    pub(crate) fn hash_bytes(bytes: &[u8]) -> u64 {
+        let mut history = HistoryHash::new();
+        history.add_bytes(bytes);
         history.value()
     }
 
@@ -45,8 +45,8 @@ mod tests {
     #[test]
     fn order_length_and_every_bit_count() {
         let of = |parts: &[&[u8]]| {
-            let mut history = History::new();
-            parts.iter().for_each(|part| history.bytes(part));
+            let mut history = HistoryHash::new();
+            parts.iter().for_each(|part| history.add_bytes(part));
             history.value()
         };
         let all = [of(&[b"ab"]), of(&[b"ba"]), of(&[b"a", b"b"]), of(&[b"ab\0"]), of(&[]), of(&[b""])];

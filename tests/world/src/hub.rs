@@ -9,38 +9,38 @@ use scanhub_schema::{Background, Failure, Kind, MICROS, MILLIS, Nanos};
 
 use crate::event::Event;
 use crate::setup::Setup;
-use crate::shared::Shared;
+use crate::shared::SharedState;
 use crate::sim_platform::SimPlatform;
-use crate::world::{Ending, World};
+use crate::world::{HubEnding, World};
 
 /// A hub begins, lives and ends; `world` knows then when the next one begins.
-pub(crate) fn live(world: &mut World) {
+pub(crate) fn run_hub(world: &mut World) {
     let shared = world.shared.clone();
-    let (life, now) = (world.life, world.now());
-    world.life += 1;
-    let boot = (world.seed + 1).wrapping_mul(0x9E37_79B9_7F4A_7C15).wrapping_add(life);
-    shared.tell(&Event::HubBegins { life, boot });
-    let ending = match begin(world, &shared, boot) {
+    let (run, now) = (world.run, world.now());
+    world.run += 1;
+    let boot = (world.seed + 1).wrapping_mul(0x9E37_79B9_7F4A_7C15).wrapping_add(run);
+    shared.log_event(&Event::HubStarted { run, boot });
+    let ending = match start(world, &shared, boot) {
         Ok(ending) => ending,
         // A service manager tries it again.
         Err(failure) => {
-            shared.tell(&Event::Acted { text: &format!("hub {life} did not start: {failure}") });
-            Ending { is_killed: true, back_at: now + AGAIN }
+            shared.log_event(&Event::ActionTaken { text: &format!("hub {run} did not start: {failure}") });
+            HubEnding { is_killed: true, restart_at: now + RESTART_INTERVAL }
         }
     };
     world.commands = None;
-    world.begins_at = ending.back_at;
-    shared.board.borrow_mut().end();
-    shared.tell(&Event::HubEnds { life, killed: ending.is_killed });
+    world.hub_starts_at = ending.restart_at;
+    shared.topics.borrow_mut().end();
+    shared.log_event(&Event::HubEnded { run, killed: ending.is_killed });
 }
 
-fn begin(world: &mut World, shared: &Rc<Shared>, boot: u64) -> Result<Ending, Failure> {
+fn start(world: &mut World, shared: &Rc<SharedState>, boot: u64) -> Result<HubEnding, Failure> {
     let (setup, edition) = (world.setup.clone(), world.edition.clone());
     // What was refused is not there when the next hub begins.
     let read = || setup.config(edition.get());
     let config = read().or_else(|_| setup.config(0))?;
-    let wall_ns = |now: Nanos| now + shared.wall_ahead.get();
-    let (config, mut saver) = StateSaver::load(config, Disk(shared.clone()), wall_ns(world.now()))?;
+    let wall_ns = |now: Nanos| now + shared.wall_offset.get();
+    let (config, mut saver) = StateSaver::load(config, StateFiles(shared.clone()), wall_ns(world.now()))?;
     let queue = saver.as_ref().map(StateSaver::queue);
     let names = || (0..setup.sensors.len()).map(Setup::name).collect::<Vec<_>>();
     let (commands, queues) = CommandSender::new(names().iter().map(String::as_str))?;
@@ -54,41 +54,42 @@ fn begin(world: &mut World, shared: &Rc<Shared>, boot: u64) -> Result<Ending, Fa
         config.links.iter().enumerate().zip(platforms.iter().zip(queues))
     {
         let live = LiveLink::new(link, number as u8, boot, platform, queue)?;
-        links.push(Running::new(live, platform));
+        links.push(RunningLink::new(live, platform));
     }
     let mut writes_at = world.now();
-    world.greet();
+    world.poll_all_subscribers();
     // Its process is another one than that which stood still.
     world.stalled_until = 0;
     let ending = loop {
-        world.ring();
+        world.deliver_wakeups();
         let links_at = links.iter().map(|link| link.next_ns().max(world.stalled_until));
         let next = links_at.chain([world.next_ns(), writes_at]).min().unwrap_or(writes_at);
-        world.pass(next);
-        if let Some(ending) = world.wants.end.take() {
+        world.run_due(next);
+        if let Some(ending) = world.hub_requests.ending.take() {
             break ending;
         }
         if world.is_over() {
-            break Ending { is_killed: false, back_at: Nanos::MAX };
+            break HubEnding { is_killed: false, restart_at: Nanos::MAX };
         }
         let now = world.now();
-        if std::mem::take(&mut world.wants.reload)
+        if std::mem::take(&mut world.hub_requests.reload)
             && let Some(commands) = &world.commands
         {
             reload.reload(commands, now);
-            links.iter_mut().for_each(|link| link.is_wanted = true);
+            links.iter_mut().for_each(|link| link.is_requested = true);
         }
-        for (sensor, verb) in std::mem::take(&mut world.wants.asks) {
+        for (sensor, verb) in std::mem::take(&mut world.hub_requests.sensor_requests) {
             let model = Box::<Background>::default();
-            let asked = world.commands.as_mut().map(|commands| commands.ask(&names[sensor], verb, model));
-            match asked {
-                Some(Ok(_)) => links[sensor].is_wanted = true,
+            let result =
+                world.commands.as_mut().map(|commands| commands.enqueue(&names[sensor], verb, model));
+            match result {
+                Some(Ok(_)) => links[sensor].is_requested = true,
                 // Too many wait: whoever asks tries again.
-                _ => world.wants.asks.push((sensor, verb)),
+                _ => world.hub_requests.sensor_requests.push((sensor, verb)),
             }
         }
         for link in &mut links {
-            link.look(now);
+            link.poll(now);
             if link.next_ns().max(world.stalled_until) <= now {
                 link.run(now);
             }
@@ -96,17 +97,17 @@ fn begin(world: &mut World, shared: &Rc<Shared>, boot: u64) -> Result<Ending, Fa
         while world.commands.as_ref().and_then(CommandSender::outcome).is_some() {}
         if now >= writes_at {
             let due = saver.as_mut().map(|saver| saver.flush_due(now, wall_ns(now), false));
-            writes_at = due.unwrap_or(Nanos::MAX).clamp(now + WRITES, now + 10 * WRITES);
+            writes_at = due.unwrap_or(Nanos::MAX).clamp(now + WRITE_DELAY, now + 10 * WRITE_DELAY);
         }
     };
     if !ending.is_killed {
         let now = world.now();
-        for Running { link, platform, .. } in links {
-            platform.clock.pass(now);
+        for RunningLink { link, platform, .. } in links {
+            platform.clock.advance_to(now);
             link.end();
         }
         // What they say last wakes whoever sleeps.
-        world.ring();
+        world.deliver_wakeups();
         if let Some(saver) = &mut saver {
             saver.flush_due(world.now(), wall_ns(world.now()), true);
         }
@@ -115,78 +116,78 @@ fn begin(world: &mut World, shared: &Rc<Shared>, boot: u64) -> Result<Ending, Fa
 }
 
 /// A link and what its thread would wait for.
-struct Running<'a> {
+struct RunningLink<'a> {
     link: LiveLink<'a, SimPlatform<'a>>,
     platform: &'a SimPlatform<'a>,
     /// The device that it watches, and whether for bytes or only for its loss.
     watched: Option<(u64, bool)>,
-    until: Nanos,
+    due_at: Nanos,
     /// What it watches is ready, and its thread runs then.
     ready_at: Option<Nanos>,
     /// A user wants something.
-    is_wanted: bool,
+    is_requested: bool,
 }
 
-impl<'a> Running<'a> {
-    fn new(link: LiveLink<'a, SimPlatform<'a>>, platform: &'a SimPlatform<'a>) -> Running<'a> {
-        Running { link, platform, watched: None, until: 0, ready_at: None, is_wanted: false }
+impl<'a> RunningLink<'a> {
+    fn new(link: LiveLink<'a, SimPlatform<'a>>, platform: &'a SimPlatform<'a>) -> RunningLink<'a> {
+        RunningLink { link, platform, watched: None, due_at: 0, ready_at: None, is_requested: false }
     }
 
     /// When it has something to do, or when its sensor has something that it may have to.
     fn next_ns(&self) -> Nanos {
         let SimPlatform { shared, number, clock, .. } = self.platform;
-        let due = match (self.is_wanted, self.ready_at, self.watched) {
+        let due = match (self.is_requested, self.ready_at, self.watched) {
             (true, ..) => 0,
             (_, Some(ready_at), _) => ready_at,
             (.., Some((_, true))) => {
                 let sensor = shared.ports[*number].borrow().sensor.next_ns();
-                self.until.saturating_add(LATE).min(sensor.unwrap_or(Nanos::MAX))
+                self.due_at.saturating_add(TIMER_DELAY).min(sensor.unwrap_or(Nanos::MAX))
             }
-            _ => self.until.saturating_add(LATE),
+            _ => self.due_at.saturating_add(TIMER_DELAY),
         };
-        due.max(clock.read())
+        due.max(clock.peek())
     }
 
     /// Looks whether what it watches is ready.
-    fn look(&mut self, now: Nanos) {
+    fn poll(&mut self, now: Nanos) {
         let Some((device, wants_bytes)) = self.watched.filter(|_| self.ready_at.is_none()) else { return };
         let SimPlatform { shared, number, .. } = self.platform;
         let mut tty = shared.ports[*number].borrow_mut();
         if wants_bytes {
             tty.advance(now, &shared.log);
         }
-        if !tty.is_there(device) || (wants_bytes && tty.waiting() > 0) {
-            self.ready_at = Some(now + WAKES);
+        if !tty.is_plugged_in(device) || (wants_bytes && tty.waiting() > 0) {
+            self.ready_at = Some(now + WAKE_DELAY);
         }
     }
 
     /// Its thread runs at `now`, if there is a reason.
     fn run(&mut self, now: Nanos) {
-        let woken = if std::mem::take(&mut self.is_wanted) {
+        let woken = if std::mem::take(&mut self.is_requested) {
             WakeReason::Request
         } else if self.ready_at.is_some() {
             WakeReason::Ready
-        } else if now >= self.until {
+        } else if now >= self.due_at {
             WakeReason::Timeout
         } else {
             return;
         };
         self.ready_at = None;
-        self.platform.clock.pass(now);
-        let Wait { on, until, .. } = self.link.on_wakeup(woken);
+        self.platform.clock.advance_to(now);
+        let Wait { source: on, until, .. } = self.link.on_wakeup(woken);
         self.watched = match on {
             WaitSource::Nothing | WaitSource::Opening => None,
             WaitSource::Bytes(line) => Some((line.handle.device, true)),
             WaitSource::Loss(line) => Some((line.handle.device, false)),
         };
-        self.until = until;
+        self.due_at = until;
     }
 }
 
 /// The files of the domain's state.
-struct Disk(Rc<Shared>);
+struct StateFiles(Rc<SharedState>);
 
-impl StateStore for Disk {
+impl StateStore for StateFiles {
     fn read(&self, name: &str, _: u64) -> Result<Option<String>, Failure> {
         Ok(self.0.files.borrow().get(name).cloned())
     }
@@ -210,10 +211,10 @@ impl StateStore for Disk {
 }
 
 /// From a port that is ready to a thread that runs.
-const WAKES: Nanos = 50 * MICROS;
+const WAKE_DELAY: Nanos = 50 * MICROS;
 /// A timer is late by so much.
-const LATE: Nanos = 50 * MICROS;
+const TIMER_DELAY: Nanos = 50 * MICROS;
 /// What was learned is written within so long.
-const WRITES: Nanos = 100 * MILLIS;
+const WRITE_DELAY: Nanos = 100 * MILLIS;
 /// A service manager starts a hub again that did not start.
-const AGAIN: Nanos = 1_000 * MILLIS;
+const RESTART_INTERVAL: Nanos = 1_000 * MILLIS;

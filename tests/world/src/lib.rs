@@ -3,31 +3,31 @@
 //! and their times, and judges check every event. A failure is a seed that can be repeated, and shrinks to the few actions that
 //! matter.
 //!
-//! [`Plan`] is the course of a world as data, [`run`] runs it, and [`Outcome`] is the result of the judges.
+//! [`Scenario`] is the course of a world as data, [`run`] runs it, and [`Outcome`] is the result of the judges.
 
 mod actions;
-mod consumer;
 mod event;
 mod family;
 mod hash;
 mod hub;
-mod judges;
+mod injected_defects;
+mod invariants;
 mod line;
 mod network;
-mod plan;
-mod planted;
 mod remote;
 mod runner;
+mod scenario;
 mod sensor;
 mod setup;
 mod shared;
 mod sim_platform;
+mod subscriber;
 mod topics;
 mod tty;
 mod world;
 
-pub use event::{Detail, Figures, Violation};
-pub use plan::{Action, Plan, corpus, shrink};
-pub use planted::Defect;
+pub use event::{Detail, RevolutionFigures, Violation};
+pub use injected_defects::Defect;
 pub use runner::{Runner, Totals};
+pub use scenario::{Action, Scenario, corpus, shrink};
 pub use world::{Outcome, is_found, run};

@@ -5,13 +5,13 @@ use std::io;
 use std::path::Path;
 use std::rc::Rc;
 
-use scanhub_daemon::platform::Line;
-use scanhub_port::{Allowance, Alteration};
+use scanhub_daemon::platform::PortIo;
+use scanhub_port::{ReadBudget, SettingsChange};
 use scanhub_schema::Nanos;
 
 use crate::event::Event;
-use crate::planted::{Defect, eeprom_request};
-use crate::shared::Shared;
+use crate::injected_defects::{Defect, eeprom_request};
+use crate::shared::SharedState;
 
 /// The time of one link: its thread may be ahead of the others' while it writes a request byte by byte.
 #[derive(Default)]
@@ -20,34 +20,34 @@ pub(crate) struct LinkClock(Cell<Nanos>);
 impl LinkClock {
     /// Each look at the clock takes a moment.
     pub(crate) fn now(&self) -> Nanos {
-        self.0.set(self.0.get() + LOOK);
+        self.0.set(self.0.get() + CLOCK_READ_TIME);
         self.0.get()
     }
 
     /// The time, without a look.
-    pub(crate) fn read(&self) -> Nanos {
+    pub(crate) fn peek(&self) -> Nanos {
         self.0.get()
     }
 
     /// It is at least `time`.
-    pub(crate) fn pass(&self, time: Nanos) {
+    pub(crate) fn advance_to(&self, time: Nanos) {
         self.0.set(self.0.get().max(time));
     }
 }
 
 /// What it takes to look at a clock.
-const LOOK: Nanos = 40;
+const CLOCK_READ_TIME: Nanos = 40;
 
 /// An open descriptor of a port; the port is closed with the last one.
 pub(crate) struct Handle {
-    pub(crate) shared: Rc<Shared>,
+    pub(crate) shared: Rc<SharedState>,
     pub(crate) port: usize,
     pub(crate) device: u64,
 }
 
 impl Drop for Handle {
     fn drop(&mut self) {
-        let Shared { handles, ports, log, clock, .. } = &*self.shared;
+        let SharedState { handles, ports, log, clock, .. } = &*self.shared;
         handles.set(handles.get() - 1);
         ports[self.port].borrow_mut().close(self.device, log, clock.get());
     }
@@ -61,50 +61,50 @@ pub(crate) struct OpenLine {
 
 impl OpenLine {
     /// Whether it is there; an error if it is not, as the kernel tells it.
-    fn check(&self, is_there: bool) -> io::Result<bool> {
-        let is_told = !self.handle.shared.planted.is(Defect::SwallowedHangUp);
-        if is_there || !is_told {
-            Ok(is_there)
+    fn check(&self, is_connected: bool) -> io::Result<bool> {
+        let is_told = !self.handle.shared.defect.is_active(Defect::SwallowedHangUp);
+        if is_connected || !is_told {
+            Ok(is_connected)
         } else {
             Err(io::Error::new(io::ErrorKind::UnexpectedEof, "the line hung up"))
         }
     }
 }
 
-impl Line for OpenLine {
+impl PortIo for OpenLine {
     fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
         let Handle { shared, port, device } = &*self.handle;
         let (mut tty, now) = (shared.ports[*port].borrow_mut(), self.clock.now());
         tty.advance(now, &shared.log);
-        let planted = &shared.planted;
-        if !self.check(tty.is_there(*device))? {
+        let defect = &shared.defect;
+        if !self.check(tty.is_plugged_in(*device))? {
             return Ok(0);
         }
         let len = tty.read(buffer, &shared.log, now);
-        if len > 0 && planted.strikes(Defect::FlippedBit, 100) {
+        if len > 0 && defect.triggers(Defect::FlippedBit, 100) {
             buffer[len / 2] ^= 4;
         }
-        if planted.strikes(Defect::EepromWrite, 500) {
+        if defect.triggers(Defect::EepromWrite, 500) {
             eeprom_request().into_iter().for_each(|byte| tty.write(byte, now));
         }
-        if planted.strikes(Defect::NeedlessByte, 100) {
+        if defect.triggers(Defect::NeedlessByte, 100) {
             tty.write(0, now);
-            shared.log.tell(now, &Event::Written { sensor: *port });
+            shared.log.record(now, &Event::Written { sensor: *port });
         }
-        Ok(if len > 1 && planted.strikes(Defect::LostByte, 100) { len - 1 } else { len })
+        Ok(if len > 1 && defect.triggers(Defect::LostByte, 100) { len - 1 } else { len })
     }
 
     fn write(&self, bytes: &[u8]) -> io::Result<()> {
         let Handle { shared, port, device } = &*self.handle;
         let (mut tty, now) = (shared.ports[*port].borrow_mut(), self.clock.now());
         tty.advance(now, &shared.log);
-        let is_deaf = shared.planted.is(Defect::DeafScanner) && tty.sensor.streams();
+        let is_deaf = shared.defect.is_active(Defect::IgnoredRequests) && tty.sensor.is_streaming();
         // Half a request is none.
-        let cuts = shared.planted.is(Defect::UnturnedHead);
+        let cuts = shared.defect.is_active(Defect::UnstartedMotor);
         let is_cut = |byte: &&u8| cuts && matches!(byte, 0xF0 | 0xA8);
-        if self.check(tty.is_there(*device))? && !is_deaf {
+        if self.check(tty.is_plugged_in(*device))? && !is_deaf {
             bytes.iter().filter(|byte| !is_cut(byte)).for_each(|byte| tty.write(*byte, now));
-            shared.log.tell(now, &Event::Written { sensor: *port });
+            shared.log.record(now, &Event::Written { sensor: *port });
         }
         Ok(())
     }
@@ -113,21 +113,21 @@ impl Line for OpenLine {
         let Handle { shared, port, device } = &*self.handle;
         let (mut tty, now) = (shared.ports[*port].borrow_mut(), self.clock.now());
         tty.advance(now, &shared.log);
-        if !self.check(tty.is_there(*device))? {
+        if !self.check(tty.is_plugged_in(*device))? {
             return Ok(None);
         }
-        if !tty.can_have(baud) {
+        if !tty.supports_rate(baud) {
             return Ok(Some(io::Error::other(format!("{baud} Bd is not possible here"))));
         }
         tty.set_rate(baud, &shared.log, now);
         Ok(None)
     }
 
-    fn altered(&self) -> io::Result<Option<Alteration>> {
+    fn alteration(&self) -> io::Result<Option<SettingsChange>> {
         let Handle { shared, port, device } = &*self.handle;
         let tty = shared.ports[*port].borrow();
-        let is_told = self.check(tty.is_there(*device))? && !shared.planted.is(Defect::HiddenRate);
-        Ok(tty.altered().filter(|_| is_told).map(Alteration::Rate))
+        let is_told = self.check(tty.is_plugged_in(*device))? && !shared.defect.is_active(Defect::HiddenRate);
+        Ok(tty.altered_rate().filter(|_| is_told).map(SettingsChange::Rate))
     }
 
     fn restore(&self, baud: u32) -> io::Result<()> {
@@ -138,14 +138,14 @@ impl Line for OpenLine {
         Ok(())
     }
 
-    fn waiting(&self) -> Option<usize> {
+    fn buffered_len(&self) -> Option<usize> {
         let Handle { shared, port, device } = &*self.handle;
         let mut tty = shared.ports[*port].borrow_mut();
         tty.advance(self.clock.now(), &shared.log);
-        tty.is_there(*device).then(|| tty.waiting())
+        tty.is_plugged_in(*device).then(|| tty.waiting())
     }
 
-    fn allowance(&self, _: u32) -> Option<Allowance> {
+    fn read_budget(&self, _: u32) -> Option<ReadBudget> {
         None
     }
 

@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use clap::Parser;
-use scanhub_world::{Detail, Outcome, Plan, Runner, Totals, corpus, run, shrink};
+use scanhub_world::{Detail, Outcome, Runner, Scenario, Totals, corpus, run, shrink};
 
 /// Simulates whole hubs in made-up time, and watches what they promise.
 #[derive(Debug, Parser)]
@@ -61,24 +61,24 @@ fn main() -> ExitCode {
         let _ = signal_hook::flag::register_conditional_shutdown(signal, 130, is_over.clone());
         let _ = signal_hook::flag::register(signal, is_over.clone());
     }
-    let plans = match plans(&arguments) {
-        Ok(plans) => plans,
+    let scenarios = match scenarios(&arguments) {
+        Ok(scenarios) => scenarios,
         Err(error) => {
             eprintln!("{error}");
             return ExitCode::from(2);
         }
     };
-    if let ([plan], true) = (&plans[..], arguments.seed.is_some() || arguments.plan.is_some()) {
-        print!("{plan}");
-        let outcome = run(plan, if arguments.all { Detail::All } else { Detail::News });
+    if let ([scenario], true) = (&scenarios[..], arguments.seed.is_some() || arguments.plan.is_some()) {
+        print!("{scenario}");
+        let outcome = run(scenario, if arguments.all { Detail::All } else { Detail::Rare });
         outcome.violations.iter().for_each(|violation| println!("{violation}"));
         println!("hash {:016x}", outcome.hash);
         return ExitCode::from(u8::from(!outcome.violations.is_empty()));
     }
     let before = descriptors();
-    let begun = Instant::now();
-    let (count, is_terminal) = (plans.len(), std::io::stderr().is_terminal());
-    let runner = Runner { plans, twice: arguments.twice, threads: arguments.threads };
+    let started = Instant::now();
+    let (count, is_terminal) = (scenarios.len(), std::io::stderr().is_terminal());
+    let runner = Runner { scenarios, run_twice: arguments.twice, threads: arguments.threads };
     let totals = runner.run(&is_over, |totals| {
         if is_terminal {
             eprint!("\r{} of {count} worlds, {} failed ", totals.worlds, totals.failed.len());
@@ -88,26 +88,27 @@ fn main() -> ExitCode {
     if is_terminal {
         eprintln!();
     }
-    for (plan, outcome, is_same) in &totals.failed {
-        report(plan, outcome, *is_same, arguments.no_shrink || is_over.load(Ordering::Relaxed));
+    for (scenario, outcome, is_same) in &totals.failed {
+        report(scenario, outcome, *is_same, arguments.no_shrink || is_over.load(Ordering::Relaxed));
     }
     let left = descriptors().saturating_sub(before);
     if left > 0 {
         println!("{left} descriptors were not given back");
     }
-    conclude(&totals, begun.elapsed().as_secs_f64(), arguments.json);
+    print_totals(&totals, started.elapsed().as_secs_f64(), arguments.json);
     let is_well = totals.failed.is_empty() && left == 0 && !is_over.load(Ordering::Relaxed);
     ExitCode::from(u8::from(!is_well))
 }
 
-fn plans(arguments: &Arguments) -> Result<Vec<Plan>, String> {
-    let of_seed = |seed| Plan { is_auto: arguments.auto, ..Plan::of_seed(seed, arguments.virtual_seconds) };
+fn scenarios(arguments: &Arguments) -> Result<Vec<Scenario>, String> {
+    let of_seed =
+        |seed| Scenario { is_auto: arguments.auto, ..Scenario::from_seed(seed, arguments.virtual_seconds) };
     if let Some(path) = &arguments.plan {
         let text = std::fs::read_to_string(path).map_err(|error| format!("{}: {error}", path.display()))?;
         return Ok(vec![text.parse()?]);
     }
     if arguments.corpus {
-        return Ok(corpus().into_iter().map(|(_, plan)| plan).collect());
+        return Ok(corpus().into_iter().map(|(_, scenario)| scenario).collect());
     }
     Ok(match arguments.seed {
         Some(seed) => vec![of_seed(seed)],
@@ -116,18 +117,20 @@ fn plans(arguments: &Arguments) -> Result<Vec<Plan>, String> {
 }
 
 /// Says what failed, and the shortest plan that still does.
-fn report(plan: &Plan, outcome: &Outcome, is_same: bool, is_long: bool) {
-    println!("SEED={}{} COMMIT={}", plan.seed, if plan.is_auto { " --auto" } else { "" }, commit());
+fn report(scenario: &Scenario, outcome: &Outcome, is_same: bool, is_long: bool) {
+    println!("SEED={}{} COMMIT={}", scenario.seed, if scenario.is_auto { " --auto" } else { "" }, commit());
     if !is_same {
         println!("the second run was another one than the first");
     }
     outcome.violations.iter().take(5).for_each(|violation| println!("  {violation}"));
-    let judge = |plan: &Plan| run(plan, Detail::Nothing).violations.first().map(|violation| violation.judge);
-    let shortest = if is_long { plan.clone() } else { shrink(plan, judge) };
+    let first_violation = |scenario: &Scenario| {
+        run(scenario, Detail::Nothing).violations.first().map(|violation| violation.invariant)
+    };
+    let shortest = if is_long { scenario.clone() } else { shrink(scenario, first_violation) };
     println!("{shortest}");
 }
 
-fn conclude(totals: &Totals, took_s: f64, is_json: bool) {
+fn print_totals(totals: &Totals, took_s: f64, is_json: bool) {
     let Totals { worlds, sensor_seconds, samples, busy, failed } = totals;
     let per_core = *sensor_seconds as f64 / busy.as_secs_f64().max(1e-9);
     if is_json {
@@ -155,7 +158,7 @@ fn descriptors() -> usize {
 }
 
 fn commit() -> String {
-    let asked = Command::new("git").args(["rev-parse", "--short", "HEAD"]).output();
-    let text = asked.ok().filter(|output| output.status.success()).map(|output| output.stdout);
+    let git_output = Command::new("git").args(["rev-parse", "--short", "HEAD"]).output();
+    let text = git_output.ok().filter(|output| output.status.success()).map(|output| output.stdout);
     String::from_utf8_lossy(&text.unwrap_or_default()).trim().to_owned()
 }

@@ -30,40 +30,40 @@ pub(crate) struct Network {
     rng: Rng,
     faults: Faults,
     /// By the time at which they come, and by a number.
-    waiting: BTreeMap<(Nanos, u64), Vec<u8>>,
+    queue: BTreeMap<(Nanos, u64), Vec<u8>>,
     number: u64,
     /// When it is cut the next time, or was, and until when.
-    cut: (Nanos, Nanos),
+    partition: (Nanos, Nanos),
 }
 
 /// Between two partitions, at most.
-const BETWEEN_NS: Nanos = 6_000_000_000;
+const MAX_PARTITION_INTERVAL_NS: Nanos = 6_000_000_000;
 
 impl Network {
     pub(crate) fn new(seed: u64, faults: Faults) -> Network {
         let mut network = Network {
             rng: Rng::with_seed(seed),
             faults,
-            waiting: BTreeMap::new(),
+            queue: BTreeMap::new(),
             number: 0,
-            cut: (Nanos::MAX, Nanos::MAX),
+            partition: (Nanos::MAX, Nanos::MAX),
         };
-        network.cut = network.cut_after(0);
+        network.partition = network.next_partition(0);
         network
     }
 
     /// From now on the faults are these.
     pub(crate) fn set_faults(&mut self, faults: Faults, now: Nanos) {
         self.faults = faults;
-        self.cut = self.cut_after(now);
+        self.partition = self.next_partition(now);
     }
 
     /// Takes a datagram at `now`.
     pub(crate) fn send(&mut self, now: Nanos, bytes: &[u8]) {
-        while now >= self.cut.1 {
-            self.cut = self.cut_after(self.cut.1);
+        while now >= self.partition.1 {
+            self.partition = self.next_partition(self.partition.1);
         }
-        if now >= self.cut.0 || self.rng.f64() < self.faults.loss {
+        if now >= self.partition.0 || self.rng.f64() < self.faults.loss {
             return;
         }
         let copies = if self.rng.f64() < self.faults.duplicate { 2 } else { 1 };
@@ -74,18 +74,18 @@ impl Network {
             }
             let way_ns = self.faults.delay_ns + self.rng.u64(0..=self.faults.jitter_ns);
             self.number += 1;
-            self.waiting.insert((now + way_ns, self.number), bytes);
+            self.queue.insert((now + way_ns, self.number), bytes);
         }
     }
 
     /// Returns a datagram that came until `now`, the earliest one.
     pub(crate) fn poll(&mut self, now: Nanos) -> Option<Vec<u8>> {
-        self.waiting.first_entry().filter(|first| first.key().0 <= now).map(|first| first.remove())
+        self.queue.first_entry().filter(|first| first.key().0 <= now).map(|first| first.remove())
     }
 
     /// Returns when the next datagram comes.
-    pub(crate) fn next(&self) -> Option<Nanos> {
-        self.waiting.first_key_value().map(|((at, _), _)| *at)
+    pub(crate) fn next_delivery(&self) -> Option<Nanos> {
+        self.queue.first_key_value().map(|((at, _), _)| *at)
     }
 
     fn damage(&mut self, bytes: &mut [u8]) {
@@ -100,11 +100,11 @@ impl Network {
         }
     }
 
-    fn cut_after(&mut self, now: Nanos) -> (Nanos, Nanos) {
+    fn next_partition(&mut self, now: Nanos) -> (Nanos, Nanos) {
         if self.faults.partition_ns == 0 {
             return (Nanos::MAX, Nanos::MAX);
         }
-        let begin = now + self.rng.u64(1..=BETWEEN_NS);
+        let begin = now + self.rng.u64(1..=MAX_PARTITION_INTERVAL_NS);
         (begin, begin + self.rng.u64(1..=self.faults.partition_ns))
     }
 }

@@ -8,16 +8,16 @@ use std::time::Duration;
 use rustix::time::{ClockId, clock_gettime};
 
 use crate::event::Detail;
-use crate::plan::Plan;
+use crate::scenario::Scenario;
 use crate::world::{Outcome, run};
 
 /// What is to be run.
 #[derive(Clone, Debug)]
 pub struct Runner {
     /// The plans.
-    pub plans: Vec<Plan>,
+    pub scenarios: Vec<Scenario>,
     /// So many of the first are run twice, and must have the same hash.
-    pub twice: usize,
+    pub run_twice: usize,
     /// Worlds at a time.
     pub threads: usize,
 }
@@ -34,7 +34,7 @@ pub struct Totals {
     /// Time that threads had a core.
     pub busy: Duration,
     /// Plans that ended in violations, or differently the second time.
-    pub failed: Vec<(Plan, Outcome, bool)>,
+    pub failed: Vec<(Scenario, Outcome, bool)>,
 }
 
 impl Runner {
@@ -43,41 +43,43 @@ impl Runner {
         let next = AtomicU64::new(0);
         let mut totals = Totals::default();
         thread::scope(|scope| {
-            let (told, heard) = mpsc::channel();
+            let (sender, receiver) = mpsc::channel();
             for _ in 0..self.threads {
-                let (told, next) = (told.clone(), &next);
+                let (sender, next) = (sender.clone(), &next);
                 scope.spawn(move || {
                     while !is_over.load(Ordering::Relaxed) {
                         let at = next.fetch_add(1, Ordering::Relaxed) as usize;
-                        let Some(plan) = self.plans.get(at) else { return };
-                        let begun = on_core();
-                        let outcome = run(plan, Detail::Nothing);
-                        let is_same = at >= self.twice || run(plan, Detail::Nothing).hash == outcome.hash;
+                        let Some(scenario) = self.scenarios.get(at) else { return };
+                        let started = thread_cpu_time();
+                        let outcome = run(scenario, Detail::Nothing);
+                        let is_same =
+                            at >= self.run_twice || run(scenario, Detail::Nothing).hash == outcome.hash;
                         // Nobody hears it who has ended.
-                        let _ = told.send((at, outcome, is_same, on_core().saturating_sub(begun)));
+                        let _ =
+                            sender.send((at, outcome, is_same, thread_cpu_time().saturating_sub(started)));
                     }
                 });
             }
-            drop(told);
-            for (at, outcome, is_same, took) in heard {
-                let runs = if at < self.twice { 2 } else { 1 };
+            drop(sender);
+            for (at, outcome, is_same, elapsed) in receiver {
+                let runs = if at < self.run_twice { 2 } else { 1 };
                 totals.worlds += 1;
                 totals.sensor_seconds += runs * outcome.sensor_seconds;
                 totals.samples += runs * outcome.samples;
-                totals.busy += took;
+                totals.busy += elapsed;
                 if !is_same || !outcome.violations.is_empty() {
-                    totals.failed.push((self.plans[at].clone(), outcome, is_same));
+                    totals.failed.push((self.scenarios[at].clone(), outcome, is_same));
                 }
                 progress(&totals);
             }
         });
-        totals.failed.sort_by_key(|(plan, ..)| plan.seed);
+        totals.failed.sort_by_key(|(scenario, ..)| scenario.seed);
         totals
     }
 }
 
 /// How long this thread has had a core: others may want it, too.
-fn on_core() -> Duration {
+fn thread_cpu_time() -> Duration {
     let time = clock_gettime(ClockId::ThreadCPUTime);
     Duration::new(time.tv_sec.unsigned_abs(), time.tv_nsec as u32)
 }

@@ -7,15 +7,15 @@ use scanhub_schema::{MICROS, Nanos, line_time};
 use scanhub_sim::Arrival;
 use scanhub_sim::fault::Faults;
 use scanhub_sim::ld::TruePoint;
-use scanhub_sim::wire::{Delivery, LineModel};
+use scanhub_sim::line_model::{Delivery, LineModel};
 
-use crate::family::{Ailment, Scanner};
-use crate::plan::Action;
+use crate::family::{Scanner, ScannerFault};
+use crate::scenario::Action;
 
 /// A sensor at the end of its line.
 pub(crate) struct Sensor {
     scanner: Box<dyn Scanner>,
-    wire: LineModel,
+    line: LineModel,
     /// Bytes of the host on their way: when they are through, and their rate.
     outgoing: VecDeque<(Nanos, u8, u32)>,
     now: Nanos,
@@ -24,7 +24,7 @@ pub(crate) struct Sensor {
 }
 
 /// What happens at a sensor and its line.
-pub(crate) enum Happening {
+pub(crate) enum SensorEvent {
     /// Bytes come out of the line.
     Arrived(Delivery),
     /// The scanner measured these points.
@@ -36,7 +36,7 @@ impl Sensor {
     pub(crate) fn new(scanner: Box<dyn Scanner>) -> Sensor {
         Sensor {
             scanner,
-            wire: LineModel::new(&Faults::default(), 0),
+            line: LineModel::new(&Faults::default(), 0),
             outgoing: VecDeque::new(),
             now: 0,
             eeprom_writes: 0,
@@ -45,29 +45,29 @@ impl Sensor {
 
     /// When something may come next.
     pub(crate) fn next_ns(&self) -> Option<Nanos> {
-        let heard = self.outgoing.front().map(|(at, ..)| *at);
-        self.wire.poll_timeout(self.scanner.device(), self.now).into_iter().chain(heard).min()
+        let received_at = self.outgoing.front().map(|(at, ..)| *at);
+        self.line.poll_timeout(self.scanner.device(), self.now).into_iter().chain(received_at).min()
     }
 
-    /// Lets the time be `to`, unless it is later already; what arrives or is measured meanwhile goes to `happens`.
-    pub(crate) fn advance(&mut self, to: Nanos, mut happens: impl FnMut(Nanos, Happening)) {
+    /// Lets the time be `to`, unless it is later already; what arrives or is measured meanwhile goes to `draw`.
+    pub(crate) fn advance(&mut self, to: Nanos, mut on_event: impl FnMut(Nanos, SensorEvent)) {
         while let Some(at) = self.next_ns().filter(|&at| at <= to) {
             self.now = self.now.max(at);
             loop {
-                let carried = self.wire.poll_transmit(self.scanner.device_mut(), self.now);
+                let carried = self.line.poll_transmit(self.scanner.device_mut(), self.now);
                 let points = self.scanner.measured();
                 if !points.is_empty() {
-                    happens(self.now, Happening::Measured(points));
+                    on_event(self.now, SensorEvent::Measured(points));
                 }
                 let Some(carried) = carried else { break };
-                happens(self.now, Happening::Arrived(carried));
+                on_event(self.now, SensorEvent::Arrived(carried));
             }
             while self.outgoing.front().is_some_and(|(at, ..)| *at <= self.now)
                 && let Some((at, byte, rate)) = self.outgoing.pop_front()
             {
                 // At another rate it hears something else, which is no request.
                 if self.scanner.device().rate() == rate {
-                    self.wire.receive(self.scanner.device_mut(), byte, Arrival::at(at));
+                    self.line.receive(self.scanner.device_mut(), byte, Arrival::at(at));
                 }
             }
         }
@@ -81,13 +81,13 @@ impl Sensor {
     }
 
     /// The cable is pulled out: what is on its way does not arrive.
-    pub(crate) fn cut(&mut self) {
+    pub(crate) fn drop_outgoing(&mut self) {
         self.outgoing.clear();
     }
 
     /// Its head turns at this share of its usual speed.
-    pub(crate) fn set_pace(&mut self, share: f64) {
-        self.scanner.set_pace(share);
+    pub(crate) fn set_speed(&mut self, share: f64) {
+        self.scanner.set_speed(share);
     }
 
     /// Its power goes off and on.
@@ -103,17 +103,17 @@ impl Sensor {
     /// Another one is there instead, as `action` says.
     pub(crate) fn exchange(&mut self, action: &Action) {
         self.eeprom_writes += self.scanner.device().eeprom_writes();
-        let said = self.scanner.exchange(action, self.now);
+        let sent = self.scanner.exchange(action, self.now);
         let (rate, mut at) = (self.scanner.device().rate(), self.now);
-        for byte in said {
-            at += line_time(1, rate) + PAUSE;
+        for byte in sent {
+            at += line_time(1, rate) + BYTE_INTERVAL;
             self.outgoing.push_back((at, byte, rate));
         }
     }
 
     /// The line has these faults from now on.
     pub(crate) fn set_faults(&mut self, faults: &Faults, seed: u64) {
-        self.wire.set_faults(faults, seed);
+        self.line.set_faults(faults, seed);
     }
 
     /// It behaves badly as `action` says, or well again.
@@ -122,12 +122,12 @@ impl Sensor {
     }
 
     /// Something happens to it.
-    pub(crate) fn suffer(&mut self, ailment: Ailment) {
-        self.scanner.suffer(ailment, self.now);
+    pub(crate) fn inject_fault(&mut self, fault: ScannerFault) {
+        self.scanner.inject_fault(fault, self.now);
     }
 
     /// Whether it sends unasked.
-    pub(crate) fn streams(&self) -> bool {
+    pub(crate) fn is_streaming(&self) -> bool {
         self.scanner.device().streams()
     }
 
@@ -138,4 +138,4 @@ impl Sensor {
 }
 
 /// Who makes a sensor stream pauses so long after each byte.
-const PAUSE: Nanos = 60 * MICROS;
+const BYTE_INTERVAL: Nanos = 60 * MICROS;

@@ -7,25 +7,25 @@ use std::rc::Rc;
 
 use scanhub_schema::{Nanos, Topic};
 
-use crate::consumer::{Bell, Consumer, Habit, Number};
-use crate::event::{Detail, Event, Figures, Violation};
-use crate::hash::History;
-use crate::judges::{Judge, Say};
+use crate::event::{Detail, Event, RevolutionFigures, Violation};
+use crate::hash::HistoryHash;
+use crate::injected_defects::InjectedDefect;
+use crate::invariants::{Invariant, ViolationReporter};
 use crate::line::Handle;
-use crate::planted::Planted;
-use crate::topics::Board;
+use crate::subscriber::{Behavior, Subscriber, SubscriberId, WakeSource};
+use crate::topics::TopicBoard;
 use crate::tty::Tty;
 
 /// The parts of a world that a hub can reach.
-pub(crate) struct Shared {
+pub(crate) struct SharedState {
     /// Nanoseconds since the machine was started.
     pub(crate) clock: Cell<Nanos>,
     /// From the clock to 1970.
-    pub(crate) wall_ahead: Cell<u64>,
+    pub(crate) wall_offset: Cell<u64>,
     pub(crate) ports: Vec<RefCell<Tty>>,
-    pub(crate) board: RefCell<Board>,
-    pub(crate) log: Log,
-    pub(crate) planted: Planted,
+    pub(crate) topics: RefCell<TopicBoard>,
+    pub(crate) log: EventLog,
+    pub(crate) defect: InjectedDefect,
     /// The directory in which what was learned is kept, and whether its disk is full.
     pub(crate) files: RefCell<BTreeMap<String, String>>,
     pub(crate) disk_is_full: Cell<bool>,
@@ -33,49 +33,49 @@ pub(crate) struct Shared {
     pub(crate) records: RefCell<BTreeMap<String, Vec<u8>>>,
     /// A service manager keeps ports of a killed hub.
     pub(crate) keeps_ports: bool,
-    pub(crate) kept: RefCell<BTreeMap<String, Rc<Handle>>>,
+    pub(crate) stored_lines: RefCell<BTreeMap<String, Rc<Handle>>>,
     /// Lines that are open, kept ones too.
     pub(crate) handles: Cell<usize>,
     /// Nobody can open anything.
     pub(crate) lacks_descriptors: Cell<bool>,
     /// Sensors whose subscribers were woken, the bell, and the time.
-    pub(crate) woken: RefCell<Vec<(usize, Bell, Nanos)>>,
+    pub(crate) wakeups: RefCell<Vec<(usize, WakeSource, Nanos)>>,
     /// Number of the next subscriber.
-    pub(crate) next_consumer: Cell<u32>,
+    pub(crate) next_subscriber: Cell<u32>,
     /// Changes of subscribers that happen while a hub sends the samples of a scan.
-    pub(crate) changes: RefCell<Vec<Change>>,
+    pub(crate) changes: RefCell<Vec<SubscriberChange>>,
     /// Subscribers that such a change has attached, with the milliseconds for which they stay, and those that have left.
-    pub(crate) newcomers: RefCell<Vec<(Consumer, u64)>>,
-    pub(crate) leavers: RefCell<Vec<Number>>,
+    pub(crate) attached: RefCell<Vec<(Subscriber, u64)>>,
+    pub(crate) detached: RefCell<Vec<SubscriberId>>,
 }
 
 /// A change of the subscribers of a sensor after it has sent some more samples.
-pub(crate) struct Change {
+pub(crate) struct SubscriberChange {
     pub(crate) sensor: usize,
     /// Number of samples that are sent before it happens.
-    pub(crate) sends: u64,
-    pub(crate) what: Who,
+    pub(crate) after_sends: u64,
+    pub(crate) kind: ChangeKind,
 }
 
 /// Subscriber that attaches or leaves.
 #[derive(Clone, Copy)]
-pub(crate) enum Who {
+pub(crate) enum ChangeKind {
     /// A new one attaches, and stays for this number of milliseconds.
-    Comes { topic: Topic, habit: Habit, holds: usize, span_ms: u64 },
+    Attach { topic: Topic, behavior: Behavior, max_held: usize, span_ms: u64 },
     /// This subscriber of a topic leaves.
-    Leaves { topic: Topic, number: Number },
+    Detach { topic: Topic, id: SubscriberId },
 }
 
-impl Shared {
-    pub(crate) fn tell(&self, event: &Event<'_>) {
-        self.log.tell(self.clock.get(), event);
+impl SharedState {
+    pub(crate) fn log_event(&self, event: &Event<'_>) {
+        self.log.record(self.clock.get(), event);
     }
 
     /// Returns the number of a new subscriber.
-    pub(crate) fn consumer_number(&self) -> Number {
-        let number = self.next_consumer.get();
-        self.next_consumer.set(number + 1);
-        Number(number)
+    pub(crate) fn next_subscriber_id(&self) -> SubscriberId {
+        let number = self.next_subscriber.get();
+        self.next_subscriber.set(number + 1);
+        SubscriberId(number)
     }
 
     /// Makes the changes of subscribers that are due after a sample of `sensor` was sent at `now`.
@@ -85,24 +85,24 @@ impl Shared {
             if change.sensor != sensor {
                 return true;
             }
-            if change.sends == 0 {
-                due.push(change.what);
+            if change.after_sends == 0 {
+                due.push(change.kind);
                 return false;
             }
-            change.sends -= 1;
+            change.after_sends -= 1;
             true
         });
-        for who in due {
-            match who {
-                Who::Comes { topic, habit, holds, span_ms } => {
-                    let number = self.consumer_number();
-                    let came = Consumer::attach(self, number, (sensor, topic), habit, holds, now);
-                    self.newcomers.borrow_mut().extend(came.map(|consumer| (consumer, span_ms)));
+        for due_change in due {
+            match due_change {
+                ChangeKind::Attach { topic, behavior, max_held: holds, span_ms } => {
+                    let number = self.next_subscriber_id();
+                    let subscriber = Subscriber::attach(self, number, (sensor, topic), behavior, holds, now);
+                    self.attached.borrow_mut().extend(subscriber.map(|client| (client, span_ms)));
                 }
-                Who::Leaves { topic, number } => {
-                    self.board.borrow_mut().detach(sensor, topic, number, false);
-                    self.log.tell(now, &Event::Left { consumer: number, is_drained: false });
-                    self.leavers.borrow_mut().push(number);
+                ChangeKind::Detach { topic, id: number } => {
+                    self.topics.borrow_mut().detach(sensor, topic, number, false);
+                    self.log.record(now, &Event::Detached { subscriber: number, is_drained: false });
+                    self.detached.borrow_mut().push(number);
                 }
             }
         }
@@ -110,26 +110,31 @@ impl Shared {
 }
 
 /// Everything that happens goes through here: into the hash, and to the judges.
-pub(crate) struct Log {
-    inner: RefCell<Inner>,
+pub(crate) struct EventLog {
+    inner: RefCell<LogState>,
     detail: Detail,
     /// Judges of which one violation is enough.
-    sought: &'static [&'static str],
+    sought_invariants: &'static [&'static str],
     /// Whether one of them has found something.
     is_found: Cell<bool>,
 }
 
-struct Inner {
-    history: History,
-    judges: Vec<Box<dyn Judge>>,
+struct LogState {
+    history: HistoryHash,
+    invariants: Vec<Box<dyn Invariant>>,
     violations: Vec<Violation>,
     published: u64,
 }
 
-impl Log {
-    pub(crate) fn new(judges: Vec<Box<dyn Judge>>, detail: Detail, sought: &'static [&'static str]) -> Log {
-        let inner = Inner { history: History::new(), judges, violations: Vec::new(), published: 0 };
-        Log { inner: RefCell::new(inner), detail, sought, is_found: Cell::new(false) }
+impl EventLog {
+    pub(crate) fn new(
+        invariants: Vec<Box<dyn Invariant>>,
+        detail: Detail,
+        sought_invariants: &'static [&'static str],
+    ) -> EventLog {
+        let inner =
+            LogState { history: HistoryHash::new(), invariants, violations: Vec::new(), published: 0 };
+        EventLog { inner: RefCell::new(inner), detail, sought_invariants, is_found: Cell::new(false) }
     }
 
     /// Returns whether a judge whose violation is sought has found one.
@@ -138,29 +143,29 @@ impl Log {
     }
 
     /// `event` happened at `at`.
-    pub(crate) fn tell(&self, at: Nanos, event: &Event<'_>) {
-        let Inner { history, judges, violations, published } = &mut *self.inner.borrow_mut();
+    pub(crate) fn record(&self, at: Nanos, event: &Event<'_>) {
+        let LogState { history, invariants, violations, published } = &mut *self.inner.borrow_mut();
         if self.detail > Detail::Nothing
-            && let Some(words) = event.words(self.detail)
+            && let Some(words) = event.describe(self.detail)
         {
             eprintln!("{:>12.6} {words}", at as f64 / 1e9);
         }
         event.hash(at, history);
         *published += u64::from(matches!(event, Event::Published { .. }));
-        for judge in judges {
-            let name = judge.name();
-            judge.note(at, event, &mut Say { judge: name, at_ns: at, violations });
+        for invariant in invariants {
+            let name = invariant.name();
+            invariant.on_event(at, event, &mut ViolationReporter { invariant: name, at_ns: at, violations });
         }
-        if violations.last().is_some_and(|last| self.sought.contains(&last.judge)) {
+        if violations.last().is_some_and(|last| self.sought_invariants.contains(&last.invariant)) {
             self.is_found.set(true);
         }
     }
 
     /// What the judges said, the hash of everything, how many samples were published, and what the judges measured.
-    pub(crate) fn end(&self) -> (Vec<Violation>, u64, u64, Figures) {
+    pub(crate) fn finish(&self) -> (Vec<Violation>, u64, u64, RevolutionFigures) {
         let mut inner = self.inner.borrow_mut();
-        let mut figures = Figures::default();
-        inner.judges.iter().for_each(|judge| figures.add(&judge.figures()));
+        let mut figures = RevolutionFigures::default();
+        inner.invariants.iter().for_each(|invariant| figures.add(&invariant.figures()));
         (std::mem::take(&mut inner.violations), inner.history.value(), inner.published, figures)
     }
 }

@@ -8,49 +8,49 @@ use std::sync::Arc;
 use rustix::io::Errno;
 use scanhub_daemon::SaveQueue;
 use scanhub_daemon::platform::{Platform, SavedState};
-use scanhub_port::{PortError, Source};
-use scanhub_schema::{Failure, Kind, MICROS, Nanos, Ring, Wake};
+use scanhub_port::{PortError, PortSpec};
+use scanhub_schema::{DoorbellWord, Failure, Kind, MICROS, Nanos, WakeEvent};
 use scanhub_shm::Payload;
 
-use crate::consumer::Bell;
 use crate::event::Event;
+use crate::injected_defects::Defect;
 use crate::line::{Handle, LinkClock, OpenLine};
-use crate::planted::Defect;
-use crate::shared::Shared;
-use crate::topics::Carrier;
+use crate::shared::SharedState;
+use crate::subscriber::WakeSource;
+use crate::topics::SimTransport;
 
 /// Platform of link number `number`, whose sensor has the same number.
 pub(crate) struct SimPlatform<'a> {
-    pub(crate) shared: Rc<Shared>,
+    pub(crate) shared: Rc<SharedState>,
     pub(crate) number: usize,
     pub(crate) clock: Rc<LinkClock>,
     pub(crate) save_slot: Option<scanhub_daemon::SaveSlot<'a>>,
     /// A planted defect owes the first ring.
-    is_owed: Cell<bool>,
+    is_ring_delayed: Cell<bool>,
 }
 
 impl<'a> SimPlatform<'a> {
     /// Of a hub that began at the world's present time.
     pub(crate) fn new(
-        shared: &Rc<Shared>,
+        shared: &Rc<SharedState>,
         number: usize,
         sensor: &str,
         queue: Option<&'a Arc<SaveQueue>>,
     ) -> Self {
         let clock = Rc::new(LinkClock::default());
-        clock.pass(shared.clock.get());
+        clock.advance_to(shared.clock.get());
         let save_slot = queue.and_then(|queue| queue.slot(sensor));
-        SimPlatform { shared: shared.clone(), number, clock, save_slot, is_owed: Cell::default() }
+        SimPlatform { shared: shared.clone(), number, clock, save_slot, is_ring_delayed: Cell::default() }
     }
 
     /// Whoever sleeps for topics of `ring` will hear it.
-    fn rouse(&self, ring: Ring) {
-        let (now, Shared { planted, woken, log, .. }) = (self.clock.now(), &*self.shared);
-        if !planted.strikes(Defect::LostWake, 200) {
-            log.tell(now, &Event::Rung { sensor: self.number, ring });
-            woken.borrow_mut().push((self.number, Bell::Ring(ring), now));
-            if planted.strikes(Defect::NeedlessRing, 100) {
-                log.tell(now, &Event::Rung { sensor: self.number, ring });
+    fn wake_subscribers(&self, ring: DoorbellWord) {
+        let (now, SharedState { defect, wakeups: woken, log, .. }) = (self.clock.now(), &*self.shared);
+        if !defect.triggers(Defect::LostWake, 200) {
+            log.record(now, &Event::Rung { sensor: self.number, ring });
+            woken.borrow_mut().push((self.number, WakeSource::Ring(ring), now));
+            if defect.triggers(Defect::NeedlessRing, 100) {
+                log.record(now, &Event::Rung { sensor: self.number, ring });
             }
         }
     }
@@ -63,59 +63,59 @@ impl<'a> SimPlatform<'a> {
 }
 
 impl Platform for SimPlatform<'_> {
-    type Line = OpenLine;
-    type Medium<P: Payload + ?Sized> = Carrier<P>;
+    type Port = OpenLine;
+    type Transport<P: Payload + ?Sized> = SimTransport<P>;
 
     fn now(&self) -> Nanos {
         self.clock.now()
     }
 
     fn wall_ns(&self) -> u64 {
-        self.clock.now() + self.shared.wall_ahead.get()
+        self.clock.now() + self.shared.wall_offset.get()
     }
 
     fn pause(&self, until: Nanos) {
         // A sleeping thread is late by about so much.
-        self.clock.pass(until + 50 * MICROS);
+        self.clock.advance_to(until + 50 * MICROS);
     }
 
     fn take_name(&self) -> Result<(), Failure> {
         Ok(())
     }
 
-    fn open(&self, _: &Source, baud: u32) -> Option<Result<OpenLine, PortError>> {
+    fn open(&self, _: &PortSpec, baud: u32) -> Option<Result<OpenLine, PortError>> {
         if self.shared.lacks_descriptors.get() {
-            return Some(Err(PortError::Short(Errno::MFILE)));
+            return Some(Err(PortError::ResourceExhausted(Errno::MFILE)));
         }
         let mut tty = self.shared.ports[self.number].borrow_mut();
         let opened = tty.open(baud, &self.shared.log, self.clock.now());
         drop(tty);
         Some(opened.map(|device| {
             let line = self.line(device);
-            if self.shared.planted.is(Defect::UnreleasedHandle) {
+            if self.shared.defect.is_active(Defect::UnreleasedHandle) {
                 std::mem::forget(line.handle.clone());
             }
             line
         }))
     }
 
-    fn explain(&self, error: &PortError, source: &Source) -> Failure {
+    fn explain(&self, error: &PortError, source: &PortSpec) -> Failure {
         let kind = match error {
-            PortError::Missing | PortError::Dead => Kind::PortMissing,
-            PortError::Denied => Kind::PortPermission,
+            PortError::Missing | PortError::NoDevice => Kind::PortMissing,
+            PortError::PermissionDenied => Kind::PortPermission,
             PortError::Busy => Kind::PortBusy,
-            PortError::Short(_) => Kind::Short,
+            PortError::ResourceExhausted(_) => Kind::ResourceExhausted,
             _ => Kind::PortNotTty,
         };
         Failure::new(kind, format!("{}: {error}", source.name()), "")
     }
 
-    fn altering_program(&self, _: &Source) -> Option<String> {
+    fn altering_program(&self, _: &PortSpec) -> Option<String> {
         None
     }
 
-    fn take_kept(&self, name: &str, _: &Source, baud: u32) -> Option<OpenLine> {
-        let handle = self.shared.kept.borrow().get(name).cloned()?;
+    fn take_kept_port(&self, name: &str, _: &PortSpec, baud: u32) -> Option<OpenLine> {
+        let handle = self.shared.stored_lines.borrow().get(name).cloned()?;
         let mut tty = self.shared.ports[handle.port].borrow_mut();
         let is_same = tty.adopt(handle.device, baud, &self.shared.log, self.clock.now());
         drop(tty);
@@ -125,47 +125,51 @@ impl Platform for SimPlatform<'_> {
         is_same.then(|| OpenLine { handle, clock: self.clock.clone() })
     }
 
-    fn keep(&self, name: &str, line: &OpenLine) {
+    fn keep_open(&self, name: &str, line: &OpenLine) {
         if self.shared.keeps_ports {
-            self.shared.kept.borrow_mut().insert(name.to_owned(), line.handle.clone());
+            self.shared.stored_lines.borrow_mut().insert(name.to_owned(), line.handle.clone());
         }
     }
 
     fn release(&self, name: &str) {
         // Not while it is borrowed: the port may be closed with it.
-        let kept = self.shared.kept.borrow_mut().remove(name);
+        let kept = self.shared.stored_lines.borrow_mut().remove(name);
         drop(kept);
     }
 
-    fn medium<P: Payload + ?Sized>(&self, _: &str) -> Result<Carrier<P>, Failure> {
-        Ok(Carrier::new(&self.shared, &self.clock, self.number))
+    fn transport<P: Payload + ?Sized>(&self, _: &str) -> Result<SimTransport<P>, Failure> {
+        Ok(SimTransport::new(&self.shared, &self.clock, self.number))
     }
 
-    fn attached(&self) -> Option<u32> {
-        let Shared { board, planted, .. } = &*self.shared;
-        Some(if planted.is(Defect::UnseenSubscriber) { 0 } else { board.borrow().attached(self.number) })
+    fn attach_count(&self) -> Option<u32> {
+        let SharedState { topics: board, defect, .. } = &*self.shared;
+        Some(if defect.is_active(Defect::UnnoticedSubscriber) {
+            0
+        } else {
+            board.borrow().attached(self.number)
+        })
     }
 
     fn has_listeners(&self) -> bool {
-        self.shared.board.borrow().has_listeners(self.number)
+        self.shared.topics.borrow().has_listeners(self.number)
     }
 
-    fn ring(&self, ring: Ring) {
-        if ring == Ring::First && self.shared.planted.is(Defect::OneRing) {
-            self.is_owed.set(true);
+    fn ring(&self, ring: DoorbellWord) {
+        if ring == DoorbellWord::First && self.shared.defect.is_active(Defect::OneRing) {
+            self.is_ring_delayed.set(true);
         } else {
-            self.rouse(ring);
+            self.wake_subscribers(ring);
         }
     }
 
-    fn notify_event(&self, _: Wake) {
-        let (now, Shared { planted, woken, log, .. }) = (self.clock.now(), &*self.shared);
-        if !planted.strikes(Defect::UnsentEvent, 20) {
-            log.tell(now, &Event::Notified { sensor: self.number });
-            woken.borrow_mut().push((self.number, Bell::Event, now));
+    fn notify_event(&self, _: WakeEvent) {
+        let (now, SharedState { defect, wakeups: woken, log, .. }) = (self.clock.now(), &*self.shared);
+        if !defect.triggers(Defect::UnsentEvent, 20) {
+            log.record(now, &Event::Notified { sensor: self.number });
+            woken.borrow_mut().push((self.number, WakeSource::Event, now));
         }
-        if self.is_owed.take() {
-            self.rouse(Ring::First);
+        if self.is_ring_delayed.take() {
+            self.wake_subscribers(DoorbellWord::First);
         }
     }
 

@@ -11,13 +11,13 @@ use std::rc::Rc;
 
 use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Early, Header, Nanos, Topic, Verdict, limits};
-use scanhub_shm::{LoanError, Medium, Payload, SendError};
+use scanhub_shm::{LoanError, Payload, SampleTransport, SendError};
 
-use crate::consumer::Number;
 use crate::event::Event;
+use crate::injected_defects::{Defect, SampleCorrupter};
 use crate::line::LinkClock;
-use crate::planted::{Defect, Spoiler};
-use crate::shared::{Log, Shared};
+use crate::shared::{EventLog, SharedState};
+use crate::subscriber::SubscriberId;
 
 /// A sample that was sent.
 #[derive(Debug)]
@@ -26,33 +26,33 @@ pub(crate) struct Sample {
     pub(crate) header: Header,
     pub(crate) bytes: Vec<u8>,
     /// When it was sent, and how many of its topic were sent before it by the same hub.
-    pub(crate) at: Nanos,
+    pub(crate) sent_at: Nanos,
     pub(crate) index: u64,
     /// Number of subscribers to which it was sent.
-    pub(crate) reached: usize,
+    pub(crate) receivers: usize,
     /// Samples that are in memory count as long as anybody has them.
-    _counted: Counted,
+    _counted: LiveCount,
 }
 
 /// One of the things that are counted while they are there.
 #[derive(Debug)]
-struct Counted(Rc<Cell<usize>>);
+struct LiveCount(Rc<Cell<usize>>);
 
-impl Counted {
-    fn new(count: &Rc<Cell<usize>>) -> Counted {
+impl LiveCount {
+    fn new(count: &Rc<Cell<usize>>) -> LiveCount {
         count.set(count.get() + 1);
-        Counted(count.clone())
+        LiveCount(count.clone())
     }
 }
 
-impl Drop for Counted {
+impl Drop for LiveCount {
     fn drop(&mut self) {
         self.0.set(self.0.get() - 1);
     }
 }
 
 /// All topics of all sensors.
-pub(crate) struct Board {
+pub(crate) struct TopicBoard {
     sensors: Vec<[Channel; Topic::ALL.len()]>,
     /// Loans that were not sent, and samples that are held, wait or are kept.
     loans: Rc<Cell<usize>>,
@@ -65,23 +65,23 @@ pub(crate) struct Board {
 
 #[derive(Default)]
 struct Channel {
-    places: Vec<Place>,
-    kept: VecDeque<Rc<Sample>>,
+    slots: Vec<SubscriberSlot>,
+    history: VecDeque<Rc<Sample>>,
 }
 
-struct Place {
-    consumer: Number,
+struct SubscriberSlot {
+    subscriber: SubscriberId,
     queue: VecDeque<Rc<Sample>>,
     is_connected: bool,
     /// Whether the subscriber sleeps on the event of the sensor.
     is_listener: bool,
     /// Its process was killed; the next hub cleans up.
-    is_dead: bool,
+    was_killed: bool,
 }
 
-impl Board {
-    pub(crate) fn new(sensors: usize) -> Board {
-        Board {
+impl TopicBoard {
+    pub(crate) fn new(sensors: usize) -> TopicBoard {
+        TopicBoard {
             sensors: (0..sensors).map(|_| Default::default()).collect(),
             loans: Rc::default(),
             samples: Rc::default(),
@@ -97,21 +97,21 @@ impl Board {
 
     /// A hub begins to publish: what dead ones left is cleaned up, and everybody has to connect anew.
     fn begin(&mut self, sensor: usize, topic: Topic) {
-        self.clean();
+        self.remove_killed();
         let channel = &mut self.sensors[sensor][topic as usize];
-        channel.kept.clear();
-        channel.places.iter_mut().for_each(|place| place.is_connected = false);
+        channel.history.clear();
+        channel.slots.iter_mut().for_each(|place| place.is_connected = false);
     }
 
     /// What killed consumers left is removed.
-    pub(crate) fn clean(&mut self) {
+    pub(crate) fn remove_killed(&mut self) {
         let channels = self.sensors.iter_mut().flatten();
-        channels.for_each(|channel| channel.places.retain(|place| !place.is_dead));
+        channels.for_each(|channel| channel.slots.retain(|place| !place.was_killed));
     }
 
     /// The hub is gone: nobody keeps anything for late joiners any more.
     pub(crate) fn end(&mut self) {
-        self.sensors.iter_mut().flatten().for_each(|channel| channel.kept.clear());
+        self.sensors.iter_mut().flatten().for_each(|channel| channel.history.clear());
     }
 
     /// Returns the number of times that a subscriber of `sensor` has attached.
@@ -121,7 +121,7 @@ impl Board {
 
     /// Returns whether the event of `sensor` has a listener. A killed one counts until the next hub cleans up.
     pub(crate) fn has_listeners(&self, sensor: usize) -> bool {
-        self.sensors[sensor].iter().flat_map(|channel| &channel.places).any(|place| place.is_listener)
+        self.sensors[sensor].iter().flat_map(|channel| &channel.slots).any(|place| place.is_listener)
     }
 
     /// Attaches `consumer`, which sleeps on the event of the sensor if it `is_listener`. Returns whether there was a place.
@@ -129,134 +129,145 @@ impl Board {
         &mut self,
         sensor: usize,
         topic: Topic,
-        consumer: Number,
+        subscriber: SubscriberId,
         is_listener: bool,
     ) -> bool {
         self.attached[sensor] += 1;
-        let places = &mut self.sensors[sensor][topic as usize].places;
+        let places = &mut self.sensors[sensor][topic as usize].slots;
         let has_room = places.len() < TopicLimits::default().subscribers;
         if has_room {
             let queue = VecDeque::new();
-            places.push(Place { consumer, queue, is_connected: false, is_listener, is_dead: false });
+            places.push(SubscriberSlot {
+                subscriber,
+                queue,
+                is_connected: false,
+                is_listener,
+                was_killed: false,
+            });
         }
         has_room
     }
 
     /// `consumer` leaves, or is killed.
-    pub(crate) fn detach(&mut self, sensor: usize, topic: Topic, consumer: Number, is_killed: bool) {
-        let places = &mut self.sensors[sensor][topic as usize].places;
+    pub(crate) fn detach(&mut self, sensor: usize, topic: Topic, subscriber: SubscriberId, is_killed: bool) {
+        let places = &mut self.sensors[sensor][topic as usize].slots;
         if is_killed {
-            places.iter_mut().for_each(|place| place.is_dead |= place.consumer == consumer);
+            places.iter_mut().for_each(|place| place.was_killed |= place.subscriber == subscriber);
         } else {
-            places.retain(|place| place.consumer != consumer);
+            places.retain(|place| place.subscriber != subscriber);
         }
     }
 
     /// The oldest sample that waits for `consumer`.
-    pub(crate) fn take(&mut self, sensor: usize, topic: Topic, consumer: Number) -> Option<Rc<Sample>> {
-        let places = &mut self.sensors[sensor][topic as usize].places;
-        places.iter_mut().find(|place| place.consumer == consumer)?.queue.pop_front()
+    pub(crate) fn take(
+        &mut self,
+        sensor: usize,
+        topic: Topic,
+        subscriber: SubscriberId,
+    ) -> Option<Rc<Sample>> {
+        let places = &mut self.sensors[sensor][topic as usize].slots;
+        places.iter_mut().find(|place| place.subscriber == subscriber)?.queue.pop_front()
     }
 
     /// Returns the number of subscribers of a topic.
     fn subscribers(&self, sensor: usize, topic: Topic) -> usize {
-        self.sensors[sensor][topic as usize].places.len()
+        self.sensors[sensor][topic as usize].slots.len()
     }
 
-    fn connect(&mut self, sensor: usize, topic: Topic, log: &Log, now: Nanos) {
-        let Channel { places, kept } = &mut self.sensors[sensor][topic as usize];
-        for place in places.iter_mut().filter(|place| !place.is_connected) {
+    fn connect(&mut self, sensor: usize, topic: Topic, log: &EventLog, now: Nanos) {
+        let Channel { slots, history } = &mut self.sensors[sensor][topic as usize];
+        for place in slots.iter_mut().filter(|place| !place.is_connected) {
             place.is_connected = true;
-            kept.iter().for_each(|sample| place.push(sample, log, now));
+            history.iter().for_each(|sample| place.push(sample, log, now));
         }
     }
 
-    fn send(&mut self, sensor: usize, sample: &Rc<Sample>, log: &Log, now: Nanos) -> usize {
+    fn send(&mut self, sensor: usize, sample: &Rc<Sample>, log: &EventLog, now: Nanos) -> usize {
         self.connect(sensor, sample.topic, log, now);
-        let Channel { places, kept } = &mut self.sensors[sensor][sample.topic as usize];
-        places.iter_mut().for_each(|place| place.push(sample, log, now));
-        if limits::history(sample.topic) > 0 {
-            if kept.len() == limits::history(sample.topic) {
-                kept.pop_front();
+        let Channel { slots, history } = &mut self.sensors[sensor][sample.topic as usize];
+        slots.iter_mut().for_each(|place| place.push(sample, log, now));
+        if limits::history_len(sample.topic) > 0 {
+            if history.len() == limits::history_len(sample.topic) {
+                history.pop_front();
             }
-            kept.push_back(sample.clone());
+            history.push_back(sample.clone());
         }
-        places.len()
+        slots.len()
     }
 }
 
-impl Place {
-    fn push(&mut self, sample: &Rc<Sample>, log: &Log, now: Nanos) {
-        if self.queue.len() == limits::buffer(sample.topic)
+impl SubscriberSlot {
+    fn push(&mut self, sample: &Rc<Sample>, log: &EventLog, now: Nanos) {
+        if self.queue.len() == limits::queue_len(sample.topic)
             && let Some(oldest) = self.queue.pop_front()
         {
-            log.tell(now, &Event::Dropped { consumer: self.consumer, sample: &oldest });
+            log.record(now, &Event::Dropped { subscriber: self.subscriber, sample: &oldest });
         }
         self.queue.push_back(sample.clone());
     }
 }
 
 /// The publishing end of one topic of one sensor.
-pub(crate) struct Carrier<P: ?Sized> {
-    shared: Rc<Shared>,
+pub(crate) struct SimTransport<P: ?Sized> {
+    shared: Rc<SharedState>,
     clock: Rc<LinkClock>,
     sensor: usize,
     /// Loans of this publisher that were not sent.
     loaned: Rc<Cell<usize>>,
     sent: Cell<u64>,
     /// A sample that a planted defect holds back.
-    late: RefCell<Option<Rc<Sample>>>,
-    spoiler: RefCell<Spoiler>,
+    delayed: RefCell<Option<Rc<Sample>>>,
+    corrupter: RefCell<SampleCorrupter>,
     payload: PhantomData<fn(&P)>,
 }
 
 /// Memory of a sample.
 pub(crate) struct Loan<P: Payload + ?Sized> {
     payload: P::Owned,
-    _counted: (Counted, Counted),
+    _counted: (LiveCount, LiveCount),
 }
 
-impl<P: Payload + ?Sized> Carrier<P> {
-    pub(crate) fn new(shared: &Rc<Shared>, clock: &Rc<LinkClock>, sensor: usize) -> Self {
-        shared.board.borrow_mut().begin(sensor, P::TOPIC);
+impl<P: Payload + ?Sized> SimTransport<P> {
+    pub(crate) fn new(shared: &Rc<SharedState>, clock: &Rc<LinkClock>, sensor: usize) -> Self {
+        shared.topics.borrow_mut().begin(sensor, P::TOPIC);
         let (shared, clock) = (shared.clone(), clock.clone());
-        Carrier {
+        SimTransport {
             shared,
             clock,
             sensor,
             loaned: Rc::default(),
             sent: Cell::new(0),
-            late: RefCell::default(),
-            spoiler: RefCell::default(),
+            delayed: RefCell::default(),
+            corrupter: RefCell::default(),
             payload: PhantomData,
         }
     }
 }
 
-impl<P: Payload + ?Sized> Medium<P> for Carrier<P> {
+impl<P: Payload + ?Sized> SampleTransport<P> for SimTransport<P> {
     type Loan = Loan<P>;
 
     fn subscribers(&self) -> usize {
-        self.shared.board.borrow().subscribers(self.sensor, P::TOPIC)
+        self.shared.topics.borrow().subscribers(self.sensor, P::TOPIC)
     }
 
     fn connect(&self) -> Result<(), impl Debug + use<P>> {
-        let mut board = self.shared.board.borrow_mut();
+        let mut board = self.shared.topics.borrow_mut();
         board.connect(self.sensor, P::TOPIC, &self.shared.log, self.clock.now());
         Ok::<(), Infallible>(())
     }
 
     fn loan(&self, len: usize) -> Result<Loan<P>, LoanError> {
-        let board = self.shared.board.borrow();
-        if self.loaned.get() == limits::LOANED {
+        let board = self.shared.topics.borrow();
+        if self.loaned.get() == limits::MAX_LOANED_SAMPLES {
             return Err(LoanError::ExceedsMaxLoans);
         }
         if board.lacks_memory {
-            let lacking = Event::Lacking { sensor: self.sensor, topic: P::TOPIC };
-            self.shared.log.tell(self.clock.now(), &lacking);
+            let lacking = Event::OutOfMemory { sensor: self.sensor, topic: P::TOPIC };
+            self.shared.log.record(self.clock.now(), &lacking);
             return Err(LoanError::OutOfMemory);
         }
-        let _counted = (Counted::new(&board.loans), Counted::new(&self.loaned));
+        let _counted = (LiveCount::new(&board.loans), LiveCount::new(&self.loaned));
         Ok(Loan { payload: P::owned(len), _counted })
     }
 
@@ -271,56 +282,56 @@ impl<P: Payload + ?Sized> Medium<P> for Carrier<P> {
     }
 }
 
-impl<P: Payload + ?Sized> Carrier<P> {
+impl<P: Payload + ?Sized> SimTransport<P> {
     fn send_now(&self, loan: Loan<P>, header: &Header) -> Result<usize, SendError> {
         let now = self.clock.now();
-        let Shared { board, log, planted, .. } = &*self.shared;
+        let SharedState { topics: board, log, defect, .. } = &*self.shared;
         let mut board = board.borrow_mut();
         let payload: &P = loan.payload.borrow();
         let mut bytes = payload.bytes().to_vec();
-        let _counted = Counted::new(&board.samples);
+        let _counted = LiveCount::new(&board.samples);
         let mut header = *header;
         let topic = P::TOPIC;
-        if topic == Topic::Telegram && planted.strikes(Defect::UnsentTelegram, 100) {
+        if topic == Topic::Telegram && defect.triggers(Defect::UnsentTelegram, 100) {
             return Ok(0);
         }
-        if topic == Topic::Early && planted.is(Defect::UnsentWarning) {
+        if topic == Topic::Early && defect.is_active(Defect::UnsentWarning) {
             return Ok(0);
         }
-        if topic == Topic::Early && planted.is(Defect::KeptWarning) && bytes[1] == Early::WITHDRAWN {
+        if topic == Topic::Early && defect.is_active(Defect::KeptWarning) && bytes[1] == Early::WITHDRAWN {
             return Ok(0);
         }
-        if topic == Topic::Zones && planted.is(Defect::SurvivingVerdict) && bytes[0] == UNKNOWN {
+        if topic == Topic::Zones && defect.is_active(Defect::SurvivingVerdict) && bytes[0] == UNKNOWN {
             bytes[0] = Verdict::Clear as u8;
         }
-        if header.topic_seq > 0 && planted.strikes(Defect::Renumbered, 100) {
+        if header.topic_seq > 0 && defect.triggers(Defect::Renumbered, 100) {
             header.topic_seq -= 1;
         }
-        if Spoiler::is_needed(planted) {
-            self.spoiler.borrow_mut().spoil(planted, (topic, now), &mut header, &mut bytes);
+        if SampleCorrupter::is_needed(defect) {
+            self.corrupter.borrow_mut().corrupt(defect, (topic, now), &mut header, &mut bytes);
         }
         let index = self.sent.replace(self.sent.get() + 1);
-        let reached = board.subscribers(self.sensor, topic);
-        let sample = Rc::new(Sample { topic, header, bytes, at: now, index, reached, _counted });
-        log.tell(now, &Event::Published { sensor: self.sensor, sample: &sample });
-        if planted.strikes(Defect::LeakedLoan, 1_000) {
+        let receivers = board.subscribers(self.sensor, topic);
+        let sample = Rc::new(Sample { topic, header, bytes, sent_at: now, index, receivers, _counted });
+        log.record(now, &Event::Published { sensor: self.sensor, sample: &sample });
+        if defect.triggers(Defect::LeakedLoan, 1_000) {
             std::mem::forget(loan);
         }
-        if planted.strikes(Defect::Delayed, 100) || planted.strikes(Defect::Reordered, 100) {
+        if defect.triggers(Defect::Delayed, 100) || defect.triggers(Defect::Reordered, 100) {
             return Ok(self
-                .late
+                .delayed
                 .replace(Some(sample))
                 .map_or(1, |late| board.send(self.sensor, &late, log, now)));
         }
-        let late = self.late.take();
-        let is_behind = late.is_some() && planted.is(Defect::Reordered);
+        let late = self.delayed.take();
+        let is_behind = late.is_some() && defect.is_active(Defect::Reordered);
         let (first, second) = if is_behind { (Some(sample), late) } else { (late, Some(sample)) };
-        let mut reached = 0;
+        let mut receivers = 0;
         for sample in first.into_iter().chain(second) {
-            let times = if planted.strikes(Defect::SentTwice, 100) { 2 } else { 1 };
-            (0..times).for_each(|_| reached = board.send(self.sensor, &sample, log, now));
+            let times = if defect.triggers(Defect::SentTwice, 100) { 2 } else { 1 };
+            (0..times).for_each(|_| receivers = board.send(self.sensor, &sample, log, now));
         }
-        Ok(reached)
+        Ok(receivers)
     }
 }
 

@@ -10,17 +10,17 @@ use scanhub_schema::{MILLIS, Nanos, Topic, Verb};
 use scanhub_sim::fault::Faults;
 
 use crate::actions::scene_changes;
-use crate::consumer::{Bell, Consumer, Habit, Number};
-use crate::event::{Detail, Event, Figures, Violation};
-use crate::family::Ailment;
+use crate::event::{Detail, Event, RevolutionFigures, Violation};
+use crate::family::ScannerFault;
 use crate::hub;
-use crate::judges;
-use crate::plan::{Action, Plan};
-use crate::planted::{Defect, Planted};
-use crate::remote::Remote;
+use crate::injected_defects::{Defect, InjectedDefect};
+use crate::invariants;
+use crate::remote::RemoteMachines;
+use crate::scenario::{Action, Scenario};
 use crate::setup::Setup;
-use crate::shared::{Change, Log, Shared, Who};
-use crate::topics::Board;
+use crate::shared::{ChangeKind, EventLog, SharedState, SubscriberChange};
+use crate::subscriber::{Behavior, Subscriber, SubscriberId, WakeSource};
+use crate::topics::TopicBoard;
 use crate::tty::Tty;
 
 /// What came of a plan.
@@ -35,126 +35,131 @@ pub struct Outcome {
     /// Samples that hubs published.
     pub samples: u64,
     /// What the turns of heads were like.
-    pub figures: Figures,
+    pub figures: RevolutionFigures,
 }
 
 /// Lets happen what `plan` says, and tells standard error so much of it.
-pub fn run(plan: &Plan, detail: Detail) -> Outcome {
-    World::new(plan, detail, None, &[]).live()
+pub fn run(scenario: &Scenario, detail: Detail) -> Outcome {
+    World::new(scenario, detail, None, &[]).run_to_end()
 }
 
-/// Returns whether one of `judges` finds a violation while `plan` is played with `defect` around the hub. The world
+/// Returns whether one of `invariants` finds a violation while `plan` is played with `defect` around the hub. The world
 /// ends with the first violation.
-pub fn is_found(plan: &Plan, defect: Option<Defect>, judges: &'static [&'static str]) -> bool {
-    let outcome = World::new(plan, Detail::Nothing, defect, judges).live();
-    outcome.violations.iter().any(|violation| judges.contains(&violation.judge))
+pub fn is_found(scenario: &Scenario, defect: Option<Defect>, invariants: &'static [&'static str]) -> bool {
+    let outcome = World::new(scenario, Detail::Nothing, defect, invariants).run_to_end();
+    outcome.violations.iter().any(|violation| invariants.contains(&violation.invariant))
 }
 
 /// Something that is to be done at its time, or when everything is made well again.
-type Later = Box<dyn FnOnce(&mut World)>;
+type ScheduledTask = Box<dyn FnOnce(&mut World)>;
 
 /// What actions want of the hub.
 #[derive(Default)]
-pub(crate) struct Wants {
+pub(crate) struct HubRequests {
     /// That it is gone, killed or ended in order.
-    pub(crate) end: Option<Ending>,
+    pub(crate) ending: Option<HubEnding>,
     /// That it reads its configuration again.
     pub(crate) reload: bool,
     /// That it does this to a sensor.
-    pub(crate) asks: Vec<(usize, Verb)>,
+    pub(crate) sensor_requests: Vec<(usize, Verb)>,
 }
 
 /// How a hub ends, and when the next one begins.
 #[derive(Clone, Copy)]
-pub(crate) struct Ending {
+pub(crate) struct HubEnding {
     pub(crate) is_killed: bool,
-    pub(crate) back_at: Nanos,
+    pub(crate) restart_at: Nanos,
 }
 
 /// All that there is beside a hub.
 pub(crate) struct World {
-    pub(crate) shared: Rc<Shared>,
+    pub(crate) shared: Rc<SharedState>,
     pub(crate) setup: Rc<Setup>,
     pub(crate) seed: u64,
-    pub(crate) consumers: Vec<Consumer>,
+    pub(crate) subscribers: Vec<Subscriber>,
     actions: VecDeque<Action>,
-    later: BTreeMap<(Nanos, u64), Later>,
-    next_later: u64,
-    heals_at: Nanos,
+    scheduled: BTreeMap<(Nanos, u64), ScheduledTask>,
+    next_task_id: u64,
+    faults_clear_at: Nanos,
     end: Nanos,
-    pub(crate) wants: Wants,
+    pub(crate) hub_requests: HubRequests,
     /// Which configuration the next reading finds.
     pub(crate) edition: Rc<Cell<u64>>,
     /// Number of the hub, and when it begins or begun.
-    pub(crate) life: u64,
-    pub(crate) begins_at: Nanos,
+    pub(crate) run: u64,
+    pub(crate) hub_starts_at: Nanos,
     /// Until when its process does not run.
     pub(crate) stalled_until: Nanos,
     pub(crate) commands: Option<CommandSender>,
     /// What is behind the hub's topics in another machine.
-    pub(crate) remote: Remote,
+    pub(crate) remote_machines: RemoteMachines,
 }
 
 impl World {
-    fn new(plan: &Plan, detail: Detail, defect: Option<Defect>, sought: &'static [&'static str]) -> World {
-        let setup = Rc::new(Setup::of_plan(plan));
-        let sensors = setup.sensors(|sensor| scene_changes(plan, sensor, setup.sensors.len()));
-        let sensors = sensors.into_iter().zip(setup.impossible.iter().cloned()).enumerate();
+    fn new(
+        scenario: &Scenario,
+        detail: Detail,
+        defect: Option<Defect>,
+        sought_invariants: &'static [&'static str],
+    ) -> World {
+        let setup = Rc::new(Setup::from_scenario(scenario));
+        let sensors = setup.sensors(|sensor| scene_changes(scenario, sensor, setup.sensors.len()));
+        let sensors = sensors.into_iter().zip(setup.unsupported_rates.iter().cloned()).enumerate();
         let ports = sensors.map(|(number, (sensor, impossible))| Tty::new(number, sensor, impossible));
-        let shared = Rc::new(Shared {
+        let shared = Rc::new(SharedState {
             clock: Cell::new(0),
-            wall_ahead: Cell::new(WALL_NS),
+            wall_offset: Cell::new(WALL_NS),
             ports: ports.map(RefCell::new).collect(),
-            board: RefCell::new(Board::new(setup.sensors.len())),
-            log: Log::new(judges::all(&setup, plan), detail, sought),
-            planted: Planted::new(defect),
+            topics: RefCell::new(TopicBoard::new(setup.sensors.len())),
+            log: EventLog::new(invariants::all(&setup, scenario), detail, sought_invariants),
+            defect: InjectedDefect::new(defect),
             files: RefCell::default(),
             disk_is_full: Cell::new(false),
             records: RefCell::default(),
             keeps_ports: setup.keeps_ports,
-            kept: RefCell::default(),
+            stored_lines: RefCell::default(),
             handles: Cell::new(0),
             lacks_descriptors: Cell::new(false),
-            woken: RefCell::default(),
-            next_consumer: Cell::default(),
+            wakeups: RefCell::default(),
+            next_subscriber: Cell::default(),
             changes: RefCell::default(),
-            newcomers: RefCell::default(),
-            leavers: RefCell::default(),
+            attached: RefCell::default(),
+            detached: RefCell::default(),
         });
         let mut world = World {
             shared,
             setup: setup.clone(),
-            seed: plan.seed,
-            consumers: Vec::new(),
-            actions: plan.actions.clone().into(),
-            later: BTreeMap::new(),
-            next_later: 0,
-            heals_at: plan.heals_at(),
-            end: plan.seconds * 1_000 * MILLIS,
-            wants: Wants::default(),
+            seed: scenario.seed,
+            subscribers: Vec::new(),
+            actions: scenario.actions.clone().into(),
+            scheduled: BTreeMap::new(),
+            next_task_id: 0,
+            faults_clear_at: scenario.faults_clear_at(),
+            end: scenario.seconds * 1_000 * MILLIS,
+            hub_requests: HubRequests::default(),
             edition: Rc::default(),
-            life: 0,
-            begins_at: 0,
+            run: 0,
+            hub_starts_at: 0,
             stalled_until: 0,
             commands: None,
-            remote: Remote::new(plan, &setup),
+            remote_machines: RemoteMachines::new(scenario, &setup),
         };
-        for &(sensor, topic, habit, holds) in &setup.cast {
-            world.attach(sensor, topic, habit, holds);
+        for &(sensor, topic, behavior, holds) in &setup.subscribers {
+            world.attach(sensor, topic, behavior, holds);
         }
-        world.remote.begin_gateway(&world.shared);
-        world.remote.begin_listener(&world.shared);
+        world.remote_machines.begin_gateway(&world.shared);
+        world.remote_machines.begin_listener(&world.shared);
         world
     }
 
-    fn live(mut self) -> Outcome {
+    fn run_to_end(mut self) -> Outcome {
         while !self.is_over() {
-            self.rest_without_hub();
+            self.run_without_hub();
             if !self.is_over() {
-                hub::live(&mut self);
+                hub::run_hub(&mut self);
             }
         }
-        self.close()
+        self.finish()
     }
 
     pub(crate) fn now(&self) -> Nanos {
@@ -167,82 +172,88 @@ impl World {
     }
 
     /// How long things may still go wrong.
-    pub(crate) fn until_healed(&self) -> Nanos {
-        self.heals_at.saturating_sub(self.now())
+    pub(crate) fn time_until_faults_clear(&self) -> Nanos {
+        self.faults_clear_at.saturating_sub(self.now())
     }
 
     /// When something is due that is not the hub's.
     pub(crate) fn next_ns(&self) -> Nanos {
         let action = self.actions.front().map(|action| action.at_ms * MILLIS);
-        let later = self.later.first_key_value().map(|((at, _), _)| *at);
-        let consumers = self.consumers.iter().map(|consumer| consumer.next_ns(self.now()));
-        let all = action.into_iter().chain(later).chain(consumers);
-        all.chain([self.remote.next_ns(self.now()), self.heals_at, self.end]).min().unwrap_or(self.end)
+        let later = self.scheduled.first_key_value().map(|((at, _), _)| *at);
+        let subscribers = self.subscribers.iter().map(|subscriber| subscriber.next_ns(self.now()));
+        let all = action.into_iter().chain(later).chain(subscribers);
+        all.chain([self.remote_machines.next_ns(self.now()), self.faults_clear_at, self.end])
+            .min()
+            .unwrap_or(self.end)
     }
 
     /// The time is `now`: does what is due.
-    pub(crate) fn pass(&mut self, now: Nanos) {
+    pub(crate) fn run_due(&mut self, now: Nanos) {
         self.shared.clock.set(self.now().max(now));
         while self.actions.front().is_some_and(|action| action.at_ms * MILLIS <= now)
             && let Some(action) = self.actions.pop_front()
         {
-            self.shared.tell(&Event::Acted { text: &action.to_string() });
+            self.shared.log_event(&Event::ActionTaken { text: &action.to_string() });
             (action.kind.act)(self, &action);
         }
-        while let Some(entry) = self.later.first_entry().filter(|entry| entry.key().0 <= now) {
+        while let Some(entry) = self.scheduled.first_entry().filter(|entry| entry.key().0 <= now) {
             entry.remove()(self);
         }
-        if now >= self.heals_at {
-            self.heal();
+        if now >= self.faults_clear_at {
+            self.clear_faults();
         }
-        for consumer in &mut self.consumers {
-            if consumer.next_ns(now) <= now {
-                consumer.run(&self.shared, now);
+        for subscriber in &mut self.subscribers {
+            if subscriber.next_ns(now) <= now {
+                subscriber.run(&self.shared, now);
             }
         }
-        self.remote.pass(&self.shared, now);
+        self.remote_machines.run_due(&self.shared, now);
     }
 
     /// Lets consumers know that they were woken.
-    pub(crate) fn ring(&mut self) {
-        self.admit_newcomers();
-        for (sensor, bell, at) in self.shared.woken.borrow_mut().drain(..) {
-            let its = self.consumers.iter_mut().filter(|consumer| consumer.sensor == sensor);
-            its.for_each(|consumer| consumer.wake(bell, at));
-            if bell != Bell::Event {
-                self.remote.wake(at);
+    pub(crate) fn deliver_wakeups(&mut self) {
+        self.apply_subscriber_changes();
+        for (sensor, wake_source, at) in self.shared.wakeups.borrow_mut().drain(..) {
+            let its = self.subscribers.iter_mut().filter(|subscriber| subscriber.sensor == sensor);
+            its.for_each(|subscriber| subscriber.wake(wake_source, at));
+            if wake_source != WakeSource::Event {
+                self.remote_machines.wake(at);
             }
         }
     }
 
     /// Takes over the subscribers that attached and left while samples were sent.
-    fn admit_newcomers(&mut self) {
+    fn apply_subscriber_changes(&mut self) {
         let shared = self.shared.clone();
-        let leavers = shared.leavers.take();
-        self.consumers.retain(|consumer| !leavers.contains(&consumer.number));
-        for (consumer, span_ms) in shared.newcomers.take() {
-            let (sensor, topic, number) = (consumer.sensor, consumer.topic, consumer.number);
-            self.consumers.push(consumer);
-            self.later(span_ms, move |world| {
-                let what = Who::Leaves { topic, number };
-                let sends = u64::from(number.0) % MOST_SENDS;
-                world.shared.changes.borrow_mut().push(Change { sensor, sends, what });
+        let leavers = shared.detached.take();
+        self.subscribers.retain(|subscriber| !leavers.contains(&subscriber.id));
+        for (subscriber, span_ms) in shared.attached.take() {
+            let (sensor, topic, number) = (subscriber.sensor, subscriber.topic, subscriber.id);
+            self.subscribers.push(subscriber);
+            self.schedule(span_ms, move |world| {
+                let what = ChangeKind::Detach { topic, id: number };
+                let sends = u64::from(number.0) % MAX_SENDS;
+                world.shared.changes.borrow_mut().push(SubscriberChange {
+                    sensor,
+                    after_sends: sends,
+                    kind: what,
+                });
             });
         }
     }
 
     /// Consumers look for a hub now and then, and find the one that begins.
-    pub(crate) fn greet(&mut self) {
-        let at = self.now() + LOOKS;
-        self.consumers.iter_mut().for_each(|consumer| consumer.look_at(at));
-        self.remote.wake(at);
+    pub(crate) fn poll_all_subscribers(&mut self) {
+        let at = self.now() + HUB_POLL_INTERVAL;
+        self.subscribers.iter_mut().for_each(|subscriber| subscriber.poll_at(at));
+        self.remote_machines.wake(at);
     }
 
     /// Does `what` in `span_ms`, or when everything is made well again.
-    pub(crate) fn later(&mut self, span_ms: u64, what: impl FnOnce(&mut World) + 'static) {
+    pub(crate) fn schedule(&mut self, span_ms: u64, task: impl FnOnce(&mut World) + 'static) {
         let at = self.now() + span_ms * MILLIS;
-        self.later.insert((at, self.next_later), Box::new(what));
-        self.next_later += 1;
+        self.scheduled.insert((at, self.next_task_id), Box::new(task));
+        self.next_task_id += 1;
     }
 
     /// A new consumer, if there is a place for it.
@@ -250,36 +261,37 @@ impl World {
         &mut self,
         sensor: usize,
         topic: Topic,
-        habit: Habit,
-        holds: usize,
-    ) -> Option<Number> {
-        let number = self.shared.consumer_number();
-        let consumer = Consumer::attach(&self.shared, number, (sensor, topic), habit, holds, self.now())?;
-        self.consumers.push(consumer);
+        behavior: Behavior,
+        max_held: usize,
+    ) -> Option<SubscriberId> {
+        let number = self.shared.next_subscriber_id();
+        let subscriber =
+            Subscriber::attach(&self.shared, number, (sensor, topic), behavior, max_held, self.now())?;
+        self.subscribers.push(subscriber);
         Some(number)
     }
 
     /// It leaves, or is killed.
-    pub(crate) fn detach(&mut self, number: Number, is_killed: bool) {
-        if let Some(at) = self.consumers.iter().position(|consumer| consumer.number == number) {
-            self.consumers.remove(at).leave(&self.shared, is_killed, false);
+    pub(crate) fn detach(&mut self, id: SubscriberId, is_killed: bool) {
+        if let Some(at) = self.subscribers.iter().position(|subscriber| subscriber.id == id) {
+            self.subscribers.remove(at).detach(&self.shared, is_killed, false);
         }
     }
 
     /// Does `what` to the port of `sensor`.
-    pub(crate) fn port(&mut self, sensor: usize, what: impl FnOnce(&mut Tty, &Log, Nanos)) {
-        what(&mut self.shared.ports[sensor].borrow_mut(), &self.shared.log, self.now());
+    pub(crate) fn with_port(&mut self, sensor: usize, task: impl FnOnce(&mut Tty, &EventLog, Nanos)) {
+        task(&mut self.shared.ports[sensor].borrow_mut(), &self.shared.log, self.now());
     }
 
     /// The line of an action's sensor has `faults` for the action's time.
-    pub(crate) fn fault(&mut self, action: &Action, faults: &Faults) {
+    pub(crate) fn inject_line_fault(&mut self, action: &Action, faults: &Faults) {
         let (sensor, seed) = (self.sensor(action), self.seed ^ action.at_ms);
-        self.port(sensor, |tty, log, now| {
+        self.with_port(sensor, |tty, log, now| {
             tty.advance(now, log);
             tty.sensor.set_faults(faults, seed);
         });
-        self.later(action.value("span_ms"), move |world| {
-            world.port(sensor, |tty, log, now| {
+        self.schedule(action.value("span_ms"), move |world| {
+            world.with_port(sensor, |tty, log, now| {
                 tty.advance(now, log);
                 tty.sensor.set_faults(&Faults::default(), 0);
             });
@@ -287,17 +299,17 @@ impl World {
     }
 
     /// `ailment` happens to an action's sensor.
-    pub(crate) fn ail(&mut self, action: &Action, ailment: Ailment) {
-        self.port(self.sensor(action), |tty, log, now| {
+    pub(crate) fn inject_scanner_fault(&mut self, action: &Action, fault: ScannerFault) {
+        self.with_port(self.sensor(action), |tty, log, now| {
             tty.advance(now, log);
-            tty.sensor.suffer(ailment);
+            tty.sensor.inject_fault(fault);
         });
     }
 
     /// The same when an action's time is over.
-    pub(crate) fn ail_later(&mut self, action: &Action, ailment: Ailment) {
+    pub(crate) fn inject_scanner_fault_later(&mut self, action: &Action, fault: ScannerFault) {
         let copy = action.clone();
-        self.later(action.value("span_ms"), move |world| world.ail(&copy, ailment));
+        self.schedule(action.value("span_ms"), move |world| world.inject_scanner_fault(&copy, fault));
     }
 
     /// The sensor that an action means.
@@ -305,43 +317,43 @@ impl World {
         action.value("sensor") as usize % self.setup.sensors.len()
     }
 
-    fn heal(&mut self) {
-        self.heals_at = Nanos::MAX;
-        while let Some((_, what)) = self.later.pop_first() {
+    fn clear_faults(&mut self) {
+        self.faults_clear_at = Nanos::MAX;
+        while let Some((_, what)) = self.scheduled.pop_first() {
             what(self);
         }
-        self.begins_at = self.begins_at.min(self.now());
+        self.hub_starts_at = self.hub_starts_at.min(self.now());
         self.stalled_until = 0;
-        self.remote.heal();
-        self.shared.tell(&Event::Healed);
+        self.remote_machines.clear_faults();
+        self.shared.log_event(&Event::FaultsCleared);
     }
 
     /// Until the next hub begins.
-    fn rest_without_hub(&mut self) {
-        while self.now() < self.begins_at && !self.is_over() {
-            self.pass(self.next_ns().min(self.begins_at));
-            self.wants = Wants::default();
+    fn run_without_hub(&mut self) {
+        while self.now() < self.hub_starts_at && !self.is_over() {
+            self.run_due(self.next_ns().min(self.hub_starts_at));
+            self.hub_requests = HubRequests::default();
         }
     }
 
-    fn close(mut self) -> Outcome {
-        self.admit_newcomers();
-        for consumer in &mut self.consumers {
-            consumer.drain(&self.shared);
+    fn finish(mut self) -> Outcome {
+        self.apply_subscriber_changes();
+        for subscriber in &mut self.subscribers {
+            subscriber.drain(&self.shared);
         }
-        for consumer in std::mem::take(&mut self.consumers) {
-            consumer.leave(&self.shared, false, true);
+        for subscriber in std::mem::take(&mut self.subscribers) {
+            subscriber.detach(&self.shared, false, true);
         }
-        self.remote.close(&self.shared);
-        let kept = self.shared.kept.take();
+        self.remote_machines.close(&self.shared);
+        let kept = self.shared.stored_lines.take();
         drop(kept);
-        self.shared.board.borrow_mut().end();
-        self.shared.board.borrow_mut().clean();
-        let (loans, held) = self.shared.board.borrow().in_use();
+        self.shared.topics.borrow_mut().end();
+        self.shared.topics.borrow_mut().remove_killed();
+        let (loans, held) = self.shared.topics.borrow().in_use();
         let eeprom_writes = self.shared.ports.iter().map(|port| port.borrow().sensor.eeprom_writes()).sum();
         let handles = self.shared.handles.get();
-        self.shared.tell(&Event::Over { eeprom_writes, handles, loans, held });
-        let (violations, hash, samples, figures) = self.shared.log.end();
+        self.shared.log_event(&Event::WorldEnded { eeprom_writes, handles, loans, held });
+        let (violations, hash, samples, figures) = self.shared.log.finish();
         let sensor_seconds = self.end / (1_000 * MILLIS) * self.setup.sensors.len() as u64;
         Outcome { violations, hash, sensor_seconds, samples, figures }
     }
@@ -350,6 +362,6 @@ impl World {
 /// The wall clock when a world begins: some day in 2026.
 const WALL_NS: u64 = 1_780_000_000_000_000_000;
 /// More than the samples of one scan. A subscriber leaves after fewer.
-const MOST_SENDS: u64 = 12;
+const MAX_SENDS: u64 = 12;
 /// A consumer without a hub looks for one so often.
-const LOOKS: Nanos = 50 * MILLIS;
+const HUB_POLL_INTERVAL: Nanos = 50 * MILLIS;

@@ -5,9 +5,9 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 
-use scanhub_world::{Defect, Detail, Plan, is_found, run};
+use scanhub_world::{Defect, Detail, Scenario, is_found, run};
 
-fn judge(defect: Defect) -> &'static [&'static str] {
+fn invariants(defect: Defect) -> &'static [&'static str] {
     match defect {
         Defect::LostWake | Defect::OneRing | Defect::Delayed => &["prompt"],
         Defect::LostByte => &["bytes"],
@@ -18,41 +18,42 @@ fn judge(defect: Defect) -> &'static [&'static str] {
         Defect::Renumbered => &["numbers"],
         Defect::EepromWrite => &["eeprom"],
         Defect::SwallowedHangUp => &["liveness"],
-        Defect::MergedTurn | Defect::OtherBeams | Defect::StampedOnArrival | Defect::UnmarkedTurn => {
-            &["turns"]
-        }
+        Defect::MergedRevolution
+        | Defect::ExtraBeam
+        | Defect::StampedOnArrival
+        | Defect::UnmarkedRevolution => &["turns"],
         Defect::UncountedLoss => &["lost_on_line"],
         Defect::RemoteAltered | Defect::RemoteHalf => &["remote_nothing_invented"],
         Defect::RemoteCountedTwice => &["remote_accounts"],
         Defect::RemoteStampedLate => &["remote_numbers"],
         Defect::RemoteSurvivingVerdict => &["remote_verdict"],
         Defect::RemoteUnchecked => &["remote_keys"],
-        Defect::Unannounced | Defect::RouterGivenUp => &["remote_liveness"],
-        Defect::RouterUntold => &["remote_bridge"],
+        Defect::Unannounced | Defect::RouterNotReconnected => &["remote_liveness"],
+        Defect::UncountedDrop => &["remote_bridge"],
         Defect::WrongChecksum => &["nothing_invented"],
-        Defect::UnmarkedNeighbour => &["nothing_lost"],
-        Defect::DeafScanner | Defect::UnturnedHead => &["liveness"],
-        Defect::WrongPlaces => &["turns"],
+        Defect::UnmarkedNeighbor => &["nothing_lost"],
+        Defect::IgnoredRequests | Defect::UnstartedMotor => &["liveness"],
+        Defect::ShiftedPoints => &["turns"],
         Defect::KeptWarning => &["early"],
         Defect::HiddenRate => &["settings"],
         Defect::UnmarkedEstimate | Defect::NeedlessEstimate => &["stamps"],
         Defect::UnsentWarning => &["early"],
         Defect::WrongFamily | Defect::NeedlessByte => &["family"],
-        Defect::UnseenSubscriber | Defect::NeedlessRing | Defect::UnsentEvent => &["subscribers"],
+        Defect::UnnoticedSubscriber | Defect::NeedlessRing | Defect::UnsentEvent => &["subscribers"],
     }
 }
 
 /// Defects of turns and of requests, in worlds with nothing but this scanner, whose head turns.
-const OF_HEADS: [(Defect, &str); 12] = [
-    (Defect::MergedTurn, "a1:express"),
-    (Defect::UnmarkedTurn, "s1"),
+const ROTATING_DEFECTS: [(Defect, &str); 12] = [
+    (Defect::MergedRevolution, "a1:express"),
+    (Defect::UnmarkedRevolution, "s1"),
     (Defect::StampedOnArrival, "a1"),
     (Defect::UncountedLoss, "c1"),
     (Defect::WrongChecksum, "a1"),
-    (Defect::UnmarkedNeighbour, "s1"),
-    (Defect::DeafScanner, "a1::streaming"),
-    (Defect::UnturnedHead, "a2m8"),
-    (Defect::WrongPlaces, "c1"),
+    (Defect::UnmarkedNeighbor, "s1"),
+    (Defect::IgnoredRequests, "a1::streaming"),
+    (Defect::UnstartedMotor, "a2m8"),
+    (Defect::ShiftedPoints, "c1"),
     (Defect::KeptWarning, "ld19"),
     (Defect::KeptWarning, "s1"),
     (Defect::UnsentWarning, "ld19"),
@@ -60,33 +61,33 @@ const OF_HEADS: [(Defect, &str); 12] = [
 
 /// First seeds by which a defect was found when this was written, where that is not 0. Seeds that find nothing are not
 /// played again; if one of these finds nothing either, all are.
-const FOUND_BY: [(Defect, &str, u64); 17] = [
-    (Defect::MergedTurn, "", 1),
-    (Defect::OtherBeams, "", 1),
+const SEEDS: [(Defect, &str, u64); 17] = [
+    (Defect::MergedRevolution, "", 1),
+    (Defect::ExtraBeam, "", 1),
     (Defect::StampedOnArrival, "", 22),
-    (Defect::UnmarkedTurn, "", 3),
+    (Defect::UnmarkedRevolution, "", 3),
     (Defect::UncountedLoss, "", 9),
     (Defect::RemoteHalf, "", 1),
     (Defect::RemoteUnchecked, "", 1),
-    (Defect::UnmarkedNeighbour, "", 3),
-    (Defect::UnturnedHead, "", 3),
-    (Defect::WrongPlaces, "", 1),
+    (Defect::UnmarkedNeighbor, "", 3),
+    (Defect::UnstartedMotor, "", 3),
+    (Defect::ShiftedPoints, "", 1),
     (Defect::UnmarkedEstimate, "", 2),
     (Defect::UnsentWarning, "", 51),
     (Defect::NeedlessByte, "", 1),
-    (Defect::UnmarkedTurn, "s1", 3),
+    (Defect::UnmarkedRevolution, "s1", 3),
     (Defect::StampedOnArrival, "a1", 45),
     (Defect::UncountedLoss, "c1", 3),
-    (Defect::DeafScanner, "a1::streaming", 3),
+    (Defect::IgnoredRequests, "a1::streaming", 3),
 ];
 
 /// Returns the seed by which `defect` is found in worlds with `model` alone, or in all if it is empty.
 fn found_by(defect: Defect, model: &str) -> Option<u64> {
     let finds = |seed: &u64| {
         let model = Some(model.to_owned()).filter(|model| !model.is_empty());
-        is_found(&Plan { model, ..Plan::of_seed(*seed, 40) }, Some(defect), judge(defect))
+        is_found(&Scenario { model, ..Scenario::from_seed(*seed, 40) }, Some(defect), invariants(defect))
     };
-    let known = FOUND_BY.iter().find(|(of, with, _)| (*of, *with) == (defect, model));
+    let known = SEEDS.iter().find(|(of, with, _)| (*of, *with) == (defect, model));
     let seed = known.map_or(0, |(.., seed)| *seed);
     [seed].into_iter().chain(0..200).find(finds)
 }
@@ -94,12 +95,14 @@ fn found_by(defect: Defect, model: &str) -> Option<u64> {
 #[test]
 fn every_planted_defect_is_found() {
     let of_all = Defect::ALL.into_iter().map(|defect| (defect, ""));
-    let planted: Vec<(Defect, &str)> = of_all.chain(OF_HEADS).collect();
+    let injected: Vec<(Defect, &str)> = of_all.chain(ROTATING_DEFECTS).collect();
     let (next, missed) = (AtomicUsize::new(0), Mutex::new(Vec::new()));
     let seek = || {
-        while let Some(&(defect, model)) = planted.get(next.fetch_add(1, Ordering::Relaxed)) {
+        while let Some(&(defect, model)) = injected.get(next.fetch_add(1, Ordering::Relaxed)) {
             match found_by(defect, model) {
-                Some(seed) => println!("{defect:?} is found by {:?} with seed {seed} {model}", judge(defect)),
+                Some(seed) => {
+                    println!("{defect:?} is found by {:?} with seed {seed} {model}", invariants(defect))
+                }
                 None => missed.lock().expect("whole").push((defect, model)),
             }
         }
@@ -110,27 +113,27 @@ fn every_planted_defect_is_found() {
 }
 
 /// What happens between the machines, and a defect that shows when nothing else happens.
-const BETWEEN_MACHINES: [(&str, Defect); 3] = [
+const NETWORK_DEFECTS: [(&str, Defect); 3] = [
     ("partition", Defect::RemoteSurvivingVerdict),
-    ("router_killed", Defect::RouterGivenUp),
+    ("router_killed", Defect::RouterNotReconnected),
     ("key_errors", Defect::RemoteUnchecked),
 ];
 
 #[test]
-fn what_happens_between_machines_alone_shows_its_defect() {
-    for (name, defect) in BETWEEN_MACHINES {
+fn actions_between_machines_alone_reveal_their_defect() {
+    for (name, defect) in NETWORK_DEFECTS {
         let alone = |seed: u64| {
-            let mut plan = Plan::of_seed(seed, 40);
-            plan.actions.retain(|action| action.name() == name);
-            plan
+            let mut scenario = Scenario::from_seed(seed, 40);
+            scenario.actions.retain(|action| action.name() == name);
+            scenario
         };
         let finds = |seed: &u64| {
-            let plan = alone(*seed);
-            !plan.actions.is_empty() && is_found(&plan, Some(defect), judge(defect))
+            let scenario = alone(*seed);
+            !scenario.actions.is_empty() && is_found(&scenario, Some(defect), invariants(defect))
         };
         let found = (0..200).find(finds);
         let seed = found.unwrap_or_else(|| panic!("{name}: nobody finds {defect:?}"));
-        println!("{name}: {defect:?} is found by {:?} with seed {seed}", judge(defect));
+        println!("{name}: {defect:?} is found by {:?} with seed {seed}", invariants(defect));
         let without = run(&alone(seed), Detail::Nothing).violations;
         assert_eq!(without, [], "{name}, seed {seed}: something is found without it");
     }

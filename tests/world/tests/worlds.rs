@@ -3,52 +3,53 @@
 use std::sync::atomic::AtomicBool;
 use std::thread;
 
-use scanhub_world::{Detail, Plan, Runner, corpus, run};
+use scanhub_world::{Detail, Runner, Scenario, corpus, run};
 
 #[test]
-fn what_was_mended_stays_so() {
-    let plans: Vec<Plan> = corpus().into_iter().map(|(_, plan)| plan).collect();
-    are_well(plans);
+fn saved_scenarios_of_fixed_bugs_keep_all_invariants() {
+    let scenarios: Vec<Scenario> = corpus().into_iter().map(|(_, scenario)| scenario).collect();
+    assert_no_violation(scenarios);
 }
 
 #[test]
 fn the_same_seed_has_the_same_hash() {
-    let plans: Vec<Plan> = (0..10).map(|seed| Plan::of_seed(seed, 20)).collect();
-    let hashes =
-        |plans: &[Plan]| -> Vec<u64> { plans.iter().map(|plan| run(plan, Detail::Nothing).hash).collect() };
-    let first = hashes(&plans);
-    assert_eq!(first, hashes(&plans));
+    let scenarios: Vec<Scenario> = (0..10).map(|seed| Scenario::from_seed(seed, 20)).collect();
+    let hashes = |scenarios: &[Scenario]| -> Vec<u64> {
+        scenarios.iter().map(|scenario| run(scenario, Detail::Nothing).hash).collect()
+    };
+    let first = hashes(&scenarios);
+    assert_eq!(first, hashes(&scenarios));
     let different: std::collections::HashSet<_> = first.iter().collect();
-    assert_eq!(different.len(), plans.len());
+    assert_eq!(different.len(), scenarios.len());
 }
 
 /// Debug and release, this machine and others.
 #[test]
 fn the_hash_of_a_world_is_known() {
-    let plan: Plan = "seed 5 seconds 15\n1000 kill_hub away_ms=500\n".parse().unwrap();
-    assert_eq!(run(&plan, Detail::Nothing).hash, 0xad26_3a4b_b7f0_1116);
+    let scenario: Scenario = "seed 5 seconds 15\n1000 kill_hub away_ms=500\n".parse().unwrap();
+    assert_eq!(run(&scenario, Detail::Nothing).hash, 0xad26_3a4b_b7f0_1116);
 }
 
 /// The first of those that `.ci/run` has.
 #[test]
 fn worlds_are_well() {
-    are_well((0..20).map(|seed| Plan::of_seed(seed, 60)).collect());
+    assert_no_violation((0..20).map(|seed| Scenario::from_seed(seed, 60)).collect());
 }
 
 /// The first of those in which the hub searches for scanners.
 #[test]
 fn worlds_with_links_without_a_family_are_well() {
-    are_well((0..10).map(|seed| Plan::auto_of_seed(seed, 60)).collect());
+    assert_no_violation((0..10).map(|seed| Scenario::auto_from_seed(seed, 60)).collect());
 }
 
 /// Checks that no judge finds a violation in these worlds.
-fn are_well(plans: Vec<Plan>) {
-    let count = plans.len();
+fn assert_no_violation(scenarios: Vec<Scenario>) {
+    let count = scenarios.len();
     let threads = thread::available_parallelism().map_or(1, usize::from);
-    let runner = Runner { plans, twice: 0, threads };
+    let runner = Runner { scenarios, run_twice: 0, threads };
     let totals = runner.run(&AtomicBool::new(false), |_| ());
-    for (plan, outcome, _) in &totals.failed {
-        println!("{:#?}\n{plan}", outcome.violations);
+    for (scenario, outcome, _) in &totals.failed {
+        println!("{:#?}\n{scenario}", outcome.violations);
     }
     assert_eq!((totals.worlds, totals.failed.len()), (count, 0));
 }

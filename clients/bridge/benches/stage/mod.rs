@@ -18,20 +18,20 @@ use tempfile::TempDir;
 use zenoh::{Config, Wait};
 
 /// A directory for the programs of a bench, removed when it is dropped.
-pub(crate) struct Stage {
-    place: TempDir,
+pub(crate) struct BenchEnvironment {
+    directory: TempDir,
     scanhub: PathBuf,
 }
 
 /// A running program.
-pub(crate) struct Running {
+pub(crate) struct RunningProgram {
     child: Child,
-    out: PathBuf,
+    stdout_path: PathBuf,
 }
 
 /// A simulated machine: all programs on it share a domain.
 pub(crate) struct Machine<'a> {
-    stage: &'a Stage,
+    stage: &'a BenchEnvironment,
     pub(crate) root: PathBuf,
 }
 
@@ -39,29 +39,29 @@ const BRIDGE: &str = env!("CARGO_BIN_EXE_scanhub-bridge");
 /// Sensors of a robot.
 pub(crate) const SENSORS: [&str; 2] = ["front", "rear"];
 
-impl Stage {
+impl BenchEnvironment {
     /// Creates the directory; `None` if the program with the hub was not built.
-    pub(crate) fn new(name: &str) -> Option<Stage> {
+    pub(crate) fn new(name: &str) -> Option<BenchEnvironment> {
         let scanhub = Path::new(BRIDGE).with_file_name("scanhub");
         if !scanhub.is_file() {
             eprintln!("{} was not built: run cargo build --release", scanhub.display());
             return None;
         }
         let prefix = format!("scanhub-bench-{name}-");
-        let place = tempfile::Builder::new().prefix(&prefix).tempdir().expect("a new directory");
-        Some(Stage { place, scanhub })
+        let directory = tempfile::Builder::new().prefix(&prefix).tempdir().expect("a new directory");
+        Some(BenchEnvironment { directory, scanhub })
     }
 
     pub(crate) fn machine(&self, name: &str) -> Machine<'_> {
-        let root = self.place.path().join(name);
-        make(&root);
+        let root = self.directory.path().join(name);
+        make_directory(&root);
         Machine { stage: self, root }
     }
 }
 
 impl Machine<'_> {
     /// Starts a hub of two simulated sensors at 500 kBd.
-    pub(crate) fn robot(&self) -> [Running; 2] {
+    pub(crate) fn robot(&self) -> [RunningProgram; 2] {
         let port = |name: &str| self.root.join(format!("tty-{name}")).display().to_string();
         let ports = SENSORS.map(|name| format!("--port={}", port(name)));
         let links = SENSORS.map(|name| format!("--link={name}={},family=lms", port(name)));
@@ -70,29 +70,29 @@ impl Machine<'_> {
         [simulator, self.start(scanhub, &["run", &links[0], &links[1]])]
     }
 
-    pub(crate) fn bridge(&self, arguments: &[&str]) -> Running {
+    pub(crate) fn start_bridge(&self, arguments: &[&str]) -> RunningProgram {
         self.start(Path::new(BRIDGE), &[&["--json"], arguments].concat())
     }
 
-    fn start(&self, program: &Path, arguments: &[&str]) -> Running {
+    fn start(&self, program: &Path, arguments: &[&str]) -> RunningProgram {
         let number = fs::read_dir(&self.root).expect("it is there").count();
-        let out = self.root.join(format!("out-{number}"));
+        let stdout_path = self.root.join(format!("out-{number}"));
         let mut command = Command::new(program);
         command.args(arguments).args(["--domain", "bench", "--root"]).arg(&self.root);
         command.env("STATE_DIRECTORY", &self.root).env("SCANHUB_END_WITH_PARENT", "1").stdin(Stdio::null());
-        command.stdout(File::create(&out).expect("a new file")).stderr(Stdio::null());
+        command.stdout(File::create(&stdout_path).expect("a new file")).stderr(Stdio::null());
         let child = command.spawn().unwrap_or_else(|error| panic!("{}: {error}", program.display()));
-        Running { child, out }
+        RunningProgram { child, stdout_path }
     }
 
     /// Subscribes to topics in the shared memory of this machine, and waits until all of them exist.
-    pub(crate) fn follow<const N: usize>(&self, topics: [(&str, Topic); N]) -> (Session, [Source; N]) {
+    pub(crate) fn subscribe<const N: usize>(&self, topics: [(&str, Topic); N]) -> (Session, [Source; N]) {
         let mut memory = Session::new(vec![Domain::at("bench", &self.root).expect("a name")]);
         let mut sources = topics.map(|(sensor, topic)| Source::new(sensor, topic));
-        let begun = Instant::now();
+        let started = Instant::now();
         while !sources.iter().all(Source::subscribed) {
-            assert!(begun.elapsed() < Duration::from_secs(30), "no topics in {}", self.root.display());
-            memory.look().expect("a domain");
+            assert!(started.elapsed() < Duration::from_secs(30), "no topics in {}", self.root.display());
+            memory.check_hub().expect("a domain");
             sources.iter_mut().for_each(|source| drop(source.receive(&mut memory)));
             memory.wait_for(Some(Duration::from_millis(20))).expect("to wait");
         }
@@ -100,31 +100,34 @@ impl Machine<'_> {
     }
 }
 
-impl Running {
+impl RunningProgram {
     /// Returns the CPU time so far, in clock ticks of a hundredth of a second.
-    pub(crate) fn ticks(&self) -> u64 {
+    pub(crate) fn cpu_ticks(&self) -> u64 {
         let stat = fs::read_to_string(format!("/proc/{}/stat", self.child.id())).unwrap_or_default();
         let after_name = stat.rsplit(") ").next().unwrap_or_default();
         after_name.split(' ').skip(11).take(2).filter_map(|number| number.parse::<u64>().ok()).sum()
     }
 
     /// Returns what the program has printed so far, one object per line.
-    pub(crate) fn told(&self) -> Vec<serde_json::Value> {
-        let text = fs::read_to_string(&self.out).unwrap_or_default();
+    pub(crate) fn lines(&self) -> Vec<serde_json::Value> {
+        let text = fs::read_to_string(&self.stdout_path).unwrap_or_default();
         text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect()
     }
 
     /// Waits until the program prints a line that `what` accepts.
-    pub(crate) fn tells(&self, what: impl Fn(&serde_json::Value) -> bool) -> serde_json::Value {
-        let begun = Instant::now();
+    pub(crate) fn wait_for_line(
+        &self,
+        is_expected: impl Fn(&serde_json::Value) -> bool,
+    ) -> serde_json::Value {
+        let started = Instant::now();
         loop {
-            if let Some(line) = self.told().into_iter().find(&what) {
+            if let Some(line) = self.lines().into_iter().find(&is_expected) {
                 return line;
             }
             assert!(
-                begun.elapsed() < Duration::from_secs(30),
+                started.elapsed() < Duration::from_secs(30),
                 "the expected line was not printed; last line: {:?}",
-                self.told().last()
+                self.lines().last()
             );
             thread::sleep(Duration::from_millis(20));
         }
@@ -136,19 +139,19 @@ impl Running {
             rustix::process::kill_process(process, rustix::process::Signal::INT).expect("it is ours");
         }
         self.child.wait().expect("it is ours");
-        self.told()
+        self.lines()
     }
 }
 
-impl Drop for Running {
+impl Drop for RunningProgram {
     fn drop(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
 }
 
-fn make(place: &Path) {
-    DirBuilder::new().mode(0o700).create(place).expect("a new directory");
+fn make_directory(path: &Path) {
+    DirBuilder::new().mode(0o700).create(path).expect("a new directory");
 }
 
 /// Returns an address on which no program listens.
@@ -157,10 +160,10 @@ pub(crate) fn free_port() -> SocketAddr {
 }
 
 /// Waits until a program listens on the address.
-pub(crate) fn listened(at: SocketAddr) {
-    let begun = Instant::now();
+pub(crate) fn wait_until_listening(at: SocketAddr) {
+    let started = Instant::now();
     while TcpStream::connect(at).is_err() {
-        assert!(begun.elapsed() < Duration::from_secs(30), "no program listens on {at}");
+        assert!(started.elapsed() < Duration::from_secs(30), "no program listens on {at}");
         thread::sleep(Duration::from_millis(1));
     }
 }
@@ -188,7 +191,7 @@ fn open(mode: &str, endpoints: &str, at: SocketAddr) -> zenoh::Session {
 }
 
 /// Durations in nanoseconds, measured by any thread.
-pub(crate) type Times = Arc<Mutex<Vec<u64>>>;
+pub(crate) type SendTimes = Arc<Mutex<Vec<u64>>>;
 
 /// Returns the value below which this share of all lies, in us.
 pub(crate) fn percentile(values: &mut [u64], share: f64) -> f64 {

@@ -5,26 +5,26 @@ use std::collections::VecDeque;
 use std::num::NonZeroU64;
 use std::ops::Index;
 
-use scanhub_network::lan::Stamp;
+use scanhub_network::lan::WallTimestamp;
 use scanhub_network::lan::outgoing::{PayloadRef, Sample};
-use scanhub_ros::zenoh_wire::Qos;
-use scanhub_ros::{DIAGNOSTICS, Names, TF_STATIC, Type};
+use scanhub_ros::rmw_zenoh::Qos;
+use scanhub_ros::{DIAGNOSTICS, RosNames, TF_STATIC, Type};
 use scanhub_schema::{Cloud, Foreground, Header, Pose, Scan, Status, SweepPoints, Topic};
 
 /// The graph of one hub.
 #[derive(Debug)]
 pub(super) struct Graph {
-    names: Names,
+    names: RosNames,
     hub: Hub,
     sensors: Vec<Sensor>,
-    topics: Vec<Published>,
+    topics: Vec<PublishedTopic>,
     slots: Vec<Slot>,
     /// A slot for each message that waits, the one that waited for longest first.
     waiting: VecDeque<usize>,
     /// What was handed last, and memory for others.
-    handed: Vec<u8>,
+    current: Vec<u8>,
     spare: Vec<Vec<u8>>,
-    /// The topic of the last message from [`hand`](Graph::hand), until it is settled.
+    /// The topic of the last message from [`take_next`](Graph::hand), until it is settled.
     in_flight: Option<usize>,
     /// By frame.
     poses: Vec<(String, Pose)>,
@@ -33,7 +33,7 @@ pub(super) struct Graph {
 
 /// A topic that has a publisher.
 #[derive(Debug)]
-pub(super) struct Published {
+pub(super) struct PublishedTopic {
     pub(super) name: String,
     pub(super) of: Type,
     pub(super) qos: Qos,
@@ -53,7 +53,7 @@ struct Slot {
 
 /// What is to be sent.
 #[derive(Debug)]
-pub(super) struct Handed<'a> {
+pub(super) struct QueuedMessage<'a> {
     /// Position among the [`topics`](Graph::topics).
     pub(super) topic: usize,
     pub(super) message: &'a [u8],
@@ -66,29 +66,29 @@ struct Hub {
     slot: Option<usize>,
     /// Wall clock of when it was first missed, and of when it was told of last.
     missed_ns: Option<u64>,
-    told_ns: u64,
+    reported_ns: u64,
 }
 
 #[derive(Debug)]
 struct Sensor {
     name: String,
-    every: [Option<NonZeroU64>; TOPICS],
-    slots: Slots,
+    every: [Option<NonZeroU64>; TOPIC_COUNT],
+    slots: TopicSlots,
     /// The last scans, by the number of their telegram: foregrounds are points of them.
     scans: VecDeque<(u64, Box<Scan>)>,
     /// A foreground that came before its scan.
-    early: Option<(Header, Box<Foreground>)>,
+    pending_foreground: Option<(Header, Box<Foreground>)>,
     /// Of a name that has clouds.
     sweep: SweepPoints,
     /// Wall clock of the last scan, and of the last status; when a status was told of last.
-    scanned_ns: Option<u64>,
-    heard_ns: Option<u64>,
-    told_ns: u64,
+    last_scan_ns: Option<u64>,
+    last_status_ns: Option<u64>,
+    reported_ns: u64,
 }
 
 /// Where the messages of a sensor wait; nothing where its topic does not go out.
 #[derive(Clone, Copy, Debug, Default)]
-struct Slots {
+struct TopicSlots {
     scan: Option<usize>,
     foreground: Option<usize>,
     marks: Option<usize>,
@@ -102,20 +102,20 @@ struct Slots {
 
 /// Time after which a waiting message is dropped if its topic has a newer one. On a good network, a subscriber with a
 /// depth of five misses no message. On a slow network, messages do not delay each other.
-const FRESH_NS: u64 = 100_000_000;
-const TOPICS: usize = Topic::ALL.len();
+const MAX_QUEUED_NS: u64 = 100_000_000;
+const TOPIC_COUNT: usize = Topic::ALL.len();
 /// Number of scans that are kept for their foregrounds.
-const SCANS: usize = 4;
+const MAX_SCANS: usize = 4;
 /// Time without a status after which the state of a sensor is unknown. A hub sends a status once a second.
-const SILENT_NS: u64 = 3_000_000_000;
+const SILENT_AFTER_NS: u64 = 3_000_000_000;
 /// Time after which a hub that was not found counts as absent.
-const ABSENT_NS: u64 = 500_000_000;
+const ABSENT_AFTER_NS: u64 = 500_000_000;
 /// Interval of the reports about absent hubs and silent sensors.
-const SAID_EVERY_NS: u64 = 1_000_000_000;
+const REPORT_INTERVAL_NS: u64 = 1_000_000_000;
 
 impl Graph {
     /// Creates the graph of a hub. With `tells_state`, it publishes once a second whether the hub runs.
-    pub(super) fn new(names: Names, tells_state: bool) -> Graph {
+    pub(super) fn new(names: RosNames, reports_hub: bool) -> Graph {
         let mut graph = Graph {
             names,
             hub: Hub::default(),
@@ -123,13 +123,13 @@ impl Graph {
             topics: Vec::new(),
             slots: Vec::new(),
             waiting: VecDeque::new(),
-            handed: Vec::new(),
+            current: Vec::new(),
             spare: Vec::new(),
             in_flight: None,
             poses: Vec::new(),
             poses_slot: None,
         };
-        graph.hub.slot = tells_state.then(|| graph.publish_diagnostics());
+        graph.hub.slot = reports_hub.then(|| graph.publish_diagnostics());
         graph
     }
 
@@ -140,7 +140,7 @@ impl Graph {
         let mut slot = |topic: Topic, word: &str, of: Type| {
             every[topic as usize].map(|_| self.publish(self.names.topic(name, word), of, Qos::SensorData))
         };
-        let mut slots = Slots {
+        let mut slots = TopicSlots {
             scan: slot(Topic::Scan, "scan", scanhub_ros::LASER_SCAN),
             foreground: slot(Topic::Foreground, "foreground", scanhub_ros::POINT_CLOUD),
             marks: slot(Topic::Marks, "marks", scanhub_ros::MARKER_ARRAY),
@@ -159,33 +159,33 @@ impl Graph {
             every,
             slots,
             scans: VecDeque::new(),
-            early: None,
+            pending_foreground: None,
             sweep: SweepPoints::default(),
-            scanned_ns: None,
-            heard_ns: None,
-            told_ns: 0,
+            last_scan_ns: None,
+            last_status_ns: None,
+            reported_ns: 0,
         });
         self.sensors.len() - 1
     }
 
     /// Returns whether samples of this topic are wanted: scans for their foregrounds, too, and a status for its pose.
-    pub(super) fn wants(&self, sensor: usize, topic: Topic) -> bool {
-        let goes_out = |topic: Topic| self.sensors[sensor].every[topic as usize].is_some();
+    pub(super) fn needs(&self, sensor: usize, topic: Topic) -> bool {
+        let is_sent = |topic: Topic| self.sensors[sensor].every[topic as usize].is_some();
         match topic {
-            Topic::Scan => goes_out(topic) || goes_out(Topic::Foreground),
+            Topic::Scan => is_sent(topic) || is_sent(Topic::Foreground),
             Topic::Status => true,
-            Topic::Foreground | Topic::Marks | Topic::Zones | Topic::Cloud | Topic::Tracks => goes_out(topic),
+            Topic::Foreground | Topic::Marks | Topic::Zones | Topic::Cloud | Topic::Tracks => is_sent(topic),
             _ => false,
         }
     }
 
     /// Takes a sample of the sensor at this position.
-    pub(super) fn sample(&mut self, sensor: usize, sample: &Sample<'_>, now: Stamp) {
+    pub(super) fn sample(&mut self, sensor: usize, sample: &Sample<'_>, now: WallTimestamp) {
         let Some(header) = sample.header else {
             // The word that nothing comes any more is as good as a sample of the verdict.
             if let PayloadRef::Zones(zones) = sample.payload {
                 let slot = self.sensors[sensor].slots.verdict;
-                self.write(slot, now, |message| scanhub_ros::verdict_word(message, zones.verdict()));
+                self.write(slot, now, |message| scanhub_ros::verdict_message(message, zones.verdict()));
             }
             return;
         };
@@ -196,30 +196,30 @@ impl Graph {
         }
         let known = &self.sensors[sensor];
         let topic = sample.payload.topic();
-        let goes_out = known.every[topic as usize].is_some_and(|every| header.seq % every == 0);
+        let is_sent = known.every[topic as usize].is_some_and(|every| header.seq % every == 0);
         let (slots, frame) = (known.slots, self.names.frame(&known.name).to_owned());
         match sample.payload {
             PayloadRef::Scan(scan) => {
-                if goes_out {
+                if is_sent {
                     self.write(slots.scan, now, |message| {
                         scanhub_ros::laser_scan(message, &frame, header, scan)
                     });
                 }
                 self.scan(sensor, header, scan, now);
             }
-            PayloadRef::Foreground(foreground) if goes_out => {
-                self.foreground(sensor, header, foreground, now)
-            }
-            PayloadRef::Marks(marks) if goes_out => {
+            PayloadRef::Foreground(foreground) if is_sent => self.foreground(sensor, header, foreground, now),
+            PayloadRef::Marks(marks) if is_sent => {
                 self.write(slots.marks, now, |message| {
                     scanhub_ros::mark_markers(message, &frame, header, marks)
                 });
             }
-            PayloadRef::Zones(zones) if goes_out => {
+            PayloadRef::Zones(zones) if is_sent => {
                 self.write(slots.zones, now, |message| scanhub_ros::zone_markers(message, header, zones));
-                self.write(slots.verdict, now, |message| scanhub_ros::verdict_word(message, zones.verdict()));
+                self.write(slots.verdict, now, |message| {
+                    scanhub_ros::verdict_message(message, zones.verdict())
+                });
             }
-            PayloadRef::Tracks(tracks) if goes_out => {
+            PayloadRef::Tracks(tracks) if is_sent => {
                 self.write(slots.people, now, |message| {
                     scanhub_ros::people_markers(message, &frame, header, tracks)
                 });
@@ -232,26 +232,26 @@ impl Graph {
     }
 
     /// Says each second whether the hub is there, and of sensors whose status stays out that nobody says how they are.
-    pub(super) fn look(&mut self, is_hub_there: bool, now: Stamp) {
+    pub(super) fn report_silence(&mut self, is_hub_there: bool, now: WallTimestamp) {
         let now_ns = now.wall_ns;
         let missed_ns = *self.hub.missed_ns.get_or_insert(now_ns);
         if is_hub_there {
             self.hub.missed_ns = None;
         }
-        let is_absent = !is_hub_there && now_ns.saturating_sub(missed_ns) >= ABSENT_NS;
-        let is_due = now_ns.saturating_sub(self.hub.told_ns) >= SAID_EVERY_NS;
+        let is_absent = !is_hub_there && now_ns.saturating_sub(missed_ns) >= ABSENT_AFTER_NS;
+        let is_due = now_ns.saturating_sub(self.hub.reported_ns) >= REPORT_INTERVAL_NS;
         if is_due && (is_hub_there || is_absent) {
-            self.hub.told_ns = now_ns;
+            self.hub.reported_ns = now_ns;
             self.write(self.hub.slot, now, |message| {
                 scanhub_ros::hub_diagnosis(message, now_ns, is_hub_there)
             });
         }
         for sensor in 0..self.sensors.len() {
-            let Sensor { name, slots, heard_ns, told_ns, .. } = &mut self.sensors[sensor];
-            let heard_ns = *heard_ns.get_or_insert(now_ns);
-            let is_silent = is_absent || now_ns.saturating_sub(heard_ns) >= SILENT_NS;
-            if is_silent && now_ns.saturating_sub(*told_ns) >= SAID_EVERY_NS {
-                *told_ns = now_ns;
+            let Sensor { name, slots, last_status_ns, reported_ns, .. } = &mut self.sensors[sensor];
+            let last_status_ns = *last_status_ns.get_or_insert(now_ns);
+            let is_silent = is_absent || now_ns.saturating_sub(last_status_ns) >= SILENT_AFTER_NS;
+            if is_silent && now_ns.saturating_sub(*reported_ns) >= REPORT_INTERVAL_NS {
+                *reported_ns = now_ns;
                 let (slot, name) = (slots.diagnosis, name.clone());
                 self.write(slot, now, |message| scanhub_ros::diagnosis(message, &name, now_ns, None, None));
             }
@@ -259,7 +259,7 @@ impl Graph {
     }
 
     /// Returns the topics that have a publisher; new ones append.
-    pub(super) fn topics(&self) -> &[Published] {
+    pub(super) fn topics(&self) -> &[PublishedTopic] {
         &self.topics
     }
 
@@ -269,23 +269,24 @@ impl Graph {
     }
 
     /// Returns the message that has waited for longest, and counts it as sent.
-    pub(super) fn hand(&mut self, now: Stamp) -> Option<Handed<'_>> {
+    pub(super) fn take_next(&mut self, now: WallTimestamp) -> Option<QueuedMessage<'_>> {
         loop {
             let slot = &mut self.slots[self.waiting.pop_front()?];
             let topic = slot.topic;
             let (since_ns, message) = slot.messages.pop_front()?;
-            let is_fresh = now.monotonic_ns.saturating_sub(since_ns) <= FRESH_NS || slot.messages.is_empty();
-            self.spare.push(std::mem::replace(&mut self.handed, message));
+            let is_fresh =
+                now.monotonic_ns.saturating_sub(since_ns) <= MAX_QUEUED_NS || slot.messages.is_empty();
+            self.spare.push(std::mem::replace(&mut self.current, message));
             if is_fresh {
                 self.topics[topic].sent += 1;
                 self.in_flight = Some(topic);
-                return Some(Handed { topic, message: &self.handed });
+                return Some(QueuedMessage { topic, message: &self.current });
             }
             self.topics[topic].replaced += 1;
         }
     }
 
-    /// Settles the last message from [`hand`](Graph::hand): it was sent, or else it failed.
+    /// Settles the last message from [`take_next`](Graph::hand): it was sent, or else it failed.
     pub(super) fn settle(&mut self, is_sent: bool) {
         if let Some(topic) = self.in_flight.take().filter(|_| !is_sent) {
             let topic = &mut self.topics[topic];
@@ -293,11 +294,11 @@ impl Graph {
         }
     }
 
-    fn status(&mut self, sensor: usize, header: &Header, status: &Status, now: Stamp) {
+    fn status(&mut self, sensor: usize, header: &Header, status: &Status, now: WallTimestamp) {
         let now_ns = now.wall_ns;
         let known = &mut self.sensors[sensor];
-        (known.heard_ns, known.told_ns) = (Some(now_ns), now_ns);
-        let age_ns = known.scanned_ns.map(|scanned_ns| now_ns.saturating_sub(scanned_ns));
+        (known.last_status_ns, known.reported_ns) = (Some(now_ns), now_ns);
+        let age_ns = known.last_scan_ns.map(|scanned_ns| now_ns.saturating_sub(scanned_ns));
         let (slot, name) = (known.slots.diagnosis, known.name.clone());
         self.write(slot, now, |message| scanhub_ros::diagnosis(message, &name, now_ns, Some(status), age_ns));
         let frame = self.names.frame(&name);
@@ -307,7 +308,7 @@ impl Graph {
             None => self.poses.push((frame.to_owned(), status.pose)),
         }
         if self.poses_slot.is_none() {
-            let topic = self.names.shared(TF_STATIC);
+            let topic = self.names.global_topic(TF_STATIC);
             self.poses_slot = Some(self.publish(topic, scanhub_ros::TF_MESSAGE, Qos::Latched));
         }
         let (slot, poses) = (self.poses_slot, std::mem::take(&mut self.poses));
@@ -316,33 +317,33 @@ impl Graph {
     }
 
     /// Keeps a scan for its foreground, which may have come before it.
-    fn scan(&mut self, sensor: usize, header: &Header, scan: &Scan, now: Stamp) {
+    fn scan(&mut self, sensor: usize, header: &Header, scan: &Scan, now: WallTimestamp) {
         let known = &mut self.sensors[sensor];
-        known.scanned_ns = Some(header.wall_ns);
+        known.last_scan_ns = Some(header.wall_ns);
         if known.slots.foreground.is_none() {
             return;
         }
         known.scans.push_back((header.seq, scan.boxed()));
-        if known.scans.len() > SCANS {
+        if known.scans.len() > MAX_SCANS {
             known.scans.pop_front();
         }
-        if let Some((of, foreground)) = known.early.take_if(|(of, _)| of.seq <= header.seq) {
+        if let Some((of, foreground)) = known.pending_foreground.take_if(|(of, _)| of.seq <= header.seq) {
             self.foreground(sensor, &of, &foreground, now);
         }
     }
 
     /// The points of a foreground, if its scan is there; else it waits for it.
-    fn foreground(&mut self, sensor: usize, header: &Header, foreground: &Foreground, now: Stamp) {
+    fn foreground(&mut self, sensor: usize, header: &Header, foreground: &Foreground, now: WallTimestamp) {
         let known = &mut self.sensors[sensor];
-        let Some(place) = known.scans.iter().position(|(seq, _)| *seq == header.seq) else {
+        let Some(index) = known.scans.iter().position(|(seq, _)| *seq == header.seq) else {
             if known.scans.back().is_none_or(|(seq, _)| *seq < header.seq) {
-                known.early = Some((*header, foreground.boxed()));
+                known.pending_foreground = Some((*header, foreground.boxed()));
             }
             return;
         };
         let (slot, scans) = (known.slots.foreground, std::mem::take(&mut known.scans));
         let frame = self.names.frame(&self.sensors[sensor].name).to_owned();
-        let (_, scan) = scans.index(place);
+        let (_, scan) = scans.index(index);
         self.write(slot, now, |message| {
             scanhub_ros::foreground_cloud(message, &frame, header, scan, foreground)
         });
@@ -350,7 +351,7 @@ impl Graph {
     }
 
     /// A message of a whole sweep, with the last of its samples.
-    fn cloud(&mut self, sensor: usize, header: &Header, cloud: &Cloud, now: Stamp) {
+    fn cloud(&mut self, sensor: usize, header: &Header, cloud: &Cloud, now: WallTimestamp) {
         let known = &mut self.sensors[sensor];
         let (slot, mut sweep) = (known.slots.cloud, std::mem::take(&mut known.sweep));
         if let Some(points) = sweep.take(header, cloud) {
@@ -361,14 +362,14 @@ impl Graph {
 
     /// A new place for messages of how something is.
     fn publish_diagnostics(&mut self) -> usize {
-        self.publish(self.names.shared(DIAGNOSTICS), scanhub_ros::DIAGNOSTIC_ARRAY, Qos::Reliable(10))
+        self.publish(self.names.global_topic(DIAGNOSTICS), scanhub_ros::DIAGNOSTIC_ARRAY, Qos::Reliable(10))
     }
 
     /// A new place for messages of the topic called `name`.
     fn publish(&mut self, name: String, of: Type, qos: Qos) -> usize {
         let known = self.topics.iter().position(|topic| topic.name == name);
         let topic = known.unwrap_or_else(|| {
-            self.topics.push(Published { name, of, qos, sent: 0, replaced: 0, failed: 0 });
+            self.topics.push(PublishedTopic { name, of, qos, sent: 0, replaced: 0, failed: 0 });
             self.topics.len() - 1
         });
         self.slots.push(Slot { topic, messages: VecDeque::new() });
@@ -376,12 +377,12 @@ impl Graph {
     }
 
     /// Has a message for `slot` written; where there are as many as are kept, it takes the place of the oldest.
-    fn write(&mut self, slot: Option<usize>, now: Stamp, write: impl FnOnce(&mut Vec<u8>)) {
-        let Some(place) = slot else { return };
-        let slot = &mut self.slots[place];
+    fn write(&mut self, slot: Option<usize>, now: WallTimestamp, write: impl FnOnce(&mut Vec<u8>)) {
+        let Some(index) = slot else { return };
+        let slot = &mut self.slots[index];
         let topic = &mut self.topics[slot.topic];
         let mut message = if slot.messages.len() < topic.qos.depth() {
-            self.waiting.push_back(place);
+            self.waiting.push_back(index);
             self.spare.pop().unwrap_or_default()
         } else {
             topic.replaced += 1;
@@ -404,8 +405,8 @@ mod tests {
     use super::*;
 
     /// Returns the time `ns` after the start of both clocks.
-    fn at(ns: u64) -> Stamp {
-        Stamp { monotonic_ns: ns, wall_ns: ns }
+    fn at(ns: u64) -> WallTimestamp {
+        WallTimestamp { monotonic_ns: ns, wall_ns: ns }
     }
 
     const SECOND_NS: u64 = 1_000_000_000;
@@ -432,18 +433,20 @@ mod tests {
     }
 
     fn graph(every: impl Fn(Topic) -> Option<u64>) -> Graph {
-        let mut graph = Graph::new(Names::default(), false);
+        let mut graph = Graph::new(RosNames::default(), false);
         let of_links = |topic: Topic| {
-            every(topic).filter(|_| topic.maker() != scanhub_schema::Maker::Tracker).and_then(NonZeroU64::new)
+            every(topic)
+                .filter(|_| topic.publisher_kind() != scanhub_schema::PublisherKind::Tracker)
+                .and_then(NonZeroU64::new)
         };
         assert_eq!(graph.follow("front", &of_links), 0);
         graph
     }
 
     /// All that waits: name of the topic and message.
-    fn handed(graph: &mut Graph) -> Vec<(String, Value)> {
+    fn take_messages(graph: &mut Graph) -> Vec<(String, Value)> {
         let mut all = Vec::new();
-        while let Some(Handed { topic, message }) = graph.hand(at(0)) {
+        while let Some(QueuedMessage { topic, message }) = graph.take_next(at(0)) {
             let message = message.to_vec();
             let topic = &graph.topics()[topic];
             all.push((topic.name.clone(), read(&topic.of, &message).expect("a message of its type")));
@@ -451,8 +454,8 @@ mod tests {
         all
     }
 
-    fn names(handed: &[(String, Value)]) -> Vec<&str> {
-        handed.iter().map(|(name, _)| &**name).collect()
+    fn names(messages: &[(String, Value)]) -> Vec<&str> {
+        messages.iter().map(|(name, _)| &**name).collect()
     }
 
     #[test]
@@ -484,35 +487,38 @@ mod tests {
         ] {
             graph.sample(0, &sample(&first, payload), at(101 * SECOND_NS));
         }
-        let told = handed(&mut graph);
-        let wanted = ["/front/scan", "/front/foreground", "/front/marks", "/front/zones", "/front/verdict"];
-        assert_eq!(names(&told), [&wanted[..], &["/diagnostics", "/tf_static"]].concat());
-        assert_eq!(told[0].1.number("ranges.90"), Some(f64::from(3_f32)));
+        let messages = take_messages(&mut graph);
+        let expected = ["/front/scan", "/front/foreground", "/front/marks", "/front/zones", "/front/verdict"];
+        assert_eq!(names(&messages), [&expected[..], &["/diagnostics", "/tf_static"]].concat());
+        assert_eq!(messages[0].1.number("ranges.90"), Some(f64::from(3_f32)));
         assert_eq!(
-            (told[1].1.number("width"), told[1].1.text("header.frame_id")),
+            (messages[1].1.number("width"), messages[1].1.text("header.frame_id")),
             (Some(1.0), Some("front"))
         );
-        assert_eq!(told[4].1.text("data"), Some("slow"));
-        assert_eq!(told[5].1.text("status.0.message"), Some("streaming"));
-        assert_eq!(told[6].1.text("transforms.0.child_frame_id"), Some("front"));
+        assert_eq!(messages[4].1.text("data"), Some("slow"));
+        assert_eq!(messages[5].1.text("status.0.message"), Some("streaming"));
+        assert_eq!(messages[6].1.text("transforms.0.child_frame_id"), Some("front"));
         // The pose is published when it changes, and the state of the sensor with each status.
         graph.sample(0, &sample(&first, PayloadRef::Status(&status)), at(102 * SECOND_NS));
-        assert_eq!(names(&handed(&mut graph)), ["/diagnostics"]);
+        assert_eq!(names(&take_messages(&mut graph)), ["/diagnostics"]);
         let moved = Status { pose: Pose { x_m: 0.5, ..Pose::default() }, ..status };
         graph.sample(0, &sample(&first, PayloadRef::Status(&moved)), at(103 * SECOND_NS));
-        let told = handed(&mut graph);
-        assert_eq!(names(&told), ["/diagnostics", "/tf_static"]);
-        assert_eq!(told[1].1.number("transforms.0.transform.translation.x"), Some(0.5));
+        let messages = take_messages(&mut graph);
+        assert_eq!(names(&messages), ["/diagnostics", "/tf_static"]);
+        assert_eq!(messages[1].1.number("transforms.0.transform.translation.x"), Some(0.5));
     }
 
     #[test]
     fn as_many_wait_as_are_kept_and_old_ones_give_way() {
         let mut graph = graph(|topic| (topic == Topic::Scan).then_some(1));
-        let ranges = |told: Vec<(String, Value)>| {
-            told.iter().map(|(_, scan)| scan.number("ranges.0").unwrap().round() as u64).collect::<Vec<_>>()
+        let ranges = |messages: Vec<(String, Value)>| {
+            messages
+                .iter()
+                .map(|(_, scan)| scan.number("ranges.0").unwrap().round() as u64)
+                .collect::<Vec<_>>()
         };
         let counts = |graph: &Graph| {
-            let Published { sent, replaced, failed, .. } = graph.topics()[0];
+            let PublishedTopic { sent, replaced, failed, .. } = graph.topics()[0];
             (sent, replaced, failed)
         };
         let take = |graph: &mut Graph, now_ns| {
@@ -522,15 +528,15 @@ mod tests {
             }
         };
         take(&mut graph, 0);
-        assert_eq!(ranges(handed(&mut graph)), [3, 4, 5, 6, 7]);
+        assert_eq!(ranges(take_messages(&mut graph)), [3, 4, 5, 6, 7]);
         graph.settle(false);
         assert_eq!(counts(&graph), (4, 2, 1));
         // Two of the scans from 60 to 140 ms after the start are old at 190 ms. The newest one is never dropped for its
         // age.
         take(&mut graph, 0);
-        let first = graph.hand(at(190_000_000)).map(|handed| handed.message.to_vec()).unwrap();
+        let first = graph.take_next(at(190_000_000)).map(|handed| handed.message.to_vec()).unwrap();
         assert_eq!(read(&scanhub_ros::LASER_SCAN, &first).unwrap().number("ranges.0"), Some(5.0));
-        let last = graph.hand(at(SECOND_NS)).map(|handed| handed.message.to_vec()).unwrap();
+        let last = graph.take_next(at(SECOND_NS)).map(|handed| handed.message.to_vec()).unwrap();
         assert_eq!(read(&scanhub_ros::LASER_SCAN, &last).unwrap().number("ranges.0"), Some(7.0));
         assert!(!graph.is_waiting());
         assert_eq!(counts(&graph), (6, 7, 1));
@@ -542,43 +548,43 @@ mod tests {
         let mut sent = Vec::new();
         for seq in 0..9 {
             graph.sample(0, &sample(&header(seq), PayloadRef::Scan(&scan(100))), at(0));
-            if !handed(&mut graph).is_empty() {
+            if !take_messages(&mut graph).is_empty() {
                 sent.push(seq);
             }
         }
         assert_eq!(sent, [0, 4, 8]);
         assert!(
-            graph.wants(0, Topic::Status)
-                && !graph.wants(0, Topic::Zones)
-                && !graph.wants(0, Topic::Telegram)
+            graph.needs(0, Topic::Status)
+                && !graph.needs(0, Topic::Zones)
+                && !graph.needs(0, Topic::Telegram)
         );
     }
 
     #[test]
     fn a_foreground_waits_for_its_scan_alone() {
         let mut graph = graph(|topic| (topic == Topic::Foreground).then_some(1));
-        assert!(graph.wants(0, Topic::Scan), "it says where beams point");
+        assert!(graph.needs(0, Topic::Scan), "it says where beams point");
         let (scan, foreground) = (scan(500), foreground());
         graph.sample(0, &sample(&header(1), PayloadRef::Foreground(&foreground)), at(0));
-        assert!(handed(&mut graph).is_empty());
+        assert!(take_messages(&mut graph).is_empty());
         graph.sample(0, &sample(&header(1), PayloadRef::Scan(&scan)), at(0));
-        assert_eq!(names(&handed(&mut graph)), ["/front/foreground"]);
+        assert_eq!(names(&take_messages(&mut graph)), ["/front/foreground"]);
         for seq in 2..5 {
             graph.sample(0, &sample(&header(seq), PayloadRef::Scan(&scan)), at(0));
         }
         graph.sample(0, &sample(&header(2), PayloadRef::Foreground(&foreground)), at(0));
-        let told = handed(&mut graph);
-        assert_eq!((told.len(), told[0].1.number("header.stamp.sec")), (1, Some(99.0)));
+        let messages = take_messages(&mut graph);
+        assert_eq!((messages.len(), messages[0].1.number("header.stamp.sec")), (1, Some(99.0)));
         // That of a scan that was missed, or is long gone, is none.
         graph.sample(0, &sample(&header(6), PayloadRef::Foreground(&foreground)), at(0));
         graph.sample(0, &sample(&header(7), PayloadRef::Scan(&scan)), at(0));
         graph.sample(0, &sample(&header(1), PayloadRef::Foreground(&foreground)), at(0));
-        assert!(handed(&mut graph).is_empty());
+        assert!(take_messages(&mut graph).is_empty());
     }
 
     #[test]
-    fn two_sensors_do_not_take_each_others_place_in_a_topic_that_they_share() {
-        let names = Names::new("robot1", "lidars", vec![("rear".to_owned(), "back".to_owned())]).unwrap();
+    fn sensors_do_not_overwrite_each_other_in_one_topic() {
+        let names = RosNames::new("robot1", "lidars", vec![("rear".to_owned(), "back".to_owned())]).unwrap();
         let mut graph = Graph::new(names, false);
         for (position, sensor) in ["front", "rear"].into_iter().enumerate() {
             graph.follow(sensor, &|topic| (topic == Topic::Status).then_some(NonZeroU64::MIN));
@@ -588,44 +594,48 @@ mod tests {
                 at(SECOND_NS),
             );
         }
-        let told = handed(&mut graph);
-        let of_sensors: Vec<_> = told.iter().filter_map(|(_, value)| value.text("status.0.name")).collect();
+        let messages = take_messages(&mut graph);
+        let of_sensors: Vec<_> =
+            messages.iter().filter_map(|(_, value)| value.text("status.0.name")).collect();
         assert_eq!(of_sensors, ["scanhub: front", "scanhub: rear"]);
         assert_eq!(graph.topics().len(), 2, "{:?}", graph.topics());
-        let poses = &told.iter().find(|(name, _)| name == "/robot1/tf_static").unwrap().1;
+        let poses = &messages.iter().find(|(name, _)| name == "/robot1/tf_static").unwrap().1;
         assert_eq!(poses.text("transforms.1.child_frame_id"), Some("back"));
     }
 
     #[test]
-    fn without_a_hub_nobody_knows_how_a_sensor_is() {
+    fn silent_sensor_is_unknown_and_its_diagnostics_stale() {
         let mut graph = graph(|topic| matches!(topic, Topic::Status | Topic::Zones).then_some(1));
         graph.sample(0, &sample(&header(1), PayloadRef::Status(&Status::default())), at(10 * SECOND_NS));
-        handed(&mut graph);
-        graph.look(true, at(12 * SECOND_NS));
-        assert!(handed(&mut graph).is_empty());
+        take_messages(&mut graph);
+        graph.report_silence(true, at(12 * SECOND_NS));
+        assert!(take_messages(&mut graph).is_empty());
         let unknown = Zones::unknown();
         let silence = Sample { header: None, missed: 0, payload: PayloadRef::Zones(&unknown) };
         graph.sample(0, &silence, at(12 * SECOND_NS));
-        let told = handed(&mut graph);
-        assert_eq!((names(&told), told[0].1.text("data")), (vec!["/front/verdict"], Some("unknown")));
-        let mut said = 0;
+        let messages = take_messages(&mut graph);
+        assert_eq!((names(&messages), messages[0].1.text("data")), (vec!["/front/verdict"], Some("unknown")));
+        let mut report_count = 0;
         for tenth in 130..160 {
-            graph.look(true, at(tenth * SECOND_NS / 10));
-            let told = handed(&mut graph);
-            said += told.len();
-            assert!(told.iter().all(|(_, value)| value.number("status.0.level") == Some(3.0)), "{told:?}");
+            graph.report_silence(true, at(tenth * SECOND_NS / 10));
+            let messages = take_messages(&mut graph);
+            report_count += messages.len();
+            assert!(
+                messages.iter().all(|(_, value)| value.number("status.0.level") == Some(3.0)),
+                "{messages:?}"
+            );
         }
-        assert_eq!(said, 3);
+        assert_eq!(report_count, 3);
     }
 
     #[test]
-    fn that_there_is_no_hub_is_said_within_a_second_and_again() {
-        let mut graph = Graph::new(Names::default(), true);
-        let mut hear = |tenths: std::ops::Range<u64>, is_there| {
-            let mut told = Vec::new();
+    fn missing_hub_is_reported_every_second() {
+        let mut graph = Graph::new(RosNames::default(), true);
+        let mut levels_during = |tenths: std::ops::Range<u64>, is_hub_running| {
+            let mut levels = Vec::new();
             for tenth in tenths {
-                graph.look(is_there, at(tenth * SECOND_NS / 10));
-                told.extend(handed(&mut graph).into_iter().map(|(topic, value)| {
+                graph.report_silence(is_hub_running, at(tenth * SECOND_NS / 10));
+                levels.extend(take_messages(&mut graph).into_iter().map(|(topic, value)| {
                     assert_eq!(
                         (&*topic, value.text("status.0.name")),
                         ("/diagnostics", Some("scanhub: hub"))
@@ -633,58 +643,58 @@ mod tests {
                     (tenth, value.number("status.0.level"))
                 }));
             }
-            told
+            levels
         };
-        assert_eq!(hear(100..120, false), [(105, Some(3.0)), (115, Some(3.0))]);
-        assert_eq!(hear(120..140, true), [(125, Some(0.0)), (135, Some(0.0))]);
+        assert_eq!(levels_during(100..120, false), [(105, Some(3.0)), (115, Some(3.0))]);
+        assert_eq!(levels_during(120..140, true), [(125, Some(0.0)), (135, Some(0.0))]);
         // One that goes and comes at once is not gone.
-        assert_eq!(hear(140..144, false), []);
-        assert_eq!(hear(144..150, true), [(145, Some(0.0))]);
-        assert_eq!(hear(150..160, false), [(155, Some(3.0))]);
+        assert_eq!(levels_during(140..144, false), []);
+        assert_eq!(levels_during(144..150, true), [(145, Some(0.0))]);
+        assert_eq!(levels_during(150..160, false), [(155, Some(3.0))]);
     }
 
     #[test]
-    fn of_sensors_without_a_hub_it_is_said_as_soon() {
+    fn sensor_without_a_hub_is_stale_within_a_second() {
         let mut graph = graph(|topic| (topic == Topic::Status).then_some(1));
         graph.sample(0, &sample(&header(1), PayloadRef::Status(&Status::default())), at(10 * SECOND_NS));
-        handed(&mut graph);
+        take_messages(&mut graph);
         for ms in [10_100, 10_500] {
-            graph.look(false, at(ms * SECOND_NS / 1000));
-            assert!(handed(&mut graph).is_empty(), "{ms}");
+            graph.report_silence(false, at(ms * SECOND_NS / 1000));
+            assert!(take_messages(&mut graph).is_empty(), "{ms}");
         }
-        graph.look(false, at(11 * SECOND_NS));
-        let told = handed(&mut graph);
-        let said =
-            told.last().map(|(_, value)| (value.text("status.0.name"), value.number("status.0.level")));
-        assert_eq!(said, Some((Some("scanhub: front"), Some(3.0))), "{told:?}");
+        graph.report_silence(false, at(11 * SECOND_NS));
+        let messages = take_messages(&mut graph);
+        let last_status =
+            messages.last().map(|(_, value)| (value.text("status.0.name"), value.number("status.0.level")));
+        assert_eq!(last_status, Some((Some("scanhub: front"), Some(3.0))), "{messages:?}");
     }
 
     #[test]
     fn a_sweep_is_one_cloud() {
         let mut graph = graph(|topic| (topic == Topic::Cloud).then_some(1));
         assert_eq!(graph.topics().len(), 1);
-        assert!(graph.wants(0, Topic::Cloud) && !graph.wants(0, Topic::Scan));
+        assert!(graph.needs(0, Topic::Cloud) && !graph.needs(0, Topic::Scan));
         for (topic_seq, flags) in [(4, Cloud::LAST), (5, Cloud::FIRST), (6, 0), (7, Cloud::LAST)] {
             let cloud = Cloud::of(CloudHead { flags, ..CloudHead::default() }, &[CloudPoint::default(); 3]);
             let header = Header { topic_seq, ..header(topic_seq) };
             graph.sample(0, &sample(&header, PayloadRef::Cloud(&cloud)), at(0));
         }
-        let told = handed(&mut graph);
-        assert_eq!(names(&told), ["/front/cloud"]);
+        let messages = take_messages(&mut graph);
+        assert_eq!(names(&messages), ["/front/cloud"]);
         assert_eq!(
-            (told[0].1.number("width"), told[0].1.text("header.frame_id")),
+            (messages[0].1.number("width"), messages[0].1.text("header.frame_id")),
             (Some(9.0), Some("base_link"))
         );
-        assert_eq!(told[0].1.number("header.stamp.nanosec"), Some(7.0));
+        assert_eq!(messages[0].1.number("header.stamp.nanosec"), Some(7.0));
     }
 
     #[test]
-    fn people_of_a_tracker_are_shapes_and_poses_in_its_map() {
-        let mut graph = Graph::new(Names::default(), false);
+    fn people_become_markers_and_poses_in_the_map() {
+        let mut graph = Graph::new(RosNames::default(), false);
         graph.follow("house", &|topic| {
-            (topic.maker() == scanhub_schema::Maker::Tracker).then_some(NonZeroU64::MIN)
+            (topic.publisher_kind() == scanhub_schema::PublisherKind::Tracker).then_some(NonZeroU64::MIN)
         });
-        assert!(graph.wants(0, Topic::Tracks) && !graph.wants(0, Topic::Scan));
+        assert!(graph.needs(0, Topic::Tracks) && !graph.needs(0, Topic::Scan));
         let topics: Vec<_> = graph.topics().iter().map(|topic| (&*topic.name, topic.of)).collect();
         assert_eq!(
             topics,
@@ -693,14 +703,14 @@ mod tests {
         let mut tracks = Tracks::default();
         tracks.push(Track { id: 5, state: TrackState::Confirmed as u8, x_m: 2.0, ..Track::default() });
         graph.sample(0, &sample(&header(1), PayloadRef::Tracks(&tracks)), at(101 * SECOND_NS));
-        let told = handed(&mut graph);
-        assert_eq!(names(&told), ["/house/tracks", "/house/poses"]);
+        let messages = take_messages(&mut graph);
+        assert_eq!(names(&messages), ["/house/tracks", "/house/poses"]);
         assert_eq!(
-            (told[0].1.text("markers.1.text"), told[0].1.text("markers.1.header.frame_id")),
+            (messages[0].1.text("markers.1.text"), messages[0].1.text("markers.1.header.frame_id")),
             (Some("5"), Some("house"))
         );
         assert_eq!(
-            (told[1].1.number("poses.0.position.x"), told[1].1.text("header.frame_id")),
+            (messages[1].1.number("poses.0.position.x"), messages[1].1.text("header.frame_id")),
             (Some(2.0), Some("house"))
         );
     }

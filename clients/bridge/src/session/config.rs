@@ -3,13 +3,13 @@
 
 use std::path::Path;
 
-use scanhub_files::regular;
+use scanhub_files::regular_file;
 use scanhub_schema::{Failure, Kind};
 use x509_parser::pem::Pem;
 use zenoh::Config;
 use zenoh::config::{EndPoint, WhatAmI};
 
-use super::log::without_places;
+use super::log::without_locations;
 use crate::BridgeOptions;
 
 /// A valid configuration.
@@ -49,7 +49,7 @@ const LIMITS: &[(&str, &str)] = &[
 /// A client has one link. It waits as long as a link without data lives (10 s), so that it drops nothing unless the
 /// link breaks. A longer wait would delay the end of a dead link, because the wait holds a lock of Zenoh. A router may
 /// have many links, and one that stalls must not delay the others.
-const WAIT: [(&str, [&str; 2]); 2] = [
+const WAIT_SETTINGS: [(&str, [&str; 2]); 2] = [
     ("transport/link/tx/queue/congestion_control/drop/wait_before_drop", ["10000000", "1000000"]),
     ("transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments", ["0", "2000000"]),
 ];
@@ -85,30 +85,32 @@ impl CheckedConfig {
     /// there is neither a router nor an address to listen on, or if a certificate has expired.
     pub(crate) fn read(options: &BridgeOptions, now_s: i64) -> Result<CheckedConfig, Failure> {
         let mut config = options.config.as_deref().map_or_else(|| Ok(Config::default()), read)?;
-        let unsaid = Config::default();
-        let is_said = |config: &Config, key: &str| config.get_json(key).ok() != unsaid.get_json(key).ok();
-        let listens_by_itself = !is_said(&config, "listen/endpoints");
-        let said = config.get_json("mode").ok().and_then(|said| serde_json::from_str::<WhatAmI>(&said).ok());
-        let mode = match said {
+        let defaults = Config::default();
+        let is_set = |config: &Config, key: &str| config.get_json(key).ok() != defaults.get_json(key).ok();
+        let uses_default_endpoints = !is_set(&config, "listen/endpoints");
+        let configured =
+            config.get_json("mode").ok().and_then(|text| serde_json::from_str::<WhatAmI>(&text).ok());
+        let mode = match configured {
             _ if !options.listen.is_empty() => WhatAmI::Router,
             Some(mode) => mode,
             None => WhatAmI::Client,
         };
         set(&mut config, "mode", &format!("{:?}", mode.to_str()));
-        let mut listen = if listens_by_itself { Vec::new() } else { endpoints(&config, "listen", mode) };
-        listen.extend(checked("--listen", &options.listen)?);
+        let mut listen = if uses_default_endpoints { Vec::new() } else { endpoints(&config, "listen", mode) };
+        listen.extend(check_endpoints("--listen", &options.listen)?);
         let mut connect = endpoints(&config, "connect", mode);
-        connect.extend(checked("--connect", &options.connect)?);
-        let is_silent = config.get_json("scouting/multicast/enabled").is_ok_and(|said| said != "true");
+        connect.extend(check_endpoints("--connect", &options.connect)?);
+        let is_silent = config.get_json("scouting/multicast/enabled").is_ok_and(|text| text != "true");
         if listen.is_empty() && connect.is_empty() && is_silent {
             let hint = "name one (--connect tcp/HOST:7447), or accept connections (--listen tcp/0.0.0.0:7447); \
                         --config FILE can do both";
             return Err(Failure::new(Kind::Configuration, "no router", hint));
         }
         let listens = !listen.is_empty();
-        let waits = WAIT.iter().map(|(key, values)| (*key, values[usize::from(mode != WhatAmI::Client)]));
+        let waits =
+            WAIT_SETTINGS.iter().map(|(key, values)| (*key, values[usize::from(mode != WhatAmI::Client)]));
         for (key, value) in LIMITS.iter().copied().chain(waits) {
-            if !is_said(&config, key) {
+            if !is_set(&config, key) {
                 set(&mut config, key, value);
             }
         }
@@ -116,7 +118,7 @@ impl CheckedConfig {
             let list: Vec<_> = endpoints.iter().map(|endpoint| format!("{endpoint:?}")).collect();
             set(&mut config, key, &format!("[{}]", list.join(",")));
         }
-        let has = |key: &str| is_said(&config, key) || is_said(&config, &format!("{key}_base64"));
+        let has = |key: &str| is_set(&config, key) || is_set(&config, &format!("{key}_base64"));
         let of_tls = listen.iter().find(|endpoint| endpoint.starts_with("tls/"));
         if let Some(endpoint) = of_tls.filter(|_| !has(CERTIFICATE)) {
             let hint =
@@ -145,12 +147,12 @@ impl CheckedConfig {
 }
 
 fn read(path: &Path) -> Result<Config, Failure> {
-    let text = regular::read_text(path, regular::LONGEST).map_err(|error| {
+    let text = regular_file::read_text(path, regular_file::MAX_FILE_BYTES).map_err(|error| {
         let what = format!("--config {}: cannot read it: {error}", path.display());
         Failure::new(Kind::Input, what, "name a file with Zenoh's own configuration (docs/bridge.md)")
     })?;
     Config::from_json5(&text).map_err(|error| {
-        let what = format!("{}: {}", path.display(), without_places(&error.to_string()));
+        let what = format!("{}: {}", path.display(), without_locations(&error.to_string()));
         let hint = "it is Zenoh's own configuration in JSON5: https://zenoh.io/docs/manual/configuration";
         Failure::new(Kind::Configuration, what, hint)
     })
@@ -164,21 +166,21 @@ fn set(config: &mut Config, key: &str, value: &str) {
 
 /// The addresses under `key` that are said for this `mode`.
 fn endpoints(config: &Config, key: &str, mode: WhatAmI) -> Vec<String> {
-    let said = config.get_json(&format!("{key}/endpoints")).unwrap_or_default();
-    let said: serde_json::Value = serde_json::from_str(&said).unwrap_or_default();
-    let said = if said.is_object() { said[mode.to_str()].clone() } else { said };
+    let value = config.get_json(&format!("{key}/endpoints")).unwrap_or_default();
+    let value: serde_json::Value = serde_json::from_str(&value).unwrap_or_default();
+    let value = if value.is_object() { value[mode.to_str()].clone() } else { value };
     let text = |value: &serde_json::Value| value.as_str().map(str::to_owned);
-    said.as_array().map(|all| all.iter().filter_map(text).collect()).unwrap_or_default()
+    value.as_array().map(|all| all.iter().filter_map(text).collect()).unwrap_or_default()
 }
 
-fn checked(flag: &str, texts: &[String]) -> Result<Vec<String>, Failure> {
+fn check_endpoints(flag: &str, texts: &[String]) -> Result<Vec<String>, Failure> {
     let check = |text: &String| {
         let refuse = |why: &str| {
             let hint = "tcp/HOST:PORT or tls/HOST:PORT, for example tcp/192.0.2.7:7447";
             Failure::new(Kind::Configuration, format!("{flag} {text}: {why}"), hint)
         };
         let endpoint: EndPoint =
-            text.parse().map_err(|error| refuse(&without_places(&format!("{error}"))))?;
+            text.parse().map_err(|error| refuse(&without_locations(&format!("{error}"))))?;
         match endpoint.protocol().as_str() {
             "tcp" | "tls" => Ok(text.clone()),
             other => Err(refuse(&format!("{other} is not built in"))),
@@ -188,12 +190,13 @@ fn checked(flag: &str, texts: &[String]) -> Result<Vec<String>, Failure> {
 }
 
 fn check_file(config: &Config, key: &str, content: Content, now_s: i64) -> Result<(), Failure> {
-    let said = config.get_json(key).ok().and_then(|said| serde_json::from_str::<Option<String>>(&said).ok());
-    let Some(path) = said.flatten() else { return Ok(()) };
+    let configured =
+        config.get_json(key).ok().and_then(|text| serde_json::from_str::<Option<String>>(&text).ok());
+    let Some(path) = configured.flatten() else { return Ok(()) };
     let refuse = |why: String, remedy: &str| {
         Failure::new(Kind::Configuration, format!("{key}: {path}: {why}"), remedy)
     };
-    let text = regular::read(Path::new(&path), regular::LONGEST)
+    let text = regular_file::read(Path::new(&path), regular_file::MAX_FILE_BYTES)
         .map_err(|error| refuse(format!("cannot read it: {error}"), "see --config"))?;
     match content {
         Content::Trusted => check_trusted(&text, now_s),
@@ -201,70 +204,73 @@ fn check_file(config: &Config, key: &str, content: Content, now_s: i64) -> Resul
         Content::Key => check_key(&text),
         Content::Users => Ok(()),
     }
-    .map_err(|Unusable { why, remedy }| refuse(why, remedy))
+    .map_err(|UnusableFile { reason: why, remedy }| refuse(why, remedy))
 }
 
 /// Reason why the file of a certificate or key cannot be used. The files are checked before Zenoh opens them: it does
 /// that only when it connects, and reports an expired certificate with the message of the other side.
-struct Unusable {
-    why: String,
+struct UnusableFile {
+    reason: String,
     remedy: &'static str,
 }
 
 /// Checks that the first certificate in `text`, which this machine shows, is valid `now_s` seconds after 1970.
-fn check_own(text: &[u8], now_s: i64) -> Result<(), Unusable> {
-    judge(&certificates(text)?[0], now_s)
+fn check_own(text: &[u8], now_s: i64) -> Result<(), UnusableFile> {
+    check_validity(&certificates(text)?[0], now_s)
 }
 
 /// Checks that one of the certificates in `text`, which this machine trusts, is valid `now_s` seconds after 1970. A
 /// list may have expired ones.
-fn check_trusted(text: &[u8], now_s: i64) -> Result<(), Unusable> {
+fn check_trusted(text: &[u8], now_s: i64) -> Result<(), UnusableFile> {
     let certificates = certificates(text)?;
-    let is_good = certificates[1..].iter().any(|block| judge(block, now_s).is_ok());
-    judge(&certificates[0], now_s).or_else(|unusable| if is_good { Ok(()) } else { Err(unusable) })
+    let is_good = certificates[1..].iter().any(|block| check_validity(block, now_s).is_ok());
+    check_validity(&certificates[0], now_s).or_else(|unusable| if is_good { Ok(()) } else { Err(unusable) })
 }
 
 /// Checks that `text` has a private key.
-fn check_key(text: &[u8]) -> Result<(), Unusable> {
+fn check_key(text: &[u8]) -> Result<(), UnusableFile> {
     if blocks(text)?.iter().any(|block| block.label.ends_with("PRIVATE KEY")) {
         return Ok(());
     }
-    Err(Unusable { why: "there is no private key in it".into(), remedy: NO_PEM })
+    Err(UnusableFile { reason: "there is no private key in it".into(), remedy: NO_PEM })
 }
 
 /// Remedy for a file without the certificate or key that it must have.
 const NO_PEM: &str = "it has to be a file in PEM, as openssl writes it (docs/bridge.md)";
 
 /// Returns the certificates in `text`, at least one.
-fn certificates(text: &[u8]) -> Result<Vec<Pem>, Unusable> {
+fn certificates(text: &[u8]) -> Result<Vec<Pem>, UnusableFile> {
     let mut blocks = blocks(text)?;
     blocks.retain(|block| block.label == "CERTIFICATE");
     if blocks.is_empty() {
-        return Err(Unusable { why: "there is no certificate in it".into(), remedy: NO_PEM });
+        return Err(UnusableFile { reason: "there is no certificate in it".into(), remedy: NO_PEM });
     }
     Ok(blocks)
 }
 
-fn judge(block: &Pem, now_s: i64) -> Result<(), Unusable> {
+fn check_validity(block: &Pem, now_s: i64) -> Result<(), UnusableFile> {
     let certificate = block.parse_x509().map_err(|error| {
         let why = format!("it has a certificate that cannot be read: {error}");
-        Unusable { why, remedy: NO_PEM }
+        UnusableFile { reason: why, remedy: NO_PEM }
     })?;
-    let (validity, who) = (certificate.validity(), certificate.subject());
+    let (validity, subject) = (certificate.validity(), certificate.subject());
     if now_s > validity.not_after.timestamp() {
-        let why = format!("the certificate of {who} expired at {}", validity.not_after);
-        return Err(Unusable { why, remedy: "renew it, as docs/bridge.md shows" });
+        let why = format!("the certificate of {subject} expired at {}", validity.not_after);
+        return Err(UnusableFile { reason: why, remedy: "renew it, as docs/bridge.md shows" });
     }
     if now_s < validity.not_before.timestamp() {
-        let why = format!("the certificate of {who} is not valid before {}", validity.not_before);
-        return Err(Unusable { why, remedy: "set the clock of this machine, or of the one that made it" });
+        let why = format!("the certificate of {subject} is not valid before {}", validity.not_before);
+        return Err(UnusableFile {
+            reason: why,
+            remedy: "set the clock of this machine, or of the one that made it",
+        });
     }
     Ok(())
 }
 
-fn blocks(text: &[u8]) -> Result<Vec<Pem>, Unusable> {
+fn blocks(text: &[u8]) -> Result<Vec<Pem>, UnusableFile> {
     let blocks: Result<Vec<Pem>, _> = Pem::iter_from_buffer(text).collect();
-    blocks.map_err(|error| Unusable { why: format!("it cannot be read: {error}"), remedy: NO_PEM })
+    blocks.map_err(|error| UnusableFile { reason: format!("it cannot be read: {error}"), remedy: NO_PEM })
 }
 
 #[cfg(test)]
@@ -287,59 +293,62 @@ mod tests {
         }
     }
 
-    fn said(prepared: &CheckedConfig, key: &str) -> String {
+    fn json_value(prepared: &CheckedConfig, key: &str) -> String {
         prepared.config.get_json(key).unwrap()
     }
 
     /// What becomes of a file with this `text`.
-    fn of_file(name: &str, text: &str, connect: &[&str]) -> Result<CheckedConfig, Failure> {
+    fn read_file(name: &str, text: &str, connect: &[&str]) -> Result<CheckedConfig, Failure> {
         let file = tempfile::Builder::new().suffix(name).tempfile().unwrap();
         std::fs::write(&file, text).unwrap();
         CheckedConfig::read(&options(connect, &[], Some(file.path())), NOW_S)
     }
 
     #[test]
-    fn nothing_listens_or_is_looked_for_unless_it_was_said() {
+    fn neither_listens_nor_scouts_unless_configured() {
         let client = CheckedConfig::read(&options(&["tcp/127.0.0.1:7447"], &[], None), NOW_S).unwrap();
-        assert_eq!(said(&client, "mode"), r#""client""#);
-        assert_eq!(said(&client, "listen/endpoints"), "[]");
-        assert_eq!(said(&client, "connect/endpoints"), r#"["tcp/127.0.0.1:7447"]"#);
+        assert_eq!(json_value(&client, "mode"), r#""client""#);
+        assert_eq!(json_value(&client, "listen/endpoints"), "[]");
+        assert_eq!(json_value(&client, "connect/endpoints"), r#"["tcp/127.0.0.1:7447"]"#);
         let router = CheckedConfig::read(&options(&[], &["tcp/127.0.0.1:0"], None), NOW_S).unwrap();
-        assert_eq!((said(&router, "mode"), router.listens()), (r#""router""#.into(), true));
+        assert_eq!((json_value(&router, "mode"), router.listens()), (r#""router""#.into(), true));
         for (prepared, wait) in [(&client, 0), (&router, 1)] {
             for (key, value) in LIMITS.iter().filter(|(key, _)| *key != "connect/retry") {
-                assert_eq!(said(prepared, key), *value, "{key}");
+                assert_eq!(json_value(prepared, key), *value, "{key}");
             }
-            for (key, values) in WAIT {
-                assert_eq!(said(prepared, key), values[wait], "{key}");
+            for (key, values) in WAIT_SETTINGS {
+                assert_eq!(json_value(prepared, key), values[wait], "{key}");
             }
         }
-        let nobody = CheckedConfig::read(&options(&[], &[], None), NOW_S).unwrap_err();
-        assert!(nobody.kind == Kind::Configuration && nobody.hint.contains("--listen"), "{nobody}");
+        let failure = CheckedConfig::read(&options(&[], &[], None), NOW_S).unwrap_err();
+        assert!(failure.kind == Kind::Configuration && failure.hint.contains("--listen"), "{failure}");
     }
 
     #[test]
-    fn what_the_file_says_stands_and_flags_are_added() {
+    fn file_settings_are_kept_and_flags_add_endpoints() {
         let text = "{ connect: { endpoints: ['tcp/10.0.0.1:1'] }, transport: { link: { tx: { batch_size: 4096 } } } }";
-        let read = of_file("adds", text, &["tcp/10.0.0.2:2"]).unwrap();
-        assert_eq!(said(&read, "connect/endpoints"), r#"["tcp/10.0.0.1:1","tcp/10.0.0.2:2"]"#);
+        let read = read_file("adds", text, &["tcp/10.0.0.2:2"]).unwrap();
+        assert_eq!(json_value(&read, "connect/endpoints"), r#"["tcp/10.0.0.1:1","tcp/10.0.0.2:2"]"#);
         assert_eq!(
-            (said(&read, "transport/link/tx/batch_size"), said(&read, "mode")),
+            (json_value(&read, "transport/link/tx/batch_size"), json_value(&read, "mode")),
             ("4096".into(), r#""client""#.into())
         );
         let peer =
-            of_file("peer", "{ mode: 'peer', scouting: { multicast: { enabled: true } } }", &[]).unwrap();
-        assert_eq!((said(&peer, "mode"), said(&peer, "listen/endpoints")), (r#""peer""#.into(), "[]".into()));
-        assert_eq!(said(&peer, "scouting/multicast/enabled"), "true");
+            read_file("peer", "{ mode: 'peer', scouting: { multicast: { enabled: true } } }", &[]).unwrap();
+        assert_eq!(
+            (json_value(&peer, "mode"), json_value(&peer, "listen/endpoints")),
+            (r#""peer""#.into(), "[]".into())
+        );
+        assert_eq!(json_value(&peer, "scouting/multicast/enabled"), "true");
     }
 
     #[test]
-    fn what_cannot_be_is_refused_by_its_place() {
+    fn impossible_configurations_are_refused() {
         let kind = |read: Result<CheckedConfig, Failure>| read.map(drop).map_err(|failure| failure.kind);
         let missing = CheckedConfig::read(&options(&[], &[], Some(Path::new("/nowhere/zenoh.json5"))), NOW_S);
         assert_eq!(kind(missing), Err(Kind::Input));
         for text in ["{ mode: 'king' }", "{ mode: ", "{ no_such_key: 1 }"] {
-            let failure = of_file("wrong", text, &["tcp/10.0.0.1:1"]).unwrap_err();
+            let failure = read_file("wrong", text, &["tcp/10.0.0.1:1"]).unwrap_err();
             assert!(
                 failure.kind == Kind::Configuration && failure.message.contains("wrong"),
                 "{text}: {failure}"
@@ -355,7 +364,7 @@ mod tests {
             );
         }
         let text = "{ transport: { link: { tls: { root_ca_certificate: '/nowhere/ca.pem' } } } }";
-        let failure = of_file("ca", text, &["tls/10.0.0.1:1"]).unwrap_err();
+        let failure = read_file("ca", text, &["tls/10.0.0.1:1"]).unwrap_err();
         assert_eq!(failure.kind, Kind::Configuration);
         assert!(
             failure.message.contains("/nowhere/ca.pem") && failure.message.contains("root_ca"),
@@ -370,8 +379,8 @@ mod tests {
     const DAY_S: i64 = 86_400;
 
     #[test]
-    fn a_certificate_is_good_from_its_first_to_its_last_second() {
-        let refused = |now_s| check_own(CERTIFICATE, now_s).err().map(|unusable| unusable.why);
+    fn certificate_is_valid_from_first_to_last_second() {
+        let refused = |now_s| check_own(CERTIFICATE, now_s).err().map(|unusable| unusable.reason);
         assert_eq!([SINCE_S, SINCE_S + DAY_S].map(refused), [None, None]);
         let expired = refused(SINCE_S + DAY_S + 1).unwrap();
         assert_eq!(expired, "the certificate of CN=robot expired at Jan  2 00:00:00 2026 +00:00");
@@ -380,8 +389,8 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_certificate_or_no_key_is_told() {
-        let why = |unusable: Result<(), Unusable>| unusable.err().map(|unusable| unusable.why);
+    fn missing_certificates_and_keys_are_reported() {
+        let why = |unusable: Result<(), UnusableFile>| unusable.err().map(|unusable| unusable.reason);
         assert_eq!(why(check_key(CERTIFICATE)).as_deref(), Some("there is no private key in it"));
         let key = b"-----BEGIN PRIVATE KEY-----\nAAAA\n-----END PRIVATE KEY-----\n";
         assert_eq!(why(check_key(key)), None);

@@ -17,38 +17,39 @@ pub(super) struct Log(Arc<Mutex<Lines>>);
 struct Lines {
     waiting: VecDeque<String>,
     /// The last ones that were told or wait, so that they are told once.
-    known: VecDeque<String>,
+    recent: VecDeque<String>,
     count: u64,
 }
 
 /// Lines that wait or are known: whoever can connect can cause them.
-const MOST: usize = 16;
+const MAX_LINES: usize = 16;
 /// The longest line, in bytes.
-const LONGEST: usize = 500;
+const MAX_LINE_LEN: usize = 500;
 
 /// Text after which a line differs in each attempt (the time until the next one, the local port), or has advice for the
 /// wrong system, and how much of that text is kept.
-const CUT: [(&str, usize); 3] = [(" Retry in ", 0), ("Syn on: ", 3), (" Hint: increase the system", 0)];
+const CUT_MARKERS: [(&str, usize); 3] =
+    [(" Retry in ", 0), ("Syn on: ", 3), (" Hint: increase the system", 0)];
 /// What Zenoh writes behind addresses, because this program told it so (`config.rs`).
 const OUR_LIMIT: &str = "#so_sndbuf=8192";
 
 /// What Zenoh tells at the level of debugging only: where it is from, and how it begins. Why a connection that was lost does not
 /// come again, and why one that somebody else began was refused.
-const QUIET: [(&str, &str); 3] = [
+const QUIET_MESSAGES: [(&str, &str); 3] = [
     ("zenoh::net::runtime::orchestrator", "Unable to connect"),
     ("zenoh_link_tls::unicast", "Can not accept"),
     ("zenoh_transport::unicast::establishment::accept", ""),
 ];
 /// Begin of Zenoh's line about a link that it closes because it has no room. Such a connection was not refused.
-const CLOSED: &str = "Unable to push";
+const CLOSED_MESSAGE: &str = "Unable to push";
 /// How it tells of one that it did not refuse.
-const ACCEPTED: &str = "New transport";
+const ACCEPTED_MESSAGE: &str = "New transport";
 
 impl Log {
     /// Takes what is logged from now on. In a process that has somebody else for that, nothing comes.
     pub(super) fn install() -> Log {
         let log = Log::default();
-        let _ = tracing::subscriber::set_global_default(Taker(log.clone()));
+        let _ = tracing::subscriber::set_global_default(LogSubscriber(log.clone()));
         log
     }
 
@@ -67,51 +68,51 @@ impl Log {
     }
 
     fn add(&self, line: &str) {
-        let end = CUT.iter().filter_map(|(sign, len)| Some(line.find(sign)? + len)).min();
-        let mut line = without_places(&line[..end.unwrap_or(line.len())]).replace(OUR_LIMIT, "");
-        let end = line.char_indices().map(|(at, _)| at).find(|at| *at + 4 > LONGEST);
+        let end = CUT_MARKERS.iter().filter_map(|(sign, len)| Some(line.find(sign)? + len)).min();
+        let mut line = without_locations(&line[..end.unwrap_or(line.len())]).replace(OUR_LIMIT, "");
+        let end = line.char_indices().map(|(at, _)| at).find(|at| *at + 4 > MAX_LINE_LEN);
         line.truncate(end.unwrap_or(line.len()));
         let mut lines = self.lines();
-        lines.count += u64::from(!line.starts_with(CLOSED));
-        if lines.known.contains(&line) {
+        lines.count += u64::from(!line.starts_with(CLOSED_MESSAGE));
+        if lines.recent.contains(&line) {
             return;
         }
-        if lines.known.len() == MOST {
-            lines.known.pop_front();
+        if lines.recent.len() == MAX_LINES {
+            lines.recent.pop_front();
         }
-        if lines.waiting.len() == MOST {
+        if lines.waiting.len() == MAX_LINES {
             lines.waiting.pop_front();
         }
-        lines.known.push_back(line.clone());
+        lines.recent.push_back(line.clone());
         lines.waiting.push_back(line);
     }
 }
 
 /// `line` without the places in Zenoh's own files of which its errors tell, ` at PATH.rs:LINE`.
-pub(super) fn without_places(line: &str) -> String {
+pub(super) fn without_locations(line: &str) -> String {
     let mut kept = String::with_capacity(line.len());
-    let mut rest = line;
-    while let Some(at) = rest.find(" at ") {
-        let (before, place) = rest.split_at(at);
-        let word = place[4..].split([' ', ']', ')']).next().unwrap_or_default();
+    let mut remainder = line;
+    while let Some(at) = remainder.find(" at ") {
+        let (before, after) = remainder.split_at(at);
+        let word = after[4..].split([' ', ']', ')']).next().unwrap_or_default();
         kept.push_str(before);
         if !word.contains(".rs:") {
             kept.push_str(" at ");
-            rest = &place[4..];
+            remainder = &after[4..];
             continue;
         }
-        rest = &place[4 + word.len()..];
+        remainder = &after[4 + word.len()..];
     }
-    kept.push_str(rest);
+    kept.push_str(remainder);
     kept
 }
 
-struct Taker(Log);
+struct LogSubscriber(Log);
 
-impl Subscriber for Taker {
+impl Subscriber for LogSubscriber {
     fn enabled(&self, metadata: &Metadata<'_>) -> bool {
         let is_zenoh = metadata.target().starts_with("zenoh");
-        let is_quiet = QUIET.iter().any(|(target, _)| metadata.target() == *target);
+        let is_quiet = QUIET_MESSAGES.iter().any(|(target, _)| metadata.target() == *target);
         let level = *metadata.level();
         metadata.is_event() && is_zenoh && (level <= Level::WARN || is_quiet && level == Level::DEBUG)
     }
@@ -125,14 +126,14 @@ impl Subscriber for Taker {
     fn record_follows_from(&self, _: &Id, _: &Id) {}
 
     fn event(&self, event: &Event<'_>) {
-        let mut message = Message(String::new());
+        let mut message = MessageText(String::new());
         event.record(&mut message);
-        let is_wanted = |(target, begin): &(&str, &str)| {
+        let is_relevant = |(target, begin): &(&str, &str)| {
             event.metadata().target() == *target
                 && message.0.starts_with(begin)
-                && !message.0.starts_with(ACCEPTED)
+                && !message.0.starts_with(ACCEPTED_MESSAGE)
         };
-        if *event.metadata().level() <= Level::WARN || QUIET.iter().any(is_wanted) {
+        if *event.metadata().level() <= Level::WARN || QUIET_MESSAGES.iter().any(is_relevant) {
             self.0.add(&message.0);
         }
     }
@@ -143,9 +144,9 @@ impl Subscriber for Taker {
 }
 
 /// The text of an event.
-struct Message(String);
+struct MessageText(String);
 
-impl Visit for Message {
+impl Visit for MessageText {
     fn record_debug(&mut self, field: &Field, value: &dyn Debug) {
         if field.name() == "message" {
             let _ = write!(self.0, "{value:?}");
@@ -161,11 +162,11 @@ mod tests {
     fn places_in_other_peoples_files_are_left_out() {
         let line =
             "no link: [host: refused (error 111) at /a/b-1.0/tcp.rs:105.] at /a/c.rs:1. at noon. Retry";
-        assert_eq!(without_places(line), "no link: [host: refused (error 111)] at noon. Retry");
+        assert_eq!(without_locations(line), "no link: [host: refused (error 111)] at noon. Retry");
     }
 
     #[test]
-    fn a_line_is_told_once_and_a_flood_takes_no_memory() {
+    fn repeated_lines_are_merged_and_a_flood_is_bounded() {
         let log = Log::default();
         log.add("no route");
         log.add("no route");
@@ -187,7 +188,7 @@ mod tests {
         assert_eq!(log.take(), ["a close message in response to an OpenSyn"]);
         (0..1000).for_each(|n| log.add(&format!("{n} {}", "é".repeat(1000))));
         let lines = log.take();
-        assert!(lines.len() == MOST && lines.iter().all(|line| line.len() <= LONGEST), "{lines:?}");
+        assert!(lines.len() == MAX_LINES && lines.iter().all(|line| line.len() <= MAX_LINE_LEN), "{lines:?}");
         assert!(lines.last().is_some_and(|line| line.starts_with("999 ")));
     }
 }

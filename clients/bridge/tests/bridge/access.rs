@@ -3,28 +3,28 @@
 use std::process::Command;
 
 use crate::testkit::{INT, Program, TestEnv, output};
-use crate::{address, bridge, lonely, refused};
+use crate::{address, bridge, bridge_without_peer, refusal_count};
 
 /// Runs `openssl` in the directory of this test.
-fn openssl(env: &TestEnv, words: &str) {
+fn run_openssl(env: &TestEnv, words: &str) {
     let output = output(Command::new("openssl").args(words.split(' ')).current_dir(env.path("")));
     let output = output.expect("openssl is installed");
     assert!(output.status.success(), "openssl {words}: {}", String::from_utf8_lossy(&output.stderr));
 }
 
 /// An authority called `ca`, and a certificate of it for the loopback called `name`.
-fn certificates(env: &TestEnv, ca: &str, names: &[&str]) {
-    openssl(
+fn make_certificates(env: &TestEnv, ca: &str, names: &[&str]) {
+    run_openssl(
         env,
         &format!("req -x509 -newkey rsa:2048 -nodes -keyout {ca}.key -out {ca}.pem -days 2 -subj /CN={ca}"),
     );
     env.file("ext", "subjectAltName=IP:127.0.0.1,DNS:localhost\nextendedKeyUsage=serverAuth,clientAuth\n");
     for name in names {
-        openssl(
+        run_openssl(
             env,
             &format!("req -newkey rsa:2048 -nodes -keyout {name}.key -out {name}.csr -subj /CN={name}"),
         );
-        openssl(
+        run_openssl(
             env,
             &format!(
                 "x509 -req -in {name}.csr -CA {ca}.pem -CAkey {ca}.key -CAcreateserial -out {name}.pem -days 2 -extfile ext"
@@ -35,7 +35,7 @@ fn certificates(env: &TestEnv, ca: &str, names: &[&str]) {
 
 /// A file of Zenoh's configuration: mutual TLS by the authority `ca` with the certificate `own`.
 fn tls(env: &TestEnv, file: &str, ca: &str, own: &str) -> String {
-    let path = |name: &str| env.word(name);
+    let path = |name: &str| env.path_argument(name);
     let (ca, certificate, key) =
         (path(&format!("{ca}.pem")), path(&format!("{own}.pem")), path(&format!("{own}.key")));
     env.file(
@@ -48,12 +48,12 @@ fn tls(env: &TestEnv, file: &str, ca: &str, own: &str) -> String {
     )
 }
 
-fn is_up(program: &mut Program) {
-    crate::linked(program);
+fn await_ready(program: &mut Program) {
+    crate::wait_until_linked(program);
 }
 
 /// Waits until it says why it is not connected, in these words, and what to do.
-fn reason(program: &mut Program, finding: &str) {
+fn await_finding(program: &mut Program, finding: &str) {
     let line = program.await_line("the reason", |line| {
         line["class"] == "bridge_link" && line["state"] == "failing" && line["finding"] == finding
     });
@@ -61,36 +61,36 @@ fn reason(program: &mut Program, finding: &str) {
 }
 
 /// What `doctor` and `bridge --check` find with this address and configuration: the same, and end so.
-fn checked(env: &TestEnv, at: &str, config: &str) -> String {
+fn check_finding(env: &TestEnv, at: &str, config: &str) -> String {
     let doctor = env.run(&["doctor", "--json", "--bridge", at, "--bridge-config", config]);
-    assert_eq!(doctor.code, Some(5), "{doctor}");
+    assert_eq!(doctor.exit_code, Some(5), "{doctor}");
     let found = doctor.of_class("check").into_iter().find(|line| line["name"] == "bridge");
-    let said = found.unwrap_or_else(|| panic!("nothing of the bridge: {doctor}"))["finding"].to_string();
+    let finding = found.unwrap_or_else(|| panic!("nothing of the bridge: {doctor}"))["finding"].to_string();
     let outcome = env.run(&["bridge", "--check", "--json", "--connect", at, "--config", config]);
-    assert_eq!(outcome.code, Some(5), "{outcome}");
-    assert_eq!(outcome.of_class("bridge_check")[0]["finding"].to_string(), said);
-    said
+    assert_eq!(outcome.exit_code, Some(5), "{outcome}");
+    assert_eq!(outcome.of_class("bridge_check")[0]["finding"].to_string(), finding);
+    finding
 }
 
 #[test]
-fn who_has_a_certificate_of_the_authority_is_connected_and_nobody_else() {
+fn only_certificates_of_the_authority_can_connect() {
     let (env, other) = (TestEnv::new(), TestEnv::new());
-    certificates(&env, "ca", &["robot", "desk"]);
-    certificates(&env, "stranger", &["thief"]);
+    make_certificates(&env, "ca", &["robot", "desk"]);
+    make_certificates(&env, "stranger", &["thief"]);
     let at = address("tls");
     let of = |file: &str, ca: &str, own: &str| tls(&env, file, ca, own);
     let (mut robot, _) = bridge(&env, &["--listen", &at, "--config", &of("robot.json5", "ca", "robot")]);
     let desk = of("desk.json5", "ca", "desk");
     let (mut here, _) = bridge(&other, &["--connect", &at, "--publish", "--config", &desk]);
-    is_up(&mut here);
-    is_up(&mut robot);
-    assert_eq!(here.end(INT).code, Some(0));
+    await_ready(&mut here);
+    await_ready(&mut robot);
+    assert_eq!(here.end(INT).exit_code, Some(0));
     // One that does not know the robot's authority, and one that the robot does not know.
     for (file, ca) in [("a.json5", "stranger"), ("b.json5", "ca")] {
         let config = of(file, ca, "thief");
-        let mut thief = lonely(&other, &["--connect", &at, "--publish", "--config", &config]);
-        reason(&mut thief, "the certificates do not fit");
-        assert_eq!(thief.end(INT).of_class("bridge_published").len(), 0);
+        let mut intruder = bridge_without_peer(&other, &["--connect", &at, "--publish", "--config", &config]);
+        await_finding(&mut intruder, "the certificates do not fit");
+        assert_eq!(intruder.end(INT).of_class("bridge_published").len(), 0);
     }
     // The robot only sends. It reports what its peers need, and counts them.
     let line = robot.await_line("the refusal", |line| {
@@ -103,7 +103,7 @@ fn who_has_a_certificate_of_the_authority_is_connected_and_nobody_else() {
         line["class"] == "bridge_refused" && line["connection"].as_u64() > Some(0)
     });
     let outcome = robot.end(INT);
-    assert!(refused(&outcome, "connection") > 0, "{outcome}");
+    assert!(refusal_count(&outcome, "connection") > 0, "{outcome}");
     let outcome = other.run(&[
         "bridge",
         "--json",
@@ -112,11 +112,11 @@ fn who_has_a_certificate_of_the_authority_is_connected_and_nobody_else() {
         "--config",
         &other.file("none.json5", "{ transport: { link: { tls: { root_ca_certificate: '/nowhere' } } } }"),
     ]);
-    assert_eq!(outcome.code, Some(78), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(78), "{outcome}");
 }
 
 #[test]
-fn who_does_not_know_the_password_is_refused() {
+fn wrong_or_missing_password_is_refused() {
     let (env, other) = (TestEnv::new(), TestEnv::new());
     let users = env.file("users", "robot:secret\ndesk:word\n");
     let auth = |file: &str, user: &str, password: &str, more: &str| {
@@ -130,26 +130,26 @@ fn who_does_not_know_the_password_is_refused() {
     let (mut robot, _) = bridge(&env, &["--listen", &at, "--config", &listens]);
     let (mut here, _) =
         bridge(&other, &["--connect", &at, "--publish", "--config", &auth("desk.json5", "desk", "word", "")]);
-    is_up(&mut here);
-    is_up(&mut robot);
-    assert_eq!(here.end(INT).code, Some(0));
+    await_ready(&mut here);
+    await_ready(&mut robot);
+    assert_eq!(here.end(INT).exit_code, Some(0));
     let wrong = [
         (auth("guess.json5", "desk", "guess", ""), "the user or the password is refused"),
         (auth("nobody.json5", "nobody", "word", ""), "the user or the password is refused"),
         (env.file("none.json5", "{}"), "the router wants a user and a password"),
     ];
     for (config, finding) in &wrong {
-        let mut thief = lonely(&other, &["--connect", &at, "--publish", "--config", config]);
-        reason(&mut thief, finding);
-        let outcome = thief.end(INT);
-        assert_eq!((outcome.code, outcome.of_class("bridge_ready").len()), (Some(0), 0), "{outcome}");
+        let mut intruder = bridge_without_peer(&other, &["--connect", &at, "--publish", "--config", config]);
+        await_finding(&mut intruder, finding);
+        let outcome = intruder.end(INT);
+        assert_eq!((outcome.exit_code, outcome.of_class("bridge_ready").len()), (Some(0), 0), "{outcome}");
     }
-    assert!(checked(&other, &at, &wrong[0].0).contains(wrong[0].1));
-    reason(&mut robot, "somebody was refused: the user or the password is wrong, or there is none");
+    assert!(check_finding(&other, &at, &wrong[0].0).contains(wrong[0].1));
+    await_finding(&mut robot, "somebody was refused: the user or the password is wrong, or there is none");
 }
 
 /// A certificate of its own authority for CN=robot that was good on one day in 2024.
-fn expired(env: &TestEnv) -> String {
+fn expired_config(env: &TestEnv) -> String {
     env.file("index", "");
     env.file("serial", "01\n");
     env.file(
@@ -157,8 +157,8 @@ fn expired(env: &TestEnv) -> String {
         "[ca]\ndefault_ca=own\n[own]\ndatabase=index\nserial=serial\nnew_certs_dir=.\ndefault_md=sha256\npolicy=any\n\
          [any]\ncommonName=supplied\n",
     );
-    openssl(env, "req -newkey rsa:2048 -nodes -keyout old.key -out old.csr -subj /CN=robot");
-    openssl(
+    run_openssl(env, "req -newkey rsa:2048 -nodes -keyout old.key -out old.csr -subj /CN=robot");
+    run_openssl(
         env,
         "ca -batch -selfsign -config authority.cnf -keyfile old.key -in old.csr -out old.pem -notext \
          -startdate 20240101000000Z -enddate 20240102000000Z",
@@ -167,19 +167,19 @@ fn expired(env: &TestEnv) -> String {
 }
 
 #[test]
-fn a_certificate_that_has_expired_is_told_with_its_date() {
+fn expired_certificate_is_reported_with_its_date() {
     let env = TestEnv::new();
-    let config = expired(&env);
+    let config = expired_config(&env);
     let at = address("tls");
     for flag in ["--listen", "--connect"] {
         let outcome = env.run(&["bridge", "--json", flag, &at, "--config", &config]);
-        assert_eq!(outcome.code, Some(78), "{outcome}");
-        let said = outcome.to_string();
+        assert_eq!(outcome.exit_code, Some(78), "{outcome}");
+        let output = outcome.to_string();
         assert!(
-            said.contains("old.pem") && said.contains("CN=robot expired at Jan  2 00:00:00 2024"),
-            "{said}"
+            output.contains("old.pem") && output.contains("CN=robot expired at Jan  2 00:00:00 2024"),
+            "{output}"
         );
         assert!(outcome.of_class("bridge_ready").is_empty(), "{outcome}");
     }
-    assert!(checked(&env, &at, &config).contains("expired at Jan  2 00:00:00 2024"));
+    assert!(check_finding(&env, &at, &config).contains("expired at Jan  2 00:00:00 2024"));
 }

@@ -1,14 +1,14 @@
 //! Peers that mean harm: whatever they send is refused, counted, and takes no memory; who is honest is heard.
 
-use scanhub_schema::datagram::{HEAD, Head};
+use scanhub_schema::datagram::{HEADER_LEN, Head};
 use scanhub_schema::{State, Status, Topic, Verdict, Zones};
 use zenoh::{Session, Wait};
 
-use crate::testkit::{INT, Program, Sender, TestEnv, number, until};
-use crate::{address, bridge, linked, peer, refused};
+use crate::testkit::{INT, Program, TestEnv, TestGateway, number, wait_until};
+use crate::{address, bridge, open_peer, refusal_count, wait_until_linked};
 
-const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
-const FRONT: &str = "scanhub/5f3a12bc00d1e2f3/front";
+const HUB_ID: u64 = 0x5f3a_12bc_00d1_e2f3;
+const SENSOR_KEY: &str = "scanhub/5f3a12bc00d1e2f3/front";
 
 fn put(session: &Session, key: &str, bytes: &[u8]) {
     use zenoh::qos::CongestionControl;
@@ -16,41 +16,42 @@ fn put(session: &Session, key: &str, bytes: &[u8]) {
 }
 
 /// Memory of its own, in bytes.
-fn resident(program: &Program) -> u64 {
+fn resident_bytes(program: &Program) -> u64 {
     let text = std::fs::read_to_string(format!("/proc/{}/statm", program.pid())).expect("it lives");
     let pages: u64 = text.split(' ').nth(1).and_then(|word| word.parse().ok()).expect("a number");
     pages * 4096
 }
 
 #[test]
-fn what_is_wrong_is_refused_and_who_is_honest_is_heard() {
+fn invalid_datagrams_do_not_block_a_valid_sender() {
     let env = TestEnv::new();
     let at = address("tcp");
     let (mut here, _) = bridge(&env, &["--listen", &at, "--publish", "--name=robot1=5f3a12bc00d1e2f3"]);
-    let session = peer(&at);
-    linked(&mut here);
-    let mut sender = Sender::new(HUB, 7, 0, "front");
+    let session = open_peer(&at);
+    wait_until_linked(&mut here);
+    let mut sender = TestGateway::new(HUB_ID, 7, 0, "front");
     let topics = [Topic::Zones, Topic::Status];
     // Nobody has a name for it before the bridge has heard of it.
-    until("the sensor is published", || {
+    wait_until("the sensor is published", || {
         let bytes = sender.announcement(&topics);
-        put(&session, &format!("{FRONT}/announce"), &bytes);
-        here.is_heard(|line| line["kind"] == "published")
+        put(&session, &format!("{SENSOR_KEY}/announce"), &bytes);
+        here.prints(|line| line["kind"] == "published")
     });
-    let status = sender.make(Topic::Status, &Status { state: State::Streaming as u8, ..Status::default() });
-    put(&session, &format!("{FRONT}/status"), &status);
+    let status =
+        sender.next_datagram(Topic::Status, &Status { state: State::Streaming as u8, ..Status::default() });
+    put(&session, &format!("{SENSOR_KEY}/status"), &status);
     let mut echo = env.echo(&["robot1.front/zones"]);
-    let zones = |sender: &mut Sender, verdict: Verdict| {
-        sender.make(Topic::Zones, &Zones { verdict: verdict as u8, ..Zones::unknown() })
+    let zones = |sender: &mut TestGateway, verdict: Verdict| {
+        sender.next_datagram(Topic::Zones, &Zones { verdict: verdict as u8, ..Zones::unknown() })
     };
-    put(&session, &format!("{FRONT}/zones"), &zones(&mut sender, Verdict::Clear));
+    put(&session, &format!("{SENSOR_KEY}/zones"), &zones(&mut sender, Verdict::Clear));
     echo.await_line("zones", |line| line["class"] == "zones" && line["verdict"] == "clear");
-    let before = resident(&here);
+    let before = resident_bytes(&here);
 
     let good = zones(&mut sender, Verdict::Stop);
     let version = [&good[..4], &[9], &good[5..]].concat();
     let mut broken = good.clone();
-    broken[HEAD] ^= 1;
+    broken[HEADER_LEN] ^= 1;
     let wrong: [(&str, &[u8], &str); 8] = [
         ("zones", b"", "short"),
         ("zones", b"SHUB", "short"),
@@ -62,7 +63,7 @@ fn what_is_wrong_is_refused_and_who_is_honest_is_heard() {
         ("scan", &good, "key"),
     ];
     for (topic, bytes, _) in &wrong {
-        (0..50).for_each(|_| put(&session, &format!("{FRONT}/{topic}"), bytes));
+        (0..50).for_each(|_| put(&session, &format!("{SENSOR_KEY}/{topic}"), bytes));
     }
     // Names of others, names that are none, and a sensor that is called otherwise.
     for key in [
@@ -81,25 +82,25 @@ fn what_is_wrong_is_refused_and_who_is_honest_is_heard() {
     }
     // A flood of what nobody can take so fast.
     for _ in 0..20_000 {
-        put(&session, &format!("{FRONT}/zones"), &broken);
+        put(&session, &format!("{SENSOR_KEY}/zones"), &broken);
     }
     // Who is honest goes on, and announces: it sent for less than a second, and had to make room for others.
-    until("who is honest is heard", || {
-        put(&session, &format!("{FRONT}/announce"), &sender.announcement(&topics));
-        put(&session, &format!("{FRONT}/zones"), &zones(&mut sender, Verdict::Stop));
-        echo.is_heard(|line| line["class"] == "zones" && line["verdict"] == "stop")
+    wait_until("who is honest is heard", || {
+        put(&session, &format!("{SENSOR_KEY}/announce"), &sender.announcement(&topics));
+        put(&session, &format!("{SENSOR_KEY}/zones"), &zones(&mut sender, Verdict::Stop));
+        echo.prints(|line| line["class"] == "zones" && line["verdict"] == "stop")
     });
-    let grown = resident(&here).saturating_sub(before);
+    let grown = resident_bytes(&here).saturating_sub(before);
     assert!(grown < 64 << 20, "{grown} bytes more");
     let outcome = here.end(INT);
-    let overrun = refused(&outcome, "overrun");
+    let overrun = refusal_count(&outcome, "overrun");
     for (_, _, reason) in wrong {
-        assert!(refused(&outcome, reason) > 0, "{reason}: {outcome}");
+        assert!(refusal_count(&outcome, reason) > 0, "{reason}: {outcome}");
     }
-    assert!(refused(&outcome, "key") >= 50 || overrun > 0, "{outcome}");
+    assert!(refusal_count(&outcome, "key") >= 50 || overrun > 0, "{outcome}");
     let sum: u64 = ["short", "magic", "version", "crc", "length", "long", "key", "capacity", "overrun"]
         .iter()
-        .map(|reason| refused(&outcome, reason))
+        .map(|reason| refusal_count(&outcome, reason))
         .sum();
     assert!(sum >= 20_400, "{sum}: {outcome}");
     let published = outcome.of_class("bridge_published");

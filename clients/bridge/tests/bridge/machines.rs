@@ -7,26 +7,29 @@ use scanhub_schema::datagram::Datagram;
 use serde_json::Value;
 use zenoh::Wait;
 
-use crate::testkit::{INT, TestEnv, number, output, succeeds, until, write_program};
-use crate::{NO_FLAGS, account, address, agree, bridge, linked, lonely, peer, refused};
+use crate::testkit::{INT, TestEnv, number, output, succeeds, wait_until, write_program};
+use crate::{
+    NO_FLAGS, address, assert_counters_agree, bridge, bridge_without_peer, final_counters, open_peer,
+    refusal_count, wait_until_linked,
+};
 
 /// By the number of the scan, what `name` saw.
 fn scans(env: &TestEnv, name: &str, count: &str) -> Vec<(u64, Value)> {
     let outcome = env.run(&["echo", name, "--json", "-n", count, "--timeout", "20s"]);
-    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     outcome.of_class("scan").iter().map(|line| (number(line, "seq"), line["ranges"].clone())).collect()
 }
 
 #[test]
-fn what_a_hub_publishes_is_on_the_other_machine_and_nothing_is_lost() {
+fn hub_is_published_on_another_machine_without_loss() {
     let (robot, desk) = (TestEnv::new(), TestEnv::new());
     let _sensor = robot.simulator(&["front"], NO_FLAGS);
     let at = address("tcp");
     let (mut there, id) = bridge(&robot, &["--listen", &at]);
     let (mut here, _) =
         bridge(&desk, &["--connect", &at, "--publish", "--hub=robot1", &format!("--name=robot1={id}")]);
-    linked(&mut here);
-    linked(&mut there);
+    wait_until_linked(&mut here);
+    wait_until_linked(&mut there);
     let hub = robot.hub(&[robot.link("front")]);
     let line = here.await_line("a sensor", |line| line["kind"] == "published");
     assert_eq!(line["sensor"], "robot1.front");
@@ -52,7 +55,7 @@ fn what_a_hub_publishes_is_on_the_other_machine_and_nothing_is_lost() {
     let own = format!("{id}.front");
     late.await_info(&own, |info| info["state"] == "streaming");
     let background = late.run(&["echo", &format!("{own}/background"), "--json", "-n1", "--timeout=20s"]);
-    assert_eq!(background.code, Some(0), "{background}");
+    assert_eq!(background.exit_code, Some(0), "{background}");
 
     // The hub goes: zones are unknown, and its bridge stays for the next one.
     let mut zones = desk.echo(&["robot1.front/zones"]);
@@ -60,17 +63,26 @@ fn what_a_hub_publishes_is_on_the_other_machine_and_nothing_is_lost() {
     zones.await_line("nothing is known", |line| line["class"] == "zones" && line["verdict"] == "unknown");
     let (sent, latest) = (there.end(INT), latest.end(INT));
     let received = here.end(INT);
-    assert_eq!((sent.code, received.code, latest.code), (Some(0), Some(0), Some(0)), "{sent}{received}");
-    assert_eq!(agree(&sent, &received), 0, "{received}");
+    assert_eq!(
+        (sent.exit_code, received.exit_code, latest.exit_code),
+        (Some(0), Some(0), Some(0)),
+        "{sent}{received}"
+    );
+    assert_eq!(assert_counters_agree(&sent, &received), 0, "{received}");
     // Who came late lost nothing: what was sent before does not count.
-    let (all, of_latest) = (account(&sent, &["sent"]), account(&latest, &["received", "lost", "duplicate"]));
+    let (all, of_latest) =
+        (final_counters(&sent, &["sent"]), final_counters(&latest, &["received", "lost", "duplicate"]));
     assert!(of_latest["front/scan"][0] > 0, "{latest}");
     for (name, row) in &of_latest {
         let sent = all.get(name).map_or(0, |sent| sent[0]);
         assert!(row[1] == 0 && row[0] <= sent, "{name}: {row:?} of {all:?}");
     }
     for reason in ["crc", "payload", "key", "long", "overrun", "twin"] {
-        assert_eq!((refused(&received, reason), refused(&latest, reason)), (0, 0), "{reason}: {received}");
+        assert_eq!(
+            (refusal_count(&received, reason), refusal_count(&latest, reason)),
+            (0, 0),
+            "{reason}: {received}"
+        );
     }
 }
 
@@ -89,13 +101,13 @@ fn answers(session: &zenoh::Session, query: &str) -> Vec<String> {
 }
 
 #[test]
-fn a_plain_client_gets_samples_and_every_answer_that_fits_its_query() {
+fn plain_zenoh_client_gets_samples_and_query_replies() {
     let robot = TestEnv::new();
     let _sensors = robot.simulator(&["front", "rear"], NO_FLAGS);
     let at = address("tcp");
     let (mut there, id) = bridge(&robot, &["--listen", &at]);
-    let client = peer(&at);
-    linked(&mut there);
+    let client = open_peer(&at);
+    wait_until_linked(&mut there);
     let hub = robot.hub(&[robot.link("front"), robot.link("rear")]);
     let keys = |names: &[&str]| names.iter().map(|name| format!("scanhub/{id}/{name}")).collect::<Vec<_>>();
     let all = keys(&[
@@ -111,7 +123,7 @@ fn a_plain_client_gets_samples_and_every_answer_that_fits_its_query() {
     for _ in 0..5 {
         assert!(!samples.recv().expect("a scan").express());
     }
-    until("all answers exist", || answers(&client, "scanhub/**") == all);
+    wait_until("all answers exist", || answers(&client, "scanhub/**") == all);
     assert_eq!(answers(&client, "**"), all);
     assert_eq!(answers(&client, "scanhub/*/*/announce"), keys(&["front/announce", "rear/announce"]));
     assert_eq!(answers(&client, &format!("scanhub/{id}/rear/*")), all[3..]);
@@ -119,12 +131,12 @@ fn a_plain_client_gets_samples_and_every_answer_that_fits_its_query() {
     assert_eq!(answers(&client, "scanhub/*/*/scan"), all[..0], "no scan is kept");
 
     // Without a hub, the bridge still announces its sensors, but neither the hub nor they have a token.
-    assert_eq!(hub.end(INT).code, Some(0));
+    assert_eq!(hub.end(INT).exit_code, Some(0));
     let tokens = || {
         let replies = client.liveliness().get("scanhub/*/*/@live").wait().expect("a query");
         std::iter::from_fn(|| replies.recv().ok()).count()
     };
-    until("the tokens are gone", || tokens() == 0);
+    wait_until("the tokens are gone", || tokens() == 0);
     let changes = client.liveliness().declare_subscriber("scanhub/*/*/@live").wait().expect("a subscriber");
     let announcements = client.declare_subscriber("scanhub/*/*/announce").wait().expect("a subscriber");
     for _ in 0..4 {
@@ -134,14 +146,14 @@ fn a_plain_client_gets_samples_and_every_answer_that_fits_its_query() {
 }
 
 #[test]
-fn a_frame_of_an_unknown_sensor_is_refused_without_a_router() {
+fn unknown_sensor_in_frame_flag_fails_without_router() {
     let robot = TestEnv::new();
     let _sensor = robot.simulator(&["front"], NO_FLAGS);
     let _hub = robot.hub(&[robot.link("front")]);
     robot.await_info("front", |info| info["state"] == "streaming");
     let outcome = robot.run(&["bridge", "--connect=tcp/127.0.0.1:1", "--ros2", "--frame=nothere=x"]);
-    assert_eq!(outcome.code, Some(3), "{outcome}");
-    assert!(outcome.errors.contains("nothere") && outcome.errors.contains("front"), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(3), "{outcome}");
+    assert!(outcome.stderr.contains("nothere") && outcome.stderr.contains("front"), "{outcome}");
 }
 
 #[test]
@@ -155,7 +167,7 @@ fn both_directions_go_through_one_connection() {
     let published = |line: &Value| line["kind"] == "published";
     assert_eq!(one.await_line("its sensor", published)["sensor"], format!("{right_id}.rear"));
     assert_eq!(other.await_line("its sensor", published)["sensor"], format!("{left_id}.front"));
-    until("both have both", || left.subscribers_of_all() == 2 && right.subscribers_of_all() == 2);
+    wait_until("both have both", || left.sensor_count() == 2 && right.sensor_count() == 2);
     let (one, other) = (one.end(INT), other.end(INT));
     // What came is not sent back.
     for outcome in [&one, &other] {
@@ -170,7 +182,7 @@ fn both_directions_go_through_one_connection() {
 
 impl TestEnv {
     /// How many sensors have topics here.
-    fn subscribers_of_all(&self) -> usize {
+    fn sensor_count(&self) -> usize {
         let topics = self.run(&["list", "--json"]).of_class("topic");
         let mut sensors: Vec<_> = topics.iter().map(|line| line["sensor"].to_string()).collect();
         sensors.sort();
@@ -180,12 +192,12 @@ impl TestEnv {
 }
 
 /// What `scanhub bridge` says in one line, with nothing of its own but `beside`, a text of a shell.
-fn alone(env: &TestEnv, beside: Option<&str>) -> String {
+fn error_of_lone_program(env: &TestEnv, bridge_script: Option<&str>) -> String {
     let program = env.command(&["bridge", "--connect=tcp/127.0.0.1:1"]).get_program().to_owned();
     let alone = env.path("scanhub");
     // For the reason that `write_program` gives, another process writes it.
     assert!(succeeds(Command::new("cp").arg(program).arg(&alone)), "can be copied");
-    if let Some(script) = beside {
+    if let Some(script) = bridge_script {
         write_program(env.path("scanhub-bridge"), format!("#!/bin/sh\n{script}\n"));
     }
     let outcome = output(Command::new(&alone).arg("bridge").env("PATH", env.path("nothing"))).expect("runs");
@@ -197,10 +209,10 @@ fn alone(env: &TestEnv, beside: Option<&str>) -> String {
 }
 
 #[test]
-fn without_the_program_or_with_another_version_it_is_said_how_to_get_it() {
+fn explains_how_to_install_the_matching_program() {
     let env = TestEnv::new();
-    assert!(alone(&env, None).contains("is not installed"));
-    let other = alone(&env, Some("echo scanhub-bridge 0.0.7"));
+    assert!(error_of_lone_program(&env, None).contains("is not installed"));
+    let other = error_of_lone_program(&env, Some("echo scanhub-bridge 0.0.7"));
     assert!(other.contains("version 0.0.7") && other.contains(env!("CARGO_PKG_VERSION")), "{other}");
 }
 
@@ -208,23 +220,23 @@ fn without_the_program_or_with_another_version_it_is_said_how_to_get_it() {
 fn it_is_ready_when_the_router_is_there() {
     let (robot, middle) = (TestEnv::new(), TestEnv::new());
     let at = address("tcp");
-    let mut there = lonely(&robot, &["--connect", &at]);
+    let mut there = bridge_without_peer(&robot, &["--connect", &at]);
     let is = |line: &Value, state: &str| line["class"] == "bridge_link" && line["state"] == state;
     let (waits, why) = (Cell::new(false), Cell::new(false));
     there.await_line("that it waits, and why", |line| {
-        let says = |key: &str, text: &str| line[key].as_str().is_some_and(|said| said.contains(text));
+        let says = |key: &str, text: &str| line[key].as_str().is_some_and(|reported| reported.contains(text));
         waits.set(waits.get() || is(line, "waiting") && says("message", &at));
         why.set(why.get() || is(line, "failing") && says("finding", "no router is reached"));
         waits.get() && why.get()
     });
-    assert!(!there.is_heard(|line| line["class"] == "bridge_ready"));
+    assert!(!there.prints(|line| line["class"] == "bridge_ready"));
     // Who listens is ready when others can connect.
     let _router = bridge(&middle, &["--listen", &at]);
     let socket = at.strip_prefix("tcp/").expect("tcp");
     std::net::TcpStream::connect(socket).expect("it listens");
     there.await_line("its begin", |line| line["class"] == "bridge_ready");
-    linked(&mut there);
-    assert_eq!(there.end(INT).code, Some(0));
+    wait_until_linked(&mut there);
+    assert_eq!(there.end(INT).exit_code, Some(0));
 }
 
 #[test]
@@ -244,20 +256,20 @@ fn only_the_topics_that_are_named_are_received() {
     let topics: Vec<_> = topics.iter().map(|line| line["topic"].clone()).collect();
     assert_eq!(topics, ["scan", "status"]);
     let (sent, received) = (there.end(INT), here.end(INT));
-    let rows = account(&received, &["received", "lost"]);
+    let rows = final_counters(&received, &["received", "lost"]);
     let names: Vec<_> = rows.keys().map(String::as_str).collect();
     assert_eq!(names, ["front/announce", "front/scan", "front/status"], "{received}");
-    assert!(rows.values().all(|row| row[1] == 0) && account(&sent, &["sent"]).len() > 3, "{received}");
+    assert!(rows.values().all(|row| row[1] == 0) && final_counters(&sent, &["sent"]).len() > 3, "{received}");
     for wrong in ["front/scan", "*/scan:every=2"] {
         let outcome = desk.run(&["bridge", "--connect", &at, "--publish", &format!("--topic={wrong}")]);
-        assert_eq!(outcome.code, Some(2), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(2), "{outcome}");
     }
 }
 
 #[test]
-fn what_cannot_be_is_refused_before_anything_begins() {
+fn invalid_arguments_are_refused_at_startup() {
     let env = TestEnv::new();
-    let code = |flags: &[&str]| env.run(&[&["bridge", "--json"], flags].concat()).code;
+    let code = |flags: &[&str]| env.run(&[&["bridge", "--json"], flags].concat()).exit_code;
     assert_eq!(code(&[]), Some(78), "nobody is named");
     assert_eq!(code(&["--connect=nonsense"]), Some(78));
     assert_eq!(code(&["--connect=tcp/127.0.0.1:1", "--topic=front/scam"]), Some(2));
@@ -271,6 +283,6 @@ fn what_cannot_be_is_refused_before_anything_begins() {
     let taken = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
     let port = taken.local_addr().expect("bound").port();
     let outcome = env.run(&["bridge", "--json", &format!("--listen=tcp/127.0.0.1:{port}")]);
-    assert_eq!(outcome.code, Some(78), "{outcome}");
+    assert_eq!(outcome.exit_code, Some(78), "{outcome}");
     assert!(outcome.to_string().contains("in use"), "{outcome}");
 }

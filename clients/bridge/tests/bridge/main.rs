@@ -16,7 +16,7 @@ use std::collections::BTreeMap;
 use std::net::TcpListener;
 
 use serde_json::Value;
-use testkit::{Outcome, Program, TestEnv, number, until};
+use testkit::{Outcome, Program, TestEnv, number, wait_until};
 use zenoh::{Config, Session, Wait};
 
 /// A simulator whose sensors are as usual.
@@ -31,18 +31,18 @@ fn address(protocol: &str) -> String {
 
 /// A bridge with these flags that listens or is connected, and what it is called if it sends.
 fn bridge(env: &TestEnv, flags: &[&str]) -> (Program, String) {
-    let mut program = lonely(env, flags);
+    let mut program = bridge_without_peer(env, flags);
     let line = program.await_line("its begin", |line| line["class"] == "bridge_ready");
     (program, line["hub"].as_str().unwrap_or_default().to_owned())
 }
 
 /// A bridge with these flags that nobody waits for.
-fn lonely(env: &TestEnv, flags: &[&str]) -> Program {
+fn bridge_without_peer(env: &TestEnv, flags: &[&str]) -> Program {
     env.start(&[&["bridge", "--json"], flags].concat())
 }
 
 /// Waits until somebody is connected to it.
-fn linked(program: &mut Program) {
+fn wait_until_linked(program: &mut Program) {
     program.await_line("a link", |line| line["class"] == "bridge_link" && line["state"] == "up");
 }
 
@@ -55,7 +55,7 @@ fn router(env: &TestEnv, listen: &str, connect: &[&str]) -> Program {
 }
 
 /// Returns a plain Zenoh client of the router at this address.
-fn peer(at: &str) -> Session {
+fn open_peer(at: &str) -> Session {
     let mut config = Config::default();
     for (key, value) in [
         ("mode", "\"client\""),
@@ -66,7 +66,7 @@ fn peer(at: &str) -> Session {
     }
     // A bridge reports that it is ready before it listens.
     let mut session = None;
-    until("the router accepts connections", || {
+    wait_until("the router accepts connections", || {
         session = zenoh::open(config.clone()).wait().ok();
         session.is_some()
     });
@@ -75,23 +75,23 @@ fn peer(at: &str) -> Session {
 
 /// By sensor and topic, the value of each of these keys in the last account of a bridge: in one before it, a sensor that is
 /// received may have had no name yet.
-fn account(outcome: &Outcome, keys: &[&str]) -> Account {
-    last_account(&outcome.lines(), keys)
+fn final_counters(outcome: &Outcome, keys: &[&str]) -> CounterValues {
+    last_counters(&outcome.lines(), keys)
 }
 
 /// Returns the counters that a running bridge has printed last.
-fn account_so_far(program: &mut Program, keys: &[&str]) -> Account {
+fn current_counters(program: &mut Program, keys: &[&str]) -> CounterValues {
     let lines = RefCell::new(Vec::new());
-    program.is_heard(|line| {
+    program.prints(|line| {
         lines.borrow_mut().push(line.clone());
         false
     });
-    last_account(&lines.into_inner(), keys)
+    last_counters(&lines.into_inner(), keys)
 }
 
-type Account = BTreeMap<String, Vec<u64>>;
+type CounterValues = BTreeMap<String, Vec<u64>>;
 
-fn last_account(lines: &[Value], keys: &[&str]) -> Account {
+fn last_counters(lines: &[Value], keys: &[&str]) -> CounterValues {
     let (mut rows, mut is_whole) = (BTreeMap::new(), false);
     for line in lines {
         // The end of an account of what is received.
@@ -109,7 +109,7 @@ fn last_account(lines: &[Value], keys: &[&str]) -> Account {
 }
 
 /// What was refused for this reason, as last accounted.
-fn refused(outcome: &Outcome, reason: &str) -> u64 {
+fn refusal_count(outcome: &Outcome, reason: &str) -> u64 {
     outcome.of_class("bridge_refused").last().map_or(0, |line| number(line, reason))
 }
 
@@ -118,9 +118,9 @@ fn text(value: &Value) -> &str {
 }
 
 /// Nothing that was sent is lost or counted twice: of each topic as much was received and lost as was sent.
-fn agree(sent: &Outcome, received: &Outcome) -> u64 {
-    let there = account(sent, &["sent", "replaced"]);
-    let here = account(received, &["received", "lost", "replaced"]);
+fn assert_counters_agree(sent: &Outcome, received: &Outcome) -> u64 {
+    let there = final_counters(sent, &["sent", "replaced"]);
+    let here = final_counters(received, &["received", "lost", "replaced"]);
     assert!(there.len() > 4 && there.keys().eq(here.keys()), "{there:?}\n{here:?}");
     let mut lost = 0;
     for (name, row) in &there {

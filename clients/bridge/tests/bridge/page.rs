@@ -29,8 +29,8 @@ fn the_commands_of_the_page_run() {
             assert!(output.status.success(), "{line}: {}", String::from_utf8_lossy(&output.stderr));
         } else if let Some(words) = line.strip_prefix("scanhub bridge ") {
             let configured =
-                configuration.replace('"', "'").replace(": 'ca", &format!(": '{}/ca", env.word("")));
-            let configured = configured.replace(": 'robot", &format!(": '{}/robot", env.word("")));
+                configuration.replace('"', "'").replace(": 'ca", &format!(": '{}/ca", env.path_argument("")));
+            let configured = configured.replace(": 'robot", &format!(": '{}/robot", env.path_argument("")));
             let words = words.replace("tcp/0.0.0.0:7447", &plain).replace("tcp/robot:7447", &plain);
             let words = words.replace("tls/0.0.0.0:7447", &safe);
             let words = words.replace("robot.json5", &env.file("robot.json5", configured));
@@ -42,9 +42,9 @@ fn the_commands_of_the_page_run() {
         count += 1;
     }
     assert!(count > 5, "{count}");
-    crate::linked(&mut running[1].0);
+    crate::wait_until_linked(&mut running[1].0);
     for (program, _place) in running {
         let outcome = program.end(INT);
-        assert_eq!(outcome.code, Some(0), "{outcome}");
+        assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     }
 }

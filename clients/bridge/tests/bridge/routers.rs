@@ -4,14 +4,14 @@ use rustix::process::Signal;
 use serde_json::Value;
 
 use crate::testkit::{INT, KILL, TestEnv, number, wall_ns};
-use crate::{NO_FLAGS, address, agree, bridge, linked, router};
+use crate::{NO_FLAGS, address, assert_counters_agree, bridge, router, wait_until_linked};
 
 fn is_link(line: &Value, state: &str) -> bool {
     line["class"] == "bridge_link" && line["state"] == state
 }
 
 #[test]
-fn a_router_that_is_killed_and_back_loses_nothing_that_is_not_told() {
+fn losses_of_a_restarted_router_are_all_counted() {
     let (robot, desk, first, second) = (TestEnv::new(), TestEnv::new(), TestEnv::new(), TestEnv::new());
     let (near, far) = (address("tcp"), address("tcp"));
     let mut killed = router(&first, &near, &[]);
@@ -19,8 +19,8 @@ fn a_router_that_is_killed_and_back_loses_nothing_that_is_not_told() {
     let _sensor = robot.simulator(&["front"], NO_FLAGS);
     let (mut there, id) = bridge(&robot, &["--connect", &near]);
     let (mut here, _) = bridge(&desk, &["--connect", &far, "--publish", &format!("--name=robot1={id}")]);
-    linked(&mut there);
-    linked(&mut here);
+    wait_until_linked(&mut there);
+    wait_until_linked(&mut here);
     let _hub = robot.hub(&[robot.link("front")]);
     here.await_line("a sensor", |line| line["kind"] == "published");
     let mut local = robot.echo(&["front/scan"]);
@@ -31,8 +31,8 @@ fn a_router_that_is_killed_and_back_loses_nothing_that_is_not_told() {
             let is_known = line["class"] == "zones" && line["stale"] != true && line["verdict"] != "unknown";
             is_known && number(line, "wall_ns") >= since_ns
         };
-        let begun = wall_ns();
-        remote.await_line("zones", |line| is_zones(line, begun));
+        let started = wall_ns();
+        remote.await_line("zones", |line| is_zones(line, started));
         killed.end(KILL);
         there.await_line("the end of the link", |line| is_link(line, "down"));
         killed = router(&first, &near, &[]);
@@ -45,7 +45,7 @@ fn a_router_that_is_killed_and_back_loses_nothing_that_is_not_told() {
     assert_eq!(local.of_class("summary")[0]["missed"], 0, "the hub's own consumers: {local}");
     let sent = there.end(INT);
     // The last announcement goes over two routers.
-    let announced = account_of_announcements(&sent);
+    let announced = announcement_count(&sent);
     here.await_line("the last announcement", |line| {
         line["class"] == "bridge"
             && line["topic"] == "announce"
@@ -55,18 +55,18 @@ fn a_router_that_is_killed_and_back_loses_nothing_that_is_not_told() {
                 .zip(line["lost"].as_u64())
                 .is_some_and(|(received, lost)| received + lost >= announced)
     });
-    agree(&sent, &here.end(INT));
+    assert_counters_agree(&sent, &here.end(INT));
 }
 
 /// The link of a router that is stopped ends with Zenoh's lease, although a sample waits for room on it.
 #[test]
-fn a_router_that_is_stopped_loses_its_link_and_gets_it_back() {
+fn stopped_router_loses_its_link_and_gets_it_back() {
     let (robot, desk) = (TestEnv::new(), TestEnv::new());
     let _sensor = robot.simulator(&["front"], NO_FLAGS);
     let at = address("tcp");
     let (mut here, _) = bridge(&desk, &["--listen", &at, "--publish"]);
     let (mut there, _) = bridge(&robot, &["--connect", &at, "--topic=*/*"]);
-    linked(&mut there);
+    wait_until_linked(&mut there);
     let _hub = robot.hub(&[robot.link("front")]);
     let sensor = here.await_line("a sensor", |line| line["kind"] == "published")["sensor"].clone();
     here.signal(Signal::STOP);
@@ -74,14 +74,16 @@ fn a_router_that_is_stopped_loses_its_link_and_gets_it_back() {
     here.signal(Signal::CONT);
     there.await_line("the link", |line| is_link(line, "up"));
     let mut zones = desk.echo(&[&format!("{}/zones", sensor.as_str().unwrap_or_default())]);
-    let begun = wall_ns();
-    zones.await_line("zones after that", |line| line["class"] == "zones" && number(line, "wall_ns") >= begun);
-    assert_eq!(there.end(INT).code, Some(0));
+    let started = wall_ns();
+    zones.await_line("zones after that", |line| {
+        line["class"] == "zones" && number(line, "wall_ns") >= started
+    });
+    assert_eq!(there.end(INT).exit_code, Some(0));
 }
 
 /// How many announcements were sent.
-fn account_of_announcements(sent: &crate::testkit::Outcome) -> u64 {
-    crate::account(sent, &["sent"])
+fn announcement_count(sent: &crate::testkit::Outcome) -> u64 {
+    crate::final_counters(sent, &["sent"])
         .iter()
         .find(|(name, _)| name.ends_with("/announce"))
         .map_or(0, |(_, row)| row[0])

@@ -6,11 +6,14 @@ use std::process::Command;
 use rustix::process::Signal;
 use serde_json::Value;
 
-use crate::testkit::{INT, Outcome, Program, TERM, TestEnv, in_a_network, skip, succeeds, until};
-use crate::{Account, NO_FLAGS, account, account_so_far, address, agree, bridge, linked};
+use crate::testkit::{INT, Outcome, Program, TERM, TestEnv, in_a_network, skip, succeeds, wait_until};
+use crate::{
+    CounterValues, NO_FLAGS, address, assert_counters_agree, bridge, current_counters, final_counters,
+    wait_until_linked,
+};
 
 /// Lets no more than 0.5 Mbit/s through the loopback, whose packets are those of a network.
-fn slow_down() -> bool {
+fn limit_rate() -> bool {
     let run = |program: &str, words: &str| succeeds(Command::new(program).args(words.split(' ')));
     run("ip", "link set lo mtu 1500")
         && run("tc", "qdisc add dev lo root tbf rate 500kbit burst 5000 latency 200ms")
@@ -19,23 +22,23 @@ fn slow_down() -> bool {
 /// Ends the bridges `there`, which sends, and `here`, which receives, after everything has arrived. The hub has ended
 /// before, so that the link gets empty: a bridge that ends cuts off the samples on its link. Returns what the sender printed,
 /// and the number of lost samples.
-fn end_when_all_arrived(mut there: Program, mut here: Program) -> (Outcome, u64) {
-    let mut received = || account_so_far(&mut here, &["received", "lost"]);
-    until("all samples have arrived", || {
-        let samples = |account: Account| -> Vec<(String, u64)> {
-            let rows = account.into_iter().filter(|(name, _)| !name.ends_with("/announce"));
+fn end_after_delivery(mut sender: Program, mut receiver: Program) -> (Outcome, u64) {
+    let mut received = || current_counters(&mut receiver, &["received", "lost"]);
+    wait_until("all samples have arrived", || {
+        let samples = |stats: CounterValues| -> Vec<(String, u64)> {
+            let rows = stats.into_iter().filter(|(name, _)| !name.ends_with("/announce"));
             rows.map(|(name, row)| (name, row.iter().sum())).collect()
         };
-        let sent = samples(account_so_far(&mut there, &["sent"]));
+        let sent = samples(current_counters(&mut sender, &["sent"]));
         sent.len() > 4 && sent == samples(received())
     });
-    let sent = there.end(INT);
-    let counts = account(&sent, &["sent"]);
-    until("the last announcements have arrived", || {
+    let sent = sender.end(INT);
+    let counts = final_counters(&sent, &["sent"]);
+    wait_until("the last announcements have arrived", || {
         let received = received();
         counts.iter().all(|(name, row)| received.get(name).is_some_and(|it| it[0] + it[1] == row[0]))
     });
-    let lost = agree(&sent, &here.end(INT));
+    let lost = assert_counters_agree(&sent, &receiver.end(INT));
     (sent, lost)
 }
 
@@ -44,14 +47,14 @@ fn on_a_slow_link_the_newest_comes_first() {
     in_a_network("slow::on_a_slow_link_the_newest_comes_first", || {
         let (robot, desk) = (TestEnv::new(), TestEnv::new());
         let _sensors = robot.simulator(&["front", "rear"], NO_FLAGS);
-        if !slow_down() {
+        if !limit_rate() {
             return skip("tc", "the kernel has no tbf");
         }
         let at = address("tcp");
         let (mut there, id) = bridge(&robot, &["--listen", &at, "--topic=*/*"]);
         let (mut here, _) = bridge(&desk, &["--connect", &at, "--publish", &format!("--name=robot1={id}")]);
-        linked(&mut there);
-        linked(&mut here);
+        wait_until_linked(&mut there);
+        wait_until_linked(&mut here);
         let hub = robot.hub(&[robot.link("front"), robot.link("rear")]);
         here.await_line("a sensor", |line| line["kind"] == "published");
         let mut local = robot.echo(&["front/scan"]);
@@ -60,15 +63,15 @@ fn on_a_slow_link_the_newest_comes_first() {
         local.await_line("a scan", |line| line["class"] == "scan");
         let local = local.end(INT);
         assert_eq!(local.of_class("summary")[0]["missed"], 0, "{local}");
-        assert_eq!(hub.end(TERM).code, Some(0));
-        let (sent, _) = end_when_all_arrived(there, here);
-        let replaced: u64 = account(&sent, &["sent", "replaced"]).values().map(|row| row[1]).sum();
+        assert_eq!(hub.end(TERM).exit_code, Some(0));
+        let (sent, _) = end_after_delivery(there, here);
+        let replaced: u64 = final_counters(&sent, &["sent", "replaced"]).values().map(|row| row[1]).sum();
         assert!(replaced > 100, "it was not slow: {sent}");
     });
 }
 
 /// Number of zones that newer ones must replace before the stalled link moves again: those of more than 1 s.
-const REPLACED: u64 = 60;
+const MIN_REPLACED: u64 = 60;
 
 /// Stops the program that receives until newer samples have replaced many others, with this bridge as the router.
 fn stall(robot_listens: bool) {
@@ -89,25 +92,25 @@ fn stall(robot_listens: bool) {
         here = receive();
         there = send();
     }
-    linked(&mut there);
-    linked(&mut here);
+    wait_until_linked(&mut there);
+    wait_until_linked(&mut here);
     let hub = robot.hub(&[robot.link("front")]);
     here.await_line("a sensor", |line| line["kind"] == "published");
     let replaced = |there: &mut Program| {
-        account_so_far(there, &["sent", "replaced"]).get("front/zones").map_or(0, |row| row[1])
+        current_counters(there, &["sent", "replaced"]).get("front/zones").map_or(0, |row| row[1])
     };
     here.signal(Signal::STOP);
-    until("many samples are replaced", || replaced(&mut there) > REPLACED);
+    wait_until("many samples are replaced", || replaced(&mut there) > MIN_REPLACED);
     here.signal(Signal::CONT);
-    assert_eq!(hub.end(TERM).code, Some(0));
-    let (sent, lost) = end_when_all_arrived(there, here);
+    assert_eq!(hub.end(TERM).exit_code, Some(0));
+    let (sent, lost) = end_after_delivery(there, here);
     // A receiver that is stopped for longer than 5 s loses the link, and what was on it.
     let is_broken = sent.of_class("bridge_link").iter().any(|line| line["state"] == "down");
     assert!(lost == 0 || is_broken, "{lost} samples were not sent: {sent}");
 }
 
 #[test]
-fn what_a_stalled_link_has_no_room_for_is_not_counted_as_sent() {
+fn stalled_link_does_not_count_replaced_as_sent() {
     stall(true);
     stall(false);
 }

@@ -13,37 +13,37 @@ use std::time::{Duration, Instant};
 use rustix::time::{ClockId, clock_gettime};
 use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{
-    Background, Failure, Foreground, Header, Marks, Scan, ScanHead, State, Status, Verdict, Wake, Zones,
+    Background, Failure, Foreground, Header, Marks, Scan, ScanHead, State, Status, Verdict, WakeEvent, Zones,
 };
 use scanhub_shm::{
-    CallbackProgression, Node, Payload, PortFactory, Publisher, TopicService, UpdateConnections, Waker,
+    CallbackProgression, Node, Payload, PortFactory, Publisher, TopicService, UpdateConnections, WakeSender,
 };
 use scanhub_shm::{Domain, HubLock};
 use tempfile::TempDir;
 
 /// A domain that goes with the test.
-pub(crate) struct Place {
+pub(crate) struct TestDomain {
     pub(crate) base: PathBuf,
     _directory: TempDir,
     pub(crate) domain: Domain,
 }
 
-impl Place {
-    pub(crate) fn new() -> Place {
+impl TestDomain {
+    pub(crate) fn new() -> TestDomain {
         static NEXT: AtomicU32 = AtomicU32::new(0);
         let name = format!("c{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
         // Not TMPDIR: root and prefix of a domain must be short.
         let directory = tempfile::Builder::new().prefix("sh").tempdir_in("/tmp").unwrap();
         let base = directory.path().to_owned();
-        Place { domain: Domain::at(&name, &base).unwrap(), base, _directory: directory }
+        TestDomain { domain: Domain::at(&name, &base).unwrap(), base, _directory: directory }
     }
 
-    pub(crate) fn places(&self) -> Vec<Domain> {
+    pub(crate) fn locations(&self) -> Vec<Domain> {
         vec![self.domain.clone()]
     }
 }
 
-impl Drop for Place {
+impl Drop for TestDomain {
     fn drop(&mut self) {
         // The node management of a domain outlives its nodes.
         for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
@@ -55,22 +55,22 @@ impl Drop for Place {
 }
 
 /// A topic with its own numbers.
-pub(crate) struct Port<P: Payload + ?Sized> {
+pub(crate) struct TopicPort<P: Payload + ?Sized> {
     pub(crate) service: TopicService<P>,
     pub(crate) publisher: Publisher<P>,
     pub(crate) topic_seq: u64,
 }
 
-impl<P: Payload + ?Sized> Port<P> {
-    fn new(node: &Node, sensor: &str) -> Port<P> {
+impl<P: Payload + ?Sized> TopicPort<P> {
+    fn new(node: &Node, sensor: &str) -> TopicPort<P> {
         let limits = TopicLimits::default();
         let service = P::create(node, sensor, &limits).unwrap();
-        Port { publisher: P::publisher(&service, &limits).unwrap(), service, topic_seq: 0 }
+        TopicPort { publisher: P::publisher(&service, &limits).unwrap(), service, topic_seq: 0 }
     }
 
     /// Waits until the next sample reaches `count` subscribers.
     pub(crate) fn await_subscribers(&self, count: usize) {
-        until("subscribers", || self.subscribers() == count);
+        wait_until("subscribers", || self.subscribers() == count);
     }
 
     /// Returns the number of subscribers that the next sample reaches. The service's own number does not count: it
@@ -87,20 +87,20 @@ impl<P: Payload + ?Sized> Port<P> {
 
 /// One sensor of a hub.
 pub(crate) struct FakeSensor {
-    pub(crate) telegram: Port<[u8]>,
-    pub(crate) scan: Port<Scan>,
-    pub(crate) marks: Port<Marks>,
-    pub(crate) zones: Port<Zones>,
-    pub(crate) foreground: Port<Foreground>,
-    pub(crate) background: Port<Background>,
-    pub(crate) status: Port<Status>,
-    pub(crate) waker: Waker,
+    pub(crate) telegram: TopicPort<[u8]>,
+    pub(crate) scan: TopicPort<Scan>,
+    pub(crate) marks: TopicPort<Marks>,
+    pub(crate) zones: TopicPort<Zones>,
+    pub(crate) foreground: TopicPort<Foreground>,
+    pub(crate) background: TopicPort<Background>,
+    pub(crate) status: TopicPort<Status>,
+    pub(crate) waker: WakeSender,
     pub(crate) boot: u64,
     /// Flags of the headers.
     pub(crate) flags: u8,
     pub(crate) seq: u64,
     /// CLOCK_MONOTONIC at its first telegram, in ns. By default long before any subscriber.
-    pub(crate) begun_ns: u64,
+    pub(crate) start_ns: u64,
     /// Period of the scans in us.
     pub(crate) period_us: u32,
 }
@@ -110,8 +110,8 @@ impl FakeSensor {
         Header {
             seq: self.seq,
             topic_seq,
-            stamp_first_ns: self.begun_ns + self.seq,
-            stamp_last_ns: self.begun_ns + 10_000_000 + self.seq,
+            stamp_first_ns: self.start_ns + self.seq,
+            stamp_last_ns: self.start_ns + 10_000_000 + self.seq,
             wall_ns: 1_700_000_000_000_000_000 + self.seq,
             boot: self.boot,
             period_us: self.period_us,
@@ -122,7 +122,7 @@ impl FakeSensor {
     }
 
     /// Publishes a scan of these ranges and wakes the subscribers.
-    pub(crate) fn scan(&mut self, ranges: &[u16]) {
+    pub(crate) fn publish_scan(&mut self, ranges: &[u16]) {
         let header = self.header(self.scan.topic_seq);
         let head = ScanHead::lms(ranges.len(), -90_000, 500, 10, 13);
         let len = Scan::len(ranges.len(), head.contents);
@@ -132,19 +132,19 @@ impl FakeSensor {
         sample.send().unwrap();
         self.scan.topic_seq += 1;
         self.seq += 1;
-        self.waker.wake(Wake::Telegram).unwrap();
+        self.waker.wake(WakeEvent::Telegram).unwrap();
     }
 
     /// Publishes a scan of these ranges with an empty foreground, and wakes the subscribers. The wall clock of the
     /// sample is `seq` ns after that of the hub's first one.
-    pub(crate) fn scan_with_foreground(&mut self, seq: u64, ranges: &[u16]) {
-        self.foreground(seq, ranges.len());
-        self.scan(ranges);
+    pub(crate) fn publish_scan_with_foreground(&mut self, seq: u64, ranges: &[u16]) {
+        self.publish_foreground(seq, ranges.len());
+        self.publish_scan(ranges);
     }
 
     /// Publishes the empty foreground of a scan of `beams`, and wakes no subscriber. The next scan belongs to the same
     /// telegram.
-    pub(crate) fn foreground(&mut self, seq: u64, beams: usize) {
+    pub(crate) fn publish_foreground(&mut self, seq: u64, beams: usize) {
         self.seq = seq;
         let header = self.header(self.foreground.topic_seq);
         let mut sample = Foreground::loan(&self.foreground.publisher, Foreground::len(beams)).unwrap();
@@ -156,18 +156,18 @@ impl FakeSensor {
 
     /// Wakes the subscribers.
     pub(crate) fn wake(&self) {
-        self.waker.wake(Wake::Telegram).unwrap();
+        self.waker.wake(WakeEvent::Telegram).unwrap();
     }
 
     /// Publishes zones of `verdict` with something at `nearest_mm`, measured just now, and wakes the subscribers.
-    pub(crate) fn zones(&mut self, verdict: Verdict, nearest_mm: u32) {
+    pub(crate) fn publish_zones(&mut self, verdict: Verdict, nearest_mm: u32) {
         let now = clock_gettime(ClockId::Monotonic);
         let now_ns = now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64;
-        self.zones_of(verdict, nearest_mm, now_ns);
+        self.publish_zones_at(verdict, nearest_mm, now_ns);
     }
 
     /// Publishes zones as [`zones`](Self::zones) does, measured at `stamp_ns`.
-    pub(crate) fn zones_of(&mut self, verdict: Verdict, nearest_mm: u32, stamp_ns: u64) {
+    pub(crate) fn publish_zones_at(&mut self, verdict: Verdict, nearest_mm: u32, stamp_ns: u64) {
         let header = self.header(self.zones.topic_seq);
         let mut sample = self.zones.publisher.loan().unwrap();
         *sample.user_header_mut() = Header { stamp_first_ns: stamp_ns, stamp_last_ns: stamp_ns, ..header };
@@ -176,22 +176,22 @@ impl FakeSensor {
         sample.send().unwrap();
         self.zones.topic_seq += 1;
         self.seq += 1;
-        self.waker.wake(Wake::Telegram).unwrap();
+        self.waker.wake(WakeEvent::Telegram).unwrap();
     }
 
     /// Publishes a telegram and wakes the subscribers.
-    pub(crate) fn telegram(&mut self, bytes: &[u8]) {
+    pub(crate) fn publish_telegram(&mut self, bytes: &[u8]) {
         let header = self.header(self.telegram.topic_seq);
         let mut sample = self.telegram.publisher.loan_slice_uninit(bytes.len()).unwrap();
         *sample.user_header_mut() = header;
         sample.write_from_slice(bytes).send().unwrap();
         self.telegram.topic_seq += 1;
         self.seq += 1;
-        self.waker.wake(Wake::Telegram).unwrap();
+        self.waker.wake(WakeEvent::Telegram).unwrap();
     }
 
     /// Publishes a status and wakes the subscribers.
-    pub(crate) fn status(&mut self, change: impl FnOnce(&mut Status)) {
+    pub(crate) fn publish_status(&mut self, change: impl FnOnce(&mut Status)) {
         let header = self.header(self.status.topic_seq);
         let mut sample = self.status.publisher.loan().unwrap();
         *sample.user_header_mut() = header;
@@ -200,7 +200,7 @@ impl FakeSensor {
         change(status);
         sample.send().unwrap();
         self.status.topic_seq += 1;
-        self.waker.wake(Wake::Status).unwrap();
+        self.waker.wake(WakeEvent::Status).unwrap();
     }
 }
 
@@ -216,18 +216,18 @@ impl FakeHub {
         let lock = HubLock::acquire(domain.root()).unwrap();
         let node = scanhub_shm::hub_node(domain).unwrap();
         let sensor = |name: &&str| FakeSensor {
-            telegram: Port::new(&node, name),
-            scan: Port::new(&node, name),
-            marks: Port::new(&node, name),
-            zones: Port::new(&node, name),
-            foreground: Port::new(&node, name),
-            background: Port::new(&node, name),
-            status: Port::new(&node, name),
-            waker: Waker::new(&node, name).unwrap(),
+            telegram: TopicPort::new(&node, name),
+            scan: TopicPort::new(&node, name),
+            marks: TopicPort::new(&node, name),
+            zones: TopicPort::new(&node, name),
+            foreground: TopicPort::new(&node, name),
+            background: TopicPort::new(&node, name),
+            status: TopicPort::new(&node, name),
+            waker: WakeSender::new(&node, name).unwrap(),
             boot,
             flags: 0,
             seq: 0,
-            begun_ns: 1_000_000_000,
+            start_ns: 1_000_000_000,
             period_us: 26_640,
         };
         let sensors = sensors.iter().map(sensor).collect();
@@ -235,38 +235,38 @@ impl FakeHub {
         FakeHub { sensors, _node: node, _lock: lock }
     }
 
-    pub(crate) fn front(&mut self) -> &mut FakeSensor {
+    pub(crate) fn front_sensor(&mut self) -> &mut FakeSensor {
         &mut self.sensors[0]
     }
 
     /// Hands the last status to newcomers until `done`.
-    pub(crate) fn serve_history(&self, done: impl Fn() -> bool) {
-        until("history taken", || {
+    pub(crate) fn serve_history(&self, is_done: impl Fn() -> bool) {
+        wait_until("history taken", || {
             for sensor in &self.sensors {
                 sensor.status.publisher.update_connections().unwrap();
             }
-            done()
+            is_done()
         });
     }
 }
 
 /// A verb at work in a thread of its own, its output as it comes.
-pub(crate) struct Verb {
-    pub(crate) out: Sink,
-    pub(crate) notes: Sink,
+pub(crate) struct RunningVerb {
+    pub(crate) out: OutputFile,
+    pub(crate) notes: OutputFile,
     pub(crate) stop: Arc<AtomicBool>,
     thread: JoinHandle<Result<(), Failure>>,
 }
 
-impl Verb {
+impl RunningVerb {
     /// Starts `verb` with its standard output, its standard error and the flag that ends it.
     pub(crate) fn start(
         verb: impl FnOnce(File, File, Arc<AtomicBool>) -> Result<(), Failure> + Send + 'static,
-    ) -> Verb {
-        let (out, notes, stop) = (Sink::new(), Sink::new(), Arc::new(AtomicBool::new(false)));
-        let (to, beside, flag) = (out.file(), notes.file(), stop.clone());
-        let thread = std::thread::spawn(move || verb(to, beside, flag));
-        Verb { out, notes, stop, thread }
+    ) -> RunningVerb {
+        let (out, notes, stop) = (OutputFile::new(), OutputFile::new(), Arc::new(AtomicBool::new(false)));
+        let (to, notes_file, flag) = (out.file(), notes.file(), stop.clone());
+        let thread = std::thread::spawn(move || verb(to, notes_file, flag));
+        RunningVerb { out, notes, stop, thread }
     }
 
     pub(crate) fn stop(&self) {
@@ -279,17 +279,17 @@ impl Verb {
 
     /// Waits for the end.
     pub(crate) fn join(self) -> (Result<(), Failure>, String, String) {
-        until("the verb's end", || self.thread.is_finished());
+        wait_until("the verb's end", || self.thread.is_finished());
         (self.thread.join().unwrap(), self.out.text(), self.notes.text())
     }
 }
 
 /// File without a name that a verb writes to. A test reads it at the same time.
-pub(crate) struct Sink(File);
+pub(crate) struct OutputFile(File);
 
-impl Sink {
-    pub(crate) fn new() -> Sink {
-        Sink(tempfile::tempfile().unwrap())
+impl OutputFile {
+    pub(crate) fn new() -> OutputFile {
+        OutputFile(tempfile::tempfile().unwrap())
     }
 
     /// Returns the file for the verb. It writes at its end.
@@ -309,15 +309,15 @@ impl Sink {
 
     /// Waits until `count` lines contain `text`.
     pub(crate) fn await_lines(&self, text: &str, count: usize) {
-        until(text, || self.text().lines().filter(|line| line.contains(text)).count() >= count);
+        wait_until(text, || self.text().lines().filter(|line| line.contains(text)).count() >= count);
     }
 }
 
 /// Waits until `done`. The limit only bounds a hang.
-pub(crate) fn until(what: &str, mut done: impl FnMut() -> bool) {
+pub(crate) fn wait_until(description: &str, mut is_done: impl FnMut() -> bool) {
     let give_up_at = Instant::now() + Duration::from_secs(180);
-    while !done() {
-        assert!(Instant::now() < give_up_at, "waited in vain for {what}");
+    while !is_done() {
+        assert!(Instant::now() < give_up_at, "waited in vain for {description}");
         std::thread::sleep(Duration::from_millis(2));
     }
 }

@@ -2,8 +2,8 @@
 
 use std::num::NonZeroU64;
 
-use scanhub_schema::{Failure, Kind, Maker, Pace, ROBOT, Topic, is_remote};
-use scanhub_verbs::names::Word;
+use scanhub_schema::{Failure, Kind, PublishRate, PublisherKind, ROBOT, Topic, is_remote};
+use scanhub_verbs::names::TopicPattern;
 
 /// Topics that are sent.
 #[derive(Clone, Debug)]
@@ -13,7 +13,7 @@ pub struct Selection {
 
 #[derive(Clone, Debug)]
 struct Entry {
-    word: Word,
+    pattern: TopicPattern,
     every: NonZeroU64,
 }
 
@@ -30,11 +30,11 @@ impl Selection {
         let mut entries: Vec<Entry> = Vec::new();
         for text in texts {
             let entry = Entry::parse(text)?;
-            if bare && entry.word.topic != Some(Topic::Telegram) {
+            if bare && entry.pattern.topic != Some(Topic::Telegram) {
                 let hint = "without --bare all topics can be sent";
                 return Err(refuse(text, "has no telegrams, and --bare sends nothing else", hint));
             }
-            if entries.iter().any(|other| other.word == entry.word) {
+            if entries.iter().any(|other| other.pattern == entry.pattern) {
                 return Err(refuse(text, "is named twice", "name each topic once"));
             }
             entries.push(entry);
@@ -46,7 +46,7 @@ impl Selection {
             };
             let all = Topic::ALL.into_iter().filter(is_sent);
             entries.extend(all.map(|topic| Entry {
-                word: Word { sensor: None, topic: Some(topic) },
+                pattern: TopicPattern { sensor: None, topic: Some(topic) },
                 every: NonZeroU64::MIN,
             }));
         }
@@ -61,42 +61,42 @@ impl Selection {
 
     /// Returns the thinning factor of this topic, or `None` if it is not sent. The most specific pattern applies.
     pub(super) fn every(&self, sensor: &str, topic: Topic) -> Option<NonZeroU64> {
-        let word = |sensor: Option<&str>, topic| Word { sensor: sensor.map(str::to_owned), topic };
+        let pattern = |sensor: Option<&str>, topic| TopicPattern { sensor: sensor.map(str::to_owned), topic };
         let most_specific_first =
             [(Some(sensor), Some(topic)), (Some(sensor), None), (None, Some(topic)), (None, None)];
-        let find = |word: Word| self.entries.iter().find(|entry| entry.word == word);
+        let find = |pattern: TopicPattern| self.entries.iter().find(|entry| entry.pattern == pattern);
         most_specific_first
             .into_iter()
-            .find_map(|(sensor, topic)| find(word(sensor, topic)))
+            .find_map(|(sensor, topic)| find(pattern(sensor, topic)))
             .map(|entry| entry.every)
     }
 
     /// Returns whether this topic of any sensor is sent.
-    pub fn names(&self, topic: Topic) -> bool {
-        self.entries.iter().any(|entry| entry.word.topic.is_none_or(|named| named == topic))
+    pub fn includes(&self, topic: Topic) -> bool {
+        self.entries.iter().any(|entry| entry.pattern.topic.is_none_or(|named| named == topic))
     }
 
     /// Returns the sensors that are named, each once.
-    pub(super) fn named(&self) -> Vec<&str> {
+    pub(super) fn named_sensors(&self) -> Vec<&str> {
         let mut named: Vec<_> =
-            self.entries.iter().filter_map(|entry| entry.word.sensor.as_deref()).collect();
+            self.entries.iter().filter_map(|entry| entry.pattern.sensor.as_deref()).collect();
         named.sort_unstable();
         named.dedup();
         named
     }
 
     /// Returns the kind of publisher of the topics that are selected for this sensor. It is the link if all topics are.
-    pub(super) fn maker_of(&self, sensor: &str) -> Maker {
-        let words = self.entries.iter().map(|entry| &entry.word);
-        let mut makers = words
-            .filter(|word| word.sensor.as_deref() == Some(sensor))
-            .filter_map(|word| word.topic.map(Topic::maker));
-        makers.find(|maker| *maker != Maker::Link).unwrap_or(Maker::Link)
+    pub(super) fn publisher_kind(&self, sensor: &str) -> PublisherKind {
+        let patterns = self.entries.iter().map(|entry| &entry.pattern);
+        let mut kinds = patterns
+            .filter(|pattern| pattern.sensor.as_deref() == Some(sensor))
+            .filter_map(|pattern| pattern.topic.map(Topic::publisher_kind));
+        kinds.find(|kind| *kind != PublisherKind::Link).unwrap_or(PublisherKind::Link)
     }
 
     /// Returns whether topics of sensors are sent that are not named.
-    pub(super) fn wants_all(&self) -> bool {
-        self.entries.iter().any(|entry| entry.word.sensor.is_none())
+    pub(super) fn includes_unnamed(&self) -> bool {
+        self.entries.iter().any(|entry| entry.pattern.sensor.is_none())
     }
 }
 
@@ -110,18 +110,20 @@ impl Entry {
                 (name, every.ok_or_else(|| refuse(text, "cannot be thinned so", EVERY_FORM))?)
             }
         };
-        let word = Word::parse(name)?;
-        if word.sensor.as_deref() == Some(ROBOT) {
+        let pattern = TopicPattern::parse(name)?;
+        if pattern.sensor.as_deref() == Some(ROBOT) {
             return Err(refuse(text, "is a fold", "*/zones sends the zones of each sensor"));
         }
-        if word.sensor.as_deref().is_some_and(is_remote) {
+        if pattern.sensor.as_deref().is_some_and(is_remote) {
             let hint = "a gateway sends what the hub of its own machine publishes";
             return Err(refuse(text, "is another machine's", hint));
         }
-        if every > NonZeroU64::MIN && word.topic.is_none_or(|topic| topic.row().pace != Pace::Scan) {
+        if every > NonZeroU64::MIN
+            && pattern.topic.is_none_or(|topic| topic.spec().publish_rate != PublishRate::Scan)
+        {
             return Err(refuse(text, "is not only of each telegram, and cannot be thinned", name));
         }
-        Ok(Entry { word, every })
+        Ok(Entry { pattern, every })
     }
 }
 
@@ -156,8 +158,11 @@ mod tests {
             assert_eq!(every(&bare, "front", topic), (topic == Topic::Telegram).then_some(1));
         }
         let house = selection(&["front/*", "house/tracks"], false).unwrap();
-        assert_eq!((house.maker_of("front"), house.maker_of("house")), (Maker::Link, Maker::Tracker));
-        assert!(usual.wants_all() && bare.wants_all() && usual.named().is_empty());
+        assert_eq!(
+            (house.publisher_kind("front"), house.publisher_kind("house")),
+            (PublisherKind::Link, PublisherKind::Tracker)
+        );
+        assert!(usual.includes_unnamed() && bare.includes_unnamed() && usual.named_sensors().is_empty());
     }
 
     #[test]
@@ -169,10 +174,10 @@ mod tests {
             (every(&some, "front", Topic::Zones), every(&some, "rear", Topic::Zones)),
             (Some(1), None)
         );
-        assert_eq!((some.named(), some.wants_all()), (vec!["front"], true));
-        assert!(some.names(Topic::Zones) && !some.names(Topic::Marks));
-        assert!(selection(&["front/*"], false).unwrap().names(Topic::Marks));
-        assert!(!selection(&["front/zones"], false).unwrap().wants_all());
+        assert_eq!((some.named_sensors(), some.includes_unnamed()), (vec!["front"], true));
+        assert!(some.includes(Topic::Zones) && !some.includes(Topic::Marks));
+        assert!(selection(&["front/*"], false).unwrap().includes(Topic::Marks));
+        assert!(!selection(&["front/zones"], false).unwrap().includes_unnamed());
         let front = selection(&["*/scan:every=8", "front/*", "front/marks:every=2"], false).unwrap();
         assert_eq!(every(&front, "front", Topic::Scan), Some(1));
         assert_eq!(every(&front, "front", Topic::Marks), Some(2));

@@ -18,11 +18,11 @@ pub(super) struct Host {
     /// Time at which the name was resolved last; `None` for a literal address.
     resolved_at: Option<Instant>,
     task: Option<BackgroundTask<Option<SocketAddr>>>,
-    resolve: Resolve,
+    resolve: Resolver,
 }
 
 /// Function that resolves a name to addresses.
-pub(super) type Resolve = fn(&str) -> io::Result<Vec<SocketAddr>>;
+pub(super) type Resolver = fn(&str) -> io::Result<Vec<SocketAddr>>;
 
 /// Interval at which a name is resolved again, because machines may get another address.
 const RESOLVE_INTERVAL: Duration = Duration::from_secs(60);
@@ -42,7 +42,7 @@ impl Host {
 
     /// Does the same as [`parse`](Host::parse) with the function `resolve`.
     pub(super) fn resolve_with(
-        resolve: Resolve,
+        resolve: Resolver,
         text: &str,
         more_ports: u16,
         stop: &AtomicBool,
@@ -169,7 +169,7 @@ mod tests {
         let refused = of("[fe80::1]:7").unwrap_err();
         assert!(refused.kind == Kind::Configuration && refused.hint.contains("%eth0"), "{refused}");
         assert_eq!(of("[fe80::1%3]:7"), Ok("[fe80::1%3]:7".into()));
-        let lo = crate::interface::named("lo").unwrap().index;
+        let lo = crate::interface::by_name("lo").unwrap().index;
         assert_eq!(of("[fe80::1%lo]:7"), Ok(format!("[fe80::1%{lo}]:7")));
         assert!(of("[fe80::1%no-such]:7").is_err() && of("[fe80::1%lo]:").is_err());
     }

@@ -12,7 +12,7 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 use scanhub_schema::{Failure, Kind};
 
-use crate::interface::{Interface, InterfaceChanges, interfaces, named};
+use crate::interface::{Interface, InterfaceChanges, by_name, interfaces};
 
 /// A network interface and its state. A separate thread monitors it, so that the sender needs no system calls for it.
 pub(super) struct InterfaceMonitor {
@@ -48,7 +48,7 @@ impl InterfaceMonitor {
         };
         // Subscribe before reading the state, so that no change is missed in between.
         let changes = InterfaceChanges::subscribe()?;
-        let found = named(name)?;
+        let found = by_name(name)?;
         let state = State::of(Some(&found));
         let latest = Arc::new(AtomicU64::new(state.to_word()));
         let (ending, end) = pipe().map_err(|error| unwatched(&error))?;

@@ -4,19 +4,19 @@
 use std::num::NonZeroU64;
 use std::sync::atomic::AtomicBool;
 
-use scanhub_schema::datagram::{HEAD, MTU_ETHERNET, MTU_LEAST, PORT};
+use scanhub_schema::datagram::{HEADER_LEN, MIN_MTU, MTU_ETHERNET, PORT};
 use scanhub_schema::{Failure, Kind, Topic};
 
 use super::interface_monitor::InterfaceMonitor;
 use super::udp_destination::UdpDestination;
-use crate::forward::Carrier;
-use crate::gateway_identity::Life;
+use crate::forward::SampleSink;
+use crate::gateway_identity::GatewayIdentity;
 use crate::lan::outgoing::{Form, Outgoing, Sample, Transmit};
 use crate::now;
 
 /// Sending end of a gateway and its destinations.
 pub(super) struct Network {
-    pub(super) life: Life,
+    pub(super) identity: GatewayIdentity,
     pub(super) outgoing: Outgoing,
     pub(super) destinations: Destinations,
 }
@@ -45,7 +45,7 @@ impl Network {
     /// [`Kind::Failed`] if a socket cannot be opened, and [`Kind::Interrupted`] if `stop` is set before all hosts are
     /// resolved.
     pub(super) fn open(
-        life: Life,
+        identity: GatewayIdentity,
         interface: Option<InterfaceMonitor>,
         to: &[String],
         form: Form,
@@ -53,9 +53,9 @@ impl Network {
         longest: usize,
         stop: &AtomicBool,
     ) -> Result<Network, Failure> {
-        if !(MTU_LEAST..=MTU_ETHERNET).contains(&longest) {
+        if !(MIN_MTU..=MTU_ETHERNET).contains(&longest) {
             let what = format!("datagrams of {longest} bytes are not possible");
-            let hint = format!("from {MTU_LEAST} to {MTU_ETHERNET}, the most that an Ethernet carries");
+            let hint = format!("from {MIN_MTU} to {MTU_ETHERNET}, the most that an Ethernet carries");
             return Err(Failure::new(Kind::Configuration, what, hint));
         }
         let (port, more_ports) = match form {
@@ -81,19 +81,19 @@ impl Network {
             groups.use_interface();
             groups.destination.max_len(groups.interface.index()?)
         });
-        let longest = longest.min(max_len.unwrap_or(longest)).max(HEAD);
-        let outgoing = Outgoing::new(life.hub, life.epoch, form, longest);
-        Ok(Network { life, outgoing, destinations: Destinations { groups, copies } })
+        let longest = longest.min(max_len.unwrap_or(longest)).max(HEADER_LEN);
+        let outgoing = Outgoing::new(identity.hub, identity.epoch, form, longest);
+        Ok(Network { identity, outgoing, destinations: Destinations { groups, copies } })
     }
 }
 
-impl Carrier for Network {
+impl SampleSink for Network {
     fn follow(&mut self, name: &str, every: &dyn Fn(Topic) -> Option<NonZeroU64>) -> usize {
         self.outgoing.follow(name, every)
     }
 
-    fn wants(&self, sensor: usize, topic: Topic) -> bool {
-        self.outgoing.wants(sensor, topic)
+    fn needs(&self, sensor: usize, topic: Topic) -> bool {
+        self.outgoing.needs(sensor, topic)
     }
 
     fn sample(&mut self, sensor: usize, sample: &Sample<'_>) {

@@ -17,7 +17,7 @@ use rustix::net::sockopt::{
     set_ip_multicast_if_with_ifindex, set_ipv6_mtu_discover, set_socket_recv_buffer_size,
 };
 use rustix::net::{RecvAncillaryBuffer, RecvFlags, recvmsg};
-use scanhub_schema::datagram::{Announce, GROUPS, PORT};
+use scanhub_schema::datagram::{Announce, GROUP_PREFIX, PORT};
 use scanhub_schema::{Failure, Kind};
 
 use super::host::Host;
@@ -37,7 +37,7 @@ pub(super) struct UdpDestination {
     /// them.
     pub(super) is_down: bool,
     socket: UdpSocket,
-    to: To,
+    target: Target,
     last_error: Option<io::Error>,
     /// Datagrams that were lost by the last check.
     lost: u64,
@@ -45,7 +45,7 @@ pub(super) struct UdpDestination {
     checks_without_failure: Option<u32>,
 }
 
-enum To {
+enum Target {
     /// All groups, on this port.
     Groups {
         port: u16,
@@ -59,7 +59,7 @@ pub(super) enum DestinationEvent {
     /// Some or all datagrams are lost, with the last reason.
     Failing(String),
     /// All datagrams are accepted again.
-    Well,
+    Recovered,
 }
 
 impl UdpDestination {
@@ -69,7 +69,7 @@ impl UdpDestination {
     ///
     /// Returns [`Kind::Failed`] if the socket cannot be opened.
     pub(super) fn groups(name: &str, port: u16, ttl: u8) -> Result<UdpDestination, Failure> {
-        let destination = UdpDestination::new(name, To::Groups { port })?;
+        let destination = UdpDestination::new(name, Target::Groups { port })?;
         let set = destination.socket.set_multicast_ttl_v4(ttl.into());
         set.and_then(|()| destination.socket.set_multicast_loop_v4(true))
             .map_err(|error| no_socket(&error))?;
@@ -82,14 +82,14 @@ impl UdpDestination {
     ///
     /// Returns the same errors as [`Host::parse`], and [`Kind::Failed`] if the socket cannot be opened.
     pub(super) fn host(text: &str, more_ports: u16, stop: &AtomicBool) -> Result<UdpDestination, Failure> {
-        UdpDestination::new(text, To::Host(Host::parse(text, more_ports, stop)?))
+        UdpDestination::new(text, Target::Host(Host::parse(text, more_ports, stop)?))
     }
 
     /// Returns whether datagrams to `other` arrive at the same destination.
     pub(super) fn is_same(&self, other: &UdpDestination) -> bool {
-        match (&self.to, &other.to) {
-            (To::Groups { .. }, To::Groups { .. }) => true,
-            (To::Host(one), To::Host(other)) => one.address() == other.address(),
+        match (&self.target, &other.target) {
+            (Target::Groups { .. }, Target::Groups { .. }) => true,
+            (Target::Host(one), Target::Host(other)) => one.address() == other.address(),
             _ => false,
         }
     }
@@ -97,7 +97,7 @@ impl UdpDestination {
     /// Continues with the address that the host's name has now, and returns it if it has changed. Call it once a
     /// second.
     pub(super) fn follow_name(&mut self, now: Instant) -> Option<SocketAddr> {
-        let To::Host(host) = &mut self.to else { return None };
+        let Target::Host(host) = &mut self.target else { return None };
         let address = host.new_address(self.checks_without_failure.is_some(), now)?;
         if address.is_ipv4() != host.address().is_ipv4() {
             // If the socket cannot be opened, keep the old address. The name is resolved again later.
@@ -121,16 +121,23 @@ impl UdpDestination {
         let any = Ipv4Addr::UNSPECIFIED;
         let probe = socket(any.into()).ok()?;
         set_ip_multicast_if_with_ifindex(&probe, &any, &any, index).ok()?;
-        probe.connect((Ipv4Addr::from([GROUPS[0], GROUPS[1], GROUPS[2], Announce::GROUP]), PORT)).ok()?;
+        probe
+            .connect((
+                Ipv4Addr::from([GROUP_PREFIX[0], GROUP_PREFIX[1], GROUP_PREFIX[2], Announce::GROUP]),
+                PORT,
+            ))
+            .ok()?;
         (ip_mtu(&probe).ok()? as usize).checked_sub(IP_AND_UDP)
     }
 
     /// Sends a datagram, to the group with this last byte if the destination is the groups, and to the port that is
     /// `above` ports after the usual one. Returns whether the kernel accepted it.
     pub(super) fn send(&mut self, datagram: &[u8], group: u8, above: u8) -> bool {
-        let mut address = match &self.to {
-            To::Groups { port } => SocketAddr::from(([GROUPS[0], GROUPS[1], GROUPS[2], group], *port)),
-            To::Host(host) => host.address(),
+        let mut address = match &self.target {
+            Target::Groups { port } => {
+                SocketAddr::from(([GROUP_PREFIX[0], GROUP_PREFIX[1], GROUP_PREFIX[2], group], *port))
+            }
+            Target::Host(host) => host.address(),
         };
         address.set_port(address.port() + u16::from(above));
         match self.socket.send_to(datagram, address) {
@@ -162,7 +169,7 @@ impl UdpDestination {
             }
             (None, true) => {
                 self.checks_without_failure = Some(0);
-                let reason = self.last_error.as_ref().map_or_else(|| NOBODY.into(), explain);
+                let reason = self.last_error.as_ref().map_or_else(|| NO_RECEIVER.into(), explain);
                 Some(DestinationEvent::Failing(reason))
             }
             (Some(checks), false) if *checks < RECOVERY_CHECKS => {
@@ -171,15 +178,15 @@ impl UdpDestination {
             }
             (Some(_), false) => {
                 self.checks_without_failure = None;
-                Some(DestinationEvent::Well)
+                Some(DestinationEvent::Recovered)
             }
         }
     }
 
-    fn new(name: &str, to: To) -> Result<UdpDestination, Failure> {
+    fn new(name: &str, to: Target) -> Result<UdpDestination, Failure> {
         let ip = match &to {
-            To::Groups { .. } => Ipv4Addr::UNSPECIFIED.into(),
-            To::Host(host) => host.address().ip(),
+            Target::Groups { .. } => Ipv4Addr::UNSPECIFIED.into(),
+            Target::Host(host) => host.address().ip(),
         };
         Ok(UdpDestination {
             name: name.to_owned(),
@@ -188,7 +195,7 @@ impl UdpDestination {
             reported: 0,
             is_down: false,
             socket: socket(ip).map_err(|error| no_socket(&error))?,
-            to,
+            target: to,
             last_error: None,
             lost: 0,
             checks_without_failure: None,
@@ -243,7 +250,7 @@ fn no_socket(error: &io::Error) -> Failure {
     Failure::new(Kind::Failed, format!("no socket for datagrams: {error}"), "")
 }
 
-const NOBODY: &str = "nobody is there";
+const NO_RECEIVER: &str = "nobody is there";
 /// Number of checks without a failure after which a destination has recovered. The network reports the errors of a host
 /// without a receiver at most once a second.
 const RECOVERY_CHECKS: u32 = 2;
@@ -271,7 +278,7 @@ mod tests {
         PORT.store(there.local_addr().unwrap().port(), Ordering::SeqCst);
         let begin = Instant::now();
         let host = Host::resolve_with(resolve, "robot:7", 0, &AtomicBool::new(false), begin).unwrap();
-        let mut destination = UdpDestination::new("robot:7", To::Host(host)).unwrap();
+        let mut destination = UdpDestination::new("robot:7", Target::Host(host)).unwrap();
         let later = begin + Duration::from_secs(60);
         assert_eq!(destination.follow_name(begin), None);
         HAS_MOVED.store(true, Ordering::SeqCst);
@@ -317,7 +324,7 @@ mod tests {
                 && destination.check().is_none()
         );
         let receiver = UdpSocket::bind(&text).unwrap();
-        assert_eq!((destination.check(), destination.check()), (None, Some(DestinationEvent::Well)));
+        assert_eq!((destination.check(), destination.check()), (None, Some(DestinationEvent::Recovered)));
         assert!(destination.send(b"three", 0, 0));
         let mut bytes = [0; 9];
         assert_eq!(receiver.recv(&mut bytes).unwrap(), 5);

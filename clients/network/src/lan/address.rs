@@ -29,7 +29,7 @@ pub const LIVE: &str = "@live";
 impl<'a> Address<'a> {
     /// Returns the address with this name. `None` if it is not valid.
     pub fn parse(text: &'a str) -> Option<Address<'a>> {
-        let (hub, sensor, last) = words(text)?;
+        let (hub, sensor, last) = split_name(text)?;
         let topic = if last == ANNOUNCE { None } else { Some(Topic::parse(last)?) };
         Some(Address { hub, sensor, topic })
     }
@@ -43,7 +43,9 @@ impl<'a> Address<'a> {
             return false;
         }
         match self.topic {
-            None => Announce::unpack(datagram.payload).is_none_or(|said| said.sensor() == self.sensor),
+            None => {
+                Announce::unpack(datagram.payload).is_none_or(|announced| announced.sensor() == self.sensor)
+            }
             Some(_) => gateways
                 .announced(head.hub, head.epoch, head.sensor)
                 .is_none_or(|known| known.sensor() == self.sensor),
@@ -59,13 +61,13 @@ impl fmt::Display for Address<'_> {
 }
 
 /// Returns hub and sensor of a name that exists as long as the sensor does: `scanhub/HUB/SENSOR/@live`.
-pub fn live(text: &str) -> Option<(u64, &str)> {
-    let (hub, sensor, last) = words(text)?;
+pub fn parse_live(text: &str) -> Option<(u64, &str)> {
+    let (hub, sensor, last) = split_name(text)?;
     (last == LIVE).then_some((hub, sensor))
 }
 
 /// Returns hub, sensor and last word of a name.
-fn words(text: &str) -> Option<(u64, &str, &str)> {
+fn split_name(text: &str) -> Option<(u64, &str, &str)> {
     let mut words = text.split('/');
     let (prefix, hub) = (words.next()?, words.next()?);
     let (sensor, last) = (words.next()?, words.next()?);
@@ -77,10 +79,10 @@ fn words(text: &str) -> Option<(u64, &str, &str)> {
 #[cfg(test)]
 mod tests {
     use scanhub_schema::Zones;
-    use scanhub_schema::datagram::{HEAD, Head, Packed};
+    use scanhub_schema::datagram::{DatagramPayload, HEADER_LEN, Head};
 
     use super::*;
-    use crate::lan::Stamp;
+    use crate::lan::WallTimestamp;
     use crate::lan::incoming::Incoming;
 
     #[test]
@@ -90,7 +92,7 @@ mod tests {
         assert_eq!((scan.to_string().as_str(), Address::parse(text)), (text, Some(scan)));
         let announce = Address { topic: None, ..scan };
         assert_eq!(Address::parse(&announce.to_string()), Some(announce));
-        assert_eq!(live("scanhub/00000000000000ab/front/@live"), Some((0xab, "front")));
+        assert_eq!(parse_live("scanhub/00000000000000ab/front/@live"), Some((0xab, "front")));
         for other in [
             "scanhub/00000000000000AB/front/scan",
             "scanhub/ab/front/scan",
@@ -104,7 +106,7 @@ mod tests {
             "scanhub//front/scan",
             "",
         ] {
-            assert!(Address::parse(other).is_none() && live(other).is_none(), "{other}");
+            assert!(Address::parse(other).is_none() && parse_live(other).is_none(), "{other}");
         }
     }
 
@@ -112,7 +114,7 @@ mod tests {
     fn datagrams_are_compared_with_their_name() {
         let sealed = |head: Head, pack: &dyn Fn(&mut [u8]) -> Option<usize>| {
             let mut buffer = [0; 400];
-            let len = pack(&mut buffer[HEAD..]).unwrap();
+            let len = pack(&mut buffer[HEADER_LEN..]).unwrap();
             head.seal(&mut buffer, len).unwrap().to_vec()
         };
         let zones = |hub, sensor| {
@@ -130,7 +132,7 @@ mod tests {
         assert!(may(&incoming, rear, &zones(5, 2)), "no sensor was announced yet");
         assert!(!may(&incoming, "scanhub/0000000000000005/rear/announce", &announced));
         assert!(may(&incoming, "scanhub/0000000000000005/front/announce", &announced));
-        incoming.receive(&announced, 0, Stamp::default(), &mut Vec::new());
+        incoming.receive(&announced, 0, WallTimestamp::default(), &mut Vec::new());
         assert!(may(&incoming, front, &zones(5, 2)) && !may(&incoming, rear, &zones(5, 2)));
         assert!(!may(&incoming, front, &zones(6, 2)), "another hub");
         assert!(!may(&incoming, "scanhub/0000000000000005/front/scan", &zones(5, 2)), "another topic");

@@ -3,7 +3,7 @@
 //! Each start of a gateway is a run with its own epoch. The run with the highest epoch is active, and lower ones are
 //! retired. Memory is bounded by the number of runs and of their sensors and topics, no matter who sends. There is one
 //! rule for the run that makes room for another one: the run that retired first is evicted. If no run is retired,
-//! active runs are compared by their [`Standing`].
+//! active runs are compared by their [`EvictionRank`].
 //!
 //! Anyone who can send can invent gateways. A run that is known to deliver is therefore never evicted for one that only
 //! announces itself, and the run that has been silent for longest goes first. Time is an argument, and MACs are checked
@@ -16,7 +16,7 @@ use scanhub_schema::Topic;
 use scanhub_schema::datagram::{Announce, Datagram, DatagramError, Head};
 
 use super::senders::{DuplicateDetector, SILENCE_NS, SenderMatch, Senders};
-use super::sequence::{Fresh, Row};
+use super::sequence::{SequenceStatus, StreamCounters};
 
 /// Maximum number of runs of gateways that are distinguished.
 pub const MAX_RUNS: usize = 64;
@@ -40,7 +40,7 @@ pub(crate) const MAX_EPOCHS: usize = 1024;
 /// known to send.
 pub struct GatewayTable {
     /// Bit n is set if the receiver has joined the group of topic number n.
-    followed: u64,
+    joined_topics: u64,
     /// Whether the receiver has a key, so that only samples of announced topics are accepted.
     is_keyed: bool,
     /// By number.
@@ -62,7 +62,7 @@ pub struct GatewayTable {
 struct Gateway {
     /// By epoch: the last one is active.
     runs: BTreeMap<u32, Run>,
-    kept_epoch: Option<KeptEpoch>,
+    stored_epoch: Option<StoredEpoch>,
     duplicates: DuplicateDetector,
     /// Whether the difference of its clock was reported. Such a gateway is never forgotten, so that the report is not
     /// repeated. There are at most [`MAX_RUNS`] of them.
@@ -72,7 +72,7 @@ struct Gateway {
 }
 
 /// Highest epoch of a gateway that had the key. It outlives the runs and the receiver.
-struct KeptEpoch {
+struct StoredEpoch {
     epoch: u32,
     order: u64,
 }
@@ -85,7 +85,7 @@ struct Run {
     accepted: u64,
     /// Order in which runs retired; `None` for the active run of a gateway.
     retired: Option<u64>,
-    standing: Standing,
+    rank: EvictionRank,
     senders: Senders,
     delays: Delays,
     /// By the sensor's number.
@@ -101,7 +101,7 @@ struct Sensor {
     /// Whether it was printed under its number.
     is_numbered: bool,
     /// By the topic's number.
-    rows: BTreeMap<u8, Row>,
+    rows: BTreeMap<u8, StreamCounters>,
 }
 
 /// Gateway and epoch of a run.
@@ -127,8 +127,8 @@ pub struct EvictedTotals {
 }
 
 /// Result of accepting a datagram.
-pub(super) struct Accepted {
-    pub(super) fresh: Fresh,
+pub(super) struct AcceptedDatagram {
+    pub(super) status: SequenceStatus,
     /// Whether a run of the gateway begins with the datagram.
     pub(super) begins: bool,
     /// Samples that were sent since the one before it and have not arrived.
@@ -144,7 +144,7 @@ impl GatewayTable {
     /// ignored, because their samples would count as lost.
     pub fn new(topics: &[Topic]) -> GatewayTable {
         GatewayTable {
-            followed: topics.iter().fold(0, |bits, topic| bits | 1 << topic.number()),
+            joined_topics: topics.iter().fold(0, |bits, topic| bits | 1 << topic.number()),
             is_keyed: false,
             gateways: BTreeMap::new(),
             run_count: 0,
@@ -161,12 +161,12 @@ impl GatewayTable {
     /// Returns the table of a receiver with a key. It accepts samples only from announced sensors and topics, starting
     /// with the number in the first announcement, and no run before those in `epochs`. It does not accept another
     /// sender as the next run of a silent gateway. Recorded datagrams therefore cannot be replayed.
-    pub(super) fn keyed(mut self, epochs: HashMap<u64, u32>) -> GatewayTable {
+    pub(super) fn with_key(mut self, epochs: HashMap<u64, u32>) -> GatewayTable {
         self.is_keyed = true;
         let mut epochs: Vec<_> = epochs.into_iter().collect();
         epochs.sort_unstable_by_key(|&(hub, epoch)| Reverse((epoch, hub)));
         epochs.truncate(MAX_EPOCHS);
-        epochs.iter().rev().for_each(|&(hub, epoch)| self.keep_epoch(hub, epoch));
+        epochs.iter().rev().for_each(|&(hub, epoch)| self.store_epoch(hub, epoch));
         self.is_epoch_new = false;
         self
     }
@@ -183,21 +183,21 @@ impl GatewayTable {
         bytes: &'a [u8],
         from: u64,
         now_ns: u64,
-    ) -> Result<(Datagram<'a>, Fresh), DatagramError> {
+    ) -> Result<(Datagram<'a>, SequenceStatus), DatagramError> {
         let read = Datagram::read(bytes);
         let taken =
-            read.and_then(|datagram| Ok((datagram, self.take(&datagram, from, false, now_ns)?.fresh)));
-        taken.inspect_err(|why| self.refuse(*why))
+            read.and_then(|datagram| Ok((datagram, self.take(&datagram, from, false, now_ns)?.status)));
+        taken.inspect_err(|reason| self.refuse(*reason))
     }
 
     /// Counts a datagram that is refused for this reason.
-    pub(super) fn refuse(&mut self, why: DatagramError) {
-        self.refused[why as usize] += 1;
+    pub(super) fn refuse(&mut self, reason: DatagramError) {
+        self.refused[reason as usize] += 1;
     }
 
     /// Returns how many datagrams were refused for this reason.
-    pub fn refused(&self, why: DatagramError) -> u64 {
-        self.refused[why as usize]
+    pub fn refused(&self, reason: DatagramError) -> u64 {
+        self.refused[reason as usize]
     }
 
     /// Returns the totals of everything that was evicted.
@@ -206,7 +206,7 @@ impl GatewayTable {
     }
 
     /// Returns the counters of every sensor and topic that has sent samples, by gateway, epoch, sensor and topic.
-    pub fn rows(&self) -> impl Iterator<Item = &Row> {
+    pub fn rows(&self) -> impl Iterator<Item = &StreamCounters> {
         let runs = self.gateways.values().flat_map(|gateway| gateway.runs.values());
         runs.flat_map(Run::rows).filter(|row| row.received + row.lost() > 0)
     }
@@ -227,14 +227,14 @@ impl GatewayTable {
         from: u64,
         may_move: bool,
         now_ns: u64,
-    ) -> Result<Accepted, DatagramError> {
+    ) -> Result<AcceptedDatagram, DatagramError> {
         let (head, run_id) = (&datagram.head, (datagram.head.hub, datagram.head.epoch));
         // The only check of the payload: everything that follows uses its result.
         let announce = datagram.announce();
         let boot = announce.map(|announce| announce.boot);
         let known = self.find(run_id)?;
         let room = if announce.is_some() { Ok(0) } else { datagram.check_payload() };
-        let mut sender = known.map_or(SenderMatch::Own, |run| run.senders.judge(from, boot, now_ns));
+        let mut sender = known.map_or(SenderMatch::Own, |run| run.senders.match_sender(from, boot, now_ns));
         let is_ahead = || known.and_then(|run| run.row(head)).is_some_and(|row| row.is_ahead(head.sequence));
         let moved_to = boot.filter(|_| sender == SenderMatch::Next && may_move && is_ahead());
         let is_known = known.is_some();
@@ -245,19 +245,19 @@ impl GatewayTable {
                 sender = SenderMatch::Own;
             } else if is_twin {
                 if room.is_ok() {
-                    run.senders.note(from, boot, now_ns);
+                    run.senders.record(from, boot, now_ns);
                 }
                 return Err(DatagramError::Twin);
             }
         }
         let is_known = is_known && sender == SenderMatch::Own;
-        let arrival = Arrival { delivers: head.topic != Announce::NUMBER, now_ns };
+        let arrival = Arrival { is_sample: head.topic != Announce::NUMBER, now_ns };
         match self.run(run_id).and_then(|run| run.row(head)) {
             // The whole run of the silent gateway makes room.
             _ if sender == SenderMatch::Next => {}
             Some(row) if row.is_stale(head.sequence) => return Err(DatagramError::Stale),
             Some(row) if self.is_keyed && row.is_before(head.sequence) => return Err(DatagramError::Stale),
-            None if self.is_keyed && arrival.delivers => return Err(DatagramError::Untimely),
+            None if self.is_keyed && arrival.is_sample => return Err(DatagramError::Untimely),
             None if !self.has_room(run_id, is_known, arrival) => return Err(DatagramError::Capacity),
             _ => {}
         }
@@ -269,28 +269,31 @@ impl GatewayTable {
             self.begin(run_id, arrival);
         }
         if self.is_keyed {
-            self.keep_epoch(head.hub, head.epoch);
+            self.store_epoch(head.hub, head.epoch);
         }
         if let Some(run) = self.run_mut(run_id) {
-            run.standing.take(arrival);
-            run.senders.note(from, boot, now_ns);
+            run.rank.take(arrival);
+            run.senders.record(from, boot, now_ns);
         }
         let row = self.row(head, head.topic, head.sequence, arrival);
-        let (missed, fresh) =
-            row.map_or((0, Fresh::New), |row| (row.missed_before(head.sequence), row.take(head.sequence)));
-        if let Some(gateway) = self.gateways.get_mut(&head.hub).filter(|_| fresh != Fresh::Duplicate) {
-            gateway.duplicates.accepted();
+        let (missed, status) = row.map_or((0, SequenceStatus::New), |row| {
+            (row.missed_before(head.sequence), row.record(head.sequence))
+        });
+        if let Some(gateway) =
+            self.gateways.get_mut(&head.hub).filter(|_| status != SequenceStatus::Duplicate)
+        {
+            gateway.duplicates.on_accepted();
         }
         if let Some(announce) = &announce {
             self.announce_numbers(head, announce, arrival);
         }
-        Ok(Accepted { fresh, begins: !is_known, missed, room, announce })
+        Ok(AcceptedDatagram { status, begins: !is_known, missed, room, announce })
     }
 
     /// Records the next sequence numbers of an announcement. A topic that finds no room starts with its first datagram,
     /// if there is room then.
     fn announce_numbers(&mut self, head: &Head, announce: &Announce, arrival: Arrival) {
-        let followed = self.followed;
+        let followed = self.joined_topics;
         let is_followed = |number: u8| number < 64 && followed >> number & 1 == 1;
         for announced in announce.topics().iter().filter(|announced| is_followed(announced.topic)) {
             if let Some(row) = self.row(head, announced.topic, announced.next, arrival) {
@@ -315,7 +318,7 @@ impl GatewayTable {
         if row.is_stale(head.sequence) || row.is_before(head.sequence) {
             return Err(DatagramError::Stale);
         }
-        Ok(row.came(head.sequence))
+        Ok(row.has_arrived(head.sequence))
     }
 
     /// Returns whether this sensor was announced in this run of its gateway, and neither has been evicted since.
@@ -332,7 +335,7 @@ impl GatewayTable {
 
     /// Returns whether this run of `hub` is active and known to deliver: its accepted samples cover a second or more.
     pub fn is_proven(&self, hub: u64, epoch: u32) -> bool {
-        self.find((hub, epoch)).is_ok_and(|run| run.is_some_and(|run| run.standing.is_proven()))
+        self.find((hub, epoch)).is_ok_and(|run| run.is_some_and(|run| run.rank.is_proven()))
     }
 
     /// Returns whether two gateways are known to send under this number and epoch. All datagrams of one of them are
@@ -345,7 +348,7 @@ impl GatewayTable {
     pub(super) fn is_duplicate(&mut self, head: &Head, now_ns: u64) -> bool {
         let is_shared = self.is_shared(head.hub, head.epoch);
         let gateway = self.gateways.get_mut(&head.hub);
-        is_shared || gateway.is_some_and(|gateway| gateway.duplicates.refused(now_ns))
+        is_shared || gateway.is_some_and(|gateway| gateway.duplicates.on_refused(now_ns))
     }
 
     /// Records an announcement that was accepted and is newer than all others of its sensor. Returns by how much this
@@ -398,7 +401,7 @@ impl GatewayTable {
 
     /// Returns the name of the sensor of a row, as [`name`](Self::name) does, but `#` and its number if it had several
     /// names, because the row counts the samples of each of them.
-    pub(crate) fn row_name(&self, row: &Row) -> String {
+    pub(crate) fn row_name(&self, row: &StreamCounters) -> String {
         match self.sensor(row.hub, row.epoch, row.sensor) {
             Some(sensor) if sensor.is_renamed => format!("#{}", row.sensor),
             _ => self.name(row.hub, row.epoch, row.sensor),
@@ -407,7 +410,7 @@ impl GatewayTable {
 
     /// Returns how many samples of the row's topic were replaced by newer ones before they were sent, as last
     /// announced. `None` if that was not announced.
-    pub fn replaced(&self, row: &Row) -> Option<u32> {
+    pub fn replaced(&self, row: &StreamCounters) -> Option<u32> {
         self.announced(row.hub, row.epoch, row.sensor)?.replaced(row.topic)
     }
 
@@ -426,36 +429,36 @@ impl GatewayTable {
     }
 
     /// Returns the highest authenticated epoch of `hub`, if it is kept.
-    pub(super) fn kept_epoch(&self, hub: u64) -> Option<u32> {
-        Some(self.gateways.get(&hub)?.kept_epoch.as_ref()?.epoch)
+    pub(super) fn stored_epoch(&self, hub: u64) -> Option<u32> {
+        Some(self.gateways.get(&hub)?.stored_epoch.as_ref()?.epoch)
     }
 
     /// Returns the highest authenticated epochs of all gateways if one of them is new since the last call.
     pub(super) fn take_epochs(&mut self) -> Option<HashMap<u64, u32>> {
-        let kept = |(hub, gateway): (&u64, &Gateway)| Some((*hub, gateway.kept_epoch.as_ref()?.epoch));
+        let kept = |(hub, gateway): (&u64, &Gateway)| Some((*hub, gateway.stored_epoch.as_ref()?.epoch));
         std::mem::take(&mut self.is_epoch_new).then(|| self.gateways.iter().filter_map(kept).collect())
     }
 
     /// Keeps an authenticated epoch of `hub`. Anyone with the key can invent gateways, so the one that has been
     /// known for longest is forgotten if there are too many.
-    fn keep_epoch(&mut self, hub: u64, epoch: u32) {
+    fn store_epoch(&mut self, hub: u64, epoch: u32) {
         let order = self.order();
         let gateway = self.gateways.entry(hub).or_default();
-        if let Some(kept) = &mut gateway.kept_epoch {
-            self.is_epoch_new |= epoch > kept.epoch;
-            kept.epoch = epoch.max(kept.epoch);
+        if let Some(stored) = &mut gateway.stored_epoch {
+            self.is_epoch_new |= epoch > stored.epoch;
+            stored.epoch = epoch.max(stored.epoch);
             return;
         }
-        gateway.kept_epoch = Some(KeptEpoch { epoch, order });
+        gateway.stored_epoch = Some(StoredEpoch { epoch, order });
         self.is_epoch_new = true;
         self.epoch_count += 1;
         if self.epoch_count > MAX_EPOCHS {
-            let order = |gateway: &Gateway| gateway.kept_epoch.as_ref().map(|kept| kept.order);
+            let order = |gateway: &Gateway| gateway.stored_epoch.as_ref().map(|kept| kept.order);
             let kept = self.gateways.iter().filter_map(|(hub, gateway)| Some((order(gateway)?, *hub)));
             if let Some((_, first)) = kept.min() {
-                self.gateways.entry(first).and_modify(|gateway| gateway.kept_epoch = None);
+                self.gateways.entry(first).and_modify(|gateway| gateway.stored_epoch = None);
                 self.epoch_count -= 1;
-                self.forget_if_unused(first);
+                self.remove_if_unused(first);
             }
         }
     }
@@ -483,7 +486,7 @@ impl GatewayTable {
 
     /// Returns the row of the sensor that sent `head` for `topic`, or a new row that starts with `first`. `None` if
     /// there is no room.
-    fn row(&mut self, head: &Head, topic: u8, first: u32, arrival: Arrival) -> Option<&mut Row> {
+    fn row(&mut self, head: &Head, topic: u8, first: u32, arrival: Arrival) -> Option<&mut StreamCounters> {
         let Head { hub, epoch, sensor, .. } = *head;
         let known = self.sensor(hub, epoch, sensor);
         if known.is_none_or(|sensor| !sensor.rows.contains_key(&topic)) {
@@ -495,7 +498,7 @@ impl GatewayTable {
         }
         let sensors = &mut self.run_mut((hub, epoch))?.sensors;
         let rows = &mut sensors.entry(sensor).or_default().rows;
-        Some(rows.entry(topic).or_insert_with(|| Row::new((hub, epoch, sensor, topic), first)))
+        Some(rows.entry(topic).or_insert_with(|| StreamCounters::new((hub, epoch, sensor, topic), first)))
     }
 
     /// Returns whether there is room for another row of `run_id`, or a run that can be evicted for `arrival`.
@@ -526,7 +529,7 @@ impl GatewayTable {
     fn evict(&mut self, run_id: RunId, arrival: Arrival) -> Option<RunId> {
         let (evicted, is_displaced) = self.next_evicted(run_id, arrival)?;
         self.end(evicted, is_displaced);
-        self.forget_if_unused(evicted.0);
+        self.remove_if_unused(evicted.0);
         Some(evicted)
     }
 
@@ -536,11 +539,11 @@ impl GatewayTable {
             .gateways
             .iter()
             .flat_map(|(hub, gateway)| gateway.runs.iter().map(move |(epoch, run)| ((*hub, *epoch), run)));
-        let may_go =
-            all.filter(|&(id, run)| id != run_id && (run.retired.is_some() || run.standing.may_go(arrival)));
+        let may_go = all
+            .filter(|&(id, run)| id != run_id && (run.retired.is_some() || run.rank.may_be_evicted(arrival)));
         let rank = |run: &Run| match run.retired {
             Some(retired) => (false, 0, retired),
-            None => (true, run.standing.worth_ns(), run.accepted),
+            None => (true, run.rank.active_until_ns(), run.accepted),
         };
         may_go.min_by_key(|(_, run)| rank(run)).map(|(id, run)| (id, run.retired.is_none()))
     }
@@ -550,14 +553,14 @@ impl GatewayTable {
         let Some(run) = self.gateways.get_mut(&hub).and_then(|gateway| gateway.runs.remove(&epoch)) else {
             return;
         };
-        let sum = &mut self.evicted;
-        sum.runs += 1;
-        sum.evicted_active += u64::from(is_active);
+        let totals = &mut self.evicted;
+        totals.runs += 1;
+        totals.evicted_active += u64::from(is_active);
         for row in run.rows() {
-            sum.received += row.received;
-            sum.lost += row.lost();
-            sum.duplicate += row.duplicate;
-            sum.reordered += row.reordered;
+            totals.received += row.received;
+            totals.lost += row.lost();
+            totals.duplicate += row.duplicate;
+            totals.reordered += row.reordered;
         }
         self.run_count -= 1;
         self.row_count -= run.rows().count();
@@ -565,9 +568,9 @@ impl GatewayTable {
 
     /// Forgets a gateway without runs, unless its epoch is kept or the difference of its clock was reported. Adds its
     /// counter to the totals.
-    fn forget_if_unused(&mut self, hub: u64) {
+    fn remove_if_unused(&mut self, hub: u64) {
         let is_unused = |gateway: &Gateway| {
-            gateway.runs.is_empty() && gateway.kept_epoch.is_none() && !gateway.is_clock_reported
+            gateway.runs.is_empty() && gateway.stored_epoch.is_none() && !gateway.is_clock_reported
         };
         if self.gateways.get(&hub).is_some_and(is_unused) {
             let forgotten = self.gateways.remove(&hub);
@@ -590,16 +593,16 @@ impl Gateway {
 
 impl Run {
     fn new(since_ns: u64, accepted: u64) -> Run {
-        let (standing, senders, delays) = (Standing::NONE, Senders::NONE, Delays::default());
-        Run { since_ns, accepted, retired: None, standing, senders, delays, sensors: BTreeMap::new() }
+        let (rank, senders, delays) = (EvictionRank::NONE, Senders::NONE, Delays::default());
+        Run { since_ns, accepted, retired: None, rank, senders, delays, sensors: BTreeMap::new() }
     }
 
-    fn rows(&self) -> impl Iterator<Item = &Row> {
+    fn rows(&self) -> impl Iterator<Item = &StreamCounters> {
         self.sensors.values().flat_map(|sensor| sensor.rows.values())
     }
 
     /// Returns the row of the sensor and topic of `head`.
-    fn row(&self, head: &Head) -> Option<&Row> {
+    fn row(&self, head: &Head) -> Option<&StreamCounters> {
         self.sensors.get(&head.sensor)?.rows.get(&head.topic)
     }
 }
@@ -608,57 +611,57 @@ impl Run {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Arrival {
     /// Whether it is a sample rather than an announcement.
-    pub(super) delivers: bool,
+    pub(super) is_sample: bool,
     /// Time of arrival, in ns of a clock that is never set.
     pub(super) now_ns: u64,
 }
 
 /// Rank of a run when there is no room for another one.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(super) struct Standing {
-    heard_ns: u64,
+pub(super) struct EvictionRank {
+    last_datagram_ns: u64,
     /// Times of the first and the last sample.
     delivered_ns: Option<(u64, u64)>,
 }
 
 /// Minimum time between the first and the last sample of a run that is known to deliver.
-const PROVEN_NS: u64 = 1_000_000_000;
+const MIN_PROVEN_NS: u64 = 1_000_000_000;
 /// Time after its last sample for which a run that is known to deliver keeps its rank.
-const KEPT_NS: u64 = 60_000_000_000;
+const RANK_LIFETIME_NS: u64 = 60_000_000_000;
 
-impl Standing {
+impl EvictionRank {
     /// Rank of a run from which nothing was accepted.
-    pub(super) const NONE: Standing = Standing { heard_ns: 0, delivered_ns: None };
+    pub(super) const NONE: EvictionRank = EvictionRank { last_datagram_ns: 0, delivered_ns: None };
 
     /// Records that a datagram was accepted.
     pub(super) fn take(&mut self, arrival: Arrival) {
         let now_ns = arrival.now_ns;
-        self.heard_ns = now_ns;
-        if arrival.delivers {
+        self.last_datagram_ns = now_ns;
+        if arrival.is_sample {
             self.delivered_ns = Some((self.delivered_ns.map_or(now_ns, |(first_ns, _)| first_ns), now_ns));
         }
     }
 
     /// Returns whether the run may be evicted for a run that `arrival` belongs to. It may if it has not delivered for 3
     /// s. For a sample, it also may if it has delivered for less than a second.
-    pub(super) fn may_go(&self, arrival: Arrival) -> bool {
+    pub(super) fn may_be_evicted(&self, arrival: Arrival) -> bool {
         let silent_ns = |(_, last_ns): (u64, u64)| arrival.now_ns.saturating_sub(last_ns);
         let is_busy = self.delivered_ns.is_some_and(|delivered_ns| silent_ns(delivered_ns) < SILENCE_NS);
-        !is_busy || arrival.delivers && !self.is_proven()
+        !is_busy || arrival.is_sample && !self.is_proven()
     }
 
     /// Returns the time until which the run counts as active. Among the runs that may be evicted, the one with the
     /// lowest value is evicted first.
-    pub(super) fn worth_ns(&self) -> u64 {
+    pub(super) fn active_until_ns(&self) -> u64 {
         match self.delivered_ns {
-            None => self.heard_ns,
-            Some((_, last_ns)) => last_ns + if self.is_proven() { KEPT_NS } else { SILENCE_NS },
+            None => self.last_datagram_ns,
+            Some((_, last_ns)) => last_ns + if self.is_proven() { RANK_LIFETIME_NS } else { SILENCE_NS },
         }
     }
 
     /// Returns whether the run is known to deliver: a second or more passed between its first and its last sample.
     pub(super) fn is_proven(&self) -> bool {
-        self.delivered_ns.is_some_and(|(first_ns, last_ns)| last_ns.saturating_sub(first_ns) >= PROVEN_NS)
+        self.delivered_ns.is_some_and(|(first_ns, last_ns)| last_ns.saturating_sub(first_ns) >= MIN_PROVEN_NS)
     }
 }
 
@@ -666,43 +669,44 @@ impl Standing {
 /// time plus the difference of the clocks. The shortest one is the least disturbed.
 #[derive(Default)]
 struct Delays {
-    last_ns: [i64; DELAYS],
+    last_ns: [i64; MAX_DELAYS],
     count: usize,
 }
 
 /// Number of announcements that count: those of two sensors in the last five seconds.
-const DELAYS: usize = 10;
+const MAX_DELAYS: usize = 10;
 /// Maximum difference of clocks that are treated as one. An age is at least the time of a telegram on its line, which
 /// is 15 ms or more.
-const CLOCKS_AGREE_NS: u64 = 20_000_000;
+const MAX_CLOCK_DIFFERENCE_NS: u64 = 20_000_000;
 
 impl Delays {
     fn add(&mut self, delay_ns: i64) {
-        self.last_ns[self.count % DELAYS] = delay_ns;
+        self.last_ns[self.count % MAX_DELAYS] = delay_ns;
         self.count += 1;
     }
 
     /// Returns by how much this machine's clock is ahead of the gateway's, plus the shortest transit time, in ns.
     /// `None` before the first announcement.
     fn difference_ns(&self) -> Option<i64> {
-        self.last_ns[..self.count.min(DELAYS)].iter().min().copied()
+        self.last_ns[..self.count.min(MAX_DELAYS)].iter().min().copied()
     }
 
     fn clocks_agree(&self) -> bool {
-        self.difference_ns().is_some_and(|difference_ns| difference_ns.unsigned_abs() <= CLOCKS_AGREE_NS)
+        self.difference_ns()
+            .is_some_and(|difference_ns| difference_ns.unsigned_abs() <= MAX_CLOCK_DIFFERENCE_NS)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use scanhub_schema::Zones;
-    use scanhub_schema::datagram::{Announced, HEAD, Packed};
+    use scanhub_schema::datagram::{Announced, DatagramPayload, HEADER_LEN};
 
     use super::*;
 
     fn zones(head: Head) -> Vec<u8> {
         let mut buffer = [0; 100];
-        let len = Zones::unknown().pack(&mut buffer[HEAD..]).unwrap();
+        let len = Zones::unknown().pack(&mut buffer[HEADER_LEN..]).unwrap();
         head.seal(&mut buffer, len).unwrap().to_vec()
     }
 
@@ -716,15 +720,15 @@ mod tests {
             announce.add(Announced { topic: topic.number(), group: 81, port: 22_200, next });
         }
         let mut buffer = [0; 200];
-        let len = announce.pack(&mut buffer[HEAD..]).unwrap();
+        let len = announce.pack(&mut buffer[HEADER_LEN..]).unwrap();
         Head { topic: 0, ..head(hub, 1, 0) }.seal(&mut buffer, len).unwrap().to_vec()
     }
 
-    fn fresh(table: &mut GatewayTable, bytes: &[u8]) -> Result<Fresh, DatagramError> {
+    fn fresh(table: &mut GatewayTable, bytes: &[u8]) -> Result<SequenceStatus, DatagramError> {
         at(table, bytes, 0)
     }
 
-    fn at(table: &mut GatewayTable, bytes: &[u8], now_ms: u64) -> Result<Fresh, DatagramError> {
+    fn at(table: &mut GatewayTable, bytes: &[u8], now_ms: u64) -> Result<SequenceStatus, DatagramError> {
         table.receive(bytes, 1, now_ms * 1_000_000).map(|(_, fresh)| fresh)
     }
 
@@ -737,7 +741,7 @@ mod tests {
         let mut table = GatewayTable::new(&Topic::ALL);
         for (number, now_ms) in [(0, 0), (1, 1000)] {
             for hub in 0..64 {
-                assert_eq!(at(&mut table, &zones(head(hub, 1, number)), now_ms), Ok(Fresh::New));
+                assert_eq!(at(&mut table, &zones(head(hub, 1, number)), now_ms), Ok(SequenceStatus::New));
             }
         }
         table
@@ -746,20 +750,20 @@ mod tests {
     const MS: u64 = 1_000_000;
 
     fn announces(at_ms: u64) -> Arrival {
-        Arrival { delivers: false, now_ns: at_ms * MS }
+        Arrival { is_sample: false, now_ns: at_ms * MS }
     }
 
     fn delivers(at_ms: u64) -> Arrival {
-        Arrival { delivers: true, now_ns: at_ms * MS }
+        Arrival { is_sample: true, now_ns: at_ms * MS }
     }
 
     /// Accepts a datagram of a known or unknown run. Returns the run that was evicted for it.
-    fn hear(table: &mut GatewayTable, run: RunId, arrival: Arrival) -> Option<RunId> {
+    fn receive(table: &mut GatewayTable, run: RunId, arrival: Arrival) -> Option<RunId> {
         let evicted = match table.find(run) {
             Ok(Some(_)) => None,
             _ => table.begin(run, arrival),
         };
-        table.run_mut(run).unwrap().standing.take(arrival);
+        table.run_mut(run).unwrap().rank.take(arrival);
         evicted
     }
 
@@ -779,12 +783,12 @@ mod tests {
     fn higher_epoch_retires_the_lower_one() {
         let mut table = GatewayTable::new(&Topic::ALL);
         for (hub, epoch, expected) in [
-            (1, 7, Ok(Fresh::New)),
-            (2, 3, Ok(Fresh::New)),
+            (1, 7, Ok(SequenceStatus::New)),
+            (2, 3, Ok(SequenceStatus::New)),
             (1, 6, Err(DatagramError::Epoch)),
-            (1, 8, Ok(Fresh::New)),
+            (1, 8, Ok(SequenceStatus::New)),
             (1, 7, Err(DatagramError::Epoch)),
-            (2, 3, Ok(Fresh::Duplicate)),
+            (2, 3, Ok(SequenceStatus::Duplicate)),
         ] {
             assert_eq!(fresh(&mut table, &zones(head(hub, epoch, 0))), expected, "{hub} {epoch}");
         }
@@ -809,7 +813,7 @@ mod tests {
             assert_eq!(fresh(&mut table, bytes), Err(*refusal));
         }
         assert_eq!(table.rows().count(), 0);
-        assert_eq!(fresh(&mut table, &zones(head(1, 1, 0))), Ok(Fresh::New), "epoch 2 was refused");
+        assert_eq!(fresh(&mut table, &zones(head(1, 1, 0))), Ok(SequenceStatus::New), "epoch 2 was refused");
         assert_eq!(table.refused(DatagramError::Payload), 2);
     }
 
@@ -817,11 +821,15 @@ mod tests {
     fn memory_is_bounded() {
         let mut table = full();
         assert_eq!(at(&mut table, &zones(head(64, 1, 0)), 1000), Err(DatagramError::Capacity));
-        assert_eq!(at(&mut table, &zones(head(1, 1, 2)), 1000), Ok(Fresh::New), "known gateways continue");
+        assert_eq!(
+            at(&mut table, &zones(head(1, 1, 2)), 1000),
+            Ok(SequenceStatus::New),
+            "known gateways continue"
+        );
         for sensor in 1..=240 {
             for hub in 0..4 {
                 let bytes = zones(Head { sensor, ..head(hub, 1, 0) });
-                assert_eq!(at(&mut table, &bytes, 1000), Ok(Fresh::New));
+                assert_eq!(at(&mut table, &bytes, 1000), Ok(SequenceStatus::New));
             }
         }
         let more = zones(Head { sensor: 241, ..head(1, 1, 0) });
@@ -829,8 +837,8 @@ mod tests {
         assert_eq!((table.rows().count(), table.refused(DatagramError::Capacity)), (MAX_ROWS, 2));
         assert_eq!(table.evicted(), EvictedTotals::default());
         // Runs that were silent for three seconds make room. The totals keep their received samples.
-        assert_eq!(at(&mut table, &more, 4000), Ok(Fresh::New));
-        assert_eq!(at(&mut table, &zones(head(64, 1, 0)), 4000), Ok(Fresh::New));
+        assert_eq!(at(&mut table, &more, 4000), Ok(SequenceStatus::New));
+        assert_eq!(at(&mut table, &zones(head(64, 1, 0)), 4000), Ok(SequenceStatus::New));
         let sum = table.evicted();
         assert_eq!(
             (sum.runs, sum.evicted_active, sum.lost),
@@ -847,7 +855,7 @@ mod tests {
         for number in 0..2 {
             assert_eq!(
                 at(&mut table, &zones(head(9999, 1, number)), 1000 * u64::from(number)),
-                Ok(Fresh::New)
+                Ok(SequenceStatus::New)
             );
         }
         for (now_ms, bytes) in [(1001, announce(0, 10)), (1002, zones(head(0, 1, 0)))] {
@@ -856,12 +864,12 @@ mod tests {
                 forged[8..10].copy_from_slice(&(hub as u16).to_le_bytes());
                 let Datagram { mut head, payload, .. } = Datagram::read(&bytes).unwrap();
                 head.hub = hub;
-                forged[HEAD..].copy_from_slice(payload);
+                forged[HEADER_LEN..].copy_from_slice(payload);
                 let forged = head.seal(&mut forged, payload.len()).unwrap();
                 assert!(at(&mut table, forged, now_ms).is_ok());
             }
         }
-        assert_eq!(at(&mut table, &zones(head(7777, 1, 0)), 1003), Ok(Fresh::New));
+        assert_eq!(at(&mut table, &zones(head(7777, 1, 0)), 1003), Ok(SequenceStatus::New));
         assert!(knows(&table, 9999, 1) && knows(&table, 7777, 1), "{:?}", table.evicted());
         assert_eq!(table.evicted().evicted_active, table.evicted().runs);
     }
@@ -874,22 +882,22 @@ mod tests {
         };
         let announce = |boot: u64, number: u32| {
             let mut buffer = [0; 200];
-            let len = Announce::new(boot, "front", "").pack(&mut buffer[HEAD..]).unwrap();
+            let len = Announce::new(boot, "front", "").pack(&mut buffer[HEADER_LEN..]).unwrap();
             Head { topic: 0, ..head(5, 1, number) }.seal(&mut buffer, len).unwrap().to_vec()
         };
         for n in 0..30_u32 {
             let now_ms = 100 * u64::from(n);
             if n % 10 == 0 {
-                assert_eq!(hear(1, &announce(7, n / 10), now_ms), Ok(Fresh::New));
+                assert_eq!(hear(1, &announce(7, n / 10), now_ms), Ok(SequenceStatus::New));
                 assert_eq!(hear(2, &announce(8, n / 10), now_ms), Err(DatagramError::Twin));
             }
-            assert_eq!(hear(1, &zones(head(5, 1, n)), now_ms), Ok(Fresh::New));
+            assert_eq!(hear(1, &zones(head(5, 1, n)), now_ms), Ok(SequenceStatus::New));
             assert_eq!(hear(2, &zones(head(5, 1, 500 + n)), now_ms + 50), Err(DatagramError::Twin));
         }
         // The second gateway continues alone. It never replaces the first one.
         assert_eq!(hear(2, &zones(head(5, 1, 100)), 5899), Err(DatagramError::Twin));
         assert_eq!(hear(2, &zones(head(5, 1, 101)), 60_000), Err(DatagramError::Twin));
-        assert_eq!(hear(1, &zones(head(5, 1, 30)), 60_001), Ok(Fresh::New));
+        assert_eq!(hear(1, &zones(head(5, 1, 30)), 60_001), Ok(SequenceStatus::New));
         assert!(table.is_shared(5, 1));
         assert_eq!(table.refused(DatagramError::Twin), 35);
     }
@@ -901,11 +909,11 @@ mod tests {
             table.receive(bytes, from, now_ms * 1_000_000).map(|(_, fresh)| fresh)
         };
         for n in 0..30 {
-            assert_eq!(hear(1, &zones(head(5, 1, 200 + n)), 100 * u64::from(n)), Ok(Fresh::New));
+            assert_eq!(hear(1, &zones(head(5, 1, 200 + n)), 100 * u64::from(n)), Ok(SequenceStatus::New));
         }
         // Its numbers start again, and none of the first gateway's numbers count as lost.
         assert_eq!(hear(2, &zones(head(5, 1, 100)), 5899), Err(DatagramError::Twin));
-        assert_eq!(hear(2, &zones(head(5, 1, 101)), 5900), Ok(Fresh::New));
+        assert_eq!(hear(2, &zones(head(5, 1, 101)), 5900), Ok(SequenceStatus::New));
         assert!(!table.is_shared(5, 1), "a new run");
         let rows: Vec<_> = table.rows().map(|row| (row.received, row.lost())).collect();
         assert_eq!(rows, [(1, 0)]);
@@ -918,9 +926,9 @@ mod tests {
     fn retired_runs_make_room_and_stay_in_totals() {
         let mut table = full();
         let fresh = |table: &mut GatewayTable, bytes: &[u8]| at(table, bytes, 1000);
-        assert_eq!(fresh(&mut table, &zones(head(5, 1, 4))), Ok(Fresh::New));
+        assert_eq!(fresh(&mut table, &zones(head(5, 1, 4))), Ok(SequenceStatus::New));
         // A gateway that restarts is accepted even though the table is full.
-        assert_eq!(fresh(&mut table, &zones(head(5, 2, 0))), Ok(Fresh::New));
+        assert_eq!(fresh(&mut table, &zones(head(5, 2, 0))), Ok(SequenceStatus::New));
         let mut evicted = EvictedTotals { runs: 1, received: 3, lost: 2, ..EvictedTotals::default() };
         assert_eq!((table.evicted(), table.rows().count()), (evicted, 64));
         assert_eq!(
@@ -938,10 +946,10 @@ mod tests {
         for sensor in 1..=240 {
             for hub in 0..4 {
                 let bytes = zones(Head { sensor, ..head(hub, 1, 0) });
-                assert_eq!(fresh(&mut table, &bytes), Ok(Fresh::New));
+                assert_eq!(fresh(&mut table, &bytes), Ok(SequenceStatus::New));
             }
         }
-        assert_eq!(fresh(&mut table, &zones(head(2, 9, 0))), Ok(Fresh::New));
+        assert_eq!(fresh(&mut table, &zones(head(2, 9, 0))), Ok(SequenceStatus::New));
         evicted = EvictedTotals { runs: 2, received: 3 + 242, ..evicted };
         assert_eq!((table.evicted(), table.rows().count()), (evicted, MAX_ROWS - 240));
         let counted: u64 = table.rows().map(|row| row.received).sum();
@@ -951,9 +959,9 @@ mod tests {
     #[test]
     fn announcements_count_for_joined_topics() {
         let mut table = GatewayTable::new(&[Topic::Zones]);
-        assert_eq!(fresh(&mut table, &announce(1, 10)), Ok(Fresh::New));
+        assert_eq!(fresh(&mut table, &announce(1, 10)), Ok(SequenceStatus::New));
         assert_eq!(table.rows().map(|row| row.topic).collect::<Vec<_>>(), [0], "no samples yet");
-        assert_eq!(fresh(&mut table, &announce(1, 12)), Ok(Fresh::Duplicate));
+        assert_eq!(fresh(&mut table, &announce(1, 12)), Ok(SequenceStatus::Duplicate));
         let rows: Vec<_> = table.rows().map(|row| (row.topic, row.received, row.lost())).collect();
         assert_eq!(rows, [(0, 1, 0), (Topic::Zones.number(), 0, 2)]);
     }
@@ -962,7 +970,7 @@ mod tests {
     fn evicts_the_run_that_retired_first() {
         let mut table = GatewayTable::new(&Topic::ALL);
         for run in [(1, 5), (2, 5), (3, 5), (2, 6), (1, 9), (2, 7)] {
-            assert_eq!(hear(&mut table, run, delivers(0)), None);
+            assert_eq!(receive(&mut table, run, delivers(0)), None);
         }
         assert!(contains(&table, (2, 5)) && is_over(&table, (1, 8)) && !is_over(&table, (1, 9)));
         let mut evict = || {
@@ -984,14 +992,14 @@ mod tests {
         let mut table = GatewayTable::new(&Topic::ALL);
         for hub in 0..MAX_RUNS as u64 {
             assert!(!is_full(&table));
-            assert_eq!(hear(&mut table, (hub, 1), delivers(0)), None);
-            hear(&mut table, (hub, 1), delivers(1000));
+            assert_eq!(receive(&mut table, (hub, 1), delivers(0)), None);
+            receive(&mut table, (hub, 1), delivers(1000));
         }
         let now = delivers(1001);
         assert!(
             is_full(&table) && !table.has_room((99, 1), false, now) && table.has_room((7, 2), false, now)
         );
-        assert_eq!(hear(&mut table, (7, 2), now), Some((7, 1)));
+        assert_eq!(receive(&mut table, (7, 2), now), Some((7, 1)));
         assert!(
             is_full(&table) && is_over(&table, (7, 1)) && !table.has_room((9, 1), false, announces(1002))
         );
@@ -1000,15 +1008,15 @@ mod tests {
     #[test]
     fn announcements_never_evict_a_delivering_run() {
         let mut table = GatewayTable::new(&Topic::ALL);
-        assert_eq!(hear(&mut table, (1, 1), delivers(0)), None);
-        assert_eq!(hear(&mut table, (2, 1), delivers(0)), None);
+        assert_eq!(receive(&mut table, (1, 1), delivers(0)), None);
+        assert_eq!(receive(&mut table, (2, 1), delivers(0)), None);
         for n in 1..30_000 {
             // One gateway delivers ten times a second, the other one delivered once. Every millisecond, an attacker
             // invents another.
             if n % 100 == 0 {
-                assert_eq!(hear(&mut table, (1, 1), delivers(n)), None, "{n}");
+                assert_eq!(receive(&mut table, (1, 1), delivers(n)), None, "{n}");
             }
-            let evicted = hear(&mut table, (1000 + n, 1), announces(n));
+            let evicted = receive(&mut table, (1000 + n, 1), announces(n));
             assert!(evicted.is_none_or(|(hub, _)| hub >= 1000 || hub == 2 && n >= 3000), "{n}: {evicted:?}");
         }
         assert!(contains(&table, (1, 1)) && !contains(&table, (2, 1)));
@@ -1020,10 +1028,10 @@ mod tests {
         let mut displaced = 0;
         for n in 0..30_000 {
             if n % 100 == 0 && !(10_000..20_000).contains(&n) {
-                assert_eq!(hear(&mut table, (1, 1), delivers(n)), None, "{n}: its silence is too short");
+                assert_eq!(receive(&mut table, (1, 1), delivers(n)), None, "{n}: its silence is too short");
             }
             if n > 1000 {
-                displaced += u32::from(hear(&mut table, (1000 + n, 1), delivers(n)).is_some());
+                displaced += u32::from(receive(&mut table, (1000 + n, 1), delivers(n)).is_some());
             }
         }
         assert!(contains(&table, (1, 1)) && displaced > 28_000);
@@ -1034,13 +1042,13 @@ mod tests {
         let mut table = GatewayTable::new(&Topic::ALL);
         for hub in 0..MAX_RUNS as u64 {
             for at_ms in [0, 2000 + hub] {
-                assert_eq!(hear(&mut table, (hub, 1), delivers(at_ms)), None);
+                assert_eq!(receive(&mut table, (hub, 1), delivers(at_ms)), None);
             }
         }
         assert!(!table.has_room((99, 1), false, delivers(4999)));
-        assert_eq!(hear(&mut table, (99, 1), delivers(5000)), Some((0, 1)));
-        assert_eq!(hear(&mut table, (100, 1), announces(6000)), Some((1, 1)));
-        assert_eq!(hear(&mut table, (101, 1), announces(6001)), Some((100, 1)), "it never delivered");
+        assert_eq!(receive(&mut table, (99, 1), delivers(5000)), Some((0, 1)));
+        assert_eq!(receive(&mut table, (100, 1), announces(6000)), Some((1, 1)));
+        assert_eq!(receive(&mut table, (101, 1), announces(6001)), Some((100, 1)), "it never delivered");
     }
 
     #[test]
@@ -1058,7 +1066,7 @@ mod tests {
     #[test]
     fn row_of_two_sensors_has_no_name() {
         let mut table = GatewayTable::new(&Topic::ALL);
-        let row = Row::new((5, 9, 0, 4), 0);
+        let row = StreamCounters::new((5, 9, 0, 4), 0);
         table.begin((5, 9), delivers(0));
         let mut announce = |boot, name| {
             table.announce(&head(5, 9, 0), &Announce::new(boot, name, ""), 0);
@@ -1107,17 +1115,17 @@ mod tests {
         let mut table = GatewayTable::new(&Topic::ALL);
         let differing = |hub, epoch| Head { stamp_ns: 3_000 * MS, ..head(hub, epoch, 0) };
         let announce = |table: &mut GatewayTable, hub, epoch, at_ms| {
-            hear(table, (hub, epoch), announces(at_ms));
+            receive(table, (hub, epoch), announces(at_ms));
             table.announce(&differing(hub, epoch), &Announce::new(1, "front", ""), 1_000 * MS).0
         };
         assert_eq!(announce(&mut table, 5, 1, 0), Some(-2_000 * MS as i64));
         table.count_no_room(5);
         table.count_no_room(5);
         // Gateways whose clocks were not reported are dropped with their last run.
-        hear(&mut table, (6, 1), announces(0));
+        receive(&mut table, (6, 1), announces(0));
         table.count_no_room(6);
         for hub in 0..MAX_RUNS as u64 {
-            hear(&mut table, (100 + hub, 1), announces(1 + hub));
+            receive(&mut table, (100 + hub, 1), announces(1 + hub));
         }
         assert!(!contains(&table, (5, 1)) && !contains(&table, (6, 1)));
         let counted = table.evicted().no_room + table.no_room().map(|(_, count)| count).sum::<u64>();
@@ -1133,10 +1141,10 @@ mod tests {
     fn successor_of_a_gateway_keeps_order_of_retired_runs() {
         let mut table = GatewayTable::new(&Topic::ALL);
         for (hub, epoch) in [(5, 1), (5, 2), (6, 1), (6, 2)] {
-            assert_eq!(at(&mut table, &zones(head(hub, epoch, 0)), 0), Ok(Fresh::New));
+            assert_eq!(at(&mut table, &zones(head(hub, epoch, 0)), 0), Ok(SequenceStatus::New));
         }
         let (fresh, now_ns) = (zones(head(5, 2, 0)), 6_000 * MS);
-        assert!(table.receive(&fresh, 2, now_ns).is_ok_and(|(_, fresh)| fresh == Fresh::New));
+        assert!(table.receive(&fresh, 2, now_ns).is_ok_and(|(_, fresh)| fresh == SequenceStatus::New));
         assert_eq!(table.evicted().runs, 1, "the silent run has ended");
         let evicted = [(); 2].map(|()| table.evict((9, 9), announces(6_000)));
         assert_eq!(evicted, [Some((5, 1)), Some((6, 1))], "the run that retired first goes first");
@@ -1145,12 +1153,12 @@ mod tests {
     #[test]
     fn epochs_of_gateways_with_the_key_are_bounded() {
         let epochs = (0..2000).map(|hub| (hub, 2000 - hub as u32)).collect();
-        let mut table = GatewayTable::new(&Topic::ALL).keyed(epochs);
+        let mut table = GatewayTable::new(&Topic::ALL).with_key(epochs);
         assert_eq!(table.take_epochs(), None);
-        table.keep_epoch(10_000, 1);
+        table.store_epoch(10_000, 1);
         let kept = table.take_epochs().unwrap();
         assert_eq!((kept.len(), kept.get(&0), kept.get(&1023)), (MAX_EPOCHS, Some(&2000), None));
-        (20_000..25_000).for_each(|hub| table.keep_epoch(hub, 1));
+        (20_000..25_000).for_each(|hub| table.store_epoch(hub, 1));
         let kept = table.take_epochs().unwrap();
         assert_eq!((kept.len(), kept.contains_key(&24_999)), (MAX_EPOCHS, true));
         assert_eq!(table.gateways.len(), MAX_EPOCHS);

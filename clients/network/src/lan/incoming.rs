@@ -7,33 +7,33 @@
 
 use std::collections::HashMap;
 
-use scanhub_schema::datagram::{Announce, Datagram, DatagramError, Head, LanFlags, Packed};
+use scanhub_schema::datagram::{Announce, Datagram, DatagramError, DatagramPayload, Head, LanFlags};
 use scanhub_schema::{Flags, Header, Quality, Topic};
 
 use super::address::Address;
-use super::gateways::{Accepted, GatewayTable};
+use super::gateways::{AcceptedDatagram, GatewayTable};
 use super::reassembly::Reassembler;
-use super::sequence::Fresh;
-use super::{Key, Stamp};
+use super::sequence::SequenceStatus;
+use super::{Key, WallTimestamp};
 
 /// Receiving end of a network.
 pub struct Incoming {
     gateways: GatewayTable,
-    parts: Reassembler,
+    reassembler: Reassembler,
     key: Option<Key>,
     /// Gateways whose datagrams are received; empty: all.
     hubs: Vec<u64>,
 }
 
 /// Maximum difference of the clocks for the first announcement of a sensor, if there is a key.
-const FIRST_WITHIN_NS: u64 = 5_000_000_000;
+const MAX_FIRST_CLOCK_DIFFERENCE_NS: u64 = 5_000_000_000;
 
 /// Result of receiving a datagram.
-pub enum Arrived<'a> {
+pub enum ReceiveOutcome<'a> {
     /// The datagram was refused and counted.
     Refused {
         /// Reason under which it is counted.
-        why: DatagramError,
+        reason: DatagramError,
         /// Number of the gateway, if two are known to send under it.
         shared: Option<u64>,
     },
@@ -50,7 +50,7 @@ pub enum Arrived<'a> {
     /// A part of a sample that is not complete yet.
     Part,
     /// A duplicate, or an announcement that is older than the last one.
-    Known,
+    Duplicate,
     /// An announcement of a sensor.
     Announced(Announcement),
     /// A new sample.
@@ -78,7 +78,7 @@ pub struct Announcement {
 /// A sample, and what is known about its sender.
 pub struct RemoteSample<'a> {
     /// The sample.
-    pub remote: Remote<'a>,
+    pub remote: ReceivedSample<'a>,
     /// Last announcement of its sensor.
     pub announced: Option<Announce>,
     /// Whether a run of its gateway begins with it.
@@ -94,13 +94,13 @@ pub struct RemoteSample<'a> {
 pub struct CheckedPayload<'a> {
     /// The payload as it was received.
     pub bytes: &'a [u8],
-    /// Bytes of memory that it fills, as [`Packed::room`] returned when it was checked.
+    /// Bytes of memory that it fills, as [`DatagramPayload::room`] returned when it was checked.
     pub room: usize,
 }
 
 /// A sample of another machine.
 #[derive(Clone, Copy)]
-pub struct Remote<'a> {
+pub struct ReceivedSample<'a> {
     /// Topic of the sample.
     pub topic: Topic,
     /// Header of its datagram.
@@ -119,7 +119,7 @@ pub struct Remote<'a> {
     pub authenticated: bool,
 }
 
-impl Remote<'_> {
+impl ReceivedSample<'_> {
     /// Returns the header of the sample when process `pid` publishes it here. Its stamps are those of the arrival, and
     /// the sensor's is in `wall_ns`. It has no period, because a gateway may leave out samples.
     pub fn header(&self, pid: u32) -> Header {
@@ -145,7 +145,7 @@ impl Remote<'_> {
 
 impl CheckedPayload<'_> {
     /// Returns the payload as a value, whose type is that of the topic. `None` if there is too little memory.
-    pub fn unpack<P: Packed + ?Sized>(&self) -> Option<Box<P>>
+    pub fn unpack<P: DatagramPayload + ?Sized>(&self) -> Option<Box<P>>
     where
         Box<P>: Default,
     {
@@ -155,12 +155,12 @@ impl CheckedPayload<'_> {
     }
 }
 
-impl Arrived<'_> {
+impl ReceiveOutcome<'_> {
     /// Returns the header of a datagram with which a run of its gateway begins.
     pub fn begins(&self) -> Option<&Head> {
         match self {
-            Arrived::Announced(announced) if announced.begins => Some(&announced.head),
-            Arrived::Sample(sample) if sample.begins => Some(&sample.remote.head),
+            ReceiveOutcome::Announced(announced) if announced.begins => Some(&announced.head),
+            ReceiveOutcome::Sample(sample) if sample.begins => Some(&sample.remote.head),
             _ => None,
         }
     }
@@ -171,18 +171,18 @@ impl Incoming {
     /// explains.
     pub fn new(topics: &[Topic]) -> Incoming {
         let (gateways, parts) = (GatewayTable::new(topics), Reassembler::default());
-        Incoming { gateways, parts, key: None, hubs: Vec::new() }
+        Incoming { gateways, reassembler: parts, key: None, hubs: Vec::new() }
     }
 
     /// Creates a receiving end that accepts only what is authenticated with `key`. `epochs` has the highest epoch of
     /// each gateway that was received before, see [`take_epochs`](Incoming::take_epochs).
     pub fn with_key(topics: &[Topic], key: Key, epochs: HashMap<u64, u32>) -> Incoming {
         let end = Incoming::new(topics);
-        Incoming { gateways: end.gateways.keyed(epochs), key: Some(key), ..end }
+        Incoming { gateways: end.gateways.with_key(epochs), key: Some(key), ..end }
     }
 
     /// Receives only from these gateways; if there are none, from all.
-    pub fn only(self, hubs: Vec<u64>) -> Incoming {
+    pub fn with_hubs(self, hubs: Vec<u64>) -> Incoming {
         Incoming { hubs, ..self }
     }
 
@@ -213,9 +213,9 @@ impl Incoming {
         &mut self,
         bytes: &'a [u8],
         from: u64,
-        arrival: Stamp,
+        arrival: WallTimestamp,
         whole: &'a mut Vec<u8>,
-    ) -> Arrived<'a> {
+    ) -> ReceiveOutcome<'a> {
         self.receive_named(bytes, None, from, arrival, whole)
     }
 
@@ -225,17 +225,17 @@ impl Incoming {
         bytes: &'a [u8],
         name: Option<&Address<'_>>,
         from: u64,
-        arrival: Stamp,
+        arrival: WallTimestamp,
         whole: &'a mut Vec<u8>,
-    ) -> Arrived<'a> {
+    ) -> ReceiveOutcome<'a> {
         // The only place where a checksum is computed.
         let read = Datagram::read(bytes);
         if let Ok(datagram) = &read {
             if name.is_some_and(|name| !name.is_of(datagram, &self.gateways)) {
-                return Arrived::Foreign;
+                return ReceiveOutcome::Foreign;
             }
             if !self.hubs.is_empty() && !self.hubs.contains(&datagram.head.hub) {
-                return Arrived::Ignored;
+                return ReceiveOutcome::Ignored;
             }
         }
         let taken = read
@@ -243,41 +243,48 @@ impl Incoming {
             .and_then(|datagram| self.complete(datagram, from, whole));
         let datagram = match taken {
             Ok(Some(datagram)) => datagram,
-            Ok(None) => return Arrived::Part,
-            Err(why) => {
-                self.gateways.refuse(why);
+            Ok(None) => return ReceiveOutcome::Part,
+            Err(reason) => {
+                self.gateways.refuse(reason);
                 return match read {
                     Ok(Datagram { head, .. })
-                        if why == DatagramError::Untimely && head.topic == Announce::NUMBER =>
+                        if reason == DatagramError::Untimely && head.topic == Announce::NUMBER =>
                     {
-                        Arrived::Untimely { behind_ns: arrival.wall_ns.wrapping_sub(head.stamp_ns) as i64 }
+                        ReceiveOutcome::Untimely {
+                            behind_ns: arrival.wall_ns.wrapping_sub(head.stamp_ns) as i64,
+                        }
                     }
-                    _ => Arrived::Refused { why, shared: None },
+                    _ => ReceiveOutcome::Refused { reason, shared: None },
                 };
             }
         };
         let head = &datagram.head;
         let may_move = self.key.is_some() && is_timely(head, arrival);
         match self.gateways.take(&datagram, from, may_move, arrival.monotonic_ns) {
-            Ok(Accepted { fresh: Fresh::Duplicate, .. }) => Arrived::Known,
-            Ok(accepted) => self.accepted(&datagram, &accepted, arrival),
-            Err(why) => {
-                self.gateways.refuse(why);
-                let may_be_shared = matches!(why, DatagramError::Epoch | DatagramError::Twin);
+            Ok(AcceptedDatagram { status: SequenceStatus::Duplicate, .. }) => ReceiveOutcome::Duplicate,
+            Ok(accepted) => self.on_accepted(&datagram, &accepted, arrival),
+            Err(reason) => {
+                self.gateways.refuse(reason);
+                let may_be_shared = matches!(reason, DatagramError::Epoch | DatagramError::Twin);
                 let is_shared = may_be_shared && self.gateways.is_duplicate(head, arrival.monotonic_ns);
-                Arrived::Refused { why, shared: is_shared.then_some(head.hub) }
+                ReceiveOutcome::Refused { reason, shared: is_shared.then_some(head.hub) }
             }
         }
     }
 
     /// Checks that `datagram`, which was read from `bytes`, is authenticated and cannot be a recorded one, if there is
     /// a key.
-    fn check_key(&self, bytes: &[u8], datagram: &Datagram<'_>, arrival: Stamp) -> Result<(), DatagramError> {
+    fn check_key(
+        &self,
+        bytes: &[u8],
+        datagram: &Datagram<'_>,
+        arrival: WallTimestamp,
+    ) -> Result<(), DatagramError> {
         let (Some(key), head) = (&self.key, &datagram.head) else { return Ok(()) };
         if !key.is_of(bytes, datagram.mac.ok_or(DatagramError::Unauthenticated)?) {
             return Err(DatagramError::Mac);
         }
-        if self.gateways.kept_epoch(head.hub).is_some_and(|kept| head.epoch < kept) {
+        if self.gateways.stored_epoch(head.hub).is_some_and(|kept| head.epoch < kept) {
             return Err(DatagramError::Epoch);
         }
         if !self.gateways.is_announced(head) && !is_timely(head, arrival) {
@@ -298,20 +305,27 @@ impl Incoming {
             return Ok(Some(datagram));
         }
         let is_known = self.gateways.check_part(&datagram.head)?;
-        let complete = self.parts.take(&datagram, from, is_known, whole);
+        let complete = self.reassembler.take(&datagram, from, is_known, whole);
         Ok(complete.map(|head| Datagram { head, payload: whole, mac: None }))
     }
 
     /// Handles a datagram that was not received before.
-    fn accepted<'a>(&mut self, datagram: &Datagram<'a>, accepted: &Accepted, arrival: Stamp) -> Arrived<'a> {
-        let (head, late) = (datagram.head, accepted.fresh == Fresh::Late);
+    fn on_accepted<'a>(
+        &mut self,
+        datagram: &Datagram<'a>,
+        accepted: &AcceptedDatagram,
+        arrival: WallTimestamp,
+    ) -> ReceiveOutcome<'a> {
+        let (head, late) = (datagram.head, accepted.status == SequenceStatus::Late);
         let (begins, arrival_ns) = (accepted.begins, arrival.monotonic_ns);
         let is_proven = self.key.is_some() || self.gateways.is_proven(head.hub, head.epoch);
         let Some(topic) = Topic::of_number(head.topic) else {
             // A newer announcement supersedes a late one.
-            let Some(announce) = accepted.announce.filter(|_| !late) else { return Arrived::Known };
+            let Some(announce) = accepted.announce.filter(|_| !late) else {
+                return ReceiveOutcome::Duplicate;
+            };
             let (behind_ns, is_named) = self.gateways.announce(&head, &announce, arrival.wall_ns);
-            return Arrived::Announced(Announcement {
+            return ReceiveOutcome::Announced(Announcement {
                 head,
                 announce,
                 arrival_ns,
@@ -325,7 +339,7 @@ impl Incoming {
         // Bytes after a telegram belong to a later revision.
         let (room, is_telegram) = (accepted.room, topic == Topic::Telegram);
         let bytes = if is_telegram { &datagram.payload[..room] } else { datagram.payload };
-        let remote = Remote {
+        let remote = ReceivedSample {
             topic,
             head,
             payload: CheckedPayload { bytes, room },
@@ -336,19 +350,19 @@ impl Incoming {
             authenticated: self.key.is_some(),
         };
         let missed = if late { 0 } else { accepted.missed };
-        Arrived::Sample(RemoteSample { remote, announced, begins, missed, is_proven })
+        ReceiveOutcome::Sample(RemoteSample { remote, announced, begins, missed, is_proven })
     }
 }
 
 /// Returns whether `head` belongs to an announcement that was sent just now, by this machine's clock.
-fn is_timely(head: &Head, arrival: Stamp) -> bool {
-    head.topic == Announce::NUMBER && arrival.wall_ns.abs_diff(head.stamp_ns) <= FIRST_WITHIN_NS
+fn is_timely(head: &Head, arrival: WallTimestamp) -> bool {
+    head.topic == Announce::NUMBER && arrival.wall_ns.abs_diff(head.stamp_ns) <= MAX_FIRST_CLOCK_DIFFERENCE_NS
 }
 
 #[cfg(test)]
 mod tests {
     use scanhub_schema::Zones;
-    use scanhub_schema::datagram::{Announced, HEAD, PORT, group};
+    use scanhub_schema::datagram::{Announced, HEADER_LEN, PORT, group};
 
     use super::*;
 
@@ -360,7 +374,7 @@ mod tests {
 
     fn sealed(head: Head, pack: impl FnOnce(&mut [u8]) -> Option<usize>) -> Vec<u8> {
         let mut buffer = [0; 400];
-        let len = pack(&mut buffer[HEAD..]).unwrap();
+        let len = pack(&mut buffer[HEADER_LEN..]).unwrap();
         let head = Head { revision: 1, hub: 5, ..head };
         head.seal_with(&mut buffer, len, |covered| key().mac(covered)).unwrap().to_vec()
     }
@@ -396,10 +410,10 @@ mod tests {
     }
 
     fn receive_from(from: u64, incoming: &mut Incoming, bytes: &[u8], at_s: u64) -> Option<DatagramError> {
-        let arrival = Stamp { monotonic_ns: at_s * SECOND, wall_ns: at_s * SECOND };
+        let arrival = WallTimestamp { monotonic_ns: at_s * SECOND, wall_ns: at_s * SECOND };
         match incoming.receive(bytes, from, arrival, &mut Vec::new()) {
-            Arrived::Refused { why, .. } => Some(why),
-            Arrived::Untimely { .. } => Some(DatagramError::Untimely),
+            ReceiveOutcome::Refused { reason: why, .. } => Some(why),
+            ReceiveOutcome::Untimely { .. } => Some(DatagramError::Untimely),
             _ => None,
         }
     }
@@ -408,7 +422,7 @@ mod tests {
     fn accepts_only_datagrams_with_the_key() {
         let mut incoming = listener(&[]);
         let mut plain = [0; 400];
-        let len = Zones::unknown().pack(&mut plain[HEAD..]).unwrap();
+        let len = Zones::unknown().pack(&mut plain[HEADER_LEN..]).unwrap();
         let head = Head { topic: Topic::Zones.number(), revision: 1, hub: 5, ..Head::default() };
         let bytes = head.seal(&mut plain, len).unwrap().to_vec();
         assert_eq!(receive(&mut incoming, &bytes, 100), Some(DatagramError::Unauthenticated));
@@ -512,7 +526,7 @@ mod tests {
     /// A datagram with zones of gateway 5, without a MAC.
     fn plain_zones(epoch: u32, sequence: u32) -> Vec<u8> {
         let mut buffer = [0; 100];
-        let len = Zones::unknown().pack(&mut buffer[HEAD..]).unwrap();
+        let len = Zones::unknown().pack(&mut buffer[HEADER_LEN..]).unwrap();
         let topic = Topic::Zones.number();
         let head = Head { topic, revision: 1, hub: 5, epoch, sequence, ..Head::default() };
         head.seal(&mut buffer, len).unwrap().to_vec()
@@ -522,7 +536,7 @@ mod tests {
     fn run_begins_once_even_in_one_instant() {
         let mut incoming = Incoming::new(&Topic::ALL);
         let mut begins = |epoch, sequence, from, ms: u64| {
-            let arrival = Stamp { monotonic_ns: ms * 1_000_000, wall_ns: 0 };
+            let arrival = WallTimestamp { monotonic_ns: ms * 1_000_000, wall_ns: 0 };
             let bytes = plain_zones(epoch, sequence);
             let mut whole = Vec::new();
             let arrived = incoming.receive(&bytes, from, arrival, &mut whole);
@@ -535,11 +549,14 @@ mod tests {
 
     #[test]
     fn receives_only_from_hubs_that_are_named() {
-        let mut incoming = Incoming::new(&Topic::ALL).only(vec![4, 5]);
+        let mut incoming = Incoming::new(&Topic::ALL).with_hubs(vec![4, 5]);
         let mut is_ignored = |bytes: &[u8]| {
-            matches!(incoming.receive(bytes, 1, Stamp::default(), &mut Vec::new()), Arrived::Ignored)
+            matches!(
+                incoming.receive(bytes, 1, WallTimestamp::default(), &mut Vec::new()),
+                ReceiveOutcome::Ignored
+            )
         };
-        let other = Head { hub: 6, ..Head::default() }.seal(&mut [0; HEAD], 0).unwrap().to_vec();
+        let other = Head { hub: 6, ..Head::default() }.seal(&mut [0; HEADER_LEN], 0).unwrap().to_vec();
         assert!(is_ignored(&other) && !is_ignored(&plain_zones(1, 0)));
         assert!(!is_ignored(b"a broken datagram is counted"));
         assert_eq!(DatagramError::ALL.map(|why| incoming.gateways().refused(why)).iter().sum::<u64>(), 1);

@@ -2,7 +2,7 @@
 //! numbered.
 //!
 //! A sample is an argument, and so is the time. Datagrams go to a [`Transmit`] at once, or wait until
-//! [`Outgoing::hand`] takes them.
+//! [`Outgoing::take_next`] takes them.
 
 mod datagram_writer;
 mod sensor;
@@ -10,12 +10,12 @@ mod sensor;
 use std::num::NonZeroU64;
 use std::time::Duration;
 
-use scanhub_schema::datagram::Packed;
+use scanhub_schema::datagram::DatagramPayload;
 use scanhub_schema::{Header, Topic};
 
-use crate::lan::Stamp;
+use crate::lan::WallTimestamp;
 use datagram_writer::DatagramWriter;
-pub use datagram_writer::{Form, Handed, Row, Rows, Transmit};
+pub use datagram_writer::{Form, QueuedSample, SensorStats, TopicStats, Transmit};
 use sensor::Sensor;
 
 /// Sending end of one gateway in one run.
@@ -25,7 +25,7 @@ pub struct Outgoing {
 }
 
 /// Interval between the announcements of a sensor.
-pub const ANNOUNCE_EVERY: Duration = Duration::from_secs(1);
+pub const ANNOUNCEMENT_INTERVAL: Duration = Duration::from_secs(1);
 
 /// A sample of a topic, or a silence.
 #[derive(Clone, Copy, Debug)]
@@ -72,10 +72,10 @@ impl Outgoing {
     }
 
     /// Creates the end of gateway `hub` in its run `epoch` for a connection that is slow at times: the newest sample of
-    /// each sensor and topic waits until [`hand`](Outgoing::hand) takes it. A sample is one datagram, however long it
+    /// each sensor and topic waits until [`take_next`](Outgoing::take_next) takes it. A sample is one datagram, however long it
     /// is.
-    pub fn waiting(hub: u64, epoch: u32) -> Outgoing {
-        Outgoing { writer: DatagramWriter::waiting(hub, epoch), sensors: Vec::new() }
+    pub fn with_queue(hub: u64, epoch: u32) -> Outgoing {
+        Outgoing { writer: DatagramWriter::with_queue(hub, epoch), sensors: Vec::new() }
     }
 
     /// Adds the sensor called `name`. `every` is the thinning factor of each topic, or `None` if it is not sent.
@@ -92,7 +92,7 @@ impl Outgoing {
 
     /// Returns whether samples of this topic are needed, because they are sent or an announcement contains something of
     /// them.
-    pub fn wants(&self, sensor: usize, topic: Topic) -> bool {
+    pub fn needs(&self, sensor: usize, topic: Topic) -> bool {
         let is_announced = self.writer.announces();
         self.sensors[sensor].sends(topic) || is_announced && topic == Topic::Status
     }
@@ -100,23 +100,23 @@ impl Outgoing {
     /// Sends a sample of the sensor at this position, or a silence of its zones, to `to`. Before the first sample of a
     /// run of the hub, it sends an announcement. It sends nothing if the sample is thinned out, is a background that
     /// was sent before, or comes from another machine.
-    pub fn sample(&mut self, sensor: usize, sample: &Sample<'_>, now: Stamp, to: &mut impl Transmit) {
+    pub fn sample(&mut self, sensor: usize, sample: &Sample<'_>, now: WallTimestamp, to: &mut impl Transmit) {
         self.sensors[sensor].send(sample, now, &mut self.writer, to);
     }
 
-    /// Announces all sensors that have sent a sample. Call it every [`ANNOUNCE_EVERY`], and at the end.
-    pub fn announce(&mut self, now: Stamp, to: &mut impl Transmit) {
+    /// Announces all sensors that have sent a sample. Call it every [`ANNOUNCEMENT_INTERVAL`], and at the end.
+    pub fn announce(&mut self, now: WallTimestamp, to: &mut impl Transmit) {
         self.sensors.iter().for_each(|sensor| sensor.announce(now, &mut self.writer, to));
     }
 
     /// Sends each background again whose last transmission is `every` or longer ago.
-    pub fn repeat(&mut self, every: Duration, now: Stamp, to: &mut impl Transmit) {
+    pub fn repeat(&mut self, every: Duration, now: WallTimestamp, to: &mut impl Transmit) {
         self.sensors.iter_mut().for_each(|sensor| sensor.repeat(every, now, &mut self.writer, to));
     }
 
     /// Takes the sample that has waited for longest, numbers it, and returns it as it is sent at `now`. `None` if none
     /// waits.
-    pub fn hand(&mut self, now: Stamp) -> Option<Handed<'_>> {
+    pub fn take_next(&mut self, now: WallTimestamp) -> Option<QueuedSample<'_>> {
         self.writer.take_next(now)
     }
 
@@ -125,53 +125,53 @@ impl Outgoing {
         self.writer.is_waiting()
     }
 
-    /// Counts the last sample that [`hand`](Outgoing::hand) returned for this sensor and topic, of `bytes` bytes, as
+    /// Counts the last sample that [`take_next`](Outgoing::take_next) returned for this sensor and topic, of `bytes` bytes, as
     /// failed. Its number stays in use.
-    pub fn not_taken(&mut self, sensor: u8, topic: Option<Topic>, bytes: usize) {
+    pub fn mark_failed(&mut self, sensor: u8, topic: Option<Topic>, bytes: usize) {
         self.writer.mark_failed(sensor, topic, bytes);
     }
 
     /// Returns the announcement (no topic), the status or the background of the sensor called `name` that
-    /// [`hand`](Outgoing::hand) returned last, for a receiver that queries it at `now`. It has the number that it had
+    /// [`take_next`](Outgoing::take_next) returned last, for a receiver that queries it at `now`. It has the number that it had
     /// before, so that receivers count it once.
-    pub fn again(&mut self, name: &str, topic: Option<Topic>, now: Stamp) -> Option<&[u8]> {
+    pub fn resend_last(&mut self, name: &str, topic: Option<Topic>, now: WallTimestamp) -> Option<&[u8]> {
         self.writer.resend_last(name, topic, now)
     }
 
-    /// Returns the sensors and topics (`None`: announcements) for which [`again`](Outgoing::again) has a sample. The
+    /// Returns the sensors and topics (`None`: announcements) for which [`again`](Outgoing::resend_last) has a sample. The
     /// announcement of a sensor comes before its samples.
-    pub fn kept(&self) -> impl Iterator<Item = (&str, Option<Topic>)> {
-        self.writer.kept()
+    pub fn stored_samples(&self) -> impl Iterator<Item = (&str, Option<Topic>)> {
+        self.writer.stored_samples()
     }
 
-    /// Drops the samples that [`again`](Outgoing::again) returns.
-    pub fn forget_kept(&mut self) {
-        self.writer.forget_kept();
+    /// Drops the samples that [`again`](Outgoing::resend_last) returns.
+    pub fn drop_kept(&mut self) {
+        self.writer.drop_kept();
     }
 
     /// Returns whether samples wait, so that newer ones may replace them. Announcements then contain the number of
     /// replaced samples.
-    pub(crate) fn tells_replaced(&self) -> bool {
+    pub(crate) fn announces_replaced(&self) -> bool {
         self.writer.counts_replaced()
     }
 
     /// Returns the maximum length of a datagram, in bytes.
-    pub fn longest(&self) -> usize {
-        self.writer.longest()
+    pub fn max_datagram_len(&self) -> usize {
+        self.writer.max_datagram_len()
     }
 
     /// Returns the counters of each sensor, by its number in the hub.
-    pub fn account(&self) -> impl Iterator<Item = &Rows> {
+    pub fn counters(&self) -> impl Iterator<Item = &SensorStats> {
         self.writer.sensors()
     }
 
     /// Returns the number of samples that did not fit into the maximum number of parts.
-    pub fn unfit(&self) -> u64 {
-        self.writer.unfit()
+    pub fn oversized_samples(&self) -> u64 {
+        self.writer.oversized_samples()
     }
 
     /// Returns a `SENSOR/TOPIC` whose samples do not all fit into datagrams, each of them once.
-    pub(crate) fn misfit(&mut self) -> Option<String> {
+    pub(crate) fn take_oversized(&mut self) -> Option<String> {
         self.writer.take_oversized()
     }
 }

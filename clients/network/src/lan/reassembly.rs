@@ -1,7 +1,7 @@
 //! Reassembles samples that are sent in parts. Parts may arrive in any order, twice, or not at all. Memory is bounded,
 //! no matter who sends what.
 
-use scanhub_schema::datagram::{Datagram, Head, PART_LONGEST};
+use scanhub_schema::datagram::{Datagram, Head, MAX_PART_LEN};
 
 /// Samples that are not complete yet. A sample that is evicted for another one is not reported: its number did not
 /// arrive.
@@ -30,9 +30,9 @@ struct PartialSample {
 }
 
 /// Maximum number of partial samples of one sender, sensor and topic.
-const MAX_OF_TOPIC: usize = 4;
+const MAX_PER_TOPIC: usize = 4;
 /// Maximum number of partial samples of all senders. They take 23 MB if all are as long as possible.
-const MAX_OF_ALL: usize = 64;
+const MAX_TOTAL: usize = 64;
 
 impl Reassembler {
     /// Takes a part from the sender `from`. `is_known` is true if its sample is a duplicate. Once the sample is
@@ -54,7 +54,7 @@ impl Reassembler {
         let it = &mut self.partial[at];
         it.last = self.count;
         let number = usize::from(part.head.part);
-        let begin = PART_LONGEST * number;
+        let begin = MAX_PART_LEN * number;
         it.bytes[begin..begin + part.payload.len()].copy_from_slice(part.payload);
         it.lengths[number] = Some(part.payload.len());
         if it.lengths.iter().any(Option::is_none) {
@@ -62,7 +62,7 @@ impl Reassembler {
         }
         let it = self.partial.swap_remove(at);
         whole.clear();
-        for (bytes, len) in it.bytes.chunks(PART_LONGEST).zip(it.lengths.iter().flatten()) {
+        for (bytes, len) in it.bytes.chunks(MAX_PART_LEN).zip(it.lengths.iter().flatten()) {
             whole.extend_from_slice(&bytes[..*len]);
         }
         self.free.push(it);
@@ -78,12 +78,12 @@ impl Reassembler {
         let same = self.partial.iter().filter(|it| topic(it) == of_topic);
         let other =
             self.partial.iter().position(|it| topic(it) == of_topic && it.head.sequence == head.sequence);
-        let is_full = same.count() == MAX_OF_TOPIC;
+        let is_full = same.count() == MAX_PER_TOPIC;
         let waits = self.partial.iter().enumerate();
         let oldest = waits
             .filter(|(_, it)| !is_full || topic(it) == of_topic)
             .min_by_key(|(_, it)| (!it.is_known, it.last));
-        let is_full = is_full || self.partial.len() == MAX_OF_ALL;
+        let is_full = is_full || self.partial.len() == MAX_TOTAL;
         if other.is_none() && is_full && is_known && oldest.is_some_and(|(_, it)| !it.is_known) {
             return None;
         }
@@ -96,7 +96,7 @@ impl Reassembler {
         let parts = usize::from(head.parts);
         it.lengths.clear();
         it.lengths.resize(parts, None);
-        it.bytes.resize(parts * PART_LONGEST, 0);
+        it.bytes.resize(parts * MAX_PART_LEN, 0);
         self.partial.push(it);
         Some(self.partial.len() - 1)
     }
@@ -183,7 +183,7 @@ mod tests {
         }
         let places = parts.partial.iter().chain(&parts.free);
         let bytes: usize = places.clone().map(|it| it.bytes.capacity()).sum();
-        assert!(places.count() <= 65 && bytes <= 65 * 255 * PART_LONGEST, "{bytes}");
+        assert!(places.count() <= 65 && bytes <= 65 * 255 * MAX_PART_LEN, "{bytes}");
         take(&mut parts, head(7), 0, 1);
         take(&mut parts, head(7), 1, 1);
         assert!(take(&mut parts, head(7), 2, 1).is_some());

@@ -7,35 +7,35 @@ mod remote_sensor;
 use std::collections::VecDeque;
 
 use scanhub_schema::datagram::{Announce, Head};
-use scanhub_schema::{Failure, Header, Topic, Wake};
+use scanhub_schema::{Failure, Header, Topic, WakeEvent};
 
-use super::Stamp;
+use super::WallTimestamp;
 use super::gateways::Arrival;
-use super::incoming::{Announcement, CheckedPayload, Remote, RemoteSample};
+use super::incoming::{Announcement, CheckedPayload, ReceivedSample, RemoteSample};
 use remote_sensor::{Outcome, RemoteSensor};
 
 /// Publisher of all remote sensors in a domain.
 pub struct Republisher<S: TopicStore> {
     sensors: Vec<RemoteSensor<S::Sensor>>,
     /// Samples that were not published.
-    pub left_out: LeftOut,
+    pub left_out: DroppedSamples,
     /// Sensors that were evicted for others.
     pub displaced: u64,
     /// Whether topics are created only for sensors of a gateway that is known to deliver.
     only_proven: bool,
     candidates: Candidates,
     /// Number of sensors that may still be evicted, and the time at which it increases by 1.
-    allowance: usize,
-    allow_ns: u64,
-    greet_ns: u64,
-    upkeep_ns: u64,
+    eviction_credit: usize,
+    next_credit_ns: u64,
+    next_history_ns: u64,
+    next_cleanup_ns: u64,
     pid: u32,
     store: S,
 }
 
 /// Samples that were received and not published, by reason.
 #[derive(Clone, Copy, Default)]
-pub struct LeftOut {
+pub struct DroppedSamples {
     /// The sensor has no name, because it is not announced yet.
     pub unnamed: u64,
     /// The sensor's announcement does not name the topic.
@@ -57,27 +57,27 @@ pub(crate) const MAX_SENSORS: usize = 16;
 
 /// Interval at which one more sensor may be evicted, after as many as there is room for. An eviction takes
 /// milliseconds, and anyone who can send can cause it.
-const ALLOW_EVERY_NS: u64 = 250_000_000;
+const EVICTION_CREDIT_INTERVAL_NS: u64 = 250_000_000;
 
 /// Interval at which late joiners receive the last status, zones and background.
-const GREET_EVERY_NS: u64 = 100_000_000;
+const HISTORY_INTERVAL_NS: u64 = 100_000_000;
 
 /// Interval between cleanups after dead subscribers, as in the hub.
-const UPKEEP_NS: u64 = 5_000_000_000;
+const CLEANUP_INTERVAL_NS: u64 = 5_000_000_000;
 
 impl<S: TopicStore> Republisher<S> {
     /// Creates the publisher of process `pid` at `now_ns`. It creates topics in `store`.
     pub fn new(store: S, pid: u32, now_ns: u64) -> Republisher<S> {
         Republisher {
             sensors: Vec::new(),
-            left_out: LeftOut::default(),
+            left_out: DroppedSamples::default(),
             displaced: 0,
             only_proven: false,
             candidates: Candidates::default(),
-            allowance: MAX_SENSORS,
-            allow_ns: now_ns,
-            greet_ns: now_ns,
-            upkeep_ns: now_ns.saturating_add(UPKEEP_NS),
+            eviction_credit: MAX_SENSORS,
+            next_credit_ns: now_ns,
+            next_history_ns: now_ns,
+            next_cleanup_ns: now_ns.saturating_add(CLEANUP_INTERVAL_NS),
             pid,
             store,
         }
@@ -90,11 +90,11 @@ impl<S: TopicStore> Republisher<S> {
 
     /// Handles the start of a gateway's run with `head`. Published sensors with the same epoch belong to another
     /// gateway.
-    pub fn begun(&mut self, head: &Head, now: Stamp) {
+    pub fn on_run_started(&mut self, head: &Head, now: WallTimestamp) {
         self.sensors
             .iter_mut()
-            .filter(|sensor| sensor.is_of(head.hub, head.epoch))
-            .for_each(|sensor| sensor.replaced(now));
+            .filter(|sensor| sensor.belongs_to(head.hub, head.epoch))
+            .for_each(|sensor| sensor.retire(now));
     }
 
     /// Handles an announcement of the gateway that is called `hub`: creates the missing topics of its sensor. Returns
@@ -104,44 +104,44 @@ impl<S: TopicStore> Republisher<S> {
     ///
     /// Returns [`Kind::Short`](scanhub_schema::Kind) if memory or descriptors are short. Other sensors are not
     /// affected.
-    pub fn announced(
+    pub fn on_announcement(
         &mut self,
         announcement: &Announcement,
         hub: &str,
-        now: Stamp,
+        now: WallTimestamp,
     ) -> Result<Option<String>, Failure> {
         let Announcement { head, announce, arrival_ns, is_proven, .. } = announcement;
-        let arrival = Arrival { delivers: false, now_ns: *arrival_ns };
+        let arrival = Arrival { is_sample: false, now_ns: *arrival_ns };
         let candidate = if *is_proven { self.candidates.take(head) } else { None };
-        let made = self.make(head, hub, announce, arrival, *is_proven, now);
-        self.publish_kept(head, announce.boot, candidate);
+        let made = self.create_sensor(head, hub, announce, arrival, *is_proven, now);
+        self.publish_stored(head, announce.boot, candidate);
         made
     }
 
     /// Publishes `sample`, or counts it in [`left_out`](Self::left_out). Creates its topics as
-    /// [`announced`](Self::announced) does if its gateway is known to deliver since this sample. If there is no room
+    /// [`announced`](Self::on_announcement) does if its gateway is known to deliver since this sample. If there is no room
     /// for its sensor, another one may be evicted.
     ///
     /// # Errors
     ///
-    /// Returns the same errors as [`announced`](Self::announced).
+    /// Returns the same errors as [`announced`](Self::on_announcement).
     pub fn sample(
         &mut self,
         sample: &RemoteSample<'_>,
         hub: impl FnOnce() -> String,
-        now: Stamp,
+        now: WallTimestamp,
     ) -> Result<Option<String>, Failure> {
         let RemoteSample { remote, announced, is_proven, .. } = sample;
         let head = &remote.head;
         let candidate = if *is_proven { self.candidates.take(head) } else { None };
         let made = match announced {
             Some(announce) if candidate.is_some() || self.may_make_room(head, announce) => {
-                let arrival = Arrival { delivers: true, now_ns: remote.arrival_ns };
-                self.make(head, &hub(), announce, arrival, *is_proven, now)
+                let arrival = Arrival { is_sample: true, now_ns: remote.arrival_ns };
+                self.create_sensor(head, &hub(), announce, arrival, *is_proven, now)
             }
             _ => Ok(None),
         };
-        self.publish_kept(head, remote.boot, candidate);
+        self.publish_stored(head, remote.boot, candidate);
         self.publish(sample);
         made
     }
@@ -153,17 +153,17 @@ impl<S: TopicStore> Republisher<S> {
 
     /// Does what is due at `now_ns`: reports silent sensors, connects late joiners, and cleans up after dead
     /// subscribers. Everything that arrived before `read` has been handled, so a silence is reported as of that time.
-    pub fn look(&mut self, now_ns: u64, read: Stamp) {
-        if now_ns >= self.greet_ns {
-            self.greet_ns = now_ns + GREET_EVERY_NS;
-            self.sensors.iter_mut().for_each(|sensor| sensor.look(read));
+    pub fn do_periodic_work(&mut self, now_ns: u64, read: WallTimestamp) {
+        if now_ns >= self.next_history_ns {
+            self.next_history_ns = now_ns + HISTORY_INTERVAL_NS;
+            self.sensors.iter_mut().for_each(|sensor| sensor.do_periodic_work(read));
         }
-        if now_ns >= self.allow_ns {
-            self.allow_ns = now_ns + ALLOW_EVERY_NS;
-            self.allowance = MAX_SENSORS.min(self.allowance + 1);
+        if now_ns >= self.next_credit_ns {
+            self.next_credit_ns = now_ns + EVICTION_CREDIT_INTERVAL_NS;
+            self.eviction_credit = MAX_SENSORS.min(self.eviction_credit + 1);
         }
-        if now_ns >= self.upkeep_ns {
-            self.upkeep_ns = now_ns + UPKEEP_NS;
+        if now_ns >= self.next_cleanup_ns {
+            self.next_cleanup_ns = now_ns + CLEANUP_INTERVAL_NS;
             self.store.clean_up();
         }
     }
@@ -183,35 +183,35 @@ impl<S: TopicStore> Republisher<S> {
     /// room for this one, so that no sample is published under another sensor's name.
     ///
     /// If there is no room, a sample evicts another sensor that is not known to deliver. An announcement does not.
-    fn make(
+    fn create_sensor(
         &mut self,
         head: &Head,
         hub: &str,
         announce: &Announce,
         arrival: Arrival,
         is_proven: bool,
-        now: Stamp,
+        now: WallTimestamp,
     ) -> Result<Option<String>, Failure> {
         let name = format!("{hub}.{}", announce.sensor());
-        for sensor in self.sensors.iter_mut().filter(|sensor| sensor.is(head) && sensor.name != name) {
-            sensor.replaced(now);
+        for sensor in self.sensors.iter_mut().filter(|sensor| sensor.has_sent(head) && sensor.name != name) {
+            sensor.retire(now);
         }
         let at = self.sensors.iter().position(|sensor| sensor.name == name);
         if let Some(at) = at {
             // Its topics stay, even if there is no room for others.
-            self.sensors[at].announced(head, announce, arrival);
+            self.sensors[at].on_announcement(head, announce, arrival);
         }
         if self.only_proven && !is_proven {
             self.candidates.add(head);
             return Ok(None);
         }
         while at.is_none() && self.is_full(announce) {
-            match self.next_evicted(arrival).filter(|_| arrival.delivers && self.allowance > 0) {
+            match self.next_evicted(arrival).filter(|_| arrival.is_sample && self.eviction_credit > 0) {
                 Some(evicted) => self.evict(evicted, now),
                 None => return Ok(None),
             }
         }
-        let is_missing = |topic: &Topic| at.is_none_or(|at| !self.sensors[at].has(*topic));
+        let is_missing = |topic: &Topic| at.is_none_or(|at| !self.sensors[at].has_topic(*topic));
         let missing: Vec<_> = topics(announce).into_iter().filter(is_missing).collect();
         if at.is_some() && !missing.is_empty() && !self.store.fits(&missing) {
             return Ok(None);
@@ -223,7 +223,7 @@ impl<S: TopicStore> Republisher<S> {
             Some(at) => at,
             None => {
                 let mut sensor = RemoteSensor::new(&name, self.store.sensor(&name)?, self.pid);
-                sensor.announced(head, announce, arrival);
+                sensor.on_announcement(head, announce, arrival);
                 self.sensors.push(sensor);
                 self.sensors.len() - 1
             }
@@ -240,8 +240,8 @@ impl<S: TopicStore> Republisher<S> {
 
     /// Returns whether the sensor that sent `head` is not published, and another one may be evicted for it.
     fn may_make_room(&self, head: &Head, announce: &Announce) -> bool {
-        let is_here = || self.sensors.iter().any(|sensor| sensor.is(head));
-        self.allowance > 0 && !is_here() && self.is_full(announce)
+        let is_here = || self.sensors.iter().any(|sensor| sensor.has_sent(head));
+        self.eviction_credit > 0 && !is_here() && self.is_full(announce)
     }
 
     /// Returns whether there is no room for one more sensor with the topics of `announce`.
@@ -251,9 +251,9 @@ impl<S: TopicStore> Republisher<S> {
 
     /// Publishes the samples of `candidate`, which sent `head`, if the sensor was made. Otherwise, it stays a
     /// candidate. Samples from another run of the hub than `boot` may belong to another sensor, so they are dropped.
-    fn publish_kept(&mut self, head: &Head, boot: u64, candidate: Option<Candidate>) {
+    fn publish_stored(&mut self, head: &Head, boot: u64, candidate: Option<Candidate>) {
         let Some(candidate) = candidate else { return };
-        let Some(sensor) = self.sensors.iter_mut().find(|sensor| sensor.is(head)) else {
+        let Some(sensor) = self.sensors.iter_mut().find(|sensor| sensor.has_sent(head)) else {
             return self.candidates.put_back(candidate);
         };
         let samples = candidate.samples().filter(|remote| remote.boot == boot);
@@ -268,7 +268,7 @@ impl<S: TopicStore> Republisher<S> {
         let head = &remote.head;
         let reason = if remote.late {
             &mut self.left_out.late
-        } else if let Some(sensor) = self.sensors.iter_mut().find(|sensor| sensor.is(head)) {
+        } else if let Some(sensor) = self.sensors.iter_mut().find(|sensor| sensor.has_sent(head)) {
             match sensor.publish(remote) {
                 Outcome::Published => return,
                 Outcome::NoTopic if !sensor.is_announced(remote.topic) => &mut self.left_out.unannounced,
@@ -278,7 +278,7 @@ impl<S: TopicStore> Republisher<S> {
             }
         } else if let Some(announce) = announced {
             if self.only_proven && !is_proven {
-                self.candidates.add(head).keep(remote);
+                self.candidates.add(head).store_sample(remote);
                 &mut self.left_out.unproven
             } else if self.sensors.len() == MAX_SENSORS {
                 &mut self.left_out.capacity
@@ -295,15 +295,15 @@ impl<S: TopicStore> Republisher<S> {
 
     /// Returns the index of the sensor that is evicted next for another one.
     fn next_evicted(&self, arrival: Arrival) -> Option<usize> {
-        let may_go = |at: &usize| self.sensors[*at].standing.may_go(arrival);
-        (0..self.sensors.len()).filter(may_go).min_by_key(|&at| self.sensors[at].standing.worth_ns())
+        let may_go = |at: &usize| self.sensors[*at].rank.may_be_evicted(arrival);
+        (0..self.sensors.len()).filter(may_go).min_by_key(|&at| self.sensors[at].rank.active_until_ns())
     }
 
     /// Removes the sensor, after it has published that it is silent.
-    fn evict(&mut self, at: usize, now: Stamp) {
-        self.sensors.remove(at).replaced(now);
+    fn evict(&mut self, at: usize, now: WallTimestamp) {
+        self.sensors.remove(at).retire(now);
         self.displaced += 1;
-        self.allowance -= 1;
+        self.eviction_credit -= 1;
     }
 }
 
@@ -371,7 +371,7 @@ pub trait SensorTopics {
     fn connect(&self, topic: Topic);
 
     /// Wakes the subscribers of all topics.
-    fn wake(&self, why: Wake);
+    fn wake(&self, event: WakeEvent);
 
     /// Returns the number of samples for which there was no memory.
     fn failed(&self) -> u64;
@@ -387,11 +387,11 @@ pub(super) struct Candidate {
     /// Gateway, its run, and the sensor's number.
     source: (u64, u32, u8),
     /// At most one of each topic.
-    kept: Vec<Kept>,
+    stored: Vec<StoredSample>,
 }
 
 /// A sample that is not published yet.
-struct Kept {
+struct StoredSample {
     head: Head,
     topic: Topic,
     bytes: Vec<u8>,
@@ -411,7 +411,7 @@ impl Candidates {
         let at = match self.0.iter().position(|candidate| candidate.source == source) {
             Some(at) => at,
             None => {
-                self.put_back(Candidate { source, kept: Vec::new() });
+                self.put_back(Candidate { source, stored: Vec::new() });
                 self.0.len() - 1
             }
         };
@@ -436,18 +436,26 @@ impl Candidates {
 
 impl Candidate {
     /// Keeps `remote` in place of the last sample of its topic, if the topic has a history.
-    pub(super) fn keep(&mut self, remote: &Remote<'_>) {
-        let &Remote { topic, head, payload, boot, arrival_ns, age_ns, .. } = remote;
-        if topic.row().kept > 0 {
-            self.kept.retain(|kept| kept.topic != topic);
+    pub(super) fn store_sample(&mut self, remote: &ReceivedSample<'_>) {
+        let &ReceivedSample { topic, head, payload, boot, arrival_ns, age_ns, .. } = remote;
+        if topic.spec().history_len > 0 {
+            self.stored.retain(|kept| kept.topic != topic);
             let CheckedPayload { bytes, room } = payload;
-            self.kept.push(Kept { head, topic, bytes: bytes.to_vec(), room, boot, arrival_ns, age_ns });
+            self.stored.push(StoredSample {
+                head,
+                topic,
+                bytes: bytes.to_vec(),
+                room,
+                boot,
+                arrival_ns,
+                age_ns,
+            });
         }
     }
 
     /// Returns the samples that are kept, each as it was received.
-    pub(super) fn samples(&self) -> impl Iterator<Item = Remote<'_>> {
-        self.kept.iter().map(|kept| Remote {
+    pub(super) fn samples(&self) -> impl Iterator<Item = ReceivedSample<'_>> {
+        self.stored.iter().map(|kept| ReceivedSample {
             topic: kept.topic,
             head: kept.head,
             payload: CheckedPayload { bytes: &kept.bytes, room: kept.room },
@@ -470,26 +478,26 @@ mod tests {
     use std::cell::Cell;
     use std::rc::Rc;
 
-    use scanhub_schema::datagram::{Announced, HEAD, MTU_ETHERNET, PORT, Packed};
-    use scanhub_schema::{Header, Wake, Zones};
+    use scanhub_schema::datagram::{Announced, DatagramPayload, HEADER_LEN, MTU_ETHERNET, PORT};
+    use scanhub_schema::{Header, WakeEvent, Zones};
 
-    use crate::lan::incoming::{Arrived, Incoming};
+    use crate::lan::incoming::{Incoming, ReceiveOutcome};
 
     use super::*;
 
     /// A store with places for a number of sensors.
     #[derive(Clone)]
-    struct Places {
+    struct TestStore {
         free: Rc<Cell<usize>>,
         /// Samples of all sensors.
         sent: Rc<Cell<usize>>,
     }
 
     /// A sensor in a place, which is free again when this is dropped.
-    struct Place(Places);
+    struct TestSensor(TestStore);
 
-    impl TopicStore for Places {
-        type Sensor = Place;
+    impl TopicStore for TestStore {
+        type Sensor = TestSensor;
 
         fn check_room(&self, _: &[Topic]) -> Result<(), Failure> {
             Ok(())
@@ -499,15 +507,15 @@ mod tests {
             self.free.get() > 0
         }
 
-        fn sensor(&self, _: &str) -> Result<Place, Failure> {
+        fn sensor(&self, _: &str) -> Result<TestSensor, Failure> {
             self.free.set(self.free.get() - 1);
-            Ok(Place(self.clone()))
+            Ok(TestSensor(self.clone()))
         }
 
         fn clean_up(&self) {}
     }
 
-    impl SensorTopics for Place {
+    impl SensorTopics for TestSensor {
         fn add(&mut self, _: Topic) -> Result<(), Failure> {
             Ok(())
         }
@@ -522,14 +530,14 @@ mod tests {
 
         fn connect(&self, _: Topic) {}
 
-        fn wake(&self, _: Wake) {}
+        fn wake(&self, _: WakeEvent) {}
 
         fn failed(&self) -> u64 {
             0
         }
     }
 
-    impl Drop for Place {
+    impl Drop for TestSensor {
         fn drop(&mut self) {
             self.0.free.set(self.0.free.get() + 1);
         }
@@ -538,13 +546,13 @@ mod tests {
     /// A network without a key, on which gateway `h5` and others send zones of their sensor `front`.
     struct Network {
         incoming: Incoming,
-        republisher: Republisher<Places>,
+        republisher: Republisher<TestStore>,
         sequence: u32,
     }
 
     impl Network {
-        fn new(places: usize) -> Network {
-            let store = Places { free: Rc::new(Cell::new(places)), sent: Rc::default() };
+        fn new(capacity: usize) -> Network {
+            let store = TestStore { free: Rc::new(Cell::new(capacity)), sent: Rc::default() };
             let republisher = Republisher::new(store, 1, 0).only_proven();
             Network { incoming: Incoming::new(&Topic::ALL), republisher, sequence: 0 }
         }
@@ -559,7 +567,7 @@ mod tests {
         ) -> Option<String> {
             self.sequence += 1;
             let mut buffer = [0; MTU_ETHERNET];
-            let len = pack(&mut buffer[HEAD..]).unwrap();
+            let len = pack(&mut buffer[HEADER_LEN..]).unwrap();
             let head = Head {
                 topic: number,
                 revision: 1,
@@ -569,11 +577,13 @@ mod tests {
                 ..Head::default()
             };
             let bytes = head.seal(&mut buffer, len).unwrap().to_vec();
-            let (mut whole, now) = (Vec::new(), Stamp { monotonic_ns: ms * 1_000_000, wall_ns: 0 });
+            let (mut whole, now) = (Vec::new(), WallTimestamp { monotonic_ns: ms * 1_000_000, wall_ns: 0 });
             let name = format!("h{hub}");
             match self.incoming.receive(&bytes, hub, now, &mut whole) {
-                Arrived::Announced(announcement) => self.republisher.announced(&announcement, &name, now),
-                Arrived::Sample(sample) => self.republisher.sample(&sample, || name, now),
+                ReceiveOutcome::Announced(announcement) => {
+                    self.republisher.on_announcement(&announcement, &name, now)
+                }
+                ReceiveOutcome::Sample(sample) => self.republisher.sample(&sample, || name, now),
                 _ => panic!("refused"),
             }
             .unwrap()
@@ -599,7 +609,7 @@ mod tests {
         );
         assert_eq!((network.zones(5, 999), network.republisher.names()), (None, vec![]));
         assert_eq!(network.zones(5, 1_000), Some("h5.front".to_owned()));
-        let LeftOut { unproven, shortage, .. } = network.republisher.left_out;
+        let DroppedSamples { unproven, shortage, .. } = network.republisher.left_out;
         assert_eq!((unproven, shortage), (1, 0), "the last sample is published late");
         assert_eq!(network.republisher.store.sent.get(), 2);
         // Announced only after its gateway is known to deliver.

@@ -20,7 +20,7 @@ struct Sender {
     from: u64,
     /// Runs of the hub that it has announced, the latest one first. 0 is none.
     boots: [u64; MAX_BOOTS],
-    heard_ns: u64,
+    last_datagram_ns: u64,
     announced_ns: u64,
     /// Time since which it has announced a run of the hub that the first sender does not announce.
     other_since_ns: Option<u64>,
@@ -47,20 +47,25 @@ const MAX_BOOTS: usize = 4;
 pub(super) const SILENCE_NS: u64 = 3_000_000_000;
 /// Time for which two senders announce different runs of a hub before they count as two gateways. The sockets of one
 /// gateway change their run within milliseconds of each other.
-const SHARED_NS: u64 = 500_000_000;
+const MIN_SHARED_TIME_NS: u64 = 500_000_000;
 
 impl Senders {
     /// State before the first datagram.
     pub(super) const NONE: Senders = Senders {
-        all: [Sender { from: 0, boots: [0; MAX_BOOTS], heard_ns: 0, announced_ns: 0, other_since_ns: None };
-            MAX_SENDERS],
+        all: [Sender {
+            from: 0,
+            boots: [0; MAX_BOOTS],
+            last_datagram_ns: 0,
+            announced_ns: 0,
+            other_since_ns: None,
+        }; MAX_SENDERS],
         count: 0,
         is_shared: false,
     };
 
     /// Returns whom a datagram of sender `from` belongs to. `boot` is the run of the hub if the datagram is an
     /// announcement. A sender that has not announced itself does not count as the same gateway.
-    pub(super) fn judge(&self, from: u64, boot: Option<u64>, now_ns: u64) -> SenderMatch {
+    pub(super) fn match_sender(&self, from: u64, boot: Option<u64>, now_ns: u64) -> SenderMatch {
         let known = &self.all[..self.count];
         let Some(first) = known.first().filter(|first| first.from != from) else { return SenderMatch::Own };
         let announced = known.iter().find(|sender| sender.from == from).map(|sender| sender.boots[0]);
@@ -73,12 +78,12 @@ impl Senders {
     }
 
     /// Records a datagram of sender `from` that was accepted, or refused because it came from another gateway.
-    pub(super) fn note(&mut self, from: u64, boot: Option<u64>, now_ns: u64) {
-        let is_own = self.judge(from, boot, now_ns) == SenderMatch::Own;
+    pub(super) fn record(&mut self, from: u64, boot: Option<u64>, now_ns: u64) {
+        let is_own = self.match_sender(from, boot, now_ns) == SenderMatch::Own;
         let first = self.all[0];
-        let at = self.place(from);
+        let at = self.sender_index(from);
         let sender = &mut self.all[at];
-        sender.heard_ns = now_ns;
+        sender.last_datagram_ns = now_ns;
         if let Some(boot) = boot {
             sender.announce(boot, now_ns);
         }
@@ -94,7 +99,7 @@ impl Senders {
             }
         } else if boot.is_some() && first.boots[0] != 0 {
             let since_ns = *sender.other_since_ns.get_or_insert(now_ns);
-            let is_long = now_ns.saturating_sub(since_ns) >= SHARED_NS;
+            let is_long = now_ns.saturating_sub(since_ns) >= MIN_SHARED_TIME_NS;
             self.is_shared |= is_long && first.announced_ns > since_ns;
         }
     }
@@ -102,10 +107,10 @@ impl Senders {
     /// Moves the gateway to the address `from`, where it has announced another run of its hub.
     pub(super) fn move_to(&mut self, from: u64, boot: u64, now_ns: u64) {
         let boots = self.all[0].boots;
-        let at = self.place(from);
+        let at = self.sender_index(from);
         self.all[at].boots = boots;
         self.all[at].announce(boot, now_ns);
-        self.all[at].heard_ns = now_ns;
+        self.all[at].last_datagram_ns = now_ns;
         self.all[at].other_since_ns = None;
         self.all[..=at].rotate_right(1);
     }
@@ -117,7 +122,7 @@ impl Senders {
 
     /// Returns the index of sender `from`. A new sender replaces the one that has been silent for longest, but never
     /// the first one.
-    fn place(&mut self, from: u64) -> usize {
+    fn sender_index(&mut self, from: u64) -> usize {
         if let Some(at) = self.all[..self.count].iter().position(|sender| sender.from == from) {
             return at;
         }
@@ -125,7 +130,7 @@ impl Senders {
             self.count += 1;
             self.count - 1
         } else {
-            (1..MAX_SENDERS).min_by_key(|&at| self.all[at].heard_ns).unwrap_or(MAX_SENDERS - 1)
+            (1..MAX_SENDERS).min_by_key(|&at| self.all[at].last_datagram_ns).unwrap_or(MAX_SENDERS - 1)
         };
         self.all[at] = Sender { from, ..Sender::default() };
         at
@@ -134,7 +139,7 @@ impl Senders {
 
 impl Sender {
     fn is_silent(&self, now_ns: u64) -> bool {
-        now_ns.saturating_sub(self.heard_ns) >= SILENCE_NS
+        now_ns.saturating_sub(self.last_datagram_ns) >= SILENCE_NS
     }
 
     fn announce(&mut self, boot: u64, now_ns: u64) {
@@ -152,39 +157,39 @@ pub(super) struct DuplicateDetector {
     /// Start of the window, which begins with a refused datagram.
     since_ns: Option<u64>,
     /// Refused datagrams in the window that followed an accepted one.
-    turns: u32,
+    alternations: u32,
     /// Whether the last datagram was accepted.
     is_accepted: bool,
     is_reported: bool,
 }
 
 /// Minimum number of turns, and minimum time that they cover, of two gateways.
-const MIN_TURNS: u32 = 8;
-const MIN_SPAN_NS: u64 = 3_000_000_000;
+const MIN_ALTERNATIONS: u32 = 8;
+const MIN_ALTERNATION_SPAN_NS: u64 = 3_000_000_000;
 /// Length of the window. Each restart of a gateway may cause some turns.
-const TURNS_WINDOW_NS: u64 = 30_000_000_000;
+const ALTERNATION_WINDOW_NS: u64 = 30_000_000_000;
 
 impl DuplicateDetector {
     /// Records that a datagram of the gateway was accepted.
-    pub(super) fn accepted(&mut self) {
+    pub(super) fn on_accepted(&mut self) {
         self.is_accepted = true;
     }
 
     /// Records that a datagram was refused because of its epoch or sender. Returns whether two gateways are known to
     /// send since this datagram.
-    pub(super) fn refused(&mut self, now_ns: u64) -> bool {
+    pub(super) fn on_refused(&mut self, now_ns: u64) -> bool {
         let is_accepted = std::mem::take(&mut self.is_accepted);
         let Some(since_ns) = self.since_ns else {
             self.since_ns = Some(now_ns);
             return false;
         };
         let span_ns = now_ns.saturating_sub(since_ns);
-        if span_ns >= TURNS_WINDOW_NS {
-            (self.since_ns, self.turns) = (Some(now_ns), 0);
+        if span_ns >= ALTERNATION_WINDOW_NS {
+            (self.since_ns, self.alternations) = (Some(now_ns), 0);
         }
-        self.turns += u32::from(is_accepted);
-        let is_long = (MIN_SPAN_NS..TURNS_WINDOW_NS).contains(&span_ns);
-        let is_new = self.turns >= MIN_TURNS && is_long && !self.is_reported;
+        self.alternations += u32::from(is_accepted);
+        let is_long = (MIN_ALTERNATION_SPAN_NS..ALTERNATION_WINDOW_NS).contains(&span_ns);
+        let is_new = self.alternations >= MIN_ALTERNATIONS && is_long && !self.is_reported;
         self.is_reported |= is_new;
         is_new
     }
@@ -198,11 +203,11 @@ mod tests {
 
     /// Handles a datagram as `GatewayTable` does.
     fn send(senders: &mut Senders, from: u64, boot: Option<u64>, at_ms: u64) -> SenderMatch {
-        let sender_match = senders.judge(from, boot, at_ms * MS);
+        let sender_match = senders.match_sender(from, boot, at_ms * MS);
         if sender_match == SenderMatch::Next {
             *senders = Senders::NONE;
         }
-        senders.note(from, boot, at_ms * MS);
+        senders.record(from, boot, at_ms * MS);
         sender_match
     }
 
@@ -279,8 +284,8 @@ mod tests {
     /// which of them report two gateways.
     fn reports(detector: &mut DuplicateDetector, begin_ms: u64, every_ms: u64, count: u64) -> Vec<u64> {
         let turn = |n: &u64| {
-            detector.accepted();
-            detector.refused((begin_ms + every_ms * *n) * MS)
+            detector.on_accepted();
+            detector.on_refused((begin_ms + every_ms * *n) * MS)
         };
         (0..count).filter(turn).collect()
     }
@@ -297,6 +302,6 @@ mod tests {
         assert!(reports(&mut detector, 0, 1, 1000).is_empty(), "a restart");
         assert!(reports(&mut detector, 3_600_000, 1, 1000).is_empty(), "and another one");
         let mut alone = DuplicateDetector::default();
-        assert!((0..1000).all(|n| !alone.refused(100 * MS * n)), "a gateway whose clock was set back");
+        assert!((0..1000).all(|n| !alone.on_refused(100 * MS * n)), "a gateway whose clock was set back");
     }
 }

@@ -1,12 +1,12 @@
 //! Counters of one sensor and topic in one run of a gateway: which sequence numbers arrived, late, again or not at all.
 
 /// Sequence numbers below the highest one that are still distinguished. Older ones are stale.
-pub const WINDOW: usize = 1024;
+pub const WINDOW_LEN: usize = 1024;
 
 /// Counters of one sensor and topic in one run of a gateway. Sequence numbers have 32 bits, wrap, and may arrive in any
 /// order.
 #[derive(Clone, Copy, Debug)]
-pub struct Row {
+pub struct StreamCounters {
     /// Number of the gateway.
     pub hub: u64,
     /// Epoch of its run.
@@ -28,12 +28,12 @@ pub struct Row {
     /// One more than the highest number that is known to have been sent.
     next: i64,
     /// Bit n % WINDOW is set if number n of the window has arrived.
-    seen: [u64; WINDOW / 64],
+    arrived: [u64; WINDOW_LEN / 64],
 }
 
 /// A sequence number, compared with those that arrived before.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Fresh {
+pub enum SequenceStatus {
     /// Higher than all others of its topic.
     New,
     /// Arrived after a higher one.
@@ -43,11 +43,11 @@ pub enum Fresh {
 }
 
 /// Key of a row, in the order of output: gateway, epoch, sensor, topic.
-type Key = (u64, u32, u8, u8);
+type StreamKey = (u64, u32, u8, u8);
 
-impl Row {
+impl StreamCounters {
     /// An unused row.
-    pub(super) const EMPTY: Row = Row {
+    pub(super) const EMPTY: StreamCounters = StreamCounters {
         hub: 0,
         epoch: 0,
         sensor: 0,
@@ -58,14 +58,14 @@ impl Row {
         lowest: 0,
         highest: 0,
         next: 0,
-        seen: [0; WINDOW / 64],
+        arrived: [0; WINDOW_LEN / 64],
     };
 
     /// Creates a row that expects all numbers from `first` on.
-    pub(super) fn new((hub, epoch, sensor, topic): Key, first: u32) -> Row {
+    pub(super) fn new((hub, epoch, sensor, topic): StreamKey, first: u32) -> StreamCounters {
         // Numbers before the first one must not become negative.
         let first = i64::from(first) + (1 << 32);
-        Row { hub, epoch, sensor, topic, lowest: first, next: first, ..Row::EMPTY }
+        StreamCounters { hub, epoch, sensor, topic, lowest: first, next: first, ..StreamCounters::EMPTY }
     }
 
     /// Returns the count of numbers that were sent since the first known one and have not arrived. The first known
@@ -77,7 +77,7 @@ impl Row {
 
     /// Returns whether the number is so far below the highest one that it may be a duplicate.
     pub(super) fn is_stale(&self, sequence: u32) -> bool {
-        self.received > 0 && self.highest - self.number(sequence) >= WINDOW as i64
+        self.received > 0 && self.highest - self.number(sequence) >= WINDOW_LEN as i64
     }
 
     /// Returns whether the number is below the first one that is known to have been sent to this receiver.
@@ -91,7 +91,7 @@ impl Row {
     }
 
     /// Returns whether the number, which is not stale, has arrived.
-    pub(super) fn came(&self, sequence: u32) -> bool {
+    pub(super) fn has_arrived(&self, sequence: u32) -> bool {
         !self.is_ahead(sequence) && self.has(self.number(sequence))
     }
 
@@ -103,26 +103,26 @@ impl Row {
     }
 
     /// Records the arrival of a number that is not stale.
-    pub(super) fn take(&mut self, sequence: u32) -> Fresh {
+    pub(super) fn record(&mut self, sequence: u32) -> SequenceStatus {
         let number = self.number(sequence);
         let is_late = !self.is_ahead(sequence);
         if is_late && self.has(number) {
             self.duplicate += 1;
-            return Fresh::Duplicate;
+            return SequenceStatus::Duplicate;
         }
         if !is_late {
             self.advance(number);
         }
-        let (word, bit) = place(number);
-        self.seen[word] |= bit;
+        let (word, bit) = window_bit(number);
+        self.arrived[word] |= bit;
         self.received += 1;
         self.lowest = self.lowest.min(number);
         self.next = self.next.max(number.saturating_add(1));
         if is_late {
             self.reordered += 1;
-            return Fresh::Late;
+            return SequenceStatus::Late;
         }
-        Fresh::New
+        SequenceStatus::New
     }
 
     /// Records that all numbers before `next` were sent. An announcement that samples have overtaken changes nothing.
@@ -137,18 +137,18 @@ impl Row {
     }
 
     fn has(&self, number: i64) -> bool {
-        let (word, bit) = place(number);
-        self.seen[word] & bit != 0
+        let (word, bit) = window_bit(number);
+        self.arrived[word] & bit != 0
     }
 
     /// Moves the window up to `number`. Neither that number nor those in between have arrived.
     fn advance(&mut self, number: i64) {
-        if self.received == 0 || number - self.highest >= WINDOW as i64 {
-            self.seen = [0; WINDOW / 64];
+        if self.received == 0 || number - self.highest >= WINDOW_LEN as i64 {
+            self.arrived = [0; WINDOW_LEN / 64];
         } else {
             for between in self.highest + 1..=number {
-                let (word, bit) = place(between);
-                self.seen[word] &= !bit;
+                let (word, bit) = window_bit(between);
+                self.arrived[word] &= !bit;
             }
         }
         self.highest = number;
@@ -156,8 +156,8 @@ impl Row {
 }
 
 /// Returns the word and the bit of a number in the window.
-fn place(number: i64) -> (usize, u64) {
-    let at = number as usize % WINDOW;
+fn window_bit(number: i64) -> (usize, u64) {
+    let at = number as usize % WINDOW_LEN;
     (at / 64, 1 << (at % 64))
 }
 
@@ -165,23 +165,23 @@ fn place(number: i64) -> (usize, u64) {
 mod tests {
     use super::*;
 
-    fn row(first: u32) -> Row {
-        Row::new((1, 2, 3, 4), first)
+    fn row(first: u32) -> StreamCounters {
+        StreamCounters::new((1, 2, 3, 4), first)
     }
 
-    fn figures(row: &Row) -> (u64, u64, u64, u64) {
+    fn figures(row: &StreamCounters) -> (u64, u64, u64, u64) {
         (row.received, row.lost(), row.duplicate, row.reordered)
     }
 
     #[test]
     fn numbers_wrap() {
         let mut row = row(u32::MAX - 1);
-        assert_eq!(row.take(u32::MAX - 1), Fresh::New);
-        assert_eq!(row.take(1), Fresh::New);
+        assert_eq!(row.record(u32::MAX - 1), SequenceStatus::New);
+        assert_eq!(row.record(1), SequenceStatus::New);
         assert_eq!(figures(&row), (2, 2, 0, 0));
         assert_eq!(
-            (row.take(0), row.take(0), row.take(u32::MAX)),
-            (Fresh::Late, Fresh::Duplicate, Fresh::Late)
+            (row.record(0), row.record(0), row.record(u32::MAX)),
+            (SequenceStatus::Late, SequenceStatus::Duplicate, SequenceStatus::Late)
         );
         assert_eq!(figures(&row), (4, 0, 1, 2));
     }
@@ -189,13 +189,13 @@ mod tests {
     #[test]
     fn the_window_ends_after_1024() {
         let mut row = row(5000);
-        row.take(5000);
+        row.record(5000);
         assert!(!row.is_stale(5000 - 1023) && row.is_stale(5000 - 1024));
-        assert_eq!(row.take(5000 - 1023), Fresh::Late);
+        assert_eq!(row.record(5000 - 1023), SequenceStatus::Late);
         assert_eq!(figures(&row), (2, 1022, 0, 1));
-        row.take(5001);
+        row.record(5001);
         assert!(row.is_stale(5000 - 1023));
-        assert_eq!(row.take(5001 - 1023), Fresh::Late, "its place in the window was another's");
+        assert_eq!(row.record(5001 - 1023), SequenceStatus::Late, "its place in the window was another's");
     }
 
     #[test]
@@ -204,20 +204,20 @@ mod tests {
         assert_eq!(figures(&row), (0, 0, 0, 0));
         row.announce(13);
         assert_eq!(figures(&row), (0, 3, 0, 0));
-        row.take(14);
+        row.record(14);
         row.announce(12);
         assert_eq!(figures(&row), (1, 4, 0, 0));
         row.announce(20);
         assert_eq!(figures(&row), (1, 9, 0, 0));
-        row.take(19);
+        row.record(19);
         assert_eq!(figures(&row), (2, 8, 0, 0), "announced, but none that came was higher");
     }
 
     #[test]
     fn counts_missed_numbers_from_the_first_known_one() {
-        let take = |row: &mut Row, sequence| {
+        let take = |row: &mut StreamCounters, sequence| {
             let missed = row.missed_before(sequence);
-            row.take(sequence);
+            row.record(sequence);
             missed
         };
         let mut heard = row(70);

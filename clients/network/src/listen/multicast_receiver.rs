@@ -13,20 +13,20 @@ use nix::sys::socket::{ControlMessageOwned, MsgFlags, SockaddrIn, recvmsg, setso
 use nix::sys::time::TimeSpec;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use scanhub_client::clock;
-use scanhub_schema::datagram::{GROUPS, PORT};
+use scanhub_schema::datagram::{GROUP_PREFIX, PORT};
 use scanhub_schema::{Failure, Kind};
 use socket2::{Domain, InterfaceIndexOrAddress, Protocol, SockRef, Socket, Type};
 
-use crate::interface::{Interface, InterfaceChanges, interfaces, named};
-use crate::lan::Stamp;
+use crate::interface::{Interface, InterfaceChanges, by_name, interfaces};
+use crate::lan::WallTimestamp;
 
 /// Receiver of groups.
 pub(super) struct MulticastReceiver {
     socket: UdpSocket,
     groups: Vec<Ipv4Addr>,
     /// The only interface to receive on; `None`: all suitable ones.
-    only: Option<String>,
-    joined: Vec<Joined>,
+    only_interface: Option<String>,
+    joined: Vec<JoinedInterface>,
     changes: InterfaceChanges,
     /// Whether the kernel has reported a change that was not handled yet.
     is_changed: bool,
@@ -47,11 +47,11 @@ pub(super) struct ReceivedDatagram<'a> {
     /// Address and port of the sender.
     pub(super) from: SocketAddrV4,
     /// Time at which it arrived, even if it was read later.
-    pub(super) arrival: Stamp,
+    pub(super) arrival: WallTimestamp,
 }
 
 /// An interface on which the groups were joined.
-struct Joined {
+struct JoinedInterface {
     name: String,
     index: u32,
     /// Whether it had a carrier at the last update, and has not lost it since.
@@ -63,7 +63,7 @@ const UPDATE_INTERVAL: Duration = Duration::from_millis(500);
 
 /// Size of the kernel's buffer for datagrams that arrive while this process does not run, in bytes. The system may
 /// reduce it.
-const RECEIVE_BUFFER: usize = 4 << 20;
+const RECEIVE_BUFFER_LEN: usize = 4 << 20;
 
 /// Maximum length of a datagram, in bytes.
 pub(super) const MAX_DATAGRAM_LEN: usize = 65_536;
@@ -82,7 +82,7 @@ impl MulticastReceiver {
         now: Instant,
     ) -> Result<MulticastReceiver, Failure> {
         if let Some(name) = only {
-            let interface = named(name)?;
+            let interface = by_name(name)?;
             if !interface.multicast {
                 let hint = "choose another --interface, or have the gateway send copies: `gateway --to`";
                 return Err(Failure::new(Kind::Configuration, format!("{name} carries no multicast"), hint));
@@ -94,11 +94,11 @@ impl MulticastReceiver {
             let hint = "it is in use by a program that does not share it: `ss -lunp` names it";
             Failure::new(Kind::Failed, format!("cannot listen on UDP port {PORT}: {error}"), hint)
         })?;
-        let [a, b, c] = GROUPS;
+        let [a, b, c] = GROUP_PREFIX;
         let mut receiver = MulticastReceiver {
             socket,
             groups: groups.iter().map(|&last| Ipv4Addr::new(a, b, c, last)).collect(),
-            only: only.map(str::to_owned),
+            only_interface: only.map(str::to_owned),
             joined: Vec::new(),
             changes,
             is_changed: false,
@@ -196,7 +196,10 @@ impl MulticastReceiver {
         Ok(Some(ReceivedDatagram {
             bytes: &buffer[..len],
             from: from.map_or(SocketAddrV4::new(Ipv4Addr::UNSPECIFIED, 0), SocketAddrV4::from),
-            arrival: Stamp { monotonic_ns: now_ns - waited_ns, wall_ns: wall_ns.saturating_sub(waited_ns) },
+            arrival: WallTimestamp {
+                monotonic_ns: now_ns - waited_ns,
+                wall_ns: wall_ns.saturating_sub(waited_ns),
+            },
         }))
     }
 
@@ -212,7 +215,7 @@ impl MulticastReceiver {
 
     /// Returns whether to receive on `interface`.
     fn is_suitable(&self, interface: &Interface) -> bool {
-        match &self.only {
+        match &self.only_interface {
             Some(name) => interface.name == *name,
             // Interfaces of containers and bridges have no address, and a socket cannot join on all of them.
             None => interface.multicast && interface.address.is_some(),
@@ -233,7 +236,11 @@ impl MulticastReceiver {
             }
         }
         self.joined.retain(|joined| joined.index != interface.index);
-        self.joined.push(Joined { name: interface.name.clone(), index: interface.index, running: true });
+        self.joined.push(JoinedInterface {
+            name: interface.name.clone(),
+            index: interface.index,
+            running: true,
+        });
     }
 }
 
@@ -263,7 +270,7 @@ fn bind() -> io::Result<UdpSocket> {
     socket.set_reuse_address(true)?;
     socket.set_multicast_all_v4(false)?;
     // With a smaller buffer, more datagrams are lost, and they are counted.
-    let _ = socket.set_recv_buffer_size(RECEIVE_BUFFER);
+    let _ = socket.set_recv_buffer_size(RECEIVE_BUFFER_LEN);
     socket.set_nonblocking(true)?;
     // Datagrams that waited while this process did not run must not count as new.
     setsockopt(socket.as_raw_fd(), ReceiveTimestampns, &true)?;

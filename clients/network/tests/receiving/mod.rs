@@ -4,36 +4,36 @@
 use std::collections::VecDeque;
 
 use scanhub_client::Robot;
-use scanhub_client::clock::Moment;
+use scanhub_client::clock::Timestamp;
 use scanhub_client::streams::ZonesState;
-use scanhub_network::lan::Stamp;
-use scanhub_network::lan::incoming::{Arrived, Incoming};
+use scanhub_network::lan::WallTimestamp;
+use scanhub_network::lan::incoming::{Incoming, ReceiveOutcome};
 use scanhub_network::lan::republish::Republisher;
-use scanhub_schema::datagram::Packed;
+use scanhub_schema::datagram::DatagramPayload;
 use scanhub_schema::{Header, Topic, Verdict, Zones};
 
 use crate::network::Nanos;
-use crate::remote_topics::{self, Memory};
+use crate::remote_topics::{self, TopicMemory};
 
 /// Receiving machine.
-pub(crate) struct Receiving {
+pub(crate) struct ReceivingMachine {
     /// Clocks at the start.
-    clocks: Stamp,
+    clocks: WallTimestamp,
     pub(crate) incoming: Incoming,
-    pub(crate) republisher: Republisher<Memory>,
-    memory: Memory,
+    pub(crate) republisher: Republisher<TopicMemory>,
+    memory: TopicMemory,
     /// Datagrams in the kernel's buffer, with the time of their arrival.
     queue: VecDeque<(Nanos, Vec<u8>)>,
     /// Time until which the listener is stopped.
     stalled_until: Nanos,
-    look_at: Nanos,
+    next_check_at: Nanos,
     pub(crate) robot: Robot,
-    followed: Vec<(String, ZonesState)>,
+    subscriptions: Vec<(String, ZonesState)>,
 }
 
 /// A published sample of topic zones.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Published {
+pub(crate) struct PublishedZones {
     /// Position of its sensor.
     pub(crate) position: usize,
     pub(crate) header: Header,
@@ -41,35 +41,35 @@ pub(crate) struct Published {
 }
 
 /// Event that a test observes.
-pub(crate) enum Seen<'a> {
-    Datagram { arrived_at: Nanos, bytes: &'a [u8], arrived: &'a Arrived<'a> },
-    Published(Published),
+pub(crate) enum TestEvent<'a> {
+    Datagram { arrived_at: Nanos, bytes: &'a [u8], arrived: &'a ReceiveOutcome<'a> },
+    Published(PublishedZones),
 }
 
 /// ID of the publishing process.
-const PID: u32 = 77;
+const PUBLISHER_PID: u32 = 77;
 /// Maximum sleep of the listener.
 const MAX_SLEEP_NS: Nanos = 100_000_000;
 
-impl Receiving {
+impl ReceivingMachine {
     /// Creates a machine whose robot subscribes to the zones of `names` of gateway `hub`.
-    pub(crate) fn new(clocks: Stamp, hub: &str, names: &[&str]) -> Receiving {
-        let memory = Memory::default();
-        let mut receiving = Receiving {
+    pub(crate) fn new(clocks: WallTimestamp, hub: &str, names: &[&str]) -> ReceivingMachine {
+        let memory = TopicMemory::default();
+        let mut receiving = ReceivingMachine {
             clocks,
             incoming: Incoming::new(&Topic::ALL),
-            republisher: Republisher::new(memory.clone(), PID, clocks.monotonic_ns),
+            republisher: Republisher::new(memory.clone(), PUBLISHER_PID, clocks.monotonic_ns),
             memory,
             queue: VecDeque::new(),
             stalled_until: 0,
-            look_at: 0,
+            next_check_at: 0,
             robot: Robot::default(),
-            followed: Vec::new(),
+            subscriptions: Vec::new(),
         };
         for name in names {
             let name = format!("{hub}.{name}");
             receiving.robot.expect(&name);
-            receiving.followed.push((name, ZonesState::new(receiving.moment(0))));
+            receiving.subscriptions.push((name, ZonesState::new(receiving.moment(0))));
         }
         receiving
     }
@@ -87,53 +87,57 @@ impl Receiving {
     /// Returns the time of the next event without a datagram.
     pub(crate) fn next(&self, now: Nanos) -> Nanos {
         let moment = self.moment(now);
-        let left = self.followed.iter().filter_map(|(_, state)| state.left(moment));
+        let left = self.subscriptions.iter().filter_map(|(_, state)| state.time_left(moment));
         let silence_at = left.min().map_or(Nanos::MAX, |left| now + left.as_nanos() as Nanos);
-        silence_at.min(self.look_at.max(self.stalled_until))
+        silence_at.min(self.next_check_at.max(self.stalled_until))
     }
 
     /// Handles waiting datagrams, and calls `seen` with each event.
-    pub(crate) fn step(&mut self, now: Nanos, hub: &str, mut seen: impl FnMut(Seen<'_>)) {
+    pub(crate) fn step(&mut self, now: Nanos, hub: &str, mut on_event: impl FnMut(TestEvent<'_>)) {
         if now >= self.stalled_until {
             let wall = self.stamp(now);
             while let Some((arrived_at, bytes)) = self.queue.pop_front() {
                 let (arrival, mut whole) = (self.stamp(arrived_at), Vec::new());
                 let arrived = self.incoming.receive(&bytes, 1, arrival, &mut whole);
-                seen(Seen::Datagram { arrived_at, bytes: &bytes, arrived: &arrived });
+                on_event(TestEvent::Datagram { arrived_at, bytes: &bytes, arrived: &arrived });
                 if let Some(head) = arrived.begins() {
-                    self.republisher.begun(head, wall);
+                    self.republisher.on_run_started(head, wall);
                 }
                 let made = match &arrived {
-                    Arrived::Sample(sample) => self.republisher.sample(sample, || hub.to_owned(), wall),
-                    Arrived::Announced(announced) => self.republisher.announced(announced, hub, wall),
+                    ReceiveOutcome::Sample(sample) => {
+                        self.republisher.sample(sample, || hub.to_owned(), wall)
+                    }
+                    ReceiveOutcome::Announced(announced) => {
+                        self.republisher.on_announcement(announced, hub, wall)
+                    }
                     _ => Ok(None),
                 };
                 made.expect("memory is not short");
             }
             self.republisher.wake();
-            if now >= self.look_at {
-                self.look_at = now + MAX_SLEEP_NS;
-                self.republisher.look(wall.monotonic_ns, wall);
+            if now >= self.next_check_at {
+                self.next_check_at = now + MAX_SLEEP_NS;
+                self.republisher.do_periodic_work(wall.monotonic_ns, wall);
             }
         }
-        self.follow(now, seen);
+        self.take_published(now, on_event);
     }
 
     /// Receives the published zones, and detects silences.
-    fn follow(&mut self, now: Nanos, mut seen: impl FnMut(Seen<'_>)) {
+    fn take_published(&mut self, now: Nanos, mut on_event: impl FnMut(TestEvent<'_>)) {
         let moment = self.moment(now);
-        for (position, (name, state)) in self.followed.iter_mut().enumerate() {
+        for (position, (name, state)) in self.subscriptions.iter_mut().enumerate() {
             let waiting = self.memory.take(name).into_iter();
-            for remote_topics::Published { header, payload, .. } in
+            for remote_topics::PublishedSample { header, payload, .. } in
                 waiting.filter(|published| published.topic == Topic::Zones)
             {
                 let mut zones = Zones::default();
                 assert!(zones.unpack(&payload));
-                seen(Seen::Published(Published { position, header, zones }));
-                self.robot.hear(position, state.take(&header, &zones, 0, moment).zones);
+                on_event(TestEvent::Published(PublishedZones { position, header, zones }));
+                self.robot.update(position, state.take(&header, &zones, 0, moment).zones);
             }
             if let Some(silence) = state.silence(moment) {
-                self.robot.hear(position, silence.zones);
+                self.robot.update(position, silence.zones);
             }
         }
     }
@@ -148,12 +152,12 @@ impl Receiving {
         stamp_ns.checked_sub(self.clocks.monotonic_ns).expect("a stamp of this machine")
     }
 
-    fn stamp(&self, now: Nanos) -> Stamp {
-        Stamp { monotonic_ns: self.clocks.monotonic_ns + now, wall_ns: self.clocks.wall_ns + now }
+    fn stamp(&self, now: Nanos) -> WallTimestamp {
+        WallTimestamp { monotonic_ns: self.clocks.monotonic_ns + now, wall_ns: self.clocks.wall_ns + now }
     }
 
-    fn moment(&self, now: Nanos) -> Moment {
+    fn moment(&self, now: Nanos) -> Timestamp {
         let monotonic_ns = self.stamp(now).monotonic_ns;
-        Moment { monotonic_ns, boottime_ns: monotonic_ns }
+        Timestamp { monotonic_ns, boottime_ns: monotonic_ns }
     }
 }

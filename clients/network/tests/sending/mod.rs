@@ -5,9 +5,9 @@ use std::collections::BTreeMap;
 use std::num::NonZeroU64;
 
 use fastrand::Rng;
-use scanhub_client::clock::Moment;
+use scanhub_client::clock::Timestamp;
 use scanhub_client::streams::ZonesState;
-use scanhub_network::lan::Stamp;
+use scanhub_network::lan::WallTimestamp;
 use scanhub_network::lan::outgoing::{Form, Outgoing, PayloadRef, Sample, Transmit};
 use scanhub_schema::datagram::Datagram;
 use scanhub_schema::{Header, Status, Topic, Verdict, Zones};
@@ -16,7 +16,7 @@ use crate::network::{Nanos, Network};
 
 /// Faults of the sending machine.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Mishaps {
+pub(crate) struct MachineFaults {
     /// Whether sensors fall silent.
     pub(crate) silence: bool,
     /// Whether the hub restarts.
@@ -30,7 +30,7 @@ pub(crate) struct Mishaps {
 }
 
 /// Number of the gateway.
-pub(crate) const HUB: u64 = 0xab;
+pub(crate) const HUB_ID: u64 = 0xab;
 /// Names of the sensors. Zones of the sensor at position n have n in `invalid_beams`.
 pub(crate) const NAMES: [&str; 2] = ["front", "rear"];
 /// Time between two scans.
@@ -41,32 +41,32 @@ const UNKNOWN_AFTER_NS: Nanos = 2 * PERIOD_NS + 20_000_000;
 const NEVER: Nanos = Nanos::MAX;
 
 /// Sending machine.
-pub(crate) struct Sending {
+pub(crate) struct SendingMachine {
     rng: Rng,
-    mishaps: Mishaps,
+    faults: MachineFaults,
     /// Thinning factor of zones.
-    every: u64,
-    longest: usize,
+    send_interval: u64,
+    max_datagram_len: usize,
     /// Clocks at the start, which differ from those of other machines.
-    clocks: Stamp,
+    clocks: WallTimestamp,
     boot: u64,
-    hub: Process,
-    gateway: Process,
-    sensors: [Sensor; 2],
+    hub: ProcessState,
+    gateway: ProcessState,
+    sensors: [SimulatedSensor; 2],
     outgoing: Outgoing,
     epoch: u32,
     announce_at: Nanos,
-    pub(crate) sent: Sent,
+    pub(crate) sent: SentDatagrams,
 }
 
 /// A program that is stopped and restarted.
-struct Process {
-    runs: bool,
+struct ProcessState {
+    is_running: bool,
     /// Time at which it is stopped or started.
-    at: Nanos,
+    changes_at: Nanos,
 }
 
-struct Sensor {
+struct SimulatedSensor {
     /// Number of the sensor, its position in the hub's configuration.
     number: u8,
     seq: u64,
@@ -79,17 +79,17 @@ struct Sensor {
 }
 
 /// Epoch, number of the sensor, and number of the topic.
-pub(crate) type Key = (u32, u8, u8);
+pub(crate) type StreamKey = (u32, u8, u8);
 /// Datagrams of a sample; `None` for a datagram that the kernel refused.
-pub(crate) type Parts = Vec<Option<Vec<u8>>>;
+pub(crate) type DatagramParts = Vec<Option<Vec<u8>>>;
 
 /// Everything that was sent.
 #[derive(Default)]
-pub(crate) struct Sent {
+pub(crate) struct SentDatagrams {
     /// Samples of each stream, by their sequence numbers.
-    pub(crate) datagrams: BTreeMap<Key, Vec<Parts>>,
+    pub(crate) datagrams: BTreeMap<StreamKey, Vec<DatagramParts>>,
     /// Run of the hub in which the zones with this value in `nearest_mm` were published.
-    pub(crate) boots: Vec<u64>,
+    pub(crate) boot_ids: Vec<u64>,
 }
 
 /// Connection from the gateway to the network.
@@ -97,7 +97,7 @@ struct Uplink<'a> {
     now: Nanos,
     rng: &'a mut Rng,
     refusal: f64,
-    sent: &'a mut Sent,
+    sent: &'a mut SentDatagrams,
     network: &'a mut Network,
 }
 
@@ -120,25 +120,30 @@ impl Transmit for Uplink<'_> {
     }
 }
 
-impl Sending {
+impl SendingMachine {
     /// Creates a machine that sends every `every`th sample of zones, in datagrams of at most `longest` bytes.
-    pub(crate) fn new(seed: u64, mishaps: Mishaps, every: u64, longest: usize) -> Sending {
+    pub(crate) fn new(
+        seed: u64,
+        faults: MachineFaults,
+        send_interval: u64,
+        max_datagram_len: usize,
+    ) -> SendingMachine {
         let mut rng = Rng::with_seed(seed);
-        let clocks = Stamp { monotonic_ns: rng.u64(1..1 << 50), wall_ns: rng.u64(1 << 60..1 << 61) };
+        let clocks = WallTimestamp { monotonic_ns: rng.u64(1..1 << 50), wall_ns: rng.u64(1 << 60..1 << 61) };
         let epoch = 1_700_000_000;
-        let mut sending = Sending {
-            mishaps,
-            every,
+        let mut sending = SendingMachine {
+            faults,
+            send_interval,
             clocks,
             boot: 0,
-            hub: Process { runs: false, at: 0 },
-            gateway: Process { runs: false, at: 0 },
-            sensors: [0, 1].map(|number| Sensor::new(number, moment(clocks, 0))),
-            outgoing: gateway(epoch, every, longest),
-            longest,
+            hub: ProcessState { is_running: false, changes_at: 0 },
+            gateway: ProcessState { is_running: false, changes_at: 0 },
+            sensors: [0, 1].map(|number| SimulatedSensor::new(number, moment(clocks, 0))),
+            outgoing: gateway(epoch, send_interval, max_datagram_len),
+            max_datagram_len,
             epoch,
             announce_at: SECOND_NS,
-            sent: Sent::default(),
+            sent: SentDatagrams::default(),
             rng,
         };
         sending.switch_hub(0);
@@ -148,9 +153,9 @@ impl Sending {
 
     /// Starts everything that is stopped. No further faults occur.
     pub(crate) fn stop_faults(&mut self, now: Nanos) {
-        self.mishaps = Mishaps::default();
+        self.faults = MachineFaults::default();
         for runs in [&mut self.hub, &mut self.gateway] {
-            runs.at = if runs.runs { NEVER } else { now };
+            runs.changes_at = if runs.is_running { NEVER } else { now };
         }
         for sensor in &mut self.sensors {
             sensor.scan_at = sensor.scan_at.min(now + PERIOD_NS);
@@ -159,38 +164,38 @@ impl Sending {
 
     /// Returns the time of the next event.
     pub(crate) fn next(&self, now: Nanos) -> Nanos {
-        let restart_at = self.hub.at.min(self.gateway.at);
-        let announce_at = if self.gateway.runs { self.announce_at } else { NEVER };
+        let restart_at = self.hub.changes_at.min(self.gateway.changes_at);
+        let announce_at = if self.gateway.is_running { self.announce_at } else { NEVER };
         let of_sensors = self.sensors.iter().map(|sensor| {
-            let left = sensor.state.left(moment(self.clocks, now)).filter(|_| self.gateway.runs);
+            let left = sensor.state.time_left(moment(self.clocks, now)).filter(|_| self.gateway.is_running);
             let silence_at = left.map_or(NEVER, |left| now + left.as_nanos() as Nanos);
             let publish_at = sensor.scan_at.min(sensor.unknown_at).min(sensor.status_at);
-            silence_at.min(if self.hub.runs { publish_at } else { NEVER })
+            silence_at.min(if self.hub.is_running { publish_at } else { NEVER })
         });
         of_sensors.fold(restart_at.min(announce_at), Nanos::min)
     }
 
     /// Does what is due.
     pub(crate) fn step(&mut self, now: Nanos, network: &mut Network) {
-        if now >= self.hub.at {
+        if now >= self.hub.changes_at {
             self.switch_hub(now);
         }
-        if now >= self.gateway.at {
+        if now >= self.gateway.changes_at {
             self.end_gateway(now, network);
             self.switch_gateway(now);
         }
         for position in 0..NAMES.len() {
-            if self.hub.runs {
+            if self.hub.is_running {
                 self.publish_due(position, now, network);
             }
             let moment = moment(self.clocks, now);
-            if self.gateway.runs
-                && let Some(heard) = self.sensors[position].state.silence(moment)
+            if self.gateway.is_running
+                && let Some(update) = self.sensors[position].state.silence(moment)
             {
-                self.pass_to_gateway(position, None, PayloadRef::Zones(&heard.zones), now, network);
+                self.pass_to_gateway(position, None, PayloadRef::Zones(&update.zones), now, network);
             }
         }
-        if self.gateway.runs && now >= self.announce_at {
+        if self.gateway.is_running && now >= self.announce_at {
             self.announce_at = now + SECOND_NS;
             self.announce(now, network);
         }
@@ -198,20 +203,21 @@ impl Sending {
 
     /// Announces all sensors.
     pub(crate) fn announce(&mut self, now: Nanos, network: &mut Network) {
-        let Sending { rng, sent, outgoing, .. } = self;
-        let mut uplink = Uplink { now, rng, refusal: self.mishaps.refusal, sent, network };
+        let SendingMachine { rng, sent, outgoing, .. } = self;
+        let mut uplink = Uplink { now, rng, refusal: self.faults.refusal, sent, network };
         outgoing.announce(stamp(self.clocks, now), &mut uplink);
     }
 
     fn switch_hub(&mut self, now: Nanos) {
-        self.hub.runs = !self.hub.runs;
-        if !self.hub.runs {
-            self.hub.at = now + self.rng.u64(30_000_000..2 * SECOND_NS);
+        self.hub.is_running = !self.hub.is_running;
+        if !self.hub.is_running {
+            self.hub.changes_at = now + self.rng.u64(30_000_000..2 * SECOND_NS);
             return;
         }
-        self.hub.at = if self.mishaps.hub { now + self.rng.u64(SECOND_NS..9 * SECOND_NS) } else { NEVER };
+        self.hub.changes_at =
+            if self.faults.hub { now + self.rng.u64(SECOND_NS..9 * SECOND_NS) } else { NEVER };
         self.boot = self.rng.u64(1..);
-        if self.mishaps.order && self.rng.bool() {
+        if self.faults.order && self.rng.bool() {
             self.sensors.iter_mut().for_each(|sensor| sensor.number ^= 1);
         }
         for sensor in &mut self.sensors {
@@ -223,15 +229,15 @@ impl Sending {
     }
 
     fn switch_gateway(&mut self, now: Nanos) {
-        self.gateway.runs = !self.gateway.runs;
-        if !self.gateway.runs {
-            self.gateway.at = now + self.rng.u64(10_000_000..2 * SECOND_NS);
+        self.gateway.is_running = !self.gateway.is_running;
+        if !self.gateway.is_running {
+            self.gateway.changes_at = now + self.rng.u64(10_000_000..2 * SECOND_NS);
             return;
         }
-        self.gateway.at =
-            if self.mishaps.gateway { now + self.rng.u64(SECOND_NS..9 * SECOND_NS) } else { NEVER };
+        self.gateway.changes_at =
+            if self.faults.gateway { now + self.rng.u64(SECOND_NS..9 * SECOND_NS) } else { NEVER };
         self.epoch += 1;
-        self.outgoing = gateway(self.epoch, self.every, self.longest);
+        self.outgoing = gateway(self.epoch, self.send_interval, self.max_datagram_len);
         self.announce_at = now + SECOND_NS;
         let moment = moment(self.clocks, now);
         self.sensors.iter_mut().for_each(|sensor| sensor.state = ZonesState::new(moment));
@@ -239,16 +245,16 @@ impl Sending {
 
     /// Kills half of the gateways. The others send a last announcement.
     fn end_gateway(&mut self, now: Nanos, network: &mut Network) {
-        if self.gateway.runs && self.rng.bool() {
+        if self.gateway.is_running && self.rng.bool() {
             self.announce(now, network);
         }
     }
 
     /// Publishes what is due of a sensor.
     fn publish_due(&mut self, position: usize, now: Nanos, network: &mut Network) {
-        let Sensor { scan_at, unknown_at, status_at, .. } = self.sensors[position];
+        let SimulatedSensor { scan_at, unknown_at, status_at, .. } = self.sensors[position];
         if now >= scan_at {
-            let silent_ns = if self.mishaps.silence && self.rng.u8(..) == 0 {
+            let silent_ns = if self.faults.silence && self.rng.u8(..) == 0 {
                 self.rng.u64(PERIOD_NS..4 * SECOND_NS)
             } else {
                 PERIOD_NS
@@ -279,20 +285,20 @@ impl Sending {
         let zones = Zones {
             verdict: verdict as u8,
             invalid_beams: position as u16,
-            nearest_mm: self.sent.boots.len() as u32,
+            nearest_mm: self.sent.boot_ids.len() as u32,
             ..Zones::unknown()
         };
-        self.sent.boots.push(self.boot);
-        if self.gateway.runs {
+        self.sent.boot_ids.push(self.boot);
+        if self.gateway.is_running {
             let (header, moment) = (self.header(position, now), moment(self.clocks, now));
-            let heard = self.sensors[position].state.take(&header, &zones, 0, moment);
-            self.pass_to_gateway(position, Some(&header), PayloadRef::Zones(&heard.zones), now, network);
+            let update = self.sensors[position].state.take(&header, &zones, 0, moment);
+            self.pass_to_gateway(position, Some(&header), PayloadRef::Zones(&update.zones), now, network);
         }
     }
 
     fn header(&self, position: usize, now: Nanos) -> Header {
-        let Stamp { monotonic_ns, wall_ns } = stamp(self.clocks, now);
-        let Sensor { number, seq, .. } = self.sensors[position];
+        let WallTimestamp { monotonic_ns, wall_ns } = stamp(self.clocks, now);
+        let SimulatedSensor { number, seq, .. } = self.sensors[position];
         Header {
             seq,
             stamp_first_ns: monotonic_ns,
@@ -314,28 +320,36 @@ impl Sending {
         now: Nanos,
         network: &mut Network,
     ) {
-        if self.gateway.runs {
-            let Sending { rng, sent, outgoing, .. } = self;
-            let mut uplink = Uplink { now, rng, refusal: self.mishaps.refusal, sent, network };
+        if self.gateway.is_running {
+            let SendingMachine { rng, sent, outgoing, .. } = self;
+            let mut uplink = Uplink { now, rng, refusal: self.faults.refusal, sent, network };
             let sample = Sample { header, missed: 0, payload };
             outgoing.sample(position, &sample, stamp(self.clocks, now), &mut uplink);
         }
     }
 }
 
-impl Sensor {
-    fn new(number: u8, now: Moment) -> Sensor {
+impl SimulatedSensor {
+    fn new(number: u8, now: Timestamp) -> SimulatedSensor {
         let state = ZonesState::new(now);
         let verdict = Verdict::Clear;
-        Sensor { number, seq: 0, verdict, scan_at: NEVER, unknown_at: NEVER, status_at: NEVER, state }
+        SimulatedSensor {
+            number,
+            seq: 0,
+            verdict,
+            scan_at: NEVER,
+            unknown_at: NEVER,
+            status_at: NEVER,
+            state,
+        }
     }
 }
 
-fn gateway(epoch: u32, every: u64, longest: usize) -> Outgoing {
-    let mut outgoing = Outgoing::new(HUB, epoch, Form::Sealed, longest);
+fn gateway(epoch: u32, send_interval: u64, max_datagram_len: usize) -> Outgoing {
+    let mut outgoing = Outgoing::new(HUB_ID, epoch, Form::Sealed, max_datagram_len);
     for name in NAMES {
         outgoing.follow(name, |topic| match topic {
-            Topic::Zones => NonZeroU64::new(every),
+            Topic::Zones => NonZeroU64::new(send_interval),
             Topic::Status => NonZeroU64::new(1),
             _ => None,
         });
@@ -343,11 +357,11 @@ fn gateway(epoch: u32, every: u64, longest: usize) -> Outgoing {
     outgoing
 }
 
-fn stamp(clocks: Stamp, now: Nanos) -> Stamp {
-    Stamp { monotonic_ns: clocks.monotonic_ns + now, wall_ns: clocks.wall_ns + now }
+fn stamp(clocks: WallTimestamp, now: Nanos) -> WallTimestamp {
+    WallTimestamp { monotonic_ns: clocks.monotonic_ns + now, wall_ns: clocks.wall_ns + now }
 }
 
-fn moment(clocks: Stamp, now: Nanos) -> Moment {
+fn moment(clocks: WallTimestamp, now: Nanos) -> Timestamp {
     let monotonic_ns = clocks.monotonic_ns + now;
-    Moment { monotonic_ns, boottime_ns: monotonic_ns }
+    Timestamp { monotonic_ns, boottime_ns: monotonic_ns }
 }

@@ -5,11 +5,11 @@ use scanhub_sim::room::BeamTarget;
 
 use super::hall::Hall;
 
-const SECOND: u64 = 1_000_000_000;
+const ONE_SECOND: u64 = 1_000_000_000;
 
 /// Points of persons and of new things, and what they were taken for.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Score {
+pub(crate) struct PointScore {
     /// On persons; of these in the foreground.
     pub(crate) persons: (usize, usize),
     /// On what was put down and cannot be background yet; of these in the foreground.
@@ -18,7 +18,7 @@ pub(crate) struct Score {
     pub(crate) wrong: usize,
 }
 
-impl Score {
+impl PointScore {
     /// Adds the points of a sweep. What is put down counts as new until it was met in enough sweeps, and is not counted in
     /// the two after that, nor is what stands beside it on the same beam.
     pub(crate) fn add(&mut self, hall: &Hall, sweep: &Sweep<'_>, settings: &Settings, sweep_ns: u64) {
@@ -28,7 +28,7 @@ impl Score {
             let count = |(all, found): &mut (usize, usize)| {
                 (*all, *found) = (*all + 1, *found + usize::from(is_found))
             };
-            match hall.met(point) {
+            match hall.target_of(point) {
                 Some(BeamTarget::Person) => count(&mut self.persons),
                 Some(BeamTarget::Box { since_ns }) if point.stamp_ns < since_ns + new_ns => {
                     count(&mut self.things)
@@ -54,8 +54,8 @@ impl Score {
 
 /// Objects that are new, and obstacles that were found.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Things {
-    /// Clusters of at least [`LEAST`] points on people and new things; of these found.
+pub(crate) struct ObstacleScore {
+    /// Clusters of at least [`MIN_POINTS`] points on people and new things; of these found.
     pub(crate) new: (usize, usize),
     /// Obstacles on something new.
     pub(crate) right: usize,
@@ -64,18 +64,18 @@ pub(crate) struct Things {
 }
 
 /// An object with fewer points need not be found.
-const LEAST: usize = 15;
+const MIN_POINTS: usize = 15;
 /// Maximum distance between neighboring points of an object, in meters.
-const NEAR_M: f32 = 0.2;
+const NEIGHBOR_DISTANCE_M: f32 = 0.2;
 
-impl Things {
-    /// Adds the obstacles of a sweep. [`Score::add`] defines which points are new. It leaves out some
+impl ObstacleScore {
+    /// Adds the obstacles of a sweep. [`PointScore::add`] defines which points are new. It leaves out some
     /// points; obstacles there do not count either.
     pub(crate) fn add(&mut self, hall: &Hall, sweep: &Sweep<'_>, settings: &Settings, sweep_ns: u64) {
         let new_ns = u64::from(settings.sweeps) * sweep_ns;
         let (mut new, mut open) = (Vec::new(), Vec::new());
         for point in sweep.points {
-            match hall.met(point) {
+            match hall.target_of(point) {
                 Some(BeamTarget::Person) => new.push(point.at),
                 Some(BeamTarget::Box { since_ns }) if point.stamp_ns < since_ns + new_ns => {
                     new.push(point.at)
@@ -97,7 +97,7 @@ impl Things {
                 _ => self.wrong += 1,
             }
         }
-        for cluster in clusters(&new).into_iter().filter(|cluster| cluster.len() >= LEAST) {
+        for cluster in clusters(&new).into_iter().filter(|cluster| cluster.len() >= MIN_POINTS) {
             let in_some = cluster.iter().filter(|at| sweep.obstacles.iter().any(|one| is_in(one, at)));
             self.new.0 += 1;
             self.new.1 += usize::from(2 * in_some.count() >= cluster.len());
@@ -125,7 +125,8 @@ fn clusters(points: &[[f32; 3]]) -> Vec<Vec<[f32; 3]>> {
         while let Some(at) = cluster.get(next).copied() {
             next += 1;
             let is_near = |other: &mut [f32; 3]| {
-                (0..3).map(|i| (at[i] - other[i]).powi(2)).sum::<f32>() < NEAR_M * NEAR_M
+                (0..3).map(|i| (at[i] - other[i]).powi(2)).sum::<f32>()
+                    < NEIGHBOR_DISTANCE_M * NEIGHBOR_DISTANCE_M
             };
             cluster.extend(open.extract_if(.., is_near));
         }
@@ -141,50 +142,53 @@ pub(crate) fn share(part: usize, all: usize) -> f64 {
 
 /// When the pole and the box of world `tilt` were among the obstacles: beginning of the sweep, and whether.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Seen {
+pub(crate) struct ObstacleTimes {
     pole: Vec<(u64, bool)>,
     boxed: Vec<(u64, bool)>,
 }
 
-impl Seen {
+impl ObstacleTimes {
     /// Adds the obstacles of a sweep.
     pub(crate) fn add(&mut self, sweep: &Sweep<'_>) {
-        let found = |at: [f32; 2], wide: f32| sweep.obstacles.iter().any(|one| stands_at(one, at, wide));
+        let found = |at: [f32; 2], wide: f32| sweep.obstacles.iter().any(|one| is_at(one, at, wide));
         // In the world x is to the right and y ahead.
         self.pole.push((sweep.from_ns, found([2.0, -0.3], 0.6)));
         self.boxed.push((sweep.from_ns, found([2.6, 0.9], 0.8)));
     }
 
     /// Whether the pole was found in the first whole sweep in which it stood.
-    pub(crate) fn is_pole_found_at_once(&self) -> bool {
-        self.pole.iter().find(|(from_ns, _)| *from_ns >= seconds(POLE_S)).is_some_and(|(_, found)| *found)
+    pub(crate) fn is_pole_found_first_sweep(&self) -> bool {
+        self.pole
+            .iter()
+            .find(|(from_ns, _)| *from_ns >= seconds(POLE_PLACED_S))
+            .is_some_and(|(_, found)| *found)
     }
 
     /// In how many sweeps the pole was found, until it was background.
     pub(crate) fn sweeps_of_pole(&self) -> usize {
-        self.pole.iter().filter(|(from_ns, found)| *found && *from_ns > seconds(POLE_S - 2)).count()
+        self.pole.iter().filter(|(from_ns, found)| *found && *from_ns > seconds(POLE_PLACED_S - 2)).count()
     }
 
     /// The same of the box.
     pub(crate) fn sweeps_of_box(&self) -> usize {
-        self.boxed.iter().filter(|(from_ns, found)| *found && *from_ns > seconds(BOX_S - 2)).count()
+        self.boxed.iter().filter(|(from_ns, found)| *found && *from_ns > seconds(BOX_PLACED_S - 2)).count()
     }
 }
 
 /// Whether `obstacle` is what stands at `x` and `y` and is so wide at most.
-fn stands_at(obstacle: &Obstacle, [x, y]: [f32; 2], wide: f32) -> bool {
-    (obstacle.middle[0] - x).hypot(obstacle.middle[1] - y) < wide / 2.0
-        && obstacle.high[0] - obstacle.low[0] < wide
-        && obstacle.high[1] - obstacle.low[1] < wide
+fn is_at(obstacle: &Obstacle, [x, y]: [f32; 2], max_width_m: f32) -> bool {
+    (obstacle.middle[0] - x).hypot(obstacle.middle[1] - y) < max_width_m / 2.0
+        && obstacle.high[0] - obstacle.low[0] < max_width_m
+        && obstacle.high[1] - obstacle.low[1] < max_width_m
 }
 
 /// When world `tilt` puts up its pole and puts down its box.
-const POLE_S: u64 = 30;
-const BOX_S: u64 = 36;
+const POLE_PLACED_S: u64 = 30;
+const BOX_PLACED_S: u64 = 36;
 /// Its mount swings by 50 degrees at 30 degrees a second.
-pub(crate) const SWEEP_NS: u64 = 1_666_666_667;
+pub(crate) const SWEEP_TIME_NS: u64 = 1_666_666_667;
 
 /// Seconds in ns.
 pub(crate) const fn seconds(s: u64) -> u64 {
-    s * SECOND
+    s * ONE_SECOND
 }

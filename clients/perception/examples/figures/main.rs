@@ -11,13 +11,13 @@ mod judge;
 use std::ops::Range;
 
 use hall::Hall;
-use judge::{Score, Seen, Things, seconds, share};
+use judge::{ObstacleScore, ObstacleTimes, PointScore, seconds, share};
 use scanhub_perception::tilt::{DropReason, Settings};
 use scanhub_sim::mount::{Fault, FaultKind};
 use scanhub_sim::world::World;
 
 /// So many halls.
-const SEEDS: u64 = 10;
+const SEED_COUNT: u64 = 10;
 
 fn main() -> Result<(), scanhub_schema::Failure> {
     let world: World = "tilt".parse()?;
@@ -30,20 +30,20 @@ fn main() -> Result<(), scanhub_schema::Failure> {
     };
     let is_wanted = |name: &str| part.as_deref().is_none_or(|part| part == name);
     if is_wanted("unchanging") {
-        unchanging(halls(4));
+        measure_unchanging(halls(4));
     }
     if is_wanted("changing") {
-        changing(halls(SEEDS));
+        measure_changing(halls(SEED_COUNT));
     }
     if is_wanted("stamps") {
-        late_stamps();
+        measure_late_stamps();
     }
     if is_wanted("cost") {
-        let cost = |seed| Hall::new(&halls::changing(seed), seed).cost(Settings::default(), 80);
+        let cost = |seed| Hall::new(&halls::changing(seed), seed).min_time_per_scan(Settings::default(), 80);
         println!("time of the library for a scan of 361 beams, in three halls: {:?}", [0, 1, 2].map(cost));
     }
     if is_wanted("people") {
-        people(&world);
+        measure_people(&world);
     }
     if is_wanted("faults") {
         println!(
@@ -51,25 +51,25 @@ fn main() -> Result<(), scanhub_schema::Failure> {
         );
         println!("  greatest error of points in other sweeps; obstacles in them where nothing is new");
         for (name, kind) in FAULTS {
-            fault(&world, name, kind);
+            measure_fault(&world, name, kind);
         }
     }
     Ok(())
 }
 
 const FAULTS: [(&str, FaultKind); 8] = [
-    ("halts", FaultKind::Halts),
-    ("silent", FaultKind::Silent),
+    ("halts", FaultKind::Halt),
+    ("silent", FaultKind::Silence),
     ("stuck", FaultKind::Stuck),
-    ("jumps by 8 degrees", FaultKind::Jumps(8.0)),
-    ("jumps by -3 degrees", FaultKind::Jumps(-3.0)),
-    ("lies by 4 degrees", FaultKind::Lies(4.0)),
-    ("late by 0.2 s", FaultKind::Late(0.2)),
-    ("late by 1 s", FaultKind::Late(1.0)),
+    ("jumps by 8 degrees", FaultKind::Jump(8.0)),
+    ("jumps by -3 degrees", FaultKind::Jump(-3.0)),
+    ("lies by 4 degrees", FaultKind::Drift(4.0)),
+    ("late by 0.2 s", FaultKind::Delay(0.2)),
+    ("late by 1 s", FaultKind::Delay(1.0)),
 ];
 
 /// Halls in which nothing changes, for 200 sweeps: obstacles that are invented once the background is known.
-fn unchanging(halls: Range<u64>) {
+fn measure_unchanging(halls: Range<u64>) {
     let (mut sweeps, mut with, mut obstacles, mut late) = (0, 0, 0, 0);
     for seed in halls.clone() {
         let mut hall = Hall::new(&halls::unchanging(seed), seed);
@@ -89,19 +89,19 @@ fn unchanging(halls: Range<u64>) {
 }
 
 /// Furnished halls with new things and a person: obstacles.
-fn changing(halls: Range<u64>) {
+fn measure_changing(halls: Range<u64>) {
     let settings = Settings::default();
-    let mut all = Things::default();
+    let mut all = ObstacleScore::default();
     for seed in halls.clone() {
-        let mut things = Things::default();
+        let mut obstacle_score = ObstacleScore::default();
         let mut hall = Hall::new(&halls::changing(seed), seed);
         hall.play(settings, 80, |hall, sweep| {
             if sweep.from_ns > seconds(20) {
-                things.add(hall, sweep, &settings, hall.sweep_ns());
+                obstacle_score.add(hall, sweep, &settings, hall.sweep_ns());
             }
         });
-        all.new = (all.new.0 + things.new.0, all.new.1 + things.new.1);
-        (all.right, all.wrong) = (all.right + things.right, all.wrong + things.wrong);
+        all.new = (all.new.0 + obstacle_score.new.0, all.new.1 + obstacle_score.new.1);
+        (all.right, all.wrong) = (all.right + obstacle_score.right, all.wrong + obstacle_score.wrong);
     }
     println!(
         "furnished halls {halls:?}, 80 s each: obstacles recall {:.3} of {}, precision {:.3} of {}",
@@ -113,7 +113,7 @@ fn changing(halls: Range<u64>) {
 }
 
 /// Stamps of angles that are wrong from the start, in halls in which nothing changes.
-fn late_stamps() {
+fn measure_late_stamps() {
     println!(
         "stamps of angles late by: found; error of points from 20 to 40 s, p50 and p99; obstacles; unreliable sweeps"
     );
@@ -121,7 +121,7 @@ fn late_stamps() {
         let (mut errors, mut obstacles, mut unreliable, mut sweeps) = (Vec::new(), 0, 0, 0);
         let mut found = Vec::new();
         for seed in 0..4 {
-            let fault = Fault { kind: FaultKind::StampsLate(by_s), from_s: 0.0, until_s: f64::INFINITY };
+            let fault = Fault { kind: FaultKind::StampDelay(by_s), from_s: 0.0, until_s: f64::INFINITY };
             let world = halls::unchanging(seed).with_mount_faults(&[fault]);
             let mut hall = Hall::new(&world, seed);
             let counts = hall.play(Settings::default(), 40, |hall, sweep| {
@@ -130,7 +130,7 @@ fn late_stamps() {
                     obstacles += sweep.obstacles.len();
                 }
             });
-            found.push(hall.late_ns as f64 / 1e6);
+            found.push(hall.stamp_delay_ns as f64 / 1e6);
             (unreliable, sweeps) = (unreliable + counts.unreliable, sweeps + counts.sweeps);
         }
         errors.sort_by(f64::total_cmp);
@@ -144,42 +144,44 @@ fn late_stamps() {
     }
 }
 
-fn people(world: &World) {
+fn measure_people(world: &World) {
     let settings = Settings::default();
-    let mut all = Score::default();
+    let mut all = PointScore::default();
     let (mut at_once, mut errors) = (0, Vec::new());
     let (mut poles, mut boxes) = (Vec::new(), Vec::new());
     let (mut recalls, mut precisions) = (Vec::new(), Vec::new());
-    for seed in 0..SEEDS {
-        let (mut score, mut seen) = (Score::default(), Seen::default());
+    for seed in 0..SEED_COUNT {
+        let (mut score, mut times) = (PointScore::default(), ObstacleTimes::default());
         Hall::new(world, seed).play(settings, 60, |hall, sweep| {
-            seen.add(sweep);
+            times.add(sweep);
             if sweep.until_ns > seconds(20) {
-                score.add(hall, sweep, &settings, judge::SWEEP_NS);
+                score.add(hall, sweep, &settings, judge::SWEEP_TIME_NS);
             }
             let far = sweep.points.iter().filter(|point| (4.8..5.2).contains(&hall.range_m(point)));
             errors.extend(far.map(|point| hall.error_m(point)));
         });
-        at_once += u32::from(seen.is_pole_found_at_once());
-        poles.push(seen.sweeps_of_pole());
-        boxes.push(seen.sweeps_of_box());
+        at_once += u32::from(times.is_pole_found_first_sweep());
+        poles.push(times.sweeps_of_pole());
+        boxes.push(times.sweeps_of_box());
         recalls.push(score.recall());
         precisions.push(score.precision());
         all.persons = (all.persons.0 + score.persons.0, all.persons.1 + score.persons.1);
         all.things = (all.things.0 + score.things.0, all.things.1 + score.things.1);
         all.wrong += score.wrong;
     }
-    let least = |values: &[f64]| values.iter().copied().fold(1.0, f64::min);
-    println!("{SEEDS} halls of 60 s, sweeps of 50 degrees at 30 degrees a second, background after 5 sweeps");
-    println!("pole at 2 m found in the first whole sweep: {at_once} of {SEEDS}");
+    let minimum = |values: &[f64]| values.iter().copied().fold(1.0, f64::min);
+    println!(
+        "{SEED_COUNT} halls of 60 s, sweeps of 50 degrees at 30 degrees a second, background after 5 sweeps"
+    );
+    println!("pole at 2 m found in the first whole sweep: {at_once} of {SEED_COUNT}");
     println!("sweeps until it is background: {poles:?}; the box: {boxes:?}");
     let [persons, things] = [all.persons, all.things].map(|(points, found)| share(found, points));
     println!(
         "recall {:.3} [least {:.3}]: persons {persons:.3}, pole and box {things:.3}",
         all.recall(),
-        least(&recalls)
+        minimum(&recalls)
     );
-    println!("precision {:.3} [least {:.3}]", all.precision(), least(&precisions));
+    println!("precision {:.3} [least {:.3}]", all.precision(), minimum(&precisions));
     errors.sort_by(f64::total_cmp);
     let at = |share: f64| 1000.0 * errors[((errors.len() - 1) as f64 * share) as usize];
     println!(
@@ -190,14 +192,14 @@ fn people(world: &World) {
     );
 }
 
-fn fault(world: &World, name: &str, kind: FaultKind) {
+fn measure_fault(world: &World, name: &str, kind: FaultKind) {
     let fault = Fault { kind, from_s: 20.0, until_s: 24.0 };
-    let (mut most, mut invented) = (0.0_f64, 0);
+    let (mut maximum, mut invented) = (0.0_f64, 0);
     // Nobody has come yet.
     let world = world.clone().with_mount_faults(&[fault]);
     let counts = Hall::new(&world, 1).play(Settings::default(), 29, |hall, sweep| {
         if !sweep.is_unreliable {
-            most = sweep.points.iter().map(|point| hall.error_m(point)).fold(most, f64::max);
+            maximum = sweep.points.iter().map(|point| hall.error_m(point)).fold(maximum, f64::max);
             invented += if sweep.until_ns < seconds(24) { sweep.obstacles.len() } else { 0 };
         }
     });
@@ -206,6 +208,6 @@ fn fault(world: &World, name: &str, kind: FaultKind) {
         "{name:20} {silent:6} {jumped:6} {inconsistent:6} {standing:6}  {} of {}  {:.1} mm  {invented}",
         counts.unreliable,
         counts.sweeps,
-        1000.0 * most
+        1000.0 * maximum
     );
 }

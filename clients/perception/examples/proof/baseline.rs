@@ -1,26 +1,26 @@
 //! The simplest that one might do: each segment is a person, and belongs to the nearest one within half a metre.
 
 use scanhub_perception::track::geometry::{Point, distance};
-use scanhub_perception::track::{PICTURE_NS, Picture, Site, Track};
+use scanhub_perception::track::{SNAPSHOT_INTERVAL_NS, Site, Snapshot, Track};
 use scanhub_schema::Foreground;
 use scanhub_schema::TrackState;
 
-struct One {
+struct NearestTrack {
     id: u64,
-    place: Point,
-    seen_ns: u64,
+    position: Point,
+    last_seen_ns: u64,
 }
 
-pub(crate) struct Nearest {
+pub(crate) struct NearestTracker {
     site: Site,
-    all: Vec<One>,
+    known: Vec<NearestTrack>,
     next_id: u64,
     next_ns: u64,
 }
 
-impl Nearest {
-    pub(crate) fn new(site: Site) -> Nearest {
-        Nearest { site, all: Vec::new(), next_id: 1, next_ns: 0 }
+impl NearestTracker {
+    pub(crate) fn new(site: Site) -> NearestTracker {
+        NearestTracker { site, known: Vec::new(), next_id: 1, next_ns: 0 }
     }
 
     pub(crate) fn take(
@@ -28,29 +28,29 @@ impl Nearest {
         at_ns: u64,
         sensor: usize,
         foreground: &Foreground,
-        pictures: &mut Vec<Picture>,
+        samples: &mut Vec<Snapshot>,
     ) {
         let sensor = &self.site.sensors[sensor];
         let (sin, cos) = sensor.yaw_rad.sin_cos();
         for segment in foreground.segments() {
             let (x, y) = (f64::from(segment.x_mm) / 1000.0, f64::from(segment.y_mm) / 1000.0);
-            let place = [sensor.place[0] + x * cos - y * sin, sensor.place[1] + x * sin + y * cos];
-            let near = self.all.iter_mut().map(|one| (distance(one.place, place), one));
+            let position = [sensor.position[0] + x * cos - y * sin, sensor.position[1] + x * sin + y * cos];
+            let near = self.known.iter_mut().map(|one| (distance(one.position, position), one));
             match near.min_by(|a, b| a.0.total_cmp(&b.0)).filter(|(off, _)| *off < 0.5) {
-                Some((_, one)) => (one.place, one.seen_ns) = (place, at_ns),
+                Some((_, one)) => (one.position, one.last_seen_ns) = (position, at_ns),
                 None => {
-                    self.all.push(One { id: self.next_id, place, seen_ns: at_ns });
+                    self.known.push(NearestTrack { id: self.next_id, position, last_seen_ns: at_ns });
                     self.next_id += 1;
                 }
             }
         }
-        self.all.retain(|one| at_ns.saturating_sub(one.seen_ns) < 500_000_000);
+        self.known.retain(|one| at_ns.saturating_sub(one.last_seen_ns) < 500_000_000);
         if at_ns >= self.next_ns {
-            self.next_ns = at_ns + PICTURE_NS;
-            let tracks = self.all.iter().map(|one| Track {
+            self.next_ns = at_ns + SNAPSHOT_INTERVAL_NS;
+            let tracks = self.known.iter().map(|one| Track {
                 id: one.id,
                 state: TrackState::Confirmed,
-                place: one.place,
+                position: one.position,
                 velocity: [0.0, 0.0],
                 covariance: [0.0; 3],
                 room: None,
@@ -58,7 +58,7 @@ impl Nearest {
                 age_s: 0.0,
                 score: 1.0,
             });
-            pictures.push(Picture { wall_ns: at_ns, tracks: tracks.collect(), ..Picture::default() });
+            samples.push(Snapshot { wall_ns: at_ns, tracks: tracks.collect(), ..Snapshot::default() });
         }
     }
 }

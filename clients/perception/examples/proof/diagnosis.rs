@@ -4,16 +4,16 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use scanhub_perception::track::geometry::{Point, distance};
-use scanhub_perception::track::{Picture, Track};
+use scanhub_perception::track::{Snapshot, Track};
 use scanhub_schema::TrackState;
 
 use crate::house::CHAIRS;
-use crate::walkers::{CORRIDOR, Crossing};
+use crate::walkers::{CORRIDOR_X, Crossing};
 
 /// Tracks and people match within this distance, as in the score.
 const MATCH_M: f64 = 0.5;
 /// So near to each other two may be taken for one another.
-const BESIDE_M: f64 = 1.2;
+const NEIGHBOR_M: f64 = 1.2;
 
 /// Follows which track is whose, frame by frame.
 pub(crate) struct Diagnosis {
@@ -21,12 +21,12 @@ pub(crate) struct Diagnosis {
     tracks: Vec<Option<(u64, f64)>>,
     /// Who had each track last.
     owners: HashMap<u64, usize>,
-    ever: BTreeSet<u64>,
+    known_ids: BTreeSet<u64>,
     /// How often each cause was met.
     pub(crate) causes: BTreeMap<&'static str, usize>,
     /// Squared errors of confirmed tracks and how many, by what may be their cause.
     pub(crate) errors: BTreeMap<&'static str, (f64, usize)>,
-    is_told: bool,
+    is_reported: bool,
 }
 
 impl Diagnosis {
@@ -34,10 +34,10 @@ impl Diagnosis {
         Diagnosis {
             tracks: vec![None; people],
             owners: HashMap::new(),
-            ever: BTreeSet::new(),
+            known_ids: BTreeSet::new(),
             causes: BTreeMap::new(),
             errors: BTreeMap::new(),
-            is_told: std::env::args().any(|argument| argument == "--events"),
+            is_reported: std::env::args().any(|argument| argument == "--events"),
         }
     }
 
@@ -47,64 +47,65 @@ impl Diagnosis {
         now_s: f64,
         truth: &[Point],
         is_scored: &dyn Fn(Point) -> bool,
-        picture: &Picture,
+        sample: &Snapshot,
         crossings: &[Crossing],
     ) {
-        let shown: Vec<&Track> = picture.tracks.iter().filter(|track| is_shown(track)).collect();
+        let shown: Vec<&Track> = sample.tracks.iter().filter(|track| is_confirmed(track)).collect();
         let mut free: Vec<&Track> = shown.clone();
-        let mut mine: Vec<Option<&Track>> = vec![None; truth.len()];
-        for (who, place) in truth.iter().enumerate() {
-            let Some((id, _)) = self.tracks[who] else { continue };
-            let old = free.iter().position(|track| track.id == id && distance(track.place, *place) < MATCH_M);
-            mine[who] = old.map(|old| free.swap_remove(old));
+        let mut matched: Vec<Option<&Track>> = vec![None; truth.len()];
+        for (person, place) in truth.iter().enumerate() {
+            let Some((id, _)) = self.tracks[person] else { continue };
+            let old =
+                free.iter().position(|track| track.id == id && distance(track.position, *place) < MATCH_M);
+            matched[person] = old.map(|old| free.swap_remove(old));
         }
-        for (who, place) in truth.iter().enumerate() {
-            if mine[who].is_some() || !is_scored(*place) {
+        for (person, place) in truth.iter().enumerate() {
+            if matched[person].is_some() || !is_scored(*place) {
                 continue;
             }
-            let off = |track: &&Track| distance(track.place, *place);
+            let off = |track: &&Track| distance(track.position, *place);
             let nearest = (0..free.len()).min_by(|&a, &b| off(&free[a]).total_cmp(&off(&free[b])));
-            mine[who] = nearest.filter(|&i| off(&free[i]) < MATCH_M).map(|i| free.swap_remove(i));
+            matched[person] = nearest.filter(|&i| off(&free[i]) < MATCH_M).map(|i| free.swap_remove(i));
         }
-        for (who, track) in mine.iter().enumerate() {
+        for (person, track) in matched.iter().enumerate() {
             let Some(track) = track else { continue };
-            if let Some((old, then_s)) = self.tracks[who]
+            if let Some((old, then_s)) = self.tracks[person]
                 && old != track.id
             {
-                let place = truth[who];
+                let place = truth[person];
                 let through = crossings.iter().any(|crossing| {
-                    crossing.walker == who
+                    crossing.walker == person
                         && crossing.entered_s < now_s + 0.5
                         && crossing.left_s > then_s - 0.5
                 });
                 let cause = if through || (now_s - then_s > 0.15 && at_door(place)) {
-                    self.of_corridor(old, track.id, picture)
+                    self.corridor_cause(old, track.id, sample)
                 } else {
-                    self.of_room(who, old, track.id, picture, truth, then_s, now_s)
+                    self.room_cause(person, old, track.id, sample, truth, then_s, now_s)
                 };
                 *self.causes.entry(cause).or_default() += 1;
-                if self.is_told {
-                    let old_now = picture.tracks.iter().find(|one| one.id == old);
-                    let old_now = old_now.map(|one| (one.state, one.place));
+                if self.is_reported {
+                    let old_now = sample.tracks.iter().find(|one| one.id == old);
+                    let old_now = old_now.map(|one| (one.state, one.position));
                     println!(
-                        "{now_s:.1}: {who} at {place:.2?} was {old} at {then_s:.1}, is {}: {cause}; old {old_now:.2?}, of {:?}",
+                        "{now_s:.1}: {person} at {place:.2?} was {old} at {then_s:.1}, is {}: {cause}; old {old_now:.2?}, of {:?}",
                         track.id,
                         self.owners.get(&track.id)
                     );
                 }
             }
         }
-        for (who, track) in mine.iter().enumerate() {
+        for (person, track) in matched.iter().enumerate() {
             let Some(track) = track else { continue };
-            self.tracks[who] = Some((track.id, now_s));
-            self.owners.insert(track.id, who);
-            self.ever.insert(track.id);
-            if track.state == TrackState::Confirmed && is_scored(truth[who]) {
-                let off = distance(track.place, truth[who]);
-                let others = truth.iter().enumerate().filter(|(other, _)| *other != who);
+            self.tracks[person] = Some((track.id, now_s));
+            self.owners.insert(track.id, person);
+            self.known_ids.insert(track.id);
+            if track.state == TrackState::Confirmed && is_scored(truth[person]) {
+                let off = distance(track.position, truth[person]);
+                let others = truth.iter().enumerate().filter(|(other, _)| *other != person);
                 let near =
-                    others.map(|(_, place)| distance(*place, truth[who])).fold(f64::INFINITY, f64::min);
-                let sits = CHAIRS.iter().any(|(chair, _)| distance(*chair, truth[who]) < 0.5);
+                    others.map(|(_, place)| distance(*place, truth[person])).fold(f64::INFINITY, f64::min);
+                let sits = CHAIRS.iter().any(|(chair, _)| distance(*chair, truth[person]) < 0.5);
                 let class = match (track.sensors.count_ones(), near < 0.9) {
                     _ if sits => "on a chair",
                     (0 | 1, true) => "one sensor, somebody near",
@@ -121,29 +122,29 @@ impl Diagnosis {
             }
         }
         for track in &free {
-            let near = |place: &Point| distance(*place, track.place) < 1.0;
-            let cause = if CHAIRS.iter().any(|(chair, _)| distance(*chair, track.place) < 0.6) {
+            let near = |place: &Point| distance(*place, track.position) < 1.0;
+            let cause = if CHAIRS.iter().any(|(chair, _)| distance(*chair, track.position) < 0.6) {
                 "(frames of a track that is nobody, at a chair)"
-            } else if [0.0, 17.0].iter().any(|x| distance([*x, 2.5], track.place) < 1.0) {
+            } else if [0.0, 17.0].iter().any(|x| distance([*x, 2.5], track.position) < 1.0) {
                 "(frames of a track that is nobody, at a door to the street)"
             } else if truth.iter().any(near) {
                 "(frames of a track that is nobody, near somebody)"
             } else {
                 "(frames of a track that is nobody, elsewhere)"
             };
-            *self.causes.entry(cause).or_default() += usize::from(is_scored(track.place));
-            if self.is_told && is_scored(track.place) {
+            *self.causes.entry(cause).or_default() += usize::from(is_scored(track.position));
+            if self.is_reported && is_scored(track.position) {
                 println!(
                     "{now_s:.1}: false {} {:?} at {:.2?} by {:b} {cause}",
-                    track.id, track.state, track.place, track.sensors
+                    track.id, track.state, track.position, track.sensors
                 );
             }
         }
     }
 
-    fn of_corridor(&self, old: u64, new: u64, picture: &Picture) -> &'static str {
+    fn corridor_cause(&self, old: u64, new: u64, sample: &Snapshot) -> &'static str {
         let was_of_another = self.owners.contains_key(&new);
-        let old_now = picture.tracks.iter().find(|track| track.id == old).map(|track| track.state);
+        let old_now = sample.tracks.iter().find(|track| track.id == old).map(|track| track.state);
         match (was_of_another, old_now) {
             (true, Some(TrackState::BetweenRooms)) => "corridor: taken for another, own one still inside",
             (true, Some(_)) => "corridor: taken for another, own one is another's",
@@ -155,21 +156,21 @@ impl Diagnosis {
     }
 
     #[allow(clippy::too_many_arguments)]
-    fn of_room(
+    fn room_cause(
         &self,
-        who: usize,
+        person: usize,
         old: u64,
         new: u64,
-        picture: &Picture,
+        sample: &Snapshot,
         truth: &[Point],
         then_s: f64,
         now_s: f64,
     ) -> &'static str {
-        let place = truth[who];
-        let old_now = picture.tracks.iter().find(|track| track.id == old);
+        let place = truth[person];
+        let old_now = sample.tracks.iter().find(|track| track.id == old);
         let unseen = now_s - then_s > 1.0;
         if let Some(&owner) = self.owners.get(&new) {
-            return match (distance(truth[owner], place) < BESIDE_M, unseen) {
+            return match (distance(truth[owner], place) < NEIGHBOR_M, unseen) {
                 (true, _) => "room: two beside each other swapped",
                 (false, true) => "room: lost for a second, then taken for one farther away",
                 (false, false) => "room: taken for one farther away",
@@ -182,8 +183,8 @@ impl Diagnosis {
                 "room: away though in the room, born anew"
             }
             Some(track) => {
-                let near = |other: &Point| distance(*other, track.place) < MATCH_M;
-                if truth.iter().enumerate().any(|(other, place)| other != who && near(place)) {
+                let near = |other: &Point| distance(*other, track.position) < MATCH_M;
+                if truth.iter().enumerate().any(|(other, place)| other != person && near(place)) {
                     "room: drifted to another one, born anew"
                 } else if track.state == TrackState::Hidden {
                     "room: hidden elsewhere, born anew"
@@ -195,10 +196,10 @@ impl Diagnosis {
     }
 }
 
-fn is_shown(track: &Track) -> bool {
+fn is_confirmed(track: &Track) -> bool {
     matches!(track.state, TrackState::Confirmed | TrackState::Hidden)
 }
 
-fn at_door(place: Point) -> bool {
-    CORRIDOR.into_iter().any(|x| (place[0] - x).abs() < 1.0 && (place[1] - 2.5).abs() < 1.0)
+fn at_door(position: Point) -> bool {
+    CORRIDOR_X.into_iter().any(|x| (position[0] - x).abs() < 1.0 && (position[1] - 2.5).abs() < 1.0)
 }

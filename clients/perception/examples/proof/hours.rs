@@ -3,75 +3,80 @@
 
 use std::time::Instant;
 
-use scanhub_perception::track::{PeopleTracker, Picture, Site};
-use scanhub_preprocess::background::{Model, Settings};
+use scanhub_perception::track::{PeopleTracker, Site, Snapshot};
+use scanhub_preprocess::background::{BackgroundModel, Settings};
 use scanhub_preprocess::segments::Segmenter;
 use scanhub_schema::{Foreground, Pose, Scan};
 
-use crate::house::{BEAMS, Eye, House};
+use crate::house::{BEAMS, House, HouseSensor};
 use crate::walkers::Crowd;
 
-const HOUR_S: u64 = 3600;
+const SECONDS_PER_HOUR: u64 = 3600;
 /// Shares of changes of the room, and of rests on a chair.
-const PLANS: (f64, f64) = (0.25, 0.25);
+const CHANGE_SHARES: (f64, f64) = (0.25, 0.25);
 /// Scans a second, one sensor after the other.
-const SCANS_HZ: u64 = 100;
-const DELAY_NS: u64 = 80_000_000;
+const SCAN_RATE_HZ: u64 = 100;
+const SCAN_DELAY_NS: u64 = 80_000_000;
 /// So long the same people are there, and then others.
-const VISIT_S: u64 = 600;
+const VISIT_TIME_S: u64 = 600;
 /// So much later than the others a late scan comes.
-const LATE_NS: u64 = 300_000_000;
-const BEGIN_NS: u64 = 1_800_000_000_000_000_000;
+const LATE_DELAY_NS: u64 = 300_000_000;
+const START_NS: u64 = 1_800_000_000_000_000_000;
 
 /// Follows `people` at a time for so many virtual hours and says each hour what there is.
 pub(crate) fn run(hours: u64, people: usize) {
     let house = House { is_ideal: false };
     let site = Site::parse("house.toml", &house.site()).expect("the house is right");
-    let mut eyes: Vec<(Eye, Model, Segmenter)> = (0..site.sensors.len())
+    let mut eyes: Vec<(HouseSensor, BackgroundModel, Segmenter)> = (0..site.sensors.len())
         .map(|sensor| {
             let segmenter = Segmenter::new(Pose::default(), BEAMS);
-            (Eye::new(house, sensor, hours), Model::new(Settings::default(), BEAMS), segmenter)
+            (
+                HouseSensor::new(house, sensor, hours),
+                BackgroundModel::new(Settings::default(), BEAMS),
+                segmenter,
+            )
         })
         .collect();
     let sensors = eyes.len() as u64;
-    let mut tracker = PeopleTracker::new(site, DELAY_NS);
-    let mut ids = Identities::default();
+    let mut tracker = PeopleTracker::new(site, SCAN_DELAY_NS);
+    let mut ids = TrackIds::default();
     let mut held: Option<(usize, u64, Box<Scan>, Box<Foreground>)> = None;
     let (mut sent_late, mut tracker_s) = (0, 0.0);
-    let mut crowd = Crowd::new(house, 0, 0.0, PLANS, 0);
-    for step in 0..hours * HOUR_S * SCANS_HZ {
-        if step % (VISIT_S * SCANS_HZ) == 0 {
-            crowd = Crowd::new(house, people, 12.0, PLANS, step);
+    let mut crowd = Crowd::new(house, 0, 0.0, CHANGE_SHARES, 0);
+    for step in 0..hours * SECONDS_PER_HOUR * SCAN_RATE_HZ {
+        if step % (VISIT_TIME_S * SCAN_RATE_HZ) == 0 {
+            crowd = Crowd::new(house, people, 12.0, CHANGE_SHARES, step);
         }
-        let visit_s = (step % (VISIT_S * SCANS_HZ)) as f64 / SCANS_HZ as f64;
-        crowd.step(visit_s, 1.0 / SCANS_HZ as f64);
+        let visit_s = (step % (VISIT_TIME_S * SCAN_RATE_HZ)) as f64 / SCAN_RATE_HZ as f64;
+        crowd.step(visit_s, 1.0 / SCAN_RATE_HZ as f64);
         let sensor = (step % sensors) as usize;
         let (eye, model, segmenter) = &mut eyes[sensor];
-        let scan = eye.scan(&|_| crowd.shapes(), step * 1_000_000_000 / SCANS_HZ);
+        let scan = eye.scan(&|_| crowd.shapes(), step * 1_000_000_000 / SCAN_RATE_HZ);
         let mut foreground = Foreground::of(BEAMS);
         model.update(&scan, &mut foreground);
         segmenter.update(&scan, &mut foreground);
-        let now_ns = BEGIN_NS + step * 1_000_000_000 / SCANS_HZ;
-        if step % (60 * SCANS_HZ) == 30 * SCANS_HZ {
+        let now_ns = START_NS + step * 1_000_000_000 / SCAN_RATE_HZ;
+        if step % (60 * SCAN_RATE_HZ) == 30 * SCAN_RATE_HZ {
             held = Some((sensor, now_ns, scan, foreground));
             continue;
         }
         let begin = Instant::now();
-        tracker.take(sensor, now_ns, &scan, &foreground, |picture| ids.take(picture));
-        if let Some((sensor, at_ns, scan, foreground)) = held.take_if(|held| held.1 + LATE_NS < now_ns) {
+        tracker.take(sensor, now_ns, &scan, &foreground, |sample| ids.take(sample));
+        if let Some((sensor, at_ns, scan, foreground)) = held.take_if(|held| held.1 + LATE_DELAY_NS < now_ns)
+        {
             sent_late += 1;
-            tracker.take(sensor, at_ns, &scan, &foreground, |picture| ids.take(picture));
+            tracker.take(sensor, at_ns, &scan, &foreground, |sample| ids.take(sample));
         }
         tracker_s += begin.elapsed().as_secs_f64();
-        if (step + 1) % (HOUR_S * SCANS_HZ) == 0 {
-            let hour = (step + 1) / (HOUR_S * SCANS_HZ);
+        if (step + 1) % (SECONDS_PER_HOUR * SCAN_RATE_HZ) == 0 {
+            let hour = (step + 1) / (SECONDS_PER_HOUR * SCAN_RATE_HZ);
             println!(
                 "{hour} h: {} kB at most, {} identities shown, {} used again, {} of {sent_late} scans late, {:.0} times the clock",
                 peak_kb(),
-                ids.shown,
-                ids.again,
+                ids.track_count,
+                ids.reused,
                 tracker.counts().late,
-                (hour * HOUR_S) as f64 / tracker_s
+                (hour * SECONDS_PER_HOUR) as f64 / tracker_s
             );
         }
     }
@@ -79,25 +84,25 @@ pub(crate) fn run(hours: u64, people: usize) {
 
 /// Identities rise: one that was not in the last picture and is not above all before was used again.
 #[derive(Default)]
-struct Identities {
+struct TrackIds {
     highest: u64,
     last: Vec<u64>,
-    shown: u64,
-    again: u64,
+    track_count: u64,
+    reused: u64,
 }
 
-impl Identities {
-    fn take(&mut self, picture: &Picture) {
+impl TrackIds {
+    fn take(&mut self, sample: &Snapshot) {
         let highest = self.highest;
-        for track in &picture.tracks {
+        for track in &sample.tracks {
             if !self.last.contains(&track.id) {
-                self.shown += 1;
-                self.again += u64::from(track.id <= highest);
+                self.track_count += 1;
+                self.reused += u64::from(track.id <= highest);
             }
             self.highest = self.highest.max(track.id);
         }
         self.last.clear();
-        self.last.extend(picture.tracks.iter().map(|track| track.id));
+        self.last.extend(sample.tracks.iter().map(|track| track.id));
     }
 }
 

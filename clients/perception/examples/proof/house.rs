@@ -66,7 +66,7 @@ between = [[17, 2], [17, 3]]
 /// Corners of the cupboards: minimum x and y, maximum x and y.
 const CUPBOARDS: [[f64; 4]; 2] = [[2.6, 3.2, 3.6, 3.6], [13.4, 1.4, 13.8, 2.4]];
 /// Corners of the tables, in the same order. A table has four legs.
-const TABLES: [[f64; 4]; 2] = [[3.4, 0.5, 4.6, 1.2], [14.9, 3.5, 16.1, 4.2]];
+const TABLE_CORNERS: [[f64; 4]; 2] = [[3.4, 0.5, 4.6, 1.2], [14.9, 3.5, 16.1, 4.2]];
 const TABLE_LEG_M: f64 = 0.03;
 /// Chairs: x, y, and the direction in radians that a sitter faces.
 pub(crate) const CHAIRS: [(Point, f64); 6] = [
@@ -101,7 +101,7 @@ impl House {
 
     /// Returns the areas that nobody walks through: minimum x and y, maximum x and y.
     pub(crate) fn obstacles(self) -> impl Iterator<Item = &'static [f64; 4]> {
-        CUPBOARDS.iter().chain(TABLES.iter().filter(move |_| !self.is_ideal))
+        CUPBOARDS.iter().chain(TABLE_CORNERS.iter().filter(move |_| !self.is_ideal))
     }
 
     /// Returns the world of the simulator, without people, chairs and leaves of doors.
@@ -111,7 +111,7 @@ impl House {
         for sensor in
             scanhub_perception::track::Site::parse("house.toml", ROOMS).expect("the house is right").sensors
         {
-            let [x, y] = sensor.place.map(|m| 1000.0 * m);
+            let [x, y] = sensor.position.map(|m| 1000.0 * m);
             text += &format!("[[sensor]]\npose = [{x:.0}, {y:.0}, {:.3}]\n", sensor.yaw_rad.to_degrees());
         }
         let mut line = |points: &[Point]| {
@@ -135,7 +135,7 @@ impl House {
         for &[a, b, c, d] in &CUPBOARDS {
             line(&[[a, b], [c, b], [c, d], [a, d], [a, b]]);
         }
-        for [a, b, c, d] in TABLES.into_iter().filter(|_| !self.is_ideal) {
+        for [a, b, c, d] in TABLE_CORNERS.into_iter().filter(|_| !self.is_ideal) {
             for [x, y] in [[a, b], [a, d], [c, b], [c, d]] {
                 let radius = 1000.0 * TABLE_LEG_M;
                 text += &format!("[[thing]]\nradius_mm = {radius}\npose = {}\n", mm([x, y]));
@@ -150,11 +150,11 @@ impl House {
 }
 
 /// A sensor of the house.
-pub(crate) struct Eye(Room);
+pub(crate) struct HouseSensor(Room);
 
-impl Eye {
-    pub(crate) fn new(house: House, sensor: usize, seed: u64) -> Eye {
-        Eye(Room::of_port(&house.world(), seed, sensor as u64))
+impl HouseSensor {
+    pub(crate) fn new(house: House, sensor: usize, seed: u64) -> HouseSensor {
+        HouseSensor(Room::of_port(&house.world(), seed, sensor as u64))
     }
 
     /// Returns the scan that ends at `end_ns`. `shapes` returns everything that moves, at a time.

@@ -20,7 +20,7 @@ use std::ops::Range;
 use std::process::{Command, Stdio};
 
 use house::House;
-use run::{Outcome, Setup, Way, run};
+use run::{Outcome, ProofSetup, TrackerKind, run};
 
 const SCORE: &str = include_str!("score.py");
 
@@ -37,25 +37,35 @@ fn main() {
     let seconds = value("--seconds").map_or(120, |text| number(text)) as f64;
     let has = |flag: &str| arguments.iter().any(|argument| argument == flag);
     println!("seeds {from} to {}, {seconds} s each", to - 1);
-    let of_seeds = |seeds: Range<u64>, people, seconds, (restless, sits), is_ideal, way| -> Vec<Outcome> {
-        let house = House { is_ideal };
-        let setup = |seed| Setup { people, seconds, seed, restless, sits, house, way };
-        seeds.map(|seed| run(setup(seed))).collect()
+    let of_seeds =
+        |seeds: Range<u64>, people, seconds, (restless, sits), is_ideal, tracker| -> Vec<Outcome> {
+            let house = House { is_ideal };
+            let setup = |seed| ProofSetup {
+                people,
+                seconds,
+                seed,
+                room_change_share: restless,
+                sit_share: sits,
+                house,
+                tracking: tracker,
+            };
+            seeds.map(|seed| run(setup(seed))).collect()
+        };
+    let all = |people, seconds, shares, is_ideal, tracker| {
+        of_seeds(from..to, people, seconds, shares, is_ideal, tracker)
     };
-    let all =
-        |people, seconds, shares, is_ideal, way| of_seeds(from..to, people, seconds, shares, is_ideal, way);
     if let Some(people) = value("--people") {
-        let outcomes = all(number(people) as usize, seconds, USUAL, has("--ideal"), Way::All);
+        let outcomes = all(number(people) as usize, seconds, USUAL_SHARES, has("--ideal"), TrackerKind::All);
         return report(people, &outcomes);
     }
-    let cases: &[(&str, usize, Way)] = &[
-        ("3 people", 3, Way::All),
-        ("8 people", 8, Way::All),
-        ("20 people", 20, Way::All),
-        ("8 people, one sensor a room", 8, Way::OneSensorEach),
-        ("20 people, one sensor a room", 20, Way::OneSensorEach),
-        ("8 people, nearest segment", 8, Way::NearestSegment),
-        ("20 people, nearest segment", 20, Way::NearestSegment),
+    let cases: &[(&str, usize, TrackerKind)] = &[
+        ("3 people", 3, TrackerKind::All),
+        ("8 people", 8, TrackerKind::All),
+        ("20 people", 20, TrackerKind::All),
+        ("8 people, one sensor a room", 8, TrackerKind::OneSensorEach),
+        ("20 people, one sensor a room", 20, TrackerKind::OneSensorEach),
+        ("8 people, nearest segment", 8, TrackerKind::NearestSegment),
+        ("20 people, nearest segment", 20, TrackerKind::NearestSegment),
     ];
     let is_quick = has("--quick");
     for (title, is_ideal) in [("sensors as they are", false), ("ideal sensor", true)] {
@@ -67,8 +77,8 @@ fn main() {
         );
         println!("|---|---|---|---|---|---|---|---|---|---|---|---|");
         let cases = if is_quick || is_ideal { &cases[1..3] } else { cases };
-        for &(name, people, way) in cases {
-            report(name, &all(people, seconds, USUAL, is_ideal, way));
+        for &(name, people, tracker) in cases {
+            report(name, &all(people, seconds, USUAL_SHARES, is_ideal, tracker));
         }
         if is_quick {
             return;
@@ -78,26 +88,26 @@ fn main() {
         return;
     }
     println!();
-    let sitter = of_seeds(from..from + 20, 1, 180.0, (0.25, 1.0), false, Way::All);
+    let sitter = of_seeds(from..from + 20, 1, 180.0, (0.25, 1.0), false, TrackerKind::All);
     report("one person who sits down and leaves, 20 seeds", &sitter);
-    let empty = all(0, 600.0, USUAL, false, Way::All);
+    let empty = all(0, 600.0, USUAL_SHARES, false, TrackerKind::All);
     let false_tracks: usize = empty.iter().map(|outcome| outcome.tracks).sum();
     println!("empty rooms: {:.3} false tracks a minute", false_tracks as f64 / (10.0 * empty.len() as f64));
-    let stands = all(1, 630.0, (-1.0, 0.0), false, Way::All);
+    let stands = all(1, 630.0, (-1.0, 0.0), false, TrackerKind::All);
     let stands: Vec<(usize, f64)> = stands.iter().map(|outcome| outcome.late_ids[0]).collect();
-    let kept = stands.iter().filter(|(ids, share)| *ids == 1 && *share > 0.98).count();
-    println!("standing for 10 minutes: {kept} of {} kept under one identity", stands.len());
-    let passages = all(2, 600.0, (1.0, 0.0), false, Way::All);
+    let kept_share = stands.iter().filter(|(ids, share)| *ids == 1 && *share > 0.98).count();
+    println!("standing for 10 minutes: {kept_share} of {} kept under one identity", stands.len());
+    let passages = all(2, 600.0, (1.0, 0.0), false, TrackerKind::All);
     let sum = |f: &dyn Fn(&Outcome) -> usize| passages.iter().map(f).sum::<usize>();
-    let (real, told, right) = (sum(&|o| o.doors.0), sum(&|o| o.doors.1), sum(&|o| o.doors.2));
+    let (real, counted, right) = (sum(&|o| o.doors.0), sum(&|o| o.doors.1), sum(&|o| o.doors.2));
     println!(
-        "passages of doors: {real}, told {told}, right {right}: {:.4}",
-        right as f64 / real.max(told) as f64
+        "passages of doors: {real}, told {counted}, right {right}: {:.4}",
+        right as f64 / real.max(counted) as f64
     );
 }
 
 /// Shares of changes of the room, and of rests on a chair.
-const USUAL: (f64, f64) = (0.25, 0.12);
+const USUAL_SHARES: (f64, f64) = (0.25, 0.12);
 
 fn usage() -> ! {
     eprintln!(
@@ -121,7 +131,7 @@ fn report(name: &str, outcomes: &[Outcome]) {
         }
     };
     let sum = |f: &dyn Fn(&Outcome) -> f64| outcomes.iter().map(f).sum::<f64>();
-    let rms = (sum(&|o| o.squares.0) / sum(&|o| o.squares.1 as f64)).sqrt();
+    let rms = (sum(&|o| o.squared_errors.0) / sum(&|o| o.squared_errors.1 as f64)).sqrt();
     let crossings = sum(&|o| o.crossings.0 as f64);
     let time_s = sum(&|o| o.simulated_s);
     println!(
@@ -136,8 +146,8 @@ fn report(name: &str, outcomes: &[Outcome]) {
         sum(&|o| o.crossings.2 as f64) / crossings,
         sum(&|o| o.doors.2 as f64) / sum(&|o| o.doors.0.max(o.doors.1) as f64),
         sum(&|o| o.doors.0 as f64),
-        1e6 * sum(&|o| o.tracker_s) / (time_s * 100.0),
-        time_s / sum(&|o| o.tracker_s),
+        1e6 * sum(&|o| o.tracker_time_s) / (time_s * 100.0),
+        time_s / sum(&|o| o.tracker_time_s),
     );
     let offset = outcomes.iter().map(|o| o.offset_error_s.abs()).fold(0.0, f64::max);
     let bounds: Vec<f64> = outcomes.iter().filter_map(|o| Some(score(&o.oracle_csv)?[0])).collect();
@@ -148,12 +158,12 @@ fn report(name: &str, outcomes: &[Outcome]) {
         bounds.iter().sum::<f64>() / bounds.len() as f64
     );
     if std::env::args().any(|argument| argument == "--why") {
-        why(outcomes);
+        print_causes(outcomes);
     }
 }
 
 /// Says why identities were lost, and which places are how far off.
-fn why(outcomes: &[Outcome]) {
+fn print_causes(outcomes: &[Outcome]) {
     let (mut causes, mut errors) = (BTreeMap::new(), BTreeMap::new());
     for diagnosis in outcomes.iter().filter_map(|outcome| outcome.diagnosis.as_ref()) {
         for (cause, count) in &diagnosis.causes {

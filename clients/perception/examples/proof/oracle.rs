@@ -1,11 +1,11 @@
 //! Who comes out of the corridor, guessed by somebody who sees every door exactly and knows how fast people walk in this
 //! house, and how many stop for how long, but no person's own pace.
 
-use crate::walkers::{CORRIDOR, Crossing, Crowd, PACE, STOPS};
+use crate::walkers::{CORRIDOR_X, Crossing, Crowd, STOP_SHARE, WALKING_SPEED};
 
 /// Whether the oracle, at the moment of `crossing`, names the right one of all who are inside: the one whose coming out now is
 /// the most likely, given that nobody else has come out before.
-pub(crate) fn guess(crowd: &Crowd, crossing: &Crossing) -> bool {
+pub(crate) fn is_guess_right(crowd: &Crowd, crossing: &Crossing) -> bool {
     let inside = crowd
         .crossings
         .iter()
@@ -23,9 +23,9 @@ pub(crate) fn guess(crowd: &Crowd, crossing: &Crossing) -> bool {
 pub(crate) struct Identities {
     /// Entries and exits by their time: when, who, whether out.
     events: Vec<(f64, usize, bool)>,
-    next: usize,
+    next_event: usize,
     /// Of each walker.
-    pub(crate) now: Vec<usize>,
+    pub(crate) current_ids: Vec<usize>,
     /// Who is inside, as far as is known: since when, and as whom.
     inside: Vec<(f64, usize)>,
 }
@@ -36,24 +36,31 @@ impl Identities {
         let through =
             through.flat_map(|one| [(one.entered_s, one.walker, false), (one.left_s, one.walker, true)]);
         let still = crowd.walkers.iter().enumerate();
-        let still = still.filter_map(|(who, walker)| Some((walker.entered_s?, who, false)));
+        let still = still.filter_map(|(walker_index, walker)| Some((walker.entered_s?, walker_index, false)));
         let mut events: Vec<_> = through.chain(still).collect();
         events.sort_by(|a, b| a.0.total_cmp(&b.0));
-        Identities { events, next: 0, now: (0..crowd.walkers.len()).collect(), inside: Vec::new() }
+        Identities {
+            events,
+            next_event: 0,
+            current_ids: (0..crowd.walkers.len()).collect(),
+            inside: Vec::new(),
+        }
     }
 
     /// Moves to `now_s`.
     pub(crate) fn advance(&mut self, now_s: f64) {
-        while let Some(&(at_s, who, is_out)) = self.events.get(self.next).filter(|event| event.0 <= now_s) {
-            self.next += 1;
+        while let Some(&(at_s, walker, is_out)) =
+            self.events.get(self.next_event).filter(|event| event.0 <= now_s)
+        {
+            self.next_event += 1;
             if !is_out {
-                self.inside.push((at_s, self.now[who]));
+                self.inside.push((at_s, self.current_ids[walker]));
                 continue;
             }
             let likely = |one: &usize| hazard(at_s - self.inside[*one].0);
             let best = (0..self.inside.len()).max_by(|a, b| likely(a).total_cmp(&likely(b)));
             if let Some(best) = best {
-                self.now[who] = self.inside.swap_remove(best).1;
+                self.current_ids[walker] = self.inside.swap_remove(best).1;
             }
         }
     }
@@ -61,13 +68,13 @@ impl Identities {
 
 /// Density of the time inside over what is left of it, by the walkers' own distribution.
 fn hazard(after_s: f64) -> f64 {
-    let way = CORRIDOR[1] - CORRIDOR[0];
+    let corridor_m = CORRIDOR_X[1] - CORRIDOR_X[0];
     let (mut density, mut remains) = (1e-9, 1e-9);
     let width = 0.3;
     for i in 0..60 {
         let z = -3.0 + 0.1 * f64::from(i);
         let weight = (-z * z / 2.0).exp();
-        let walks_s = way / (PACE.0 + PACE.1 * z).clamp(0.7, 1.7);
+        let walks_s = corridor_m / (WALKING_SPEED.0 + WALKING_SPEED.1 * z).clamp(0.7, 1.7);
         let mut add = |takes_s: f64, weight: f64| {
             if (takes_s - after_s).abs() < width {
                 density += weight;
@@ -76,9 +83,9 @@ fn hazard(after_s: f64) -> f64 {
                 remains += weight;
             }
         };
-        add(walks_s, weight * (1.0 - STOPS.0));
+        add(walks_s, weight * (1.0 - STOP_SHARE.0));
         for stop in 0..20 {
-            add(walks_s + STOPS.1 * (f64::from(stop) + 0.5) / 20.0, weight * STOPS.0 / 20.0);
+            add(walks_s + STOP_SHARE.1 * (f64::from(stop) + 0.5) / 20.0, weight * STOP_SHARE.0 / 20.0);
         }
     }
     density / remains

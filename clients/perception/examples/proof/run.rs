@@ -4,42 +4,42 @@ use std::collections::{HashMap, VecDeque};
 use std::time::Instant;
 
 use scanhub_perception::track::geometry::{Point, distance, distance_to_border};
-use scanhub_perception::track::{Kind, PeopleTracker, Picture, Site};
-use scanhub_preprocess::background::{Model, Settings};
+use scanhub_perception::track::{Kind, PeopleTracker, Site, Snapshot};
+use scanhub_preprocess::background::{BackgroundModel, Settings};
 use scanhub_preprocess::segments::Segmenter;
 use scanhub_schema::TrackState;
 use scanhub_schema::{Foreground, Nanos, Pose, Scan};
 use scanhub_sim::Shape;
 
-use crate::baseline::Nearest;
+use crate::baseline::NearestTracker;
 use crate::diagnosis::Diagnosis;
-use crate::house::{BEAMS, Eye, House};
+use crate::house::{BEAMS, House, HouseSensor};
 use crate::walkers::{Crossing, Crowd};
 
-pub(crate) const EMPTY_S: f64 = 12.0;
-const RATE_HZ: f64 = 25.0;
-const NS: f64 = 1e9;
+pub(crate) const EMPTY_TIME_S: f64 = 12.0;
+const SAMPLE_RATE_HZ: f64 = 25.0;
+const NS_PER_S: f64 = 1e9;
 /// A mirror turn of an LMS 2xx, and steps of the simulation that it takes.
-const TURN_NS: Nanos = 13_320_000;
-const TURN_STEPS: usize = 3;
+const MIRROR_TURN_NS: Nanos = 13_320_000;
+const STEPS_PER_MIRROR_TURN: usize = 3;
 /// Begin of time, as a wall clock says it.
-const BEGIN_NS: u64 = 1_800_000_000_000_000_000;
+const START_NS: u64 = 1_800_000_000_000_000_000;
 
 #[derive(Clone, Copy)]
-pub(crate) struct Setup {
+pub(crate) struct ProofSetup {
     pub(crate) people: usize,
     pub(crate) seconds: f64,
     pub(crate) seed: u64,
-    pub(crate) restless: f64,
+    pub(crate) room_change_share: f64,
     /// Share of rests on a chair.
-    pub(crate) sits: f64,
+    pub(crate) sit_share: f64,
     pub(crate) house: House,
-    pub(crate) way: Way,
+    pub(crate) tracking: TrackerKind,
 }
 
 /// Who tracks.
 #[derive(Clone, Copy, PartialEq)]
-pub(crate) enum Way {
+pub(crate) enum TrackerKind {
     All,
     OneSensorEach,
     NearestSegment,
@@ -52,14 +52,14 @@ pub(crate) struct Outcome {
     /// The same for perfect places with the identities of the oracle.
     pub(crate) oracle_csv: String,
     /// Squared distances of confirmed tracks from the person, and how many.
-    pub(crate) squares: (f64, usize),
+    pub(crate) squared_errors: (f64, usize),
     /// Ways through the corridor: seen, kept by the tracker, guessed right by the oracle.
     pub(crate) crossings: (usize, usize, usize),
     /// Doors passed, told, and told right: which door, which way, within two seconds.
     pub(crate) doors: (usize, usize, usize),
     /// Tracks of each person in the second half, and the share of that time.
     pub(crate) late_ids: Vec<(usize, f64)>,
-    pub(crate) tracker_s: f64,
+    pub(crate) tracker_time_s: f64,
     pub(crate) simulated_s: f64,
     /// Tracks at all, when nobody was there.
     pub(crate) tracks: usize,
@@ -69,7 +69,7 @@ pub(crate) struct Outcome {
     pub(crate) diagnosis: Option<Diagnosis>,
 }
 
-struct Sent {
+struct SentScan {
     arrives_s: f64,
     sensor: usize,
     wall_ns: u64,
@@ -77,24 +77,31 @@ struct Sent {
     foreground: Box<Foreground>,
 }
 
-pub(crate) fn run(setup: Setup) -> Outcome {
+pub(crate) fn run(setup: ProofSetup) -> Outcome {
     let site = Site::parse("house.toml", &setup.house.site()).expect("the house is right");
     let mut random = fastrand::Rng::with_seed(setup.seed ^ 0x5EED);
     let sensors = site.sensors.len();
-    let eyes: Vec<Eye> = (0..sensors).map(|sensor| Eye::new(setup.house, sensor, setup.seed)).collect();
-    let mut models: Vec<(Model, Segmenter)> = (0..sensors)
-        .map(|_| (Model::new(Settings::default(), BEAMS), Segmenter::new(Pose::default(), BEAMS)))
+    let eyes: Vec<HouseSensor> =
+        (0..sensors).map(|sensor| HouseSensor::new(setup.house, sensor, setup.seed)).collect();
+    let mut models: Vec<(BackgroundModel, Segmenter)> = (0..sensors)
+        .map(|_| (BackgroundModel::new(Settings::default(), BEAMS), Segmenter::new(Pose::default(), BEAMS)))
         .collect();
     let offset = 0.05 * (2.0 * random.f64() - 1.0);
     let drift = 50e-6 * (2.0 * random.f64() - 1.0);
-    let phases: Vec<f64> = (0..sensors).map(|_| random.f64() / RATE_HZ).collect();
-    let mut crowd = Crowd::new(setup.house, setup.people, EMPTY_S, (setup.restless, setup.sits), setup.seed);
+    let phases: Vec<f64> = (0..sensors).map(|_| random.f64() / SAMPLE_RATE_HZ).collect();
+    let mut crowd = Crowd::new(
+        setup.house,
+        setup.people,
+        EMPTY_TIME_S,
+        (setup.room_change_share, setup.sit_share),
+        setup.seed,
+    );
     let mut people = PeopleTracker::new(site.clone(), 80_000_000);
-    let mut nearest = Nearest::new(site.clone());
+    let mut nearest = NearestTracker::new(site.clone());
     let mut outcome = Outcome { simulated_s: setup.seconds, ..Outcome::default() };
     let mut truths: Vec<Vec<Point>> = Vec::new();
-    let mut pictures: Vec<Picture> = Vec::new();
-    let mut sent: Vec<Sent> = Vec::new();
+    let mut samples: Vec<Snapshot> = Vec::new();
+    let mut sent: Vec<SentScan> = Vec::new();
     // Shapes of the last mirror turns of a scanner.
     let mut shapes: VecDeque<Vec<Shape>> = VecDeque::new();
     let steps = (setup.seconds * 200.0) as usize;
@@ -102,19 +109,19 @@ pub(crate) fn run(setup: Setup) -> Outcome {
         let now_s = step as f64 / 200.0;
         crowd.step(now_s, 1.0 / 200.0);
         if step % 20 == 0 {
-            truths.push(crowd.walkers.iter().map(|walker| walker.place).collect());
+            truths.push(crowd.walkers.iter().map(|walker| walker.position).collect());
         }
         shapes.push_back(crowd.shapes());
-        if shapes.len() > TURN_STEPS + 1 {
+        if shapes.len() > STEPS_PER_MIRROR_TURN + 1 {
             shapes.pop_front();
         }
         for sensor in 0..sensors {
-            let turn = |s: f64| ((s + phases[sensor]) * RATE_HZ).floor();
-            if step > 0 && turn(now_s) == turn(now_s - 1.0 / 200.0) {
+            let revolution_index = |s: f64| ((s + phases[sensor]) * SAMPLE_RATE_HZ).floor();
+            if step > 0 && revolution_index(now_s) == revolution_index(now_s - 1.0 / 200.0) {
                 continue;
             }
-            let end_ns = (now_s * NS) as Nanos;
-            let at = |time_ns: Nanos| match time_ns + TURN_NS * 3 / 2 < end_ns {
+            let end_ns = (now_s * NS_PER_S) as Nanos;
+            let at = |time_ns: Nanos| match time_ns + MIRROR_TURN_NS * 3 / 2 < end_ns {
                 true => shapes.front().cloned().unwrap_or_default(),
                 false => shapes.back().cloned().unwrap_or_default(),
             };
@@ -127,42 +134,40 @@ pub(crate) fn run(setup: Setup) -> Outcome {
             let arrives_s = now_s + 0.005 + 0.03 * random.f64();
             let is_b = site.sensors[sensor].hub() == "b";
             let off_s = if is_b { offset + drift * now_s } else { 0.0 };
-            let wall_ns = BEGIN_NS.saturating_add_signed(((now_s + off_s) * NS) as i64);
-            let is_left_out = setup.way == Way::OneSensorEach && is_b;
+            let wall_ns = START_NS.saturating_add_signed(((now_s + off_s) * NS_PER_S) as i64);
+            let is_left_out = setup.tracking == TrackerKind::OneSensorEach && is_b;
             if !is_lost && !is_left_out {
-                sent.push(Sent { arrives_s, sensor, wall_ns, scan, foreground });
+                sent.push(SentScan { arrives_s, sensor, wall_ns, scan, foreground });
             }
         }
         sent.sort_by(|a, b| a.arrives_s.total_cmp(&b.arrives_s));
         let due = sent.partition_point(|one| one.arrives_s <= now_s);
-        for Sent { sensor, wall_ns, scan, foreground, .. } in sent.drain(..due) {
+        for SentScan { sensor, wall_ns, scan, foreground, .. } in sent.drain(..due) {
             let begin = Instant::now();
-            match setup.way {
-                Way::NearestSegment => nearest.take(wall_ns, sensor, &foreground, &mut pictures),
-                _ => {
-                    people.take(sensor, wall_ns, &scan, &foreground, |picture| pictures.push(picture.clone()))
-                }
+            match setup.tracking {
+                TrackerKind::NearestSegment => nearest.take(wall_ns, sensor, &foreground, &mut samples),
+                _ => people.take(sensor, wall_ns, &scan, &foreground, |sample| samples.push(sample.clone())),
             }
-            outcome.tracker_s += begin.elapsed().as_secs_f64();
+            outcome.tracker_time_s += begin.elapsed().as_secs_f64();
         }
     }
     outcome.late = people.counts().late;
     outcome.offset_error_s = people.offset_s(1) - (offset + drift * setup.seconds);
-    judge(&site, &truths, &pictures, &crowd, &mut outcome);
+    score_run(&site, &truths, &samples, &crowd, &mut outcome);
     outcome
 }
 
-fn at_s(picture: &Picture) -> f64 {
-    (picture.wall_ns as i64 - BEGIN_NS as i64) as f64 / NS
+fn at_s(sample: &Snapshot) -> f64 {
+    (sample.wall_ns as i64 - START_NS as i64) as f64 / NS_PER_S
 }
 
-fn judge(site: &Site, truths: &[Vec<Point>], pictures: &[Picture], crowd: &Crowd, outcome: &mut Outcome) {
-    let watched = site.watched();
+fn score_run(site: &Site, truths: &[Vec<Point>], samples: &[Snapshot], crowd: &Crowd, outcome: &mut Outcome) {
+    let watched = site.rooms_with_sensor();
     let is_scored = |place: Point| {
         let room = site.room_at(place).filter(|&room| watched[room]);
         room.is_some_and(|room| distance_to_border(&site.rooms[room].polygon, place) > 0.1)
     };
-    let is_told = std::env::args().any(|argument| argument == "--events");
+    let prints_events = std::env::args().any(|argument| argument == "--events");
     let mut diagnosis = Diagnosis::new(crowd.walkers.len());
     let mut oracle = crate::oracle::Identities::new(crowd);
     let mut next = 0;
@@ -171,65 +176,68 @@ fn judge(site: &Site, truths: &[Vec<Point>], pictures: &[Picture], crowd: &Crowd
     let mut ids: HashMap<u64, u64> = HashMap::new();
     for (frame, truth) in truths.iter().enumerate() {
         let now_s = frame as f64 * 0.1;
-        while next < pictures.len() && at_s(&pictures[next]) <= now_s + 1e-6 {
+        while next < samples.len() && at_s(&samples[next]) <= now_s + 1e-6 {
             next += 1;
         }
-        if now_s < EMPTY_S || next == 0 {
+        if now_s < EMPTY_TIME_S || next == 0 {
             continue;
         }
-        let picture = &pictures[next - 1];
-        let ahead = now_s - at_s(picture);
-        diagnosis.take(now_s, truth, &is_scored, picture, &crowd.crossings);
+        let sample = &samples[next - 1];
+        let ahead = now_s - at_s(sample);
+        diagnosis.take(now_s, truth, &is_scored, sample, &crowd.crossings);
         oracle.advance(now_s);
-        for (who, place) in truth.iter().enumerate().filter(|(_, place)| is_scored(**place)) {
-            outcome.csv += &format!("{frame},0,{who},{:.3},{:.3}\n", place[0], place[1]);
-            for (kind, id) in [(0, who), (1, oracle.now[who])] {
+        for (person, place) in truth.iter().enumerate().filter(|(_, place)| is_scored(**place)) {
+            outcome.csv += &format!("{frame},0,{person},{:.3},{:.3}\n", place[0], place[1]);
+            for (kind, id) in [(0, person), (1, oracle.current_ids[person])] {
                 outcome.oracle_csv += &format!("{frame},{kind},{id},{:.3},{:.3}\n", place[0], place[1]);
             }
         }
-        for track in &picture.tracks {
-            let at = [track.place[0] + ahead * track.velocity[0], track.place[1] + ahead * track.velocity[1]];
+        for track in &sample.tracks {
+            let at = [
+                track.position[0] + ahead * track.velocity[0],
+                track.position[1] + ahead * track.velocity[1],
+            ];
             let counts = matches!(track.state, TrackState::Confirmed | TrackState::Hidden);
             if !counts {
                 continue;
             }
-            let nearest = truth.iter().enumerate().map(|(who, &place)| (distance(place, at), who));
+            let nearest = truth.iter().enumerate().map(|(person, &place)| (distance(place, at), person));
             let nearest = nearest.min_by(|a, b| a.0.total_cmp(&b.0));
             if !is_scored(at) {
                 continue;
             }
             ids.insert(track.id, track.id);
             outcome.csv += &format!("{frame},1,{},{:.3},{:.3}\n", track.id, at[0], at[1]);
-            if let Some((off, who)) = nearest.filter(|(off, _)| *off < 0.5) {
+            if let Some((off, person)) = nearest.filter(|(off, _)| *off < 0.5) {
                 if track.state == TrackState::Confirmed {
-                    outcome.squares.0 += off * off;
-                    outcome.squares.1 += 1;
+                    outcome.squared_errors.0 += off * off;
+                    outcome.squared_errors.1 += 1;
                 }
-                known[who].push((now_s, track.id));
+                known[person].push((now_s, track.id));
             }
         }
     }
-    if is_told {
-        for event in pictures.iter().flat_map(|picture| &picture.events) {
-            let at = (event.wall_ns as i64 - BEGIN_NS as i64) as f64 / NS;
+    if prints_events {
+        for event in samples.iter().flat_map(|sample| &sample.events) {
+            let at = (event.wall_ns as i64 - START_NS as i64) as f64 / NS_PER_S;
             let frame = truths.get((at * 10.0) as usize);
             println!("{at:.2} id {} room {:?} {:?} people {:.2?}", event.id, event.room, event.kind, frame);
         }
     }
     outcome.tracks = ids.len();
     outcome.diagnosis = Some(diagnosis);
-    let mut told: Vec<(f64, usize, bool)> = Vec::new();
-    for event in pictures.iter().flat_map(|picture| &picture.events) {
+    let mut reported: Vec<(f64, usize, bool)> = Vec::new();
+    for event in samples.iter().flat_map(|sample| &sample.events) {
         if let Kind::Door { door, from, .. } = event.kind {
-            let at = (event.wall_ns as i64 - BEGIN_NS as i64) as f64 / NS;
-            told.push((at, door, from == site.doors[door].from));
+            let at = (event.wall_ns as i64 - START_NS as i64) as f64 / NS_PER_S;
+            reported.push((at, door, from == site.doors[door].from));
         }
     }
-    outcome.doors = (crowd.passages.len(), told.len(), 0);
+    outcome.doors = (crowd.passages.len(), reported.len(), 0);
     for (at, door, forth) in &crowd.passages {
         let fits = |one: &(f64, usize, bool)| (one.1, one.2) == (*door, *forth) && (one.0 - at).abs() < 2.0;
-        if let Some(found) = told.iter().position(fits) {
-            told.remove(found);
+        if let Some(found) = reported.iter().position(fits) {
+            reported.remove(found);
             outcome.doors.2 += 1;
         }
     }
@@ -252,14 +260,14 @@ fn judge(site: &Site, truths: &[Vec<Point>], pictures: &[Picture], crowd: &Crowd
         };
         let before = track(crossing.entered_s - 2.0, crossing.entered_s, true);
         let after = track(crossing.left_s, crossing.left_s + 2.0, false);
-        if crossing.entered_s > EMPTY_S + 2.0 && crossing.left_s < lives_s - 2.5 {
-            if is_told && before != after {
+        if crossing.entered_s > EMPTY_TIME_S + 2.0 && crossing.left_s < lives_s - 2.5 {
+            if prints_events && before != after {
                 let Crossing { walker, entered_s, left_s } = crossing;
                 println!("lost: {walker} in {entered_s:.2} out {left_s:.2}, was {before:?}, is {after:?}");
             }
             outcome.crossings.0 += 1;
             outcome.crossings.1 += usize::from(before.is_some() && before == after);
-            outcome.crossings.2 += usize::from(crate::oracle::guess(crowd, crossing));
+            outcome.crossings.2 += usize::from(crate::oracle::is_guess_right(crowd, crossing));
         }
     }
 }

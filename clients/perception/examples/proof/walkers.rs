@@ -6,23 +6,23 @@ use scanhub_sim::Shape;
 
 use crate::house::{CHAIRS, House, chair_legs, normal, post, wall};
 
-pub(crate) const LEG_M: f64 = 0.06;
+pub(crate) const LEG_RADIUS_M: f64 = 0.06;
 /// Half the distance of the legs across the way, and how far a foot gets ahead.
-const HIP_M: f64 = 0.11;
-const STRIDE_M: f64 = 0.25;
-const DOUBLE_STEP_M: f64 = 1.4;
+const HALF_HIP_WIDTH_M: f64 = 0.11;
+const STRIDE_LEN_M: f64 = 0.25;
+const DOUBLE_STEP_LEN_M: f64 = 1.4;
 /// Mean and deviation of how fast people walk.
-pub(crate) const PACE: (f64, f64) = (1.15, 0.22);
+pub(crate) const WALKING_SPEED: (f64, f64) = (1.15, 0.22);
 /// Share of those who stop in the corridor, and for how long at most.
-pub(crate) const STOPS: (f64, f64) = (0.15, 8.0);
-const INSIDE: usize = 3;
-pub(crate) const CORRIDOR: [f64; 2] = [6.0, 11.0];
+pub(crate) const STOP_SHARE: (f64, f64) = (0.15, 8.0);
+const INSIDE_ROOM: usize = 3;
+pub(crate) const CORRIDOR_X: [f64; 2] = [6.0, 11.0];
 
 /// Nobody steps nearer to another one.
-const NEAREST_M: f64 = 0.55;
+const MIN_DISTANCE_M: f64 = 0.55;
 
 /// A free part of the plan: minimum x and y, maximum x and y.
-const FREE: [[f64; 4]; 9] = [
+const FREE_AREAS: [[f64; 4]; 9] = [
     [0.35, 0.35, 5.65, 4.65],
     [11.35, 0.35, 16.65, 4.65],
     [6.3, 1.8, 10.7, 3.2],
@@ -35,42 +35,42 @@ const FREE: [[f64; 4]; 9] = [
     [17.35, 0.5, 20.4, 4.5],
 ];
 /// The doors to the street: x, and the direction of the street.
-const OUTER: [(f64, f64); 2] = [(0.0, -1.0), (17.0, 1.0)];
+const OUTER_DOORS: [(f64, f64); 2] = [(0.0, -1.0), (17.0, 1.0)];
 /// Number of the first of them in the site.
-const FIRST_OUTER: usize = 2;
+const FIRST_OUTER_DOOR: usize = 2;
 /// Share of plans that lead to the street, and time after which somebody else comes in, in seconds.
-const LEAVES: f64 = 0.06;
-const RETURNS_S: (f64, f64) = (3.0, 12.0);
+const LEAVE_SHARE: f64 = 0.06;
+const RETURN_TIME_S: (f64, f64) = (3.0, 12.0);
 /// A door opens for a person who is nearer to it and wants to pass, and takes this time.
-const OPENS_M: f64 = 1.4;
-const OPENS_S: f64 = 0.9;
+const DOOR_OPEN_DISTANCE_M: f64 = 1.4;
+const DOOR_OPEN_TIME_S: f64 = 0.9;
 /// Distance of the shins of a sitter from the center of the chair: the front edge of the seat is at 0.2 m.
-const SHINS_M: f64 = 0.36;
+const SHIN_DISTANCE_M: f64 = 0.36;
 /// Distance by which a sitter moves the chair along each axis, at most, and its turn in radians.
-const CHAIR_MOVES: (f64, f64) = (0.05, 0.15);
+const MAX_CHAIR_MOVE: (f64, f64) = (0.05, 0.15);
 /// Minimum distance of a walker from the center of a chair.
-const CHAIR_M: f64 = 0.3;
+const MIN_CHAIR_DISTANCE_M: f64 = 0.3;
 /// Duration of sitting, in seconds.
-const SITS_S: (f64, f64) = (10.0, 40.0);
+const SIT_TIME_S: (f64, f64) = (10.0, 40.0);
 /// Position of people who have left.
-const GONE: Point = [-1000.0, -1000.0];
+const OUTSIDE_POSITION: Point = [-1000.0, -1000.0];
 
 pub(crate) struct Walker {
-    pub(crate) place: Point,
+    pub(crate) position: Point,
     velocity: Point,
     heading: Point,
-    pub(crate) pace: f64,
+    pub(crate) speed: f64,
     /// Turns of a double step.
     phase: f64,
-    way: Vec<(Point, f64)>,
-    rest_s: f64,
+    path: Vec<(Point, f64)>,
+    pause_s: f64,
     room: usize,
     /// For how long he has wanted to go and could not.
-    stuck_s: f64,
+    blocked_s: f64,
     /// The chair that the person sits on, or walks to.
     chair: Option<usize>,
     /// The door to the street that the person wants to pass.
-    outer: Option<usize>,
+    outer_door: Option<usize>,
     /// When he went into the corridor, if he is there.
     pub(crate) entered_s: Option<f64>,
 }
@@ -89,14 +89,14 @@ pub(crate) struct Crowd {
     /// Doors that were passed: when, which, and whether from the room that the site names first.
     pub(crate) passages: Vec<(f64, usize, bool)>,
     /// How often one whose rest is over changes rooms; less than 0: whoever is in a room stands there for good.
-    restless: f64,
+    room_change_share: f64,
     /// Share of rests on a chair.
-    sits: f64,
+    sit_share: f64,
     house: House,
     /// Center and direction of each chair.
     chairs: Vec<(Point, f64)>,
     /// Opening of the doors to the street, 0 to 1.
-    open: [f64; 2],
+    door_openings: [f64; 2],
     /// Times at which new people enter, and the number of the door.
     arrivals: Vec<(f64, usize)>,
     now_s: f64,
@@ -114,20 +114,20 @@ impl Crowd {
         let mut random = fastrand::Rng::with_seed(seed);
         let walkers = (0..count).map(|i| {
             let room = i % 2;
-            let place = [8.5 + 0.3 * (i as f64 % 4.0 - 1.5), 2.0 + 0.1 * (i as f64 % 10.0)];
-            let pace = (PACE.0 + PACE.1 * normal(&mut random)).clamp(0.7, 1.7);
+            let position = [8.5 + 0.3 * (i as f64 % 4.0 - 1.5), 2.0 + 0.1 * (i as f64 % 10.0)];
+            let speed = (WALKING_SPEED.0 + WALKING_SPEED.1 * normal(&mut random)).clamp(0.7, 1.7);
             Walker {
-                place,
+                position,
                 velocity: [0.0, 0.0],
                 heading: [1.0, 0.0],
-                pace,
+                speed,
                 phase: random.f64(),
-                way: Vec::new(),
-                rest_s: from_s + 1.3 * i as f64,
+                path: Vec::new(),
+                pause_s: from_s + 1.3 * i as f64,
                 room,
-                stuck_s: 0.0,
+                blocked_s: 0.0,
                 chair: None,
-                outer: None,
+                outer_door: None,
                 entered_s: None,
             }
         });
@@ -137,32 +137,32 @@ impl Crowd {
             random,
             crossings: Vec::new(),
             passages: Vec::new(),
-            restless,
-            sits: if house.is_ideal { 0.0 } else { sits },
+            room_change_share: restless,
+            sit_share: if house.is_ideal { 0.0 } else { sits },
             house,
             chairs: if house.is_ideal { Vec::new() } else { CHAIRS.to_vec() },
-            open: [0.0; 2],
+            door_openings: [0.0; 2],
             arrivals: Vec::new(),
             now_s: 0.0,
         };
         for i in 0..count {
             let (door, _) = doors(crowd.walkers[i].room);
-            let inner = crowd.free_place(crowd.walkers[i].room);
-            crowd.walkers[i].way = vec![(inner, 0.0), (door[2], 0.0), (door[1], 0.0), (door[0], 0.0)];
+            let inner = crowd.free_position(crowd.walkers[i].room);
+            crowd.walkers[i].path = vec![(inner, 0.0), (door[2], 0.0), (door[1], 0.0), (door[0], 0.0)];
         }
         crowd
     }
 
     /// Whether the walker is not yet on his way.
-    pub(crate) fn waits(&self, walker: usize) -> bool {
-        let [x, _] = self.walkers[walker].place;
+    pub(crate) fn is_waiting(&self, walker: usize) -> bool {
+        let [x, _] = self.walkers[walker].position;
         self.walkers[walker].entered_s.is_none()
-            && (CORRIDOR[0]..=CORRIDOR[1]).contains(&x)
+            && (CORRIDOR_X[0]..=CORRIDOR_X[1]).contains(&x)
             && self.now_s < 13.0 + 1.3 * walker as f64
     }
 
-    fn free_place(&mut self, room: usize) -> Point {
-        let [a, b, c, d] = FREE[room];
+    fn free_position(&mut self, room: usize) -> Point {
+        let [a, b, c, d] = FREE_AREAS[room];
         loop {
             let place = [a + (c - a) * self.random.f64(), b + (d - b) * self.random.f64()];
             let is_clear = self.house.obstacles().all(|one| !within(one, 0.4, place));
@@ -175,87 +175,93 @@ impl Crowd {
     pub(crate) fn step(&mut self, now_s: f64, dt: f64) {
         self.now_s = now_s;
         self.move_doors(dt);
-        self.let_in(now_s);
-        let places: Vec<Point> = self.walkers.iter().map(|walker| walker.place).collect();
+        self.admit_arrivals(now_s);
+        let places: Vec<Point> = self.walkers.iter().map(|walker| walker.position).collect();
         let inside = places.iter().filter(|place| (5.9..=11.1).contains(&place[0])).count();
         for i in 0..self.walkers.len() {
-            if self.walkers[i].place == GONE {
+            if self.walkers[i].position == OUTSIDE_POSITION {
                 continue;
             }
-            let waits = self.waits(i);
-            if self.walkers[i].rest_s > 0.0 {
-                self.walkers[i].rest_s -= dt;
-                if self.walkers[i].rest_s <= 0.0 && self.walkers[i].way.is_empty() {
+            let waits = self.is_waiting(i);
+            if self.walkers[i].pause_s > 0.0 {
+                self.walkers[i].pause_s -= dt;
+                if self.walkers[i].pause_s <= 0.0 && self.walkers[i].path.is_empty() {
                     self.stand_up(i);
                 }
-            } else if self.walkers[i].way.is_empty() {
-                self.plan(i, inside);
+            } else if self.walkers[i].path.is_empty() {
+                self.plan_path(i, inside);
             }
-            let gives_way = self.gives_way(i, &places);
+            let gives_way = self.must_wait(i, &places);
             let (house, chairs) = (self.house, self.chairs.clone());
             let is_free = |place: Point| {
-                FREE.iter().any(|free| within(free, 1e-9, place))
+                FREE_AREAS.iter().any(|free| within(free, 1e-9, place))
                     && house.obstacles().all(|one| !within(one, 0.3, place))
-                    && chairs.iter().all(|(chair, _)| distance(*chair, place) > CHAIR_M)
+                    && chairs.iter().all(|(chair, _)| distance(*chair, place) > MIN_CHAIR_DISTANCE_M)
             };
             let walker = &mut self.walkers[i];
-            let mut wish = [0.0, 0.0];
-            let rests = walker.rest_s > 0.0 || gives_way;
-            if let (false, Some(&(goal, rest_s))) = (rests, walker.way.last()) {
-                let off = distance(goal, walker.place);
-                let seat = walker.chair.filter(|_| walker.way.len() == 1);
-                if off < if seat.is_some() { 0.04 } else { 0.25 } {
-                    walker.way.pop();
-                    walker.rest_s = rest_s;
-                    if let Some(chair) = seat {
-                        self.chairs[chair] = moved(self.chairs[chair], &mut self.random);
+            let mut desired_velocity = [0.0, 0.0];
+            let is_resting = walker.pause_s > 0.0 || gives_way;
+            if let (false, Some(&(goal, rest_s))) = (is_resting, walker.path.last()) {
+                let off = distance(goal, walker.position);
+                let own_chair = walker.chair.filter(|_| walker.path.len() == 1);
+                if off < if own_chair.is_some() { 0.04 } else { 0.25 } {
+                    walker.path.pop();
+                    walker.pause_s = rest_s;
+                    if let Some(chair) = own_chair {
+                        self.chairs[chair] = move_chair(self.chairs[chair], &mut self.random);
                         let (sin, cos) = self.chairs[chair].1.sin_cos();
                         (walker.heading, walker.velocity) = ([cos, sin], [0.0, 0.0]);
                     }
-                    if walker.way.is_empty() && walker.outer.is_some_and(|door| is_outside(door, goal)) {
-                        walker.place = GONE;
-                        let after_s = RETURNS_S.0 + (RETURNS_S.1 - RETURNS_S.0) * self.random.f64();
-                        self.arrivals.push((now_s + after_s, self.random.usize(..OUTER.len())));
+                    if walker.path.is_empty() && walker.outer_door.is_some_and(|door| is_outside(door, goal))
+                    {
+                        walker.position = OUTSIDE_POSITION;
+                        let after_s =
+                            RETURN_TIME_S.0 + (RETURN_TIME_S.1 - RETURN_TIME_S.0) * self.random.f64();
+                        self.arrivals.push((now_s + after_s, self.random.usize(..OUTER_DOORS.len())));
                         continue;
                     }
                 } else {
-                    let pace = walker.pace / off;
-                    let pace = if seat.is_some() { pace.min(2.5) } else { pace };
-                    wish = [pace * (goal[0] - walker.place[0]), pace * (goal[1] - walker.place[1])];
+                    let pace = walker.speed / off;
+                    let pace = if own_chair.is_some() { pace.min(2.5) } else { pace };
+                    desired_velocity =
+                        [pace * (goal[0] - walker.position[0]), pace * (goal[1] - walker.position[1])];
                 }
             }
             for (j, other) in places.iter().enumerate() {
-                let off = distance(*other, walker.place);
-                let sits = rests && walker.chair.is_some();
+                let off = distance(*other, walker.position);
+                let sits = is_resting && walker.chair.is_some();
                 if i != j && off < 0.9 && off > 1e-6 && !waits && !sits {
-                    let near = |x: f64| (walker.place[0] - x).abs() < 1.0;
+                    let near = |x: f64| (walker.position[0] - x).abs() < 1.0;
                     let near_door = [0.0, 6.0, 11.0, 17.0].into_iter().any(near) && walker.chair.is_none();
                     let push = (0.9 - off) / off
                         * if near_door {
                             1.0
-                        } else if rests {
+                        } else if is_resting {
                             1.5
                         } else {
                             4.0
                         };
                     // To the side as well, so that two who meet pass.
-                    let away = [walker.place[0] - other[0], walker.place[1] - other[1]];
-                    wish = [
-                        wish[0] + push * (away[0] - 0.5 * away[1]),
-                        wish[1] + push * (away[1] + 0.5 * away[0]),
+                    let away = [walker.position[0] - other[0], walker.position[1] - other[1]];
+                    desired_velocity = [
+                        desired_velocity[0] + push * (away[0] - 0.5 * away[1]),
+                        desired_velocity[1] + push * (away[1] + 0.5 * away[0]),
                     ];
                 }
             }
-            let speed = (wish[0] * wish[0] + wish[1] * wish[1]).sqrt();
-            let most = 1.3 * walker.pace;
-            if speed > most {
-                wish = [wish[0] * most / speed, wish[1] * most / speed];
+            let speed = (desired_velocity[0] * desired_velocity[0]
+                + desired_velocity[1] * desired_velocity[1])
+                .sqrt();
+            let maximum = 1.3 * walker.speed;
+            if speed > maximum {
+                desired_velocity =
+                    [desired_velocity[0] * maximum / speed, desired_velocity[1] * maximum / speed];
             }
-            for (speed, wish) in walker.velocity.iter_mut().zip(wish) {
+            for (speed, wish) in walker.velocity.iter_mut().zip(desired_velocity) {
                 *speed += (wish - *speed) * (dt / 0.25);
             }
-            let from = walker.place;
-            let nearest = if walker.stuck_s > 1.0 { 0.35 } else { NEAREST_M };
+            let from = walker.position;
+            let nearest = if walker.blocked_s > 1.0 { 0.35 } else { MIN_DISTANCE_M };
             let bumps = |to: Point| {
                 places.iter().enumerate().any(|(j, other)| {
                     let now = distance(*other, to);
@@ -263,85 +269,85 @@ impl Crowd {
                 })
             };
             for axis in 0..2 {
-                let mut to = walker.place;
+                let mut to = walker.position;
                 to[axis] += walker.velocity[axis] * dt;
                 if is_free(to) && !bumps(to) {
-                    walker.place = to;
+                    walker.position = to;
                 } else {
                     walker.velocity[axis] = 0.0;
                     // Around a corner.
-                    let mut aside = walker.place;
+                    let mut aside = walker.position;
                     aside[1 - axis] += dt * 0.5 * if i % 2 == 0 { 1.0 } else { -1.0 };
-                    if is_free(aside) && !rests && !bumps(aside) {
-                        walker.place = aside;
+                    if is_free(aside) && !is_resting && !bumps(aside) {
+                        walker.position = aside;
                     }
                 }
             }
             let speed = walker.velocity[0].hypot(walker.velocity[1]);
             if speed > 0.15 {
                 walker.heading = [walker.velocity[0] / speed, walker.velocity[1] / speed];
-                walker.phase += speed * dt / DOUBLE_STEP_M;
+                walker.phase += speed * dt / DOUBLE_STEP_LEN_M;
             }
-            let went = distance(walker.place, from) / dt;
-            walker.stuck_s =
-                if went < 0.1 && walker.rest_s <= 0.0 && !waits { walker.stuck_s + dt } else { 0.0 };
-            let is_stuck = walker.stuck_s > 1.5 && walker.way.len() == 1;
-            self.note(i, from[0], now_s);
-            let [x, _] = self.walkers[i].place;
+            let went = distance(walker.position, from) / dt;
+            walker.blocked_s =
+                if went < 0.1 && walker.pause_s <= 0.0 && !waits { walker.blocked_s + dt } else { 0.0 };
+            let is_stuck = walker.blocked_s > 1.5 && walker.path.len() == 1;
+            self.note_crossing(i, from[0], now_s);
+            let [x, _] = self.walkers[i].position;
             let is_in_room = (0.3..5.7).contains(&x) || (11.3..16.7).contains(&x);
-            if is_stuck || self.walkers[i].stuck_s > 6.0 && is_in_room {
+            if is_stuck || self.walkers[i].blocked_s > 6.0 && is_in_room {
                 let walker = &mut self.walkers[i];
-                walker.stuck_s = 0.0;
-                walker.way.clear();
-                (walker.chair, walker.outer) = (None, None);
+                walker.blocked_s = 0.0;
+                walker.path.clear();
+                (walker.chair, walker.outer_door) = (None, None);
                 walker.room = usize::from(x > 8.5);
             }
         }
     }
 
     /// Somebody comes through the door that this one wants to go through.
-    fn gives_way(&self, i: usize, places: &[Point]) -> bool {
+    fn must_wait(&self, i: usize, positions: &[Point]) -> bool {
         let walker = &self.walkers[i];
-        let Some((goal, _)) = walker.way.last() else { return false };
-        let door = CORRIDOR.into_iter().find(|x| (goal[0] - x).abs() < 0.1);
-        let before = door.filter(|x| (0.5..0.9).contains(&(walker.place[0] - x).abs()));
+        let Some((goal, _)) = walker.path.last() else { return false };
+        let door = CORRIDOR_X.into_iter().find(|x| (goal[0] - x).abs() < 0.1);
+        let before = door.filter(|x| (0.5..0.9).contains(&(walker.position[0] - x).abs()));
         before.is_some_and(|x| {
-            let side = (walker.place[0] - x).signum();
+            let side = (walker.position[0] - x).signum();
             let comes = |j: usize| {
                 let other = &self.walkers[j];
-                let off = [places[j][0] - x, places[j][1] - 2.5];
+                let off = [positions[j][0] - x, positions[j][1] - 2.5];
                 j != i && off[0].abs() < 1.0 && off[1].abs() < 0.7 && other.velocity[0] * side > 0.2
             };
-            walker.stuck_s < 3.0 && (0..places.len()).any(comes)
+            walker.blocked_s < 3.0 && (0..positions.len()).any(comes)
         })
     }
 
-    fn plan(&mut self, i: usize, inside: usize) {
+    fn plan_path(&mut self, i: usize, inside: usize) {
         let room = self.walkers[i].room;
-        if self.restless < 0.0 {
-            let goal = self.free_place(room);
-            self.walkers[i].way = vec![(goal, f64::INFINITY)];
+        if self.room_change_share < 0.0 {
+            let goal = self.free_position(room);
+            self.walkers[i].path = vec![(goal, f64::INFINITY)];
             return;
         }
-        self.walkers[i].outer = None;
+        self.walkers[i].outer_door = None;
         let waiting = if self.random.f64() < 0.4 { 2.0 + 18.0 * self.random.f64() } else { 0.0 };
-        if !self.house.is_ideal && self.random.f64() < self.sits && self.sit_down(i) {
+        if !self.house.is_ideal && self.random.f64() < self.sit_share && self.sit_down(i) {
             return;
         }
-        if !self.house.is_ideal && self.restless > 0.0 && self.random.f64() < LEAVES {
-            self.walkers[i].outer = Some(room);
-            let (x, out) = OUTER[room];
-            let ways = [2.8, 0.8, 0.0, -0.8].map(|off| ([x + out * off, 2.5], 0.0));
-            self.walkers[i].way = ways.to_vec();
+        if !self.house.is_ideal && self.room_change_share > 0.0 && self.random.f64() < LEAVE_SHARE {
+            self.walkers[i].outer_door = Some(room);
+            let (x, out) = OUTER_DOORS[room];
+            let path = [2.8, 0.8, 0.0, -0.8].map(|off| ([x + out * off, 2.5], 0.0));
+            self.walkers[i].path = path.to_vec();
             return;
         }
-        if self.random.f64() < self.restless && inside < INSIDE {
+        if self.random.f64() < self.room_change_share && inside < INSIDE_ROOM {
             let other = 1 - room;
             let ((out, _), (into, _)) = (doors(room), doors(other));
-            let goal = self.free_place(other);
-            let stop = if self.random.f64() < STOPS.0 { STOPS.1 * self.random.f64() } else { 0.0 };
+            let goal = self.free_position(other);
+            let stop = if self.random.f64() < STOP_SHARE.0 { STOP_SHARE.1 * self.random.f64() } else { 0.0 };
             let aside = 2.5 + 0.5 * (2.0 * self.random.f64() - 1.0);
-            self.walkers[i].way = vec![
+            self.walkers[i].path = vec![
                 (goal, waiting),
                 (into[2], 0.0),
                 (into[1], 0.0),
@@ -353,14 +359,14 @@ impl Crowd {
             ];
             self.walkers[i].room = other;
         } else {
-            let goal = self.free_place(room);
-            self.walkers[i].way = vec![(goal, waiting)];
+            let goal = self.free_position(room);
+            self.walkers[i].path = vec![(goal, waiting)];
         }
     }
 
-    fn note(&mut self, i: usize, from_x: f64, now_s: f64) {
-        let to_x = self.walkers[i].place[0];
-        for (door, x) in CORRIDOR.into_iter().enumerate() {
+    fn note_crossing(&mut self, i: usize, from_x: f64, now_s: f64) {
+        let to_x = self.walkers[i].position[0];
+        for (door, x) in CORRIDOR_X.into_iter().enumerate() {
             if (from_x < x) == (to_x < x) {
                 continue;
             }
@@ -372,9 +378,9 @@ impl Crowd {
                 self.crossings.push(Crossing { walker: i, entered_s, left_s: now_s });
             }
         }
-        for (door, (x, out)) in OUTER.into_iter().enumerate() {
+        for (door, (x, out)) in OUTER_DOORS.into_iter().enumerate() {
             if (from_x < x) != (to_x < x) {
-                self.passages.push((now_s, FIRST_OUTER + door, (to_x - x) * out > 0.0));
+                self.passages.push((now_s, FIRST_OUTER_DOOR + door, (to_x - x) * out > 0.0));
             }
         }
     }
@@ -383,7 +389,7 @@ impl Crowd {
     fn sit_down(&mut self, i: usize) -> bool {
         let room = self.walkers[i].room;
         let is_free = |&chair: &usize| {
-            let [a, b, c, d] = FREE[room];
+            let [a, b, c, d] = FREE_AREAS[room];
             within(&[a, b, c, d], 0.0, self.chairs[chair].0)
                 && self.walkers.iter().all(|walker| walker.chair != Some(chair))
         };
@@ -394,54 +400,55 @@ impl Crowd {
             return false;
         }
         let chair = free[self.random.usize(..free.len())];
-        let sits_s = SITS_S.0 + (SITS_S.1 - SITS_S.0) * self.random.f64();
+        let sits_s = SIT_TIME_S.0 + (SIT_TIME_S.1 - SIT_TIME_S.0) * self.random.f64();
         self.walkers[i].chair = Some(chair);
         let ahead = |m: f64| {
-            let ([x, y], turn) = self.chairs[chair];
-            [x + m * turn.cos(), y + m * turn.sin()]
+            let ([x, y], yaw_rad) = self.chairs[chair];
+            [x + m * yaw_rad.cos(), y + m * yaw_rad.sin()]
         };
-        self.walkers[i].way = vec![(ahead(SHINS_M), sits_s), (ahead(0.8), 0.0)];
+        self.walkers[i].path = vec![(ahead(SHIN_DISTANCE_M), sits_s), (ahead(0.8), 0.0)];
         true
     }
 
     /// The person leaves the chair, which moves a little.
     fn stand_up(&mut self, i: usize) {
         if let Some(chair) = self.walkers[i].chair.take() {
-            self.chairs[chair] = moved(self.chairs[chair], &mut self.random);
+            self.chairs[chair] = move_chair(self.chairs[chair], &mut self.random);
         }
     }
 
     fn move_doors(&mut self, dt: f64) {
-        for (door, (x, _)) in OUTER.into_iter().enumerate() {
-            let wants =
-                |walker: &Walker| walker.outer == Some(door) && distance(walker.place, [x, 2.5]) < OPENS_M;
-            let step = dt / OPENS_S * if self.walkers.iter().any(wants) { 1.0 } else { -1.0 };
-            self.open[door] = (self.open[door] + step).clamp(0.0, 1.0);
+        for (door, (x, _)) in OUTER_DOORS.into_iter().enumerate() {
+            let wants = |walker: &Walker| {
+                walker.outer_door == Some(door) && distance(walker.position, [x, 2.5]) < DOOR_OPEN_DISTANCE_M
+            };
+            let step = dt / DOOR_OPEN_TIME_S * if self.walkers.iter().any(wants) { 1.0 } else { -1.0 };
+            self.door_openings[door] = (self.door_openings[door] + step).clamp(0.0, 1.0);
         }
     }
 
     /// Adds the people who enter from the street by now.
-    fn let_in(&mut self, now_s: f64) {
+    fn admit_arrivals(&mut self, now_s: f64) {
         while let Some(due) = self.arrivals.iter().position(|(at_s, _)| *at_s <= now_s) {
             let (_, door) = self.arrivals.swap_remove(due);
-            let (x, out) = OUTER[door];
-            let inner = self.free_place(door);
-            let pace = (PACE.0 + PACE.1 * normal(&mut self.random)).clamp(0.7, 1.7);
+            let (x, out) = OUTER_DOORS[door];
+            let inner = self.free_position(door);
+            let speed = (WALKING_SPEED.0 + WALKING_SPEED.1 * normal(&mut self.random)).clamp(0.7, 1.7);
             self.walkers.push(Walker {
-                place: [x + out * 2.8, 2.5],
+                position: [x + out * 2.8, 2.5],
                 velocity: [0.0, 0.0],
                 heading: [-out, 0.0],
-                pace,
+                speed,
                 phase: self.random.f64(),
-                way: [(inner, 0.0)]
+                path: [(inner, 0.0)]
                     .into_iter()
                     .chain([-0.8, 0.0, 0.8].map(|off| ([x + out * off, 2.5], 0.0)))
                     .collect(),
-                rest_s: 0.0,
+                pause_s: 0.0,
                 room: door,
-                stuck_s: 0.0,
+                blocked_s: 0.0,
                 chair: None,
-                outer: Some(door),
+                outer_door: Some(door),
                 entered_s: None,
             });
         }
@@ -451,28 +458,28 @@ impl Crowd {
     pub(crate) fn shapes(&self) -> Vec<Shape> {
         let mut legs = Vec::new();
         self.legs(&mut legs);
-        let mut shapes: Vec<Shape> = legs.into_iter().map(|leg| post(leg, LEG_M)).collect();
-        shapes.extend(self.chairs.iter().flat_map(|&(center, turn)| chair_legs(center, turn)));
+        let mut shapes: Vec<Shape> = legs.into_iter().map(|leg| post(leg, LEG_RADIUS_M)).collect();
+        shapes.extend(self.chairs.iter().flat_map(|&(center, yaw_rad)| chair_legs(center, yaw_rad)));
         if !self.house.is_ideal {
             // The one swings into the street, the other slides along the wall.
-            let (sin, cos) = (85.0_f64.to_radians() * self.open[0]).sin_cos();
+            let (sin, cos) = (85.0_f64.to_radians() * self.door_openings[0]).sin_cos();
             shapes.push(wall([0.0, 2.0], [-sin, 2.0 + cos]));
-            let y = 2.0 + 0.95 * self.open[1];
+            let y = 2.0 + 0.95 * self.door_openings[1];
             shapes.push(wall([17.02, y], [17.02, y + 1.0]));
         }
         shapes
     }
 
     fn legs(&self, legs: &mut Vec<Point>) {
-        for walker in self.walkers.iter().filter(|walker| walker.place != GONE) {
+        for walker in self.walkers.iter().filter(|walker| walker.position != OUTSIDE_POSITION) {
             let speed = walker.velocity[0].hypot(walker.velocity[1]);
             let swing = (speed / 0.6).min(1.0);
-            let stride = swing * STRIDE_M * (std::f64::consts::TAU * walker.phase).sin();
+            let stride = swing * STRIDE_LEN_M * (std::f64::consts::TAU * walker.phase).sin();
             for side in [1.0, -1.0] {
                 let [hx, hy] = walker.heading;
                 legs.push([
-                    walker.place[0] + side * (stride * hx - HIP_M * hy),
-                    walker.place[1] + side * (stride * hy + HIP_M * hx),
+                    walker.position[0] + side * (stride * hx - HALF_HIP_WIDTH_M * hy),
+                    walker.position[1] + side * (stride * hy + HALF_HIP_WIDTH_M * hx),
                 ]);
             }
         }
@@ -492,13 +499,13 @@ fn within([a, b, c, d]: &[f64; 4], margin: f64, [x, y]: Point) -> bool {
 }
 
 /// Returns whether `place` is at the end of the way out by that door.
-fn is_outside(door: usize, place: Point) -> bool {
-    let (x, out) = OUTER[door];
-    (place[0] - x) * out > 2.0
+fn is_outside(door: usize, position: Point) -> bool {
+    let (x, out) = OUTER_DOORS[door];
+    (position[0] - x) * out > 2.0
 }
 
 /// Returns a chair that was moved a little.
-fn moved(([x, y], turn): (Point, f64), random: &mut fastrand::Rng) -> (Point, f64) {
-    let mut off = |most: f64| most * (2.0 * random.f64() - 1.0);
-    ([x + off(CHAIR_MOVES.0), y + off(CHAIR_MOVES.0)], turn + off(CHAIR_MOVES.1))
+fn move_chair(([x, y], turn): (Point, f64), random: &mut fastrand::Rng) -> (Point, f64) {
+    let mut off = |maximum: f64| maximum * (2.0 * random.f64() - 1.0);
+    ([x + off(MAX_CHAIR_MOVE.0), y + off(MAX_CHAIR_MOVE.0)], turn + off(MAX_CHAIR_MOVE.1))
 }

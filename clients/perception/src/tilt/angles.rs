@@ -53,16 +53,16 @@ pub(crate) enum AngleUpdate {
     /// The angle was dropped.
     Dropped,
     /// The mount moved to this angle.
-    On,
+    Moved,
     /// The angles between the last one and this one are unknown.
-    Torn,
+    Interrupted,
 }
 
 #[derive(Clone, Copy)]
 struct Entry {
     angle: Angle,
     /// Reason why the angles between the last one and this one are unknown.
-    torn: Option<DropReason>,
+    drop_reason: Option<DropReason>,
 }
 
 /// The most recent angles.
@@ -74,14 +74,14 @@ pub(crate) struct Angles {
 }
 
 /// Maximum number of stored angles: ten seconds at 100 Hz.
-const ANGLES: usize = 1024;
+const MAX_ANGLES: usize = 1024;
 /// Difference from other stamps at which a clock is taken to have been set back, or from scans at which an angle is
 /// dropped.
-const JUMP_NS: u64 = 1_000_000_000;
+const CLOCK_JUMP_NS: u64 = 1_000_000_000;
 
 impl Angles {
     pub(crate) fn new() -> Angles {
-        Angles { entries: VecDeque::with_capacity(ANGLES), settled_ns: 0, late_ns: 0 }
+        Angles { entries: VecDeque::with_capacity(MAX_ANGLES), settled_ns: 0, late_ns: 0 }
     }
 
     /// Takes the next angle. The latest scan is from `scan_ns`.
@@ -96,58 +96,58 @@ impl Angles {
             counts.angles_invalid += 1;
             return AngleUpdate::Dropped;
         }
-        if scan_ns.is_some_and(|scan_ns| angle.stamp_ns > scan_ns.saturating_add(JUMP_NS)) {
+        if scan_ns.is_some_and(|scan_ns| angle.stamp_ns > scan_ns.saturating_add(CLOCK_JUMP_NS)) {
             counts.angles_in_future += 1;
             return AngleUpdate::Dropped;
         }
         let Some(before) = self.entries.back().map(|entry| entry.angle) else {
-            self.entries.push_back(Entry { angle, torn: Some(DropReason::Silent) });
-            return AngleUpdate::Torn;
+            self.entries.push_back(Entry { angle, drop_reason: Some(DropReason::Silent) });
+            return AngleUpdate::Interrupted;
         };
         if angle.stamp_ns <= before.stamp_ns {
             counts.angles_out_of_order += 1;
-            if before.stamp_ns - angle.stamp_ns > JUMP_NS {
+            if before.stamp_ns - angle.stamp_ns > CLOCK_JUMP_NS {
                 self.entries.clear();
-                self.entries.push_back(Entry { angle, torn: Some(DropReason::Silent) });
-                return AngleUpdate::Torn;
+                self.entries.push_back(Entry { angle, drop_reason: Some(DropReason::Silent) });
+                return AngleUpdate::Interrupted;
             }
             return AngleUpdate::Dropped;
         }
-        let torn = self.torn(&before, &angle, settings);
-        if self.entries.len() == ANGLES {
+        let drop_reason = self.drop_reason(&before, &angle, settings);
+        if self.entries.len() == MAX_ANGLES {
             self.entries.pop_front();
         }
-        self.entries.push_back(Entry { angle, torn });
-        if torn.is_some() { AngleUpdate::Torn } else { AngleUpdate::On }
+        self.entries.push_back(Entry { angle, drop_reason });
+        if drop_reason.is_some() { AngleUpdate::Interrupted } else { AngleUpdate::Moved }
     }
 
-    fn torn(&mut self, before: &Angle, angle: &Angle, settings: &Settings) -> Option<DropReason> {
+    fn drop_reason(&mut self, before: &Angle, angle: &Angle, settings: &Settings) -> Option<DropReason> {
         let lasts_ns = angle.stamp_ns - before.stamp_ns;
         let speed = (angle.angle_rad - before.angle_rad) / (lasts_ns as f64 * 1e-9);
         if lasts_ns > settings.gap_ns {
             return Some(DropReason::Silent);
         }
-        if speed.abs() > settings.fastest_rad_s {
+        if speed.abs() > settings.max_speed_rad_s {
             self.settled_ns = angle.stamp_ns.saturating_add(settings.settle_ns);
         }
         if angle.stamp_ns <= self.settled_ns {
             return Some(DropReason::Jumped);
         }
         // At a reversal, the rates differ, and the speed is between them.
-        let (least, most) =
+        let (lowest, highest) =
             (before.rate_rad_s.min(angle.rate_rad_s), before.rate_rad_s.max(angle.rate_rad_s));
-        let is_off = speed < least - settings.rate_rad_s || speed > most + settings.rate_rad_s;
+        let is_off = speed < lowest - settings.rate_rad_s || speed > highest + settings.rate_rad_s;
         is_off.then_some(DropReason::Inconsistent)
     }
 
     /// Marks all angles after the one with the stamp `since_ns` as standing.
-    pub(crate) fn stand_since(&mut self, since_ns: u64) {
-        let stands = |entry: &&mut Entry| entry.angle.stamp_ns > since_ns && entry.torn.is_none();
+    pub(crate) fn mark_standing(&mut self, since_ns: u64) {
+        let stands = |entry: &&mut Entry| entry.angle.stamp_ns > since_ns && entry.drop_reason.is_none();
         self.entries
             .iter_mut()
             .rev()
             .take_while(stands)
-            .for_each(|entry| entry.torn = Some(DropReason::Standing));
+            .for_each(|entry| entry.drop_reason = Some(DropReason::Standing));
     }
 
     /// Returns the delay of all stamps.
@@ -172,19 +172,19 @@ impl Angles {
 
     /// Returns the reason why the angles before the last one are unknown.
     pub(crate) fn problem(&self) -> Option<DropReason> {
-        self.entries.back().map_or(Some(DropReason::Silent), |entry| entry.torn)
+        self.entries.back().map_or(Some(DropReason::Silent), |entry| entry.drop_reason)
     }
 
     /// Returns the angle at `time_ns`, interpolated between those before and after.
     pub(crate) fn at(&self, time_ns: u64) -> AngleLookup {
         let time_ns = time_ns.saturating_add_signed(self.late_ns);
         let after = self.entries.partition_point(|entry| entry.angle.stamp_ns < time_ns);
-        let Some(Entry { angle, torn }) = self.entries.get(after) else { return AngleLookup::Open };
+        let Some(Entry { angle, drop_reason }) = self.entries.get(after) else { return AngleLookup::Open };
         let Some(before) = after.checked_sub(1).map(|i| self.entries[i].angle) else {
             return AngleLookup::Never(DropReason::Silent);
         };
-        match torn {
-            Some(why) => AngleLookup::Never(*why),
+        match drop_reason {
+            Some(reason) => AngleLookup::Never(*reason),
             None => {
                 let share = (time_ns - before.stamp_ns) as f64 / (angle.stamp_ns - before.stamp_ns) as f64;
                 AngleLookup::Known(before.angle_rad + share * (angle.angle_rad - before.angle_rad))
@@ -198,14 +198,14 @@ impl Angles {
 pub(crate) enum SwingEvent {
     Nothing,
     /// The mount reversed at this time.
-    Turned(u64),
+    Reversed(u64),
     /// The mount has been standing since this time.
-    Stands(u64),
+    Standing(u64),
 }
 
 /// An angle with its stamp.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Place {
+struct StampedAngle {
     stamp_ns: u64,
     rad: f64,
 }
@@ -214,11 +214,11 @@ struct Place {
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Direction {
     /// Unknown, with the minimum and maximum angle since then.
-    Open { least: Place, most: Place },
+    Open { lowest: StampedAngle, highest: StampedAngle },
     /// To larger angles, with the maximum so far.
-    Up(Place),
+    Up(StampedAngle),
     /// To smaller angles, with the minimum so far.
-    Down(Place),
+    Down(StampedAngle),
 }
 
 /// Detects the reversals of a mount, and whether it stands. Thanks to a hysteresis, play of the gears is neither.
@@ -226,40 +226,40 @@ enum Direction {
 pub(crate) struct ReversalDetector {
     direction: Option<Direction>,
     /// Last angle at which it moved.
-    moved: Option<Place>,
+    moved: Option<StampedAngle>,
 }
 
 impl ReversalDetector {
     /// Resets the detector.
-    pub(crate) fn forget(&mut self) {
+    pub(crate) fn reset(&mut self) {
         *self = ReversalDetector::default();
     }
 
     /// Takes the next angle.
     pub(crate) fn take(&mut self, stamp_ns: u64, rad: f64, settings: &Settings) -> SwingEvent {
         use Direction::{Down, Open, Up};
-        use SwingEvent::{Nothing, Turned};
-        let here = Place { stamp_ns, rad };
+        use SwingEvent::{Nothing, Reversed};
+        let here = StampedAngle { stamp_ns, rad };
         let moved = *self.moved.get_or_insert(here);
-        if (rad - moved.rad).abs() > settings.turn_rad / 10.0 {
+        if (rad - moved.rad).abs() > settings.reversal_rad / 10.0 {
             self.moved = Some(here);
         } else if stamp_ns - moved.stamp_ns > settings.standing_ns {
             self.direction = None;
-            return SwingEvent::Stands(moved.stamp_ns);
+            return SwingEvent::Standing(moved.stamp_ns);
         }
-        let back = settings.turn_rad;
-        let (direction, event) = match self.direction.unwrap_or(Open { least: here, most: here }) {
-            Open { least, .. } if rad > least.rad + back => (Up(here), Nothing),
-            Open { most, .. } if rad < most.rad - back => (Down(here), Nothing),
-            Open { least, most } => {
-                let least = if rad <= least.rad { here } else { least };
-                let most = if rad >= most.rad { here } else { most };
-                (Open { least, most }, Nothing)
+        let back = settings.reversal_rad;
+        let (direction, event) = match self.direction.unwrap_or(Open { lowest: here, highest: here }) {
+            Open { lowest, .. } if rad > lowest.rad + back => (Up(here), Nothing),
+            Open { highest, .. } if rad < highest.rad - back => (Down(here), Nothing),
+            Open { lowest, highest } => {
+                let lowest = if rad <= lowest.rad { here } else { lowest };
+                let highest = if rad >= highest.rad { here } else { highest };
+                (Open { lowest, highest }, Nothing)
             }
-            Up(most) if rad < most.rad - back => (Down(here), Turned(most.stamp_ns)),
-            Up(most) => (Up(if rad >= most.rad { here } else { most }), Nothing),
-            Down(least) if rad > least.rad + back => (Up(here), Turned(least.stamp_ns)),
-            Down(least) => (Down(if rad <= least.rad { here } else { least }), Nothing),
+            Up(highest) if rad < highest.rad - back => (Down(here), Reversed(highest.stamp_ns)),
+            Up(highest) => (Up(if rad >= highest.rad { here } else { highest }), Nothing),
+            Down(lowest) if rad > lowest.rad + back => (Up(here), Reversed(lowest.stamp_ns)),
+            Down(lowest) => (Down(if rad <= lowest.rad { here } else { lowest }), Nothing),
         };
         self.direction = Some(direction);
         event
@@ -272,10 +272,10 @@ mod tests {
 
     const MS: u64 = 1_000_000;
 
-    fn angles(said: &[(u64, f64)]) -> (Angles, Vec<AngleUpdate>, Counts) {
+    fn angles(reported: &[(u64, f64)]) -> (Angles, Vec<AngleUpdate>, Counts) {
         let (mut angles, mut counts) = (Angles::new(), Counts::default());
         let settings = Settings::default();
-        let steps = said.iter().map(|&(ms, deg)| {
+        let steps = reported.iter().map(|&(ms, deg)| {
             let angle = Angle { stamp_ns: ms * MS, angle_rad: f64::to_radians(deg), rate_rad_s: f64::NAN };
             angles.take(angle, Some(1000 * MS), &settings, &mut counts)
         });
@@ -293,7 +293,7 @@ mod tests {
     #[test]
     fn between_two_angles_it_goes_evenly() {
         let (angles, steps, _) = angles(&[(10, 1.0), (20, 2.0), (40, 1.0)]);
-        assert_eq!(steps, [AngleUpdate::Torn, AngleUpdate::On, AngleUpdate::On]);
+        assert_eq!(steps, [AngleUpdate::Interrupted, AngleUpdate::Moved, AngleUpdate::Moved]);
         assert_eq!([15, 20, 30, 40].map(|ms| deg(&angles, ms)), [1.5, 2.0, 1.5, 1.0].map(Some));
         assert_eq!(
             (angles.at(9 * MS), angles.at(41 * MS)),
@@ -306,20 +306,20 @@ mod tests {
         let (silent, ..) = angles(&[(10, 1.0), (20, 2.0), (200, 3.0), (210, 4.0)]);
         assert_eq!(silent.at(100 * MS), AngleLookup::Never(DropReason::Silent));
         assert_eq!(deg(&silent, 205), Some(3.5));
-        let said: Vec<_> = (0..80).map(|i| (10 * i, if i < 5 { 0.0 } else { 8.0 })).collect();
-        let (jumped, steps, _) = angles(&said);
+        let reported: Vec<_> = (0..80).map(|i| (10 * i, if i < 5 { 0.0 } else { 8.0 })).collect();
+        let (jumped, steps, _) = angles(&reported);
         assert_eq!(jumped.at(45 * MS), AngleLookup::Never(DropReason::Jumped));
         assert_eq!(jumped.at(300 * MS), AngleLookup::Never(DropReason::Jumped), "not settled");
         assert_eq!(deg(&jumped, 600), Some(8.0));
-        assert_eq!(steps.iter().filter(|step| **step == AngleUpdate::On).count(), 4 + 80 - 5 - 51);
+        assert_eq!(steps.iter().filter(|step| **step == AngleUpdate::Moved).count(), 4 + 80 - 5 - 51);
     }
 
     #[test]
     fn stamps_that_cannot_be_are_dropped_and_counted() {
         let (angles, steps, counts) =
             angles(&[(1500, 1.0), (1490, 1.0), (2100, 1.0), (1510, 2.0), (100, 3.0), (110, 4.0)]);
-        use AngleUpdate::{Dropped as D, On, Torn};
-        assert_eq!(steps, [Torn, D, D, On, Torn, On]);
+        use AngleUpdate::{Dropped as D, Interrupted, Moved};
+        assert_eq!(steps, [Interrupted, D, D, Moved, Interrupted, Moved]);
         assert_eq!((counts.angles_out_of_order, counts.angles_in_future, counts.angles_invalid), (2, 1, 0));
         assert_eq!(deg(&angles, 105), Some(3.5), "the clock was set back");
     }
@@ -335,16 +335,19 @@ mod tests {
         };
         assert_eq!(
             [say(0, 0.0, 30.0), say(10, 0.3, 30.0), say(20, 0.1, -30.0)],
-            [AngleUpdate::Torn, AngleUpdate::On, AngleUpdate::On]
+            [AngleUpdate::Interrupted, AngleUpdate::Moved, AngleUpdate::Moved]
         );
-        assert_eq!([say(30, -0.2, 30.0), say(40, -0.5, 30.0)], [AngleUpdate::On, AngleUpdate::Torn]);
+        assert_eq!(
+            [say(30, -0.2, 30.0), say(40, -0.5, 30.0)],
+            [AngleUpdate::Moved, AngleUpdate::Interrupted]
+        );
         assert_eq!(angles.at(35 * MS), AngleLookup::Never(DropReason::Inconsistent));
     }
 
     #[test]
-    fn what_stands_is_marked_back_to_where_it_stood_still() {
+    fn marks_angles_as_standing_since_the_given_time() {
         let (mut angles, ..) = angles(&[(10, 1.0), (20, 2.0), (30, 2.0), (40, 2.0)]);
-        angles.stand_since(20 * MS);
+        angles.mark_standing(20 * MS);
         assert_eq!(deg(&angles, 15), Some(1.5));
         assert_eq!(angles.at(25 * MS), AngleLookup::Never(DropReason::Standing));
     }
@@ -369,7 +372,7 @@ mod tests {
         let times: Vec<u64> = turns
             .iter()
             .map(|event| match event {
-                SwingEvent::Turned(ns) => ns / MS,
+                SwingEvent::Reversed(ns) => ns / MS,
                 other => panic!("{other:?}"),
             })
             .collect();
@@ -382,8 +385,8 @@ mod tests {
     #[test]
     fn it_stands_when_the_angle_does() {
         let stands = events((0..200).map(|i| f64::from(i.min(100)) * 0.3));
-        let SwingEvent::Stands(since) = stands[0] else { panic!("{stands:?}") };
+        let SwingEvent::Standing(since) = stands[0] else { panic!("{stands:?}") };
         assert_eq!(since / MS, 1000);
-        assert!(stands[1..].iter().all(|event| *event == SwingEvent::Stands(since)), "as long as it does");
+        assert!(stands[1..].iter().all(|event| *event == SwingEvent::Standing(since)), "as long as it does");
     }
 }

@@ -14,7 +14,7 @@ pub(crate) struct Reading {
     /// Height that the beam gains with each meter, -1 to 1.
     pub(crate) rise: f32,
     /// Change of the rise per radian of the mount's angle.
-    pub(crate) turn: f32,
+    pub(crate) rise_change: f32,
     /// Range in meters. Infinite without a return.
     pub(crate) range_m: f32,
 }
@@ -37,25 +37,25 @@ struct Cell {
     /// Number of sweeps in a row that met the candidate.
     run: u16,
     /// Surfaces that beams meet now and then, because they are narrower than the distance between two scans.
-    narrow: [Narrow; NARROW],
+    narrow: [NarrowSurface; MAX_NARROW],
     /// Number of the last sweep that it was updated in, plus 1. Only one reading of a sweep counts.
-    seen: u32,
+    last_sweep: u32,
 }
 
 /// A surface that the beams of a cell do not meet in each sweep.
 #[derive(Clone, Copy, Default)]
-struct Narrow {
+struct NarrowSurface {
     surface: Surface,
     /// Number of sweeps that met it. Beams that meet a third surface decrease it. 0 if no surface is stored.
-    met: u16,
+    hit_count: u16,
     /// Number of times that a sweep met it and the sweep before did not.
     visits: u16,
     /// Number of sweeps since the last one that met it. Sweeps that did not measure the cell do not count.
-    missed: u16,
+    miss_count: u16,
 }
 
 /// The background of all beams.
-pub(crate) struct Model {
+pub(crate) struct SurfaceModel {
     beams: usize,
     /// Number of sweeps in which a surface must be met until it is background.
     sweeps: u16,
@@ -63,11 +63,11 @@ pub(crate) struct Model {
     rows: Box<[Box<[Cell]>]>,
 }
 
-impl Model {
+impl SurfaceModel {
     /// Creates an empty model, for a mount that tilts by at most 90 degrees to each side of level.
-    pub(crate) fn new(beams: usize, settings: &Settings) -> Model {
+    pub(crate) fn new(beams: usize, settings: &Settings) -> SurfaceModel {
         let rows = (std::f64::consts::PI / width_rad(settings)).ceil() as usize + 1;
-        Model { beams, sweeps: settings.sweeps, rows: (0..rows).map(|_| Box::default()).collect() }
+        SurfaceModel { beams, sweeps: settings.sweeps, rows: (0..rows).map(|_| Box::default()).collect() }
     }
 
     /// Returns the class of a reading, compared with the model.
@@ -79,13 +79,13 @@ impl Model {
             return PointClass::Background;
         }
         // At edges a beam meets the surfaces of its neighbors.
-        let beside = || {
+        let neighbors = || {
             let rows = row.saturating_sub(1)..=row + 1;
             rows.flat_map(|row| (beam.saturating_sub(1)..=beam + 1).map(move |beam| (row, beam)))
         };
-        let mut all = beside().filter_map(|(row, beam)| self.background(row, beam));
+        let mut all = neighbors().filter_map(|(row, beam)| self.background(row, beam));
         let mut narrow =
-            beside().filter_map(|(row, beam)| self.cell(row, beam)).flat_map(|cell| &cell.narrow);
+            neighbors().filter_map(|(row, beam)| self.cell(row, beam)).flat_map(|cell| &cell.narrow);
         if all.any(|surface| explains(&surface))
             || narrow.any(|narrow| narrow.is_background(self.sweeps) && explains(&narrow.surface))
         {
@@ -101,7 +101,7 @@ impl Model {
     }
 
     /// Returns whether the background of the reading's own cell is known.
-    pub(crate) fn knows(&self, reading: &Reading, row: usize) -> bool {
+    pub(crate) fn is_known(&self, reading: &Reading, row: usize) -> bool {
         self.background(row, reading.beam.into()).is_some()
     }
 
@@ -112,8 +112,9 @@ impl Model {
         let known = self.background(row, reading.beam.into())?;
         let [level, upright] = known.ends(reading);
         let is_level = known.expected(reading, threshold_m) == (level, level) && level != upright;
-        let tells = is_level && reading.range_m.is_finite() && reading.turn.abs() > LEAST_TURN;
-        tells.then(|| (known.range_m * known.rise / reading.range_m - reading.rise) / reading.turn)
+        let is_usable =
+            is_level && reading.range_m.is_finite() && reading.rise_change.abs() > MIN_RISE_CHANGE;
+        is_usable.then(|| (known.range_m * known.rise / reading.range_m - reading.rise) / reading.rise_change)
     }
 
     /// Learns from a reading of sweep number `sweep`.
@@ -124,15 +125,15 @@ impl Model {
             *cells = vec![Cell::default(); beams].into();
         }
         let Some(cell) = cells.get_mut(usize::from(reading.beam)) else { return };
-        let is_first = cell.seen != sweep + 1;
+        let is_first = cell.last_sweep != sweep + 1;
         if is_first {
-            cell.seen = sweep + 1;
+            cell.last_sweep = sweep + 1;
             cell.narrow.iter_mut().for_each(|narrow| narrow.begin_sweep(settings.sweeps));
         }
         let threshold_m = settings.threshold_m as f32;
         if cell.background.is_known() && cell.background.explains(reading, threshold_m) {
             if is_first {
-                cell.background.meet(reading);
+                cell.background.update(reading);
                 cell.run = 0;
             }
             return;
@@ -142,7 +143,7 @@ impl Model {
             return;
         }
         if cell.run > 0 && cell.candidate.explains(reading, threshold_m) {
-            cell.candidate.meet(reading);
+            cell.candidate.update(reading);
             cell.run += 1;
         } else {
             (cell.candidate, cell.run) = (Surface::of(reading), 1);
@@ -153,7 +154,7 @@ impl Model {
     }
 
     /// Forgets everything.
-    pub(crate) fn forget(&mut self) {
+    pub(crate) fn clear(&mut self) {
         self.rows.iter_mut().for_each(|cells| cells.fill(Cell::default()));
     }
 
@@ -169,51 +170,53 @@ impl Model {
 impl Cell {
     /// Counts the sweeps that meet surfaces other than the background.
     fn learn_narrow(&mut self, reading: &Reading, sweeps: u16, threshold_m: f32) {
-        let met = |narrow: &&mut Narrow| narrow.met > 0 && narrow.surface.explains(reading, threshold_m);
-        if let Some(narrow) = self.narrow.iter_mut().find(met) {
-            narrow.meet(reading, sweeps);
+        let explains = |narrow: &&mut NarrowSurface| {
+            narrow.hit_count > 0 && narrow.surface.explains(reading, threshold_m)
+        };
+        if let Some(narrow) = self.narrow.iter_mut().find(explains) {
+            narrow.record_hit(reading, sweeps);
             return;
         }
-        let Some(least) = self.narrow.iter_mut().min_by_key(|narrow| narrow.met) else { return };
-        least.met = least.met.saturating_sub(1);
-        if least.met == 0 {
-            *least = Narrow { surface: Surface::of(reading), met: 1, visits: 1, missed: 0 };
+        let Some(rarest) = self.narrow.iter_mut().min_by_key(|narrow| narrow.hit_count) else { return };
+        rarest.hit_count = rarest.hit_count.saturating_sub(1);
+        if rarest.hit_count == 0 {
+            *rarest = NarrowSurface { surface: Surface::of(reading), hit_count: 1, visits: 1, miss_count: 0 };
         }
     }
 }
 
-impl Narrow {
+impl NarrowSurface {
     /// Returns whether it is background. An object that stands still for a while and leaves visits the cell once. People who
     /// walk do not return to the same range.
     fn is_background(&self, sweeps: u16) -> bool {
-        self.met >= sweeps && self.visits >= VISITS.min(sweeps)
+        self.hit_count >= sweeps && self.visits >= MIN_VISITS.min(sweeps)
     }
 
     /// A sweep measures its cell. Forgets the surface if too many sweeps have met something else.
     fn begin_sweep(&mut self, sweeps: u16) {
-        self.missed = self.missed.saturating_add(1);
-        if self.missed > sweeps.saturating_mul(MEMORY) {
-            *self = Narrow::default();
+        self.miss_count = self.miss_count.saturating_add(1);
+        if self.miss_count > sweeps.saturating_mul(FORGET_FACTOR) {
+            *self = NarrowSurface::default();
         }
     }
 
-    fn meet(&mut self, reading: &Reading, sweeps: u16) {
-        if self.missed > 0 {
-            self.met = (self.met + 1).min(sweeps.saturating_mul(2).max(1));
-            self.visits = self.visits.saturating_add(u16::from(self.missed > 1));
+    fn record_hit(&mut self, reading: &Reading, sweeps: u16) {
+        if self.miss_count > 0 {
+            self.hit_count = (self.hit_count + 1).min(sweeps.saturating_mul(2).max(1));
+            self.visits = self.visits.saturating_add(u16::from(self.miss_count > 1));
         }
-        self.missed = 0;
-        self.surface.meet(reading);
+        self.miss_count = 0;
+        self.surface.update(reading);
     }
 }
 
 /// Width of a row. Narrower ones would take memory without end.
 fn width_rad(settings: &Settings) -> f64 {
-    settings.bin_rad.max(LEAST_BIN_RAD)
+    settings.bin_rad.max(MIN_BIN_RAD)
 }
 
 /// Returns the row of the model for a beam at `beam_rad` that was measured at `angle_rad`, and how it is compared with it.
-pub(crate) fn placed(
+pub(crate) fn row_for(
     mount: &Mount,
     settings: &Settings,
     (angle_rad, beam_rad): (f64, f64),
@@ -225,7 +228,7 @@ pub(crate) fn placed(
     let row = (from_lowest / width_rad(settings)).floor().max(0.0) as usize;
     let rise = |angle_rad: f64| mount.direction(angle_rad, beam_rad)[2];
     let turn = (rise(angle_rad + STEP_RAD) - rise(angle_rad)) / STEP_RAD;
-    (row, Reading { beam, rise: rise(angle_rad) as f32, turn: turn as f32, range_m })
+    (row, Reading { beam, rise: rise(angle_rad) as f32, rise_change: turn as f32, range_m })
 }
 
 impl Surface {
@@ -242,8 +245,8 @@ impl Surface {
     fn ends(&self, reading: &Reading) -> [f32; 2] {
         let Surface { range_m, rise, .. } = *self;
         let over_ground = |rise: f32| (1.0 - rise * rise).max(0.0).sqrt();
-        let upright = range_m * over_ground(rise) / over_ground(reading.rise).max(LEAST_OVER_GROUND);
-        let is_slope = rise * reading.rise > 0.0 && rise.abs().min(reading.rise.abs()) > LEAST_RISE;
+        let upright = range_m * over_ground(rise) / over_ground(reading.rise).max(MIN_OVER_GROUND);
+        let is_slope = rise * reading.rise > 0.0 && rise.abs().min(reading.rise.abs()) > MIN_RISE;
         [if is_slope { range_m * rise / reading.rise } else { upright }, upright]
     }
 
@@ -260,11 +263,11 @@ impl Surface {
     }
 
     /// Takes a beam that ended on it.
-    fn meet(&mut self, reading: &Reading) {
+    fn update(&mut self, reading: &Reading) {
         if reading.range_m.is_finite() {
             let ends = self.ends(reading);
             for (off, end) in self.off.iter_mut().zip(ends) {
-                *off += NEWS * ((end - reading.range_m).powi(2) - *off);
+                *off += UPDATE_WEIGHT * ((end - reading.range_m).powi(2) - *off);
             }
         }
     }
@@ -273,28 +276,28 @@ impl Surface {
         if self.range_m.is_infinite() || reading.range_m.is_infinite() {
             return self.range_m == reading.range_m;
         }
-        let (least, most) = self.expected(reading, threshold_m);
-        (least - threshold_m..=most + threshold_m).contains(&reading.range_m)
+        let (min_m, max_m) = self.expected(reading, threshold_m);
+        (min_m - threshold_m..=max_m + threshold_m).contains(&reading.range_m)
     }
 }
 
 /// Number of narrow surfaces that a cell stores, such as the edge and the top of a board.
-const NARROW: usize = 2;
+const MAX_NARROW: usize = 2;
 /// Minimum number of visits of a narrow surface that is background. Objects that are put down and people can visit twice.
-const VISITS: u16 = 3;
+const MIN_VISITS: u16 = 3;
 /// A narrow surface is forgotten when this many times the sweeps of the setting have not met it in a row.
-const MEMORY: u16 = 20;
+const FORGET_FACTOR: u16 = 20;
 /// Less than a planar scanner measures exactly.
-const LEAST_BIN_RAD: f64 = 0.002;
+const MIN_BIN_RAD: f64 = 0.002;
 /// Weight of the last beam in the mean squares of a surface.
-const NEWS: f32 = 0.25;
+const UPDATE_WEIGHT: f32 = 0.25;
 /// A beam goes nearly straight up or down.
-const LEAST_OVER_GROUND: f32 = 0.02;
+const MIN_OVER_GROUND: f32 = 0.02;
 /// Beams along the axis keep their height at any angle.
-const LEAST_TURN: f32 = 0.3;
+const MIN_RISE_CHANGE: f32 = 0.3;
 /// A beam that rises less ends on no level surface within reach but one in the plane of the scanner: 8 m away it is 0.16 m from
 /// there.
-const LEAST_RISE: f32 = 0.02;
+const MIN_RISE: f32 = 0.02;
 
 #[cfg(test)]
 mod tests {
@@ -305,13 +308,13 @@ mod tests {
     }
 
     fn reading(range_m: f32) -> Reading {
-        Reading { beam: 5, rise: -0.2, turn: -1.0, range_m }
+        Reading { beam: 5, rise: -0.2, rise_change: -1.0, range_m }
     }
 
     #[test]
-    fn what_is_met_in_enough_sweeps_in_a_row_is_background() {
-        let mut model = Model::new(11, &settings());
-        let class = |model: &Model, range| model.class(&reading(range), 90, 0.06);
+    fn surface_met_in_consecutive_sweeps_is_background() {
+        let mut model = SurfaceModel::new(11, &settings());
+        let class = |model: &SurfaceModel, range| model.class(&reading(range), 90, 0.06);
         for (sweep, range) in [4.0, 4.0, 2.0, 4.0, 4.0].into_iter().enumerate() {
             model.learn(&reading(range), 90, sweep as u32, &settings());
             assert_eq!(class(&model, 2.0), PointClass::Unknown, "after sweep {sweep}");
@@ -322,14 +325,14 @@ mod tests {
         assert_eq!(class(&model, f32::INFINITY), Behind);
         (6..9).for_each(|sweep| model.learn(&reading(2.0), 90, sweep, &settings()));
         assert_eq!([2.0, 4.0].map(|range| class(&model, range)), [Background, Behind], "it stays");
-        model.forget();
+        model.clear();
         assert_eq!(class(&model, 2.0), PointClass::Unknown);
     }
 
     #[test]
-    fn a_surface_that_is_met_now_and_then_is_background_after_three_visits() {
+    fn intermittent_surface_is_background_after_3_visits() {
         use PointClass::{Background, Foreground};
-        let mut model = Model::new(11, &settings());
+        let mut model = SurfaceModel::new(11, &settings());
         let mut classes = Vec::new();
         for sweep in 0..16 {
             let range_m = if sweep % 4 == 3 { 2.0 } else { 4.0 };
@@ -338,14 +341,14 @@ mod tests {
         }
         assert_eq!(classes[3..], [[Foreground; 9].as_slice(), &[Background; 4]].concat());
         assert_eq!(model.class(&reading(3.0), 90, 0.06), Foreground, "before both");
-        let beside = Reading { beam: 6, ..reading(4.0) };
-        (16..20).for_each(|sweep| model.learn(&beside, 91, sweep, &settings()));
+        let neighbor = Reading { beam: 6, ..reading(4.0) };
+        (16..20).for_each(|sweep| model.learn(&neighbor, 91, sweep, &settings()));
         assert_eq!(model.class(&Reading { beam: 6, ..reading(2.0) }, 91, 0.06), Background, "beside it");
     }
 
     /// Returns whether the reading at 2 m is background after `sweeps`. Each has a range, or `None` if it did not measure the cell.
     fn is_narrow_background(settings: &Settings, sweeps: impl IntoIterator<Item = Option<f32>>) -> bool {
-        let mut model = Model::new(11, settings);
+        let mut model = SurfaceModel::new(11, settings);
         for (sweep, range_m) in sweeps.into_iter().enumerate() {
             if let Some(range_m) = range_m {
                 model.learn(&reading(range_m), 90, sweep as u32, settings);
@@ -355,7 +358,7 @@ mod tests {
     }
 
     #[test]
-    fn a_narrow_surface_is_background_after_the_sweeps_of_the_settings() {
+    fn narrow_surface_needs_the_configured_sweeps() {
         let visits = |count| [Some(4.0); 20].into_iter().chain([Some(4.0), Some(2.0)].repeat(count));
         for (sweeps, wanted) in [(1, 1), (3, 3), (5, 5), (12, 12)] {
             let settings = Settings { sweeps, ..Settings::default() };
@@ -383,20 +386,20 @@ mod tests {
     }
 
     #[test]
-    fn what_stands_for_a_while_or_walks_does_not_return() {
+    fn removed_and_moving_objects_are_foreground() {
         use PointClass::Foreground;
-        let mut model = Model::new(11, &settings());
-        let met = |ranges: &[f32], from: u32, model: &mut Model| {
+        let mut model = SurfaceModel::new(11, &settings());
+        let learn_ranges = |ranges: &[f32], from: u32, model: &mut SurfaceModel| {
             for (range_m, sweep) in ranges.iter().zip(from..) {
                 model.learn(&reading(*range_m), 90, sweep, &settings());
             }
         };
-        met(&[4.0; 5], 0, &mut model);
+        learn_ranges(&[4.0; 5], 0, &mut model);
         // An object stands there until it is background, and leaves.
-        met(&[2.0, 2.0, 2.0, 2.0, 4.0, 4.0, 4.0, 4.0], 5, &mut model);
+        learn_ranges(&[2.0, 2.0, 2.0, 2.0, 4.0, 4.0, 4.0, 4.0], 5, &mut model);
         assert_eq!(model.class(&reading(2.0), 90, 0.06), Foreground);
         let walks = [1.5, 4.0, 2.5, 3.0, 4.0, 2.0, 1.7, 4.0, 3.3, 2.5, 4.0, 1.5, 2.2, 4.0, 3.6, 2.8, 4.0];
-        met(&walks, 13, &mut model);
+        learn_ranges(&walks, 13, &mut model);
         for range_m in walks.into_iter().filter(|range_m| *range_m < 4.0) {
             assert_eq!(model.class(&reading(range_m), 90, 0.06), Foreground, "{range_m}");
         }
@@ -404,25 +407,25 @@ mod tests {
 
     #[test]
     fn a_sweep_counts_once_however_often_a_cell_is_met() {
-        let mut model = Model::new(11, &settings());
+        let mut model = SurfaceModel::new(11, &settings());
         (0..9).for_each(|_| model.learn(&reading(4.0), 90, 0, &settings()));
-        assert!(!model.knows(&reading(4.0), 90));
+        assert!(!model.is_known(&reading(4.0), 90));
     }
 
     #[test]
-    fn a_floor_stays_a_floor_wherever_in_its_cell_it_is_met() {
+    fn level_surface_explains_readings_across_its_cell() {
         let mut floor = Surface { range_m: 5.0, rise: -0.2, off: [0.0; 2] };
         let at = |rise: f32, range_m| Reading { rise, ..reading(range_m) };
         assert!(floor.explains(&at(-0.21, 1.0 / 0.21), 0.01) && floor.explains(&at(-0.19, 1.0 / 0.19), 0.01));
         assert!(floor.explains(&at(-0.21, 5.0 * (0.96_f32 / (1.0 - 0.0441)).sqrt()), 0.01), "a wall");
         assert!(!floor.explains(&at(-0.21, 1.0 / 0.21 - 0.05), 0.01));
         assert!(!floor.explains(&at(0.01, 20.0), 0.01), "a beam that rises");
-        (0..4).for_each(|_| floor.meet(&at(-0.21, 1.0 / 0.21)));
+        (0..4).for_each(|_| floor.update(&at(-0.21, 1.0 / 0.21)));
         assert!(floor.explains(&at(-0.21, 1.0 / 0.21), 0.05), "seen to be level");
         assert!(!floor.explains(&at(-0.21, 5.0), 0.05), "and no wall any more");
         // A table's top a little below the scanner, from which a beam is met farther away with each minute of arc.
         let mut top = Surface { range_m: 4.76, rise: -0.042, off: [0.0; 2] };
-        (1..5).for_each(|i| top.meet(&at(-0.042 - 0.001 * i as f32, 0.2 / (0.042 + 0.001 * i as f32))));
+        (1..5).for_each(|i| top.update(&at(-0.042 - 0.001 * i as f32, 0.2 / (0.042 + 0.001 * i as f32))));
         assert!(top.explains(&at(-0.047, 0.2 / 0.047), 0.06) && !top.explains(&at(-0.047, 3.9), 0.06));
         let sky = Surface { range_m: f32::INFINITY, rise: 0.1, off: [0.0; 2] };
         assert!(sky.explains(&at(0.1, f32::INFINITY), 0.01) && !sky.explains(&at(0.1, 9.0), 0.01));
@@ -430,11 +433,11 @@ mod tests {
 
     /// The same by the definition, from all that a cell was ever met with: one surface a sweep, background is the last that was
     /// met in enough sweeps in a row.
-    fn slowly(met: &[f32], scans: usize) -> Option<f32> {
+    fn reference_background(ranges: &[f32], scans: usize) -> Option<f32> {
         let same = |a: f32, b: f32| a == b || (a - b).abs() <= 0.06;
         let mut background = None;
         let mut run: Vec<f32> = Vec::new();
-        for &range in met {
+        for &range in ranges {
             if background.is_some_and(|known| same(known, range)) {
                 run.clear();
                 continue;
@@ -456,14 +459,14 @@ mod tests {
         for seed in 0..200 {
             let mut random = fastrand::Rng::with_seed(seed);
             let surfaces = [2.0, 2.05, 3.0, f32::INFINITY];
-            let mut model = Model::new(11, &settings());
-            let mut met = Vec::new();
+            let mut model = SurfaceModel::new(11, &settings());
+            let mut ranges = Vec::new();
             for sweep in 0..40 {
                 let range = surfaces[random.usize(..4) * random.usize(..2)];
                 let known = model.background(90, 5).map(|surface| surface.range_m);
-                assert_eq!(known, slowly(&met, 3), "seed {seed}, sweep {sweep}");
+                assert_eq!(known, reference_background(&ranges, 3), "seed {seed}, sweep {sweep}");
                 model.learn(&reading(range), 90, sweep, &settings());
-                met.push(range);
+                ranges.push(range);
             }
         }
     }

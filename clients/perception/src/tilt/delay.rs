@@ -4,19 +4,19 @@
 use super::sweep::Ray;
 
 /// Number of directions of the scanner that are compared.
-const COLUMNS: usize = 24;
+const COLUMN_COUNT: usize = 24;
 /// Fewer points on slopes do not show a delay.
-const ENOUGH: usize = 60;
+const MIN_VOTES: usize = 60;
 /// Two sweeps that are farther apart than this show a delay, in radians: 0.1 degrees.
-const LEAST_RAD: f64 = 0.0017;
+const MIN_SHIFT_RAD: f64 = 0.0017;
 /// Maximum delay that is corrected, in seconds.
-pub(crate) const MOST_S: f64 = 0.15;
+pub(crate) const MAX_DELAY_S: f64 = 0.15;
 /// Meters that the end of a beam moves by per radian of the mount's angle. On flatter slopes, noise hides the delay.
-const LEAST_SLOPE_M: f64 = 3.0;
+const MIN_SLOPE_M: f64 = 3.0;
 /// Two neighboring slopes on one surface differ by at most this share.
-const BEND: f64 = 0.3;
+const MAX_SLOPE_DIFFERENCE: f64 = 0.3;
 /// Points farther apart than this, in radians, are not joined.
-const GAP_RAD: f64 = 0.06;
+const MAX_GAP_RAD: f64 = 0.06;
 
 /// A beam of a sweep.
 #[derive(Clone, Copy)]
@@ -47,7 +47,7 @@ pub(crate) struct Delay {
 
 impl Delay {
     /// Forgets all sweeps.
-    pub(crate) fn forget(&mut self) {
+    pub(crate) fn reset(&mut self) {
         (self.before.until_ns, self.now.until_ns, self.last) = (0, 0, None);
     }
 
@@ -67,9 +67,10 @@ impl Delay {
         let measured = if is_pair { self.measure() } else { None };
         let before = std::mem::replace(&mut self.last, measured.map(|(late_s, _)| late_s));
         let ((late_s, rate), before_s) = (measured?, before?);
-        let agrees = (late_s - before_s).abs() * rate < LEAST_RAD.max(0.2 * late_s.abs() * rate);
-        let is_worth_it = late_s.abs().min(before_s.abs()) * rate > LEAST_RAD && late_s.abs() < MOST_S;
-        (agrees && is_worth_it).then_some(late_s)
+        let agrees = (late_s - before_s).abs() * rate < MIN_SHIFT_RAD.max(0.2 * late_s.abs() * rate);
+        let is_significant =
+            late_s.abs().min(before_s.abs()) * rate > MIN_SHIFT_RAD && late_s.abs() < MAX_DELAY_S;
+        (agrees && is_significant).then_some(late_s)
     }
 
     /// Returns the delay in seconds, and the rate at which the two sweeps move apart by it, in radians a second.
@@ -79,21 +80,21 @@ impl Delay {
             let mut rate = 0.0;
             self.votes.clear();
             for (now, before) in self.now.columns.iter().zip(&self.before.columns) {
-                for around in now.windows(3) {
-                    if let Some((vote, apart)) = vote(around, before, late_s) {
+                for window in now.windows(3) {
+                    if let Some((vote, apart)) = vote(window, before, late_s) {
                         self.votes.push(vote);
                         rate += apart;
                     }
                 }
             }
-            if self.votes.len() < ENOUGH {
+            if self.votes.len() < MIN_VOTES {
                 return None;
             }
             rate /= self.votes.len() as f64;
             let middle = self.votes.len() / 2;
             let more_s = *self.votes.select_nth_unstable_by(middle, f64::total_cmp).1;
             late_s += more_s;
-            if more_s.abs() * rate < LEAST_RAD {
+            if more_s.abs() * rate < MIN_SHIFT_RAD {
                 return Some((late_s, rate));
             }
         }
@@ -103,14 +104,14 @@ impl Delay {
 
 /// Returns the delay that the middle one of three samples shows in addition to `late_s`, and the rate at which the sweeps move
 /// apart with it.
-fn vote(around: &[Sample], before: &[Sample], late_s: f64) -> Option<(f64, f64)> {
-    let [first, here, last] = around else { return None };
+fn vote(window: &[Sample], before: &[Sample], late_s: f64) -> Option<(f64, f64)> {
+    let [first, here, last] = window else { return None };
     let rate = (last.angle_rad - first.angle_rad) / (last.time_s - first.time_s);
     let apart = rate - slopes(before, here.angle_rad)?.rate;
     let angle_rad = here.angle_rad + apart * late_s;
     let there = slopes(before, angle_rad)?;
     let expected = there.at.inverse + there.slope * (angle_rad - there.at.angle_rad);
-    let is_steep = there.slope.abs() > LEAST_SLOPE_M * here.inverse * here.inverse;
+    let is_steep = there.slope.abs() > MIN_SLOPE_M * here.inverse * here.inverse;
     // Where the mount turns back, the sweeps are hardly apart.
     let goes_back = rate * there.rate < 0.0 && apart.abs() > rate.abs();
     (is_steep && goes_back).then(|| ((here.inverse - expected) / (there.slope * apart), apart.abs()))
@@ -129,8 +130,8 @@ fn slopes(column: &[Sample], angle_rad: f64) -> Option<Slopes> {
     let [a, b, c, d] = column.get(after.checked_sub(2)?..after + 2)? else { return None };
     let slope = |a: &Sample, b: &Sample| (b.inverse - a.inverse) / (b.angle_rad - a.angle_rad);
     let [left, middle, right] = [slope(a, b), slope(b, c), slope(c, d)];
-    let is_plane = (left - middle).abs().max((right - middle).abs()) < BEND * middle.abs();
-    let is_near = d.angle_rad - a.angle_rad < 3.0 * GAP_RAD;
+    let is_plane = (left - middle).abs().max((right - middle).abs()) < MAX_SLOPE_DIFFERENCE * middle.abs();
+    let is_near = d.angle_rad - a.angle_rad < 3.0 * MAX_GAP_RAD;
     let rate = (d.angle_rad - a.angle_rad) / (d.time_s - a.time_s);
     (is_plane && is_near).then_some(Slopes { at: *b, slope: middle, rate })
 }
@@ -138,7 +139,7 @@ fn slopes(column: &[Sample], angle_rad: f64) -> Option<Slopes> {
 impl Profile {
     /// Takes the beams that are compared, by growing angles.
     fn fill(&mut self, rays: &[Ray], beams: usize, from_ns: u64) {
-        let every = (beams / COLUMNS).max(1);
+        let every = (beams / COLUMN_COUNT).max(1);
         self.columns.resize_with(beams.div_ceil(every), Vec::new);
         self.columns.iter_mut().for_each(Vec::clear);
         for ray in rays {

@@ -42,24 +42,24 @@ impl Mount {
     pub fn direction(&self, angle_rad: f64, beam_rad: f64) -> [f64; 3] {
         let turned = if self.is_upside_down { -beam_rad } else { beam_rad };
         let (sin, cos) = (self.yaw_rad + turned).sin_cos();
-        self.turned([cos, sin, 0.0], angle_rad)
+        self.rotated([cos, sin, 0.0], angle_rad)
     }
 
     /// Returns the origin of the beams while the mount's angle is `angle_rad`.
     pub fn origin(&self, angle_rad: f64) -> [f64; 3] {
         let arm = std::array::from_fn(|i| self.sensor_at[i] - self.axis_at[i]);
-        let arm = self.turned(arm, angle_rad);
+        let arm = self.rotated(arm, angle_rad);
         std::array::from_fn(|i| self.axis_at[i] + arm[i])
     }
 
     /// Returns the end of that beam, `range_m` away.
     pub fn point(&self, angle_rad: f64, beam_rad: f64, range_m: f64) -> [f64; 3] {
-        let (origin, way) = (self.origin(angle_rad), self.direction(angle_rad, beam_rad));
-        std::array::from_fn(|i| origin[i] + range_m * way[i])
+        let (origin, direction) = (self.origin(angle_rad), self.direction(angle_rad, beam_rad));
+        std::array::from_fn(|i| origin[i] + range_m * direction[i])
     }
 
     /// Rodrigues' formula.
-    fn turned(&self, v: [f64; 3], angle_rad: f64) -> [f64; 3] {
+    fn rotated(&self, v: [f64; 3], angle_rad: f64) -> [f64; 3] {
         let length = dot(self.axis, self.axis).sqrt();
         let k = self.axis.map(|value| value / length);
         let (sin, cos) = (angle_rad - self.level_rad).sin_cos();
@@ -77,25 +77,25 @@ fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
 }
 
 /// The floor is searched up to this distance from height 0, in meters.
-const FLOOR_M: f64 = 0.4;
+const MAX_FLOOR_OFFSET_M: f64 = 0.4;
 /// Points farther away than this are not used: small angles move them too far.
-const FAR_M: f64 = 6.0;
+const MAX_DISTANCE_M: f64 = 6.0;
 /// Points of the wall have at least this height, in meters.
-const WALL_FROM_M: f64 = 0.3;
+const MIN_WALL_POINT_HEIGHT_M: f64 = 0.3;
 /// Width of the distances that are counted to find the wall, in meters.
 const BIN_M: f64 = 0.1;
 /// Fewer points make no plane.
-const ENOUGH: usize = 300;
+const MIN_POINTS: usize = 300;
 /// A wall is at least this high, in meters.
-const WALL_HIGH_M: f64 = 0.4;
+const MIN_WALL_HEIGHT_M: f64 = 0.4;
 /// Points with a larger standard deviation are not a wall, in meters.
-const ROUGH_M: f64 = 0.07;
+const MAX_ROUGHNESS_M: f64 = 0.07;
 /// Maximum number of points that are stored of a sweep. Each sweep has the same share, because up and down sweeps can differ.
-const POINTS: usize = 40_000;
+const MAX_POINTS: usize = 40_000;
 
 /// Points of sweeps, until they are enough.
 #[derive(Debug, Default)]
-pub struct Check {
+pub struct MountCheck {
     points: Vec<[f64; 3]>,
     sweeps: u32,
     /// Delay by which the angles of these sweeps are corrected, in ns.
@@ -130,7 +130,7 @@ pub struct Wall {
     pub points: usize,
 }
 
-impl Check {
+impl MountCheck {
     /// Takes the points of a complete sweep. If another delay corrects its angles than those of the sweeps before, the check
     /// starts again with this sweep.
     pub fn take(&mut self, sweep: &Sweep<'_>) {
@@ -138,12 +138,12 @@ impl Check {
             return;
         }
         if sweep.late_ns != self.late_ns {
-            *self = Check { late_ns: sweep.late_ns, ..Check::default() };
+            *self = MountCheck { late_ns: sweep.late_ns, ..MountCheck::default() };
         }
         self.sweeps += 1;
         let points = sweep.points.iter().map(|point| point.at.map(f64::from));
-        let near = points.filter(|at| at[0].hypot(at[1]) < FAR_M);
-        let every = near.clone().count().div_ceil(POINTS).max(1);
+        let near = points.filter(|at| at[0].hypot(at[1]) < MAX_DISTANCE_M);
+        let every = near.clone().count().div_ceil(MAX_POINTS).max(1);
         self.points.extend(near.step_by(every));
     }
 
@@ -154,7 +154,8 @@ impl Check {
 
     /// Returns the floor, if there are enough points on one plane.
     pub fn floor(&self, mount: &Mount) -> Option<Floor> {
-        let is_low = |at: &&[f64; 3]| at[2].abs() < FLOOR_M && at[0].hypot(at[1]) < FAR_M / 2.0;
+        let is_low =
+            |at: &&[f64; 3]| at[2].abs() < MAX_FLOOR_OFFSET_M && at[0].hypot(at[1]) < MAX_DISTANCE_M / 2.0;
         let low = self.points.iter().filter(is_low).map(|at| ([1.0, at[0], at[1]], at[2]));
         let plane = Plane::of(low.collect())?;
         let [height, ahead, left] = plane.terms;
@@ -180,13 +181,13 @@ impl Check {
     /// Returns the wall ahead, within 45 degrees, with the largest area.
     pub fn wall(&self) -> Option<Wall> {
         let high: Vec<[f64; 3]> =
-            self.points.iter().filter(|at| at[2] > WALL_FROM_M && at[0] > 0.3).copied().collect();
+            self.points.iter().filter(|at| at[2] > MIN_WALL_POINT_HEIGHT_M && at[0] > 0.3).copied().collect();
         let mut best = (0.0, 0.0, 0.0);
         for degrees in -45..=45 {
-            let way = f64::from(degrees).to_radians();
-            let mut areas = [0.0; (FAR_M / BIN_M) as usize + 2];
+            let yaw = f64::from(degrees).to_radians();
+            let mut areas = [0.0; (MAX_DISTANCE_M / BIN_M) as usize + 2];
             for at in &high {
-                let distance = at[0] * way.cos() + at[1] * way.sin();
+                let distance = at[0] * yaw.cos() + at[1] * yaw.sin();
                 // Points of a side wall can be behind the origin.
                 if distance >= 0.0
                     && let Some(area) = areas.get_mut((distance / BIN_M) as usize)
@@ -197,12 +198,12 @@ impl Check {
             }
             for (bin, pair) in areas.windows(2).enumerate() {
                 if pair[0] + pair[1] > best.0 {
-                    best = (pair[0] + pair[1], way, (bin + 1) as f64 * BIN_M);
+                    best = (pair[0] + pair[1], yaw, (bin + 1) as f64 * BIN_M);
                 }
             }
         }
-        let (_, way, distance_m) = best;
-        let (sin, cos) = way.sin_cos();
+        let (_, yaw, distance_m) = best;
+        let (sin, cos) = yaw.sin_cos();
         let off = |at: &[f64; 3]| at[0] * cos + at[1] * sin;
         let on: Vec<_> = high
             .iter()
@@ -211,10 +212,10 @@ impl Check {
             .collect();
         let heights = on.iter().map(|(terms, _)| terms[2]);
         let (low, top) = heights.fold((f64::INFINITY, 0.0_f64), |(low, top), z| (low.min(z), top.max(z)));
-        if top - low < WALL_HIGH_M {
+        if top - low < MIN_WALL_HEIGHT_M {
             return None;
         }
-        let plane = Plane::of(on).filter(|plane| plane.deviation < ROUGH_M)?;
+        let plane = Plane::of(on).filter(|plane| plane.deviation < MAX_ROUGHNESS_M)?;
         // The wall is not exactly across the direction in which it was found.
         let [distance, slope, lean] = plane.terms;
         let across = slope.hypot(1.0);
@@ -239,10 +240,10 @@ impl Plane {
     fn of(mut points: Vec<([f64; 3], f64)>) -> Option<Plane> {
         let mut plane = None;
         for _ in 0..8 {
-            if points.len() < ENOUGH {
+            if points.len() < MIN_POINTS {
                 return None;
             }
-            let terms = solved(&points)?;
+            let terms = solve(&points)?;
             let off = |(a, b): &([f64; 3], f64)| b - (0..3).map(|i| a[i] * terms[i]).sum::<f64>();
             let deviation =
                 (points.iter().map(|point| off(point).powi(2)).sum::<f64>() / points.len() as f64).sqrt();
@@ -255,7 +256,7 @@ impl Plane {
 }
 
 /// Solves the normal equations by Cramer's rule.
-fn solved(points: &[([f64; 3], f64)]) -> Option<[f64; 3]> {
+fn solve(points: &[([f64; 3], f64)]) -> Option<[f64; 3]> {
     let (mut m, mut v) = ([[0.0; 3]; 3], [0.0; 3]);
     for (a, b) in points {
         for i in 0..3 {
@@ -305,7 +306,7 @@ mod tests {
     }
 
     #[test]
-    fn the_arm_turns_with_the_mount_and_level_is_where_it_is_said() {
+    fn arm_rotates_with_the_mount_relative_to_level() {
         let mount = Mount {
             axis_at: [0.1, 0.0, 1.0],
             sensor_at: [0.2, 0.0, 1.0],
@@ -321,34 +322,35 @@ mod tests {
 
     /// Returns what a check finds in a room with a wall 3 m ahead and a box on its floor, if the mount is `real` and is described as
     /// `told`.
-    fn found(real: &Mount, told: &Mount) -> (Floor, Wall) {
+    fn check_room(real: &Mount, described: &Mount) -> (Floor, Wall) {
         let mut points = Vec::new();
         for tenth in -150..450 {
             for beam in -60..=60 {
                 let (down, beam) = (f64::from(tenth).to_radians() / 10.0, f64::from(beam).to_radians());
                 let angle = down * real.axis[1].signum();
-                let (from, way) = (real.origin(angle), real.direction(angle, beam));
+                let (from, direction) = (real.origin(angle), real.direction(angle, beam));
                 let to = |at: f64, axis: usize| {
-                    Some((at - from[axis]) / way[axis]).filter(|range| *range > 0.1 && way[axis].abs() > 1e-3)
+                    Some((at - from[axis]) / direction[axis])
+                        .filter(|range| *range > 0.1 && direction[axis].abs() > 1e-3)
                 };
                 let on_box = to(1.5, 0).filter(|range| {
-                    let [y, z] = [1, 2].map(|i| from[i] + range * way[i]);
+                    let [y, z] = [1, 2].map(|i| from[i] + range * direction[i]);
                     (-0.3..0.3).contains(&y) && (0.0..0.35).contains(&z)
                 });
                 let ranges = [to(0.0, 2), to(3.0, 0), on_box].into_iter().flatten();
                 let range = ranges.fold(f64::INFINITY, f64::min);
                 if range < 8.0 {
-                    let at = told.point(angle, beam, range).map(|value| value as f32);
+                    let at = described.point(angle, beam, range).map(|value| value as f32);
                     points.push(Point { at, ..Point::default() });
                 }
             }
         }
-        let mut check = Check::default();
+        let mut check = MountCheck::default();
         check.take(&Sweep { points: &points, ..Sweep::default() });
         assert_eq!(check.sweeps(), 0, "not complete");
         check.take(&Sweep { points: &points, is_complete: true, ..Sweep::default() });
         assert_eq!(check.sweeps(), 1);
-        (check.floor(told).expect("a floor"), check.wall().expect("a wall"))
+        (check.floor(described).expect("a floor"), check.wall().expect("a wall"))
     }
 
     #[test]
@@ -359,7 +361,7 @@ mod tests {
         // In a direction to the left, all of it is behind the origin.
         let right = grid(2500).map(|(x, z)| [0.35 + 4.0 * x, -3.0 - 4.0 * x, 0.4 + z]);
         let points: Vec<Point> = ahead.chain(right).map(|at| Point { at, ..Point::default() }).collect();
-        let mut check = Check::default();
+        let mut check = MountCheck::default();
         check.take(&Sweep { points: &points, is_complete: true, ..Sweep::default() });
         let wall = check.wall().expect("a wall");
         assert!((wall.distance_m - 3.0).abs() < 0.01, "{wall:?}");
@@ -370,7 +372,7 @@ mod tests {
         let points: Vec<Point> = (0..100_000_u32)
             .map(|i| Point { at: [if i < 50_000 { 1.0 } else { 2.0 }, 0.0, 0.0], ..Point::default() })
             .collect();
-        let mut check = Check::default();
+        let mut check = MountCheck::default();
         for _ in 0..6 {
             check.take(&Sweep { points: &points, is_complete: true, ..Sweep::default() });
         }
@@ -383,9 +385,9 @@ mod tests {
     }
 
     #[test]
-    fn a_correction_starts_the_check_again_with_the_first_corrected_sweep() {
+    fn first_corrected_sweep_restarts_the_check() {
         let points = vec![Point { at: [1.0, 0.0, 0.0], ..Point::default() }; 10];
-        let mut check = Check::default();
+        let mut check = MountCheck::default();
         let sweeps = [0, 0, 0, 30_000_000, 30_000_000].map(|late_ns| {
             check.take(&Sweep { points: &points, is_complete: true, late_ns, ..Sweep::default() });
             check.sweeps()
@@ -398,10 +400,10 @@ mod tests {
     }
 
     #[test]
-    fn a_mount_that_is_described_right_has_a_level_floor_and_an_upright_wall() {
+    fn correct_mount_gives_level_floor_and_upright_wall() {
         for axis in [[0.0, 1.0, 0.0], [0.0, -2.0, 0.0]] {
             let real = Mount { axis, ..mount() };
-            let (floor, wall) = found(&real, &real);
+            let (floor, wall) = check_room(&real, &real);
             assert!(floor.height_m.abs().max(floor.level_rad.abs()) < 1e-3, "{floor:?}");
             assert!(floor.roll_rad.abs().max(wall.lean_rad.abs()) < 1e-3, "{floor:?} {wall:?}");
             assert!((wall.distance_m - 3.0).abs() < 1e-3, "{wall:?}");
@@ -411,16 +413,16 @@ mod tests {
     #[test]
     fn each_error_shows_where_it_is() {
         let real = mount();
-        let (floor, wall) = found(&real, &Mount { level_rad: 0.02, ..real });
+        let (floor, wall) = check_room(&real, &Mount { level_rad: 0.02, ..real });
         assert!((floor.level_rad - 0.02).abs() < 2e-3, "{floor:?}");
         assert!((wall.lean_rad + 0.02).abs() < 3e-3 && floor.height_m.abs() < 0.02, "{floor:?} {wall:?}");
         let higher = Mount { axis_at: [0.0, 0.0, 0.95], sensor_at: [0.06, 0.0, 0.99], ..real };
-        let (floor, _) = found(&real, &higher);
+        let (floor, _) = check_room(&real, &higher);
         assert!((floor.height_m - 0.05).abs() < 2e-3 && floor.level_rad.abs() < 2e-3, "{floor:?}");
-        let (floor, _) = found(&real, &Mount { axis: [0.0, 1.0, 0.03], ..real });
+        let (floor, _) = check_room(&real, &Mount { axis: [0.0, 1.0, 0.03], ..real });
         assert!(floor.roll_rad.abs() > 5e-3 && floor.level_rad.abs() < 5e-3, "{floor:?}");
         // An arm that is 0.1 m too long makes the wall lean, and hardly tilts the floor.
-        let (floor, wall) = found(&real, &Mount { sensor_at: [0.06, 0.0, 1.04], ..real });
+        let (floor, wall) = check_room(&real, &Mount { sensor_at: [0.06, 0.0, 1.04], ..real });
         assert!((wall.lean_rad + floor.level_rad).abs() > 5e-3, "{floor:?} {wall:?}");
     }
 }

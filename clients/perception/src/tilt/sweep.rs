@@ -3,14 +3,14 @@
 
 use scanhub_schema::{MAX_OBSTACLES, Obstacle, PointClass};
 
-use super::background::{Model, Reading, placed};
+use super::background::{Reading, SurfaceModel, row_for};
 use super::mount::Mount;
 use super::{Point, Settings, Sweep};
 
 /// Number of parts of a sweep whose angles are checked separately.
-const PARTS: usize = 4;
+const PART_COUNT: usize = 4;
 /// Minimum number of beams on known background for a check of the angles.
-const ENOUGH: usize = 200;
+const MIN_BEAMS: usize = 200;
 
 /// A beam with the mount's angle.
 #[derive(Clone, Copy)]
@@ -27,7 +27,7 @@ pub(crate) struct Ray {
 pub(crate) struct SweepAnalyzer {
     mount: Mount,
     settings: Settings,
-    model: Model,
+    model: SurfaceModel,
     /// Number of resets of the model.
     pub(crate) background_resets: u64,
     points: Vec<Point>,
@@ -51,7 +51,7 @@ impl SweepAnalyzer {
         SweepAnalyzer {
             mount,
             settings,
-            model: Model::new(0, &settings),
+            model: SurfaceModel::new(0, &settings),
             background_resets: 0,
             points: Vec::new(),
             readings: Vec::new(),
@@ -66,12 +66,12 @@ impl SweepAnalyzer {
 
     /// Starts with a new background for scans with this number of beams.
     pub(crate) fn begin(&mut self, beams: usize, is_first: bool) {
-        self.model = Model::new(beams, &self.settings);
+        self.model = SurfaceModel::new(beams, &self.settings);
         self.background_resets += u64::from(!is_first);
     }
 
     /// Marks the angles as unreliable after a jump, until the floor is where they put it.
-    pub(crate) fn distrust(&mut self) {
+    pub(crate) fn mark_unreliable(&mut self) {
         self.is_confirmed = false;
     }
 
@@ -79,17 +79,18 @@ impl SweepAnalyzer {
     /// the angles were right when it was learned, and it stays.
     pub(crate) fn correct(&mut self) {
         if self.unreliable == 0 {
-            self.model.forget();
+            self.model.clear();
             self.background_resets += 1;
         }
     }
 
     /// Returns `sweep` with the points and obstacles of `rays`.
-    pub(crate) fn look<'a>(&'a mut self, rays: &[Ray], sweep: Sweep<'a>) -> Sweep<'a> {
+    pub(crate) fn analyze<'a>(&'a mut self, rays: &[Ray], sweep: Sweep<'a>) -> Sweep<'a> {
         let (known, elsewhere) = self.compare(rays);
-        let is_elsewhere = known >= ENOUGH && elsewhere as f64 > self.settings.doubt * known as f64;
+        let is_elsewhere =
+            known >= MIN_BEAMS && elsewhere as f64 > self.settings.max_displaced_share * known as f64;
         let is_contradicted = is_elsewhere || self.is_angle_off();
-        self.is_confirmed |= !is_contradicted && self.off.len() >= ENOUGH;
+        self.is_confirmed |= !is_contradicted && self.off.len() >= MIN_BEAMS;
         let is_unreliable = is_contradicted || !self.is_confirmed;
         let generation = self.background_resets as u32;
         self.standing.clear();
@@ -98,11 +99,11 @@ impl SweepAnalyzer {
             self.unreliable += 1;
         } else {
             self.learn(sweep.number);
-            self.pick();
+            self.pick_candidates();
             self.unreliable = 0;
         }
         if self.unreliable > 2 * self.settings.sweeps {
-            self.model.forget();
+            self.model.clear();
             self.background_resets += 1;
             (self.unreliable, self.is_confirmed) = (0, true);
         }
@@ -125,7 +126,7 @@ impl SweepAnalyzer {
             self.readings.push((row, reading));
             let class = self.model.class(&reading, row, threshold_m);
             self.off.extend(self.model.angle_off(&reading, row, threshold_m));
-            if self.model.knows(&reading, row) {
+            if self.model.is_known(&reading, row) {
                 known += 1;
                 elsewhere += usize::from(class != PointClass::Background);
             }
@@ -142,8 +143,8 @@ impl SweepAnalyzer {
     /// Returns whether the level surfaces of the background are where they would be if the angles of a part of the sweep were
     /// off.
     fn is_angle_off(&mut self) -> bool {
-        let most = self.settings.off_rad as f32;
-        let part = (self.off.len() / PARTS).max(ENOUGH);
+        let most = self.settings.max_error_rad as f32;
+        let part = (self.off.len() / PART_COUNT).max(MIN_BEAMS);
         let is_off = |part: &mut [f32]| {
             let middle = part.len() / 2;
             part.select_nth_unstable_by(middle, f32::total_cmp).1.abs() > most
@@ -158,7 +159,7 @@ impl SweepAnalyzer {
     }
 
     /// Picks the points that may belong to obstacles.
-    fn pick(&mut self) {
+    fn pick_candidates(&mut self) {
         let near = self.settings.near;
         for (point, &(angle_rad, rise)) in self.points.iter().zip(&self.beams) {
             let within = |near: &[[f64; 2]; 3]| {
@@ -177,7 +178,7 @@ impl SweepAnalyzer {
 impl Ray {
     /// Returns the row of the background for this ray, and the reading.
     fn reading(&self, mount: &Mount, settings: &Settings) -> (usize, Reading) {
-        placed(mount, settings, (self.angle_rad, self.beam_rad), self.beam, self.range_m)
+        row_for(mount, settings, (self.angle_rad, self.beam_rad), self.beam, self.range_m)
     }
 }
 
@@ -194,7 +195,7 @@ pub(crate) struct Candidate {
 }
 
 /// Obstacle with the beams that met it.
-struct Grown {
+struct ObstacleCluster {
     obstacle: Obstacle,
     /// Lowest and highest angle of the mount.
     angles_rad: [f32; 2],
@@ -202,20 +203,22 @@ struct Grown {
     rise: f32,
 }
 
-impl Grown {
+impl ObstacleCluster {
     /// Returns whether a level surface, which stands always, can be all of it. Nearly level beams graze a top in few sweeps,
     /// each time at another range, and in a span of the mount's angle that is smaller than the distance between two scans. An
     /// object that is put down is higher.
     fn is_grazed(&self) -> bool {
         let [low, high] = self.angles_rad;
-        self.obstacle.flags & Obstacle::NEAR == 0 && high - low < GRAZED_RAD && self.rise < GRAZING_RISE
+        self.obstacle.flags & Obstacle::NEAR == 0
+            && high - low < MAX_GRAZED_RAD
+            && self.rise < MAX_GRAZING_RISE
     }
 }
 
 /// Span of the mount's angle in which beams graze a top: 0.4 degrees.
-const GRAZED_RAD: f32 = 0.007;
+const MAX_GRAZED_RAD: f32 = 0.007;
 /// Beams that rise or fall more meet a top in more than one scan.
-const GRAZING_RISE: f32 = 0.1;
+const MAX_GRAZING_RISE: f32 = 0.1;
 
 /// Finds obstacles: clusters of points whose cubes touch.
 #[derive(Default)]
@@ -232,7 +235,12 @@ pub(crate) struct Clusters {
 impl Clusters {
     /// Returns the obstacles with at least `least` points, the nearest first, and the number of obstacles beyond the
     /// maximum.
-    pub(crate) fn find(&mut self, points: &[Candidate], cube_m: f32, least: usize) -> (&[Obstacle], u32) {
+    pub(crate) fn find(
+        &mut self,
+        points: &[Candidate],
+        cube_m: f32,
+        min_points: usize,
+    ) -> (&[Obstacle], u32) {
         let cube = |at: [f32; 3]| at.map(|value| (value / cube_m).floor() as i16);
         self.cubes.clear();
         self.cubes.extend(points.iter().zip(0..).map(|(point, number)| (cube(point.at), number)));
@@ -244,8 +252,8 @@ impl Clusters {
             if !self.open[first] || first > 0 && self.cubes[first].0 == self.cubes[first - 1].0 {
                 continue;
             }
-            let grown = self.grown_from(first, points);
-            if grown.obstacle.points as usize >= least && !grown.is_grazed() {
+            let grown = self.grow(first, points);
+            if grown.obstacle.points as usize >= min_points && !grown.is_grazed() {
                 self.found.push(grown.obstacle);
             }
         }
@@ -255,7 +263,7 @@ impl Clusters {
         (&self.found, dropped)
     }
 
-    fn grown_from(&mut self, first: usize, points: &[Candidate]) -> Grown {
+    fn grow(&mut self, first: usize, points: &[Candidate]) -> ObstacleCluster {
         let (inf, mut sum) = (f32::INFINITY, [0.0_f64; 3]);
         let mut grown = Obstacle { low: [inf; 3], high: [-inf; 3], distance_m: inf, ..Obstacle::default() };
         let (mut angles_rad, mut most_rise) = ([inf, -inf], 0.0_f32);
@@ -276,22 +284,22 @@ impl Clusters {
                 grown.points += 1;
                 grown.flags |= flags;
             }
-            for beside in around(cube) {
-                let place = self.cubes.partition_point(|(other, _)| *other < beside);
-                let is_there = self.cubes.get(place).is_some_and(|(other, _)| *other == beside);
-                if is_there && self.open[place] {
-                    self.open[place] = false;
-                    self.front.push(place);
+            for neighbor in neighbors(cube) {
+                let index = self.cubes.partition_point(|(other, _)| *other < neighbor);
+                let is_there = self.cubes.get(index).is_some_and(|(other, _)| *other == neighbor);
+                if is_there && self.open[index] {
+                    self.open[index] = false;
+                    self.front.push(index);
                 }
             }
         }
         grown.middle = sum.map(|value| (value / f64::from(grown.points)) as f32);
-        Grown { obstacle: grown, angles_rad, rise: most_rise }
+        ObstacleCluster { obstacle: grown, angles_rad, rise: most_rise }
     }
 }
 
 /// Returns the 26 cubes that touch `cube`.
-fn around(cube: [i16; 3]) -> impl Iterator<Item = [i16; 3]> {
+fn neighbors(cube: [i16; 3]) -> impl Iterator<Item = [i16; 3]> {
     let offset = |i: i16| [i / 9 - 1, i / 3 % 3 - 1, i % 3 - 1];
     (0..27)
         .map(offset)
@@ -308,7 +316,7 @@ mod tests {
     }
 
     #[test]
-    fn a_line_that_level_beams_of_one_scan_graze_is_no_obstacle() {
+    fn line_grazed_by_one_level_scan_is_no_obstacle() {
         let line = |flags, angle_rad: f32, rise| {
             let point = move |i| ([4.0, 0.05 * i as f32, 0.7 + angle_rad], flags);
             (0..12).map(move |i| Candidate { angle_rad, rise, ..candidate(point(i)) })
@@ -339,7 +347,7 @@ mod tests {
     }
 
     /// The same by the definition: pairs of points whose cubes touch have the same name, until nothing changes.
-    fn slowly(points: &[[f32; 3]], cube_m: f32, least: usize) -> Vec<usize> {
+    fn reference_cluster_sizes(points: &[[f32; 3]], cube_m: f32, min_size: usize) -> Vec<usize> {
         let cube = |at: &[f32; 3]| at.map(|value| (value / cube_m).floor() as i32);
         let mut names: Vec<usize> = (0..points.len()).collect();
         let mut changes = true;
@@ -356,7 +364,7 @@ mod tests {
             }
         }
         let sizes = (0..points.len()).map(|name| names.iter().filter(|of| **of == name).count());
-        let mut sizes: Vec<usize> = sizes.filter(|size| *size >= least).collect();
+        let mut sizes: Vec<usize> = sizes.filter(|size| *size >= min_size).collect();
         sizes.sort_unstable();
         sizes
     }
@@ -373,7 +381,7 @@ mod tests {
             let (found, dropped) = clusters.find(&flagged, 0.15, 2);
             let mut sizes: Vec<usize> = found.iter().map(|obstacle| obstacle.points as usize).collect();
             sizes.sort_unstable();
-            assert_eq!((sizes, dropped), (slowly(&points, 0.15, 2), 0), "seed {seed}");
+            assert_eq!((sizes, dropped), (reference_cluster_sizes(&points, 0.15, 2), 0), "seed {seed}");
         }
     }
 }

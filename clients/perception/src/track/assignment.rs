@@ -8,7 +8,7 @@ use pathfinding::prelude::kuhn_munkres;
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Edge {
     pub(crate) leg: usize,
-    pub(crate) place: usize,
+    pub(crate) target: usize,
     /// Gain compared with leaving both unassigned. Always more than 0.
     pub(crate) gain: f64,
 }
@@ -19,7 +19,7 @@ pub(crate) struct Assignment {
     /// Group of each leg, and then of each position.
     group: Vec<usize>,
     legs: Vec<usize>,
-    places: Vec<usize>,
+    targets: Vec<usize>,
     /// Group and index of each edge.
     order: Vec<(usize, usize)>,
 }
@@ -28,14 +28,14 @@ impl Assignment {
     /// Appends each leg with its position to `pairs`, so that the sum of the gains is maximal.
     pub(crate) fn solve(
         &mut self,
-        (legs, places): (usize, usize),
+        (legs, targets): (usize, usize),
         edges: &[Edge],
         pairs: &mut Vec<(usize, usize)>,
     ) {
         self.group.clear();
-        self.group.extend(0..legs + places);
+        self.group.extend(0..legs + targets);
         for edge in edges {
-            let (a, b) = (self.root(edge.leg), self.root(legs + edge.place));
+            let (a, b) = (self.root(edge.leg), self.root(legs + edge.target));
             self.group[a.max(b)] = a.min(b);
         }
         self.order.clear();
@@ -48,17 +48,17 @@ impl Assignment {
         let order = std::mem::take(&mut self.order);
         for group in order.chunk_by(|a, b| a.0 == b.0) {
             if let &[(_, alone)] = group {
-                pairs.push((edges[alone].leg, edges[alone].place));
+                pairs.push((edges[alone].leg, edges[alone].target));
                 continue;
             }
             self.legs.clear();
-            self.places.clear();
+            self.targets.clear();
             for &(_, i) in group {
                 if !self.legs.contains(&edges[i].leg) {
                     self.legs.push(edges[i].leg);
                 }
-                if !self.places.contains(&edges[i].place) {
-                    self.places.push(edges[i].place);
+                if !self.targets.contains(&edges[i].target) {
+                    self.targets.push(edges[i].target);
                 }
             }
             self.compete(edges, group, pairs);
@@ -68,25 +68,25 @@ impl Assignment {
 
     fn compete(&self, edges: &[Edge], group: &[(usize, usize)], pairs: &mut Vec<(usize, usize)>) {
         // Usually the two legs of one person.
-        if let (&[leg, other_leg], &[place, other_place]) = (&self.legs[..], &self.places[..]) {
-            let find = |leg: usize, place: usize| {
-                group.iter().map(|&(_, i)| &edges[i]).find(|one| (one.leg, one.place) == (leg, place))
+        if let (&[leg, other_leg], &[target, other_target]) = (&self.legs[..], &self.targets[..]) {
+            let find = |leg: usize, target: usize| {
+                group.iter().map(|&(_, i)| &edges[i]).find(|one| (one.leg, one.target) == (leg, target))
             };
-            let straight = [find(leg, place), find(other_leg, other_place)];
-            let crossed = [find(leg, other_place), find(other_leg, place)];
+            let straight = [find(leg, target), find(other_leg, other_target)];
+            let crossed = [find(leg, other_target), find(other_leg, target)];
             let gain = |two: &[Option<&Edge>; 2]| two.iter().flatten().map(|edge| edge.gain).sum::<f64>();
             let best = if gain(&crossed) > gain(&straight) { crossed } else { straight };
-            pairs.extend(best.into_iter().flatten().map(|edge| (edge.leg, edge.place)));
+            pairs.extend(best.into_iter().flatten().map(|edge| (edge.leg, edge.target)));
             return;
         }
         // The solver requires at least as many columns as rows.
-        let turn = self.legs.len() > self.places.len();
-        let (rows, columns) = if turn { (&self.places, &self.legs) } else { (&self.legs, &self.places) };
+        let turn = self.legs.len() > self.targets.len();
+        let (rows, columns) = if turn { (&self.targets, &self.legs) } else { (&self.legs, &self.targets) };
         let mut weights = Matrix::new(rows.len(), columns.len(), 0_i64);
         for edge in group.iter().map(|&(_, i)| &edges[i]) {
-            let (row, column) = if turn { (edge.place, edge.leg) } else { (edge.leg, edge.place) };
-            let place = |list: &[usize], what| list.iter().position(|&one| one == what);
-            if let (Some(row), Some(column)) = (place(rows, row), place(columns, column)) {
+            let (row, column) = if turn { (edge.target, edge.leg) } else { (edge.leg, edge.target) };
+            let index_in = |list: &[usize], what| list.iter().position(|&one| one == what);
+            if let (Some(row), Some(column)) = (index_in(rows, row), index_in(columns, column)) {
                 weights[(row, column)] = (edge.gain * 1e6) as i64;
             }
         }
@@ -102,7 +102,7 @@ impl Assignment {
     /// Returns the number of elements that memory is allocated for.
     #[cfg(test)]
     pub(crate) fn capacity(&self) -> usize {
-        self.group.capacity() + self.legs.capacity() + self.places.capacity() + self.order.capacity()
+        self.group.capacity() + self.legs.capacity() + self.targets.capacity() + self.order.capacity()
     }
 
     fn root(&mut self, mut one: usize) -> usize {
@@ -123,8 +123,8 @@ mod tests {
         if leg == legs {
             return 0.0;
         }
-        let free = edges.iter().filter(|edge| edge.leg == leg && taken >> edge.place & 1 == 0);
-        let with = free.map(|edge| edge.gain + best(edges, leg + 1, legs, taken | 1 << edge.place));
+        let free = edges.iter().filter(|edge| edge.leg == leg && taken >> edge.target & 1 == 0);
+        let with = free.map(|edge| edge.gain + best(edges, leg + 1, legs, taken | 1 << edge.target));
         with.fold(best(edges, leg + 1, legs, taken), f64::max)
     }
 
@@ -133,19 +133,19 @@ mod tests {
         let mut random = fastrand::Rng::with_seed(1);
         let mut assignment = Assignment::default();
         for _ in 0..400 {
-            let (legs, places) = (random.usize(1..7), random.usize(1..7));
+            let (legs, targets) = (random.usize(1..7), random.usize(1..7));
             let mut edges = Vec::new();
             for leg in 0..legs {
-                for place in 0..places {
+                for target in 0..targets {
                     if random.f64() < 0.4 {
-                        edges.push(Edge { leg, place, gain: 0.01 + 10.0 * random.f64() });
+                        edges.push(Edge { leg, target, gain: 0.01 + 10.0 * random.f64() });
                     }
                 }
             }
             let mut pairs = Vec::new();
-            assignment.solve((legs, places), &edges, &mut pairs);
-            let gain = |&(leg, place): &(usize, usize)| {
-                edges.iter().find(|edge| (edge.leg, edge.place) == (leg, place)).unwrap().gain
+            assignment.solve((legs, targets), &edges, &mut pairs);
+            let gain = |&(leg, target): &(usize, usize)| {
+                edges.iter().find(|edge| (edge.leg, edge.target) == (leg, target)).unwrap().gain
             };
             let sum: f64 = pairs.iter().map(gain).sum();
             assert!((sum - best(&edges, 0, legs, 0)).abs() < 1e-4, "{edges:?}");

@@ -5,31 +5,31 @@ use super::geometry::{Point, distance_to_segment, length2, middle, minus};
 use super::site::Site;
 
 /// Maximum time of a path that is not in the site file, in seconds.
-pub(crate) const LONGEST_S: f64 = 60.0;
+pub(crate) const MAX_GAP_S: f64 = 60.0;
 /// Spread of the logarithm of a person's speed around their pace.
-const SPREAD: f64 = 0.2;
+const PACE_SPREAD: f64 = 0.2;
 /// Share of people who walk on without a stop, if they walked when they were last seen, and if they stood.
-const WALKS: f64 = 0.6;
-const WALKS_ON: f64 = 0.3;
+const CONTINUE_SHARE_WALKING: f64 = 0.6;
+const CONTINUE_SHARE_STANDING: f64 = 0.3;
 /// Share of people who stay at their position, and the time for which they do, in seconds.
-const STAYS: f64 = 0.4;
-const STAYS_S: f64 = 4.0;
+const STAY_SHARE: f64 = 0.4;
+const STAY_TIME_S: f64 = 4.0;
 /// Share of people who turn back.
-const TURNS: f64 = 0.04;
+const TURN_BACK_SHARE: f64 = 0.04;
 /// Minimum speed of a person who walks.
-const WALKING_M_S: f64 = 0.5;
+const MIN_WALKING_SPEED_M_S: f64 = 0.5;
 /// Minimum speed of a person who goes back.
-const BACK_M_S: f64 = 0.35;
+const MIN_RETURN_SPEED_M_S: f64 = 0.35;
 /// Standard deviations of positions along and across the path. Across, it grows per second, up to the width of a
 /// path.
 const ALONG_M: f64 = 0.25;
-const BESIDE_M: f64 = 0.25;
-const BESIDE_M_S: f64 = 0.3;
-const WIDTH_M: f64 = 0.7;
+const ACROSS_M: f64 = 0.25;
+const ACROSS_M_S: f64 = 0.3;
+const MAX_ACROSS_M: f64 = 0.7;
 /// Likelihood of a person who is earlier or much later than the gap allows.
-const HARDLY: f64 = 1e-6;
+const MIN_LIKELIHOOD: f64 = 1e-6;
 /// Length of a path with an unknown end.
-const REST_M: f64 = 5.0;
+const DEFAULT_PATH_M: f64 = 5.0;
 
 /// A person who is out of sight.
 pub(crate) struct DepartedPerson {
@@ -57,61 +57,65 @@ impl Site {
     /// Returns the minimum and maximum time of the gap between two doors, in seconds.
     fn gap(&self, [a, b]: [usize; 2]) -> [f64; 2] {
         let found = self.gaps.iter().find(|gap| gap.doors == [a, b] || gap.doors == [b, a]);
-        found.map_or([0.0, LONGEST_S], |gap| gap.seconds)
+        found.map_or([0.0, MAX_GAP_S], |gap| gap.seconds)
     }
 
     /// Returns the likelihood per square meter that `gone`, who went out of sight `after_s` seconds ago, is at the position of
     /// `new`. The person is assumed to be still on the path: they walk on at their pace, walk on after a stop, stay, or turn
     /// back.
-    pub(crate) fn likelihood(&self, gone: &DepartedPerson, new: &ArrivedPerson, after_s: f64) -> f64 {
+    pub(crate) fn likelihood(&self, departed: &DepartedPerson, arrived: &ArrivedPerson, after_s: f64) -> f64 {
         let t = after_s.max(0.0);
-        let off = minus(new.at, gone.at);
+        let off = minus(arrived.at, departed.at);
         let far_m = length2(off).sqrt();
         // The distance that they would be ahead, the length of the rest of the path, and the speed ahead.
-        let (ahead_m, rest_m, speed) = match gone.entry {
+        let (ahead_m, rest_m, speed) = match departed.entry {
             Some(entry) => {
                 let door = self.doors[entry].between;
-                let returns = new.is_out && new.exit == entry;
-                let from_door = distance_to_segment(new.at, door);
+                let returns = arrived.is_out && arrived.exit == entry;
+                let from_door = distance_to_segment(arrived.at, door);
                 let now_m = if returns { -from_door } else { from_door };
-                let end = if new.exit == entry { new.at } else { middle(self.doors[new.exit].between) };
-                let way = minus(end, middle(door));
-                let along =
-                    (way[0] * new.velocity[0] + way[1] * new.velocity[1]) / length2(way).sqrt().max(0.1);
-                let rest_m = if new.exit == entry {
-                    REST_M
+                let end =
+                    if arrived.exit == entry { arrived.at } else { middle(self.doors[arrived.exit].between) };
+                let path = minus(end, middle(door));
+                let along = (path[0] * arrived.velocity[0] + path[1] * arrived.velocity[1])
+                    / length2(path).sqrt().max(0.1);
+                let rest_m = if arrived.exit == entry {
+                    DEFAULT_PATH_M
                 } else {
-                    distance_to_segment(gone.at, self.doors[new.exit].between)
+                    distance_to_segment(departed.at, self.doors[arrived.exit].between)
                 };
-                let ahead_m = now_m - distance_to_segment(gone.at, door);
-                let [shortest_s, longest_s] = self.gap([entry, new.exit]);
-                let is_too_soon = ahead_m * shortest_s > (t + 0.5) * length2(way).sqrt();
+                let ahead_m = now_m - distance_to_segment(departed.at, door);
+                let [shortest_s, longest_s] = self.gap([entry, arrived.exit]);
+                let is_too_soon = ahead_m * shortest_s > (t + 0.5) * length2(path).sqrt();
                 if is_too_soon || t > 2.0 * longest_s {
-                    return HARDLY;
+                    return MIN_LIKELIHOOD;
                 }
                 (ahead_m, rest_m, if returns { -along } else { along })
             }
-            None => (far_m, REST_M, 0.0),
+            None => (far_m, DEFAULT_PATH_M, 0.0),
         };
-        let beside_m = (far_m * far_m - ahead_m * ahead_m).max(0.0).sqrt();
-        let walked_m = gone.pace.max(0.3) * t;
-        let (range_m, sigma_m) = (walked_m.max(0.3), ALONG_M + SPREAD * walked_m);
-        let walks = if gone.speed > WALKING_M_S { WALKS } else { WALKS_ON };
-        let stays = STAYS * (-t / STAYS_S).exp();
-        let stops = 1.0 - walks - stays;
-        let within =
-            |least: f64, most: f64| if (least..=most).contains(&ahead_m) { 1.0 / range_m } else { 0.0 };
+        let across_m = (far_m * far_m - ahead_m * ahead_m).max(0.0).sqrt();
+        let walked_m = departed.pace.max(0.3) * t;
+        let (range_m, sigma_m) = (walked_m.max(0.3), ALONG_M + PACE_SPREAD * walked_m);
+        let walks = if departed.speed > MIN_WALKING_SPEED_M_S {
+            CONTINUE_SHARE_WALKING
+        } else {
+            CONTINUE_SHARE_STANDING
+        };
+        let staying = STAY_SHARE * (-t / STAY_TIME_S).exp();
+        let stops = 1.0 - walks - staying;
+        let within = |from: f64, to: f64| if (from..=to).contains(&ahead_m) { 1.0 / range_m } else { 0.0 };
         let density = walks * normal(ahead_m - walked_m, sigma_m)
             + stops * within(-0.1, range_m)
-            + stays * normal(ahead_m, ALONG_M)
-            + TURNS * within(-range_m, 0.0).max(0.01);
+            + staying * normal(ahead_m, ALONG_M)
+            + TURN_BACK_SHARE * within(-range_m, 0.0).max(0.01);
         let remains = walks * normal_below((rest_m - walked_m) / sigma_m)
             + stops * (rest_m / range_m).min(1.0)
-            + stays
-            + TURNS;
-        let beside = normal(beside_m, (BESIDE_M + BESIDE_M_S * t).min(WIDTH_M));
-        let turns = if speed < -BACK_M_S { TURNS } else { 1.0 };
-        turns * beside * density / remains
+            + staying
+            + TURN_BACK_SHARE;
+        let across = normal(across_m, (ACROSS_M + ACROSS_M_S * t).min(MAX_ACROSS_M));
+        let turns = if speed < -MIN_RETURN_SPEED_M_S { TURN_BACK_SHARE } else { 1.0 };
+        turns * across * density / remains
     }
 }
 
@@ -167,16 +171,16 @@ seconds = [2, 15]
 "#;
 
     #[test]
-    fn who_comes_from_the_other_side_comes_out_and_who_stood_there_still_does() {
+    fn gap_likelihood_depends_on_direction_and_time() {
         let site = Site::parse("house.toml", HOUSE).expect("a house");
-        let gone =
+        let departed =
             |entry: usize, x: f64| DepartedPerson { entry: Some(entry), at: [x, 2.5], speed: 1.0, pace: 1.1 };
-        let (from_left, from_right) = (gone(0, 6.5), gone(1, 10.5));
+        let (from_left, from_right) = (departed(0, 6.5), departed(1, 10.5));
         let new =
             |x: f64, vx: f64| ArrivedPerson { exit: 0, at: [x, 2.5], velocity: [vx, 0.0], is_out: x < 6.0 };
-        for comes in [new(6.7, -1.0), new(5.7, -1.0)] {
+        for arrived in [new(6.7, -1.0), new(5.7, -1.0)] {
             let (turns, walks) =
-                (site.likelihood(&from_left, &comes, 4.0), site.likelihood(&from_right, &comes, 4.0));
+                (site.likelihood(&from_left, &arrived, 4.0), site.likelihood(&from_right, &arrived, 4.0));
             assert!(walks > 10.0 * turns, "{walks} and {turns}");
         }
         let stands = new(6.6, 0.0);

@@ -9,7 +9,7 @@ use scanhub_schema::TrackState;
 
 use super::geometry::{Point, distance};
 use super::sensor_view::Leg;
-use super::site::SENSORS;
+use super::site::MAX_SENSORS;
 
 /// One person.
 pub(crate) struct Person {
@@ -17,17 +17,17 @@ pub(crate) struct Person {
     pub(crate) filter: Filter,
     /// Time of the filter's state in ns.
     pub(crate) at_ns: u64,
-    pub(crate) born_ns: u64,
+    pub(crate) first_seen_ns: u64,
     /// Position at which they were first seen.
-    pub(crate) born_at: Point,
-    pub(crate) life: TrackPhase,
+    pub(crate) first_position: Point,
+    pub(crate) phase: TrackPhase,
     /// Time at which a leg of theirs was last seen.
-    pub(crate) seen_ns: u64,
+    pub(crate) last_seen_ns: u64,
     /// Time at which a leg of theirs was last seen outside the ignored areas.
-    pub(crate) free_ns: u64,
+    pub(crate) last_free_ns: u64,
     /// Time at which each sensor last saw them. 0 before the first time.
-    pub(crate) seen_by_ns: [u64; SENSORS],
-    /// Number of scans that are evidence for them, at most [`MOST_SUPPORT`]. One of a slow sensor counts up to twice.
+    pub(crate) seen_by_ns: [u64; MAX_SENSORS],
+    /// Number of scans that are evidence for them, at most [`MAX_SUPPORT`]. One of a slow sensor counts up to twice.
     pub(crate) support: f64,
     /// Number of scans that showed both legs.
     pub(crate) pairs: f64,
@@ -37,7 +37,7 @@ pub(crate) struct Person {
     pub(crate) pace: f64,
     pub(crate) room: Option<usize>,
     /// Door through which they were seen to enter that room.
-    pub(crate) came_by: Option<usize>,
+    pub(crate) entry_door: Option<usize>,
     /// Share of the recent scans of them that show both legs.
     pub(crate) both: f64,
 }
@@ -55,19 +55,19 @@ pub(crate) enum TrackPhase {
 }
 
 /// Minimum number of scans that confirm a person.
-const ENOUGH: f64 = 8.0;
-pub(crate) const MOST_SUPPORT: f64 = 20.0;
+const MIN_SCANS: f64 = 8.0;
+pub(crate) const MAX_SUPPORT: f64 = 20.0;
 /// Maximum period of a sensor whose scans count once. Scans of a slower sensor count up to twice; otherwise it would
 /// take a second to confirm a person at 7.5 Hz.
-const FULL_S: f64 = 0.0625;
+const FULL_WEIGHT_PERIOD_S: f64 = 0.0625;
 /// Minimum number of beams on a leg that is certainly not the leg of a chair.
-const CLEAR_BEAMS: usize = 4;
+const MIN_CLEAR_BEAMS: usize = 4;
 /// Weight of a leg with fewer beams, compared with a sensor that sees through the position.
-pub(crate) const COARSE: f64 = 0.5;
+pub(crate) const COARSE_WEIGHT: f64 = 0.5;
 /// Minimum age of a confirmed person.
-const SOONEST_NS: u64 = 300_000_000;
+const MIN_TRACK_AGE_NS: u64 = 300_000_000;
 /// A person who was seen within this time is not hidden.
-const LATELY_NS: u64 = 250_000_000;
+const RECENT_NS: u64 = 250_000_000;
 
 impl Person {
     pub(crate) fn new(id: u64, at_ns: u64, legs: &[Leg]) -> Person {
@@ -77,20 +77,20 @@ impl Person {
         }
         Person {
             id,
-            born_at: filter.place(),
+            first_position: filter.position(),
             filter,
             at_ns,
-            born_ns: at_ns,
-            life: TrackPhase::Tentative,
-            seen_ns: at_ns,
-            free_ns: at_ns,
-            seen_by_ns: [0; SENSORS],
+            first_seen_ns: at_ns,
+            phase: TrackPhase::Tentative,
+            last_seen_ns: at_ns,
+            last_free_ns: at_ns,
+            seen_by_ns: [0; MAX_SENSORS],
             support: 1.0,
             pairs: if legs.len() > 1 { 1.0 } else { 0.0 },
             absent_s: 0.0,
             pace: 1.1,
             room: None,
-            came_by: None,
+            entry_door: None,
             both: if legs.len() > 1 { 1.0 } else { 0.0 },
         }
     }
@@ -99,7 +99,7 @@ impl Person {
     pub(crate) fn predict(&mut self, at_ns: u64) {
         if at_ns > self.at_ns {
             let dt = (at_ns - self.at_ns) as f64 * 1e-9;
-            let fades = at_ns - self.seen_ns > LATELY_NS;
+            let fades = at_ns - self.last_seen_ns > RECENT_NS;
             self.filter.predict(dt, fades);
             self.at_ns = at_ns;
         }
@@ -107,15 +107,16 @@ impl Person {
 
     /// Handles a scan of `sensor`, `since_s` after its last one, that showed `legs` of the person, one of them with this number of
     /// `beams`.
-    pub(crate) fn seen(&mut self, sensor: usize, since_s: f64, legs: usize, beams: usize) {
-        self.seen_ns = self.at_ns;
+    pub(crate) fn on_detection(&mut self, sensor: usize, since_s: f64, legs: usize, beams: usize) {
+        self.last_seen_ns = self.at_ns;
         self.seen_by_ns[sensor] = self.at_ns;
         // A few beams may also be on the leg of a chair, so another sensor may contradict.
-        self.absent_s = if beams < CLEAR_BEAMS { (self.absent_s - COARSE * since_s).max(0.0) } else { 0.0 };
+        self.absent_s =
+            if beams < MIN_CLEAR_BEAMS { (self.absent_s - COARSE_WEIGHT * since_s).max(0.0) } else { 0.0 };
         let both = if legs > 1 { 1.0 } else { 0.0 };
         self.pairs += both;
         self.both += 0.05 * (both - self.both);
-        self.support = (self.support + (since_s / FULL_S).clamp(1.0, 2.0)).min(MOST_SUPPORT);
+        self.support = (self.support + (since_s / FULL_WEIGHT_PERIOD_S).clamp(1.0, 2.0)).min(MAX_SUPPORT);
         let speed = self.speed();
         if speed > 0.5 {
             // A person who turns or gives way is slower than their pace.
@@ -129,30 +130,32 @@ impl Person {
     }
 
     /// Returns whether this is certainly a person: seen often enough, with two legs, or in motion.
-    pub(crate) fn is_sure(&self) -> bool {
-        let way = distance(self.filter.place(), self.born_at);
-        self.support >= ENOUGH && self.at_ns - self.born_ns >= SOONEST_NS && (self.pairs >= 3.0 || way > 0.3)
+    pub(crate) fn is_certain(&self) -> bool {
+        let walked_m = distance(self.filter.position(), self.first_position);
+        self.support >= MIN_SCANS
+            && self.at_ns - self.first_seen_ns >= MIN_TRACK_AGE_NS
+            && (self.pairs >= 3.0 || walked_m > 0.3)
     }
 
     pub(crate) fn is_known(&self) -> bool {
-        self.life == TrackPhase::Known
+        self.phase == TrackPhase::Known
     }
 
     pub(crate) fn state(&self, now_ns: u64) -> TrackState {
-        match self.life {
+        match self.phase {
             TrackPhase::Tentative => TrackState::Tentative,
             TrackPhase::Away { .. } => TrackState::BetweenRooms,
-            TrackPhase::Known if now_ns.saturating_sub(self.seen_ns) > LATELY_NS => TrackState::Hidden,
+            TrackPhase::Known if now_ns.saturating_sub(self.last_seen_ns) > RECENT_NS => TrackState::Hidden,
             TrackPhase::Known => TrackState::Confirmed,
         }
     }
 
     /// Returns the sensors that have seen them within the last 250 ms, as bits.
     pub(crate) fn sensors(&self, now_ns: u64) -> u32 {
-        let lately = |&at: &u64| at > 0 && now_ns.saturating_sub(at) <= LATELY_NS;
+        let is_recent = |&at: &u64| at > 0 && now_ns.saturating_sub(at) <= RECENT_NS;
         (0..)
             .zip(&self.seen_by_ns)
-            .filter(|(_, at)| lately(at))
+            .filter(|(_, at)| is_recent(at))
             .map(|(sensor, _): (u32, _)| 1 << sensor)
             .sum()
     }
@@ -161,18 +164,18 @@ impl Person {
 /// Spectral density of the body's acceleration, m2/s3.
 const BODY_NOISE: f64 = 0.6;
 /// Angular frequency of the swing of legs in rad/s: 0.8 double steps a second.
-const SWING: f64 = 5.0;
+const SWING_RATE_RAD_S: f64 = 5.0;
 /// Damping of the swing as a share of the critical damping.
 const DAMPING: f64 = 0.5;
 /// Spectral density of a leg's acceleration in m2/s3. With the two constants above, a leg is 0.14 m away from the
 /// middle.
 const LEG_NOISE: f64 = 5.0;
 /// Maximum length of a prediction step in seconds, and maximum number of steps.
-const LONGEST_STEP_S: f64 = 0.05;
-const MOST_STEPS: f64 = 40.0;
+const MAX_STEP_S: f64 = 0.05;
+const MAX_STEPS: f64 = 40.0;
 /// Standard deviations for a new person: velocity in m/s, and half of the distance between the legs.
-const NEW_SPEED: f64 = 0.9;
-const NEW_HALF_M: f64 = 0.17;
+const INITIAL_SPEED_M_S: f64 = 0.9;
+const INITIAL_HALF_M: f64 = 0.17;
 
 /// One of the two legs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -202,13 +205,13 @@ impl Filter {
     /// Creates the filter of a person whose one leg is seen.
     pub(crate) fn of_leg(at: Point, sigma_m: f64) -> Filter {
         let mut covariance = Matrix4::zeros();
-        let half = NEW_HALF_M * NEW_HALF_M;
+        let half = INITIAL_HALF_M * INITIAL_HALF_M;
         covariance[(0, 0)] = half + sigma_m * sigma_m;
         covariance[(0, 2)] = -half;
         covariance[(2, 0)] = -half;
         covariance[(2, 2)] = half;
-        covariance[(1, 1)] = NEW_SPEED * NEW_SPEED;
-        covariance[(3, 3)] = half * SWING * SWING;
+        covariance[(1, 1)] = INITIAL_SPEED_M_S * INITIAL_SPEED_M_S;
+        covariance[(3, 3)] = half * SWING_RATE_RAD_S * SWING_RATE_RAD_S;
         let mut state = Matrix4x2::zeros();
         state.set_row(0, &RowVector2::new(at[0], at[1]));
         Filter { state, covariance }
@@ -217,7 +220,7 @@ impl Filter {
     /// Predicts the state `dt` seconds later, in steps that are short compared with a swing. If `fades`, the person
     /// is not seen, and the velocity decays.
     pub(crate) fn predict(&mut self, dt: f64, fades: bool) {
-        let steps = (dt / LONGEST_STEP_S).ceil().clamp(1.0, MOST_STEPS);
+        let steps = (dt / MAX_STEP_S).ceil().clamp(1.0, MAX_STEPS);
         (0..steps as usize).for_each(|_| self.step(dt / steps, fades));
     }
 
@@ -228,7 +231,7 @@ impl Filter {
             1.0, dt, 0.0, 0.0,
             0.0, keep, 0.0, 0.0,
             0.0, 0.0, 1.0, dt,
-            0.0, 0.0, -SWING * SWING * dt, (1.0 - 2.0 * DAMPING * SWING * dt).max(0.0),
+            0.0, 0.0, -SWING_RATE_RAD_S * SWING_RATE_RAD_S * dt, (1.0 - 2.0 * DAMPING * SWING_RATE_RAD_S * dt).max(0.0),
         );
         self.state = swing * self.state;
         self.covariance = swing * self.covariance * swing.transpose();
@@ -259,7 +262,7 @@ impl Filter {
     }
 
     /// Returns the middle between the legs.
-    pub(crate) fn place(&self) -> Point {
+    pub(crate) fn position(&self) -> Point {
         [self.state[(0, 0)], self.state[(0, 1)]]
     }
 
@@ -279,8 +282,8 @@ impl Filter {
     }
 
     /// Stops the person at `place`, in front of a wall.
-    pub(crate) fn stop(&mut self, place: Point) {
-        self.state.set_row(0, &RowVector2::new(place[0], place[1]));
+    pub(crate) fn stop(&mut self, position: Point) {
+        self.state.set_row(0, &RowVector2::new(position[0], position[1]));
         self.state.set_row(1, &RowVector2::zeros());
     }
 }
@@ -290,10 +293,10 @@ mod tests {
     use nalgebra::DMatrix;
 
     use super::*;
-    use crate::track::sensor_view::AtDoor;
+    use crate::track::sensor_view::DoorProximity;
 
     #[test]
-    fn somebody_is_known_after_eight_scans_or_fewer_of_a_slow_sensor() {
+    fn confirmation_takes_300_to_800_ms_by_scan_rate() {
         const MS: u64 = 1_000_000;
         let legs = [-0.1, 0.1].map(|y| Leg {
             at: [2.0, y],
@@ -303,15 +306,15 @@ mod tests {
             is_solid: true,
             beams: 5,
             is_free: true,
-            at_door: AtDoor::Clear,
+            at_door: DoorProximity::Clear,
         });
         let known_after_ms = |every_ms: u64| {
             let mut person = Person::new(1, MS, &legs);
             let mut after_ms = 0;
-            while !person.is_sure() {
+            while !person.is_certain() {
                 after_ms += every_ms;
                 person.predict(MS * (1 + after_ms));
-                person.seen(0, every_ms as f64 * 1e-3, 2, 5);
+                person.on_detection(0, every_ms as f64 * 1e-3, 2, 5);
             }
             after_ms
         };
@@ -358,7 +361,7 @@ mod tests {
     }
 
     #[test]
-    fn who_is_not_seen_slows_down_and_gets_uncertain() {
+    fn occluded_person_slows_down_and_gets_uncertain() {
         let mut filter = Filter::of_leg([0.0, 0.0], 0.03);
         for i in 0..50 {
             filter.predict(0.04, false);
@@ -367,9 +370,9 @@ mod tests {
             filter.correct(Side::Minus, [x, -0.1], 0.03);
         }
         assert!((filter.velocity()[0] - 1.0).abs() < 0.1 && filter.variance() < 0.03 * 0.03);
-        let from = filter.place()[0];
+        let from = filter.position()[0];
         (0..250).for_each(|_| filter.predict(0.04, true));
-        let walked = filter.place()[0] - from;
+        let walked = filter.position()[0] - from;
         assert!((1.2..1.8).contains(&walked) && filter.variance() > 0.5, "{walked} {}", filter.variance());
         assert!((filter.half()[0].powi(2) + filter.half()[1].powi(2)).sqrt() < 0.05);
     }

@@ -9,34 +9,34 @@ use super::geometry::{Point, distance, minus};
 use super::site::{Sensor, Site};
 
 /// Maximum number of legs in a scan.
-pub(crate) const LEGS: usize = 64;
+pub(crate) const MAX_LEGS: usize = 64;
 /// Radius of a leg with its trousers, in meters.
 pub(crate) const LEG_M: f64 = 0.06;
 /// Maximum width of a leg. A wider object is two legs next to each other.
-const WIDEST_LEG_M: f64 = 0.26;
+const MAX_LEG_WIDTH_M: f64 = 0.26;
 /// Minimum width of a leg with its trousers. The legs of chairs and tables are thinner.
-const THINNEST_LEG_M: f64 = 0.09;
+const MIN_LEG_WIDTH_M: f64 = 0.09;
 /// Diameter of the spot of a beam at the scanner, and its growth with the range: an LMS 2xx, the widest of the supported
 /// scanners.
 const SPOT_M: f64 = 0.01;
 const SPOT_RAD: f64 = 0.0045;
 /// Minimum width of a surface, such as a leaf of a door, in meters. A narrower straight piece may be legs.
-const FLAT_M: f64 = 0.4;
+const MIN_FLAT_WIDTH_M: f64 = 0.4;
 /// Standard deviation of points from the line of a surface: the noise of the ranges.
 const FLATNESS_M: f64 = 0.015;
 /// Minimum distance by which the beams next to a free leg reach behind it, in meters. Points of a surface are closer together.
-const FREE_M: f64 = 0.6;
+const MIN_FREE_DEPTH_M: f64 = 0.6;
 /// Points between the jambs at which a door is checked, and the distance from the line that a closed leaf may have.
 const CLOSED_POINTS: usize = 9;
-const CLOSED_M: f64 = 0.25;
+const MAX_CLOSED_OFFSET_M: f64 = 0.25;
 /// Maximum width of a person.
-const WIDEST_M: f64 = 1.3;
+const MAX_PERSON_WIDTH_M: f64 = 1.3;
 /// Minimum distance of an object from the farthest point that its beam has reached.
-const BEFORE_M: f64 = 0.15;
+const MIN_FOREGROUND_DISTANCE_M: f64 = 0.15;
 /// Number of scans in a row that must reach farther than all before.
-const SCANS_FARTHER: u8 = 5;
+const MIN_FARTHER_SCANS: u8 = 5;
 /// Maximum distance of the legs of a person from their position.
-const REACH_M: f64 = 0.35;
+const MAX_LEG_DISTANCE_M: f64 = 0.35;
 
 /// A leg that one sensor sees.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -58,16 +58,16 @@ pub(crate) struct Leg {
     /// Whether the beams on both sides of it reach far behind it. The points of a leaf of a door are next to each other.
     pub(crate) is_free: bool,
     /// Position relative to the leaves of doors.
-    pub(crate) at_door: AtDoor,
+    pub(crate) at_door: DoorProximity,
 }
 
 /// Whether a leg may be a part of a leaf of a door.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd)]
-pub(crate) enum AtDoor {
+pub(crate) enum DoorProximity {
     /// No leaf reaches it.
     Clear,
     /// A leaf that swings about a jamb reaches it.
-    ReversalDetector,
+    Swing,
     /// Between the jambs of a door, on the line along which a leaf may slide.
     Line,
     /// On this line, at a jamb or outside the opening, where an open leaf ends.
@@ -78,11 +78,11 @@ pub(crate) enum AtDoor {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Visibility {
     /// The sensor sees through the position, so no one stands there.
-    Through,
+    Free,
     /// Something stands there.
-    Here,
+    Occupied,
     /// A nearer object occludes it, or no beam points there.
-    Hidden,
+    Occluded,
 }
 
 /// View of one sensor, and the farthest ranges that it has measured.
@@ -117,7 +117,7 @@ impl SensorView {
             farthest: Vec::new(),
             farther: Vec::new(),
             is_foreground: Vec::new(),
-            legs: Vec::with_capacity(LEGS),
+            legs: Vec::with_capacity(MAX_LEGS),
             standing: Vec::new(),
             points: Vec::new(),
         }
@@ -138,7 +138,7 @@ impl SensorView {
             };
             // Most beams end where they always do.
             if *range > *farthest || farther.0 > 0 {
-                reach(*range, farthest, farther);
+                update_farthest(*range, farthest, farther);
             }
         }
         for (direction, &angle) in self.directions.iter_mut().zip(scan.exact_angles()) {
@@ -157,7 +157,7 @@ impl SensorView {
 
     /// Corrects the sensor's position by the offset of everything that it sees.
     pub(crate) fn shift(&mut self, off: Point) {
-        self.sensor.place = minus(self.sensor.place, off);
+        self.sensor.position = minus(self.sensor.position, off);
     }
 
     /// Marks the legs in the ignored areas of `site`, and those that may be leaves of its doors.
@@ -177,7 +177,10 @@ impl SensorView {
             let share = (i + 1) as f64 / (CLOSED_POINTS + 1) as f64;
             let (beam, far) = self.beam([a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1])])?;
             let beam = beam.round() as usize;
-            self.ranges.get(beam).is_some_and(|range| (range - far).abs() <= CLOSED_M).then_some(beam)
+            self.ranges
+                .get(beam)
+                .is_some_and(|range| (range - far).abs() <= MAX_CLOSED_OFFSET_M)
+                .then_some(beam)
         };
         // An open door fails at its middle, which is the first point.
         let order = (0..CLOSED_POINTS).map(|i| (i + CLOSED_POINTS / 2) % CLOSED_POINTS);
@@ -194,48 +197,51 @@ impl SensorView {
     }
 
     /// Returns the visibility of `place` in the last scan.
-    pub(crate) fn look(&self, place: Point) -> Visibility {
-        let Some((middle, far)) = self.beam(place) else { return Visibility::Hidden };
+    pub(crate) fn visibility(&self, position: Point) -> Visibility {
+        let Some((middle, far)) = self.beam(position) else { return Visibility::Occluded };
         // Half the width of a person's legs.
         let half = ((0.2 / far).min(0.5) / self.step.abs()).ceil();
         let first = (middle - half).max(0.0) as usize;
         let last = ((middle + half) as usize).min(self.ranges.len() - 1);
         let spacing = far * self.step.abs();
-        let (mut through, mut hidden, mut here_run, mut hidden_run) = (0, 0, 0, 0);
+        let (mut through, mut hidden, mut occupied_run, mut occluded_run) = (0, 0, 0, 0);
         for (&range, &farthest) in self.ranges[first..=last].iter().zip(&self.farthest[first..=last]) {
             if range.is_nan() {
                 continue;
             }
-            let is_here = range > far - REACH_M && range <= far + REACH_M && range < farthest - BEFORE_M;
+            let is_here = range > far - MAX_LEG_DISTANCE_M
+                && range <= far + MAX_LEG_DISTANCE_M
+                && range < farthest - MIN_FOREGROUND_DISTANCE_M;
             // A person is not as thin as this object.
-            let is_through =
-                is_here || range > far + REACH_M || (range > farthest - BEFORE_M && range > far - 0.05);
-            here_run = if is_here { here_run + 1 } else { 0 };
-            if is_here && !is_thin(here_run, spacing) {
-                return Visibility::Here;
+            let is_through = is_here
+                || range > far + MAX_LEG_DISTANCE_M
+                || (range > farthest - MIN_FOREGROUND_DISTANCE_M && range > far - 0.05);
+            occupied_run = if is_here { occupied_run + 1 } else { 0 };
+            if is_here && !is_thin(occupied_run, spacing) {
+                return Visibility::Occupied;
             }
             if is_through {
                 through += 1;
                 // Nor is a person hidden by something thin.
-                hidden += if is_thin(hidden_run, spacing) { 0 } else { hidden_run };
-                hidden_run = 0;
+                hidden += if is_thin(occluded_run, spacing) { 0 } else { occluded_run };
+                occluded_run = 0;
             } else {
-                hidden_run += 1;
+                occluded_run += 1;
             }
         }
-        hidden += hidden_run;
+        hidden += occluded_run;
         let all = through + hidden;
-        if all >= 2 && 5 * through >= 4 * all { Visibility::Through } else { Visibility::Hidden }
+        if all >= 2 && 5 * through >= 4 * all { Visibility::Free } else { Visibility::Occluded }
     }
 
     /// Returns the beam to `place`, as a fraction of beams, and the distance; `None` if no beam points there.
-    fn beam(&self, place: Point) -> Option<(f64, f64)> {
-        let way = minus(place, self.sensor.place);
-        let far = (way[0] * way[0] + way[1] * way[1]).sqrt();
+    fn beam(&self, position: Point) -> Option<(f64, f64)> {
+        let offset = minus(position, self.sensor.position);
+        let far = (offset[0] * offset[0] + offset[1] * offset[1]).sqrt();
         if self.step == 0.0 || far < 0.2 {
             return None;
         }
-        let bearing = way[1].atan2(way[0]) - self.sensor.yaw_rad;
+        let bearing = offset[1].atan2(offset[0]) - self.sensor.yaw_rad;
         let angle = if self.sensor.is_upside_down { -bearing } else { bearing };
         let turned = ((angle - self.first_angle) * self.step.signum() + 1e-9).rem_euclid(TAU);
         let middle = turned / self.step.abs();
@@ -278,36 +284,36 @@ impl SensorView {
         let step = self.step.abs();
         let beams = self.ranges.iter().zip(&self.farthest).zip(&self.is_foreground).enumerate();
         let stands = beams.filter(|(_, ((range, farthest), is_foreground))| {
-            range.is_finite() && (**range < **farthest - BEFORE_M || **is_foreground)
+            range.is_finite() && (**range < **farthest - MIN_FOREGROUND_DISTANCE_M || **is_foreground)
         });
         let mut standing = std::mem::take(&mut self.standing);
         standing.clear();
         standing.extend(stands.map(|(i, _)| i));
         for &i in &standing {
             let range = self.ranges[i];
-            let (place, direction) = (self.sensor.place, self.directions[i]);
-            let point = [place[0] + range * direction[0], place[1] + range * direction[1]];
+            let (position, direction) = (self.sensor.position, self.directions[i]);
+            let point = [position[0] + range * direction[0], position[1] + range * direction[1]];
             if let Some(&(before, last)) = points.last()
                 && (before + 1 != i || distance(last, point) > 0.08 + 1.5 * range * step)
             {
-                self.close(&points);
+                self.close_cluster(&points);
                 points.clear();
             }
             points.push((i, point));
         }
-        self.close(&points);
+        self.close_cluster(&points);
         (self.points, self.standing) = (points, standing);
     }
 
     /// Finds the legs in neighboring points.
-    fn close(&mut self, points: &[(usize, Point)]) {
+    fn close_cluster(&mut self, points: &[(usize, Point)]) {
         let (Some(&(first, begin)), Some(&(last, end))) = (points.first(), points.last()) else { return };
         let width = distance(begin, end);
-        if width > WIDEST_M || self.legs.len() == LEGS {
+        if width > MAX_PERSON_WIDTH_M || self.legs.len() == MAX_LEGS {
             return;
         }
-        if width > WIDEST_LEG_M && points.len() >= 4 {
-            if width > FLAT_M && is_flat(points) {
+        if width > MAX_LEG_WIDTH_M && points.len() >= 4 {
+            if width > MIN_FLAT_WIDTH_M && is_flat(points) {
                 return;
             }
             // Between two legs the points lie farther apart than on one.
@@ -318,47 +324,48 @@ impl SensorView {
                 gap(a).total_cmp(&gap(b))
             });
             if let Some(cut) = cut {
-                self.close(&points[..cut]);
-                self.close(&points[cut..]);
+                self.close_cluster(&points[..cut]);
+                self.close_cluster(&points[cut..]);
             }
             return;
         }
         let n = points.len() as f64;
         let sum = points.iter().fold([0.0, 0.0], |sum, (_, p)| [sum[0] + p[0], sum[1] + p[1]]);
         let mean = [sum[0] / n, sum[1] / n];
-        let way = minus(mean, self.sensor.place);
-        let range = (way[0] * way[0] + way[1] * way[1]).sqrt().max(0.05);
+        let offset = minus(mean, self.sensor.position);
+        let range = (offset[0] * offset[0] + offset[1] * offset[1]).sqrt().max(0.05);
         // Mean depth of the near half of a circle whose points lie at even angles.
         let deeper = LEG_M * FRAC_PI_4 / range;
         let spacing = range * self.step.abs();
         let cut_off = |beam: Option<usize>| {
-            beam.and_then(|beam| self.ranges.get(beam)).is_some_and(|&beside| beside < range - 0.1)
+            beam.and_then(|beam| self.ranges.get(beam)).is_some_and(|&neighbor| neighbor < range - 0.1)
         };
         let is_partial = cut_off(first.checked_sub(1)) || cut_off(Some(last + 1));
         let is_short = points.len() == 1 && spacing < LEG_M;
         // A beam that meets two surfaces may report any value between them.
         let is_between = is_partial && points.len() as f64 <= 1.0 + (SPOT_M + SPOT_RAD * range) / spacing;
         let is_free = |beam: Option<usize>| {
-            beam.and_then(|beam| self.ranges.get(beam)).is_some_and(|&beside| beside > range + FREE_M)
+            beam.and_then(|beam| self.ranges.get(beam))
+                .is_some_and(|&neighbor| neighbor > range + MIN_FREE_DEPTH_M)
         };
         let sigma_m = if is_partial || is_short { 0.07 } else { 0.03 + 0.3 * spacing };
         let fresh = points.iter().filter(|(beam, _)| self.is_foreground[*beam]).count();
         self.legs.push(Leg {
-            at: [mean[0] + deeper * way[0], mean[1] + deeper * way[1]],
+            at: [mean[0] + deeper * offset[0], mean[1] + deeper * offset[1]],
             sigma_m,
             is_fresh: 2 * fresh > points.len() && !is_short,
             beams: points.len(),
             is_solid: !is_between && !is_short && (is_partial || !is_thin(points.len(), spacing)),
             is_ignored: false,
             is_free: is_free(first.checked_sub(1)) && is_free(Some(last + 1)),
-            at_door: AtDoor::Clear,
+            at_door: DoorProximity::Clear,
         });
     }
 }
 
 /// Returns whether a leg reflects more than this number of beams, which are `spacing_m` apart.
 fn is_thin(beams: usize, spacing_m: f64) -> bool {
-    (beams + 1) as f64 * spacing_m < THINNEST_LEG_M
+    (beams + 1) as f64 * spacing_m < MIN_LEG_WIDTH_M
 }
 
 /// Returns whether the points lie on a line, within the noise of the ranges.
@@ -376,10 +383,10 @@ fn is_flat(points: &[(usize, Point)]) -> bool {
 }
 
 /// Takes a range of a beam. Single readings that are too far are noise.
-fn reach(range: f64, farthest: &mut f64, (scans, least): &mut (u8, f64)) {
+fn update_farthest(range: f64, farthest: &mut f64, (scans, least): &mut (u8, f64)) {
     if range > *farthest {
         (*scans, *least) = (*scans + 1, least.min(range));
-        if *scans == SCANS_FARTHER {
+        if *scans == MIN_FARTHER_SCANS {
             *farthest = *least;
             (*scans, *least) = (0, f64::INFINITY);
         }

@@ -4,7 +4,7 @@
 use std::fmt::Display;
 use std::ops::Range;
 
-use scanhub_schema::{Failure, Kind, check_followed};
+use scanhub_schema::{Failure, Kind, check_any_sensor};
 use serde::Deserialize;
 use toml::Spanned;
 
@@ -12,14 +12,14 @@ use super::geometry::{
     Point, area, contains, crosses_itself, distance, distance_to_border, distance_to_segment, dot, middle,
     minus, overlap,
 };
-use super::sensor_view::AtDoor;
+use super::sensor_view::DoorProximity;
 
 /// Maximum number of sensors of a site, which is the maximum number of links of a hub.
-pub(crate) const SENSORS: usize = 32;
+pub(crate) const MAX_SENSORS: usize = 32;
 /// Maximum number of rooms.
-pub(crate) const ROOMS: usize = 64;
+pub(crate) const MAX_ROOMS: usize = 64;
 /// Maximum number of ignored areas.
-pub(crate) const IGNORED: usize = 64;
+pub(crate) const MAX_IGNORED: usize = 64;
 
 /// A plan that was checked.
 #[derive(Clone, Debug, PartialEq)]
@@ -42,7 +42,7 @@ pub struct Sensor {
     /// Name as in topics: `front`, or `kitchen.front` for a remote sensor.
     pub name: String,
     /// Position in the map in meters.
-    pub place: Point,
+    pub position: Point,
     /// Direction in radians, counterclockwise from x.
     pub yaw_rad: f64,
     /// Whether it is mounted upside down, so that its beams run clockwise.
@@ -90,7 +90,8 @@ impl Site {
     /// revolving door does, it is the distance from this area.
     pub(crate) fn distance_to_door(&self, point: Point, door: usize) -> f64 {
         let between = self.doors[door].between;
-        let area = self.ignored.iter().find(|area| touches(&area.polygon, middle(between), ON_THE_WALL_M));
+        let area =
+            self.ignored.iter().find(|area| touches(&area.polygon, middle(between), MAX_WALL_DISTANCE_M));
         let from_area = area.map_or(f64::INFINITY, |area| match contains(&area.polygon, point) {
             true => 0.0,
             false => distance_to_border(&area.polygon, point),
@@ -99,20 +100,24 @@ impl Site {
     }
 
     /// Returns whether a leaf may reach `point`, for the doors that have leaves.
-    pub(crate) fn at_door(&self, point: Point, has_leaves: &[bool]) -> AtDoor {
-        let mut found = AtDoor::Clear;
+    pub(crate) fn at_door(&self, point: Point, has_leaves: &[bool]) -> DoorProximity {
+        let mut found = DoorProximity::Clear;
         for (Door { between: [a, b], .. }, _) in self.doors.iter().zip(has_leaves).filter(|(_, has)| **has) {
             let width = distance(*a, *b);
             // A wide door has two leaves. One that slides does so along the wall, as far as it is wide.
-            let leaf_m = if width > WIDEST_LEAF_M { width / 2.0 } else { width }.min(WIDEST_LEAF_M);
+            let leaf_m = if width > MAX_LEAF_WIDTH_M { width / 2.0 } else { width }.min(MAX_LEAF_WIDTH_M);
             let along = minus(*b, *a).map(|value| value * leaf_m / width);
             let line = [minus(*a, along), [b[0] + along[0], b[1] + along[1]]];
-            if distance_to_segment(point, line) < LINE_M {
+            if distance_to_segment(point, line) < MAX_LEAF_OFFSET_M {
                 let share = dot(minus(point, *a), minus(*b, *a)) / width;
-                return if (JAMB_M..width - JAMB_M).contains(&share) { AtDoor::Line } else { AtDoor::Jamb };
+                return if (MAX_JAMB_DISTANCE_M..width - MAX_JAMB_DISTANCE_M).contains(&share) {
+                    DoorProximity::Line
+                } else {
+                    DoorProximity::Jamb
+                };
             }
-            if distance(point, *a).min(distance(point, *b)) < leaf_m + LINE_M {
-                found = AtDoor::ReversalDetector;
+            if distance(point, *a).min(distance(point, *b)) < leaf_m + MAX_LEAF_OFFSET_M {
+                found = DoorProximity::Swing;
             }
         }
         found
@@ -131,17 +136,17 @@ impl Site {
 
     /// Returns the rooms in which there is a sensor, in the order of the rooms. A sensor on a wall is in every room that it
     /// touches, at most 0.15 m away.
-    pub fn watched(&self) -> Vec<bool> {
+    pub fn rooms_with_sensor(&self) -> Vec<bool> {
         let watched = |room: &Area| {
-            let mut places = self.sensors.iter().map(|sensor| sensor.place);
-            places.any(|place| touches(&room.polygon, place, ON_THE_WALL_M))
+            let mut positions = self.sensors.iter().map(|sensor| sensor.position);
+            positions.any(|position| touches(&room.polygon, position, MAX_WALL_DISTANCE_M))
         };
         self.rooms.iter().map(watched).collect()
     }
 
     /// Returns the name of a room, `outside` for none.
     pub fn room_name(&self, room: Option<usize>) -> &str {
-        room.and_then(|room| self.rooms.get(room)).map_or(OUTSIDE, |room| &room.name)
+        room.and_then(|room| self.rooms.get(room)).map_or(OUTSIDE_NAME, |room| &room.name)
     }
 }
 
@@ -167,24 +172,24 @@ impl Sensor {
 }
 
 /// Maximum length of the name of a room or door in bytes, as in an event.
-pub(crate) const NAME: usize = 24;
+pub(crate) const MAX_NAME_LEN: usize = 24;
 /// Name of the other side of a door to the street.
-pub(crate) const OUTSIDE: &str = "outside";
+pub(crate) const OUTSIDE_NAME: &str = "outside";
 /// Maximum width of a leaf of a door, in meters.
-const WIDEST_LEAF_M: f64 = 1.3;
+const MAX_LEAF_WIDTH_M: f64 = 1.3;
 /// Distance from a jamb within which an open leaf may end.
-const JAMB_M: f64 = 0.15;
+const MAX_JAMB_DISTANCE_M: f64 = 0.15;
 /// Maximum distance of a leaf that slides from the line between the jambs.
-const LINE_M: f64 = 0.15;
+const MAX_LEAF_OFFSET_M: f64 = 0.15;
 /// Maximum distance from a wall of a sensor on it.
-const ON_THE_WALL_M: f64 = 0.15;
+const MAX_WALL_DISTANCE_M: f64 = 0.15;
 
 fn touches(polygon: &[Point], point: Point, tolerance_m: f64) -> bool {
     contains(polygon, point) || distance_to_border(polygon, point) <= tolerance_m
 }
 
 /// Text of a file, and its name in errors.
-struct Source<'a> {
+struct SourceText<'a> {
     name: &'a str,
     text: &'a str,
 }
@@ -267,16 +272,16 @@ impl Site {
     /// # Ok::<(), scanhub_schema::Failure>(())
     /// ```
     pub fn parse(name: &str, text: &str) -> Result<Site, Failure> {
-        let source = Source { name, text };
+        let source = SourceText { name, text };
         let file: File = toml::from_str(text).map_err(|error| source.explain(&error))?;
         plan(&source, &file)
     }
 }
 
-impl Source<'_> {
+impl SourceText<'_> {
     /// Returns the error for an invalid value at `span`.
     fn refuse(&self, span: Option<Range<usize>>, what: impl Display, remedy: impl Into<String>) -> Failure {
-        let place = match span {
+        let location = match span {
             Some(span) => {
                 let before = &self.text[..span.start.min(self.text.len())];
                 let line = before.matches('\n').count() + 1;
@@ -285,7 +290,7 @@ impl Source<'_> {
             }
             None => self.name.to_owned(),
         };
-        Failure::new(Kind::Configuration, format!("{place}: {what}"), remedy)
+        Failure::new(Kind::Configuration, format!("{location}: {what}"), remedy)
     }
 
     fn explain(&self, error: &toml::de::Error) -> Failure {
@@ -307,40 +312,44 @@ fn nearest(word: &str, known: &[&str]) -> String {
 }
 
 /// Maximum overlap of rooms, because they are measured by hand.
-const OVERLAP_M: f64 = 0.05;
+const MAX_OVERLAP_M: f64 = 0.05;
 /// Maximum distance of the middle of a door from the walls of its rooms, because walls are thick.
-const DOOR_OFF_M: f64 = 0.5;
+const MAX_DOOR_OFFSET_M: f64 = 0.5;
 /// Minimum size of a room and of an ignored area in square meters, with the digits that errors show. A curtain is thin.
-const LEAST_ROOM_M2: (f64, usize) = (0.25, 2);
-const LEAST_IGNORED_M2: (f64, usize) = (0.02, 3);
+const MIN_ROOM_M2: (f64, usize) = (0.25, 2);
+const MIN_IGNORED_M2: (f64, usize) = (0.02, 3);
 /// Maximum coordinate. Larger ones are probably in millimeters.
-const FARTHEST_M: f64 = 1_000.0;
+const MAX_COORDINATE_M: f64 = 1_000.0;
 
-fn plan(source: &Source<'_>, file: &File) -> Result<Site, Failure> {
+fn plan(source: &SourceText<'_>, file: &File) -> Result<Site, Failure> {
     if file.sensor.is_empty() {
         return Err(source.refuse(None, "no sensor", "add [[sensor]] with name and pose"));
     }
     if file.room.is_empty() {
         return Err(source.refuse(None, "no room", "add [[room]] with name and polygon"));
     }
-    if file.sensor.len() > SENSORS || file.room.len() > ROOMS {
+    if file.sensor.len() > MAX_SENSORS || file.room.len() > MAX_ROOMS {
         let what = format!("{} sensors and {} rooms", file.sensor.len(), file.room.len());
-        return Err(source.refuse(None, what, format!("at most {SENSORS} sensors and {ROOMS} rooms")));
+        return Err(source.refuse(
+            None,
+            what,
+            format!("at most {MAX_SENSORS} sensors and {MAX_ROOMS} rooms"),
+        ));
     }
-    if let Some(entry) = file.ignore.get(IGNORED) {
+    if let Some(entry) = file.ignore.get(MAX_IGNORED) {
         let what = format!("{} ignored areas", file.ignore.len());
-        return Err(source.refuse(Some(entry.name.span()), what, format!("at most {IGNORED}")));
+        return Err(source.refuse(Some(entry.name.span()), what, format!("at most {MAX_IGNORED}")));
     }
-    once(source, "sensor", file.sensor.iter().map(|entry| &entry.name))?;
-    once(source, "room", file.room.iter().map(|entry| &entry.name))?;
-    once(source, "door", file.door.iter().map(|entry| &entry.name))?;
-    once(source, "ignored area", file.ignore.iter().map(|entry| &entry.name))?;
+    check_unique(source, "sensor", file.sensor.iter().map(|entry| &entry.name))?;
+    check_unique(source, "room", file.room.iter().map(|entry| &entry.name))?;
+    check_unique(source, "door", file.door.iter().map(|entry| &entry.name))?;
+    check_unique(source, "ignored area", file.ignore.iter().map(|entry| &entry.name))?;
     let mut site = Site {
         sensors: file.sensor.iter().map(|entry| sensor(source, entry)).collect::<Result<_, _>>()?,
         rooms: file
             .room
             .iter()
-            .map(|entry| checked_area(source, "room", entry, LEAST_ROOM_M2))
+            .map(|entry| checked_area(source, "room", entry, MIN_ROOM_M2))
             .collect::<Result<_, _>>()?,
         doors: Vec::new(),
         gaps: Vec::new(),
@@ -354,8 +363,8 @@ fn plan(source: &Source<'_>, file: &File) -> Result<Site, Failure> {
     Ok(site)
 }
 
-fn once<'a>(
-    source: &Source<'_>,
+fn check_unique<'a>(
+    source: &SourceText<'_>,
     what: &str,
     names: impl Iterator<Item = &'a Spanned<String>>,
 ) -> Result<(), Failure> {
@@ -366,8 +375,8 @@ fn once<'a>(
         if known.contains(&name) {
             return Err(source.refuse(span, format!("{what} {name:?} twice"), "give each another name"));
         }
-        if what != "sensor" && (name.is_empty() || name.len() > NAME || name == OUTSIDE) {
-            let remedy = format!("1 to {} bytes, and not {OUTSIDE:?}", NAME);
+        if what != "sensor" && (name.is_empty() || name.len() > MAX_NAME_LEN || name == OUTSIDE_NAME) {
+            let remedy = format!("1 to {} bytes, and not {OUTSIDE_NAME:?}", MAX_NAME_LEN);
             return Err(source.refuse(span, format!("{what} name {name:?} is not possible"), remedy));
         }
         known.push(name);
@@ -375,27 +384,27 @@ fn once<'a>(
     Ok(())
 }
 
-fn finite(source: &Source<'_>, span: Range<usize>, points: &[Point]) -> Result<(), Failure> {
-    let far = points.iter().flatten().find(|value| value.is_nan() || value.abs() > FARTHEST_M);
+fn check_finite(source: &SourceText<'_>, span: Range<usize>, points: &[Point]) -> Result<(), Failure> {
+    let far = points.iter().flatten().find(|value| value.is_nan() || value.abs() > MAX_COORDINATE_M);
     far.map_or(Ok(()), |value| {
         let what = format!("{value} m is too far");
-        Err(source.refuse(Some(span), what, format!("metres, at most {FARTHEST_M}")))
+        Err(source.refuse(Some(span), what, format!("metres, at most {MAX_COORDINATE_M}")))
     })
 }
 
-fn sensor(source: &Source<'_>, entry: &SensorEntry) -> Result<Sensor, Failure> {
+fn sensor(source: &SourceText<'_>, entry: &SensorEntry) -> Result<Sensor, Failure> {
     let name = entry.name.as_ref();
-    check_followed(name)
+    check_any_sensor(name)
         .map_err(|failure| source.refuse(Some(entry.name.span()), failure.message, failure.hint))?;
     let (pose, span) = (entry.pose.as_ref(), entry.pose.span());
-    finite(source, span.clone(), &[[pose.x, pose.y]])?;
+    check_finite(source, span.clone(), &[[pose.x, pose.y]])?;
     if pose.yaw.is_nan() || pose.yaw.abs() > std::f64::consts::TAU {
         let what = format!("yaw {} of sensor {name}", pose.yaw);
         return Err(source.refuse(Some(span), what, "radians, at most one turn: 1.5708 looks along y"));
     }
     Ok(Sensor {
         name: name.clone(),
-        place: [pose.x, pose.y],
+        position: [pose.x, pose.y],
         yaw_rad: pose.yaw,
         is_upside_down: pose.upside_down,
     })
@@ -403,13 +412,13 @@ fn sensor(source: &Source<'_>, entry: &SensorEntry) -> Result<Sensor, Failure> {
 
 /// Checks the area `what`: three corners or more, sides that do not cross, and a minimum size.
 fn checked_area(
-    source: &Source<'_>,
+    source: &SourceText<'_>,
     what: &str,
     entry: &AreaEntry,
     (least_m2, digits): (f64, usize),
 ) -> Result<Area, Failure> {
     let (name, span, polygon) = (entry.name.as_ref(), entry.polygon.span(), entry.polygon.as_ref());
-    finite(source, span.clone(), polygon)?;
+    check_finite(source, span.clone(), polygon)?;
     let size = area(polygon).abs();
     let (problem, remedy) = if polygon.len() < 3 {
         (format!(": {} corners", polygon.len()), "at least three".to_owned())
@@ -423,8 +432,8 @@ fn checked_area(
     Err(source.refuse(Some(span), format!("{what} {name}{problem}"), remedy))
 }
 
-fn ignored(source: &Source<'_>, entry: &AreaEntry, site: &Site) -> Result<Area, Failure> {
-    let ignored = checked_area(source, "ignored area", entry, LEAST_IGNORED_M2)?;
+fn ignored(source: &SourceText<'_>, entry: &AreaEntry, site: &Site) -> Result<Area, Failure> {
+    let ignored = checked_area(source, "ignored area", entry, MIN_IGNORED_M2)?;
     let (name, polygon) = (&ignored.name, &ignored.polygon);
     if !site.rooms.iter().any(|room| overlap(&room.polygon, polygon, 0.0)) {
         let what = format!("ignored area {name} is in no room");
@@ -439,10 +448,10 @@ fn ignored(source: &Source<'_>, entry: &AreaEntry, site: &Site) -> Result<Area, 
     Ok(ignored)
 }
 
-fn no_overlap(source: &Source<'_>, file: &File, site: &Site) -> Result<(), Failure> {
+fn no_overlap(source: &SourceText<'_>, file: &File, site: &Site) -> Result<(), Failure> {
     for (i, room) in site.rooms.iter().enumerate() {
         if let Some(other) =
-            site.rooms[..i].iter().find(|other| overlap(&room.polygon, &other.polygon, OVERLAP_M))
+            site.rooms[..i].iter().find(|other| overlap(&room.polygon, &other.polygon, MAX_OVERLAP_M))
         {
             let what = format!("rooms {} and {} overlap", other.name, room.name);
             let remedy =
@@ -453,19 +462,19 @@ fn no_overlap(source: &Source<'_>, file: &File, site: &Site) -> Result<(), Failu
     Ok(())
 }
 
-fn door(source: &Source<'_>, entry: &DoorEntry, site: &Site) -> Result<Door, Failure> {
+fn door(source: &SourceText<'_>, entry: &DoorEntry, site: &Site) -> Result<Door, Failure> {
     let name = entry.name.as_ref();
-    let side = |said: &Spanned<String>| {
-        let room = said.as_ref().as_str();
-        if room == OUTSIDE {
+    let side = |spanned: &Spanned<String>| {
+        let room = spanned.as_ref().as_str();
+        if room == OUTSIDE_NAME {
             return Ok(None);
         }
         let found = site.rooms.iter().position(|known| known.name == room);
         found.map(Some).ok_or_else(|| {
             let mut known: Vec<&str> = site.rooms.iter().map(|room| room.name.as_str()).collect();
-            known.push(OUTSIDE);
+            known.push(OUTSIDE_NAME);
             let remedy = format!("{}Rooms here: {}", nearest(room, &known), known.join(", "));
-            source.refuse(Some(said.span()), format!("door {name}: no room {room:?}"), remedy)
+            source.refuse(Some(spanned.span()), format!("door {name}: no room {room:?}"), remedy)
         })
     };
     let (from, to) = (side(&entry.from)?, side(&entry.to)?);
@@ -474,7 +483,7 @@ fn door(source: &Source<'_>, entry: &DoorEntry, site: &Site) -> Result<Door, Fai
         return Err(source.refuse(Some(entry.to.span()), what, "a door leads from one room to another"));
     }
     let (between, span) = (*entry.between.as_ref(), entry.between.span());
-    finite(source, span.clone(), &between)?;
+    check_finite(source, span.clone(), &between)?;
     let width = distance(between[0], between[1]);
     if !(0.3..=20.0).contains(&width) {
         let what = format!("door {name}: {width:.2} m wide");
@@ -482,22 +491,22 @@ fn door(source: &Source<'_>, entry: &DoorEntry, site: &Site) -> Result<Door, Fai
     }
     for room in [from, to].into_iter().flatten().map(|room| &site.rooms[room]) {
         let off = distance_to_border(&room.polygon, middle(between));
-        if off > DOOR_OFF_M {
+        if off > MAX_DOOR_OFFSET_M {
             let what = format!("door {name}: {off:.2} m from the walls of room {}", room.name);
-            let remedy = format!("at most {DOOR_OFF_M} m; correct between, or the room");
+            let remedy = format!("at most {MAX_DOOR_OFFSET_M} m; correct between, or the room");
             return Err(source.refuse(Some(span), what, remedy));
         }
     }
     Ok(Door { name: name.clone(), from, to, between })
 }
 
-fn gap(source: &Source<'_>, entry: &GapEntry, site: &Site) -> Result<Gap, Failure> {
-    let find = |said: &Spanned<String>| {
-        let name = said.as_ref().as_str();
+fn gap(source: &SourceText<'_>, entry: &GapEntry, site: &Site) -> Result<Gap, Failure> {
+    let find = |spanned: &Spanned<String>| {
+        let name = spanned.as_ref().as_str();
         site.doors.iter().position(|door| door.name == name).ok_or_else(|| {
             let known: Vec<&str> = site.doors.iter().map(|door| door.name.as_str()).collect();
             let remedy = format!("{}Doors here: {}", nearest(name, &known), known.join(", "));
-            source.refuse(Some(said.span()), format!("gap: no door {name:?}"), remedy)
+            source.refuse(Some(spanned.span()), format!("gap: no door {name:?}"), remedy)
         })
     };
     let [first, second] = entry.between.as_ref();
@@ -520,12 +529,14 @@ fn gap(source: &Source<'_>, entry: &GapEntry, site: &Site) -> Result<Gap, Failur
 }
 
 /// Checks that every room can be reached from a room with a sensor, through doors, outside or gaps.
-fn all_reachable(source: &Source<'_>, file: &File, site: &Site) -> Result<(), Failure> {
-    let mut reached = site.watched();
+fn all_reachable(source: &SourceText<'_>, file: &File, site: &Site) -> Result<(), Failure> {
+    let mut reached = site.rooms_with_sensor();
     if !reached.contains(&true) {
-        let place = site.sensors[0].place;
-        let what =
-            format!("no sensor is in a room: {} is at [{}, {}]", site.sensors[0].name, place[0], place[1]);
+        let position = site.sensors[0].position;
+        let what = format!(
+            "no sensor is in a room: {} is at [{}, {}]",
+            site.sensors[0].name, position[0], position[1]
+        );
         return Err(source.refuse(Some(file.sensor[0].pose.span()), what, "correct the poses, or the rooms"));
     }
     let mut outside = false;

@@ -11,7 +11,7 @@ use scanhub_schema::{Failure, Flags, Header};
 use scanhub_shm::{Domain, Payload};
 use scanhub_verbs::follow::Notice;
 use scanhub_verbs::names::{TopicName, position};
-use scanhub_verbs::output::{End, Output};
+use scanhub_verbs::output::{ExitReason, Output};
 use serde::Serialize;
 
 /// The topics of the name that the results are published under.
@@ -61,9 +61,14 @@ impl<'a, A: Payload + ?Sized, B: Payload + ?Sized> Results<'a, A, B> {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::NoHub`](scanhub_schema::Kind) if none runs, and the errors of [`PublishSession::beside`].
-    pub(super) fn publish(&mut self, limits: TopicLimits, places: &[Domain]) -> Result<(), Failure> {
-        let sensor = PublishSession::beside(&find(places)?, self.name, A::TOPIC.maker().topics(), limits)?;
+    /// Returns [`Kind::NoHub`](scanhub_schema::Kind) if none runs, and the errors of [`PublishSession::open_named`].
+    pub(super) fn publish(&mut self, limits: TopicLimits, locations: &[Domain]) -> Result<(), Failure> {
+        let sensor = PublishSession::open_named(
+            &find(locations)?,
+            self.name,
+            A::TOPIC.publisher_kind().topics(),
+            limits,
+        )?;
         self.topics = Some(Topics { publications: (sensor.topic()?, sensor.topic()?), sensor });
         Ok(())
     }
@@ -85,7 +90,7 @@ impl<'a, A: Payload + ?Sized, B: Payload + ?Sized> Results<'a, A, B> {
         &mut self,
         json: &impl Serialize,
         text: impl FnOnce(&mut Vec<u8>) -> io::Result<()>,
-    ) -> Result<(), End> {
+    ) -> Result<(), ExitReason> {
         if self.is_json { self.out.json(json) } else { self.out.line(text) }
     }
 
@@ -94,15 +99,15 @@ impl<'a, A: Payload + ?Sized, B: Payload + ?Sized> Results<'a, A, B> {
         &mut self,
         json: &impl Serialize,
         text: impl FnOnce(&mut Vec<u8>) -> io::Result<()>,
-    ) -> Result<(), End> {
+    ) -> Result<(), ExitReason> {
         if self.is_json { self.out.json(json) } else { self.notes.line(text) }
     }
 
     /// Writes a notice about subscribed topics.
-    pub(super) fn notice(&mut self, names: &[Rc<TopicName>], notice: &Notice) -> Result<(), End> {
+    pub(super) fn notice(&mut self, names: &[Rc<TopicName>], notice: &Notice) -> Result<(), ExitReason> {
         if let Notice::Missed(count) = notice {
             self.missed += count;
         }
-        notice.tell(names, self.is_json, &mut self.out, &mut self.notes)
+        notice.report(names, self.is_json, &mut self.out, &mut self.notes)
     }
 }

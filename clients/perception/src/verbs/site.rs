@@ -5,10 +5,10 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand};
-use scanhub_files::{output, regular};
+use scanhub_files::{output, regular_file};
 use scanhub_schema::{Failure, Kind, Printable};
 use scanhub_verbs::context::Context;
-use scanhub_verbs::output::{End, Output, quiet};
+use scanhub_verbs::output::{ExitReason, Output, verb_result};
 use serde::Serialize;
 
 use crate::track::Site;
@@ -63,7 +63,7 @@ impl SiteArgs {
         if let Some(svg) = svg {
             output::write(svg, site.svg().as_bytes(), *force)?;
         }
-        let watched = site.watched();
+        let watched = site.rooms_with_sensor();
         let unwatched = site.rooms.iter().zip(&watched).filter(|(_, is_watched)| !**is_watched);
         let plan = Plan {
             class: "site",
@@ -75,12 +75,12 @@ impl SiteArgs {
             ignored: site.ignored.iter().map(|area| area.name.as_str()).collect(),
         };
         let mut out = Output::new(&mut context.out);
-        quiet(if context.json { out.json(&plan) } else { plan.write(&mut out) })
+        verb_result(if context.json { out.json(&plan) } else { plan.write(&mut out) })
     }
 }
 
 impl Plan<'_> {
-    fn write(&self, out: &mut Output<'_>) -> Result<(), End> {
+    fn write(&self, out: &mut Output<'_>) -> Result<(), ExitReason> {
         let doors = if self.doors.is_empty() { "none".to_owned() } else { self.doors.join(", ") };
         out.line(|line| write!(line, "sensors: {}", self.sensors.join(", ")))?;
         out.line(|line| write!(line, "rooms: {}", self.rooms.join(", ")))?;
@@ -97,7 +97,7 @@ impl Plan<'_> {
 }
 
 /// Pixels per meter.
-const SCALE: f64 = 60.0;
+const PIXELS_PER_M: f64 = 60.0;
 /// Margin around the plan, in meters.
 const MARGIN_M: f64 = 0.8;
 
@@ -108,7 +108,7 @@ impl Site {
     ///
     /// Returns [`Kind::Input`] if the file cannot be read, and the errors of [`Site::parse`].
     pub fn read(path: &Path) -> Result<Site, Failure> {
-        let text = regular::read_text(path, regular::LONGEST).map_err(|error| {
+        let text = regular_file::read_text(path, regular_file::MAX_FILE_BYTES).map_err(|error| {
             let message = format!("{}: {error}", path.display());
             Failure::new(Kind::Input, message, "name a readable site file; docs/tracks.md has one")
         })?;
@@ -120,12 +120,12 @@ impl Site {
     pub fn svg(&self) -> String {
         let corners = self.rooms.iter().flat_map(|room| room.polygon.iter().copied());
         let corners = corners.chain(self.ignored.iter().flat_map(|area| area.polygon.iter().copied()));
-        let points: Vec<Point> = corners.chain(self.sensors.iter().map(|sensor| sensor.place)).collect();
-        let least = |axis: usize| points.iter().map(|p| p[axis]).fold(f64::INFINITY, f64::min) - MARGIN_M;
+        let points: Vec<Point> = corners.chain(self.sensors.iter().map(|sensor| sensor.position)).collect();
+        let minimum = |axis: usize| points.iter().map(|p| p[axis]).fold(f64::INFINITY, f64::min) - MARGIN_M;
         let most = |axis: usize| points.iter().map(|p| p[axis]).fold(f64::NEG_INFINITY, f64::max) + MARGIN_M;
-        let (left, top) = (least(0), most(1));
-        let (width, height) = (SCALE * (most(0) - left), SCALE * (top - least(1)));
-        let at = |point: Point| (SCALE * (point[0] - left), SCALE * (top - point[1]));
+        let (left, top) = (minimum(0), most(1));
+        let (width, height) = (PIXELS_PER_M * (most(0) - left), PIXELS_PER_M * (top - minimum(1)));
+        let at = |point: Point| (PIXELS_PER_M * (point[0] - left), PIXELS_PER_M * (top - point[1]));
         let mut svg = format!(
             "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {width:.0} {height:.0}\" \
              font-family=\"sans-serif\" font-size=\"13\">\n\
@@ -147,7 +147,7 @@ impl Site {
                 corners.iter().map(|&p| at(p)).map(|(x, y)| format!("{x:.1},{y:.1}")).collect();
             let _ = writeln!(svg, "<polygon points=\"{}\" {style}/>", corners.join(" "));
         };
-        for (room, watched) in self.rooms.iter().zip(self.watched()) {
+        for (room, watched) in self.rooms.iter().zip(self.rooms_with_sensor()) {
             let fill = if watched { "#e6eef7" } else { "#eeeeee" };
             let style = format!("fill=\"{fill}\" stroke=\"#333333\" stroke-width=\"3\"");
             polygon(&mut svg, &room.polygon, &style);
@@ -180,9 +180,9 @@ impl Site {
         }
         for sensor in &self.sensors {
             let ahead = sensor.direction(0.0);
-            let tip = [sensor.place[0] + 0.5 * ahead[0], sensor.place[1] + 0.5 * ahead[1]];
-            line(&mut svg, [sensor.place, tip], "stroke=\"#b00020\" stroke-width=\"2\"");
-            let (x, y) = at(sensor.place);
+            let tip = [sensor.position[0] + 0.5 * ahead[0], sensor.position[1] + 0.5 * ahead[1]];
+            line(&mut svg, [sensor.position, tip], "stroke=\"#b00020\" stroke-width=\"2\"");
+            let (x, y) = at(sensor.position);
             let _ = writeln!(svg, "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"5\" fill=\"#b00020\"/>");
             text(&mut svg, tip, 14.0, "#b00020", &sensor.name);
         }

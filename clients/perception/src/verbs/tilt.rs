@@ -7,18 +7,18 @@ use std::time::Duration;
 use clap::Args;
 use scanhub_client::streams::Sample;
 use scanhub_schema::limits::TopicLimits;
-use scanhub_schema::{Cloud, CloudHead, CloudPoint, Failure, Header, Kind, Obstacles, Topic, Wake};
+use scanhub_schema::{Cloud, CloudHead, CloudPoint, Failure, Header, Kind, Obstacles, Topic, WakeEvent};
 use scanhub_shm::Domain;
 use scanhub_verbs::context::Context;
-use scanhub_verbs::follow::{Bounds, Event, Following};
+use scanhub_verbs::follow::{Event, RunLimits, TopicRun};
 use scanhub_verbs::names::TopicName;
-use scanhub_verbs::output::{End, quiet};
+use scanhub_verbs::output::{ExitReason, verb_result};
 use scanhub_verbs::{duration, json, text};
 use serde::{Serialize, Serializer};
 
 use super::own_name;
 use super::results::{Results, Topics};
-use crate::tilt::{Angle, Check, Counts, DropReason, Mount, Point, Settings, Sweep, TiltScanner};
+use crate::tilt::{Angle, Counts, DropReason, Mount, MountCheck, Point, Settings, Sweep, TiltScanner};
 
 /// 3D from a tilting scanner: points, background, obstacles
 #[derive(Args, Clone, Debug)]
@@ -115,9 +115,9 @@ impl TiltArgs {
     /// - [`Kind::NoHub`] if the run is bounded and no hub runs at its start.
     /// - [`Kind::Timeout`], and [`Kind::Interrupted`] if a signal stopped a bounded run or a check before its end.
     /// - [`Kind::Check`] if a check has failed.
-    /// - The errors of [`PublishSession::beside`](scanhub_client::PublishSession::beside) if it publishes.
+    /// - The errors of [`PublishSession::open_named`](scanhub_client::PublishSession::open_named) if it publishes.
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
-        let (places, stop) = (context.domain.places()?, context.signals.stop()?);
+        let (locations, stop) = (context.domain.locations()?, context.signals.stop()?);
         let names = [(&self.sensor, Topic::Scan), (&self.angles, Topic::Tilt)]
             .map(|(sensor, topic)| TopicName { sensor: sensor.clone(), topic });
         let mount = Mount {
@@ -129,64 +129,64 @@ impl TiltArgs {
             is_upside_down: self.upside_down,
         };
         let settings = Settings { sweeps: self.sweeps, near: self.near, ..Settings::default() };
-        let bounds = Bounds { count: None, run_for: self.run_for, timeout: self.timeout };
-        let name = self.name.as_deref().unwrap_or(UNNAMED);
+        let limits = RunLimits { count: None, run_for: self.run_for, timeout: self.timeout };
+        let name = self.name.as_deref().unwrap_or(DEFAULT_NAME);
         let mut run = TiltRun {
             args: self,
-            places: &places,
+            locations: &locations,
             scanner: TiltScanner::new(mount, settings),
             problem: ProblemFilter::default(),
             late_ns: 0,
-            check: self.check.then(Check::default),
+            check: self.check.then(MountCheck::default),
             beams: None,
             writer: SweepWriter {
                 results: Results::new(name, context.json, &mut context.out, &mut context.notes),
                 to_wall_ns: 0,
                 obstacles: Box::default(),
-                written: Ok(()),
+                first_error: Ok(()),
             },
         };
-        let followed = run.follow(&mut Following::new(&names, &[], &places, &bounds, &stop));
-        let TiltRun { check: Some(check), writer, .. } = &mut run else { return quiet(followed) };
+        let followed = run.follow(&mut TopicRun::new(&names, &[], &locations, &limits, &stop));
+        let TiltRun { check: Some(check), writer, .. } = &mut run else { return verb_result(followed) };
         if check.sweeps() < CHECKED_SWEEPS {
-            quiet(followed)?;
+            verb_result(followed)?;
             let message =
                 format!("the check ended after {} of {CHECKED_SWEEPS} whole sweeps", check.sweeps());
             let kind = if stop.load(Ordering::Relaxed) { Kind::Interrupted } else { Kind::Timeout };
             return Err(Failure::new(kind, message, "let it run until it ends by itself"));
         }
-        quiet(write_findings(check, &mount, &mut writer.results))
+        verb_result(write_findings(check, &mount, &mut writer.results))
     }
 }
 
 /// Name in the lines of a run that publishes nothing.
-const UNNAMED: &str = "tilted";
+const DEFAULT_NAME: &str = "tilted";
 /// Minimum duration of a problem with the angles that is reported. A shorter one is only counted.
-const REPORTED_AFTER_NS: u64 = 300_000_000;
+const MIN_PROBLEM_NS: u64 = 300_000_000;
 
 struct TiltRun<'a> {
     args: &'a TiltArgs,
-    places: &'a [Domain],
+    locations: &'a [Domain],
     scanner: TiltScanner,
     problem: ProblemFilter,
     /// Delay of the angles' stamps that was reported.
     late_ns: i64,
-    check: Option<Check>,
+    check: Option<MountCheck>,
     /// Number of beams of the first scan, once it has arrived.
     beams: Option<usize>,
     writer: SweepWriter<'a>,
 }
 
 impl TiltRun<'_> {
-    fn follow(&mut self, following: &mut Following<'_>) -> Result<(), End> {
+    fn follow(&mut self, following: &mut TopicRun<'_>) -> Result<(), ExitReason> {
         let end = self.take_events(following);
-        if self.check.is_none() && !matches!(end, Err(End::ReaderGone)) {
+        if self.check.is_none() && !matches!(end, Err(ExitReason::ReaderClosed)) {
             self.sum_up()?;
         }
         end
     }
 
-    fn take_events(&mut self, following: &mut Following<'_>) -> Result<(), End> {
+    fn take_events(&mut self, following: &mut TopicRun<'_>) -> Result<(), ExitReason> {
         while let Some(event) = following.next(None)? {
             match event {
                 Event::Sample(_, sample, _) => self.sample(&sample)?,
@@ -199,15 +199,15 @@ impl TiltRun<'_> {
     }
 
     /// Publishes as soon as the number of beams is known, which limits the length of samples.
-    fn publish(&mut self) -> Result<(), End> {
+    fn publish(&mut self) -> Result<(), ExitReason> {
         let results = &mut self.writer.results;
         if let (Some(_), Some(beams), None) = (&self.args.name, self.beams, &results.topics) {
-            results.publish(TopicLimits { beams, ..TopicLimits::default() }, self.places)?;
+            results.publish(TopicLimits { beams, ..TopicLimits::default() }, self.locations)?;
         }
         Ok(())
     }
 
-    fn sample(&mut self, sample: &Sample) -> Result<(), End> {
+    fn sample(&mut self, sample: &Sample) -> Result<(), ExitReason> {
         let TiltRun { scanner, writer, check, .. } = self;
         let mut take = |sweep: &Sweep<'_>| match check {
             Some(check) => check.take(sweep),
@@ -237,14 +237,14 @@ impl TiltRun<'_> {
         }
         if check.as_ref().is_some_and(|check| check.sweeps() >= CHECKED_SWEEPS) {
             // Ends without a summary.
-            return Err(End::ReaderGone);
+            return Err(ExitReason::ReaderClosed);
         }
-        std::mem::replace(&mut writer.written, Ok(()))
+        std::mem::replace(&mut writer.first_error, Ok(()))
     }
 
-    fn sum_up(&mut self) -> Result<(), End> {
+    fn sum_up(&mut self) -> Result<(), ExitReason> {
         let results = &mut self.writer.results;
-        let line = Line::Summary {
+        let line = TiltJson::Summary {
             sensor: results.name,
             counts: self.scanner.counts(),
             missed: results.missed,
@@ -269,7 +269,7 @@ impl ProblemFilter {
         if now != self.now || self.since_ns == 0 {
             (self.now, self.since_ns) = (now, stamp_ns);
         }
-        let is_old = stamp_ns.saturating_sub(self.since_ns) >= REPORTED_AFTER_NS;
+        let is_old = stamp_ns.saturating_sub(self.since_ns) >= MIN_PROBLEM_NS;
         (is_old && now != self.reported).then(|| {
             self.reported = now;
             now
@@ -285,7 +285,7 @@ struct SweepWriter<'a> {
     /// Obstacles of the last sweep.
     obstacles: Box<Obstacles>,
     /// The first error since the last sample.
-    written: Result<(), End>,
+    first_error: Result<(), ExitReason>,
 }
 
 impl SweepWriter<'_> {
@@ -294,8 +294,8 @@ impl SweepWriter<'_> {
         let SweepWriter { results, obstacles, .. } = self;
         let line = json::obstacles(results.name, &header, obstacles);
         let written = results.result(&line, |out| text::obstacles(out, &header, obstacles));
-        if self.written.is_ok() {
-            self.written = written;
+        if self.first_error.is_ok() {
+            self.first_error = written;
         }
     }
 
@@ -344,8 +344,8 @@ impl SweepWriter<'_> {
             let header = header_of(cloud.next_number(), from_ns, until_ns);
             // Subscribers notice by its number that a sample is missing, and poll if they cannot be woken.
             let _ = cloud.send_len_with(&header, Cloud::len(points.len()), |sample| {
-                for (place, point) in sample.begin(head).iter_mut().zip(points) {
-                    *place = CloudPoint {
+                for (slot, point) in sample.begin(head).iter_mut().zip(points) {
+                    *slot = CloudPoint {
                         at: point.at,
                         beam: point.beam,
                         point_class: point.class as u8,
@@ -355,7 +355,7 @@ impl SweepWriter<'_> {
             });
         }
         let _ = obstacles.send_with(&header, |sample| *sample = *self.obstacles);
-        let _ = sensor.wake(Wake::Telegram);
+        let _ = sensor.wake(WakeEvent::Telegram);
         header
     }
 
@@ -365,8 +365,8 @@ impl SweepWriter<'_> {
         problem: Option<DropReason>,
         late_ns: i64,
         mount: Option<&str>,
-    ) -> Result<(), End> {
-        let line = Line::Angles { sensor: self.results.name, problem, late_ns, mount };
+    ) -> Result<(), ExitReason> {
+        let line = TiltJson::Angles { sensor: self.results.name, problem, late_ns, mount };
         self.results.note(&line, |out| line.text(out))
     }
 }
@@ -379,7 +379,7 @@ fn scans(points: &[Point], most: usize) -> impl Iterator<Item = &[Point]> {
 /// The lines that only `tilt` has. The variant is the class.
 #[derive(Serialize)]
 #[serde(tag = "class", rename_all = "snake_case")]
-enum Line<'a> {
+enum TiltJson<'a> {
     Angles {
         sensor: &'a str,
         problem: Option<DropReason>,
@@ -402,16 +402,16 @@ enum Line<'a> {
     },
 }
 
-impl Line<'_> {
+impl TiltJson<'_> {
     fn text(&self, out: &mut Vec<u8>) -> io::Result<()> {
         match self {
-            Line::Angles { mount: Some(mount), late_ns, .. } => write!(
+            TiltJson::Angles { mount: Some(mount), late_ns, .. } => write!(
                 out,
                 "the stamps of {mount}/tilt are {}, or its gears have play: corrected. Publish each angle with the time of \
                  its measurement",
                 lateness(*late_ns)
             ),
-            Line::Angles { problem, .. } => {
+            TiltJson::Angles { problem, .. } => {
                 let text = match problem {
                     None => "the angles are well again",
                     Some(DropReason::Silent) => {
@@ -426,11 +426,11 @@ impl Line<'_> {
                 };
                 out.write_all(text.as_bytes())
             }
-            Line::TiltCheck(Finding { name, state, finding, remedy, .. }) => {
+            TiltJson::TiltCheck(Finding { name, state, finding, remedy, .. }) => {
                 write!(out, "{state:<8} {name}: {finding}")?;
                 if remedy.is_empty() { Ok(()) } else { write!(out, "; {remedy}") }
             }
-            Line::Summary { counts, missed, failed, late_ns, .. } => {
+            TiltJson::Summary { counts, missed, failed, late_ns, .. } => {
                 let Counts { sweeps, incomplete, unreliable, scans, points, angles, .. } = counts;
                 write!(
                     out,
@@ -470,11 +470,11 @@ fn lateness(late_ns: i64) -> String {
 /// Number of complete sweeps that a check takes.
 const CHECKED_SWEEPS: u32 = 6;
 /// Maximum error of the height, in meters.
-const HEIGHT_M: f64 = 0.02;
+const MAX_HEIGHT_ERROR_M: f64 = 0.02;
 /// Maximum error of the level and of the roll, in degrees.
-const LEVEL_DEG: f64 = 0.3;
+const MAX_LEVEL_ERROR_DEG: f64 = 0.3;
 /// Maximum lean of a wall that the level does not explain, in degrees.
-const LEAN_DEG: f64 = 0.5;
+const MAX_LEAN_DEG: f64 = 0.5;
 
 /// Result of one item of a check.
 #[derive(Serialize)]
@@ -494,14 +494,14 @@ struct Finding<'a> {
 ///
 /// Returns [`Kind::Check`] if an item has failed.
 fn write_findings(
-    check: &Check,
+    check: &MountCheck,
     mount: &Mount,
     results: &mut Results<'_, Cloud, Obstacles>,
-) -> Result<(), End> {
+) -> Result<(), ExitReason> {
     let findings = find(check, mount, results.name);
     let has_failed = findings.iter().any(|finding| finding.state == "failed");
     for finding in findings {
-        let line = Line::TiltCheck(finding);
+        let line = TiltJson::TiltCheck(finding);
         results.result(&line, |out| line.text(out))?;
     }
     if has_failed {
@@ -513,7 +513,7 @@ fn write_findings(
 }
 
 /// Returns the result of each item of a check.
-fn find<'a>(check: &Check, mount: &Mount, sensor: &'a str) -> Vec<Finding<'a>> {
+fn find<'a>(check: &MountCheck, mount: &Mount, sensor: &'a str) -> Vec<Finding<'a>> {
     let item =
         |name, off_m: Option<f64>, off_deg: Option<f64>, is_ok: bool, finding: String, remedy: String| {
             let (state, remedy) = if is_ok { ("ok", String::new()) } else { ("failed", remedy) };
@@ -538,7 +538,7 @@ fn find<'a>(check: &Check, mount: &Mount, sensor: &'a str) -> Vec<Finding<'a>> {
             "floor",
             Some(floor.height_m),
             None,
-            floor.height_m.abs() <= HEIGHT_M,
+            floor.height_m.abs() <= MAX_HEIGHT_ERROR_M,
             format!(
                 "its height is {:.3} m, from {} points with a standard deviation of {:.3} m",
                 floor.height_m, floor.points, floor.deviation_m
@@ -549,7 +549,7 @@ fn find<'a>(check: &Check, mount: &Mount, sensor: &'a str) -> Vec<Finding<'a>> {
             "level",
             None,
             Some(level_deg),
-            level_deg.abs() <= LEVEL_DEG,
+            level_deg.abs() <= MAX_LEVEL_ERROR_DEG,
             format!("the floor rises by {level_deg:.2} degrees in the direction in which the mount tilts"),
             format!("--level {:.4}", mount.level_rad - floor.level_rad),
         ),
@@ -557,7 +557,7 @@ fn find<'a>(check: &Check, mount: &Mount, sensor: &'a str) -> Vec<Finding<'a>> {
             "axis",
             None,
             Some(roll_deg),
-            roll_deg.abs() <= LEVEL_DEG,
+            roll_deg.abs() <= MAX_LEVEL_ERROR_DEG,
             format!("the floor rises by {roll_deg:.2} degrees along the axis"),
             "level axis and scanner across, or describe the axis with --axis".into(),
         ),
@@ -574,7 +574,7 @@ fn find<'a>(check: &Check, mount: &Mount, sensor: &'a str) -> Vec<Finding<'a>> {
                 "arm",
                 None,
                 Some(off_deg),
-                off_deg.abs() <= LEAN_DEG,
+                off_deg.abs() <= MAX_LEAN_DEG,
                 format!(
                     "the wall at {:.2} m leans by {off_deg:.2} degrees more than the floor explains, from {} points with a \
                      standard deviation of {:.3} m",
@@ -619,7 +619,7 @@ mod tests {
     }
 
     #[test]
-    fn places_and_boxes_are_read_and_what_is_none_is_refused() {
+    fn positions_axes_and_boxes_are_parsed_or_refused() {
         assert_eq!(numbers("0.1, -2,3"), Ok([0.1, -2.0, 3.0]));
         assert_eq!(numbers::<3>("1,2").unwrap_err(), "expected 3 numbers, found 2");
         assert_eq!(numbers::<1>("inf").unwrap_err(), "\"inf\" is not a number");

@@ -8,18 +8,18 @@ use clap::Args;
 use scanhub_client::clock;
 use scanhub_client::streams::{Join, Sample};
 use scanhub_schema::limits::TopicLimits;
-use scanhub_schema::{Event, Failure, Foreground, Header, Kind, Scan, Topic, Tracks, Wake};
+use scanhub_schema::{Event, Failure, Foreground, Header, Kind, Scan, Topic, Tracks, WakeEvent};
 use scanhub_shm::Domain;
 use scanhub_verbs::context::Context;
-use scanhub_verbs::follow::{self, Bounds, Following};
+use scanhub_verbs::follow::{self, RunLimits, TopicRun};
 use scanhub_verbs::names::TopicName;
-use scanhub_verbs::output::{End, quiet};
+use scanhub_verbs::output::{ExitReason, verb_result};
 use scanhub_verbs::{duration, json, text};
 use serde::{Serialize, Serializer};
 
 use super::own_name;
 use super::results::{Results, Topics};
-use crate::track::{self, Counts, Misplaced, PICTURE_NS, PeopleTracker, Picture, Site};
+use crate::track::{self, Counts, MisplacedSensor, PeopleTracker, SNAPSHOT_INTERVAL_NS, Site, Snapshot};
 
 /// Follow people across the sensors and rooms of a site, and count them at doors
 #[derive(Args, Clone, Debug)]
@@ -62,22 +62,22 @@ impl TrackArgs {
     /// - [`Kind::NoTopic`] if a sensor does not exist; the message lists the sensors.
     /// - [`Kind::NoHub`] if the run is bounded and no hub runs at its start.
     /// - [`Kind::Timeout`], and [`Kind::Interrupted`] if a signal stopped a bounded run before its end.
-    /// - The errors of [`PublishSession::beside`](scanhub_client::PublishSession::beside) if it publishes.
+    /// - The errors of [`PublishSession::open_named`](scanhub_client::PublishSession::open_named) if it publishes.
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
-        let (places, stop) = (context.domain.places()?, context.signals.stop()?);
+        let (locations, stop) = (context.domain.locations()?, context.signals.stop()?);
         let site = Site::read(&self.site)?;
         let counted = self.count.iter().map(|name| door(&site, name)).collect::<Result<_, _>>()?;
         let topics = |sensor: &track::site::Sensor| {
             [Topic::Scan, Topic::Foreground].map(|topic| TopicName { sensor: sensor.name.clone(), topic })
         };
         let names: Vec<TopicName> = site.sensors.iter().flat_map(topics).collect();
-        let bounds = Bounds { count: None, run_for: self.run_for, timeout: self.timeout };
-        let name = self.name.as_deref().unwrap_or(UNNAMED);
+        let limits = RunLimits { count: None, run_for: self.run_for, timeout: self.timeout };
+        let name = self.name.as_deref().unwrap_or(DEFAULT_NAME);
         let mut results = Results::new(name, context.json, &mut context.out, &mut context.notes);
-        results.header.period_us = (PICTURE_NS / 1000) as u32;
+        results.header.period_us = (SNAPSHOT_INTERVAL_NS / 1000) as u32;
         let mut run = TrackRun {
             args: self,
-            places: &places,
+            locations: &locations,
             tracker: PeopleTracker::new(
                 site.clone(),
                 u64::try_from(self.delay.as_nanos()).unwrap_or(u64::MAX),
@@ -85,9 +85,9 @@ impl TrackArgs {
             joins: site.sensors.iter().map(|_| Join::default()).collect(),
             late: LateReports::new(site.sensors.len()),
             is_subscribed: false,
-            writer: PictureWriter {
+            writer: SnapshotWriter {
                 counted,
-                passed: vec![[0; 2]; site.doors.len()],
+                passages: vec![[0; 2]; site.doors.len()],
                 appeared: 0,
                 tracks: Box::default(),
                 samples: [0; 2],
@@ -95,7 +95,7 @@ impl TrackArgs {
                 results,
             },
         };
-        quiet(run.follow(&mut Following::new(&names, &[], &places, &bounds, &stop)))
+        verb_result(run.follow(&mut TopicRun::new(&names, &[], &locations, &limits, &stop)))
     }
 }
 
@@ -112,32 +112,32 @@ fn door(site: &Site, name: &str) -> Result<usize, Failure> {
 }
 
 /// Name in the lines of a tracker that publishes nothing.
-const UNNAMED: &str = "people";
+const DEFAULT_NAME: &str = "people";
 
 type StampedScan = (Header, Box<Scan>);
 
 struct TrackRun<'a> {
     args: &'a TrackArgs,
-    places: &'a [Domain],
+    locations: &'a [Domain],
     tracker: PeopleTracker,
     /// Scans and foregrounds of each sensor of the site.
     joins: Vec<Join<StampedScan, Box<Foreground>>>,
     late: LateReports,
     /// Whether a topic of a sensor has existed.
     is_subscribed: bool,
-    writer: PictureWriter<'a>,
+    writer: SnapshotWriter<'a>,
 }
 
 impl TrackRun<'_> {
-    fn follow(&mut self, following: &mut Following<'_>) -> Result<(), End> {
+    fn follow(&mut self, following: &mut TopicRun<'_>) -> Result<(), ExitReason> {
         let end = self.take_events(following);
-        if !matches!(end, Err(End::ReaderGone)) {
+        if !matches!(end, Err(ExitReason::ReaderClosed)) {
             self.sum_up()?;
         }
         end
     }
 
-    fn take_events(&mut self, following: &mut Following<'_>) -> Result<(), End> {
+    fn take_events(&mut self, following: &mut TopicRun<'_>) -> Result<(), ExitReason> {
         while let Some(event) = following.next(None)? {
             match event {
                 follow::Event::Subscribed(_) => self.is_subscribed = true,
@@ -157,18 +157,18 @@ impl TrackRun<'_> {
     }
 
     /// Reports late scans, and publishes as soon as a domain exists.
-    fn tick(&mut self, now: Instant) -> Result<(), End> {
+    fn tick(&mut self, now: Instant) -> Result<(), ExitReason> {
         for (sensor, count) in self.late.due(now, self.tracker.late()) {
             self.writer.report_late(sensor, count, self.args.delay)?;
         }
         let results = &mut self.writer.results;
         if self.args.name.is_some() && self.is_subscribed && results.topics.is_none() {
-            results.publish(TopicLimits::default(), self.places)?;
+            results.publish(TopicLimits::default(), self.locations)?;
         }
         Ok(())
     }
 
-    fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
+    fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), ExitReason> {
         let sensors = &self.tracker.site().sensors;
         let Some(sensor) = sensors.iter().position(|one| one.name == name.sensor) else { return Ok(()) };
         let (join, now_ns) = (&mut self.joins[sensor], clock::now_ns());
@@ -188,7 +188,7 @@ impl TrackRun<'_> {
         written
     }
 
-    fn sum_up(&mut self) -> Result<(), End> {
+    fn sum_up(&mut self) -> Result<(), ExitReason> {
         let writer = &mut self.writer;
         let mut written = Ok(());
         self.tracker.finish(|picture| {
@@ -205,12 +205,12 @@ impl TrackRun<'_> {
 }
 
 /// Writes and publishes pictures.
-struct PictureWriter<'a> {
+struct SnapshotWriter<'a> {
     site: Site,
     /// Indices of the doors whose counts alone are printed; empty: everything is.
     counted: Vec<usize>,
     /// Number of people who went through each door: from its `from` to its `to`, and back.
-    passed: Vec<[u64; 2]>,
+    passages: Vec<[u64; 2]>,
     appeared: u64,
     /// Tracks of the last picture.
     tracks: Box<Tracks>,
@@ -219,32 +219,38 @@ struct PictureWriter<'a> {
     results: Results<'a, Tracks, Event>,
 }
 
-impl PictureWriter<'_> {
-    fn write(&mut self, picture: &Picture) -> Result<(), End> {
+impl SnapshotWriter<'_> {
+    fn write(&mut self, picture: &Snapshot) -> Result<(), ExitReason> {
         let events = self.publish(picture);
-        let PictureWriter { site, counted, passed, appeared, tracks, results, .. } = self;
+        let SnapshotWriter { site, counted, passages: passed, appeared, tracks, results, .. } = self;
         let (name, prints_all) = (results.name, counted.is_empty());
         // Where everyone is would be too much text.
         if prints_all && results.is_json {
             let header = results.header;
             results.result(&json::tracks(name, &header, tracks), |_| Ok(()))?;
         }
-        for &Misplaced { sensor, other, off: [dx_m, dy_m] } in &picture.misplaced {
+        for &MisplacedSensor { sensor, other, offset: [dx_m, dy_m] } in &picture.misplaced {
             let [sensor, other] = [sensor, other].map(|number| site.sensors[number].name.as_str());
-            let line =
-                Line::Misplaced { sensor: name, wall_ns: picture.wall_ns, name: sensor, other, dx_m, dy_m };
+            let line = TrackJson::Misplaced {
+                sensor: name,
+                wall_ns: picture.wall_ns,
+                name: sensor,
+                other,
+                dx_m,
+                dy_m,
+            };
             results.note(&line, |out| line.text(out))?;
         }
         for (event, (header, payload)) in picture.events.iter().zip(&events) {
             if prints_all {
-                results.result(&json::event(name, header, payload), |out| text::event_words(out, payload))?;
+                results.result(&json::event(name, header, payload), |out| text::event_text(out, payload))?;
             }
             *appeared += u64::from(event.kind == track::Kind::Appeared);
             let track::Kind::Door { door, from, .. } = event.kind else { continue };
             passed[door][usize::from(site.doors[door].from != from)] += 1;
             if counted.contains(&door) {
-                let door = Passed::of(&site.doors[door].name, passed[door]);
-                let line = Line::Count { sensor: name, wall_ns: event.wall_ns, door };
+                let door = PassageCounts::of(&site.doors[door].name, passed[door]);
+                let line = TrackJson::Count { sensor: name, wall_ns: event.wall_ns, door };
                 results.result(&line, |out| line.text(out))?;
             }
         }
@@ -252,8 +258,8 @@ impl PictureWriter<'_> {
     }
 
     /// Publishes a picture if the tracker has topics. Returns its events as samples.
-    fn publish(&mut self, picture: &Picture) -> Vec<(Header, Event)> {
-        let PictureWriter { site, tracks, samples: [pictures, events], results, .. } = self;
+    fn publish(&mut self, picture: &Snapshot) -> Vec<(Header, Event)> {
+        let SnapshotWriter { site, tracks, samples: [pictures, events], results, .. } = self;
         let now_ns = clock::now_ns();
         let header = Header {
             seq: *pictures,
@@ -277,25 +283,25 @@ impl PictureWriter<'_> {
                 let _ = publications.1.send_with(header, |sample| *sample = *event);
             }
             let _ = publications.0.send_with(&header, |sample| *sample = **tracks);
-            let _ = sensor.wake(Wake::Telegram);
+            let _ = sensor.wake(WakeEvent::Telegram);
         }
         numbered
     }
 
     /// Reports `late` late scans of a sensor.
-    fn report_late(&mut self, sensor: usize, late: u64, delay: Duration) -> Result<(), End> {
+    fn report_late(&mut self, sensor: usize, late: u64, delay: Duration) -> Result<(), ExitReason> {
         let (sensor, name) = (self.results.name, &self.site.sensors[sensor].name);
-        let line = Line::Late { sensor, wall_ns: self.results.header.wall_ns, name, late, delay };
+        let line = TrackJson::Late { sensor, wall_ns: self.results.header.wall_ns, name, late, delay };
         self.results.note(&line, |out| line.text(out))
     }
 
-    fn sum_up(&mut self, counts: Counts) -> Result<(), End> {
-        let doors = self.site.doors.iter().zip(&self.passed);
-        let line = Line::Summary {
+    fn sum_up(&mut self, counts: Counts) -> Result<(), ExitReason> {
+        let doors = self.site.doors.iter().zip(&self.passages);
+        let line = TrackJson::Summary {
             sensor: self.results.name,
             samples: self.samples[0],
             appeared: self.appeared,
-            doors: doors.map(|(door, &passed)| Passed::of(&door.name, passed)).collect(),
+            doors: doors.map(|(door, &passed)| PassageCounts::of(&door.name, passed)).collect(),
             counts,
             missed: self.results.missed,
             failed: self.results.failed(),
@@ -307,12 +313,12 @@ impl PictureWriter<'_> {
 /// The lines that only `track` has. The variant is the class.
 #[derive(Serialize)]
 #[serde(tag = "class", rename_all = "snake_case")]
-enum Line<'a> {
+enum TrackJson<'a> {
     Count {
         sensor: &'a str,
         wall_ns: u64,
         #[serde(flatten)]
-        door: Passed<'a>,
+        door: PassageCounts<'a>,
     },
     Misplaced {
         sensor: &'a str,
@@ -336,7 +342,7 @@ enum Line<'a> {
         sensor: &'a str,
         samples: u64,
         appeared: u64,
-        doors: Vec<Passed<'a>>,
+        doors: Vec<PassageCounts<'a>>,
         #[serde(flatten)]
         counts: Counts,
         missed: u64,
@@ -347,15 +353,15 @@ enum Line<'a> {
 
 /// Number of people who went through a door: from its `from` to its `to`, and back.
 #[derive(Clone, Copy, Serialize)]
-struct Passed<'a> {
+struct PassageCounts<'a> {
     door: &'a str,
     forth: u64,
     back: u64,
 }
 
-impl<'a> Passed<'a> {
-    fn of(door: &'a str, [forth, back]: [u64; 2]) -> Passed<'a> {
-        Passed { door, forth, back }
+impl<'a> PassageCounts<'a> {
+    fn of(door: &'a str, [forth, back]: [u64; 2]) -> PassageCounts<'a> {
+        PassageCounts { door, forth, back }
     }
 
     fn text(&self, out: &mut Vec<u8>) -> io::Result<()> {
@@ -363,23 +369,23 @@ impl<'a> Passed<'a> {
     }
 }
 
-impl Line<'_> {
+impl TrackJson<'_> {
     fn text(&self, out: &mut Vec<u8>) -> io::Result<()> {
         match self {
-            Line::Count { door, .. } => door.text(out),
-            Line::Misplaced { name, other, dx_m, dy_m, .. } => write!(
+            TrackJson::Count { door, .. } => door.text(out),
+            TrackJson::Misplaced { name, other, dx_m, dy_m, .. } => write!(
                 out,
                 "{name} sees people ({dx_m:.2}, {dy_m:.2}) m beside where {other} sees them: correct one of their poses \
                  in the site file; until then {name} is taken to be where {other} says"
             ),
-            Line::Late { name, late, delay, .. } => {
+            TrackJson::Late { name, late, delay, .. } => {
                 match late {
                     1 => write!(out, "{name}: 1 scan was dropped because it arrived late")?,
                     _ => write!(out, "{name}: {late} scans were dropped because they arrived late")?,
                 }
                 write!(out, ": set --delay longer than {delay:?}")
             }
-            Line::Summary { appeared, doors, counts, missed, failed, .. } => {
+            TrackJson::Summary { appeared, doors, counts, missed, failed, .. } => {
                 let Counts { scans, late, jumped, invalid } = counts;
                 write!(out, "{appeared} people appeared in {scans} scans")?;
                 for door in doors {
@@ -441,7 +447,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn first_late_scan_is_reported_at_once_and_others_every_five_seconds() {
+    fn late_scans_are_reported_at_most_every_5_seconds() {
         let begin = Instant::now();
         let mut reports = LateReports::new(3);
         let mut due = |after_s: u64, late: [u64; 3]| reports.due(begin + Duration::from_secs(after_s), &late);

@@ -9,7 +9,7 @@ use scanhub_schema::{Scan, ScanHead};
 const MS: u64 = 1_000_000;
 
 /// What (w, x, y, z) turns v to.
-fn turned(q: [f64; 4], v: [f64; 3]) -> [f64; 3] {
+fn rotate(q: [f64; 4], v: [f64; 3]) -> [f64; 3] {
     let times = |a: [f64; 4], b: [f64; 4]| {
         [
             a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
@@ -30,7 +30,7 @@ fn point(mount: &Mount, angle_rad: f64, beam_rad: f64, range_m: f64) -> [f64; 3]
     let (sin, cos) = (mount.yaw_rad + sign * beam_rad).sin_cos();
     let end: [f64; 3] =
         std::array::from_fn(|i| mount.sensor_at[i] - mount.axis_at[i] + range_m * [cos, sin, 0.0][i]);
-    let end = turned(q, end);
+    let end = rotate(q, end);
     std::array::from_fn(|i| mount.axis_at[i] + end[i])
 }
 
@@ -38,7 +38,7 @@ fn point(mount: &Mount, angle_rad: f64, beam_rad: f64, range_m: f64) -> [f64; 3]
 fn each_point_is_where_all_angles_together_say() {
     for seed in 0..8 {
         let mut random = fastrand::Rng::with_seed(seed);
-        let mut draw = |most: f64| most * (2.0 * random.f64() - 1.0);
+        let mut draw = |maximum: f64| maximum * (2.0 * random.f64() - 1.0);
         let mount = Mount {
             axis_at: [draw(0.3), draw(0.3), 1.0 + draw(0.3)],
             axis: if seed % 2 == 0 { [0.0, 1.0, 0.0] } else { [0.6, -0.8, 0.0] },
@@ -77,8 +77,8 @@ fn each_point_is_where_all_angles_together_say() {
         let mut made = 0;
         let mut check = |sweep: &scanhub_perception::tilt::Sweep<'_>| {
             for point in sweep.points {
-                let wanted = expected[&(point.stamp_ns, point.beam)];
-                let off = (0..3).map(|i| (wanted[i] - f64::from(point.at[i])).abs()).fold(0.0, f64::max);
+                let target = expected[&(point.stamp_ns, point.beam)];
+                let off = (0..3).map(|i| (target[i] - f64::from(point.at[i])).abs()).fold(0.0, f64::max);
                 assert!(off < 1e-5, "seed {seed}: {off} m");
                 assert!(point.stamp_ns <= sweep.until_ns && point.stamp_ns >= sweep.from_ns);
                 made += 1;

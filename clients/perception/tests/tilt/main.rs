@@ -13,22 +13,22 @@ mod halls;
 mod judge;
 
 use hall::Hall;
-use judge::{Score, Seen, seconds};
+use judge::{ObstacleTimes, PointScore, seconds};
 use scanhub_perception::tilt::{DropReason, Settings};
 use scanhub_sim::mount::{Fault, FaultKind};
 use scanhub_sim::world::World;
 
 #[test]
-fn people_a_pole_and_a_box_are_found_and_melt_into_the_background() {
+fn obstacles_are_found_and_become_background() {
     let settings = Settings::default();
-    let mut score = Score::default();
-    let mut seen = Seen::default();
+    let mut score = PointScore::default();
+    let mut detections = ObstacleTimes::default();
     let counts = Hall::new(&"tilt".parse().expect("built in"), 1).play(settings, 52, |hall, sweep| {
-        seen.add(sweep);
+        detections.add(sweep);
         let is_known = sweep.from_ns > seconds(10) && sweep.until_ns < seconds(24);
         assert!(!is_known || sweep.obstacles.is_empty(), "nothing is new yet: {:?}", sweep.obstacles);
         if sweep.until_ns > seconds(20) {
-            score.add(hall, sweep, &settings, judge::SWEEP_NS);
+            score.add(hall, sweep, &settings, judge::SWEEP_TIME_NS);
         }
     });
     assert_eq!(
@@ -36,16 +36,16 @@ fn people_a_pole_and_a_box_are_found_and_melt_into_the_background() {
         0,
         "{counts:?}"
     );
-    assert!(seen.is_pole_found_at_once(), "{seen:?}");
-    assert!(seen.sweeps_of_pole() >= 4 && seen.sweeps_of_pole() <= 7, "{seen:?}");
-    assert!(seen.sweeps_of_box() >= 4 && seen.sweeps_of_box() <= 7, "{seen:?}");
+    assert!(detections.is_pole_found_first_sweep(), "{detections:?}");
+    assert!(detections.sweeps_of_pole() >= 4 && detections.sweeps_of_pole() <= 7, "{detections:?}");
+    assert!(detections.sweeps_of_box() >= 4 && detections.sweeps_of_box() <= 7, "{detections:?}");
     assert!(score.persons.0 > 2000 && score.things.0 > 1000, "{score:?}");
     assert!(score.recall() > 0.95 && score.precision() > 0.97, "{score:?}");
 }
 
 /// Returns the dropped beams by reason, and the number of unreliable sweeps, for a fault from 7 to 10 s in a room in which
 /// nothing is new. Asserts that no obstacle is invented, that no final point is wrong, and that the tilt recovers.
-fn of(kind: FaultKind) -> ([u64; DropReason::COUNT], u64) {
+fn run_with_fault(kind: FaultKind) -> ([u64; DropReason::COUNT], u64) {
     let room = "[[thing]]\nline = [[-2500, -1000], [2500, -1000], [2500, 4000], [-2500, 4000], [-2500, -1000]]\n\
                 [[thing]]\nbox = [600, 400]\nheight_mm = 350\npose = [-900, 2200, 35]\n";
     let mount = "[sensor.mount]\nheight_mm = 900\narm_mm = [60, 40]\nfrom_deg = 0\nto_deg = 30\n";
@@ -64,28 +64,28 @@ fn of(kind: FaultKind) -> ([u64; DropReason::COUNT], u64) {
         healthy += u32::from(from > 11.5 && sweep.is_complete && !sweep.is_unreliable);
     });
     assert!(healthy >= 4, "{kind:?}: {healthy}, {counts:?}");
-    assert_eq!(hall.late_ns, 0, "{kind:?}: the stamps were right");
+    assert_eq!(hall.stamp_delay_ns, 0, "{kind:?}: the stamps were right");
     (counts.points_dropped, counts.unreliable)
 }
 
 #[test]
-fn a_mount_that_halts_is_told_and_makes_no_points() {
-    let ([silent, jumped, inconsistent, standing], unreliable) = of(FaultKind::Halts);
+fn points_of_a_halted_mount_are_dropped_as_standing() {
+    let ([silent, jumped, inconsistent, standing], unreliable) = run_with_fault(FaultKind::Halt);
     assert_eq!([silent, jumped, inconsistent, unreliable], [0; 4]);
     // As long as it stands, and no longer.
     assert!((35_000..42_000).contains(&standing), "{standing}");
 }
 
 #[test]
-fn an_encoder_that_hangs_is_told_and_makes_no_points() {
-    let ([silent, jumped, inconsistent, standing], unreliable) = of(FaultKind::Stuck);
+fn points_of_a_hanging_encoder_are_dropped() {
+    let ([silent, jumped, inconsistent, standing], unreliable) = run_with_fault(FaultKind::Stuck);
     assert_eq!([silent, inconsistent, unreliable], [0; 3]);
     assert!(standing > 30_000 && jumped > 0, "{standing} {jumped}");
 }
 
 #[test]
-fn a_silent_encoder_is_told_and_makes_no_points() {
-    let ([silent, jumped, inconsistent, standing], unreliable) = of(FaultKind::Silent);
+fn points_of_a_silent_encoder_are_dropped() {
+    let ([silent, jumped, inconsistent, standing], unreliable) = run_with_fault(FaultKind::Silence);
     assert_eq!([jumped, inconsistent, standing, unreliable], [0; 4]);
     assert!((35_000..42_000).contains(&silent), "{silent}");
 }
@@ -93,7 +93,7 @@ fn a_silent_encoder_is_told_and_makes_no_points() {
 #[test]
 fn an_encoder_that_jumps_is_told_and_what_it_says_then_is_unreliable() {
     for by_deg in [8.0, -3.0] {
-        let ([_, jumped, ..], unreliable) = of(FaultKind::Jumps(by_deg));
+        let ([_, jumped, ..], unreliable) = run_with_fault(FaultKind::Jump(by_deg));
         assert!(jumped > 5_000 && unreliable > 0, "{by_deg}: {jumped} {unreliable}");
     }
 }
@@ -101,36 +101,40 @@ fn an_encoder_that_jumps_is_told_and_what_it_says_then_is_unreliable() {
 #[test]
 fn an_encoder_that_lies_is_unreliable() {
     for by_deg in [4.0, -2.0] {
-        let (points_dropped, unreliable) = of(FaultKind::Lies(by_deg));
+        let (points_dropped, unreliable) = run_with_fault(FaultKind::Drift(by_deg));
         assert!(unreliable >= 3, "{by_deg}: {points_dropped:?} {unreliable}");
     }
 }
 
 #[test]
-fn angles_that_come_late_are_waited_for_but_not_for_ever() {
-    let ([silent, others @ ..], unreliable) = of(FaultKind::Late(0.2));
+fn late_angles_are_awaited_for_a_limited_time() {
+    let ([silent, others @ ..], unreliable) = run_with_fault(FaultKind::Delay(0.2));
     // When they come in time again, the last late ones come after them.
     assert!(silent < 4_000 && others == [0; 3] && unreliable == 0, "{silent} {others:?} {unreliable}");
-    let ([silent, ..], _) = of(FaultKind::Late(1.0));
+    let ([silent, ..], _) = run_with_fault(FaultKind::Delay(1.0));
     assert!(silent > 20_000, "{silent}");
 }
 
 #[test]
-fn stamps_that_are_late_from_the_start_are_found_and_corrected() {
+fn constant_stamp_offset_is_found_and_corrected() {
     for (seed, by_s) in [(0, 0.03), (1, -0.03), (2, 0.1), (3, 0.01)] {
-        let fault = Fault { kind: FaultKind::StampsLate(by_s), from_s: 0.0, until_s: f64::INFINITY };
+        let fault = Fault { kind: FaultKind::StampDelay(by_s), from_s: 0.0, until_s: f64::INFINITY };
         let world = halls::unchanging(seed).with_mount_faults(&[fault]);
-        let (mut sweeps, mut most) = (0, 0.0_f64);
+        let (mut sweeps, mut max_error_m) = (0, 0.0_f64);
         let mut hall = Hall::new(&world, seed);
         let counts = hall.play(Settings::default(), 17, |hall, sweep| {
             if sweep.from_ns > seconds(11) {
                 sweeps += 1;
                 let errors = sweep.points.iter().map(|point| hall.error_m(point));
-                most = errors.fold(most, f64::max);
+                max_error_m = errors.fold(max_error_m, f64::max);
             }
         });
-        assert!((hall.late_ns as f64 / 1e9 - by_s).abs() < 0.001, "{by_s} s: {} ns", hall.late_ns);
-        assert!(sweeps > 1 && most < 0.02, "{by_s} s: {most} m in {sweeps} sweeps");
+        assert!(
+            (hall.stamp_delay_ns as f64 / 1e9 - by_s).abs() < 0.001,
+            "{by_s} s: {} ns",
+            hall.stamp_delay_ns
+        );
+        assert!(sweeps > 1 && max_error_m < 0.02, "{by_s} s: {max_error_m} m in {sweeps} sweeps");
         assert_eq!(
             (counts.background_resets, counts.unreliable),
             (1, 0),
@@ -140,8 +144,8 @@ fn stamps_that_are_late_from_the_start_are_found_and_corrected() {
 }
 
 #[test]
-fn stamps_that_get_late_are_corrected_and_the_background_stays() {
-    let fault = Fault { kind: FaultKind::StampsLate(0.03), from_s: 20.0, until_s: f64::INFINITY };
+fn new_stamp_delay_is_corrected_and_background_stays() {
+    let fault = Fault { kind: FaultKind::StampDelay(0.03), from_s: 20.0, until_s: f64::INFINITY };
     let world = halls::unchanging(0).with_mount_faults(&[fault]);
     let mut known = 0;
     let mut hall = Hall::new(&world, 0);
@@ -151,7 +155,7 @@ fn stamps_that_get_late_are_corrected_and_the_background_stays() {
         known += u32::from(sweep.from_ns > seconds(30) && is_known);
         assert!(sweep.is_unreliable || sweep.obstacles.is_empty(), "{:?}", sweep.obstacles);
     });
-    assert!((hall.late_ns as f64 / 1e6 - 30.0).abs() < 1.0, "{} ns", hall.late_ns);
+    assert!((hall.stamp_delay_ns as f64 / 1e6 - 30.0).abs() < 1.0, "{} ns", hall.stamp_delay_ns);
     assert!(
         (1..=5).contains(&counts.unreliable) && counts.background_resets == 0 && known > 2,
         "{counts:?} {known}"
@@ -159,7 +163,7 @@ fn stamps_that_get_late_are_corrected_and_the_background_stays() {
 }
 
 #[test]
-fn boards_narrower_than_the_distance_between_scans_are_no_obstacles() {
+fn narrow_boards_between_scans_are_no_obstacles() {
     let mut hall = Hall::new(&halls::unchanging(1), 1);
     let until_s = 45 * hall.sweep_ns() / seconds(1);
     hall.play(Settings::default(), until_s, |_, sweep| {
@@ -178,7 +182,7 @@ fn a_top_that_level_beams_graze_is_no_obstacle() {
 
 #[test]
 fn a_check_finds_the_wall_ahead_between_side_walls() {
-    let mut check = scanhub_perception::tilt::Check::default();
+    let mut check = scanhub_perception::tilt::MountCheck::default();
     let mut hall = Hall::new(&"tilt".parse().expect("built in"), 1);
     hall.play(Settings::default(), 14, |_, sweep| check.take(sweep));
     let (floor, wall) = (check.floor(&hall.mount).expect("a floor"), check.wall().expect("a wall"));

@@ -1,19 +1,19 @@
 //! Doors with leaves that move: no one is counted when only the leaves move, and each person is counted once, whether they
 //! walk through or stand in the opening.
 
-use crate::hall::{LEAVES, Leaves, SCANNERS, SITE, Scene, Walker, events};
+use crate::hall::{DOOR_KINDS, DoorKind, HALL_SITE, SCANNERS, Scene, Walker, events};
 use scanhub_perception::track::geometry::Point;
 use scanhub_perception::track::{Event, Kind};
 
 /// Positions of the scanner: in the middle of the wall, at its side, and nearer to the door.
-const PLACES: [Point; 3] = [[0.0, 0.0], [0.0, -2.5], [2.5, -2.5]];
+const DOOR_POSITIONS: [Point; 3] = [[0.0, 0.0], [0.0, -2.5], [2.5, -2.5]];
 
-fn told(events: &[(f64, Event)]) -> String {
+fn describe(events: &[(f64, Event)]) -> String {
     events.iter().map(|(at_s, event)| format!("{at_s:.2} {} {:?}\n", event.id, event.kind)).collect()
 }
 
 /// Returns the passages that `events` report, and whether into the hall.
-fn counted(events: &[(f64, Event)]) -> Vec<(f64, bool)> {
+fn reported_passages(events: &[(f64, Event)]) -> Vec<(f64, bool)> {
     let door = |(at_s, event): &(f64, Event)| match event.kind {
         Kind::Door { to, .. } => Some((*at_s, to == Some(0))),
         _ => None,
@@ -23,8 +23,8 @@ fn counted(events: &[(f64, Event)]) -> Vec<(f64, bool)> {
 
 /// Returns the number of passages of `walkers` without a report, and of reports without a passage. Someone who stands in the
 /// opening is counted when they leave it, so that a report may come as long before or after the passage as they stand there.
-fn wrong(walkers: &[Walker], events: &[(f64, Event)], stand_s: f64) -> (usize, usize) {
-    let mut reports = counted(events);
+fn count_errors(walkers: &[Walker], events: &[(f64, Event)], stand_s: f64) -> (usize, usize) {
+    let mut reports = reported_passages(events);
     let mut missed = 0;
     for (at_s, into) in walkers.iter().flat_map(Walker::passages) {
         let after_s = |report: &(f64, bool)| report.0 - at_s;
@@ -40,21 +40,21 @@ fn wrong(walkers: &[Walker], events: &[(f64, Event)], stand_s: f64) -> (usize, u
 }
 
 /// Minutes of each scanner in each position: an hour for all of them.
-const MINUTES: u64 = 5;
+const EMPTY_MINUTES: u64 = 5;
 
-fn nobody(leaves: Leaves) {
+fn check_no_events(leaves: DoorKind) {
     let mut all = String::new();
-    for (scanner, at) in SCANNERS.into_iter().flat_map(|scanner| PLACES.map(|at| (scanner, at))) {
+    for (scanner, at) in SCANNERS.into_iter().flat_map(|scanner| DOOR_POSITIONS.map(|at| (scanner, at))) {
         let scene = Scene {
-            site: SITE,
+            site: HALL_SITE,
             leaves,
             scanner,
             at,
             seed: 1,
-            seconds: 60 * MINUTES,
-            moves: true,
+            seconds: 60 * EMPTY_MINUTES,
+            is_door_moving: true,
             opens_m: 0.0,
-            stays_s: 4.0,
+            open_time_s: 4.0,
             walkers: &[],
         };
         let events = events(&scene);
@@ -62,42 +62,42 @@ fn nobody(leaves: Leaves) {
             all += &format!(
                 "{leaves:?} {scanner:?} at {at:?}: {} events, {} counts\n",
                 events.len(),
-                counted(&events).len()
+                reported_passages(&events).len()
             );
-            all += &told(&events[..events.len().min(12)]);
+            all += &describe(&events[..events.len().min(12)]);
         }
     }
     assert!(all.is_empty(), "{all}");
 }
 
 #[test]
-fn leaves_that_slide_behind_the_wall_are_nobody() {
-    nobody(Leaves::Slide(0.05));
+fn leaves_sliding_behind_the_wall_cause_no_events() {
+    check_no_events(DoorKind::Slide(0.05));
 }
 
 #[test]
-fn leaves_that_slide_before_the_wall_are_nobody() {
-    nobody(Leaves::Slide(-0.05));
+fn leaves_sliding_before_the_wall_cause_no_events() {
+    check_no_events(DoorKind::Slide(-0.05));
 }
 
 #[test]
-fn leaves_that_swing_into_the_hall_are_nobody() {
-    nobody(Leaves::SwingIn);
+fn leaves_swinging_into_the_hall_cause_no_events() {
+    check_no_events(DoorKind::SwingIn);
 }
 
 #[test]
-fn leaves_that_swing_into_the_lobby_are_nobody() {
-    nobody(Leaves::SwingOut);
+fn leaves_swinging_into_the_lobby_cause_no_events() {
+    check_no_events(DoorKind::SwingOut);
 }
 
 /// Seeds of each scanner.
-const SEEDS: u64 = 20;
+const SEED_COUNT: u64 = 20;
 /// Share of passages that may be wrong with one degree and ten scans a second, where a leg is one beam at the door.
-const WRONG: f64 = 0.05;
+const MAX_ERROR_SHARE: f64 = 0.05;
 
 /// Runs the walkers of each seed, with all leaves and scanners. The door opens within the first meters of `opens`, and stays
 /// open for the seconds of the second one. People stand in the opening for up to `stand_s` seconds.
-fn people_are_counted(
+fn check_counts(
     of_seed: impl Fn(&mut fastrand::Rng) -> Vec<Walker>,
     seconds: u64,
     opens: (f64, f64),
@@ -105,44 +105,46 @@ fn people_are_counted(
 ) {
     for (number, scanner) in SCANNERS.into_iter().enumerate() {
         let (mut all, mut passages, mut missed, mut extra) = (String::new(), 0, 0, 0);
-        for seed in 1..=SEEDS {
+        for seed in 1..=SEED_COUNT {
             let mut random = fastrand::Rng::with_seed(100 * number as u64 + seed);
             let walkers = of_seed(&mut random);
             let scene = Scene {
-                site: SITE,
-                leaves: LEAVES[seed as usize % LEAVES.len()],
+                site: HALL_SITE,
+                leaves: DOOR_KINDS[seed as usize % DOOR_KINDS.len()],
                 scanner,
-                at: PLACES[seed as usize % PLACES.len()],
+                at: DOOR_POSITIONS[seed as usize % DOOR_POSITIONS.len()],
                 seed,
                 seconds,
-                moves: false,
+                is_door_moving: false,
                 opens_m: opens.0,
-                stays_s: opens.1,
+                open_time_s: opens.1,
                 walkers: &walkers,
             };
             let events = events(&scene);
             let real: Vec<(f64, bool)> = walkers.iter().flat_map(Walker::passages).collect();
-            let wrong = wrong(&walkers, &events, stand_s);
+            let wrong = count_errors(&walkers, &events, stand_s);
             (passages, missed, extra) = (passages + real.len(), missed + wrong.0, extra + wrong.1);
             if wrong != (0, 0) {
                 let (leaves, at) = (scene.leaves, scene.at);
-                all +=
-                    &format!("seed {seed} {leaves:?} at {at:?}: {wrong:?} of {real:.1?}\n{}", told(&events));
+                all += &format!(
+                    "seed {seed} {leaves:?} at {at:?}: {wrong:?} of {real:.1?}\n{}",
+                    describe(&events)
+                );
             }
         }
         println!("{scanner:?}: {passages} passages, {missed} not counted, {extra} counted without one");
         let is_coarse = scanner.step_deg == 1.0 && scanner.hz == 10;
-        let most = if is_coarse { (WRONG * passages as f64) as usize } else { 0 };
-        assert!(missed + extra <= most, "{scanner:?} {missed} {extra}\n{all}");
+        let max_errors = if is_coarse { (MAX_ERROR_SHARE * passages as f64) as usize } else { 0 };
+        assert!(missed + extra <= max_errors, "{scanner:?} {missed} {extra}\n{all}");
     }
 }
 
 #[test]
-fn one_person_who_walks_in_and_out_and_stands_in_the_opening_is_counted_each_time() {
+fn person_in_the_opening_is_counted_at_each_passage() {
     let of_seed = |random: &mut fastrand::Rng| {
         let mut place =
             |x: [f64; 2], y: f64| [x[0] + (x[1] - x[0]) * random.f64(), y * (2.0 * random.f64() - 1.0)];
-        let way = vec![
+        let path = vec![
             (place([9.0, 9.5], 3.0), 0.0),
             (place([6.0, 6.0], 0.4), 0.0),
             (place([2.0, 3.5], 2.0), 3.0),
@@ -154,9 +156,9 @@ fn one_person_who_walks_in_and_out_and_stands_in_the_opening_is_counted_each_tim
             (place([8.5, 9.5], 1.0), 0.0),
             (place([9.7, 9.9], 1.0), 0.0),
         ];
-        vec![Walker { from_s: 80.0, way, pace: 0.9 + 0.4 * random.f64(), phase: random.f64() }]
+        vec![Walker { from_s: 80.0, path, speed: 0.9 + 0.4 * random.f64(), phase: random.f64() }]
     };
-    people_are_counted(of_seed, 140, (2.0, 2.0), 10.0);
+    check_counts(of_seed, 140, (2.0, 2.0), 10.0);
 }
 
 #[test]
@@ -166,14 +168,14 @@ fn people_in_a_row_are_counted_while_the_leaves_move() {
         let pace = 0.9 + 0.4 * random.f64();
         let walker = |number: i32, random: &mut fastrand::Rng| {
             let y = 0.6 * (random.f64() - 0.5);
-            let mut way =
+            let mut path =
                 vec![([9.5, y], 0.0), ([6.0, y], 0.0), ([1.5, y + 1.5], 0.0), ([0.5, y + 3.0], 0.0)];
             if !into {
-                way.reverse();
+                path.reverse();
             }
-            Walker { from_s: 80.0 + 1.3 * f64::from(number), way, pace, phase: random.f64() }
+            Walker { from_s: 80.0 + 1.3 * f64::from(number), path, speed: pace, phase: random.f64() }
         };
         (0..4).map(|number| walker(number, random)).collect()
     };
-    people_are_counted(of_seed, 105, (1.5, 0.5), 0.0);
+    check_counts(of_seed, 105, (1.5, 0.5), 0.0);
 }

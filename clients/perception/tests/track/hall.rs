@@ -5,13 +5,13 @@
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
 use scanhub_perception::track::geometry::{Point, distance};
-use scanhub_perception::track::{Event, PeopleTracker, Picture, Site};
-use scanhub_preprocess::background::{Model, Settings};
+use scanhub_perception::track::{Event, PeopleTracker, Site, Snapshot};
+use scanhub_preprocess::background::{BackgroundModel, Settings};
 use scanhub_preprocess::segments::Segmenter;
 use scanhub_schema::{Foreground, Pose, Scan, ScanHead};
 
 /// The hall has 8 m by 6 m, and the lobby behind it 8 m by 4 m. The opening in the wall between them is 1.8 m wide.
-pub(crate) const SITE: &str = r#"
+pub(crate) const HALL_SITE: &str = r#"
 [[sensor]]
 name = "front"
 pose = { x = 0.0, y = 0.0, yaw = 0.0 }
@@ -27,7 +27,7 @@ from = "lobby"
 to = "hall"
 between = [[6, -0.9], [6, 0.9]]
 "#;
-const WALLS: [[Point; 2]; 7] = [
+const HALL_WALLS: [[Point; 2]; 7] = [
     [[0.0, -4.0], [6.0, -4.0]],
     [[0.0, 4.0], [6.0, 4.0]],
     [[6.0, -4.0], [6.0, -0.9]],
@@ -37,22 +37,22 @@ const WALLS: [[Point; 2]; 7] = [
     [[10.0, -4.0], [10.0, 4.0]],
 ];
 /// Half the width of the opening, which is the width of a leaf, and the way of a leaf that slides.
-const LEAF_M: f64 = 0.9;
-const SLIDE_M: f64 = 0.85;
+const LEAF_WIDTH_M: f64 = 0.9;
+const SLIDE_DISTANCE_M: f64 = 0.85;
 /// Time in which a leaf opens or closes.
-const MOVES_S: f64 = 1.5;
+const MOVE_TIME_S: f64 = 1.5;
 /// Time until the door moves again by itself, if it does.
-const EVERY_S: f64 = 20.0;
+const MOVE_INTERVAL_S: f64 = 20.0;
 /// Angle that a beam covers, standard deviation of a range, and the share of beams on an edge with a mixed value.
 const BEAM_RAD: f64 = 0.5 * PI / 180.0;
 const NOISE_M: f64 = 0.01;
-const MIXED: f64 = 0.2;
-const LEG_M: f64 = 0.06;
-const BEGIN_NS: u64 = 1_800_000_000_000_000_000;
+const MIXED_SHARE: f64 = 0.2;
+const LEG_RADIUS_M: f64 = 0.06;
+const START_NS: u64 = 1_800_000_000_000_000_000;
 
 /// The movement of the two leaves.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) enum Leaves {
+pub(crate) enum DoorKind {
     /// Along the wall, in a plane so far behind it.
     Slide(f64),
     /// About the two jambs, by a right angle: into the hall, or into the lobby.
@@ -66,8 +66,8 @@ pub(crate) struct Scanner {
     pub(crate) hz: u64,
 }
 
-pub(crate) const LEAVES: [Leaves; 4] =
-    [Leaves::Slide(0.05), Leaves::Slide(-0.05), Leaves::SwingIn, Leaves::SwingOut];
+pub(crate) const DOOR_KINDS: [DoorKind; 4] =
+    [DoorKind::Slide(0.05), DoorKind::Slide(-0.05), DoorKind::SwingIn, DoorKind::SwingOut];
 pub(crate) const SCANNERS: [Scanner; 4] = [
     Scanner { step_deg: 0.5, hz: 25 },
     Scanner { step_deg: 0.5, hz: 10 },
@@ -75,16 +75,19 @@ pub(crate) const SCANNERS: [Scanner; 4] = [
     Scanner { step_deg: 1.0, hz: 10 },
 ];
 
-impl Leaves {
+impl DoorKind {
     /// Returns the leaves of a door that is open by `share`.
     fn at(self, share: f64) -> [[Point; 2]; 2] {
         let (sin, cos) = (share * FRAC_PI_2).sin_cos();
         [1.0, -1.0].map(|side| match self {
-            Leaves::Slide(behind) => {
-                [share * SLIDE_M, share * SLIDE_M + LEAF_M].map(|y| [6.0 + behind, side * y])
+            DoorKind::Slide(behind) => [share * SLIDE_DISTANCE_M, share * SLIDE_DISTANCE_M + LEAF_WIDTH_M]
+                .map(|y| [6.0 + behind, side * y]),
+            DoorKind::SwingIn => {
+                [[6.0, side * LEAF_WIDTH_M], [6.0 - LEAF_WIDTH_M * sin, side * LEAF_WIDTH_M * (1.0 - cos)]]
             }
-            Leaves::SwingIn => [[6.0, side * LEAF_M], [6.0 - LEAF_M * sin, side * LEAF_M * (1.0 - cos)]],
-            Leaves::SwingOut => [[6.0, side * LEAF_M], [6.0 + LEAF_M * sin, side * LEAF_M * (1.0 - cos)]],
+            DoorKind::SwingOut => {
+                [[6.0, side * LEAF_WIDTH_M], [6.0 + LEAF_WIDTH_M * sin, side * LEAF_WIDTH_M * (1.0 - cos)]]
+            }
         })
     }
 }
@@ -92,8 +95,8 @@ impl Leaves {
 /// A person who comes at `from_s`, and walks from point to point. At each of them, they stand for some seconds.
 pub(crate) struct Walker {
     pub(crate) from_s: f64,
-    pub(crate) way: Vec<(Point, f64)>,
-    pub(crate) pace: f64,
+    pub(crate) path: Vec<(Point, f64)>,
+    pub(crate) speed: f64,
     /// Share of a double step that they are ahead at the start.
     pub(crate) phase: f64,
 }
@@ -107,7 +110,7 @@ impl Walker {
         if left_s < 0.0 {
             return None;
         }
-        for leg in self.way.windows(2) {
+        for leg in self.path.windows(2) {
             let [(from, stands_s), (to, _)] = [leg[0], leg[1]];
             let far_m = distance(from, to);
             let ahead = [(to[0] - from[0]) / far_m, (to[1] - from[1]) / far_m];
@@ -115,13 +118,13 @@ impl Walker {
                 return Some((from, ahead, walked_m, true));
             }
             left_s -= stands_s;
-            let gone_m = left_s * self.pace;
+            let gone_m = left_s * self.speed;
             if gone_m < far_m {
                 let place = [from[0] + gone_m * ahead[0], from[1] + gone_m * ahead[1]];
                 return Some((place, ahead, walked_m + gone_m, false));
             }
             walked_m += far_m;
-            left_s -= far_m / self.pace;
+            left_s -= far_m / self.speed;
         }
         None
     }
@@ -159,35 +162,35 @@ impl Walker {
 /// A run of the hall.
 pub(crate) struct Scene<'a> {
     pub(crate) site: &'a str,
-    pub(crate) leaves: Leaves,
+    pub(crate) leaves: DoorKind,
     pub(crate) scanner: Scanner,
     /// Position of the scanner, which looks at the wall with the door.
     pub(crate) at: Point,
     pub(crate) seed: u64,
     pub(crate) seconds: u64,
     /// The door opens every 20 s, although no one is near it.
-    pub(crate) moves: bool,
+    pub(crate) is_door_moving: bool,
     /// Distance of a person from the middle of the door within which it opens, and the time for which it then stays open.
     pub(crate) opens_m: f64,
-    pub(crate) stays_s: f64,
+    pub(crate) open_time_s: f64,
     pub(crate) walkers: &'a [Walker],
 }
 
 /// Returns the events in the hall, with their time in seconds.
 pub(crate) fn events(scene: &Scene<'_>) -> Vec<(f64, Event)> {
     let mut events = Vec::new();
-    run(scene, |picture| {
-        let at_s = |event: &Event| event.wall_ns.saturating_sub(BEGIN_NS) as f64 * 1e-9;
-        events.extend(picture.events.iter().map(|event| (at_s(event), *event)));
+    run(scene, |sample| {
+        let at_s = |event: &Event| event.wall_ns.saturating_sub(START_NS) as f64 * 1e-9;
+        events.extend(sample.events.iter().map(|event| (at_s(event), *event)));
     });
     events
 }
 
 /// Runs a scene, and passes each picture to `show`.
-pub(crate) fn run(scene: &Scene<'_>, mut show: impl FnMut(&Picture)) {
+pub(crate) fn run(scene: &Scene<'_>, mut on_sample: impl FnMut(&Snapshot)) {
     let Scene { leaves, scanner, walkers, at, .. } = *scene;
     let from_scanner = |[x, y]: Point| [x - at[0], y - at[1]];
-    let walls = WALLS.map(|wall| wall.map(from_scanner));
+    let walls = HALL_WALLS.map(|wall| wall.map(from_scanner));
     let mut random = fastrand::Rng::with_seed(scene.seed);
     let beams = (180.0 / scanner.step_deg) as usize + 1;
     let step = scanner.step_deg.to_radians();
@@ -209,26 +212,26 @@ pub(crate) fn run(scene: &Scene<'_>, mut show: impl FnMut(&Picture)) {
     let directions: Vec<[Point; 3]> = (0..beams).map(edges).collect();
     let empty = directions.iter().map(|rays| rays.map(|ray| nearest(ray, walls.iter().enumerate())));
     let empty: Vec<[(f64, usize); 3]> = empty.collect();
-    let mut model = Model::new(Settings::default(), beams);
+    let mut model = BackgroundModel::new(Settings::default(), beams);
     let mut segmenter = Segmenter::new(Pose::default(), beams);
     let mut foreground = Foreground::of(beams);
     let pose = format!("x = {:.2}, y = {:.2}", at[0], at[1]);
     let site = scene.site.replace("x = 0.0, y = 0.0", &pose);
     let mut people = PeopleTracker::new(Site::parse("hall.toml", &site).expect("a hall"), 0);
     let mut words = vec![0; beams];
-    let (mut open, mut until_s, mut next_s) = (0.0_f64, 0.0, EVERY_S);
+    let (mut open, mut until_s, mut next_s) = (0.0_f64, 0.0, MOVE_INTERVAL_S);
     for scan in 0..scene.seconds * scanner.hz {
         let now_s = scan as f64 / scanner.hz as f64;
         let near = |walker: &Walker| {
             walker.at(now_s).is_some_and(|(place, ..)| distance(place, [6.0, 0.0]) < scene.opens_m)
         };
         if walkers.iter().any(near) {
-            until_s = now_s + scene.stays_s;
-        } else if scene.moves && now_s >= next_s {
-            (until_s, next_s) = (now_s + MOVES_S + scene.stays_s, next_s + EVERY_S);
+            until_s = now_s + scene.open_time_s;
+        } else if scene.is_door_moving && now_s >= next_s {
+            (until_s, next_s) = (now_s + MOVE_TIME_S + scene.open_time_s, next_s + MOVE_INTERVAL_S);
         }
-        let way = 1.0 / (MOVES_S * scanner.hz as f64);
-        open = (open + if now_s < until_s { way } else { -way }).clamp(0.0, 1.0);
+        let step_share = 1.0 / (MOVE_TIME_S * scanner.hz as f64);
+        open = (open + if now_s < until_s { step_share } else { -step_share }).clamp(0.0, 1.0);
         let both = leaves.at(open).map(|leaf| leaf.map(from_scanner));
         let legs: Vec<Point> =
             walkers.iter().filter_map(|walker| walker.legs(now_s)).flatten().map(from_scanner).collect();
@@ -241,7 +244,8 @@ pub(crate) fn run(scene: &Scene<'_>, mut show: impl FnMut(&Picture)) {
                 }
                 for (number, leg) in legs.iter().enumerate() {
                     let along = leg[0] * ray[0] + leg[1] * ray[1];
-                    let depth = LEG_M * LEG_M - (leg[0] * leg[0] + leg[1] * leg[1] - along * along);
+                    let depth =
+                        LEG_RADIUS_M * LEG_RADIUS_M - (leg[0] * leg[0] + leg[1] * leg[1] - along * along);
                     if depth > 0.0 && along - depth.sqrt() < hit.0 {
                         *hit = (along - depth.sqrt(), 20 + number);
                     }
@@ -250,7 +254,7 @@ pub(crate) fn run(scene: &Scene<'_>, mut show: impl FnMut(&Picture)) {
             let (near, far) = hits.iter().fold((hits[0], hits[0]), |(near, far), &hit| {
                 (if hit.0 < near.0 { hit } else { near }, if hit.0 > far.0 { hit } else { far })
             });
-            let is_mixed = near.1 != far.1 && far.0 - near.0 > 0.1 && random.f64() < MIXED;
+            let is_mixed = near.1 != far.1 && far.0 - near.0 > 0.1 && random.f64() < MIXED_SHARE;
             let range = if is_mixed { near.0 + (far.0 - near.0) * random.f64() } else { hits[1].0 };
             let noisy = range + NOISE_M * normal(&mut random);
             *word = if noisy.is_finite() { (1000.0 * noisy).round() as u16 } else { 30_000 };
@@ -258,7 +262,7 @@ pub(crate) fn run(scene: &Scene<'_>, mut show: impl FnMut(&Picture)) {
         let scan = Scan::of(head, &words);
         model.update(&scan, &mut foreground);
         segmenter.update(&scan, &mut foreground);
-        people.take(0, BEGIN_NS + (now_s * 1e9) as u64, &scan, &foreground, &mut show);
+        people.take(0, START_NS + (now_s * 1e9) as u64, &scan, &foreground, &mut on_sample);
     }
 }
 

@@ -22,7 +22,7 @@ fn page(name: &str) -> String {
 }
 
 #[test]
-fn the_site_of_the_page_is_what_its_drawing_shows() {
+fn drawing_on_the_page_matches_its_site_file() {
     let page_text = page("tracks.md");
     let (_, rest) = page_text.split_once("```toml\n").expect("a site file");
     let (text, _) = rest.split_once("```").expect("its end");

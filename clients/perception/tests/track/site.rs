@@ -50,14 +50,14 @@ fn a_house_is_read() {
     let site = Site::parse("house.toml", HOUSE).unwrap();
     assert_eq!((site.sensors.len(), site.rooms.len(), site.doors.len(), site.gaps.len()), (2, 3, 2, 1));
     assert_eq!((site.sensors[0].hub(), site.sensors[1].hub()), ("", "kitchen"));
-    assert_eq!(site.watched(), [true, false, true]);
+    assert_eq!(site.rooms_with_sensor(), [true, false, true]);
     assert_eq!((site.room_at([6.0, 2.0]), site.room_at([6.0, 3.5])), (Some(1), None));
     assert_eq!((site.doors[1].from, site.doors[1].to), (Some(1), Some(2)));
     assert_eq!((site.is_ignored([2.9, 1.5]), site.is_ignored([2.1, 1.5])), (true, false));
 }
 
 #[test]
-fn each_mistake_is_told_with_place_value_and_remedy() {
+fn each_site_error_has_a_location_and_a_remedy() {
     let cases: &[(&str, &str, &str, &str)] = &[
         ("yaw = 0.0 }", "yaw = 0.0, z = 1.0 }", "house.toml:4:39: unknown key `z`", "Known here: x, y, yaw"),
         ("\"kitchen.rear\"", "\"front\"", "house.toml:7:8: sensor \"front\" twice", "another name"),

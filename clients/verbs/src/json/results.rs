@@ -1,43 +1,43 @@
 //! The classes of results that the hub and its clients compute from scans: marks, lines, motion, zones, foreground, people,
 //! tilt and obstacles. A contract, like its parent module.
 
-use scanhub_client::{Heard, Robot};
+use scanhub_client::{Robot, ZonesUpdate};
 use scanhub_schema::{
     Cloud, Corner, Early, Event, Foreground, Header, Line as StraightLine, Lines, Mark, Marks, Motion,
     Obstacle, Obstacles, ROBOT, Segment, Tilt, Tracks, Verdict, Zone, Zones, in_degrees,
 };
 use serde::{Serialize, Serializer};
 
-use super::{Stamp, Words};
+use super::{FlagNames, SampleKeys};
 
 /// Class `marks`.
 pub(crate) fn marks<'a>(sensor: &'a str, header: &Header, marks: &'a Marks) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct Line<'a> {
+    struct MarksJson<'a> {
         #[serde(flatten)]
-        stamp: Stamp<'a>,
+        stamp: SampleKeys<'a>,
         available: bool,
         overflow: bool,
         #[serde(serialize_with = "mark_list")]
         marks: &'a [Mark],
         #[serde(flatten)]
-        flags: Words,
+        flags: FlagNames,
     }
-    Line {
-        stamp: Stamp::new("marks", sensor, header),
+    MarksJson {
+        stamp: SampleKeys::new("marks", sensor, header),
         available: marks.is_available(),
         overflow: marks.is_overflow(),
         marks: marks.marks(),
-        flags: Words::of(header),
+        flags: FlagNames::of(header),
     }
 }
 
 /// Class `lines`.
 pub(crate) fn lines<'a>(sensor: &'a str, header: &Header, lines: &'a Lines) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct Line<'a> {
+    struct MarksJson<'a> {
         #[serde(flatten)]
-        stamp: Stamp<'a>,
+        stamp: SampleKeys<'a>,
         readings: u16,
         points: u16,
         noise_m: f64,
@@ -47,26 +47,26 @@ pub(crate) fn lines<'a>(sensor: &'a str, header: &Header, lines: &'a Lines) -> i
         #[serde(serialize_with = "corner_list")]
         corners: &'a [Corner],
         #[serde(flatten)]
-        flags: Words,
+        flags: FlagNames,
     }
-    Line {
-        stamp: Stamp::new("lines", sensor, header),
+    MarksJson {
+        stamp: SampleKeys::new("lines", sensor, header),
         readings: lines.readings,
         points: lines.on_lines,
         noise_m: millionths(lines.noise_m),
         overflow: lines.is_overflow(),
         lines: lines.lines(),
         corners: lines.corners(),
-        flags: Words::of(header),
+        flags: FlagNames::of(header),
     }
 }
 
 /// Class `motion`; what is not known is null.
 pub(crate) fn motion<'a>(sensor: &'a str, header: &Header, motion: &Motion) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct Line<'a> {
+    struct MarksJson<'a> {
         #[serde(flatten)]
-        stamp: Stamp<'a>,
+        stamp: SampleKeys<'a>,
         dx_m: Option<f64>,
         dy_m: Option<f64>,
         dyaw_deg: Option<f64>,
@@ -81,18 +81,18 @@ pub(crate) fn motion<'a>(sensor: &'a str, header: &Header, motion: &Motion) -> i
         refused_steps: u16,
         pose_covariance: Option<[f32; 9]>,
         #[serde(flatten)]
-        flags: Words,
+        flags: FlagNames,
     }
     let of_step = |value: f32| motion.has_step().then(|| millionths(value));
     let of_pose = |value: f64| motion.has_pose().then(|| millionths(value));
-    Line {
-        stamp: Stamp::new("motion", sensor, header),
+    MarksJson {
+        stamp: SampleKeys::new("motion", sensor, header),
         dx_m: of_step(motion.dx_m),
         dy_m: of_step(motion.dy_m),
         dyaw_deg: motion.has_step().then(|| in_degrees(motion.dyaw_rad.into())),
         covariance: motion.has_step().then_some(motion.covariance),
         overlap: of_step(motion.overlap),
-        method: motion.how().name(),
+        method: motion.method().name(),
         x_m: of_pose(motion.x_m),
         y_m: of_pose(motion.y_m),
         yaw_deg: motion.has_pose().then(|| in_degrees(motion.yaw_rad)),
@@ -100,16 +100,16 @@ pub(crate) fn motion<'a>(sensor: &'a str, header: &Header, motion: &Motion) -> i
         degenerate: motion.is_degenerate(),
         refused_steps: motion.refused_steps,
         pose_covariance: motion.sum_covariance().copied(),
-        flags: Words::of(header),
+        flags: FlagNames::of(header),
     }
 }
 
 /// Class `early`.
 pub(crate) fn early<'a>(sensor: &'a str, header: &Header, early: &Early) -> impl Serialize + use<'a> {
     #[derive(Serialize)]
-    struct Line<'a> {
+    struct MarksJson<'a> {
         #[serde(flatten)]
-        stamp: Stamp<'a>,
+        stamp: SampleKeys<'a>,
         verdict: &'static str,
         beam: u16,
         distance_mm: u32,
@@ -118,26 +118,26 @@ pub(crate) fn early<'a>(sensor: &'a str, header: &Header, early: &Early) -> impl
         #[serde(skip_serializing_if = "std::ops::Not::not")]
         withdrawn: bool,
         #[serde(flatten)]
-        flags: Words,
+        flags: FlagNames,
     }
-    Line {
-        stamp: Stamp::new("early", sensor, header),
+    MarksJson {
+        stamp: SampleKeys::new("early", sensor, header),
         verdict: early.verdict().name(),
         beam: early.beam,
         distance_mm: early.distance_mm,
         bytes_seen: early.bytes_seen,
         beams_seen: early.beams_seen,
         withdrawn: early.is_withdrawn(),
-        flags: Words::of(header),
+        flags: FlagNames::of(header),
     }
 }
 
 /// Class `zones`; a silence has neither numbers nor stamps.
-pub(crate) fn zones<'a>(sensor: &'a str, heard: &'a Heard) -> impl Serialize + 'a {
+pub(crate) fn zones<'a>(sensor: &'a str, update: &'a ZonesUpdate) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct Line<'a> {
+    struct MarksJson<'a> {
         #[serde(flatten)]
-        stamp: Stamp<'a>,
+        stamp: SampleKeys<'a>,
         verdict: &'static str,
         nearest_mm: Option<u32>,
         nearest_beam: Option<u16>,
@@ -149,15 +149,15 @@ pub(crate) fn zones<'a>(sensor: &'a str, heard: &'a Heard) -> impl Serialize + '
         #[serde(skip_serializing_if = "std::ops::Not::not")]
         stale: bool,
         #[serde(flatten)]
-        flags: Option<Words>,
+        flags: Option<FlagNames>,
     }
-    let zones = &heard.zones;
+    let zones = &update.zones;
     let (nearest_beam, nearest_mm) = zones.nearest().unzip();
-    let stamp = match &heard.header {
-        Some(header) => Stamp::new("zones", sensor, header),
-        None => Stamp::unheard("zones", sensor),
+    let stamp = match &update.header {
+        Some(header) => SampleKeys::new("zones", sensor, header),
+        None => SampleKeys::for_silence("zones", sensor),
     };
-    Line {
+    MarksJson {
         stamp,
         verdict: zones.verdict().name(),
         nearest_mm,
@@ -165,15 +165,15 @@ pub(crate) fn zones<'a>(sensor: &'a str, heard: &'a Heard) -> impl Serialize + '
         zones: zones.zones(),
         invalid_beams: zones.invalid_beams,
         provisional: zones.flags & Zones::PROVISIONAL != 0,
-        stale: heard.stale,
-        flags: heard.header.as_ref().map(Words::of),
+        stale: update.stale,
+        flags: update.header.as_ref().map(FlagNames::of),
     }
 }
 
 /// Class `zones` of the robot: the fold over its sensors after `heard`, the last sample of one of them.
-pub(crate) fn robot<'a>(robot: &'a Robot, heard: &Heard) -> impl Serialize + 'a {
+pub(crate) fn robot<'a>(robot: &'a Robot, update: &ZonesUpdate) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct Line<'a> {
+    struct MarksJson<'a> {
         class: &'static str,
         sensor: &'static str,
         stamp_ns: Option<u64>,
@@ -187,16 +187,16 @@ pub(crate) fn robot<'a>(robot: &'a Robot, heard: &Heard) -> impl Serialize + 'a 
         stale: bool,
     }
     let (nearest_mm, nearest_sensor) = robot.nearest().unzip();
-    Line {
+    MarksJson {
         class: "zones",
         sensor: ROBOT,
-        stamp_ns: heard.header.map(|header| header.stamp_first_ns),
-        wall_ns: heard.header.map(|header| header.wall_ns),
+        stamp_ns: update.header.map(|header| header.stamp_first_ns),
+        wall_ns: update.header.map(|header| header.wall_ns),
         verdict: robot.verdict().name(),
         nearest_mm,
         nearest_sensor,
         sensors: robot,
-        stale: heard.stale,
+        stale: update.stale,
     }
 }
 
@@ -207,9 +207,9 @@ pub(crate) fn foreground<'a>(
     foreground: &'a Foreground,
 ) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct Line<'a> {
+    struct MarksJson<'a> {
         #[serde(flatten)]
-        stamp: Stamp<'a>,
+        stamp: SampleKeys<'a>,
         generation: u32,
         #[serde(serialize_with = "scanhub_schema::unit_in_mm")]
         unit_mm: u32,
@@ -220,17 +220,17 @@ pub(crate) fn foreground<'a>(
         segments: &'a Foreground,
         dropped: u16,
         #[serde(flatten)]
-        flags: Words,
+        flags: FlagNames,
     }
-    Line {
-        stamp: Stamp::new("foreground", sensor, header),
+    MarksJson {
+        stamp: SampleKeys::new("foreground", sensor, header),
         generation: foreground.generation,
         unit_mm: foreground.unit_um,
         beams: foreground,
         ranges: foreground.ranges(),
         segments: foreground,
         dropped: foreground.dropped,
-        flags: Words::of(header),
+        flags: FlagNames::of(header),
     }
 }
 
@@ -362,23 +362,23 @@ fn beams<S: Serializer>(foreground: &Foreground, serializer: S) -> Result<S::Ok,
 /// Class `tracks`.
 pub fn tracks<'a>(sensor: &'a str, header: &Header, tracks: &'a Tracks) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct Line<'a> {
+    struct MarksJson<'a> {
         #[serde(flatten)]
-        stamp: Stamp<'a>,
+        stamp: SampleKeys<'a>,
         #[serde(serialize_with = "track_list")]
         tracks: &'a Tracks,
         #[serde(flatten)]
-        flags: Words,
+        flags: FlagNames,
     }
-    Line { stamp: Stamp::new("tracks", sensor, header), tracks, flags: Words::of(header) }
+    MarksJson { stamp: SampleKeys::new("tracks", sensor, header), tracks, flags: FlagNames::of(header) }
 }
 
 /// Class `event`.
 pub fn event<'a>(sensor: &'a str, header: &Header, event: &'a Event) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct Line<'a> {
+    struct MarksJson<'a> {
         #[serde(flatten)]
-        stamp: Stamp<'a>,
+        stamp: SampleKeys<'a>,
         kind: Option<&'static str>,
         id: u64,
         room: Option<&'a str>,
@@ -389,18 +389,18 @@ pub fn event<'a>(sensor: &'a str, header: &Header, event: &'a Event) -> impl Ser
         #[serde(skip_serializing_if = "Option::is_none")]
         door: Option<&'a str>,
         #[serde(flatten)]
-        flags: Words,
+        flags: FlagNames,
     }
-    let way = event.door();
-    Line {
-        stamp: Stamp::new("event", sensor, header),
+    let passage = event.door();
+    MarksJson {
+        stamp: SampleKeys::new("event", sensor, header),
         kind: event.kind().map(|kind| kind.name()),
         id: event.id,
         room: event.room_name(),
-        from: way.map(|(_, from, _)| from),
-        to: way.map(|(.., to)| to),
-        door: way.map(|(door, ..)| door),
-        flags: Words::of(header),
+        from: passage.map(|(_, from, _)| from),
+        to: passage.map(|(.., to)| to),
+        door: passage.map(|(door, ..)| door),
+        flags: FlagNames::of(header),
     }
 }
 
@@ -428,7 +428,7 @@ fn track_list<S: Serializer>(tracks: &Tracks, serializer: S) -> Result<S::Ok, S:
         vy_m_s: thousandths(track.vy_m_s),
         cov: track.covariance.map(millionths),
         room: track.room_name(),
-        sensors: tracks.seen_by(track).collect(),
+        sensors: tracks.sensor_names_of(track).collect(),
         age_s: f64::from(track.age_ms) / 1000.0,
         score: thousandths(track.score),
     }))
@@ -442,28 +442,28 @@ fn thousandths(value: f32) -> f64 {
 /// Class `tilt`.
 pub(crate) fn tilt<'a>(sensor: &'a str, header: &Header, tilt: &Tilt) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct Line<'a> {
+    struct MarksJson<'a> {
         #[serde(flatten)]
-        stamp: Stamp<'a>,
+        stamp: SampleKeys<'a>,
         angle_deg: f64,
         rate_deg_s: Option<f64>,
         #[serde(flatten)]
-        flags: Words,
+        flags: FlagNames,
     }
-    Line {
-        stamp: Stamp::new("tilt", sensor, header),
+    MarksJson {
+        stamp: SampleKeys::new("tilt", sensor, header),
         angle_deg: degrees(tilt.angle_rad),
         rate_deg_s: tilt.rate_rad_s().map(degrees),
-        flags: Words::of(header),
+        flags: FlagNames::of(header),
     }
 }
 
 /// Class `cloud`.
 pub(crate) fn cloud<'a>(sensor: &'a str, header: &Header, cloud: &'a Cloud) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct Line<'a> {
+    struct MarksJson<'a> {
         #[serde(flatten)]
-        stamp: Stamp<'a>,
+        stamp: SampleKeys<'a>,
         sweep: u32,
         generation: u32,
         first: bool,
@@ -477,10 +477,10 @@ pub(crate) fn cloud<'a>(sensor: &'a str, header: &Header, cloud: &'a Cloud) -> i
         #[serde(serialize_with = "class_list")]
         classes: &'a Cloud,
         #[serde(flatten)]
-        flags: Words,
+        flags: FlagNames,
     }
-    Line {
-        stamp: Stamp::new("cloud", sensor, header),
+    MarksJson {
+        stamp: SampleKeys::new("cloud", sensor, header),
         sweep: cloud.sweep,
         generation: cloud.generation,
         first: cloud.has(Cloud::FIRST),
@@ -490,16 +490,16 @@ pub(crate) fn cloud<'a>(sensor: &'a str, header: &Header, cloud: &'a Cloud) -> i
         points: cloud,
         beams: cloud,
         classes: cloud,
-        flags: Words::of(header),
+        flags: FlagNames::of(header),
     }
 }
 
 /// Class `obstacles`.
 pub fn obstacles<'a>(sensor: &'a str, header: &Header, found: &'a Obstacles) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct Line<'a> {
+    struct MarksJson<'a> {
         #[serde(flatten)]
-        stamp: Stamp<'a>,
+        stamp: SampleKeys<'a>,
         sweep: u32,
         generation: u32,
         complete: bool,
@@ -508,17 +508,17 @@ pub fn obstacles<'a>(sensor: &'a str, header: &Header, found: &'a Obstacles) -> 
         obstacles: &'a Obstacles,
         dropped: u32,
         #[serde(flatten)]
-        flags: Words,
+        flags: FlagNames,
     }
-    Line {
-        stamp: Stamp::new("obstacles", sensor, header),
+    MarksJson {
+        stamp: SampleKeys::new("obstacles", sensor, header),
         sweep: found.sweep,
         generation: found.generation,
         complete: found.has(Obstacles::COMPLETE),
         unreliable: found.has(Obstacles::UNRELIABLE),
         obstacles: found,
         dropped: found.dropped,
-        flags: Words::of(header),
+        flags: FlagNames::of(header),
     }
 }
 
@@ -607,7 +607,7 @@ mod tests {
 
     #[test]
     fn events_to_the_letter() {
-        let door = Event::new(EventKind::Door, 3, Some("hall")).through("left", "outside", "hall");
+        let door = Event::new(EventKind::Door, 3, Some("hall")).with_door("left", "outside", "hall");
         let line = letters(event("house", &header(), &door));
         let rest = r#""kind":"door","id":3,"room":"hall","from":"outside","to":"hall","door":"left"}"#;
         assert_eq!(line, format!(r#"{{"class":"event",{HEAD}{rest}"#));
@@ -622,9 +622,9 @@ mod tests {
 
     #[test]
     fn angles_to_the_letter() {
-        let said = Tilt { angle_rad: -0.5, rate_rad_s: 0.25 };
+        let sample = Tilt { angle_rad: -0.5, rate_rad_s: 0.25 };
         let rest = r#""angle_deg":-28.6479,"rate_deg_s":14.3239}"#;
-        assert_eq!(letters(tilt("house", &header(), &said)), format!(r#"{{"class":"tilt",{HEAD}{rest}"#));
+        assert_eq!(letters(tilt("house", &header(), &sample)), format!(r#"{{"class":"tilt",{HEAD}{rest}"#));
         let rest = r#""angle_deg":0.0,"rate_deg_s":null}"#;
         let line = letters(tilt("house", &header(), &Tilt::default()));
         assert_eq!(line, format!(r#"{{"class":"tilt",{HEAD}{rest}"#));

@@ -73,14 +73,14 @@ impl Spans {
     }
 
     /// Takes the times of a sample that arrived at `seen`.
-    pub(super) fn take(&mut self, header: &Header, seen: Arrival) {
+    pub(super) fn take(&mut self, header: &Header, arrival: Arrival) {
         self.received += 1;
         self.flags |= header.flags;
         if header.stamp_last_ns < self.since_ns {
             self.before += 1;
             return;
         }
-        let Some(age_ns) = seen.monotonic_ns.checked_sub(header.stamp_last_ns) else {
+        let Some(age_ns) = arrival.monotonic_ns.checked_sub(header.stamp_last_ns) else {
             self.in_future += 1;
             return;
         };
@@ -92,7 +92,7 @@ impl Spans {
             self.record(Span::Wake, age_ns - hub_ns);
         }
         if header.flags & Flags::REMOTE != 0 {
-            let arrival_ns = seen.wall_ns.saturating_sub(age_ns);
+            let arrival_ns = arrival.wall_ns.saturating_sub(age_ns);
             match arrival_ns.checked_sub(header.wall_ns) {
                 _ if arrival_ns.abs_diff(header.wall_ns) < OWN_SAMPLE_NS => {}
                 Some(network_ns) => {
@@ -143,18 +143,18 @@ pub(super) struct Quantiles {
 
 /// Number of times in `from_ns..to_ns`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Bar {
+pub(super) struct HistogramBin {
     pub(super) from_ns: u64,
     pub(super) to_ns: u64,
     pub(super) count: u64,
 }
 
-const LONGEST_NS: u64 = 100_000_000_000;
-const DIGITS: u8 = 3;
+const MAX_SPAN_NS: u64 = 100_000_000_000;
+const SIGNIFICANT_DIGITS: u8 = 3;
 
 impl Ages {
     pub(super) fn new() -> Ages {
-        let histogram = Histogram::new_with_bounds(1, LONGEST_NS, DIGITS);
+        let histogram = Histogram::new_with_bounds(1, MAX_SPAN_NS, SIGNIFICANT_DIGITS);
         Ages { histogram: histogram.expect("bounds that a histogram can have"), min_ns: u64::MAX, max_ns: 0 }
     }
 
@@ -179,34 +179,35 @@ impl Ages {
         })
     }
 
-    /// Returns the bars from the minimum to the maximum, with the edges of [`STEPS`] and 0.
-    pub(super) fn bars(&self) -> Vec<Bar> {
-        let mut bars: Vec<Bar> = Vec::new();
+    /// Returns the bars from the minimum to the maximum, with the edges of [`BIN_EDGES`] and 0.
+    pub(super) fn bins(&self) -> Vec<HistogramBin> {
+        let mut bins: Vec<HistogramBin> = Vec::new();
         let mut edges = edges();
-        let mut open = Bar { from_ns: 0, to_ns: edges.next().unwrap_or(LONGEST_NS), count: 0 };
+        let mut open = HistogramBin { from_ns: 0, to_ns: edges.next().unwrap_or(MAX_SPAN_NS), count: 0 };
         for step in self.histogram.iter_recorded() {
             while step.value_iterated_to() >= open.to_ns {
-                let next = Bar { from_ns: open.to_ns, to_ns: edges.next().unwrap_or(u64::MAX), count: 0 };
+                let next =
+                    HistogramBin { from_ns: open.to_ns, to_ns: edges.next().unwrap_or(u64::MAX), count: 0 };
                 let full = std::mem::replace(&mut open, next);
-                if full.count > 0 || !bars.is_empty() {
-                    bars.push(full);
+                if full.count > 0 || !bins.is_empty() {
+                    bins.push(full);
                 }
             }
             open.count += step.count_since_last_iteration();
         }
         if open.count > 0 {
-            bars.push(open);
+            bins.push(open);
         }
-        bars
+        bins
     }
 }
 
 /// Edges between bars in each power of ten, from 1 us on.
-const STEPS: [u64; 7] = [1, 2, 3, 4, 5, 6, 8];
+const BIN_EDGES: [u64; 7] = [1, 2, 3, 4, 5, 6, 8];
 
 fn edges() -> impl Iterator<Item = u64> {
     let tens = std::iter::successors(Some(1_000_u64), |ten| Some(ten * 10));
-    tens.take_while(|ten| *ten < LONGEST_NS).flat_map(|ten| STEPS.map(|step| step * ten))
+    tens.take_while(|ten| *ten < MAX_SPAN_NS).flat_map(|ten| BIN_EDGES.map(|step| step * ten))
 }
 
 #[cfg(test)]
@@ -225,31 +226,31 @@ mod tests {
     }
 
     /// So long after `header`'s last byte.
-    fn seen(header: &Header, age_ns: u64) -> Arrival {
+    fn arrival_after(header: &Header, age_ns: u64) -> Arrival {
         Arrival { monotonic_ns: header.stamp_last_ns + age_ns, wall_ns: 0 }
     }
 
-    fn begun() -> Spans {
+    fn started_spans() -> Spans {
         let mut spans = Spans::new();
         spans.begin(1_000_000 * US);
         spans
     }
 
     /// Greatest time and count of each known span, in us.
-    fn told(spans: &Spans) -> Vec<(&'static str, u64, u64)> {
-        let told = |span: Span| {
+    fn known_spans(spans: &Spans) -> Vec<(&'static str, u64, u64)> {
+        let max_and_count = |span: Span| {
             let quantiles = spans.ages(span).quantiles()?;
             Some((span.name(), quantiles.max_ns / US, quantiles.count))
         };
-        Span::ALL.into_iter().filter_map(told).collect()
+        Span::ALL.into_iter().filter_map(max_and_count).collect()
     }
 
     #[test]
     fn a_telegram_is_split() {
-        let mut spans = begun();
+        let mut spans = started_spans();
         let header = Header { flags: Flags::SIMULATED, ..header(2_000_000 * US) };
-        spans.take(&header, seen(&header, 72 * US));
-        let parts = told(&spans);
+        spans.take(&header, arrival_after(&header, 72 * US));
+        let parts = known_spans(&spans);
         let names: Vec<_> = parts.iter().map(|part| part.0).collect();
         assert_eq!(names, ["line", "hub", "wake", "age", "total"]);
         assert!(parts[0].1.abs_diff(15_000) <= 15, "{parts:?}");
@@ -259,42 +260,42 @@ mod tests {
     }
 
     #[test]
-    fn what_was_kept_for_late_joiners_is_no_latency() {
+    fn history_for_late_joiners_has_no_latency() {
         let mut spans = Spans::new();
         let old = header(900_000 * US);
-        spans.take(&old, seen(&old, 200_000 * US));
+        spans.take(&old, arrival_after(&old, 200_000 * US));
         spans.begin(1_000_000 * US);
-        spans.take(&old, seen(&old, 200_000 * US));
-        assert_eq!((spans.received, spans.before, told(&spans).len()), (2, 2, 0));
+        spans.take(&old, arrival_after(&old, 200_000 * US));
+        assert_eq!((spans.received, spans.before, known_spans(&spans).len()), (2, 2, 0));
         let new = header(1_000_000 * US);
-        spans.take(&new, seen(&new, 50 * US));
-        assert_eq!((spans.received, spans.before, told(&spans).len()), (3, 2, 5));
+        spans.take(&new, arrival_after(&new, 50 * US));
+        assert_eq!((spans.received, spans.before, known_spans(&spans).len()), (3, 2, 5));
     }
 
     #[test]
-    fn what_stamps_do_not_tell_is_left_out() {
+    fn spans_without_known_stamps_are_omitted() {
         let names = |header: &Header| {
-            let mut spans = begun();
-            spans.take(header, seen(header, 72 * US));
-            told(&spans).iter().map(|part| part.0).collect::<Vec<_>>()
+            let mut spans = started_spans();
+            spans.take(header, arrival_after(header, 72 * US));
+            known_spans(&spans).iter().map(|part| part.0).collect::<Vec<_>>()
         };
         let telegram = header(2_000_000 * US);
         let estimated = Header { flags: Flags::STAMP_ESTIMATED, ..telegram };
         assert_eq!(names(&estimated), ["hub", "wake", "age"]);
-        let untold = Header { hub_time: [0; 3], ..telegram };
-        assert_eq!(names(&untold), ["line", "age", "total"]);
-        let status = Header { stamp_first_ns: telegram.stamp_last_ns, ..untold };
+        let without_hub_time = Header { hub_time: [0; 3], ..telegram };
+        assert_eq!(names(&without_hub_time), ["line", "age", "total"]);
+        let status = Header { stamp_first_ns: telegram.stamp_last_ns, ..without_hub_time };
         assert_eq!(names(&status), ["age"]);
     }
 
     #[test]
     fn no_age_is_negative() {
-        let mut spans = begun();
+        let mut spans = started_spans();
         let header = header(2_000_000 * US);
         spans.take(&header, Arrival { monotonic_ns: header.stamp_last_ns - 1, wall_ns: 0 });
-        assert_eq!((spans.in_future, told(&spans).len()), (1, 0));
-        spans.take(&header, seen(&header, 10));
-        let parts = told(&spans);
+        assert_eq!((spans.in_future, known_spans(&spans).len()), (1, 0));
+        spans.take(&header, arrival_after(&header, 10));
+        let parts = known_spans(&spans);
         assert_eq!((parts[1], parts[2]), (("hub", 0, 1), ("wake", 0, 1)), "never more than the age");
     }
 
@@ -308,20 +309,20 @@ mod tests {
             flags: Flags::REMOTE,
             ..Header::default()
         };
-        let seen = Arrival { monotonic_ns: arrival + 50 * US, wall_ns: 9_000_050 * US };
-        let mut spans = begun();
-        spans.take(&remote(8_999_000 * US), seen);
-        let parts = told(&spans);
+        let arrival_time = Arrival { monotonic_ns: arrival + 50 * US, wall_ns: 9_000_050 * US };
+        let mut spans = started_spans();
+        spans.take(&remote(8_999_000 * US), arrival_time);
+        let parts = known_spans(&spans);
         assert_eq!(parts, [("network", 1_000, 1), ("age", 50, 1), ("total", 1_050, 1)]);
         // Its wall clock is ahead: the stretch here is known all the same.
-        spans.take(&remote(9_001_000 * US), seen);
-        assert_eq!((spans.in_future, told(&spans)[1]), (1, ("age", 50, 2)));
-        assert_eq!((told(&spans)[0].2, told(&spans)[2].2), (1, 1));
+        spans.take(&remote(9_001_000 * US), arrival_time);
+        assert_eq!((spans.in_future, known_spans(&spans)[1]), (1, ("age", 50, 2)));
+        assert_eq!((known_spans(&spans)[0].2, known_spans(&spans)[2].2), (1, 1));
         // Said here, when nothing came.
         for wall_ns in [9_000_000 * US - 300, 9_000_000 * US + 300] {
-            spans.take(&remote(wall_ns), seen);
+            spans.take(&remote(wall_ns), arrival_time);
         }
-        assert_eq!((spans.in_future, told(&spans)[0].2, told(&spans)[1].2), (1, 1, 4));
+        assert_eq!((spans.in_future, known_spans(&spans)[0].2, known_spans(&spans)[1].2), (1, 1, 4));
     }
 
     fn of(times: impl IntoIterator<Item = u64>) -> Ages {
@@ -354,14 +355,17 @@ mod tests {
 
     #[test]
     fn bars_hold_each_time_once() {
-        assert_eq!(Ages::new().bars(), []);
-        let bar =
-            |from_us: u64, to_us: u64, count| Bar { from_ns: from_us * 1000, to_ns: to_us * 1000, count };
-        let bars = of([25_000, 40_000, 49_000, 60_000, 150_000, 250_000]).bars();
+        assert_eq!(Ages::new().bins(), []);
+        let bar = |from_us: u64, to_us: u64, count| HistogramBin {
+            from_ns: from_us * 1000,
+            to_ns: to_us * 1000,
+            count,
+        };
+        let bars = of([25_000, 40_000, 49_000, 60_000, 150_000, 250_000]).bins();
         assert_eq!(bars[..3], [bar(20, 30, 1), bar(30, 40, 0), bar(40, 50, 2)]);
         assert_eq!(bars[3..6], [bar(50, 60, 0), bar(60, 80, 1), bar(80, 100, 0)]);
         assert_eq!(bars[6..], [bar(100, 200, 1), bar(200, 300, 1)]);
-        assert_eq!(of([10]).bars(), [bar(0, 1, 1)]);
-        assert_eq!(of([u64::MAX, 3]).bars().iter().map(|bar| bar.count).sum::<u64>(), 2);
+        assert_eq!(of([10]).bins(), [bar(0, 1, 1)]);
+        assert_eq!(of([u64::MAX, 3]).bins().iter().map(|bar| bar.count).sum::<u64>(), 2);
     }
 }

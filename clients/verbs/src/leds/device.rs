@@ -10,24 +10,24 @@ use std::time::{Duration, Instant};
 use scanhub_schema::{Failure, Kind};
 
 /// Interval at which an LED that cannot be switched is tried again.
-const AGAIN: Duration = Duration::from_secs(1);
+const RETRY_INTERVAL: Duration = Duration::from_secs(1);
 
 /// An LED.
 pub(super) struct Device {
     directory: PathBuf,
     /// `None` if its state is unknown.
-    lit: Option<bool>,
+    is_on: Option<bool>,
     /// Time of the next try, if it could not be switched.
-    again_at: Option<Instant>,
+    retry_at: Option<Instant>,
 }
 
 /// Change of an LED.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) enum News {
+pub(super) enum DeviceEvent {
     /// It cannot be switched any more.
     Failed(Failure),
     /// It can be switched again.
-    Back,
+    Recovered,
 }
 
 impl Device {
@@ -50,27 +50,27 @@ impl Device {
         let is_name = !name.is_empty() && !name.contains('/') && name != "." && name != "..";
         if !is_name || !directory.join(BRIGHTNESS).is_file() {
             let message = format!("{} has no light {name:?}", root.display());
-            return Err(Failure::new(Kind::Configuration, message, there_are(root)));
+            return Err(Failure::new(Kind::Configuration, message, available_leds(root)));
         }
-        let mut device = Device { directory, lit: None, again_at: None };
+        let mut device = Device { directory, is_on: None, retry_at: None };
         let trigger = device.trigger();
         device.take().map_err(|error| device.failure(&error))?;
         Ok((device, trigger))
     }
 
     /// Switches it unless it shows `on` already. Returns news if that starts or stops to fail.
-    pub(super) fn show(&mut self, on: bool, now: Instant) -> Option<News> {
-        if self.lit == Some(on) || self.again_at.is_some_and(|at| now < at) {
+    pub(super) fn show(&mut self, on: bool, now: Instant) -> Option<DeviceEvent> {
+        if self.is_on == Some(on) || self.retry_at.is_some_and(|at| now < at) {
             return None;
         }
         // An LED that was unplugged may have the state after power-on.
-        let taken = if self.again_at.is_some() { self.take() } else { Ok(()) };
+        let taken = if self.retry_at.is_some() { self.take() } else { Ok(()) };
         match taken.and_then(|()| self.switch(on)) {
-            Ok(()) => self.again_at.take().map(|_| News::Back),
+            Ok(()) => self.retry_at.take().map(|_| DeviceEvent::Recovered),
             Err(error) => {
-                self.lit = None;
-                let is_new = self.again_at.replace(now + AGAIN).is_none();
-                is_new.then(|| News::Failed(self.failure(&error)))
+                self.is_on = None;
+                let is_new = self.retry_at.replace(now + RETRY_INTERVAL).is_none();
+                is_new.then(|| DeviceEvent::Failed(self.failure(&error)))
             }
         }
     }
@@ -87,7 +87,7 @@ impl Device {
     fn switch(&mut self, on: bool) -> io::Result<()> {
         let brightness = if on { self.brightest()? } else { 0 };
         write(&self.directory.join(BRIGHTNESS), format!("{brightness}\n").as_bytes())?;
-        self.lit = Some(on);
+        self.is_on = Some(on);
         Ok(())
     }
 
@@ -128,7 +128,7 @@ fn write(path: &Path, content: &[u8]) -> io::Result<()> {
     File::options().write(true).truncate(true).open(path)?.write_all(content)
 }
 
-fn there_are(root: &Path) -> String {
+fn available_leds(root: &Path) -> String {
     let entries = fs::read_dir(root).into_iter().flatten().flatten();
     let mut names: Vec<_> = entries.map(|entry| entry.file_name().to_string_lossy().into_owned()).collect();
     names.sort();
@@ -184,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn a_light_that_blinks_by_itself_is_taken_from_what_makes_it() {
+    fn opening_a_light_disables_its_trigger() {
         let root = Root::new();
         root.plug("red", "none timer [heartbeat]\n");
         let (_, trigger) = Device::open(root.0.path(), "red").unwrap();
@@ -193,7 +193,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_light_is_refused_with_those_that_are() {
+    fn unknown_light_is_refused_and_available_ones_named() {
         let root = Root::new();
         for (plugged, hint) in [("", "there are none"), ("red", "there are red")] {
             if !plugged.is_empty() {
@@ -211,32 +211,34 @@ mod tests {
     }
 
     #[test]
-    fn one_that_is_unplugged_is_told_once_and_taken_up_when_it_is_back() {
+    fn unplugged_light_is_reported_once_and_resumes_later() {
         let (root, start) = (Root::new(), Instant::now());
         root.plug("red", "[none]\n");
         let (mut red, _) = Device::open(root.0.path(), "red").unwrap();
         root.unplug("red");
-        let Some(News::Failed(failure)) = red.show(true, start) else { panic!("nothing told") };
+        let Some(DeviceEvent::Failed(failure)) = red.show(true, start) else { panic!("nothing told") };
         assert!(failure.message.contains("red/brightness cannot be written"), "{failure}");
-        assert_eq!(red.show(true, start + AGAIN), None, "it was told");
+        assert_eq!(red.show(true, start + RETRY_INTERVAL), None, "it was told");
         root.plug("red", "[timer]\n");
         assert_eq!(
-            (red.show(true, start + AGAIN), root.brightness("red").as_str()),
+            (red.show(true, start + RETRY_INTERVAL), root.brightness("red").as_str()),
             (None, "77\n"),
             "too early"
         );
-        assert_eq!(red.show(true, start + 2 * AGAIN), Some(News::Back));
+        assert_eq!(red.show(true, start + 2 * RETRY_INTERVAL), Some(DeviceEvent::Recovered));
         assert_eq!(root.brightness("red"), "255\n");
         assert_eq!(fs::read_to_string(root.0.path().join("red").join(TRIGGER)).unwrap(), "none\n");
     }
 
     #[test]
-    fn what_the_kernel_says_is_no_number_is_told() {
+    fn non_numeric_max_brightness_is_reported() {
         let root = Root::new();
         root.plug("red", "[none]\n");
         let (mut red, _) = Device::open(root.0.path(), "red").unwrap();
         fs::write(root.0.path().join("red").join("max_brightness"), "bright\n").unwrap();
-        let Some(News::Failed(failure)) = red.show(true, Instant::now()) else { panic!("nothing told") };
+        let Some(DeviceEvent::Failed(failure)) = red.show(true, Instant::now()) else {
+            panic!("nothing told")
+        };
         assert!(failure.message.contains("its max_brightness is \"bright\""), "{failure}");
     }
 }

@@ -33,16 +33,16 @@ impl Split {
             let time = duration::parse(text).map_err(|_| {
                 format!("{text:?} is neither a size nor a duration: write it like 512MiB, 2GB, 10m or 1h")
             })?;
-            return match time >= SHORTEST {
+            return match time >= MIN_SPLIT_TIME {
                 true => Ok(Split::Time(time)),
-                false => Err(format!("{text:?} is too short: a file takes at least {SHORTEST:?}")),
+                false => Err(format!("{text:?} is too short: a file takes at least {MIN_SPLIT_TIME:?}")),
             };
         };
         let digits = number.chars().all(|c| c.is_ascii_digit() || c == '.');
         let number: Option<f64> = number.parse().ok().filter(|_| digits);
         let size = number.ok_or_else(|| format!("{text:?} is no size: write it like 512MiB or 2GB"))?;
         let size = (size * *factor as f64) as u64;
-        match (SMALLEST..=LARGEST).contains(&size) {
+        match (MIN_SPLIT_BYTES..=MAX_SPLIT_BYTES).contains(&size) {
             true => Ok(Split::Bytes(size)),
             false => Err(format!("{text:?}: a file takes 128KiB to 1024TiB")),
         }
@@ -60,9 +60,9 @@ const UNITS: [(&str, u64); 8] = [
     ("TiB", 1 << 40),
 ];
 /// Half of it describes the topics.
-const SMALLEST: u64 = 128 << 10;
-const LARGEST: u64 = 1 << 50;
-const SHORTEST: Duration = Duration::from_secs(1);
+const MIN_SPLIT_BYTES: u64 = 128 << 10;
+const MAX_SPLIT_BYTES: u64 = 1 << 50;
+const MIN_SPLIT_TIME: Duration = Duration::from_secs(1);
 
 /// The files that a run has made so far.
 pub(super) struct Files {
@@ -77,7 +77,7 @@ pub(super) struct Files {
     /// Text near the beginning of each file of this run, and of no other file.
     run: String,
     /// Files of this run, the current one last.
-    made: Vec<PathBuf>,
+    created: Vec<PathBuf>,
     /// Files of earlier runs that count as kept files, the lowest number first.
     older: Vec<PathBuf>,
 }
@@ -93,8 +93,8 @@ impl Files {
         keep: Option<usize>,
         run: &str,
     ) -> Files {
-        let (path, run, made, older) = (path.to_owned(), run.to_owned(), Vec::new(), Vec::new());
-        Files { path, is_split, overwrites, keep, number: 0, count: 0, run, made, older }
+        let (path, run, created, older) = (path.to_owned(), run.to_owned(), Vec::new(), Vec::new());
+        Files { path, is_split, overwrites, keep, number: 0, count: 0, run, created, older }
     }
 
     /// Makes the first file.
@@ -122,7 +122,7 @@ impl Files {
         let mut number = self.number + 1;
         loop {
             match self.make(number, false) {
-                Err(error) if TAKEN.contains(&error.kind()) => number += 1,
+                Err(error) if NAME_TAKEN_ERRORS.contains(&error.kind()) => number += 1,
                 made => return made,
             }
         }
@@ -139,9 +139,9 @@ impl Files {
         for _ in 0..self.surplus() {
             // Something else may have the name by now.
             let (path, removable) = if self.older.is_empty() {
-                let path = self.made.remove(0);
-                let ours = lock_of_run(&path, &self.run);
-                (path, ours)
+                let path = self.created.remove(0);
+                let own = lock_of_run(&path, &self.run);
+                (path, own)
             } else {
                 let path = self.older.remove(0);
                 let finished = lock_finished(&path);
@@ -157,7 +157,7 @@ impl Files {
     /// Returns by how many files there are more than are kept. The current one is always kept.
     fn surplus(&self) -> usize {
         let keep = self.keep.map_or(usize::MAX, |keep| keep.max(1));
-        (self.older.len() + self.made.len()).saturating_sub(keep)
+        (self.older.len() + self.created.len()).saturating_sub(keep)
     }
 
     /// Returns the number of files of this run.
@@ -169,7 +169,7 @@ impl Files {
         let path = self.name(number);
         let file = open(&path, overwrites)?;
         (self.number, self.count) = (number, self.count + 1);
-        self.made.push(path.clone());
+        self.created.push(path.clone());
         Ok((path, file))
     }
 
@@ -177,12 +177,12 @@ impl Files {
         if number == 1 && !self.is_split {
             return self.path.clone();
         }
-        let (stem, ending) = self.around();
+        let (stem, ending) = self.name_parts();
         self.path.with_file_name(format!("{stem}-{number:04}{ending}"))
     }
 
     /// Returns the text before and after the number in a name.
-    fn around(&self) -> (String, String) {
+    fn name_parts(&self) -> (String, String) {
         let stem = self.path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         let ending = self.path.extension().map(|ending| format!(".{}", ending.to_string_lossy()));
         (stem, ending.unwrap_or_default())
@@ -190,9 +190,9 @@ impl Files {
 
     /// Returns the numbers of the names in the directory that belong to these files, in ascending order.
     fn existing(&self) -> Vec<u32> {
-        let (stem, ending) = self.around();
-        let place = self.path.parent().filter(|place| !place.as_os_str().is_empty());
-        let Ok(entries) = fs::read_dir(place.unwrap_or(Path::new("."))) else { return Vec::new() };
+        let (stem, ending) = self.name_parts();
+        let directory = self.path.parent().filter(|directory| !directory.as_os_str().is_empty());
+        let Ok(entries) = fs::read_dir(directory.unwrap_or(Path::new("."))) else { return Vec::new() };
         let names = entries.flatten().map(|entry| entry.file_name());
         let number = |name: &str| {
             let digits = name.strip_prefix(&stem)?.strip_prefix('-')?.strip_suffix(&ending)?;
@@ -235,7 +235,7 @@ fn head(path: &Path) -> io::Result<(File, Vec<u8>, Option<bool>)> {
     // Another recorder could write the file between a look and the lock.
     let is_taken = is_taken(&file);
     let mut head = Vec::new();
-    (&file).take(HEAD).read_to_end(&mut head)?;
+    (&file).take(HEAD_LEN).read_to_end(&mut head)?;
     Ok((file, head, is_taken))
 }
 
@@ -245,7 +245,7 @@ fn open(path: &Path, overwrites: bool) -> io::Result<File> {
     let mut file = target.create(overwrites)?;
     take_lock(&file)?;
     // Another run may remove it as an old file between the open and the lock.
-    for _ in 0..TRIES {
+    for _ in 0..MAX_ATTEMPTS {
         if is_at(&file, path) {
             break;
         }
@@ -264,7 +264,7 @@ fn is_at(file: &File, path: &Path) -> bool {
 }
 
 /// Opens of a file that other runs remove at the same time. Some file systems never report the same inode twice.
-const TRIES: usize = 3;
+const MAX_ATTEMPTS: usize = 3;
 
 /// Locks `file` for this process until it is closed, because two writers would overwrite each other.
 ///
@@ -274,8 +274,8 @@ const TRIES: usize = 3;
 fn take_lock(file: &File) -> io::Result<()> {
     match file.try_lock() {
         Err(TryLockError::WouldBlock) => {
-            let who = holder(file).map_or(String::new(), |pid| format!(" (process {pid})"));
-            Err(io::Error::new(ErrorKind::ResourceBusy, format!("another recorder writes it{who}")))
+            let process = holder(file).map_or(String::new(), |pid| format!(" (process {pid})"));
+            Err(io::Error::new(ErrorKind::ResourceBusy, format!("another recorder writes it{process}")))
         }
         Ok(()) | Err(TryLockError::Error(_)) => Ok(()),
     }
@@ -293,26 +293,26 @@ fn is_taken(file: &File) -> Option<bool> {
 
 /// Returns the process that has locked `file`, if the kernel reports it.
 fn holder(file: &File) -> Option<u32> {
-    let place = file.metadata().ok()?;
-    let id = format!("{:02x}:{:02x}:{}", major(place.dev()), minor(place.dev()), place.ino());
+    let metadata = file.metadata().ok()?;
+    let id = format!("{:02x}:{:02x}:{}", major(metadata.dev()), minor(metadata.dev()), metadata.ino());
     let locks = fs::read_to_string("/proc/locks").ok()?;
     let words = locks.lines().map(|line| line.split_whitespace().collect::<Vec<_>>());
-    let words = words.into_iter().find(|words| words.get(PLACE) == Some(&id.as_str()))?;
-    words[PROCESS].parse().ok().filter(|pid| *pid > 0)
+    let words = words.into_iter().find(|words| words.get(FILE_WORD) == Some(&id.as_str()))?;
+    words[PROCESS_WORD].parse().ok().filter(|pid| *pid > 0)
 }
 
 /// Words of a line of /proc/locks: `1: FLOCK ADVISORY WRITE 4711 08:01:131 0 EOF`.
-const PROCESS: usize = 4;
-const PLACE: usize = 5;
+const PROCESS_WORD: usize = 4;
+const FILE_WORD: usize = 5;
 
 /// Bytes that contain the description of the run, which is the first record of a recording.
-const HEAD: u64 = 4096;
+const HEAD_LEN: u64 = 4096;
 /// Errors if another run has the name.
-const TAKEN: [ErrorKind; 2] = [ErrorKind::AlreadyExists, ErrorKind::ResourceBusy];
+const NAME_TAKEN_ERRORS: [ErrorKind; 2] = [ErrorKind::AlreadyExists, ErrorKind::ResourceBusy];
 
 /// Removes the file that was made at `path`, unless it is a device or a link.
 pub(super) fn discard(path: &Path) {
-    if fs::symlink_metadata(path).is_ok_and(|place| place.is_file()) {
+    if fs::symlink_metadata(path).is_ok_and(|metadata| metadata.is_file()) {
         let _ = fs::remove_file(path);
     }
 }
@@ -332,7 +332,7 @@ pub(super) fn iso(wall_ns: u64) -> String {
 /// Returns year, month, day, hour, minute and second of a time in ns since 1970, in the Gregorian calendar.
 fn utc(wall_ns: u64) -> [u64; 6] {
     let seconds = wall_ns / 1_000_000_000;
-    let (mut day, time) = (seconds / DAY, seconds % DAY);
+    let (mut day, time) = (seconds / SECONDS_PER_DAY, seconds % SECONDS_PER_DAY);
     let is_leap =
         |year: u64| year.is_multiple_of(4) && (!year.is_multiple_of(100) || year.is_multiple_of(400));
     let mut year = 1970;
@@ -352,7 +352,7 @@ fn utc(wall_ns: u64) -> [u64; 6] {
     [year, month, day + 1, time / 3600, time / 60 % 60, time % 60]
 }
 
-const DAY: u64 = 86_400;
+const SECONDS_PER_DAY: u64 = 86_400;
 
 #[cfg(test)]
 mod tests {
@@ -450,7 +450,7 @@ mod tests {
     }
 
     #[test]
-    fn does_not_remove_a_file_that_is_recorded_into_meanwhile() {
+    fn does_not_remove_a_file_while_it_is_recorded() {
         let directory = tempfile::tempdir().unwrap();
         let place = directory.path();
         let path = place.join("walk-0001.mcap");
@@ -498,8 +498,8 @@ mod tests {
         assert_eq!(files.next().unwrap().0, at("walk-0005.mcap"));
         files.prune();
         assert_eq!(fs::read(at("walk-0003.mcap")).unwrap(), recording("run 2"));
-        let taken = Files::new(&at("walk-0002.mcap"), false, false, None, "").first().unwrap_err();
-        assert_eq!(taken.kind(), ErrorKind::AlreadyExists);
+        let failure = Files::new(&at("walk-0002.mcap"), false, false, None, "").first().unwrap_err();
+        assert_eq!(failure.kind(), ErrorKind::AlreadyExists);
         // Those of an earlier run are not mixed with those of the next one.
         for other in
             ["walk-20261122.mcap", "walk-00009.mcap", "walk-7.mcap", "walk-0009.bag", "walks-0009.mcap"]

@@ -13,11 +13,11 @@ use crate::names::TopicName;
 
 /// Samples that were received and are in no file yet.
 pub(super) struct Queue {
-    waiting: Mutex<Waiting>,
-    over: Condvar,
+    waiting: Mutex<QueueState>,
+    ended: Condvar,
 }
 
-struct Waiting {
+struct QueueState {
     batch: Batch,
     is_over: bool,
 }
@@ -51,7 +51,10 @@ pub(super) struct Gap {
 
 impl Queue {
     pub(super) fn new() -> Queue {
-        Queue { waiting: Mutex::new(Waiting { batch: Batch::new(), is_over: false }), over: Condvar::new() }
+        Queue {
+            waiting: Mutex::new(QueueState { batch: Batch::new(), is_over: false }),
+            ended: Condvar::new(),
+        }
     }
 
     /// Adds an entry that always has room, because such entries are rare.
@@ -69,7 +72,7 @@ impl Queue {
     ) -> bool {
         let Batch { entries, bytes } = &mut self.lock().batch;
         let begin = bytes.len();
-        if entries.len() >= MOST_ENTRIES || begin + longest > MOST_BYTES {
+        if entries.len() >= MAX_ENTRIES || begin + longest > MAX_BYTES {
             return false;
         }
         bytes.resize(begin + longest, 0);
@@ -88,19 +91,19 @@ impl Queue {
     /// Returns whether at least half of the room is free.
     pub(super) fn is_roomy(&self) -> bool {
         let Batch { entries, bytes } = &self.lock().batch;
-        entries.len() < MOST_ENTRIES / 2 && bytes.len() < MOST_BYTES / 2
+        entries.len() < MAX_ENTRIES / 2 && bytes.len() < MAX_BYTES / 2
     }
 
     /// Ends the queue: nothing is added from now on.
     pub(super) fn end(&self) {
         self.lock().is_over = true;
-        self.over.notify_all();
+        self.ended.notify_all();
     }
 
     /// Waits until `until` or the end of the queue. Returns whether it has ended.
     pub(super) fn wait(&self, until: Instant) -> bool {
         let left = until.saturating_duration_since(Instant::now());
-        let waiting = self.over.wait_timeout_while(self.lock(), left, |waiting| !waiting.is_over);
+        let waiting = self.ended.wait_timeout_while(self.lock(), left, |waiting| !waiting.is_over);
         waiting.unwrap_or_else(PoisonError::into_inner).0.is_over
     }
 
@@ -110,14 +113,14 @@ impl Queue {
         std::mem::swap(&mut self.lock().batch, batch);
     }
 
-    fn lock(&self) -> MutexGuard<'_, Waiting> {
+    fn lock(&self) -> MutexGuard<'_, QueueState> {
         self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 impl Batch {
     pub(super) fn new() -> Batch {
-        Batch { entries: Vec::with_capacity(MOST_ENTRIES), bytes: Vec::with_capacity(MOST_BYTES) }
+        Batch { entries: Vec::with_capacity(MAX_ENTRIES), bytes: Vec::with_capacity(MAX_BYTES) }
     }
 
     pub(super) fn clear(&mut self) {
@@ -153,30 +156,30 @@ pub(super) struct RecordStats {
     /// Samples in all files that still exist.
     pub(super) samples: u64,
     /// Events since the receiving thread last read them.
-    pub(super) news: Vec<News>,
+    pub(super) events: Vec<WriterEvent>,
 }
 
 /// Event of the disk thread.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) enum News {
+pub(super) enum WriterEvent {
     /// The recording continues in this file.
     File(PathBuf),
     /// The file cannot be written, for this reason.
-    Trouble(PathBuf, String),
+    WriteFailed(PathBuf, String),
     /// The file can be written again, after this time.
-    Well(PathBuf, Duration),
+    WriteResumed(PathBuf, Duration),
     /// This number of samples was lost, because the file was removed or cut.
-    Gone(PathBuf, u64),
+    Removed(PathBuf, u64),
     /// The reader of stdout went away.
-    ReaderGone,
+    ReaderClosed,
 }
 
 impl WriterProgress {
     /// Returns the progress, and takes the news.
-    pub(super) fn look(&self) -> RecordStats {
+    pub(super) fn take_stats(&self) -> RecordStats {
         let mut stats = self.stats();
-        let news = std::mem::take(&mut stats.news);
-        RecordStats { news, ..stats.clone() }
+        let events = std::mem::take(&mut stats.events);
+        RecordStats { events, ..stats.clone() }
     }
 
     /// Locks the progress for the disk thread.
@@ -186,8 +189,8 @@ impl WriterProgress {
 }
 
 /// Bytes of payloads: 20 seconds of all topics of two sensors at their fastest.
-const MOST_BYTES: usize = 8 << 20;
-const MOST_ENTRIES: usize = 1 << 15;
+const MAX_BYTES: usize = 8 << 20;
+const MAX_ENTRIES: usize = 1 << 15;
 /// Interval at which the queue is written and a chunk is closed. A kill costs no more than this.
 pub(super) const WRITE_INTERVAL: Duration = Duration::from_millis(100);
 
@@ -203,10 +206,10 @@ mod tests {
     }
 
     #[test]
-    fn what_waits_is_bounded_and_comes_in_its_order() {
+    fn queue_is_bounded_and_keeps_the_order() {
         let queue = Queue::new();
         let pushed = (0..).take_while(|&i| push(&queue, i as u8, 1000)).count();
-        assert_eq!(pushed, (MOST_BYTES - 2000) / 1000 + 1);
+        assert_eq!(pushed, (MAX_BYTES - 2000) / 1000 + 1);
         assert!(!queue.is_roomy());
         let mut batch = Batch::new();
         queue.take(&mut batch);
@@ -216,10 +219,10 @@ mod tests {
         queue.take(&mut batch);
         assert_eq!((batch.count(), &batch.bytes[..]), (1, &[9; 10][..]));
         let mut small = (0..).take_while(|_| push(&queue, 0, 10)).count();
-        assert_eq!(small, MOST_ENTRIES);
+        assert_eq!(small, MAX_ENTRIES);
         queue.take(&mut batch);
         small = batch.count() as usize;
-        assert_eq!(small, MOST_ENTRIES);
+        assert_eq!(small, MAX_ENTRIES);
     }
 
     #[test]

@@ -8,16 +8,16 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
-use super::queue::{Gap, News, RecordStats};
+use super::queue::{Gap, RecordStats, WriterEvent};
 use crate::follow::Notice;
 use crate::names::TopicName;
-use crate::output::{End, Output, columns, fitting};
+use crate::output::{ExitReason, Output, columns, fitting};
 use crate::receive_stats::ReceiveStats;
 use crate::{json, text};
 
 /// Form of the reports.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Look {
+pub(super) enum ReportForm {
     /// Lines of text at the start, at the end, and for events.
     Lines,
     /// JSON objects, also once a second.
@@ -26,25 +26,25 @@ pub(super) enum Look {
     Terminal,
 }
 
-impl Look {
+impl ReportForm {
     /// Returns the form of reports for this output.
-    pub(super) fn of(is_json: bool, is_terminal: bool) -> Look {
+    pub(super) fn of(is_json: bool, is_terminal: bool) -> ReportForm {
         match (is_json, is_terminal) {
-            (true, _) => Look::Json,
-            (false, true) => Look::Terminal,
-            (false, false) => Look::Lines,
+            (true, _) => ReportForm::Json,
+            (false, true) => ReportForm::Terminal,
+            (false, false) => ReportForm::Lines,
         }
     }
 }
 
 /// Reports of a run, and the counts in them.
 pub(super) struct Report<'a> {
-    look: Look,
+    form: ReportForm,
     out: Output<'a>,
     notes: Output<'a>,
     /// The terminal of the progress line, for its width.
     terminal: Option<OwnedFd>,
-    begun: Instant,
+    started: Instant,
     next: Instant,
     files: Vec<PathBuf>,
     /// Bytes in the last report of progress.
@@ -53,42 +53,42 @@ pub(super) struct Report<'a> {
     missed: u64,
     /// Samples whose file was removed or cut.
     removed: u64,
-    is_in_trouble: bool,
+    is_write_failing: bool,
 }
 
 /// Interval between two reports of progress.
-const EVERY: Duration = Duration::from_secs(1);
+const REPORT_INTERVAL: Duration = Duration::from_secs(1);
 
 impl<'a> Report<'a> {
     /// Creates the reports of a run. They go to `out`, which may be `terminal`, and notices to `notes` if `out` is not
     /// JSON.
     pub(super) fn new(
-        look: Look,
+        form: ReportForm,
         out: &'a mut dyn Write,
         notes: &'a mut dyn Write,
         terminal: Option<OwnedFd>,
     ) -> Report<'a> {
         let now = Instant::now();
         Report {
-            look,
+            form,
             out: Output::new(out),
             notes: Output::new(notes),
             terminal,
-            begun: now,
-            next: now + EVERY,
+            started: now,
+            next: now + REPORT_INTERVAL,
             files: Vec::new(),
             bytes: 0,
             missed: 0,
             removed: 0,
-            is_in_trouble: false,
+            is_write_failing: false,
         }
     }
 
     /// Writes the first line: the file at `path`, and how many files of earlier runs are removed once it has samples.
-    pub(super) fn begin(&mut self, path: &Path, older: usize) -> Result<(), End> {
+    pub(super) fn begin(&mut self, path: &Path, older: usize) -> Result<(), ExitReason> {
         self.files.push(path.to_owned());
-        if self.look == Look::Json {
-            let first = Progress { older_removed: Some(older), ..self.at(&RecordStats::default(), 0) };
+        if self.form == ReportForm::Json {
+            let first = ProgressJson { older_removed: Some(older), ..self.at(&RecordStats::default(), 0) };
             return self.out.json(&first);
         }
         self.out.line(|line| {
@@ -102,30 +102,32 @@ impl<'a> Report<'a> {
     }
 
     /// Reports news of the hub, and missed samples.
-    pub(super) fn hub(&mut self, names: &[Rc<TopicName>], notice: Notice) -> Result<(), End> {
+    pub(super) fn hub(&mut self, names: &[Rc<TopicName>], notice: Notice) -> Result<(), ExitReason> {
         if let Notice::Missed(missed) = notice {
             self.missed += missed;
         }
-        if self.look == Look::Json {
+        if self.form == ReportForm::Json {
             return json::notices(&mut self.out, names, &notice);
         }
         self.note(|line| text::notice(line, names, &notice))
     }
 
     /// Reports news of the disk thread.
-    pub(super) fn disk(&mut self, news: &News) -> Result<(), End> {
-        self.is_in_trouble = match news {
-            News::Trouble(..) => true,
-            News::Well(..) => false,
-            News::File(_) | News::Gone(..) | News::ReaderGone => self.is_in_trouble,
+    pub(super) fn disk(&mut self, event: &WriterEvent) -> Result<(), ExitReason> {
+        self.is_write_failing = match event {
+            WriterEvent::WriteFailed(..) => true,
+            WriterEvent::WriteResumed(..) => false,
+            WriterEvent::File(_) | WriterEvent::Removed(..) | WriterEvent::ReaderClosed => {
+                self.is_write_failing
+            }
         };
-        match news {
-            News::File(path) => self.files.push(path.clone()),
-            News::Gone(_, samples) => self.removed += samples,
+        match event {
+            WriterEvent::File(path) => self.files.push(path.clone()),
+            WriterEvent::Removed(_, samples) => self.removed += samples,
             _ => {}
         }
-        if self.look == Look::Json {
-            let of = |kind, path: &Path| Disk {
+        if self.form == ReportForm::Json {
+            let of = |kind, path: &Path| DiskJson {
                 class: "notice",
                 kind,
                 file: path.display().to_string(),
@@ -133,51 +135,55 @@ impl<'a> Report<'a> {
                 seconds: None,
                 samples: None,
             };
-            let notice = match news {
-                News::File(path) => of("file", path),
-                News::Trouble(path, message) => Disk { message: Some(message), ..of("write_failed", path) },
-                News::Well(path, after) => {
-                    Disk { seconds: Some(after.as_secs_f64()), ..of("write_resumed", path) }
+            let notice = match event {
+                WriterEvent::File(path) => of("file", path),
+                WriterEvent::WriteFailed(path, message) => {
+                    DiskJson { message: Some(message), ..of("write_failed", path) }
                 }
-                News::Gone(path, samples) => Disk { samples: Some(*samples), ..of("file_removed", path) },
-                News::ReaderGone => return Ok(()),
+                WriterEvent::WriteResumed(path, after) => {
+                    DiskJson { seconds: Some(after.as_secs_f64()), ..of("write_resumed", path) }
+                }
+                WriterEvent::Removed(path, samples) => {
+                    DiskJson { samples: Some(*samples), ..of("file_removed", path) }
+                }
+                WriterEvent::ReaderClosed => return Ok(()),
             };
             return self.out.json(&notice);
         }
-        self.note(|line| match news {
-            News::File(path) => write!(line, "continues in {}", path.display()),
-            News::Trouble(path, message) => {
+        self.note(|line| match event {
+            WriterEvent::File(path) => write!(line, "continues in {}", path.display()),
+            WriterEvent::WriteFailed(path, message) => {
                 let path = path.display();
                 write!(
                     line,
                     "cannot write {path}: {message}; samples are kept in memory, and writing is tried again"
                 )
             }
-            News::Well(path, after) => {
+            WriterEvent::WriteResumed(path, after) => {
                 write!(line, "{} is written again, after {:.1} s", path.display(), after.as_secs_f64())
             }
-            News::Gone(path, samples) => {
+            WriterEvent::Removed(path, samples) => {
                 write!(line, "{} was removed or cut: its {samples} samples are lost", path.display())
             }
-            News::ReaderGone => Ok(()),
+            WriterEvent::ReaderClosed => Ok(()),
         })
     }
 
     /// Reports that samples are left out from now on.
-    pub(super) fn gap_begins(&mut self) -> Result<(), End> {
-        if self.look == Look::Json {
+    pub(super) fn gap_begins(&mut self) -> Result<(), ExitReason> {
+        if self.form == ReportForm::Json {
             let (dropped, seconds) = (0, 0.0);
-            return self.out.json(&Left { class: "notice", kind: "gap_begins", dropped, seconds });
+            return self.out.json(&DroppedJson { class: "notice", kind: "gap_begins", dropped, seconds });
         }
         self.note(|line| write!(line, "memory for samples is full: samples are left out of the recording"))
     }
 
     /// Reports what a gap left out.
-    pub(super) fn gap_ends(&mut self, gap: &Gap) -> Result<(), End> {
+    pub(super) fn gap_ends(&mut self, gap: &Gap) -> Result<(), ExitReason> {
         let dropped = gap.dropped.iter().map(|(_, count)| count).sum();
         let seconds = gap.to_ns.saturating_sub(gap.from_ns) as f64 / 1e9;
-        if self.look == Look::Json {
-            return self.out.json(&Left { class: "notice", kind: "gap_ends", dropped, seconds });
+        if self.form == ReportForm::Json {
+            return self.out.json(&DroppedJson { class: "notice", kind: "gap_ends", dropped, seconds });
         }
         self.note(|line| {
             write!(line, "records again: {dropped} samples of {seconds:.1} s are not in the recording (")?;
@@ -189,22 +195,22 @@ impl<'a> Report<'a> {
     }
 
     /// Reports the progress once a second, to a terminal or as JSON.
-    pub(super) fn progress(&mut self, written: &RecordStats, dropped: u64) -> Result<(), End> {
+    pub(super) fn progress(&mut self, written: &RecordStats, dropped: u64) -> Result<(), ExitReason> {
         if Instant::now() < self.next {
             return Ok(());
         }
-        self.next = Instant::now() + EVERY;
-        match self.look {
-            Look::Lines => Ok(()),
-            Look::Json => {
+        self.next = Instant::now() + REPORT_INTERVAL;
+        match self.form {
+            ReportForm::Lines => Ok(()),
+            ReportForm::Json => {
                 let progress = self.at(written, dropped);
                 self.out.json(&progress)
             }
-            Look::Terminal => {
+            ReportForm::Terminal => {
                 // A line that wraps could not be redrawn, so the terminal cuts a line that is still too long.
                 let columns = self.terminal.as_ref().and_then(columns).unwrap_or(usize::MAX - 2);
                 let status = fitting(self.status(written, dropped), columns);
-                let line = [WIPE, b"\x1b[?7l", status.as_bytes(), b"\x1b[?7h"].concat();
+                let line = [CLEAR_LINE, b"\x1b[?7l", status.as_bytes(), b"\x1b[?7h"].concat();
                 self.bytes = written.bytes;
                 self.out.raw(&line)
             }
@@ -212,19 +218,19 @@ impl<'a> Report<'a> {
     }
 
     /// Reports what was received of a topic.
-    pub(super) fn topic(&mut self, name: &TopicName, account: &ReceiveStats) -> Result<(), End> {
-        if self.look == Look::Json {
-            return self.out.json(&json::summary(name, account));
+    pub(super) fn topic(&mut self, name: &TopicName, stats: &ReceiveStats) -> Result<(), ExitReason> {
+        if self.form == ReportForm::Json {
+            return self.out.json(&json::summary(name, stats));
         }
-        self.wipe()?;
-        self.out.line(|line| text::summary(line, name, account))
+        self.clear_line()?;
+        self.out.line(|line| text::summary(line, name, stats))
     }
 
     /// Reports the finished recording.
-    pub(super) fn end(&mut self, written: &RecordStats, dropped: u64) -> Result<(), End> {
+    pub(super) fn end(&mut self, written: &RecordStats, dropped: u64) -> Result<(), ExitReason> {
         let RecordStats { bytes, samples, .. } = *written;
-        if self.look == Look::Json {
-            return self.out.json(&Recorded {
+        if self.form == ReportForm::Json {
+            return self.out.json(&RecordedJson {
                 class: "recorded",
                 files: self.files.iter().map(|file| file.display().to_string()).collect(),
                 bytes,
@@ -232,10 +238,10 @@ impl<'a> Report<'a> {
                 missed: self.missed,
                 dropped,
                 removed: self.removed,
-                seconds: self.begun.elapsed().as_secs_f64(),
+                seconds: self.started.elapsed().as_secs_f64(),
             });
         }
-        self.wipe()?;
+        self.clear_line()?;
         let removed = self.removed;
         let files = &self.files;
         self.out.line(|line| {
@@ -254,24 +260,24 @@ impl<'a> Report<'a> {
         })
     }
 
-    fn at(&self, written: &RecordStats, dropped: u64) -> Progress {
-        Progress {
+    fn at(&self, written: &RecordStats, dropped: u64) -> ProgressJson {
+        ProgressJson {
             class: "recording",
             file: self.files.last().map(|file| file.display().to_string()),
             bytes: written.bytes,
             samples: written.samples,
             missed: self.missed,
             dropped,
-            seconds: self.begun.elapsed().as_secs_f64(),
+            seconds: self.started.elapsed().as_secs_f64(),
             older_removed: None,
         }
     }
 
     /// Returns the progress in parts with their ranks. Lost samples have the highest rank.
     fn status(&self, written: &RecordStats, dropped: u64) -> Vec<(u8, String)> {
-        let seconds = self.begun.elapsed().as_secs();
-        let rate = written.bytes.saturating_sub(self.bytes) / EVERY.as_secs();
-        let trouble = self.is_in_trouble.then(|| (4, "disk trouble".to_owned()));
+        let seconds = self.started.elapsed().as_secs();
+        let rate = written.bytes.saturating_sub(self.bytes) / REPORT_INTERVAL.as_secs();
+        let problem = self.is_write_failing.then(|| (4, "disk trouble".to_owned()));
         let parts = [
             (3, format!("{}:{:02}:{:02}", seconds / 3600, seconds / 60 % 60, seconds % 60)),
             (1, size(written.bytes)),
@@ -279,19 +285,19 @@ impl<'a> Report<'a> {
             (2, format!("{} samples", written.samples)),
             (5, format!("{} lost", self.missed + dropped + self.removed)),
         ];
-        trouble.into_iter().chain(parts).collect()
+        problem.into_iter().chain(parts).collect()
     }
 
     /// Writes a notice.
-    fn note(&mut self, build: impl FnOnce(&mut Vec<u8>) -> io::Result<()>) -> Result<(), End> {
-        self.wipe()?;
+    fn note(&mut self, build: impl FnOnce(&mut Vec<u8>) -> io::Result<()>) -> Result<(), ExitReason> {
+        self.clear_line()?;
         self.notes.line(build)
     }
 
-    fn wipe(&mut self) -> Result<(), End> {
-        match self.look {
-            Look::Terminal => self.out.raw(WIPE),
-            Look::Json | Look::Lines => Ok(()),
+    fn clear_line(&mut self) -> Result<(), ExitReason> {
+        match self.form {
+            ReportForm::Terminal => self.out.raw(CLEAR_LINE),
+            ReportForm::Json | ReportForm::Lines => Ok(()),
         }
     }
 }
@@ -307,7 +313,7 @@ fn size(bytes: u64) -> String {
 
 /// Line of class `recording`.
 #[derive(Serialize)]
-struct Progress {
+struct ProgressJson {
     class: &'static str,
     file: Option<String>,
     bytes: u64,
@@ -322,7 +328,7 @@ struct Progress {
 
 /// Line of class `recorded`, the last one.
 #[derive(Serialize)]
-struct Recorded {
+struct RecordedJson {
     class: &'static str,
     files: Vec<String>,
     bytes: u64,
@@ -335,7 +341,7 @@ struct Recorded {
 
 /// Line of class `notice` on the disk.
 #[derive(Serialize)]
-struct Disk<'a> {
+struct DiskJson<'a> {
     class: &'static str,
     kind: &'static str,
     file: String,
@@ -349,7 +355,7 @@ struct Disk<'a> {
 
 /// Line of class `notice` on samples that were left out.
 #[derive(Serialize)]
-struct Left {
+struct DroppedJson {
     class: &'static str,
     kind: &'static str,
     dropped: u64,
@@ -357,7 +363,7 @@ struct Left {
 }
 
 /// Moves the cursor to the start of the line, and erases it (ECMA-48).
-const WIPE: &[u8] = b"\r\x1b[K";
+const CLEAR_LINE: &[u8] = b"\r\x1b[K";
 
 #[cfg(test)]
 mod tests {

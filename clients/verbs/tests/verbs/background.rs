@@ -8,21 +8,21 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use crate::fake::{Place, Sink};
-use crate::{context, named};
-use scanhub_schema::{Background, BackgroundHead, Failure, Kind, Response, Shown, Verb, as_json};
+use crate::fake::{OutputFile, TestDomain};
+use crate::{context, domain_options};
+use scanhub_schema::{Background, BackgroundHead, Failure, Kind, Response, ResponseModel, Verb, as_json};
 use scanhub_shm::ControlServer;
 use scanhub_shm::{Domain, HubLock};
-use scanhub_verbs::background::{BackgroundArgs, ModelOrder, saved_model};
+use scanhub_verbs::background::{BackgroundArgs, ModelRequest, saved_model};
 
 /// A hub that answers for the background of `front`.
-struct Keeper {
+struct FakeControlServer {
     stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
 
-impl Keeper {
-    fn new(domain: &Domain, mut model: Box<Background>) -> Keeper {
+impl FakeControlServer {
+    fn new(domain: &Domain, mut model: Box<Background>) -> FakeControlServer {
         let (stop, domain) = (Arc::new(AtomicBool::new(false)), domain.clone());
         let lock = HubLock::acquire(domain.root()).unwrap();
         let flag = stop.clone();
@@ -32,52 +32,56 @@ impl Keeper {
             lock.report_ready().unwrap();
             ready.send(()).unwrap();
             while !flag.load(Ordering::Relaxed) {
-                while let Some(asked) = server.receive().unwrap() {
-                    let request = asked.request().expect("requests of this version");
+                while let Some(incoming) = server.receive().unwrap() {
+                    let request = incoming.request().expect("requests of this version");
                     let answer = match (request.sensor.as_str(), request.verb) {
-                        ("front", Some(verb)) => obey(&mut model, verb, request.model),
+                        ("front", Some(verb)) => apply_request(&mut model, verb, request.model),
                         (other, _) => Err(Failure::new(
                             Kind::NoTopic,
                             format!("the hub has no sensor {other}"),
                             "there are front",
                         )),
                     };
-                    server.answer(asked, &Response(answer.map(|model| model.map(Shown::from)))).unwrap();
+                    server
+                        .respond(incoming, &Response(answer.map(|model| model.map(ResponseModel::from))))
+                        .unwrap();
                 }
                 scanhub_shm::sleep(&[server.requests()], Duration::from_millis(5)).unwrap();
             }
         });
         is_ready.recv().unwrap();
-        Keeper { stop, thread: Some(thread) }
+        FakeControlServer { stop, thread: Some(thread) }
     }
 }
 
-impl Drop for Keeper {
+impl Drop for FakeControlServer {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         let _ = self.thread.take().map(JoinHandle::join);
     }
 }
 
-fn obey(
+fn apply_request(
     model: &mut Box<Background>,
     verb: Verb,
-    wanted: Option<Box<Background>>,
+    new_model: Option<Box<Background>>,
 ) -> Result<Option<Box<Background>>, Failure> {
     let generation = model.generation + 1;
-    match (verb, wanted) {
+    match (verb, new_model) {
         (Verb::Reset, _) => {
             model.ranges_mut().fill(Background::UNKNOWN);
             (model.generation, model.known_beams) = (generation, 0);
         }
         (Verb::Freeze, _) => model.flags = Background::FROZEN,
         (Verb::Thaw, _) => model.flags = 0,
-        (Verb::Load, Some(wanted)) if (wanted.count, wanted.unit_um) != (model.count, model.unit_um) => {
-            let message = format!("front has {} beams, the model {}", model.count, wanted.count);
+        (Verb::Load, Some(expected))
+            if (expected.count, expected.unit_um) != (model.count, model.unit_um) =>
+        {
+            let message = format!("front has {} beams, the model {}", model.count, expected.count);
             return Err(Failure::new(Kind::Configuration, message, "save one of this resolution"));
         }
-        (Verb::Load, Some(wanted)) => {
-            *model = wanted;
+        (Verb::Load, Some(expected)) => {
+            *model = expected;
             model.generation = generation;
         }
         _ => return Ok(Some(model.clone())),
@@ -86,10 +90,10 @@ fn obey(
 }
 
 fn model() -> Box<Background> {
-    of_beams(181, 1.0)
+    model_with_beams(181, 1.0)
 }
 
-fn of_beams(count: usize, step_deg: f64) -> Box<Background> {
+fn model_with_beams(count: usize, step_deg: f64) -> Box<Background> {
     let head = BackgroundHead {
         first_angle: (-90_f64).to_radians(),
         step: step_deg.to_radians(),
@@ -103,44 +107,50 @@ fn of_beams(count: usize, step_deg: f64) -> Box<Background> {
     model
 }
 
-fn ask(place: &Place, sensor: &str, order: ModelOrder, json: bool) -> (Result<(), Failure>, String) {
-    let args = BackgroundArgs { sensor: sensor.into(), order };
-    let (out, notes) = (Sink::new(), Sink::new());
-    let end = args.run(&mut context(named(place), json, out.file(), notes.file(), Arc::default()));
+fn run_order(
+    test_domain: &TestDomain,
+    sensor: &str,
+    request: ModelRequest,
+    json: bool,
+) -> (Result<(), Failure>, String) {
+    let args = BackgroundArgs { sensor: sensor.into(), order: request };
+    let (out, notes) = (OutputFile::new(), OutputFile::new());
+    let end =
+        args.run(&mut context(domain_options(test_domain), json, out.file(), notes.file(), Arc::default()));
     (end, out.text())
 }
 
 /// To save a model where nothing is yet.
-fn keep(file: &Path) -> ModelOrder {
-    ModelOrder::Save { file: file.to_owned(), force: false }
+fn save_order(file: &Path) -> ModelRequest {
+    ModelRequest::Save { file: file.to_owned(), force: false }
 }
 
-fn load(file: &Path) -> ModelOrder {
-    ModelOrder::Load { file: file.to_owned(), any_sensor: false }
+fn load_order(file: &Path) -> ModelRequest {
+    ModelRequest::Load { file: file.to_owned(), any_sensor: false }
 }
 
 #[test]
 fn a_model_is_saved_forgotten_and_loaded_again() {
-    let place = Place::new();
-    let _keeper = Keeper::new(&place.domain, model());
-    let file = place.base.join("model.json");
+    let test_domain = TestDomain::new();
+    let _keeper = FakeControlServer::new(&test_domain.domain, model());
+    let file = test_domain.base.join("model.json");
     let say = |order| {
-        let (end, out) = ask(&place, "front", order, false);
+        let (end, out) = run_order(&test_domain, "front", order, false);
         assert_eq!(end, Ok(()));
         out
     };
-    assert_eq!(say(ModelOrder::Show), "front: generation 4: 3 of 181 beams known, 1 far, in 10 mm\n");
+    assert_eq!(say(ModelRequest::Show), "front: generation 4: 3 of 181 beams known, 1 far, in 10 mm\n");
     let saved = format!("front: 3 of 181 beams saved to {}\n", file.display());
-    assert_eq!(say(keep(&file)), saved);
-    assert_eq!(say(ModelOrder::Freeze), "front: background frozen\n");
-    assert!(say(ModelOrder::Show).ends_with(", frozen\n"));
-    assert_eq!(say(ModelOrder::Thaw), "front: background learning resumed\n");
-    assert_eq!(say(ModelOrder::Reset), "front: background reset\n");
-    assert_eq!(say(ModelOrder::Show), "front: generation 5: 0 of 181 beams known, 0 far, in 10 mm\n");
+    assert_eq!(say(save_order(&file)), saved);
+    assert_eq!(say(ModelRequest::Freeze), "front: background frozen\n");
+    assert!(say(ModelRequest::Show).ends_with(", frozen\n"));
+    assert_eq!(say(ModelRequest::Thaw), "front: background learning resumed\n");
+    assert_eq!(say(ModelRequest::Reset), "front: background reset\n");
+    assert_eq!(say(ModelRequest::Show), "front: generation 5: 0 of 181 beams known, 0 far, in 10 mm\n");
     let loaded = saved_model(&file, "front", false, &mut &b""[..]).unwrap();
     assert_eq!(loaded, model());
-    assert_eq!(say(load(&file)), "front: background loaded\n");
-    let (end, out) = ask(&place, "front", ModelOrder::Show, true);
+    assert_eq!(say(load_order(&file)), "front: background loaded\n");
+    let (end, out) = run_order(&test_domain, "front", ModelRequest::Show, true);
     assert_eq!(end, Ok(()));
     assert_eq!(
         out.split_at(160).0,
@@ -149,10 +159,11 @@ fn a_model_is_saved_forgotten_and_loaded_again() {
             .0
     );
     // What is shown is what a file is.
-    let (_, piped) = ask(&place, "front", keep(Path::new("-")), false);
+    let (_, piped) = run_order(&test_domain, "front", save_order(Path::new("-")), false);
     assert_eq!(piped, out);
     assert!(saved_model("-".as_ref(), "front", false, &mut out.as_bytes()).is_ok());
-    let (_, out) = ask(&place, "front", ModelOrder::Save { file: file.clone(), force: true }, true);
+    let (_, out) =
+        run_order(&test_domain, "front", ModelRequest::Save { file: file.clone(), force: true }, true);
     assert_eq!(
         out,
         format!(
@@ -160,16 +171,16 @@ fn a_model_is_saved_forgotten_and_loaded_again() {
             file.display().to_string()
         )
     );
-    let (_, out) = ask(&place, "front", ModelOrder::Thaw, true);
+    let (_, out) = run_order(&test_domain, "front", ModelRequest::Thaw, true);
     assert_eq!(out, "{\"class\":\"control\",\"sensor\":\"front\",\"verb\":\"thaw\",\"outcome\":\"taken\"}\n");
 }
 
 #[test]
-fn what_does_not_go_with_the_sensor_is_refused() {
-    let place = Place::new();
-    let _keeper = Keeper::new(&place.domain, of_beams(361, 0.5));
-    let file = place.base.join("model.json");
-    ask(&place, "front", keep(&file), false).0.unwrap();
+fn unsuitable_or_unreadable_models_are_refused() {
+    let test_domain = TestDomain::new();
+    let _keeper = FakeControlServer::new(&test_domain.domain, model_with_beams(361, 0.5));
+    let file = test_domain.base.join("model.json");
+    run_order(&test_domain, "front", save_order(&file), false).0.unwrap();
 
     let foreign = saved_model(&file, "rear", false, &mut &b""[..]).unwrap_err();
     let message = format!("{} is the background of front, not of rear", file.display());
@@ -178,16 +189,16 @@ fn what_does_not_go_with_the_sensor_is_refused() {
     assert!(saved_model(&file, "rear", true, &mut &b""[..]).is_ok());
 
     // The hub says what it has; here it is another resolution.
-    let other = place.base.join("other.json");
+    let other = test_domain.base.join("other.json");
     fs::write(&other, serde_json::to_vec(&as_json("front", &model())).unwrap()).unwrap();
-    let refused = ask(&place, "front", load(&other), false).0.unwrap_err();
+    let refused = run_order(&test_domain, "front", load_order(&other), false).0.unwrap_err();
     assert_eq!(
         (refused.kind, refused.message.as_str()),
         (Kind::Configuration, "front has 361 beams, the model 181")
     );
-    let unknown = ask(&place, "rear", ModelOrder::Show, false).0.unwrap_err();
+    let unknown = run_order(&test_domain, "rear", ModelRequest::Show, false).0.unwrap_err();
     assert_eq!((unknown.kind, unknown.hint.as_str()), (Kind::NoTopic, "there are front"));
-    assert_eq!(ask(&place, "Front", ModelOrder::Show, false).0.unwrap_err().kind, Kind::Usage);
+    assert_eq!(run_order(&test_domain, "Front", ModelRequest::Show, false).0.unwrap_err().kind, Kind::Usage);
 
     let text = fs::read(&file).unwrap();
     fs::write(&file, &text[..text.len() / 2]).unwrap();
@@ -201,16 +212,17 @@ fn what_does_not_go_with_the_sensor_is_refused() {
 
 #[test]
 fn nothing_is_saved_by_halves() {
-    let place = Place::new();
-    let _keeper = Keeper::new(&place.domain, model());
-    let save = |file: PathBuf| ask(&place, "front", ModelOrder::Save { file, force: true }, false);
+    let test_domain = TestDomain::new();
+    let _keeper = FakeControlServer::new(&test_domain.domain, model());
+    let save =
+        |file: PathBuf| run_order(&test_domain, "front", ModelRequest::Save { file, force: true }, false);
     for impossible in ["/nowhere/model.json", "/"] {
         let (end, out) = save(impossible.into());
         let failure = end.unwrap_err();
         assert!(failure.kind == Kind::Output && failure.message.contains(impossible), "{failure}");
         assert_eq!(out, "");
     }
-    let (file, link) = (place.base.join("model.json"), place.base.join("link"));
+    let (file, link) = (test_domain.base.join("model.json"), test_domain.base.join("link"));
     fs::write(&file, "old").unwrap();
     std::os::unix::fs::symlink(&file, &link).unwrap();
     for refused in [link, "/dev/null".into()] {
@@ -226,16 +238,18 @@ fn nothing_is_saved_by_halves() {
     let before = rights();
     save(file.clone()).0.unwrap();
     assert_eq!(rights(), before);
-    let left: Vec<_> = fs::read_dir(&place.base).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    let left: Vec<_> =
+        fs::read_dir(&test_domain.base).unwrap().map(|entry| entry.unwrap().file_name()).collect();
     assert!(left.iter().all(|name| !name.to_string_lossy().starts_with('.')), "{left:?}");
 }
 
 #[test]
-fn what_is_there_is_replaced_only_if_it_may_be() {
-    let place = Place::new();
-    let _keeper = Keeper::new(&place.domain, model());
-    let file = place.base.join("model.json");
-    let save = |force| ask(&place, "front", ModelOrder::Save { file: file.clone(), force }, false).0;
+fn existing_file_is_replaced_only_by_force() {
+    let test_domain = TestDomain::new();
+    let _keeper = FakeControlServer::new(&test_domain.domain, model());
+    let file = test_domain.base.join("model.json");
+    let save =
+        |force| run_order(&test_domain, "front", ModelRequest::Save { file: file.clone(), force }, false).0;
     save(false).unwrap();
     fs::write(&file, "mine").unwrap();
     let failure = save(false).unwrap_err();
@@ -247,17 +261,17 @@ fn what_is_there_is_replaced_only_if_it_may_be() {
 
 #[test]
 fn a_model_that_knows_nothing_takes_no_others_place() {
-    let place = Place::new();
-    let _keeper = Keeper::new(&place.domain, model());
-    let file = place.base.join("model.json");
-    let say = |order| ask(&place, "front", order, false);
-    say(keep(&file)).0.unwrap();
-    say(ModelOrder::Freeze).0.unwrap();
-    let (_, out) = say(ModelOrder::Reset);
+    let test_domain = TestDomain::new();
+    let _keeper = FakeControlServer::new(&test_domain.domain, model());
+    let file = test_domain.base.join("model.json");
+    let say = |order| run_order(&test_domain, "front", order, false);
+    say(save_order(&file)).0.unwrap();
+    say(ModelRequest::Freeze).0.unwrap();
+    let (_, out) = say(ModelRequest::Reset);
     let hint = "it is frozen: nothing is learned until `scanhub background front thaw`";
     assert_eq!(out, format!("front: background reset\n{hint}\n"));
     for to in [file.clone(), "-".into()] {
-        let (end, out) = say(ModelOrder::Save { file: to, force: true });
+        let (end, out) = say(ModelRequest::Save { file: to, force: true });
         let failure = end.unwrap_err();
         assert_eq!(failure.message, "the background of front has no known beam yet");
         assert_eq!((failure.kind, out.as_str()), (Kind::Failed, ""));
@@ -267,10 +281,10 @@ fn a_model_that_knows_nothing_takes_no_others_place() {
 
 #[test]
 fn before_the_first_scan_there_is_nothing_to_save() {
-    let place = Place::new();
-    let _keeper = Keeper::new(&place.domain, Box::default());
-    let file = place.base.join("model.json");
-    let failure = ask(&place, "front", keep(&file), false).0.unwrap_err();
+    let test_domain = TestDomain::new();
+    let _keeper = FakeControlServer::new(&test_domain.domain, Box::default());
+    let file = test_domain.base.join("model.json");
+    let failure = run_order(&test_domain, "front", save_order(&file), false).0.unwrap_err();
     assert_eq!((failure.kind, failure.message.as_str()), (Kind::Failed, "front has no background model yet"));
     assert!(!file.exists());
 }

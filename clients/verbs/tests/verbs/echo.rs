@@ -6,15 +6,15 @@ use std::os::fd::OwnedFd;
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
-use crate::fake::{FakeHub, Place, Verb};
-use crate::{context, named};
+use crate::fake::{FakeHub, RunningVerb, TestDomain};
+use crate::{context, domain_options};
 use scanhub_schema::{Counter, Flags, Kind, Topic, Verdict};
-use scanhub_verbs::Bounds;
+use scanhub_verbs::RunLimits;
 use scanhub_verbs::echo::EchoArgs;
-use scanhub_verbs::follow::{Event, Following};
+use scanhub_verbs::follow::{Event, TopicRun};
 use scanhub_verbs::names::TopicName;
 
-const ANSWER: [u8; 9] = [0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A];
+const REPLY: [u8; 9] = [0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A];
 
 #[derive(PartialEq)]
 pub(crate) enum Format {
@@ -24,28 +24,33 @@ pub(crate) enum Format {
     Raw,
 }
 
-fn args(topics: &[&str], format: &Format, bounds: Bounds) -> EchoArgs {
+fn args(topics: &[&str], format: &Format, bounds: RunLimits) -> EchoArgs {
     EchoArgs {
         topics: topics.iter().map(|&it| it.into()).collect(),
         csv: *format == Format::Csv,
         raw: *format == Format::Raw,
-        bounds,
+        limits: bounds,
         ..EchoArgs::default()
     }
 }
 
-pub(crate) fn start(place: &Place, topics: &[&str], format: Format, bounds: Bounds) -> Verb {
-    let (args, domain) = (args(topics, &format, bounds), named(place));
+pub(crate) fn start(
+    test_domain: &TestDomain,
+    topics: &[&str],
+    format: Format,
+    bounds: RunLimits,
+) -> RunningVerb {
+    let (args, domain) = (args(topics, &format, bounds), domain_options(test_domain));
     let json = format == Format::Json;
-    Verb::start(move |out, notes, stop| args.run(&mut context(domain, json, out, notes, stop)))
+    RunningVerb::start(move |out, notes, stop| args.run(&mut context(domain, json, out, notes, stop)))
 }
 
-fn count(count: u64) -> Bounds {
-    Bounds { count: Some(count), ..Bounds::default() }
+fn count(count: u64) -> RunLimits {
+    RunLimits { count: Some(count), ..RunLimits::default() }
 }
 
 /// Without the last line, which carries times.
-fn but_last(text: &str) -> Vec<&str> {
+fn all_but_last_line(text: &str) -> Vec<&str> {
     let mut lines: Vec<_> = text.lines().collect();
     lines.pop();
     lines
@@ -53,16 +58,16 @@ fn but_last(text: &str) -> Vec<&str> {
 
 #[test]
 fn scans_as_json() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 0xAB);
-    let verb = start(&place, &["front/scan"], Format::Json, count(2));
-    hub.front().scan.await_subscribers(1);
-    hub.front().scan(&[1000, 0x1FFF, 0x1FF7, 7]);
-    hub.front().scan(&[]);
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 0xAB);
+    let verb = start(&test_domain, &["front/scan"], Format::Json, count(2));
+    hub.front_sensor().scan.await_subscribers(1);
+    hub.front_sensor().publish_scan(&[1000, 0x1FFF, 0x1FF7, 7]);
+    hub.front_sensor().publish_scan(&[]);
     let (end, out, notes) = verb.join();
     assert_eq!((end, notes.as_str()), (Ok(()), ""));
     assert_eq!(
-        but_last(&out),
+        all_but_last_line(&out),
         [
             r#"{"class":"scan","sensor":"front","seq":0,"topic_seq":0,"stamp_ns":1000000000,"wall_ns":1700000000000000000,"boot":"00000000000000ab","quality":"clean","family":"lms","unit_um":10000,"count":4,"first_angle_deg":-90.0,"step_deg":0.5,"beam_time_ns":18500,"ranges":[1000,null,null,7],"codes":[[1,"no_return"],[2,"beyond"]]}"#,
             r#"{"class":"scan","sensor":"front","seq":1,"topic_seq":1,"stamp_ns":1000000001,"wall_ns":1700000000000000001,"boot":"00000000000000ab","quality":"clean","family":"lms","unit_um":10000,"count":0,"first_angle_deg":-90.0,"step_deg":0.5,"beam_time_ns":18500,"ranges":[],"codes":[]}"#,
@@ -75,15 +80,15 @@ fn scans_as_json() {
 
 #[test]
 fn telegrams_and_status_as_json() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let verb = start(&place, &["front/telegram", "front/status"], Format::Json, count(2));
-    hub.front().telegram.await_subscribers(1);
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    let verb = start(&test_domain, &["front/telegram", "front/status"], Format::Json, count(2));
+    hub.front_sensor().telegram.await_subscribers(1);
     // What was asked for, and the state of the line beside it.
-    hub.front().status.await_subscribers(2);
-    hub.front().telegram(&ANSWER);
+    hub.front_sensor().status.await_subscribers(2);
+    hub.front_sensor().publish_telegram(&REPLY);
     verb.out.await_lines("telegram", 1);
-    hub.front().status(|status| {
+    hub.front_sensor().publish_status(|status| {
         status.baud = 500_000;
         status.set_port("/dev/ttyUSB0");
         status.counters[Counter::RejectedCrc] = 3;
@@ -102,13 +107,13 @@ fn telegrams_and_status_as_json() {
 
 #[test]
 fn scans_as_columns_and_as_bytes() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let csv = start(&place, &["front/scan"], Format::Csv, count(2));
-    let raw = start(&place, &["front/scan"], Format::Raw, count(1));
-    hub.front().scan.await_subscribers(2);
-    hub.front().scan(&[1000, 0x1FFF]);
-    hub.front().scan(&[5, 6]);
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    let csv = start(&test_domain, &["front/scan"], Format::Csv, count(2));
+    let raw = start(&test_domain, &["front/scan"], Format::Raw, count(1));
+    hub.front_sensor().scan.await_subscribers(2);
+    hub.front_sensor().publish_scan(&[1000, 0x1FFF]);
+    hub.front_sensor().publish_scan(&[5, 6]);
     let (end, out, notes) = csv.join();
     assert_eq!(end, Ok(()));
     assert_eq!(
@@ -120,7 +125,7 @@ fn scans_as_columns_and_as_bytes() {
         ]
     );
     assert!(notes.starts_with("front/scan: 2 received, 0 missed"), "{notes}");
-    crate::fake::until("bytes", || raw.finished());
+    crate::fake::wait_until("bytes", || raw.finished());
     let bytes = raw.out.bytes();
     // The head up to the unit, unit, count, the greatest range and the code above it; the ranges behind the head.
     let field = |at: usize| u16::from_le_bytes([bytes[at], bytes[at + 1]]);
@@ -129,14 +134,14 @@ fn scans_as_columns_and_as_bytes() {
 
 #[test]
 fn samples_as_text() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let verb = start(&place, &["front/scan", "front/telegram"], Format::Text, count(2));
-    hub.front().scan.await_subscribers(1);
-    hub.front().telegram.await_subscribers(1);
-    hub.front().scan(&[1000, 900, 0x1FFF]);
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    let verb = start(&test_domain, &["front/scan", "front/telegram"], Format::Text, count(2));
+    hub.front_sensor().scan.await_subscribers(1);
+    hub.front_sensor().telegram.await_subscribers(1);
+    hub.front_sensor().publish_scan(&[1000, 900, 0x1FFF]);
     verb.out.await_lines("front/scan", 1);
-    hub.front().telegram(&ANSWER);
+    hub.front_sensor().publish_telegram(&REPLY);
     let (_, out, _) = verb.join();
     assert_eq!(
         out.lines().take(2).collect::<Vec<_>>(),
@@ -149,14 +154,14 @@ fn samples_as_text() {
 
 #[test]
 fn a_gap_in_the_numbers_is_missed() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let verb = start(&place, &["front/scan"], Format::Json, count(2));
-    hub.front().scan.await_subscribers(1);
-    hub.front().scan.topic_seq = 5;
-    hub.front().scan(&[1]);
-    hub.front().scan.topic_seq = 9;
-    hub.front().scan(&[1]);
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    let verb = start(&test_domain, &["front/scan"], Format::Json, count(2));
+    hub.front_sensor().scan.await_subscribers(1);
+    hub.front_sensor().scan.topic_seq = 5;
+    hub.front_sensor().publish_scan(&[1]);
+    hub.front_sensor().scan.topic_seq = 9;
+    hub.front_sensor().publish_scan(&[1]);
     let (_, out, _) = verb.join();
     let lines: Vec<_> = out.lines().collect();
     assert_eq!(lines[1], r#"{"class":"notice","kind":"missed","sensor":"front","topic":"scan","missed":3}"#);
@@ -165,15 +170,15 @@ fn a_gap_in_the_numbers_is_missed() {
 
 #[test]
 fn several_sensors_wake_one_echo() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front", "rear"], 1);
-    let verb = start(&place, &["front/scan", "rear/scan"], Format::Json, count(40));
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front", "rear"], 1);
+    let verb = start(&test_domain, &["front/scan", "rear/scan"], Format::Json, count(40));
     for sensor in &hub.sensors {
         sensor.scan.await_subscribers(1);
     }
     for sent in 1..=20 {
-        hub.sensors[0].scan(&[1]);
-        hub.sensors[1].scan(&[2]);
+        hub.sensors[0].publish_scan(&[1]);
+        hub.sensors[1].publish_scan(&[2]);
         verb.out.await_lines("\"class\":\"scan\"", 2 * sent);
     }
     let (end, out, _) = verb.join();
@@ -187,17 +192,17 @@ fn several_sensors_wake_one_echo() {
 
 #[test]
 fn no_hub() {
-    let place = Place::new();
-    let (end, out, _) = start(&place, &["front/scan"], Format::Json, count(1)).join();
+    let test_domain = TestDomain::new();
+    let (end, out, _) = start(&test_domain, &["front/scan"], Format::Json, count(1)).join();
     assert_eq!(end.unwrap_err().kind, Kind::NoHub);
     assert!(out.lines().all(|line| line.contains("summary")), "{out}");
 
-    let waiting = start(&place, &["front/scan"], Format::Json, Bounds::default());
+    let waiting = start(&test_domain, &["front/scan"], Format::Json, RunLimits::default());
     waiting.out.await_lines("hub_gone", 1);
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     waiting.out.await_lines("hub_back", 1);
-    hub.front().scan.await_subscribers(1);
-    hub.front().scan(&[1]);
+    hub.front_sensor().scan.await_subscribers(1);
+    hub.front_sensor().publish_scan(&[1]);
     waiting.out.await_lines(r#""class":"scan""#, 1);
     waiting.stop();
     let (end, out, _) = waiting.join();
@@ -207,31 +212,32 @@ fn no_hub() {
 
 #[test]
 fn bounds_that_are_not_met() {
-    let place = Place::new();
-    let _hub = FakeHub::new(&place.domain, &["front"], 1);
+    let test_domain = TestDomain::new();
+    let _hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let short = Some(Duration::from_millis(50));
-    let kind = |bounds| start(&place, &["front/scan"], Format::Json, bounds).join().0.map_err(|it| it.kind);
-    assert_eq!(kind(Bounds { timeout: short, ..Bounds::default() }), Err(Kind::Timeout));
-    assert_eq!(kind(Bounds { run_for: short, ..count(1) }), Err(Kind::Timeout));
-    assert_eq!(kind(Bounds { run_for: short, ..Bounds::default() }), Ok(()));
+    let kind =
+        |bounds| start(&test_domain, &["front/scan"], Format::Json, bounds).join().0.map_err(|it| it.kind);
+    assert_eq!(kind(RunLimits { timeout: short, ..RunLimits::default() }), Err(Kind::Timeout));
+    assert_eq!(kind(RunLimits { run_for: short, ..count(1) }), Err(Kind::Timeout));
+    assert_eq!(kind(RunLimits { run_for: short, ..RunLimits::default() }), Ok(()));
     assert_eq!(kind(count(0)), Ok(()));
-    let interrupted = start(&place, &["front/scan"], Format::Json, count(1));
+    let interrupted = start(&test_domain, &["front/scan"], Format::Json, count(1));
     interrupted.stop();
     assert_eq!(interrupted.join().0.map_err(|it| it.kind), Err(Kind::Interrupted));
 }
 
 #[test]
 fn all_sensors_and_all_topics() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front", "rear"], 1);
-    let verb = start(&place, &["*/scan", "rear/*"], Format::Json, count(3));
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front", "rear"], 1);
+    let verb = start(&test_domain, &["*/scan", "rear/*"], Format::Json, count(3));
     for sensor in &hub.sensors {
         sensor.scan.await_subscribers(1);
     }
     hub.sensors[1].telegram.await_subscribers(1);
-    hub.sensors[0].scan(&[1]);
-    hub.sensors[1].scan(&[2]);
-    hub.sensors[1].telegram(&[2, 0x80, 0, 0]);
+    hub.sensors[0].publish_scan(&[1]);
+    hub.sensors[1].publish_scan(&[2]);
+    hub.sensors[1].publish_telegram(&[2, 0x80, 0, 0]);
     let (end, out, _) = verb.join();
     assert_eq!(end, Ok(()));
     for begin in [
@@ -246,10 +252,11 @@ fn all_sensors_and_all_topics() {
 }
 
 #[test]
-fn what_the_hub_does_not_have() {
-    let place = Place::new();
-    let _hub = FakeHub::new(&place.domain, &["front", "rear"], 1);
-    let failure = start(&place, &["left/scan"], Format::Text, Bounds::default()).join().0.unwrap_err();
+fn unknown_topics_and_unsuitable_formats_are_refused() {
+    let test_domain = TestDomain::new();
+    let _hub = FakeHub::new(&test_domain.domain, &["front", "rear"], 1);
+    let failure =
+        start(&test_domain, &["left/scan"], Format::Text, RunLimits::default()).join().0.unwrap_err();
     assert_eq!((failure.kind, failure.hint.as_str()), (Kind::NoTopic, "there are front, rear"));
     for (topics, format, kind) in [
         (&["front/zone"][..], Format::Text, Kind::Usage),
@@ -257,40 +264,41 @@ fn what_the_hub_does_not_have() {
         (&["front/scan", "rear/scan"], Format::Raw, Kind::Usage),
         (&[], Format::Text, Kind::Usage),
     ] {
-        let failure = start(&place, topics, format, Bounds::default()).join().0.unwrap_err();
+        let failure = start(&test_domain, topics, format, RunLimits::default()).join().0.unwrap_err();
         assert_eq!(failure.kind, kind, "{topics:?}");
     }
 }
 
 #[test]
 fn a_reader_that_goes_away_is_a_quiet_end() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let (args, domain) = (args(&["front/scan"], &Format::Json, count(5)), named(&place));
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    let (args, domain) = (args(&["front/scan"], &Format::Json, count(5)), domain_options(&test_domain));
     let (reader, pipe) = io::pipe().unwrap();
     drop(reader);
     let out = File::from(OwnedFd::from(pipe));
-    let verb = Verb::start(move |_, notes, stop| args.run(&mut context(domain, true, out, notes, stop)));
-    hub.front().scan.await_subscribers(1);
-    hub.front().scan(&[1]);
+    let verb =
+        RunningVerb::start(move |_, notes, stop| args.run(&mut context(domain, true, out, notes, stop)));
+    hub.front_sensor().scan.await_subscribers(1);
+    hub.front_sensor().publish_scan(&[1]);
     assert_eq!(verb.join().0, Ok(()));
 }
 
 #[test]
 fn flags_are_the_last_key_of_a_line_with_a_head() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let verb = start(&place, &["front/scan", "front/zones", "front/telegram"], Format::Json, count(4));
-    hub.front().scan.await_subscribers(1);
-    hub.front().zones.await_subscribers(1);
-    hub.front().telegram.await_subscribers(1);
-    hub.front().flags = Flags::SIMULATED | Flags::REPLAYED | Flags::STAMP_ESTIMATED;
-    hub.front().scan(&[1000]);
-    hub.front().zones(Verdict::Clear, 1000);
-    hub.front().telegram(&ANSWER);
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    let verb = start(&test_domain, &["front/scan", "front/zones", "front/telegram"], Format::Json, count(4));
+    hub.front_sensor().scan.await_subscribers(1);
+    hub.front_sensor().zones.await_subscribers(1);
+    hub.front_sensor().telegram.await_subscribers(1);
+    hub.front_sensor().flags = Flags::SIMULATED | Flags::REPLAYED | Flags::STAMP_ESTIMATED;
+    hub.front_sensor().publish_scan(&[1000]);
+    hub.front_sensor().publish_zones(Verdict::Clear, 1000);
+    hub.front_sensor().publish_telegram(&REPLY);
     verb.out.await_lines("stamp_estimated", 3);
-    hub.front().flags = 0;
-    hub.front().telegram(&ANSWER);
+    hub.front_sensor().flags = 0;
+    hub.front_sensor().publish_telegram(&REPLY);
     let (end, out, _) = verb.join();
     assert_eq!(end, Ok(()));
     let flagged: Vec<_> = out.lines().filter(|line| line.contains("flags")).collect();
@@ -299,21 +307,21 @@ fn flags_are_the_last_key_of_a_line_with_a_head() {
 }
 
 #[test]
-fn what_the_line_took_away_meanwhile_is_in_the_summary() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let verb = start(&place, &["front/scan"], Format::Json, Bounds::default());
-    hub.front().scan.await_subscribers(1);
-    hub.front().status.await_subscribers(1);
+fn summary_reports_line_loss_during_the_run() {
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    let verb = start(&test_domain, &["front/scan"], Format::Json, RunLimits::default());
+    hub.front_sensor().scan.await_subscribers(1);
+    hub.front_sensor().status.await_subscribers(1);
     for n in 1..=3 {
-        hub.front().status(|status| {
+        hub.front_sensor().publish_status(|status| {
             status.counters[Counter::BytesRead] = 1000 * n;
             status.counters[Counter::BytesDamaged] = 250 * n;
             status.counters[Counter::DueOnLine] = 100 * n;
             status.counters[Counter::LostOnLine] = 40 * n;
         });
     }
-    hub.front().scan(&[1000]);
+    hub.front_sensor().publish_scan(&[1000]);
     verb.out.await_lines("ranges", 1);
     verb.stop();
     let (end, out, _) = verb.join();
@@ -330,24 +338,24 @@ fn what_the_line_took_away_meanwhile_is_in_the_summary() {
 /// A hub lends four statuses at most, and that number may have waited.
 #[test]
 fn statuses_that_waited_do_not_hide_later_ones() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let names = [TopicName { sensor: "front".to_owned(), topic: Topic::Scan }];
-    let (places, bounds, stop) = (place.places(), Bounds::default(), AtomicBool::new(false));
-    let mut following = Following::new(&names, &[], &places, &bounds, &stop).with_lines();
+    let (places, bounds, stop) = (test_domain.locations(), RunLimits::default(), AtomicBool::new(false));
+    let mut following = TopicRun::new(&names, &[], &places, &bounds, &stop).with_lines();
     // Takes events until the status with this count arrives, or for 0 until the topic has a subscriber.
     let mut follow = |hub: &mut FakeHub, errors: u64| loop {
         match following.next(None).unwrap().expect("the run has no end") {
             Event::Line(_, status) if status.counters[Counter::LineErrors] == errors => break,
-            Event::Tick(_) if errors == 0 && hub.front().status.subscribers() == 1 => break,
+            Event::Tick(_) if errors == 0 && hub.front_sensor().status.subscribers() == 1 => break,
             _ => {}
         }
     };
     follow(&mut hub, 0);
     for errors in 1..=4 {
-        hub.front().status(|status| status.counters[Counter::LineErrors] = errors);
+        hub.front_sensor().publish_status(|status| status.counters[Counter::LineErrors] = errors);
     }
     follow(&mut hub, 4);
-    hub.front().status(|status| status.counters[Counter::LineErrors] = 5);
+    hub.front_sensor().publish_status(|status| status.counters[Counter::LineErrors] = 5);
     follow(&mut hub, 5);
 }

@@ -7,51 +7,56 @@ use scanhub_schema::{Failure, Kind, Verdict};
 use scanhub_verbs::context::Context;
 use scanhub_verbs::latency::LatencyArgs;
 
-use crate::fake::{FakeHub, Place, Verb};
-use crate::{context, named};
+use crate::fake::{FakeHub, RunningVerb, TestDomain};
+use crate::{context, domain_options};
 
 /// Runs `latency` with these arguments and without real-time priority.
-fn start(place: &Place, is_json: bool, arguments: &str) -> Verb {
+fn start(test_domain: &TestDomain, is_json: bool, arguments: &str) -> RunningVerb {
     let command = LatencyArgs::augment_args(Command::new("latency").no_binary_name(true));
     let words = arguments.split(' ').chain(["--no-realtime"]);
     let args = LatencyArgs::from_arg_matches(&command.get_matches_from(words)).expect("arguments");
-    let domain = named(place);
-    Verb::start(move |out, notes, stop| {
+    let domain = domain_options(test_domain);
+    RunningVerb::start(move |out, notes, stop| {
         let context = context(domain, is_json, out, notes, stop);
         args.run(&mut Context { is_terminal: true, ..context })
     })
 }
 
 /// Three zones, stamped when they are sent, to a consumer that listens.
-fn three_zones(place: &Place, is_json: bool, arguments: &str) -> (Result<(), Failure>, String, String) {
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let verb = start(place, is_json, arguments);
-    hub.front().zones.await_subscribers(1);
+fn run_with_three_zones(
+    test_domain: &TestDomain,
+    is_json: bool,
+    arguments: &str,
+) -> (Result<(), Failure>, String, String) {
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    let verb = start(test_domain, is_json, arguments);
+    hub.front_sensor().zones.await_subscribers(1);
     // It has to be past its subscription, which is told by nothing but what it receives.
     while !verb.finished() {
-        hub.front().zones(Verdict::Clear, 700);
+        hub.front_sensor().publish_zones(Verdict::Clear, 700);
         std::thread::sleep(Duration::from_millis(5));
     }
     verb.join()
 }
 
 /// The line of what came of `topic`.
-fn told<'a>(out: &'a str, topic: &str) -> &'a str {
+fn latency_line<'a>(out: &'a str, topic: &str) -> &'a str {
     let named = format!(r#""class":"latency","sensor":"front","topic":"{topic}""#);
     out.lines().rfind(|line| line.contains(&named)).unwrap_or_else(|| panic!("no {topic}: {out}"))
 }
 
 #[test]
-fn each_wait_tells_ages() {
+fn each_wait_mode_reports_ages() {
     for name in ["doorbell", "event", "spin"] {
-        let place = Place::new();
-        let (end, out, _) = three_zones(&place, true, &format!("front/zones -n 40 --wait {name}"));
+        let test_domain = TestDomain::new();
+        let (end, out, _) =
+            run_with_three_zones(&test_domain, true, &format!("front/zones -n 40 --wait {name}"));
         assert_eq!(end, Ok(()), "{name}: {out}");
         let begin =
             format!(r#"{{"class":"conditions","wait":"{name}","realtime":false,"memory_locked":false,"#);
         assert!(out.starts_with(&begin), "{out}");
         assert!(out.lines().next().is_some_and(|line| line.ends_with(r#","refused":[]}"#)), "{out}");
-        let line = told(&out, "zones");
+        let line = latency_line(&out, "zones");
         assert!(
             line.contains(r#""received":40,"#)
                 && line.contains(r#""in_future":0,"flags":[],"age":{"count":"#)
@@ -70,41 +75,43 @@ fn each_wait_tells_ages() {
 
 #[test]
 fn a_limit_is_kept_or_is_a_failed_check() {
-    let place = Place::new();
-    let with = |limit: &str| three_zones(&place, true, &format!("front/zones -n 20 --max-p99 {limit}"));
+    let test_domain = TestDomain::new();
+    let with = |limit: &str| {
+        run_with_three_zones(&test_domain, true, &format!("front/zones -n 20 --max-p99 {limit}"))
+    };
     assert_eq!(with("60s").0, Ok(()));
     let (end, out, _) = with("0.001us");
     let failure = end.expect_err("nobody is that fast");
     assert_eq!(failure.kind, Kind::Check);
     assert!(failure.message.starts_with("front/zones: p99 of the age on arrival is "), "{failure}");
     assert!(failure.message.ends_with("more than 1ns"), "{failure}");
-    assert!(told(&out, "zones").contains(r#""received":20,"#), "it is told all the same");
+    assert!(latency_line(&out, "zones").contains(r#""received":20,"#), "it is told all the same");
 }
 
 #[test]
-fn what_was_sent_before_is_no_latency() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let verb = start(&place, true, "front/scan front/scan -n 5 --max-p99 60s");
-    hub.front().scan.await_subscribers(1);
+fn samples_from_before_the_start_have_no_age() {
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    let verb = start(&test_domain, true, "front/scan front/scan -n 5 --max-p99 60s");
+    hub.front_sensor().scan.await_subscribers(1);
     // Stamps of the first seconds after the machine's start.
     while !verb.finished() {
-        hub.front().scan(&[100]);
+        hub.front_sensor().publish_scan(&[100]);
         std::thread::sleep(Duration::from_millis(5));
     }
     let (end, out, _) = verb.join();
     let failure = end.expect_err("no age is known");
     assert_eq!((failure.kind, failure.kind.exit_code()), (Kind::Check, 5));
     assert!(failure.message.contains("no sample with a known age arrived"), "{failure}");
-    let line = told(&out, "scan");
+    let line = latency_line(&out, "scan");
     assert!(line.contains(r#""received":5,"before":5,"in_future":0,"flags":[],"age":null,"#), "{line}");
     assert_eq!(out.matches(r#""class":"summary""#).count(), 1, "a topic that is named twice is one");
 }
 
 #[test]
 fn as_text() {
-    let place = Place::new();
-    let (end, out, notes) = three_zones(&place, false, "front/zones -n 20");
+    let test_domain = TestDomain::new();
+    let (end, out, notes) = run_with_three_zones(&test_domain, false, "front/zones -n 20");
     assert_eq!(end, Ok(()));
     assert!(
         notes.starts_with("wait by doorbell, normal priority, memory not locked; the clock takes "),
@@ -117,13 +124,13 @@ fn as_text() {
 
 #[test]
 fn a_line_each_second_and_a_hub_that_is_replaced() {
-    let place = Place::new();
-    let verb = start(&place, true, "front/zones");
+    let test_domain = TestDomain::new();
+    let verb = start(&test_domain, true, "front/zones");
     let tell = |boot, lines| {
-        let mut hub = FakeHub::new(&place.domain, &["front"], boot);
-        hub.front().zones.await_subscribers(1);
+        let mut hub = FakeHub::new(&test_domain.domain, &["front"], boot);
+        hub.front_sensor().zones.await_subscribers(1);
         while verb.out.text().matches(r#""topic":"zones","received":"#).count() < lines {
-            hub.front().zones(Verdict::Clear, 700);
+            hub.front_sensor().publish_zones(Verdict::Clear, 700);
             std::thread::sleep(Duration::from_millis(5));
         }
     };
@@ -136,14 +143,14 @@ fn a_line_each_second_and_a_hub_that_is_replaced() {
     verb.stop();
     let (end, out, _) = verb.join();
     assert_eq!(end, Ok(()), "{out}");
-    assert!(told(&out, "zones").contains(r#""age":{"count":"#), "{out}");
+    assert!(latency_line(&out, "zones").contains(r#""age":{"count":"#), "{out}");
 }
 
 #[test]
 fn without_a_hub_it_ends_within_a_second() {
-    let place = Place::new();
-    let failure = start(&place, true, "front/scan -n 1").join().0.expect_err("no hub");
+    let test_domain = TestDomain::new();
+    let failure = start(&test_domain, true, "front/scan -n 1").join().0.expect_err("no hub");
     assert_eq!(failure.kind, Kind::NoHub);
-    let failure = start(&place, true, "front -n 1").join().0.expect_err("no topic");
+    let failure = start(&test_domain, true, "front -n 1").join().0.expect_err("no topic");
     assert_eq!(failure.kind, Kind::Usage);
 }

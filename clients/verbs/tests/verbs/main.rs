@@ -19,11 +19,11 @@ use std::sync::atomic::AtomicBool;
 
 use scanhub_verbs::context::{Context, DomainOptions};
 
-use fake::Place;
+use fake::TestDomain;
 
 /// Returns the domain of `place` as a user would name it.
-fn named(place: &Place) -> DomainOptions {
-    DomainOptions { name: place.domain.name().to_owned(), root: Some(place.base.clone()) }
+fn domain_options(test_domain: &TestDomain) -> DomainOptions {
+    DomainOptions { name: test_domain.domain.name().to_owned(), root: Some(test_domain.base.clone()) }
 }
 
 /// Returns what a verb gets that writes to `out` and `notes` until `stop` is set.

@@ -2,32 +2,32 @@
 
 use std::time::Duration;
 
-use crate::fake::{FakeHub, Place, Verb};
-use crate::{context, named};
+use crate::fake::{FakeHub, RunningVerb, TestDomain};
+use crate::{context, domain_options};
 use scanhub_schema::{Counter, Kind, Pose};
-use scanhub_verbs::Bounds;
+use scanhub_verbs::RunLimits;
 use scanhub_verbs::hz::HzArgs;
 use scanhub_verbs::info::InfoArgs;
 use scanhub_verbs::list::ListArgs;
 
-fn start_list(place: &Place, json: bool) -> Verb {
-    list(place, ListArgs { domains: false }, json)
+fn start_list(test_domain: &TestDomain, json: bool) -> RunningVerb {
+    list(test_domain, ListArgs { domains: false }, json)
 }
 
-fn list(place: &Place, args: ListArgs, json: bool) -> Verb {
-    let domain = named(place);
-    Verb::start(move |out, notes, stop| args.run(&mut context(domain, json, out, notes, stop)))
+fn list(test_domain: &TestDomain, args: ListArgs, json: bool) -> RunningVerb {
+    let domain = domain_options(test_domain);
+    RunningVerb::start(move |out, notes, stop| args.run(&mut context(domain, json, out, notes, stop)))
 }
 
-fn start_info(place: &Place, sensor: Option<&str>, json: bool) -> Verb {
-    let (args, domain) = (InfoArgs { sensor: sensor.map(Into::into) }, named(place));
-    Verb::start(move |out, notes, stop| args.run(&mut context(domain, json, out, notes, stop)))
+fn start_info(test_domain: &TestDomain, sensor: Option<&str>, json: bool) -> RunningVerb {
+    let (args, domain) = (InfoArgs { sensor: sensor.map(Into::into) }, domain_options(test_domain));
+    RunningVerb::start(move |out, notes, stop| args.run(&mut context(domain, json, out, notes, stop)))
 }
 
 #[test]
 fn without_a_hub_they_end() {
-    let place = Place::new();
-    let verbs = [start_list(&place, true), start_info(&place, None, true)];
+    let test_domain = TestDomain::new();
+    let verbs = [start_list(&test_domain, true), start_info(&test_domain, None, true)];
     for verb in verbs {
         assert_eq!(verb.join().0.unwrap_err().kind, Kind::NoHub);
     }
@@ -35,18 +35,21 @@ fn without_a_hub_they_end() {
 
 #[test]
 fn topics_of_a_hub() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["rear", "front"], 1);
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["rear", "front"], 1);
     for sensor in &mut hub.sensors {
-        sensor.status(|status| status.rate_mhz = 37_540);
+        sensor.publish_status(|status| status.rate_mhz = 37_540);
     }
-    let verb = start_list(&place, true);
+    let verb = start_list(&test_domain, true);
     hub.serve_history(|| verb.finished());
     let (end, out, _) = verb.join();
     assert_eq!(end, Ok(()));
-    const SHOWN: [&str; 3] = [r#""topic":"telegram""#, r#""topic":"scan""#, r#""topic":"status""#];
+    const LISTED_TOPICS: [&str; 3] = [r#""topic":"telegram""#, r#""topic":"scan""#, r#""topic":"status""#];
     assert_eq!(
-        out.lines().filter(|line| SHOWN.iter().any(|it| line.contains(it))).take(3).collect::<Vec<_>>(),
+        out.lines()
+            .filter(|line| LISTED_TOPICS.iter().any(|it| line.contains(it)))
+            .take(3)
+            .collect::<Vec<_>>(),
         [
             r#"{"class":"topic","sensor":"front","topic":"telegram","payload":"u8[]","revision":1,"hz":37.54,"subscribers":0}"#,
             r#"{"class":"topic","sensor":"front","topic":"scan","payload":"scanhub.Scan.v2","revision":1,"hz":37.54,"subscribers":0}"#,
@@ -56,7 +59,7 @@ fn topics_of_a_hub() {
     let rates: Vec<_> = out.lines().map(|line| line.contains(r#""hz":37.54"#)).collect();
     let of_one = [true, true, true, true, true, false, false];
     assert_eq!(rates, [of_one, of_one].concat(), "background and status come at their own time");
-    let verb = start_list(&place, false);
+    let verb = start_list(&test_domain, false);
     hub.serve_history(|| verb.finished());
     let (_, out, _) = verb.join();
     assert_eq!(
@@ -68,15 +71,16 @@ fn topics_of_a_hub() {
 
 #[test]
 fn live_domains() {
-    let place = Place::new();
+    let test_domain = TestDomain::new();
     let list = || {
-        let (end, out, _) = list(&place, ListArgs { domains: true }, true).join();
+        let (end, out, _) = list(&test_domain, ListArgs { domains: true }, true).join();
         assert_eq!(end, Ok(()));
         out
     };
     assert_eq!(list(), "");
-    let _hub = FakeHub::new(&place.domain, &[], 1);
-    let (name, root, pid) = (place.domain.name(), place.domain.root().display(), std::process::id());
+    let _hub = FakeHub::new(&test_domain.domain, &[], 1);
+    let (name, root, pid) =
+        (test_domain.domain.name(), test_domain.domain.root().display(), std::process::id());
     let expected =
         format!("{{\"class\":\"domain\",\"domain\":\"{name}\",\"root\":\"{root}\",\"pid\":{pid}}}\n");
     assert_eq!(list(), expected);
@@ -84,10 +88,10 @@ fn live_domains() {
 
 #[test]
 fn info_of_a_sensor() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front", "rear"], 1);
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front", "rear"], 1);
     for sensor in &mut hub.sensors {
-        sensor.status(|status| {
+        sensor.publish_status(|status| {
             status.set_sensor_type("LMS200");
             status.set_port("/dev/ttyUSB1");
             status.mode = 0;
@@ -95,48 +99,49 @@ fn info_of_a_sensor() {
             status.counters[Counter::Telegrams] = 12;
         });
     }
-    let verb = start_info(&place, Some("rear"), true);
+    let verb = start_info(&test_domain, Some("rear"), true);
     hub.serve_history(|| verb.finished());
     let (end, out, _) = verb.join();
     assert_eq!((end, out.lines().count()), (Ok(()), 1));
     assert!(out.starts_with(r#"{"class":"status","sensor":"rear","state":"streaming""#), "{out}");
-    let verb = start_info(&place, None, false);
+    let verb = start_info(&test_domain, None, false);
     hub.serve_history(|| verb.finished());
     let (_, out, _) = verb.join();
     assert!(out.starts_with("front                  streaming for"), "{out}");
     assert!(out.contains("  telegrams            12\n"), "{out}");
     assert!(out.contains("  pose                 x 0.3 m, y 0 m, yaw 180.0 deg, upside down\n"), "{out}");
     assert!(out.contains("`scanhub configure /dev/ttyUSB1 mode=0x01`\n"), "{out}");
-    let failure = start_info(&place, Some("left"), true).join().0.unwrap_err();
+    let failure = start_info(&test_domain, Some("left"), true).join().0.unwrap_err();
     assert_eq!((failure.kind, failure.hint.as_str()), (Kind::NoTopic, "there are front, rear"));
 }
 
 #[test]
 fn a_hub_that_says_nothing() {
-    let place = Place::new();
-    let _hub = FakeHub::new(&place.domain, &["front"], 1);
-    assert_eq!(start_info(&place, None, true).join().0.unwrap_err().kind, Kind::Timeout);
-    let (end, out, _) = start_list(&place, true).join();
+    let test_domain = TestDomain::new();
+    let _hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    assert_eq!(start_info(&test_domain, None, true).join().0.unwrap_err().kind, Kind::Timeout);
+    let (end, out, _) = start_list(&test_domain, true).join();
     assert_eq!((end, out.matches(r#""hz":null"#).count()), (Ok(()), 7));
 }
 
 #[test]
 fn rates_of_all_topics() {
-    let place = Place::new();
-    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let args = HzArgs { topics: Vec::new(), window: Duration::from_secs(10), bounds: Bounds::default() };
-    let domain = named(&place);
+    let test_domain = TestDomain::new();
+    let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
+    let args = HzArgs { topics: Vec::new(), window: Duration::from_secs(10), limits: RunLimits::default() };
+    let domain = domain_options(&test_domain);
     // Statuses from before anybody followed them wait for whoever comes.
-    hub.front().status(|_| {});
-    let verb = Verb::start(move |out, notes, stop| args.run(&mut context(domain, true, out, notes, stop)));
-    hub.front().scan.await_subscribers(1);
+    hub.front_sensor().publish_status(|_| {});
+    let verb =
+        RunningVerb::start(move |out, notes, stop| args.run(&mut context(domain, true, out, notes, stop)));
+    hub.front_sensor().scan.await_subscribers(1);
     // It follows the state of the line, too.
-    hub.front().status.await_subscribers(2);
-    hub.front().status(|_| {});
+    hub.front_sensor().status.await_subscribers(2);
+    hub.front_sensor().publish_status(|_| {});
     // From here on they are sent to who is there: after all that was.
-    hub.front().begun_ns = u64::MAX / 2;
+    hub.front_sensor().start_ns = u64::MAX / 2;
     while !verb.out.text().contains(r#""topic":"scan","hz":"#) {
-        hub.front().scan(&[1]);
+        hub.front_sensor().publish_scan(&[1]);
         hub.serve_history(|| true);
         std::thread::sleep(Duration::from_millis(10));
     }

@@ -3,116 +3,123 @@
 use std::time::{Duration, Instant};
 
 use crate::echo::{Format, start};
-use crate::fake::{FakeHub, FakeSensor, Place, Verb, until};
-use crate::{context, named};
+use crate::fake::{FakeHub, FakeSensor, RunningVerb, TestDomain, wait_until};
+use crate::{context, domain_options};
 use scanhub_client::{ErrorKind, RobotSubscriber, ZonesSubscriber};
 use scanhub_schema::Verdict;
-use scanhub_verbs::Bounds;
+use scanhub_verbs::RunLimits;
 use scanhub_verbs::hz::HzArgs;
 
 /// Slow scans, so that a busy machine is no silence: two of them and 40 ms are.
 const PERIOD_US: u32 = 300_000;
 
 /// A hub of such scans.
-fn slow_hub(place: &Place, sensors: &[&str], boot: u64) -> FakeHub {
-    let mut hub = FakeHub::new(&place.domain, sensors, boot);
+fn slow_hub(test_domain: &TestDomain, sensors: &[&str], boot: u64) -> FakeHub {
+    let mut hub = FakeHub::new(&test_domain.domain, sensors, boot);
     hub.sensors.iter_mut().for_each(|sensor| sensor.period_us = PERIOD_US);
     hub
 }
 
 /// Publishes zones until a consumer that came late has heard them, too.
-fn until_heard(sensor: &mut FakeSensor, verdict: Verdict, mut heard: impl FnMut() -> bool) {
-    until("a sample", || {
-        sensor.zones(verdict, 1234);
-        heard()
+fn publish_until_received(sensor: &mut FakeSensor, verdict: Verdict, mut is_received: impl FnMut() -> bool) {
+    wait_until("a sample", || {
+        sensor.publish_zones(verdict, 1234);
+        is_received()
     });
 }
 
 #[test]
 fn a_silence_is_unknown_once() {
-    let place = Place::new();
-    let mut hub = slow_hub(&place, &["front"], 7);
-    let mut zones = ZonesSubscriber::builder("front").in_domain(&place.domain).open().unwrap();
-    until_heard(hub.front(), Verdict::Clear, || {
-        zones.try_next().unwrap().is_some_and(|heard| heard.zones.verdict() == Verdict::Clear)
+    let test_domain = TestDomain::new();
+    let mut hub = slow_hub(&test_domain, &["front"], 7);
+    let mut zones = ZonesSubscriber::builder("front").in_domain(&test_domain.domain).open().unwrap();
+    publish_until_received(hub.front_sensor(), Verdict::Clear, || {
+        zones.try_next().unwrap().is_some_and(|update| update.zones.verdict() == Verdict::Clear)
     });
     while zones.try_next().unwrap().is_some() {}
-    hub.front().zones(Verdict::Slow, 700);
-    let heard = zones.next().unwrap();
-    assert_eq!((heard.zones.verdict(), heard.zones.nearest_mm, heard.stale), (Verdict::Slow, 700, false));
-    assert_eq!(heard.header.map(|header| (header.boot, header.period_us)), Some((7, PERIOD_US)));
-    let heard = zones.next().unwrap();
-    assert_eq!((heard.zones.verdict(), heard.header, heard.stale), (Verdict::Unknown, None, true));
+    hub.front_sensor().publish_zones(Verdict::Slow, 700);
+    let received = zones.next().unwrap();
+    assert_eq!(
+        (received.zones.verdict(), received.zones.nearest_mm, received.stale),
+        (Verdict::Slow, 700, false)
+    );
+    assert_eq!(received.header.map(|header| (header.boot, header.period_us)), Some((7, PERIOD_US)));
+    let received = zones.next().unwrap();
+    assert_eq!((received.zones.verdict(), received.header, received.stale), (Verdict::Unknown, None, true));
     let quiet_until = Instant::now() + Duration::from_millis(700);
     while Instant::now() < quiet_until {
         assert!(zones.try_next().unwrap().is_none(), "said already");
         std::thread::sleep(Duration::from_millis(5));
     }
-    hub.front().zones(Verdict::Clear, 5000);
+    hub.front_sensor().publish_zones(Verdict::Clear, 5000);
     assert_eq!(zones.next().unwrap().zones.verdict(), Verdict::Clear);
-    hub.front().zones(Verdict::Unknown, 0);
-    let heard = zones.next().unwrap();
-    assert_eq!((heard.zones.verdict(), heard.stale), (Verdict::Unknown, false), "the hub's own word");
+    hub.front_sensor().publish_zones(Verdict::Unknown, 0);
+    let received = zones.next().unwrap();
+    assert_eq!((received.zones.verdict(), received.stale), (Verdict::Unknown, false), "the hub's own word");
 }
 
 #[test]
 fn without_a_hub_and_after_one() {
-    let place = Place::new();
-    let mut zones = ZonesSubscriber::builder("front").in_domain(&place.domain).open().unwrap();
-    let heard = zones.next().unwrap();
-    assert_eq!((heard.zones.verdict(), heard.stale, heard.header), (Verdict::Unknown, true, None));
-    let mut hub = slow_hub(&place, &["front"], 1);
-    until_heard(hub.front(), Verdict::Clear, || zones.try_next().unwrap().is_some());
+    let test_domain = TestDomain::new();
+    let mut zones = ZonesSubscriber::builder("front").in_domain(&test_domain.domain).open().unwrap();
+    let received = zones.next().unwrap();
+    assert_eq!((received.zones.verdict(), received.stale, received.header), (Verdict::Unknown, true, None));
+    let mut hub = slow_hub(&test_domain, &["front"], 1);
+    publish_until_received(hub.front_sensor(), Verdict::Clear, || zones.try_next().unwrap().is_some());
     drop(hub);
     let last = std::iter::from_fn(|| zones.next().ok()).find(|heard| heard.stale);
-    assert_eq!(last.map(|heard| heard.zones.verdict()), Some(Verdict::Unknown));
+    assert_eq!(last.map(|update| update.zones.verdict()), Some(Verdict::Unknown));
 }
 
 #[test]
-fn the_newest_counts_and_what_waited_is_no_news() {
-    let place = Place::new();
-    let mut hub = slow_hub(&place, &["front"], 1);
-    let mut zones = ZonesSubscriber::builder("front").in_domain(&place.domain).open().unwrap();
-    until_heard(hub.front(), Verdict::Clear, || zones.try_next().unwrap().is_some());
+fn newest_verdict_counts_and_stale_one_is_unknown() {
+    let test_domain = TestDomain::new();
+    let mut hub = slow_hub(&test_domain, &["front"], 1);
+    let mut zones = ZonesSubscriber::builder("front").in_domain(&test_domain.domain).open().unwrap();
+    publish_until_received(hub.front_sensor(), Verdict::Clear, || zones.try_next().unwrap().is_some());
     while zones.try_next().unwrap().is_some() {}
     for nearest_mm in [300, 200, 100] {
-        hub.front().zones(Verdict::Stop, nearest_mm);
+        hub.front_sensor().publish_zones(Verdict::Stop, nearest_mm);
     }
-    let heard = zones.next().unwrap();
-    assert_eq!((heard.zones.nearest_mm, heard.missed, heard.stale), (100, 2, false));
+    let received = zones.next().unwrap();
+    assert_eq!((received.zones.nearest_mm, received.missed, received.stale), (100, 2, false));
     // A second after the machine started.
-    hub.front().zones_of(Verdict::Clear, 9000, 1_000_000_000);
-    let heard = zones.next().unwrap();
-    assert_eq!((heard.zones.verdict(), heard.zones.nearest(), heard.stale), (Verdict::Unknown, None, true));
-    assert!(heard.header.is_some_and(|header| header.stamp_last_ns == 1_000_000_000));
+    hub.front_sensor().publish_zones_at(Verdict::Clear, 9000, 1_000_000_000);
+    let received = zones.next().unwrap();
+    assert_eq!(
+        (received.zones.verdict(), received.zones.nearest(), received.stale),
+        (Verdict::Unknown, None, true)
+    );
+    assert!(received.header.is_some_and(|header| header.stamp_last_ns == 1_000_000_000));
 }
 
 #[test]
 fn echo_says_the_silence_too() {
-    let place = Place::new();
-    let mut hub = slow_hub(&place, &["front"], 0xAB);
+    let test_domain = TestDomain::new();
+    let mut hub = slow_hub(&test_domain, &["front"], 0xAB);
     let verbs = [Format::Json, Format::Text, Format::Raw]
-        .map(|format| start(&place, &["front/zones"], format, Bounds::default()));
+        .map(|format| start(&test_domain, &["front/zones"], format, RunLimits::default()));
     let args = HzArgs {
         topics: vec!["front/zones".into()],
         window: Duration::from_secs(10),
-        bounds: Bounds::default(),
+        limits: RunLimits::default(),
     };
-    let domain = named(&place);
-    let rate = Verb::start(move |out, notes, stop| args.run(&mut context(domain, true, out, notes, stop)));
-    hub.front().zones.await_subscribers(4);
-    hub.front().zones(Verdict::Stop, 420);
+    let domain = domain_options(&test_domain);
+    let rate =
+        RunningVerb::start(move |out, notes, stop| args.run(&mut context(domain, true, out, notes, stop)));
+    hub.front_sensor().zones.await_subscribers(4);
+    hub.front_sensor().publish_zones(Verdict::Stop, 420);
     verbs[0].out.await_lines(r#""stale":true"#, 1);
     verbs[1].out.await_lines("no recent data", 1);
-    until("bytes", || verbs[2].out.bytes().len() == 2 * 76);
-    verbs.iter().chain([&rate]).for_each(Verb::stop);
+    wait_until("bytes", || verbs[2].out.bytes().len() == 2 * 76);
+    verbs.iter().chain([&rate]).for_each(RunningVerb::stop);
     let [json, text, raw] = verbs;
     let (end, out, _) = json.join();
     assert_eq!((end, out.lines().count()), (Ok(()), 3), "{out}");
     let lines: Vec<_> = out.lines().collect();
     assert!(lines[0].starts_with(r#"{"class":"zones","sensor":"front","seq":0,"topic_seq":0,"stamp_ns":"#));
-    let told = r#""quality":"clean","verdict":"stop","nearest_mm":420,"nearest_beam":180,"zones":[],"invalid_beams":0}"#;
-    assert!(lines[0].ends_with(told), "{out}");
+    let expected = r#""quality":"clean","verdict":"stop","nearest_mm":420,"nearest_beam":180,"zones":[],"invalid_beams":0}"#;
+    assert!(lines[0].ends_with(expected), "{out}");
     let silence = r#"{"class":"zones","sensor":"front","seq":null,"topic_seq":null,"stamp_ns":null,"wall_ns":null,"boot":null,"quality":null,"verdict":"unknown","nearest_mm":null,"nearest_beam":null,"zones":[],"invalid_beams":0,"stale":true}"#;
     assert_eq!(lines[1], silence);
     assert!(
@@ -129,23 +136,23 @@ fn echo_says_the_silence_too() {
 
 #[test]
 fn the_robot_is_the_worst_of_its_sensors() {
-    let place = Place::new();
-    let mut hub = slow_hub(&place, &["front", "rear"], 1);
-    let mut all = RobotSubscriber::builder(&[]).in_domain(&place.domain).open().unwrap();
+    let test_domain = TestDomain::new();
+    let mut hub = slow_hub(&test_domain, &["front", "rear"], 1);
+    let mut all = RobotSubscriber::builder(&[]).in_domain(&test_domain.domain).open().unwrap();
     assert_eq!((all.now().unwrap().verdict(), all.now().unwrap().worst()), (Verdict::Unknown, None));
     let mut publish = |front: Verdict, rear: Option<Verdict>| {
-        hub.sensors[0].zones(front, 900);
+        hub.sensors[0].publish_zones(front, 900);
         if let Some(rear) = rear {
-            hub.sensors[1].zones(rear, 800);
+            hub.sensors[1].publish_zones(rear, 800);
         }
     };
-    until("both", || {
+    wait_until("both", || {
         publish(Verdict::Clear, Some(Verdict::Slow));
         all.now().unwrap().verdict() == Verdict::Slow
     });
     let robot = all.now().unwrap();
     assert_eq!((robot.worst(), robot.nearest()), (Some("rear"), Some((800, "rear"))));
-    until("one falls silent", || {
+    wait_until("one falls silent", || {
         publish(Verdict::Clear, None);
         all.now().unwrap().verdict() == Verdict::Unknown
     });
@@ -154,33 +161,34 @@ fn the_robot_is_the_worst_of_its_sensors() {
     assert_eq!(verdicts, [("front", Verdict::Clear), ("rear", Verdict::Unknown)]);
     assert_eq!((robot.worst(), robot.nearest()), (Some("rear"), Some((900, "front"))));
 
-    let mut named = RobotSubscriber::builder(&["front", "left"]).in_domain(&place.domain).open().unwrap();
-    until("the one that is there", || {
+    let mut named =
+        RobotSubscriber::builder(&["front", "left"]).in_domain(&test_domain.domain).open().unwrap();
+    wait_until("the one that is there", || {
         publish(Verdict::Stop, Some(Verdict::Clear));
         named.next().unwrap().verdict() == Verdict::Stop
     });
     let verdicts: Vec<_> = named.now().unwrap().sensors().map(|(_, verdict)| verdict).collect();
     assert_eq!(verdicts, [Verdict::Stop, Verdict::Unknown], "never heard");
-    let refused = RobotSubscriber::builder(&["robot"]).in_domain(&place.domain).open().err();
+    let refused = RobotSubscriber::builder(&["robot"]).in_domain(&test_domain.domain).open().err();
     assert_eq!(refused.map(|error| error.kind()), Some(ErrorKind::InvalidInput));
 }
 
 #[test]
 fn echo_of_the_robot() {
-    let place = Place::new();
-    let mut hub = slow_hub(&place, &["rear", "front"], 1);
-    let bounds = Bounds { count: Some(3), ..Bounds::default() };
-    let verb = start(&place, &["robot/zones"], Format::Json, bounds);
+    let test_domain = TestDomain::new();
+    let mut hub = slow_hub(&test_domain, &["rear", "front"], 1);
+    let bounds = RunLimits { count: Some(3), ..RunLimits::default() };
+    let verb = start(&test_domain, &["robot/zones"], Format::Json, bounds);
     hub.sensors.iter().for_each(|sensor| sensor.zones.await_subscribers(1));
     // There is nothing to say of all of them until each was heard.
-    hub.sensors[1].zones(Verdict::Stop, 500);
-    hub.sensors[0].zones(Verdict::Slow, 700);
+    hub.sensors[1].publish_zones(Verdict::Stop, 500);
+    hub.sensors[0].publish_zones(Verdict::Slow, 700);
     verb.out.await_lines(r#""verdict":"stop","nearest_mm":500,"nearest_sensor":"front""#, 1);
-    hub.sensors[1].zones(Verdict::Clear, 900);
-    let told = r#""verdict":"slow","nearest_mm":700,"nearest_sensor":"rear","sensors":[{"sensor":"front","verdict":"clear"},{"sensor":"rear","verdict":"slow"}]}"#;
-    verb.out.await_lines(told, 1);
+    hub.sensors[1].publish_zones(Verdict::Clear, 900);
+    let expected = r#""verdict":"slow","nearest_mm":700,"nearest_sensor":"rear","sensors":[{"sensor":"front","verdict":"clear"},{"sensor":"rear","verdict":"slow"}]}"#;
+    verb.out.await_lines(expected, 1);
     verb.out.await_lines(r#""stale":true"#, 2);
-    hub.sensors[0].zones(Verdict::Stop, 300);
+    hub.sensors[0].publish_zones(Verdict::Stop, 300);
     let (end, out, _) = verb.join();
     assert_eq!(end, Ok(()));
     assert!(out.lines().all(|line| {
@@ -188,6 +196,6 @@ fn echo_of_the_robot() {
             || line
                 .starts_with(r#"{"class":"summary","sensor":"robot","topic":"zones","received":3,"missed":0"#)
     }));
-    let told = r#""verdict":"stop","nearest_mm":300,"nearest_sensor":"rear","sensors":[{"sensor":"front","verdict":"unknown"},{"sensor":"rear","verdict":"stop"}]}"#;
-    assert!(out.lines().nth_back(1).is_some_and(|line| line.ends_with(told)), "{out}");
+    let expected = r#""verdict":"stop","nearest_mm":300,"nearest_sensor":"rear","sensors":[{"sensor":"front","verdict":"unknown"},{"sensor":"rear","verdict":"stop"}]}"#;
+    assert!(out.lines().nth_back(1).is_some_and(|line| line.ends_with(expected)), "{out}");
 }

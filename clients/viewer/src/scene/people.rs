@@ -7,7 +7,7 @@ use scanhub_schema::{Track, TrackState, Tracks};
 /// The people of one tracker.
 #[derive(Clone, Debug, Default)]
 pub struct People {
-    persons: Vec<Person>,
+    people: Vec<Person>,
     /// Time from which on the last sample is too old, in ns of CLOCK_MONOTONIC.
     old_at_ns: u64,
 }
@@ -22,7 +22,7 @@ pub struct Person {
     /// Position in the map of the site, in meters.
     pub position: (f64, f64),
     /// Uncertainty of the position.
-    pub reach: Ellipse,
+    pub ellipse: Ellipse,
     /// Name of the room, if the person is in one.
     pub room: Option<String>,
     /// Times in ns of CLOCK_MONOTONIC and positions of the last seconds, the oldest first.
@@ -74,7 +74,7 @@ impl Person {
             id: track.id,
             state: track.state(),
             position: (track.x_m.into(), track.y_m.into()),
-            reach: Ellipse::of(track.covariance),
+            ellipse: Ellipse::of(track.covariance),
             room: track.room_name().map(str::to_owned),
             tail,
         }
@@ -84,8 +84,8 @@ impl Person {
 impl People {
     /// Takes a sample that arrived at `now_ns`.
     pub(crate) fn take(&mut self, tracks: &Tracks, now_ns: u64) {
-        let mut before = std::mem::take(&mut self.persons);
-        self.persons = tracks
+        let mut before = std::mem::take(&mut self.people);
+        self.people = tracks
             .tracks()
             .iter()
             .map(|track| {
@@ -99,31 +99,30 @@ impl People {
             })
             .collect();
         self.old_at_ns = now_ns + MAX_AGE_NS;
-        self.age(now_ns);
+        self.expire(now_ns);
     }
 
     /// Deletes positions and people that are too old at `now_ns`. Returns whether there were any.
-    pub(crate) fn age(&mut self, now_ns: u64) -> bool {
-        let steps =
-            |people: &People| people.persons.iter().map(|person| person.tail.len() + 1).sum::<usize>();
+    pub(crate) fn expire(&mut self, now_ns: u64) -> bool {
+        let steps = |people: &People| people.people.iter().map(|person| person.tail.len() + 1).sum::<usize>();
         let before = steps(self);
         if now_ns >= self.old_at_ns {
-            self.persons.clear();
+            self.people.clear();
         }
-        for person in &mut self.persons {
+        for person in &mut self.people {
             person.tail.retain(|(at_ns, _)| now_ns < at_ns + TAIL_NS);
         }
         before != steps(self)
     }
 
     /// Returns all people, even tentative ones.
-    pub fn persons(&self) -> &[Person] {
-        &self.persons
+    pub fn people(&self) -> &[Person] {
+        &self.people
     }
 
     /// Returns the people whose track is not tentative.
     pub fn known(&self) -> impl Iterator<Item = &Person> {
-        self.persons.iter().filter(|person| person.is_known())
+        self.people.iter().filter(|person| person.is_known())
     }
 }
 
@@ -170,13 +169,13 @@ mod tests {
             let here = if n % 2 == 0 { &places[..] } else { &[places[1], places[0]] };
             people.take(&of(if n < 200 { here } else { &places[..1] }), n * 40_000_000);
         }
-        assert_eq!(people.persons().len(), 1);
-        let tail: Vec<f64> = people.persons()[0].tail().map(|(x, _)| x).collect();
+        assert_eq!(people.people().len(), 1);
+        let tail: Vec<f64> = people.people()[0].tail().map(|(x, _)| x).collect();
         assert!(tail.len() > 25 && tail.len() < 36 && tail.is_sorted(), "{tail:?}");
-        assert!(people.persons()[0].is_known());
+        assert!(people.people()[0].is_known());
         let last_ns = 299 * 40_000_000;
-        assert!(!people.age(last_ns + 1) && people.age(last_ns + MAX_AGE_NS));
-        assert!(people.persons().is_empty());
+        assert!(!people.expire(last_ns + 1) && people.expire(last_ns + MAX_AGE_NS));
+        assert!(people.people().is_empty());
     }
 
     #[test]

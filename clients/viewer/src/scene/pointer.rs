@@ -47,7 +47,7 @@ impl<'a> PointerPosition<'a> {
 
     /// Returns the lines of text about the position, the most important first: distance, coordinates, and for a point
     /// the sensor with angle and range, and the intensity.
-    pub fn words(&self) -> Vec<String> {
+    pub fn text_lines(&self) -> Vec<String> {
         let mut words = vec![
             format!("{} m from the robot", fixed(self.distance_m(), 2)),
             format!("x {}  y {} m", fixed(self.x_m, 2), fixed(self.y_m, 2)),
@@ -105,7 +105,7 @@ mod tests {
         let reading = place.reading.unwrap();
         assert_eq!((&reading.sensor.name[..], reading.point.beam, reading.range_m), ("ahead", 1, 4.0));
         assert_eq!(
-            place.words(),
+            place.text_lines(),
             ["5.00 m from the robot", "x 5.00  y 0.00 m", "ahead: 0.00\u{b0}, 4.000 m"]
         );
         let left = read((0.1, 2.0)).reading.unwrap();
@@ -113,7 +113,7 @@ mod tests {
         assert!((left.angle_rad.to_degrees() - 90.0).abs() < 1e-6);
         let nowhere = read((2.0, -2.0));
         assert!(nowhere.reading.is_none());
-        assert_eq!(nowhere.words(), ["2.83 m from the robot", "x 2.00  y -2.00 m"]);
+        assert_eq!(nowhere.text_lines(), ["2.83 m from the robot", "x 2.00  y -2.00 m"]);
     }
 
     #[test]

@@ -67,7 +67,7 @@ impl Sensor {
         self.old_at_ns = now_ns + MAX_SCAN_AGE_NS.max(3000 * u64::from(header.period_us));
         // The highest intensity fades over minutes, because colors that change quickly cannot be read.
         let brightest = scan.intensities().iter().max().map_or(1.0, f64::from);
-        self.brightest = brightest.max(FADING * self.brightest).max(1.0);
+        self.brightest = brightest.max(BRIGHTNESS_DECAY * self.brightest).max(1.0);
         self.flags = header.flags;
     }
 
@@ -80,8 +80,8 @@ impl Sensor {
     pub fn take_pair(&mut self, scan: &Scan, foreground: &Foreground, now_ns: u64) {
         let Some(pose) = self.placement.pose() else { return };
         self.trail.take(now_ns, || {
-            let seen = points(scan, Some(foreground), pose).filter(|point| point.is_foreground);
-            seen.map(|point| (point.x_m, point.y_m)).collect()
+            let points = points(scan, Some(foreground), pose).filter(|point| point.is_foreground);
+            points.map(|point| (point.x_m, point.y_m)).collect()
         });
     }
 
@@ -94,18 +94,18 @@ impl Sensor {
     }
 
     /// Deletes a scan and steps of the trail that are too old at `now_ns`. Returns whether there were any.
-    pub(super) fn age(&mut self, now_ns: u64) -> bool {
+    pub(super) fn expire(&mut self, now_ns: u64) -> bool {
         let is_old = self.scan.is_some() && now_ns >= self.old_at_ns;
         if is_old {
             (self.scan, self.foreground) = (None, None);
             (self.marks, self.lines) = (None, None);
             self.meter = RateMeter::default();
         }
-        self.trail.age(now_ns) | is_old
+        self.trail.expire(now_ns) | is_old
     }
 
     /// Deletes all data of a hub that has exited, except for the background, which is only drawn.
-    pub(super) fn hub_gone(&mut self) {
+    pub(super) fn on_hub_exit(&mut self) {
         let background = self.background.take();
         let Sensor { placement, lost, .. } = *self;
         *self = Sensor { placement, background, lost, ..Sensor::new(&self.name) };
@@ -221,11 +221,11 @@ impl Trail {
         if self.steps.back().is_none_or(|(at_ns, _)| now_ns >= at_ns + STEP_INTERVAL_NS) {
             self.steps.push_back((now_ns, points()));
         }
-        self.age(now_ns);
+        self.expire(now_ns);
     }
 
     /// Deletes steps that are too old at `now_ns`. Returns whether there were any.
-    fn age(&mut self, now_ns: u64) -> bool {
+    fn expire(&mut self, now_ns: u64) -> bool {
         let before = self.steps.len();
         self.steps.retain(|(at_ns, _)| now_ns < at_ns + TRAIL_NS);
         before != self.steps.len()
@@ -254,7 +254,7 @@ impl RateMeter {
         let is_known = header.flags & Flags::STAMP_ESTIMATED == 0;
         let age = is_known.then(|| now_ns.saturating_sub(header.stamp_last_ns));
         self.scans.push_back((header.stamp_first_ns, age));
-        while self.scans.front().is_some_and(|(ns, _)| header.stamp_first_ns - ns > WINDOW_NS) {
+        while self.scans.front().is_some_and(|(ns, _)| header.stamp_first_ns - ns > RATE_WINDOW_NS) {
             self.scans.pop_front();
         }
     }
@@ -290,7 +290,7 @@ impl RateMeter {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Problem {
     /// Description of the problem.
-    pub what: String,
+    pub description: String,
     /// Remedy, often a command. May be empty.
     pub remedy: String,
 }
@@ -299,7 +299,7 @@ impl Problem {
     /// Returns why `sensor`, whose link has this status, sends no scans. The link's own error takes precedence.
     fn of_silent(sensor: &str, status: Option<&Status>) -> Problem {
         let Some(status) = status else {
-            return Problem { what: "nothing was heard of it yet".into(), remedy: String::new() };
+            return Problem { description: "nothing was heard of it yet".into(), remedy: String::new() };
         };
         let port = status.port();
         let check = || format!("scanhub doctor {port}");
@@ -318,12 +318,12 @@ impl Problem {
             }
         };
         let what = if status.last_error().is_empty() { what } else { status.last_error() };
-        Problem { what: what.to_owned(), remedy }
+        Problem { description: what.to_owned(), remedy }
     }
 }
 
 /// Share of the highest intensity that remains after each scan.
-const FADING: f64 = 0.9995;
+const BRIGHTNESS_DECAY: f64 = 0.9995;
 /// Minimum time for which the last scan is shown.
 const MAX_SCAN_AGE_NS: u64 = 1_000_000_000;
 /// Minimum interval between two steps of a trail.
@@ -331,7 +331,7 @@ const STEP_INTERVAL_NS: u64 = 90_000_000;
 /// Duration of a trail.
 const TRAIL_NS: u64 = 1_600_000_000;
 /// Window of the rate: a number that changes with every scan cannot be read.
-const WINDOW_NS: u64 = 2_000_000_000;
+const RATE_WINDOW_NS: u64 = 2_000_000_000;
 
 #[cfg(test)]
 mod tests {
@@ -339,7 +339,7 @@ mod tests {
     use scanhub_schema::{ForegroundHead, ScanHead};
 
     #[test]
-    fn pair_leaves_a_trail_and_shades_follow_the_brightest_point() {
+    fn pair_leaves_a_trail_and_brightest_sets_the_shade() {
         let mut sensor = Sensor::new("front");
         let scan = Scan::of(ScanHead::lms(9, 0, 1000, 1, 13), &[1000; 9]);
         let mut found = Foreground::of(9);
@@ -375,8 +375,8 @@ mod tests {
         }
         let steps: Vec<_> = trail.points().map(|(x, _)| x).collect();
         assert_eq!((steps.first(), steps.last(), steps.len()), (Some(&36.0), Some(&96.0), 16));
-        assert!(!trail.age(2_499_999_999) && trail.age(2_500_000_000));
-        trail.age(u64::MAX);
+        assert!(!trail.expire(2_499_999_999) && trail.expire(2_500_000_000));
+        trail.expire(u64::MAX);
         assert_eq!(trail.points().count(), 0);
     }
 
@@ -409,7 +409,7 @@ mod tests {
     }
 
     #[test]
-    fn estimated_stamps_have_no_age_and_earlier_stamps_restart_the_window() {
+    fn ignores_estimated_ages_and_restarts_on_old_stamps() {
         let mut meter = RateMeter::default();
         meter.scan(&header(1000, Flags::STAMP_ESTIMATED), 2_000_000_000);
         meter.scan(&header(1100, Flags::STAMP_ESTIMATED), 2_100_000_000);
@@ -421,18 +421,18 @@ mod tests {
     }
 
     #[test]
-    fn every_state_has_a_problem_and_the_error_of_the_link_takes_precedence() {
-        assert_eq!(Problem::of_silent("front", None).what, "nothing was heard of it yet");
+    fn link_error_takes_precedence_over_state_problems() {
+        assert_eq!(Problem::of_silent("front", None).description, "nothing was heard of it yet");
         let mut status = Status { state: State::Silent as u8, ..Status::default() };
         status.set_port("/dev/ttyUSB0");
         let silent = Problem::of_silent("front", Some(&status));
-        assert_eq!(silent.what, "its telegrams stopped");
+        assert_eq!(silent.description, "its telegrams stopped");
         assert_eq!(silent.remedy, "scanhub doctor /dev/ttyUSB0");
         status.set_last_error("permission denied");
-        assert_eq!(Problem::of_silent("front", Some(&status)).what, "permission denied");
+        assert_eq!(Problem::of_silent("front", Some(&status)).description, "permission denied");
         for state in 0..=7 {
             let status = Status { state, ..Status::default() };
-            assert!(!Problem::of_silent("front", Some(&status)).what.is_empty(), "{state}");
+            assert!(!Problem::of_silent("front", Some(&status)).description.is_empty(), "{state}");
         }
     }
 }

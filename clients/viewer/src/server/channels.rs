@@ -32,7 +32,7 @@ pub struct Channel {
 
 /// A message in the queue of a channel.
 #[derive(Clone, Debug)]
-pub(crate) struct Queued {
+pub(crate) struct QueuedMessage {
     /// Number in the channel, from 1 on.
     pub(crate) number: u64,
     /// Time of the message, in nanoseconds since 1970.
@@ -56,7 +56,7 @@ pub struct ChannelStore {
 struct ChannelQueue {
     channel: Arc<Channel>,
     /// The last messages, oldest first.
-    queue: VecDeque<Queued>,
+    queue: VecDeque<QueuedMessage>,
     /// Number of the last message.
     number: u64,
     subscribers: u32,
@@ -67,11 +67,15 @@ impl ChannelStore {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`] if no descriptors are left.
+    /// [`Kind::ResourceExhausted`] if no descriptors are left.
     pub fn new() -> Result<ChannelStore, Failure> {
         let wake = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK);
         let wake = wake.map_err(|error| {
-            Failure::new(Kind::Short, format!("no eventfd: {error}"), "raise the limit: ulimit -n")
+            Failure::new(
+                Kind::ResourceExhausted,
+                format!("no eventfd: {error}"),
+                "raise the limit: ulimit -n",
+            )
         })?;
         Ok(ChannelStore { channels: Mutex::default(), is_new: AtomicBool::new(false), wake })
     }
@@ -135,7 +139,7 @@ impl ChannelStore {
 
     /// Returns the message after message `number`, or the newest one if that is no longer queued. `None` if there is
     /// none.
-    pub(crate) fn next(&self, id: usize, number: u64) -> Option<Queued> {
+    pub(crate) fn next(&self, id: usize, number: u64) -> Option<QueuedMessage> {
         let channels = self.channels();
         let queue = &channels.get(id)?.queue;
         let following = queue.iter().find(|queued| queued.number == number + 1);
@@ -157,7 +161,7 @@ pub struct ChannelPublisher<'a> {
 
 impl ChannelPublisher<'_> {
     /// Returns whether a present or a later subscriber would get a message.
-    pub fn is_wanted(&self) -> bool {
+    pub fn is_needed(&self) -> bool {
         let one = &self.store.channels()[self.id];
         one.channel.is_kept || one.subscribers > 0
     }
@@ -173,10 +177,10 @@ impl ChannelPublisher<'_> {
         let one = &mut self.store.channels()[self.id];
         one.number += 1;
         let (number, is_kept) = (one.number, one.channel.is_kept);
-        one.queue.push_back(Queued { number, wall_ns, payload: payload.into(), is_kept });
-        let is_old = |queue: &VecDeque<Queued>| {
+        one.queue.push_back(QueuedMessage { number, wall_ns, payload: payload.into(), is_kept });
+        let is_old = |queue: &VecDeque<QueuedMessage>| {
             let span = queue.front().map_or(0, |oldest| wall_ns.saturating_sub(oldest.wall_ns));
-            is_kept || queue.len() > MAX_LEN || (queue.len() > MIN_LEN && span > SPAN_NS)
+            is_kept || queue.len() > MAX_LEN || (queue.len() > MIN_LEN && span > QUEUE_SPAN_NS)
         };
         while one.queue.len() > 1 && is_old(&one.queue) {
             one.queue.pop_front();
@@ -195,7 +199,7 @@ const MIN_LEN: usize = 2;
 /// Maximum length of a queue.
 const MAX_LEN: usize = 16;
 /// Time that a queue covers between these lengths.
-const SPAN_NS: u64 = 250_000_000;
+const QUEUE_SPAN_NS: u64 = 250_000_000;
 
 #[cfg(test)]
 mod tests {
@@ -218,7 +222,7 @@ mod tests {
         let store = ChannelStore::new().unwrap();
         let (scan, status) = (store.open(channel("/scan", false)), store.open(channel("/status", true)));
         assert_eq!(store.open(channel("/scan", false)).id, scan.id);
-        assert!(!scan.is_wanted() && status.is_wanted());
+        assert!(!scan.is_needed() && status.is_needed());
         for n in 1..=3 {
             scan.publish(n, &[n as u8]);
             status.publish(n, &[n as u8]);
@@ -235,9 +239,9 @@ mod tests {
         let late = store.subscribe(status.id).unwrap();
         status.publish(4, &[4]);
         assert_eq!(store.next(status.id, late).unwrap().number, late + 1, "a removed message counts as sent");
-        assert!(scan.is_wanted() && status.is_subscribed());
+        assert!(scan.is_needed() && status.is_subscribed());
         store.unsubscribe(scan.id);
-        assert!(!scan.is_wanted());
+        assert!(!scan.is_needed());
         assert_eq!(store.subscribe(7), None);
     }
 

@@ -50,7 +50,7 @@ enum ConnectionState {
         stream: TcpStream,
         bytes: Vec<u8>,
         /// Number of bytes that were sent.
-        at: usize,
+        sent: usize,
         until: Instant,
     },
     Viewer(Box<Viewer>),
@@ -122,7 +122,7 @@ impl Connection {
                 self.serve(context, true, viewers, now)
             }
             ConnectionState::Request { .. } => Ok(()),
-            ConnectionState::Response { stream, bytes, at, .. } => match stream.write(&bytes[*at..]) {
+            ConnectionState::Response { stream, bytes, sent: at, .. } => match stream.write(&bytes[*at..]) {
                 Ok(0) => Err(Disconnected),
                 Ok(written) => {
                     *at += written;
@@ -155,7 +155,7 @@ impl Connection {
         let ConnectionState::Request { mut stream, head, .. } = state else { return Err(Disconnected) };
         self.state = match context.reply(request, viewers) {
             Reply::Response(bytes) => {
-                ConnectionState::Response { stream, bytes, at: 0, until: now + RESPONSE_TIMEOUT }
+                ConnectionState::Response { stream, bytes, sent: 0, until: now + RESPONSE_TIMEOUT }
             }
             Reply::WebSocket { key, protocol } => {
                 // The response fits into the empty buffer of a new connection.

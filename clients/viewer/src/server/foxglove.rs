@@ -25,7 +25,7 @@ pub(crate) fn server_info(session: &str) -> String {
 pub(crate) fn advertise<'a>(channels: impl Iterator<Item = (usize, &'a Channel)>) -> String {
     #[derive(Serialize)]
     #[serde(rename_all = "camelCase")]
-    struct Advertised<'a> {
+    struct AdvertisedChannel<'a> {
         id: usize,
         topic: &'a str,
         encoding: &'a str,
@@ -34,7 +34,7 @@ pub(crate) fn advertise<'a>(channels: impl Iterator<Item = (usize, &'a Channel)>
         schema_encoding: &'a str,
     }
     let channels: Vec<_> = channels
-        .map(|(at, channel)| Advertised {
+        .map(|(at, channel)| AdvertisedChannel {
             id: at + 1,
             topic: &channel.topic,
             encoding: channel.encoding,

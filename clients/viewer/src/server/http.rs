@@ -25,16 +25,16 @@ pub(crate) struct Request {
 
 /// The bytes are not a valid head.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Malformed;
+pub(crate) struct MalformedRequest;
 
 impl Request {
     /// Parses the head at the start of `bytes`. Returns it with its length, or `None` while it is incomplete.
-    pub(crate) fn parse(bytes: &[u8]) -> Result<Option<(Request, usize)>, Malformed> {
+    pub(crate) fn parse(bytes: &[u8]) -> Result<Option<(Request, usize)>, MalformedRequest> {
         let mut headers = [httparse::EMPTY_HEADER; 64];
         let mut head = httparse::Request::new(&mut headers);
-        let length = match head.parse(bytes).map_err(|_| Malformed)? {
+        let length = match head.parse(bytes).map_err(|_| MalformedRequest)? {
             httparse::Status::Complete(length) => length,
-            httparse::Status::Partial if bytes.len() >= MAX_HEAD_LEN => return Err(Malformed),
+            httparse::Status::Partial if bytes.len() >= MAX_HEAD_LEN => return Err(MalformedRequest),
             httparse::Status::Partial => return Ok(None),
         };
         let target = head.path.unwrap_or_default();
@@ -44,14 +44,14 @@ impl Request {
             named.map(|header| std::str::from_utf8(header.value).unwrap_or("?").trim().to_owned()).collect()
         };
         // If a header is repeated, a proxy may have checked the other value.
-        let one = |name: &str| -> Result<Option<String>, Malformed> {
+        let one = |name: &str| -> Result<Option<String>, MalformedRequest> {
             let mut values: Vec<String> = all(name);
-            if values.len() > 1 { Err(Malformed) } else { Ok(values.pop()) }
+            if values.len() > 1 { Err(MalformedRequest) } else { Ok(values.pop()) }
         };
-        let has = |name: &str, wanted: &str| {
+        let has = |name: &str, expected: &str| {
             let values: Vec<String> = all(name);
             let mut words = values.iter().flat_map(|value| value.split(','));
-            words.any(|word| word.trim().eq_ignore_ascii_case(wanted))
+            words.any(|word| word.trim().eq_ignore_ascii_case(expected))
         };
         let is_upgrade = has("upgrade", "websocket") && has("connection", "upgrade");
         let is_current = has("sec-websocket-version", "13");
@@ -101,7 +101,7 @@ pub(crate) enum Refusal {
 impl AccessPolicy {
     /// Checks the headers `Host` and `Origin` and the token of a request.
     pub(crate) fn check(&self, request: &Request) -> Result<(), Refusal> {
-        let host = request.host.as_deref().filter(|host| self.is_here(host)).ok_or(Refusal::Host)?;
+        let host = request.host.as_deref().filter(|host| self.is_this_machine(host)).ok_or(Refusal::Host)?;
         let is_own = |origin: &str| {
             origin.strip_prefix("http://").is_some_and(|authority| authority.eq_ignore_ascii_case(host))
         };
@@ -120,7 +120,7 @@ impl AccessPolicy {
 
     /// Returns whether `host` is this machine. An address cannot be made to point elsewhere, but a name can, so only
     /// names of this machine are accepted.
-    fn is_here(&self, host: &str) -> bool {
+    fn is_this_machine(&self, host: &str) -> bool {
         let name = match host.strip_prefix('[') {
             Some(rest) => rest.split(']').next().unwrap_or_default(),
             None => host.rsplit_once(':').map_or(host, |(name, _)| name),
@@ -210,10 +210,10 @@ mod tests {
 
     #[test]
     fn refuses_two_hosts_and_endless_heads() {
-        assert_eq!(Request::parse(b"GET / HTTP/1.1\r\nHost: a\r\nHost: b\r\n\r\n"), Err(Malformed));
-        assert_eq!(Request::parse(b"\x16\x03\x01\x02\x00"), Err(Malformed));
+        assert_eq!(Request::parse(b"GET / HTTP/1.1\r\nHost: a\r\nHost: b\r\n\r\n"), Err(MalformedRequest));
+        assert_eq!(Request::parse(b"\x16\x03\x01\x02\x00"), Err(MalformedRequest));
         let endless = format!("GET /{}", "a".repeat(MAX_HEAD_LEN));
-        assert_eq!(Request::parse(endless.as_bytes()), Err(Malformed));
+        assert_eq!(Request::parse(endless.as_bytes()), Err(MalformedRequest));
         let plain = Request::parse(b"GET / HTTP/1.1\r\nSec-WebSocket-Key: x\r\n\r\n").unwrap().unwrap().0;
         assert_eq!(plain.key, None, "a handshake has other headers too");
     }

@@ -15,22 +15,22 @@ pub(crate) use scene_update::{lines, marks, obstacles, tracks, zones};
 
 /// Returns the channel of a sensor's scans, as `sensor_msgs/msg/LaserScan`.
 pub(crate) fn scan_channel(sensor: &str) -> Channel {
-    of_ros(scan_topic(sensor), LASER_SCAN, false)
+    ros_channel(scan_topic(sensor), LASER_SCAN, false)
 }
 
 /// Returns the channel of a sensor's foreground, as `sensor_msgs/msg/PointCloud2`.
 pub(crate) fn foreground_channel(sensor: &str) -> Channel {
-    of_ros(beside_scan(sensor, "foreground"), POINT_CLOUD, false)
+    ros_channel(sibling_topic(sensor, "foreground"), POINT_CLOUD, false)
 }
 
 /// Returns the channel of a sensor's learned background, as `sensor_msgs/msg/LaserScan`.
 pub(crate) fn background_channel(sensor: &str) -> Channel {
-    of_ros(beside_scan(sensor, "background"), LASER_SCAN, true)
+    ros_channel(sibling_topic(sensor, "background"), LASER_SCAN, true)
 }
 
 /// Returns the channel of the sensors' poses, as `tf2_msgs/msg/TFMessage`.
 pub(crate) fn transforms_channel() -> Channel {
-    of_ros(TF_STATIC.to_owned(), TF_MESSAGE, true)
+    ros_channel(TF_STATIC.to_owned(), TF_MESSAGE, true)
 }
 
 /// Returns the channel of the circles around the robot and the beams that violate them, as `foxglove.SceneUpdate`.
@@ -50,18 +50,18 @@ pub(crate) fn lines_channel() -> Channel {
 
 /// Returns the channel of the people of `tracker` and their tails, as `foxglove.SceneUpdate`.
 pub(crate) fn tracks_channel(tracker: &str) -> Channel {
-    scene_update::channel(&beside_scan(tracker, "tracks"))
+    scene_update::channel(&sibling_topic(tracker, "tracks"))
 }
 
 /// Returns the channel of the points of complete sweeps, as `sensor_msgs/msg/PointCloud2` in the robot's frame.
 pub(crate) fn cloud_channel(name: &str) -> Channel {
-    of_ros(beside_scan(name, "cloud"), POINT_CLOUD, false)
+    ros_channel(sibling_topic(name, "cloud"), POINT_CLOUD, false)
 }
 
 /// Returns the channel of the last sweep's obstacles, as `foxglove.SceneUpdate`. They are not kept for later
 /// subscribers, because a message is valid for a limited time after its arrival.
 pub(crate) fn obstacles_channel(name: &str) -> Channel {
-    Channel { is_kept: false, ..scene_update::channel(&beside_scan(name, "obstacles")) }
+    Channel { is_kept: false, ..scene_update::channel(&sibling_topic(name, "obstacles")) }
 }
 
 /// Returns the channel of the verdict and the hub, see [`robot`].
@@ -71,7 +71,7 @@ pub(crate) fn robot_channel() -> Channel {
 
 /// Returns the channel of a sensor's state, see [`status`].
 pub(crate) fn status_channel(sensor: &str) -> Channel {
-    json_channel(beside_scan(sensor, "status"), "scanhub.Status", include_str!("messages/status.json"))
+    json_channel(sibling_topic(sensor, "status"), "scanhub.Status", include_str!("messages/status.json"))
 }
 
 /// Encodes the verdict of the robot's sensors, whether they are shown in a map, the state of the hub, and the number of
@@ -89,7 +89,7 @@ pub(crate) fn robot(scene: &Scene, domain: &str, problem: Option<&Problem>) -> V
         hub_words: String,
         map: bool,
         people: Option<String>,
-        trouble: Option<Words<'a>>,
+        trouble: Option<ProblemJson<'a>>,
     }
     let (verdict, sensor, nearest_mm) = crate::scene::verdict(scene.robot().map(|(_, sensor)| sensor));
     json_bytes(&Robot {
@@ -97,19 +97,19 @@ pub(crate) fn robot(scene: &Scene, domain: &str, problem: Option<&Problem>) -> V
         sensor,
         nearest_m: nearest_mm.map(|mm| f64::from(mm) / 1000.0),
         domain,
-        hub: scene.hub_lives,
+        hub: scene.hub_is_running,
         pid: (scene.hub_pid != 0).then_some(scene.hub_pid),
         load_percent: scene.hub_percent,
-        hub_words: hub_words(scene, domain),
+        hub_words: hub_text(scene, domain),
         map: scene.is_in_map(),
         people: rooms(scene.people()),
-        trouble: problem.map(Words::of),
+        trouble: problem.map(ProblemJson::of),
     })
 }
 
 /// Returns the state of the hub as text.
-fn hub_words(scene: &Scene, domain: &str) -> String {
-    if !scene.hub_lives {
+fn hub_text(scene: &Scene, domain: &str) -> String {
+    if !scene.hub_is_running {
         return "no hub".to_owned();
     }
     let pid = if scene.hub_pid == 0 { String::new() } else { format!(", hub process {}", scene.hub_pid) };
@@ -128,7 +128,7 @@ pub(crate) fn status(sensor: &Sensor) -> Vec<u8> {
         model: Option<String>,
         port: Option<&'a str>,
         remote: bool,
-        pose: Option<Place>,
+        pose: Option<PoseJson>,
         hz: Option<f64>,
         lost: u64,
         lost_on_line: Option<u64>,
@@ -145,16 +145,16 @@ pub(crate) fn status(sensor: &Sensor) -> Vec<u8> {
         marks: Option<usize>,
         verdict: &'a str,
         nearest_m: Option<f64>,
-        trouble: Option<Words<'a>>,
+        trouble: Option<ProblemJson<'a>>,
     }
     #[derive(Serialize)]
-    struct Place {
+    struct PoseJson {
         x_m: f64,
         y_m: f64,
         yaw_rad: f64,
         upside_down: bool,
     }
-    let place = |Pose { x_m, y_m, yaw_rad, upside_down, .. }| Place {
+    let pose = |Pose { x_m, y_m, yaw_rad, upside_down, .. }| PoseJson {
         x_m,
         y_m,
         yaw_rad,
@@ -170,12 +170,12 @@ pub(crate) fn status(sensor: &Sensor) -> Vec<u8> {
         model: status.and_then(|status| status.model()),
         port: status.map(|status| status.port()).filter(|port| !port.is_empty()),
         remote: is_remote(&sensor.name),
-        pose: sensor.placement.pose().map(place),
+        pose: sensor.placement.pose().map(pose),
         hz: sensor.meter.hz(),
         lost: sensor.lost,
         lost_on_line: status.and_then(|status| status.lost_on_line()),
         lost_share: status.and_then(|status| status.lost_share()),
-        damaged: status.map_or(0.0, |status| status.damaged()),
+        damaged: status.map_or(0.0, |status| status.damaged_share()),
         suspect: sensor.count(Counter::Suspect),
         age_p50_ms: ages.map(|(half, _)| half),
         age_p99_ms: ages.map(|(_, most)| most),
@@ -187,7 +187,7 @@ pub(crate) fn status(sensor: &Sensor) -> Vec<u8> {
         marks: sensor.marks.map(|marks| marks.marks().len()),
         verdict: sensor.zones.verdict().name(),
         nearest_m: sensor.zones.nearest().map(|(_, mm)| f64::from(mm) / 1000.0),
-        trouble: problem.as_ref().map(Words::of),
+        trouble: problem.as_ref().map(ProblemJson::of),
     })
 }
 
@@ -227,7 +227,7 @@ pub(crate) fn transforms(scene: &Scene, wall_ns: u64) -> Vec<u8> {
 /// Returns the channel of the angles of `mount`, see [`tilt`].
 pub(crate) fn tilt_channel(mount: &str) -> Channel {
     let schema = include_str!("messages/tilt.json");
-    Channel { is_kept: false, ..json_channel(beside_scan(mount, "tilt"), "scanhub.Tilt", schema) }
+    Channel { is_kept: false, ..json_channel(sibling_topic(mount, "tilt"), "scanhub.Tilt", schema) }
 }
 
 /// Encodes the angle of a mount, and its rate if that is known.
@@ -242,24 +242,24 @@ pub(crate) fn tilt(tilt: &Tilt) -> Vec<u8> {
 }
 
 #[derive(Serialize)]
-struct Words<'a> {
+struct ProblemJson<'a> {
     what: &'a str,
     remedy: &'a str,
 }
 
-impl Words<'_> {
-    fn of(problem: &Problem) -> Words<'_> {
-        Words { what: &problem.what, remedy: &problem.remedy }
+impl ProblemJson<'_> {
+    fn of(problem: &Problem) -> ProblemJson<'_> {
+        ProblemJson { what: &problem.description, remedy: &problem.remedy }
     }
 }
 
 /// Returns the topic `word` in the namespace of the sensor's scans.
-fn beside_scan(sensor: &str, word: &str) -> String {
+fn sibling_topic(sensor: &str, word: &str) -> String {
     let topic = scan_topic(sensor);
     format!("{}{word}", topic.strip_suffix("scan").unwrap_or(&topic))
 }
 
-fn of_ros(topic: String, kind: Type, is_kept: bool) -> Channel {
+fn ros_channel(topic: String, kind: Type, is_kept: bool) -> Channel {
     let Type { name, text } = kind;
     Channel {
         topic,
@@ -294,31 +294,31 @@ mod tests {
         let model = Background::of(head, &[4000, Background::UNKNOWN, Background::FAR]);
         let mut message = Vec::new();
         background(&mut message, "front", 7, &model);
-        let told = read(&LASER_SCAN, &message).unwrap();
-        assert_eq!((told.text("header.frame_id"), told.number("ranges.0")), (Some("front"), Some(4.0)));
-        assert!(told.number("ranges.1").unwrap().is_nan());
-        assert_eq!(told.number("ranges.2"), Some(f64::INFINITY));
+        let decoded = read(&LASER_SCAN, &message).unwrap();
+        assert_eq!((decoded.text("header.frame_id"), decoded.number("ranges.0")), (Some("front"), Some(4.0)));
+        assert!(decoded.number("ranges.1").unwrap().is_nan());
+        assert_eq!(decoded.number("ranges.2"), Some(f64::INFINITY));
     }
 
     #[test]
     fn unknown_values_are_null() {
         let mut scene = Scene::default();
         let object = |bytes: Vec<u8>| serde_json::from_slice::<serde_json::Value>(&bytes).unwrap();
-        let told = object(robot(&scene, "default", None));
-        assert_eq!((&told["verdict"], &told["hub"]), (&"unknown".into(), &false.into()));
-        assert_eq!((&told["hub_words"], &told["people"]), (&"no hub".into(), &serde_json::Value::Null));
-        let told = object(status(scene.sensor("front")));
-        assert_eq!((&told["state"], &told["hz"]), (&"no status".into(), &serde_json::Value::Null));
-        assert_eq!(told["pose"], serde_json::Value::Null, "its pose is unknown");
-        assert_eq!(told["trouble"]["what"], "nothing was heard of it yet");
+        let decoded = object(robot(&scene, "default", None));
+        assert_eq!((&decoded["verdict"], &decoded["hub"]), (&"unknown".into(), &false.into()));
+        assert_eq!((&decoded["hub_words"], &decoded["people"]), (&"no hub".into(), &serde_json::Value::Null));
+        let decoded = object(status(scene.sensor("front")));
+        assert_eq!((&decoded["state"], &decoded["hz"]), (&"no status".into(), &serde_json::Value::Null));
+        assert_eq!(decoded["pose"], serde_json::Value::Null, "its pose is unknown");
+        assert_eq!(decoded["trouble"]["what"], "nothing was heard of it yet");
     }
 
     #[test]
     fn state_of_the_hub_as_text() {
-        let mut scene = Scene { hub_lives: true, ..Scene::default() };
-        assert_eq!(hub_words(&scene, "default"), "domain default");
+        let mut scene = Scene { hub_is_running: true, ..Scene::default() };
+        assert_eq!(hub_text(&scene, "default"), "domain default");
         (scene.hub_pid, scene.hub_percent) = (77, Some(1.26));
-        assert_eq!(hub_words(&scene, "default"), "domain default, hub process 77, CPU 1.3 %");
+        assert_eq!(hub_text(&scene, "default"), "domain default, hub process 77, CPU 1.3 %");
     }
 
     #[test]

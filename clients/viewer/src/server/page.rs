@@ -79,7 +79,7 @@ mod tests {
     }
 
     /// The colour `name` of the light and of the dark page, as 8-bit red, green and blue.
-    fn colour(name: &str) -> [[u8; 3]; 2] {
+    fn color(name: &str) -> [[u8; 3]; 2] {
         let line = STYLE.lines().find_map(|line| line.trim().strip_prefix(&format!("--{name}: light-dark(")));
         let both = line.and_then(|line| line.strip_suffix(");")).unwrap_or_else(|| panic!("no {name}"));
         let parts: Vec<_> = both.split(", ").map(|part| part.strip_prefix('#').unwrap()).collect();
@@ -102,22 +102,22 @@ mod tests {
     /// WCAG 2.2, 1.4.3 and 1.4.11: text has 4.5 to 1, what is drawn and has a meaning 3 to 1, on the light page and the
     /// dark.
     #[test]
-    fn what_is_written_and_drawn_can_be_seen() {
+    fn colors_have_the_contrast_that_wcag_requires() {
         assert!((contrast([0; 3], [255; 3]) - 21.0).abs() < 1e-9);
-        let least = |inks: &[&str], papers: &[&str], wanted: f64| {
+        let check_contrast = |inks: &[&str], papers: &[&str], wanted: f64| {
             for (ink, paper) in inks.iter().flat_map(|ink| papers.iter().map(move |paper| (ink, paper))) {
                 for scheme in [0, 1] {
-                    let ratio = contrast(colour(ink)[scheme], colour(paper)[scheme]);
+                    let ratio = contrast(color(ink)[scheme], color(paper)[scheme]);
                     assert!(ratio >= wanted, "{ink} on {paper}, scheme {scheme}: {ratio:.2} of {wanted}");
                 }
             }
         };
-        least(&["ink", "soft", "accent", "slow", "stop", "clear"], &["paper", "panel"], 4.5);
-        least(&["new", "mark", "line", "soft", "stop"], &["paper"], 3.0);
-        least(&["person"], &["paper", "panel"], 4.5);
+        check_contrast(&["ink", "soft", "accent", "slow", "stop", "clear"], &["paper", "panel"], 4.5);
+        check_contrast(&["new", "mark", "line", "soft", "stop"], &["paper"], 3.0);
+        check_contrast(&["person"], &["paper", "panel"], 4.5);
         for fill in ["clear-fill", "slow-fill", "stop-fill"] {
             for scheme in [0, 1] {
-                let ratio = contrast([255; 3], colour(fill)[scheme]);
+                let ratio = contrast([255; 3], color(fill)[scheme]);
                 assert!(ratio >= 4.5, "white on {fill}, scheme {scheme}: {ratio:.2}");
             }
         }

@@ -66,10 +66,10 @@ pub(crate) fn message(progress: &Progress) -> Vec<u8> {
         progress: &'a Progress,
         words: String,
     }
-    json_bytes(&Replay { progress, words: words(progress) })
+    json_bytes(&Replay { progress, words: text(progress) })
 }
 
-fn words(&Progress { position_s, length_s, rate, paused, over, lap, .. }: &Progress) -> String {
+fn text(&Progress { position_s, length_s, rate, paused, over, lap, .. }: &Progress) -> String {
     let speed = rate.map_or("\u{d7}max".to_owned(), |rate| format!("\u{d7}{rate}"));
     let state = match (over, paused) {
         (true, _) => "at its end".to_owned(),
@@ -97,8 +97,8 @@ mod tests {
             Progress { position_s: 59.96, length_s: Some(75.0), rate: Some(0.5), ..Progress::default() };
         let paused = Progress { paused: true, rate: None, length_s: None, lap: 1, ..playing };
         let over = Progress { over: true, paused: true, ..playing };
-        assert_eq!(words(&playing), "1:00.0 / 1:15.0  \u{d7}0.5");
-        assert_eq!(words(&paused), "1:00.0  paused, \u{d7}max  lap 2");
-        assert_eq!(words(&over), "1:00.0 / 1:15.0  at its end");
+        assert_eq!(text(&playing), "1:00.0 / 1:15.0  \u{d7}0.5");
+        assert_eq!(text(&paused), "1:00.0  paused, \u{d7}max  lap 2");
+        assert_eq!(text(&over), "1:00.0 / 1:15.0  at its end");
     }
 }

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use tungstenite::protocol::{Role, WebSocketConfig};
 use tungstenite::{Bytes, Error, Message, WebSocket};
 
-use super::channels::{ChannelStore, Queued};
+use super::channels::{ChannelStore, QueuedMessage};
 use super::foxglove::{self, ClientMessage};
 use super::player::Playback;
 
@@ -20,7 +20,7 @@ const MAX_MESSAGE_LEN: usize = 64 << 10;
 /// viewers.
 const BATCH_SIZE: usize = 32;
 /// Number of bytes that are written at once: few system calls for many small messages, and little data in flight.
-const PIECE: usize = 16 << 10;
+const WRITE_SIZE: usize = 16 << 10;
 /// Send timeout. A viewer that does not accept a message in this time is disconnected.
 const SEND_TIMEOUT: Duration = Duration::from_secs(30);
 /// Minimum interval between two reports of skipped messages.
@@ -38,11 +38,11 @@ pub(crate) struct Viewer {
     pending: Option<Instant>,
     /// Whether the socket was full since this viewer last had all messages.
     was_full: bool,
-    skipped: Skipped,
-    reported: Skipped,
+    skipped: ReplacedMessages,
+    reported: ReplacedMessages,
     report_at: Instant,
     /// The last subscription to an unknown channel, which was not refused yet.
-    unknown: Option<usize>,
+    unknown_channel: Option<usize>,
     /// Whether unread messages may be left, even if the socket receives nothing new.
     has_unread: bool,
 }
@@ -56,7 +56,7 @@ struct Subscription {
 
 /// Messages that were replaced by newer ones before they were sent.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-struct Skipped {
+struct ReplacedMessages {
     /// Messages that the viewer, or the network to it, was too slow for.
     by_viewer: u64,
     /// Messages that this process was too late for.
@@ -77,7 +77,7 @@ impl Viewer {
     ) -> Result<Viewer, Disconnected> {
         let config = WebSocketConfig::default()
             .read_buffer_size(4096)
-            .write_buffer_size(2 * PIECE)
+            .write_buffer_size(2 * WRITE_SIZE)
             .max_message_size(Some(MAX_MESSAGE_LEN))
             .max_frame_size(Some(MAX_MESSAGE_LEN));
         let mut viewer = Viewer {
@@ -87,10 +87,10 @@ impl Viewer {
             next: 0,
             pending: None,
             was_full: false,
-            skipped: Skipped::default(),
-            reported: Skipped::default(),
+            skipped: ReplacedMessages::default(),
+            reported: ReplacedMessages::default(),
             report_at: now,
-            unknown: None,
+            unknown_channel: None,
             has_unread: true,
         };
         viewer.send(Message::text(foxglove::server_info(session)), now)?;
@@ -153,8 +153,8 @@ impl Viewer {
         player: Option<&dyn Playback>,
     ) -> Result<(), Disconnected> {
         match message {
-            Some(ClientMessage::Subscribe(wanted)) => {
-                for (id, channel) in wanted {
+            Some(ClientMessage::Subscribe(requested)) => {
+                for (id, channel) in requested {
                     if self.subscriptions.iter().any(|one| one.id == id) {
                         continue;
                     }
@@ -162,18 +162,18 @@ impl Viewer {
                         return Err(Disconnected);
                     }
                     let Some(number) = channels.subscribe(channel) else {
-                        self.unknown = Some(channel);
+                        self.unknown_channel = Some(channel);
                         continue;
                     };
                     self.subscriptions.push(Subscription { id, channel, number });
                 }
             }
             Some(ClientMessage::Unsubscribe(ids)) => {
-                let (gone, left) = std::mem::take(&mut self.subscriptions)
+                let (removed, left) = std::mem::take(&mut self.subscriptions)
                     .into_iter()
                     .partition(|one: &Subscription| ids.contains(&one.id));
                 self.subscriptions = left;
-                gone.iter().for_each(|one| channels.unsubscribe(one.channel));
+                removed.iter().for_each(|one| channels.unsubscribe(one.channel));
             }
             Some(ClientMessage::Player(command)) => {
                 player.into_iter().for_each(|player| player.command(command))
@@ -195,23 +195,23 @@ impl Viewer {
         Ok(())
     }
 
-    /// Buffers about [`PIECE`] bytes for the viewer. Returns whether there are any.
+    /// Buffers about [`WRITE_SIZE`] bytes for the viewer. Returns whether there are any.
     fn gather(&mut self, channels: &ChannelStore, now: Instant) -> Result<bool, Disconnected> {
         let mut length = 0;
-        while length < PIECE {
+        while length < WRITE_SIZE {
             let new = channels.channels_from(self.advertised);
             if !new.is_empty() {
                 self.advertised += new.len();
-                length += PIECE;
+                length += WRITE_SIZE;
                 let advertisement = foxglove::advertise(new.iter().map(|(at, channel)| (*at, &**channel)));
                 self.send(Message::text(advertisement), now)?;
-            } else if let Some(channel) = self.unknown.take() {
-                length += PIECE;
+            } else if let Some(channel) = self.unknown_channel.take() {
+                length += WRITE_SIZE;
                 self.send(Message::text(foxglove::unknown_channel(channel)), now)?;
             } else if self.skipped != self.reported && now >= self.report_at {
                 self.reported = self.skipped;
                 self.report_at = now + REPORT_INTERVAL;
-                length += PIECE;
+                length += WRITE_SIZE;
                 self.send(Message::text(foxglove::warning("skipped", &self.skipped.text())), now)?;
             } else if let Some((id, queued)) = self.choose(channels) {
                 let frame = foxglove::message(id, queued.wall_ns, &queued.payload);
@@ -225,7 +225,7 @@ impl Viewer {
     }
 
     /// Returns the next message and its subscription. Subscriptions take turns.
-    fn choose(&mut self, channels: &ChannelStore) -> Option<(u32, Queued)> {
+    fn choose(&mut self, channels: &ChannelStore) -> Option<(u32, QueuedMessage)> {
         let count = self.subscriptions.len();
         for step in 0..count {
             let at = (self.next + step) % count;
@@ -233,7 +233,7 @@ impl Viewer {
             let Some(queued) = channels.next(subscription.channel, subscription.number) else { continue };
             if !queued.is_kept {
                 let skipped = queued.number - subscription.number - 1;
-                let Skipped { by_viewer, by_server } = &mut self.skipped;
+                let ReplacedMessages { by_viewer, by_server } = &mut self.skipped;
                 *(if self.was_full { by_viewer } else { by_server }) += skipped;
             }
             subscription.number = queued.number;
@@ -271,10 +271,10 @@ impl Viewer {
     }
 }
 
-impl Skipped {
+impl ReplacedMessages {
     /// Returns the report for the viewer.
     fn text(self) -> String {
-        let Skipped { by_viewer, by_server } = self;
+        let ReplacedMessages { by_viewer, by_server } = self;
         let viewer = format!("{by_viewer} messages skipped: this viewer or its network is too slow");
         let server =
             format!("{by_server} messages skipped: the server was too late, its machine may be busy");
@@ -304,7 +304,7 @@ mod tests {
     }
 
     #[test]
-    fn slow_viewer_gets_the_newest_message_and_a_report_of_skipped_ones() {
+    fn slow_viewer_gets_newest_message_and_skipped_count() {
         let (channels, now) = (ChannelStore::new().unwrap(), Instant::now());
         let scans = channels.open(Channel {
             topic: "/front/scan".into(),
@@ -317,7 +317,7 @@ mod tests {
         let (mut viewer, mut client) = pair(now);
         let subscribe = r#"{"op":"subscribe","subscriptions":[{"id":7,"channelId":1}]}"#;
         client.send(Message::text(subscribe)).unwrap();
-        while !scans.is_wanted() {
+        while !scans.is_needed() {
             viewer.receive(&channels, None).unwrap();
         }
         let publish = |number: u32| {

@@ -9,34 +9,34 @@ use ratatui::widgets::{Block, Clear, Paragraph};
 
 use scanhub_schema::{Counter, Status};
 
-use super::map::{DOTS, color, map};
+use super::map::{DOTS_PER_CELL, color, map};
 use super::view::View;
 use crate::scene::{PointerPosition, Scene, Sensor, rooms, verdict};
 
 /// Draws `scene` as in `view`. If the picture is frozen, it shows `held`, but verdict and sensors are always those of
 /// `scene`.
 pub(crate) fn draw(frame: &mut Frame<'_>, scene: &Scene, held: Option<&Scene>, view: &View) {
-    let places = Places::of(frame.area(), scene);
-    let heading = heading(scene, view, places.heading.width);
-    let fits = |hub: &Line<'_>| heading.width() + hub.width() <= width(places.heading);
+    let areas = ScreenAreas::of(frame.area(), scene);
+    let heading = heading(scene, view, areas.heading.width);
+    let fits = |hub: &Line<'_>| heading.width() + hub.width() <= width(areas.heading);
     if let Some(hub) = hub_states(scene).into_iter().find(fits) {
-        let place = right(places.heading, hub.width());
-        frame.render_widget(hub, place);
+        let area = right(areas.heading, hub.width());
+        frame.render_widget(hub, area);
     }
-    frame.render_widget(heading, places.heading);
+    frame.render_widget(heading, areas.heading);
     let pictured = held.unwrap_or(scene);
     if view.counters {
-        frame.render_widget(Paragraph::new(counters(&view.shown(scene), places.map)), places.map);
+        frame.render_widget(Paragraph::new(counters(&view.shown(scene), areas.map)), areas.map);
     } else {
-        frame.render_widget(map(pictured, view, (places.map.width, places.map.height)), places.map);
+        frame.render_widget(map(pictured, view, (areas.map.width, areas.map.height)), areas.map);
         let scale_bar = scale_bar(view.dot_m);
-        let room = width(places.map).saturating_sub(scale_bar.chars().count() + 2);
+        let room = width(areas.map).saturating_sub(scale_bar.chars().count() + 2);
         let text = pointer_text(pictured, view, room);
-        let place = right(last_row(places.map), text.chars().count());
-        frame.render_widget(Line::raw(scale_bar), last_row(places.map));
-        frame.render_widget(Line::raw(text), place);
+        let area = right(last_row(areas.map), text.chars().count());
+        frame.render_widget(Line::raw(scale_bar), last_row(areas.map));
+        frame.render_widget(Line::raw(text), area);
     }
-    for (row, (number, sensor)) in places.sensors.rows().zip(listed(scene, view, places.sensors.height)) {
+    for (row, (number, sensor)) in areas.sensors.rows().zip(listed(scene, view, areas.sensors.height)) {
         frame.render_widget(line(number, sensor, view, row.width), row);
     }
     let keys = match (view.message.as_str(), view.note.as_str()) {
@@ -44,36 +44,36 @@ pub(crate) fn draw(frame: &mut Frame<'_>, scene: &Scene, held: Option<&Scene>, v
         ("", note) => Line::raw(format!("{FEW_KEYS}  {note}")),
         (message, _) => Line::raw(message.to_owned()),
     };
-    frame.render_widget(keys.patch_style(Modifier::DIM), places.keys);
+    frame.render_widget(keys.patch_style(Modifier::DIM), areas.keys);
     if view.help {
-        help(frame, places.map);
+        help(frame, areas.map);
     }
 }
 
 /// Returns the area of the picture on a screen of `area`.
 pub(super) fn map_area(area: Rect, scene: &Scene) -> Rect {
-    Places::of(area, scene).map
+    ScreenAreas::of(area, scene).map
 }
 
 /// Areas of the screen.
-struct Places {
+struct ScreenAreas {
     heading: Rect,
     map: Rect,
     sensors: Rect,
     keys: Rect,
 }
 
-impl Places {
-    fn of(area: Rect, scene: &Scene) -> Places {
+impl ScreenAreas {
+    fn of(area: Rect, scene: &Scene) -> ScreenAreas {
         let row = |from: u16, rows: u16| {
             let y = area.y + from.min(area.height);
             Rect { y, height: rows.min(area.bottom() - y), ..area }
         };
         // The picture has priority, so on a small screen not every sensor has a line.
-        let wanted = u16::try_from(scene.sensors.len()).unwrap_or(u16::MAX);
-        let sensors = wanted.min(area.height / 4);
+        let needed = u16::try_from(scene.sensors.len()).unwrap_or(u16::MAX);
+        let sensors = needed.min(area.height / 4);
         let map = area.height.saturating_sub(2 + sensors);
-        Places {
+        ScreenAreas {
             heading: row(0, 1),
             map: row(1, map),
             sensors: row(1 + map, sensors),
@@ -113,7 +113,7 @@ fn heading(scene: &Scene, view: &View, columns: u16) -> Line<'static> {
 /// Returns the state of the hub as text, the longest form first.
 fn hub_states(scene: &Scene) -> Vec<Line<'static>> {
     let percent = scene.hub_percent.map(|percent| format!(" {percent:.1} %")).unwrap_or_default();
-    let words = match (scene.hub_lives, scene.hub_pid) {
+    let words = match (scene.hub_is_running, scene.hub_pid) {
         (false, _) => {
             return [" no hub: waiting for it", " no hub"]
                 .map(|text| Line::styled(text, Modifier::BOLD))
@@ -128,7 +128,7 @@ fn hub_states(scene: &Scene) -> Vec<Line<'static>> {
 /// Returns the sensors that have a line in `rows`: all, or those from the selected one on.
 fn listed<'a>(scene: &'a Scene, view: &View, rows: u16) -> impl Iterator<Item = (usize, &'a Sensor)> {
     let hidden = scene.sensors.len().saturating_sub(usize::from(rows));
-    let first = view.only.unwrap_or(0).min(hidden);
+    let first = view.only_sensor.unwrap_or(0).min(hidden);
     scene.sensors.iter().enumerate().skip(first)
 }
 
@@ -151,7 +151,7 @@ fn line(number: usize, sensor: &Sensor, view: &View, width: u16) -> Line<'static
             fields.push("  frozen".to_owned());
         }
         fields.push(format!("  suspect {}", sensor.count(Counter::Suspect)));
-        if width >= WIDE {
+        if width >= MIN_WIDE_COLUMNS {
             let known_beams = sensor.background.as_ref().map_or(0, |model| model.known_beams);
             let marks = sensor.marks.map(|marks| marks.marks().len().to_string());
             let objects =
@@ -161,7 +161,7 @@ fn line(number: usize, sensor: &Sensor, view: &View, width: u16) -> Line<'static
         }
         append_fitting(&mut text, fields, "", usize::from(width));
     }
-    let is_shown = view.only.is_none_or(|only| only == number);
+    let is_shown = view.only_sensor.is_none_or(|only| only == number);
     let mut style = if is_shown { Style::new() } else { Style::new().add_modifier(Modifier::DIM) };
     if loss.is_some() {
         style = style.add_modifier(Modifier::BOLD);
@@ -182,10 +182,10 @@ fn counters(shown: &[(usize, &Sensor)], area: Rect) -> Vec<Line<'static>> {
         sensor.status.as_ref().and_then(value).unwrap_or_else(|| "-".to_owned())
     };
     let percent = |share: f64| format!("{:.2} %", 100.0 * share);
-    let mut lines = vec![Line::styled(row("", &|sensor| short(&sensor.name)), Modifier::BOLD)];
+    let mut lines = vec![Line::styled(row("", &|sensor| short_name(&sensor.name)), Modifier::BOLD)];
     let shares = [
         row("damaged on the line, last 10 s", &|sensor| {
-            of(sensor, &|status| Some(percent(status.damaged())))
+            of(sensor, &|status| Some(percent(status.damaged_share())))
         }),
         row("lost on the line, last 10 s", &|sensor| of(sensor, &|status| status.lost_share().map(percent))),
         row("scans this program missed", &|sensor| sensor.lost.to_string()),
@@ -201,14 +201,14 @@ fn counters(shown: &[(usize, &Sensor)], area: Rect) -> Vec<Line<'static>> {
 }
 
 /// Returns the end of a name that fits in a column. It distinguishes the sensors of one machine.
-fn short(name: &str) -> String {
+fn short_name(name: &str) -> String {
     let excess = name.chars().count().saturating_sub(COLUMN_WIDTH - 1);
     name.chars().skip(excess).collect()
 }
 
 /// Returns a scale bar with a round length: `|----| 1 m`.
 fn scale_bar(dot_m: f64) -> String {
-    let cell_m = dot_m * DOTS.0;
+    let cell_m = dot_m * DOTS_PER_CELL.0;
     let length = LENGTHS_M.into_iter().rev().find(|length| length / cell_m <= SCALE_BAR_CELLS);
     let length = length.unwrap_or(LENGTHS_M[0]);
     let cells = (length / cell_m).round().clamp(2.0, 4.0 * SCALE_BAR_CELLS) as usize;
@@ -220,9 +220,13 @@ fn scale_bar(dot_m: f64) -> String {
 fn pointer_text(scene: &Scene, view: &View, room: usize) -> String {
     let Some(at) = view.pointer_m else { return String::new() };
     let shown = view.shown(scene);
-    let position = PointerPosition::of(shown.iter().map(|(_, sensor)| *sensor), at, NEAR_DOTS * view.dot_m);
+    let position = PointerPosition::of(
+        shown.iter().map(|(_, sensor)| *sensor),
+        at,
+        MAX_POINTER_DISTANCE_DOTS * view.dot_m,
+    );
     let mut text = String::new();
-    append_fitting(&mut text, position.words(), ", ", room);
+    append_fitting(&mut text, position.text_lines(), ", ", room);
     text
 }
 
@@ -242,9 +246,9 @@ fn help(frame: &mut Frame<'_>, area: Rect) {
     let width = lines.iter().map(Line::width).max().unwrap_or_default() as u16 + 2;
     let (width, height) = (width.min(area.width), (lines.len() as u16 + 2).min(area.height));
     let (x, y) = (area.x + (area.width - width) / 2, area.y + (area.height - height) / 2);
-    let place = Rect { x, y, width, height };
-    frame.render_widget(Clear, place);
-    frame.render_widget(Paragraph::new(lines).block(Block::bordered().title(" scanhub watch ")), place);
+    let rect = Rect { x, y, width, height };
+    frame.render_widget(Clear, rect);
+    frame.render_widget(Paragraph::new(lines).block(Block::bordered().title(" scanhub watch ")), rect);
 }
 
 fn right(row: Rect, width: usize) -> Rect {
@@ -285,9 +289,9 @@ const NAME_WIDTH: usize = 32;
 /// Width of the column of a sensor.
 const COLUMN_WIDTH: usize = 14;
 /// Maximum distance of a point from the pointer that is read, in dots.
-const NEAR_DOTS: f64 = 6.0;
+const MAX_POINTER_DISTANCE_DOTS: f64 = 6.0;
 /// Columns from which on the line of a sensor has more fields.
-const WIDE: u16 = 100;
+const MIN_WIDE_COLUMNS: u16 = 100;
 const LENGTHS_M: [f64; 9] = [0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0];
 /// Maximum length of the scale bar, in cells.
 const SCALE_BAR_CELLS: f64 = 12.0;

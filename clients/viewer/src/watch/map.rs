@@ -12,18 +12,18 @@ use super::view::View;
 use crate::scene::{Scene, circles};
 
 /// Dots across and down in a cell of the terminal.
-pub(super) const DOTS: (f64, f64) = (2.0, 4.0);
+pub(super) const DOTS_PER_CELL: (f64, f64) = (2.0, 4.0);
 
 /// Returns the picture of `scene` for `cells`, columns and rows.
 pub(super) fn map(scene: &Scene, view: &View, cells: (u16, u16)) -> Canvas<'static, impl Fn(&mut Context)> {
     // The ends of the axes are the centers of dots, not their edges.
     let half = |cells: u16, dots: f64| view.dot_m * (f64::from(cells) * dots - 1.0).max(1.0) / 2.0;
-    let (aside, ahead) = (half(cells.0, DOTS.0), half(cells.1, DOTS.1));
+    let (lateral, ahead) = (half(cells.0, DOTS_PER_CELL.0), half(cells.1, DOTS_PER_CELL.1));
     let (up, right) = (view.center_m.0, -view.center_m.1);
-    let (x, y) = ([right - aside, right + aside], [up - ahead, up + ahead]);
+    let (x, y) = ([right - lateral, right + lateral], [up - ahead, up + ahead]);
     let mut layers = Layers::new(scene, view);
     if view.grid {
-        layers.rule(x, y, view.dot_m);
+        layers.add_grid(x, y, view.dot_m);
     }
     layers.snap(&Grid { x, y, cells, dot_m: view.dot_m });
     Canvas::default()
@@ -61,8 +61,8 @@ impl Grid {
             let cell = ((from_m / self.dot_m).round() / dots).floor() + 0.25;
             (cell * length / f64::from(cells.saturating_sub(1).max(1))).min(length)
         };
-        let across = cell(x - self.x[0], DOTS.0, self.cells.0, self.x[1] - self.x[0]);
-        let down = cell(self.y[1] - y, DOTS.1, self.cells.1, self.y[1] - self.y[0]);
+        let across = cell(x - self.x[0], DOTS_PER_CELL.0, self.cells.0, self.x[1] - self.x[0]);
+        let down = cell(self.y[1] - y, DOTS_PER_CELL.1, self.cells.1, self.y[1] - self.y[0]);
         (self.x[0] + across, self.y[1] - down)
     }
 
@@ -106,19 +106,20 @@ struct Circle {
 impl Layers {
     fn new(scene: &Scene, view: &View) -> Layers {
         let shown = view.shown(scene);
-        let around = if view.zones { circles(shown.iter().map(|(_, sensor)| *sensor)) } else { Vec::new() };
+        let zone_circles =
+            if view.zones { circles(shown.iter().map(|(_, sensor)| *sensor)) } else { Vec::new() };
         let mut layers = Layers {
             colors: view.colors,
             robot: (!scene.is_in_map()).then_some((0.0, 0.0)),
-            circles: around.iter().map(|circle| dotted(circle, view.dot_m)).collect(),
-            pointer: view.pointer_m.map(turned),
+            circles: zone_circles.iter().map(|circle| dotted(circle, view.dot_m)).collect(),
+            pointer: view.pointer_m.map(to_canvas),
             ..Layers::default()
         };
         for person in scene.people() {
             if view.trails {
-                layers.tails.extend(person.tail().map(turned));
+                layers.tails.extend(person.tail().map(to_canvas));
             }
-            let (x, y) = turned(person.position);
+            let (x, y) = to_canvas(person.position);
             let number = format!("#{}", person.id);
             layers.people.push((x, y, if person.is_seen() { number } else { format!("({number})") }));
         }
@@ -128,24 +129,24 @@ impl Layers {
                 let wall = shade.map_or(0, |shade| 1 + (shade * 3.999) as usize);
                 let is_foreground = point.is_foreground && view.foreground;
                 let dots = if is_foreground { &mut layers.foreground } else { &mut layers.walls[wall] };
-                dots.push(turned((point.x_m, point.y_m)));
+                dots.push(to_canvas((point.x_m, point.y_m)));
             }
             if view.trails && view.foreground {
-                layers.trails.extend(sensor.trail.points().map(turned));
+                layers.trails.extend(sensor.trail.points().map(to_canvas));
             }
             if view.background {
-                layers.background.extend(sensor.background_points().into_iter().map(turned));
+                layers.background.extend(sensor.background_points().into_iter().map(to_canvas));
             }
             if view.marks {
-                layers.marks.extend(sensor.mark_points().into_iter().map(turned));
+                layers.marks.extend(sensor.mark_points().into_iter().map(to_canvas));
             }
             if let Some(found) = sensor.lines().filter(|_| view.lines) {
                 layers.lines.extend(found.lines().iter().flat_map(|line| dots_of(line, view.dot_m)));
                 let corners = found.corners().iter().map(|corner| (corner.x_m.into(), corner.y_m.into()));
-                layers.corners.extend(corners.map(turned));
+                layers.corners.extend(corners.map(to_canvas));
             }
             if let Some(pose) = sensor.placement.pose() {
-                let (x, y) = turned((pose.x_m, pose.y_m));
+                let (x, y) = to_canvas((pose.x_m, pose.y_m));
                 layers.sensors.push((x, y, (number + 1).to_string()));
             }
         }
@@ -153,7 +154,7 @@ impl Layers {
     }
 
     /// Adds the crossings of a grid in meters, and dotted axes, in the bounds `x` and `y`.
-    fn rule(&mut self, x: [f64; 2], y: [f64; 2], dot_m: f64) {
+    fn add_grid(&mut self, x: [f64; 2], y: [f64; 2], dot_m: f64) {
         let step = grid_step_m(dot_m);
         let ticks = |[from, to]: [f64; 2], step: f64| {
             let (first, last) = ((from / step).ceil() as i32, (to / step).floor() as i32);
@@ -249,7 +250,7 @@ impl Layers {
 }
 
 /// Converts meters ahead and to the left to the right and up.
-fn turned((x, y): (f64, f64)) -> (f64, f64) {
+fn to_canvas((x, y): (f64, f64)) -> (f64, f64) {
     (-y, x)
 }
 
@@ -258,7 +259,7 @@ fn dots_of(line: &scanhub_schema::Line, dot_m: f64) -> Dots {
     let [x1, y1, x2, y2] = [line.x1_m, line.y1_m, line.x2_m, line.y2_m].map(f64::from);
     let steps = ((x2 - x1).hypot(y2 - y1) / dot_m).ceil().clamp(1.0, 2000.0);
     let at = |n: u32| (x1 + (x2 - x1) * f64::from(n) / steps, y1 + (y2 - y1) * f64::from(n) / steps);
-    (0..=steps as u32).map(at).map(turned).collect()
+    (0..=steps as u32).map(at).map(to_canvas).collect()
 }
 
 /// Returns `circle` as a dotted line, from the top on.

@@ -22,7 +22,7 @@ use ratatui::crossterm::{execute, queue};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::termios::tcgetwinsize;
 use scanhub_schema::{Failure, Kind};
-use scanhub_verbs::output::End;
+use scanhub_verbs::output::ExitReason;
 
 /// The terminal while the picture is shown.
 pub(super) struct Terminal<'a> {
@@ -50,7 +50,7 @@ pub(super) enum Input {
 
 impl<'a> Terminal<'a> {
     /// Takes over the terminal that `out` writes to.
-    pub(super) fn new(out: &'a mut dyn Write) -> Result<Terminal<'a>, End> {
+    pub(super) fn new(out: &'a mut dyn Write) -> Result<Terminal<'a>, ExitReason> {
         let written = Rc::new(Cell::new(0));
         let is_restored = Arc::new(AtomicBool::new(false));
         let mut buffer = FrameBuffer {
@@ -84,16 +84,16 @@ impl<'a> Terminal<'a> {
     }
 
     /// Draws a frame. Returns its size in bytes.
-    pub(super) fn draw(&mut self, picture: impl FnOnce(&mut Frame<'_>)) -> Result<usize, End> {
+    pub(super) fn draw(&mut self, picture: impl FnOnce(&mut Frame<'_>)) -> Result<usize, ExitReason> {
         self.written.set(0);
         self.screen.draw(picture).map_err(closed)?;
         Ok(self.written.get())
     }
 
     /// Returns the next input without waiting.
-    pub(super) fn input(&mut self) -> Result<Option<Input>, End> {
+    pub(super) fn input(&mut self) -> Result<Option<Input>, ExitReason> {
         if hung_up() {
-            return Err(End::ReaderGone);
+            return Err(ExitReason::ReaderClosed);
         }
         let size = size();
         if std::mem::replace(&mut self.size, size) != size {
@@ -133,13 +133,13 @@ fn hung_up() -> bool {
     is_polled && ends[0].revents().intersects(PollFlags::HUP | PollFlags::ERR)
 }
 
-/// Converts the error of a closed terminal to [`End::ReaderGone`].
-fn closed(error: io::Error) -> End {
+/// Converts the error of a closed terminal to [`End::ReaderClosed`].
+fn closed(error: io::Error) -> ExitReason {
     const EIO: i32 = 5;
     if error.raw_os_error() == Some(EIO) || error.kind() == ErrorKind::UnexpectedEof {
-        return End::ReaderGone;
+        return ExitReason::ReaderClosed;
     }
-    End::from(error)
+    ExitReason::from(error)
 }
 
 /// Collects a frame, which is written at once.
@@ -196,7 +196,7 @@ const MOUSE_OFF: &str = "\x1b[?1006l\x1b[?1002l";
 /// terminal from one where no key is pressed.
 struct Keys {
     terminal: File,
-    typed: VecDeque<u8>,
+    pending: VecDeque<u8>,
 }
 
 impl Keys {
@@ -206,7 +206,7 @@ impl Keys {
             true => stdin.as_fd().try_clone_to_owned()?.into(),
             false => File::open("/dev/tty")?,
         };
-        Ok(Keys { terminal, typed: VecDeque::new() })
+        Ok(Keys { terminal, pending: VecDeque::new() })
     }
 
     /// Returns the next key without waiting.
@@ -215,7 +215,7 @@ impl Keys {
     ///
     /// Returns [`ErrorKind::UnexpectedEof`] if the terminal was closed.
     fn next(&mut self) -> io::Result<Option<Key>> {
-        let mut key = next(&mut self.typed);
+        let mut key = next(&mut self.pending);
         if key.is_none() {
             let mut fds = [PollFd::new(&self.terminal, PollFlags::IN)];
             // The caller handles a signal that arrived during the call.
@@ -224,11 +224,11 @@ impl Keys {
                 let mut piece = [0; 256];
                 match self.terminal.read(&mut piece) {
                     Ok(0) => return Err(ErrorKind::UnexpectedEof.into()),
-                    Ok(len) => self.typed.extend(&piece[..len]),
+                    Ok(len) => self.pending.extend(&piece[..len]),
                     Err(error) if error.kind() == ErrorKind::Interrupted => {}
                     Err(error) => return Err(error),
                 }
-                key = next(&mut self.typed);
+                key = next(&mut self.pending);
             }
         }
         Ok(key)
@@ -251,7 +251,7 @@ fn next(typed: &mut VecDeque<u8>) -> Option<Key> {
                         return None;
                     }
                     let sequence: Vec<u8> = typed.drain(..length.min(typed.len())).collect();
-                    typed.front().and_then(|last| meaning(&sequence[2..], *last))
+                    typed.front().and_then(|last| parse_sequence(&sequence[2..], *last))
                 }
                 // The next character was typed with Alt.
                 Some(_) => None,
@@ -269,7 +269,7 @@ fn next(typed: &mut VecDeque<u8>) -> Option<Key> {
 }
 
 /// Returns the meaning of a sequence with these parameters and this last byte: an arrow, or the mouse.
-fn meaning(parameters: &[u8], last: u8) -> Option<Key> {
+fn parse_sequence(parameters: &[u8], last: u8) -> Option<Key> {
     match last {
         b'A' => Some(Key::Up),
         b'B' => Some(Key::Down),

@@ -10,7 +10,7 @@ use ratatui::backend::TestBackend;
 use ratatui::buffer::Buffer;
 use ratatui::style::{Color, Modifier};
 use scanhub_schema::{
-    Background, BackgroundHead, Contents, Corner, Counter, Foreground, ForegroundHead, Header, Line, Lines,
+    ArrayFlags, Background, BackgroundHead, Corner, Counter, Foreground, ForegroundHead, Header, Line, Lines,
     Mark, Marks, Pose, Scan, ScanHead, Segment, State, Status, Track, TrackState, Tracks, Verdict, Zone,
     Zones,
 };
@@ -25,7 +25,7 @@ const WALLS: [f64; 4] = [4.2, -3.4, 3.0, -3.6];
 const LEGS: [(f64, f64, f64); 3] = [(1.9, 0.9, 0.12), (2.1, 0.6, 0.12), (-0.75, -0.25, 0.1)];
 
 /// Returns the length of the beam from `pose` along `direction` to a leg or a wall.
-fn meets(pose: &Pose, (dx, dy): (f64, f64), legs: &[(f64, f64, f64)]) -> f64 {
+fn beam_length(pose: &Pose, (dx, dy): (f64, f64), legs: &[(f64, f64, f64)]) -> f64 {
     let wall = |to: f64, from: f64, slope: f64| ((to - from) / slope > 0.0).then(|| (to - from) / slope);
     let walls = [
         wall(WALLS[0], pose.x_m, dx),
@@ -42,7 +42,7 @@ fn meets(pose: &Pose, (dx, dy): (f64, f64), legs: &[(f64, f64, f64)]) -> f64 {
 }
 
 /// Fills in the samples of a sensor at `pose`.
-fn see(sensor: &mut Sensor, pose: Pose) {
+fn fill_samples(sensor: &mut Sensor, pose: Pose) {
     let mut scan = Scan::of(ScanHead::lms(361, -90_000, 500, 1, 13), &[0; 361]);
     let ScanHead { first_angle, step, unit_um, .. } = **scan;
     let head = BackgroundHead {
@@ -59,7 +59,7 @@ fn see(sensor: &mut Sensor, pose: Pose) {
     let arrays = foreground.begin(head);
     for i in 0..361 {
         let direction = pose.direction(scan.angle(i));
-        let (now, empty) = (meets(&pose, direction, &LEGS), meets(&pose, direction, &[]));
+        let (now, empty) = (beam_length(&pose, direction, &LEGS), beam_length(&pose, direction, &[]));
         let range = (1000.0 * now) as u16;
         scan.arrays().ranges[i] = range;
         background.ranges_mut()[i] = (1000.0 * empty) as u16;
@@ -100,12 +100,13 @@ fn zones(verdict: Verdict, nearest_mm: u32, violated: [u8; 2]) -> Zones {
 
 /// Returns a scene with two sensors, a person ahead, and one behind who is near enough to slow the robot down.
 pub(super) fn scene() -> Scene {
-    let mut scene = Scene { hub_lives: true, hub_pid: 4711, hub_percent: Some(1.234), ..Scene::default() };
+    let mut scene =
+        Scene { hub_is_running: true, hub_pid: 4711, hub_percent: Some(1.234), ..Scene::default() };
     let front = scene.sensor("front");
-    see(front, Pose { x_m: 0.3, ..Pose::default() });
+    fill_samples(front, Pose { x_m: 0.3, ..Pose::default() });
     front.zones = zones(Verdict::Clear, 1870, [0, 0]);
     let rear = scene.sensor("rear");
-    see(rear, Pose { x_m: -0.3, yaw_rad: PI, ..Pose::default() });
+    fill_samples(rear, Pose { x_m: -0.3, yaw_rad: PI, ..Pose::default() });
     rear.zones = zones(Verdict::Slow, 691, [1, 0]);
     rear.lost = 2;
     scene
@@ -157,9 +158,10 @@ fn help_one_sensor_and_no_hub() {
     let mut scene = scene();
     let help = View { help: true, ..View::new(false) };
     compare("tests/watch/help_60x20.txt", &text(&screen(&scene, &help, (60, 20))));
-    let rear = View { only: Some(1), background: false, zones: false, paused: true, ..View::new(false) };
+    let rear =
+        View { only_sensor: Some(1), background: false, zones: false, paused: true, ..View::new(false) };
     compare("tests/watch/rear_60x20.txt", &text(&screen(&scene, &rear, (60, 20))));
-    scene.hub_gone();
+    scene.on_hub_exit();
     let gone = View { dot_m: 0.12, ..View::new(false) };
     compare("tests/watch/gone_60x20.txt", &text(&screen(&scene, &gone, (60, 20))));
 }
@@ -183,7 +185,7 @@ fn frozen_picture_has_the_current_verdict() {
     let stop = rows(&now);
     assert!(stop[0].starts_with(" STOP  HELD  front, nearest 0.41 m"), "{stop:#?}");
     assert!(stop[18].contains("lost 7"), "{stop:#?}");
-    now.hub_gone();
+    now.on_hub_exit();
     let gone = rows(&now);
     assert!(
         gone[0].starts_with(" UNKNOWN  HELD  front") && gone[0].ends_with("no hub: waiting for it"),
@@ -416,10 +418,13 @@ fn shows_counters_the_pointer_and_line_features() {
 
 #[test]
 fn colors_show_intensities_and_trails() {
-    let mut scene = Scene { hub_lives: true, ..Scene::default() };
+    let mut scene = Scene { hub_is_running: true, ..Scene::default() };
     let sensor = scene.sensor("front");
-    let head =
-        ScanHead { intensity_bits: 8, contents: Contents::UPPER, ..ScanHead::lms(181, -90_000, 1000, 1, 13) };
+    let head = ScanHead {
+        intensity_bits: 8,
+        contents: ArrayFlags::UPPER,
+        ..ScanHead::lms(181, -90_000, 1000, 1, 13)
+    };
     let mut scan = Scan::of(head, &[4000; 181]);
     for (n, value) in scan.arrays().upper.iter_mut().enumerate() {
         *value = n as u8;

@@ -2,7 +2,7 @@
 
 use ratatui::layout::{Position, Rect};
 
-use super::map::DOTS;
+use super::map::DOTS_PER_CELL;
 use super::terminal::Key;
 use crate::scene::{Scene, Sensor};
 
@@ -10,7 +10,7 @@ use crate::scene::{Scene, Sensor};
 #[derive(Clone, Debug)]
 pub(crate) struct View {
     /// Index of the only sensor that is shown; `None` for all sensors of the robot.
-    pub(crate) only: Option<usize>,
+    pub(crate) only_sensor: Option<usize>,
     /// Area of the picture on the screen, in cells.
     pub(crate) map: Rect,
     /// Center of the picture, in meters in the robot's frame.
@@ -61,10 +61,10 @@ impl View {
     /// Shows all layers of the whole robot.
     pub(crate) fn new(colors: bool) -> View {
         View {
-            only: None,
+            only_sensor: None,
             map: Rect::default(),
             center_m: (0.0, 0.0),
-            dot_m: FIRST_DOT_M,
+            dot_m: INITIAL_DOT_M,
             fits: true,
             foreground: true,
             background: true,
@@ -86,7 +86,7 @@ impl View {
 
     /// Returns the sensors that are shown, with their indices.
     pub(crate) fn shown<'a>(&self, scene: &'a Scene) -> Vec<(usize, &'a Sensor)> {
-        match self.only.and_then(|n| Some((n, scene.sensors.get(n)?))) {
+        match self.only_sensor.and_then(|n| Some((n, scene.sensors.get(n)?))) {
             Some(one) => vec![one],
             None => scene.robot().collect(),
         }
@@ -104,25 +104,25 @@ impl View {
             Key::Sign('F') => return Some(ViewCommand::Freeze),
             Key::Sign('?') => self.help = !self.help,
             Key::Sign(' ') => self.paused = !self.paused,
-            Key::Sign('+' | '=') => self.zoom(1.0 / ZOOM),
-            Key::Sign('-') => self.zoom(ZOOM),
+            Key::Sign('+' | '=') => self.zoom(1.0 / ZOOM_FACTOR),
+            Key::Sign('-') => self.zoom(ZOOM_FACTOR),
             Key::Sign('c') => self.fits = true,
             Key::Sign('x') => {
                 self.pointer_m = if self.pointer_m.is_none() { Some(self.center_m) } else { None }
             }
-            Key::Left | Key::Right | Key::Up | Key::Down => self.go(key),
+            Key::Left | Key::Right | Key::Up | Key::Down => self.move_by(key),
             Key::Point(..) | Key::WheelUp(..) | Key::WheelDown(..) if self.help || self.counters => {}
             Key::Point(column, row) => self.pointer_m = self.at_m(column, row).or(self.pointer_m),
-            Key::WheelUp(column, row) => self.zoom_at(column, row, 1.0 / ZOOM),
-            Key::WheelDown(column, row) => self.zoom_at(column, row, ZOOM),
+            Key::WheelUp(column, row) => self.zoom_at(column, row, 1.0 / ZOOM_FACTOR),
+            Key::WheelDown(column, row) => self.zoom_at(column, row, ZOOM_FACTOR),
             Key::Sign('h') => self.pan(0.0, 1.0),
             Key::Sign('l') => self.pan(0.0, -1.0),
             Key::Sign('k') => self.pan(1.0, 0.0),
             Key::Sign('j') => self.pan(-1.0, 0.0),
-            Key::Tab => self.choose(self.only.map_or(0, |n| n + 1), scene),
+            Key::Tab => self.select_sensor(self.only_sensor.map_or(0, |n| n + 1), scene),
             Key::Sign(digit @ '0'..='9') => {
                 let number = digit as usize - '0' as usize;
-                self.choose(number.checked_sub(1).unwrap_or(usize::MAX), scene);
+                self.select_sensor(number.checked_sub(1).unwrap_or(usize::MAX), scene);
             }
             Key::Sign('f') => self.foreground = !self.foreground,
             Key::Sign('b') => self.background = !self.background,
@@ -141,25 +141,28 @@ impl View {
     /// Fits the points into the picture, unless the user has moved it. If they fit already and the scale is about
     /// right, nothing changes, because a picture that changes its scale often cannot be read.
     pub(crate) fn fit(&mut self, scene: &Scene) {
-        let dots = (f64::from(self.map.width.max(1)) * DOTS.0, f64::from(self.map.height.max(1)) * DOTS.1);
+        let dots = (
+            f64::from(self.map.width.max(1)) * DOTS_PER_CELL.0,
+            f64::from(self.map.height.max(1)) * DOTS_PER_CELL.1,
+        );
         let shown = self.shown(scene);
-        let seen: Vec<_> = shown.iter().flat_map(|(_, sensor)| sensor.points()).collect();
-        if !self.fits || seen.is_empty() {
+        let points: Vec<_> = shown.iter().flat_map(|(_, sensor)| sensor.points()).collect();
+        if !self.fits || points.is_empty() {
             return;
         }
         let reach = shown.iter().flat_map(|(_, sensor)| sensor.zones.zones().iter());
         let reach = reach.map(|zone| f64::from(zone.radius_mm) / 1000.0).fold(MIN_REACH_M, f64::max);
-        let ahead = span(seen.iter().map(|point| point.x_m).collect(), reach);
-        let aside = span(seen.iter().map(|point| point.y_m).collect(), reach);
-        let needed = ((aside.1 - aside.0) / dots.0).max((ahead.1 - ahead.0) / dots.1) * MARGIN;
+        let ahead = span(points.iter().map(|point| point.x_m).collect(), reach);
+        let lateral = span(points.iter().map(|point| point.y_m).collect(), reach);
+        let needed = ((lateral.1 - lateral.0) / dots.0).max((ahead.1 - ahead.0) / dots.1) * MARGIN_FACTOR;
         let fits = |middle: f64, span: (f64, f64), dots: f64| {
             let half = self.dot_m * dots / 2.0;
             middle - half <= span.0 && span.1 <= middle + half
         };
-        let is_in = fits(self.center_m.0, ahead, dots.1) && fits(self.center_m.1, aside, dots.0);
-        if !is_in || needed < TOO_SMALL * self.dot_m {
+        let is_in = fits(self.center_m.0, ahead, dots.1) && fits(self.center_m.1, lateral, dots.0);
+        if !is_in || needed < MIN_FILL_SHARE * self.dot_m {
             self.dot_m = needed;
-            self.center_m = ((ahead.0 + ahead.1) / 2.0, (aside.0 + aside.1) / 2.0);
+            self.center_m = ((ahead.0 + ahead.1) / 2.0, (lateral.0 + lateral.1) / 2.0);
         }
     }
 
@@ -171,8 +174,8 @@ impl View {
         // In dots from the middle of the picture.
         let from_middle =
             |cell: u16, cells: u16, dots: f64| (f64::from(cell) + 0.5 - f64::from(cells) / 2.0) * dots;
-        let right = from_middle(column - self.map.x, self.map.width, DOTS.0);
-        let down = from_middle(row - self.map.y, self.map.height, DOTS.1);
+        let right = from_middle(column - self.map.x, self.map.width, DOTS_PER_CELL.0);
+        let down = from_middle(row - self.map.y, self.map.height, DOTS_PER_CELL.1);
         Some((self.center_m.0 - down * self.dot_m, self.center_m.1 - right * self.dot_m))
     }
 
@@ -186,11 +189,11 @@ impl View {
 
     fn zoom(&mut self, factor: f64) {
         self.fits = false;
-        self.dot_m = (self.dot_m * factor).clamp(FINEST_DOT_M, COARSEST_DOT_M);
+        self.dot_m = (self.dot_m * factor).clamp(MIN_DOT_M, MAX_DOT_M);
     }
 
     /// Moves the pointer by a cell, or the picture if there is no pointer.
-    fn go(&mut self, arrow: Key) {
+    fn move_by(&mut self, arrow: Key) {
         let (ahead, left) = match arrow {
             Key::Up => (1.0, 0.0),
             Key::Down => (-1.0, 0.0),
@@ -199,7 +202,9 @@ impl View {
         };
         let dot_m = self.dot_m;
         match &mut self.pointer_m {
-            Some((x, y)) => (*x, *y) = (*x + ahead * DOTS.1 * dot_m, *y + left * DOTS.0 * dot_m),
+            Some((x, y)) => {
+                (*x, *y) = (*x + ahead * DOTS_PER_CELL.1 * dot_m, *y + left * DOTS_PER_CELL.0 * dot_m)
+            }
             None => self.pan(ahead, left),
         }
     }
@@ -213,37 +218,37 @@ impl View {
     }
 
     /// Shows only the sensor with index `n`, or all if it does not exist.
-    fn choose(&mut self, n: usize, scene: &Scene) {
-        self.only = (n < scene.sensors.len()).then_some(n);
+    fn select_sensor(&mut self, n: usize, scene: &Scene) {
+        self.only_sensor = (n < scene.sensors.len()).then_some(n);
     }
 }
 
 /// Returns minimum and maximum of `values` without a few outliers, and at least `reach` around the center.
 fn span(mut values: Vec<f64>, reach: f64) -> (f64, f64) {
     values.sort_by(f64::total_cmp);
-    let out = values.len() / OUTLIERS;
+    let out = values.len() / OUTLIER_DIVISOR;
     (values[out].min(-reach), values[values.len() - 1 - out].max(reach))
 }
 
 /// Factor of a step of zoom.
-const ZOOM: f64 = 1.25;
+const ZOOM_FACTOR: f64 = 1.25;
 /// Distance of a step of pan.
 const STEP_DOTS: f64 = 8.0;
 /// Scale before the first scan: eight meters in a picture of 80 columns.
-const FIRST_DOT_M: f64 = 0.05;
-const FINEST_DOT_M: f64 = 0.001;
-const COARSEST_DOT_M: f64 = 1.0;
+const INITIAL_DOT_M: f64 = 0.05;
+const MIN_DOT_M: f64 = 0.001;
+const MAX_DOT_M: f64 = 1.0;
 /// Maximum distance of the center. It is more than the range of a sensor (82 m) beyond its maximum distance from the
 /// robot (100 m).
 const MAX_CENTER_M: f64 = 200.0;
 /// Minimum distance around the robot that is shown.
 const MIN_REACH_M: f64 = 0.5;
 /// Size of the picture relative to the points.
-const MARGIN: f64 = 1.1;
+const MARGIN_FACTOR: f64 = 1.1;
 /// The scale changes if the points need less than this share of the picture.
-const TOO_SMALL: f64 = 0.6;
+const MIN_FILL_SHARE: f64 = 0.6;
 /// Points per point that may lie outside at either end.
-const OUTLIERS: usize = 50;
+const OUTLIER_DIVISOR: usize = 50;
 
 #[cfg(test)]
 mod tests {
@@ -271,16 +276,16 @@ mod tests {
         assert_eq!(view.shown(&scene).len(), 2);
         for only in [Some(0), Some(1), None] {
             view.key(Key::Tab, &scene);
-            assert_eq!(view.only, only);
+            assert_eq!(view.only_sensor, only);
         }
         press(&mut view, &scene, "2fbmz ?");
-        assert_eq!((view.only, view.shown(&scene)[0].1.name.as_str()), (Some(1), "rear"));
+        assert_eq!((view.only_sensor, view.shown(&scene)[0].1.name.as_str()), (Some(1), "rear"));
         assert!(!(view.foreground || view.background || view.marks || view.zones));
         assert!(view.paused && view.help);
         press(&mut view, &scene, "tgien");
         assert!(!(view.trails || view.grid || view.intensity) && view.lines && view.counters);
         press(&mut view, &scene, "9");
-        assert_eq!(view.only, None, "there is no ninth");
+        assert_eq!(view.only_sensor, None, "there is no ninth");
     }
 
     #[test]

@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 
 use scanhub_client::streams::Sample;
-use scanhub_schema::{Background, Header, Maker, Scan, SweepPoints, Topic};
+use scanhub_schema::{Background, Header, PublisherKind, Scan, SweepPoints, Topic};
 use scanhub_verbs::names::TopicName;
 
 use crate::live_scene::Pair;
@@ -36,7 +36,7 @@ impl<'a> SensorChannels<'a> {
 
     /// Publishes a scan.
     pub(super) fn publish_scan(&mut self, header: &Header, scan: &Scan) {
-        if self.scan.is_wanted() {
+        if self.scan.is_needed() {
             self.message.clear();
             scanhub_ros::laser_scan(&mut self.message, scanhub_ros::frame(&self.sensor), header, scan);
             self.scan.publish(header.wall_ns, &self.message);
@@ -45,7 +45,7 @@ impl<'a> SensorChannels<'a> {
 
     /// Publishes a foreground. Its scan has the angles of the beams.
     pub(super) fn publish_foreground(&mut self, ((header, scan), foreground): &Pair) {
-        if self.foreground.is_wanted() {
+        if self.foreground.is_needed() {
             let (message, frame) = (&mut self.message, scanhub_ros::frame(&self.sensor));
             message.clear();
             scanhub_ros::foreground_cloud(message, frame, header, scan, foreground);
@@ -61,8 +61,8 @@ impl<'a> SensorChannels<'a> {
     }
 
     /// Publishes the state of the sensor.
-    pub(super) fn publish_status(&self, wall_ns: u64, seen: &Sensor) {
-        self.status.publish(wall_ns, &messages::status(seen));
+    pub(super) fn publish_status(&self, wall_ns: u64, state: &Sensor) {
+        self.status.publish(wall_ns, &messages::status(state));
     }
 
     /// Removes messages of scans that are too old.
@@ -97,8 +97,8 @@ impl<'a> TiltChannels<'a> {
 
     /// Opens the channels of a topic that will be followed.
     pub(super) fn begin(&mut self, name: &TopicName) {
-        match name.topic.maker() {
-            Maker::Mount => drop(self.mount(&name.sensor)),
+        match name.topic.publisher_kind() {
+            PublisherKind::Mount => drop(self.mount(&name.sensor)),
             _ => drop(self.sweeps(&name.sensor)),
         }
     }
@@ -119,7 +119,7 @@ impl<'a> TiltChannels<'a> {
     }
 
     /// Returns whether a viewer subscribes to `topic` of any mount or program. Other topics are always wanted.
-    pub(super) fn wants(&self, topic: Topic) -> bool {
+    pub(super) fn needs(&self, topic: Topic) -> bool {
         match topic {
             Topic::Tilt => self.mounts.values().any(ChannelPublisher::is_subscribed),
             Topic::Cloud => self.sweeps.values().any(|sweeps| sweeps.cloud.is_subscribed()),
@@ -132,14 +132,14 @@ impl<'a> TiltChannels<'a> {
         match sample {
             Sample::Tilt(angle) => {
                 let channel = self.mount(&name.sensor);
-                if channel.is_wanted() {
+                if channel.is_needed() {
                     channel.publish(angle.header().wall_ns, &messages::tilt(angle));
                 }
             }
             Sample::Cloud(cloud) => {
                 let SweepChannels { cloud: channel, points, message, .. } = self.sweeps(&name.sensor);
                 if let Some(points) = points.take(cloud.header(), cloud)
-                    && channel.is_wanted()
+                    && channel.is_needed()
                 {
                     message.clear();
                     scanhub_ros::sweep_cloud(message, cloud.header(), points);
@@ -161,7 +161,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn follows_angles_and_points_only_while_a_viewer_subscribes() {
+    fn obstacles_need_no_viewer_but_angles_and_points_do() {
         let channels = ChannelStore::new().unwrap();
         let mut tilted = TiltChannels::new(&channels);
         let name = |sensor: &str, topic| TopicName { sensor: sensor.to_owned(), topic };
@@ -169,8 +169,8 @@ mod tests {
         tilted.begin(&name("hall", Topic::Cloud));
         tilted.begin(&name("hall", Topic::Obstacles));
         assert_eq!((tilted.mounts.len(), tilted.sweeps.len()), (1, 1));
-        let wants = [Topic::Tilt, Topic::Cloud, Topic::Obstacles].map(|topic| tilted.wants(topic));
+        let wants = [Topic::Tilt, Topic::Cloud, Topic::Obstacles].map(|topic| tilted.needs(topic));
         assert_eq!(wants, [false, false, true]);
-        assert!(!tilted.sweeps["hall"].obstacles.is_wanted(), "obstacles are valid from their arrival");
+        assert!(!tilted.sweeps["hall"].obstacles.is_needed(), "obstacles are valid from their arrival");
     }
 }

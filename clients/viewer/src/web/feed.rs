@@ -5,12 +5,12 @@ use std::rc::Rc;
 use std::time::{Duration, Instant};
 
 use scanhub_client::clock;
-use scanhub_client::streams::{Sample, Session, Who};
-use scanhub_schema::{Failure, Kind, Maker, Topic, Verdict};
+use scanhub_client::streams::{DomainHolder, Sample, Session};
+use scanhub_schema::{Failure, Kind, PublisherKind, Topic, Verdict};
 use scanhub_shm::Domain;
-use scanhub_verbs::follow::{Event, Following, Notice};
+use scanhub_verbs::follow::{Event, Notice, TopicRun};
 use scanhub_verbs::names::TopicName;
-use scanhub_verbs::output::End;
+use scanhub_verbs::output::ExitReason;
 
 use super::Reporter;
 use super::channels::{SensorChannels, TiltChannels};
@@ -35,7 +35,7 @@ const STATUS_INTERVAL: Duration = Duration::from_millis(500);
 pub(super) struct Feed<'a> {
     channels: &'a ChannelStore,
     /// Locations where the domain may be.
-    places: &'a [Domain],
+    locations: &'a [Domain],
     live: LiveScene,
     sensors: SensorFeed<'a>,
     trackers: BTreeMap<String, ChannelPublisher<'a>>,
@@ -49,7 +49,7 @@ pub(super) struct Feed<'a> {
 impl<'a> Feed<'a> {
     pub(super) fn new(
         channels: &'a ChannelStore,
-        places: &'a [Domain],
+        locations: &'a [Domain],
         player: Option<&'a dyn Playback>,
         reporter: Reporter<'a>,
     ) -> Feed<'a> {
@@ -57,7 +57,7 @@ impl<'a> Feed<'a> {
         let player = player.map(|player| PlayerFeed::new(player, channels, now));
         Feed {
             channels,
-            places,
+            locations,
             live: LiveScene::default(),
             trackers: BTreeMap::new(),
             tilted: TiltChannels::new(channels),
@@ -86,10 +86,14 @@ impl<'a> Feed<'a> {
     /// Removes messages whose contents the scene has deleted.
     fn clear(&mut self) {
         let scene = &self.live.scene;
-        scene.sensors.iter().filter(|seen| seen.scan.is_none()).for_each(|seen| self.sensors.clear(seen));
+        scene
+            .sensors
+            .iter()
+            .filter(|sensor| sensor.scan.is_none())
+            .for_each(|sensor| self.sensors.clear(sensor));
         for (tracker, channel) in &self.trackers {
             let mut trackers = scene.trackers.iter();
-            if !trackers.any(|(name, people)| name == tracker && !people.persons().is_empty()) {
+            if !trackers.any(|(name, people)| name == tracker && !people.people().is_empty()) {
                 channel.clear();
             }
         }
@@ -101,33 +105,33 @@ impl<'a> Feed<'a> {
         let wall_ns = clock::wall_ns();
         self.overlays.publish(&self.live.scene, now, wall_ns);
         if !self.overlays.lines.channel.is_subscribed() {
-            self.live.scene.forget_lines();
+            self.live.scene.delete_lines();
         }
         if self.sensors.is_due(now) {
-            self.robot.problem = problem(&self.live.scene, self.places);
+            self.robot.problem = problem(&self.live.scene, self.locations);
             self.live.measure_hub(now);
             self.sensors.publish(&self.live.scene, now, wall_ns);
         }
-        let domain = self.places.first().map(Domain::name).unwrap_or_default();
+        let domain = self.locations.first().map(Domain::name).unwrap_or_default();
         self.robot.publish(&self.live.scene, domain, now, wall_ns);
     }
 }
 
 impl Feed<'_> {
     /// Takes what arrives until the run ends.
-    pub(super) fn follow(&mut self, following: &mut Following<'_>) -> Result<(), End> {
+    pub(super) fn follow(&mut self, following: &mut TopicRun<'_>) -> Result<(), ExitReason> {
         loop {
-            following.want(Topic::Lines, self.overlays.lines.channel.is_subscribed());
-            for topic in [Maker::Mount, Maker::Tilted].iter().flat_map(|maker| maker.topics()) {
-                following.want(*topic, self.tilted.wants(*topic));
+            following.set_subscribed(Topic::Lines, self.overlays.lines.channel.is_subscribed());
+            for topic in [PublisherKind::Mount, PublisherKind::Tilted].iter().flat_map(|kind| kind.topics()) {
+                following.set_subscribed(*topic, self.tilted.needs(*topic));
             }
             let Some(event) = following.next(None)? else { return Ok(()) };
             match event {
-                Event::Begun(name) => self.begin(&name),
+                Event::Added(name) => self.begin(&name),
                 Event::Sample(name, sample, _) => self.sample(&name, &sample),
                 Event::Notice(names, notice) => self.notice(&names, &notice)?,
                 // The topics that are followed already stay.
-                Event::Short(name, failure) => self.reporter.not_served(&name, &failure)?,
+                Event::ResourceExhausted(name, failure) => self.reporter.not_served(&name, &failure)?,
                 Event::Tick(now) => {
                     if following.is_caught_up() {
                         self.live.expire_joins();
@@ -141,16 +145,16 @@ impl Feed<'_> {
 
     fn begin(&mut self, name: &TopicName) {
         self.live.begin(name);
-        match name.topic.maker() {
-            Maker::Link => drop(self.sensors.channels_of(&name.sensor)),
-            Maker::Tracker => drop(self.tracker(&name.sensor)),
-            Maker::Mount | Maker::Tilted => self.tilted.begin(name),
+        match name.topic.publisher_kind() {
+            PublisherKind::Link => drop(self.sensors.channels_of(&name.sensor)),
+            PublisherKind::Tracker => drop(self.tracker(&name.sensor)),
+            PublisherKind::Mount | PublisherKind::Tilted => self.tilted.begin(name),
         }
         self.sensors.are_poses_new = true;
     }
 
     fn sample(&mut self, name: &TopicName, sample: &Sample) {
-        if let Maker::Mount | Maker::Tilted = name.topic.maker() {
+        if let PublisherKind::Mount | PublisherKind::Tilted = name.topic.publisher_kind() {
             return self.tilted.publish(name, sample);
         }
         // Only these topics have poses.
@@ -176,8 +180,8 @@ impl Feed<'_> {
         }
     }
 
-    fn notice(&mut self, names: &[Rc<TopicName>], notice: &Notice) -> Result<(), End> {
-        self.live.note(names, notice);
+    fn notice(&mut self, names: &[Rc<TopicName>], notice: &Notice) -> Result<(), ExitReason> {
+        self.live.take_notice(names, notice);
         if let Notice::NoHub(failure) = notice {
             self.reporter.no_hub(failure)?;
         }
@@ -188,10 +192,10 @@ impl Feed<'_> {
         Ok(())
     }
 
-    fn tick(&mut self, now: Instant) -> Result<(), End> {
+    fn tick(&mut self, now: Instant) -> Result<(), ExitReason> {
         self.reporter.report_events()?;
         let is_held = self.player.as_mut().is_some_and(|player| player.publish(now).is_held());
-        if !is_held && self.live.age() {
+        if !is_held && self.live.expire() {
             self.clear();
         }
         self.publish(now);
@@ -205,24 +209,24 @@ fn placements(scene: &Scene) -> Vec<SensorPlacement> {
 }
 
 /// Returns why the scene is empty: no hub runs, or it has no sensors.
-fn problem(scene: &Scene, places: &[Domain]) -> Option<Problem> {
-    if scene.hub_lives {
+fn problem(scene: &Scene, locations: &[Domain]) -> Option<Problem> {
+    if scene.hub_is_running {
         let what = || "the hub has no sensors".to_owned();
         let remedy = || "scanhub run --link front=/dev/ttyUSB0".to_owned();
-        return scene.sensors.is_empty().then(|| Problem { what: what(), remedy: remedy() });
+        return scene.sensors.is_empty().then(|| Problem { description: what(), remedy: remedy() });
     }
-    let mut session = Session::new(places.to_vec());
-    let failure = session.look().err().map(Failure::from);
-    let Failure { message, hint, .. } = match session.publishes() {
+    let mut session = Session::new(locations.to_vec());
+    let failure = session.check_hub().err().map(Failure::from);
+    let Failure { message, hint, .. } = match session.domain_holder() {
         None => failure.unwrap_or_else(|| session.no_hub_here().into()),
-        Some(Who::Hub) => return None,
-        Some(Who::Listener) => Failure::new(
+        Some(DomainHolder::Hub) => return None,
+        Some(DomainHolder::Listener) => Failure::new(
             Kind::NoTopic,
             "no sensor of another machine is published here yet",
             "on that machine: scanhub gateway --interface NAME; here, scanhub listen shows who sends",
         ),
     };
-    Some(Problem { what: message, remedy: hint })
+    Some(Problem { description: message, remedy: hint })
 }
 
 /// Channels of all sensors, and the channel of their poses.
@@ -259,12 +263,15 @@ impl<'a> SensorFeed<'a> {
             self.poses.publish(wall_ns, &messages::transforms(scene, wall_ns));
         }
         self.publish_at = now + STATUS_INTERVAL;
-        scene.sensors.iter().for_each(|seen| self.channels_of(&seen.name).publish_status(wall_ns, seen));
+        scene
+            .sensors
+            .iter()
+            .for_each(|sensor| self.channels_of(&sensor.name).publish_status(wall_ns, sensor));
     }
 
     /// Removes the scans of a sensor.
-    fn clear(&self, seen: &Sensor) {
-        self.sensors.get(&seen.name).into_iter().for_each(SensorChannels::clear);
+    fn clear(&self, sensor: &Sensor) {
+        self.sensors.get(&sensor.name).into_iter().for_each(SensorChannels::clear);
     }
 }
 
@@ -318,10 +325,10 @@ impl<'a> Overlays<'a> {
 
     fn publish(&mut self, scene: &Scene, now: Instant, wall_ns: u64) {
         if self.zones.take_due(now) {
-            let around = circles(scene.robot().map(|(_, sensor)| sensor));
-            let is_unchanged = around == self.circles && !around.iter().any(Circle::is_violated);
+            let zone_circles = circles(scene.robot().map(|(_, sensor)| sensor));
+            let is_unchanged = zone_circles == self.circles && !zone_circles.iter().any(Circle::is_violated);
             if !is_unchanged || now >= self.repeat_at {
-                (self.circles, self.repeat_at) = (around, now + CIRCLES_INTERVAL);
+                (self.circles, self.repeat_at) = (zone_circles, now + CIRCLES_INTERVAL);
                 self.zones.channel.publish(wall_ns, &messages::zones(scene, wall_ns));
             }
         }
@@ -356,7 +363,7 @@ impl<'a> RobotFeed<'a> {
             return;
         }
         let (verdict, sensor, _) = verdict(scene.robot().map(|(_, sensor)| sensor));
-        let current = (verdict, sensor.map(str::to_owned), scene.hub_lives);
+        let current = (verdict, sensor.map(str::to_owned), scene.hub_is_running);
         if now >= self.repeat_at || current != self.published {
             self.channel.publish(wall_ns, &messages::robot(scene, domain, self.problem.as_ref()));
             (self.published, self.repeat_at) = (current, now + ROBOT_INTERVAL);

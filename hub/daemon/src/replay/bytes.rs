@@ -3,12 +3,12 @@
 
 use std::io::Read;
 
-use scanhub_drivers::line::{Event, Output, Protocol as _};
+use scanhub_drivers::line::{Action, Event, Protocol as _};
 use scanhub_drivers::{PortSession, Settings};
 use scanhub_schema::{Failure, MILLIS, Nanos, State};
 
 use super::recorded::{Stream, read};
-use super::{Pace, ReplayLink, VALID_UNTIL_NEXT};
+use super::{ReplayLink, ReplayTiming, VALID_UNTIL_NEXT};
 use crate::link_output::RecordedMetadata;
 use crate::platform::Platform;
 
@@ -38,10 +38,10 @@ impl<'f> BytesLap<'f> {
     ///
     /// Returns [`Kind::Input`](scanhub_schema::Kind) if the file cannot be opened.
     pub(super) fn new<S: Platform>(
-        replay: &ReplayLink<'_, S, impl Pace<S>>,
+        replay: &ReplayLink<'_, S, impl ReplayTiming<S>>,
         stream: &'f Stream,
     ) -> Result<Self, Failure> {
-        let (start_ns, end_ns) = replay.pace.part();
+        let (start_ns, end_ns) = replay.timing.range();
         let link = &replay.link;
         let settings = Settings { mode_number: stream.mode, ..link.link.settings() };
         Ok(BytesLap {
@@ -64,17 +64,20 @@ impl<'f> BytesLap<'f> {
         (!is_over).then_some(self.media)
     }
 
-    pub(super) fn step<S: Platform>(&mut self, replay: &mut ReplayLink<'_, S, impl Pace<S>>) -> Option<()> {
+    pub(super) fn step<S: Platform>(
+        &mut self,
+        replay: &mut ReplayLink<'_, S, impl ReplayTiming<S>>,
+    ) -> Option<()> {
         let BytesLap { stream, bytes, read_len, session, recorded, media, .. } = self;
         let is_skipped = *media < self.start_ns;
         if is_skipped {
-            if !replay.pass() {
+            if !replay.continue_skipping() {
                 return None;
             }
         } else {
-            recorded.stretch = replay.wait_turn(Some(session), *media, self.state)?.stretch;
+            recorded.stretch = replay.wait_until_due(Some(session), *media, self.state)?.stretch;
         }
-        let room = session.spare();
+        let room = session.read_buffer();
         let chunk_len = room.len().min(CHUNK_LEN);
         let len = read(&mut **bytes, &mut room[..chunk_len]);
         *read_len += len as u64;
@@ -84,29 +87,32 @@ impl<'f> BytesLap<'f> {
             // Without further bytes, the session has no reason to hold a telegram back.
             session.handle_timeout(now + HOLD_TIME);
         }
-        while let Output::Event(Event::Telegram(received)) = session.poll_output() {
+        while let Action::Event(Event::Telegram(received)) = session.poll_action() {
             if !is_skipped {
                 recorded.measured_ns = Some(*media);
                 self.lifetime = replay.link.publish(&received, recorded, false).or(self.lifetime);
                 replay.link.output.extend_verdict(VALID_UNTIL_NEXT);
-                replay.pace.played(*media);
-            } else if let Some(scan) = received.whole.and_then(|whole| whole.scan) {
+                replay.timing.note_played(*media);
+            } else if let Some(scan) = received.contents.and_then(|whole| whole.scan) {
                 replay.link.output.learn(&scan, *media);
             }
             if !received.is_reply {
-                *media += stream.period(received.whole.map_or(0, |whole| whole.beams));
+                *media += stream.period(received.contents.map_or(0, |whole| whole.beams));
             }
         }
         if !is_skipped {
-            replay.link.show(Some(session), self.state, &replay.problem);
+            replay.link.publish_status(Some(session), self.state, &replay.problem);
         }
         self.is_over = len == 0;
         Some(())
     }
 
     /// Returns how long the last verdict stays valid.
-    pub(super) fn end<S: Platform>(&self, replay: &mut ReplayLink<'_, S, impl Pace<S>>) -> Option<Nanos> {
-        replay.link.stats.close(&self.session);
+    pub(super) fn end<S: Platform>(
+        &self,
+        replay: &mut ReplayLink<'_, S, impl ReplayTiming<S>>,
+    ) -> Option<Nanos> {
+        replay.link.stats.close_session(&self.session);
         self.lifetime
     }
 }

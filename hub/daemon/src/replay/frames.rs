@@ -8,15 +8,15 @@
 use std::iter::Peekable;
 
 use scanhub_drivers::PortSession;
-use scanhub_drivers::line::{Event, RawScan, Received, Session as _, suspect};
+use scanhub_drivers::line::{Event, RawScan, ReceivedTelegram, ScannerSession as _, suspect};
 use scanhub_recording::{Frame, VirtualTime};
 use scanhub_schema::{Failure, Flags, Header, MILLIS, Nanos, State};
 
 use super::recorded::{Frames, Timeline};
-use super::{LATEST, MAX_GAP, Pace, ReplayLink, VALID_UNTIL_NEXT};
+use super::{MAX_GAP, MAX_STAMP, ReplayLink, ReplayTiming, VALID_UNTIL_NEXT};
 use crate::link_output::{RecordedMetadata, micros, verdict_lifetime};
 use crate::platform::Platform;
-use crate::player::Due;
+use crate::player::DueTime;
 
 /// One pass through telegrams or packets.
 pub(crate) struct FramesLap<'f> {
@@ -31,7 +31,7 @@ pub(crate) struct FramesLap<'f> {
     /// Number of frames that were read.
     pub(super) read_frames: u64,
     /// Frames of a scanner of another family.
-    foreign: u64,
+    foreign_frames: u64,
     /// Run of the hub that recorded the last frame.
     run: Option<u64>,
     has_begun: bool,
@@ -41,17 +41,17 @@ pub(crate) struct FramesLap<'f> {
     session: Option<VirtualTime<PortSession>>,
     /// Stamp of the last published frame; stamps never go back.
     last_stamp: Nanos,
-    verdict: Option<Verdict>,
+    verdict: Option<PendingVerdict>,
     /// Duration for which the last published verdict stays valid.
-    limit: Option<Nanos>,
+    verdict_lifetime: Option<Nanos>,
     state: State,
 }
 
 /// Validity of the verdict on the last scan.
 #[derive(Clone, Copy)]
-struct Verdict {
+struct PendingVerdict {
     /// Media time of that scan.
-    of: Nanos,
+    media: Nanos,
     /// End of its validity, by the clock of the hub that recorded it.
     until_ns: Nanos,
     /// That end as media time.
@@ -60,7 +60,7 @@ struct Verdict {
 
 /// Times of a frame.
 #[derive(Clone, Copy)]
-struct When {
+struct FrameTime {
     /// Stamps by the clock of the hub that recorded it.
     first: Nanos,
     last: Nanos,
@@ -79,10 +79,10 @@ impl<'f> FramesLap<'f> {
     ///
     /// Returns [`Kind::Input`](scanhub_schema::Kind) if the file cannot be opened.
     pub(super) fn new<S: Platform>(
-        replay: &ReplayLink<'_, S, impl Pace<S>>,
+        replay: &ReplayLink<'_, S, impl ReplayTiming<S>>,
         frames: &'f Frames,
     ) -> Result<Self, Failure> {
-        let (start_ns, end_ns) = replay.pace.part();
+        let (start_ns, end_ns) = replay.timing.range();
         let mut lap = FramesLap {
             frames,
             read: frames.read()?.peekable(),
@@ -91,14 +91,14 @@ impl<'f> FramesLap<'f> {
             start_ns,
             end_ns,
             read_frames: 0,
-            foreign: 0,
+            foreign_frames: 0,
             run: None,
             has_begun: false,
             understood_from: 0,
             session: None,
             last_stamp: 0,
             verdict: None,
-            limit: None,
+            verdict_lifetime: None,
             state: if frames.is_whole { State::Streaming } else { State::Starting },
         };
         lap.advance();
@@ -106,55 +106,61 @@ impl<'f> FramesLap<'f> {
     }
 
     pub(super) fn next_media(&self) -> Option<Nanos> {
-        let when = self.next_when()?;
-        let stale = self.verdict.filter(|verdict| verdict.until_ns < when.last && !when.is_skipped);
-        Some(stale.map_or(when.media, |verdict| self.stale_at(&verdict, when)))
+        let time = self.next_time()?;
+        let stale = self.verdict.filter(|verdict| verdict.until_ns < time.last && !time.is_skipped);
+        Some(stale.map_or(time.media, |verdict| self.stale_at(&verdict, time)))
     }
 
     /// Returns the times of the next frame; `None` at the end.
-    fn next_when(&self) -> Option<When> {
+    fn next_time(&self) -> Option<FrameTime> {
         let (frame, media) = self.next.as_ref()?;
-        Some(When::of(frame, *media, *media < self.start_ns))
+        Some(FrameTime::of(frame, *media, *media < self.start_ns))
     }
 
     /// Returns the media time at which `verdict` becomes stale, if the frame at `when` ends after it.
-    fn stale_at(&self, verdict: &Verdict, when: When) -> Nanos {
-        verdict.until.clamp(self.start_ns, when.media)
+    fn stale_at(&self, verdict: &PendingVerdict, time: FrameTime) -> Nanos {
+        verdict.until.clamp(self.start_ns, time.media)
     }
 
-    pub(super) fn step<S: Platform>(&mut self, replay: &mut ReplayLink<'_, S, impl Pace<S>>) -> Option<()> {
-        let Some(when) = self.next_when() else { return Some(()) };
-        if let Some(verdict) = self.verdict.take_if(|verdict| verdict.until_ns < when.last) {
-            return self.note_silence(replay, verdict, when);
+    pub(super) fn step<S: Platform>(
+        &mut self,
+        replay: &mut ReplayLink<'_, S, impl ReplayTiming<S>>,
+    ) -> Option<()> {
+        let Some(time) = self.next_time() else { return Some(()) };
+        if let Some(verdict) = self.verdict.take_if(|verdict| verdict.until_ns < time.last) {
+            return self.note_silence(replay, verdict, time);
         }
         let Some((frame, _)) = self.next.take() else { return Some(()) };
-        self.note_run(replay, &frame, when);
+        self.note_run(replay, &frame, time);
         if self.frames.is_whole {
-            let beams = self.play_telegram(replay, &frame, when)?;
+            let beams = self.play_telegram(replay, &frame, time)?;
             if !self.frames.has_stamps() && frame.is_scan() {
-                self.timeline.pass(self.frames.period(beams));
+                self.timeline.advance(self.frames.period(beams));
             }
         } else {
-            self.play_packets(replay, &frame, when)?;
+            self.play_packets(replay, &frame, time)?;
         }
         self.advance();
         Some(())
     }
 
     /// Returns how long the last verdict stays valid.
-    pub(super) fn end<S: Platform>(&self, replay: &mut ReplayLink<'_, S, impl Pace<S>>) -> Option<Nanos> {
-        if self.foreign > 0 {
+    pub(super) fn end<S: Platform>(
+        &self,
+        replay: &mut ReplayLink<'_, S, impl ReplayTiming<S>>,
+    ) -> Option<Nanos> {
+        if self.foreign_frames > 0 {
             tracing::warn!(
                 "{}: {} telegrams are dropped, because their scanner is not of family {}",
                 replay.link.link.name,
-                self.foreign,
+                self.foreign_frames,
                 self.frames.family.name()
             );
         }
         if let Some(session) = self.shown_session() {
-            replay.link.stats.close(session);
+            replay.link.stats.close_session(session);
         }
-        self.limit
+        self.verdict_lifetime
     }
 
     /// Reads the next frame of the scanner's family.
@@ -163,7 +169,7 @@ impl<'f> FramesLap<'f> {
         for frame in self.read.by_ref() {
             self.read_frames += 1;
             if frame.header.is_some_and(|header| header.family != self.frames.family as u8) {
-                self.foreign += 1;
+                self.foreign_frames += 1;
                 continue;
             }
             let media = self.timeline.media(&frame);
@@ -178,19 +184,19 @@ impl<'f> FramesLap<'f> {
     /// end.
     fn note_silence<S: Platform>(
         &mut self,
-        replay: &mut ReplayLink<'_, S, impl Pace<S>>,
-        verdict: Verdict,
-        when: When,
+        replay: &mut ReplayLink<'_, S, impl ReplayTiming<S>>,
+        verdict: PendingVerdict,
+        time: FrameTime,
     ) -> Option<()> {
-        if when.is_skipped {
+        if time.is_skipped {
             replay.link.output.note_silence();
             return Some(());
         }
-        let at = self.stale_at(&verdict, when);
-        let due = replay.wait_turn(self.shown_session(), at, self.state)?;
+        let at = self.stale_at(&verdict, time);
+        let due = replay.wait_until_due(self.shown_session(), at, self.state)?;
         replay.link.output.publish_stale(due.at);
         // A scan that was lost on the line makes the verdict stale, and the sensor not silent.
-        if when.media.saturating_sub(verdict.of) >= SILENCE.max(verdict.until - verdict.of) {
+        if time.media.saturating_sub(verdict.media) >= SILENCE_TIME.max(verdict.until - verdict.media) {
             self.state = State::Silent;
         }
         Some(())
@@ -199,28 +205,28 @@ impl<'f> FramesLap<'f> {
     /// Resets the processors if another run of the hub recorded `frame`, because a hub starts without learned data.
     fn note_run<S: Platform>(
         &mut self,
-        replay: &mut ReplayLink<'_, S, impl Pace<S>>,
+        replay: &mut ReplayLink<'_, S, impl ReplayTiming<S>>,
         frame: &Frame,
-        when: When,
+        time: FrameTime,
     ) {
         let run = frame.header.map(|header| header.boot);
         if !self.has_begun || self.run != run {
             if std::mem::replace(&mut self.has_begun, true) {
                 self.verdict = None;
-                if when.is_skipped { replay.link.output.reset() } else { replay.restart() }
+                if time.is_skipped { replay.link.output.reset() } else { replay.restart() }
             }
             if let Some(session) = self.shown_session() {
-                replay.link.stats.close(session);
+                replay.link.stats.close_session(session);
                 (self.session, self.state) = (None, State::Starting);
             }
             self.run = run;
-            self.understood_from = frame.header.map_or(0, |header| self.frames.understood_from(&header));
+            self.understood_from = frame.header.map_or(0, |header| self.frames.first_understood(&header));
         }
         self.session.get_or_insert_with(|| {
             let link = replay.link.link;
             let settings = self.frames.settings(link);
-            let session = PortSession::begin(Some(self.frames.family), &settings, None, when.first);
-            VirtualTime::new(session, when.first)
+            let session = PortSession::begin(Some(self.frames.family), &settings, None, time.first);
+            VirtualTime::new(session, time.first)
         });
     }
 
@@ -232,13 +238,13 @@ impl<'f> FramesLap<'f> {
     /// Waits until the frame at `when` is due: `Some(None)` if it is skipped, `None` if the hub must end.
     fn wait<S: Platform>(
         &mut self,
-        replay: &mut ReplayLink<'_, S, impl Pace<S>>,
-        when: When,
-    ) -> Option<Option<Due>> {
-        if when.is_skipped {
-            return replay.pass().then_some(None);
+        replay: &mut ReplayLink<'_, S, impl ReplayTiming<S>>,
+        time: FrameTime,
+    ) -> Option<Option<DueTime>> {
+        if time.is_skipped {
+            return replay.continue_skipping().then_some(None);
         }
-        let due = replay.wait_turn(self.shown_session(), when.media, self.state)?;
+        let due = replay.wait_until_due(self.shown_session(), time.media, self.state)?;
         self.last_stamp = due.at.max(self.last_stamp);
         Some(Some(due))
     }
@@ -247,9 +253,9 @@ impl<'f> FramesLap<'f> {
     /// `None` if the hub must end.
     fn play_telegram<S: Platform>(
         &mut self,
-        replay: &mut ReplayLink<'_, S, impl Pace<S>>,
+        replay: &mut ReplayLink<'_, S, impl ReplayTiming<S>>,
         frame: &Frame,
-        when: When,
+        when: FrameTime,
     ) -> Option<usize> {
         let due = self.wait(replay, when)?;
         let header = frame.header;
@@ -259,12 +265,12 @@ impl<'f> FramesLap<'f> {
         let Some(received) = session.read_recorded(&frame.telegram, is_readable, status) else {
             return Some(0);
         };
-        let whole = received.whole?;
+        let whole = received.contents?;
         match due {
             None => whole.scan.iter().for_each(|scan| replay.link.output.learn(scan, when.first)),
             Some(due) => {
                 let at = self.last_stamp;
-                let received = Received {
+                let received = ReceivedTelegram {
                     first: at.saturating_sub(when.last - when.first),
                     last: at,
                     estimated: header.is_some_and(|header| header.flags & Flags::STAMP_ESTIMATED != 0),
@@ -272,24 +278,25 @@ impl<'f> FramesLap<'f> {
                     ..received
                 };
                 replay.link.stats.note_recorded(received.bytes.len());
-                let gap = self.read.peek().and_then(|next| gap(frame, next));
+                let gap = self.read.peek().and_then(|next| time_to_next(frame, next));
                 let recorded = RecordedMetadata {
                     period_us: header.map(|header| header.period_us),
                     gap_us: gap.map_or(0, |gap| (gap / 1000) as u32),
                     stretch: due.stretch,
                     measured_ns: Some(when.first),
-                    ..recorded(frame)
+                    ..recorded_metadata(frame)
                 };
-                self.limit = replay.link.publish(&received, &recorded, false).or(self.limit);
+                self.verdict_lifetime =
+                    replay.link.publish(&received, &recorded, false).or(self.verdict_lifetime);
                 replay.link.output.extend_verdict(VALID_UNTIL_NEXT);
-                replay.pace.played(when.begin);
+                replay.timing.note_played(when.begin);
                 self.state = State::Streaming;
-                replay.link.show(None, self.state, &replay.problem);
+                replay.link.publish_status(None, self.state, &replay.problem);
             }
         }
         // A scan whose values could not be read had no verdict.
         if whole.scan.is_some() {
-            self.verdict = header.map(|header| Verdict::of(&header, when.begin)).or(self.verdict);
+            self.verdict = header.map(|header| PendingVerdict::of(&header, when.begin)).or(self.verdict);
         }
         Some(whole.beams)
     }
@@ -297,16 +304,16 @@ impl<'f> FramesLap<'f> {
     /// Plays packets of a rotating scanner, and the revolutions that end with them. Returns `None` if the hub must end.
     fn play_packets<S: Platform>(
         &mut self,
-        replay: &mut ReplayLink<'_, S, impl Pace<S>>,
+        replay: &mut ReplayLink<'_, S, impl ReplayTiming<S>>,
         frame: &Frame,
-        when: When,
+        when: FrameTime,
     ) -> Option<()> {
         let at = self.wait(replay, when)?.map(|due| {
-            let recorded = RecordedMetadata { stretch: due.stretch, ..recorded(frame) };
+            let recorded = RecordedMetadata { stretch: due.stretch, ..recorded_metadata(frame) };
             (self.last_stamp, recorded)
         });
         if let Some((at, recorded)) = &at {
-            let received = Received {
+            let received = ReceivedTelegram {
                 bytes: &frame.telegram,
                 first: at.saturating_sub(when.last - when.first),
                 last: *at,
@@ -315,62 +322,62 @@ impl<'f> FramesLap<'f> {
                 count: 0,
                 is_checked: false,
                 is_reply: false,
-                whole: None,
+                contents: None,
             };
             replay.link.publish(&received, recorded, false);
-            replay.pace.played(when.begin);
+            replay.timing.note_played(when.begin);
         }
-        let FramesLap { session, verdict, limit: last_limit, state, .. } = self;
+        let FramesLap { session, verdict, verdict_lifetime: last_limit, state, .. } = self;
         let session = session.as_mut()?;
         // As on a line, an error of the line concerns the packets alone, not the revolution.
         session.session_mut().mark_suspect(frame.reasons & !suspect::LINE_ERROR);
         session.take(when.last, &frame.telegram, |event| {
             let Event::Scan(scan) = event else { return };
             let Some((at, recorded)) = at else { return replay.link.output.learn(&scan, scan.first) };
-            let here = |stamp: Nanos| at.saturating_sub(when.last.saturating_sub(stamp));
+            let in_media_time = |stamp: Nanos| at.saturating_sub(when.last.saturating_sub(stamp));
             let wall_ns = recorded.wall_ns.map(|ns| ns.saturating_add(scan.first).saturating_sub(when.first));
-            let (first, last) = (here(scan.first), here(scan.last));
+            let (first, last) = (in_media_time(scan.first), in_media_time(scan.last));
             let recorded = RecordedMetadata { wall_ns, measured_ns: Some(scan.first), ..recorded };
             *last_limit = Some(replay.link.publish_scan(&RawScan { first, last, ..scan }, &recorded, false));
             replay.link.output.extend_verdict(VALID_UNTIL_NEXT);
             let valid = verdict_lifetime(micros(scan.period));
             let (until_ns, until) = (when.last.saturating_add(valid), when.media.saturating_add(valid));
-            *verdict = Some(Verdict { of: when.media, until_ns, until });
+            *verdict = Some(PendingVerdict { media: when.media, until_ns, until });
             *state = State::Streaming;
         });
         if !when.is_skipped {
-            replay.link.show(Some(session.session()), *state, &replay.problem);
+            replay.link.publish_status(Some(session.session()), *state, &replay.problem);
         }
         Some(())
     }
 }
 
-impl Verdict {
+impl PendingVerdict {
     /// Returns how long the verdict on the scan with `header`, at `media`, was valid in the hub that recorded it.
-    fn of(header: &Header, media: Nanos) -> Verdict {
+    fn of(header: &Header, media: Nanos) -> PendingVerdict {
         let published = header.stamp_last_ns.saturating_add(header.hub_time_ns().unwrap_or(0));
         let until_ns = published.saturating_add(verdict_lifetime(header.period_us));
         let after = until_ns.saturating_sub(header.stamp_first_ns);
-        Verdict { of: media, until_ns, until: media.saturating_add(after) }
+        PendingVerdict { media, until_ns, until: media.saturating_add(after) }
     }
 }
 
-impl When {
+impl FrameTime {
     /// Returns the times of `frame`, which begins at `begin`. A frame without stamps has a clock that starts at
-    /// [`BEGIN`].
-    fn of(frame: &Frame, begin: Nanos, is_skipped: bool) -> When {
-        let begun = BEGIN.saturating_add(begin);
+    /// [`CLOCK_START`].
+    fn of(frame: &Frame, begin: Nanos, is_skipped: bool) -> FrameTime {
+        let start = CLOCK_START.saturating_add(begin);
         let (first, last) =
-            frame.header.map_or((begun, begun), |header| (header.stamp_first_ns, header.stamp_last_ns));
-        let (first, last) = (first.min(LATEST), last.min(LATEST));
-        let took = last.saturating_sub(first);
+            frame.header.map_or((start, start), |header| (header.stamp_first_ns, header.stamp_last_ns));
+        let (first, last) = (first.min(MAX_STAMP), last.min(MAX_STAMP));
+        let duration = last.saturating_sub(first);
         // A hub has a frame with its last byte.
-        let media = begin.saturating_add(took.min(MAX_GAP));
-        When { first, last: last.max(first), begin, media, is_skipped }
+        let media = begin.saturating_add(duration.min(MAX_GAP));
+        FrameTime { first, last: last.max(first), begin, media, is_skipped }
     }
 }
 
-fn recorded(frame: &Frame) -> RecordedMetadata {
+fn recorded_metadata(frame: &Frame) -> RecordedMetadata {
     RecordedMetadata {
         wall_ns: frame.wall_ns,
         flags: frame.header.map_or(0, |header| header.flags & Flags::SIMULATED),
@@ -379,7 +386,7 @@ fn recorded(frame: &Frame) -> RecordedMetadata {
 }
 
 /// Returns the time to the next scan of a log, which may leave scans out. Until then, nothing newer can be known.
-fn gap(frame: &Frame, next: &Frame) -> Option<Nanos> {
+fn time_to_next(frame: &Frame, next: &Frame) -> Option<Nanos> {
     if frame.header.is_some() {
         return None;
     }
@@ -388,6 +395,6 @@ fn gap(frame: &Frame, next: &Frame) -> Option<Nanos> {
 }
 
 /// A scanner is silent after this time without a scan.
-const SILENCE: Nanos = 1_000 * MILLIS;
+const SILENCE_TIME: Nanos = 1_000 * MILLIS;
 /// Time at which the clock of a frame without stamps starts: that of a machine that has run for a while.
-pub(crate) const BEGIN: Nanos = 10_000_000_000;
+pub(crate) const CLOCK_START: Nanos = 10_000_000_000;

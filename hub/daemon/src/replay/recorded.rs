@@ -12,7 +12,7 @@ use scanhub_schema::{Failure, Family, Header, Kind, Nanos};
 use super::MAX_GAP;
 
 /// Recording of one sensor.
-pub(crate) enum Recorded {
+pub(crate) enum RecordedSensor {
     /// Bytes of a line, without stamps.
     Stream(Stream),
     /// Telegrams, or packets of a rotating scanner.
@@ -52,23 +52,23 @@ pub(crate) struct Origin {
     pub(crate) run: Option<(u64, Nanos)>,
 }
 
-impl Recorded {
+impl RecordedSensor {
     /// Opens the recording at `path`. If it has several sensors, the link plays the one with its name. A file without a
     /// telegram counts as a line with noise.
     ///
     /// # Errors
     ///
     /// Returns [`Kind::Input`] if it cannot be read, and [`Kind::Configuration`] if it has other sensors.
-    pub(crate) fn open(path: &Path, link: &Link) -> Result<Recorded, Failure> {
-        let recording = Recording::open_line(path, link.family())?;
+    pub(crate) fn open(path: &Path, link: &Link) -> Result<RecordedSensor, Failure> {
+        let recording = Recording::open_stream(path, link.family())?;
         log_damage(&recording);
         if recording.contents().sensors.len() > 1 {
             // The configuration names the sensor, not an argument of the user.
             let part = recording.of(&link.name);
             let part = part.map_err(|failure| Failure { kind: Kind::Configuration, ..failure })?;
-            return Recorded::new(part, link);
+            return RecordedSensor::new(part, link);
         }
-        Recorded::new(recording, link)
+        RecordedSensor::new(recording, link)
     }
 
     /// Creates the recording that `link` plays from `recording` of one sensor, and logs how the ranges of a log are
@@ -78,7 +78,7 @@ impl Recorded {
     ///
     /// Returns [`Kind::Input`] if this version does not have the family of the scanner, and [`Kind::Configuration`] if
     /// the family is not that of the link.
-    pub(crate) fn new(recording: Recording, link: &Link) -> Result<Recorded, Failure> {
+    pub(crate) fn new(recording: Recording, link: &Link) -> Result<RecordedSensor, Failure> {
         let family = check_family(&recording, link)?;
         if !features(family).has_whole_telegrams {
             let mut frames = Frames {
@@ -91,38 +91,38 @@ impl Recorded {
                 receives_mode: false,
             };
             frames.origin = frames.read()?.next().as_ref().and_then(Origin::of);
-            return Ok(Recorded::Frames(frames));
+            return Ok(RecordedSensor::Frames(frames));
         }
         log_encoding(&recording, &link.name);
         let mode = recording.contents().mode_or(configured_mode(link));
         log_mode(&recording, link);
         if recording.contents().form == Form::Telegrams {
-            return Ok(Recorded::Stream(Stream { recording, family, mode }));
+            return Ok(RecordedSensor::Stream(Stream { recording, family, mode }));
         }
         let encoding = recording.contents().encoding(mode);
         let mut frames =
             Frames { recording, family, is_whole: true, encoding, mode, origin: None, receives_mode: false };
-        let mut first = frames.read()?.take(MODE_WITHIN).peekable();
+        let mut first = frames.read()?.take(MAX_TELEGRAMS_TO_MODE).peekable();
         frames.origin = first.peek().and_then(Origin::of);
         let begin = first.peek().and_then(|frame| frame.header).filter(is_first);
-        let is_open = begin.is_some_and(|header| frames.recording.understood(header.boot).is_none());
-        frames.receives_mode = is_open && first.any(|frame| frame.tells_mode());
-        Ok(Recorded::Frames(frames))
+        let is_open = begin.is_some_and(|header| frames.recording.first_understood(header.boot).is_none());
+        frames.receives_mode = is_open && first.any(|frame| frame.has_mode());
+        Ok(RecordedSensor::Frames(frames))
     }
 
     /// Returns the family of the scanner.
     pub(crate) fn family(&self) -> Family {
         match self {
-            Recorded::Stream(stream) => stream.family,
-            Recorded::Frames(frames) => frames.family,
+            RecordedSensor::Stream(stream) => stream.family,
+            RecordedSensor::Frames(frames) => frames.family,
         }
     }
 
     /// Returns the sensor's type, if a status of the recording has it. The recording may also contain a scanner of
     /// another family, which is not played.
     pub(super) fn sensor_type(&self) -> Option<&str> {
-        let (Recorded::Stream(Stream { recording, family, .. })
-        | Recorded::Frames(Frames { recording, family, .. })) = self;
+        let (RecordedSensor::Stream(Stream { recording, family, .. })
+        | RecordedSensor::Frames(Frames { recording, family, .. })) = self;
         let (number, name) = recording.contents().sensor_type.as_ref()?;
         (*number == *family as u8).then_some(name.as_str())
     }
@@ -130,14 +130,14 @@ impl Recorded {
     /// Returns the start of its media time; `None` without stamps.
     pub(crate) fn origin(&self) -> Option<Origin> {
         match self {
-            Recorded::Stream(_) => None,
-            Recorded::Frames(frames) => frames.origin,
+            RecordedSensor::Stream(_) => None,
+            RecordedSensor::Frames(frames) => frames.origin,
         }
     }
 
     /// Sets the start of its media time to `origin`, which it shares with other recordings.
     pub(crate) fn set_origin(&mut self, origin: Origin) {
-        if let Recorded::Frames(frames) = self {
+        if let RecordedSensor::Frames(frames) = self {
             frames.origin = Some(origin);
         }
     }
@@ -149,8 +149,8 @@ impl Recorded {
 
     /// Returns a message if no scan of the recording can be read; otherwise an empty string.
     pub(crate) fn problem(&self, name: &str) -> String {
-        let (Recorded::Stream(Stream { mode, recording, .. })
-        | Recorded::Frames(Frames { mode, recording, .. })) = self;
+        let (RecordedSensor::Stream(Stream { mode, recording, .. })
+        | RecordedSensor::Frames(Frames { mode, recording, .. })) = self;
         if recording.contents().telegrams == 0 {
             return "there is no telegram in the recording".to_owned();
         }
@@ -162,7 +162,8 @@ impl Recorded {
 
     /// Returns messages about data that a replay leaves out or changes.
     pub(crate) fn losses(&self, name: &str) -> Vec<String> {
-        let (Recorded::Stream(Stream { recording, .. }) | Recorded::Frames(Frames { recording, .. })) = self;
+        let (RecordedSensor::Stream(Stream { recording, .. })
+        | RecordedSensor::Frames(Frames { recording, .. })) = self;
         let Contents { other_family, unencodable, .. } = recording.contents();
         let foreign = other_family.map(|_| {
             let family = self.family().name();
@@ -174,7 +175,8 @@ impl Recorded {
 
     /// Returns the media time of its end, if it is known.
     pub(crate) fn length(&self) -> Option<Nanos> {
-        let (Recorded::Stream(Stream { recording, .. }) | Recorded::Frames(Frames { recording, .. })) = self;
+        let (RecordedSensor::Stream(Stream { recording, .. })
+        | RecordedSensor::Frames(Frames { recording, .. })) = self;
         let contents = recording.contents();
         match (contents.span, self.begin_ns()) {
             (Some((_, last_ns)), Some(begin_ns)) => Some(last_ns.saturating_sub(begin_ns)),
@@ -186,7 +188,7 @@ impl Recorded {
     /// Returns the media time of its last telegram. A recording with stamps is read to its end for this.
     pub(crate) fn end(&self) -> Result<Nanos, Failure> {
         match self {
-            Recorded::Frames(frames) if frames.has_stamps() => {
+            RecordedSensor::Frames(frames) if frames.has_stamps() => {
                 let mut timeline = frames.timeline();
                 Ok(frames.read()?.map(|frame| timeline.media(&frame)).last().unwrap_or(0))
             }
@@ -250,15 +252,15 @@ impl Frames {
         if !self.is_whole && link.scanner.is_auto() {
             let model = self.recording.model().ok().flatten();
             settings.model = settings.model.or(model.map(|model| model.name));
-            settings.mode = settings.mode.or(self.recording.contents().way);
+            settings.mode = settings.mode.or(self.recording.contents().mode_name);
             settings.beams = settings.beams.or(self.recording.beams());
         }
         settings
     }
 
     /// Returns the number of the first telegram whose values the hub could read, in the run that starts with `header`.
-    pub(super) fn understood_from(&self, header: &Header) -> u64 {
-        let understood = is_first(header).then(|| self.recording.understood(header.boot));
+    pub(super) fn first_understood(&self, header: &Header) -> u64 {
+        let understood = is_first(header).then(|| self.recording.first_understood(header.boot));
         understood.flatten().unwrap_or(0)
     }
 
@@ -302,7 +304,7 @@ impl Timeline {
     /// Returns the media time of a sample of another program with this `header`. Its stamp and those of the telegrams before it
     /// in the recording are from the same clock. Returns `None` if it is before the first telegram, or if the machine was
     /// restarted after the last one: scans follow only when the hub of the new start has sent a telegram.
-    pub(super) fn media_beside(&self, header: &Header) -> Option<Nanos> {
+    pub(super) fn media_of_sample(&self, header: &Header) -> Option<Nanos> {
         let by_wall = i128::from(header.wall_ns) - self.wall_zero_ns;
         let by_stamp = self.run.map(|(_, zero_ns)| i128::from(header.stamp_first_ns) - zero_ns);
         let media = Nanos::try_from(by_stamp.unwrap_or(by_wall)).ok()?;
@@ -330,7 +332,7 @@ impl Timeline {
     }
 
     /// Advances by `period`, for a frame without a time.
-    pub(super) fn pass(&mut self, period: Nanos) {
+    pub(super) fn advance(&mut self, period: Nanos) {
         self.last = self.last.saturating_add(period);
     }
 
@@ -369,14 +371,14 @@ fn check_family(recording: &Recording, link: &Link) -> Result<Family, Failure> {
     {
         return Ok(family);
     }
-    let (place, number) = (recording.path().display(), recording.contents().family);
+    let (path, number) = (recording.path().display(), recording.contents().family);
     let Some(family) = recording.family() else {
-        let message = format!("recording {place} is of a scanner of family number {number}");
+        let message = format!("recording {path} is of a scanner of family number {number}");
         let hint = "a later version of scanhub recorded it: replay it with that";
         return Err(Failure::new(Kind::Input, message, hint));
     };
     let message = format!(
-        "recording {place} is of a scanner of family {}, and link {} is of family {}",
+        "recording {path} is of a scanner of family {}, and link {} is of family {}",
         family.name(),
         link.name,
         set.map_or("auto", Family::name)
@@ -391,7 +393,7 @@ fn log_mode(recording: &Recording, link: &Link) {
     if contents.mode.is_none()
         && configured_mode(link).is_none()
         && contents.scans > 0
-        && contents.readable().is_some()
+        && contents.readable_mode().is_some()
     {
         let name = &link.name;
         tracing::info!(
@@ -429,7 +431,7 @@ fn configured_mode(link: &Link) -> Option<u8> {
 }
 
 /// Number of telegrams within which a hub that found a streaming scanner has requested its mode.
-const MODE_WITHIN: usize = 500;
+const MAX_TELEGRAMS_TO_MODE: usize = 500;
 
 #[cfg(test)]
 mod tests {
@@ -468,7 +470,7 @@ mod tests {
     }
 
     #[test]
-    fn angles_follow_the_stamps_of_the_telegrams_before_them() {
+    fn mount_angles_are_timed_by_preceding_telegrams() {
         let header = |boot, wall_s: u64, stamp_s: u64| Header {
             boot,
             wall_ns: wall_s * SECOND,
@@ -479,7 +481,7 @@ mod tests {
         let first = telegram(1, 5000, 100);
         let mut timeline = Timeline::new(Origin::of(&first));
         let angle = |timeline: &Timeline, wall_s, stamp_s| {
-            timeline.media_beside(&header(9, wall_s, stamp_s)).map(|media| media / SECOND)
+            timeline.media_of_sample(&header(9, wall_s, stamp_s)).map(|media| media / SECOND)
         };
         assert_eq!(angle(&timeline, 4999, 99), None, "before the first telegram");
         timeline.media(&first);
@@ -497,7 +499,7 @@ mod tests {
     }
 
     #[test]
-    fn log_whose_clock_was_set_back_continues() {
+    fn log_continues_after_its_clock_was_set_back() {
         let walls = [5000, 5001, 5000, 5002, 10, 11, 12, 5000];
         let frames = walls.map(|wall_s| frame(wall_s, None));
         assert_eq!(medias(&frames), [0, 1, 1, 2, 2, 3, 4, 4992]);

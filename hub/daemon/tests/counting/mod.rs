@@ -7,25 +7,25 @@ use std::sync::atomic::{AtomicI32, AtomicI64, AtomicU64, Ordering::Relaxed};
 use rustix::thread::gettid;
 
 /// Counts what one thread asks for.
-struct Counting;
+struct CountingAllocator;
 
 /// The thread whose requests are counted; 0: nobody's.
-pub(crate) static WATCHED: AtomicI32 = AtomicI32::new(0);
+pub(crate) static WATCHED_THREAD: AtomicI32 = AtomicI32::new(0);
 /// Pieces taken.
-pub(crate) static TAKEN: AtomicU64 = AtomicU64::new(0);
+pub(crate) static ALLOCATIONS: AtomicU64 = AtomicU64::new(0);
 /// Bytes taken and not given back.
-pub(crate) static HELD: AtomicI64 = AtomicI64::new(0);
+pub(crate) static HELD_BYTES: AtomicI64 = AtomicI64::new(0);
 
-fn note(taken: u64, bytes: i64) {
-    let watched = WATCHED.load(Relaxed);
+fn note(allocations: u64, bytes: i64) {
+    let watched = WATCHED_THREAD.load(Relaxed);
     if watched != 0 && gettid().as_raw_nonzero().get() == watched {
-        TAKEN.fetch_add(taken, Relaxed);
-        HELD.fetch_add(bytes, Relaxed);
+        ALLOCATIONS.fetch_add(allocations, Relaxed);
+        HELD_BYTES.fetch_add(bytes, Relaxed);
     }
 }
 
 // SAFETY: every call goes to the system's allocator as it came; counting asks for no memory.
-unsafe impl GlobalAlloc for Counting {
+unsafe impl GlobalAlloc for CountingAllocator {
     // SAFETY: the caller keeps the promises of the trait, which are those of the system's allocator.
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         note(1, layout.size() as i64);
@@ -42,4 +42,4 @@ unsafe impl GlobalAlloc for Counting {
 }
 
 #[global_allocator]
-static ALLOCATOR: Counting = Counting;
+static ALLOCATOR: CountingAllocator = CountingAllocator;

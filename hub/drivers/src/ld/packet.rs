@@ -3,28 +3,28 @@
 
 use scanhub_schema::{MILLIS, Nanos};
 
-use crate::line::framing::Verdict;
+use crate::line::framing::FrameCheck;
 use crate::line::{self, Buffer, Point, suspect};
 
 /// Bytes of a packet.
-pub const LEN: usize = 47;
+pub const PACKET_LEN: usize = 47;
 /// Points of a packet.
-pub const POINTS: usize = 12;
+pub const POINTS_PER_PACKET: usize = 12;
 /// What every packet begins with: the start byte, and kind and number of points.
 pub const HEADER: [u8; 2] = [0x54, 0x2C];
 /// A turn in the packet's unit of angles, a hundredth of a degree.
-pub const TURN: u16 = 36_000;
+pub const FULL_CIRCLE: u16 = 36_000;
 /// The milliseconds of a packet begin again after so many.
-pub const CLOCK_TURN: u16 = 30_000;
+pub const CLOCK_PERIOD_MS: u16 = 30_000;
 /// The widest angle of a packet: a head that measures slower than it turns by so much is none.
-const WIDEST: u16 = 4_500;
+const MAX_SPAN: u16 = 4_500;
 /// The greatest range; greater values are codes.
-pub const LONGEST: u16 = 0xFFEF;
+pub const MAX_RANGE: u16 = 0xFFEF;
 
 /// A packet whose checksum is right and whose angles are angles.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Packet<'a> {
-    bytes: &'a [u8; LEN],
+    bytes: &'a [u8; PACKET_LEN],
 }
 
 /// Why bytes that begin like a packet are none.
@@ -42,23 +42,27 @@ impl<'a> Packet<'a> {
     /// # Errors
     ///
     /// They are none, for this reason.
-    pub fn check(bytes: &'a [u8; LEN]) -> Result<Packet<'a>, Reject> {
+    pub fn check(bytes: &'a [u8; PACKET_LEN]) -> Result<Packet<'a>, Reject> {
         let packet = Packet { bytes };
-        if bytes[..2] != HEADER || crc(&bytes[..LEN - 1]) != bytes[LEN - 1] {
+        if bytes[..2] != HEADER || crc(&bytes[..PACKET_LEN - 1]) != bytes[PACKET_LEN - 1] {
             return Err(Reject::Checksum);
         }
-        let (start, end) = (packet.start(), packet.word(END));
-        if start > TURN || end > TURN || packet.span() > WIDEST { Err(Reject::Angle) } else { Ok(packet) }
+        let (start, end) = (packet.start(), packet.word(END_OFFSET));
+        if start > FULL_CIRCLE || end > FULL_CIRCLE || packet.span() > MAX_SPAN {
+            Err(Reject::Angle)
+        } else {
+            Ok(packet)
+        }
     }
 
     /// Returns the packet in bytes that [`Packet::check`] has accepted before.
-    pub(crate) fn checked(bytes: &'a [u8; LEN]) -> Packet<'a> {
+    pub(crate) fn assume_valid(bytes: &'a [u8; PACKET_LEN]) -> Packet<'a> {
         debug_assert!(Packet::check(bytes).is_ok());
         Packet { bytes }
     }
 
     /// Its bytes.
-    pub fn bytes(&self) -> &'a [u8; LEN] {
+    pub fn bytes(&self) -> &'a [u8; PACKET_LEN] {
         self.bytes
     }
 
@@ -74,23 +78,24 @@ impl<'a> Packet<'a> {
 
     /// From the first point to the last one, in hundredths of a degree.
     pub fn span(&self) -> u16 {
-        ((u32::from(self.word(END)) + u32::from(TURN) - u32::from(self.start())) % u32::from(TURN)) as u16
+        ((u32::from(self.word(END_OFFSET)) + u32::from(FULL_CIRCLE) - u32::from(self.start()))
+            % u32::from(FULL_CIRCLE)) as u16
     }
 
-    /// The scanner's clock in milliseconds, modulo [`CLOCK_TURN`].
+    /// The scanner's clock in milliseconds, modulo [`CLOCK_PERIOD_MS`].
     pub fn millis(&self) -> u16 {
-        self.word(END + 2) % CLOCK_TURN
+        self.word(END_OFFSET + 2) % CLOCK_PERIOD_MS
     }
 
     /// Angle of point `i` in hundredths of a degree, clockwise, from the first point's on: of those between the first and
     /// the last the packet does not tell more than that they lie evenly.
     pub fn angle(&self, i: usize) -> f32 {
-        f32::from(self.start()) + f32::from(self.span()) * i as f32 / (POINTS - 1) as f32
+        f32::from(self.start()) + f32::from(self.span()) * i as f32 / (POINTS_PER_PACKET - 1) as f32
     }
 
     /// Range in millimetres and intensity of point `i`; a range of 0 is no return.
     pub fn measured(&self, i: usize) -> (u16, u8) {
-        let at = FIRST_POINT + 3 * i;
+        let at = FIRST_POINT_OFFSET + 3 * i;
         (self.word(at), self.bytes[at + 2])
     }
 
@@ -98,8 +103,8 @@ impl<'a> Packet<'a> {
     pub fn point(&self, i: usize) -> Point {
         let (range, intensity) = self.measured(i);
         // The highest values are codes.
-        let range = if (1..=LONGEST).contains(&range) { range } else { line::NO_RETURN };
-        Point { angle: self.angle(i) * -RADIANS, range, intensity }
+        let range = if (1..=MAX_RANGE).contains(&range) { range } else { line::NO_RETURN };
+        Point { angle: self.angle(i) * -RADIANS_PER_UNIT, range, intensity }
     }
 
     fn word(&self, at: usize) -> u16 {
@@ -109,43 +114,45 @@ impl<'a> Packet<'a> {
 
 /// What a packet is made of.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Contents {
+pub struct PacketContents {
     /// Degrees per second.
     pub speed: u16,
     /// Angle of the first point in hundredths of a degree.
     pub start: u16,
     /// Range in millimetres and intensity of each point.
-    pub points: [(u16, u8); POINTS],
+    pub points: [(u16, u8); POINTS_PER_PACKET],
     /// Angle of the last point in hundredths of a degree.
     pub end: u16,
     /// Milliseconds.
     pub millis: u16,
 }
 
-impl Contents {
+impl PacketContents {
     /// The bytes of the packet.
-    pub fn encode(&self) -> [u8; LEN] {
-        let mut bytes = [0; LEN];
+    pub fn encode(&self) -> [u8; PACKET_LEN] {
+        let mut bytes = [0; PACKET_LEN];
         bytes[..2].copy_from_slice(&HEADER);
         bytes[2..4].copy_from_slice(&self.speed.to_le_bytes());
         bytes[4..6].copy_from_slice(&self.start.to_le_bytes());
-        for (place, (range, intensity)) in bytes[FIRST_POINT..END].chunks_exact_mut(3).zip(self.points) {
-            place[..2].copy_from_slice(&range.to_le_bytes());
-            place[2] = intensity;
+        for (slot, (range, intensity)) in
+            bytes[FIRST_POINT_OFFSET..END_OFFSET].chunks_exact_mut(3).zip(self.points)
+        {
+            slot[..2].copy_from_slice(&range.to_le_bytes());
+            slot[2] = intensity;
         }
-        bytes[END..END + 2].copy_from_slice(&self.end.to_le_bytes());
-        bytes[END + 2..END + 4].copy_from_slice(&self.millis.to_le_bytes());
-        bytes[LEN - 1] = crc(&bytes[..LEN - 1]);
+        bytes[END_OFFSET..END_OFFSET + 2].copy_from_slice(&self.end.to_le_bytes());
+        bytes[END_OFFSET + 2..END_OFFSET + 4].copy_from_slice(&self.millis.to_le_bytes());
+        bytes[PACKET_LEN - 1] = crc(&bytes[..PACKET_LEN - 1]);
         bytes
     }
 }
 
 /// CRC-8 with the polynomial 4Dh, from 0, not reflected.
 pub fn crc(bytes: &[u8]) -> u8 {
-    bytes.iter().fold(0, |crc, byte| CRC[usize::from(crc ^ byte)])
+    bytes.iter().fold(0, |crc, byte| CRC_TABLE[usize::from(crc ^ byte)])
 }
 
-const CRC: [u8; 256] = {
+const CRC_TABLE: [u8; 256] = {
     let mut table = [0; 256];
     let mut i = 0;
     while i < 256 {
@@ -160,10 +167,10 @@ const CRC: [u8; 256] = {
     table
 };
 
-const FIRST_POINT: usize = 6;
-const END: usize = FIRST_POINT + 3 * POINTS;
+const FIRST_POINT_OFFSET: usize = 6;
+const END_OFFSET: usize = FIRST_POINT_OFFSET + 3 * POINTS_PER_PACKET;
 /// Radians in a hundredth of a degree.
-const RADIANS: f32 = core::f32::consts::PI / 18_000.0;
+const RADIANS_PER_UNIT: f32 = core::f32::consts::PI / 18_000.0;
 
 /// Packets without anything between them, in the framer's buffer until the next bytes are committed.
 #[derive(Clone, Copy, Debug)]
@@ -182,12 +189,12 @@ pub struct Span {
 pub struct Framer {
     pub(crate) buffer: Buffer<CAPACITY>,
     /// Whether bytes were discarded since the last packet.
-    damage: bool,
+    is_damaged: bool,
 }
 
 impl Default for Framer {
     fn default() -> Self {
-        Framer { buffer: Buffer::new(HOLD), damage: false }
+        Framer { buffer: Buffer::new(HOLD_TIME), is_damaged: false }
     }
 }
 
@@ -197,7 +204,7 @@ impl line::framing::Format for Format {
     type Reject = Reject;
 
     fn packet_len(&self) -> usize {
-        LEN
+        PACKET_LEN
     }
 
     fn begins(&self, bytes: &[u8]) -> bool {
@@ -212,34 +219,36 @@ impl line::framing::Format for Format {
 
 impl Framer {
     /// Returns the next packets, at most `most`. `None` until more bytes arrive.
-    pub fn advance(&mut self, most: usize) -> Option<Span> {
+    pub fn advance(&mut self, max_packets: usize) -> Option<Span> {
         self.buffer.begin_check();
         loop {
-            match self.buffer.judge(&Format, 0) {
-                Verdict::Packet => break,
-                Verdict::Open | Verdict::Held => return None,
-                Verdict::Nothing(rejected) => self.discard(rejected),
+            match self.buffer.check_frame(&Format, 0) {
+                FrameCheck::Packet => break,
+                FrameCheck::Incomplete | FrameCheck::Held => return None,
+                FrameCheck::NoPacket(rejected) => self.discard(rejected),
             }
         }
         let mut packets = 1;
-        while packets < most && matches!(self.buffer.judge(&Format, packets * LEN), Verdict::Packet) {
+        while packets < max_packets
+            && matches!(self.buffer.check_frame(&Format, packets * PACKET_LEN), FrameCheck::Packet)
+        {
             packets += 1;
         }
-        let is_damaged = core::mem::take(&mut self.damage) && self.buffer.tally().packets > 0;
+        let is_damaged = core::mem::take(&mut self.is_damaged) && self.buffer.byte_counters().packets > 0;
         let offset = self.buffer.offset();
-        let at = self.buffer.take(packets * LEN, packets);
+        let at = self.buffer.take(packets * PACKET_LEN, packets);
         Some(Span { at, packets, offset, reasons: if is_damaged { suspect::NEIGHBOUR } else { 0 } })
     }
 
     /// Returns the bytes of the span that [`Framer::advance`] returned last.
     pub fn bytes(&self, span: Span) -> &[u8] {
-        self.buffer.taken(span.at, span.packets * LEN)
+        self.buffer.taken_bytes(span.at, span.packets * PACKET_LEN)
     }
 
     /// Gives up all bytes that are still open, for example because the line's rate changes.
     pub fn clear(&mut self) {
         self.buffer.clear();
-        self.damage = false;
+        self.is_damaged = false;
     }
 
     /// Discards the first open byte, and those after it up to the next one that may begin a packet.
@@ -247,24 +256,24 @@ impl Framer {
         if rejected == Some(Reject::Checksum) {
             self.buffer.reject_checksum();
         }
-        let behind = &self.buffer.open()[1..];
-        let skipped = 1 + behind.iter().position(|&byte| byte == HEADER[0]).unwrap_or(behind.len());
+        let rest = &self.buffer.open_bytes()[1..];
+        let skipped = 1 + rest.iter().position(|&byte| byte == HEADER[0]).unwrap_or(rest.len());
         self.buffer.discard(skipped);
-        self.damage = true;
+        self.is_damaged = true;
     }
 }
 
 /// Capacity of a tty for a late reader, and a part of a packet.
-const CAPACITY: usize = 4_096 + 2 * LEN;
+const CAPACITY: usize = 4_096 + 2 * PACKET_LEN;
 /// A packet takes 2.04 ms at 230,400 baud. After this time without a byte, none is in flight.
-const HOLD: Nanos = 4 * MILLIS;
+const HOLD_TIME: Nanos = 4 * MILLIS;
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
     /// The packet that the manual of the LD06 explains.
-    const MANUAL: [u8; LEN] = [
+    const MANUAL: [u8; PACKET_LEN] = [
         0x54, 0x2C, 0x68, 0x08, 0xAB, 0x7E, 0xE0, 0x00, 0xE4, 0xDC, 0x00, 0xE2, 0xD9, 0x00, 0xE5, 0xD5, 0x00,
         0xE3, 0xD3, 0x00, 0xE4, 0xD0, 0x00, 0xE9, 0xCD, 0x00, 0xE4, 0xCA, 0x00, 0xE2, 0xC7, 0x00, 0xE9, 0xC5,
         0x00, 0xE5, 0xC2, 0x00, 0xE5, 0xC0, 0x00, 0xE5, 0xBE, 0x82, 0x3A, 0x1A, 0x50,
@@ -279,13 +288,13 @@ mod tests {
         let last = packet.point(11);
         assert!((last.angle.to_degrees() + 334.70).abs() < 1e-3, "{last:?}");
         let points = core::array::from_fn(|i| packet.measured(i));
-        let contents = Contents { speed: 2_152, start: 32_427, points, end: 33_470, millis: 6_714 };
+        let contents = PacketContents { speed: 2_152, start: 32_427, points, end: 33_470, millis: 6_714 };
         assert_eq!(contents.encode(), MANUAL);
     }
 
     #[test]
     fn every_bit_counts() {
-        for bit in 0..LEN * 8 {
+        for bit in 0..PACKET_LEN * 8 {
             let mut bytes = MANUAL;
             bytes[bit / 8] ^= 1 << (bit % 8);
             assert_eq!(Packet::check(&bytes), Err(Reject::Checksum), "{bit}");
@@ -294,14 +303,19 @@ mod tests {
 
     #[test]
     fn angles_run_on_through_zero() {
-        let contents =
-            Contents { speed: 3_600, start: 35_560, points: [(1_000, 9); POINTS], end: 440, millis: 0 };
+        let contents = PacketContents {
+            speed: 3_600,
+            start: 35_560,
+            points: [(1_000, 9); POINTS_PER_PACKET],
+            end: 440,
+            millis: 0,
+        };
         let bytes = contents.encode();
         let packet = Packet::check(&bytes).expect("intact");
         assert_eq!((packet.span(), packet.angle(0), packet.angle(11)), (880, 35_560.0, 36_440.0));
         assert!((packet.angle(5) - 35_960.0).abs() < 0.01 && (packet.angle(6) - 36_040.0).abs() < 0.01);
         for (start, end) in [(36_001, 100), (100, 36_001), (100, 90), (0, 4_501)] {
-            let bytes = Contents { start, end, ..contents }.encode();
+            let bytes = PacketContents { start, end, ..contents }.encode();
             assert_eq!(Packet::check(&bytes), Err(Reject::Angle), "{start} {end}");
         }
     }

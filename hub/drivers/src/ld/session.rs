@@ -6,30 +6,31 @@ use core::fmt;
 
 use scanhub_schema::{Family, MILLIS, Nanos, line_time};
 
-use crate::ld::packet::{Framer, LEN, POINTS, Packet, Span};
-use crate::ld::point_count::{Counted, PointCount};
-use crate::ld::sequence::{Place, Restarts, Sequence};
-use crate::ld::{FEATURES, Model, described};
+use crate::ld::packet::{Framer, PACKET_LEN, POINTS_PER_PACKET, Packet, Span};
+use crate::ld::point_count::{CountedRevolution, PointCount};
+use crate::ld::sequence::{PacketPosition, PacketSequencer, Restarts};
+use crate::ld::{FEATURES, Model, describe};
 use crate::line::{
-    self, Account, Closed, Control, Event, Flow, Output, Pace, RawScan, Reads, Received, SensorClock, State,
-    StreamCounters, Tally, TurnCounts, Turns, Watchdog, family,
+    self, Action, ByteCounters, ClosedRevolution, Control, Event, RawScan, ReadScheduler, ReceivedTelegram,
+    RevolutionAssembler, RevolutionCounts, RotationRate, SensorClock, SessionStats, State, StreamCounters,
+    StreamTiming, Watchdog, family,
 };
 use crate::settings::Settings;
 
 /// The session with one scanner.
 #[derive(Clone, Debug)]
-pub struct Session {
+pub struct LdSession {
     settings: Settings,
     framer: Framer,
-    reads: Reads,
+    reads: ReadScheduler,
     clock: SensorClock,
     /// If a new sequence began within the packets that were returned last: the number of its first packet among them,
     /// and the clock of the packets before.
     clock_before: Option<(usize, SensorClock)>,
-    sequence: Sequence,
-    turns: Turns<MOST_POINTS>,
+    sequencer: PacketSequencer,
+    revolutions: RevolutionAssembler<MAX_POINTS>,
     /// Pace of the packet whose points were added last.
-    pace: Option<Pace>,
+    rotation_rate: Option<RotationRate>,
     phase: Phase,
     baud: u32,
     change_baud: bool,
@@ -42,18 +43,18 @@ pub struct Session {
     /// Another number of beams, which the points have required since this time of the scanner's clock.
     other_beams: Option<(usize, Nanos)>,
     /// The last change of the number of beams, and until when it is reported.
-    change: Option<(Trouble, Nanos)>,
+    beams_change: Option<(Problem, Nanos)>,
     /// Number of beams, once it is known.
     beams: Option<usize>,
     /// Whether the points per second of this stream are known.
-    is_learned: bool,
+    is_rate_known: bool,
     scanner_time: Option<Nanos>,
     /// Packets that were returned and whose points are not in revolutions yet.
-    current: Option<Current>,
+    current: Option<PendingPackets>,
     now: Nanos,
-    trouble: Option<Trouble>,
+    problem: Option<Problem>,
     /// Time since which no packet has arrived.
-    quiet_since: Nanos,
+    no_packet_since: Nanos,
     counters: StreamCounters,
     restarts: Restarts,
 }
@@ -70,42 +71,42 @@ enum Phase {
 
 /// Packets whose points are being added to revolutions.
 #[derive(Clone, Copy, Debug)]
-struct Current {
+struct PendingPackets {
     span: Span,
-    places: [Place; MOST],
+    positions: [PacketPosition; MAX_PACKETS_PER_SAMPLE],
     /// Number of the first packet that is not finished.
     packet: usize,
     /// Whether its points were added.
-    is_put: bool,
+    is_added: bool,
 }
 
-impl Session {
+impl LdSession {
     /// Creates a session on a port that is open at the rate of `settings`.
     pub fn new(settings: Settings, now: Nanos) -> Self {
-        Session {
+        LdSession {
             settings,
             framer: Framer::default(),
-            reads: Reads::new(now),
+            reads: ReadScheduler::new(now),
             clock: SensorClock::new(),
             clock_before: None,
-            sequence: Sequence::new(),
-            turns: Turns::new(),
-            pace: None,
+            sequencer: PacketSequencer::new(),
+            revolutions: RevolutionAssembler::new(),
+            rotation_rate: None,
             point_count: PointCount::default(),
             measured: None,
             undecided_since: now,
             other_beams: None,
-            change: None,
-            phase: Phase::Listening { shown: State::Probing, next_at: now + LISTEN },
-            baud: Model::of(&settings).map_or(FEATURES.auto.baud, Model::baud),
+            beams_change: None,
+            phase: Phase::Listening { shown: State::Probing, next_at: now + LISTEN_TIME },
+            baud: Model::of(&settings).map_or(FEATURES.defaults.baud, Model::baud),
             change_baud: false,
             beams: None,
-            is_learned: false,
+            is_rate_known: false,
             scanner_time: None,
             current: None,
             now,
-            trouble: None,
-            quiet_since: now,
+            problem: None,
+            no_packet_since: now,
             counters: StreamCounters::default(),
             restarts: Restarts::default(),
         }
@@ -113,7 +114,7 @@ impl Session {
 
     /// Restores the model and the number of beams that an earlier session on the same port has measured. Call it before
     /// the first read.
-    pub fn recall(&mut self, model: Model, beams: usize) {
+    pub fn restore_model(&mut self, model: Model, beams: usize) {
         self.measured = Some((model, beams));
     }
 
@@ -132,7 +133,7 @@ impl Session {
 
     /// Handles the points of a revolution of a scanner without a configured model. The first reliable number of points
     /// decides. Later, it must be different for a long time.
-    fn count(&mut self, counted: Counted) {
+    fn update_beams(&mut self, counted: CountedRevolution) {
         let Some((_, beams)) = self.measured else {
             self.measured = counted.is_final().then(|| (counted.model(), counted.beams()));
             return;
@@ -145,42 +146,42 @@ impl Session {
         let is_same = |&(other, since): &(usize, Nanos)| !counted.differs_from(other) && since <= counted.at;
         let known = self.other_beams.filter(is_same);
         let (other, since) = *self.other_beams.insert(known.unwrap_or((counted.beams(), counted.at)));
-        if counted.at.saturating_sub(since) < CHANGE {
+        if counted.at.saturating_sub(since) < CHANGE_DELAY {
             return;
         }
         (self.measured, self.other_beams) = (Some((counted.model(), other)), None);
         if self.settings.beams.is_none() {
-            self.is_learned = false;
-            let trouble = Trouble::BeamsChanged { from: beams, to: other };
-            self.change = Some((trouble, self.now + SHOW_CHANGE));
+            self.is_rate_known = false;
+            let problem = Problem::BeamsChanged { from: beams, to: other };
+            self.beams_change = Some((problem, self.now + CHANGE_REPORT_TIME));
         }
     }
 
     /// Returns the model of the scanner if it is not the one of the settings. Models with the same number of points per
     /// second cannot be distinguished.
-    fn heard_other_model(&self) -> Option<Model> {
-        let wanted = Model::of(&self.settings)?;
-        self.heard_model().filter(|heard| heard.points_per_second() != wanted.points_per_second())
+    fn unexpected_model_by_rate(&self) -> Option<Model> {
+        let configured = Model::of(&self.settings)?;
+        self.model_by_rate().filter(|model| model.points_per_second() != configured.points_per_second())
     }
 
     /// Returns the model that the points per second indicate.
-    fn heard_model(&self) -> Option<Model> {
-        self.sequence.points_per_second().map(Model::of_point_rate)
+    fn model_by_rate(&self) -> Option<Model> {
+        self.sequencer.points_per_second().map(Model::of_point_rate)
     }
 
     /// Returns the points that the scanner measures per second, once enough packets have arrived.
     pub fn points_per_second(&self) -> Option<f32> {
-        self.sequence.points_per_second()
+        self.sequencer.points_per_second()
     }
 
     /// Returns the counters of the framer.
-    pub fn tally(&self) -> &Tally {
-        self.framer.buffer.tally()
+    pub fn byte_counters(&self) -> &ByteCounters {
+        self.framer.buffer.byte_counters()
     }
 
     /// Returns the numbers of revolutions by kind.
-    pub fn turn_counts(&self) -> TurnCounts {
-        self.turns.counts()
+    pub fn revolution_counts(&self) -> RevolutionCounts {
+        self.revolutions.counts()
     }
 
     /// Returns the rates at which packets may arrive.
@@ -192,104 +193,112 @@ impl Session {
 
     /// Ends the stream, and waits for packets. The session shows the state `shown` meanwhile.
     fn listen(&mut self, shown: State) {
-        self.phase = Phase::Listening { shown, next_at: self.now + LISTEN };
-        self.quiet_since = self.now;
-        self.sequence.end();
-        self.turns.give_up();
-        self.is_learned = false;
+        self.phase = Phase::Listening { shown, next_at: self.now + LISTEN_TIME };
+        self.no_packet_since = self.now;
+        self.sequencer.end();
+        self.revolutions.discard();
+        self.is_rate_known = false;
         self.current = None;
-        self.reads.end_rest();
+        self.reads.cancel_wait();
     }
 
     /// Tries the next rate, because no packet arrived at this one, and updates the time in the trouble.
-    fn listen_on(&mut self, shown: State) {
-        self.phase = Phase::Listening { shown, next_at: self.now + LISTEN };
+    fn listen_at_next_rate(&mut self, shown: State) {
+        self.phase = Phase::Listening { shown, next_at: self.now + LISTEN_TIME };
         let rates = self.rates();
         if let Some(&next) = rates.iter().find(|&&rate| rate != self.baud) {
             self.baud = next;
             self.change_baud = true;
         }
-        let seconds = (self.now.saturating_sub(self.quiet_since) / (1_000 * MILLIS)) as u32;
+        let seconds = (self.now.saturating_sub(self.no_packet_since) / (1_000 * MILLIS)) as u32;
         if seconds > 0 {
             let seconds = 1 << seconds.ilog2();
             let baud = (rates.len() == 1).then_some(self.baud);
-            self.trouble = Some(Trouble::NoPackets { baud, seconds });
+            self.problem = Some(Problem::NoPackets { baud, seconds });
         }
     }
 
     /// Handles deadlines after all bytes were framed. Bytes that are no packets do not extend a deadline.
-    fn expire(&mut self) {
+    fn handle_deadlines(&mut self) {
         match self.phase {
-            Phase::Listening { shown, next_at } if self.now >= next_at => self.listen_on(shown),
+            Phase::Listening { shown, next_at } if self.now >= next_at => self.listen_at_next_rate(shown),
             Phase::Streaming(watchdog) if watchdog.is_silent(self.now) => {
                 self.counters.note_resync();
-                self.trouble = Some(Trouble::Silence);
+                self.problem = Some(Problem::Silence);
                 self.listen(State::Silent);
             }
             Phase::Streaming(watchdog) if watchdog.is_revolution_overdue(self.now) => {
-                let is_damaged = self.counters.is_mostly_damaged(self.framer.buffer.tally());
-                self.trouble = (!is_damaged).then_some(Trouble::StandsStill);
+                let is_damaged = self.counters.is_mostly_damaged(self.framer.buffer.byte_counters());
+                self.problem = (!is_damaged).then_some(Problem::HeadBlocked);
             }
             _ => {}
         }
     }
 
     /// Stamps the packets of `span`, and keeps them for revolutions.
-    fn receive(&mut self, span: Span) -> Received<'_> {
+    fn receive(&mut self, span: Span) -> ReceivedTelegram<'_> {
         let mut span = span;
-        span.reasons |= self.reads.take_doubt(span.offset + (span.packets * LEN) as u64);
-        let pace = (!self.settings.fixed_rate).then_some(self.baud);
-        let packet_time = line_time(LEN, self.baud);
-        let mut places = [Place::Odd; MOST];
+        span.reasons |= self.reads.take_suspect(span.offset + (span.packets * PACKET_LEN) as u64);
+        let line_rate = (!self.settings.fixed_rate).then_some(self.baud);
+        let packet_time = line_time(PACKET_LEN, self.baud);
+        let mut positions = [PacketPosition::Outlier; MAX_PACKETS_PER_SAMPLE];
         self.clock_before = None;
-        let flow = Flow { byte_ns: self.sequence.packet_ns() / LEN as f64, packet_len: LEN, pace };
+        let timing = StreamTiming {
+            byte_ns: self.sequencer.packet_ns() / PACKET_LEN as f64,
+            packet_len: PACKET_LEN,
+            line_rate,
+        };
         let mut counted = None;
-        let (bytes, _) = self.framer.bytes(span).as_chunks::<LEN>();
+        let (bytes, _) = self.framer.bytes(span).as_chunks::<PACKET_LEN>();
         for (number, bytes) in bytes.iter().enumerate() {
-            let packet = Packet::checked(bytes);
-            let place = self.sequence.place(&packet);
-            counted = self.point_count.note(&packet, place).or(counted);
-            self.measured = self.measured.or_else(|| self.point_count.typical());
-            let end = span.offset + ((number + 1) * LEN - 1) as u64;
-            if matches!(place, Place::First { .. }) {
-                let arrivals = self.reads.arrivals();
-                let earliest = arrivals.earliest_behind_gap(end, flow);
-                let arrival = earliest.map(|earliest| (earliest, arrivals.latest(end, pace)));
+            let packet = Packet::assume_valid(bytes);
+            let position = self.sequencer.locate(&packet);
+            counted = self.point_count.note_packet(&packet, position).or(counted);
+            self.measured = self.measured.or_else(|| self.point_count.typical_model());
+            let end = span.offset + ((number + 1) * PACKET_LEN - 1) as u64;
+            if matches!(position, PacketPosition::First { .. }) {
+                let arrivals = self.reads.read_log();
+                let earliest = arrivals.earliest_after_gap(end, timing);
+                let arrival = earliest.map(|earliest| (earliest, arrivals.latest(end, line_rate)));
                 self.restarts.note_first(packet.millis(), arrival);
                 let before = core::mem::replace(&mut self.clock, SensorClock::new());
                 self.clock_before.get_or_insert((number, before));
             }
-            if let Some(time) = place.time() {
-                self.clock.note(time, self.reads.arrivals().latest(end, pace).saturating_sub(packet_time));
+            if let Some(time) = position.time() {
+                self.clock.note_arrival(
+                    time,
+                    self.reads.read_log().latest(end, line_rate).saturating_sub(packet_time),
+                );
             }
-            if let Place::Next { time, .. } = place
+            if let PacketPosition::Next { time, .. } = position
                 && let Some(measured) = self.clock.time(time)
             {
                 self.restarts.note_next(packet.millis(), measured + packet_time);
             }
-            places[number] = place;
+            positions[number] = position;
         }
         if let Some(counted) = counted.filter(|_| self.settings.model.is_none()) {
-            self.count(counted);
-            if !self.is_learned
+            self.update_beams(counted);
+            if !self.is_rate_known
                 && let Phase::Streaming(watchdog) = &mut self.phase
             {
                 watchdog.await_revolution(self.now);
             }
         }
-        self.scanner_time = places[..span.packets].iter().rev().find_map(|place| place.time());
-        let stamp = |number: usize| places[number].time().and_then(|time| self.clock_of(number).time(time));
+        self.scanner_time = positions[..span.packets].iter().rev().find_map(|place| place.time());
+        let stamp =
+            |number: usize| positions[number].time().and_then(|time| self.clock_of(number).time(time));
         let first = stamp(0);
-        let last_byte = span.offset + (span.packets * LEN - 1) as u64;
-        let latest = self.reads.arrivals().latest(last_byte, pace);
+        let last_byte = span.offset + (span.packets * PACKET_LEN - 1) as u64;
+        let latest = self.reads.read_log().latest(last_byte, line_rate);
         let last = stamp(span.packets - 1).map_or(latest, |at| at + packet_time);
         let at = first.unwrap_or(last.saturating_sub(packet_time * span.packets as u64));
         // A packet that arrived twice is stamped by its arrival, and the next one by the scanner's clock.
-        let last = self.reads.date_packet(last.max(at));
-        self.current = Some(Current { span, places, packet: 0, is_put: false });
-        self.counters.note_packets(self.framer.buffer.tally(), span.packets);
+        let last = self.reads.stamp_packet(last.max(at));
+        self.current = Some(PendingPackets { span, positions, packet: 0, is_added: false });
+        self.counters.note_packets(self.framer.buffer.byte_counters(), span.packets);
         self.continue_stream();
-        Received {
+        ReceivedTelegram {
             bytes: self.framer.bytes(span),
             first: at,
             last,
@@ -298,7 +307,7 @@ impl Session {
             count: span.packets,
             is_checked: true,
             is_reply: false,
-            whole: None,
+            contents: None,
         }
     }
 
@@ -315,104 +324,107 @@ impl Session {
         match &mut self.phase {
             Phase::Streaming(watchdog) => {
                 watchdog.note_packets(self.now);
-                self.counters.continue_stream(self.framer.buffer.tally());
+                self.counters.continue_stream(self.framer.buffer.byte_counters());
                 if self.measured.is_none()
-                    && self.now >= self.undecided_since + UNDECIDED
-                    && let Some(rate) = self.sequence.points_per_second()
+                    && self.now >= self.undecided_since + DECISION_TIMEOUT
+                    && let Some(rate) = self.sequencer.points_per_second()
                 {
                     let model = Model::of_point_rate(rate);
                     self.measured = Some((model, model.beams()));
                 }
             }
             Phase::Listening { .. } => {
-                self.trouble = None;
+                self.problem = None;
                 self.undecided_since = self.now;
                 self.phase = Phase::Streaming(Watchdog::new(self.now));
-                self.counters.begin_stream(self.framer.buffer.tally());
+                self.counters.begin_stream(self.framer.buffer.byte_counters());
             }
             Phase::Paused => {}
         }
-        if !self.is_learned
-            && self.sequence.points_per_second().is_some()
+        if !self.is_rate_known
+            && self.sequencer.points_per_second().is_some()
             && let Some(beams) = self.known_beams()
         {
-            (self.beams, self.is_learned) = (Some(beams), true);
-            self.turns.begin(beams);
+            (self.beams, self.is_rate_known) = (Some(beams), true);
+            self.revolutions.begin(beams);
         }
     }
 
     /// Adds the points of the current packets to revolutions. Returns the first revolution that is complete.
-    fn advance_turns(&mut self) -> Option<Closed> {
+    fn advance_revolutions(&mut self) -> Option<ClosedRevolution> {
         while let Some(current) = &mut self.current {
-            let (bytes, _) = self.framer.bytes(current.span).as_chunks::<LEN>();
-            let packet = bytes.get(current.packet).map(Packet::checked);
-            let Some(packet) = packet.filter(|_| self.is_learned) else {
+            let (bytes, _) = self.framer.bytes(current.span).as_chunks::<PACKET_LEN>();
+            let packet = bytes.get(current.packet).map(Packet::assume_valid);
+            let Some(packet) = packet.filter(|_| self.is_rate_known) else {
                 self.current = None;
                 return None;
             };
-            let place = current.places[current.packet];
+            let position = current.positions[current.packet];
             let reasons = if current.packet == 0 { current.span.reasons } else { 0 };
-            let step = f64::from(packet.span()) / 100.0 / (POINTS - 1) as f64;
-            let pace = Pace { step, point_ns: f64::from(self.sequence.point_ns()) };
-            if !current.is_put {
-                if let Place::Next { angle, missing, from, .. } = place
+            let step = f64::from(packet.span()) / 100.0 / (POINTS_PER_PACKET - 1) as f64;
+            let rotation_rate = RotationRate { step, point_ns: f64::from(self.sequencer.point_ns()) };
+            if !current.is_added {
+                if let PacketPosition::Next { angle, missing, from, .. } = position
                     && missing > 0
                 {
                     // No point was received between the two angles. They may be in a revolution that has not begun yet.
-                    self.turns.lacks(from + pace.step, angle - pace.step);
+                    self.revolutions.mark_gap(from + rotation_rate.step, angle - rotation_rate.step);
                     // The head may be slower now than in the revolution that ends here.
-                    if let Some(closed) = self.turns.reach(angle, self.pace.unwrap_or(pace)) {
+                    if let Some(closed) =
+                        self.revolutions.close_before(angle, self.rotation_rate.unwrap_or(rotation_rate))
+                    {
                         return Some(closed);
                     }
                 }
-                self.pace = Some(pace);
-                current.is_put = true;
-                put(&mut self.turns, &packet, place, reasons, pace);
+                self.rotation_rate = Some(rotation_rate);
+                current.is_added = true;
+                add_points(&mut self.revolutions, &packet, position, reasons, rotation_rate);
             }
-            if let Place::First { angle, .. } | Place::Next { angle, .. } = place
-                && let Some(closed) = self.turns.reach(angle + f64::from(packet.span()) / 100.0, pace)
+            if let PacketPosition::First { angle, .. } | PacketPosition::Next { angle, .. } = position
+                && let Some(closed) =
+                    self.revolutions.close_before(angle + f64::from(packet.span()) / 100.0, rotation_rate)
             {
                 return Some(closed);
             }
             if let Some(current) = &mut self.current {
-                (current.packet, current.is_put) = (current.packet + 1, false);
+                (current.packet, current.is_added) = (current.packet + 1, false);
             }
         }
         None
     }
 
     /// Returns a complete revolution, and updates the state of the session.
-    fn show(&mut self, closed: Closed) -> RawScan<'_> {
-        let first = self.dated(closed).first;
-        self.reads.end_turn(first);
-        self.trouble = None;
+    fn complete_revolution(&mut self, revolution: ClosedRevolution) -> RawScan<'_> {
+        let first = self.to_scan(revolution).first;
+        self.reads.end_revolution(first);
+        self.problem = None;
         if let Phase::Streaming(watchdog) = &mut self.phase {
             watchdog.note_revolution(self.now);
         }
-        self.counters.await_revolution(self.framer.buffer.tally());
-        self.dated(closed)
+        self.counters.await_revolution(self.framer.buffer.byte_counters());
+        self.to_scan(revolution)
     }
 
     /// Converts a revolution to the hub's clock.
-    fn dated(&self, closed: Closed) -> RawScan<'_> {
+    fn to_scan(&self, revolution: ClosedRevolution) -> RawScan<'_> {
         let packet = self.current.map_or(usize::MAX, |current| current.packet);
         let stamp = |at: Nanos| self.clock_of(packet).time(at).unwrap_or(self.now);
-        let stamps = self.reads.turn_dates(stamp(closed.first), stamp(closed.last));
+        let stamps = self.reads.revolution_stamps(stamp(revolution.first), stamp(revolution.last));
         let resolution = (self.beams.unwrap_or_default(), self.points_per_second().unwrap_or_default());
-        RawScan::revolution(Family::Ld, &closed, stamps, resolution, self.turns.points(&closed))
+        RawScan::revolution(Family::Ld, &revolution, stamps, resolution, self.revolutions.points(&revolution))
     }
 }
 
-impl line::Protocol for Session {
-    fn spare(&mut self) -> &mut [u8] {
-        let spare = self.framer.buffer.spare();
-        self.reads.offer(spare.len());
+impl line::Protocol for LdSession {
+    fn read_buffer(&mut self) -> &mut [u8] {
+        let spare = self.framer.buffer.read_buffer();
+        self.reads.set_buffer_len(spare.len());
         spare
     }
 
     fn commit(&mut self, now: Nanos, len: usize) {
         self.now = now;
-        self.reads.note(now, len, line::Session::state(self) == State::Streaming);
+        self.reads.note_read(now, len, line::ScannerSession::state(self) == State::Streaming);
         if len > 0 {
             self.framer.buffer.commit(len);
         }
@@ -423,35 +435,35 @@ impl line::Protocol for Session {
         self.framer.buffer.release(now.saturating_sub(self.reads.last_byte()));
     }
 
-    fn transmitted(&mut self, now: Nanos) {
+    fn handle_transmitted(&mut self, now: Nanos) {
         self.now = now;
     }
 
-    fn poll_output(&mut self) -> Output<'_> {
-        if let Some(closed) = self.advance_turns() {
-            return Output::Event(Event::Scan(self.show(closed)));
+    fn poll_action(&mut self) -> Action<'_> {
+        if let Some(closed) = self.advance_revolutions() {
+            return Action::Event(Event::Scan(self.complete_revolution(closed)));
         }
-        while let Some(span) = self.framer.advance(most_together(self.baud)) {
+        while let Some(span) = self.framer.advance(max_packets_per_sample(self.baud)) {
             if !matches!(self.phase, Phase::Paused) {
-                return Output::Event(Event::Telegram(self.receive(span)));
+                return Action::Event(Event::Telegram(self.receive(span)));
             }
         }
-        self.expire();
+        self.handle_deadlines();
         if core::mem::take(&mut self.change_baud) {
             self.framer.clear();
-            return Output::SetRate(self.baud);
+            return Action::SetRate(self.baud);
         }
         let until = match self.phase {
             Phase::Listening { next_at, .. } => next_at,
             Phase::Streaming(watchdog) => watchdog.silent_at(),
             Phase::Paused => Nanos::MAX,
         };
-        self.reads.wait(self.now, until, self.framer.buffer.hold())
+        self.reads.wait_action(self.now, until, self.framer.buffer.hold())
     }
 }
 
-impl line::Session for Session {
-    type Trouble = Trouble;
+impl line::ScannerSession for LdSession {
+    type Problem = Problem;
 
     fn control(&mut self, control: Control, now: Nanos) {
         self.now = now;
@@ -464,7 +476,7 @@ impl line::Session for Session {
             (Control::Resume, _) => {}
             (Control::Resync, _) => {
                 self.counters.note_resync();
-                self.trouble = None;
+                self.problem = None;
                 self.listen(State::Probing);
             }
         }
@@ -478,23 +490,23 @@ impl line::Session for Session {
         }
     }
 
-    fn trouble(&self) -> Option<Trouble> {
-        let change = self.change.filter(|&(_, until)| self.now < until).map(|(trouble, _)| trouble);
-        self.trouble.or(change).filter(|_| !matches!(self.phase, Phase::Paused))
+    fn problem(&self) -> Option<Problem> {
+        let change = self.beams_change.filter(|&(_, until)| self.now < until).map(|(problem, _)| problem);
+        self.problem.or(change).filter(|_| !matches!(self.phase, Phase::Paused))
     }
 
-    fn missing(&self) -> Option<&'static str> {
-        matches!(self.trouble(), Some(Trouble::NoPackets { .. })).then_some("LDROBOT packets")
+    fn missing_transmission(&self) -> Option<&'static str> {
+        matches!(self.problem(), Some(Problem::NoPackets { .. })).then_some("LDROBOT packets")
     }
 
     fn rate(&self) -> u32 {
         self.baud
     }
 
-    fn account(&self) -> Account {
-        let (tally, buffered) = (self.framer.buffer.tally(), self.framer.buffer.open().len());
-        let account = self.counters.account(tally, buffered, self.sequence.came_and_lost());
-        Account { restarts: self.restarts.count, ..account }
+    fn stats(&self) -> SessionStats {
+        let (tally, buffered) = (self.framer.buffer.byte_counters(), self.framer.buffer.open_bytes().len());
+        let stats = self.counters.stats(tally, buffered, self.sequencer.received_and_lost());
+        SessionStats { restarts: self.restarts.count, ..stats }
     }
 
     fn begin_at(&mut self, rate: u32, _: Nanos) {
@@ -502,14 +514,14 @@ impl line::Session for Session {
     }
 
     fn restore_beams(&mut self, model: family::Model, beams: usize) {
-        let model = Model::named(model.name);
+        let model = Model::from_name(model.name);
         if let Some(model) = model.filter(|model| self.settings.fixed_rate || model.baud() == self.baud) {
-            self.recall(model, beams);
+            self.restore_model(model, beams);
         }
     }
 
     fn model(&self) -> Option<family::Model> {
-        self.model().map(described)
+        self.model().map(describe)
     }
 
     fn beams(&self) -> Option<usize> {
@@ -517,11 +529,11 @@ impl line::Session for Session {
     }
 
     fn partial_scan(&self) -> Option<RawScan<'_>> {
-        self.turns.begun(self.pace?).map(|begun| self.dated(begun))
+        self.revolutions.partial_revolution(self.rotation_rate?).map(|revolution| self.to_scan(revolution))
     }
 
-    fn other_model(&self) -> Option<family::Model> {
-        self.heard_other_model().map(described)
+    fn unexpected_model(&self) -> Option<family::Model> {
+        self.unexpected_model_by_rate().map(describe)
     }
 
     fn scanner_time(&self) -> Option<Nanos> {
@@ -529,13 +541,13 @@ impl line::Session for Session {
     }
 
     fn mark_suspect(&mut self, reasons: u8) {
-        self.reads.doubt(reasons);
+        self.reads.mark_suspect(reasons);
     }
 }
 
 /// Reason why a session does not stream.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Trouble {
+pub enum Problem {
     /// No packets arrive.
     NoPackets {
         /// The only rate that the session tried. `None`: it tried both.
@@ -546,7 +558,7 @@ pub enum Trouble {
     /// No packet arrived for one second.
     Silence,
     /// Packets arrive, but the head does not rotate.
-    StandsStill,
+    HeadBlocked,
     /// The scanner measures another number of points per revolution, so its scans have another number of beams.
     BeamsChanged {
         /// Number of beams before.
@@ -556,10 +568,10 @@ pub enum Trouble {
     },
 }
 
-impl fmt::Display for Trouble {
+impl fmt::Display for Problem {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Trouble::NoPackets { baud, seconds } => {
+            Problem::NoPackets { baud, seconds } => {
                 f.write_str("no packets at ")?;
                 match baud {
                     Some(baud) => write!(f, "{baud}")?,
@@ -567,9 +579,9 @@ impl fmt::Display for Trouble {
                 }
                 write!(f, " baud for {seconds} s: power, cable, other port?")
             }
-            Trouble::Silence => f.write_str("no packet for one second"),
-            Trouble::StandsStill => f.write_str("packets come, but the head does not turn: is it blocked?"),
-            Trouble::BeamsChanged { from, to } => {
+            Problem::Silence => f.write_str("no packet for one second"),
+            Problem::HeadBlocked => f.write_str("packets come, but the head does not turn: is it blocked?"),
+            Problem::BeamsChanged { from, to } => {
                 write!(f, "scans have {to} beams instead of {from}, as many as the scanner measures points")
             }
         }
@@ -577,38 +589,51 @@ impl fmt::Display for Trouble {
 }
 
 /// Adds the points of `packet`, which is at `place` of the sequence, to `turns`.
-fn put(turns: &mut Turns<MOST_POINTS>, packet: &Packet<'_>, place: Place, reasons: u8, pace: Pace) {
-    let (last, angle) = match place {
-        Place::Again => return,
-        Place::Odd => return turns.doubt(),
-        Place::First { time, angle } => {
-            turns.give_up();
+fn add_points(
+    revolutions: &mut RevolutionAssembler<MAX_POINTS>,
+    packet: &Packet<'_>,
+    position: PacketPosition,
+    reasons: u8,
+    rate: RotationRate,
+) {
+    let (last, angle) = match position {
+        PacketPosition::Repeated => return,
+        PacketPosition::Outlier => return revolutions.mark_incomplete(),
+        PacketPosition::First { time, angle } => {
+            revolutions.discard();
             (time, angle)
         }
-        Place::Next { time, angle, .. } => (time, angle),
+        PacketPosition::Next { time, angle, .. } => (time, angle),
     };
-    for i in 0..POINTS {
+    for i in 0..POINTS_PER_PACKET {
         let point = packet.point(i);
-        let time = last as f64 - pace.point_ns * (POINTS - 1 - i) as f64;
-        turns.put(angle + pace.step * i as f64, time, point.range, point.intensity, reasons, pace);
+        let time = last as f64 - rate.point_ns * (POINTS_PER_PACKET - 1 - i) as f64;
+        revolutions.add_point(
+            angle + rate.step * i as f64,
+            time,
+            point.range,
+            point.intensity,
+            reasons,
+            rate,
+        );
     }
 }
 
 /// Returns how many packets are returned together: as many as arrive in 10 ms.
-const fn most_together(baud: u32) -> usize {
-    if baud > 500_000 { MOST } else { 3 }
+const fn max_packets_per_sample(baud: u32) -> usize {
+    if baud > 500_000 { MAX_PACKETS_PER_SAMPLE } else { 3 }
 }
 
 /// Maximum number of points in a revolution: more than an STL27L measures at five revolutions per second.
-const MOST_POINTS: usize = 4_400;
+const MAX_POINTS: usize = 4_400;
 /// How long the session listens at one rate. A stream has a packet every 3 ms.
-const LISTEN: Nanos = 300 * MILLIS;
+const LISTEN_TIME: Nanos = 300 * MILLIS;
 /// Time after which a scanner whose speed is never constant, or whose sequence has a gap in every revolution, has the
 /// beams of its model.
-const UNDECIDED: Nanos = 10_000 * MILLIS;
+const DECISION_TIMEOUT: Nanos = 10_000 * MILLIS;
 /// After this time with another number of points per revolution, the number of beams changes.
-const CHANGE: Nanos = 10_000 * MILLIS;
+const CHANGE_DELAY: Nanos = 10_000 * MILLIS;
 /// Duration for which a change of the number of beams is reported.
-const SHOW_CHANGE: Nanos = 60_000 * MILLIS;
+const CHANGE_REPORT_TIME: Nanos = 60_000 * MILLIS;
 /// Maximum number of packets that are returned together: those of an STL27L in 10 ms, one every 0.56 ms.
-pub(crate) const MOST: usize = 17;
+pub(crate) const MAX_PACKETS_PER_SAMPLE: usize = 17;

@@ -13,22 +13,22 @@ pub struct Features {
     /// The models. Empty if the scanner reports its model.
     pub models: &'static [Model],
     /// Values for an unknown model: the first rate, and the number of beams for which there is space.
-    pub auto: Model,
+    pub defaults: Model,
     /// Names of the scan modes. Empty if there is no choice.
     pub modes: &'static [&'static str],
     /// Keys of settings that only this family has.
     pub keys: &'static [Key],
     /// Whether the motor can be stopped.
-    pub can_rest: bool,
+    pub can_stop_motor: bool,
     /// Whether the scanner streams as soon as it has power, without a request.
-    pub speaks_unasked: bool,
+    pub streams_unrequested: bool,
     /// Whether each telegram is a scan or a reply by itself. Otherwise the family sends packets, which are parts of a
     /// scan.
     pub has_whole_telegrams: bool,
     /// Whether the scanner reports its settings on request, outside a session: to an [inquiry](crate::inquiry).
     pub has_inquiry: bool,
-    /// Arrays of a scan: bits of [`scanhub_schema::Contents`].
-    pub contents: u8,
+    /// Arrays of a scan: bits of [`scanhub_schema::ArrayFlags`].
+    pub array_flags: u8,
     /// Maximum number of bytes of a telegram, or of packets that arrived together.
     pub max_telegram: usize,
 }
@@ -119,7 +119,7 @@ pub enum Evidence {
     /// A transmission of the family may have been damaged. It is worth sending the request again.
     Damaged,
     /// A transmission of the family may have begun. It is worth waiting for its end.
-    Begun,
+    Partial,
     /// The bytes look like a stream of the family. A reply is needed to prove it.
     Stream,
     /// The scanner belongs to the family, and to this model if it has reported one.
@@ -132,9 +132,9 @@ pub struct Approach {
     /// The family.
     pub family: Family,
     /// Steps without a request, in this order.
-    pub listens: &'static [Listen],
+    pub listen_steps: &'static [ListenStep],
     /// Steps with a request. `None` for a family that never gets a byte.
-    pub asks: Option<Asks>,
+    pub request_steps: Option<RequestSteps>,
     /// Rate at which a scanner reports that it has started, in bits per second. The search pauses at this rate.
     pub boot_rate: Option<u32>,
     /// Maximum number of bytes of a transmission.
@@ -146,9 +146,9 @@ pub struct Approach {
 impl Approach {
     /// Returns the rates at which the search looks for the family, in bits per second, in increasing order.
     pub fn rates(&self) -> Vec<u32> {
-        let asks = self.asks.map_or(&[][..], |asks| asks.rates);
-        let mut rates: Vec<u32> = self.listens.iter().map(|listen| listen.rate).collect();
-        rates.extend(asks);
+        let request_rates = self.request_steps.map_or(&[][..], |asks| asks.rates);
+        let mut rates: Vec<u32> = self.listen_steps.iter().map(|step| step.rate).collect();
+        rates.extend(request_rates);
         rates.sort_unstable();
         rates.dedup();
         rates
@@ -157,35 +157,35 @@ impl Approach {
 
 /// Step that only listens.
 #[derive(Clone, Copy, Debug)]
-pub struct Listen {
+pub struct ListenStep {
     /// Rate in bits per second.
     pub rate: u32,
     /// Duration.
-    pub span: Nanos,
+    pub duration: Nanos,
     /// Whether the step is skipped in a round in which no byte has arrived.
     pub needs_bytes: bool,
 }
 
 /// Steps that send a request at one rate after the other.
 #[derive(Clone, Copy, Debug)]
-pub struct Asks {
+pub struct RequestSteps {
     /// Rates in bits per second, the likeliest first.
     pub rates: &'static [u32],
     /// Time between a change of the rate and the first byte.
-    pub settle: Nanos,
+    pub settle_time: Nanos,
     /// Request that stops a stream. It is sent first.
-    pub stop: Option<Stop>,
+    pub stop: Option<StopRequest>,
     /// Requests for a reply. Every round uses the next one.
     pub requests: &'static [&'static [u8]],
     /// Minimum and maximum time between the end of a byte and the next one. `None` if the scanner accepts any time: then
     /// a request is one write.
     pub gap: Option<(Nanos, Nanos)>,
     /// Time for the reply to begin, from the last byte of the request.
-    pub reply: Nanos,
+    pub reply_timeout: Nanos,
     /// Additional time for the reply in every second round, for slow scanners.
-    pub patience: Nanos,
-    /// Additional time for a reply that has [begun](Evidence::Begun).
-    pub extension: Nanos,
+    pub extra_reply_time: Nanos,
+    /// Additional time for a reply that has [begun](Evidence::Partial).
+    pub extra_partial_time: Nanos,
     /// Number of times that the request is sent in every second round. A request whose reply may have been
     /// [damaged](Evidence::Damaged) is sent again in any round.
     pub repeats: u8,
@@ -193,11 +193,11 @@ pub struct Asks {
 
 /// Request that stops a stream, and the wait for the end of the stream.
 #[derive(Clone, Copy, Debug)]
-pub struct Stop {
+pub struct StopRequest {
     /// The request.
     pub request: &'static [u8],
     /// The stream has ended when no byte has arrived for this time.
-    pub quiet: Nanos,
+    pub quiet_time: Nanos,
     /// After this time, the search sends its request even if bytes still arrive.
-    pub at_most: Nanos,
+    pub max_wait: Nanos,
 }

@@ -27,44 +27,44 @@ pub trait Format {
 
 /// Result of checking for a packet.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Verdict<R> {
+pub enum FrameCheck<R> {
     /// A packet.
     Packet,
     /// No packet. Contains the reason if the bytes begin like one and the check failed.
-    Nothing(Option<R>),
+    NoPacket(Option<R>),
     /// More bytes are needed.
-    Open,
+    Incomplete,
     /// A packet, unless another one begins inside it. More bytes are needed to decide.
     Held,
 }
 
 /// Checks whether a packet begins at the first byte of `open`. If `is_released`, incomplete packets inside it are ignored.
-fn judge<F: Format>(format: &F, open: &[u8], is_released: bool) -> Verdict<F::Reject> {
+fn check_frame<F: Format>(format: &F, open: &[u8], is_released: bool) -> FrameCheck<F::Reject> {
     let len = format.packet_len();
     if !format.begins(open) {
-        return Verdict::Nothing(None);
+        return FrameCheck::NoPacket(None);
     }
-    let Some(packet) = open.get(..len) else { return Verdict::Open };
+    let Some(packet) = open.get(..len) else { return FrameCheck::Incomplete };
     if let Err(reject) = format.check(packet) {
-        return Verdict::Nothing(Some(reject));
+        return FrameCheck::NoPacket(Some(reject));
     }
-    if open.len() >= len + HEADER && format.begins(&open[len..]) {
-        return Verdict::Packet;
+    if open.len() >= len + HEADER_LEN && format.begins(&open[len..]) {
+        return FrameCheck::Packet;
     }
-    for inside in (1..len).filter(|&inside| format.begins(&open[inside..])) {
-        match open.get(inside..inside + len).map(|rival| format.check(rival)) {
-            Some(Ok(())) => return Verdict::Nothing(None),
+    for offset in (1..len).filter(|&inside| format.begins(&open[inside..])) {
+        match open.get(offset..offset + len).map(|inner| format.check(inner)) {
+            Some(Ok(())) => return FrameCheck::NoPacket(None),
             Some(Err(_)) => {}
             None if is_released => {}
-            None => return Verdict::Held,
+            None => return FrameCheck::Held,
         }
     }
-    Verdict::Packet
+    FrameCheck::Packet
 }
 
 /// Counters of a framer. They only increase, and `read == in_packets + discarded + buffered`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Tally {
+pub struct ByteCounters {
     /// Bytes committed.
     pub read: u64,
     /// Bytes of packets that were returned.
@@ -90,26 +90,26 @@ pub struct Buffer<const N: usize> {
     is_held: bool,
     /// Whether it does not have to be held back any longer.
     is_released: bool,
-    tally: Tally,
+    counters: ByteCounters,
 }
 
 impl<const N: usize> Buffer<N> {
     /// Creates an empty buffer. A packet that is held back is released when the line was idle for `hold`.
     pub fn new(hold: Nanos) -> Self {
-        let tally = Tally::default();
-        Buffer { bytes: [0; N], start: 0, end: 0, hold, is_held: false, is_released: false, tally }
+        let counters = ByteCounters::default();
+        Buffer { bytes: [0; N], start: 0, end: 0, hold, is_held: false, is_released: false, counters }
     }
 
     /// Returns the free space for the next bytes. Write to its beginning, then call [`Buffer::commit`]. Invalidates the results
     /// of [`Buffer::take`].
-    pub fn spare(&mut self) -> &mut [u8] {
+    pub fn read_buffer(&mut self) -> &mut [u8] {
         self.bytes.copy_within(self.start..self.end, 0);
         self.end -= self.start;
         self.start = 0;
         &mut self.bytes[self.end..]
     }
 
-    /// Adds the first `len` bytes of [`Buffer::spare`].
+    /// Adds the first `len` bytes of [`Buffer::read_buffer`].
     ///
     /// # Panics
     ///
@@ -117,15 +117,15 @@ impl<const N: usize> Buffer<N> {
     pub fn commit(&mut self, len: usize) {
         self.end += len;
         assert!(self.end <= N, "more bytes committed than there was room");
-        self.tally.read += len as u64;
+        self.counters.read += len as u64;
         self.is_released &= len == 0;
     }
 
     /// Checks whether a packet begins at the open byte number `at`.
-    pub fn judge<F: Format>(&mut self, format: &F, at: usize) -> Verdict<F::Reject> {
-        let verdict = judge(format, &self.open()[at..], self.is_released);
-        self.is_held |= matches!(verdict, Verdict::Held);
-        verdict
+    pub fn check_frame<F: Format>(&mut self, format: &F, at: usize) -> FrameCheck<F::Reject> {
+        let check = check_frame(format, &self.open_bytes()[at..], self.is_released);
+        self.is_held |= matches!(check, FrameCheck::Held);
+        check
     }
 
     /// Begins to check the open bytes again.
@@ -145,40 +145,40 @@ impl<const N: usize> Buffer<N> {
     }
 
     /// Returns the open bytes.
-    pub fn open(&self) -> &[u8] {
+    pub fn open_bytes(&self) -> &[u8] {
         &self.bytes[self.start..self.end]
     }
 
     /// Returns the number of the first open byte among all committed bytes, from 0.
     pub fn offset(&self) -> u64 {
-        self.tally.read - (self.end - self.start) as u64
+        self.counters.read - (self.end - self.start) as u64
     }
 
-    /// Takes the first `len` open bytes, which are `packets` packets. Returns their position for [`Buffer::taken`].
+    /// Takes the first `len` open bytes, which are `packets` packets. Returns their position for [`Buffer::taken_bytes`].
     pub fn take(&mut self, len: usize, packets: usize) -> usize {
         let at = self.start;
         self.start += len;
-        self.tally.packets += packets as u64;
-        self.tally.in_packets += len as u64;
+        self.counters.packets += packets as u64;
+        self.counters.in_packets += len as u64;
         at
     }
 
     /// Makes the last `len` bytes that were taken, which are `packets` packets, open again.
-    pub fn give_back(&mut self, len: usize, packets: usize) {
+    pub fn unread(&mut self, len: usize, packets: usize) {
         self.start -= len;
-        self.tally.packets -= packets as u64;
-        self.tally.in_packets -= len as u64;
+        self.counters.packets -= packets as u64;
+        self.counters.in_packets -= len as u64;
     }
 
     /// Returns `len` bytes that [`Buffer::take`] took at position `at`.
-    pub fn taken(&self, at: usize, len: usize) -> &[u8] {
+    pub fn taken_bytes(&self, at: usize, len: usize) -> &[u8] {
         &self.bytes[at..at + len]
     }
 
     /// Discards the first `len` open bytes.
     pub fn discard(&mut self, len: usize) {
         self.start += len;
-        self.tally.discarded += len as u64;
+        self.counters.discarded += len as u64;
     }
 
     /// Discards all open bytes, for example because the rate of the line changes.
@@ -189,23 +189,23 @@ impl<const N: usize> Buffer<N> {
 
     /// Counts a discarded header whose packet had a wrong checksum.
     pub fn reject_checksum(&mut self) {
-        self.tally.rejected_checksum += 1;
+        self.counters.rejected_checksum += 1;
     }
 
     /// Returns the counters.
-    pub fn tally(&self) -> &Tally {
-        &self.tally
+    pub fn byte_counters(&self) -> &ByteCounters {
+        &self.counters
     }
 }
 
 /// Moves the first of `bytes` into `spare`. Returns their number.
-pub(crate) fn fill(spare: &mut [u8], bytes: &mut &[u8]) -> usize {
-    let len = spare.len().min(bytes.len());
+pub(crate) fn fill(buffer: &mut [u8], bytes: &mut &[u8]) -> usize {
+    let len = buffer.len().min(bytes.len());
     let (now, later) = bytes.split_at(len);
-    spare[..len].copy_from_slice(now);
+    buffer[..len].copy_from_slice(now);
     *bytes = later;
     len
 }
 
 /// Length of a header, in bytes.
-const HEADER: usize = 2;
+const HEADER_LEN: usize = 2;

@@ -6,7 +6,7 @@ use core::f32::consts::TAU;
 
 use scanhub_schema::{Code, Family, Nanos, Scan, ScanArrays, ScanHead};
 
-use crate::line::Closed;
+use crate::line::ClosedRevolution;
 
 /// A scan as it was received.
 #[derive(Clone, Copy, Debug)]
@@ -53,12 +53,12 @@ impl<'a> RawScan<'a> {
     /// 0 and of the last point. `per_second` is the number of points per second; 0 if unknown.
     pub fn revolution(
         family: Family,
-        closed: &Closed,
+        revolution: &ClosedRevolution,
         (first, last): (Nanos, Nanos),
         (beams, per_second): (usize, f32),
         points: &'a [Point],
     ) -> RawScan<'a> {
-        let &Closed { number, period, reasons, incomplete, .. } = closed;
+        let &ClosedRevolution { number, period, reasons, incomplete, .. } = revolution;
         let head = revolution_head(family, beams, period, per_second, incomplete);
         let values = Values::Points { points, per_second };
         RawScan { number, first, last, period, reasons, bytes: 0, head, values }
@@ -120,10 +120,10 @@ pub fn revolution_head(
     points_per_second: f32,
     is_incomplete: bool,
 ) -> ScanHead {
-    let head = ScanHead::turning(family, beams);
+    let head = ScanHead::of_revolution(family, beams);
     // The scanner's own points in a revolution.
-    let own = f64::from(points_per_second) * period as f64 / 1e9;
-    let spacing = if own >= 1.0 { core::f64::consts::TAU / own } else { -head.step };
+    let measured_points = f64::from(points_per_second) * period as f64 / 1e9;
+    let spacing = if measured_points >= 1.0 { core::f64::consts::TAU / measured_points } else { -head.step };
     ScanHead {
         spacing: spacing as f32,
         beam_time_ns: u32::try_from(period / beams.max(1) as u64).unwrap_or(u32::MAX),
@@ -148,7 +148,7 @@ pub const NO_RETURN: u16 = Code::NoReturn.value();
 /// Range of a beam without a point in this revolution.
 pub const NOT_MEASURED: u16 = Scan::NOT_MEASURED;
 /// Numbers of beams that a revolution may have.
-pub const BEAMS: core::ops::RangeInclusive<usize> = 2..=scanhub_schema::MAX_BEAMS;
+pub const BEAM_RANGE: core::ops::RangeInclusive<usize> = 2..=scanhub_schema::MAX_BEAMS;
 
 /// Equal bins all around for a head that rotates clockwise. Beam 0 is ahead, and beam `i` at `-i` times the step, so beams
 /// are in the order of measuring. The bin of beam 0 begins half a step before the scanner's zero: 0 and 360 degrees are
@@ -159,11 +159,11 @@ pub struct Grid {
 }
 
 impl Grid {
-    /// Creates a grid of `beams` beams, limited to [`BEAMS`].
+    /// Creates a grid of `beams` beams, limited to [`BEAM_RANGE`].
     pub const fn new(beams: usize) -> Grid {
-        let (least, most) = (*BEAMS.start(), *BEAMS.end());
-        let beams = if beams < least { least } else { beams };
-        Grid { beams: if beams > most { most } else { beams } }
+        let (min, max) = (*BEAM_RANGE.start(), *BEAM_RANGE.end());
+        let beams = if beams < min { min } else { beams };
+        Grid { beams: if beams > max { max } else { beams } }
     }
 
     /// Returns the number of beams.
@@ -196,9 +196,9 @@ impl Grid {
         let mut collisions = 0;
         for point in points {
             // Up to one more revolution on either side is accepted. The result is rounded to the nearest beam.
-            let place = point.angle * bins_per_radian + (beams as f32 + 0.5);
+            let bin_position = point.angle * bins_per_radian + (beams as f32 + 0.5);
             // An angle that is not a number has no beam. 32 bits, because a conversion to 64 takes three times as long.
-            let measured = if place >= 0.0 { place as u32 as usize } else { usize::MAX };
+            let measured = if bin_position >= 0.0 { bin_position as u32 as usize } else { usize::MAX };
             let mut bin = measured;
             let mut angle = point.angle - TAU;
             for _ in 0..2 {
@@ -223,7 +223,7 @@ impl Grid {
 
 #[cfg(test)]
 mod tests {
-    use scanhub_schema::Contents;
+    use scanhub_schema::ArrayFlags;
 
     use super::*;
 
@@ -244,7 +244,7 @@ mod tests {
         };
         let mut scan = Scan::zeroed(raw.payload_len());
         raw.write(&mut scan);
-        assert_eq!(raw.payload_len(), Scan::len(8, Contents::TURNING));
+        assert_eq!(raw.payload_len(), Scan::len(8, ArrayFlags::REVOLUTION));
         assert_eq!((scan.beams(), scan.collisions, scan.is_incomplete()), (8, 1, true));
         assert_eq!(
             (scan.distance_mm(0), scan.distance_mm(2), scan.intensities().get(2)),
@@ -295,7 +295,7 @@ mod tests {
     }
 
     #[test]
-    fn the_nearest_that_has_a_range_wins_and_keeps_its_angle() {
+    fn nearest_range_wins_and_keeps_its_angle() {
         let turn = [at(44.0, 900), at(47.0, 300), at(50.0, NO_RETURN), at(89.0, NO_RETURN), at(91.0, 1200)];
         let (ranges, angles, collisions) = eight(&turn);
         assert_eq!(ranges[..3], [NOT_MEASURED, 300, 1200]);
@@ -305,7 +305,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_came_back_is_another_thing_than_nothing_was_measured() {
+    fn no_return_is_distinct_from_not_measured() {
         let (ranges, angles, collisions) = eight(&[at(90.0, NO_RETURN), at(92.0, NO_RETURN)]);
         assert_eq!((ranges[2], ranges[3]), (NO_RETURN, NOT_MEASURED));
         assert!((angles[2] - 90.0).abs() < 1e-3);

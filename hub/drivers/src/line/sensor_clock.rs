@@ -8,169 +8,171 @@ use scanhub_schema::{MILLIS, Nanos};
 #[derive(Clone, Debug)]
 pub struct SensorClock {
     /// Minimum delay of each span, oldest first from `next` on.
-    least: [Option<Delay>; SensorClock::SPANS],
+    min_delays: [Option<Delay>; SensorClock::SPAN_COUNT],
     next: usize,
     /// Beginning of the newest span, and duration of a span, which grows: first the drift is known soon, later exactly.
-    since: Nanos,
+    span_began: Nanos,
     span: Nanos,
     /// Minimum delay of all spans.
-    best: Option<Delay>,
+    min_delay: Option<Delay>,
     /// Nanoseconds by which the hub's clock gets ahead in each nanosecond of the scanner's.
     drift: f64,
     /// Times from the first value on may be off by the second one against earlier ones, until the spans decide it.
-    doubt: Option<(Nanos, Nanos)>,
+    uncertainty: Option<(Nanos, Nanos)>,
 }
 
 /// Offset from a time of the scanner's clock to the hub's clock.
 #[derive(Clone, Copy, Debug)]
 struct Delay {
-    at: Nanos,
+    sensor_time: Nanos,
     offset: i64,
 }
 
 impl Delay {
     /// Returns the offset at another time `at`, for clocks with this drift.
-    fn seen_from(self, at: Nanos, drift: f64) -> i64 {
-        self.offset + (drift * (at as i64 - self.at as i64) as f64) as i64
+    fn offset_at(self, at: Nanos, drift: f64) -> i64 {
+        self.offset + (drift * (at as i64 - self.sensor_time as i64) as f64) as i64
     }
 }
 
 impl SensorClock {
-    const SPANS: usize = 16;
+    const SPAN_COUNT: usize = 16;
 
     /// Creates a clock before its first time.
     #[expect(clippy::new_without_default, reason = "the start of a stream is not a default value")]
     pub fn new() -> Self {
         SensorClock {
-            least: [None; Self::SPANS],
+            min_delays: [None; Self::SPAN_COUNT],
             next: 0,
-            since: 0,
+            span_began: 0,
             span: FIRST_SPAN,
-            best: None,
+            min_delay: None,
             drift: 0.0,
-            doubt: None,
+            uncertainty: None,
         }
     }
 
     /// Records that times from `at` of the scanner's clock on may be off by `most` against earlier ones, because the
     /// time between them was counted, not measured. Earlier delays count until those of a later span are known as well.
-    pub fn doubt(&mut self, at: Nanos, most: Nanos) {
-        if self.best.is_some() {
-            self.doubt = Some((at, most));
+    pub fn add_uncertainty(&mut self, at: Nanos, max_error: Nanos) {
+        if self.min_delay.is_some() {
+            self.uncertainty = Some((at, max_error));
             self.begin_span(at);
         }
     }
 
     /// Records that an event at `at` of the scanner's clock had arrived at `latest` of the hub's clock.
-    pub fn note(&mut self, at: Nanos, latest: Nanos) {
-        let delay = Delay { at, offset: latest as i64 - at as i64 };
-        if self.best.is_none() || at.saturating_sub(self.since) >= self.span {
-            if self.span < SPAN && self.known().count() == Self::SPANS {
+    pub fn note_arrival(&mut self, at: Nanos, latest: Nanos) {
+        let delay = Delay { sensor_time: at, offset: latest as i64 - at as i64 };
+        if self.min_delay.is_none() || at.saturating_sub(self.span_began) >= self.span {
+            if self.span < MAX_SPAN && self.delays().count() == Self::SPAN_COUNT {
                 self.join_pairs();
             }
-            self.settle(at);
+            self.resolve_uncertainty(at);
             self.begin_span(at);
-            self.learn_drift();
+            self.estimate_drift();
             let drift = self.drift;
-            self.best = self.known().min_by_key(|known| known.seen_from(at, drift));
+            self.min_delay = self.delays().min_by_key(|known| known.offset_at(at, drift));
         }
         let drift = self.drift;
         let is_less =
-            |known: Option<Delay>| known.is_none_or(|known| delay.offset < known.seen_from(at, drift));
-        if is_less(self.least[self.next]) {
-            self.least[self.next] = Some(delay);
+            |known: Option<Delay>| known.is_none_or(|known| delay.offset < known.offset_at(at, drift));
+        if is_less(self.min_delays[self.next]) {
+            self.min_delays[self.next] = Some(delay);
         }
-        if is_less(self.best) {
-            self.best = Some(delay);
+        if is_less(self.min_delay) {
+            self.min_delay = Some(delay);
         }
     }
 
     /// Converts `at` of the scanner's clock to the hub's clock. `None` before the first event.
     pub fn time(&self, at: Nanos) -> Option<Nanos> {
-        let best = self.best?;
-        Some(at.saturating_add_signed(best.seen_from(at, self.drift)))
+        let min_delay = self.min_delay?;
+        Some(at.saturating_add_signed(min_delay.offset_at(at, self.drift)))
     }
 
     fn begin_span(&mut self, at: Nanos) {
-        self.next = (self.next + 1) % Self::SPANS;
-        self.least[self.next] = None;
-        self.since = at;
+        self.next = (self.next + 1) % Self::SPAN_COUNT;
+        self.min_delays[self.next] = None;
+        self.span_began = at;
     }
 
     /// Ends a span at `at`. If it agrees with the spans before the [uncertain](Self::doubt) time, those are not needed
     /// any more.
-    fn settle(&mut self, at: Nanos) {
-        let Some((from, most)) = self.doubt else { return };
-        let seen = |known: Delay| known.seen_from(at, self.drift);
-        let before = self.known().filter(|known| known.at < from).map(seen).min();
-        let since = self.known().filter(|known| known.at >= from).map(seen).min();
+    fn resolve_uncertainty(&mut self, at: Nanos) {
+        let Some((from, max_error)) = self.uncertainty else { return };
+        let offset_of = |known: Delay| known.offset_at(at, self.drift);
+        let before = self.delays().filter(|known| known.sensor_time < from).map(offset_of).min();
+        let since = self.delays().filter(|known| known.sensor_time >= from).map(offset_of).min();
         let is_known = match (before, since) {
-            (Some(before), Some(since)) => since - before <= most as i64,
+            (Some(before), Some(since)) => since - before <= max_error as i64,
             (before, _) => before.is_none(),
         };
         if is_known {
-            self.least.iter_mut().for_each(|place| *place = place.filter(|known| known.at >= from));
-            self.doubt = None;
+            self.min_delays
+                .iter_mut()
+                .for_each(|slot| *slot = slot.filter(|known| known.sensor_time >= from));
+            self.uncertainty = None;
         }
     }
 
     /// Joins pairs of spans, so that spans become twice as long.
     fn join_pairs(&mut self) {
-        let mut joined = [None; Self::SPANS];
-        for (n, delay) in self.known().enumerate() {
-            let place: &mut Option<Delay> = &mut joined[n / 2];
+        let mut joined = [None; Self::SPAN_COUNT];
+        for (n, delay) in self.delays().enumerate() {
+            let slot: &mut Option<Delay> = &mut joined[n / 2];
             let drift = self.drift;
-            if place.is_none_or(|known| delay.offset < known.seen_from(delay.at, drift)) {
-                *place = Some(delay);
+            if slot.is_none_or(|known| delay.offset < known.offset_at(delay.sensor_time, drift)) {
+                *slot = Some(delay);
             }
         }
-        (self.least, self.next) = (joined, Self::SPANS / 2 - 1);
+        (self.min_delays, self.next) = (joined, Self::SPAN_COUNT / 2 - 1);
         self.span *= 2;
     }
 
-    fn known(&self) -> impl Iterator<Item = Delay> {
-        let (newer, older) = self.least.split_at(self.next + 1);
+    fn delays(&self) -> impl Iterator<Item = Delay> {
+        let (newer, older) = self.min_delays.split_at(self.next + 1);
         older.iter().chain(newer).copied().flatten()
     }
 
     /// Estimates the drift: the median over pairs of an older and a newer span, of those in which the host ran.
-    fn learn_drift(&mut self) {
-        if self.doubt.is_some() {
+    fn estimate_drift(&mut self) {
+        if self.uncertainty.is_some() {
             return;
         }
-        let Some(least) = self.known().min_by_key(|known| known.offset) else { return };
-        let ran = |known: &Delay| {
-            let most = MOST_DRIFT * known.at.abs_diff(least.at) as f64;
-            ((known.offset - least.offset) as f64) < most + JITTER
+        let Some(min) = self.delays().min_by_key(|known| known.offset) else { return };
+        let was_host_running = |known: &Delay| {
+            let max_offset = MAX_DRIFT * known.sensor_time.abs_diff(min.sensor_time) as f64;
+            ((known.offset - min.offset) as f64) < max_offset + MAX_JITTER_NS
         };
-        let count = self.known().filter(ran).count();
-        if count < ENOUGH {
+        let count = self.delays().filter(was_host_running).count();
+        if count < MIN_SPANS {
             return;
         }
-        let mut slopes = [0.0; (Self::SPANS / 2) * Self::SPANS.div_ceil(2)];
+        let mut slopes = [0.0; (Self::SPAN_COUNT / 2) * Self::SPAN_COUNT.div_ceil(2)];
         let mut len = 0;
-        for older in self.known().filter(ran).take(count / 2) {
-            for newer in self.known().filter(ran).skip(count / 2) {
-                let span = newer.at.saturating_sub(older.at).max(1);
+        for older in self.delays().filter(was_host_running).take(count / 2) {
+            for newer in self.delays().filter(was_host_running).skip(count / 2) {
+                let span = newer.sensor_time.saturating_sub(older.sensor_time).max(1);
                 slopes[len] = (newer.offset - older.offset) as f64 / span as f64;
                 len += 1;
             }
         }
         let slopes = &mut slopes[..len];
         slopes.sort_unstable_by(f64::total_cmp);
-        self.drift = slopes[len / 2].clamp(-MOST_DRIFT, MOST_DRIFT);
+        self.drift = slopes[len / 2].clamp(-MAX_DRIFT, MAX_DRIFT);
     }
 }
 
 /// Maximum duration of a span, and that of the first ones.
-const SPAN: Nanos = 500 * MILLIS;
-const FIRST_SPAN: Nanos = SPAN / 8;
+const MAX_SPAN: Nanos = 500 * MILLIS;
+const FIRST_SPAN: Nanos = MAX_SPAN / 8;
 /// Minimum number of spans for an estimate of the drift.
-const ENOUGH: usize = 6;
+const MIN_SPANS: usize = 6;
 /// Maximum drift. No oscillator is off by more, not even one without a crystal.
-const MOST_DRIFT: f64 = 0.02;
+const MAX_DRIFT: f64 = 0.02;
 /// Maximum delay of a host that runs, in nanoseconds.
-const JITTER: f64 = 4e6;
+const MAX_JITTER_NS: f64 = 4e6;
 
 #[cfg(test)]
 mod tests {
@@ -190,7 +192,7 @@ mod tests {
             let phase = hub_s % every;
             let stopped = if hub_s > 1.0 && phase < stall { stall - phase } else { 0.0 };
             let nanos = |s: f64| ((s + 1_000.0) * 1e9) as Nanos;
-            clock.note(nanos(sensor_s), nanos(hub_s + late_s.max(stopped)));
+            clock.note_arrival(nanos(sensor_s), nanos(hub_s + late_s.max(stopped)));
             let mapped = clock.time(nanos(sensor_s)).expect("tied");
             if hub_s > from {
                 worst = worst.max((mapped as f64 - nanos(hub_s) as f64).abs() / 1e3);
@@ -217,10 +219,10 @@ mod tests {
             let phase = n % 2_000;
             if n > 4_000 && phase == 1_250 {
                 counted += MILLIS;
-                clock.doubt(hub - counted, 3 * MILLIS);
+                clock.add_uncertainty(hub - counted, 3 * MILLIS);
             }
             let waits = if n > 4_000 && (1_000..1_500).contains(&phase) { 1_500 - phase } else { 0 };
-            clock.note(hub - counted, hub + waits * MILLIS);
+            clock.note_arrival(hub - counted, hub + waits * MILLIS);
             let off = clock.time(hub - counted).expect("tied").abs_diff(hub);
             assert!(off <= 1_100_000, "{n}: {off}");
             wrong += u64::from(off > 100_000);

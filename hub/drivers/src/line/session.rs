@@ -7,25 +7,25 @@ use crate::line::RawScan;
 use crate::line::family::Model;
 use scanhub_schema::{Counter, Counters, Nanos, Status};
 
-/// A protocol state machine on an open port. After every call that changes it, drain [`Protocol::poll_output`] until it
-/// returns [`Output::Wait`] or [`Output::Rest`].
+/// A protocol state machine on an open port. After every call that changes it, drain [`Protocol::poll_action`] until it
+/// returns [`Action::Wait`] or [`Action::SleepUntil`].
 pub trait Protocol {
     /// Returns the buffer of the next read. It is never empty after the outputs were drained.
-    fn spare(&mut self) -> &mut [u8];
+    fn read_buffer(&mut self) -> &mut [u8];
 
-    /// Handles a read that returned at `now` with `len` bytes in [`Protocol::spare`].
+    /// Handles a read that returned at `now` with `len` bytes in [`Protocol::read_buffer`].
     fn commit(&mut self, now: Nanos, len: usize);
 
     /// Handles a deadline that has passed without a byte.
     fn handle_timeout(&mut self, now: Nanos);
 
-    /// Handles that the bytes of [`Output::Transmit`] were written at `now`.
-    fn transmitted(&mut self, now: Nanos);
+    /// Handles that the bytes of [`Action::Transmit`] were written at `now`.
+    fn handle_transmitted(&mut self, now: Nanos);
 
     /// Returns the next action that the protocol requests.
-    fn poll_output(&mut self) -> Output<'_>;
+    fn poll_action(&mut self) -> Action<'_>;
 
-    /// Call it at `now`, immediately before the bytes of [`Output::Transmit`] are written. Returns whether it is too
+    /// Call it at `now`, immediately before the bytes of [`Action::Transmit`] are written. Returns whether it is too
     /// late for them, as on a machine that did not run the program for a few milliseconds. Then do not write them, and
     /// continue draining: the request starts over.
     fn restart_if_late(&mut self, now: Nanos) -> bool {
@@ -33,7 +33,7 @@ pub trait Protocol {
         false
     }
 
-    /// Handles at `now` that the port cannot have the rate of the last [`Output::SetRate`], or, before the first
+    /// Handles at `now` that the port cannot have the rate of the last [`Action::SetRate`], or, before the first
     /// output, the rate at which it should be open. A protocol that can try other rates leaves this one out.
     fn reject_rate(&mut self, now: Nanos) {
         let _ = now;
@@ -48,9 +48,9 @@ pub trait Protocol {
 /// A session with a scanner that lasts as long as the line is open.
 ///
 /// The methods with a body are for what only some families have.
-pub trait Session: Protocol {
+pub trait ScannerSession: Protocol {
     /// Reason why a session does not stream as it should, as text when displayed.
-    type Trouble: Copy + PartialEq + fmt::Display;
+    type Problem: Copy + PartialEq + fmt::Display;
 
     /// Handles a request of a user. A repeated request changes nothing, but each [`Control::Resync`] counts. A
     /// recording cannot be controlled.
@@ -60,17 +60,17 @@ pub trait Session: Protocol {
     fn state(&self) -> State;
 
     /// Returns why the session does not stream as it should.
-    fn trouble(&self) -> Option<Self::Trouble>;
+    fn problem(&self) -> Option<Self::Problem>;
 
     /// Returns the name of the transmissions that the session misses, such as `LMS replies`, while its
-    /// [`trouble`](Self::trouble) is that none of them arrive. Other bytes may arrive meanwhile.
-    fn missing(&self) -> Option<&'static str>;
+    /// [`trouble`](Self::problem) is that none of them arrive. Other bytes may arrive meanwhile.
+    fn missing_transmission(&self) -> Option<&'static str>;
 
     /// Returns the rate at which the session receives and sends, in bits per second.
     fn rate(&self) -> u32;
 
     /// Returns the counters.
-    fn account(&self) -> Account;
+    fn stats(&self) -> SessionStats;
 
     /// Returns whether [`defer_read`](Self::defer_read) may postpone the next read, so that counting the waiting bytes
     /// pays off.
@@ -139,7 +139,7 @@ pub trait Session: Protocol {
         let _ = count;
     }
 
-    /// Returns the scan that is arriving, with the values so far. Call it when [`poll_output`](Protocol::poll_output)
+    /// Returns the scan that is arriving, with the values so far. Call it when [`poll_action`](Protocol::poll_action)
     /// has returned a wait. `None` between scans, and while the meaning of values is not known.
     fn partial_scan(&self) -> Option<RawScan<'_>>;
 
@@ -155,7 +155,7 @@ pub trait Session: Protocol {
     }
 
     /// Returns the model if it is not the one of the settings. Of models that cannot be distinguished, it is one.
-    fn other_model(&self) -> Option<Model> {
+    fn unexpected_model(&self) -> Option<Model> {
         None
     }
 
@@ -184,7 +184,7 @@ pub trait Session: Protocol {
     /// the model, the kind of packets, or the time per point. Empty if the session has received them with the packets, or if
     /// the family does not need them. Used for a recording. `reported` is the type of the scanner in a status of the
     /// recording, and `beams` the number of beams of its scans, if the recording has them.
-    fn stream_head(&self, reported: &str, beams: Option<usize>) -> Vec<u8> {
+    fn stream_responses(&self, reported: &str, beams: Option<usize>) -> Vec<u8> {
         let _ = (reported, beams);
         Vec::new()
     }
@@ -196,7 +196,7 @@ pub trait Session: Protocol {
 
     /// Returns the identity and the health that the scanner reported. `None` before it has reported both, and always
     /// for a family without such requests.
-    fn introduction(&self) -> Option<Introduction> {
+    fn device_info(&self) -> Option<DeviceInfo> {
         None
     }
 
@@ -222,7 +222,7 @@ pub trait Session: Protocol {
         telegram: &'a [u8],
         is_readable: bool,
         status: Option<&mut Status>,
-    ) -> Option<Received<'a>> {
+    ) -> Option<ReceivedTelegram<'a>> {
         let _ = (telegram, is_readable, status);
         None
     }
@@ -242,19 +242,19 @@ pub trait Session: Protocol {
 
     /// Adds the counters of this session to `counters`, which are those of earlier ones.
     fn add_counters(&self, counters: &mut Counters) {
-        self.account().add_to(counters);
+        self.stats().add_to(counters);
     }
 }
 
 /// Action that a protocol requests, in the order in which it is to be carried out.
 #[derive(Debug)]
-pub enum Output<'a> {
+pub enum Action<'a> {
     /// Set the port to this rate, in bits per second, and discard what it had received. If the port cannot have this
     /// rate, call [`Protocol::reject_rate`]. Then continue draining.
     SetRate(u32),
     /// Assert the line DTR of a serial port, or clear it; other ports have none. Then continue draining.
     SetDtr(bool),
-    /// Write these bytes, not before the time given, then call [`Protocol::transmitted`]. Do nothing else meanwhile,
+    /// Write these bytes, not before the time given, then call [`Protocol::handle_transmitted`]. Do nothing else meanwhile,
     /// because a request may have to arrive without pauses. It is one byte at a time where the scanner requires gaps
     /// between bytes.
     Transmit {
@@ -266,7 +266,7 @@ pub enum Output<'a> {
     /// Something arrived.
     Event(Event<'a>),
     /// Do not read before this time: nothing can be complete earlier, or it can wait.
-    Rest(Nanos),
+    SleepUntil(Nanos),
     /// Read when the port has bytes; at the deadline, if a read finds none, call [`Protocol::handle_timeout`].
     Wait {
         /// The deadline; [`Nanos::MAX`] is none.
@@ -279,14 +279,14 @@ pub enum Output<'a> {
 pub enum Event<'a> {
     /// A telegram, or packets that arrived together, at most 10 ms of them, without other bytes between them. Each
     /// packet is in one of these events, in the order of arrival.
-    Telegram(Received<'a>),
+    Telegram(ReceivedTelegram<'a>),
     /// A complete revolution of a rotating scanner, after its packets.
     Scan(RawScan<'a>),
 }
 
 /// A telegram, or packets that arrived together, with their stamps.
 #[derive(Clone, Copy, Debug)]
-pub struct Received<'a> {
+pub struct ReceivedTelegram<'a> {
     /// The bytes, in the session's buffer.
     pub bytes: &'a [u8],
     /// Time at which the first byte arrived.
@@ -304,12 +304,12 @@ pub struct Received<'a> {
     /// Whether it is the response to a request, without measured data.
     pub is_reply: bool,
     /// Contents of a telegram that is a scan or a reply by itself. `None` for packets, which are parts of a scan.
-    pub whole: Option<Whole<'a>>,
+    pub contents: Option<TelegramContents<'a>>,
 }
 
 /// Contents of a telegram that is a scan or a reply by itself.
 #[derive(Clone, Copy, Debug)]
-pub struct Whole<'a> {
+pub struct TelegramContents<'a> {
     /// [Number](RawScan::number) that the telegram had as a partial scan. Any other partial scan has come to nothing.
     pub number: u64,
     /// Number of beams of measured data; 0 for a reply.
@@ -335,18 +335,18 @@ pub type Identity = [u8; 32];
 
 /// Identity and health that a scanner reported on request, as text.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Introduction {
+pub struct DeviceInfo {
     /// Firmware and numbers.
     pub identity: String,
     /// Health; empty if it was not reported.
     pub health: String,
     /// The same as a verdict.
-    pub condition: Condition,
+    pub condition: HealthStatus,
 }
 
 /// Health that a scanner reports.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Condition {
+pub enum HealthStatus {
     /// Not reported.
     Unknown,
     /// The scanner works.
@@ -397,7 +397,7 @@ pub enum Control {
 /// Counters of a session. All of them except `buffered` only increase. Always
 /// `read == in_telegrams + acknowledge + discarded + buffered`, in bytes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Account {
+pub struct SessionStats {
     /// Bytes read.
     pub read: u64,
     /// Bytes of telegrams and packets that were returned.
@@ -423,10 +423,10 @@ pub struct Account {
     /// Restarts of the scanner that the session did not request. First contact is not one.
     pub restarts: u64,
     /// Whether the first transmission came after a fragment of one, which was in flight when the port was opened.
-    pub began_with_a_cut: bool,
+    pub first_frame_truncated: bool,
 }
 
-impl Account {
+impl SessionStats {
     /// Adds these counters to those of earlier sessions.
     pub fn add_to(&self, counters: &mut Counters) {
         counters[Counter::BytesRead] += self.read;
@@ -440,7 +440,7 @@ impl Account {
         counters[Counter::BytesDamaged] += self.damaged;
         counters[Counter::DueOnLine] += self.due;
         counters[Counter::LostOnLine] += self.lost;
-        counters[Counter::LostInRestart] += u64::from(self.began_with_a_cut);
+        counters[Counter::LostInRestart] += u64::from(self.first_frame_truncated);
         counters[Counter::RejectedCrc] += self.rejected_checksum;
     }
 }

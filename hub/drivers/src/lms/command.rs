@@ -3,7 +3,7 @@
 //! code that has only a [`Request`] cannot write it.
 
 use crate::lms::operating::{self, Operating};
-use crate::lms::telegram::{Encoded, Telegram, Writer};
+use crate::lms::telegram::{EncodedTelegram, Telegram, Writer};
 use crate::lms::variant::{Baud, Variant};
 
 /// Part of a request: encoded after the command, and decoded from the data.
@@ -87,21 +87,21 @@ requests! {
         /// 36h: mean values of this number of scans, 2 to 250.
         Means(number: u8) = MEANS,
         /// 37h: values of a sub-range; bit 15 of its first asks for direct output of a partial scan.
-        Range(span: Span) = RANGE,
+        Range(span: SubRange) = RANGE,
         /// 3Ah: type and firmware.
         Type = TYPE,
         /// 3Bh: switch angle and resolution; forgotten at power-off.
         Variant(variant: Variant) = VARIANT,
         /// 3Eh: values of a sub-range with those of the fields A, B and C; at most 100.
-        RangeFields(span: Span) = RANGE_FIELDS,
+        RangeFields(span: SubRange) = RANGE_FIELDS,
         /// 3Fh: mean values of this number of scans in a sub-range.
-        RangeMeans(number: u8, span: Span) = RANGE_MEANS,
+        RangeMeans(number: u8, span: SubRange) = RANGE_MEANS,
         /// 41h: switch the set of fields. Its parameters are not decoded.
-        FieldSet(raw: Raw) = FIELD_SET,
+        FieldSet(raw: RawParameters) = FIELD_SET,
         /// 44h: all ranges, and the reflectivity of a sub-range; LMS S14 only.
-        Reflectivity(span: Span) = REFLECTIVITY,
+        Reflectivity(span: SubRange) = REFLECTIVITY,
         /// 45h: read a field. Its parameters are not decoded.
-        Field(raw: Raw) = FIELD,
+        Field(raw: RawParameters) = FIELD,
         /// 4Ah: state of the field outputs.
         Outputs = OUTPUTS,
         /// 69h: the ranges of the positioning aid.
@@ -109,9 +109,9 @@ requests! {
         /// 74h: first part of the configuration, with unit and measuring mode.
         Configuration = CONFIGURATION,
         /// 75h: ranges and reflectivities of one to five sub-ranges.
-        Reflectivities(spans: Spans) = REFLECTIVITIES,
+        Reflectivities(spans: SubRanges) = REFLECTIVITIES,
         /// 76h: a sub-range as Cartesian coordinates, at most 200.
-        Cartesian(span: Span) = CARTESIAN,
+        Cartesian(span: SubRange) = CARTESIAN,
         /// 7Bh: second part of the configuration.
         Configuration2 = CONFIGURATION_2,
     }
@@ -119,7 +119,7 @@ requests! {
 
 impl Request {
     /// Returns the telegram with this request for the scanner at `address`; 0 is for all.
-    pub fn encode(self, address: u8) -> Encoded {
+    pub fn encode(self, address: u8) -> EncodedTelegram {
         self.write_parameters(Writer::new(address, self.command())).finish()
     }
 
@@ -188,7 +188,7 @@ pub const EEPROM_WRITES: [u8; 6] = [0x40, 0x42, 0x46, 0x66, 0x77, 0x7C];
 
 /// A sub-range of the values, both ends included, counted from 1.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Span {
+pub struct SubRange {
     /// The first value.
     pub first: u16,
     /// The last value.
@@ -215,11 +215,11 @@ impl Parameter for u16 {
     }
 }
 
-impl Parameter for Span {
-    fn read(data: &[u8]) -> Option<(Span, &[u8])> {
+impl Parameter for SubRange {
+    fn read(data: &[u8]) -> Option<(SubRange, &[u8])> {
         let (first, data) = u16::read(data)?;
         let (last, data) = u16::read(data)?;
-        Some((Span { first, last }, data))
+        Some((SubRange { first, last }, data))
     }
 
     fn write(self, writer: Writer) -> Writer {
@@ -229,39 +229,39 @@ impl Parameter for Span {
 
 /// One to five sub-ranges.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Spans {
-    list: [Span; Spans::MAX],
+pub struct SubRanges {
+    list: [SubRange; SubRanges::MAX],
     len: u8,
 }
 
-impl Spans {
+impl SubRanges {
     /// Maximum number in a telegram (Telegram listing, 75h).
     pub const MAX: usize = 5;
 
     /// Creates the list. `None` if it is empty, or has more than five sub-ranges.
-    pub fn new(spans: &[Span]) -> Option<Spans> {
+    pub fn new(spans: &[SubRange]) -> Option<SubRanges> {
         if spans.is_empty() {
             return None;
         }
-        let mut list = [Span::default(); Spans::MAX];
+        let mut list = [SubRange::default(); SubRanges::MAX];
         list.get_mut(..spans.len())?.copy_from_slice(spans);
-        Some(Spans { list, len: spans.len() as u8 })
+        Some(SubRanges { list, len: spans.len() as u8 })
     }
 
     /// Returns the sub-ranges in their order.
-    pub fn as_slice(&self) -> &[Span] {
+    pub fn as_slice(&self) -> &[SubRange] {
         &self.list[..usize::from(self.len)]
     }
 }
 
-impl Parameter for Spans {
-    fn read(data: &[u8]) -> Option<(Spans, &[u8])> {
+impl Parameter for SubRanges {
+    fn read(data: &[u8]) -> Option<(SubRanges, &[u8])> {
         let (count, mut data) = u16::read(data)?;
-        let mut list = [Span::default(); Spans::MAX];
+        let mut list = [SubRange::default(); SubRanges::MAX];
         for span in list.get_mut(..count.into())? {
-            (*span, data) = Span::read(data)?;
+            (*span, data) = SubRange::read(data)?;
         }
-        Some((Spans::new(&list[..count.into()])?, data))
+        Some((SubRanges::new(&list[..count.into()])?, data))
     }
 
     fn write(self, writer: Writer) -> Writer {
@@ -303,20 +303,20 @@ impl Parameter for Variant {
 
 /// Parameters without a known layout: at most sixteen bytes, unchanged.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Raw {
-    bytes: [u8; Raw::MAX],
+pub struct RawParameters {
+    bytes: [u8; RawParameters::MAX],
     len: u8,
 }
 
-impl Raw {
+impl RawParameters {
     /// Maximum length in bytes.
     pub const MAX: usize = 16;
 
-    /// Copies `bytes`. `None` if they are longer than [`Raw::MAX`].
-    pub fn new(bytes: &[u8]) -> Option<Raw> {
-        let mut kept = [0; Raw::MAX];
+    /// Copies `bytes`. `None` if they are longer than [`RawParameters::MAX`].
+    pub fn new(bytes: &[u8]) -> Option<RawParameters> {
+        let mut kept = [0; RawParameters::MAX];
         kept.get_mut(..bytes.len())?.copy_from_slice(bytes);
-        Some(Raw { bytes: kept, len: bytes.len() as u8 })
+        Some(RawParameters { bytes: kept, len: bytes.len() as u8 })
     }
 
     /// Returns the bytes.
@@ -325,9 +325,9 @@ impl Raw {
     }
 }
 
-impl Parameter for Raw {
-    fn read(data: &[u8]) -> Option<(Raw, &[u8])> {
-        Raw::new(data).map(|raw| (raw, &[][..]))
+impl Parameter for RawParameters {
+    fn read(data: &[u8]) -> Option<(RawParameters, &[u8])> {
+        RawParameters::new(data).map(|raw| (raw, &[][..]))
     }
 
     fn write(self, writer: Writer) -> Writer {
@@ -366,11 +366,11 @@ mod tests {
                 b"\x02\x00\x0A\x00\x20\x00\x53\x49\x43\x4B\x5F\x4C\x4D\x53\xBE\xC5",
             ),
             (
-                Request::Operate(Operating::Range(Span { first: 27, last: 299 })),
+                Request::Operate(Operating::Range(SubRange { first: 27, last: 299 })),
                 &[0x02, 0, 6, 0, 0x20, 0x27, 0x1B, 0, 0x2B, 0x01, 0xFF, 0xFE],
             ),
             (
-                Request::Range(Span { first: 1, last: 361 }),
+                Request::Range(SubRange { first: 1, last: 361 }),
                 &[0x02, 0, 5, 0, 0x37, 0x01, 0, 0x69, 0x01, 0xEB, 0x75],
             ),
             (variant(180, 50), &[0x02, 0, 5, 0, 0x3B, 0xB4, 0, 0x32, 0, 0x3B, 0x1F]),
@@ -388,8 +388,8 @@ mod tests {
 
     #[test]
     fn every_other_request_both_ways() {
-        let span = Span { first: 1, last: 181 };
-        let spans = Spans::new(&[span, Span { first: 200, last: 201 }]).unwrap();
+        let span = SubRange { first: 1, last: 181 };
+        let spans = SubRanges::new(&[span, SubRange { first: 200, last: 201 }]).unwrap();
         for request in [
             Request::Counters,
             Request::Means(250),
@@ -400,9 +400,9 @@ mod tests {
             Request::Reflectivity(span),
             Request::Cartesian(span),
             Request::Reflectivities(spans),
-            Request::FieldSet(Raw::new(&[1]).unwrap()),
-            Request::Field(Raw::new(&[1, 2]).unwrap()),
-            Request::Field(Raw::new(&[]).unwrap()),
+            Request::FieldSet(RawParameters::new(&[1]).unwrap()),
+            Request::Field(RawParameters::new(&[1, 2]).unwrap()),
+            Request::Field(RawParameters::new(&[]).unwrap()),
         ] {
             let encoded = request.encode(3);
             assert_eq!(encoded.telegram().address(), 3);
@@ -411,7 +411,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_none_is_no_request() {
+    fn invalid_and_eeprom_telegrams_are_not_requests() {
         let variant = Writer::new(0, VARIANT).word(180).word(25);
         let cut = Writer::new(0, RANGE).word(180);
         let too_many = Writer::new(0, REFLECTIVITIES).word(6).slice(&[1; 24]);
@@ -426,19 +426,22 @@ mod tests {
 
     #[test]
     fn one_to_five_spans() {
-        let span = Span { first: 1, last: 2 };
-        assert_eq!(Spans::new(&[]), None);
-        assert_eq!(Spans::new(&[span; 6]), None);
-        assert_eq!(Spans::new(&[span; 5]).unwrap().as_slice(), [span; 5]);
-        assert_eq!(Spans::read(&[1, 0, 1, 0, 2, 0, 9]), Spans::new(&[span]).map(|spans| (spans, &[9][..])));
-        assert_eq!(Spans::read(&[2, 0, 1, 0, 2, 0]), None);
-        assert_eq!(Spans::read(&[0, 0]), None);
-        assert_eq!(Spans::read(&[0]), None);
+        let span = SubRange { first: 1, last: 2 };
+        assert_eq!(SubRanges::new(&[]), None);
+        assert_eq!(SubRanges::new(&[span; 6]), None);
+        assert_eq!(SubRanges::new(&[span; 5]).unwrap().as_slice(), [span; 5]);
+        assert_eq!(
+            SubRanges::read(&[1, 0, 1, 0, 2, 0, 9]),
+            SubRanges::new(&[span]).map(|spans| (spans, &[9][..]))
+        );
+        assert_eq!(SubRanges::read(&[2, 0, 1, 0, 2, 0]), None);
+        assert_eq!(SubRanges::read(&[0, 0]), None);
+        assert_eq!(SubRanges::read(&[0]), None);
     }
 
     #[test]
     fn raw_parameters_end_somewhere() {
-        assert_eq!(Raw::new(&[7; 16]).unwrap().as_slice(), [7; 16]);
-        assert_eq!(Raw::new(&[7; 17]), None);
+        assert_eq!(RawParameters::new(&[7; 16]).unwrap().as_slice(), [7; 16]);
+        assert_eq!(RawParameters::new(&[7; 17]), None);
     }
 }

@@ -10,7 +10,7 @@ pub struct Configuration<'a>(&'a [u8]);
 impl<'a> Configuration<'a> {
     /// The configuration that `bytes` are; `None` if they are fewer than 32.
     pub fn new(bytes: &'a [u8]) -> Option<Configuration<'a>> {
-        (bytes.len() >= OLD_LEN).then_some(Configuration(bytes))
+        (bytes.len() >= OLD_CONFIGURATION_LEN).then_some(Configuration(bytes))
     }
 
     /// The bytes as the sensor keeps them.
@@ -40,8 +40,8 @@ impl<'a> Configuration<'a> {
 }
 
 /// A factory-new configuration with this measuring mode and unit.
-pub fn factory(mode: Mode, unit: Unit) -> [u8; LEN] {
-    let mut bytes = [0; LEN];
+pub fn factory_configuration(mode: Mode, unit: Unit) -> [u8; CONFIGURATION_LEN] {
+    let mut bytes = [0; CONFIGURATION_LEN];
     bytes[2] = 0x70;
     bytes[5] = mode.0;
     bytes[6] = unit.code();
@@ -106,7 +106,7 @@ pub const ITEMS: [Item; 31] = {
 };
 
 /// What availability byte `byte` sets.
-pub fn availability_words(byte: u8) -> &'static str {
+pub fn availability_text(byte: u8) -> &'static str {
     match byte & 7 {
         0 => "level 1",
         1 => "level 3",
@@ -120,9 +120,9 @@ pub fn availability_words(byte: u8) -> &'static str {
 }
 
 /// Bytes of a configuration.
-pub const LEN: usize = 34;
+pub const CONFIGURATION_LEN: usize = 34;
 /// Bytes with older firmware.
-pub const OLD_LEN: usize = 32;
+pub const OLD_CONFIGURATION_LEN: usize = 32;
 /// Bit of the availability byte: telegrams of values carry indices.
 pub const REAL_TIME_INDICES: u8 = 2;
 
@@ -136,15 +136,15 @@ mod tests {
             assert_eq!(item.at, at, "{}", item.name);
             at + item.len
         });
-        assert_eq!(end, LEN);
+        assert_eq!(end, CONFIGURATION_LEN);
     }
 
     #[test]
     fn old_and_new_lengths() {
-        let mut bytes = factory(Mode(4), Unit::Mm);
+        let mut bytes = factory_configuration(Mode(4), Unit::Mm);
         bytes[4] = 3;
         assert_eq!(Configuration::new(&bytes[..31]), None);
-        for len in [OLD_LEN, LEN] {
+        for len in [OLD_CONFIGURATION_LEN, CONFIGURATION_LEN] {
             let configuration = Configuration::new(&bytes[..len]).unwrap();
             assert_eq!((configuration.mode(), configuration.unit()), (Mode(4), Some(Unit::Mm)));
             assert!(configuration.has_indices());

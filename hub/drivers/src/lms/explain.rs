@@ -10,11 +10,11 @@ use crate::lms::command::{
     CARTESIAN, EEPROM_WRITES, MEANS, MODE, RANGE, RANGE_FIELDS, RANGE_MEANS, REFLECTIVITIES, REFLECTIVITY,
     Request, VALUES, VARIANT,
 };
-use crate::lms::configuration::{self, availability_words};
-use crate::lms::measured::{COUNT, MEASURED, Measured, PARTIAL};
+use crate::lms::configuration::{self, availability_text};
+use crate::lms::measured::{COUNT_MASK, MEASURED, MeasuredValues, PARTIAL_FLAG};
 use crate::lms::operating;
 use crate::lms::reply::{POWER_ON, REFUSED, RESET, Reply};
-use crate::lms::status::{self, Condition, Fault, Kind};
+use crate::lms::status::{self, Fault, StatusByte, ValueFormat};
 use crate::lms::telegram::{REPLY, Telegram};
 use crate::lms::variant::{Baud, Mode, Unit, Variant};
 
@@ -29,7 +29,7 @@ pub struct Field<'a> {
     /// Decoded value.
     pub value: Value<'a>,
     /// The meaning of the value as text; `None` if it needs none.
-    pub words: Option<&'a dyn Display>,
+    pub meaning: Option<&'a dyn Display>,
 }
 
 /// Value of a field.
@@ -71,7 +71,7 @@ impl<'a> Ranges<'a> {
     }
 
     /// Returns the range of each value in millimeters, or the code that says why it has none.
-    pub fn millimetres(&self) -> impl ExactSizeIterator<Item = Result<u32, crate::lms::variant::Code>> + 'a {
+    pub fn millimeters(&self) -> impl ExactSizeIterator<Item = Result<u32, crate::lms::variant::Code>> + 'a {
         let (mode, mm) = (self.mode, u32::from(self.unit.mm()));
         self.raw().map(move |word| mode.split(word).range.map(|range| u32::from(range) * mm))
     }
@@ -88,8 +88,8 @@ impl fmt::Display for Ranges<'_> {
         if self.mode_known && !self.mode.has_ranges() {
             return write!(f, "mode {:02X}h: {}", self.mode.0, self.mode.name());
         }
-        let all = self.millimetres().len();
-        let ranges = || self.millimetres().flatten();
+        let all = self.millimeters().len();
+        let ranges = || self.millimeters().flatten();
         let none = all - ranges().count();
         match (ranges().min(), ranges().max()) {
             (Some(nearest), Some(farthest)) => write!(f, "{nearest} to {farthest} mm")?,
@@ -127,7 +127,7 @@ impl fmt::Display for Headline<'_> {
             write_request(f, telegram)?;
         }
         match telegram.status() {
-            Some(status) => write!(f, "; {}", Condition(status)),
+            Some(status) => write!(f, "; {}", StatusByte(status)),
             None => Ok(()),
         }
     }
@@ -187,7 +187,7 @@ fn write_reply(f: &mut fmt::Formatter<'_>, telegram: Telegram<'_>) -> fmt::Resul
     }
 }
 
-fn write_measured(f: &mut fmt::Formatter<'_>, values: Measured<'_>) -> fmt::Result {
+fn write_measured(f: &mut fmt::Formatter<'_>, values: MeasuredValues<'_>) -> fmt::Result {
     write!(f, ": {} in {}", values.count(), unit_name(values.unit()))?;
     match (values.partial(), Variant::of_beams(values.count())) {
         (Some(quarter), _) => write!(f, ", partial scan from {}", Degrees(25 * u16::from(quarter))),
@@ -203,30 +203,32 @@ fn write_measured(f: &mut fmt::Formatter<'_>, values: Measured<'_>) -> fmt::Resu
 /// `mode` defines how the scanner splits its values, which a telegram of values does not state. Without it, the lower 13 bits
 /// count as the range.
 pub fn explain(telegram: Telegram<'_>, mode: Option<Mode>, visit: &mut dyn FnMut(&Field<'_>)) {
-    let mut walk = Walk::new(telegram.bytes(), visit);
+    let mut reader = FieldReader::new(telegram.bytes(), visit);
     // A telegram that is shorter than its layout ends early. The rest is shown as bytes.
-    let _ = fields(&mut walk, telegram, mode);
-    walk.leave(2 + usize::from(telegram.status().is_some()));
+    let _ = fields(&mut reader, telegram, mode);
+    reader.show_to_tail(2 + usize::from(telegram.status().is_some()));
     if telegram.status().is_some() {
-        walk.byte_as("status", Condition);
+        reader.byte_as("status", StatusByte);
     }
-    walk.word("checksum");
+    reader.word("checksum");
 }
 
-fn fields(walk: &mut Walk<'_, '_>, telegram: Telegram<'_>, mode: Option<Mode>) -> Option<()> {
-    walk.open(5);
-    walk.byte("STX")?;
-    walk.byte_as("address", |byte| {
-        said(move |f| match byte {
+fn fields(reader: &mut FieldReader<'_, '_>, telegram: Telegram<'_>, mode: Option<Mode>) -> Option<()> {
+    reader.set_end(5);
+    reader.byte("STX")?;
+    reader.byte_as("address", |byte| {
+        lazy_text(move |f| match byte {
             0 => f.write_str("to all sensors"),
             1..REPLY => write!(f, "to sensor {byte}"),
             _ => write!(f, "from sensor {}", byte & !REPLY),
         })
     })?;
-    walk.word_as("length", |length| said(move |f| write!(f, "{length} bytes from command to checksum")))?;
-    walk.byte_as("command", |command| name(command, telegram.is_reply()).unwrap_or("unknown"))?;
-    walk.open(5 + telegram.data().len());
-    if telegram.is_reply() { reply_fields(walk, telegram, mode) } else { request_fields(walk, telegram) }
+    reader.word_as("length", |length| {
+        lazy_text(move |f| write!(f, "{length} bytes from command to checksum"))
+    })?;
+    reader.byte_as("command", |command| name(command, telegram.is_reply()).unwrap_or("unknown"))?;
+    reader.set_end(5 + telegram.data().len());
+    if telegram.is_reply() { reply_fields(reader, telegram, mode) } else { request_fields(reader, telegram) }
 }
 
 /// Returns the name of `command` (Telegram listing, table 7-1), for a reply that of the request. `None` if it is unknown.
@@ -292,56 +294,58 @@ fn request_name(command: u8) -> Option<&'static str> {
 }
 
 /// Shows the parameters of a request. Those without a layout here are left for the caller.
-fn request_fields(walk: &mut Walk<'_, '_>, telegram: Telegram<'_>) -> Option<()> {
+fn request_fields(reader: &mut FieldReader<'_, '_>, telegram: Telegram<'_>) -> Option<()> {
     match telegram.command() {
-        MODE => mode_fields(walk),
-        VALUES => walk.byte_as("selection", selection).map(drop),
-        MEANS => shots(walk),
+        MODE => mode_fields(reader),
+        VALUES => reader.byte_as("selection", selection).map(drop),
+        MEANS => show_scan_count(reader),
         RANGE => {
-            walk.word_as("first value", |first| {
-                said(move |f| match first & DIRECT {
+            reader.word_as("first value", |first| {
+                lazy_text(move |f| match first & DIRECT {
                     0 => Ok(()),
                     _ => write!(f, "{}, direct output of a partial scan", first & !DIRECT),
                 })
             })?;
-            walk.word("last value").map(drop)
+            reader.word("last value").map(drop)
         }
-        RANGE_FIELDS | REFLECTIVITY | CARTESIAN => span(walk),
-        RANGE_MEANS => shots(walk).and_then(|()| span(walk)),
-        REFLECTIVITIES => spans(walk),
+        RANGE_FIELDS | REFLECTIVITY | CARTESIAN => span(reader),
+        RANGE_MEANS => show_scan_count(reader).and_then(|()| span(reader)),
+        REFLECTIVITIES => spans(reader),
         VARIANT => {
-            walk.word_as("angle", |angle| said(move |f| write!(f, "{angle} degrees")))?;
-            walk.word_as("resolution", |step| said(move |f| write!(f, "{} degrees", Degrees(step)))).map(drop)
+            reader.word_as("angle", |angle| lazy_text(move |f| write!(f, "{angle} degrees")))?;
+            reader
+                .word_as("resolution", |step| lazy_text(move |f| write!(f, "{} degrees", Degrees(step))))
+                .map(drop)
         }
-        WRITE_CONFIGURATION => configuration_fields(walk),
-        POWER_ON_RATE => walk.byte_as("rate after power-on", power_on).map(drop),
-        _ => walk.rest("parameters"),
+        WRITE_CONFIGURATION => configuration_fields(reader),
+        POWER_ON_RATE => reader.byte_as("rate after power-on", power_on).map(drop),
+        _ => reader.show_rest("parameters"),
     }
 }
 
-fn mode_fields(walk: &mut Walk<'_, '_>) -> Option<()> {
-    match walk.byte_as("operating mode", operating::name)? {
-        operating::INSTALLATION | 0x30 => walk.text("password", 8),
-        0x26 => shots(walk),
-        0x27 | 0x29 | 0x50 => span(walk),
-        0x28 => shots(walk).and_then(|()| span(walk)),
-        0x2B => spans(walk),
-        _ => walk.rest("parameters"),
+fn mode_fields(reader: &mut FieldReader<'_, '_>) -> Option<()> {
+    match reader.byte_as("operating mode", operating::name)? {
+        operating::INSTALLATION | 0x30 => reader.text("password", 8),
+        0x26 => show_scan_count(reader),
+        0x27 | 0x29 | 0x50 => span(reader),
+        0x28 => show_scan_count(reader).and_then(|()| span(reader)),
+        0x2B => spans(reader),
+        _ => reader.show_rest("parameters"),
     }
 }
 
-fn shots(walk: &mut Walk<'_, '_>) -> Option<()> {
-    walk.byte_as("scans", |shots| said(move |f| write!(f, "mean of {shots}"))).map(drop)
+fn show_scan_count(reader: &mut FieldReader<'_, '_>) -> Option<()> {
+    reader.byte_as("scans", |count| lazy_text(move |f| write!(f, "mean of {count}"))).map(drop)
 }
 
-fn span(walk: &mut Walk<'_, '_>) -> Option<()> {
-    walk.word("first value")?;
-    walk.word("last value").map(drop)
+fn span(reader: &mut FieldReader<'_, '_>) -> Option<()> {
+    reader.word("first value")?;
+    reader.word("last value").map(drop)
 }
 
-fn spans(walk: &mut Walk<'_, '_>) -> Option<()> {
-    for _ in 0..walk.word("sub-ranges")? {
-        span(walk)?;
+fn spans(reader: &mut FieldReader<'_, '_>) -> Option<()> {
+    for _ in 0..reader.word("sub-ranges")? {
+        span(reader)?;
     }
     Some(())
 }
@@ -376,71 +380,73 @@ const WRITE_CONFIGURATION: u8 = 0x77;
 const DIRECT: u16 = 1 << 15;
 
 /// Shows the data of a reply. Data without a layout here is left for the caller.
-fn reply_fields(walk: &mut Walk<'_, '_>, telegram: Telegram<'_>, mode: Option<Mode>) -> Option<()> {
+fn reply_fields(reader: &mut FieldReader<'_, '_>, telegram: Telegram<'_>, mode: Option<Mode>) -> Option<()> {
     match telegram.command() {
         RESET | REFUSED => Some(()),
-        POWER_ON | 0xBA => walk.text("type, number, firmware", walk.left()),
-        0xA0 => walk.byte_as("outcome", done_if_zero).map(drop),
-        MEASURED => values(walk, mode),
-        0xB1 => status_fields(walk),
-        0xB2 => error_fields(walk),
+        POWER_ON | 0xBA => reader.text("type, number, firmware", reader.remaining()),
+        0xA0 => reader.byte_as("outcome", done_if_zero).map(drop),
+        MEASURED => values(reader, mode),
+        0xB1 => status_fields(reader),
+        0xB2 => error_fields(reader),
         0xB5 => {
-            walk.word_as("hours", |hours| said(move |f| write!(f, "{} h", 2 * u32::from(hours))))?;
-            walk.word("power-ons").map(drop)
+            reader.word_as("hours", |hours| lazy_text(move |f| write!(f, "{} h", 2 * u32::from(hours))))?;
+            reader.word("power-ons").map(drop)
         }
-        0xB6 => walk.byte("scans").and_then(|_| values(walk, mode)),
-        0xB7 => span(walk).and_then(|()| values(walk, mode)),
+        0xB6 => reader.byte("scans").and_then(|_| values(reader, mode)),
+        0xB7 => span(reader).and_then(|()| values(reader, mode)),
         0xBB => {
-            walk.byte_as("outcome", done_if_one)?;
-            walk.word_as("angle", |angle| said(move |f| write!(f, "{angle} degrees")))?;
-            walk.word_as("resolution", |step| said(move |f| write!(f, "{} degrees", Degrees(step)))).map(drop)
+            reader.byte_as("outcome", done_if_one)?;
+            reader.word_as("angle", |angle| lazy_text(move |f| write!(f, "{angle} degrees")))?;
+            reader
+                .word_as("resolution", |step| lazy_text(move |f| write!(f, "{} degrees", Degrees(step))))
+                .map(drop)
         }
         0xBE => {
-            span(walk)?;
-            let count = count_word(walk)?;
-            walk.rows("values", count, &["value", "field A", "field B", "field C"])?;
-            indices(walk)
+            span(reader)?;
+            let count = count_word(reader)?;
+            reader.rows("values", count, &["value", "field A", "field B", "field C"])?;
+            indices(reader)
         }
         0xBF => {
-            walk.byte("scans")?;
-            span(walk).and_then(|()| values(walk, mode))
+            reader.byte("scans")?;
+            span(reader).and_then(|()| values(reader, mode))
         }
         0xC4 => {
-            let (count, unit) = counted(walk)?;
-            ranges(walk, count, unit, mode)?;
-            let levels = usize::from(walk.word("reflectivities")? & COUNT);
-            span(walk)?;
-            walk.raw("reflectivity", levels)?;
-            indices(walk)
+            let (count, unit) = counted(reader)?;
+            ranges(reader, count, unit, mode)?;
+            let levels = usize::from(reader.word("reflectivities")? & COUNT_MASK);
+            span(reader)?;
+            reader.raw("reflectivity", levels)?;
+            indices(reader)
         }
         0xE6 => {
-            walk.byte("outcome")?;
-            walk.byte_as("rate after power-on", power_on).map(drop)
+            reader.byte("outcome")?;
+            reader.byte_as("rate after power-on", power_on).map(drop)
         }
-        0xF4 => configuration_fields(walk),
+        0xF4 => configuration_fields(reader),
         0xF5 => {
-            for _ in 0..walk.word("sub-ranges")? {
-                span(walk)?;
-                let count = count_word(walk)?;
-                walk.rows("values", count, &["distance", "reflectivity"])?;
+            for _ in 0..reader.word("sub-ranges")? {
+                span(reader)?;
+                let count = count_word(reader)?;
+                reader.rows("values", count, &["distance", "reflectivity"])?;
             }
-            indices(walk)
+            indices(reader)
         }
-        0xF7 => walk.byte_as("outcome", done_if_one).and_then(|_| configuration_fields(walk)),
-        0xFC => walk.byte_as("outcome", done_if_one).and_then(|_| walk.rest("parameters")),
-        _ => walk.rest("data"),
+        0xF7 => reader.byte_as("outcome", done_if_one).and_then(|_| configuration_fields(reader)),
+        0xFC => reader.byte_as("outcome", done_if_one).and_then(|_| reader.show_rest("parameters")),
+        _ => reader.show_rest("data"),
     }
 }
 
 /// Shows count word, values, and the two indices if they are present.
-fn values(walk: &mut Walk<'_, '_>, mode: Option<Mode>) -> Option<()> {
-    let (count, unit) = counted(walk)?;
-    ranges(walk, count, unit, mode)?;
-    indices(walk)
+fn values(reader: &mut FieldReader<'_, '_>, mode: Option<Mode>) -> Option<()> {
+    let (count, unit) = counted(reader)?;
+    ranges(reader, count, unit, mode)?;
+    indices(reader)
 }
 
-fn ranges(walk: &mut Walk<'_, '_>, count: usize, unit: Unit, mode: Option<Mode>) -> Option<()> {
-    walk.ranges("values", count, |bytes| Ranges {
+fn ranges(reader: &mut FieldReader<'_, '_>, count: usize, unit: Unit, mode: Option<Mode>) -> Option<()> {
+    reader.ranges("values", count, |bytes| Ranges {
         bytes,
         mode: mode.unwrap_or(Mode(0)),
         mode_known: mode.is_some(),
@@ -448,35 +454,35 @@ fn ranges(walk: &mut Walk<'_, '_>, count: usize, unit: Unit, mode: Option<Mode>)
     })
 }
 
-fn counted(walk: &mut Walk<'_, '_>) -> Option<(usize, Unit)> {
-    let word = walk.word_as("count and unit", |word| {
-        said(move |f| {
-            write!(f, "{} values in {}", word & COUNT, unit_words((word >> 14) as u8))?;
-            match word & PARTIAL {
+fn counted(reader: &mut FieldReader<'_, '_>) -> Option<(usize, Unit)> {
+    let word = reader.word_as("count and unit", |word| {
+        lazy_text(move |f| {
+            write!(f, "{} values in {}", word & COUNT_MASK, unit_text((word >> 14) as u8))?;
+            match word & PARTIAL_FLAG {
                 0 => Ok(()),
                 _ => write!(f, ", partial scan from x.{:02}", 25 * (word >> 11 & 3)),
             }
         })
     })?;
-    Some((usize::from(word & COUNT), Unit::of_code((word >> 14) as u8).unwrap_or(Unit::Mm)))
+    Some((usize::from(word & COUNT_MASK), Unit::of_code((word >> 14) as u8).unwrap_or(Unit::Mm)))
 }
 
-fn count_word(walk: &mut Walk<'_, '_>) -> Option<usize> {
-    counted(walk).map(|(count, _)| count)
+fn count_word(reader: &mut FieldReader<'_, '_>) -> Option<usize> {
+    counted(reader).map(|(count, _)| count)
 }
 
-fn indices(walk: &mut Walk<'_, '_>) -> Option<()> {
-    if walk.left() == 2 {
-        walk.byte("scan index")?;
-        walk.byte("telegram index")?;
+fn indices(reader: &mut FieldReader<'_, '_>) -> Option<()> {
+    if reader.remaining() == 2 {
+        reader.byte("scan index")?;
+        reader.byte("telegram index")?;
     }
     Some(())
 }
 
-fn error_fields(walk: &mut Walk<'_, '_>) -> Option<()> {
-    while walk.left() >= 2 {
+fn error_fields(reader: &mut FieldReader<'_, '_>) -> Option<()> {
+    while reader.remaining() >= 2 {
         // Both bytes are one error.
-        walk.word_as("error", |word| {
+        reader.word_as("error", |word| {
             let [kind, number] = word.to_le_bytes();
             Fault { kind, number }
         })?;
@@ -484,19 +490,19 @@ fn error_fields(walk: &mut Walk<'_, '_>) -> Option<()> {
     Some(())
 }
 
-fn status_fields(walk: &mut Walk<'_, '_>) -> Option<()> {
+fn status_fields(reader: &mut FieldReader<'_, '_>) -> Option<()> {
     for item in status::ITEMS {
         match item.kind {
-            Kind::Text => walk.text(item.name, item.len)?,
-            Kind::Words => walk.rows(item.name, item.len / 2, &["channel"])?,
-            Kind::Bytes => walk.raw(item.name, item.len)?,
-            Kind::Number => {
+            ValueFormat::Text => reader.text(item.name, item.len)?,
+            ValueFormat::Words => reader.rows(item.name, item.len / 2, &["channel"])?,
+            ValueFormat::Bytes => reader.raw(item.name, item.len)?,
+            ValueFormat::Number => {
                 let name = item.name;
-                let words = move |value: u32| {
-                    said(move |f| match name {
+                let text = move |value: u32| {
+                    lazy_text(move |f| match name {
                         "operating mode" => f.write_str(operating::name(value as u8)),
                         "measuring mode" => f.write_str(Mode(value as u8).name()),
-                        "unit" => f.write_str(unit_words(value as u8)),
+                        "unit" => f.write_str(unit_text(value as u8)),
                         "defective" => f.write_str(if value == 0 { "no" } else { "yes" }),
                         "laser" => f.write_str(if value == 0 { "off" } else { "on" }),
                         "motor" => write!(f, "{} us a turn", 90 * value),
@@ -512,7 +518,7 @@ fn status_fields(walk: &mut Walk<'_, '_>) -> Option<()> {
                         _ => Ok(()),
                     })
                 };
-                walk.number(item.name, item.len, Some(words)).map(drop)?;
+                reader.number(item.name, item.len, Some(text)).map(drop)?;
             }
         }
     }
@@ -520,23 +526,23 @@ fn status_fields(walk: &mut Walk<'_, '_>) -> Option<()> {
 }
 
 /// Shows the configuration, as far as the telegram contains it.
-fn configuration_fields(walk: &mut Walk<'_, '_>) -> Option<()> {
+fn configuration_fields(reader: &mut FieldReader<'_, '_>) -> Option<()> {
     for item in configuration::ITEMS {
-        if walk.left() < item.len {
+        if reader.remaining() < item.len {
             break;
         }
         let name = item.name;
-        let words = move |value: u32| {
-            said(move |f| match name {
+        let text = move |value: u32| {
+            lazy_text(move |f| match name {
                 "blanking" => write!(f, "{value} cm"),
                 "stop threshold" => write!(f, "{value} mV"),
-                "availability" => f.write_str(availability_words(value as u8)),
+                "availability" => f.write_str(availability_text(value as u8)),
                 "measuring mode" => f.write_str(Mode(value as u8).name()),
                 "unit" => f.write_str(Unit::of_code(value as u8).map_or("unknown", unit_name)),
                 _ => Ok(()),
             })
         };
-        walk.number(item.name, item.len, Some(words)).map(drop)?;
+        reader.number(item.name, item.len, Some(text)).map(drop)?;
     }
     Some(())
 }
@@ -570,37 +576,37 @@ fn unit_name(unit: Unit) -> &'static str {
     }
 }
 
-fn unit_words(code: u8) -> &'static str {
+fn unit_text(code: u8) -> &'static str {
     Unit::of_code(code).map_or("unknown", unit_name)
 }
 
 /// A walk through the bytes of a telegram. It never steps over the end of the layout, and never leaves a byte out.
-struct Walk<'t, 'v> {
+struct FieldReader<'t, 'v> {
     bytes: &'t [u8],
     at: usize,
     end: usize,
     visit: &'v mut dyn FnMut(&Field<'_>),
 }
 
-impl<'t, 'v> Walk<'t, 'v> {
+impl<'t, 'v> FieldReader<'t, 'v> {
     fn new(bytes: &'t [u8], visit: &'v mut dyn FnMut(&Field<'_>)) -> Self {
-        Walk { bytes, at: 0, end: 0, visit }
+        FieldReader { bytes, at: 0, end: 0, visit }
     }
 
     /// Sets the end of the fields that follow.
-    fn open(&mut self, end: usize) {
+    fn set_end(&mut self, end: usize) {
         self.end = end;
     }
 
     /// Shows the bytes that have no field yet, up to the last `len` bytes of the telegram, which follow.
-    fn leave(&mut self, len: usize) {
+    fn show_to_tail(&mut self, len: usize) {
         self.end = self.bytes.len() - len;
-        self.rest("data");
+        self.show_rest("data");
         self.end = self.bytes.len();
     }
 
     /// Returns the number of bytes before the end of the layout.
-    fn left(&self) -> usize {
+    fn remaining(&self) -> usize {
         self.end - self.at
     }
 
@@ -608,16 +614,16 @@ impl<'t, 'v> Walk<'t, 'v> {
         self.number(name, 1, None::<fn(u32) -> &'static str>).map(|value| value as u8)
     }
 
-    fn byte_as<D: Display>(&mut self, name: &'static str, words: impl FnOnce(u8) -> D) -> Option<u8> {
-        self.number(name, 1, Some(|value| words(value as u8))).map(|value| value as u8)
+    fn byte_as<D: Display>(&mut self, name: &'static str, meaning: impl FnOnce(u8) -> D) -> Option<u8> {
+        self.number(name, 1, Some(|value| meaning(value as u8))).map(|value| value as u8)
     }
 
     fn word(&mut self, name: &'static str) -> Option<u16> {
         self.number(name, 2, None::<fn(u32) -> &'static str>).map(|value| value as u16)
     }
 
-    fn word_as<D: Display>(&mut self, name: &'static str, words: impl FnOnce(u16) -> D) -> Option<u16> {
-        self.number(name, 2, Some(|value| words(value as u16))).map(|value| value as u16)
+    fn word_as<D: Display>(&mut self, name: &'static str, meaning: impl FnOnce(u16) -> D) -> Option<u16> {
+        self.number(name, 2, Some(|value| meaning(value as u16))).map(|value| value as u16)
     }
 
     /// Shows a number of one to four bytes, the low byte first.
@@ -625,36 +631,36 @@ impl<'t, 'v> Walk<'t, 'v> {
         &mut self,
         name: &'static str,
         len: usize,
-        words: Option<impl FnOnce(u32) -> D>,
+        meaning: Option<impl FnOnce(u32) -> D>,
     ) -> Option<u32> {
         let (offset, bytes) = self.take(len)?;
         let value = bytes.iter().rev().fold(0, |value, &byte| value << 8 | u32::from(byte));
-        let words = words.map(|words| words(value));
-        let words = words.as_ref().map(|words| words as &dyn Display);
-        self.show(&Field { offset, bytes, name, value: Value::Number(value), words });
+        let meaning = meaning.map(|words| words(value));
+        let meaning = meaning.as_ref().map(|words| words as &dyn Display);
+        self.show(&Field { offset, bytes, name, value: Value::Number(value), meaning });
         Some(value)
     }
 
     fn text(&mut self, name: &'static str, len: usize) -> Option<()> {
         let (offset, bytes) = self.take(len)?;
-        self.show(&Field { offset, bytes, name, value: Value::Text(bytes), words: None });
+        self.show(&Field { offset, bytes, name, value: Value::Text(bytes), meaning: None });
         Some(())
     }
 
     fn raw(&mut self, name: &'static str, len: usize) -> Option<()> {
         let (offset, bytes) = self.take(len)?;
-        self.show(&Field { offset, bytes, name, value: Value::Bytes(bytes), words: None });
+        self.show(&Field { offset, bytes, name, value: Value::Bytes(bytes), meaning: None });
         Some(())
     }
 
     /// Shows all bytes before the end of the layout.
-    fn rest(&mut self, name: &'static str) -> Option<()> {
-        self.raw(name, self.left())
+    fn show_rest(&mut self, name: &'static str) -> Option<()> {
+        self.raw(name, self.remaining())
     }
 
     fn rows(&mut self, name: &'static str, rows: usize, columns: &'static [&'static str]) -> Option<()> {
         let (offset, bytes) = self.take(rows * 2 * columns.len())?;
-        self.show(&Field { offset, bytes, name, value: Value::Rows { bytes, columns }, words: None });
+        self.show(&Field { offset, bytes, name, value: Value::Rows { bytes, columns }, meaning: None });
         Some(())
     }
 
@@ -667,7 +673,7 @@ impl<'t, 'v> Walk<'t, 'v> {
     ) -> Option<()> {
         let (offset, bytes) = self.take(2 * count)?;
         let ranges = make(bytes);
-        self.show(&Field { offset, bytes, name, value: Value::Ranges(ranges), words: Some(&ranges) });
+        self.show(&Field { offset, bytes, name, value: Value::Ranges(ranges), meaning: Some(&ranges) });
         Some(())
     }
 
@@ -687,14 +693,14 @@ impl<'t, 'v> Walk<'t, 'v> {
 }
 
 /// Text that is written when it is displayed.
-struct Said<F>(F);
+struct LazyText<F>(F);
 
 /// Returns text that `write` writes.
-fn said<F: Fn(&mut fmt::Formatter<'_>) -> fmt::Result>(write: F) -> Said<F> {
-    Said(write)
+fn lazy_text<F: Fn(&mut fmt::Formatter<'_>) -> fmt::Result>(write: F) -> LazyText<F> {
+    LazyText(write)
 }
 
-impl<F: Fn(&mut fmt::Formatter<'_>) -> fmt::Result> Display for Said<F> {
+impl<F: Fn(&mut fmt::Formatter<'_>) -> fmt::Result> Display for LazyText<F> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         (self.0)(f)
     }
@@ -712,7 +718,7 @@ mod tests {
     fn told(telegram: Telegram<'_>, mode: Option<Mode>) -> Vec<(usize, String)> {
         let mut lines = vec![];
         explain(telegram, mode, &mut |field| {
-            let words = field.words.map(|words| words.to_string()).unwrap_or_default();
+            let words = field.meaning.map(|words| words.to_string()).unwrap_or_default();
             lines.push((field.offset, format!("{}: {words}", field.name)));
         });
         lines

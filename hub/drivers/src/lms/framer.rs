@@ -6,18 +6,20 @@
 //! while another header begins inside it, or might begin with its last bytes. If that one succeeds, the frame was wrong. A
 //! gap in time may release a held frame, but it never drops a byte.
 //!
-//! The counters in [`Tally`] include every byte: always `read == in_telegrams + acknowledge + discarded + buffered`.
+//! The counters in [`FramerCounters`] include every byte: always `read == in_telegrams + acknowledge + discarded + buffered`.
 
 use scanhub_schema::{MILLIS, Nanos};
 
 use crate::line::suspect;
-use crate::lms::header::{Expect, HEADER_DISTANCE, Judgement, MAX_HEADER, Reject, State, judge};
+use crate::lms::header::{
+    ExpectedHeaders, HeaderCheck, MAX_HEADER_LEN, MIN_HEADER_DISTANCE, Reject, State, check_header,
+};
 use crate::lms::measured::MEASURED;
 use crate::lms::telegram::{ACK, Checksum, MAX_TELEGRAM, NAK, STX, Telegram};
 
 /// What became of the bytes; every field only grows.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Tally {
+pub struct FramerCounters {
     /// Bytes committed.
     pub read: u64,
     /// Bytes in delivered telegrams.
@@ -40,7 +42,7 @@ pub struct Tally {
 
 /// A telegram as it was found.
 #[derive(Clone, Copy, Debug)]
-pub struct Framed<'a> {
+pub struct FramedTelegram<'a> {
     /// The telegram; it lies in the framer's buffer.
     pub telegram: Telegram<'a>,
     /// Number of its first byte among all bytes committed, from 0.
@@ -51,7 +53,7 @@ pub struct Framed<'a> {
 
 /// The bytes of a telegram that has begun, as far as they are there: nothing of them is checked but the header.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Begun<'a> {
+pub(crate) struct PartialTelegram<'a> {
     /// From its start byte on.
     pub(crate) bytes: &'a [u8],
     /// Number of its first byte among all bytes committed, from 0.
@@ -62,9 +64,9 @@ pub(crate) struct Begun<'a> {
 
 /// What was found next.
 #[derive(Clone, Copy, Debug)]
-pub enum Found<'a> {
+pub enum FramerEvent<'a> {
     /// A telegram.
-    Telegram(Framed<'a>),
+    Telegram(FramedTelegram<'a>),
     /// A single ACK.
     Ack,
     /// A single NAK.
@@ -73,7 +75,7 @@ pub enum Found<'a> {
 
 /// [`Found`] without the bytes.
 #[derive(Clone, Copy, Debug)]
-pub(crate) enum Advance {
+pub(crate) enum FoundItem {
     Telegram(TelegramSpan),
     Ack,
     Nak,
@@ -91,27 +93,27 @@ pub struct TelegramSpan {
 /// The framer with its buffer of twice the longest telegram.
 #[derive(Clone, Debug)]
 pub struct Framer {
-    buffer: [u8; CAPACITY],
+    buffer: [u8; BUFFER_LEN],
     /// `buffer[start..end]` are the bytes whose fate is open.
     start: usize,
     end: usize,
     /// Every position before it was judged.
     cursor: usize,
     /// Positions with an acceptable header whose checksum was not looked at, ascending.
-    live: Candidates,
+    candidates: Candidates,
     /// A frame with a right checksum that waits for a header inside it.
-    held: Option<Held>,
+    held: Option<HeldFrame>,
     /// Checksum of a candidate that is arriving, and the number of its first byte.
-    arriving: (u64, Checksum),
-    expect: Expect,
-    awaits_acknowledge: bool,
+    partial_checksum: (u64, Checksum),
+    expect: ExpectedHeaders,
+    expects_acknowledge: bool,
     /// Bytes were discarded since the last telegram.
-    damage: bool,
-    tally: Tally,
+    has_damage: bool,
+    counters: FramerCounters,
 }
 
 #[derive(Clone, Copy, Debug)]
-struct Held {
+struct HeldFrame {
     at: usize,
     end: usize,
     header_inside: bool,
@@ -120,17 +122,17 @@ struct Held {
 impl Default for Framer {
     fn default() -> Self {
         Framer {
-            buffer: [0; CAPACITY],
+            buffer: [0; BUFFER_LEN],
             start: 0,
             end: 0,
             cursor: 0,
-            live: Candidates::new(),
+            candidates: Candidates::new(),
             held: None,
-            arriving: (0, Checksum::default()),
-            expect: Expect::Anything,
-            awaits_acknowledge: false,
-            damage: false,
-            tally: Tally::default(),
+            partial_checksum: (0, Checksum::default()),
+            expect: ExpectedHeaders::Anything,
+            expects_acknowledge: false,
+            has_damage: false,
+            counters: FramerCounters::default(),
         }
     }
 }
@@ -138,75 +140,75 @@ impl Default for Framer {
 impl Framer {
     /// Room for the next bytes, never empty after [`Framer::poll`] answered `None`: write into its beginning, then
     /// [`Framer::commit`].
-    pub fn spare(&mut self) -> &mut [u8] {
+    pub fn read_buffer(&mut self) -> &mut [u8] {
         if self.start == self.end {
             self.shift(self.start);
-        } else if CAPACITY - self.end < MAX_TELEGRAM {
+        } else if BUFFER_LEN - self.end < MAX_TELEGRAM {
             self.buffer.copy_within(self.start..self.end, 0);
             self.shift(self.start);
         }
         &mut self.buffer[self.end..]
     }
 
-    /// The first `len` bytes of [`Framer::spare`] are valid now.
+    /// The first `len` bytes of [`Framer::read_buffer`] are valid now.
     pub fn commit(&mut self, len: usize) {
         self.end += len;
-        assert!(self.end <= CAPACITY, "more bytes committed than there was room");
-        self.tally.read += len as u64;
+        assert!(self.end <= BUFFER_LEN, "more bytes committed than there was room");
+        self.counters.read += len as u64;
     }
 
     /// What may come from now on. Bytes that were judged stay judged.
-    pub fn expect(&mut self, expect: Expect) {
+    pub fn expect(&mut self, expect: ExpectedHeaders) {
         self.expect = expect;
     }
 
     /// Whether single ACK and NAK bytes may come.
-    pub fn await_acknowledge(&mut self, awaits: bool) {
-        self.awaits_acknowledge = awaits;
+    pub fn expect_acknowledge(&mut self, is_expected: bool) {
+        self.expects_acknowledge = is_expected;
     }
 
     /// The next telegram or acknowledgement in the bytes committed so far, or `None` until more come.
-    pub fn poll(&mut self) -> Option<Found<'_>> {
+    pub fn poll(&mut self) -> Option<FramerEvent<'_>> {
         Some(match self.advance()? {
-            Advance::Telegram(span) => Found::Telegram(self.view(span)),
-            Advance::Ack => Found::Ack,
-            Advance::Nak => Found::Nak,
+            FoundItem::Telegram(span) => FramerEvent::Telegram(self.telegram_at(span)),
+            FoundItem::Ack => FramerEvent::Ack,
+            FoundItem::Nak => FramerEvent::Nak,
         })
     }
 
     /// The telegram at a span that [`Framer::advance`] answered last.
-    pub(crate) fn view(&self, span: TelegramSpan) -> Framed<'_> {
+    pub(crate) fn telegram_at(&self, span: TelegramSpan) -> FramedTelegram<'_> {
         let TelegramSpan { at, end, offset, reasons } = span;
-        Framed { telegram: Telegram::checked(&self.buffer[at..end]), offset, reasons }
+        FramedTelegram { telegram: Telegram::assume_valid(&self.buffer[at..end]), offset, reasons }
     }
 
     /// As [`Framer::poll`], for a caller who must look at other things between finding and reading.
-    pub(crate) fn advance(&mut self) -> Option<Advance> {
+    pub(crate) fn advance(&mut self) -> Option<FoundItem> {
         loop {
-            self.judge_headers();
+            self.check_headers();
             if let Some(held) = self.held
                 && self.cursor >= held.end
-                && !self.live.any_before(held.end)
+                && !self.candidates.has_candidate_before(held.end)
             {
-                return Some(Advance::Telegram(self.deliver(held)));
+                return Some(FoundItem::Telegram(self.deliver(held)));
             }
-            if let Some(candidate) = self.live.first_complete(self.end) {
+            if let Some(candidate) = self.candidates.first_complete(self.end) {
                 self.complete(candidate);
                 continue;
             }
             self.add_arrived();
             if let Some(held) = self.held {
-                self.give_up_before(held);
+                self.discard_before(held);
                 return None;
             }
-            let decided = self.live.first().map_or(self.cursor, |candidate| usize::from(candidate.at));
-            if self.awaits_acknowledge
+            let decided = self.candidates.first().map_or(self.cursor, |candidate| usize::from(candidate.at));
+            if self.expects_acknowledge
                 && let Some(at) = (self.start..decided).find(|&at| matches!(self.buffer[at], ACK | NAK))
             {
                 self.discard(at, None);
                 self.start = at + 1;
-                self.tally.acknowledge += 1;
-                return Some(if self.buffer[at] == ACK { Advance::Ack } else { Advance::Nak });
+                self.counters.acknowledge += 1;
+                return Some(if self.buffer[at] == ACK { FoundItem::Ack } else { FoundItem::Nak });
             }
             self.discard(decided, None);
             return None;
@@ -215,7 +217,9 @@ impl Framer {
 
     /// How long the line must be idle until [`Framer::release`] may deliver the held frame; `None` if none is held.
     pub fn hold(&self) -> Option<Nanos> {
-        self.held.map(|held| if self.live.any_before(held.end) { VETO_HOLD } else { SUFFIX_HOLD })
+        self.held.map(|held| {
+            if self.candidates.has_candidate_before(held.end) { VETO_HOLD_TIME } else { SUFFIX_HOLD_TIME }
+        })
     }
 
     /// A read found nothing, and no byte came for `idle`: gives up waiting for headers inside the held frame.
@@ -228,37 +232,38 @@ impl Framer {
 
     /// Gives up all bytes that are still open, for example because the line's rate changes.
     pub fn clear(&mut self) {
-        self.live = Candidates::new();
+        self.candidates = Candidates::new();
         self.held = None;
         self.discard(self.end, None);
         self.cursor = self.end;
-        self.damage = false;
+        self.has_damage = false;
     }
 
     /// What the earliest open position waits for, after [`Framer::poll`] answered `None`.
     pub fn state(&self) -> State {
-        match self.live.first() {
+        match self.candidates.first() {
             Some(candidate) if self.end + 2 < usize::from(candidate.end) => State::Body,
             Some(_) => State::Crc,
-            None => match judge(&self.buffer[self.cursor..self.end], &self.expect) {
-                Judgement::Prefix(state) => state,
-                Judgement::Candidate { .. } | Judgement::Refused(_) => State::Stx,
+            None => match check_header(&self.buffer[self.cursor..self.end], &self.expect) {
+                HeaderCheck::Prefix(state) => state,
+                HeaderCheck::Candidate { .. } | HeaderCheck::Refused(_) => State::Stx,
             },
         }
     }
 
     /// The earliest telegram that has begun and was not delivered, after [`Framer::poll`] answered `None`.
-    pub(crate) fn begun(&self) -> Option<Begun<'_>> {
+    pub(crate) fn partial_telegram(&self) -> Option<PartialTelegram<'_>> {
         let held = self.held.map(|held| (held.at, held.end));
-        let live = || self.live.first().map(|candidate| (candidate.at.into(), candidate.end.into()));
-        let (at, end): (usize, usize) = held.or_else(live)?;
-        let reasons = if self.damage || at > self.start { suspect::NEIGHBOUR } else { 0 };
-        Some(Begun { bytes: &self.buffer[at..end.min(self.end)], offset: self.offset(at), reasons })
+        let first_candidate =
+            || self.candidates.first().map(|candidate| (candidate.at.into(), candidate.end.into()));
+        let (at, end): (usize, usize) = held.or_else(first_candidate)?;
+        let reasons = if self.has_damage || at > self.start { suspect::NEIGHBOUR } else { 0 };
+        Some(PartialTelegram { bytes: &self.buffer[at..end.min(self.end)], offset: self.offset(at), reasons })
     }
 
     /// What became of the bytes.
-    pub fn tally(&self) -> &Tally {
-        &self.tally
+    pub fn counters(&self) -> &FramerCounters {
+        &self.counters
     }
 
     /// Bytes whose fate is open.
@@ -268,20 +273,20 @@ impl Framer {
 
     /// Returns the number of the byte at `at` among all bytes committed, from 0.
     fn offset(&self, at: usize) -> u64 {
-        self.tally.read - (self.end - at) as u64
+        self.counters.read - (self.end - at) as u64
     }
 
-    fn judge_headers(&mut self) {
+    fn check_headers(&mut self) {
         while let Some(found) = find_stx(&self.buffer[self.cursor..self.end]) {
             let at = self.cursor + found;
-            let header = &self.buffer[at..self.end.min(at + MAX_HEADER)];
-            match judge(header, &self.expect) {
-                Judgement::Prefix(_) => {
+            let header = &self.buffer[at..self.end.min(at + MAX_HEADER_LEN)];
+            match check_header(header, &self.expect) {
+                HeaderCheck::Prefix(_) => {
                     self.cursor = at;
                     return;
                 }
-                Judgement::Candidate { len } => self.live.push(at, at + len),
-                Judgement::Refused(_) => {}
+                HeaderCheck::Candidate { len } => self.candidates.push(at, at + len),
+                HeaderCheck::Refused(_) => {}
             }
             self.cursor = at + 1;
         }
@@ -291,17 +296,17 @@ impl Framer {
     /// Adds the bytes that have arrived to the checksum of the first candidate, so that little is left to do after its last
     /// byte.
     fn add_arrived(&mut self) {
-        if let Some(first) = self.live.first() {
+        if let Some(first) = self.candidates.first() {
             let (at, end) = (usize::from(first.at), usize::from(first.end));
             let mut checksum = self.checksum(at);
             checksum.extend(&self.buffer[at..self.end.min(end - 2)]);
-            self.arriving = (self.offset(at), checksum);
+            self.partial_checksum = (self.offset(at), checksum);
         }
     }
 
     /// Returns the checksum of the candidate at `at`, which may already include some of its bytes.
     fn checksum(&self, at: usize) -> Checksum {
-        let (offset, checksum) = self.arriving;
+        let (offset, checksum) = self.partial_checksum;
         if offset == self.offset(at) { checksum } else { Checksum::default() }
     }
 
@@ -309,87 +314,87 @@ impl Framer {
     /// began before it and the held frame that it began in.
     fn complete(&mut self, candidate: Candidate) {
         let (at, end) = (usize::from(candidate.at), usize::from(candidate.end));
-        let right = Telegram::check_rest(&self.buffer[at..end], self.checksum(at)).is_some();
+        let is_valid = Telegram::check_with(&self.buffer[at..end], self.checksum(at)).is_some();
         match &mut self.held {
             // What began inside the held frame reaches into this telegram, so it is none.
-            Some(held) if right && held.end <= at => return self.refute_headers_inside(),
+            Some(held) if is_valid && held.end <= at => return self.refute_headers_inside(),
             Some(held) => held.header_inside |= at < held.end,
             None => {}
         }
-        self.live.remove(candidate);
-        if right {
-            self.live.drop_before(at);
-            self.held = Some(Held { at, end, header_inside: self.live.any_before(end) });
+        self.candidates.remove(candidate);
+        if is_valid {
+            self.candidates.drop_before(at);
+            self.held = Some(HeldFrame { at, end, header_inside: self.candidates.has_candidate_before(end) });
         }
     }
 
     fn refute_headers_inside(&mut self) {
         if let Some(held) = &mut self.held {
-            held.header_inside |= self.live.any_before(held.end);
-            self.live.drop_before(held.end);
+            held.header_inside |= self.candidates.has_candidate_before(held.end);
+            self.candidates.drop_before(held.end);
         }
     }
 
-    fn deliver(&mut self, held: Held) -> TelegramSpan {
-        let Held { at, end, header_inside } = held;
-        self.give_up_before(held);
+    fn deliver(&mut self, held: HeldFrame) -> TelegramSpan {
+        let HeldFrame { at, end, header_inside } = held;
+        self.discard_before(held);
         self.held = None;
         self.start = end;
-        self.live.drop_before(end);
-        self.tally.in_telegrams += (end - at) as u64;
-        self.tally.telegrams += 1;
-        self.tally.held += u64::from(header_inside);
-        let damage = core::mem::take(&mut self.damage) && self.tally.telegrams > 1;
-        let reasons = if damage { suspect::NEIGHBOUR } else { 0 }
+        self.candidates.drop_before(end);
+        self.counters.in_telegrams += (end - at) as u64;
+        self.counters.telegrams += 1;
+        self.counters.held += u64::from(header_inside);
+        let is_damaged = core::mem::take(&mut self.has_damage) && self.counters.telegrams > 1;
+        let reasons = if is_damaged { suspect::NEIGHBOUR } else { 0 }
             | if header_inside { suspect::HEADER_INSIDE } else { 0 };
         TelegramSpan { at, end, offset: self.offset(at), reasons }
     }
 
     /// Whatever becomes of `held`, what came before it is in nothing.
-    fn give_up_before(&mut self, held: Held) {
+    fn discard_before(&mut self, held: HeldFrame) {
         self.discard(held.at, Some((self.buffer[held.at + 4], held.end)));
     }
 
     /// Gives up the bytes before `to`; `winner` is the command of the telegram that begins there, and its end.
-    fn discard(&mut self, to: usize, winner: Option<(u8, usize)>) {
-        let reply = winner.is_some_and(|(command, _)| command != MEASURED);
-        let decided = winner.map_or(self.end, |(_, end)| end);
+    fn discard(&mut self, to: usize, successor: Option<(u8, usize)>) {
+        let is_reply = successor.is_some_and(|(command, _)| command != MEASURED);
+        let decided = successor.map_or(self.end, |(_, end)| end);
         let mut until = to;
-        if reply && self.awaits_acknowledge && until > self.start && self.buffer[until - 1] == ACK {
+        if is_reply && self.expects_acknowledge && until > self.start && self.buffer[until - 1] == ACK {
             until -= 1;
-            self.tally.acknowledge += 1;
+            self.counters.acknowledge += 1;
         }
         let mut broken_off = 0;
         for at in self.start..until {
-            if self.buffer[at] == STX && self.count_refusal(at, reply, decided) {
+            if self.buffer[at] == STX && self.count_rejection(at, is_reply, decided) {
                 broken_off = broken_off.max(until - at);
             }
         }
-        self.tally.broken_off += broken_off as u64;
-        self.damage |= until > self.start && !reply;
-        self.tally.discarded += (until - self.start) as u64;
+        self.counters.broken_off += broken_off as u64;
+        self.has_damage |= until > self.start && !is_reply;
+        self.counters.discarded += (until - self.start) as u64;
         self.start = to;
     }
 
     /// Counts why the start byte at `at` was none, as it stood when the bytes before `decided` were there. Whether a scan
     /// began there that broke off.
-    fn count_refusal(&mut self, at: usize, winner_is_reply: bool, decided: usize) -> bool {
-        let reject = match judge(&self.buffer[at..self.end.min(at + MAX_HEADER)], &self.expect) {
-            Judgement::Refused(reject) => reject,
-            Judgement::Prefix(_) => Reject::Superseded,
-            Judgement::Candidate { len } if at + len > decided => {
-                if winner_is_reply && self.buffer[at + 4] == MEASURED {
-                    self.tally.aborted += 1;
+    fn count_rejection(&mut self, at: usize, is_reply: bool, decided: usize) -> bool {
+        let reject = match check_header(&self.buffer[at..self.end.min(at + MAX_HEADER_LEN)], &self.expect) {
+            HeaderCheck::Refused(reject) => reject,
+            HeaderCheck::Prefix(_) => Reject::Superseded,
+            HeaderCheck::Candidate { len } if at + len > decided => {
+                if is_reply && self.buffer[at + 4] == MEASURED {
+                    self.counters.aborted += 1;
                     return true;
                 }
                 Reject::Superseded
             }
-            Judgement::Candidate { len } => match Telegram::check(&self.buffer[at..at + len]) {
+            HeaderCheck::Candidate { len } => match Telegram::check(&self.buffer[at..at + len]) {
                 Some(_) => Reject::Vetoed,
                 None => Reject::Crc,
             },
         };
-        self.tally.rejected[reject as usize] += 1;
+        self.counters.rejected[reject as usize] += 1;
         false
     }
 
@@ -398,7 +403,7 @@ impl Framer {
         self.start -= by;
         self.end -= by;
         self.cursor -= by;
-        self.live.shift(by);
+        self.candidates.shift(by);
         if let Some(held) = &mut self.held {
             held.at -= by;
             held.end -= by;
@@ -414,11 +419,11 @@ fn find_stx(bytes: &[u8]) -> Option<usize> {
 }
 
 /// A held frame and a header that begins with its last byte must fit.
-pub(crate) const CAPACITY: usize = 2 * MAX_TELEGRAM;
+pub(crate) const BUFFER_LEN: usize = 2 * MAX_TELEGRAM;
 /// The longest pause inside a telegram (Telegram listing 4.3): a header inside a held frame is given up after it.
-pub const VETO_HOLD: Nanos = 14 * MILLIS;
+pub const VETO_HOLD_TIME: Nanos = 14 * MILLIS;
 /// A frame whose last bytes might begin a header is delivered when nothing followed for so long.
-pub const SUFFIX_HOLD: Nanos = 2 * MILLIS;
+pub const SUFFIX_HOLD_TIME: Nanos = 2 * MILLIS;
 
 /// A position with an acceptable header, and where its telegram would end.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -430,15 +435,15 @@ pub(crate) struct Candidate {
 /// The candidates in a full buffer, ascending by position.
 #[derive(Clone, Debug)]
 pub(crate) struct Candidates {
-    list: [Candidate; Candidates::CAPACITY],
+    list: [Candidate; Candidates::MAX_CANDIDATES],
     len: usize,
 }
 
 impl Candidates {
-    const CAPACITY: usize = CAPACITY.div_ceil(HEADER_DISTANCE);
+    const MAX_CANDIDATES: usize = BUFFER_LEN.div_ceil(MIN_HEADER_DISTANCE);
 
     pub(crate) fn new() -> Self {
-        Candidates { list: [Candidate::default(); Candidates::CAPACITY], len: 0 }
+        Candidates { list: [Candidate::default(); Candidates::MAX_CANDIDATES], len: 0 }
     }
 
     fn as_slice(&self) -> &[Candidate] {
@@ -461,7 +466,7 @@ impl Candidates {
         complete.copied().min_by_key(|candidate| (candidate.end, core::cmp::Reverse(candidate.at)))
     }
 
-    pub(crate) fn any_before(&self, at: usize) -> bool {
+    pub(crate) fn has_candidate_before(&self, at: usize) -> bool {
         self.first().is_some_and(|candidate| usize::from(candidate.at) < at)
     }
 
@@ -473,9 +478,9 @@ impl Candidates {
     }
 
     pub(crate) fn drop_before(&mut self, at: usize) {
-        let gone = self.as_slice().partition_point(|candidate| usize::from(candidate.at) < at);
-        self.list.copy_within(gone..self.len, 0);
-        self.len -= gone;
+        let removed = self.as_slice().partition_point(|candidate| usize::from(candidate.at) < at);
+        self.list.copy_within(removed..self.len, 0);
+        self.len -= removed;
     }
 
     pub(crate) fn shift(&mut self, by: usize) {

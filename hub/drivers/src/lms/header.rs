@@ -3,7 +3,7 @@
 
 use crate::lms::command;
 use crate::lms::measured::MEASURED;
-use crate::lms::telegram::{FRAME, MAX_LENGTH, REPLY, STX};
+use crate::lms::telegram::{FRAME_LEN, MAX_LENGTH, REPLY, STX};
 use crate::lms::variant::MAX_BEAMS;
 
 /// What a candidate waits for; the six states of the paper's Fig. 3.
@@ -53,7 +53,7 @@ pub type StreamHeader = [u8; 7];
 
 /// Which headers are acceptable at the moment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Expect {
+pub enum ExpectedHeaders {
     /// Any reply of at most [`MAX_LENGTH`]; a measured-value telegram must have the length that its count asks for.
     Anything,
     /// A stream in a known mode, and the reply to the request that is open, or its refusal. At any time what a sensor
@@ -68,7 +68,7 @@ pub enum Expect {
 
 /// What the first bytes at a position are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Judgement {
+pub(crate) enum HeaderCheck {
     /// The beginning of an acceptable header, which ends before the state that it names.
     Prefix(State),
     /// A whole acceptable header of a telegram of `len` bytes, STX to checksum.
@@ -78,8 +78,8 @@ pub(crate) enum Judgement {
 }
 
 /// Judges the header that begins at `bytes[0]`; only as many bytes are looked at as a header has.
-pub(crate) fn judge(bytes: &[u8], expect: &Expect) -> Judgement {
-    use Judgement::{Candidate, Prefix, Refused};
+pub(crate) fn check_header(bytes: &[u8], expect: &ExpectedHeaders) -> HeaderCheck {
+    use HeaderCheck::{Candidate, Prefix, Refused};
     let Some(&stx) = bytes.first() else { return Prefix(State::Stx) };
     debug_assert_eq!(stx, STX);
     let Some(&address) = bytes.get(1) else { return Prefix(State::Address) };
@@ -95,8 +95,8 @@ pub(crate) fn judge(bytes: &[u8], expect: &Expect) -> Judgement {
     let Some(&command) = bytes.get(4) else { return Prefix(State::Body) };
     match command_fits(command, length, expect) {
         Err(reject) => return Refused(reject),
-        Ok(Counted::No) => return Candidate { len: length + FRAME },
-        Ok(Counted::Yes) => {}
+        Ok(HasCount::No) => return Candidate { len: length + FRAME_LEN },
+        Ok(HasCount::Yes) => {}
     }
     let (Some(&count_low), Some(&count_high)) = (bytes.get(5), bytes.get(6)) else {
         return Prefix(State::Body);
@@ -104,68 +104,71 @@ pub(crate) fn judge(bytes: &[u8], expect: &Expect) -> Judgement {
     if !count_fits([count_low, count_high], length, expect) {
         return Refused(Reject::Count);
     }
-    Candidate { len: length + FRAME }
+    Candidate { len: length + FRAME_LEN }
 }
 
 /// Whether a count word follows the command.
-enum Counted {
+enum HasCount {
     Yes,
     No,
 }
 
-fn address_fits(address: u8, expect: &Expect) -> bool {
+fn address_fits(address: u8, expect: &ExpectedHeaders) -> bool {
     match expect {
-        Expect::Anything => address & REPLY != 0,
-        Expect::Stream { header, .. } => address == header[1],
+        ExpectedHeaders::Anything => address & REPLY != 0,
+        ExpectedHeaders::Stream { header, .. } => address == header[1],
     }
 }
 
-fn length_fits(length: usize, expect: &Expect) -> bool {
+fn length_fits(length: usize, expect: &ExpectedHeaders) -> bool {
     match expect {
-        Expect::Anything | Expect::Stream { reply: Some(_), .. } => {
+        ExpectedHeaders::Anything | ExpectedHeaders::Stream { reply: Some(_), .. } => {
             (MIN_LENGTH..=MAX_LENGTH).contains(&length)
         }
-        Expect::Stream { header, reply: None } => {
+        ExpectedHeaders::Stream { header, reply: None } => {
             length == stream_length(header)
-                || BESIDE_A_STREAM.iter().any(|(_, lengths)| lengths.contains(&length))
+                || REPLIES_IN_STREAM.iter().any(|(_, lengths)| lengths.contains(&length))
         }
     }
 }
 
-fn command_fits(command: u8, length: usize, expect: &Expect) -> Result<Counted, Reject> {
+fn command_fits(command: u8, length: usize, expect: &ExpectedHeaders) -> Result<HasCount, Reject> {
     match expect {
-        Expect::Anything if command == MEASURED => Ok(Counted::Yes),
-        Expect::Anything if command & REPLY != 0 => Ok(Counted::No),
-        Expect::Stream { header, .. } if command == MEASURED => {
+        ExpectedHeaders::Anything if command == MEASURED => Ok(HasCount::Yes),
+        ExpectedHeaders::Anything if command & REPLY != 0 => Ok(HasCount::No),
+        ExpectedHeaders::Stream { header, .. } if command == MEASURED => {
             if length == stream_length(header) {
-                Ok(Counted::Yes)
+                Ok(HasCount::Yes)
             } else {
                 Err(Reject::Length)
             }
         }
-        Expect::Stream { reply: Some(reply), .. }
+        ExpectedHeaders::Stream { reply: Some(reply), .. }
             if command == *reply || command == crate::lms::reply::REFUSED =>
         {
-            Ok(Counted::No)
+            Ok(HasCount::No)
         }
-        Expect::Stream { .. }
-            if BESIDE_A_STREAM.iter().any(|(may, lengths)| *may == command && lengths.contains(&length)) =>
+        ExpectedHeaders::Stream { .. }
+            if REPLIES_IN_STREAM
+                .iter()
+                .any(|(allowed, lengths)| *allowed == command && lengths.contains(&length)) =>
         {
-            Ok(Counted::No)
+            Ok(HasCount::No)
         }
         _ => Err(Reject::Command),
     }
 }
 
-fn count_fits(word: [u8; 2], length: usize, expect: &Expect) -> bool {
+fn count_fits(word: [u8; 2], length: usize, expect: &ExpectedHeaders) -> bool {
     match expect {
-        Expect::Anything => {
+        ExpectedHeaders::Anything => {
             let count = usize::from(u16::from_le_bytes(word) & 0x03FF);
             // Command, count word and status; two more where real-time indices are on.
-            let plain = 2 * count + 4;
-            (1..=MAX_BEAMS).contains(&count) && (length == plain || length == plain + 2)
+            let len_without_indices = 2 * count + 4;
+            (1..=MAX_BEAMS).contains(&count)
+                && (length == len_without_indices || length == len_without_indices + 2)
         }
-        Expect::Stream { header, .. } => word == [header[5], header[6]],
+        ExpectedHeaders::Stream { header, .. } => word == [header[5], header[6]],
     }
 }
 
@@ -175,15 +178,15 @@ fn stream_length(header: &StreamHeader) -> usize {
 
 /// Whether a sensor sends telegrams with this command byte unasked, scan after scan, in one of its operating modes.
 pub(crate) fn is_data(command: u8) -> bool {
-    STREAMED.contains(&command)
+    STREAM_COMMANDS.contains(&command)
 }
 
 /// All values, means, a sub-range, with field values, means of a sub-range, with reflectivity, ranges and
 /// reflectivity, Cartesian (Telegram listing, 20h).
-const STREAMED: [u8; 8] = [MEASURED, 0xB6, 0xB7, 0xBE, 0xBF, 0xC4, 0xF5, 0xF6];
+const STREAM_COMMANDS: [u8; 8] = [MEASURED, 0xB6, 0xB7, 0xBE, 0xBF, 0xC4, 0xF5, 0xF6];
 /// Replies to the requests of a session, the refusal, and the banner at power-on, each with its LENGTH: names have 20
 /// or 21 characters, configurations 32 or 34 bytes. Without their length they would be found in scans.
-const BESIDE_A_STREAM: [(u8, core::ops::RangeInclusive<usize>); 7] = [
+const REPLIES_IN_STREAM: [(u8, core::ops::RangeInclusive<usize>); 7] = [
     (crate::lms::reply::POWER_ON, 20..=26),
     (crate::lms::reply::REFUSED, 2..=2),
     (command::MODE | REPLY, 3..=3),
@@ -195,10 +198,10 @@ const BESIDE_A_STREAM: [(u8, core::ops::RangeInclusive<usize>); 7] = [
 /// Command and status.
 const MIN_LENGTH: usize = 2;
 /// Bytes of the longest header.
-pub(crate) const MAX_HEADER: usize = 7;
+pub(crate) const MAX_HEADER_LEN: usize = 7;
 /// Acceptable headers cannot begin closer to each other: the length's high byte is at most 3, so it is no address,
 /// but it may be a start byte.
-pub(crate) const HEADER_DISTANCE: usize = 3;
+pub(crate) const MIN_HEADER_DISTANCE: usize = 3;
 
 const _: () = assert!(MAX_LENGTH < 0x0400, "HEADER_DISTANCE rests on it");
 
@@ -210,13 +213,13 @@ mod tests {
 
     #[test]
     fn a_header_is_judged_as_soon_as_a_byte_decides() {
-        let stream = Expect::Stream { header: HEADER, reply: None };
+        let stream = ExpectedHeaders::Stream { header: HEADER, reply: None };
         let states =
             [State::Address, State::LengthLow, State::LengthHigh, State::Body, State::Body, State::Body];
         for (n, state) in states.into_iter().enumerate() {
-            assert_eq!(judge(&HEADER[..=n], &stream), Judgement::Prefix(state));
+            assert_eq!(check_header(&HEADER[..=n], &stream), HeaderCheck::Prefix(state));
         }
-        assert_eq!(judge(&HEADER, &stream), Judgement::Candidate { len: 732 });
+        assert_eq!(check_header(&HEADER, &stream), HeaderCheck::Candidate { len: 732 });
         for (at, reject) in [
             (1, Reject::Address),
             (2, Reject::Length),
@@ -228,45 +231,48 @@ mod tests {
             let mut bytes = HEADER;
             bytes[at] ^= 1;
             let decides = if at == 2 { 3 } else { at.max(if at == 5 { 6 } else { at }) };
-            assert_eq!(judge(&bytes[..=decides], &stream), Judgement::Refused(reject), "byte {at}");
+            assert_eq!(check_header(&bytes[..=decides], &stream), HeaderCheck::Refused(reject), "byte {at}");
         }
     }
 
     #[test]
     fn before_the_mode_is_known_any_reply_may_come() {
-        let any = Expect::Anything;
-        assert_eq!(judge(&[0x02, 0x81, 3, 0, 0xA0], &any), Judgement::Candidate { len: 9 });
-        assert_eq!(judge(&[0x02, 0x00], &any), Judgement::Refused(Reject::Address));
-        assert_eq!(judge(&[0x02, 0x80, 0x02, 0x80], &any), Judgement::Refused(Reject::Length));
-        assert_eq!(judge(&[0x02, 0x80, 3, 0, 0x20], &any), Judgement::Refused(Reject::Command));
+        let any = ExpectedHeaders::Anything;
+        assert_eq!(check_header(&[0x02, 0x81, 3, 0, 0xA0], &any), HeaderCheck::Candidate { len: 9 });
+        assert_eq!(check_header(&[0x02, 0x00], &any), HeaderCheck::Refused(Reject::Address));
+        assert_eq!(check_header(&[0x02, 0x80, 0x02, 0x80], &any), HeaderCheck::Refused(Reject::Length));
+        assert_eq!(check_header(&[0x02, 0x80, 3, 0, 0x20], &any), HeaderCheck::Refused(Reject::Command));
         assert_eq!(
-            judge(&[0x02, 0x80, 0xD6, 0x02, 0xB0, 0x67, 0x41], &any),
-            Judgement::Refused(Reject::Count)
+            check_header(&[0x02, 0x80, 0xD6, 0x02, 0xB0, 0x67, 0x41], &any),
+            HeaderCheck::Refused(Reject::Count)
         );
-        assert_eq!(judge(&HEADER, &any), Judgement::Candidate { len: 732 });
+        assert_eq!(check_header(&HEADER, &any), HeaderCheck::Candidate { len: 732 });
     }
 
     #[test]
     fn in_a_stream_the_open_reply_may_come() {
-        let open = Expect::Stream { header: HEADER, reply: Some(0xB1) };
-        assert_eq!(judge(&[0x02, 0x80, 0x9A, 0, 0xB1], &open), Judgement::Candidate { len: 160 });
-        assert_eq!(judge(&[0x02, 0x80, 2, 0, 0x92], &open), Judgement::Candidate { len: 8 });
-        assert_eq!(judge(&[0x02, 0x80, 0x17, 0, 0xCA], &open), Judgement::Refused(Reject::Command));
-        assert_eq!(judge(&[0x02, 0x80, 0x17, 0, 0xB0], &open), Judgement::Refused(Reject::Length));
+        let open = ExpectedHeaders::Stream { header: HEADER, reply: Some(0xB1) };
+        assert_eq!(check_header(&[0x02, 0x80, 0x9A, 0, 0xB1], &open), HeaderCheck::Candidate { len: 160 });
+        assert_eq!(check_header(&[0x02, 0x80, 2, 0, 0x92], &open), HeaderCheck::Candidate { len: 8 });
+        assert_eq!(check_header(&[0x02, 0x80, 0x17, 0, 0xCA], &open), HeaderCheck::Refused(Reject::Command));
+        assert_eq!(check_header(&[0x02, 0x80, 0x17, 0, 0xB0], &open), HeaderCheck::Refused(Reject::Length));
     }
 
     #[test]
-    fn in_a_stream_a_late_reply_may_come_with_its_own_length() {
-        let stream = Expect::Stream { header: HEADER, reply: None };
+    fn accepts_late_reply_in_stream_with_own_length() {
+        let stream = ExpectedHeaders::Stream { header: HEADER, reply: None };
         for (command, length) in
             [(0x90, 0x17), (0x92, 2), (0xA0, 3), (0xB1, 0x9A), (0xBA, 0x17), (0xBB, 7), (0xF4, 0x24)]
         {
             let mut header = [0x02, 0x80, length, 0, command];
-            assert_eq!(judge(&header, &stream), Judgement::Candidate { len: usize::from(length) + FRAME });
+            assert_eq!(
+                check_header(&header, &stream),
+                HeaderCheck::Candidate { len: usize::from(length) + FRAME_LEN }
+            );
             header[4] = 0xC0;
-            assert_eq!(judge(&header, &stream), Judgement::Refused(Reject::Command));
+            assert_eq!(check_header(&header, &stream), HeaderCheck::Refused(Reject::Command));
             header[2] = 0x50;
-            assert_eq!(judge(&header, &stream), Judgement::Refused(Reject::Length));
+            assert_eq!(check_header(&header, &stream), HeaderCheck::Refused(Reject::Length));
         }
     }
 }

@@ -5,7 +5,7 @@
 use scanhub_schema::{Nanos, ScanHead};
 
 use crate::line::{RawScan, Values};
-use crate::lms::telegram::{Encoded, REPLY, Telegram, Writer};
+use crate::lms::telegram::{EncodedTelegram, REPLY, Telegram, Writer};
 use crate::lms::variant::{MAX_BEAMS, Mode, Unit, Variant};
 
 /// Command byte of a measured-value telegram.
@@ -13,20 +13,20 @@ pub const MEASURED: u8 = 0xB0;
 
 /// View of measured values, from the count word on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Measured<'a> {
+pub struct MeasuredValues<'a> {
     count_word: u16,
     values: &'a [u8],
     indices: Option<(u8, u8)>,
 }
 
-impl<'a> Measured<'a> {
+impl<'a> MeasuredValues<'a> {
     /// The view, if `telegram` is one: command B0h, a known unit, as many words as it says, nothing else but the two
     /// real-time indices.
     pub fn decode(telegram: Telegram<'a>) -> Option<Self> {
         if telegram.command() != MEASURED || !telegram.is_reply() {
             return None;
         }
-        Measured::read(telegram.data())
+        MeasuredValues::read(telegram.data())
     }
 
     /// The values that `data` are, from the count word on.
@@ -34,7 +34,7 @@ impl<'a> Measured<'a> {
         let [low, high, rest @ ..] = data else { return None };
         let count_word = u16::from_le_bytes([*low, *high]);
         Unit::of_code((count_word >> 14) as u8)?;
-        let count = usize::from(count_word & COUNT);
+        let count = usize::from(count_word & COUNT_MASK);
         if count == 0 || count > MAX_BEAMS {
             return None;
         }
@@ -44,7 +44,7 @@ impl<'a> Measured<'a> {
             [scan, telegram] => Some((scan, telegram)),
             _ => return None,
         };
-        Some(Measured { count_word, values, indices })
+        Some(MeasuredValues { count_word, values, indices })
     }
 
     /// Appends them to a reply; `None` if they do not fit into it.
@@ -69,7 +69,7 @@ impl<'a> Measured<'a> {
 
     /// Of a partial scan, its start in quarters of a degree (0 to 3); `None` for a whole scan.
     pub fn partial(&self) -> Option<u8> {
-        (self.count_word & PARTIAL != 0).then_some((self.count_word >> 11) as u8 & 3)
+        (self.count_word & PARTIAL_FLAG != 0).then_some((self.count_word >> 11) as u8 & 3)
     }
 
     /// Scan index and telegram index, both modulo 256, where the sensor is set to send them.
@@ -84,7 +84,7 @@ impl<'a> Measured<'a> {
 
     /// Returns the scan, with its values split as `mode` says. Its stamps are 0.
     pub fn scan(&self, mode: Mode) -> RawScan<'a> {
-        raw(self.values, head(self.count(), self.unit(), self.partial(), mode), mode)
+        raw_scan(self.values, head(self.count(), self.unit(), self.partial(), mode), mode)
     }
 
     /// The values as sent: range in the low bits, reflector level or field bits above (see [`crate::lms::variant::Mode`]).
@@ -99,31 +99,31 @@ fn words(values: &[u8]) -> impl ExactSizeIterator<Item = u16> + use<'_> {
 
 /// The first values of a measured-value telegram that is not complete.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct FirstValues<'a> {
+pub struct PartialValues<'a> {
     count: usize,
     unit: Unit,
     values: &'a [u8],
 }
 
-impl<'a> FirstValues<'a> {
+impl<'a> PartialValues<'a> {
     /// Those of the telegram that begins with `bytes`, if its header is that of a whole scan.
     pub(crate) fn of(bytes: &'a [u8]) -> Option<Self> {
         let [_, _, _, _, MEASURED, low, high, rest @ ..] = bytes else { return None };
         let count_word = u16::from_le_bytes([*low, *high]);
-        let count = usize::from(count_word & COUNT);
+        let count = usize::from(count_word & COUNT_MASK);
         let unit = Unit::of_code((count_word >> 14) as u8)?;
-        let is_whole = count_word & PARTIAL == 0 && (1..=MAX_BEAMS).contains(&count);
+        let is_whole = count_word & PARTIAL_FLAG == 0 && (1..=MAX_BEAMS).contains(&count);
         let (values, _) = rest.split_at(rest.len().min(2 * count) & !1);
-        is_whole.then_some(FirstValues { count, unit, values })
+        is_whole.then_some(PartialValues { count, unit, values })
     }
 
     /// Returns the scan so far, with its values split as `mode` says. Its stamps are 0.
     pub(crate) fn scan(&self, mode: Mode) -> RawScan<'a> {
-        raw(self.values, head(self.count, self.unit, None, mode), mode)
+        raw_scan(self.values, head(self.count, self.unit, None, mode), mode)
     }
 }
 
-fn raw(bytes: &[u8], head: ScanHead, mode: Mode) -> RawScan<'_> {
+fn raw_scan(bytes: &[u8], head: ScanHead, mode: Mode) -> RawScan<'_> {
     let values = Values::Words { bytes, range_bits: mode.range_bits() };
     RawScan { number: 0, first: 0, last: 0, period: 0, reasons: 0, bytes: 0, head, values }
 }
@@ -154,13 +154,13 @@ pub fn nominal_period(beams: usize, baud: u32) -> Nanos {
 
 /// A measured-value telegram of a whole scan from the sensor at `address` (0 to 127): at most 401 `words` as they
 /// are, then `status`.
-pub fn encode(address: u8, unit: Unit, words: &[u16], status: u8) -> Encoded {
-    encode_with(address, Frame { unit, partial: None, indices: None }, words, status)
+pub fn encode(address: u8, unit: Unit, words: &[u16], status: u8) -> EncodedTelegram {
+    encode_with(address, ScanFrame { unit, partial: None, indices: None }, words, status)
 }
 
 /// What a measured-value telegram says beside its values.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Frame {
+pub struct ScanFrame {
     /// Unit of the ranges.
     pub unit: Unit,
     /// Of a partial scan, its start in quarters of a degree (0 to 3).
@@ -170,8 +170,8 @@ pub struct Frame {
 }
 
 /// As [`encode`], also for partial scans and with real-time indices.
-pub fn encode_with(address: u8, frame: Frame, words: &[u16], status: u8) -> Encoded {
-    let partial = frame.partial.map_or(0, |quarter| PARTIAL | u16::from(quarter & 3) << 11);
+pub fn encode_with(address: u8, frame: ScanFrame, words: &[u16], status: u8) -> EncodedTelegram {
+    let partial = frame.partial.map_or(0, |quarter| PARTIAL_FLAG | u16::from(quarter & 3) << 11);
     let count_word = words.len() as u16 | partial | u16::from(frame.unit.code()) << 14;
     let mut writer = Writer::new(address | REPLY, MEASURED).word(count_word);
     for &word in words {
@@ -184,9 +184,9 @@ pub fn encode_with(address: u8, frame: Frame, words: &[u16], status: u8) -> Enco
 }
 
 /// Bits of the count word that are the count.
-pub(crate) const COUNT: u16 = 0x03FF;
+pub(crate) const COUNT_MASK: u16 = 0x03FF;
 /// Bit of the count word that marks a partial scan.
-pub(crate) const PARTIAL: u16 = 1 << 13;
+pub(crate) const PARTIAL_FLAG: u16 = 1 << 13;
 
 /// Data of a reply with more than one word per beam, whose counts fit its length. The two real-time indices may follow.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -199,22 +199,22 @@ impl<'a> Rows<'a> {
         for _ in 0..word(data, 0)? {
             used += 6 + 4 * count(data, used + 4)?;
         }
-        Rows::checked(data, used)
+        Rows::check_len(data, used)
     }
 
     /// Checks the data of C4h, which an LMS S14 sends: all ranges as words, then the reflectivity of a sub-range as bytes.
     pub fn of_reflectivity(data: &'a [u8]) -> Option<Self> {
         let reflectivities = 2 + 2 * count(data, 0)?;
-        Rows::checked(data, reflectivities + 6 + count(data, reflectivities)?)
+        Rows::check_len(data, reflectivities + 6 + count(data, reflectivities)?)
     }
 
     /// Checks the data of BEh: a sub-range, with the range of each beam and the borders of the fields A, B and C in its
     /// direction. These are four words each: 100 beams fill the longest telegram to the byte.
     pub fn of_fields(data: &'a [u8]) -> Option<Self> {
-        Rows::checked(data, 6 + 8 * count(data, 4)?)
+        Rows::check_len(data, 6 + 8 * count(data, 4)?)
     }
 
-    fn checked(data: &'a [u8], used: usize) -> Option<Self> {
+    fn check_len(data: &'a [u8], used: usize) -> Option<Self> {
         matches!(data.len().checked_sub(used)?, 0 | 2).then_some(Rows(data))
     }
 
@@ -226,7 +226,7 @@ impl<'a> Rows<'a> {
 
 /// Returns the count in the count word at `at`.
 fn count(bytes: &[u8], at: usize) -> Option<usize> {
-    word(bytes, at).map(|word| (word & COUNT).into())
+    word(bytes, at).map(|word| (word & COUNT_MASK).into())
 }
 
 fn word(bytes: &[u8], at: usize) -> Option<u16> {
@@ -243,7 +243,7 @@ mod tests {
     fn words_are_split_as_the_mode_says() {
         let words: Vec<u16> = (0..181).map(|i| (i % 8) << 13 | (1000 + i)).collect();
         let encoded = encode(0, Unit::Cm, &words, 0x10);
-        let measured = Measured::decode(encoded.telegram()).unwrap();
+        let measured = MeasuredValues::decode(encoded.telegram()).unwrap();
         let mut scan = Scan::zeroed(measured.scan(Mode(1)).payload_len());
         measured.scan(Mode(1)).write(&mut scan);
         assert_eq!(
@@ -278,7 +278,7 @@ mod tests {
         assert_eq!(encoded.bytes().len(), 732);
         assert_eq!(encoded.bytes()[..9], [0x02, 0x80, 0xD6, 0x02, 0xB0, 0x69, 0x41, 0xE8, 0x03]);
         assert_eq!(encoded.bytes()[727..], [0x50, 0x05, 0x10, 0x86, 0x0C]);
-        let measured = Measured::decode(encoded.telegram()).unwrap();
+        let measured = MeasuredValues::decode(encoded.telegram()).unwrap();
         assert_eq!((measured.count(), measured.unit(), measured.partial()), (361, Unit::Mm, None));
         assert!(measured.words().eq(words));
     }
@@ -286,11 +286,11 @@ mod tests {
     #[test]
     fn partial_scans_with_indices_both_ways() {
         let words: [u16; 180] = core::array::from_fn(|i| i as u16);
-        let frame = Frame { unit: Unit::Cm, partial: Some(2), indices: Some((255, 7)) };
+        let frame = ScanFrame { unit: Unit::Cm, partial: Some(2), indices: Some((255, 7)) };
         let encoded = encode_with(1, frame, &words, 0x11);
         assert_eq!((encoded.bytes().len(), encoded.telegram().length()), (372, 0x016C + 2));
         assert_eq!(encoded.telegram().data()[..2], [180, 0b0011_0000]);
-        let measured = Measured::decode(encoded.telegram()).unwrap();
+        let measured = MeasuredValues::decode(encoded.telegram()).unwrap();
         assert_eq!(
             (measured.unit(), measured.partial(), measured.indices()),
             (Unit::Cm, Some(2), Some((255, 7)))
@@ -303,7 +303,7 @@ mod tests {
         for (beams, length) in [(181, 0x016E), (361, 0x02D6), (101, 0xCE), (201, 0x0196), (401, 0x0326)] {
             let encoded = encode(0, Unit::Mm, &[0; MAX_BEAMS][..beams], 0x10);
             assert_eq!(encoded.telegram().length(), length);
-            let frame = Frame { unit: Unit::Mm, partial: None, indices: Some((0, 0)) };
+            let frame = ScanFrame { unit: Unit::Mm, partial: None, indices: Some((0, 0)) };
             let with_indices = encode_with(0, frame, &[0; MAX_BEAMS][..beams], 0x10);
             assert_eq!(with_indices.telegram().length(), length + 2);
         }
@@ -316,10 +316,14 @@ mod tests {
             for _ in 0..values {
                 writer = writer.word(0);
             }
-            assert_eq!(Measured::decode(writer.byte(0x10).finish().telegram()), None, "{word} {values}");
+            assert_eq!(
+                MeasuredValues::decode(writer.byte(0x10).finish().telegram()),
+                None,
+                "{word} {values}"
+            );
         }
         let with_indices = Writer::new(0x80, MEASURED).word(1).word(7).byte(3).byte(4).byte(0x10).finish();
-        assert_eq!(Measured::decode(with_indices.telegram()).unwrap().indices(), Some((3, 4)));
+        assert_eq!(MeasuredValues::decode(with_indices.telegram()).unwrap().indices(), Some((3, 4)));
     }
 
     #[test]

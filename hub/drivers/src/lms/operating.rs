@@ -1,6 +1,6 @@
 //! Operating modes, which follow command 20h. The two that every session needs, and the rates, are separate requests.
 
-use crate::lms::command::{Parameter, Password, Raw, Span, Spans, requests};
+use crate::lms::command::{Parameter, Password, RawParameters, SubRange, SubRanges, requests};
 use crate::lms::telegram::Writer;
 use crate::lms::variant::Baud;
 
@@ -22,23 +22,23 @@ requests! {
         /// 26h: mean values of this number of scans, continuously; each telegram is a B6h.
         Means(number: u8) = MEANS,
         /// 27h: a sub-range, continuously; each telegram is a B7h.
-        Range(span: Span) = RANGE,
+        Range(span: SubRange) = RANGE,
         /// 28h: mean values of a sub-range, continuously; BFh.
-        RangeMeans(number: u8, span: Span) = RANGE_MEANS,
+        RangeMeans(number: u8, span: SubRange) = RANGE_MEANS,
         /// 29h: a sub-range with field values, continuously; BEh.
-        RangeFields(span: Span) = RANGE_FIELDS,
+        RangeFields(span: SubRange) = RANGE_FIELDS,
         /// 2Ah: each mirror turn as soon as it is complete; B0h of partial scans.
         Partial = PARTIAL,
         /// 2Bh: ranges and reflectivities of sub-ranges, continuously; F5h.
-        Reflectivities(spans: Spans) = REFLECTIVITIES,
+        Reflectivities(spans: SubRanges) = REFLECTIVITIES,
         /// 2Ch: the lowest value of each segment in a sub-range. Its parameters are not decoded.
-        SegmentMinimumOfRange(raw: Raw) = 0x2C,
+        SegmentMinimumOfRange(raw: RawParameters) = 0x2C,
         /// 2Eh: records for navigation.
         Navigation = 0x2E,
         /// 30h: tests a password.
         TestPassword(password: Password) = 0x30,
         /// 50h: ranges, and reflectivities of a sub-range, continuously; C4h. LMS S14 only.
-        Reflectivity(span: Span) = 0x50,
+        Reflectivity(span: SubRange) = 0x50,
     }
 }
 
@@ -129,7 +129,7 @@ mod tests {
 
     #[test]
     fn every_mode_both_ways() {
-        let span = Span { first: 1, last: 181 };
+        let span = SubRange { first: 1, last: 181 };
         let modes = [
             Operating::Installation(Password::FACTORY),
             Operating::Diagnosis,
@@ -142,8 +142,8 @@ mod tests {
             Operating::RangeMeans(2, span),
             Operating::RangeFields(span),
             Operating::Partial,
-            Operating::Reflectivities(Spans::new(&[span, span]).unwrap()),
-            Operating::SegmentMinimumOfRange(Raw::new(&[1, 0, 1, 0]).unwrap()),
+            Operating::Reflectivities(SubRanges::new(&[span, span]).unwrap()),
+            Operating::SegmentMinimumOfRange(RawParameters::new(&[1, 0, 1, 0]).unwrap()),
             Operating::Navigation,
             Operating::TestPassword(Password(*b"password")),
             Operating::Reflectivity(span),
@@ -159,7 +159,7 @@ mod tests {
     #[test]
     fn one_range_as_drivers_ask_for_it() {
         // 20 2B 01 00 01 00 B5 00, as CARMEN says it.
-        let spans = Spans::new(&[Span { first: 1, last: 181 }]).unwrap();
+        let spans = SubRanges::new(&[SubRange { first: 1, last: 181 }]).unwrap();
         let encoded = Request::Operate(Operating::Reflectivities(spans)).encode(0);
         assert_eq!(encoded.telegram().data(), [0x2B, 1, 0, 1, 0, 0xB5, 0]);
     }

@@ -1,16 +1,16 @@
 //! Replies: what a sensor says to a host's requests, and unasked in a stream. Every reply ends with a status byte, which
-//! is [`crate::lms::status::Condition`]'s affair, not this file's.
+//! is [`crate::lms::status::StatusByte`]'s affair, not this file's.
 
 use crate::lms::command as request;
-use crate::lms::command::{Parameter as _, Span};
-use crate::lms::configuration::factory;
-use crate::lms::measured::{MEASURED, Measured, Rows};
+use crate::lms::command::{Parameter as _, SubRange};
+use crate::lms::configuration::factory_configuration;
+use crate::lms::measured::{MEASURED, MeasuredValues, Rows};
 use crate::lms::status::Errors;
-use crate::lms::telegram::{Encoded, REPLY, Telegram, Writer};
+use crate::lms::telegram::{EncodedTelegram, REPLY, Telegram, Writer};
 use crate::lms::variant::{Mode, Unit, Variant};
 
 pub use crate::lms::configuration::Configuration;
-pub use crate::lms::status::{Health, StatusReport, status};
+pub use crate::lms::status::{SimulatedStatus, StatusReport, status_reply};
 
 /// A reply.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -27,7 +27,7 @@ pub enum Reply<'a> {
         done: bool,
     },
     /// B0h: a scan, asked for or streamed.
-    Measured(Measured<'a>),
+    Measured(MeasuredValues<'a>),
     /// B1h.
     Status(StatusReport<'a>),
     /// B2h: none, if everything is well.
@@ -42,16 +42,16 @@ pub enum Reply<'a> {
     /// B6h: mean values.
     Means {
         /// Of how many scans.
-        shots: u8,
+        scans: u8,
         /// The values.
-        values: Measured<'a>,
+        values: MeasuredValues<'a>,
     },
     /// B7h: a sub-range.
     Range {
         /// Which.
-        span: Span,
+        span: SubRange,
         /// The values.
-        values: Measured<'a>,
+        values: MeasuredValues<'a>,
     },
     /// BAh: type, number and firmware as ASCII, such as `LMS200;S18063;V02.19`.
     Type(&'a [u8]),
@@ -69,11 +69,11 @@ pub enum Reply<'a> {
     /// BFh: mean values of a sub-range.
     RangeMeans {
         /// Of how many scans.
-        shots: u8,
+        scans: u8,
         /// Which.
-        span: Span,
+        span: SubRange,
         /// The values.
-        values: Measured<'a>,
+        values: MeasuredValues<'a>,
     },
     /// C4h: ranges, and reflectivities of a sub-range; LMS S14.
     Reflectivity(Rows<'a>),
@@ -105,7 +105,7 @@ pub enum Reply<'a> {
         parameters: &'a [u8],
     },
     /// C0h, C1h, C2h, C5h, C6h, CAh, E9h and F6h, whose layout is not known here: the data as they are.
-    Unread {
+    Undecoded {
         /// The command byte.
         command: u8,
         /// Without the status byte.
@@ -135,17 +135,19 @@ impl<'a> Reply<'a> {
             (RESET, []) => Reply::Reset,
             (REFUSED, _) => Reply::Refused,
             (MODE, &[outcome, ..]) => Reply::Mode { done: outcome == 0 },
-            (MEASURED, data) => Reply::Measured(Measured::read(data)?),
+            (MEASURED, data) => Reply::Measured(MeasuredValues::read(data)?),
             (STATUS, data) => Reply::Status(StatusReport::new(data)?),
             (ERRORS, data) => Reply::Errors(Errors::new(data)?),
             (COUNTERS, &[a, b, c, d]) => Reply::Counters {
                 hours_by_2: u16::from_le_bytes([a, b]),
                 power_ons: u16::from_le_bytes([c, d]),
             },
-            (MEANS, &[shots, ref rest @ ..]) => Reply::Means { shots, values: Measured::read(rest)? },
+            (MEANS, &[shots, ref rest @ ..]) => {
+                Reply::Means { scans: shots, values: MeasuredValues::read(rest)? }
+            }
             (RANGE, data) => {
-                let (span, rest) = Span::read(data)?;
-                Reply::Range { span, values: Measured::read(rest)? }
+                let (span, rest) = SubRange::read(data)?;
+                Reply::Range { span, values: MeasuredValues::read(rest)? }
             }
             (TYPE, name) => Reply::Type(name.trim_ascii()),
             (VARIANT, &[done, a, b, c, d]) => Reply::Variant {
@@ -155,8 +157,8 @@ impl<'a> Reply<'a> {
             },
             (RANGE_FIELDS, data) => Reply::RangeFields(Rows::of_fields(data)?),
             (RANGE_MEANS, &[shots, ref rest @ ..]) => {
-                let (span, rest) = Span::read(rest)?;
-                Reply::RangeMeans { shots, span, values: Measured::read(rest)? }
+                let (span, rest) = SubRange::read(rest)?;
+                Reply::RangeMeans { scans: shots, span, values: MeasuredValues::read(rest)? }
             }
             (REFLECTIVITY, data) => Reply::Reflectivity(Rows::of_reflectivity(data)?),
             (POWER_ON_SET, &[outcome, set]) => Reply::PowerOnSet { outcome, set },
@@ -169,14 +171,14 @@ impl<'a> Reply<'a> {
             (CONFIGURATION_2_WRITTEN, &[outcome, ref parameters @ ..]) => {
                 Reply::Configuration2Written { done: outcome == 1, parameters }
             }
-            (command, data) if UNREAD.contains(&command) => Reply::Unread { command, data },
+            (command, data) if UNDECODED_COMMANDS.contains(&command) => Reply::Undecoded { command, data },
             _ => return None,
         })
     }
 
     /// The telegram that says it, from the sensor at `address`, ending with `status`; `None` if it is longer than a
     /// telegram may be. Names are filled up with spaces to the 21 characters that they have.
-    pub fn encode(&self, address: u8, status: u8) -> Option<Encoded> {
+    pub fn encode(&self, address: u8, status: u8) -> Option<EncodedTelegram> {
         let writer = Writer::new(address | REPLY, self.command());
         let writer = match *self {
             Reply::PowerOn(name) | Reply::Type(name) => {
@@ -189,12 +191,14 @@ impl<'a> Reply<'a> {
             Reply::Status(report) => writer.slice(report.bytes()),
             Reply::Errors(errors) => writer.reply_slice(errors.bytes())?,
             Reply::Counters { hours_by_2, power_ons } => writer.word(hours_by_2).word(power_ons),
-            Reply::Means { shots, values } => values.write(writer.byte(shots))?,
+            Reply::Means { scans: shots, values } => values.write(writer.byte(shots))?,
             Reply::Range { span, values } => values.write(span.write(writer))?,
             Reply::Variant { done, angle_deg, resolution_cdeg } => {
                 writer.byte(u8::from(done)).word(angle_deg).word(resolution_cdeg)
             }
-            Reply::RangeMeans { shots, span, values } => values.write(span.write(writer.byte(shots)))?,
+            Reply::RangeMeans { scans: shots, span, values } => {
+                values.write(span.write(writer.byte(shots)))?
+            }
             Reply::PowerOnSet { outcome, set } => writer.byte(outcome).byte(set),
             Reply::Configuration(configuration) => writer.reply_slice(configuration.bytes())?,
             Reply::RangeFields(rows) | Reply::Reflectivity(rows) | Reply::Reflectivities(rows) => {
@@ -207,7 +211,7 @@ impl<'a> Reply<'a> {
             Reply::Configuration2Written { done, parameters } => {
                 writer.byte(u8::from(done)).reply_slice(parameters)?
             }
-            Reply::Unread { data, .. } => writer.reply_slice(data)?,
+            Reply::Undecoded { data, .. } => writer.reply_slice(data)?,
         };
         Some(writer.byte(status).finish())
     }
@@ -236,28 +240,28 @@ impl<'a> Reply<'a> {
             Reply::ConfigurationWritten { .. } => CONFIGURATION_WRITTEN,
             Reply::Configuration2(_) => CONFIGURATION_2,
             Reply::Configuration2Written { .. } => CONFIGURATION_2_WRITTEN,
-            Reply::Unread { command, .. } => *command,
+            Reply::Undecoded { command, .. } => *command,
         }
     }
 }
 
 /// A0h: mode or rate changed (or not), from `address`, ending with `status`.
-pub fn mode(address: u8, done: bool, status: u8) -> Encoded {
+pub fn mode_reply(address: u8, done: bool, status: u8) -> EncodedTelegram {
     Writer::new(address | REPLY, MODE).byte(u8::from(!done)).byte(status).finish()
 }
 
 /// 92h: refused, from `address`, ending with `status`.
-pub fn refused(address: u8, status: u8) -> Encoded {
+pub fn refusal(address: u8, status: u8) -> EncodedTelegram {
     Writer::new(address | REPLY, REFUSED).byte(status).finish()
 }
 
 /// BAh: `name` is type, number and firmware, 20 or 21 ASCII characters by custom.
-pub fn kind(address: u8, name: &[u8], status: u8) -> Encoded {
+pub fn type_reply(address: u8, name: &[u8], status: u8) -> EncodedTelegram {
     Writer::new(address | REPLY, TYPE).slice(name).byte(status).finish()
 }
 
 /// BBh: whether the switch was done, and the variant in force.
-pub fn variant(address: u8, done: bool, variant: Variant, status: u8) -> Encoded {
+pub fn variant_reply(address: u8, done: bool, variant: Variant, status: u8) -> EncodedTelegram {
     Writer::new(address | REPLY, VARIANT)
         .byte(u8::from(done))
         .word(variant.angle_deg)
@@ -267,8 +271,11 @@ pub fn variant(address: u8, done: bool, variant: Variant, status: u8) -> Encoded
 }
 
 /// F4h: 34 bytes of a sensor as it left the factory, with this measuring mode and unit.
-pub fn configuration(address: u8, mode: Mode, unit: Unit, status: u8) -> Encoded {
-    Writer::new(address | REPLY, CONFIGURATION).slice(&factory(mode, unit)).byte(status).finish()
+pub fn configuration_reply(address: u8, mode: Mode, unit: Unit, status: u8) -> EncodedTelegram {
+    Writer::new(address | REPLY, CONFIGURATION)
+        .slice(&factory_configuration(mode, unit))
+        .byte(status)
+        .finish()
 }
 
 /// Command byte of what a sensor says when it is up.
@@ -296,6 +303,6 @@ const CONFIGURATION_WRITTEN: u8 = 0xF7;
 const CONFIGURATION_2: u8 = request::CONFIGURATION_2 | REPLY;
 const CONFIGURATION_2_WRITTEN: u8 = 0xFC;
 /// Replies without a layout here.
-const UNREAD: [u8; 8] = [0xC0, 0xC1, 0xC2, 0xC5, 0xC6, 0xCA, 0xE9, 0xF6];
+const UNDECODED_COMMANDS: [u8; 8] = [0xC0, 0xC1, 0xC2, 0xC5, 0xC6, 0xCA, 0xE9, 0xF6];
 /// Characters of type, number and firmware.
 const NAME_LEN: usize = 21;

@@ -5,18 +5,18 @@ use core::fmt;
 
 use crate::line;
 use crate::lms::command::Request;
-use crate::lms::family::Family;
 use crate::lms::header::StreamHeader;
+use crate::lms::lms_model::LmsModel;
 use crate::lms::reply::{POWER_ON, Reply};
-use crate::lms::status::{Condition, DIRTY, Severity, StatusReport};
+use crate::lms::status::{DIRTY_BELOW_PERCENT, Severity, StatusByte, StatusReport};
 use crate::lms::telegram::Telegram;
 use crate::lms::variant::{Baud, Mode, Unit, Variant};
 
 /// Reason why a session does not stream as it should.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Trouble {
+pub enum Problem {
     /// No reply at any rate.
-    NoAnswer {
+    NoReply {
         /// The only rate that the session tried. `None`: it tried all.
         baud: Option<Baud>,
         /// Seconds without a reply, rounded down to steps that grow.
@@ -33,12 +33,12 @@ pub enum Trouble {
     /// The line cannot carry 500,000 baud: it was silent after two switches to that rate.
     NeedsRs422 {
         /// Rate that the session uses instead; `None` if it has to keep to 500,000 baud.
-        instead: Option<Baud>,
+        fallback: Option<Baud>,
     },
     /// The port cannot have 500,000 baud.
     PortLacksRate {
         /// Rate that the session uses instead.
-        instead: Baud,
+        fallback: Baud,
     },
     /// The session is paused, but bytes arrive, and the scanner has not confirmed that it stops.
     NotStopped,
@@ -50,43 +50,43 @@ pub enum Trouble {
     ModeUnknown,
 }
 
-impl fmt::Display for Trouble {
+impl fmt::Display for Problem {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Trouble::NoAnswer { baud: None, seconds } => write!(
+            Problem::NoReply { baud: None, seconds } => write!(
                 f,
                 "no answer at 9600, 19200, 38400 or 500000 baud for {seconds} s: power, cable, RS-422 jumper?"
             ),
-            Trouble::NoAnswer { baud: Some(baud), .. } => write!(
+            Problem::NoReply { baud: Some(baud), .. } => write!(
                 f,
                 "no answer at {} baud, the rate set in the serial server: power, cable, rate?",
                 baud.rate()
             ),
-            Trouble::Unanswered(request) => write!(f, "no reply to {request:?} in several tries"),
-            Trouble::Refused(request) => write!(f, "the sensor refused {request:?}"),
-            Trouble::VariantRefused => f.write_str("the sensor keeps its own angle and resolution"),
-            Trouble::ModeUnknown => f.write_str("the sensor does not report its measuring mode: no scans"),
-            Trouble::AnglesUnknown => {
+            Problem::Unanswered(request) => write!(f, "no reply to {request:?} in several tries"),
+            Problem::Refused(request) => write!(f, "the sensor refused {request:?}"),
+            Problem::VariantRefused => f.write_str("the sensor keeps its own angle and resolution"),
+            Problem::ModeUnknown => f.write_str("the sensor does not report its measuring mode: no scans"),
+            Problem::AnglesUnknown => {
                 f.write_str("the sensor is a version S14, whose angles are not known here: no scans")
             }
-            Trouble::NoRanges(Mode(mode)) => {
+            Problem::NoRanges(Mode(mode)) => {
                 write!(f, "the sensor measures in mode {mode:02x}h, which has no ranges: no scans")
             }
-            Trouble::NotStopped => f.write_str("paused, but the sensor does not stop: cable to the sensor?"),
-            Trouble::Silence => f.write_str("no measured data for one second"),
-            Trouble::NeedsRs422 { instead: Some(baud) } => write!(
+            Problem::NotStopped => f.write_str("paused, but the sensor does not stop: cable to the sensor?"),
+            Problem::Silence => f.write_str("no measured data for one second"),
+            Problem::NeedsRs422 { fallback: Some(baud) } => write!(
                 f,
                 "500000 baud needs RS-422: the scanner was lost in two switches to it, so the hub uses {} baud. If no \
                  scans arrive, cycle the scanner's power",
                 baud.rate()
             ),
-            Trouble::PortLacksRate { instead } => write!(
+            Problem::PortLacksRate { fallback: instead } => write!(
                 f,
                 "the port cannot have 500000 baud, so the hub uses {} baud, with a tenth of the scans. An adapter with \
                  an FTDI chip can have it",
                 instead.rate()
             ),
-            Trouble::NeedsRs422 { instead: None } => f.write_str(
+            Problem::NeedsRs422 { fallback: None } => f.write_str(
                 "500000 baud needs RS-422: the scanner was lost in two switches to it. On RS-232, set baud = 38400 and \
                  cycle the scanner's power",
             ),
@@ -109,7 +109,7 @@ pub struct Sensor {
     pub streams: bool,
     /// Status byte of its telegrams. A worse one counts at once, a better one after some hundred telegrams, because it
     /// may change with each scan.
-    pub condition: Option<Condition>,
+    pub status_byte: Option<StatusByte>,
     /// Whether it reports that it is defective.
     pub defective: Option<bool>,
     /// Whether its EEPROM contains a rate for power-on that is not the factory's 9,600 baud.
@@ -119,27 +119,27 @@ pub struct Sensor {
     /// Transmission of the dirtiest channel of the window, in percent of a clean one. The scanner warns below 75, and
     /// reports an error below 30.
     pub window_percent: Option<u16>,
-    software: [u8; SOFTWARE_LEN],
-    kind: [u8; KIND_LEN],
+    software: [u8; SOFTWARE_NAME_LEN],
+    kind: [u8; MAX_TYPE_LEN],
     kind_len: usize,
     /// Family that the type names.
-    family: Option<Family>,
+    family: Option<LmsModel>,
     /// Number of telegrams in a row whose condition was better.
-    calm: u16,
+    better_telegrams: u16,
     /// Whether the line damages telegrams, so that a single one does not prove a worse condition.
     is_line_damaged: bool,
     /// Number of reports of a worse condition on such a line, and telegrams since the first one.
-    sightings: u8,
-    sighted_since: u16,
+    worse_reports: u8,
+    worse_since: u16,
     /// Number of reports of a fatal condition.
-    fatal_sightings: u8,
+    fatal_reports: u8,
     /// Complaint of the last status report, and whether the one before had the same.
-    complaint: Option<Complaint>,
+    issues: Option<HealthIssues>,
     is_confirmed: bool,
 }
 
 /// Whether a status report says that the scanner is defective, and that its window is dirty.
-type Complaint = (bool, bool);
+type HealthIssues = (bool, bool);
 
 impl Sensor {
     /// Returns type, number and firmware as ASCII, such as `LMS200;S18063;V02.19`. Empty if not reported yet.
@@ -149,7 +149,7 @@ impl Sensor {
 
     /// Returns whether its scans have none of the angles of [`Variant`], although they look so.
     pub fn has_other_angles(&self) -> bool {
-        self.family == Some(Family::Fast)
+        self.family == Some(LmsModel::Fast)
     }
 
     /// Returns the measuring mode if values are ranges at known angles. `None`: there are no scans.
@@ -164,9 +164,9 @@ impl Sensor {
 
     /// Returns the notices for the owner, the worst first. Faults come before all others.
     pub fn notices(&self) -> impl Iterator<Item = Notice> {
-        let severity = self.condition.and_then(Condition::severity);
-        let dirty = self.condition.is_some_and(Condition::is_polluted);
-        let (defective, dim) = self.complaint.filter(|_| self.is_confirmed).unwrap_or_default();
+        let severity = self.status_byte.and_then(StatusByte::severity);
+        let dirty = self.status_byte.is_some_and(StatusByte::is_polluted);
+        let (defective, dim) = self.issues.filter(|_| self.is_confirmed).unwrap_or_default();
         [
             (defective, Notice::Defective),
             (severity == Some(Severity::Fatal), Notice::Fatal),
@@ -180,11 +180,11 @@ impl Sensor {
 
     /// Discards the identity and the layout of values: the next telegram may come from another scanner, or from the
     /// same one with another configuration. State that each scan repeats may stay.
-    pub(crate) fn forget(&mut self) {
+    pub(crate) fn reset_identity(&mut self) {
         self.mode = None;
         self.set_kind(&[]);
         self.defective = None;
-        self.complaint = None;
+        self.issues = None;
         self.is_confirmed = false;
     }
 
@@ -192,13 +192,13 @@ impl Sensor {
     pub(crate) fn set_line_damaged(&mut self, is_line_damaged: bool) {
         self.is_line_damaged = is_line_damaged;
         if !is_line_damaged {
-            (self.sightings, self.fatal_sightings) = (0, 0);
+            (self.worse_reports, self.fatal_reports) = (0, 0);
         }
     }
 
     /// Returns whether the health must be requested again, because a single report with a complaint may be damaged.
-    pub(crate) fn is_complaint_open(&self) -> bool {
-        self.complaint.is_some() && !self.is_confirmed
+    pub(crate) fn needs_confirmation(&self) -> bool {
+        self.issues.is_some() && !self.is_confirmed
     }
 
     /// Accepts the last report, because there will not be a second one.
@@ -216,30 +216,30 @@ impl Sensor {
     /// Restores an identity of a scanner that still streams as it did then.
     pub(crate) fn restore_identity(&mut self, known: Identity) {
         self.mode = Some(known.mode);
-        let kind_len = known.kind.iter().position(|&byte| byte == 0).unwrap_or(KIND_LEN);
+        let kind_len = known.kind.iter().position(|&byte| byte == 0).unwrap_or(MAX_TYPE_LEN);
         self.set_kind(&known.kind[..kind_len]);
     }
 
-    /// Stores the first [`KIND_LEN`] bytes of the type `kind`.
+    /// Stores the first [`MAX_TYPE_LEN`] bytes of the type `kind`.
     fn set_kind(&mut self, kind: &[u8]) {
-        self.kind_len = kind.len().min(KIND_LEN);
-        self.kind = [0; KIND_LEN];
+        self.kind_len = kind.len().min(MAX_TYPE_LEN);
+        self.kind = [0; MAX_TYPE_LEN];
         self.kind[..self.kind_len].copy_from_slice(&kind[..self.kind_len]);
-        self.family = Family::of_type(self.kind());
+        self.family = LmsModel::of_type(self.kind());
     }
 
     /// Stores what `telegram` reports, which decodes to `reply`.
-    pub(crate) fn learn(&mut self, reply: Option<&Reply<'_>>, telegram: Telegram<'_>) {
+    pub(crate) fn update(&mut self, reply: Option<&Reply<'_>>, telegram: Telegram<'_>) {
         self.address = Some(telegram.address());
-        self.note_condition(telegram.status().map(Condition));
+        self.note_status_byte(telegram.status().map(StatusByte));
         if telegram.command() == POWER_ON {
-            self.forget();
+            self.reset_identity();
             self.streams = false;
             self.variant = None;
         }
         let Some(reply) = reply else { return };
         match reply {
-            Reply::Status(report) => self.read(report),
+            Reply::Status(report) => self.read_status(report),
             Reply::Configuration(configuration) => {
                 self.mode = Some(configuration.mode());
                 self.unit = configuration.unit().or(self.unit);
@@ -256,7 +256,7 @@ impl Sensor {
         }
     }
 
-    fn read(&mut self, report: &StatusReport<'_>) {
+    fn read_status(&mut self, report: &StatusReport<'_>) {
         self.mode = Some(report.mode());
         self.unit = report.unit().or(self.unit);
         self.variant = report.variant().or(self.variant);
@@ -265,43 +265,43 @@ impl Sensor {
         self.permanent_baud = Some(report.has_permanent_baud());
         self.laser_power_percent = Some(report.laser_power_percent());
         self.window_percent = report.window_percent();
-        let is_dim = self.window_percent.is_some_and(|percent| percent < DIRTY);
-        let complaint = Some((report.is_defective(), is_dim)).filter(|&it| it != (false, false));
-        self.is_confirmed = complaint.is_some() && complaint == self.complaint;
-        self.complaint = complaint;
-        self.software = *report.bytes().first_chunk().unwrap_or(&[0; SOFTWARE_LEN]);
+        let is_dim = self.window_percent.is_some_and(|percent| percent < DIRTY_BELOW_PERCENT);
+        let issues = Some((report.is_defective(), is_dim)).filter(|&issues| issues != (false, false));
+        self.is_confirmed = issues.is_some() && issues == self.issues;
+        self.issues = issues;
+        self.software = *report.bytes().first_chunk().unwrap_or(&[0; SOFTWARE_NAME_LEN]);
     }
 
     /// Counts a worse condition on a line that damages telegrams. Returns whether there were enough of them. A scanner
     /// may report a fatal condition only now and then, so two scans are enough, however far apart.
-    fn is_confirmed_now(&mut self, is_fatal: bool) -> bool {
+    fn count_worse_report(&mut self, is_fatal: bool) -> bool {
         if is_fatal {
-            self.fatal_sightings += 1;
-            return self.fatal_sightings == FATAL_SIGHTINGS;
+            self.fatal_reports += 1;
+            return self.fatal_reports == FATAL_CONFIRMATIONS;
         }
-        if self.sightings == 0 || self.sighted_since > CALM {
-            (self.sightings, self.sighted_since) = (0, 0);
+        if self.worse_reports == 0 || self.worse_since > RECOVERY_TELEGRAMS {
+            (self.worse_reports, self.worse_since) = (0, 0);
         }
-        self.sightings += 1;
-        self.sightings == SIGHTINGS
+        self.worse_reports += 1;
+        self.worse_reports == CONFIRMATIONS
     }
 
-    fn note_condition(&mut self, condition: Option<Condition>) {
-        self.sighted_since = self.sighted_since.saturating_add(1);
-        let is_fatal = condition.and_then(Condition::severity) == Some(Severity::Fatal);
+    fn note_status_byte(&mut self, condition: Option<StatusByte>) {
+        self.worse_since = self.worse_since.saturating_add(1);
+        let is_fatal = condition.and_then(StatusByte::severity) == Some(Severity::Fatal);
         if self.is_line_damaged
-            && badness(condition) > badness(self.condition)
-            && !self.is_confirmed_now(is_fatal)
+            && severity_rank(condition) > severity_rank(self.status_byte)
+            && !self.count_worse_report(is_fatal)
         {
             return;
         }
-        self.fatal_sightings = if is_fatal { 0 } else { self.fatal_sightings };
-        self.sightings = if badness(condition) > 0 { 0 } else { self.sightings };
-        let is_better = badness(condition) < badness(self.condition);
-        self.calm = if is_better { self.calm + 1 } else { 0 };
-        if !is_better || self.calm > CALM {
-            self.condition = condition;
-            self.calm = 0;
+        self.fatal_reports = if is_fatal { 0 } else { self.fatal_reports };
+        self.worse_reports = if severity_rank(condition) > 0 { 0 } else { self.worse_reports };
+        let is_better = severity_rank(condition) < severity_rank(self.status_byte);
+        self.better_telegrams = if is_better { self.better_telegrams + 1 } else { 0 };
+        if !is_better || self.better_telegrams > RECOVERY_TELEGRAMS {
+            self.status_byte = condition;
+            self.better_telegrams = 0;
         }
     }
 }
@@ -314,7 +314,7 @@ pub(crate) struct Identity {
     pub(crate) header: StreamHeader,
     mode: Mode,
     /// Type, padded with 0.
-    kind: [u8; KIND_LEN],
+    kind: [u8; MAX_TYPE_LEN],
 }
 
 impl Identity {
@@ -330,7 +330,7 @@ impl Identity {
 
     /// Decodes the result of [`to_bytes`](Self::to_bytes).
     pub(crate) fn from_bytes(bytes: line::Identity) -> Identity {
-        let mut identity = Identity { header: Default::default(), mode: Mode(0), kind: [0; KIND_LEN] };
+        let mut identity = Identity { header: Default::default(), mode: Mode(0), kind: [0; MAX_TYPE_LEN] };
         let (header, rest) = bytes.split_at(identity.header.len());
         identity.header.copy_from_slice(header);
         identity.mode = Mode(rest[0]);
@@ -339,7 +339,7 @@ impl Identity {
     }
 }
 
-const _: () = assert!(size_of::<StreamHeader>() + 1 + KIND_LEN == size_of::<line::Identity>());
+const _: () = assert!(size_of::<StreamHeader>() + 1 + MAX_TYPE_LEN == size_of::<line::Identity>());
 
 /// A fact that the owner of the scanner should know although scans arrive.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -379,22 +379,22 @@ impl Notice {
 }
 
 /// Returns how bad a condition is, as far as notices report it.
-fn badness(condition: Option<Condition>) -> u8 {
-    let severity = condition.and_then(Condition::severity).unwrap_or(Severity::Ok);
-    let polluted = condition.is_some_and(Condition::is_polluted);
+fn severity_rank(condition: Option<StatusByte>) -> u8 {
+    let severity = condition.and_then(StatusByte::severity).unwrap_or(Severity::Ok);
+    let polluted = condition.is_some_and(StatusByte::is_polluted);
     if severity >= Severity::Error { 2 * severity.code() + u8::from(polluted) } else { u8::from(polluted) }
 }
 
 /// Number of better telegrams in a row before a bad one is discarded: some seconds of scans.
-const CALM: u16 = 200;
-/// Number of telegrams, among [`CALM`], that must report a worse condition on a line that damages some of them.
-const SIGHTINGS: u8 = 3;
+const RECOVERY_TELEGRAMS: u16 = 200;
+/// Number of telegrams, among [`RECOVERY_TELEGRAMS`], that must report a worse condition on a line that damages some of them.
+const CONFIRMATIONS: u8 = 3;
 /// Number of telegrams, among any number, that must report a fatal condition on such a line.
-const FATAL_SIGHTINGS: u8 = 2;
+const FATAL_CONFIRMATIONS: u8 = 2;
 /// Length of the firmware's name, in bytes.
-const SOFTWARE_LEN: usize = 7;
+const SOFTWARE_NAME_LEN: usize = 7;
 /// Maximum length of a type. Replies have 20 or 21 characters.
-const KIND_LEN: usize = 24;
+const MAX_TYPE_LEN: usize = 24;
 /// Operating mode: values on request.
 const ON_REQUEST: u8 = 0x25;
 
@@ -402,17 +402,17 @@ const ON_REQUEST: u8 = 0x25;
 mod tests {
     use super::*;
     use crate::lms::command::STATUS;
-    use crate::lms::status::Health;
+    use crate::lms::status::SimulatedStatus;
     use crate::lms::telegram::{REPLY, Writer};
 
     #[test]
     fn repeated_conditions_count_on_a_damaged_line() {
         // Severity in the lowest bits: 0 ok, 4 fatal; the highest one is a dirty window.
-        let (ok, fatal, dirty) = (Condition(0x10), Condition(0x14), Condition(0x90));
-        let report = |sensor: &mut Sensor, condition: Condition, calm: u32| {
-            sensor.note_condition(Some(condition));
+        let (ok, fatal, dirty) = (StatusByte(0x10), StatusByte(0x14), StatusByte(0x90));
+        let report = |sensor: &mut Sensor, condition: StatusByte, calm: u32| {
+            sensor.note_status_byte(Some(condition));
             let notice = sensor.notices().next();
-            (0..calm).for_each(|_| sensor.note_condition(Some(ok)));
+            (0..calm).for_each(|_| sensor.note_status_byte(Some(ok)));
             notice
         };
         let mut sensor = Sensor::default();
@@ -426,7 +426,7 @@ mod tests {
         for _ in 0..2 {
             assert_eq!(report(&mut sensor, fatal, 10), None);
             sensor.set_line_damaged(false);
-            sensor.note_condition(Some(ok));
+            sensor.note_status_byte(Some(ok));
             sensor.set_line_damaged(true);
         }
         assert_eq!([(); 3].map(|()| report(&mut sensor, dirty, 10)), [None, None, Some(Notice::Dirty)]);
@@ -434,7 +434,7 @@ mod tests {
 
     #[test]
     fn complaint_counts_once_confirmed() {
-        let healthy = Health {
+        let healthy = SimulatedStatus {
             software: *b"V02.30 ",
             operating_mode: ON_REQUEST,
             mode: Mode(1),
@@ -450,8 +450,8 @@ mod tests {
             let telegram = Writer::new(REPLY, STATUS | REPLY).slice(report).byte(0x10).finish();
             let reply = Reply::decode(telegram.telegram());
             assert!(matches!(reply, Some(Reply::Status(_))));
-            sensor.learn(reply.as_ref(), telegram.telegram());
-            (sensor.notices().next(), sensor.is_complaint_open())
+            sensor.update(reply.as_ref(), telegram.telegram());
+            (sensor.notices().next(), sensor.needs_confirmation())
         };
         assert_eq!(reports(&healthy), (None, false));
         assert_eq!(reports(&defective), (None, true));

@@ -3,19 +3,20 @@
 use scanhub_schema::{Counter, Counters, Nanos, Status};
 
 use crate::line::{
-    self, Account, Control, Event, KnownRate, Output, RawScan, Received, State, Whole, suspect,
+    self, Action, Control, Event, KnownRate, RawScan, ReceivedTelegram, SessionStats, State,
+    TelegramContents, suspect,
 };
-use crate::lms::arrival::{Arrivals, Rhythm, Stamp};
-use crate::lms::cadence::{Cadence, Damage};
-use crate::lms::dialogue::Dialogue;
-use crate::lms::exchange::{Outgoing, SOON};
-use crate::lms::framer::{Advance, Framer, Tally, TelegramSpan};
+use crate::lms::arrival_time::{ArrivalEstimator, TelegramTiming, Timestamp};
+use crate::lms::framer::{FoundItem, Framer, FramerCounters, TelegramSpan};
 use crate::lms::header::Reject;
-use crate::lms::measured::{FirstValues, MEASURED, nominal_period};
+use crate::lms::measured::{MEASURED, PartialValues, nominal_period};
+use crate::lms::protocol_state::ProtocolState;
 use crate::lms::reply::Reply;
-use crate::lms::sensor::{Sensor, Trouble};
+use crate::lms::request_channel::{PendingRequest, SEND_AHEAD};
+use crate::lms::scan_schedule::{LineDamage, ScanSchedule};
+use crate::lms::sensor::{Problem, Sensor};
 use crate::lms::telegram::Telegram;
-use crate::lms::variant::{BYTES_PER_TURN, Baud, Mode, Unit, Variant};
+use crate::lms::variant::{BYTES_PER_REVOLUTION, Baud, Mode, Unit, Variant};
 use crate::settings;
 
 /// Settings of a session.
@@ -39,90 +40,90 @@ pub struct Settings {
 /// The session with one scanner. If the scanner is replaced within a second by one that streams already, with the same
 /// number of values and the same address, the session does not notice.
 #[derive(Clone, Debug)]
-pub struct Session {
+pub struct LmsSession {
     settings: Settings,
     framer: Framer,
-    dialogue: Dialogue,
-    arrivals: Arrivals,
-    rhythm: Rhythm,
-    cadence: Cadence,
-    damage: Damage,
+    protocol: ProtocolState,
+    arrivals: ArrivalEstimator,
+    timing: TelegramTiming,
+    schedule: ScanSchedule,
+    damage: LineDamage,
     /// Number of the first byte of the last scan.
     last_scan: u64,
     now: Nanos,
     last_byte: Nanos,
     /// Stamp of the last byte of the last telegram.
     last_stamp: Nanos,
-    cut: bool,
+    first_frame_truncated: bool,
     /// Size of the buffer of the next read.
-    room: usize,
+    buffer_len: usize,
     /// Whether the last read filled its buffer, so that more bytes may be waiting.
     has_more: bool,
     /// Time until which waiting bytes are not read.
-    left_until: Option<Nanos>,
+    deferred_until: Option<Nanos>,
     /// Mode that the last telegrams of a recording reported.
     recorded_mode: Option<Mode>,
 }
 
-impl Session {
+impl LmsSession {
     /// Creates a session on a port that is open at the rate of `settings`.
     pub fn new(settings: Settings, now: Nanos) -> Self {
-        Session {
+        LmsSession {
             settings,
             framer: Framer::default(),
-            dialogue: Dialogue::new(settings, now),
-            arrivals: Arrivals::new(now),
-            rhythm: Rhythm::new(),
-            cadence: Cadence::new(),
-            damage: Damage::default(),
+            protocol: ProtocolState::new(settings, now),
+            arrivals: ArrivalEstimator::new(now),
+            timing: TelegramTiming::new(),
+            schedule: ScanSchedule::new(),
+            damage: LineDamage::default(),
             last_scan: 0,
             now,
             last_byte: now,
             last_stamp: 0,
-            cut: false,
-            room: 0,
+            first_frame_truncated: false,
+            buffer_len: 0,
             has_more: false,
-            left_until: None,
+            deferred_until: None,
             recorded_mode: settings.mode,
         }
     }
 
     /// Restores the [number of silent switches](Self::silent_switches) that the previous session counted. After two of
     /// them, the session streams at 38,400 baud, unless its settings keep it at 500,000. Call it before the first read.
-    pub fn recall_silent_switches(&mut self, count: u8) {
-        self.dialogue.restore_silent_switches(count, self.now);
+    pub fn restore_silent_switches(&mut self, count: u8) {
+        self.protocol.restore_silent_switches(count, self.now);
     }
 
     /// Returns the number of switches to 500,000 baud in a row that the scanner acknowledged and that were followed by
     /// silence, at most 2. It outlives restarts of the scanner.
     pub fn silent_switches(&self) -> u8 {
-        self.dialogue.rate.silent_switches()
+        self.protocol.rate.silent_switches()
     }
 
     /// Returns the rate of the line.
     pub fn baud(&self) -> Baud {
-        self.dialogue.rate.baud
+        self.protocol.rate.baud
     }
 
     /// Returns what the scanner has reported.
     pub fn sensor(&self) -> &Sensor {
-        &self.dialogue.sensor
+        &self.protocol.sensor
     }
 
     /// Returns why the session does not stream.
-    pub fn trouble(&self) -> Option<Trouble> {
-        self.dialogue.trouble()
+    pub fn problem(&self) -> Option<Problem> {
+        self.protocol.problem()
     }
 
     /// Returns the counters of the framer.
-    pub fn tally(&self) -> &Tally {
-        self.framer.tally()
+    pub fn framer_counters(&self) -> &FramerCounters {
+        self.framer.counters()
     }
 
     /// Stamps a telegram, and passes it to the dialogue.
-    fn receive(&mut self, span: TelegramSpan) -> Received<'_> {
+    fn receive(&mut self, span: TelegramSpan) -> ReceivedTelegram<'_> {
         let baud = self.baud().rate();
-        let framed = self.framer.view(span);
+        let framed = self.framer.telegram_at(span);
         let telegram = framed.telegram;
         let reply = Reply::decode(telegram);
         let (len, is_scan) = (telegram.bytes().len() as u64, telegram.command() == MEASURED);
@@ -131,51 +132,52 @@ impl Session {
         let last = self.arrivals.stamp(span.offset + len - 1, baud);
         // A line may have held back only the end of a telegram.
         let estimated = first.estimated || last.estimated;
-        let due = period.and(self.due(&first, span.offset, len));
+        let due = period.and(self.due_time(&first, span.offset, len));
         // A later read may show that bytes were older than their stamps. Those before them were older still, but their
         // stamps are published.
         first.at = due.unwrap_or(first.at).max(self.last_stamp);
-        let last = match due.and(self.rhythm.duration) {
-            Some(usual) => (first.at + usual).min(last.latest.unwrap_or(last.at)),
+        let last = match due.and(self.timing.duration) {
+            Some(duration) => (first.at + duration).min(last.latest.unwrap_or(last.at)),
             None => last.at,
         };
         let last = last.max(first.at);
         self.last_stamp = last;
         match period {
-            Some(period) => self.cadence.note(first.at, first.estimated, period),
-            None => self.cadence.rest(),
+            Some(period) => self.schedule.note_scan(first.at, first.estimated, period),
+            None => self.schedule.end_stream(),
         }
         if self.is_live() {
-            self.damage.note(self.framer.tally(), self.now);
+            self.damage.note_bytes(self.framer.counters(), self.now);
         } else {
-            self.damage.end();
+            self.damage.end_stream();
         }
         self.last_scan = if is_scan { span.offset } else { self.last_scan };
-        self.cut |= is_scan && self.tally().telegrams == 1 && self.tally().discarded > 0;
+        self.first_frame_truncated |=
+            is_scan && self.framer_counters().telegrams == 1 && self.framer_counters().discarded > 0;
         // Replies follow requests, and a recording has the pace of its reader.
-        let has_rhythm = is_scan && self.is_live() && !first.estimated;
-        let took = last.saturating_sub(first.at);
-        let slow = has_rhythm && self.rhythm.is_slow(took);
-        if has_rhythm {
-            self.rhythm.complete(took);
+        let is_measurable = is_scan && self.is_live() && !first.estimated;
+        let elapsed = last.saturating_sub(first.at);
+        let is_slow = is_measurable && self.timing.is_slow(elapsed);
+        if is_measurable {
+            self.timing.end_telegram(elapsed);
         } else {
-            self.rhythm.lose();
+            self.timing.reset();
         }
         if self.framer.buffered() > 0 {
-            let begun = self.next_began();
-            self.rhythm.begin(begun);
+            let start = self.next_start();
+            self.timing.begin_telegram(start);
         }
         let (is_at_rate, is_line_damaged) = (self.is_at_rate(), self.damage.is_recent(self.now));
-        self.dialogue.on_telegram(telegram, reply, is_line_damaged, first.at, self.now);
+        self.protocol.on_telegram(telegram, reply, is_line_damaged, first.at, self.now);
         let mode = self.sensor().mode_of_scans().filter(|_| is_at_rate).or(self.settings.mode);
-        let received = received(telegram, reply.as_ref(), mode, self.dialogue.rate.target, span.offset);
-        let reasons = received.reasons | framed.reasons | if slow { suspect::SLOW } else { 0 };
-        Received { first: first.at, last, estimated, reasons, ..received }
+        let received = to_received(telegram, reply.as_ref(), mode, self.protocol.rate.target, span.offset);
+        let reasons = received.reasons | framed.reasons | if is_slow { suspect::SLOW } else { 0 };
+        ReceivedTelegram { first: first.at, last, estimated, reasons, ..received }
     }
 
     /// Returns when the first byte arrived that is in no telegram yet.
-    fn next_began(&self) -> Nanos {
-        let open = self.tally().read - self.framer.buffered() as u64;
+    fn next_start(&self) -> Nanos {
+        let open = self.framer_counters().read - self.framer.buffered() as u64;
         self.arrivals.stamp(open, self.baud().rate()).at
     }
 
@@ -189,57 +191,57 @@ impl Session {
 
     /// Returns when the scan of `len` bytes at `offset` began, if it is part of a backlog of a host that did not run.
     /// The time follows from its position in the backlog, limited by the time of the read.
-    fn due(&self, first: &Stamp, offset: u64, len: u64) -> Option<Nanos> {
+    fn due_time(&self, first: &Timestamp, offset: u64, len: u64) -> Option<Nanos> {
         let latest = first.latest?;
         let slots = (offset - self.last_scan + len / 2) / len;
-        self.cadence.after(slots).map(|due| due.clamp(first.at, latest))
+        self.schedule.due_after(slots).map(|due| due.clamp(first.at, latest))
     }
 
     /// Returns whether a scanner streams, and not a recording.
     fn is_live(&self) -> bool {
-        self.dialogue.state() == State::Streaming && !self.settings.listen_only
+        self.protocol.state() == State::Streaming && !self.settings.listen_only
     }
 
     /// Returns whether the line has the rate of the settings, so that periods and durations are those of that rate.
     fn is_at_rate(&self) -> bool {
-        let rate = &self.dialogue.rate;
-        !rate.is_changed && rate.baud == rate.target
+        let rate = &self.protocol.rate;
+        !rate.needs_change && rate.baud == rate.target
     }
 
     /// Returns whether bytes arrive at the pace of a line, unlike those of a recording or a network.
-    fn has_pace(&self) -> bool {
+    fn has_line_rate(&self) -> bool {
         !(self.settings.listen_only || self.settings.fixed_rate)
     }
 }
 
-impl line::Protocol for Session {
+impl line::Protocol for LmsSession {
     fn reject_rate(&mut self, now: Nanos) {
         self.now = now;
-        self.dialogue.reject_rate();
+        self.protocol.reject_rate();
     }
 
-    fn spare(&mut self) -> &mut [u8] {
-        let spare = self.framer.spare();
-        self.room = spare.len();
+    fn read_buffer(&mut self) -> &mut [u8] {
+        let spare = self.framer.read_buffer();
+        self.buffer_len = spare.len();
         spare
     }
 
     fn commit(&mut self, now: Nanos, len: usize) {
         self.now = now;
-        self.has_more = len > 0 && len == self.room;
-        self.left_until = None;
-        self.arrivals.note(now, len, self.has_pace().then_some(self.baud().rate()));
+        self.has_more = len > 0 && len == self.buffer_len;
+        self.deferred_until = None;
+        self.arrivals.note_read(now, len, self.has_line_rate().then_some(self.baud().rate()));
         if len == 0 {
             return;
         }
         let was_empty = self.framer.buffered() == 0;
         self.framer.commit(len);
-        self.rhythm.note_read();
+        self.timing.count_read();
         self.last_byte = now;
-        self.dialogue.on_bytes();
+        self.protocol.on_bytes();
         if was_empty {
-            let begun = self.next_began();
-            self.rhythm.begin(begun);
+            let start = self.next_start();
+            self.timing.begin_telegram(start);
         }
     }
 
@@ -248,95 +250,100 @@ impl line::Protocol for Session {
         self.framer.release(now.saturating_sub(self.last_byte));
         if self.is_live() {
             // The stream may be over now.
-            self.damage.note(self.framer.tally(), now);
+            self.damage.note_bytes(self.framer.counters(), now);
         }
-        self.dialogue.handle_timeout(now);
+        self.protocol.handle_timeout(now);
     }
 
-    fn transmitted(&mut self, now: Nanos) {
+    fn handle_transmitted(&mut self, now: Nanos) {
         self.now = now;
-        self.dialogue.transmitted(now);
+        self.protocol.on_transmitted(now);
     }
 
-    fn poll_output(&mut self) -> Output<'_> {
+    fn poll_action(&mut self) -> Action<'_> {
         while let Some(found) = self.framer.advance() {
             match found {
-                Advance::Telegram(span) => return Output::Event(Event::Telegram(self.receive(span))),
-                Advance::Ack => self.dialogue.on_acknowledge(self.now),
-                Advance::Nak => self.dialogue.on_nak(self.now),
+                FoundItem::Telegram(span) => return Action::Event(Event::Telegram(self.receive(span))),
+                FoundItem::Ack => self.protocol.on_acknowledge(self.now),
+                FoundItem::Nak => self.protocol.on_nak(self.now),
             }
         }
-        if let Some(baud) = self.dialogue.take_rate_change() {
+        if let Some(baud) = self.protocol.take_rate_change() {
             self.framer.clear();
-            self.rhythm.lose();
-            return Output::SetRate(baud.rate());
+            self.timing.reset();
+            return Action::SetRate(baud.rate());
         }
-        self.framer.expect(self.dialogue.expect());
-        self.framer.await_acknowledge(self.dialogue.open().is_some());
-        let next_at = self.dialogue.open().and_then(Outgoing::next_at);
-        if let Some(not_before) = next_at.filter(|&at| at <= self.now + SOON) {
+        self.framer.expect(self.protocol.expected_headers());
+        self.framer.expect_acknowledge(self.protocol.open_request().is_some());
+        let next_at = self.protocol.open_request().and_then(PendingRequest::next_at);
+        if let Some(not_before) = next_at.filter(|&at| at <= self.now + SEND_AHEAD) {
             // The sensor skips scans while it answers.
-            self.cadence.rest();
-            let bytes = self.dialogue.open().map_or(&[][..], Outgoing::next_byte);
-            return Output::Transmit { bytes, not_before };
+            self.schedule.end_stream();
+            let bytes = self.protocol.open_request().map_or(&[][..], PendingRequest::next_byte);
+            return Action::Transmit { bytes, not_before };
         }
-        if let Some(until) = self.left_until {
-            return Output::Rest(until);
+        if let Some(until) = self.deferred_until {
+            return Action::SleepUntil(until);
         }
         if self.framer.buffered() == 0 {
-            self.rhythm.lose();
+            self.timing.reset();
         } else if self.is_live()
-            && self.dialogue.open().is_none()
+            && self.protocol.open_request().is_none()
             && !self.has_more
-            && let Some(until) = self.rhythm.rest(self.now)
+            && let Some(until) = self.timing.sleep_until(self.now)
         {
-            return Output::Rest(until);
+            return Action::SleepUntil(until);
         }
         // A telegram may be held back until the line was idle for a while.
         let held_until = self.framer.hold().map_or(Nanos::MAX, |hold| self.last_byte + hold);
-        Output::Wait { until: self.dialogue.deadline().min(held_until) }
+        Action::Wait { until: self.protocol.deadline().min(held_until) }
     }
 }
 
-impl line::Session for Session {
-    type Trouble = Trouble;
+impl line::ScannerSession for LmsSession {
+    type Problem = Problem;
 
     fn can_defer_read(&self) -> bool {
-        let begins = self.framer.buffered() == 0 && !self.has_more && self.left_until.is_none();
+        let is_between_telegrams =
+            self.framer.buffered() == 0 && !self.has_more && self.deferred_until.is_none();
         // A reply takes less time than a scan.
-        let is_silent = self.dialogue.open().is_none();
-        begins && is_silent && self.rhythm.duration.is_some() && self.has_pace() && self.is_live()
+        let has_no_request = self.protocol.open_request().is_none();
+        is_between_telegrams
+            && has_no_request
+            && self.timing.duration.is_some()
+            && self.has_line_rate()
+            && self.is_live()
     }
 
     fn defer_read(&mut self, now: Nanos, waiting: usize) -> bool {
         self.now = now;
         // If the bytes of more than a revolution wait, the host did not run. Then the read has to find out since when
         // they wait.
-        if (1..=BYTES_PER_TURN).contains(&waiting) && self.can_defer_read() {
-            self.arrivals.sense(now, waiting);
-            let begun = self.next_began();
-            self.rhythm.begin(begun);
-            self.left_until = self.rhythm.rest(now);
+        if (1..=BYTES_PER_REVOLUTION).contains(&waiting) && self.can_defer_read() {
+            self.arrivals.note_unread(now, waiting);
+            let start = self.next_start();
+            self.timing.begin_telegram(start);
+            self.deferred_until = self.timing.sleep_until(now);
         }
-        self.left_until.is_some()
+        self.deferred_until.is_some()
     }
 
     fn control(&mut self, control: Control, now: Nanos) {
         self.now = now;
-        self.left_until = None;
-        self.dialogue.control(control, now);
+        self.deferred_until = None;
+        self.protocol.control(control, now);
     }
 
     fn state(&self) -> State {
-        self.dialogue.state()
+        self.protocol.state()
     }
 
-    fn trouble(&self) -> Option<Trouble> {
-        self.trouble()
+    fn problem(&self) -> Option<Problem> {
+        self.problem()
     }
 
-    fn missing(&self) -> Option<&'static str> {
-        matches!(self.trouble(), Some(Trouble::NoAnswer { .. })).then_some("LMS replies")
+    fn missing_transmission(&self) -> Option<&'static str> {
+        matches!(self.problem(), Some(Problem::NoReply { .. })).then_some("LMS replies")
     }
 
     fn rate(&self) -> u32 {
@@ -348,72 +355,72 @@ impl line::Session for Session {
     /// without a known period, of partial scans, and of a recording. A loss is counted a second later. A scan that the
     /// scanner aborts to reply is not damage. The session resynchronizes when no measured data arrive for a second,
     /// when the scanner reports power-on, and when a user requests it.
-    fn account(&self) -> Account {
-        let tally = self.framer.tally();
-        Account {
+    fn stats(&self) -> SessionStats {
+        let tally = self.framer.counters();
+        SessionStats {
             read: tally.read,
             in_telegrams: tally.in_telegrams,
             acknowledge: tally.acknowledge,
             discarded: tally.discarded,
             buffered: self.framer.buffered() as u64,
             telegrams: tally.telegrams,
-            due: self.cadence.due,
-            lost: self.cadence.lost,
+            due: self.schedule.due,
+            lost: self.schedule.lost,
             damaged: self.damage.damaged(tally),
             rejected_checksum: tally.rejected[Reject::Crc as usize],
-            resyncs: self.dialogue.resyncs,
-            restarts: self.dialogue.restarts(),
-            began_with_a_cut: self.cut,
+            resyncs: self.protocol.resyncs,
+            restarts: self.protocol.restarts(),
+            first_frame_truncated: self.first_frame_truncated,
         }
     }
 
     fn restore_identity(&mut self, identity: line::Identity) {
-        self.dialogue.restore_identity(identity);
+        self.protocol.restore_identity(identity);
     }
 
     fn identity(&self) -> Option<line::Identity> {
-        self.dialogue.identity()
+        self.protocol.identity()
     }
 
     /// The search tries it in place of 9,600 baud if no stream arrives.
     fn hint_rate(&mut self, known: KnownRate) {
         if let Some(baud) = Baud::of_rate(known.baud) {
-            self.dialogue.restore_rate(baud);
-            self.recall_silent_switches(known.silent_switches);
+            self.protocol.restore_rate(baud);
+            self.restore_silent_switches(known.silent_switches);
         }
     }
 
     fn begin_at(&mut self, rate: u32, now: Nanos) {
         if let Some(baud) = Baud::of_rate(rate) {
-            self.dialogue.begin_at(baud, now);
+            self.protocol.begin_at(baud, now);
         }
     }
 
     /// For a line that cannot carry 500,000 baud, it is the rate in use.
     fn known_rate(&self) -> Option<KnownRate> {
-        self.dialogue.rate.known()
+        self.protocol.rate.known()
     }
 
     fn set_partial_reads(&mut self, count: u8) {
-        self.rhythm.look_in(count);
+        self.timing.set_partial_reads(count);
     }
 
     fn partial_scan(&self) -> Option<RawScan<'_>> {
         if !self.is_live() || !self.is_at_rate() {
             return None;
         }
-        let begun = self.framer.begun()?;
-        let values = FirstValues::of(begun.bytes)?;
+        let partial = self.framer.partial_telegram()?;
+        let values = PartialValues::of(partial.bytes)?;
         let scan = values.scan(self.sensor().mode_of_scans()?);
-        let (baud, bytes) = (self.baud().rate(), begun.bytes.len());
-        let first = self.arrivals.stamp(begun.offset, baud);
-        let last = self.arrivals.stamp(begun.offset + bytes as u64 - 1, baud);
+        let (baud, bytes) = (self.baud().rate(), partial.bytes.len());
+        let first = self.arrivals.stamp(partial.offset, baud);
+        let last = self.arrivals.stamp(partial.offset + bytes as u64 - 1, baud);
         Some(RawScan {
-            number: begun.offset,
+            number: partial.offset,
             first: first.at.max(self.last_stamp),
             last: last.at.max(first.at).max(self.last_stamp),
-            period: nominal_period(scan.beams(), self.dialogue.rate.target.rate()),
-            reasons: begun.reasons,
+            period: nominal_period(scan.beams(), self.protocol.rate.target.rate()),
+            reasons: partial.reasons,
             bytes,
             ..scan
         })
@@ -433,7 +440,7 @@ impl line::Session for Session {
         telegram: &'a [u8],
         is_readable: bool,
         status: Option<&mut Status>,
-    ) -> Option<Received<'a>> {
+    ) -> Option<ReceivedTelegram<'a>> {
         let telegram = Telegram::check(telegram)?;
         let reply = Reply::decode(telegram);
         let reported = reply.as_ref().and_then(Reply::mode);
@@ -453,7 +460,7 @@ impl line::Session for Session {
                 _ => {}
             }
         }
-        Some(received(telegram, reply.as_ref(), mode, self.dialogue.rate.target, 0))
+        Some(to_received(telegram, reply.as_ref(), mode, self.protocol.rate.target, 0))
     }
 
     fn describe(&self, status: &mut Status) {
@@ -468,8 +475,8 @@ impl line::Session for Session {
     }
 
     fn add_counters(&self, counters: &mut Counters) {
-        self.account().add_to(counters);
-        let tally = self.framer.tally();
+        self.stats().add_to(counters);
+        let tally = self.framer.counters();
         counters[Counter::Aborted] += tally.aborted;
         for (reject, counter) in REJECTS {
             counters[counter] += tally.rejected[reject as usize];
@@ -478,13 +485,13 @@ impl line::Session for Session {
 }
 
 /// Returns `telegram`, which decodes to `reply`, with stamps of 0. Its scan, if it has one, is split as `mode` says.
-fn received<'a>(
+fn to_received<'a>(
     telegram: Telegram<'a>,
     reply: Option<&Reply<'a>>,
     mode: Option<Mode>,
     baud: Baud,
     number: u64,
-) -> Received<'a> {
+) -> ReceivedTelegram<'a> {
     let measured = match reply {
         Some(Reply::Measured(measured)) => Some(*measured),
         _ => None,
@@ -495,7 +502,7 @@ fn received<'a>(
     let split = measured.zip(mode.filter(|mode| mode.has_ranges()));
     let is_forbidden = split.is_some_and(|(measured, mode)| measured.is_forbidden(mode));
     let scan = split.map(|(measured, mode)| RawScan { number, period, ..measured.scan(mode) });
-    Received {
+    ReceivedTelegram {
         bytes: telegram.bytes(),
         first: 0,
         last: 0,
@@ -504,7 +511,7 @@ fn received<'a>(
         count: 1,
         is_checked: true,
         is_reply: telegram.command() != MEASURED,
-        whole: Some(Whole { number, beams, period, scan }),
+        contents: Some(TelegramContents { number, beams, period, scan }),
     }
 }
 

@@ -4,8 +4,8 @@
 use scanhub_schema::{MILLIS, Nanos};
 
 use crate::lms::command::Request;
-use crate::lms::exchange::{MORE_TRIES, TRIES};
 use crate::lms::reply::Reply;
+use crate::lms::request_channel::{ESSENTIAL_TRIES, TRIES};
 use crate::lms::sensor::Sensor;
 use crate::lms::variant::{Baud, Variant};
 
@@ -32,7 +32,7 @@ pub(crate) struct Start {
     /// Number of stops that may still be sent.
     stops_left: u8,
     /// Steps once the scanner is at rest, at the rate to stream at.
-    settings: &'static [Step],
+    setting_steps: &'static [Step],
     /// Whether the scanner has reported its status, which contains what it does and how its values are split.
     has_status: bool,
     /// Whether the scanner has replied to a request for its type.
@@ -43,8 +43,8 @@ impl Start {
     /// A start that begins with a check.
     pub(crate) const CHECK: Start = Start {
         step: Step::Check,
-        stops_left: STOPS + 1,
-        settings: &[Step::Variant, Step::Type, Step::Configuration, Step::Stream],
+        stops_left: MAX_STOPS + 1,
+        setting_steps: &[Step::Variant, Step::Type, Step::Configuration, Step::Stream],
         has_status: false,
         has_type: false,
     };
@@ -52,18 +52,18 @@ impl Start {
     /// Returns the request of the step, and its number of tries.
     pub(crate) fn request(&self, baud: Baud, variant: Variant) -> (Request, u8) {
         match self.step {
-            Step::Stop => (Request::Stop, MORE_TRIES),
-            Step::Check => (Request::Status, MORE_TRIES),
-            Step::Baud => (Request::Baud(baud), MORE_TRIES),
+            Step::Stop => (Request::Stop, ESSENTIAL_TRIES),
+            Step::Check => (Request::Status, ESSENTIAL_TRIES),
+            Step::Baud => (Request::Baud(baud), ESSENTIAL_TRIES),
             Step::Variant => (Request::Variant(variant), TRIES),
             Step::Type => (Request::Type, TRIES),
             Step::Configuration => (Request::Configuration, TRIES),
-            Step::Stream => (Request::Stream, MORE_TRIES),
+            Step::Stream => (Request::Stream, ESSENTIAL_TRIES),
         }
     }
 
     /// Returns the start after the `reply` to `request`. A scanner that refuses to report its type is not asked again.
-    pub(crate) fn after(self, request: Request, reply: Option<&Reply<'_>>) -> Start {
+    pub(crate) fn after_reply(self, request: Request, reply: Option<&Reply<'_>>) -> Start {
         Start {
             has_status: self.has_status || matches!(reply, Some(Reply::Status(_))),
             has_type: self.has_type || request == Request::Type,
@@ -72,14 +72,14 @@ impl Start {
     }
 
     /// Returns the start with a check as its step.
-    pub(crate) fn check(self) -> Start {
+    pub(crate) fn with_check(self) -> Start {
         Start { step: Step::Check, ..self }
     }
 
     /// Returns whether a scanner that refused to change its rate may be in a mode that does not allow it, because its
     /// status is not known and it was not stopped.
     pub(crate) fn may_be_in_other_mode(&self) -> bool {
-        !self.has_status && self.stops_left > STOPS
+        !self.has_status && self.stops_left > MAX_STOPS
     }
 
     /// Returns the next step, now that it is known what the scanner does.
@@ -87,16 +87,16 @@ impl Start {
         match self.stops_left.checked_sub(1) {
             Some(stops_left) if sensor.streams => Start { step: Step::Stop, stops_left, ..self },
             _ if !is_at_rate => Start { step: Step::Baud, ..self },
-            _ => self.settle(sensor, variant),
+            _ => self.next_setting(sensor, variant),
         }
     }
 
     /// Returns the step for the next setting that is not known to be right.
-    pub(crate) fn settle(mut self, sensor: &Sensor, variant: Variant) -> Start {
+    pub(crate) fn next_setting(mut self, sensor: &Sensor, variant: Variant) -> Start {
         // Without any left, the stream was requested, and it is not known what came of it.
         self.step = Step::Stream;
-        while let Some((&step, rest)) = self.settings.split_first() {
-            self.settings = rest;
+        while let Some((&step, rest)) = self.setting_steps.split_first() {
+            self.setting_steps = rest;
             let is_known = match step {
                 Step::Variant => sensor.variant == Some(variant),
                 Step::Type => self.has_type,
@@ -117,18 +117,18 @@ impl Start {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Questions {
     /// The rest of this round.
-    left: &'static [Request],
+    remaining: &'static [Request],
     /// Number of complete rounds.
     rounds: u8,
     /// Earliest time of the next question.
-    ask_at: Nanos,
+    next_at: Nanos,
 }
 
 /// Action that follows from the questions.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum NextQuestion {
     /// Send this request.
-    Ask(Request),
+    Send(Request),
     /// Nothing now: the next round follows.
     Later,
     /// All is known, or as much as the scanner reports.
@@ -138,45 +138,45 @@ pub(crate) enum NextQuestion {
 }
 
 impl Questions {
-    /// Returns the questions from the time `ask_at` on.
-    pub(crate) fn new(ask_at: Nanos) -> Questions {
-        Questions { left: QUESTIONS, rounds: 0, ask_at }
+    /// Returns the questions from the time `next_at` on.
+    pub(crate) fn new(start_at: Nanos) -> Questions {
+        Questions { remaining: STATUS_REQUESTS, rounds: 0, next_at: start_at }
     }
 
     /// Returns what follows at `now`, right after a scan, while no request is open.
     pub(crate) fn next(&mut self, sensor: &Sensor, now: Nanos) -> NextQuestion {
-        if now < self.ask_at {
+        if now < self.next_at {
             return NextQuestion::Later;
         }
-        let is_open = |question: Request| match question {
+        let is_unanswered = |question: Request| match question {
             Request::Type => sensor.kind().is_empty(),
-            Request::Status => sensor.defective.is_none() || sensor.is_complaint_open(),
+            Request::Status => sensor.defective.is_none() || sensor.needs_confirmation(),
             _ => sensor.mode.is_none(),
         };
-        while let Some((&question, rest)) = self.left.split_first() {
-            self.left = rest;
-            if is_open(question) {
-                return NextQuestion::Ask(question);
+        while let Some((&question, rest)) = self.remaining.split_first() {
+            self.remaining = rest;
+            if is_unanswered(question) {
+                return NextQuestion::Send(question);
             }
         }
-        if QUESTIONS.iter().any(|&question| is_open(question)) && self.rounds < ROUNDS - 1 {
+        if STATUS_REQUESTS.iter().any(|&question| is_unanswered(question)) && self.rounds < ROUNDS - 1 {
             self.rounds += 1;
-            self.left = QUESTIONS;
+            self.remaining = STATUS_REQUESTS;
             NextQuestion::Later
         } else if sensor.mode.is_some() {
-            self.ask_at = Nanos::MAX;
+            self.next_at = Nanos::MAX;
             NextQuestion::Done
         } else {
-            self.ask_at = now + ROUND_PAUSE;
-            self.left = QUESTIONS;
+            self.next_at = now + ROUND_PAUSE;
+            self.remaining = STATUS_REQUESTS;
             NextQuestion::ModeUnknown
         }
     }
 }
 
 /// Number of stops after the first one. A scanner that continues after them does not receive them.
-pub(crate) const STOPS: u8 = 2;
-const QUESTIONS: &[Request] = &[Request::Type, Request::Status, Request::Configuration];
+pub(crate) const MAX_STOPS: u8 = 2;
+const STATUS_REQUESTS: &[Request] = &[Request::Type, Request::Status, Request::Configuration];
 /// Number of rounds of questions without a pause.
 const ROUNDS: u8 = 5;
 /// Pause between later rounds.

@@ -6,16 +6,16 @@
 
 use core::fmt;
 
-use crate::lms::telegram::{Encoded, REPLY, Writer};
+use crate::lms::telegram::{EncodedTelegram, REPLY, Writer};
 use crate::lms::variant::{Baud, Mode, Unit, Variant};
 
 /// A status byte.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Condition(pub u8);
+pub struct StatusByte(pub u8);
 
-impl Condition {
+impl StatusByte {
     /// A healthy LMS type 6.
-    pub const OK: Condition = Condition(0x10);
+    pub const OK: StatusByte = StatusByte(0x10);
 
     /// Returns the severity. `None` for codes without a meaning.
     pub fn severity(self) -> Option<Severity> {
@@ -28,7 +28,7 @@ impl Condition {
     }
 }
 
-impl fmt::Display for Condition {
+impl fmt::Display for StatusByte {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.severity() {
             Some(severity) => f.write_str(severity.name())?,
@@ -40,8 +40,8 @@ impl fmt::Display for Condition {
             (self.0 & 0x40 != 0, "implausible values"),
             (self.is_polluted(), "window polluted"),
         ];
-        for (_, words) in flags.iter().filter(|(is_set, _)| *is_set) {
-            write!(f, ", {words}")?;
+        for (_, text) in flags.iter().filter(|(is_set, _)| *is_set) {
+            write!(f, ", {text}")?;
         }
         Ok(())
     }
@@ -89,7 +89,7 @@ impl Severity {
 
 /// Data of a status reply.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct StatusReport<'a>(&'a [u8; LEN]);
+pub struct StatusReport<'a>(&'a [u8; REPORT_LEN]);
 
 impl<'a> StatusReport<'a> {
     /// Creates the view of the report in `bytes`. `None` if they are not 152.
@@ -98,7 +98,7 @@ impl<'a> StatusReport<'a> {
     }
 
     /// Returns the bytes as received.
-    pub fn bytes(&self) -> &'a [u8; LEN] {
+    pub fn bytes(&self) -> &'a [u8; REPORT_LEN] {
         self.0
     }
 
@@ -121,10 +121,10 @@ impl<'a> StatusReport<'a> {
     /// if the clean window was never measured.
     pub fn window_percent(&self) -> Option<u16> {
         let percent = |channel| {
-            let (is, was) = (self.word(18 + 2 * channel), self.word(42 + 2 * channel));
-            (u32::from(is) * 100).checked_div(u32::from(was))
+            let (measured, clean) = (self.word(18 + 2 * channel), self.word(42 + 2 * channel));
+            (u32::from(measured) * 100).checked_div(u32::from(clean))
         };
-        (0..CHANNELS).filter_map(percent).min().and_then(|percent| percent.try_into().ok())
+        (0..WINDOW_CHANNELS).filter_map(percent).min().and_then(|percent| percent.try_into().ok())
     }
 
     /// Returns the laser power in percent of the nominal power. A real scanner reported 156 to 161.
@@ -174,7 +174,7 @@ impl<'a> StatusReport<'a> {
 
 /// State of a simulated scanner, for its status reply.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Health {
+pub struct SimulatedStatus {
     /// Firmware version, 7 ASCII characters.
     pub software: [u8; 7],
     /// Operating mode, the byte after the last 20h.
@@ -189,10 +189,10 @@ pub struct Health {
     pub baud: Baud,
 }
 
-impl Health {
+impl SimulatedStatus {
     /// Returns a report with these settings, a motor at its nominal speed and the laser on. Everything else is 0.
-    pub fn report(&self) -> [u8; LEN] {
-        let mut data = [0; LEN];
+    pub fn report(&self) -> [u8; REPORT_LEN] {
+        let mut data = [0; REPORT_LEN];
         data[..7].copy_from_slice(&self.software);
         data[7] = self.operating_mode;
         data[66..68].copy_from_slice(&148u16.to_le_bytes());
@@ -206,8 +206,8 @@ impl Health {
     }
 }
 
-/// Encodes the status reply B1h with the settings of `health`, see [`Health::report`].
-pub fn status(address: u8, health: &Health, status: u8) -> Encoded {
+/// Encodes the status reply B1h with the settings of `health`, see [`SimulatedStatus::report`].
+pub fn status_reply(address: u8, health: &SimulatedStatus, status: u8) -> EncodedTelegram {
     Writer::new(address | REPLY, crate::lms::command::STATUS | REPLY)
         .slice(&health.report())
         .byte(status)
@@ -231,7 +231,7 @@ pub(crate) fn baud_of_divisor(divisor: u16) -> Option<Baud> {
 
 /// Format of a value.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Kind {
+pub enum ValueFormat {
     /// ASCII.
     Text,
     /// One number of 1, 2 or 4 bytes.
@@ -252,74 +252,74 @@ pub struct Item {
     /// Name of the value.
     pub name: &'static str,
     /// Format of the value.
-    pub kind: Kind,
+    pub kind: ValueFormat,
 }
 
-const fn item(at: usize, len: usize, name: &'static str, kind: Kind) -> Item {
+const fn item(at: usize, len: usize, name: &'static str, kind: ValueFormat) -> Item {
     Item { at, len, name, kind }
 }
 
 /// All values in their order, without gaps. The listing counts from the command byte, so its offsets are higher by one.
 pub const ITEMS: [Item; 50] = [
-    item(0, 7, "software version", Kind::Text),
-    item(7, 1, "operating mode", Kind::Number),
-    item(8, 1, "defective", Kind::Number),
-    item(9, 8, "reserved", Kind::Text),
-    item(17, 1, "variant type", Kind::Number),
-    item(18, 16, "pollution", Kind::Words),
-    item(34, 8, "pollution reference", Kind::Words),
-    item(42, 16, "pollution calibration", Kind::Words),
-    item(58, 8, "pollution reference calibration", Kind::Words),
-    item(66, 2, "motor", Kind::Number),
-    item(68, 2, "reserved", Kind::Bytes),
-    item(70, 2, "dark signal at 100 %", Kind::Number),
-    item(72, 2, "reserved", Kind::Bytes),
-    item(74, 2, "dark signal at 100 %", Kind::Number),
-    item(76, 2, "dark signal at 66 %", Kind::Number),
-    item(78, 2, "reserved", Kind::Bytes),
-    item(80, 2, "dark signal at 66 %", Kind::Number),
-    item(82, 2, "laser power", Kind::Number),
-    item(84, 2, "angle", Kind::Number),
-    item(86, 2, "peak threshold", Kind::Number),
-    item(88, 2, "angle of the reference", Kind::Number),
-    item(90, 2, "calibration of the reference", Kind::Number),
-    item(92, 2, "target stop threshold", Kind::Number),
-    item(94, 2, "target peak threshold", Kind::Number),
-    item(96, 2, "actual stop threshold", Kind::Number),
-    item(98, 2, "actual peak threshold", Kind::Number),
-    item(100, 1, "reserved", Kind::Bytes),
-    item(101, 1, "measuring mode", Kind::Number),
-    item(102, 2, "reference target filter", Kind::Number),
-    item(104, 2, "reference target filter", Kind::Number),
-    item(106, 2, "scan angle", Kind::Number),
-    item(108, 2, "resolution", Kind::Number),
-    item(110, 1, "restart", Kind::Number),
-    item(111, 2, "restart time", Kind::Number),
-    item(113, 2, "offset of field set 2", Kind::Number),
-    item(115, 2, "rate of the line", Kind::Number),
-    item(117, 1, "evaluations", Kind::Number),
-    item(118, 1, "permanent rate", Kind::Number),
-    item(119, 1, "address", Kind::Number),
-    item(120, 1, "field set", Kind::Number),
-    item(121, 1, "unit", Kind::Number),
-    item(122, 1, "laser", Kind::Number),
-    item(123, 7, "boot PROM version", Kind::Text),
-    item(130, 4, "calibration", Kind::Number),
-    item(134, 4, "calibration", Kind::Number),
-    item(138, 4, "calibration", Kind::Number),
-    item(142, 4, "calibration", Kind::Number),
-    item(146, 2, "M0, first", Kind::Number),
-    item(148, 2, "M0, second", Kind::Number),
-    item(150, 2, "calibration interval", Kind::Number),
+    item(0, 7, "software version", ValueFormat::Text),
+    item(7, 1, "operating mode", ValueFormat::Number),
+    item(8, 1, "defective", ValueFormat::Number),
+    item(9, 8, "reserved", ValueFormat::Text),
+    item(17, 1, "variant type", ValueFormat::Number),
+    item(18, 16, "pollution", ValueFormat::Words),
+    item(34, 8, "pollution reference", ValueFormat::Words),
+    item(42, 16, "pollution calibration", ValueFormat::Words),
+    item(58, 8, "pollution reference calibration", ValueFormat::Words),
+    item(66, 2, "motor", ValueFormat::Number),
+    item(68, 2, "reserved", ValueFormat::Bytes),
+    item(70, 2, "dark signal at 100 %", ValueFormat::Number),
+    item(72, 2, "reserved", ValueFormat::Bytes),
+    item(74, 2, "dark signal at 100 %", ValueFormat::Number),
+    item(76, 2, "dark signal at 66 %", ValueFormat::Number),
+    item(78, 2, "reserved", ValueFormat::Bytes),
+    item(80, 2, "dark signal at 66 %", ValueFormat::Number),
+    item(82, 2, "laser power", ValueFormat::Number),
+    item(84, 2, "angle", ValueFormat::Number),
+    item(86, 2, "peak threshold", ValueFormat::Number),
+    item(88, 2, "angle of the reference", ValueFormat::Number),
+    item(90, 2, "calibration of the reference", ValueFormat::Number),
+    item(92, 2, "target stop threshold", ValueFormat::Number),
+    item(94, 2, "target peak threshold", ValueFormat::Number),
+    item(96, 2, "actual stop threshold", ValueFormat::Number),
+    item(98, 2, "actual peak threshold", ValueFormat::Number),
+    item(100, 1, "reserved", ValueFormat::Bytes),
+    item(101, 1, "measuring mode", ValueFormat::Number),
+    item(102, 2, "reference target filter", ValueFormat::Number),
+    item(104, 2, "reference target filter", ValueFormat::Number),
+    item(106, 2, "scan angle", ValueFormat::Number),
+    item(108, 2, "resolution", ValueFormat::Number),
+    item(110, 1, "restart", ValueFormat::Number),
+    item(111, 2, "restart time", ValueFormat::Number),
+    item(113, 2, "offset of field set 2", ValueFormat::Number),
+    item(115, 2, "rate of the line", ValueFormat::Number),
+    item(117, 1, "evaluations", ValueFormat::Number),
+    item(118, 1, "permanent rate", ValueFormat::Number),
+    item(119, 1, "address", ValueFormat::Number),
+    item(120, 1, "field set", ValueFormat::Number),
+    item(121, 1, "unit", ValueFormat::Number),
+    item(122, 1, "laser", ValueFormat::Number),
+    item(123, 7, "boot PROM version", ValueFormat::Text),
+    item(130, 4, "calibration", ValueFormat::Number),
+    item(134, 4, "calibration", ValueFormat::Number),
+    item(138, 4, "calibration", ValueFormat::Number),
+    item(142, 4, "calibration", ValueFormat::Number),
+    item(146, 2, "M0, first", ValueFormat::Number),
+    item(148, 2, "M0, second", ValueFormat::Number),
+    item(150, 2, "calibration interval", ValueFormat::Number),
 ];
 
 /// Transmission in percent below which the window is dirty (Telegram listing, errors 18 and 19).
-pub(crate) const DIRTY: u16 = 75;
+pub(crate) const DIRTY_BELOW_PERCENT: u16 = 75;
 /// Number of channels of the pollution measurement that measure the window. The others are its reference.
-const CHANNELS: usize = 8;
+const WINDOW_CHANNELS: usize = 8;
 
 /// Length of the report in bytes: LENGTH 9Ah without command and status (Telegram listing 7-5).
-pub const LEN: usize = 152;
+pub const REPORT_LEN: usize = 152;
 
 /// The errors of a reply.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -354,12 +354,12 @@ pub struct Fault {
 impl Fault {
     /// Returns the severity. `None` for codes without a meaning.
     pub fn severity(self) -> Option<Severity> {
-        Severity::of_code(self.kind & !PAST)
+        Severity::of_code(self.kind & !PAST_FLAG)
     }
 
     /// Returns whether the error has ended and is only in the error memory, which command 10h clears.
     pub fn is_past(self) -> bool {
-        self.kind & PAST != 0
+        self.kind & PAST_FLAG != 0
     }
 
     /// Returns the meaning of the number. `None` if it is unknown.
@@ -395,7 +395,7 @@ impl fmt::Display for Fault {
         f.write_str(if self.is_past() { "past " } else { "" })?;
         match self.severity() {
             Some(severity) => f.write_str(severity.name())?,
-            None => write!(f, "type {:02X}", self.kind & !PAST)?,
+            None => write!(f, "type {:02X}", self.kind & !PAST_FLAG)?,
         }
         write!(f, " {}", self.number)?;
         match self.meaning() {
@@ -406,7 +406,7 @@ impl fmt::Display for Fault {
 }
 
 /// Bit in the type of an error that has ended.
-const PAST: u8 = 0x80;
+const PAST_FLAG: u8 = 0x80;
 
 #[cfg(test)]
 mod tests {
@@ -427,7 +427,7 @@ mod tests {
             (0x18, "ok, no LMS of type 6"),
             (0x15, "severity 5"),
         ] {
-            assert_eq!(Condition(byte).to_string(), words);
+            assert_eq!(StatusByte(byte).to_string(), words);
         }
         assert!((0..5).all(|code| Severity::of_code(code).unwrap().code() == code));
     }
@@ -438,13 +438,13 @@ mod tests {
             assert_eq!(item.at, at, "{}", item.name);
             at + item.len
         });
-        assert_eq!(end, LEN);
+        assert_eq!(end, REPORT_LEN);
     }
 
     #[test]
     fn encodes_and_reads_status() {
         for baud in Baud::ALL {
-            let health = Health {
+            let health = SimulatedStatus {
                 software: *b"V02.19 ",
                 operating_mode: 0x24,
                 mode: Mode(1),
@@ -452,7 +452,7 @@ mod tests {
                 unit: Unit::Cm,
                 baud,
             };
-            let encoded = status(0, &health, 0x10);
+            let encoded = status_reply(0, &health, 0x10);
             assert_eq!((encoded.bytes().len(), encoded.telegram().length()), (160, 0x9A));
             let telegram = Telegram::check(encoded.bytes()).unwrap();
             let report = StatusReport::new(telegram.data()).unwrap();

@@ -14,11 +14,11 @@ pub const NAK: u8 = 0x15;
 /// Added to the sensor's own address in what it sends, and to a command in its reply.
 pub const REPLY: u8 = 0x80;
 /// STX, address, two length bytes, two checksum bytes: what LENGTH does not count.
-pub const FRAME: usize = 6;
+pub const FRAME_LEN: usize = 6;
 /// Greatest LENGTH: 401 values with real-time indices.
 pub const MAX_LENGTH: usize = 808;
 /// Longest telegram in bytes.
-pub const MAX_TELEGRAM: usize = MAX_LENGTH + FRAME;
+pub const MAX_TELEGRAM: usize = MAX_LENGTH + FRAME_LEN;
 
 /// A whole telegram whose length and checksum are right, in the caller's buffer.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -27,20 +27,21 @@ pub struct Telegram<'a>(&'a [u8]);
 impl<'a> Telegram<'a> {
     /// The telegram that `bytes` are, from STX to the second checksum byte; `None` if they are not exactly one.
     pub fn check(bytes: &'a [u8]) -> Option<Self> {
-        Telegram::check_rest(bytes, Checksum::default())
+        Telegram::check_with(bytes, Checksum::default())
     }
 
     /// Checks `bytes` like [`Telegram::check`]. `checksum` already includes the first ones.
-    pub(crate) fn check_rest(bytes: &'a [u8], checksum: Checksum) -> Option<Self> {
+    pub(crate) fn check_with(bytes: &'a [u8], checksum: Checksum) -> Option<Self> {
         let [STX, _, low, high, _, .., crc_low, crc_high] = *bytes else { return None };
         let length = usize::from(u16::from_le_bytes([low, high]));
-        let whole = (1..=MAX_LENGTH).contains(&length) && bytes.len() == length + FRAME;
+        let is_len_valid = (1..=MAX_LENGTH).contains(&length) && bytes.len() == length + FRAME_LEN;
         let (covered, _) = bytes.split_at(bytes.len() - 2);
-        (whole && checksum.of(covered) == u16::from_le_bytes([crc_low, crc_high])).then_some(Telegram(bytes))
+        (is_len_valid && checksum.of(covered) == u16::from_le_bytes([crc_low, crc_high]))
+            .then_some(Telegram(bytes))
     }
 
     /// The telegram in bytes that [`Telegram::check`] has seen before.
-    pub(crate) fn checked(bytes: &'a [u8]) -> Self {
+    pub(crate) fn assume_valid(bytes: &'a [u8]) -> Self {
         debug_assert!(Telegram::check(bytes).is_some());
         Telegram(bytes)
     }
@@ -62,7 +63,7 @@ impl<'a> Telegram<'a> {
 
     /// LENGTH: number of bytes from command to status.
     pub fn length(&self) -> usize {
-        self.0.len() - FRAME
+        self.0.len() - FRAME_LEN
     }
 
     /// The command byte; a reply's is that of its request + 80h.
@@ -141,25 +142,25 @@ impl Writer {
     }
 
     /// Writes length and checksum. A reply appends its status byte before.
-    pub fn finish(mut self) -> Encoded {
+    pub fn finish(mut self) -> EncodedTelegram {
         let [low, high] = (self.length() as u16).to_le_bytes();
         self.bytes[2] = low;
         self.bytes[3] = high;
         let sum = crc(&self.bytes[..self.len]);
-        Encoded(self.word(sum))
+        EncodedTelegram(self.word(sum))
     }
 }
 
 /// A telegram with its own storage.
 #[derive(Clone)]
-pub struct Encoded(Writer);
+pub struct EncodedTelegram(Writer);
 
-impl Encoded {
+impl EncodedTelegram {
     /// A copy of `telegram`.
-    pub fn of(telegram: Telegram<'_>) -> Encoded {
+    pub fn of(telegram: Telegram<'_>) -> EncodedTelegram {
         let mut bytes = [0; MAX_TELEGRAM];
         bytes[..telegram.0.len()].copy_from_slice(telegram.0);
-        Encoded(Writer { bytes, len: telegram.0.len() })
+        EncodedTelegram(Writer { bytes, len: telegram.0.len() })
     }
 
     /// The telegram's bytes, STX to checksum.
@@ -173,7 +174,7 @@ impl Encoded {
     }
 }
 
-impl fmt::Debug for Encoded {
+impl fmt::Debug for EncodedTelegram {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         self.telegram().fmt(f)
     }
@@ -300,7 +301,7 @@ mod tests {
     }
 
     #[test]
-    fn checksum_is_that_of_the_manual_however_bytes_arrive() {
+    fn checksum_matches_the_manual_for_any_chunking() {
         let mut random = fastrand::Rng::with_seed(1);
         for len in 0..MAX_TELEGRAM {
             let bytes: Vec<u8> = core::iter::repeat_with(|| random.u8(..)).take(len).collect();

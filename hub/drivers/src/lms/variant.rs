@@ -7,9 +7,9 @@ use core::fmt;
 use scanhub_schema::Nanos;
 
 /// One mirror turn: 75 Hz nominal (Telegram listing 10; a real motor word of 148 gives 13.32 ms).
-pub const MIRROR_TURN: Nanos = 13_320_000;
+pub const MIRROR_PERIOD: Nanos = 13_320_000;
 /// The sensor sends at most so many bytes per mirror turn, so 732 bytes come in two bursts.
-pub const BYTES_PER_TURN: usize = 508;
+pub const BYTES_PER_REVOLUTION: usize = 508;
 /// Most beams in one telegram: 100 degrees at 0.25.
 pub const MAX_BEAMS: usize = 401;
 
@@ -51,7 +51,7 @@ impl Variant {
     }
 
     /// Mirror turns that make one scan: 1, 2 or 4.
-    pub fn turns(self) -> u64 {
+    pub fn revolutions(self) -> u64 {
         u64::from(100 / self.resolution_cdeg)
     }
 
@@ -63,7 +63,7 @@ impl Variant {
     /// Time between telegrams of `telegram_len` bytes at `baud`: whole scans, as many as the line needs (Telegram
     /// listing table 10-17).
     pub fn period(self, telegram_len: usize, baud: u32) -> Nanos {
-        let scan = self.turns() * MIRROR_TURN;
+        let scan = self.revolutions() * MIRROR_PERIOD;
         scan * scanhub_schema::line_time(telegram_len, baud).div_ceil(scan).max(1)
     }
 }
@@ -200,7 +200,7 @@ pub enum Code {
 
 impl Code {
     /// The code of a value that is so much less than the greatest; `None` if it is a range.
-    pub fn of_distance(below_max: u16) -> Option<Code> {
+    pub fn from_distance(below_max: u16) -> Option<Code> {
         Some(match below_max {
             0 => Code::NoReturn,
             1 => Code::Dazzled,
@@ -232,7 +232,7 @@ impl Mode {
     /// `word` as this mode splits it.
     pub fn split(self, word: u16) -> Value {
         let range = word & self.max_value();
-        let code = Code::of_distance(self.max_value() - range);
+        let code = Code::from_distance(self.max_value() - range);
         Value { range: code.map_or(Ok(range), Err), upper: (word >> self.range_bits()) as u8 }
     }
 
@@ -271,9 +271,9 @@ mod tests {
         assert_eq!(Variant::of_beams(361), Some(Variant::HALF));
         assert_eq!(Variant::new(180, 25), None);
         // Table 10-17: one telegram of 361 beams in 29, 15, 8, 1 scans.
-        let scans = Baud::ALL.map(|b| Variant::HALF.period(732, b.rate()) / (2 * MIRROR_TURN));
+        let scans = Baud::ALL.map(|b| Variant::HALF.period(732, b.rate()) / (2 * MIRROR_PERIOD));
         assert_eq!(scans, [29, 15, 8, 1]);
-        assert_eq!(Variant::new(100, 25).unwrap().period(812, 9_600) / MIRROR_TURN, 64);
+        assert_eq!(Variant::new(100, 25).unwrap().period(812, 9_600) / MIRROR_PERIOD, 64);
         assert_eq!(Variant::new(100, 25).unwrap().first_angle_mdeg(), -50_000);
     }
 

@@ -8,9 +8,9 @@
 
 use scanhub_schema::{MILLIS, Nanos};
 
-use crate::rplidar::packet::Kind;
-use crate::rplidar::request::{Answer, Health, Info, Request, key};
-use crate::rplidar::session::{DRAIN, Trouble};
+use crate::rplidar::packet::PacketFormat;
+use crate::rplidar::request::{Health, Info, Request, ResponseType, key};
+use crate::rplidar::session::{MAX_DRAIN_TIME, Problem};
 use crate::rplidar::{FEATURES, Mode, Model, Motor};
 use crate::settings::Settings;
 
@@ -42,13 +42,13 @@ impl Query {
         match self {
             Query::Info => Request::INFO,
             Query::Health => Request::HEALTH,
-            Query::Board => Request::board(),
+            Query::Board => Request::accessory_board(),
             Query::ModeCount => Request::configuration(key::COUNT, None),
             Query::TypicalMode => Request::configuration(key::TYPICAL, None),
             Query::SampleTime(mode) | Query::Confirm(mode) => {
                 Request::configuration(key::SAMPLE_TIME, Some(mode))
             }
-            Query::Kind(mode) => Request::configuration(key::ANSWER, Some(mode)),
+            Query::Kind(mode) => Request::configuration(key::RESPONSE_TYPE, Some(mode)),
             Query::Name(mode) => Request::configuration(key::NAME, Some(mode)),
             Query::SampleTimes => Request::SAMPLE_TIMES,
             Query::StandardScan => Request::SCAN,
@@ -58,21 +58,21 @@ impl Query {
 
     /// Returns the contents of a response if `answer` and its `data` belong to this query. A response about a key
     /// begins with that key.
-    fn contents(self, answer: Answer, data: &[u8]) -> Option<&[u8]> {
+    fn contents(self, response: ResponseType, data: &[u8]) -> Option<&[u8]> {
         let (expected, key) = match self {
-            Query::Info => (Answer::Info, None),
-            Query::Health => (Answer::Health, None),
-            Query::Board => (Answer::Board, None),
-            Query::ModeCount => (Answer::Configuration, Some(key::COUNT)),
-            Query::TypicalMode => (Answer::Configuration, Some(key::TYPICAL)),
-            Query::SampleTime(_) | Query::Confirm(_) => (Answer::Configuration, Some(key::SAMPLE_TIME)),
-            Query::Kind(_) => (Answer::Configuration, Some(key::ANSWER)),
-            Query::Name(_) => (Answer::Configuration, Some(key::NAME)),
-            Query::SampleTimes => (Answer::SampleTimes, None),
+            Query::Info => (ResponseType::Info, None),
+            Query::Health => (ResponseType::Health, None),
+            Query::Board => (ResponseType::Board, None),
+            Query::ModeCount => (ResponseType::Configuration, Some(key::COUNT)),
+            Query::TypicalMode => (ResponseType::Configuration, Some(key::TYPICAL)),
+            Query::SampleTime(_) | Query::Confirm(_) => (ResponseType::Configuration, Some(key::SAMPLE_TIME)),
+            Query::Kind(_) => (ResponseType::Configuration, Some(key::RESPONSE_TYPE)),
+            Query::Name(_) => (ResponseType::Configuration, Some(key::NAME)),
+            Query::SampleTimes => (ResponseType::SampleTimes, None),
             Query::StandardScan | Query::ExpressScan(_) => return None,
         };
         let data = key.map_or(Some(data), |key| data.strip_prefix(&[key, 0, 0, 0]))?;
-        (answer == expected).then_some(data)
+        (response == expected).then_some(data)
     }
 
     /// Returns whether the response is a stream.
@@ -83,17 +83,17 @@ impl Query {
 
 /// Step that follows from a response, or from its absence.
 #[derive(Clone, Copy, Debug)]
-pub(crate) enum Next {
+pub(crate) enum NextStep {
     /// Nothing. For example, it was not the expected response.
     Nothing,
     /// The scanner has responded to the first query: send this one.
-    Found(Query),
+    ScannerFound(Query),
     /// Send this query.
     Query(Query),
     /// Restart the scanner, which reports an error.
     Reset,
     /// Wait: the scanner reports an error even after a restart.
-    Unwell(Health),
+    Unhealthy(Health),
     /// Start the motor, and send this query.
     StartMotor(Query),
     /// Start this mode.
@@ -120,7 +120,7 @@ pub(crate) struct Handshake {
     /// The mode of the settings, if the scanner cannot use it.
     pub(crate) unavailable_mode: Option<Mode>,
     /// In a recording: place of the last mode in a response to the recorded program, and the key of that response.
-    recorded: (u8, u8),
+    last_recorded: (u8, u8),
 }
 
 impl Handshake {
@@ -134,7 +134,7 @@ impl Handshake {
             modes: ScanModes::default(),
             mode: Mode::of(&settings).filter(|_| settings.listen_only),
             unavailable_mode: None,
-            recorded: (0, 0),
+            last_recorded: (0, 0),
         }
     }
 
@@ -145,28 +145,28 @@ impl Handshake {
 
     /// Handles the descriptor of a stream with packets of `kind`. In a recording, the mode is the only reported one with such
     /// packets, if there is only one.
-    pub(crate) fn stream_begins(&mut self, kind: Kind) {
+    pub(crate) fn stream_begins(&mut self, kind: PacketFormat) {
         if self.settings.listen_only && self.settings.mode.is_none() {
-            self.mode = self.modes.only_of(kind);
+            self.mode = self.modes.single_mode(kind);
         }
     }
 
     /// Returns the kind of packets that look like both express and dense ones if no response has named it: the fastest
     /// kind of the model.
-    pub(crate) fn alike(&self) -> Option<Kind> {
+    pub(crate) fn ambiguous_format(&self) -> Option<PacketFormat> {
         match (Mode::of(&self.settings), self.model()) {
-            (Some(Mode::DenseBoost), _) => Some(Kind::Dense),
-            (Some(_), _) => Some(Kind::Express),
-            (None, Some(Model::A1 | Model::A2m8 | Model::A2m12 | Model::A3)) => Some(Kind::Express),
-            (None, model) => model.map(|_| Kind::Dense),
+            (Some(Mode::DenseBoost), _) => Some(PacketFormat::Dense),
+            (Some(_), _) => Some(PacketFormat::Express),
+            (None, Some(Model::A1 | Model::A2m8 | Model::A2m12 | Model::A3)) => Some(PacketFormat::Express),
+            (None, model) => model.map(|_| PacketFormat::Dense),
         }
     }
 
     /// Returns the request that starts the motor, or stops it. `None` if the line DTR controls it.
     pub(crate) fn motor_request(&self, is_on: bool) -> Option<Request> {
         match self.motor() {
-            Motor::Speed => Some(Request::speed(if is_on { SPEED } else { 0 })),
-            Motor::Board if self.has_board => Some(Request::duty(if is_on { DUTY } else { 0 })),
+            Motor::Speed => Some(Request::set_motor_speed(if is_on { MOTOR_SPEED_RPM } else { 0 })),
+            Motor::Board if self.has_board => Some(Request::set_motor_pwm(if is_on { MOTOR_PWM } else { 0 })),
             Motor::Board | Motor::Dtr => None,
         }
     }
@@ -177,66 +177,77 @@ impl Handshake {
 
     /// Handles a response with the contents `data`, while the response to `query` is expected, on a line of `baud` bits
     /// per second. It may belong to an earlier query.
-    pub(crate) fn answered(&mut self, query: Option<Query>, answer: Answer, data: &[u8], baud: u32) -> Next {
-        if answer == Answer::Info {
+    pub(crate) fn handle_response(
+        &mut self,
+        query: Option<Query>,
+        response: ResponseType,
+        data: &[u8],
+        baud: u32,
+    ) -> NextStep {
+        if response == ResponseType::Info {
             self.info = Info::parse(data);
         }
         let query = match query {
             Some(query) => query,
-            None if self.settings.listen_only => self.infer_query(answer, data),
-            None => return Next::Nothing,
+            None if self.settings.listen_only => self.infer_query(response, data),
+            None => return NextStep::Nothing,
         };
-        let Some(data) = query.contents(answer, data) else { return Next::Nothing };
+        let Some(data) = query.contents(response, data) else { return NextStep::Nothing };
         match query {
-            Query::Info => return Next::Found(Query::Health),
-            Query::Health => return self.examine(Health::parse(data)),
+            Query::Info => return NextStep::ScannerFound(Query::Health),
+            Query::Health => return self.handle_health(Health::parse(data)),
             Query::Board => {
                 self.has_board = number(data) & 1 == 1;
-                return Next::StartMotor(Query::ModeCount);
+                return NextStep::StartMotor(Query::ModeCount);
             }
             Query::ModeCount => {
                 self.modes.begin(number(data) as usize);
-                return Next::Query(Query::TypicalMode);
+                return NextStep::Query(Query::TypicalMode);
             }
-            Query::TypicalMode => self.modes.recommend(number(data) as u8),
+            Query::TypicalMode => self.modes.set_recommended(number(data) as u8),
             Query::SampleTime(mode) => {
-                self.modes.set(mode, |mode| mode.sample_us = Some(sample_us(data)).filter(|us| *us > 0.0));
+                self.modes
+                    .change_mode(mode, |mode| mode.sample_us = Some(sample_us(data)).filter(|us| *us > 0.0));
             }
-            Query::Kind(mode) => self.modes.set(mode, |mode| mode.kind = Kind::of(number(data) as u8)),
-            Query::Name(mode) => self.modes.set(mode, |mode| mode.named = Mode::said(data)),
+            Query::Kind(mode) => {
+                self.modes.change_mode(mode, |mode| mode.kind = PacketFormat::of(number(data) as u8))
+            }
+            Query::Name(mode) => {
+                self.modes.change_mode(mode, |mode| mode.mode = Mode::from_device_name(data))
+            }
             Query::Confirm(mode) => {
                 let is_same = self.modes.nth(mode).and_then(|mode| mode.sample_us) == Some(sample_us(data));
-                return if is_same { self.start(baud) } else { Next::Restart };
+                return if is_same { self.start(baud) } else { NextStep::Restart };
             }
             Query::SampleTimes => {
                 let us = number(data);
-                self.modes = ScanModes::of_old(us as u16, (us >> 16) as u16);
+                self.modes = ScanModes::without_list(us as u16, (us >> 16) as u16);
                 return self.start(baud);
             }
-            Query::StandardScan | Query::ExpressScan(_) => return Next::Nothing,
+            Query::StandardScan | Query::ExpressScan(_) => return NextStep::Nothing,
         }
         self.after(query, baud)
     }
 
     /// Continues without the response to `query`, other than [`Query::Info`].
-    pub(crate) fn unanswered(&mut self, query: Query, baud: u32) -> Next {
+    pub(crate) fn handle_no_response(&mut self, query: Query, baud: u32) -> NextStep {
         match query {
-            Query::Board => Next::StartMotor(Query::ModeCount),
+            Query::Board => NextStep::StartMotor(Query::ModeCount),
             // The scanner responds, but not to everything. Its health counts as good.
             Query::Health => self.after_health(),
-            Query::ModeCount => Next::Query(Query::SampleTimes),
+            Query::ModeCount => NextStep::Query(Query::SampleTimes),
             Query::SampleTimes => {
-                self.modes = ScanModes::of_old(0, 0);
+                self.modes = ScanModes::without_list(0, 0);
                 self.start(baud)
             }
             Query::Confirm(_) => self.start(baud),
-            Query::StandardScan | Query::ExpressScan(_) => Next::Refused,
+            Query::StandardScan | Query::ExpressScan(_) => NextStep::Refused,
             query => self.after(query, baud),
         }
     }
 
     /// Returns the step after `query`, which is about the list of modes.
-    fn after(&mut self, query: Query, baud: u32) -> Next {
+    fn after(&mut self, query: Query, baud: u32) -> NextStep {
         let next = match query {
             Query::SampleTime(mode) => Query::Kind(mode),
             Query::Kind(mode) => Query::Name(mode),
@@ -245,20 +256,20 @@ impl Handshake {
         };
         match next {
             Query::SampleTime(mode) if usize::from(mode) >= self.modes.count => self.confirm(baud),
-            next => Next::Query(next),
+            next => NextStep::Query(next),
         }
     }
 
     /// Handles the reported health.
-    fn examine(&mut self, health: Option<Health>) -> Next {
+    fn handle_health(&mut self, health: Option<Health>) -> NextStep {
         self.health = health;
         match health {
-            _ if self.settings.listen_only => Next::Nothing,
+            _ if self.settings.listen_only => NextStep::Nothing,
             Some(Health::Error(_)) if !self.was_reset => {
                 self.was_reset = true;
-                Next::Reset
+                NextStep::Reset
             }
-            Some(health @ Health::Error(_)) => Next::Unwell(health),
+            Some(health @ Health::Error(_)) => NextStep::Unhealthy(health),
             _ => {
                 self.was_reset = false;
                 self.after_health()
@@ -266,63 +277,63 @@ impl Handshake {
         }
     }
 
-    fn after_health(&self) -> Next {
+    fn after_health(&self) -> NextStep {
         if self.motor() == Motor::Board {
-            Next::Query(Query::Board)
+            NextStep::Query(Query::Board)
         } else {
-            Next::StartMotor(Query::ModeCount)
+            NextStep::StartMotor(Query::ModeCount)
         }
     }
 
     /// Confirms the time per point of the chosen scan mode, and then starts the mode.
-    fn confirm(&mut self, baud: u32) -> Next {
+    fn confirm(&mut self, baud: u32) -> NextStep {
         if self.settings.listen_only {
-            return Next::Nothing;
+            return NextStep::Nothing;
         }
-        let mode = self.choose(baud);
-        if mode.sample_us.is_some() { Next::Query(Query::Confirm(mode.id)) } else { self.start(baud) }
+        let mode = self.choose_mode(baud);
+        if mode.sample_us.is_some() { NextStep::Query(Query::Confirm(mode.id)) } else { self.start(baud) }
     }
 
     /// Starts the chosen scan mode.
-    fn start(&mut self, baud: u32) -> Next {
+    fn start(&mut self, baud: u32) -> NextStep {
         if self.settings.listen_only {
-            return Next::Nothing;
+            return NextStep::Nothing;
         }
-        let mode = self.choose(baud);
-        self.mode = mode.named;
-        Next::Scan(mode)
+        let mode = self.choose_mode(baud);
+        self.mode = mode.mode;
+        NextStep::Scan(mode)
     }
 
     /// Returns the mode of the settings, or the fastest one if the scanner or the line cannot use it.
-    fn choose(&mut self, baud: u32) -> ScanMode {
+    fn choose_mode(&mut self, baud: u32) -> ScanMode {
         let baud = (!self.settings.fixed_rate).then_some(baud);
         let requested = Mode::of(&self.settings);
-        let wanted = requested.and_then(|mode| self.modes.wanted(mode, baud));
-        self.unavailable_mode = requested.filter(|_| wanted.is_none());
+        let usable = requested.and_then(|mode| self.modes.find_mode(mode, baud));
+        self.unavailable_mode = requested.filter(|_| usable.is_none());
         let fastest = || self.modes.fastest(baud).or_else(|| self.modes.fastest(None));
-        wanted.or_else(fastest).unwrap_or_default()
+        usable.or_else(fastest).unwrap_or_default()
     }
 
     /// Infers the query from a response in a recording: a program lists the modes in their order, and the keys of each
     /// mode in ascending order.
-    fn infer_query(&mut self, answer: Answer, data: &[u8]) -> Query {
-        let key = match answer {
-            Answer::Info => return Query::Info,
-            Answer::Health => return Query::Health,
-            Answer::Board => return Query::Board,
-            Answer::SampleTimes => return Query::SampleTimes,
-            Answer::Configuration => data.first().copied().unwrap_or(key::COUNT),
+    fn infer_query(&mut self, response: ResponseType, data: &[u8]) -> Query {
+        let key = match response {
+            ResponseType::Info => return Query::Info,
+            ResponseType::Health => return Query::Health,
+            ResponseType::Board => return Query::Board,
+            ResponseType::SampleTimes => return Query::SampleTimes,
+            ResponseType::Configuration => data.first().copied().unwrap_or(key::COUNT),
         };
-        let (mode, before) = self.recorded;
+        let (mode, before) = self.last_recorded;
         let mode = if key > before { mode } else { mode + 1 };
         match key {
-            key::COUNT => self.recorded = (0, 0),
-            key::SAMPLE_TIME | key::ANSWER | key::NAME => self.recorded = (mode, key),
+            key::COUNT => self.last_recorded = (0, 0),
+            key::SAMPLE_TIME | key::RESPONSE_TYPE | key::NAME => self.last_recorded = (mode, key),
             _ => {}
         }
         match key {
             key::SAMPLE_TIME => Query::SampleTime(mode),
-            key::ANSWER => Query::Kind(mode),
+            key::RESPONSE_TYPE => Query::Kind(mode),
             key::NAME => Query::Name(mode),
             key::TYPICAL => Query::TypicalMode,
             _ => Query::ModeCount,
@@ -337,14 +348,14 @@ pub(crate) struct ScanMode {
     id: u8,
     /// Microseconds from one point to the next.
     pub(crate) sample_us: Option<f32>,
-    kind: Option<Kind>,
-    named: Option<Mode>,
+    kind: Option<PacketFormat>,
+    mode: Option<Mode>,
 }
 
 impl ScanMode {
     /// Returns the query that starts the mode.
     pub(crate) fn query(&self) -> Query {
-        if self.kind.is_none_or(|kind| kind == Kind::Standard) {
+        if self.kind.is_none_or(|kind| kind == PacketFormat::Standard) {
             Query::StandardScan
         } else {
             Query::ExpressScan(self.id)
@@ -355,71 +366,72 @@ impl ScanMode {
 /// The scan modes of a scanner.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct ScanModes {
-    all: [ScanMode; ScanModes::MOST],
+    list: [ScanMode; ScanModes::MAX],
     count: usize,
     typical: Option<u8>,
 }
 
 impl ScanModes {
-    const MOST: usize = 12;
+    const MAX: usize = 12;
 
     /// Begins a list of `count` modes.
     fn begin(&mut self, count: usize) {
-        *self = ScanModes { count: count.min(ScanModes::MOST), ..ScanModes::default() };
-        (0..).zip(&mut self.all).for_each(|(id, mode)| mode.id = id);
+        *self = ScanModes { count: count.min(ScanModes::MAX), ..ScanModes::default() };
+        (0..).zip(&mut self.list).for_each(|(id, mode)| mode.id = id);
     }
 
-    fn nth(&self, place: u8) -> Option<&ScanMode> {
-        self.all[..self.count].get(usize::from(place))
+    fn nth(&self, index: u8) -> Option<&ScanMode> {
+        self.list[..self.count].get(usize::from(index))
     }
 
     /// Changes the mode at `place` of the list.
-    fn set(&mut self, place: u8, set: impl Fn(&mut ScanMode)) {
-        self.all[..self.count].get_mut(usize::from(place)).into_iter().for_each(set);
+    fn change_mode(&mut self, index: u8, set: impl Fn(&mut ScanMode)) {
+        self.list[..self.count].get_mut(usize::from(index)).into_iter().for_each(set);
     }
 
     /// Marks the mode with number `id` as the one that the manufacturer recommends.
-    fn recommend(&mut self, id: u8) {
+    fn set_recommended(&mut self, id: u8) {
         self.typical = Some(id);
     }
 
     /// Returns the two modes that every scanner has, for one that does not list its modes. The times per point are in
     /// microseconds; 0 if unknown.
-    fn of_old(standard_us: u16, express_us: u16) -> ScanModes {
-        let old = |us: u16, kind, mode| ScanMode {
+    fn without_list(standard_us: u16, express_us: u16) -> ScanModes {
+        let mode_of = |us: u16, kind, mode| ScanMode {
             id: 0,
             sample_us: (us > 0).then_some(f32::from(us)),
             kind: Some(kind),
-            named: Some(mode),
+            mode: Some(mode),
         };
         let mut modes = ScanModes::default();
-        modes.all[0] = old(standard_us, Kind::Standard, Mode::Standard);
-        modes.all[1] = old(express_us, Kind::Express, Mode::Express);
+        modes.list[0] = mode_of(standard_us, PacketFormat::Standard, Mode::Standard);
+        modes.list[1] = mode_of(express_us, PacketFormat::Express, Mode::Express);
         modes.count = if express_us > 0 { 2 } else { 1 };
         modes
     }
 
     /// Returns the offered mode that is `mode`, if a line of `baud` bits per second can carry it. `None` for `baud`:
     /// the line has no rate.
-    fn wanted(&self, mode: Mode, baud: Option<u32>) -> Option<ScanMode> {
+    fn find_mode(&self, mode: Mode, baud: Option<u32>) -> Option<ScanMode> {
         let kind = match mode {
-            Mode::Standard => Some(Kind::Standard),
-            Mode::Express => Some(Kind::Express),
-            Mode::DenseBoost => Some(Kind::Dense),
-            Mode::UltraDense => Some(Kind::UltraDense),
+            Mode::Standard => Some(PacketFormat::Standard),
+            Mode::Express => Some(PacketFormat::Express),
+            Mode::DenseBoost => Some(PacketFormat::Dense),
+            Mode::UltraDense => Some(PacketFormat::UltraDense),
             Mode::Boost | Mode::Sensitivity | Mode::Stability => None,
         };
-        let named = self.possible(baud).find(|offered| offered.named == Some(mode));
-        named.or_else(|| self.possible(baud).find(|offered| kind.is_some() && offered.kind == kind))
+        let mode_with_name = self.possible_modes(baud).find(|candidate| candidate.mode == Some(mode));
+        mode_with_name
+            .or_else(|| self.possible_modes(baud).find(|offered| kind.is_some() && offered.kind == kind))
     }
 
     /// Returns the fastest mode that the line can carry. Among equally fast ones, it prefers those with a checksum,
     /// then the recommended one.
     fn fastest(&self, baud: Option<u32>) -> Option<ScanMode> {
-        self.possible(baud).min_by(|a, b| {
+        self.possible_modes(baud).min_by(|a, b| {
             let of = |mode: &ScanMode| mode.sample_us.unwrap_or(f32::MAX);
             let rank = |mode: &ScanMode| {
-                let is_checked = mode.kind.is_some_and(Kind::is_checked);
+                let is_checked = mode.kind.is_some_and(PacketFormat::is_checked);
                 (!is_checked, self.typical != Some(mode.id))
             };
             of(a).total_cmp(&of(b)).then(rank(a).cmp(&rank(b)))
@@ -428,50 +440,50 @@ impl ScanModes {
 
     /// Returns the microseconds from one point to the next for packets of `kind`: in `mode` if it has such packets,
     /// otherwise in the fastest mode that has.
-    pub(crate) fn sample_us(&self, kind: Kind, mode: Option<Mode>) -> Option<f32> {
+    pub(crate) fn sample_us(&self, kind: PacketFormat, mode: Option<Mode>) -> Option<f32> {
         let of_kind = || self.of_kind(kind);
-        let named = of_kind().filter(|(named, _)| mode.is_some() && *named == mode).map(|(_, us)| us);
-        named.reduce(f32::min).or_else(|| of_kind().map(|(_, us)| us).reduce(f32::min))
+        let in_mode = of_kind().filter(|(named, _)| mode.is_some() && *named == mode).map(|(_, us)| us);
+        in_mode.reduce(f32::min).or_else(|| of_kind().map(|(_, us)| us).reduce(f32::min))
     }
 
     /// Returns the reported microseconds per point that are nearest to `us`, among the modes with packets of `kind`.
-    pub(crate) fn nearest_us(&self, kind: Kind, us: f32) -> Option<f32> {
+    pub(crate) fn nearest_us(&self, kind: PacketFormat, us: f32) -> Option<f32> {
         self.of_kind(kind)
             .map(|(_, reported)| reported)
             .min_by(|a, b| (a - us).abs().total_cmp(&(b - us).abs()))
     }
 
     /// Returns the mode with packets of `kind`, if there is only one and scanhub knows it.
-    fn only_of(&self, kind: Kind) -> Option<Mode> {
-        let mut modes = self.all[..self.count].iter().filter(|mode| mode.kind == Some(kind));
-        let only = modes.next().filter(|_| modes.next().is_none());
-        only.and_then(|mode| mode.named)
+    fn single_mode(&self, kind: PacketFormat) -> Option<Mode> {
+        let mut modes = self.list[..self.count].iter().filter(|mode| mode.kind == Some(kind));
+        let single = modes.next().filter(|_| modes.next().is_none());
+        single.and_then(|mode| mode.mode)
     }
 
     /// Returns whether all reported modes with packets of `kind` have the same time per point, so that the packets define it.
-    pub(crate) fn is_unambiguous(&self, kind: Kind) -> bool {
+    pub(crate) fn is_unambiguous(&self, kind: PacketFormat) -> bool {
         let mut times = self.of_kind(kind).map(|(_, us)| us);
         let first = times.next();
         times.all(|us| Some(us) == first)
     }
 
     /// Returns whether a reported mode with packets of `kind` and this time per point is `mode`.
-    pub(crate) fn has(&self, mode: Mode, kind: Kind, us: f32) -> bool {
+    pub(crate) fn has(&self, mode: Mode, kind: PacketFormat, us: f32) -> bool {
         let nearest = self.nearest_us(kind, us);
         self.of_kind(kind).any(|(named, us)| named == Some(mode) && Some(us) == nearest)
     }
 
-    fn of_kind(&self, kind: Kind) -> impl Iterator<Item = (Option<Mode>, f32)> {
-        let all = self.all[..self.count].iter().filter(move |mode| mode.kind == Some(kind));
-        all.filter_map(|mode| Some((mode.named, mode.sample_us?)))
+    fn of_kind(&self, kind: PacketFormat) -> impl Iterator<Item = (Option<Mode>, f32)> {
+        let all = self.list[..self.count].iter().filter(move |mode| mode.kind == Some(kind));
+        all.filter_map(|mode| Some((mode.mode, mode.sample_us?)))
     }
 
     /// Returns the modes whose packets scanhub can decode and the line can carry.
-    fn possible(&self, baud: Option<u32>) -> impl Iterator<Item = ScanMode> {
-        self.all[..self.count].iter().copied().filter(move |mode| {
+    fn possible_modes(&self, baud: Option<u32>) -> impl Iterator<Item = ScanMode> {
+        self.list[..self.count].iter().copied().filter(move |mode| {
             let Some((kind, baud)) = mode.kind.zip(baud) else { return mode.kind.is_some() };
             let packets_per_second = 1e6 / (mode.sample_us.unwrap_or(1e6) * kind.points() as f32);
-            packets_per_second * kind.bytes() as f32 * 10.0 <= baud as f32
+            packets_per_second * kind.byte_len() as f32 * 10.0 <= baud as f32
         })
     }
 }
@@ -487,9 +499,9 @@ fn sample_us(data: &[u8]) -> f32 {
 }
 
 /// Requested speed, in revolutions per minute: of an S1, the manufacturer's choice.
-const SPEED: u16 = 600;
+const MOTOR_SPEED_RPM: u16 = 600;
 /// Requested duty cycle of the motor, of 1,023: of an A2, the manufacturer's choice.
-const DUTY: u16 = 660;
+const MOTOR_PWM: u16 = 660;
 
 /// The rate of the line, and the state of the search for it.
 #[derive(Clone, Copy, Debug)]
@@ -498,22 +510,22 @@ pub(crate) struct RateSearch {
     /// Whether the port has this rate and no other, or nothing can be sent.
     is_fixed: bool,
     /// Whether the port does not have the rate yet.
-    pub(crate) is_changed: bool,
+    pub(crate) needs_change: bool,
     /// Time since which no response has arrived, and the number of bytes read by then.
-    quiet_since: Option<(Nanos, u64)>,
+    no_response_since: Option<(Nanos, u64)>,
     /// Rate of the last stream, until a boot message is received or the session restarts the scanner.
-    streamed_at: Option<u32>,
+    stream_rate: Option<u32>,
 }
 
 impl RateSearch {
     /// Creates a search on a port that is open at the rate of `settings`.
     pub(crate) fn new(settings: &Settings) -> RateSearch {
         RateSearch {
-            baud: Model::of(settings).map_or(FEATURES.auto.baud, Model::baud),
+            baud: Model::of(settings).map_or(FEATURES.defaults.baud, Model::baud),
             is_fixed: settings.fixed_rate || settings.listen_only,
-            is_changed: false,
-            quiet_since: None,
-            streamed_at: None,
+            needs_change: false,
+            no_response_since: None,
+            stream_rate: None,
         }
     }
 
@@ -524,23 +536,24 @@ impl RateSearch {
 
     /// Returns the rate if the port has to be set to it.
     pub(crate) fn take_change(&mut self) -> Option<u32> {
-        core::mem::take(&mut self.is_changed).then_some(self.baud)
+        core::mem::take(&mut self.needs_change).then_some(self.baud)
     }
 
     /// Ends the search, because the scanner has responded.
     pub(crate) fn end(&mut self) {
-        self.quiet_since = None;
+        self.no_response_since = None;
     }
 
     /// Tries the next rate, because no response arrived. `read` is the number of bytes read so far. Returns since when
     /// no response has arrived.
     pub(crate) fn advance(&mut self, now: Nanos, read: u64) -> Nanos {
-        let (since, read_before) = *self.quiet_since.get_or_insert((now, read));
+        let (since, read_before) = *self.no_response_since.get_or_insert((now, read));
         // Stay at the rate of the last stream for a while, so that the boot message is received.
-        let may_boot = self.streamed_at == Some(self.baud) && read == read_before && now < since + POWER_ON;
-        if let Some(baud) = self.next().filter(|_| !may_boot) {
+        let may_boot =
+            self.stream_rate == Some(self.baud) && read == read_before && now < since + BOOT_TIMEOUT;
+        if let Some(baud) = self.next_rate().filter(|_| !may_boot) {
             self.baud = baud;
-            self.is_changed = true;
+            self.needs_change = true;
         }
         since
     }
@@ -549,33 +562,34 @@ impl RateSearch {
     /// asked at this rate, because at the right rate it would have stopped. Later a request is sent, because the line
     /// may never be quiet.
     pub(crate) fn is_quick(&self, now: Nanos) -> bool {
-        self.quiet_since.is_none_or(|(since, _)| now < since + ROUNDS) && self.next().is_some()
+        self.no_response_since.is_none_or(|(since, _)| now < since + QUICK_SEARCH_TIME)
+            && self.next_rate().is_some()
     }
 
     /// Returns the message that no response has arrived since `since`, after a second.
-    pub(crate) fn no_answer(&self, since: Nanos, now: Nanos) -> Option<Trouble> {
+    pub(crate) fn no_response_problem(&self, since: Nanos, now: Nanos) -> Option<Problem> {
         let seconds = (now.saturating_sub(since) / (1_000 * MILLIS)) as u32;
-        let baud = self.next().is_none().then_some(self.baud);
-        (seconds > 0).then(|| Trouble::NoAnswer { baud, seconds: 1 << seconds.ilog2() })
+        let baud = self.next_rate().is_none().then_some(self.baud);
+        (seconds > 0).then(|| Problem::NoResponse { baud, seconds: 1 << seconds.ilog2() })
     }
 
     /// Handles packets, which arrived at this rate.
     pub(crate) fn note_stream(&mut self) {
-        self.streamed_at = Some(self.baud);
+        self.stream_rate = Some(self.baud);
     }
 
     /// Forgets the rate of the last stream if it is this rate. Returns whether it is.
     pub(crate) fn take_stream(&mut self) -> bool {
-        self.streamed_at.take_if(|baud| *baud == self.baud).is_some()
+        self.stream_rate.take_if(|baud| *baud == self.baud).is_some()
     }
 
     /// Forgets the rate of the last stream.
     pub(crate) fn forget_stream(&mut self) {
-        self.streamed_at = None;
+        self.stream_rate = None;
     }
 
     /// Returns the rate after this one. `None` if there is no choice.
-    fn next(&self) -> Option<u32> {
+    fn next_rate(&self) -> Option<u32> {
         const RATES: [u32; 4] = [115_200, 256_000, 460_800, 1_000_000];
         let at = RATES.iter().position(|rate| *rate == self.baud)?;
         (!self.is_fixed).then(|| RATES[(at + 1) % RATES.len()])
@@ -583,9 +597,9 @@ impl RateSearch {
 }
 
 /// Maximum time from power-on to the boot message.
-const POWER_ON: Nanos = 3_000 * MILLIS;
+const BOOT_TIMEOUT: Nanos = 3_000 * MILLIS;
 /// All rates are tried twice in this time if bytes arrive at each of them, because a stop request can be lost.
-const ROUNDS: Nanos = 8 * DRAIN;
+const QUICK_SEARCH_TIME: Nanos = 8 * MAX_DRAIN_TIME;
 
 #[cfg(test)]
 mod tests {
@@ -596,18 +610,18 @@ mod tests {
         let mut listed = ScanModes::default();
         listed.begin(5);
         let modes = [
-            (Mode::Standard, 508.0, Kind::Standard),
-            (Mode::Express, 254.0, Kind::Express),
-            (Mode::Boost, 127.0, Kind::Ultra),
-            (Mode::Sensitivity, 127.0, Kind::Ultra),
-            (Mode::Stability, 201.0, Kind::Ultra),
+            (Mode::Standard, 508.0, PacketFormat::Standard),
+            (Mode::Express, 254.0, PacketFormat::Express),
+            (Mode::Boost, 127.0, PacketFormat::Ultra),
+            (Mode::Sensitivity, 127.0, PacketFormat::Ultra),
+            (Mode::Stability, 201.0, PacketFormat::Ultra),
         ];
         for (place, (mode, us, kind)) in (0..).zip(modes) {
-            listed.set(place, |listed| {
-                (listed.named, listed.sample_us, listed.kind) = (Some(mode), Some(us), Some(kind));
+            listed.change_mode(place, |listed| {
+                (listed.mode, listed.sample_us, listed.kind) = (Some(mode), Some(us), Some(kind));
             });
         }
-        listed.recommend(3);
+        listed.set_recommended(3);
         listed
     }
 
@@ -618,22 +632,22 @@ mod tests {
         assert_eq!(a1().fastest(Some(57_600)).map(|mode| mode.id), None);
         assert_eq!(a1().fastest(None).map(|mode| mode.id), Some(3));
         assert_eq!(
-            ScanModes::of_old(500, 250).fastest(Some(115_200)).and_then(|mode| mode.kind),
-            Some(Kind::Express)
+            ScanModes::without_list(500, 250).fastest(Some(115_200)).and_then(|mode| mode.kind),
+            Some(PacketFormat::Express)
         );
         assert_eq!(
-            ScanModes::of_old(500, 0).fastest(Some(115_200)).and_then(|mode| mode.kind),
-            Some(Kind::Standard)
+            ScanModes::without_list(500, 0).fastest(Some(115_200)).and_then(|mode| mode.kind),
+            Some(PacketFormat::Standard)
         );
     }
 
     #[test]
     fn finds_mode_by_name_or_kind() {
-        assert_eq!(a1().wanted(Mode::Boost, None).map(|mode| mode.id), Some(2));
-        assert_eq!(a1().wanted(Mode::DenseBoost, None).map(|mode| mode.id), None);
+        assert_eq!(a1().find_mode(Mode::Boost, None).map(|mode| mode.id), Some(2));
+        assert_eq!(a1().find_mode(Mode::DenseBoost, None).map(|mode| mode.id), None);
         let mut nameless = a1();
-        (0..5).for_each(|n| nameless.set(n, |mode| mode.named = None));
-        assert_eq!(nameless.wanted(Mode::Express, None).map(|mode| mode.id), Some(1));
-        assert_eq!(nameless.wanted(Mode::Boost, None).map(|mode| mode.id), None);
+        (0..5).for_each(|n| nameless.change_mode(n, |mode| mode.mode = None));
+        assert_eq!(nameless.find_mode(Mode::Express, None).map(|mode| mode.id), Some(1));
+        assert_eq!(nameless.find_mode(Mode::Boost, None).map(|mode| mode.id), None);
     }
 }

@@ -3,7 +3,7 @@
 
 /// What a stream is made of. HQ packets (83h) are not known here.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Kind {
+pub enum PacketFormat {
     /// A point a packet, without a checksum.
     Standard,
     /// 32 points, each with a compensation of its angle.
@@ -18,7 +18,7 @@ pub enum Kind {
 
 /// A point of a packet.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Measured {
+pub struct PacketPoint {
     /// By how many degrees it lies before its place, or if negative behind it, among the evenly spaced points of its packet.
     pub before: f32,
     /// Millimetres; 0 is no return.
@@ -27,114 +27,122 @@ pub struct Measured {
     pub quality: u8,
 }
 
-impl Kind {
+impl PacketFormat {
     /// All of them.
-    pub const ALL: [Kind; 5] = [Kind::Standard, Kind::Express, Kind::Ultra, Kind::Dense, Kind::UltraDense];
+    pub const ALL: [PacketFormat; 5] = [
+        PacketFormat::Standard,
+        PacketFormat::Express,
+        PacketFormat::Ultra,
+        PacketFormat::Dense,
+        PacketFormat::UltraDense,
+    ];
     /// Bytes of the longest packet.
-    pub const LONGEST: usize = 170;
+    pub const MAX_LEN: usize = 170;
     /// The most points of a packet.
-    pub const MOST_POINTS: usize = 96;
+    pub const MAX_POINTS: usize = 96;
 
     /// The kind of which a scanner says this byte.
-    pub(crate) fn of(answer: u8) -> Option<Kind> {
-        Kind::ALL.into_iter().find(|kind| kind.answer() == answer)
+    pub(crate) fn of(answer: u8) -> Option<PacketFormat> {
+        PacketFormat::ALL.into_iter().find(|kind| kind.response_type() == answer)
     }
 
     /// Returns the type of this kind in a descriptor.
-    pub(crate) const fn answer(self) -> u8 {
+    pub(crate) const fn response_type(self) -> u8 {
         match self {
-            Kind::Standard => 0x81,
-            Kind::Express => 0x82,
-            Kind::Ultra => 0x84,
-            Kind::Dense => 0x85,
-            Kind::UltraDense => 0x86,
+            PacketFormat::Standard => 0x81,
+            PacketFormat::Express => 0x82,
+            PacketFormat::Ultra => 0x84,
+            PacketFormat::Dense => 0x85,
+            PacketFormat::UltraDense => 0x86,
         }
     }
 
     /// Bytes of a packet.
-    pub const fn bytes(self) -> usize {
+    pub const fn byte_len(self) -> usize {
         match self {
-            Kind::Standard => 5,
-            Kind::Express | Kind::Dense => 84,
-            Kind::Ultra => 132,
-            Kind::UltraDense => Kind::LONGEST,
+            PacketFormat::Standard => 5,
+            PacketFormat::Express | PacketFormat::Dense => 84,
+            PacketFormat::Ultra => 132,
+            PacketFormat::UltraDense => PacketFormat::MAX_LEN,
         }
     }
 
     /// Points of a packet.
     pub const fn points(self) -> usize {
         match self {
-            Kind::Standard => 1,
-            Kind::Express => 32,
-            Kind::Ultra => Kind::MOST_POINTS,
-            Kind::Dense => 40,
-            Kind::UltraDense => 64,
+            PacketFormat::Standard => 1,
+            PacketFormat::Express => 32,
+            PacketFormat::Ultra => PacketFormat::MAX_POINTS,
+            PacketFormat::Dense => 40,
+            PacketFormat::UltraDense => 64,
         }
     }
 
     /// Whether packets have a checksum.
     pub const fn is_checked(self) -> bool {
-        !matches!(self, Kind::Standard)
+        !matches!(self, PacketFormat::Standard)
     }
 
     /// Degrees by which a point may lie before its place, and some.
-    pub(crate) const fn most_before(self) -> f64 {
+    pub(crate) const fn max_before(self) -> f64 {
         match self {
-            Kind::Dense | Kind::UltraDense => 0.5,
-            Kind::Standard | Kind::Express | Kind::Ultra => 10.0,
+            PacketFormat::Dense | PacketFormat::UltraDense => 0.5,
+            PacketFormat::Standard | PacketFormat::Express | PacketFormat::Ultra => 10.0,
         }
     }
 
     /// Degrees by which a point may lie behind its place.
-    pub(crate) const fn most_behind(self) -> f64 {
-        if matches!(self, Kind::Ultra) { 21.0 } else { 0.0 }
+    pub(crate) const fn max_after(self) -> f64 {
+        if matches!(self, PacketFormat::Ultra) { 21.0 } else { 0.0 }
     }
 
     /// Whether a packet may begin with `bytes`, as far as there are any.
     pub(crate) fn begins(self, bytes: &[u8]) -> bool {
-        let fits = |at: usize, holds: fn(u8) -> bool| bytes.get(at).is_none_or(|byte| holds(*byte));
+        let fits = |at: usize, is_match: fn(u8) -> bool| bytes.get(at).is_none_or(|byte| is_match(*byte));
         match self {
             // The bit that a turn begins and its inverse differ; the lowest bit of the angle's word is set.
-            Kind::Standard => fits(0, |byte| (byte ^ byte >> 1) & 1 == 1) && fits(1, |byte| byte & 1 == 1),
+            PacketFormat::Standard => {
+                fits(0, |byte| (byte ^ byte >> 1) & 1 == 1) && fits(1, |byte| byte & 1 == 1)
+            }
             _ => fits(0, |byte| byte >> 4 == 0xA) && fits(1, |byte| byte >> 4 == 0x5),
         }
     }
 
     /// Whether `packet` is one, by its checksum if it has one.
-    pub(crate) fn is_right(self, packet: &[u8]) -> bool {
-        let is_sum_right = || {
+    pub(crate) fn is_valid(self, packet: &[u8]) -> bool {
+        let is_sum_valid = || {
             let sum = packet[2..].iter().fold(0, |sum, byte| sum ^ byte);
             sum == packet[0] & 15 | packet[1] << 4
         };
-        self.begins(packet) && (!self.is_checked() || is_sum_right()) && self.start(packet) <= 360.0
+        self.begins(packet) && (!self.is_checked() || is_sum_valid()) && self.start_angle(packet) <= 360.0
     }
 
     /// Degrees, clockwise, of the first point of `packet`.
-    pub fn start(self, packet: &[u8]) -> f32 {
+    pub fn start_angle(self, packet: &[u8]) -> f32 {
         match self {
-            Kind::Standard => f32::from(word(packet, 1) >> 1) / 64.0,
-            Kind::UltraDense => f32::from(word(packet, 8) & 0x7FFF) / 64.0,
+            PacketFormat::Standard => f32::from(word(packet, 1) >> 1) / 64.0,
+            PacketFormat::UltraDense => f32::from(word(packet, 8) & 0x7FFF) / 64.0,
             _ => f32::from(word(packet, 2) & 0x7FFF) / 64.0,
         }
     }
 
     /// Point `i` of `packet`, which `next` follows.
-    pub fn point(self, packet: &[u8], next: &[u8], i: usize) -> Measured {
+    pub fn point(self, packet: &[u8], next: &[u8], i: usize) -> PacketPoint {
         match self {
-            Kind::Standard => {
+            PacketFormat::Standard => {
                 let (quality, range) = (packet[0] >> 2, word(packet, 3) / 4);
-                Measured { before: 0.0, range: if quality == 0 { 0 } else { range }, quality }
+                PacketPoint { before: 0.0, range: if quality == 0 { 0 } else { range }, quality }
             }
-            Kind::Express => {
+            PacketFormat::Express => {
                 let cabin = &packet[4 + i / 2 * 5..][..5];
                 let half = i % 2;
                 let (word, low) = (word(cabin, 2 * half), cabin[4] >> (4 * half) & 15);
                 let eighths = u16::from(low) | (word & 3) << 4;
-                Measured { before: f32::from(eighths) / 8.0, range: word >> 2, quality: 0 }
+                PacketPoint { before: f32::from(eighths) / 8.0, range: word >> 2, quality: 0 }
             }
-            Kind::Ultra => ultra(packet, next, i),
-            Kind::Dense => Measured { before: 0.0, range: word(packet, 4 + 2 * i), quality: 0 },
-            Kind::UltraDense => ultra_dense(packet, i),
+            PacketFormat::Ultra => ultra(packet, next, i),
+            PacketFormat::Dense => PacketPoint { before: 0.0, range: word(packet, 4 + 2 * i), quality: 0 },
+            PacketFormat::UltraDense => ultra_dense(packet, i),
         }
     }
 }
@@ -144,27 +152,27 @@ fn word(bytes: &[u8], at: usize) -> u16 {
 }
 
 /// The first of three points has a range of its own, the others differ from it or from the first of the next three.
-fn ultra(packet: &[u8], next: &[u8], i: usize) -> Measured {
-    let three = |packet: &[u8], n: usize| {
+fn ultra(packet: &[u8], next: &[u8], i: usize) -> PacketPoint {
+    let triple = |packet: &[u8], n: usize| {
         u32::from(word(packet, 4 + 4 * n)) | u32::from(word(packet, 6 + 4 * n)) << 16
     };
-    let (n, cabins) = (i / 3, Kind::Ultra.points() / 3);
-    let here = three(packet, n);
-    let behind = if n + 1 < cabins { three(packet, n + 1) } else { three(next, 0) };
-    let ((major, level), (major_behind, level_behind)) = (major(here), major(behind));
+    let (n, cabins) = (i / 3, PacketFormat::Ultra.points() / 3);
+    let this_triple = triple(packet, n);
+    let next_triple = if n + 1 < cabins { triple(packet, n + 1) } else { triple(next, 0) };
+    let ((major, level), (next_major, next_level)) = (major(this_triple), major(next_triple));
     // Two numbers of ten bits with a sign.
-    let (first, second) = ((here << 10) as i32 >> 22, here as i32 >> 22);
+    let (first, second) = ((this_triple << 10) as i32 >> 22, this_triple as i32 >> 22);
     let differs = |difference: i32, base: i32, level: u32| {
         if matches!(difference, -512 | 511) { 0 } else { base + (difference << level) }
     };
     let mm = match i % 3 {
         0 => major,
-        1 if major == 0 => differs(first, major_behind, level_behind),
+        1 if major == 0 => differs(first, next_major, next_level),
         1 => differs(first, major, level),
-        _ => differs(second, major_behind, level_behind),
+        _ => differs(second, next_major, next_level),
     };
     let range = u16::try_from(mm).unwrap_or(0);
-    Measured { before: before(range), range, quality: 0 }
+    PacketPoint { before: before(range), range, quality: 0 }
 }
 
 /// A range in millimetres of which the steps get wider, and how many bits they are wider.
@@ -187,27 +195,27 @@ fn before(range: u16) -> f32 {
 }
 
 /// 20 bits a point: range and quality in one of four scales.
-fn ultra_dense(packet: &[u8], i: usize) -> Measured {
+fn ultra_dense(packet: &[u8], i: usize) -> PacketPoint {
     let cabin = &packet[10 + i / 2 * 5..][..5];
     let half = i % 2;
-    let v = u32::from(word(cabin, 2 * half)) | u32::from(cabin[4] >> (4 * half) & 15) << 16;
-    let (range, quality) = match v & 3 {
-        0 => (2 * (v >> 2 & 0x3FF), v >> 12),
-        1 => (3 * (v >> 2 & 0x7FF) + 2_046, v >> 13 << 1),
-        2 => (4 * (v >> 2 & 0xFFF) + 8_187, v >> 14 << 2),
-        _ => (5 * (v >> 2 & 0x1FFF) + 24_567, v >> 15 << 3),
+    let bits = u32::from(word(cabin, 2 * half)) | u32::from(cabin[4] >> (4 * half) & 15) << 16;
+    let (range, quality) = match bits & 3 {
+        0 => (2 * (bits >> 2 & 0x3FF), bits >> 12),
+        1 => (3 * (bits >> 2 & 0x7FF) + 2_046, bits >> 13 << 1),
+        2 => (4 * (bits >> 2 & 0xFFF) + 8_187, bits >> 14 << 2),
+        _ => (5 * (bits >> 2 & 0x1FFF) + 24_567, bits >> 15 << 3),
     };
-    Measured { before: 0.0, range: range as u16, quality: quality as u8 }
+    PacketPoint { before: 0.0, range: range as u16, quality: quality as u8 }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn packet(kind: Kind, body: &[u8]) -> [u8; Kind::LONGEST] {
-        let mut bytes = [0; Kind::LONGEST];
+    fn packet(kind: PacketFormat, body: &[u8]) -> [u8; PacketFormat::MAX_LEN] {
+        let mut bytes = [0; PacketFormat::MAX_LEN];
         bytes[2..2 + body.len()].copy_from_slice(body);
-        let sum = bytes[2..kind.bytes()].iter().fold(0, |sum, byte| sum ^ byte);
+        let sum = bytes[2..kind.byte_len()].iter().fold(0, |sum, byte| sum ^ byte);
         (bytes[0], bytes[1]) = (0xA0 | sum & 15, 0x50 | sum >> 4);
         bytes
     }
@@ -216,16 +224,16 @@ mod tests {
     fn a_point_by_itself() {
         // Quality 15, 90 degrees, 2 m.
         let node = [0x3D, 0x01, 0x2D, 0x40, 0x1F];
-        assert!(Kind::Standard.is_right(&node));
-        assert_eq!(Kind::Standard.start(&node), 90.0);
-        let point = Kind::Standard.point(&node, &node, 0);
-        assert_eq!(point, Measured { before: 0.0, range: 2_000, quality: 15 });
+        assert!(PacketFormat::Standard.is_valid(&node));
+        assert_eq!(PacketFormat::Standard.start_angle(&node), 90.0);
+        let point = PacketFormat::Standard.point(&node, &node, 0);
+        assert_eq!(point, PacketPoint { before: 0.0, range: 2_000, quality: 15 });
         // Without a quality nothing came back.
-        assert_eq!(Kind::Standard.point(&[0x01, 1, 0x2D, 0x40, 0x1F], &node, 0).range, 0);
+        assert_eq!(PacketFormat::Standard.point(&[0x01, 1, 0x2D, 0x40, 0x1F], &node, 0).range, 0);
         for wrong in
             [[0x3F, 1, 0x2D, 0, 0], [0x3C, 1, 0x2D, 0, 0], [0x3D, 0, 0x2D, 0, 0], [0x3D, 0xFF, 0xFF, 0, 0]]
         {
-            assert!(!Kind::Standard.is_right(&wrong), "{wrong:02X?}");
+            assert!(!PacketFormat::Standard.is_valid(&wrong), "{wrong:02X?}");
         }
     }
 
@@ -233,13 +241,13 @@ mod tests {
     fn express_points_lie_before_their_places() {
         // 1,234 mm and 37 eighths of a degree, 40 mm and 26.
         let [a, b] = [1_234 << 2 | 2u16, 40 << 2 | 1].map(u16::to_le_bytes);
-        let bytes = packet(Kind::Express, &[0x80, 0x16, a[0], a[1], b[0], b[1], 0xA5]);
-        assert!(Kind::Express.is_right(&bytes[..84]));
-        assert_eq!(Kind::Express.start(&bytes), 90.0);
-        let points = [0, 1, 2].map(|i| Kind::Express.point(&bytes, &bytes, i));
-        assert_eq!(points[0], Measured { before: 4.625, range: 1_234, quality: 0 });
-        assert_eq!(points[1], Measured { before: 3.25, range: 40, quality: 0 });
-        assert_eq!(points[2], Measured::default());
+        let bytes = packet(PacketFormat::Express, &[0x80, 0x16, a[0], a[1], b[0], b[1], 0xA5]);
+        assert!(PacketFormat::Express.is_valid(&bytes[..84]));
+        assert_eq!(PacketFormat::Express.start_angle(&bytes), 90.0);
+        let points = [0, 1, 2].map(|i| PacketFormat::Express.point(&bytes, &bytes, i));
+        assert_eq!(points[0], PacketPoint { before: 4.625, range: 1_234, quality: 0 });
+        assert_eq!(points[1], PacketPoint { before: 3.25, range: 40, quality: 0 });
+        assert_eq!(points[2], PacketPoint::default());
     }
 
     #[test]
@@ -271,14 +279,15 @@ mod tests {
         let threes = [three(600, 10, -3), three(1_300, -512, 511), three(0, 5, -1), three(1_300, 0, 0)];
         let mut body = [0; 18];
         body[2..].copy_from_slice(threes.as_flattened());
-        let bytes = packet(Kind::Ultra, &body);
-        let ranges: [u16; 9] = core::array::from_fn(|i| Kind::Ultra.point(&bytes, &bytes, i).range);
+        let bytes = packet(PacketFormat::Ultra, &body);
+        let ranges: [u16; 9] = core::array::from_fn(|i| PacketFormat::Ultra.point(&bytes, &bytes, i).range);
         assert_eq!(ranges, [688, 708, 2_116, 2_128, 0, 0, 0, 2_148, 2_124]);
         // The last one differs from what the next packet begins with.
         let mut body = [0; 130];
         body[126..].copy_from_slice(&three(100, 0, 7));
-        let (last, next) = (packet(Kind::Ultra, &body), packet(Kind::Ultra, &[0, 0, 0x14, 0x05, 0, 0]));
-        assert_eq!(Kind::Ultra.point(&last, &next, 95).range, 2_128 + 7 * 4);
+        let (last, next) =
+            (packet(PacketFormat::Ultra, &body), packet(PacketFormat::Ultra, &[0, 0, 0x14, 0x05, 0, 0]));
+        assert_eq!(PacketFormat::Ultra.point(&last, &next, 95).range, 2_128 + 7 * 4);
     }
 
     #[test]
@@ -289,16 +298,16 @@ mod tests {
         // k is 24: 0.0234375 and 0.000002 radians.
         assert!((before(1_000) - 6.657).abs() < 1e-3, "{}", before(1_000));
         assert_eq!(before(25_000), 8.0);
-        let kinds = Kind::ALL.map(|kind| (kind.most_before(), kind.most_behind()));
+        let kinds = PacketFormat::ALL.map(|kind| (kind.max_before(), kind.max_after()));
         let ultra = (0..u16::MAX).map(before).map(f64::from);
         assert!(ultra.clone().all(|before| before < kinds[2].0 && -before < kinds[2].1));
     }
 
     #[test]
     fn dense_ranges_are_plain() {
-        let bytes = packet(Kind::Dense, &[0, 0, 0x10, 0x27, 0, 0]);
-        let ranges = [0, 1].map(|i| Kind::Dense.point(&bytes, &bytes, i).range);
-        assert_eq!((ranges, Kind::Dense.start(&bytes)), ([10_000, 0], 0.0));
+        let bytes = packet(PacketFormat::Dense, &[0, 0, 0x10, 0x27, 0, 0]);
+        let ranges = [0, 1].map(|i| PacketFormat::Dense.point(&bytes, &bytes, i).range);
+        assert_eq!((ranges, PacketFormat::Dense.start_angle(&bytes)), ([10_000, 0], 0.0));
     }
 
     #[test]
@@ -316,22 +325,24 @@ mod tests {
             place[2..4].copy_from_slice(&(two[1] as u16).to_le_bytes());
             place[4] = (two[0] >> 16 | two[1] >> 16 << 4) as u8;
         }
-        let bytes = packet(Kind::UltraDense, &body);
-        assert!(Kind::UltraDense.is_right(&bytes) && Kind::UltraDense.start(&bytes) == 90.0);
-        let points = [0, 1, 2, 3].map(|i| Kind::UltraDense.point(&bytes, &bytes, i));
+        let bytes = packet(PacketFormat::UltraDense, &body);
+        assert!(
+            PacketFormat::UltraDense.is_valid(&bytes) && PacketFormat::UltraDense.start_angle(&bytes) == 90.0
+        );
+        let points = [0, 1, 2, 3].map(|i| PacketFormat::UltraDense.point(&bytes, &bytes, i));
         assert_eq!(points.map(|point| point.range), [84, 2_346, 12_187, 39_567]);
         assert_eq!(points.map(|point| point.quality), [0x9A, 0x9A, 0x98, 0x98]);
     }
 
     #[test]
     fn every_bit_of_a_packet_with_a_checksum_counts() {
-        for kind in Kind::ALL.into_iter().filter(|kind| kind.is_checked()) {
+        for kind in PacketFormat::ALL.into_iter().filter(|kind| kind.is_checked()) {
             let right = packet(kind, &[0x80, 0x16, 1, 2, 3, 4, 0x80, 0x16, 7, 8, 9]);
-            assert!(kind.is_right(&right[..kind.bytes()]));
-            for bit in 0..kind.bytes() * 8 {
+            assert!(kind.is_valid(&right[..kind.byte_len()]));
+            for bit in 0..kind.byte_len() * 8 {
                 let mut bytes = right;
                 bytes[bit / 8] ^= 1 << (bit % 8);
-                assert!(!kind.is_right(&bytes[..kind.bytes()]), "{kind:?} {bit}");
+                assert!(!kind.is_valid(&bytes[..kind.byte_len()]), "{kind:?} {bit}");
             }
         }
     }

@@ -4,40 +4,40 @@
 
 use core::fmt;
 
-use crate::rplidar::packet::Kind;
+use crate::rplidar::packet::PacketFormat;
 use crate::rplidar::{Mode, Model, Motor};
 
 /// An encoded request.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Request {
-    bytes: [u8; Request::LONGEST],
+    bytes: [u8; Request::MAX_LEN],
     len: usize,
 }
 
 impl Request {
-    const LONGEST: usize = 12;
+    const MAX_LEN: usize = 12;
 
     /// Stops a stream. There is no response.
-    pub(crate) const STOP: Request = Request::plain(0x25);
+    pub(crate) const STOP: Request = Request::without_payload(0x25);
     /// Restarts the scanner.
-    pub(crate) const RESET: Request = Request::plain(0x40);
+    pub(crate) const RESET: Request = Request::without_payload(0x40);
     /// Starts the standard scan: single points.
-    pub(crate) const SCAN: Request = Request::plain(0x20);
+    pub(crate) const SCAN: Request = Request::without_payload(0x20);
     /// Requests model, versions and serial number.
-    pub(crate) const INFO: Request = Request::plain(0x50);
+    pub(crate) const INFO: Request = Request::without_payload(0x50);
     /// Requests the health.
-    pub(crate) const HEALTH: Request = Request::plain(0x52);
+    pub(crate) const HEALTH: Request = Request::without_payload(0x52);
     /// Requests the time per point of a scanner that does not list its modes.
-    pub(crate) const SAMPLE_TIMES: Request = Request::plain(0x59);
+    pub(crate) const SAMPLE_TIMES: Request = Request::without_payload(0x59);
 
-    const fn plain(command: u8) -> Request {
-        let mut bytes = [0; Request::LONGEST];
-        (bytes[0], bytes[1]) = (START, command);
+    const fn without_payload(command: u8) -> Request {
+        let mut bytes = [0; Request::MAX_LEN];
+        (bytes[0], bytes[1]) = (START_BYTE, command);
         Request { bytes, len: 2 }
     }
 
-    fn with(command: u8, payload: &[u8]) -> Request {
-        let mut request = Request::plain(command);
+    fn with_payload(command: u8, payload: &[u8]) -> Request {
+        let mut request = Request::without_payload(command);
         let end = 3 + payload.len();
         request.bytes[2] = payload.len() as u8;
         request.bytes[3..end].copy_from_slice(payload);
@@ -48,28 +48,28 @@ impl Request {
 
     /// Starts the scan mode with this number, whose packets contain several points.
     pub(crate) fn express(mode: u8) -> Request {
-        Request::with(0x82, &[mode, 0, 0, 0, 0])
+        Request::with_payload(0x82, &[mode, 0, 0, 0, 0])
     }
 
     /// Requests the value of `key`, of one mode if `mode` is given.
     pub(crate) fn configuration(key: u8, mode: Option<u8>) -> Request {
         let payload = [key, 0, 0, 0, mode.unwrap_or_default(), 0];
-        Request::with(0x84, &payload[..if mode.is_some() { 6 } else { 4 }])
+        Request::with_payload(0x84, &payload[..if mode.is_some() { 6 } else { 4 }])
     }
 
     /// Requests whether an accessory board controls the motor.
-    pub(crate) fn board() -> Request {
-        Request::with(0xFF, &[0; 4])
+    pub(crate) fn accessory_board() -> Request {
+        Request::with_payload(0xFF, &[0; 4])
     }
 
     /// Sets the duty cycle of the motor, 0 to 1,023.
-    pub(crate) fn duty(duty: u16) -> Request {
-        Request::with(0xF0, &duty.to_le_bytes())
+    pub(crate) fn set_motor_pwm(duty: u16) -> Request {
+        Request::with_payload(0xF0, &duty.to_le_bytes())
     }
 
     /// Sets the speed of the head, in revolutions per minute.
-    pub(crate) fn speed(turns_per_minute: u16) -> Request {
-        Request::with(0xA8, &turns_per_minute.to_le_bytes())
+    pub(crate) fn set_motor_speed(revolutions_per_minute: u16) -> Request {
+        Request::with_payload(0xA8, &revolutions_per_minute.to_le_bytes())
     }
 
     pub(crate) fn bytes(&self) -> &[u8] {
@@ -88,8 +88,8 @@ impl RequestQueue {
     /// Adds `request` after the requests that are queued, as far as there is room.
     pub(crate) fn push(&mut self, request: &Request) {
         for byte in request.bytes() {
-            if let Some(place) = self.bytes.get_mut(self.len) {
-                *place = *byte;
+            if let Some(slot) = self.bytes.get_mut(self.len) {
+                *slot = *byte;
                 self.len += 1;
             }
         }
@@ -108,7 +108,7 @@ pub(crate) mod key {
     /// Time per point of a mode, in 1/256 us.
     pub(crate) const SAMPLE_TIME: u8 = 0x71;
     /// Kind of the packets of a mode.
-    pub(crate) const ANSWER: u8 = 0x75;
+    pub(crate) const RESPONSE_TYPE: u8 = 0x75;
     /// Number of the mode that the manufacturer recommends.
     pub(crate) const TYPICAL: u8 = 0x7C;
     /// Name of a mode.
@@ -117,16 +117,16 @@ pub(crate) mod key {
 
 /// Descriptor at the beginning of a response.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Head {
+pub(crate) enum ResponseDescriptor {
     /// One response with this number of bytes follows.
-    Reply(Answer, usize),
+    Reply(ResponseType, usize),
     /// A stream of these packets follows, until it is stopped.
-    Stream(Kind),
+    Stream(PacketFormat),
 }
 
 /// The request that a response belongs to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Answer {
+pub(crate) enum ResponseType {
     /// [`Request::INFO`].
     Info,
     /// [`Request::HEALTH`].
@@ -135,66 +135,70 @@ pub(crate) enum Answer {
     SampleTimes,
     /// [`Request::configuration`].
     Configuration,
-    /// [`Request::board`].
+    /// [`Request::accessory_board`].
     Board,
 }
 
-impl Answer {
+impl ResponseType {
     /// Returns the type in the descriptor.
     const fn number(self) -> u8 {
         match self {
-            Answer::Info => 0x04,
-            Answer::Health => 0x06,
-            Answer::SampleTimes => 0x15,
-            Answer::Configuration => 0x20,
-            Answer::Board => 0xFF,
+            ResponseType::Info => 0x04,
+            ResponseType::Health => 0x06,
+            ResponseType::SampleTimes => 0x15,
+            ResponseType::Configuration => 0x20,
+            ResponseType::Board => 0xFF,
         }
     }
 }
 
-impl Head {
+impl ResponseDescriptor {
     /// Length of a descriptor, in bytes.
     pub(crate) const LEN: usize = 7;
 
     /// Decodes the descriptor that `bytes` begin with. Returns `None` if they begin with something else, or are too few.
-    pub(crate) fn parse(bytes: &[u8]) -> Option<Head> {
-        let &[START, 0x5A, a, b, c, d, answer] = bytes.first_chunk()? else { return None };
+    pub(crate) fn parse(bytes: &[u8]) -> Option<ResponseDescriptor> {
+        let &[START_BYTE, 0x5A, a, b, c, d, response] = bytes.first_chunk()? else { return None };
         let word = u32::from_le_bytes([a, b, c, d]);
         let (len, times) = ((word & 0x3FFF_FFFF) as usize, word >> 30);
-        match (times, answer, len) {
-            (0, 0x04, 20) => Some(Head::Reply(Answer::Info, len)),
-            (0, 0x06, 3) => Some(Head::Reply(Answer::Health, len)),
-            (0, 0x15, 4) => Some(Head::Reply(Answer::SampleTimes, len)),
-            (0, 0x20, 4..=LONGEST_REPLY) => Some(Head::Reply(Answer::Configuration, len)),
-            (0, 0xFF, 4) => Some(Head::Reply(Answer::Board, len)),
-            (1, answer, len) => Kind::of(answer).filter(|kind| kind.bytes() == len).map(Head::Stream),
+        match (times, response, len) {
+            (0, 0x04, 20) => Some(ResponseDescriptor::Reply(ResponseType::Info, len)),
+            (0, 0x06, 3) => Some(ResponseDescriptor::Reply(ResponseType::Health, len)),
+            (0, 0x15, 4) => Some(ResponseDescriptor::Reply(ResponseType::SampleTimes, len)),
+            (0, 0x20, 4..=MAX_RESPONSE_LEN) => {
+                Some(ResponseDescriptor::Reply(ResponseType::Configuration, len))
+            }
+            (0, 0xFF, 4) => Some(ResponseDescriptor::Reply(ResponseType::Board, len)),
+            (1, answer, len) => {
+                PacketFormat::of(answer).filter(|kind| kind.byte_len() == len).map(ResponseDescriptor::Stream)
+            }
             _ => None,
         }
     }
 
     /// Encodes the descriptor, in the form in which a scanner sends it.
-    pub(crate) fn encode(self) -> [u8; Head::LEN] {
+    pub(crate) fn encode(self) -> [u8; ResponseDescriptor::LEN] {
         let (len, times, kind) = match self {
-            Head::Reply(answer, len) => (len, 0, answer.number()),
-            Head::Stream(kind) => (kind.bytes(), 1, kind.answer()),
+            ResponseDescriptor::Reply(answer, len) => (len, 0, answer.number()),
+            ResponseDescriptor::Stream(kind) => (kind.byte_len(), 1, kind.response_type()),
         };
         let [a, b, c, d] = (len as u32 | times << 30).to_le_bytes();
-        [START, 0x5A, a, b, c, d, kind]
+        [START_BYTE, 0x5A, a, b, c, d, kind]
     }
 
     /// Returns whether `bytes` may be the beginning of a descriptor.
     pub(crate) fn begins(bytes: &[u8]) -> bool {
         match bytes {
             [] => true,
-            [first] => *first == START,
-            [first, second, ..] => *first == START && *second == 0x5A,
+            [first] => *first == START_BYTE,
+            [first, second, ..] => *first == START_BYTE && *second == 0x5A,
         }
     }
 }
 
-const START: u8 = 0xA5;
+const START_BYTE: u8 = 0xA5;
 /// Maximum length of a response: more than the longest name of a mode needs.
-const LONGEST_REPLY: usize = 64;
+const MAX_RESPONSE_LEN: usize = 64;
 
 /// Identity of a scanner, from its reply to `A5 50`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -307,7 +311,7 @@ pub(crate) struct StreamHead {
     /// Microseconds per point, if they are known.
     pub(crate) sample_us: Option<f64>,
     /// Kind of the packets.
-    pub(crate) kind: Kind,
+    pub(crate) kind: PacketFormat,
 }
 
 impl StreamHead {
@@ -316,26 +320,26 @@ impl StreamHead {
     pub(crate) fn encode(&self) -> Vec<u8> {
         let mut bytes = Vec::new();
         if let Some(info) = &self.info {
-            push(&mut bytes, Answer::Info, &info.encode());
+            push_response(&mut bytes, ResponseType::Info, &info.encode());
         }
         let mut value = |key: u8, value: &[u8]| {
-            push(&mut bytes, Answer::Configuration, &[&[key, 0, 0, 0], value].concat());
+            push_response(&mut bytes, ResponseType::Configuration, &[&[key, 0, 0, 0], value].concat());
         };
         value(key::COUNT, &[1, 0]);
         if let Some(us) = self.sample_us {
             value(key::SAMPLE_TIME, &((us * 256.0).round() as u32).to_le_bytes());
         }
-        value(key::ANSWER, &[self.kind.answer()]);
+        value(key::RESPONSE_TYPE, &[self.kind.response_type()]);
         if let Some(mode) = self.mode {
             value(key::NAME, &[mode.name().as_bytes(), &[0]].concat());
         }
-        bytes.extend(Head::Stream(self.kind).encode());
+        bytes.extend(ResponseDescriptor::Stream(self.kind).encode());
         bytes
     }
 }
 
-fn push(bytes: &mut Vec<u8>, answer: Answer, data: &[u8]) {
-    bytes.extend(Head::Reply(answer, data.len()).encode());
+fn push_response(bytes: &mut Vec<u8>, response: ResponseType, data: &[u8]) {
+    bytes.extend(ResponseDescriptor::Reply(response, data.len()).encode());
     bytes.extend(data);
 }
 
@@ -347,7 +351,7 @@ mod tests {
     fn requests_as_the_maker_writes_them() {
         assert_eq!(Request::STOP.bytes(), [0xA5, 0x25]);
         assert_eq!(Request::express(0).bytes(), [0xA5, 0x82, 5, 0, 0, 0, 0, 0, 0x22]);
-        assert_eq!(Request::duty(660).bytes(), [0xA5, 0xF0, 2, 0x94, 0x02, 0xC1]);
+        assert_eq!(Request::set_motor_pwm(660).bytes(), [0xA5, 0xF0, 2, 0x94, 0x02, 0xC1]);
         let asked = Request::configuration(key::NAME, Some(3));
         assert_eq!(asked.bytes(), [0xA5, 0x84, 6, 0x7F, 0, 0, 0, 3, 0, 0xA5 ^ 0x84 ^ 6 ^ 0x7F ^ 3]);
         assert_eq!(Request::configuration(key::COUNT, None).bytes(), [0xA5, 0x84, 4, 0x70, 0, 0, 0, 0x55]);
@@ -356,18 +360,21 @@ mod tests {
     #[test]
     fn heads_of_answers() {
         let info = [0xA5, 0x5A, 0x14, 0, 0, 0, 0x04];
-        assert_eq!(Head::parse(&info), Some(Head::Reply(Answer::Info, 20)));
+        assert_eq!(ResponseDescriptor::parse(&info), Some(ResponseDescriptor::Reply(ResponseType::Info, 20)));
         let express = [0xA5, 0x5A, 0x54, 0, 0, 0x40, 0x82];
-        assert_eq!(Head::parse(&express), Some(Head::Stream(Kind::Express)));
+        assert_eq!(
+            ResponseDescriptor::parse(&express),
+            Some(ResponseDescriptor::Stream(PacketFormat::Express))
+        );
         for bytes in [info, express] {
-            assert_eq!(Head::parse(&bytes).map(Head::encode), Some(bytes));
+            assert_eq!(ResponseDescriptor::parse(&bytes).map(ResponseDescriptor::encode), Some(bytes));
         }
         for (at, wrong) in [(0, 0xA4), (1, 0x5B), (2, 0x13), (5, 0x40), (6, 0x05)] {
             let mut bytes = info;
             bytes[at] = wrong;
-            assert_eq!(Head::parse(&bytes), None, "{at}");
+            assert_eq!(ResponseDescriptor::parse(&bytes), None, "{at}");
         }
-        assert_eq!(Head::parse(&info[..6]), None);
+        assert_eq!(ResponseDescriptor::parse(&info[..6]), None);
     }
 
     #[test]

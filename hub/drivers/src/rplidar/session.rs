@@ -9,28 +9,30 @@ use core::fmt;
 use scanhub_schema::{MILLIS, Nanos, line_time};
 
 use crate::line::{
-    self, Account, Closed, Condition, Control, Event, Introduction, Output, RawScan, Reads, Received, State,
-    StreamCounters, Tally, TurnCounts, Watchdog, family,
+    self, Action, ByteCounters, ClosedRevolution, Control, DeviceInfo, Event, HealthStatus, RawScan,
+    ReadScheduler, ReceivedTelegram, RevolutionCounts, SessionStats, State, StreamCounters, Watchdog, family,
 };
-use crate::rplidar::framer::{Expect, Found, Framer, Span};
-use crate::rplidar::handshake::{Handshake, Next, Query, RateSearch};
-use crate::rplidar::packet::Kind;
-use crate::rplidar::request::{Answer, Head, Health, Info, Request, RequestQueue, StreamHead};
-use crate::rplidar::stream::{Line, Stream};
-use crate::rplidar::{Mode, Model, described};
+use crate::rplidar::framer::{ExpectedBytes, Framer, FramerEvent, Span};
+use crate::rplidar::handshake::{Handshake, NextStep, Query, RateSearch};
+use crate::rplidar::packet::PacketFormat;
+use crate::rplidar::request::{
+    Health, Info, Request, RequestQueue, ResponseDescriptor, ResponseType, StreamHead,
+};
+use crate::rplidar::stream::{LineTiming, Stream};
+use crate::rplidar::{Mode, Model, describe};
 use crate::settings::Settings;
 
 /// The session with one scanner.
 #[derive(Clone, Debug)]
-pub struct Session {
+pub struct RplidarSession {
     settings: Settings,
     now: Nanos,
     phase: Phase,
     /// State that is shown until measured data arrive.
     shown: State,
-    trouble: Option<Trouble>,
+    problem: Option<Problem>,
     framer: Framer,
-    reads: Reads,
+    reads: ReadScheduler,
     rate: RateSearch,
     requests: RequestQueue,
     /// Level that the DTR line has to get.
@@ -38,7 +40,7 @@ pub struct Session {
     handshake: Handshake,
     stream: Stream,
     /// Kind of the stream and arrival of its descriptor, once the descriptor has arrived.
-    announced: Option<(Kind, Nanos)>,
+    announced: Option<(PacketFormat, Nanos)>,
     counters: StreamCounters,
     /// Time since which there are no subscribers.
     idle_since: Option<Nanos>,
@@ -55,24 +57,24 @@ enum Phase {
     /// The scanner restarts.
     Booting { until: Nanos },
     /// The scanner reports an error. The session requests the health again at `until`.
-    Unwell { until: Nanos },
+    Unhealthy { until: Nanos },
     /// Packets arrive.
     Streaming(Watchdog),
     /// A user paused the session, or, if `is_resting`, there are no subscribers.
-    Paused { is_resting: bool },
+    Paused { is_idle: bool },
 }
 
-impl Session {
+impl RplidarSession {
     /// Creates a session on a port that is open at the rate of `settings`.
     pub fn new(settings: Settings, now: Nanos) -> Self {
-        let mut session = Session {
+        let mut session = RplidarSession {
             settings,
             now,
             phase: Phase::Listening { since: now },
             shown: State::Probing,
-            trouble: None,
-            framer: Framer::new(Expect::Nothing),
-            reads: Reads::new(now),
+            problem: None,
+            framer: Framer::new(ExpectedBytes::Nothing),
+            reads: ReadScheduler::new(now),
             rate: RateSearch::new(&settings),
             requests: RequestQueue::default(),
             change_dtr: None,
@@ -107,13 +109,13 @@ impl Session {
     }
 
     /// Returns the counters of the framer.
-    pub fn tally(&self) -> &Tally {
-        self.framer.buffer.tally()
+    pub fn byte_counters(&self) -> &ByteCounters {
+        self.framer.buffer.byte_counters()
     }
 
     /// Returns the numbers of revolutions by kind.
-    pub fn turn_counts(&self) -> TurnCounts {
-        self.stream.turn_counts()
+    pub fn revolution_counts(&self) -> RevolutionCounts {
+        self.stream.revolution_counts()
     }
 
     /// Begins again at the current rate. The session shows the state `shown` until measured data arrive.
@@ -123,7 +125,7 @@ impl Session {
         self.shown = shown;
         if self.settings.listen_only {
             self.phase = Phase::Listening { since: self.now };
-            return self.framer.expect(Expect::Anything(self.handshake.alike()));
+            return self.framer.expect(ExpectedBytes::AnyPackets(self.handshake.ambiguous_format()));
         }
         // Opening a port asserts it, which keeps the motor of an A1 off.
         self.change_dtr = Some(false);
@@ -132,23 +134,23 @@ impl Session {
 
     /// Sends the stop request. The first query follows; `attempts` of it were not answered.
     fn stop(&mut self, attempts: u8) {
-        self.framer.expect(Expect::Answers);
+        self.framer.expect(ExpectedBytes::Responses);
         self.requests = RequestQueue::default();
         self.requests.push(&Request::STOP);
-        let (until, at_most) = (self.now + QUIET, self.now + DRAIN);
+        let (until, at_most) = (self.now + QUIET_TIME, self.now + MAX_DRAIN_TIME);
         self.phase = Phase::Draining { attempts, until, at_most };
     }
 
     /// Stops the stream and the motor, and expects nothing.
-    fn rest(&mut self, is_resting: bool) {
+    fn stop_scanner(&mut self, is_idle: bool) {
         self.end_stream();
-        self.framer.expect(Expect::Nothing);
+        self.framer.expect(ExpectedBytes::Nothing);
         if !self.settings.listen_only {
             self.requests = RequestQueue::default();
             self.requests.push(&Request::STOP);
             self.set_motor(false);
         }
-        self.phase = Phase::Paused { is_resting };
+        self.phase = Phase::Paused { is_idle };
     }
 
     /// Starts the motor, or stops it.
@@ -174,11 +176,13 @@ impl Session {
     }
 
     /// Restarts the timeout after a request was sent completely.
-    fn requests_sent(&mut self) {
+    fn on_requests_sent(&mut self) {
         let (now, timeout) = (self.now, self.response_timeout());
         match &mut self.phase {
             Phase::Querying { until, .. } => *until = now + timeout,
-            Phase::Draining { until, at_most, .. } => (*until, *at_most) = (now + QUIET, now + DRAIN),
+            Phase::Draining { until, at_most, .. } => {
+                (*until, *at_most) = (now + QUIET_TIME, now + MAX_DRAIN_TIME)
+            }
             _ => {}
         }
     }
@@ -188,83 +192,83 @@ impl Session {
     }
 
     /// Handles a response with its descriptor in `span`.
-    fn answered(&mut self, answer: Answer, span: Span) {
+    fn on_response(&mut self, response: ResponseType, span: Span) {
         let query = if let Phase::Querying { query, .. } = self.phase { Some(query) } else { None };
-        let data = &self.framer.bytes(span)[Head::LEN..];
-        let next = self.handshake.answered(query, answer, data, self.rate.baud);
+        let data = &self.framer.bytes(span)[ResponseDescriptor::LEN..];
+        let next = self.handshake.handle_response(query, response, data, self.rate.baud);
         self.proceed(next);
     }
 
     /// Handles that no response to `query` arrived.
-    fn unanswered(&mut self, query: Query, attempts: u8) {
+    fn on_no_response(&mut self, query: Query, attempts: u8) {
         // Bytes arrived, but no valid response. The response may have been damaged, so do not conclude that the request
         // is unsupported.
         let is_damaged =
             self.reads.last_byte() + self.response_timeout() > self.now && attempts < MAX_ATTEMPTS;
         match query {
             Query::Info if attempts == 0 && is_damaged => self.stop(1),
-            Query::Info => self.search_on(),
+            Query::Info => self.search_next_rate(),
             _ if attempts == 0 || is_damaged => self.query(query, attempts + 1),
             _ => {
-                let next = self.handshake.unanswered(query, self.rate.baud);
+                let next = self.handshake.handle_no_response(query, self.rate.baud);
                 self.proceed(next);
             }
         }
     }
 
     /// Carries out the next step of the handshake.
-    fn proceed(&mut self, next: Next) {
+    fn proceed(&mut self, next: NextStep) {
         match next {
-            Next::Nothing => {}
-            Next::Found(query) => {
+            NextStep::Nothing => {}
+            NextStep::ScannerFound(query) => {
                 self.rate.end();
                 if self.shown == State::Probing {
                     self.shown = State::Starting;
                 }
                 self.query(query, 0);
             }
-            Next::Query(query) => self.query(query, 0),
-            Next::Reset => {
+            NextStep::Query(query) => self.query(query, 0),
+            NextStep::Reset => {
                 self.rate.forget_stream();
                 self.requests.push(&Request::RESET);
-                self.phase = Phase::Booting { until: self.now + BOOT };
+                self.phase = Phase::Booting { until: self.now + RESET_TIMEOUT };
             }
-            Next::Unwell(health) => {
-                self.trouble = Some(Trouble::Unwell(health));
-                self.phase = Phase::Unwell { until: self.now + HEALTH_RETRY_INTERVAL };
+            NextStep::Unhealthy(health) => {
+                self.problem = Some(Problem::Unhealthy(health));
+                self.phase = Phase::Unhealthy { until: self.now + HEALTH_RETRY_INTERVAL };
             }
-            Next::StartMotor(query) => {
+            NextStep::StartMotor(query) => {
                 self.set_motor(true);
                 self.query(query, 0);
             }
-            Next::Scan(mode) => {
+            NextStep::Scan(mode) => {
                 self.stream.set_sample_us(mode.sample_us);
                 self.query(mode.query(), 0);
             }
-            Next::Restart => self.begin(self.shown),
-            Next::Refused => {
-                self.trouble = Some(Trouble::Refused);
+            NextStep::Restart => self.begin(self.shown),
+            NextStep::Refused => {
+                self.problem = Some(Problem::Refused);
                 self.stop(0);
             }
         }
     }
 
     /// Tries the next rate, and updates the time in the trouble.
-    fn search_on(&mut self) {
-        let since = self.rate.advance(self.now, self.framer.buffer.tally().read);
-        self.complain(since);
+    fn search_next_rate(&mut self) {
+        let since = self.rate.advance(self.now, self.framer.buffer.byte_counters().read);
+        self.report_no_response(since);
         self.stop(0);
     }
 
     /// Reports that no response has arrived since `since`.
-    fn complain(&mut self, since: Nanos) {
-        if self.trouble != Some(Trouble::Alike) {
-            self.trouble = self.rate.no_answer(since, self.now).or(self.trouble);
+    fn report_no_response(&mut self, since: Nanos) {
+        if self.problem != Some(Problem::AmbiguousPackets) {
+            self.problem = self.rate.no_response_problem(since, self.now).or(self.problem);
         }
     }
 
-    /// Handles the boot message of a scanner, which has lost its settings. `is_named` as of [`Found::Greeting`].
-    fn booted(&mut self, is_named: bool) {
+    /// Handles the boot message of a scanner, which has lost its settings. `is_named` as of [`Found::BootMessage`].
+    fn on_boot_message(&mut self, is_named: bool) {
         match self.phase {
             Phase::Paused { .. } | Phase::Listening { .. } => {}
             // The first query follows anyway. A stream at another rate may look like text again and again.
@@ -273,13 +277,14 @@ impl Session {
                     self.counters.note_restart();
                 }
             }
-            Phase::Booting { .. } => self.phase = Phase::Booting { until: self.now + SETTLE },
+            Phase::Booting { .. } => self.phase = Phase::Booting { until: self.now + SETTLE_TIME },
             // The rest of a packet may be text too, but a scanner that boots pauses before its boot message. A name
             // proves it even after other bytes, which a scanner sends while its supply drops.
             Phase::Streaming(watchdog)
                 if !is_named
-                    && (watchdog.silent_at().abs_diff(self.now + Watchdog::SILENCE) < BOOT_SILENCE
-                        || self.framer.skipped() > Kind::LONGEST as u32 + BOOT_MESSAGE_LEN) => {}
+                    && (watchdog.silent_at().abs_diff(self.now + Watchdog::SILENCE_TIMEOUT)
+                        < BOOT_SILENCE
+                        || self.framer.skipped() > PacketFormat::MAX_LEN as u32 + BOOT_MESSAGE_LEN) => {}
             // A stream whose beginning was damaged looks like text here and there.
             Phase::Querying { .. } if !is_named => {}
             phase => {
@@ -290,32 +295,32 @@ impl Session {
                 self.rate.forget_stream();
                 self.begin(State::Starting);
                 self.requests = RequestQueue::default();
-                self.phase = Phase::Booting { until: self.now + SETTLE };
+                self.phase = Phase::Booting { until: self.now + SETTLE_TIME };
             }
         }
     }
 
     /// Handles the descriptor of a stream.
-    fn stream_begins(&mut self) {
+    fn on_stream_begin(&mut self) {
         match self.phase {
             // Another stream, in an unknown mode: of another program, or of another scanner.
-            Phase::Streaming(_) if !self.settings.listen_only && !self.is_announced_again() => {
+            Phase::Streaming(_) if !self.settings.listen_only && !self.is_repeated_announcement() => {
                 self.counters.note_resync();
                 self.begin(State::Starting);
             }
-            Phase::Querying { query, .. } if !query.is_scan() => self.framer.expect(Expect::Answers),
+            Phase::Querying { query, .. } if !query.is_scan() => self.framer.expect(ExpectedBytes::Responses),
             Phase::Querying { .. } | Phase::Listening { .. } | Phase::Streaming(_) => {
                 self.end_stream();
                 self.announced = self.framer.kind().map(|kind| (kind, self.now));
                 self.framer.kind().into_iter().for_each(|kind| self.handshake.stream_begins(kind));
                 let mut watchdog = self.continue_stream();
-                watchdog.await_spin_up(self.now + SPIN_UP);
+                watchdog.await_spin_up(self.now + SPIN_UP_TIME);
                 self.phase = Phase::Streaming(watchdog);
-                self.counters.await_revolution(self.framer.buffer.tally());
+                self.counters.await_revolution(self.framer.buffer.byte_counters());
             }
-            Phase::Paused { .. } => self.framer.expect(Expect::Nothing),
-            Phase::Draining { .. } | Phase::Booting { .. } | Phase::Unwell { .. } => {
-                self.framer.expect(Expect::Answers);
+            Phase::Paused { .. } => self.framer.expect(ExpectedBytes::Nothing),
+            Phase::Draining { .. } | Phase::Booting { .. } | Phase::Unhealthy { .. } => {
+                self.framer.expect(ExpectedBytes::Responses);
             }
         }
     }
@@ -323,11 +328,11 @@ impl Session {
     /// Returns whether the descriptor that has just arrived announces the session's own stream once more: the scanner
     /// responds to a request and to its repetition. A head may need a second to reach its speed. During this time, another
     /// scanner or program can start a stream, too.
-    fn is_announced_again(&self) -> bool {
-        let is_repeated = |(kind, at): (Kind, Nanos)| {
+    fn is_repeated_announcement(&self) -> bool {
+        let is_repeated = |(kind, at): (PacketFormat, Nanos)| {
             self.framer.kind() == Some(kind) && self.now < at + 2 * self.response_timeout()
         };
-        !self.stream.is_begun() && self.announced.is_some_and(is_repeated)
+        !self.stream.has_begun() && self.announced.is_some_and(is_repeated)
     }
 
     /// Starts or extends the stream after packets have arrived. Returns its deadlines.
@@ -336,10 +341,10 @@ impl Session {
         if let Phase::Streaming(known) = self.phase {
             watchdog = known;
             watchdog.note_packets(self.now);
-            self.counters.continue_stream(self.framer.buffer.tally());
+            self.counters.continue_stream(self.framer.buffer.byte_counters());
         } else {
-            self.trouble = None;
-            self.counters.begin_stream(self.framer.buffer.tally());
+            self.problem = None;
+            self.counters.begin_stream(self.framer.buffer.byte_counters());
         }
         self.phase = Phase::Streaming(watchdog);
         self.rate.note_stream();
@@ -349,28 +354,28 @@ impl Session {
     /// Ends the stream: the next packet belongs to another one.
     fn end_stream(&mut self) {
         self.stream.end();
-        self.reads.end_rest();
+        self.reads.cancel_wait();
     }
 
     /// Stamps the packets of `span`, and keeps them for revolutions.
-    fn receive(&mut self, kind: Kind, mut span: Span) -> Received<'_> {
+    fn receive(&mut self, kind: PacketFormat, mut span: Span) -> ReceivedTelegram<'_> {
         self.continue_stream();
-        span.reasons |= self.reads.take_doubt(span.offset + span.len as u64);
+        span.reasons |= self.reads.take_suspect(span.offset + span.len as u64);
         let baud = self.rate.baud;
-        let pace = (!self.settings.fixed_rate).then_some(baud);
-        let line = Line { arrivals: self.reads.arrivals(), baud, pace };
+        let line_rate = (!self.settings.fixed_rate).then_some(baud);
+        let line_timing = LineTiming { read_log: self.reads.read_log(), baud, line_rate };
         let mut stamps = None;
-        if self.stream.measure(kind, span, line, &self.handshake.modes) {
-            stamps = self.stream.place(kind, &mut span, &mut self.framer, line, &self.handshake);
-            self.counters.note_packets(self.framer.buffer.tally(), span.packets);
+        if self.stream.measure_point_time(kind, span, line_timing, &self.handshake.modes) {
+            stamps = self.stream.locate(kind, &mut span, &mut self.framer, line_timing, &self.handshake);
+            self.counters.note_packets(self.framer.buffer.byte_counters(), span.packets);
         }
-        let packet_time = line_time(kind.bytes(), baud);
-        let latest = line.arrivals.latest(span.offset + span.len as u64 - 1, pace);
+        let packet_time = line_time(kind.byte_len(), baud);
+        let latest = line_timing.read_log.latest(span.offset + span.len as u64 - 1, line_rate);
         let latest = latest.saturating_sub(packet_time);
         let (first, last) = stamps.unwrap_or((latest, latest));
         let first = first.min(self.now);
-        let last = self.reads.date_packet((last + packet_time).clamp(first, self.now.max(first)));
-        Received {
+        let last = self.reads.stamp_packet((last + packet_time).clamp(first, self.now.max(first)));
+        ReceivedTelegram {
             bytes: self.framer.bytes(span),
             first,
             last,
@@ -379,13 +384,13 @@ impl Session {
             count: span.packets,
             is_checked: kind.is_checked(),
             is_reply: false,
-            whole: None,
+            contents: None,
         }
     }
 
     /// Returns the packets of a response for the caller.
-    fn reply(&self, span: Span) -> Received<'_> {
-        Received {
+    fn reply(&self, span: Span) -> ReceivedTelegram<'_> {
+        ReceivedTelegram {
             bytes: self.framer.bytes(span),
             first: self.reads.last_byte(),
             last: self.reads.last_byte(),
@@ -394,51 +399,55 @@ impl Session {
             count: span.packets,
             is_checked: false,
             is_reply: true,
-            whole: None,
+            contents: None,
         }
     }
 
     /// Returns a complete revolution, and updates the state of the session.
-    fn show(&mut self, closed: Closed) -> RawScan<'_> {
-        let first = self.stream.scan(closed, &self.reads, self.now).first;
-        self.reads.end_turn(first);
-        self.trouble = None;
+    fn complete_revolution(&mut self, revolution: ClosedRevolution) -> RawScan<'_> {
+        let first = self.stream.to_scan(revolution, &self.reads, self.now).first;
+        self.reads.end_revolution(first);
+        self.problem = None;
         if let Phase::Streaming(watchdog) = &mut self.phase {
             watchdog.note_revolution(self.now);
         }
-        self.counters.await_revolution(self.framer.buffer.tally());
-        self.stream.scan(closed, &self.reads, self.now)
+        self.counters.await_revolution(self.framer.buffer.byte_counters());
+        self.stream.to_scan(revolution, &self.reads, self.now)
     }
 
     /// Handles deadlines after all bytes were framed. Bytes that belong to nothing do not extend a deadline.
-    fn expire(&mut self) {
+    fn handle_deadlines(&mut self) {
         let now = self.now;
         let is_idle =
-            self.settings.stop_when_idle && self.idle_since.is_some_and(|since| now >= since + IDLE);
+            self.settings.stop_when_idle && self.idle_since.is_some_and(|since| now >= since + IDLE_TIME);
         if is_idle && !self.settings.listen_only && !matches!(self.phase, Phase::Paused { .. }) {
-            return self.rest(true);
+            return self.stop_scanner(true);
         }
         match self.phase {
-            Phase::Listening { .. } if self.framer.is_alike() => self.trouble = Some(Trouble::Alike),
-            Phase::Listening { since } => self.complain(since),
+            Phase::Listening { .. } if self.framer.is_ambiguous() => {
+                self.problem = Some(Problem::AmbiguousPackets)
+            }
+            Phase::Listening { since } => self.report_no_response(since),
             Phase::Draining { until, at_most, .. }
                 if until > at_most && now >= at_most && self.rate.is_quick(now) =>
             {
-                self.search_on();
+                self.search_next_rate();
             }
             Phase::Draining { attempts, until, at_most } if now >= until.min(at_most) => {
                 self.query(Query::Info, attempts);
             }
-            Phase::Querying { query, attempts, until } if now >= until => self.unanswered(query, attempts),
-            Phase::Booting { until } | Phase::Unwell { until } if now >= until => self.begin(self.shown),
+            Phase::Querying { query, attempts, until } if now >= until => {
+                self.on_no_response(query, attempts)
+            }
+            Phase::Booting { until } | Phase::Unhealthy { until } if now >= until => self.begin(self.shown),
             Phase::Streaming(watchdog) if watchdog.is_silent(now) => {
                 self.counters.note_resync();
-                self.trouble = Some(Trouble::Silence);
+                self.problem = Some(Problem::Silence);
                 self.begin(State::Silent);
             }
             Phase::Streaming(watchdog) if watchdog.is_revolution_overdue(now) => {
-                let is_damaged = self.counters.is_mostly_damaged(self.framer.buffer.tally());
-                self.trouble = (!is_damaged).then_some(Trouble::StandsStill);
+                let is_damaged = self.counters.is_mostly_damaged(self.framer.buffer.byte_counters());
+                self.problem = (!is_damaged).then_some(Problem::HeadBlocked);
             }
             _ => {}
         }
@@ -454,26 +463,26 @@ impl Session {
             }
             Phase::Paused { .. } => Nanos::MAX,
             Phase::Draining { until, at_most, .. } => until.min(at_most),
-            Phase::Querying { until, .. } | Phase::Booting { until } | Phase::Unwell { until } => until,
+            Phase::Querying { until, .. } | Phase::Booting { until } | Phase::Unhealthy { until } => until,
             Phase::Streaming(watchdog) => watchdog.silent_at(),
         }
     }
 }
 
-impl line::Protocol for Session {
-    fn spare(&mut self) -> &mut [u8] {
-        let spare = self.framer.buffer.spare();
-        self.reads.offer(spare.len());
+impl line::Protocol for RplidarSession {
+    fn read_buffer(&mut self) -> &mut [u8] {
+        let spare = self.framer.buffer.read_buffer();
+        self.reads.set_buffer_len(spare.len());
         spare
     }
 
     fn commit(&mut self, now: Nanos, len: usize) {
         self.now = now;
-        self.reads.note(now, len, line::Session::state(self) == State::Streaming);
+        self.reads.note_read(now, len, line::ScannerSession::state(self) == State::Streaming);
         if len > 0 {
             self.framer.buffer.commit(len);
             if let Phase::Draining { until, .. } = &mut self.phase {
-                *until = now + QUIET;
+                *until = now + QUIET_TIME;
             }
         }
     }
@@ -483,64 +492,64 @@ impl line::Protocol for Session {
         self.framer.buffer.release(now.saturating_sub(self.reads.last_byte()));
     }
 
-    fn transmitted(&mut self, now: Nanos) {
+    fn handle_transmitted(&mut self, now: Nanos) {
         self.now = now;
         self.requests = RequestQueue::default();
-        self.requests_sent();
+        self.on_requests_sent();
     }
 
-    fn poll_output(&mut self) -> Output<'_> {
+    fn poll_action(&mut self) -> Action<'_> {
         loop {
             if let Some(on) = self.change_dtr.take() {
-                return Output::SetDtr(on);
+                return Action::SetDtr(on);
             }
             if let Some(baud) = self.rate.take_change() {
                 self.framer.clear();
-                return Output::SetRate(baud);
+                return Action::SetRate(baud);
             }
             if !self.requests.bytes().is_empty() {
-                return Output::Transmit { bytes: self.requests.bytes(), not_before: 0 };
+                return Action::Transmit { bytes: self.requests.bytes(), not_before: 0 };
             }
             if let Some(closed) = self.stream.advance(&self.framer) {
-                return Output::Event(Event::Scan(self.show(closed)));
+                return Action::Event(Event::Scan(self.complete_revolution(closed)));
             }
-            let most = self.framer.kind().map_or(1, |kind| self.stream.max_packets_per_sample(kind));
-            let Some(found) = self.framer.advance(most) else { break };
+            let max_packets = self.framer.kind().map_or(1, |kind| self.stream.max_packets_per_sample(kind));
+            let Some(found) = self.framer.advance(max_packets) else { break };
             match found {
-                Found::Reply(answer, span) => {
-                    self.answered(answer, span);
-                    return Output::Event(Event::Telegram(self.reply(span)));
+                FramerEvent::Reply(answer, span) => {
+                    self.on_response(answer, span);
+                    return Action::Event(Event::Telegram(self.reply(span)));
                 }
-                Found::Stream(span) => {
-                    self.stream_begins();
-                    return Output::Event(Event::Telegram(self.reply(span)));
+                FramerEvent::Stream(span) => {
+                    self.on_stream_begin();
+                    return Action::Event(Event::Telegram(self.reply(span)));
                 }
-                Found::Packets(kind, span) => {
-                    return Output::Event(Event::Telegram(self.receive(kind, span)));
+                FramerEvent::Packets(kind, span) => {
+                    return Action::Event(Event::Telegram(self.receive(kind, span)));
                 }
-                Found::Greeting { is_named } => self.booted(is_named),
+                FramerEvent::BootMessage { is_named } => self.on_boot_message(is_named),
             }
         }
-        self.expire();
-        if self.change_dtr.is_some() || self.rate.is_changed || !self.requests.bytes().is_empty() {
-            return self.poll_output();
+        self.handle_deadlines();
+        if self.change_dtr.is_some() || self.rate.needs_change || !self.requests.bytes().is_empty() {
+            return self.poll_action();
         }
-        self.reads.wait(self.now, self.deadline(), self.framer.buffer.hold())
+        self.reads.wait_action(self.now, self.deadline(), self.framer.buffer.hold())
     }
 }
 
-impl line::Session for Session {
-    type Trouble = Trouble;
+impl line::ScannerSession for RplidarSession {
+    type Problem = Problem;
 
     fn control(&mut self, control: Control, now: Nanos) {
         self.now = now;
         match (control, self.phase) {
-            (Control::Pause, _) => self.rest(false),
-            (Control::Resume, Phase::Paused { is_resting: false }) => self.begin(State::Probing),
+            (Control::Pause, _) => self.stop_scanner(false),
+            (Control::Resume, Phase::Paused { is_idle: false }) => self.begin(State::Probing),
             (Control::Resume, _) => {}
             (Control::Resync, _) => {
                 self.counters.note_resync();
-                self.trouble = None;
+                self.problem = None;
                 self.begin(State::Probing);
             }
         }
@@ -553,18 +562,18 @@ impl line::Session for Session {
             return;
         }
         self.idle_since = None;
-        if let Phase::Paused { is_resting: true } = self.phase {
+        if let Phase::Paused { is_idle: true } = self.phase {
             self.begin(State::Starting);
         }
     }
 
     fn end(&mut self, now: Nanos) -> bool {
         self.now = now;
-        let is_at_work = !self.settings.listen_only && !matches!(self.phase, Phase::Paused { .. });
-        if is_at_work {
-            self.rest(false);
+        let is_active = !self.settings.listen_only && !matches!(self.phase, Phase::Paused { .. });
+        if is_active {
+            self.stop_scanner(false);
         }
-        is_at_work
+        is_active
     }
 
     fn state(&self) -> State {
@@ -575,29 +584,29 @@ impl line::Session for Session {
         }
     }
 
-    fn trouble(&self) -> Option<Trouble> {
+    fn problem(&self) -> Option<Problem> {
         let is_paused = matches!(self.phase, Phase::Paused { .. });
-        let no_mode = self.handshake.unavailable_mode.map(Trouble::NoMode);
+        let unavailable_mode = self.handshake.unavailable_mode.map(Problem::ModeUnavailable);
         let warning =
-            self.health().filter(|health| matches!(health, Health::Warning(_))).map(Trouble::Unwell);
-        self.trouble.or(no_mode).or(warning).filter(|_| !is_paused)
+            self.health().filter(|health| matches!(health, Health::Warning(_))).map(Problem::Unhealthy);
+        self.problem.or(unavailable_mode).or(warning).filter(|_| !is_paused)
     }
 
-    fn missing(&self) -> Option<&'static str> {
-        matches!(self.trouble(), Some(Trouble::NoAnswer { .. })).then_some("RPLIDAR replies")
+    fn missing_transmission(&self) -> Option<&'static str> {
+        matches!(self.problem(), Some(Problem::NoResponse { .. })).then_some("RPLIDAR replies")
     }
 
     fn rate(&self) -> u32 {
         self.rate.baud
     }
 
-    fn account(&self) -> Account {
-        let (tally, buffered) = (self.framer.buffer.tally(), self.framer.buffer.open().len());
-        self.counters.account(tally, buffered, self.stream.came_and_lost())
+    fn stats(&self) -> SessionStats {
+        let (tally, buffered) = (self.framer.buffer.byte_counters(), self.framer.buffer.open_bytes().len());
+        self.counters.stats(tally, buffered, self.stream.received_and_lost())
     }
 
     fn model(&self) -> Option<family::Model> {
-        self.model().map(described)
+        self.model().map(describe)
     }
 
     fn beams(&self) -> Option<usize> {
@@ -606,16 +615,16 @@ impl line::Session for Session {
 
     fn partial_scan(&self) -> Option<RawScan<'_>> {
         let closed = self.framer.kind().and_then(|kind| self.stream.partial_revolution(kind))?;
-        Some(self.stream.scan(closed, &self.reads, self.now))
+        Some(self.stream.to_scan(closed, &self.reads, self.now))
     }
 
-    fn other_model(&self) -> Option<family::Model> {
+    fn unexpected_model(&self) -> Option<family::Model> {
         let reported = self.info().and_then(|info| info.model())?;
-        Model::of(&self.settings).filter(|wanted| *wanted != reported).map(|_| described(reported))
+        Model::of(&self.settings).filter(|configured| *configured != reported).map(|_| describe(reported))
     }
 
     fn missing_setting(&self) -> Option<&'static str> {
-        (line::Session::trouble(self) == Some(Trouble::Alike)).then_some("model or mode")
+        (line::ScannerSession::problem(self) == Some(Problem::AmbiguousPackets)).then_some("model or mode")
     }
 
     fn model_text(&self) -> Option<String> {
@@ -623,18 +632,18 @@ impl line::Session for Session {
         self.model().map(|model| model.name().to_uppercase()).or_else(number)
     }
 
-    fn stream_head(&self, reported: &str, beams: Option<usize>) -> Vec<u8> {
+    fn stream_responses(&self, reported: &str, beams: Option<usize>) -> Vec<u8> {
         let Some(kind) = self.framer.kind() else { return Vec::new() };
         let (model, modes) = (self.model(), &self.handshake.modes);
         if self.announced.is_some() && self.info().is_some() && modes.is_unambiguous(kind) {
             return Vec::new();
         }
         let sample_us = self.stream.reported_us(model, beams);
-        let of_status = reported.split_whitespace().nth(1).and_then(Mode::named);
-        let is_it = |mode: &Mode| sample_us.is_some_and(|us| modes.has(*mode, kind, us as f32));
+        let of_status = reported.split_whitespace().nth(1).and_then(Mode::from_name);
+        let is_reported = |mode: &Mode| sample_us.is_some_and(|us| modes.has(*mode, kind, us as f32));
         let head = StreamHead {
             info: self.info().or_else(|| Info::of_status(model, reported)),
-            mode: self.handshake.mode.or(of_status.filter(is_it)),
+            mode: self.handshake.mode.or(of_status.filter(is_reported)),
             sample_us,
             kind,
         };
@@ -653,20 +662,20 @@ impl line::Session for Session {
     }
 
     fn mark_suspect(&mut self, reasons: u8) {
-        self.reads.doubt(reasons);
+        self.reads.mark_suspect(reasons);
     }
 
     fn begin_at(&mut self, rate: u32, _: Nanos) {
         self.rate.begin_at(rate);
     }
 
-    fn introduction(&self) -> Option<Introduction> {
+    fn device_info(&self) -> Option<DeviceInfo> {
         // The health is known, unless the scanner does not respond to that request.
-        let is_asked = matches!(
+        let is_unconfirmed = matches!(
             self.phase,
             Phase::Draining { .. } | Phase::Querying { query: Query::Info | Query::Health, .. }
         );
-        let info = self.info().filter(|_| !is_asked)?;
+        let info = self.info().filter(|_| !is_unconfirmed)?;
         let (major, minor) = info.firmware;
         let serial: String = info.serial.iter().map(|byte| format!("{byte:02X}")).collect();
         let model = match info.model() {
@@ -675,14 +684,14 @@ impl line::Session for Session {
         };
         let hardware = info.hardware;
         let identity = format!("{model}firmware {major}.{minor:02}, hardware {hardware}, number {serial}");
-        Some(Introduction {
+        Some(DeviceInfo {
             identity,
             health: self.health().map_or_else(String::new, |health| health.to_string()),
             condition: match self.health() {
-                None => Condition::Unknown,
-                Some(Health::Good) => Condition::Good,
-                Some(Health::Warning(_)) => Condition::Warning,
-                Some(Health::Error(_)) => Condition::Error,
+                None => HealthStatus::Unknown,
+                Some(Health::Good) => HealthStatus::Good,
+                Some(Health::Warning(_)) => HealthStatus::Warning,
+                Some(Health::Error(_)) => HealthStatus::Error,
             },
         })
     }
@@ -690,9 +699,9 @@ impl line::Session for Session {
 
 /// Reason why a session does not stream as it should.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Trouble {
+pub enum Problem {
     /// No response, or no packets in a recording.
-    NoAnswer {
+    NoResponse {
         /// The only rate that the session tried. `None`: it tried all.
         baud: Option<u32>,
         /// Seconds without a response, rounded down to 1, 2, 4, ..
@@ -701,21 +710,21 @@ pub enum Trouble {
     /// No measured data arrived for one second.
     Silence,
     /// Packets arrive, but the head does not rotate.
-    StandsStill,
+    HeadBlocked,
     /// The scanner reports a warning or an error.
-    Unwell(Health),
+    Unhealthy(Health),
     /// The scanner responds, but does not begin to measure.
     Refused,
     /// A recording contains packets that may be of two kinds, and nothing shows which kind they are.
-    Alike,
+    AmbiguousPackets,
     /// The scanner does not have this mode, or the line is too slow for it. The scanner uses another mode.
-    NoMode(Mode),
+    ModeUnavailable(Mode),
 }
 
-impl fmt::Display for Trouble {
+impl fmt::Display for Problem {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Trouble::NoAnswer { baud, seconds } => {
+            Problem::NoResponse { baud, seconds } => {
                 f.write_str("no answer at ")?;
                 match baud {
                     Some(baud) => write!(f, "{baud}")?,
@@ -723,14 +732,14 @@ impl fmt::Display for Trouble {
                 }
                 write!(f, " baud for {seconds} s: power, cable, other port?")
             }
-            Trouble::Silence => f.write_str("no measured data for one second"),
-            Trouble::StandsStill => f.write_str("packets come, but the head does not turn: is it blocked?"),
-            Trouble::Unwell(health) => write!(f, "the scanner reports: {health}"),
-            Trouble::Refused => f.write_str("the scanner answers, but does not begin to measure"),
-            Trouble::Alike => f.write_str(
+            Problem::Silence => f.write_str("no measured data for one second"),
+            Problem::HeadBlocked => f.write_str("packets come, but the head does not turn: is it blocked?"),
+            Problem::Unhealthy(health) => write!(f, "the scanner reports: {health}"),
+            Problem::Refused => f.write_str("the scanner answers, but does not begin to measure"),
+            Problem::AmbiguousPackets => f.write_str(
                 "the packets may be of two kinds (82h or 85h), which nothing here tells: name the model or the mode",
             ),
-            Trouble::NoMode(mode) => {
+            Problem::ModeUnavailable(mode) => {
                 write!(
                     f,
                     "the scanner or its line cannot do mode {}: it measures in its fastest one",
@@ -742,9 +751,9 @@ impl fmt::Display for Trouble {
 }
 
 /// A line without a byte for this time after the stop request is quiet.
-const QUIET: Nanos = 15 * MILLIS;
+const QUIET_TIME: Nanos = 15 * MILLIS;
 /// Maximum time to wait for a quiet line before the first query.
-pub(crate) const DRAIN: Nanos = 60 * MILLIS;
+pub(crate) const MAX_DRAIN_TIME: Nanos = 60 * MILLIS;
 /// A response takes some milliseconds. An adapter that collects bytes takes 16 ms more, twice.
 const RESPONSE_TIMEOUT: Nanos = 70 * MILLIS;
 /// Maximum time for a response over a network.
@@ -752,17 +761,17 @@ const NETWORK_TIMEOUT: Nanos = 500 * MILLIS;
 /// Maximum number of attempts with a query whose responses are damaged.
 const MAX_ATTEMPTS: u8 = 8;
 /// Maximum time from a restart request to the boot message. A real A1 has booted after 0.67 s.
-const BOOT: Nanos = 1_500 * MILLIS;
+const RESET_TIMEOUT: Nanos = 1_500 * MILLIS;
 /// Minimum silence before the boot message.
 const BOOT_SILENCE: Nanos = 200 * MILLIS;
 /// Maximum length of a boot message, in bytes.
 const BOOT_MESSAGE_LEN: u32 = 64;
 /// Time from the boot message to the first query. A scanner responds after 4 ms.
-const SETTLE: Nanos = 10 * MILLIS;
+const SETTLE_TIME: Nanos = 10 * MILLIS;
 /// Interval between requests for the health of a scanner that reports an error.
 const HEALTH_RETRY_INTERVAL: Nanos = 2_000 * MILLIS;
 /// Some heads have to reach their speed before they measure.
-const SPIN_UP: Nanos = 3_000 * MILLIS;
+const SPIN_UP_TIME: Nanos = 3_000 * MILLIS;
 /// The motor stops after this time without subscribers. A program that restarts subscribes again in less.
-const IDLE: Nanos = 5_000 * MILLIS;
+const IDLE_TIME: Nanos = 5_000 * MILLIS;
 const SECOND: Nanos = 1_000 * MILLIS;

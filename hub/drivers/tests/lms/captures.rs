@@ -4,8 +4,8 @@
 #[path = "../../../../tests/testkit/skip.rs"]
 mod skip;
 
-use scanhub_drivers::lms::framer::{Found, Framer, Tally, VETO_HOLD};
-use scanhub_drivers::lms::header::{Expect, StreamHeader};
+use scanhub_drivers::lms::framer::{Framer, FramerCounters, FramerEvent, VETO_HOLD_TIME};
+use scanhub_drivers::lms::header::{ExpectedHeaders, StreamHeader};
 use scanhub_drivers::lms::measured::MEASURED;
 use scanhub_drivers::lms::telegram::{ACK, STX};
 use skip::skip;
@@ -13,9 +13,11 @@ use std::path::PathBuf;
 
 /// A file of `$SCANHUB_DATA/captures` or `../shared/data/captures`.
 fn capture(name: &str) -> Option<Vec<u8>> {
-    let beside = || PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data");
-    let path =
-        std::env::var_os("SCANHUB_DATA").map_or_else(beside, PathBuf::from).join("captures").join(name);
+    let default_directory = || PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data");
+    let path = std::env::var_os("SCANHUB_DATA")
+        .map_or_else(default_directory, PathBuf::from)
+        .join("captures")
+        .join(name);
     match std::fs::read(&path) {
         Ok(bytes) => Some(bytes),
         Err(error) => {
@@ -26,7 +28,7 @@ fn capture(name: &str) -> Option<Vec<u8>> {
 }
 
 /// Where a recording's table says that a telegram lies: offset and length, the last columns but the command.
-fn places(csv: &[u8], columns: (usize, Option<usize>), every_len: usize) -> Vec<(usize, usize)> {
+fn telegram_ranges(csv: &[u8], columns: (usize, Option<usize>), every_len: usize) -> Vec<(usize, usize)> {
     let text = std::str::from_utf8(csv).expect("a table is text");
     let number = |line: &str, column: usize| line.split(',').nth(column).and_then(|n| n.parse().ok());
     text.lines()
@@ -40,7 +42,7 @@ fn places(csv: &[u8], columns: (usize, Option<usize>), every_len: usize) -> Vec<
 
 /// A line with a framer at its end, and what came of it.
 #[derive(Default)]
-struct Line {
+struct FramedCapture {
     framer: Framer,
     /// Everything fed so far.
     bytes: Vec<u8>,
@@ -50,12 +52,12 @@ struct Line {
     suspect: usize,
 }
 
-impl Line {
-    fn feed(&mut self, mut bytes: &[u8], piece: usize) {
+impl FramedCapture {
+    fn feed(&mut self, mut bytes: &[u8], max_piece_len: usize) {
         self.bytes.extend(bytes);
         while !bytes.is_empty() {
-            let spare = self.framer.spare();
-            let n = bytes.len().min(piece).min(spare.len());
+            let spare = self.framer.read_buffer();
+            let n = bytes.len().min(max_piece_len).min(spare.len());
             spare[..n].copy_from_slice(&bytes[..n]);
             self.framer.commit(n);
             bytes = &bytes[n..];
@@ -66,26 +68,26 @@ impl Line {
     fn drain(&mut self) {
         while let Some(found) = self.framer.poll() {
             match found {
-                Found::Telegram(framed) => {
+                FramerEvent::Telegram(framed) => {
                     let (at, len) = (framed.offset as usize, framed.telegram.bytes().len());
                     assert_eq!(framed.telegram.bytes(), &self.bytes[at..at + len], "not what the line said");
                     self.found.push((at, len));
                     self.suspect += usize::from(framed.reasons != 0);
                 }
-                Found::Ack | Found::Nak => self.acknowledged += 1,
+                FramerEvent::Ack | FramerEvent::Nak => self.acknowledged += 1,
             }
         }
-        let Tally { read, in_telegrams, acknowledge, discarded, .. } = *self.framer.tally();
+        let FramerCounters { read, in_telegrams, acknowledge, discarded, .. } = *self.framer.counters();
         assert_eq!(read, in_telegrams + acknowledge + discarded + self.framer.buffered() as u64);
     }
 
     /// Silence, then the end: gives up what is still open and prints a line of the table.
-    fn end(&mut self, legend: &str) -> Tally {
-        self.framer.release(VETO_HOLD);
+    fn end(&mut self, legend: &str) -> FramerCounters {
+        self.framer.release(VETO_HOLD_TIME);
         self.drain();
         self.framer.clear();
         self.drain();
-        let tally = *self.framer.tally();
+        let tally = *self.framer.counters();
         let [address, length, command, count, crc, vetoed, superseded] = tally.rejected;
         eprintln!(
             "{legend:<44} {:>7} bytes {:>4} telegrams {:>3} suspect {:>3} ack {:>5} discarded | address {address} \
@@ -99,7 +101,7 @@ impl Line {
     }
 
     /// Each start byte outside the telegrams is refused for exactly one reason, or began what was aborted.
-    fn assert_every_start_byte_has_a_reason(&self, tally: &Tally) {
+    fn assert_every_start_byte_has_a_reason(&self, tally: &FramerCounters) {
         let inside = |at: usize| self.found.iter().any(|&(start, len)| (start..start + len).contains(&at));
         let starts = (0..self.bytes.len()).filter(|&at| self.bytes[at] == STX && !inside(at)).count();
         assert_eq!(starts as u64, tally.rejected.iter().sum::<u64>() + tally.aborted);
@@ -111,14 +113,14 @@ fn header_of(scan: &[u8]) -> StreamHeader {
 }
 
 #[test]
-fn seven_sessions_with_a_sensor_whose_mode_is_unknown() {
+fn finds_all_telegrams_without_knowing_the_mode() {
     let (Some(bytes), Some(csv)) = (capture("lms200_38400.bin"), capture("lms200_38400.csv")) else { return };
-    let places = places(&csv, (2, Some(3)), 0);
+    let places = telegram_ranges(&csv, (2, Some(3)), 0);
     assert_eq!(places.len(), 427);
     for awaits in [false, true] {
         for piece in [1, 16, 333, 1628] {
-            let mut line = Line::default();
-            line.framer.await_acknowledge(awaits);
+            let mut line = FramedCapture::default();
+            line.framer.expect_acknowledge(awaits);
             line.feed(&bytes, piece);
             let tally = line.end(&format!("lms200_38400, anything, ack {awaits}, by {piece}"));
             assert_eq!(line.found, places);
@@ -130,18 +132,18 @@ fn seven_sessions_with_a_sensor_whose_mode_is_unknown() {
 #[test]
 fn seven_sessions_as_a_session_listens_to_them() {
     let (Some(bytes), Some(csv)) = (capture("lms200_38400.bin"), capture("lms200_38400.csv")) else { return };
-    let places = places(&csv, (2, Some(3)), 0);
+    let places = telegram_ranges(&csv, (2, Some(3)), 0);
     let command = |&(at, _): &(usize, usize)| bytes[at + 4];
-    let mut line = Line::default();
+    let mut line = FramedCapture::default();
     let (mut stream, mut expected) = (None, Vec::new());
     for (i, &(at, len)) in places.iter().enumerate() {
         let telegram = &bytes[at..at + len];
         if telegram[4] == MEASURED {
             stream = Some(header_of(telegram));
-            line.framer.await_acknowledge(false);
+            line.framer.expect_acknowledge(false);
         } else {
             // The recorder left out what precedes each reply on the line.
-            line.framer.await_acknowledge(true);
+            line.framer.expect_acknowledge(true);
             line.feed(&[ACK], 1);
         }
         expected.push((line.bytes.len(), len));
@@ -150,8 +152,8 @@ fn seven_sessions_as_a_session_listens_to_them() {
         let (before, after) = telegram.split_at(if telegram[4] == MEASURED { len / 2 } else { len });
         line.feed(before, 16);
         if let Some(header) = stream {
-            line.framer.expect(Expect::Stream { header, reply: open });
-            line.framer.await_acknowledge(open.is_some() || telegram[4] != MEASURED);
+            line.framer.expect(ExpectedHeaders::Stream { header, reply: open });
+            line.framer.expect_acknowledge(open.is_some() || telegram[4] != MEASURED);
         }
         line.feed(after, 16);
     }
@@ -168,14 +170,16 @@ fn scans_with_reflector_levels() {
     else {
         return;
     };
-    let places = places(&csv, (2, None), 732);
+    let places = telegram_ranges(&csv, (2, None), 732);
     assert_eq!(places.len(), 675);
-    for expect in [Expect::Anything, Expect::Stream { header: header_of(&bytes), reply: None }] {
+    for expect in
+        [ExpectedHeaders::Anything, ExpectedHeaders::Stream { header: header_of(&bytes), reply: None }]
+    {
         for piece in [1, 16, 560] {
-            let mut line = Line::default();
+            let mut line = FramedCapture::default();
             line.framer.expect(expect);
             line.feed(&bytes, piece);
-            let known = if expect == Expect::Anything { "anything" } else { "stream" };
+            let known = if expect == ExpectedHeaders::Anything { "anything" } else { "stream" };
             let tally = line.end(&format!("reflector_levels, {known}, by {piece}"));
             assert_eq!(line.found, places);
             assert_eq!(tally.discarded, 0);
@@ -187,13 +191,13 @@ fn scans_with_reflector_levels() {
 fn a_wrong_rate_looks_like_no_telegram() {
     let Some(bytes) = capture("host19200_while_sensor_38400.bin") else { return };
     let header = [0x02, 0x80, 0xD6, 0x02, 0xB0, 0x69, 0x41];
-    for expect in [Expect::Anything, Expect::Stream { header, reply: None }] {
+    for expect in [ExpectedHeaders::Anything, ExpectedHeaders::Stream { header, reply: None }] {
         for awaits in [false, true] {
-            let mut line = Line::default();
+            let mut line = FramedCapture::default();
             line.framer.expect(expect);
-            line.framer.await_acknowledge(awaits);
+            line.framer.expect_acknowledge(awaits);
             line.feed(&bytes, 16);
-            let known = if expect == Expect::Anything { "anything" } else { "stream" };
+            let known = if expect == ExpectedHeaders::Anything { "anything" } else { "stream" };
             let tally = line.end(&format!("host19200_while_sensor_38400, {known}, ack {awaits}"));
             assert_eq!(line.found, []);
             assert_eq!(tally.discarded + tally.acknowledge, bytes.len() as u64);
@@ -206,13 +210,13 @@ fn a_wrong_rate_looks_like_no_telegram() {
 fn a_scan_broken_off_by_a_reply() {
     let Some(bytes) = capture("scan_interrupted_by_reply.bin") else { return };
     let header = header_of(&bytes);
-    for expect in [Expect::Anything, Expect::Stream { header, reply: Some(0xBA) }] {
+    for expect in [ExpectedHeaders::Anything, ExpectedHeaders::Stream { header, reply: Some(0xBA) }] {
         for piece in [1, 16, 732] {
-            let mut line = Line::default();
+            let mut line = FramedCapture::default();
             line.framer.expect(expect);
-            line.framer.await_acknowledge(true);
+            line.framer.expect_acknowledge(true);
             line.feed(&bytes, piece);
-            let known = if expect == Expect::Anything { "anything" } else { "stream" };
+            let known = if expect == ExpectedHeaders::Anything { "anything" } else { "stream" };
             // 15 bytes of a scan, ACK, a reply of 29 bytes, the beginning of the next scan.
             assert_eq!((line.found.as_slice(), bytes[20]), (&[(16, 29)][..], 0xBA));
             assert_eq!(line.framer.buffered(), 687);

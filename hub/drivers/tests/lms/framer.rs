@@ -4,32 +4,32 @@
 use proptest::prelude::*;
 use scanhub_drivers::line::suspect;
 use scanhub_drivers::lms;
-use scanhub_drivers::lms::framer::{Found, Framer, SUFFIX_HOLD, Tally, VETO_HOLD};
-use scanhub_drivers::lms::header::{Expect, Reject, State};
+use scanhub_drivers::lms::framer::{Framer, FramerCounters, FramerEvent, SUFFIX_HOLD_TIME, VETO_HOLD_TIME};
+use scanhub_drivers::lms::header::{ExpectedHeaders, Reject, State};
 use scanhub_drivers::lms::measured;
 use scanhub_drivers::lms::reply;
 use scanhub_drivers::lms::variant::Unit;
 
-const HEADER: [u8; 7] = [0x02, 0x80, 0xD6, 0x02, 0xB0, 0x69, 0x41];
-const STREAM: Expect = Expect::Stream { header: HEADER, reply: None };
+const STREAM_HEADER: [u8; 7] = [0x02, 0x80, 0xD6, 0x02, 0xB0, 0x69, 0x41];
+const STREAM_EXPECT: ExpectedHeaders = ExpectedHeaders::Stream { header: STREAM_HEADER, reply: None };
 
 fn scan(value: impl Fn(usize) -> u16) -> Vec<u8> {
     let words: Vec<u16> = (0..361).map(value).collect();
     measured::encode(0, Unit::Mm, &words, 0x10).bytes().to_vec()
 }
 
-fn framer(expect: Expect) -> Framer {
+fn framer(expect: ExpectedHeaders) -> Framer {
     let mut framer = Framer::default();
     framer.expect(expect);
     framer
 }
 
 /// All telegrams with their reasons after these bytes, fed in pieces of at most `piece`.
-fn feed(framer: &mut Framer, mut bytes: &[u8], piece: usize) -> Vec<(Vec<u8>, u8)> {
+fn feed(framer: &mut Framer, mut bytes: &[u8], max_piece_len: usize) -> Vec<(Vec<u8>, u8)> {
     let mut telegrams = Vec::new();
     while !bytes.is_empty() {
-        let spare = framer.spare();
-        let n = bytes.len().min(piece).min(spare.len());
+        let spare = framer.read_buffer();
+        let n = bytes.len().min(max_piece_len).min(spare.len());
         assert!(n > 0, "a framer that was polled has room");
         spare[..n].copy_from_slice(&bytes[..n]);
         framer.commit(n);
@@ -41,21 +41,21 @@ fn feed(framer: &mut Framer, mut bytes: &[u8], piece: usize) -> Vec<(Vec<u8>, u8
 
 fn drain(framer: &mut Framer, telegrams: &mut Vec<(Vec<u8>, u8)>) {
     while let Some(found) = framer.poll() {
-        if let Found::Telegram(framed) = found {
+        if let FramerEvent::Telegram(framed) = found {
             telegrams.push((framed.telegram.bytes().to_vec(), framed.reasons));
         }
     }
-    assert_conserved(framer);
+    assert_bytes_conserved(framer);
 }
 
-fn assert_conserved(framer: &Framer) {
-    let Tally { read, in_telegrams, acknowledge, discarded, .. } = *framer.tally();
+fn assert_bytes_conserved(framer: &Framer) {
+    let FramerCounters { read, in_telegrams, acknowledge, discarded, .. } = *framer.counters();
     assert_eq!(read, in_telegrams + acknowledge + discarded + framer.buffered() as u64);
 }
 
 #[test]
 fn the_six_states_in_their_order() {
-    let mut framer = framer(STREAM);
+    let mut framer = framer(STREAM_EXPECT);
     let mut states = vec![framer.state()];
     for byte in scan(|_| 3000) {
         feed(&mut framer, &[byte], 1);
@@ -74,9 +74,9 @@ fn a_telegram_behind_a_shortened_one_is_not_lost() {
         bytes.drain(300..300 + lost);
         let intact = scan(|i| 4000 + i as u16);
         bytes.extend(&intact);
-        let mut framer = framer(STREAM);
+        let mut framer = framer(STREAM_EXPECT);
         assert_eq!(feed(&mut framer, &bytes, 16), [(intact, 0)], "{lost} bytes lost");
-        assert_eq!(framer.tally().discarded, 732 - lost as u64);
+        assert_eq!(framer.counters().discarded, 732 - lost as u64);
     }
 }
 
@@ -90,29 +90,29 @@ fn false_frame_that_ends_with(next: &[u8]) -> Vec<u8> {
 }
 
 #[test]
-fn a_frame_that_may_have_eaten_a_start_byte_waits_for_what_follows() {
+fn frame_ending_in_stx_waits_for_the_next_byte() {
     let next = scan(|i| 4000 + i as u16);
     let ends_with_stx = false_frame_that_ends_with(&next);
     // Refuted by the next byte.
-    let mut framer = framer(STREAM);
+    let mut framer = framer(STREAM_EXPECT);
     assert_eq!(feed(&mut framer, &ends_with_stx, 16), []);
-    assert_eq!(framer.hold(), Some(SUFFIX_HOLD));
+    assert_eq!(framer.hold(), Some(SUFFIX_HOLD_TIME));
     assert_eq!(feed(&mut framer, &next[..1], 1), [(ends_with_stx.clone(), 0)]);
     // Nothing follows: released by idleness, not before.
-    let mut framer = self::framer(STREAM);
+    let mut framer = self::framer(STREAM_EXPECT);
     feed(&mut framer, &ends_with_stx, 999);
-    framer.release(SUFFIX_HOLD - 1);
+    framer.release(SUFFIX_HOLD_TIME - 1);
     assert!(framer.poll().is_none());
-    framer.release(SUFFIX_HOLD);
+    framer.release(SUFFIX_HOLD_TIME);
     let mut late = Vec::new();
     drain(&mut framer, &mut late);
     assert_eq!(late, [(ends_with_stx.clone(), 0)]);
     // The start byte was the next telegram's: that one wins.
-    let mut framer = self::framer(STREAM);
+    let mut framer = self::framer(STREAM_EXPECT);
     let mut bytes = ends_with_stx;
     bytes.extend(&next[1..]);
     assert_eq!(feed(&mut framer, &bytes, 16), [(next, 0)]);
-    assert_eq!(framer.tally().rejected[Reject::Vetoed as usize], 1);
+    assert_eq!(framer.counters().rejected[Reject::Vetoed as usize], 1);
 }
 
 #[test]
@@ -125,36 +125,36 @@ fn a_frame_with_a_header_inside_waits_for_it_to_fail() {
         203 => 0x1041,
         _ => 3000,
     });
-    let mut framer = framer(STREAM);
+    let mut framer = framer(STREAM_EXPECT);
     assert_eq!(feed(&mut framer, &spelled, 16), []);
-    assert_eq!(framer.hold(), Some(VETO_HOLD));
-    framer.release(VETO_HOLD - 1);
+    assert_eq!(framer.hold(), Some(VETO_HOLD_TIME));
+    framer.release(VETO_HOLD_TIME - 1);
     assert!(framer.poll().is_none());
-    framer.release(VETO_HOLD);
+    framer.release(VETO_HOLD_TIME);
     let mut late = Vec::new();
     drain(&mut framer, &mut late);
     assert_eq!(late, [(spelled.clone(), suspect::HEADER_INSIDE)]);
     // Or the next telegram arrives whole, which the false one would reach into.
     let next = scan(|_| 4000);
-    let mut framer = self::framer(STREAM);
+    let mut framer = self::framer(STREAM_EXPECT);
     let mut bytes = spelled.clone();
     bytes.extend(&next);
     assert_eq!(feed(&mut framer, &bytes, 16), [(spelled, suspect::HEADER_INSIDE), (next, 0)]);
-    assert_eq!(framer.tally().held, 1);
+    assert_eq!(framer.counters().held, 1);
 }
 
 #[test]
-fn a_scan_broken_off_for_a_reply_is_aborted_not_damaged() {
-    let reply = reply::kind(0, b"LMS200;S18063;V02.19 ", 0x10);
+fn scan_interrupted_by_reply_counts_as_aborted() {
+    let reply = reply::type_reply(0, b"LMS200;S18063;V02.19 ", 0x10);
     let next = scan(|_| 4000);
     let mut bytes = scan(|_| 3000)[..15].to_vec();
     bytes.push(0x06);
     bytes.extend(reply.bytes());
     bytes.extend(&next);
-    let mut framer = framer(Expect::Stream { header: HEADER, reply: Some(0xBA) });
-    framer.await_acknowledge(true);
+    let mut framer = framer(ExpectedHeaders::Stream { header: STREAM_HEADER, reply: Some(0xBA) });
+    framer.expect_acknowledge(true);
     assert_eq!(feed(&mut framer, &bytes, 16), [(reply.bytes().to_vec(), 0), (next, 0)]);
-    let tally = framer.tally();
+    let tally = framer.counters();
     assert_eq!((tally.aborted, tally.acknowledge, tally.discarded), (1, 1, 15));
     // The high byte of its length is a start byte too.
     let mut rejected = [0; Reject::COUNT];
@@ -164,20 +164,20 @@ fn a_scan_broken_off_for_a_reply_is_aborted_not_damaged() {
 
 #[test]
 fn acknowledgements_count_only_while_they_are_awaited() {
-    let mut framer = framer(Expect::Anything);
-    framer.await_acknowledge(true);
-    framer.spare()[..3].copy_from_slice(&[0x06, 0x33, 0x15]);
+    let mut framer = framer(ExpectedHeaders::Anything);
+    framer.expect_acknowledge(true);
+    framer.read_buffer()[..3].copy_from_slice(&[0x06, 0x33, 0x15]);
     framer.commit(3);
-    assert!(matches!(framer.poll(), Some(Found::Ack)));
-    assert!(matches!(framer.poll(), Some(Found::Nak)));
-    framer.await_acknowledge(false);
+    assert!(matches!(framer.poll(), Some(FramerEvent::Ack)));
+    assert!(matches!(framer.poll(), Some(FramerEvent::Nak)));
+    framer.expect_acknowledge(false);
     feed(&mut framer, &[0x06], 1);
-    assert_eq!((framer.tally().acknowledge, framer.tally().discarded), (2, 2));
+    assert_eq!((framer.counters().acknowledge, framer.counters().discarded), (2, 2));
 }
 
 #[test]
 fn every_refusal_has_its_reason() {
-    let mut framer = framer(STREAM);
+    let mut framer = framer(STREAM_EXPECT);
     feed(&mut framer, &[0x02, 0x02, 0x80, 0xD7, 0x02, 0x02, 0x80, 0xD6, 0x02, 0xB1], 3);
     feed(&mut framer, &[0x02, 0x80, 0xD6, 0x02, 0xB0, 0x69, 0x40, 0, 0, 0, 0], 3);
     let mut wrong = scan(|_| 3000);
@@ -189,14 +189,14 @@ fn every_refusal_has_its_reason() {
     expected[Reject::Command as usize] = 1;
     expected[Reject::Count as usize] = 1;
     expected[Reject::Crc as usize] = 1;
-    expected[Reject::Address as usize] = framer.tally().rejected[Reject::Address as usize];
-    assert_eq!(framer.tally().rejected, expected);
+    expected[Reject::Address as usize] = framer.counters().rejected[Reject::Address as usize];
+    assert_eq!(framer.counters().rejected, expected);
     assert_eq!(expected[Reject::Address as usize], 5);
 }
 
 #[test]
 fn a_flood_of_headers_is_bounded() {
-    let mut framer = framer(Expect::Anything);
+    let mut framer = framer(ExpectedHeaders::Anything);
     let flood: Vec<u8> = [0x02, 0x80, 0x03].into_iter().cycle().take(100_000).collect();
     for piece in [1, 7, 814, 1628] {
         assert_eq!(feed(&mut framer, &flood, piece), []);
@@ -225,14 +225,14 @@ fn frames_that_refute_each_other_leave_room() {
         bytes.extend(&next[8..]);
     }
     for piece in [1, 16, 1628] {
-        let mut framer = framer(Expect::Anything);
+        let mut framer = framer(ExpectedHeaders::Anything);
         feed(&mut framer, &bytes, piece);
-        assert!(!framer.spare().is_empty());
+        assert!(!framer.read_buffer().is_empty());
     }
 }
 
 prop_compose! {
-    fn content()(kind in 0..4, seed in any::<u64>()) -> Vec<u8> {
+    fn scan_content()(kind in 0..4, seed in any::<u64>()) -> Vec<u8> {
         let mut state = seed | 1;
         let mut random = move || {
             state ^= state << 13;
@@ -252,8 +252,8 @@ prop_compose! {
 
 prop_compose! {
     /// Telegrams, some with a hole, and what may follow: garbage. Returns the bytes and the intact telegrams.
-    fn damaged()(
-        scans in prop::collection::vec((content(), prop::option::of((0usize..732, 1usize..12))), 1..8),
+    fn damaged_stream()(
+        scans in prop::collection::vec((scan_content(), prop::option::of((0usize..732, 1usize..12))), 1..8),
     ) -> (Vec<u8>, Vec<Vec<u8>>) {
         let (mut bytes, mut intact) = (Vec::new(), Vec::new());
         for (mut scan, hole) in scans {
@@ -269,19 +269,19 @@ prop_compose! {
 
 proptest! {
     #[test]
-    fn the_cut_into_reads_changes_nothing((bytes, _) in damaged(), piece in 1usize..1628, any in any::<bool>()) {
-        let expect = if any { Expect::Anything } else { STREAM };
+    fn the_cut_into_reads_changes_nothing((bytes, _) in damaged_stream(), piece in 1usize..1628, any in any::<bool>()) {
+        let expect = if any { ExpectedHeaders::Anything } else { STREAM_EXPECT };
         let (mut whole, mut cut) = (framer(expect), framer(expect));
         prop_assert_eq!(feed(&mut whole, &bytes, 1), feed(&mut cut, &bytes, piece));
     }
 
     #[test]
-    fn every_intact_telegram_is_found_in_order((mut bytes, intact) in damaged(), piece in 1usize..1628) {
+    fn every_intact_telegram_is_found_in_order((mut bytes, intact) in damaged_stream(), piece in 1usize..1628) {
         let last = scan(|_| 3000);
         bytes.extend(&last);
-        let mut framer = framer(STREAM);
+        let mut framer = framer(STREAM_EXPECT);
         let mut found: Vec<_> = feed(&mut framer, &bytes, piece).into_iter().map(|(bytes, _)| bytes).collect();
-        framer.release(VETO_HOLD);
+        framer.release(VETO_HOLD_TIME);
         let mut late = Vec::new();
         drain(&mut framer, &mut late);
         found.extend(late.into_iter().map(|(bytes, _)| bytes));
@@ -294,11 +294,11 @@ proptest! {
 
     #[test]
     fn garbage_is_never_an_error(bytes in prop::collection::vec(prop_oneof![Just(0x02u8), Just(0x80), any::<u8>()], 0..5000)) {
-        for expect in [Expect::Anything, STREAM] {
+        for expect in [ExpectedHeaders::Anything, STREAM_EXPECT] {
             let mut framer = framer(expect);
             feed(&mut framer, &bytes, 16);
             framer.clear();
-            assert_conserved(&framer);
+            assert_bytes_conserved(&framer);
             prop_assert_eq!(framer.buffered(), 0);
         }
     }

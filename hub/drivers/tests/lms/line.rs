@@ -9,27 +9,27 @@
 
 use fastrand::Rng;
 use scanhub_drivers::line::suspect;
-use scanhub_drivers::lms::framer::{Found, Framer};
-use scanhub_drivers::lms::header::{Expect, StreamHeader};
+use scanhub_drivers::lms::framer::{Framer, FramerEvent};
+use scanhub_drivers::lms::header::{ExpectedHeaders, StreamHeader};
 use scanhub_drivers::lms::measured;
 use scanhub_drivers::lms::telegram::{STX, Telegram};
-use scanhub_drivers::lms::variant::{BYTES_PER_TURN, MIRROR_TURN, Unit};
+use scanhub_drivers::lms::variant::{BYTES_PER_REVOLUTION, MIRROR_PERIOD, Unit};
 use scanhub_schema::{MICROS, MILLIS, Nanos};
 
 /// Bytes of each telegram: 361 beams.
-pub(crate) const TELEGRAM: usize = 732;
+pub(crate) const TELEGRAM_LEN: usize = 732;
 /// Time from the first byte of a telegram to the first of the next: 361 beams take two turns.
-const PERIOD: Nanos = 2 * MIRROR_TURN;
+const TELEGRAM_PERIOD: Nanos = 2 * MIRROR_PERIOD;
 /// Time of a byte at 500 kBd.
-const BYTE: Nanos = 20 * MICROS;
+const BYTE_TIME: Nanos = 20 * MICROS;
 /// Bytes that a UART collects before it hands them over.
-const PIECE: usize = 16;
+const UART_PIECE_LEN: usize = 16;
 /// A UART passes its bytes on when no byte arrived for four byte times.
-const FLUSH: Nanos = 4 * BYTE;
+const UART_FLUSH_TIME: Nanos = 4 * BYTE_TIME;
 
 /// Bytes that become readable together.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Piece {
+pub(crate) struct ReadablePiece {
     /// When.
     pub(crate) at: Nanos,
     /// End of the piece in [`Line::received`]; it begins where the one before ended.
@@ -37,37 +37,37 @@ pub(crate) struct Piece {
 }
 
 /// The history of a line: a number of telegrams, and what was left of them.
-pub(crate) struct Line {
+pub(crate) struct SimulatedLine {
     /// All that the sensor sent.
     pub(crate) sent: Vec<u8>,
     /// Bytes that arrived.
     pub(crate) received: Vec<u8>,
     /// Pieces in which these bytes become readable, in order.
-    pub(crate) pieces: Vec<Piece>,
+    pub(crate) pieces: Vec<ReadablePiece>,
     /// Header of every telegram.
     pub(crate) header: StreamHeader,
     /// First and last + 1 of each run of lost bytes in `sent`, ascending.
-    holes: Vec<(usize, usize)>,
+    lost_runs: Vec<(usize, usize)>,
     /// For each hole where it lies in `received`.
     cuts: Vec<usize>,
     /// For each hole how many bytes were lost up to its end.
     lost: Vec<usize>,
 }
 
-impl Line {
+impl SimulatedLine {
     /// Creates a line with `telegrams` telegrams of `scene`. The same seed creates the same line.
-    pub(crate) fn new(scene: Scene, telegrams: usize, seed: u64) -> Line {
+    pub(crate) fn new(scene: LineContent, telegrams: usize, seed: u64) -> SimulatedLine {
         let mut rng = Rng::with_seed(seed);
         let sent = scene.telegrams(telegrams, &mut rng);
         let header = sent[..7].try_into().expect("a telegram has a header");
-        let holes = slide_left(&sent, bursts(sent.len(), &mut rng));
-        let mut line = Line {
+        let lost_runs = normalize_runs(&sent, bursts(sent.len(), &mut rng));
+        let mut line = SimulatedLine {
             received: Vec::with_capacity(sent.len()),
             pieces: Vec::new(),
             header,
-            cuts: Vec::with_capacity(holes.len()),
-            lost: Vec::with_capacity(holes.len()),
-            holes,
+            cuts: Vec::with_capacity(lost_runs.len()),
+            lost: Vec::with_capacity(lost_runs.len()),
+            lost_runs,
             sent,
         };
         line.transmit();
@@ -87,32 +87,32 @@ impl Line {
 
     /// Returns whether no byte of telegram number `telegram` was lost.
     pub(crate) fn is_intact(&self, telegram: usize) -> bool {
-        let (start, end) = (telegram * TELEGRAM, (telegram + 1) * TELEGRAM);
-        let after = self.holes.partition_point(|hole| hole.1 <= start);
-        self.holes.get(after).is_none_or(|hole| hole.0 >= end)
+        let (start, end) = (telegram * TELEGRAM_LEN, (telegram + 1) * TELEGRAM_LEN);
+        let after = self.lost_runs.partition_point(|hole| hole.1 <= start);
+        self.lost_runs.get(after).is_none_or(|hole| hole.0 >= end)
     }
 
     /// Returns the bytes of telegram number `telegram` as they were sent.
     pub(crate) fn telegram(&self, telegram: usize) -> &[u8] {
-        &self.sent[telegram * TELEGRAM..(telegram + 1) * TELEGRAM]
+        &self.sent[telegram * TELEGRAM_LEN..(telegram + 1) * TELEGRAM_LEN]
     }
 
     /// Returns the number of sent telegrams.
     pub(crate) fn telegrams(&self) -> usize {
-        self.sent.len() / TELEGRAM
+        self.sent.len() / TELEGRAM_LEN
     }
 
     fn transmit(&mut self) {
         let mut next = 0;
         let mut piece_begin = 0;
         let mut last = 0;
-        for (start, end) in self.holes.iter().copied().chain([(self.sent.len(), self.sent.len())]) {
+        for (start, end) in self.lost_runs.iter().copied().chain([(self.sent.len(), self.sent.len())]) {
             for number in next..start {
                 let now = sent_at(number);
                 let len = self.received.len() - piece_begin;
-                if len == PIECE || (len > 0 && now - last > FLUSH) {
+                if len == UART_PIECE_LEN || (len > 0 && now - last > UART_FLUSH_TIME) {
                     piece_begin = self.received.len();
-                    self.pieces.push(Piece { at: last, end: piece_begin });
+                    self.pieces.push(ReadablePiece { at: last, end: piece_begin });
                 }
                 self.received.push(self.sent[number]);
                 last = now;
@@ -123,15 +123,16 @@ impl Line {
             }
             next = end;
         }
-        self.pieces.push(Piece { at: last, end: self.received.len() });
+        self.pieces.push(ReadablePiece { at: last, end: self.received.len() });
     }
 }
 
 /// Returns the time at which the scanner has sent byte `number`.
 pub(crate) fn sent_at(number: usize) -> Nanos {
-    let (telegram, byte) = ((number / TELEGRAM) as Nanos, number % TELEGRAM);
-    let (turn, in_turn) = ((byte / BYTES_PER_TURN) as Nanos, (byte % BYTES_PER_TURN + 1) as Nanos);
-    telegram * PERIOD + turn * MIRROR_TURN + in_turn * BYTE
+    let (telegram, byte) = ((number / TELEGRAM_LEN) as Nanos, number % TELEGRAM_LEN);
+    let (turn, in_turn) =
+        ((byte / BYTES_PER_REVOLUTION) as Nanos, (byte % BYTES_PER_REVOLUTION + 1) as Nanos);
+    telegram * TELEGRAM_PERIOD + turn * MIRROR_PERIOD + in_turn * BYTE_TIME
 }
 
 /// Draws the runs of lost bytes among `len`. Probabilities are multiples of 2^-32, so every machine draws the same
@@ -158,9 +159,9 @@ fn bursts(len: usize, rng: &mut Rng) -> Vec<(usize, usize)> {
 /// A lost byte that equals a kept neighbour could as well be that neighbour: the reader sees the same bytes. At a
 /// telegram's border the two histories blame different telegrams, so all that look alike are told alike: the hole
 /// is moved left as far as the bytes are equal, and joined with one it meets.
-fn slide_left(sent: &[u8], holes: Vec<(usize, usize)>) -> Vec<(usize, usize)> {
-    let mut slid: Vec<(usize, usize)> = Vec::with_capacity(holes.len());
-    for (mut start, mut end) in holes {
+fn normalize_runs(sent: &[u8], runs: Vec<(usize, usize)>) -> Vec<(usize, usize)> {
+    let mut slid: Vec<(usize, usize)> = Vec::with_capacity(runs.len());
+    for (mut start, mut end) in runs {
         loop {
             if let Some(&(before, limit)) = slid.last()
                 && limit == start
@@ -181,7 +182,7 @@ fn slide_left(sent: &[u8], holes: Vec<(usize, usize)>) -> Vec<(usize, usize)> {
 
 /// A frame that a parser accepted.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Accepted<'a> {
+pub(crate) struct AcceptedFrame<'a> {
     /// Number of its first byte among those read.
     pub(crate) offset: usize,
     /// The frame.
@@ -193,7 +194,7 @@ pub(crate) struct Accepted<'a> {
 /// A parser that can be compared.
 pub(crate) trait Parser {
     /// Reads `bytes` and hands over every frame that it accepts.
-    fn read(&mut self, bytes: &[u8], accept: &mut dyn FnMut(Accepted<'_>));
+    fn read(&mut self, bytes: &[u8], accept: &mut dyn FnMut(AcceptedFrame<'_>));
 
     /// Returns the time without bytes after which [`Parser::release`] may return more.
     fn hold(&self) -> Option<Nanos> {
@@ -201,13 +202,13 @@ pub(crate) trait Parser {
     }
 
     /// Handles an idle line: no byte arrived for `idle`.
-    fn release(&mut self, _idle: Nanos, _accept: &mut dyn FnMut(Accepted<'_>)) {}
+    fn release(&mut self, _idle: Nanos, _accept: &mut dyn FnMut(AcceptedFrame<'_>)) {}
 }
 
 impl Parser for Framer {
-    fn read(&mut self, mut bytes: &[u8], accept: &mut dyn FnMut(Accepted<'_>)) {
+    fn read(&mut self, mut bytes: &[u8], accept: &mut dyn FnMut(AcceptedFrame<'_>)) {
         while !bytes.is_empty() {
-            let spare = self.spare();
+            let spare = self.read_buffer();
             let len = bytes.len().min(spare.len());
             spare[..len].copy_from_slice(&bytes[..len]);
             self.commit(len);
@@ -220,31 +221,31 @@ impl Parser for Framer {
         Framer::hold(self)
     }
 
-    fn release(&mut self, idle: Nanos, accept: &mut dyn FnMut(Accepted<'_>)) {
+    fn release(&mut self, idle: Nanos, accept: &mut dyn FnMut(AcceptedFrame<'_>)) {
         Framer::release(self, idle);
         drain(self, accept);
     }
 }
 
-fn drain(framer: &mut Framer, accept: &mut dyn FnMut(Accepted<'_>)) {
+fn drain(framer: &mut Framer, accept: &mut dyn FnMut(AcceptedFrame<'_>)) {
     while let Some(found) = framer.poll() {
-        if let Found::Telegram(framed) = found {
+        if let FramerEvent::Telegram(framed) = found {
             let (offset, bytes) = (framed.offset as usize, framed.telegram.bytes());
-            accept(Accepted { offset, bytes, reasons: framed.reasons });
+            accept(AcceptedFrame { offset, bytes, reasons: framed.reasons });
         }
     }
 }
 
 /// Creates a framer with the session's settings for this stream.
-pub(crate) fn framer(line: &Line) -> Framer {
+pub(crate) fn framer(line: &SimulatedLine) -> Framer {
     let mut framer = Framer::default();
-    framer.expect(Expect::Stream { header: line.header, reply: None });
+    framer.expect(ExpectedHeaders::Stream { header: line.header, reply: None });
     framer
 }
 
 /// Fate of the telegrams of one or more lines.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(crate) struct Account {
+pub(crate) struct TelegramCounts {
     /// Telegrams sent.
     pub(crate) telegrams: u64,
     /// Number of these that lost a byte.
@@ -260,26 +261,26 @@ pub(crate) struct Account {
     /// Frames that waited for a header inside them to fail.
     pub(crate) held: u64,
     /// Time from the arrival of the last byte to acceptance, of the other telegrams: sum and maximum.
-    pub(crate) extra: Nanos,
+    pub(crate) extra_time: Nanos,
     /// See `extra`.
-    pub(crate) extra_max: Nanos,
+    pub(crate) extra_time_max: Nanos,
 }
 
-impl Account {
+impl TelegramCounts {
     /// Runs `parser` on `line` to its end like a session: every piece when it arrives, and the release when a read
     /// finds no bytes after the hold.
-    pub(crate) fn take(&mut self, line: &Line, parser: &mut impl Parser) {
+    pub(crate) fn run_parser(&mut self, line: &SimulatedLine, parser: &mut impl Parser) {
         let mut delivered = vec![false; line.telegrams()];
         let mut begin = 0;
         for (number, piece) in line.pieces.iter().enumerate() {
             parser.read(&line.received[begin..piece.end], &mut |accepted| {
-                self.enter(line, accepted, piece.at, &mut delivered);
+                self.add_frame(line, accepted, piece.at, &mut delivered);
             });
             begin = piece.end;
             let next = line.pieces.get(number + 1).map_or(Nanos::MAX, |next| next.at);
             while let Some(hold) = parser.hold().filter(|hold| piece.at + hold < next) {
                 parser.release(hold, &mut |accepted| {
-                    self.enter(line, accepted, piece.at + hold, &mut delivered);
+                    self.add_frame(line, accepted, piece.at + hold, &mut delivered);
                 });
             }
         }
@@ -294,19 +295,25 @@ impl Account {
 
     /// Returns the mean extra latency in ms, over `telegrams - lost - held`.
     pub(crate) fn extra_mean_ms(&self) -> f64 {
-        self.extra as f64 / MILLIS as f64 / (self.telegrams - self.lost - self.held).max(1) as f64
+        self.extra_time as f64 / MILLIS as f64 / (self.telegrams - self.lost - self.held).max(1) as f64
     }
 
     /// Returns the largest extra latency in ms.
     pub(crate) fn extra_max_ms(&self) -> f64 {
-        self.extra_max as f64 / MILLIS as f64
+        self.extra_time_max as f64 / MILLIS as f64
     }
 
-    fn enter(&mut self, line: &Line, accepted: Accepted<'_>, now: Nanos, delivered: &mut [bool]) {
-        let Accepted { offset, bytes, reasons } = accepted;
+    fn add_frame(
+        &mut self,
+        line: &SimulatedLine,
+        accepted: AcceptedFrame<'_>,
+        now: Nanos,
+        delivered: &mut [bool],
+    ) {
+        let AcceptedFrame { offset, bytes, reasons } = accepted;
         let last = offset + bytes.len() - 1;
         assert_eq!(bytes, &line.received[offset..=last], "a parser invents nothing");
-        let number = line.origin(offset) / TELEGRAM;
+        let number = line.origin(offset) / TELEGRAM_LEN;
         let held = reasons & suspect::HEADER_INSIDE != 0;
         self.held += u64::from(held);
         // Bytes decide: a damaged telegram that equal bytes of the next one completed is what was sent.
@@ -314,21 +321,21 @@ impl Account {
             delivered[number] = true;
             let extra = now - line.readable_at(last);
             if !held {
-                self.extra += extra;
-                self.extra_max = self.extra_max.max(extra);
+                self.extra_time += extra;
+                self.extra_time_max = self.extra_time_max.max(extra);
             }
             return;
         }
         self.wrong += 1;
         // The session adds this reason to those of the framer.
-        let took = sent_at(line.origin(last)) - sent_at(line.origin(offset));
-        let slow = took > sent_at(TELEGRAM - 1) - sent_at(0) + SLOW;
+        let transmit_time = sent_at(line.origin(last)) - sent_at(line.origin(offset));
+        let slow = transmit_time > sent_at(TELEGRAM_LEN - 1) - sent_at(0) + SUSPECT_DELAY;
         self.wrong_clean += u64::from(reasons == 0 && !slow);
     }
 }
 
-impl core::ops::AddAssign for Account {
-    fn add_assign(&mut self, other: Account) {
+impl core::ops::AddAssign for TelegramCounts {
+    fn add_assign(&mut self, other: TelegramCounts) {
         self.telegrams += other.telegrams;
         self.damaged += other.damaged;
         self.lost += other.lost;
@@ -336,30 +343,30 @@ impl core::ops::AddAssign for Account {
         self.wrong += other.wrong;
         self.wrong_clean += other.wrong_clean;
         self.held += other.held;
-        self.extra += other.extra;
-        self.extra_max = self.extra_max.max(other.extra_max);
+        self.extra_time += other.extra_time;
+        self.extra_time_max = self.extra_time_max.max(other.extra_time_max);
     }
 }
 
 /// A telegram that takes longer than usual by this time is suspect.
-const SLOW: Nanos = 8 * MILLIS;
+const SUSPECT_DELAY: Nanos = 8 * MILLIS;
 
 /// A state machine with six states that collects a telegram, and discards what it collected if it turns out not to be a
 /// telegram.
-pub(crate) struct Discarding {
+pub(crate) struct DiscardingParser {
     header: StreamHeader,
     collected: Vec<u8>,
     read: usize,
 }
 
-impl Discarding {
+impl DiscardingParser {
     pub(crate) fn new(header: StreamHeader) -> Self {
-        Discarding { header, collected: Vec::with_capacity(TELEGRAM), read: 0 }
+        DiscardingParser { header, collected: Vec::with_capacity(TELEGRAM_LEN), read: 0 }
     }
 }
 
-impl Parser for Discarding {
-    fn read(&mut self, bytes: &[u8], accept: &mut dyn FnMut(Accepted<'_>)) {
+impl Parser for DiscardingParser {
+    fn read(&mut self, bytes: &[u8], accept: &mut dyn FnMut(AcceptedFrame<'_>)) {
         for &byte in bytes {
             self.read += 1;
             self.collected.push(byte);
@@ -369,10 +376,14 @@ impl Parser for Discarding {
                 // The low byte of the length is not checked alone.
                 [_, _, _] => true,
                 [_, _, low, high] => [low, high] == self.header[2..4],
-                ref collected if collected.len() < TELEGRAM => true,
+                ref collected if collected.len() < TELEGRAM_LEN => true,
                 ref collected => {
                     if Telegram::check(collected).is_some() {
-                        accept(Accepted { offset: self.read - TELEGRAM, bytes: collected, reasons: 0 });
+                        accept(AcceptedFrame {
+                            offset: self.read - TELEGRAM_LEN,
+                            bytes: collected,
+                            reasons: 0,
+                        });
                     }
                     false
                 }
@@ -386,20 +397,20 @@ impl Parser for Discarding {
 
 /// Collects a telegram after a strict header, and returns to the byte after its start byte if it turns out not to be a
 /// telegram.
-pub(crate) struct Rewinding {
+pub(crate) struct RewindingParser {
     header: StreamHeader,
     open: Vec<u8>,
     read: usize,
 }
 
-impl Rewinding {
+impl RewindingParser {
     pub(crate) fn new(header: StreamHeader) -> Self {
-        Rewinding { header, open: Vec::with_capacity(2 * TELEGRAM), read: 0 }
+        RewindingParser { header, open: Vec::with_capacity(2 * TELEGRAM_LEN), read: 0 }
     }
 }
 
-impl Parser for Rewinding {
-    fn read(&mut self, bytes: &[u8], accept: &mut dyn FnMut(Accepted<'_>)) {
+impl Parser for RewindingParser {
+    fn read(&mut self, bytes: &[u8], accept: &mut dyn FnMut(AcceptedFrame<'_>)) {
         self.open.extend(bytes);
         self.read += bytes.len();
         let mut at = 0;
@@ -408,11 +419,15 @@ impl Parser for Rewinding {
             let known = open.len().min(self.header.len());
             if open[..known] != self.header[..known] {
                 at += 1;
-            } else if open.len() < TELEGRAM {
+            } else if open.len() < TELEGRAM_LEN {
                 break;
-            } else if Telegram::check(&open[..TELEGRAM]).is_some() {
-                accept(Accepted { offset: self.read - open.len(), bytes: &open[..TELEGRAM], reasons: 0 });
-                at += TELEGRAM;
+            } else if Telegram::check(&open[..TELEGRAM_LEN]).is_some() {
+                accept(AcceptedFrame {
+                    offset: self.read - open.len(),
+                    bytes: &open[..TELEGRAM_LEN],
+                    reasons: 0,
+                });
+                at += TELEGRAM_LEN;
             } else {
                 at += 1;
             }
@@ -421,11 +436,11 @@ impl Parser for Rewinding {
     }
 }
 
-const BEAMS: usize = 361;
+const BEAM_COUNT: usize = 361;
 
 /// A surrounding, and what makes it easy or hard.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Scene {
+pub(crate) enum LineContent {
     /// Walls and furniture with noise, in mm: the everyday case.
     Furnished,
     /// Only a few grains of dust in range: long runs of equal bytes, in which losses look alike.
@@ -436,35 +451,39 @@ pub(crate) enum Scene {
     Random,
 }
 
-impl Scene {
+impl LineContent {
     /// All four.
-    pub(crate) const ALL: [Scene; 4] = [Scene::Furnished, Scene::Empty, Scene::Wall, Scene::Random];
+    pub(crate) const ALL: [LineContent; 4] =
+        [LineContent::Furnished, LineContent::Empty, LineContent::Wall, LineContent::Random];
 
     /// Returns its name in a table.
     pub(crate) fn name(self) -> &'static str {
         match self {
-            Scene::Furnished => "furnished",
-            Scene::Empty => "empty",
-            Scene::Wall => "wall at 640 cm",
-            Scene::Random => "random words",
+            LineContent::Furnished => "furnished",
+            LineContent::Empty => "empty",
+            LineContent::Wall => "wall at 640 cm",
+            LineContent::Random => "random words",
         }
     }
 
     /// Returns the bytes of `count` consecutive telegrams.
     pub(crate) fn telegrams(self, count: usize, rng: &mut Rng) -> Vec<u8> {
-        let mut bytes = Vec::with_capacity(count * TELEGRAM);
-        let mut room = [0; BEAMS];
+        let mut bytes = Vec::with_capacity(count * TELEGRAM_LEN);
+        let mut room = [0; BEAM_COUNT];
         for number in 0..count {
             if number % SCANS_PER_PLACE == 0 {
                 room = furniture(rng);
             }
             let words = match self {
-                Scene::Furnished => room.map(|range| range + rng.u16(..10)),
-                Scene::Empty => [FAR; BEAMS].map(|far| one_in(rng, 200).map_or(far, |rng| rng.u16(20..4000))),
-                Scene::Wall => [640; BEAMS].map(|wall| one_in(rng, 40).map_or(wall, |rng| rng.u16(639..642))),
-                Scene::Random => [0; BEAMS].map(|_: u16| rng.u16(..)),
+                LineContent::Furnished => room.map(|range| range + rng.u16(..10)),
+                LineContent::Empty => [NO_RETURN; BEAM_COUNT]
+                    .map(|far| with_chance(rng, 200).map_or(far, |rng| rng.u16(20..4000))),
+                LineContent::Wall => {
+                    [640; BEAM_COUNT].map(|wall| with_chance(rng, 40).map_or(wall, |rng| rng.u16(639..642)))
+                }
+                LineContent::Random => [0; BEAM_COUNT].map(|_: u16| rng.u16(..)),
             };
-            let unit = if self == Scene::Wall { Unit::Cm } else { Unit::Mm };
+            let unit = if self == LineContent::Wall { Unit::Cm } else { Unit::Mm };
             bytes.extend(measured::encode(0, unit, &words, 0x10).bytes());
         }
         bytes
@@ -472,11 +491,11 @@ impl Scene {
 }
 
 /// Flat faces, each a run of beams whose ranges rise or fall evenly.
-fn furniture(rng: &mut Rng) -> [u16; BEAMS] {
-    let mut ranges = [0; BEAMS];
+fn furniture(rng: &mut Rng) -> [u16; BEAM_COUNT] {
+    let mut ranges = [0; BEAM_COUNT];
     let mut at = 0;
-    while at < BEAMS {
-        let beams = rng.usize(8..60).min(BEAMS - at);
+    while at < BEAM_COUNT {
+        let beams = rng.usize(8..60).min(BEAM_COUNT - at);
         let (near, slope) = (rng.i32(500..7000), rng.i32(-15..16));
         for (i, range) in ranges[at..at + beams].iter_mut().enumerate() {
             *range = (near + slope * i as i32).clamp(20, 8000) as u16;
@@ -486,11 +505,11 @@ fn furniture(rng: &mut Rng) -> [u16; BEAMS] {
     ranges
 }
 
-fn one_in(rng: &mut Rng, n: u32) -> Option<&mut Rng> {
+fn with_chance(rng: &mut Rng, n: u32) -> Option<&mut Rng> {
     (rng.u32(..n) == 0).then_some(rng)
 }
 
 /// The code of a beam without return, 13 bits.
-const FAR: u16 = 0x1FFF;
+const NO_RETURN: u16 = 0x1FFF;
 /// Number of scans after which a moving robot sees another part of the room.
 const SCANS_PER_PLACE: usize = 100;

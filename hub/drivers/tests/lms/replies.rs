@@ -2,13 +2,13 @@
 //! documents misprint. Telegrams with any bytes and a right checksum cause no panic, and are encoded as they were decoded.
 
 use proptest::prelude::*;
-use scanhub_drivers::lms::command::{Request, Span};
+use scanhub_drivers::lms::command::{Request, SubRange};
 use scanhub_drivers::lms::configuration::Configuration;
 use scanhub_drivers::lms::explain::{Headline, explain};
-use scanhub_drivers::lms::measured::{Frame, Measured, Rows};
+use scanhub_drivers::lms::measured::{MeasuredValues, Rows, ScanFrame};
 use scanhub_drivers::lms::reply::Reply;
-use scanhub_drivers::lms::status::{Condition, Errors};
-use scanhub_drivers::lms::telegram::{Encoded, Telegram, Writer};
+use scanhub_drivers::lms::status::{Errors, StatusByte};
+use scanhub_drivers::lms::telegram::{EncodedTelegram, Telegram, Writer};
 use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
 use scanhub_drivers::lms::{measured, reply};
 
@@ -27,12 +27,12 @@ fn bytes(text: &str) -> Vec<u8> {
     bytes
 }
 
-const ZEROS: &str = "00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00";
+const ZERO_BYTES: &str = "00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00";
 
 #[test]
 fn printed_and_captured_replies_both_ways() {
-    let f4 = format!("02 80 24 00 F4 00 00 70 00 00 04 01 00 00 02 02 {ZEROS} 02 00 10 36 FE");
-    let f7 = format!("02 80 25 00 F7 01 00 00 70 00 00 00 01 00 00 02 02 {ZEROS} 02 00 10 C5 7A");
+    let f4 = format!("02 80 24 00 F4 00 00 70 00 00 04 01 00 00 02 02 {ZERO_BYTES} 02 00 10 36 FE");
+    let f7 = format!("02 80 25 00 F7 01 00 00 70 00 00 00 01 00 00 02 02 {ZERO_BYTES} 02 00 10 C5 7A");
     let (f4, f7) = (bytes(&f4), bytes(&f7));
     let vectors: [(&str, Reply<'_>); 12] = [
         ("02 80 03 00 A0 00 10 16 0A", Reply::Mode { done: true }),
@@ -69,19 +69,19 @@ fn printed_and_captured_replies_both_ways() {
         let again = expected.encode(telegram.address(), status).expect("it is short enough");
         assert_eq!(again.bytes(), bytes, "{expected:?}");
     }
-    assert_eq!(reply::configuration(0, Mode(4), Unit::Mm, 0x10).bytes(), f4);
-    assert_eq!(reply::mode(1, true, 0x10).bytes(), bytes("02 81 03 00 A0 00 10 36 1A"));
-    assert_eq!(reply::refused(0, 0x10).bytes(), bytes("02 80 02 00 92 10 7F 33"));
+    assert_eq!(reply::configuration_reply(0, Mode(4), Unit::Mm, 0x10).bytes(), f4);
+    assert_eq!(reply::mode_reply(1, true, 0x10).bytes(), bytes("02 81 03 00 A0 00 10 36 1A"));
+    assert_eq!(reply::refusal(0, 0x10).bytes(), bytes("02 80 02 00 92 10 7F 33"));
     let name = b"LMS200;S18063;V02.19 ";
-    assert_eq!(reply::kind(0, name, 0x10).bytes()[26..], [0x10, 0x85, 0x6A]);
-    assert_eq!(reply::variant(0, true, Variant::HALF, 0x10).bytes()[11..], [0x03, 0x9D]);
+    assert_eq!(reply::type_reply(0, name, 0x10).bytes()[26..], [0x10, 0x85, 0x6A]);
+    assert_eq!(reply::variant_reply(0, true, Variant::HALF, 0x10).bytes()[11..], [0x03, 0x9D]);
 }
 
 /// What the documents print wrong, as far as the bytes are known (found by computing the checksums).
 #[test]
 fn misprints_are_refused() {
     let a_zero_lost =
-        format!("02 80 25 00 F7 01 00 00 70 00 00 00 01 00 00 02 02 {} 02 00 10 C5 7A", &ZEROS[3..]);
+        format!("02 80 25 00 F7 01 00 00 70 00 00 00 01 00 00 02 02 {} 02 00 10 C5 7A", &ZERO_BYTES[3..]);
     for text in [
         // Installation mode with the checksum of table 6-4, copied into programs.
         "02 00 0A 00 20 00 \"SICK_LMS\" 5F B2",
@@ -103,44 +103,44 @@ fn misprints_are_refused() {
     assert_eq!(up, Some(Some(Reply::PowerOn(b"LMS200;301063;V02.10"))));
 }
 
-fn both_ways(reply: &Reply<'_>) -> Encoded {
-    let encoded = reply.encode(0, Condition::OK.0).expect("it is short enough");
+fn encode_and_decode(reply: &Reply<'_>) -> EncodedTelegram {
+    let encoded = reply.encode(0, StatusByte::OK.0).expect("it is short enough");
     assert_eq!(Reply::decode(encoded.telegram()).as_ref(), Some(reply));
     encoded
 }
 
 #[test]
 fn every_other_reply_both_ways() {
-    let span = Span { first: 27, last: 28 };
+    let span = SubRange { first: 27, last: 28 };
     let scan = measured::encode_with(
         0,
-        Frame { unit: Unit::Mm, partial: None, indices: Some((1, 2)) },
+        ScanFrame { unit: Unit::Mm, partial: None, indices: Some((1, 2)) },
         &[7, 8],
         0x10,
     );
     let Some(Reply::Measured(values)) = Reply::decode(scan.telegram()) else { panic!("no scan") };
-    both_ways(&Reply::Measured(values));
-    both_ways(&Reply::PowerOn(b"LMS200;301063;V02.10"));
-    both_ways(&Reply::Counters { hours_by_2: 4000, power_ons: 12 });
-    both_ways(&Reply::Mode { done: false });
-    both_ways(&Reply::Means { shots: 250, values });
-    both_ways(&Reply::Range { span, values });
-    both_ways(&Reply::RangeMeans { shots: 2, span, values });
-    both_ways(&Reply::PowerOnSet { outcome: 1, set: 0 });
-    both_ways(&Reply::Configuration2(&[3; 84]));
-    both_ways(&Reply::Configuration2Written { done: true, parameters: &[3; 84] });
+    encode_and_decode(&Reply::Measured(values));
+    encode_and_decode(&Reply::PowerOn(b"LMS200;301063;V02.10"));
+    encode_and_decode(&Reply::Counters { hours_by_2: 4000, power_ons: 12 });
+    encode_and_decode(&Reply::Mode { done: false });
+    encode_and_decode(&Reply::Means { scans: 250, values });
+    encode_and_decode(&Reply::Range { span, values });
+    encode_and_decode(&Reply::RangeMeans { scans: 2, span, values });
+    encode_and_decode(&Reply::PowerOnSet { outcome: 1, set: 0 });
+    encode_and_decode(&Reply::Configuration2(&[3; 84]));
+    encode_and_decode(&Reply::Configuration2Written { done: true, parameters: &[3; 84] });
     for command in [0xC0, 0xC1, 0xC2, 0xC5, 0xC6, 0xCA, 0xE9, 0xF6] {
-        both_ways(&Reply::Unread { command, data: &[1, 2, 3] });
+        encode_and_decode(&Reply::Undecoded { command, data: &[1, 2, 3] });
     }
     let errors = [0x84, 0x16, 0x01, 0x31];
-    assert_eq!(both_ways(&Reply::Errors(Errors::new(&errors).unwrap())).telegram().data(), errors);
+    assert_eq!(encode_and_decode(&Reply::Errors(Errors::new(&errors).unwrap())).telegram().data(), errors);
     let old = [0; 32];
-    let f4 = both_ways(&Reply::Configuration(Configuration::new(&old).unwrap()));
+    let f4 = encode_and_decode(&Reply::Configuration(Configuration::new(&old).unwrap()));
     assert_eq!(f4.telegram().length(), 0x22);
 }
 
 #[test]
-fn what_does_not_fit_is_no_reply() {
+fn rejects_malformed_and_oversized_replies() {
     let reply = |command: u8, data: &[u8]| {
         let encoded = Writer::new(0x80, command).slice(data).byte(0x10).finish();
         Reply::decode(encoded.telegram()).is_some()
@@ -153,20 +153,20 @@ fn what_does_not_fit_is_no_reply() {
     assert!(Reply::Configuration2(&[0; 900]).encode(0, 0x10).is_none());
     assert!(Reply::Type(&[b'x'; 900]).encode(0, 0x10).is_none());
     // All that a telegram of values holds, and one byte more.
-    let frame = Frame { unit: Unit::Mm, partial: None, indices: Some((1, 2)) };
+    let frame = ScanFrame { unit: Unit::Mm, partial: None, indices: Some((1, 2)) };
     let longest = measured::encode_with(0, frame, &[7; 401], 0x10);
-    let values = Measured::decode(longest.telegram()).expect("is one");
-    let span = Span { first: 1, last: 401 };
+    let values = MeasuredValues::decode(longest.telegram()).expect("is one");
+    let span = SubRange { first: 1, last: 401 };
     assert!(Reply::Measured(values).encode(0, 0x10).is_some());
-    assert!(Reply::Means { shots: 2, values }.encode(0, 0x10).is_none());
+    assert!(Reply::Means { scans: 2, values }.encode(0, 0x10).is_none());
     assert!(Reply::Range { span, values }.encode(0, 0x10).is_none());
-    assert!(Reply::RangeMeans { shots: 2, span, values }.encode(0, 0x10).is_none());
+    assert!(Reply::RangeMeans { scans: 2, span, values }.encode(0, 0x10).is_none());
     let data = [&[1, 0, 101, 0, 101, 0][..], &[0; 8 * 101]].concat();
     let fields = Rows::of_fields(&data).expect("is one");
     assert!(Reply::RangeFields(fields).encode(0, 0x10).is_none());
 }
 
-fn telegram(address: u8, command: u8, data: &[u8]) -> Encoded {
+fn telegram(address: u8, command: u8, data: &[u8]) -> EncodedTelegram {
     Writer::new(address, command).slice(data).finish()
 }
 
@@ -191,7 +191,7 @@ fn data() -> impl Strategy<Value = Vec<u8>> {
 }
 
 /// Explains `telegram`; every byte of it must be in one field, in order.
-fn explained(telegram: Telegram<'_>, mode: Option<Mode>) -> String {
+fn explain_all(telegram: Telegram<'_>, mode: Option<Mode>) -> String {
     let mut text = Headline(telegram).to_string();
     let mut at = 0;
     explain(telegram, mode, &mut |field| {
@@ -203,7 +203,7 @@ fn explained(telegram: Telegram<'_>, mode: Option<Mode>) -> String {
         );
         assert!(!field.bytes.is_empty() && !field.name.is_empty());
         at += field.bytes.len();
-        text += &field.words.map(|words| words.to_string()).unwrap_or_default();
+        text += &field.meaning.map(|words| words.to_string()).unwrap_or_default();
     });
     assert_eq!(at, telegram.bytes().len());
     text
@@ -226,7 +226,7 @@ proptest! {
         data in data(),
         mode in proptest::option::of(any::<u8>().prop_map(Mode)),
     ) {
-        prop_assert!(!explained(telegram(address, command, &data).telegram(), mode).is_empty());
+        prop_assert!(!explain_all(telegram(address, command, &data).telegram(), mode).is_empty());
     }
 
     #[test]

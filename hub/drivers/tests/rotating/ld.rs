@@ -2,17 +2,19 @@
 //! counted once, and the session does not panic.
 
 use scanhub_drivers::Settings;
-use scanhub_drivers::ld::packet::{CLOCK_TURN, Contents, HEADER, LEN, POINTS, TURN};
-use scanhub_drivers::ld::{Model, Session, Trouble};
-use scanhub_drivers::line::{Control, Event, Output, Protocol as _, Session as _, State};
+use scanhub_drivers::ld::packet::{
+    CLOCK_PERIOD_MS, FULL_CIRCLE, HEADER, PACKET_LEN, POINTS_PER_PACKET, PacketContents,
+};
+use scanhub_drivers::ld::{LdSession, Model, Problem};
+use scanhub_drivers::line::{Action, Control, Event, Protocol as _, ScannerSession as _, State};
 use scanhub_drivers::line::{Grid, NOT_MEASURED};
 use scanhub_schema::{MILLIS, Nanos};
 
-use crate::{Damage, DamagedLine, Sent};
+use crate::{DamageRates, DamagedLine, SentPacket};
 
 /// A revolution as the session delivered it.
 #[derive(Debug)]
-struct Told {
+struct DeliveredRevolution {
     /// Numbers of the head's points.
     points: Vec<u64>,
     /// Number of points whose range and angle do not match.
@@ -24,25 +26,25 @@ struct Told {
 
 /// Outputs of a session.
 #[derive(Default)]
-struct Log {
-    packets: Vec<[u8; LEN]>,
-    turns: Vec<Told>,
+struct SessionLog {
+    packets: Vec<[u8; PACKET_LEN]>,
+    revolutions: Vec<DeliveredRevolution>,
     /// The longest time between two packets of a sample, and the most packets.
-    most: usize,
+    max_packets: usize,
     reads: usize,
     bauds: Vec<u32>,
 }
 
-struct Bench {
-    session: Session,
-    head: Head,
+struct TestBench {
+    session: LdSession,
+    scanner: SimulatedScanner,
     now: Nanos,
-    log: Log,
+    log: SessionLog,
 }
 
-impl Bench {
-    fn new(settings: Settings, head: Head) -> Bench {
-        Bench { session: Session::new(settings, 0), head, now: 0, log: Log::default() }
+impl TestBench {
+    fn new(settings: Settings, scanner: SimulatedScanner) -> TestBench {
+        TestBench { session: LdSession::new(settings, 0), scanner, now: 0, log: SessionLog::default() }
     }
 
     /// Drives the session until `until`.
@@ -52,8 +54,8 @@ impl Bench {
                 (Some(at), _) => (at, false),
                 (None, at) => (at, true),
             };
-            let ready = if waits && self.session.rate() == self.head.model.baud() {
-                self.head.next()
+            let ready = if waits && self.session.rate() == self.scanner.model.baud() {
+                self.scanner.next()
             } else {
                 Nanos::MAX
             };
@@ -63,56 +65,67 @@ impl Bench {
     }
 
     fn read(&mut self, is_timeout: bool) {
-        let room = self.session.spare().len();
-        let mut bytes = self.head.read(self.now, room);
-        if self.session.rate() != self.head.model.baud() {
+        let room = self.session.read_buffer().len();
+        let mut bytes = self.scanner.read(self.now, room);
+        if self.session.rate() != self.scanner.model.baud() {
             // A rate four times as fast or slow makes noise of it.
             bytes = bytes.iter().step_by(4).map(|byte| byte | 0x80).collect();
         }
-        self.session.spare()[..bytes.len()].copy_from_slice(&bytes);
+        self.session.read_buffer()[..bytes.len()].copy_from_slice(&bytes);
         self.session.commit(self.now, bytes.len());
         self.log.reads += 1;
         if bytes.is_empty() && is_timeout {
             self.session.handle_timeout(self.now);
         }
-        let account = self.session.account();
-        assert_eq!(account.read, account.in_telegrams + account.discarded + account.buffered);
+        let stats = self.session.stats();
+        assert_eq!(stats.read, stats.in_telegrams + stats.discarded + stats.buffered);
     }
 
     /// Returns the end of the session's rest, if it rests, and the end of its wait.
     fn drain(&mut self) -> (Option<Nanos>, Nanos) {
         loop {
-            match self.session.poll_output() {
-                Output::SetRate(baud) => self.log.bauds.push(baud),
-                Output::Transmit { .. } | Output::SetDtr(_) => panic!("nothing is sent to such a scanner"),
-                Output::Rest(until) => {
+            match self.session.poll_action() {
+                Action::SetRate(baud) => self.log.bauds.push(baud),
+                Action::Transmit { .. } | Action::SetDtr(_) => panic!("nothing is sent to such a scanner"),
+                Action::SleepUntil(until) => {
                     assert!(until > self.now && until <= self.now + 5 * MILLIS);
                     return (Some(until), until);
                 }
-                Output::Wait { until, .. } => return (None, until),
-                Output::Event(Event::Telegram(received)) => {
+                Action::Wait { until, .. } => return (None, until),
+                Action::Event(Event::Telegram(received)) => {
                     assert!(received.first <= received.last && received.last <= self.now);
                     assert!(received.last - received.first <= 10 * MILLIS);
-                    let (packets, rest) = received.bytes.as_chunks::<LEN>();
+                    let (packets, rest) = received.bytes.as_chunks::<PACKET_LEN>();
                     assert!(rest.is_empty());
-                    self.log.most = self.log.most.max(packets.len());
+                    self.log.max_packets = self.log.max_packets.max(packets.len());
                     self.log.packets.extend(packets);
                 }
-                Output::Event(Event::Scan(turn)) => {
-                    let head = &self.head;
+                Action::Event(Event::Scan(revolution)) => {
+                    let head = &self.scanner;
                     let rate = u64::from(head.model.points_per_second());
-                    let about = turn.first.saturating_sub(head.zero) * rate / 1_000_000_000;
-                    let points: Vec<u64> =
-                        turn.points().iter().map(|point| Head::point_of(point.range, about)).collect();
-                    let wrong = turn.points().iter().zip(&points).filter(|(told, point)| {
+                    let about = revolution.first.saturating_sub(head.switched_on_at) * rate / 1_000_000_000;
+                    let points: Vec<u64> = revolution
+                        .points()
+                        .iter()
+                        .map(|point| SimulatedScanner::point_of(point.range, about))
+                        .collect();
+                    let wrong = revolution.points().iter().zip(&points).filter(|(delivered, point)| {
                         let right = head.angle(**point) % 36_000.0;
-                        let off = (-f64::from(told.angle).to_degrees() * 100.0 - right).rem_euclid(36_000.0);
+                        let off =
+                            (-f64::from(delivered.angle).to_degrees() * 100.0 - right).rem_euclid(36_000.0);
                         // The packet's own angles are cut off to a hundredth.
                         off.min(36_000.0 - off) > 2.0
                     });
                     let wrong = wrong.count();
-                    let (first, period, incomplete) = (turn.first, turn.period, turn.is_incomplete());
-                    self.log.turns.push(Told { points, wrong, first, period, incomplete });
+                    let (first, period, incomplete) =
+                        (revolution.first, revolution.period, revolution.is_incomplete());
+                    self.log.revolutions.push(DeliveredRevolution {
+                        points,
+                        wrong,
+                        first,
+                        period,
+                        incomplete,
+                    });
                 }
             }
         }
@@ -120,268 +133,295 @@ impl Bench {
 
     /// Checks every revolution: its points belong to one revolution of the head, in order, and are right. Without a
     /// mark, none is missing. Returns the largest error of a stamp.
-    fn judge(&self) -> Nanos {
+    fn check_revolutions(&self) -> Nanos {
         let beams = self.session.beams().expect("known");
         let edge = 18_000.0 / beams as f64;
         let mut worst = 0;
-        let turn_of = |point: u64| ((self.head.angle(point) + edge) / 36_000.0).floor();
-        for told in &self.log.turns {
-            let (first, last) = (told.points[0], told.points[told.points.len() - 1]);
+        let turn_of = |point: u64| ((self.scanner.angle(point) + edge) / 36_000.0).floor();
+        for revolution in &self.log.revolutions {
+            let (first, last) = (revolution.points[0], revolution.points[revolution.points.len() - 1]);
             // The rounding of angles may put a point into another packet.
-            let is_whole = told.points.len() as u64 == last - first + 1;
-            assert!(told.points.windows(2).all(|pair| pair[0] < pair[1]), "{told:?}");
-            assert!(last - first <= self.head.points.ceil() as u64, "merged: {told:?}");
-            assert!((turn_of(first) - turn_of(last)).abs() < 2.0, "merged: {told:?}");
-            if !told.incomplete {
-                assert_eq!(told.wrong, 0, "{told:?}");
-                assert!(is_whole && (last - first + 1).abs_diff(self.head.points as u64) <= 1, "{told:?}");
+            let is_whole = revolution.points.len() as u64 == last - first + 1;
+            assert!(revolution.points.windows(2).all(|pair| pair[0] < pair[1]), "{revolution:?}");
+            assert!(
+                last - first <= self.scanner.points_per_revolution.ceil() as u64,
+                "merged: {revolution:?}"
+            );
+            assert!((turn_of(first) - turn_of(last)).abs() < 2.0, "merged: {revolution:?}");
+            if !revolution.incomplete {
+                assert_eq!(revolution.wrong, 0, "{revolution:?}");
+                assert!(
+                    is_whole && (last - first + 1).abs_diff(self.scanner.points_per_revolution as u64) <= 1,
+                    "{revolution:?}"
+                );
             }
             let at = (turn_of(last - 1) * 36_000.0 - edge).max(0.0);
-            let begun = self.head.time((at / 36_000.0 * self.head.points).ceil() as u64);
-            worst = worst.max(told.first.abs_diff(begun));
+            let started =
+                self.scanner.time((at / 36_000.0 * self.scanner.points_per_revolution).ceil() as u64);
+            worst = worst.max(revolution.first.abs_diff(started));
         }
         worst
     }
 
-    fn intact_packets_came_once_in_order(&self) {
-        let mut came = self.log.packets.iter();
-        for sent in self.head.sent.iter().filter(|sent| sent.intact && sent.at + 10 * MILLIS < self.now) {
-            assert!(came.any(|bytes| sent.bytes == *bytes), "lost: {:?}", sent.bytes);
+    fn assert_intact_packets_once_in_order(&self) {
+        let mut arrived = self.log.packets.iter();
+        for sent in self.scanner.sent.iter().filter(|sent| sent.intact && sent.at + 10 * MILLIS < self.now) {
+            assert!(arrived.any(|bytes| sent.bytes == *bytes), "lost: {:?}", sent.bytes);
         }
     }
 }
 
-fn of(model: Model) -> Settings {
+fn settings_of(model: Model) -> Settings {
     Settings { model: Some(model.name()), ..Settings::default() }
 }
 
-fn points(model: Model) -> f64 {
-    f64::from(model.points_per_second()) / f64::from(model.turns_per_second())
+fn points_per_revolution(model: Model) -> f64 {
+    f64::from(model.points_per_second()) / f64::from(model.revolutions_per_second())
 }
 
-const SECOND: Nanos = 1_000 * MILLIS;
+const ONE_SECOND: Nanos = 1_000 * MILLIS;
 
 #[test]
-fn scanner_with_uneven_speed_has_the_beams_of_its_model() {
+fn uneven_speed_does_not_change_the_models_beams() {
     let model = Model::Ld19;
-    let mut head = Head::new(model, points(model), 1, Damage::default());
+    let mut head = SimulatedScanner::new(model, points_per_revolution(model), 1, DamageRates::default());
     head.jitter = 0.05;
-    let mut bench = Bench::new(Settings::default(), head);
-    bench.run(9 * SECOND);
-    assert_eq!((bench.log.turns.len(), bench.session.trouble()), (0, None), "the head rotates");
-    bench.run(15 * SECOND);
-    assert!(bench.log.turns.len() > 25, "{}", bench.log.turns.len());
-    assert_eq!((bench.session.beams(), bench.session.trouble()), (Some(model.beams()), None));
+    let mut bench = TestBench::new(Settings::default(), head);
+    bench.run(9 * ONE_SECOND);
+    assert_eq!((bench.log.revolutions.len(), bench.session.problem()), (0, None), "the head rotates");
+    bench.run(15 * ONE_SECOND);
+    assert!(bench.log.revolutions.len() > 25, "{}", bench.log.revolutions.len());
+    assert_eq!((bench.session.beams(), bench.session.problem()), (Some(model.beams()), None));
 }
 
 #[test]
-fn every_model_is_heard_and_every_turn_of_it() {
+fn receives_every_revolution_of_every_model() {
     for model in Model::ALL {
         // A speed at which no two turns have their points at the same places.
-        let head = Head::new(model, points(model) * 1.000_7, 1, Damage::default());
-        let mut bench = Bench::new(of(model), head);
+        let head =
+            SimulatedScanner::new(model, points_per_revolution(model) * 1.000_7, 1, DamageRates::default());
+        let mut bench = TestBench::new(settings_of(model), head);
         // The session reads byte by byte until it knows the stream.
-        bench.run(2 * SECOND);
+        bench.run(2 * ONE_SECOND);
         bench.log.reads = 0;
-        bench.run(11 * SECOND);
-        let hz = u64::from(model.turns_per_second());
-        let turns = bench.log.turns.len() as u64;
-        assert!((10 * hz - 3..=10 * hz).contains(&turns), "{model:?}: {turns}");
-        assert!(bench.log.turns.iter().all(|told| !told.incomplete));
-        let worst = bench.judge();
+        bench.run(11 * ONE_SECOND);
+        let hz = u64::from(model.revolutions_per_second());
+        let revolutions = bench.log.revolutions.len() as u64;
+        assert!((10 * hz - 3..=10 * hz).contains(&revolutions), "{model:?}: {revolutions}");
+        assert!(bench.log.revolutions.iter().all(|revolution| !revolution.incomplete));
+        let worst = bench.check_revolutions();
         assert!(worst < 2 * MILLIS, "{model:?}: {worst}");
-        bench.intact_packets_came_once_in_order();
-        let account = bench.session.account();
-        assert_eq!((account.lost, account.discarded), (0, 0));
-        assert_eq!(account.due, account.telegrams);
+        bench.assert_intact_packets_once_in_order();
+        let stats = bench.session.stats();
+        assert_eq!((stats.lost, stats.discarded), (0, 0));
+        assert_eq!(stats.due, stats.telegrams);
         assert_eq!(bench.session.state(), State::Streaming);
         assert_eq!(bench.session.beams(), Some(model.beams()));
         // A read each five milliseconds, not one for each byte.
         assert!(bench.log.reads < 1_900, "{model:?}: {} reads", bench.log.reads);
-        assert!(bench.log.most <= 17 && bench.log.bauds.is_empty());
+        assert!(bench.log.max_packets <= 17 && bench.log.bauds.is_empty());
     }
 }
 
 #[test]
-fn a_model_that_is_not_told_is_found_by_its_rate_and_its_points() {
+fn finds_unconfigured_model_by_rate_and_points() {
     for (model, found) in
         [(Model::Ld06, Model::Ld19), (Model::Stl27l, Model::Stl27l), (Model::Ld14p, Model::Ld14p)]
     {
-        let mut bench =
-            Bench::new(Settings::default(), Head::new(model, points(model), 1, Damage::default()));
-        bench.run(4 * SECOND);
+        let mut bench = TestBench::new(
+            Settings::default(),
+            SimulatedScanner::new(model, points_per_revolution(model), 1, DamageRates::default()),
+        );
+        bench.run(4 * ONE_SECOND);
         assert_eq!(bench.session.model(), Some(found));
         assert_eq!(bench.session.state(), State::Streaming, "{model:?}: {:?}", bench.log.bauds);
         assert_eq!(bench.session.beams(), Some(found.beams()));
-        assert!(bench.log.turns.len() > 10);
-        bench.judge();
+        assert!(bench.log.revolutions.len() > 10);
+        bench.check_revolutions();
     }
 }
 
 #[test]
-fn a_line_that_damages_bytes_costs_the_packets_that_it_damages() {
+fn damaged_bytes_cost_only_damaged_packets() {
     for seed in 0..100 {
         let mut random = fastrand::Rng::with_seed(!seed);
-        let damage = Damage {
+        let damage = DamageRates {
             lost: random.f64() * 0.004,
             inserted: random.f64() * 0.001,
             flipped: random.f64() * 0.001,
         };
         let model = Model::ALL[seed as usize % 5];
-        let head = Head::new(model, points(model) * (0.9 + 0.2 * random.f64()), seed, damage);
-        let mut bench = Bench::new(of(model), head);
-        bench.run(6 * SECOND);
-        bench.intact_packets_came_once_in_order();
-        bench.judge();
-        let counts = bench.session.turn_counts();
-        assert!(counts.turns > 4 * u64::from(model.turns_per_second()), "{seed}: {counts:?}");
-        assert!(counts.incomplete > 0 && counts.turns == bench.log.turns.len() as u64);
-        let account = bench.session.account();
-        let sent = bench.head.sent.iter().filter(|sent| sent.at < bench.now).count() as u64;
-        let off = (account.due as i64 - sent as i64).abs();
-        assert!(off <= 8 + sent as i64 / 500, "{seed}: {account:?} of {sent}");
-        assert!(account.lost > 0 && account.damaged > 0);
+        let head = SimulatedScanner::new(
+            model,
+            points_per_revolution(model) * (0.9 + 0.2 * random.f64()),
+            seed,
+            damage,
+        );
+        let mut bench = TestBench::new(settings_of(model), head);
+        bench.run(6 * ONE_SECOND);
+        bench.assert_intact_packets_once_in_order();
+        bench.check_revolutions();
+        let counts = bench.session.revolution_counts();
+        assert!(counts.returned > 4 * u64::from(model.revolutions_per_second()), "{seed}: {counts:?}");
+        assert!(counts.incomplete > 0 && counts.returned == bench.log.revolutions.len() as u64);
+        let stats = bench.session.stats();
+        let sent = bench.scanner.sent.iter().filter(|sent| sent.at < bench.now).count() as u64;
+        let off = (stats.due as i64 - sent as i64).abs();
+        assert!(off <= 8 + sent as i64 / 500, "{seed}: {stats:?} of {sent}");
+        assert!(stats.lost > 0 && stats.damaged > 0);
     }
 }
 
 #[test]
-fn a_host_that_stops_dates_what_waited_for_it() {
+fn stamps_after_host_stall_are_within_5_ms() {
     for model in [Model::Ld19, Model::Stl27l] {
         for drift in [0.0, 0.000_2, -0.001] {
-            let mut head = Head::new(model, points(model), 3, Damage::default());
+            let mut head =
+                SimulatedScanner::new(model, points_per_revolution(model), 3, DamageRates::default());
             head.drift = drift;
-            let mut bench = Bench::new(of(model), head);
+            let mut bench = TestBench::new(settings_of(model), head);
             for stall in 2..20 {
-                bench.run(stall * SECOND);
+                bench.run(stall * ONE_SECOND);
                 bench.now += 500 * MILLIS;
                 bench.read(true);
             }
-            bench.run(20 * SECOND);
-            let worst = bench.judge();
+            bench.run(20 * ONE_SECOND);
+            let worst = bench.check_revolutions();
             assert!(worst < 5 * MILLIS, "{model:?} {drift}: {worst}");
-            assert_eq!((bench.session.account().lost, bench.session.account().restarts), (0, 0));
-            bench.intact_packets_came_once_in_order();
+            assert_eq!((bench.session.stats().lost, bench.session.stats().restarts), (0, 0));
+            bench.assert_intact_packets_once_in_order();
         }
     }
 }
 
 #[test]
-fn what_a_full_buffer_drops_is_missing_and_told() {
-    let mut bench =
-        Bench::new(of(Model::Ld19), Head::new(Model::Ld19, points(Model::Ld19), 3, Damage::default()));
-    bench.run(3 * SECOND);
-    let before = bench.session.turn_counts();
-    bench.head.cut(3 * SECOND + 250 * MILLIS);
+fn counts_packets_lost_in_a_full_buffer() {
+    let mut bench = TestBench::new(
+        settings_of(Model::Ld19),
+        SimulatedScanner::new(Model::Ld19, points_per_revolution(Model::Ld19), 3, DamageRates::default()),
+    );
+    bench.run(3 * ONE_SECOND);
+    let before = bench.session.revolution_counts();
+    bench.scanner.lose_until(3 * ONE_SECOND + 250 * MILLIS);
     bench.now += 250 * MILLIS;
     bench.read(true);
-    bench.run(6 * SECOND);
-    let counts = bench.session.turn_counts();
-    assert!(bench.judge() < 5 * MILLIS);
+    bench.run(6 * ONE_SECOND);
+    let counts = bench.session.revolution_counts();
+    assert!(bench.check_revolutions() < 5 * MILLIS);
     assert!(counts.incomplete > before.incomplete && counts.missed + counts.short >= 1, "{counts:?}");
-    let lost = bench.session.account().lost;
+    let lost = bench.session.stats().lost;
     assert!((92..=95).contains(&lost), "{lost}");
-    assert_eq!((bench.session.state(), bench.session.account().restarts), (State::Streaming, 0));
+    assert_eq!((bench.session.state(), bench.session.stats().restarts), (State::Streaming, 0));
 }
 
 #[test]
-fn a_host_that_stops_for_long_is_not_a_restart_of_the_scanner() {
+fn long_host_stall_is_not_a_scanner_restart() {
     for stall in [2, 9, 29, 30, 31, 64] {
-        let head = Head::new(Model::Ld19, 450.0, 3, Damage::default());
-        let mut bench = Bench::new(of(Model::Ld19), head);
-        bench.run(3 * SECOND);
+        let head = SimulatedScanner::new(Model::Ld19, 450.0, 3, DamageRates::default());
+        let mut bench = TestBench::new(settings_of(Model::Ld19), head);
+        bench.run(3 * ONE_SECOND);
         // The tty keeps what arrives first, and the rest finds no room.
-        bench.now += stall * SECOND;
-        bench.head.cut(bench.now);
+        bench.now += stall * ONE_SECOND;
+        bench.scanner.lose_until(bench.now);
         bench.read(true);
-        bench.run(bench.now + 3 * SECOND);
-        assert_eq!(
-            (bench.session.state(), bench.session.account().restarts),
-            (State::Streaming, 0),
-            "{stall}"
-        );
+        bench.run(bench.now + 3 * ONE_SECOND);
+        assert_eq!((bench.session.state(), bench.session.stats().restarts), (State::Streaming, 0), "{stall}");
     }
 }
 
 #[test]
-fn a_turn_that_ends_in_a_gap_went_as_fast_as_before_it() {
-    let mut bench = Bench::new(of(Model::Ld19), Head::new(Model::Ld19, 450.0, 3, Damage::default()));
+fn revolution_cut_by_a_gap_keeps_previous_period() {
+    let mut bench = TestBench::new(
+        settings_of(Model::Ld19),
+        SimulatedScanner::new(Model::Ld19, 450.0, 3, DamageRates::default()),
+    );
     // In the twentieth turn it gets slower, but is where it was, a turn aside.
-    bench.run(SECOND + 1_970 * MILLIS);
-    bench.head.points = 450.0 * 19.7 / 18.7;
-    bench.head.cut(bench.now + 200 * MILLIS);
+    bench.run(ONE_SECOND + 1_970 * MILLIS);
+    bench.scanner.points_per_revolution = 450.0 * 19.7 / 18.7;
+    bench.scanner.lose_until(bench.now + 200 * MILLIS);
     bench.now += 200 * MILLIS;
     bench.read(true);
-    bench.run(4 * SECOND);
-    assert_eq!(bench.session.account().resyncs, 0);
-    let told = bench.log.turns.iter().find(|told| told.incomplete).expect("one with a gap");
-    assert!(told.period.abs_diff(100 * MILLIS) < MILLIS, "{}", told.period);
+    bench.run(4 * ONE_SECOND);
+    assert_eq!(bench.session.stats().resyncs, 0);
+    let revolution =
+        bench.log.revolutions.iter().find(|revolution| revolution.incomplete).expect("one with a gap");
+    assert!(revolution.period.abs_diff(100 * MILLIS) < MILLIS, "{}", revolution.period);
 }
 
 #[test]
 fn a_second_without_a_packet_begins_again() {
-    let mut bench = Bench::new(of(Model::Ld19), Head::new(Model::Ld19, 450.0, 3, Damage::default()));
-    bench.run(3 * SECOND);
-    bench.head.cut(5 * SECOND);
-    bench.run(4 * SECOND + 50 * MILLIS);
-    assert_eq!((bench.session.state(), bench.session.trouble()), (State::Silent, Some(Trouble::Silence)));
-    bench.run(6 * SECOND);
-    assert_eq!((bench.session.state(), bench.session.trouble()), (State::Streaming, None));
-    assert_eq!((bench.session.account().resyncs, bench.session.account().lost), (1, 0));
-    assert_eq!(bench.session.account().restarts, 0, "its clock went on");
-    bench.judge();
+    let mut bench = TestBench::new(
+        settings_of(Model::Ld19),
+        SimulatedScanner::new(Model::Ld19, 450.0, 3, DamageRates::default()),
+    );
+    bench.run(3 * ONE_SECOND);
+    bench.scanner.lose_until(5 * ONE_SECOND);
+    bench.run(4 * ONE_SECOND + 50 * MILLIS);
+    assert_eq!((bench.session.state(), bench.session.problem()), (State::Silent, Some(Problem::Silence)));
+    bench.run(6 * ONE_SECOND);
+    assert_eq!((bench.session.state(), bench.session.problem()), (State::Streaming, None));
+    assert_eq!((bench.session.stats().resyncs, bench.session.stats().lost), (1, 0));
+    assert_eq!(bench.session.stats().restarts, 0, "its clock went on");
+    bench.check_revolutions();
 }
 
 #[test]
-fn where_nobody_speaks_it_says_so_in_steps() {
-    let mut session = Session::new(Settings::default(), 0);
+fn reports_a_silent_line_in_steps() {
+    let mut session = LdSession::new(Settings::default(), 0);
     let (mut now, mut troubles, mut bauds) = (0, Vec::new(), Vec::new());
-    while now < 20 * SECOND {
-        match session.poll_output() {
-            Output::SetRate(baud) => bauds.push(baud),
-            Output::Wait { until, .. } => {
+    while now < 20 * ONE_SECOND {
+        match session.poll_action() {
+            Action::SetRate(baud) => bauds.push(baud),
+            Action::Wait { until, .. } => {
                 now = until;
-                session.spare();
+                session.read_buffer();
                 session.commit(now, 0);
                 session.handle_timeout(now);
             }
             output => panic!("{output:?}"),
         }
-        if troubles.last() != Some(&session.trouble()) {
-            troubles.push(session.trouble());
+        if troubles.last() != Some(&session.problem()) {
+            troubles.push(session.problem());
         }
     }
     assert_eq!(bauds[..3], [921_600, 230_400, 921_600]);
-    let steps = [1, 2, 4, 8, 16].map(|seconds| Trouble::NoPackets { baud: None, seconds });
+    let steps = [1, 2, 4, 8, 16].map(|seconds| Problem::NoPackets { baud: None, seconds });
     assert_eq!(troubles[1..], steps.map(Some));
     assert!(steps[0].to_string().contains("230400 and 921600"));
 }
 
 #[test]
 fn a_pause_is_quiet_and_ends() {
-    let mut bench = Bench::new(of(Model::Ld19), Head::new(Model::Ld19, 450.0, 3, Damage::default()));
-    bench.run(3 * SECOND);
+    let mut bench = TestBench::new(
+        settings_of(Model::Ld19),
+        SimulatedScanner::new(Model::Ld19, 450.0, 3, DamageRates::default()),
+    );
+    bench.run(3 * ONE_SECOND);
     bench.session.control(Control::Pause, bench.now);
-    let (packets, turns) = (bench.log.packets.len(), bench.log.turns.len());
-    bench.run(5 * SECOND);
-    assert_eq!((bench.log.packets.len(), bench.log.turns.len()), (packets, turns));
-    assert_eq!((bench.session.state(), bench.session.trouble()), (State::Paused, None));
+    let (packets, revolutions) = (bench.log.packets.len(), bench.log.revolutions.len());
+    bench.run(5 * ONE_SECOND);
+    assert_eq!((bench.log.packets.len(), bench.log.revolutions.len()), (packets, revolutions));
+    assert_eq!((bench.session.state(), bench.session.problem()), (State::Paused, None));
     bench.session.control(Control::Resume, bench.now);
-    bench.run(6 * SECOND);
+    bench.run(6 * ONE_SECOND);
     assert_eq!(bench.session.state(), State::Streaming);
-    assert!(bench.log.turns.len() > turns + 5);
-    assert_eq!(bench.session.account().restarts, 0);
-    bench.judge();
+    assert!(bench.log.revolutions.len() > revolutions + 5);
+    assert_eq!(bench.session.stats().restarts, 0);
+    bench.check_revolutions();
 }
 
 #[test]
-fn a_turn_goes_on_a_grid_of_constant_beams() {
-    let mut bench = Bench::new(of(Model::Ld19), Head::new(Model::Ld19, 450.3, 3, Damage::default()));
-    bench.run(2 * SECOND);
+fn revolution_fills_a_grid_of_constant_beams() {
+    let mut bench = TestBench::new(
+        settings_of(Model::Ld19),
+        SimulatedScanner::new(Model::Ld19, 450.3, 3, DamageRates::default()),
+    );
+    bench.run(2 * ONE_SECOND);
     let grid = Grid::new(bench.session.beams().expect("known"));
     loop {
-        let output = bench.session.poll_output();
-        let Output::Event(Event::Scan(turn)) = output else {
-            let is_wait = matches!(output, Output::Wait { .. } | Output::Rest(_));
+        let output = bench.session.poll_action();
+        let Action::Event(Event::Scan(revolution)) = output else {
+            let is_wait = matches!(output, Action::Wait { .. } | Action::SleepUntil(_));
             if is_wait {
                 bench.now += MILLIS;
                 bench.read(false);
@@ -390,7 +430,7 @@ fn a_turn_goes_on_a_grid_of_constant_beams() {
         };
         let beams = grid.beams();
         let (mut ranges, mut intensities, mut angles) = (vec![0; beams], vec![0; beams], vec![0.0; beams]);
-        let collisions = grid.fill(turn.points(), &mut ranges, &mut intensities, &mut angles);
+        let collisions = grid.fill(revolution.points(), &mut ranges, &mut intensities, &mut angles);
         let empty = ranges.iter().filter(|range| **range == NOT_MEASURED).count();
         assert!(empty < 3 && collisions < 3, "{empty} empty beams, {collisions} collisions");
         for (beam, angle) in angles.iter().enumerate().filter(|(_, angle)| !angle.is_nan()) {
@@ -403,33 +443,33 @@ fn a_turn_goes_on_a_grid_of_constant_beams() {
 }
 
 /// A head that rotates evenly. The range of each point identifies it.
-struct Head {
+struct SimulatedScanner {
     model: Model,
     /// Points in a turn.
-    points: f64,
+    points_per_revolution: f64,
     /// Share by which its clock is slow.
     drift: f64,
     /// Share by which the speed in every other packet differs from the true one.
     jitter: f64,
     random: fastrand::Rng,
     line: DamagedLine,
-    sent: Vec<Sent>,
+    sent: Vec<SentPacket>,
     /// When it was switched on, and how many packets it has sent since.
-    zero: Nanos,
+    switched_on_at: Nanos,
     packets: u64,
 }
 
-impl Head {
-    fn new(model: Model, points: f64, seed: u64, damage: Damage) -> Head {
-        Head {
+impl SimulatedScanner {
+    fn new(model: Model, points_per_revolution: f64, seed: u64, damage: DamageRates) -> SimulatedScanner {
+        SimulatedScanner {
             model,
-            points,
+            points_per_revolution,
             drift: 0.0,
             jitter: 0.0,
             random: fastrand::Rng::with_seed(seed),
             line: DamagedLine::new(damage),
             sent: Vec::new(),
-            zero: 1_000 * MILLIS,
+            switched_on_at: 1_000 * MILLIS,
             packets: 0,
         }
     }
@@ -437,12 +477,12 @@ impl Head {
     /// Returns the time of point number `point` on the hub's clock.
     fn time(&self, point: u64) -> Nanos {
         let sensor_s = point as f64 / f64::from(self.model.points_per_second());
-        self.zero + (sensor_s / (1.0 - self.drift) * 1e9) as Nanos
+        self.switched_on_at + (sensor_s / (1.0 - self.drift) * 1e9) as Nanos
     }
 
     /// Returns the angle of point number `point` in hundredths of a degree, over all revolutions.
     fn angle(&self, point: u64) -> f64 {
-        point as f64 * f64::from(TURN) / self.points
+        point as f64 * f64::from(FULL_CIRCLE) / self.points_per_revolution
     }
 
     /// The range of point number `point`: by which it is known again.
@@ -464,7 +504,7 @@ impl Head {
 
     /// Returns the time at which the next byte arrives.
     fn next(&mut self) -> Nanos {
-        let mut until = self.time((self.packets + 2) * POINTS as u64);
+        let mut until = self.time((self.packets + 2) * POINTS_PER_PACKET as u64);
         while self.line.bytes.is_empty() {
             self.send_until(until);
             until += 10 * MILLIS;
@@ -474,84 +514,86 @@ impl Head {
 
     fn send_until(&mut self, now: Nanos) {
         loop {
-            let first = self.packets * POINTS as u64;
-            let last = first + POINTS as u64 - 1;
+            let first = self.packets * POINTS_PER_PACKET as u64;
+            let last = first + POINTS_PER_PACKET as u64 - 1;
             let done = self.time(last);
             if done > now {
                 return;
             }
             self.packets += 1;
             let sensor_ms = last as f64 / f64::from(self.model.points_per_second()) * 1e3;
-            let hz = f64::from(self.model.points_per_second()) / self.points;
-            let word = |angle: f64| (angle % f64::from(TURN)) as u16;
-            let packet = Contents {
+            let hz = f64::from(self.model.points_per_second()) / self.points_per_revolution;
+            let word = |angle: f64| (angle % f64::from(FULL_CIRCLE)) as u16;
+            let packet = PacketContents {
                 speed: (360.0 * hz * (1.0 + self.jitter * (self.packets % 2) as f64)).round() as u16,
                 start: word(self.angle(first)),
-                points: std::array::from_fn(|i| (Head::range(first + i as u64), (i * 7) as u8)),
+                points: std::array::from_fn(|i| (SimulatedScanner::range(first + i as u64), (i * 7) as u8)),
                 end: word(self.angle(last)),
-                millis: ((sensor_ms + 12_345.0) % f64::from(CLOCK_TURN)) as u16,
+                millis: ((sensor_ms + 12_345.0) % f64::from(CLOCK_PERIOD_MS)) as u16,
             };
             let (bytes, baud) = (packet.encode(), self.model.baud());
-            self.sent.push(self.line.carry(&bytes, done, baud, &mut self.random));
+            self.sent.push(self.line.transmit(&bytes, done, baud, &mut self.random));
         }
     }
 
     /// Loses the bytes on the line and the next ones up to `until`.
-    fn cut(&mut self, until: Nanos) {
+    fn lose_until(&mut self, until: Nanos) {
         self.send_until(until);
         self.line.bytes.retain(|(at, _)| *at > until);
-        let lost = self.sent.iter_mut().rev().take_while(|sent| sent.at + 3 * MILLIS > self.zero);
+        let lost = self.sent.iter_mut().rev().take_while(|sent| sent.at + 3 * MILLIS > self.switched_on_at);
         lost.filter(|sent| sent.at <= until + 3 * MILLIS).for_each(|sent| sent.intact = false);
     }
 }
 
 /// A packet with a right checksum that says anything.
-fn wild(random: &mut fastrand::Rng) -> [u8; LEN] {
+fn random_packet(random: &mut fastrand::Rng) -> [u8; PACKET_LEN] {
     let angle = |random: &mut fastrand::Rng| random.u16(..=36_000);
     let start = angle(random);
     let end = if random.bool() { angle(random) } else { (start + random.u16(..4_500)) % 36_000 };
     let speed = if random.bool() { random.u16(..) } else { 3_600 };
     let points = std::array::from_fn(|_| (random.u16(..), random.u8(..)));
-    Contents { speed, start, points, end, millis: random.u16(..) }.encode()
+    PacketContents { speed, start, points, end, millis: random.u16(..) }.encode()
 }
 
 #[test]
 fn every_byte_is_counted_once() {
     for seed in 0..300 {
         let mut random = fastrand::Rng::with_seed(seed);
-        let mut session = Session::new(Settings::default(), 0);
-        let (mut now, mut told) = (0, 0);
+        let mut session = LdSession::new(Settings::default(), 0);
+        let (mut now, mut delivered_bytes) = (0, 0);
         for _ in 0..400 {
             let mut bytes = Vec::new();
             while bytes.len() < 300 {
                 match random.u8(..5) {
                     0 => bytes.extend((0..random.usize(..60)).map(|_| random.u8(..))),
                     1 => bytes.extend(HEADER.iter().cycle().take(random.usize(..100))),
-                    2 => bytes.extend(&wild(&mut random)[..random.usize(..LEN)]),
-                    _ => bytes.extend(wild(&mut random)),
+                    2 => bytes.extend(&random_packet(&mut random)[..random.usize(..PACKET_LEN)]),
+                    _ => bytes.extend(random_packet(&mut random)),
                 }
             }
-            bytes.truncate(session.spare().len());
-            session.spare()[..bytes.len()].copy_from_slice(&bytes);
+            bytes.truncate(session.read_buffer().len());
+            session.read_buffer()[..bytes.len()].copy_from_slice(&bytes);
             now += random.u64(..400 * MILLIS);
             session.commit(now, bytes.len());
             loop {
-                match session.poll_output() {
-                    Output::Event(Event::Telegram(received)) => {
-                        told += received.bytes.len() as u64;
-                        assert!(received.bytes.len() % LEN == 0 && received.first <= received.last);
+                match session.poll_action() {
+                    Action::Event(Event::Telegram(received)) => {
+                        delivered_bytes += received.bytes.len() as u64;
+                        assert!(received.bytes.len() % PACKET_LEN == 0 && received.first <= received.last);
                     }
-                    Output::Event(Event::Scan(turn)) => assert!(turn.points().len() >= POINTS),
-                    Output::SetRate(_) => {}
-                    Output::Transmit { .. } | Output::SetDtr(_) => panic!("nothing is sent"),
-                    Output::Rest(_) | Output::Wait { .. } => break,
+                    Action::Event(Event::Scan(revolution)) => {
+                        assert!(revolution.points().len() >= POINTS_PER_PACKET)
+                    }
+                    Action::SetRate(_) => {}
+                    Action::Transmit { .. } | Action::SetDtr(_) => panic!("nothing is sent"),
+                    Action::SleepUntil(_) | Action::Wait { .. } => break,
                 }
             }
-            let account = session.account();
-            assert_eq!(account.read, account.in_telegrams + account.discarded + account.buffered);
-            assert_eq!(account.in_telegrams, told);
-            assert!(account.buffered < 2 * LEN as u64, "{account:?}");
+            let stats = session.stats();
+            assert_eq!(stats.read, stats.in_telegrams + stats.discarded + stats.buffered);
+            assert_eq!(stats.in_telegrams, delivered_bytes);
+            assert!(stats.buffered < 2 * PACKET_LEN as u64, "{stats:?}");
         }
-        assert!(session.account().telegrams > 500);
+        assert!(session.stats().telegrams > 500);
     }
 }

@@ -9,7 +9,7 @@ use scanhub_schema::{Nanos, line_time};
 
 /// Faults of the bytes of packets, as shares of all bytes.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Damage {
+pub(crate) struct DamageRates {
     /// Starts of bursts that are lost. Their mean length is four bytes.
     lost: f64,
     /// Bytes that follow an inserted one.
@@ -20,14 +20,14 @@ pub(crate) struct Damage {
 
 /// The line from a scanner to the host.
 pub(crate) struct DamagedLine {
-    damage: Damage,
+    damage: DamageRates,
     is_in_burst: bool,
     /// Bytes on the line, with the times at which they arrive.
     bytes: VecDeque<(Nanos, u8)>,
 }
 
 /// A packet as it was sent.
-pub(crate) struct Sent {
+pub(crate) struct SentPacket {
     bytes: Vec<u8>,
     intact: bool,
     /// Time at which its last byte has left the line, if none was lost.
@@ -35,12 +35,12 @@ pub(crate) struct Sent {
 }
 
 impl DamagedLine {
-    fn new(damage: Damage) -> DamagedLine {
+    fn new(damage: DamageRates) -> DamagedLine {
         DamagedLine { damage, is_in_burst: false, bytes: VecDeque::new() }
     }
 
     /// Puts `packet` on the line at `from` with `baud` bits per second.
-    fn carry(&mut self, packet: &[u8], from: Nanos, baud: u32, random: &mut fastrand::Rng) -> Sent {
+    fn transmit(&mut self, packet: &[u8], from: Nanos, baud: u32, random: &mut fastrand::Rng) -> SentPacket {
         let (mut intact, mut at) = (true, from);
         for (place, &byte) in packet.iter().enumerate() {
             at += line_time(1, baud);
@@ -56,12 +56,12 @@ impl DamagedLine {
                 self.bytes.push_back((at, byte ^ flip));
             }
         }
-        Sent { bytes: packet.to_vec(), intact, at }
+        SentPacket { bytes: packet.to_vec(), intact, at }
     }
 
     /// Returns the bytes that have arrived by `now`, at most `room`.
-    fn read(&mut self, now: Nanos, room: usize) -> Vec<u8> {
-        let count = self.bytes.iter().take(room).take_while(|(at, _)| *at <= now).count();
+    fn read(&mut self, now: Nanos, max_len: usize) -> Vec<u8> {
+        let count = self.bytes.iter().take(max_len).take_while(|(at, _)| *at <= now).count();
         self.bytes.drain(..count).map(|(_, byte)| byte).collect()
     }
 }

@@ -4,14 +4,14 @@
 //! All beams take the same steps, whatever they hit, so that the compiler can vectorize them. The constants of [`Multi`]
 //! were found on seeds 0 to 9 of the simulated scenes, by `benches/perception`.
 
-use super::{Class, INVALID, Limits, Runs};
+use super::{Class, INVALID, Limits, RunFilter};
 use crate::search::position;
 use scanhub_schema::Background;
 
 /// State of the paper's method: one range per beam, which is replaced by a new range once that was read a number of
 /// times in a row. A beam that flips between two surfaces never learns either of them.
 #[derive(Clone)]
-pub(super) struct Paper {
+pub(super) struct SingleSurface {
     /// Ranges in device units, [`Background::UNKNOWN`] or [`Background::FAR`].
     background: Box<[u16]>,
     /// Candidates for the background, where `run` is not 0.
@@ -20,15 +20,15 @@ pub(super) struct Paper {
     run: Box<[u16]>,
 }
 
-impl Paper {
+impl SingleSurface {
     /// Creates the state for at most `beams` beams.
-    pub(super) fn new(beams: usize) -> Paper {
+    pub(super) fn new(beams: usize) -> SingleSurface {
         let none = || vec![0; beams].into_boxed_slice();
-        Paper { background: vec![Background::UNKNOWN; beams].into(), candidate: none(), run: none() }
+        SingleSurface { background: vec![Background::UNKNOWN; beams].into(), candidate: none(), run: none() }
     }
 
     /// Restores the initial state.
-    pub(super) fn forget(&mut self) {
+    pub(super) fn reset(&mut self) {
         self.background.fill(Background::UNKNOWN);
         self.run.fill(0);
     }
@@ -37,9 +37,9 @@ impl Paper {
     /// but are never foreground. The scan that completes a run is compared with the old background.
     pub(super) fn update(&mut self, readings: &[u16], limits: &Limits, learn: bool, classes: &mut [Class]) {
         for ((&reading, &background), class) in readings.iter().zip(&self.background).zip(classes) {
-            let aside = if reading < background { Class::Foreground } else { Class::Behind };
+            let other = if reading < background { Class::Foreground } else { Class::Behind };
             let ends = reading.abs_diff(background) <= limits.threshold;
-            let known = if ends { Class::Background } else { aside };
+            let known = if ends { Class::Background } else { other };
             let valid = if background == Background::UNKNOWN { Class::Unknown } else { known };
             *class = if reading == INVALID { Class::Invalid } else { valid };
         }
@@ -60,10 +60,10 @@ impl Paper {
             let goes_on = (run[i] > 0) & (reading.abs_diff(candidate[i]) <= limits.candidate);
             let longer = if goes_on { run[i] + 1 } else { 1 };
             let adopted = valid & !ends & (longer >= limits.scans);
-            let anew = valid & !ends & (!goes_on | limits.latest);
+            let is_new = valid & !ends & (!goes_on | limits.latest);
             let new_run = if ends | adopted { 0 } else { longer };
             background[i] = if adopted { reading } else { background[i] };
-            candidate[i] = if anew { reading } else { candidate[i] };
+            candidate[i] = if is_new { reading } else { candidate[i] };
             run[i] = if valid { new_run } else { run[i] };
         }
     }
@@ -80,11 +80,11 @@ impl Paper {
 }
 
 /// State of the method with several surfaces per beam. At edges, a beam flips between two surfaces, and both are
-/// learned. [`Runs`] decides how many neighboring beams make an object.
+/// learned. [`RunFilter`] decides how many neighboring beams make an object.
 #[derive(Clone)]
-pub(super) struct Multi {
-    blocks: Box<[Block]>,
-    runs: Runs,
+pub(super) struct MultiSurface {
+    blocks: Box<[BeamBlock]>,
+    run_filter: RunFilter,
     /// The nearest background of each beam, while a scan is processed.
     nearest: Box<[u16]>,
 }
@@ -95,12 +95,12 @@ pub(super) struct Multi {
 /// Such a scan changes only its range, so the block takes a short path with the same result.
 #[derive(Clone)]
 #[cfg_attr(test, derive(Debug, PartialEq))]
-struct Block {
-    slots: [Slots; SLOTS],
+struct BeamBlock {
+    slots: [Slots; SLOT_COUNT],
     /// Weight that the next surface of the beam gains: more if previous scans had no return.
-    gain: [i16; BLOCK],
+    gain: [i16; BLOCK_LEN],
     /// Ranges of the surfaces, if each beam has one only, which is fully known. The slots then have older ranges.
-    settled: Option<[u16; BLOCK]>,
+    single_surfaces: Option<[u16; BLOCK_LEN]>,
 }
 
 /// A surface of each beam of a block, if it has one.
@@ -108,58 +108,59 @@ struct Block {
 #[cfg_attr(test, derive(Debug, PartialEq))]
 struct Slots {
     /// In device units.
-    range: [u16; BLOCK],
+    range: [u16; BLOCK_LEN],
     /// How well the surface is known. It grows with each scan in which the beam met it, and decreases in others.
     /// [`NONE`]: there is no surface.
-    weight: [i16; BLOCK],
+    weight: [i16; BLOCK_LEN],
 }
 
 /// Limits of the steps, as numbers that compare like signed ranges and weights.
 #[derive(Clone, Copy)]
-struct Bounds {
+struct WeightBounds {
     threshold: i16,
-    returned: i16,
+    max_gain: i16,
     full: i16,
     known: i16,
     replaced: i16,
 }
 
-impl Multi {
+impl MultiSurface {
     /// Creates the state for at most `beams` beams.
-    pub(super) fn new(beams: usize) -> Multi {
-        Multi {
-            blocks: vec![Block::NEW; beams.div_ceil(BLOCK)].into(),
-            runs: Runs::new(beams),
-            nearest: vec![INVALID; beams.next_multiple_of(BLOCK)].into(),
+    pub(super) fn new(beams: usize) -> MultiSurface {
+        MultiSurface {
+            blocks: vec![BeamBlock::NEW; beams.div_ceil(BLOCK_LEN)].into(),
+            run_filter: RunFilter::new(beams),
+            nearest: vec![INVALID; beams.next_multiple_of(BLOCK_LEN)].into(),
         }
     }
 
     /// Restores the initial state.
-    pub(super) fn forget(&mut self) {
-        self.blocks.fill(Block::NEW);
-        self.runs.forget();
+    pub(super) fn reset(&mut self) {
+        self.blocks.fill(BeamBlock::NEW);
+        self.run_filter.reset();
     }
 
     /// Compares all beams with the state before this scan, then learns from them. `readings` and `classes` have whole
     /// blocks.
     pub(super) fn update(&mut self, readings: &[u16], limits: &Limits, learn: bool, classes: &mut [Class]) {
-        let bounds = Bounds::of(limits);
-        let (read, _) = readings.as_chunks::<BLOCK>();
+        let bounds = WeightBounds::of(limits);
+        let (read, _) = readings.as_chunks::<BLOCK_LEN>();
         let nearest = &mut self.nearest[..readings.len()];
-        let results = classes.as_chunks_mut::<BLOCK>().0.iter_mut().zip(nearest.as_chunks_mut::<BLOCK>().0);
+        let results =
+            classes.as_chunks_mut::<BLOCK_LEN>().0.iter_mut().zip(nearest.as_chunks_mut::<BLOCK_LEN>().0);
         for ((block, readings), (classes, nearest)) in self.blocks.iter_mut().zip(read).zip(results) {
             block.compare(readings, bounds, classes, nearest);
         }
         let nearest = &self.nearest[..readings.len()];
-        let mut left = 0;
-        while let Some(unknown) = position(nearest, left, |range| range == INVALID) {
-            let Some(known) = position(nearest, unknown, |range| range != INVALID) else { break };
-            left = known;
-            if let Some(right) = unknown.checked_sub(1) {
-                self.compare_with_neighbors(right, left, readings, limits, classes);
+        let mut begin = 0;
+        while let Some(first) = position(nearest, begin, |range| range == INVALID) {
+            let Some(end) = position(nearest, first, |range| range != INVALID) else { break };
+            begin = end;
+            if let Some(right) = first.checked_sub(1) {
+                self.compare_with_neighbors(right, begin, readings, limits, classes);
             }
         }
-        self.runs.keep(readings, limits, classes);
+        self.run_filter.retain_objects(readings, limits, classes);
         if learn {
             self.blocks.iter_mut().zip(read).for_each(|(block, readings)| block.learn(readings, bounds));
         }
@@ -175,14 +176,14 @@ impl Multi {
         limits: &Limits,
         classes: &mut [Class],
     ) {
-        let bounds = Bounds::of(limits);
+        let bounds = WeightBounds::of(limits);
         let limit = self.nearest[right].min(self.nearest[left]).saturating_sub(limits.threshold);
-        for i in left.saturating_sub(ASIDE).max(right + 1)..left.min(right + ASIDE + 1) {
+        for i in left.saturating_sub(MAX_NEIGHBORS).max(right + 1)..left.min(right + MAX_NEIGHBORS + 1) {
             let reading = readings[i];
-            let met = |(range, weight): (u16, i16)| {
+            let is_met = |(range, weight): (u16, i16)| {
                 weight >= bounds.replaced && signed(range.abs_diff(reading)) <= bounds.threshold
             };
-            if reading < limit && reading != INVALID && !self.surfaces(i).any(met) {
+            if reading < limit && reading != INVALID && !self.surfaces(i).any(is_met) {
                 classes[i] = Class::Foreground;
             }
         }
@@ -190,15 +191,15 @@ impl Multi {
 
     /// Returns range and weight of each surface of beam `i`, whose block is not settled.
     fn surfaces(&self, i: usize) -> impl Iterator<Item = (u16, i16)> {
-        let beam = i % BLOCK;
-        self.blocks[i / BLOCK].slots.iter().map(move |slots| (slots.range[beam], slots.weight[beam]))
+        let beam = i % BLOCK_LEN;
+        self.blocks[i / BLOCK_LEN].slots.iter().map(move |slots| (slots.range[beam], slots.weight[beam]))
     }
 
     /// Uses `range` as the only background of beam `i`, as well known as possible.
     pub(super) fn adopt(&mut self, i: usize, range: u16) {
-        let (block, beam) = (&mut self.blocks[i / BLOCK], i % BLOCK);
-        block.unsettle();
-        block.slots.iter_mut().for_each(|slots| slots.weight[beam] = NONE);
+        let (block, beam) = (&mut self.blocks[i / BLOCK_LEN], i % BLOCK_LEN);
+        block.clear_single_surfaces();
+        block.slots.iter_mut().for_each(|slots| slots.weight[beam] = NO_WEIGHT);
         block.slots[0].range[beam] = range;
         block.slots[0].weight[beam] = i16::MAX;
     }
@@ -206,21 +207,21 @@ impl Multi {
     /// Returns the best known background of beam `i`, and of equal ones the nearer one. A surface takes precedence over
     /// no return, however frequent: a model that starts with that range alone would report the surface as foreground.
     pub(super) fn background(&self, i: usize, limits: &Limits) -> u16 {
-        if let Some(ranges) = &self.blocks[i / BLOCK].settled {
-            return ranges[i % BLOCK];
+        if let Some(ranges) = &self.blocks[i / BLOCK_LEN].single_surfaces {
+            return ranges[i % BLOCK_LEN];
         }
-        let known = |&(_, weight): &(u16, i16)| weight >= Bounds::of(limits).known;
+        let known = |&(_, weight): &(u16, i16)| weight >= WeightBounds::of(limits).known;
         let rank = |&(range, weight): &(u16, i16)| (range != Background::FAR, weight, u16::MAX - range);
         let best = self.surfaces(i).filter(known).max_by_key(rank);
         best.map_or(Background::UNKNOWN, |(range, _)| range)
     }
 }
 
-impl Block {
-    const NEW: Block = Block {
-        slots: [const { Slots { range: [0; BLOCK], weight: [NONE; BLOCK] } }; SLOTS],
-        gain: [MET; BLOCK],
-        settled: None,
+impl BeamBlock {
+    const NEW: BeamBlock = BeamBlock {
+        slots: [const { Slots { range: [0; BLOCK_LEN], weight: [NO_WEIGHT; BLOCK_LEN] } }; SLOT_COUNT],
+        gain: [MET_WEIGHT; BLOCK_LEN],
+        single_surfaces: None,
     };
 
     /// Classifies each beam by its own background, and finds the nearest background of each beam; [`INVALID`] if there
@@ -228,31 +229,31 @@ impl Block {
     #[inline]
     fn compare(
         &mut self,
-        readings: &[u16; BLOCK],
-        bounds: Bounds,
-        classes: &mut [Class; BLOCK],
-        nearest: &mut [u16; BLOCK],
+        readings: &[u16; BLOCK_LEN],
+        bounds: WeightBounds,
+        classes: &mut [Class; BLOCK_LEN],
+        nearest: &mut [u16; BLOCK_LEN],
     ) {
-        match &self.settled {
-            Some(ranges) if meets(ranges, readings, bounds) => {
+        match &self.single_surfaces {
+            Some(ranges) if all_meet(ranges, readings, bounds) => {
                 *nearest = *ranges;
                 for (class, &reading) in classes.iter_mut().zip(readings) {
                     *class = if reading == INVALID { Class::Invalid } else { Class::Background };
                 }
             }
             _ => {
-                self.unsettle();
-                self.compare_all(readings, bounds, classes, nearest);
+                self.clear_single_surfaces();
+                self.compare_surfaces(readings, bounds, classes, nearest);
             }
         }
     }
 
     /// Writes the ranges of a settled block into the slots, because a beam has a reading of something else.
-    fn unsettle(&mut self) {
-        if let Some(ranges) = self.settled.take() {
+    fn clear_single_surfaces(&mut self) {
+        if let Some(ranges) = self.single_surfaces.take() {
             for slots in &mut self.slots {
                 for ((range, weight), new) in slots.range.iter_mut().zip(slots.weight).zip(ranges) {
-                    *range = if weight == NONE { *range } else { new };
+                    *range = if weight == NO_WEIGHT { *range } else { new };
                 }
             }
         }
@@ -260,12 +261,12 @@ impl Block {
 
     /// Compares with all surfaces.
     #[inline]
-    fn compare_all(
+    fn compare_surfaces(
         &self,
-        readings: &[u16; BLOCK],
-        bounds: Bounds,
-        classes: &mut [Class; BLOCK],
-        nearest: &mut [u16; BLOCK],
+        readings: &[u16; BLOCK_LEN],
+        bounds: WeightBounds,
+        classes: &mut [Class; BLOCK_LEN],
+        nearest: &mut [u16; BLOCK_LEN],
     ) {
         for (i, &reading) in readings.iter().enumerate() {
             let (mut ends, mut known, mut range) = (false, false, Background::FAR);
@@ -276,8 +277,8 @@ impl Block {
                 range = if is_known & (slots.range[i] < range) { slots.range[i] } else { range };
             }
             nearest[i] = if known { range } else { INVALID };
-            let aside = if reading < range { Class::Foreground } else { Class::Behind };
-            let with_background = if ends { Class::Background } else { aside };
+            let other = if reading < range { Class::Foreground } else { Class::Behind };
+            let with_background = if ends { Class::Background } else { other };
             let valid = if known { with_background } else { Class::Unknown };
             classes[i] = if reading == INVALID { Class::Invalid } else { valid };
         }
@@ -287,8 +288,8 @@ impl Block {
     /// that the beam passed through more than those that may be hidden. A reading of no surface replaces the least
     /// known one, unless all are known too well.
     #[inline]
-    fn learn(&mut self, readings: &[u16; BLOCK], bounds: Bounds) {
-        match &mut self.settled {
+    fn learn(&mut self, readings: &[u16; BLOCK_LEN], bounds: WeightBounds) {
+        match &mut self.single_surfaces {
             Some(ranges) => {
                 let (readings, mut drawn) = (*readings, *ranges);
                 for (range, reading) in drawn.iter_mut().zip(readings) {
@@ -297,13 +298,13 @@ impl Block {
                 *ranges = drawn;
                 self.gain(readings, bounds);
             }
-            None => self.learn_all(readings, bounds),
+            None => self.learn_surfaces(readings, bounds),
         }
     }
 
     /// Updates all surfaces.
     #[inline]
-    fn learn_all(&mut self, readings: &[u16; BLOCK], bounds: Bounds) {
+    fn learn_surfaces(&mut self, readings: &[u16; BLOCK_LEN], bounds: WeightBounds) {
         let gains = self.gain(*readings, bounds);
         for (i, &reading) in readings.iter().enumerate() {
             let range = self.slots.each_ref().map(|slots| slots.range[i]);
@@ -314,32 +315,32 @@ impl Block {
                 slots.weight[i] = weight[k];
             }
         }
-        self.settled = self.single_surfaces(bounds.full);
+        self.single_surfaces = self.single_surfaces(bounds.full);
     }
 
     /// Returns the ranges of the surfaces if each beam has one only, of weight `full`.
     #[inline]
-    fn single_surfaces(&self, full: i16) -> Option<[u16; BLOCK]> {
-        let (mut ranges, mut known, mut empty) = ([0; BLOCK], [0; BLOCK], [0; BLOCK]);
+    fn single_surfaces(&self, full: i16) -> Option<[u16; BLOCK_LEN]> {
+        let (mut ranges, mut known, mut empty) = ([0; BLOCK_LEN], [0; BLOCK_LEN], [0; BLOCK_LEN]);
         for slots in &self.slots {
-            for i in 0..BLOCK {
+            for i in 0..BLOCK_LEN {
                 let is_full = mask(slots.weight[i] == full);
                 ranges[i] |= slots.range[i] & is_full as u16;
                 known[i] += is_full;
-                empty[i] += mask(slots.weight[i] == NONE);
+                empty[i] += mask(slots.weight[i] == NO_WEIGHT);
             }
         }
-        (known == [-1; BLOCK] && empty == [1 - SLOTS as i16; BLOCK]).then_some(ranges)
+        (known == [-1; BLOCK_LEN] && empty == [1 - SLOT_COUNT as i16; BLOCK_LEN]).then_some(ranges)
     }
 
     /// Returns the weights that the surfaces gain in this scan.
     #[inline]
-    fn gain(&mut self, readings: [u16; BLOCK], bounds: Bounds) -> [i16; BLOCK] {
+    fn gain(&mut self, readings: [u16; BLOCK_LEN], bounds: WeightBounds) -> [i16; BLOCK_LEN] {
         let (mut gains, mut next_gains) = (self.gain, self.gain);
         for ((gain, next), reading) in gains.iter_mut().zip(&mut next_gains).zip(readings) {
             let (far, valid) = (mask(reading == Background::FAR), mask(reading != INVALID));
-            let after = ((*next + MET).min(bounds.returned) & far) | (MET & !far);
-            *gain = (MET & far) | (*next & !far);
+            let after = ((*next + MET_WEIGHT).min(bounds.max_gain) & far) | (MET_WEIGHT & !far);
+            *gain = (MET_WEIGHT & far) | (*next & !far);
             *next = (after & valid) | (*next & !valid);
         }
         self.gain = next_gains;
@@ -349,7 +350,7 @@ impl Block {
 
 /// Returns whether each beam meets its surface at `range`, or has no reading.
 #[inline]
-fn meets(range: &[u16; BLOCK], readings: &[u16; BLOCK], bounds: Bounds) -> bool {
+fn all_meet(range: &[u16; BLOCK_LEN], readings: &[u16; BLOCK_LEN], bounds: WeightBounds) -> bool {
     let beams = range.iter().zip(readings);
     beams.fold(true, |all, (&range, &reading)| {
         all & ((signed(range.abs_diff(reading)) <= bounds.threshold) | (reading == INVALID))
@@ -360,8 +361,8 @@ fn meets(range: &[u16; BLOCK], readings: &[u16; BLOCK], bounds: Bounds) -> bool 
 /// rounded to zero. Shifts stay 16 bits wide, which a division does not.
 #[inline]
 fn step(range: u16, reading: u16) -> i16 {
-    let apart = reading.wrapping_sub(range) as i16;
-    apart.wrapping_add((apart >> 15) & ((1 << DRAWN) - 1)) >> DRAWN
+    let difference = reading.wrapping_sub(range) as i16;
+    difference.wrapping_add((difference >> 15) & ((1 << DRIFT_SHIFT) - 1)) >> DRIFT_SHIFT
 }
 
 /// Returns -1, which has all bits, or 0. An `if` in a short loop would become a branch for each beam.
@@ -373,40 +374,41 @@ fn mask(is_set: bool) -> i16 {
 /// Returns the surfaces of one beam after `reading`. The one that was met gains this weight.
 #[inline]
 fn learned(
-    range: [u16; SLOTS],
-    weight: [i16; SLOTS],
+    range: [u16; SLOT_COUNT],
+    weight: [i16; SLOT_COUNT],
     reading: u16,
     gain: i16,
-    bounds: Bounds,
-) -> ([u16; SLOTS], [i16; SLOTS]) {
+    bounds: WeightBounds,
+) -> ([u16; SLOT_COUNT], [i16; SLOT_COUNT]) {
     const NOT_MET: i16 = i16::MAX;
-    let mut apart = [NOT_MET; SLOTS];
+    let mut distances = [NOT_MET; SLOT_COUNT];
     let mut least_apart = NOT_MET;
-    for k in 0..SLOTS {
-        let away = signed(range[k].abs_diff(reading));
-        apart[k] = if (weight[k] > NONE) & (away <= bounds.threshold) { away } else { NOT_MET };
-        least_apart = least_apart.min(apart[k]);
+    for k in 0..SLOT_COUNT {
+        let distance = signed(range[k].abs_diff(reading));
+        distances[k] =
+            if (weight[k] > NO_WEIGHT) & (distance <= bounds.threshold) { distance } else { NOT_MET };
+        least_apart = least_apart.min(distances[k]);
     }
     let (mut new_range, mut new_weight) = (range, weight);
     let valid = reading != INVALID;
     let mut open = valid & (least_apart != NOT_MET);
-    let mut least = i16::MAX;
-    for k in 0..SLOTS {
-        let met = open & (apart[k] == least_apart);
-        open &= !met;
-        new_range[k] = range[k].wrapping_add_signed(if met { step(range[k], reading) } else { 0 });
-        let leak = if signed(reading) > signed(range[k]) { -PASSED } else { -HIDDEN };
-        let change = if met { gain } else { leak };
+    let mut minimum = i16::MAX;
+    for k in 0..SLOT_COUNT {
+        let is_met = open & (distances[k] == least_apart);
+        open &= !is_met;
+        new_range[k] = range[k].wrapping_add_signed(if is_met { step(range[k], reading) } else { 0 });
+        let leak = if signed(reading) > signed(range[k]) { -PASSED_LOSS } else { -HIDDEN_LOSS };
+        let change = if is_met { gain } else { leak };
         let change = if valid { change } else { 0 };
         new_weight[k] = weight[k].min(bounds.full).saturating_add(change).min(bounds.full);
-        least = least.min(new_weight[k]);
+        minimum = minimum.min(new_weight[k]);
     }
-    let mut homeless = valid & (least_apart == NOT_MET) & (least < bounds.replaced);
-    for k in 0..SLOTS {
-        let replaced = homeless & (new_weight[k] == least);
+    let mut homeless = valid & (least_apart == NOT_MET) & (minimum < bounds.replaced);
+    for k in 0..SLOT_COUNT {
+        let replaced = homeless & (new_weight[k] == minimum);
         homeless &= !replaced;
         new_range[k] = if replaced { reading } else { new_range[k] };
-        new_weight[k] = if replaced { NONE.wrapping_add(gain) } else { new_weight[k] };
+        new_weight[k] = if replaced { NO_WEIGHT.wrapping_add(gain) } else { new_weight[k] };
     }
     (new_range, new_weight)
 }
@@ -416,50 +418,50 @@ fn signed(value: u16) -> i16 {
     (value ^ 0x8000) as i16
 }
 
-impl Bounds {
-    fn of(limits: &Limits) -> Bounds {
+impl WeightBounds {
+    fn of(limits: &Limits) -> WeightBounds {
         let scans = limits.scans;
-        Bounds {
+        WeightBounds {
             threshold: signed(limits.threshold),
-            returned: MET * ((scans / RETURNED_OF).clamp(1, RETURNED) as i16),
-            full: signed(MET as u16 * scans),
-            known: signed(KNOWN * scans),
-            replaced: signed(REPLACED * scans),
+            max_gain: MET_WEIGHT * ((scans / SCANS_PER_NO_RETURN).clamp(1, MAX_NO_RETURN_SCANS) as i16),
+            full: signed(MET_WEIGHT as u16 * scans),
+            known: signed(KNOWN_WEIGHT * scans),
+            replaced: signed(REPLACEABLE_WEIGHT * scans),
         }
     }
 }
 
 /// Number of surfaces per beam: two at an edge, and one that may replace either.
-const SLOTS: usize = 3;
-/// Number of beams of a [`Block`]: the 16-bit numbers that the processor computes at once.
-pub(super) const BLOCK: usize = 8;
+const SLOT_COUNT: usize = 3;
+/// Number of beams of a [`BeamBlock`]: the 16-bit numbers that the processor computes at once.
+pub(super) const BLOCK_LEN: usize = 8;
 /// Share of the distance between a surface and a reading by which the surface moves, in whole units: 1/16, as a number
 /// of bits. Too slow to follow a person who walks.
-const DRAWN: u32 = 4;
+const DRIFT_SHIFT: u32 = 4;
 
 /// Weight of a surface that does not exist.
-const NONE: i16 = i16::MIN;
+const NO_WEIGHT: i16 = i16::MIN;
 /// Weight of a scan in which the surface was met. It is fully known after the configured number of scans.
-const MET: i16 = 8;
+const MET_WEIGHT: i16 = 8;
 /// A surface also counts as met in the scans just before that had no return: at most this number, including the one in
 /// which it was met, and at most one per this number of configured scans. So a wall that returns 15 % of the beams is
 /// background after 5/4 of the configured scans, and a person who stands there no sooner because of a lost beam.
-const RETURNED: u16 = 16;
-const RETURNED_OF: u16 = 16;
+const MAX_NO_RETURN_SCANS: u16 = 16;
+const SCANS_PER_NO_RETURN: u16 = 16;
 /// Weight lost in a scan that saw something behind the surface. An object that was removed is no longer background
 /// after 3/4 of the configured scans, and a surface that is met in more than a third of the scans finally becomes
 /// background.
-const PASSED: i16 = 4;
+const PASSED_LOSS: i16 = 4;
 /// Weight lost in a scan that saw something in front of the surface, which may still exist. Not 0, because otherwise
 /// all slots could be taken by hidden surfaces.
-const HIDDEN: i16 = 1;
+const HIDDEN_LOSS: i16 = 1;
 /// Weight per configured scan from which on a surface is background: 5/8 of the full weight, so that readings may be
 /// missing.
-const KNOWN: u16 = 5;
+const KNOWN_WEIGHT: u16 = 5;
 /// Weight per configured scan below which a surface can be replaced.
-const REPLACED: u16 = 2;
+const REPLACEABLE_WEIGHT: u16 = 2;
 /// Number of beams on either side among which one must be known, to replace an unknown one.
-const ASIDE: usize = 8;
+const MAX_NEIGHBORS: usize = 8;
 
 #[cfg(test)]
 mod tests {
@@ -474,11 +476,11 @@ mod tests {
         let mut random = fastrand::Rng::with_seed(1);
         let limits =
             Limits { scans: 300, ..Limits::of(&Settings::default(), &ScanHead::lms(BEAMS, 0, 500, 1, 13)) };
-        let [mut short, mut long] = [Multi::new(BEAMS), Multi::new(BEAMS)];
+        let [mut short, mut long] = [MultiSurface::new(BEAMS), MultiSurface::new(BEAMS)];
         let mut settled = 0;
         for number in 0..6_000 {
             let noise = if number % 500 == 0 { 60 } else { 20 };
-            let mut readings = [INVALID; 3 * BLOCK];
+            let mut readings = [INVALID; 3 * BLOCK_LEN];
             for (i, reading) in readings[..BEAMS].iter_mut().enumerate() {
                 *reading = match random.u16(..10_000) {
                     0..100 => INVALID,
@@ -491,20 +493,20 @@ mod tests {
             if number % 1_000 == 0 {
                 // A model is loaded, so the windows are known before the gains of their beams have grown.
                 for multi in [&mut short, &mut long] {
-                    multi.forget();
+                    multi.reset();
                     let valid = readings.iter().enumerate().filter(|&(_, &reading)| reading != INVALID);
                     valid.for_each(|(i, &reading)| multi.adopt(i, reading));
                 }
             }
-            let [mut short_classes, mut long_classes] = [[Class::Invalid; 3 * BLOCK]; 2];
-            long.blocks.iter_mut().for_each(|block| block.unsettle());
+            let [mut short_classes, mut long_classes] = [[Class::Invalid; 3 * BLOCK_LEN]; 2];
+            long.blocks.iter_mut().for_each(|block| block.clear_single_surfaces());
             short.update(&readings, &limits, true, &mut short_classes);
             long.update(&readings, &limits, true, &mut long_classes);
             assert_eq!(short_classes, long_classes, "scan {number}");
-            settled += short.blocks.iter().filter(|block| block.settled.is_some()).count();
-            let state = |multi: &Multi| {
+            settled += short.blocks.iter().filter(|block| block.single_surfaces.is_some()).count();
+            let state = |multi: &MultiSurface| {
                 let mut multi = multi.clone();
-                multi.blocks.iter_mut().for_each(|block| block.unsettle());
+                multi.blocks.iter_mut().for_each(|block| block.clear_single_surfaces());
                 multi.blocks
             };
             assert_eq!(state(&short), state(&long), "scan {number}");

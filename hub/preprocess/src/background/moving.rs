@@ -6,26 +6,26 @@ use std::f64::consts::FRAC_PI_2;
 
 use scanhub_schema::{Background, Motion, Pose, Scan};
 
-use super::{Class, INVALID, Limits, Runs};
+use super::{Class, INVALID, Limits, RunFilter};
 use crate::directions::exact_angle;
-use crate::velocity::{Rigid, Velocity};
+use crate::velocity::{Pose2, Velocity};
 
 /// State of the method that follows the robot.
 #[derive(Clone)]
-pub(super) struct Moving {
+pub(super) struct OccupancyMap {
     /// Square cells around the robot. The index of a cell is its coordinates modulo the width.
     cells: Box<[Cell]>,
     /// Effect of the last scan that met each cell, see [`Mark`].
-    marks: Box<[u8]>,
+    effects: Box<[u8]>,
     /// The cell of the robot, in the middle of those that are kept.
     middle: (i32, i32),
-    place: Option<Place>,
+    map_pose: Option<MapPose>,
     scan: u8,
     /// Positions of the sensor at the times of the beams, in cells, while a scan is processed.
     starts: Box<[(f32, f32)]>,
     /// Ends of the beams in cells, while a scan is processed.
     ends: Box<[(f32, f32)]>,
-    runs: Runs,
+    run_filter: RunFilter,
 }
 
 /// A square of the floor.
@@ -44,8 +44,8 @@ struct Cell {
 
 /// Position of the robot and its sensor in the map, and the directions of the beams.
 #[derive(Clone, Copy)]
-struct Place {
-    robot: Rigid,
+struct MapPose {
+    robot: Pose2,
     /// Position of the sensor.
     x: f64,
     y: f64,
@@ -57,9 +57,9 @@ struct Place {
 }
 
 /// Effect of a scan on a cell, in a byte: three times the number of the scan, plus one of these values.
-struct Mark;
+struct CellEffect;
 
-impl Mark {
+impl CellEffect {
     /// Number of scans that fit into the byte.
     const SCANS: u8 = 84;
     const THROUGH: u8 = 0;
@@ -68,39 +68,39 @@ impl Mark {
     const ENDED: u8 = 2;
 }
 
-impl Moving {
+impl OccupancyMap {
     /// Creates the state for at most `beams` beams.
-    pub(super) fn new(beams: usize) -> Moving {
-        Moving {
-            cells: vec![Cell::default(); CELLS].into(),
-            marks: vec![0; CELLS].into(),
+    pub(super) fn new(beams: usize) -> OccupancyMap {
+        OccupancyMap {
+            cells: vec![Cell::default(); CELL_COUNT].into(),
+            effects: vec![0; CELL_COUNT].into(),
             middle: (0, 0),
-            place: None,
+            map_pose: None,
             scan: 0,
             starts: vec![(0.0, 0.0); beams].into(),
             ends: vec![(0.0, 0.0); beams].into(),
-            runs: Runs::new(beams),
+            run_filter: RunFilter::new(beams),
         }
     }
 
     /// Restores the initial state.
-    pub(super) fn forget(&mut self) {
+    pub(super) fn reset(&mut self) {
         self.cells.fill(Cell::default());
-        self.runs.forget();
+        self.run_filter.reset();
     }
 
     /// Takes the robot's position at the next scan from `motion`, and its `velocity` during that scan, for a sensor at
     /// `pose`. Returns whether the map still shows the robot's surroundings: it does not after an uncertain step.
-    pub(super) fn follow(&mut self, pose: &Pose, motion: &Motion, velocity: &Velocity) -> bool {
-        let robot = Rigid::new(motion.x_m, motion.y_m, motion.yaw_rad);
+    pub(super) fn set_motion(&mut self, pose: &Pose, motion: &Motion, velocity: &Velocity) -> bool {
+        let robot = Pose2::new(motion.x_m, motion.y_m, motion.yaw_rad);
         let (x, y) = robot.point((pose.x_m, pose.y_m));
-        let is_known = motion.has_pose() && x.abs() < FARTHEST_M && y.abs() < FARTHEST_M;
+        let is_known = motion.has_pose() && x.abs() < MAX_DISTANCE_M && y.abs() < MAX_DISTANCE_M;
         let (angles, unit_m) = ((0.0, 0.0), 0.0);
         let velocity = velocity.of_sensor(pose);
-        self.place = is_known.then_some(Place { robot, x, y, pose: *pose, velocity, angles, unit_m });
+        self.map_pose = is_known.then_some(MapPose { robot, x, y, pose: *pose, velocity, angles, unit_m });
         // Along a corridor, all positions look alike.
         let variance = f64::from(motion.covariance[0].max(motion.covariance[4]));
-        let is_sure = motion.is_degenerate() || variance <= UNSURE_M * UNSURE_M;
+        let is_sure = motion.is_degenerate() || variance <= MAX_STEP_SIGMA_M * MAX_STEP_SIGMA_M;
         is_known && motion.has_step() && is_sure
     }
 
@@ -113,14 +113,14 @@ impl Moving {
         learn: bool,
         classes: &mut [Class],
     ) {
-        let Some(place) = &mut self.place else {
+        let Some(map_pose) = &mut self.map_pose else {
             classes.fill(Class::Unknown);
             return;
         };
-        (place.angles, place.unit_m) = ((scan.first_angle, scan.step), f64::from(scan.unit_um) * 1e-6);
-        let place = *place;
-        self.scroll((cell(place.x), cell(place.y)));
-        let (ahead, left) = (place.along(0.0), place.along(FRAC_PI_2));
+        (map_pose.angles, map_pose.unit_m) = ((scan.first_angle, scan.step), f64::from(scan.unit_um) * 1e-6);
+        let map_pose = *map_pose;
+        self.scroll((cell(map_pose.x), cell(map_pose.y)));
+        let (forward, left) = (map_pose.direction(0.0), map_pose.direction(FRAC_PI_2));
         let exact = scan.exact_angles();
         for (i, (&reading, class)) in readings.iter().zip(classes.iter_mut()).enumerate() {
             self.ends[i] = (f32::NAN, f32::NAN);
@@ -128,37 +128,38 @@ impl Moving {
                 *class = if reading == INVALID { Class::Invalid } else { Class::Unknown };
                 continue;
             }
-            let angle = exact_angle(exact, i).unwrap_or(place.angles.0 + i as f64 * place.angles.1);
-            let range = f64::from(reading) * place.unit_m;
+            let angle = exact_angle(exact, i).unwrap_or(map_pose.angles.0 + i as f64 * map_pose.angles.1);
+            let range = f64::from(reading) * map_pose.unit_m;
             // The sensor moves while a scan is measured.
-            let (x, y, yaw) = place.velocity.position(1e-9 * scan.beam_ns(i) as f64);
-            let along = place.along(angle + yaw);
-            let start = (place.x + x * ahead.0 + y * left.0, place.y + x * ahead.1 + y * left.1);
-            let end = (start.0 + range * along.0, start.1 + range * along.1);
+            let (x, y, yaw) = map_pose.velocity.position(1e-9 * scan.beam_ns(i) as f64);
+            let direction = map_pose.direction(angle + yaw);
+            let start = (map_pose.x + x * forward.0 + y * left.0, map_pose.y + x * forward.1 + y * left.1);
+            let end = (start.0 + range * direction.0, start.1 + range * direction.1);
             self.starts[i] = in_cells(start);
             self.ends[i] = in_cells(end);
             *class = self.class(cell(end.0), cell(end.1), limits);
         }
-        self.runs.keep(readings, limits, classes);
+        self.run_filter.retain_objects(readings, limits, classes);
         if learn {
-            self.lay(readings.len(), limits);
+            self.add_scan(readings.len(), limits);
         }
     }
 
     /// Returns the class of a beam that ends in this cell.
     fn class(&self, x: i32, y: i32, limits: &Limits) -> Class {
-        if !self.is_inside(x, y, AROUND) {
+        if !self.is_inside(x, y, UNCERTAINTY_CELLS) {
             return Class::Unknown;
         }
         let mut is_free = true;
-        for dx in -AROUND..=AROUND {
-            for dy in -AROUND..=AROUND {
+        for dx in -UNCERTAINTY_CELLS..=UNCERTAINTY_CELLS {
+            for dy in -UNCERTAINTY_CELLS..=UNCERTAINTY_CELLS {
                 let cell = &self.cells[index(x + dx, y + dy)];
-                if cell.stands(limits) {
+                if cell.is_occupied(limits) {
                     return Class::Background;
                 }
                 let is_near = dx.abs().max(dy.abs()) <= 1;
-                is_free &= !is_near || cell.free >= if (dx, dy) == (0, 0) { FREE } else { FREE / 2 };
+                is_free &= !is_near
+                    || cell.free >= if (dx, dy) == (0, 0) { MIN_FREE_SCANS } else { MIN_FREE_SCANS / 2 };
             }
         }
         if is_free { Class::Foreground } else { Class::Unknown }
@@ -167,39 +168,39 @@ impl Moving {
     /// Moves the map to `middle`, and clears the cells that are new in it.
     fn scroll(&mut self, middle: (i32, i32)) {
         let (dx, dy) = (middle.0 - self.middle.0, middle.1 - self.middle.1);
-        if dx.abs() >= WIDTH || dy.abs() >= WIDTH {
+        if dx.abs() >= MAP_WIDTH || dy.abs() >= MAP_WIDTH {
             self.cells.fill(Cell::default());
         } else {
             let new = |from: i32, by: i32| {
-                let (old, new) = (from - WIDTH / 2, from + by - WIDTH / 2);
-                if by > 0 { old + WIDTH..new + WIDTH } else { new..old }
+                let (old, new) = (from - MAP_WIDTH / 2, from + by - MAP_WIDTH / 2);
+                if by > 0 { old + MAP_WIDTH..new + MAP_WIDTH } else { new..old }
             };
             for x in new(self.middle.0, dx) {
-                (0..WIDTH).for_each(|y| self.cells[index(x, y)] = Cell::default());
+                (0..MAP_WIDTH).for_each(|y| self.cells[index(x, y)] = Cell::default());
             }
             for y in new(self.middle.1, dy) {
-                (0..WIDTH).for_each(|x| self.cells[index(x, y)] = Cell::default());
+                (0..MAP_WIDTH).for_each(|x| self.cells[index(x, y)] = Cell::default());
             }
         }
         self.middle = middle;
     }
 
     /// Returns whether a cell is in the map, and `around` cells on each side of it.
-    fn is_inside(&self, x: i32, y: i32, around: i32) -> bool {
-        let half = WIDTH / 2 - around;
+    fn is_inside(&self, x: i32, y: i32, margin: i32) -> bool {
+        let half = MAP_WIDTH / 2 - margin;
         let is_near = |at: i32, middle: i32| (middle - half..middle + half).contains(&at);
         is_near(x, self.middle.0) && is_near(y, self.middle.1)
     }
 
     /// Adds the scan to the map. Each cell counts once, and a beam that ended in a cell outweighs those that saw
     /// through it.
-    fn lay(&mut self, beams: usize, limits: &Limits) {
-        self.scan = if self.scan >= Mark::SCANS { 1 } else { self.scan + 1 };
+    fn add_scan(&mut self, beams: usize, limits: &Limits) {
+        self.scan = if self.scan >= CellEffect::SCANS { 1 } else { self.scan + 1 };
         if self.scan == 1 {
-            self.marks.fill(0);
+            self.effects.fill(0);
         }
-        let (near, ended) = (3 * self.scan + Mark::NEAR, 3 * self.scan + Mark::ENDED);
-        let most = limits.scans.max(FREE);
+        let (near, ended) = (3 * self.scan + CellEffect::NEAR, 3 * self.scan + CellEffect::ENDED);
+        let max_hits = limits.scans.max(MIN_FREE_SCANS);
         // The ends of all beams are added before the cells that they saw through.
         for i in 0..beams {
             let (x, y) = self.ends[i];
@@ -208,68 +209,70 @@ impl Moving {
                 continue;
             }
             let at = index(x, y);
-            if self.marks[at] == ended {
+            if self.effects[at] == ended {
                 continue;
             }
-            self.cells[at].hit(most);
+            self.cells[at].note_hit(max_hits);
             for dx in -1..=1 {
                 for dy in -1..=1 {
-                    let mark = &mut self.marks[index(x + dx, y + dy)];
+                    let mark = &mut self.effects[index(x + dx, y + dy)];
                     *mark = near.max(*mark);
                 }
             }
-            self.marks[at] = ended;
+            self.effects[at] = ended;
         }
         // Relative to the first cell of the map, no coordinate is negative.
-        let first = ((self.middle.0 - WIDTH / 2) as f32, (self.middle.1 - WIDTH / 2) as f32);
+        let first = ((self.middle.0 - MAP_WIDTH / 2) as f32, (self.middle.1 - MAP_WIDTH / 2) as f32);
         for i in 0..beams {
             let (start, end) = (self.starts[i], self.ends[i]);
             if !end.0.is_nan() {
                 let from = (start.0 - first.0, start.1 - first.1);
-                self.see_through(from, (end.0 - first.0, end.1 - first.1), most);
+                self.note_empty_cells(from, (end.0 - first.0, end.1 - first.1), max_hits);
             }
         }
     }
 
     /// Counts the cells between the sensor and the end of a beam, in steps of at most one cell.
-    fn see_through(&mut self, from: (f32, f32), end: (f32, f32), most: u16) {
-        let through = 3 * self.scan + Mark::THROUGH;
+    fn note_empty_cells(&mut self, from: (f32, f32), end: (f32, f32), max_hits: u16) {
+        let through = 3 * self.scan + CellEffect::THROUGH;
         let (dx, dy) = (end.0 - from.0, end.1 - from.1);
         let length = dx.hypot(dy);
-        let steps = (length - SHORT).min(WIDTH as f32 / 2.0);
+        let steps = (length - END_MARGIN_CELLS).min(MAP_WIDTH as f32 / 2.0);
         let (dx, dy) = (dx / length, dy / length);
         let (mut x, mut y) = from;
-        let first = (self.middle.0 - WIDTH / 2, self.middle.1 - WIDTH / 2);
-        let first = (first.0.rem_euclid(WIDTH), first.1.rem_euclid(WIDTH));
-        let wrapped = |at: i32| if at >= WIDTH { at - WIDTH } else { at };
+        let first = (self.middle.0 - MAP_WIDTH / 2, self.middle.1 - MAP_WIDTH / 2);
+        let first = (first.0.rem_euclid(MAP_WIDTH), first.1.rem_euclid(MAP_WIDTH));
+        let wrapped = |at: i32| if at >= MAP_WIDTH { at - MAP_WIDTH } else { at };
         for _ in 0..steps as u32 {
             (x, y) = (x + dx, y + dy);
             let (column, row) = (x as i32, y as i32);
-            if !(0..WIDTH).contains(&column) || !(0..WIDTH).contains(&row) {
+            if !(0..MAP_WIDTH).contains(&column) || !(0..MAP_WIDTH).contains(&row) {
                 return;
             }
-            let at = (wrapped(first.0 + column) * WIDTH + wrapped(first.1 + row)) as usize;
+            let at = (wrapped(first.0 + column) * MAP_WIDTH + wrapped(first.1 + row)) as usize;
             // A greater mark is from this scan already.
-            if self.marks[at] < through {
-                self.marks[at] = through;
-                self.cells[at].seen_through(most);
+            if self.effects[at] < through {
+                self.effects[at] = through;
+                self.cells[at].note_seen_through(max_hits);
             }
         }
     }
 
     /// Returns the range of beam `i` without a foreground, in device units.
     pub(super) fn background(&self, i: usize, limits: &Limits) -> u16 {
-        let Some(place) = self.place.filter(|place| place.unit_m > 0.0) else { return Background::UNKNOWN };
-        let along = place.along(place.angles.0 + i as f64 * place.angles.1);
-        for step in 1..WIDTH / 2 {
+        let Some(map_pose) = self.map_pose.filter(|map_pose| map_pose.unit_m > 0.0) else {
+            return Background::UNKNOWN;
+        };
+        let direction = map_pose.direction(map_pose.angles.0 + i as f64 * map_pose.angles.1);
+        for step in 1..MAP_WIDTH / 2 {
             let range = f64::from(step) * CELL_M;
-            let (x, y) = (cell(place.x + range * along.0), cell(place.y + range * along.1));
+            let (x, y) = (cell(map_pose.x + range * direction.0), cell(map_pose.y + range * direction.1));
             if !self.is_inside(x, y, 0) {
                 break;
             }
             let cell = &self.cells[index(x, y)];
-            if cell.stands(limits) {
-                return (range / place.unit_m).min(f64::from(INVALID - 1)) as u16;
+            if cell.is_occupied(limits) {
+                return (range / map_pose.unit_m).min(f64::from(INVALID - 1)) as u16;
             }
         }
         Background::UNKNOWN
@@ -279,14 +282,14 @@ impl Moving {
 impl Cell {
     /// Returns whether an object stands in the cell. It must have stood there before the cell was seen free, or for
     /// long enough.
-    fn stands(&self, limits: &Limits) -> bool {
-        self.hits >= STANDS && self.free < FREE
-            || self.hits >= limits.scans.max(STANDS)
-            || self.returns >= RETURNS
+    fn is_occupied(&self, limits: &Limits) -> bool {
+        self.hits >= MIN_HITS && self.free < MIN_FREE_SCANS
+            || self.hits >= limits.scans.max(MIN_HITS)
+            || self.returns >= MIN_RETURNS
     }
 
-    fn hit(&mut self, most: u16) {
-        self.hits = (self.hits + 1).min(most);
+    fn note_hit(&mut self, max_hits: u16) {
+        self.hits = (self.hits + 1).min(max_hits);
         self.returns = self.returns.saturating_add(u8::from(self.through > 0));
         self.through = 0;
         if self.hits.is_multiple_of(8) {
@@ -294,19 +297,19 @@ impl Cell {
         }
     }
 
-    fn seen_through(&mut self, most: u16) {
-        self.free = (self.free + 1).min(most);
+    fn note_seen_through(&mut self, max_hits: u16) {
+        self.free = (self.free + 1).min(max_hits);
         self.through = self.through.saturating_add(1);
-        if self.through >= LONG {
+        if self.through >= MAX_THROUGH_SCANS {
             self.returns = 0;
         }
         self.hits = self.hits.saturating_sub(1 + self.hits / 16);
     }
 }
 
-impl Place {
+impl MapPose {
     /// Returns the direction in the map of a beam at the sensor's `angle`.
-    fn along(&self, angle: f64) -> (f64, f64) {
+    fn direction(&self, angle: f64) -> (f64, f64) {
         self.robot.turned(self.pose.direction(angle))
     }
 }
@@ -323,27 +326,27 @@ fn cell(meters: f64) -> i32 {
 
 /// Returns the index of a cell.
 fn index(x: i32, y: i32) -> usize {
-    (x.rem_euclid(WIDTH) * WIDTH + y.rem_euclid(WIDTH)) as usize
+    (x.rem_euclid(MAP_WIDTH) * MAP_WIDTH + y.rem_euclid(MAP_WIDTH)) as usize
 }
 
 /// Width of a cell in meters. People are several cells wide, and a position is known to less than one.
 const CELL_M: f64 = 0.05;
 /// Number of cells on each side of the map: 40 m.
-const WIDTH: i32 = 800;
-const CELLS: usize = (WIDTH * WIDTH) as usize;
+const MAP_WIDTH: i32 = 800;
+const CELL_COUNT: usize = (MAP_WIDTH * MAP_WIDTH) as usize;
 /// Number of cells around the end of a beam in which an object may stand: the uncertainty of a position and of a wall.
-const AROUND: i32 = 2;
+const UNCERTAINTY_CELLS: i32 = 2;
 /// Number of scans that must see through a cell until it is free.
-const FREE: u16 = 5;
+const MIN_FREE_SCANS: u16 = 5;
 /// Number of beams that must end in a cell that was never seen free, until an object stands there.
-const STANDS: u16 = 3;
+const MIN_HITS: u16 = 3;
 /// Number of returns from which on a thin object stands in a cell, and number of consecutive scans that see through it
 /// after which it does not.
-const RETURNS: u8 = 24;
-const LONG: u8 = 60;
+const MIN_RETURNS: u8 = 24;
+const MAX_THROUGH_SCANS: u8 = 60;
 /// Number of cells before the end of a beam that do not count as seen free.
-const SHORT: f32 = 2.5;
+const END_MARGIN_CELLS: f32 = 2.5;
 /// Maximum standard deviation of a step with which the map continues. Otherwise, walls would appear in free space.
-const UNSURE_M: f64 = CELL_M;
+const MAX_STEP_SIGMA_M: f64 = CELL_M;
 /// Maximum distance of a robot from its start.
-const FARTHEST_M: f64 = 1e6;
+const MAX_DISTANCE_M: f64 = 1e6;

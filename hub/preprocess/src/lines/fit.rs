@@ -17,7 +17,7 @@ pub(super) struct Ray {
 
 impl Ray {
     /// Returns the distance between the ends of two rays in meters.
-    pub(super) fn apart(&self, other: &Ray) -> f64 {
+    pub(super) fn distance(&self, other: &Ray) -> f64 {
         let (x, y) = (
             self.range * self.cos - other.range * other.cos,
             self.range * self.sin - other.range * other.sin,
@@ -28,12 +28,12 @@ impl Ray {
 
 /// A line by the inverse ranges at which beams meet it, in 1/m.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(super) struct Line {
+pub(super) struct LineEquation {
     pub(super) a: f64,
     pub(super) b: f64,
 }
 
-impl Line {
+impl LineEquation {
     /// Returns the inverse of the range at which `ray` meets the line. It is not positive if the ray does not meet the
     /// line.
     pub(super) fn inverse(&self, ray: &Ray) -> f64 {
@@ -45,7 +45,7 @@ impl Line {
         let mut sum = 0.0;
         for ray in rays {
             let inverse = self.inverse(ray);
-            if inverse <= FARTHEST {
+            if inverse <= MIN_INVERSE_RANGE {
                 return f64::INFINITY;
             }
             let off = ray.range - 1.0 / inverse;
@@ -55,18 +55,21 @@ impl Line {
     }
 
     /// Returns the line through the ends of two rays.
-    pub(super) fn through(first: &Ray, last: &Ray) -> Line {
+    pub(super) fn through(first: &Ray, last: &Ray) -> LineEquation {
         let det = first.cos * last.sin - first.sin * last.cos;
         let (one, two) = (1.0 / first.range, 1.0 / last.range);
-        Line { a: (one * last.sin - two * first.sin) / det, b: (two * first.cos - one * last.cos) / det }
+        LineEquation {
+            a: (one * last.sin - two * first.sin) / det,
+            b: (two * first.cos - one * last.cos) / det,
+        }
     }
 
     /// Returns the line that is likelier for `rays` after at most `steps` steps, and its error.
-    pub(super) fn refined(self, rays: &[Ray], steps: usize) -> (Line, f64) {
+    pub(super) fn refined(self, rays: &[Ray], steps: usize) -> (LineEquation, f64) {
         let (mut line, mut error) = (self, self.error(rays));
         if let [first, .., last] = rays {
             // If a surface is seen at a very flat angle, the line of the sums may be behind the sensor.
-            let through = Line::through(first, last);
+            let through = LineEquation::through(first, last);
             let alternative = through.error(rays);
             if alternative < error {
                 (line, error) = (through, alternative);
@@ -75,9 +78,9 @@ impl Line {
         for _ in 0..steps {
             let Some(information) = Information::of(&line, rays) else { break };
             let (da, db) = information.step();
-            let (mut part, before) = (1.0, error);
+            let (mut part, previous_error) = (1.0, error);
             while part > 0.1 {
-                let next = Line { a: line.a + part * da, b: line.b + part * db };
+                let next = LineEquation { a: line.a + part * da, b: line.b + part * db };
                 let reached = next.error(rays);
                 if reached < error {
                     (line, error) = (next, reached);
@@ -85,7 +88,7 @@ impl Line {
                 }
                 part *= 0.5;
             }
-            if before - error <= 1e-4 * error {
+            if previous_error - error <= 1e-4 * error {
                 break;
             }
         }
@@ -94,7 +97,7 @@ impl Line {
 }
 
 /// Inverse of a range beyond that of every scanner: 10 km.
-const FARTHEST: f64 = 1e-4;
+const MIN_INVERSE_RANGE: f64 = 1e-4;
 
 /// Information of rays about a line: the sums of the products of slopes, and of slope times difference.
 #[derive(Clone, Copy, Debug, Default)]
@@ -108,11 +111,11 @@ pub(super) struct Information {
 
 impl Information {
     /// Returns the information about `line`; `None` if a ray does not meet it.
-    pub(super) fn of(line: &Line, rays: &[Ray]) -> Option<Information> {
+    pub(super) fn of(line: &LineEquation, rays: &[Ray]) -> Option<Information> {
         let mut sums = Information::default();
         for ray in rays {
             let inverse = line.inverse(ray);
-            if inverse <= FARTHEST {
+            if inverse <= MIN_INVERSE_RANGE {
                 return None;
             }
             let range = 1.0 / inverse;
@@ -171,9 +174,9 @@ impl Sums {
     }
 
     /// Returns the line with the minimum error.
-    pub(super) fn line(&self) -> Line {
+    pub(super) fn line(&self) -> LineEquation {
         let det = self.cc * self.ss - self.cs * self.cs;
-        Line {
+        LineEquation {
             a: (self.ss * self.c - self.cs * self.s) / det,
             b: (self.cc * self.s - self.cs * self.c) / det,
         }
@@ -184,7 +187,7 @@ impl Sums {
         if self.count < 2.5 {
             return 0.0;
         }
-        let Line { a, b } = self.line();
+        let LineEquation { a, b } = self.line();
         (self.square - a * self.c - b * self.s).max(0.0)
     }
 

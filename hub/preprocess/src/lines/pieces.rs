@@ -6,7 +6,7 @@
 //! - A cut is taken from where it helps least to where it helps most.
 //! - Rays at ends that fit worst are dropped.
 
-use super::fit::{Line, Ray, Sums};
+use super::fit::{LineEquation, Ray, Sums};
 
 /// Limits of cutting.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -37,29 +37,29 @@ pub(super) struct Pieces<'a> {
 }
 
 /// Memory for cutting.
-pub(super) struct Cutter {
+pub(super) struct ScanPartitioner {
     pieces: Box<[Piece]>,
     count: usize,
     joiner: Joiner,
 }
 
-impl Cutter {
+impl ScanPartitioner {
     /// Creates the memory for at most `beams` beams.
-    pub(super) fn new(beams: usize) -> Cutter {
+    pub(super) fn new(beams: usize) -> ScanPartitioner {
         let pieces = vec![Piece::default(); beams].into();
-        Cutter { pieces, count: 0, joiner: Joiner::new(beams) }
+        ScanPartitioner { pieces, count: 0, joiner: Joiner::new(beams) }
     }
 
     /// Returns the pieces of `rays`. `ends` has the index after the last ray of each group.
-    pub(super) fn cut(&mut self, rays: &[Ray], ends: &[u16], bounds: &Bounds) -> Pieces<'_> {
+    pub(super) fn partition(&mut self, rays: &[Ray], ends: &[u16], bounds: &Bounds) -> Pieces<'_> {
         self.begin(rays, ends, bounds.min_points);
         let (count, is_full) = self.joiner.join(&mut self.pieces[..self.count], bounds);
         self.count = count;
-        settle(&mut self.pieces[..count], rays, bounds.rounds);
+        move_cuts_until_stable(&mut self.pieces[..count], rays, bounds.rounds);
         if bounds.exchange {
             exchange(&mut self.pieces[..count], rays, bounds);
         }
-        self.leave_out(rays, bounds);
+        self.drop_small_pieces(rays, bounds);
         trim(&mut self.pieces[..self.count], rays, bounds);
         Pieces { list: &self.pieces[..self.count], is_full }
     }
@@ -84,25 +84,25 @@ impl Cutter {
     }
 
     /// Drops pieces that are too small. Their neighbors get the rays that fit.
-    fn leave_out(&mut self, rays: &[Ray], bounds: &Bounds) {
-        let mut kept: usize = 0;
+    fn drop_small_pieces(&mut self, rays: &[Ray], bounds: &Bounds) {
+        let mut kept_count: usize = 0;
         let mut is_apart = true;
         for i in 0..self.count {
             let mut piece = self.pieces[i];
             let is_last = piece.is_last;
             if piece.len() >= bounds.min_points {
-                if let Some(left) = kept.checked_sub(1).filter(|_| !is_apart) {
-                    let left = &mut self.pieces[left];
-                    left.end += left.grow(rays[left.end..piece.first].iter(), bounds.variance);
-                    piece.first -= piece.grow(rays[left.end..piece.first].iter().rev(), bounds.variance);
+                if let Some(previous) = kept_count.checked_sub(1).filter(|_| !is_apart) {
+                    let previous = &mut self.pieces[previous];
+                    previous.end += previous.grow(rays[previous.end..piece.first].iter(), bounds.variance);
+                    piece.first -= piece.grow(rays[previous.end..piece.first].iter().rev(), bounds.variance);
                 }
-                self.pieces[kept] = piece;
-                kept += 1;
+                self.pieces[kept_count] = piece;
+                kept_count += 1;
                 is_apart = false;
             }
             is_apart |= is_last;
         }
-        self.count = kept;
+        self.count = kept_count;
     }
 }
 
@@ -127,7 +127,7 @@ impl Piece {
     }
 
     /// Returns the line with the minimum error.
-    pub(super) fn line(&self) -> Line {
+    pub(super) fn line(&self) -> LineEquation {
         self.sums.line()
     }
 
@@ -143,7 +143,7 @@ impl Piece {
 
     /// Returns the cost of joining this piece with the next one, in m2, if ranges have this `variance`. If both pieces vary more,
     /// as surfaces do that are not quite straight, the cost counts less.
-    fn price(&self, next: &Piece, variance: f64) -> f64 {
+    fn join_cost(&self, next: &Piece, variance: f64) -> f64 {
         if self.is_last {
             return f64::INFINITY;
         }
@@ -175,57 +175,57 @@ impl Piece {
 struct Joiner {
     before: Box<[u16]>,
     after: Box<[u16]>,
-    least: Least,
+    costs: TournamentTree,
 }
 
-const NONE: u16 = u16::MAX;
+const NO_PIECE: u16 = u16::MAX;
 
 impl Joiner {
     /// Creates a joiner for pieces of at least two rays, of at most `beams` beams.
     pub(super) fn new(beams: usize) -> Joiner {
-        let before = vec![NONE; beams].into();
-        let after = vec![NONE; beams].into();
-        Joiner { before, after, least: Least::new(beams) }
+        let before = vec![NO_PIECE; beams].into();
+        let after = vec![NO_PIECE; beams].into();
+        Joiner { before, after, costs: TournamentTree::new(beams) }
     }
 
     /// Joins `pieces`. Returns how many are left, which are then the first ones, and whether there were more than allowed.
     pub(super) fn join(&mut self, pieces: &mut [Piece], bounds: &Bounds) -> (usize, bool) {
         self.begin(pieces, bounds.variance);
-        let (mut left, mut is_full) = (pieces.len(), false);
-        while left > 1 {
-            let (at, price) = self.least.get();
+        let (mut remaining, mut is_full) = (pieces.len(), false);
+        while remaining > 1 {
+            let (at, price) = self.costs.minimum();
             let is_too_dear = price > bounds.penalty;
-            if left <= bounds.max && is_too_dear {
+            if remaining <= bounds.max && is_too_dear {
                 break;
             }
             // If the number is the only limit, no cost is too high.
             is_full |= is_too_dear && bounds.penalty > 0.0;
             match self.worst(pieces, bounds.loss, price) {
-                Some(worst) if left > bounds.max => self.leave_out(pieces, worst),
+                Some(worst) if remaining > bounds.max => self.drop_piece(pieces, worst),
                 _ if price.is_finite() => self.join_at(pieces, at, bounds.variance),
                 _ => break,
             }
-            left -= 1;
+            remaining -= 1;
         }
-        let mut kept = 0;
+        let mut kept_count = 0;
         for i in 0..pieces.len() {
             if pieces[i].len() > 0 {
-                pieces[kept] = pieces[i];
-                kept += 1;
+                pieces[kept_count] = pieces[i];
+                kept_count += 1;
             }
         }
-        (kept, is_full)
+        (kept_count, is_full)
     }
 
     fn begin(&mut self, pieces: &[Piece], variance: f64) {
-        self.least.begin(pieces.len());
+        self.costs.clear(pieces.len());
         for (i, piece) in pieces.iter().enumerate() {
             let next = pieces.get(i + 1);
-            self.before[i] = if i == 0 { NONE } else { i as u16 - 1 };
-            self.after[i] = if next.is_none() { NONE } else { i as u16 + 1 };
-            self.least.put(i, next.map_or(f64::INFINITY, |next| piece.price(next, variance)));
+            self.before[i] = if i == 0 { NO_PIECE } else { i as u16 - 1 };
+            self.after[i] = if next.is_none() { NO_PIECE } else { i as u16 + 1 };
+            self.costs.initialize(i, next.map_or(f64::INFINITY, |next| piece.join_cost(next, variance)));
         }
-        self.least.build();
+        self.costs.build();
     }
 
     /// Returns the piece that costs least if its rays belong to no piece, if that is less than `price`.
@@ -235,78 +235,78 @@ impl Joiner {
             return None;
         }
         let cost = |i: &usize| pieces[*i].len() as f64 * loss - pieces[*i].error;
-        let there = (0..pieces.len()).filter(|&i| pieces[i].len() > 0);
-        there.min_by(|a, b| cost(a).total_cmp(&cost(b))).filter(|worst| cost(worst) < price)
+        let remaining = (0..pieces.len()).filter(|&i| pieces[i].len() > 0);
+        remaining.min_by(|a, b| cost(a).total_cmp(&cost(b))).filter(|worst| cost(worst) < price)
     }
 
-    fn leave_out(&mut self, pieces: &mut [Piece], i: usize) {
+    fn drop_piece(&mut self, pieces: &mut [Piece], i: usize) {
         let (back, next) = (self.before[i], self.after[i]);
-        if back != NONE {
+        if back != NO_PIECE {
             let back = usize::from(back);
             self.after[back] = next;
             pieces[back].is_last = true;
-            self.least.set(back, f64::INFINITY);
+            self.costs.set(back, f64::INFINITY);
         }
-        if next != NONE {
+        if next != NO_PIECE {
             self.before[usize::from(next)] = back;
         }
         pieces[i].end = pieces[i].first;
-        self.least.set(i, f64::INFINITY);
+        self.costs.set(i, f64::INFINITY);
     }
 
     /// Joins the piece `at` with the next one.
     fn join_at(&mut self, pieces: &mut [Piece], at: usize, variance: f64) {
-        let gone = usize::from(self.after[at]);
-        pieces[at] = pieces[at].joined(&pieces[gone]);
-        pieces[gone].end = pieces[gone].first;
-        self.after[at] = self.after[gone];
-        self.least.set(gone, f64::INFINITY);
+        let removed = usize::from(self.after[at]);
+        pieces[at] = pieces[at].joined(&pieces[removed]);
+        pieces[removed].end = pieces[removed].first;
+        self.after[at] = self.after[removed];
+        self.costs.set(removed, f64::INFINITY);
         let mut price = f64::INFINITY;
-        if self.after[at] != NONE {
+        if self.after[at] != NO_PIECE {
             let next = usize::from(self.after[at]);
             self.before[next] = at as u16;
-            price = pieces[at].price(&pieces[next], variance);
+            price = pieces[at].join_cost(&pieces[next], variance);
         }
-        self.least.set(at, price);
-        if self.before[at] != NONE {
+        self.costs.set(at, price);
+        if self.before[at] != NO_PIECE {
             let back = usize::from(self.before[at]);
-            self.least.set(back, pieces[back].price(&pieces[at], variance));
+            self.costs.set(back, pieces[back].join_cost(&pieces[at], variance));
         }
     }
 }
 
 /// Minimum of numbers that change one at a time: a tournament tree.
-struct Least {
+struct TournamentTree {
     values: Box<[f64]>,
     /// Winner of each match. The root is 1; the numbers themselves follow after the matches.
     winners: Box<[u16]>,
     size: usize,
 }
 
-impl Least {
+impl TournamentTree {
     /// Creates a tree for at most half as many numbers as `beams`, or for one.
-    fn new(beams: usize) -> Least {
+    fn new(beams: usize) -> TournamentTree {
         let beams = beams.max(1);
         let values = vec![f64::INFINITY; beams].into();
         let winners = vec![0; beams].into();
-        Least { values, winners, size: 1 }
+        TournamentTree { values, winners, size: 1 }
     }
 
     /// Starts with `count` numbers, all infinite.
-    fn begin(&mut self, count: usize) {
+    fn clear(&mut self, count: usize) {
         self.size = count.next_power_of_two();
         self.values[..self.size].fill(f64::INFINITY);
     }
 
     /// Sets a number before the tree is built.
-    fn put(&mut self, i: usize, value: f64) {
+    fn initialize(&mut self, i: usize, value: f64) {
         self.values[i] = value;
     }
 
     /// Builds the tree.
     fn build(&mut self) {
         for node in (1..self.size).rev() {
-            self.play(node);
+            self.update_winner(node);
         }
     }
 
@@ -315,13 +315,13 @@ impl Least {
         self.values[i] = value;
         let mut node = (self.size + i) / 2;
         while node > 0 {
-            self.play(node);
+            self.update_winner(node);
             node /= 2;
         }
     }
 
     /// Returns the index of the minimum, and the minimum.
-    fn get(&self) -> (usize, f64) {
+    fn minimum(&self) -> (usize, f64) {
         let i = self.winner(1);
         (i, self.values[i])
     }
@@ -330,15 +330,15 @@ impl Least {
         if node >= self.size { node - self.size } else { self.winners[node].into() }
     }
 
-    fn play(&mut self, node: usize) {
+    fn update_winner(&mut self, node: usize) {
         let (left, right) = (self.winner(2 * node), self.winner(2 * node + 1));
-        let least = if self.values[left] <= self.values[right] { left } else { right };
-        self.winners[node] = least as u16;
+        let smaller = if self.values[left] <= self.values[right] { left } else { right };
+        self.winners[node] = smaller as u16;
     }
 }
 
 /// Moves each cut to where it costs least. Returns whether any moved.
-fn slide(pieces: &mut [Piece], rays: &[Ray]) -> bool {
+fn move_cuts(pieces: &mut [Piece], rays: &[Ray]) -> bool {
     let mut moved = false;
     for i in 1..pieces.len() {
         let (left, right) = (pieces[i - 1], pieces[i]);
@@ -355,9 +355,9 @@ fn slide(pieces: &mut [Piece], rays: &[Ray]) -> bool {
 }
 
 /// Moves cuts until none moves, at most `rounds` times.
-fn settle(pieces: &mut [Piece], rays: &[Ray], rounds: usize) {
+fn move_cuts_until_stable(pieces: &mut [Piece], rays: &[Ray], rounds: usize) {
     for _ in 0..rounds {
-        if !slide(pieces, rays) {
+        if !move_cuts(pieces, rays) {
             break;
         }
     }
@@ -365,15 +365,15 @@ fn settle(pieces: &mut [Piece], rays: &[Ray], rounds: usize) {
 
 /// Moves a cut from where it helps least to where it helps most, while that helps, at most once per piece.
 fn exchange(pieces: &mut [Piece], rays: &[Ray], bounds: &Bounds) {
-    let least = bounds.min_points.max(2);
+    let min_points = bounds.min_points.max(2);
     for _ in 0..pieces.len() {
         // Piece whose cut in two helps most.
         let mut best = (0.0, 0, 0, (Sums::default(), Sums::default()));
         for (i, piece) in pieces.iter().enumerate() {
-            if piece.len() < 2 * least || piece.error <= best.0 {
+            if piece.len() < 2 * min_points || piece.error <= best.0 {
                 continue;
             }
-            let (cut, sums, error) = halves(rays, piece, least);
+            let (cut, sums, error) = halves(rays, piece, min_points);
             if piece.error - error > best.0 {
                 best = (piece.error - error, i, cut, sums);
             }
@@ -382,7 +382,7 @@ fn exchange(pieces: &mut [Piece], rays: &[Ray], bounds: &Bounds) {
         // Neighbors that cost least to join, neither of which is the one to be cut.
         let mut cheapest = (f64::INFINITY, 0);
         for i in 1..pieces.len() {
-            let price = pieces[i - 1].price(&pieces[i], bounds.variance);
+            let price = pieces[i - 1].join_cost(&pieces[i], bounds.variance);
             if price < cheapest.0 && i - 1 != split && i != split {
                 cheapest = (price, i - 1);
             }
@@ -404,7 +404,7 @@ fn exchange(pieces: &mut [Piece], rays: &[Ray], bounds: &Bounds) {
             split
         };
         (pieces[at], pieces[at + 1]) = (left, right);
-        settle(pieces, rays, SETTLED);
+        move_cuts_until_stable(pieces, rays, MAX_ROUNDS);
     }
 }
 
@@ -434,11 +434,11 @@ fn trim(pieces: &mut [Piece], rays: &[Ray], bounds: &Bounds) {
     }
 }
 
-/// Returns where to cut a piece in two, with at least `least` rays each, so that it costs least.
-fn halves(rays: &[Ray], piece: &Piece, least: usize) -> (usize, (Sums, Sums), f64) {
+/// Returns where to cut a piece in two, with at least `costs` rays each, so that it costs least.
+fn halves(rays: &[Ray], piece: &Piece, min_points: usize) -> (usize, (Sums, Sums), f64) {
     let mut best = (piece.first, (Sums::default(), Sums::default()), f64::INFINITY);
-    let mut left = Sums::of(&rays[piece.first..piece.first + least - 1]);
-    for cut in piece.first + least..=piece.end - least {
+    let mut left = Sums::of(&rays[piece.first..piece.first + min_points - 1]);
+    for cut in piece.first + min_points..=piece.end - min_points {
         left = left + Sums::one(&rays[cut - 1]);
         let right = piece.sums - left;
         let error = left.error() + right.error();
@@ -475,4 +475,4 @@ fn best_cut(rays: &[Ray], left: &Piece, right: &Piece) -> Option<(usize, (Sums, 
 }
 
 /// More rounds than cuts need to settle.
-const SETTLED: usize = 8;
+const MAX_ROUNDS: usize = 8;

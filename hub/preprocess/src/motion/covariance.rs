@@ -1,6 +1,6 @@
 //! Covariances of positions and steps: symmetric 3 x 3 matrices, and what transforms do with them.
 
-use crate::velocity::Rigid;
+use crate::velocity::Pose2;
 
 /// A matrix as three rows.
 pub(super) type Square = [[f64; 3]; 3];
@@ -26,7 +26,7 @@ fn product(a: &Square, b: &Square) -> Square {
 }
 
 /// Returns a b a'.
-pub(super) fn around(a: &Square, b: &Square) -> Square {
+pub(super) fn transformed(a: &Square, b: &Square) -> Square {
     let transposed: Square = std::array::from_fn(|i| std::array::from_fn(|j| a[j][i]));
     product(&product(a, b), &transposed)
 }
@@ -34,7 +34,7 @@ pub(super) fn around(a: &Square, b: &Square) -> Square {
 /// Returns the eigenvalues of a symmetric matrix, and the unit vector of each, by Jacobi's rotations.
 pub(super) fn eigen(mut m: Square) -> ([f64; 3], [[f64; 3]; 3]) {
     let mut vectors = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
-    for _ in 0..SWEEPS {
+    for _ in 0..JACOBI_SWEEPS {
         for (p, q) in [(0, 1), (0, 2), (1, 2)] {
             if m[p][q].abs() <= f64::MIN_POSITIVE {
                 continue;
@@ -58,25 +58,25 @@ pub(super) fn eigen(mut m: Square) -> ([f64; 3], [[f64; 3]; 3]) {
 
 /// Returns the covariance of `step`, which leads from `before` to another position in the same frame. The errors of both
 /// positions are independent: `of_before` and `own`.
-pub(super) fn of_step(own: &Square, of_before: &Square, before: &Rigid, step: &Rigid) -> Square {
-    let (x, y) = (before.turned_back((1.0, 0.0)), before.turned_back((0.0, 1.0)));
+pub(super) fn of_step(own: &Square, reference: &Square, start: &Pose2, step: &Pose2) -> Square {
+    let (x, y) = (start.turned_back((1.0, 0.0)), start.turned_back((0.0, 1.0)));
     let back = rotation(x, y);
     // Derivatives of the step by the position before it.
     let by_before = [[-x.0, -y.0, step.y], [-x.1, -y.1, -step.x], [0.0, 0.0, -1.0]];
-    sum(&around(&back, own), &around(&by_before, of_before))
+    sum(&transformed(&back, own), &transformed(&by_before, reference))
 }
 
 /// Returns the covariance of `first` followed by `next`, whose covariances are `of_first` and `of_next`, as in Smith, Self and
 /// Cheeseman: "Estimating uncertain spatial relationships in robotics" (1990). The two errors must be independent.
-pub(super) fn of_both(of_first: &Square, of_next: &Square, first: &Rigid, next: &Rigid) -> Square {
+pub(super) fn of_both(of_first: &Square, of_next: &Square, first: &Pose2, next: &Pose2) -> Square {
     let (x, y) = first.turned((next.x, next.y));
     let by_first = [[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]];
-    sum(&around(&by_first, of_first), &turned(of_next, first))
+    sum(&transformed(&by_first, of_first), &turned(of_next, first))
 }
 
 /// Returns the covariance `m` of a position in the frame of `place`, in the frame that contains `place`.
-pub(super) fn turned(m: &Square, place: &Rigid) -> Square {
-    around(&rotation(place.turned((1.0, 0.0)), place.turned((0.0, 1.0))), m)
+pub(super) fn turned(m: &Square, pose: &Pose2) -> Square {
+    transformed(&rotation(pose.turned((1.0, 0.0)), pose.turned((0.0, 1.0))), m)
 }
 
 /// Returns the rotation that turns the axes to `x` and `y`.
@@ -90,7 +90,7 @@ pub(super) fn rows(m: &Square) -> [f32; 9] {
 }
 
 /// Number of sweeps after which all digits of three eigenvalues are right.
-const SWEEPS: usize = 6;
+const JACOBI_SWEEPS: usize = 6;
 
 #[cfg(test)]
 mod tests {

@@ -1,23 +1,23 @@
 //! Matches a scan with another one: each of its beams ends on the surface nearest to it, and the position where the
 //! beams are least off is that of the scan.
 //!
-//! A [`View`] is one scan as it is compared: its points, the surfaces on which they lie, and its lines.
+//! A [`PreparedScan`] is one scan as it is compared: its points, the surfaces on which they lie, and its lines.
 
 use std::f64::consts::{FRAC_PI_2, TAU};
 
 use scanhub_schema::{Corner, Line, Lines, Pose, Scan};
 
-use super::covariance::{Square, add_outer, around, eigen};
+use super::covariance::{Square, add_outer, eigen, transformed};
 use crate::directions::Directions;
-use crate::velocity::{Rigid, is_whole};
+use crate::velocity::{Pose2, is_whole};
 
 /// Position of one scan relative to another.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Match {
-    pub(super) place: Rigid,
+    pub(super) pose: Pose2,
     /// Covariance of the position by the noise of the scan, and by that of the kept one.
     pub(super) own: Square,
-    pub(super) of_kept: Square,
+    pub(super) of_reference: Square,
     /// Share of the readings that lie on surfaces.
     pub(super) overlap: f64,
     /// Sum of the weights of the readings. A reading near a surface has more weight, so a match with a greater sum fits
@@ -32,28 +32,28 @@ pub(super) struct Match {
 }
 
 /// Matches scans.
-pub(super) struct Matcher {
+pub(super) struct ScanMatcher {
     /// By reading: 0 for an object that stands, otherwise the number of kept scans for which a moving object is
     /// ignored.
-    doubts: Box<[u8]>,
+    ignored_scans: Box<[u8]>,
     runs: Box<[Run]>,
 }
 
-/// Neighboring readings, at most [`PIECE`], that may belong to one object.
+/// Neighboring readings, at most [`MAX_RUN_LEN`], that may belong to one object.
 #[derive(Clone, Copy, Default)]
 struct Run {
     first: u16,
     /// Number of readings.
     all: u16,
     /// Readings in space that was empty before.
-    come: u16,
+    in_free_space: u16,
     /// Readings on objects that moved before, and the maximum time for which these are ignored.
-    doubted: u16,
-    doubt: u8,
+    on_moving_objects: u16,
+    ignored_scans: u8,
     /// Readings near a surface.
     beams: u16,
     /// Sum of their squared distances from the surface, in variances of their noise.
-    off: f64,
+    squared_distances: f64,
 }
 
 /// Sums over beams near surfaces.
@@ -66,72 +66,83 @@ struct Sums {
     /// Part of `weight` that surfaces of uncertain direction add by chance.
     chance: f64,
     own: Square,
-    of_kept: Square,
+    of_reference: Square,
     /// Sums of the squared distances of the beams, and of the variances by noise alone.
-    off: f64,
+    squared_distances: f64,
     expected: f64,
     weights: f64,
     beams: usize,
 }
 
 /// Directions in which the surroundings define the position.
-struct Known {
+struct Observability {
     values: [f64; 3],
     vectors: [[f64; 3]; 3],
     /// Whether enough beams meet walls across it to be better than a guess.
-    is_said: [bool; 3],
+    is_significant: [bool; 3],
     /// Whether enough beams meet walls across it.
     is_known: [bool; 3],
 }
 
-impl Matcher {
+impl ScanMatcher {
     /// Allocates a matcher for at most `beams` beams.
-    pub(super) fn new(beams: usize) -> Matcher {
-        Matcher { doubts: vec![0; beams].into(), runs: vec![Run::default(); beams].into() }
+    pub(super) fn new(beams: usize) -> ScanMatcher {
+        ScanMatcher { ignored_scans: vec![0; beams].into(), runs: vec![Run::default(); beams].into() }
     }
 
     /// Returns the position of `now` relative to `kept`, near `begin`; `None` if too few beams match. In directions
     /// that the surroundings do not define, the position is that of `begin`, with a standard deviation of `unknown_m`.
-    pub(super) fn find(&mut self, kept: &View, now: &View, begin: Rigid, unknown_m: f64) -> Option<Match> {
-        self.trust_all();
-        let pair = Pair { kept, now, scale: scale(now)?, finest: WIDTH * kept.noise.hypot(now.noise) };
-        let mut place = pair.settle(begin, FIRST_M, &self.doubts);
-        for _ in 0..LOOKS {
-            if !self.mark_moving(&pair, &place) {
+    pub(super) fn find(
+        &mut self,
+        reference: &PreparedScan,
+        current: &PreparedScan,
+        begin: Pose2,
+        unknown_m: f64,
+    ) -> Option<Match> {
+        self.reset();
+        let pair = Pair {
+            reference,
+            current,
+            scale: scale(current)?,
+            finest: MAX_DEVIATIONS * reference.noise.hypot(current.noise),
+        };
+        let mut pose = pair.converge(begin, FIRST_WIDTH_M, &self.ignored_scans);
+        for _ in 0..MAX_SEARCHES {
+            if !self.mark_moving(&pair, &pose) {
                 break;
             }
-            place = pair.settle(place, 0.0, &self.doubts);
+            pose = pair.converge(pose, 0.0, &self.ignored_scans);
         }
-        let sums = pair.sums(&place, pair.finest, 1, &self.doubts);
-        if sums.beams < LEAST_BEAMS {
+        let sums = pair.sums(&pose, pair.finest, 1, &self.ignored_scans);
+        if sums.beams < MIN_BEAMS {
             return None;
         }
-        let known = Known::of(&sums, 1);
-        let (own, of_kept) = known.covariances(&sums, pair.scale, unknown_m);
+        let observability = Observability::of(&sums, 1);
+        let (own, of_kept) = observability.covariances(&sums, pair.scale, unknown_m);
         let is_finite =
             own.as_flattened().iter().chain(of_kept.as_flattened()).all(|value| value.is_finite());
         let found = Match {
-            place,
+            pose,
             own,
-            of_kept,
-            overlap: pair.overlap(&place),
+            of_reference: of_kept,
+            overlap: pair.overlap(&pose),
             weight: sums.weights,
-            is_degenerate: !known.is_known.iter().all(|is_known| *is_known),
-            has_corners: same_corners(kept, now, &place),
-            has_lines: same_lines(kept, now, &place),
+            is_degenerate: !observability.is_known.iter().all(|is_known| *is_known),
+            has_corners: same_corners(reference, current, &pose),
+            has_lines: same_lines(reference, current, &pose),
         };
-        (is_finite && place.x.is_finite() && place.y.is_finite() && place.yaw.is_finite()).then_some(found)
+        (is_finite && pose.x.is_finite() && pose.y.is_finite() && pose.yaw.is_finite()).then_some(found)
     }
 
     /// Returns, by reading of the last scan, 0 for an object that stands, otherwise the number of kept scans for which
     /// a moving object is ignored.
-    pub(super) fn doubts(&self) -> &[u8] {
-        &self.doubts
+    pub(super) fn ignored_scans(&self) -> &[u8] {
+        &self.ignored_scans
     }
 
     /// Resets the matcher: no object is known to move.
-    pub(super) fn trust_all(&mut self) {
-        self.doubts.fill(0);
+    pub(super) fn reset(&mut self) {
+        self.ignored_scans.fill(0);
     }
 
     /// Marks readings of moving objects, and returns whether other readings than before are marked. A run of
@@ -140,28 +151,32 @@ impl Matcher {
     /// - Together, they are farther from surfaces than their noise.
     /// - Most of them lie in space that was empty before.
     /// - Most of them lie on objects that moved before.
-    fn mark_moving(&mut self, pair: &Pair<'_>, place: &Rigid) -> bool {
+    fn mark_moving(&mut self, pair: &Pair<'_>, pose: &Pose2) -> bool {
         let width = 2.0 * pair.finest;
-        let beams = pair.now.points().len();
+        let beams = pair.current.points().len();
         let (mut runs, mut off, mut expected) = (0, 0.0, 0.0);
         for i in 0..beams {
-            if i == 0 || !pair.now.is_connected(i) || usize::from(self.runs[runs - 1].all) >= PIECE {
+            if i == 0 || !pair.current.is_connected(i) || usize::from(self.runs[runs - 1].all) >= MAX_RUN_LEN
+            {
                 self.runs[runs] = Run { first: i as u16, ..Run::default() };
                 runs += 1;
             }
             let run = &mut self.runs[runs - 1];
             run.all += 1;
-            let point = place.point(pair.now.points()[i]);
-            run.come += u16::from(pair.kept.sees_through(point, width));
-            let doubt = pair.kept.nearest(point, width).map_or(0, |at| pair.kept.readings()[at].doubt);
-            run.doubted += u16::from(doubt > 0);
-            run.doubt = run.doubt.max(doubt);
-            let Some(on) = pair.on(i, place, width) else { continue };
-            let square = on.off * on.off;
-            run.off += (square / on.variance()).min(CAP);
+            let point = pose.point(pair.current.points()[i]);
+            run.in_free_space += u16::from(pair.reference.sees_through(point, width));
+            let ignored_scans = pair
+                .reference
+                .nearest(point, width)
+                .map_or(0, |at| pair.reference.readings()[at].ignored_scans);
+            run.on_moving_objects += u16::from(ignored_scans > 0);
+            run.ignored_scans = run.ignored_scans.max(ignored_scans);
+            let Some(residual) = pair.residual(i, pose, width) else { continue };
+            let square = residual.distance * residual.distance;
+            run.squared_distances += (square / residual.variance()).min(MAX_SQUARE);
             run.beams += 1;
-            if self.doubts[i] == 0 && on.off.abs() < pair.finest {
-                (off, expected) = (off + square, expected + on.variance());
+            if self.ignored_scans[i] == 0 && residual.distance.abs() < pair.finest {
+                (off, expected) = (off + square, expected + residual.variance());
             }
         }
         let level = if expected > 0.0 { (off / expected).max(1.0) } else { 1.0 };
@@ -171,15 +186,15 @@ impl Matcher {
             let run = self.runs[at];
             // The variance of the sum of squares is twice the number of beams.
             let n = f64::from(run.beams);
-            let is_off = run.off > level * (MORE * n + 4.0 * (2.0 * n).sqrt());
-            let doubt = match is_off || 2 * run.come > run.all {
-                true => DOUBT,
-                false if 2 * run.doubted > run.all => run.doubt - 1,
+            let is_off = run.squared_distances > level * (MAX_MEAN_SQUARE * n + 4.0 * (2.0 * n).sqrt());
+            let ignored_scans = match is_off || 2 * run.in_free_space > run.all {
+                true => IGNORED_SCANS,
+                false if 2 * run.on_moving_objects > run.all => run.ignored_scans - 1,
                 false => 0,
             };
-            for was in &mut self.doubts[run.first.into()..end] {
-                is_new |= (*was > 0) != (doubt > 0);
-                *was = doubt;
+            for ignored in &mut self.ignored_scans[run.first.into()..end] {
+                is_new |= (*ignored > 0) != (ignored_scans > 0);
+                *ignored = ignored_scans;
             }
         }
         is_new
@@ -188,8 +203,8 @@ impl Matcher {
 
 /// Two scans that are matched.
 struct Pair<'a> {
-    kept: &'a View,
-    now: &'a View,
+    reference: &'a PreparedScan,
+    current: &'a PreparedScan,
     /// See [`scale`].
     scale: f64,
     /// Maximum distance of a beam from its surface in the last rounds, in meters.
@@ -197,92 +212,95 @@ struct Pair<'a> {
 }
 
 /// A beam that ends near a surface.
-struct On {
+struct SurfaceResidual {
     point: (f64, f64),
     surface: Surface,
-    off: f64,
+    distance: f64,
     /// Whether the surface belongs to a moving object.
-    is_doubted: bool,
+    is_moving: bool,
     /// Variance of `off` by the noise of the scan, and by that of the kept one.
-    by_now: f64,
-    by_kept: f64,
+    current_variance: f64,
+    reference_variance: f64,
 }
 
-impl On {
+impl SurfaceResidual {
     fn variance(&self) -> f64 {
-        self.by_now + self.by_kept
+        self.current_variance + self.reference_variance
     }
 }
 
 impl Pair<'_> {
     /// Returns the position of `now`, starting at `place` with beams that are at most `width` away from surfaces.
-    fn settle(&self, mut place: Rigid, width: f64, doubts: &[u8]) -> Rigid {
+    fn converge(&self, mut pose: Pose2, width: f64, ignored_scans: &[u8]) -> Pose2 {
         let mut width = width.max(self.finest);
-        let coarse = self.now.points().len().div_ceil(COARSE);
-        for _ in 0..ROUNDS {
+        let coarse = self.current.points().len().div_ceil(COARSE_BEAMS);
+        for _ in 0..MAX_ROUNDS {
             let is_last = width <= self.finest;
             let stride = if is_last { 1 } else { coarse };
-            let sums = self.sums(&place, width, stride, doubts);
-            let step = Known::of(&sums, stride).solve(&sums.slope);
+            let sums = self.sums(&pose, width, stride, ignored_scans);
+            let step = Observability::of(&sums, stride).solve(&sums.slope);
             let turn = step[2] / self.scale;
-            place = Rigid::new(step[0], step[1], turn).then(&place);
-            if is_last && step[0].hypot(step[1]) < STILL_M && turn.abs() < STILL_RAD {
+            pose = Pose2::new(step[0], step[1], turn).then(&pose);
+            if is_last && step[0].hypot(step[1]) < MIN_STEP_M && turn.abs() < MIN_STEP_RAD {
                 break;
             }
             width = (0.5 * width).max(self.finest);
         }
-        place
+        pose
     }
 
     /// Returns the share of the readings that are near a surface.
-    fn overlap(&self, place: &Rigid) -> f64 {
-        let beams = self.now.points().len();
-        (0..beams).filter(|&i| self.on(i, place, self.finest).is_some()).count() as f64 / beams as f64
+    fn overlap(&self, pose: &Pose2) -> f64 {
+        let beams = self.current.points().len();
+        (0..beams).filter(|&i| self.residual(i, pose, self.finest).is_some()).count() as f64 / beams as f64
     }
 
     /// Returns reading `i` if it is less than `width` away from a surface.
-    fn on(&self, i: usize, place: &Rigid, width: f64) -> Option<On> {
-        let (reading, point) = (&self.now.readings()[i], place.point(self.now.points()[i]));
+    fn residual(&self, i: usize, pose: &Pose2, width: f64) -> Option<SurfaceResidual> {
+        let (reading, point) = (&self.current.readings()[i], pose.point(self.current.points()[i]));
         // The beam nearest to the point may end as far from it as neighboring beams are apart.
-        let on = &self.kept.readings()[self.kept.nearest(point, width + SPACING_M)?];
-        let surface = on.surface?;
-        let off = surface.off(point);
+        let nearest = &self.reference.readings()[self.reference.nearest(point, width + MAX_SPACING_M)?];
+        let surface = nearest.surface?;
+        let distance = surface.distance(point);
         let along = |(x, y): (f64, f64)| surface.normal.0 * x + surface.normal.1 * y;
-        let deviations =
-            (along(place.turned(reading.direction)) * self.now.noise, along(on.direction) * self.kept.noise);
-        let (by_now, by_kept) = (deviations.0 * deviations.0, deviations.1 * deviations.1);
+        let deviations = (
+            along(pose.turned(reading.direction)) * self.current.noise,
+            along(nearest.direction) * self.reference.noise,
+        );
+        let (current_variance, reference_variance) =
+            (deviations.0 * deviations.0, deviations.1 * deviations.1);
         // A surface that is seen edge-on also varies across the beams.
-        let least = LEAST_SHARE * (self.now.noise * self.now.noise);
-        (off.abs() < width).then_some(On {
+        let min_variance = MIN_VARIANCE_SHARE * (self.current.noise * self.current.noise);
+        (distance.abs() < width).then_some(SurfaceResidual {
             point,
             surface,
-            off,
-            is_doubted: on.doubt > 0,
-            by_now: by_now.max(least),
-            by_kept: by_kept.max(least),
+            distance,
+            is_moving: nearest.ignored_scans > 0,
+            current_variance: current_variance.max(min_variance),
+            reference_variance: reference_variance.max(min_variance),
         })
     }
 
     /// Returns the sums over every `stride`th beam at `place` that is less than `width` away from a surface and not on
     /// a moving object.
-    fn sums(&self, place: &Rigid, width: f64, stride: usize, doubts: &[u8]) -> Sums {
+    fn sums(&self, pose: &Pose2, width: f64, stride: usize, ignored_scans: &[u8]) -> Sums {
         let mut sums = Sums::default();
-        for i in (0..self.now.points().len()).step_by(stride.max(1)).filter(|&i| doubts[i] == 0) {
-            let Some(on) = self.on(i, place, width).filter(|on| !on.is_doubted) else { continue };
-            let (share, off) = (on.off / width, on.off);
+        for i in (0..self.current.points().len()).step_by(stride.max(1)).filter(|&i| ignored_scans[i] == 0) {
+            let Some(residual) = self.residual(i, pose, width).filter(|on| !on.is_moving) else { continue };
+            let (share, off) = (residual.distance / width, residual.distance);
             // Tukey's biweight.
             let weight = (1.0 - share * share) * (1.0 - share * share);
-            let ((nx, ny), (x, y)) = (on.surface.normal, on.point);
+            let ((nx, ny), (x, y)) = (residual.surface.normal, residual.point);
             let row = [nx, ny, (ny * x - nx * y) / self.scale];
             add_outer(&mut sums.weight, &row, weight);
             for (slope, value) in sums.slope.iter_mut().zip(row) {
                 *slope += weight * off * value;
             }
-            add_outer(&mut sums.own, &row, weight * weight * on.by_now);
-            add_outer(&mut sums.of_kept, &row, weight * weight * on.by_kept);
-            sums.chance += CHANCE * weight * on.surface.variance;
-            sums.off += weight * off * off;
-            sums.expected += weight * on.variance();
+            add_outer(&mut sums.own, &row, weight * weight * residual.current_variance);
+            add_outer(&mut sums.of_reference, &row, weight * weight * residual.reference_variance);
+            sums.chance += CHANCE_FACTOR * weight * residual.surface.variance;
+            sums.squared_distances += weight * off * off;
+            sums.expected += weight * residual.variance();
             sums.weights += weight;
             sums.beams += 1;
         }
@@ -292,27 +310,34 @@ impl Pair<'_> {
 
 /// Returns the root mean square distance of the points of `now`, so that a turn by its inverse moves them by about one
 /// meter. `None` if there are no points.
-fn scale(now: &View) -> Option<f64> {
+fn scale(now: &PreparedScan) -> Option<f64> {
     let square: f64 = now.points().iter().map(|point| point.0 * point.0 + point.1 * point.1).sum();
     let scale = (square / now.points().len().max(1) as f64).sqrt();
     (scale.is_finite() && scale > 0.0).then_some(scale)
 }
 
-impl Known {
+impl Observability {
     /// A direction is known if enough beams meet walls across it, not counting the part that chance adds.
-    fn of(sums: &Sums, stride: usize) -> Known {
+    fn of(sums: &Sums, stride: usize) -> Observability {
         let (values, vectors) = eigen(sums.weight);
-        let least = (LEAST_BEAMS as f64 / stride as f64).max(LEAST_PART * sums.weights);
-        let said = values.map(|value| value - sums.chance);
-        let is_said = said.map(|beams| beams * stride as f64 >= SAID_BEAMS);
-        Known { values, vectors, is_said, is_known: said.map(|beams| beams >= least) }
+        let min_beams = (MIN_BEAMS as f64 / stride as f64).max(MIN_BEAM_SHARE * sums.weights);
+        let significant = values.map(|value| value - sums.chance);
+        let is_significant = significant.map(|beams| beams * stride as f64 >= MIN_SIGNIFICANT_BEAMS);
+        Observability {
+            values,
+            vectors,
+            is_significant,
+            is_known: significant.map(|beams| beams >= min_beams),
+        }
     }
 
     /// Returns the step against `slope`, along directions with enough beams.
     fn solve(&self, slope: &[f64; 3]) -> [f64; 3] {
         let mut step = [0.0; 3];
-        for ((value, vector), is_said) in self.values.iter().zip(&self.vectors).zip(self.is_said) {
-            if is_said {
+        for ((value, vector), is_significant) in
+            self.values.iter().zip(&self.vectors).zip(self.is_significant)
+        {
+            if is_significant {
                 let along: f64 = vector.iter().zip(slope).map(|(a, b)| a * b).sum();
                 step.iter_mut().zip(vector).for_each(|(step, v)| *step -= along / value * v);
             }
@@ -324,11 +349,11 @@ impl Known {
     /// radians.
     fn covariances(&self, sums: &Sums, scale: f64, unknown_m: f64) -> (Square, Square) {
         // If beams are off by more than their noise, the position is less certain.
-        let factor = (sums.off / sums.expected).max(1.0);
+        let factor = (sums.squared_distances / sums.expected).max(1.0);
         let inverse = self.inverse();
         let of_radians = [1.0, 1.0, 1.0 / scale];
         let of = |sum: &Square, unknown_m: f64| {
-            let mut covariance = around(&inverse, sum);
+            let mut covariance = transformed(&inverse, sum);
             covariance.as_flattened_mut().iter_mut().for_each(|value| *value *= factor);
             for (vector, is_known) in self.vectors.iter().zip(self.is_known) {
                 if !is_known {
@@ -337,7 +362,7 @@ impl Known {
             }
             std::array::from_fn(|i| std::array::from_fn(|j| covariance[i][j] * of_radians[i] * of_radians[j]))
         };
-        (of(&sums.own, unknown_m), of(&sums.of_kept, 0.0))
+        (of(&sums.own, unknown_m), of(&sums.of_reference, 0.0))
     }
 
     fn inverse(&self) -> Square {
@@ -352,40 +377,40 @@ impl Known {
 }
 
 /// Returns whether a corner of `now` at `place` is one of `kept`.
-fn same_corners(kept: &View, now: &View, place: &Rigid) -> bool {
-    let near = NEAR * kept.noise.hypot(now.noise) + NEAR_M;
+fn same_corners(reference: &PreparedScan, current: &PreparedScan, pose: &Pose2) -> bool {
+    let near = MATCH_DEVIATIONS * reference.noise.hypot(current.noise) + MATCH_MARGIN_M;
     let is_same = |corner: &Corner| {
-        let (x, y) = place.point((corner.x_m.into(), corner.y_m.into()));
+        let (x, y) = pose.point((corner.x_m.into(), corner.y_m.into()));
         let off = |other: &Corner| (x - f64::from(other.x_m)).hypot(y - f64::from(other.y_m));
-        kept.lines.corners().iter().any(|other| off(other) <= near)
+        reference.lines.corners().iter().any(|other| off(other) <= near)
     };
-    now.lines.corners().iter().any(is_same)
+    current.lines.corners().iter().any(is_same)
 }
 
 /// Returns whether a line of `now` at `place` is one of `kept`: both of its ends lie on that line, and the two overlap.
-fn same_lines(kept: &View, now: &View, place: &Rigid) -> bool {
-    let near = NEAR * kept.noise.hypot(now.noise) + NEAR_M;
+fn same_lines(reference: &PreparedScan, current: &PreparedScan, pose: &Pose2) -> bool {
+    let near = MATCH_DEVIATIONS * reference.noise.hypot(current.noise) + MATCH_MARGIN_M;
     let is_same = |line: &Line| {
         let ends =
-            [(line.x1_m, line.y1_m), (line.x2_m, line.y2_m)].map(|(x, y)| place.point((x.into(), y.into())));
+            [(line.x1_m, line.y1_m), (line.x2_m, line.y2_m)].map(|(x, y)| pose.point((x.into(), y.into())));
         let is_on = |other: &Line| {
             let (sin, cos) = f64::from(other.alpha_rad).sin_cos();
             let along = |(x, y): (f64, f64)| cos * y - sin * x;
             let of_other = [(other.x1_m, other.y1_m), (other.x2_m, other.y2_m)];
             let of_other = of_other.map(|(x, y)| along((x.into(), y.into())));
-            let (least, most) = (of_other[0].min(of_other[1]), of_other[0].max(of_other[1]));
+            let (begin, end) = (of_other[0].min(of_other[1]), of_other[0].max(of_other[1]));
             let alongs = ends.map(along);
-            let is_beside = alongs[0].max(alongs[1]) < least || alongs[0].min(alongs[1]) > most;
+            let is_beside = alongs[0].max(alongs[1]) < begin || alongs[0].min(alongs[1]) > end;
             !is_beside
                 && ends.iter().all(|end| (cos * end.0 + sin * end.1 - f64::from(other.r_m)).abs() <= near)
         };
-        kept.lines.lines().iter().any(is_on)
+        reference.lines.lines().iter().any(is_on)
     };
-    now.lines.lines().iter().any(is_same)
+    current.lines.lines().iter().any(is_same)
 }
 
 /// Readings of one scan, with their surfaces and lines.
-pub(super) struct View {
+pub(super) struct PreparedScan {
     pose: Pose,
     /// First angle, step and number of the beams.
     grid: (f64, f64, usize),
@@ -411,7 +436,7 @@ pub(super) struct Reading {
     pub(super) range: f64,
     pub(super) surface: Option<Surface>,
     /// Number of kept scans for which its object is ignored, because it was seen to move; 0 if it stands.
-    pub(super) doubt: u8,
+    pub(super) ignored_scans: u8,
 }
 
 /// A plane across the floor: x nx + y ny = r.
@@ -423,10 +448,10 @@ pub(super) struct Surface {
     pub(super) variance: f64,
 }
 
-impl View {
+impl PreparedScan {
     /// Allocates a view of at most `beams` beams.
-    pub(super) fn new(beams: usize) -> View {
-        View {
+    pub(super) fn new(beams: usize) -> PreparedScan {
+        PreparedScan {
             pose: Pose::default(),
             grid: (0.0, 0.0, 0),
             directions: Directions::new(beams),
@@ -443,7 +468,7 @@ impl View {
     pub(super) fn take(&mut self, pose: &Pose, scan: &Scan, lines: &Lines) {
         self.lines = *lines;
         let noise = f64::from(lines.noise_m);
-        self.noise = if noise.is_finite() { noise.max(LEAST_NOISE_M) } else { LEAST_NOISE_M };
+        self.noise = if noise.is_finite() { noise.max(MIN_NOISE_M) } else { MIN_NOISE_M };
         self.pose = *pose;
         self.grid = (scan.first_angle, scan.step, scan.beams().min(self.slots.len()));
         self.directions.fit(pose, scan);
@@ -454,14 +479,14 @@ impl View {
             next = beam + 1;
             self.points[self.count] = (pose.x_m + range * direction.0, pose.y_m + range * direction.1);
             self.readings[self.count] =
-                Reading { beam: beam as u16, direction, range, surface: None, doubt: 0 };
+                Reading { beam: beam as u16, direction, range, surface: None, ignored_scans: 0 };
             self.count += 1;
         }
         self.slots[next..self.grid.2].fill(self.count as u16);
         self.set_surfaces_of_lines();
         for i in 0..self.count {
             if self.readings[i].surface.is_none() {
-                self.readings[i].surface = self.among_neighbors(i);
+                self.readings[i].surface = self.surface_of_neighbors(i);
             }
         }
     }
@@ -480,7 +505,7 @@ impl View {
                 if reading.beam > line.last {
                     break;
                 }
-                if surface.off(point).abs() <= 4.0 * self.noise {
+                if surface.distance(point).abs() <= 4.0 * self.noise {
                     reading.surface = Some(surface);
                 }
             }
@@ -488,12 +513,12 @@ impl View {
     }
 
     /// Returns the surface through reading `i` and its neighbors, if they lie on one.
-    fn among_neighbors(&self, i: usize) -> Option<Surface> {
+    fn surface_of_neighbors(&self, i: usize) -> Option<Surface> {
         let (mut first, mut last) = (i, i);
-        while first > 0 && i - first < NEIGHBORS && self.is_connected(first) {
+        while first > 0 && i - first < SURFACE_NEIGHBORS && self.is_connected(first) {
             first -= 1;
         }
-        while last + 1 < self.count && last - i < NEIGHBORS && self.is_connected(last + 1) {
+        while last + 1 < self.count && last - i < SURFACE_NEIGHBORS && self.is_connected(last + 1) {
             last += 1;
         }
         let n = (last - first + 1) as f64;
@@ -509,21 +534,21 @@ impl View {
             (xx, xy, yy) = (xx + x * x, xy + x * y, yy + y * y);
         }
         let half = ((xx - yy) / 2.0).hypot(xy);
-        let (most, least) = ((xx + yy) / 2.0 + half, (xx + yy) / 2.0 - half);
+        let (major, minor) = ((xx + yy) / 2.0 + half, (xx + yy) / 2.0 - half);
         let along = 0.5 * (2.0 * xy).atan2(xx - yy);
         let (sin, cos) = along.sin_cos();
-        let variance = (least / (n - 2.0)).max(self.noise * self.noise) / most;
+        let variance = (minor / (n - 2.0)).max(self.noise * self.noise) / major;
         let normal = (-sin, cos);
         let surface = Surface { normal, r: normal.0 * middle.0 + normal.1 * middle.1, variance };
-        (variance <= MOST_VARIANCE).then_some(surface)
+        (variance <= MAX_DIRECTION_VARIANCE).then_some(surface)
     }
 
     /// Returns whether reading `i` and the one before it may belong to one object.
     pub(super) fn is_connected(&self, i: usize) -> bool {
         let (one, two) = (&self.readings[i - 1], &self.readings[i]);
         let (p, q) = (self.points[i - 1], self.points[i]);
-        let apart = f64::from(two.beam - one.beam) * self.grid.1.abs() * one.range.max(two.range);
-        (p.0 - q.0).hypot(p.1 - q.1) <= CONNECTED_M + 3.0 * apart
+        let spacing = f64::from(two.beam - one.beam) * self.grid.1.abs() * one.range.max(two.range);
+        (p.0 - q.0).hypot(p.1 - q.1) <= MAX_CONNECTED_M + 3.0 * spacing
     }
 
     /// Returns the beams that have a range.
@@ -537,9 +562,9 @@ impl View {
     }
 
     /// Stores for each reading for how long its object is ignored.
-    pub(super) fn doubt(&mut self, doubts: &[u8]) {
-        for (reading, doubt) in self.readings[..self.count].iter_mut().zip(doubts) {
-            reading.doubt = *doubt;
+    pub(super) fn set_ignored_scans(&mut self, ignored_scans: &[u8]) {
+        for (reading, scans) in self.readings[..self.count].iter_mut().zip(ignored_scans) {
+            reading.ignored_scans = *scans;
         }
     }
 
@@ -579,7 +604,7 @@ impl View {
     /// Returns the reading whose point is nearest to `point`, if it is nearer than `most`. The sine of the angle
     /// between a beam and `point` is a lower bound of the distance for all beams farther aside, so only a few are
     /// compared.
-    pub(super) fn nearest(&self, point: (f64, f64), most: f64) -> Option<usize> {
+    pub(super) fn nearest(&self, point: (f64, f64), max_distance: f64) -> Option<usize> {
         let (_, step, beams) = self.grid;
         if self.count == 0 {
             return None;
@@ -587,14 +612,14 @@ impl View {
         let (distance, at) = self.towards(point)?;
         let (turn, last) = (TAU / step.abs(), beams as f64 - 1.0);
         let begin = usize::from(self.slots[at.clamp(0.0, last) as usize]);
-        let mut best = (most * most, None);
+        let mut best = (max_distance * max_distance, None);
         // Minimum distance of a beam that is `aside` steps away, by sin a >= 2 a / pi. Exact angles are up to a step
         // off.
-        let bound = |aside: f64| distance * ((aside - 1.5) * step.abs() / FRAC_PI_2).clamp(0.0, 1.0);
-        let mut look = |i: usize, at: f64| {
-            let aside = (f64::from(self.readings[i].beam) - at).abs();
-            let least = bound(aside);
-            if least * least > best.0 {
+        let bound = |steps: f64| distance * ((steps - 1.5) * step.abs() / FRAC_PI_2).clamp(0.0, 1.0);
+        let mut compare = |i: usize, at: f64| {
+            let steps = (f64::from(self.readings[i].beam) - at).abs();
+            let min_distance = bound(steps);
+            if min_distance * min_distance > best.0 {
                 return false;
             }
             let (dx, dy) = (self.points[i].0 - point.0, self.points[i].1 - point.1);
@@ -604,14 +629,14 @@ impl View {
             }
             true
         };
-        let up = (begin..self.count).all(|i| look(i, at));
-        let down = (0..begin).rev().all(|i| look(i, at));
+        let up = (begin..self.count).all(|i| compare(i, at));
+        let down = (0..begin).rev().all(|i| compare(i, at));
         if self.is_whole() {
             if up {
-                let _ = (0..begin).all(|i| look(i, at - turn));
+                let _ = (0..begin).all(|i| compare(i, at - turn));
             }
             if down {
-                let _ = (begin..self.count).rev().all(|i| look(i, at + turn));
+                let _ = (begin..self.count).rev().all(|i| compare(i, at + turn));
             }
         }
         best.1
@@ -621,52 +646,52 @@ impl View {
 impl Surface {
     /// Returns the signed distance of `point` from the surface.
     #[inline]
-    pub(super) fn off(&self, point: (f64, f64)) -> f64 {
+    pub(super) fn distance(&self, point: (f64, f64)) -> f64 {
         self.normal.0 * point.0 + self.normal.1 * point.1 - self.r
     }
 }
 
 /// Maximum distance of a beam from its surface in the first round. It is halved in each round.
-const FIRST_M: f64 = 0.3;
+const FIRST_WIDTH_M: f64 = 0.3;
 /// Maximum distance in the last rounds, in standard deviations. With this constant of Tukey, almost nothing is lost if
 /// there is only noise.
-const WIDTH: f64 = 3.0;
-const ROUNDS: usize = 20;
+const MAX_DEVIATIONS: f64 = 3.0;
+const MAX_ROUNDS: usize = 20;
 /// Number of beams that are enough for all rounds except the last ones.
-const COARSE: usize = 120;
-const STILL_M: f64 = 2e-5;
-const STILL_RAD: f64 = 1e-5;
+const COARSE_BEAMS: usize = 120;
+const MIN_STEP_M: f64 = 2e-5;
+const MIN_STEP_RAD: f64 = 1e-5;
 /// Minimum number of beams that define a direction. Fewer may be a leg.
-const LEAST_BEAMS: usize = 6;
+const MIN_BEAMS: usize = 6;
 /// Number of beams from which on a direction is better than a guess.
-const SAID_BEAMS: f64 = 1.5;
-/// `LEAST_BEAMS` as a share of all beams. In a long corridor, door frames are mistaken for one another.
-const LEAST_PART: f64 = 0.03;
+const MIN_SIGNIFICANT_BEAMS: f64 = 1.5;
+/// `MIN_BEAMS` as a share of all beams. In a long corridor, door frames are mistaken for one another.
+const MIN_BEAM_SHARE: f64 = 0.03;
 /// Maximum number of readings that are judged together. A whole wall would count as moving because of one end of it.
-const PIECE: usize = 24;
+const MAX_RUN_LEN: usize = 24;
 /// Maximum square that a reading adds, in variances of its noise. A few readings at an edge do not decide about the
 /// others.
-const CAP: f64 = 9.0;
+const MAX_SQUARE: f64 = 9.0;
 /// Number of times that moving objects are searched for.
-const LOOKS: usize = 2;
+const MAX_SEARCHES: usize = 2;
 /// Maximum mean square of the readings of an object that stands, in variances of their noise.
-const MORE: f64 = 3.0;
+const MAX_MEAN_SQUARE: f64 = 3.0;
 /// Number of kept scans for which a moving object is ignored.
-const DOUBT: u8 = 3;
+const IGNORED_SCANS: u8 = 3;
 /// Minimum variance across a surface, as a share of the variance of a range.
-const LEAST_SHARE: f64 = 0.05;
+const MIN_VARIANCE_SHARE: f64 = 0.05;
 /// Factor of the part of the weight that is expected by chance.
-const CHANCE: f64 = 2.0;
+const CHANCE_FACTOR: f64 = 2.0;
 /// Maximum distance of neighboring points whose surface counts for a point between them.
-pub(super) const SPACING_M: f64 = 0.2;
+pub(super) const MAX_SPACING_M: f64 = 0.2;
 /// Maximum distance of equal corners and lines in standard deviations, and in addition to that in meters.
-const NEAR: f64 = 3.0;
-const NEAR_M: f64 = 0.02;
+const MATCH_DEVIATIONS: f64 = 3.0;
+const MATCH_MARGIN_M: f64 = 0.02;
 /// Minimum standard deviation of a range in meters, for errors of a scanner other than noise.
-const LEAST_NOISE_M: f64 = 0.005;
+const MIN_NOISE_M: f64 = 0.005;
 /// Number of neighbors on each side that define a surface.
-const NEIGHBORS: usize = 4;
+const SURFACE_NEIGHBORS: usize = 4;
 /// Maximum distance of two points of one object, in addition to that of a surface that is seen at a flat angle.
-const CONNECTED_M: f64 = 0.1;
+const MAX_CONNECTED_M: f64 = 0.1;
 /// Maximum variance of the direction of a surface: 10 degrees.
-const MOST_VARIANCE: f64 = 0.03;
+const MAX_DIRECTION_VARIANCE: f64 = 0.03;

@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
 use fastrand::Rng;
-use scanhub_preprocess::motion::Rigid;
+use scanhub_preprocess::motion::Pose2;
 use scanhub_schema::{Code, Scan, ScanHead};
 
 type Point = (f64, f64);
@@ -14,7 +14,7 @@ type Point = (f64, f64);
 pub(crate) struct Drive {
     pub(crate) scans: Vec<Box<Scan>>,
     /// Where the robot was.
-    pub(crate) places: Vec<Rigid>,
+    pub(crate) poses: Vec<Pose2>,
     /// Which beams met a person.
     pub(crate) people: Vec<Vec<bool>>,
     walls: Vec<(Point, Point)>,
@@ -28,14 +28,14 @@ pub(crate) struct Drive {
 
 /// Which squares of 0.1 m were seen free in how many scans, by the true places.
 #[derive(Default)]
-pub(crate) struct Seen {
+pub(crate) struct ObservedSquares {
     squares: HashMap<(i32, i32), (u32, u32)>,
     scans: u32,
 }
 
-impl Seen {
+impl ObservedSquares {
     /// Takes what the scan with number `at` sees.
-    pub(crate) fn look(&mut self, drive: &Drive, at: usize) {
+    pub(crate) fn observe(&mut self, drive: &Drive, at: usize) {
         self.scans += 1;
         let scan = &drive.scans[at];
         for beam in 0..scan.beams() {
@@ -59,25 +59,25 @@ impl Seen {
 
 /// The square in which a beam of the scan with number `at` is at this range.
 fn square(drive: &Drive, at: usize, beam: usize, range: f64) -> (i32, i32) {
-    let (scan, before) = (&drive.scans[at], &drive.places[at.saturating_sub(1)]);
-    let (place, angle) = (place_of(before, &drive.places[at], scan, beam), scan.angle(beam));
-    let (x, y) = place.point((range * angle.cos(), range * angle.sin()));
+    let (scan, before) = (&drive.scans[at], &drive.poses[at.saturating_sub(1)]);
+    let (pose, angle) = (relative_pose(before, &drive.poses[at], scan, beam), scan.angle(beam));
+    let (x, y) = pose.point((range * angle.cos(), range * angle.sin()));
     ((10.0 * x).floor() as i32, (10.0 * y).floor() as i32)
 }
 
 /// The robot's place at the time of a beam of `scan`, during which it moves from `before` to `place`.
-fn place_of(before: &Rigid, place: &Rigid, scan: &Scan, beam: usize) -> Rigid {
-    let part = 1.0 + 1e-9 * scan.beam_ns(beam) as f64 / PERIOD_S;
-    let step = before.inverse().then(place);
-    before.then(&Rigid::new(part * step.x, part * step.y, part * step.yaw))
+fn relative_pose(before: &Pose2, pose: &Pose2, scan: &Scan, beam: usize) -> Pose2 {
+    let part = 1.0 + 1e-9 * scan.beam_ns(beam) as f64 / SCAN_PERIOD_S;
+    let step = before.inverse().then(pose);
+    before.then(&Pose2::new(part * step.x, part * step.y, part * step.yaw))
 }
 
 /// Time of a scan of an LMS at half degrees, two revolutions of its mirror, in seconds.
-pub(crate) const PERIOD_S: f64 = 0.026_64;
+pub(crate) const SCAN_PERIOD_S: f64 = 0.026_64;
 
 /// Returns the stamp of the scan with this number, in ns.
 pub(crate) fn stamp_ns(number: usize) -> u64 {
-    1_000_000_000 + (number as f64 * 1e9 * PERIOD_S) as u64
+    1_000_000_000 + (number as f64 * 1e9 * SCAN_PERIOD_S) as u64
 }
 
 struct Walker {
@@ -117,14 +117,14 @@ pub(crate) fn normal(random: &mut Rng) -> f64 {
     (-2.0 * (1.0 - random.f64()).ln()).sqrt() * (TAU * random.f64()).cos()
 }
 
-fn boxed(middle: Point, (long, wide): (f64, f64), yaw: f64) -> Vec<(Point, Point)> {
-    let place = Rigid::new(middle.0, middle.1, yaw);
+fn box_walls(center: Point, (long, wide): (f64, f64), yaw: f64) -> Vec<(Point, Point)> {
+    let pose = Pose2::new(center.0, center.1, yaw);
     let corners = [(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)]
-        .map(|(x, y): Point| place.point((x * long / 2.0, y * wide / 2.0)));
+        .map(|(x, y): Point| pose.point((x * long / 2.0, y * wide / 2.0)));
     (0..4).map(|i| (corners[i], corners[(i + 1) % 4])).collect()
 }
 
-fn to_wall(from: Point, along: Point, ((x1, y1), (x2, y2)): &(Point, Point)) -> Option<f64> {
+fn distance_to_wall(from: Point, along: Point, ((x1, y1), (x2, y2)): &(Point, Point)) -> Option<f64> {
     let (dx, dy) = (x2 - x1, y2 - y1);
     let cross = along.0 * dy - along.1 * dx;
     let (ox, oy) = (x1 - from.0, y1 - from.1);
@@ -132,8 +132,8 @@ fn to_wall(from: Point, along: Point, ((x1, y1), (x2, y2)): &(Point, Point)) -> 
     (range > 0.0 && (0.0..=1.0).contains(&share)).then_some(range)
 }
 
-fn to_disc(from: Point, along: Point, middle: Point, radius: f64) -> Option<f64> {
-    let (dx, dy) = (middle.0 - from.0, middle.1 - from.1);
+fn distance_to_disc(from: Point, along: Point, center: Point, radius: f64) -> Option<f64> {
+    let (dx, dy) = (center.0 - from.0, center.1 - from.1);
     let ahead = dx * along.0 + dy * along.1;
     let inside = radius * radius - (dx * dx + dy * dy - ahead * ahead);
     (inside > 0.0 && ahead > radius).then(|| ahead - inside.sqrt())
@@ -142,31 +142,31 @@ fn to_disc(from: Point, along: Point, middle: Point, radius: f64) -> Option<f64>
 impl Drive {
     /// `count` scans of `beams` beams over half a turn in a room of `seed` with boxes in it.
     pub(crate) fn through_a_room(seed: u64, beams: usize, count: usize, noise_m: f64) -> Drive {
-        let mut drive = Drive::begin(seed, beams, noise_m);
-        drive.on(count, 0.02);
+        let mut drive = Drive::new_room(seed, beams, noise_m);
+        drive.drive_on(count, 0.02);
         drive
     }
 
     /// The same, with so many `people` around the robot.
     pub(crate) fn among_people(seed: u64, beams: usize, count: usize, people: usize) -> Drive {
-        let mut drive = Drive::begin(seed, beams, 0.01);
+        let mut drive = Drive::new_room(seed, beams, 0.01);
         for _ in 0..people {
             drive.add_walker();
         }
-        drive.on(count, 0.02);
+        drive.drive_on(count, 0.02);
         drive
     }
 
     /// A robot that drives by `speed` metres a scan, or stands, among so many `people` who walk.
     pub(crate) fn with_walkers(seed: u64, beams: usize, count: usize, people: usize, speed: f64) -> Drive {
-        let mut drive = Drive::begin(seed, beams, 0.01);
+        let mut drive = Drive::new_room(seed, beams, 0.01);
         for _ in 0..people {
             drive.add_walker();
         }
         if speed == 0.0 {
-            drive.stand(count);
+            drive.stand_still(count);
         } else {
-            drive.on(count, speed);
+            drive.drive_on(count, speed);
         }
         drive
     }
@@ -174,12 +174,12 @@ impl Drive {
     /// Returns scans of an LMS at half degrees, on a robot that drives by `speed` meters a scan through a furnished room among
     /// `people`: tables and chairs with thin legs, cupboards, and pillars. The robot moves while a scan is measured.
     pub(crate) fn through_furniture(seed: u64, count: usize, people: usize, speed: f64) -> Drive {
-        let mut drive = Drive::begin(seed, 361, 0.01);
+        let mut drive = Drive::new_room(seed, 361, 0.01);
         drive.furnish();
         for _ in 0..people {
             drive.add_walker();
         }
-        drive.on(count, speed);
+        drive.drive_on(count, speed);
         drive
     }
 
@@ -187,16 +187,16 @@ impl Drive {
     /// the end it stands for 20 scans.
     pub(crate) fn on_the_spot(seed: u64, count: usize, deg_per_s: f64) -> Drive {
         let mut drive = Drive::turning(seed, count + 1, deg_per_s);
-        drive.stand(19);
+        drive.stand_still(19);
         drive
     }
 
     /// Returns `count` scans of an LMS at half degrees, on a robot that turns on the spot in a furnished room by `deg_per_s`.
     pub(crate) fn turning(seed: u64, count: usize, deg_per_s: f64) -> Drive {
-        let mut drive = Drive::begin(seed, 361, 0.01);
+        let mut drive = Drive::new_room(seed, 361, 0.01);
         drive.furnish();
-        let place = Rigid::new(0.0, 0.0, TAU * drive.random.f64());
-        drive.look(place);
+        let pose = Pose2::new(0.0, 0.0, TAU * drive.random.f64());
+        drive.scan_from(pose);
         drive.turn(count - 1, deg_per_s);
         drive
     }
@@ -211,55 +211,55 @@ impl Drive {
         };
         for _ in 0..5 {
             let (at, yaw) = (free(random), PI * random.f64());
-            let table = Rigid::new(at.0, at.1, yaw);
+            let table = Pose2::new(at.0, at.1, yaw);
             let corners = |long: f64, wide: f64| [(long, wide), (-long, wide), (-long, -wide), (long, -wide)];
             legs.extend(corners(0.7, 0.38).map(|corner| (table.point(corner), 0.025)));
             for side in [-1.0, 1.0] {
-                let chair = table.then(&Rigid::new(0.6 * (random.f64() - 0.5), side * 0.7, random.f64()));
+                let chair = table.then(&Pose2::new(0.6 * (random.f64() - 0.5), side * 0.7, random.f64()));
                 legs.extend(corners(0.2, 0.2).map(|corner| (chair.point(corner), 0.012)));
             }
         }
         for _ in 0..3 {
             legs.push((free(random), 0.08 + 0.2 * random.f64()));
-            walls.extend(boxed(free(random), (0.9, 0.45), FRAC_PI_2 * f64::from(random.u8(..4))));
+            walls.extend(box_walls(free(random), (0.9, 0.45), FRAC_PI_2 * f64::from(random.u8(..4))));
         }
     }
 
     fn add_walker(&mut self) {
         let at = (1.2 + 2.0 * self.random.f64(), TAU * self.random.f64());
-        let way = (TAU * self.random.f64()).sin_cos();
+        let direction = (TAU * self.random.f64()).sin_cos();
         let speed = 0.02 + 0.02 * self.random.f64();
         self.walkers.push(Walker {
             at: (at.0 * at.1.cos(), at.0 * at.1.sin()),
-            by_scan: (speed * way.1, speed * way.0),
+            by_scan: (speed * direction.1, speed * direction.0),
         });
     }
 
     /// Between two endless walls.
     pub(crate) fn along_a_corridor(seed: u64, beams: usize, count: usize) -> Drive {
-        let mut drive = Drive::begin(seed, beams, 0.01);
+        let mut drive = Drive::new_room(seed, beams, 0.01);
         drive.walls = vec![((-500.0, 1.2), (500.0, 1.2)), ((-500.0, -1.0), (500.0, -1.0))];
-        let mut place = Rigid::default();
+        let mut pose = Pose2::default();
         for _ in 0..count {
-            drive.look(place);
-            place = place.then(&Rigid::new(0.02, 0.0, 0.0));
+            drive.scan_from(pose);
+            pose = pose.then(&Pose2::new(0.02, 0.0, 0.0));
         }
         drive
     }
 
-    fn begin(seed: u64, beams: usize, noise_m: f64) -> Drive {
+    fn new_room(seed: u64, beams: usize, noise_m: f64) -> Drive {
         let mut random = Rng::with_seed(seed);
-        let mut walls = boxed((0.3, -0.4), (11.0, 8.0), 0.0);
+        let mut walls = box_walls((0.3, -0.4), (11.0, 8.0), 0.0);
         for _ in 0..9 {
             let at = (10.0 * (random.f64() - 0.5), 7.0 * (random.f64() - 0.5));
             if at.0.hypot(at.1) > 2.6 {
                 let size = (0.3 + random.f64(), 0.3 + random.f64());
-                walls.extend(boxed(at, size, PI * random.f64()));
+                walls.extend(box_walls(at, size, PI * random.f64()));
             }
         }
         Drive {
             scans: Vec::new(),
-            places: Vec::new(),
+            poses: Vec::new(),
             people: Vec::new(),
             walls,
             legs: Vec::new(),
@@ -275,53 +275,56 @@ impl Drive {
     }
 
     /// So many scans more, while the robot drives around.
-    pub(crate) fn on(&mut self, count: usize, speed: f64) {
-        let mut turn = 0.0;
+    pub(crate) fn drive_on(&mut self, count: usize, speed: f64) {
+        let mut yaw_sum = 0.0;
         let yaw = TAU * self.random.f64();
-        let mut place = self.places.last().copied().unwrap_or(Rigid::new(0.0, 0.0, yaw));
+        let mut pose = self.poses.last().copied().unwrap_or(Pose2::new(0.0, 0.0, yaw));
         for _ in 0..count {
-            self.look(place);
-            turn = f64::clamp(turn + 0.01 * (self.random.f64() - 0.5), -0.03, 0.03);
-            let is_far = place.x.hypot(place.y) > 1.3;
-            let home = Rigid::new(0.0, 0.0, (-place.y).atan2(-place.x) - place.yaw).yaw.clamp(-1.0, 1.0);
-            place = place.then(&Rigid::new(speed, 0.0, if is_far { 0.04 * home } else { turn }));
+            self.scan_from(pose);
+            yaw_sum = f64::clamp(yaw_sum + 0.01 * (self.random.f64() - 0.5), -0.03, 0.03);
+            let is_far = pose.x.hypot(pose.y) > 1.3;
+            let home = Pose2::new(0.0, 0.0, (-pose.y).atan2(-pose.x) - pose.yaw).yaw.clamp(-1.0, 1.0);
+            pose = pose.then(&Pose2::new(speed, 0.0, if is_far { 0.04 * home } else { yaw_sum }));
         }
     }
 
     /// Adds `count` scans, while the robot turns on the spot by `deg_per_s`.
     pub(crate) fn turn(&mut self, count: usize, deg_per_s: f64) {
-        let step = Rigid::new(0.0, 0.0, (deg_per_s * PERIOD_S).to_radians());
+        let step = Pose2::new(0.0, 0.0, (deg_per_s * SCAN_PERIOD_S).to_radians());
         for _ in 0..count {
-            let place = self.places.last().copied().unwrap_or_default();
-            self.look(place.then(&step));
+            let pose = self.poses.last().copied().unwrap_or_default();
+            self.scan_from(pose.then(&step));
         }
     }
 
     /// Adds a scan. The robot has moved by `by` since the scan before, and turns by `deg_per_s` during this one.
-    pub(crate) fn carry(&mut self, by: Rigid, deg_per_s: f64) {
-        let before = self.places.last().copied().unwrap_or_default().then(&by);
-        self.look_from(before, before.then(&Rigid::new(0.0, 0.0, (deg_per_s * PERIOD_S).to_radians())));
+    pub(crate) fn move_by(&mut self, by: Pose2, deg_per_s: f64) {
+        let before = self.poses.last().copied().unwrap_or_default().then(&by);
+        self.scan_between(
+            before,
+            before.then(&Pose2::new(0.0, 0.0, (deg_per_s * SCAN_PERIOD_S).to_radians())),
+        );
     }
 
     /// So many scans more from where the robot is.
-    pub(crate) fn stand(&mut self, count: usize) {
-        let place = self.places.last().copied().unwrap_or_default();
-        (0..count).for_each(|_| self.look(place));
+    pub(crate) fn stand_still(&mut self, count: usize) {
+        let pose = self.poses.last().copied().unwrap_or_default();
+        (0..count).for_each(|_| self.scan_from(pose));
     }
 
     /// One scan more, which ends at `place`. The robot moves there from its last place while the scan is measured.
-    fn look(&mut self, place: Rigid) {
-        self.look_from(self.places.last().copied().unwrap_or(place), place);
+    fn scan_from(&mut self, pose: Pose2) {
+        self.scan_between(self.poses.last().copied().unwrap_or(pose), pose);
     }
 
     /// One scan more, during which the robot moves from `before` to `place`.
-    fn look_from(&mut self, before: Rigid, place: Rigid) {
+    fn scan_between(&mut self, before: Pose2, pose: Pose2) {
         let Drive { walls, legs, walkers, head, noise_m, random, .. } = self;
         let times = Scan::of(*head, &[]);
         for walker in walkers.iter_mut() {
             walker.at = (walker.at.0 + walker.by_scan.0, walker.at.1 + walker.by_scan.1);
             // Nobody walks into the robot, and nobody goes far.
-            let (dx, dy) = (walker.at.0 - place.x, walker.at.1 - place.y);
+            let (dx, dy) = (walker.at.0 - pose.x, walker.at.1 - pose.y);
             let far = dx.hypot(dy);
             let outwards = dx * walker.by_scan.0 + dy * walker.by_scan.1;
             if far < 0.8 && outwards < 0.0 || far > 3.2 && outwards > 0.0 {
@@ -331,20 +334,20 @@ impl Drive {
         let mut met = Vec::new();
         let mut beam = 0;
         let scan = scan(*head, |angle| {
-            let place = place_of(&before, &place, &times, beam);
+            let pose = relative_pose(&before, &pose, &times, beam);
             beam += 1;
-            let (sin, cos) = (place.yaw + angle).sin_cos();
-            let (from, along) = ((place.x, place.y), (cos, sin));
-            let wall = walls.iter().filter_map(|wall| to_wall(from, along, wall));
-            let legs = legs.iter().filter_map(|(at, radius)| to_disc(from, along, *at, *radius));
+            let (sin, cos) = (pose.yaw + angle).sin_cos();
+            let (from, along) = ((pose.x, pose.y), (cos, sin));
+            let wall = walls.iter().filter_map(|wall| distance_to_wall(from, along, wall));
+            let legs = legs.iter().filter_map(|(at, radius)| distance_to_disc(from, along, *at, *radius));
             let wall = wall.chain(legs).fold(f64::INFINITY, f64::min);
-            let discs = walkers.iter().filter_map(|walker| to_disc(from, along, walker.at, 0.2));
+            let discs = walkers.iter().filter_map(|walker| distance_to_disc(from, along, walker.at, 0.2));
             let disc = discs.fold(f64::INFINITY, f64::min);
             met.push(disc < wall);
             Some(disc.min(wall) + *noise_m * normal(random))
         });
         self.scans.push(scan);
-        self.places.push(place);
+        self.poses.push(pose);
         self.people.push(met);
     }
 }

@@ -7,7 +7,7 @@ use fastrand::Rng;
 use scanhub_schema::{Pose, Scan, ScanHead};
 
 /// Beams, first angle and step of the five variants.
-pub(crate) const VARIANTS: [(usize, i32, u32); 5] = [
+pub(crate) const LMS_VARIANTS: [(usize, i32, u32); 5] = [
     (181, -90_000, 1000),
     (361, -90_000, 500),
     (101, -50_000, 1000),
@@ -17,7 +17,7 @@ pub(crate) const VARIANTS: [(usize, i32, u32); 5] = [
 
 /// A scan in `unit_mm` without readings yet: any variant, 13, 14 or 15 bits of range.
 pub(crate) fn layout(random: &mut Rng, unit_mm: u32) -> Box<Scan> {
-    let (count, first_angle_mdeg, step_mdeg) = VARIANTS[random.usize(..VARIANTS.len())];
+    let (count, first_angle_mdeg, step_mdeg) = LMS_VARIANTS[random.usize(..LMS_VARIANTS.len())];
     let range_bits = random.u8(13..=15);
     let head = ScanHead::lms(count, first_angle_mdeg, step_mdeg, unit_mm, range_bits);
     Scan::of(ScanHead { intensity_bits: 16 - range_bits, ..head }, &vec![0; count])

@@ -4,11 +4,11 @@
 
 use std::fmt;
 
-use scanhub_preprocess::background::{Class, Model};
+use scanhub_preprocess::background::{BackgroundModel, Class};
 use scanhub_schema::{Background, BackgroundHead, Foreground, ForegroundHead, Scan, ScanHead};
 
 /// The most beams of a scan.
-pub(crate) const BEAMS: usize = 401;
+pub(crate) const MAX_TEST_BEAMS: usize = 401;
 
 /// Angles, unit and bits of a scan.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -36,17 +36,17 @@ impl Shape {
 }
 
 /// Surroundings that are looked at scan by scan.
-pub(crate) struct Surroundings {
+pub(crate) struct RandomSurroundings {
     pub(crate) shape: Shape,
     random: fastrand::Rng,
     /// Ranges in mm of the surfaces of each beam.
     beams: Vec<Vec<f64>>,
     /// Something before them: its first beam, its beams, its range in mm.
-    body: (f64, usize, f64),
+    moving_object: (f64, usize, f64),
 }
 
-impl Surroundings {
-    pub(crate) fn new(shape: Shape, seed: u64) -> Surroundings {
+impl RandomSurroundings {
+    pub(crate) fn new(shape: Shape, seed: u64) -> RandomSurroundings {
         let mut random = fastrand::Rng::with_seed(seed);
         let mut wall_mm = 3_000.0;
         let beams = (0..shape.count)
@@ -56,26 +56,26 @@ impl Surroundings {
                 (0..surfaces).map(|n| wall_mm + 170.0 * n as f64 * random.f64()).collect()
             })
             .collect();
-        Surroundings { shape, random, beams, body: (0.0, 6, 1_500.0) }
+        RandomSurroundings { shape, random, beams, moving_object: (0.0, 6, 1_500.0) }
     }
 
     /// The next scan.
     pub(crate) fn next(&mut self) -> Box<Scan> {
-        let Surroundings { shape, random, beams, body } = self;
+        let RandomSurroundings { shape, random, beams, moving_object } = self;
         let &mut Shape { count, first_angle_mdeg, step_mdeg, unit_mm, range_bits } = shape;
         let head = ScanHead::lms(count.into(), first_angle_mdeg, step_mdeg, unit_mm.into(), range_bits);
         let mut scan = Scan::of(head, &vec![0; count.into()]);
-        body.0 = (body.0 + random.f64() - 0.3).rem_euclid(BEAMS as f64);
-        body.2 = (body.2 + 30.0 * (random.f64() - 0.5)).clamp(100.0, 3_200.0);
+        moving_object.0 = (moving_object.0 + random.f64() - 0.3).rem_euclid(MAX_TEST_BEAMS as f64);
+        moving_object.2 = (moving_object.2 + 30.0 * (random.f64() - 0.5)).clamp(100.0, 3_200.0);
         if random.u16(..200) == 0 {
-            body.1 = random.usize(..9);
+            moving_object.1 = random.usize(..9);
         }
         for (i, surfaces) in beams.iter_mut().enumerate() {
             if random.u16(..4_000) == 0 {
                 surfaces[0] = 500.0 + 4_000.0 * random.f64();
             }
-            let before = (body.0 as usize..body.0 as usize + body.1).contains(&i);
-            let range_mm = if before { body.2 } else { *random.choice(surfaces.iter()).unwrap() };
+            let before = (moving_object.0 as usize..moving_object.0 as usize + moving_object.1).contains(&i);
+            let range_mm = if before { moving_object.2 } else { *random.choice(surfaces.iter()).unwrap() };
             let noise_mm = (0..4).map(|_| random.f64() - 0.5).sum::<f64>() * 14.0;
             let max = ((1_u32 << shape.range_bits) - 1) as u16;
             scan.arrays().ranges[i] = match random.u16(..1_000) {
@@ -130,18 +130,18 @@ pub(crate) fn ranges_mm(model: &Background) -> Vec<f64> {
 /// Lets `model` look at `scan` and compares all that it says with `classes` and `generation`, in a payload that is full of
 /// `dirt` before. `place` is named where it differs.
 pub(crate) fn check_scan(
-    model: &mut Model,
+    model: &mut BackgroundModel,
     scan: &Scan,
     classes: &[Class],
     generation: u32,
     dirt: u8,
-    place: &fmt::Arguments<'_>,
+    description: &fmt::Arguments<'_>,
 ) {
     let dirty = || Foreground::of_bytes(&vec![dirt; Foreground::len(scan.beams())]);
     let mut out = dirty();
     model.update(scan, &mut out);
-    assert_eq!(model.classes(), classes, "{place}");
-    assert_eq!(out, foreground(scan, classes, generation, dirty()), "{place}");
+    assert_eq!(model.classes(), classes, "{description}");
+    assert_eq!(out, foreground(scan, classes, generation, dirty()), "{description}");
 }
 
 /// The foreground that belongs to `classes`, but for its segments, which stay as they are in `expected`.
@@ -174,7 +174,7 @@ pub(crate) fn unit_mm(unit_um: u32) -> f64 {
 }
 
 /// How far apart readings of one surface may be: as it is set, else by the unit, and never less than the unit.
-pub(crate) fn apart_at_most_mm(set_mm: Option<u16>, scan: &Scan) -> f64 {
+pub(crate) fn max_difference_mm(set_mm: Option<u16>, scan: &Scan) -> f64 {
     let default_mm = match scan.unit_um {
         1_000 => 30,
         10_000 => 60,

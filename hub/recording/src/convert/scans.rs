@@ -9,19 +9,19 @@
 
 use std::collections::BTreeMap;
 
-use scanhub_drivers::line::{Event, RawScan, Session as _, suspect};
-use scanhub_drivers::lms::measured::Measured;
+use scanhub_drivers::line::{Event, RawScan, ScannerSession as _, suspect};
+use scanhub_drivers::lms::measured::MeasuredValues;
 use scanhub_drivers::lms::reply::Reply;
 use scanhub_drivers::lms::telegram::Telegram;
 use scanhub_drivers::lms::variant::{Baud, Mode, Variant};
 use scanhub_drivers::{Session, Settings, features};
-use scanhub_schema::datagram::Packed;
+use scanhub_schema::datagram::DatagramPayload;
 use scanhub_schema::{
     Failure, Family, Flags, Header, Kind, MILLIS, Nanos, Pose, Quality, Scan, Status, Topic,
 };
 
-use crate::convert::Ended;
-use crate::convert::writers::is_made_up;
+use crate::convert::ConversionError;
+use crate::convert::writers::is_synthetic;
 use crate::mcap::Item;
 use crate::{Encoding, Form, Frame, Recording, VirtualTime};
 
@@ -53,19 +53,19 @@ struct Sensor {
 ///
 /// Returns [`Kind::Configuration`] if the measuring mode is unknown, without which values are not ranges. Otherwise returns the
 /// error of `take_item`.
-pub(super) fn each(
+pub(super) fn for_each_item(
     recording: &Recording,
     name: &str,
     encoding: Encoding,
     mode: Option<Mode>,
-    take_item: &mut impl FnMut(DecodedItem<'_>) -> Result<(), Ended>,
-) -> Result<(), Ended> {
+    take_item: &mut impl FnMut(DecodedItem<'_>) -> Result<(), ConversionError>,
+) -> Result<(), ConversionError> {
     match recording.contents().form {
-        Form::Mcap => each_of_mcap(recording, mode, take_item),
+        Form::Mcap => for_each_mcap_item(recording, mode, take_item),
         form => {
             let of_log = (form == Form::Carmen).then_some(encoding.mode);
             let contents = recording.contents();
-            let mode = contents.mode.or(of_log).or(mode).or(contents.readable());
+            let mode = contents.mode.or(of_log).or(mode).or(contents.readable_mode());
             let mut sensor =
                 Sensor { mode, is_decoded: true, revolutions: Revolutions::of(recording)?, is_first: true };
             sensor.check(recording, name)?;
@@ -76,14 +76,14 @@ pub(super) fn each(
                 let next_ns = frames.peek().and_then(|(_, next)| next.wall_ns);
                 let header = clock.header(&frame, number as u64, next_ns);
                 if let Some(revolutions) = &mut sensor.revolutions {
-                    revolutions.each(&header, &frame.telegram, |header, scan| {
+                    revolutions.for_each_revolution(&header, &frame.telegram, |header, scan| {
                         take_item(DecodedItem::Scan(name, header, scan))
                     })?;
                     continue;
                 }
                 match sensor.decode(&frame.telegram, &mut scan) {
                     true => take_item(DecodedItem::Scan(name, header, &scan))?,
-                    false if number == 0 && is_made_up(&frame.telegram, None) => {}
+                    false if number == 0 && is_synthetic(&frame.telegram, None) => {}
                     false => take_item(DecodedItem::Other)?,
                 }
             }
@@ -92,16 +92,16 @@ pub(super) fn each(
     }
 }
 
-fn each_of_mcap(
+fn for_each_mcap_item(
     recording: &Recording,
     mode: Option<Mode>,
-    take_item: &mut impl FnMut(DecodedItem<'_>) -> Result<(), Ended>,
-) -> Result<(), Ended> {
+    take_item: &mut impl FnMut(DecodedItem<'_>) -> Result<(), ConversionError>,
+) -> Result<(), ConversionError> {
     let (mut reader, catalog) = recording.reader()?;
     let mut sensors = BTreeMap::new();
     for name in &recording.contents().sensors {
         let contents = recording.of(name)?.contents().clone();
-        let mode = contents.mode.or(mode).or(contents.readable());
+        let mode = contents.mode.or(mode).or(contents.readable_mode());
         let has_scans = catalog.has_scans(name);
         let revolutions = if has_scans { None } else { Revolutions::of(&recording.of(name)?)? };
         let is_decoded = contents.scans > 0 && (mode.is_some() || !has_scans);
@@ -110,14 +110,14 @@ fn each_of_mcap(
         sensors.insert(name.clone(), sensor);
     }
     let mut scan = Box::<Scan>::default();
-    while let Some(item) = reader.next().map_err(|error| recording.broken(&error))? {
+    while let Some(item) = reader.next().map_err(|error| recording.read_failure(&error))? {
         match item {
             Item::Telegram(sample) => {
                 let Some(sensor) = sensors.get_mut(&sample.sensor) else { continue };
                 if sample.header.family != Family::Lms as u8 {
                     let Some(revolutions) = &mut sensor.revolutions else { continue };
                     let name = &sample.sensor;
-                    revolutions.each(&sample.header, &sample.telegram, |header, scan| {
+                    revolutions.for_each_revolution(&sample.header, &sample.telegram, |header, scan| {
                         take_item(DecodedItem::Scan(name, header, scan))
                     })?;
                     continue;
@@ -125,7 +125,7 @@ fn each_of_mcap(
                 let is_first = std::mem::replace(&mut sensor.is_first, false);
                 match sensor.decode(&sample.telegram, &mut scan) && sensor.is_decoded {
                     true => take_item(DecodedItem::Scan(&sample.sensor, sample.header, &scan))?,
-                    false if is_first && is_made_up(&sample.telegram, Some(&sample.header)) => {}
+                    false if is_first && is_synthetic(&sample.telegram, Some(&sample.header)) => {}
                     false => take_item(DecodedItem::Other)?,
                 }
             }
@@ -164,7 +164,7 @@ impl Sensor {
         if let Some(Reply::Configuration(configuration)) = Reply::decode(telegram) {
             self.mode = Some(configuration.mode());
         }
-        match (Measured::decode(telegram), self.mode) {
+        match (MeasuredValues::decode(telegram), self.mode) {
             (Some(measured), Some(mode)) => {
                 let raw = measured.scan(mode);
                 Scan::grow(scan, raw.payload_len());
@@ -196,17 +196,17 @@ impl Revolutions {
     }
 
     /// Takes the packets of a sample with this `header`, and calls `take_item` for each scan that they complete, with its header.
-    pub(super) fn each(
+    pub(super) fn for_each_revolution(
         &mut self,
         header: &Header,
         packets: &[u8],
-        mut take_item: impl FnMut(Header, &Scan) -> Result<(), Ended>,
-    ) -> Result<(), Ended> {
+        mut take_item: impl FnMut(Header, &Scan) -> Result<(), ConversionError>,
+    ) -> Result<(), ConversionError> {
         let Revolutions { family, settings, session, scan } = self;
         // Another run of the hub has another clock.
         if session.as_ref().is_none_or(|(boot, _)| *boot != header.boot) {
-            let begun = Session::begin(*family, settings, header.stamp_first_ns);
-            *session = Some((header.boot, VirtualTime::new(begun, header.stamp_first_ns)));
+            let new_session = Session::begin(*family, settings, header.stamp_first_ns);
+            *session = Some((header.boot, VirtualTime::new(new_session, header.stamp_first_ns)));
         }
         let Some((_, session)) = session else { return Ok(()) };
         session.session_mut().mark_suspect(header.reasons & !suspect::LINE_ERROR);
@@ -253,7 +253,7 @@ impl SyntheticClock {
         let took_ns = contents.scanner_ns.unwrap_or(contents.scans * scan_ns(variant));
         let begin_ns = match contents.span {
             Some((first_ns, _)) => first_ns,
-            None => recording.written_ns().saturating_sub(took_ns),
+            None => recording.modified_ns().saturating_sub(took_ns),
         };
         // Any number that differs between recordings.
         let boot = begin_ns.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1;
@@ -273,7 +273,7 @@ impl SyntheticClock {
     /// until the frame at `next_ns`, because logs leave scans out, and nothing newer can be known until then.
     pub(super) fn header(&mut self, frame: &Frame, number: u64, next_ns: Option<u64>) -> Header {
         let wall_ns = self.wall_ns(frame);
-        let first_ns = wall_ns.saturating_add(UPTIME_NS).saturating_sub(self.begin_ns);
+        let first_ns = wall_ns.saturating_add(START_NS).saturating_sub(self.begin_ns);
         let gap_ns = next_ns.map_or(0, |next_ns| next_ns.saturating_sub(wall_ns));
         let period_ns = scan_ns(self.variant).max(gap_ns).min(MAX_PERIOD_NS);
         Header {
@@ -323,7 +323,7 @@ pub(super) fn stream_heads(recording: &Recording) -> Result<Vec<(usize, Vec<u8>)
     let (mut heads, mut is_guess) = (Vec::new(), false);
     let mut close = |stream: Stream| {
         let session = stream.session.session();
-        let head = session.stream_head(reported, recording.beams());
+        let head = session.stream_responses(reported, recording.beams());
         if !head.is_empty() {
             // Without a model, neither a status nor the scanner has confirmed the time per point.
             is_guess |= status.is_none() && session.model_text().is_none();
@@ -333,7 +333,7 @@ pub(super) fn stream_heads(recording: &Recording) -> Result<Vec<(usize, Vec<u8>)
     let mut open: Option<Stream> = None;
     for (number, frame) in recording.telegrams(Encoding::default())?.enumerate() {
         let Some(header) = frame.header.filter(|header| header.family == family as u8) else { continue };
-        let is_reply = family.packets(&frame.telegram).is_some_and(|facts| facts.kind == REPLY);
+        let is_reply = family.packets(&frame.telegram).is_some_and(|info| info.kind == REPLY_KIND);
         if let Some(ended) = open.take_if(|stream| !stream.continues_with(&header, is_reply)) {
             close(ended);
         }
@@ -372,13 +372,13 @@ impl Stream {
     /// Creates the stream that begins with the frame `number`, which has this `header`. The mode in `settings` is that of the
     /// recording's first status. It is not used for a scanner that reports its modes.
     fn begin(family: Family, settings: Settings, number: usize, header: &Header, is_reply: bool) -> Stream {
-        let (begun, mode) = (header.stamp_first_ns, settings.mode.filter(|_| !is_reply));
-        let session = Session::begin(family, &Settings { mode, ..settings }, begun);
+        let (start, mode) = (header.stamp_first_ns, settings.mode.filter(|_| !is_reply));
+        let session = Session::begin(family, &Settings { mode, ..settings }, start);
         Stream {
             boot: header.boot,
             at: number,
             packets_since: None,
-            session: VirtualTime::new(session, begun),
+            session: VirtualTime::new(session, start),
         }
     }
 
@@ -394,7 +394,7 @@ impl Stream {
             self.at = number;
         } else {
             let since = *self.packets_since.get_or_insert(header.stamp_first_ns);
-            if header.stamp_first_ns >= since.saturating_add(MEASURED_TIME) {
+            if header.stamp_first_ns >= since.saturating_add(MEASURING_TIME) {
                 return;
             }
         }
@@ -407,8 +407,8 @@ impl Stream {
 /// Maximum period, which fits into a header.
 const MAX_PERIOD_NS: u64 = 3_600_000_000_000;
 /// Monotonic clock at the first telegram, as on a machine that has just started.
-const UPTIME_NS: u64 = 10_000_000_000;
+const START_NS: u64 = 10_000_000_000;
 /// Kind of a telegram that is a response.
-const REPLY: &str = "reply";
+const REPLY_KIND: &str = "reply";
 /// Time for which the packets of a stream are measured.
-const MEASURED_TIME: Nanos = 4_000 * MILLIS;
+const MEASURING_TIME: Nanos = 4_000 * MILLIS;

@@ -6,19 +6,22 @@ use std::io::{self, Write};
 
 use mcap::records::{Record as Parsed, op};
 use scanhub_drivers::lms::variant::Baud;
-use scanhub_ros::bag::{self, Bag};
+use scanhub_ros::bag::{self, BagWriter};
 use scanhub_schema::csv::{MarkColumns, ScanColumns};
-use scanhub_schema::datagram::Packed;
+use scanhub_schema::datagram::DatagramPayload;
 use scanhub_schema::file::{METADATA, Writer};
 use scanhub_schema::{Failure, Flags, Header, Kind, Marks, Topic};
 
 use super::scans::{self, DecodedItem, SyntheticClock, stream_heads};
-use super::{Conversion, Ended, Packing, Written, form_name};
+use super::{Conversion, ConversionError, OutputEncoder, WrittenItem, form_name};
 use crate::mcap::{Catalog, Item, Record, Sample};
 use crate::{Encoding, Form, Frame, Recording, carmen};
 
 /// Writes a stream of telegrams.
-pub(super) fn write_stream(conversion: &mut Conversion, mut out: Packing<impl Write>) -> Result<(), Ended> {
+pub(super) fn write_stream(
+    conversion: &mut Conversion,
+    mut out: OutputEncoder<impl Write>,
+) -> Result<(), ConversionError> {
     let recording = conversion.recording;
     let mut heads = stream_heads(recording)?.into_iter().peekable();
     for (number, frame) in frames(recording, conversion.encoding)?.enumerate() {
@@ -26,14 +29,17 @@ pub(super) fn write_stream(conversion: &mut Conversion, mut out: Packing<impl Wr
         out.write_all(&head)?;
         out.write_all(&frame.telegram)?;
         let form = recording.contents().form;
-        conversion.count(Written::of_frame(form, number, &frame), frame.wall_ns)?;
+        conversion.count(WrittenItem::of_frame(form, number, &frame), frame.wall_ns)?;
     }
     out.finish()?;
     Ok(())
 }
 
 /// Writes a CARMEN log.
-pub(super) fn write_log(conversion: &mut Conversion, mut out: Packing<impl Write>) -> Result<(), Ended> {
+pub(super) fn write_log(
+    conversion: &mut Conversion,
+    mut out: OutputEncoder<impl Write>,
+) -> Result<(), ConversionError> {
     let (recording, encoding) = (conversion.recording, conversion.encoding);
     let mut clock = SyntheticClock::of(recording);
     let first_line = carmen::encoding_line(encoding);
@@ -42,34 +48,35 @@ pub(super) fn write_log(conversion: &mut Conversion, mut out: Packing<impl Write
     for (number, frame) in recording.telegrams(encoding)?.enumerate() {
         let at_ns = clock.wall_ns(&frame);
         // The first line has the encoding.
-        if number == 0 && is_made_up(&frame.telegram, frame.header.as_ref()) {
+        if number == 0 && is_synthetic(&frame.telegram, frame.header.as_ref()) {
             continue;
         }
         let line = carmen::scan_line(&frame.telegram, encoding.mode, at_ns, *first_ns.get_or_insert(at_ns));
         out.write_all(line.as_deref().unwrap_or_default().as_bytes())?;
-        conversion.count(if line.is_some() { Written::Scan } else { Written::LeftOut }, Some(at_ns))?;
+        conversion
+            .count(if line.is_some() { WrittenItem::Scan } else { WrittenItem::Dropped }, Some(at_ns))?;
     }
     out.finish()?;
     Ok(())
 }
 
 /// Writes telegrams that have no header into an MCAP file.
-pub(super) fn write_mcap(conversion: &mut Conversion, file: &mut impl Write) -> Result<(), Ended> {
+pub(super) fn write_mcap(conversion: &mut Conversion, file: &mut impl Write) -> Result<(), ConversionError> {
     let (recording, sensor) = (conversion.recording, conversion.sensor);
     conversion.converted.sensors = vec![sensor.to_owned()];
     let form = recording.contents().form;
-    let facts = [("converted from".to_owned(), form_name(form).to_owned())];
+    let metadata = [("converted from".to_owned(), form_name(form).to_owned())];
     let compression = conversion.options.compression.unwrap_or_default();
-    let mut writer = Writer::packed(file, "", compression, facts.into())?;
+    let mut writer = Writer::begin_compressed(file, "", compression, metadata.into())?;
     let mut clock = SyntheticClock::of(recording);
     let mut bytes = 0;
     let mut frames = frames(recording, conversion.encoding)?.enumerate().peekable();
     while let Some((number, frame)) = frames.next() {
         let next_ns = frames.peek().and_then(|(_, next)| next.wall_ns);
         let header = clock.header(&frame, number as u64, next_ns);
-        writer.sample(sensor, Topic::Telegram, &header, &frame.telegram)?;
+        writer.write_sample(sensor, Topic::Telegram, &header, &frame.telegram)?;
         close_chunk(&mut writer, &mut bytes, frame.telegram.len())?;
-        conversion.count(Written::of_frame(form, number, &frame), Some(header.wall_ns))?;
+        conversion.count(WrittenItem::of_frame(form, number, &frame), Some(header.wall_ns))?;
     }
     writer.finish()?;
     Ok(())
@@ -78,7 +85,7 @@ pub(super) fn write_mcap(conversion: &mut Conversion, file: &mut impl Write) -> 
 /// Adds `len` to the `bytes` in the open chunk of `writer`, and ends the chunk if it is large enough.
 fn close_chunk<W: Write>(writer: &mut Writer<W>, bytes: &mut usize, len: usize) -> io::Result<()> {
     *bytes += len;
-    if *bytes >= CHUNK {
+    if *bytes >= CHUNK_LEN {
         *bytes = 0;
         writer.close_chunk()?;
     }
@@ -99,32 +106,33 @@ fn frames(recording: &Recording, encoding: Encoding) -> Result<impl Iterator<Ite
 
 /// Returns whether `telegram`, the first one of a sensor, is the reply that [`frames`] adds to a log. No scanner sent it, so
 /// nothing is lost without it.
-pub(super) fn is_made_up(telegram: &[u8], header: Option<&Header>) -> bool {
+pub(super) fn is_synthetic(telegram: &[u8], header: Option<&Header>) -> bool {
     let is_estimated = header.is_none_or(|header| header.flags & Flags::STAMP_ESTIMATED != 0);
-    is_estimated && carmen::is_made_up(telegram)
+    is_estimated && carmen::is_synthetic(telegram)
 }
 
 /// Copies an MCAP file: every message that can be read, of all channels including those of other programs, and a new index.
-pub(super) fn copy(conversion: &mut Conversion, file: &mut impl Write) -> Result<(), Ended> {
+pub(super) fn copy(conversion: &mut Conversion, file: &mut impl Write) -> Result<(), ConversionError> {
     let recording = conversion.recording;
     let (mut reader, catalog) = recording.reader()?;
-    let sensor = recording.chosen();
+    let sensor = recording.selected_sensor();
     let compression = conversion.options.compression.unwrap_or_default();
-    let writer = Writer::packed(file, &catalog.profile, compression, catalog.facts.clone())?;
-    let mut copy = Copy { writer, catalog, channels: BTreeMap::new(), has_facts: false, bytes: 0 };
-    while let Some(item) = reader.next().map_err(|error| recording.broken(&error))? {
+    let writer = Writer::begin_compressed(file, &catalog.profile, compression, catalog.metadata.clone())?;
+    let mut copy = Copy { writer, catalog, channels: BTreeMap::new(), has_metadata: false, bytes: 0 };
+    while let Some(item) = reader.next().map_err(|error| recording.read_failure(&error))? {
         match item {
             Item::Telegram(sample) if sensor.is_none_or(|sensor| *sensor == sample.sensor) => {
                 let Sample { sensor, header, telegram } = &sample;
-                copy.writer.sample(sensor, Topic::Telegram, header, telegram)?;
+                copy.writer.write_sample(sensor, Topic::Telegram, header, telegram)?;
                 close_chunk(&mut copy.writer, &mut copy.bytes, telegram.len())?;
                 let is_scan = crate::is_scan(header.family, telegram);
-                conversion.count(Written::of(is_scan), Some(header.wall_ns))?;
+                conversion.count(WrittenItem::of(is_scan), Some(header.wall_ns))?;
             }
             Item::Telegram(_) => {}
             Item::Record(record) => {
-                let channel =
-                    record.message().and_then(|(message, _)| catalog.place(message.channel_id).flatten());
+                let channel = record
+                    .message()
+                    .and_then(|(message, _)| catalog.channel_topic(message.channel_id).flatten());
                 let is_chosen =
                     sensor.is_none_or(|sensor| channel.is_some_and(|channel| channel.sensor == *sensor));
                 if is_chosen || record.opcode != op::MESSAGE {
@@ -143,7 +151,7 @@ struct Copy<'a, W: Write> {
     /// Channel numbers in the new file, by those in the old file.
     channels: BTreeMap<u16, u16>,
     /// Whether the facts of the old file were read. The new file begins with them.
-    has_facts: bool,
+    has_metadata: bool,
     /// Bytes in the open chunk.
     bytes: usize,
 }
@@ -153,13 +161,15 @@ impl<W: Write> Copy<'_, W> {
         match record.opcode {
             op::MESSAGE => self.message(record),
             op::METADATA | op::ATTACHMENT => match record.parse() {
-                Some(Parsed::Metadata(metadata)) if metadata.name == METADATA && !self.has_facts => {
-                    self.has_facts = true;
+                Some(Parsed::Metadata(metadata)) if metadata.name == METADATA && !self.has_metadata => {
+                    self.has_metadata = true;
                     Ok(())
                 }
-                Some(Parsed::Metadata(metadata)) => self.writer.note(&metadata.name, metadata.metadata),
+                Some(Parsed::Metadata(metadata)) => {
+                    self.writer.write_metadata(&metadata.name, metadata.metadata)
+                }
                 Some(Parsed::Attachment { header, data, .. }) => {
-                    self.writer.copied_attachment(&mcap::Attachment {
+                    self.writer.copy_attachment(&mcap::Attachment {
                         log_time: header.log_time,
                         create_time: header.create_time,
                         name: header.name,
@@ -181,12 +191,12 @@ impl<W: Write> Copy<'_, W> {
             None => {
                 let Some((channel, schema)) = self.catalog.channel(head.channel_id) else { return Ok(()) };
                 let schema = schema.map(|(name, language, text)| (&name[..], &language[..], &text[..]));
-                let id = self.writer.copied_channel(channel, schema)?;
+                let id = self.writer.copy_channel(channel, schema)?;
                 self.channels.insert(head.channel_id, id);
                 id
             }
         };
-        self.writer.copied_message(&head, data)?;
+        self.writer.copy_message(&head, data)?;
         close_chunk(&mut self.writer, &mut self.bytes, data.len())
     }
 }
@@ -194,7 +204,7 @@ impl<W: Write> Copy<'_, W> {
 /// A writer of a format that holds decoded scans.
 pub(super) trait ScanSink {
     /// Writes `item`, and returns how. Returns `None` if it was not a telegram.
-    fn write(&mut self, item: &DecodedItem<'_>) -> io::Result<Option<Written>>;
+    fn write(&mut self, item: &DecodedItem<'_>) -> io::Result<Option<WrittenItem>>;
 
     /// Returns whether intensities were requested, and no scan had any.
     fn lacks_intensities(&self) -> bool {
@@ -206,11 +216,14 @@ pub(super) trait ScanSink {
 }
 
 /// Writes the scans into `sink`.
-pub(super) fn write_scans(conversion: &mut Conversion, mut sink: impl ScanSink) -> Result<(), Ended> {
+pub(super) fn write_scans(
+    conversion: &mut Conversion,
+    mut sink: impl ScanSink,
+) -> Result<(), ConversionError> {
     let recording = conversion.recording;
     let (sensor, encoding, mode) = (conversion.sensor, conversion.encoding, conversion.options.mode);
     let mut is_empty = true;
-    scans::each(recording, sensor, encoding, mode, &mut |item| {
+    scans::for_each_item(recording, sensor, encoding, mode, &mut |item| {
         let Some(written) = sink.write(&item)? else { return Ok(()) };
         let DecodedItem::Scan(_, header, _) = item else { return conversion.count(written, None) };
         is_empty = false;
@@ -233,7 +246,7 @@ pub(super) fn write_scans(conversion: &mut Conversion, mut sink: impl ScanSink) 
 /// An MCAP file with only messages of ROS 2.
 pub(super) struct Ros2<W: Write> {
     writer: Writer<W>,
-    bag: Bag,
+    bag: BagWriter,
     /// Whether each scan is also written as points.
     has_points: bool,
     /// Bytes of scans in the open chunk, approximately.
@@ -243,11 +256,11 @@ pub(super) struct Ros2<W: Write> {
 impl<W: Write> Ros2<W> {
     pub(super) fn begin(conversion: &Conversion, file: W) -> io::Result<Self> {
         let from = form_name(conversion.recording.contents().form);
-        let facts = [("converted from".to_owned(), from.to_owned())];
+        let metadata = [("converted from".to_owned(), from.to_owned())];
         let compression = conversion.options.compression.unwrap_or_default();
         Ok(Ros2 {
-            writer: Writer::packed(file, bag::PROFILE, compression, facts.into())?,
-            bag: Bag::default(),
+            writer: Writer::begin_compressed(file, bag::PROFILE, compression, metadata.into())?,
+            bag: BagWriter::default(),
             has_points: conversion.options.points,
             chunk_len: 0,
         })
@@ -255,23 +268,23 @@ impl<W: Write> Ros2<W> {
 }
 
 impl<W: Write> ScanSink for Ros2<W> {
-    fn write(&mut self, item: &DecodedItem<'_>) -> io::Result<Option<Written>> {
+    fn write(&mut self, item: &DecodedItem<'_>) -> io::Result<Option<WrittenItem>> {
         match item {
             DecodedItem::Scan(sensor, header, scan) => {
-                self.bag.scan(&mut self.writer, sensor, header, scan)?;
+                self.bag.write_scan(&mut self.writer, sensor, header, scan)?;
                 let mut len = scan.beams() * size_of::<f32>();
                 if self.has_points {
-                    self.bag.points(&mut self.writer, sensor, header, scan)?;
+                    self.bag.write_points(&mut self.writer, sensor, header, scan)?;
                     len += scan.beams() * size_of::<[f32; 4]>();
                 }
                 close_chunk(&mut self.writer, &mut self.chunk_len, len)?;
-                Ok(Some(Written::Scan))
+                Ok(Some(WrittenItem::Scan))
             }
             DecodedItem::Pose(sensor, wall_ns, pose) => {
-                self.bag.pose(&mut self.writer, sensor, *wall_ns, pose)?;
+                self.bag.write_pose(&mut self.writer, sensor, *wall_ns, pose)?;
                 Ok(None)
             }
-            DecodedItem::Other => Ok(Some(Written::LeftOut)),
+            DecodedItem::Other => Ok(Some(WrittenItem::Dropped)),
         }
     }
 
@@ -282,7 +295,7 @@ impl<W: Write> ScanSink for Ros2<W> {
 
 /// A row for each scan, after the names of the columns. The names are repeated if the number of beams changes.
 pub(super) struct Csv<W: Write> {
-    out: Packing<W>,
+    out: OutputEncoder<W>,
     columns: ScanColumns,
     /// Number of beams in the last line of column names.
     beams: Option<usize>,
@@ -291,27 +304,27 @@ pub(super) struct Csv<W: Write> {
 }
 
 impl<W: Write> Csv<W> {
-    pub(super) fn begin(out: Packing<W>, columns: ScanColumns) -> Self {
+    pub(super) fn begin(out: OutputEncoder<W>, columns: ScanColumns) -> Self {
         Csv { out, columns, beams: None, has_intensities: false, line: Vec::new() }
     }
 }
 
 impl<W: Write> ScanSink for Csv<W> {
-    fn write(&mut self, item: &DecodedItem<'_>) -> io::Result<Option<Written>> {
+    fn write(&mut self, item: &DecodedItem<'_>) -> io::Result<Option<WrittenItem>> {
         let DecodedItem::Scan(_, header, scan) = item else {
-            return Ok(matches!(item, DecodedItem::Other).then_some(Written::LeftOut));
+            return Ok(matches!(item, DecodedItem::Other).then_some(WrittenItem::Dropped));
         };
         self.line.clear();
         if self.beams != Some(scan.beams()) {
             self.beams = Some(scan.beams());
-            self.columns.names(&mut self.line, scan.beams())?;
+            self.columns.write_header(&mut self.line, scan.beams())?;
             self.line.push(b'\n');
         }
         self.has_intensities |= !scan.intensities().is_empty();
-        self.columns.row(&mut self.line, header, scan)?;
+        self.columns.write_row(&mut self.line, header, scan)?;
         self.line.push(b'\n');
         self.out.write_all(&self.line)?;
-        Ok(Some(Written::Scan))
+        Ok(Some(WrittenItem::Scan))
     }
 
     fn lacks_intensities(&self) -> bool {
@@ -331,30 +344,30 @@ impl<W: Write> ScanSink for Csv<W> {
 pub(super) fn write_marks(
     conversion: &mut Conversion,
     columns: MarkColumns,
-    mut out: Packing<impl Write>,
-) -> Result<(), Ended> {
+    mut out: OutputEncoder<impl Write>,
+) -> Result<(), ConversionError> {
     let recording = conversion.recording;
     let mut lines = Vec::new();
-    columns.names(&mut lines)?;
-    let (mut samples, mut written) = (0, 0);
+    columns.write_header(&mut lines)?;
+    let (mut samples, mut mark_count) = (0, 0);
     if recording.contents().form == Form::Mcap {
         let (mut reader, catalog) = recording.reader()?;
-        while let Some(item) = reader.next().map_err(|error| recording.broken(&error))? {
+        while let Some(item) = reader.next().map_err(|error| recording.read_failure(&error))? {
             let Item::Record(record) = item else { continue };
             let Some((channel, header, payload)) = catalog.message(&record) else { continue };
             let mut marks = Marks::default();
             if channel.topic != Topic::Marks
-                || recording.chosen() != Some(&channel.sensor)
+                || recording.selected_sensor() != Some(&channel.sensor)
                 || !marks.unpack(payload)
             {
                 continue;
             }
-            columns.rows(&mut lines, &header, &marks)?;
+            columns.write_rows(&mut lines, &header, &marks)?;
             out.write_all(&lines)?;
             lines.clear();
             samples += 1;
-            written += marks.marks().len() as u64;
-            conversion.count(Written::Marks, Some(header.wall_ns))?;
+            mark_count += marks.marks().len() as u64;
+            conversion.count(WrittenItem::Marks, Some(header.wall_ns))?;
         }
     }
     if samples == 0 {
@@ -365,10 +378,10 @@ pub(super) fn write_marks(
         );
         return Err(Failure::new(Kind::NoTopic, message, hint).into());
     }
-    conversion.converted.marks = Some(written);
+    conversion.converted.marks = Some(mark_count);
     out.finish()?;
     Ok(())
 }
 
 /// Bytes of telegrams after which a chunk ends.
-const CHUNK: usize = 256 * 1024;
+const CHUNK_LEN: usize = 256 * 1024;

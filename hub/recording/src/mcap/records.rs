@@ -24,7 +24,7 @@ use mcap::{MAGIC, McapError, parse_record};
 
 use super::split_sample;
 use crate::Damage;
-use crate::open::is_end;
+use crate::open::is_truncation;
 
 /// A record: its kind ([`mcap::records::op`]), and its bytes after opcode and length.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -105,7 +105,7 @@ impl<R: Read> Records<R> {
     ///
     /// # Errors
     ///
-    /// Returns the error of the input. Returns `FileTooLarge` at an intact chunk that is longer than [`MAX_LEN`], compressed
+    /// Returns the error of the input. Returns `FileTooLarge` at an intact chunk that is longer than [`MAX_RECORD_LEN`], compressed
     /// or not, and `Unsupported` at a chunk whose compression this build lacks.
     pub(crate) fn next(&mut self) -> io::Result<Option<Record>> {
         loop {
@@ -134,7 +134,7 @@ impl<R: Read> Records<R> {
 
     /// Reads the next record outside chunks; `None` if it was a chunk, or cannot be used.
     fn read_record(&mut self) -> io::Result<Option<Record>> {
-        let head = self.read(HEAD)?;
+        let head = self.read(HEAD_LEN)?;
         let Some((opcode, length)) = split_head(&head) else {
             self.end_in_record(head.len() as u64);
             return Ok(None);
@@ -145,11 +145,11 @@ impl<R: Read> Records<R> {
         if opcode == op::CHUNK {
             return self.read_chunk(head, length);
         }
-        if length > MAX_LEN {
+        if length > MAX_RECORD_LEN {
             return self.skip_long(&head, length).map(|()| None);
         }
         let body = self.read(length as usize)?;
-        let len = HEAD as u64 + body.len() as u64;
+        let len = HEAD_LEN as u64 + body.len() as u64;
         if (body.len() as u64) < length {
             return self.end_or_resynchronize(head, body);
         }
@@ -157,7 +157,7 @@ impl<R: Read> Records<R> {
         let is_no_footer = opcode == op::FOOTER && length != FOOTER_LEN;
         let is_no_end = opcode == op::DATA_END && length != DATA_END_LEN;
         let is_chunk = is_chunk(&body, length);
-        if is_chunk || is_no_footer || is_no_end || RESERVED.contains(&opcode) {
+        if is_chunk || is_no_footer || is_no_end || RESERVED_OPCODES.contains(&opcode) {
             self.damage.chunks += u64::from(is_chunk);
             self.skip(len);
             return Ok(None);
@@ -169,8 +169,8 @@ impl<R: Read> Records<R> {
             }
             op::FOOTER => {
                 self.section.update(&head);
-                self.section.update(body.get(..FOOTER_CRC).unwrap_or_default());
-                self.check_section(body.get(FOOTER_CRC..).and_then(<[u8]>::first_chunk));
+                self.section.update(body.get(..FOOTER_CRC_OFFSET).unwrap_or_default());
+                self.check_section(body.get(FOOTER_CRC_OFFSET..).and_then(<[u8]>::first_chunk));
                 self.end_file()?;
             }
             _ => {
@@ -193,20 +193,20 @@ impl<R: Read> Records<R> {
 
     /// Reads the body of a chunk, and opens the chunk if it can be used.
     fn read_chunk(&mut self, head: Vec<u8>, length: u64) -> io::Result<Option<Record>> {
-        let mut body = self.read(HEAD_OF_CHUNK.min(length as usize))?;
+        let mut body = self.read(CHUNK_HEAD_LEN.min(length as usize))?;
         if !is_chunk(&body, length) {
-            let is_end = (body.len() as u64) < length && body.len() < HEAD_OF_CHUNK;
+            let is_end = (body.len() as u64) < length && body.len() < CHUNK_HEAD_LEN;
             return if is_end {
                 self.end_or_resynchronize(head, body)
             } else {
                 self.resynchronize([head, body].concat())
             };
         }
-        if length > MAX_LEN {
+        if length > MAX_RECORD_LEN {
             return Err(too_long(length));
         }
         body.append(&mut self.read(length as usize - body.len())?);
-        let len = HEAD as u64 + body.len() as u64;
+        let len = HEAD_LEN as u64 + body.len() as u64;
         if (body.len() as u64) < length {
             return self.end_or_resynchronize(head, body);
         }
@@ -219,7 +219,7 @@ impl<R: Read> Records<R> {
         match Chunk::open(body) {
             Ok(_) if is_dated && !self.is_new(hasher.finish()) => {
                 self.damage.repeats += 1;
-                self.damage.is_harmed = true;
+                self.damage.is_damaged = true;
             }
             Ok(chunk) => self.chunk = chunk,
             Err(McapError::UnsupportedCompression(name)) if matches!(&name[..], "lz4" | "zstd") => {
@@ -243,23 +243,23 @@ impl<R: Read> Records<R> {
 
     /// Counts `record`, which was read outside chunks, as damaged.
     pub(crate) fn reject(&mut self, record: &Record) {
-        self.skip((HEAD + record.body.len()) as u64);
+        self.skip((HEAD_LEN + record.body.len()) as u64);
     }
 
     /// Passes over a record that is too long to be held in memory.
     fn skip_long(&mut self, head: &[u8], length: u64) -> io::Result<()> {
         self.damage.bytes += head.len() as u64;
         self.section.update(head);
-        let mut left = length;
-        while left > 0 {
-            let piece = self.read(left.min(PIECE) as usize)?;
+        let mut remaining = length;
+        while remaining > 0 {
+            let piece = self.read(remaining.min(READ_LEN) as usize)?;
             if piece.is_empty() {
                 self.end_in_record(0);
                 break;
             }
             self.section.update(&piece);
             self.damage.bytes += piece.len() as u64;
-            left -= piece.len() as u64;
+            remaining -= piece.len() as u64;
         }
         Ok(())
     }
@@ -270,14 +270,14 @@ impl<R: Read> Records<R> {
         self.resyncs += 1;
         let mut from = 1;
         while self.resyncs <= MAX_RESYNCS {
-            let missing = (from + PIECE as usize).saturating_sub(window.len());
+            let missing = (from + READ_LEN as usize).saturating_sub(window.len());
             let is_end = missing > 0 && {
                 let more = self.read(missing)?;
                 window.extend_from_slice(&more);
                 more.len() < missing
             };
-            let end = if is_end { window.len() } else { window.len() - HEAD - HEAD_OF_CHUNK };
-            if let Some(at) = (from..end).find(|&at| is_border(&window[at..], self.has_messages)) {
+            let end = if is_end { window.len() } else { window.len() - HEAD_LEN - CHUNK_HEAD_LEN };
+            if let Some(at) = (from..end).find(|&at| is_record_boundary(&window[at..], self.has_messages)) {
                 self.skip(at as u64);
                 window.drain(..at);
                 self.unread.read_to_end(&mut window)?;
@@ -327,8 +327,8 @@ impl<R: Read> Records<R> {
         self.damage.bytes += len;
         // A whole file in which a wrong length leads beyond the end was not cut.
         let is_whole = self.tail == MAGIC;
-        self.damage.is_cut |= !is_whole;
-        self.damage.is_harmed |= is_whole;
+        self.damage.is_truncated |= !is_whole;
+        self.damage.is_damaged |= is_whole;
     }
 
     /// Ends reading because the structure is lost. The last `len` bytes that were read cannot be used.
@@ -336,27 +336,27 @@ impl<R: Read> Records<R> {
         self.is_ended = true;
         let rest = self.discard()?;
         self.skip(len as u64 + rest);
-        self.damage.is_cut |= self.tail != MAGIC;
+        self.damage.is_truncated |= self.tail != MAGIC;
         Ok(())
     }
 
     /// Counts `len` bytes that are not used because they are damaged.
     fn skip(&mut self, len: u64) {
         self.damage.bytes += len;
-        self.damage.is_harmed = true;
+        self.damage.is_damaged = true;
     }
 
     /// Compares the checksum of the section with `saved`; 0 means that the writer did not compute it.
     fn check_section(&mut self, saved: Option<&[u8; 4]>) {
         let saved = saved.map_or(0, |saved| u32::from_le_bytes(*saved));
-        self.damage.is_harmed |= saved != 0 && saved != self.section.sum();
+        self.damage.is_damaged |= saved != 0 && saved != self.section.sum();
     }
 
     /// Reads the rest of the file, and returns its length.
     fn discard(&mut self) -> io::Result<u64> {
         let mut len = 0;
         loop {
-            match self.read(PIECE as usize)?.len() as u64 {
+            match self.read(READ_LEN as usize)?.len() as u64 {
                 0 => return Ok(len),
                 read => len += read,
             }
@@ -366,10 +366,10 @@ impl<R: Read> Records<R> {
     /// Reads `len` bytes; fewer only at the end of the file. A gzip file ends where it is cut or damaged.
     fn read(&mut self, len: usize) -> io::Result<Vec<u8>> {
         // A length may be wrong: memory is allocated for bytes that exist.
-        let mut bytes = Vec::with_capacity(len.min(PIECE as usize));
+        let mut bytes = Vec::with_capacity(len.min(READ_LEN as usize));
         let begin = self.unread.by_ref().take(len as u64).read_to_end(&mut bytes)?;
         match self.input.by_ref().take((len - begin) as u64).read_to_end(&mut bytes) {
-            Err(error) if !is_end(&error) => return Err(error),
+            Err(error) if !is_truncation(&error) => return Err(error),
             _ => {}
         }
         self.tail.extend_from_slice(&bytes[begin.max(bytes.len().saturating_sub(MAGIC.len()))..]);
@@ -392,12 +392,12 @@ impl Chunk {
     /// # Errors
     ///
     /// Returns an error if the checksum is wrong, if its records do not fill it, or if it cannot be unpacked. Returns
-    /// [`McapError::ChunkTooLarge`] if it is intact, but unpacks to more than [`MAX_LEN`].
+    /// [`McapError::ChunkTooLarge`] if it is intact, but unpacks to more than [`MAX_RECORD_LEN`].
     fn open(body: Vec<u8>) -> Result<Chunk, McapError> {
         let Parsed::Chunk { header, data } = parse_record(op::CHUNK, &body)? else {
             return Err(McapError::UnexpectedEoc);
         };
-        if header.uncompressed_size > MAX_LEN {
+        if header.uncompressed_size > MAX_RECORD_LEN {
             // Its length may be damaged. Only an intact chunk shows that the file has longer chunks than can be read.
             return Err(match unpacked_length(&body, header.uncompressed_size) {
                 Ok(len) if len == header.uncompressed_size => McapError::ChunkTooLarge(len),
@@ -436,7 +436,7 @@ impl Iterator for Chunk {
             return None;
         };
         self.at += record.len();
-        Some(Record { opcode: record[0], body: record[HEAD..].to_vec(), is_in_chunk: true })
+        Some(Record { opcode: record[0], body: record[HEAD_LEN..].to_vec(), is_in_chunk: true })
     }
 }
 
@@ -458,10 +458,10 @@ fn unpack(body: &[u8]) -> Result<Vec<u8>, McapError> {
 
 /// Returns the length of the records of a compressed chunk that may be too long to be held in memory. Stops when it is
 /// longer than `most`, or than any chunk that a recorder writes.
-fn unpacked_length(body: &[u8], most: u64) -> Result<u64, McapError> {
-    let (mut len, most) = (0, most.min(MAX_WRITTEN_CHUNK));
+fn unpacked_length(body: &[u8], max_len: u64) -> Result<u64, McapError> {
+    let (mut len, most) = (0, max_len.min(MAX_CHUNK_LEN));
     for_each_record(body, LinearReaderOptions::default().with_validate_chunk_crcs(true), |_, data| {
-        len += (HEAD + data.len()) as u64;
+        len += (HEAD_LEN + data.len()) as u64;
         len <= most
     })?;
     Ok(len)
@@ -476,7 +476,7 @@ fn for_each_record(
     let options = options
         .with_skip_start_magic(true)
         .with_skip_end_magic(true)
-        .with_record_length_limit(MAX_LEN as usize);
+        .with_record_length_limit(MAX_RECORD_LEN as usize);
     let mut reader = LinearReader::new_with_options(options);
     let chunk = [&[op::CHUNK][..], &(body.len() as u64).to_le_bytes(), body].concat();
     let mut input = &chunk[..];
@@ -500,18 +500,18 @@ fn for_each_record(
 
 /// Returns the error of a chunk of `len` bytes, which is too long.
 fn too_long(len: u64) -> io::Error {
-    let (megabytes, most) = (len >> 20, MAX_LEN >> 20);
-    let what = format!("it has a chunk of {megabytes} MB; at most {most} MB are read at a time");
+    let (megabytes, max_megabytes) = (len >> 20, MAX_RECORD_LEN >> 20);
+    let what = format!("it has a chunk of {megabytes} MB; at most {max_megabytes} MB are read at a time");
     io::Error::new(io::ErrorKind::FileTooLarge, what)
 }
 
 /// Returns whether `bytes` start with a chunk whose lengths agree, or with a message of the hub, if `messages` count. Neither
 /// occurs by chance: both have lengths or times twice.
-fn is_border(bytes: &[u8], messages: bool) -> bool {
+fn is_record_boundary(bytes: &[u8], messages: bool) -> bool {
     let Some((opcode, length)) = split_head(bytes) else { return false };
     match opcode {
-        _ if length > MAX_LEN => false,
-        op::CHUNK => is_chunk(&bytes[HEAD..], length),
+        _ if length > MAX_RECORD_LEN => false,
+        op::CHUNK => is_chunk(&bytes[HEAD_LEN..], length),
         op::MESSAGE => messages && is_message_of_hub(bytes),
         _ => false,
     }
@@ -519,19 +519,19 @@ fn is_border(bytes: &[u8], messages: bool) -> bool {
 
 /// Returns whether a chunk with messages or a message of the hub starts anywhere in `bytes`. Packets of a scanner that sees
 /// nothing are zeros, and with the range before them they may look like an empty chunk.
-pub(crate) fn has_border(bytes: &[u8]) -> bool {
+pub(crate) fn has_record_boundary(bytes: &[u8]) -> bool {
     let is_dated = |bytes: &[u8]| match split_head(bytes) {
-        Some((op::CHUNK, _)) => bytes[HEAD..].iter().take(8).any(|byte| *byte != 0),
+        Some((op::CHUNK, _)) => bytes[HEAD_LEN..].iter().take(8).any(|byte| *byte != 0),
         _ => true,
     };
-    (0..bytes.len()).any(|at| is_border(&bytes[at..], true) && is_dated(&bytes[at..]))
+    (0..bytes.len()).any(|at| is_record_boundary(&bytes[at..], true) && is_dated(&bytes[at..]))
 }
 
 /// Returns whether `bytes` start with a message of the hub, whole or not.
 fn is_message_of_hub(bytes: &[u8]) -> bool {
     let Some((op::MESSAGE, length)) = split_head(bytes) else { return false };
-    let end = bytes.len().min(HEAD.saturating_add(length as usize)).min(HEAD + HEAD_OF_MESSAGE);
-    match parse_record(op::MESSAGE, &bytes[HEAD..end]) {
+    let end = bytes.len().min(HEAD_LEN.saturating_add(length as usize)).min(HEAD_LEN + MESSAGE_HEAD_LEN);
+    match parse_record(op::MESSAGE, &bytes[HEAD_LEN..end]) {
         Ok(Parsed::Message { header, data }) => {
             header.log_time != 0 && split_sample(&header, &data).is_some()
         }
@@ -543,7 +543,7 @@ fn is_message_of_hub(bytes: &[u8]) -> bool {
 fn is_chunk(body: &[u8], length: u64) -> bool {
     let is_known = |name: &[u8]| matches!(name, b"" | b"lz4" | b"zstd");
     let compression = || {
-        let (len, rest) = body.get(COMPRESSION..)?.split_first_chunk()?;
+        let (len, rest) = body.get(COMPRESSION_OFFSET..)?.split_first_chunk()?;
         rest.get(..u32::from_le_bytes(*len) as usize)
     };
     chunk_length(body) == Some(length) && compression().is_some_and(is_known)
@@ -560,29 +560,29 @@ fn max_possible_len(opcode: u8) -> u64 {
         | op::STATISTICS
         | op::METADATA_INDEX
         | op::SUMMARY_OFFSET
-        | op::DATA_END => MAX_LEN,
+        | op::DATA_END => MAX_RECORD_LEN,
         _ => MAX_FILE_LEN,
     }
 }
 
 /// Returns opcode and length of the body of the record that starts with `bytes`.
 fn split_head(bytes: &[u8]) -> Option<(u8, u64)> {
-    let (head, _) = bytes.split_first_chunk::<HEAD>()?;
+    let (head, _) = bytes.split_first_chunk::<HEAD_LEN>()?;
     Some((head[0], u64::from_le_bytes(*head.last_chunk()?)))
 }
 
 /// Splits `bytes` after their first record, which includes its opcode and length.
 fn split_record(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
     let (opcode, length) = split_head(bytes)?;
-    bytes.split_at_checked(HEAD + usize::try_from(length).ok().filter(|_| length <= max_len(opcode))?)
+    bytes.split_at_checked(HEAD_LEN + usize::try_from(length).ok().filter(|_| length <= max_len(opcode))?)
 }
 
 /// Returns the length that a chunk must have according to the fields at the beginning of its `body`.
 fn chunk_length(body: &[u8]) -> Option<u64> {
-    let (compression, rest) = body.get(COMPRESSION..)?.split_first_chunk()?;
+    let (compression, rest) = body.get(COMPRESSION_OFFSET..)?.split_first_chunk()?;
     let compression = u32::from_le_bytes(*compression);
     let records = rest.get(compression as usize..)?.first_chunk()?;
-    let head = COMPRESSION as u64 + 4 + u64::from(compression) + 8;
+    let head = COMPRESSION_OFFSET as u64 + 4 + u64::from(compression) + 8;
     u64::from_le_bytes(*records).checked_add(head)
 }
 
@@ -610,36 +610,36 @@ fn is_interpreted(opcode: u8) -> bool {
 fn max_len(opcode: u8) -> u64 {
     match opcode {
         op::HEADER | op::CHANNEL | op::METADATA => 1 << 20,
-        _ => MAX_LEN,
+        _ => MAX_RECORD_LEN,
     }
 }
 
 /// Bytes of opcode and length, with which every record begins.
-const HEAD: usize = 1 + 8;
+const HEAD_LEN: usize = 1 + 8;
 /// Bytes of a chunk that include the length of its records, whatever the name of its compression.
-const HEAD_OF_CHUNK: usize = 1024;
+const CHUNK_HEAD_LEN: usize = 1024;
 /// Position of the name of a chunk's compression: after the times of the first and the last message, the uncompressed size,
 /// and the CRC.
-const COMPRESSION: usize = 8 + 8 + 8 + 4;
+const COMPRESSION_OFFSET: usize = 8 + 8 + 8 + 4;
 /// Bytes of a message that include the header of a sample of the hub.
-const HEAD_OF_MESSAGE: usize = 2 + 4 + 8 + 8 + size_of::<scanhub_schema::Header>();
+const MESSAGE_HEAD_LEN: usize = 2 + 4 + 8 + 8 + size_of::<scanhub_schema::Header>();
 /// Length of a data end.
 const DATA_END_LEN: u64 = 4;
 /// Position of the checksum in the footer.
-const FOOTER_CRC: usize = 8 + 8;
+const FOOTER_CRC_OFFSET: usize = 8 + 8;
 /// Length of a footer.
-const FOOTER_LEN: u64 = FOOTER_CRC as u64 + 4;
+const FOOTER_LEN: u64 = FOOTER_CRC_OFFSET as u64 + 4;
 /// Opcodes that no version of the format uses yet. Those from 80h are free for any program.
-const RESERVED: RangeInclusive<u8> = 0x10..=0x7F;
+const RESERVED_OPCODES: RangeInclusive<u8> = 0x10..=0x7F;
 /// Maximum length of all other records. A few times this is held in memory; recorders write chunks of less than half of it.
-const MAX_LEN: u64 = 8 << 20;
+const MAX_RECORD_LEN: u64 = 8 << 20;
 /// No file is longer.
 const MAX_FILE_LEN: u64 = 1 << 40;
 /// Longest chunk that is unpacked to find out whether it is intact.
-const MAX_WRITTEN_CHUNK: u64 = 1 << 30;
+const MAX_CHUNK_LEN: u64 = 1 << 30;
 /// Maximum number of chunks that are compared with later ones: 14 hours of a recording of the hub.
 const MAX_CHUNKS: usize = 1 << 19;
 /// Maximum number of places at which the structure of a file is found again. Each one may read the longest record twice.
 const MAX_RESYNCS: u32 = 256;
 /// Bytes that are read at a time.
-const PIECE: u64 = 64 * 1024;
+const READ_LEN: u64 = 64 * 1024;

@@ -7,18 +7,18 @@ use std::sync::atomic::AtomicBool;
 
 use tempfile::TempDir;
 
-use crate::folder::{converted, file};
+use crate::folder::{convert_file, file};
 use crate::real;
 use scanhub_drivers::lms::measured;
 use scanhub_drivers::lms::reply;
 use scanhub_drivers::lms::variant::{Mode, Unit};
-use scanhub_recording::convert::{ConvertOptions, Converted, Target, convert};
+use scanhub_recording::convert::{ConversionResult, ConvertOptions, Target, convert};
 use scanhub_recording::{Encoding, Form, Frame, Recording};
-use scanhub_schema::datagram::Packed;
+use scanhub_schema::datagram::DatagramPayload;
 use scanhub_schema::file::Writer;
 use scanhub_schema::{Family, Flags, Header, Mark, Marks, Topic};
 
-const CM: Encoding = Encoding { unit: Unit::Cm, mode: Mode(0) };
+const CM_ENCODING: Encoding = Encoding { unit: Unit::Cm, mode: Mode(0) };
 
 /// Names of all files in `folder`.
 fn names(folder: &TempDir) -> Vec<String> {
@@ -35,7 +35,7 @@ fn frames(path: &Path, encoding: Encoding) -> Vec<Frame> {
 }
 
 fn telegrams(path: &Path) -> Vec<Vec<u8>> {
-    frames(path, CM).into_iter().map(|frame| frame.telegram).collect()
+    frames(path, CM_ENCODING).into_iter().map(|frame| frame.telegram).collect()
 }
 
 /// Channel, sequence, times and data of all messages, as the library of the format reads them.
@@ -49,16 +49,16 @@ fn an_mcap_file_keeps_all_messages_of_all_channels() {
     let folder = TempDir::new().unwrap();
     let written = crate::written::recording(20, 11);
     let (whole, copy) = (file(&folder, "whole.mcap", &written.bytes), folder.path().join("copy.mcap"));
-    let account = converted(&whole, &copy, None).unwrap();
-    assert_eq!((account.telegrams, account.scans, account.dropped), (40, 36, 0));
-    assert_eq!(account.telegrams, written.telegrams.len() as u64);
-    assert!(account.damage.is_none(), "{}", account.damage);
+    let result = convert_file(&whole, &copy, None).unwrap();
+    assert_eq!((result.telegrams, result.scans, result.dropped), (40, 36, 0));
+    assert_eq!(result.telegrams, written.telegrams.len() as u64);
+    assert!(result.damage.is_none(), "{}", result.damage);
     let bytes = fs::read(&copy).unwrap();
     assert!(messages(&bytes) == messages(&written.bytes));
-    let told = |bytes: &[u8]| mcap::Summary::read(bytes).unwrap().unwrap().metadata_indexes.len();
-    assert_eq!(told(&bytes), 1);
+    let metadata_count = |bytes: &[u8]| mcap::Summary::read(bytes).unwrap().unwrap().metadata_indexes.len();
+    assert_eq!(metadata_count(&bytes), 1);
     let rear = folder.path().join("rear.mcap");
-    assert_eq!(converted(&whole, &rear, Some("rear")).unwrap().telegrams, 20);
+    assert_eq!(convert_file(&whole, &rear, Some("rear")).unwrap().telegrams, 20);
     let only = messages(&fs::read(&rear).unwrap());
     assert!(only.len() == 200 && only.iter().all(|(topic, ..)| topic.starts_with("rear/")));
 }
@@ -75,15 +75,15 @@ fn a_file_that_was_cut_or_harmed_is_whole_afterwards() {
     for (name, bytes) in [("cut", cut), ("harmed", &harmed)] {
         let broken = file(&folder, &format!("{name}-in.mcap"), bytes);
         let whole = folder.path().join(format!("{name}-out.mcap"));
-        let account = converted(&broken, &whole, None).unwrap();
-        assert!(!account.damage.is_none(), "{name}");
-        assert_eq!(account.damage.is_cut, name == "cut");
-        assert_eq!(account.forms.0, Form::Mcap);
+        let result = convert_file(&broken, &whole, None).unwrap();
+        assert!(!result.damage.is_none(), "{name}");
+        assert_eq!(result.damage.is_truncated, name == "cut");
+        assert_eq!(result.forms.0, Form::Mcap);
         let recording = Recording::open(&whole).unwrap();
-        assert_eq!(recording.contents().telegrams, account.telegrams);
-        assert_eq!(account.telegrams, Recording::open(&broken).unwrap().contents().telegrams);
+        assert_eq!(recording.contents().telegrams, result.telegrams);
+        assert_eq!(result.telegrams, Recording::open(&broken).unwrap().contents().telegrams);
         let damage = recording.contents().damage;
-        assert!(damage.bytes == 0 && !damage.is_cut && !damage.is_harmed, "{damage}");
+        assert!(damage.bytes == 0 && !damage.is_truncated && !damage.is_damaged, "{damage}");
         let kept = messages(&fs::read(&whole).unwrap());
         assert!(kept.len() > all.len() / 2 && kept.iter().all(|message| all.contains(message)), "{name}");
         // Channels of others come along.
@@ -92,9 +92,10 @@ fn a_file_that_was_cut_or_harmed_is_whole_afterwards() {
 }
 
 #[test]
-fn a_stream_gets_times_and_loses_none_of_its_telegrams() {
+fn stream_gains_times_and_loses_no_telegrams() {
     let folder = TempDir::new().unwrap();
-    let mut scans: Vec<Vec<u8>> = vec![reply::configuration(0, Mode(4), Unit::Mm, 0x10).bytes().to_vec()];
+    let mut scans: Vec<Vec<u8>> =
+        vec![reply::configuration_reply(0, Mode(4), Unit::Mm, 0x10).bytes().to_vec()];
     scans.extend((0..30).map(|first| {
         let words: Vec<u16> = (0..361).map(|i| 500 + first + i).collect();
         measured::encode(0, Unit::Mm, &words, 0x10).bytes().to_vec()
@@ -102,38 +103,38 @@ fn a_stream_gets_times_and_loses_none_of_its_telegrams() {
     let stream = file(&folder, "a.bin", &[b"noise", &scans.concat()[..]].concat());
     let (mcap, again, log) =
         (folder.path().join("a.mcap"), folder.path().join("b.bin.gz"), folder.path().join("a.log.gz"));
-    let account = converted(&stream, &mcap, Some("left")).unwrap();
-    assert_eq!((account.forms, account.telegrams), ((Form::Telegrams, Target::Recording(Form::Mcap)), 31));
+    let result = convert_file(&stream, &mcap, Some("left")).unwrap();
+    assert_eq!((result.forms, result.telegrams), ((Form::Telegrams, Target::Recording(Form::Mcap)), 31));
     // As the stamps say that it gets: a reply takes its time on the line.
     assert!(
-        account.took_ns.is_some_and(|ns| (29 * 26_640_000..30 * 26_640_000).contains(&ns)),
-        "{account:?}"
+        result.duration_ns.is_some_and(|ns| (29 * 26_640_000..30 * 26_640_000).contains(&ns)),
+        "{result:?}"
     );
-    assert_eq!(converted(&stream, &folder.path().join("c.bin"), None).unwrap().took_ns, None);
+    assert_eq!(convert_file(&stream, &folder.path().join("c.bin"), None).unwrap().duration_ns, None);
     let recording = Recording::open(&mcap).unwrap();
     assert_eq!(
         (&recording.contents().sensors[..], recording.contents().mode),
         (&["left".into()][..], Some(Mode(4)))
     );
     assert_eq!(telegrams(&mcap), scans);
-    let headers: Vec<_> = frames(&mcap, CM).into_iter().map(|frame| frame.header.unwrap()).collect();
+    let headers: Vec<_> = frames(&mcap, CM_ENCODING).into_iter().map(|frame| frame.header.unwrap()).collect();
     assert!(headers.iter().all(|header| header.flags == Flags::STAMP_ESTIMATED));
     assert!(headers.windows(2).all(|pair| pair[1].topic_seq == pair[0].topic_seq + 1));
     assert_eq!(headers[30].wall_ns - headers[1].wall_ns, 29 * 26_640_000);
-    converted(&mcap, &again, None).unwrap();
+    convert_file(&mcap, &again, None).unwrap();
     assert_eq!(telegrams(&again), scans);
     // The log contains the encoding, so the reply is not lost.
-    let account = converted(&mcap, &log, None).unwrap();
-    assert_eq!((account.telegrams, account.dropped), (30, 0));
+    let result = convert_file(&mcap, &log, None).unwrap();
+    assert_eq!((result.telegrams, result.dropped), (30, 0));
     let read = frames(&log, Encoding { unit: Unit::Mm, mode: Mode(4) });
     assert!(read.iter().map(|frame| &frame.telegram).eq(&scans[1..]));
 }
 
 /// Converts, and returns the lines of the output.
-fn rows(options: &ConvertOptions) -> (Converted, Vec<String>) {
-    let account = convert(options, &AtomicBool::new(false), |_, _| {}).unwrap();
+fn rows(options: &ConvertOptions) -> (ConversionResult, Vec<String>) {
+    let result = convert(options, &AtomicBool::new(false), |_, _| {}).unwrap();
     let text = fs::read_to_string(&options.output).unwrap();
-    (account, text.lines().map(str::to_owned).collect())
+    (result, text.lines().map(str::to_owned).collect())
 }
 
 #[test]
@@ -142,8 +143,8 @@ fn rows_have_intensities_and_meters_on_request() {
     // Three reflector bits above the range.
     let words: Vec<u16> = (0..181).map(|i| (1234 + i) | ((i % 8) << 13)).collect();
     let scan = measured::encode(0, Unit::Mm, &words, 0x10);
-    let told = reply::configuration(0, Mode(1), Unit::Mm, 0x10);
-    let input = file(&folder, "a.bin", &[told.bytes(), scan.bytes()].concat());
+    let configuration = reply::configuration_reply(0, Mode(1), Unit::Mm, 0x10);
+    let input = file(&folder, "a.bin", &[configuration.bytes(), scan.bytes()].concat());
     let plain =
         ConvertOptions { input, output: folder.path().join("a.csv"), force: true, ..Default::default() };
     let (_, lines) = rows(&plain);
@@ -184,21 +185,21 @@ fn raw_bytes_of_two_families_are_refused() {
         for (number, family) in (0..).zip(families) {
             let header =
                 Header { seq: number, topic_seq: number, family: *family as u8, ..Header::default() };
-            writer.sample("front", Topic::Telegram, &header, &[0x54; 47]).unwrap();
+            writer.write_sample("front", Topic::Telegram, &header, &[0x54; 47]).unwrap();
         }
         file(&folder, "front.mcap", &writer.finish().unwrap())
     };
     let (bytes, copy) = (folder.path().join("out.bin"), folder.path().join("out.mcap"));
     let one = recorded(&[Family::Ld, Family::Ld]);
-    assert_eq!(converted(&one, &bytes, None).unwrap().telegrams, 2);
+    assert_eq!(convert_file(&one, &bytes, None).unwrap().telegrams, 2);
     fs::remove_file(&bytes).unwrap();
     // The scanner was replaced while the hub searched for any.
     let two = recorded(&[Family::Ld, Family::Rplidar, Family::Ld]);
-    let failure = converted(&two, &bytes, Some("front")).unwrap_err();
+    let failure = convert_file(&two, &bytes, Some("front")).unwrap_err();
     assert_eq!(failure.kind.exit_code(), 66);
     assert!(failure.message.contains("of families ld and rplidar"), "{failure}");
     assert!(failure.hint.contains("OUT.mcap") && !bytes.exists(), "{failure}");
-    assert_eq!(converted(&two, &copy, None).unwrap().telegrams, 3);
+    assert_eq!(convert_file(&two, &copy, None).unwrap().telegrams, 3);
 }
 
 #[test]
@@ -215,14 +216,14 @@ fn recorded_marks_become_rows() {
         let header = Header { seq: round, topic_seq: round, wall_ns: 1000 + round, ..Header::default() };
         let mut room = [0; 2048];
         let len = marks.pack(&mut room).unwrap();
-        writer.sample(sensor, Topic::Marks, &header, &room[..len]).unwrap();
+        writer.write_sample(sensor, Topic::Marks, &header, &room[..len]).unwrap();
     }
     let input = file(&folder, "a.mcap", &writer.finish().unwrap());
     let output = folder.path().join("marks.csv");
     let topic = Some("front/marks".to_owned());
     let options = ConvertOptions { input: input.clone(), output, topic, force: true, ..Default::default() };
-    let (account, lines) = rows(&options);
-    assert_eq!((account.marks, account.scans, account.telegrams, account.dropped), (Some(4), 3, 0, 0));
+    let (result, lines) = rows(&options);
+    assert_eq!((result.marks, result.scans, result.telegrams, result.dropped), (Some(4), 3, 0, 0));
     assert_eq!(
         lines,
         [
@@ -239,7 +240,7 @@ fn recorded_marks_become_rows() {
 
     let stream = file(&folder, "a.bin", measured::encode(0, Unit::Cm, &[7; 181], 0x10).bytes());
     let topic = |topic: &str| Some(topic.to_owned());
-    for (changed, code, says) in [
+    for (changed, code, message) in [
         (ConvertOptions { topic: topic("side/marks"), ..options.clone() }, 3, "no sensor \"side\""),
         (ConvertOptions { topic: topic("front/zones"), ..options.clone() }, 2, "only scan and marks"),
         (ConvertOptions { topic: topic("front"), ..options.clone() }, 2, "is not a topic"),
@@ -270,7 +271,7 @@ fn recorded_marks_become_rows() {
         ),
     ] {
         let failure = convert(&changed, &AtomicBool::new(false), |_, _| {}).unwrap_err();
-        assert!(failure.message.contains(says) && !failure.hint.is_empty(), "{says}: {failure}");
+        assert!(failure.message.contains(message) && !failure.hint.is_empty(), "{message}: {failure}");
         assert_eq!(failure.kind.exit_code(), code, "{failure}");
     }
 }
@@ -281,22 +282,22 @@ fn a_stream_of_a_real_sensor_comes_back() {
     let folder = TempDir::new().unwrap();
     let capture = data.join("captures/lms200_38400.bin");
     let (mcap, again) = (folder.path().join("capture.mcap"), folder.path().join("capture.bin"));
-    converted(&capture, &mcap, None).unwrap();
-    converted(&mcap, &again, None).unwrap();
+    convert_file(&capture, &mcap, None).unwrap();
+    convert_file(&mcap, &again, None).unwrap();
     assert!(fs::read(&capture).unwrap() == fs::read(&again).unwrap());
 }
 
 #[test]
-fn what_cannot_be_done_is_refused_and_leaves_nothing() {
+fn refused_conversion_leaves_no_output() {
     let folder = TempDir::new().unwrap();
     let noise = file(&folder, "noise.mcap", &[0x42; 900]);
-    let failure = converted(&noise, &folder.path().join("out.mcap"), None).unwrap_err();
+    let failure = convert_file(&noise, &folder.path().join("out.mcap"), None).unwrap_err();
     assert!(failure.kind.exit_code() == 66 && failure.message.contains("no telegram"), "{failure}");
     fs::remove_file(noise).unwrap();
     let input = file(&folder, "in.mcap", &crate::written::recording(8, 13).bytes);
-    let there = file(&folder, "there.bin", b"mine");
+    let existing = file(&folder, "there.bin", b"mine");
     std::os::unix::fs::symlink(&input, folder.path().join("link.mcap")).unwrap();
-    for (output, sensor, says) in [
+    for (output, sensor, message) in [
         ("in.mcap", None, "both read and written"),
         ("link.mcap", None, "both read and written"),
         ("there.bin", Some("front"), "exists"),
@@ -306,13 +307,13 @@ fn what_cannot_be_done_is_refused_and_leaves_nothing() {
         ("out.mcap.gz", None, "is not a known format"),
         ("no/such/out.mcap", None, "cannot write"),
     ] {
-        let failure = converted(&input, &folder.path().join(output), sensor).unwrap_err();
-        assert!(failure.message.contains(says) && !failure.hint.is_empty(), "{output}: {failure}");
+        let failure = convert_file(&input, &folder.path().join(output), sensor).unwrap_err();
+        assert!(failure.message.contains(message) && !failure.hint.is_empty(), "{output}: {failure}");
     }
     let options =
         ConvertOptions { input, output: folder.path().join("stopped.mcap"), ..ConvertOptions::default() };
     let failure = convert(&options, &AtomicBool::new(true), |_, _| {}).unwrap_err();
     assert_eq!(failure.kind.exit_code(), 130);
     assert_eq!(names(&folder), ["in.mcap", "link.mcap", "there.bin"]);
-    assert_eq!(fs::read(there).unwrap(), b"mine");
+    assert_eq!(fs::read(existing).unwrap(), b"mine");
 }

@@ -12,47 +12,48 @@ use scanhub_schema::file::Compression;
 use tempfile::TempDir;
 
 use crate::folder::file;
-use crate::written::{self, Known, SENSORS, Written};
+use crate::written::{self, SENSOR_NAMES, WrittenRecording, WrittenTelegram};
 
 /// A recording, and where its records are.
-struct Whole {
+struct IntactRecording {
     bytes: Vec<u8>,
-    telegrams: Vec<Known>,
-    /// Bytes of each chunk, each of which has [`PER_CHUNK`] telegrams.
+    telegrams: Vec<WrittenTelegram>,
+    /// Bytes of each chunk, each of which has [`MESSAGES_PER_CHUNK`] telegrams.
     chunks: Vec<Range<usize>>,
     /// Ends of all records outside chunks, after the end of the magic bytes.
     ends: Vec<usize>,
 }
 
-impl Whole {
-    fn new(rounds: u64, compression: Compression) -> Whole {
-        let Written { bytes, telegrams } = written::packed(rounds, 7, compression);
-        let (mut chunks, mut ends) = (Vec::new(), vec![MAGIC]);
-        while let Some(&at) = ends.last().filter(|at| **at < bytes.len() - MAGIC) {
-            let end = at + HEAD + u64::from_le_bytes(*bytes[at + 1..].first_chunk().unwrap()) as usize;
+impl IntactRecording {
+    fn new(rounds: u64, compression: Compression) -> IntactRecording {
+        let WrittenRecording { bytes, telegrams } = written::recording_with(rounds, 7, compression);
+        let (mut chunks, mut ends) = (Vec::new(), vec![MAGIC_LEN]);
+        while let Some(&at) = ends.last().filter(|at| **at < bytes.len() - MAGIC_LEN) {
+            let end =
+                at + RECORD_HEAD_LEN + u64::from_le_bytes(*bytes[at + 1..].first_chunk().unwrap()) as usize;
             if bytes[at] == mcap::records::op::CHUNK {
                 chunks.push(at..end);
             }
             ends.push(end);
         }
-        assert_eq!(chunks.len() * PER_CHUNK, telegrams.len());
-        Whole { bytes, telegrams, chunks, ends }
+        assert_eq!(chunks.len() * MESSAGES_PER_CHUNK, telegrams.len());
+        IntactRecording { bytes, telegrams, chunks, ends }
     }
 
     /// The telegrams of the chunks that `is_left` accepts, one sensor after the other.
-    fn telegrams(&self, is_left: impl Fn(usize) -> bool) -> Vec<Known> {
-        let chunks = self.telegrams.chunks(PER_CHUNK).enumerate();
+    fn telegrams(&self, is_kept: impl Fn(usize) -> bool) -> Vec<WrittenTelegram> {
+        let chunks = self.telegrams.chunks(MESSAGES_PER_CHUNK).enumerate();
         let left: Vec<_> =
-            chunks.filter(|(number, _)| is_left(*number)).flat_map(|(_, known)| known).collect();
+            chunks.filter(|(number, _)| is_kept(*number)).flat_map(|(_, known)| known).collect();
         let of =
             |sensor| left.iter().filter(move |known| known.sensor == sensor).map(|known| (*known).clone());
-        SENSORS.into_iter().flat_map(of).collect()
+        SENSOR_NAMES.into_iter().flat_map(of).collect()
     }
 
     /// Positions in chunk `number` at which a change is found by the checksum: the checksum itself, and its records.
     fn content(&self, number: usize) -> Vec<usize> {
         let chunk = self.chunks[number].clone();
-        let compression = chunk.start + HEAD + 8 + 8 + 8 + 4;
+        let compression = chunk.start + RECORD_HEAD_LEN + 8 + 8 + 8 + 4;
         let records = compression + 4 + usize::from(self.bytes[compression]) + 8;
         let step = (chunk.end - records) / 7;
         [compression - 3].into_iter().chain((records..chunk.end).step_by(step).take(7)).collect()
@@ -60,21 +61,21 @@ impl Whole {
 }
 
 /// Returns the telegrams that are read from `bytes`, one sensor after the other, and the reported damage.
-fn read(folder: &TempDir, bytes: &[u8]) -> (Vec<Known>, Damage) {
+fn read(folder: &TempDir, bytes: &[u8]) -> (Vec<WrittenTelegram>, Damage) {
     let recording = Recording::open(file(folder, "damaged.mcap", bytes)).unwrap();
     let contents = recording.contents();
     let of = |sensor: &'static str| {
         let frames = contents.sensors.iter().any(|name| name == sensor).then(|| {
             recording.of(sensor).unwrap().telegrams(Encoding { unit: Unit::Mm, mode: Mode(1) }).unwrap()
         });
-        frames.into_iter().flatten().map(move |frame| Known {
+        frames.into_iter().flatten().map(move |frame| WrittenTelegram {
             sensor,
             header: frame.header.unwrap(),
             telegram: frame.telegram,
         })
     };
-    let known: Vec<_> = SENSORS.into_iter().flat_map(of).collect();
-    let is_nameless = contents.sensors.iter().any(|name| !SENSORS.contains(&&name[..]));
+    let known: Vec<_> = SENSOR_NAMES.into_iter().flat_map(of).collect();
+    let is_nameless = contents.sensors.iter().any(|name| !SENSOR_NAMES.contains(&&name[..]));
     assert!(is_nameless || known.len() as u64 == contents.telegrams, "{contents:?}");
     (known, contents.damage)
 }
@@ -83,16 +84,16 @@ fn read(folder: &TempDir, bytes: &[u8]) -> (Vec<Known>, Damage) {
 fn cut_at_any_byte_is_read_to_the_last_whole_chunk() {
     let folder = TempDir::new().unwrap();
     for compression in [Compression::None, Compression::Zstd] {
-        let whole = Whole::new(12, compression);
+        let whole = IntactRecording::new(12, compression);
         let len = whole.bytes.len();
         let is_near_end = |at: usize| whole.ends.iter().any(|end| end.abs_diff(at) <= 2);
-        for cut in (MAGIC..len).filter(|at| at % 499 == 0 || is_near_end(*at)) {
+        for cut in (MAGIC_LEN..len).filter(|at| at % 499 == 0 || is_near_end(*at)) {
             let (telegrams, damage) = read(&folder, &whole.bytes[..cut]);
             let expected = whole.telegrams(|number| whole.chunks[number].end <= cut);
             assert!(telegrams == expected, "{compression:?}, cut at {cut}: {} telegrams", telegrams.len());
             let used = whole.ends.iter().rfind(|end| **end <= cut).unwrap();
             let bytes = (cut - used) as u64;
-            assert_eq!(damage, Damage { bytes, is_cut: true, ..Damage::default() }, "cut at {cut}");
+            assert_eq!(damage, Damage { bytes, is_truncated: true, ..Damage::default() }, "cut at {cut}");
         }
         assert_eq!(read(&folder, &whole.bytes), (whole.telegrams(|_| true), Damage::default()));
     }
@@ -102,7 +103,7 @@ fn cut_at_any_byte_is_read_to_the_last_whole_chunk() {
 fn flipped_byte_costs_one_chunk() {
     let folder = TempDir::new().unwrap();
     for compression in [Compression::None, Compression::Lz4, Compression::Zstd] {
-        let whole = Whole::new(20, compression);
+        let whole = IntactRecording::new(20, compression);
         for (number, chunk) in whole.chunks.iter().enumerate() {
             for at in whole.content(number) {
                 let mut bytes = whole.bytes.clone();
@@ -113,10 +114,10 @@ fn flipped_byte_costs_one_chunk() {
                 // The numbers show a gap only between telegrams.
                 let is_inside = (1..whole.chunks.len() - 1).contains(&number);
                 let expected = Damage {
-                    telegrams: if is_inside { PER_CHUNK as u64 } else { 0 },
+                    telegrams: if is_inside { MESSAGES_PER_CHUNK as u64 } else { 0 },
                     bytes: chunk.len() as u64,
                     chunks: 1,
-                    is_harmed: true,
+                    is_damaged: true,
                     ..Damage::default()
                 };
                 assert_eq!(damage, expected, "{name}");
@@ -128,7 +129,7 @@ fn flipped_byte_costs_one_chunk() {
 #[test]
 fn chunk_with_another_opcode_costs_one_chunk() {
     let folder = TempDir::new().unwrap();
-    let whole = Whole::new(20, Compression::Zstd);
+    let whole = IntactRecording::new(20, Compression::Zstd);
     // A footer, and an opcode that the format reserves.
     for opcode in [0x02, 0x16] {
         for (number, chunk) in whole.chunks.iter().enumerate() {
@@ -137,16 +138,16 @@ fn chunk_with_another_opcode_costs_one_chunk() {
             let (telegrams, damage) = read(&folder, &bytes);
             let name = format!("opcode {opcode} at chunk {number}: {damage}");
             assert!(telegrams == whole.telegrams(|other| other != number), "{name}");
-            assert!(damage.bytes == chunk.len() as u64 && damage.is_harmed, "{name}");
+            assert!(damage.bytes == chunk.len() as u64 && damage.is_damaged, "{name}");
         }
     }
 }
 
 #[test]
-fn reading_continues_at_next_chunk_after_an_impossible_length() {
+fn resumes_at_next_chunk_after_impossible_length() {
     let folder = TempDir::new().unwrap();
     for compression in [Compression::None, Compression::Zstd] {
-        let whole = Whole::new(20, compression);
+        let whole = IntactRecording::new(20, compression);
         let last = 1 + 7;
         for (number, chunk) in whole.chunks.iter().enumerate() {
             let next = whole.chunks.get(number + 1).map_or(whole.bytes.len(), |next| next.start);
@@ -165,16 +166,16 @@ fn reading_continues_at_next_chunk_after_an_impossible_length() {
                 let (telegrams, damage) = read(&folder, &bytes);
                 let left = |other| !is_chunk || other != number;
                 assert!(telegrams == whole.telegrams(left), "{compression:?}, byte {at}: {damage}");
-                assert_eq!((damage.bytes, damage.is_harmed), ((next - start) as u64, true), "byte {at}");
+                assert_eq!((damage.bytes, damage.is_damaged), ((next - start) as u64, true), "byte {at}");
             }
         }
     }
 }
 
 #[test]
-fn any_flipped_bit_of_an_opcode_costs_at_most_one_chunk() {
+fn flipped_opcode_bit_costs_at_most_one_chunk() {
     let folder = TempDir::new().unwrap();
-    let whole = Whole::new(20, Compression::Lz4);
+    let whole = IntactRecording::new(20, Compression::Lz4);
     // The last end is that of the footer.
     for (index, start) in whole.ends.iter().enumerate().take(whole.ends.len() - 1) {
         for bit in 0..8 {
@@ -184,7 +185,7 @@ fn any_flipped_bit_of_an_opcode_costs_at_most_one_chunk() {
             let name = format!("bit {bit} of record {index}, opcode {}: {damage}", whole.bytes[*start]);
             let hit = whole.chunks.iter().position(|chunk| chunk.start == *start);
             assert!(telegrams == whole.telegrams(|number| Some(number) != hit), "{name}");
-            assert!(damage.is_harmed, "{name}");
+            assert!(damage.is_damaged, "{name}");
             assert!(hit.is_none() || damage.bytes > 0, "{name}");
         }
     }
@@ -194,7 +195,7 @@ fn any_flipped_bit_of_an_opcode_costs_at_most_one_chunk() {
 fn chunk_that_the_file_has_twice_is_read_once() {
     let folder = TempDir::new().unwrap();
     for compression in [Compression::None, Compression::Zstd] {
-        let whole = Whole::new(20, compression);
+        let whole = IntactRecording::new(20, compression);
         // One chunk again at another place, and a block of three chunks with all records between them.
         let (first, block) = (whole.chunks[0].clone(), whole.chunks[1].start..whole.chunks[3].end);
         for (copied, at, repeats) in [(first, whole.chunks[2].end, 1), (block, whole.chunks[3].end, 3)] {
@@ -203,7 +204,7 @@ fn chunk_that_the_file_has_twice_is_read_once() {
             bytes.splice(at..at, again);
             let (telegrams, damage) = read(&folder, &bytes);
             assert!(telegrams == whole.telegrams(|_| true), "{compression:?}: {damage}");
-            assert_eq!(damage, Damage { repeats, is_harmed: true, ..Damage::default() });
+            assert_eq!(damage, Damage { repeats, is_damaged: true, ..Damage::default() });
             let words = if repeats == 1 {
                 "1 chunk that the file has twice"
             } else {
@@ -215,22 +216,22 @@ fn chunk_that_the_file_has_twice_is_read_once() {
 }
 
 #[test]
-fn telegram_outside_chunks_is_checked_by_its_own_checksum() {
+fn unchunked_telegram_is_checked_by_own_checksum() {
     let folder = TempDir::new().unwrap();
-    let whole = Whole::new(8, Compression::None);
+    let whole = IntactRecording::new(8, Compression::None);
     let telegrams = whole.telegrams(|_| true);
     // The records of the chunks, without the chunks, and checksums of sections that were not computed.
-    let (mut bytes, mut at) = (whole.bytes[..MAGIC].to_vec(), MAGIC);
+    let (mut bytes, mut at) = (whole.bytes[..MAGIC_LEN].to_vec(), MAGIC_LEN);
     let mut messages = Vec::new();
     for end in &whole.ends[1..] {
         let record = at..*end;
         at = *end;
         match whole.bytes[record.start] {
             mcap::records::op::CHUNK => {
-                let mut from = record.start + HEAD + 8 + 8 + 8 + 4 + 4 + 8;
+                let mut from = record.start + RECORD_HEAD_LEN + 8 + 8 + 8 + 4 + 4 + 8;
                 while from < record.end {
                     let len = u64::from_le_bytes(*whole.bytes[from + 1..].first_chunk().unwrap()) as usize;
-                    let next = from + HEAD + len;
+                    let next = from + RECORD_HEAD_LEN + len;
                     if whole.bytes[from] == mcap::records::op::MESSAGE {
                         messages.push(bytes.len()..bytes.len() + next - from);
                     }
@@ -259,7 +260,7 @@ fn telegram_outside_chunks_is_checked_by_its_own_checksum() {
                 let (read, damage) = read(&folder, &changed);
                 assert_eq!(read.len() + 1, telegrams.len(), "byte {at}: {damage}");
                 assert!(read.iter().all(|read| telegrams.contains(read)), "byte {at}: {damage}");
-                assert!(damage.bytes == hit.len() as u64 && damage.is_harmed, "byte {at}: {damage}");
+                assert!(damage.bytes == hit.len() as u64 && damage.is_damaged, "byte {at}: {damage}");
             }
         }
         assert!(!hits.is_empty());
@@ -268,24 +269,25 @@ fn telegram_outside_chunks_is_checked_by_its_own_checksum() {
     let hit = messages[telegrams.len()].clone();
     bytes[hit.start + 1 + 7] ^= 0x40;
     let (read, damage) = read(&folder, &bytes);
-    assert!(read.len() + 1 >= telegrams.len() && damage.is_harmed, "{} telegrams, {damage}", read.len());
+    assert!(read.len() + 1 >= telegrams.len() && damage.is_damaged, "{} telegrams, {damage}", read.len());
 }
 
 #[test]
-fn intact_chunk_that_unpacks_to_too_much_is_refused_and_a_wrong_length_is_not() {
+fn refuses_too_large_chunk_but_not_a_wrong_length() {
     let folder = TempDir::new().unwrap();
     // Zeros, so that the chunk is short until it is unpacked.
     let mut writer =
-        scanhub_schema::file::Writer::packed(Vec::new(), "", Compression::Zstd, Default::default()).unwrap();
-    let channel = scanhub_schema::file::Foreign {
+        scanhub_schema::file::Writer::begin_compressed(Vec::new(), "", Compression::Zstd, Default::default())
+            .unwrap();
+    let channel = scanhub_schema::file::ForeignChannel {
         topic: "/map",
         encoding: "raw",
         schema: ("map", "bytes", "text"),
         metadata: &[],
     };
-    let map = writer.channel(&channel).unwrap();
+    let map = writer.add_channel(&channel).unwrap();
     for round in 0..9 {
-        writer.message(map, round, u64::from(round), &vec![0; 1 << 20]).unwrap();
+        writer.write_message(map, round, u64::from(round), &vec![0; 1 << 20]).unwrap();
     }
     writer.close_chunk().unwrap();
     let failure = Recording::open(file(&folder, "long.mcap", &writer.finish().unwrap())).unwrap_err();
@@ -295,11 +297,11 @@ fn intact_chunk_that_unpacks_to_too_much_is_refused_and_a_wrong_length_is_not() 
     );
     assert!(failure.hint.contains("mcap filter"), "{failure}");
 
-    let whole = Whole::new(20, Compression::Zstd);
+    let whole = IntactRecording::new(20, Compression::Zstd);
     for (number, chunk) in whole.chunks.iter().enumerate() {
         for at in [2, 3, 5, 7] {
             let mut bytes = whole.bytes.clone();
-            bytes[chunk.start + HEAD + 8 + 8 + at] ^= 0x80;
+            bytes[chunk.start + RECORD_HEAD_LEN + 8 + 8 + at] ^= 0x80;
             let (telegrams, damage) = read(&folder, &bytes);
             assert!(telegrams == whole.telegrams(|other| other != number), "{at}: {damage}");
             assert_eq!(damage.chunks, 1, "{at}: {damage}");
@@ -308,15 +310,15 @@ fn intact_chunk_that_unpacks_to_too_much_is_refused_and_a_wrong_length_is_not() 
 }
 
 #[test]
-fn sensors_whose_names_are_lost_are_called_by_their_numbers() {
+fn sensors_with_lost_names_are_called_by_number() {
     let folder = TempDir::new().unwrap();
-    let whole = Whole::new(20, Compression::Zstd);
+    let whole = IntactRecording::new(20, Compression::Zstd);
     // Only the first chunk and the index name the sensors.
     let mut bytes = whole.bytes[..whole.chunks[3].end].to_vec();
     bytes[whole.content(0)[1]] ^= 0x10;
     let recording = Recording::open(file(&folder, "damaged.mcap", &bytes)).unwrap();
     assert_eq!(recording.contents().sensors, ["sensor0", "sensor1"]);
-    assert_eq!(recording.contents().telegrams, 3 * PER_CHUNK as u64);
+    assert_eq!(recording.contents().telegrams, 3 * MESSAGES_PER_CHUNK as u64);
     let rear = recording.of("sensor1").unwrap();
     let frames = rear.telegrams(Encoding { unit: Unit::Mm, mode: Mode(1) }).unwrap();
     let expected = whole.telegrams(|number| (1..4).contains(&number));
@@ -329,13 +331,15 @@ fn nothing_is_invented_whatever_is_damaged() {
     let folder = TempDir::new().unwrap();
     for seed in 0..300 {
         let mut random = Rng::with_seed(seed);
-        let whole = Whole::new(12, if seed % 2 == 0 { Compression::None } else { Compression::Lz4 });
+        let whole =
+            IntactRecording::new(12, if seed % 2 == 0 { Compression::None } else { Compression::Lz4 });
         let len = whole.bytes.len();
-        let (mut bytes, from) = (whole.bytes.clone(), random.usize(MAGIC..len));
+        let (mut bytes, from) = (whole.bytes.clone(), random.usize(MAGIC_LEN..len));
         let some = from..(from + random.usize(1..5_000)).min(len);
         let first = match random.u8(..4) {
             0 => {
-                let places: Vec<_> = (0..random.usize(1..=16)).map(|_| random.usize(MAGIC..len)).collect();
+                let places: Vec<_> =
+                    (0..random.usize(1..=16)).map(|_| random.usize(MAGIC_LEN..len)).collect();
                 places.iter().for_each(|at| bytes[*at] ^= 1 << random.u8(..8));
                 *places.iter().min().unwrap()
             }
@@ -354,8 +358,9 @@ fn nothing_is_invented_whatever_is_damaged() {
             }
         };
         let (telegrams, damage) = read(&folder, &bytes);
-        let is_same =
-            |one: &Known, other: &Known| one.header == other.header && one.telegram == other.telegram;
+        let is_same = |one: &WrittenTelegram, other: &WrittenTelegram| {
+            one.header == other.header && one.telegram == other.telegram
+        };
         for read in &telegrams {
             assert!(whole.telegrams.iter().any(|known| is_same(read, known)), "seed {seed}: {read:?}");
         }
@@ -368,16 +373,19 @@ fn nothing_is_invented_whatever_is_damaged() {
 #[test]
 fn file_without_its_beginning_is_refused() {
     let folder = TempDir::new().unwrap();
-    let bytes = &Whole::new(20, Compression::None).bytes;
-    for begin in [1, MAGIC, bytes.len() / 3] {
+    let bytes = &IntactRecording::new(20, Compression::None).bytes;
+    for begin in [1, MAGIC_LEN, bytes.len() / 3] {
         let failure = Recording::open(file(&folder, "rest.mcap", &bytes[begin..])).unwrap_err();
         assert!(failure.message.ends_with("is the end of an MCAP file, without its beginning"), "{failure}");
         assert_eq!(failure.kind.exit_code(), 66);
     }
     // Neither the beginning nor the end: messages, or a chunk of which nothing can be read.
-    let packed = Whole::new(20, Compression::Zstd);
-    let middle = |whole: &Whole| whole.bytes[whole.chunks[1].start + 40..whole.chunks[3].end].to_vec();
-    for bytes in [middle(&Whole::new(20, Compression::None)), middle(&packed), gzip(&middle(&packed))] {
+    let packed = IntactRecording::new(20, Compression::Zstd);
+    let middle =
+        |whole: &IntactRecording| whole.bytes[whole.chunks[1].start + 40..whole.chunks[3].end].to_vec();
+    for bytes in
+        [middle(&IntactRecording::new(20, Compression::None)), middle(&packed), gzip(&middle(&packed))]
+    {
         let failure = Recording::open(file(&folder, "middle.bin", &bytes)).unwrap_err();
         assert!(failure.message.ends_with("is a piece of an MCAP file, without its beginning"), "{failure}");
         assert!(failure.hint.contains("whole file"), "{failure}");
@@ -391,7 +399,7 @@ fn gzip(bytes: &[u8]) -> Vec<u8> {
 }
 
 /// Telegrams in a chunk: four of each sensor.
-const PER_CHUNK: usize = 8;
-const MAGIC: usize = mcap::MAGIC.len();
+const MESSAGES_PER_CHUNK: usize = 8;
+const MAGIC_LEN: usize = mcap::MAGIC.len();
 /// Bytes of opcode and length.
-const HEAD: usize = 1 + 8;
+const RECORD_HEAD_LEN: usize = 1 + 8;

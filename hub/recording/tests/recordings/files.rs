@@ -7,7 +7,7 @@ use crate::real;
 use flate2::Compression;
 use flate2::write::GzEncoder;
 use scanhub_drivers::lms::command::Request;
-use scanhub_drivers::lms::measured::{self, Measured};
+use scanhub_drivers::lms::measured::{self, MeasuredValues};
 use scanhub_drivers::lms::reply;
 use scanhub_drivers::lms::telegram::Telegram;
 use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
@@ -15,7 +15,7 @@ use scanhub_recording::{Encoding, Form, Recording};
 use scanhub_schema::Family;
 use tempfile::NamedTempFile;
 
-const MM: Encoding = Encoding { unit: Unit::Mm, mode: Mode(1) };
+const MM_ENCODING: Encoding = Encoding { unit: Unit::Mm, mode: Mode(1) };
 
 /// Creates a temporary file whose name ends with `name`.
 fn temporary(name: &str, bytes: &[u8]) -> NamedTempFile {
@@ -36,14 +36,14 @@ fn scan(first: u16) -> Vec<u8> {
 }
 
 #[test]
-fn a_stream_gives_its_telegrams_bit_for_bit_and_says_what_the_sensor_was() {
+fn stream_file_has_exact_telegrams_and_settings() {
     let telegrams =
-        [scan(700), reply::configuration(0, Mode(4), Unit::Cm, 0x11).bytes().to_vec(), scan(1700)];
+        [scan(700), reply::configuration_reply(0, Mode(4), Unit::Cm, 0x11).bytes().to_vec(), scan(1700)];
     let mut bytes = b"\x06\x02\x80noise".to_vec();
     bytes.extend_from_slice(&telegrams.concat());
     // A scan that broke off for a reply, at the very end.
     bytes.extend_from_slice(&scan(5)[..40]);
-    let last = reply::mode(0, true, 0x10);
+    let last = reply::mode_reply(0, true, 0x10);
     bytes.extend_from_slice(&[&[0x06], last.bytes()].concat());
     for (name, stored) in [("stream.bin", bytes.clone()), ("stream.bin.gz", gzip(&bytes))] {
         let file = temporary(name, &stored);
@@ -52,7 +52,7 @@ fn a_stream_gives_its_telegrams_bit_for_bit_and_says_what_the_sensor_was() {
         assert_eq!((contents.form, contents.telegrams, contents.scans), (Form::Telegrams, 4, 2));
         assert_eq!(contents.variant, Some(Variant::HALF));
         assert_eq!((contents.unit, contents.mode), (Some(Unit::Cm), Some(Mode(4))));
-        let read: Vec<_> = recording.telegrams(MM).unwrap().map(|frame| frame.telegram).collect();
+        let read: Vec<_> = recording.telegrams(MM_ENCODING).unwrap().map(|frame| frame.telegram).collect();
         assert_eq!(read[..3], telegrams);
         assert_eq!(read[3], last.bytes());
         let mut unpacked = Vec::new();
@@ -74,10 +74,10 @@ fn a_log_becomes_telegrams() {
     assert_eq!((recording.contents().form, recording.contents().scans), (Form::Carmen, 2));
     assert_eq!(recording.contents().variant, Some(Variant::HALF));
     assert_eq!(recording.encoding(), Some(Encoding { unit: Unit::Mm, mode: Mode(0) }));
-    let frames: Vec<_> = recording.telegrams(MM).unwrap().collect();
+    let frames: Vec<_> = recording.telegrams(MM_ENCODING).unwrap().collect();
     let last = |i: usize| {
         let telegram = Telegram::check(&frames[i].telegram).unwrap();
-        let words: Vec<u16> = Measured::decode(telegram).unwrap().words().collect();
+        let words: Vec<u16> = MeasuredValues::decode(telegram).unwrap().words().collect();
         (words.len(), words[0], words[360])
     };
     assert_eq!((last(0), last(1)), ((361, 1234, 8184), (361, 1234, 1234)));
@@ -90,11 +90,11 @@ fn a_log_becomes_telegrams() {
 }
 
 #[test]
-fn what_is_no_recording_is_refused_with_place_value_and_remedy() {
+fn refuses_a_non_recording_with_place_and_remedy() {
     let missing = Recording::open("/nonexistent/a.bin").unwrap_err();
     assert_eq!(missing.kind.exit_code(), 66);
     assert!(missing.message.contains("/nonexistent/a.bin") && !missing.hint.is_empty(), "{missing}");
-    for (name, bytes, says) in [
+    for (name, bytes, message) in [
         ("empty", Vec::new(), "is empty"),
         ("noise", vec![0x42; 9000], "no telegram in it"),
         ("program.py", b"#!/usr/bin/env python3\nprint('\x02\x80')\n".to_vec(), "no telegram in it"),
@@ -107,10 +107,10 @@ fn what_is_no_recording_is_refused_with_place_value_and_remedy() {
     ] {
         let file = temporary(name, &bytes);
         let failure = Recording::open(file.path()).unwrap_err();
-        assert!(failure.message.contains(says), "{failure}");
+        assert!(failure.message.contains(message), "{failure}");
         // A line may bring nothing but noise, if it is known whose it is.
-        let line = |family| Recording::open_line(file.path(), family);
-        let is_noise = says == "no telegram in it";
+        let line = |family| Recording::open_stream(file.path(), family);
+        let is_noise = message == "no telegram in it";
         let known = line(Some(Family::Lms)).ok();
         assert_eq!(known.map(|line| line.contents().telegrams), is_noise.then_some(0));
         let unknown = line(None).unwrap_err();
@@ -119,7 +119,7 @@ fn what_is_no_recording_is_refused_with_place_value_and_remedy() {
 }
 
 #[test]
-fn stream_of_which_no_family_takes_half_needs_the_family() {
+fn mostly_unrecognized_stream_needs_the_family() {
     let telegrams: Vec<u8> = (0..8).flat_map(scan).collect();
     let noise = vec![0x42; telegrams.len() + 1];
     let few = temporary("few.bin", &[&telegrams[..], &noise].concat());
@@ -137,15 +137,15 @@ fn stream_of_which_no_family_takes_half_needs_the_family() {
 }
 
 #[test]
-fn what_is_there_of_a_packed_file_that_is_cut_is_read() {
+fn reads_the_intact_start_of_a_truncated_gzip_file() {
     // So much that what is cut off is not all of it, and different enough not to be packed to nothing.
     let telegrams: Vec<Vec<u8>> = (0..400).map(scan).collect();
     let packed = gzip(&telegrams.concat());
     let file = temporary("cut.bin.gz", &packed[..packed.len() * 2 / 3]);
     let recording = Recording::open(file.path()).unwrap();
     let contents = recording.contents();
-    assert!(contents.damage.is_cut && (1..400).contains(&contents.telegrams), "{contents:?}");
-    let read: Vec<_> = recording.telegrams(MM).unwrap().map(|frame| frame.telegram).collect();
+    assert!(contents.damage.is_truncated && (1..400).contains(&contents.telegrams), "{contents:?}");
+    let read: Vec<_> = recording.telegrams(MM_ENCODING).unwrap().map(|frame| frame.telegram).collect();
     assert_eq!(read[..], telegrams[..contents.telegrams as usize]);
 }
 
@@ -158,16 +158,19 @@ fn a_log_with_harmed_lines_gives_the_others() {
     let file = temporary("harmed.log", log.as_bytes());
     let recording = Recording::open(file.path()).unwrap();
     let damage = recording.contents().damage;
-    assert_eq!((recording.contents().scans, damage.telegrams, damage.is_harmed), (3998, 1, true));
-    let walls: Vec<_> =
-        recording.telegrams(MM).unwrap().map(|frame| frame.wall_ns.unwrap() / 1_000_000_000).collect();
+    assert_eq!((recording.contents().scans, damage.telegrams, damage.is_damaged), (3998, 1, true));
+    let walls: Vec<_> = recording
+        .telegrams(MM_ENCODING)
+        .unwrap()
+        .map(|frame| frame.wall_ns.unwrap() / 1_000_000_000)
+        .collect();
     assert!(walls.iter().copied().eq((1..4000).filter(|at| *at != 7)));
     let packed = gzip(log.as_bytes());
     let cut = temporary("cut.log.gz", &packed[..packed.len() * 2 / 3]);
     let recording = Recording::open(cut.path()).unwrap();
     let contents = recording.contents();
-    assert!(contents.damage.is_cut && contents.scans > 0, "{contents:?}");
-    assert_eq!(recording.telegrams(MM).unwrap().count() as u64, contents.telegrams);
+    assert!(contents.damage.is_truncated && contents.scans > 0, "{contents:?}");
+    assert_eq!(recording.telegrams(MM_ENCODING).unwrap().count() as u64, contents.telegrams);
 }
 
 #[test]
@@ -176,7 +179,7 @@ fn recordings_of_real_sensors() {
     let capture = Recording::open(data.join("captures/lms200_38400.bin")).unwrap();
     assert_eq!((capture.contents().telegrams, capture.contents().scans), (427, 354));
     assert_eq!((capture.contents().unit, capture.contents().mode), (Some(Unit::Mm), Some(Mode(4))));
-    let bytes: Vec<u8> = capture.telegrams(MM).unwrap().flat_map(|frame| frame.telegram).collect();
+    let bytes: Vec<u8> = capture.telegrams(MM_ENCODING).unwrap().flat_map(|frame| frame.telegram).collect();
     assert_eq!(bytes, fs::read(data.join("captures/lms200_38400.bin")).unwrap());
     for (name, scans, beams) in
         [("intel", 910, 181), ("freiburg-079", 4791, 361), ("aces", 440, 181), ("orebro", 237, 181)]

@@ -7,12 +7,12 @@ use std::sync::atomic::AtomicBool;
 
 use fastrand::Rng;
 use mcap::records::op;
-use scanhub_recording::convert::{ConvertOptions, Converted, convert};
+use scanhub_recording::convert::{ConversionResult, ConvertOptions, convert};
 use scanhub_schema::{Failure, Kind};
 use tempfile::TempDir;
 
 /// Converts `bytes` to MCAP, in `folder`.
-fn convert_again(folder: &TempDir, bytes: &[u8]) -> Result<Converted, Failure> {
+fn convert_again(folder: &TempDir, bytes: &[u8]) -> Result<ConversionResult, Failure> {
     let (input, output) = (folder.path().join("in.mcap"), copy(folder));
     fs::write(&input, bytes).unwrap();
     let options = ConvertOptions { input, output, force: true, ..ConvertOptions::default() };
@@ -38,7 +38,7 @@ fn attachment(data: &[u8]) -> Vec<u8> {
 }
 
 /// Bodies of one record of each kind that a file has beside its messages.
-fn others() -> Vec<(u8, Vec<u8>)> {
+fn foreign_records() -> Vec<(u8, Vec<u8>)> {
     let pairs = [text("robot"), text("r1"), text("place"), text("hall 3")].concat();
     let map = [&(pairs.len() as u32).to_le_bytes()[..], &pairs].concat();
     let counted = |entries: &[u8]| [&(entries.len() as u32).to_le_bytes()[..], entries].concat();
@@ -56,17 +56,17 @@ fn others() -> Vec<(u8, Vec<u8>)> {
 }
 
 /// A recording with this record behind its first records, and checksums that do not say anything.
-fn with_record(whole: &[u8], record: &[u8]) -> Vec<u8> {
-    let (mut at, mut file) = (MAGIC, whole[..MAGIC].to_vec());
+fn with_record(recording: &[u8], record: &[u8]) -> Vec<u8> {
+    let (mut at, mut file) = (MAGIC_LEN, recording[..MAGIC_LEN].to_vec());
     let mut is_in = false;
-    while at + 9 < whole.len() - MAGIC {
-        let len = u64::from_le_bytes(*whole[at + 1..].first_chunk().unwrap()) as usize;
-        let (opcode, end) = (whole[at], at + 9 + len);
+    while at + 9 < recording.len() - MAGIC_LEN {
+        let len = u64::from_le_bytes(*recording[at + 1..].first_chunk().unwrap()) as usize;
+        let (opcode, end) = (recording[at], at + 9 + len);
         if opcode == op::CHUNK && !is_in {
             file.extend_from_slice(record);
             is_in = true;
         }
-        file.extend_from_slice(&whole[at..end]);
+        file.extend_from_slice(&recording[at..end]);
         let place = file.len();
         match opcode {
             op::DATA_END => file[place - 4..].fill(0),
@@ -75,14 +75,14 @@ fn with_record(whole: &[u8], record: &[u8]) -> Vec<u8> {
         }
         at = end;
     }
-    file.extend_from_slice(&whole[at..]);
+    file.extend_from_slice(&recording[at..]);
     file
 }
 
-const MAGIC: usize = 8;
+const MAGIC_LEN: usize = 8;
 
 #[test]
-fn an_attachment_that_is_too_short_is_reported_and_dropped() {
+fn reports_and_drops_a_truncated_attachment() {
     let folder = TempDir::new().unwrap();
     let whole = crate::written::recording(8, 1);
     let telegrams = whole.telegrams.len() as u64;
@@ -98,7 +98,7 @@ fn an_attachment_that_is_too_short_is_reported_and_dropped() {
             let cut = record(op::ATTACHMENT, &body[..len]);
             let converted = convert_again(&folder, &with_record(&whole.bytes, &cut)).unwrap();
             assert_eq!(converted.telegrams, telegrams, "{len}: {converted:?}");
-            assert!(converted.damage.bytes > 0 && converted.damage.is_harmed, "{len}: {converted:?}");
+            assert!(converted.damage.bytes > 0 && converted.damage.is_damaged, "{len}: {converted:?}");
             assert_eq!(attachments(&copy(&folder)), 0, "{len}");
         }
     }
@@ -110,11 +110,11 @@ fn attachments(path: &Path) -> u32 {
 }
 
 #[test]
-fn no_content_of_a_record_causes_a_panic_or_costs_a_telegram() {
+fn malformed_record_never_panics_or_costs_a_telegram() {
     let folder = TempDir::new().unwrap();
     let whole = crate::written::recording(4, 2);
     let telegrams = whole.telegrams.len() as u64;
-    let (mut random, others) = (Rng::with_seed(3), others());
+    let (mut random, others) = (Rng::with_seed(3), foreign_records());
     for round in 0..400 {
         let (opcode, mut body) = others[random.usize(..others.len())].clone();
         for _ in 0..random.usize(1..4) {

@@ -7,12 +7,12 @@ use std::path::Path;
 
 use tempfile::TempDir;
 
-use crate::folder::{converted, file};
+use crate::folder::{convert_file, file};
 use crate::real;
 use scanhub_drivers::lms::measured;
 use scanhub_drivers::lms::reply;
 use scanhub_drivers::lms::variant::{Mode, Unit};
-use scanhub_recording::{Encoding, Frame, Recording, Unread};
+use scanhub_recording::{Encoding, Frame, Recording, UnreadLines};
 
 #[test]
 fn a_log_comes_back_from_an_mcap_file() {
@@ -26,14 +26,14 @@ fn a_log_comes_back_from_an_mcap_file() {
         .collect();
     let log = file(&folder, "a.log", log.as_bytes());
     let (mcap, again) = (folder.path().join("a.mcap"), folder.path().join("b.log"));
-    converted(&log, &mcap, None).unwrap();
+    convert_file(&log, &mcap, None).unwrap();
     // Millimetres up to 8.4 m do not go into 13 bits.
     let contents = Recording::open(&mcap).unwrap().contents().clone();
     assert_eq!(
         (contents.unit, contents.mode, &contents.sensors[0][..]),
         (Some(Unit::Mm), Some(Mode(4)), "front")
     );
-    converted(&mcap, &again, None).unwrap();
+    convert_file(&mcap, &again, None).unwrap();
     assert_eq!(sweeps(&again), sweeps(&log));
 }
 
@@ -62,26 +62,26 @@ fn sweeps(log: &Path) -> Vec<(Vec<i64>, i64)> {
 
 /// Converts `log` to MCAP and back, to a stream and back, and to one by the other: the same ranges everywhere, the same
 /// codes, and the same times where there are any.
-fn assert_comes_back(folder: &TempDir, name: &str, log: &Path) {
-    let there = |ending: &str| folder.path().join(format!("{name}{ending}"));
-    let (mcap, stream, both) = (there(".mcap"), there(".bin.gz"), there("-mcap.bin"));
-    converted(log, &mcap, None).unwrap();
-    converted(log, &stream, None).unwrap();
-    converted(&mcap, &both, None).unwrap();
+fn assert_round_trips(folder: &TempDir, name: &str, log: &Path) {
+    let path = |ending: &str| folder.path().join(format!("{name}{ending}"));
+    let (mcap, stream, both) = (path(".mcap"), path(".bin.gz"), path("-mcap.bin"));
+    convert_file(log, &mcap, None).unwrap();
+    convert_file(log, &stream, None).unwrap();
+    convert_file(&mcap, &both, None).unwrap();
     let original = sweeps(log);
     let own = Recording::open(log).unwrap();
-    for (way, has_times) in [(&mcap, true), (&stream, false), (&both, false)] {
-        let again = there(&format!("-{}.log.gz", way.extension().unwrap().display()));
+    for (file_name, has_times) in [(&mcap, true), (&stream, false), (&both, false)] {
+        let again = path(&format!("-{}.log.gz", file_name.extension().unwrap().display()));
         let _ = fs::remove_file(&again);
-        converted(way, &again, None).unwrap();
+        convert_file(file_name, &again, None).unwrap();
         let back = sweeps(&again);
-        assert_eq!(back.len(), original.len(), "{}", way.display());
+        assert_eq!(back.len(), original.len(), "{}", file_name.display());
         for (number, (one, other)) in original.iter().zip(&back).enumerate() {
-            assert!(one.0 == other.0, "{}, scan {number}", way.display());
-            assert!(!has_times || one.1 == 0 || one.1 == other.1, "{}, scan {number}", way.display());
+            assert!(one.0 == other.0, "{}, scan {number}", file_name.display());
+            assert!(!has_times || one.1 == 0 || one.1 == other.1, "{}, scan {number}", file_name.display());
         }
         // And the way there has the words and codes that the log itself is read as.
-        let recording = Recording::open(way).unwrap();
+        let recording = Recording::open(file_name).unwrap();
         assert_eq!(recording.encoding(), own.encoding());
         let words = |recording: &Recording| -> Vec<_> {
             let frames = recording.telegrams(recording.encoding().unwrap()).unwrap();
@@ -112,7 +112,7 @@ fn ranges_and_codes_of_every_kind_of_log_come_back() {
         ("mm-15", 181, &["1.234", "32.767", "32.759", "32.763", "20.001"]),
     ] {
         let log = file(&folder, &format!("{name}.log"), log(count, ranges).as_bytes());
-        assert_comes_back(&folder, name, &log);
+        assert_round_trips(&folder, name, &log);
     }
     let sensor = "0 -1.570796 3.141593 0.017453 81.91 0.01 0";
     let both: String = (0..3)
@@ -129,7 +129,7 @@ fn ranges_and_codes_of_every_kind_of_log_come_back() {
     for word in ["RAWLASER1", "ROBOTLASER1"] {
         let lines: String =
             both.lines().filter(|line| line.starts_with(word)).map(|line| format!("{line}\n")).collect();
-        assert_comes_back(&folder, word, &file(&folder, &format!("{word}.log"), lines.as_bytes()));
+        assert_round_trips(&folder, word, &file(&folder, &format!("{word}.log"), lines.as_bytes()));
     }
 }
 
@@ -146,8 +146,8 @@ fn times_come_back_to_the_microsecond() {
         })
         .collect();
     let (mcap, again) = (folder.path().join("a.mcap"), folder.path().join("b.log"));
-    converted(&file(&folder, "a.log", log.as_bytes()), &mcap, None).unwrap();
-    converted(&mcap, &again, None).unwrap();
+    convert_file(&file(&folder, "a.log", log.as_bytes()), &mcap, None).unwrap();
+    convert_file(&mcap, &again, None).unwrap();
     let again = fs::read_to_string(again).unwrap();
     let times = |log: &str| -> Vec<String> {
         let scans = log.lines().filter(|line| line.starts_with("FLASER"));
@@ -174,71 +174,75 @@ fn counts_the_data_of_a_log_that_no_telegram_holds() {
         format!("ROBOTLASER1 {sensor} 181{ranges} 0 1 2 3 1 2 3 0 0 0 0 0 12.7 host 1\n"),
     ];
     let log = file(&folder, "a.log", log.concat().as_bytes());
-    let unread = Unread { poses: 2, odometry: 2, remissions: 0, lines: 2 };
+    let unread = UnreadLines { poses: 2, odometry: 2, remissions: 0, lines: 2 };
     assert_eq!(unread.to_string(), "2 poses, 2 lines of odometry, 2 other lines");
     for output in ["a.mcap", "a.bin", "b.log", "a.csv"] {
-        let account = converted(&log, &folder.path().join(output), None).unwrap();
-        assert_eq!((account.scans, account.unread), (3, unread), "{output}");
+        let result = convert_file(&log, &folder.path().join(output), None).unwrap();
+        assert_eq!((result.scans, result.unread), (3, unread), "{output}");
     }
-    assert_eq!(Recording::open(folder.path().join("a.mcap")).unwrap().contents().unread, Unread::default());
+    assert_eq!(
+        Recording::open(folder.path().join("a.mcap")).unwrap().contents().unread,
+        UnreadLines::default()
+    );
     let lines: String = (0..2)
         .map(|at| format!("RAWLASER1 {sensor} 181{ranges} 181{} 1{at}.5 host 1\n", " 9".repeat(181)))
         .collect();
-    let account =
-        converted(&file(&folder, "raw.log", lines.as_bytes()), &folder.path().join("raw.mcap"), None);
-    assert_eq!(account.unwrap().unread, Unread { remissions: 2, ..Unread::default() });
+    let result =
+        convert_file(&file(&folder, "raw.log", lines.as_bytes()), &folder.path().join("raw.mcap"), None);
+    assert_eq!(result.unwrap().unread, UnreadLines { remissions: 2, ..UnreadLines::default() });
 }
 
 #[test]
-fn the_reply_that_stands_for_an_encoding_is_not_left_out() {
+fn reply_with_the_encoding_is_not_counted_as_dropped() {
     let folder = TempDir::new().unwrap();
     let log = file(&folder, "a.log", log(181, &["1.234", "9.001"]).as_bytes());
-    let there = |name: &str| folder.path().join(name);
-    for way in ["a.mcap", "a.bin"] {
-        let account = converted(&log, &there(way), None).unwrap();
-        assert_eq!((account.telegrams, account.scans, account.dropped), (3, 3, 0), "{way}");
+    let path = |name: &str| folder.path().join(name);
+    for file_name in ["a.mcap", "a.bin"] {
+        let result = convert_file(&log, &path(file_name), None).unwrap();
+        assert_eq!((result.telegrams, result.scans, result.dropped), (3, 3, 0), "{file_name}");
         for output in ["log", "csv"] {
-            let account = converted(&there(way), &there(&format!("{way}.{output}")), None).unwrap();
-            assert_eq!((account.telegrams, account.scans, account.dropped), (3, 3, 0), "{way}, {output}");
+            let result =
+                convert_file(&path(file_name), &path(&format!("{file_name}.{output}")), None).unwrap();
+            assert_eq!((result.telegrams, result.scans, result.dropped), (3, 3, 0), "{file_name}, {output}");
         }
     }
     // Replies that a scanner sent are.
     let recorded = file(&folder, "hub.mcap", &crate::written::recording(20, 14).bytes);
     for output in ["hub.log", "hub.csv"] {
-        let account = converted(&recorded, &there(output), Some("front")).unwrap();
-        assert_eq!((account.telegrams, account.dropped), (18, 2), "{output}");
+        let result = convert_file(&recorded, &path(output), Some("front")).unwrap();
+        assert_eq!((result.telegrams, result.dropped), (18, 2), "{output}");
     }
 }
 
 #[test]
-fn a_range_where_others_have_codes_stays_a_range_on_its_way_through_a_log() {
+fn range_of_14_bits_survives_a_log_round_trip() {
     let folder = TempDir::new().unwrap();
     // 8.185 m in 14 bits; in 13 bits it would be a code.
     let scan = measured::encode(0, Unit::Mm, &[8185; 181], 0x10);
-    let told = reply::configuration(0, Mode(4), Unit::Mm, 0x10);
-    let stream = file(&folder, "a.bin", &[told.bytes(), scan.bytes()].concat());
+    let configuration = reply::configuration_reply(0, Mode(4), Unit::Mm, 0x10);
+    let stream = file(&folder, "a.bin", &[configuration.bytes(), scan.bytes()].concat());
     let log = folder.path().join("a.log");
-    converted(&stream, &log, None).unwrap();
+    convert_file(&stream, &log, None).unwrap();
     let recording = Recording::open(&log).unwrap();
     assert_eq!(recording.encoding(), Some(Encoding { unit: Unit::Mm, mode: Mode(4) }));
-    assert_comes_back(&folder, "b", &log);
+    assert_round_trips(&folder, "b", &log);
 }
 
 #[test]
-fn a_log_that_no_sensor_could_have_sent_is_refused_with_the_reason() {
+fn refuses_to_convert_unencodable_log_with_reason() {
     let folder = TempDir::new().unwrap();
-    for (name, ranges, says) in [
+    for (name, ranges, message) in [
         ("fine", &["1.23456", "2"][..], "ranges are finer"),
         ("far", &["1.234", "2", "81.91"], "ranges are finer"),
         ("farther", &["1.5", "1000.0"], "too long"),
     ] {
         let input = file(&folder, &format!("{name}.log"), log(361, ranges).as_bytes());
         for output in ["out.mcap", "out.bin", "out.log"] {
-            let failure = converted(&input, &folder.path().join(output), None).unwrap_err();
+            let failure = convert_file(&input, &folder.path().join(output), None).unwrap_err();
             assert_eq!(failure.kind.exit_code(), 66);
             let all = format!("{failure} {}", failure.hint);
             assert!(all.contains("cannot become telegrams without loss"), "{name}: {all}");
-            assert!(all.contains(says), "{name}: {all}");
+            assert!(all.contains(message), "{name}: {all}");
         }
         // It can be played all the same.
         let recording = Recording::open(&input).unwrap();
@@ -248,11 +252,11 @@ fn a_log_that_no_sensor_could_have_sent_is_refused_with_the_reason() {
 }
 
 #[test]
-fn a_log_in_an_mcap_file_says_how_long_each_scan_stands() {
+fn mcap_from_log_has_the_period_of_each_scan() {
     let folder = TempDir::new().unwrap();
     let log = file(&folder, "a.log", log(181, &["1.5"]).as_bytes());
     let mcap = folder.path().join("a.mcap");
-    converted(&log, &mcap, None).unwrap();
+    convert_file(&log, &mcap, None).unwrap();
     let recording = Recording::open(&mcap).unwrap();
     let frames: Vec<Frame> = recording.telegrams(recording.encoding().unwrap()).unwrap().collect();
     let periods: Vec<_> = frames.iter().map(|frame| frame.header.unwrap().period_us).collect();
@@ -269,7 +273,7 @@ fn logs_of_real_sensors_come_back() {
     let Some(data) = real::recordings() else { return };
     let folder = TempDir::new().unwrap();
     for name in ["aces", "freiburg-079", "intel", "orebro"] {
-        assert_comes_back(&folder, name, &data.join(format!("carmen/{name}-corrected.log.gz")));
+        assert_round_trips(&folder, name, &data.join(format!("carmen/{name}-corrected.log.gz")));
         let (scans, own) = (sweeps(&data.join(format!("carmen/{name}-corrected.log.gz"))), {
             Recording::open(data.join(format!("carmen/{name}-corrected.log.gz"))).unwrap().encoding()
         });

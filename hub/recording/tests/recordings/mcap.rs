@@ -2,12 +2,12 @@
 
 use std::fs;
 
-use crate::written::{Known, SENSORS};
+use crate::written::{SENSOR_NAMES, WrittenTelegram};
 use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
 use scanhub_recording::{Encoding, Form, Recording};
 use tempfile::NamedTempFile;
 
-const MM: Encoding = Encoding { unit: Unit::Mm, mode: Mode(1) };
+const MM_ENCODING: Encoding = Encoding { unit: Unit::Mm, mode: Mode(1) };
 
 /// Creates a temporary file with these bytes.
 fn file(bytes: &[u8]) -> NamedTempFile {
@@ -17,13 +17,13 @@ fn file(bytes: &[u8]) -> NamedTempFile {
 }
 
 /// The telegrams of `sensor` as `recording` gives them.
-fn read(recording: &Recording, sensor: &'static str) -> Vec<Known> {
-    let frames = recording.of(sensor).unwrap().telegrams(MM).unwrap();
+fn read(recording: &Recording, sensor: &'static str) -> Vec<WrittenTelegram> {
+    let frames = recording.of(sensor).unwrap().telegrams(MM_ENCODING).unwrap();
     frames
         .map(|frame| {
             let header = frame.header.unwrap();
             assert_eq!(frame.wall_ns, Some(header.wall_ns));
-            Known { sensor, header, telegram: frame.telegram }
+            WrittenTelegram { sensor, header, telegram: frame.telegram }
         })
         .collect()
 }
@@ -35,18 +35,18 @@ fn each_sensor_has_its_telegrams() {
     let recording = Recording::open(file.path()).unwrap();
     let contents = recording.contents();
     assert_eq!((contents.form, contents.telegrams, contents.scans), (Form::Mcap, 40, 36));
-    assert_eq!(contents.sensors, SENSORS);
+    assert_eq!(contents.sensors, SENSOR_NAMES);
     let [first, .., last] = &written.telegrams[..] else { panic!("no telegrams") };
     assert_eq!(contents.span, Some((first.header.wall_ns, last.header.wall_ns)));
     assert!(contents.damage.is_none(), "{}", contents.damage);
-    for sensor in SENSORS {
+    for sensor in SENSOR_NAMES {
         let of_sensor: Vec<_> = written.telegrams.iter().filter(|known| known.sensor == sensor).collect();
         assert!(read(&recording, sensor).iter().eq(of_sensor));
         let part = recording.of(sensor).unwrap();
         assert_eq!((part.contents().telegrams, part.contents().sensors.len()), (20, 1));
-        let told = (part.contents().variant, part.contents().unit, part.contents().mode);
+        let settings = (part.contents().variant, part.contents().unit, part.contents().mode);
         let full = Variant::of_beams(181);
-        assert_eq!(told, (full, Some(Unit::Mm), Some(Mode(4))));
+        assert_eq!(settings, (full, Some(Unit::Mm), Some(Mode(4))));
     }
 }
 
@@ -54,7 +54,8 @@ fn each_sensor_has_its_telegrams() {
 fn a_sensor_has_to_be_chosen_of_several() {
     let file = file(&crate::written::recording(4, 2).bytes);
     let recording = Recording::open(file.path()).unwrap();
-    let refused = [(recording.telegrams(MM).err().unwrap(), 2), (recording.of("left").unwrap_err(), 3)];
+    let refused =
+        [(recording.telegrams(MM_ENCODING).err().unwrap(), 2), (recording.of("left").unwrap_err(), 3)];
     for (failure, code) in refused {
         assert_eq!(failure.kind.exit_code(), code);
         assert_eq!(failure.hint, "choose one: front, rear");
@@ -63,11 +64,11 @@ fn a_sensor_has_to_be_chosen_of_several() {
 
 /// A recorder that was killed leaves whole chunks.
 #[test]
-fn what_was_written_before_a_kill_is_there() {
+fn reads_a_recording_truncated_by_a_kill() {
     let written = crate::written::recording(20, 3);
     let file = file(&written.bytes[..written.bytes.len() / 2]);
     let recording = Recording::open(file.path()).unwrap();
-    assert!(recording.contents().damage.is_cut);
+    assert!(recording.contents().damage.is_truncated);
     let rear = read(&recording, "rear");
     assert!(rear.len() >= 8, "{}", rear.len());
     assert!(rear.iter().eq(written.telegrams.iter().filter(|known| known.sensor == "rear").take(rear.len())));

@@ -6,36 +6,36 @@ use std::path::Path;
 
 use tempfile::TempDir;
 
-use crate::folder::{converted, file};
-use crate::written::{self, Known, SENSORS, Written};
+use crate::folder::{convert_file, file};
+use crate::written::{self, SENSOR_NAMES, WrittenRecording, WrittenTelegram};
 use bytemuck::bytes_of;
 use scanhub_drivers::lms::measured;
 use scanhub_drivers::lms::variant::{Mode, Unit};
 use scanhub_recording::convert::{ConvertOptions, convert};
 use scanhub_recording::{Encoding, Form, Recording};
-use scanhub_schema::datagram::Packed;
-use scanhub_schema::file::{ENCODING, ENCODING_V1, Foreign, Writer};
+use scanhub_schema::datagram::DatagramPayload;
+use scanhub_schema::file::{ENCODING, ENCODING_V1, ForeignChannel, Writer};
 use scanhub_schema::{Header, Kind, Scan, ScanHead, Topic};
 
-const MM: Encoding = Encoding { unit: Unit::Mm, mode: Mode(1) };
+const MM_ENCODING: Encoding = Encoding { unit: Unit::Mm, mode: Mode(1) };
 
 /// The telegrams of all sensors in the file at `path`, with their headers.
-fn telegrams(path: &Path) -> Vec<Known> {
+fn telegrams(path: &Path) -> Vec<WrittenTelegram> {
     let recording = Recording::open(path).unwrap();
     let of_sensor = |sensor: &'static str| {
-        let frames: Vec<_> = recording.of(sensor).unwrap().telegrams(MM).unwrap().collect();
-        frames.into_iter().map(move |frame| Known {
+        let frames: Vec<_> = recording.of(sensor).unwrap().telegrams(MM_ENCODING).unwrap().collect();
+        frames.into_iter().map(move |frame| WrittenTelegram {
             sensor,
             header: frame.header.unwrap(),
             telegram: frame.telegram,
         })
     };
-    SENSORS.into_iter().flat_map(of_sensor).collect()
+    SENSOR_NAMES.into_iter().flat_map(of_sensor).collect()
 }
 
-fn in_order_of_sensors(written: &Written) -> Vec<Known> {
+fn sorted_by_sensor(written: &WrittenRecording) -> Vec<WrittenTelegram> {
     let of_sensor = |sensor| written.telegrams.iter().filter(move |known| known.sensor == sensor).cloned();
-    SENSORS.into_iter().flat_map(of_sensor).collect()
+    SENSOR_NAMES.into_iter().flat_map(of_sensor).collect()
 }
 
 /// Encoding of the channel and data of all messages.
@@ -49,16 +49,16 @@ fn messages(bytes: &[u8]) -> Vec<(String, String, Vec<u8>)> {
 #[test]
 fn its_telegrams_are_all_there() {
     let folder = TempDir::new().unwrap();
-    let (old, new) = (written::of_version_1(20, 21, &Topic::ALL), written::recording(20, 21));
+    let (old, new) = (written::recording_of_version_1(20, 21, &Topic::ALL), written::recording(20, 21));
     assert_eq!(old.telegrams, new.telegrams, "both say the same");
     let (file, copy) = (file(&folder, "old.mcap", &old.bytes), folder.path().join("copy.mcap"));
     let contents = Recording::open(&file).unwrap().contents().clone();
     assert_eq!((contents.form, contents.telegrams, contents.scans), (Form::Mcap, 40, 36));
-    assert_eq!((&contents.sensors[..], contents.mode), (&SENSORS.map(String::from)[..], Some(Mode(4))));
+    assert_eq!((&contents.sensors[..], contents.mode), (&SENSOR_NAMES.map(String::from)[..], Some(Mode(4))));
     assert!(contents.damage.is_none(), "{}", contents.damage);
-    assert_eq!(telegrams(&file), in_order_of_sensors(&old));
+    assert_eq!(telegrams(&file), sorted_by_sensor(&old));
     // A copy has all of it as it was; its telegrams are those of any version.
-    converted(&file, &copy, None).unwrap();
+    convert_file(&file, &copy, None).unwrap();
     let (kept, all) = (messages(&fs::read(&copy).unwrap()), messages(&old.bytes));
     assert_eq!(kept.len(), all.len());
     for ((topic, encoding, data), (its_topic, its_encoding, its_data)) in kept.iter().zip(&all) {
@@ -67,19 +67,19 @@ fn its_telegrams_are_all_there() {
         assert_eq!(encoding, if is_telegram { ENCODING } else { its_encoding }, "{topic}");
         assert!(topic == "/imu" || its_encoding == ENCODING_V1);
     }
-    assert_eq!(telegrams(&copy), in_order_of_sensors(&old));
+    assert_eq!(telegrams(&copy), sorted_by_sensor(&old));
 }
 
 #[test]
 fn its_scans_are_those_of_its_telegrams() {
     let folder = TempDir::new().unwrap();
-    let payload = written::scan_of_version_1();
+    let payload = written::version_1_scan();
     assert!(Scan::room(&payload).is_some(), "nothing but the encoding says that it is none of today");
-    let old = file(&folder, "old.mcap", &written::of_version_1(20, 22, &Topic::ALL).bytes);
+    let old = file(&folder, "old.mcap", &written::recording_of_version_1(20, 22, &Topic::ALL).bytes);
     let new = file(&folder, "new.mcap", &written::recording(20, 22).bytes);
     let rows = |file: &Path, name: &str| {
         let out = folder.path().join(name);
-        assert_eq!(converted(file, &out, Some("rear")).unwrap().scans, 18);
+        assert_eq!(convert_file(file, &out, Some("rear")).unwrap().scans, 18);
         fs::read_to_string(out).unwrap()
     };
     let expected = rows(&new, "new.csv");
@@ -99,8 +99,12 @@ fn its_scans_are_those_of_its_telegrams() {
 #[test]
 fn without_telegrams_there_is_nothing_to_convert() {
     let folder = TempDir::new().unwrap();
-    let old = file(&folder, "old.mcap", &written::of_version_1(4, 23, &[Topic::Scan, Topic::Status]).bytes);
-    let failure = converted(&old, &folder.path().join("out.csv"), Some("front")).unwrap_err();
+    let old = file(
+        &folder,
+        "old.mcap",
+        &written::recording_of_version_1(4, 23, &[Topic::Scan, Topic::Status]).bytes,
+    );
+    let failure = convert_file(&old, &folder.path().join("out.csv"), Some("front")).unwrap_err();
     assert_eq!(failure.kind, Kind::Input);
     assert!(failure.message.starts_with("there is no scan in "), "{failure}");
 }
@@ -108,23 +112,23 @@ fn without_telegrams_there_is_nothing_to_convert() {
 /// Telegrams of values that no two people would split alike, beside the published scan: one of today says how to read them,
 /// and is taken; one of version 1 is not asked, and that is refused, not guessed.
 #[test]
-fn its_scans_do_not_stand_in_for_telegrams_that_cannot_be_read() {
+fn version_1_scan_does_not_define_the_measuring_mode() {
     let folder = TempDir::new().unwrap();
     let telegram = measured::encode(0, Unit::Mm, &[0x3FFF; 181], 0x10).bytes().to_vec();
     let made = |encoding, scan: &[u8]| {
         let mut writer = Writer::begin(Vec::new(), "", Default::default()).unwrap();
         for (topic, payload) in [("front/telegram", &telegram[..]), ("front/scan", scan)] {
-            let channel = Foreign { topic, encoding, schema: ("any", "", encoding), metadata: &[] };
-            let channel = writer.channel(&channel).unwrap();
+            let channel = ForeignChannel { topic, encoding, schema: ("any", "", encoding), metadata: &[] };
+            let channel = writer.add_channel(&channel).unwrap();
             let message = [bytes_of(&Header::default()), payload].concat();
-            writer.message(channel, 0, 0, &message).unwrap();
+            writer.write_message(channel, 0, 0, &message).unwrap();
         }
         file(&folder, "in.mcap", &writer.finish().unwrap())
     };
-    let converted = |file: &Path, name: &str| converted(file, &folder.path().join(name), Some("front"));
+    let converted = |file: &Path, name: &str| convert_file(file, &folder.path().join(name), Some("front"));
     let today = Scan::of(ScanHead::lms(181, -90_000, 1000, 1, 13), &[700; 181]);
     assert_eq!(converted(&made(ENCODING, today.bytes()), "today.csv").unwrap().scans, 1);
-    let failure = converted(&made(ENCODING_V1, &written::scan_of_version_1()), "old.csv").unwrap_err();
+    let failure = converted(&made(ENCODING_V1, &written::version_1_scan()), "old.csv").unwrap_err();
     assert_eq!(failure.kind, Kind::Configuration);
     assert!(failure.message.ends_with("does not contain the measuring mode of front"), "{failure}");
 }

@@ -30,7 +30,7 @@ pub enum Model {
 
 /// Format of a mode's points: the type in its descriptor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Form {
+pub enum PacketFormat {
     /// 0x81: one point in 5 bytes.
     Standard,
     /// 0x82: 32 points in 84 bytes, with a correction of each angle.
@@ -51,7 +51,7 @@ pub struct Mode {
     /// Time from one point to the next in microseconds, as the scanner reports it. A real A1 takes 0.7 % longer.
     pub sample_us: f64,
     /// Format of its points.
-    pub form: Form,
+    pub form: PacketFormat,
     /// Maximum range that the scanner reports, in meters.
     pub reach_m: f64,
 }
@@ -67,36 +67,36 @@ pub(crate) enum Motor {
     Rpm,
 }
 
-impl Form {
+impl PacketFormat {
     /// Returns the type in the descriptor.
-    pub fn answer(self) -> u8 {
+    pub fn response_type(self) -> u8 {
         match self {
-            Form::Standard => 0x81,
-            Form::Express => 0x82,
-            Form::Ultra => 0x84,
-            Form::Dense => 0x85,
-            Form::UltraDense => 0x86,
+            PacketFormat::Standard => 0x81,
+            PacketFormat::Express => 0x82,
+            PacketFormat::Ultra => 0x84,
+            PacketFormat::Dense => 0x85,
+            PacketFormat::UltraDense => 0x86,
         }
     }
 
     /// Returns the number of bytes in a packet.
     pub fn packet_len(self) -> usize {
         match self {
-            Form::Standard => 5,
-            Form::Express | Form::Dense => 84,
-            Form::Ultra => 132,
-            Form::UltraDense => 170,
+            PacketFormat::Standard => 5,
+            PacketFormat::Express | PacketFormat::Dense => 84,
+            PacketFormat::Ultra => 132,
+            PacketFormat::UltraDense => 170,
         }
     }
 
     /// Returns the number of points in a packet.
     pub fn points(self) -> usize {
         match self {
-            Form::Standard => 1,
-            Form::Express => 32,
-            Form::Ultra => 96,
-            Form::Dense => 40,
-            Form::UltraDense => 64,
+            PacketFormat::Standard => 1,
+            PacketFormat::Express => 32,
+            PacketFormat::Ultra => 96,
+            PacketFormat::Dense => 40,
+            PacketFormat::UltraDense => 64,
         }
     }
 }
@@ -169,7 +169,7 @@ impl Model {
 
     /// Returns the revolutions per second with factory settings. A real A1 sent 1,954 points per second, and 264 to 267 of them per
     /// revolution.
-    pub fn turns_per_second(self) -> f64 {
+    pub fn revolutions_per_second(self) -> f64 {
         if self == Model::A1 { 7.36 } else { 10.0 }
     }
 
@@ -214,12 +214,12 @@ impl Model {
 
     /// Returns the length of the scanner's microsecond in microseconds of the host: a real A1 reported 508 us per point, and sent
     /// 1,954 points per second.
-    pub(crate) fn slowness(self) -> f64 {
+    pub(crate) fn clock_ratio(self) -> f64 {
         if self == Model::A1 { 1.0 / (508e-6 * 1_954.0) } else { 1.0 }
     }
 }
 
-const fn mode(name: &'static str, sample_us: f64, form: Form, reach_m: f64) -> Mode {
+const fn mode(name: &'static str, sample_us: f64, form: PacketFormat, reach_m: f64) -> Mode {
     Mode { name, sample_us, form, reach_m }
 }
 
@@ -227,11 +227,11 @@ const fn mode(name: &'static str, sample_us: f64, form: Form, reach_m: f64) -> M
 /// Stability.
 const fn modes(us: f64, stable_us: f64, reach_m: f64, fast_reach_m: f64) -> [Mode; 5] {
     [
-        mode("Standard", 4.0 * us, Form::Standard, reach_m),
-        mode("Express", 2.0 * us, Form::Express, reach_m),
-        mode("Boost", us, Form::Ultra, fast_reach_m),
-        mode("Sensitivity", us, Form::Ultra, fast_reach_m),
-        mode("Stability", stable_us, Form::Ultra, fast_reach_m),
+        mode("Standard", 4.0 * us, PacketFormat::Standard, reach_m),
+        mode("Express", 2.0 * us, PacketFormat::Express, reach_m),
+        mode("Boost", us, PacketFormat::Ultra, fast_reach_m),
+        mode("Sensitivity", us, PacketFormat::Ultra, fast_reach_m),
+        mode("Stability", stable_us, PacketFormat::Ultra, fast_reach_m),
     ]
 }
 
@@ -240,17 +240,19 @@ const MODES_A2M12: [Mode; 5] = modes(63.0, 100.0, 12.0, 12.0);
 const MODES_A3: [Mode; 5] = modes(63.0, 100.0, 16.0, 25.0);
 /// The rate of the line limits the standard mode.
 const MODES_S1: [Mode; 3] = [
-    mode("Standard", 217.0, Form::Standard, 16.0),
-    mode("Express", 108.5, Form::Express, 16.0),
-    mode("DenseBoost", 108.5, Form::Dense, 40.0),
+    mode("Standard", 217.0, PacketFormat::Standard, 16.0),
+    mode("Express", 108.5, PacketFormat::Express, 16.0),
+    mode("DenseBoost", 108.5, PacketFormat::Dense, 40.0),
 ];
 const MODES_S3: [Mode; 3] = [
-    mode("Standard", 62.5, Form::Standard, 16.0),
-    mode("DenseBoost", 31.25, Form::Dense, 40.0),
-    mode("UltraDense", 31.25, Form::UltraDense, 40.0),
+    mode("Standard", 62.5, PacketFormat::Standard, 16.0),
+    mode("DenseBoost", 31.25, PacketFormat::Dense, 40.0),
+    mode("UltraDense", 31.25, PacketFormat::UltraDense, 40.0),
 ];
-const MODES_C1: [Mode; 2] =
-    [mode("Standard", 200.0, Form::Standard, 16.0), mode("DenseBoost", 200.0, Form::Dense, 16.0)];
+const MODES_C1: [Mode; 2] = [
+    mode("Standard", 200.0, PacketFormat::Standard, 16.0),
+    mode("DenseBoost", 200.0, PacketFormat::Dense, 16.0),
+];
 
 /// A request of a host.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -290,13 +292,13 @@ impl Decoder {
     /// Adds a byte, and returns the request that it completes. Requests with a wrong checksum, a wrong length or an
     /// unknown command are dropped.
     pub(crate) fn receive(&mut self, byte: u8) -> Option<Request> {
-        if self.bytes.is_empty() && byte != START {
+        if self.bytes.is_empty() && byte != REQUEST_START {
             return None;
         }
         self.bytes.push(byte);
         let (&command, payload) = match &self.bytes[..] {
             [_] => return None,
-            [_, command] if command & PAYLOAD == 0 => (command, &[][..]),
+            [_, command] if command & PAYLOAD_FLAG == 0 => (command, &[][..]),
             [_, command, len, payload @ ..] if payload.len() == usize::from(*len) + 1 => (command, payload),
             _ => return None,
         };
@@ -340,18 +342,18 @@ impl Request {
 
 /// Encodes a descriptor: `A5 5A`, the length of a response in 30 bits, 2 bits that announce further responses, and the
 /// type.
-fn descriptor(len: usize, follows: bool, answer: u8) -> Vec<u8> {
-    let word = len as u32 | u32::from(follows) << 30;
-    [&[0xA5, 0x5A][..], &word.to_le_bytes(), &[answer]].concat()
+fn descriptor(len: usize, has_more: bool, response_type: u8) -> Vec<u8> {
+    let word = len as u32 | u32::from(has_more) << 30;
+    [&[0xA5, 0x5A][..], &word.to_le_bytes(), &[response_type]].concat()
 }
 
-fn answer(data: &[u8], kind: u8) -> Vec<u8> {
-    [descriptor(data.len(), false, kind), data.to_vec()].concat()
+fn response(data: &[u8], response_type: u8) -> Vec<u8> {
+    [descriptor(data.len(), false, response_type), data.to_vec()].concat()
 }
 
 /// Encodes the descriptor before the packets of a stream in `mode`.
 pub(crate) fn stream_descriptor(mode: &Mode) -> Vec<u8> {
-    descriptor(mode.form.packet_len(), true, mode.form.answer())
+    descriptor(mode.form.packet_len(), true, mode.form.response_type())
 }
 
 /// Encodes the number `id` of the model, firmware, hardware, and a serial number that `seed` selects.
@@ -359,19 +361,19 @@ pub(crate) fn info(model: Model, id: u8, seed: u64) -> Vec<u8> {
     let ([major, minor], hardware) = model.versions();
     let mut random = fastrand::Rng::with_seed(seed ^ u64::from(model.id()) << 32);
     let serial: [u8; 16] = std::array::from_fn(|_| random.u8(..));
-    answer(&[&[id, minor, major, hardware][..], &serial].concat(), 0x04)
+    response(&[&[id, minor, major, hardware][..], &serial].concat(), 0x04)
 }
 
 /// Encodes a health status (0 good, 1 warning, 2 error) and a code.
 pub(crate) fn health(status: u8, code: u16) -> Vec<u8> {
     let [low, high] = code.to_le_bytes();
-    answer(&[status, low, high], 0x06)
+    response(&[status, low, high], 0x06)
 }
 
 /// Encodes the time per point in the standard mode and in the first express mode, in microseconds.
 pub(crate) fn sample_rate(model: Model) -> Vec<u8> {
     let micros = |number: usize| (model.modes()[number].sample_us.round() as u16).to_le_bytes();
-    answer(&[micros(0), micros(1)].concat(), 0x15)
+    response(&[micros(0), micros(1)].concat(), 0x15)
 }
 
 /// Encodes the value of `key` for mode number `mode`. Returns `None` if the scanner does not have this key or mode.
@@ -381,28 +383,28 @@ pub(crate) fn configuration(model: Model, typical: usize, key: u32, mode: u16) -
     let value = match key {
         // Recommended revolutions per minute, and the duty cycle for them.
         0x01 => {
-            let rpm = (60.0 * model.turns_per_second()).round() as u16;
-            [rpm.to_le_bytes(), PWM.to_le_bytes()].concat()
+            let rpm = (60.0 * model.revolutions_per_second()).round() as u16;
+            [rpm.to_le_bytes(), DEFAULT_PWM.to_le_bytes()].concat()
         }
         0x70 => (model.modes().len() as u16).to_le_bytes().to_vec(),
         0x71 => eighths(of?.sample_us),
         0x74 => eighths(of?.reach_m),
-        0x75 => vec![of?.form.answer()],
+        0x75 => vec![of?.form.response_type()],
         0x7C => (typical as u16).to_le_bytes().to_vec(),
         0x7F => [of?.name.as_bytes(), &[0]].concat(),
         _ => return None,
     };
-    Some(answer(&[&key.to_le_bytes()[..], &value].concat(), 0x20))
+    Some(response(&[&key.to_le_bytes()[..], &value].concat(), 0x20))
 }
 
 /// Encodes the confirmation that a value of the configuration was stored.
-pub(crate) fn is_set(key: u32) -> Vec<u8> {
-    answer(&[key.to_le_bytes(), 0u32.to_le_bytes()].concat(), 0x21)
+pub(crate) fn configuration_stored(key: u32) -> Vec<u8> {
+    response(&[key.to_le_bytes(), 0u32.to_le_bytes()].concat(), 0x21)
 }
 
 /// Encodes the capabilities of the accessory board: bit 0 means that it controls the motor.
-pub(crate) fn board(steers: bool) -> Vec<u8> {
-    answer(&[u8::from(steers), 0, 0, 0], 0xFF)
+pub(crate) fn accessory_board(controls_motor: bool) -> Vec<u8> {
+    response(&[u8::from(controls_motor), 0, 0, 0], 0xFF)
 }
 
 /// Encodes the boot message of a scanner that reports `id` as its model: 64 bytes of ASCII.
@@ -428,42 +430,42 @@ pub(crate) struct Reading {
     /// Strength of the return, 0 to 255; 0 means no return.
     pub(crate) quality: u8,
     /// Whether the point is the first one of a revolution.
-    pub(crate) begins_turn: bool,
+    pub(crate) begins_revolution: bool,
 }
 
 /// Encodes a packet of type 0x81: quality and the flag of a new revolution with its inverse, the angle in 1/64 degree
 /// with a bit that is always 1, and the range in 1/4 millimeter.
 pub(crate) fn standard(reading: &Reading) -> Vec<u8> {
-    let flags = if reading.begins_turn { 0b01 } else { 0b10 };
+    let flags = if reading.begins_revolution { 0b01 } else { 0b10 };
     let angle = sixty_fourths(reading.clockwise_deg) << 1 | 1;
     let mut packet = vec![reading.quality & 0xFC | flags];
     packet.extend(angle.to_le_bytes());
-    packet.extend(quarters(reading.range_mm).to_le_bytes());
+    packet.extend(quarter_mm(reading.range_mm).to_le_bytes());
     packet
 }
 
 /// Encodes a packet of type 0x82: 16 pairs of points. Each point has its range, and its lag behind the head's angle, in
 /// 1/8 degree. The lag has 6 bits, and its upper two are the lowest bits of the range's word.
 pub(crate) fn express(is_first: bool, readings: &[Reading]) -> Vec<u8> {
-    let mut body = head(is_first, readings);
+    let mut body = start_angle(is_first, readings);
     for pair in readings.chunks(2) {
         let mut nibbles = 0;
         for (place, reading) in pair.iter().enumerate() {
             let behind_deg = (reading.head_deg - reading.clockwise_deg + 360.0) % 360.0;
             let behind = (behind_deg * 8.0).round().min(63.0) as u16;
-            body.extend((quarters(reading.range_mm) | behind >> 4).to_le_bytes());
+            body.extend((quarter_mm(reading.range_mm) | behind >> 4).to_le_bytes());
             nibbles |= (behind as u8 & 0x0F) << (4 * place);
         }
         body.push(nibbles);
     }
-    sealed(body)
+    with_checksum(body)
 }
 
 /// Encodes a packet of type 0x84: 32 words. Each word has one range of 12 bits, on a scale whose steps grow with the
 /// range. Two differences of 10 bits follow, in steps of that scale: one from this range, and one from the range of the
 /// next word. A range that no difference reaches becomes no return. `next` is the first range of the next packet.
 pub(crate) fn ultra(is_first: bool, readings: &[Reading], next: &Reading) -> Vec<u8> {
-    let mut body = head(is_first, readings);
+    let mut body = start_angle(is_first, readings);
     let majors: Vec<u16> =
         readings.iter().step_by(3).chain([next]).map(|first| scaled(first.range_mm)).collect();
     for (cabin, pair) in readings.chunks(3).zip(majors.windows(2)) {
@@ -474,14 +476,14 @@ pub(crate) fn ultra(is_first: bool, readings: &[Reading], next: &Reading) -> Vec
             | predicted(cabin[2].range_mm, there) << 22;
         body.extend(word.to_le_bytes());
     }
-    sealed(body)
+    with_checksum(body)
 }
 
 /// Encodes a packet of type 0x85: 40 ranges in millimeters.
 pub(crate) fn dense(is_first: bool, readings: &[Reading]) -> Vec<u8> {
-    let mut body = head(is_first, readings);
+    let mut body = start_angle(is_first, readings);
     body.extend(readings.iter().flat_map(|reading| reading.range_mm.to_le_bytes()));
-    sealed(body)
+    with_checksum(body)
 }
 
 /// Encodes a packet of type 0x86: the scanner's clock and state, and 32 pairs of 20 bits. Each point has a scale of 2
@@ -490,23 +492,23 @@ pub(crate) fn ultra_dense(is_first: bool, clock: u32, readings: &[Reading]) -> V
     let mut body = clock.to_le_bytes().to_vec();
     // The state of the scanner. The vendor's headers name it, without its values.
     body.extend([0, 0]);
-    body.extend(head(is_first, readings));
+    body.extend(start_angle(is_first, readings));
     for pair in readings.chunks(2) {
         let values = [twenty_bits(&pair[0]), twenty_bits(&pair[1])];
         values.iter().for_each(|value| body.extend((*value as u16).to_le_bytes()));
         body.push((values[0] >> 16 | values[1] >> 16 << 4) as u8);
     }
-    sealed(body)
+    with_checksum(body)
 }
 
 /// Encodes the angle of the head at the first point, and whether the stream begins with this packet.
-fn head(is_first: bool, readings: &[Reading]) -> Vec<u8> {
+fn start_angle(is_first: bool, readings: &[Reading]) -> Vec<u8> {
     let start = sixty_fourths(readings[0].head_deg) | u16::from(is_first) << 15;
     start.to_le_bytes().to_vec()
 }
 
 /// Adds the checksum before `body`: the XOR of all its bytes, with four bits after each of the marks A and 5.
-fn sealed(body: Vec<u8>) -> Vec<u8> {
+fn with_checksum(body: Vec<u8>) -> Vec<u8> {
     let sum = body.iter().fold(0, |sum, byte| sum ^ byte);
     [vec![0xA0 | sum & 0x0F, 0x50 | sum >> 4], body].concat()
 }
@@ -517,7 +519,7 @@ fn sixty_fourths(degrees: f64) -> u16 {
 }
 
 /// Converts millimeters to 1/4 millimeter. A range that does not fit becomes no return.
-fn quarters(range_mm: u16) -> u16 {
+fn quarter_mm(range_mm: u16) -> u16 {
     range_mm.checked_mul(4).unwrap_or(0)
 }
 
@@ -565,11 +567,11 @@ fn twenty_bits(reading: &Reading) -> u32 {
 }
 
 /// First byte of every request.
-const START: u8 = 0xA5;
+const REQUEST_START: u8 = 0xA5;
 /// The bit of a command that has a payload.
-const PAYLOAD: u8 = 0x80;
+const PAYLOAD_FLAG: u8 = 0x80;
 /// Duty cycle for the recommended speed, of 1,023. It is the vendor's default.
-pub(crate) const PWM: u16 = 660;
+pub(crate) const DEFAULT_PWM: u16 = 660;
 /// Length of the boot message in bytes.
 const BOOT_MESSAGE_LEN: usize = 64;
 
@@ -582,7 +584,7 @@ mod tests {
         for model in Model::ALL {
             assert!(model.typical() < model.modes().len());
             for mode in model.modes() {
-                let packets = 1e6 / (mode.sample_us * model.slowness() * mode.form.points() as f64);
+                let packets = 1e6 / (mode.sample_us * model.clock_ratio() * mode.form.points() as f64);
                 let load = packets * mode.form.packet_len() as f64 * 10.0 / f64::from(model.baud());
                 assert!(load < 0.95, "{model:?} {}: {load}", mode.name);
             }

@@ -16,22 +16,22 @@ use rustix::io::Errno;
 use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::command::Request;
-use scanhub_drivers::lms::framer::{Found, Framer};
+use scanhub_drivers::lms::framer::{Framer, FramerEvent};
 use scanhub_schema::Failure;
 use scanhub_sim::fault::Fault;
 use scanhub_sim::options::SimulateOptions;
 use scanhub_sim::simulate::{Record, Summary};
-use scanhub_sim::{Ready, simulate};
+use scanhub_sim::{SimulatedPort, simulate};
 use tempfile::TempDir;
 
-use crate::PATIENCE;
+use crate::WAIT_TIMEOUT;
 
 /// A temporary directory.
-pub(crate) struct Folder(TempDir);
+pub(crate) struct TestFolder(TempDir);
 
-impl Folder {
-    pub(crate) fn new() -> Folder {
-        Folder(TempDir::new().unwrap())
+impl TestFolder {
+    pub(crate) fn new() -> TestFolder {
+        TestFolder(TempDir::new().unwrap())
     }
 
     pub(crate) fn path(&self, name: &str) -> PathBuf {
@@ -44,7 +44,7 @@ pub(crate) struct Simulator {
     stop: Option<UnixStream>,
     thread: Option<thread::JoinHandle<Result<Vec<Summary>, Failure>>>,
     pub(crate) records: Receiver<Record>,
-    pub(crate) ready: Vec<Ready>,
+    pub(crate) ready: Vec<SimulatedPort>,
 }
 
 impl Simulator {
@@ -59,20 +59,20 @@ impl Simulator {
             };
             simulate(&options, &stopped, |ready| send_ready.send(ready.to_vec()).unwrap(), tell)
         });
-        let ready = ready.recv_timeout(PATIENCE).expect("ready");
+        let ready = ready.recv_timeout(WAIT_TIMEOUT).expect("ready");
         Simulator { stop: Some(stop), thread: Some(thread), records, ready }
     }
 
     pub(crate) fn record(&self) -> Record {
-        self.records.recv_timeout(PATIENCE).expect("a telegram is sent")
+        self.records.recv_timeout(WAIT_TIMEOUT).expect("a telegram is sent")
     }
 
     /// Returns the next record that fulfills `wanted`.
-    pub(crate) fn record_where(&self, wanted: impl Fn(&Record) -> bool) -> Record {
-        let end = Instant::now() + PATIENCE;
+    pub(crate) fn record_where(&self, is_expected: impl Fn(&Record) -> bool) -> Record {
+        let end = Instant::now() + WAIT_TIMEOUT;
         while Instant::now() < end {
             let record = self.record();
-            if wanted(&record) {
+            if is_expected(&record) {
                 return record;
             }
         }
@@ -128,11 +128,11 @@ impl Host {
     }
 
     /// Returns the next telegram that arrives within `patience`; `None` if the port is unplugged before.
-    pub(crate) fn telegram(&mut self, patience: Duration) -> Option<Vec<u8>> {
-        let end = Instant::now() + patience;
+    pub(crate) fn telegram(&mut self, timeout: Duration) -> Option<Vec<u8>> {
+        let end = Instant::now() + timeout;
         loop {
             while let Some(found) = self.framer.poll() {
-                if let Found::Telegram(framed) = found {
+                if let FramerEvent::Telegram(framed) = found {
                     return Some(framed.telegram.bytes().to_vec());
                 }
             }
@@ -141,13 +141,13 @@ impl Host {
             let mut fds = [PollFd::new(&self.port, PollFlags::IN)];
             if poll(&mut fds, Some(&timeout)).unwrap() == 0 {
                 // A frame whose end looks like a beginning is delivered when nothing follows.
-                self.framer.release(lms::framer::VETO_HOLD);
-                if let Some(Found::Telegram(framed)) = self.framer.poll() {
+                self.framer.release(lms::framer::VETO_HOLD_TIME);
+                if let Some(FramerEvent::Telegram(framed)) = self.framer.poll() {
                     return Some(framed.telegram.bytes().to_vec());
                 }
                 return None;
             }
-            match rustix::io::read(&self.port, self.framer.spare()) {
+            match rustix::io::read(&self.port, self.framer.read_buffer()) {
                 Ok(0) => return None,
                 Ok(count) => self.framer.commit(count),
                 Err(Errno::AGAIN | Errno::INTR) => {}
@@ -160,7 +160,7 @@ impl Host {
     pub(crate) fn ask(&mut self, request: Request) -> Vec<u8> {
         self.write(request);
         loop {
-            let telegram = self.telegram(PATIENCE).unwrap_or_else(|| panic!("no answer to {request:?}"));
+            let telegram = self.telegram(WAIT_TIMEOUT).unwrap_or_else(|| panic!("no answer to {request:?}"));
             if telegram[4] == request.command() | 0x80 {
                 return telegram;
             }

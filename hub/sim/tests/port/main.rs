@@ -14,22 +14,22 @@ use std::time::Duration;
 
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::command::Request;
-use scanhub_drivers::lms::family::Family;
+use scanhub_drivers::lms::lms_model::LmsModel;
 use scanhub_drivers::lms::measured;
 use scanhub_drivers::lms::reply::Reply;
 use scanhub_drivers::lms::telegram::Telegram;
 use scanhub_drivers::lms::variant::{Baud, Unit, Variant};
 use scanhub_sim::fault::{Fault, Faults};
-use scanhub_sim::machine::Start;
-use scanhub_sim::operating::Operating;
+use scanhub_sim::machine::StartState;
+use scanhub_sim::operating::OperatingMode;
 use scanhub_sim::options::SimulateOptions;
 use scanhub_sim::simulate;
 use scanhub_sim::simulate::Record;
 
-use bench::{Folder, Host, Simulator};
+use bench::{Host, Simulator, TestFolder};
 
 /// Limit of every wait. It only bounds a hang.
-const PATIENCE: Duration = Duration::from_secs(180);
+const WAIT_TIMEOUT: Duration = Duration::from_secs(180);
 
 fn options(port: PathBuf) -> SimulateOptions {
     let baud = Some(Baud::B500000);
@@ -41,8 +41,8 @@ fn is_data(record: &Record) -> bool {
 }
 
 #[test]
-fn from_9600_to_a_stream_at_500k_bit_for_bit_as_the_truth_says() {
-    let folder = Folder::new();
+fn stream_at_500k_after_9600_matches_ground_truth() {
+    let folder = TestFolder::new();
     let (port, truth) = (folder.path("front"), folder.path("truth.jsonl"));
     std::os::unix::fs::symlink("/dev/pts/999999", &port).unwrap();
     let simulator = Simulator::start(SimulateOptions {
@@ -61,7 +61,7 @@ fn from_9600_to_a_stream_at_500k_bit_for_bit_as_the_truth_says() {
     host.set_rate(500_000);
     let begin = host.ask(Request::Stream);
     assert_eq!(begin[4], 0xA0);
-    let received: Vec<Vec<u8>> = (0..40).map(|_| host.telegram(PATIENCE).expect("a scan")).collect();
+    let received: Vec<Vec<u8>> = (0..40).map(|_| host.telegram(WAIT_TIMEOUT).expect("a scan")).collect();
     let (summaries, records) = simulator.end();
     assert!(fs::symlink_metadata(&port).is_err(), "the symlink is left");
     let sent: Vec<&Record> = records.iter().filter(|record| is_data(record)).collect();
@@ -83,8 +83,8 @@ fn from_9600_to_a_stream_at_500k_bit_for_bit_as_the_truth_says() {
 }
 
 #[test]
-fn requests_that_are_written_at_once_are_all_answered_at_9600() {
-    let folder = Folder::new();
+fn requests_written_in_one_call_are_answered_at_9600() {
+    let folder = TestFolder::new();
     let port = folder.path("front");
     let faults = Faults { answer: 0.001, ..Faults::default() };
     let baud = Some(Baud::B9600);
@@ -92,15 +92,15 @@ fn requests_that_are_written_at_once_are_all_answered_at_9600() {
     let mut host = Host::open(&port, 9_600);
     for number in 0..100 {
         host.write(Request::Stop);
-        let reply = host.telegram(PATIENCE).unwrap_or_else(|| panic!("request {number} got no answer"));
+        let reply = host.telegram(WAIT_TIMEOUT).unwrap_or_else(|| panic!("request {number} got no answer"));
         assert_eq!(reply[4], 0xA0);
     }
     assert_eq!(simulator.end().0[0].sent, 100);
 }
 
 #[test]
-fn a_closed_port_loses_what_is_sent_and_keeps_nothing_for_the_next_host() {
-    let folder = Folder::new();
+fn closed_port_loses_telegrams_and_buffers_none() {
+    let folder = TestFolder::new();
     let port = folder.path("front");
     let simulator = Simulator::start(options(port.clone()));
     let mut host = Host::open(&port, 500_000);
@@ -112,7 +112,7 @@ fn a_closed_port_loses_what_is_sent_and_keeps_nothing_for_the_next_host() {
         simulator.record_where(|record| record.fault == Some(Fault::Unread));
     }
     let mut host = Host::open(&port, 500_000);
-    let first = Record::hash(&host.telegram(PATIENCE).expect("a scan"));
+    let first = Record::hash(&host.telegram(WAIT_TIMEOUT).expect("a scan"));
     let mut next = simulator.record();
     while next.sha256 != first {
         assert!(next.fault.is_some(), "an intact telegram was not read");
@@ -123,8 +123,8 @@ fn a_closed_port_loses_what_is_sent_and_keeps_nothing_for_the_next_host() {
 }
 
 #[test]
-fn at_another_rate_nothing_is_understood_on_either_side() {
-    let folder = Folder::new();
+fn wrong_rate_garbles_both_directions() {
+    let folder = TestFolder::new();
     let port = folder.path("front");
     let simulator = Simulator::start(options(port.clone()));
     let mut host = Host::open(&port, 500_000);
@@ -143,13 +143,13 @@ fn at_another_rate_nothing_is_understood_on_either_side() {
     let mut buffer = vec![0; 30_000];
     assert!(rustix::io::read(&host.port, &mut buffer).unwrap() > 0);
     host.set_rate(500_000);
-    assert_eq!(host.telegram(PATIENCE).expect("a scan").len(), 732);
+    assert_eq!(host.telegram(WAIT_TIMEOUT).expect("a scan").len(), 732);
     simulator.end();
 }
 
 #[test]
-fn a_host_that_does_not_read_loses_what_has_no_room() {
-    let folder = Folder::new();
+fn host_that_does_not_read_causes_an_overrun() {
+    let folder = TestFolder::new();
     let port = folder.path("front");
     let simulator = Simulator::start(SimulateOptions { speed: 10.0, ..options(port.clone()) });
     let mut host = Host::open(&port, 500_000);
@@ -160,8 +160,8 @@ fn a_host_that_does_not_read_loses_what_has_no_room() {
 }
 
 #[test]
-fn a_lossless_line_waits_for_a_host_that_does_not_read() {
-    let folder = Folder::new();
+fn lossless_line_waits_for_the_host_to_read() {
+    let folder = TestFolder::new();
     let ports = ["waits", "loses"].map(|name| folder.path(name));
     let start = |port: &PathBuf, lossless| {
         Simulator::start(SimulateOptions { lossless, speed: 10.0, ..options(port.clone()) })
@@ -172,7 +172,7 @@ fn a_lossless_line_waits_for_a_host_that_does_not_read() {
     for _ in 0..100 {
         loses.record_where(|record| record.fault == Some(Fault::Overrun));
     }
-    let received: Vec<Vec<u8>> = (0..40).map(|_| hosts[0].telegram(PATIENCE).expect("a scan")).collect();
+    let received: Vec<Vec<u8>> = (0..40).map(|_| hosts[0].telegram(WAIT_TIMEOUT).expect("a scan")).collect();
     loses.end();
     let (_, records) = waits.end();
     let sent: Vec<&Record> = records.iter().filter(|record| is_data(record)).collect();
@@ -182,13 +182,13 @@ fn a_lossless_line_waits_for_a_host_that_does_not_read() {
 }
 
 #[test]
-fn a_replay_is_sent_once_in_order_and_then_the_line_is_silent() {
-    let folder = Folder::new();
+fn replay_is_sent_once_in_order_then_line_is_silent() {
+    let folder = TestFolder::new();
     let (port, file) = (folder.path("front"), folder.path("stream.bin"));
     let scans: Vec<Vec<u8>> =
         (0..100u16).map(|i| measured::encode(3, Unit::Cm, &[700 + i; 361], 0x11).bytes().to_vec()).collect();
     let mut bytes = Request::Stop.encode(0).bytes().to_vec();
-    bytes.extend_from_slice(lms::reply::mode(3, true, 0x10).bytes());
+    bytes.extend_from_slice(lms::reply::mode_reply(3, true, 0x10).bytes());
     bytes.extend(scans.concat());
     fs::write(&file, bytes).unwrap();
     let replay = Some(file);
@@ -200,7 +200,7 @@ fn a_replay_is_sent_once_in_order_and_then_the_line_is_silent() {
     assert_eq!((status.unit(), status.mode().0), (Some(Unit::Cm), 1));
     host.ask(Request::Stream);
     for (number, scan) in scans.iter().enumerate() {
-        let telegram = host.telegram(PATIENCE).expect("a scan");
+        let telegram = host.telegram(WAIT_TIMEOUT).expect("a scan");
         assert!(&telegram == scan, "not scan {number}; sent: {:?}", simulator.faults());
     }
     // It still answers; the count below says that nothing else was sent.
@@ -211,15 +211,15 @@ fn a_replay_is_sent_once_in_order_and_then_the_line_is_silent() {
 }
 
 #[test]
-fn lost_bytes_damage_exactly_the_telegrams_that_the_truth_names() {
-    let folder = Folder::new();
+fn only_telegrams_marked_intact_are_received() {
+    let folder = TestFolder::new();
     let port = folder.path("front");
     let faults = Faults { loss: 0.00135, burst: 1.89, ..Faults::default() };
     let simulator = Simulator::start(SimulateOptions { faults, speed: 2.0, ..options(port.clone()) });
     let mut host = Host::open(&port, 500_000);
     host.ask(Request::Stream);
     let received: Vec<[u8; 32]> =
-        (0..60).map(|_| Record::hash(&host.telegram(PATIENCE).expect("a scan"))).collect();
+        (0..60).map(|_| Record::hash(&host.telegram(WAIT_TIMEOUT).expect("a scan"))).collect();
     let (_, records) = simulator.end();
     let data: Vec<&Record> = records.iter().filter(|record| is_data(record)).collect();
     let last = data.iter().position(|record| record.sha256 == received[59]).expect("was sent");
@@ -230,15 +230,15 @@ fn lost_bytes_damage_exactly_the_telegrams_that_the_truth_names() {
 }
 
 #[test]
-fn two_ports_and_what_is_refused() {
-    let folder = Folder::new();
+fn simulates_two_ports_and_refuses_invalid_options() {
+    let folder = TestFolder::new();
     let ports = vec![folder.path("front"), folder.path("rear")];
     let truth = Some(folder.path("truth"));
     let simulator = Simulator::start(SimulateOptions { ports: ports.clone(), truth, ..options("".into()) });
     for port in &ports {
         let mut host = Host::open(port, 500_000);
         host.ask(Request::Stream);
-        host.telegram(PATIENCE).expect("a scan");
+        host.telegram(WAIT_TIMEOUT).expect("a scan");
     }
     let (summaries, records) = simulator.end();
     assert_eq!(
@@ -261,7 +261,7 @@ fn two_ports_and_what_is_refused() {
         (SimulateOptions { pollution: 101, ..options(folder.path("x")) }, 78),
         (
             SimulateOptions {
-                family: Family::Lms211,
+                family: LmsModel::Lms211,
                 variant: Some(Variant::HALF),
                 ..options(folder.path("x"))
             },
@@ -279,37 +279,37 @@ fn two_ports_and_what_is_refused() {
 }
 
 #[test]
-fn an_unplugged_port_is_gone_and_comes_back_under_its_name() {
-    let folder = Folder::new();
+fn unplugged_port_disappears_and_returns_by_name() {
+    let folder = TestFolder::new();
     let port = folder.path("front");
     let faults: Faults = "unplug=0.3,unplug_at=1,unplug_every=1".parse().unwrap();
-    let state = Start::In(Operating::All);
+    let state = StartState::Operating(OperatingMode::All);
     let simulator = Simulator::start(SimulateOptions { faults, state, ..options(port.clone()) });
     let first = fs::read_link(&port).unwrap();
     for _ in 0..2 {
         // A busy machine may unplug the port before a scan is complete.
         let mut plugged = None;
-        until("a scan", || {
+        wait_until("a scan", || {
             plugged = Host::try_open(&port, 500_000).ok();
-            plugged.as_mut().is_some_and(|host| host.telegram(PATIENCE).is_some())
+            plugged.as_mut().is_some_and(|host| host.telegram(WAIT_TIMEOUT).is_some())
         });
         let host = plugged.expect("the port of the scan");
         // The hosts of a pty whose other side is gone read its end.
         let mut buffer = [0; 4096];
-        until("it is unplugged", || rustix::io::read(&host.port, &mut buffer) == Ok(0));
+        wait_until("it is unplugged", || rustix::io::read(&host.port, &mut buffer) == Ok(0));
         assert!(rustix::termios::tcgetattr(&host.port).is_err(), "the port is there");
         simulator.record_where(|record| record.fault == Some(Fault::Unplug));
-        until("it is back", || fs::symlink_metadata(&port).is_ok());
+        wait_until("it is back", || fs::symlink_metadata(&port).is_ok());
     }
     assert!(fs::read_link(&port).unwrap().starts_with("/dev/pts"), "{first:?}");
     simulator.end();
     assert!(fs::symlink_metadata(&port).is_err(), "the symlink is left");
 }
 
-fn until(what: &str, mut is_so: impl FnMut() -> bool) {
-    let end = std::time::Instant::now() + PATIENCE;
-    while !is_so() {
-        assert!(std::time::Instant::now() < end, "not: {what}");
+fn wait_until(condition: &str, mut is_true: impl FnMut() -> bool) {
+    let end = std::time::Instant::now() + WAIT_TIMEOUT;
+    while !is_true() {
+        assert!(std::time::Instant::now() < end, "not: {condition}");
         std::thread::sleep(Duration::from_millis(1));
     }
 }

@@ -5,9 +5,9 @@ use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use scanhub_drivers::ld;
-use scanhub_drivers::ld::Session;
-use scanhub_drivers::ld::packet::LEN;
-use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _, State};
+use scanhub_drivers::ld::LdSession;
+use scanhub_drivers::ld::packet::PACKET_LEN;
+use scanhub_drivers::line::{Action, Event, Protocol as _, ScannerSession as _, State};
 use scanhub_drivers::{Settings, features, lms};
 use scanhub_schema::{Failure, Family, Nanos};
 use scanhub_sim::fault::{Fault, Faults};
@@ -17,32 +17,32 @@ use scanhub_sim::rplidar::Model;
 use scanhub_sim::simulate;
 use scanhub_sim::simulate::Record;
 
-use crate::PATIENCE;
-use crate::bench::{Folder, Host, Simulator};
+use crate::WAIT_TIMEOUT;
+use crate::bench::{Host, Simulator, TestFolder};
 
 /// Reads until there are `len` bytes.
 fn read(host: &Host, len: usize) -> Vec<u8> {
-    let (end, mut bytes) = (Instant::now() + PATIENCE, Vec::new());
+    let (end, mut bytes) = (Instant::now() + WAIT_TIMEOUT, Vec::new());
     while bytes.len() < len {
         assert!(Instant::now() < end, "{} of {len} bytes", bytes.len());
         let timeout = Timespec { tv_sec: 0, tv_nsec: 100_000_000 };
         poll(&mut [PollFd::new(&host.port, PollFlags::IN)], Some(&timeout)).expect("a poll");
         let mut buffer = [0; 256];
-        let most = buffer.len().min(len - bytes.len());
-        let count = rustix::io::read(&host.port, &mut buffer[..most]).unwrap_or(0);
+        let maximum = buffer.len().min(len - bytes.len());
+        let count = rustix::io::read(&host.port, &mut buffer[..maximum]).unwrap_or(0);
         bytes.extend(&buffer[..count]);
     }
     bytes
 }
 
-fn say(host: &Host, request: &[u8]) {
+fn send(host: &Host, request: &[u8]) {
     assert_eq!(rustix::io::write(&host.port, request), Ok(request.len()));
 }
 
 #[test]
-fn what_a_host_reads_is_what_the_truth_says() {
+fn received_packets_match_the_truth_file() {
     for (model, mode) in [(Model::A1, 1), (Model::S2, 1)] {
-        let folder = Folder::new();
+        let folder = TestFolder::new();
         let (port, truth) = (folder.path("front"), folder.path("truth.jsonl"));
         let simulator = Simulator::start(SimulateOptions {
             ports: vec![port.clone()],
@@ -53,23 +53,26 @@ fn what_a_host_reads_is_what_the_truth_says() {
             ..SimulateOptions::default()
         });
         let host = Host::open(&port, model.baud());
-        say(&host, &[0xA5, 0x50]);
+        send(&host, &[0xA5, 0x50]);
         let info = read(&host, 27);
         assert_eq!(info[..8], [0xA5, 0x5A, 0x14, 0, 0, 0, 0x04, model.id()]);
-        say(&host, &[0xA5, 0x82, 5, 1, 0, 0, 0, 0, 0xA5 ^ 0x82 ^ 5 ^ 1]);
+        send(&host, &[0xA5, 0x82, 5, 1, 0, 0, 0, 0, 0xA5 ^ 0x82 ^ 5 ^ 1]);
         let descriptor = read(&host, 7);
         let form = model.modes()[1].form;
-        assert_eq!(descriptor, [0xA5, 0x5A, form.packet_len() as u8, 0, 0, 0x40, form.answer()]);
+        assert_eq!(descriptor, [0xA5, 0x5A, form.packet_len() as u8, 0, 0, 0x40, form.response_type()]);
         let packets = read(&host, 50 * form.packet_len());
         let (summaries, _) = simulator.end();
         assert_eq!(summaries[0].eeprom_writes, 0);
         let truth = fs::read_to_string(&truth).expect("the truth");
-        let mut told = truth.lines();
+        let mut truth_lines = truth.lines();
         for packet in packets.chunks(form.packet_len()) {
             let sum = packet[2..].iter().fold(0, |sum, byte| sum ^ byte);
             assert_eq!((packet[0], packet[1]), (0xA0 | sum & 15, 0x50 | sum >> 4));
             let sha256 = Record::hash(packet).map(|byte| format!("{byte:02x}")).concat();
-            assert!(told.any(|line| line.contains(&sha256)), "the truth has not this packet, or earlier");
+            assert!(
+                truth_lines.any(|line| line.contains(&sha256)),
+                "the truth has not this packet, or earlier"
+            );
         }
     }
 }
@@ -78,7 +81,7 @@ fn what_a_host_reads_is_what_the_truth_says() {
 #[test]
 fn it_restarts_after_a_dip_and_a_power_cycle() {
     for model in [Model::A1, Model::S2] {
-        let folder = Folder::new();
+        let folder = TestFolder::new();
         let port = folder.path("front");
         let simulator = Simulator::start(SimulateOptions {
             ports: vec![port.clone()],
@@ -92,7 +95,7 @@ fn it_restarts_after_a_dip_and_a_power_cycle() {
             assert!(boot_message.is_reply && boot_message.length == 64, "{boot_message:?}");
         }
         let host = Host::open(&port, model.baud());
-        say(&host, &[0xA5, 0x50]);
+        send(&host, &[0xA5, 0x50]);
         assert_eq!(read(&host, 27)[..8], [0xA5, 0x5A, 0x14, 0, 0, 0, 0x04, model.id()]);
         let (summaries, _) = simulator.end();
         assert_eq!((summaries[0].sent, summaries[0].eeprom_writes), (3, 0));
@@ -100,8 +103,8 @@ fn it_restarts_after_a_dip_and_a_power_cycle() {
 }
 
 #[test]
-fn a_host_at_another_rate_hears_noise_and_what_it_has_not_is_refused() {
-    let folder = Folder::new();
+fn wrong_rate_garbles_and_unsupported_options_fail() {
+    let folder = TestFolder::new();
     let port = folder.path("front");
     let of = |model| SimulateOptions {
         ports: vec![port.clone()],
@@ -127,29 +130,29 @@ fn a_host_at_another_rate_hears_noise_and_what_it_has_not_is_refused() {
 }
 
 /// Runs `session` on the port of `host` until it has delivered `turns`, and returns the received packets.
-fn hear(session: &mut Session, host: &Host, turns: usize) -> Vec<[u8; LEN]> {
-    let (end, mut packets, mut told) = (Instant::now() + PATIENCE, Vec::new(), 0);
-    while told < turns {
-        assert!(Instant::now() < end, "{told} turns, {:?}", session.account());
+fn receive(session: &mut LdSession, host: &Host, revolutions: usize) -> Vec<[u8; PACKET_LEN]> {
+    let (end, mut packets, mut delivered) = (Instant::now() + WAIT_TIMEOUT, Vec::new(), 0);
+    while delivered < revolutions {
+        assert!(Instant::now() < end, "{delivered} turns, {:?}", session.stats());
         let (until, flags) = loop {
-            match session.poll_output() {
-                Output::SetRate(rate) => host.set_rate(rate),
-                Output::Event(Event::Telegram(received)) => {
-                    packets.extend(received.bytes.as_chunks::<LEN>().0)
+            match session.poll_action() {
+                Action::SetRate(rate) => host.set_rate(rate),
+                Action::Event(Event::Telegram(received)) => {
+                    packets.extend(received.bytes.as_chunks::<PACKET_LEN>().0)
                 }
-                Output::Event(Event::Scan(turn)) => {
-                    told += 1;
-                    assert!(turn.first < turn.last && turn.last < now_ns());
+                Action::Event(Event::Scan(revolution)) => {
+                    delivered += 1;
+                    assert!(revolution.first < revolution.last && revolution.last < now_ns());
                 }
-                Output::Rest(until) => break (until, PollFlags::empty()),
-                Output::Wait { until, .. } => break (until, PollFlags::IN),
+                Action::SleepUntil(until) => break (until, PollFlags::empty()),
+                Action::Wait { until, .. } => break (until, PollFlags::IN),
                 output => panic!("{output:?}"),
             }
         };
         let left: Nanos = until.saturating_sub(now_ns()).min(100_000_000);
         let timeout = Timespec { tv_sec: 0, tv_nsec: left as _ };
         poll(&mut [PollFd::new(&host.port, flags)], Some(&timeout)).expect("a poll");
-        let len = rustix::io::read(&host.port, session.spare()).unwrap_or(0);
+        let len = rustix::io::read(&host.port, session.read_buffer()).unwrap_or(0);
         session.commit(now_ns(), len);
         if len == 0 && now_ns() >= until {
             session.handle_timeout(now_ns());
@@ -159,9 +162,9 @@ fn hear(session: &mut Session, host: &Host, turns: usize) -> Vec<[u8; LEN]> {
 }
 
 #[test]
-fn every_model_is_heard_bit_for_bit_as_the_truth_says() {
+fn ld_packets_match_the_recorded_truth() {
     for model in [ld::Model::Ld19, ld::Model::Stl27l] {
-        let folder = Folder::new();
+        let folder = TestFolder::new();
         let port = folder.path("front");
         let simulator = Simulator::start(SimulateOptions {
             ports: vec![port.clone()],
@@ -170,25 +173,28 @@ fn every_model_is_heard_bit_for_bit_as_the_truth_says() {
             ..SimulateOptions::default()
         });
         let settings = Settings::default();
-        let host = Host::open(&port, features(Family::Ld).auto.baud);
-        let mut session = Session::new(settings, now_ns());
-        let packets = hear(&mut session, &host, 20);
+        let host = Host::open(&port, features(Family::Ld).defaults.baud);
+        let mut session = LdSession::new(settings, now_ns());
+        let packets = receive(&mut session, &host, 20);
         assert_eq!((session.state(), session.model()), (State::Streaming, Some(model)));
         let (summaries, records) = simulator.end();
         assert_eq!(summaries[0].eeprom_writes, 0);
         let first = Record::hash(&packets[0]);
         let first = records.iter().position(|record| record.sha256 == first).expect("was sent");
         for (packet, record) in packets.iter().zip(&records[first..]) {
-            assert_eq!((Record::hash(packet), record.length, record.fault), (record.sha256, LEN, None));
+            assert_eq!(
+                (Record::hash(packet), record.length, record.fault),
+                (record.sha256, PACKET_LEN, None)
+            );
             assert!(!record.is_reply);
         }
-        assert_eq!(session.turn_counts().incomplete, 0, "{:?}", session.turn_counts());
+        assert_eq!(session.revolution_counts().incomplete, 0, "{:?}", session.revolution_counts());
     }
 }
 
 #[test]
-fn faults_are_told_and_what_an_ld_has_not_is_refused() {
-    let folder = Folder::new();
+fn ld_records_faults_and_refuses_foreign_options() {
+    let folder = TestFolder::new();
     let port = folder.path("front");
     let scanner = Some(Scanner::Ld(ld::Model::Ld06));
     let of = || SimulateOptions { ports: vec![port.clone()], scanner, ..SimulateOptions::default() };

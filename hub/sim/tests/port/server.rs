@@ -15,7 +15,7 @@ use scanhub_sim::rplidar::Model;
 use scanhub_sim::simulate;
 use scanhub_sim::simulate::Record;
 
-use crate::PATIENCE;
+use crate::WAIT_TIMEOUT;
 use crate::bench::Simulator;
 
 fn options(scanner: Option<Scanner>) -> SimulateOptions {
@@ -27,7 +27,7 @@ fn connect(simulator: &Simulator) -> TcpStream {
     let port = simulator.ready[0].port.to_str().expect("a name");
     assert_eq!(simulator.ready[0].pty, None);
     let stream = TcpStream::connect(port.strip_prefix("tcp:").expect("a server")).expect("connected");
-    stream.set_read_timeout(Some(PATIENCE)).expect("set");
+    stream.set_read_timeout(Some(WAIT_TIMEOUT)).expect("set");
     stream
 }
 
@@ -74,7 +74,7 @@ fn one_host_at_a_time_and_the_next_when_it_has_left() {
     assert_eq!(second.read(&mut [0; 1]).expect("turned away"), 0);
     ask(&mut first);
     drop(first);
-    let end = Instant::now() + PATIENCE;
+    let end = Instant::now() + WAIT_TIMEOUT;
     let mut third = loop {
         let mut host = connect(&simulator);
         host.set_read_timeout(Some(Duration::from_millis(50))).expect("set");
@@ -85,7 +85,7 @@ fn one_host_at_a_time_and_the_next_when_it_has_left() {
         }
         assert!(Instant::now() < end);
     };
-    third.set_read_timeout(Some(PATIENCE)).expect("set");
+    third.set_read_timeout(Some(WAIT_TIMEOUT)).expect("set");
     ask(&mut third);
     let taken = SimulateOptions { ports: vec![simulator.ready[0].port.clone()], ..options(None) };
     let refused = |options: SimulateOptions| {
@@ -98,7 +98,7 @@ fn one_host_at_a_time_and_the_next_when_it_has_left() {
 }
 
 #[test]
-fn an_unplugged_server_is_gone_and_comes_back_at_the_same_address() {
+fn unplugged_server_returns_at_the_same_address() {
     let faults: Faults = "unplug=0.3,unplug_at=0.2".parse().expect("faults");
     let scanner = Some(Scanner::Ld(ld::Model::Ld19));
     let simulator = Simulator::start(SimulateOptions { faults, ..options(scanner) });
@@ -106,7 +106,7 @@ fn an_unplugged_server_is_gone_and_comes_back_at_the_same_address() {
     let mut rest = Vec::new();
     // It may end with a reset, where bytes were on their way.
     let _ = host.read_to_end(&mut rest);
-    let end = Instant::now() + PATIENCE;
+    let end = Instant::now() + WAIT_TIMEOUT;
     let address = simulator.ready[0].port.to_str().expect("a name").replace("tcp:", "");
     let mut again = loop {
         match TcpStream::connect(&address) {
@@ -114,7 +114,7 @@ fn an_unplugged_server_is_gone_and_comes_back_at_the_same_address() {
             Err(_) => assert!(Instant::now() < end),
         }
     };
-    again.set_read_timeout(Some(PATIENCE)).expect("set");
+    again.set_read_timeout(Some(WAIT_TIMEOUT)).expect("set");
     read(&mut again, 470);
     drop(simulator.end());
 }

@@ -6,49 +6,49 @@
 
 use std::collections::HashMap;
 
-use scanhub_drivers::line::Session as _;
+use scanhub_drivers::line::ScannerSession as _;
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::telegram::NAK;
-use scanhub_drivers::lms::variant::{Baud, MIRROR_TURN};
+use scanhub_drivers::lms::variant::{Baud, MIRROR_PERIOD};
 use scanhub_schema::{MILLIS, Nanos};
 use scanhub_sim::fault::Faults;
-use scanhub_sim::machine::{LmsSimulator, ProtocolQuirks, Settings, Start};
-use scanhub_sim::operating::{Operating, Source};
+use scanhub_sim::line_model::LineModel;
+use scanhub_sim::machine::{LmsSimulator, ProtocolQuirks, Settings, StartState};
+use scanhub_sim::operating::{OperatingMode, ScanSource};
 use scanhub_sim::room::Room;
-use scanhub_sim::wire::LineModel;
 
-use crate::session::{Bench, Received, Sent};
+use crate::session::{Bench, ReceivedTelegram, SentTelegram};
 
 /// Runs `faults` with seeds up to this one, and sums up.
-fn hold(faults: &str, span_ms: u64, seeds: u64) -> Verdict {
-    let all = sum(&Scene::new(faults.parse().expect("faults"), span_ms), seeds);
+fn run_scene(faults: &str, span_ms: u64, seeds: u64) -> SceneResult {
+    let all = run_seeds(&FaultScene::new(faults.parse().expect("faults"), span_ms), seeds);
     println!("{faults}: {all:?}");
     assert!(is_sound(&all, faults), "delivered and never sent: {faults}: {all:?}");
     all
 }
 
-fn sum(scene: &Scene, seeds: u64) -> Verdict {
-    let mut all = Verdict::default();
+fn run_seeds(scene: &FaultScene, seeds: u64) -> SceneResult {
+    let mut all = SceneResult::default();
     (1..=seeds).for_each(|seed| all.add(scene.run(seed)));
     all
 }
 
 /// Seeds for each scene.
-const SEEDS: u64 = 100;
+const SEED_COUNT: u64 = 100;
 
 macro_rules! scenes {
     ($($name:ident: $faults:literal, $span_ms:literal, $least:expr;)*) => {
         $(
             #[test]
             fn $name() {
-                let all = hold($faults, $span_ms, SEEDS);
-                let least: fn(&Verdict) -> bool = $least;
+                let all = run_scene($faults, $span_ms, SEED_COUNT);
+                let least: fn(&SceneResult) -> bool = $least;
                 assert!(least(&all), "not what {} should do: {all:?}", $faults);
             }
         )*
 
         /// Faults, their duration in milliseconds, and the check that they had an effect.
-        const SCENES: &[(&str, u64, fn(&Verdict) -> bool)] = &[$(($faults, $span_ms, $least)),*];
+        const SCENES: &[(&str, u64, fn(&SceneResult) -> bool)] = &[$(($faults, $span_ms, $least)),*];
     };
 }
 
@@ -56,28 +56,28 @@ macro_rules! scenes {
 #[ignore = "takes minutes: each scene with five times as many seeds, for five times as long"]
 fn everything_for_longer() {
     for (faults, span_ms, _) in SCENES {
-        hold(faults, 5 * span_ms, 5 * SEEDS);
+        run_scene(faults, 5 * span_ms, 5 * SEED_COUNT);
     }
 }
 
 #[test]
 fn no_scene_is_about_nothing() {
-    let mut healthy: HashMap<(bool, u64), Verdict> = HashMap::new();
-    for &(faults, span_ms, least) in SCENES.iter().filter(|(faults, ..)| !faults.is_empty()) {
-        let Scene { is_idle, .. } = Scene::new(faults.parse().expect("faults"), span_ms);
-        let inert = Scene { is_idle, ..Scene::new(Faults::default(), span_ms) };
-        let all = healthy.entry((is_idle, span_ms)).or_insert_with(|| sum(&inert, SEEDS));
-        assert!(!least(all), "without {faults} the same shows: {all:?}");
+    let mut healthy: HashMap<(bool, u64), SceneResult> = HashMap::new();
+    for &(faults, span_ms, has_effect) in SCENES.iter().filter(|(faults, ..)| !faults.is_empty()) {
+        let FaultScene { is_idle, .. } = FaultScene::new(faults.parse().expect("faults"), span_ms);
+        let inert = FaultScene { is_idle, ..FaultScene::new(Faults::default(), span_ms) };
+        let all = healthy.entry((is_idle, span_ms)).or_insert_with(|| run_seeds(&inert, SEED_COUNT));
+        assert!(!has_effect(all), "without {faults} the same shows: {all:?}");
     }
 }
 
 /// Returns whether the session delivered only telegrams that the scanner sent. Changed and foreign bytes are an
 /// exception: the scanner's checksum accepts 1.19e-3 of all pairs of flipped bits, and such telegrams need no mark.
-fn is_sound(all: &Verdict, faults: &str) -> bool {
+fn is_sound(all: &SceneResult, faults: &str) -> bool {
     let flips = faults.starts_with("flip");
     let changes = ["flip=", "insert=", "double=", "length=", "flood=", "wall="];
-    let most = if changes.iter().any(|key| faults.contains(key)) { all.faulty / 200 } else { 0 };
-    all.wrong <= most && (flips || all.unmarked == 0)
+    let maximum = if changes.iter().any(|key| faults.contains(key)) { all.faulty / 200 } else { 0 };
+    all.wrong <= maximum && (flips || all.unmarked == 0)
 }
 
 // Minimum effect of each fault.
@@ -99,26 +99,26 @@ scenes! {
     walls_between_telegrams: "wall=1000,wall_every=0.03,inside=0", 320, |all| all.intact > 700 && all.effects.foreign > 500_000;
     silence: "silence=0.05,silence_at=0.1,silence_every=0.15", 320, |all| all.faulty > 120;
     long_silence: "silence=1.05,silence_at=0.1", 1200, |all| all.resyncs >= 100;
-    a_stuck_line: "stall=0.2,stall_at=0.1", 400, |all| all.intact > 1000 && all.effects.off_grid >= 100;
-    late_pieces: "delay=0.02", 320, |all| all.intact > 700 && all.effects.off_grid > 50;
+    a_stuck_line: "stall=0.2,stall_at=0.1", 400, |all| all.intact > 1000 && all.effects.unaligned_scans >= 100;
+    late_pieces: "delay=0.02", 320, |all| all.intact > 700 && all.effects.unaligned_scans > 50;
     power_cycles: "power_every=0.2", 300, |all| all.faulty > 20 && all.resyncs >= 100;
     unplugged: "unplug=0.2,unplug_at=0.1,unplug_every=1", 400, |all| all.faulty > 500;
     all_at_once: "loss=0.0005,burst=3,flip=0.0001,insert=0.0001,double=0.0001,truncate=0.02,length=0.02,\
         abort=0.02,repeat=0.02,flood=300,flood_every=0.2,wall=300,wall_every=0.2,delay=0.002", 400,
         |all| all.faulty > 300;
-    requests_overlooked: "overlook=0.3", 650, |all| all.effects.unheard > 60 && all.back_ms < 4_000;
-    requests_refused_by_nak: "nak=0.3", 650, |all| all.effects.naks > 60 && all.back_ms < 4_000;
+    requests_overlooked: "overlook=0.3", 650, |all| all.effects.unacknowledged > 60 && all.recovery_ms < 4_000;
+    requests_refused_by_nak: "nak=0.3", 650, |all| all.effects.naks > 60 && all.recovery_ms < 4_000;
     acknowledgements_at_the_limit: "late_ack=0.052", 900, |all| all.effects.late_acknowledgements >= 300;
     acknowledgements_late: "late_ack=0.1", 900, |all| all.effects.late_acknowledgements >= 300;
     replies_late: "late=0.4", 2200, |all| all.effects.late_replies > 200;
-    replies_twice: "twice=0.5", 650, |all| all.effects.doubled > 30;
-    modes_changed_slowly: "late_mode=2.9", 3600, |all| all.effects.late_replies >= 100 && all.back_ms < 1_000;
+    replies_twice: "twice=0.5", 650, |all| all.effects.extra_replies > 30;
+    modes_changed_slowly: "late_mode=2.9", 3600, |all| all.effects.late_replies >= 100 && all.recovery_ms < 1_000;
     a_command_refused: "refuse=0x3A", 800, |all| all.effects.refused >= 100;
-    nobody_answers: "mute=1", 300, |all| all.effects.unheard >= 100 && all.back_ms > 100;
+    nobody_answers: "mute=1", 300, |all| all.effects.unacknowledged >= 100 && all.recovery_ms > 100;
 }
 
 /// Faults and their duration.
-struct Scene {
+struct FaultScene {
     faults: Faults,
     span_ms: u64,
     /// Whether the scanner is idle at the start. Otherwise it streams.
@@ -127,7 +127,7 @@ struct Scene {
 
 /// Results of a run.
 #[derive(Debug, Default)]
-struct Verdict {
+struct SceneResult {
     /// Telegrams that arrived as sent while the session streamed: all of them were delivered.
     intact: usize,
     /// Telegrams that did not arrive as sent.
@@ -137,76 +137,77 @@ struct Verdict {
     unmarked: usize,
     resyncs: u64,
     /// Longest time from the end of the faults to a stream.
-    back_ms: u64,
+    recovery_ms: u64,
     effects: Effects,
 }
 
-impl Verdict {
-    fn add(&mut self, other: Verdict) {
+impl SceneResult {
+    fn add(&mut self, other: SceneResult) {
         self.effects.add(&other.effects);
         self.intact += other.intact;
         self.faulty += other.faulty;
         self.wrong += other.wrong;
         self.unmarked += other.unmarked;
         self.resyncs += other.resyncs;
-        self.back_ms = self.back_ms.max(other.back_ms);
+        self.recovery_ms = self.recovery_ms.max(other.recovery_ms);
     }
 }
 
-impl Scene {
+impl FaultScene {
     /// Creates a scene. Protocol quirks affect replies to requests, so a scanner that has them is idle.
-    fn new(faults: Faults, span_ms: u64) -> Scene {
-        Scene { faults, span_ms, is_idle: faults.quirks() != ProtocolQuirks::default() }
+    fn new(faults: Faults, span_ms: u64) -> FaultScene {
+        FaultScene { faults, span_ms, is_idle: faults.quirks() != ProtocolQuirks::default() }
     }
 
-    fn run(&self, seed: u64) -> Verdict {
+    fn run(&self, seed: u64) -> SceneResult {
         let quirks = self.faults.quirks();
-        let start = Start::In(if self.is_idle { Operating::OnRequest } else { Operating::All });
+        let start =
+            StartState::Operating(if self.is_idle { OperatingMode::OnRequest } else { OperatingMode::All });
         let baud = Baud::B500000;
         let boot_ns = 200 * MILLIS;
         let settings = Settings { baud, start, boot_ns, quirks, seed, ..Settings::default() };
         let world = world(seed).parse().expect("a world with this name");
-        let mut bench = Bench::new(LmsSimulator::new(settings, Source::Room(Room::new(&world, seed))), 0);
-        bench.wire = LineModel::new(&self.faults, seed);
+        let mut bench = Bench::new(LmsSimulator::new(settings, ScanSource::Room(Room::new(&world, seed))), 0);
+        bench.line = LineModel::new(&self.faults, seed);
         bench.run(self.span_ms * MILLIS);
-        bench.wire.set_faults(&Faults::default(), 0);
+        bench.line.set_faults(&Faults::default(), 0);
         bench.machine.set_quirks(ProtocolQuirks::default());
         let healed = bench.now;
         let streams = |bench: &Bench| bench.is_streaming() && !bench.received_scans(healed).is_empty();
-        let back = bench.until(&self.name(seed), LONGEST, streams);
+        let back = bench.run_until(&self.name(seed), SEARCH_TIMEOUT, streams);
         // Telegrams that were held back after damage are released after some intact ones, and the last one after a
         // pause.
         bench.run(80 * MILLIS);
         bench.to_host = Box::new(|_, _| Vec::new());
         bench.run(40 * MILLIS);
-        let verdict = self.account(&bench, seed);
+        let verdict = self.compare(&bench, seed);
         let has_power = self.faults.power_at + self.faults.power_every == 0.0;
-        assert!(!has_power || bench.session.account().restarts == 0, "{}", self.name(seed));
+        assert!(!has_power || bench.session.stats().restarts == 0, "{}", self.name(seed));
         let effects = Effects::of(&bench);
-        Verdict { effects, resyncs: bench.session.account().resyncs, back_ms: back / MILLIS, ..verdict }
+        SceneResult { effects, resyncs: bench.session.stats().resyncs, recovery_ms: back / MILLIS, ..verdict }
     }
 
     /// Holds what was delivered against what was sent.
-    fn account(&self, bench: &Bench, seed: u64) -> Verdict {
-        let is_due = |sent: &Sent| sent.streamed && !sent.damaged;
-        let account = align(&bench.sent, &bench.received, is_due);
+    fn compare(&self, bench: &Bench, seed: u64) -> SceneResult {
+        let is_due = |sent: &SentTelegram| sent.was_streaming && !sent.damaged;
+        let unmatched = align(&bench.sent, &bench.received, is_due);
         let name = self.name(seed);
-        if let Some(lost) = account.lost.first() {
-            let Sent { at, is_reply, .. } = lost;
-            let (command, count) = (lost.telegram[4], account.lost.len());
+        if let Some(lost) = unmatched.lost.first() {
+            let SentTelegram { at, is_reply, .. } = lost;
+            let (command, count) = (lost.telegram[4], unmatched.lost.len());
             panic!("{name}: {count} lost, first {command:02X} sent {at} reply {is_reply}: {bench}");
         }
-        let unmarked: Vec<_> = account.wrong.iter().filter(|wrong| wrong.reasons == 0).collect();
+        let unmarked: Vec<_> = unmatched.unsent.iter().filter(|wrong| wrong.reasons == 0).collect();
         if let Some(wrong) = unmarked.first() {
             let (command, at) = (wrong.telegram[4], wrong.at);
             println!("{name}: nobody sent {command:02X} received {at}, and it is not marked: {bench}");
         }
-        Verdict {
+        SceneResult {
             intact: bench.sent.iter().filter(|sent| is_due(sent)).count(),
             faulty: bench.sent.iter().filter(|sent| sent.fault.is_some()).count(),
-            wrong: account.wrong.len(),
+            wrong: unmatched.unsent.len(),
             unmarked: unmarked.len(),
-            ..Verdict::default()
+            ..SceneResult::default()
         }
     }
 
@@ -224,23 +225,23 @@ fn world(seed: u64) -> &'static str {
 }
 
 /// Time within which a session that must search for its scanner finds it.
-const LONGEST: Nanos = 10_000 * MILLIS;
+const SEARCH_TIMEOUT: Nanos = 10_000 * MILLIS;
 
 /// Number of occurrences of each effect.
 #[derive(Debug, Default)]
 struct Effects {
     /// Requests that reached the sensor and were not acknowledged.
-    unheard: usize,
+    unacknowledged: usize,
     naks: usize,
     /// Replies beyond one for each ACK.
-    doubled: usize,
+    extra_replies: usize,
     /// Replies 92h.
     refused: usize,
     /// Acknowledgements, and replies, later than the sensor usually has them.
     late_acknowledgements: usize,
     late_replies: usize,
     /// Scans that arrived at a time that does not fit the mirror.
-    off_grid: usize,
+    unaligned_scans: usize,
     /// Telegrams that arrived twice.
     copies: usize,
     /// Bytes between telegrams that the sensor did not send.
@@ -250,20 +251,23 @@ struct Effects {
 impl Effects {
     /// Returns the effects that show on `bench`.
     fn of(bench: &Bench) -> Effects {
-        let Bench { asked, acknowledged, sent, foreign, .. } = bench;
+        let Bench { request_times, acknowledged, sent, foreign, .. } = bench;
         let naks = acknowledged.iter().filter(|(_, byte)| *byte == NAK).count();
-        let replies: Vec<&Sent> = sent.iter().filter(|sent| sent.is_reply).collect();
+        let replies: Vec<&SentTelegram> = sent.iter().filter(|sent| sent.is_reply).collect();
         let acks: Vec<Nanos> =
             acknowledged.iter().filter(|(_, byte)| *byte != NAK).map(|(at, _)| *at).collect();
         let mut effects = Effects {
-            unheard: asked.len().saturating_sub(acknowledged.len()),
+            unacknowledged: request_times.len().saturating_sub(acknowledged.len()),
             naks,
-            doubled: replies.len().saturating_sub(acks.len()),
+            extra_replies: replies.len().saturating_sub(acks.len()),
             refused: replies.iter().filter(|sent| sent.telegram[4] == lms::reply::REFUSED).count(),
-            late_acknowledgements: acks.iter().filter(|&&at| at > after(asked, at) + 40 * MILLIS).count(),
+            late_acknowledgements: acks
+                .iter()
+                .filter(|&&at| at > last_before(request_times, at) + 40 * MILLIS)
+                .count(),
             late_replies: replies
                 .iter()
-                .filter(|sent| sent.at > after(&acks, sent.at) + 250 * MILLIS)
+                .filter(|sent| sent.at > last_before(&acks, sent.at) + 250 * MILLIS)
                 .count(),
             foreign: *foreign,
             ..Effects::default()
@@ -271,39 +275,44 @@ impl Effects {
         for pair in sent.windows(2).filter(|pair| pair.iter().all(|sent| !sent.is_reply && !sent.aborted)) {
             let gap = pair[1].at - pair[0].at;
             effects.copies += usize::from(gap == 0 && pair[0].telegram == pair[1].telegram);
-            effects.off_grid += usize::from(gap == 0 || (gap + MILLIS) % (2 * MIRROR_TURN) > 2 * MILLIS);
+            effects.unaligned_scans +=
+                usize::from(gap == 0 || (gap + MILLIS) % (2 * MIRROR_PERIOD) > 2 * MILLIS);
         }
         effects
     }
 
     fn add(&mut self, other: &Effects) {
-        self.unheard += other.unheard;
+        self.unacknowledged += other.unacknowledged;
         self.naks += other.naks;
-        self.doubled += other.doubled;
+        self.extra_replies += other.extra_replies;
         self.refused += other.refused;
         self.late_acknowledgements += other.late_acknowledgements;
         self.late_replies += other.late_replies;
-        self.off_grid += other.off_grid;
+        self.unaligned_scans += other.unaligned_scans;
         self.copies += other.copies;
         self.foreign += other.foreign;
     }
 }
 
 /// The last of `times` that is not after `at`; `at` itself if there is none.
-fn after(times: &[Nanos], at: Nanos) -> Nanos {
+fn last_before(times: &[Nanos], at: Nanos) -> Nanos {
     times.iter().rev().copied().find(|&time| time <= at).unwrap_or(at)
 }
 
 /// Telegrams that a pairing leaves over.
-struct Account<'a> {
+struct Unmatched<'a> {
     /// Sent, due, and not delivered.
-    lost: Vec<&'a Sent>,
+    lost: Vec<&'a SentTelegram>,
     /// Delivered, and not sent.
-    wrong: Vec<&'a Received>,
+    unsent: Vec<&'a ReceivedTelegram>,
 }
 
 /// Pairs `received` with `sent`. The telegrams that are due must be received.
-fn align<'a>(sent: &'a [Sent], received: &'a [Received], is_due: impl Fn(&Sent) -> bool) -> Account<'a> {
+fn align<'a>(
+    sent: &'a [SentTelegram],
+    received: &'a [ReceivedTelegram],
+    is_due: impl Fn(&SentTelegram) -> bool,
+) -> Unmatched<'a> {
     let same = |s: usize, r: usize| sent[s].telegram == received[r].telegram;
     // best[s][r]: (lost, wrong) of the rest from these on.
     let mut best = vec![vec![(0, 0); received.len() + 1]; sent.len() + 1];
@@ -320,18 +329,18 @@ fn align<'a>(sent: &'a [Sent], received: &'a [Received], is_due: impl Fn(&Sent) 
         }
     }
     let (mut s, mut r) = (0, 0);
-    let mut account = Account { lost: Vec::new(), wrong: Vec::new() };
+    let mut unmatched = Unmatched { lost: Vec::new(), unsent: Vec::new() };
     while s < sent.len() || r < received.len() {
         let both = s < sent.len() && r < received.len();
         if both && same(s, r) && best[s][r] == best[s + 1][r + 1] {
             (s, r) = (s + 1, r + 1);
         } else if r < received.len() && best[s][r] == (best[s][r + 1].0, best[s][r + 1].1 + 1) {
-            account.wrong.push(&received[r]);
+            unmatched.unsent.push(&received[r]);
             r += 1;
         } else {
-            account.lost.extend(is_due(&sent[s]).then_some(&sent[s]));
+            unmatched.lost.extend(is_due(&sent[s]).then_some(&sent[s]));
             s += 1;
         }
     }
-    account
+    unmatched
 }

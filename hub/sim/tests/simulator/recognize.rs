@@ -2,20 +2,20 @@
 //! on a line that loses bytes.
 
 use scanhub_drivers::lms::variant::{Baud, Variant};
-use scanhub_drivers::recognize::{EXAMINED, family_of};
+use scanhub_drivers::recognize::{EXAMINED_BYTES, family_of};
 use scanhub_schema::{Family, MILLIS, Nanos};
 use scanhub_sim::device::Device;
 use scanhub_sim::fault::Faults;
 use scanhub_sim::ld::{LdSettings, LdSimulator};
-use scanhub_sim::machine::{LmsSimulator, Settings, Start};
-use scanhub_sim::operating::Operating;
-use scanhub_sim::operating::Source;
+use scanhub_sim::line_model::LineModel;
+use scanhub_sim::machine::{LmsSimulator, Settings, StartState};
+use scanhub_sim::operating::OperatingMode;
+use scanhub_sim::operating::ScanSource;
 use scanhub_sim::room::Room;
 use scanhub_sim::rplidar::{self, RplidarSettings, RplidarSimulator, RplidarStart};
-use scanhub_sim::wire::LineModel;
 
 /// Returns at most the first `len` bytes that arrive from `device` within 30 s.
-fn bytes_of(device: &mut dyn Device, faults: &str, len: usize) -> Vec<u8> {
+fn first_bytes(device: &mut dyn Device, faults: &str, len: usize) -> Vec<u8> {
     let mut wire = LineModel::new(&faults.parse::<Faults>().expect("faults"), 3);
     let (mut now, mut bytes): (Nanos, _) = (0, Vec::new());
     while now < 30_000 * MILLIS && bytes.len() < len {
@@ -36,13 +36,18 @@ fn room() -> Room {
 /// Every scanner that streams, with its family and a name.
 fn scanners() -> Vec<(Family, String, Box<dyn Device>)> {
     let mut scanners: Vec<(Family, String, Box<dyn Device>)> = Vec::new();
-    let modes = [Operating::All, Operating::Partial, Operating::Means(10), Operating::Range(31, 91)];
+    let modes =
+        [OperatingMode::All, OperatingMode::Partial, OperatingMode::Means(10), OperatingMode::Range(31, 91)];
     for (number, operating) in modes.into_iter().enumerate() {
         for variant in Variant::ALL {
-            let start = Start::In(operating.clone());
+            let start = StartState::Operating(operating.clone());
             let settings = Settings { baud: Baud::B500000, variant, start, ..Settings::default() };
             let name = format!("lms, mode {number}, {variant:?}");
-            scanners.push((Family::Lms, name, Box::new(LmsSimulator::new(settings, Source::Room(room())))));
+            scanners.push((
+                Family::Lms,
+                name,
+                Box::new(LmsSimulator::new(settings, ScanSource::Room(room()))),
+            ));
         }
     }
     for model in scanhub_drivers::ld::Model::ALL {
@@ -63,7 +68,7 @@ fn scanners() -> Vec<(Family, String, Box<dyn Device>)> {
 #[test]
 fn family_of_every_scanner_in_every_mode() {
     for (family, name, mut scanner) in scanners() {
-        let bytes = bytes_of(&mut *scanner, "", EXAMINED + 1_000);
+        let bytes = first_bytes(&mut *scanner, "", EXAMINED_BYTES + 1_000);
         assert!(bytes.len() > 5_000, "{name}: {} bytes", bytes.len());
         for begin in [0, 1, 20, 977] {
             assert_eq!(family_of(&bytes[begin..]), Some(family), "{name} from byte {begin}");
@@ -75,7 +80,7 @@ fn family_of_every_scanner_in_every_mode() {
 #[test]
 fn family_on_a_line_that_loses_bytes() {
     for (family, name, mut scanner) in scanners() {
-        let bytes = bytes_of(&mut *scanner, "loss=0.00135,burst=1.89", EXAMINED);
+        let bytes = first_bytes(&mut *scanner, "loss=0.00135,burst=1.89", EXAMINED_BYTES);
         assert_eq!(family_of(&bytes), Some(family), "{name}");
     }
 }

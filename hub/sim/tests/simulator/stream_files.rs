@@ -5,53 +5,54 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _};
+use scanhub_drivers::line::{Action, Event, Protocol as _, ScannerSession as _};
 use scanhub_drivers::{Session, Settings, ld};
-use scanhub_recording::convert::{ConvertOptions, Converted, convert};
+use scanhub_recording::convert::{ConversionResult, ConvertOptions, convert};
 use scanhub_recording::{Encoding, Form, Recording, VirtualTime};
-use scanhub_schema::datagram::Packed;
+use scanhub_schema::datagram::DatagramPayload;
 use scanhub_schema::file::Writer;
 use scanhub_schema::{Failure, Family, Foreground, Header, MILLIS, Nanos, Scan, Status, Topic};
 use scanhub_sim::Arrival;
 use scanhub_sim::device::Device;
 use scanhub_sim::fault::Faults;
 use scanhub_sim::ld::{LdSettings, LdSimulator};
+use scanhub_sim::line_model::LineModel;
 use scanhub_sim::room::Room;
 use scanhub_sim::rplidar::{Model, RplidarSettings, RplidarSimulator};
-use scanhub_sim::wire::LineModel;
 use tempfile::TempDir;
 
-const SECOND: Nanos = 1_000 * MILLIS;
+const ONE_SECOND: Nanos = 1_000 * MILLIS;
 /// Length of a recording. The motor of an RPLIDAR takes 1.6 s to get up to speed.
-const LENGTH: Nanos = 9 * SECOND;
+const RECORDING_LEN: Nanos = 9 * ONE_SECOND;
 /// Time at which a recording begins that lacks the beginning of the stream.
-const JOINED: Nanos = 4 * SECOND;
+const LATE_START: Nanos = 4 * ONE_SECOND;
 /// Time at which the clock of a read file begins.
-const BEGIN: Nanos = 10 * SECOND;
+const FILE_CLOCK_START: Nanos = 10 * ONE_SECOND;
 /// Length of a packet of one point, in bytes.
-const POINT: u64 = 5;
-const WALL: u64 = 1_700_000_000_000_000_000;
+const POINT_PACKET_LEN: u64 = 5;
+const WALL_NS: u64 = 1_700_000_000_000_000_000;
 
 /// Telegrams, scans and status that a hub published of a scanner.
-struct Live {
+struct LiveStream {
     family: Family,
     telegrams: Vec<(Header, Vec<u8>)>,
     scans: Vec<(Nanos, Box<Scan>)>,
     status: Status,
 }
 
-impl Live {
-    /// Runs a session with `settings` on `device` for [`LENGTH`].
-    fn of(device: &mut dyn Device, family: Family, settings: &Settings) -> Live {
+impl LiveStream {
+    /// Runs a session with `settings` on `device` for [`RECORDING_LEN`].
+    fn run_session(device: &mut dyn Device, family: Family, settings: &Settings) -> LiveStream {
         let mut wire = LineModel::new(&Faults::default(), 3);
         let mut session = Session::begin(family, settings, 0);
-        let mut live = Live { family, telegrams: Vec::new(), scans: Vec::new(), status: Status::default() };
-        for now in (0..LENGTH).step_by(MILLIS as usize) {
+        let mut live =
+            LiveStream { family, telegrams: Vec::new(), scans: Vec::new(), status: Status::default() };
+        for now in (0..RECORDING_LEN).step_by(MILLIS as usize) {
             let mut bytes = Vec::new();
             while let Some(carried) = wire.poll_transmit(device, now) {
                 bytes.extend(carried.bytes);
             }
-            let spare = session.spare();
+            let spare = session.read_buffer();
             let len = bytes.len();
             spare[..len].copy_from_slice(&bytes);
             session.commit(now, len);
@@ -59,14 +60,14 @@ impl Live {
                 session.handle_timeout(now);
             }
             loop {
-                match session.poll_output() {
-                    Output::Event(Event::Telegram(received)) => {
+                match session.poll_action() {
+                    Action::Event(Event::Telegram(received)) => {
                         let header = Header {
                             seq: live.telegrams.len() as u64,
                             topic_seq: live.telegrams.len() as u64,
                             stamp_first_ns: received.first,
                             stamp_last_ns: received.last,
-                            wall_ns: WALL + received.first,
+                            wall_ns: WALL_NS + received.first,
                             boot: 77,
                             hub_pid: 1,
                             family: family as u8,
@@ -75,21 +76,21 @@ impl Live {
                         };
                         live.telegrams.push((header, received.bytes.to_vec()));
                     }
-                    Output::Event(Event::Scan(raw)) => {
+                    Action::Event(Event::Scan(raw)) => {
                         let mut scan = Scan::zeroed(raw.payload_len());
                         raw.write(&mut scan);
                         live.scans.push((raw.first, scan));
                     }
-                    Output::Transmit { bytes, .. } => {
+                    Action::Transmit { bytes, .. } => {
                         let bytes = bytes.to_vec();
                         let is_heard = session.rate() == device.rate();
                         for byte in bytes.iter().filter(|_| is_heard) {
                             wire.receive(device, *byte, Arrival::at(now));
                         }
-                        session.transmitted(now);
+                        session.handle_transmitted(now);
                     }
-                    Output::SetRate(_) | Output::SetDtr(_) => {}
-                    Output::Rest(_) | Output::Wait { .. } => break,
+                    Action::SetRate(_) | Action::SetDtr(_) => {}
+                    Action::SleepUntil(_) | Action::Wait { .. } => break,
                 }
             }
         }
@@ -105,7 +106,7 @@ impl Live {
         let first = self.telegrams.iter().position(|(header, _)| header.stamp_first_ns >= from).unwrap();
         let (header, _) = self.telegrams[first];
         let mut write = |topic, header: &Header, payload: &[u8]| {
-            writer.sample("front", topic, header, payload).unwrap();
+            writer.write_sample("front", topic, header, payload).unwrap();
         };
         if has_status {
             let len = self.status.pack(&mut room).unwrap();
@@ -123,11 +124,11 @@ impl Live {
     }
 }
 
-fn converted(input: &Path, output: &str) -> (PathBuf, Converted) {
+fn convert_file(input: &Path, output: &str) -> (PathBuf, ConversionResult) {
     try_convert(input, output).unwrap()
 }
 
-fn try_convert(input: &Path, output: &str) -> Result<(PathBuf, Converted), Failure> {
+fn try_convert(input: &Path, output: &str) -> Result<(PathBuf, ConversionResult), Failure> {
     let output = input.with_file_name(output);
     let options = ConvertOptions {
         input: input.to_owned(),
@@ -147,7 +148,9 @@ fn scans_of(path: &Path) -> Vec<Box<Scan>> {
     let mut session: Option<VirtualTime<Session>> = None;
     let mut scans = Vec::new();
     for frame in recording.telegrams(Encoding::default()).unwrap() {
-        let at = frame.header.map_or(BEGIN + frame.scanner_ns.unwrap_or(0), |header| header.stamp_last_ns);
+        let at = frame
+            .header
+            .map_or(FILE_CLOCK_START + frame.scanner_ns.unwrap_or(0), |header| header.stamp_last_ns);
         let session =
             session.get_or_insert_with(|| VirtualTime::new(Session::begin(family, &settings, at), at));
         session.take(at, &frame.telegram, |event| {
@@ -172,7 +175,7 @@ fn is_same(a: &Scan, b: &Scan) -> bool {
 
 /// Checks that `path` has the scans of `live` that began after `from`. Where the recording begins in the middle of the stream, the
 /// first one may be missing.
-fn check(name: &str, live: &Live, from: Nanos, path: &Path) {
+fn check(name: &str, live: &LiveStream, from: Nanos, path: &Path) {
     let expected: Vec<_> = live.scans.iter().filter(|(first, _)| *first >= from).collect();
     let read = scans_of(path);
     // A file that has the time per point may have an earlier scan, before which the live session was measuring that time.
@@ -191,38 +194,41 @@ fn check(name: &str, live: &Live, from: Nanos, path: &Path) {
 }
 
 /// Checks that the scans of `live` come back from a stream file, whenever the recording began.
-fn check_stream_files(name: &str, live: &Live) {
+fn check_stream_files(name: &str, live: &LiveStream) {
     let folder = TempDir::new().unwrap();
-    for from in [0, JOINED] {
-        let name = format!("{name} from {} s", from / SECOND);
+    for from in [0, LATE_START] {
+        let name = format!("{name} from {} s", from / ONE_SECOND);
         let recorded = live.record(&folder, from, true);
         let recording = Recording::open(&recorded).unwrap();
-        let (stream, account) = converted(&recorded, "a.bin");
-        assert_eq!(account.telegrams, recording.contents().telegrams, "{name}");
+        let (stream, result) = convert_file(&recorded, "a.bin");
+        assert_eq!(result.telegrams, recording.contents().telegrams, "{name}");
         let read = Recording::open(&stream).unwrap();
         assert_eq!((read.contents().form, read.family()), (Form::Telegrams, Some(live.family)), "{name}");
         // A point without a checksum counts only if another one follows.
-        assert!(read.contents().damage.bytes <= POINT, "{name}: {}", read.contents().damage);
+        assert!(read.contents().damage.bytes <= POINT_PACKET_LEN, "{name}: {}", read.contents().damage);
         // Models of LDROBOT may be alike.
         let model = |recording: &Recording| recording.model().unwrap().map(|model| (model.baud, model.beams));
         assert_eq!(model(&read), model(&recording), "{name}");
-        let took = read.contents().scanner_ns.expect("a clock of the scanner");
-        let expected = LENGTH
+        let scanner_ns = read.contents().scanner_ns.expect("a clock of the scanner");
+        let expected = RECORDING_LEN
             - live
                 .telegrams
                 .iter()
                 .map(|(header, _)| header.stamp_first_ns)
                 .find(|first| *first >= from.max(live.scans[0].0))
                 .unwrap();
-        assert!(took.abs_diff(expected) < SECOND, "{name}: {took} {expected}");
+        assert!(scanner_ns.abs_diff(expected) < ONE_SECOND, "{name}: {scanner_ns} {expected}");
         check(&name, live, from, &stream);
         // A file of packets and their stamps again, and a stream file of that.
-        let (again, _) = converted(&stream, "b.mcap");
+        let (again, _) = convert_file(&stream, "b.mcap");
         check(&format!("{name}, in MCAP"), live, from, &again);
-        let (twice, _) = converted(&again, "c.bin");
+        let (twice, _) = convert_file(&again, "c.bin");
         let [bytes, twice] = [stream, twice].map(|path| std::fs::read(path).unwrap());
         let missing = bytes.len() - twice.len();
-        assert!(bytes.starts_with(&twice) && missing as u64 <= POINT, "{name}: {missing} bytes are missing");
+        assert!(
+            bytes.starts_with(&twice) && missing as u64 <= POINT_PACKET_LEN,
+            "{name}: {missing} bytes are missing"
+        );
     }
 }
 
@@ -235,12 +241,12 @@ fn every_rplidar_in_every_mode_has_the_same_scans() {
     for model in Model::ALL {
         let fastest = Settings { is_found: true, ..Settings::default() };
         let modes = model.modes().iter().map(|mode| {
-            let mode = scanhub_drivers::rplidar::Mode::named(mode.name).expect("known").name();
+            let mode = scanhub_drivers::rplidar::Mode::from_name(mode.name).expect("known").name();
             (mode, Settings { model: Some(model.name()), mode: Some(mode), ..Settings::default() })
         });
         for (mode, settings) in modes.chain([("the fastest mode", fastest)]) {
             let mut unit = RplidarSimulator::new(RplidarSettings::of(model), room());
-            let live = Live::of(&mut unit, Family::Rplidar, &settings);
+            let live = LiveStream::run_session(&mut unit, Family::Rplidar, &settings);
             check_stream_files(&format!("{} {mode}", model.name()), &live);
         }
     }
@@ -251,7 +257,7 @@ fn every_ldrobot_has_the_same_scans() {
     for model in ld::Model::ALL {
         for settings in [Settings::default(), Settings { model: Some(model.name()), ..Settings::default() }] {
             let mut head = LdSimulator::new(LdSettings::of(model), room());
-            let live = Live::of(&mut head, Family::Ld, &settings);
+            let live = LiveStream::run_session(&mut head, Family::Ld, &settings);
             check_stream_files(model.name(), &live);
         }
     }
@@ -260,23 +266,23 @@ fn every_ldrobot_has_the_same_scans() {
 /// The packets alone do not define the model, or the time per point. The responses at the beginning of a stream do, and so
 /// does the topic `status`.
 #[test]
-fn recording_without_status_and_responses_becomes_no_stream_file() {
+fn refuses_stream_file_without_status_and_responses() {
     for model in Model::ALL {
         let name = model.name();
         let fastest = Settings { is_found: true, ..Settings::default() };
-        let live = Live::of(
+        let live = LiveStream::run_session(
             &mut RplidarSimulator::new(RplidarSettings::of(model), room()),
             Family::Rplidar,
             &fastest,
         );
         let folder = TempDir::new().unwrap();
-        let recorded = live.record(&folder, JOINED, false);
+        let recorded = live.record(&folder, LATE_START, false);
         let failure = try_convert(&recorded, "a.bin").expect_err(name);
         assert_eq!(failure.kind.exit_code(), 66, "{name}: {failure}");
         assert!(failure.hint.contains("NAME/status"), "{name}: {failure}");
         assert!(!folder.path().join("a.bin").exists(), "{name}");
         let recorded = live.record(&folder, 0, false);
-        let (stream, _) = converted(&recorded, "a.bin");
+        let (stream, _) = convert_file(&recorded, "a.bin");
         check(name, &live, 0, &stream);
     }
 }
@@ -284,15 +290,15 @@ fn recording_without_status_and_responses_becomes_no_stream_file() {
 /// A stream that was captured without the responses of the scanner is read as before: its packets are found, and scans need the
 /// model or the mode if the packets may be of two kinds.
 #[test]
-fn stream_without_responses_needs_model_or_mode_if_its_packets_look_alike() {
+fn ambiguous_stream_needs_the_model_or_mode() {
     let folder = TempDir::new().unwrap();
     let settings = Settings { model: Some("s1"), ..Settings::default() };
-    let live = Live::of(
+    let live = LiveStream::run_session(
         &mut RplidarSimulator::new(RplidarSettings::of(Model::S1), room()),
         Family::Rplidar,
         &settings,
     );
-    let packets = live.telegrams.iter().filter(|(header, _)| header.stamp_first_ns >= JOINED);
+    let packets = live.telegrams.iter().filter(|(header, _)| header.stamp_first_ns >= LATE_START);
     let bytes: Vec<u8> = packets.flat_map(|(_, bytes)| bytes.clone()).collect();
     let path = folder.path().join("old.bin");
     std::fs::write(&path, &bytes).unwrap();
@@ -304,10 +310,11 @@ fn stream_without_responses_needs_model_or_mode_if_its_packets_look_alike() {
     assert!(frames.iter().flat_map(|frame| &frame.telegram).eq(&bytes));
     let in_mode = |settings: Settings| {
         let settings = Settings { fixed_rate: true, listen_only: true, ..settings };
-        let mut session = VirtualTime::new(Session::begin(Family::Rplidar, &settings, BEGIN), BEGIN);
+        let mut session =
+            VirtualTime::new(Session::begin(Family::Rplidar, &settings, FILE_CLOCK_START), FILE_CLOCK_START);
         let mut beams = Vec::new();
         for frame in &frames {
-            session.take(BEGIN + frame.scanner_ns.unwrap_or(0), &frame.telegram, |event| {
+            session.take(FILE_CLOCK_START + frame.scanner_ns.unwrap_or(0), &frame.telegram, |event| {
                 if let Event::Scan(scan) = event {
                     beams.push(scan.beams());
                 }
@@ -321,6 +328,6 @@ fn stream_without_responses_needs_model_or_mode_if_its_packets_look_alike() {
         assert!(beams.len() > 20 && beams.iter().all(|beams| beams.abs_diff(920) < 20), "{beams:?}");
     }
     // It stays as it is.
-    let (copy, _) = converted(&path, "copy.bin");
+    let (copy, _) = convert_file(&path, "copy.bin");
     assert!(std::fs::read(copy).unwrap() == bytes);
 }

@@ -4,7 +4,7 @@
 use std::path::Path;
 use std::time::Duration;
 
-use scanhub_port::{Holder, Source};
+use scanhub_port::{Holder, PortSpec};
 use scanhub_schema::{Failure, Kind, State, Status, is_remote};
 use scanhub_shm::Payload;
 use scanhub_shm::{Domain, Environment, RunningHub};
@@ -20,59 +20,58 @@ pub(crate) struct Hub {
 impl Hub {
     /// Returns the hub in `domain`, if there is one.
     pub(crate) fn find(domain: &Domain) -> Option<Hub> {
-        let pid = scanhub_shm::holder(domain.root()).ok().flatten()?;
+        let pid = scanhub_shm::hub_pid(domain.root()).ok().flatten()?;
         Some(Hub { pid, info: "scanhub info".to_owned(), statuses: statuses(domain).unwrap_or_default() })
     }
 
     /// Returns the hub that uses the port `source`: one of its `holders`, in `places` or in another domain of this machine, or
     /// one in `places` that is connected to this serial server.
-    pub(crate) fn at(source: &Source, holders: &[Holder], places: &[Domain]) -> Option<Hub> {
-        if let Source::Tcp { .. } = source {
+    pub(crate) fn at(source: &PortSpec, holders: &[Holder], locations: &[Domain]) -> Option<Hub> {
+        if let PortSpec::Tcp { .. } = source {
             let is_connected = |(_, status): (&str, &Status)| status.state() != Some(State::Absent);
             let uses_it = |hub: &Hub| hub.link(source).is_some_and(is_connected);
-            return places.iter().filter_map(Hub::find).find(uses_it);
+            return locations.iter().filter_map(Hub::find).find(uses_it);
         }
         let is_holder = |pid| holders.iter().any(|holder| holder.pid == pid);
         if holders.is_empty() {
             return None;
         }
-        let runs_hub =
-            |place: &&Domain| matches!(scanhub_shm::holder(place.root()), Ok(Some(pid)) if is_holder(pid));
-        if let Some(place) = places.iter().find(runs_hub) {
-            return Hub::find(place);
+        let runs_hub = |location: &&Domain| matches!(scanhub_shm::hub_pid(location.root()), Ok(Some(pid)) if is_holder(pid));
+        if let Some(location) = locations.iter().find(runs_hub) {
+            return Hub::find(location);
         }
         let running = RunningHub::all(Path::new("/")).into_iter().find(|hub| is_holder(hub.pid))?;
         let domain = Domain::at(running.domain.as_ref()?, running.base.as_ref()?).ok()?;
-        let asked = places.first().map_or(scanhub_shm::DEFAULT_DOMAIN, Domain::name);
-        let info = running.command("info", asked, &Environment::of_process());
+        let domain_name = locations.first().map_or(scanhub_shm::DEFAULT_DOMAIN, Domain::name);
+        let info = running.command("info", domain_name, &Environment::of_process());
         Hub::find(&domain).filter(|hub| hub.pid == running.pid).map(|hub| Hub { info, ..hub })
     }
 
     /// Returns the port of a link, if `source` is the link's name and not the path of a file.
-    pub(crate) fn port_of(&self, source: &Source) -> Option<Source> {
-        self.source_of(self.named(source)?.1.as_ref()?)
+    pub(crate) fn port_of(&self, source: &PortSpec) -> Option<PortSpec> {
+        self.source_of(self.link_named(source)?.1.as_ref()?)
     }
 
     /// Returns the port of the link with this `status`. The hub may have been started in another directory.
-    fn source_of(&self, status: &Status) -> Option<Source> {
-        let source = Source::parse(status.port()).ok()?;
-        let Source::Tty(path) = &source else { return Some(source) };
+    fn source_of(&self, status: &Status) -> Option<PortSpec> {
+        let source = PortSpec::parse(status.port()).ok()?;
+        let PortSpec::Tty(path) = &source else { return Some(source) };
         let directory = || std::fs::read_link(format!("/proc/{}/cwd", self.pid)).ok();
         match directory().filter(|_| path.is_relative()) {
-            Some(directory) => Some(Source::Tty(directory.join(path))),
+            Some(directory) => Some(PortSpec::Tty(directory.join(path))),
             None => Some(source),
         }
     }
 
     /// Returns the ports of all links that report theirs.
-    pub(crate) fn ports(&self) -> Vec<Source> {
+    pub(crate) fn ports(&self) -> Vec<PortSpec> {
         let statuses = self.statuses.iter().filter_map(|(_, status)| status.as_ref());
         statuses.filter_map(|status| self.source_of(status)).collect()
     }
 
     /// Returns whether `source` names a link whose port is unknown because its status did not arrive.
-    pub(crate) fn is_mute_link(&self, source: &Source) -> bool {
-        self.named(source).is_some_and(|(_, status)| status.is_none())
+    pub(crate) fn is_mute_link(&self, source: &PortSpec) -> bool {
+        self.link_named(source).is_some_and(|(_, status)| status.is_none())
     }
 
     /// Returns the links whose status did not arrive, although a running hub keeps it for late joiners.
@@ -81,7 +80,7 @@ impl Hub {
     }
 
     /// Returns name and status of the link with this port, even if its configuration has another name for it.
-    pub(crate) fn link(&self, port: &Source) -> Option<(&str, &Status)> {
+    pub(crate) fn link(&self, port: &PortSpec) -> Option<(&str, &Status)> {
         let links =
             || self.statuses.iter().filter_map(|(name, status)| Some((name.as_str(), status.as_ref()?)));
         let is_named = |(_, status): &(&str, &Status)| self.source_of(status).as_ref() == Some(port);
@@ -92,7 +91,7 @@ impl Hub {
     }
 
     /// Returns the reason why a port that the hub has open belongs to none of its reported links.
-    pub(crate) fn why_unknown(&self) -> &'static str {
+    pub(crate) fn unknown_reason(&self) -> &'static str {
         match self.statuses.iter().any(|(_, status)| status.is_none()) {
             true => "the hub has the port, and does not publish",
             false => "the hub has the port under another name: scanhub info",
@@ -116,7 +115,7 @@ impl Hub {
     }
 
     /// Returns the failure for a program that needs the port `source` of this hub, which has `holders`.
-    pub(crate) fn refuse(&self, source: &Source, holders: &[Holder]) -> Failure {
+    pub(crate) fn refuse(&self, source: &PortSpec, holders: &[Holder]) -> Failure {
         let (name, pid, stop) = (source.name(), self.pid, self.stop(holders));
         let mut message = format!("{name}: in use by the hub, process {pid}");
         let mut remedies = Vec::new();
@@ -154,8 +153,8 @@ impl Hub {
         Hub { pid, info: "scanhub info".to_owned(), statuses: Vec::new() }
     }
 
-    fn named(&self, source: &Source) -> Option<&LinkStatus> {
-        let Source::Tty(path) = source else { return None };
+    fn link_named(&self, source: &PortSpec) -> Option<&LinkStatus> {
+        let PortSpec::Tty(path) = source else { return None };
         let name = path.to_str().filter(|_| !path.exists())?;
         self.statuses.iter().find(|(sensor, _)| sensor == name)
     }
@@ -180,7 +179,7 @@ fn statuses(domain: &Domain) -> Result<Vec<LinkStatus>, Failure> {
         subscribers.push(Status::subscriber(&node, &topic)?);
         found.push((sensor, None));
     }
-    for _ in 0..POLLS {
+    for _ in 0..MAX_POLLS {
         for (subscriber, (_, status)) in subscribers.iter().zip(&mut found) {
             if let Ok(Some(sample)) = Status::receive(subscriber) {
                 *status = Some(*Status::read(&sample));
@@ -197,7 +196,7 @@ fn statuses(domain: &Domain) -> Result<Vec<LinkStatus>, Failure> {
 /// Process ID of the service manager, which holds ports only for a service.
 const SERVICE_MANAGER: u32 = 1;
 /// Number of polls: a second and a half in total.
-const POLLS: u32 = 75;
+const MAX_POLLS: u32 = 75;
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
 #[cfg(test)]
@@ -216,10 +215,10 @@ mod tests {
     }
 
     #[test]
-    fn a_port_of_the_hub_is_refused_with_what_the_hub_reports() {
+    fn refuses_hub_port_with_the_hubs_own_report() {
         let error = "1,200 bytes/s arrive, but no LMS replies; is it another scanner?";
         let hub = hub(State::Probing, "/dev/x", error);
-        let source = Source::Tty("/dev/x".into());
+        let source = PortSpec::Tty("/dev/x".into());
         let refused = hub.refuse(&source, &[holder(7, "scanhub")]);
         assert_eq!(refused.kind, Kind::PortBusy);
         let message = format!("/dev/x: in use by the hub, process 7; its link front is probing: {error}");
@@ -244,12 +243,12 @@ mod tests {
         let hub = hub(State::Streaming, &name.display().to_string(), "");
         for port in [name.as_path(), Path::new("/dev/null")] {
             assert_eq!(
-                hub.link(&Source::Tty(port.to_owned())).map(|(name, _)| name),
+                hub.link(&PortSpec::Tty(port.to_owned())).map(|(name, _)| name),
                 Some("front"),
                 "{port:?}"
             );
         }
-        assert!(hub.link(&Source::Tty("/dev/zero".into())).is_none());
-        assert_eq!(hub.ports(), [Source::Tty(name)]);
+        assert!(hub.link(&PortSpec::Tty("/dev/zero".into())).is_none());
+        assert_eq!(hub.ports(), [PortSpec::Tty(name)]);
     }
 }

@@ -14,9 +14,9 @@ use std::thread;
 use std::time::Duration;
 
 use rustix::process::{geteuid, getuid};
-use scanhub_files::regular;
-use scanhub_port::Candidate;
-use scanhub_shm::LIBRARY;
+use scanhub_files::regular_file;
+use scanhub_port::SerialPortInfo;
+use scanhub_shm::LIBRARY_VERSION;
 
 use crate::doctor::Finding;
 
@@ -30,7 +30,7 @@ pub struct System {
 
 impl System {
     /// Returns this machine, and the user of this process.
-    pub fn this() -> System {
+    pub fn local() -> System {
         System::at("/", getuid().as_raw())
     }
 
@@ -52,7 +52,7 @@ impl System {
 
     /// Returns the text of a file, or `None` if it cannot be read.
     pub(crate) fn text(&self, path: &str) -> Option<String> {
-        regular::read_text(&self.path(path), regular::LONGEST).ok()
+        regular_file::read_text(&self.path(path), regular_file::MAX_FILE_BYTES).ok()
     }
 
     /// Returns the path of `name` in the first of `directories` that has it. A symlink without a target counts.
@@ -98,7 +98,7 @@ pub(crate) enum VersionMatch {
 
 /// The program of a hub's process.
 #[derive(Clone, Debug, PartialEq, Eq)]
-struct Running {
+struct RunningProgram {
     build: VersionMatch,
     /// Whether its file was replaced or removed after the start.
     is_replaced: bool,
@@ -108,13 +108,13 @@ struct Running {
 pub(crate) fn version(system: &System, hub: Option<u32>) -> Finding {
     let kernel = system.text("proc/sys/kernel/osrelease").unwrap_or_default();
     let own = match kernel.trim() {
-        "" => format!("scanhub {VERSION}, {LIBRARY}"),
-        kernel => format!("scanhub {VERSION}, {LIBRARY}, Linux {kernel}"),
+        "" => format!("scanhub {VERSION}, {LIBRARY_VERSION}"),
+        kernel => format!("scanhub {VERSION}, {LIBRARY_VERSION}, Linux {kernel}"),
     };
-    judge(own, hub.map(|pid| (pid, running(pid))))
+    version_finding(own, hub.map(|pid| (pid, running_program(pid))))
 }
 
-fn judge(own: String, hub: Option<(u32, Option<Running>)>) -> Finding {
+fn version_finding(own: String, hub: Option<(u32, Option<RunningProgram>)>) -> Finding {
     const NAME: &str = "version";
     let restart = "restart the hub: sudo systemctl restart scanhub, if it is the service";
     match hub {
@@ -122,33 +122,35 @@ fn judge(own: String, hub: Option<(u32, Option<Running>)>) -> Finding {
         Some((_, None)) => {
             Finding::ok(NAME, format!("{own}; this user may not see which program the hub runs"))
         }
-        Some((pid, Some(Running { build: VersionMatch::Other(Some(version)), .. })))
+        Some((pid, Some(RunningProgram { build: VersionMatch::Other(Some(version)), .. })))
             if version != VERSION =>
         {
             let text = format!("{own}; the hub, process {pid}, is scanhub {version}: they refuse each other");
             Finding::failed(NAME, text, format!("use one version for both; {restart}"))
         }
-        Some((pid, Some(Running { is_replaced: true, build }))) if build != VersionMatch::Same => {
+        Some((pid, Some(RunningProgram { is_replaced: true, build }))) if build != VersionMatch::Same => {
             let text = format!("{own}; the hub, process {pid}, runs a program that was replaced since");
             Finding::warning(NAME, text, restart)
         }
-        Some((_, Some(Running { is_replaced: true, .. }))) => {
+        Some((_, Some(RunningProgram { is_replaced: true, .. }))) => {
             Finding::ok(NAME, format!("{own}; the hub runs this version; its file was replaced"))
         }
-        Some((_, Some(Running { build: VersionMatch::Same, .. }))) => {
+        Some((_, Some(RunningProgram { build: VersionMatch::Same, .. }))) => {
             Finding::ok(NAME, format!("{own}; the hub runs the same program"))
         }
-        Some((_, Some(Running { .. }))) => Finding::ok(NAME, format!("{own}; the hub runs another build")),
+        Some((_, Some(RunningProgram { .. }))) => {
+            Finding::ok(NAME, format!("{own}; the hub runs another build"))
+        }
     }
 }
 
 /// Returns the program of process `pid`, or `None` if this user may not see it.
-fn running(pid: u32) -> Option<Running> {
+fn running_program(pid: u32) -> Option<RunningProgram> {
     let process = PathBuf::from(format!("/proc/{pid}"));
     let link = fs::read_link(process.join("exe")).ok()?;
     let is_own = user_of(pid) == Some(geteuid().as_raw());
     let build = compare(&process.join("exe"), is_own).ok()?;
-    Some(Running { build, is_replaced: link.to_string_lossy().ends_with(" (deleted)") })
+    Some(RunningProgram { build, is_replaced: link.to_string_lossy().ends_with(" (deleted)") })
 }
 
 /// Compares `program` with this one. Starts it to query its version only if it is `trusted`, and if only this user and
@@ -190,7 +192,7 @@ fn is_ours(metadata: &Metadata) -> bool {
 }
 
 fn is_same(mut one: File, mut other: File) -> bool {
-    let (mut left, mut right) = (vec![0; PIECE], vec![0; PIECE]);
+    let (mut left, mut right) = (vec![0; BLOCK_LEN], vec![0; BLOCK_LEN]);
     loop {
         match one.read(&mut left) {
             Ok(0) => return true,
@@ -205,7 +207,7 @@ fn reported_version(program: &Path) -> Option<String> {
     let mut command = Command::new(program);
     command.arg("--version").stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null());
     let mut process = command.spawn().ok()?;
-    for _ in 0..POLLS {
+    for _ in 0..MAX_POLLS {
         if let Ok(Some(_)) = process.try_wait() {
             let mut output = String::new();
             process.stdout.take()?.take(MAX_OUTPUT).read_to_string(&mut output).ok()?;
@@ -222,7 +224,7 @@ fn reported_version(program: &Path) -> Option<String> {
 /// hub, if one runs.
 pub(crate) fn service(system: &System, hub: Option<u32>) -> Finding {
     const NAME: &str = "service";
-    let Some(unit) = system.first(&UNITS, UNIT) else {
+    let Some(unit) = system.first(&UNIT_DIRECTORIES, UNIT_NAME) else {
         return Finding::skipped(NAME, "not installed; hub/dist/install.sh puts it in place");
     };
     if fs::read_link(&unit).is_ok_and(|target| target == Path::new("/dev/null")) {
@@ -230,23 +232,23 @@ pub(crate) fn service(system: &System, hub: Option<u32>) -> Finding {
     }
     let at = unit.display().to_string();
     let Some(program) = program(system, &unit) else {
-        return Finding::failed(NAME, format!("{at} starts nothing"), INSTALL);
+        return Finding::failed(NAME, format!("{at} starts nothing"), INSTALL_REMEDY);
     };
-    let place = system.path(&program);
-    let build = match compare(&place, true) {
+    let program_path = system.path(&program);
+    let build = match compare(&program_path, true) {
         Ok(VersionMatch::Same) => "this program".to_owned(),
         Ok(VersionMatch::Other(Some(version))) if version == VERSION => format!("another build of {VERSION}"),
         Ok(VersionMatch::Other(Some(version))) => {
             return Finding::warning(
                 NAME,
                 format!("{at} starts {}, version {version}; this is {VERSION}", program.display()),
-                format!("{INSTALL}, then sudo systemctl restart scanhub"),
+                format!("{INSTALL_REMEDY}, then sudo systemctl restart scanhub"),
             );
         }
         Ok(VersionMatch::Other(None)) => "a program that does not report its version".to_owned(),
         Err(error) if error.kind() == ErrorKind::NotFound => {
             let text = format!("{at} starts {}, which is not there", program.display());
-            return Finding::failed(NAME, text, INSTALL);
+            return Finding::failed(NAME, text, INSTALL_REMEDY);
         }
         // A program that only root can read is not a problem.
         Err(_) => "a program that this user may not read".to_owned(),
@@ -269,19 +271,23 @@ pub(crate) fn service(system: &System, hub: Option<u32>) -> Finding {
 }
 
 /// Checks whether the udev rule of this version is installed, and has named the adapters `there`.
-pub(crate) fn rules(system: &System, there: &[Candidate]) -> Finding {
+pub(crate) fn rules(system: &System, serial_ports: &[SerialPortInfo]) -> Finding {
     const NAME: &str = "udev";
-    let Some(path) = system.first(&RULES, RULE) else {
+    let Some(path) = system.first(&RULE_DIRECTORIES, RULE_NAME) else {
         return Finding::skipped(NAME, "no rule installed; hub/dist/install.sh puts it in place");
     };
     let at = path.display();
-    match regular::read_text(&path, regular::LONGEST) {
-        Ok(text) if text == TEXT => {}
+    match regular_file::read_text(&path, regular_file::MAX_FILE_BYTES) {
+        Ok(text) if text == RULE_TEXT => {}
         Ok(_) => {
             let text = format!("{at} belongs to another version");
-            return Finding::warning(NAME, text, format!("{INSTALL}; give your own rule another name"));
+            return Finding::warning(
+                NAME,
+                text,
+                format!("{INSTALL_REMEDY}; give your own rule another name"),
+            );
         }
-        Err(error) => return Finding::warning(NAME, format!("{at}: {error}"), INSTALL),
+        Err(error) => return Finding::warning(NAME, format!("{at}: {error}"), INSTALL_REMEDY),
     }
     let links = fs::read_dir(system.path("dev/scanhub")).into_iter().flatten().flatten();
     let named: Vec<PathBuf> = links.filter_map(|entry| entry.path().canonicalize().ok()).collect();
@@ -289,7 +295,7 @@ pub(crate) fn rules(system: &System, there: &[Candidate]) -> Finding {
         let name = device.file_name().unwrap_or_default().to_string_lossy();
         ["ttyUSB", "ttyACM"].iter().any(|kind| name.starts_with(kind))
     };
-    let adapters = there.iter().map(|port| port.device.as_path()).filter(|device| is_adapter(device));
+    let adapters = serial_ports.iter().map(|port| port.device.as_path()).filter(|device| is_adapter(device));
     let without: Vec<String> = adapters
         .filter(|device| !named.iter().any(|named| named == device))
         .map(|it| it.display().to_string())
@@ -306,10 +312,11 @@ pub(crate) fn rules(system: &System, there: &[Candidate]) -> Finding {
 
 /// Returns the program that `unit` starts, with respect to its drop-in files.
 fn program(system: &System, unit: &Path) -> Option<PathBuf> {
-    let directories: Vec<String> = UNITS.iter().map(|place| format!("{place}/{UNIT}.d")).collect();
+    let directories: Vec<String> =
+        UNIT_DIRECTORIES.iter().map(|directory| format!("{directory}/{UNIT_NAME}.d")).collect();
     let mut program = None;
     for path in std::iter::once(unit.to_owned()).chain(system.drop_ins(&directories)) {
-        let text = regular::read_text(&path, regular::LONGEST).unwrap_or_default();
+        let text = regular_file::read_text(&path, regular_file::MAX_FILE_BYTES).unwrap_or_default();
         for line in text.lines() {
             let Some(command) = line.trim().strip_prefix("ExecStart=") else { continue };
             // An empty value resets the setting. Characters before the path select how systemd starts it.
@@ -322,18 +329,19 @@ fn program(system: &System, unit: &Path) -> Option<PathBuf> {
 
 /// Returns whether another unit starts the service, such as at boot.
 fn is_enabled(system: &System) -> bool {
-    let directories = UNITS.iter().filter_map(|place| fs::read_dir(system.path(place)).ok());
+    let directories =
+        UNIT_DIRECTORIES.iter().filter_map(|directory| fs::read_dir(system.path(directory)).ok());
     let mut entries = directories.flatten().flatten().map(|entry| entry.path());
     entries.any(|path| {
         let is_dependency = path.extension().is_some_and(|kind| kind == "wants" || kind == "requires");
-        is_dependency && path.join(UNIT).symlink_metadata().is_ok()
+        is_dependency && path.join(UNIT_NAME).symlink_metadata().is_ok()
     })
 }
 
 /// Returns whether the service has processes, by the kernel's list of its control group.
 fn is_running(system: &System) -> bool {
     let groups = ["", "unified/", "systemd/"]
-        .map(|kind| format!("sys/fs/cgroup/{kind}system.slice/{UNIT}/cgroup.procs"));
+        .map(|kind| format!("sys/fs/cgroup/{kind}system.slice/{UNIT_NAME}/cgroup.procs"));
     groups.iter().any(|path| system.text(path).is_some_and(|pids| !pids.trim().is_empty()))
 }
 
@@ -343,15 +351,15 @@ fn is_running(system: &System) -> bool {
 pub(crate) fn logout(system: &System, user: u32) -> Finding {
     const NAME: &str = "logout";
     let name = system.name_of(user);
-    if user <= LAST_SYSTEM_USER {
+    if user <= MAX_SYSTEM_UID {
         return Finding::ok(NAME, format!("user {name} is a system user: shared memory stays at logout"));
     }
     if !system.path("run/systemd/users").is_dir() {
         return Finding::ok(NAME, "there is no logind that could remove shared memory");
     }
-    let (removes, place) = removes_ipc(system);
+    let (removes, file) = removes_ipc(system);
     if !removes {
-        return Finding::ok(NAME, format!("RemoveIPC=no in {place}: shared memory stays"));
+        return Finding::ok(NAME, format!("RemoveIPC=no in {file}: shared memory stays"));
     }
     if system.path("var/lib/systemd/linger").join(&name).exists() {
         return Finding::ok(NAME, format!("user {name} lingers: shared memory stays"));
@@ -359,7 +367,7 @@ pub(crate) fn logout(system: &System, user: u32) -> Finding {
     Finding::warning(
         NAME,
         format!(
-            "RemoveIPC=yes ({place}): when user {name} logs out, shared memory is removed, even while a hub uses it"
+            "RemoveIPC=yes ({file}): when user {name} logs out, shared memory is removed, even while a hub uses it"
         ),
         format!(
             "sudo loginctl enable-linger {name}; or run the service, whose user does not log out; or set RemoveIPC=no under \
@@ -370,12 +378,12 @@ pub(crate) fn logout(system: &System, user: u32) -> Finding {
 
 /// Returns whether logind removes shared memory, and the file with this setting.
 fn removes_ipc(system: &System) -> (bool, String) {
-    let directories = CONFIGURATIONS.map(|place| format!("{place}/logind.conf.d"));
-    let first = system.first(&CONFIGURATIONS, "logind.conf");
+    let directories = CONFIG_DIRECTORIES.map(|directory| format!("{directory}/logind.conf.d"));
+    let first = system.first(&CONFIG_DIRECTORIES, "logind.conf");
     let files = first.into_iter().chain(system.drop_ins(&directories));
     let mut found = (true, "the default".to_owned());
     for path in files {
-        let text = regular::read_text(&path, regular::LONGEST).unwrap_or_default();
+        let text = regular_file::read_text(&path, regular_file::MAX_FILE_BYTES).unwrap_or_default();
         if let Some(removes) = remove_ipc_setting(&text) {
             found = (removes, path.display().to_string());
         }
@@ -414,18 +422,18 @@ pub(crate) use tests::TempRoot;
 /// The version of this program.
 const VERSION: &str = env!("CARGO_PKG_VERSION");
 /// Number of bytes that are compared at once.
-const PIECE: usize = 1 << 16;
+const BLOCK_LEN: usize = 1 << 16;
 /// Maximum length of the output of `--version`, in bytes.
 const MAX_OUTPUT: u64 = 1 << 10;
 /// Number of polls: two seconds in total.
-const POLLS: u32 = 200;
+const MAX_POLLS: u32 = 200;
 const POLL_INTERVAL: Duration = Duration::from_millis(10);
-const UNIT: &str = "scanhub.service";
-const RULE: &str = "60-scanhub.rules";
+const UNIT_NAME: &str = "scanhub.service";
+const RULE_NAME: &str = "60-scanhub.rules";
 /// The rule of this version.
-const TEXT: &str = include_str!("../../../dist/60-scanhub.rules");
+const RULE_TEXT: &str = include_str!("../../../dist/60-scanhub.rules");
 /// Directories in which systemd searches for units, in its order.
-const UNITS: [&str; 5] = [
+const UNIT_DIRECTORIES: [&str; 5] = [
     "etc/systemd/system",
     "run/systemd/system",
     "usr/local/lib/systemd/system",
@@ -433,22 +441,23 @@ const UNITS: [&str; 5] = [
     "lib/systemd/system",
 ];
 /// Directories in which udev searches for rules, in its order.
-const RULES: [&str; 5] = [
+const RULE_DIRECTORIES: [&str; 5] = [
     "etc/udev/rules.d",
     "run/udev/rules.d",
     "usr/local/lib/udev/rules.d",
     "usr/lib/udev/rules.d",
     "lib/udev/rules.d",
 ];
-const INSTALL: &str = "sudo hub/dist/install.sh puts this version in place";
+const INSTALL_REMEDY: &str = "sudo hub/dist/install.sh puts this version in place";
 /// Directories in which systemd searches for its configuration, in its order.
-const CONFIGURATIONS: [&str; 4] = ["etc/systemd", "run/systemd", "usr/local/lib/systemd", "usr/lib/systemd"];
+const CONFIG_DIRECTORIES: [&str; 4] =
+    ["etc/systemd", "run/systemd", "usr/local/lib/systemd", "usr/lib/systemd"];
 /// Highest ID of a system user (systemd, SYSTEM_UID_MAX).
-const LAST_SYSTEM_USER: u32 = 999;
+const MAX_SYSTEM_UID: u32 = 999;
 
 #[cfg(test)]
 mod tests {
-    use scanhub_port::found_in;
+    use scanhub_port::serial_ports_in;
 
     use crate::doctor::State;
 
@@ -496,13 +505,13 @@ mod tests {
         let temp = TempRoot::new(0, &[("dev/ttyUSB0", ""), ("sys/usb/idVendor", "0403\n")]);
         fs::create_dir_all(temp.path("sys/class/tty/ttyUSB0")).unwrap();
         temp.link(temp.path("sys/usb").to_str().unwrap(), "sys/class/tty/ttyUSB0/device");
-        let there = found_in(&temp.path(""));
+        let there = serial_ports_in(&temp.path(""));
         assert_eq!(there.len(), 1);
         let of = || rules(&temp.system, &there);
         assert_eq!(of().state, State::Skipped);
         temp.put("etc/udev/rules.d/60-scanhub.rules", "# older\n");
         assert!(of().state == State::Warning && of().remedy.contains("install.sh"), "{}", of());
-        temp.put("etc/udev/rules.d/60-scanhub.rules", TEXT);
+        temp.put("etc/udev/rules.d/60-scanhub.rules", RULE_TEXT);
         assert!(of().state == State::Warning && of().remedy.contains("udevadm trigger"), "{}", of());
         temp.link(temp.path("dev/ttyUSB0").to_str().unwrap(), "dev/scanhub/pci-0");
         assert_eq!(of().state, State::Ok);
@@ -539,11 +548,12 @@ mod tests {
 
     #[test]
     fn judges_program_of_hub() {
-        let of =
-            |build, is_replaced| judge("own".to_owned(), Some((7, Some(Running { build, is_replaced }))));
+        let of = |build, is_replaced| {
+            version_finding("own".to_owned(), Some((7, Some(RunningProgram { build, is_replaced }))))
+        };
         let other = |version: &str| VersionMatch::Other(Some(version.to_owned()));
-        assert_eq!(judge("own".to_owned(), None).state, State::Ok);
-        assert_eq!(judge("own".to_owned(), Some((7, None))).state, State::Ok);
+        assert_eq!(version_finding("own".to_owned(), None).state, State::Ok);
+        assert_eq!(version_finding("own".to_owned(), Some((7, None))).state, State::Ok);
         assert_eq!(of(VersionMatch::Same, false).state, State::Ok);
         assert_eq!(of(other(VERSION), false).state, State::Ok);
         assert_eq!(of(VersionMatch::Same, true).state, State::Ok);
@@ -558,9 +568,9 @@ mod tests {
 
     #[test]
     fn recognizes_own_program() {
-        let own = running(std::process::id()).expect("may be seen");
-        assert_eq!(own, Running { build: VersionMatch::Same, is_replaced: false });
-        assert_eq!(running(0), None);
+        let own = running_program(std::process::id()).expect("may be seen");
+        assert_eq!(own, RunningProgram { build: VersionMatch::Same, is_replaced: false });
+        assert_eq!(running_program(0), None);
     }
 
     #[test]

@@ -5,52 +5,52 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use scanhub_port::{
-    Candidate, Counts, Holder, PROMPT_MS, Port, PortError, PortlessAdapter, Rights, Source, all_holders,
-    check_tty, latency_ms,
+    Holder, MAX_LATENCY_MS, Port, PortError, PortPermissions, PortSpec, PortlessAdapter, SerialPortInfo,
+    UartCounters, all_holders, check_tty, latency_ms,
 };
 use scanhub_schema::{Counter, Failure, Kind, Status};
 
 use super::hub::{Hub, other_reader};
-use super::{Finding, Subject, sensor};
-use crate::driver::MOST_DAMAGED;
-use crate::probe::{self, Answer};
+use super::{Finding, PortTarget, sensor};
+use crate::driver::UNRELIABLE_DAMAGE;
+use crate::probe::{self, FoundScanner};
 
 /// Checks a port and its scanner.
 ///
 /// # Errors
 ///
 /// Returns [`Kind::Interrupted`] if `stop` is set. Every other problem is a finding.
-pub(crate) fn examine(
-    subject: &Subject,
-    there: &[Candidate],
+pub(crate) fn check_port(
+    subject: &PortTarget,
+    serial_ports: &[SerialPortInfo],
     hub: Option<&Hub>,
     stop: &AtomicBool,
-    tell: &mut dyn FnMut(Finding),
+    report: &mut dyn FnMut(Finding),
 ) -> Result<(), Failure> {
     // A hub that waits for the port reports the reason.
-    let reported = hub.and_then(|hub| Some(sensor::of_hub(hub, hub.link(&subject.source)?, &[])));
+    let reported = hub.and_then(|hub| Some(sensor::check_hub_link(hub, hub.link(&subject.source)?, &[])));
     let path = match &subject.source {
-        Source::Tty(path) => path,
-        Source::File { path, .. } => {
-            tell(recording(path));
-            reported.into_iter().flatten().for_each(tell);
+        PortSpec::Tty(path) => path,
+        PortSpec::File { path, .. } => {
+            report(recording(path));
+            reported.into_iter().flatten().for_each(report);
             return Ok(());
         }
-        Source::Tcp { .. } => return server(subject, hub, stop, tell),
+        PortSpec::Tcp { .. } => return check_server(subject, hub, stop, report),
     };
-    let candidate = candidate(path, there);
+    let candidate = candidate(path, serial_ports);
     if hub.is_some_and(|hub| hub.is_mute_link(&subject.source)) {
-        tell(Finding::skipped("port", "a link of the hub, which does not report its port"));
+        report(Finding::skipped("port", "a link of the hub, which does not report its port"));
         return Ok(());
     }
-    if let Err(error @ (PortError::NotTty | PortError::Dead | PortError::Other(_))) = check_tty(path) {
-        tell(refused(error.explain(&subject.source)));
-        reported.into_iter().flatten().for_each(tell);
+    if let Err(error @ (PortError::NotTty | PortError::NoDevice | PortError::Other(_))) = check_tty(path) {
+        report(access_failure(error.explain(&subject.source)));
+        reported.into_iter().flatten().for_each(report);
         return Ok(());
     }
-    tell(presence(&subject.source, path, candidate));
+    report(port_finding(&subject.source, path, candidate));
     if !path.exists() {
-        reported.into_iter().flatten().for_each(tell);
+        reported.into_iter().flatten().for_each(report);
         return Ok(());
     }
     let holders = all_holders(path);
@@ -60,86 +60,86 @@ pub(crate) fn examine(
         let of_other_domain = if own.is_none() { Hub::at(&subject.source, &holders, &[]) } else { None };
         match own.or(of_other_domain.as_ref()) {
             Some(hub) => {
-                tell(latency(path, latency_ms(path)));
-                tell(held(&holders, hub.pid));
-                let why = hub.why_unknown();
+                report(latency(path, latency_ms(path)));
+                report(holder_finding(&holders, hub.pid));
+                let why = hub.unknown_reason();
                 match hub.link(&subject.source) {
                     Some(link) => {
-                        [as_the_hub_counts(link.1), line_loss(link.1)].into_iter().for_each(&mut *tell);
-                        sensor::of_hub(hub, link, &holders).into_iter().for_each(tell);
+                        [hub_line_errors(link.1), line_loss(link.1)].into_iter().for_each(&mut *report);
+                        sensor::check_hub_link(hub, link, &holders).into_iter().for_each(report);
                     }
                     None => {
                         ["line-errors", "sensor"]
                             .into_iter()
-                            .for_each(|name| tell(Finding::skipped(name, why)));
+                            .for_each(|name| report(Finding::skipped(name, why)));
                     }
                 }
             }
             None => {
-                tell(refused(PortError::Busy.explain(&subject.source)));
+                report(access_failure(PortError::Busy.explain(&subject.source)));
                 let skipped = || vec![Finding::skipped("sensor", "its port is in use")];
-                reported.unwrap_or_else(skipped).into_iter().for_each(tell);
+                reported.unwrap_or_else(skipped).into_iter().for_each(report);
             }
         }
         return Ok(());
     }
-    tell(Finding::ok("holder", "nobody has it open"));
-    if !subject.named {
+    report(Finding::ok("holder", "nobody has it open"));
+    if !subject.is_named {
         // Opening the port would restart some devices.
-        tell(if candidate.is_none_or(|candidate| candidate.is_permitted) {
+        report(if candidate.is_none_or(|candidate| candidate.is_permitted) {
             Finding::ok("access", "may be opened")
         } else {
-            refused(PortError::Denied.explain(&subject.source))
+            access_failure(PortError::PermissionDenied.explain(&subject.source))
         });
         let name = subject.source.name();
         let why = format!("not opened, because the port was not named; scanhub doctor {name} checks it");
         let skipped = || vec![Finding::skipped("sensor", why)];
-        reported.unwrap_or_else(skipped).into_iter().for_each(tell);
+        reported.unwrap_or_else(skipped).into_iter().for_each(report);
         return Ok(());
     }
     let (port, first) = match probe::open(&subject.source, stop) {
         Ok(opened) => opened,
         Err(failure) => {
-            tell(refused(failure));
+            report(access_failure(failure));
             return Ok(());
         }
     };
-    tell(Finding::ok("access", format!("can be opened, is a serial line{}", whose(path))));
+    report(Finding::ok("access", format!("can be opened, is a serial line{}", describe_permissions(path))));
     // The hub's settings of an open port make most adapters return bytes at once.
-    tell(latency(path, latency_ms(path)));
-    let answer = ask(subject, &port, first, stop)?;
+    report(latency(path, latency_ms(path)));
+    let answer = check_scanner(subject, &port, first, stop)?;
     // Without an answer, bytes may have arrived at another rate.
-    let now = if answer.is_ok() { port.line_errors() } else { 0 };
+    let reply_errors = if answer.is_ok() { port.line_errors() } else { 0 };
     let found = answer.as_ref().ok().and_then(|answer| answer.0);
-    tell(rate(subject, &port, first, found));
-    report(answer).into_iter().for_each(&mut *tell);
-    tell(line_errors(port.counts(), now));
+    report(rate(subject, &port, first, found));
+    scanner_findings(answer).into_iter().for_each(&mut *report);
+    report(line_errors(port.uart_counters(), reply_errors));
     Ok(())
 }
 
 /// Checks a serial server and its scanner.
-fn server(
-    subject: &Subject,
+fn check_server(
+    subject: &PortTarget,
     hub: Option<&Hub>,
     stop: &AtomicBool,
-    tell: &mut dyn FnMut(Finding),
+    report: &mut dyn FnMut(Finding),
 ) -> Result<(), Failure> {
     // Most servers accept one client at a time, so do not connect to the server of a link.
     if let Some((hub, link)) = hub.and_then(|hub| Some((hub, hub.link(&subject.source)?))) {
-        tell(Finding::ok("holder", format!("it is a link of the hub, process {}", hub.pid)));
-        tell(line_loss(link.1));
-        sensor::of_hub(hub, link, &[]).into_iter().for_each(tell);
+        report(Finding::ok("holder", format!("it is a link of the hub, process {}", hub.pid)));
+        report(line_loss(link.1));
+        sensor::check_hub_link(hub, link, &[]).into_iter().for_each(report);
         return Ok(());
     }
     match probe::open(&subject.source, stop) {
         Ok((port, first)) => {
-            tell(Finding::ok("access", "connected; its rate was set there, by hand"));
-            report(ask(subject, &port, first, stop)?).into_iter().for_each(tell);
+            report(Finding::ok("access", "connected; its rate was set there, by hand"));
+            scanner_findings(check_scanner(subject, &port, first, stop)?).into_iter().for_each(report);
             Ok(())
         }
         Err(failure) if failure.kind == Kind::Interrupted => Err(failure),
         Err(failure) => {
-            tell(refused(failure));
+            report(access_failure(failure));
             Ok(())
         }
     }
@@ -147,41 +147,50 @@ fn server(
 
 /// Rate at which a rotating scanner was found, and the findings about the scanner. Otherwise the reason why none
 /// replied.
-type Examined = Result<(Option<u32>, Vec<Finding>), Finding>;
+type ScannerCheck = Result<(Option<u32>, Vec<Finding>), Finding>;
 
 /// Checks the scanner at `port`, which is open at `first`, in bits per second.
-fn ask(subject: &Subject, port: &Port, first: u32, stop: &AtomicBool) -> Result<Examined, Failure> {
+fn check_scanner(
+    subject: &PortTarget,
+    port: &Port,
+    first: u32,
+    stop: &AtomicBool,
+) -> Result<ScannerCheck, Failure> {
     let (source, link) = (&subject.source, subject.link.as_ref());
     match probe::find(port, first, source, link.and_then(scanhub_config::Link::family), stop, |_| {}) {
-        Ok(Answer::Asked(report)) => Ok(Ok((None, sensor::check_report(&source.name(), &report, link)))),
-        Ok(Answer::Detected(heard)) => Ok(Ok((Some(heard.rate), sensor::check_rotating(&heard, link)))),
+        Ok(FoundScanner::Inquiry(report)) => {
+            Ok(Ok((None, sensor::check_report(&source.name(), &report, link))))
+        }
+        Ok(FoundScanner::Rotating(scanner)) => {
+            Ok(Ok((Some(scanner.rate), sensor::check_rotating(&scanner, link))))
+        }
         Err(failure) if failure.kind == Kind::Interrupted => Err(failure),
         Err(failure) => Ok(Err(Finding::failed("sensor", failure.message, failure.hint))),
     }
 }
 
-fn report(examined: Examined) -> Vec<Finding> {
-    examined.map_or_else(|finding| vec![finding], |(_, findings)| findings)
+fn scanner_findings(check: ScannerCheck) -> Vec<Finding> {
+    check.map_or_else(|finding| vec![finding], |(_, findings)| findings)
 }
 
 /// Checks the holders of a port that the hub has open. Another process takes bytes away from the hub. Only the service
 /// manager may hold the port, too, because it keeps the port for the next hub.
-fn held(holders: &[Holder], hub: u32) -> Finding {
+fn holder_finding(holders: &[Holder], hub: u32) -> Finding {
     const NAME: &str = "holder";
-    let words: Vec<String> = holders.iter().map(ToString::to_string).collect();
+    let names: Vec<String> = holders.iter().map(ToString::to_string).collect();
     match other_reader(holders, hub) {
-        None => Finding::ok(NAME, format!("the hub has it, {}", words.join(", "))),
+        None => Finding::ok(NAME, format!("the hub has it, {}", names.join(", "))),
         Some(other) => Finding::warning(
             NAME,
-            format!("another process reads the port: {}", words.join(", ")),
+            format!("another process reads the port: {}", names.join(", ")),
             format!("end {other}: the hub loses every byte that it reads"),
         ),
     }
 }
 
 /// Returns group and mode of the port, as text.
-fn whose(path: &Path) -> String {
-    let rights = Rights::of(path);
+fn describe_permissions(path: &Path) -> String {
+    let rights = PortPermissions::of(path);
     rights.port.map_or(String::new(), |port| format!("; group {}, mode {:03o}", rights.group, port.mode))
 }
 
@@ -194,9 +203,9 @@ fn recording(path: &Path) -> Finding {
 }
 
 /// Returns the port in the list of the machine's ports.
-fn candidate<'a>(path: &Path, there: &'a [Candidate]) -> Option<&'a Candidate> {
+fn candidate<'a>(path: &Path, serial_ports: &'a [SerialPortInfo]) -> Option<&'a SerialPortInfo> {
     let device = path.canonicalize().ok()?;
-    there.iter().find(|candidate| candidate.device == device)
+    serial_ports.iter().find(|candidate| candidate.device == device)
 }
 
 /// Reports an adapter without a port, which is a failure if there is no other port to examine.
@@ -206,12 +215,12 @@ pub(crate) fn without_port(adapter: &PortlessAdapter, is_only: bool) -> Finding 
 }
 
 /// Checks whether the port exists, and whether its name does not change.
-fn presence(source: &Source, path: &Path, candidate: Option<&Candidate>) -> Finding {
+fn port_finding(source: &PortSpec, path: &Path, candidate: Option<&SerialPortInfo>) -> Finding {
     const NAME: &str = "port";
     if !path.exists() {
-        return refused(PortError::Missing.explain(source));
+        return access_failure(PortError::Missing.explain(source));
     }
-    let Some(Candidate { name, device, .. }) = candidate else {
+    let Some(SerialPortInfo { name, device, .. }) = candidate else {
         let device = path.canonicalize().unwrap_or_else(|_| path.to_owned());
         return Finding::ok(NAME, format!("{}, no hardware behind it", device.display()));
     };
@@ -230,8 +239,8 @@ fn presence(source: &Source, path: &Path, candidate: Option<&Candidate>) -> Find
     Finding::ok(NAME, text)
 }
 
-fn describe(candidate: &Candidate) -> String {
-    let Candidate { device, driver, product, .. } = candidate;
+fn describe(candidate: &SerialPortInfo) -> String {
+    let SerialPortInfo { device, driver, product, .. } = candidate;
     let mut text = device.display().to_string();
     for word in [product, driver].into_iter().flatten() {
         text = format!("{text}, {word}");
@@ -240,7 +249,7 @@ fn describe(candidate: &Candidate) -> String {
 }
 
 /// Returns the finding for a port that cannot be opened.
-fn refused(failure: Failure) -> Finding {
+fn access_failure(failure: Failure) -> Finding {
     let name = match failure.kind {
         Kind::PortBusy => "holder",
         Kind::PortMissing => "port",
@@ -254,7 +263,7 @@ fn refused(failure: Failure) -> Finding {
 fn latency(path: &Path, ms: Option<u8>) -> Finding {
     const NAME: &str = "latency";
     let Some(ms) = ms else { return Finding::skipped(NAME, "the driver has no latency timer") };
-    if ms <= PROMPT_MS {
+    if ms <= MAX_LATENCY_MS {
         return Finding::ok(NAME, format!("the adapter hands over bytes after {ms} ms"));
     }
     let device = path.canonicalize().unwrap_or_else(|_| path.to_owned());
@@ -272,22 +281,22 @@ fn latency(path: &Path, ms: Option<u8>) -> Finding {
 
 /// Checks whether the port supports the rate of the stream: the rate of the rotating scanner that was `found`, or that
 /// of the link.
-fn rate(subject: &Subject, port: &Port, first: u32, found: Option<u32>) -> Finding {
+fn rate(subject: &PortTarget, port: &Port, first: u32, found: Option<u32>) -> Finding {
     const NAME: &str = "rate";
     // The search for a scanner leaves out a rate that the port cannot have.
     let link = subject.link.as_ref().filter(|link| link.family().is_some());
     let link_rate = link.map_or(probe::HIGHEST_RATE, scanhub_config::Link::rate);
-    let wanted = found.unwrap_or(link_rate);
-    let outcome = port.set_baud(wanted);
-    let given = port.baud().filter(|&given| given != wanted);
+    let required_rate = found.unwrap_or(link_rate);
+    let outcome = port.set_baud(required_rate);
+    let actual_rate = port.baud().filter(|&actual| actual != required_rate);
     // The requests start at the rate at which the port was opened.
     let _ = port.set_baud(first);
     match (outcome, link) {
         (Ok(()), _) => {
-            let near =
-                given.map_or(String::new(), |given| format!(": the driver sets {given} Bd, close enough"));
+            let near = actual_rate
+                .map_or(String::new(), |given| format!(": the driver sets {given} Bd, close enough"));
             let state = if found.is_some() { "in use" } else { "possible" };
-            Finding::ok(NAME, format!("{wanted} Bd is {state}{near}"))
+            Finding::ok(NAME, format!("{required_rate} Bd is {state}{near}"))
         }
         (Err(error), Some(link)) if !link.scanner.features().models.is_empty() => Finding::failed(
             NAME,
@@ -317,20 +326,20 @@ const LINE_ERRORS: &str = "line-errors";
 /// Judges the counters that the driver of an open line has kept since it was loaded, if it counts errors. `now` is the
 /// number of errors while a scanner replied at its rate. At a wrong rate every byte is an error, and the search for a
 /// scanner tries wrong rates, so a few errors are ignored.
-fn line_errors(counts: Option<Counts>, now: u64) -> Finding {
+fn line_errors(counts: Option<UartCounters>, reply_errors: u64) -> Finding {
     let Some(counts) = counts else {
         return Finding::skipped(LINE_ERRORS, "the driver does not count errors");
     };
-    let Counts { received, framing, overrun, parity, breaks, buffer } = counts;
+    let UartCounters { received, framing, overrun, parity, breaks, buffer } = counts;
     let text = format!(
         "framing {framing}, parity {parity}, breaks {breaks}, overruns {} in {received} bytes since its driver was loaded",
         overrun.wrapping_add(buffer)
     );
     let lost = overrun.wrapping_add(buffer);
-    if now > MAX_ERRORS_NOW {
+    if reply_errors > MAX_ERRORS_NOW {
         return Finding::warning(
             LINE_ERRORS,
-            format!("{now} errors while the sensor answered; {text}"),
+            format!("{reply_errors} errors while the sensor answered; {text}"),
             errors_remedy(false),
         );
     }
@@ -344,7 +353,7 @@ fn line_errors(counts: Option<Counts>, now: u64) -> Finding {
 }
 
 /// Judges the errors that the hub counted at one of its ports.
-fn as_the_hub_counts(status: &Status) -> Finding {
+fn hub_line_errors(status: &Status) -> Finding {
     let (errors, bytes) = (status.counters[Counter::LineErrors], status.counters[Counter::BytesRead]);
     let text = format!("the hub counted {errors} in {bytes} bytes");
     if is_large(errors, bytes) {
@@ -357,7 +366,7 @@ fn as_the_hub_counts(status: &Status) -> Finding {
 /// Judges the share of its stream that a line of the hub damages or loses.
 fn line_loss(status: &Status) -> Finding {
     const NAME: &str = "line-loss";
-    if let Some((discarded, read)) = status.mostly_discarded() {
+    if let Some((discarded, read)) = status.discarded_and_read() {
         let text = format!(
             "no scans arrive, and {discarded} of {read} bytes since the hub's start were in no intact telegram"
         );
@@ -366,11 +375,14 @@ fn line_loss(status: &Status) -> Finding {
     let due = status.counters[Counter::DueOnLine];
     let all = match status.lost_on_line() {
         // Damaged scans are lost, too, but too few arrive to count them.
-        Some(0) if is_mostly_damaged(status) => format!("how many {} are lost is not known", status.sent()),
-        Some(lost) => format!("{lost} of {due} {} lost since the hub's start", status.sent()),
-        None => format!("how many {} are lost is not known", status.sent()),
+        Some(0) if is_mostly_damaged(status) => {
+            format!("how many {} are lost is not known", status.transmission_name())
+        }
+        Some(lost) => format!("{lost} of {due} {} lost since the hub's start", status.transmission_name()),
+        None => format!("how many {} are lost is not known", status.transmission_name()),
     };
-    let text = format!("{:.2} % of the bytes damaged in the last 10 s, {all}", 100.0 * status.damaged());
+    let text =
+        format!("{:.2} % of the bytes damaged in the last 10 s, {all}", 100.0 * status.damaged_share());
     match status.line_loss() {
         Some(loss) if is_mostly_damaged(status) => {
             Finding::failed(NAME, format!("{loss}; {text}"), LOSS_REMEDY)
@@ -382,12 +394,12 @@ fn line_loss(status: &Status) -> Finding {
 
 /// Returns whether the line damages most bytes, which makes every conclusion from the others unreliable.
 pub(crate) fn is_mostly_damaged(status: &Status) -> bool {
-    status.damaged() > MOST_DAMAGED
+    status.damaged_share() > UNRELIABLE_DAMAGE
 }
 
 /// Returns whether `errors` in `bytes` are more than the search for a scanner causes, and cost scans.
 fn is_large(errors: u64, bytes: u64) -> bool {
-    errors > MAX_SEARCH_ERRORS && errors.saturating_mul(BYTES_PER_ERROR) > bytes
+    errors > MAX_SEARCH_ERRORS && errors.saturating_mul(MIN_BYTES_PER_ERROR) > bytes
 }
 
 /// Returns the remedy for bytes that were lost in the machine, or damaged on the line.
@@ -407,7 +419,7 @@ const MAX_ERRORS_NOW: u64 = 2;
 /// Maximum number of errors that the search for the rates of scanners causes.
 const MAX_SEARCH_ERRORS: u64 = 1000;
 /// Minimum number of bytes per error on a good line. One error in 7,000 bytes damages one of ten telegrams.
-const BYTES_PER_ERROR: u64 = 7000;
+const MIN_BYTES_PER_ERROR: u64 = 7000;
 
 #[cfg(test)]
 mod tests {
@@ -418,7 +430,7 @@ mod tests {
     fn warns_of_slow_adapter() {
         let of = |ms| latency(Path::new("/dev/ttyUSB0"), ms);
         assert_eq!([of(None).state, of(Some(1)).state], [State::Skipped, State::Ok]);
-        assert_eq!(of(Some(PROMPT_MS)).state, State::Ok);
+        assert_eq!(of(Some(MAX_LATENCY_MS)).state, State::Ok);
         let slow = of(Some(16));
         assert_eq!(slow.state, State::Warning);
         assert!(slow.remedy.contains("/sys/class/tty/ttyUSB0/device/latency_timer"), "{slow}");
@@ -428,7 +440,7 @@ mod tests {
     fn warns_of_name_that_may_change() {
         // Files that exist everywhere stand for the names.
         let [device, by_path, shared] = ["/dev/null", "/dev/zero", "/dev/full"].map(Path::new);
-        let twin = Candidate {
+        let twin = SerialPortInfo {
             name: by_path.to_owned(),
             device: device.to_owned(),
             shared_name: Some(shared.to_owned()),
@@ -437,7 +449,9 @@ mod tests {
             holder: None,
             is_permitted: true,
         };
-        let of = |path: &Path, port: &Candidate| presence(&Source::Tty(path.to_owned()), path, Some(port));
+        let of = |path: &Path, port: &SerialPortInfo| {
+            port_finding(&PortSpec::Tty(path.to_owned()), path, Some(port))
+        };
         let found = of(shared, &twin);
         assert!(found.state == State::Warning && found.finding.contains("same serial number"), "{found}");
         assert!(found.remedy.contains("/dev/zero"), "{found}");
@@ -445,7 +459,7 @@ mod tests {
         let numbered = of(device, &twin);
         assert!(numbered.state == State::Warning && numbered.remedy.contains("/dev/zero"), "{numbered}");
         let [name, device] = ["/dev/ttyAMA10"; 2].map(Into::into);
-        let debug = of(shared, &Candidate { name, device, shared_name: None, ..twin });
+        let debug = of(shared, &SerialPortInfo { name, device, shared_name: None, ..twin });
         assert!(
             debug.finding.contains("debug connector") && debug.remedy.contains("/dev/ttyAMA0"),
             "{debug}"
@@ -459,7 +473,7 @@ mod tests {
             id: "1a86:7523".to_owned(),
             chip: "CH340",
             module: "ch341",
-            reason: scanhub_port::Reason::Brltty { pid: 7 },
+            reason: scanhub_port::NoPortReason::Brltty { pid: 7 },
         };
         assert_eq!(without_port(&adapter, true).state, State::Failed);
         let found = without_port(&adapter, false);
@@ -470,25 +484,25 @@ mod tests {
     fn warns_of_process_that_reads_port_of_hub() {
         let holder = |pid, program: &str| Holder { pid, program: program.to_owned() };
         let (manager, hub, cat) = (holder(1, "systemd"), holder(7, "scanhub"), holder(9, "cat"));
-        assert_eq!(held(std::slice::from_ref(&hub), 7).state, State::Ok);
-        assert_eq!(held(&[manager, hub.clone()], 7).state, State::Ok);
-        let two = held(&[hub, cat], 7);
+        assert_eq!(holder_finding(std::slice::from_ref(&hub), 7).state, State::Ok);
+        assert_eq!(holder_finding(&[manager, hub.clone()], 7).state, State::Ok);
+        let two = holder_finding(&[hub, cat], 7);
         assert!(two.state == State::Warning && two.remedy.contains("process 9 (cat)"), "{two}");
     }
 
     #[test]
     fn judges_errors_by_time_and_number() {
-        let healthy = Counts { received: 100_000_000, framing: 900, ..Counts::default() };
-        let of = |counts: Counts, now| line_errors(Some(counts), now);
+        let healthy = UartCounters { received: 100_000_000, framing: 900, ..UartCounters::default() };
+        let of = |counts: UartCounters, now| line_errors(Some(counts), now);
         assert_eq!(line_errors(None, 0).state, State::Skipped);
         assert_eq!(of(healthy, 0).state, State::Ok);
         assert_eq!(of(healthy, MAX_ERRORS_NOW).state, State::Ok);
         let grown = of(healthy, 40);
         assert!(grown.state == State::Warning && grown.finding.starts_with("40 errors while"), "{grown}");
         assert!(grown.remedy.contains("120 ohm"), "{grown}");
-        let large = of(Counts { parity: 90_000, ..healthy }, 0);
+        let large = of(UartCounters { parity: 90_000, ..healthy }, 0);
         assert!(large.state == State::Warning && large.remedy.contains("cable"), "{large}");
-        let lost = of(Counts { overrun: 10_000, buffer: 80_000, ..healthy }, 0);
+        let lost = of(UartCounters { overrun: 10_000, buffer: 80_000, ..healthy }, 0);
         assert!(lost.state == State::Warning && lost.remedy.contains("FIFO"), "{lost}");
         assert!(lost.finding.contains("overruns 90000 in 100000000 bytes"), "{lost}");
     }
@@ -522,8 +536,8 @@ mod tests {
         let mut status = Status::default();
         status.counters[Counter::BytesRead] = 1_000_000;
         status.counters[Counter::LineErrors] = 10;
-        assert_eq!(as_the_hub_counts(&status).state, State::Ok);
+        assert_eq!(hub_line_errors(&status).state, State::Ok);
         status.counters[Counter::LineErrors] = 5000;
-        assert_eq!(as_the_hub_counts(&status).state, State::Warning);
+        assert_eq!(hub_line_errors(&status).state, State::Warning);
     }
 }

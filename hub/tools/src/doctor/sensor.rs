@@ -2,10 +2,10 @@
 //! the hub, and last a rotating scanner. `probe` sends the requests.
 
 use scanhub_config::Link;
-use scanhub_drivers::line::{Condition as ReportedHealth, Introduction};
-use scanhub_drivers::lms::family::Family;
+use scanhub_drivers::line::{DeviceInfo, HealthStatus as ReportedHealth};
 use scanhub_drivers::lms::inquiry::Report;
-use scanhub_drivers::lms::status::{Condition, Fault, Severity};
+use scanhub_drivers::lms::lms_model::LmsModel;
+use scanhub_drivers::lms::status::{Fault, Severity, StatusByte};
 use scanhub_drivers::lms::variant::Variant;
 use scanhub_port::Holder;
 use scanhub_schema::{State, Status};
@@ -27,12 +27,12 @@ pub(crate) fn check_report(port: &str, report: &Report, link: Option<&Link>) -> 
 }
 
 /// Checks a link of `hub` by its status. `holders` have its port open.
-pub(crate) fn of_hub(hub: &Hub, (name, status): (&str, &Status), holders: &[Holder]) -> Vec<Finding> {
+pub(crate) fn check_hub_link(hub: &Hub, (name, status): (&str, &Status), holders: &[Holder]) -> Vec<Finding> {
     // `info` shows no more of a damaged line than this check.
     let remedy =
         if is_mostly_damaged(status) { LOSS_REMEDY.to_owned() } else { hub.remedy(name, status, holders) };
     let marks = marks(status, "stop the hub first: ");
-    std::iter::once(link_of_the_hub(name, status, remedy)).chain(marks).collect()
+    std::iter::once(hub_link_finding(name, status, remedy)).chain(marks).collect()
 }
 
 /// Checks whether the measuring mode of an LMS has bits for reflectors. Returns `None` if the mode is unknown, or if a
@@ -52,7 +52,7 @@ fn marks(status: &Status, when: &str) -> Option<Finding> {
     Some(Finding::warning(NAME, what, remedy))
 }
 
-fn link_of_the_hub(name: &str, status: &Status, remedy: String) -> Finding {
+fn hub_link_finding(name: &str, status: &Status, remedy: String) -> Finding {
     const NAME: &str = "sensor";
     let text = format!(
         "link {name} of the hub: {}, family {}, {}",
@@ -99,17 +99,17 @@ fn settings(port: &str, report: &Report, link: Option<&Link>) -> Vec<Finding> {
     };
     let text = format!(
         "{}, {}, measuring mode {:02x}h",
-        status.variant().map_or("unknown view".into(), in_words),
+        status.variant().map_or("unknown view".into(), describe_variant),
         status.unit().map_or("unknown unit".into(), |unit| format!("unit {} mm", unit.mm())),
         status.mode().0
     );
-    let mut wrong = Vec::new();
-    let family = report.kind().and_then(Family::of_type);
+    let mut differences = Vec::new();
+    let family = report.kind().and_then(LmsModel::of_type);
     let scanner = link.map(|link| &link.scanner);
     if let Some((expected, is)) = scanner.and_then(|scanner| scanner.settings.expected_type).zip(family)
         && expected != is.name()
     {
-        wrong.push(Finding::warning(
+        differences.push(Finding::warning(
             NAME,
             format!("the configuration says type {expected}, it is a {}", is.name()),
             "correct the type in the configuration, or plug in the other sensor",
@@ -118,7 +118,7 @@ fn settings(port: &str, report: &Report, link: Option<&Link>) -> Vec<Finding> {
     if let Some((expected, is)) = scanner.and_then(|scanner| scanner.settings.unit_mm).zip(status.unit())
         && expected != is.mm()
     {
-        wrong.push(Finding::warning(
+        differences.push(Finding::warning(
             NAME,
             format!("{text}; the configuration says unit {expected} mm"),
             format!(
@@ -127,10 +127,10 @@ fn settings(port: &str, report: &Report, link: Option<&Link>) -> Vec<Finding> {
             ),
         ));
     }
-    if wrong.is_empty() {
+    if differences.is_empty() {
         return vec![Finding::ok(NAME, text)];
     }
-    wrong
+    differences
 }
 
 /// Checks whether an earlier owner has changed the rate after power-on, or left the scanner in installation mode.
@@ -144,7 +144,7 @@ fn power_on(port: &str, report: &Report) -> Finding {
             "the hub finds it anyway, other programs may not: scanhub configure {port} power_on_baud=9600"
         ));
     }
-    if status.is_some_and(|status| status.operating_mode() == INSTALLATION) {
+    if status.is_some_and(|status| status.operating_mode() == INSTALLATION_MODE) {
         whats.push("an earlier owner left it in installation mode, in which its field outputs are blocked");
         remedies.push("scanhub run leaves it by itself; or power it off and on again".to_owned());
     }
@@ -166,7 +166,7 @@ fn health(report: &Report) -> Finding {
     if status.is_some_and(|status| !status.is_laser_on()) {
         complaints.insert(0, "its laser is off".to_owned());
     }
-    let reported = report.status_byte.and_then(|byte| Condition(byte).severity());
+    let reported = report.status_byte.and_then(|byte| StatusByte(byte).severity());
     if reported >= Some(Severity::Warning) && reported > worst {
         complaints.insert(0, format!("its telegrams say {}", reported.map_or("", Severity::name)));
         worst = reported;
@@ -187,70 +187,73 @@ fn health(report: &Report) -> Finding {
     if complaints.is_empty() {
         return Finding::ok(NAME, format!("no complaint{past}"));
     }
-    let look = "clean its window, check what is in front of it";
+    let window_remedy = "clean its window, check what is in front of it";
     if worst >= Some(Severity::Error) {
-        let remedy = format!("{look}, power it off and on again; if it stays, a repair{past}");
+        let remedy = format!("{window_remedy}, power it off and on again; if it stays, a repair{past}");
         return Finding::failed(NAME, complaints.join("; "), remedy);
     }
-    Finding::warning(NAME, complaints.join("; "), format!("{look}{past}"))
+    Finding::warning(NAME, complaints.join("; "), format!("{window_remedy}{past}"))
 }
 
-fn in_words(variant: Variant) -> String {
+fn describe_variant(variant: Variant) -> String {
     let Variant { angle_deg, resolution_cdeg } = variant;
     format!("{angle_deg} degrees at {}", f64::from(resolution_cdeg) / 100.0)
 }
 
 /// Operating mode in which the EEPROM can be written.
-const INSTALLATION: u8 = 0x00;
+const INSTALLATION_MODE: u8 = 0x00;
 
 /// Checks a rotating scanner that was `heard`.
-pub(crate) fn check_rotating(heard: &DetectedScanner, link: Option<&Link>) -> Vec<Finding> {
-    let text = format!("{heard}, family {}", heard.family.name());
-    let mut findings = vec![match &heard.said {
-        Some(said) => Finding::ok("sensor", format!("{text}, {}", said.identity)),
+pub(crate) fn check_rotating(scanner: &DetectedScanner, link: Option<&Link>) -> Vec<Finding> {
+    let text = format!("{scanner}, family {}", scanner.family.name());
+    let mut findings = vec![match &scanner.introduction {
+        Some(introduction) => Finding::ok("sensor", format!("{text}, {}", introduction.identity)),
         None => Finding::ok("sensor", text),
     }];
-    findings.push(loss(heard));
-    let is_reported = heard.said.is_some();
-    if heard.is_unreliable() && !is_reported {
+    findings.push(loss(scanner));
+    let is_reported = scanner.introduction.is_some();
+    if scanner.is_unreliable() && !is_reported {
         let why = "not judged: the line damages most bytes";
         findings.extend(["settings", "health"].map(|name| Finding::skipped(name, why)));
         return findings;
     }
     findings.extend([
-        model(heard, link),
-        heard.said.as_ref().map_or_else(|| rotation(heard), |said| reported_health(said, heard)),
+        model(scanner, link),
+        scanner
+            .introduction
+            .as_ref()
+            .map_or_else(|| rotation(scanner), |introduction| reported_health(introduction, scanner)),
     ]);
     findings
 }
 
 /// Checks the health that the scanner reports, and whether it measures.
-fn reported_health(said: &Introduction, heard: &DetectedScanner) -> Finding {
+fn reported_health(introduction: &DeviceInfo, scanner: &DetectedScanner) -> Finding {
     const NAME: &str = "health";
     let remedy = "see whether its head turns freely; power it off and on again; if it stays so, a repair";
-    match said.condition {
-        ReportedHealth::Good | ReportedHealth::Warning | ReportedHealth::Unknown if heard.packets == 0 => {
-            let trouble = heard.trouble.as_deref().unwrap_or("it does not measure");
-            Finding::failed(NAME, trouble, remedy)
+    match introduction.condition {
+        ReportedHealth::Good | ReportedHealth::Warning | ReportedHealth::Unknown if scanner.packets == 0 => {
+            let problem = scanner.problem.as_deref().unwrap_or("it does not measure");
+            Finding::failed(NAME, problem, remedy)
         }
         ReportedHealth::Unknown => Finding::warning(NAME, "it does not say how it is", remedy),
-        ReportedHealth::Good => Finding::ok(NAME, said.health.clone()),
-        ReportedHealth::Warning => Finding::warning(NAME, said.health.clone(), remedy),
-        ReportedHealth::Error => Finding::failed(NAME, said.health.clone(), remedy),
+        ReportedHealth::Good => Finding::ok(NAME, introduction.health.clone()),
+        ReportedHealth::Warning => Finding::warning(NAME, introduction.health.clone(), remedy),
+        ReportedHealth::Error => Finding::failed(NAME, introduction.health.clone(), remedy),
     }
 }
 
 /// Checks whether the scanner is the configured model, and whether topics have room for its points.
-fn model(heard: &DetectedScanner, link: Option<&Link>) -> Finding {
+fn model(scanner: &DetectedScanner, link: Option<&Link>) -> Finding {
     const NAME: &str = "settings";
-    let text = match (&heard.said, heard.model) {
+    let text = match (&scanner.introduction, scanner.model) {
         (None, _) => {
-            format!("{:.0} points a second, {:.0} in a turn", heard.points_per_second, heard.points())
+            format!("{:.0} points a second, {:.0} in a turn", scanner.points_per_second, scanner.points())
         }
         (Some(_), Some(model)) => format!("up to {} points in a turn", model.beams),
         (Some(_), None) => "a model that is not known here".to_owned(),
     };
-    let Some((model, link)) = heard.model.zip(link) else { return Finding::ok(NAME, text) };
+    let Some((model, link)) = scanner.model.zip(link) else { return Finding::ok(NAME, text) };
     let (set, name) = (link.scanner.model(), &link.name);
     let is_named = link.scanner.settings.model.is_some();
     if is_named && (set.baud, set.beams) != (model.baud, model.beams) {
@@ -274,12 +277,12 @@ fn model(heard: &DetectedScanner, link: Option<&Link>) -> Finding {
 }
 
 /// Checks whether the head of a scanner that reports no health rotates.
-fn rotation(heard: &DetectedScanner) -> Finding {
+fn rotation(scanner: &DetectedScanner) -> Finding {
     const NAME: &str = "health";
-    if heard.turns_per_second > 0.0 {
-        return Finding::ok(NAME, format!("{:.1} turns a second", heard.turns_per_second));
+    if scanner.revolutions_per_second > 0.0 {
+        return Finding::ok(NAME, format!("{:.1} turns a second", scanner.revolutions_per_second));
     }
-    let what = heard.trouble.as_deref().unwrap_or("packets come, but no turn was whole");
+    let what = scanner.problem.as_deref().unwrap_or("packets come, but no turn was whole");
     let (what, _) = what.split_once(": ").unwrap_or((what, ""));
     Finding::failed(
         NAME,
@@ -289,34 +292,34 @@ fn rotation(heard: &DetectedScanner) -> Finding {
 }
 
 /// Checks how many packets are damaged or lost.
-fn loss(heard: &DetectedScanner) -> Finding {
+fn loss(scanner: &DetectedScanner) -> Finding {
     const NAME: &str = "line-loss";
-    let (damaged, lost) = (100.0 * heard.damaged(), heard.account.lost);
-    if heard.packets == 0 {
+    let (damaged, lost) = (100.0 * scanner.damaged(), scanner.stats.lost);
+    if scanner.packets == 0 {
         return Finding::skipped(NAME, "it does not measure");
     }
     let packets = match lost {
         // Damaged packets are lost, too, but too few arrive to count them.
-        0 if heard.is_unreliable() => "how many packets are lost is not known".to_owned(),
-        lost => format!("{lost} of {} packets lost", heard.account.due),
+        0 if scanner.is_unreliable() => "how many packets are lost is not known".to_owned(),
+        lost => format!("{lost} of {} packets lost", scanner.stats.due),
     };
     let text = format!("{damaged:.1} % of the bytes damaged, {packets}");
-    if heard.is_unreliable() {
+    if scanner.is_unreliable() {
         return Finding::failed(NAME, text, LINE_REMEDY);
     }
-    if lost * MAX_LOSS > heard.account.due || heard.line_trouble().is_some() {
+    if lost * PACKETS_PER_LOSS > scanner.stats.due || scanner.line_problem().is_some() {
         return Finding::warning(NAME, text, LINE_REMEDY);
     }
     Finding::ok(NAME, text)
 }
 
 /// A line that loses more than one packet out of this number needs a remedy.
-const MAX_LOSS: u64 = 100;
+const PACKETS_PER_LOSS: u64 = 100;
 
 #[cfg(test)]
 mod tests {
-    use scanhub_drivers::line::{Account, Output, Protocol as _};
-    use scanhub_drivers::lms::status::Health;
+    use scanhub_drivers::line::{Action, Protocol as _, SessionStats};
+    use scanhub_drivers::lms::status::SimulatedStatus;
     use scanhub_drivers::lms::telegram::{Telegram, Writer};
     use scanhub_drivers::lms::variant::{Baud, Mode, Unit};
     use scanhub_drivers::lms::{Inquiry, configuration};
@@ -330,17 +333,17 @@ mod tests {
         let mut inquiry = Inquiry::new(Baud::B38400, 0);
         let (mut now, mut request, mut reply) = (0, Vec::new(), Vec::new());
         loop {
-            match inquiry.poll_output() {
-                Output::Transmit { bytes, not_before } => {
+            match inquiry.poll_action() {
+                Action::Transmit { bytes, not_before } => {
                     now = not_before.max(now);
                     request.extend(bytes);
-                    inquiry.transmitted(now);
+                    inquiry.handle_transmitted(now);
                     if let Some(received) = Telegram::check(&request) {
                         let data: Vec<u8> = match received.command() {
                             0x31 => status.to_vec(),
                             0x32 => errors.to_vec(),
                             0x3A => b"LMS200;301063;V02.30 ".to_vec(),
-                            _ => configuration::factory(Mode(1), Unit::Mm).to_vec(),
+                            _ => configuration::factory_configuration(Mode(1), Unit::Mm).to_vec(),
                         };
                         let telegram =
                             Writer::new(0x80, received.command() | 0x80).slice(&data).byte(condition);
@@ -348,13 +351,13 @@ mod tests {
                         request.clear();
                     }
                 }
-                Output::Wait { until } => {
+                Action::Wait { until } => {
                     if inquiry.is_done() {
                         return inquiry.report().clone();
                     }
                     now = until;
                     let bytes = std::mem::take(&mut reply);
-                    inquiry.spare()[..bytes.len()].copy_from_slice(&bytes);
+                    inquiry.read_buffer()[..bytes.len()].copy_from_slice(&bytes);
                     inquiry.commit(now, bytes.len());
                     if bytes.is_empty() {
                         inquiry.handle_timeout(now);
@@ -370,7 +373,7 @@ mod tests {
     }
 
     fn with_mode(mode: u8) -> [u8; 152] {
-        let health = Health {
+        let health = SimulatedStatus {
             software: *b"V02.30 ",
             operating_mode: 0x25,
             mode: Mode(mode),
@@ -447,7 +450,7 @@ mod tests {
     fn reports_settings_that_differ_from_configuration() {
         let link = Link {
             name: "front".into(),
-            port: scanhub_port::Source::Tty("/dev/ttyUSB0".into()),
+            port: scanhub_port::PortSpec::Tty("/dev/ttyUSB0".into()),
             scanner: scanhub_config::Scanner {
                 family: Some(scanhub_schema::Family::Lms),
                 settings: Settings {
@@ -471,7 +474,7 @@ mod tests {
     fn passes_on_status_of_hub() {
         let mut status = Status { state: State::Streaming as u8, baud: 500_000, ..Status::default() };
         let hub = Hub::without_links(7);
-        let findings = |status: &Status| of_hub(&hub, ("front", status), &[]);
+        let findings = |status: &Status| check_hub_link(&hub, ("front", status), &[]);
         assert_eq!(findings(&status).iter().map(|finding| finding.state).collect::<Vec<_>>(), [Verdict::Ok]);
         status.mode = 0;
         status.set_port("/dev/ttyUSB0");
@@ -498,7 +501,7 @@ mod tests {
 
     /// Returns the family that streams without a request.
     fn streaming() -> scanhub_schema::Family {
-        let is_streaming = |family: &scanhub_schema::Family| features(*family).speaks_unasked;
+        let is_streaming = |family: &scanhub_schema::Family| features(*family).streams_unrequested;
         scanhub_schema::Family::ALL.into_iter().find(is_streaming).expect("there is one")
     }
 
@@ -509,12 +512,12 @@ mod tests {
             model: Some(features(family).models[1]),
             model_text: Some(features(family).models[1].name.to_owned()),
             rate: 230_400,
-            account: Account { in_telegrams: 9_400, due: 200, ..Account::default() },
-            said: None,
+            stats: SessionStats { in_telegrams: 9_400, due: 200, ..SessionStats::default() },
+            introduction: None,
             packets: 200,
             points_per_second: 4_500.0,
-            turns_per_second: 10.0,
-            trouble: None,
+            revolutions_per_second: 10.0,
+            problem: None,
         }
     }
 
@@ -535,23 +538,23 @@ mod tests {
         };
         let names = ["sensor", "line-loss", "settings", "health"];
         assert_eq!(said(&heard()), names.map(|name| (name, Verdict::Ok)));
-        let still = DetectedScanner { turns_per_second: 0.0, ..heard() };
+        let still = DetectedScanner { revolutions_per_second: 0.0, ..heard() };
         assert_eq!(said(&still)[3], ("health", Verdict::Failed));
-        let lossy = DetectedScanner { account: Account { lost: 3, ..heard().account }, ..heard() };
+        let lossy = DetectedScanner { stats: SessionStats { lost: 3, ..heard().stats }, ..heard() };
         assert_eq!(said(&lossy)[1], ("line-loss", Verdict::Warning));
-        let damaged = DetectedScanner { account: Account { damaged: 100, ..heard().account }, ..heard() };
+        let damaged = DetectedScanner { stats: SessionStats { damaged: 100, ..heard().stats }, ..heard() };
         assert_eq!(said(&damaged)[1], ("line-loss", Verdict::Warning));
         let text = check_rotating(&damaged, None)[1].to_string();
         assert!(text.contains(", 0 of "), "{text}");
         // If most bytes are damaged, a head that seems to stand still may rotate.
-        let account = Account { damaged: 40_000, ..heard().account };
+        let account = SessionStats { damaged: 40_000, ..heard().stats };
         let unreliable = [
             ("sensor", Verdict::Ok),
             ("line-loss", Verdict::Failed),
             ("settings", Verdict::Skipped),
             ("health", Verdict::Skipped),
         ];
-        let most = DetectedScanner { account, ..still };
+        let most = DetectedScanner { stats: account, ..still };
         assert_eq!(said(&most), unreliable);
         let text = check_rotating(&most, None)[1].to_string();
         assert!(text.contains("how many packets are lost is not known"), "{text}");
@@ -560,8 +563,8 @@ mod tests {
     #[test]
     fn checks_reported_health() {
         let said = |condition| {
-            let said = Introduction { identity: "firmware 1.29".into(), health: "so".into(), condition };
-            let findings = check_rotating(&DetectedScanner { said: Some(said), ..heard() }, None);
+            let said = DeviceInfo { identity: "firmware 1.29".into(), health: "so".into(), condition };
+            let findings = check_rotating(&DetectedScanner { introduction: Some(said), ..heard() }, None);
             findings.iter().map(|finding| (finding.name, finding.state)).next_back()
         };
         for (condition, state) in [

@@ -11,11 +11,11 @@ use std::path::PathBuf;
 
 use scanhub_schema::{Failure, Kind};
 use scanhub_shm::Domain;
-use scanhub_shm::shortage::SHARED_MEMORY;
-use scanhub_shm::{Cleaned, Segment, is_unheld};
+use scanhub_shm::resource_limits::SHARED_MEMORY_DIRECTORY;
+use scanhub_shm::{CleanupReport, Segment, is_unused};
 
 use super::Finding;
-use super::machine::{Facts, plural};
+use super::machine::{MachineState, plural};
 
 /// A file in shared memory.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -26,19 +26,19 @@ pub(crate) struct SharedFile {
 }
 
 /// Checks whether dead processes left anything.
-pub(crate) fn leftovers(facts: &Facts) -> Finding {
+pub(crate) fn leftovers(state: &MachineState) -> Finding {
     const NAME: &str = "leftovers";
-    let nodes = match &facts.nodes {
+    let nodes = match &state.nodes {
         Ok(nodes) => nodes,
         Err(failure) => return Finding::failed(NAME, failure.message.clone(), failure.hint.clone()),
     };
-    let left = describe(&facts.segments);
-    match (facts.hub_pid(), nodes.dead, nodes.alive) {
+    let files = describe(&state.segments);
+    match (state.hub_pid(), nodes.dead, nodes.alive) {
         (Some(_), 0, _) => Finding::ok(NAME, "none"),
         (Some(_), dead, _) => {
             Finding::ok(NAME, format!("{} died; the hub is cleaning up", plural(dead as u64, "process")))
         }
-        (None, 0, 0) if facts.segments.is_empty() => match &facts.lock {
+        (None, 0, 0) if state.segments.is_empty() => match &state.lock {
             None => Finding::ok(NAME, "none"),
             Some(lock) => {
                 let text = format!("none but {}, a lock of 16 bytes that the next hub takes", lock.display());
@@ -49,14 +49,14 @@ pub(crate) fn leftovers(facts: &Facts) -> Finding {
             Finding::ok(NAME, format!("none; {} waiting for a hub", plural(alive as u64, "consumer")))
         }
         (None, 0, _) => {
-            Finding::warning(NAME, format!("no process holds {left}"), "scanhub doctor --clean removes them")
+            Finding::warning(NAME, format!("no process holds {files}"), "scanhub doctor --clean removes them")
         }
         (None, dead, _) => Finding::warning(
             NAME,
-            format!("{} died without a hub to clean up; {left}", plural(dead as u64, "process")),
+            format!("{} died without a hub to clean up; {files}", plural(dead as u64, "process")),
             format!(
                 "scanhub doctor --clean removes it; so does the next `scanhub run` at {}",
-                facts.root.display()
+                state.root.display()
             ),
         ),
     }
@@ -64,27 +64,29 @@ pub(crate) fn leftovers(facts: &Facts) -> Finding {
 
 /// Removes everything that dead processes of `user` left in this domain, at all its `places`, and reports it. Has no
 /// effect while a hub or a listener runs at one of them.
-pub(crate) fn clean(places: &[&Domain], user: u32) -> Finding {
+pub(crate) fn clean(locations: &[&Domain], user: u32) -> Finding {
     const NAME: &str = "clean";
-    let Some(prefix) = places.first().map(|place| place.prefix()) else {
+    let Some(prefix) = locations.first().map(|location| location.prefix()) else {
         return Finding::ok(NAME, "no domain");
     };
-    for place in places {
-        if let Ok(Some(pid)) = scanhub_shm::publisher(place.root()) {
+    for location in locations {
+        if let Ok(Some(pid)) = scanhub_shm::publisher_pid(location.root()) {
             let why =
-                format!("{}: process {pid} publishes there, and cleans up itself", place.root().display());
+                format!("{}: process {pid} publishes there, and cleans up itself", location.root().display());
             return Finding::skipped(NAME, why);
         }
     }
     let before = files(&prefix, user);
     let (mut dead, mut alive) = (0, 0);
     let mut roots = Vec::new();
-    for place in places.iter().filter(|place| place.root().metadata().is_ok_and(|it| it.uid() == user)) {
-        match scanhub_shm::clean(place) {
-            Ok(Cleaned { dead: here, alive: others, root }) => {
+    for location in
+        locations.iter().filter(|location| location.root().metadata().is_ok_and(|it| it.uid() == user))
+    {
+        match scanhub_shm::clean_up(location) {
+            Ok(CleanupReport { dead: here, alive: others, root }) => {
                 dead += here;
                 alive += others;
-                roots.extend(root.then(|| place.root().display().to_string()));
+                roots.extend(root.then(|| location.root().display().to_string()));
             }
             // A hub has started since the check above.
             Err(Failure { kind: Kind::DomainHeld, message, .. }) => return Finding::skipped(NAME, message),
@@ -92,27 +94,29 @@ pub(crate) fn clean(places: &[&Domain], user: u32) -> Finding {
         }
     }
     // Clients that wait for the next hub may be opening the files.
-    let unheld = if alive == 0 { unheld(&prefix, user) } else { Vec::new() };
+    let unheld = if alive == 0 { unused_files(&prefix, user) } else { Vec::new() };
     for file in unheld {
         // A file that cannot be removed is in the list below, so it is not reported as removed.
         let _ = fs::remove_file(&file.path);
     }
-    let left = files(&prefix, user);
-    let gone: Vec<SharedFile> = before.into_iter().filter(|file| !left.contains(file)).collect();
-    let removed = gone.iter().map(|file| file.path.display().to_string()).chain(roots.iter().cloned());
+    let remaining = files(&prefix, user);
+    let removed_files: Vec<SharedFile> =
+        before.into_iter().filter(|file| !remaining.contains(file)).collect();
+    let removed =
+        removed_files.iter().map(|file| file.path.display().to_string()).chain(roots.iter().cloned());
     removed.for_each(|path| tracing::info!("removed {path}"));
-    cleaned(dead, &gone, &roots)
+    clean_finding(dead, &removed_files, &roots)
 }
 
 /// Reports that everything of `dead` processes, the files `gone`, and the directories `roots` were removed.
-fn cleaned(dead: usize, gone: &[SharedFile], roots: &[String]) -> Finding {
+fn clean_finding(dead: usize, removed_files: &[SharedFile], roots: &[String]) -> Finding {
     const NAME: &str = "clean";
     let mut removed = Vec::new();
     if dead > 0 {
         removed.push(format!("what {} left", plural(dead as u64, "process")));
     }
-    if !gone.is_empty() {
-        removed.push(describe(gone));
+    if !removed_files.is_empty() {
+        removed.push(describe(removed_files));
     }
     if !roots.is_empty() {
         removed.push(format!(
@@ -130,12 +134,16 @@ fn cleaned(dead: usize, gone: &[SharedFile], roots: &[String]) -> Finding {
 /// Returns number and length of `files`, as text.
 fn describe(files: &[SharedFile]) -> String {
     let bytes = files.iter().map(|file| file.bytes).sum::<u64>();
-    format!("{} ({} kB) in {SHARED_MEMORY}", plural(files.len() as u64, "file"), bytes.div_ceil(1024))
+    format!(
+        "{} ({} kB) in {SHARED_MEMORY_DIRECTORY}",
+        plural(files.len() as u64, "file"),
+        bytes.div_ceil(1024)
+    )
 }
 
 /// Returns the files of `user` in shared memory whose names begin with `prefix`.
 fn files(prefix: &str, user: u32) -> Vec<SharedFile> {
-    let entries = fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();
+    let entries = fs::read_dir(SHARED_MEMORY_DIRECTORY).into_iter().flatten().flatten();
     let named = entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(prefix));
     let mut files: Vec<SharedFile> = named
         .filter_map(|entry| Some((entry.path(), entry.metadata().ok()?)))
@@ -149,21 +157,21 @@ fn files(prefix: &str, user: u32) -> Vec<SharedFile> {
 /// Returns those of the [`files`] that no process has open or mapped. No process keeps the library's lock open. The
 /// lock counts as held if a process holds another file whose name begins in the same way, because a domain of this name
 /// at another location uses it.
-fn unheld(prefix: &str, user: u32) -> Vec<SharedFile> {
+fn unused_files(prefix: &str, user: u32) -> Vec<SharedFile> {
     let files = files(prefix, user);
-    let (free, held): (Vec<_>, Vec<_>) = files.into_iter().partition(|file| is_unheld(&file.path));
+    let (free, held_files): (Vec<_>, Vec<_>) = files.into_iter().partition(|file| is_unused(&file.path));
     let domain = |file: &SharedFile| {
         let name = file.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        name.get(..prefix.len() + RANDOM).map(str::to_owned)
+        name.get(..prefix.len() + SUFFIX_LEN).map(str::to_owned)
     };
-    let is_used = |file: &SharedFile| held.iter().any(|other| domain(other) == domain(file));
-    free.into_iter().filter(|file| file.bytes > ALWAYS_LEFT || !is_used(file)).collect()
+    let is_used = |file: &SharedFile| held_files.iter().any(|other| domain(other) == domain(file));
+    free.into_iter().filter(|file| file.bytes > LOCK_LEN || !is_used(file)).collect()
 }
 
 /// Returns those of the [`files`] that no process holds, without the very short one that each hub leaves at its exit.
-pub(crate) fn abandoned(prefix: &str, user: u32) -> Vec<SharedFile> {
+pub(crate) fn abandoned_files(prefix: &str, user: u32) -> Vec<SharedFile> {
     let mut files = files(prefix, user);
-    files.retain(|file| file.bytes > ALWAYS_LEFT && is_unheld(&file.path));
+    files.retain(|file| file.bytes > LOCK_LEN && is_unused(&file.path));
     files
 }
 
@@ -171,14 +179,14 @@ pub(crate) fn abandoned(prefix: &str, user: u32) -> Vec<SharedFile> {
 /// a hub that runs.
 pub(crate) fn lock(prefix: &str, user: u32) -> Option<PathBuf> {
     let files = files(prefix, user);
-    let is_alone = files.iter().all(|file| file.bytes <= ALWAYS_LEFT);
-    files.into_iter().map(|file| file.path).find(|path| is_alone && is_unheld(path))
+    let is_alone = files.iter().all(|file| file.bytes <= LOCK_LEN);
+    files.into_iter().map(|file| file.path).find(|path| is_alone && is_unused(path))
 }
 
 /// Number of letters that follow the name of a domain in its file names (docs/topics.md, "Domain").
-const RANDOM: usize = 6;
+const SUFFIX_LEN: usize = 6;
 /// Length of the library's lock in bytes. The library never removes it.
-const ALWAYS_LEFT: u64 = 16;
+const LOCK_LEN: u64 = 16;
 /// Maximum number of files that a finding names.
 const MAX_NAMED: usize = 4;
 
@@ -216,7 +224,7 @@ mod tests {
     use std::path::Path;
     use std::time::{Duration, Instant};
 
-    use scanhub_shm::Nodes;
+    use scanhub_shm::NodeCounts;
 
     use super::*;
     use crate::doctor::State;
@@ -231,10 +239,13 @@ mod tests {
     #[test]
     fn reports_files_of_dead_processes() {
         says(&leftovers(&facts()), State::Ok, &["none"]);
-        let lock = Facts { lock: Some("/dev/shm/sh_a_lock".into()), ..facts() };
+        let lock = MachineState { lock: Some("/dev/shm/sh_a_lock".into()), ..facts() };
         says(&leftovers(&lock), State::Ok, &["none but /dev/shm/sh_a_lock", "16 bytes"]);
-        let nodes =
-            |alive, dead| Facts { nodes: Ok(Nodes { alive, dead }), segments: two_files(), ..facts() };
+        let nodes = |alive, dead| MachineState {
+            nodes: Ok(NodeCounts { alive, dead }),
+            segments: two_files(),
+            ..facts()
+        };
         says(&leftovers(&nodes(3, 0)), State::Ok, &["3 consumers waiting"]);
         let words = [
             "1 process died",
@@ -244,15 +255,19 @@ mod tests {
         ];
         says(&leftovers(&nodes(0, 1)), State::Warning, &words);
         says(&leftovers(&nodes(0, 0)), State::Warning, &["no process", "2 files", "doctor --clean"]);
-        says(&leftovers(&Facts { hub: Ok(Some(5)), ..nodes(3, 2) }), State::Ok, &["2 processes", "cleaning"]);
+        says(
+            &leftovers(&MachineState { hub: Ok(Some(5)), ..nodes(3, 2) }),
+            State::Ok,
+            &["2 processes", "cleaning"],
+        );
     }
 
     #[test]
-    fn reports_what_was_removed() {
-        says(&cleaned(0, &[], &[]), State::Ok, &["nothing"]);
+    fn reports_removed_files_and_directories() {
+        says(&clean_finding(0, &[], &[]), State::Ok, &["nothing"]);
         let roots = ["/tmp/a".to_owned()];
         says(
-            &cleaned(2, &two_files(), &roots),
+            &clean_finding(2, &two_files(), &roots),
             State::Ok,
             &["what 2 processes left, 2 files (2 kB)", "directory /tmp/a"],
         );
@@ -263,7 +278,7 @@ mod tests {
     #[expect(clippy::disallowed_methods, reason = "a limit of real time")]
     fn await_unheld(prefix: &str, user: u32, path: &Path) {
         let give_up_at = Instant::now() + Duration::from_secs(60);
-        while !unheld(prefix, user).iter().any(|file| file.path == path) {
+        while !unused_files(prefix, user).iter().any(|file| file.path == path) {
             assert!(Instant::now() < give_up_at, "{} is still open", path.display());
             std::thread::sleep(Duration::from_millis(1));
         }
@@ -272,33 +287,34 @@ mod tests {
     #[test]
     fn counts_files_that_no_process_holds() {
         let prefix = format!("sh_segments-{}_", std::process::id());
-        let path = PathBuf::from(format!("{SHARED_MEMORY}/{prefix}a"));
+        let path = PathBuf::from(format!("{SHARED_MEMORY_DIRECTORY}/{prefix}a"));
         let file = fs::File::create_new(&path).unwrap();
         file.set_len(64).unwrap();
         let user = file.metadata().unwrap().uid();
-        let open = abandoned(&prefix, user);
+        let open = abandoned_files(&prefix, user);
         drop(file);
         await_unheld(&prefix, user, &path);
-        let short = PathBuf::from(format!("{SHARED_MEMORY}/{prefix}b"));
+        let short = PathBuf::from(format!("{SHARED_MEMORY_DIRECTORY}/{prefix}b"));
         fs::write(&short, "16 bytes are few").unwrap();
-        let beside = lock(&prefix, user);
+        let lock_file = lock(&prefix, user);
         let of_one_that_lives = {
             let other = [format!("{prefix}abcde_data"), format!("{prefix}abcde_lock")];
-            let [data, counter] = other.map(|name| PathBuf::from(format!("{SHARED_MEMORY}/{name}")));
+            let [data, counter] =
+                other.map(|name| PathBuf::from(format!("{SHARED_MEMORY_DIRECTORY}/{name}")));
             let held = fs::File::create_new(&data).unwrap();
             held.set_len(64).unwrap();
             fs::write(&counter, "16 bytes are few").unwrap();
-            let is_spared = !unheld(&prefix, user).iter().any(|file| file.path == counter);
+            let is_spared = !unused_files(&prefix, user).iter().any(|file| file.path == counter);
             drop(held);
             await_unheld(&prefix, user, &data);
-            let is_left = unheld(&prefix, user).iter().any(|file| file.path == counter);
+            let is_left = unused_files(&prefix, user).iter().any(|file| file.path == counter);
             [data, counter].iter().for_each(|path| fs::remove_file(path).unwrap());
             (is_spared, is_left)
         };
-        let (closed, other) = (abandoned(&prefix, user), abandoned(&prefix, user + 1));
-        let all = (files(&prefix, user).len(), unheld(&prefix, user).len());
+        let (closed, other) = (abandoned_files(&prefix, user), abandoned_files(&prefix, user + 1));
+        let all = (files(&prefix, user).len(), unused_files(&prefix, user).len());
         fs::remove_file(&path).unwrap();
-        assert_eq!((beside, lock(&prefix, user)), (None, Some(short.clone())));
+        assert_eq!((lock_file, lock(&prefix, user)), (None, Some(short.clone())));
         fs::remove_file(&short).unwrap();
         assert_eq!((open, other), (Vec::new(), Vec::new()));
         assert_eq!(closed, [SharedFile { path, bytes: 64 }]);

@@ -4,11 +4,11 @@
 use std::fmt;
 
 use scanhub_drivers::lms::command::Request;
-use scanhub_drivers::lms::configuration::availability_words;
-use scanhub_drivers::lms::family::Family as Type;
+use scanhub_drivers::lms::configuration::availability_text;
+use scanhub_drivers::lms::lms_model::LmsModel as Type;
 use scanhub_drivers::lms::operating;
 use scanhub_drivers::lms::reply::Reply;
-use scanhub_drivers::lms::status::Condition;
+use scanhub_drivers::lms::status::StatusByte;
 use scanhub_drivers::lms::variant::Mode;
 use scanhub_drivers::{Model, Report, features, lms};
 use scanhub_schema::{Family, Status};
@@ -19,18 +19,18 @@ use crate::driver::DetectedScanner;
 /// The scanner at a port.
 #[derive(Clone, Debug, Serialize)]
 #[serde(untagged)]
-pub(super) enum Found {
+pub(super) enum FoundDescription {
     /// A scanner that reports its settings on request.
-    Asked(Box<Description>),
+    Inquiry(Box<Description>),
     /// A rotating scanner.
-    Turning(Box<Turning>),
+    Rotating(Box<RotatingDescription>),
 }
 
-impl fmt::Display for Found {
+impl fmt::Display for FoundDescription {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Found::Asked(description) => description.fmt(f),
-            Found::Turning(turning) => turning.fmt(f),
+            FoundDescription::Inquiry(description) => description.fmt(f),
+            FoundDescription::Rotating(turning) => turning.fmt(f),
         }
     }
 }
@@ -42,7 +42,7 @@ pub(crate) fn link_settings(report: &Report, rate: u32) -> Vec<(&'static str, St
     let kind = kind.filter(|kind| kind.factory_variant().is_some());
     let mut settings = vec![("family", Family::Lms.name().to_owned())];
     settings.extend(kind.map(|kind| ("type", kind.name().to_owned())));
-    settings.extend((rate != features(Family::Lms).auto.baud).then(|| ("baud", rate.to_string())));
+    settings.extend((rate != features(Family::Lms).defaults.baud).then(|| ("baud", rate.to_string())));
     settings
 }
 
@@ -97,7 +97,7 @@ impl Description {
         let (kind, number, firmware) = (words.next(), words.next(), words.next());
         let status = report.status();
         let variant = status.and_then(|status| status.variant());
-        let condition = report.status_byte.map(Condition);
+        let condition = report.status_byte.map(StatusByte);
         let configuration = report.configuration();
         let faults = |fault: lms::status::Fault| Fault {
             severity: fault.severity().map(|severity| severity.name()),
@@ -160,11 +160,11 @@ impl fmt::Display for Description {
             "operating mode",
             self.operating_mode.map(|mode| format!("{mode:02x}h, {}", operating::name(mode))),
         )?;
-        row("measuring mode", self.mode.map(|mode| format!("{mode:02x}h, {}", measuring(Mode(mode)))))?;
+        row("measuring mode", self.mode.map(|mode| format!("{mode:02x}h, {}", describe_mode(Mode(mode)))))?;
         row("unit", self.unit_mm.map(|mm| format!("{mm} mm")))?;
         let view = self.angle_deg.zip(self.step_deg);
         row("view", view.map(|(angle, step)| format!("{angle} degrees in steps of {step}")))?;
-        row("availability", self.availability.map(|byte| availability_words(byte).to_owned()))?;
+        row("availability", self.availability.map(|byte| availability_text(byte).to_owned()))?;
         let defect = if self.defective == Some(true) { "reports that it is defective; " } else { "" };
         let dirty = self.polluted == Some(true);
         let condition = |condition: &String| {
@@ -191,7 +191,7 @@ impl fmt::Display for Description {
 }
 
 /// Returns the meaning of the bits of a value in measuring `mode` (Telegram listing, 77h block D).
-pub(crate) fn measuring(mode: Mode) -> String {
+pub(crate) fn describe_mode(mode: Mode) -> String {
     let upper = match (mode.0, mode.intensity_bits()) {
         (0x00, _) => "fields A and B, dazzle",
         (0x02, _) => "fields A, B and C",
@@ -214,7 +214,7 @@ pub(crate) fn hex(bytes: &[u8]) -> String {
 
 /// Description of a rotating scanner. An unknown value is null.
 #[derive(Clone, Debug, Serialize)]
-pub(super) struct Turning {
+pub(super) struct RotatingDescription {
     class: &'static str,
     port: String,
     family: &'static str,
@@ -234,43 +234,47 @@ pub(super) struct Turning {
     problem: Option<String>,
 }
 
-impl Turning {
+impl RotatingDescription {
     /// Creates the description of the scanner that was `heard` at `port`.
-    pub(crate) fn new(port: String, heard: &DetectedScanner) -> Turning {
-        let known = |value: f64| (value > 0.0).then(|| (value * 100.0).round() / 100.0);
-        let is_heard = heard.packets > 0 || heard.said.is_none();
-        Turning {
+    pub(crate) fn new(port: String, scanner: &DetectedScanner) -> RotatingDescription {
+        let rounded = |value: f64| (value > 0.0).then(|| (value * 100.0).round() / 100.0);
+        let is_received = scanner.packets > 0 || scanner.introduction.is_none();
+        RotatingDescription {
             class: "probe",
             port,
-            family: heard.family.name(),
-            model: heard.model_text.clone(),
-            baud: heard.rate,
-            identity: heard.said.as_ref().map(|said| said.identity.clone()),
-            health: heard.said.as_ref().map(|said| said.health.clone()).filter(|words| !words.is_empty()),
-            packets: is_heard.then_some(heard.packets),
-            damaged: is_heard.then(|| heard.damaged()),
-            points_per_second: known(heard.points_per_second),
-            turns_per_second: known(heard.turns_per_second),
+            family: scanner.family.name(),
+            model: scanner.model_text.clone(),
+            baud: scanner.rate,
+            identity: scanner.introduction.as_ref().map(|introduction| introduction.identity.clone()),
+            health: scanner
+                .introduction
+                .as_ref()
+                .map(|introduction| introduction.health.clone())
+                .filter(|words| !words.is_empty()),
+            packets: is_received.then_some(scanner.packets),
+            damaged: is_received.then(|| scanner.damaged()),
+            points_per_second: rounded(scanner.points_per_second),
+            turns_per_second: rounded(scanner.revolutions_per_second),
             // If the line damages bytes, any other problem may be a consequence.
-            problem: heard.line_trouble().or_else(|| heard.trouble.clone()),
+            problem: scanner.line_problem().or_else(|| scanner.problem.clone()),
         }
     }
 
     /// Returns the models that a scanner cannot be distinguished from, unless it has identified itself.
-    fn alike(&self) -> String {
+    fn similar_models(&self) -> String {
         let features = Family::parse(self.family).map(features);
         let models = features.map_or(&[][..], |features| features.models);
         let found = models.iter().find(|model| Some(model.name) == self.model.as_deref());
         let Some(found) = found.filter(|_| self.identity.is_none()) else { return String::new() };
-        let is_alike = |model: &&Model| {
+        let is_similar = |model: &&Model| {
             model.name != found.name && (model.baud, model.beams) == (found.baud, found.beams)
         };
-        let names: Vec<_> = models.iter().filter(is_alike).map(|model| model.name).collect();
+        let names: Vec<_> = models.iter().filter(is_similar).map(|model| model.name).collect();
         if names.is_empty() { String::new() } else { format!(" (or {}: same protocol)", names.join(", ")) }
     }
 }
 
-impl fmt::Display for Turning {
+impl fmt::Display for RotatingDescription {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let mut row = |label: &str, value: Option<String>| match value {
             Some(value) => writeln!(f, "  {label:<16}{value}"),
@@ -279,15 +283,17 @@ impl fmt::Display for Turning {
         row("family", Some(self.family.to_owned()))?;
         row(
             "model",
-            self.model.as_ref().map(|model| format!("{}{}", Status::shown_model(model), self.alike())),
+            self.model
+                .as_ref()
+                .map(|model| format!("{}{}", Status::display_model(model), self.similar_models())),
         )?;
         row("rate", Some(format!("{} Bd", self.baud)))?;
         row("identity", self.identity.clone())?;
         row("health", self.health.clone())?;
-        let heard = self.packets.zip(self.damaged);
+        let received = self.packets.zip(self.damaged);
         row(
             "packets",
-            heard.map(|(packets, damaged)| {
+            received.map(|(packets, damaged)| {
                 format!("{packets}, {:.1} % of the bytes damaged", 100.0 * damaged)
             }),
         )?;

@@ -4,8 +4,10 @@
 use std::io;
 
 use scanhub_drivers::lms::explain::name;
-use scanhub_drivers::lms::framer::{Found, Framer, VETO_HOLD};
-use scanhub_drivers::lms::telegram::{ACK, FRAME, MAX_LENGTH, MAX_TELEGRAM, NAK, REPLY, STX, Telegram, crc};
+use scanhub_drivers::lms::framer::{Framer, FramerEvent, VETO_HOLD_TIME};
+use scanhub_drivers::lms::telegram::{
+    ACK, FRAME_LEN, MAX_LENGTH, MAX_TELEGRAM, NAK, REPLY, STX, Telegram, crc,
+};
 
 /// A part of the stream.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -51,12 +53,12 @@ impl StreamParser {
     /// Adds bytes.
     pub(crate) fn feed(&mut self, mut bytes: &[u8], sink: &mut Sink<'_>) -> io::Result<()> {
         while !bytes.is_empty() {
-            let spare = self.framer.spare();
-            let (now, later) = bytes.split_at(bytes.len().min(spare.len()));
-            spare[..now.len()].copy_from_slice(now);
-            self.framer.commit(now.len());
-            self.pending.extend(now);
-            bytes = later;
+            let buffer = self.framer.read_buffer();
+            let (taken, remaining) = bytes.split_at(bytes.len().min(buffer.len()));
+            buffer[..taken.len()].copy_from_slice(taken);
+            self.framer.commit(taken.len());
+            self.pending.extend(taken);
+            bytes = remaining;
             self.drain(sink)?;
             if self.pending.len() > MAX_PENDING {
                 self.report_old(sink)?;
@@ -67,16 +69,16 @@ impl StreamParser {
 
     /// Ends the stream.
     pub(crate) fn end(&mut self, sink: &mut Sink<'_>) -> io::Result<()> {
-        self.framer.release(VETO_HOLD);
+        self.framer.release(VETO_HOLD_TIME);
         self.drain(sink)?;
-        between(&self.pending, self.base, false, sink)
+        report_gap(&self.pending, self.base, false, sink)
     }
 
     fn drain(&mut self, sink: &mut Sink<'_>) -> io::Result<()> {
         while let Some(found) = self.framer.poll() {
-            let Found::Telegram(framed) = found else { continue };
+            let FramerEvent::Telegram(framed) = found else { continue };
             let at = (framed.offset - self.base) as usize;
-            between(&self.pending[..at], self.base, true, sink)?;
+            report_gap(&self.pending[..at], self.base, true, sink)?;
             sink(framed.offset, Item::Telegram(framed.telegram))?;
             let end = at + framed.telegram.bytes().len();
             self.pending.drain(..end);
@@ -88,9 +90,9 @@ impl StreamParser {
     /// Reports bytes that the framer has dropped long ago, up to a position at which no telegram is split.
     fn report_old(&mut self, sink: &mut Sink<'_>) -> io::Result<()> {
         let max = self.pending.len() - 2 * MAX_TELEGRAM;
-        let across = whole(&self.pending).find(|&(at, telegram)| at + telegram.bytes().len() > max);
+        let across = whole_telegrams(&self.pending).find(|&(at, telegram)| at + telegram.bytes().len() > max);
         let end = across.map_or(max, |(at, _)| at.min(max));
-        between(&self.pending[..end], self.base, false, sink)?;
+        report_gap(&self.pending[..end], self.base, false, sink)?;
         self.pending.drain(..end);
         self.base += end as u64;
         Ok(())
@@ -98,26 +100,26 @@ impl StreamParser {
 }
 
 /// Reports the items before a telegram of the scanner, or at the end.
-fn between(bytes: &[u8], base: u64, before_reply: bool, sink: &mut Sink<'_>) -> io::Result<()> {
+fn report_gap(bytes: &[u8], base: u64, before_reply: bool, sink: &mut Sink<'_>) -> io::Result<()> {
     let mut reported = 0;
     let mut after_telegram = false;
-    for (at, telegram) in whole(bytes) {
-        scraps(&bytes[reported..at], base + reported as u64, (after_telegram, false), sink)?;
+    for (at, telegram) in whole_telegrams(bytes) {
+        report_fragments(&bytes[reported..at], base + reported as u64, (after_telegram, false), sink)?;
         sink(base + at as u64, Item::Telegram(telegram))?;
         reported = at + telegram.bytes().len();
         after_telegram = true;
     }
-    scraps(&bytes[reported..], base + reported as u64, (after_telegram, before_reply), sink)
+    report_fragments(&bytes[reported..], base + reported as u64, (after_telegram, before_reply), sink)
 }
 
 /// Returns the telegrams with a valid checksum in `bytes`, in either direction, with their positions. They do not overlap.
-fn whole(bytes: &[u8]) -> impl Iterator<Item = (usize, Telegram<'_>)> {
+fn whole_telegrams(bytes: &[u8]) -> impl Iterator<Item = (usize, Telegram<'_>)> {
     let mut from = 0;
     std::iter::from_fn(move || {
         loop {
             let at = from + bytes[from..].iter().position(|&byte| byte == STX)?;
             from = at + 1;
-            let len = announced(&bytes[at..]).unwrap_or(0);
+            let len = announced_len(&bytes[at..]).unwrap_or(0);
             if let Some(telegram) = bytes.get(at..at + len).and_then(Telegram::check) {
                 from = at + len;
                 return Some((at, telegram));
@@ -128,7 +130,7 @@ fn whole(bytes: &[u8]) -> impl Iterator<Item = (usize, Telegram<'_>)> {
 
 /// Reports bytes without a whole telegram. A byte counts as an acknowledgement directly after a request, directly before a
 /// reply, or alone. `neighbors` are whether a request is before the bytes, and a reply after them.
-fn scraps(bytes: &[u8], base: u64, neighbors: (bool, bool), sink: &mut Sink<'_>) -> io::Result<()> {
+fn report_fragments(bytes: &[u8], base: u64, neighbors: (bool, bool), sink: &mut Sink<'_>) -> io::Result<()> {
     let (after_request, before_reply) = neighbors;
     let mut other = 0;
     let mut at = 0;
@@ -138,8 +140,9 @@ fn scraps(bytes: &[u8], base: u64, neighbors: (bool, bool), sink: &mut Sink<'_>)
             NAK => Some(Item::Nak),
             _ => None,
         };
-        let placed = at == 0 && (after_request || bytes.len() == 1) || at + 1 == bytes.len() && before_reply;
-        let (item, len) = match (acknowledge.filter(|_| placed), plausible(&bytes[at..])) {
+        let is_acknowledge =
+            at == 0 && (after_request || bytes.len() == 1) || at + 1 == bytes.len() && before_reply;
+        let (item, len) = match (acknowledge.filter(|_| is_acknowledge), plausible_len(&bytes[at..])) {
             (Some(item), _) => (item, 1),
             (None, Some(announced)) => match bytes.get(at..at + announced) {
                 Some(bytes) => (Item::Broken { bytes, expected: crc(&bytes[..announced - 2]) }, announced),
@@ -165,15 +168,15 @@ fn scraps(bytes: &[u8], base: u64, neighbors: (bool, bool), sink: &mut Sink<'_>)
 }
 
 /// Returns the length of the telegram whose head `bytes` start with.
-fn announced(bytes: &[u8]) -> Option<usize> {
+fn announced_len(bytes: &[u8]) -> Option<usize> {
     let &[STX, _, low, high, ..] = bytes else { return None };
     let length = usize::from(u16::from_le_bytes([low, high]));
-    (1..=MAX_LENGTH).contains(&length).then_some(length + FRAME)
+    (1..=MAX_LENGTH).contains(&length).then_some(length + FRAME_LEN)
 }
 
 /// Returns the same length, if the command exists in the direction of the address.
-fn plausible(bytes: &[u8]) -> Option<usize> {
-    let len = announced(bytes)?;
+fn plausible_len(bytes: &[u8]) -> Option<usize> {
+    let len = announced_len(bytes)?;
     let is_reply = bytes[1] & REPLY != 0;
     name(*bytes.get(4)?, is_reply).is_some().then_some(len)
 }
@@ -224,9 +227,9 @@ mod tests {
         bytes.extend(Request::Stop.encode(0).bytes());
         bytes.extend(&scan.bytes()[..50]);
         bytes.push(ACK);
-        bytes.extend(reply::mode(0, true, 0x10).bytes());
+        bytes.extend(reply::mode_reply(0, true, 0x10).bytes());
         bytes.extend(scan.bytes());
-        let mut damaged = reply::refused(0, 0x10).bytes().to_vec();
+        let mut damaged = reply::refusal(0, 0x10).bytes().to_vec();
         damaged[6] ^= 1;
         bytes.extend(&damaged);
         let expected = [

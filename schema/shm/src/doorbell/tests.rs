@@ -96,11 +96,11 @@ impl Sensor {
     /// As a consumer does: the number first, then what was sent, then sleep. False if the wake-up was lost.
     fn await_sample(&self, number: u32) -> bool {
         loop {
-            let seen = rung(&self.rung);
+            let ring_count = read_count(&self.rung);
             if self.sent.load(Ordering::Relaxed) >= number {
                 return true;
             }
-            if !sleep(&[(&self.rung, seen)]) {
+            if !sleep(&[(&self.rung, ring_count)]) {
                 return false;
             }
         }
@@ -108,29 +108,32 @@ impl Sensor {
 
     fn await_end(&self) -> bool {
         loop {
-            let seen = rung(&self.rung);
+            let ring_count = read_count(&self.rung);
             if self.closed.load(Ordering::Relaxed) != 0 {
                 return true;
             }
-            if !sleep(&[(&self.rung, seen)]) {
+            if !sleep(&[(&self.rung, ring_count)]) {
                 return false;
             }
         }
     }
 }
 
-fn one() -> Arc<Sensor> {
+fn new_sensor() -> Arc<Sensor> {
     Arc::new(Sensor::new(&Arc::default()))
 }
 
 /// Runs `act` in a thread with a sensor of its own.
-fn consumer(sensor: &Arc<Sensor>, act: impl FnOnce(&Sensor) -> bool + 'static) -> thread::JoinHandle<bool> {
+fn spawn_subscriber(
+    sensor: &Arc<Sensor>,
+    act: impl FnOnce(&Sensor) -> bool + 'static,
+) -> thread::JoinHandle<bool> {
     let sensor = sensor.clone();
     thread::spawn(move || act(&sensor))
 }
 
 /// Runs `act` in a thread that is counted as a hub until it is through.
-fn hub(sensor: &Arc<Sensor>, act: impl FnOnce(&Sensor) + 'static) -> thread::JoinHandle<()> {
+fn spawn_hub(sensor: &Arc<Sensor>, act: impl FnOnce(&Sensor) + 'static) -> thread::JoinHandle<()> {
     let sensor = sensor.clone();
     sensor.rung.futex.calls.lock().unwrap().hubs += 1;
     thread::spawn(move || {
@@ -142,7 +145,7 @@ fn hub(sensor: &Arc<Sensor>, act: impl FnOnce(&Sensor) + 'static) -> thread::Joi
 
 /// Tries `act` in all interleavings with at most two switches away from a thread that could go on, which is where nearly all
 /// faults of this kind lie and takes seconds in place of hours; in how many of them it says false.
-fn lost(act: impl Fn() -> bool + Sync + Send + 'static) -> usize {
+fn count_lost_wakeups(act: impl Fn() -> bool + Sync + Send + 'static) -> usize {
     let lost = Arc::new(AtomicUsize::new(0));
     let count = lost.clone();
     let mut model = loom::model::Builder::new();
@@ -157,9 +160,9 @@ fn lost(act: impl Fn() -> bool + Sync + Send + 'static) -> usize {
 
 #[test]
 fn no_wake_is_lost_by_one_consumer_of_two_samples() {
-    let lost = lost(|| {
-        let sensor = one();
-        let hub = hub(&sensor, |sensor| {
+    let lost = count_lost_wakeups(|| {
+        let sensor = new_sensor();
+        let hub = spawn_hub(&sensor, |sensor| {
             for number in 1..=2 {
                 sensor.send(number);
                 ring(&sensor.rung);
@@ -174,13 +177,13 @@ fn no_wake_is_lost_by_one_consumer_of_two_samples() {
 
 #[test]
 fn one_call_wakes_two_consumers() {
-    let lost = lost(|| {
-        let sensor = one();
-        let hub = hub(&sensor, |sensor| {
+    let lost = count_lost_wakeups(|| {
+        let sensor = new_sensor();
+        let hub = spawn_hub(&sensor, |sensor| {
             sensor.send(1);
             ring(&sensor.rung);
         });
-        let other = consumer(&sensor, |sensor| sensor.await_sample(1));
+        let other = spawn_subscriber(&sensor, |sensor| sensor.await_sample(1));
         let got = sensor.await_sample(1);
         hub.join().unwrap();
         other.join().unwrap() && got
@@ -189,12 +192,12 @@ fn one_call_wakes_two_consumers() {
 }
 
 #[test]
-fn the_next_hub_wakes_those_that_a_killed_one_left_asleep() {
+fn next_hub_wakes_sleepers_left_by_a_killed_hub() {
     // Killed before the number, and after it.
     for counted in [false, true] {
-        let lost = lost(move || {
-            let sensor = one();
-            let hubs = hub(&sensor, move |sensor| {
+        let lost = count_lost_wakeups(move || {
+            let sensor = new_sensor();
+            let hubs = spawn_hub(&sensor, move |sensor| {
                 sensor.send(1);
                 if counted {
                     sensor.rung.fetch_add(1, Ordering::Release);
@@ -211,10 +214,10 @@ fn the_next_hub_wakes_those_that_a_killed_one_left_asleep() {
 }
 
 #[test]
-fn nobody_sleeps_at_a_bell_that_is_closed() {
-    let lost = lost(|| {
-        let sensor = one();
-        let hub = hub(&sensor, |sensor| {
+fn no_subscriber_sleeps_at_a_closed_doorbell() {
+    let lost = count_lost_wakeups(|| {
+        let sensor = new_sensor();
+        let hub = spawn_hub(&sensor, |sensor| {
             ring(&sensor.rung);
             close(&sensor.closed, &sensor.rung);
         });
@@ -227,21 +230,21 @@ fn nobody_sleeps_at_a_bell_that_is_closed() {
 
 #[test]
 fn a_consumer_asleep_at_two_bells_is_woken_by_each() {
-    let lost = lost(|| {
+    let lost = count_lost_wakeups(|| {
         let futex = Arc::default();
         let sensors = [Sensor::new(&futex), Sensor::new(&futex)].map(Arc::new);
         let hubs = sensors.each_ref().map(|sensor| {
-            hub(sensor, |sensor| {
+            spawn_hub(sensor, |sensor| {
                 sensor.send(1);
                 ring(&sensor.rung);
             })
         });
         let got = loop {
-            let seen = sensors.each_ref().map(|sensor| rung(&sensor.rung));
+            let ring_counts = sensors.each_ref().map(|sensor| read_count(&sensor.rung));
             if sensors.iter().all(|sensor| sensor.sent.load(Ordering::Relaxed) == 1) {
                 break true;
             }
-            if !sleep(&[(&sensors[0].rung, seen[0]), (&sensors[1].rung, seen[1])]) {
+            if !sleep(&[(&sensors[0].rung, ring_counts[0]), (&sensors[1].rung, ring_counts[1])]) {
                 break false;
             }
         };
@@ -253,9 +256,9 @@ fn a_consumer_asleep_at_two_bells_is_woken_by_each() {
 
 #[test]
 fn a_hub_that_wakes_before_it_counts_is_found() {
-    let lost = lost(|| {
-        let sensor = one();
-        let hub = hub(&sensor, |sensor| {
+    let lost = count_lost_wakeups(|| {
+        let sensor = new_sensor();
+        let hub = spawn_hub(&sensor, |sensor| {
             sensor.send(1);
             sensor.rung.wake();
             sensor.rung.fetch_add(1, Ordering::Release);
@@ -268,20 +271,20 @@ fn a_hub_that_wakes_before_it_counts_is_found() {
 }
 
 #[test]
-fn a_consumer_that_sees_the_number_before_the_sample_is_found() {
-    let lost = lost(|| {
-        let sensor = one();
-        let hub = hub(&sensor, |sensor| {
+fn model_detects_a_wakeup_lost_without_the_fence() {
+    let lost = count_lost_wakeups(|| {
+        let sensor = new_sensor();
+        let hub = spawn_hub(&sensor, |sensor| {
             sensor.send(1);
             ring(&sensor.rung);
         });
         let got = loop {
             // Without the fence of `rung`.
-            let seen = sensor.rung.load(Ordering::Relaxed);
+            let ring_count = sensor.rung.load(Ordering::Relaxed);
             if sensor.sent.load(Ordering::Relaxed) == 1 {
                 break true;
             }
-            if !sleep(&[(&sensor.rung, seen)]) {
+            if !sleep(&[(&sensor.rung, ring_count)]) {
                 break false;
             }
         };
@@ -292,18 +295,18 @@ fn a_consumer_that_sees_the_number_before_the_sample_is_found() {
 }
 
 #[test]
-fn a_hub_that_sees_the_count_sees_who_attached() {
-    let lost = lost(|| {
-        let sensor = one();
-        let joiner = consumer(&sensor, |sensor| {
+fn hub_that_reads_the_count_detects_the_subscriber() {
+    let lost = count_lost_wakeups(|| {
+        let sensor = new_sensor();
+        let joiner = spawn_subscriber(&sensor, |sensor| {
             sensor.send(1);
-            note(&sensor.rung);
+            increment(&sensor.rung);
             true
         });
-        let is_counted = rung(&sensor.rung) == 1;
+        let is_counted = read_count(&sensor.rung) == 1;
         let is_there = sensor.sent.load(Ordering::Relaxed) == 1;
         joiner.join().unwrap();
-        is_there || !is_counted && rung(&sensor.rung) == 1
+        is_there || !is_counted && read_count(&sensor.rung) == 1
     });
     assert_eq!(lost, 0);
 }

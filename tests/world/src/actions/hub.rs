@@ -2,91 +2,107 @@
 
 use scanhub_schema::MILLIS;
 
-use super::{Key, Kind};
+use super::{ActionKey, ActionKind};
 use crate::event::Event;
-use crate::plan::Action;
-use crate::world::{Ending, World};
+use crate::scenario::Action;
+use crate::world::{HubEnding, World};
 
 /// The hub is killed, and another one starts after a while.
-pub(super) const KILL_HUB: Kind = Kind {
+pub(super) const KILL_HUB: ActionKind = ActionKind {
     name: "kill_hub",
     per_minute: 3.0,
-    keys: &[Key::new("away_ms", 20, 4_000)],
-    act: |world, action| end(world, action, true),
+    keys: &[ActionKey::new("away_ms", 20, 4_000)],
+    act: |world, action| end_hub(world, action, true),
 };
 
 /// The hub ends in order, and another one starts after a while.
-pub(super) const END_HUB: Kind = Kind {
+pub(super) const END_HUB: ActionKind = ActionKind {
     name: "end_hub",
     per_minute: 1.5,
-    keys: &[Key::new("away_ms", 20, 4_000)],
-    act: |world, action| end(world, action, false),
+    keys: &[ActionKey::new("away_ms", 20, 4_000)],
+    act: |world, action| end_hub(world, action, false),
 };
 
-fn end(world: &mut World, action: &Action, is_killed: bool) {
+fn end_hub(world: &mut World, action: &Action, is_killed: bool) {
     let back_at = world.now() + action.value("away_ms") * MILLIS;
-    world.wants.end = Some(Ending { is_killed, back_at });
+    world.hub_requests.ending = Some(HubEnding { is_killed, restart_at: back_at });
 }
 
 /// The hub's process does not run for a while.
-pub(super) const STALL: Kind =
-    Kind { name: "stall", per_minute: 4.0, keys: &[Key::new("span_ms", 5, 5_000)], act: stall_hub };
+pub(super) const STALL: ActionKind = ActionKind {
+    name: "stall",
+    per_minute: 4.0,
+    keys: &[ActionKey::new("span_ms", 5, 5_000)],
+    act: stall_hub,
+};
 
 fn stall_hub(world: &mut World, action: &Action) {
     let until = world.now() + action.value("span_ms") * MILLIS;
     world.stalled_until = world.stalled_until.max(until);
-    world.shared.tell(&Event::Stalled { until: world.stalled_until });
+    world.shared.log_event(&Event::Stalled { until: world.stalled_until });
 }
 
 /// The configuration changes, to a valid or an invalid one, and the hub gets the request to read it.
-pub(super) const RELOAD: Kind =
-    Kind { name: "reload", per_minute: 4.0, keys: &[Key::new("edition", 0, 2)], act: reload_configuration };
+pub(super) const RELOAD: ActionKind = ActionKind {
+    name: "reload",
+    per_minute: 4.0,
+    keys: &[ActionKey::new("edition", 0, 2)],
+    act: reload_configuration,
+};
 
 fn reload_configuration(world: &mut World, action: &Action) {
     world.edition.set(action.value("edition"));
-    world.wants.reload = true;
+    world.hub_requests.reload = true;
 }
 
 /// The disk is full for a while.
-pub(super) const DISK_FULL: Kind =
-    Kind { name: "disk_full", per_minute: 2.0, keys: &[Key::new("span_ms", 100, 20_000)], act: fill_disk };
+pub(super) const DISK_FULL: ActionKind = ActionKind {
+    name: "disk_full",
+    per_minute: 2.0,
+    keys: &[ActionKey::new("span_ms", 100, 20_000)],
+    act: fill_disk,
+};
 
 fn fill_disk(world: &mut World, action: &Action) {
     world.shared.disk_is_full.set(true);
-    world.later(action.value("span_ms"), |world| world.shared.disk_is_full.set(false));
+    world.schedule(action.value("span_ms"), |world| world.shared.disk_is_full.set(false));
 }
 
 /// There is no memory for samples for a while.
-pub(super) const NO_MEMORY: Kind =
-    Kind { name: "no_memory", per_minute: 2.0, keys: &[Key::new("span_ms", 5, 3_000)], act: lack_memory };
+pub(super) const NO_MEMORY: ActionKind = ActionKind {
+    name: "no_memory",
+    per_minute: 2.0,
+    keys: &[ActionKey::new("span_ms", 5, 3_000)],
+    act: exhaust_memory,
+};
 
-fn lack_memory(world: &mut World, action: &Action) {
-    world.shared.board.borrow_mut().lacks_memory = true;
-    world.later(action.value("span_ms"), |world| world.shared.board.borrow_mut().lacks_memory = false);
+fn exhaust_memory(world: &mut World, action: &Action) {
+    world.shared.topics.borrow_mut().lacks_memory = true;
+    world.schedule(action.value("span_ms"), |world| world.shared.topics.borrow_mut().lacks_memory = false);
 }
 
 /// The hub cannot open anything for a while.
-pub(super) const NO_DESCRIPTORS: Kind = Kind {
+pub(super) const NO_DESCRIPTORS: ActionKind = ActionKind {
     name: "no_descriptors",
     per_minute: 2.0,
-    keys: &[Key::new("span_ms", 100, 5_000)],
-    act: lack_descriptors,
+    keys: &[ActionKey::new("span_ms", 100, 5_000)],
+    act: exhaust_descriptors,
 };
 
-fn lack_descriptors(world: &mut World, action: &Action) {
+fn exhaust_descriptors(world: &mut World, action: &Action) {
     world.shared.lacks_descriptors.set(true);
-    world.later(action.value("span_ms"), |world| world.shared.lacks_descriptors.set(false));
+    world.schedule(action.value("span_ms"), |world| world.shared.lacks_descriptors.set(false));
 }
 
 /// The wall clock is set.
-pub(super) const WALL_STEP: Kind = Kind {
+pub(super) const WALL_STEP: ActionKind = ActionKind {
     name: "wall_step",
     per_minute: 2.0,
-    keys: &[Key::new("is_back", 0, 1), Key::new("seconds", 1, 1_000_000)],
+    keys: &[ActionKey::new("is_back", 0, 1), ActionKey::new("seconds", 1, 1_000_000)],
     act: step_wall_clock,
 };
 
 fn step_wall_clock(world: &mut World, action: &Action) {
-    let (ahead, by) = (&world.shared.wall_ahead, action.value("seconds") * 1_000_000_000);
+    let (ahead, by) = (&world.shared.wall_offset, action.value("seconds") * 1_000_000_000);
     ahead.set(if action.value("is_back") > 0 { ahead.get() - by } else { ahead.get() + by });
 }

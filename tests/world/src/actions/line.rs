@@ -4,28 +4,28 @@ use scanhub_port::PortError;
 use scanhub_schema::{MILLIS, Nanos};
 use scanhub_sim::fault::Faults;
 
-use super::{Key, Kind, SENSOR};
-use crate::plan::Action;
+use super::{ActionKey, ActionKind, SENSOR};
+use crate::scenario::Action;
 use crate::world::World;
 
 /// The line loses, flips, inserts and duplicates bytes for a while. Shares are in units of 1e-5.
-pub(super) const NOISE: Kind = Kind {
+pub(super) const NOISE: ActionKind = ActionKind {
     name: "noise",
     per_minute: 3.0,
     keys: &[
         SENSOR,
-        Key::new("loss", 0, 1_000),
-        Key::new("flip", 0, 1_000),
-        Key::new("insert", 0, 500),
-        Key::new("double", 0, 500),
-        Key::new("burst", 1, 40),
-        Key::new("span_ms", 20, 10_000),
+        ActionKey::new("loss", 0, 1_000),
+        ActionKey::new("flip", 0, 1_000),
+        ActionKey::new("insert", 0, 500),
+        ActionKey::new("double", 0, 500),
+        ActionKey::new("burst", 1, 40),
+        ActionKey::new("span_ms", 20, 10_000),
     ],
     act: add_noise,
 };
 
 fn add_noise(world: &mut World, action: &Action) {
-    world.fault(action, &noise_faults(action));
+    world.inject_line_fault(action, &noise_faults(action));
 }
 
 /// Returns the faults of the bytes on the line.
@@ -45,21 +45,21 @@ pub(super) fn noise_faults(action: &Action) -> Faults {
 }
 
 /// Floods of random bytes and walls of start bytes arrive on the line for a while.
-pub(super) const GARBAGE: Kind = Kind {
+pub(super) const GARBAGE: ActionKind = ActionKind {
     name: "garbage",
     per_minute: 3.0,
     keys: &[
         SENSOR,
-        Key::new("flood", 0, 3_000),
-        Key::new("wall", 0, 3_000),
-        Key::new("every_ms", 20, 2_000),
-        Key::new("span_ms", 20, 6_000),
+        ActionKey::new("flood", 0, 3_000),
+        ActionKey::new("wall", 0, 3_000),
+        ActionKey::new("every_ms", 20, 2_000),
+        ActionKey::new("span_ms", 20, 6_000),
     ],
     act: add_garbage,
 };
 
 fn add_garbage(world: &mut World, action: &Action) {
-    world.fault(action, &garbage_faults(action));
+    world.inject_line_fault(action, &garbage_faults(action));
 }
 
 /// Returns the faults of the bytes on the line.
@@ -71,22 +71,22 @@ pub(super) fn garbage_faults(action: &Action) -> Faults {
 
 /// Whole telegrams are damaged for a while: the line loses their ends, changes their length fields or duplicates them, or the
 /// scanner aborts them. Shares are in percent.
-pub(super) const TELEGRAMS: Kind = Kind {
+pub(super) const TELEGRAMS: ActionKind = ActionKind {
     name: "telegrams",
     per_minute: 3.0,
     keys: &[
         SENSOR,
-        Key::new("truncate", 0, 30),
-        Key::new("length", 0, 30),
-        Key::new("repeat", 0, 30),
-        Key::new("abort", 0, 30),
-        Key::new("span_ms", 20, 10_000),
+        ActionKey::new("truncate", 0, 30),
+        ActionKey::new("length", 0, 30),
+        ActionKey::new("repeat", 0, 30),
+        ActionKey::new("abort", 0, 30),
+        ActionKey::new("span_ms", 20, 10_000),
     ],
     act: damage_telegrams,
 };
 
 fn damage_telegrams(world: &mut World, action: &Action) {
-    world.fault(action, &telegram_faults(action));
+    world.inject_line_fault(action, &telegram_faults(action));
 }
 
 /// Returns the faults of the bytes on the line.
@@ -102,22 +102,22 @@ pub(super) fn telegram_faults(action: &Action) -> Faults {
 }
 
 /// No byte arrives for a while, or every byte arrives late.
-pub(super) const SILENCE: Kind = Kind {
+pub(super) const SILENCE: ActionKind = ActionKind {
     name: "silence",
     per_minute: 4.0,
-    keys: &[SENSOR, Key::new("is_late", 0, 1), Key::new("span_ms", 20, 4_000)],
-    act: silence,
+    keys: &[SENSOR, ActionKey::new("is_late", 0, 1), ActionKey::new("span_ms", 20, 4_000)],
+    act: silence_line,
 };
 
-fn silence(world: &mut World, action: &Action) {
+fn silence_line(world: &mut World, action: &Action) {
     // The line would still hold bytes back after the world has healed.
-    let faults = silence_faults(action, world.now(), world.until_healed());
-    world.fault(action, &faults);
+    let faults = silence_faults(action, world.now(), world.time_until_faults_clear());
+    world.inject_line_fault(action, &faults);
 }
 
 /// Returns the faults of the bytes on the line from `now` on, which end after `most`.
-pub(super) fn silence_faults(action: &Action, now: Nanos, most: Nanos) -> Faults {
-    let span = (action.value("span_ms") * MILLIS).min(most) as f64 / 1e9;
+pub(super) fn silence_faults(action: &Action, now: Nanos, max_span: Nanos) -> Faults {
+    let span = (action.value("span_ms") * MILLIS).min(max_span) as f64 / 1e9;
     let at = now as f64 / 1e9 + 1e-3;
     match action.value("is_late") {
         0 => Faults { silence: span, silence_at: at, ..Faults::default() },
@@ -126,32 +126,36 @@ pub(super) fn silence_faults(action: &Action, now: Nanos, most: Nanos) -> Faults
 }
 
 /// The adapter is unplugged, and plugged in again.
-pub(super) const UNPLUG: Kind =
-    Kind { name: "unplug", per_minute: 3.0, keys: &[SENSOR, Key::new("span_ms", 1, 6_000)], act: unplug };
+pub(super) const UNPLUG: ActionKind = ActionKind {
+    name: "unplug",
+    per_minute: 3.0,
+    keys: &[SENSOR, ActionKey::new("span_ms", 1, 6_000)],
+    act: unplug,
+};
 
 fn unplug(world: &mut World, action: &Action) {
     let sensor = world.sensor(action);
-    world.port(sensor, |tty, log, now| tty.unplug(log, now));
-    world.later(action.value("span_ms"), move |world| {
-        world.port(sensor, |tty, log, now| tty.plug(false, log, now));
+    world.with_port(sensor, |tty, log, now| tty.unplug(log, now));
+    world.schedule(action.value("span_ms"), move |world| {
+        world.with_port(sensor, |tty, log, now| tty.plug(false, log, now));
     });
 }
 
 /// The adapter is unplugged and returns under another name, and later under its own.
-pub(super) const REPLUG_ELSEWHERE: Kind = Kind {
+pub(super) const REPLUG_ELSEWHERE: ActionKind = ActionKind {
     name: "replug_elsewhere",
     per_minute: 1.5,
-    keys: &[SENSOR, Key::new("out_ms", 1, 1_000), Key::new("span_ms", 100, 6_000)],
+    keys: &[SENSOR, ActionKey::new("out_ms", 1, 1_000), ActionKey::new("span_ms", 100, 6_000)],
     act: replug_elsewhere,
 };
 
 fn replug_elsewhere(world: &mut World, action: &Action) {
     let (sensor, span_ms) = (world.sensor(action), action.value("span_ms"));
-    world.port(sensor, |tty, log, now| tty.unplug(log, now));
-    world.later(action.value("out_ms"), move |world| {
-        world.port(sensor, |tty, log, now| tty.plug(true, log, now));
-        world.later(span_ms, move |world| {
-            world.port(sensor, |tty, log, now| {
+    world.with_port(sensor, |tty, log, now| tty.unplug(log, now));
+    world.schedule(action.value("out_ms"), move |world| {
+        world.with_port(sensor, |tty, log, now| tty.plug(true, log, now));
+        world.schedule(span_ms, move |world| {
+            world.with_port(sensor, |tty, log, now| {
                 tty.unplug(log, now);
                 tty.plug(false, log, now);
             });
@@ -161,35 +165,39 @@ fn replug_elsewhere(world: &mut World, action: &Action) {
 
 /// For a while, a port exists but cannot be opened: the hub has no permission, another program has the port, or the driver
 /// refuses the rate.
-pub(super) const DENIED: Kind = Kind {
+pub(super) const PORT_DENIED: ActionKind = ActionKind {
     name: "denied",
     per_minute: 2.0,
-    keys: &[SENSOR, Key::new("reason", 0, 2), Key::new("span_ms", 100, 5_000)],
-    act: deny,
+    keys: &[SENSOR, ActionKey::new("reason", 0, 2), ActionKey::new("span_ms", 100, 5_000)],
+    act: deny_port,
 };
 
-fn deny(world: &mut World, action: &Action) {
+fn deny_port(world: &mut World, action: &Action) {
     let sensor = world.sensor(action);
     let error = match action.value("reason") {
-        0 => PortError::Denied,
+        0 => PortError::PermissionDenied,
         1 => PortError::Busy,
-        _ => PortError::Rate { wanted: 500_000, given: 115_200 },
+        _ => PortError::Rate { requested: 500_000, actual: 115_200 },
     };
-    world.port(sensor, |tty, _, _| tty.refuses = Some(error));
-    world.later(action.value("span_ms"), move |world| {
-        world.port(sensor, |tty, _, _| tty.refuses = None);
+    world.with_port(sensor, |tty, _, _| tty.open_error = Some(error));
+    world.schedule(action.value("span_ms"), move |world| {
+        world.with_port(sensor, |tty, _, _| tty.open_error = None);
     });
 }
 
 /// Another process that opened the port before the hub sets it to another rate.
-pub(super) const ALTERED: Kind =
-    Kind { name: "altered", per_minute: 2.0, keys: &[SENSOR, Key::new("rate", 0, 4)], act: alter };
+pub(super) const RATE_ALTERED: ActionKind = ActionKind {
+    name: "altered",
+    per_minute: 2.0,
+    keys: &[SENSOR, ActionKey::new("rate", 0, 4)],
+    act: alter_rate,
+};
 
-fn alter(world: &mut World, action: &Action) {
-    let rate = RATES[action.value("rate") as usize];
+fn alter_rate(world: &mut World, action: &Action) {
+    let rate = ALTERED_RATES[action.value("rate") as usize];
     let sensor = world.sensor(action);
-    world.port(sensor, |tty, log, now| tty.alter(rate, log, now));
+    world.with_port(sensor, |tty, log, now| tty.alter(rate, log, now));
 }
 
 /// Rates that programs try, in bits per second.
-const RATES: [u32; 5] = [9_600, 38_400, 57_600, 115_200, 500_000];
+const ALTERED_RATES: [u32; 5] = [9_600, 38_400, 57_600, 115_200, 500_000];

@@ -1,49 +1,49 @@
 //! Actions of a plan: faults and events, each with its name, its keys and its effect. A plan draws, prints and parses all
 //! actions alike. An action undoes its effect after a while, or when the world heals.
 
-mod consumers;
 mod hub;
 mod line;
 mod network;
 mod scanner;
+mod subscribers;
 
 use scanhub_schema::{Nanos, Topic};
 use scanhub_sim::fault::Faults;
 
-use crate::plan::Action;
+use crate::scenario::Action;
 use crate::world::World;
 pub(crate) use scanner::{objects_inside, scene_changes};
 
 /// A kind of action.
 #[derive(Debug)]
-pub(crate) struct Kind {
+pub(crate) struct ActionKind {
     pub(crate) name: &'static str,
     /// Number of occurrences per minute in a world that has it.
     pub(crate) per_minute: f64,
-    pub(crate) keys: &'static [Key],
+    pub(crate) keys: &'static [ActionKey],
     pub(crate) act: fn(&mut World, &Action),
 }
 
 /// A key of an action, and the range of its drawn values.
 #[derive(Debug)]
-pub(crate) struct Key {
+pub(crate) struct ActionKey {
     pub(crate) name: &'static str,
-    pub(crate) least: u64,
-    pub(crate) most: u64,
+    pub(crate) min: u64,
+    pub(crate) max: u64,
 }
 
-impl Key {
-    const fn new(name: &'static str, least: u64, most: u64) -> Key {
-        Key { name, least, most }
+impl ActionKey {
+    const fn new(name: &'static str, min: u64, max: u64) -> ActionKey {
+        ActionKey { name, min, max }
     }
 }
 
 /// Number of the sensor that the action affects.
-const SENSOR: Key = Key::new("sensor", 0, 1);
+const SENSOR: ActionKey = ActionKey::new("sensor", 0, 1);
 
 /// All kinds, in the order in which plans draw them.
-pub(crate) const KINDS: &[Kind] = &[
-    scanner::OBJECT,
+pub(crate) const ACTION_KINDS: &[ActionKind] = &[
+    scanner::OBJECT_INSIDE,
     line::UNPLUG,
     line::REPLUG_ELSEWHERE,
     scanner::EXCHANGE,
@@ -52,7 +52,7 @@ pub(crate) const KINDS: &[Kind] = &[
     line::GARBAGE,
     line::TELEGRAMS,
     line::SILENCE,
-    scanner::HABITS,
+    scanner::PROTOCOL_QUIRKS,
     hub::STALL,
     hub::KILL_HUB,
     hub::END_HUB,
@@ -60,27 +60,27 @@ pub(crate) const KINDS: &[Kind] = &[
     hub::DISK_FULL,
     hub::NO_MEMORY,
     hub::NO_DESCRIPTORS,
-    line::DENIED,
+    line::PORT_DENIED,
     hub::WALL_STEP,
-    consumers::COMES,
-    consumers::KILLED,
-    consumers::STOPS,
-    consumers::PAUSE,
-    consumers::RESYNC,
+    subscribers::ATTACH,
+    subscribers::ATTACH_AND_KILL,
+    subscribers::STALL_SUBSCRIBER,
+    subscribers::PAUSE,
+    subscribers::RESYNC,
     network::NETWORK_LOSS,
     network::PARTITION,
     network::NETWORK_STALL,
     network::GATEWAY_KILLED,
     network::LISTENER_KILLED,
-    scanner::PACE,
+    scanner::HEAD_SPEED,
     network::KEY_ERRORS,
     scanner::BROWN_OUT,
-    scanner::HOLD,
-    scanner::UNWELL,
-    scanner::DEAF,
+    scanner::HEAD_HELD,
+    scanner::UNHEALTHY,
+    scanner::IGNORED_REQUESTS,
     network::ROUTER_KILLED,
-    line::ALTERED,
-    consumers::AMID,
+    line::RATE_ALTERED,
+    subscribers::ATTACH_BETWEEN_SAMPLES,
 ];
 
 /// Returns whether gateway and listener of a world with these actions have a key.
@@ -94,8 +94,8 @@ pub(crate) fn are_bridges(actions: &[Action]) -> bool {
 }
 
 /// Returns the topics that lose their constant subscribers in a world with these actions. No judge needs them.
-pub(crate) fn lonely_topics(actions: &[Action], seed: u64) -> Vec<Topic> {
-    if actions.iter().all(|action| action.name() != consumers::AMID.name) {
+pub(crate) fn topics_without_constant_subscriber(actions: &[Action], seed: u64) -> Vec<Topic> {
+    if actions.iter().all(|action| action.name() != subscribers::ATTACH_BETWEEN_SAMPLES.name) {
         return Vec::new();
     }
     let mut random = fastrand::Rng::with_seed(seed ^ 0xA31D_0000_0000_0000);
@@ -109,8 +109,8 @@ pub(crate) fn faults(action: &Action, now: Nanos) -> Option<Faults> {
     if name == line::SILENCE.name {
         return Some(line::silence_faults(action, now, Nanos::MAX));
     }
-    type Of = (&'static Kind, fn(&Action) -> Faults);
-    let of: [Of; 3] = [
+    type FaultsOfKind = (&'static ActionKind, fn(&Action) -> Faults);
+    let of: [FaultsOfKind; 3] = [
         (&line::GARBAGE, line::garbage_faults),
         (&line::NOISE, line::noise_faults),
         (&line::TELEGRAMS, line::telegram_faults),
@@ -118,15 +118,15 @@ pub(crate) fn faults(action: &Action, now: Nanos) -> Option<Faults> {
     of.into_iter().find(|(kind, _)| kind.name == name).map(|(_, faults)| faults(action))
 }
 
-impl Kind {
+impl ActionKind {
     /// Draws values for the keys. Where a range is wide, their logarithms are evenly distributed.
     pub(crate) fn draw(&self, random: &mut fastrand::Rng) -> Vec<u64> {
-        let value = |key: &Key| match key {
-            Key { least, most, .. } if *most > 20 * (*least).max(1) => {
-                let (low, high) = (((*least).max(1) as f64).ln(), (*most as f64).ln());
-                ((low + random.f64() * (high - low)).exp() as u64).clamp(*least, *most)
+        let value = |key: &ActionKey| match key {
+            ActionKey { min: minimum, max: maximum, .. } if *maximum > 20 * (*minimum).max(1) => {
+                let (low, high) = (((*minimum).max(1) as f64).ln(), (*maximum as f64).ln());
+                ((low + random.f64() * (high - low)).exp() as u64).clamp(*minimum, *maximum)
             }
-            Key { least, most, .. } => random.u64(*least..=*most),
+            ActionKey { min: minimum, max: maximum, .. } => random.u64(*minimum..=*maximum),
         };
         self.keys.iter().map(value).collect()
     }

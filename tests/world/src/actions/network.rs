@@ -2,25 +2,25 @@
 
 use scanhub_schema::MILLIS;
 
-use super::{Key, Kind};
+use super::{ActionKey, ActionKind};
 use crate::network::Faults;
-use crate::plan::Action;
 use crate::remote::Forgery;
+use crate::scenario::Action;
 use crate::world::World;
 
 /// The network loses, duplicates, damages, delays and reorders datagrams for a while, and the gateway's sockets refuse some.
 /// Shares are in thousandths.
-pub(super) const NETWORK_LOSS: Kind = Kind {
+pub(super) const NETWORK_LOSS: ActionKind = ActionKind {
     name: "network_loss",
     per_minute: 4.0,
     keys: &[
-        Key::new("loss", 0, 600),
-        Key::new("double", 0, 300),
-        Key::new("damage", 0, 200),
-        Key::new("refuse", 0, 200),
-        Key::new("delay_ms", 0, 500),
-        Key::new("jitter_ms", 0, 500),
-        Key::new("span_ms", 20, 15_000),
+        ActionKey::new("loss", 0, 600),
+        ActionKey::new("double", 0, 300),
+        ActionKey::new("damage", 0, 200),
+        ActionKey::new("refuse", 0, 200),
+        ActionKey::new("delay_ms", 0, 500),
+        ActionKey::new("jitter_ms", 0, 500),
+        ActionKey::new("span_ms", 20, 15_000),
     ],
     act: lose_datagrams,
 };
@@ -36,91 +36,99 @@ fn lose_datagrams(world: &mut World, action: &Action) {
         partition_ns: 0,
     };
     set_network_faults(world, faults, share("refuse"));
-    world.later(action.value("span_ms"), |world| set_network_faults(world, Faults::default(), 0.0));
+    world.schedule(action.value("span_ms"), |world| set_network_faults(world, Faults::default(), 0.0));
 }
 
 fn set_network_faults(world: &mut World, faults: Faults, refusal: f64) {
     let now = world.now();
-    world.remote.set_faults(faults, now);
-    world.remote.refusal = refusal;
+    world.remote_machines.set_faults(faults, now);
+    world.remote_machines.refusal_rate = refusal;
 }
 
 /// No datagram passes the network for a while.
-pub(super) const PARTITION: Kind =
-    Kind { name: "partition", per_minute: 4.0, keys: &[Key::new("span_ms", 20, 8_000)], act: partition };
+pub(super) const PARTITION: ActionKind = ActionKind {
+    name: "partition",
+    per_minute: 4.0,
+    keys: &[ActionKey::new("span_ms", 20, 8_000)],
+    act: partition,
+};
 
 fn partition(world: &mut World, action: &Action) {
     let now = world.now();
-    world.remote.part(true, now);
-    world.later(action.value("span_ms"), |world| {
+    world.remote_machines.change_partitions(true, now);
+    world.schedule(action.value("span_ms"), |world| {
         let now = world.now();
-        world.remote.part(false, now);
+        world.remote_machines.change_partitions(false, now);
     });
 }
 
 /// The gateway's or the listener's process does not run for a while.
-pub(super) const NETWORK_STALL: Kind = Kind {
+pub(super) const NETWORK_STALL: ActionKind = ActionKind {
     name: "network_stall",
     per_minute: 4.0,
-    keys: &[Key::new("is_listener", 0, 1), Key::new("span_ms", 5, 5_000)],
+    keys: &[ActionKey::new("is_listener", 0, 1), ActionKey::new("span_ms", 5, 5_000)],
     act: stall_network,
 };
 
 fn stall_network(world: &mut World, action: &Action) {
     let until = world.now() + action.value("span_ms") * MILLIS;
-    world.remote.stall(action.value("is_listener") > 0, until);
+    world.remote_machines.stall(action.value("is_listener") > 0, until);
 }
 
 /// The gateway is killed or ends in order, and another one starts after a while.
-pub(super) const GATEWAY_KILLED: Kind = Kind {
+pub(super) const GATEWAY_KILLED: ActionKind = ActionKind {
     name: "gateway_killed",
     per_minute: 3.0,
-    keys: &[Key::new("in_order", 0, 1), Key::new("away_ms", 5, 5_000)],
+    keys: &[ActionKey::new("in_order", 0, 1), ActionKey::new("away_ms", 5, 5_000)],
     act: kill_gateway,
 };
 
 fn kill_gateway(world: &mut World, action: &Action) {
-    world.remote.end_gateway(&world.shared, action.value("in_order") == 0);
-    world.later(action.value("away_ms"), |world| world.remote.begin_gateway(&world.shared));
+    world.remote_machines.end_gateway(&world.shared, action.value("in_order") == 0);
+    world.schedule(action.value("away_ms"), |world| world.remote_machines.begin_gateway(&world.shared));
 }
 
 /// The listener is killed, and another one starts after a while.
-pub(super) const LISTENER_KILLED: Kind = Kind {
+pub(super) const LISTENER_KILLED: ActionKind = ActionKind {
     name: "listener_killed",
     per_minute: 3.0,
-    keys: &[Key::new("away_ms", 5, 5_000)],
+    keys: &[ActionKey::new("away_ms", 5, 5_000)],
     act: kill_listener,
 };
 
 fn kill_listener(world: &mut World, action: &Action) {
-    world.remote.kill_listener(&world.shared);
-    world.later(action.value("away_ms"), |world| world.remote.begin_listener(&world.shared));
+    world.remote_machines.kill_listener(&world.shared);
+    world.schedule(action.value("away_ms"), |world| world.remote_machines.begin_listener(&world.shared));
 }
 
 /// The router between gateway and listener is killed with everything that it holds, and another one starts after a while.
 /// Gateway and listener of such a world are bridges, unless they have a key. Then the network takes the place of the router,
 /// and no datagram passes it meanwhile.
-pub(super) const ROUTER_KILLED: Kind =
-    Kind { name: "router_killed", per_minute: 4.0, keys: &[Key::new("away_ms", 5, 8_000)], act: kill_router };
+pub(super) const ROUTER_KILLED: ActionKind = ActionKind {
+    name: "router_killed",
+    per_minute: 4.0,
+    keys: &[ActionKey::new("away_ms", 5, 8_000)],
+    act: kill_router,
+};
 
 fn kill_router(world: &mut World, action: &Action) {
     let now = world.now();
-    world.remote.kill_router(now);
-    world.later(action.value("away_ms"), |world| world.remote.begin_router(&world.shared));
+    world.remote_machines.kill_router(now);
+    world.schedule(action.value("away_ms"), |world| world.remote_machines.begin_router(&world.shared));
 }
 
 /// A sender on the network has no key, has another key, or repeats recorded datagrams; or the clocks of both machines are apart
 /// for a while. Gateway and listener of such a world have a key.
 ///
 /// `what`: 0 no MAC, 1 another key, 2 the MAC of another datagram, 3 a recording that is sent again, 4 clocks that are apart.
-pub(super) const KEY_ERRORS: Kind = Kind {
+pub(super) const KEY_ERRORS: ActionKind = ActionKind {
     name: "key_errors",
     per_minute: 6.0,
     keys: &[
-        Key::new("what", 0, 4),
-        Key::new("count", 1, 400),
-        Key::new("apart_s", 8, 600),
-        Key::new("span_ms", 20, 8_000),
+        ActionKey::new("what", 0, 4),
+        ActionKey::new("count", 1, 400),
+        ActionKey::new("apart_s", 8, 600),
+        ActionKey::new("span_ms", 20, 8_000),
     ],
     act: forge,
 };
@@ -136,9 +144,10 @@ fn forge(world: &mut World, action: &Action) {
             // Behind as often as ahead.
             let apart_s = action.value("apart_s") as i64;
             let apart_s = if count.is_multiple_of(2) { apart_s } else { -apart_s };
-            world.remote.set_apart(apart_s * 1_000_000_000);
-            return world.later(action.value("span_ms"), |world| world.remote.set_apart(0));
+            world.remote_machines.set_extra_clock_offset(apart_s * 1_000_000_000);
+            return world
+                .schedule(action.value("span_ms"), |world| world.remote_machines.set_extra_clock_offset(0));
         }
     };
-    world.remote.forge(&world.shared, forgery, count);
+    world.remote_machines.forge(&world.shared, forgery, count);
 }

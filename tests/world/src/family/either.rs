@@ -8,59 +8,61 @@ use scanhub_sim::device::Device;
 use scanhub_sim::ld::TruePoint;
 use scanhub_sim::room::Changes;
 
-use super::{Ailment, Begin, Exactness, Family, Scanner, is_ld_packet};
-use crate::plan::Action;
+use super::{Family, FirstPoint, PointAccuracy, Scanner, ScannerFault, is_ld_packet};
+use crate::scenario::Action;
 
 /// Both scanners. The link has the keys of the first one.
-pub(super) struct Either {
+pub(super) struct TwoFamilies {
     /// The scanner that is connected at the start.
     pub(super) first: Rc<dyn Family>,
     /// The scanner that the first exchange connects.
     pub(super) second: Rc<dyn Family>,
 }
 
-impl Either {
+impl TwoFamilies {
     /// Returns the family of these bytes.
     fn of(&self, bytes: &[u8]) -> &dyn Family {
-        let is_ld = bytes.chunks(scanhub_drivers::ld::packet::LEN).all(is_ld_packet) && !bytes.is_empty();
+        let is_ld =
+            bytes.chunks(scanhub_drivers::ld::packet::PACKET_LEN).all(is_ld_packet) && !bytes.is_empty();
         let is_first = (self.first.families() == [Name::Ld]) == is_ld;
         if is_first { &*self.first } else { &*self.second }
     }
 }
 
-impl Family for Either {
+impl Family for TwoFamilies {
     fn keys(&self) -> Vec<String> {
         self.first.keys()
     }
 
     fn auto(&self) -> Rc<dyn Family> {
-        Rc::new(Either { first: self.first.auto(), second: self.second.auto() })
+        Rc::new(TwoFamilies { first: self.first.auto(), second: self.second.auto() })
     }
 
     fn families(&self) -> Vec<Name> {
         [self.first.families(), self.second.families()].concat()
     }
 
-    fn rates(&self) -> Vec<u32> {
-        [self.first.rates(), self.second.rates()].concat()
+    fn baud_rates(&self) -> Vec<u32> {
+        [self.first.baud_rates(), self.second.baud_rates()].concat()
     }
 
-    fn times(&self) -> (Nanos, Nanos) {
-        let (first, second) = (self.first.times(), self.second.times());
+    fn scan_times(&self) -> (Nanos, Nanos) {
+        let (first, second) = (self.first.scan_times(), self.second.scan_times());
         (first.0.max(second.0), first.1.max(second.1))
     }
 
-    fn found(&self, changes: Changes) -> Box<dyn Scanner> {
-        let (first, second) = (self.first.found(changes.clone()), self.second.found(changes));
-        Box::new(AtLine { connected: first, other: second })
+    fn initial_scanner(&self, changes: Changes) -> Box<dyn Scanner> {
+        let (first, second) =
+            (self.first.initial_scanner(changes.clone()), self.second.initial_scanner(changes));
+        Box::new(ConnectedScanners { connected: first, other: second })
     }
 
-    fn units<'a>(&self, sample: &'a [u8]) -> Vec<&'a [u8]> {
-        self.of(sample).units(sample)
+    fn telegrams<'a>(&self, sample: &'a [u8]) -> Vec<&'a [u8]> {
+        self.of(sample).telegrams(sample)
     }
 
-    fn most_units(&self) -> usize {
-        self.first.most_units().max(self.second.most_units())
+    fn max_telegrams(&self) -> usize {
+        self.first.max_telegrams().max(self.second.max_telegrams())
     }
 
     fn is_data(&self, unit: &[u8]) -> bool {
@@ -75,26 +77,26 @@ impl Family for Either {
         self.of(got).is_collision(got, damaged)
     }
 
-    fn turns(&self) -> bool {
+    fn is_rotating(&self) -> bool {
         true
     }
 
-    fn begin(&self, unit: &[u8]) -> Option<Begin> {
-        self.of(unit).begin(unit)
+    fn first_point(&self, unit: &[u8]) -> Option<FirstPoint> {
+        self.of(unit).first_point(unit)
     }
 
-    fn exactness(&self, unit: &[u8]) -> Exactness {
-        self.of(unit).exactness(unit)
+    fn point_accuracy(&self, unit: &[u8]) -> PointAccuracy {
+        self.of(unit).point_accuracy(unit)
     }
 }
 
 /// The scanner at the line, and the one that takes its place.
-struct AtLine {
+struct ConnectedScanners {
     connected: Box<dyn Scanner>,
     other: Box<dyn Scanner>,
 }
 
-impl Scanner for AtLine {
+impl Scanner for ConnectedScanners {
     fn device(&self) -> &dyn Device {
         self.connected.device()
     }
@@ -117,13 +119,13 @@ impl Scanner for AtLine {
         self.other.misbehave(action);
     }
 
-    fn suffer(&mut self, ailment: Ailment, now: Nanos) {
-        self.connected.suffer(ailment, now);
+    fn inject_fault(&mut self, fault: ScannerFault, now: Nanos) {
+        self.connected.inject_fault(fault, now);
     }
 
-    fn set_pace(&mut self, share: f64) {
-        self.connected.set_pace(share);
-        self.other.set_pace(share);
+    fn set_speed(&mut self, share: f64) {
+        self.connected.set_speed(share);
+        self.other.set_speed(share);
     }
 
     fn measured(&mut self) -> Vec<TruePoint> {

@@ -4,7 +4,7 @@
 use std::rc::Rc;
 
 use scanhub_drivers::ld::Model;
-use scanhub_drivers::ld::packet::{LEN, POINTS, Packet};
+use scanhub_drivers::ld::packet::{PACKET_LEN, POINTS_PER_PACKET, Packet};
 use scanhub_schema::{MILLIS, Nanos, Scan};
 use scanhub_sim::ChunkSize;
 use scanhub_sim::device::Device;
@@ -12,8 +12,8 @@ use scanhub_sim::ld::{LdSettings, LdSimulator, TruePoint};
 use scanhub_sim::room::Changes;
 use scanhub_sim::room::Room;
 
-use super::{Begin, Family, INERTIA, SLOWEST, Scanner, still_rooms};
-use crate::plan::Action;
+use super::{Family, FirstPoint, MAX_SPEED_CHANGE, MIN_SPEED, Scanner, still_rooms};
+use crate::scenario::Action;
 
 /// One of them, and what its link asks for.
 #[derive(Clone)]
@@ -22,7 +22,7 @@ pub(super) struct Ld {
     /// Name of the family in the link.
     family: &'static str,
     /// The link says which model it is.
-    is_said: bool,
+    is_model_configured: bool,
     beams: Option<usize>,
 }
 
@@ -36,52 +36,53 @@ impl Ld {
     /// One of this model, on its own beams.
     pub(super) fn of(model: Model, random: &mut fastrand::Rng) -> Ld {
         let settings = LdSettings {
-            wander: random.f64() * 0.01,
+            speed_variation: random.f64() * 0.01,
             boot_ns: random.u64(100..2_500) * MILLIS,
             chunk: if random.bool() { ChunkSize::Uart } else { ChunkSize::Usb },
             seed: random.u64(..),
             ..LdSettings::of(model)
         };
-        Ld { settings, family: "ld", is_said: random.bool(), beams: None }
+        Ld { settings, family: "ld", is_model_configured: random.bool(), beams: None }
     }
 }
 
 impl Family for Ld {
     fn keys(&self) -> Vec<String> {
-        let model = self.is_said.then(|| format!("model={}", self.settings.model.name()));
+        let model = self.is_model_configured.then(|| format!("model={}", self.settings.model.name()));
         let beams = self.beams.map(|beams| format!("beams={beams}"));
         [format!("family={}", self.family)].into_iter().chain(model).chain(beams).collect()
     }
 
     fn auto(&self) -> Rc<dyn Family> {
-        Rc::new(Ld { family: "auto", is_said: false, ..self.clone() })
+        Rc::new(Ld { family: "auto", is_model_configured: false, ..self.clone() })
     }
 
     fn families(&self) -> Vec<scanhub_schema::Family> {
         vec![scanhub_schema::Family::Ld]
     }
 
-    fn rates(&self) -> Vec<u32> {
+    fn baud_rates(&self) -> Vec<u32> {
         vec![self.settings.model.baud()]
     }
 
     /// What appears where the head has just been is measured a turn later, and told when that turn is over.
-    fn times(&self) -> (Nanos, Nanos) {
-        let LdSettings { turns_per_second, wander, .. } = self.settings;
-        let slowest = turns_per_second * SLOWEST * (1.0 - wander);
-        let turn = (1e9 / slowest) as Nanos;
-        (turn, 2 * turn + LAST_PACKET)
+    fn scan_times(&self) -> (Nanos, Nanos) {
+        let LdSettings { revolutions_per_second: turns_per_second, speed_variation: wander, .. } =
+            self.settings;
+        let slowest = turns_per_second * MIN_SPEED * (1.0 - wander);
+        let revolution_ns = (1e9 / slowest) as Nanos;
+        (revolution_ns, 2 * revolution_ns + LAST_PACKET_TIME)
     }
 
-    fn found(&self, changes: Changes) -> Box<dyn Scanner> {
-        Box::new(AtLine::new(self.settings, changes))
+    fn initial_scanner(&self, changes: Changes) -> Box<dyn Scanner> {
+        Box::new(LdScanner::new(self.settings, changes))
     }
 
-    fn units<'a>(&self, sample: &'a [u8]) -> Vec<&'a [u8]> {
-        sample.chunks(LEN).collect()
+    fn telegrams<'a>(&self, sample: &'a [u8]) -> Vec<&'a [u8]> {
+        sample.chunks(PACKET_LEN).collect()
     }
 
-    fn most_units(&self) -> usize {
+    fn max_telegrams(&self) -> usize {
         17
     }
 
@@ -99,38 +100,42 @@ impl Family for Ld {
         damaged.next().is_some()
     }
 
-    fn turns(&self) -> bool {
+    fn is_rotating(&self) -> bool {
         true
     }
 
-    fn begin(&self, unit: &[u8]) -> Option<Begin> {
+    fn first_point(&self, unit: &[u8]) -> Option<FirstPoint> {
         let packet = Packet::check(unit.first_chunk()?).ok()?;
-        let on_line = scanhub_schema::line_time(LEN, self.settings.model.baud());
-        Some(Begin { clockwise_deg: f64::from(packet.angle(0)) / 100.0, points: POINTS, on_line })
+        let on_line = scanhub_schema::line_time(PACKET_LEN, self.settings.model.baud());
+        Some(FirstPoint {
+            clockwise_deg: f64::from(packet.angle(0)) / 100.0,
+            points: POINTS_PER_PACKET,
+            line_time: on_line,
+        })
     }
 }
 
 /// A scanner at a line.
-struct AtLine {
+struct LdScanner {
     head: LdSimulator,
     settings: LdSettings,
     changes: Changes,
     /// Packets whose points were told as true.
-    told: u64,
+    reported: u64,
     /// The share of its usual speed at which it turns, and at which it shall.
-    pace: f64,
-    wanted: f64,
+    speed: f64,
+    target_speed: f64,
 }
 
-impl AtLine {
-    fn new(settings: LdSettings, changes: Changes) -> AtLine {
+impl LdScanner {
+    fn new(settings: LdSettings, changes: Changes) -> LdScanner {
         let room = Room::of_series(still_rooms(), changes.clone());
         let head = LdSimulator::new(settings, room);
-        AtLine { head, settings, changes, told: 0, pace: 1.0, wanted: 1.0 }
+        LdScanner { head, settings, changes, reported: 0, speed: 1.0, target_speed: 1.0 }
     }
 }
 
-impl Scanner for AtLine {
+impl Scanner for LdScanner {
     fn device(&self) -> &dyn Device {
         &self.head
     }
@@ -147,32 +152,33 @@ impl Scanner for AtLine {
     /// It gets its power then.
     fn exchange(&mut self, _: &Action, now: Nanos) -> Vec<u8> {
         let seed = self.settings.seed.wrapping_add(1);
-        *self = AtLine::new(LdSettings { seed, ..self.settings }, self.changes.clone());
+        *self = LdScanner::new(LdSettings { seed, ..self.settings }, self.changes.clone());
         self.head.power_cycle(now);
         Vec::new()
     }
 
     fn misbehave(&mut self, _: Option<&Action>) {}
 
-    fn set_pace(&mut self, share: f64) {
-        self.wanted = share;
+    fn set_speed(&mut self, share: f64) {
+        self.target_speed = share;
     }
 
     fn measured(&mut self) -> Vec<TruePoint> {
         let sent = self.head.sent();
-        if std::mem::replace(&mut self.told, sent) == sent || sent == 0 {
+        if std::mem::replace(&mut self.reported, sent) == sent || sent == 0 {
             return Vec::new();
         }
-        let first = (sent - 1) * POINTS as u64;
-        let points = (first..first + POINTS as u64).map(|point| self.head.truth(point)).collect();
-        if self.pace != self.wanted {
-            let most = INERTIA * POINTS as f64 / f64::from(self.settings.model.points_per_second());
-            self.pace += (self.wanted - self.pace).clamp(-most, most);
-            self.head.set_speed(self.settings.turns_per_second * self.pace);
+        let first = (sent - 1) * POINTS_PER_PACKET as u64;
+        let points = (first..first + POINTS_PER_PACKET as u64).map(|point| self.head.truth(point)).collect();
+        if self.speed != self.target_speed {
+            let maximum = MAX_SPEED_CHANGE * POINTS_PER_PACKET as f64
+                / f64::from(self.settings.model.points_per_second());
+            self.speed += (self.target_speed - self.speed).clamp(-maximum, maximum);
+            self.head.set_speed(self.settings.revolutions_per_second * self.speed);
         }
         points
     }
 }
 
 /// The last packet of a turn, until the hub has all of it.
-const LAST_PACKET: Nanos = 20 * MILLIS;
+const LAST_PACKET_TIME: Nanos = 20 * MILLIS;

@@ -11,14 +11,14 @@ use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
 use scanhub_schema::{MILLIS, Nanos, Scan};
 use scanhub_sim::ChunkSize;
 use scanhub_sim::device::Device;
-use scanhub_sim::machine::{LmsSimulator, ProtocolQuirks, Settings, Start};
-use scanhub_sim::operating::Operating;
-use scanhub_sim::operating::Source;
+use scanhub_sim::machine::{LmsSimulator, ProtocolQuirks, Settings, StartState};
+use scanhub_sim::operating::OperatingMode;
+use scanhub_sim::operating::ScanSource;
 use scanhub_sim::room::Room;
 use scanhub_sim::room::{Changes, PrecomputedScans};
 
 use super::{Family, Scanner, quirks, rooms};
-use crate::plan::Action;
+use crate::scenario::Action;
 
 /// One of them, and what its link asks for.
 #[derive(Clone)]
@@ -36,10 +36,10 @@ impl Lms {
         let baud = if random.u8(..6) == 0 { Baud::B38400 } else { Baud::B500000 };
         let found = [baud, Baud::B9600, Baud::B38400, Baud::B19200][random.usize(..4)];
         let states = [
-            Start::In(Operating::OnRequest),
-            Start::In(Operating::Installation),
-            Start::In(Operating::All),
-            Start::PowerOn,
+            StartState::Operating(OperatingMode::OnRequest),
+            StartState::Operating(OperatingMode::Installation),
+            StartState::Operating(OperatingMode::All),
+            StartState::PowerOn,
         ];
         let settings = Settings {
             baud: found,
@@ -78,31 +78,31 @@ impl Family for Lms {
         vec![scanhub_schema::Family::Lms]
     }
 
-    fn rates(&self) -> Vec<u32> {
+    fn baud_rates(&self) -> Vec<u32> {
         Baud::ALL.map(Baud::rate).to_vec()
     }
 
     /// At the rate that the link asks for.
-    fn times(&self) -> (Nanos, Nanos) {
+    fn scan_times(&self) -> (Nanos, Nanos) {
         let len = 2 * self.variant.beams() + 10;
         let rate = self.baud.rate();
-        let turns = (len - 1) / lms::variant::BYTES_PER_TURN;
-        let on_line = scanhub_schema::line_time(len, rate) + turns as Nanos * lms::variant::MIRROR_TURN;
+        let turns = (len - 1) / lms::variant::BYTES_PER_REVOLUTION;
+        let on_line = scanhub_schema::line_time(len, rate) + turns as Nanos * lms::variant::MIRROR_PERIOD;
         let period = self.variant.period(len, rate);
         (period, period + on_line)
     }
 
-    fn found(&self, changes: Changes) -> Box<dyn Scanner> {
+    fn initial_scanner(&self, changes: Changes) -> Box<dyn Scanner> {
         let (settings, series) = (self.settings.clone(), measured(self.variant));
         let machine = machine(&settings, &series, &changes);
-        Box::new(AtLine { machine, settings, series, changes })
+        Box::new(LmsScanner { machine, settings, series, changes })
     }
 
-    fn units<'a>(&self, sample: &'a [u8]) -> Vec<&'a [u8]> {
+    fn telegrams<'a>(&self, sample: &'a [u8]) -> Vec<&'a [u8]> {
         vec![sample]
     }
 
-    fn most_units(&self) -> usize {
+    fn max_telegrams(&self) -> usize {
         1
     }
 
@@ -130,20 +130,20 @@ impl Family for Lms {
             let (sent, got) = (&sent[first..=last], &got[first..=last]);
             // A byte too many and one too few shift what is between.
             let shifted = [others(&sent[1..], got), others(sent, &got[1..])];
-            others(sent, got).min(shifted[0]).min(shifted[1]) <= MOST_OTHERS
+            others(sent, got).min(shifted[0]).min(shifted[1]) <= MAX_CHANGED_BYTES
         })
     }
 }
 
 /// A sensor at a line.
-struct AtLine {
+struct LmsScanner {
     machine: LmsSimulator,
     settings: Settings,
     series: Arc<PrecomputedScans>,
     changes: Changes,
 }
 
-impl Scanner for AtLine {
+impl Scanner for LmsScanner {
     fn device(&self) -> &dyn Device {
         &self.machine
     }
@@ -156,7 +156,7 @@ impl Scanner for AtLine {
     fn exchange(&mut self, action: &Action, _: Nanos) -> Vec<u8> {
         let baud = Baud::ALL[action.value("rate") as usize % Baud::ALL.len()];
         let seed = self.settings.seed.wrapping_add(1);
-        let start = Start::In(Operating::OnRequest);
+        let start = StartState::Operating(OperatingMode::OnRequest);
         self.settings = Settings { baud, seed, start, ..self.settings.clone() };
         self.machine = machine(&self.settings, &self.series, &self.changes);
         let streams = action.value("streams") > 0;
@@ -170,19 +170,24 @@ impl Scanner for AtLine {
 
 fn machine(settings: &Settings, series: &Arc<PrecomputedScans>, changes: &Changes) -> LmsSimulator {
     let room = Room::of_series(series.clone(), changes.clone());
-    LmsSimulator::new(settings.clone(), Source::Room(room))
+    LmsSimulator::new(settings.clone(), ScanSource::Room(room))
 }
 
 /// The scans that sensors of `variant` tell, measured once.
 fn measured(variant: Variant) -> Arc<PrecomputedScans> {
-    type Known = Mutex<Vec<(Variant, Arc<PrecomputedScans>)>>;
-    static KNOWN: LazyLock<Known> = LazyLock::new(Known::default);
-    let mut known = KNOWN.lock().unwrap_or_else(PoisonError::into_inner);
+    type MeasuredScans = Mutex<Vec<(Variant, Arc<PrecomputedScans>)>>;
+    static MEASURED_SCANS: LazyLock<MeasuredScans> = LazyLock::new(MeasuredScans::default);
+    let mut known = MEASURED_SCANS.lock().unwrap_or_else(PoisonError::into_inner);
     match known.iter().find(|(of, _)| *of == variant) {
         Some((_, series)) => series.clone(),
         None => {
-            let made =
-                Arc::new(PrecomputedScans::new(rooms(|scene| scene), SCANS, variant, Unit::Mm, Mode(1)));
+            let made = Arc::new(PrecomputedScans::new(
+                rooms(|scene| scene),
+                SCANS_PER_ROOM,
+                variant,
+                Unit::Mm,
+                Mode(1),
+            ));
             known.push((variant, made.clone()));
             made
         }
@@ -190,6 +195,6 @@ fn measured(variant: Variant) -> Arc<PrecomputedScans> {
 }
 
 /// So many different scans of each room: enough that no model of it stands still.
-const SCANS: usize = 12;
+const SCANS_PER_ROOM: usize = 12;
 /// A line that changes more bytes of a telegram changes its neighbours, too, and then it is suspect.
-const MOST_OTHERS: usize = 32;
+const MAX_CHANGED_BYTES: usize = 32;

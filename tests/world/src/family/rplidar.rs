@@ -4,18 +4,18 @@
 
 use std::rc::Rc;
 
-use scanhub_drivers::rplidar::packet::Kind;
+use scanhub_drivers::rplidar::packet::PacketFormat;
 use scanhub_schema::{MILLIS, Nanos, Scan};
 use scanhub_sim::device::Device;
 use scanhub_sim::ld::TruePoint;
 use scanhub_sim::machine::ProtocolQuirks;
 use scanhub_sim::room::Changes;
 use scanhub_sim::room::Room;
-use scanhub_sim::rplidar::{Form, Model, RplidarSettings, RplidarSimulator, RplidarStart};
+use scanhub_sim::rplidar::{Model, RplidarSettings, RplidarSimulator, RplidarStart};
 use scanhub_sim::{Arrival, ChunkSize};
 
-use super::{Ailment, Begin, Exactness, Family, Scanner, quirks, still_rooms};
-use crate::plan::Action;
+use super::{Family, FirstPoint, PointAccuracy, Scanner, ScannerFault, quirks, still_rooms};
+use crate::scenario::Action;
 
 /// One of them, and what its link asks for.
 #[derive(Clone)]
@@ -26,14 +26,14 @@ pub(super) struct Rplidar {
     /// Nobody told its motor to turn.
     is_off: bool,
     /// The link says which model it is, and in which of its modes it shall measure.
-    is_said: bool,
+    is_model_configured: bool,
     mode: Option<usize>,
     beams: Option<usize>,
 }
 
 impl Rplidar {
     pub(super) fn draw(random: &mut fastrand::Rng) -> Rplidar {
-        let model = DRAWN[random.usize(..DRAWN.len())];
+        let model = DRAWN_MODELS[random.usize(..DRAWN_MODELS.len())];
         let mode = random.usize(..2 * model.modes().len());
         let mode = Some(mode).filter(|&mode| model.modes().get(mode).is_some_and(is_moderate));
         let start = [RplidarStart::Idle, RplidarStart::Streaming, RplidarStart::PowerOn][random.usize(..3)];
@@ -48,19 +48,19 @@ impl Rplidar {
     /// One of this model, idle, on its own beams and in its fastest mode.
     fn of(model: Model, random: &mut fastrand::Rng) -> Rplidar {
         let settings = RplidarSettings {
-            wander: random.f64() * 0.01,
+            speed_variation: random.f64() * 0.01,
             boot_ns: random.u64(100..2_500) * MILLIS,
             chunk: if random.bool() { ChunkSize::Uart } else { ChunkSize::Usb },
             seed: random.u64(..),
             ..RplidarSettings::of(model)
         };
-        let is_said = random.bool();
-        Rplidar { settings, family: "rplidar", is_off: false, is_said, mode: None, beams: None }
+        let is_model_configured = random.bool();
+        Rplidar { settings, family: "rplidar", is_off: false, is_model_configured, mode: None, beams: None }
     }
 
     /// The one that is written `MODEL`, `MODEL:MODE` or `MODEL:MODE:STATE`; without a mode it is the fastest, and
     /// without a state it is idle.
-    pub(super) fn named(text: &str, random: &mut fastrand::Rng) -> Option<Rplidar> {
+    pub(super) fn from_name(text: &str, random: &mut fastrand::Rng) -> Option<Rplidar> {
         let mut words = text.split(':');
         let (model, mode, state) = (words.next()?, words.next(), words.next());
         let model = Model::ALL.into_iter().find(|known| known.name() == model)?;
@@ -79,68 +79,72 @@ impl Rplidar {
     }
 
     /// What these bytes are packets of: by what each begins with, for a wrong checksum does not make them others.
-    fn kind(&self, sample: &[u8]) -> Option<Kind> {
-        let is_of = |kind: &Kind| {
+    fn kind(&self, sample: &[u8]) -> Option<PacketFormat> {
+        let is_of = |kind: &PacketFormat| {
             let begins = |packet: &[u8]| packet[0] >> 4 == 0xA && packet[1] >> 4 == 0x5;
-            sample.len().is_multiple_of(kind.bytes()) && sample.chunks(kind.bytes()).all(begins)
+            sample.len().is_multiple_of(kind.byte_len()) && sample.chunks(kind.byte_len()).all(begins)
         };
-        let alike = if is_triangulating(self.settings.model) { Kind::Express } else { Kind::Dense };
-        let checked = [alike, Kind::Ultra, Kind::UltraDense].into_iter().find(is_of);
-        checked.or_else(|| sample.len().is_multiple_of(Kind::Standard.bytes()).then_some(Kind::Standard))
+        let alike =
+            if is_triangulating(self.settings.model) { PacketFormat::Express } else { PacketFormat::Dense };
+        let checked = [alike, PacketFormat::Ultra, PacketFormat::UltraDense].into_iter().find(is_of);
+        checked.or_else(|| {
+            sample.len().is_multiple_of(PacketFormat::Standard.byte_len()).then_some(PacketFormat::Standard)
+        })
     }
 }
 
 impl Family for Rplidar {
     fn keys(&self) -> Vec<String> {
         let RplidarSettings { model, .. } = self.settings;
-        let said = self.is_said.then(|| format!("model={}", model.name()));
+        let model_key = self.is_model_configured.then(|| format!("model={}", model.name()));
         let mode = self.mode.map(|mode| format!("mode={}", key(model.modes()[mode].name)));
         let beams = self.beams.map(|beams| format!("beams={beams}"));
-        [format!("family={}", self.family)].into_iter().chain(said).chain(mode).chain(beams).collect()
+        [format!("family={}", self.family)].into_iter().chain(model_key).chain(mode).chain(beams).collect()
     }
 
     fn auto(&self) -> Rc<dyn Family> {
-        Rc::new(Rplidar { family: "auto", is_said: false, mode: None, ..self.clone() })
+        Rc::new(Rplidar { family: "auto", is_model_configured: false, mode: None, ..self.clone() })
     }
 
     fn families(&self) -> Vec<scanhub_schema::Family> {
         vec![scanhub_schema::Family::Rplidar]
     }
 
-    fn rates(&self) -> Vec<u32> {
-        alike(self.settings.model).iter().map(|model| model.baud()).collect()
+    fn baud_rates(&self) -> Vec<u32> {
+        models_alike(self.settings.model).iter().map(|model| model.baud()).collect()
     }
 
     /// As of any head that turns; whether a turn is over is seen only when the head is well behind its end.
-    fn times(&self) -> (Nanos, Nanos) {
-        let slowest = alike(self.settings.model).iter().map(|model| model.turns_per_second());
-        let slowest = slowest.fold(f64::MAX, f64::min) * super::SLOWEST * (1.0 - self.settings.wander);
-        let turn = (1e9 / slowest) as Nanos;
-        (turn, 2 * turn + BEHIND)
+    fn scan_times(&self) -> (Nanos, Nanos) {
+        let slowest = models_alike(self.settings.model).iter().map(|model| model.revolutions_per_second());
+        let slowest =
+            slowest.fold(f64::MAX, f64::min) * super::MIN_SPEED * (1.0 - self.settings.speed_variation);
+        let revolution_ns = (1e9 / slowest) as Nanos;
+        (revolution_ns, 2 * revolution_ns + EDGE_DELAY)
     }
 
-    fn found(&self, changes: Changes) -> Box<dyn Scanner> {
-        let mut scanner = AtLine::new(self.settings.clone(), changes);
+    fn initial_scanner(&self, changes: Changes) -> Box<dyn Scanner> {
+        let mut scanner = RplidarScanner::new(self.settings.clone(), changes);
         if self.is_off {
-            let said = request(0xA8, &[0, 0]);
-            said.into_iter().for_each(|byte| scanner.unit.receive(byte, Arrival::at(0)));
+            let start_request = request(0xA8, &[0, 0]);
+            start_request.into_iter().for_each(|byte| scanner.unit.receive(byte, Arrival::at(0)));
         }
         Box::new(scanner)
     }
 
-    fn units<'a>(&self, sample: &'a [u8]) -> Vec<&'a [u8]> {
+    fn telegrams<'a>(&self, sample: &'a [u8]) -> Vec<&'a [u8]> {
         match self.kind(sample) {
-            Some(kind) if !is_reply(sample) => sample.chunks(kind.bytes()).collect(),
+            Some(kind) if !is_reply(sample) => sample.chunks(kind.byte_len()).collect(),
             _ => vec![sample],
         }
     }
 
-    fn most_units(&self) -> usize {
+    fn max_telegrams(&self) -> usize {
         128
     }
 
     fn is_data(&self, unit: &[u8]) -> bool {
-        !is_reply(unit) && self.kind(unit).is_some_and(|kind| kind.bytes() == unit.len())
+        !is_reply(unit) && self.kind(unit).is_some_and(|kind| kind.byte_len() == unit.len())
     }
 
     /// A turn has points of many samples.
@@ -158,89 +162,106 @@ impl Family for Rplidar {
         is_right && damaged.next().is_some()
     }
 
-    fn turns(&self) -> bool {
+    fn is_rotating(&self) -> bool {
         true
     }
 
-    fn begin(&self, unit: &[u8]) -> Option<Begin> {
-        let kind = self.kind(unit).filter(|kind| !is_reply(unit) && kind.bytes() == unit.len())?;
+    fn first_point(&self, unit: &[u8]) -> Option<FirstPoint> {
+        let kind = self.kind(unit).filter(|kind| !is_reply(unit) && kind.byte_len() == unit.len())?;
         // What its first point is depends on nothing that comes behind it.
         let before = kind.point(unit, unit, 0).before;
-        let clockwise_deg = f64::from(kind.start(unit) - before).rem_euclid(360.0);
-        Some(Begin { clockwise_deg, points: kind.points(), on_line: line_time(unit, self.settings.model) })
+        let clockwise_deg = f64::from(kind.start_angle(unit) - before).rem_euclid(360.0);
+        Some(FirstPoint {
+            clockwise_deg,
+            points: kind.points(),
+            line_time: line_time(unit, self.settings.model),
+        })
     }
 
-    fn exactness(&self, unit: &[u8]) -> Exactness {
-        let plain = Exactness { nothing_deg: 9.0, has_clock: false, ..Exactness::default() };
+    fn point_accuracy(&self, unit: &[u8]) -> PointAccuracy {
+        let plain = PointAccuracy { no_return_deg: 9.0, has_clock: false, ..PointAccuracy::default() };
         match self.kind(unit) {
             // Angles are told in eighths of a degree, up to 63.
-            Some(Kind::Express) => Exactness { angle_deg: 0.25, points: 12, ..plain },
+            Some(PacketFormat::Express) => PointAccuracy { angle_deg: 0.25, points: 12, ..plain },
             // Angles follow from ranges, whose steps get wider.
-            Some(Kind::Ultra) => Exactness { angle_deg: 0.4, range_mm: 6.0, points: 16, ..plain },
-            Some(Kind::UltraDense) => Exactness { range_mm: 6.0, ..plain },
-            Some(Kind::Dense) => plain,
+            Some(PacketFormat::Ultra) => PointAccuracy { angle_deg: 0.4, range_mm: 6.0, points: 16, ..plain },
+            Some(PacketFormat::UltraDense) => PointAccuracy { range_mm: 6.0, ..plain },
+            Some(PacketFormat::Dense) => plain,
             // So many may be missing without a mark.
-            Some(Kind::Standard) | None => Exactness { points: 45, neighbours: 16, ..plain },
+            Some(PacketFormat::Standard) | None => PointAccuracy { points: 45, neighbors: 16, ..plain },
         }
     }
 }
 
 /// A scanner at a line.
-struct AtLine {
+struct RplidarScanner {
     unit: RplidarSimulator,
     settings: RplidarSettings,
     changes: Changes,
     /// The stream of which so many packets' points were told as true: when it began.
     stream: Option<Nanos>,
-    told: u64,
+    reported: u64,
     /// The share of its usual speed at which its head shall turn.
-    wanted: f64,
+    target_speed: f64,
     quirks: ProtocolQuirks,
     /// While it measures it hears nothing, not even that it shall stop.
-    is_deaf: bool,
+    ignores_requests: bool,
 }
 
-impl AtLine {
-    fn new(settings: RplidarSettings, changes: Changes) -> AtLine {
+impl RplidarScanner {
+    fn new(settings: RplidarSettings, changes: Changes) -> RplidarScanner {
         let unit = RplidarSimulator::new(settings.clone(), Room::of_series(still_rooms(), changes.clone()));
         let quirks = ProtocolQuirks::default();
-        AtLine { unit, settings, changes, stream: None, told: 0, wanted: 1.0, quirks, is_deaf: false }
+        RplidarScanner {
+            unit,
+            settings,
+            changes,
+            stream: None,
+            reported: 0,
+            target_speed: 1.0,
+            quirks,
+            ignores_requests: false,
+        }
     }
 
     /// Brings its head nearer to the speed that it shall have.
-    fn turn(&mut self, passed_s: f64) {
-        let usual = self.settings.turns_per_second;
-        let Some(share) = self.unit.turns_per_second().map(|turns| turns / usual) else { return };
-        let most = super::INERTIA * passed_s;
-        let next = share + (self.wanted - share).clamp(-most, most);
+    fn change_speed(&mut self, passed_s: f64) {
+        let usual = self.settings.revolutions_per_second;
+        let Some(share) = self.unit.revolutions_per_second().map(|turns| turns / usual) else { return };
+        let maximum = super::MAX_SPEED_CHANGE * passed_s;
+        let next = share + (self.target_speed - share).clamp(-maximum, maximum);
         if next != share {
             self.unit.set_speed(usual * next);
         }
     }
 }
 
-impl Scanner for AtLine {
+impl Scanner for RplidarScanner {
     fn device(&self) -> &dyn Device {
         &self.unit
     }
 
     fn device_mut(&mut self) -> &mut dyn Device {
-        if self.is_deaf {
-            let mute = self.quirks.mute || self.unit.streams();
-            self.unit.set_quirks(ProtocolQuirks { mute, ..self.quirks.clone() });
+        if self.ignores_requests {
+            let mute = self.quirks.is_mute || self.unit.streams();
+            self.unit.set_quirks(ProtocolQuirks { is_mute: mute, ..self.quirks.clone() });
         }
         &mut self.unit
     }
 
     /// Of the same kind, maybe another model; it gets its power then, or somebody has it stream.
     fn exchange(&mut self, action: &Action, now: Nanos) -> Vec<u8> {
-        let models = alike(self.settings.model);
+        let models = models_alike(self.settings.model);
         let at = models.iter().position(|model| *model == self.settings.model).unwrap_or(0);
         let model = models[(at + action.value("rate") as usize) % models.len()];
-        let RplidarSettings { wander, boot_ns, chunk, seed, .. } = self.settings;
+        let RplidarSettings { speed_variation: wander, boot_ns, chunk, seed, .. } = self.settings;
         let seed = seed.wrapping_add(1);
-        let settings = RplidarSettings { wander, boot_ns, chunk, seed, ..RplidarSettings::of(model) };
-        *self = AtLine { wanted: self.wanted, ..AtLine::new(settings, self.changes.clone()) };
+        let settings =
+            RplidarSettings { speed_variation: wander, boot_ns, chunk, seed, ..RplidarSettings::of(model) };
+        *self = RplidarScanner {
+            target_speed: self.target_speed,
+            ..RplidarScanner::new(settings, self.changes.clone())
+        };
         if action.value("streams") == 0 {
             self.unit.power_cycle(now);
             return Vec::new();
@@ -254,44 +275,44 @@ impl Scanner for AtLine {
         self.unit.set_quirks(self.quirks.clone());
     }
 
-    fn suffer(&mut self, ailment: Ailment, now: Nanos) {
-        match ailment {
-            Ailment::Held { span } => self.unit.hold(now, span),
-            Ailment::Unwell { status, is_stubborn } => {
+    fn inject_fault(&mut self, fault: ScannerFault, now: Nanos) {
+        match fault {
+            ScannerFault::HeadHeld { span } => self.unit.hold(now, span),
+            ScannerFault::Unhealthy { status, is_stubborn } => {
                 self.unit.set_health(now, (status, 0x8001), is_stubborn);
             }
-            Ailment::Deaf(is_deaf) => {
-                self.is_deaf = is_deaf;
+            ScannerFault::IgnoresRequests(is_deaf) => {
+                self.ignores_requests = is_deaf;
                 self.unit.set_quirks(self.quirks.clone());
             }
         }
     }
 
-    fn set_pace(&mut self, share: f64) {
-        self.wanted = share;
+    fn set_speed(&mut self, share: f64) {
+        self.target_speed = share;
     }
 
     fn measured(&mut self) -> Vec<TruePoint> {
         let (stream, sent) = (self.unit.begin_ns(), self.unit.sent().unwrap_or(0));
-        if self.stream != stream || sent < self.told {
-            (self.stream, self.told) = (stream, 0);
+        if self.stream != stream || sent < self.reported {
+            (self.stream, self.reported) = (stream, 0);
         }
-        if sent == self.told {
+        if sent == self.reported {
             return Vec::new();
         }
         let Some(mode) = self.unit.mode() else { return Vec::new() };
         let per_packet = mode.form.points() as u64;
-        let points = self.told * per_packet..sent * per_packet;
-        self.told = sent;
+        let points = self.reported * per_packet..sent * per_packet;
+        self.reported = sent;
         let points: Vec<TruePoint> = points.filter_map(|point| self.unit.truth(point)).collect();
-        self.turn(points.len() as f64 * mode.sample_us / 1e6);
+        self.change_speed(points.len() as f64 * mode.sample_us / 1e6);
         points
     }
 }
 
 /// The models that measure alike: what one of them sends another one may send, and nobody takes one's packets for the
 /// other's.
-fn alike(model: Model) -> &'static [Model] {
+fn models_alike(model: Model) -> &'static [Model] {
     if is_triangulating(model) {
         &[Model::A1, Model::A2m8, Model::A2m12, Model::A3]
     } else {
@@ -305,7 +326,7 @@ fn is_triangulating(model: Model) -> bool {
 
 /// So many packets a second take long to judge, and need not be in many worlds.
 fn is_moderate(mode: &scanhub_sim::rplidar::Mode) -> bool {
-    mode.form != Form::Standard || mode.sample_us > 150.0
+    mode.form != scanhub_sim::rplidar::PacketFormat::Standard || mode.sample_us > 150.0
 }
 
 /// The name of a mode as links write it.
@@ -333,7 +354,7 @@ fn line_time(unit: &[u8], model: Model) -> Nanos {
 }
 
 /// The models that are drawn, fast ones seldom: their points take long to measure.
-const DRAWN: [Model; 13] = [
+const DRAWN_MODELS: [Model; 13] = [
     Model::A1,
     Model::A1,
     Model::A1,
@@ -350,4 +371,4 @@ const DRAWN: [Model; 13] = [
 ];
 /// A head is ten degrees and two packets behind the end of a turn before it is over, and the last packet is on the
 /// line.
-const BEHIND: Nanos = 90 * MILLIS;
+const EDGE_DELAY: Nanos = 90 * MILLIS;

@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 
 use scanhub_network::lan::Key;
 use scanhub_schema::Nanos;
-use scanhub_schema::datagram::{Datagram, HEAD, Head, LanFlags, MAC};
+use scanhub_schema::datagram::{Datagram, HEADER_LEN, Head, LanFlags, MAC_LEN};
 
 /// What somebody sends who has not the key.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -24,23 +24,23 @@ pub(crate) enum Forgery {
 #[derive(Default)]
 pub(super) struct Forger {
     /// The datagrams, with the time by the listener's wall clock; the oldest first.
-    heard: VecDeque<(Nanos, Vec<u8>)>,
+    recorded: VecDeque<(Nanos, Vec<u8>)>,
 }
 
 impl Forger {
     /// A datagram reached the listener's machine at `wall_ns` of its clock.
-    pub(super) fn hear(&mut self, wall_ns: Nanos, bytes: &[u8]) {
-        if self.heard.len() == MOST {
-            self.heard.pop_front();
+    pub(super) fn record(&mut self, wall_ns: Nanos, bytes: &[u8]) {
+        if self.recorded.len() == MAX_RECORDED {
+            self.recorded.pop_front();
         }
-        self.heard.push_back((wall_ns, bytes.to_vec()));
+        self.recorded.push_back((wall_ns, bytes.to_vec()));
     }
 
     /// So many datagrams as `forgery` says, made of what was heard last, or recorded at least 8 s before `wall_ns`: what is
     /// younger may be believed by a listener that has just begun (docs/datagram.md).
     pub(super) fn forge(&self, forgery: Forgery, count: usize, wall_ns: Nanos) -> Vec<Vec<u8>> {
-        let is_old = |at: Nanos| at.abs_diff(wall_ns) > OLD;
-        let all = self.heard.iter();
+        let is_old = |at: Nanos| at.abs_diff(wall_ns) > MIN_REPLAY_AGE;
+        let all = self.recorded.iter();
         match forgery {
             Forgery::Recording => {
                 let old: Vec<_> = all.filter(|(at, _)| is_old(*at)).map(|(_, bytes)| bytes.clone()).collect();
@@ -48,14 +48,14 @@ impl Forger {
             }
             _ => {
                 let last = all.rev().take(count).rev();
-                last.filter_map(|(_, bytes)| forged(bytes, forgery)).collect()
+                last.filter_map(|(_, bytes)| forge_next(bytes, forgery)).collect()
             }
         }
     }
 }
 
 /// A datagram that says otherwise and comes next.
-fn forged(bytes: &[u8], forgery: Forgery) -> Option<Vec<u8>> {
+fn forge_next(bytes: &[u8], forgery: Forgery) -> Option<Vec<u8>> {
     let Datagram { head, payload, mac } = Datagram::read(bytes).ok()?;
     let head = Head {
         sequence: head.sequence.wrapping_add(1),
@@ -63,8 +63,8 @@ fn forged(bytes: &[u8], forgery: Forgery) -> Option<Vec<u8>> {
         flags: head.flags & !LanFlags::AUTHENTICATED,
         ..head
     };
-    let mut buffer = vec![0; HEAD + payload.len() + MAC];
-    buffer[HEAD..HEAD + payload.len()].copy_from_slice(payload);
+    let mut buffer = vec![0; HEADER_LEN + payload.len() + MAC_LEN];
+    buffer[HEADER_LEN..HEADER_LEN + payload.len()].copy_from_slice(payload);
     let len = payload.len();
     let sealed = match forgery {
         Forgery::Plain => head.seal(&mut buffer, len),
@@ -75,6 +75,6 @@ fn forged(bytes: &[u8], forgery: Forgery) -> Option<Vec<u8>> {
 }
 
 /// Datagrams that are recorded.
-const MOST: usize = 4_000;
+const MAX_RECORDED: usize = 4_000;
 /// Recorded so long ago, a datagram is believed by nobody.
-const OLD: Nanos = 8_000_000_000;
+const MIN_REPLAY_AGE: Nanos = 8_000_000_000;

@@ -1,96 +1,97 @@
 //! A run of a gateway: it subscribes to topics of the hub like any subscriber, and passes datagrams to a network.
 
-use scanhub_client::clock::Moment;
-use scanhub_client::streams::{Noted, Numbers, ZonesState};
-use scanhub_network::lan::Stamp;
+use scanhub_client::clock::Timestamp;
+use scanhub_client::streams::{SequenceGap, SequenceTracker, ZonesState};
+use scanhub_network::lan::WallTimestamp;
 use scanhub_network::lan::outgoing::{
-    ANNOUNCE_EVERY, Form, Outgoing, PayloadRef, Sample as Outbound, Transmit,
+    ANNOUNCEMENT_INTERVAL, Form, Outgoing, PayloadRef, Sample as Outbound, Transmit,
 };
-use scanhub_schema::datagram::{Datagram, HEAD, PARTS};
+use scanhub_schema::datagram::{Datagram, HEADER_LEN, MAX_PARTS};
 use scanhub_schema::{MILLIS, Nanos, Topic};
 
-use super::{Terms, WAKES};
-use crate::consumer::Number;
+use super::{LinkSettings, WAKE_DELAY};
 use crate::event::Event;
+use crate::injected_defects::Defect;
 use crate::network::Network;
-use crate::planted::Defect;
 use crate::setup::Setup;
-use crate::shared::Shared;
+use crate::shared::SharedState;
+use crate::subscriber::SubscriberId;
 use crate::topics::Sample;
 
 /// The gateway.
 pub(super) struct Gateway {
     outgoing: Outgoing,
     epoch: u32,
-    sources: Vec<Source>,
+    subscriptions: Vec<TopicSubscription>,
     /// What is known of each sensor's zones.
     zones: Vec<ZonesState>,
-    repeat: Option<std::time::Duration>,
+    background_interval: Option<std::time::Duration>,
     /// When it looks at its topics.
-    next_at: Nanos,
+    next_poll_at: Nanos,
     tick_at: Nanos,
 }
 
 /// One topic of one sensor.
-struct Source {
+struct TopicSubscription {
     sensor: usize,
     topic: Topic,
-    number: Number,
-    numbers: Numbers,
+    id: SubscriberId,
+    sequence: SequenceTracker,
     /// There was a place for it.
     is_attached: bool,
 }
 
 impl Gateway {
-    /// Number `life` of all gateways follows `sensors`.
-    pub(super) fn begin(shared: &Shared, terms: &Terms, life: u32, sensors: usize) -> Gateway {
-        let (now, epoch) = (shared.clock.get(), EPOCH + life);
-        shared.tell(&Event::GatewayBegins { epoch });
+    /// Number `run` of all gateways follows `sensors`.
+    pub(super) fn begin(shared: &SharedState, terms: &LinkSettings, run: u32, sensors: usize) -> Gateway {
+        let (now, epoch) = (shared.clock.get(), BASE_EPOCH + run);
+        shared.log_event(&Event::GatewayStarted { epoch });
         let form = terms.key().map_or(Form::Sealed, Form::Authenticated);
         let mut outgoing = match terms.are_bridges {
-            true => Outgoing::waiting(HUB, epoch),
-            false => Outgoing::new(HUB, epoch, form, terms.longest),
+            true => Outgoing::with_queue(HUB_ID, epoch),
+            false => Outgoing::new(HUB_ID, epoch, form, terms.max_datagram_len),
         };
-        let mut sources = Vec::new();
+        let mut subscriptions = Vec::new();
         for sensor in 0..sensors {
-            let position = outgoing.follow(&Setup::name(sensor), |topic| terms.every(topic));
-            for topic in Topic::OF_LINKS.into_iter().filter(|&topic| outgoing.wants(position, topic)) {
-                let number = Number(NUMBERS * life + sources.len() as u32);
-                let numbers = Numbers::default();
-                sources.push(Source { sensor, topic, number, numbers, is_attached: false });
+            let position = outgoing.follow(&Setup::name(sensor), |topic| terms.send_interval(topic));
+            for topic in Topic::OF_LINKS.into_iter().filter(|&topic| outgoing.needs(position, topic)) {
+                let id = SubscriberId(FIRST_SUBSCRIBER_ID * run + subscriptions.len() as u32);
+                let sequence = SequenceTracker::default();
+                subscriptions.push(TopicSubscription { sensor, topic, id, sequence, is_attached: false });
             }
         }
-        sources.iter_mut().for_each(|source| source.attach(shared));
+        subscriptions.iter_mut().for_each(|source| source.attach(shared));
         let zones = (0..sensors).map(|_| ZonesState::new(moment(now))).collect();
-        let (repeat, next_at, tick_at) = (terms.repeat, now + GREETING, now + TICK);
-        Gateway { outgoing, epoch, sources, zones, repeat, next_at, tick_at }
+        let (background_interval, next_poll_at, tick_at) =
+            (terms.background_interval, now + HISTORY_DELAY, now + ANNOUNCE_INTERVAL);
+        Gateway { outgoing, epoch, subscriptions, zones, background_interval, next_poll_at, tick_at }
     }
 
     /// The hub woke the consumers of a sensor at `at`.
     pub(super) fn wake(&mut self, at: Nanos) {
-        self.next_at = self.next_at.min(at + WAKES);
+        self.next_poll_at = self.next_poll_at.min(at + WAKE_DELAY);
     }
 
     /// When it has something to do.
     pub(super) fn next_ns(&self, now: Nanos) -> Nanos {
-        let left = self.zones.iter().filter_map(|zones| zones.left(moment(now))).min();
+        let left = self.zones.iter().filter_map(|zones| zones.time_left(moment(now))).min();
         let silence = left.map_or(Nanos::MAX, |left| now.saturating_add(left.as_nanos() as Nanos));
-        silence.min(self.next_at).min(self.tick_at)
+        silence.min(self.next_poll_at).min(self.tick_at)
     }
 
     /// Sends what waits, and what is due.
-    pub(super) fn run(&mut self, shared: &Shared, now: Nanos, uplink: &mut Uplink<'_>) {
-        self.next_at = Nanos::MAX;
+    pub(super) fn run(&mut self, shared: &SharedState, now: Nanos, uplink: &mut Uplink<'_>) {
+        self.next_poll_at = Nanos::MAX;
         let stamp = stamp(shared, now);
-        let Gateway { outgoing, sources, zones, .. } = self;
-        for source in sources.iter_mut() {
+        let Gateway { outgoing, subscriptions, zones, .. } = self;
+        for source in subscriptions.iter_mut() {
             let (sensor, zones) = (source.sensor, &mut zones[source.sensor]);
             while let Some((sample, missed)) = source.take(shared, now) {
                 let header = Some(&sample.header);
                 lend(&sample, |payload| match payload {
-                    PayloadRef::Zones(said) => {
-                        let heard = zones.take(&sample.header, said, missed, moment(now));
-                        let payload = PayloadRef::Zones(&heard.zones);
+                    PayloadRef::Zones(zones_payload) => {
+                        let update = zones.take(&sample.header, zones_payload, missed, moment(now));
+                        let payload = PayloadRef::Zones(&update.zones);
                         outgoing.sample(sensor, &Outbound { header, missed, payload }, stamp, uplink);
                     }
                     payload => outgoing.sample(sensor, &Outbound { header, missed, payload }, stamp, uplink),
@@ -104,22 +105,22 @@ impl Gateway {
             }
         }
         if now >= self.tick_at {
-            self.tick_at = now + TICK;
-            self.sources
+            self.tick_at = now + ANNOUNCE_INTERVAL;
+            self.subscriptions
                 .iter_mut()
                 .filter(|source| !source.is_attached)
                 .for_each(|source| source.attach(shared));
-            if let Some(every) = self.repeat {
+            if let Some(every) = self.background_interval {
                 self.outgoing.repeat(every, stamp, uplink);
             }
-            if !shared.planted.is(Defect::Unannounced) {
+            if !shared.defect.is_active(Defect::Unannounced) {
                 self.announce(shared, now, uplink);
             }
         }
     }
 
     /// Says who all sensors are.
-    pub(super) fn announce(&mut self, shared: &Shared, now: Nanos, uplink: &mut Uplink<'_>) {
+    pub(super) fn announce(&mut self, shared: &SharedState, now: Nanos, uplink: &mut Uplink<'_>) {
         self.outgoing.announce(stamp(shared, now), uplink);
     }
 
@@ -129,69 +130,69 @@ impl Gateway {
     }
 
     /// The sample that has waited for longest, which is handed over now and taken or not.
-    pub(super) fn hand(&mut self, shared: &Shared, now: Nanos, is_taken: bool) -> Option<Vec<u8>> {
-        if shared.planted.strikes(Defect::RouterUntold, 100) {
-            self.outgoing.hand(stamp(shared, now));
+    pub(super) fn take_next(&mut self, shared: &SharedState, now: Nanos, is_taken: bool) -> Option<Vec<u8>> {
+        if shared.defect.triggers(Defect::UncountedDrop, 100) {
+            self.outgoing.take_next(stamp(shared, now));
         }
-        let handed = self.outgoing.hand(stamp(shared, now))?;
+        let handed = self.outgoing.take_next(stamp(shared, now))?;
         let (sensor, topic, bytes) = (handed.sensor.0, handed.topic, handed.datagram.to_vec());
         let datagram = Datagram::read(&bytes).expect("a bridge makes whole datagrams");
-        shared.log.tell(now, &Event::Transmitted { datagram: &datagram, bytes: &bytes, is_taken });
+        shared.log.record(now, &Event::Transmitted { datagram: &datagram, bytes: &bytes, is_taken });
         if !is_taken {
-            self.outgoing.not_taken(sensor, topic, bytes.len());
+            self.outgoing.mark_failed(sensor, topic, bytes.len());
         }
         Some(bytes)
     }
 
     /// It is gone.
-    pub(super) fn leave(self, shared: &Shared, is_killed: bool, is_drained: bool) {
-        for (sensor, rows) in self.outgoing.account().enumerate() {
-            for (topic, row) in rows.used() {
-                shared.tell(&Event::Accounted { sensor, topic, row });
+    pub(super) fn detach(self, shared: &SharedState, is_killed: bool, is_drained: bool) {
+        for (sensor, rows) in self.outgoing.counters().enumerate() {
+            for (topic, row) in rows.used_topics() {
+                shared.log_event(&Event::GatewayCounters { sensor, topic, row });
             }
         }
-        for source in self.sources.into_iter().filter(|source| source.is_attached) {
-            shared.board.borrow_mut().detach(source.sensor, source.topic, source.number, is_killed);
-            shared.tell(&Event::Left { consumer: source.number, is_drained });
+        for source in self.subscriptions.into_iter().filter(|source| source.is_attached) {
+            shared.topics.borrow_mut().detach(source.sensor, source.topic, source.id, is_killed);
+            shared.log_event(&Event::Detached { subscriber: source.id, is_drained });
         }
-        shared.tell(&Event::GatewayEnds { epoch: self.epoch, is_killed });
+        shared.log_event(&Event::GatewayEnded { epoch: self.epoch, is_killed });
     }
 }
 
-impl Source {
+impl TopicSubscription {
     /// Takes a place, if there is one.
-    fn attach(&mut self, shared: &Shared) {
-        let Source { sensor, topic, number, .. } = *self;
-        self.is_attached = shared.board.borrow_mut().attach(sensor, topic, number, false);
+    fn attach(&mut self, shared: &SharedState) {
+        let TopicSubscription { sensor, topic, id, .. } = *self;
+        self.is_attached = shared.topics.borrow_mut().attach(sensor, topic, id, false);
         if self.is_attached {
             let (is_prompt, is_listener) = (false, false);
-            shared.tell(&Event::Attached { consumer: number, sensor, topic, is_prompt, is_listener });
+            shared.log_event(&Event::Attached { subscriber: id, sensor, topic, is_prompt, is_listener });
         }
     }
 
     /// The oldest sample that waits, and how many were missed before it.
-    fn take(&mut self, shared: &Shared, now: Nanos) -> Option<(std::rc::Rc<Sample>, u64)> {
-        let sample = shared.board.borrow_mut().take(self.sensor, self.topic, self.number)?;
-        let Noted { missed, .. } = self.numbers.note(&sample.header);
-        shared.log.tell(now, &Event::Taken { consumer: self.number, sample: &sample, missed });
+    fn take(&mut self, shared: &SharedState, now: Nanos) -> Option<(std::rc::Rc<Sample>, u64)> {
+        let sample = shared.topics.borrow_mut().take(self.sensor, self.topic, self.id)?;
+        let SequenceGap { missed, .. } = self.sequence.note(&sample.header);
+        shared.log.record(now, &Event::Taken { subscriber: self.id, sample: &sample, missed });
         Some((sample, missed))
     }
 }
 
 /// The way to the network.
 pub(super) struct Uplink<'a> {
-    pub(super) shared: &'a Shared,
+    pub(super) shared: &'a SharedState,
     pub(super) now: Nanos,
     pub(super) random: &'a mut fastrand::Rng,
-    pub(super) refusal: f64,
+    pub(super) refusal_rate: f64,
     pub(super) network: &'a mut Network,
 }
 
 impl Transmit for Uplink<'_> {
     fn transmit(&mut self, bytes: &[u8], _group: u8, _above: u8) -> bool {
-        let is_taken = self.refusal <= 0.0 || self.random.f64() >= self.refusal;
+        let is_taken = self.refusal_rate <= 0.0 || self.random.f64() >= self.refusal_rate;
         let datagram = Datagram::read(bytes).expect("a gateway makes whole datagrams");
-        self.shared.log.tell(self.now, &Event::Transmitted { datagram: &datagram, bytes, is_taken });
+        self.shared.log.record(self.now, &Event::Transmitted { datagram: &datagram, bytes, is_taken });
         if is_taken {
             self.network.send(self.now, bytes);
         }
@@ -200,24 +201,24 @@ impl Transmit for Uplink<'_> {
 }
 
 /// The clocks of the hub's machine.
-fn stamp(shared: &Shared, now: Nanos) -> Stamp {
-    Stamp { monotonic_ns: now, wall_ns: now + shared.wall_ahead.get() }
+fn stamp(shared: &SharedState, now: Nanos) -> WallTimestamp {
+    WallTimestamp { monotonic_ns: now, wall_ns: now + shared.wall_offset.get() }
 }
 
-fn moment(now: Nanos) -> Moment {
-    Moment { monotonic_ns: now, boottime_ns: now }
+fn moment(now: Nanos) -> Timestamp {
+    Timestamp { monotonic_ns: now, boottime_ns: now }
 }
 
 /// The gateway's number.
-const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
+const HUB_ID: u64 = 0x5f3a_12bc_00d1_e2f3;
 /// The epoch before the first one.
-const EPOCH: u32 = 1_780_000_000;
+const BASE_EPOCH: u32 = 1_780_000_000;
 /// As consumers, gateways have numbers beyond those of all others.
-pub(crate) const NUMBERS: u32 = 1_000_000;
+pub(crate) const FIRST_SUBSCRIBER_ID: u32 = 1_000_000;
 /// Between two announcements.
-const TICK: Nanos = ANNOUNCE_EVERY.as_nanos() as Nanos;
+const ANNOUNCE_INTERVAL: Nanos = ANNOUNCEMENT_INTERVAL.as_nanos() as Nanos;
 /// A hub that lives hands what it keeps to newcomers within so long, and wakes nobody for it.
-const GREETING: Nanos = 110 * MILLIS;
+const HISTORY_DELAY: Nanos = 110 * MILLIS;
 
 /// Defines `lend`, which reads the bytes of a sample by the table of topics.
 macro_rules! payloads {
@@ -252,20 +253,24 @@ macro_rules! payloads {
 scanhub_schema::for_each_topic!(payloads);
 
 /// Buffer for a payload as in datagrams. Its size limits some payloads.
-pub(crate) struct Packet {
-    room: Vec<u8>,
+pub(crate) struct PayloadBuffer {
+    buffer: Vec<u8>,
 }
 
-impl Packet {
-    pub(crate) fn new(terms: &Terms) -> Packet {
+impl PayloadBuffer {
+    pub(crate) fn new(terms: &LinkSettings) -> PayloadBuffer {
         // A bridge sends samples whole.
-        let room = if terms.are_bridges { u16::MAX.into() } else { PARTS * (terms.longest - HEAD) };
-        Packet { room: vec![0; room] }
+        let room = if terms.are_bridges {
+            u16::MAX.into()
+        } else {
+            MAX_PARTS * (terms.max_datagram_len - HEADER_LEN)
+        };
+        PayloadBuffer { buffer: vec![0; room] }
     }
 
     /// Returns the payload of `sample` in datagrams, or `None` if it does not fit.
-    pub(crate) fn of(&mut self, sample: &Sample) -> Option<&[u8]> {
-        let len = lend(sample, |payload| payload.pack(&mut self.room))?;
-        self.room.get(..len)
+    pub(crate) fn encode(&mut self, sample: &Sample) -> Option<&[u8]> {
+        let len = lend(sample, |payload| payload.pack(&mut self.buffer))?;
+        self.buffer.get(..len)
     }
 }

@@ -7,21 +7,21 @@ use std::rc::Rc;
 
 use scanhub_network::lan::incoming::CheckedPayload;
 use scanhub_network::lan::republish::{SensorTopics, TopicStore};
-use scanhub_schema::{Failure, Header, Topic, Wake};
+use scanhub_schema::{Failure, Header, Topic, WakeEvent};
 
 /// Topics in memory, by their sensors' names. They stay when who publishes is gone.
 #[derive(Clone, Default)]
-pub(crate) struct Memory(Rc<RefCell<BTreeMap<String, Waiting>>>);
+pub(crate) struct TopicMemory(Rc<RefCell<BTreeMap<String, SensorQueue>>>);
 
 /// What waits of one sensor for its consumer.
 #[derive(Default)]
-struct Waiting {
-    samples: VecDeque<Published>,
+struct SensorQueue {
+    samples: VecDeque<PublishedSample>,
     is_woken: bool,
 }
 
 /// A sample that was published.
-pub(crate) struct Published {
+pub(crate) struct PublishedSample {
     pub(crate) topic: Topic,
     pub(crate) header: Header,
     /// As in a datagram.
@@ -33,12 +33,12 @@ pub(crate) struct MemoryTopics {
     name: String,
     /// The next number of each topic that is there.
     next: [Option<u64>; Topic::ALL.len()],
-    memory: Memory,
+    memory: TopicMemory,
 }
 
-impl Memory {
+impl TopicMemory {
     /// What waits of the sensor called `name`, if its consumer was woken since the last call.
-    pub(crate) fn take(&self, name: &str) -> VecDeque<Published> {
+    pub(crate) fn take(&self, name: &str) -> VecDeque<PublishedSample> {
         let mut all = self.0.borrow_mut();
         let Some(waiting) = all.get_mut(name) else { return VecDeque::new() };
         if std::mem::take(&mut waiting.is_woken) {
@@ -49,7 +49,7 @@ impl Memory {
     }
 }
 
-impl TopicStore for Memory {
+impl TopicStore for TopicMemory {
     type Sensor = MemoryTopics;
 
     fn check_room(&self, _topics: &[Topic]) -> Result<(), Failure> {
@@ -84,12 +84,12 @@ impl SensorTopics for MemoryTopics {
         *next += 1;
         let mut all = self.memory.0.borrow_mut();
         let waiting = all.get_mut(&self.name).expect("it was made");
-        waiting.samples.push_back(Published { topic, header, payload: payload.bytes.to_vec() });
+        waiting.samples.push_back(PublishedSample { topic, header, payload: payload.bytes.to_vec() });
     }
 
     fn connect(&self, _topic: Topic) {}
 
-    fn wake(&self, _why: Wake) {
+    fn wake(&self, _why: WakeEvent) {
         self.memory.0.borrow_mut().get_mut(&self.name).expect("it was made").is_woken = true;
     }
 

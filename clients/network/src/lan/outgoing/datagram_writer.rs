@@ -4,9 +4,11 @@
 use std::collections::VecDeque;
 
 use scanhub_schema::Topic;
-use scanhub_schema::datagram::{Announce, Announced, HEAD, Head, MAC, MTU_ETHERNET, PARTS, group};
+use scanhub_schema::datagram::{
+    Announce, Announced, HEADER_LEN, Head, MAC_LEN, MAX_PARTS, MTU_ETHERNET, group,
+};
 
-use crate::lan::{Key, Stamp};
+use crate::lan::{Key, WallTimestamp};
 
 /// Destination of datagrams: sockets, or a model of a network.
 pub trait Transmit {
@@ -29,7 +31,7 @@ pub enum Form {
 impl Form {
     /// Returns the number of bytes that are added to a payload.
     fn overhead(&self) -> usize {
-        if matches!(self, Form::Authenticated(_)) { HEAD + MAC } else { HEAD }
+        if matches!(self, Form::Authenticated(_)) { HEADER_LEN + MAC_LEN } else { HEADER_LEN }
     }
 
     fn is_bare(&self) -> bool {
@@ -41,12 +43,12 @@ impl Form {
 pub(super) struct DatagramWriter {
     hub: u64,
     epoch: u32,
-    sensors: Vec<Rows>,
+    sensors: Vec<SensorStats>,
     form: Form,
     /// Maximum length of a datagram, in bytes.
-    longest: usize,
+    max_datagram_len: usize,
     /// Samples that did not fit into the maximum number of parts.
-    unfit: u64,
+    oversized_samples: u64,
     /// Room for a header and the longest payload.
     buffer: Vec<u8>,
     queue: Option<Queue>,
@@ -62,7 +64,7 @@ struct Queue {
 
 /// A sample that was taken from the queue, with its number.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Handed<'a> {
+pub struct QueuedSample<'a> {
     /// Number of the sensor in the hub, and its name.
     pub sensor: (u8, &'a str),
     /// Topic of the sample; `None` for an announcement.
@@ -73,15 +75,15 @@ pub struct Handed<'a> {
 
 /// Counters of one sensor.
 #[derive(Default)]
-pub struct Rows {
+pub struct SensorStats {
     /// Name of the sensor that had this number last.
     pub name: String,
-    rows: [Row; KINDS],
+    topics: [TopicStats; STREAM_COUNT],
 }
 
 /// Counters of one sensor and topic.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Row {
+pub struct TopicStats {
     /// Samples that were sent.
     pub sent: u64,
     /// Samples that have a number and were not sent, or not all parts of them.
@@ -104,17 +106,17 @@ enum Oversize {
     Reported,
 }
 
-impl Row {
+impl TopicStats {
     /// Returns the number of the next sample.
-    pub fn next(&self) -> u32 {
+    pub fn next_number(&self) -> u32 {
         (self.sent + self.failed) as u32
     }
 }
 
-impl Rows {
+impl SensorStats {
     /// Returns all topics with a counter that is not 0; `None` stands for announcements.
-    pub fn used(&self) -> impl Iterator<Item = (Option<Topic>, &Row)> {
-        let numbered = self.rows.iter().enumerate().filter(|(_, row)| **row != Row::default());
+    pub fn used_topics(&self) -> impl Iterator<Item = (Option<Topic>, &TopicStats)> {
+        let numbered = self.topics.iter().enumerate().filter(|(_, row)| **row != TopicStats::default());
         numbered.map(|(number, row)| (Topic::of_number(number as u8), row))
     }
 
@@ -123,18 +125,18 @@ impl Rows {
     /// would count samples as lost that were sent before.
     fn write(&self, head: &Head, payload: &[u8], room: &mut [u8]) -> Option<usize> {
         if head.topic == Announce::NUMBER {
-            return self.updated(&Announce::unpack(payload)?).pack(room);
+            return self.updated_announcement(&Announce::unpack(payload)?).pack(room);
         }
         room.get_mut(..payload.len())?.copy_from_slice(payload);
         Some(payload.len())
     }
 
     /// Returns the announcement `old` with the numbers of this moment.
-    fn updated(&self, old: &Announce) -> Announce {
+    fn updated_announcement(&self, old: &Announce) -> Announce {
         let mut announce = Announce::new(old.boot, old.sensor(), old.kind());
         for topic in old.topics() {
-            let row = self.rows.get(usize::from(topic.topic)).copied().unwrap_or_default();
-            announce.add(Announced { next: row.next(), ..*topic });
+            let row = self.topics.get(usize::from(topic.topic)).copied().unwrap_or_default();
+            announce.add(Announced { next: row.next_number(), ..*topic });
             announce.add_replaced(row.replaced);
         }
         announce
@@ -147,17 +149,35 @@ impl DatagramWriter {
         let overhead = form.overhead();
         let longest = longest.clamp(overhead + 1, MTU_ETHERNET);
         // Bare telegrams have no header with the number of a part.
-        let parts = if form.is_bare() { 1 } else { PARTS };
+        let parts = if form.is_bare() { 1 } else { MAX_PARTS };
         let buffer = vec![0; overhead + parts * (longest - overhead)];
-        DatagramWriter { hub, epoch, sensors: Vec::new(), form, longest, unfit: 0, buffer, queue: None }
+        DatagramWriter {
+            hub,
+            epoch,
+            sensors: Vec::new(),
+            form,
+            max_datagram_len: longest,
+            oversized_samples: 0,
+            buffer,
+            queue: None,
+        }
     }
 
     /// Creates a writer with a queue. Each sample is one datagram, however long it is, and waits until it is taken.
-    pub(super) fn waiting(hub: u64, epoch: u32) -> DatagramWriter {
+    pub(super) fn with_queue(hub: u64, epoch: u32) -> DatagramWriter {
         let buffer = vec![0; MAX_SAMPLE_LEN];
         let queue = Some(Queue::default());
         let (form, longest) = (Form::Sealed, MAX_SAMPLE_LEN);
-        DatagramWriter { hub, epoch, sensors: Vec::new(), form, longest, unfit: 0, buffer, queue }
+        DatagramWriter {
+            hub,
+            epoch,
+            sensors: Vec::new(),
+            form,
+            max_datagram_len: longest,
+            oversized_samples: 0,
+            buffer,
+            queue,
+        }
     }
 
     /// Returns whether announcements contain the number of replaced samples.
@@ -167,25 +187,25 @@ impl DatagramWriter {
 
     /// Returns how many samples of this sensor and topic were replaced.
     pub(super) fn replaced(&self, number: u8, topic: Topic) -> u64 {
-        let rows = self.sensors.get(usize::from(number));
-        rows.map_or(0, |rows| rows.rows[usize::from(topic.number())].replaced)
+        let stats = self.sensors.get(usize::from(number));
+        stats.map_or(0, |stats| stats.topics[usize::from(topic.number())].replaced)
     }
 
     /// Takes the sample that has waited for longest, numbers it, and returns it as it is sent at `now`. `None` if none
     /// waits.
-    pub(super) fn take_next(&mut self, now: Stamp) -> Option<Handed<'_>> {
+    pub(super) fn take_next(&mut self, now: WallTimestamp) -> Option<QueuedSample<'_>> {
         let Queue { waiting, last } = self.queue.as_mut()?;
         let (head, payload) = waiting.take()?;
-        let rows = self.sensors.get_mut(usize::from(head.sensor))?;
-        let len = rows.write(&head, payload, &mut self.buffer[HEAD..])?;
-        let row = rows.rows.get_mut(usize::from(head.topic))?;
+        let stats = self.sensors.get_mut(usize::from(head.sensor))?;
+        let len = stats.write(&head, payload, &mut self.buffer[HEADER_LEN..])?;
+        let row = stats.topics.get_mut(usize::from(head.topic))?;
         let stamp_ns = stamp_ns(&head, now);
-        let head = Head { hub: self.hub, epoch: self.epoch, sequence: row.next(), stamp_ns, ..head };
+        let head = Head { hub: self.hub, epoch: self.epoch, sequence: row.next_number(), stamp_ns, ..head };
         let datagram = head.seal(&mut self.buffer, len)?;
         row.sent += 1;
         row.bytes += datagram.len() as u64;
         let topic = Topic::of_number(head.topic);
-        if topic.is_none_or(is_kept) {
+        if topic.is_none_or(is_stored) {
             let same = |(other, _): &(Head, _)| (other.sensor, other.topic) == (head.sensor, head.topic);
             match last.iter_mut().find(|kept| same(kept)) {
                 Some((kept, bytes)) => {
@@ -197,23 +217,30 @@ impl DatagramWriter {
             }
         }
         let name = &self.sensors[usize::from(head.sensor)].name;
-        Some(Handed { sensor: (head.sensor, name), topic, datagram })
+        Some(QueuedSample { sensor: (head.sensor, name), topic, datagram })
     }
 
     /// Returns the last sample of a kept topic as it is sent again at `now`, under the number that it has.
-    pub(super) fn resend_last(&mut self, name: &str, topic: Option<Topic>, now: Stamp) -> Option<&[u8]> {
+    pub(super) fn resend_last(
+        &mut self,
+        name: &str,
+        topic: Option<Topic>,
+        now: WallTimestamp,
+    ) -> Option<&[u8]> {
         let number = topic.map_or(Announce::NUMBER, Topic::number);
         let last = &self.queue.as_ref()?.last;
-        let is_it = |head: &Head| self.sensors[usize::from(head.sensor)].name == name && head.topic == number;
+        let is_requested =
+            |head: &Head| self.sensors[usize::from(head.sensor)].name == name && head.topic == number;
         // After a restart of the hub, a sensor may have two numbers. The later one is valid.
-        let (head, payload) = last.iter().rev().find(|(head, _)| is_it(head))?;
+        let (head, payload) = last.iter().rev().find(|(head, _)| is_requested(head))?;
         let head = Head { stamp_ns: stamp_ns(head, now), ..*head };
-        let len = self.sensors[usize::from(head.sensor)].write(&head, payload, &mut self.buffer[HEAD..])?;
+        let len =
+            self.sensors[usize::from(head.sensor)].write(&head, payload, &mut self.buffer[HEADER_LEN..])?;
         head.seal(&mut self.buffer, len)
     }
 
     /// Returns the sensors and topics with a kept sample, in the order in which they were sent first.
-    pub(super) fn kept(&self) -> impl Iterator<Item = (&str, Option<Topic>)> {
+    pub(super) fn stored_samples(&self) -> impl Iterator<Item = (&str, Option<Topic>)> {
         self.queue
             .iter()
             .flat_map(|queue| &queue.last)
@@ -221,7 +248,7 @@ impl DatagramWriter {
     }
 
     /// Drops all kept samples.
-    pub(super) fn forget_kept(&mut self) {
+    pub(super) fn drop_kept(&mut self) {
         if let Some(queue) = &mut self.queue {
             queue.last.clear();
         }
@@ -247,20 +274,20 @@ impl DatagramWriter {
     }
 
     /// Returns the maximum length of a datagram, in bytes.
-    pub(super) fn longest(&self) -> usize {
-        self.longest
+    pub(super) fn max_datagram_len(&self) -> usize {
+        self.max_datagram_len
     }
 
     /// Returns the number of samples that did not fit into the maximum number of parts.
-    pub(super) fn unfit(&self) -> u64 {
-        self.unfit
+    pub(super) fn oversized_samples(&self) -> u64 {
+        self.oversized_samples
     }
 
     /// Assigns sensor number `number` to the sensor called `name`.
     pub(super) fn claim(&mut self, number: u8, name: &str) {
         let at = usize::from(number);
         if self.sensors.len() <= at {
-            self.sensors.resize_with(at + 1, Rows::default);
+            self.sensors.resize_with(at + 1, SensorStats::default);
         }
         if self.sensors[at].name == name {
             return;
@@ -269,20 +296,20 @@ impl DatagramWriter {
         if let Some(Queue { waiting, last }) = &mut self.queue {
             last.retain(|(head, _)| head.sensor != number);
             for topic in waiting.drop_sensor(number) {
-                self.sensors[at].rows[usize::from(topic)].replaced += 1;
+                self.sensors[at].topics[usize::from(topic)].replaced += 1;
             }
         }
     }
 
     /// Returns whether `number` is assigned to `name`. A hub that restarts may number its sensors differently.
     pub(super) fn is_claimed(&self, number: u8, name: &str) -> bool {
-        self.sensors.get(usize::from(number)).is_some_and(|rows| rows.name == name)
+        self.sensors.get(usize::from(number)).is_some_and(|stats| stats.name == name)
     }
 
     /// Returns the number of the next sample of this sensor and topic.
     pub(super) fn next(&self, number: u8, topic: Topic) -> u32 {
-        let rows = self.sensors.get(usize::from(number));
-        rows.map_or(0, |rows| rows.rows[usize::from(topic.number())].next())
+        let stats = self.sensors.get(usize::from(number));
+        stats.map_or(0, |stats| stats.topics[usize::from(topic.number())].next_number())
     }
 
     /// Counts samples that the hub sent and the gateway did not receive.
@@ -293,7 +320,7 @@ impl DatagramWriter {
     }
 
     /// Returns the counters of each sensor, by its number.
-    pub(super) fn sensors(&self) -> impl Iterator<Item = &Rows> {
+    pub(super) fn sensors(&self) -> impl Iterator<Item = &SensorStats> {
         self.sensors.iter()
     }
 
@@ -307,22 +334,25 @@ impl DatagramWriter {
     ) {
         let (hub, epoch) = (self.hub, self.epoch);
         if let Some(Queue { waiting, .. }) = &mut self.queue {
-            let payload = pack(&mut self.buffer[HEAD..]);
-            let is_replaced = payload.is_some_and(|len| waiting.put(head, &self.buffer[HEAD..HEAD + len]));
-            self.unfit += u64::from(payload.is_none());
+            let payload = pack(&mut self.buffer[HEADER_LEN..]);
+            let is_replaced =
+                payload.is_some_and(|len| waiting.put(head, &self.buffer[HEADER_LEN..HEADER_LEN + len]));
+            self.oversized_samples += u64::from(payload.is_none());
             if let Some(row) = self.row(head.sensor, head.topic) {
                 row.replaced += u64::from(is_replaced);
             }
             return;
         }
         let Some(row) = self.row(head.sensor, head.topic) else { return };
-        let head = Head { hub, epoch, sequence: row.next(), ..head };
-        let end = self.buffer.len() + HEAD - self.form.overhead();
-        let payload = pack(&mut self.buffer[HEAD..end]);
+        let head = Head { hub, epoch, sequence: row.next_number(), ..head };
+        let end = self.buffer.len() + HEADER_LEN - self.form.overhead();
+        let payload = pack(&mut self.buffer[HEADER_LEN..end]);
         let group = Topic::of_number(head.topic).map_or(Announce::GROUP, group);
         let sent = payload.and_then(|len| match self.form {
             Form::Sealed | Form::Authenticated(_) => self.send_sealed(head, len, group, to),
-            Form::Bare => to.transmit(&self.buffer[HEAD..HEAD + len], group, head.sensor).then_some(len),
+            Form::Bare => {
+                to.transmit(&self.buffer[HEADER_LEN..HEADER_LEN + len], group, head.sensor).then_some(len)
+            }
         });
         if let Some(row) = self.row(head.sensor, head.topic) {
             match sent {
@@ -336,7 +366,7 @@ impl DatagramWriter {
                 row.oversize = Oversize::Unreported;
             }
         }
-        self.unfit += u64::from(payload.is_none());
+        self.oversized_samples += u64::from(payload.is_none());
     }
 
     /// Sends the payload of `len` bytes in the buffer, in as few parts as possible. Returns the bytes of all datagrams
@@ -345,17 +375,17 @@ impl DatagramWriter {
     /// The parts are sealed in place. The header of a part overwrites the end of the part before it, which was sent
     /// already. Its MAC overwrites the start of the part after it, which is restored afterward.
     fn send_sealed(&mut self, head: Head, len: usize, group: u8, to: &mut impl Transmit) -> Option<usize> {
-        let room = self.longest - self.form.overhead();
+        let room = self.max_datagram_len - self.form.overhead();
         let parts = len.div_ceil(room).max(1);
         let mut bytes = Some(0);
         for part in 0..parts {
             let begin = part * room;
             let head = Head { part: part as u8, parts: parts as u8, ..head };
             let (buffer, len) = (&mut self.buffer[begin..], room.min(len - begin));
-            let mut after = [0; MAC];
+            let mut after = [0; MAC_LEN];
             let datagram = match &self.form {
                 Form::Authenticated(key) => {
-                    after.copy_from_slice(buffer.get(HEAD + len..HEAD + len + MAC)?);
+                    after.copy_from_slice(buffer.get(HEADER_LEN + len..HEADER_LEN + len + MAC_LEN)?);
                     head.seal_with(buffer, len, |covered| key.mac(covered))?
                 }
                 _ => head.seal(buffer, len)?,
@@ -364,7 +394,7 @@ impl DatagramWriter {
             let is_sent = to.transmit(datagram, group, 0);
             bytes = bytes.filter(|_| is_sent).map(|bytes| bytes + datagram.len());
             if matches!(self.form, Form::Authenticated(_)) {
-                buffer[HEAD + len..][..MAC].copy_from_slice(&after);
+                buffer[HEADER_LEN + len..][..MAC_LEN].copy_from_slice(&after);
             }
         }
         bytes
@@ -372,23 +402,23 @@ impl DatagramWriter {
 
     /// Returns a `SENSOR/TOPIC` whose samples do not all fit into datagrams, each of them once.
     pub(super) fn take_oversized(&mut self) -> Option<String> {
-        self.sensors.iter_mut().find_map(|Rows { name, rows }| {
+        self.sensors.iter_mut().find_map(|SensorStats { name, topics }| {
             let (number, row) =
-                rows.iter_mut().enumerate().find(|(_, row)| row.oversize == Oversize::Unreported)?;
+                topics.iter_mut().enumerate().find(|(_, row)| row.oversize == Oversize::Unreported)?;
             row.oversize = Oversize::Reported;
             let topic = Topic::of_number(number as u8).map_or("announce", Topic::name);
             Some(format!("{name}/{topic}"))
         })
     }
 
-    fn row(&mut self, number: u8, topic: u8) -> Option<&mut Row> {
-        self.sensors.get_mut(usize::from(number))?.rows.get_mut(usize::from(topic))
+    fn row(&mut self, number: u8, topic: u8) -> Option<&mut TopicStats> {
+        self.sensors.get_mut(usize::from(number))?.topics.get_mut(usize::from(topic))
     }
 }
 
 /// Returns the stamp of a sample with this `head` that is sent at `now`. Announcements and statuses have the time at
 /// which they are sent, however long they waited, because receivers compare clocks by them.
-fn stamp_ns(head: &Head, now: Stamp) -> u64 {
+fn stamp_ns(head: &Head, now: WallTimestamp) -> u64 {
     match Topic::of_number(head.topic) {
         None | Some(Topic::Status) => now.wall_ns,
         Some(_) => head.stamp_ns,
@@ -396,15 +426,15 @@ fn stamp_ns(head: &Head, now: Stamp) -> u64 {
 }
 
 /// Returns whether the last sample of this topic is kept for receivers that query it. It is valid until the next one.
-fn is_kept(topic: Topic) -> bool {
+fn is_stored(topic: Topic) -> bool {
     matches!(topic, Topic::Status | Topic::Background)
 }
 
 /// Maximum length of a sample in one datagram: a header, and the longest payload whose length it can contain.
-const MAX_SAMPLE_LEN: usize = HEAD + u16::MAX as usize;
+const MAX_SAMPLE_LEN: usize = HEADER_LEN + u16::MAX as usize;
 
 /// Number of counted streams: announcements, and the topics by their numbers.
-const KINDS: usize = 1 + Topic::ALL.len();
+const STREAM_COUNT: usize = 1 + Topic::ALL.len();
 
 /// Queue that holds only the newest sample of each sensor and topic. When the network is slow or down, a newer sample
 /// replaces the older one, so nothing stale is sent. Topics are served in the order in which they started to wait.

@@ -4,12 +4,12 @@ use std::collections::VecDeque;
 use std::num::NonZeroU64;
 use std::time::Duration;
 
-use scanhub_schema::datagram::{Announce, Announced, Head, LanFlags, PORT, Packed, group};
+use scanhub_schema::datagram::{Announce, Announced, DatagramPayload, Head, LanFlags, PORT, group};
 use scanhub_schema::{Background, Family, Flags, Header, Quality, Topic, Verdict};
 
 use super::datagram_writer::{DatagramWriter, Transmit};
 use super::{PayloadRef, Sample};
-use crate::lan::Stamp;
+use crate::lan::WallTimestamp;
 
 /// A subscribed sensor.
 pub(super) struct Sensor {
@@ -92,7 +92,7 @@ impl Sensor {
     pub(super) fn repeat(
         &mut self,
         every: Duration,
-        now: Stamp,
+        now: WallTimestamp,
         writer: &mut DatagramWriter,
         to: &mut impl Transmit,
     ) {
@@ -108,7 +108,7 @@ impl Sensor {
     }
 
     /// Announces the sensor's name, and the next number of each topic. Sends nothing before the sensor's first sample.
-    pub(super) fn announce(&self, now: Stamp, writer: &mut DatagramWriter, to: &mut impl Transmit) {
+    pub(super) fn announce(&self, now: WallTimestamp, writer: &mut DatagramWriter, to: &mut impl Transmit) {
         let is_announced = writer.announces();
         let last = self.last.filter(|last| is_announced && writer.is_claimed(last.sensor, &self.name));
         let Some(last) = last else { return };
@@ -137,7 +137,7 @@ impl Sensor {
     pub(super) fn send(
         &mut self,
         sample: &Sample<'_>,
-        now: Stamp,
+        now: WallTimestamp,
         writer: &mut DatagramWriter,
         to: &mut impl Transmit,
     ) {

@@ -4,13 +4,13 @@ use std::num::NonZeroU64;
 use std::time::Duration;
 
 use crate::lan::GatewayTable;
-use scanhub_schema::datagram::{Announce, Datagram, HEAD, Head, MTU_LEAST, MTU_SAFE};
+use scanhub_schema::datagram::{Announce, Datagram, HEADER_LEN, Head, MIN_MTU, MTU_SAFE};
 use scanhub_schema::{
     Background, BackgroundHead, Early, Family, Flags, Header, Status, Topic, Verdict, Zones,
 };
 
 use super::{Form, Outgoing, PayloadRef, Sample, Transmit};
-use crate::lan::{Key, Stamp};
+use crate::lan::{Key, WallTimestamp};
 
 /// A network that records datagrams, and may refuse them.
 #[derive(Default)]
@@ -51,8 +51,8 @@ fn each(_: Topic) -> Option<NonZeroU64> {
     Some(NonZeroU64::MIN)
 }
 
-fn at(ms: u64) -> Stamp {
-    Stamp { monotonic_ns: ms * 1_000_000, wall_ns: 5_000_000_000 + ms * 1_000_000 }
+fn at(ms: u64) -> WallTimestamp {
+    WallTimestamp { monotonic_ns: ms * 1_000_000, wall_ns: 5_000_000_000 + ms * 1_000_000 }
 }
 
 fn header(boot: u64, sensor: u8, seq: u64) -> Header {
@@ -102,10 +102,10 @@ fn thinned_samples_use_no_number_and_unknown_is_sent() {
     assert_eq!(send(3, Verdict::Unknown), []);
     assert_eq!(send(4, Verdict::Clear), [(ZONES, 2)]);
     assert!(
-        out.wants(front, Topic::Zones) && out.wants(front, Topic::Status),
+        out.needs(front, Topic::Zones) && out.needs(front, Topic::Status),
         "announcements need the type in the status"
     );
-    assert!(!out.wants(front, Topic::Scan));
+    assert!(!out.needs(front, Topic::Scan));
 }
 
 #[test]
@@ -148,7 +148,7 @@ fn silence_is_sent_as_unknown_zones() {
     assert_eq!(send(&mut out, rear, Some(header(2, 0, 0)), Verdict::Clear), [(0, 1), (ZONES, 2)]);
     assert_eq!(send(&mut out, front, None, Verdict::Unknown), []);
     assert_eq!(send(&mut out, front, Some(header(1, 0, 1)), Verdict::Clear), []);
-    let names: Vec<_> = out.account().map(|rows| rows.name.as_str()).collect();
+    let names: Vec<_> = out.counters().map(|stats| stats.name.as_str()).collect();
     assert_eq!(names, ["rear"]);
 }
 
@@ -196,14 +196,15 @@ fn status_has_send_time_and_sets_announced_type() {
     assert_eq!(kind.kind(), "LMS200");
     let stamps: Vec<_> = network.heads().iter().map(|head| head.stamp_ns).collect();
     assert_eq!(stamps, [5_070_000_000, 5_070_000_000]);
-    let missed: Vec<_> = out.account().flat_map(|rows| rows.used()).map(|(_, row)| row.missed).collect();
+    let missed: Vec<_> =
+        out.counters().flat_map(|stats| stats.used_topics()).map(|(_, row)| row.missed).collect();
     assert_eq!(missed, [0, 3]);
 }
 
 #[test]
 fn failures_use_numbers_and_oversize_is_reported_once() {
     // The telegram does not fit into 255 parts.
-    let mut out = Outgoing::new(7, 9, Form::Sealed, HEAD + 2);
+    let mut out = Outgoing::new(7, 9, Form::Sealed, HEADER_LEN + 2);
     let front = out.follow("front", |topic| NonZeroU64::new(1).filter(|_| topic != Topic::Status));
     let mut network = RecordingNetwork { is_cut: true, ..RecordingNetwork::default() };
     let (header, zones, telegram) = (header(1, 0, 0), Zones::unknown(), [2; 511]);
@@ -214,16 +215,21 @@ fn failures_use_numbers_and_oversize_is_reported_once() {
     let mut numbers = network.numbers();
     numbers.dedup();
     assert_eq!(numbers, [(Announce::NUMBER, 0), (ZONES, 0), (ZONES, 1)]);
-    let counts: Vec<_> = out.account().flat_map(|rows| rows.used()).map(|(_, row)| row).collect();
-    let counts: Vec<_> = counts.iter().map(|row| (row.sent, row.failed, row.next())).collect();
+    let counts: Vec<_> = out.counters().flat_map(|stats| stats.used_topics()).map(|(_, row)| row).collect();
+    let counts: Vec<_> = counts.iter().map(|row| (row.sent, row.failed, row.next_number())).collect();
     assert_eq!(counts, [(0, 1, 1), (0, 1, 1), (1, 1, 2)]);
-    assert_eq!((out.misfit().as_deref(), out.misfit(), out.unfit()), (Some("front/telegram"), None, 1));
+    assert_eq!(
+        (out.take_oversized().as_deref(), out.take_oversized(), out.oversized_samples()),
+        (Some("front/telegram"), None, 1)
+    );
 }
 
 #[test]
 fn sends_long_samples_in_parts() {
     let telegram: Vec<u8> = (0..814).map(|i| i as u8).collect();
-    for (longest, lengths) in [(MTU_SAFE, &[814][..]), (MTU_LEAST, &[528, 286]), (HEAD + 407, &[407, 407])] {
+    for (longest, lengths) in
+        [(MTU_SAFE, &[814][..]), (MIN_MTU, &[528, 286]), (HEADER_LEN + 407, &[407, 407])]
+    {
         let mut out = Outgoing::new(7, 9, Form::Sealed, longest);
         let front = out.follow("front", |topic| NonZeroU64::new(1).filter(|_| topic == Topic::Telegram));
         let mut network = RecordingNetwork::default();
@@ -241,21 +247,21 @@ fn sends_long_samples_in_parts() {
             assert!(parts.iter().map(|it| it.payload.len()).eq(lengths.iter().copied()));
             assert_eq!(parts.iter().flat_map(|it| it.payload).copied().collect::<Vec<_>>(), telegram);
         }
-        let (_, row) = out.account().flat_map(|rows| rows.used()).last().unwrap();
-        assert_eq!((row.sent, row.failed, row.bytes), (2, 0, 2 * (814 + HEAD * lengths.len()) as u64));
+        let (_, row) = out.counters().flat_map(|stats| stats.used_topics()).last().unwrap();
+        assert_eq!((row.sent, row.failed, row.bytes), (2, 0, 2 * (814 + HEADER_LEN * lengths.len()) as u64));
     }
 }
 
 #[test]
 fn sends_other_parts_after_a_failed_one() {
-    let mut out = Outgoing::new(7, 9, Form::Sealed, MTU_LEAST);
+    let mut out = Outgoing::new(7, 9, Form::Sealed, MIN_MTU);
     let front = out.follow("front", |topic| NonZeroU64::new(1).filter(|_| topic == Topic::Telegram));
     let (mut network, header, payload) =
         (RecordingNetwork { is_cut: true, ..RecordingNetwork::default() }, header(1, 5, 0), [2; 814]);
     let sample = Sample { header: Some(&header), missed: 0, payload: PayloadRef::Telegram(&payload) };
     out.sample(front, &sample, at(0), &mut network);
     assert_eq!(network.numbers(), [(Announce::NUMBER, 0), (1, 0), (1, 0)]);
-    let (_, row) = out.account().flat_map(|rows| rows.used()).last().unwrap();
+    let (_, row) = out.counters().flat_map(|stats| stats.used_topics()).last().unwrap();
     assert_eq!((row.sent, row.failed, row.bytes), (0, 1, 0));
 }
 
@@ -263,7 +269,7 @@ fn sends_other_parts_after_a_failed_one() {
 fn sends_bare_telegrams_to_the_port_of_their_sensor() {
     let (mut out, mut network) = (outgoing(Form::Bare), RecordingNetwork::default());
     let front = out.follow("front", |topic| NonZeroU64::new(1).filter(|_| topic == Topic::Telegram));
-    assert!(!out.wants(front, Topic::Status));
+    assert!(!out.needs(front, Topic::Status));
     let header = header(1, 5, 0);
     let sample = Sample { header: Some(&header), missed: 0, payload: PayloadRef::Telegram(b"\x02bytes") };
     out.sample(front, &sample, at(0), &mut network);
@@ -274,7 +280,7 @@ fn sends_bare_telegrams_to_the_port_of_their_sensor() {
 #[test]
 fn authenticates_each_part_without_damaging_the_next() {
     let key = Key::new(&[7; 32]);
-    let mut out = Outgoing::new(7, 9, Form::Authenticated(key.clone()), MTU_LEAST);
+    let mut out = Outgoing::new(7, 9, Form::Authenticated(key.clone()), MIN_MTU);
     let front = out.follow("front", each);
     let telegram: Vec<u8> = (0..2000_u32).map(|n| (n * 7) as u8).collect();
     let header = header(1, 3, 0);
@@ -284,12 +290,14 @@ fn authenticates_each_part_without_damaging_the_next() {
     let mut whole: Vec<u8> = Vec::new();
     for (bytes, ..) in &network.datagrams {
         let datagram = Datagram::read(bytes).expect("a datagram");
-        assert!(bytes.len() <= MTU_LEAST && key.is_of(bytes, datagram.mac.expect("a MAC")));
+        assert!(bytes.len() <= MIN_MTU && key.is_of(bytes, datagram.mac.expect("a MAC")));
         if datagram.head.topic == Topic::Telegram.number() {
             whole.extend(datagram.payload);
         }
     }
-    assert!(whole == telegram && network.datagrams.len() == 1 + 2000_usize.div_ceil(MTU_LEAST - HEAD - 16));
+    assert!(
+        whole == telegram && network.datagrams.len() == 1 + 2000_usize.div_ceil(MIN_MTU - HEADER_LEN - 16)
+    );
 }
 
 /// Adds zones to the queue.
@@ -300,7 +308,7 @@ fn wait(out: &mut Outgoing, sensor: usize, seq: u64) {
 /// Takes everything that waits, in its order.
 fn take_all(out: &mut Outgoing) -> Vec<Vec<u8>> {
     let mut all = Vec::new();
-    while let Some(sample) = out.hand(at(700)) {
+    while let Some(sample) = out.take_next(at(700)) {
         all.push(sample.datagram.to_vec());
     }
     all
@@ -318,7 +326,7 @@ fn count_zones(datagrams: &[&[u8]]) -> (u64, u64) {
 
 #[test]
 fn late_receiver_counts_no_earlier_samples_as_lost() {
-    let mut out = Outgoing::waiting(7, 9);
+    let mut out = Outgoing::with_queue(7, 9);
     let front = out.follow("front", each);
     for seq in 0..100 {
         wait(&mut out, front, seq);
@@ -334,7 +342,7 @@ fn late_receiver_counts_no_earlier_samples_as_lost() {
     }
     let head = Datagram::read(announced).expect("a datagram").head;
     assert_eq!(head.stamp_ns, at(700).wall_ns, "when it is sent, not when it began to wait");
-    let resent = out.again("front", None, at(900)).expect("an announcement").to_vec();
+    let resent = out.resend_last("front", None, at(900)).expect("an announcement").to_vec();
     wait(&mut out, front, 110);
     let [zones] = &take_all(&mut out)[..] else { panic!("zones") };
     assert_eq!(count_zones(&[&resent, zones]), (1, 0), "it has the numbers of now");

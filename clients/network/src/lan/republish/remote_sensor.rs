@@ -1,12 +1,12 @@
 //! The topics of one remote sensor: their numbers and periods, and its state while nothing arrives.
 
-use scanhub_schema::datagram::{Announce, Head, MTU_ETHERNET, Packed};
-use scanhub_schema::{Failure, Header, State, Status, Topic, Wake, Zones};
+use scanhub_schema::datagram::{Announce, DatagramPayload, Head, MTU_ETHERNET};
+use scanhub_schema::{Failure, Header, State, Status, Topic, WakeEvent, Zones};
 
 use super::SensorTopics;
-use crate::lan::Stamp;
-use crate::lan::gateways::{Arrival, Standing};
-use crate::lan::incoming::{CheckedPayload, Remote};
+use crate::lan::WallTimestamp;
+use crate::lan::gateways::{Arrival, EvictionRank};
+use crate::lan::incoming::{CheckedPayload, ReceivedSample};
 
 /// A sensor of another machine.
 pub(super) struct RemoteSensor<T: SensorTopics> {
@@ -17,7 +17,7 @@ pub(super) struct RemoteSensor<T: SensorTopics> {
     /// Bit n is set if the last announcement has topic number n.
     announced: u64,
     /// Rank when there is no room for another sensor.
-    pub(super) standing: Standing,
+    pub(super) rank: EvictionRank,
     /// Whether it was reported that all announced topics exist.
     pub(super) is_reported: bool,
     /// By topic.
@@ -27,9 +27,9 @@ pub(super) struct RemoteSensor<T: SensorTopics> {
     /// Header of the last zones.
     last_zones: Option<Header>,
     /// Time of the last sample, in ns of CLOCK_MONOTONIC; `None` while the sensor is silent.
-    heard_ns: Option<u64>,
+    last_sample_ns: Option<u64>,
     /// Reason for which subscribers must be woken.
-    pending_wake: Option<Wake>,
+    pending_wake: Option<WakeEvent>,
     /// Process that publishes it.
     pid: u32,
     topics: T,
@@ -56,12 +56,12 @@ impl<T: SensorTopics> RemoteSensor<T> {
             name: name.to_owned(),
             source: None,
             announced: 0,
-            standing: Standing::NONE,
+            rank: EvictionRank::NONE,
             is_reported: false,
             streams: [const { None }; Topic::ALL.len()],
             last_status: None,
             last_zones: None,
-            heard_ns: None,
+            last_sample_ns: None,
             pending_wake: None,
             pid,
             topics,
@@ -69,7 +69,7 @@ impl<T: SensorTopics> RemoteSensor<T> {
     }
 
     /// Returns whether the topic exists.
-    pub(super) fn has(&self, topic: Topic) -> bool {
+    pub(super) fn has_topic(&self, topic: Topic) -> bool {
         self.streams[topic as usize].is_some()
     }
 
@@ -87,20 +87,20 @@ impl<T: SensorTopics> RemoteSensor<T> {
     }
 
     /// Records `announce` with `head`, which belongs to this sensor.
-    pub(super) fn announced(&mut self, head: &Head, announce: &Announce, arrival: Arrival) {
-        self.standing.take(arrival);
+    pub(super) fn on_announcement(&mut self, head: &Head, announce: &Announce, arrival: Arrival) {
+        self.rank.take(arrival);
         self.source = Some((head.hub, head.epoch, head.sensor));
         let numbers = announce.topics().iter().map(|announced| announced.topic).filter(|number| *number < 64);
         self.announced = numbers.fold(0, |bits, number| bits | 1 << number);
     }
 
     /// Publishes that the sensor is silent, because another one has its number or its place from now on.
-    pub(super) fn replaced(&mut self, now: Stamp) {
+    pub(super) fn retire(&mut self, now: WallTimestamp) {
         self.source = None;
-        self.heard_ns = None;
-        if let Some(header) = self.last_zones.take().filter(|_| self.has(Topic::Zones)) {
+        self.last_sample_ns = None;
+        if let Some(header) = self.last_zones.take().filter(|_| self.has_topic(Topic::Zones)) {
             self.send(Topic::Zones, &stamped(header, now), &Zones::unknown());
-            self.pending_wake = Some(Wake::Telegram);
+            self.pending_wake = Some(WakeEvent::Telegram);
         }
         self.publish_silence(now);
         self.wake();
@@ -112,26 +112,26 @@ impl<T: SensorTopics> RemoteSensor<T> {
     }
 
     /// Returns whether this sensor sent `head`.
-    pub(super) fn is(&self, head: &Head) -> bool {
+    pub(super) fn has_sent(&self, head: &Head) -> bool {
         self.source == Some((head.hub, head.epoch, head.sensor))
     }
 
     /// Returns whether it belongs to this gateway and epoch.
-    pub(super) fn is_of(&self, hub: u64, epoch: u32) -> bool {
+    pub(super) fn belongs_to(&self, hub: u64, epoch: u32) -> bool {
         self.source.is_some_and(|source| (source.0, source.1) == (hub, epoch))
     }
 
     /// Publishes `remote` if the sensor has the topic and room for the sample.
-    pub(super) fn publish(&mut self, remote: &Remote<'_>) -> Outcome {
-        self.heard_ns = Some(remote.arrival_ns);
-        self.standing.take(Arrival { delivers: true, now_ns: remote.arrival_ns });
+    pub(super) fn publish(&mut self, remote: &ReceivedSample<'_>) -> Outcome {
+        self.last_sample_ns = Some(remote.arrival_ns);
+        self.rank.take(Arrival { is_sample: true, now_ns: remote.arrival_ns });
         let topic = remote.topic;
         let Some(stream) = &mut self.streams[topic as usize] else { return Outcome::NoTopic };
         // Its number is skipped before the next sample that fits.
         if !self.topics.fits(topic, remote.payload) {
             return Outcome::NoRoom;
         }
-        let LocalNumber { left_out, header } = stream.place(remote, self.pid);
+        let LocalNumber { left_out, header } = stream.assign_number(remote, self.pid);
         self.topics.skip(topic, left_out);
         if topic != Topic::Status {
             self.topics.send(topic, &header, remote.payload);
@@ -141,30 +141,31 @@ impl<T: SensorTopics> RemoteSensor<T> {
         if topic == Topic::Zones {
             self.last_zones = Some(remote.header(self.pid));
         }
-        let why = if topic == Topic::Status { Wake::Status } else { Wake::Telegram };
+        let event = if topic == Topic::Status { WakeEvent::Status } else { WakeEvent::Telegram };
         self.pending_wake = match self.pending_wake {
-            Some(Wake::Telegram) => Some(Wake::Telegram),
-            _ => Some(why),
+            Some(WakeEvent::Telegram) => Some(WakeEvent::Telegram),
+            _ => Some(event),
         };
         Outcome::Published
     }
 
     /// Wakes the subscribers if something was published since the last call.
     pub(super) fn wake(&mut self) {
-        if let Some(why) = self.pending_wake.take() {
-            self.topics.wake(why);
+        if let Some(event) = self.pending_wake.take() {
+            self.topics.wake(event);
         }
     }
 
     /// Publishes that the sensor is silent, once per silence, if it was silent at `read`. Sends the history to late
     /// joiners.
-    pub(super) fn look(&mut self, read: Stamp) {
-        if self.heard_ns.is_some_and(|at_ns| read.monotonic_ns.saturating_sub(at_ns) >= SILENT_AFTER_NS) {
-            self.heard_ns = None;
+    pub(super) fn do_periodic_work(&mut self, read: WallTimestamp) {
+        if self.last_sample_ns.is_some_and(|at_ns| read.monotonic_ns.saturating_sub(at_ns) >= SILENT_AFTER_NS)
+        {
+            self.last_sample_ns = None;
             self.publish_silence(read);
             self.wake();
         }
-        let keeps = |topic: &Topic| topic.row().kept > 0 && self.has(*topic);
+        let keeps = |topic: &Topic| topic.spec().history_len > 0 && self.has_topic(*topic);
         Topic::ALL.into_iter().filter(keeps).for_each(|topic| self.topics.connect(topic));
     }
 
@@ -179,25 +180,25 @@ impl<T: SensorTopics> RemoteSensor<T> {
         let same = self.last_status.filter(|(last, _)| last.state == status.state);
         status.since_ns = same.map_or(header.stamp_first_ns, |(last, _)| last.since_ns);
         self.last_status = Some((status, *header));
-        if self.has(Topic::Status) {
+        if self.has_topic(Topic::Status) {
             self.send(Topic::Status, header, &status);
         }
     }
 
     /// Publishes that the sensor is silent, because its last status would otherwise remain forever.
-    fn publish_silence(&mut self, now: Stamp) {
+    fn publish_silence(&mut self, now: WallTimestamp) {
         let Some((mut status, header)) = self.last_status else { return };
         status.state = State::Silent as u8;
         status.rate_mhz = 0;
         status.set_last_error("nothing arrives over the network");
-        if self.has(Topic::Status) {
+        if self.has_topic(Topic::Status) {
             self.publish_status(status, &stamped(header, now));
-            self.pending_wake = self.pending_wake.or(Some(Wake::Status));
+            self.pending_wake = self.pending_wake.or(Some(WakeEvent::Status));
         }
     }
 
     /// Publishes a payload that was not received in this form.
-    fn send(&mut self, topic: Topic, header: &Header, payload: &impl Packed) {
+    fn send(&mut self, topic: Topic, header: &Header, payload: &impl DatagramPayload) {
         let mut room = [0; MTU_ETHERNET];
         let Some(len) = payload.pack(&mut room) else { return };
         let payload = CheckedPayload { bytes: &room[..len], room: len };
@@ -206,8 +207,8 @@ impl<T: SensorTopics> RemoteSensor<T> {
 }
 
 /// Returns `header` with the stamps of this moment, for a sample that was not received.
-fn stamped(header: Header, now: Stamp) -> Header {
-    let Stamp { monotonic_ns, wall_ns } = now;
+fn stamped(header: Header, now: WallTimestamp) -> Header {
+    let WallTimestamp { monotonic_ns, wall_ns } = now;
     Header { stamp_first_ns: monotonic_ns, stamp_last_ns: monotonic_ns, wall_ns, ..header }
 }
 
@@ -218,7 +219,7 @@ struct Stream {
     /// Epoch, sensor's number and sequence number of the last sample. The first sample keeps its sequence number, so
     /// that subscribers that outlive a listener see what was lost in between.
     last: Option<(u32, u8, u32)>,
-    arrivals: PeriodEstimator,
+    period_estimator: PeriodEstimator,
 }
 
 /// Number and header of a sample in this domain.
@@ -235,7 +236,7 @@ impl Stream {
     /// between the last one and it are skipped, whether they were lost or not published. In a new run of the gateway,
     /// these are all numbers before it. If the sensor has another number than before, none is skipped, because they may
     /// belong to another sensor.
-    fn place(&mut self, remote: &Remote<'_>, pid: u32) -> LocalNumber {
+    fn assign_number(&mut self, remote: &ReceivedSample<'_>, pid: u32) -> LocalNumber {
         let head = &remote.head;
         let next = (head.epoch, head.sensor, head.sequence);
         let steps = self.last.and_then(|last| steps(last, next));
@@ -245,7 +246,7 @@ impl Stream {
             (None, _) => head.sequence,
         };
         self.last = Some(next);
-        let period_us = self.arrivals.period_us(remote.arrival_ns, steps.unwrap_or_default().into());
+        let period_us = self.period_estimator.period_us(remote.arrival_ns, steps.unwrap_or_default().into());
         LocalNumber { left_out: left_out.into(), header: Header { period_us, ..remote.header(pid) } }
     }
 }
@@ -264,12 +265,12 @@ fn steps(last: (u32, u8, u32), next: (u32, u8, u32)) -> Option<u32> {
 struct PeriodEstimator {
     last_ns: Option<u64>,
     /// Times between the last samples as they were sent, in ns.
-    distances_ns: [u64; MEDIAN_OF],
+    distances_ns: [u64; MEDIAN_SAMPLES],
     count: usize,
 }
 
 /// Number of distances whose median is the period. Two gaps and a burst among them do not change the median.
-const MEDIAN_OF: usize = 5;
+const MEDIAN_SAMPLES: usize = 5;
 
 /// Maximum period. A longer time is a silence, and a verdict of that age is useless.
 const MAX_PERIOD_NS: u64 = 2_500_000_000;
@@ -282,11 +283,11 @@ impl PeriodEstimator {
         let before_ns = self.last_ns.replace(now_ns);
         let distance_ns = before_ns.and_then(|before_ns| now_ns.checked_sub(before_ns)?.checked_div(steps));
         if let Some(distance_ns) = distance_ns.filter(|distance_ns| *distance_ns <= MAX_PERIOD_NS) {
-            self.distances_ns[self.count % MEDIAN_OF] = distance_ns;
+            self.distances_ns[self.count % MEDIAN_SAMPLES] = distance_ns;
             self.count += 1;
         }
         let mut known = self.distances_ns;
-        let known = &mut known[..self.count.min(MEDIAN_OF)];
+        let known = &mut known[..self.count.min(MEDIAN_SAMPLES)];
         known.sort_unstable();
         let median_ns = known.get(known.len().saturating_sub(1) / 2);
         median_ns.map_or(0, |median_ns| (median_ns / 1000) as u32)
@@ -297,7 +298,7 @@ impl PeriodEstimator {
 mod tests {
     use super::*;
 
-    use scanhub_schema::datagram::{Datagram, HEAD};
+    use scanhub_schema::datagram::{Datagram, HEADER_LEN};
 
     /// Published statuses of a sensor: the state, and its stamps in ms.
     #[derive(Default)]
@@ -320,7 +321,7 @@ mod tests {
 
         fn connect(&self, _: Topic) {}
 
-        fn wake(&self, _: Wake) {}
+        fn wake(&self, _: WakeEvent) {}
 
         fn failed(&self) -> u64 {
             0
@@ -335,10 +336,10 @@ mod tests {
         sensor.add(Topic::Status).unwrap();
         let mut bytes = [0; MTU_ETHERNET];
         let status = Status { state: State::Streaming as u8, ..Status::default() };
-        let len = status.pack(&mut bytes[HEAD..]).unwrap();
+        let len = status.pack(&mut bytes[HEADER_LEN..]).unwrap();
         let head = Head { topic: Topic::Status.number(), revision: 1, hub: 5, epoch: 1, ..Head::default() };
         let datagram = Datagram::read(head.seal(&mut bytes, len).unwrap()).unwrap();
-        let arrived = |ms| Remote {
+        let arrived = |ms| ReceivedSample {
             topic: Topic::Status,
             head: datagram.head,
             payload: CheckedPayload { bytes: datagram.payload, room: len },
@@ -348,12 +349,12 @@ mod tests {
             late: false,
             authenticated: false,
         };
-        let read = |ms| Stamp { monotonic_ns: ms * MS, wall_ns: ms * MS };
+        let read = |ms| WallTimestamp { monotonic_ns: ms * MS, wall_ns: ms * MS };
         assert_eq!(sensor.publish(&arrived(1_000)), Outcome::Published);
         // The listener lags: it reads next what arrived at 4.6 s.
-        [3_999, 4_500, 4_550].into_iter().for_each(|ms| sensor.look(read(ms)));
+        [3_999, 4_500, 4_550].into_iter().for_each(|ms| sensor.do_periodic_work(read(ms)));
         assert_eq!(sensor.publish(&arrived(4_600)), Outcome::Published);
-        sensor.look(read(5_000));
+        sensor.do_periodic_work(read(5_000));
         let (streams, silent) = (Some(State::Streaming), Some(State::Silent));
         assert_eq!(
             sensor.topics.0,
@@ -370,8 +371,8 @@ mod tests {
         assert_eq!(steps((1, 0, 100), (1, 1, 103)), None);
     }
 
-    use scanhub_client::clock::Moment;
-    use scanhub_client::streams::Freshness;
+    use scanhub_client::clock::Timestamp;
+    use scanhub_client::streams::StalenessTimer;
     use scanhub_schema::{Flags, Header, Verdict};
 
     fn periods_ms(arrivals_ms: &[u64]) -> Vec<u32> {
@@ -411,7 +412,7 @@ mod tests {
     /// Follows a stream whose samples arrive every `period_ms` for a minute; one in `sent` samples arrives. Returns how
     /// often its verdict becomes unknown before the end, and how long after the end it does, in ms.
     fn follow(period_ms: u64, jitter_ms: u64, sent: u64) -> (u32, u64) {
-        let (mut arrivals, mut freshness) = (PeriodEstimator::default(), Freshness::new(at(0)));
+        let (mut arrivals, mut freshness) = (PeriodEstimator::default(), StalenessTimer::new(at(0)));
         let mut silences = 0;
         let mut next_ms = 0;
         let mut last_ms = 0;
@@ -425,7 +426,7 @@ mod tests {
                     flags: Flags::REMOTE,
                     ..Header::default()
                 };
-                assert!(freshness.heard(&header, Verdict::Clear, now));
+                assert!(freshness.update(&header, Verdict::Clear, now));
                 last_ms = ms;
                 let number = ms / period_ms + 1;
                 next_ms = number * period_ms + number * 7 % (jitter_ms + 1);
@@ -440,8 +441,8 @@ mod tests {
         panic!("never silent after the end");
     }
 
-    fn at(ms: u64) -> Moment {
-        Moment { monotonic_ns: ms * MS, boottime_ns: ms * MS }
+    fn at(ms: u64) -> Timestamp {
+        Timestamp { monotonic_ns: ms * MS, boottime_ns: ms * MS }
     }
 
     #[test]

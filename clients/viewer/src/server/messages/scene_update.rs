@@ -16,9 +16,9 @@ pub(super) fn channel(topic: &str) -> Channel {
 /// Encodes the circles of the robot's sensors, each with its radius and verdict as metadata. For each sensor with
 /// points inside a circle, adds the beam of the nearest point.
 pub(crate) fn zones(scene: &Scene, wall_ns: u64) -> Vec<u8> {
-    let around = circles(scene.robot().map(|(_, sensor)| sensor));
+    let zone_circles = circles(scene.robot().map(|(_, sensor)| sensor));
     let mut entities = Vec::new();
-    for circle in &around {
+    for circle in &zone_circles {
         let mut entity = Entity::new(format!("zone {:.3}", circle.radius_m), wall_ns);
         entity.add("radius_m", format!("{:.3}", circle.radius_m));
         entity.add("verdict", circle.verdict.name().to_owned());
@@ -29,7 +29,8 @@ pub(crate) fn zones(scene: &Scene, wall_ns: u64) -> Vec<u8> {
     }
     for (_, sensor) in scene.robot() {
         let near = |a: &Point, b: &Point| a.distance_m().total_cmp(&b.distance_m());
-        let inside = around.iter().filter_map(|circle| Some((circle.inside(sensor).min_by(near)?, circle)));
+        let inside =
+            zone_circles.iter().filter_map(|circle| Some((circle.inside(sensor).min_by(near)?, circle)));
         let smallest = |a: &Circle, b: &Circle| a.radius_m.total_cmp(&b.radius_m);
         let Some((point, circle)) = inside.min_by(|a, b| smallest(a.1, b.1)) else { continue };
         let mut entity = Entity::new(format!("beam {}", sensor.name), wall_ns);
@@ -58,7 +59,7 @@ pub(crate) fn tracks(people: &People, wall_ns: u64) -> Vec<u8> {
         entity.add("state", person.state.name().to_owned());
         entity.add("room", person.room.clone().unwrap_or_default());
         entity.cylinders.push(disc((x, y), PERSON_M, color));
-        entity.cylinders.push(oval((x, y), &person.reach, Color { a: FAINT, ..PERSON }));
+        entity.cylinders.push(oval((x, y), &person.ellipse, Color { a: FAINT, ..PERSON }));
         entity.lines.push(LinePrimitive::new(LINE_STRIP, person.tail().chain([(x, y)]), color));
         entity.texts.push(Text::new(at(x, y), 14.0, color, format!("#{}", person.id)));
         entity
@@ -106,7 +107,7 @@ pub(crate) fn obstacles(header: &Header, found: &Obstacles) -> Vec<u8> {
     sweep.add("complete", found.has(Obstacles::COMPLETE).to_string());
     sweep.add("unreliable", found.has(Obstacles::UNRELIABLE).to_string());
     sweep.add("dropped", found.dropped.to_string());
-    sweep.add("words", words(found));
+    sweep.add("words", sweep_text(found));
     let boxes = found.obstacles().iter().enumerate().map(|(number, one)| {
         let id = format!("obstacle {number}");
         let mut entity = Entity { lifetime: lifetime(), ..Entity::new(id, header.wall_ns) };
@@ -139,7 +140,7 @@ fn lifetime_ns(header: &Header) -> u64 {
     2 * header.stamp_last_ns.saturating_sub(header.stamp_first_ns).min(MAX_SWEEP_NS) + PROCESSING_NS
 }
 
-fn words(found: &Obstacles) -> String {
+fn sweep_text(found: &Obstacles) -> String {
     if found.has(Obstacles::UNRELIABLE) {
         return "sweep unreliable, its angles contradict what is known".to_owned();
     }
@@ -373,7 +374,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn obstacles_replace_earlier_ones_and_live_for_two_sweeps() {
+    fn new_obstacles_delete_earlier_and_have_a_lifetime() {
         let header = Header {
             stamp_first_ns: 1_000_000_000,
             stamp_last_ns: 2_500_000_000,
@@ -400,12 +401,12 @@ mod tests {
         let one = &message(&found)["entities"][1];
         assert_eq!(one["cubes"][0]["pose"]["position"], serde_json::json!({ "x": 1.5, "y": 0.0, "z": 0.75 }));
         assert_eq!(one["cubes"][0]["size"], serde_json::json!({ "x": 1.0, "y": 1.0, "z": 1.5 }));
-        assert_eq!(words(&found), "1 obstacle, nearest 1.0 m");
+        assert_eq!(sweep_text(&found), "1 obstacle, nearest 1.0 m");
         let mut other = Obstacles { flags: 0, ..found };
         (0..2 * scanhub_schema::MAX_OBSTACLES).for_each(|_| other.push(Obstacle::default()));
-        assert_eq!(words(&other), "129 obstacles, nearest 1.0 m, sweep incomplete");
+        assert_eq!(sweep_text(&other), "129 obstacles, nearest 1.0 m, sweep incomplete");
         other = Obstacles { flags: Obstacles::UNRELIABLE, ..Obstacles::default() };
-        assert_eq!(words(&other), "sweep unreliable, its angles contradict what is known");
+        assert_eq!(sweep_text(&other), "sweep unreliable, its angles contradict what is known");
         assert_eq!((&one["texts"][0]["text"], &one["frame_id"]), (&"1.00 m".into(), &"base_link".into()));
         assert_eq!(lifetime_ns(&Header { stamp_last_ns: u64::MAX, ..header }), 121_000_000_000);
     }

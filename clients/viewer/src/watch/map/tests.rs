@@ -37,15 +37,15 @@ fn scene() -> Scene {
 }
 
 /// As the page turns what `sensor` is sent in: by the pose that is sent, too.
-struct Placed(Vec<f64>);
+struct SensorTransform(Vec<f64>);
 
-impl Placed {
-    fn of(scene: &Scene, sensor: &Sensor) -> Placed {
-        let told = read(&TF_MESSAGE, &messages::transforms(scene, 1)).unwrap();
-        let all = told.sequence("transforms").unwrap();
+impl SensorTransform {
+    fn of(scene: &Scene, sensor: &Sensor) -> SensorTransform {
+        let message = read(&TF_MESSAGE, &messages::transforms(scene, 1)).unwrap();
+        let all = message.sequence("transforms").unwrap();
         let one = all.iter().find(|one| one.text("child_frame_id") == Some(&sensor.name)).unwrap();
         let keys = ["translation.x", "translation.y", "rotation.x", "rotation.y", "rotation.z", "rotation.w"];
-        Placed(keys.iter().map(|key| one.number(&format!("transform.{key}")).unwrap()).collect())
+        SensorTransform(keys.iter().map(|key| one.number(&format!("transform.{key}")).unwrap()).collect())
     }
 
     /// Ahead and to the left, in the robot's frame.
@@ -58,10 +58,10 @@ impl Placed {
 }
 
 /// The points of a LaserScan.
-fn points(message: &[u8], placed: &Placed) -> Vec<(f64, f64)> {
-    let told = read(&LASER_SCAN, message).unwrap();
-    let (first, step) = (told.number("angle_min").unwrap(), told.number("angle_increment").unwrap());
-    let ranges = told.sequence("ranges").unwrap().iter().enumerate();
+fn points(message: &[u8], placed: &SensorTransform) -> Vec<(f64, f64)> {
+    let scan = read(&LASER_SCAN, message).unwrap();
+    let (first, step) = (scan.number("angle_min").unwrap(), scan.number("angle_increment").unwrap());
+    let ranges = scan.sequence("ranges").unwrap().iter().enumerate();
     let point = |(i, range): (usize, &Value)| {
         let Value::Number(range) = range else { panic!("a number") };
         let (sin, cos) = (first + i as f64 * step).sin_cos();
@@ -70,32 +70,32 @@ fn points(message: &[u8], placed: &Placed) -> Vec<(f64, f64)> {
     ranges.filter_map(point).collect()
 }
 
-fn cloud(message: &[u8], placed: &Placed) -> Vec<(f64, f64)> {
-    let told = read(&POINT_CLOUD, message).unwrap();
+fn cloud(message: &[u8], placed: &SensorTransform) -> Vec<(f64, f64)> {
+    let decoded = read(&POINT_CLOUD, message).unwrap();
     let byte = |value: &Value| if let Value::Number(byte) = value { *byte as u8 } else { panic!("a byte") };
-    let bytes: Vec<u8> = told.sequence("data").unwrap().iter().map(byte).collect();
+    let bytes: Vec<u8> = decoded.sequence("data").unwrap().iter().map(byte).collect();
     let axis = |bytes: &[u8]| f64::from(f32::from_le_bytes(bytes.try_into().unwrap()));
     bytes.chunks(12).map(|point| placed.point((axis(&point[..4]), axis(&point[4..8])))).collect()
 }
 
-fn places<'a>(of: impl Iterator<Item = &'a Json>) -> Vec<(f64, f64)> {
+fn positions<'a>(of: impl Iterator<Item = &'a Json>) -> Vec<(f64, f64)> {
     of.map(|one| (one["x"].as_f64().unwrap(), one["y"].as_f64().unwrap())).collect()
 }
 
 fn entities(message: &[u8]) -> Vec<Json> {
-    let told: Json = serde_json::from_slice(message).unwrap();
-    told["entities"].as_array().unwrap().clone()
+    let update: Json = serde_json::from_slice(message).unwrap();
+    update["entities"].as_array().unwrap().clone()
 }
 
-fn all<'a>(entities: &'a [Json], kind: &str) -> Vec<&'a Json> {
+fn primitives<'a>(entities: &'a [Json], kind: &str) -> Vec<&'a Json> {
     entities.iter().flat_map(|entity| entity[kind].as_array().unwrap()).collect()
 }
 
 /// Whether `sent`, in the robot's frame, is what is `drawn`: to the right and up.
-fn same(what: &str, sent: Vec<(f64, f64)>, drawn: &Dots) {
+fn assert_same_points(kind: &str, sent: Vec<(f64, f64)>, drawn: &Dots) {
     assert!(
         !sent.is_empty() && sent.len() == drawn.len(),
-        "{what}: {} sent, {} drawn",
+        "{kind}: {} sent, {} drawn",
         sent.len(),
         drawn.len()
     );
@@ -104,19 +104,19 @@ fn same(what: &str, sent: Vec<(f64, f64)>, drawn: &Dots) {
         let nearest = drawn.iter().map(apart).fold(f64::INFINITY, f64::min);
         assert!(
             nearest < 0.0005,
-            "{what}: nothing is drawn at {ahead}, {left}, the nearest {nearest} m away"
+            "{kind}: nothing is drawn at {ahead}, {left}, the nearest {nearest} m away"
         );
     }
 }
 
 #[test]
-fn the_browser_is_sent_what_the_terminal_draws() {
+fn browser_and_terminal_draw_the_same_scene() {
     let scene = scene();
     let view = View { lines: true, dot_m: 0.01, ..View::new(true) };
     let layers = Layers::new(&scene, &view);
     let (mut scans, mut found, mut models) = (Vec::new(), Vec::new(), Vec::new());
     for sensor in &scene.sensors {
-        let placed = Placed::of(&scene, sensor);
+        let placed = SensorTransform::of(&scene, sensor);
         let (scan, mut message) = (sensor.scan.as_ref().unwrap(), Vec::new());
         scanhub_ros::laser_scan(&mut message, scanhub_ros::frame(&sensor.name), &Header::default(), scan);
         scans.extend(points(&message, &placed));
@@ -131,22 +131,27 @@ fn the_browser_is_sent_what_the_terminal_draws() {
     }
     // What stands before the background is drawn once in the terminal, and over the scan in the browser.
     let drawn: Dots = layers.walls.iter().flatten().chain(&layers.foreground).copied().collect();
-    same("scans", scans, &drawn);
-    same("foreground", found, &layers.foreground);
-    same("background", models, &layers.background);
+    assert_same_points("scans", scans, &drawn);
+    assert_same_points("foreground", found, &layers.foreground);
+    assert_same_points("background", models, &layers.background);
 
     let marks = entities(&messages::marks(&scene, 1));
-    same("marks", places(all(&marks, "spheres").iter().map(|one| &one["pose"]["position"])), &layers.marks);
+    assert_same_points(
+        "marks",
+        positions(primitives(&marks, "spheres").iter().map(|one| &one["pose"]["position"])),
+        &layers.marks,
+    );
     let lines = entities(&messages::lines(&scene, 1));
-    let ends = places(all(&lines, "lines").iter().flat_map(|one| one["points"].as_array().unwrap()));
+    let ends =
+        positions(primitives(&lines, "lines").iter().flat_map(|one| one["points"].as_array().unwrap()));
     assert_eq!(ends.len(), 4);
     for (ahead, left) in ends {
         let is_end = |(right, up): &(f64, f64)| (up - ahead).hypot(right + left) < 1e-6;
         assert!(layers.lines.iter().any(is_end), "{ahead}, {left}");
     }
-    same(
+    assert_same_points(
         "corners",
-        places(all(&lines, "spheres").iter().map(|one| &one["pose"]["position"])),
+        positions(primitives(&lines, "spheres").iter().map(|one| &one["pose"]["position"])),
         &layers.corners,
     );
 
@@ -154,29 +159,32 @@ fn the_browser_is_sent_what_the_terminal_draws() {
     let mut tails = Vec::new();
     for (entity, (right, up, number)) in people.iter().zip(&layers.people) {
         let [at, word] = [&entity["cylinders"][0], &entity["texts"][0]];
-        let told = places([&at["pose"]["position"]].into_iter())[0];
-        assert!((up - told.0).hypot(right + told.1) < 1e-9, "{told:?}, {number} at {right}, {up}");
+        let position = positions([&at["pose"]["position"]].into_iter())[0];
+        assert!(
+            (up - position.0).hypot(right + position.1) < 1e-9,
+            "{position:?}, {number} at {right}, {up}"
+        );
         let is_seen = at["color"]["a"] == 1.0;
         let text = word["text"].as_str().unwrap();
         assert_eq!(*number, if is_seen { text.to_owned() } else { format!("({text})") });
         // The last of a tail is where the person is.
-        let line = places(entity["lines"][0]["points"].as_array().unwrap().iter());
-        assert_eq!(line.last(), Some(&told));
+        let line = positions(entity["lines"][0]["points"].as_array().unwrap().iter());
+        assert_eq!(line.last(), Some(&position));
         tails.extend(line.into_iter().rev().skip(1));
     }
     assert_eq!((people.len(), layers.people.len()), (2, 2));
-    same("tails", tails, &layers.tails);
+    assert_same_points("tails", tails, &layers.tails);
 
     let zones = entities(&messages::zones(&scene, 1));
     let circle = |entity: &Json| {
-        let told = |key: &str| {
+        let metadata = |key: &str| {
             let all = entity["metadata"].as_array().unwrap();
             all.iter().find(|one| one["key"] == key).map(|one| one["value"].as_str().unwrap().to_owned())
         };
         let is_circle = !entity["cylinders"].as_array().unwrap().is_empty();
         is_circle.then(|| {
-            let sign = if told("verdict").unwrap() == "clear" { "" } else { "!" };
-            format!("{:.2}{sign}", told("radius_m").unwrap().parse::<f64>().unwrap())
+            let sign = if metadata("verdict").unwrap() == "clear" { "" } else { "!" };
+            format!("{:.2}{sign}", metadata("radius_m").unwrap().parse::<f64>().unwrap())
         })
     };
     let sent: Vec<_> = zones.iter().filter_map(circle).collect();
@@ -184,15 +192,15 @@ fn the_browser_is_sent_what_the_terminal_draws() {
         layers.circles.iter().map(|circle| circle.label.as_ref().unwrap().2.clone()).collect();
     assert_eq!((sent.len(), sent), (2, drawn));
     // The beam that is told with a circle ends at a point that is drawn.
-    let beams = all(&zones, "lines");
-    let ends = places(beams.iter().map(|one| &one["points"][1]));
+    let beams = primitives(&zones, "lines");
+    let ends = positions(beams.iter().map(|one| &one["points"][1]));
     assert_eq!(ends.len(), 1);
     let points: Dots = layers.walls.iter().flatten().chain(&layers.foreground).copied().collect();
     let is_there =
         |(ahead, left): (f64, f64)| points.iter().any(|(right, up)| (up - ahead).hypot(right + left) < 1e-6);
     assert!(is_there(ends[0]), "{ends:?}");
     for (n, sensor) in scene.sensors.iter().enumerate() {
-        let (ahead, left) = Placed::of(&scene, sensor).point((0.0, 0.0));
+        let (ahead, left) = SensorTransform::of(&scene, sensor).point((0.0, 0.0));
         let (right, up, number) = &layers.sensors[n];
         assert!((up - ahead).hypot(right + left) < 1e-9 && *number == (n + 1).to_string());
     }

@@ -5,21 +5,21 @@
 mod start;
 mod stream;
 
-use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _};
-use scanhub_drivers::rplidar::packet::Kind;
-use scanhub_drivers::rplidar::{Mode, Model, Session};
+use scanhub_drivers::line::{Action, Event, Protocol as _, ScannerSession as _};
+use scanhub_drivers::rplidar::packet::PacketFormat;
+use scanhub_drivers::rplidar::{Mode, Model, RplidarSession};
 use scanhub_drivers::{Settings, line};
 use scanhub_schema::{MILLIS, Nanos, line_time};
 
-use crate::{Damage, DamagedLine, Sent};
+use crate::{DamageRates, DamagedLine, SentPacket};
 
-pub(crate) const SECOND: Nanos = 1_000 * MILLIS;
+pub(crate) const ONE_SECOND: Nanos = 1_000 * MILLIS;
 /// Bytes that a tty returns at once.
-const TTY: usize = 4_095;
+const TTY_READ_LEN: usize = 4_095;
 
 /// A revolution as the session delivered it.
 #[derive(Debug)]
-pub(crate) struct Told {
+pub(crate) struct DeliveredRevolution {
     /// Points: clockwise angle in degrees, 0 to 360, and range in mm.
     pub(crate) points: Vec<(f64, u16)>,
     pub(crate) first: Nanos,
@@ -30,7 +30,7 @@ pub(crate) struct Told {
 
 /// An output of the session as a recorder keeps it.
 #[derive(Clone)]
-pub(crate) struct Kept {
+pub(crate) struct RecordedOutput {
     pub(crate) first: Nanos,
     pub(crate) last: Nanos,
     pub(crate) bytes: Vec<u8>,
@@ -38,95 +38,95 @@ pub(crate) struct Kept {
 }
 
 #[derive(Default)]
-pub(crate) struct Log {
+pub(crate) struct SessionLog {
     pub(crate) packets: Vec<Vec<u8>>,
-    pub(crate) turns: Vec<Told>,
+    pub(crate) revolutions: Vec<DeliveredRevolution>,
     pub(crate) replies: usize,
     /// All outputs except revolutions.
-    pub(crate) heard: Vec<Kept>,
+    pub(crate) outputs: Vec<RecordedOutput>,
     pub(crate) reads: usize,
     pub(crate) bauds: Vec<u32>,
     pub(crate) dtr: Vec<bool>,
 }
 
-pub(crate) struct Bench {
-    pub(crate) session: Session,
-    pub(crate) head: Head,
+pub(crate) struct TestBench {
+    pub(crate) session: RplidarSession,
+    pub(crate) scanner: SimulatedScanner,
     pub(crate) now: Nanos,
-    pub(crate) log: Log,
+    pub(crate) log: SessionLog,
 }
 
-impl Bench {
-    pub(crate) fn new(settings: Settings, head: Head) -> Bench {
-        Bench { session: Session::new(settings, 0), head, now: 0, log: Log::default() }
+impl TestBench {
+    pub(crate) fn new(settings: Settings, scanner: SimulatedScanner) -> TestBench {
+        TestBench { session: RplidarSession::new(settings, 0), scanner, now: 0, log: SessionLog::default() }
     }
 
     /// Drives the session until `until`.
     pub(crate) fn run(&mut self, until: Nanos) {
         while self.now < until {
             let (wakes_at, waits) = self.drain();
-            let ready = if waits { self.head.next(wakes_at.min(until), self.now) } else { Nanos::MAX };
+            let ready = if waits { self.scanner.next(wakes_at.min(until), self.now) } else { Nanos::MAX };
             self.now = wakes_at.min(ready.max(self.now)).min(until).max(self.now);
             self.read(self.now >= wakes_at);
         }
     }
 
     /// Drives it until `done`, for `most` at most. How long that took.
-    pub(crate) fn until(&mut self, most: Nanos, done: impl Fn(&Bench) -> bool) -> Nanos {
-        let begun = self.now;
-        while !done(self) {
-            assert!(self.now < begun + most, "{:?} {:?}", self.session.state(), self.session.trouble());
+    pub(crate) fn run_until(&mut self, max_time: Nanos, is_done: impl Fn(&TestBench) -> bool) -> Nanos {
+        let started = self.now;
+        while !is_done(self) {
+            assert!(self.now < started + max_time, "{:?} {:?}", self.session.state(), self.session.problem());
             self.run(self.now + 5 * MILLIS);
         }
-        self.now - begun
+        self.now - started
     }
 
     pub(crate) fn read(&mut self, is_timeout: bool) {
-        let room = self.session.spare().len().min(TTY);
-        let mut bytes = self.head.read(self.now, room);
-        if self.session.rate() != self.head.baud {
+        let room = self.session.read_buffer().len().min(TTY_READ_LEN);
+        let mut bytes = self.scanner.read(self.now, room);
+        if self.session.rate() != self.scanner.baud {
             // Another rate makes noise of it.
-            let made = |byte: &u8| if self.head.is_text { b'0' | byte & 15 } else { byte | 0x80 };
+            let made = |byte: &u8| if self.scanner.is_text { b'0' | byte & 15 } else { byte | 0x80 };
             bytes = bytes.iter().step_by(3).map(made).collect();
         }
-        self.session.spare()[..bytes.len()].copy_from_slice(&bytes);
+        self.session.read_buffer()[..bytes.len()].copy_from_slice(&bytes);
         self.session.commit(self.now, bytes.len());
         self.log.reads += 1;
         if bytes.is_empty() && is_timeout {
             self.session.handle_timeout(self.now);
         }
-        let account = self.session.account();
-        assert_eq!(account.read, account.in_telegrams + account.discarded + account.buffered);
+        let stats = self.session.stats();
+        assert_eq!(stats.read, stats.in_telegrams + stats.discarded + stats.buffered);
     }
 
     /// Returns the end of the session's rest or wait, and whether it is a wait.
     fn drain(&mut self) -> (Nanos, bool) {
         loop {
-            match self.session.poll_output() {
-                Output::SetRate(baud) => {
-                    self.head.read(self.now, usize::MAX);
+            match self.session.poll_action() {
+                Action::SetRate(baud) => {
+                    self.scanner.read(self.now, usize::MAX);
                     self.log.bauds.push(baud);
                 }
-                Output::SetDtr(on) => {
-                    self.head.dtr = on;
+                Action::SetDtr(on) => {
+                    self.scanner.dtr = on;
                     self.log.dtr.push(on);
                 }
-                Output::Transmit { bytes, not_before } => {
+                Action::Transmit { bytes, not_before } => {
                     self.now = self.now.max(not_before);
                     assert!(bytes.len() > 1, "a request is one write: {bytes:?}");
                     let bytes = bytes.to_vec();
                     let rate = self.session.rate();
-                    bytes.into_iter().for_each(|byte| self.head.write(byte, rate, self.now));
-                    self.session.transmitted(self.now);
+                    bytes.into_iter().for_each(|byte| self.scanner.write(byte, rate, self.now));
+                    self.session.handle_transmitted(self.now);
                 }
-                Output::Rest(until) => {
+                Action::SleepUntil(until) => {
                     assert!(until > self.now && until <= self.now + 5 * MILLIS);
                     return (until, false);
                 }
-                Output::Wait { until, .. } => return (until, true),
-                Output::Event(Event::Telegram(received)) => {
+                Action::Wait { until, .. } => return (until, true),
+                Action::Event(Event::Telegram(received)) => {
                     assert!(received.first <= received.last && received.last <= self.now, "{received:?}");
-                    self.log.heard.push(Kept {
+                    self.log.outputs.push(RecordedOutput {
                         first: received.first,
                         last: received.last,
                         bytes: received.bytes.to_vec(),
@@ -141,16 +141,16 @@ impl Bench {
                     assert_eq!(received.is_checked, len > 5);
                     self.log.packets.extend(received.bytes.chunks_exact(len).map(<[u8]>::to_vec));
                 }
-                Output::Event(Event::Scan(turn)) => {
-                    let points = turn.points().iter();
-                    self.log.turns.push(Told {
+                Action::Event(Event::Scan(scan)) => {
+                    let points = scan.points().iter();
+                    self.log.revolutions.push(DeliveredRevolution {
                         points: points
                             .map(|point| (-f64::from(point.angle).to_degrees(), point.range))
                             .collect(),
-                        first: turn.first,
-                        incomplete: turn.is_incomplete(),
-                        reasons: turn.reasons,
-                        beams: turn.beams(),
+                        first: scan.first,
+                        incomplete: scan.is_incomplete(),
+                        reasons: scan.reasons,
+                        beams: scan.beams(),
                     });
                 }
             }
@@ -160,89 +160,96 @@ impl Bench {
     /// Checks the revolutions of the current stream: each has points of one revolution of the head at their right
     /// places. Without a mark, none is missing. Returns the largest error of a stamp, and the number of wrong points
     /// of unmarked revolutions.
-    pub(crate) fn judge(&self, turns: &[Told]) -> (Nanos, usize) {
-        let kind = self.head.kind().expect("measuring");
-        let (step, mut worst, mut wrong) = (self.head.step(), 0, 0);
-        let begun = self.head.time(0.0).expect("measuring");
+    pub(crate) fn check_revolutions(&self, revolutions: &[DeliveredRevolution]) -> (Nanos, usize) {
+        let kind = self.scanner.kind().expect("measuring");
+        let (step, mut worst, mut wrong) = (self.scanner.step(), 0, 0);
+        let started = self.scanner.time(0.0).expect("measuring");
         let per_turn = 360.0 / step;
         let mut last_turn = -1.0;
-        for told in turns.iter().filter(|told| told.first > begun) {
+        for delivered in revolutions.iter().filter(|delivered| delivered.first > started) {
             // Beam 0's edge is half a beam before the zero.
-            let edge = 180.0 / told.beams as f64;
-            let about = (told.first - begun) as f64 / (self.head.time(1.0).unwrap() - begun) as f64;
-            let turn = ((about + shift(kind) / -step) / per_turn).round();
-            assert!(turn > last_turn, "two turns are one: {turn} after {last_turn}");
-            last_turn = turn;
-            let zero = (turn * 360.0 + shift(kind) - edge) / step;
-            worst = worst.max(told.first.abs_diff(self.head.time(zero).expect("measuring")));
-            let bad = told.points.iter().filter(|point| !self.is_right(kind, turn, **point, edge)).count();
-            assert!(told.points.len() as f64 <= per_turn + 12.0, "merged: {}", told.points.len());
-            if !told.incomplete && told.reasons == 0 {
+            let edge = 180.0 / delivered.beams as f64;
+            let about =
+                (delivered.first - started) as f64 / (self.scanner.time(1.0).unwrap() - started) as f64;
+            let revolution = ((about + mean_shift(kind) / -step) / per_turn).round();
+            assert!(revolution > last_turn, "two turns are one: {revolution} after {last_turn}");
+            last_turn = revolution;
+            let zero = (revolution * 360.0 + mean_shift(kind) - edge) / step;
+            worst = worst.max(delivered.first.abs_diff(self.scanner.time(zero).expect("measuring")));
+            let bad = delivered
+                .points
+                .iter()
+                .filter(|point| !self.is_right(kind, revolution, **point, edge))
+                .count();
+            assert!(delivered.points.len() as f64 <= per_turn + 12.0, "merged: {}", delivered.points.len());
+            if !delivered.incomplete && delivered.reasons == 0 {
                 wrong += bad;
-                let lacking = per_turn - told.points.len() as f64;
-                assert!(lacking < 12.0, "{lacking} points lack in turn {turn}");
+                let lacking = per_turn - delivered.points.len() as f64;
+                assert!(lacking < 12.0, "{lacking} points lack in turn {revolution}");
             }
         }
         (worst, wrong)
     }
 
-    fn is_right(&self, kind: Kind, turn: f64, (degrees, range): (f64, u16), edge: f64) -> bool {
-        let step = self.head.step();
+    fn is_right(&self, kind: PacketFormat, revolution: f64, (degrees, range): (f64, u16), edge: f64) -> bool {
+        let step = self.scanner.step();
         if !(-edge - 0.1..360.0 - edge + 0.1).contains(&degrees) {
             return false;
         }
-        let around = (turn * 360.0 + degrees) / step;
+        let around = (revolution * 360.0 + degrees) / step;
         let (from, to) = (around - 2.0, around + 10.0 / step + 2.0);
         (from.max(0.0) as u64..to.max(0.0) as u64).any(|point| {
-            let sample = Head::sample(point);
+            let sample = SimulatedScanner::sample(point);
             let range = if range == line::NO_RETURN { 0 } else { u32::from(range) };
             // A difference from a missing return cannot be encoded.
-            let is_untold = kind == Kind::Ultra && point % 3 == 2 && Head::sample(point + 1).range == 0;
-            let sample = if is_untold { Sample { range: 0, ..sample } } else { sample };
-            let angle = point as f64 * step - Head::before(kind, sample);
-            sample.range.abs_diff(range) <= 4 && (angle - turn * 360.0 - degrees).abs() < 0.1
+            let is_untold = kind == PacketFormat::Ultra
+                && point % 3 == 2
+                && SimulatedScanner::sample(point + 1).range == 0;
+            let sample = if is_untold { TestPoint { range: 0, ..sample } } else { sample };
+            let angle = point as f64 * step - SimulatedScanner::angle_before(kind, sample);
+            sample.range.abs_diff(range) <= 4 && (angle - revolution * 360.0 - degrees).abs() < 0.1
         })
     }
 
-    pub(crate) fn intact_packets_came_once_in_order(&self) {
-        let mut came = self.log.packets.iter();
-        for sent in self.head.sent.iter().filter(|sent| sent.intact && sent.at + 20 * MILLIS < self.now) {
-            assert!(came.any(|bytes| *bytes == sent.bytes), "lost: {:?} at {}", sent.bytes, sent.at);
+    pub(crate) fn assert_intact_packets_once_in_order(&self) {
+        let mut arrived = self.log.packets.iter();
+        for sent in self.scanner.sent.iter().filter(|sent| sent.intact && sent.at + 20 * MILLIS < self.now) {
+            assert!(arrived.any(|bytes| *bytes == sent.bytes), "lost: {:?} at {}", sent.bytes, sent.at);
         }
     }
 }
 
 /// Degrees by which points lie before their places on the mean.
-fn shift(kind: Kind) -> f64 {
+fn mean_shift(kind: PacketFormat) -> f64 {
     match kind {
-        Kind::Express => 4.0,
-        Kind::Ultra => 7.2,
+        PacketFormat::Express => 4.0,
+        PacketFormat::Ultra => 7.2,
         _ => 0.0,
     }
 }
 
 /// A mode that it offers.
-pub(crate) type Offered = (&'static str, f64, Kind);
+pub(crate) type OfferedMode = (&'static str, f64, PacketFormat);
 
 #[derive(Clone, Copy, Debug, PartialEq)]
-enum Doing {
+enum ScannerState {
     Nothing,
     Booting {
         until: Nanos,
     },
     /// First point of the stream, and number of packets that were sent.
     Measuring {
-        kind: Kind,
+        kind: PacketFormat,
         us: f64,
-        zero: Nanos,
+        first_point_at: Nanos,
         packets: u64,
     },
 }
 
-pub(crate) struct Head {
+pub(crate) struct SimulatedScanner {
     pub(crate) id: u8,
     pub(crate) baud: u32,
-    pub(crate) modes: Vec<Offered>,
+    pub(crate) modes: Vec<OfferedMode>,
     pub(crate) typical: u8,
     /// Firmware that cannot list its modes.
     pub(crate) is_old: bool,
@@ -255,9 +262,9 @@ pub(crate) struct Head {
     /// Health status and error code.
     pub(crate) health: (u8, u16),
     /// Whether a reboot clears the error.
-    pub(crate) heals: bool,
+    pub(crate) clears_on_reboot: bool,
     /// Requests that the scanner ignores, one entry for each time.
-    pub(crate) deaf_to: Vec<u8>,
+    pub(crate) ignored_requests: Vec<u8>,
     /// Whether it has power.
     pub(crate) is_on: bool,
     /// Bytes that it sends before its greeting.
@@ -268,102 +275,122 @@ pub(crate) struct Head {
     /// The last request for a motor: duty or speed.
     pub(crate) motor: Option<u16>,
     pub(crate) requests: Vec<u8>,
-    doing: Doing,
+    state: ScannerState,
     request: Vec<u8>,
     random: fastrand::Rng,
     pub(crate) line: DamagedLine,
     free_at: Nanos,
-    pub(crate) sent: Vec<Sent>,
+    pub(crate) sent: Vec<SentPacket>,
     /// Points of the streams before this one.
-    before: u64,
+    earlier_points: u64,
 }
 
-impl Head {
-    pub(crate) fn new(model: Model, seed: u64) -> Head {
-        let (id, modes): (u8, Vec<Offered>) = match model {
+impl SimulatedScanner {
+    pub(crate) fn new(model: Model, seed: u64) -> SimulatedScanner {
+        let (id, modes): (u8, Vec<OfferedMode>) = match model {
             Model::A1 => (
                 0x18,
                 vec![
-                    ("Standard", 508.0, Kind::Standard),
-                    ("Express", 254.0, Kind::Express),
-                    ("Boost", 127.0, Kind::Ultra),
-                    ("Sensitivity", 127.0, Kind::Ultra),
-                    ("Stability", 201.0, Kind::Ultra),
+                    ("Standard", 508.0, PacketFormat::Standard),
+                    ("Express", 254.0, PacketFormat::Express),
+                    ("Boost", 127.0, PacketFormat::Ultra),
+                    ("Sensitivity", 127.0, PacketFormat::Ultra),
+                    ("Stability", 201.0, PacketFormat::Ultra),
                 ],
             ),
-            Model::A2m8 => {
-                (0x28, vec![("Standard", 500.0, Kind::Standard), ("Sensitivity", 125.0, Kind::Ultra)])
-            }
-            Model::A2m12 => {
-                (0x2C, vec![("Standard", 250.0, Kind::Standard), ("Sensitivity", 62.5, Kind::Ultra)])
-            }
-            Model::A3 => {
-                (0x31, vec![("Standard", 250.0, Kind::Standard), ("Sensitivity", 62.5, Kind::Ultra)])
-            }
-            Model::S1 => {
-                (0x61, vec![("Standard", 217.5, Kind::Standard), ("DenseBoost", 108.75, Kind::Dense)])
-            }
-            Model::S2 => (0x71, vec![("Standard", 62.5, Kind::Standard), ("DenseBoost", 31.25, Kind::Dense)]),
-            Model::S3 => {
-                (0x81, vec![("Standard", 62.5, Kind::Standard), ("Ultra Dense", 31.25, Kind::UltraDense)])
-            }
-            Model::C1 => {
-                (0x41, vec![("Standard", 200.0, Kind::Standard), ("DenseBoost", 200.0, Kind::Dense)])
-            }
+            Model::A2m8 => (
+                0x28,
+                vec![
+                    ("Standard", 500.0, PacketFormat::Standard),
+                    ("Sensitivity", 125.0, PacketFormat::Ultra),
+                ],
+            ),
+            Model::A2m12 => (
+                0x2C,
+                vec![("Standard", 250.0, PacketFormat::Standard), ("Sensitivity", 62.5, PacketFormat::Ultra)],
+            ),
+            Model::A3 => (
+                0x31,
+                vec![("Standard", 250.0, PacketFormat::Standard), ("Sensitivity", 62.5, PacketFormat::Ultra)],
+            ),
+            Model::S1 => (
+                0x61,
+                vec![
+                    ("Standard", 217.5, PacketFormat::Standard),
+                    ("DenseBoost", 108.75, PacketFormat::Dense),
+                ],
+            ),
+            Model::S2 => (
+                0x71,
+                vec![("Standard", 62.5, PacketFormat::Standard), ("DenseBoost", 31.25, PacketFormat::Dense)],
+            ),
+            Model::S3 => (
+                0x81,
+                vec![
+                    ("Standard", 62.5, PacketFormat::Standard),
+                    ("Ultra Dense", 31.25, PacketFormat::UltraDense),
+                ],
+            ),
+            Model::C1 => (
+                0x41,
+                vec![("Standard", 200.0, PacketFormat::Standard), ("DenseBoost", 200.0, PacketFormat::Dense)],
+            ),
         };
-        Head {
+        SimulatedScanner {
             id,
             baud: model.baud(),
             typical: modes.len() as u8 - 1,
             modes,
             is_old: false,
-            hz: f64::from(model.turns_per_second()) * 1.000_7,
+            hz: f64::from(model.revolutions_per_second()) * 1.000_7,
             spin_up: 0,
             drift: 0.0,
             health: (0, 0),
-            heals: true,
-            deaf_to: Vec::new(),
+            clears_on_reboot: true,
+            ignored_requests: Vec::new(),
             is_on: true,
             junk: Vec::new(),
             dtr: true,
             is_text: false,
             motor: None,
             requests: Vec::new(),
-            doing: Doing::Nothing,
+            state: ScannerState::Nothing,
             request: Vec::new(),
             random: fastrand::Rng::with_seed(seed),
-            line: DamagedLine::new(Damage::default()),
+            line: DamagedLine::new(DamageRates::default()),
             free_at: 0,
             sent: Vec::new(),
-            before: 0,
+            earlier_points: 0,
         }
     }
 
     /// Starts its first mode of this kind, as another program may have left it.
-    pub(crate) fn left_in(&mut self, kind: Kind, now: Nanos) {
+    pub(crate) fn start_before(&mut self, kind: PacketFormat, now: Nanos) {
         let us = self.modes.iter().find(|(.., of)| *of == kind).map_or(254.0, |(_, us, _)| *us);
-        self.doing = Doing::Measuring { kind, us, zero: now, packets: 0 };
+        self.state = ScannerState::Measuring { kind, us, first_point_at: now, packets: 0 };
         self.dtr = false;
     }
 
     /// Puts this number of unread bytes on the line.
-    pub(crate) fn line_is_full(&mut self, bytes: usize) {
+    pub(crate) fn fill_line(&mut self, bytes: usize) {
         self.line.bytes.extend((0..bytes).map(|n| (0, (n * 31 % 256) as u8)));
     }
 
     /// Cycles the power: the scanner boots.
     pub(crate) fn boot(&mut self, now: Nanos) {
         self.end(now);
-        self.doing = Doing::Booting { until: now + 671 * MILLIS };
+        self.state = ScannerState::Booting { until: now + 671 * MILLIS };
     }
 
     pub(crate) fn is_measuring(&self) -> bool {
-        matches!(self.doing, Doing::Measuring { .. })
+        matches!(self.state, ScannerState::Measuring { .. })
     }
 
     fn us(&self) -> Option<(Nanos, f64)> {
-        match self.doing {
-            Doing::Measuring { zero, us, .. } => Some((zero, us * 1e3 * (1.0 + self.drift))),
+        match self.state {
+            ScannerState::Measuring { first_point_at: zero, us, .. } => {
+                Some((zero, us * 1e3 * (1.0 + self.drift)))
+            }
             _ => None,
         }
     }
@@ -379,19 +406,19 @@ impl Head {
     }
 
     /// Returns point number `point`.
-    pub(crate) fn sample(point: u64) -> Sample {
+    pub(crate) fn sample(point: u64) -> TestPoint {
         let range = if point % 7 == 3 { 0 } else { 1_500 + (point * 7_919 % 997) as u32 };
-        Sample { range, eighths: (point * 13 % 64) as u32, quality: 1 + (point % 60) as u32 }
+        TestPoint { range, eighths: (point * 13 % 64) as u32, quality: 1 + (point % 60) as u32 }
     }
 
     /// Returns the angle by which it lies before its place, in degrees.
-    pub(crate) fn before(kind: Kind, sample: Sample) -> f64 {
+    pub(crate) fn angle_before(kind: PacketFormat, sample: TestPoint) -> f64 {
         match kind {
             // One in eight comes out of order, by up to five places.
-            Kind::Standard if sample.eighths < 8 => f64::from(sample.eighths),
-            Kind::Express => f64::from(sample.eighths) / 8.0,
-            Kind::Ultra if sample.range < 50 => 7.5,
-            Kind::Ultra => {
+            PacketFormat::Standard if sample.eighths < 8 => f64::from(sample.eighths),
+            PacketFormat::Express => f64::from(sample.eighths) / 8.0,
+            PacketFormat::Ultra if sample.range < 50 => 7.5,
+            PacketFormat::Ultra => {
                 let k2 = f64::from(98_361 / (4 * sample.range));
                 8.0 - (k2 / 1024.0 + k2.powi(3) / 6_442_450_944.0).to_degrees()
             }
@@ -402,7 +429,7 @@ impl Head {
     /// Takes a byte that the host sent at `rate` and that left the line at `now`.
     pub(crate) fn write(&mut self, byte: u8, rate: u32, now: Nanos) {
         self.send_until(now);
-        if !self.is_on || rate != self.baud || matches!(self.doing, Doing::Booting { .. }) {
+        if !self.is_on || rate != self.baud || matches!(self.state, ScannerState::Booting { .. }) {
             return;
         }
         if self.request.is_empty() && byte != 0xA5 {
@@ -421,13 +448,13 @@ impl Head {
         if let Some((command, payload)) = request {
             self.request.clear();
             self.requests.push(command);
-            self.obey(command, &payload, now);
+            self.handle_request(command, &payload, now);
         }
     }
 
-    fn obey(&mut self, command: u8, payload: &[u8], now: Nanos) {
-        if let Some(at) = self.deaf_to.iter().position(|unheard| *unheard == command) {
-            self.deaf_to.swap_remove(at);
+    fn handle_request(&mut self, command: u8, payload: &[u8], now: Nanos) {
+        if let Some(at) = self.ignored_requests.iter().position(|unheard| *unheard == command) {
+            self.ignored_requests.swap_remove(at);
             return;
         }
         if self.is_measuring() && !matches!(command, 0x25 | 0x40 | 0xA8 | 0xF0) {
@@ -437,7 +464,7 @@ impl Head {
         match command {
             0x25 => self.end(now),
             0x40 => {
-                if self.heals {
+                if self.clears_on_reboot {
                     self.health = (0, 0);
                 }
                 self.boot(now);
@@ -445,15 +472,15 @@ impl Head {
             0x50 => {
                 let mut info = vec![self.id, 29, 1, 7];
                 info.extend((0..16).map(|n| n * 17));
-                self.answer(0x04, 0, &info, now);
+                self.reply(0x04, 0, &info, now);
             }
             0x52 => {
                 let [low, high] = self.health.1.to_le_bytes();
-                self.answer(0x06, 0, &[self.health.0, low, high], now);
+                self.reply(0x06, 0, &[self.health.0, low, high], now);
             }
             0x59 => {
                 let us = |n: usize| (self.modes.get(n).map_or(0.0, |mode| mode.1) as u16).to_le_bytes();
-                self.answer(0x15, 0, &[us(0), us(1)].concat(), now);
+                self.reply(0x15, 0, &[us(0), us(1)].concat(), now);
             }
             0x84 if self.is_old => {}
             0x84 => {
@@ -462,14 +489,14 @@ impl Head {
                 let data = match payload[0] {
                     0x70 => (self.modes.len() as u16).to_le_bytes().to_vec(),
                     0x71 => ((us * 256.0) as u32).to_le_bytes().to_vec(),
-                    0x75 => vec![answer_of(kind)],
+                    0x75 => vec![descriptor_type(kind)],
                     0x7C => vec![self.typical, 0],
                     0x7F => [name.as_bytes(), &[0]].concat(),
                     key => panic!("{key:02X} is not asked for"),
                 };
-                self.answer(0x20, 0, &[&payload[..4], &data[..]].concat(), now);
+                self.reply(0x20, 0, &[&payload[..4], &data[..]].concat(), now);
             }
-            0xFF => self.answer(0xFF, 0, &[u8::from(self.id >> 4 == 2), 0, 0, 0], now),
+            0xFF => self.reply(0xFF, 0, &[u8::from(self.id >> 4 == 2), 0, 0, 0], now),
             0xF0 | 0xA8 => self.motor = Some(word(0)),
             0x20 | 0x82 => {
                 let mode = if command == 0x20 { 0 } else { usize::from(payload[0]) };
@@ -477,17 +504,17 @@ impl Head {
                     true if command == 0x82 => self.modes[1],
                     _ => self.modes[mode],
                 };
-                let len = kind.bytes() as u8;
-                self.answer(answer_of(kind), 0x40, &[len], now);
-                let zero = now + self.spin_up + 10 * MILLIS + (self.before % 7_777) * 10_000;
-                self.doing = Doing::Measuring { kind, us, zero, packets: 0 };
+                let len = kind.byte_len() as u8;
+                self.reply(descriptor_type(kind), 0x40, &[len], now);
+                let zero = now + self.spin_up + 10 * MILLIS + (self.earlier_points % 7_777) * 10_000;
+                self.state = ScannerState::Measuring { kind, us, first_point_at: zero, packets: 0 };
             }
             command => panic!("{command:02X} must not be said"),
         }
     }
 
     /// `data`, or packets of as many bytes as it says.
-    fn answer(&mut self, answer: u8, times: u8, data: &[u8], now: Nanos) {
+    fn reply(&mut self, answer: u8, times: u8, data: &[u8], now: Nanos) {
         let len = if times > 0 { data[0] } else { data.len() as u8 };
         let mut at = (now + 2 * MILLIS).max(self.free_at);
         let head = [0xA5, 0x5A, len, 0, 0, times, answer];
@@ -501,10 +528,10 @@ impl Head {
 
     fn end(&mut self, now: Nanos) {
         self.send_until(now);
-        if let Doing::Measuring { kind, packets, .. } = self.doing {
-            self.before += packets * kind.points() as u64;
+        if let ScannerState::Measuring { kind, packets, .. } = self.state {
+            self.earlier_points += packets * kind.points() as u64;
         }
-        self.doing = Doing::Nothing;
+        self.state = ScannerState::Nothing;
     }
 
     /// Returns the bytes that have arrived by `now`, at most `room`.
@@ -524,42 +551,46 @@ impl Head {
     }
 
     fn send_until(&mut self, now: Nanos) {
-        if let Doing::Booting { until } = self.doing
+        if let ScannerState::Booting { until } = self.state
             && now >= until
         {
-            self.doing = Doing::Nothing;
+            self.state = ScannerState::Nothing;
             let text = b"RP LIDAR System.\r\nFirmware Ver 1.29, HW Ver 7\r\nModel: 18\r\n......";
             let text = [&self.junk[..], &text[..64]].concat();
             for (n, byte) in text.iter().enumerate() {
                 self.line.bytes.push_back((until + line_time(n + 1, self.baud), *byte));
             }
         }
-        while let Doing::Measuring { kind, packets, .. } = self.doing {
+        while let ScannerState::Measuring { kind, packets, .. } = self.state {
             let points = kind.points() as u64;
             let first = packets * points;
             let Some(done) = self.time((first + points - 1) as f64).filter(|done| *done <= now && self.is_on)
             else {
                 return;
             };
-            let samples: Vec<_> = (first..first + points).map(Head::sample).collect();
-            let late = if kind == Kind::Standard { Head::before(kind, samples[0]) } else { 0.0 };
+            let samples: Vec<_> = (first..first + points).map(SimulatedScanner::sample).collect();
+            let late = if kind == PacketFormat::Standard {
+                SimulatedScanner::angle_before(kind, samples[0])
+            } else {
+                0.0
+            };
             let start = first as f64 * self.step() - late;
-            let bytes = encode(kind, start, &samples, Head::sample(first + points));
-            self.put(&bytes, done);
-            if let Doing::Measuring { packets, .. } = &mut self.doing {
+            let bytes = encode(kind, start, &samples, SimulatedScanner::sample(first + points));
+            self.put_on_line(&bytes, done);
+            if let ScannerState::Measuring { packets, .. } = &mut self.state {
                 *packets += 1;
             }
         }
     }
 
-    fn put(&mut self, bytes: &[u8], done: Nanos) {
-        let sent = self.line.carry(bytes, done.max(self.free_at), self.baud, &mut self.random);
+    fn put_on_line(&mut self, bytes: &[u8], done: Nanos) {
+        let sent = self.line.transmit(bytes, done.max(self.free_at), self.baud, &mut self.random);
         self.free_at = sent.at;
         self.sent.push(sent);
     }
 
     /// Sends the rest of a packet, which is text.
-    pub(crate) fn leave_text(&mut self, now: Nanos) {
+    pub(crate) fn send_rest_as_text(&mut self, now: Nanos) {
         self.send_until(now);
         for _ in 0..60 {
             self.free_at = self.free_at.max(now) + line_time(1, self.baud);
@@ -568,11 +599,11 @@ impl Head {
     }
 
     /// Loses the bytes on the line and the next ones up to `until`.
-    pub(crate) fn cut(&mut self, until: Nanos) {
+    pub(crate) fn lose_until(&mut self, until: Nanos) {
         self.send_until(until);
         let oldest = self.line.bytes.front().map_or(until, |(at, _)| *at);
         self.line.bytes.retain(|(at, _)| *at > until);
-        let is_hit = |sent: &&mut Sent| sent.at >= oldest && sent.at <= until + 10 * MILLIS;
+        let is_hit = |sent: &&mut SentPacket| sent.at >= oldest && sent.at <= until + 10 * MILLIS;
         self.sent.iter_mut().filter(is_hit).for_each(|sent| sent.intact = false);
     }
 
@@ -580,25 +611,25 @@ impl Head {
     pub(crate) fn overflow(&mut self, until: Nanos, room: usize) {
         self.send_until(until);
         let Some(kind) = self.kind() else { return };
-        let dropped = self.line.bytes.len().saturating_sub(room) / kind.bytes();
-        self.line.bytes.truncate(self.line.bytes.len() - dropped * kind.bytes());
+        let dropped = self.line.bytes.len().saturating_sub(room) / kind.byte_len();
+        self.line.bytes.truncate(self.line.bytes.len() - dropped * kind.byte_len());
         self.sent.iter_mut().rev().take(dropped).for_each(|sent| sent.intact = false);
     }
 
     /// Returns the kind of the packets that it sends.
-    pub(crate) fn kind(&self) -> Option<Kind> {
-        if let Doing::Measuring { kind, .. } = self.doing { Some(kind) } else { None }
+    pub(crate) fn kind(&self) -> Option<PacketFormat> {
+        if let ScannerState::Measuring { kind, .. } = self.state { Some(kind) } else { None }
     }
 
     /// Returns whether the scanner has this mode.
-    pub(crate) fn has(&self, mode: Mode) -> bool {
+    pub(crate) fn has_mode(&self, mode: Mode) -> bool {
         self.modes.iter().any(|(name, ..)| name.replace(' ', "").eq_ignore_ascii_case(mode.name()))
     }
 }
 
 /// A point as it is encoded: its raw angle is that of its place.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Sample {
+pub(crate) struct TestPoint {
     /// Range in mm; 0 is no return.
     pub(crate) range: u32,
     /// Eighths of a degree by which it lies before its place; express packets only.
@@ -607,11 +638,11 @@ pub(crate) struct Sample {
 }
 
 /// Encodes a packet that starts at `start` degrees. `next` is the first point after it.
-pub(crate) fn encode(kind: Kind, start: f64, samples: &[Sample], next: Sample) -> Vec<u8> {
+pub(crate) fn encode(kind: PacketFormat, start: f64, samples: &[TestPoint], next: TestPoint) -> Vec<u8> {
     let word = ((start.rem_euclid(360.0) * 64.0) as u16).to_le_bytes();
     let mut bytes = match kind {
-        Kind::Standard => {
-            let Sample { range, quality, .. } = samples[0];
+        PacketFormat::Standard => {
+            let TestPoint { range, quality, .. } = samples[0];
             let angle = ((start.rem_euclid(360.0) * 64.0) as u16) << 1 | 1;
             let quality = if range == 0 { 0 } else { quality as u8 & 63 };
             let head = quality << 2 | if start.rem_euclid(360.0) < 2.0 { 1 } else { 2 };
@@ -620,12 +651,12 @@ pub(crate) fn encode(kind: Kind, start: f64, samples: &[Sample], next: Sample) -
             bytes.extend((range as u16 * 4).to_le_bytes());
             return bytes;
         }
-        Kind::UltraDense => [vec![0, 0, 1, 2, 3, 4, 0, 0], word.to_vec()].concat(),
+        PacketFormat::UltraDense => [vec![0, 0, 1, 2, 3, 4, 0, 0], word.to_vec()].concat(),
         _ => [vec![0, 0], word.to_vec()].concat(),
     };
     match kind {
-        Kind::Standard => unreachable!("encoded above"),
-        Kind::Express => {
+        PacketFormat::Standard => unreachable!("encoded above"),
+        PacketFormat::Express => {
             for two in samples.chunks(2) {
                 for sample in two {
                     bytes.extend((((sample.range << 2) | sample.eighths >> 4) as u16).to_le_bytes());
@@ -633,11 +664,11 @@ pub(crate) fn encode(kind: Kind, start: f64, samples: &[Sample], next: Sample) -
                 bytes.push((two[0].eighths & 15 | (two[1].eighths & 15) << 4) as u8);
             }
         }
-        Kind::Ultra => {
+        PacketFormat::Ultra => {
             for (n, three) in samples.chunks(3).enumerate() {
                 let behind = samples.get(3 * n + 3).copied().unwrap_or(next);
                 let ((stored, base, level), (_, base_behind, level_behind)) =
-                    (major(three[0].range), major(behind.range));
+                    (encode_major(three[0].range), encode_major(behind.range));
                 let differs = |range: u32, base: i64, level: u32| {
                     let difference = (i64::from(range) - base) >> level;
                     let is_told = range > 0 && (-511..511).contains(&difference);
@@ -650,8 +681,10 @@ pub(crate) fn encode(kind: Kind, start: f64, samples: &[Sample], next: Sample) -
                 bytes.extend((stored | first << 12 | second << 22).to_le_bytes());
             }
         }
-        Kind::Dense => samples.iter().for_each(|sample| bytes.extend((sample.range as u16).to_le_bytes())),
-        Kind::UltraDense => {
+        PacketFormat::Dense => {
+            samples.iter().for_each(|sample| bytes.extend((sample.range as u16).to_le_bytes()))
+        }
+        PacketFormat::UltraDense => {
             for two in samples.chunks(2) {
                 let [a, b] = [two[0], two[1]].map(twenty_bits);
                 bytes.extend((a as u16).to_le_bytes());
@@ -667,7 +700,7 @@ pub(crate) fn encode(kind: Kind, start: f64, samples: &[Sample], next: Sample) -
 
 /// Returns the stored value of a range, the range that it stands for, and the number of bits by which its steps are
 /// wider.
-fn major(range: u32) -> (u32, i64, u32) {
+fn encode_major(range: u32) -> (u32, i64, u32) {
     let (from, base, level) = match range {
         0x4000.. => (3328, 0x4000, 4),
         0x1000.. => (1792, 0x1000, 3),
@@ -679,8 +712,8 @@ fn major(range: u32) -> (u32, i64, u32) {
     (from + steps, i64::from(base + (steps << level)), level)
 }
 
-fn twenty_bits(sample: Sample) -> u32 {
-    let Sample { range, quality, .. } = sample;
+fn twenty_bits(sample: TestPoint) -> u32 {
+    let TestPoint { range, quality, .. } = sample;
     match range {
         0 => 0,
         1..=2046 => (range / 2) << 2 | quality << 12,
@@ -691,12 +724,12 @@ fn twenty_bits(sample: Sample) -> u32 {
 }
 
 /// Returns the descriptor type of packets of this kind.
-pub(crate) fn answer_of(kind: Kind) -> u8 {
+pub(crate) fn descriptor_type(kind: PacketFormat) -> u8 {
     match kind {
-        Kind::Standard => 0x81,
-        Kind::Express => 0x82,
-        Kind::Ultra => 0x84,
-        Kind::Dense => 0x85,
-        Kind::UltraDense => 0x86,
+        PacketFormat::Standard => 0x81,
+        PacketFormat::Express => 0x82,
+        PacketFormat::Ultra => 0x84,
+        PacketFormat::Dense => 0x85,
+        PacketFormat::UltraDense => 0x86,
     }
 }

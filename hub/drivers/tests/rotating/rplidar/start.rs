@@ -1,38 +1,38 @@
 //! The start of a session with a Slamtec scanner, whatever the scanner was doing before.
 
 use scanhub_drivers::Settings;
-use scanhub_drivers::line::{Control, Event, Output, Protocol as _, Session as _, State};
-use scanhub_drivers::rplidar::packet::Kind;
-use scanhub_drivers::rplidar::{Health, Mode, Model, Session, Trouble};
+use scanhub_drivers::line::{Action, Control, Event, Protocol as _, ScannerSession as _, State};
+use scanhub_drivers::rplidar::packet::PacketFormat;
+use scanhub_drivers::rplidar::{Health, Mode, Model, Problem, RplidarSession};
 use scanhub_schema::MILLIS;
 
-use super::{Bench, Head, SECOND, answer_of};
+use super::{ONE_SECOND, SimulatedScanner, TestBench, descriptor_type};
 
-pub(crate) fn of(model: Model) -> Settings {
+pub(crate) fn settings_of(model: Model) -> Settings {
     Settings { model: Some(model.name()), ..Settings::default() }
 }
 
-fn is_streaming(bench: &Bench) -> bool {
+fn is_streaming(bench: &TestBench) -> bool {
     bench.session.state() == State::Streaming
 }
 
 #[test]
-fn every_model_streams_within_three_seconds_whatever_it_was_doing() {
+fn every_model_streams_within_2_s_from_any_state() {
     for model in Model::ALL {
-        for settings in [of(model), Settings::default()] {
+        for settings in [settings_of(model), Settings::default()] {
             for doing in 0..3 {
-                let mut head = Head::new(model, 1);
+                let mut head = SimulatedScanner::new(model, 1);
                 match doing {
-                    1 => head.left_in(head.modes[head.modes.len() - 1].2, 0),
-                    2 => head.left_in(Kind::Standard, 0),
+                    1 => head.start_before(head.modes[head.modes.len() - 1].2, 0),
+                    2 => head.start_before(PacketFormat::Standard, 0),
                     _ => {}
                 }
-                let mut bench = Bench::new(settings, head);
-                let took = bench.until(3 * SECOND, is_streaming);
-                assert_eq!((bench.session.model(), bench.session.trouble()), (Some(model), None));
+                let mut bench = TestBench::new(settings, head);
+                let elapsed = bench.run_until(3 * ONE_SECOND, is_streaming);
+                assert_eq!((bench.session.model(), bench.session.problem()), (Some(model), None));
                 assert_eq!(bench.session.beams(), Some(model.beams()), "{model:?}");
-                assert!(!bench.head.dtr && bench.log.dtr == [false], "{:?}", bench.log.dtr);
-                assert!(took < 2 * SECOND, "{model:?} {doing}: {took}");
+                assert!(!bench.scanner.dtr && bench.log.dtr == [false], "{:?}", bench.log.dtr);
+                assert!(elapsed < 2 * ONE_SECOND, "{model:?} {doing}: {elapsed}");
             }
         }
     }
@@ -43,58 +43,64 @@ fn every_rate_is_sought() {
     for (model, baud) in
         [(Model::A1, 115_200), (Model::S1, 256_000), (Model::C1, 460_800), (Model::S2, 1_000_000)]
     {
-        for doing in [None, Some(Kind::Standard)] {
-            let mut head = Head::new(model, 1);
-            doing.into_iter().for_each(|kind| head.left_in(kind, 0));
-            let mut bench = Bench::new(Settings::default(), head);
-            let took = bench.until(3 * SECOND, is_streaming);
-            assert_eq!((bench.session.rate(), bench.session.trouble()), (baud, None));
-            assert!(took < 2 * SECOND, "{baud}: {took}");
+        for doing in [None, Some(PacketFormat::Standard)] {
+            let mut head = SimulatedScanner::new(model, 1);
+            doing.into_iter().for_each(|kind| head.start_before(kind, 0));
+            let mut bench = TestBench::new(Settings::default(), head);
+            let elapsed = bench.run_until(3 * ONE_SECOND, is_streaming);
+            assert_eq!((bench.session.rate(), bench.session.problem()), (baud, None));
+            assert!(elapsed < 2 * ONE_SECOND, "{baud}: {elapsed}");
         }
     }
 }
 
 #[test]
-fn a_stream_that_is_text_at_another_rate_is_no_greeting_again_and_again() {
-    for kind in [Kind::Standard, Kind::Dense] {
-        let mut head = Head::new(Model::S1, 1);
-        head.left_in(kind, 0);
+fn text_like_stream_is_not_taken_for_a_boot_message() {
+    for kind in [PacketFormat::Standard, PacketFormat::Dense] {
+        let mut head = SimulatedScanner::new(Model::S1, 1);
+        head.start_before(kind, 0);
         head.is_text = true;
-        let mut bench = Bench::new(Settings::default(), head);
-        let took = bench.until(3 * SECOND, is_streaming);
-        assert!(took < 2 * SECOND, "{took}");
-        assert_eq!(bench.session.account().restarts, 0);
+        let mut bench = TestBench::new(Settings::default(), head);
+        let elapsed = bench.run_until(3 * ONE_SECOND, is_streaming);
+        assert!(elapsed < 2 * ONE_SECOND, "{elapsed}");
+        assert_eq!(bench.session.stats().restarts, 0);
     }
 }
 
 #[test]
 fn where_the_rate_is_fixed_it_stays() {
-    let settings = Settings { fixed_rate: true, ..of(Model::S1) };
-    let mut head = Head::new(Model::S1, 1);
+    let settings = Settings { fixed_rate: true, ..settings_of(Model::S1) };
+    let mut head = SimulatedScanner::new(Model::S1, 1);
     head.is_on = false;
-    let mut bench = Bench::new(settings, head);
-    bench.run(5 * SECOND);
+    let mut bench = TestBench::new(settings, head);
+    bench.run(5 * ONE_SECOND);
     assert!(bench.log.bauds.is_empty());
-    let told = bench.session.trouble().expect("told");
-    assert!(matches!(told, Trouble::NoAnswer { baud: Some(256_000), seconds: 2.. }), "{told}");
-    bench.head.is_on = true;
-    bench.until(3 * SECOND, is_streaming);
-    assert_eq!(bench.session.trouble(), None);
+    let problem = bench.session.problem().expect("told");
+    assert!(matches!(problem, Problem::NoResponse { baud: Some(256_000), seconds: 2.. }), "{problem}");
+    bench.scanner.is_on = true;
+    bench.run_until(3 * ONE_SECOND, is_streaming);
+    assert_eq!(bench.session.problem(), None);
 }
 
 #[test]
-fn a_stream_that_somebody_left_streams_again_in_half_a_second_at_whatever_rate() {
+fn restarts_abandoned_stream_within_500ms() {
     for model in Model::ALL {
-        let kinds = Head::new(model, 1).modes.into_iter().map(|(.., kind)| kind);
+        let kinds = SimulatedScanner::new(model, 1).modes.into_iter().map(|(.., kind)| kind);
         for kind in kinds {
             // The rate of the first is tried first.
-            for first in [Settings::default(), of(model), of(Model::A3), of(Model::C1), of(Model::S3)] {
-                let mut head = Head::new(model, 1);
-                head.left_in(kind, 0);
-                head.line_is_full(4_000);
-                let mut bench = Bench::new(first, head);
-                bench.until(SECOND / 2, |bench| !bench.log.packets.is_empty());
-                bench.until(3 * SECOND, is_streaming);
+            for first in [
+                Settings::default(),
+                settings_of(model),
+                settings_of(Model::A3),
+                settings_of(Model::C1),
+                settings_of(Model::S3),
+            ] {
+                let mut head = SimulatedScanner::new(model, 1);
+                head.start_before(kind, 0);
+                head.fill_line(4_000);
+                let mut bench = TestBench::new(first, head);
+                bench.run_until(ONE_SECOND / 2, |bench| !bench.log.packets.is_empty());
+                bench.run_until(3 * ONE_SECOND, is_streaming);
                 assert_eq!(bench.session.rate(), model.baud());
             }
         }
@@ -102,95 +108,102 @@ fn a_stream_that_somebody_left_streams_again_in_half_a_second_at_whatever_rate()
 }
 
 #[test]
-fn one_that_does_not_hear_that_it_shall_stop_is_told_again() {
-    for settings in [of(Model::S2), Settings::default()] {
-        let mut head = Head::new(Model::S2, 1);
-        head.left_in(Kind::Dense, 0);
-        head.deaf_to = vec![0x25];
-        let mut bench = Bench::new(settings, head);
-        bench.until(SECOND, |bench| !bench.log.packets.is_empty());
+fn repeats_an_ignored_stop_request() {
+    for settings in [settings_of(Model::S2), Settings::default()] {
+        let mut head = SimulatedScanner::new(Model::S2, 1);
+        head.start_before(PacketFormat::Dense, 0);
+        head.ignored_requests = vec![0x25];
+        let mut bench = TestBench::new(settings, head);
+        bench.run_until(ONE_SECOND, |bench| !bench.log.packets.is_empty());
     }
 }
 
 #[test]
 fn a_scanner_that_is_not_well_is_booted_once() {
     for model in [Model::A1, Model::S2] {
-        let mut head = Head::new(model, 1);
+        let mut head = SimulatedScanner::new(model, 1);
         head.health = (2, 0x8001);
-        let mut bench = Bench::new(Settings::default(), head);
-        let took = bench.until(3 * SECOND, is_streaming);
-        assert_eq!((bench.session.trouble(), bench.session.health()), (None, Some(Health::Good)));
-        assert_eq!(bench.head.requests.iter().filter(|request| **request == 0x40).count(), 1, "{took}");
-        assert_eq!(bench.session.account().restarts, 0, "the session requested it");
+        let mut bench = TestBench::new(Settings::default(), head);
+        let elapsed = bench.run_until(3 * ONE_SECOND, is_streaming);
+        assert_eq!((bench.session.problem(), bench.session.health()), (None, Some(Health::Good)));
+        assert_eq!(bench.scanner.requests.iter().filter(|request| **request == 0x40).count(), 1, "{elapsed}");
+        assert_eq!(bench.session.stats().restarts, 0, "the session requested it");
     }
 }
 
 #[test]
-fn one_that_stays_unwell_is_told_in_words_and_asked_again() {
-    let mut head = Head::new(Model::A1, 1);
-    (head.health, head.heals) = ((2, 0x8001), false);
-    let mut bench = Bench::new(of(Model::A1), head);
-    bench.run(9 * SECOND);
-    let told = bench.session.trouble();
-    assert_eq!(told, Some(Trouble::Unwell(Health::Error(0x8001))));
-    assert!(told.expect("told").to_string().contains("8001h"));
-    assert_eq!(bench.head.requests.iter().filter(|request| **request == 0x40).count(), 1);
-    assert!(!bench.head.is_measuring());
-    bench.head.health = (1, 7);
-    bench.until(3 * SECOND, is_streaming);
+fn reports_health_error_and_retries_until_it_clears() {
+    let mut head = SimulatedScanner::new(Model::A1, 1);
+    (head.health, head.clears_on_reboot) = ((2, 0x8001), false);
+    let mut bench = TestBench::new(settings_of(Model::A1), head);
+    bench.run(9 * ONE_SECOND);
+    let problem = bench.session.problem();
+    assert_eq!(problem, Some(Problem::Unhealthy(Health::Error(0x8001))));
+    assert!(problem.expect("told").to_string().contains("8001h"));
+    assert_eq!(bench.scanner.requests.iter().filter(|request| **request == 0x40).count(), 1);
+    assert!(!bench.scanner.is_measuring());
+    bench.scanner.health = (1, 7);
+    bench.run_until(3 * ONE_SECOND, is_streaming);
     // It measures, and says that it may not for long.
     let warning = Health::Warning(7);
     assert_eq!(
-        (bench.session.trouble(), bench.session.health()),
-        (Some(Trouble::Unwell(warning)), Some(warning))
+        (bench.session.problem(), bench.session.health()),
+        (Some(Problem::Unhealthy(warning)), Some(warning))
     );
 }
 
 #[test]
-fn a_motor_obeys_what_its_model_obeys() {
+fn pause_and_resume_control_the_motor_by_model() {
     for (model, request) in [(Model::A1, None), (Model::A2m8, Some(660)), (Model::S2, Some(600))] {
-        let mut bench = Bench::new(of(model), Head::new(model, 1));
-        bench.until(3 * SECOND, is_streaming);
-        assert_eq!((bench.head.motor, bench.head.dtr), (request, false), "{model:?}");
+        let mut bench = TestBench::new(settings_of(model), SimulatedScanner::new(model, 1));
+        bench.run_until(3 * ONE_SECOND, is_streaming);
+        assert_eq!((bench.scanner.motor, bench.scanner.dtr), (request, false), "{model:?}");
         bench.session.control(Control::Pause, bench.now);
-        bench.run(bench.now + SECOND);
+        bench.run(bench.now + ONE_SECOND);
         assert_eq!(bench.session.state(), State::Paused);
-        assert_eq!((bench.head.motor, bench.head.dtr), (request.map(|_| 0), model == Model::A1), "{model:?}");
-        assert!(!bench.head.is_measuring());
+        assert_eq!(
+            (bench.scanner.motor, bench.scanner.dtr),
+            (request.map(|_| 0), model == Model::A1),
+            "{model:?}"
+        );
+        assert!(!bench.scanner.is_measuring());
         let packets = bench.log.packets.len();
-        bench.run(bench.now + SECOND);
+        bench.run(bench.now + ONE_SECOND);
         assert_eq!(bench.log.packets.len(), packets);
         bench.session.control(Control::Resume, bench.now);
-        bench.until(3 * SECOND, is_streaming);
-        assert_eq!((bench.head.motor, bench.head.dtr), (request, false), "{model:?}");
+        bench.run_until(3 * ONE_SECOND, is_streaming);
+        assert_eq!((bench.scanner.motor, bench.scanner.dtr), (request, false), "{model:?}");
     }
 }
 
 #[test]
 fn the_motor_rests_when_the_hub_ends() {
     for (model, duty) in [(Model::A1, None), (Model::A2m8, Some(0)), (Model::S2, Some(0))] {
-        let mut bench = Bench::new(of(model), Head::new(model, 1));
-        bench.until(3 * SECOND, is_streaming);
+        let mut bench = TestBench::new(settings_of(model), SimulatedScanner::new(model, 1));
+        bench.run_until(3 * ONE_SECOND, is_streaming);
         assert!(bench.session.end(bench.now));
         bench.run(bench.now + MILLIS);
-        assert_eq!((bench.head.motor, bench.head.dtr), (duty, model == Model::A1), "{model:?}");
-        assert!(!bench.head.is_measuring() && !bench.session.end(bench.now));
+        assert_eq!((bench.scanner.motor, bench.scanner.dtr), (duty, model == Model::A1), "{model:?}");
+        assert!(!bench.scanner.is_measuring() && !bench.session.end(bench.now));
     }
 }
 
 #[test]
-fn what_it_is_is_told_also_where_something_else_was_expected() {
-    let told = |settings, model| {
-        let mut bench = Bench::new(settings, Head::new(model, 1));
-        bench.until(3 * SECOND, is_streaming);
+fn reports_mode_firmware_and_unexpected_model() {
+    let details_and_unexpected_model = |settings, model| {
+        let mut bench = TestBench::new(settings, SimulatedScanner::new(model, 1));
+        bench.run_until(3 * ONE_SECOND, is_streaming);
         let mut kind = String::new();
         bench.session.write_details(&mut kind);
-        (kind, bench.session.other_model().map(|model| model.name))
+        (kind, bench.session.unexpected_model().map(|model| model.name))
     };
-    assert_eq!(told(Settings::default(), Model::A1), (" boost 1.29".to_owned(), None));
-    let standard = Settings { mode: Some(Mode::Standard.name()), ..of(Model::A2m8) };
-    assert_eq!(told(standard, Model::A2m8), (" standard 1.29".to_owned(), None));
-    assert_eq!(told(of(Model::A1), Model::A2m8).1, Some("a2m8"));
+    assert_eq!(
+        details_and_unexpected_model(Settings::default(), Model::A1),
+        (" boost 1.29".to_owned(), None)
+    );
+    let standard = Settings { mode: Some(Mode::Standard.name()), ..settings_of(Model::A2m8) };
+    assert_eq!(details_and_unexpected_model(standard, Model::A2m8), (" standard 1.29".to_owned(), None));
+    assert_eq!(details_and_unexpected_model(settings_of(Model::A1), Model::A2m8).1, Some("a2m8"));
     // As long as a status has room for it.
     let longest = Model::ALL.map(|model| model.name().len()).into_iter().max().expect("some");
     let mode = Model::ALL.iter().flat_map(|_| Mode::ALL).map(|mode| mode.name().len()).max().expect("some");
@@ -200,91 +213,102 @@ fn what_it_is_is_told_also_where_something_else_was_expected() {
 #[test]
 fn one_answer_may_be_missing() {
     for request in [0x50, 0x52, 0x82, 0x84, 0xFF] {
-        let mut head = Head::new(Model::A2m8, 1);
-        head.deaf_to = vec![request];
-        let mut bench = Bench::new(of(Model::A2m8), head);
-        bench.until(3 * SECOND, is_streaming);
-        assert_eq!((bench.head.motor, bench.head.kind()), (Some(660), Some(Kind::Ultra)), "{request:02X}");
+        let mut head = SimulatedScanner::new(Model::A2m8, 1);
+        head.ignored_requests = vec![request];
+        let mut bench = TestBench::new(settings_of(Model::A2m8), head);
+        bench.run_until(3 * ONE_SECOND, is_streaming);
+        assert_eq!(
+            (bench.scanner.motor, bench.scanner.kind()),
+            (Some(660), Some(PacketFormat::Ultra)),
+            "{request:02X}"
+        );
     }
 }
 
 #[test]
-fn one_that_does_not_begin_to_measure_is_told_as_long_as_that_is_so() {
-    let mut head = Head::new(Model::A1, 1);
-    head.deaf_to = vec![0x82; 1_000];
-    let mut bench = Bench::new(Settings::default(), head);
-    bench.run(3 * SECOND);
-    assert_eq!(bench.session.trouble(), Some(Trouble::Refused));
+fn reports_refused_start_until_it_is_resolved() {
+    let mut head = SimulatedScanner::new(Model::A1, 1);
+    head.ignored_requests = vec![0x82; 1_000];
+    let mut bench = TestBench::new(Settings::default(), head);
+    bench.run(3 * ONE_SECOND);
+    assert_eq!(bench.session.problem(), Some(Problem::Refused));
     assert_eq!(bench.session.rate(), 115_200, "it answers at this one");
-    bench.head.is_on = false;
-    bench.run(8 * SECOND);
-    let told = bench.session.trouble();
-    assert!(matches!(told, Some(Trouble::NoAnswer { .. })), "{told:?}");
-    (bench.head.is_on, bench.head.deaf_to) = (true, Vec::new());
-    bench.until(3 * SECOND, is_streaming);
-    assert_eq!(bench.session.trouble(), None);
+    bench.scanner.is_on = false;
+    bench.run(8 * ONE_SECOND);
+    let problem = bench.session.problem();
+    assert!(matches!(problem, Some(Problem::NoResponse { .. })), "{problem:?}");
+    (bench.scanner.is_on, bench.scanner.ignored_requests) = (true, Vec::new());
+    bench.run_until(3 * ONE_SECOND, is_streaming);
+    assert_eq!(bench.session.problem(), None);
 }
 
 #[test]
-fn the_motor_rests_while_nobody_follows_if_it_shall() {
+fn idle_motor_stops_only_if_configured() {
     for stop_when_idle in [false, true] {
-        let settings = Settings { stop_when_idle, ..of(Model::A1) };
-        let mut bench = Bench::new(settings, Head::new(Model::A1, 1));
-        bench.until(3 * SECOND, is_streaming);
+        let settings = Settings { stop_when_idle, ..settings_of(Model::A1) };
+        let mut bench = TestBench::new(settings, SimulatedScanner::new(Model::A1, 1));
+        bench.run_until(3 * ONE_SECOND, is_streaming);
         bench.session.set_has_subscribers(bench.now, false);
-        bench.run(bench.now + 2 * SECOND);
+        bench.run(bench.now + 2 * ONE_SECOND);
         assert_eq!(bench.session.state(), State::Streaming, "not at once");
-        bench.run(bench.now + 5 * SECOND);
-        assert_eq!(bench.head.is_measuring(), !stop_when_idle);
-        assert_eq!(bench.head.dtr, stop_when_idle);
+        bench.run(bench.now + 5 * ONE_SECOND);
+        assert_eq!(bench.scanner.is_measuring(), !stop_when_idle);
+        assert_eq!(bench.scanner.dtr, stop_when_idle);
         bench.session.control(Control::Resume, bench.now);
-        assert_eq!(bench.head.is_measuring(), !stop_when_idle);
+        assert_eq!(bench.scanner.is_measuring(), !stop_when_idle);
         bench.session.set_has_subscribers(bench.now, true);
-        bench.until(2 * SECOND, is_streaming);
-        assert!(!bench.head.dtr);
+        bench.run_until(2 * ONE_SECOND, is_streaming);
+        assert!(!bench.scanner.dtr);
     }
 }
 
 #[test]
 fn the_fastest_mode_or_the_wanted_one() {
     let run = |model, mode: Option<Mode>| {
-        let mut bench = Bench::new(Settings { mode: mode.map(Mode::name), ..of(model) }, Head::new(model, 1));
-        bench.until(3 * SECOND, is_streaming);
+        let mut bench = TestBench::new(
+            Settings { mode: mode.map(Mode::name), ..settings_of(model) },
+            SimulatedScanner::new(model, 1),
+        );
+        bench.run_until(3 * ONE_SECOND, is_streaming);
         let us = 1e6 / bench.session.points_per_second().expect("known");
-        (bench.head.kind().expect("measuring"), us.round(), bench.session.trouble(), bench.session.beams())
+        (bench.scanner.kind().expect("measuring"), us.round(), bench.session.problem(), bench.session.beams())
     };
-    assert_eq!(run(Model::A1, None), (Kind::Ultra, 127.0, None, Some(1_079)));
-    assert_eq!(run(Model::A1, Some(Mode::Express)), (Kind::Express, 254.0, None, Some(539)));
-    assert_eq!(run(Model::A1, Some(Mode::Standard)), (Kind::Standard, 508.0, None, Some(270)));
-    let lacking = Some(Trouble::NoMode(Mode::DenseBoost));
-    assert_eq!(run(Model::A1, Some(Mode::DenseBoost)), (Kind::Ultra, 127.0, lacking, Some(1_079)));
-    assert_eq!(run(Model::S3, None).0, Kind::UltraDense);
+    assert_eq!(run(Model::A1, None), (PacketFormat::Ultra, 127.0, None, Some(1_079)));
+    assert_eq!(run(Model::A1, Some(Mode::Express)), (PacketFormat::Express, 254.0, None, Some(539)));
+    assert_eq!(run(Model::A1, Some(Mode::Standard)), (PacketFormat::Standard, 508.0, None, Some(270)));
+    let lacking = Some(Problem::ModeUnavailable(Mode::DenseBoost));
+    assert_eq!(run(Model::A1, Some(Mode::DenseBoost)), (PacketFormat::Ultra, 127.0, lacking, Some(1_079)));
+    assert_eq!(run(Model::S3, None).0, PacketFormat::UltraDense);
 }
 
 #[test]
 fn old_firmware_has_two_modes() {
-    for (mode, kind) in [(None, Kind::Express), (Some(Mode::Standard), Kind::Standard)] {
-        let mut head = Head::new(Model::A1, 1);
+    for (mode, kind) in [(None, PacketFormat::Express), (Some(Mode::Standard), PacketFormat::Standard)] {
+        let mut head = SimulatedScanner::new(Model::A1, 1);
         head.is_old = true;
-        let mut bench = Bench::new(Settings { mode: mode.map(Mode::name), ..of(Model::A1) }, head);
-        bench.until(3 * SECOND, is_streaming);
-        assert_eq!(bench.head.kind(), Some(kind));
+        let mut bench =
+            TestBench::new(Settings { mode: mode.map(Mode::name), ..settings_of(Model::A1) }, head);
+        bench.run_until(3 * ONE_SECOND, is_streaming);
+        assert_eq!(bench.scanner.kind(), Some(kind));
     }
 }
 
 #[test]
-fn a_scanner_that_a_search_has_found_has_the_beams_that_it_reports() {
+fn discovered_scanner_has_the_beams_it_reports() {
     let found = Settings { max_beams: Some(3_240), is_found: true, ..Settings::default() };
     let family = Settings { max_beams: Some(2_048), ..Settings::default() };
     let beams = |model, is_old, settings| {
-        let mut head = Head::new(model, 1);
+        let mut head = SimulatedScanner::new(model, 1);
         head.is_old = is_old;
-        let mut bench = Bench::new(settings, head);
-        bench.until(3 * SECOND, is_streaming);
-        bench.head.boot(bench.now);
-        bench.run(bench.now + 3 * SECOND);
+        let mut bench = TestBench::new(settings, head);
+        bench.run_until(3 * ONE_SECOND, is_streaming);
+        bench.scanner.boot(bench.now);
+        bench.run(bench.now + 3 * ONE_SECOND);
         let beams = bench.session.beams().expect("known");
-        assert!(bench.log.turns.len() > 5 && bench.log.turns.iter().all(|turn| turn.beams == beams));
+        assert!(
+            bench.log.revolutions.len() > 5
+                && bench.log.revolutions.iter().all(|revolution| revolution.beams == beams)
+        );
         beams
     };
     for model in Model::ALL {
@@ -299,45 +323,48 @@ fn a_scanner_that_a_search_has_found_has_the_beams_that_it_reports() {
 
 #[test]
 fn a_second_without_data_begins_again() {
-    let mut bench = Bench::new(of(Model::A1), Head::new(Model::A1, 1));
-    bench.run(3 * SECOND);
-    bench.head.is_on = false;
-    bench.run(3 * SECOND + 1_050 * MILLIS);
-    assert_eq!((bench.session.state(), bench.session.trouble()), (State::Silent, Some(Trouble::Silence)));
-    bench.run(6 * SECOND);
-    assert!(matches!(bench.session.trouble(), Some(Trouble::NoAnswer { baud: None, .. })));
-    bench.head.is_on = true;
-    bench.head.boot(bench.now);
-    bench.until(4 * SECOND, is_streaming);
-    assert_eq!((bench.session.trouble(), bench.session.account().resyncs), (None, 1));
-    assert_eq!(bench.session.account().lost, 0, "silence is no loss on the line");
+    let mut bench = TestBench::new(settings_of(Model::A1), SimulatedScanner::new(Model::A1, 1));
+    bench.run(3 * ONE_SECOND);
+    bench.scanner.is_on = false;
+    bench.run(3 * ONE_SECOND + 1_050 * MILLIS);
+    assert_eq!((bench.session.state(), bench.session.problem()), (State::Silent, Some(Problem::Silence)));
+    bench.run(6 * ONE_SECOND);
+    assert!(matches!(bench.session.problem(), Some(Problem::NoResponse { baud: None, .. })));
+    bench.scanner.is_on = true;
+    bench.scanner.boot(bench.now);
+    bench.run_until(4 * ONE_SECOND, is_streaming);
+    assert_eq!((bench.session.problem(), bench.session.stats().resyncs), (None, 1));
+    assert_eq!(bench.session.stats().lost, 0, "silence is no loss on the line");
 }
 
 /// Returns a bench with a scanner that has announced its stream and spins up.
-fn spinning_up(model: Model) -> Bench {
-    let mut bench = Bench::new(Settings::default(), Head { spin_up: SECOND, ..Head::new(model, 1) });
-    bench.until(SECOND, |bench| bench.head.is_measuring());
+fn spinning_up(model: Model) -> TestBench {
+    let mut bench = TestBench::new(
+        Settings::default(),
+        SimulatedScanner { spin_up: ONE_SECOND, ..SimulatedScanner::new(model, 1) },
+    );
+    bench.run_until(ONE_SECOND, |bench| bench.scanner.is_measuring());
     bench.run(bench.now + 20 * MILLIS);
     assert!(bench.session.model() == Some(model) && bench.log.packets.is_empty());
     bench
 }
 
 #[test]
-fn identifies_a_scanner_that_streams_during_the_spin_up() {
+fn identifies_a_scanner_streaming_during_spin_up() {
     // Packets of another kind, and packets of the same kind with another time per point.
     for (before, model) in [(Model::S1, Model::A3), (Model::A3, Model::S1), (Model::A1, Model::A2m8)] {
         let mut bench = spinning_up(before);
         bench.run(bench.now + 500 * MILLIS);
-        let mut head = Head { spin_up: 300 * MILLIS, ..Head::new(model, 1) };
+        let mut head = SimulatedScanner { spin_up: 300 * MILLIS, ..SimulatedScanner::new(model, 1) };
         let request = [0xA5, 0x82, 5, head.typical, 0, 0, 0, 0, 0xA5 ^ 0x82 ^ 5 ^ head.typical];
         request.into_iter().for_each(|byte| head.write(byte, model.baud(), bench.now));
-        bench.head = head;
-        bench.until(3 * SECOND, is_streaming);
-        assert_eq!((bench.session.model(), bench.session.account().resyncs), (Some(model), 1), "{before:?}");
-        bench.run(bench.now + 3 * SECOND);
-        let (worst, wrong) = bench.judge(&bench.log.turns);
+        bench.scanner = head;
+        bench.run_until(3 * ONE_SECOND, is_streaming);
+        assert_eq!((bench.session.model(), bench.session.stats().resyncs), (Some(model), 1), "{before:?}");
+        bench.run(bench.now + 3 * ONE_SECOND);
+        let (worst, wrong) = bench.check_revolutions(&bench.log.revolutions);
         assert!(
-            bench.log.turns.len() > 20 && worst < 2 * MILLIS && wrong == 0,
+            bench.log.revolutions.len() > 20 && worst < 2 * MILLIS && wrong == 0,
             "{before:?}: {worst} {wrong}"
         );
     }
@@ -346,49 +373,51 @@ fn identifies_a_scanner_that_streams_during_the_spin_up() {
 #[test]
 fn accepts_a_stream_that_is_announced_twice() {
     let mut bench = spinning_up(Model::A1);
-    let kind = bench.head.kind().expect("measuring");
-    bench.head.answer(answer_of(kind), 0x40, &[kind.bytes() as u8], bench.now + 70 * MILLIS);
-    bench.until(3 * SECOND, is_streaming);
-    assert_eq!(bench.session.account().resyncs, 0);
+    let kind = bench.scanner.kind().expect("measuring");
+    bench.scanner.reply(descriptor_type(kind), 0x40, &[kind.byte_len() as u8], bench.now + 70 * MILLIS);
+    bench.run_until(3 * ONE_SECOND, is_streaming);
+    assert_eq!(bench.session.stats().resyncs, 0);
 }
 
 #[test]
-fn a_scanner_that_starts_with_the_session_has_not_restarted() {
+fn power_on_with_the_session_is_not_a_restart() {
     for model in [Model::A1, Model::S2] {
-        for settings in [of(model), Settings::default()] {
-            let mut head = Head::new(model, 1);
+        for settings in [settings_of(model), Settings::default()] {
+            let mut head = SimulatedScanner::new(model, 1);
             head.boot(0);
-            let mut bench = Bench::new(settings, head);
-            bench.until(4 * SECOND, is_streaming);
-            assert_eq!(bench.session.account().restarts, 0, "{model:?}");
+            let mut bench = TestBench::new(settings, head);
+            bench.run_until(4 * ONE_SECOND, is_streaming);
+            assert_eq!(bench.session.stats().restarts, 0, "{model:?}");
         }
     }
 }
 
 #[test]
 fn a_cable_that_is_plugged_in_again_is_not_a_restart() {
-    let mut bench = Bench::new(of(Model::A1), Head::new(Model::A1, 1));
-    bench.run(3 * SECOND);
-    bench.head.is_on = false;
-    bench.run(6 * SECOND);
-    bench.head.is_on = true;
-    bench.until(4 * SECOND, is_streaming);
-    assert_eq!(bench.session.account().restarts, 0);
+    let mut bench = TestBench::new(settings_of(Model::A1), SimulatedScanner::new(Model::A1, 1));
+    bench.run(3 * ONE_SECOND);
+    bench.scanner.is_on = false;
+    bench.run(6 * ONE_SECOND);
+    bench.scanner.is_on = true;
+    bench.run_until(4 * ONE_SECOND, is_streaming);
+    assert_eq!(bench.session.stats().restarts, 0);
 }
 
 #[test]
-fn a_greeting_in_the_midst_of_a_stream_begins_again_at_once() {
+fn boot_message_during_a_stream_restarts_at_once() {
     for model in [Model::A1, Model::A3, Model::S2, Model::S3] {
         for mode in [None, Some(Mode::Standard)] {
-            let mut bench =
-                Bench::new(Settings { mode: mode.map(Mode::name), ..of(model) }, Head::new(model, 1));
-            bench.run(3 * SECOND);
-            bench.head.boot(bench.now);
-            let took = bench.until(1_500 * MILLIS, |bench| bench.session.account().resyncs > 0);
-            assert!((671 * MILLIS..700 * MILLIS).contains(&took), "{model:?} {mode:?}: {took}");
-            bench.until(SECOND, is_streaming);
-            assert_eq!((bench.session.account().resyncs, bench.session.trouble()), (1, None));
-            assert_eq!(bench.session.account().restarts, 1, "{model:?} {mode:?}");
+            let mut bench = TestBench::new(
+                Settings { mode: mode.map(Mode::name), ..settings_of(model) },
+                SimulatedScanner::new(model, 1),
+            );
+            bench.run(3 * ONE_SECOND);
+            bench.scanner.boot(bench.now);
+            let elapsed = bench.run_until(1_500 * MILLIS, |bench| bench.session.stats().resyncs > 0);
+            assert!((671 * MILLIS..700 * MILLIS).contains(&elapsed), "{model:?} {mode:?}: {elapsed}");
+            bench.run_until(ONE_SECOND, is_streaming);
+            assert_eq!((bench.session.stats().resyncs, bench.session.problem()), (1, None));
+            assert_eq!(bench.session.stats().restarts, 1, "{model:?} {mode:?}");
         }
     }
 }
@@ -400,13 +429,13 @@ fn a_greeting_after_other_bytes_is_a_restart() {
     for (model, junk) in
         [Model::A1, Model::S2].into_iter().flat_map(|model| junk.each_ref().map(|it| (model, it)))
     {
-        let mut bench = Bench::new(of(model), Head::new(model, 1));
-        bench.run(3 * SECOND);
-        bench.head.junk.clone_from(junk);
-        bench.head.boot(bench.now);
-        bench.until(4 * SECOND, |bench| bench.session.account().restarts > 0);
-        bench.until(4 * SECOND, is_streaming);
-        assert_eq!(bench.session.account().restarts, 1, "{model:?} after {} bytes", junk.len());
+        let mut bench = TestBench::new(settings_of(model), SimulatedScanner::new(model, 1));
+        bench.run(3 * ONE_SECOND);
+        bench.scanner.junk.clone_from(junk);
+        bench.scanner.boot(bench.now);
+        bench.run_until(4 * ONE_SECOND, |bench| bench.session.stats().restarts > 0);
+        bench.run_until(4 * ONE_SECOND, is_streaming);
+        assert_eq!(bench.session.stats().restarts, 1, "{model:?} after {} bytes", junk.len());
     }
 }
 
@@ -414,66 +443,72 @@ fn a_greeting_after_other_bytes_is_a_restart() {
 fn ranges_that_are_text_are_no_greeting() {
     // A single point counts if another one follows it.
     for (mode, lost) in [(Mode::Standard, 65), (Mode::DenseBoost, 60)] {
-        let mut bench =
-            Bench::new(Settings { mode: Some(mode.name()), ..of(Model::S2) }, Head::new(Model::S2, 1));
-        bench.run(3 * SECOND);
+        let mut bench = TestBench::new(
+            Settings { mode: Some(mode.name()), ..settings_of(Model::S2) },
+            SimulatedScanner::new(Model::S2, 1),
+        );
+        bench.run(3 * ONE_SECOND);
         for _ in 0..20 {
-            bench.head.leave_text(bench.now);
+            bench.scanner.send_rest_as_text(bench.now);
             bench.run(bench.now + 33 * MILLIS);
         }
-        let account = bench.session.account();
-        assert_eq!((account.resyncs, account.damaged), (0, 20 * lost), "{mode:?}");
-        assert_eq!(account.restarts, 0, "{mode:?}");
+        let stats = bench.session.stats();
+        assert_eq!((stats.resyncs, stats.damaged), (0, 20 * lost), "{mode:?}");
+        assert_eq!(stats.restarts, 0, "{mode:?}");
     }
 }
 
 #[test]
-fn nothing_is_said_that_a_scanner_keeps() {
+fn sends_only_requests_without_permanent_effect() {
     for model in Model::ALL {
-        let mut bench = Bench::new(Settings::default(), Head::new(model, 1));
-        bench.run(3 * SECOND);
+        let mut bench = TestBench::new(Settings::default(), SimulatedScanner::new(model, 1));
+        bench.run(3 * ONE_SECOND);
         bench.session.control(Control::Resync, bench.now);
-        bench.run(6 * SECOND);
+        bench.run(6 * ONE_SECOND);
         let known = [0x25, 0x20, 0x50, 0x52, 0x82, 0x84, 0xA8, 0xF0, 0xFF];
         assert!(
-            bench.head.requests.iter().all(|request| known.contains(request)),
+            bench.scanner.requests.iter().all(|request| known.contains(request)),
             "{:02X?}",
-            bench.head.requests
+            bench.scanner.requests
         );
     }
 }
 
 #[test]
-fn a_recording_is_read_and_nothing_is_said() {
+fn reads_recording_without_sending_requests() {
     for (model, mode) in
         [(Model::A1, Mode::Express), (Model::S2, Mode::DenseBoost), (Model::A1, Mode::Standard)]
     {
-        let mut live = Bench::new(Settings { mode: Some(mode.name()), ..of(model) }, Head::new(model, 1));
-        live.run(4 * SECOND);
+        let mut live = TestBench::new(
+            Settings { mode: Some(mode.name()), ..settings_of(model) },
+            SimulatedScanner::new(model, 1),
+        );
+        live.run(4 * ONE_SECOND);
         let bytes = live.log.packets.concat();
-        let settings = Settings { mode: Some(mode.name()), fixed_rate: true, listen_only: true, ..of(model) };
-        let mut session = Session::new(settings, 0);
+        let settings =
+            Settings { mode: Some(mode.name()), fixed_rate: true, listen_only: true, ..settings_of(model) };
+        let mut session = RplidarSession::new(settings, 0);
         let per_second = bytes.len() / 3;
-        let (mut now, mut turns) = (0, 0);
+        let (mut now, mut count) = (0, 0);
         for piece in bytes.chunks(per_second / 100) {
             now += 10 * MILLIS;
             let mut rest = piece;
             while !rest.is_empty() {
-                let len = rest.len().min(session.spare().len());
-                session.spare()[..len].copy_from_slice(&rest[..len]);
+                let len = rest.len().min(session.read_buffer().len());
+                session.read_buffer()[..len].copy_from_slice(&rest[..len]);
                 session.commit(now, len);
                 rest = &rest[len..];
                 loop {
-                    match session.poll_output() {
-                        Output::Event(Event::Scan(_)) => turns += 1,
-                        Output::Event(_) => {}
-                        Output::Rest(_) | Output::Wait { .. } => break,
+                    match session.poll_action() {
+                        Action::Event(Event::Scan(_)) => count += 1,
+                        Action::Event(_) => {}
+                        Action::SleepUntil(_) | Action::Wait { .. } => break,
                         output => panic!("{output:?}"),
                     }
                 }
             }
         }
-        assert!(turns > 8, "{model:?} {mode:?}: {turns}");
-        assert_eq!(session.account().discarded, 0);
+        assert!(count > 8, "{model:?} {mode:?}: {count}");
+        assert_eq!(session.stats().discarded, 0);
     }
 }

@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use scanhub_recording::convert::{ConvertOptions, Converted, convert};
+use scanhub_recording::convert::{ConversionResult, ConvertOptions, convert};
 use scanhub_schema::Failure;
 use tempfile::TempDir;
 
@@ -15,7 +15,11 @@ pub(crate) fn file(folder: &TempDir, name: &str, bytes: &[u8]) -> PathBuf {
     path
 }
 
-pub(crate) fn converted(input: &Path, output: &Path, sensor: Option<&str>) -> Result<Converted, Failure> {
+pub(crate) fn convert_file(
+    input: &Path,
+    output: &Path,
+    sensor: Option<&str>,
+) -> Result<ConversionResult, Failure> {
     let options = ConvertOptions {
         input: input.to_owned(),
         output: output.to_owned(),

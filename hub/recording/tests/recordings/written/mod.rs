@@ -7,65 +7,65 @@ use fastrand::Rng;
 use scanhub_drivers::lms::measured;
 use scanhub_drivers::lms::reply;
 use scanhub_drivers::lms::variant::{Mode, Unit};
-use scanhub_schema::datagram::Packed;
-use scanhub_schema::file::{self, Compression, ENCODING_V1, Foreign, Writer};
+use scanhub_schema::datagram::DatagramPayload;
+use scanhub_schema::file::{self, Compression, ENCODING_V1, ForeignChannel, Writer};
 use scanhub_schema::{
     Background, Early, Flags, Foreground, Header, Lines, Marks, Motion, Scan, Status, Topic, Zones,
 };
 
 /// A telegram that was written.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Known {
+pub(crate) struct WrittenTelegram {
     pub(crate) sensor: &'static str,
     pub(crate) header: Header,
     pub(crate) telegram: Vec<u8>,
 }
 
 /// The file, and its telegrams in order.
-pub(crate) struct Written {
+pub(crate) struct WrittenRecording {
     pub(crate) bytes: Vec<u8>,
-    pub(crate) telegrams: Vec<Known>,
+    pub(crate) telegrams: Vec<WrittenTelegram>,
 }
 
 /// `rounds` telegrams of each sensor with all that the hub makes of them, a chunk for each four, a channel of somebody
 /// else's.
-pub(crate) fn recording(rounds: u64, seed: u64) -> Written {
-    packed(rounds, seed, Compression::None)
+pub(crate) fn recording(rounds: u64, seed: u64) -> WrittenRecording {
+    recording_with(rounds, seed, Compression::None)
 }
 
 /// The same with packed chunks.
-pub(crate) fn packed(rounds: u64, seed: u64, compression: Compression) -> Written {
-    written(rounds, seed, compression, |writer, sensor, topic, header, payload| {
-        writer.sample(sensor, topic, header, payload).unwrap();
+pub(crate) fn recording_with(rounds: u64, seed: u64, compression: Compression) -> WrittenRecording {
+    write_recording(rounds, seed, compression, |writer, sensor, topic, header, payload| {
+        writer.write_sample(sensor, topic, header, payload).unwrap();
     })
 }
 
 /// The same as version 1 wrote it, with only some of its topics.
-pub(crate) fn of_version_1(rounds: u64, seed: u64, topics: &[Topic]) -> Written {
-    written(rounds, seed, Compression::None, |writer, sensor, topic, header, payload| {
+pub(crate) fn recording_of_version_1(rounds: u64, seed: u64, topics: &[Topic]) -> WrittenRecording {
+    write_recording(rounds, seed, Compression::None, |writer, sensor, topic, header, payload| {
         if !topics.contains(&topic) {
             return;
         }
         let payload = match topic {
-            Topic::Scan => scan_of_version_1(),
+            Topic::Scan => version_1_scan(),
             // Generation, counts, unit and flags, all 0.
             Topic::Foreground | Topic::Background => vec![0; 12],
             _ => payload.to_vec(),
         };
-        let channel = Foreign {
+        let channel = ForeignChannel {
             topic: &format!("{sensor}/{}", topic.name()),
             encoding: ENCODING_V1,
-            schema: (&file::schema(topic).replace(".v2", ".v1"), "as it was", ENCODING_V1),
+            schema: (&file::schema_name(topic).replace(".v2", ".v1"), "as it was", ENCODING_V1),
             metadata: &[],
         };
-        let channel = writer.channel(&channel).unwrap();
+        let channel = writer.add_channel(&channel).unwrap();
         let message = [bytes_of(header), &payload].concat();
-        writer.message(channel, header.topic_seq as u32, header.wall_ns, &message).unwrap();
+        writer.write_message(channel, header.topic_seq as u32, header.wall_ns, &message).unwrap();
     })
 }
 
 /// A scan of 361 beams as version 1 has it, of ranges that happen to be what a scan of today may be too.
-pub(crate) fn scan_of_version_1() -> Vec<u8> {
+pub(crate) fn version_1_scan() -> Vec<u8> {
     let mut payload = vec![0x69, 0x01, 10, 13];
     payload.extend(0_i32.to_le_bytes());
     payload.extend([500_u16.to_le_bytes(), [0, 1]].concat());
@@ -75,29 +75,29 @@ pub(crate) fn scan_of_version_1() -> Vec<u8> {
 }
 
 /// A recording whose samples `write` writes.
-fn written(
+fn write_recording(
     rounds: u64,
     seed: u64,
     compression: Compression,
     mut write: impl FnMut(&mut Writer<Vec<u8>>, &str, Topic, &Header, &[u8]),
-) -> Written {
+) -> WrittenRecording {
     let mut random = Rng::with_seed(seed);
     let facts = BTreeMap::from([("domain".to_owned(), "test".to_owned())]);
-    let mut writer = Writer::packed(Vec::new(), "", compression, facts).unwrap();
-    let cloud = Foreign {
+    let mut writer = Writer::begin_compressed(Vec::new(), "", compression, facts).unwrap();
+    let cloud = ForeignChannel {
         topic: "/imu",
         encoding: "cdr",
         schema: ("sensor_msgs/msg/Imu", "float64 x", "ros2msg"),
         metadata: &[],
     };
-    let imu = writer.channel(&cloud).unwrap();
+    let imu = writer.add_channel(&cloud).unwrap();
     let mut telegrams = Vec::new();
     for round in 0..rounds {
-        for (number, sensor) in SENSORS.into_iter().enumerate() {
+        for (number, sensor) in SENSOR_NAMES.into_iter().enumerate() {
             let telegram = match round {
-                0 => reply::configuration(0, Mode(4), Unit::Mm, 0x10).bytes().to_vec(),
+                0 => reply::configuration_reply(0, Mode(4), Unit::Mm, 0x10).bytes().to_vec(),
                 // A reply again and again: bit for bit the same.
-                round if round % 16 == 7 => reply::mode(0, true, 0x10).bytes().to_vec(),
+                round if round % 16 == 7 => reply::mode_reply(0, true, 0x10).bytes().to_vec(),
                 _ => scan(&mut random),
             };
             let header = header(round, number as u8, &mut random);
@@ -105,28 +105,30 @@ fn written(
             for (topic, payload) in results(&telegram, &mut random) {
                 write(&mut writer, sensor, topic, &header, &payload);
             }
-            telegrams.push(Known { sensor, header, telegram });
+            telegrams.push(WrittenTelegram { sensor, header, telegram });
         }
-        writer.message(imu, round as u32, WALL + round * PERIOD, &random.u64(..).to_le_bytes()).unwrap();
+        writer
+            .write_message(imu, round as u32, WALL_NS + round * PERIOD_NS, &random.u64(..).to_le_bytes())
+            .unwrap();
         if round % 4 == 3 {
             writer.close_chunk().unwrap();
         }
     }
-    Written { bytes: writer.finish().unwrap(), telegrams }
+    WrittenRecording { bytes: writer.finish().unwrap(), telegrams }
 }
 
 fn header(round: u64, sensor: u8, random: &mut Rng) -> Header {
-    let first_ns = 5_000_000_000 + round * PERIOD + u64::from(sensor) * 3_000_000;
+    let first_ns = 5_000_000_000 + round * PERIOD_NS + u64::from(sensor) * 3_000_000;
     let mut header = Header {
         seq: 40 + round,
         topic_seq: 40 + round,
         stamp_first_ns: first_ns,
         stamp_last_ns: first_ns + 14_640_000,
-        wall_ns: WALL + first_ns,
+        wall_ns: WALL_NS + first_ns,
         boot: 0x1122_3344_5566_7788,
         sensor,
         flags: Flags::SIMULATED,
-        period_us: (PERIOD / 1000) as u32,
+        period_us: (PERIOD_NS / 1000) as u32,
         hub_pid: 4711,
         ..Header::default()
     };
@@ -163,6 +165,6 @@ fn results(telegram: &[u8], random: &mut Rng) -> Vec<(Topic, Vec<u8>)> {
     ]
 }
 
-pub(crate) const SENSORS: [&str; 2] = ["front", "rear"];
-const WALL: u64 = 1_700_000_000_000_000_000;
-const PERIOD: u64 = 26_640_000;
+pub(crate) const SENSOR_NAMES: [&str; 2] = ["front", "rear"];
+const WALL_NS: u64 = 1_700_000_000_000_000_000;
+const PERIOD_NS: u64 = 26_640_000;

@@ -6,50 +6,50 @@ use scanhub_drivers::lms::command::Password;
 use scanhub_drivers::lms::configuration::Configuration;
 use scanhub_drivers::lms::telegram::{NAK, Writer};
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit};
-use scanhub_lms_configure::{Change, Consent, Failing, Outcome, Plan, Step, eeprom::PowerOn};
+use scanhub_lms_configure::{Change, ChangeError, Consent, Outcome, Plan, Step, eeprom::PowerOn};
 use scanhub_schema::{MILLIS, Nanos};
 use scanhub_sim::device::Device as _;
 use scanhub_sim::machine::{LmsSimulator, ProtocolQuirks, Settings};
-use scanhub_sim::operating::Operating;
+use scanhub_sim::operating::OperatingMode;
 
 use super::{Bench, machine, make_stream, sensor};
 
 /// Asks the sensor what it is; returns the plan to change nothing, and when that was known.
-pub(crate) fn plan(machine: LmsSimulator, now: Nanos) -> (Plan, LmsSimulator, Nanos) {
+pub(crate) fn probe_and_plan(machine: LmsSimulator, now: Nanos) -> (Plan, LmsSimulator, Nanos) {
     let mut bench = Bench::new(Inquiry::new(Baud::B500000, now), Baud::B500000, machine, now);
     bench.finish(20_000 * MILLIS);
-    let plan = Plan::of(bench.talk.report()).expect("it told all of it");
+    let plan = Plan::from_report(bench.protocol.report()).expect("it told all of it");
     (plan, bench.machine, bench.now)
 }
 
 /// Unit mm, mode 4.
-pub(crate) fn other_values(plan: &mut Plan) {
+pub(crate) fn set_other_values(plan: &mut Plan) {
     plan.new.set(5, 4);
     plan.new.set(6, Unit::Cm.code());
 }
 
 pub(crate) fn change(plan: Plan, machine: LmsSimulator, now: Nanos) -> Bench<Change> {
-    Bench::new(Change::new(Consent::of_a_person(plan), now), plan.baud, machine, now)
+    Bench::new(Change::new(Consent::confirmed_by_person(plan), now), plan.baud, machine, now)
 }
 
 /// What the sensor says of itself now.
-pub(crate) fn again(bench: Bench<Change>) -> (Plan, LmsSimulator, Nanos) {
-    plan(bench.machine, bench.now)
+pub(crate) fn probe_again(bench: Bench<Change>) -> (Plan, LmsSimulator, Nanos) {
+    probe_and_plan(bench.machine, bench.now)
 }
 
 #[test]
-fn written_once_read_back_and_the_stream_goes_on() {
+fn configuration_is_written_once_and_stream_resumes() {
     for baud in Baud::ALL {
         for streaming in [false, true] {
             for len in [32, 34] {
                 let settings = Settings { baud, configuration_len: len, seed: 3, ..Settings::default() };
                 let mut machine = machine(settings);
                 let now = if streaming { make_stream(&mut machine) } else { 0 };
-                let (mut plan, machine, now) = plan(machine, now);
+                let (mut plan, machine, now) = probe_and_plan(machine, now);
                 assert_eq!((plan.is_empty(), plan.old.bytes().len()), (true, len));
-                other_values(&mut plan);
+                set_other_values(&mut plan);
                 let mut bench = change(plan, machine, now);
-                let took = bench.finish(60_000 * MILLIS);
+                let elapsed = bench.finish(60_000 * MILLIS);
                 let expected = Outcome {
                     failed: None,
                     written: true,
@@ -57,11 +57,11 @@ fn written_once_read_back_and_the_stream_goes_on() {
                     permanent_baud: None,
                     operating_mode: Some(if streaming { 0x24 } else { 0x25 }),
                 };
-                assert_eq!(*bench.talk.outcome(), expected, "{baud:?} {streaming} {len}");
+                assert_eq!(*bench.protocol.outcome(), expected, "{baud:?} {streaming} {len}");
                 assert_eq!(bench.machine.eeprom_writes(), 1);
-                println!("{baud:?}, streaming {streaming}, {len} bytes: {} ms", took / MILLIS);
-                assert_eq!(bench.overhear(2_000 * MILLIS).is_empty(), !streaming);
-                let (found, machine, _) = again(bench);
+                println!("{baud:?}, streaming {streaming}, {len} bytes: {} ms", elapsed / MILLIS);
+                assert_eq!(bench.collect_telegrams(2_000 * MILLIS).is_empty(), !streaming);
+                let (found, machine, _) = probe_again(bench);
                 let configuration = Configuration::new(found.old.bytes()).unwrap();
                 assert_eq!((configuration.mode(), configuration.unit()), (Mode(4), Some(Unit::Cm)));
                 assert_eq!(machine.eeprom_writes(), 1);
@@ -72,105 +72,108 @@ fn written_once_read_back_and_the_stream_goes_on() {
 
 #[test]
 fn the_rate_after_power_on() {
-    let (mut first, machine, now) = plan(sensor(Baud::B38400), 0);
+    let (mut first, machine, now) = probe_and_plan(sensor(Baud::B38400), 0);
     first.power_on = Some(PowerOn::KeepBaud);
     let mut bench = change(first, machine, now);
     bench.finish(60_000 * MILLIS);
-    let outcome = *bench.talk.outcome();
+    let outcome = *bench.protocol.outcome();
     assert_eq!((outcome.failed, outcome.permanent_baud), (None, Some(true)));
-    let (mut second, machine, now) = again(bench);
+    let (mut second, machine, now) = probe_again(bench);
     second.power_on = Some(PowerOn::Baud9600);
     let mut bench = change(second, machine, now);
     bench.finish(60_000 * MILLIS);
-    assert_eq!((bench.talk.outcome().failed, bench.talk.outcome().permanent_baud), (None, Some(false)));
+    assert_eq!(
+        (bench.protocol.outcome().failed, bench.protocol.outcome().permanent_baud),
+        (None, Some(false))
+    );
     assert_eq!(bench.machine.eeprom_writes(), 2);
 }
 
 #[test]
-fn another_sensor_than_the_one_that_was_asked_is_not_written() {
-    let (mut plan, _, _) = plan(sensor(Baud::B9600), 0);
-    other_values(&mut plan);
+fn does_not_write_to_a_different_scanner() {
+    let (mut plan, _, _) = probe_and_plan(sensor(Baud::B9600), 0);
+    set_other_values(&mut plan);
     let other = machine(Settings { mode: Mode(3), seed: 9, ..Settings::default() });
     let mut bench = change(plan, other, 0);
     bench.finish(60_000 * MILLIS);
-    let outcome = bench.talk.outcome();
-    assert_eq!((outcome.failed, outcome.written), (Some((Step::Compare, Failing::Differs)), false));
-    assert!(bench.said.iter().all(|telegram| telegram[4] == 0x74), "{:02X?}", bench.said);
+    let outcome = bench.protocol.outcome();
+    assert_eq!((outcome.failed, outcome.written), (Some((Step::Compare, ChangeError::Mismatch)), false));
+    assert!(bench.sent_requests.iter().all(|telegram| telegram[4] == 0x74), "{:02X?}", bench.sent_requests);
     assert_eq!(bench.machine.eeprom_writes(), 0);
 }
 
 #[test]
-fn a_wrong_password_writes_nothing_and_leaves_the_stream() {
+fn wrong_password_writes_nothing_and_keeps_stream() {
     let mut machine = sensor(Baud::B500000);
     let now = make_stream(&mut machine);
-    let (mut plan, machine, now) = plan(machine, now);
-    other_values(&mut plan);
+    let (mut plan, machine, now) = probe_and_plan(machine, now);
+    set_other_values(&mut plan);
     plan.password = Password(*b"mistaken");
     let mut bench = change(plan, machine, now);
     bench.finish(60_000 * MILLIS);
-    let outcome = bench.talk.outcome();
-    assert_eq!(outcome.failed, Some((Step::Enter, Failing::Refused)));
+    let outcome = bench.protocol.outcome();
+    assert_eq!(outcome.failed, Some((Step::Enter, ChangeError::Refused)));
     assert_eq!((outcome.written, outcome.configuration), (false, Some(plan.old)));
     assert_eq!((outcome.operating_mode, bench.machine.eeprom_writes()), (Some(0x24), 0));
-    assert!(!bench.overhear(1_000 * MILLIS).is_empty());
+    assert!(!bench.collect_telegrams(1_000 * MILLIS).is_empty());
 }
 
 #[test]
-fn a_refused_write_leaves_what_was() {
-    let (mut plan, mut machine, now) = plan(sensor(Baud::B19200), 0);
-    other_values(&mut plan);
-    machine.set_quirks(ProtocolQuirks { refuses: vec![0x77], ..ProtocolQuirks::default() });
+fn refused_write_keeps_the_old_configuration() {
+    let (mut plan, mut machine, now) = probe_and_plan(sensor(Baud::B19200), 0);
+    set_other_values(&mut plan);
+    machine.set_quirks(ProtocolQuirks { refused_commands: vec![0x77], ..ProtocolQuirks::default() });
     let mut bench = change(plan, machine, now);
     bench.finish(60_000 * MILLIS);
-    let outcome = bench.talk.outcome();
-    assert_eq!(outcome.failed, Some((Step::Write, Failing::Refused)));
+    let outcome = bench.protocol.outcome();
+    assert_eq!(outcome.failed, Some((Step::Write, ChangeError::Refused)));
     assert_eq!((outcome.configuration, outcome.operating_mode), (Some(plan.old), Some(0x25)));
 }
 
 #[test]
 fn another_unit_may_take_seven_seconds() {
-    let (mut plan, mut machine, now) = plan(sensor(Baud::B38400), 0);
-    other_values(&mut plan);
+    let (mut plan, mut machine, now) = probe_and_plan(sensor(Baud::B38400), 0);
+    set_other_values(&mut plan);
     machine.set_quirks(ProtocolQuirks { late_write_ns: 6_000 * MILLIS, ..ProtocolQuirks::default() });
     let mut bench = change(plan, machine, now);
-    let took = bench.finish(60_000 * MILLIS);
-    assert!(took > 7_000 * MILLIS, "{took}");
-    assert_eq!((bench.talk.outcome().failed, bench.machine.eeprom_writes()), (None, 1));
-    assert_eq!(bench.talk.outcome().configuration, Some(plan.new));
+    let elapsed = bench.finish(60_000 * MILLIS);
+    assert!(elapsed > 7_000 * MILLIS, "{elapsed}");
+    assert_eq!((bench.protocol.outcome().failed, bench.machine.eeprom_writes()), (None, 1));
+    assert_eq!(bench.protocol.outcome().configuration, Some(plan.new));
 }
 
 #[test]
 fn a_reply_that_was_lost_costs_no_second_write() {
-    let (mut plan, machine, now) = plan(sensor(Baud::B38400), 0);
-    other_values(&mut plan);
+    let (mut plan, machine, now) = probe_and_plan(sensor(Baud::B38400), 0);
+    set_other_values(&mut plan);
     let mut bench = change(plan, machine, now);
     // Everything is lost while the sensor answers the write: its ACK too.
-    let mut heard = 0;
+    let mut received = 0;
     bench.to_host = Box::new(move |bytes| {
-        heard += bytes.len();
+        received += bytes.len();
         // ACK and F4h of 42 bytes come first, then ACK and A0h of 9, then ACK and F7h of 43.
-        if heard > 53 && heard <= 53 + 44 { Vec::new() } else { bytes }
+        if received > 53 && received <= 53 + 44 { Vec::new() } else { bytes }
     });
     bench.finish(120_000 * MILLIS);
-    assert_eq!((bench.talk.outcome().failed, bench.machine.eeprom_writes()), (None, 1));
-    assert_eq!(bench.talk.outcome().configuration, Some(plan.new));
+    assert_eq!((bench.protocol.outcome().failed, bench.machine.eeprom_writes()), (None, 1));
+    assert_eq!(bench.protocol.outcome().configuration, Some(plan.new));
 }
 
 #[test]
-fn a_sensor_that_falls_silent_may_be_in_installation_mode() {
-    let (mut plan, machine, now) = plan(sensor(Baud::B38400), 0);
-    other_values(&mut plan);
+fn silent_scanner_has_an_unknown_operating_mode() {
+    let (mut plan, machine, now) = probe_and_plan(sensor(Baud::B38400), 0);
+    set_other_values(&mut plan);
     let mut bench = change(plan, machine, now);
-    let mut heard = 0;
+    let mut received = 0;
     bench.to_host = Box::new(move |bytes| {
-        heard += bytes.len();
-        if heard > 53 { Vec::new() } else { bytes }
+        received += bytes.len();
+        if received > 53 { Vec::new() } else { bytes }
     });
-    let took = bench.finish(180_000 * MILLIS);
-    let outcome = bench.talk.outcome();
-    assert_eq!(outcome.failed, Some((Step::Check, Failing::Unanswered)));
+    let elapsed = bench.finish(180_000 * MILLIS);
+    let outcome = bench.protocol.outcome();
+    assert_eq!(outcome.failed, Some((Step::Check, ChangeError::Unanswered)));
     assert_eq!((outcome.written, outcome.configuration, outcome.operating_mode), (true, None, None));
-    println!("silence: {} ms", took / MILLIS);
+    println!("silence: {} ms", elapsed / MILLIS);
 }
 
 #[test]
@@ -180,20 +183,25 @@ fn bad_habits_and_lossy_lines_never_lie() {
         let baud = Baud::ALL[seed as usize % 4];
         let mut machine = sensor(baud);
         let now = if seed % 3 == 0 { make_stream(&mut machine) } else { 0 };
-        let (mut plan, mut machine, now) = plan(machine, now);
-        other_values(&mut plan);
-        let quirks = ProtocolQuirks { overlooks: 0.2, naks: 0.1, doubles: 0.2, ..ProtocolQuirks::default() };
+        let (mut plan, mut machine, now) = probe_and_plan(machine, now);
+        set_other_values(&mut plan);
+        let quirks = ProtocolQuirks {
+            overlooked_share: 0.2,
+            nak_share: 0.1,
+            doubled_share: 0.2,
+            ..ProtocolQuirks::default()
+        };
         machine.set_quirks(quirks);
         let mut bench = change(plan, machine, now);
         let mut random = fastrand::Rng::with_seed(seed);
         bench.to_host = Box::new(move |bytes| bytes.into_iter().filter(|_| random.f64() > 0.001).collect());
         bench.finish(300_000 * MILLIS);
-        let outcome = *bench.talk.outcome();
+        let outcome = *bench.protocol.outcome();
         let writes = bench.machine.eeprom_writes();
         assert!(writes <= 3, "{writes} writes, seed {seed}");
         assert!(outcome.written || writes == 0, "seed {seed}");
         bench.machine.set_quirks(ProtocolQuirks::default());
-        let (found, _, _) = again(bench);
+        let (found, _, _) = probe_again(bench);
         if outcome.failed.is_none() {
             done += 1;
             assert_eq!((found.old, outcome.configuration), (plan.new, Some(plan.new)), "seed {seed}");
@@ -225,19 +233,19 @@ fn losing_stops(mut count: usize) -> Box<dyn FnMut(Vec<u8>) -> Vec<u8>> {
 }
 
 #[test]
-fn the_installation_mode_is_left_although_stops_are_lost() {
+fn leaves_installation_mode_although_stops_are_lost() {
     for (lost, streaming) in [(4, false), (4, true), (7, false), (7, true)] {
         let mut machine = sensor(Baud::B38400);
         let now = if streaming { make_stream(&mut machine) } else { 0 };
-        let (mut plan, machine, now) = plan(machine, now);
-        other_values(&mut plan);
+        let (mut plan, machine, now) = probe_and_plan(machine, now);
+        set_other_values(&mut plan);
         let mut bench = change(plan, machine, now);
-        bench.to_sensor = losing_stops(lost);
+        bench.to_scanner = losing_stops(lost);
         bench.finish(60_000 * MILLIS);
-        let outcome = *bench.talk.outcome();
-        let failed = (lost > 4).then_some((Step::Leave, Failing::Unanswered));
+        let outcome = *bench.protocol.outcome();
+        let failed = (lost > 4).then_some((Step::Leave, ChangeError::Unanswered));
         assert_eq!((outcome.failed, outcome.configuration), (failed, Some(plan.new)), "{lost} {streaming}");
-        let expected = if streaming { Operating::All } else { Operating::OnRequest };
+        let expected = if streaming { OperatingMode::All } else { OperatingMode::OnRequest };
         assert_eq!(*bench.machine.operating(), expected, "{lost} {streaming}");
         assert_eq!(outcome.operating_mode, Some(expected.code()));
     }
@@ -247,35 +255,35 @@ fn the_installation_mode_is_left_although_stops_are_lost() {
 fn a_stray_nak_is_not_believed_where_it_does_harm() {
     // Before the first reply, and while the sensor writes: behind the ACK and F4h of 42 bytes, the ACK and A0h of 9.
     for after in [0, 53] {
-        let (mut plan, mut machine, now) = plan(sensor(Baud::B38400), 0);
-        other_values(&mut plan);
+        let (mut plan, mut machine, now) = probe_and_plan(sensor(Baud::B38400), 0);
+        set_other_values(&mut plan);
         machine.set_quirks(ProtocolQuirks { late_write_ns: 5_000 * MILLIS, ..ProtocolQuirks::default() });
         let mut bench = change(plan, machine, now);
-        let mut heard = 0;
+        let mut received = 0;
         bench.to_host = Box::new(move |mut bytes| {
-            heard += bytes.len();
-            if heard == after + 1 {
+            received += bytes.len();
+            if received == after + 1 {
                 bytes.push(NAK);
             }
             bytes
         });
         bench.finish(60_000 * MILLIS);
-        assert_eq!((bench.talk.outcome().failed, bench.machine.eeprom_writes()), (None, 1), "{after}");
-        let commands: Vec<u8> = bench.said.iter().map(|telegram| telegram[4]).collect();
+        assert_eq!((bench.protocol.outcome().failed, bench.machine.eeprom_writes()), (None, 1), "{after}");
+        let commands: Vec<u8> = bench.sent_requests.iter().map(|telegram| telegram[4]).collect();
         assert_eq!(commands, [0x74, 0x20, 0x77, 0x20, 0x74], "{after}: nothing was said twice");
     }
 }
 
 #[test]
 fn a_reply_that_cannot_be_read_is_no_refusal() {
-    let (mut plan, machine, now) = plan(sensor(Baud::B38400), 0);
-    other_values(&mut plan);
+    let (mut plan, machine, now) = probe_and_plan(sensor(Baud::B38400), 0);
+    set_other_values(&mut plan);
     let mut bench = change(plan, machine, now);
-    let (mut heard, short) =
+    let (mut received, short) =
         (0, Writer::new(0x80, 0xF7).byte(1).slice(&plan.new.bytes()[..7]).byte(0x10).finish());
     bench.to_host = Box::new(move |bytes| {
-        let before = heard;
-        heard += bytes.len();
+        let before = received;
+        received += bytes.len();
         // ACK and F4h of 42 bytes, ACK and A0h of 9, ACK; then F7h of 43.
         match before {
             54 => short.bytes().to_vec(),
@@ -284,7 +292,7 @@ fn a_reply_that_cannot_be_read_is_no_refusal() {
         }
     });
     bench.finish(60_000 * MILLIS);
-    let outcome = *bench.talk.outcome();
+    let outcome = *bench.protocol.outcome();
     assert_eq!((outcome.failed, outcome.configuration), (None, Some(plan.new)));
     assert_eq!(bench.machine.eeprom_writes(), 1);
 }

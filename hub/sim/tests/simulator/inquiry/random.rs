@@ -1,63 +1,63 @@
 //! Random bytes, random orders of events and the fault table against inquiries and changes: they do not panic, they end, and
 //! their results are true. A change writes no more often than it may, and never unnoticed.
 
-use scanhub_drivers::line::{Output, Protocol};
+use scanhub_drivers::line::{Action, Protocol};
 use scanhub_drivers::lms::Inquiry;
 use scanhub_drivers::lms::command::Password;
-use scanhub_drivers::lms::configuration::factory;
-use scanhub_drivers::lms::framer::Tally;
-use scanhub_drivers::lms::telegram::{FRAME, Telegram, Writer};
+use scanhub_drivers::lms::configuration::factory_configuration;
+use scanhub_drivers::lms::framer::FramerCounters;
+use scanhub_drivers::lms::telegram::{FRAME_LEN, Telegram, Writer};
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit};
 use scanhub_lms_configure::{Change, Consent, OwnedConfiguration, Plan};
 use scanhub_schema::{MILLIS, Nanos};
 use scanhub_sim::device::Device as _;
 use scanhub_sim::fault::Faults;
+use scanhub_sim::line_model::LineModel;
 use scanhub_sim::machine::{LmsSimulator, ProtocolQuirks};
-use scanhub_sim::wire::LineModel;
 
-use super::change::{again, change, other_values, plan};
+use super::change::{change, probe_again, probe_and_plan, set_other_values};
 use super::{Bench, make_stream, sensor};
 
-/// Drives `talk` until it is over, by what comes to mind; returns the telegrams that it said.
-fn drive<C: Protocol>(talk: &mut C, seed: u64) -> Vec<Vec<u8>> {
+/// Drives `protocol` until it is over, by what comes to mind; returns the telegrams that it said.
+fn drive<C: Protocol>(protocol: &mut C, seed: u64) -> Vec<Vec<u8>> {
     let mut random = fastrand::Rng::with_seed(seed);
-    let (mut now, mut said, mut request): (Nanos, Vec<Vec<u8>>, Vec<u8>) = (0, Vec::new(), Vec::new());
+    let (mut now, mut sent, mut request): (Nanos, Vec<Vec<u8>>, Vec<u8>) = (0, Vec::new(), Vec::new());
     for _ in 0..200_000 {
-        match talk.poll_output() {
-            Output::SetRate(_) => request.clear(),
-            Output::Transmit { bytes, not_before } => {
+        match protocol.poll_action() {
+            Action::SetRate(_) => request.clear(),
+            Action::Transmit { bytes, not_before } => {
                 let &[byte] = bytes else { panic!("no gaps between {bytes:?}") };
                 now = now.max(not_before) + if random.u8(..100) == 0 { 20 * MILLIS } else { 0 };
-                if talk.restart_if_late(now) {
+                if protocol.restart_if_late(now) {
                     request.clear();
                     continue;
                 }
                 request.push(byte);
                 if let [_, _, low, high, ..] = request[..]
-                    && request.len() == usize::from(u16::from_le_bytes([low, high])) + FRAME
+                    && request.len() == usize::from(u16::from_le_bytes([low, high])) + FRAME_LEN
                 {
-                    said.push(std::mem::take(&mut request));
+                    sent.push(std::mem::take(&mut request));
                 }
-                talk.transmitted(now);
+                protocol.handle_transmitted(now);
             }
-            Output::Wait { until } => {
-                if talk.is_done() {
-                    return said;
+            Action::Wait { until } => {
+                if protocol.is_done() {
+                    return sent;
                 }
-                let asked = said.last().map(|telegram| telegram[4]);
-                let bytes = anything(asked, &mut random);
+                let last_command = sent.last().map(|telegram| telegram[4]);
+                let bytes = random_bytes_or_reply(last_command, &mut random);
                 let is_early = random.u8(..3) == 0;
                 now = if is_early {
                     now + random.u64(..5 * MILLIS)
                 } else {
                     until.clamp(now, now + 10_000_000_000)
                 };
-                let spare = talk.spare();
+                let spare = protocol.read_buffer();
                 let len = if random.bool() { bytes.len().min(spare.len()) } else { 0 };
                 spare[..len].copy_from_slice(&bytes[..len]);
-                talk.commit(now, len);
+                protocol.commit(now, len);
                 if len == 0 {
-                    talk.handle_timeout(now);
+                    protocol.handle_timeout(now);
                 }
             }
             output => panic!("{output:?}"),
@@ -67,9 +67,9 @@ fn drive<C: Protocol>(talk: &mut C, seed: u64) -> Vec<Vec<u8>> {
 }
 
 /// Noise, acknowledgements, or a telegram that a sensor may send, often the answer to what it was `asked`.
-fn anything(asked: Option<u8>, random: &mut fastrand::Rng) -> Vec<u8> {
-    let noise = |random: &mut fastrand::Rng, most| {
-        (0..random.usize(..most)).map(|_| random.u8(..)).collect::<Vec<u8>>()
+fn random_bytes_or_reply(request: Option<u8>, random: &mut fastrand::Rng) -> Vec<u8> {
+    let noise = |random: &mut fastrand::Rng, maximum| {
+        (0..random.usize(..maximum)).map(|_| random.u8(..)).collect::<Vec<u8>>()
     };
     match random.u8(..6) {
         0 => noise(random, 400),
@@ -78,11 +78,12 @@ fn anything(asked: Option<u8>, random: &mut fastrand::Rng) -> Vec<u8> {
             const COMMANDS: [u8; 12] =
                 [0x90, 0x92, 0xA0, 0xB0, 0xB1, 0xB2, 0xB5, 0xB6, 0xBA, 0xE6, 0xF4, 0xF7];
             let any = COMMANDS[random.usize(..COMMANDS.len())];
-            let command = asked.filter(|_| random.u8(..4) > 0).map_or(any, |asked| asked | 0x80);
+            let command =
+                request.filter(|_| random.u8(..4) > 0).map_or(any, |request_code| request_code | 0x80);
             let data = match command {
                 0xA0 => vec![random.u8(..4) / 3],
                 0xB1 => (0..152).map(|_| random.u8(..)).collect(),
-                0xF4 if random.u8(..4) > 0 => factory(Mode(1), Unit::Mm).to_vec(),
+                0xF4 if random.u8(..4) > 0 => factory_configuration(Mode(1), Unit::Mm).to_vec(),
                 0xF4 => (0..34).map(|_| random.u8(..)).collect(),
                 0xF7 => (0..35).map(|_| random.u8(..2)).collect(),
                 _ => noise(random, 40),
@@ -92,7 +93,7 @@ fn anything(asked: Option<u8>, random: &mut fastrand::Rng) -> Vec<u8> {
     }
 }
 
-fn is_conserved(tally: &Tally, open: usize) -> bool {
+fn are_bytes_conserved(tally: &FramerCounters, open: usize) -> bool {
     tally.read == tally.in_telegrams + tally.acknowledge + tally.discarded + open as u64
 }
 
@@ -104,17 +105,17 @@ fn an_inquiry_ends_and_only_asks() {
             let telegram = Telegram::check(&telegram).unwrap_or_else(|| panic!("{telegram:02X?}"));
             assert!([0x31, 0x32, 0x35, 0x3A, 0x74].contains(&telegram.command()), "{telegram:?}");
         }
-        let (tally, open) = inquiry.tally();
-        assert!(is_conserved(tally, open), "seed {seed}: {tally:?}");
+        let (tally, open) = inquiry.byte_counters();
+        assert!(are_bytes_conserved(tally, open), "seed {seed}: {tally:?}");
     }
 }
 
 #[test]
-fn a_change_ends_writes_what_was_shown_and_leaves_the_installation_mode() {
-    let old = OwnedConfiguration::new(&factory(Mode(1), Unit::Mm)).expect("34 bytes");
+fn writes_the_plan_and_leaves_installation_mode() {
+    let old = OwnedConfiguration::new(&factory_configuration(Mode(1), Unit::Mm)).expect("34 bytes");
     let mut new = old;
     new.set(6, 0);
-    let mut most = 0;
+    let mut maximum = 0;
     for seed in 0..200 {
         let plan = Plan {
             baud: Baud::B38400,
@@ -125,9 +126,9 @@ fn a_change_ends_writes_what_was_shown_and_leaves_the_installation_mode() {
             power_on: None,
             password: Password::FACTORY,
         };
-        let mut change = Change::new(Consent::of_a_person(plan), 0);
-        let said = drive(&mut change, seed);
-        let commands: Vec<(u8, u8)> = said
+        let mut change = Change::new(Consent::confirmed_by_person(plan), 0);
+        let sent = drive(&mut change, seed);
+        let commands: Vec<(u8, u8)> = sent
             .iter()
             .map(|bytes| {
                 let telegram = Telegram::check(bytes).unwrap_or_else(|| panic!("{bytes:02X?}"));
@@ -138,14 +139,14 @@ fn a_change_ends_writes_what_was_shown_and_leaves_the_installation_mode() {
             })
             .collect();
         let writes = commands.iter().filter(|(command, _)| *command == 0x77).count();
-        most = most.max(writes);
+        maximum = maximum.max(writes);
         assert_eq!(writes > 0, change.outcome().written, "seed {seed}");
         assert!(commands.iter().all(|(command, _)| [0x20, 0x74, 0x77].contains(command)), "{commands:02X?}");
-        let entered = commands.iter().rposition(|said| *said == (0x20, 0x00));
-        let left = commands.iter().rposition(|said| *said == (0x20, 0x25));
+        let entered = commands.iter().rposition(|command| *command == (0x20, 0x00));
+        let left = commands.iter().rposition(|command| *command == (0x20, 0x25));
         assert!(entered.is_none() || left > entered, "seed {seed}: {commands:02X?}");
     }
-    assert!((1..=3).contains(&most), "{most} writes");
+    assert!((1..=3).contains(&maximum), "{maximum} writes");
 }
 
 /// Faults, and the minimum number of 8 inquiries and of 8 changes that must succeed with them.
@@ -172,7 +173,7 @@ const SCENES: &[(&str, [usize; 2])] = &[
 ];
 
 /// The sensor of `seed`, idle or streaming, and when it is.
-fn any_sensor(seed: u64) -> (Baud, LmsSimulator, u64, bool) {
+fn any_scanner(seed: u64) -> (Baud, LmsSimulator, u64, bool) {
     let baud = Baud::ALL[seed as usize % 4];
     let mut machine = sensor(baud);
     let is_streaming = seed % 8 >= 4;
@@ -181,24 +182,24 @@ fn any_sensor(seed: u64) -> (Baud, LmsSimulator, u64, bool) {
 }
 
 /// `bench` with `faults`, the sensor's own and the line's.
-fn troubled<C>(mut bench: Bench<C>, faults: &Faults, seed: u64) -> Bench<C> {
+fn with_faults<C>(mut bench: Bench<C>, faults: &Faults, seed: u64) -> Bench<C> {
     bench.machine.set_quirks(faults.quirks());
     let fresh = LineModel::new(faults, seed);
-    bench.wire = fresh;
+    bench.line = fresh;
     bench
 }
 
 #[test]
-fn an_inquiry_tells_what_is_so() {
-    for (text, [least, _]) in SCENES {
+fn probe_report_is_right_despite_faults() {
+    for (text, [min_found, _]) in SCENES {
         let faults: Faults = text.parse().expect("faults");
         let mut found = 0;
-        for seed in 0..SEEDS {
-            let (baud, machine, now, is_streaming) = any_sensor(seed);
+        for seed in 0..SEED_COUNT {
+            let (baud, machine, now, is_streaming) = any_scanner(seed);
             let inquiry = Bench::new(Inquiry::new(Baud::B500000, now), Baud::B500000, machine, now);
-            let mut bench = troubled(inquiry, &faults, seed);
+            let mut bench = with_faults(inquiry, &faults, seed);
             bench.finish(60_000 * MILLIS);
-            let report = bench.talk.report();
+            let report = bench.protocol.report();
             if let Some(status) = report.status() {
                 found += 1;
                 // The power may have gone since.
@@ -210,33 +211,33 @@ fn an_inquiry_tells_what_is_so() {
             if let Some(kind) = report.kind() {
                 assert_eq!(kind, b"LMS200;301063;V02.30", "{text}, {seed}");
             }
-            let (tally, open) = bench.talk.tally();
+            let (tally, open) = bench.protocol.byte_counters();
             let known = tally.in_telegrams + tally.acknowledge + tally.discarded + open as u64;
             assert_eq!((tally.read, bench.machine.eeprom_writes()), (known, 0), "{text}, {seed}");
         }
-        println!("{text}: {found} of {SEEDS} found");
-        assert!(found >= *least, "{text}: {found} of {SEEDS} found");
+        println!("{text}: {found} of {SEED_COUNT} found");
+        assert!(found >= *min_found, "{text}: {found} of {SEED_COUNT} found");
     }
 }
 
 #[test]
-fn a_change_knows_what_it_did() {
-    for (text, [_, least]) in SCENES {
+fn change_outcome_is_right_despite_faults() {
+    for (text, [_, min_done]) in SCENES {
         let faults: Faults = text.parse().expect("faults");
         let mut done = 0;
-        for seed in 0..SEEDS {
-            let (_, machine, now, _) = any_sensor(seed);
-            let (mut plan, machine, now) = plan(machine, now);
-            other_values(&mut plan);
-            let mut bench: Bench<Change> = troubled(change(plan, machine, now), &faults, seed);
+        for seed in 0..SEED_COUNT {
+            let (_, machine, now, _) = any_scanner(seed);
+            let (mut plan, machine, now) = probe_and_plan(machine, now);
+            set_other_values(&mut plan);
+            let mut bench: Bench<Change> = with_faults(change(plan, machine, now), &faults, seed);
             bench.finish(300_000 * MILLIS);
-            let outcome = *bench.talk.outcome();
+            let outcome = *bench.protocol.outcome();
             let writes = bench.machine.eeprom_writes();
             assert!(writes <= 3 && (outcome.written || writes == 0), "{text}, {seed}: {writes} writes");
-            bench.wire.set_faults(&Faults::default(), 0);
+            bench.line.set_faults(&Faults::default(), 0);
             bench.machine.set_quirks(ProtocolQuirks::default());
-            bench.overhear(10_000 * MILLIS);
-            let (found, _, _) = again(bench);
+            bench.collect_telegrams(10_000 * MILLIS);
+            let (found, _, _) = probe_again(bench);
             if let Some(kept) = outcome.configuration {
                 assert_eq!(found.old, kept, "{text}, {seed}: {outcome:?}");
             }
@@ -251,10 +252,10 @@ fn a_change_knows_what_it_did() {
                 );
             }
         }
-        println!("{text}: {done} of {SEEDS} done");
-        assert!(done >= *least, "{text}: {done} of {SEEDS} done");
+        println!("{text}: {done} of {SEED_COUNT} done");
+        assert!(done >= *min_done, "{text}: {done} of {SEED_COUNT} done");
     }
 }
 
 /// Each rate, idle and streaming.
-const SEEDS: u64 = 8;
+const SEED_COUNT: u64 = 8;

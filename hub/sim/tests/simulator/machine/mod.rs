@@ -6,19 +6,19 @@ mod states;
 use proptest::prelude::*;
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::command::{EEPROM_WRITES, Request};
-use scanhub_drivers::lms::measured::Measured;
+use scanhub_drivers::lms::measured::MeasuredValues;
 use scanhub_drivers::lms::reply::Reply;
 use scanhub_drivers::lms::telegram::{ACK, NAK, Telegram, Writer};
-use scanhub_drivers::lms::variant::{Baud, MIRROR_TURN, Mode, Unit, Variant};
+use scanhub_drivers::lms::variant::{Baud, MIRROR_PERIOD, Mode, Unit, Variant};
 use scanhub_schema::{MICROS, MILLIS, Nanos, line_time};
-use scanhub_sim::device::{Chunk, Device as _, Part, Sent};
+use scanhub_sim::device::{Chunk, ChunkKind, Device as _, SentTelegram};
 use scanhub_sim::fault::{Fault, Faults};
-use scanhub_sim::machine::{LmsSimulator, Settings, Start};
-use scanhub_sim::operating::{Operating, Source};
+use scanhub_sim::line_model::LineModel;
+use scanhub_sim::machine::{LmsSimulator, Settings, StartState};
+use scanhub_sim::operating::{OperatingMode, ScanSource};
 use scanhub_sim::room::Room;
-use scanhub_sim::wire::LineModel;
 use scanhub_sim::world::World;
-use scanhub_sim::{Arrival, ChunkSize, Dropped};
+use scanhub_sim::{Arrival, ChunkSize, DroppedRequest};
 
 /// A simulated scanner with its clock, and everything that it has sent.
 pub(crate) struct Bench {
@@ -29,10 +29,10 @@ pub(crate) struct Bench {
 
 impl Bench {
     pub(crate) fn new(settings: Settings) -> Bench {
-        Bench::with(settings, Source::Room(Room::new(&"room".parse().unwrap(), 1)))
+        Bench::with_source(settings, ScanSource::Room(Room::new(&"room".parse().unwrap(), 1)))
     }
 
-    pub(crate) fn with(settings: Settings, source: Source) -> Bench {
+    pub(crate) fn with_source(settings: Settings, source: ScanSource) -> Bench {
         Bench { machine: LmsSimulator::new(settings, source), now: 0, chunks: Vec::new() }
     }
 
@@ -47,7 +47,7 @@ impl Bench {
     }
 
     /// Says `bytes` with `gap` of idle time between them.
-    pub(crate) fn say(&mut self, bytes: &[u8], gap: Nanos) {
+    pub(crate) fn send(&mut self, bytes: &[u8], gap: Nanos) {
         for &byte in bytes {
             self.run_until(self.now + line_time(1, self.machine.baud().rate()) + gap);
             self.machine.receive(byte, Arrival::at(self.now));
@@ -57,7 +57,7 @@ impl Bench {
     /// Sends `request` with correct timing, and returns the reply of the next half second.
     pub(crate) fn ask(&mut self, bytes: &[u8]) -> Vec<u8> {
         let before = self.chunks.len();
-        self.say(bytes, 60 * MICROS);
+        self.send(bytes, 60 * MICROS);
         self.run_until(self.now + 500 * MILLIS);
         self.bytes_from(before)
     }
@@ -66,10 +66,10 @@ impl Bench {
         self.chunks[first..].iter().flat_map(|(_, chunk)| chunk.bytes.clone()).collect()
     }
 
-    pub(crate) fn sent(&self) -> Vec<(Nanos, Sent)> {
+    pub(crate) fn sent(&self) -> Vec<(Nanos, SentTelegram)> {
         let end = |(at, chunk): &(Nanos, Chunk)| match &chunk.part {
-            Part::End(sent) => Some((*at, sent.clone())),
-            Part::Acknowledge | Part::Telegram => None,
+            ChunkKind::End(sent) => Some((*at, sent.clone())),
+            ChunkKind::Acknowledge | ChunkKind::Telegram => None,
         };
         self.chunks.iter().filter_map(end).collect()
     }
@@ -81,7 +81,7 @@ pub(crate) fn reply(bytes: &[u8]) -> Reply<'_> {
     Reply::decode(Telegram::check(&bytes[1..]).expect("a whole telegram")).expect("a reply")
 }
 
-pub(crate) fn fast() -> Settings {
+pub(crate) fn fast_settings() -> Settings {
     Settings { baud: Baud::B500000, ..Settings::default() }
 }
 
@@ -115,7 +115,7 @@ fn a_start_up_at_9600_to_a_stream_at_500k() {
     let sent = bench.sent().split_off(first);
     assert!(sent[0].1.is_reply && sent.len() > 20);
     for pair in sent[1..].windows(2) {
-        assert_eq!(pair[1].0 - pair[0].0, MIRROR_TURN, "181 beams at 500k come once a turn");
+        assert_eq!(pair[1].0 - pair[0].0, MIRROR_PERIOD, "181 beams at 500k come once a turn");
         assert_eq!(pair[1].1.telegram.len(), 372);
     }
     assert_eq!(bench.machine.eeprom_writes(), 0);
@@ -123,31 +123,34 @@ fn a_start_up_at_9600_to_a_stream_at_500k() {
 
 #[test]
 fn the_times_of_an_answer() {
-    for (request, least, most) in
+    for (request, min, max) in
         [(Request::Status, 55 * MILLIS, 160 * MILLIS), (Request::Stop, 55 * MILLIS, 100 * MILLIS)]
     {
-        let mut bench = Bench::new(fast());
-        bench.say(request.encode(0).bytes(), 60 * MICROS);
-        let asked = bench.now;
-        bench.run_until(asked + 3_000 * MILLIS);
-        assert_eq!((&bench.chunks[0].1.bytes[..], &bench.chunks[0].1.part), (&[ACK][..], &Part::Acknowledge));
-        assert!(bench.chunks[0].0 - asked <= 60 * MILLIS);
-        let answered = bench.chunks.last().unwrap().0 - asked;
-        assert!((least..=most).contains(&answered), "{request:?} after {answered} ns");
+        let mut bench = Bench::new(fast_settings());
+        bench.send(request.encode(0).bytes(), 60 * MICROS);
+        let requested_at = bench.now;
+        bench.run_until(requested_at + 3_000 * MILLIS);
+        assert_eq!(
+            (&bench.chunks[0].1.bytes[..], &bench.chunks[0].1.part),
+            (&[ACK][..], &ChunkKind::Acknowledge)
+        );
+        assert!(bench.chunks[0].0 - requested_at <= 60 * MILLIS);
+        let answered = bench.chunks.last().unwrap().0 - requested_at;
+        assert!((min..=max).contains(&answered), "{request:?} after {answered} ns");
     }
 }
 
 #[test]
 fn a_stream_keeps_its_grid_and_pauses_with_the_mirror() {
-    let mut bench = Bench::new(fast());
+    let mut bench = Bench::new(fast_settings());
     bench.ask(Request::Stream.encode(0).bytes());
     bench.run_until(60_000 * MILLIS);
     let sent: Vec<_> = bench.sent().into_iter().filter(|(_, sent)| !sent.is_reply).collect();
     let (first, last) = (sent[0].0, sent[sent.len() - 1].0);
-    assert_eq!(last - first, (sent.len() as Nanos - 1) * 2 * MIRROR_TURN, "drifts");
+    assert_eq!(last - first, (sent.len() as Nanos - 1) * 2 * MIRROR_PERIOD, "drifts");
     assert!(sent.iter().all(|(_, sent)| !sent.aborted && Telegram::check(&sent.telegram).is_some()));
     // Of the last telegram: 508 bytes in 10.16 ms, a pause, the rest in the next turn.
-    let start = last - MIRROR_TURN - line_time(224, 500_000);
+    let start = last - MIRROR_PERIOD - line_time(224, 500_000);
     let mut through = 0;
     let mut pauses = 0;
     for (at, chunk) in bench.chunks.iter().filter(|(at, _)| (start..=last).contains(at)) {
@@ -162,7 +165,7 @@ fn a_stream_keeps_its_grid_and_pauses_with_the_mirror() {
 }
 
 #[test]
-fn each_rate_and_variant_has_the_period_of_the_listing() {
+fn period_at_each_rate_and_variant_is_as_listed() {
     for baud in Baud::ALL {
         for variant in Variant::ALL {
             let mut bench =
@@ -179,11 +182,11 @@ fn each_rate_and_variant_has_the_period_of_the_listing() {
 }
 
 #[test]
-fn a_request_breaks_the_scan_off_and_a_fresh_one_follows() {
-    let mut bench = Bench::new(fast());
+fn request_aborts_the_scan_then_a_full_one_is_sent() {
+    let mut bench = Bench::new(fast_settings());
     bench.ask(Request::Stream.encode(0).bytes());
     // Into the middle of the first burst.
-    let next = bench.sent().last().unwrap().0 + 2 * MIRROR_TURN - 17_800 * MICROS;
+    let next = bench.sent().last().unwrap().0 + 2 * MIRROR_PERIOD - 17_800 * MICROS;
     bench.run_until(next + 3 * MILLIS);
     let (before, sent_before) = (bench.chunks.len(), bench.sent().len());
     let bytes = bench.ask(Request::Type.encode(0).bytes());
@@ -193,7 +196,7 @@ fn a_request_breaks_the_scan_off_and_a_fresh_one_follows() {
     assert!(sent[2..].iter().all(|(_, sent)| !sent.is_reply && !sent.aborted));
     // On the wire: the scan's head, ACK, the whole reply, a whole scan.
     let broken = &sent[0].1.telegram;
-    let head = bench.chunks[..before].iter().rev().take_while(|(_, chunk)| chunk.part == Part::Telegram);
+    let head = bench.chunks[..before].iter().rev().take_while(|(_, chunk)| chunk.part == ChunkKind::Telegram);
     let head: usize = head.map(|(_, chunk)| chunk.bytes.len()).sum();
     let rest = bytes.iter().zip(&broken[head..]).take_while(|(a, b)| a == b).count();
     assert!(head + rest < 300, "{} bytes of it left", head + rest);
@@ -202,15 +205,15 @@ fn a_request_breaks_the_scan_off_and_a_fresh_one_follows() {
     assert_eq!(answer, sent[1].1.telegram);
     assert_eq!(bytes[rest + 30..][..732], sent[2].1.telegram);
     // The new scan begins where the mirror begins one.
-    assert_eq!((sent[2].0 - 17_800 * MICROS) % (2 * MIRROR_TURN), 0);
+    assert_eq!((sent[2].0 - 17_800 * MICROS) % (2 * MIRROR_PERIOD), 0);
 }
 
 #[test]
-fn a_request_between_two_bursts_breaks_the_scan_off_too() {
-    let mut bench = Bench::new(fast());
+fn request_between_bursts_also_aborts_the_scan() {
+    let mut bench = Bench::new(fast_settings());
     bench.ask(Request::Stream.encode(0).bytes());
     // 508 bytes are through, the others wait for the mirror.
-    let next = bench.sent().last().unwrap().0 + 2 * MIRROR_TURN - 17_800 * MICROS;
+    let next = bench.sent().last().unwrap().0 + 2 * MIRROR_PERIOD - 17_800 * MICROS;
     bench.run_until(next + 11 * MILLIS);
     let sent_before = bench.sent().len();
     bench.ask(Request::Type.encode(0).bytes());
@@ -220,8 +223,8 @@ fn a_request_between_two_bursts_breaks_the_scan_off_too() {
 }
 
 #[test]
-fn stopping_stops_and_a_second_request_replaces_the_first() {
-    let mut bench = Bench::new(fast());
+fn stop_ends_stream_and_newer_request_replaces_older() {
+    let mut bench = Bench::new(fast_settings());
     bench.ask(Request::Stream.encode(0).bytes());
     bench.ask(Request::Stop.encode(0).bytes());
     let chunks = bench.chunks.len();
@@ -229,7 +232,7 @@ fn stopping_stops_and_a_second_request_replaces_the_first() {
     assert_eq!(bench.chunks.len(), chunks);
     assert_eq!(bench.machine.poll_timeout(), None);
     let replies = bench.sent().len();
-    bench.say(Request::Status.encode(0).bytes(), 60 * MICROS);
+    bench.send(Request::Status.encode(0).bytes(), 60 * MICROS);
     bench.ask(Request::Type.encode(0).bytes());
     let sent = bench.sent().split_off(replies);
     assert_eq!(sent.len(), 1);
@@ -237,13 +240,13 @@ fn stopping_stops_and_a_second_request_replaces_the_first() {
 }
 
 #[test]
-fn what_is_not_heard_and_what_is_refused() {
-    let mut bench = Bench::new(Settings { address: 5, ..fast() });
+fn ignores_or_refuses_invalid_requests() {
+    let mut bench = Bench::new(Settings { address: 5, ..fast_settings() });
     let status = Request::Status.encode(0);
-    bench.say(status.bytes(), 7 * MILLIS);
+    bench.send(status.bytes(), 7 * MILLIS);
     bench.run_until(bench.now + 500 * MILLIS);
     assert!(bench.chunks.is_empty(), "bytes with long gaps were heard");
-    assert_eq!(bench.machine.take_dropped(), Some(Dropped::LongGap { after: 1 }));
+    assert_eq!(bench.machine.take_dropped(), Some(DroppedRequest::LongGap { after: 1 }));
     assert!(bench.ask(Request::Status.encode(4).bytes()).is_empty(), "another address");
     let mut wrong = status.bytes().to_vec();
     wrong[6] ^= 1;
@@ -261,8 +264,8 @@ fn what_is_not_heard_and_what_is_refused() {
 }
 
 #[test]
-fn every_write_to_the_eeprom_is_counted_and_only_installation_mode_does_one() {
-    let mut bench = Bench::new(fast());
+fn counts_refused_and_executed_eeprom_writes() {
+    let mut bench = Bench::new(fast_settings());
     for (count, command) in EEPROM_WRITES.into_iter().enumerate() {
         assert_eq!(reply(&bench.ask(Writer::new(0, command).byte(0).finish().bytes())), Reply::Refused);
         assert_eq!(bench.machine.eeprom_writes(), count as u64 + 1);
@@ -285,15 +288,15 @@ fn every_write_to_the_eeprom_is_counted_and_only_installation_mode_does_one() {
 }
 
 #[test]
-fn a_recording_is_sent_once_from_its_beginning_whatever_the_host_does() {
+fn recording_is_sent_once_despite_host_requests() {
     let telegrams: Vec<Vec<u8>> =
         (0..30u16).map(|i| lms::measured::encode(0, Unit::Cm, &[i; 181], 0x10).bytes().to_vec()).collect();
     let variant = Variant::new(180, 100).unwrap();
-    let source = Source::Recorded { variant, telegrams: Box::new(telegrams.clone().into_iter()) };
-    let mut bench = Bench::with(Settings { variant, ..fast() }, source);
+    let source = ScanSource::Recorded { variant, telegrams: Box::new(telegrams.clone().into_iter()) };
+    let mut bench = Bench::with_source(Settings { variant, ..fast_settings() }, source);
     let bytes = bench.ask(Request::Variant(Variant::HALF).encode(0).bytes());
     assert_eq!(reply(&bytes), Reply::Variant { done: false, angle_deg: 180, resolution_cdeg: 100 });
-    bench.say(Request::Stream.encode(0).bytes(), 60 * MICROS);
+    bench.send(Request::Stream.encode(0).bytes(), 60 * MICROS);
     bench.run_until(bench.now + 200 * MILLIS);
     bench.ask(Request::Type.encode(0).bytes());
     let data = bench.sent().into_iter().filter(|(_, sent)| !sent.is_reply).map(|(_, sent)| sent.telegram);
@@ -322,7 +325,7 @@ proptest! {
             ..Settings::default()
         };
         let world: World = World::names().nth(world).unwrap().parse().unwrap();
-        let mut machine = LmsSimulator::new(settings, Source::Room(Room::new(&world, seed)));
+        let mut machine = LmsSimulator::new(settings, ScanSource::Room(Room::new(&world, seed)));
         let mut now = 0;
         for &byte in Request::Stream.encode(0).bytes() {
             now += line_time(1, machine.baud().rate()) + 60 * MICROS;
@@ -334,13 +337,13 @@ proptest! {
             while let Some(chunk) = machine.poll_transmit(now) {
                 bytes.extend_from_slice(&chunk.bytes);
                 match chunk.part {
-                    Part::Acknowledge => bytes.clear(),
-                    Part::Telegram => {}
-                    Part::End(sent) => {
+                    ChunkKind::Acknowledge => bytes.clear(),
+                    ChunkKind::Telegram => {}
+                    ChunkKind::End(sent) => {
                         prop_assert!(!sent.aborted);
                         prop_assert_eq!(&bytes, &sent.telegram);
                         let telegram = Telegram::check(&bytes).expect("intact");
-                        prop_assert_eq!(Measured::decode(telegram).is_none(), sent.is_reply);
+                        prop_assert_eq!(MeasuredValues::decode(telegram).is_none(), sent.is_reply);
                         bytes.clear();
                     }
                 }
@@ -350,32 +353,36 @@ proptest! {
 }
 
 /// A telegram with the bytes that arrived in its time, and the verdict.
-struct Told {
+struct TransmittedTelegram {
     telegram: Vec<u8>,
     arrived: Vec<u8>,
     fault: Option<Fault>,
 }
 
 /// Everything that a sensor says within `span` over a wire with `faults`.
-fn carried(faults: &str, seed: u64, chunk: ChunkSize, span: Nanos) -> Vec<Told> {
-    let settings =
-        Settings { baud: Baud::B500000, start: Start::In(Operating::All), chunk, ..Settings::default() };
-    let mut machine = LmsSimulator::new(settings, Source::Room(Room::new(&World::Random, 1)));
+fn transmit(faults: &str, seed: u64, chunk: ChunkSize, span: Nanos) -> Vec<TransmittedTelegram> {
+    let settings = Settings {
+        baud: Baud::B500000,
+        start: StartState::Operating(OperatingMode::All),
+        chunk,
+        ..Settings::default()
+    };
+    let mut machine = LmsSimulator::new(settings, ScanSource::Room(Room::new(&World::Random, 1)));
     let mut wire = LineModel::new(&faults.parse::<Faults>().unwrap(), seed);
-    let (mut now, mut arrived, mut fault, mut told) = (0, Vec::new(), None, Vec::new());
+    let (mut now, mut arrived, mut fault, mut transmitted) = (0, Vec::new(), None, Vec::new());
     while let Some(at) = wire.poll_timeout(&machine, now).filter(|&at| at <= span) {
         assert!(at > now || now == 0, "no progress at {at}");
         now = at;
         while let Some(carried) = wire.poll_transmit(&mut machine, now) {
             fault = fault.or(carried.fault);
             arrived.extend(carried.bytes);
-            if let Some(Part::End(sent)) = carried.part {
+            if let Some(ChunkKind::End(sent)) = carried.part {
                 let (arrived, fault) = (std::mem::take(&mut arrived), fault.take());
-                told.push(Told { telegram: sent.telegram, arrived, fault });
+                transmitted.push(TransmittedTelegram { telegram: sent.telegram, arrived, fault });
             }
         }
     }
-    told
+    transmitted
 }
 
 fn contains(bytes: &[u8], part: &[u8]) -> bool {
@@ -383,7 +390,7 @@ fn contains(bytes: &[u8], part: &[u8]) -> bool {
 }
 
 #[test]
-fn a_telegram_is_called_damaged_exactly_if_it_did_not_arrive_in_one_piece() {
+fn fault_is_set_exactly_for_telegrams_not_intact() {
     for (faults, named) in [
         ("", None),
         ("loss=0.001,burst=2", Some(Fault::Loss)),
@@ -401,15 +408,15 @@ fn a_telegram_is_called_damaged_exactly_if_it_did_not_arrive_in_one_piece() {
         ("stall=0.3,stall_every=1,delay=0.01", None),
         ("flood=100,flood_every=0.01,wall=50,wall_every=0.01,inside=0", None),
     ] {
-        let told = carried(faults, 3, ChunkSize::Uart, 5_000 * MILLIS);
+        let transmitted = transmit(faults, 3, ChunkSize::Uart, 5_000 * MILLIS);
         let mut damaged = 0;
-        for Told { telegram, arrived, fault } in &told {
+        for TransmittedTelegram { telegram, arrived, fault } in &transmitted {
             assert_eq!(fault.is_none(), contains(arrived, telegram), "{faults}: {fault:?}");
             assert!(fault.is_none() || *fault == named, "{faults}: {fault:?}");
             damaged += usize::from(fault.is_some());
         }
         assert_eq!(damaged > 0, named.is_some(), "{faults}");
-        assert!(told.len() - damaged > 10, "{faults}: {damaged} of {}", told.len());
+        assert!(transmitted.len() - damaged > 10, "{faults}: {damaged} of {}", transmitted.len());
     }
 }
 
@@ -418,8 +425,8 @@ fn a_seed_damages_the_same_bytes_however_they_are_cut() {
     let faults =
         "loss=0.001,burst=2,flip=0.0005,flip_bits=3,insert=0.0005,double=0.0005,truncate=0.1,length=0.1";
     let cut = |chunk, seed| -> Vec<(Vec<u8>, Option<Fault>)> {
-        let told = carried(faults, seed, chunk, 3_000 * MILLIS);
-        told.into_iter().map(|told| (told.arrived, told.fault)).collect()
+        let transmitted = transmit(faults, seed, chunk, 3_000 * MILLIS);
+        transmitted.into_iter().map(|sent| (sent.arrived, sent.fault)).collect()
     };
     let (uart, usb) = (cut(ChunkSize::Uart, 7), cut(ChunkSize::Usb, 7));
     assert!(uart.len() > 100 && uart == usb);
@@ -428,16 +435,16 @@ fn a_seed_damages_the_same_bytes_however_they_are_cut() {
 
 #[test]
 fn a_repeated_telegram_has_a_truth_of_its_own() {
-    let told = carried("repeat=0.5", 3, ChunkSize::Uart, 3_000 * MILLIS);
-    let repeated = told.windows(2).filter(|pair| pair[0].telegram == pair[1].telegram).count();
-    assert!((30..80).contains(&repeated), "{repeated} of {}", told.len());
-    assert!(told.iter().all(|told| told.fault.is_none() && told.arrived == told.telegram));
+    let transmitted = transmit("repeat=0.5", 3, ChunkSize::Uart, 3_000 * MILLIS);
+    let repeated = transmitted.windows(2).filter(|pair| pair[0].telegram == pair[1].telegram).count();
+    assert!((30..80).contains(&repeated), "{repeated} of {}", transmitted.len());
+    assert!(transmitted.iter().all(|sent| sent.fault.is_none() && sent.arrived == sent.telegram));
 }
 
 #[test]
-fn what_is_stuck_comes_late_and_in_order() {
-    let told = carried("stall=0.5,stall_at=1", 3, ChunkSize::Uart, 3_000 * MILLIS);
-    let smooth = carried("", 3, ChunkSize::Uart, 3_000 * MILLIS);
-    assert_eq!(told.len(), smooth.len());
-    assert!(told.iter().zip(&smooth).all(|(late, smooth)| late.arrived == smooth.telegram));
+fn stalled_telegrams_arrive_late_but_in_order() {
+    let transmitted = transmit("stall=0.5,stall_at=1", 3, ChunkSize::Uart, 3_000 * MILLIS);
+    let smooth = transmit("", 3, ChunkSize::Uart, 3_000 * MILLIS);
+    assert_eq!(transmitted.len(), smooth.len());
+    assert!(transmitted.iter().zip(&smooth).all(|(late, smooth)| late.arrived == smooth.telegram));
 }

@@ -3,23 +3,23 @@
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::command::Password;
 use scanhub_drivers::lms::command::Request;
-use scanhub_drivers::lms::measured::Measured;
+use scanhub_drivers::lms::measured::MeasuredValues;
 use scanhub_drivers::lms::reply::Reply;
 use scanhub_drivers::lms::telegram::{ACK, NAK, Telegram, Writer};
-use scanhub_drivers::lms::variant::{Baud, MIRROR_TURN, Unit, Variant};
-use scanhub_lms_configure::eeprom::{PowerOn, Write};
+use scanhub_drivers::lms::variant::{Baud, MIRROR_PERIOD, Unit, Variant};
+use scanhub_lms_configure::eeprom::{EepromWrite, PowerOn};
 use scanhub_schema::{MICROS, MILLIS, Nanos, line_time};
 use scanhub_sim::device::Device as _;
-use scanhub_sim::machine::{ProtocolQuirks, Settings, Start};
-use scanhub_sim::operating::Operating;
-use scanhub_sim::{Arrival, Dropped};
+use scanhub_sim::machine::{ProtocolQuirks, Settings, StartState};
+use scanhub_sim::operating::OperatingMode;
+use scanhub_sim::{Arrival, DroppedRequest};
 
-use super::{Bench, fast, reply};
+use super::{Bench, fast_settings, reply};
 
 /// Returns the telegrams of a scanner in mode `operating` within a second, with the times of their last bytes.
-fn streamed(operating: Operating, settings: Settings) -> Vec<(Nanos, Vec<u8>)> {
+fn streamed_telegrams(operating: OperatingMode, settings: Settings) -> Vec<(Nanos, Vec<u8>)> {
     let code = operating.code();
-    let mut bench = Bench::new(Settings { start: Start::In(operating), ..settings });
+    let mut bench = Bench::new(Settings { start: StartState::Operating(operating), ..settings });
     bench.run_until(1_000 * MILLIS);
     let sent = bench.sent();
     assert!(sent.iter().all(|(_, sent)| !sent.is_reply && Telegram::check(&sent.telegram).is_some()));
@@ -30,24 +30,39 @@ fn streamed(operating: Operating, settings: Settings) -> Vec<(Nanos, Vec<u8>)> {
 }
 
 /// Checks that all `telegrams` have this length, this command, and this interval in mirror revolutions.
-fn holds(telegrams: &[(Nanos, Vec<u8>)], command: u8, len: usize, turns: u64) {
+fn assert_stream(telegrams: &[(Nanos, Vec<u8>)], command: u8, len: usize, mirror_turns: u64) {
     assert!(telegrams.len() > 3, "{}", telegrams.len());
     for pair in telegrams.windows(2) {
         assert_eq!((pair[0].1[4], pair[0].1.len()), (command, len));
-        assert_eq!(pair[1].0 - pair[0].0, turns * MIRROR_TURN);
+        assert_eq!(pair[1].0 - pair[0].0, mirror_turns * MIRROR_PERIOD);
     }
 }
 
 #[test]
 fn every_mode_streams_telegrams_of_its_own() {
-    holds(&streamed(Operating::All, fast()), 0xB0, 732, 2);
-    holds(&streamed(Operating::Means(5), fast()), 0xB6, 733, 10);
-    holds(&streamed(Operating::Range(27, 299), fast()), 0xB7, 6 + 1 + 6 + 2 * 273 + 1, 2);
-    holds(&streamed(Operating::MeanRange(2, 1, 181), fast()), 0xBF, 6 + 1 + 7 + 2 * 181 + 1, 4);
-    holds(&streamed(Operating::Fields(1, 100), fast()), 0xBE, 814, 2);
-    holds(&streamed(Operating::Reflectivity(vec![(1, 181)]), fast()), 0xF5, 740, 2);
-    assert!(streamed(Operating::OnRequest, fast()).is_empty());
-    assert!(streamed(Operating::Installation, fast()).is_empty());
+    assert_stream(&streamed_telegrams(OperatingMode::All, fast_settings()), 0xB0, 732, 2);
+    assert_stream(&streamed_telegrams(OperatingMode::Means(5), fast_settings()), 0xB6, 733, 10);
+    assert_stream(
+        &streamed_telegrams(OperatingMode::Range(27, 299), fast_settings()),
+        0xB7,
+        6 + 1 + 6 + 2 * 273 + 1,
+        2,
+    );
+    assert_stream(
+        &streamed_telegrams(OperatingMode::MeanRange(2, 1, 181), fast_settings()),
+        0xBF,
+        6 + 1 + 7 + 2 * 181 + 1,
+        4,
+    );
+    assert_stream(&streamed_telegrams(OperatingMode::Fields(1, 100), fast_settings()), 0xBE, 814, 2);
+    assert_stream(
+        &streamed_telegrams(OperatingMode::Reflectivity(vec![(1, 181)]), fast_settings()),
+        0xF5,
+        740,
+        2,
+    );
+    assert!(streamed_telegrams(OperatingMode::OnRequest, fast_settings()).is_empty());
+    assert!(streamed_telegrams(OperatingMode::Installation, fast_settings()).is_empty());
 }
 
 #[test]
@@ -55,37 +70,40 @@ fn partial_scans_take_turns() {
     for (variant, quarters) in
         [(Variant::ALL[0], &[0u8][..]), (Variant::HALF, &[0, 2]), (Variant::ALL[4], &[0, 1, 2, 3])]
     {
-        let telegrams = streamed(Operating::Partial, Settings { variant, ..fast() });
+        let telegrams = streamed_telegrams(OperatingMode::Partial, Settings { variant, ..fast_settings() });
         for (number, (_, telegram)) in telegrams.iter().enumerate() {
-            let measured = Measured::decode(Telegram::check(telegram).unwrap()).expect("values");
+            let measured = MeasuredValues::decode(Telegram::check(telegram).unwrap()).expect("values");
             let quarter = quarters[number % quarters.len()];
             assert_eq!(measured.partial(), Some(quarter));
             assert_eq!(measured.count(), if quarter == 0 { 181 } else { 180 });
         }
-        assert!(telegrams.windows(2).all(|pair| (pair[1].0 - pair[0].0).abs_diff(MIRROR_TURN) <= 40_000));
+        assert!(telegrams.windows(2).all(|pair| (pair[1].0 - pair[0].0).abs_diff(MIRROR_PERIOD) <= 40_000));
     }
 }
 
 #[test]
 fn partial_scans_begin_with_the_first() {
-    let mut bench = Bench::new(fast());
+    let mut bench = Bench::new(fast_settings());
     bench.ask(Writer::new(0, 0x30).byte(1).finish().bytes());
     bench.ask(Writer::new(0, 0x20).byte(0x2A).finish().bytes());
     let sent = bench.sent();
     let quarters = sent[2..4].iter().map(|(_, sent)| {
-        Measured::decode(Telegram::check(&sent.telegram).unwrap()).and_then(|measured| measured.partial())
+        MeasuredValues::decode(Telegram::check(&sent.telegram).unwrap())
+            .and_then(|measured| measured.partial())
     });
     assert_eq!(quarters.collect::<Vec<_>>(), [Some(0), Some(2)]);
 }
 
 #[test]
 fn indices_count_mirror_turns_and_telegrams() {
-    let settings = Settings { availability: 2, baud: Baud::B38400, ..fast() };
-    let telegrams = streamed(Operating::All, settings);
+    let settings = Settings { availability: 2, baud: Baud::B38400, ..fast_settings() };
+    let telegrams = streamed_telegrams(OperatingMode::All, settings);
     assert!(telegrams.iter().all(|(_, telegram)| telegram.len() == 734));
     let indices: Vec<(u8, u8)> = telegrams
         .iter()
-        .map(|(_, telegram)| Measured::decode(Telegram::check(telegram).unwrap()).unwrap().indices().unwrap())
+        .map(|(_, telegram)| {
+            MeasuredValues::decode(Telegram::check(telegram).unwrap()).unwrap().indices().unwrap()
+        })
         .collect();
     for pair in indices.windows(2) {
         assert_eq!(pair[1].1, pair[0].1 + 1);
@@ -95,7 +113,7 @@ fn indices_count_mirror_turns_and_telegrams() {
 
 #[test]
 fn one_telegram_may_be_asked_for() {
-    let mut bench = Bench::new(Settings { unit: Unit::Cm, ..fast() });
+    let mut bench = Bench::new(Settings { unit: Unit::Cm, ..fast_settings() });
     for (request, command, len) in [
         (Writer::new(0, 0x30).byte(1), 0xB0, 732),
         (Writer::new(0, 0x30).byte(8), 0xB0, 372),
@@ -112,35 +130,40 @@ fn one_telegram_may_be_asked_for() {
     }
     // An LMS 211 sees no more than 100 degrees.
     let type_name = "LMS211;301063;V02.30 ".into();
-    let mut bench = Bench::new(Settings { type_name, variant: Variant::ALL[3], ..fast() });
+    let mut bench = Bench::new(Settings { type_name, variant: Variant::ALL[3], ..fast_settings() });
     let kept = bench.ask(Writer::new(0, 0x3B).word(180).word(50).finish().bytes());
     assert_eq!(kept[5..11], [0xBB, 0, 100, 0, 50, 0]);
 }
 
-const BOOT: Nanos = 3_000 * MILLIS;
+const BOOT_TIME: Nanos = 3_000 * MILLIS;
 
-fn install() -> Vec<u8> {
+fn installation_request() -> Vec<u8> {
     Writer::new(0, 0x20).byte(0).slice(b"SICK_LMS").finish().bytes().to_vec()
 }
 
 #[test]
-fn a_power_cycle_breaks_off_forgets_and_announces_itself() {
-    let mut bench =
-        Bench::new(Settings { start: Start::In(Operating::All), boot_ns: BOOT, unit: Unit::Cm, ..fast() });
+fn power_cycle_aborts_resets_and_sends_boot_message() {
+    let mut bench = Bench::new(Settings {
+        start: StartState::Operating(OperatingMode::All),
+        boot_ns: BOOT_TIME,
+        unit: Unit::Cm,
+        ..fast_settings()
+    });
     bench.ask(Request::Variant(Variant::ALL[0]).encode(0).bytes());
     let next = bench.sent().last().unwrap().0 + 10 * MILLIS;
     bench.run_until(next);
     assert!(bench.machine.power_cycle(next), "nothing was on the line");
     let before = bench.chunks.len();
-    bench.run_until(next + BOOT - 1_000 * MILLIS);
+    bench.run_until(next + BOOT_TIME - 1_000 * MILLIS);
     assert!(bench.ask(Request::Status.encode(0).bytes()).is_empty(), "heard while it starts");
-    bench.run_until(next + 2 * BOOT);
+    bench.run_until(next + 2 * BOOT_TIME);
     let sent: Vec<_> = bench.sent().into_iter().filter(|(at, _)| *at > next).collect();
     assert_eq!((sent[0].1.aborted, sent[0].1.is_reply, sent.len()), (true, false, 2));
     assert_eq!((sent[1].1.telegram[4], sent[1].1.is_reply), (0x90, true));
-    assert!(sent[1].0 >= next + BOOT);
-    let banner = bench.chunks[before..].iter().rev().find(|(_, chunk)| !chunk.bytes.is_empty()).unwrap();
-    assert_eq!((banner.1.rate, bench.machine.baud()), (9_600, Baud::B9600));
+    assert!(sent[1].0 >= next + BOOT_TIME);
+    let boot_message =
+        bench.chunks[before..].iter().rev().find(|(_, chunk)| !chunk.bytes.is_empty()).unwrap();
+    assert_eq!((boot_message.1.rate, bench.machine.baud()), (9_600, Baud::B9600));
     let answer = bench.ask(Request::Status.encode(0).bytes());
     let Reply::Status(status) = reply(&answer) else { panic!("no status") };
     assert_eq!(
@@ -153,54 +176,58 @@ fn a_power_cycle_breaks_off_forgets_and_announces_itself() {
 #[test]
 fn a_reset_says_that_it_comes_and_that_it_is_over() {
     let errors = vec![(0x84, 22), (1, 49)];
-    let mut bench = Bench::new(Settings { boot_ns: BOOT, errors, ..fast() });
-    let told = bench.ask(&[0x02, 0, 1, 0, 0x32, 0x16, 0x12]);
-    assert_eq!(told[5..10], [0xB2, 0x84, 22, 1, 49]);
+    let mut bench = Bench::new(Settings { boot_ns: BOOT_TIME, errors, ..fast_settings() });
+    let errors_reply = bench.ask(&[0x02, 0, 1, 0, 0x32, 0x16, 0x12]);
+    assert_eq!(errors_reply[5..10], [0xB2, 0x84, 22, 1, 49]);
     let bytes = bench.ask(&[0x02, 0, 1, 0, 0x10, 0x34, 0x12]);
     assert_eq!(bytes[..9], [ACK, 0x02, 0x80, 2, 0, 0x91, 0x10, 0x79, 0x30]);
     assert_eq!(bytes.len(), 9);
     let before = bench.chunks.len();
-    bench.run_until(bench.now + 2 * BOOT);
-    let banner = bench.bytes_from(before);
-    assert_eq!((Telegram::check(&banner).unwrap().command(), bench.machine.baud()), (0x90, Baud::B9600));
+    bench.run_until(bench.now + 2 * BOOT_TIME);
+    let boot_message = bench.bytes_from(before);
+    assert_eq!(
+        (Telegram::check(&boot_message).unwrap().command(), bench.machine.baud()),
+        (0x90, Baud::B9600)
+    );
     assert_eq!(bench.ask(&[0x02, 0, 1, 0, 0x32, 0x16, 0x12])[5..7], [0xB2, 0x10], "faults were not cleared");
 }
 
 #[test]
 fn a_sensor_may_start_with_the_simulation() {
-    let mut bench = Bench::new(Settings { start: Start::PowerOn, boot_ns: BOOT, ..Settings::default() });
-    bench.run_until(BOOT - 1);
+    let mut bench =
+        Bench::new(Settings { start: StartState::PowerOn, boot_ns: BOOT_TIME, ..Settings::default() });
+    bench.run_until(BOOT_TIME - 1);
     assert!(bench.chunks.is_empty());
-    bench.run_until(BOOT + 100 * MILLIS);
+    bench.run_until(BOOT_TIME + 100 * MILLIS);
     assert_eq!(Telegram::check(&bench.bytes_from(0)).unwrap().command(), 0x90);
 }
 
 #[test]
-fn a_permanent_rate_is_written_in_installation_mode_and_stays() {
-    let mut bench = Bench::new(fast());
+fn permanent_rate_needs_installation_mode_and_stays() {
+    let mut bench = Bench::new(fast_settings());
     let keep = Writer::new(0, 0x66).byte(1).finish();
     assert_eq!(reply(&bench.ask(keep.bytes())), Reply::Refused);
-    bench.ask(&install());
+    bench.ask(&installation_request());
     assert_eq!(bench.ask(keep.bytes())[5], 0xE6);
-    assert_eq!((bench.machine.eeprom_writes(), bench.machine.operating()), (2, &Operating::Installation));
+    assert_eq!((bench.machine.eeprom_writes(), bench.machine.operating()), (2, &OperatingMode::Installation));
     bench.machine.power_cycle(bench.now);
     bench.run_until(bench.now + 10_000 * MILLIS);
-    assert_eq!((bench.machine.baud(), bench.machine.operating()), (Baud::B500000, &Operating::OnRequest));
+    assert_eq!((bench.machine.baud(), bench.machine.operating()), (Baud::B500000, &OperatingMode::OnRequest));
     let status = bench.ask(Request::Status.encode(0).bytes());
     assert_eq!(status[5 + 119], 1);
-    bench.ask(&install());
+    bench.ask(&installation_request());
     bench.ask(Writer::new(0, 0x66).byte(0).finish().bytes());
     bench.machine.power_cycle(bench.now);
     assert_eq!(bench.machine.baud(), Baud::B9600);
 }
 
 #[test]
-fn a_short_configuration_changes_the_leading_bytes_only() {
+fn short_configuration_changes_only_leading_bytes() {
     for (configuration_len, length) in [(34, 0x24), (32, 0x22)] {
-        let mut bench = Bench::new(Settings { configuration_len, availability: 2, ..fast() });
+        let mut bench = Bench::new(Settings { configuration_len, availability: 2, ..fast_settings() });
         let before = bench.ask(Request::Configuration.encode(0).bytes());
         assert_eq!(before[3], length);
-        bench.ask(&install());
+        bench.ask(&installation_request());
         let refused = bench.ask(Writer::new(0, 0x77).slice(&[0, 0, 0x70, 0, 2, 0x07]).finish().bytes());
         assert_eq!(
             (refused[5], refused[6], &refused[7..]),
@@ -216,10 +243,10 @@ fn a_short_configuration_changes_the_leading_bytes_only() {
 }
 
 #[test]
-fn what_ails_it_is_in_the_status() {
+fn status_reply_reports_errors_and_pollution() {
     let errors = vec![(4, 22)];
     let mut bench =
-        Bench::new(Settings { status: 0x94, errors, pollution_percent: 60, address: 7, ..fast() });
+        Bench::new(Settings { status: 0x94, errors, pollution_percent: 60, address: 7, ..fast_settings() });
     let bytes = bench.ask(Request::Status.encode(7).bytes());
     let telegram = Telegram::check(&bytes[1..]).unwrap();
     let Reply::Status(report) = Reply::decode(telegram).unwrap() else { panic!("no status") };
@@ -229,29 +256,31 @@ fn what_ails_it_is_in_the_status() {
     assert_eq!(telegram.data()[119], 7);
 }
 
-fn with(quirks: ProtocolQuirks) -> Bench {
-    Bench::new(Settings { quirks, ..fast() })
+fn bench_with_quirks(quirks: ProtocolQuirks) -> Bench {
+    Bench::new(Settings { quirks, ..fast_settings() })
 }
 
 /// Returns the number of 200 type requests whose reply starts with this byte.
-fn answered(quirks: ProtocolQuirks, first: Option<u8>) -> usize {
-    let mut bench = with(quirks);
+fn replies_of_200(quirks: ProtocolQuirks, first: Option<u8>) -> usize {
+    let mut bench = bench_with_quirks(quirks);
     let request = Request::Type.encode(0);
     (0..200).filter(|_| bench.ask(request.bytes()).first().copied() == first).count()
 }
 
 #[test]
-fn a_share_of_the_requests_is_overlooked_or_refused_by_nak() {
-    let overlooked = answered(ProtocolQuirks { overlooks: 0.3, ..ProtocolQuirks::default() }, None);
+fn some_requests_are_ignored_or_answered_with_nak() {
+    let overlooked =
+        replies_of_200(ProtocolQuirks { overlooked_share: 0.3, ..ProtocolQuirks::default() }, None);
     assert!((40..80).contains(&overlooked), "{overlooked}");
-    let refused = answered(ProtocolQuirks { naks: 0.3, ..ProtocolQuirks::default() }, Some(NAK));
+    let refused = replies_of_200(ProtocolQuirks { nak_share: 0.3, ..ProtocolQuirks::default() }, Some(NAK));
     assert!((40..80).contains(&refused), "{refused}");
-    assert_eq!(answered(ProtocolQuirks { mute: true, ..ProtocolQuirks::default() }, None), 200);
+    assert_eq!(replies_of_200(ProtocolQuirks { is_mute: true, ..ProtocolQuirks::default() }, None), 200);
 }
 
 #[test]
 fn a_command_may_be_refused() {
-    let mut bench = with(ProtocolQuirks { refuses: vec![0x3A], ..ProtocolQuirks::default() });
+    let mut bench =
+        bench_with_quirks(ProtocolQuirks { refused_commands: vec![0x3A], ..ProtocolQuirks::default() });
     assert_eq!(reply(&bench.ask(Request::Type.encode(0).bytes())), Reply::Refused);
     assert!(matches!(reply(&bench.ask(Request::Status.encode(0).bytes())), Reply::Status(_)));
     bench.machine.set_quirks(ProtocolQuirks::default());
@@ -260,30 +289,33 @@ fn a_command_may_be_refused() {
 
 #[test]
 fn replies_come_twice() {
-    let mut bench = with(ProtocolQuirks { doubles: 1.0, ..ProtocolQuirks::default() });
+    let mut bench = bench_with_quirks(ProtocolQuirks { doubled_share: 1.0, ..ProtocolQuirks::default() });
     bench.ask(Request::Type.encode(0).bytes());
     let sent = bench.sent();
     assert_eq!((sent.len(), &sent[0].1.telegram), (2, &sent[1].1.telegram));
 }
 
 #[test]
-fn a_late_reply_comes_though_the_next_request_was_there_before_it() {
-    let mut bench = with(ProtocolQuirks { late_reply_ns: 800 * MILLIS, ..ProtocolQuirks::default() });
+fn late_reply_is_sent_after_the_next_request() {
+    let mut bench =
+        bench_with_quirks(ProtocolQuirks { late_reply_ns: 800 * MILLIS, ..ProtocolQuirks::default() });
     assert_eq!(bench.ask(Request::Type.encode(0).bytes()), [ACK]);
     assert_eq!(bench.ask(Request::Stop.encode(0).bytes())[0], ACK);
     bench.run_until(bench.now + 2_000 * MILLIS);
     let commands: Vec<u8> = bench.sent().iter().map(|(_, sent)| sent.telegram[4]).collect();
     assert_eq!(commands, [0xBA, 0xA0]);
-    let mut bench = with(ProtocolQuirks { late_acknowledge_ns: 300 * MILLIS, ..ProtocolQuirks::default() });
-    bench.say(Request::Type.encode(0).bytes(), 60_000);
-    let asked = bench.now;
-    bench.run_until(asked + 1_000 * MILLIS);
-    assert!(bench.chunks[0].0 >= asked + 300 * MILLIS && bench.chunks[0].1.bytes == [ACK]);
+    let mut bench =
+        bench_with_quirks(ProtocolQuirks { late_acknowledge_ns: 300 * MILLIS, ..ProtocolQuirks::default() });
+    bench.send(Request::Type.encode(0).bytes(), 60_000);
+    let requested_at = bench.now;
+    bench.run_until(requested_at + 1_000 * MILLIS);
+    assert!(bench.chunks[0].0 >= requested_at + 300 * MILLIS && bench.chunks[0].1.bytes == [ACK]);
 }
 
 #[test]
-fn a_mode_is_changed_slowly_and_a_status_told_at_once() {
-    let mut bench = with(ProtocolQuirks { late_mode_ns: 2_000 * MILLIS, ..ProtocolQuirks::default() });
+fn mode_change_is_slow_but_status_is_immediate() {
+    let mut bench =
+        bench_with_quirks(ProtocolQuirks { late_mode_ns: 2_000 * MILLIS, ..ProtocolQuirks::default() });
     for request in [Request::Stop, Request::Variant(Variant::ALL[0]), Request::Baud(Baud::B500000)] {
         assert_eq!(bench.ask(request.encode(0).bytes()), [ACK]);
         let before = bench.sent().len();
@@ -300,12 +332,13 @@ fn a_mode_is_changed_slowly_and_a_status_told_at_once() {
 
 #[test]
 fn writing_the_eeprom_takes_its_time() {
-    let mut bench = with(ProtocolQuirks { late_write_ns: 6_000 * MILLIS, ..ProtocolQuirks::default() });
+    let mut bench =
+        bench_with_quirks(ProtocolQuirks { late_write_ns: 6_000 * MILLIS, ..ProtocolQuirks::default() });
     assert_eq!(
         reply(&bench.ask(Request::install(Password::FACTORY).encode(0).bytes())),
         Reply::Mode { done: true }
     );
-    for write in [Write::Configuration(&[20, 0]), Write::PowerOn(PowerOn::Baud9600)] {
+    for write in [EepromWrite::Configuration(&[20, 0]), EepromWrite::PowerOn(PowerOn::Baud9600)] {
         let before = bench.sent().len();
         assert_eq!(bench.ask(write.encode(0).expect("short enough").bytes()), [ACK]);
         bench.run_until(bench.now + 5_400 * MILLIS);
@@ -316,9 +349,9 @@ fn writing_the_eeprom_takes_its_time() {
 }
 
 #[test]
-fn a_strict_sensor_does_not_measure_in_installation_mode() {
+fn installation_mode_blocks_measuring_if_strict() {
     for strict in [false, true] {
-        let mut bench = with(ProtocolQuirks { strict, ..ProtocolQuirks::default() });
+        let mut bench = bench_with_quirks(ProtocolQuirks { is_strict: strict, ..ProtocolQuirks::default() });
         bench.ask(Request::install(Password::FACTORY).encode(0).bytes());
         let measuring = [
             Request::Operate(lms::operating::Operating::Means(2)),
@@ -338,14 +371,14 @@ fn a_strict_sensor_does_not_measure_in_installation_mode() {
             assert_eq!(reply == Some(0x92), strict, "{request:?}");
         }
         bench.ask(Request::Stop.encode(0).bytes());
-        assert_eq!(*bench.machine.operating(), Operating::OnRequest);
+        assert_eq!(*bench.machine.operating(), OperatingMode::OnRequest);
         let bytes = bench.ask(Request::Stream.encode(0).bytes());
         assert_eq!(bytes[5], 0xA0);
     }
 }
 
 /// Returns the number of 100 requests that get a reply, each written at once or with 55 us between its bytes.
-fn answered_unspaced(bench: &mut Bench) -> usize {
+fn unspaced_replies_of_100(bench: &mut Bench) -> usize {
     let request = Request::Stop.encode(0);
     let mut count = 0;
     for step in [0, 55 * MICROS].repeat(50) {
@@ -361,21 +394,21 @@ fn answered_unspaced(bench: &mut Bench) -> usize {
 }
 
 #[test]
-fn what_a_host_leaves_to_its_uart_is_heard_unless_the_sensor_is_strict() {
+fn strict_scanner_ignores_requests_without_byte_gaps() {
     for (baud, line_ns) in
         [(Baud::B9600, 6 * line_time(1, 9_600)), (Baud::B500000, 6 * line_time(1, 500_000))]
     {
-        let slow = Settings { baud, ..fast() };
+        let slow = Settings { baud, ..fast_settings() };
         let mut bench = Bench::new(slow.clone());
-        assert_eq!(answered_unspaced(&mut bench), 100);
+        assert_eq!(unspaced_replies_of_100(&mut bench), 100);
         assert_eq!(bench.machine.take_dropped(), None);
         assert!(bench.chunks[0].0 >= line_ns + 2 * MILLIS, "the line carries it first");
-        bench.machine.set_quirks(ProtocolQuirks { strict_gap: true, ..ProtocolQuirks::default() });
-        assert_eq!(answered_unspaced(&mut bench), 0);
-        assert_eq!(bench.machine.take_dropped(), Some(Dropped::ShortGap));
+        bench.machine.set_quirks(ProtocolQuirks { checks_gaps: true, ..ProtocolQuirks::default() });
+        assert_eq!(unspaced_replies_of_100(&mut bench), 0);
+        assert_eq!(bench.machine.take_dropped(), Some(DroppedRequest::ShortGap));
         let strict =
-            Settings { quirks: ProtocolQuirks { strict_gap: true, ..ProtocolQuirks::default() }, ..slow };
-        assert_eq!(answered_unspaced(&mut Bench::new(strict.clone())), 0);
+            Settings { quirks: ProtocolQuirks { checks_gaps: true, ..ProtocolQuirks::default() }, ..slow };
+        assert_eq!(unspaced_replies_of_100(&mut Bench::new(strict.clone())), 0);
         assert!(matches!(
             reply(&Bench::new(strict).ask(Request::Status.encode(0).bytes())),
             Reply::Status(_)
@@ -385,7 +418,8 @@ fn what_a_host_leaves_to_its_uart_is_heard_unless_the_sensor_is_strict() {
 
 #[test]
 fn a_sensor_may_think_as_long_each_time() {
-    let mut bench = with(ProtocolQuirks { answer_ns: 60 * MILLIS, ..ProtocolQuirks::default() });
+    let mut bench =
+        bench_with_quirks(ProtocolQuirks { reply_delay_ns: 60 * MILLIS, ..ProtocolQuirks::default() });
     for request in [Request::Type, Request::Stop, Request::Variant(Variant::HALF)] {
         let before = bench.chunks.len();
         bench.ask(request.encode(0).bytes());

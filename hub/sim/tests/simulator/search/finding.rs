@@ -2,42 +2,42 @@
 //! remembered scanner nearly as soon as a session of its family does, and a scanner that gets power late soon after it can
 //! reply. Bytes that no scanner sent never end a search, and no scanner accepts a request at another rate.
 
-use scanhub_drivers::line::{KnownRate, Output, Protocol as _, Session as _};
+use scanhub_drivers::line::{Action, KnownRate, Protocol as _, ScannerSession as _};
 use scanhub_drivers::lms::variant::{Baud, Variant};
-use scanhub_drivers::search::{Found, Memory, PortKind, Search};
+use scanhub_drivers::search::{FoundScanner, Memory, PortKind, Search};
 use scanhub_drivers::{Settings, ld, lms, rplidar};
 use scanhub_schema::{Family, MILLIS, Nanos, line_time};
 use scanhub_sim::device::Device;
 use scanhub_sim::ld::{LdSettings, LdSimulator};
+use scanhub_sim::line_model::UartReceiver;
 use scanhub_sim::machine::LmsSimulator;
-use scanhub_sim::operating::Source;
+use scanhub_sim::operating::ScanSource;
 use scanhub_sim::rplidar::{Model, RplidarSettings, RplidarSimulator};
-use scanhub_sim::wire::Receiver;
 use scanhub_sim::{Arrival, machine};
 
 use super::Bench;
 
 /// Creates a scanner with a seed.
-type Create = Box<dyn Fn(u64) -> Box<dyn Device>>;
+type CreateScanner = Box<dyn Fn(u64) -> Box<dyn Device>>;
 
 /// Returns all models and states: the name, the expected result, and a function that creates the scanner.
-pub(super) fn scanners() -> Vec<(String, Found, Create)> {
-    let mut all: Vec<(String, Found, Create)> = Vec::new();
+pub(super) fn scanners() -> Vec<(String, FoundScanner, CreateScanner)> {
+    let mut all: Vec<(String, FoundScanner, CreateScanner)> = Vec::new();
     for baud in Baud::ALL {
         for streams in [false, true] {
-            let found = Found { family: Family::Lms, model: None, rate: Some(baud.rate()) };
+            let found = FoundScanner { family: Family::Lms, model: None, rate: Some(baud.rate()) };
             let create = Box::new(move |seed| super::lms(baud, streams, seed));
             all.push((format!("lms {} {streams}", baud.rate()), found, create));
         }
     }
     for model in ld::Model::ALL {
-        let found = Found { family: Family::Ld, model: None, rate: Some(model.baud()) };
+        let found = FoundScanner { family: Family::Ld, model: None, rate: Some(model.baud()) };
         all.push((model.name().into(), found, Box::new(move |seed| super::ld(model, seed))));
     }
     for model in Model::ALL {
         for (state, streams, health) in [("idle", false, 0), ("streams", true, 0), ("error", false, 2)] {
             let found =
-                Found { family: Family::Rplidar, model: Some(model.name()), rate: Some(model.baud()) };
+                FoundScanner { family: Family::Rplidar, model: Some(model.name()), rate: Some(model.baud()) };
             let create = Box::new(move |seed| super::rplidar(model, streams, health, seed));
             all.push((format!("{} {state}", model.name()), found, create));
         }
@@ -49,7 +49,7 @@ pub(super) fn scanners() -> Vec<(String, Found, Create)> {
 fn find_all(faults: &str, port: PortKind) -> Vec<Nanos> {
     let mut times = Vec::new();
     for (name, expected, create) in scanners() {
-        let expected = Found { rate: expected.rate.filter(|_| port == PortKind::Serial), ..expected };
+        let expected = FoundScanner { rate: expected.rate.filter(|_| port == PortKind::Serial), ..expected };
         let mut of_model = Vec::new();
         for seed in 0..20 {
             let mut bench = Bench::with_faults(Some(create(seed)), port, None, faults, seed);
@@ -88,7 +88,7 @@ fn finds_every_scanner_behind_a_server() {
 }
 
 /// Times at which rounds begin, from the open: each one starts with a step at 230,400 baud.
-fn rounds(bench: &Bench) -> Vec<Nanos> {
+fn round_starts(bench: &Bench) -> Vec<Nanos> {
     let begins = bench.rates.iter().filter(|(_, rate)| *rate == 230_400).map(|(at, _)| at - bench.opened_at);
     [0].into_iter().chain(begins).collect()
 }
@@ -97,13 +97,13 @@ fn rounds(bench: &Bench) -> Vec<Nanos> {
 fn rounds_take_their_time_on_a_silent_line() {
     let mut bench = Bench::new(None, PortKind::Serial, None, 1);
     assert!(bench.find(12_000 * MILLIS).is_none());
-    let begins = rounds(&bench);
+    let begins = round_starts(&bench);
     println!("silent: rounds begin at {:?} ms", begins.iter().map(|at| at / MILLIS).collect::<Vec<_>>());
     assert!(begins[1].abs_diff(1_200 * MILLIS) < 60 * MILLIS);
     // A patient round and a pause of 0.5 s, then a round and a pause of 1 s.
     assert!((begins[2] - begins[1]).abs_diff(3_060 * MILLIS) < 60 * MILLIS);
     assert!((begins[3] - begins[2]).abs_diff(2_200 * MILLIS) < 60 * MILLIS);
-    let message = bench.host.trouble().unwrap().message("/dev/ttyUSB0");
+    let message = bench.host.problem().unwrap().message("/dev/ttyUSB0");
     assert_eq!(message, "no scanner replies (looked for lms, ld, rplidar for 10 s): power, cable?");
 }
 
@@ -111,11 +111,11 @@ fn rounds_take_their_time_on_a_silent_line() {
 fn rounds_take_their_time_on_a_noisy_line() {
     let mut bench = Bench::new(None, PortKind::Serial, None, 1).with_noise(MILLIS);
     assert!(bench.find(30_000 * MILLIS).is_none());
-    let begins = rounds(&bench);
+    let begins = round_starts(&bench);
     println!("noisy: rounds begin at {:?} ms", begins.iter().map(|at| at / MILLIS).collect::<Vec<_>>());
     assert!(begins[1].abs_diff(1_600 * MILLIS) < 100 * MILLIS);
     assert!((begins[2] - begins[1]).abs_diff(3_100 * MILLIS) < 150 * MILLIS);
-    let message = bench.host.trouble().unwrap().message("/dev/ttyUSB0");
+    let message = bench.host.problem().unwrap().message("/dev/ttyUSB0");
     let end = " bytes/s arrive, but scanhub does not recognize the scanner: stop the hub, then: scanhub probe /dev/ttyUSB0";
     assert!(message.ends_with(end), "{message}");
 }
@@ -141,9 +141,9 @@ fn hands_over_every_read_of_the_last_step() {
                 } else {
                     assert_eq!(reads, read, "{name}");
                 }
-                let (account, captured) =
-                    (bench.host.account(), reads.iter().map(|(_, bytes)| bytes.len() as u64).sum::<u64>());
-                assert!(account.discarded + captured == account.read && captured > 0, "{name}");
+                let (stats, captured) =
+                    (bench.host.stats(), reads.iter().map(|(_, bytes)| bytes.len() as u64).sum::<u64>());
+                assert!(stats.discarded + captured == stats.read && captured > 0, "{name}");
             }
         }
     }
@@ -156,7 +156,7 @@ fn leaves_out_rates_that_the_port_cannot_have() {
         let impossible = [230_400, 500_000, 921_600, 1_000_000, 9_600];
         let impossible = impossible.into_iter().filter(|&other| other != rate).collect();
         let mut bench = Bench::new(Some(create(1)), PortKind::Serial, None, 1);
-        bench.impossible = impossible;
+        bench.unsupported_rates = impossible;
         if rate != 230_400 {
             bench.host.reject_rate(bench.now);
         }
@@ -166,10 +166,10 @@ fn leaves_out_rates_that_the_port_cannot_have() {
 }
 
 #[test]
-fn a_restricted_search_sends_only_requests_of_its_family() {
+fn restricted_search_sends_only_its_familys_requests() {
     let open = |family, device, seed| {
-        let search = |now| Search::new(PortKind::Serial, None, now).at_another_rate().only(family);
-        Bench::auto(search, device, None, seed)
+        let search = |now| Search::new(PortKind::Serial, None, now).with_rate_change().restricted_to(family);
+        Bench::with_search(search, device, None, seed)
     };
     for (family, first, rates) in [
         (Family::Ld, 230_400, &[][..]),
@@ -192,7 +192,7 @@ fn a_restricted_search_sends_only_requests_of_its_family() {
 }
 
 /// Compares the search with a session of the family, and returns by how much the search is slower in the worst case.
-fn slower(
+fn max_extra_time(
     name: &str,
     memory: Memory,
     create: impl Fn(u64) -> Box<dyn Device>,
@@ -226,22 +226,22 @@ fn finds_a_remembered_lms_soon() {
                 mode: None,
             };
             let begin = |now| {
-                let mut session = lms::Session::new(settings, now);
+                let mut session = lms::LmsSession::new(settings, now);
                 session.hint_rate(KnownRate { baud: first.rate(), silent_switches: 0 });
                 session
             };
-            Bench::named(begin, device, seed)
+            Bench::find_named(begin, device, seed)
         }
     };
     for baud in Baud::ALL {
         // After a restart of the hub, and after a power cycle of a scanner that starts at this rate.
-        let restarted = slower(
+        let restarted = max_extra_time(
             "lms streams",
             memory(500_000, baud),
             |seed| super::lms(Baud::B500000, true, seed),
             named(baud),
         );
-        let cycled = slower(
+        let cycled = max_extra_time(
             &format!("lms {}", baud.rate()),
             memory(500_000, baud),
             |seed| super::lms(baud, false, seed),
@@ -256,13 +256,13 @@ fn finds_a_remembered_rotating_scanner_soon() {
     for model in ld::Model::ALL {
         let rate = model.baud();
         let memory = Memory { family: Family::Ld, stream_rate: rate, reply_rate: rate };
-        let slower = slower(
+        let slower = max_extra_time(
             model.name(),
             memory,
             |seed| super::ld(model, seed),
             |device, seed| {
                 let settings = Settings { model: Some(model.name()), ..Settings::default() };
-                Bench::named(|now| ld::Session::new(settings, now), device, seed)
+                Bench::find_named(|now| ld::LdSession::new(settings, now), device, seed)
             },
         );
         assert!(slower <= 300 * MILLIS);
@@ -272,13 +272,13 @@ fn finds_a_remembered_rotating_scanner_soon() {
         let memory = Memory { family: Family::Rplidar, stream_rate: rate, reply_rate: rate };
         for (state, streams, health) in [("idle", false, 0), ("streams", true, 0), ("error", false, 2)] {
             let name = format!("{} {state}", model.name());
-            let slower = slower(
+            let slower = max_extra_time(
                 &name,
                 memory,
                 |seed| super::rplidar(model, streams, health, seed),
                 |device, seed| {
                     let settings = Settings { model: Some(named.name()), ..Settings::default() };
-                    Bench::named(|now| rplidar::Session::new(settings, now), device, seed)
+                    Bench::find_named(|now| rplidar::RplidarSession::new(settings, now), device, seed)
                 },
             );
             assert!(slower <= 300 * MILLIS);
@@ -311,16 +311,16 @@ fn finds_another_scanner_than_the_remembered_one() {
     assert!(worst <= 6_000 * MILLIS);
 }
 
-const SECOND: Nanos = 1_000 * MILLIS;
+const ONE_SECOND: Nanos = 1_000 * MILLIS;
 
 /// Returns the worst time from when scanners that `create` creates can answer until they are found. They get power `after` this
 /// time from the open, and then start for `boot`.
-fn worst(name: &str, after: Nanos, boot: Nanos, create: impl Fn(u64) -> Box<dyn Device>) -> Nanos {
+fn worst_find_time(name: &str, after: Nanos, boot: Nanos, create: impl Fn(u64) -> Box<dyn Device>) -> Nanos {
     let times = (0..10).map(|seed| {
         let after = after + seed * 317 * MILLIS;
         let mut bench = Bench::new(Some(create(seed)), PortKind::Serial, None, seed).powered_after(after);
         let (_, time) =
-            bench.find(after + boot + 20 * SECOND).unwrap_or_else(|| panic!("{name}, seed {seed}"));
+            bench.find(after + boot + 20 * ONE_SECOND).unwrap_or_else(|| panic!("{name}, seed {seed}"));
         time.saturating_sub(after + boot)
     });
     let worst = times.max().unwrap_or(Nanos::MAX);
@@ -331,40 +331,40 @@ fn worst(name: &str, after: Nanos, boot: Nanos, create: impl Fn(u64) -> Box<dyn 
 #[test]
 fn finds_an_lms_that_starts_slowly() {
     for (boot, permanent_baud) in [2, 20, 60].into_iter().flat_map(|s| [(s, None), (s, Some(Baud::B38400))]) {
-        let boot = boot * SECOND;
-        let worst = worst(&format!("lms {}", boot / SECOND), 100 * MILLIS, boot, |seed| {
+        let boot = boot * ONE_SECOND;
+        let worst = worst_find_time(&format!("lms {}", boot / ONE_SECOND), 100 * MILLIS, boot, |seed| {
             let settings =
                 machine::Settings { boot_ns: boot, permanent_baud, seed, ..machine::Settings::default() };
-            Box::new(LmsSimulator::new(settings, Source::Room(super::room(seed))))
+            Box::new(LmsSimulator::new(settings, ScanSource::Room(super::room(seed))))
         });
-        assert!(worst <= 6 * SECOND);
+        assert!(worst <= 6 * ONE_SECOND);
     }
 }
 
 #[test]
 fn finds_rotating_scanners_that_get_power_later() {
-    let boot = 2 * SECOND;
+    let boot = 2 * ONE_SECOND;
     for model in ld::Model::ALL {
-        let worst = worst(model.name(), 30 * SECOND, boot, |seed| {
+        let worst = worst_find_time(model.name(), 30 * ONE_SECOND, boot, |seed| {
             let settings = LdSettings { boot_ns: boot, seed, ..LdSettings::of(model) };
             Box::new(LdSimulator::new(settings, super::room(seed)))
         });
-        assert!(worst <= 6 * SECOND);
+        assert!(worst <= 6 * ONE_SECOND);
     }
     for model in Model::ALL {
-        let worst = worst(model.name(), 30 * SECOND, boot, |seed| {
+        let worst = worst_find_time(model.name(), 30 * ONE_SECOND, boot, |seed| {
             let settings = RplidarSettings { boot_ns: boot, seed, ..RplidarSettings::of(model) };
             Box::new(RplidarSimulator::new(settings, super::room(seed)))
         });
-        assert!(worst <= 6 * SECOND);
+        assert!(worst <= 6 * ONE_SECOND);
     }
 }
 
-/// Passes `bytes` to a search on `port`, in reads of at most `most` bytes, until `seconds` have passed.
-fn feed(
+/// Passes `bytes` to a search on `port`, in reads of at most `max_read` bytes, until `seconds` have passed.
+fn feed_search(
     port: PortKind,
     seed: u64,
-    most: usize,
+    max_read: usize,
     seconds: u64,
     mut bytes: impl FnMut(&mut fastrand::Rng) -> u8,
 ) -> usize {
@@ -373,20 +373,20 @@ fn feed(
     let (mut now, mut count): (Nanos, usize) = (0, 0);
     while now < seconds * 1_000 * MILLIS {
         let until = loop {
-            match search.poll_output() {
-                Output::SetRate(_) => {}
-                Output::Transmit { not_before, .. } => {
+            match search.poll_action() {
+                Action::SetRate(_) => {}
+                Action::Transmit { not_before, .. } => {
                     now = now.max(not_before);
-                    search.transmitted(now);
+                    search.handle_transmitted(now);
                 }
-                Output::Wait { until } => break until,
+                Action::Wait { until } => break until,
                 output => panic!("{output:?}"),
             }
         };
         assert_eq!(search.found(), None, "in garbage, seed {seed}");
         now = (now + random.u64(..5 * MILLIS)).min(until);
-        let len = random.usize(..=most).min(search.spare().len());
-        search.spare()[..len].fill_with(|| bytes(&mut random));
+        let len = random.usize(..=max_read).min(search.read_buffer().len());
+        search.read_buffer()[..len].fill_with(|| bytes(&mut random));
         search.commit(now, len);
         count += len;
         if len == 0 && now >= until {
@@ -401,14 +401,19 @@ fn garbage_is_not_a_scanner() {
     let mut count = 0;
     for port in [PortKind::Serial, PortKind::Server, PortKind::Recording] {
         for seed in 0..6 {
-            count += feed(port, seed, 200, 20, |random| random.u8(..));
+            count += feed_search(port, seed, 200, 20, |random| random.u8(..));
             // Bytes that begin telegrams and packets of the families, among others.
             let heads = [0x02, 0x80, 0x81, 0xB0, 0xBA, 0x06, 0x54, 0x2C, 0xA5, 0x5A, 0x14, 0x04, 0x00, 0xFF];
-            count += feed(port, seed, 200, 20, |random| heads[random.usize(..heads.len())]);
-            count +=
-                feed(port, seed, 200, 20, |random| if random.u8(..4) > 0 { 0x00 } else { random.u8(..) });
+            count += feed_search(port, seed, 200, 20, |random| heads[random.usize(..heads.len())]);
+            count += feed_search(
+                port,
+                seed,
+                200,
+                20,
+                |random| if random.u8(..4) > 0 { 0x00 } else { random.u8(..) },
+            );
             for byte in [0x00, 0xFF, 0x02, 0x54, 0xA5] {
-                count += feed(port, seed, 200, 2, |_| byte);
+                count += feed_search(port, seed, 200, 2, |_| byte);
             }
         }
     }
@@ -445,9 +450,9 @@ fn receivers() -> Vec<(String, bool, Box<dyn Device>)> {
 
 /// Returns what a scanner at `rate` receives of a request that a host sends at `sent_at`, `drift` percent off, with `gap`
 /// between its bytes.
-fn received(request: &[u8], sent_at: u32, rate: u32, gap: Nanos, drift: f64) -> Vec<u8> {
+fn received_bytes(request: &[u8], sent_at: u32, rate: u32, gap: Nanos, drift: f64) -> Vec<u8> {
     let rate_of_host = (f64::from(sent_at) * (1.0 + drift / 100.0)) as u32;
-    let mut receiver = Receiver::new(rate_of_host, rate);
+    let mut receiver = UartReceiver::new(rate_of_host, rate);
     let mut bytes = Vec::new();
     for &byte in request {
         bytes.extend(receiver.receive(&[byte], gap > line_time(1, rate)));
@@ -458,15 +463,15 @@ fn received(request: &[u8], sent_at: u32, rate: u32, gap: Nanos, drift: f64) -> 
 
 /// Returns how many telegrams that are not part of a stream, and how many parts of broken ones, `device` sends from `now` until
 /// `end`.
-fn reactions(device: &mut dyn Device, now: &mut Nanos, end: Nanos) -> usize {
-    use scanhub_sim::device::Part;
+fn count_reactions(device: &mut dyn Device, now: &mut Nanos, end: Nanos) -> usize {
+    use scanhub_sim::device::ChunkKind;
     let mut count = 0;
     loop {
         while let Some(chunk) = device.poll_transmit(*now) {
             count += match chunk.part {
-                Part::Acknowledge => 1,
-                Part::End(sent) => usize::from(sent.is_reply || sent.aborted),
-                Part::Telegram => 0,
+                ChunkKind::Acknowledge => 1,
+                ChunkKind::End(sent) => usize::from(sent.is_reply || sent.aborted),
+                ChunkKind::Telegram => 0,
             };
         }
         match device.poll_timeout().filter(|&at| at <= end) {
@@ -479,13 +484,13 @@ fn reactions(device: &mut dyn Device, now: &mut Nanos, end: Nanos) -> usize {
 }
 
 /// Sends the requests of the search to an RPLIDAR at its own rate, and returns whether it replies.
-fn replies(device: &mut dyn Device, now: &mut Nanos) -> bool {
+fn is_answered(device: &mut dyn Device, now: &mut Nanos) -> bool {
     for byte in [0xA5, 0x25, 0xA5, 0x50] {
         *now += line_time(1, device.rate());
         device.receive(byte, Arrival::at(*now));
     }
     let end = *now + 50 * MILLIS;
-    reactions(device, now, end) == 1
+    count_reactions(device, now, end) == 1
 }
 
 #[test]
@@ -502,17 +507,20 @@ fn no_request_is_accepted_at_another_rate() {
                 if is_same_family && rate == own {
                     continue;
                 }
-                for byte in received(request, rate, own, gap, drift) {
+                for byte in received_bytes(request, rate, own, gap, drift) {
                     now += line_time(1, own);
-                    reactions(&mut *device, &mut now.clone(), now);
+                    count_reactions(&mut *device, &mut now.clone(), now);
                     device.receive(byte, Arrival::at(now));
                 }
                 let end = now + 300 * MILLIS;
-                let reactions = reactions(&mut *device, &mut now, end);
+                let reactions = count_reactions(&mut *device, &mut now, end);
                 assert_eq!(reactions, 0, "{name}: {request:02X?} at {rate}, {drift} %");
                 assert_eq!((device.streams(), device.eeprom_writes()), (streams, 0), "{name}");
                 if name.ends_with("false") && !is_lms {
-                    assert!(replies(&mut *device, &mut now), "{name}: {request:02X?} at {rate}, {drift} %");
+                    assert!(
+                        is_answered(&mut *device, &mut now),
+                        "{name}: {request:02X?} at {rate}, {drift} %"
+                    );
                 }
                 checked += 1;
             }
@@ -528,10 +536,10 @@ fn a_stop_for_an_lms_would_disturb_an_rplidar() {
     let is_disturbed = |tenths: i32| {
         let mut device = super::rplidar(Model::C1, false, 0, 1);
         let mut now = 3_000 * MILLIS;
-        for byte in received(&stop, 500_000, device.rate(), 120_000, f64::from(tenths) / 10.0) {
+        for byte in received_bytes(&stop, 500_000, device.rate(), 120_000, f64::from(tenths) / 10.0) {
             device.receive(byte, Arrival::at(now));
         }
-        !replies(&mut *device, &mut now)
+        !is_answered(&mut *device, &mut now)
     };
     assert!((-20..=20).any(is_disturbed));
 }

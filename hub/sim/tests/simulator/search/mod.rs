@@ -6,19 +6,19 @@ mod port;
 
 use std::collections::VecDeque;
 
-use scanhub_drivers::line::{Output, Protocol};
+use scanhub_drivers::line::{Action, Protocol};
 use scanhub_drivers::lms::variant::Baud;
-use scanhub_drivers::search::{Found, Memory, PortKind, Search};
+use scanhub_drivers::search::{FoundScanner, Memory, PortKind, Search};
 use scanhub_drivers::{ld, line};
 use scanhub_schema::{MICROS, MILLIS, Nanos, line_time};
 use scanhub_sim::device::Device;
 use scanhub_sim::fault::Faults;
 use scanhub_sim::ld::{LdSettings, LdSimulator};
-use scanhub_sim::machine::{LmsSimulator, Start};
-use scanhub_sim::operating::Operating;
+use scanhub_sim::line_model::{BaudMismatch, LineModel};
+use scanhub_sim::machine::{LmsSimulator, StartState};
+use scanhub_sim::operating::OperatingMode;
 use scanhub_sim::room::Room;
 use scanhub_sim::rplidar::{Model, RplidarSettings, RplidarSimulator, RplidarStart};
-use scanhub_sim::wire::{BaudMismatch, LineModel};
 use scanhub_sim::{Arrival, machine};
 
 /// Host's end of the line: a search, or a session to compare it with.
@@ -27,7 +27,7 @@ pub(crate) trait Host {
 
     fn protocol(&mut self) -> &mut impl Protocol;
 
-    fn poll(&mut self) -> Event<Self::Result>;
+    fn poll(&mut self) -> HostAction<Self::Result>;
 
     fn commit(&mut self, now: Nanos, len: usize) {
         self.protocol().commit(now, len);
@@ -35,29 +35,29 @@ pub(crate) trait Host {
 }
 
 /// Next action of a host.
-pub(crate) enum Event<R> {
+pub(crate) enum HostAction<R> {
     SetRate(u32),
     Transmit(Vec<u8>, Nanos),
     Wait(Nanos),
-    Rest(Nanos),
+    SleepUntil(Nanos),
     Done(R),
 }
 
-impl<R> Event<R> {
+impl<R> HostAction<R> {
     /// Returns the next action that `protocol` requests. `event` handles its events, and returns a result to end with.
-    pub(crate) fn of(
+    pub(crate) fn next_action(
         protocol: &mut impl Protocol,
         mut event: impl FnMut(line::Event<'_>) -> Option<R>,
-    ) -> Event<R> {
+    ) -> HostAction<R> {
         loop {
-            return match protocol.poll_output() {
-                Output::SetRate(rate) => Event::SetRate(rate),
-                Output::SetDtr(_) => continue,
-                Output::Transmit { bytes, not_before } => Event::Transmit(bytes.to_vec(), not_before),
-                Output::Wait { until } => Event::Wait(until),
-                Output::Rest(until) => Event::Rest(until),
-                Output::Event(received) => match event(received) {
-                    Some(result) => Event::Done(result),
+            return match protocol.poll_action() {
+                Action::SetRate(rate) => HostAction::SetRate(rate),
+                Action::SetDtr(_) => continue,
+                Action::Transmit { bytes, not_before } => HostAction::Transmit(bytes.to_vec(), not_before),
+                Action::Wait { until } => HostAction::Wait(until),
+                Action::SleepUntil(until) => HostAction::SleepUntil(until),
+                Action::Event(received) => match event(received) {
+                    Some(result) => HostAction::Done(result),
                     None => continue,
                 },
             };
@@ -66,30 +66,30 @@ impl<R> Event<R> {
 }
 
 impl Host for Search {
-    type Result = Found;
+    type Result = FoundScanner;
 
     fn protocol(&mut self) -> &mut impl Protocol {
         self
     }
 
-    fn poll(&mut self) -> Event<Found> {
-        let event = Event::of(self, |event| panic!("{event:?}"));
-        self.found().map_or(event, Event::Done)
+    fn poll(&mut self) -> HostAction<FoundScanner> {
+        let event = HostAction::next_action(self, |event| panic!("{event:?}"));
+        self.found().map_or(event, HostAction::Done)
     }
 }
 
 /// A session of a named family, until something of the scanner arrives.
-pub(crate) struct Named<S>(pub(crate) S);
+pub(crate) struct NamedFamily<S>(pub(crate) S);
 
-impl<S: line::Session> Host for Named<S> {
+impl<S: line::ScannerSession> Host for NamedFamily<S> {
     type Result = ();
 
     fn protocol(&mut self) -> &mut impl Protocol {
         &mut self.0
     }
 
-    fn poll(&mut self) -> Event<()> {
-        Event::of(&mut self.0, |_| Some(()))
+    fn poll(&mut self) -> HostAction<()> {
+        HostAction::next_action(&mut self.0, |_| Some(()))
     }
 }
 
@@ -98,7 +98,7 @@ pub(crate) struct Bench<H = Search> {
     pub(crate) host: H,
     /// `None` if no scanner is connected.
     pub(crate) device: Option<Box<dyn Device>>,
-    wire: LineModel,
+    line: LineModel,
     /// Time at which the scanner gets power.
     power_at: Nanos,
     is_powered: bool,
@@ -107,11 +107,11 @@ pub(crate) struct Bench<H = Search> {
     port: PortKind,
     rate: u32,
     /// Rates that the port cannot have.
-    pub(crate) impossible: Vec<u32>,
+    pub(crate) unsupported_rates: Vec<u32>,
     to_host: BaudMismatch,
     to_device: BaudMismatch,
     /// Time at which the last byte of the host has left, and whether the line was idle since then.
-    left_at: Nanos,
+    last_sent_at: Nanos,
     is_flushed: bool,
     inbox: VecDeque<u8>,
     /// Random bytes that arrive in addition: the time of the next one, and the mean time between them.
@@ -131,10 +131,14 @@ pub(crate) fn room(seed: u64) -> Room {
 
 /// Creates an LMS at `baud` that streams or not.
 pub(crate) fn lms(baud: Baud, streams: bool, seed: u64) -> Box<dyn Device> {
-    let operating = if streams { Operating::All } else { Operating::OnRequest };
-    let settings =
-        machine::Settings { baud, start: Start::In(operating), seed, ..machine::Settings::default() };
-    Box::new(LmsSimulator::new(settings, scanhub_sim::operating::Source::Room(room(seed))))
+    let operating = if streams { OperatingMode::All } else { OperatingMode::OnRequest };
+    let settings = machine::Settings {
+        baud,
+        start: StartState::Operating(operating),
+        seed,
+        ..machine::Settings::default()
+    };
+    Box::new(LmsSimulator::new(settings, scanhub_sim::operating::ScanSource::Room(room(seed))))
 }
 
 pub(crate) fn ld(model: ld::Model, seed: u64) -> Box<dyn Device> {
@@ -172,21 +176,21 @@ impl Bench {
             PortKind::Server | PortKind::Recording => device.as_ref().map_or(9_600, |device| device.rate()),
         };
         let faults = faults.parse().expect("faults");
-        Bench::hosting(|now| Search::new(port, memory, now), device, port, rate, &faults, seed)
+        Bench::with_host(|now| Search::new(port, memory, now), device, port, rate, &faults, seed)
     }
 }
 
-impl<S: line::Session> Bench<Named<S>> {
+impl<S: line::ScannerSession> Bench<NamedFamily<S>> {
     /// Opens a serial port for a session of a named family, which `begin` creates. Returns the time until something of
     /// the scanner arrives.
-    pub(crate) fn named(begin: impl FnOnce(Nanos) -> S, device: Box<dyn Device>, seed: u64) -> Nanos {
+    pub(crate) fn find_named(begin: impl FnOnce(Nanos) -> S, device: Box<dyn Device>, seed: u64) -> Nanos {
         let mut rate = 0;
         let begin = |now| {
             let session = begin(now);
             rate = session.rate();
-            Named(session)
+            NamedFamily(session)
         };
-        let mut bench = Bench::hosting(begin, Some(device), PortKind::Serial, 0, &Faults::default(), seed);
+        let mut bench = Bench::with_host(begin, Some(device), PortKind::Serial, 0, &Faults::default(), seed);
         bench.rate = rate;
         bench.run(bench.now + 20_000 * MILLIS).expect("something arrives");
         bench.now - bench.opened_at
@@ -195,17 +199,17 @@ impl<S: line::Session> Bench<Named<S>> {
 
 impl<H: Host> Bench<H> {
     /// Opens a serial port for a session that searches for the scanner.
-    pub(crate) fn auto(
+    pub(crate) fn with_search(
         begin: impl FnOnce(Nanos) -> H,
         device: Option<Box<dyn Device>>,
         memory: Option<Memory>,
         seed: u64,
     ) -> Bench<H> {
         let rate = Search::opening_rate(memory);
-        Bench::hosting(begin, device, PortKind::Serial, rate, &Faults::default(), seed)
+        Bench::with_host(begin, device, PortKind::Serial, rate, &Faults::default(), seed)
     }
 
-    fn hosting(
+    fn with_host(
         begin: impl FnOnce(Nanos) -> H,
         mut device: Option<Box<dyn Device>>,
         port: PortKind,
@@ -219,17 +223,17 @@ impl<H: Host> Bench<H> {
         Bench {
             host: begin(now),
             device,
-            wire: LineModel::new(faults, seed),
+            line: LineModel::new(faults, seed),
             power_at: 0,
             is_powered: true,
             opened_at: now,
             now,
             port,
             rate,
-            impossible: Vec::new(),
+            unsupported_rates: Vec::new(),
             to_host: BaudMismatch::default(),
             to_device: BaudMismatch::default(),
-            left_at: 0,
+            last_sent_at: 0,
             is_flushed: true,
             inbox: VecDeque::new(),
             noise: None,
@@ -275,7 +279,7 @@ impl<H: Host> Bench<H> {
             let woken = if self.inbox.is_empty() { until.min(end) } else { self.now };
             let latency = self.random.u64(20 * MICROS..3 * MILLIS);
             self.advance(woken.max(self.now) + latency);
-            let spare = self.host.protocol().spare();
+            let spare = self.host.protocol().read_buffer();
             assert!(!spare.is_empty());
             let len = spare.len().min(self.inbox.len());
             for (place, byte) in spare.iter_mut().zip(self.inbox.drain(..len)) {
@@ -293,10 +297,10 @@ impl<H: Host> Bench<H> {
     fn drain(&mut self) -> Result<Nanos, H::Result> {
         loop {
             match self.host.poll() {
-                Event::SetRate(rate) if self.impossible.contains(&rate) => {
+                HostAction::SetRate(rate) if self.unsupported_rates.contains(&rate) => {
                     self.host.protocol().reject_rate(self.now);
                 }
-                Event::SetRate(rate) => {
+                HostAction::SetRate(rate) => {
                     assert_eq!(self.port, PortKind::Serial);
                     self.flush();
                     self.rate = rate;
@@ -304,25 +308,25 @@ impl<H: Host> Bench<H> {
                     self.read.clear();
                     self.rates.push((self.now, rate));
                 }
-                Event::Transmit(bytes, not_before) => self.transmit(&bytes, not_before),
-                Event::Wait(until) | Event::Rest(until) => {
+                HostAction::Transmit(bytes, not_before) => self.transmit(&bytes, not_before),
+                HostAction::Wait(until) | HostAction::SleepUntil(until) => {
                     self.flush();
                     return Ok(until);
                 }
-                Event::Done(result) => return Err(result),
+                HostAction::Done(result) => return Err(result),
             }
         }
     }
 
     fn transmit(&mut self, bytes: &[u8], not_before: Nanos) {
         self.advance(not_before);
-        self.host.protocol().transmitted(self.now);
+        self.host.protocol().handle_transmitted(self.now);
         for &byte in bytes {
             self.written.push((self.now, self.rate, byte));
-            if self.now > self.left_at {
+            if self.now > self.last_sent_at {
                 self.flush();
             }
-            self.left_at = self.now.max(self.left_at) + line_time(1, self.rate);
+            self.last_sent_at = self.now.max(self.last_sent_at) + line_time(1, self.rate);
             self.is_flushed = false;
             self.deliver(&[byte], false);
         }
@@ -343,14 +347,14 @@ impl<H: Host> Bench<H> {
             rate => self.to_device.receive((self.rate, rate), bytes, is_idle),
         };
         for byte in bytes {
-            self.wire.receive(&mut **device, byte, Arrival::at(self.left_at));
+            self.line.receive(&mut **device, byte, Arrival::at(self.last_sent_at));
         }
     }
 
     fn next_event(&self) -> Option<Nanos> {
         let noise = self.noise.map(|(at, _)| at);
         let device = self.device.as_ref().map(|device| match self.is_powered {
-            true => self.wire.poll_timeout(&**device, self.now),
+            true => self.line.poll_timeout(&**device, self.now),
             false => Some(self.power_at),
         });
         noise.into_iter().chain(device.flatten()).min().map(|at| at.max(self.now))
@@ -371,7 +375,7 @@ impl<H: Host> Bench<H> {
                 }
                 continue;
             }
-            while let Some(carried) = self.wire.poll_transmit(&mut **device, self.now) {
+            while let Some(carried) = self.line.poll_transmit(&mut **device, self.now) {
                 let bytes = match carried.rate {
                     rate if rate == self.rate => carried.bytes,
                     rate => self.to_host.receive((rate, self.rate), &carried.bytes, carried.idle_after),

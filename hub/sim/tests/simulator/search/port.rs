@@ -1,7 +1,7 @@
 //! A session on a port without a configured family: scans arrive soon, no byte is lost on the way from the search to
 //! the session, and the search begins again after the scanner was unplugged.
 
-use scanhub_drivers::line::{self, Account, Protocol, Session as _, State};
+use scanhub_drivers::line::{self, Protocol, ScannerSession as _, SessionStats, State};
 use scanhub_drivers::lms::variant::Baud;
 use scanhub_drivers::search::Memory;
 use scanhub_drivers::{PortSession, Settings, ld};
@@ -9,18 +9,18 @@ use scanhub_schema::{Counter, Counters, Family, MICROS, MILLIS, Nanos, Status};
 use scanhub_sim::device::Device;
 use scanhub_sim::rplidar::Model;
 
-use super::{Bench, Event, Host};
+use super::{Bench, Host, HostAction};
 
 /// A host whose result is the first scan.
-pub(crate) struct Auto {
+pub(crate) struct AutoHost {
     pub(crate) session: PortSession,
     scans: u64,
     /// Wanted number of scans.
-    wanted: u64,
+    wanted_scans: u64,
     bytes: u64,
 }
 
-impl Host for Auto {
+impl Host for AutoHost {
     type Result = u64;
 
     fn protocol(&mut self) -> &mut impl Protocol {
@@ -30,27 +30,27 @@ impl Host for Auto {
     fn commit(&mut self, now: Nanos, len: usize) {
         self.bytes += len as u64;
         self.session.commit(now, len);
-        self.check();
+        self.check_counters();
     }
 
-    fn poll(&mut self) -> Event<u64> {
+    fn poll(&mut self) -> HostAction<u64> {
         loop {
-            if self.scans >= self.wanted {
-                return Event::Done(self.scans);
+            if self.scans >= self.wanted_scans {
+                return HostAction::Done(self.scans);
             }
-            let (scans, wanted) = (&mut self.scans, self.wanted);
+            let (scans, expected) = (&mut self.scans, self.wanted_scans);
             let count = |event: line::Event<'_>| {
                 *scans += match event {
                     line::Event::Telegram(received) => {
-                        u64::from(received.whole.is_some_and(|whole| whole.scan.is_some()))
+                        u64::from(received.contents.is_some_and(|whole| whole.scan.is_some()))
                     }
                     line::Event::Scan(_) => 1,
                 };
-                (*scans >= wanted).then_some(*scans)
+                (*scans >= expected).then_some(*scans)
             };
-            let event = Event::of(&mut self.session, count);
-            if matches!(event, Event::Wait(_)) && self.session.advance() {
-                self.check();
+            let event = HostAction::next_action(&mut self.session, count);
+            if matches!(event, HostAction::Wait(_)) && self.session.advance() {
+                self.check_counters();
                 continue;
             }
             return event;
@@ -58,13 +58,13 @@ impl Host for Auto {
     }
 }
 
-impl Auto {
+impl AutoHost {
     /// Every byte that was read is in the counters, in those of the status too.
-    fn check(&self) {
-        let account = self.session.account();
-        let Account { read, in_telegrams, acknowledge, discarded, buffered, .. } = account;
+    fn check_counters(&self) {
+        let stats = self.session.stats();
+        let SessionStats { read, in_telegrams, acknowledge, discarded, buffered, .. } = stats;
         assert_eq!(read, self.bytes);
-        assert_eq!(read, in_telegrams + acknowledge + discarded + buffered, "{account:?}");
+        assert_eq!(read, in_telegrams + acknowledge + discarded + buffered, "{stats:?}");
         let mut counters = Counters::default();
         self.session.add_counters(&mut counters);
         assert_eq!([counters[Counter::BytesRead], counters[Counter::BytesBuffered]], [read, buffered]);
@@ -72,31 +72,31 @@ impl Auto {
     }
 }
 
-fn host(memory: Option<Memory>, now: Nanos) -> Auto {
+fn host(memory: Option<Memory>, now: Nanos) -> AutoHost {
     let settings = Settings { max_beams: Some(3_240), ..Settings::default() };
     let session = PortSession::begin(None, &settings, memory, now);
-    Auto { session, scans: 0, wanted: 1, bytes: 0 }
+    AutoHost { session, scans: 0, wanted_scans: 1, bytes: 0 }
 }
 
-fn open(device: Option<Box<dyn Device>>, memory: Option<Memory>, seed: u64) -> Bench<Auto> {
-    Bench::auto(|now| host(memory, now), device, memory, seed)
+fn open(device: Option<Box<dyn Device>>, memory: Option<Memory>, seed: u64) -> Bench<AutoHost> {
+    Bench::with_search(|now| host(memory, now), device, memory, seed)
 }
 
 /// Runs until the next scan. Returns the time that it took.
-fn next_scan(bench: &mut Bench<Auto>, what: &str) -> Nanos {
+fn next_scan(bench: &mut Bench<AutoHost>, context: &str) -> Nanos {
     let begin = bench.now;
-    bench.host.wanted = bench.host.scans + 1;
+    bench.host.wanted_scans = bench.host.scans + 1;
     bench.run(begin + 60_000 * MILLIS).unwrap_or_else(|| {
         let session = &bench.host.session;
-        panic!("{what}: {:?}, {:?}, at {}", session.state(), session.trouble(), session.rate())
+        panic!("{context}: {:?}, {:?}, at {}", session.state(), session.problem(), session.rate())
     });
     bench.now - begin
 }
 
 /// Creates a scanner from a seed.
-type Create = Box<dyn Fn(u64) -> Box<dyn Device>>;
+type CreateScanner = Box<dyn Fn(u64) -> Box<dyn Device>>;
 
-fn scanners() -> Vec<(&'static str, Family, Create)> {
+fn scanners() -> Vec<(&'static str, Family, CreateScanner)> {
     vec![
         ("lms idle at 9600", Family::Lms, Box::new(|seed| super::lms(Baud::B9600, false, seed))),
         ("lms idle at 38400", Family::Lms, Box::new(|seed| super::lms(Baud::B38400, false, seed))),
@@ -111,7 +111,7 @@ fn scanners() -> Vec<(&'static str, Family, Create)> {
 }
 
 #[test]
-fn scans_of_every_family_arrive_and_the_scanner_is_remembered() {
+fn finds_every_family_and_remembers_the_scanner() {
     for (name, family, create) in scanners() {
         let (mut times, mut remembered) = (Vec::new(), Vec::new());
         for seed in 0..8 {
@@ -145,9 +145,9 @@ fn the_telegrams_of_the_search_reach_the_session() {
             let mut bench = open(Some(device), None, seed);
             next_scan(&mut bench, name);
             let at_rate: u64 = bench.read.iter().map(|(_, bytes)| bytes.len() as u64).sum();
-            let account = bench.host.session.account();
+            let stats = bench.host.session.stats();
             // All bytes of the last rate are in telegrams, except a fragment of the first one.
-            let lost = at_rate - account.in_telegrams - account.buffered;
+            let lost = at_rate - stats.in_telegrams - stats.buffered;
             assert!(lost < most_lost, "{name}, seed {seed}: {lost} of {at_rate}");
             assert_eq!(bench.written.is_empty(), name == "ld", "{name}, seed {seed}");
         }
@@ -155,17 +155,17 @@ fn the_telegrams_of_the_search_reach_the_session() {
 }
 
 #[test]
-fn another_scanner_is_found_ten_seconds_after_the_first_one_is_gone() {
+fn searches_again_10_s_after_the_scanner_disappears() {
     let mut bench = open(Some(super::ld(ld::Model::Ld19, 1)), None, 1);
     next_scan(&mut bench, "ld19");
     bench.device = None;
-    let gone = bench.now;
-    bench.host.wanted = u64::MAX;
-    bench.run(gone + 9_900 * MILLIS);
+    let disconnected_at = bench.now;
+    bench.host.wanted_scans = u64::MAX;
+    bench.run(disconnected_at + 9_900 * MILLIS);
     assert_eq!(bench.host.session.family(), Some(Family::Ld), "its session handles silence");
-    bench.run(gone + 10_200 * MILLIS);
+    bench.run(disconnected_at + 10_200 * MILLIS);
     assert_eq!(bench.host.session.family(), None);
-    assert!(bench.host.session.trouble().is_some(), "the trouble of the session is shown");
+    assert!(bench.host.session.problem().is_some(), "the trouble of the session is shown");
     let mut status = Status::default();
     status.set_sensor_type("LD19");
     bench.host.session.describe(&mut status);
@@ -185,7 +185,7 @@ fn scans_arrive_at_a_port_that_rejects_rates() {
                 continue;
             }
             let mut bench = open(Some(device), None, 1);
-            bench.impossible = impossible.to_vec();
+            bench.unsupported_rates = impossible.to_vec();
             if impossible.contains(&230_400) {
                 bench.host.session.reject_rate(bench.now);
             }
@@ -195,15 +195,15 @@ fn scans_arrive_at_a_port_that_rejects_rates() {
             if family == Family::Lms && impossible.contains(&500_000) {
                 // It was not sent to a rate that only it can have.
                 assert_eq!(session.rate(), 38_400, "{name}");
-                let trouble = session.trouble().map(|trouble| trouble.to_string()).unwrap_or_default();
-                assert!(trouble.starts_with("the port cannot have 500000 baud"), "{name}: {trouble}");
+                let problem = session.problem().map(|problem| problem.to_string()).unwrap_or_default();
+                assert!(problem.starts_with("the port cannot have 500000 baud"), "{name}: {problem}");
             }
         }
     }
 }
 
 #[test]
-fn beams_that_are_restored_stay_unless_the_rate_is_that_of_another_model() {
+fn restored_beams_stay_unless_the_rate_differs() {
     for (scanner, restored, expected) in [
         (ld::Model::Ld19, ld::Model::Ld14p, 666),
         (ld::Model::Ld14p, ld::Model::Ld19, 450),
@@ -218,7 +218,7 @@ fn beams_that_are_restored_stay_unless_the_rate_is_that_of_another_model() {
             host.session.restore_beams(*model.expect("a model"), restored.beams());
             host
         };
-        let mut bench = Bench::auto(begin, Some(super::ld(scanner, 1)), Some(memory), 1);
+        let mut bench = Bench::with_search(begin, Some(super::ld(scanner, 1)), Some(memory), 1);
         next_scan(&mut bench, scanner.name());
         assert_eq!(bench.host.session.beams(), Some(expected), "{scanner:?} after {restored:?}");
     }
@@ -238,16 +238,16 @@ fn a_paused_search_sends_nothing() {
 fn a_silent_line_has_a_message() {
     let mut bench = open(None, None, 4);
     bench.run(bench.now + 13_000 * MILLIS);
-    let trouble = bench.host.session.trouble().map(|trouble| trouble.to_string());
+    let problem = bench.host.session.problem().map(|problem| problem.to_string());
     let expected = "no scanner replies (looked for lms, ld, rplidar for 10 s): power, cable?";
-    assert_eq!(trouble.as_deref(), Some(expected));
+    assert_eq!(problem.as_deref(), Some(expected));
 }
 
 #[test]
 fn bytes_of_no_scanner_have_a_message() {
     let mut bench = open(None, None, 5).with_noise(200 * MICROS);
     bench.run(bench.now + 13_000 * MILLIS);
-    let trouble = bench.host.session.trouble().map(|trouble| trouble.to_string()).unwrap_or_default();
-    assert!(trouble.ends_with(" bytes/s arrive, but scanhub does not recognize the scanner"), "{trouble}");
+    let problem = bench.host.session.problem().map(|problem| problem.to_string()).unwrap_or_default();
+    assert!(problem.ends_with(" bytes/s arrive, but scanhub does not recognize the scanner"), "{problem}");
     assert_eq!(bench.host.session.family(), None);
 }

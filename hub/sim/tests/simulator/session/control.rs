@@ -1,11 +1,11 @@
 //! What a user may ask of a running session: pause, resume, resync.
 
-use scanhub_drivers::line::{Control, Session as _, State};
+use scanhub_drivers::line::{Control, ScannerSession as _, State};
 use scanhub_drivers::lms;
-use scanhub_drivers::lms::Trouble;
+use scanhub_drivers::lms::Problem;
 use scanhub_drivers::lms::variant::Baud;
 use scanhub_schema::{MILLIS, Nanos};
-use scanhub_sim::operating::Operating;
+use scanhub_sim::operating::OperatingMode;
 
 use super::{Bench, make_stream, sensor};
 
@@ -16,27 +16,27 @@ impl Bench {
 }
 
 /// Bytes of the sensor that came after `since`.
-fn sent_after(bench: &Bench, since: Nanos) -> usize {
+fn bytes_sent_since(bench: &Bench, since: Nanos) -> usize {
     bench.sent.iter().filter(|sent| sent.at > since).count()
 }
 
 #[test]
 fn a_pause_stops_the_stream_and_a_resume_starts_it() {
     let mut bench = Bench::new(sensor(Baud::B9600), 0);
-    bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+    bench.run_until("streaming", 3_000 * MILLIS, Bench::is_streaming);
     bench.run(500 * MILLIS);
     for round in 1..4 {
         bench.control(Control::Pause);
         bench.control(Control::Pause);
         bench.run(200 * MILLIS);
-        let (quiet, said) = (bench.now, bench.said.len());
+        let (quiet, sent_count) = (bench.now, bench.sent_bytes.len());
         bench.run(20_000 * MILLIS);
-        assert_eq!((bench.session.state(), bench.said.len()), (State::Paused, said), "{bench}");
-        assert_eq!(sent_after(&bench, quiet), 0, "the sensor streams on: {bench}");
-        assert_eq!((bench.session.trouble(), bench.session.account().resyncs), (None, 0));
+        assert_eq!((bench.session.state(), bench.sent_bytes.len()), (State::Paused, sent_count), "{bench}");
+        assert_eq!(bytes_sent_since(&bench, quiet), 0, "the sensor streams on: {bench}");
+        assert_eq!((bench.session.problem(), bench.session.stats().resyncs), (None, 0));
         bench.control(Control::Resume);
         bench.control(Control::Resume);
-        bench.until("streaming", 2_000 * MILLIS, Bench::is_streaming);
+        bench.run_until("streaming", 2_000 * MILLIS, Bench::is_streaming);
         bench.run(200 * MILLIS);
         assert!(bench.is_streaming(), "{round}: {bench}");
     }
@@ -52,22 +52,26 @@ fn a_pause_may_come_at_any_moment() {
         for streams in [false, true] {
             for at in 0..60 {
                 let mut machine = sensor(baud);
-                let begun = if streams { make_stream(&mut machine) } else { 0 };
-                let mut bench = Bench::new(machine, begun);
+                let started = if streams { make_stream(&mut machine) } else { 0 };
+                let mut bench = Bench::new(machine, started);
                 bench.run(at * 23 * MILLIS);
                 bench.control(Control::Pause);
                 assert_eq!(bench.session.state(), State::Paused);
                 bench.run(5_000 * MILLIS);
-                let (quiet, said) = (bench.now, bench.said.len());
+                let (quiet, sent_count) = (bench.now, bench.sent_bytes.len());
                 bench.run(2_000 * MILLIS);
-                assert_eq!((bench.session.state(), bench.said.len()), (State::Paused, said), "{bench}");
-                assert_eq!(sent_after(&bench, quiet), 0, "{at}: the sensor streams on: {bench}");
-                assert_eq!(bench.machine.operating(), &Operating::OnRequest, "{at}: {bench}");
-                assert_eq!(bench.session.trouble(), None, "{at}: {bench}");
+                assert_eq!(
+                    (bench.session.state(), bench.sent_bytes.len()),
+                    (State::Paused, sent_count),
+                    "{bench}"
+                );
+                assert_eq!(bytes_sent_since(&bench, quiet), 0, "{at}: the sensor streams on: {bench}");
+                assert_eq!(bench.machine.operating(), &OperatingMode::OnRequest, "{at}: {bench}");
+                assert_eq!(bench.session.problem(), None, "{at}: {bench}");
                 bench.control(Control::Resume);
-                bench.until("streaming", 5_000 * MILLIS, Bench::is_streaming);
+                bench.run_until("streaming", 5_000 * MILLIS, Bench::is_streaming);
                 bench.run(200 * MILLIS);
-                assert!(bench.is_streaming() && bench.session.trouble().is_none(), "{at}: {bench}");
+                assert!(bench.is_streaming() && bench.session.problem().is_none(), "{at}: {bench}");
             }
         }
     }
@@ -76,94 +80,94 @@ fn a_pause_may_come_at_any_moment() {
 #[test]
 fn an_absent_sensor_is_paused_in_peace() {
     let mut bench = Bench::new(sensor(Baud::B500000), 0);
-    bench.to_sensor = Box::new(|_, _| None);
+    bench.to_scanner = Box::new(|_, _| None);
     bench.control(Control::Pause);
     bench.run(10_000 * MILLIS);
-    let said = bench.said.len();
-    assert!(said <= 8 * 8, "{said} bytes to nobody");
+    let sent_count = bench.sent_bytes.len();
+    assert!(sent_count <= 8 * 8, "{sent_count} bytes to nobody");
     bench.run(60_000 * MILLIS);
-    assert_eq!((bench.session.state(), bench.said.len()), (State::Paused, said));
-    assert_eq!(bench.session.trouble(), None);
+    assert_eq!((bench.session.state(), bench.sent_bytes.len()), (State::Paused, sent_count));
+    assert_eq!(bench.session.problem(), None);
     // A pause does not count as time in which it did not answer.
     bench.control(Control::Resume);
-    bench.until("said", 3_000 * MILLIS, |bench| bench.session.trouble().is_some());
-    assert!(matches!(bench.session.trouble(), Some(Trouble::NoAnswer { seconds: 0..=3, .. })), "{bench}");
+    bench.run_until("said", 3_000 * MILLIS, |bench| bench.session.problem().is_some());
+    assert!(matches!(bench.session.problem(), Some(Problem::NoReply { seconds: 0..=3, .. })), "{bench}");
 }
 
 #[test]
-fn what_sends_at_another_rate_and_does_not_listen_is_no_pause() {
+fn stream_at_another_rate_is_reported_as_not_stopped() {
     let mut machine = sensor(Baud::B38400);
-    let begun = make_stream(&mut machine);
-    let mut bench = Bench::new(machine, begun);
-    bench.to_sensor = Box::new(|_, _| None);
+    let started = make_stream(&mut machine);
+    let mut bench = Bench::new(machine, started);
+    bench.to_scanner = Box::new(|_, _| None);
     bench.run(300 * MILLIS);
     bench.control(Control::Pause);
     bench.run(20_000 * MILLIS);
-    let said = bench.said.len();
+    let sent_count = bench.sent_bytes.len();
     bench.run(60_000 * MILLIS);
-    assert_eq!((bench.session.state(), bench.said.len()), (State::Paused, said));
-    assert_eq!(bench.session.trouble(), Some(Trouble::NotStopped), "{bench}");
+    assert_eq!((bench.session.state(), bench.sent_bytes.len()), (State::Paused, sent_count));
+    assert_eq!(bench.session.problem(), Some(Problem::NotStopped), "{bench}");
 }
 
 #[test]
-fn what_streams_on_is_delivered_and_told_to_stop_some_times() {
+fn delivers_unstoppable_stream_and_limits_stops() {
     let mut machine = sensor(Baud::B500000);
-    let begun = make_stream(&mut machine);
-    let mut bench = Bench::new(machine, begun);
-    bench.until("streaming", 100 * MILLIS, Bench::is_streaming);
+    let started = make_stream(&mut machine);
+    let mut bench = Bench::new(machine, started);
+    bench.run_until("streaming", 100 * MILLIS, Bench::is_streaming);
     bench.run(300 * MILLIS);
     // The line to the sensor breaks, the line back does not.
-    bench.to_sensor = Box::new(|_, _| None);
+    bench.to_scanner = Box::new(|_, _| None);
     let paused = bench.now;
     bench.control(Control::Pause);
     bench.run(30_000 * MILLIS);
-    let said = bench.said.len();
+    let sent_count = bench.sent_bytes.len();
     bench.run(10_000 * MILLIS);
-    assert_eq!((bench.session.state(), bench.said.len()), (State::Paused, said), "{bench}");
-    assert_eq!(bench.session.trouble(), Some(Trouble::NotStopped), "{bench}");
+    assert_eq!((bench.session.state(), bench.sent_bytes.len()), (State::Paused, sent_count), "{bench}");
+    assert_eq!(bench.session.problem(), Some(Problem::NotStopped), "{bench}");
     let mut intact = bench.intact_scans(paused);
     assert!(intact.len() > 1400);
     intact.truncate(bench.received_scans(paused).len());
     assert_eq!(bench.received_scans(paused), intact);
     bench.control(Control::Resume);
-    bench.until("streaming", 100 * MILLIS, Bench::is_streaming);
+    bench.run_until("streaming", 100 * MILLIS, Bench::is_streaming);
     bench.run(5_000 * MILLIS);
     // It is asked who it is, as often as any other.
-    assert!(bench.is_streaming() && bench.said.len() <= said + 15 * 7, "{bench}");
+    assert!(bench.is_streaming() && bench.sent_bytes.len() <= sent_count + 15 * 7, "{bench}");
 }
 
 #[test]
-fn a_resync_begins_anew_and_is_counted() {
+fn resync_restarts_and_is_counted() {
     let mut bench = Bench::new(sensor(Baud::B500000), 0);
-    bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+    bench.run_until("streaming", 3_000 * MILLIS, Bench::is_streaming);
     bench.run(500 * MILLIS);
-    let (said, begun) = (bench.said.len(), bench.now);
+    let (sent_count, started) = (bench.sent_bytes.len(), bench.now);
     bench.control(Control::Resync);
-    assert_eq!((bench.session.state(), bench.session.account().resyncs), (State::Probing, 1));
-    bench.until("streaming", 60 * MILLIS, Bench::is_streaming);
+    assert_eq!((bench.session.state(), bench.session.stats().resyncs), (State::Probing, 1));
+    bench.run_until("streaming", 60 * MILLIS, Bench::is_streaming);
     bench.run(1_000 * MILLIS);
-    assert_eq!(bench.said.len(), said + 2 * 7, "an adopted stream costs two questions");
-    let mut intact = bench.intact_scans(begun);
-    intact.truncate(bench.received_scans(begun).len());
-    assert_eq!(bench.received_scans(begun), intact, "{bench}");
+    assert_eq!(bench.sent_bytes.len(), sent_count + 2 * 7, "an adopted stream costs two questions");
+    let mut intact = bench.intact_scans(started);
+    intact.truncate(bench.received_scans(started).len());
+    assert_eq!(bench.received_scans(started), intact, "{bench}");
     // From a pause too.
     bench.control(Control::Pause);
     bench.run(500 * MILLIS);
     bench.control(Control::Resync);
-    bench.until("streaming", 2_000 * MILLIS, Bench::is_streaming);
-    assert_eq!(bench.session.account().resyncs, 2);
+    bench.run_until("streaming", 2_000 * MILLIS, Bench::is_streaming);
+    assert_eq!(bench.session.stats().resyncs, 2);
 }
 
 #[test]
 fn a_recording_is_not_controlled() {
-    let wanted = lms::Settings { listen_only: true, ..super::WANTED };
+    let settings = lms::Settings { listen_only: true, ..super::SESSION_SETTINGS };
     let mut machine = sensor(Baud::B500000);
-    let begun = make_stream(&mut machine);
-    let mut bench = Bench::wanting(wanted, machine, begun);
+    let started = make_stream(&mut machine);
+    let mut bench = Bench::with_settings(settings, machine, started);
     for control in [Control::Pause, Control::Resume, Control::Resync] {
         bench.control(control);
         bench.run(200 * MILLIS);
-        assert_eq!((bench.session.state(), bench.session.account().resyncs), (State::Streaming, 0));
+        assert_eq!((bench.session.state(), bench.session.stats().resyncs), (State::Streaming, 0));
     }
-    assert!(bench.said.is_empty());
+    assert!(bench.sent_bytes.is_empty());
 }

@@ -1,27 +1,27 @@
 //! Losses and delays of the line and the host. The session delivers intact telegrams and counts losses. Its stamps are
 //! right even if the host did not run for a while, or reads only when a telegram is due.
 
-use scanhub_drivers::line::{Control, Session as _};
+use scanhub_drivers::line::{Control, ScannerSession as _};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::variant::{Baud, Variant};
 use scanhub_schema::{MICROS, MILLIS, Nanos};
 use scanhub_sim::ChunkSize;
 use scanhub_sim::fault::{Faults, Loss};
 use scanhub_sim::machine::{LmsSimulator, Settings};
-use scanhub_sim::operating::Source;
+use scanhub_sim::operating::ScanSource;
 use scanhub_sim::room::Room;
 
-use super::{Bench, Received, Sent, WANTED, make_stream, sensor};
+use super::{Bench, ReceivedTelegram, SESSION_SETTINGS, SentTelegram, make_stream, sensor};
 
 /// Runs with these losses, and compares the received telegrams with the intact ones that were sent.
-fn delivered(faults: Faults, seed: u64, span: Nanos) -> (usize, usize) {
+fn run_with_losses(faults: Faults, seed: u64, span: Nanos) -> (usize, usize) {
     let mut bench = Bench::new(sensor(Baud::B500000), 0);
-    bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+    bench.run_until("streaming", 3_000 * MILLIS, Bench::is_streaming);
     bench.run(500 * MILLIS);
-    let begun = bench.now;
+    let started = bench.now;
     let mut loss = Loss::new(faults, seed);
     bench.to_host = Box::new(move |at, mut bytes| {
-        if at < begun + span {
+        if at < started + span {
             loss.apply(&mut bytes);
         }
         bytes
@@ -31,18 +31,21 @@ fn delivered(faults: Faults, seed: u64, span: Nanos) -> (usize, usize) {
     bench.run(200 * MILLIS);
     bench.to_host = Box::new(|_, _| Vec::new());
     bench.run(60 * MILLIS);
-    let (intact, scans) = (bench.intact_scans(begun), bench.received_scans(begun));
+    let (intact, scans) = (bench.intact_scans(started), bench.received_scans(started));
     assert!(scans == intact, "{} received, {} intact: {bench}", scans.len(), intact.len());
-    let sent = bench.sent.iter().filter(|sent| sent.at > begun && !sent.is_reply).count();
-    assert_eq!(bench.session.account().resyncs, 0);
+    let sent = bench.sent.iter().filter(|sent| sent.at > started && !sent.is_reply).count();
+    assert_eq!(bench.session.stats().resyncs, 0);
     (sent, intact.len())
 }
 
 #[test]
-fn the_losses_of_the_paper_cost_only_what_they_damage() {
+fn losses_as_in_the_paper_cost_only_damaged_scans() {
     for seed in 1..=4 {
-        let (sent, intact) =
-            delivered(Faults { loss: 0.00135, burst: 1.89, ..Faults::default() }, seed, 30_000 * MILLIS);
+        let (sent, intact) = run_with_losses(
+            Faults { loss: 0.00135, burst: 1.89, ..Faults::default() },
+            seed,
+            30_000 * MILLIS,
+        );
         let share = 1.0 - intact as f64 / sent as f64;
         assert!(sent > 1100 && (0.33..0.47).contains(&share), "{share} of {sent} were damaged");
     }
@@ -51,21 +54,21 @@ fn the_losses_of_the_paper_cost_only_what_they_damage() {
 #[test]
 fn long_bursts_and_single_bytes_too() {
     for (loss, burst) in [(0.0005, 1.0), (0.002, 3.34), (0.02, 200.0), (0.1, 1000.0)] {
-        let (sent, intact) = delivered(Faults { loss, burst, ..Faults::default() }, 9, 20_000 * MILLIS);
+        let (sent, intact) = run_with_losses(Faults { loss, burst, ..Faults::default() }, 9, 20_000 * MILLIS);
         assert!(intact > 0 && intact < sent, "{loss} {burst}: {intact} of {sent}");
     }
 }
 
 /// A stream whose questions are all answered.
 fn streaming(baud: Baud) -> Bench {
-    let mut bench = Bench::wanting(lms::Settings { baud, ..WANTED }, sensor(baud), 0);
-    bench.until("streaming", 5_000 * MILLIS, Bench::is_streaming);
+    let mut bench = Bench::with_settings(lms::Settings { baud, ..SESSION_SETTINGS }, sensor(baud), 0);
+    bench.run_until("streaming", 5_000 * MILLIS, Bench::is_streaming);
     bench.run(3_000 * MILLIS);
     bench
 }
 
 /// Scans that were sent after `since`, and those of them that the line damaged.
-fn truth(bench: &Bench, since: Nanos) -> (u64, u64) {
+fn sent_and_damaged(bench: &Bench, since: Nanos) -> (u64, u64) {
     let scans = || bench.sent.iter().filter(|sent| sent.at > since && !sent.is_reply && !sent.aborted);
     (scans().count() as u64, scans().filter(|sent| sent.damaged).count() as u64)
 }
@@ -73,37 +76,37 @@ fn truth(bench: &Bench, since: Nanos) -> (u64, u64) {
 #[test]
 fn ten_minutes_of_the_bursts_of_the_paper() {
     let mut bench = streaming(Baud::B500000);
-    let begun = bench.now;
+    let started = bench.now;
     let mut loss = Loss::new(Faults { loss: 0.00135, burst: 1.89, ..Faults::default() }, 3);
     bench.to_host = Box::new(move |_, mut bytes| {
         loss.apply(&mut bytes);
         bytes
     });
     bench.run(600_000 * MILLIS);
-    let (sent, lost) = truth(&bench, begun);
-    let counted = bench.session.account().lost;
-    println!("{lost} of {sent} lost, {counted} counted, {} due", bench.session.account().due);
+    let (sent, lost) = sent_and_damaged(&bench, started);
+    let counted = bench.session.stats().lost;
+    println!("{lost} of {sent} lost, {counted} counted, {} due", bench.session.stats().due);
     assert!(sent > 20_000 && lost * 10 > sent * 3);
     assert!(counted.abs_diff(lost) * 100 <= sent, "{counted} instead of {lost} of {sent}: {bench}");
-    assert_eq!(bench.session.account().resyncs, 0);
-    let tally = bench.session.tally();
-    let share = bench.session.account().damaged as f64 / tally.read as f64;
+    assert_eq!(bench.session.stats().resyncs, 0);
+    let tally = bench.session.framer_counters();
+    let share = bench.session.stats().damaged as f64 / tally.read as f64;
     assert!((0.3..0.5).contains(&share), "{share} of the bytes");
 }
 
 #[test]
-fn slower_lines_lose_what_they_lose() {
+fn counts_lost_scans_at_slower_rates() {
     // The slower line would treat more in a row as a silence.
     for (baud, loss, minutes) in [(Baud::B38400, 0.0003, 10), (Baud::B9600, 0.00008, 40)] {
         let mut bench = streaming(baud);
-        let begun = bench.now;
+        let started = bench.now;
         let mut loss = Loss::new(Faults { loss, ..Faults::default() }, 7);
         bench.to_host = Box::new(move |_, mut bytes| {
             loss.apply(&mut bytes);
             bytes
         });
         bench.run(minutes * 60_000 * MILLIS);
-        let ((sent, lost), counted) = (truth(&bench, begun), bench.session.account().lost);
+        let ((sent, lost), counted) = (sent_and_damaged(&bench, started), bench.session.stats().lost);
         println!("{baud:?}: {counted} of {lost} of {sent}");
         assert!(
             lost > 100 && counted.abs_diff(lost) * 100 <= sent,
@@ -113,10 +116,10 @@ fn slower_lines_lose_what_they_lose() {
 }
 
 #[test]
-fn a_line_that_is_well_has_lost_nothing_whatever_is_asked_of_its_sensor() {
+fn control_requests_and_silence_count_no_loss() {
     let mut bench = streaming(Baud::B500000);
-    let well = |bench: &Bench| (bench.session.account().lost, bench.session.account().damaged) == (0, 0);
-    assert!(bench.session.account().due > 60 && well(&bench), "{bench}");
+    let well = |bench: &Bench| (bench.session.stats().lost, bench.session.stats().damaged) == (0, 0);
+    assert!(bench.session.stats().due > 60 && well(&bench), "{bench}");
     for control in [Control::Pause, Control::Resume, Control::Resync] {
         bench.session.control(control, bench.now);
         bench.run(5_000 * MILLIS);
@@ -127,30 +130,30 @@ fn a_line_that_is_well_has_lost_nothing_whatever_is_asked_of_its_sensor() {
     bench.to_host = Box::new(|_, _| Vec::new());
     bench.run(10_000 * MILLIS);
     bench.to_host = Box::new(|_, bytes| bytes);
-    bench.until("streaming", 10_000 * MILLIS, Bench::is_streaming);
+    bench.run_until("streaming", 10_000 * MILLIS, Bench::is_streaming);
     bench.run(5_000 * MILLIS);
     assert!(well(&bench), "{bench}");
     // One telegram less.
-    let (begun, due) = (bench.now, bench.session.account().due);
-    bench.to_host = Box::new(move |at, bytes| if at < begun + 27 * MILLIS { Vec::new() } else { bytes });
+    let (started, due) = (bench.now, bench.session.stats().due);
+    bench.to_host = Box::new(move |at, bytes| if at < started + 27 * MILLIS { Vec::new() } else { bytes });
     bench.run(5_000 * MILLIS);
-    assert!((1..=2).contains(&bench.session.account().lost), "{}", bench.session.account().lost);
-    assert!((185..190).contains(&(bench.session.account().due - due)));
+    assert!((1..=2).contains(&bench.session.stats().lost), "{}", bench.session.stats().lost);
+    assert!((185..190).contains(&(bench.session.stats().due - due)));
 }
 
 /// Returns a bench that has streamed for some seconds, and the time of a scan from its first to its last byte.
 fn streaming_variant(baud: Baud, variant: Variant) -> (Bench, Nanos) {
     let settings = Settings { baud, variant, ..Settings::default() };
-    let machine = LmsSimulator::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 5)));
-    let mut bench = Bench::wanting(lms::Settings { baud, variant, ..WANTED }, machine, 0);
-    bench.until("streaming", 5_000 * MILLIS, Bench::is_streaming);
+    let machine = LmsSimulator::new(settings, ScanSource::Room(Room::new(&"room".parse().unwrap(), 5)));
+    let mut bench = Bench::with_settings(lms::Settings { baud, variant, ..SESSION_SETTINGS }, machine, 0);
+    bench.run_until("streaming", 5_000 * MILLIS, Bench::is_streaming);
     bench.run(10_000 * MILLIS);
-    let took = |bench: &Bench| {
+    let scan_time_of = |bench: &Bench| {
         let got = bench.received.iter().rev().take(8).filter(|got| !got.estimated);
         got.filter_map(|got| Some(sent_at(bench, &got.telegram)? - got.first)).max()
     };
-    let took = took(&bench).expect("stamps that are no estimates");
-    (bench, took)
+    let scan_time = scan_time_of(&bench).expect("stamps that are no estimates");
+    (bench, scan_time)
 }
 
 /// Returns the time at which the last byte of `telegram` left the line.
@@ -159,11 +162,11 @@ fn sent_at(bench: &Bench, telegram: &[u8]) -> Option<Nanos> {
 }
 
 /// Returns the errors of the stamps of scans that arrived after `since`, and whether they are estimates.
-fn errors(bench: &Bench, since: Nanos, took: Nanos) -> Vec<(Nanos, bool)> {
+fn errors(bench: &Bench, since: Nanos, scan_time: Nanos) -> Vec<(Nanos, bool)> {
     let scans = bench.received.iter().filter(|got| got.at > since && got.telegram.len() > 300);
-    let error = |got: &super::Received| {
-        let begun = sent_at(bench, &got.telegram).expect("it was sent") - took;
-        (got.first.abs_diff(begun), got.estimated)
+    let error = |got: &super::ReceivedTelegram| {
+        let started = sent_at(bench, &got.telegram).expect("it was sent") - scan_time;
+        (got.first.abs_diff(started), got.estimated)
     };
     scans.map(error).collect()
 }
@@ -174,40 +177,40 @@ fn median(mut values: Vec<Nanos>) -> Nanos {
 }
 
 #[test]
-fn what_waited_is_dated_by_its_place_among_what_waited() {
+fn stamps_of_backlogged_scans_are_within_5_ms() {
     for (baud, variant) in
         [(Baud::B500000, Variant::HALF), (Baud::B500000, Variant::ALL[0]), (Baud::B38400, Variant::HALF)]
     {
-        let (mut bench, took) = streaming_variant(baud, variant);
+        let (mut bench, scan_time) = streaming_variant(baud, variant);
         let mut all = Vec::new();
         for span in [300, 700, 1_300, 3_000] {
             let stopped = bench.now;
-            bench.stop(span * MILLIS + 7 * MILLIS);
+            bench.stop_host(span * MILLIS + 7 * MILLIS);
             bench.run(2_000 * MILLIS);
-            let errors = errors(&bench, stopped, took);
+            let errors = errors(&bench, stopped, scan_time);
             assert!(errors.len() as u64 * 1_000 > span, "{} scans", errors.len());
             // No byte was lost, so all stamps are right, with or without the mark of an estimate.
-            let most = errors.iter().map(|(error, _)| *error).max();
-            assert!(most <= Some(5 * MILLIS), "{baud:?} {variant:?} {span} ms: {most:?}");
+            let maximum = errors.iter().map(|(error, _)| *error).max();
+            assert!(maximum <= Some(5 * MILLIS), "{baud:?} {variant:?} {span} ms: {maximum:?}");
             all.extend(errors.into_iter().filter(|(_, estimated)| *estimated).map(|(error, _)| error));
         }
         let (count, median) = (all.len(), median(all));
         println!("{baud:?} {variant:?}: {count} that waited, median error {} us", median / MICROS);
         assert!(count > 15 && median < MILLIS, "{count} {median}");
-        assert_eq!((bench.session.account().resyncs, bench.session.account().lost), (0, 0));
+        assert_eq!((bench.session.stats().resyncs, bench.session.stats().lost), (0, 0));
     }
 }
 
 #[test]
-fn where_the_buffer_was_full_a_stamp_is_right_or_says_that_it_is_none() {
+fn stamps_after_overflow_are_right_or_estimated() {
     for room in [4_096, 65_536] {
-        let (mut bench, took) = streaming_variant(Baud::B500000, Variant::HALF);
-        bench.room = room;
+        let (mut bench, scan_time) = streaming_variant(Baud::B500000, Variant::HALF);
+        bench.buffer_len = room;
         for span in (300..=3_000).step_by(330) {
             let stopped = bench.now;
-            bench.stop(span * MILLIS);
+            bench.stop_host(span * MILLIS);
             bench.run(2_000 * MILLIS);
-            for (error, estimated) in errors(&bench, stopped, took) {
+            for (error, estimated) in errors(&bench, stopped, scan_time) {
                 assert!(estimated || error <= 5 * MILLIS, "{room} {span} ms: {error}");
             }
             let stamps: Vec<Nanos> = bench.received.iter().map(|got| got.first).collect();
@@ -215,13 +218,13 @@ fn where_the_buffer_was_full_a_stamp_is_right_or_says_that_it_is_none() {
         }
         bench.run(2_000 * MILLIS);
         let lost = bench.sent.iter().filter(|sent| sent.damaged && !sent.is_reply && !sent.aborted).count();
-        let counted = bench.session.account().lost;
+        let counted = bench.session.stats().lost;
         assert!(counted.abs_diff(lost as u64) <= 2, "{counted} of {lost} with room for {room}");
     }
 }
 
 #[test]
-fn what_waited_while_a_host_between_two_telegrams_was_stopped_is_no_newer_than_it_is() {
+fn stop_between_scans_does_not_stamp_backlog_as_new() {
     let (mut bench, _) = streaming_variant(Baud::B500000, Variant::HALF);
     for _ in 0..20 {
         bench.run(100 * MILLIS);
@@ -230,7 +233,7 @@ fn what_waited_while_a_host_between_two_telegrams_was_stopped_is_no_newer_than_i
         }
         let stopped = bench.now;
         // As much as a tty has room for.
-        bench.stop(140 * MILLIS);
+        bench.stop_host(140 * MILLIS);
         let continued = bench.now;
         bench.run(5 * MILLIS);
         let waited: Vec<_> = bench.received.iter().filter(|got| got.at >= stopped).collect();
@@ -254,63 +257,65 @@ fn a_telegram_is_there_soon_after_its_last_byte() {
     for chunk in [ChunkSize::Uart, ChunkSize::Usb] {
         for variant in [Variant::HALF, Variant::ALL[0]] {
             let settings = Settings { baud: Baud::B500000, variant, chunk, ..Settings::default() };
-            let machine = LmsSimulator::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 5)));
+            let machine =
+                LmsSimulator::new(settings, ScanSource::Room(Room::new(&"room".parse().unwrap(), 5)));
             let mut bench = Bench::new(machine, 0);
-            bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+            bench.run_until("streaming", 3_000 * MILLIS, Bench::is_streaming);
             bench.run(20_000 * MILLIS);
             let scans: Vec<_> = bench.received.iter().filter(|got| got.telegram.len() > 300).collect();
             let sent: Vec<_> = bench.sent.iter().filter(|sent| !sent.is_reply).collect();
-            let pairs: Vec<(&&Received, &&Sent)> = scans.iter().zip(&sent).skip(LESSONS).collect();
+            let pairs: Vec<(&&ReceivedTelegram, &&SentTelegram)> =
+                scans.iter().zip(&sent).skip(TELEGRAMS_BEFORE_TIMING).collect();
             assert!(pairs.len() > 600 && pairs.iter().all(|(got, sent)| got.telegram == sent.telegram));
-            let late = |(got, sent): &(&&Received, &&Sent)| got.at - sent.at;
+            let late = |(got, sent): &(&&ReceivedTelegram, &&SentTelegram)| got.at - sent.at;
             let prompt: Vec<_> = pairs.iter().filter(|(_, sent)| !is_held(&sent.telegram)).collect();
             assert!(prompt.len() * 10 > pairs.len() * 9);
             let latest = prompt.iter().copied().map(late).max().unwrap_or_default();
             assert!(latest <= 1_500 * MICROS, "{variant:?} {chunk:?}: {latest} ns");
             let latest = pairs.iter().map(late).max().unwrap_or_default();
             assert!(latest <= 3_500 * MICROS, "{variant:?} {chunk:?}: {latest} ns for one that was held");
-            let most = prompt.iter().map(|(got, _)| got.looks).max().unwrap_or_default();
-            assert!((1..=6).contains(&most), "{variant:?} {chunk:?}: {most} looks for a telegram");
+            let maximum = prompt.iter().map(|(got, _)| got.reads_since_last).max().unwrap_or_default();
+            assert!((1..=6).contains(&maximum), "{variant:?} {chunk:?}: {maximum} looks for a telegram");
         }
     }
 }
 
 /// Telegrams that are read as they come, before the first rest.
-const LESSONS: usize = 6;
+const TELEGRAMS_BEFORE_TIMING: usize = 6;
 
 #[test]
-fn what_a_killed_host_would_lose_is_not_read_before_it_is_nearly_complete() {
+fn reads_a_scan_only_when_it_is_nearly_complete() {
     let settings = Settings { baud: Baud::B500000, ..Settings::default() };
-    let machine = LmsSimulator::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 5)));
+    let machine = LmsSimulator::new(settings, ScanSource::Room(Room::new(&"room".parse().unwrap(), 5)));
     let mut bench = Bench::new(machine, 0);
-    bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+    bench.run_until("streaming", 3_000 * MILLIS, Bench::is_streaming);
     bench.run(500 * MILLIS);
-    let looks = 2_000;
+    let polls = 2_000;
     let mut exposed = 0;
-    for _ in 0..looks {
+    for _ in 0..polls {
         bench.run(MILLIS - MILLIS / 7);
-        exposed += u32::from(bench.session.account().buffered > 0);
+        exposed += u32::from(bench.session.stats().buffered > 0);
     }
     // 0.6 ms and a chunk of every 26.64.
-    assert!(exposed * 100 < looks * 6, "{exposed} of {looks}");
+    assert!(exposed * 100 < polls * 6, "{exposed} of {polls}");
 }
 
 #[test]
-fn what_is_asked_of_a_running_stream_is_heard_as_soon_as_it_is_answered() {
+fn replies_during_a_stream_are_received_within_2_ms() {
     let mut machine = sensor(Baud::B500000);
     let now = make_stream(&mut machine);
     let mut bench = Bench::new(machine, now);
     // The scanner overlooks the first requests. The session knows the duration of a telegram by the time of the
     // others.
-    bench.to_sensor = Box::new(|number, byte| (number >= 60).then_some(byte));
-    bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+    bench.to_scanner = Box::new(|number, byte| (number >= 60).then_some(byte));
+    bench.run_until("streaming", 3_000 * MILLIS, Bench::is_streaming);
     bench.run(3_000 * MILLIS);
     let replies: Vec<_> = bench.sent.iter().filter(|sent| sent.is_reply && sent.at > now).collect();
     assert!(!replies.is_empty());
     for reply in replies {
         let mut same =
             bench.received.iter().filter(|got| got.telegram == reply.telegram && got.at >= reply.at);
-        let heard = same.next().expect("it was delivered").at;
-        assert!(heard < reply.at + 2 * MILLIS, "{} us late", (heard - reply.at) / MICROS);
+        let received_at = same.next().expect("it was delivered").at;
+        assert!(received_at < reply.at + 2 * MILLIS, "{} us late", (received_at - reply.at) / MICROS);
     }
 }

@@ -4,71 +4,71 @@
 mod control;
 mod losses;
 mod power;
+mod problems;
 mod property;
 mod start;
-mod trouble;
 
 use std::collections::VecDeque;
 
-use scanhub_drivers::line::{Event, KnownRate, Output, Protocol as _, Session as _, State, Values};
+use scanhub_drivers::line::{Action, Event, KnownRate, Protocol as _, ScannerSession as _, State, Values};
 use scanhub_drivers::lms::command::Request;
 use scanhub_drivers::lms::variant::{Baud, Variant};
-use scanhub_drivers::lms::{Session, Settings};
+use scanhub_drivers::lms::{LmsSession, Settings};
 use scanhub_drivers::{line, lms};
 use scanhub_schema::{MICROS, MILLIS, Nanos, line_time};
-use scanhub_sim::device::{Device as _, Part};
+use scanhub_sim::device::{ChunkKind, Device as _};
 use scanhub_sim::fault::{Fault, Faults};
+use scanhub_sim::line_model::{BaudMismatch, Delivery, LineModel};
 use scanhub_sim::machine::LmsSimulator;
-use scanhub_sim::operating::Source;
+use scanhub_sim::operating::ScanSource;
 use scanhub_sim::room::Room;
-use scanhub_sim::wire::{BaudMismatch, Delivery, LineModel};
 use scanhub_sim::{Arrival, machine};
 
 /// Change of a chunk from scanner to host that has left the line at this time.
-pub(crate) type ToHost = Box<dyn FnMut(Nanos, Vec<u8>) -> Vec<u8>>;
+pub(crate) type HostFilter = Box<dyn FnMut(Nanos, Vec<u8>) -> Vec<u8>>;
 /// Change of the byte with this number from host to scanner. `None` loses it.
-pub(crate) type ToSensor = Box<dyn FnMut(usize, u8) -> Option<u8>>;
+pub(crate) type SensorFilter = Box<dyn FnMut(usize, u8) -> Option<u8>>;
 
 /// Both ends, the line, and everything that went over it.
 pub(crate) struct Bench {
-    pub(crate) session: Session,
+    pub(crate) session: LmsSession,
     pub(crate) machine: LmsSimulator,
     /// Faults of the line.
-    pub(crate) wire: LineModel,
+    pub(crate) line: LineModel,
     pub(crate) now: Nanos,
-    pub(crate) to_host: ToHost,
-    pub(crate) to_sensor: ToSensor,
+    pub(crate) to_host: HostFilter,
+    pub(crate) to_scanner: SensorFilter,
     /// Bytes that the session said, with the time.
-    pub(crate) said: Vec<(Nanos, u8)>,
+    pub(crate) sent_bytes: Vec<(Nanos, u8)>,
     /// When the sensor got the last byte of a request.
-    pub(crate) asked: Vec<Nanos>,
+    pub(crate) request_times: Vec<Nanos>,
     /// Received ACKs and NAKs with their times.
     pub(crate) acknowledged: Vec<(Nanos, u8)>,
     /// Number of received bytes outside of telegrams that the scanner did not send.
     pub(crate) foreign: usize,
-    pub(crate) sent: Vec<Sent>,
-    pub(crate) received: Vec<Received>,
+    pub(crate) sent: Vec<SentTelegram>,
+    pub(crate) received: Vec<ReceivedTelegram>,
     /// Every state that was seen, once in a row.
     pub(crate) states: Vec<State>,
     port: Baud,
     /// Size of the input buffer in bytes. As in a tty, bytes beyond it are lost.
-    pub(crate) room: usize,
+    pub(crate) buffer_len: usize,
     /// Bytes in the input buffer.
     inbox: VecDeque<u8>,
-    mistuned: BaudMismatch,
+    baud_mismatch: BaudMismatch,
     damaged: bool,
     fault: Option<Fault>,
     /// Whether the session streamed since the telegram on the line began.
-    streamed: bool,
+    was_streaming: bool,
     read: u64,
-    looks: u32,
+    reads: u32,
     /// Bytes of the current request that have been sent.
     request: Vec<u8>,
 }
 
 /// A telegram as the sensor sent it.
 #[derive(Clone, Debug)]
-pub(crate) struct Sent {
+pub(crate) struct SentTelegram {
     /// When its last byte was through.
     pub(crate) at: Nanos,
     pub(crate) telegram: Vec<u8>,
@@ -81,12 +81,12 @@ pub(crate) struct Sent {
     pub(crate) fault: Option<Fault>,
     /// Whether the session streamed when it arrived, so that only the line can have lost it.
     #[allow(dead_code, reason = "for the tests of faults")]
-    pub(crate) streamed: bool,
+    pub(crate) was_streaming: bool,
 }
 
 /// A telegram as the session delivered it.
 #[derive(Clone, Debug)]
-pub(crate) struct Received {
+pub(crate) struct ReceivedTelegram {
     pub(crate) at: Nanos,
     pub(crate) telegram: Vec<u8>,
     /// Range bits of its values, if it is a scan whose mode was known when it was delivered.
@@ -100,11 +100,11 @@ pub(crate) struct Received {
     #[allow(dead_code, reason = "for the tests of stamps")]
     pub(crate) estimated: bool,
     /// Reads since the one before it.
-    pub(crate) looks: u32,
+    pub(crate) reads_since_last: u32,
 }
 
 /// Settings of the session in all tests of this module.
-pub(crate) const WANTED: Settings = Settings {
+pub(crate) const SESSION_SETTINGS: Settings = Settings {
     variant: Variant::HALF,
     baud: Baud::B500000,
     listen_only: false,
@@ -116,12 +116,12 @@ pub(crate) const WANTED: Settings = Settings {
 /// Creates a scanner in a room, at this rate.
 pub(crate) fn sensor(baud: Baud) -> LmsSimulator {
     let settings = machine::Settings { baud, seed: 1, ..machine::Settings::default() };
-    LmsSimulator::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 1)))
+    LmsSimulator::new(settings, ScanSource::Room(Room::new(&"room".parse().unwrap(), 1)))
 }
 
 /// Creates a scanner with `settings` in a room.
 pub(crate) fn sensor_with(settings: machine::Settings) -> LmsSimulator {
-    LmsSimulator::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 1)))
+    LmsSimulator::new(settings, ScanSource::Room(Room::new(&"room".parse().unwrap(), 1)))
 }
 
 /// Makes `machine` stream like a previous host, and returns the time.
@@ -140,53 +140,53 @@ pub(crate) fn make_stream(machine: &mut LmsSimulator) -> Nanos {
 impl Bench {
     /// Creates a session that starts at `now` of the machine's time, on a line without faults.
     pub(crate) fn new(machine: LmsSimulator, now: Nanos) -> Bench {
-        Bench::wanting(WANTED, machine, now)
+        Bench::with_settings(SESSION_SETTINGS, machine, now)
     }
 
     /// Creates a session like [`Bench::new`], with other settings.
-    pub(crate) fn wanting(wanted: Settings, mut machine: LmsSimulator, now: Nanos) -> Bench {
+    pub(crate) fn with_settings(settings: Settings, mut machine: LmsSimulator, now: Nanos) -> Bench {
         while machine.poll_transmit(now).is_some() {}
         Bench {
-            session: Session::new(wanted, now),
+            session: LmsSession::new(settings, now),
             machine,
-            wire: LineModel::new(&Faults::default(), 0),
+            line: LineModel::new(&Faults::default(), 0),
             now,
             to_host: Box::new(|_, bytes| bytes),
-            to_sensor: Box::new(|_, byte| Some(byte)),
-            said: Vec::new(),
-            asked: Vec::new(),
+            to_scanner: Box::new(|_, byte| Some(byte)),
+            sent_bytes: Vec::new(),
+            request_times: Vec::new(),
             acknowledged: Vec::new(),
             foreign: 0,
             sent: Vec::new(),
             received: Vec::new(),
             states: Vec::new(),
-            port: wanted.baud,
-            room: usize::MAX,
+            port: settings.baud,
+            buffer_len: usize::MAX,
             inbox: VecDeque::new(),
-            mistuned: BaudMismatch::default(),
+            baud_mismatch: BaudMismatch::default(),
             damaged: false,
             fault: None,
-            streamed: true,
+            was_streaming: true,
             read: 0,
-            looks: 0,
+            reads: 0,
             request: Vec::new(),
         }
     }
 
     /// Has the session try `baud` first, as a hub does that has found the sensor there before.
-    pub(crate) fn seek_first(&mut self, baud: Baud) {
+    pub(crate) fn set_first_probe_rate(&mut self, baud: Baud) {
         let silent_switches = self.session.silent_switches();
         self.session.hint_rate(KnownRate { baud: baud.rate(), silent_switches });
     }
 
     /// Returns the rate at which the session has found the sensor.
-    pub(crate) fn found_at(&self) -> Option<Baud> {
+    pub(crate) fn discovered_rate(&self) -> Option<Baud> {
         self.session.known_rate().and_then(|known| Baud::of_rate(known.baud))
     }
 
     /// Connects this machine to a session with a history, none of whose requests is partly sent.
-    pub(crate) fn adopting(session: Session, machine: LmsSimulator, now: Nanos) -> Bench {
-        let (port, read) = (session.baud(), session.tally().read);
+    pub(crate) fn with_session(session: LmsSession, machine: LmsSimulator, now: Nanos) -> Bench {
+        let (port, read) = (session.baud(), session.framer_counters().read);
         Bench { port, read, session, ..Bench::new(machine, now) }
     }
 
@@ -199,13 +199,18 @@ impl Bench {
     }
 
     /// Runs until `is_so`, which must be within `span`; returns the time it took.
-    pub(crate) fn until(&mut self, what: &str, span: Nanos, is_so: impl Fn(&Bench) -> bool) -> Nanos {
-        let begun = self.now;
-        while !is_so(self) {
-            assert!(self.now < begun + span, "not {what} within {} ms: {self}", span / MILLIS);
-            self.step(begun + span);
+    pub(crate) fn run_until(
+        &mut self,
+        description: &str,
+        span: Nanos,
+        is_true: impl Fn(&Bench) -> bool,
+    ) -> Nanos {
+        let started = self.now;
+        while !is_true(self) {
+            assert!(self.now < started + span, "not {description} within {} ms: {self}", span / MILLIS);
+            self.step(started + span);
         }
-        self.now - begun
+        self.now - started
     }
 
     pub(crate) fn is_streaming(&self) -> bool {
@@ -214,7 +219,8 @@ impl Bench {
 
     /// Returns the scans that were sent whole and undamaged, with their last byte after `since`.
     pub(crate) fn intact_scans(&self, since: Nanos) -> Vec<&[u8]> {
-        let intact = |sent: &&Sent| sent.at > since && !(sent.is_reply || sent.aborted || sent.damaged);
+        let intact =
+            |sent: &&SentTelegram| sent.at > since && !(sent.is_reply || sent.aborted || sent.damaged);
         self.sent.iter().filter(intact).map(|sent| &sent.telegram[..]).collect()
     }
 
@@ -224,14 +230,15 @@ impl Bench {
     }
 
     /// Returns scans that were delivered after `since`, with their stamps and reasons.
-    pub(crate) fn scans(&self, since: Nanos) -> impl Iterator<Item = &Received> {
-        let is_scan = move |got: &&Received| got.at > since && got.telegram[4] == lms::measured::MEASURED;
+    pub(crate) fn scans(&self, since: Nanos) -> impl Iterator<Item = &ReceivedTelegram> {
+        let is_scan =
+            move |got: &&ReceivedTelegram| got.at > since && got.telegram[4] == lms::measured::MEASURED;
         self.received.iter().filter(is_scan)
     }
 
     /// Stops the host for `span`.
     #[allow(dead_code, reason = "for the tests of stamps")]
-    pub(crate) fn stop(&mut self, span: Nanos) {
+    pub(crate) fn stop_host(&mut self, span: Nanos) {
         self.advance(self.now + span);
     }
 
@@ -242,11 +249,11 @@ impl Bench {
         if !watch && self.now < until {
             return;
         }
-        self.looks += 1;
+        self.reads += 1;
         if watch && self.session.can_defer_read() && self.session.defer_read(self.now, self.inbox.len()) {
             return;
         }
-        let spare = self.session.spare();
+        let spare = self.session.read_buffer();
         let len = spare.len().min(self.inbox.len());
         for (place, byte) in spare.iter_mut().zip(self.inbox.drain(..len)) {
             *place = byte;
@@ -260,48 +267,48 @@ impl Bench {
 
     fn drain(&mut self) -> (bool, Nanos) {
         let wait = loop {
-            match self.session.poll_output() {
-                Output::SetDtr(_) => panic!("there is nothing at this line"),
-                Output::SetRate(baud) => {
+            match self.session.poll_action() {
+                Action::SetDtr(_) => panic!("there is nothing at this line"),
+                Action::SetRate(baud) => {
                     self.port = self.session.baud();
                     assert_eq!(self.port.rate(), baud);
                     self.damaged |= !self.inbox.is_empty();
                     self.inbox.clear();
                 }
-                Output::Transmit { bytes, not_before } => {
+                Action::Transmit { bytes, not_before } => {
                     let &[byte] = bytes else { panic!("no gaps between {bytes:?}") };
                     self.transmit(byte, not_before);
                 }
-                Output::Event(Event::Scan(_)) => panic!("a telegram is a scan"),
-                Output::Event(Event::Telegram(received)) => {
-                    let line::Received { bytes, whole, reasons, first, estimated, .. } = received;
+                Action::Event(Event::Scan(_)) => panic!("a telegram is a scan"),
+                Action::Event(Event::Telegram(received)) => {
+                    let line::ReceivedTelegram { bytes, contents: whole, reasons, first, estimated, .. } =
+                        received;
                     let telegram = bytes.to_vec();
-                    let looks = std::mem::take(&mut self.looks);
+                    let reads_since_last = std::mem::take(&mut self.reads);
                     let range_bits = whole.and_then(|whole| match whole.scan?.values {
                         Values::Words { range_bits, .. } => Some(range_bits),
                         Values::Points { .. } => None,
                     });
                     let at = self.now;
-                    self.received.push(Received {
+                    self.received.push(ReceivedTelegram {
                         at,
                         telegram,
                         range_bits,
                         reasons,
                         first,
                         estimated,
-                        looks,
+                        reads_since_last,
                     });
                 }
-                Output::Rest(until) => break (false, until),
-                Output::Wait { until, .. } => break (true, until),
+                Action::SleepUntil(until) => break (false, until),
+                Action::Wait { until, .. } => break (true, until),
             }
         };
-        let tally = self.session.tally();
-        let known =
-            tally.in_telegrams + tally.acknowledge + tally.discarded + self.session.account().buffered;
+        let tally = self.session.framer_counters();
+        let known = tally.in_telegrams + tally.acknowledge + tally.discarded + self.session.stats().buffered;
         assert_eq!((tally.read, known), (self.read, self.read), "bytes vanished");
         assert_eq!(self.machine.eeprom_writes(), 0);
-        self.streamed &= self.is_streaming();
+        self.was_streaming &= self.is_streaming();
         if self.states.last() != Some(&self.session.state()) {
             self.states.push(self.session.state());
         }
@@ -311,80 +318,88 @@ impl Bench {
     /// Waits until `until`, or for bytes if they are watched for.
     fn wait(&mut self, watch: bool, until: Nanos) {
         while !watch || self.inbox.is_empty() {
-            match self.wire.poll_timeout(&self.machine, self.now) {
+            match self.line.poll_timeout(&self.machine, self.now) {
                 Some(at) if at <= until => self.advance(at),
                 _ => break,
             }
         }
         let woken = if watch && !self.inbox.is_empty() { self.now } else { until };
-        self.advance(woken.max(self.now) + WAKE);
+        self.advance(woken.max(self.now) + WAKE_DELAY);
     }
 
     fn transmit(&mut self, byte: u8, not_before: Nanos) {
         self.advance(not_before);
         let byte_ns = line_time(1, self.port.rate());
         if !self.request.is_empty() {
-            let (last, _) = self.said[self.said.len() - 1];
+            let (last, _) = self.sent_bytes[self.sent_bytes.len() - 1];
             let gap = self.now - last - byte_ns;
             assert!((55 * MICROS..=6 * MILLIS).contains(&gap), "{gap} ns between two bytes of a request");
         }
         self.request.push(byte);
         let mut is_whole = false;
         if let [_, _, low, high, ..] = self.request[..]
-            && self.request.len() == usize::from(u16::from_le_bytes([low, high])) + lms::telegram::FRAME
+            && self.request.len() == usize::from(u16::from_le_bytes([low, high])) + lms::telegram::FRAME_LEN
         {
             self.request.clear();
             is_whole = true;
         }
-        let number = self.said.len();
-        self.said.push((self.now, byte));
-        self.session.transmitted(self.now);
+        let number = self.sent_bytes.len();
+        self.sent_bytes.push((self.now, byte));
+        self.session.handle_transmitted(self.now);
         self.advance(self.now + byte_ns);
-        if let Some(byte) = (self.to_sensor)(number, byte)
+        if let Some(byte) = (self.to_scanner)(number, byte)
             && self.machine.baud() == self.port
         {
-            self.wire.receive(&mut self.machine, byte, Arrival::at(self.now));
-            self.asked.extend(is_whole.then_some(self.now));
+            self.line.receive(&mut self.machine, byte, Arrival::at(self.now));
+            self.request_times.extend(is_whole.then_some(self.now));
         }
     }
 
     /// Advances the time to `to`, unless it is later already.
     fn advance(&mut self, to: Nanos) {
-        while let Some(at) = self.wire.poll_timeout(&self.machine, self.now).filter(|&at| at <= to) {
+        while let Some(at) = self.line.poll_timeout(&self.machine, self.now).filter(|&at| at <= to) {
             self.now = self.now.max(at);
-            while let Some(carried) = self.wire.poll_transmit(&mut self.machine, self.now) {
-                self.carry(carried);
+            while let Some(carried) = self.line.poll_transmit(&mut self.machine, self.now) {
+                self.deliver(carried);
             }
         }
         self.now = self.now.max(to);
     }
 
     /// Takes the bytes that the line delivers.
-    fn carry(&mut self, carried: Delivery) {
-        if carried.is_telegram() {
-            self.fault = self.fault.or(carried.fault);
+    fn deliver(&mut self, delivery: Delivery) {
+        if delivery.is_telegram() {
+            self.fault = self.fault.or(delivery.fault);
         }
-        let Delivery { bytes: brought, rate, idle_after, part, .. } = carried;
+        let Delivery { bytes: brought, rate, idle_after, part, .. } = delivery;
         let mut bytes = (self.to_host)(self.now, brought.clone());
         if rate != self.port.rate() {
-            bytes = self.mistuned.receive((rate, self.port.rate()), &bytes, idle_after);
+            bytes = self.baud_mismatch.receive((rate, self.port.rate()), &bytes, idle_after);
         }
-        bytes.truncate(self.room - self.inbox.len());
+        bytes.truncate(self.buffer_len - self.inbox.len());
         self.damaged |= bytes != brought;
         self.inbox.extend(bytes);
         match part {
             None => self.foreign += brought.len(),
-            Some(Part::Telegram) => {}
-            Some(Part::Acknowledge) => {
+            Some(ChunkKind::Telegram) => {}
+            Some(ChunkKind::Acknowledge) => {
                 self.damaged = false;
                 self.acknowledged.extend(brought.first().map(|&byte| (self.now, byte)));
             }
-            Some(Part::End(scanhub_sim::device::Sent { is_reply, telegram, aborted })) => {
+            Some(ChunkKind::End(scanhub_sim::device::SentTelegram { is_reply, telegram, aborted })) => {
                 let fault = self.fault.take();
                 let damaged = std::mem::take(&mut self.damaged) || fault.is_some();
                 let streams = self.is_streaming();
-                let streamed = std::mem::replace(&mut self.streamed, streams);
-                self.sent.push(Sent { at: self.now, telegram, is_reply, aborted, damaged, fault, streamed });
+                let was_streaming = std::mem::replace(&mut self.was_streaming, streams);
+                self.sent.push(SentTelegram {
+                    at: self.now,
+                    telegram,
+                    is_reply,
+                    aborted,
+                    damaged,
+                    fault,
+                    was_streaming,
+                });
             }
         }
     }
@@ -393,16 +408,16 @@ impl Bench {
 impl std::fmt::Display for Bench {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let Bench { session, now, states, .. } = self;
-        let trouble = session.trouble();
+        let problem = session.problem();
         write!(
             f,
-            "at {} us, {:?}: {states:?}, {trouble:?}, {:?}",
+            "at {} us, {:?}: {states:?}, {problem:?}, {:?}",
             now / MICROS,
             session.baud(),
-            session.tally()
+            session.framer_counters()
         )
     }
 }
 
 /// Time from an event to a running host.
-const WAKE: Nanos = 50 * MICROS;
+const WAKE_DELAY: Nanos = 50 * MICROS;

@@ -1,40 +1,40 @@
 //! Whatever happens in whatever order: nothing panics, no byte is unaccounted for, no request writes the EEPROM, and
 //! once a healthy sensor is there, its stream is. One seed reproduces a run.
 
+use scanhub_drivers::line::{Action, Event, Protocol as _, ScannerSession as _};
 use scanhub_drivers::line::{Control, State};
-use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _};
 use scanhub_drivers::lms;
-use scanhub_drivers::lms::Session;
+use scanhub_drivers::lms::LmsSession;
 use scanhub_drivers::lms::Settings;
 use scanhub_drivers::lms::command::{EEPROM_WRITES, Request};
-use scanhub_drivers::lms::reply::{self, Health};
-use scanhub_drivers::lms::telegram::{FRAME, REPLY, STX, Telegram, Writer};
+use scanhub_drivers::lms::reply::{self, SimulatedStatus};
+use scanhub_drivers::lms::telegram::{FRAME_LEN, REPLY, STX, Telegram, Writer};
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
-use scanhub_lms_configure::eeprom::Write;
+use scanhub_lms_configure::eeprom::EepromWrite;
 use scanhub_schema::{MILLIS, Nanos, line_time};
-use scanhub_sim::machine::{self, Start};
-use scanhub_sim::operating::Operating;
+use scanhub_sim::machine::{self, StartState};
+use scanhub_sim::operating::OperatingMode;
 
-use super::{Bench, WANTED, sensor_with};
+use super::{Bench, SESSION_SETTINGS, sensor_with};
 
 /// A host without manners: reads when it likes, writes when it likes, calls when it likes.
-struct Chaos {
-    session: Session,
+struct RandomHost {
+    session: LmsSession,
     now: Nanos,
     random: fastrand::Rng,
     read: u64,
-    said: Vec<u8>,
+    sent_bytes: Vec<u8>,
     telegrams: u64,
 }
 
-impl Chaos {
+impl RandomHost {
     fn new(seed: u64) -> Self {
         let mut random = fastrand::Rng::with_seed(seed);
         let variant = Variant::ALL[random.usize(..Variant::ALL.len())];
-        let settings = Settings { variant, baud: any_baud(&mut random), ..WANTED };
+        let settings = Settings { variant, baud: any_baud(&mut random), ..SESSION_SETTINGS };
         let now = random.u64(..1_000 * MILLIS);
-        let session = Session::new(settings, now);
-        Chaos { session, now, random, read: 0, said: Vec::new(), telegrams: 0 }
+        let session = LmsSession::new(settings, now);
+        RandomHost { session, now, random, read: 0, sent_bytes: Vec::new(), telegrams: 0 }
     }
 
     fn event(&mut self) {
@@ -49,7 +49,7 @@ impl Chaos {
                 self.session.handle_timeout(self.now);
             }
             14..16 => {
-                if let Output::Wait { until, .. } = self.session.poll_output() {
+                if let Action::Wait { until, .. } = self.session.poll_action() {
                     self.now = self.now.max(until.min(self.now + 5_000 * MILLIS));
                     self.session.handle_timeout(self.now);
                 }
@@ -59,7 +59,7 @@ impl Chaos {
                 self.session.control(all[self.random.usize(..3)], self.now);
             }
             17 => self.session.commit(self.now, 0),
-            _ => self.session.transmitted(self.now),
+            _ => self.session.handle_transmitted(self.now),
         }
         let lazy = self.random.u8(..4) == 0;
         self.drain(lazy);
@@ -67,7 +67,7 @@ impl Chaos {
 
     fn commit(&mut self, mut bytes: &[u8]) {
         while !bytes.is_empty() {
-            let spare = self.session.spare();
+            let spare = self.session.read_buffer();
             assert!(!spare.is_empty(), "no room");
             let len = spare.len().min(bytes.len()).min(self.random.usize(1..1_000));
             spare[..len].copy_from_slice(&bytes[..len]);
@@ -84,30 +84,29 @@ impl Chaos {
     }
 
     /// Until it waits; if the host is `lazy`, only until it wants to write.
-    fn drain(&mut self, lazy: bool) {
+    fn drain(&mut self, is_partial: bool) {
         loop {
-            match self.session.poll_output() {
-                Output::Transmit { bytes, not_before } => {
-                    if lazy && self.random.bool() {
+            match self.session.poll_action() {
+                Action::Transmit { bytes, not_before } => {
+                    if is_partial && self.random.bool() {
                         break;
                     }
-                    self.said.extend(bytes);
+                    self.sent_bytes.extend(bytes);
                     self.now = self.now.max(not_before);
-                    self.session.transmitted(self.now);
+                    self.session.handle_transmitted(self.now);
                 }
-                Output::SetRate(_) => {}
-                Output::SetDtr(_) => panic!("there is nothing at this line"),
-                Output::Event(Event::Scan(_)) => panic!("a telegram is a scan"),
-                Output::Event(Event::Telegram(received)) => {
+                Action::SetRate(_) => {}
+                Action::SetDtr(_) => panic!("there is nothing at this line"),
+                Action::Event(Event::Scan(_)) => panic!("a telegram is a scan"),
+                Action::Event(Event::Telegram(received)) => {
                     assert!(Telegram::check(received.bytes).is_some());
                     self.telegrams += 1;
                 }
-                Output::Rest(_) | Output::Wait { .. } => break,
+                Action::SleepUntil(_) | Action::Wait { .. } => break,
             }
         }
-        let tally = self.session.tally();
-        let known =
-            tally.in_telegrams + tally.acknowledge + tally.discarded + self.session.account().buffered;
+        let tally = self.session.framer_counters();
+        let known = tally.in_telegrams + tally.acknowledge + tally.discarded + self.session.stats().buffered;
         assert_eq!((tally.read, known), (self.read, self.read), "bytes vanished");
         assert_eq!(tally.telegrams, self.telegrams);
     }
@@ -132,17 +131,17 @@ impl Chaos {
                 let command = [0xB0, 0xB6, 0xB7, 0xBE, 0xBF, 0xC4, 0xF5, 0xF6][random.usize(..8)];
                 Writer::new(address | REPLY, command).slice(&data).finish()
             }
-            7 => reply::mode(address, random.bool(), 0x10),
-            8 => reply::refused(address, 0x10),
-            9 => reply::kind(address, b"LMS200;301063;V02.30 ", 0x10),
-            10 => reply::configuration(address, Mode(random.u8(..8)), Unit::Cm, 0x10),
-            11 => reply::variant(address, random.bool(), variant, 0x10),
+            7 => reply::mode_reply(address, random.bool(), 0x10),
+            8 => reply::refusal(address, 0x10),
+            9 => reply::type_reply(address, b"LMS200;301063;V02.30 ", 0x10),
+            10 => reply::configuration_reply(address, Mode(random.u8(..8)), Unit::Cm, 0x10),
+            11 => reply::variant_reply(address, random.bool(), variant, 0x10),
             12 => Writer::new(address | REPLY, 0x90).slice(b"LMS200;301063;V02.10 ").byte(0x10).finish(),
             13 => Writer::new(address | REPLY, random.u8(0x80..)).byte(random.u8(..)).finish(),
             _ => {
                 let operating_mode = [0x00, 0x10, 0x24, 0x25, 0x2A][random.usize(..5)];
                 let baud = any_baud(random);
-                let health = Health {
+                let health = SimulatedStatus {
                     software: *b"V02.30 ",
                     operating_mode,
                     mode: Mode(1),
@@ -150,7 +149,7 @@ impl Chaos {
                     unit: Unit::Mm,
                     baud,
                 };
-                reply::status(address, &health, 0x10)
+                reply::status_reply(address, &health, 0x10)
             }
         };
         let mut bytes = telegram.bytes().to_vec();
@@ -169,36 +168,40 @@ fn any_baud(random: &mut fastrand::Rng) -> Baud {
 }
 
 /// Every telegram that stands anywhere in `said`, whatever it was cut by.
-fn telegrams(said: &[u8]) -> impl Iterator<Item = Telegram<'_>> {
-    (0..said.len()).filter_map(|at| {
-        let [STX, _, low, high, ..] = said[at..] else { return None };
-        let len = usize::from(u16::from_le_bytes([low, high])) + FRAME;
-        said.get(at..at + len).and_then(Telegram::check)
+fn telegrams(bytes: &[u8]) -> impl Iterator<Item = Telegram<'_>> {
+    (0..bytes.len()).filter_map(|at| {
+        let [STX, _, low, high, ..] = bytes[at..] else { return None };
+        let len = usize::from(u16::from_le_bytes([low, high])) + FRAME_LEN;
+        bytes.get(at..at + len).and_then(Telegram::check)
     })
 }
 
 #[test]
 fn a_write_would_be_seen() {
-    for write in [Write::Configuration(&[7; 34]), Write::Configuration2(&[2; 84]), Write::Field(&[2; 800])] {
+    for write in [
+        EepromWrite::Configuration(&[7; 34]),
+        EepromWrite::Configuration2(&[2; 84]),
+        EepromWrite::Field(&[2; 800]),
+    ] {
         let write = write.encode(0).expect("short enough");
         let stop = Request::Stop.encode(0);
-        let said = [&stop.bytes()[..3], &[2, 0], stop.bytes(), write.bytes(), &stop.bytes()[..6]].concat();
-        let found: Vec<&[u8]> = telegrams(&said).map(|telegram| telegram.bytes()).collect();
+        let sent = [&stop.bytes()[..3], &[2, 0], stop.bytes(), write.bytes(), &stop.bytes()[..6]].concat();
+        let found: Vec<&[u8]> = telegrams(&sent).map(|telegram| telegram.bytes()).collect();
         assert_eq!(found, [stop.bytes(), write.bytes()]);
     }
 }
 
 #[test]
-fn whatever_happens_a_healthy_sensor_streams_in_the_end() {
+fn healthy_scanner_streams_after_any_events() {
     let mut slowest = 0;
     for seed in 0..120 {
-        let mut chaos = Chaos::new(seed);
+        let mut chaos = RandomHost::new(seed);
         for _ in 0..chaos.random.usize(1..60) {
             chaos.event();
         }
         chaos.drain(false);
-        let Chaos { mut session, now, mut random, said, .. } = chaos;
-        for telegram in telegrams(&said) {
+        let RandomHost { mut session, now, mut random, sent_bytes, .. } = chaos;
+        for telegram in telegrams(&sent_bytes) {
             let request = Request::decode(telegram);
             assert!(
                 request.is_some_and(|request| !EEPROM_WRITES.contains(&request.command())),
@@ -206,11 +209,11 @@ fn whatever_happens_a_healthy_sensor_streams_in_the_end() {
             );
         }
         session.control(Control::Resume, now);
-        let start = Start::In(match random.u8(..4) {
-            0 => Operating::Installation,
-            1 => Operating::All,
-            2 => Operating::Partial,
-            _ => Operating::OnRequest,
+        let start = StartState::Operating(match random.u8(..4) {
+            0 => OperatingMode::Installation,
+            1 => OperatingMode::All,
+            2 => OperatingMode::Partial,
+            _ => OperatingMode::OnRequest,
         });
         let settings = machine::Settings {
             baud: any_baud(&mut random),
@@ -219,12 +222,12 @@ fn whatever_happens_a_healthy_sensor_streams_in_the_end() {
             seed,
             ..machine::Settings::default()
         };
-        let mut bench = Bench::adopting(session, sensor_with(settings), now);
+        let mut bench = Bench::with_session(session, sensor_with(settings), now);
         let is_there = |bench: &Bench| {
             bench.session.state() == State::Streaming
                 && bench.sent.iter().any(|sent| !sent.is_reply && !sent.damaged)
         };
-        slowest = slowest.max(bench.until(&format!("streaming, seed {seed}"), 10_000 * MILLIS, is_there));
+        slowest = slowest.max(bench.run_until(&format!("streaming, seed {seed}"), 10_000 * MILLIS, is_there));
     }
     println!("streaming within {} ms", slowest / MILLIS);
 }

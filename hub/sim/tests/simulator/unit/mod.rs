@@ -5,18 +5,18 @@ mod session;
 
 use scanhub_schema::{MILLIS, Nanos, line_time};
 use scanhub_sim::Arrival;
-use scanhub_sim::device::{Device as _, Part};
+use scanhub_sim::device::{ChunkKind, Device as _};
 use scanhub_sim::fault::Faults;
+use scanhub_sim::line_model::LineModel;
 use scanhub_sim::room::Room;
-use scanhub_sim::rplidar::{Form, Model, RplidarSettings, RplidarSimulator, RplidarStart};
-use scanhub_sim::wire::LineModel;
+use scanhub_sim::rplidar::{Model, PacketFormat, RplidarSettings, RplidarSimulator, RplidarStart};
 use scanhub_sim::world::World;
 
-pub(crate) const SECOND: Nanos = 1_000 * MILLIS;
+pub(crate) const ONE_SECOND: Nanos = 1_000 * MILLIS;
 
 /// A telegram that left.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Sent {
+pub(crate) struct SentMessage {
     pub(crate) bytes: Vec<u8>,
     pub(crate) is_reply: bool,
     /// Fault that the line applied.
@@ -26,11 +26,11 @@ pub(crate) struct Sent {
 
 pub(crate) struct Bench {
     pub(crate) unit: RplidarSimulator,
-    wire: LineModel,
+    line_model: LineModel,
     pub(crate) now: Nanos,
     /// Received bytes.
-    pub(crate) line: Vec<u8>,
-    pub(crate) sent: Vec<Sent>,
+    pub(crate) received: Vec<u8>,
+    pub(crate) sent: Vec<SentMessage>,
     fault: Option<&'static str>,
 }
 
@@ -41,9 +41,9 @@ impl Bench {
         let settings = RplidarSettings { faults, quirks: faults.quirks(), ..settings };
         Bench {
             unit: RplidarSimulator::new(settings, Room::new(world, seed)),
-            wire: LineModel::new(&faults, seed),
+            line_model: LineModel::new(&faults, seed),
             now: 0,
-            line: Vec::new(),
+            received: Vec::new(),
             sent: Vec::new(),
             fault: None,
         }
@@ -52,15 +52,15 @@ impl Bench {
     /// Runs until `until`.
     pub(crate) fn run(&mut self, until: Nanos) {
         loop {
-            while let Some(carried) = self.wire.poll_transmit(&mut self.unit, self.now) {
+            while let Some(carried) = self.line_model.poll_transmit(&mut self.unit, self.now) {
                 self.fault = self.fault.or(carried.fault.map(|fault| fault.name()));
-                self.line.extend(carried.bytes);
-                if let Some(Part::End(sent)) = carried.part {
+                self.received.extend(carried.bytes);
+                if let Some(ChunkKind::End(sent)) = carried.part {
                     let (fault, at) = (self.fault.take(), self.now);
-                    self.sent.push(Sent { bytes: sent.telegram, is_reply: sent.is_reply, fault, at });
+                    self.sent.push(SentMessage { bytes: sent.telegram, is_reply: sent.is_reply, fault, at });
                 }
             }
-            let next = self.wire.poll_timeout(&self.unit, self.now).filter(|&at| at <= until);
+            let next = self.line_model.poll_timeout(&self.unit, self.now).filter(|&at| at <= until);
             match next {
                 Some(at) => self.now = at.max(self.now),
                 None => break,
@@ -70,7 +70,7 @@ impl Bench {
     }
 
     /// Runs for `span`.
-    pub(crate) fn pass(&mut self, span: Nanos) {
+    pub(crate) fn run_for(&mut self, span: Nanos) {
         self.run(self.now + span);
     }
 
@@ -78,10 +78,10 @@ impl Bench {
     pub(crate) fn ask(&mut self, request: &[u8]) -> Vec<Vec<u8>> {
         let before = self.sent.len();
         for &byte in request {
-            self.pass(line_time(1, self.unit.rate()));
-            self.wire.receive(&mut self.unit, byte, Arrival::at(self.now));
+            self.run_for(line_time(1, self.unit.rate()));
+            self.line_model.receive(&mut self.unit, byte, Arrival::at(self.now));
         }
-        self.pass(20 * MILLIS);
+        self.run_for(20 * MILLIS);
         self.sent[before..].iter().filter(|sent| sent.is_reply).map(|sent| sent.bytes.clone()).collect()
     }
 
@@ -96,12 +96,12 @@ impl Bench {
     }
 
     /// Delivers a byte of a request.
-    pub(crate) fn say(&mut self, byte: u8) {
-        self.wire.receive(&mut self.unit, byte, Arrival::at(self.now));
+    pub(crate) fn send_byte(&mut self, byte: u8) {
+        self.line_model.receive(&mut self.unit, byte, Arrival::at(self.now));
     }
 
     pub(crate) fn cycle_power(&mut self) {
-        self.wire.cycle_power(&mut self.unit, self.now);
+        self.line_model.cycle_power(&mut self.unit, self.now);
     }
 }
 
@@ -114,7 +114,7 @@ pub(crate) fn with_payload(command: u8, payload: &[u8]) -> Vec<u8> {
 }
 
 /// Returns the request for the stream of mode number `mode`.
-pub(crate) fn start(mode: usize) -> Vec<u8> {
+pub(crate) fn stream_request(mode: usize) -> Vec<u8> {
     match mode {
         0 => vec![0xA5, 0x20],
         _ => with_payload(0x82, &[mode as u8, 0, 0, 0, 0]),
@@ -126,7 +126,7 @@ fn bench(model: Model) -> Bench {
 }
 
 /// Returns the only reply.
-fn one(mut replies: Vec<Vec<u8>>) -> Vec<u8> {
+fn only_reply(mut replies: Vec<Vec<u8>>) -> Vec<u8> {
     assert_eq!(replies.len(), 1, "{replies:02X?}");
     replies.pop().expect("one")
 }
@@ -134,71 +134,71 @@ fn one(mut replies: Vec<Vec<u8>>) -> Vec<u8> {
 #[test]
 fn every_request_is_answered_byte_for_byte() {
     let mut bench = bench(Model::A1);
-    let info = one(bench.ask(&[0xA5, 0x50]));
+    let info = only_reply(bench.ask(&[0xA5, 0x50]));
     // Model 18h, firmware 1.29, hardware 5, and sixteen bytes that are another scanner's only with another seed.
     assert_eq!(info[..11], [0xA5, 0x5A, 0x14, 0, 0, 0, 0x04, 0x18, 29, 1, 5]);
     assert_eq!(info.len(), 7 + 20);
-    assert_eq!(one(bench.ask(&[0xA5, 0x52])), [0xA5, 0x5A, 3, 0, 0, 0, 0x06, 0, 0, 0]);
+    assert_eq!(only_reply(bench.ask(&[0xA5, 0x52])), [0xA5, 0x5A, 3, 0, 0, 0, 0x06, 0, 0, 0]);
     let rates = [508u16.to_le_bytes(), 254u16.to_le_bytes()].concat();
-    assert_eq!(one(bench.ask(&[0xA5, 0x59])), [&[0xA5, 0x5A, 4, 0, 0, 0, 0x15], &rates[..]].concat());
+    assert_eq!(only_reply(bench.ask(&[0xA5, 0x59])), [&[0xA5, 0x5A, 4, 0, 0, 0, 0x15], &rates[..]].concat());
     let conf = |key: u8, value: &[u8]| {
         [&[0xA5, 0x5A, 4 + value.len() as u8, 0, 0, 0, 0x20, key, 0, 0, 0], value].concat()
     };
-    assert_eq!(one(bench.configuration(0x70, 0)), conf(0x70, &[5, 0]));
-    assert_eq!(one(bench.configuration(0x71, 1)), conf(0x71, &(254u32 << 8).to_le_bytes()));
-    assert_eq!(one(bench.configuration(0x74, 1)), conf(0x74, &(12u32 << 8).to_le_bytes()));
-    assert_eq!(one(bench.configuration(0x75, 2)), conf(0x75, &[0x84]));
-    assert_eq!(one(bench.configuration(0x7C, 0)), conf(0x7C, &[3, 0]));
-    assert_eq!(one(bench.configuration(0x7F, 4)), conf(0x7F, b"Stability\0"));
+    assert_eq!(only_reply(bench.configuration(0x70, 0)), conf(0x70, &[5, 0]));
+    assert_eq!(only_reply(bench.configuration(0x71, 1)), conf(0x71, &(254u32 << 8).to_le_bytes()));
+    assert_eq!(only_reply(bench.configuration(0x74, 1)), conf(0x74, &(12u32 << 8).to_le_bytes()));
+    assert_eq!(only_reply(bench.configuration(0x75, 2)), conf(0x75, &[0x84]));
+    assert_eq!(only_reply(bench.configuration(0x7C, 0)), conf(0x7C, &[3, 0]));
+    assert_eq!(only_reply(bench.configuration(0x7F, 4)), conf(0x7F, b"Stability\0"));
     // The vendor's driver sends 32 more bytes behind the key.
     let mut long = vec![0x7F, 0, 0, 0];
     long.extend([0; 32]);
-    assert_eq!(one(bench.ask(&with_payload(0x84, &long))), conf(0x7F, b"Standard\0"));
+    assert_eq!(only_reply(bench.ask(&with_payload(0x84, &long))), conf(0x7F, b"Standard\0"));
     // The scanner does not reply to an unknown mode, key or command, nor to STOP.
     for request in [
         with_payload(0x84, &[0x75, 0, 0, 0, 5, 0]),
         with_payload(0x84, &[0x79, 0, 0, 0]),
         vec![0xA5, 0x33],
         vec![0xA5, 0x25],
-        start(7),
+        stream_request(7),
     ] {
         assert_eq!(bench.ask(&request), Vec::<Vec<u8>>::new(), "{request:02X?}");
     }
     assert_eq!(bench.unit.eeprom_writes(), 0);
     let set = [0x00, 0xCC, 0x01, 0x00, 1, 2, 3, 4];
-    let answer = one(bench.ask(&with_payload(0x85, &set)));
+    let answer = only_reply(bench.ask(&with_payload(0x85, &set)));
     assert_eq!(answer, [0xA5, 0x5A, 8, 0, 0, 0, 0x21, 0x00, 0xCC, 0x01, 0x00, 0, 0, 0, 0]);
     assert_eq!(bench.unit.eeprom_writes(), 1, "a value that stays was set, and nobody counted it");
 }
 
 #[test]
-fn every_mode_begins_with_its_descriptor_and_any_request_ends_it() {
+fn descriptor_starts_a_stream_and_any_request_ends_it() {
     for model in Model::ALL {
         for (number, mode) in model.modes().iter().enumerate() {
             let mut bench = bench(model);
             bench.ask(&with_payload(0xF0, &660u16.to_le_bytes()));
-            bench.pass(2 * SECOND);
-            let descriptor = one(bench.ask(&start(number)));
+            bench.run_for(2 * ONE_SECOND);
+            let descriptor = only_reply(bench.ask(&stream_request(number)));
             let [low, high] = (mode.form.packet_len() as u16).to_le_bytes();
-            assert_eq!(descriptor, [0xA5, 0x5A, low, high, 0, 0x40, mode.form.answer()]);
-            bench.pass(SECOND / 2);
+            assert_eq!(descriptor, [0xA5, 0x5A, low, high, 0, 0x40, mode.form.response_type()]);
+            bench.run_for(ONE_SECOND / 2);
             let packets = bench.data();
             assert!(
                 packets.iter().all(|packet| packet.len() == mode.form.packet_len()) && packets.len() > 10
             );
-            if mode.form != Form::Standard {
+            if mode.form != PacketFormat::Standard {
                 // Only the first of a stream has the flag of a beginning.
-                let at = if mode.form == Form::UltraDense { 9 } else { 3 };
+                let at = if mode.form == PacketFormat::UltraDense { 9 } else { 3 };
                 let begins: Vec<_> = packets.iter().map(|packet| packet[at] & 0x80 != 0).collect();
                 assert!(begins[0] && begins[1..].iter().all(|begins| !begins), "{mode:?}");
             }
             for request in [vec![0xA5, 0x25], vec![0xA5, 0x50], vec![0xA5, 0x52]] {
-                bench.ask(&start(number));
-                bench.pass(SECOND / 5);
+                bench.ask(&stream_request(number));
+                bench.run_for(ONE_SECOND / 5);
                 assert!(bench.unit.streams());
                 bench.ask(&request);
                 let sent = bench.sent.len();
-                bench.pass(SECOND);
+                bench.run_for(ONE_SECOND);
                 assert_eq!((bench.sent.len(), bench.unit.streams()), (sent, false), "{request:02X?}");
             }
         }
@@ -220,21 +220,21 @@ fn a_motor_is_steered_as_its_model_wants() {
         let board = bench.ask(&board);
         match model {
             Model::S1 => assert!(board.is_empty()),
-            _ => assert_eq!(one(board), answer(u8::from(model == Model::A3))),
+            _ => assert_eq!(only_reply(board), answer(u8::from(model == Model::A3))),
         }
         let flows = |bench: &mut Bench| {
             let sent = bench.sent.len();
-            bench.pass(SECOND);
+            bench.run_for(ONE_SECOND);
             bench.sent.len() > sent
         };
         // The descriptor comes at once, points when the motor is at speed.
-        assert_eq!(bench.ask(&start(1)).len(), 1);
+        assert_eq!(bench.ask(&stream_request(1)).len(), 1);
         assert_eq!(flows(&mut bench), turns, "{model:?}");
         if stop.is_empty() {
             continue;
         }
         bench.ask(&go);
-        bench.pass(SECOND);
+        bench.run_for(ONE_SECOND);
         assert!(flows(&mut bench), "{model:?}");
         bench.ask(&stop);
         assert!(!flows(&mut bench), "{model:?}");
@@ -248,40 +248,44 @@ fn a_motor_is_steered_as_its_model_wants() {
 }
 
 #[test]
-fn after_a_reset_comes_the_banner_and_then_it_hears() {
+fn accepts_requests_only_after_the_boot_message() {
     let mut bench = bench(Model::A1);
-    bench.ask(&start(1));
-    bench.pass(SECOND);
-    let asked = bench.now;
+    bench.ask(&stream_request(1));
+    bench.run_for(ONE_SECOND);
+    let requested_at = bench.now;
     assert!(bench.ask(&[0xA5, 0x40]).is_empty());
     // It is busy with itself.
     assert!(bench.ask(&[0xA5, 0x50]).is_empty());
-    bench.pass(SECOND);
-    let banner = bench.sent.last().expect("a banner").clone();
-    assert!(banner.is_reply && banner.bytes.len() == 64 && banner.bytes.is_ascii());
-    let text = String::from_utf8(banner.bytes).expect("ascii");
+    bench.run_for(ONE_SECOND);
+    let boot_message = bench.sent.last().expect("a banner").clone();
+    assert!(boot_message.is_reply && boot_message.bytes.len() == 64 && boot_message.bytes.is_ascii());
+    let text = String::from_utf8(boot_message.bytes).expect("ascii");
     assert!(text.starts_with("RP LIDAR System.\r\nFirmware Ver 1.29, HW Ver 5\r\n"), "{text}");
-    let took = banner.at - asked;
-    assert!((671 * MILLIS..680 * MILLIS).contains(&took), "{took}");
+    let elapsed = boot_message.at - requested_at;
+    assert!((671 * MILLIS..680 * MILLIS).contains(&elapsed), "{elapsed}");
     assert!(!bench.unit.streams());
-    assert_eq!(one(bench.ask(&[0xA5, 0x50])).len(), 27);
+    assert_eq!(only_reply(bench.ask(&[0xA5, 0x50])).len(), 27);
     let settings = RplidarSettings { start: RplidarStart::PowerOn, ..RplidarSettings::of(Model::A1) };
     let mut bench = Bench::new(settings, &World::Empty, "");
     assert!(bench.ask(&[0xA5, 0x50]).is_empty());
-    bench.run(3 * SECOND);
-    assert_eq!(one(bench.ask(&[0xA5, 0x50])).len(), 27);
-    assert!(bench.sent[0].bytes.len() == 64 && bench.sent[0].at > 2 * SECOND);
+    bench.run(3 * ONE_SECOND);
+    assert_eq!(only_reply(bench.ask(&[0xA5, 0x50])).len(), 27);
+    assert!(bench.sent[0].bytes.len() == 64 && bench.sent[0].at > 2 * ONE_SECOND);
 }
 
 /// A scanner that streams in its mode number `typical` from the start.
-fn streaming(model: Model, typical: usize, faults: &str) -> Bench {
-    let settings =
-        RplidarSettings { typical, start: RplidarStart::Streaming, seed: 3, ..RplidarSettings::of(model) };
+fn streaming(model: Model, mode: usize, faults: &str) -> Bench {
+    let settings = RplidarSettings {
+        typical: mode,
+        start: RplidarStart::Streaming,
+        seed: 3,
+        ..RplidarSettings::of(model)
+    };
     Bench::new(settings, &World::Wall640, faults)
 }
 
 #[test]
-fn what_the_line_does_to_a_packet_is_told_of_it() {
+fn records_the_line_fault_of_each_packet() {
     for (faults, name) in [
         ("loss=0.002,burst=2", "loss"),
         ("flip=0.002", "flip"),
@@ -297,11 +301,11 @@ fn what_the_line_does_to_a_packet_is_told_of_it() {
         ("power_at=1", "power"),
     ] {
         let mut bench = streaming(Model::A1, 1, faults);
-        bench.run(6 * SECOND);
+        bench.run(6 * ONE_SECOND);
         let hit = bench.sent.iter().filter(|sent| sent.fault == Some(name)).count();
         assert!(hit > 0, "{faults}");
         // Packets that are marked as intact are on the line, whole and in order.
-        let mut rest = &bench.line[..];
+        let mut rest = &bench.received[..];
         for sent in bench.sent.iter().filter(|sent| sent.fault.is_none()) {
             let at = rest.windows(sent.bytes.len()).position(|window| window == sent.bytes);
             rest = &rest[at.unwrap_or_else(|| panic!("{faults}: an intact packet is not there"))..]
@@ -315,96 +319,100 @@ fn a_stall_delays_and_loses_nothing() {
     let mut smooth = streaming(Model::S1, 2, "");
     let mut stalled = streaming(Model::S1, 2, "stall=0.5,stall_at=1");
     for bench in [&mut smooth, &mut stalled] {
-        bench.run(3 * SECOND);
+        bench.run(3 * ONE_SECOND);
     }
     assert_eq!(smooth.data(), stalled.data());
     let held = |bench: &Bench| bench.sent.windows(2).map(|pair| pair[1].at - pair[0].at).max();
-    assert!(held(&smooth) < Some(SECOND / 50) && held(&stalled) > Some(SECOND * 48 / 100));
+    assert!(held(&smooth) < Some(ONE_SECOND / 50) && held(&stalled) > Some(ONE_SECOND * 48 / 100));
 }
 
 #[test]
-fn a_brown_out_puts_the_banner_in_the_midst_of_a_stream() {
+fn brown_out_sends_boot_message_during_a_stream() {
     let mut bench = streaming(Model::A1, 3, "brownout_at=1");
-    bench.run(4 * SECOND);
-    let banner = bench.sent.iter().position(|sent| sent.is_reply).expect("a banner");
-    assert!(banner > 50 && banner + 1 == bench.sent.len(), "it stays silent behind it");
-    assert!(bench.sent[banner].bytes.starts_with(b"RP LIDAR"));
+    bench.run(4 * ONE_SECOND);
+    let boot_message = bench.sent.iter().position(|sent| sent.is_reply).expect("a banner");
+    assert!(boot_message > 50 && boot_message + 1 == bench.sent.len(), "it stays silent behind it");
+    assert!(bench.sent[boot_message].bytes.starts_with(b"RP LIDAR"));
     // The motor has its power all the while.
-    assert_eq!(bench.ask(&start(3)).len(), 1);
+    assert_eq!(bench.ask(&stream_request(3)).len(), 1);
     let sent = bench.sent.len();
-    bench.pass(SECOND);
+    bench.run_for(ONE_SECOND);
     assert!(bench.sent.len() > sent + 50);
 }
 
 #[test]
-fn after_a_power_cycle_the_motor_gets_up_to_speed_before_there_are_points() {
+fn points_after_a_power_cycle_need_a_running_motor() {
     let mut bench = streaming(Model::A1, 1, "");
-    bench.run(SECOND);
+    bench.run(ONE_SECOND);
     bench.cycle_power();
     // The scanner boots for two seconds and then accepts requests at once. Its motor turns since the power is on.
-    bench.run(3 * SECOND + SECOND / 10);
-    assert_eq!(bench.ask(&start(1)).len(), 1);
+    bench.run(3 * ONE_SECOND + ONE_SECOND / 10);
+    assert_eq!(bench.ask(&stream_request(1)).len(), 1);
     let before = bench.data().len();
-    bench.pass(SECOND);
+    bench.run_for(ONE_SECOND);
     assert!(bench.data().len() > before);
     let mut bench = streaming(Model::A3, 1, "");
-    bench.run(SECOND);
+    bench.run(ONE_SECOND);
     bench.cycle_power();
-    bench.run(4 * SECOND);
-    bench.ask(&start(1));
+    bench.run(4 * ONE_SECOND);
+    bench.ask(&stream_request(1));
     let before = bench.data().len();
-    bench.pass(5 * SECOND);
+    bench.run_for(5 * ONE_SECOND);
     assert_eq!(bench.data().len(), before, "nobody told this motor to turn");
     assert_eq!(bench.unit.eeprom_writes(), 0);
 }
 
 #[test]
-fn an_error_ends_the_stream_and_only_some_go_away_with_a_reset() {
+fn health_error_ends_stream_and_some_survive_reset() {
     for stubborn in [false, true] {
         let mut bench = streaming(Model::A2m8, 2, "");
-        bench.run(SECOND);
+        bench.run(ONE_SECOND);
         bench.unit.set_health(bench.now, (2, 0x8001), stubborn);
         let sent = bench.sent.len();
-        bench.pass(SECOND);
+        bench.run_for(ONE_SECOND);
         assert!(bench.sent.len() <= sent + 1);
         let health = |bench: &mut Bench| bench.ask(&[0xA5, 0x52])[0][7..].to_vec();
         assert_eq!(health(&mut bench), [2, 0x01, 0x80]);
-        assert!(bench.ask(&start(2)).is_empty(), "it measures in spite of its error");
+        assert!(bench.ask(&stream_request(2)).is_empty(), "it measures in spite of its error");
         bench.ask(&[0xA5, 0x40]);
-        bench.pass(SECOND);
+        bench.run_for(ONE_SECOND);
         let (status, answers) = if stubborn { (2, 0) } else { (0, 1) };
         assert_eq!(health(&mut bench)[0], status);
-        assert_eq!(bench.ask(&start(2)).len(), answers);
+        assert_eq!(bench.ask(&stream_request(2)).len(), answers);
     }
     let mut warned = RplidarSettings::of(Model::A1);
     warned.health = (1, 7);
     let mut bench = Bench::new(warned, &World::Empty, "");
     assert_eq!(bench.ask(&[0xA5, 0x52])[0][7..], [1, 7, 0]);
-    assert_eq!(bench.ask(&start(1)).len(), 1, "a warning is no error");
+    assert_eq!(bench.ask(&stream_request(1)).len(), 1, "a warning is no error");
 }
 
 #[test]
-fn a_head_that_is_held_measures_nothing_and_gets_up_to_speed_again() {
+fn held_head_sends_no_points_and_spins_up_again() {
     let mut bench = streaming(Model::A1, 1, "hold=1,hold_at=2");
-    bench.run(8 * SECOND);
-    let gaps: Vec<_> = bench.sent.windows(2).filter(|pair| pair[1].at - pair[0].at > SECOND / 10).collect();
+    bench.run(8 * ONE_SECOND);
+    let gaps: Vec<_> =
+        bench.sent.windows(2).filter(|pair| pair[1].at - pair[0].at > ONE_SECOND / 10).collect();
     assert_eq!(gaps.len(), 1);
     let (last, first) = (gaps[0][0].at, gaps[0][1].at);
-    assert!(last < 2 * SECOND + SECOND / 20, "{last}");
+    assert!(last < 2 * ONE_SECOND + ONE_SECOND / 20, "{last}");
     // A second of standstill and 1.6 of getting up to speed.
-    assert!((46 * SECOND / 10..47 * SECOND / 10).contains(&first), "{first}");
+    assert!((46 * ONE_SECOND / 10..47 * ONE_SECOND / 10).contains(&first), "{first}");
     let mut bench = streaming(Model::A1, 1, "hold=5,hold_at=1");
-    bench.run(2 * SECOND);
+    bench.run(2 * ONE_SECOND);
     assert_eq!(bench.ask(&[0xA5, 0x52])[0][7], 2, "it does not say that its head is held");
 }
 
 #[test]
 fn bad_habits_of_answering() {
-    let asked = |faults: &str| {
+    let replies_with = |faults: &str| {
         let mut bench = Bench::new(RplidarSettings::of(Model::A1), &World::Empty, faults);
         (0..100).map(|_| bench.ask(&[0xA5, 0x52]).len()).sum::<usize>()
     };
-    assert_eq!((asked(""), asked("mute=1"), asked("twice=1"), asked("late=0.1")), (100, 0, 200, 95));
-    let some = asked("overlook=0.5");
+    assert_eq!(
+        (replies_with(""), replies_with("mute=1"), replies_with("twice=1"), replies_with("late=0.1")),
+        (100, 0, 200, 95)
+    );
+    let some = replies_with("overlook=0.5");
     assert!((30..70).contains(&some), "{some}");
 }

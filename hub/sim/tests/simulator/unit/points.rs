@@ -3,48 +3,53 @@
 
 use scanhub_schema::Nanos;
 use scanhub_sim::beam::NoiseModel;
-use scanhub_sim::rplidar::{Form, Model, RplidarSettings};
+use scanhub_sim::rplidar::{Model, PacketFormat, RplidarSettings};
 use scanhub_sim::world::World;
 
-use super::{Bench, SECOND, start};
+use super::{Bench, ONE_SECOND, stream_request};
 
 /// A point as the wire has it.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Point {
+pub(crate) struct DecodedPoint {
     /// Degrees, clockwise, 0 to 360.
-    pub(crate) deg: f64,
+    pub(crate) clockwise_deg: f64,
     /// 0: no return.
-    pub(crate) mm: f64,
+    pub(crate) range_mm: f64,
     /// Quality, if the packet has one.
     pub(crate) quality: Option<u8>,
     /// The flag of a new turn, where the wire has one.
-    pub(crate) begins: bool,
+    pub(crate) starts_revolution: bool,
 }
 
 fn word(bytes: &[u8], at: usize) -> u16 {
     u16::from_le_bytes([bytes[at], bytes[at + 1]])
 }
 
-fn turned(deg: f64) -> f64 {
+fn normalize_deg(deg: f64) -> f64 {
     deg.rem_euclid(360.0)
 }
 
 /// Decodes a packet of type 0x81.
-pub(crate) fn standard(packet: &[u8]) -> Point {
+pub(crate) fn standard(packet: &[u8]) -> DecodedPoint {
     assert_eq!(packet.len(), 5);
-    let begins = packet[0] & 1 == 1;
-    assert_eq!(packet[0] & 2 == 2, !begins, "the flag and its inverse");
+    let starts_revolution = packet[0] & 1 == 1;
+    assert_eq!(packet[0] & 2 == 2, !starts_revolution, "the flag and its inverse");
     assert_eq!(packet[1] & 1, 1, "the check bit");
-    let deg = f64::from(word(packet, 1) >> 1) / 64.0;
-    Point { deg, mm: f64::from(word(packet, 3)) / 4.0, quality: Some(packet[0] >> 2), begins }
+    let clockwise_deg = f64::from(word(packet, 1) >> 1) / 64.0;
+    DecodedPoint {
+        clockwise_deg,
+        range_mm: f64::from(word(packet, 3)) / 4.0,
+        quality: Some(packet[0] >> 2),
+        starts_revolution,
+    }
 }
 
 /// Returns the points of all packets except the last one, for the type `answer`.
-pub(crate) fn capsules(answer: u8, packets: &[Vec<u8>]) -> Vec<Point> {
+pub(crate) fn capsules(answer: u8, packets: &[Vec<u8>]) -> Vec<DecodedPoint> {
     packets.windows(2).flat_map(|pair| capsule(answer, &pair[0], &pair[1])).collect()
 }
 
-fn capsule(answer: u8, packet: &[u8], next: &[u8]) -> Vec<Point> {
+fn capsule(answer: u8, packet: &[u8], next: &[u8]) -> Vec<DecodedPoint> {
     let (len, count, at) = match answer {
         0x82 => (84, 32, 2),
         0x84 => (132, 96, 2),
@@ -59,7 +64,7 @@ fn capsule(answer: u8, packet: &[u8], next: &[u8]) -> Vec<Point> {
         assert_eq!((packet[0] & 15, packet[1] & 15), (sum & 15, sum >> 4));
     }
     let start = |packet: &[u8]| f64::from(word(packet, at) & 0x7FFF) / 64.0;
-    let step = turned(start(next) - start(packet)) / f64::from(count);
+    let step = normalize_deg(start(next) - start(packet)) / f64::from(count);
     let body = &packet[at + 2..];
     let of = |k: usize| match answer {
         0x82 => {
@@ -70,26 +75,31 @@ fn capsule(answer: u8, packet: &[u8], next: &[u8]) -> Vec<Point> {
             (f64::from(value >> 2), behind, None)
         }
         0x84 => {
-            let mm = ultra(body, &next[at + 2..], k);
-            (mm, shift(mm), None)
+            let range_mm = ultra(body, &next[at + 2..], k);
+            (range_mm, angle_correction_deg(range_mm), None)
         }
         0x85 => (f64::from(word(body, 2 * k)), 0.0, None),
         _ => {
             let cabin = &body[k / 2 * 5..][..5];
             let high = if k.is_multiple_of(2) { cabin[4] & 15 } else { cabin[4] >> 4 };
             let value = u32::from(word(cabin, k % 2 * 2)) | u32::from(high) << 16;
-            let (mm, quality) = match value & 3 {
+            let (range_mm, quality) = match value & 3 {
                 0 => (2 * (value >> 2 & 0x3FF), value >> 12),
                 1 => (3 * (value >> 2 & 0x7FF) + 2_046, value >> 13 << 1),
                 2 => (4 * (value >> 2 & 0xFFF) + 8_187, value >> 14 << 2),
                 _ => (5 * (value >> 2 & 0x1FFF) + 24_567, value >> 15 << 3),
             };
-            (f64::from(mm), 0.0, Some(quality as u8))
+            (f64::from(range_mm), 0.0, Some(quality as u8))
         }
     };
     let point = |k: usize| {
-        let (mm, behind, quality) = of(k);
-        Point { deg: turned(start(packet) + step * k as f64 - behind), mm, quality, begins: false }
+        let (range_mm, behind, quality) = of(k);
+        DecodedPoint {
+            clockwise_deg: normalize_deg(start(packet) + step * k as f64 - behind),
+            range_mm,
+            quality,
+            starts_revolution: false,
+        }
     };
     (0..count as usize).map(point).collect()
 }
@@ -123,7 +133,7 @@ fn ultra(body: &[u8], next: &[u8], k: usize) -> f64 {
 }
 
 /// Returns the correction of an angle by the vendor's decoder of type 0x84, in degrees.
-fn shift(mm: f64) -> f64 {
+fn angle_correction_deg(mm: f64) -> f64 {
     if mm < 50.0 {
         return 7.5;
     }
@@ -132,63 +142,71 @@ fn shift(mm: f64) -> f64 {
 }
 
 /// A room, without noise.
-fn still(world: &str) -> World {
+fn noiseless_world(world: &str) -> World {
     world.parse::<World>().expect("a world").with_noise(NoiseModel::NONE)
 }
 
 /// Streams in mode `mode` for `span` in `world`; the points that were sent.
-fn streamed(settings: RplidarSettings, mode: usize, world: &World, span: Nanos) -> (Bench, Vec<Point>) {
+fn stream_points(
+    settings: RplidarSettings,
+    mode: usize,
+    world: &World,
+    span: Nanos,
+) -> (Bench, Vec<DecodedPoint>) {
     let model = settings.model;
     let mut bench = Bench::new(settings, world, "");
     // Those whose motor rests until it is told.
     bench.ask(&[0xA5, 0xF0, 0x02, 0x94, 0x02, 0xC1]);
-    bench.ask(&start(mode));
-    bench.pass(2 * SECOND + span);
+    bench.ask(&stream_request(mode));
+    bench.run_for(2 * ONE_SECOND + span);
     let data = bench.data();
     let points = match model.modes()[mode].form {
-        Form::Standard => data.iter().map(|packet| standard(packet)).collect(),
-        form => capsules(form.answer(), &data),
+        PacketFormat::Standard => data.iter().map(|packet| standard(packet)).collect(),
+        form => capsules(form.response_type(), &data),
     };
     assert_eq!(bench.unit.mode(), Some(model.modes()[mode]));
     (bench, points)
 }
 
 /// Degrees from `b` to `a`, -180 to 180.
-fn off(a: f64, b: f64) -> f64 {
+fn difference_deg(a: f64, b: f64) -> f64 {
     (a - b + 540.0).rem_euclid(360.0) - 180.0
 }
 
 #[test]
-fn every_point_of_every_mode_of_every_model_is_where_it_was_measured() {
+fn every_point_of_every_mode_matches_its_truth() {
     for model in Model::ALL {
         for (number, mode) in model.modes().iter().enumerate() {
             let (mut bench, points) =
-                streamed(RplidarSettings::of(model), number, &still("corridor"), SECOND);
+                stream_points(RplidarSettings::of(model), number, &noiseless_world("corridor"), ONE_SECOND);
             let begin = bench.unit.begin_ns().expect("it streams");
             let seconds = (bench.now - begin) as f64 / 1e9;
             let due = seconds * 1e6 / mode.sample_us;
             assert!((points.len() as f64 / due - 1.0).abs() < 0.05, "{model:?} {number}: {}", points.len());
             // What the angle and the range lose by their bits.
             let (deg, mm) = match mode.form {
-                Form::Standard => (0.01, 0.6),
-                Form::Express => (0.08, 0.8),
-                Form::Ultra => (0.08, 8.6),
-                Form::Dense => (0.02, 0.6),
-                Form::UltraDense => (0.02, 4.6),
+                PacketFormat::Standard => (0.01, 0.6),
+                PacketFormat::Express => (0.08, 0.8),
+                PacketFormat::Ultra => (0.08, 8.6),
+                PacketFormat::Dense => (0.02, 0.6),
+                PacketFormat::UltraDense => (0.02, 4.6),
             };
             let (mut ranges, mut edges) = (0, 0);
             for (k, point) in points.iter().enumerate() {
                 let truth = bench.unit.truth(k as u64).expect("it streams");
-                if point.mm == 0.0 {
+                if point.range_mm == 0.0 {
                     continue;
                 }
                 let range = truth.range_mm.expect("something is there");
                 ranges += 1;
                 // Where a coarse range is near a step of the shift, the decoder's angle is one step off.
-                let is_off = off(point.deg, truth.clockwise_deg).abs() > deg;
+                let is_off = difference_deg(point.clockwise_deg, truth.clockwise_deg).abs() > deg;
                 edges += usize::from(is_off);
-                assert!(!is_off || mode.form == Form::Ultra, "{model:?} {mode:?} {k}: {point:?} {truth:?}");
-                assert!((point.mm - range).abs() < mm, "{model:?} {mode:?} {k}: {point:?} {truth:?}");
+                assert!(
+                    !is_off || mode.form == PacketFormat::Ultra,
+                    "{model:?} {mode:?} {k}: {point:?} {truth:?}"
+                );
+                assert!((point.range_mm - range).abs() < mm, "{model:?} {mode:?} {k}: {point:?} {truth:?}");
                 assert!(point.quality != Some(0));
             }
             assert!(edges * 100 <= ranges, "{model:?} {mode:?}: {edges} of {ranges}");
@@ -203,14 +221,17 @@ fn an_a1_indoors_is_as_odd_as_a_real_one() {
     let (mut in_all, mut invalid, mut backward, mut counts, mut flags) = (0, 0, 0, Vec::new(), Vec::new());
     for seed in 0..4 {
         let settings = RplidarSettings { seed, ..RplidarSettings::of(Model::A1) };
-        let (_, points) = streamed(settings, 0, &"demo".parse().expect("a world"), 10 * SECOND);
+        let (_, points) = stream_points(settings, 0, &"demo".parse().expect("a world"), 10 * ONE_SECOND);
         in_all += points.len();
         invalid += points.iter().filter(|point| point.quality == Some(0)).count();
-        assert!(points.iter().all(|point| (point.quality == Some(0)) == (point.mm == 0.0)));
-        backward += points.windows(2).filter(|pair| off(pair[1].deg, pair[0].deg) < 0.0).count();
-        let turns: Vec<usize> = (0..points.len()).filter(|&k| points[k].begins).collect();
-        counts.extend(turns.windows(2).map(|pair| pair[1] - pair[0]));
-        flags.extend(turns.iter().map(|&k| points[k].deg));
+        assert!(points.iter().all(|point| (point.quality == Some(0)) == (point.range_mm == 0.0)));
+        backward += points
+            .windows(2)
+            .filter(|pair| difference_deg(pair[1].clockwise_deg, pair[0].clockwise_deg) < 0.0)
+            .count();
+        let starts: Vec<usize> = (0..points.len()).filter(|&k| points[k].starts_revolution).collect();
+        counts.extend(starts.windows(2).map(|pair| pair[1] - pair[0]));
+        flags.extend(starts.iter().map(|&k| points[k].clockwise_deg));
     }
     println!(
         "{in_all} points: {:.1} % invalid, {:.1} % backward",
@@ -242,10 +263,10 @@ fn share(part: usize, of: usize) -> f64 {
 #[test]
 fn the_same_seed_says_the_same_and_another_another() {
     let world: World = "demo".parse().expect("a world");
-    let said = |seed| {
+    let points_of = |seed| {
         let settings = RplidarSettings { seed, ..RplidarSettings::of(Model::A1) };
-        streamed(settings, 1, &world, SECOND).1
+        stream_points(settings, 1, &world, ONE_SECOND).1
     };
-    let points = said(5);
-    assert!(points == said(5) && points != said(6));
+    let points = points_of(5);
+    assert!(points == points_of(5) && points != points_of(6));
 }

@@ -6,10 +6,10 @@ use scanhub_sim::room::BeamTarget;
 use scanhub_sim::room::Room;
 use scanhub_sim::world::World;
 
-use super::{SCAN_NS, look, text, world};
+use super::{SCAN_PERIOD_NS, scan_at, text, world};
 
 /// A wall 3 m ahead, a post before it, a dark board and a far wall.
-const WORLD: &str = "
+const TEST_WORLD: &str = "
 [[thing]]
 line = [[-3000, 3000], [3000, 3000]]
 [[thing]]
@@ -22,17 +22,17 @@ surface = \"dark\"
 line = [[6000, 9000], [9000, 2000]]
 ";
 
-const NONE: NoiseModel = NoiseModel::NONE;
+const NO_NOISE: NoiseModel = NoiseModel::NONE;
 
 /// The words of `count` scans with these layers.
 fn words(layers: NoiseModel, seed: u64, count: u64) -> Vec<Vec<u16>> {
-    let room = Room::new(&world(WORLD).with_noise(layers), seed);
-    (1..=count).map(|scan| look(&room, scan * SCAN_NS).words).collect()
+    let room = Room::new(&world(TEST_WORLD).with_noise(layers), seed);
+    (1..=count).map(|scan| scan_at(&room, scan * SCAN_PERIOD_NS).words).collect()
 }
 
 /// What `words` deviate from the truth, of all beams that tell a range in both.
 fn deviations_mm(words: &[Vec<u16>]) -> Vec<f64> {
-    let exact = &self::words(NONE, 0, 1)[0];
+    let exact = &self::words(NO_NOISE, 0, 1)[0];
     let pairs = words.iter().flat_map(|words| words.iter().zip(exact));
     pairs
         .filter(|(word, exact)| **word < 8183 && **exact < 8183)
@@ -40,26 +40,26 @@ fn deviations_mm(words: &[Vec<u16>]) -> Vec<f64> {
         .collect()
 }
 
-fn share(values: &[f64], is: impl Fn(f64) -> bool) -> f64 {
-    values.iter().filter(|&&value| is(value)).count() as f64 / values.len() as f64
+fn share(values: &[f64], is_counted: impl Fn(f64) -> bool) -> f64 {
+    values.iter().filter(|&&value| is_counted(value)).count() as f64 / values.len() as f64
 }
 
 #[test]
-fn without_layers_a_word_is_the_true_range_in_its_unit() {
-    let room = Room::new(&world(WORLD).with_noise(NONE), 9);
+fn range_words_without_noise_are_true_ranges() {
+    let room = Room::new(&world(TEST_WORLD).with_noise(NO_NOISE), 9);
     for (unit, mm) in [(Unit::Mm, 1.0), (Unit::Cm, 10.0), (Unit::Dm, 100.0)] {
-        let words = room.scan(Variant::HALF, unit, Mode(1), SCAN_NS);
+        let words = room.scan(Variant::HALF, unit, Mode(1), SCAN_PERIOD_NS);
         for beam in 180..200 {
             let angle = (f64::from(beam) / 2.0).to_radians();
             assert_eq!(f64::from(words[beam as usize]), (3000.0 / angle.sin() / mm).round(), "beam {beam}");
         }
     }
-    assert_eq!(words(NONE, 1, 3)[0], words(NONE, 2, 3)[2]);
+    assert_eq!(words(NO_NOISE, 1, 3)[0], words(NO_NOISE, 2, 3)[2]);
 }
 
 #[test]
 fn sigma_spreads_ranges() {
-    let deviations = deviations_mm(&words(NoiseModel { sigma_mm: 5.0, ..NONE }, 1, 100));
+    let deviations = deviations_mm(&words(NoiseModel { sigma_mm: 5.0, ..NO_NOISE }, 1, 100));
     let mean = deviations.iter().sum::<f64>() / deviations.len() as f64;
     let variance = deviations.iter().map(|d| (d - mean).powi(2)).sum::<f64>() / deviations.len() as f64;
     assert!(mean.abs() < 0.2 && (4.8..5.2).contains(&variance.sqrt()), "{mean} {variance}");
@@ -70,7 +70,7 @@ fn sigma_spreads_ranges() {
 fn bias_is_one_for_a_device_and_another_for_the_next() {
     let mut met: Vec<i32> = Vec::new();
     for seed in 0..20 {
-        let deviations = deviations_mm(&words(NoiseModel { bias_mm: 15.0, ..NONE }, seed, 2));
+        let deviations = deviations_mm(&words(NoiseModel { bias_mm: 15.0, ..NO_NOISE }, seed, 2));
         let bias = deviations[0].round();
         assert!(bias.abs() <= 15.0 && deviations.iter().all(|d| (d - bias).abs() <= 1.0), "seed {seed}");
         met.push(bias as i32);
@@ -82,8 +82,8 @@ fn bias_is_one_for_a_device_and_another_for_the_next() {
 
 #[test]
 fn the_tail_is_heavy_and_belongs_to_edges() {
-    let exact = &words(NONE, 1, 1)[0];
-    let scans = words(NoiseModel { tail: 0.5, ..NONE }, 1, 400);
+    let exact = &words(NO_NOISE, 1, 1)[0];
+    let scans = words(NoiseModel { tail: 0.5, ..NO_NOISE }, 1, 400);
     let ranges = (0..361).filter(|&beam| exact[beam] < 8183);
     let (mut at_edges, mut readings) = (0, Vec::new());
     for beam in ranges {
@@ -92,9 +92,9 @@ fn the_tail_is_heavy_and_belongs_to_edges() {
         if off.iter().all(|&mm| mm == 0.0) {
             continue;
         }
-        let around = beam.saturating_sub(1)..(beam + 2).min(361);
+        let neighbors = beam.saturating_sub(1)..(beam + 2).min(361);
         assert!(
-            around.clone().any(|other| exact[other].abs_diff(exact[beam]) > 40),
+            neighbors.clone().any(|other| exact[other].abs_diff(exact[beam]) > 40),
             "beam {beam} is at no edge"
         );
         at_edges += 1;
@@ -108,16 +108,16 @@ fn the_tail_is_heavy_and_belongs_to_edges() {
 
 /// In a recording of a scanner that stood for 18 s, .006 of the readings are off by more than 30 mm.
 #[test]
-fn in_scenes_with_many_edges_readings_are_off_as_often_as_in_recordings() {
+fn outliers_are_as_frequent_as_in_recordings() {
     let world: World = "fig8".parse().unwrap();
     let (mut off, mut count) = (0, 0);
     for seed in 0..3 {
         let room = Room::new(&world, seed);
         // Before anybody or anything moves.
-        let looks: Vec<_> = (1..300).map(|scan| look(&room, scan * SCAN_NS)).collect();
+        let scans: Vec<_> = (1..300).map(|scan| scan_at(&room, scan * SCAN_PERIOD_NS)).collect();
         for beam in 0..361 {
-            let told = looks.iter().filter(|look| look.truth[beam] != BeamTarget::Invalid);
-            let mut ranges: Vec<i32> = told.map(|look| i32::from(look.words[beam] & 8191)).collect();
+            let valid = scans.iter().filter(|look| look.truth[beam] != BeamTarget::Invalid);
+            let mut ranges: Vec<i32> = valid.map(|look| i32::from(look.words[beam] & 8191)).collect();
             ranges.sort_unstable();
             let Some(&middle) = ranges.get(ranges.len() / 2) else { continue };
             off += ranges.iter().filter(|range| (*range - middle).abs() > 30).count();
@@ -138,8 +138,8 @@ fn values_between(depth_mm: f64, spot: bool) -> (f64, f64) {
             "[[thing]]\nline = [[-3000, {0}], [3000, {0}]]\n[[thing]]\nradius_mm = 60\npose = [{x_mm}, 1560]",
             1_500.0 + depth_mm
         );
-        let room = Room::new(&world(&text).with_noise(NoiseModel { spot, ..NONE }), 1);
-        let scans: Vec<Vec<u16>> = (1..=50).map(|scan| look(&room, scan * SCAN_NS).words).collect();
+        let room = Room::new(&world(&text).with_noise(NoiseModel { spot, ..NO_NOISE }), 1);
+        let scans: Vec<Vec<u16>> = (1..=50).map(|scan| scan_at(&room, scan * SCAN_PERIOD_NS).words).collect();
         for beam in 170..191 {
             let ranges = scans.iter().map(|words| f64::from(words[beam]));
             let values: Vec<f64> =
@@ -157,7 +157,7 @@ fn values_between(depth_mm: f64, spot: bool) -> (f64, f64) {
 }
 
 #[test]
-fn a_spot_on_two_surfaces_reports_a_steady_value_between_if_they_are_not_far_apart() {
+fn spot_on_two_near_surfaces_reads_between_them() {
     assert_eq!(values_between(800.0, false).0, 0.0);
     let (share, deviation) = values_between(800.0, true);
     println!("{share:.3} of the beams, with a standard deviation of {deviation:.3} of the depth");
@@ -167,8 +167,8 @@ fn a_spot_on_two_surfaces_reports_a_steady_value_between_if_they_are_not_far_apa
 }
 
 #[test]
-fn errors_are_codes_in_place_of_ranges_and_change_nothing_else() {
-    let (with, without) = (words(NoiseModel { errors: 0.005, ..NONE }, 1, 200), words(NONE, 1, 200));
+fn errors_replace_ranges_by_codes_and_nothing_else() {
+    let (with, without) = (words(NoiseModel { errors: 0.005, ..NO_NOISE }, 1, 200), words(NO_NOISE, 1, 200));
     let (mut codes, mut ranges) = (0, 0);
     for (with, without) in with.iter().flatten().zip(without.iter().flatten()) {
         if *without < 8183 {
@@ -182,11 +182,11 @@ fn errors_are_codes_in_place_of_ranges_and_change_nothing_else() {
 }
 
 #[test]
-fn what_is_beyond_the_greatest_value_says_so() {
-    let room = Room::new(&world(WORLD).with_noise(NONE), 1);
+fn range_beyond_the_maximum_has_its_code() {
+    let room = Room::new(&world(TEST_WORLD).with_noise(NO_NOISE), 1);
     // The far wall: 8.5 m at 40 degrees.
-    assert_eq!(look(&room, SCAN_NS).words[80], 8191 - 8);
-    let cm = room.scan(Variant::HALF, Unit::Cm, Mode(1), SCAN_NS);
+    assert_eq!(scan_at(&room, SCAN_PERIOD_NS).words[80], 8191 - 8);
+    let cm = room.scan(Variant::HALF, Unit::Cm, Mode(1), SCAN_PERIOD_NS);
     assert!((800..950).contains(&cm[80]), "{}", cm[80]);
 }
 
@@ -194,30 +194,31 @@ fn what_is_beyond_the_greatest_value_says_so() {
 fn dark_and_oblique_surfaces_far_away_are_too_weak() {
     let board = (0..361).filter(|beam| (250..265).contains(beam));
     let far = "[[thing]]\nline = [[-20000, 900], [20000, 900]]";
-    let told = |weak: bool, beam: usize| {
-        let world = world(&format!("{WORLD}{far}")).with_noise(NoiseModel { weak, ..NONE });
-        Room::new(&world, 1).scan(Variant::HALF, Unit::Cm, Mode(1), SCAN_NS)[beam]
+    let range_word = |weak: bool, beam: usize| {
+        let world = world(&format!("{TEST_WORLD}{far}")).with_noise(NoiseModel { weak, ..NO_NOISE });
+        Room::new(&world, 1).scan(Variant::HALF, Unit::Cm, Mode(1), SCAN_PERIOD_NS)[beam]
     };
     // The wall at 0.9 m, seen from 4 degrees: 12.9 m away.
-    assert_eq!((told(true, 8), told(false, 8)), (8187, 1290));
+    assert_eq!((range_word(true, 8), range_word(false, 8)), (8187, 1290));
     let dark = "[[thing]]\nline = [[-3000, 7900], [3000, 7900]]\nsurface = \"dark\"";
-    let told = |weak: bool| {
-        let world = world(dark).with_noise(NoiseModel { weak, ..NONE });
-        look(&Room::new(&world, 1), SCAN_NS).words[180]
+    let range_word = |weak: bool| {
+        let world = world(dark).with_noise(NoiseModel { weak, ..NO_NOISE });
+        scan_at(&Room::new(&world, 1), SCAN_PERIOD_NS).words[180]
     };
-    assert_eq!((told(true), told(false)), (7900 + 287, 7900));
+    assert_eq!((range_word(true), range_word(false)), (7900 + 287, 7900));
     // Three metres away the dark board is seen.
-    let near = words(NoiseModel { weak: true, ..NONE }, 1, 1);
+    let near = words(NoiseModel { weak: true, ..NO_NOISE }, 1, 1);
     assert!(board.into_iter().all(|beam| near[0][beam] < 8183));
 }
 
 #[test]
 fn the_sun_dazzles_a_sector_for_a_time() {
-    let text = format!("{WORLD}[[sun]]\nfrom_deg = 0\nto_deg = 5\nfrom_s = 2\nuntil_s = 4\nshare = 0.5\n");
+    let text =
+        format!("{TEST_WORLD}[[sun]]\nfrom_deg = 0\nto_deg = 5\nfrom_s = 2\nuntil_s = 4\nshare = 0.5\n");
     let dazzled = |dazzle, end_s: u64, beams: std::ops::RangeInclusive<usize>| {
-        let room = Room::new(&world(&text).with_noise(NoiseModel { dazzle, ..NONE }), 1);
+        let room = Room::new(&world(&text).with_noise(NoiseModel { dazzle, ..NO_NOISE }), 1);
         let codes = (0..40).flat_map(|scan| {
-            look(&room, end_s * 1_000_000_000 + scan * SCAN_NS).words[beams.clone()].to_vec()
+            scan_at(&room, end_s * 1_000_000_000 + scan * SCAN_PERIOD_NS).words[beams.clone()].to_vec()
         });
         codes.filter(|&word| word == 8190).count() as f64 / (40.0 * beams.count() as f64)
     };
@@ -234,14 +235,15 @@ fn the_sun_dazzles_a_sector_for_a_time() {
 fn half_degrees_are_measured_one_mirror_turn_later() {
     let (comb, straight) = [true, false]
         .map(|comb| {
-            Room::new(&"approach".parse::<World>().unwrap().with_noise(NoiseModel { comb, ..NONE }), 1)
+            Room::new(&"approach".parse::<World>().unwrap().with_noise(NoiseModel { comb, ..NO_NOISE }), 1)
         })
         .into();
-    let half_scan_ns = SCAN_NS / 2;
+    let half_scan_ns = SCAN_PERIOD_NS / 2;
     let mut moved = 0;
     for end_ns in (15..25).map(|second| second * 1_000_000_000) {
-        let combed = look(&comb, end_ns).words;
-        let (last, before) = (look(&straight, end_ns).words, look(&straight, end_ns - half_scan_ns).words);
+        let combed = scan_at(&comb, end_ns).words;
+        let (last, before) =
+            (scan_at(&straight, end_ns).words, scan_at(&straight, end_ns - half_scan_ns).words);
         for beam in 0..361 {
             assert_eq!(combed[beam], if beam % 2 == 0 { before[beam] } else { last[beam] }, "beam {beam}");
         }
@@ -257,9 +259,9 @@ fn reflectors_have_graded_levels_around_their_middle() {
     let mut errors = Vec::new();
     for seed in 0..20 {
         let room = Room::new(&world(&strips), seed);
-        let marks = room.marks(SCAN_NS);
+        let marks = room.marks(SCAN_PERIOD_NS);
         assert_eq!(marks.len(), 12);
-        let words = look(&room, SCAN_NS).words;
+        let words = scan_at(&room, SCAN_PERIOD_NS).words;
         for mark in marks {
             let near = |beam: &usize| (*beam as f64 / 2.0 - 90.0 - mark.angle_deg).abs() < 3.0;
             let bright: Vec<usize> = (0..361)

@@ -14,10 +14,10 @@ use scanhub_sim::room::{BeamTarget, LabeledScan, Room};
 use scanhub_sim::world::World;
 
 /// The directory of the files.
-const WORLDS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/worlds");
+const WORLDS_FOLDER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/worlds");
 
 /// Time of one scan of 361 beams.
-const SCAN_NS: Nanos = 26_640_000;
+const SCAN_PERIOD_NS: Nanos = 26_640_000;
 
 /// The room of a world in TOML.
 fn room(text: &str, seed: u64) -> Room {
@@ -29,18 +29,18 @@ fn world(text: &str) -> World {
 }
 
 /// 361 beams in millimetres with levels.
-fn look(room: &Room, end_ns: Nanos) -> LabeledScan {
+fn scan_at(room: &Room, end_ns: Nanos) -> LabeledScan {
     room.labeled_scan(Variant::HALF, Unit::Mm, Mode(1), end_ns)
 }
 
 /// A text of the directory.
 fn text(name: &str) -> String {
-    std::fs::read_to_string(format!("{WORLDS}/{name}.toml")).expect("a file of this name")
+    std::fs::read_to_string(format!("{WORLDS_FOLDER}/{name}.toml")).expect("a file of this name")
 }
 
 #[test]
-fn every_file_is_a_world_that_the_program_brings_along() {
-    let files: BTreeSet<String> = std::fs::read_dir(WORLDS)
+fn every_world_file_is_built_in() {
+    let files: BTreeSet<String> = std::fs::read_dir(WORLDS_FOLDER)
         .expect("the directory of worlds")
         .map(|entry| entry.unwrap().path())
         .filter(|path| path.extension().is_some_and(|ending| ending == "toml"))
@@ -51,22 +51,22 @@ fn every_file_is_a_world_that_the_program_brings_along() {
     assert_eq!(coded, ["empty", "random", "wall640"]);
     assert!(files.is_subset(&brought), "{files:?}");
     for name in &files {
-        assert_eq!(name.parse::<World>(), format!("{WORLDS}/{name}.toml").parse(), "{name}");
+        assert_eq!(name.parse::<World>(), format!("{WORLDS_FOLDER}/{name}.toml").parse(), "{name}");
     }
 }
 
 #[test]
 fn every_world_runs_for_a_minute_as_its_name_says() {
-    let met = |name: &str| {
+    let targets_of = |name: &str| {
         let world: World = name.parse().unwrap();
         let mut kinds = BTreeSet::new();
         for port in 0..world.sensors() as u64 {
             let room = Room::of_port(&world, 3, port);
             for scan in (0..2_250).step_by(25) {
-                let end_ns = scan * SCAN_NS;
-                let first = look(&room, end_ns);
-                assert_eq!(first, look(&room, end_ns), "{name} at {end_ns}");
-                kinds.extend(first.truth.iter().map(|met| match met {
+                let end_ns = scan * SCAN_PERIOD_NS;
+                let first = scan_at(&room, end_ns);
+                assert_eq!(first, scan_at(&room, end_ns), "{name} at {end_ns}");
+                kinds.extend(first.truth.iter().map(|target| match target {
                     BeamTarget::Static { since_ns: 0 } => "static",
                     BeamTarget::Static { .. } => "uncovered",
                     BeamTarget::Person => "person",
@@ -79,12 +79,15 @@ fn every_world_runs_for_a_minute_as_its_name_says() {
         kinds.into_iter().collect::<Vec<_>>().join(" ")
     };
     for name in ["room", "standing", "approach", "corridor", "glass", "faint", "sun"] {
-        assert_eq!(met(name), "grazed invalid person static", "{name}");
+        assert_eq!(targets_of(name), "grazed invalid person static", "{name}");
     }
     for name in ["fig8", "door", "chair", "crowd", "demo", "house"] {
-        assert_eq!(met(name), "box grazed invalid person static uncovered", "{name}");
+        assert_eq!(targets_of(name), "box grazed invalid person static uncovered", "{name}");
     }
-    assert_eq!((met("bare"), met("strips")), ("invalid static".into(), "invalid static".into()));
+    assert_eq!(
+        (targets_of("bare"), targets_of("strips")),
+        ("invalid static".into(), "invalid static".into())
+    );
 }
 
 #[test]
@@ -106,25 +109,25 @@ fn ports_share_a_world_until_its_sensors_are_taken() {
     let text = format!("{}[[sensor]]\npose = [0, 100, 90]\n", text("fig8"));
     let quiet = world(&text).with_noise(scanhub_sim::beam::NoiseModel::NONE);
     let noisy = world(&text);
-    let scan = |world, port| look(&Room::of_port(world, 5, port), 20_000_000_000).words;
+    let scan = |world, port| scan_at(&Room::of_port(world, 5, port), 20_000_000_000).words;
     assert_eq!(quiet.sensors(), 2);
     assert_eq!(scan(&quiet, 0), scan(&quiet, 1));
     assert_ne!(scan(&noisy, 0), scan(&noisy, 1));
     assert_ne!(scan(&quiet, 0), scan(&quiet, 2));
-    assert_eq!(scan(&quiet, 2), look(&Room::new(&quiet, 6), 20_000_000_000).words);
+    assert_eq!(scan(&quiet, 2), scan_at(&Room::new(&quiet, 6), 20_000_000_000).words);
 }
 
 #[test]
 fn a_world_without_anything_is_one() {
-    let look = look(&room("", 1), SCAN_NS);
+    let look = scan_at(&room("", 1), SCAN_PERIOD_NS);
     assert!(
         look.words.iter().all(|&word| word == 8191)
-            && look.truth.iter().all(|&met| met == BeamTarget::Invalid)
+            && look.truth.iter().all(|&target| target == BeamTarget::Invalid)
     );
 }
 
 #[test]
-fn what_is_no_world_is_refused_by_name_place_and_remedy() {
+fn refuses_invalid_worlds_with_place_and_remedy() {
     let refused = |text: &str| -> Failure { World::of_toml("w.toml", text).expect_err(text) };
     for (text, place, remedy) in [
         (
@@ -265,7 +268,7 @@ proptest! {
         match World::of_toml("w.toml", &characters.into_iter().collect::<String>()) {
             Ok(world) => {
                 for port in 0..world.sensors() as u64 {
-                    let look = look(&Room::of_port(&world, 1, port), 16_000_000_000);
+                    let look = scan_at(&Room::of_port(&world, 1, port), 16_000_000_000);
                     prop_assert_eq!(look.words.len(), 361);
                 }
             }
@@ -274,33 +277,34 @@ proptest! {
     }
 }
 
-const SECOND: Nanos = 1_000_000_000;
+const ONE_SECOND: Nanos = 1_000_000_000;
 /// No noise, but beams as wide as real ones.
-const WIDE: NoiseModel = NoiseModel { spot: true, ..NoiseModel::NONE };
+const WIDE_BEAMS: NoiseModel = NoiseModel { spot: true, ..NoiseModel::NONE };
 
 /// The looks at `text` with and without everything from `cut` on, which stands at its end.
-fn beside(text: &str, cut: &str, end_ns: Nanos) -> (LabeledScan, LabeledScan) {
+fn with_and_without(text: &str, cut: &str, end_ns: Nanos) -> (LabeledScan, LabeledScan) {
     let (without, _) = text.split_once(cut).expect("what is to be cut");
-    let look_at = |text: &str| look(&Room::new(&world(text).with_noise(WIDE), 4), end_ns);
+    let look_at = |text: &str| scan_at(&Room::new(&world(text).with_noise(WIDE_BEAMS), 4), end_ns);
     (look_at(text), look_at(without))
 }
 
 /// Nothing in the world may depend on the seed, or what is cut would move the rest.
-fn fixed(name: &str) -> String {
+fn without_randomness(name: &str) -> String {
     text(name).lines().filter(|line| !line.starts_with("jitter_mm")).collect::<Vec<_>>().join("\n")
 }
 
 #[test]
-fn persons_are_where_the_room_without_them_looks_different() {
+fn person_beams_differ_from_the_empty_room() {
     let (mut persons, mut grazed) = (0, 0);
     for tenth in 0..530 {
-        let (with, without) = beside(&fixed("fig8"), "[[person]]", tenth * SECOND / 10);
+        let (with, without) =
+            with_and_without(&without_randomness("fig8"), "[[person]]", tenth * ONE_SECOND / 10);
         let inside = (80..290).contains(&tenth);
-        for (beam, met) in with.truth.iter().enumerate() {
-            let (told, empty) = (with.words[beam], without.words[beam]);
-            match met {
+        for (beam, target) in with.truth.iter().enumerate() {
+            let (range, empty) = (with.words[beam], without.words[beam]);
+            match target {
                 BeamTarget::Person => {
-                    assert!(inside && told < empty, "beam {beam} at {tenth}: {told} before {empty}");
+                    assert!(inside && range < empty, "beam {beam} at {tenth}: {range} before {empty}");
                     persons += 1;
                 }
                 BeamTarget::Grazed if inside || without.truth[beam] != BeamTarget::Grazed => {
@@ -309,7 +313,7 @@ fn persons_are_where_the_room_without_them_looks_different() {
                 }
                 // Two surfaces far apart can cost a beam its signal.
                 BeamTarget::Invalid if inside => {}
-                _ => assert_eq!((told, met), (empty, &without.truth[beam]), "beam {beam} at {tenth}"),
+                _ => assert_eq!((range, target), (empty, &without.truth[beam]), "beam {beam} at {tenth}"),
             }
         }
     }
@@ -319,44 +323,52 @@ fn persons_are_where_the_room_without_them_looks_different() {
 #[test]
 fn a_box_says_since_when_it_stands() {
     let room = Room::new(&"fig8".parse().unwrap(), 2);
-    let boxes =
-        |end_ns| look(&room, end_ns).truth.into_iter().filter(|met| matches!(met, BeamTarget::Box { .. }));
-    assert_eq!(boxes(15 * SECOND).count(), 0);
-    for end_ns in [15 * SECOND + SECOND / 10, 50 * SECOND] {
+    let boxes = |end_ns| {
+        scan_at(&room, end_ns).truth.into_iter().filter(|target| matches!(target, BeamTarget::Box { .. }))
+    };
+    assert_eq!(boxes(15 * ONE_SECOND).count(), 0);
+    for end_ns in [15 * ONE_SECOND + ONE_SECOND / 10, 50 * ONE_SECOND] {
         assert!(boxes(end_ns).count() > 10);
-        assert!(boxes(end_ns).all(|met| met == BeamTarget::Box { since_ns: 15 * SECOND }));
+        assert!(boxes(end_ns).all(|target| target == BeamTarget::Box { since_ns: 15 * ONE_SECOND }));
     }
 }
 
 #[test]
-fn what_a_box_hid_is_static_and_new() {
+fn surface_uncovered_by_a_box_is_static_and_new() {
     let room = Room::new(&"fig8".parse().unwrap(), 2);
-    let gone_ns = 22 * SECOND + SECOND / 2;
+    let gone_ns = 22 * ONE_SECOND + ONE_SECOND / 2;
     let uncovered = |end_ns: Nanos| -> Vec<usize> {
-        let truth = look(&room, end_ns).truth;
+        let truth = scan_at(&room, end_ns).truth;
         (0..361).filter(|&beam| truth[beam] == BeamTarget::Static { since_ns: gone_ns }).collect()
     };
-    assert!(uncovered(gone_ns - SECOND).is_empty());
-    let beams = uncovered(50 * SECOND);
+    assert!(uncovered(gone_ns - ONE_SECOND).is_empty());
+    let beams = uncovered(50 * ONE_SECOND);
     assert!(beams.len() > 10, "{beams:?}");
-    let (before, after) = (look(&room, 5 * SECOND), look(&room, 50 * SECOND));
+    let (before, after) = (scan_at(&room, 5 * ONE_SECOND), scan_at(&room, 50 * ONE_SECOND));
     for beam in beams {
-        let away = before.truth[beam] != BeamTarget::Invalid && after.truth[beam] != BeamTarget::Invalid;
+        let is_valid_twice =
+            before.truth[beam] != BeamTarget::Invalid && after.truth[beam] != BeamTarget::Invalid;
         // At its edges a beam may have told what is behind it before.
         let edge = before.truth[beam - 2..beam + 3] != [BeamTarget::Static { since_ns: 0 }; 5];
         let [then, now] = [&before, &after].map(|look| i32::from(look.words[beam] & 8191));
-        assert!(!away || edge || now > then + 30 || (now - then).abs() < 60, "beam {beam}: {then} to {now}");
+        assert!(
+            !is_valid_twice || edge || now > then + 30 || (now - then).abs() < 60,
+            "beam {beam}: {then} to {now}"
+        );
     }
 }
 
 #[test]
 fn a_door_is_a_box_while_it_turns_and_since_it_rests() {
-    let room = Room::new(&world(&fixed("door")).with_noise(NoiseModel { comb: false, ..WIDE }), 1);
+    let room = Room::new(
+        &world(&without_randomness("door")).with_noise(NoiseModel { comb: false, ..WIDE_BEAMS }),
+        1,
+    );
     let since = |end_ns| {
-        let mut since: Vec<Nanos> = look(&room, end_ns)
+        let mut since: Vec<Nanos> = scan_at(&room, end_ns)
             .truth
             .iter()
-            .filter_map(|met| match met {
+            .filter_map(|target| match target {
                 BeamTarget::Box { since_ns } => Some(*since_ns),
                 _ => None,
             })
@@ -364,46 +376,46 @@ fn a_door_is_a_box_while_it_turns_and_since_it_rests() {
         since.dedup();
         since
     };
-    assert!(since(10 * SECOND).is_empty());
+    assert!(since(10 * ONE_SECOND).is_empty());
     // While it moves, the time of the mirror turn.
-    assert_eq!(since(14 * SECOND + SECOND / 2), [14 * SECOND + SECOND / 2 - 13_320_000]);
-    assert_eq!(since(20 * SECOND), [15 * SECOND + SECOND / 2]);
-    assert_eq!(since(50 * SECOND), [35 * SECOND + SECOND / 2]);
+    assert_eq!(since(14 * ONE_SECOND + ONE_SECOND / 2), [14 * ONE_SECOND + ONE_SECOND / 2 - 13_320_000]);
+    assert_eq!(since(20 * ONE_SECOND), [15 * ONE_SECOND + ONE_SECOND / 2]);
+    assert_eq!(since(50 * ONE_SECOND), [35 * ONE_SECOND + ONE_SECOND / 2]);
 }
 
 #[test]
-fn what_moves_away_is_no_box_but_uncovered() {
+fn receding_box_is_static_and_approaching_one_a_box() {
     let text =
         "[[thing]]\nbox = [600, 200]\npose = [0, 2000]\nmoves = [{ from_s = 5, until_s = 6, by = [0, DY] }]";
     let truth = |by: &str| {
-        let room = Room::new(&world(&text.replace("DY", by)).with_noise(WIDE), 1);
-        look(&room, 10 * SECOND).truth[180]
+        let room = Room::new(&world(&text.replace("DY", by)).with_noise(WIDE_BEAMS), 1);
+        scan_at(&room, 10 * ONE_SECOND).truth[180]
     };
-    assert_eq!(truth("-50"), BeamTarget::Box { since_ns: 6 * SECOND });
-    assert_eq!(truth("50"), BeamTarget::Static { since_ns: 6 * SECOND });
+    assert_eq!(truth("-50"), BeamTarget::Box { since_ns: 6 * ONE_SECOND });
+    assert_eq!(truth("50"), BeamTarget::Static { since_ns: 6 * ONE_SECOND });
 }
 
 #[test]
 fn a_code_is_invalid_whatever_the_beam_met() {
     let mut codes = 0;
     let room = Room::new(&"sun".parse().unwrap(), 1);
-    for end_ns in (13..40).map(|s| s * SECOND) {
-        let look = look(&room, end_ns);
-        for (word, met) in look.words.iter().zip(&look.truth) {
-            assert_eq!(word & 8191 >= 8183, *met == BeamTarget::Invalid);
-            codes += usize::from(*met == BeamTarget::Invalid);
+    for end_ns in (13..40).map(|s| s * ONE_SECOND) {
+        let look = scan_at(&room, end_ns);
+        for (word, target) in look.words.iter().zip(&look.truth) {
+            assert_eq!(word & 8191 >= 8183, *target == BeamTarget::Invalid);
+            codes += usize::from(*target == BeamTarget::Invalid);
         }
     }
     assert!(codes > 500, "{codes}");
 }
 
 /// Beams as thin as lines, each at its own time.
-const THIN: NoiseModel = NoiseModel { comb: true, ..NoiseModel::NONE };
+const THIN_BEAMS: NoiseModel = NoiseModel { comb: true, ..NoiseModel::NONE };
 
 /// The world with one sensor 1 m high that swings from 0 to 40 degrees, and `things`.
-fn tilted(things: &str) -> World {
+fn tilted_world(things: &str) -> World {
     let mount = "[sensor.mount]\nheight_mm = 1000\nfrom_deg = 0\nto_deg = 40\ndeg_s = 20\n";
-    world(&format!("[[sensor]]\npose = [0, 0, 90]\n{mount}\n{things}")).with_noise(THIN)
+    world(&format!("[[sensor]]\npose = [0, 0, 90]\n{mount}\n{things}")).with_noise(THIN_BEAMS)
 }
 
 fn mount(world: &World) -> &Mount {
@@ -413,7 +425,7 @@ fn mount(world: &World) -> &Mount {
 /// Returns the end points of the beams with a range in the scan that ended at `end_ns`: right, ahead and up in the
 /// frame of the mount's axis on the floor. Each beam has the angle of its own time.
 fn points(world: &World, end_ns: Nanos) -> Vec<(usize, [f64; 3], BeamTarget)> {
-    let scan = look(&Room::new(world, 1), end_ns);
+    let scan = scan_at(&Room::new(world, 1), end_ns);
     let head = ScanHead::lms(361, -90_000, 500, 1, 13);
     let times = Scan::of(head, &[0; 361]);
     let point = |beam: usize| {
@@ -428,22 +440,24 @@ fn points(world: &World, end_ns: Nanos) -> Vec<(usize, [f64; 3], BeamTarget)> {
 
 #[test]
 fn the_floor_is_at_nought_at_each_beams_own_time() {
-    let bare = tilted("");
-    let mut met = 0;
+    let bare = tilted_world("");
+    let mut count = 0;
     for tenth in 8..80 {
-        for (beam, [_, _, up], _) in points(&bare, tenth * SECOND / 10) {
+        for (beam, [_, _, up], _) in points(&bare, tenth * ONE_SECOND / 10) {
             assert!(up.abs() < 1.0, "beam {beam} at {tenth}: {up} mm");
-            met += 1;
+            count += 1;
         }
     }
-    assert!(met > 10_000, "{met}");
+    assert!(count > 10_000, "{count}");
 }
 
 #[test]
-fn things_end_at_their_height_and_a_board_has_room_below() {
+fn things_have_a_height_and_boards_space_below() {
     let all = |things: &str| {
-        let world = tilted(things);
-        (0..160).flat_map(|tenth| points(&world, 3 * SECOND + tenth * SECOND / 40)).collect::<Vec<_>>()
+        let world = tilted_world(things);
+        (0..160)
+            .flat_map(|tenth| points(&world, 3 * ONE_SECOND + tenth * ONE_SECOND / 40))
+            .collect::<Vec<_>>()
     };
     let on_it = |points: &[(usize, [f64; 3], BeamTarget)], from: f64, until: f64| {
         let within = |p: &[f64; 3]| p[0].abs() < 290.0 && (1400.0..2000.0).contains(&p[1]);
@@ -459,23 +473,23 @@ fn things_end_at_their_height_and_a_board_has_room_below() {
 }
 
 #[test]
-fn what_is_put_down_and_who_walks_is_known() {
+fn ground_truth_marks_people_and_placed_boxes() {
     let world: World = "tilt".parse().expect("built in");
-    let world = world.with_noise(THIN);
+    let world = world.with_noise(THIN_BEAMS);
     let count = |second: Nanos, is: &dyn Fn(&BeamTarget) -> bool| {
         let room = Room::new(&world, 1);
-        let scans = (0..80).map(|i| look(&room, second * SECOND + i * 26_640_000));
-        scans.flat_map(|scan| scan.truth).filter(|met| is(met)).count()
+        let scans = (0..80).map(|i| scan_at(&room, second * ONE_SECOND + i * 26_640_000));
+        scans.flat_map(|scan| scan.truth).filter(|target| is(target)).count()
     };
-    let is_person = |met: &BeamTarget| *met == BeamTarget::Person;
-    let is_box = |met: &BeamTarget| matches!(met, BeamTarget::Box { .. });
+    let is_person = |target: &BeamTarget| *target == BeamTarget::Person;
+    let is_box = |target: &BeamTarget| matches!(target, BeamTarget::Box { .. });
     assert_eq!((count(10, &is_person), count(10, &is_box)), (0, 0));
     assert!(count(40, &is_person) > 100);
     assert!(count(40, &is_box) > 300);
 }
 
 #[test]
-fn a_mount_that_cannot_be_is_refused_by_name_and_place() {
+fn refuses_invalid_mounts_by_name_and_place() {
     let refused = |mount: &str| {
         let text = format!("[[sensor]]\npose = [0, 0]\n[sensor.mount]\nheight_mm = 900\n{mount}\n");
         World::of_toml("w.toml", &text).expect_err("it is none").to_string()
@@ -493,6 +507,6 @@ fn a_mount_that_cannot_be_is_refused_by_name_and_place() {
 #[test]
 fn without_a_mount_heights_change_nothing() {
     let low = text("fig8").replace("[[thing]]", "[[thing]]\nheight_mm = 10");
-    let of = |text: &str| look(&Room::new(&world(text), 3), 20 * SECOND);
+    let of = |text: &str| scan_at(&Room::new(&world(text), 3), 20 * ONE_SECOND);
     assert_eq!(of(&low), of(&text("fig8")));
 }

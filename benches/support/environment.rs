@@ -1,0 +1,334 @@
+//! Where a bench runs: its own domain and directory, and the processes in it. Processes are read line by line and ended
+//! by their ID, however the bench ends.
+
+use std::io::{BufRead, BufReader};
+use std::path::{Path, PathBuf};
+use std::process::{Child as Process, Command, Stdio};
+use std::sync::mpsc::{Receiver, channel};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use rustix::process::{Pid, Signal, kill_process};
+use scanhub_shm::{Domain, Environment};
+
+use super::{Outcome, PART_WORD, clock};
+
+/// A domain and a directory of this process. Both are removed when it is dropped.
+pub(crate) struct BenchEnvironment {
+    pub(crate) domain: Domain,
+    directory: PathBuf,
+}
+
+impl BenchEnvironment {
+    /// Creates the domain and the directory of this process.
+    pub(crate) fn new() -> Outcome<BenchEnvironment> {
+        BenchEnvironment::create(&std::process::id().to_string())
+    }
+
+    /// Creates domain and directory number `number` of this process, for a bench that needs several.
+    pub(crate) fn numbered(number: usize) -> Outcome<BenchEnvironment> {
+        BenchEnvironment::create(&format!("{}-{number}", std::process::id()))
+    }
+
+    fn create(owner: &str) -> Outcome<BenchEnvironment> {
+        let environment = BenchEnvironment::open_existing(owner)?;
+        std::fs::create_dir_all(&environment.directory)?;
+        Ok(environment)
+    }
+
+    fn open_existing(owner: &str) -> Outcome<BenchEnvironment> {
+        let name = format!("bench-{owner}");
+        let domain = Domain::of_hub(&name, None, &Environment::of_process())?;
+        Ok(BenchEnvironment { domain, directory: std::env::temp_dir().join(format!("scanhub-{name}")) })
+    }
+
+    /// Removes what interrupted benches left behind.
+    pub(crate) fn remove_leftovers() -> Outcome<()> {
+        for entry in std::fs::read_dir(std::env::temp_dir())? {
+            let name = entry?.file_name().to_string_lossy().into_owned();
+            let Some(owner) = name.strip_prefix("scanhub-bench-") else { continue };
+            let pid = owner.split('-').next().and_then(|pid| pid.parse::<u32>().ok());
+            if pid.is_some_and(|pid| !Path::new(&format!("/proc/{pid}")).exists()) {
+                drop(BenchEnvironment::open_existing(owner)?);
+            }
+        }
+        Ok(())
+    }
+
+    /// Returns the path of a file in the directory.
+    pub(crate) fn file(&self, name: &str) -> PathBuf {
+        self.directory.join(name)
+    }
+
+    /// Returns the path of the file in which the simulator logs what it sent.
+    pub(crate) fn truth(&self) -> PathBuf {
+        self.directory.join("truth")
+    }
+
+    /// Returns the path at which the pty of `sensor` appears.
+    pub(crate) fn port(&self, sensor: &str) -> String {
+        self.directory.join(sensor).display().to_string()
+    }
+
+    /// Starts a simulator with idle sensors at ptys, at `rate`.
+    pub(crate) fn simulate(&self, sensors: &[&str], rate: u32) -> Outcome<Child> {
+        self.simulator(sensors, Some(&self.truth()), &["--baud", &rate.to_string()])
+    }
+
+    /// Starts a simulator with sensors that stream at 500 kBd to any program that opens their ptys. It logs nothing.
+    pub(crate) fn simulate_streaming(&self, sensors: &[&str]) -> Outcome<Child> {
+        self.simulate_as(sensors, &["--baud", "500000", "--state", "streaming"])
+    }
+
+    /// Starts a simulator with sensors at ptys and more `flags`. It logs nothing.
+    pub(crate) fn simulate_as(&self, sensors: &[&str], flags: &[&str]) -> Outcome<Child> {
+        self.simulator(sensors, None, flags)
+    }
+
+    /// Starts a simulator with one sensor and more `flags`. It logs to [`BenchEnvironment::own_truth`].
+    pub(crate) fn simulate_one(&self, sensor: &str, flags: &[&str]) -> Outcome<Child> {
+        self.simulator(&[sensor], Some(&self.own_truth(sensor)), flags)
+    }
+
+    /// Returns the path of the log of a sensor that has its own simulator.
+    pub(crate) fn own_truth(&self, sensor: &str) -> PathBuf {
+        self.directory.join(format!("truth-{sensor}"))
+    }
+
+    fn simulator(&self, sensors: &[&str], truth: Option<&Path>, flags: &[&str]) -> Outcome<Child> {
+        let mut words: Vec<String> =
+            ["simulate", "--seed", "1"].iter().chain(flags).map(|word| word.to_string()).collect();
+        words.extend(truth.iter().flat_map(|truth| ["--truth".into(), truth.display().to_string()]));
+        words.extend(sensors.iter().flat_map(|sensor| ["--port".into(), self.port(sensor)]));
+        let child = Child::start(PROGRAM, &words)?;
+        child.wait_for_line("ready", STEP_TIMEOUT)?;
+        Ok(child)
+    }
+
+    /// Starts the hub. Its first line says that it is up.
+    pub(crate) fn start_hub(&self, sensors: &[&str]) -> Outcome<Child> {
+        Child::spawn(self.hub_command(PROGRAM, sensors), Stdio::null())
+    }
+
+    /// Starts the hub with room for [`MAX_SUBSCRIBERS`] subscribers.
+    pub(crate) fn hub_with_many_slots(&self, sensors: &[&str]) -> Outcome<Child> {
+        let mut command = self.hub_command(PROGRAM, sensors);
+        command.arg(format!("--set=limits.subscribers={MAX_SUBSCRIBERS}"));
+        Child::spawn(command, Stdio::null())
+    }
+
+    /// Returns the command that starts the hub.
+    pub(crate) fn hub_command(&self, program: &str, sensors: &[&str]) -> Command {
+        self.hub_command_on(self, program, sensors)
+    }
+
+    /// Returns the command that starts the hub with the sensors of another stage, `lines`.
+    pub(crate) fn hub_command_on(
+        &self,
+        lines: &BenchEnvironment,
+        program: &str,
+        sensors: &[&str],
+    ) -> Command {
+        let mut command = Command::new(program);
+        command.args(["run", "--domain", self.domain.name()]);
+        // The state of the hub is removed with the stage.
+        command.env("XDG_STATE_HOME", &self.directory).env_remove("STATE_DIRECTORY");
+        sensors.iter().for_each(|sensor| {
+            // Without the time and the shared memory of a search.
+            command.args(["--link", &format!("{sensor}={},family=lms", lines.port(sensor))]);
+        });
+        command
+    }
+
+    /// Starts this program as a subscriber of `topic`, with more `words`.
+    pub(crate) fn start_subscriber(&self, topic: &str, sensor: &str, words: &[&str]) -> Outcome<Child> {
+        self.start_part(&[&["consume", topic, self.domain.name(), sensor], words].concat())
+    }
+
+    /// Starts this program as the baseline that reads `count` telegrams from each port, and wakes up `lead` nanoseconds
+    /// before the expected end of each; 0: as long before it as the hub does.
+    pub(crate) fn start_baseline(
+        &self,
+        sensors: &[&str],
+        count: usize,
+        wake_ahead_ns: u64,
+    ) -> Outcome<Child> {
+        let ports: Vec<String> = sensors.iter().map(|sensor| self.port(sensor)).collect();
+        let mut words: Vec<&str> = ports.iter().map(String::as_str).collect();
+        let (count, lead) = (count.to_string(), wake_ahead_ns.to_string());
+        words.splice(0..0, ["bare", &count, &lead]);
+        self.start_part(&words)
+    }
+
+    /// Starts this program in one of its parts.
+    pub(crate) fn start_part(&self, words: &[&str]) -> Outcome<Child> {
+        let words: Vec<String> =
+            std::iter::once(&PART_WORD).chain(words).map(|word| word.to_string()).collect();
+        Child::start(&std::env::current_exe()?.display().to_string(), &words)
+    }
+}
+
+impl Drop for BenchEnvironment {
+    fn drop(&mut self) {
+        // The domain's name contains this process's ID, so nothing here belongs to another process.
+        let _ = std::fs::remove_dir_all(&self.directory);
+        let _ = std::fs::remove_dir_all(self.domain.root());
+        let entries = std::fs::read_dir("/dev/shm").into_iter().flatten().flatten();
+        let prefix = self.domain.prefix();
+        for entry in entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(&prefix)) {
+            let _ = std::fs::remove_file(entry.path());
+        }
+    }
+}
+
+/// The two sensors of a vehicle.
+pub(crate) const SENSORS: [&str; 2] = ["front", "rear"];
+/// The sensors of a vehicle with one on each side.
+pub(crate) const ALL_AROUND: [&str; 4] = ["front", "rear", "left", "right"];
+/// Number of subscribers of a topic that [`BenchEnvironment::hub_with_many_slots`] has room for.
+pub(crate) const MAX_SUBSCRIBERS: usize = 200;
+/// Timeout, far longer than any step takes.
+pub(crate) const STEP_TIMEOUT: Duration = Duration::from_secs(20);
+/// The program of this build.
+pub(crate) const PROGRAM: &str = env!("CARGO_BIN_EXE_scanhub");
+
+/// A process that is ended when this value is dropped.
+pub(crate) struct GuardedProcess(Process);
+
+impl GuardedProcess {
+    /// Takes over a process that was started.
+    pub(crate) fn new(process: Process) -> GuardedProcess {
+        GuardedProcess(process)
+    }
+
+    /// Returns the process ID.
+    pub(crate) fn pid(&self) -> u32 {
+        self.0.id()
+    }
+
+    /// Ends the process as a crash would. Fails if it ended before.
+    pub(crate) fn kill(mut self) -> Outcome<()> {
+        if let Some(status) = self.0.try_wait()? {
+            return Err(format!("process {} ended early: {status}", self.pid()).into());
+        }
+        self.0.kill()?;
+        self.wait()
+    }
+
+    /// Waits until the process has ended.
+    pub(crate) fn wait(mut self) -> Outcome<()> {
+        self.0.wait()?;
+        Ok(())
+    }
+}
+
+impl Drop for GuardedProcess {
+    fn drop(&mut self) {
+        if let (Ok(None), Some(pid)) = (self.0.try_wait(), Pid::from_raw(self.0.id() as i32)) {
+            let _ = kill_process(pid, Signal::TERM);
+        }
+        let deadline = Instant::now() + Duration::from_secs(2);
+        while let Ok(None) = self.0.try_wait() {
+            if Instant::now() > deadline {
+                let _ = self.0.kill();
+                let _ = self.0.wait();
+                return;
+            }
+            thread::sleep(Duration::from_millis(1));
+        }
+    }
+}
+
+/// A guarded process with the lines that it prints.
+pub(crate) struct Child {
+    pub(crate) guard: GuardedProcess,
+    lines: Receiver<OutputLine>,
+    /// CLOCK_MONOTONIC just before the start.
+    pub(crate) started_ns: u64,
+}
+
+/// A line that a process printed, with the time at which it was read.
+#[derive(Clone, Debug)]
+pub(crate) struct OutputLine {
+    pub(crate) at_ns: u64,
+    pub(crate) text: String,
+}
+
+impl OutputLine {
+    /// Returns the words of the line.
+    pub(crate) fn words(&self) -> Vec<&str> {
+        self.text.split_whitespace().collect()
+    }
+
+    /// Returns word number `i` as a number.
+    pub(crate) fn number(&self, i: usize) -> Outcome<u64> {
+        let word =
+            self.text.split_whitespace().nth(i).ok_or_else(|| format!("no word {i}: {}", self.text))?;
+        Ok(word.parse()?)
+    }
+}
+
+impl Child {
+    /// Starts `program` with `arguments`.
+    pub(crate) fn start(program: &str, arguments: &[String]) -> Outcome<Child> {
+        let mut command = Command::new(program);
+        command.args(arguments);
+        Child::spawn(command, Stdio::null())
+    }
+
+    /// Starts `command` with this stdin.
+    pub(crate) fn spawn(mut command: Command, stdin: Stdio) -> Outcome<Child> {
+        command.stdin(stdin).stdout(Stdio::piped());
+        // The child ends with this process, and logs only errors.
+        command.env("SCANHUB_END_WITH_PARENT", "1").env("SCANHUB_LOG", "error");
+        let started_ns = clock::now();
+        let mut process = command.spawn()?;
+        let stdout = process.stdout.take();
+        let guard = GuardedProcess::new(process);
+        let stdout = BufReader::new(stdout.ok_or("no pipe")?);
+        let (send, lines) = channel();
+        thread::spawn(move || {
+            for text in stdout.lines().map_while(Result::ok) {
+                if send.send(OutputLine { at_ns: clock::now(), text }).is_err() {
+                    return;
+                }
+            }
+        });
+        Ok(Child { guard, lines, started_ns })
+    }
+
+    /// Returns the next line that begins with `word`, and drops the lines before it.
+    pub(crate) fn wait_for_line(&self, word: &str, timeout: Duration) -> Outcome<OutputLine> {
+        let end = Instant::now() + timeout;
+        loop {
+            match self.lines.recv_timeout(end.saturating_duration_since(Instant::now())) {
+                Ok(line) if line.text.starts_with(word) => return Ok(line),
+                Ok(_) => {}
+                Err(_) => return Err(format!("no line {word:?} came").into()),
+            }
+        }
+    }
+
+    /// Returns the next line.
+    pub(crate) fn next_line(&self, timeout: Duration) -> Outcome<OutputLine> {
+        self.lines.recv_timeout(timeout).map_err(|_| "no line came".into())
+    }
+
+    /// Returns all lines before the one that is `word`.
+    pub(crate) fn lines_until(&self, word: &str, timeout: Duration) -> Outcome<Vec<OutputLine>> {
+        let end = Instant::now() + timeout;
+        let mut lines = Vec::new();
+        loop {
+            match self.lines.recv_timeout(end.saturating_duration_since(Instant::now())) {
+                Ok(line) if line.text == word => return Ok(lines),
+                Ok(line) => lines.push(line),
+                Err(_) => return Err(format!("no line {word:?} came after {} lines", lines.len()).into()),
+            }
+        }
+    }
+
+    /// Returns the lines that have arrived, without waiting.
+    pub(crate) fn lines_so_far(&self) -> Vec<OutputLine> {
+        self.lines.try_iter().collect()
+    }
+}

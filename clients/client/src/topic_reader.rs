@@ -1,0 +1,244 @@
+//! Receives one topic of one sensor, sample by sample, and counts missed samples by their sequence numbers. It
+//! continues by itself when the hub is replaced. It never waits: the session does that.
+
+use std::mem;
+use std::ops::Deref;
+use std::time::{Duration, Instant};
+
+use scanhub_schema::{Flags, Header, Kind, Scan};
+use scanhub_shm::{Payload, ReceiveError, Sample, Subscriber, ThreadSafeService};
+
+use crate::error::{Error, ErrorKind};
+use crate::session::Session;
+use crate::silence::{Silence, SilenceCheck};
+
+/// A sample in shared memory: `*` gives the payload, read-only, without a copy. Hold at most four samples of a
+/// subscriber at a time. They stay valid while it waits, and after the hub has ended.
+#[derive(Debug)]
+pub struct Received<P: Payload + ?Sized> {
+    sample: Sample<P, ThreadSafeService>,
+    /// Samples of this topic that were sent before this one and not received.
+    pub missed: u64,
+    /// The hub was restarted since the last sample: its numbers start again at 0.
+    pub restarted: bool,
+}
+
+impl<P: Payload + ?Sized> Received<P> {
+    /// Returns numbers, stamps and quality of the sample.
+    pub fn header(&self) -> &Header {
+        self.sample.user_header()
+    }
+}
+
+impl<P: Payload + ?Sized> Deref for Received<P> {
+    type Target = P;
+
+    fn deref(&self) -> &P {
+        P::read(&self.sample)
+    }
+}
+
+impl Received<Scan> {
+    /// Returns CLOCK_MONOTONIC when beam `i` was measured, in ns: stamps are of bytes on the wire, the measurement is
+    /// older.
+    pub fn beam_time_ns(&self, i: usize) -> u64 {
+        self.header().stamp_first_ns.saturating_add_signed(self.beam_ns(i))
+    }
+}
+
+/// Follows one topic, also across restarts of the hub.
+pub struct TopicReader<P: Payload + ?Sized> {
+    sensor: String,
+    port: Option<(u32, Subscriber<P, ThreadSafeService>)>,
+    tried_at: Option<Instant>,
+    /// Reason why the last attempt to subscribe found no place, memory or descriptor.
+    refused: Option<Error>,
+    sequence: SequenceTracker,
+    unconnected_since: Option<Instant>,
+    /// Moment of the session in which no sample had arrived.
+    empty_at: Option<(u32, Instant)>,
+    silence: SilenceCheck,
+}
+
+/// Interval of the attempts to open a topic that does not exist yet.
+const RETRY_INTERVAL: Duration = Duration::from_millis(50);
+
+/// Time after which a failure to connect to a publisher is reported. While a hub exits, such failures are normal.
+const CONNECTION_FAILURE_TIMEOUT: Duration = Duration::from_secs(3);
+
+impl<P: Payload + ?Sized> TopicReader<P> {
+    /// Creates a follower of the topic of `sensor`, which may not exist yet.
+    pub fn new(sensor: &str) -> TopicReader<P> {
+        TopicReader {
+            sensor: sensor.to_owned(),
+            port: None,
+            tried_at: None,
+            refused: None,
+            sequence: SequenceTracker::default(),
+            unconnected_since: None,
+            empty_at: None,
+            silence: SilenceCheck::default(),
+        }
+    }
+
+    /// Returns whether the topic has existed at least once.
+    pub fn subscribed(&self) -> bool {
+        self.port.is_some()
+    }
+
+    /// Returns why no sample arrives. It never waits, and is cheap enough for once a second. The first call after a
+    /// sample can return [`Silence::Waiting`], because it has just subscribed to the status of the sensor.
+    pub fn why_silent(&mut self, session: &mut Session) -> Silence {
+        let mut silence = mem::take(&mut self.silence);
+        let reason = silence.reason(session, self);
+        self.silence = silence;
+        reason
+    }
+
+    pub(crate) fn sensor(&self) -> &str {
+        &self.sensor
+    }
+
+    /// Returns whether it is subscribed to the topic of the session's present hub.
+    pub(crate) fn is_attached(&self, session: &Session) -> bool {
+        self.port.as_ref().is_some_and(|(number, _)| *number == session.join_count())
+    }
+
+    /// Returns the reason why the last attempt to subscribe found no place, memory or descriptor.
+    pub(crate) fn refused(&self) -> Option<&Error> {
+        self.refused.as_ref()
+    }
+
+    /// Returns the next sample that has arrived.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::TooManyHeld`] if the program holds four samples and another one has arrived,
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if descriptors or memory are short,
+    /// [`ErrorKind::Incompatible`](crate::ErrorKind) if the topic has another layout.
+    pub fn receive(&mut self, session: &mut Session) -> Result<Option<Received<P>>, Error> {
+        let received = self.receive_quietly(session)?;
+        if received.is_some() {
+            session.note_sample();
+            self.silence = SilenceCheck::default();
+        }
+        Ok(received)
+    }
+
+    /// Returns the next sample that has arrived, and does not end a silence of the session by it.
+    pub(crate) fn receive_quietly(&mut self, session: &mut Session) -> Result<Option<Received<P>>, Error> {
+        if !self.subscribe(session)? {
+            return Ok(None);
+        }
+        let Some((_, subscriber)) = &self.port else {
+            return Ok(None);
+        };
+        let mark = session.sample_mark(&self.sensor, P::TOPIC);
+        if mark.is_some() && mark == self.empty_at {
+            return Ok(None);
+        }
+        match P::receive(subscriber) {
+            Ok(sample) => {
+                self.unconnected_since = None;
+                self.empty_at = mark.filter(|_| sample.is_none());
+                Ok(sample.map(|sample| self.count(sample)))
+            }
+            Err(ReceiveError::ExceedsMaxBorrows) => Err(Error::TooManyHeld),
+            // Occurs while the memory of a killed hub is being removed. If it persists, it is a shortage.
+            Err(ReceiveError::ConnectionFailure(error)) => {
+                let since = *self.unconnected_since.get_or_insert_with(Instant::now);
+                if since.elapsed() < CONNECTION_FAILURE_TIMEOUT {
+                    return Ok(None);
+                }
+                let what = format!("cannot connect to {}/{}: {error:?}", self.sensor, P::TOPIC.name());
+                Err(Error::new(Kind::ResourceExhausted, what, "`ulimit -n` or /dev/shm may be too small"))
+            }
+        }
+    }
+
+    fn subscribe(&mut self, session: &mut Session) -> Result<bool, Error> {
+        if self.is_attached(session) {
+            return Ok(true);
+        }
+        if self.tried_at.is_some_and(|at| at.elapsed() < RETRY_INTERVAL) {
+            return Ok(false);
+        }
+        self.tried_at = Some(Instant::now());
+        let subscriber = session.subscribe::<P>(&self.sensor);
+        self.refused = match &subscriber {
+            Err(error) if error.kind() == ErrorKind::ResourceExhausted => Some(error.clone()),
+            _ => None,
+        };
+        let Some(subscriber) = subscriber? else {
+            return Ok(false);
+        };
+        self.port = Some((session.join_count(), subscriber));
+        self.sequence.reset();
+        self.empty_at = None;
+        Ok(true)
+    }
+
+    fn count(&mut self, sample: Sample<P, ThreadSafeService>) -> Received<P> {
+        let SequenceGap { missed, restarted } = self.sequence.note(sample.user_header());
+        Received { sample, missed, restarted }
+    }
+}
+
+/// Sequence numbers of one topic of one sensor, as one subscriber receives them.
+#[derive(Clone, Debug, Default)]
+pub struct SequenceTracker {
+    boot: Option<u64>,
+    expected: Option<u64>,
+}
+
+/// Result of comparing the number of a sample with the one before.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SequenceGap {
+    /// Samples of this topic that were sent before this one and not received.
+    pub missed: u64,
+    /// The hub was restarted since the last sample: its numbers start again at 0.
+    pub restarted: bool,
+}
+
+impl SequenceTracker {
+    /// Continues at the number of the next sample, because the port is a new one.
+    pub fn reset(&mut self) {
+        self.expected = None;
+    }
+
+    /// Takes the sample with `header`. A port that was open before the hub started receives the hub's samples from
+    /// number 0; a new port starts at any number.
+    pub fn note(&mut self, header: &Header) -> SequenceGap {
+        let restarted = self.boot.is_some_and(|boot| boot != header.boot);
+        // Numbers of remote topics continue when the hub on the other machine restarts.
+        let is_remote = header.flags & Flags::REMOTE != 0;
+        if restarted && !is_remote && self.expected.is_some() {
+            self.expected = Some(0);
+        }
+        let missed = self.expected.map_or(0, |expected| header.topic_seq.saturating_sub(expected));
+        self.boot = Some(header.boot);
+        self.expected = Some(header.topic_seq + 1);
+        SequenceGap { missed, restarted }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn gaps_count_and_another_hub_begins_at_0() {
+        let mut numbers = SequenceTracker::default();
+        let mut note = |boot, topic_seq, flags| {
+            let SequenceGap { missed, restarted } =
+                numbers.note(&Header { boot, topic_seq, flags, ..Header::default() });
+            (missed, restarted)
+        };
+        assert_eq!((note(1, 7, 0), note(1, 8, 0), note(1, 11, 0)), ((0, false), (0, false), (2, false)));
+        assert_eq!((note(2, 3, 0), note(2, 4, 0)), ((3, true), (0, false)));
+        assert_eq!(note(3, 9, Flags::REMOTE), (4, true), "a network's numbers go on");
+        numbers.reset();
+        let later = Header { boot: 3, topic_seq: 50, ..Header::default() };
+        assert_eq!(numbers.note(&later), SequenceGap { missed: 0, restarted: false });
+    }
+}

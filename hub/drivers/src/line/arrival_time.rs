@@ -1,0 +1,230 @@
+//! Latest and earliest possible arrival of a byte. A port only reports when a read returned and how many bytes it had.
+
+use scanhub_schema::{Nanos, line_time};
+
+/// The last reads, newest last, by the number of the byte after their last one.
+#[derive(Clone, Debug, Default)]
+pub struct ReadLog {
+    reads: [(u64, Nanos); ReadLog::CAPACITY],
+    next: usize,
+    total: u64,
+}
+
+/// Timing of a stream: on average, bytes are `byte_ns` nanoseconds apart. Those of a packet of `packet_len` may arrive
+/// at once, or at the speed of a line with `pace` bits per second.
+#[derive(Clone, Copy, Debug)]
+pub struct StreamTiming {
+    /// Mean nanoseconds from one byte to the next.
+    pub byte_ns: f64,
+    /// Length of a packet in bytes.
+    pub packet_len: usize,
+    /// Bits per second, if bytes arrive at the pace of a line.
+    pub line_rate: Option<u32>,
+}
+
+impl ReadLog {
+    /// A packet in pieces of 16 bytes, and another one that begins inside it.
+    const CAPACITY: usize = 8;
+
+    /// Handles a read of `len` bytes at `now`.
+    pub fn note_read(&mut self, now: Nanos, len: usize) {
+        if len > 0 {
+            self.total += len as u64;
+            self.reads[self.next % ReadLog::CAPACITY] = (self.total, now);
+            self.next += 1;
+        }
+    }
+
+    /// Returns the number of bytes read.
+    pub fn total(&self) -> u64 {
+        self.total
+    }
+
+    /// Returns the latest possible arrival of byte number `offset`. Bytes after it took their time on a line of `pace`
+    /// bits per second, if it was one, but none of them had arrived at the previous read.
+    pub fn latest(&self, offset: u64, line_rate: Option<u32>) -> Nanos {
+        let oldest = self.next.saturating_sub(ReadLog::CAPACITY);
+        let mut latest = Nanos::MAX;
+        for n in (oldest..self.next).rev() {
+            let (end, now) = self.reads[n % ReadLog::CAPACITY];
+            if end <= offset {
+                break;
+            }
+            let line_delay = line_rate.map_or(0, |baud| line_time((end - offset - 1) as usize, baud));
+            let (_, before) = if n > oldest { self.reads[(n - 1) % ReadLog::CAPACITY] } else { (0, 0) };
+            latest = latest.min(now.saturating_sub(line_delay).max(before));
+        }
+        latest
+    }
+
+    /// Returns the earliest possible arrival of byte number `offset` of a stream. `None` if it is not known, because
+    /// more bytes arrived at once than were sent since the previous read, so it was in a backlog.
+    pub fn earliest(&self, offset: u64, timing: StreamTiming) -> Option<Nanos> {
+        // The last piece of a backlog in a full tty is shorter, and some more bytes may arrive a moment later.
+        let is_backlog_end = |n: usize| {
+            n > self.oldest() + 2
+                && self.read(n - 2).0 - self.read(n - 3).0 >= MAX_TTY_READ as u64
+                && self.has_backlog(n - 1, timing)
+        };
+        let n = self.read_containing(offset).filter(|&n| !is_backlog_end(n))?;
+        self.earliest_in_read(n, offset, timing)
+    }
+
+    /// Returns the [`earliest`](Self::earliest) possible arrival of a byte after missing ones, which is not the rest of
+    /// a backlog. In a backlog of a full tty, it is known if almost no bytes follow: the byte arrived when there was
+    /// space again, or shortly before.
+    pub fn earliest_after_gap(&self, offset: u64, timing: StreamTiming) -> Option<Nanos> {
+        let n = self.read_containing(offset)?;
+        self.earliest_in_read(n, offset, timing).or_else(|| {
+            // The first of the consecutive reads that had more bytes than were sent since the one before.
+            let first = (self.oldest() + 1..=n).rev().take_while(|&n| self.has_backlog(n, timing)).last()?;
+            let ((begin, since), (end, now)) = (self.read(first - 1), self.read(n));
+            let delay = end.saturating_sub(offset + ADAPTER_BUFFER_LEN) as f64 * timing.byte_ns;
+            let was_full = end - begin >= MAX_TTY_READ as u64;
+            (was_full && delay <= 1.25 * now.saturating_sub(since) as f64).then_some(since)
+        })
+    }
+
+    /// Returns the number of the oldest stored read.
+    fn oldest(&self) -> usize {
+        self.next.saturating_sub(ReadLog::CAPACITY)
+    }
+
+    /// Returns the number of the byte after the last one of read `n`, and the time of the read.
+    fn read(&self, n: usize) -> (u64, Nanos) {
+        self.reads[n % ReadLog::CAPACITY]
+    }
+
+    /// Returns the read with byte number `offset`, or the newest one before.
+    fn read_containing(&self, offset: u64) -> Option<usize> {
+        (self.oldest() + 1..self.next).rev().find(|&n| self.read(n - 1).0 <= offset)
+    }
+
+    /// Returns whether read `n` had more bytes than were sent since the one before.
+    fn has_backlog(&self, n: usize, timing: StreamTiming) -> bool {
+        let ((begin, before), (end, now)) = (self.read(n - 1), self.read(n));
+        (end - begin) as f64 * timing.byte_ns > 1.25 * now.saturating_sub(before) as f64
+    }
+
+    /// Returns the earliest possible arrival of byte number `offset` of read `n`, if the whole backlog was read before.
+    fn earliest_in_read(&self, n: usize, offset: u64, timing: StreamTiming) -> Option<Nanos> {
+        let ((begin, before), (end, now)) = (self.read(n - 1), self.read(n));
+        let is_backlog_end = n > self.oldest() + 1 && begin - self.read(n - 2).0 >= MAX_TTY_READ as u64;
+        let sent = (end - begin).saturating_sub(timing.packet_len as u64) as f64 * timing.byte_ns;
+        // After a full read, a tty may return some more bytes a moment later, which prove nothing.
+        if offset >= end || is_backlog_end || sent > 1.25 * now.saturating_sub(before) as f64 {
+            return None;
+        }
+        let line_time = |bytes: u64| timing.line_rate.map_or(0, |baud| line_time(bytes as usize, baud));
+        let packet = timing.packet_len as u64;
+        // The part of the packet in this read took its time on the line.
+        let before = (before + line_time((offset + 1 - begin).min(packet))).min(now);
+        // Every adapter has space for this few bytes: if others had been dropped, these would have been, too.
+        let idle = (packet as f64 * timing.byte_ns) as Nanos;
+        let delay =
+            ((end - offset) as f64 * timing.byte_ns) as Nanos + idle.saturating_sub(line_time(packet));
+        let arrival = if end - begin <= ADAPTER_BUFFER_LEN { now.saturating_sub(delay) } else { 0 };
+        Some(arrival.max(before))
+    }
+}
+
+/// Number of bytes that every adapter buffers for a late host.
+const ADAPTER_BUFFER_LEN: u64 = 256;
+/// Maximum number of bytes that a tty returns at once.
+pub(crate) const MAX_TTY_READ: usize = 4_095;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use scanhub_schema::MILLIS;
+
+    #[test]
+    fn later_bytes_took_their_time() {
+        let mut arrivals = ReadLog::default();
+        arrivals.note_read(1_000_000, 100);
+        arrivals.note_read(1_500_000, 0);
+        arrivals.note_read(2_000_000, 10);
+        let byte = line_time(1, 1_000_000);
+        assert_eq!(arrivals.latest(99, Some(1_000_000)), 1_000_000);
+        assert_eq!(arrivals.latest(90, Some(1_000_000)), 1_000_000 - 9 * byte);
+        assert_eq!(arrivals.latest(109, Some(1_000_000)), 2_000_000);
+        assert_eq!(arrivals.latest(90, None), 1_000_000);
+        // Two reads of buffered bytes.
+        arrivals.note_read(2_000_001, 30);
+        assert_eq!(arrivals.latest(109, Some(1_000_000)), 2_000_000, "not before it was read");
+        arrivals.note_read(3_000_000, 200);
+        assert_eq!(arrivals.latest(139, Some(1_000_000)), 2_000_001, "faster than a line");
+        assert_eq!(arrivals.latest(300, Some(1_000_000)), 3_000_000 - 39 * byte);
+    }
+
+    /// Returns the timing of bytes that arrive one by one, `byte_ns` apart.
+    fn evenly(byte_ns: f64) -> StreamTiming {
+        StreamTiming { byte_ns, packet_len: 0, line_rate: None }
+    }
+
+    #[test]
+    fn backlogged_bytes_may_be_old() {
+        let (mut arrivals, flow) = (ReadLog::default(), evenly(100_000.0));
+        let at = |millis: Nanos| millis * MILLIS;
+        arrivals.note_read(at(1_000), 50);
+        arrivals.note_read(at(1_005), 50);
+        assert_eq!(arrivals.earliest(10, flow), None, "nothing was read before");
+        assert_eq!(arrivals.earliest(60, flow), Some(at(1_001)));
+        arrivals.note_read(at(2_005), 100);
+        assert_eq!(arrivals.earliest(100, flow), Some(at(1_995)), "nothing was sent before");
+        arrivals.note_read(at(3_005), 4_000);
+        assert_eq!(arrivals.earliest(4_100, flow), Some(at(2_005)), "others after it may have been dropped");
+        arrivals.note_read(at(3_010), 700);
+        assert_eq!(arrivals.earliest(4_300, flow), None, "all bytes were buffered");
+        arrivals.note_read(at(3_015), 50);
+        assert_eq!(arrivals.earliest(4_910, flow), Some(at(3_011)));
+    }
+
+    #[test]
+    fn packets_arrive_in_one_piece() {
+        let (mut arrivals, flow) = (ReadLog::default(), evenly(100_000.0));
+        let packets = StreamTiming { packet_len: 84, ..flow };
+        let on_a_line = StreamTiming { line_rate: Some(400_000), ..packets };
+        let at = |millis: Nanos| millis * MILLIS;
+        arrivals.note_read(at(1_000), 84);
+        // A pause, and then a packet at the speed of the line.
+        arrivals.note_read(at(1_500), 16);
+        arrivals.note_read(at(1_505), 68);
+        assert_eq!(arrivals.earliest(167, flow), None);
+        assert_eq!(arrivals.earliest(167, packets), Some(at(1_500)), "at once, and nothing since");
+        assert_eq!(arrivals.earliest(167, on_a_line), Some(at(1_500) + line_time(68, 400_000)));
+        // The rest after a full read was buffered, however short it is.
+        arrivals.note_read(at(2_500), 4_095);
+        arrivals.note_read(at(2_501), 60);
+        assert_eq!(arrivals.earliest(4_300, packets), None);
+        // That includes the rest after the last piece of a backlog, which is shorter.
+        arrivals.note_read(at(3_500), 4_095);
+        arrivals.note_read(at(3_501), 4_056);
+        arrivals.note_read(at(3_507), 70);
+        let rest = 84 + 84 + 4_095 + 60 + 4_095 + 4_056;
+        assert_eq!(arrivals.earliest(rest + 40, packets), None);
+        assert_eq!(arrivals.earliest_after_gap(rest + 40, packets), Some(at(3_501)));
+    }
+
+    #[test]
+    fn full_tty_has_space_once_it_is_read() {
+        let mut arrivals = ReadLog::default();
+        let packets = StreamTiming { packet_len: 84, ..evenly(15_000.0) };
+        let at = |millis: Nanos| millis * MILLIS;
+        arrivals.note_read(at(1_000), 420);
+        // A tty may need some time to return more.
+        let reads = [(1_500, 4_095), (1_501, 4_095), (1_502, 900), (1_507, 4_095)];
+        reads.iter().for_each(|&(ms, len)| arrivals.note_read(at(ms), len));
+        let end = 420 + 3 * 4_095 + 900;
+        assert_eq!(arrivals.earliest_after_gap(end - 100, packets), Some(at(1_500)));
+        let early = arrivals.earliest_after_gap(end - 4_000, packets);
+        assert_eq!(early, None, "it was buffered, or the bytes after it were");
+        arrivals.note_read(at(1_508), 2_000);
+        assert_eq!(arrivals.earliest_after_gap(end + 1_700, packets), Some(at(1_500)));
+        assert_eq!(arrivals.earliest_after_gap(end + 500, packets), None);
+        assert_eq!(arrivals.earliest(end + 1_700, packets), None);
+        arrivals.note_read(at(1_513), 336);
+        assert_eq!(arrivals.earliest_after_gap(end + 1_700, packets), Some(at(1_500)), "known later, too");
+        assert_eq!(arrivals.earliest_after_gap(end + 2_100, packets), Some(at(1_508)), "as without a gap");
+    }
+}

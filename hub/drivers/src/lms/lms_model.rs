@@ -1,0 +1,171 @@
+//! The members of the family, and what each of them cannot do, with the reason. Recognised from what a sensor says of
+//! itself; knows nothing of a particular sensor's settings.
+
+use crate::line::family::named;
+use crate::lms::command::{
+    CARTESIAN, COUNTERS, FIELD, FIELD_SET, RANGE_FIELDS, REFLECTIVITIES, REFLECTIVITY, Request,
+};
+use crate::lms::operating::Operating;
+use crate::lms::variant::{Unit, Variant};
+
+named! {
+    /// A type of sensor.
+    LmsModel {
+        /// Indoors.
+        Lms200 "lms200",
+        /// Outdoors, behind a window of 100 degrees.
+        Lms211 "lms211",
+        /// Outdoors; an LMS 220 is one.
+        Lms221 "lms221",
+        /// Indoors, long range.
+        Lms291 "lms291",
+        /// Version S14 of an LMS 211, 221 or 291: twice as fast, 90 degrees at 0.5 and nothing else.
+        Fast "s14",
+    }
+}
+
+impl LmsModel {
+    /// The one that is called so in configurations.
+    pub fn of_name(name: &str) -> Option<LmsModel> {
+        LmsModel::ALL.into_iter().find(|family| family.name().eq_ignore_ascii_case(name))
+    }
+
+    /// The one that a sensor is by its type reply, such as `LMS200;S18063;V02.19`; `None` if it is none of these.
+    pub fn of_type(text: &[u8]) -> Option<LmsModel> {
+        let mut parts = text.split(|&byte| byte == b';');
+        let (kind, version) = (parts.next()?, parts.next().unwrap_or_default());
+        let family = match kind {
+            b"LMS200" => LmsModel::Lms200,
+            b"LMS211" => LmsModel::Lms211,
+            b"LMS220" | b"LMS221" => LmsModel::Lms221,
+            b"LMS291" => LmsModel::Lms291,
+            _ => return None,
+        };
+        Some(if version.starts_with(b"S14") { LmsModel::Fast } else { family })
+    }
+
+    /// Angle and resolution as it leaves the factory; `None` for those of [`LmsModel::Fast`], which are no [`Variant`].
+    pub fn factory_variant(self) -> Option<Variant> {
+        match self {
+            LmsModel::Lms200 | LmsModel::Lms221 | LmsModel::Lms291 => Some(Variant::HALF),
+            LmsModel::Lms211 => Variant::new(100, 50),
+            LmsModel::Fast => None,
+        }
+    }
+
+    /// Unit as it leaves the factory: 8 m in millimetres, or 80 m in centimetres.
+    pub fn factory_unit(self) -> Unit {
+        match self {
+            LmsModel::Lms200 => Unit::Mm,
+            LmsModel::Lms211 | LmsModel::Lms221 | LmsModel::Lms291 | LmsModel::Fast => Unit::Cm,
+        }
+    }
+
+    /// Why it cannot scan `variant`.
+    pub fn refuses_variant(self, variant: Variant) -> Option<&'static str> {
+        match self {
+            LmsModel::Lms211 if variant.angle_deg > 100 => Some("its window is 100 degrees wide"),
+            LmsModel::Fast => Some("it scans 90 degrees at 0.5 and cannot be switched"),
+            _ => None,
+        }
+    }
+
+    /// Why it has no sensitivity to set (byte 3 of the configuration, 0 to 3); there it is a peak threshold.
+    pub fn refuses_sensitivity(self) -> Option<&'static str> {
+        (self != LmsModel::Lms291)
+            .then_some("only the LMS 291 has a sensitivity; here the byte is a peak threshold")
+    }
+
+    /// Why it cannot do what `request` asks.
+    pub fn refuses(self, request: Request) -> Option<&'static str> {
+        match request {
+            Request::Variant(variant) => self.refuses_variant(variant),
+            // What it does not answer once it does not send continuously.
+            Request::Operate(Operating::Reflectivity(_)) => self.refuses_command(REFLECTIVITY),
+            Request::Operate(Operating::RangeFields(_)) => self.refuses_command(RANGE_FIELDS),
+            Request::Operate(Operating::Reflectivities(_)) => self.refuses_command(REFLECTIVITIES),
+            _ => self.refuses_command(request.command()),
+        }
+    }
+
+    /// Why it does not know `command` (Telegram listing table 7-1), one that writes the EEPROM too.
+    pub fn refuses_command(self, command: u8) -> Option<&'static str> {
+        match (command, self) {
+            (COUNTERS, LmsModel::Lms200) => Some("only the LMS 211, 221 and 291 count their hours"),
+            (REFLECTIVITY, _) if self != LmsModel::Fast => {
+                Some("only version S14 sends ranges and reflectivity together like this")
+            }
+            (RANGE_FIELDS | FIELD_SET | FIELD, LmsModel::Fast) => Some("version S14 has no fields"),
+            (_, LmsModel::Fast) if FIELD_WRITE_COMMANDS.contains(&command) => {
+                Some("version S14 has no fields")
+            }
+            (REFLECTIVITIES | CARTESIAN, LmsModel::Fast) => Some("version S14 does not know this command"),
+            _ => None,
+        }
+    }
+}
+
+/// Commands that write fields: their module is not named here.
+const FIELD_WRITE_COMMANDS: &[u8] = &[0x40, 0x46];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::lms::command::{SubRange, SubRanges};
+
+    #[test]
+    fn recognizes_model_from_type_text() {
+        for (text, family) in [
+            ("LMS200;S18063;V02.19", Some(LmsModel::Lms200)),
+            ("LMS200;301063;V02.10 ", Some(LmsModel::Lms200)),
+            ("LMS211;302063;V02.30", Some(LmsModel::Lms211)),
+            ("LMS220;301063;V02.10", Some(LmsModel::Lms221)),
+            ("LMS221;S16063;V02.30", Some(LmsModel::Lms221)),
+            ("LMS291;S05063;V02.30", Some(LmsModel::Lms291)),
+            ("LMS291;S14063;X01.27", Some(LmsModel::Fast)),
+            ("LMS291", Some(LmsModel::Lms291)),
+            ("LMS400;301063", None),
+            ("", None),
+        ] {
+            assert_eq!(LmsModel::of_type(text.as_bytes()), family, "{text}");
+        }
+        for family in LmsModel::ALL {
+            assert_eq!(LmsModel::of_name(family.name()), Some(family));
+        }
+        assert_eq!(LmsModel::of_name("lms100"), None);
+    }
+
+    #[test]
+    fn each_cannot_do_something() {
+        let span = SubRange { first: 1, last: 2 };
+        assert!(LmsModel::Lms200.refuses(Request::Counters).is_some());
+        assert!(LmsModel::Lms211.refuses(Request::Counters).is_none());
+        assert!(LmsModel::Lms211.refuses(Request::Variant(Variant::HALF)).unwrap().contains("100 degrees"));
+        assert!(LmsModel::Lms211.refuses_variant(Variant::new(100, 25).unwrap()).is_none());
+        assert!(LmsModel::Lms291.refuses(Request::Reflectivity(span)).is_some());
+        assert!(LmsModel::Lms291.refuses(Request::Operate(Operating::Reflectivity(span))).is_some());
+        assert!(LmsModel::Fast.refuses(Request::Operate(Operating::Reflectivity(span))).is_none());
+        assert!(LmsModel::Fast.refuses(Request::Variant(Variant::HALF)).is_some());
+        let spans = SubRanges::new(&[span]).unwrap();
+        for operating in [Operating::RangeFields(span), Operating::Reflectivities(spans)] {
+            assert!(LmsModel::Fast.refuses(Request::Operate(operating)).is_some());
+            assert!(LmsModel::Lms291.refuses(Request::Operate(operating)).is_none());
+        }
+        for command in [0x3E, 0x40, 0x41, 0x45, 0x46, 0x75, 0x76] {
+            assert!(LmsModel::Fast.refuses_command(command).is_some(), "{command:02X}");
+            assert!(LmsModel::Lms200.refuses_command(command).is_none(), "{command:02X}");
+        }
+        assert!(
+            LmsModel::Lms291.refuses_sensitivity().is_none()
+                && LmsModel::Lms221.refuses_sensitivity().is_some()
+        );
+    }
+
+    #[test]
+    fn factory_variant_is_supported_by_its_model() {
+        for family in LmsModel::ALL {
+            let refused = family.factory_variant().and_then(|variant| family.refuses_variant(variant));
+            assert_eq!(refused, None);
+        }
+    }
+}

@@ -1,0 +1,109 @@
+//! Reads files named by a user: only regular ones, and only up to an expected length. A pipe may have no writer and a
+//! device no end, so neither is read. Refuses to know what is in them.
+
+use std::fs::{File, OpenOptions};
+use std::io::{self, ErrorKind, Read};
+use std::os::unix::fs::{FileTypeExt, OpenOptionsExt};
+use std::path::Path;
+
+use rustix::fs::OFlags;
+
+use scanhub_schema::{Failure, Kind};
+
+/// Most bytes of a configuration, a world or a model: many times what people write. Parsed, it is a hundred times as
+/// long.
+pub const MAX_FILE_BYTES: u64 = 512 << 10;
+
+/// Opens the regular file at `path`; never waits.
+///
+/// # Errors
+///
+/// [`ErrorKind::InvalidInput`] with what it is instead, else the system's error.
+pub fn open(path: &Path) -> io::Result<File> {
+    let flags = OFlags::NONBLOCK | OFlags::NOCTTY;
+    let file = OpenOptions::new().read(true).custom_flags(flags.bits() as i32).open(path)?;
+    let kind = file.metadata()?.file_type();
+    let what = match () {
+        () if kind.is_file() => return Ok(file),
+        () if kind.is_dir() => "a directory",
+        () if kind.is_fifo() => "a pipe",
+        () => "a device",
+    };
+    Err(io::Error::new(ErrorKind::InvalidInput, format!("it is {what}, not a regular file")))
+}
+
+/// Returns all of the regular file at `path`, which has at most `longest` bytes.
+///
+/// # Errors
+///
+/// As [`open`]; [`ErrorKind::FileTooLarge`] if it is longer.
+pub fn read(path: &Path, max_bytes: u64) -> io::Result<Vec<u8>> {
+    read_all(&mut open(path)?, max_bytes)
+}
+
+/// Returns the same as text; [`ErrorKind::InvalidData`] if it is not UTF-8.
+///
+/// # Errors
+///
+/// As [`read`]; [`ErrorKind::InvalidData`] if it is not UTF-8.
+pub fn read_text(path: &Path, max_bytes: u64) -> io::Result<String> {
+    String::from_utf8(read(path, max_bytes)?)
+        .map_err(|_| io::Error::new(ErrorKind::InvalidData, "it is no text in UTF-8"))
+}
+
+/// Returns all of `input`, which has at most `longest` bytes; [`ErrorKind::FileTooLarge`] if it has more.
+///
+/// # Errors
+///
+/// [`ErrorKind::FileTooLarge`] if it has more, else the system's error.
+pub fn read_all(input: &mut dyn Read, max_bytes: u64) -> io::Result<Vec<u8>> {
+    let mut content = Vec::new();
+    input.take(max_bytes + 1).read_to_end(&mut content)?;
+    if content.len() as u64 > max_bytes {
+        let what = format!("it is longer than {max_bytes} bytes, so it is something else");
+        return Err(io::Error::new(ErrorKind::FileTooLarge, what));
+    }
+    Ok(content)
+}
+
+/// Returns the failure of a file that a user named as input, which is at `place`.
+pub fn unreadable(name: &str, error: &io::Error) -> Failure {
+    let hint = match error.kind() {
+        ErrorKind::InvalidInput => "name a regular file",
+        ErrorKind::InvalidData | ErrorKind::FileTooLarge => "name a file of the right kind",
+        _ => "it must exist and be readable for this user",
+    };
+    Failure::new(Kind::Input, format!("cannot read {name}: {error}"), hint)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use rustix::fs::{CWD, FileType, Mode, mknodat};
+
+    use super::*;
+
+    #[test]
+    fn special_and_oversized_files_are_refused_at_once() {
+        let directory = tempfile::tempdir().unwrap();
+        let [pipe, file, link] = ["pipe", "file", "link"].map(|name| directory.path().join(name));
+        mknodat(CWD, &pipe, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).unwrap();
+        fs::write(&file, "1234567").unwrap();
+        std::os::unix::fs::symlink(&file, &link).unwrap();
+        let refused = |path: &Path| read(path, 7).map_err(|error| (error.kind(), error.to_string()));
+        let is = |what: &str| Err((ErrorKind::InvalidInput, format!("it is {what}, not a regular file")));
+        assert_eq!(refused(&pipe), is("a pipe"));
+        assert_eq!(refused(directory.path()), is("a directory"));
+        assert_eq!(refused(Path::new("/dev/zero")), is("a device"));
+        assert_eq!(refused(&file).as_deref(), Ok(&b"1234567"[..]));
+        assert_eq!(refused(&link).as_deref(), Ok(&b"1234567"[..]));
+        assert_eq!(read(&file, 6).unwrap_err().kind(), ErrorKind::FileTooLarge);
+        // Its size is said to be 0.
+        assert!(read(Path::new("/proc/self/status"), 1 << 16).unwrap().len() > 100);
+        fs::write(&file, b"\xFF").unwrap();
+        assert_eq!(read_text(&file, 6).unwrap_err().kind(), ErrorKind::InvalidData);
+        fs::remove_file(&file).unwrap();
+        assert_eq!(read(&file, 6).unwrap_err().kind(), ErrorKind::NotFound);
+    }
+}

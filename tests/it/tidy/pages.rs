@@ -1,0 +1,16 @@
+//! Text that exists twice is the same in both places: the program that docs/first-consumer.md shows is the example that is
+//! compiled.
+
+use super::tree::SourceTree;
+
+const FIRST_PAGE: (&str, &str) = ("docs/first-consumer.md", "clients/examples/first.rs");
+
+pub(crate) fn the_first_consumer_is_compiled(tree: &SourceTree) -> Vec<String> {
+    let (page, example) = FIRST_PAGE;
+    let shown: Vec<&str> =
+        tree.text(page).split("```rust\n").skip(1).filter_map(|rest| rest.split("```").next()).collect();
+    let compiled = tree.text(example).lines().filter(|line| !line.starts_with("//!"));
+    let compiled: String =
+        compiled.skip_while(|line| line.is_empty()).map(|line| format!("{line}\n")).collect();
+    if shown == [compiled] { Vec::new() } else { vec![format!("{page} shows something else than {example}")] }
+}

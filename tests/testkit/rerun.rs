@@ -1,0 +1,51 @@
+//! Runs a test again in a prepared process: in another network, with other mounts or as another user. Makes sure that
+//! it did run there.
+
+use std::io::{BufRead, BufReader};
+use std::process::{Command, Stdio};
+
+use super::child::spawn;
+
+/// Returns the path of the test binary.
+pub(crate) fn own_program() -> std::path::PathBuf {
+    std::env::current_exe().unwrap_or_else(|error| panic!("no path: {error}"))
+}
+
+/// Returns the arguments with which the test binary runs only the test `name` (with its modules).
+pub(crate) fn single_test_args(name: &str) -> [&str; 3] {
+    ["--exact", name, "--nocapture"]
+}
+
+/// Runs `command`, which runs the test `name` and no other, and prints its output.
+///
+/// # Panics
+///
+/// If the test fails there, or if there is no test of this name.
+pub(crate) fn rerun_test(name: &str, mut command: Command) {
+    command.stdin(Stdio::null()).stdout(Stdio::piped());
+    let mut child = spawn(command).unwrap_or_else(|error| panic!("{name} does not start again: {error}"));
+    let out = child.stdout.take().expect("a pipe");
+    let mut passed = false;
+    for line in BufReader::new(out).lines().map_while(Result::ok) {
+        passed |= line.starts_with("test result: ok. 1 passed");
+        println!("{line}");
+    }
+    let status = child.wait().expect("it can be waited for");
+    assert!(status.success() && passed, "{name} failed where it ran again: {status}");
+}
+
+/// Runs `test`, whose name is `name`, in a separate process: for a test that opens descriptors whose number counts, and
+/// that children of other tests would inherit.
+///
+/// # Panics
+///
+/// If the test fails.
+pub(crate) fn in_own_process(name: &str, test: impl FnOnce()) {
+    const CHILD_VARIABLE: &str = "SCANHUB_TEST_PROCESS";
+    if std::env::var_os(CHILD_VARIABLE).is_some_and(|inside| inside == name) {
+        return test();
+    }
+    let mut command = Command::new(own_program());
+    command.args(single_test_args(name)).env(CHILD_VARIABLE, name);
+    rerun_test(name, command);
+}

@@ -1,0 +1,150 @@
+//! A warning before its scan is complete says slow or stop, never clear, and it is true of the scan or taken back: before the
+//! next zones of its number or a greater one, which are of its scan, unless these are at least as bad. While nothing goes
+//! wrong, no warning is withdrawn, and no zones say stop without an earlier warning. That warning was sent when at most three
+//! quarters of the scan had arrived.
+
+use std::collections::BTreeMap;
+
+use bytemuck::pod_read_unaligned;
+use scanhub_schema::{MILLIS, Nanos, Scan, Topic, Verdict, Zones};
+
+use super::{Invariant, ViolationReporter};
+use crate::event::Event;
+
+/// What was said of the scans that are arriving, by sensors.
+#[derive(Default)]
+pub(crate) struct EarlyWarnings {
+    sensors: BTreeMap<usize, SensorWarnings>,
+    faults_cleared_at: Option<Nanos>,
+}
+
+/// A warning.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Warning {
+    seq: u64,
+    verdict: Verdict,
+    /// Its scan has exactly its number, and no greater one.
+    is_of_telegram: bool,
+    /// Beams that had arrived.
+    beams_seen: u16,
+}
+
+#[derive(Default)]
+struct SensorWarnings {
+    /// The warning that stands.
+    current: Option<Warning>,
+    /// The number of the last zones.
+    zones: Option<u64>,
+    /// A sample had no memory, so that nobody knows what stands.
+    is_unknown: bool,
+    /// A warning was withdrawn although nothing had gone wrong.
+    is_needless: bool,
+    /// Scans since the hub found the scanner, and beams of the last one.
+    scans: usize,
+    beams: usize,
+}
+
+impl Invariant for EarlyWarnings {
+    fn name(&self) -> &'static str {
+        "early"
+    }
+
+    fn on_event(&mut self, at: Nanos, event: &Event<'_>, reporter: &mut ViolationReporter<'_>) {
+        match *event {
+            Event::Published { sensor, sample } => {
+                let of = self.sensors.entry(sensor).or_default();
+                let seq = sample.header.seq;
+                let is_well = self.faults_cleared_at.is_some_and(|healed_at| at > healed_at + RECOVERY_TIME);
+                let wrong = match sample.topic {
+                    Topic::Scan => {
+                        let before = std::mem::replace(&mut of.beams, Scan::of_bytes(&sample.bytes).beams());
+                        // The session begins its revolutions again with another number of beams.
+                        of.scans = if before == of.beams { of.scans + 1 } else { 0 };
+                        None
+                    }
+                    Topic::Early => of.check_warning(seq, &pod_read_unaligned(&sample.bytes), is_well),
+                    Topic::Zones => of.check_zones(seq, &pod_read_unaligned(&sample.bytes), is_well),
+                    _ => None,
+                };
+                if let Some(wrong) = wrong {
+                    reporter.report(format!("sensor {sensor}, number {seq}: {wrong}"));
+                }
+            }
+            Event::OutOfMemory { sensor, topic: Topic::Early | Topic::Zones } => {
+                let of = self.sensors.entry(sensor).or_default();
+                (of.current, of.is_unknown) = (None, true);
+            }
+            Event::PortOpened { sensor, .. }
+            | Event::RateChanged { sensor }
+            | Event::ScannerExchanged { sensor } => {
+                self.sensors.entry(sensor).or_default().scans = 0;
+            }
+            Event::HubEnded { .. } => self.sensors.clear(),
+            Event::FaultsCleared => self.faults_cleared_at = Some(at),
+            _ => {}
+        }
+    }
+}
+
+impl SensorWarnings {
+    /// What is wrong with a warning, or with what takes it back.
+    fn check_warning(
+        &mut self,
+        seq: u64,
+        early: &scanhub_schema::Early,
+        is_faultless: bool,
+    ) -> Option<String> {
+        let verdict = early.verdict();
+        if !matches!(verdict, Verdict::Slow | Verdict::Stop) {
+            return Some(format!("a warning says {}", verdict.name()));
+        }
+        if self.zones.is_some_and(|zones| seq <= zones) {
+            return Some("a warning of a scan whose zones were there".to_owned());
+        }
+        let beams_seen = early.beams_seen;
+        let warning = Warning { seq, verdict, is_of_telegram: early.bytes_seen > 0, beams_seen };
+        let before = self.current.take();
+        if early.is_withdrawn() {
+            self.is_needless = is_faultless && self.scans > LEARNING_SCANS;
+            let is_of = before.is_some_and(|before| (before.seq, before.verdict) == (seq, verdict));
+            let is_of = is_of || std::mem::take(&mut self.is_unknown);
+            return (!is_of).then(|| format!("{before:?} stood, something else was taken back"));
+        }
+        self.current = Some(warning);
+        self.is_unknown = false;
+        let is_worse =
+            |before: &Warning| before.seq == seq && before.verdict.worse(verdict) != before.verdict;
+        before
+            .filter(|before| !is_worse(before))
+            .map(|before| format!("{before:?} stood, and {warning:?} is no worse"))
+    }
+
+    /// Returns the error of the current warning, or of a missing one, now that there are `zones`. Nothing goes wrong while all
+    /// `is_well`.
+    fn check_zones(&mut self, seq: u64, zones: &Zones, is_faultless: bool) -> Option<String> {
+        self.zones = Some(seq);
+        // A hub that ends withdraws its warning, and sends no zones after that.
+        // A scan is published before its zones. With another number of beams, the one that was announced is not completed.
+        if std::mem::take(&mut self.is_needless) && self.scans > 0 {
+            return Some("a warning was withdrawn although nothing went wrong".to_owned());
+        }
+        let verdict = zones.verdict();
+        let warning = self.current.take_if(|warning| seq >= warning.seq);
+        let is_soon = zones.nearest().is_some_and(|(beam, _)| 5 * usize::from(beam) < 3 * self.beams);
+        if is_faultless && self.scans > LEARNING_SCANS && verdict == Verdict::Stop && is_soon {
+            let is_in_time = |warning: &Warning| 4 * usize::from(warning.beams_seen) <= 3 * self.beams;
+            if !warning.as_ref().is_some_and(is_in_time) {
+                return Some(format!("{warning:?} stood before a scan of {} beams, {zones:?}", self.beams));
+            }
+        }
+        let warning = warning?;
+        let holds =
+            verdict.worse(warning.verdict) == verdict && (seq == warning.seq || !warning.is_of_telegram);
+        (!holds).then(|| format!("{warning:?}, the zones say {}", verdict.name()))
+    }
+}
+
+/// Time after the last fault from which nothing is due to it any more.
+const RECOVERY_TIME: Nanos = 3_000 * MILLIS;
+/// Scans of a stream after which the session knows its rhythm.
+const LEARNING_SCANS: usize = 20;

@@ -1,0 +1,378 @@
+//! Judges of invented data: each sample was sent by a scanner, and each remote sample was published by the hub.
+
+use std::collections::hash_map::Entry;
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque};
+use std::rc::Rc;
+
+use scanhub_network::lan::WINDOW_LEN;
+use scanhub_schema::datagram::{Announce, Announced, Datagram, DatagramError, DatagramPayload, Head};
+use scanhub_schema::{Flags, Header, MILLIS, Nanos, Quality, Scan, State, Status, Topic, Zones};
+
+use super::{Invariant, ViolationReporter};
+use crate::event::{DatagramOutcome, Event};
+use crate::family::Family;
+use crate::hash::HistoryHash;
+use crate::remote::{Forgery, LinkSettings, PayloadBuffer};
+
+/// Judge: the hub delivers nothing that no scanner sent, unless it marks it as suspect: each telegram byte by byte, as often as
+/// it was sent, and each scan value by value.
+pub(crate) struct NothingInvented {
+    sensors: Vec<SensorTelegrams>,
+}
+
+struct SensorTelegrams {
+    family: Rc<dyn Family>,
+    /// Number of times that a telegram was sent and not published.
+    unpublished: HashMap<u64, u32>,
+    /// Published units that were not sent. The next telegram decides whether foreign bytes arrived before it, because
+    /// more bytes were read than the known telegrams have.
+    foreign: Vec<Vec<u8>>,
+    /// Place behind the last byte that was read.
+    read_end: u64,
+    /// Last telegrams that the line damaged. An empty one stands for foreign bytes between two telegrams.
+    damaged: VecDeque<Vec<u8>>,
+    /// Place behind the last telegram.
+    sent_end: u64,
+    /// Number, life and bytes of the last published sample of telegrams.
+    last: (u64, u64, Vec<u8>),
+}
+
+impl NothingInvented {
+    pub(crate) fn new(sensors: &[Rc<dyn Family>]) -> NothingInvented {
+        let sensor = |family: &Rc<dyn Family>| SensorTelegrams {
+            family: family.clone(),
+            unpublished: HashMap::new(),
+            foreign: Vec::new(),
+            read_end: 0,
+            damaged: VecDeque::new(),
+            sent_end: 0,
+            last: Default::default(),
+        };
+        NothingInvented { sensors: sensors.iter().map(sensor).collect() }
+    }
+}
+
+impl Invariant for NothingInvented {
+    fn name(&self) -> &'static str {
+        "nothing_invented"
+    }
+
+    fn on_event(&mut self, _: Nanos, event: &Event<'_>, reporter: &mut ViolationReporter<'_>) {
+        match *event {
+            Event::Sent { sensor, telegram } => {
+                let of = &mut self.sensors[sensor];
+                *of.unpublished.entry(HistoryHash::hash_bytes(telegram.bytes)).or_default() += 1;
+                let (begin, end) = telegram.span;
+                if std::mem::replace(&mut of.sent_end, end) < begin {
+                    of.damage(&[]);
+                }
+                if telegram.damage.is_some() {
+                    of.damage(telegram.bytes);
+                }
+                of.check_foreign(sensor, reporter);
+            }
+            Event::Read { sensor, to, .. } => self.sensors[sensor].read_end = to,
+            Event::Published { sensor, sample } if sample.topic == Topic::Telegram => {
+                let of = &mut self.sensors[sensor];
+                for unit in of.family.telegrams(&sample.bytes) {
+                    let is_known = of.take(HistoryHash::hash_bytes(unit));
+                    let mut damaged = of.damaged.iter().map(Vec::as_slice);
+                    let is_clean = sample.header.reasons == 0;
+                    if !is_known && is_clean && !of.family.is_collision(unit, &mut damaged) {
+                        of.foreign.push(unit.to_vec());
+                    }
+                }
+                if of.read_end <= of.sent_end {
+                    of.check_foreign(sensor, reporter);
+                }
+                (of.last.0, of.last.1) = (sample.header.seq, sample.header.boot);
+                of.last.2.clear();
+                of.last.2.extend_from_slice(&sample.bytes);
+            }
+            Event::Published { sensor, sample } if sample.topic == Topic::Scan => {
+                let SensorTelegrams { family, last: (seq, boot, telegram), .. } = &self.sensors[sensor];
+                let mut scan = Box::<Scan>::default();
+                if !Scan::unpack_into(&mut scan, &sample.bytes) {
+                    reporter.report(format!("sensor {sensor}: what is no scan"));
+                }
+                if (*seq, *boot) == (sample.header.seq, sample.header.boot)
+                    && !family.is_scan_of(&scan, telegram)
+                {
+                    reporter.report(format!("sensor {sensor}: a scan that is not that of telegram {seq}"));
+                }
+            }
+            _ => {}
+        }
+    }
+}
+
+impl SensorTelegrams {
+    /// Reports strange units that are not a mixture of damaged telegrams.
+    fn check_foreign(&mut self, sensor: usize, reporter: &mut ViolationReporter<'_>) {
+        for unit in std::mem::take(&mut self.foreign) {
+            if !self.family.is_collision(&unit, &mut self.damaged.iter().map(Vec::as_slice)) {
+                reporter.report(format!("sensor {sensor} did not send {unit:02X?}"));
+            }
+        }
+    }
+
+    /// The line damaged `telegram`.
+    fn damage(&mut self, telegram: &[u8]) {
+        self.damaged.truncate(MAX_DAMAGED - 1);
+        self.damaged.push_front(telegram.to_vec());
+    }
+
+    /// Takes a telegram that was sent and not published. Returns whether there is one.
+    fn take(&mut self, key: u64) -> bool {
+        let Entry::Occupied(mut entry) = self.unpublished.entry(key) else { return false };
+        *entry.get_mut() -= 1;
+        if *entry.get() == 0 {
+            entry.remove();
+        }
+        true
+    }
+}
+
+/// Number of damaged telegrams that are kept.
+const MAX_DAMAGED: usize = 4;
+
+/// Judge: the network delivers nothing that the hub did not publish. The listener accepts no datagram that was not sent with
+/// the same bits. It refuses no datagram that was, except after the end of its gateway's run, or with a key if the datagram is
+/// not known to be new. A listener publishes samples of the hub with number, time and quality, and never a part of one.
+///
+/// Two samples have no source (`docs/topics.md`): unknown zones, because no sample arrived, and a silent sensor after 3 s of
+/// silence. A late listener may report a silence of the past, so its stamp counts: no sample arrived in the 3 s before it.
+pub(crate) struct RemoteNothingInvented {
+    published: HashSet<u64>,
+    /// Lives of the hub.
+    boots: HashSet<u64>,
+    /// By epoch, sensor, topic, number and part.
+    sent: BTreeMap<(u32, u8, u8, u32, u8), u64>,
+    /// The greatest epoch that the listener took.
+    epoch: u32,
+    /// Epoch and sensor of the announcements that the listener took: before it nobody knows whose samples are.
+    announced: HashSet<(u32, u8)>,
+    /// When samples of each sensor came that the listener took, knew and did not find late.
+    arrived_at: BTreeSet<(usize, Nanos)>,
+    /// With a key: by epoch, sensor and topic the first number that was announced to the listener, and the highest it took.
+    numbers: BTreeMap<(u32, u8, u8), (u32, u32)>,
+    has_key: bool,
+    /// CLOCK_MONOTONIC of the listener's machine when the world began.
+    clock_offset: Nanos,
+    packet: PayloadBuffer,
+    /// What everybody may say.
+    unknown: Vec<u8>,
+}
+
+impl RemoteNothingInvented {
+    pub(crate) fn new(terms: &LinkSettings) -> Self {
+        let mut unknown = vec![0; size_of::<Zones>()];
+        let len = Zones::unknown().pack(&mut unknown).unwrap_or_default();
+        unknown.truncate(len);
+        RemoteNothingInvented {
+            published: HashSet::new(),
+            boots: HashSet::new(),
+            sent: BTreeMap::new(),
+            epoch: 0,
+            announced: HashSet::new(),
+            arrived_at: BTreeSet::new(),
+            numbers: BTreeMap::new(),
+            has_key: terms.has_key,
+            clock_offset: terms.initial_clocks.monotonic_ns,
+            packet: PayloadBuffer::new(terms),
+            unknown,
+        }
+    }
+}
+
+impl RemoteNothingInvented {
+    /// Whether a listener with a key refuses it rightly: it came before its sensor's announcement, or is older than that, or
+    /// than the window, as a recording is.
+    fn is_rightly_refused(&self, head: &Head, reason: DatagramError) -> bool {
+        let known = self.numbers.get(&(head.epoch, head.sensor, head.topic));
+        match (reason, known) {
+            (DatagramError::Untimely, None) => self.has_key,
+            (DatagramError::Stale, Some((first, highest))) => {
+                self.has_key && (head.sequence < *first || head.sequence + WINDOW_LEN as u32 <= *highest)
+            }
+            _ => false,
+        }
+    }
+
+    /// The listener took this.
+    fn take_number(&mut self, datagram: &Datagram<'_>) {
+        let head = &datagram.head;
+        let own = self.numbers.entry((head.epoch, head.sensor, head.topic));
+        let own = own.or_insert((head.sequence, head.sequence));
+        own.1 = own.1.max(head.sequence);
+        if head.topic == Announce::NUMBER
+            && let Some(announce) = Announce::unpack(datagram.payload)
+        {
+            for Announced { topic, next, .. } in announce.topics() {
+                self.numbers.entry((head.epoch, head.sensor, *topic)).or_insert((*next, *next));
+            }
+        }
+    }
+}
+
+impl Invariant for RemoteNothingInvented {
+    fn name(&self) -> &'static str {
+        "remote_nothing_invented"
+    }
+
+    fn on_event(&mut self, at: Nanos, event: &Event<'_>, reporter: &mut ViolationReporter<'_>) {
+        match *event {
+            Event::HubStarted { boot, .. } => _ = self.boots.insert(boot),
+            Event::Published { sensor, sample } => {
+                if let Some(payload) = self.packet.encode(sample) {
+                    self.published.insert(key(sensor, sample.topic, &sample.header, payload));
+                }
+            }
+            Event::Transmitted { datagram, bytes, .. } => {
+                _ = self.sent.insert(part_key(datagram), HistoryHash::hash_bytes(bytes))
+            }
+            Event::ListenerStarted { .. } => {
+                // With a key it is kept.
+                self.epoch = if self.has_key { self.epoch } else { 0 };
+                self.numbers.clear();
+                self.announced.clear();
+                self.arrived_at.clear();
+            }
+            Event::Arrived { arrived_at, datagram, bytes, outcome } => {
+                let sent = datagram.and_then(|datagram| self.sent.get(&part_key(datagram)).copied());
+                let is_sent = sent == Some(HistoryHash::hash_bytes(bytes));
+                match (outcome, datagram) {
+                    (DatagramOutcome::Refused(why), Some(datagram)) if is_sent => {
+                        let is_over = datagram.head.epoch < self.epoch && why == DatagramError::Epoch;
+                        if !is_over && !self.is_rightly_refused(&datagram.head, why) {
+                            reporter.report(format!("{why:?}: {:?}", datagram.head));
+                        }
+                    }
+                    (DatagramOutcome::Refused(_), _) => {}
+                    (DatagramOutcome::Part, Some(_)) if is_sent => {}
+                    (_, Some(datagram)) if is_sent => {
+                        let head = &datagram.head;
+                        self.epoch = self.epoch.max(head.epoch);
+                        let gateway_sensor = (head.epoch, head.sensor);
+                        self.take_number(datagram);
+                        match outcome {
+                            DatagramOutcome::Announcement => _ = self.announced.insert(gateway_sensor),
+                            DatagramOutcome::Sample { late: false }
+                                if self.announced.contains(&gateway_sensor) =>
+                            {
+                                self.arrived_at.insert((head.sensor.into(), arrived_at));
+                            }
+                            _ => {}
+                        }
+                    }
+                    _ => reporter.report(format!("{} bytes that nobody sent so", bytes.len())),
+                }
+            }
+            Event::Republished { sensor, topic, header, payload } => {
+                let is_published = self.published.contains(&key(sensor, topic, header, payload));
+                let is_said = match topic {
+                    Topic::Zones => payload == self.unknown,
+                    Topic::Status => {
+                        let arrived_ns = header.stamp_last_ns.saturating_sub(self.clock_offset);
+                        let before =
+                            (sensor, (arrived_ns + 1).saturating_sub(SILENCE_TIMEOUT))..(sensor, arrived_ns);
+                        let is_silent = arrived_ns <= at && self.arrived_at.range(before).next().is_none();
+                        is_silent && status(payload).state() == Some(State::Silent)
+                    }
+                    _ => false,
+                };
+                if !is_published && !is_said {
+                    reporter.report(format!("sensor {sensor}: nobody published this {topic:?}: {header:?}"));
+                }
+                if usize::from(header.sensor) != sensor || !self.boots.contains(&header.boot) {
+                    reporter.report(format!("sensor {sensor}: of no sensor or hub: {header:?}"));
+                }
+            }
+            _ => {}
+        }
+    }
+}
+
+/// What of a sample stays the same over the network. A status is stamped when it is sent, and the beginning of its state when
+/// it is first heard of.
+fn key(sensor: usize, topic: Topic, header: &Header, payload: &[u8]) -> u64 {
+    let flags = header.flags & (Flags::SIMULATED | Flags::REPLAYED | Flags::STAMP_ESTIMATED);
+    let is_suspect = header.quality() == Quality::Suspect;
+    let mut history = HistoryHash::new();
+    history.add_number(sensor as u64);
+    history.add_number(topic as u64);
+    history.add_number(u64::from(header.seq as u32));
+    history.add_number(u64::from(flags) << 1 | u64::from(is_suspect));
+    if topic == Topic::Status {
+        history.add_bytes(bytemuck::bytes_of(&Status { since_ns: 0, ..status(payload) }));
+    } else {
+        history.add_number(header.wall_ns);
+        history.add_bytes(payload);
+    }
+    history.value()
+}
+
+fn status(payload: &[u8]) -> Status {
+    let mut status = Status::default();
+    let _ = status.unpack(payload);
+    status
+}
+
+fn part_key(datagram: &Datagram<'_>) -> (u32, u8, u8, u32, u8) {
+    let head = &datagram.head;
+    (head.epoch, head.sensor, head.topic, head.sequence, head.part)
+}
+
+/// So long nothing came of a sensor that is silent.
+const SILENCE_TIMEOUT: Nanos = 3_000 * MILLIS;
+
+/// Judge: with a key, a listener refuses every forged datagram for the right reason, and never accepts a recorded datagram
+/// as new. Other judges check that it counts all refusals and always accepts the right gateway.
+#[derive(Default)]
+pub(crate) struct RemoteKeys {
+    forged: HashMap<u64, Forgery>,
+    /// Datagrams that were recorded and sent again.
+    replayed: HashSet<u64>,
+    /// Datagrams that the running listener accepted.
+    accepted: HashSet<u64>,
+}
+
+impl Invariant for RemoteKeys {
+    fn name(&self) -> &'static str {
+        "remote_keys"
+    }
+
+    fn on_event(&mut self, _: Nanos, event: &Event<'_>, reporter: &mut ViolationReporter<'_>) {
+        match *event {
+            Event::ListenerStarted { .. } => self.accepted.clear(),
+            Event::Forged { forgery: Forgery::Recording, bytes } => {
+                _ = self.replayed.insert(HistoryHash::hash_bytes(bytes))
+            }
+            Event::Forged { forgery, bytes } => {
+                _ = self.forged.insert(HistoryHash::hash_bytes(bytes), forgery)
+            }
+            Event::Arrived { datagram, bytes, outcome, .. } => {
+                let bytes = HistoryHash::hash_bytes(bytes);
+                let is_new = matches!(
+                    outcome,
+                    DatagramOutcome::Announcement | DatagramOutcome::Sample { late: false }
+                );
+                if let Some(forgery) = self.forged.get(&bytes) {
+                    let due = match forgery {
+                        Forgery::Plain => DatagramError::Unauthenticated,
+                        _ => DatagramError::Mac,
+                    };
+                    if outcome != DatagramOutcome::Refused(due) {
+                        reporter
+                            .report(format!("{forgery:?}, and it is {outcome:?}, due {due:?}: {datagram:?}"));
+                    }
+                } else if is_new && !self.accepted.insert(bytes) {
+                    reporter.report(format!("it was taken before: {datagram:?}"));
+                } else if is_new && self.replayed.contains(&bytes) {
+                    reporter.report(format!("it was recorded: {datagram:?}"));
+                }
+            }
+            _ => {}
+        }
+    }
+}

@@ -1,0 +1,234 @@
+//! Judges of recovery: once nothing is wrong any more, everything works again soon.
+
+use std::rc::Rc;
+
+use scanhub_schema::{MILLIS, Nanos, State, Status, Topic, Verdict, Zones};
+
+use super::{Invariant, ViolationReporter};
+use crate::event::{Event, RevolutionFigures};
+use crate::family::Family;
+use crate::remote::{LinkSettings, MAX_DRAIN_TIME, RECONNECT_INTERVAL};
+use crate::setup::Setup;
+
+/// Judge: once nothing is wrong any more, each link soon reports that it streams, and publishes measured values. It publishes
+/// scans as soon as the scanner has reported how its values are split; the session repeats that request now and then. The
+/// search for a scanner of another family starts after ten seconds without data.
+pub(crate) struct Liveness {
+    faults_cleared_at: Option<Nanos>,
+    sensors: Vec<SensorProgress>,
+}
+
+struct SensorProgress {
+    family: Rc<dyn Family>,
+    reports_streaming: bool,
+    /// Time at which the search for a scanner of another family begins.
+    search_starts_at: Nanos,
+    /// Telegrams of measured values came, and scans.
+    has_arrived: [bool; 2],
+    /// When the first one of each came, without the time that the scanner waited for its motor.
+    first_at: [Option<Nanos>; 2],
+    /// When it answered last before that, and when it measured first after that answer.
+    answered_at: Nanos,
+    measured_at: Option<Nanos>,
+}
+
+impl Liveness {
+    pub(crate) fn new(sensors: &[Rc<dyn Family>]) -> Liveness {
+        let sensor = |family: &Rc<dyn Family>| SensorProgress {
+            family: family.clone(),
+            reports_streaming: false,
+            search_starts_at: 0,
+            has_arrived: [false; 2],
+            first_at: [None; 2],
+            answered_at: 0,
+            measured_at: None,
+        };
+        Liveness { faults_cleared_at: None, sensors: sensors.iter().map(sensor).collect() }
+    }
+}
+
+impl Invariant for Liveness {
+    fn name(&self) -> &'static str {
+        "liveness"
+    }
+
+    fn figures(&self) -> RevolutionFigures {
+        let last = |which: usize| self.sensors.iter().filter_map(|of| of.first_at[which]).max().unwrap_or(0);
+        RevolutionFigures { data_ns: last(0), scan_ns: last(1), ..RevolutionFigures::default() }
+    }
+
+    fn on_event(&mut self, at: Nanos, event: &Event<'_>, reporter: &mut ViolationReporter<'_>) {
+        match *event {
+            Event::FaultsCleared => {
+                self.faults_cleared_at = Some(at);
+                self.sensors.iter_mut().for_each(|of| of.has_arrived = [false; 2]);
+            }
+            Event::ScannerExchanged { sensor } if self.sensors[sensor].family.families().len() > 1 => {
+                self.sensors[sensor].search_starts_at = at + SEARCH_TIMEOUT;
+            }
+            Event::Sent { sensor, telegram }
+                if telegram.is_reply && self.sensors[sensor].first_at[0].is_none() =>
+            {
+                let of = &mut self.sensors[sensor];
+                (of.answered_at, of.measured_at) = (at, None);
+            }
+            Event::Measured { sensor, points } => {
+                let of = &mut self.sensors[sensor];
+                of.measured_at = of.measured_at.or(points.first().map(|first| first.at_ns));
+            }
+            Event::Published { sensor, sample } if sample.topic == Topic::Status => {
+                let status: Status = bytemuck::pod_read_unaligned(&sample.bytes);
+                self.sensors[sensor].reports_streaming = status.state() == Some(State::Streaming);
+            }
+            Event::Published { sensor, sample } => {
+                let of = &mut self.sensors[sensor];
+                let is_data =
+                    || of.family.telegrams(&sample.bytes).into_iter().any(|unit| of.family.is_data(unit));
+                let which = match sample.topic {
+                    Topic::Telegram if is_data() => 0,
+                    Topic::Scan => 1,
+                    _ => return,
+                };
+                if of.first_at[which].is_none() {
+                    let waited = of.measured_at.unwrap_or(0).saturating_sub(of.answered_at);
+                    of.first_at[which] = Some(at.saturating_sub(waited));
+                }
+                let is_back = of.reports_streaming && !of.has_arrived[which];
+                of.has_arrived[which] |= of.reports_streaming;
+                if let Some(healed) = self.faults_cleared_at.map(|healed| healed.max(of.search_starts_at))
+                    && is_back
+                    && at > healed + RECOVERY_LIMITS[which]
+                {
+                    let (topic, after) = (sample.topic, (at - healed) / MILLIS);
+                    reporter.report(format!("sensor {sensor}: {topic:?} {after} ms later"));
+                }
+            }
+            Event::WorldEnded { .. } => {
+                let sensors = self.sensors.iter().enumerate();
+                let is_due = |of: &SensorProgress| {
+                    of.search_starts_at == 0 || at > of.search_starts_at + RECOVERY_LIMITS[1]
+                };
+                let is_back = |of: &SensorProgress| of.reports_streaming && of.has_arrived == [true; 2];
+                for (sensor, _) in sensors.filter(|(_, of)| is_due(of) && !is_back(of)) {
+                    reporter.report(format!("sensor {sensor} does not stream at the end"));
+                }
+            }
+            _ => {}
+        }
+    }
+}
+
+/// So soon: after a second of silence a sensor is sought that may be at another rate, for some 2.4 s
+/// (`docs/measured.md`); one whose last word was damaged, just before everything was well, is asked again for up to 3 s
+/// first. One that streams and does not tell how is asked every ten seconds.
+const RECOVERY_LIMITS: [Nanos; 2] = [5_500 * MILLIS, 11_000 * MILLIS];
+/// Time after which the search begins again because nothing of the scanner arrives.
+const SEARCH_TIMEOUT: Nanos = 10_000 * MILLIS;
+
+/// Judge: once nothing is wrong any more, a remote robot soon knows what the hub knows. The next announcement names the sensor,
+/// and then the next zones are sent. The robot knows the verdict from then on, unless the zones are so rare that the first
+/// ones, which have no period yet, expire before the second ones arrive (`docs/topics.md`).
+pub(crate) struct RemoteLiveness {
+    are_faults_cleared: bool,
+    sensors: Vec<RemoteSensor>,
+}
+
+struct RemoteSensor {
+    /// From known zones in the hub to known ones here, at most.
+    max_delay: Nanos,
+    /// Zones come less often than a verdict stands whose period is not known.
+    is_slow: bool,
+    /// Time since which the hub has published a known verdict, if it does.
+    known_since: Option<Nanos>,
+    is_known: bool,
+    /// Whether the robot knew the verdict after the world healed.
+    has_recovered: bool,
+}
+
+impl RemoteLiveness {
+    pub(crate) fn new(setup: &Setup, terms: &LinkSettings) -> RemoteLiveness {
+        let sensor = |of: usize| {
+            let (period, _) = setup.sensors[of].scan_times();
+            let every = terms.send_interval.get() * period;
+            // Time to find a router that returns when the world heals, and to send the queue.
+            let over_router = if terms.are_bridges { RECONNECT_INTERVAL + MAX_DRAIN_TIME } else { 0 };
+            let max_delay = ANNOUNCE_INTERVAL + every + period + terms.delay_ns + over_router + TIMER_DELAY;
+            RemoteSensor {
+                max_delay,
+                is_slow: every > MAX_FREQUENT_INTERVAL,
+                known_since: None,
+                is_known: false,
+                has_recovered: false,
+            }
+        };
+        RemoteLiveness { are_faults_cleared: false, sensors: (0..setup.sensors.len()).map(sensor).collect() }
+    }
+}
+
+impl Invariant for RemoteLiveness {
+    fn name(&self) -> &'static str {
+        "remote_liveness"
+    }
+
+    fn on_event(&mut self, at: Nanos, event: &Event<'_>, reporter: &mut ViolationReporter<'_>) {
+        match *event {
+            Event::FaultsCleared => {
+                self.are_faults_cleared = true;
+                self.sensors
+                    .iter_mut()
+                    .for_each(|of| (of.known_since, of.has_recovered) = (None, of.is_known));
+            }
+            Event::Published { sensor, sample } if sample.topic == Topic::Zones => {
+                let zones: Zones = bytemuck::pod_read_unaligned(&sample.bytes);
+                let of = &mut self.sensors[sensor];
+                match zones.verdict() {
+                    Verdict::Unknown => of.known_since = None,
+                    _ => _ = of.known_since.get_or_insert(at),
+                }
+                of.check(sensor, at, self.are_faults_cleared, reporter);
+            }
+            Event::RemoteVerdictAccepted { sensor, verdict } => {
+                let of = &mut self.sensors[sensor];
+                of.check(sensor, at, self.are_faults_cleared, reporter);
+                of.is_known = verdict != Verdict::Unknown;
+                of.has_recovered |= of.is_known;
+            }
+            Event::WorldEnded { .. } => {
+                for (sensor, of) in self.sensors.iter().enumerate() {
+                    of.check(sensor, at, self.are_faults_cleared, reporter);
+                }
+            }
+            Event::ListenerEnded { sensors, .. }
+                if self.are_faults_cleared && sensors != self.sensors.len() =>
+            {
+                reporter.report(format!("{sensors} sensors are published at the end"));
+            }
+            _ => {}
+        }
+    }
+}
+
+impl RemoteSensor {
+    fn check(
+        &self,
+        sensor: usize,
+        at: Nanos,
+        are_faults_cleared: bool,
+        reporter: &mut ViolationReporter<'_>,
+    ) {
+        if are_faults_cleared
+            && !(self.is_known || self.is_slow && self.has_recovered)
+            && let Some(since) = self.known_since.filter(|since| at > since + self.max_delay)
+        {
+            let (ms, soon) = ((at - since) / MILLIS, self.max_delay / MILLIS);
+            reporter.report(format!("sensor {sensor}: nothing is known {ms} ms later, bound {soon}"));
+        }
+    }
+}
+
+/// Interval of zones up to which their verdict is always known.
+const MAX_FREQUENT_INTERVAL: Nanos = 230 * MILLIS;
+/// Between two announcements.
+const ANNOUNCE_INTERVAL: Nanos = 1_000 * MILLIS;
+/// Threads and timers are late by no more than this, all together.
+const TIMER_DELAY: Nanos = 3 * MILLIS;

@@ -1,0 +1,525 @@
+//! Judges of losses: bytes, telegrams, and packets that the line loses.
+
+use std::collections::VecDeque;
+use std::rc::Rc;
+
+use scanhub_schema::{Counter, MILLIS, Nanos, State, Status, Topic};
+use scanhub_sim::ld::TruePoint;
+
+use super::{Invariant, ViolationReporter};
+use crate::event::{Event, RevolutionFigures, Telegram};
+use crate::family::Family;
+
+/// Judge: no byte disappears. The bytes that a status reports as read are those that the port returned to the running hub, and
+/// each of them is in a telegram, in an acknowledgement, discarded, or still in the buffer.
+pub(crate) struct ByteCounters(Vec<u64>);
+
+impl ByteCounters {
+    pub(crate) fn new(sensors: usize) -> ByteCounters {
+        ByteCounters(vec![0; sensors])
+    }
+}
+
+impl Invariant for ByteCounters {
+    fn name(&self) -> &'static str {
+        "bytes"
+    }
+
+    fn on_event(&mut self, _: Nanos, event: &Event<'_>, reporter: &mut ViolationReporter<'_>) {
+        match event {
+            Event::HubStarted { .. } => self.0.fill(0),
+            Event::Read { sensor, len, .. } => self.0[*sensor] += *len as u64,
+            Event::Published { sensor, sample } if sample.topic == Topic::Status => {
+                let status: Status = bytemuck::pod_read_unaligned(&sample.bytes);
+                let of = |counter| status.counters[counter];
+                let read = of(Counter::BytesRead);
+                let parts = [
+                    Counter::BytesInTelegrams,
+                    Counter::BytesAcknowledge,
+                    Counter::BytesDiscarded,
+                    Counter::BytesBuffered,
+                ];
+                let known: u64 = parts.into_iter().map(of).sum();
+                let handed = self.0[*sensor];
+                if (read, known) != (handed, handed) {
+                    reporter
+                        .report(format!("sensor {sensor}: {handed} handed out, {read} read, {known} known"));
+                }
+            }
+            _ => {}
+        }
+    }
+}
+
+/// Judge: a running hub loses no intact telegram. A telegram is due if the port returned all its bytes as they were
+/// sent, while the hub reported that it streams. The hub publishes it once and in order, unless there was no memory
+/// for it.
+pub(crate) struct NothingLost {
+    sensors: Vec<SensorTelegrams>,
+}
+
+struct SensorTelegrams {
+    family: Rc<dyn Family>,
+    sent: VecDeque<SentTelegram>,
+    /// Place of the first byte that the session on the line can know.
+    valid_from: u64,
+    /// Place behind the last byte that the hub had read when it began to say that it streams, if it still says so.
+    streams_from: Option<u64>,
+    read_end: u64,
+    /// Sensors that were there before this one, and whether the hub has heard a scan of this one: one whose scans are others
+    /// is met only after a silence.
+    exchanged: u32,
+    is_other: bool,
+    /// Until when something of the sensor before this one may still be on the line.
+    mixed_until: Nanos,
+    /// Telegrams for which there was no memory.
+    lacked_memory: usize,
+    /// Place behind the last telegram, and how many of the next ones may be lost with damaged bytes before them.
+    sent_end: u64,
+    allowed_losses: usize,
+    /// What was published last, if nobody sent it.
+    foreign: Vec<u8>,
+    /// From when until when the hub does not run.
+    stall: (Nanos, Nanos),
+}
+
+struct SentTelegram {
+    bytes: Vec<u8>,
+    span: (u64, u64),
+    /// Of which sensor.
+    exchanged: u32,
+    is_whole: bool,
+    /// All of its bytes arrived as they were sent.
+    is_intact: bool,
+    is_read: bool,
+    /// When the hub had all of it, if it has to be published.
+    due_at: Option<Nanos>,
+}
+
+impl NothingLost {
+    pub(crate) fn new(sensors: &[Rc<dyn Family>]) -> NothingLost {
+        NothingLost { sensors: sensors.iter().cloned().map(SensorTelegrams::new).collect() }
+    }
+}
+
+impl Invariant for NothingLost {
+    fn name(&self) -> &'static str {
+        "nothing_lost"
+    }
+
+    fn on_event(&mut self, at: Nanos, event: &Event<'_>, reporter: &mut ViolationReporter<'_>) {
+        match *event {
+            Event::Sent { sensor, telegram } => self.sensors[sensor].send(telegram),
+            Event::Flushed { sensor, from, .. } => self.sensors[sensor].flush(from),
+            Event::PortOpened { sensor, offset } => {
+                let of = &mut self.sensors[sensor];
+                (of.valid_from, of.read_end, of.streams_from) = (offset, offset, None);
+            }
+            Event::RateChanged { sensor } => {
+                let of = &mut self.sensors[sensor];
+                of.valid_from = of.read_end;
+            }
+            Event::ScannerExchanged { sensor } => {
+                let of = &mut self.sensors[sensor];
+                (of.streams_from, of.is_other) = (None, true);
+                of.exchanged += 1;
+                of.mixed_until = at + MAX_LINE_DELAY;
+                of.end_stream(at);
+            }
+            Event::PortClosed { sensor } => self.sensors[sensor].end_stream(at),
+            Event::HubEnded { .. } => self.sensors.iter_mut().for_each(|of| of.end_stream(at)),
+            Event::Stalled { until } => {
+                self.sensors.iter_mut().for_each(|of| {
+                    let from = if of.stall.1 < at { at } else { of.stall.0 };
+                    of.stall = (from, until);
+                });
+            }
+            Event::Read { sensor, to, .. } => self.sensors[sensor].read(at, to),
+            Event::OutOfMemory { sensor, topic: Topic::Telegram } => {
+                let of = &mut self.sensors[sensor];
+                of.lacked_memory += of.family.max_telegrams();
+            }
+            Event::Published { sensor, sample } if sample.topic == Topic::Telegram => {
+                let of = &mut self.sensors[sensor];
+                for unit in of.family.clone().telegrams(&sample.bytes) {
+                    if sample.header.reasons == 0 && of.is_after_damage(unit) {
+                        reporter.report(format!("sensor {sensor}: beside damage, and not marked"));
+                    }
+                    if let Some(lost) = of.publish(at, unit) {
+                        reporter.report(format!("sensor {sensor}: {lost}"));
+                    }
+                }
+            }
+            Event::Published { sensor, sample } if sample.topic == Topic::Status => {
+                let status: Status = bytemuck::pod_read_unaligned(&sample.bytes);
+                let of = &mut self.sensors[sensor];
+                if status.state() != Some(State::Streaming) {
+                    of.streams_from = None;
+                    of.end_stream(at);
+                } else if of.streams_from.is_none() && !of.is_other {
+                    of.streams_from = Some(of.read_end);
+                }
+            }
+            Event::WorldEnded { .. } => {
+                for (sensor, of) in self.sensors.iter().enumerate() {
+                    let is_lost =
+                        |sent: &&SentTelegram| sent.due_at.is_some_and(|due| due + MAX_HOLD_TIME < at);
+                    let lost = of.sent.iter().filter(is_lost).count();
+                    if lost > of.lacked_memory {
+                        reporter.report(format!("sensor {sensor}: {lost} lost at the end"));
+                    }
+                }
+            }
+            _ => {}
+        }
+    }
+}
+
+impl SensorTelegrams {
+    fn new(family: Rc<dyn Family>) -> SensorTelegrams {
+        SensorTelegrams {
+            family,
+            sent: VecDeque::new(),
+            valid_from: 0,
+            streams_from: None,
+            read_end: 0,
+            exchanged: 0,
+            is_other: false,
+            mixed_until: 0,
+            lacked_memory: 0,
+            sent_end: 0,
+            allowed_losses: 0,
+            foreign: Vec::new(),
+            stall: (0, 0),
+        }
+    }
+
+    fn send(&mut self, telegram: &Telegram<'_>) {
+        let Telegram { bytes, span, damage, aborted, .. } = *telegram;
+        let is_intact = damage.is_none() && !aborted;
+        let near = self.family.point_accuracy(bytes).neighbors;
+        // What is asked of one whose head turns is asked again until it answers.
+        let is_promised = !self.family.is_rotating() || self.family.is_data(bytes);
+        let is_plain = span.1 - span.0 == bytes.len() as u64 && span.0 <= self.sent_end;
+        self.sent_end = span.1;
+        if !is_intact || !is_plain || !is_promised {
+            self.allowed_losses = near + 1;
+            self.sent.iter_mut().rev().take(near).for_each(|sent| {
+                (sent.is_whole, sent.due_at) = (false, None);
+            });
+        }
+        self.allowed_losses = self.allowed_losses.saturating_sub(1);
+        let is_whole = is_intact && is_promised && (self.allowed_losses == 0 || near == 0);
+        let (bytes, exchanged) = (bytes.to_vec(), self.exchanged);
+        self.sent.push_back(SentTelegram {
+            bytes,
+            span,
+            exchanged,
+            is_whole,
+            is_intact,
+            is_read: false,
+            due_at: None,
+        });
+        while self.sent.len() > MAX_REMEMBERED * self.family.max_telegrams() && self.sent[0].due_at.is_none()
+        {
+            self.sent.pop_front();
+        }
+    }
+
+    fn flush(&mut self, from: u64) {
+        for sent in self.sent.iter_mut().rev().take_while(|sent| sent.span.1 > from) {
+            sent.is_whole = false;
+        }
+    }
+
+    fn read(&mut self, at: Nanos, to: u64) {
+        self.read_end = to;
+        for sent in self.sent.iter_mut().rev().take_while(|sent| !sent.is_read) {
+            if sent.span.1 <= to {
+                sent.is_read = true;
+                let is_known = |from: u64| sent.span.0 >= from;
+                let is_due = sent.is_whole && is_known(self.valid_from);
+                sent.due_at = (is_due && self.streams_from.is_some_and(is_known)).then_some(at);
+            }
+        }
+    }
+
+    /// The stream ends: what came just before may still have been held back, to see what follows.
+    fn end_stream(&mut self, at: Nanos) {
+        let at = if self.stall.1 >= at { self.stall.0 } else { at };
+        for sent in
+            self.sent.iter_mut().filter(|sent| sent.due_at.is_some_and(|due| due + MAX_HOLD_TIME > at))
+        {
+            sent.due_at = None;
+        }
+        // Where only what follows tells that it is one, nothing follows the last one.
+        if let Some(last) = self.sent.iter_mut().rfind(|sent| sent.is_read)
+            && self.family.point_accuracy(&last.bytes).neighbors > 0
+        {
+            last.due_at = None;
+        }
+    }
+
+    /// Whether damaged bytes came before `unit`, which has a checksum and is published now: then it has to be marked.
+    fn is_after_damage(&self, unit: &[u8]) -> bool {
+        let exactness = self.family.point_accuracy(unit);
+        if !self.foreign.is_empty()
+            || exactness.has_clock
+            || exactness.neighbors > 0
+            || !self.family.is_data(unit)
+        {
+            return false;
+        }
+        let Some(found) = self.sent.iter().position(|sent| sent.is_read && sent.bytes == unit) else {
+            return false;
+        };
+        let before = found.checked_sub(1).and_then(|before| self.sent.get(before));
+        let is_known = |from: u64| self.streams_from.is_some_and(|streams_from| streams_from <= from);
+        before.is_some_and(|before| {
+            !before.is_intact && before.span.1 > before.span.0 && is_known(before.span.0)
+        })
+    }
+
+    /// A telegram is published. What was lost before it.
+    fn publish(&mut self, at: Nanos, bytes: &[u8]) -> Option<String> {
+        let is_it = |sent: &SentTelegram| sent.is_read && sent.bytes == bytes;
+        // Replies are often the same, and single points sometimes: of those that are, the one that has to come, or a whole one.
+        let due = self.sent.iter().position(|sent| sent.due_at.is_some() && is_it(sent));
+        let whole = due.or_else(|| self.sent.iter().position(|sent| sent.is_whole && is_it(sent)));
+        let first = self.sent.iter().position(is_it);
+        // The first of two alike, if the other would mean that something between them is lost; what is lost shows later.
+        let is_due = |sent: &SentTelegram| sent.due_at.is_some();
+        let skips = whole.is_some_and(|whole| self.sent.range(first.unwrap_or(0)..whole).any(is_due));
+        let found = if skips { first } else { whole.or(first) };
+        let foreign = std::mem::take(&mut self.foreign);
+        let Some(found) = found else {
+            self.foreign = bytes.to_vec();
+            return None;
+        };
+        let is_of_this = self.family.is_data(bytes) && self.sent[found].exchanged == self.exchanged;
+        self.is_other &= !is_of_this || at < self.mixed_until;
+        // One that lost its first byte is whole again with the last one of the one before it, if that is the same: either is.
+        let is_lent = !self.sent[found].is_whole;
+        let passed = self.sent.drain(..=found).take(found);
+        let mut lost: Vec<SentTelegram> = passed.filter(|sent| sent.due_at.is_some()).collect();
+        // A checksum of one byte is right by chance in 1 of 256: what damage made of two packets has a part of the intact one.
+        if let Some(torn) = lost.iter().position(|sent| overlaps(&foreign, &sent.bytes)) {
+            lost.remove(torn);
+        }
+        if is_lent && lost.last().is_some_and(|sent| sent.bytes.last() == bytes.first()) {
+            lost.pop();
+        }
+        let (count, holes) = (lost.len(), self.lacked_memory);
+        self.lacked_memory = holes.saturating_sub(count);
+        (count > holes).then(|| {
+            let SentTelegram { bytes, span, .. } = &lost[0];
+            format!("{count} lost, first at {span:?}: {:02X?}", &bytes[..bytes.len().min(8)])
+        })
+    }
+}
+
+/// Whether one of both ends, by a header at least, with what the other begins with.
+fn overlaps(foreign: &[u8], sent: &[u8]) -> bool {
+    let is_end = |len: usize| foreign.ends_with(&sent[..len]) || sent.ends_with(&foreign[..len]);
+    (MIN_HEADER_LEN..foreign.len().min(sent.len())).any(is_end)
+}
+
+/// Bytes by which what has a checksum is known to begin.
+const MIN_HEADER_LEN: usize = 2;
+/// A telegram is held back no longer than so.
+const MAX_HOLD_TIME: Nanos = 100 * MILLIS;
+/// A line holds bytes back for no longer than so (action `silence`).
+const MAX_LINE_DELAY: Nanos = 4_000 * MILLIS;
+/// So many samples that were never due are remembered.
+const MAX_REMEMBERED: usize = 64;
+
+/// Judge: the hub counts packets that a scanner sent and the hub did not receive. Packets without a number follow each other;
+/// the hub counts as many as are missing between two packets that arrived, as exactly as their times and angles permit.
+pub(crate) struct LostOnLine {
+    sensors: Vec<PacketCounters>,
+}
+
+struct PacketCounters {
+    family: Rc<dyn Family>,
+    /// Packets that were sent and not published yet, in order. An empty one marks a power cycle or an exchange.
+    sent: VecDeque<Vec<u8>>,
+    /// The last one that was published.
+    last: Vec<u8>,
+    /// Count in the last status of this hub. The other fields apply since the last agreement: reported packets,
+    /// missing packets, and their allowed difference.
+    counted: Option<u64>,
+    reported: u64,
+    missing: u64,
+    allowed_difference: u64,
+    /// Sum of reported and missing packets at the last status.
+    total_at_last_status: u64,
+    /// Whether both disagreed then. After a stall of the hub, and for points without a checksum, the hub detects the
+    /// number of missing packets later.
+    disagreed: bool,
+    /// Number of the next statuses that are not checked, after something that cannot be counted: another session, or a
+    /// packet that was not sent.
+    unchecked_statuses: u8,
+    /// Packets were not published for lack of memory.
+    lacked_memory: bool,
+    measured_at: Nanos,
+    /// Total count of all statuses.
+    reported_total: u64,
+}
+
+impl LostOnLine {
+    pub(crate) fn new(sensors: &[Rc<dyn Family>]) -> LostOnLine {
+        let sensor = |family: &Rc<dyn Family>| PacketCounters {
+            family: family.clone(),
+            sent: VecDeque::new(),
+            last: Vec::new(),
+            counted: None,
+            reported: 0,
+            missing: 0,
+            allowed_difference: 0,
+            total_at_last_status: 0,
+            disagreed: false,
+            unchecked_statuses: UNCHECKED_STATUSES,
+            lacked_memory: false,
+            measured_at: 0,
+            reported_total: 0,
+        };
+        LostOnLine { sensors: sensors.iter().map(sensor).collect() }
+    }
+}
+
+impl Invariant for LostOnLine {
+    fn name(&self) -> &'static str {
+        "lost_on_line"
+    }
+
+    fn figures(&self) -> RevolutionFigures {
+        RevolutionFigures {
+            lost: self.sensors.iter().map(|of| of.reported_total).sum(),
+            ..RevolutionFigures::default()
+        }
+    }
+
+    fn on_event(&mut self, _: Nanos, event: &Event<'_>, reporter: &mut ViolationReporter<'_>) {
+        match *event {
+            Event::Measured { sensor, points } => self.sensors[sensor].measure(points),
+            Event::Sent { sensor, telegram } if !telegram.is_reply => {
+                self.sensors[sensor].send(telegram.bytes);
+            }
+            Event::ScannerExchanged { sensor } => self.sensors[sensor].send(&[]),
+            Event::PortOpened { sensor, .. } | Event::RateChanged { sensor } => {
+                self.sensors[sensor].unchecked_statuses = UNCHECKED_STATUSES
+            }
+            Event::OutOfMemory { sensor, topic: Topic::Telegram } => {
+                self.sensors[sensor].lacked_memory = true
+            }
+            Event::HubStarted { .. } => {
+                self.sensors
+                    .iter_mut()
+                    .for_each(|of| (of.unchecked_statuses, of.counted) = (UNCHECKED_STATUSES, None));
+            }
+            Event::Published { sensor, sample } if self.sensors[sensor].family.is_rotating() => {
+                let of = &mut self.sensors[sensor];
+                match sample.topic {
+                    Topic::Telegram => {
+                        let family = of.family.clone();
+                        let units = family.telegrams(&sample.bytes).into_iter();
+                        units.filter(|unit| family.is_data(unit)).for_each(|unit| of.publish(unit));
+                    }
+                    Topic::Status => {
+                        let status: Status = bytemuck::pod_read_unaligned(&sample.bytes);
+                        if let Err(words) = of.check(&status) {
+                            reporter.report(format!("sensor {sensor}: {words}"));
+                        }
+                    }
+                    _ => {}
+                }
+            }
+            _ => {}
+        }
+    }
+}
+
+impl PacketCounters {
+    /// Takes measured points. After a power cycle, the number of missing packets is unknown.
+    fn measure(&mut self, points: &[TruePoint]) {
+        let Some(last) = points.last() else { return };
+        if last.at_ns > self.measured_at + MIN_POWER_OFF {
+            self.send(&[]);
+        }
+        self.measured_at = last.at_ns;
+    }
+
+    fn send(&mut self, unit: &[u8]) {
+        // A packet that the line duplicates was sent once.
+        let before = self.sent.back().map_or(&self.last[..], Vec::as_slice);
+        if self.family.is_rotating() && before != unit {
+            self.sent.push_back(unit.to_vec());
+        }
+        if self.sent.len() > MAX_SENT {
+            self.sent.pop_front();
+            self.unchecked_statuses = UNCHECKED_STATUSES;
+        }
+    }
+
+    fn publish(&mut self, unit: &[u8]) {
+        if unit == self.last {
+            return;
+        }
+        let Some(missing) = self.sent.iter().position(|sent| sent == unit) else {
+            self.unchecked_statuses = UNCHECKED_STATUSES;
+            return;
+        };
+        let is_other = self.sent.drain(..=missing).any(|sent| sent.is_empty());
+        self.last.clear();
+        self.last.extend_from_slice(unit);
+        let missing = missing as u64;
+        if std::mem::take(&mut self.lacked_memory) || is_other || missing > MAX_GAP_PACKETS {
+            self.unchecked_statuses = UNCHECKED_STATUSES;
+        }
+        self.missing += missing;
+        // How many fit between two packets is rounded, and a head may change its speed between them.
+        let exactness = self.family.point_accuracy(unit);
+        let unmarked = if exactness.neighbors > 0 { MAX_UNMARKED_DIFFERENCE + missing / 10 } else { 1 };
+        self.allowed_difference += if missing > 0 { unmarked + missing / 20 } else { 0 };
+    }
+
+    /// Returns the error of the count in `status`.
+    fn check(&mut self, status: &Status) -> Result<(), String> {
+        let counted = status.counters[Counter::LostOnLine];
+        let reported = counted.saturating_sub(self.counted.replace(counted).unwrap_or(0));
+        self.reported_total += reported;
+        self.reported += reported;
+        if status.state() != Some(State::Streaming) {
+            self.unchecked_statuses = UNCHECKED_STATUSES + 1;
+        }
+        let is_sure = self.unchecked_statuses == 0;
+        self.unchecked_statuses = self.unchecked_statuses.saturating_sub(1);
+        let (reported, missing) = (self.reported, self.missing);
+        let is_still =
+            std::mem::replace(&mut self.total_at_last_status, reported + missing) == reported + missing;
+        let agree = reported.abs_diff(missing) <= self.allowed_difference;
+        let was_open = std::mem::replace(&mut self.disagreed, is_sure && !agree);
+        if is_sure && (agree && !is_still || !agree && !was_open) {
+            return Ok(());
+        }
+        (self.reported, self.missing, self.allowed_difference, self.total_at_last_status, self.disagreed) =
+            (0, 0, 0, 0, false);
+        if is_sure && !agree {
+            return Err(format!("{missing} packets are missing, {reported} are told"));
+        }
+        Ok(())
+    }
+}
+
+/// The status after something that cannot be counted, and the next one, which may contain losses that the hub detected
+/// later.
+const UNCHECKED_STATUSES: u8 = 2;
+/// Allowed difference if only the number of points per revolution shows a loss.
+const MAX_UNMARKED_DIFFERENCE: u64 = 30;
+/// Number of packets that are kept: as many as a tty buffers of the fastest scanner.
+const MAX_SENT: usize = 20_000;
+/// Longest countable gap, in packets: 1.5 s of the slowest scanner. The scanner's clock may have changed in a longer
+/// one.
+const MAX_GAP_PACKETS: u64 = 400;
+/// Minimum duration of a power cycle.
+const MIN_POWER_OFF: Nanos = 50 * MILLIS;

@@ -1,0 +1,189 @@
+//! Judges of verdicts that robots accept, next to the hub and on another machine.
+
+use scanhub_schema::datagram::DatagramPayload;
+use scanhub_schema::{MILLIS, Nanos, Topic, Verdict, Zones};
+
+use super::{Invariant, ViolationReporter};
+use crate::actions::objects_inside;
+use crate::event::Event;
+use crate::remote::LinkSettings;
+use crate::scenario::Scenario;
+use crate::setup::Setup;
+
+/// Judge: a robot never accepts a clear verdict for longer than promised while an object is inside a circle.
+///
+/// The promise (`docs/topics.md`): a verdict is valid for two periods and 20 ms in the hub, for 20 ms more in a subscriber, and
+/// unknown after that. A scan shows the objects at the time of its measurement and is then on the line for a while. A circle is
+/// violated by a number of scans in a row, each of which may be as late as a verdict is valid in the hub.
+pub(crate) struct LocalVerdict {
+    sensors: Vec<SensorVerdict>,
+}
+
+struct SensorVerdict {
+    /// When something is inside.
+    object_spans: Vec<(Nanos, Nanos)>,
+    max_delay: Nanos,
+    /// Since when it is believed that the way is clear, if it is.
+    clear_since: Option<Nanos>,
+}
+
+impl LocalVerdict {
+    pub(crate) fn new(setup: &Setup, scenario: &Scenario) -> LocalVerdict {
+        let sensor = |number: usize| {
+            let max_delay = max_clear_time(setup, number);
+            let object_spans = objects_inside(scenario, number, setup.sensors.len());
+            SensorVerdict { object_spans, max_delay, clear_since: None }
+        };
+        LocalVerdict { sensors: (0..setup.sensors.len()).map(sensor).collect() }
+    }
+}
+
+impl Invariant for LocalVerdict {
+    fn name(&self) -> &'static str {
+        "verdict"
+    }
+
+    fn on_event(&mut self, at: Nanos, event: &Event<'_>, reporter: &mut ViolationReporter<'_>) {
+        match *event {
+            Event::VerdictAccepted { sensor, verdict } => {
+                let of = &mut self.sensors[sensor];
+                of.check(sensor, at, reporter);
+                of.clear_since = (verdict == Verdict::Clear).then_some(at);
+            }
+            Event::WorldEnded { .. } => {
+                let sensors = self.sensors.iter_mut().enumerate();
+                sensors.for_each(|(sensor, of)| of.check(sensor, at, reporter));
+            }
+            _ => {}
+        }
+    }
+}
+
+impl SensorVerdict {
+    fn check(&mut self, sensor: usize, at: Nanos, reporter: &mut ViolationReporter<'_>) {
+        let Some(since) = self.clear_since else { return };
+        for &(from, until) in &self.object_spans {
+            let end = at.min(until);
+            if end > since && end > from + self.max_delay {
+                let (was, bound) = ((end - from) / MILLIS, self.max_delay / MILLIS);
+                reporter.report(format!(
+                    "sensor {sensor}: clear, and something inside for {was} ms, bound {bound}"
+                ));
+            }
+        }
+    }
+}
+
+/// For so long it may be believed that nothing is inside a circle of sensor `number`, although something is.
+fn max_clear_time(setup: &Setup, number: usize) -> Nanos {
+    let (period, told_after) = setup.sensors[number].scan_times();
+    let in_hub = 2 * period + STALENESS_MARGIN;
+    told_after + setup.min_scans * in_hub + STALENESS_MARGIN + TIMER_DELAY
+}
+
+/// What is added to the two periods in the hub, and once more with a consumer.
+const STALENESS_MARGIN: Nanos = 20 * MILLIS;
+/// Threads and timers are late by no more than this, all together.
+const TIMER_DELAY: Nanos = 3 * MILLIS;
+
+/// Judge: a remote robot never accepts a clear verdict for longer than promised while an object is inside a circle.
+///
+/// The promise has two halves. A gateway is a subscriber of the hub like a robot, so it sends no clear zones for longer than a
+/// robot next to the hub accepts them. From its arrival on (`docs/topics.md`: the delay on the network is unknown), a verdict is
+/// valid for two periods as sent and 40 ms, at least half a second and at most 5.04 s, and unknown after that.
+pub(crate) struct RemoteVerdict {
+    begin_ns: u64,
+    sensors: Vec<RemoteSensor>,
+}
+
+struct RemoteSensor {
+    /// When something is inside.
+    object_spans: Vec<(Nanos, Nanos)>,
+    /// Time for which a robot next to the hub may accept another verdict.
+    max_delay: Nanos,
+    /// Time until which the last published verdict is valid.
+    valid_until: Nanos,
+    accepted: Verdict,
+}
+
+impl RemoteVerdict {
+    pub(crate) fn new(setup: &Setup, scenario: &Scenario, terms: &LinkSettings) -> RemoteVerdict {
+        let sensor = |number: usize| {
+            let object_spans = objects_inside(scenario, number, setup.sensors.len());
+            // In a bridge the newest of those that go out waits until the next one comes.
+            let (period, _) = setup.sensors[number].scan_times();
+            let waits = if terms.are_bridges { terms.send_interval.get() * period } else { 0 };
+            let max_delay = max_clear_time(setup, number) + waits;
+            RemoteSensor { object_spans, max_delay, valid_until: 0, accepted: Verdict::Unknown }
+        };
+        let sensors = (0..setup.sensors.len()).map(sensor).collect();
+        RemoteVerdict { begin_ns: terms.initial_clocks.monotonic_ns, sensors }
+    }
+}
+
+impl Invariant for RemoteVerdict {
+    fn name(&self) -> &'static str {
+        "remote_verdict"
+    }
+
+    fn on_event(&mut self, at: Nanos, event: &Event<'_>, reporter: &mut ViolationReporter<'_>) {
+        match *event {
+            Event::Transmitted { datagram, .. } if datagram.head.topic == Topic::Zones.number() => {
+                let sensor = usize::from(datagram.head.sensor);
+                let of = &self.sensors[sensor];
+                if is_clear(datagram.payload)
+                    && let Some((from, _)) =
+                        of.object_spans.iter().find(|(from, until)| from + of.max_delay < at && at < *until)
+                {
+                    let (was, bound) = ((at - from) / MILLIS, of.max_delay / MILLIS);
+                    reporter.report(format!(
+                        "sensor {sensor}: clear is sent, and something inside for {was} ms, bound {bound}"
+                    ));
+                }
+            }
+            Event::Republished { sensor, topic: Topic::Zones, header, .. } => {
+                let of = &mut self.sensors[sensor];
+                of.check(sensor, at, reporter);
+                let stands = (2_000 * u64::from(header.period_us) + VALIDITY_MARGIN).max(MIN_VALIDITY);
+                if stands > MAX_VALIDITY {
+                    reporter
+                        .report(format!("sensor {sensor}: a verdict that stands for {} ms", stands / MILLIS));
+                }
+                of.valid_until = header.stamp_last_ns - self.begin_ns + stands;
+            }
+            Event::RemoteVerdictAccepted { sensor, verdict } => {
+                let of = &mut self.sensors[sensor];
+                of.accepted = verdict;
+                of.check(sensor, at, reporter);
+            }
+            Event::WorldEnded { .. } => {
+                let sensors = self.sensors.iter().enumerate();
+                sensors.for_each(|(sensor, of)| of.check(sensor, at, reporter));
+            }
+            _ => {}
+        }
+    }
+}
+
+impl RemoteSensor {
+    /// Checks that the accepted verdict is still valid. A verdict that the robot drops now was accepted until now.
+    fn check(&self, sensor: usize, at: Nanos, reporter: &mut ViolationReporter<'_>) {
+        if self.accepted != Verdict::Unknown && at > self.valid_until {
+            let late = (at - self.valid_until) / MILLIS;
+            reporter.report(format!(
+                "sensor {sensor}: {:?}, which stands no more since {late} ms",
+                self.accepted
+            ));
+        }
+    }
+}
+
+fn is_clear(payload: &[u8]) -> bool {
+    let mut zones = Zones::default();
+    zones.unpack(payload) && zones.verdict() == Verdict::Clear
+}
+
+/// Margin after two periods, and the shortest and the longest validity of a verdict.
+const VALIDITY_MARGIN: Nanos = 40 * MILLIS;
+const MIN_VALIDITY: Nanos = 500 * MILLIS;
+const MAX_VALIDITY: Nanos = 5_040 * MILLIS;

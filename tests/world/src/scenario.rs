@@ -1,0 +1,263 @@
+//! The plan of a world as data: a seed, a duration, and a list of timed actions. The seed draws the list, which can be printed,
+//! parsed and shortened, so that a failure can be repeated with fewer actions. `actions` defines their effects.
+
+use std::fmt;
+use std::str::FromStr;
+
+use scanhub_schema::{MILLIS, Nanos};
+use scanhub_sim::fault::Faults;
+
+use crate::actions::{self, ACTION_KINDS, ActionKind};
+use crate::family;
+
+/// What shall happen. Everything else (how many sensors, their rates, the consumers) follows from the seed.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Scenario {
+    /// Of all random numbers.
+    pub seed: u64,
+    /// How long it lasts, in virtual seconds.
+    pub seconds: u64,
+    /// The only sensor, by its model, of some its mode and what it does at first; else the seed draws one or two.
+    pub model: Option<String>,
+    /// Whether half of the links have no family, and the hub searches for their scanners. The link of the only sensor
+    /// has none.
+    pub is_auto: bool,
+    /// In the order of time.
+    pub actions: Vec<Action>,
+}
+
+/// Something that happens at a time.
+#[derive(Clone, Debug)]
+pub struct Action {
+    /// When, in milliseconds since the beginning.
+    pub at_ms: u64,
+    pub(crate) kind: &'static ActionKind,
+    /// A value for each key of the kind.
+    pub(crate) values: Vec<u64>,
+}
+
+impl Scenario {
+    /// What `seed` draws for `seconds`: of the kinds of action about half (swarm testing: many faults hide each other),
+    /// each of the others some times, and nothing in the last eight seconds.
+    pub fn from_seed(seed: u64, seconds: u64) -> Scenario {
+        let mut random = fastrand::Rng::with_seed(seed ^ 0x5EED_0F1A_C710_0000);
+        let end_ms = (seconds * 1_000).saturating_sub(RECOVERY_TIME / MILLIS);
+        let mut actions = Vec::new();
+        for kind in ACTION_KINDS {
+            // Drawn for each kind, so that a new kind changes little of what the old ones do.
+            let mut random = random.fork();
+            if random.bool() || end_ms <= START_DELAY_MS {
+                continue;
+            }
+            let mean = kind.per_minute * (end_ms - START_DELAY_MS) as f64 / 60_000.0;
+            for _ in 0..1 + (random.f64() * 2.0 * mean) as u64 {
+                let at_ms = random.u64(START_DELAY_MS..end_ms);
+                actions.push(Action { at_ms, kind, values: kind.draw(&mut random) });
+            }
+        }
+        actions.sort_by_key(|action| action.at_ms);
+        Scenario { seed, seconds, model: None, is_auto: false, actions }
+    }
+
+    /// Returns the plan of [`of_seed`](Scenario::from_seed) for a world in which half of the links have no family.
+    pub fn auto_from_seed(seed: u64, seconds: u64) -> Scenario {
+        Scenario { is_auto: true, ..Scenario::from_seed(seed, seconds) }
+    }
+
+    /// When everything is made well again: what is to be seen then has eight seconds.
+    pub fn faults_clear_at(&self) -> Nanos {
+        (self.seconds * 1_000 * MILLIS).saturating_sub(RECOVERY_TIME)
+    }
+}
+
+/// Without actions at the end, in which everything has to come back.
+pub(crate) const RECOVERY_TIME: Nanos = 12_000 * MILLIS;
+/// Nothing happens in the first moment: a hub has to be there first.
+const START_DELAY_MS: u64 = 200;
+
+impl Action {
+    /// The value of the key called `name`.
+    pub fn value(&self, name: &str) -> u64 {
+        let at = self.kind.keys.iter().position(|key| key.name == name);
+        at.and_then(|at| self.values.get(at)).copied().unwrap_or_default()
+    }
+
+    /// What it does to the bytes on a line from `now` on, if it is of such a kind.
+    pub fn faults(&self, now: Nanos) -> Option<Faults> {
+        actions::faults(self, now)
+    }
+
+    /// The name of its kind.
+    pub fn name(&self) -> &'static str {
+        self.kind.name
+    }
+}
+
+impl PartialEq for Action {
+    fn eq(&self, other: &Action) -> bool {
+        (self.at_ms, self.kind.name, &self.values) == (other.at_ms, other.kind.name, &other.values)
+    }
+}
+
+impl fmt::Display for Action {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} {}", self.at_ms, self.kind.name)?;
+        let mut keys = self.kind.keys.iter().zip(&self.values);
+        keys.try_for_each(|(key, value)| write!(f, " {}={value}", key.name))
+    }
+}
+
+impl FromStr for Action {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Action, String> {
+        let wrong = || format!("{text:?} is no action");
+        let mut words = text.split_whitespace();
+        let at_ms = words.next().and_then(|word| word.parse().ok()).ok_or_else(wrong)?;
+        let name = words.next().ok_or_else(wrong)?;
+        let kind = ACTION_KINDS.iter().find(|kind| kind.name == name).ok_or_else(wrong)?;
+        let mut values = Vec::new();
+        for (key, word) in kind.keys.iter().zip(words.by_ref()) {
+            let value = word.split_once('=').filter(|(name, _)| *name == key.name);
+            values.push(value.and_then(|(_, value)| value.parse().ok()).ok_or_else(wrong)?);
+        }
+        if values.len() < kind.keys.len() || words.next().is_some() {
+            return Err(wrong());
+        }
+        Ok(Action { at_ms, kind, values })
+    }
+}
+
+impl fmt::Display for Scenario {
+    /// A line for the seed, and one for each action.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "seed {} seconds {}", self.seed, self.seconds)?;
+        self.model.iter().try_for_each(|model| write!(f, " {model}"))?;
+        f.write_str(if self.is_auto { " auto" } else { "" })?;
+        writeln!(f)?;
+        self.actions.iter().try_for_each(|action| writeln!(f, "{action}"))
+    }
+}
+
+impl FromStr for Scenario {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Scenario, String> {
+        let mut lines = text.lines().map(str::trim).filter(|line| !line.is_empty());
+        let head = lines.next().unwrap_or_default();
+        let words: Vec<&str> = head.split_whitespace().collect();
+        let ["seed", seed, "seconds", seconds, ref rest @ ..] = words[..] else {
+            return Err(format!("{head:?} is not the first line of a plan"));
+        };
+        let (is_auto, rest) = match rest {
+            [model @ .., "auto"] => (true, model),
+            model => (false, model),
+        };
+        let model = match *rest {
+            [] => None,
+            [model] if family::from_name(model, &mut fastrand::Rng::with_seed(0)).is_some() => {
+                Some(model.to_owned())
+            }
+            _ => return Err(format!("{head:?} names no model")),
+        };
+        let number = |word: &str| word.parse().map_err(|_| format!("{word:?} is no number"));
+        let (seed, seconds) = (number(seed)?, number(seconds)?);
+        Ok(Scenario {
+            seed,
+            seconds,
+            model,
+            is_auto,
+            actions: lines.map(str::parse).collect::<Result<_, _>>()?,
+        })
+    }
+}
+
+/// Returns the plans that once ended in a violation, each with its reason. They must stay without a violation.
+///
+/// # Panics
+///
+/// If the file is not a valid corpus.
+pub fn corpus() -> Vec<(String, Scenario)> {
+    let scenarios = CORPUS_TEXT.split("\n\n").filter(|text| text.lines().any(|line| !line.starts_with('#')));
+    let parse = |text: &str| {
+        let (why, scenario): (Vec<&str>, Vec<&str>) = text.lines().partition(|line| line.starts_with('#'));
+        let scenario = scenario.join("\n");
+        let why = why.iter().map(|line| line.trim_start_matches("# ")).collect::<Vec<_>>().join(" ");
+        let scenario = scenario.parse().unwrap_or_else(|error| panic!("{why}: {error}"));
+        (why, scenario)
+    };
+    scenarios.map(parse).collect()
+}
+
+/// Plans as text with an empty line between two. Lines before each plan give its reason.
+const CORPUS_TEXT: &str = include_str!("corpus.txt");
+
+/// Returns the shortest plan found for which `judge` names the same judge as for `plan`. The search leaves out halves of the
+/// actions as long as the same judge reports a violation, then quarters, down to single actions.
+pub fn shrink(scenario: &Scenario, mut check: impl FnMut(&Scenario) -> Option<&'static str>) -> Scenario {
+    let Some(expected) = check(scenario) else { return scenario.clone() };
+    let mut best = scenario.clone();
+    let mut piece = best.actions.len().div_ceil(2).max(1);
+    loop {
+        let mut from = 0;
+        let mut is_shorter = false;
+        while from < best.actions.len() {
+            let to = (from + piece).min(best.actions.len());
+            let mut less = best.clone();
+            less.actions.drain(from..to);
+            if check(&less) == Some(expected) {
+                best = less;
+                is_shorter = true;
+            } else {
+                from = to;
+            }
+        }
+        match (piece, is_shorter) {
+            (1, false) => return best,
+            (1, true) => {}
+            _ => piece = piece.div_ceil(2),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_plan_is_the_same_as_text() {
+        let mut met = std::collections::HashSet::new();
+        for seed in 0..50 {
+            let scenario = Scenario::from_seed(seed, 60);
+            assert_eq!(scenario.to_string().parse(), Ok(scenario.clone()));
+            assert_eq!(scenario, Scenario::from_seed(seed, 60));
+            assert!(scenario.actions.iter().all(|action| action.at_ms * MILLIS < scenario.faults_clear_at()));
+            met.extend(scenario.actions.iter().map(Action::name));
+            let model = Some("a1:boost".to_owned()).filter(|_| seed % 2 == 0);
+            let auto = Scenario { model, ..Scenario::auto_from_seed(seed, 60) };
+            assert_eq!(auto.to_string().parse(), Ok(auto));
+        }
+        assert_eq!(met.len(), ACTION_KINDS.len(), "{met:?}");
+        for wrong in ["", "seed x seconds 1", "seed 1 seconds 2\nfoo", "seed 1 seconds 2\n5 fly sensor=1"] {
+            assert!(wrong.parse::<Scenario>().is_err(), "{wrong:?}");
+        }
+    }
+
+    #[test]
+    fn two_culprits_among_many_are_found() {
+        let scenario = (0..)
+            .map(|seed| Scenario::from_seed(seed, 60))
+            .find(|scenario| scenario.actions.len() > 40)
+            .unwrap();
+        let culprits = [scenario.actions[7].clone(), scenario.actions[31].clone()];
+        let mut runs = 0;
+        let shrunk = shrink(&scenario, |scenario| {
+            runs += 1;
+            let has_all = culprits.iter().all(|culprit| scenario.actions.contains(culprit));
+            has_all.then_some("both")
+        });
+        assert_eq!(shrunk.actions, culprits);
+        assert!(runs < 80, "{runs}");
+        assert_eq!(shrink(&scenario, |_| None), scenario);
+    }
+}
