@@ -1,24 +1,24 @@
-// What a picture is drawn with, and what all pictures have.
+// Colors and drawing functions, the grid, and what each sensor measures.
 
-const colours = {};
-let shadeColours = [];
+const colors = {};
+let shadeColors = [];
 let isDark = false;
 
-function readColours() {
+function readColors() {
   const probe = make("span", document.body);
   for (const name of document.styleSheets[0].cssRules[0].style) {
     probe.style.color = `var(${name})`;
-    colours[name.slice(2)] = getComputedStyle(probe).color;
+    colors[name.slice(2)] = getComputedStyle(probe).color;
   }
-  colours.unknown = colours.stop;
-  // Whether it is dark is told by the paper.
-  const [red] = colours.paper.match(/[\d.]+/g).map(Number);
-  isDark = red < (colours.paper.includes("srgb") ? 0.5 : 128);
+  colors.unknown = colors.stop;
+  // The color of the paper says whether the page is dark.
+  const [red] = colors.paper.match(/[\d.]+/g).map(Number);
+  isDark = red < (colors.paper.includes("srgb") ? 0.5 : 128);
   probe.remove();
   const stops = isDark
     ? [[92, 124, 196], [70, 176, 214], [116, 214, 158], [250, 220, 96]]
     : [[52, 78, 148], [28, 120, 150], [24, 146, 98], [196, 120, 0]];
-  shadeColours = Array.from({ length: SHADES }, (_, n) => {
+  shadeColors = Array.from({ length: SHADES }, (_, n) => {
     const at = (n / (SHADES - 1)) * (stops.length - 1);
     const [low, high] = [stops[floor(at)], stops[ceil(at)]];
     return `rgb(${low.map((value, i) => Math.round(value + (high[i] - value) * (at % 1))).join(" ")})`;
@@ -27,37 +27,38 @@ function readColours() {
 
 const STEPS = [0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50];
 
-/** The colour of what is drawn and written next, and how wide lines are. */
-function ink(colour, width) {
-  pen.strokeStyle = pen.fillStyle = colour;
+/** Sets the color of what is drawn and written next, and the width of lines. */
+function ink(color, width) {
+  pen.strokeStyle = pen.fillStyle = color;
   pen.lineWidth = width;
 }
 
-/** The font of what is written next, around its place or above. */
+/** Sets the font of what is written next, which is centered at its position or above it. */
 function font(size, baseline) {
   pen.font = `${size}px system-ui, sans-serif`;
   pen.textAlign = "center";
   pen.textBaseline = baseline;
 }
 
-/** A way through places of the screen, and a line there. */
-function path(...places) {
+/** Starts a path through points of the screen. */
+function path(...points) {
   pen.beginPath();
-  for (const place of places) pen.lineTo(...place);
+  for (const point of points) pen.lineTo(...point);
 }
 
-function stroke(...places) {
-  path(...places);
+/** Draws a line through points of the screen. */
+function stroke(...points) {
+  path(...points);
   pen.stroke();
 }
 
-/** Draws on another canvas, which is empty before. */
-function drawOn(canvas, act, width = size.width, height = size.height) {
+/** Clears another canvas, and draws on it with `paint`. */
+function drawOn(canvas, paint, width = size.width, height = size.height) {
   [canvas.width, canvas.height] = [width * size.ratio, height * size.ratio];
   const before = pen;
   pen = canvas.getContext("2d");
   pen.scale(size.ratio, size.ratio);
-  act();
+  paint();
   pen = before;
 }
 
@@ -66,12 +67,12 @@ function circle(x, y, radius) {
   pen.arc(x, y, radius, 0, 2 * PI);
 }
 
-/** Words with the paper around them, so that no line runs through. */
+/** Writes a text with an outline in the color of the paper, so that lines do not cross it. */
 function label(text, x, y) {
   pen.save();
   pen.lineWidth = 4;
   pen.lineJoin = "round";
-  pen.strokeStyle = colours.paper;
+  pen.strokeStyle = colors.paper;
   pen.strokeText(text, x, y);
   pen.restore();
   pen.fillText(text, x, y);
@@ -80,10 +81,10 @@ function label(text, x, y) {
 /** Returns both axes, upright first: where index `n` of a grid line is, and the side on which the axis has its numbers. */
 function axes() {
   return [
-    { centre: view.x, at: (n, other) => toScreen(n, other), other: view.y, right: cos, down: sin, sign: 1,
-      name: isAside() ? "height, m" : "x ahead, m" },
-    { centre: view.y, at: (n, other) => toScreen(other, n), other: view.x, right: -sin, down: cos, sign: isAside() ? -1 : 1,
-      name: isAside() ? `${toTheSide()} along the floor, m` : "y left, m" },
+    { center: view.x, at: (n, other) => toScreen(n, other), other: view.y, right: cos, down: sin, sign: 1,
+      name: isSideView() ? "height, m" : "x ahead, m" },
+    { center: view.y, at: (n, other) => toScreen(other, n), other: view.x, right: -sin, down: cos, sign: isSideView() ? -1 : 1,
+      name: isSideView() ? `${sideAxisName()} along the floor, m` : "y left, m" },
   ];
 }
 
@@ -98,37 +99,37 @@ function drawGrid() {
   const [step, reach] = [gridStep(), gridReach()];
   const digits = step < 0.1 ? 2 : step < 1 ? 1 : 0;
   // The label of a zone takes the place of a number.
-  const isBare = (n) => n !== 0 && !(layers.zones && !isAside() && circles.some(({ radius }) => abs(abs(n * step) - radius) * view.scale < 26));
-  const each = (act) => {
-    for (const axis of axes()) for (let n = ceil((axis.centre - reach) / step); n * step <= axis.centre + reach; n++) act(n, axis);
+  const hasNumber = (n) => n !== 0 && !(layers.zones && !isSideView() && circles.some(({ radius }) => abs(abs(n * step) - radius) * view.scale < 26));
+  const forEachGridLine = (paint) => {
+    for (const axis of axes()) for (let n = ceil((axis.center - reach) / step); n * step <= axis.center + reach; n++) paint(n, axis);
   };
   for (const isAxis of [false, true]) {
-    ink(isAxis ? colours.axis : colours.grid, 1);
-    each((n, { at, other }) => { if ((n === 0) === isAxis) stroke(at(n * step, other - reach), at(n * step, other + reach)); });
+    ink(isAxis ? colors.axis : colors.grid, 1);
+    forEachGridLine((n, { at, other }) => { if ((n === 0) === isAxis) stroke(at(n * step, other - reach), at(n * step, other + reach)); });
   }
-  ink(colours.soft, 1);
+  ink(colors.soft, 1);
   font(11, "middle");
-  each((n, { at, right, down, sign }) => {
+  forEachGridLine((n, { at, right, down, sign }) => {
     const [x, y] = at(n * step, 0);
-    if (isBare(n) && isFree([x, y], 24)) label((sign * n * step).toFixed(digits), x + 13 * right, y + 11 * down);
+    if (hasNumber(n) && isFree([x, y], 24)) label((sign * n * step).toFixed(digits), x + 13 * right, y + 11 * down);
   });
 }
 
 /** Writes the name of each axis near its positive end, between two numbers. Called last, so that points do not hide it. */
 function drawAxisNames() {
   const [step, reach] = [gridStep(), gridReach()];
-  ink(colours.soft, 1);
+  ink(colors.soft, 1);
   font(11, "middle");
-  for (const { at, right, down, sign, name, centre } of axes()) {
+  for (const { at, right, down, sign, name, center } of axes()) {
     const { width } = pen.measureText(name);
     const apart = abs(right) * (width / 2 + 7) + abs(down) * 25;
-    const last = sign * floor((sign * centre + reach) / step);
-    for (let back = 0.5; back * step < 2 * reach; back++) {
-      const [x, y] = at((last - sign * back) * step, 0);
-      const place = [x + right * apart, y + down * apart];
-      if (!isFree(place, width)) continue;
+    const last = sign * floor((sign * center + reach) / step);
+    for (let offset = 0.5; offset * step < 2 * reach; offset++) {
+      const [x, y] = at((last - sign * offset) * step, 0);
+      const position = [x + right * apart, y + down * apart];
+      if (!isFree(position, width)) continue;
       drawn.axes += 1;
-      label(name, ...place);
+      label(name, ...position);
       break;
     }
   }
@@ -136,9 +137,9 @@ function drawAxisNames() {
 
 function drawRobot() {
   const [x, y] = toScreen(0, 0);
-  ink(colours.ink, 1);
+  ink(colors.ink, 1);
   path(...[[11, 0], [-7, 7], [-3.5, 0], [-7, -7]].map(([ahead, left]) => {
-    const [a, b] = isAside() ? [ahead * Math.cos(view.turn), left] : [-left, -ahead];
+    const [a, b] = isSideView() ? [ahead * Math.cos(view.turn), left] : [-left, -ahead];
     return [x + a * cos - b * sin, y + a * sin + b * cos];
   }));
   pen.fill();
@@ -149,27 +150,28 @@ function drawField(sensor) {
   const pose = poseOf(sensor);
   if (!scan || !pose) return;
   const far = min(scan.farthest, 2 * hypot(size.width, size.height) / view.scale);
-  const centre = toScreen(pose[4], pose[5]);
+  const center = toScreen(pose[4], pose[5]);
   const rim = Array.from({ length: 61 }, (_, n) => {
     const angle = scan.first + ((scan.last - scan.first) * n) / 60;
     return toScreen(...inFrame(pose, far * Math.cos(angle), far * Math.sin(angle)));
   });
-  const isTurn = scan.last - scan.first > 6.2;
-  path(...(isTurn ? [] : [centre]), ...rim);
-  pen.fillStyle = colours.shade;
+  const isFullCircle = scan.last - scan.first > 6.2;
+  path(...(isFullCircle ? [] : [center]), ...rim);
+  pen.fillStyle = colors.shade;
   pen.fill();
-  if (!isTurn) {
-    ink(colours.axis, 1);
+  if (!isFullCircle) {
+    ink(colors.axis, 1);
     pen.setLineDash([1, 5]);
-    stroke(rim[0], centre, rim[60]);
+    stroke(rim[0], center, rim[60]);
     pen.setLineDash([]);
   }
 }
 
-const HIDDEN = 0.8; // pixels
+// Minimum distance between two dots that are drawn one after the other, in pixels.
+const MIN_DOT_DISTANCE = 0.8;
 
-/** Squares of `width` at `points` of a sensor at `pose`, drawn as `how` says; how many of them are numbers. */
-function dots(points, width, pose, how = "fillRect") {
+/** Draws squares of `width` at `points` of a sensor at `pose` with the method of the pen. Returns the number of points that are not NaN. */
+function dots(points, width, pose, method = "fillRect") {
   if (!points || !pose) return 0;
   const [a, b, c, d, e, f] = onScreen(pose);
   const [left, top] = [e - width / 2, f - width / 2];
@@ -179,9 +181,9 @@ function dots(points, width, pose, how = "fillRect") {
     const y = top + b * points[i] + d * points[i + 1];
     if (x !== x) continue;
     count += 1;
-    // What is hidden behind the one before costs as much as what is seen.
-    if (abs(x - px) < HIDDEN && abs(y - py) < HIDDEN) continue;
-    pen[how](x, y, width, width);
+    // A dot that the one before covers would cost as much as a visible one.
+    if (abs(x - px) < MIN_DOT_DISTANCE && abs(y - py) < MIN_DOT_DISTANCE) continue;
+    pen[method](x, y, width, width);
     [px, py] = [x, y];
   }
   return count;
@@ -193,15 +195,15 @@ function drawScan(sensor) {
   const pose = poseOf(sensor);
   const width = scan.points.length > 2000 ? 2.5 : 3.5;
   const shades = layers.intensity && scan.byShade.length ? scan.byShade : [scan.points];
-  // A colour is set once for all that have it.
+  // Setting a color is slow: do it once for all points that have it.
   return shades.reduce((count, points, shade) => {
-    pen.fillStyle = shades.length > 1 ? shadeColours[shade] : colours.ink;
+    pen.fillStyle = shades.length > 1 ? shadeColors[shade] : colors.ink;
     return count + dots(points, width, pose);
   }, 0);
 }
 
 function drawTrail(sensor, now) {
-  pen.fillStyle = colours.new;
+  pen.fillStyle = colors.new;
   for (const { at, points } of sensor.trail) {
     pen.globalAlpha = 0.34 * max(0, 1 - (now - at) / TRAIL_MS);
     dots(points, 3, poseOf(sensor));

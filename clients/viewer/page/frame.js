@@ -1,20 +1,20 @@
-// The picture, frame by frame.
+// Draws the frames of the picture.
 
-function drawFromAbove(now) {
-  const seen = shown();
+function drawTopView(now) {
+  const visible = shownSensors();
   // Background and foreground in two dimensions have no meaning for a scanner on a mount: they change with its angle.
-  const level = seen.filter((sensor) => sensor !== tiltedSensor());
-  if (layers.field) seen.forEach(drawField);
+  const level = visible.filter((sensor) => sensor !== tiltedSensor());
+  if (layers.field) visible.forEach(drawField);
   if (layers.grid) drawGrid();
   if (layers.background) {
-    pen.fillStyle = colours.old;
+    pen.fillStyle = colors.old;
     for (const sensor of level) dots(sensor.background, 2.5, poseOf(sensor));
   }
   if (layers.trails) for (const sensor of level) drawTrail(sensor, now);
   if (layers.zones) drawn.zones = drawZones();
-  if (layers.scan) for (const sensor of seen) drawn.beams += drawScan(sensor);
+  if (layers.scan) for (const sensor of visible) drawn.beams += drawScan(sensor);
   if (layers.foreground) {
-    pen.fillStyle = colours.new;
+    pen.fillStyle = colors.new;
     for (const sensor of level) drawn.foreground += dots(sensor.foreground, 5, poseOf(sensor));
   }
   if (layers.lines) drawn.lines = drawLines();
@@ -28,42 +28,42 @@ function drawFromAbove(now) {
 }
 
 function draw(now) {
-  place();
-  if (view.fits && isFitDue && !kept) fit();
+  updateView();
+  if (view.fits && isFitDue && !heldMessages) fit();
   isFitDue = false;
-  const moves = glide();
+  const isMoving = moveToGoal();
   pen.setTransform(size.ratio, 0, 0, size.ratio, 0, 0);
-  pen.fillStyle = colours.paper;
+  pen.fillStyle = colors.paper;
   pen.fillRect(0, 0, size.width, size.height);
-  for (const sign in drawn) drawn[sign] = 0;
-  if (isAside()) drawFromTheSide();
-  else drawFromAbove(now);
+  for (const kind in drawn) drawn[kind] = 0;
+  if (isSideView()) drawSideView();
+  else drawTopView(now);
   drawTape();
-  readOut();
-  tellVerdict();
+  showPointer();
+  showVerdict();
   frames += 1;
-  for (const sensor of shown()) {
+  for (const sensor of shownSensors()) {
     if (sensor.stamp) ages.push([sensor.stamp, performance.timeOrigin + performance.now()]);
     sensor.stamp = null;
   }
   ages.splice(0, ages.length - 400);
-  return moves;
+  return isMoving;
 }
 
-let isAwake = false;
-let isFitDue = false; // something came, or the view is another one
+let isDrawRequested = false;
+let isFitDue = false; // new data arrived, or the view has changed
 
-function wake() {
-  if (isAwake) return;
-  isAwake = true;
+function requestDraw() {
+  if (isDrawRequested) return;
+  isDrawRequested = true;
   requestAnimationFrame((now) => {
-    isAwake = false;
-    let goesOn = draw(now);
+    isDrawRequested = false;
+    let isAnimating = draw(now);
     for (const sensor of sensors.values()) {
       sensor.trail = sensor.trail.filter(({ at }) => now - at < TRAIL_MS);
-      goesOn ||= sensor.trail.length > 0;
+      isAnimating ||= sensor.trail.length > 0;
     }
-    if (goesOn) wake();
+    if (isAnimating) requestDraw();
   });
 }
 
@@ -72,8 +72,8 @@ function resize() {
   isFitDue = true;
   size = { width: innerWidth, height: innerHeight, ratio: min(devicePixelRatio || 1, 3) };
   covered = { top: 0, right: 0, bottom: 0 };
-  measure();
+  measureMargins();
   map.width = Math.round(size.width * size.ratio);
   map.height = Math.round(size.height * size.ratio);
-  wake();
+  requestDraw();
 }

@@ -1,22 +1,22 @@
-// Which part of the world is seen, and where on the screen.
+// The part of the world that is visible, and its position on the screen.
 
-/** What can be shown, each with its key and its name. */
+/** Layers of the picture, each with its key and its name. */
 const LAYERS = {
   scan: ["s", "Scan"], intensity: ["i", "Intensity"], foreground: ["f", "Foreground"], trails: ["t", "Trails"],
   background: ["b", "Background"], zones: ["z", "Zones"], marks: ["m", "Marks"], lines: ["e", "Lines and corners"],
   obstacles: ["o", "Obstacles"], field: ["v", "Field of view"], grid: ["g", "Grid"],
 };
 const layers = Object.fromEntries(Object.keys(LAYERS).map((name) => [name, name !== "lines"]));
-try { // What was chosen before in this window; browsers may refuse to keep anything.
+try { // Layers chosen before in this window. A browser may refuse to store them.
   Object.assign(layers, JSON.parse(sessionStorage.getItem("layers")));
-} catch { /* It holds as long as the page is open. */ }
+} catch { /* The choice is valid while the page is open. */ }
 const views = ["above", "aside"].map(() => ({ x: 1, y: 0, scale: 60, turn: 0, fits: true, isFitted: false, goal: null }));
 let view = views[0];
-const isAside = () => view === views[1];
-let only = null; // the one sensor that is shown
-const isCalm = matchMedia("(prefers-reduced-motion: reduce)");
+const isSideView = () => view === views[1];
+let shownSpace = null; // the one sensor that is shown
+const isMotionReduced = matchMedia("(prefers-reduced-motion: reduce)");
 let pointer = null; // over the picture, in pixels
-let tape = null; // { from, to } in metres
+let tape = null; // { from, to } in meters
 let isTape = false;
 let size = { width: 1, height: 1, ratio: 1 };
 
@@ -24,7 +24,7 @@ let size = { width: 1, height: 1, ratio: 1 };
 let covered = { top: 0, right: 0, bottom: 0 };
 
 /** Measures the margins. They do not shrink while the window keeps its size: text that changes must not move the picture. */
-function measure() {
+function measureMargins() {
   const box = (name) => document.querySelector(name).getBoundingClientRect();
   const isNarrow = size.width <= 720;
   const lower = [isNarrow ? "aside" : "#player", "nav"].map(box).find(({ height }) => height);
@@ -33,12 +33,12 @@ function measure() {
   covered = Object.fromEntries(Object.entries(now).map(([side, width]) => [side, max(width, before[side])]));
   if (Object.keys(now).some((side) => covered[side] !== before[side])) {
     isFitDue = true;
-    wake();
+    requestDraw();
   }
 }
 
 /** Returns the part of the window that no box covers. */
-function open() {
+function freeArea() {
   const { top, right, bottom } = covered;
   const [width, height] = [size.width - right, max(1, size.height - top - bottom)];
   return { x: width / 2, y: top + height / 2, width, height };
@@ -67,34 +67,34 @@ function toRobot(px, py) {
 let middle = { x: 0, y: 0, width: 1, height: 1 };
 let [cos, sin] = [1, 0];
 
-function place() {
-  middle = open();
+function updateView() {
+  middle = freeArea();
   // From the side it is the robot that turns, and not the picture.
-  [cos, sin] = isAside() ? [1, 0] : [Math.cos(view.turn), Math.sin(view.turn)];
+  [cos, sin] = isSideView() ? [1, 0] : [Math.cos(view.turn), Math.sin(view.turn)];
 }
 
 /** Returns the scanner on a mount if it is known which one that is, because this machine has only one. */
 function tiltedSensor() {
-  const own = everySensor().filter(({ status }) => status && !status.remote);
-  return everySweep().some(({ sweep }) => sweep) && own.length === 1 ? own[0] : null;
+  const local = allSensors().filter(({ status }) => status && !status.remote);
+  return allSweeps().some(({ sweep }) => sweep) && local.length === 1 ? local[0] : null;
 }
 
-const shown = () => everySensor().filter((sensor) => (only === null ? !sensor.status?.remote || !hasOwn() : sensor.space === only));
-const hasOwn = () => everySensor().some((sensor) => sensor.status && !sensor.status.remote);
+const shownSensors = () => allSensors().filter((sensor) => (shownSpace === null ? !sensor.status?.remote || !hasLocalSensor() : sensor.space === shownSpace));
+const hasLocalSensor = () => allSensors().some((sensor) => sensor.status && !sensor.status.remote);
 
-/** All points that are looked at, the frame that they are in, and what is said of one. */
-const allPoints = () => (isAside() ? pointsAside() : shown().filter((one) => one.scan && poseOf(one)).map((one) =>
-  ({ points: one.scan.points, pose: poseOf(one), words: (beam) => beamWords(one, beam) })));
+/** Returns the visible points with the pose of their frame and the function that describes one of them. */
+const allPoints = () => (isSideView() ? sidePoints() : shownSensors().filter((one) => one.scan && poseOf(one)).map((one) =>
+  ({ points: one.scan.points, pose: poseOf(one), text: (beam) => beamText(one, beam) })));
 
 const MARGIN = 1.1;
 
-/** Brings what is seen into the picture, few outliers left out; keeps what is about right. */
+/** Moves the view to the visible points, without a few outliers. Keeps a view that is about right. */
 function fit() {
-  const seen = allPoints();
-  // Where a picture ends some hundred points tell as well as thousands.
-  const stride = 2 * ceil(seen.reduce((sum, { points }) => sum + points.length, 0) / 1000);
+  const visible = allPoints();
+  // A few hundred points are enough to find the bounds.
+  const stride = 2 * ceil(visible.reduce((sum, { points }) => sum + points.length, 0) / 1000);
   const [xs, ys] = [[], []];
-  for (const { points, pose } of seen) {
+  for (const { points, pose } of visible) {
     const [a, b, c, d, e, f] = onScreen(pose);
     for (let i = 0; i < points.length; i += stride) {
       const [x, y] = [points[i], points[i + 1]];
@@ -104,33 +104,33 @@ function fit() {
     }
   }
   if (!xs.length) return;
-  const reach = max(0.5, ...(isAside() ? [] : circles.map(({ radius }) => radius))) * 1.08 * view.scale;
+  const reach = max(0.5, ...(isSideView() ? [] : circles.map(({ radius }) => radius))) * 1.08 * view.scale;
   const robotAt = toScreen(0, 0);
   // The side view shows nothing below the floor, except for points.
-  const below = isAside() ? 0 : reach;
+  const below = isSideView() ? 0 : reach;
   const [[left, right], [top, bottom]] = [xs, ys].map((unsorted, n) => {
     const values = Float32Array.from(unsorted).sort();
-    const out = floor(values.length / 50);
-    return [min(values[out], robotAt[n] - reach), max(values[values.length - 1 - out], robotAt[n] + (n ? below : reach))];
+    const outliers = floor(values.length / 50);
+    return [min(values[outliers], robotAt[n] - reach), max(values[values.length - 1 - outliers], robotAt[n] + (n ? below : reach))];
   });
   // In the side view, the floor is at the bottom, with space for the numbers and the name of its axis.
-  const bottomSpace = isAside() ? min(44, middle.height / 4) : 0;
+  const bottomSpace = isSideView() ? min(44, middle.height / 4) : 0;
   const scale = (view.scale * min(middle.width / (right - left), (middle.height - bottomSpace) / (bottom - top))) / MARGIN;
-  const centerY = isAside() ? bottom + ((bottomSpace - middle.height / 2) * view.scale) / scale : (top + bottom) / 2;
+  const centerY = isSideView() ? bottom + ((bottomSpace - middle.height / 2) * view.scale) / scale : (top + bottom) / 2;
   const [x, y] = toRobot((left + right) / 2, centerY);
   const goal = { scale, x, y };
   const now = view.goal ?? view;
   const moved = hypot(goal.x - now.x, goal.y - now.y) * scale;
   // A moving view is hard to read: keep it while it fits.
-  const isOffFloor = isAside() && abs(goal.x - now.x) * scale > 12;
+  const isOffFloor = isSideView() && abs(goal.x - now.x) * scale > 12;
   const isOut = scale * MARGIN < now.scale * 0.99 || moved > 0.12 * min(middle.width, middle.height) || isOffFloor;
   if (isOut || now.scale < 0.6 * scale || !view.isFitted) Object.assign(view, { goal, isFitted: true });
 }
 
-/** Moves towards where the picture is to be; true while it moves. */
-function glide() {
+/** Moves the view towards its goal. Returns whether it moves. */
+function moveToGoal() {
   if (!view.goal) return false;
-  const share = isCalm.matches ? 1 : 0.16;
+  const share = isMotionReduced.matches ? 1 : 0.16;
   const { x, y, scale } = view.goal;
   view.x += (x - view.x) * share;
   view.y += (y - view.y) * share;

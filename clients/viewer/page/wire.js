@@ -1,6 +1,6 @@
-// What the server says, and the socket that it comes through.
+// Messages of the server, and the WebSocket that receives them.
 
-/** Little-endian CDR: values at multiples of their size behind four bytes of head. */
+/** Reads little-endian CDR: values at multiples of their size, after a header of 4 bytes. */
 class Cdr {
   constructor(buffer, offset) {
     this.view = new DataView(buffer, offset + 4);
@@ -41,7 +41,7 @@ function laserScan(buffer, offset) {
   return { first, last, step, period, farthest, ranges: cdr.floats(), intensities: cdr.floats() };
 }
 
-/** How many points a cloud has, and what reads a field of one of them: a float, a byte. */
+/** Returns the number of points of a cloud, and functions that read a field of one of them as a float or a byte. */
 function pointCloud(buffer, offset) {
   const cdr = new Cdr(buffer, offset);
   cdr.head();
@@ -58,26 +58,26 @@ function pointCloud(buffer, offset) {
   cdr.u32();
   cdr.u32();
   const { view, at } = cdr;
-  const place = (i, field) => at + i * step + fields[field];
-  return { count, f32: (i, field) => view.getFloat32(place(i, field), true), u8: (i, field) => view.getUint8(place(i, field)) };
+  const offsetOf = (i, field) => at + i * step + fields[field];
+  return { count, f32: (i, field) => view.getFloat32(offsetOf(i, field), true), u8: (i, field) => view.getUint8(offsetOf(i, field)) };
 }
 
 const SHADES = 24;
 
 function takeScan(topic, buffer, offset) {
   const sensor = sensorAt(topic);
-  const told = laserScan(buffer, offset);
-  const { ranges, intensities, first, step } = told;
-  const points = places(ranges, first, step);
-  // What is bright is told over minutes: colours that breathe cannot be read.
-  sensor.brightest = intensities.reduce((most, one) => max(most, one), max(1, 0.9995 * (sensor.brightest ?? 1)));
+  const message = laserScan(buffer, offset);
+  const { ranges, intensities, first, step } = message;
+  const points = toPoints(ranges, first, step);
+  // The brightest intensity decays over minutes, because colors that change all the time cannot be read.
+  sensor.brightest = intensities.reduce((highest, one) => max(highest, one), max(1, 0.9995 * (sensor.brightest ?? 1)));
   const byShade = Array.from({ length: intensities.length ? SHADES : 0 }, () => []);
   intensities.forEach((one, i) => {
     if (Number.isNaN(points[2 * i])) return;
     byShade[min(SHADES - 1, floor(SHADES * Math.sqrt(one / sensor.brightest)))].push(points[2 * i], points[2 * i + 1]);
   });
   isFitDue = true;
-  sensor.scan = { ...told, points, byShade, at: performance.now() };
+  sensor.scan = { ...message, points, byShade, at: performance.now() };
 }
 
 function takeForeground(topic, buffer, offset) {
@@ -86,19 +86,19 @@ function takeForeground(topic, buffer, offset) {
   const { count, f32 } = pointCloud(buffer, offset);
   sensor.foreground = Float32Array.from({ length: 2 * count }, (_, n) => f32(n >> 1, n % 2 ? "y" : "x"));
   if (now - sensor.trail.at(-1)?.at < TRAIL_STEP_MS) return;
-  // Here, too: a page that nobody sees draws no frames.
+  // Expire the trail here, too: a hidden page draws no frames.
   sensor.trail = sensor.trail.filter(({ at }) => now - at < TRAIL_MS);
   sensor.trail.push({ at: now, points: sensor.foreground });
 }
 
-/** What is always there is told as a scan that nobody measured. */
+/** Takes the background, which arrives in the form of a scan. */
 function takeBackground(topic, buffer, offset) {
   const { ranges, first, step } = laserScan(buffer, offset);
-  sensorAt(topic).background = places(ranges, first, step);
+  sensorAt(topic).background = toPoints(ranges, first, step);
 }
 
-/** x and y of each range in the frame of the sensor; not a number where there is none. */
-function places(ranges, first, step) {
+/** Returns x and y of each range in the frame of the sensor; NaN where there is no range. */
+function toPoints(ranges, first, step) {
   const xy = new Float32Array(2 * ranges.length);
   for (let i = 0; i < ranges.length; i++) {
     const range = Number.isFinite(ranges[i]) ? ranges[i] : NaN;
@@ -108,8 +108,8 @@ function places(ranges, first, step) {
   return xy;
 }
 
-/** Where a sensor sits, as [xx, xy, yx, yy, x, y]: upside down it is a mirror. Nothing as long as nobody told, and what it sees is
- * nowhere. */
+/** Returns the pose of a sensor as [xx, xy, yx, yy, x, y], mirrored if it is upside down. Null while the pose is unknown: then nothing of
+ * the sensor is drawn. */
 function poseOf({ status }) {
   if (!status?.pose) return null;
   const { x_m, y_m, yaw_rad, upside_down } = status.pose;
@@ -117,15 +117,15 @@ function poseOf({ status }) {
   return [c, -s * sign, s, c * sign, x_m, y_m];
 }
 
-const told = (entity) => Object.fromEntries(entity.metadata.map(({ key, value }) => [key, value]));
+const metadataOf = (entity) => Object.fromEntries(entity.metadata.map(({ key, value }) => [key, value]));
 
 function takeZones(update) {
   circles = [];
   beams = [];
   for (const entity of update.entities) {
-    const said = told(entity);
-    if (entity.cylinders.length) circles.push({ radius: Number(said.radius_m), verdict: said.verdict });
-    for (const line of entity.lines) beams.push({ points: line.points, ...said });
+    const metadata = metadataOf(entity);
+    if (entity.cylinders.length) circles.push({ radius: Number(metadata.radius_m), verdict: metadata.verdict });
+    for (const line of entity.lines) beams.push({ points: line.points, ...metadata });
   }
 }
 
@@ -138,13 +138,13 @@ function takeLines(update) {
 }
 
 function takeTracks(update, topic) {
-  const persons = update.entities.map((entity) => {
+  const tracks = update.entities.map((entity) => {
     const [body, reach] = entity.cylinders;
     const { z, w } = reach.pose.orientation;
-    return { ...told(entity), ...body.pose.position, across: body.size.x, tail: entity.lines[0].points,
+    return { ...metadataOf(entity), ...body.pose.position, across: body.size.x, tail: entity.lines[0].points,
       reach: { x: reach.size.x / 2, y: reach.size.y / 2, yaw: 2 * atan2(z, w) } };
   });
-  people.set(topic, { at: performance.now(), persons });
+  people.set(topic, { at: performance.now(), tracks });
 }
 
 function takeStatus(status, topic) {
@@ -155,70 +155,70 @@ function takeStatus(status, topic) {
   sensor.name = status.name;
   sensor.history.push({ at: now, hz: status.hz ?? 0, loss, age: status.age_p99_ms ?? 0 });
   while (now - sensor.history[0].at > HISTORY_MS) sensor.history.shift();
-  if (status.trouble && !kept) Object.assign(sensor, blind());
+  if (status.trouble && !heldMessages) Object.assign(sensor, emptySensor());
   isFitDue = true;
 }
 
-function takeRobot(said) {
-  const was = robot.hub;
-  robot = said;
-  heard = performance.now();
-  if (was && !said.hub) forget();
+function takeRobot(message) {
+  const hadHub = robot.hub;
+  robot = message;
+  lastRobotAt = performance.now();
+  if (hadHub && !message.hub) clearPicture();
 }
 
-/** What becomes of a message, by the last word of its topic: of one of ROS, and of an object of JSON. */
-const ofRos = { scan: takeScan, foreground: takeForeground, background: takeBackground, cloud: takeCloud };
-const ofJson = { robot: takeRobot, status: takeStatus, zones: takeZones, lines: takeLines, tracks: takeTracks, obstacles: takeObstacles,
+/** Handlers of ROS messages and of JSON objects, by the last part of the topic. */
+const rosHandlers = { scan: takeScan, foreground: takeForeground, background: takeBackground, cloud: takeCloud };
+const jsonHandlers = { robot: takeRobot, status: takeStatus, zones: takeZones, lines: takeLines, tracks: takeTracks, obstacles: takeObstacles,
   marks: (update) => { marks = spheres(update); }, replay: (progress) => { player = progress; } };
 
-/** What makes the words beside the picture, and not the picture. */
-const BESIDE = ["robot", "status", "replay"];
+/** Topics that change the texts and not the picture, and continue while it is frozen. */
+const LIVE_TOPICS = ["robot", "status", "replay"];
 // The newest message of each topic, while the picture is frozen.
-let kept = null;
+let heldMessages = null;
 // Whether the frozen picture is the map of a site.
 let isHeldMap = false;
 // Clear the frozen picture at its release.
-let isHeldGone = false;
+let clearOnRelease = false;
 
-const lastWord = (topic) => topic.slice(topic.lastIndexOf("/") + 1);
+const lastPart = (topic) => topic.slice(topic.lastIndexOf("/") + 1);
 
 function take(topic, buffer, offset) {
-  const word = lastWord(topic);
-  const sensor = word === "scan" && sensorAt(topic);
+  const kind = lastPart(topic);
+  const sensor = kind === "scan" && sensorAt(topic);
   if (sensor) sensor.scans += 1;
-  if (kept && !BESIDE.includes(word)) return kept.set(topic, [buffer, offset]);
+  if (heldMessages && !LIVE_TOPICS.includes(kind)) return heldMessages.set(topic, [buffer, offset]);
   show(topic, buffer, offset);
   if (sensor) sensor.stamp = Number(new DataView(buffer).getBigUint64(5, true)) / 1e6;
-  wake();
+  requestDraw();
 }
 
 function show(topic, buffer, offset) {
-  const word = lastWord(topic);
-  if (ofRos[word]) ofRos[word](topic, buffer, offset);
-  else ofJson[word]?.(JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, offset))), topic);
+  const kind = lastPart(topic);
+  if (rosHandlers[kind]) rosHandlers[kind](topic, buffer, offset);
+  else jsonHandlers[kind]?.(JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, offset))), topic);
 }
 
 // The socket.
 
 let socket = null;
 let isOpen = false;
-let retry = 250;
-// By channel, which is the number of its subscription, too.
+let retryDelay = 250;
+// By channel ID, which is the ID of its subscription, too.
 const topics = new Map();
 
-/** Whoever asks for lines and points costs others something: that is done while they are looked at. */
-function isWanted(topic) {
-  const word = lastWord(topic);
-  return word === "lines" ? layers.lines : word === "cloud" ? isAside() : !["tilt", "tf_static"].includes(word);
+/** Lines and clouds cost other programs CPU time: subscribe to them only while they are visible. */
+function isNeeded(topic) {
+  const kind = lastPart(topic);
+  return kind === "lines" ? layers.lines : kind === "cloud" ? isSideView() : !["tilt", "tf_static"].includes(kind);
 }
 
-/** Asks for what is wanted, and for nothing else; what is asked for again stays as it is. */
-function follow() {
+/** Subscribes to the topics that are needed, and to no others. A repeated subscription changes nothing. */
+function subscribe() {
   if (!isOpen) return;
   const ids = [...topics.keys()];
-  const wanted = ids.filter((id) => isWanted(topics.get(id)));
-  socket.send(JSON.stringify({ op: "unsubscribe", subscriptionIds: ids.filter((id) => !wanted.includes(id)) }));
-  socket.send(JSON.stringify({ op: "subscribe", subscriptions: wanted.map((id) => ({ id, channelId: id })) }));
+  const needed = ids.filter((id) => isNeeded(topics.get(id)));
+  socket.send(JSON.stringify({ op: "unsubscribe", subscriptionIds: ids.filter((id) => !needed.includes(id)) }));
+  socket.send(JSON.stringify({ op: "subscribe", subscriptions: needed.map((id) => ({ id, channelId: id })) }));
 }
 
 function connect() {
@@ -227,7 +227,7 @@ function connect() {
   topics.clear();
   socket.onopen = () => {
     isOpen = true;
-    retry = 250;
+    retryDelay = 250;
   };
   socket.onmessage = ({ data }) => {
     if (typeof data !== "string") {
@@ -236,23 +236,23 @@ function connect() {
       if (topic) take(topic, data, 13);
       return;
     }
-    const said = JSON.parse(data);
-    if (said.op === "serverInfo") enter(said.sessionId);
-    else if (said.op === "advertise") {
-      for (const { id, topic } of said.channels) {
+    const message = JSON.parse(data);
+    if (message.op === "serverInfo") startRun(message.sessionId);
+    else if (message.op === "advertise") {
+      for (const { id, topic } of message.channels) {
         topics.set(id, topic);
-        if (lastWord(topic) === "cloud") sweepAt(topic);
+        if (lastPart(topic) === "cloud") sweepAt(topic);
       }
-      follow();
-    } else if (said.op === "status") {
-      $("news").textContent = said.message;
-      setTimeout(() => { if ($("news").textContent === said.message) $("news").textContent = ""; }, 4000);
+      subscribe();
+    } else if (message.op === "status") {
+      $("news").textContent = message.message;
+      setTimeout(() => { if ($("news").textContent === message.message) $("news").textContent = ""; }, 4000);
     }
   };
   socket.onclose = () => {
     isOpen = false;
-    setTimeout(connect, retry);
-    retry = min(2 * retry, 2000);
-    wake();
+    setTimeout(connect, retryDelay);
+    retryDelay = min(2 * retryDelay, 2000);
+    requestDraw();
   };
 }

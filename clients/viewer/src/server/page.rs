@@ -8,15 +8,15 @@ const MARKUP: &str = include_str!("../../page/page.html");
 const STYLE: &str = include_str!("../../page/page.css");
 /// The files of the script, in the order in which the browser reads them.
 const SCRIPT: &str = concat!(
-    include_str!("../../page/known.js"),
+    include_str!("../../page/scene.js"),
     include_str!("../../page/wire.js"),
     include_str!("../../page/view.js"),
     include_str!("../../page/draw.js"),
-    include_str!("../../page/signs.js"),
-    include_str!("../../page/side.js"),
+    include_str!("../../page/overlays.js"),
+    include_str!("../../page/side_view.js"),
     include_str!("../../page/frame.js"),
-    include_str!("../../page/words.js"),
-    include_str!("../../page/person.js"),
+    include_str!("../../page/labels.js"),
+    include_str!("../../page/input.js"),
 );
 
 /// The page and its policy.
@@ -65,7 +65,7 @@ mod tests {
     #[test]
     fn page_is_one_small_response_without_external_parts() {
         let page = Page::new();
-        assert!(page.body.len() < 60_000, "{} bytes", page.body.len());
+        assert!(page.body.len() < 64_000, "{} bytes", page.body.len());
         assert!(page.body.contains(&compact(STYLE)) && page.body.contains(&compact(SCRIPT)));
         assert!(!page.body.contains("https://") && !page.body.contains("src="), "nothing is loaded");
         assert!(!SCRIPT.contains("</script") && !STYLE.contains("</style"));

@@ -1,11 +1,11 @@
-// What is drawn beside points.
+// Zones, marks, lines, people, the tape and the sensors, which are drawn over the points.
 
 function drawZones() {
   font("600 12", "bottom");
   const [x, y] = toScreen(0, 0);
   for (const { radius, verdict } of circles) {
     const isViolated = verdict !== "clear";
-    ink(colours[verdict], isViolated ? 2.5 : 1.5);
+    ink(colors[verdict], isViolated ? 2.5 : 1.5);
     circle(x, y, radius * view.scale);
     if (isViolated) {
       pen.globalAlpha = 0.09;
@@ -18,7 +18,7 @@ function drawZones() {
     label(`${radius.toFixed(2)} m${isViolated ? " !" : ""}`, x, y - radius * view.scale - 4);
   }
   for (const { points: [from, to], verdict } of beams) {
-    ink(colours[verdict], 2);
+    ink(colors[verdict], 2);
     stroke(toScreen(from.x, from.y), toScreen(to.x, to.y));
     circle(...toScreen(to.x, to.y), 5.5);
     pen.stroke();
@@ -27,8 +27,8 @@ function drawZones() {
 }
 
 function drawMarks() {
-  ink(colours.paper, 1.5);
-  pen.fillStyle = colours.mark;
+  ink(colors.paper, 1.5);
+  pen.fillStyle = colors.mark;
   for (const mark of marks) {
     const [x, y] = toScreen(mark.x, mark.y);
     path([x, y - 8], [x + 7, y], [x, y + 8], [x - 7, y]);
@@ -40,7 +40,7 @@ function drawMarks() {
 }
 
 function drawLines() {
-  ink(colours.line, 2);
+  ink(colors.line, 2);
   for (const [from, to] of walls) stroke(toScreen(from.x, from.y), toScreen(to.x, to.y));
   for (const corner of corners) {
     const [x, y] = toScreen(corner.x, corner.y);
@@ -49,11 +49,11 @@ function drawLines() {
   return walls.length;
 }
 
-/** Each with number and tail, and where else they may be; who is not seen is dashed and pale. */
+/** Draws people with number and tail, and an ellipse where they may be. Those that are not confirmed are dashed and pale. */
 function drawPeople() {
-  ink(colours.person, 2);
+  ink(colors.person, 2);
   font("600 13", "bottom");
-  const all = persons();
+  const all = allPeople();
   for (const { id, state, x, y, across, tail, reach } of all) {
     const [px, py] = toScreen(x, y);
     const radius = max(7, (across / 2) * view.scale);
@@ -76,28 +76,28 @@ function drawPeople() {
 function drawTape() {
   if (!tape) return;
   const [from, to] = [toScreen(...tape.from), toScreen(...tape.to)];
-  ink(colours.accent, 2);
+  ink(colors.accent, 2);
   stroke(from, to);
   for (const [x, y] of [from, to]) {
     circle(x, y, 4);
     pen.fill();
   }
-  const metres = hypot(tape.to[0] - tape.from[0], tape.to[1] - tape.from[1]);
+  const meters = hypot(tape.to[0] - tape.from[0], tape.to[1] - tape.from[1]);
   font("600 14", "bottom");
-  label(`${metres.toFixed(3)} m`, (from[0] + to[0]) / 2, (from[1] + to[1]) / 2 - 8);
+  label(`${meters.toFixed(3)} m`, (from[0] + to[0]) / 2, (from[1] + to[1]) / 2 - 8);
 }
 
 function drawSensors() {
   font("600 11", "middle");
-  const seen = shown();
-  everySensor().forEach((sensor, n) => {
+  const visible = shownSensors();
+  allSensors().forEach((sensor, n) => {
     const pose = poseOf(sensor);
-    if (!pose || !seen.includes(sensor)) return;
+    if (!pose || !visible.includes(sensor)) return;
     const [x, y] = toScreen(pose[4], pose[5]);
     circle(x, y, 8.5);
-    ink(colours.paper, 1.5);
+    ink(colors.paper, 1.5);
     pen.fill();
-    ink(colours.ink, 1.5);
+    ink(colors.ink, 1.5);
     pen.stroke();
     pen.fillText(String(n + 1), x, y + 0.5);
   });

@@ -1,37 +1,37 @@
-// What a person does, and the start.
+// Input by mouse, touch and keys; buttons; and the start of the page.
 
-function choose(space) {
-  only = space === only ? null : space;
+function selectSensor(space) {
+  shownSpace = space === shownSpace ? null : space;
   isFitDue = true;
-  wake();
-  tellSensors();
+  requestDraw();
+  showSensors();
 }
 
 function zoom(factor, px = middle.x, py = middle.y) {
   const [x, y] = toRobot(px, py);
-  leaveFit();
+  stopFitting();
   view.scale = min(4000, max(1.5, view.scale * factor));
   const [nx, ny] = toRobot(px, py);
   view.x += x - nx;
   view.y += y - ny;
-  wake();
+  requestDraw();
 }
 
 function pan(dx, dy) {
   const [x, y] = toRobot(middle.x - dx, middle.y - dy);
-  leaveFit();
+  stopFitting();
   [view.x, view.y] = [x, y].map((value) => max(-200, min(200, value)));
-  wake();
+  requestDraw();
 }
 
 function turn(angle) {
   view.turn += angle;
   isFitDue = true;
-  place();
-  wake();
+  updateView();
+  requestDraw();
 }
 
-function leaveFit() {
+function stopFitting() {
   Object.assign(view, { fits: false, goal: null });
   press(buttonOf("fit"), false);
 }
@@ -42,20 +42,20 @@ const press = (button, isOn) => { button.ariaPressed = isOn; };
 const actions = {
   fit: () => {
     Object.assign(view, { fits: true, isFitted: false, turn: 0 });
-    place();
+    updateView();
     press(buttonOf("fit"), true);
     fit();
   },
   side: () => {
-    view = views[isAside() ? 0 : 1];
+    view = views[isSideView() ? 0 : 1];
     tape = null;
     isFitDue = true;
-    place();
-    press(buttonOf("side"), isAside());
+    updateView();
+    press(buttonOf("side"), isSideView());
     press(buttonOf("fit"), view.fits);
-    map.ariaLabel = map.ariaLabel.replace(/above|the side/, isAside() ? "the side" : "above");
-    follow();
-    tell();
+    map.ariaLabel = map.ariaLabel.replace(/above|the side/, isSideView() ? "the side" : "above");
+    subscribe();
+    updateTexts();
   },
   in: () => zoom(1.25),
   out: () => zoom(0.8),
@@ -66,29 +66,29 @@ const actions = {
     press(buttonOf("tape"), isTape);
   },
   hold: () => {
-    const waiting = kept;
+    const held = heldMessages;
     isHeldMap = Boolean(robot.map);
-    kept = waiting ? null : new Map();
-    if (waiting && isHeldGone) forget();
-    dropOthers();
-    for (const [topic, [buffer, offset]] of waiting ?? []) show(topic, buffer, offset);
-    press(buttonOf("hold"), Boolean(kept));
-    tell();
+    heldMessages = held ? null : new Map();
+    if (held && clearOnRelease) clearPicture();
+    dropOtherRuns();
+    for (const [topic, [buffer, offset]] of held ?? []) show(topic, buffer, offset);
+    press(buttonOf("hold"), Boolean(heldMessages));
+    updateTexts();
   },
   layers: () => press(buttonOf("layers"), $("layers").classList.toggle("open")),
   theme: () => {
     document.documentElement.style.colorScheme = isDark ? "light" : "dark";
-    readColours();
+    readColors();
   },
   help: () => ($("help").open ? $("help").close() : $("help").showModal()),
 };
 
-function act(name) {
+function runAction(name) {
   actions[name]();
-  wake();
+  requestDraw();
 }
 
-for (const button of document.querySelectorAll("nav button")) button.onclick = () => act(button.dataset.do);
+for (const button of document.querySelectorAll("nav button")) button.onclick = () => runAction(button.dataset.do);
 for (const [layer, [key, name]] of Object.entries(LAYERS)) {
   const button = make("button", $("layers"));
   button.dataset.key = key;
@@ -100,13 +100,13 @@ for (const [layer, [key, name]] of Object.entries(LAYERS)) {
   const mark = () => press(button, layers[layer]);
   button.onclick = () => {
     layers[layer] = !layers[layer];
-    try { sessionStorage.setItem("layers", JSON.stringify(layers)); } catch { /* See there. */ }
+    try { sessionStorage.setItem("layers", JSON.stringify(layers)); } catch { /* The browser stores nothing. */ }
     if (layer === "lines") {
       [walls, corners] = [[], []];
-      follow();
+      subscribe();
     }
     mark();
-    wake();
+    requestDraw();
   };
   mark();
 }
@@ -121,11 +121,11 @@ document.querySelector("[data-key=i]").after(scaleBox);
 // Colors of things that are not in the list of layers, and the view in which they are.
 const LEGEND = [["above", "people", "Person. Numbers count all tracks since the tracker started"],
   ["aside", "unknown", "Background not known yet"], ["aside", "behind", "Behind the background"]];
-for (const [view, kind, words] of LEGEND) {
+for (const [view, kind, text] of LEGEND) {
   const line = make("p", $("layers"));
   line.dataset.view = view;
   make("i", line, kind);
-  make("span", line).textContent = words;
+  make("span", line).textContent = text;
 }
 
 for (const button of document.querySelectorAll("#player button")) {
@@ -139,12 +139,12 @@ addEventListener("keydown", (event) => {
   if (event.target.tagName === "BUTTON" && [" ", "Enter"].includes(event.key)) return;
   const moves = { ArrowLeft: [48, 0], ArrowRight: [-48, 0], ArrowUp: [0, 48], ArrowDown: [0, -48] };
   if (moves[event.key]) pan(...moves[event.key]);
-  else if (event.key === "=") act("in");
+  else if (event.key === "=") runAction("in");
   else if (event.key === "[") turn(-PI / 12);
-  else if (event.key === "0") choose(only);
+  else if (event.key === "0") selectSensor(shownSpace);
   else if (/^[1-9]$/.test(event.key)) {
-    const sensor = everySensor()[Number(event.key) - 1];
-    if (sensor) choose(sensor.space);
+    const sensor = allSensors()[Number(event.key) - 1];
+    if (sensor) selectSensor(sensor.space);
   } else {
     const button = document.querySelector(`[data-key="${CSS.escape(event.key)}"]`);
     if (!button || button.closest("[hidden]")) return;
@@ -153,43 +153,43 @@ addEventListener("keydown", (event) => {
   event.preventDefault();
 });
 
-// Fingers and the mouse: one moves, two zoom and turn.
+// Touch and mouse: one pointer pans, two zoom and turn.
 const fingers = new Map();
-const placeOf = (event) => [event.clientX, event.clientY];
+const pointOf = (event) => [event.clientX, event.clientY];
 
 map.onpointerdown = (event) => {
   map.setPointerCapture(event.pointerId);
-  fingers.set(event.pointerId, placeOf(event));
-  const at = toRobot(...placeOf(event));
+  fingers.set(event.pointerId, pointOf(event));
+  const at = toRobot(...pointOf(event));
   tape = (isTape || event.shiftKey) && fingers.size === 1 ? { from: at, to: at } : null;
-  wake();
+  requestDraw();
 };
 
 map.onpointermove = (event) => {
-  pointer = placeOf(event);
-  const was = fingers.get(event.pointerId);
-  if (was) {
-    const from = (place) => [pointer[0] - place[0], pointer[1] - place[1]];
+  pointer = pointOf(event);
+  const previous = fingers.get(event.pointerId);
+  if (previous) {
+    const from = (point) => [pointer[0] - point[0], pointer[1] - point[1]];
     const other = [...fingers].find(([id]) => id !== event.pointerId)?.[1];
     if (tape && fingers.size === 1) tape.to = toRobot(...pointer);
     else if (other) {
-      const [before, after] = [[was[0] - other[0], was[1] - other[1]], from(other)];
+      const [before, after] = [[previous[0] - other[0], previous[1] - other[1]], from(other)];
       turn(atan2(after[1], after[0]) - atan2(before[1], before[0]));
       zoom(hypot(...after) / max(1, hypot(...before)), ...other);
-    } else if (event.altKey) turn(from(was)[0] / 200);
-    else pan(...from(was));
+    } else if (event.altKey) turn(from(previous)[0] / 200);
+    else pan(...from(previous));
     fingers.set(event.pointerId, pointer);
   }
-  wake();
+  requestDraw();
 };
 
 map.onpointerup = map.onpointercancel = (event) => {
   fingers.delete(event.pointerId);
-  if (event.pointerType === "touch" && !fingers.size) pointer = placeOf(event);
+  if (event.pointerType === "touch" && !fingers.size) pointer = pointOf(event);
 };
 map.onpointerleave = () => {
   pointer = null;
-  wake();
+  requestDraw();
 };
 map.addEventListener("wheel", (event) => {
   event.preventDefault();
@@ -198,22 +198,22 @@ map.addEventListener("wheel", (event) => {
 
 addEventListener("resize", resize);
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
-  readColours();
-  wake();
+  readColors();
+  requestDraw();
 });
 
-// Numbers for whoever looks.
+// Numbers for tests and for the browser's console.
 
 Object.defineProperty(window, "scanhub", {
   get: () => ({
     frames,
-    scans: Object.fromEntries(everySensor().map(({ name, scans }) => [name, scans])),
+    scans: Object.fromEntries(allSensors().map(({ name, scans }) => [name, scans])),
     ...drawn,
-    people: persons(),
-    aside: isAside(),
-    sweeps: everySweep().map(({ name, sweep, obstacles, points }) => ({ name, ...sweep, obstacles, points: points?.map((xyz) => xyz.length / 3) })),
+    people: allPeople(),
+    aside: isSideView(),
+    sweeps: allSweeps().map(({ name, sweep, obstacles, points }) => ({ name, ...sweep, obstacles, points: points?.map((xyz) => xyz.length / 3) })),
     shown: () => ages,
-    points: (name) => everySensor().filter((one) => one.name === name && one.scan && poseOf(one)).flatMap((one) =>
+    points: (name) => allSensors().filter((one) => one.name === name && one.scan && poseOf(one)).flatMap((one) =>
       [...one.scan.points].flatMap((x, i, xs) => (i % 2 ? [] : inFrame(poseOf(one), x, xs[i + 1])))),
     screen: toScreen,
     place: toRobot,
@@ -222,13 +222,13 @@ Object.defineProperty(window, "scanhub", {
     connected: isOpen,
     player,
     reason: $("reason").hidden ? null : $("reason").innerText,
-    sensors: everySensor().map(({ status }) => status).filter(Boolean),
+    sensors: allSensors().map(({ status }) => status).filter(Boolean),
   }),
 });
 
-readColours();
+readColors();
 resize();
 connect();
-tell();
-setInterval(tell, 100);
-setInterval(tellSensors, 500);
+updateTexts();
+setInterval(updateTexts, 100);
+setInterval(showSensors, 500);
