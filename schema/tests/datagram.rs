@@ -1,8 +1,8 @@
 //! Golden datagrams of version 2, in `tests/vectors/datagram.json`: the tests build them from values and read the values back.
 //! Do not change these tests: another form needs another version. `docs/datagram.md` explains the bytes.
 
-#[path = "datagram/says.rs"]
-mod says;
+#[path = "datagram/describe.rs"]
+mod describe;
 #[path = "datagram/values.rs"]
 mod values;
 #[path = "../../tests/it/lan/vectors.rs"]
@@ -121,8 +121,8 @@ fn these_bytes_are_values_or_refused() {
         });
         match (description["refusal"].as_str(), checked) {
             (None, Ok(datagram)) => {
-                assert_eq!(says::head(&datagram), description["head"], "{name}");
-                assert_eq!(says::payload(&datagram), description["payload"], "{name}");
+                assert_eq!(describe::head(&datagram), description["head"], "{name}");
+                assert_eq!(describe::payload(&datagram), description["payload"], "{name}");
             }
             (None, Err(refused)) => panic!("{name}: {refused:?}"),
             (Some(refusal), Err(refused)) => assert_eq!(refused.name(), refusal, "{name}"),

@@ -3,11 +3,11 @@
 mod c;
 mod capture;
 mod damaged;
+#[path = "../../schema/tests/datagram/describe.rs"]
+mod describe;
 mod keyed_vectors;
 mod link_failures;
 mod python;
 mod readers;
-#[path = "../../schema/tests/datagram/says.rs"]
-mod says;
 mod vectors;
 mod wireshark;

@@ -13,7 +13,7 @@
 //! `cargo bench -p scanhub-bridge --bench bridge [-- MINUTES] [hop|killed|slow|stalls|loss|plain ..]` (default: 10,
 //! all), after `cargo build --release`.
 
-mod stage;
+mod environment;
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::io::{ErrorKind, Read, Write};
@@ -29,7 +29,9 @@ use serde_json::Value;
 use socket2::{Domain, Protocol, Socket, Type};
 use zenoh::Wait;
 
-use stage::{BenchEnvironment, SENSORS, SendTimes, free_port, percentile, session, wait_until_listening};
+use environment::{
+    BenchEnvironment, SENSORS, SendTimes, free_port, percentile, session, wait_until_listening,
+};
 use zenoh::sample::Sample;
 
 /// One row of the table.
@@ -52,12 +54,12 @@ fn main() {
     let parts: [Measurement<'_>; 6] = [
         ("hop", &latency),
         ("killed", &killed_router),
-        ("slow", &|stage| slow_link(stage, None)),
-        ("stalls", &|stage| {
-            slow_link(stage, Some(StallPattern { interval: STALL_INTERVAL, length: STALL_TIME }))
+        ("slow", &|environment| slow_link(environment, None)),
+        ("stalls", &|environment| {
+            slow_link(environment, Some(StallPattern { interval: STALL_INTERVAL, length: STALL_TIME }))
         }),
-        ("loss", &|stage| loss(stage, minutes)),
-        ("plain", &|stage| plain_router(stage, minutes)),
+        ("loss", &|environment| loss(environment, minutes)),
+        ("plain", &|environment| plain_router(environment, minutes)),
     ];
     for (name, part) in parts {
         if is_selected(name) || words.iter().any(|word| word == name) {
@@ -309,7 +311,7 @@ fn loss(environment: &BenchEnvironment, minutes: f64) -> Vec<TableRow> {
 fn plain_router(environment: &BenchEnvironment, minutes: f64) -> Vec<TableRow> {
     let robot = environment.machine("robot");
     let at = free_port();
-    let _router = stage::plain_router(at);
+    let _router = environment::plain_router(at);
     wait_until_listening(at);
     let received: Arc<Mutex<HashMap<(u8, u8), u64>>> = Arc::default();
     let (counts, listener) = (received.clone(), session(at));

@@ -4,7 +4,7 @@
 //!
 //! `cargo bench -p scanhub-bridge --bench ros2 [-- SECONDS]` (default 20), after `cargo build --release`.
 
-mod stage;
+mod environment;
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
@@ -16,7 +16,9 @@ use scanhub_client::{Topic, clock};
 use scanhub_ros::{LASER_SCAN, read};
 use zenoh::Wait;
 
-use stage::{BenchEnvironment, SENSORS, SendTimes, free_port, percentile, session, wait_until_listening};
+use environment::{
+    BenchEnvironment, SENSORS, SendTimes, free_port, percentile, session, wait_until_listening,
+};
 
 fn main() {
     let seconds = std::env::args().skip(1).find_map(|word| word.parse().ok()).unwrap_or(20);

@@ -5,7 +5,7 @@ use scanhub_schema::Topic;
 use scanhub_schema::datagram::{Announce, Datagram, HEADER_LEN, Head, MTU_ETHERNET};
 use serde_json::{Value, json};
 
-use super::{says, vectors};
+use super::{describe, vectors};
 
 /// So many of them, always the same, made from the golden ones.
 pub(crate) fn datagrams(count: u32) -> Vec<(Vec<u8>, Value)> {
@@ -29,7 +29,7 @@ pub(crate) fn datagrams(count: u32) -> Vec<(Vec<u8>, Value)> {
 pub(crate) fn expected(bytes: &[u8]) -> Value {
     let sound = Datagram::read(bytes).and_then(|datagram| datagram.check_payload().map(|_| datagram));
     match sound {
-        Ok(datagram) => json!({ "head": says::head(&datagram), "payload": says::payload(&datagram) }),
+        Ok(datagram) => json!({ "head": describe::head(&datagram), "payload": describe::payload(&datagram) }),
         Err(refusal) => json!({ "refusal": refusal.name() }),
     }
 }

@@ -146,7 +146,7 @@ impl Defect {
     ];
 }
 
-/// What is planted in a world, if anything.
+/// The defect that is injected into a world, if any.
 #[derive(Debug, Default)]
 pub(crate) struct InjectedDefect {
     defect: Option<Defect>,

@@ -25,7 +25,7 @@ pub(crate) struct SimPlatform<'a> {
     pub(crate) number: usize,
     pub(crate) clock: Rc<LinkClock>,
     pub(crate) save_slot: Option<scanhub_daemon::SaveSlot<'a>>,
-    /// A planted defect owes the first ring.
+    /// An injected defect owes the first ring.
     is_ring_delayed: Cell<bool>,
 }
 

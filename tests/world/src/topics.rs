@@ -215,7 +215,7 @@ pub(crate) struct SimTransport<P: ?Sized> {
     /// Loans of this publisher that were not sent.
     loaned: Rc<Cell<usize>>,
     sent: Cell<u64>,
-    /// A sample that a planted defect holds back.
+    /// A sample that an injected defect holds back.
     delayed: RefCell<Option<Rc<Sample>>>,
     corrupter: RefCell<SampleCorrupter>,
     payload: PhantomData<fn(&P)>,

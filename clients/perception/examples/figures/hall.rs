@@ -1,5 +1,5 @@
 //! A simulated hall with a scanner on a mount, played from start to end: scans and angles in the order of their arrival, and
-//! what is true of each point. Refuses to judge.
+//! what is true of each point. Does not compute scores.
 
 use std::collections::HashMap;
 use std::time::{Duration, Instant};

@@ -6,15 +6,15 @@
 
 mod hall;
 mod halls;
-mod judge;
+mod score;
 
 use std::ops::Range;
 
 use hall::Hall;
-use judge::{ObstacleScore, ObstacleTimes, PointScore, seconds, share};
 use scanhub_perception::tilt::{DropReason, Settings};
 use scanhub_sim::mount::{Fault, FaultKind};
 use scanhub_sim::world::World;
+use score::{ObstacleScore, ObstacleTimes, PointScore, seconds, share};
 
 /// So many halls.
 const SEED_COUNT: u64 = 10;
@@ -155,7 +155,7 @@ fn measure_people(world: &World) {
         Hall::new(world, seed).play(settings, 60, |hall, sweep| {
             times.add(sweep);
             if sweep.until_ns > seconds(20) {
-                score.add(hall, sweep, &settings, judge::SWEEP_TIME_NS);
+                score.add(hall, sweep, &settings, score::SWEEP_TIME_NS);
             }
             let far = sweep.points.iter().filter(|point| (4.8..5.2).contains(&hall.range_m(point)));
             errors.extend(far.map(|point| hall.error_m(point)));

@@ -9,14 +9,14 @@ mod hall;
 #[path = "../../examples/figures/halls.rs"]
 mod halls;
 #[expect(dead_code, reason = "figures needs more of it")]
-#[path = "../../examples/figures/judge.rs"]
-mod judge;
+#[path = "../../examples/figures/score.rs"]
+mod score;
 
 use hall::Hall;
-use judge::{ObstacleTimes, PointScore, seconds};
 use scanhub_perception::tilt::{DropReason, Settings};
 use scanhub_sim::mount::{Fault, FaultKind};
 use scanhub_sim::world::World;
+use score::{ObstacleTimes, PointScore, seconds};
 
 #[test]
 fn obstacles_are_found_and_become_background() {
@@ -28,7 +28,7 @@ fn obstacles_are_found_and_become_background() {
         let is_known = sweep.from_ns > seconds(10) && sweep.until_ns < seconds(24);
         assert!(!is_known || sweep.obstacles.is_empty(), "nothing is new yet: {:?}", sweep.obstacles);
         if sweep.until_ns > seconds(20) {
-            score.add(hall, sweep, &settings, judge::SWEEP_TIME_NS);
+            score.add(hall, sweep, &settings, score::SWEEP_TIME_NS);
         }
     });
     assert_eq!(

@@ -43,7 +43,7 @@ fn measure(options: &Options) -> Outcome<()> {
     figures.extend(cold_starts(options.pairs())?);
     figures.push(measure_adoption(options.pairs())?);
     figures.extend(power_cycles(options.pairs())?);
-    figures::print("moods", options.json, &figures);
+    figures::print("start_states", options.json, &figures);
     Ok(())
 }
 

@@ -31,7 +31,7 @@ pub(crate) struct RunningProgram {
 
 /// A simulated machine: all programs on it share a domain.
 pub(crate) struct Machine<'a> {
-    stage: &'a BenchEnvironment,
+    environment: &'a BenchEnvironment,
     pub(crate) root: PathBuf,
 }
 
@@ -55,7 +55,7 @@ impl BenchEnvironment {
     pub(crate) fn machine(&self, name: &str) -> Machine<'_> {
         let root = self.directory.path().join(name);
         make_directory(&root);
-        Machine { stage: self, root }
+        Machine { environment: self, root }
     }
 }
 
@@ -65,7 +65,7 @@ impl Machine<'_> {
         let port = |name: &str| self.root.join(format!("tty-{name}")).display().to_string();
         let ports = SENSORS.map(|name| format!("--port={}", port(name)));
         let links = SENSORS.map(|name| format!("--link={name}={},family=lms", port(name)));
-        let scanhub = &self.stage.scanhub;
+        let scanhub = &self.environment.scanhub;
         let simulator = self.start(scanhub, &["simulate", &ports[0], &ports[1], "--baud=500000"]);
         [simulator, self.start(scanhub, &["run", &links[0], &links[1]])]
     }

@@ -1,4 +1,4 @@
-//! What a datagram says, in the words of the list of golden datagrams.
+//! Describes datagrams in the terms of the list of golden datagrams.
 
 use scanhub_schema::datagram::{Announce, Datagram, DatagramPayload, MTU_SAFE};
 use scanhub_schema::{

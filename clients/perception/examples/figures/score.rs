@@ -1,4 +1,4 @@
-//! How right the classes of points are, and where obstacles are found. Refuses to know how a hall is played.
+//! Scores the classes of points and the positions of obstacles. Does not know how a hall is simulated.
 
 use scanhub_perception::tilt::{Obstacle, PointClass, Settings, Sweep};
 use scanhub_sim::room::BeamTarget;

@@ -1,7 +1,8 @@
-//! What the turns of scanners whose heads turn are like behind the whole hub, in virtual time: each model, in each mode, for ten
-//! minutes, a hundred lines that lose bytes in bursts, a hundred hubs that stand still for half a second again and again, and
-//! how soon a scanner streams that was found in any state. The figures of docs/measured.md:
-//! `cargo run --release -p scanhub-world --example turns`; with words behind `--`, only those tables whose names begin so.
+//! Figures of rotating scanners behind the whole hub, in virtual time: each model in each mode for ten minutes, a
+//! hundred lines that lose bytes in bursts, a hundred hubs that stop for half a second again and again, and the time
+//! until a scanner streams from any state. The figures are in docs/measured.md:
+//! `cargo run --release -p scanhub-world --example revolutions`. Arguments after `--` select the tables whose names
+//! begin with them.
 
 use std::fmt::Write as _;
 

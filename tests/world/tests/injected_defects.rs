@@ -1,5 +1,5 @@
-//! The judges are shown to bite: each of some defects that are built into the models around the hub is found within 200
-//! seeds, by the judge whose business it is.
+//! Proves that the invariants can fail: each injected defect is found within 200 seeds, by an invariant that is
+//! responsible for it.
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -93,7 +93,7 @@ fn found_by(defect: Defect, model: &str) -> Option<u64> {
 }
 
 #[test]
-fn every_planted_defect_is_found() {
+fn every_injected_defect_is_found() {
     let of_all = Defect::ALL.into_iter().map(|defect| (defect, ""));
     let injected: Vec<(Defect, &str)> = of_all.chain(ROTATING_DEFECTS).collect();
     let (next, missed) = (AtomicUsize::new(0), Mutex::new(Vec::new()));

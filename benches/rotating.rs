@@ -85,7 +85,7 @@ fn measure(options: &Options) -> Outcome<()> {
         figures.extend(load(fleet, options)?);
         figures.extend(stalls(fleet, options)?);
     }
-    figures::print("turning", options.json, &figures);
+    figures::print("rotating", options.json, &figures);
     Ok(())
 }
 
