@@ -104,7 +104,7 @@ fn check_all_refuse(target: &Path, base: &[&str], words: &[&str]) {
 
 #[test]
 fn the_fallback_directory_that_a_stranger_made() {
-    with_another_user("strangers::the_fallback_directory_that_a_stranger_made", || {
+    with_another_user("foreign_user::the_fallback_directory_that_a_stranger_made", || {
         let prey = create_victim_directory();
         run_as_other_user("mkdir /tmp/scanhub-0 && ln -s /tmp/prey /tmp/scanhub-0/scanhub");
         check_all_refuse(&prey, &[], &["/tmp/scanhub-0", "belongs to user 65533"]);
@@ -119,7 +119,7 @@ fn the_fallback_directory_that_a_stranger_made() {
 
 #[test]
 fn links_in_a_domain_and_on_the_way_to_it() {
-    with_another_user("strangers::links_in_a_domain_and_on_the_way_to_it", || {
+    with_another_user("foreign_user::links_in_a_domain_and_on_the_way_to_it", || {
         let prey = create_victim_directory();
         let base = Path::new("/tmp/base");
         fs::DirBuilder::new().mode(0o700).create(base).expect("a base");
@@ -170,7 +170,7 @@ fn allowed_attacks(path: &Path) -> Vec<String> {
 
 #[test]
 fn shared_memory_of_strangers() {
-    with_another_user("strangers::shared_memory_of_strangers", || {
+    with_another_user("foreign_user::shared_memory_of_strangers", || {
         // Both would be the names, if they could be guessed.
         run_as_other_user("touch /dev/shm/sh_scanhub_front.bell");
         let env = TestEnv::new();
@@ -237,7 +237,7 @@ fn shared_memory_of_strangers() {
 
 #[test]
 fn hub_of_another_user_is_reported_with_a_remedy() {
-    with_another_user("strangers::hub_of_another_user_is_reported_with_a_remedy", || {
+    with_another_user("foreign_user::hub_of_another_user_is_reported_with_a_remedy", || {
         run_as_other_user("mkdir -m 755 /tmp/theirs");
         let arguments = ["run", "--json", "--no-system-config", "--link=front=/tmp/no", "--root=/tmp/theirs"];
         let hub = Program::start(scanhub(OTHER_UID, &arguments)).ready();

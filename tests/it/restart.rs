@@ -1,5 +1,5 @@
-//! A hub that is killed or ended and started again while its consumers run on: they say so and go on by themselves,
-//! and the sensor is taken as it streams.
+//! A hub that is killed or terminated and restarted while its subscribers run: they report it and continue, and the
+//! hub continues with the sensor, which still streams.
 
 use std::collections::{BTreeMap, HashSet};
 
@@ -9,7 +9,7 @@ use crate::testkit::{
 use serde_json::Value;
 
 #[test]
-fn consumers_outlive_several_hubs() {
+fn subscribers_outlive_several_hubs() {
     // A hub that gets no time is stale, as it should be, and not gone.
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--seed=21"]);

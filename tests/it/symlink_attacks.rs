@@ -41,7 +41,7 @@ fn outputs(file: &str) -> [Vec<&str>; 10] {
 
 #[test]
 fn links_at_the_name_of_an_output_are_refused() {
-    with_another_user("planted_links::links_at_the_name_of_an_output_are_refused", || {
+    with_another_user("symlink_attacks::links_at_the_name_of_an_output_are_refused", || {
         prepare();
         run_as_other_user(
             "ln -s /mnt/victim /tmp/out.mcap && ln -s /mnt /tmp/way && ln -s /mnt/new /tmp/dangling.mcap",
@@ -69,7 +69,7 @@ fn links_at_the_name_of_an_output_are_refused() {
 
 #[test]
 fn directories_are_not_created_behind_links_of_others() {
-    with_another_user("planted_links::directories_are_not_created_behind_links_of_others", || {
+    with_another_user("symlink_attacks::directories_are_not_created_behind_links_of_others", || {
         fs::create_dir("/mnt/prey").expect("a directory");
         run_as_other_user("ln -s /mnt/prey /tmp/way && ln -s /mnt/new /tmp/dangling");
         for directory in ["way", "way/new", "way/new/deep", "dangling", "dangling/deep"] {
@@ -93,7 +93,7 @@ fn directories_are_not_created_behind_links_of_others() {
 /// A name that contains the process id can be planted before the process starts.
 #[test]
 fn names_of_temporary_files_cannot_be_guessed() {
-    with_another_user("planted_links::names_of_temporary_files_cannot_be_guessed", || {
+    with_another_user("symlink_attacks::names_of_temporary_files_cannot_be_guessed", || {
         prepare();
         // The shell has the process id that the program gets.
         let planted = |name: &str, words: &str| {
@@ -119,7 +119,7 @@ fn names_of_temporary_files_cannot_be_guessed() {
 /// As after `sudo -E`: the environment of another user names the directory.
 #[test]
 fn a_state_directory_of_another_user_is_not_used() {
-    with_another_user("planted_links::a_state_directory_of_another_user_is_not_used", || {
+    with_another_user("symlink_attacks::a_state_directory_of_another_user_is_not_used", || {
         prepare();
         fs::create_dir("/mnt/prey").expect("a directory");
         // Links at each of the levels that a program would open.
@@ -153,7 +153,7 @@ fn a_state_directory_of_another_user_is_not_used() {
 
 #[test]
 fn files_of_a_gateway_are_private() {
-    with_another_user("planted_links::files_of_a_gateway_are_private", || {
+    with_another_user("symlink_attacks::files_of_a_gateway_are_private", || {
         fs::create_dir_all("/mnt/state/scanhub").expect("a directory");
         let file = "/mnt/state/scanhub/gateway-scanhub-lo-1";
         // As an earlier version left it.
@@ -171,7 +171,7 @@ fn files_of_a_gateway_are_private() {
 /// Another user cannot occupy the directories of a demonstration.
 #[test]
 fn demo_runs_if_its_usual_directory_is_occupied() {
-    with_another_user("planted_links::demo_runs_if_its_usual_directory_is_occupied", || {
+    with_another_user("symlink_attacks::demo_runs_if_its_usual_directory_is_occupied", || {
         run_as_other_user("mkdir -m 777 /tmp/scanhub-0");
         let mut demo = scanhub(0, &["demo", "--headless", "--json"]);
         demo.env("PATH", std::env::var_os("PATH").unwrap_or_default());

@@ -326,7 +326,7 @@ fn a_background_begins_with_a_model_of_its_own_sensor() {
 }
 
 #[test]
-fn topics_have_places_for_as_many_subscribers_as_are_configured() {
+fn topics_have_configured_number_of_subscriber_slots() {
     let places = |set: &[&str]| load(&[], set).map(|config| config.limits.subscribers);
     assert_eq!(places(&[]), Ok(32));
     for (set, subscribers) in [("limits.subscribers=1", 1), ("limits.subscribers=250", 250)] {

@@ -142,7 +142,7 @@ fn limits_are_those_of_the_contract() {
 }
 
 #[test]
-fn a_topic_has_a_place_for_each_of_its_subscribers_and_the_next_is_told_the_key() {
+fn surplus_subscriber_is_refused_with_the_key() {
     let test_domain = TempDomain::new();
     let hub = scanhub_shm::hub_node(&test_domain.domain).unwrap();
     let two = TopicLimits { subscribers: 2, ..TOPIC_LIMITS };
@@ -158,7 +158,7 @@ fn a_topic_has_a_place_for_each_of_its_subscribers_and_the_next_is_told_the_key(
 }
 
 #[test]
-fn a_topic_that_subscribers_keep_alive_keeps_its_places() {
+fn topic_kept_alive_by_subscribers_keeps_its_slots() {
     let test_domain = TempDomain::new();
     let hub = scanhub_shm::hub_node(&test_domain.domain).unwrap();
     let kept = Scan::create(&hub, "front", &TopicLimits { subscribers: 2, ..TOPIC_LIMITS }).unwrap();

@@ -46,7 +46,7 @@ fn count_received_and_lost(received: &[Vec<u8>]) -> (u64, u64) {
 
 #[test]
 fn a_cable_is_pulled_and_an_address_taken() {
-    in_a_network("lan::trouble::a_cable_is_pulled_and_an_address_taken", || {
+    in_a_network("lan::link_failures::a_cable_is_pulled_and_an_address_taken", || {
         let robot = Robot::new(&["front"]);
         let receiver = Receiver::new(robot.machine.test_address());
         let mut gateway = robot.gateway::<&str>(&[]);
@@ -78,7 +78,7 @@ fn a_cable_is_pulled_and_an_address_taken() {
 
 #[test]
 fn a_queue_is_full() {
-    in_a_network("lan::trouble::a_queue_is_full", || {
+    in_a_network("lan::link_failures::a_queue_is_full", || {
         let robot = Robot::new(&["front"]);
         let receiver = Receiver::new(robot.machine.test_address());
         let mut gateway = robot.gateway::<&str>(&[]);
@@ -103,7 +103,7 @@ fn a_queue_is_full() {
 
 #[test]
 fn unreachable_hosts_do_not_disturb_other_receivers() {
-    in_a_network("lan::trouble::unreachable_hosts_do_not_disturb_other_receivers", || {
+    in_a_network("lan::link_failures::unreachable_hosts_do_not_disturb_other_receivers", || {
         let robot = Robot::new(&["front"]);
         let here = robot.machine.test_address();
         ip("link set lo up");
@@ -132,7 +132,7 @@ fn unreachable_hosts_do_not_disturb_other_receivers() {
 
 #[test]
 fn hubs_and_gateways_are_killed() {
-    in_a_network("lan::trouble::hubs_and_gateways_are_killed", || {
+    in_a_network("lan::link_failures::hubs_and_gateways_are_killed", || {
         let second = Machine::new(2);
         let mut robot = Robot::new(&["front"]);
         let relay = Relay::new(&robot.machine, 7);

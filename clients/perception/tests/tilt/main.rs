@@ -91,7 +91,7 @@ fn points_of_a_silent_encoder_are_dropped() {
 }
 
 #[test]
-fn an_encoder_that_jumps_is_told_and_what_it_says_then_is_unreliable() {
+fn jumping_encoder_is_reported_and_unreliable() {
     for by_deg in [8.0, -3.0] {
         let ([_, jumped, ..], unreliable) = run_with_fault(FaultKind::Jump(by_deg));
         assert!(jumped > 5_000 && unreliable > 0, "{by_deg}: {jumped} {unreliable}");

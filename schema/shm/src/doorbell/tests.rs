@@ -159,7 +159,7 @@ fn count_lost_wakeups(act: impl Fn() -> bool + Sync + Send + 'static) -> usize {
 }
 
 #[test]
-fn no_wake_is_lost_by_one_consumer_of_two_samples() {
+fn no_wake_is_lost_by_subscriber_of_two_samples() {
     let lost = count_lost_wakeups(|| {
         let sensor = new_sensor();
         let hub = spawn_hub(&sensor, |sensor| {
@@ -176,7 +176,7 @@ fn no_wake_is_lost_by_one_consumer_of_two_samples() {
 }
 
 #[test]
-fn one_call_wakes_two_consumers() {
+fn one_call_wakes_two_subscribers() {
     let lost = count_lost_wakeups(|| {
         let sensor = new_sensor();
         let hub = spawn_hub(&sensor, |sensor| {
@@ -229,7 +229,7 @@ fn no_subscriber_sleeps_at_a_closed_doorbell() {
 }
 
 #[test]
-fn a_consumer_asleep_at_two_bells_is_woken_by_each() {
+fn subscriber_wakes_at_each_of_two_doorbells() {
     let lost = count_lost_wakeups(|| {
         let futex = Arc::default();
         let sensors = [Sensor::new(&futex), Sensor::new(&futex)].map(Arc::new);

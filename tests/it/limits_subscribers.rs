@@ -1,5 +1,5 @@
-//! Many consumers, slow ones and dead ones: nobody else loses anything, everybody can tell exactly what was missed, and
-//! the hub is as it was before they came.
+//! Many subscribers, also stopped and killed ones: the others miss nothing, each one counts exactly what it missed, and
+//! the hub has all resources back after they have exited.
 
 use std::fs;
 use std::thread;
@@ -17,11 +17,11 @@ use scanhub_shm::Domain;
 use scanhub_shm::Payload;
 use serde_json::Value;
 
-/// What a consumer that is killed holds its samples of: the domain's name and where it is.
+/// Environment variables of a subscriber that is killed: name and location of the domain.
 const HOLD_VARIABLES: [&str; 2] = ["SCANHUB_TEST_DOMAIN", "SCANHUB_TEST_BASE"];
 
-/// A hub with a recording of many minutes that has a scan every `period_ms`: slow enough that whoever loses one was not
-/// just kept waiting by a busy machine.
+/// Starts a hub that replays a recording of many minutes with a scan every `period_ms`. That is slow enough that a busy
+/// machine causes no missed scans.
 fn streaming(env: &TestEnv, period_ms: u32, flags: &[&str]) -> Program {
     let line = |scan: u32| {
         let (ranges, at) = (vec!["1.5"; 181].join(" "), f64::from(scan * period_ms) / 1000.0);
@@ -35,7 +35,8 @@ fn subscribe(domain: &Domain) -> Subscriber<Scan> {
     Subscriber::builder("front").in_domain(domain).timeout(Duration::from_secs(20)).open().expect("a name")
 }
 
-/// Subscribes `count` consumers and receives until each has `wanted` scans: what they missed between them, in all.
+/// Subscribes `count` times and receives until each subscriber has `sample_count` scans. Returns the number of scans that
+/// all of them together missed.
 fn count_missed(domain: &Domain, count: usize, sample_count: usize) -> u64 {
     let mut subscribers: Vec<_> = (0..count).map(|_| (subscribe(domain), 0, 0)).collect();
     while subscribers.iter().any(|(_, received, _)| *received < sample_count) {
@@ -54,16 +55,16 @@ fn count_missed(domain: &Domain, count: usize, sample_count: usize) -> u64 {
 }
 
 #[test]
-fn forty_consumers_lose_nothing() {
-    in_own_process("limits_consumers::forty_consumers_lose_nothing", || {
+fn forty_subscribers_miss_nothing() {
+    in_own_process("limits_subscribers::forty_subscribers_miss_nothing", || {
         let env = TestEnv::new();
         let hub = streaming(&env, 100, &["--set=limits.subscribers=41"]);
         let mut echo = env.echo(&["front/scan"]);
         let domain = env.domain();
         let threads: Vec<_> = (0..4)
             .map(|_| {
-                let place = domain.clone();
-                thread::spawn(move || count_missed(&place, 10, 40))
+                let domain = domain.clone();
+                thread::spawn(move || count_missed(&domain, 10, 40))
             })
             .collect();
         let missed: Vec<_> = threads.into_iter().map(|thread| thread.join().expect("no panic")).collect();
@@ -78,7 +79,7 @@ fn forty_consumers_lose_nothing() {
 
 #[test]
 fn reports_configured_limit_to_surplus_subscriber() {
-    in_own_process("limits_consumers::reports_configured_limit_to_surplus_subscriber", || {
+    in_own_process("limits_subscribers::reports_configured_limit_to_surplus_subscriber", || {
         let env = TestEnv::new();
         let hub = env.hub(&[env.link("front"), "--set=limits.subscribers=3".to_owned()]);
         let node = scanhub_shm::client_node(&env.domain()).expect("joins");
@@ -101,7 +102,7 @@ fn reports_configured_limit_to_surplus_subscriber() {
 
 #[test]
 fn refusal_on_a_remote_topic_names_the_listener_flag() {
-    in_a_network("limits_consumers::refusal_on_a_remote_topic_names_the_listener_flag", || {
+    in_a_network("limits_subscribers::refusal_on_a_remote_topic_names_the_listener_flag", || {
         let env = TestEnv::new();
         let mut sender = TestGateway::new(0x5f3a_12bc_00d1_e2f3, 7, 3, "front");
         let flags = ["listen", "--json", "--publish", "--subscribers=2", "--name=robot1=5f3a12bc00d1e2f3"];
@@ -146,7 +147,7 @@ fn only_a_stopped_subscriber_misses_samples() {
 }
 
 #[test]
-fn killed_consumers_that_held_samples_leave_nothing() {
+fn killed_subscribers_leave_no_samples() {
     if let [Ok(domain), Ok(base)] = HOLD_VARIABLES.map(std::env::var) {
         return hold_samples(&Domain::at(&domain, base.as_ref()).expect("a place"));
     }
@@ -157,7 +158,7 @@ fn killed_consumers_that_held_samples_leave_nothing() {
     let hub_domain = env.domain();
     let segments = || testkit::shared_memory(&hub_domain.prefix()).len();
     let (open_before, segments_before) = (descriptors(), segments());
-    // Were their samples lost, the hub would have none left.
+    // If their samples were not returned, the hub would have none left.
     const {
         assert!(
             KILL_COUNT * SUBSCRIBERS_PER_PROCESS * limits::MAX_BORROWED_SAMPLES
@@ -166,9 +167,7 @@ fn killed_consumers_that_held_samples_leave_nothing() {
     };
     for _ in 0..KILL_COUNT {
         let mut holder = std::process::Command::new(testkit::own_program());
-        holder.args(testkit::single_test_args(
-            "limits_consumers::killed_consumers_that_held_samples_leave_nothing",
-        ));
+        holder.args(testkit::single_test_args("limits_subscribers::killed_subscribers_leave_no_samples"));
         holder
             .env(HOLD_VARIABLES[0], hub_domain.name())
             .env(HOLD_VARIABLES[1], hub_domain.root().parent().expect("a base"));
@@ -176,7 +175,7 @@ fn killed_consumers_that_held_samples_leave_nothing() {
         holder.wait_for_text("holding");
         assert_eq!(holder.end(KILL).exit_code, None);
     }
-    // Before there may have been more of them: whoever asked how many consumers there are was just leaving.
+    // The numbers before may include a client that counted the subscribers and was just exiting.
     wait_until("the hub is as before", || descriptors() <= open_before && segments() <= segments_before);
     echo.await_lines(40, "a scan", is_class("scan"));
     assert_eq!(env.info("front")["counters"]["loan_failed"], 0);
@@ -187,12 +186,12 @@ fn killed_consumers_that_held_samples_leave_nothing() {
     assert!(env.leftover_files().is_empty(), "{:?}", env.leftover_files());
 }
 
-/// Takes all the samples that it may hold, says so, and stays.
+/// Borrows as many samples as a subscriber may, prints their number, and does not return.
 fn hold_samples(domain: &Domain) {
     let node = scanhub_shm::client_node(domain).expect("joins");
     let topic = Scan::open(&node, "front").expect("works").expect("is there");
     let mut subscribers = Vec::new();
-    // Those that were killed before have their places until the hub looks after them.
+    // Subscribers that were killed before keep their slots until the hub removes them.
     wait_until("places", || {
         subscribers.extend(Scan::subscriber(&node, &topic));
         subscribers.len() == SUBSCRIBERS_PER_PROCESS
@@ -212,5 +211,5 @@ fn hold_samples(domain: &Domain) {
 }
 
 const KILL_COUNT: usize = 20;
-/// Consumers in each process that is killed.
+/// Subscribers in each process that is killed.
 const SUBSCRIBERS_PER_PROCESS: usize = 12;
