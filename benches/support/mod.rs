@@ -62,7 +62,7 @@ pub(crate) fn run_part(words: &[&str]) -> Outcome<()> {
         }
         ["ages", domain, sensor, count] => subscriber::print_ages(domain, sensor, count.parse()?),
         ["consume", "status", domain, sensor] => subscriber::print_statuses(domain, sensor),
-        ["crowd", domain, sensor, count, seconds] => {
+        ["many", domain, sensor, count, seconds] => {
             subscriber::count_samples(domain, sensor, count.parse()?, seconds.parse()?)
         }
         ["hold", domain, sensor, count] => subscriber::hold_samples(domain, sensor, count.parse()?),

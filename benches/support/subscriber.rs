@@ -1,5 +1,5 @@
 //! Subscribers as separate processes: they receive a topic with the client library, sleep until they are woken, and
-//! print when a sample had arrived. For a crowd, many subscribers share a process, each in its own thread and with its
+//! print when a sample had arrived. If there are many, subscribers share a process, each in its own thread and with its
 //! own membership, queue and wake-ups, as if it were a process.
 
 use scanhub_drivers::lms;

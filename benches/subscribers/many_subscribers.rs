@@ -131,9 +131,9 @@ fn start(
             wait,
         ])
     };
-    let crowd: Vec<Child> = (0..processes).map(part).collect::<Outcome<_>>()?;
-    crowd.iter().try_for_each(|child| child.wait_for_line("following", STEP_TIMEOUT).map(drop))?;
-    Ok(crowd)
+    let children: Vec<Child> = (0..processes).map(part).collect::<Outcome<_>>()?;
+    children.iter().try_for_each(|child| child.wait_for_line("following", STEP_TIMEOUT).map(drop))?;
+    Ok(children)
 }
 
 /// Returns the values of the sweep for `count` subscribers.
@@ -144,7 +144,7 @@ fn run(
     seconds: u64,
     wait: &str,
 ) -> Outcome<[f64; 7]> {
-    let crowd = start(environment, SENSOR, count, seconds, wait)?;
+    let children = start(environment, SENSOR, count, seconds, wait)?;
     // Ends before the first subscriber leaves.
     let look =
         || -> Outcome<(u64, ThreadUsage)> { Ok((clock::now(), ThreadUsage::of(hub.guard.pid(), |_| true)?)) };
@@ -155,7 +155,7 @@ fn run(
     let shared: f64 = segments(&environment.domain)?.values().map(|(_, bytes)| bytes).sum();
     let telegrams = SensorTruth::read(&environment.truth(), SENSOR)?.count(before.0, after.0);
     let (mut last, mut missed) = (BTreeMap::<u64, (u64, u64)>::new(), 0);
-    for child in &crowd {
+    for child in &children {
         for line in child.lines_until("end", STEP_TIMEOUT + Duration::from_secs(seconds))? {
             if line.text.starts_with("missed") {
                 missed += line.number(1)?;
@@ -196,14 +196,14 @@ pub(crate) fn measure_memory(options: &Options) -> Outcome<()> {
     let alone = segments(&environment.domain)?;
     // They stay until they are ended, so that the first ones are still attached when the last ones are.
     let (seconds, long) = (options.seconds(8), 3600);
-    let crowds: Vec<_> = SENSORS
+    let children: Vec<_> = SENSORS
         .iter()
         .map(|sensor| start(&environment, sensor, 100, long, "doorbell"))
         .collect::<Outcome<_>>()?;
     thread::sleep(Duration::from_secs(seconds));
     let resident = ResidentMemory::of(hub.guard.pid())?;
     let full = segments(&environment.domain)?;
-    drop(crowds);
+    drop(children);
     let figure = |name, bytes: f64, target| {
         let hub = vec![bytes / 1024.0 / 1024.0];
         Figure { name, unit: "MiB", hub, baseline: Vec::new(), target }
@@ -217,9 +217,9 @@ pub(crate) fn measure_memory(options: &Options) -> Outcome<()> {
         figure("shared memory, no subscriber", sum(&alone), Target::None),
         figure("shared memory, 200 subscribers", sum(&full), Target::None),
     ];
-    figures::print("consumers", options.json, &rows);
-    figures::print_cells("consumers", options.json, &cells("no subscriber", &alone));
-    figures::print_cells("consumers", options.json, &cells("200 subscribers", &full));
+    figures::print("subscribers", options.json, &rows);
+    figures::print_cells("subscribers", options.json, &cells("no subscriber", &alone));
+    figures::print_cells("subscribers", options.json, &cells("200 subscribers", &full));
     Ok(())
 }
 

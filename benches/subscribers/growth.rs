@@ -49,8 +49,8 @@ impl ParameterRange {
 
     /// Prints the values and how they grow.
     pub(crate) fn print(&self, is_json: bool) {
-        figures::print_cells("consumers", is_json, &self.cells());
-        figures::print_cells("consumers", is_json, &self.growths(is_json));
+        figures::print_cells("subscribers", is_json, &self.cells());
+        figures::print_cells("subscribers", is_json, &self.growths(is_json));
     }
 
     fn cells(&self) -> Vec<Cell> {

@@ -26,8 +26,8 @@
 //! - `program and libraries` are pages of the executable, which the machine holds only once. Touched shared memory is
 //!   the part of the samples that is in use, because the same few are used again and again.
 
-mod crowd;
 mod growth;
+mod many_subscribers;
 mod sensors;
 #[path = "../support/mod.rs"]
 mod support;
@@ -53,7 +53,7 @@ fn main() -> ExitCode {
             sensors::drive(begin.as_ref(), beams.parse()?, sensors.parse()?, telegrams.parse()?, followed)
         }
         ["followers", domain, sensor, count, seconds, wait] => {
-            crowd::subscribe_many(domain, sensor, count.parse()?, seconds.parse()?, wait)
+            many_subscribers::subscribe_many(domain, sensor, count.parse()?, seconds.parse()?, wait)
         }
         _ => support::run_part(words),
     };
@@ -64,31 +64,31 @@ fn measure(options: &Options) -> Outcome<()> {
     faults(options)?;
     sensors::measure_virtual_time(options)?;
     sensors::measure_variants(options)?;
-    crowd::measure_subscribers(options)?;
-    crowd::measure_memory(options)?;
+    many_subscribers::measure_subscribers(options)?;
+    many_subscribers::measure_memory(options)?;
     sensors::measure_lines(options)
 }
 
-/// Measures a crowd, and what broken subscribers do to the others.
+/// Measures many subscribers, and the effect of broken ones on the others.
 fn faults(options: &Options) -> Outcome<()> {
     let environment = BenchEnvironment::new()?;
     let _simulator = environment.simulate(&[SENSOR], 500_000)?;
     let hub = environment.hub_with_many_slots(&[SENSOR])?;
     hub.wait_for_line("ready", STEP_TIMEOUT)?;
-    let mut figures = measure_crowd(&environment, &hub, options.count(100), options.seconds(20))?;
+    let mut figures = measure_many_subscribers(&environment, &hub, options.count(100), options.seconds(20))?;
     figures.extend(measure_kills(&environment, &hub)?);
     figures.extend(measure_stopped(&environment)?);
     figures.extend(fill_slots(&environment)?);
-    // Requesting a status needs a place, and the crowd has left by now.
+    // Requesting a status needs a subscriber slot, and the many subscribers have exited by now.
     thread::sleep(CLEANUP_TIMEOUT);
     let failed = counter(&environment, Counter::LoanFailed)?;
     figures.push(figure("samples without memory", "1", failed, Target::Max(0.0)));
-    figures::print("consumers", options.json, &figures);
+    figures::print("subscribers", options.json, &figures);
     Ok(())
 }
 
 /// Measures `count` subscribers for `seconds`.
-fn measure_crowd(
+fn measure_many_subscribers(
     environment: &BenchEnvironment,
     hub: &Child,
     count: usize,
@@ -96,17 +96,16 @@ fn measure_crowd(
 ) -> Outcome<Vec<Figure>> {
     let before = start_subscriber(environment)?;
     let each = count.div_ceil(PROCESS_COUNT).to_string();
-    let start = |_| {
-        environment.start_part(&["crowd", environment.domain.name(), SENSOR, &each, &seconds.to_string()])
-    };
-    let crowd: Vec<Child> = (0..PROCESS_COUNT).map(start).collect::<Outcome<_>>()?;
-    for child in &crowd {
+    let start =
+        |_| environment.start_part(&["many", environment.domain.name(), SENSOR, &each, &seconds.to_string()]);
+    let children: Vec<Child> = (0..PROCESS_COUNT).map(start).collect::<Outcome<_>>()?;
+    for child in &children {
         child.wait_for_line("following", STEP_TIMEOUT)?;
     }
     let (from, telegrams) =
         (ThreadUsage::of(hub.guard.pid(), |_| true)?, counter(environment, Counter::Telegrams)?);
     let mut lines = Vec::new();
-    for child in &crowd {
+    for child in &children {
         lines.extend(child.lines_until("end", STEP_TIMEOUT + Duration::from_secs(seconds))?);
     }
     let work = ThreadUsage::of(hub.guard.pid(), |_| true)?.since(from);
@@ -186,8 +185,8 @@ fn measure_stopped(environment: &BenchEnvironment) -> Outcome<Vec<Figure>> {
 
 /// Takes all places of a topic, and one more.
 fn fill_slots(environment: &BenchEnvironment) -> Outcome<Vec<Figure>> {
-    let crowd = environment.start_part(&["stay", environment.domain.name(), SENSOR, "210"])?;
-    let refused = crowd.wait_for_line("refused", 6 * STEP_TIMEOUT)?;
+    let child = environment.start_part(&["stay", environment.domain.name(), SENSOR, "210"])?;
+    let refused = child.wait_for_line("refused", 6 * STEP_TIMEOUT)?;
     eprintln!("{}", refused.text);
     Ok(vec![figure("subscribers before one was refused", "1", refused.number(1)? as f64, Target::None)])
 }

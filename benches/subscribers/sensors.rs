@@ -158,7 +158,7 @@ pub(crate) fn measure_virtual_time(options: &Options) -> Outcome<()> {
             // This number of sensors at their full rate on one core.
             target: Target::Max((1e7 / (MAX_SENSORS as f64 * SCAN_RATE_HZ)).floor() / 10.0),
         };
-        figures::print("consumers", options.json, &[figure]);
+        figures::print("subscribers", options.json, &[figure]);
     }
     Ok(())
 }
