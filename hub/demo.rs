@@ -27,7 +27,7 @@ use delivery_stats::{DeliveryStats, Sensor, counted};
 use environment::{ChildEvent, DemoEnvironment};
 use participants::{Families, World};
 
-/// Run simulated sensors, the hub and a consumer for each in one terminal
+/// Run simulated sensors, the hub and a subscriber for each in one terminal
 #[derive(Args, Debug)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Demo {
@@ -382,7 +382,7 @@ fn ended(child: usize) -> Failure {
         TILTED => "what sees in three dimensions",
         TRACKER => "the tracker of people",
         WEB => "the picture for browsers",
-        _ => "a consumer",
+        _ => "a subscriber",
     };
     Failure::new(Kind::Failed, format!("{process} ended early"), "its output is above")
 }

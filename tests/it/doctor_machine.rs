@@ -181,7 +181,7 @@ fn finds_resource_shortages() {
     let limited = |words| Findings::in_outcome(&Program::start(command_under(&env, words, &[&link])).wait());
     limited("ulimit -n 64").assert_problem("descriptors are short", "descriptors", "failed", "LimitNOFILE=");
     limited("ulimit -n 128").assert_problem(
-        "descriptors for few consumers",
+        "descriptors for few subscribers",
         "descriptors",
         "warning",
         "sudo prlimit --pid $$ --nofile=",

@@ -51,7 +51,7 @@ pub struct LatencyArgs {
 enum WaitMethod {
     /// Sleep on a word in shared memory; one call of the hub wakes all
     Doorbell,
-    /// Sleep on the event; the hub sends one message to each consumer
+    /// Sleep on the event; the hub sends one message to each subscriber
     Event,
     /// Do not sleep; uses a whole processor
     Spin,

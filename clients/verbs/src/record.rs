@@ -233,7 +233,7 @@ fn selection(
     }
     if let Some(robot) = chosen.named.iter().find(|name| name.is_robot()) {
         let hint = "`*/zones` records the zones of each sensor";
-        return Err(Failure::new(Kind::Usage, format!("{robot} is computed by the consumer"), hint));
+        return Err(Failure::new(Kind::Usage, format!("{robot} is computed by the subscriber"), hint));
     }
     if ros2 {
         let named = chosen.named.iter().map(|name| name.topic);

@@ -479,7 +479,7 @@ impl<'a> Diagnosis<'a> {
     fn starved_message(&self) -> String {
         let count = self.starved;
         format!(
-            "{count} consumers are attached but get nothing: raise the limit of open descriptors (ulimit -n)"
+            "{count} subscribers are attached but get nothing: raise the limit of open descriptors (ulimit -n)"
         )
     }
 }

@@ -134,7 +134,7 @@ pub fn explain_bus_error(json: bool, is_taken: bool) {
 /// Raises the limit of open descriptors to the hard limit of the process.
 pub(crate) fn raise_descriptor_limit() {
     if let Err(error) = resource_limits::raise_descriptor_limit() {
-        tracing::warn!(%error, "cannot raise the limit of open descriptors: fewer consumers can attach");
+        tracing::warn!(%error, "cannot raise the limit of open descriptors: fewer subscribers can attach");
     }
 }
 

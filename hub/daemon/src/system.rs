@@ -350,7 +350,7 @@ impl PortIo for Port {
 
 #[cold]
 fn log_unnotified(failure: &Failure) {
-    tracing::debug!(%failure, "some consumers were not woken");
+    tracing::debug!(%failure, "some subscribers were not woken");
 }
 
 /// Maximum wait that is slept through.

@@ -80,7 +80,7 @@ impl<S: Service> WakeSender<S> {
         let notified = self.notifier.notify_with_custom_event_id(EventId::new(event as usize));
         notified
             .map(|_| ())
-            .map_err(|error| Failure::new(Kind::Failed, format!("cannot wake consumers: {error:?}"), ""))
+            .map_err(|error| Failure::new(Kind::Failed, format!("cannot wake subscribers: {error:?}"), ""))
     }
 
     /// Wakes all subscribers for `why`, whatever topics they have.

@@ -49,11 +49,11 @@ class Denied(Failure):
 
 
 class Short(Failure):
-    """Shared memory, descriptors or places for consumers are short: try later."""
+    """Shared memory, descriptors or subscriber slots are exhausted: try later."""
 
 
 class Held(Failure):
-    """The program keeps more samples of a topic than a consumer may have at a time."""
+    """The program keeps more samples of a topic than a subscriber may have at a time."""
 
 
 class Taken(Failure):

@@ -317,7 +317,7 @@ pub(crate) fn descriptors(state: &MachineState) -> Finding {
         return Finding::failed(NAME, text, remedy);
     };
     let subscribers = remaining / DESCRIPTORS_PER_SUBSCRIBER;
-    let text = format!("{limit} at most: enough for about {subscribers} consumers of a topic");
+    let text = format!("{limit} at most: enough for about {subscribers} subscribers of a topic");
     if subscribers >= MIN_SUBSCRIBERS {
         Finding::ok(NAME, text)
     } else {
@@ -510,12 +510,12 @@ mod tests {
 
     #[test]
     fn counts_descriptors_in_subscribers() {
-        says(&descriptors(&facts()), State::Ok, &["4096", "990 consumers"]);
+        says(&descriptors(&facts()), State::Ok, &["4096", "990 subscribers"]);
         says(&descriptors(&MachineState { descriptors: None, ..facts() }), State::Ok, &["no limit"]);
         says(
             &descriptors(&MachineState { descriptors: Some(152), ..facts() }),
             State::Warning,
-            &["4 consumers"],
+            &["4 subscribers"],
         );
         says(
             &descriptors(&MachineState { descriptors: Some(131), ..facts() }),

@@ -46,7 +46,7 @@ pub(crate) fn leftovers(state: &MachineState) -> Finding {
             }
         },
         (None, 0, alive) if alive > 0 => {
-            Finding::ok(NAME, format!("none; {} waiting for a hub", plural(alive as u64, "consumer")))
+            Finding::ok(NAME, format!("none; {} waiting for a hub", plural(alive as u64, "subscriber")))
         }
         (None, 0, _) => {
             Finding::warning(NAME, format!("no process holds {files}"), "scanhub doctor --clean removes them")
@@ -246,7 +246,7 @@ mod tests {
             segments: two_files(),
             ..facts()
         };
-        says(&leftovers(&nodes(3, 0)), State::Ok, &["3 consumers waiting"]);
+        says(&leftovers(&nodes(3, 0)), State::Ok, &["3 subscribers waiting"]);
         let words = [
             "1 process died",
             "2 files (2 kB)",
