@@ -160,10 +160,10 @@ fn a_directory_that_vanishes_is_waited_for() {
     let mut recorder = env.start(&["record", "--json", "-o", &file.display().to_string()]);
     await_samples(&mut recorder, 20);
     fs::rename(&place, env.path("unplugged")).unwrap();
-    let problem = recorder.await_line("trouble", is_kind("write_failed"));
+    let problem = recorder.await_line("a failed write", is_kind("write_failed"));
     assert_eq!(problem["file"], file.display().to_string());
     fs::create_dir(&place).unwrap();
-    recorder.await_line("well", is_kind("write_resumed"));
+    recorder.await_line("the resumed write", is_kind("write_resumed"));
     await_samples(&mut recorder, 20);
     let outcome = recorder.end(INT);
     assert_eq!(files(&outcome)[1], place.join("walk-0002.mcap"));
@@ -189,13 +189,13 @@ fn a_full_disk_is_waited_for() {
     let file = place.join("walk.mcap").display().to_string();
     let mut recorder =
         start_in(&env, &["unshare", "-rm", "sh", "-c", &script, "sh"], &["record", "--json", "-o", &file]);
-    recorder.await_line("trouble", is_kind("write_failed"));
+    recorder.await_line("a failed write", is_kind("write_failed"));
     // As the recorder sees it.
     let path_in_namespace = PathBuf::from(format!("/proc/{}/root{}", recorder.pid(), place.display()));
     let full = Recording::read_interrupted(&path_in_namespace.join("walk.mcap"));
     assert!(!full.of("front/telegram").is_empty(), "it ends behind a whole chunk");
     fs::remove_file(path_in_namespace.join("filler")).unwrap();
-    recorder.await_line("well", is_kind("write_resumed"));
+    recorder.await_line("the resumed write", is_kind("write_resumed"));
     let before = Recording::read_interrupted(&path_in_namespace.join("walk.mcap")).messages.len();
     wait_until("it goes on", || {
         Recording::read_interrupted(&path_in_namespace.join("walk.mcap")).messages.len() > before

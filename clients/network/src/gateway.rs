@@ -526,9 +526,9 @@ mod tests {
 
     #[test]
     fn pages_list_topics_that_are_not_sent_by_default() {
-        let left_out: Vec<_> =
+        let not_sent: Vec<_> =
             Topic::ALL.into_iter().filter(|topic| !Selection::is_default(*topic)).collect();
-        let names: Vec<_> = left_out.iter().map(|topic| topic.name()).collect();
+        let names: Vec<_> = not_sent.iter().map(|topic| topic.name()).collect();
         let (last, first) = names.split_last().unwrap();
         let sentence = format!("all topics except {} and {last}", first.join(", "));
         let pages = ["docs/configuration.md", "docs/datagram.md", "docs/bridge.md"];

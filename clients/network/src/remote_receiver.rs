@@ -213,8 +213,8 @@ impl<'a> RemoteReceiver<'a> {
         let so_far = Evictions {
             gateways: gateways.evicted().evicted_active,
             refused: gateways.refused(DatagramError::Capacity),
-            sensors: publication.map_or(0, |publication| publication.displaced),
-            samples: publication.map_or(0, |publication| publication.left_out.capacity),
+            sensors: publication.map_or(0, |publication| publication.evicted_active),
+            samples: publication.map_or(0, |publication| publication.dropped.capacity),
         };
         self.capacity.check(so_far, now).map_or(Ok(()), |what| self.report.problem(&what))
     }
@@ -293,9 +293,9 @@ impl<'a> RemoteReceiver<'a> {
         self.received += 1;
         self.last_sample = Instant::now();
         if let Some(publication) = &mut self.publication {
-            let no_room = publication.left_out.no_room;
+            let no_room = publication.dropped.no_room;
             let made = publication.sample(sample, || self.report.names.of(head.hub), now());
-            if publication.left_out.no_room > no_room {
+            if publication.dropped.no_room > no_room {
                 self.incoming.count_no_room(head.hub);
                 self.problem(NO_ROOM)?;
             }

@@ -299,7 +299,7 @@ impl SimulatedNetwork {
 
 #[test]
 fn table_agrees_with_a_model_that_keeps_everything() {
-    let (mut refused, mut full, mut evicted, mut displaced) = (BTreeMap::new(), 0, 0, 0);
+    let (mut refused, mut full, mut evicted, mut evicted_active) = (BTreeMap::new(), 0, 0, 0);
     for seed in 0..20 {
         let mut world = SimulatedNetwork::new(seed);
         let (mut table, mut model) = (GatewayTable::new(&Topic::ALL), TableModel::default());
@@ -324,7 +324,7 @@ fn table_agrees_with_a_model_that_keeps_everything() {
         }
         full += u32::from(model.rows.len() == MAX_ROWS);
         evicted += model.evicted.runs;
-        displaced += model.evicted.evicted_active;
+        evicted_active += model.evicted.evicted_active;
         assert_eq!(
             (table_counters(&table), table.evicted()),
             (model.counters(), model.evicted),
@@ -338,7 +338,7 @@ fn table_agrees_with_a_model_that_keeps_everything() {
     }
     // Every kind of refusal and eviction has occurred.
     assert!(full > 0 && evicted > 100, "{full} full, {evicted} runs evicted");
-    assert!(displaced > 100 && evicted > displaced, "{displaced} of them active");
+    assert!(evicted_active > 100 && evicted > evicted_active, "{evicted_active} of them active");
     for refusal in [DatagramError::Epoch, DatagramError::Stale, DatagramError::Capacity] {
         assert!(refused[refusal.name()] > 0, "no datagram was refused as {}", refusal.name());
     }

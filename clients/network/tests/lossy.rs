@@ -104,7 +104,7 @@ struct Observations {
     /// Datagrams with zones that were numbered.
     sent: u64,
     /// Samples that were not published, by reason.
-    left_out: [u64; 5],
+    dropped: [u64; 5],
     /// Samples that were published under the name of another sensor.
     wrong_verdicts: u64,
 }
@@ -239,9 +239,8 @@ fn simulate(run: &RunParameters) -> Observations {
         receiving.step(at, GATEWAY_NAME, |event| observations.on_event(event, &sending.sent, run));
     }
     check_counters(&observations, &sending.sent, &receiving);
-    let DroppedSamples { unnamed, unannounced, late, capacity, shortage, .. } =
-        receiving.republisher.left_out;
-    observations.left_out = [unnamed, unannounced, late, capacity, shortage];
+    let DroppedSamples { unnamed, unannounced, late, capacity, shortage, .. } = receiving.republisher.dropped;
+    observations.dropped = [unnamed, unannounced, late, capacity, shortage];
     let zones = |(key, _): &(&StreamKey, _)| key.2 == Topic::Zones.number();
     observations.sent =
         sending.sent.datagrams.iter().filter(zones).map(|(_, numbers)| numbers.len() as u64).sum();
@@ -340,7 +339,7 @@ fn network_without_faults_loses_nothing() {
             has_stalls: false,
         });
         assert!(observations.parts > observations.sent);
-        assert_eq!((observations.left_out, observations.refused, observations.duplicate), ([0; 5], 0, 0));
+        assert_eq!((observations.dropped, observations.refused, observations.duplicate), ([0; 5], 0, 0));
         assert_eq!(observations.count, observations.sent);
         assert!(
             observations.max_interval_ns <= every * PERIOD_NS,

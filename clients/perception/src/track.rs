@@ -216,7 +216,7 @@ impl PeopleTracker {
         }
     }
 
-    /// Passes the pictures before `at_ns` to `show`.
+    /// Passes the snapshots before `at_ns` to `show`.
     fn snapshots_until(&mut self, at_ns: u64, show: &mut impl FnMut(&Snapshot)) {
         if at_ns.saturating_sub(self.next_snapshot_ns) > CLOCK_JUMP_NS {
             self.next_snapshot_ns = (at_ns / SNAPSHOT_INTERVAL_NS) * SNAPSHOT_INTERVAL_NS;
@@ -494,10 +494,10 @@ polygon = [[0, 0], [6, 0], [6, 6], [0, 6]]
         let mut people = PeopleTracker::new(Site::parse("room.toml", ROOM).expect("a room"), 80 * MS);
         let (scan, foreground) = (scan(None), Foreground::of(BEAMS));
         let mut take = |after_ms: u64| {
-            let mut pictures = Vec::new();
-            let show = |picture: &Snapshot| pictures.push((picture.wall_ns - BEGIN) / MS);
+            let mut snapshots = Vec::new();
+            let show = |snapshot: &Snapshot| snapshots.push((snapshot.wall_ns - BEGIN) / MS);
             people.take(0, BEGIN + after_ms * MS, &scan, &foreground, show);
-            (pictures, people.counts().late)
+            (snapshots, people.counts().late)
         };
         assert_eq!([take(0), take(100)], [(vec![], 0), (vec![], 0)]);
         assert_eq!(take(200), (vec![40, 80, 120], 0));

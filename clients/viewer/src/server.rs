@@ -142,7 +142,7 @@ impl Server {
                 // Report a viewer that disconnected, and a client that became a viewer.
                 if was_viewer == is_closed {
                     viewers = if is_closed { viewers - 1 } else { viewers + 1 };
-                    let replaced = viewer.skipped();
+                    let replaced = viewer.replaced_count();
                     let event = ViewerEvent { address, connected: !is_closed, replaced, viewers };
                     let _ = events.send(Event::Viewer(event));
                 }

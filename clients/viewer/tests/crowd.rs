@@ -117,23 +117,23 @@ fn readers_get_every_message_despite_a_slow_viewer() {
             got.len()
         );
         drop((slow, readers));
-        let skipped = || events.recv_timeout(TIMEOUT).unwrap();
-        let mut skipped_counts = Vec::new();
-        while skipped_counts.len() <= READER_COUNT {
-            if let Event::Viewer(visit) = skipped()
+        let next_event = || events.recv_timeout(TIMEOUT).unwrap();
+        let mut replaced_counts = Vec::new();
+        while replaced_counts.len() <= READER_COUNT {
+            if let Event::Viewer(visit) = next_event()
                 && !visit.connected
             {
-                skipped_counts.push(visit.replaced);
+                replaced_counts.push(visit.replaced);
             }
         }
-        skipped_counts.sort_unstable();
-        let slow_viewer_skipped = skipped_counts.pop();
+        replaced_counts.sort_unstable();
+        let slow_viewer_replaced = replaced_counts.pop();
         assert_eq!(
-            slow_viewer_skipped,
+            slow_viewer_replaced,
             Some(u64::from(MESSAGE_COUNT) - got.len() as u64),
-            "skipped messages are counted"
+            "replaced messages are counted"
         );
-        assert!(skipped_counts.iter().all(|skipped| *skipped == 0), "{skipped_counts:?}");
+        assert!(replaced_counts.iter().all(|replaced| *replaced == 0), "{replaced_counts:?}");
         drop(closing);
         served.join().unwrap().unwrap();
     });

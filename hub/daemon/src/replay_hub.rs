@@ -49,9 +49,9 @@ pub fn replay(
     let Replay { file, sources, .. } = *replay;
     let recording = Recording::open_as(file, replay.family)?;
     let set = RecordedSet::new(recording, replay.sensor, sources)?;
-    let (links, left_out) =
+    let (links, missing_names) =
         (set.config.links.len(), links_without_sensor(sources, &set.sensors, &set.config)?);
-    for name in left_out {
+    for name in missing_names {
         tracing::info!("{name}: not in the recording, left out");
     }
     let mounts = match set.origin {
@@ -317,9 +317,9 @@ mod tests {
         std::fs::write(&place, "[[link]]\nname = \"rear\"\nport = \"/dev/x\"\nbaud = 38400\n[[link]]\nname = \"up\"\nport = \"y\"\n").unwrap();
         let sources = Sources { files: vec![place.to_path_buf()], ..Sources::default() };
         let config = configuration(&sources, &[sensor("rear")], file).unwrap();
-        let left_out = links_without_sensor(&sources, &[sensor("rear")], &config).unwrap();
+        let missing_names = links_without_sensor(&sources, &[sensor("rear")], &config).unwrap();
         assert_eq!(
-            (config.links.len(), config.links[0].rate(), left_out),
+            (config.links.len(), config.links[0].rate(), missing_names),
             (1, 38_400, vec!["up".to_owned()])
         );
     }

@@ -77,7 +77,7 @@ impl GridSheet {
         GridSheet { grid, ranges: vec![0; beams], intensities: vec![0; beams], angles: vec![0.0; beams] }
     }
 
-    /// How many of `points` collapsed, and how many beams were not measured.
+    /// Returns how many of `points` were dropped because their beam was taken, and how many beams were not measured.
     fn fill(&mut self, points: &[Point]) -> (u32, u32) {
         let collisions = self.grid.fill(points, &mut self.ranges, &mut self.intensities, &mut self.angles);
         let empty = self.ranges.iter().filter(|range| **range == NOT_MEASURED).count();
@@ -90,20 +90,20 @@ fn rows(name: &str, points_per_revolution: usize, revolutions: &[Vec<Point>], pe
     let points: usize = revolutions.iter().map(Vec::len).sum();
     for percent in percents {
         let mut sheet = GridSheet::new(points_per_revolution * percent / 100);
-        let (mut collapsed, mut empty) = (0, 0);
+        let (mut collisions, mut empty) = (0, 0);
         for revolution in revolutions {
             let placed = sheet.fill(revolution);
-            (collapsed, empty) = (collapsed + placed.0, empty + placed.1);
+            (collisions, empty) = (collisions + placed.0, empty + placed.1);
         }
         let beams = sheet.grid.beams();
-        let collapsed = 100.0 * f64::from(collapsed) / points as f64;
+        let collisions = 100.0 * f64::from(collisions) / points as f64;
         let empty = 100.0 * f64::from(empty) / (beams * revolutions.len()) as f64;
-        println!("| {name} | {beams} | {collapsed:.1} % | {empty:.1} % |");
+        println!("| {name} | {beams} | {collisions:.1} % | {empty:.1} % |");
     }
 }
 
 fn main() {
-    println!("| model | beams | of points collapsed | of beams not measured |\n|---|---|---|---|");
+    println!("| model | beams | of points dropped | of beams not measured |\n|---|---|---|---|");
     for model in [ld::Model::Ld19, ld::Model::Stl27l, ld::Model::Ld14p] {
         let session = ld::LdSession::new(Settings { model: Some(model.name()), ..Settings::default() }, 0);
         let head = LdSimulator::new(LdSettings::of(model), room());

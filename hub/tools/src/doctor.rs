@@ -304,7 +304,7 @@ pub fn run_checks(
     report(machine::memory(&facts, config.and_then(scanhub_config::Config::memory_remedy)));
     report(machine::domain(&facts));
     report(machine::hubs(&facts, |user| system.name_of(user)));
-    report(shared_memory::strangers(&scanhub_shm::foreign_segments(domain.root()), |user| {
+    report(shared_memory::foreign_files(&scanhub_shm::foreign_segments(domain.root()), |user| {
         system.name_of(user)
     }));
     report(shared_memory::leftovers(&facts));

@@ -527,8 +527,8 @@ impl GatewayTable {
     /// Evicts a run to make room for `run_id`, to which `arrival` belongs, and returns it. Returns `None` if all other
     /// runs are active and known to deliver, or if they have just delivered and `arrival` is not a sample.
     fn evict(&mut self, run_id: RunId, arrival: Arrival) -> Option<RunId> {
-        let (evicted, is_displaced) = self.next_evicted(run_id, arrival)?;
-        self.end(evicted, is_displaced);
+        let (evicted, is_active) = self.next_evicted(run_id, arrival)?;
+        self.end(evicted, is_active);
         self.remove_if_unused(evicted.0);
         Some(evicted)
     }
@@ -974,8 +974,10 @@ mod tests {
         }
         assert!(contains(&table, (2, 5)) && is_over(&table, (1, 8)) && !is_over(&table, (1, 9)));
         let mut evict = || {
-            let displaced = table.evicted().evicted_active;
-            table.evict((9, 9), announces(0)).map(|run| (run, table.evicted().evicted_active > displaced))
+            let evicted_active = table.evicted().evicted_active;
+            table
+                .evict((9, 9), announces(0))
+                .map(|run| (run, table.evicted().evicted_active > evicted_active))
         };
         let retired = [(2, 5), (1, 5), (2, 6)].map(|run| Some((run, false)));
         assert_eq!([(); 3].map(|()| evict()), retired);
@@ -1025,16 +1027,16 @@ mod tests {
     #[test]
     fn proven_run_is_not_evicted_for_a_new_one() {
         let mut table = GatewayTable::new(&Topic::ALL);
-        let mut displaced = 0;
+        let mut evicted_active = 0;
         for n in 0..30_000 {
             if n % 100 == 0 && !(10_000..20_000).contains(&n) {
                 assert_eq!(receive(&mut table, (1, 1), delivers(n)), None, "{n}: its silence is too short");
             }
             if n > 1000 {
-                displaced += u32::from(receive(&mut table, (1000 + n, 1), delivers(n)).is_some());
+                evicted_active += u32::from(receive(&mut table, (1000 + n, 1), delivers(n)).is_some());
             }
         }
-        assert!(contains(&table, (1, 1)) && displaced > 28_000);
+        assert!(contains(&table, (1, 1)) && evicted_active > 28_000);
     }
 
     #[test]

@@ -18,9 +18,9 @@ use remote_sensor::{Outcome, RemoteSensor};
 pub struct Republisher<S: TopicStore> {
     sensors: Vec<RemoteSensor<S::Sensor>>,
     /// Samples that were not published.
-    pub left_out: DroppedSamples,
+    pub dropped: DroppedSamples,
     /// Sensors that were evicted for others.
-    pub displaced: u64,
+    pub evicted_active: u64,
     /// Whether topics are created only for sensors of a gateway that is known to deliver.
     only_proven: bool,
     candidates: Candidates,
@@ -70,8 +70,8 @@ impl<S: TopicStore> Republisher<S> {
     pub fn new(store: S, pid: u32, now_ns: u64) -> Republisher<S> {
         Republisher {
             sensors: Vec::new(),
-            left_out: DroppedSamples::default(),
-            displaced: 0,
+            dropped: DroppedSamples::default(),
+            evicted_active: 0,
             only_proven: false,
             candidates: Candidates::default(),
             eviction_credit: MAX_SENSORS,
@@ -118,7 +118,7 @@ impl<S: TopicStore> Republisher<S> {
         made
     }
 
-    /// Publishes `sample`, or counts it in [`left_out`](Self::left_out). Creates its topics as
+    /// Publishes `sample`, or counts it in [`dropped`](Self::dropped). Creates its topics as
     /// [`announced`](Self::on_announcement) does if its gateway is known to deliver since this sample. If there is no room
     /// for its sensor, another one may be evicted.
     ///
@@ -259,7 +259,7 @@ impl<S: TopicStore> Republisher<S> {
         let samples = candidate.samples().filter(|remote| remote.boot == boot);
         let outcomes = samples.map(|remote| sensor.publish(&remote));
         let published = outcomes.filter(|outcome| *outcome == Outcome::Published).count();
-        self.left_out.unproven -= published as u64;
+        self.dropped.unproven -= published as u64;
     }
 
     /// Publishes `sample`, if it can be.
@@ -267,28 +267,28 @@ impl<S: TopicStore> Republisher<S> {
         let RemoteSample { remote, announced, is_proven, .. } = sample;
         let head = &remote.head;
         let reason = if remote.late {
-            &mut self.left_out.late
+            &mut self.dropped.late
         } else if let Some(sensor) = self.sensors.iter_mut().find(|sensor| sensor.has_sent(head)) {
             match sensor.publish(remote) {
                 Outcome::Published => return,
-                Outcome::NoTopic if !sensor.is_announced(remote.topic) => &mut self.left_out.unannounced,
-                Outcome::NoTopic if self.only_proven && !is_proven => &mut self.left_out.unproven,
-                Outcome::NoTopic if self.store.fits(&[remote.topic]) => &mut self.left_out.shortage,
-                Outcome::NoTopic | Outcome::NoRoom => &mut self.left_out.no_room,
+                Outcome::NoTopic if !sensor.is_announced(remote.topic) => &mut self.dropped.unannounced,
+                Outcome::NoTopic if self.only_proven && !is_proven => &mut self.dropped.unproven,
+                Outcome::NoTopic if self.store.fits(&[remote.topic]) => &mut self.dropped.shortage,
+                Outcome::NoTopic | Outcome::NoRoom => &mut self.dropped.no_room,
             }
         } else if let Some(announce) = announced {
             if self.only_proven && !is_proven {
                 self.candidates.add(head).store_sample(remote);
-                &mut self.left_out.unproven
+                &mut self.dropped.unproven
             } else if self.sensors.len() == MAX_SENSORS {
-                &mut self.left_out.capacity
+                &mut self.dropped.capacity
             } else if self.store.fits(&topics(announce)) {
-                &mut self.left_out.shortage
+                &mut self.dropped.shortage
             } else {
-                &mut self.left_out.no_room
+                &mut self.dropped.no_room
             }
         } else {
-            &mut self.left_out.unnamed
+            &mut self.dropped.unnamed
         };
         *reason += 1;
     }
@@ -302,7 +302,7 @@ impl<S: TopicStore> Republisher<S> {
     /// Removes the sensor, after it has published that it is silent.
     fn evict(&mut self, at: usize, now: WallTimestamp) {
         self.sensors.remove(at).retire(now);
-        self.displaced += 1;
+        self.evicted_active += 1;
         self.eviction_credit -= 1;
     }
 }
@@ -609,7 +609,7 @@ mod tests {
         );
         assert_eq!((network.zones(5, 999), network.republisher.names()), (None, vec![]));
         assert_eq!(network.zones(5, 1_000), Some("h5.front".to_owned()));
-        let DroppedSamples { unproven, shortage, .. } = network.republisher.left_out;
+        let DroppedSamples { unproven, shortage, .. } = network.republisher.dropped;
         assert_eq!((unproven, shortage), (1, 0), "the last sample is published late");
         assert_eq!(network.republisher.store.sent.get(), 2);
         // Announced only after its gateway is known to deliver.
@@ -628,10 +628,10 @@ mod tests {
         for ms in [2_000, 2_100, 2_200] {
             assert_eq!(network.zones(6, ms), None);
         }
-        assert_eq!(network.republisher.left_out.no_room, 3);
-        assert_eq!((network.republisher.names(), network.republisher.displaced), (vec!["h5.front"], 0));
+        assert_eq!(network.republisher.dropped.no_room, 3);
+        assert_eq!((network.republisher.names(), network.republisher.evicted_active), (vec!["h5.front"], 0));
         // A silent sensor returns its memory.
         assert_eq!(network.zones(6, 5_000), Some("h6.front".to_owned()));
-        assert_eq!((network.republisher.names(), network.republisher.displaced), (vec!["h6.front"], 1));
+        assert_eq!((network.republisher.names(), network.republisher.evicted_active), (vec!["h6.front"], 1));
     }
 }

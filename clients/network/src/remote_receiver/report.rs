@@ -432,17 +432,17 @@ struct NoRoomJson {
 
 impl<'a> PublishedJson<'a> {
     fn new(publication: &'a Publication, class: &'static str) -> PublishedJson<'a> {
-        let left_out = publication.left_out;
+        let dropped = publication.dropped;
         PublishedJson {
             class,
             sensors: publication.names(),
-            unnamed: left_out.unnamed,
-            unannounced: left_out.unannounced,
-            late: left_out.late,
-            capacity: left_out.capacity,
-            shortage: left_out.shortage,
-            unproven: left_out.unproven,
-            no_room: left_out.no_room,
+            unnamed: dropped.unnamed,
+            unannounced: dropped.unannounced,
+            late: dropped.late,
+            capacity: dropped.capacity,
+            shortage: dropped.shortage,
+            unproven: dropped.unproven,
+            no_room: dropped.no_room,
             loan_failed: publication.failed(),
         }
     }

@@ -14,7 +14,7 @@ use super::{Event, Kind, MisplacedSensor, Snapshot, Track};
 
 /// Maximum number of people at a time.
 pub(crate) const MAX_PEOPLE: usize = 64;
-/// Interval between pictures.
+/// Interval between snapshots.
 pub const SNAPSHOT_INTERVAL_NS: u64 = 40_000_000;
 
 /// Gain of a leg exactly at its expected position, and limit of a leg's squared distance over its variance.

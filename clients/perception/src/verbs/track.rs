@@ -180,9 +180,9 @@ impl TrackRun<'_> {
         let Some(((header, scan), foreground)) = pair else { return Ok(()) };
         self.writer.results.take_flags(&header);
         let mut written = Ok(());
-        self.tracker.take(sensor, header.wall_ns, &scan, &foreground, |picture| {
+        self.tracker.take(sensor, header.wall_ns, &scan, &foreground, |snapshot| {
             if written.is_ok() {
-                written = self.writer.write(picture);
+                written = self.writer.write(snapshot);
             }
         });
         written
@@ -191,9 +191,9 @@ impl TrackRun<'_> {
     fn sum_up(&mut self) -> Result<(), ExitReason> {
         let writer = &mut self.writer;
         let mut written = Ok(());
-        self.tracker.finish(|picture| {
+        self.tracker.finish(|snapshot| {
             if written.is_ok() {
-                written = writer.write(picture);
+                written = writer.write(snapshot);
             }
         });
         written?;
@@ -204,7 +204,7 @@ impl TrackRun<'_> {
     }
 }
 
-/// Writes and publishes pictures.
+/// Writes and publishes snapshots.
 struct SnapshotWriter<'a> {
     site: Site,
     /// Indices of the doors whose counts alone are printed; empty: everything is.
@@ -212,7 +212,7 @@ struct SnapshotWriter<'a> {
     /// Number of people who went through each door: from its `from` to its `to`, and back.
     passages: Vec<[u64; 2]>,
     appeared: u64,
-    /// Tracks of the last picture.
+    /// Tracks of the last snapshot.
     tracks: Box<Tracks>,
     /// Number of samples of `tracks` and of `events`.
     samples: [u64; 2],
@@ -220,8 +220,8 @@ struct SnapshotWriter<'a> {
 }
 
 impl SnapshotWriter<'_> {
-    fn write(&mut self, picture: &Snapshot) -> Result<(), ExitReason> {
-        let events = self.publish(picture);
+    fn write(&mut self, snapshot: &Snapshot) -> Result<(), ExitReason> {
+        let events = self.publish(snapshot);
         let SnapshotWriter { site, counted, passages: passed, appeared, tracks, results, .. } = self;
         let (name, prints_all) = (results.name, counted.is_empty());
         // Where everyone is would be too much text.
@@ -229,11 +229,11 @@ impl SnapshotWriter<'_> {
             let header = results.header;
             results.result(&json::tracks(name, &header, tracks), |_| Ok(()))?;
         }
-        for &MisplacedSensor { sensor, other, offset: [dx_m, dy_m] } in &picture.misplaced {
+        for &MisplacedSensor { sensor, other, offset: [dx_m, dy_m] } in &snapshot.misplaced {
             let [sensor, other] = [sensor, other].map(|number| site.sensors[number].name.as_str());
             let line = TrackJson::Misplaced {
                 sensor: name,
-                wall_ns: picture.wall_ns,
+                wall_ns: snapshot.wall_ns,
                 name: sensor,
                 other,
                 dx_m,
@@ -241,7 +241,7 @@ impl SnapshotWriter<'_> {
             };
             results.note(&line, |out| line.text(out))?;
         }
-        for (event, (header, payload)) in picture.events.iter().zip(&events) {
+        for (event, (header, payload)) in snapshot.events.iter().zip(&events) {
             if prints_all {
                 results.result(&json::event(name, header, payload), |out| text::event_text(out, payload))?;
             }
@@ -257,25 +257,25 @@ impl SnapshotWriter<'_> {
         Ok(())
     }
 
-    /// Publishes a picture if the tracker has topics. Returns its events as samples.
-    fn publish(&mut self, picture: &Snapshot) -> Vec<(Header, Event)> {
-        let SnapshotWriter { site, tracks, samples: [pictures, events], results, .. } = self;
+    /// Publishes a snapshot if the tracker has topics. Returns its events as samples.
+    fn publish(&mut self, snapshot: &Snapshot) -> Vec<(Header, Event)> {
+        let SnapshotWriter { site, tracks, samples: [snapshots, events], results, .. } = self;
         let now_ns = clock::now_ns();
         let header = Header {
-            seq: *pictures,
-            topic_seq: *pictures,
+            seq: *snapshots,
+            topic_seq: *snapshots,
             stamp_first_ns: now_ns,
             stamp_last_ns: now_ns,
-            wall_ns: picture.wall_ns,
+            wall_ns: snapshot.wall_ns,
             ..results.header
         };
         results.header = header;
-        **tracks = picture.payload(site);
-        let numbered = picture.events.iter().zip(*events..).map(|(event, topic_seq)| {
+        **tracks = snapshot.payload(site);
+        let numbered = snapshot.events.iter().zip(*events..).map(|(event, topic_seq)| {
             (Header { topic_seq, wall_ns: event.wall_ns, ..header }, event.payload(site))
         });
         let numbered: Vec<_> = numbered.collect();
-        *pictures += 1;
+        *snapshots += 1;
         *events += numbered.len() as u64;
         if let Some(Topics { publications, sensor }) = &mut results.topics {
             // Subscribers notice by its number that a sample is missing, and poll if they cannot be woken.

@@ -23,7 +23,7 @@ const BATCH_SIZE: usize = 32;
 const WRITE_SIZE: usize = 16 << 10;
 /// Send timeout. A viewer that does not accept a message in this time is disconnected.
 const SEND_TIMEOUT: Duration = Duration::from_secs(30);
-/// Minimum interval between two reports of skipped messages.
+/// Minimum interval between two reports of replaced messages.
 const REPORT_INTERVAL: Duration = Duration::from_secs(1);
 
 /// A connected viewer.
@@ -38,7 +38,7 @@ pub(crate) struct Viewer {
     pending: Option<Instant>,
     /// Whether the socket was full since this viewer last had all messages.
     was_full: bool,
-    skipped: ReplacedMessages,
+    replaced: ReplacedMessages,
     reported: ReplacedMessages,
     report_at: Instant,
     /// The last subscription to an unknown channel, which was not refused yet.
@@ -87,7 +87,7 @@ impl Viewer {
             next: 0,
             pending: None,
             was_full: false,
-            skipped: ReplacedMessages::default(),
+            replaced: ReplacedMessages::default(),
             reported: ReplacedMessages::default(),
             report_at: now,
             unknown_channel: None,
@@ -109,8 +109,8 @@ impl Viewer {
 
     /// Returns the number of messages that newer ones replaced before they were sent. Messages that are a state do not
     /// count.
-    pub(crate) fn skipped(&self) -> u64 {
-        self.skipped.by_viewer + self.skipped.by_server
+    pub(crate) fn replaced_count(&self) -> u64 {
+        self.replaced.by_viewer + self.replaced.by_server
     }
 
     /// Returns whether [`receive`](Self::receive) may have left messages unread.
@@ -121,7 +121,7 @@ impl Viewer {
     /// Returns when the viewer next needs service even without input, such as for a timeout.
     pub(crate) fn wake_at(&self) -> Option<Instant> {
         let times_out = self.pending.map(|since| since + SEND_TIMEOUT);
-        let reports = (self.skipped != self.reported).then_some(self.report_at);
+        let reports = (self.replaced != self.reported).then_some(self.report_at);
         let reads = self.has_unread.then(Instant::now);
         times_out.into_iter().chain(reports).chain(reads).min()
     }
@@ -208,11 +208,11 @@ impl Viewer {
             } else if let Some(channel) = self.unknown_channel.take() {
                 length += WRITE_SIZE;
                 self.send(Message::text(foxglove::unknown_channel(channel)), now)?;
-            } else if self.skipped != self.reported && now >= self.report_at {
-                self.reported = self.skipped;
+            } else if self.replaced != self.reported && now >= self.report_at {
+                self.reported = self.replaced;
                 self.report_at = now + REPORT_INTERVAL;
                 length += WRITE_SIZE;
-                self.send(Message::text(foxglove::warning("skipped", &self.skipped.text())), now)?;
+                self.send(Message::text(foxglove::warning("skipped", &self.replaced.text())), now)?;
             } else if let Some((id, queued)) = self.choose(channels) {
                 let frame = foxglove::message(id, queued.wall_ns, &queued.payload);
                 length += frame.len();
@@ -232,9 +232,9 @@ impl Viewer {
             let subscription = &mut self.subscriptions[at];
             let Some(queued) = channels.next(subscription.channel, subscription.number) else { continue };
             if !queued.is_kept {
-                let skipped = queued.number - subscription.number - 1;
-                let ReplacedMessages { by_viewer, by_server } = &mut self.skipped;
-                *(if self.was_full { by_viewer } else { by_server }) += skipped;
+                let replaced = queued.number - subscription.number - 1;
+                let ReplacedMessages { by_viewer, by_server } = &mut self.replaced;
+                *(if self.was_full { by_viewer } else { by_server }) += replaced;
             }
             subscription.number = queued.number;
             self.next = at + 1;
@@ -337,7 +337,7 @@ mod tests {
                 Err(other) => assert!(!other.contains("skipped"), "{other}"),
             }
         };
-        assert_eq!((newest, viewer.skipped()), (40, 39));
+        assert_eq!((newest, viewer.replaced_count()), (40, 39));
         assert!(report.contains("39 messages skipped: the server was too late"), "{report}");
         // The viewer does not read, so the buffers of the sockets fill.
         let (mut last, now) = (40, now + REPORT_INTERVAL);
@@ -360,9 +360,9 @@ mod tests {
             }
         }
         let received = numbers.len() as u64;
-        assert!(numbers.is_sorted() && received + viewer.skipped() == u64::from(last), "{numbers:?}");
-        let skipped = format!("{} messages skipped: this viewer", viewer.skipped() - 39);
-        assert!(viewer.skipped() > 39 && report.contains(&skipped), "{report}");
+        assert!(numbers.is_sorted() && received + viewer.replaced_count() == u64::from(last), "{numbers:?}");
+        let expected = format!("{} messages skipped: this viewer", viewer.replaced_count() - 39);
+        assert!(viewer.replaced_count() > 39 && report.contains(&expected), "{report}");
         // A viewer that never reads is disconnected.
         while !viewer.is_pending() {
             last += 1;

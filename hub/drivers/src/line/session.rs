@@ -63,7 +63,7 @@ pub trait ScannerSession: Protocol {
     fn problem(&self) -> Option<Self::Problem>;
 
     /// Returns the name of the transmissions that the session misses, such as `LMS replies`, while its
-    /// [`trouble`](Self::problem) is that none of them arrive. Other bytes may arrive meanwhile.
+    /// [`problem`](Self::problem) is that none of them arrive. Other bytes may arrive meanwhile.
     fn missing_transmission(&self) -> Option<&'static str>;
 
     /// Returns the rate at which the session receives and sends, in bits per second.

@@ -191,7 +191,7 @@ const LOCK_LEN: u64 = 16;
 const MAX_NAMED: usize = 4;
 
 /// Checks whether files of other users exist; `name_of` returns the name of their owner.
-pub(crate) fn strangers(found: &[Segment], name_of: impl Fn(u32) -> String) -> Finding {
+pub(crate) fn foreign_files(found: &[Segment], name_of: impl Fn(u32) -> String) -> Finding {
     const NAME: &str = "foreign-files";
     if found.is_empty() {
         return Finding::ok(NAME, "no file of another user under the domain's names");
@@ -325,11 +325,11 @@ mod tests {
     #[test]
     fn reports_files_of_other_users() {
         let name_of = |user| format!("u{user}");
-        says(&strangers(&[], name_of), State::Ok, &["no file of another user"]);
+        says(&foreign_files(&[], name_of), State::Ok, &["no file of another user"]);
         let file = |name: &str| Segment::new(name, 7, 0o666, 16);
         let words = ["/dev/shm/sh_a_x", "user 7 (u7), mode 0666", "sudo rm /dev/shm/sh_a_x"];
-        says(&strangers(&[file("/dev/shm/sh_a_x")], name_of), State::Warning, &words);
+        says(&foreign_files(&[file("/dev/shm/sh_a_x")], name_of), State::Warning, &words);
         let many = [file("/a"), file("/b"), file("/c"), file("/d"), file("/e"), file("/f")];
-        says(&strangers(&many, name_of), State::Warning, &["/d of", "and 2 more", "sudo rm /a /b /c /d"]);
+        says(&foreign_files(&many, name_of), State::Warning, &["/d of", "and 2 more", "sudo rm /a /b /c /d"]);
     }
 }

@@ -131,8 +131,8 @@ impl<T: SensorTopics> RemoteSensor<T> {
         if !self.topics.fits(topic, remote.payload) {
             return Outcome::NoRoom;
         }
-        let LocalNumber { left_out, header } = stream.assign_number(remote, self.pid);
-        self.topics.skip(topic, left_out);
+        let LocalNumber { skip_count, header } = stream.assign_number(remote, self.pid);
+        self.topics.skip(topic, skip_count);
         if topic != Topic::Status {
             self.topics.send(topic, &header, remote.payload);
         } else if let Some(status) = remote.payload.unpack::<Status>() {
@@ -226,7 +226,7 @@ struct Stream {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct LocalNumber {
     /// Numbers of the topic that are skipped before it, because their samples are missing.
-    left_out: u64,
+    skip_count: u64,
     /// Header with the period of sending, without the number in the topic.
     header: Header,
 }
@@ -240,14 +240,14 @@ impl Stream {
         let head = &remote.head;
         let next = (head.epoch, head.sensor, head.sequence);
         let steps = self.last.and_then(|last| steps(last, next));
-        let left_out = match (steps, self.last) {
+        let skip_count = match (steps, self.last) {
             (Some(steps), _) => steps.wrapping_sub(1),
             (None, Some((epoch, ..))) if head.epoch == epoch => 0,
             (None, _) => head.sequence,
         };
         self.last = Some(next);
         let period_us = self.period_estimator.period_us(remote.arrival_ns, steps.unwrap_or_default().into());
-        LocalNumber { left_out: left_out.into(), header: Header { period_us, ..remote.header(pid) } }
+        LocalNumber { skip_count: skip_count.into(), header: Header { period_us, ..remote.header(pid) } }
     }
 }
 
