@@ -86,14 +86,14 @@ fn lossy_sensor_is_amber_with_its_loss_rate() {
     let card = "document.querySelector('#sensors article.streaming.lossy')";
     page.await_true(&format!(
         "/^[1-9][0-9.]* % of its simulated line is damaged or lost: simulated faults/\
-         .test({card}?.querySelector('.trouble').innerText)"
+         .test({card}?.querySelector('.problem').innerText)"
     ));
     let amber = color(&mut page, "slow");
     // On a busy machine, a card can change its state at any time. Its dot shows the state, too.
     page.await_true(&format!(
         "(card => {{\n\
             const color = (selector, pseudo) => getComputedStyle(card.querySelector(selector), pseudo);\n\
-            return card !== null && color('.trouble').color === {amber} && color('.amber dd').color === {amber}\n\
+            return card !== null && color('.problem').color === {amber} && color('.amber dd').color === {amber}\n\
                 && color('h2 i', '::before').backgroundColor === {amber};\n\
         }})({card})"
     ));

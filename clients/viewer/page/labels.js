@@ -138,11 +138,11 @@ function showPlayer() {
 /** Writes why the picture is empty, and what to do. */
 function showProblem() {
   const [first] = shownSensors();
-  let problem = robot.trouble ?? (robot.hub ? null : { what: "No hub", remedy: "scanhub run" });
+  let problem = robot.problem ?? (robot.hub ? null : { what: "No hub", remedy: "scanhub run" });
   if (!isOpen) problem = { what: "No connection to scanhub web", remedy: "It ended, or the network between is cut. This page tries again by itself." };
   else if (!isReceiving()) problem = { what: "No data from scanhub web", remedy: "Look at its terminal." };
-  else if (!problem && first?.status?.trouble && shownSensors().every(({ scan }) => !scan)) {
-    const { what, remedy } = first.status.trouble;
+  else if (!problem && first?.status?.problem && shownSensors().every(({ scan }) => !scan)) {
+    const { what, remedy } = first.status.problem;
     problem = { what: `${first.name}: ${what}`, remedy };
   }
   if (!problem && isSideView() && !sidePoints().length) {
@@ -161,7 +161,7 @@ const FIELDS = [
   ["rate", "hz", ({ hz }) => (hz === null ? "–" : `${hz.toFixed(1)} Hz`)],
   ["age p50 / p99", "age", ({ age_p50_ms: p50, age_p99_ms: p99 }) => (p50 === null ? "–" : `${millis(p50)} / ${millis(p99)} ms`)],
   ["damaged on the line", "loss", ({ loss }) => percent(loss)],
-  ["lost on the line; missed by this program", null, ({ lost_on_line: line, lost }) => `${line ?? "–"} / ${lost}`],
+  ["lost on the line; missed by this program", null, ({ lost_on_line: line, missed }) => `${line ?? "–"} / ${missed}`],
 ];
 // Long values have no decimals, so that two fit in a line.
 const millis = (ms) => ms.toFixed(ms < 100 ? 1 : 0);
@@ -178,7 +178,7 @@ function make(tag, parent, name = "") {
 function makeCard(sensor) {
   const card = make("article", $("sensors"));
   const title = make("h2", card);
-  sensor.card = { card, title: make("button", title), state: make("i", title), kind: make("div", card, "kind"), problem: make("p", card, "trouble"), fields: [] };
+  sensor.card = { card, title: make("button", title), state: make("i", title), kind: make("div", card, "kind"), problem: make("p", card, "problem"), fields: [] };
   const list = make("dl", card);
   for (const [label, series, text] of FIELDS) {
     const field = make("div", list);
@@ -207,7 +207,7 @@ function showSensors() {
     press(title, shownSpace === sensor.space);
     put(state, stateText + (status.frozen ? ", frozen" : ""));
     put(kind, [status.family, status.model, status.port].filter(Boolean).join(" · "));
-    const problemShown = isHere && status.trouble;
+    const problemShown = isHere && status.problem;
     put(problem, problemShown ? [problemShown.what, problemShown.remedy].filter(Boolean).join(": ") : isLossy && isHere ? lossText(status) : "");
     for (const { field, number, line, scale, series, text } of fields) {
       put(number, isHere ? text(status) : "–");

@@ -155,7 +155,7 @@ function takeStatus(status, topic) {
   sensor.name = status.name;
   sensor.history.push({ at: now, hz: status.hz ?? 0, loss, age: status.age_p99_ms ?? 0 });
   while (now - sensor.history[0].at > HISTORY_MS) sensor.history.shift();
-  if (status.trouble && !heldMessages) Object.assign(sensor, emptySensor());
+  if (status.problem && !heldMessages) Object.assign(sensor, emptySensor());
   isFitDue = true;
 }
 

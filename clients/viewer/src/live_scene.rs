@@ -132,7 +132,7 @@ impl LiveScene {
     pub(crate) fn take_notice(&mut self, names: &[Rc<TopicName>], notice: &Notice) {
         match (notice, names) {
             (Notice::Missed(missed), [name]) if name.topic == Topic::Scan => {
-                self.scene.sensor(&name.sensor).lost += *missed;
+                self.scene.sensor(&name.sensor).missed += *missed;
             }
             (Notice::NoHub(_) | Notice::HubGone, _) => {
                 self.joins.clear();

@@ -36,7 +36,7 @@ pub struct Sensor {
     /// Rate and age of the scans.
     pub meter: RateMeter,
     /// Number of scans that this program missed.
-    pub lost: u64,
+    pub missed: u64,
     /// Highest intensity of the last minutes, in the sensor's units.
     brightest: f64,
     /// Time from which on the last scan is too old to be shown, in ns of CLOCK_MONOTONIC.
@@ -107,8 +107,8 @@ impl Sensor {
     /// Deletes all data of a hub that has exited, except for the background, which is only drawn.
     pub(super) fn on_hub_exit(&mut self) {
         let background = self.background.take();
-        let Sensor { placement, lost, .. } = *self;
-        *self = Sensor { placement, background, lost, ..Sensor::new(&self.name) };
+        let Sensor { placement, missed, .. } = *self;
+        *self = Sensor { placement, background, missed, ..Sensor::new(&self.name) };
     }
 
     /// Returns the brightness of a point with this `intensity`, from 0 to 1. It is the square root of the intensity's

@@ -89,7 +89,7 @@ pub(crate) fn robot(scene: &Scene, domain: &str, problem: Option<&Problem>) -> V
         hub_words: String,
         map: bool,
         people: Option<String>,
-        trouble: Option<ProblemJson<'a>>,
+        problem: Option<ProblemJson<'a>>,
     }
     let (verdict, sensor, nearest_mm) = crate::scene::verdict(scene.robot().map(|(_, sensor)| sensor));
     json_bytes(&Robot {
@@ -103,7 +103,7 @@ pub(crate) fn robot(scene: &Scene, domain: &str, problem: Option<&Problem>) -> V
         hub_words: hub_text(scene, domain),
         map: scene.is_in_map(),
         people: rooms(scene.people()),
-        trouble: problem.map(ProblemJson::of),
+        problem: problem.map(ProblemJson::of),
     })
 }
 
@@ -130,7 +130,7 @@ pub(crate) fn status(sensor: &Sensor) -> Vec<u8> {
         remote: bool,
         pose: Option<PoseJson>,
         hz: Option<f64>,
-        lost: u64,
+        missed: u64,
         lost_on_line: Option<u64>,
         lost_share: Option<f64>,
         damaged: f64,
@@ -145,7 +145,7 @@ pub(crate) fn status(sensor: &Sensor) -> Vec<u8> {
         marks: Option<usize>,
         verdict: &'a str,
         nearest_m: Option<f64>,
-        trouble: Option<ProblemJson<'a>>,
+        problem: Option<ProblemJson<'a>>,
     }
     #[derive(Serialize)]
     struct PoseJson {
@@ -172,7 +172,7 @@ pub(crate) fn status(sensor: &Sensor) -> Vec<u8> {
         remote: is_remote(&sensor.name),
         pose: sensor.placement.pose().map(pose),
         hz: sensor.meter.hz(),
-        lost: sensor.lost,
+        missed: sensor.missed,
         lost_on_line: status.and_then(|status| status.lost_on_line()),
         lost_share: status.and_then(|status| status.lost_share()),
         damaged: status.map_or(0.0, |status| status.damaged_share()),
@@ -187,7 +187,7 @@ pub(crate) fn status(sensor: &Sensor) -> Vec<u8> {
         marks: sensor.marks.map(|marks| marks.marks().len()),
         verdict: sensor.zones.verdict().name(),
         nearest_m: sensor.zones.nearest().map(|(_, mm)| f64::from(mm) / 1000.0),
-        trouble: problem.as_ref().map(ProblemJson::of),
+        problem: problem.as_ref().map(ProblemJson::of),
     })
 }
 
@@ -310,7 +310,7 @@ mod tests {
         let decoded = object(status(scene.sensor("front")));
         assert_eq!((&decoded["state"], &decoded["hz"]), (&"no status".into(), &serde_json::Value::Null));
         assert_eq!(decoded["pose"], serde_json::Value::Null, "its pose is unknown");
-        assert_eq!(decoded["trouble"]["what"], "nothing was heard of it yet");
+        assert_eq!(decoded["problem"]["what"], "nothing was heard of it yet");
     }
 
     #[test]

@@ -146,7 +146,7 @@ fn line(number: usize, sensor: &Sensor, view: &View, width: u16) -> Line<'static
     } else {
         let mut fields = vec![format!(" {hz:>5} Hz")];
         fields.extend(loss.iter().map(|loss| format!("  {loss}")));
-        fields.extend([format!(" {age:>5} ms"), format!("  lost {}", sensor.lost)]);
+        fields.extend([format!(" {age:>5} ms"), format!("  lost {}", sensor.missed)]);
         if sensor.is_frozen() {
             fields.push("  frozen".to_owned());
         }
@@ -188,7 +188,7 @@ fn counters(shown: &[(usize, &Sensor)], area: Rect) -> Vec<Line<'static>> {
             of(sensor, &|status| Some(percent(status.damaged_share())))
         }),
         row("lost on the line, last 10 s", &|sensor| of(sensor, &|status| status.lost_share().map(percent))),
-        row("scans this program missed", &|sensor| sensor.lost.to_string()),
+        row("scans this program missed", &|sensor| sensor.missed.to_string()),
     ];
     lines.extend(shares.map(Line::raw));
     // The last line has the scale bar.

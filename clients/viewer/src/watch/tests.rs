@@ -108,7 +108,7 @@ pub(super) fn scene() -> Scene {
     let rear = scene.sensor("rear");
     fill_samples(rear, Pose { x_m: -0.3, yaw_rad: PI, ..Pose::default() });
     rear.zones = zones(Verdict::Slow, 691, [1, 0]);
-    rear.lost = 2;
+    rear.missed = 2;
     scene
 }
 
@@ -181,7 +181,7 @@ fn frozen_picture_has_the_current_verdict() {
     };
     now.sensor("front").zones = zones(Verdict::Stop, 412, [1, 1]);
     now.sensor("front").scan = None;
-    now.sensor("rear").lost = 7;
+    now.sensor("rear").missed = 7;
     let stop = rows(&now);
     assert!(stop[0].starts_with(" STOP  HELD  front, nearest 0.41 m"), "{stop:#?}");
     assert!(stop[18].contains("lost 7"), "{stop:#?}");
