@@ -48,6 +48,8 @@ enum scanhub_topic {
     SCANHUB_CLOUD = 14, /* 239.255.76.82 */
     SCANHUB_OBSTACLES = 15 /* 239.255.76.81 */
 };
+/* All numbers of topics are below this one. */
+#define SCANHUB_TOPICS 16
 
 /* A family of scanners with one protocol. */
 enum scanhub_family {

@@ -173,9 +173,10 @@ static inline enum scanhub_result scanhub_read_with(const struct scanhub_key *ke
     return scanhub_is_of(key, bytes, len) ? SCANHUB_OK : SCANHUB_BAD_MAC;
 }
 
-/* So many gateways, and topics of all their sensors, there is room for. */
+/* Maximum number of gateways. */
 #define SCANHUB_HUBS 16
-#define SCANHUB_STREAMS 128
+/* Maximum number of topics of all their sensors, with announcements: enough for 16 sensors that have all topics. */
+#define SCANHUB_STREAMS (16 * SCANHUB_TOPICS)
 
 /* A gateway, and the greatest epoch that came of it. */
 struct scanhub_run {
@@ -193,10 +194,11 @@ struct scanhub_stream {
 };
 
 /* State of a reader with the key. Start with all bytes 0. To refuse older runs of gateways after a restart of your program,
- * too, save `runs`, and start with them. 20 kB. */
+ * too, save `runs`, and start with them. 40 kB. */
 struct scanhub_guard {
     struct scanhub_run runs[SCANHUB_HUBS];
-    uint8_t run_count, stream_count;
+    uint8_t run_count;
+    uint16_t stream_count;
     struct scanhub_stream streams[SCANHUB_STREAMS];
 };
 
@@ -290,7 +292,7 @@ static inline enum scanhub_result scanhub_guard_take(struct scanhub_guard *guard
         for (i = kept = 0; i < guard->stream_count; i++)
             if (guard->streams[i].hub != hub)
                 guard->streams[kept++] = guard->streams[i];
-        guard->stream_count = (uint8_t)kept;
+        guard->stream_count = (uint16_t)kept;
     }
     stream = scanhub_guard_begin(guard, hub, datagram->sensor, SCANHUB_ANNOUNCE, datagram->sequence);
     if (!stream)
@@ -302,7 +304,7 @@ static inline enum scanhub_result scanhub_guard_take(struct scanhub_guard *guard
     result = scanhub_stream_take(stream, datagram->sequence, 1);
     for (i = 0; result == SCANHUB_OK && i < announce.count; i++) {
         struct scanhub_announced announced = scanhub_announced(&announce, i);
-        if (announced.topic != SCANHUB_ANNOUNCE && announced.topic <= SCANHUB_STATUS)
+        if (announced.topic != SCANHUB_ANNOUNCE && announced.topic < SCANHUB_TOPICS)
             scanhub_guard_begin(guard, hub, datagram->sensor, announced.topic, announced.next);
     }
     return result;

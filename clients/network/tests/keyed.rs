@@ -18,6 +18,9 @@ const SECOND_NS: u64 = 1_000_000_000;
 /// Time of the first announcement.
 const START_S: u64 = 1_700_000_100;
 
+/// Topics that the first announcements have.
+const ANNOUNCED: [Topic; 3] = [Topic::Telegram, Topic::Scan, Topic::Zones];
+
 /// Lines of the list that the test builds.
 struct VectorList(Vec<String>);
 
@@ -67,13 +70,23 @@ fn zones() -> Vec<u8> {
     buffer[..len].to_vec()
 }
 
-/// An announcement that is sent at `at_s`.
+/// An announcement of three topics that is sent at `at_s`.
 fn announcement(epoch: u32, sequence: u32, at_s: u64, next: [u32; 3]) -> Vec<u8> {
+    announcement_of(epoch, sequence, at_s, ANNOUNCED.into_iter().zip(next))
+}
+
+/// An announcement of topics and their next numbers that is sent at `at_s`.
+fn announcement_of(
+    epoch: u32,
+    sequence: u32,
+    at_s: u64,
+    topics: impl Iterator<Item = (Topic, u32)>,
+) -> Vec<u8> {
     let mut announce = Announce::new(0x99AA_BBCC_DDEE_FF00, "front", "LMS200;301063;V02.30");
-    for (topic, next) in [Topic::Telegram, Topic::Scan, Topic::Zones].into_iter().zip(next) {
+    for (topic, next) in topics {
         announce.add(Announced { topic: topic.number(), group: group(topic), port: PORT, next });
     }
-    let mut buffer = [0; 200];
+    let mut buffer = [0; 400];
     let len = announce.pack(&mut buffer).expect("there is room");
     let head =
         Head { topic: 0, epoch, stamp_ns: at_s * SECOND_NS, counter: 0, ..head(Topic::Zones, sequence) };
@@ -190,6 +203,19 @@ fn vector_list() -> String {
     right("before it began", 70, &next_zone(u32::MAX - 1), "stale");
     right("of the life before", 70, &zone(5001), "epoch");
     right("its announcement", 70, &announcement(epoch, 90, START_S + 70, [0; 3]), "epoch");
+    let all = announcement_of(epoch + 1, 2, START_S + 70, Topic::ALL.into_iter().zip(std::iter::repeat(5)));
+    right("all topics", 70, &all, "taken");
+    for topic in Topic::ALL.into_iter().filter(|topic| !ANNOUNCED.contains(topic)) {
+        let golden = golden_datagram(topic.name());
+        let golden = Datagram::read(&golden).expect("a datagram");
+        for (name, sequence, outcome) in
+            [("before", 4, "stale"), ("first", 5, "taken"), ("first again", 5, "duplicate")]
+        {
+            let head = Head { epoch: epoch + 1, sequence, ..golden.head };
+            let bytes = sealed_datagram(&key(), head, golden.payload);
+            right(&format!("{}, {name}", topic.name()), 70, &bytes, outcome);
+        }
+    }
     format!(
         "{{\"key\":\"{}\",\"steps\":[\n{}\n]}}\n",
         (0..32).map(|byte| format!("{byte:02x}")).collect::<String>(),
@@ -197,13 +223,18 @@ fn vector_list() -> String {
     )
 }
 
-/// The payload of the golden scan.
-fn scan() -> Vec<u8> {
+/// Returns the golden datagram `name`, which has no MAC.
+fn golden_datagram(name: &str) -> Vec<u8> {
     let list: Value =
         serde_json::from_str(include_str!("../../../tests/vectors/datagram.json")).expect("JSON");
     let vectors = list["vectors"].as_array().expect("a list");
-    let scan = vectors.iter().find(|vector| vector["name"] == "scan").expect("a scan");
-    unhex(scan["bytes"].as_str().expect("bytes")).split_off(HEADER_LEN)
+    let vector = vectors.iter().find(|vector| vector["name"] == name).expect("a vector of this name");
+    unhex(vector["bytes"].as_str().expect("bytes"))
+}
+
+/// The payload of the golden scan.
+fn scan() -> Vec<u8> {
+    golden_datagram("scan").split_off(HEADER_LEN)
 }
 
 #[test]

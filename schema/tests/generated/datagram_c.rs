@@ -31,6 +31,9 @@ pub(crate) fn values(description: &Description) -> String {
         text += &with_comment(&line, &format!("239.255.76.{}", topic.spec().group));
     }
     text += "};\n";
+    let end = Topic::ALL.iter().map(|topic| topic.number() + 1).max().unwrap_or_default();
+    text += &comment_above("", "All numbers of topics are below this one.");
+    writeln!(text, "#define SCANHUB_TOPICS {end}").expect("a String");
     for (set, name, prefix) in ENUM_NAMES {
         let set = &description.sets[set];
         write!(text, "\n{}enum scanhub_{name} {{\n", comment_above("", &set.doc)).expect("a String");
