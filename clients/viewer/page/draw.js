@@ -11,7 +11,7 @@ function readColors() {
     colors[name.slice(2)] = getComputedStyle(probe).color;
   }
   colors.unknown = colors.stop;
-  // The color of the paper says whether the page is dark.
+  // The color of the paper shows whether the page is dark.
   const [red] = colors.paper.match(/[\d.]+/g).map(Number);
   isDark = red < (colors.paper.includes("srgb") ? 0.5 : 128);
   probe.remove();
@@ -27,13 +27,13 @@ function readColors() {
 
 const STEPS = [0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50];
 
-/** Sets the color of what is drawn and written next, and the width of lines. */
+/** Sets the color and the width of the next lines, shapes and texts. */
 function ink(color, width) {
   pen.strokeStyle = pen.fillStyle = color;
   pen.lineWidth = width;
 }
 
-/** Sets the font of what is written next, which is centered at its position or above it. */
+/** Sets the font of the next texts, which are centered at their position or above it. */
 function font(size, baseline) {
   pen.font = `${size}px system-ui, sans-serif`;
   pen.textAlign = "center";

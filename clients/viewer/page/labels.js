@@ -1,4 +1,4 @@
-// Texts beside the picture.
+// Texts around the picture.
 
 /** Returns `value` with `digits` decimals, and zero without a sign. */
 const fixed = (value, digits) => value.toFixed(digits).replace(/^-(?=[0.]*$)/, "");

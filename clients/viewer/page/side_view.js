@@ -44,7 +44,7 @@ const sidePoints = () => allSweeps().filter(({ points }) => points).flatMap((one
 });
 
 const pointsCanvas = make("canvas");
-// What the canvas shows, and its number of points.
+// Content of the canvas, and its number of points.
 let pointsCanvasState = {};
 
 /** Draws all points, and returns their number. They are drawn once for a sweep and a view, on a canvas that each frame copies. */

@@ -127,7 +127,7 @@ function fit() {
   if (isOut || now.scale < 0.6 * scale || !view.isFitted) Object.assign(view, { goal, isFitted: true });
 }
 
-/** Moves the view towards its goal. Returns whether it moves. */
+/** Moves the view toward its goal. Returns whether it moves. */
 function moveToGoal() {
   if (!view.goal) return false;
   const share = isMotionReduced.matches ? 1 : 0.16;

@@ -140,14 +140,14 @@ fn hubs_and_gateways_are_killed() {
         let env = TestEnv::on(&second);
         let mut listener = env.start(&["listen", "--json", "--topic=scan"]).ready();
         // Scans of another life than those before.
-        let mut again = |description: &str, key: &str, before: &Value| {
+        let mut await_new = |description: &str, key: &str, before: &Value| {
             let line =
                 listener.await_line(description, |line| line["class"] == "scan" && line[key] != before[key]);
             listener.await_lines(20, "scans", is_class("scan"));
             line
         };
         let first = robot.gateway::<&str>(&[]);
-        let of_first = again("the gateway", "epoch", &Value::Null);
+        let of_first = await_new("the gateway", "epoch", &Value::Null);
         robot.take_hub().end(KILL);
         let verdict = |bytes: &Vec<u8>| {
             let (datagram, mut zones) = (decode_datagram(bytes), Zones::unknown());
@@ -158,10 +158,10 @@ fn hubs_and_gateways_are_killed() {
             relay.forwarded().iter().rev().find_map(verdict) == Some(Verdict::Unknown)
         });
         robot.start();
-        again("the next hub", "boot", &of_first);
+        await_new("the next hub", "boot", &of_first);
         drop(first.end(KILL));
         let second = robot.gateway::<&str>(&[]);
-        again("the next gateway", "epoch", &of_first);
+        await_new("the next gateway", "epoch", &of_first);
         let last = second.end(TERM);
         let outcome = listener.end(INT);
         let of_epoch = |is_first: bool| {

@@ -1,6 +1,6 @@
-//! Figures of rotating scanners behind the whole hub, in virtual time: each model in each mode for ten minutes, a
-//! hundred lines that lose bytes in bursts, a hundred hubs that stop for half a second again and again, and the time
-//! until a scanner streams from any state. The figures are in docs/measured.md:
+//! Figures of rotating scanners behind the whole hub, in virtual time. Each model runs in each mode for ten minutes. A
+//! hundred lines lose bytes in bursts, and a hundred hubs stop for half a second again and again. Scanners start from
+//! any state. The figures are in docs/measured.md:
 //! `cargo run --release -p scanhub-world --example revolutions`. Arguments after `--` select the tables whose names
 //! begin with them.
 
