@@ -58,7 +58,7 @@ fn only_configure_may_write_the_eeprom() {
 #[test]
 fn consent_is_given_by_persons() {
     assert_rule(sources::consent_is_given_by_persons, |tree| {
-        let planted = "//! Writes.\nlet consent = Consent::of_a_person(plan);\n";
+        let planted = "//! Writes.\nlet consent = Consent::confirmed_by_person(plan);\n";
         let ask = tree.text("hub/tools/src/configure.rs");
         let plan = tree.text("hub/lms-configure/src/plan.rs");
         vec![

@@ -133,10 +133,10 @@ pub(crate) fn only_configure_may_write_the_eeprom(tree: &SourceTree) -> Vec<Stri
 pub(crate) fn consent_is_given_by_persons(tree: &SourceTree) -> Vec<String> {
     const CONSENT_FILE: &str = "hub/tools/src/configure.rs";
     const CONSENT_USER: &str = "hub/lms-configure/src/";
-    let mut breaches = find(tree, &["of_a_person", "Consent("], |path| {
+    let mut breaches = find(tree, &["confirmed_by_person", "Consent("], |path| {
         !is_test(path) && path != CONSENT_FILE && !path.starts_with(CONSENT_USER)
     });
-    let asks = find(tree, &["of_a_person"], |path| path == CONSENT_FILE);
+    let asks = find(tree, &["confirmed_by_person"], |path| path == CONSENT_FILE);
     let makers = find(tree, &["Consent("], |path| path.starts_with(CONSENT_USER));
     if asks.len() != 1 {
         breaches.push(format!("{CONSENT_FILE} gives consent in {} places", asks.len()));
