@@ -1,6 +1,6 @@
-//! What all families share: the session as its driver sees it, what arrived and when, and why it is suspect. For
-//! scanners with a rotating head also packets, revolutions, and the grid that a revolution is put on. This module names
-//! no family.
+//! Code that all scanner families share: the interface between session and driver, arrival times of bytes, and the
+//! reasons why a telegram or packet is suspect. For rotating scanners it also frames packets, assembles their points
+//! into revolutions, and assigns a revolution's points to the beams of a grid.
 
 mod arrival_time;
 pub mod family;
@@ -24,18 +24,19 @@ pub use session::{
 };
 pub use stream::{ReadScheduler, StreamCounters, Watchdog};
 
-/// Reasons why a telegram or packet is suspect: bits of `reasons`. A family sets those that it can detect.
+/// Bits of `reasons`, which give the reasons why a telegram or packet is suspect. Each family sets the bits that it can
+/// detect.
 pub mod suspect {
     use super::Reasons;
 
-    /// The error counters of the line have increased.
+    /// The kernel's error counters of the line have increased.
     pub const LINE_ERROR: u8 = Reasons::LINE_ERROR;
-    /// The bytes before it belonged to nothing: its neighbor was damaged.
+    /// The bytes before it were not part of a telegram or packet, so its neighbor was damaged.
     pub const NEIGHBOUR: u8 = Reasons::NEIGHBOUR;
-    /// It took longer than usual.
+    /// Its bytes took longer than usual to arrive.
     pub const SLOW: u8 = Reasons::SLOW;
-    /// Bits are set that no scanner sets.
+    /// It has bits set that no scanner sets.
     pub const FORBIDDEN_BITS: u8 = Reasons::FORBIDDEN_BITS;
-    /// Another acceptable header began inside it.
+    /// It contains another valid header.
     pub const HEADER_INSIDE: u8 = Reasons::HEADER_INSIDE;
 }

@@ -1,8 +1,9 @@
-//! Latest and earliest possible arrival of a byte. A port only reports when a read returned and how many bytes it had.
+//! Bounds for the arrival time of a byte. A port reports only when a read returned, and how many bytes the read had.
 
 use scanhub_schema::{Nanos, line_time};
 
-/// The last reads, newest last, by the number of the byte after their last one.
+/// Log of the last [`ReadLog::CAPACITY`] reads. Each entry has the offset of the byte after the read, and the time of
+/// the read.
 #[derive(Clone, Debug, Default)]
 pub struct ReadLog {
     reads: [(u64, Nanos); ReadLog::CAPACITY],
@@ -10,23 +11,24 @@ pub struct ReadLog {
     total: u64,
 }
 
-/// Timing of a stream: on average, bytes are `byte_ns` nanoseconds apart. Those of a packet of `packet_len` may arrive
-/// at once, or at the speed of a line with `pace` bits per second.
+/// Timing of a stream. Bytes are `byte_ns` nanoseconds apart on average. The bytes of one packet may arrive all
+/// together, or at the bit rate of a line.
 #[derive(Clone, Copy, Debug)]
 pub struct StreamTiming {
-    /// Mean nanoseconds from one byte to the next.
+    /// Mean time from one byte to the next, in nanoseconds.
     pub byte_ns: f64,
-    /// Length of a packet in bytes.
+    /// Length of a packet, in bytes.
     pub packet_len: usize,
-    /// Bits per second, if bytes arrive at the pace of a line.
+    /// Bit rate of the line, in bits per second; `None` if the bytes of a packet may arrive all together.
     pub line_rate: Option<u32>,
 }
 
 impl ReadLog {
-    /// A packet in pieces of 16 bytes, and another one that begins inside it.
+    /// Number of stored reads. They cover a packet that arrives in pieces of 16 bytes, and the next packet, which may
+    /// begin inside it.
     const CAPACITY: usize = 8;
 
-    /// Handles a read of `len` bytes at `now`.
+    /// Adds a read of `len` bytes that returned at `now`. Ignores an empty read.
     pub fn note_read(&mut self, now: Nanos, len: usize) {
         if len > 0 {
             self.total += len as u64;
@@ -35,13 +37,13 @@ impl ReadLog {
         }
     }
 
-    /// Returns the number of bytes read.
+    /// Returns the number of bytes read so far.
     pub fn total(&self) -> u64 {
         self.total
     }
 
-    /// Returns the latest possible arrival of byte number `offset`. Bytes after it took their time on a line of `pace`
-    /// bits per second, if it was one, but none of them had arrived at the previous read.
+    /// Returns the latest time at which the byte at `offset` can have arrived. The bytes after it in the same read took
+    /// their time on a line of `line_rate` bits per second. None of them had arrived at the previous read.
     pub fn latest(&self, offset: u64, line_rate: Option<u32>) -> Nanos {
         let oldest = self.next.saturating_sub(ReadLog::CAPACITY);
         let mut latest = Nanos::MAX;
@@ -57,10 +59,11 @@ impl ReadLog {
         latest
     }
 
-    /// Returns the earliest possible arrival of byte number `offset` of a stream. `None` if it is not known, because
-    /// more bytes arrived at once than were sent since the previous read, so it was in a backlog.
+    /// Returns the earliest time at which the byte at `offset` can have arrived. Returns `None` if the byte was in a
+    /// backlog: its read had more bytes than the scanner can have sent since the previous read.
     pub fn earliest(&self, offset: u64, timing: StreamTiming) -> Option<Nanos> {
-        // The last piece of a backlog in a full tty is shorter, and some more bytes may arrive a moment later.
+        // The last read of a backlog in a full tty is shorter than the others, and the tty may return some more bytes a
+        // moment later.
         let is_backlog_end = |n: usize| {
             n > self.oldest() + 2
                 && self.read(n - 2).0 - self.read(n - 3).0 >= MAX_TTY_READ as u64
@@ -70,13 +73,14 @@ impl ReadLog {
         self.earliest_in_read(n, offset, timing)
     }
 
-    /// Returns the [`earliest`](Self::earliest) possible arrival of a byte after missing ones, which is not the rest of
-    /// a backlog. In a backlog of a full tty, it is known if almost no bytes follow: the byte arrived when there was
-    /// space again, or shortly before.
+    /// Returns the [`earliest`](Self::earliest) arrival of the byte at `offset`, which follows missing bytes and does
+    /// not belong to the end of a backlog. If a full tty had a backlog and almost no bytes follow the byte, the time is
+    /// known: the byte arrived when the tty had space again, or shortly before.
     pub fn earliest_after_gap(&self, offset: u64, timing: StreamTiming) -> Option<Nanos> {
         let n = self.read_containing(offset)?;
         self.earliest_in_read(n, offset, timing).or_else(|| {
-            // The first of the consecutive reads that had more bytes than were sent since the one before.
+            // The first of the consecutive reads that each had more bytes than the scanner can have sent since the
+            // previous read.
             let first = (self.oldest() + 1..=n).rev().take_while(|&n| self.has_backlog(n, timing)).last()?;
             let ((begin, since), (end, now)) = (self.read(first - 1), self.read(n));
             let delay = end.saturating_sub(offset + ADAPTER_BUFFER_LEN) as f64 * timing.byte_ns;
@@ -85,41 +89,44 @@ impl ReadLog {
         })
     }
 
-    /// Returns the number of the oldest stored read.
+    /// Returns the index of the oldest stored read.
     fn oldest(&self) -> usize {
         self.next.saturating_sub(ReadLog::CAPACITY)
     }
 
-    /// Returns the number of the byte after the last one of read `n`, and the time of the read.
+    /// Returns the offset of the byte after read `n`, and the time of the read.
     fn read(&self, n: usize) -> (u64, Nanos) {
         self.reads[n % ReadLog::CAPACITY]
     }
 
-    /// Returns the read with byte number `offset`, or the newest one before.
+    /// Returns the index of the read that contains the byte at `offset`, or of the newest read if the byte has not been
+    /// read. Returns `None` if the log has no entry before that read.
     fn read_containing(&self, offset: u64) -> Option<usize> {
         (self.oldest() + 1..self.next).rev().find(|&n| self.read(n - 1).0 <= offset)
     }
 
-    /// Returns whether read `n` had more bytes than were sent since the one before.
+    /// Returns whether read `n` had more bytes than the scanner can have sent since the previous read.
     fn has_backlog(&self, n: usize, timing: StreamTiming) -> bool {
         let ((begin, before), (end, now)) = (self.read(n - 1), self.read(n));
         (end - begin) as f64 * timing.byte_ns > 1.25 * now.saturating_sub(before) as f64
     }
 
-    /// Returns the earliest possible arrival of byte number `offset` of read `n`, if the whole backlog was read before.
+    /// Returns the earliest time at which the byte at `offset`, which is in read `n`, can have arrived. Returns `None`
+    /// if read `n` may contain backlogged bytes.
     fn earliest_in_read(&self, n: usize, offset: u64, timing: StreamTiming) -> Option<Nanos> {
         let ((begin, before), (end, now)) = (self.read(n - 1), self.read(n));
         let is_backlog_end = n > self.oldest() + 1 && begin - self.read(n - 2).0 >= MAX_TTY_READ as u64;
         let sent = (end - begin).saturating_sub(timing.packet_len as u64) as f64 * timing.byte_ns;
-        // After a full read, a tty may return some more bytes a moment later, which prove nothing.
+        // After a full read, a tty may return some more bytes a moment later. Their time of arrival is unknown.
         if offset >= end || is_backlog_end || sent > 1.25 * now.saturating_sub(before) as f64 {
             return None;
         }
         let line_time = |bytes: u64| timing.line_rate.map_or(0, |baud| line_time(bytes as usize, baud));
         let packet = timing.packet_len as u64;
-        // The part of the packet in this read took its time on the line.
+        // The bytes of this packet that are in this read took their time on the line.
         let before = (before + line_time((offset + 1 - begin).min(packet))).min(now);
-        // Every adapter has space for this few bytes: if others had been dropped, these would have been, too.
+        // Every adapter can buffer this number of bytes. If the adapter had dropped bytes after this one, it would have
+        // dropped this one as well.
         let idle = (packet as f64 * timing.byte_ns) as Nanos;
         let delay =
             ((end - offset) as f64 * timing.byte_ns) as Nanos + idle.saturating_sub(line_time(packet));
@@ -128,9 +135,9 @@ impl ReadLog {
     }
 }
 
-/// Number of bytes that every adapter buffers for a late host.
+/// Number of bytes that every adapter buffers while the host does not read.
 const ADAPTER_BUFFER_LEN: u64 = 256;
-/// Maximum number of bytes that a tty returns at once.
+/// Maximum number of bytes that one read of a tty returns.
 pub(crate) const MAX_TTY_READ: usize = 4_095;
 
 #[cfg(test)]
@@ -157,7 +164,7 @@ mod tests {
         assert_eq!(arrivals.latest(300, Some(1_000_000)), 3_000_000 - 39 * byte);
     }
 
-    /// Returns the timing of bytes that arrive one by one, `byte_ns` apart.
+    /// Returns the timing of a stream whose bytes arrive one by one, `byte_ns` nanoseconds apart.
     fn evenly(byte_ns: f64) -> StreamTiming {
         StreamTiming { byte_ns, packet_len: 0, line_rate: None }
     }
@@ -193,11 +200,11 @@ mod tests {
         assert_eq!(arrivals.earliest(167, flow), None);
         assert_eq!(arrivals.earliest(167, packets), Some(at(1_500)), "at once, and nothing since");
         assert_eq!(arrivals.earliest(167, on_a_line), Some(at(1_500) + line_time(68, 400_000)));
-        // The rest after a full read was buffered, however short it is.
+        // The bytes after a full read were buffered, no matter how few they are.
         arrivals.note_read(at(2_500), 4_095);
         arrivals.note_read(at(2_501), 60);
         assert_eq!(arrivals.earliest(4_300, packets), None);
-        // That includes the rest after the last piece of a backlog, which is shorter.
+        // The same applies to the bytes after the last read of a backlog, which is shorter than a full read.
         arrivals.note_read(at(3_500), 4_095);
         arrivals.note_read(at(3_501), 4_056);
         arrivals.note_read(at(3_507), 70);

@@ -1,5 +1,6 @@
-//! Declarations of a family: the models and settings that a configuration can name, and how the search recognizes one of its
-//! scanners on a line. [`crate::search`] runs the steps of an [`Approach`], and passes the bytes to a [`Probe`].
+//! Description of a scanner family: its models and settings, and the steps by which the search recognizes one of its
+//! scanners on a line. [`crate::search`] runs the steps of an [`Approach`] and passes the received bytes to a
+//! [`Probe`].
 
 use core::fmt;
 
@@ -10,26 +11,27 @@ use crate::settings::Key;
 /// Models and settings of a family.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Features {
-    /// The models. Empty if the scanner reports its model.
+    /// The family's models. Empty if the scanner reports its model.
     pub models: &'static [Model],
-    /// Values for an unknown model: the first rate, and the number of beams for which there is space.
+    /// Values for a scanner whose model is unknown: the first baud rate to use, and the number of beams to reserve
+    /// space for.
     pub defaults: Model,
-    /// Names of the scan modes. Empty if there is no choice.
+    /// Names of the scan modes. Empty if the family has only one.
     pub modes: &'static [&'static str],
-    /// Keys of settings that only this family has.
+    /// Settings that only this family has.
     pub keys: &'static [Key],
-    /// Whether the motor can be stopped.
+    /// Whether the hub can stop the motor.
     pub can_stop_motor: bool,
     /// Whether the scanner streams as soon as it has power, without a request.
     pub streams_unrequested: bool,
-    /// Whether each telegram is a scan or a reply by itself. Otherwise the family sends packets, which are parts of a
-    /// scan.
+    /// Whether each telegram is a complete scan or a complete reply. Otherwise the scanner sends packets, and several
+    /// packets form a scan.
     pub has_whole_telegrams: bool,
-    /// Whether the scanner reports its settings on request, outside a session: to an [inquiry](crate::inquiry).
+    /// Whether the scanner reports its settings outside a session, in reply to an [inquiry](crate::inquiry).
     pub has_inquiry: bool,
     /// Arrays of a scan: bits of [`scanhub_schema::ArrayFlags`].
     pub array_flags: u8,
-    /// Maximum number of bytes of a telegram, or of packets that arrived together.
+    /// Maximum length in bytes of a telegram, or of packets that arrive together.
     pub max_telegram: usize,
 }
 
@@ -38,13 +40,13 @@ pub struct Features {
 pub struct Model {
     /// Name in the configuration and in messages.
     pub name: &'static str,
-    /// Rate of its line, in bits per second.
+    /// Baud rate of the scanner's line, in bits per second.
     pub baud: u32,
     /// Default number of beams of a scan.
     pub beams: usize,
 }
 
-/// Declares the models or the modes of a family, each with its name in configurations.
+/// Declares an enum of the models or scan modes of a family, each with its name in configurations.
 macro_rules! named {
     ($(#[doc = $doc:literal])+ $Enum:ident { $($(#[doc = $text:literal])+ $Name:ident $name:literal,)+ }) => {
         $(#[doc = $doc])+
@@ -54,10 +56,10 @@ macro_rules! named {
         }
 
         impl $Enum {
-            /// All of them.
+            /// Every variant, in the order of declaration.
             pub const ALL: [$Enum; [$($name),+].len()] = [$($Enum::$Name),+];
 
-            /// Returns its name in configurations and messages.
+            /// Returns the name in configurations and messages.
             pub const fn name(self) -> &'static str {
                 match self { $($Enum::$Name => $name,)+ }
             }
@@ -66,7 +68,7 @@ macro_rules! named {
 }
 pub(crate) use named;
 
-/// Maps a constant array with a constant function.
+/// Applies a constant function to every element of a constant array.
 macro_rules! table {
     ($from:expr, $map:path) => {{
         let mut to = [$map($from[0]); $from.len()];
@@ -80,12 +82,12 @@ macro_rules! table {
 }
 pub(crate) use table;
 
-/// Recognizer of a family.
+/// Recognizer of one family's scanners in the bytes of a line.
 pub trait Probe: fmt::Debug + Send {
-    /// Returns what the search may do to find this family.
+    /// Returns the rates, steps and requests by which the search may find this family.
     fn approach(&self) -> &'static Approach;
 
-    /// Discards all bytes, because the rate has changed. No reply is expected.
+    /// Discards all bytes after a change of the baud rate, and expects no reply.
     fn clear(&mut self);
 
     /// Sets whether a reply to the family's own request is expected.
@@ -93,58 +95,58 @@ pub trait Probe: fmt::Debug + Send {
         let _ = is_expected;
     }
 
-    /// Handles bytes of the line.
+    /// Handles bytes from the line.
     fn receive(&mut self, bytes: &[u8]);
 
-    /// Returns how long the line must be idle until [`release`](Self::release) may accept bytes that are ambiguous so far. `None`
-    /// if there are none.
+    /// Returns how long the line must be idle before [`release`](Self::release) may accept bytes that are still
+    /// ambiguous. Returns `None` if there are no such bytes.
     fn hold(&self) -> Option<Nanos> {
         None
     }
 
-    /// A read found nothing, and no byte has arrived for `idle`.
+    /// Handles a read that returned no bytes. No byte has arrived for `idle`.
     fn release(&mut self, idle: Nanos) {
         let _ = idle;
     }
 
-    /// Returns what the bytes since the last [`clear`](Self::clear) prove.
+    /// Returns what the bytes since the last [`clear`](Self::clear) prove about the scanner.
     fn evidence(&self) -> Evidence;
 }
 
-/// Evidence about the scanner that has sent some bytes.
+/// Evidence that received bytes give about the scanner.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Evidence {
-    /// Nothing.
+    /// The bytes prove nothing.
     None,
-    /// A transmission of the family may have been damaged. It is worth sending the request again.
+    /// The bytes may be a damaged transmission of the family. The search should send the request again.
     Damaged,
-    /// A transmission of the family may have begun. It is worth waiting for its end.
+    /// The bytes may be the start of a transmission of the family. The search should wait for its end.
     Partial,
-    /// The bytes look like a stream of the family. A reply is needed to prove it.
+    /// The bytes look like a stream of the family. Only a reply can prove it.
     Stream,
-    /// The scanner belongs to the family, and to this model if it has reported one.
+    /// The scanner belongs to the family. Contains the model if the scanner has reported it.
     Found(Option<&'static str>),
 }
 
-/// Rates and requests by which the search may find a family.
+/// Baud rates and requests with which the search may find a family.
 #[derive(Clone, Copy, Debug)]
 pub struct Approach {
-    /// The family.
+    /// The family that the search can find with these steps.
     pub family: Family,
-    /// Steps without a request, in this order.
+    /// Steps that only listen, in the order in which they run.
     pub listen_steps: &'static [ListenStep],
-    /// Steps with a request. `None` for a family that never gets a byte.
+    /// Steps that send requests. `None` for a family that never receives bytes.
     pub request_steps: Option<RequestSteps>,
-    /// Rate at which a scanner reports that it has started, in bits per second. The search pauses at this rate.
+    /// Baud rate at which a scanner sends its boot message, in bits per second. The search pauses at this rate.
     pub boot_rate: Option<u32>,
-    /// Maximum number of bytes of a transmission.
+    /// Maximum length of a transmission, in bytes.
     pub max_transmission: usize,
-    /// Properties of the scanner that the user should check if it is not found, as part of a message.
+    /// Part of a message: what the user should check at the scanner if the search does not find it.
     pub advice: &'static str,
 }
 
 impl Approach {
-    /// Returns the rates at which the search looks for the family, in bits per second, in increasing order.
+    /// Returns all baud rates at which the search tries to find the family, in bits per second, in increasing order.
     pub fn rates(&self) -> Vec<u32> {
         let request_rates = self.request_steps.map_or(&[][..], |asks| asks.rates);
         let mut rates: Vec<u32> = self.listen_steps.iter().map(|step| step.rate).collect();
@@ -155,49 +157,50 @@ impl Approach {
     }
 }
 
-/// Step that only listens.
+/// Step that listens at one baud rate.
 #[derive(Clone, Copy, Debug)]
 pub struct ListenStep {
-    /// Rate in bits per second.
+    /// Baud rate in bits per second.
     pub rate: u32,
-    /// Duration.
+    /// Duration of the step.
     pub duration: Nanos,
-    /// Whether the step is skipped in a round in which no byte has arrived.
+    /// Whether a round skips the step if no byte has arrived in it.
     pub needs_bytes: bool,
 }
 
-/// Steps that send a request at one rate after the other.
+/// Steps that send requests, at one baud rate after the other.
 #[derive(Clone, Copy, Debug)]
 pub struct RequestSteps {
-    /// Rates in bits per second, the likeliest first.
+    /// Baud rates in bits per second, the most likely one first.
     pub rates: &'static [u32],
-    /// Time between a change of the rate and the first byte.
+    /// Time from a change of the baud rate to the first byte of a request.
     pub settle_time: Nanos,
-    /// Request that stops a stream. It is sent first.
+    /// Request that stops a stream. The search sends it before any other request.
     pub stop: Option<StopRequest>,
-    /// Requests for a reply. Every round uses the next one.
+    /// Requests that the scanner replies to. Every round uses the next one.
     pub requests: &'static [&'static [u8]],
-    /// Minimum and maximum time between the end of a byte and the next one. `None` if the scanner accepts any time: then
-    /// a request is one write.
+    /// Minimum and maximum time between the end of one byte of a request and the start of the next. `None` if the
+    /// scanner accepts any gap, so that one write can send the whole request.
     pub gap: Option<(Nanos, Nanos)>,
-    /// Time for the reply to begin, from the last byte of the request.
+    /// Maximum time from the last byte of the request to the first byte of the reply.
     pub reply_timeout: Nanos,
-    /// Additional time for the reply in every second round, for slow scanners.
+    /// Extra time for the reply in every second round, for slow scanners.
     pub extra_reply_time: Nanos,
-    /// Additional time for a reply that has [begun](Evidence::Partial).
+    /// Extra time for a reply that has [begun](Evidence::Partial).
     pub extra_partial_time: Nanos,
-    /// Number of times that the request is sent in every second round. A request whose reply may have been
-    /// [damaged](Evidence::Damaged) is sent again in any round.
+    /// Number of times that every second round sends the request. In every round, the search sends a request again if
+    /// its reply may have been [damaged](Evidence::Damaged).
     pub repeats: u8,
 }
 
-/// Request that stops a stream, and the wait for the end of the stream.
+/// Request that stops a stream, and the time to wait for the end of the stream.
 #[derive(Clone, Copy, Debug)]
 pub struct StopRequest {
-    /// The request.
+    /// Bytes of the request.
     pub request: &'static [u8],
-    /// The stream has ended when no byte has arrived for this time.
+    /// Time without a byte after which the stream has ended.
     pub quiet_time: Nanos,
-    /// After this time, the search sends its request even if bytes still arrive.
+    /// Maximum time to wait for the end of the stream. After it, the search sends its request although bytes still
+    /// arrive.
     pub max_wait: Nanos,
 }

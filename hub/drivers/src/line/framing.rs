@@ -1,44 +1,44 @@
-//! Framing of packets with a fixed length, in a stream that may lack bytes: the check of a packet, and the buffer of a framer.
+//! Framing of packets that have a fixed length, in a stream that may lack bytes.
 //!
-//! An 8-bit checksum is right by chance in 1 of 256 cases, and a packet that lost bytes includes the beginning of the next one.
-//! A packet that contains another header is therefore accepted only if a header follows it, or if the bytes from the inner
-//! header on are not a packet.
+//! An 8-bit checksum is right by chance in 1 of 256 cases, and a packet that lost bytes contains the beginning of the
+//! next one. A packet that contains another header is therefore accepted only if a header follows it, or if the bytes
+//! from the inner header on are not a packet.
 
 use scanhub_schema::Nanos;
 
 /// Format of packets that have a fixed length and begin with a header of two bytes.
 pub trait Format {
-    /// Reason why bytes that begin like a packet are not one.
+    /// Reason why bytes that begin with a header are not a packet.
     type Reject;
 
     /// Returns the length of a packet, in bytes.
     fn packet_len(&self) -> usize;
 
-    /// Returns whether `bytes` may be the beginning of a header. No bytes may be.
+    /// Returns whether `bytes` begins with a header, or with the first part of one. Returns `true` if `bytes` is empty.
     fn begins(&self, bytes: &[u8]) -> bool;
 
     /// Checks the bytes of a packet.
     ///
     /// # Errors
     ///
-    /// Returns why they are not a packet.
+    /// Returns the reason why the bytes are not a packet.
     fn check(&self, packet: &[u8]) -> Result<(), Self::Reject>;
 }
 
-/// Result of checking for a packet.
+/// Result of a check for a packet.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FrameCheck<R> {
-    /// A packet.
+    /// The bytes are a packet.
     Packet,
-    /// No packet. Contains the reason if the bytes begin like one and the check failed.
+    /// The bytes are not a packet. Contains the reason if they begin with a header but the check of the packet failed.
     NoPacket(Option<R>),
-    /// More bytes are needed.
+    /// The packet is not complete yet.
     Incomplete,
-    /// A packet, unless another one begins inside it. More bytes are needed to decide.
+    /// The bytes are a packet, unless another packet begins inside it. The framer needs more bytes to decide.
     Held,
 }
 
-/// Checks whether a packet begins at the first byte of `open`. If `is_released`, incomplete packets inside it are ignored.
+/// Checks whether a packet begins at the first byte of `open`. If `is_released`, ignores incomplete packets inside it.
 fn check_frame<F: Format>(format: &F, open: &[u8], is_released: bool) -> FrameCheck<F::Reject> {
     let len = format.packet_len();
     if !format.begins(open) {
@@ -67,41 +67,41 @@ fn check_frame<F: Format>(format: &F, open: &[u8], is_released: bool) -> FrameCh
 pub struct ByteCounters {
     /// Bytes committed.
     pub read: u64,
-    /// Bytes of packets that were returned.
+    /// Bytes of returned packets.
     pub in_packets: u64,
-    /// Bytes that were in no packet.
+    /// Bytes that were not part of a packet.
     pub discarded: u64,
-    /// Packets that were returned.
+    /// Returned packets.
     pub packets: u64,
-    /// Discarded headers whose packet had a wrong checksum.
+    /// Headers that the framer discarded because the checksum of their packet was wrong.
     pub rejected_checksum: u64,
 }
 
-/// Buffer of a framer: up to `N` open bytes, which are neither in a packet nor discarded yet.
+/// Buffer of a framer, with room for `N` open bytes. An open byte is neither part of a returned packet nor discarded.
 #[derive(Clone, Debug)]
 pub struct Buffer<const N: usize> {
     bytes: [u8; N],
-    /// `bytes[start..end]` are open.
+    /// The open bytes are `bytes[start..end]`.
     start: usize,
     end: usize,
     /// Time without a byte after which no more bytes are in flight.
     hold: Nanos,
-    /// Whether a packet is held back, because another one may begin inside it.
+    /// Whether the framer holds a packet back because another one may begin inside it.
     is_held: bool,
-    /// Whether it does not have to be held back any longer.
+    /// Whether the line has been idle for long enough to stop holding packets back.
     is_released: bool,
     counters: ByteCounters,
 }
 
 impl<const N: usize> Buffer<N> {
-    /// Creates an empty buffer. A packet that is held back is released when the line was idle for `hold`.
+    /// Creates an empty buffer. It releases a packet that it holds back after the line was idle for `hold`.
     pub fn new(hold: Nanos) -> Self {
         let counters = ByteCounters::default();
         Buffer { bytes: [0; N], start: 0, end: 0, hold, is_held: false, is_released: false, counters }
     }
 
-    /// Returns the free space for the next bytes. Write to its beginning, then call [`Buffer::commit`]. Invalidates the results
-    /// of [`Buffer::take`].
+    /// Returns the free space for the next bytes. The caller writes to its beginning and then calls [`Buffer::commit`].
+    /// Positions from [`Buffer::take`] become invalid.
     pub fn read_buffer(&mut self) -> &mut [u8] {
         self.bytes.copy_within(self.start..self.end, 0);
         self.end -= self.start;
@@ -109,11 +109,11 @@ impl<const N: usize> Buffer<N> {
         &mut self.bytes[self.end..]
     }
 
-    /// Adds the first `len` bytes of [`Buffer::read_buffer`].
+    /// Adds the first `len` bytes of [`Buffer::read_buffer`] to the open bytes.
     ///
     /// # Panics
     ///
-    /// Panics if there was no space for them.
+    /// Panics if the free space is shorter than `len` bytes.
     pub fn commit(&mut self, len: usize) {
         self.end += len;
         assert!(self.end <= N, "more bytes committed than there was room");
@@ -121,25 +121,25 @@ impl<const N: usize> Buffer<N> {
         self.is_released &= len == 0;
     }
 
-    /// Checks whether a packet begins at the open byte number `at`.
+    /// Checks whether a packet begins at index `at` of the open bytes.
     pub fn check_frame<F: Format>(&mut self, format: &F, at: usize) -> FrameCheck<F::Reject> {
         let check = check_frame(format, &self.open_bytes()[at..], self.is_released);
         self.is_held |= matches!(check, FrameCheck::Held);
         check
     }
 
-    /// Begins to check the open bytes again.
+    /// Starts a new check of the open bytes.
     pub fn begin_check(&mut self) {
         self.is_held = false;
     }
 
-    /// Returns how long the line must be idle until [`Buffer::release`] releases a packet that is held back. `None` if there is
-    /// none.
+    /// Returns how long the line must be idle before [`Buffer::release`] releases a packet that is held back. Returns
+    /// `None` if no packet is held back.
     pub fn hold(&self) -> Option<Nanos> {
         self.is_held.then_some(self.hold)
     }
 
-    /// Handles a read that found nothing. No byte has arrived for `idle`.
+    /// Handles a read that returned no bytes. No byte has arrived for `idle`.
     pub fn release(&mut self, idle: Nanos) {
         self.is_released |= self.is_held && idle >= self.hold;
     }
@@ -149,12 +149,13 @@ impl<const N: usize> Buffer<N> {
         &self.bytes[self.start..self.end]
     }
 
-    /// Returns the number of the first open byte among all committed bytes, from 0.
+    /// Returns the offset of the first open byte, counted from the first committed byte.
     pub fn offset(&self) -> u64 {
         self.counters.read - (self.end - self.start) as u64
     }
 
-    /// Takes the first `len` open bytes, which are `packets` packets. Returns their position for [`Buffer::taken_bytes`].
+    /// Takes the first `len` open bytes, which contain `packets` packets. Returns their position for
+    /// [`Buffer::taken_bytes`].
     pub fn take(&mut self, len: usize, packets: usize) -> usize {
         let at = self.start;
         self.start += len;
@@ -163,25 +164,25 @@ impl<const N: usize> Buffer<N> {
         at
     }
 
-    /// Makes the last `len` bytes that were taken, which are `packets` packets, open again.
+    /// Makes the last `len` taken bytes, which contain `packets` packets, open again.
     pub fn unread(&mut self, len: usize, packets: usize) {
         self.start -= len;
         self.counters.packets -= packets as u64;
         self.counters.in_packets -= len as u64;
     }
 
-    /// Returns `len` bytes that [`Buffer::take`] took at position `at`.
+    /// Returns the `len` bytes at position `at`, which [`Buffer::take`] returned.
     pub fn taken_bytes(&self, at: usize, len: usize) -> &[u8] {
         &self.bytes[at..at + len]
     }
 
-    /// Discards the first `len` open bytes.
+    /// Discards the first `len` open bytes, and counts them.
     pub fn discard(&mut self, len: usize) {
         self.start += len;
         self.counters.discarded += len as u64;
     }
 
-    /// Discards all open bytes, for example because the rate of the line changes.
+    /// Discards all open bytes, for example because the baud rate changes.
     pub fn clear(&mut self) {
         self.discard(self.end - self.start);
         (self.is_held, self.is_released) = (false, false);
@@ -198,7 +199,7 @@ impl<const N: usize> Buffer<N> {
     }
 }
 
-/// Moves the first of `bytes` into `spare`. Returns their number.
+/// Moves bytes from the front of `bytes` into `buffer` until one of them is used up. Returns the number of bytes moved.
 pub(crate) fn fill(buffer: &mut [u8], bytes: &mut &[u8]) -> usize {
     let len = buffer.len().min(bytes.len());
     let (now, later) = bytes.split_at(len);

@@ -1,27 +1,27 @@
-//! Assembles points into revolutions.
+//! Assembly of points into revolutions.
 //!
-//! A revolution begins half a step of the grid before the scanner's zero, so that the beam ahead is measured in one
-//! piece. A point belongs to the revolution of its angle, and may arrive after points with larger angles. So a
-//! revolution is complete only when the head is past its end by more than a point can be late, and until then there are
-//! two. Times are those of the scanner's clock.
+//! A revolution begins half a grid step before the scanner's zero, so that all points of the beam ahead belong to the
+//! same revolution. A point belongs to the revolution that contains its angle, and may arrive after points with larger
+//! angles. A revolution is therefore complete only when the head is past its end by more than a point can be late.
+//! Until then, two revolutions are open. Times are in the scanner's clock.
 
 use crate::line::{NO_RETURN, Point};
 use scanhub_schema::Nanos;
 
-/// The revolution that is being measured, and the next one, with at most `N` points each.
+/// The two open revolutions: the one that is being measured, and the next one. Each has room for `N` points.
 #[derive(Clone, Debug)]
 pub struct RevolutionAssembler<const N: usize> {
     points: [[Point; N]; 2],
-    /// Index of the buffer with the points of the first one.
+    /// Index of the buffer that holds the points of the first open revolution.
     at: usize,
     open: [OpenRevolution; 2],
-    /// Number of the first one since the sequence began, once it is known.
+    /// Index of the first open revolution since the sequence of angles began. `None` before the first point.
     number: Option<i64>,
-    /// Number of the first one among all revolutions. The second one has the next number.
+    /// Serial number of the first open revolution among all revolutions. The second one has the next number.
     serial: u64,
-    /// The last revolution with missing points.
+    /// Index of the last revolution that has missing points.
     last_incomplete: i64,
-    /// Degrees from the edge of a revolution to the zero.
+    /// Angle from the edge of a revolution to the scanner's zero, in degrees.
     edge: f64,
     counts: RevolutionCounts,
 }
@@ -29,7 +29,7 @@ pub struct RevolutionAssembler<const N: usize> {
 #[derive(Clone, Copy, Debug, Default)]
 struct OpenRevolution {
     len: usize,
-    /// Times at its edge and of its last point, in nanoseconds.
+    /// Time at the edge in nanoseconds; `last` is the time of the last point.
     first: Option<f64>,
     last: f64,
     incomplete: bool,
@@ -39,46 +39,46 @@ struct OpenRevolution {
 /// A complete revolution, in time of the scanner's clock. Its points stay valid until the next point is added.
 #[derive(Clone, Copy, Debug)]
 pub struct ClosedRevolution {
-    /// Number that no other revolution has, not even one that was given up.
+    /// Serial number. No other revolution has it, not even a discarded one.
     pub number: u64,
     points: usize,
     len: usize,
-    /// Time at its edge, where it begins.
+    /// Time at the edge where the revolution begins.
     pub first: Nanos,
-    /// Time of its last point.
+    /// Time of the last point.
     pub last: Nanos,
-    /// Duration.
+    /// Duration from edge to edge, in nanoseconds.
     pub period: Nanos,
     /// Whether points are missing.
     pub incomplete: bool,
-    /// Reasons for suspicion: bits of [`crate::line::suspect`]; 0 is clean.
+    /// Reasons why the revolution is suspect: bits of [`crate::line::suspect`]; 0 means clean.
     pub reasons: u8,
 }
 
-/// Numbers of revolutions by kind. They only increase.
+/// Counts of revolutions by kind. They only increase.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct RevolutionCounts {
-    /// Returned revolutions, including incomplete ones.
+    /// Revolutions that were returned, including incomplete ones.
     pub returned: u64,
-    /// Returned revolutions that are incomplete.
+    /// Returned revolutions that lack points.
     pub incomplete: u64,
-    /// Revolutions that were not returned, because less than half of the points arrived.
+    /// Revolutions that were not returned: less than half of their points arrived, or the assembler discarded them.
     pub short: u64,
-    /// Revolutions without a packet.
+    /// Revolutions for which no point arrived.
     pub missed: u64,
 }
 
-/// Speed of the head, from point to point.
+/// Speed of the head, per point.
 #[derive(Clone, Copy, Debug)]
 pub struct RotationRate {
-    /// Degrees from one point to the next.
+    /// Angle from one point to the next, in degrees.
     pub step: f64,
-    /// Nanoseconds from one point to the next.
+    /// Time from one point to the next, in nanoseconds.
     pub point_ns: f64,
 }
 
 impl RotationRate {
-    /// Returns the number of points of a revolution.
+    /// Returns the number of points in a revolution.
     fn points_per_revolution(&self) -> f64 {
         360.0 / self.step.max(1e-3)
     }
@@ -90,7 +90,7 @@ impl RotationRate {
 }
 
 impl<const N: usize> RevolutionAssembler<N> {
-    /// Creates it before any point.
+    /// Creates an assembler without open revolutions.
     #[expect(clippy::new_without_default, reason = "the start of a stream is not a default value")]
     pub fn new() -> Self {
         const NONE: Point = Point { angle: 0.0, range: NO_RETURN, intensity: 0 };
@@ -106,29 +106,29 @@ impl<const N: usize> RevolutionAssembler<N> {
         }
     }
 
-    /// Begins revolutions for a grid of `beams` beams, and gives up the open ones.
+    /// Starts to assemble revolutions for a grid of `beams` beams, and discards the open ones.
     pub fn begin(&mut self, beams: usize) {
         self.edge = 180.0 / beams as f64;
         self.discard();
     }
 
-    /// Returns the numbers of revolutions by kind.
+    /// Returns the counts of revolutions.
     pub fn counts(&self) -> RevolutionCounts {
         self.counts
     }
 
-    /// Returns the first of the open revolutions, as if it ended here.
+    /// Returns the first open revolution with the points so far. Returns `None` if it has no point.
     pub fn partial_revolution(&self, rate: RotationRate) -> Option<ClosedRevolution> {
         let open = &self.open[0];
         Some(self.close(open, open.first?, rate.revolution_ns()))
     }
 
-    /// Returns the points of the revolution that was completed last, or that is being measured.
+    /// Returns the points of `revolution`, which is the last complete one or the one that is being measured.
     pub fn points(&self, revolution: &ClosedRevolution) -> &[Point] {
         &self.points[revolution.points][..revolution.len]
     }
 
-    /// Gives up the open revolutions. The next point begins a new sequence of angles.
+    /// Discards the open revolutions. The next point starts a new sequence of angles.
     pub fn discard(&mut self) {
         self.counts.short += u64::from(self.open[0].len > 0);
         self.open = [OpenRevolution::default(); 2];
@@ -136,7 +136,8 @@ impl<const N: usize> RevolutionAssembler<N> {
         (self.number, self.last_incomplete) = (None, i64::MIN);
     }
 
-    /// Adds a point at `angle`, in degrees clockwise over all revolutions, measured at `time`.
+    /// Adds a point. `angle` is in degrees, clockwise, and increases over all revolutions. `time` is in nanoseconds,
+    /// and `range` in millimeters. `reasons` are bits of [`crate::line::suspect`].
     pub fn add_point(
         &mut self,
         angle: f64,
@@ -147,10 +148,11 @@ impl<const N: usize> RevolutionAssembler<N> {
         rate: RotationRate,
     ) {
         let revolution = self.revolution_at(angle);
-        // Only the next revolution is measured from its edge on.
+        // The first point is somewhere in its revolution, so the next revolution is the first whose points are all
+        // measured.
         let number = *self.number.get_or_insert(revolution + 1);
         let Some(which) = usize::try_from(revolution - number).ok().filter(|which| *which < 2) else {
-            // The caller has not called `close_before` for it before its points.
+            // The caller added the points of this revolution before it called `close_before`.
             self.last_incomplete = self.last_incomplete.max(revolution);
             return;
         };
@@ -165,7 +167,7 @@ impl<const N: usize> RevolutionAssembler<N> {
         open.len += 1;
         open.last = open.last.max(time);
         open.reasons |= reasons;
-        // If the first points are missing, the time at the edge is extrapolated.
+        // Extrapolate the time at the edge, because the first points may be missing.
         let edge = self.edge;
         open.first.get_or_insert_with(|| {
             let points = if rate.step > 0.0 { (within + edge) / rate.step } else { 0.0 };
@@ -173,7 +175,7 @@ impl<const N: usize> RevolutionAssembler<N> {
         });
     }
 
-    /// Records that points are missing between two angles.
+    /// Records that points are missing between the angles `from` and `to`, in degrees.
     pub fn mark_gap(&mut self, from: f64, to: f64) {
         let Some(number) = self.number else { return };
         let (from, to) = (self.revolution_at(from), self.revolution_at(to));
@@ -183,13 +185,13 @@ impl<const N: usize> RevolutionAssembler<N> {
         self.last_incomplete = self.last_incomplete.max(to);
     }
 
-    /// Records that points may be missing somewhere in the revolution that is being measured.
+    /// Records that the revolution that is being measured may lack points.
     pub fn mark_incomplete(&mut self) {
         self.open[0].incomplete |= self.number.is_some();
     }
 
-    /// Handles that all points before `angle` were added. Returns a revolution that is complete now. Then call it
-    /// again, until it returns `None`.
+    /// Closes a revolution that ends before `angle`, in degrees, because all points before this angle have been added.
+    /// The caller repeats the call until it returns `None`.
     pub fn close_before(&mut self, angle: f64, rate: RotationRate) -> Option<ClosedRevolution> {
         let revolution = self.revolution_at(angle);
         while let Some(number) = self.number.filter(|number| revolution > *number) {
@@ -201,7 +203,7 @@ impl<const N: usize> RevolutionAssembler<N> {
                 self.open = [self.new_revolution(revolution), self.new_revolution(revolution + 1)];
                 return None;
             }
-            // The duration is that from edge to edge, because a head may change its speed.
+            // Measure the duration from edge to edge, because the speed of the head may change.
             let usual = rate.revolution_ns();
             let duration = open.first.zip(self.open[1].first).map(|(first, next)| next - first);
             let duration = duration.filter(|took| (0.5 * usual..2.0 * usual).contains(took));
@@ -226,7 +228,7 @@ impl<const N: usize> RevolutionAssembler<N> {
         None
     }
 
-    /// Returns the first of the open revolutions, which began at `first` and takes `period` nanoseconds.
+    /// Returns the first open revolution as a complete one that began at `first` and takes `period` nanoseconds.
     fn close(&self, open: &OpenRevolution, first: f64, period: f64) -> ClosedRevolution {
         ClosedRevolution {
             number: self.serial,
@@ -246,7 +248,7 @@ impl<const N: usize> RevolutionAssembler<N> {
 
     fn revolution_at(&self, angle: f64) -> i64 {
         let revolutions = (angle + self.edge) / 360.0;
-        // Round down, even below zero.
+        // A conversion rounds toward zero. Round down instead, so that angles below zero belong to revolution -1.
         let whole = revolutions as i64;
         if (whole as f64) > revolutions { whole - 1 } else { whole }
     }
@@ -260,7 +262,7 @@ mod tests {
     fn revolution_lasts_from_edge_to_edge() {
         let mut turns = RevolutionAssembler::<400>::new();
         turns.begin(360);
-        // Points of one degree each. The head is faster after the first revolutions.
+        // Points that are 1 degree apart. The head rotates faster after the second revolution.
         for n in 0..735 {
             let angle = f64::from(n);
             let time = 1e6 * angle.min(722.0) + 0.9e6 * (angle - 722.0).max(0.0);
@@ -280,7 +282,7 @@ mod tests {
             (from..to).map(f64::from).for_each(|at| turns.add_point(at, 1e6 * at, 1_000, 0, 0, pace));
         };
         put(&mut turns, 0, 600);
-        // A gap over an edge, and points on both sides of the next one.
+        // A gap that contains an edge, and points on both sides of the next edge.
         turns.mark_gap(601.0, 1_074.0);
         put(&mut turns, 1_075, 1_086);
         let (mut closed_turns, mut count) = ([(0, false); 2], 0);

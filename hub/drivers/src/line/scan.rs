@@ -1,6 +1,6 @@
-//! A scan in the buffer of a session, complete or still arriving, and the grid of beams that the points of a revolution are
-//! assigned to. A scan writes itself into a payload: here raw values become ranges, directly in the shared memory that
-//! subscribers read.
+//! A scan in the buffer of a session, complete or still arriving, and the grid of beams to which the points of a
+//! revolution are assigned. [`RawScan::write`] converts the received values to ranges, directly in the shared memory
+//! that subscribers read.
 
 use core::f32::consts::TAU;
 
@@ -8,49 +8,50 @@ use scanhub_schema::{Code, Family, Nanos, Scan, ScanArrays, ScanHead};
 
 use crate::line::ClosedRevolution;
 
-/// A scan as it was received.
+/// Scan as the session received it.
 #[derive(Clone, Copy, Debug)]
 pub struct RawScan<'a> {
-    /// Number among the scans of the session. Scans that are not returned have numbers, too.
+    /// Serial number among the scans of the session. Scans that are not returned also have a number.
     pub number: u64,
-    /// Time at which beam 0 was, or would have been, measured, or at which the first byte arrived.
+    /// Time at which beam 0 was measured, even if it has no point. For fixed angles, the time at which the first byte
+    /// arrived.
     pub first: Nanos,
-    /// Time at which the last point was measured, or at which the last byte arrived.
+    /// Time at which the last point was measured. For fixed angles, the time at which the last byte arrived.
     pub last: Nanos,
-    /// Time from one scan to the next; 0 if it is not known.
+    /// Time from one scan to the next in nanoseconds; 0 if it is unknown.
     pub period: Nanos,
-    /// Reasons for suspicion: bits of [`crate::line::suspect`]; 0 is clean.
+    /// Reasons why the scan is suspect: bits of [`crate::line::suspect`]; 0 means clean.
     pub reasons: u8,
-    /// Bytes of a partial telegram that have arrived; 0 for packets.
+    /// Number of bytes of an incomplete telegram that have arrived; 0 for packets.
     pub bytes: usize,
-    /// Angles, unit and arrays.
+    /// Angles, unit and arrays of the scan.
     pub head: ScanHead,
-    /// The values.
+    /// The received values.
     pub values: Values<'a>,
 }
 
-/// Values of a scan as they were received.
+/// Values of a scan, in the format of the scanner.
 #[derive(Clone, Copy, Debug)]
 pub enum Values<'a> {
-    /// Little-endian words of the first beams, which have fixed angles.
+    /// Little-endian words of the first beams of a scan, whose beams have fixed angles.
     Words {
-        /// Two bytes for each beam.
+        /// The words, two bytes for each beam.
         bytes: &'a [u8],
-        /// Low bits of a word that are the range. The others are the upper bits of the scan.
+        /// Number of low bits of a word that contain the range. The other bits become the `upper` array of the scan.
         range_bits: u8,
     },
-    /// Points of a revolution in the order of arrival, to be assigned to a grid of beams.
+    /// Points of a revolution in the order of arrival, for a grid of beams.
     Points {
         /// The points.
         points: &'a [Point],
-        /// Points that the scanner measures per second; 0 if unknown.
+        /// Number of points that the scanner measures per second; 0 if it is unknown.
         per_second: f32,
     },
 }
 
 impl<'a> RawScan<'a> {
-    /// Returns the scan of the revolution `closed` with its `points`, on a grid of `beams`. `stamps` are those of beam
-    /// 0 and of the last point. `per_second` is the number of points per second; 0 if unknown.
+    /// Creates the scan of `revolution`, which has the given points, on a grid of `beams` beams. `first` and `last` are
+    /// the stamps of beam 0 and of the last point. `per_second` is the number of points per second; 0 if it is unknown.
     pub fn revolution(
         family: Family,
         revolution: &ClosedRevolution,
@@ -69,26 +70,26 @@ impl<'a> RawScan<'a> {
         self.head.count.into()
     }
 
-    /// Returns the points of a revolution; none of a scan with fixed angles.
+    /// Returns the points of a revolution. Returns an empty slice for a scan with fixed angles.
     pub fn points(&self) -> &'a [Point] {
         if let Values::Points { points, .. } = self.values { points } else { &[] }
     }
 
-    /// Returns whether packets of the revolution are missing.
+    /// Returns whether points of the revolution are missing.
     pub fn is_incomplete(&self) -> bool {
         self.head.flags & Scan::INCOMPLETE != 0
     }
 
-    /// Returns the length of its payload in bytes.
+    /// Returns the length of the scan as a payload, in bytes.
     pub fn payload_len(&self) -> usize {
         Scan::len(self.beams(), self.head.contents)
     }
 
-    /// Writes it into `scan`, every byte that it uses. Beams whose values have not arrived are not measured.
+    /// Writes every used byte of `scan`. Beams whose values have not arrived become [`NOT_MEASURED`].
     ///
     /// # Panics
     ///
-    /// Panics if `scan` has less memory than [`payload_len`](Self::payload_len) bytes.
+    /// Panics if `scan` is shorter than [`payload_len`](Self::payload_len) bytes.
     pub fn write(&self, scan: &mut Scan) {
         let ScanArrays { angles, ranges, upper, .. } = scan.begin(self.head);
         match self.values {
@@ -111,8 +112,8 @@ impl<'a> RawScan<'a> {
     }
 }
 
-/// Returns the head of the scan of a revolution that takes `period`, on a grid of `beams`. `points_per_second` is 0 if
-/// it is not known.
+/// Returns the head of the scan of a revolution that takes `period` nanoseconds, on a grid of `beams` beams.
+/// `points_per_second` is 0 if it is unknown.
 pub fn revolution_head(
     family: Family,
     beams: usize,
@@ -121,7 +122,7 @@ pub fn revolution_head(
     is_incomplete: bool,
 ) -> ScanHead {
     let head = ScanHead::of_revolution(family, beams);
-    // The scanner's own points in a revolution.
+    // Number of points that the scanner measures in a revolution.
     let measured_points = f64::from(points_per_second) * period as f64 / 1e9;
     let spacing = if measured_points >= 1.0 { core::f64::consts::TAU / measured_points } else { -head.step };
     ScanHead {
@@ -135,24 +136,25 @@ pub fn revolution_head(
 /// One measurement of a rotating scanner.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Point {
-    /// Radians, 0 ahead, counter-clockwise positive as seen from above: a head that rotates clockwise goes from 0 to -2 pi.
+    /// Angle in radians, 0 ahead, counterclockwise positive as seen from above. For a head that rotates clockwise,
+    /// angles go from 0 to -2 pi.
     pub angle: f32,
-    /// Millimeters, or [`NO_RETURN`].
+    /// Range in millimeters, or [`NO_RETURN`].
     pub range: u16,
-    /// Strength of the echo, in the scanner's own counts.
+    /// Strength of the echo, in units of the scanner.
     pub intensity: u8,
 }
 
-/// Range of a beam without an echo: farther than any range.
+/// Range of a beam without an echo. It is greater than every measured range.
 pub const NO_RETURN: u16 = Code::NoReturn.value();
 /// Range of a beam without a point in this revolution.
 pub const NOT_MEASURED: u16 = Scan::NOT_MEASURED;
-/// Numbers of beams that a revolution may have.
+/// Number of beams that a grid may have.
 pub const BEAM_RANGE: core::ops::RangeInclusive<usize> = 2..=scanhub_schema::MAX_BEAMS;
 
-/// Equal bins all around for a head that rotates clockwise. Beam 0 is ahead, and beam `i` at `-i` times the step, so beams
-/// are in the order of measuring. The bin of beam 0 begins half a step before the scanner's zero: 0 and 360 degrees are
-/// one beam.
+/// Grid of equal bins over 360 degrees, for a head that rotates clockwise. Beam 0 points ahead, and the angle of beam
+/// `i` is `i` times the [`step`](Grid::step), which is negative. Beams are therefore in the order of measurement. The
+/// bin of beam 0 begins half a step before the scanner's zero, so 0 and 360 degrees belong to the same beam.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Grid {
     beams: usize,
@@ -171,14 +173,15 @@ impl Grid {
         self.beams
     }
 
-    /// Returns the radians from one beam to the next, which are negative.
+    /// Returns the angle from one beam to the next, in radians. It is negative.
     pub fn step(&self) -> f64 {
         -core::f64::consts::TAU / self.beams as f64
     }
 
-    /// Assigns `points`, in any order, to beams by their angles. Each slice has an element for every beam, and all of them are
-    /// written. Among the points of one bin, the nearest one that has a range is kept, with its exact angle. Without a point,
-    /// the angle is not a number. Returns the number of points that were dropped because their beam was taken.
+    /// Assigns `points`, in any order, to beams by their angles, and returns the number of points whose bin already had
+    /// a point. Each slice has at least one element per beam, and the method writes all of them. A bin keeps the
+    /// nearest of its points, with its exact angle. A point without an echo is the farthest. The angle of a bin
+    /// without a point is NaN.
     pub fn fill(
         &self,
         points: &[Point],
@@ -195,9 +198,9 @@ impl Grid {
         let bins_per_radian = -(beams as f32) / TAU;
         let mut collisions = 0;
         for point in points {
-            // Up to one more revolution on either side is accepted. The result is rounded to the nearest beam.
+            // Accept angles of up to one more revolution on either side. The sum is rounded to the nearest beam.
             let bin_position = point.angle * bins_per_radian + (beams as f32 + 0.5);
-            // An angle that is not a number has no beam. 32 bits, because a conversion to 64 takes three times as long.
+            // NaN has no beam. The conversion is to 32 bits, because a conversion to 64 bits takes three times as long.
             let measured = if bin_position >= 0.0 { bin_position as u32 as usize } else { usize::MAX };
             let mut bin = measured;
             let mut angle = point.angle - TAU;
@@ -209,11 +212,11 @@ impl Grid {
             let Some(range) = ranges.get_mut(bin) else { continue };
             let is_taken = *range != NOT_MEASURED;
             collisions += u32::from(is_taken);
-            // A point without an echo is farther than any range.
+            // A point without an echo has the greatest range, so any other point replaces it.
             if point.range < *range {
                 *range = point.range;
                 intensities[bin] = point.intensity;
-                // The angle is within the same revolution as that of its beam.
+                // Keep the angle in the same revolution as its beam.
                 angles[bin] = if (beams..2 * beams).contains(&measured) { point.angle } else { angle };
             }
         }

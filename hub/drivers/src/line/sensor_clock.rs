@@ -4,24 +4,26 @@
 
 use scanhub_schema::{MILLIS, Nanos};
 
-/// The minimum delays of the last seconds.
+/// Clock of a scanner, with the minimum delays of the last seconds.
 #[derive(Clone, Debug)]
 pub struct SensorClock {
-    /// Minimum delay of each span, oldest first from `next` on.
+    /// Minimum delay of each span. The oldest span follows index `next`, which is the newest.
     min_delays: [Option<Delay>; SensorClock::SPAN_COUNT],
     next: usize,
-    /// Beginning of the newest span, and duration of a span, which grows: first the drift is known soon, later exactly.
+    /// Start of the newest span in the scanner's clock, and duration of a span. Spans start short, so that the drift is
+    /// known soon. They then become longer, so that it is known exactly.
     span_began: Nanos,
     span: Nanos,
     /// Minimum delay of all spans.
     min_delay: Option<Delay>,
-    /// Nanoseconds by which the hub's clock gets ahead in each nanosecond of the scanner's.
+    /// Time in nanoseconds by which the hub's clock gets ahead of the scanner's clock in every nanosecond.
     drift: f64,
-    /// Times from the first value on may be off by the second one against earlier ones, until the spans decide it.
+    /// Time from which stamps may be wrong against earlier ones, and the maximum error. `None` once the spans have
+    /// settled it.
     uncertainty: Option<(Nanos, Nanos)>,
 }
 
-/// Offset from a time of the scanner's clock to the hub's clock.
+/// Offset from the scanner's clock to the hub's clock, observed at `sensor_time`.
 #[derive(Clone, Copy, Debug)]
 struct Delay {
     sensor_time: Nanos,
@@ -29,7 +31,7 @@ struct Delay {
 }
 
 impl Delay {
-    /// Returns the offset at another time `at`, for clocks with this drift.
+    /// Returns the offset at the time `at` of the scanner's clock, if the clocks drift by `drift`.
     fn offset_at(self, at: Nanos, drift: f64) -> i64 {
         self.offset + (drift * (at as i64 - self.sensor_time as i64) as f64) as i64
     }
@@ -38,7 +40,7 @@ impl Delay {
 impl SensorClock {
     const SPAN_COUNT: usize = 16;
 
-    /// Creates a clock before its first time.
+    /// Creates a clock that has not received a time.
     #[expect(clippy::new_without_default, reason = "the start of a stream is not a default value")]
     pub fn new() -> Self {
         SensorClock {
@@ -52,8 +54,9 @@ impl SensorClock {
         }
     }
 
-    /// Records that times from `at` of the scanner's clock on may be off by `most` against earlier ones, because the
-    /// time between them was counted, not measured. Earlier delays count until those of a later span are known as well.
+    /// Records that times from `at` of the scanner's clock on may be wrong by up to `max_error` against earlier ones,
+    /// because the time between them was counted and not measured. Earlier delays stay valid until a later span has
+    /// confirmed them.
     pub fn add_uncertainty(&mut self, at: Nanos, max_error: Nanos) {
         if self.min_delay.is_some() {
             self.uncertainty = Some((at, max_error));
@@ -61,7 +64,8 @@ impl SensorClock {
         }
     }
 
-    /// Records that an event at `at` of the scanner's clock had arrived at `latest` of the hub's clock.
+    /// Records an event that happened at `at` of the scanner's clock, and that had arrived at `latest` of the hub's
+    /// clock.
     pub fn note_arrival(&mut self, at: Nanos, latest: Nanos) {
         let delay = Delay { sensor_time: at, offset: latest as i64 - at as i64 };
         if self.min_delay.is_none() || at.saturating_sub(self.span_began) >= self.span {
@@ -85,7 +89,7 @@ impl SensorClock {
         }
     }
 
-    /// Converts `at` of the scanner's clock to the hub's clock. `None` before the first event.
+    /// Converts the time `at` from the scanner's clock to the hub's clock. Returns `None` before the first event.
     pub fn time(&self, at: Nanos) -> Option<Nanos> {
         let min_delay = self.min_delay?;
         Some(at.saturating_add_signed(min_delay.offset_at(at, self.drift)))
@@ -97,8 +101,8 @@ impl SensorClock {
         self.span_began = at;
     }
 
-    /// Ends a span at `at`. If it agrees with the spans before the [uncertain](Self::doubt) time, those are not needed
-    /// any more.
+    /// Ends a span at `at`. Drops the spans before an [uncertain](Self::add_uncertainty) time once the spans after it
+    /// agree with them within the maximum error, or if there are none.
     fn resolve_uncertainty(&mut self, at: Nanos) {
         let Some((from, max_error)) = self.uncertainty else { return };
         let offset_of = |known: Delay| known.offset_at(at, self.drift);
@@ -116,7 +120,7 @@ impl SensorClock {
         }
     }
 
-    /// Joins pairs of spans, so that spans become twice as long.
+    /// Joins pairs of spans, which doubles the duration of a span.
     fn join_pairs(&mut self) {
         let mut joined = [None; Self::SPAN_COUNT];
         for (n, delay) in self.delays().enumerate() {
@@ -135,7 +139,8 @@ impl SensorClock {
         older.iter().chain(newer).copied().flatten()
     }
 
-    /// Estimates the drift: the median over pairs of an older and a newer span, of those in which the host ran.
+    /// Estimates the drift as the median slope over pairs of an older and a newer span. Ignores spans in which the host
+    /// was stopped.
     fn estimate_drift(&mut self) {
         if self.uncertainty.is_some() {
             return;
@@ -164,23 +169,23 @@ impl SensorClock {
     }
 }
 
-/// Maximum duration of a span, and that of the first ones.
+/// Maximum duration of a span; below it, the duration of the first spans.
 const MAX_SPAN: Nanos = 500 * MILLIS;
 const FIRST_SPAN: Nanos = MAX_SPAN / 8;
 /// Minimum number of spans for an estimate of the drift.
 const MIN_SPANS: usize = 6;
-/// Maximum drift. No oscillator is off by more, not even one without a crystal.
+/// Maximum drift, as a ratio. Every oscillator is more precise than this, including those without a crystal.
 const MAX_DRIFT: f64 = 0.02;
-/// Maximum delay of a host that runs, in nanoseconds.
+/// Maximum delay of a packet while the host runs, in nanoseconds.
 const MAX_JITTER_NS: f64 = 4e6;
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// Returns the maximum error in microseconds from `from` seconds on. The scanner's clock is slow by `drift`, and it
-    /// sends a packet every 2 ms with a delay of at least 100 us. The host stops for `stall` seconds every `every`
-    /// seconds.
+    /// Returns the maximum error in microseconds after the first `from` seconds. The scanner's clock is slow by
+    /// `drift`, and the scanner sends a packet every 2 ms with a delay of at least 100 us. The host stops for `stall`
+    /// seconds in every `every` seconds.
     fn worst_us(drift: f64, stall: f64, every: f64, from: f64) -> f64 {
         let mut clock = SensorClock::new();
         let mut random = fastrand::Rng::with_seed(7);
@@ -214,8 +219,8 @@ mod tests {
         let (mut counted, mut wrong) = (0, 0);
         for n in 0..40_000u64 {
             let hub = 1_000_000_000_000 + n * MILLIS;
-            // In half a second of every two, nothing arrives in time. Then packets are missing, and the count of them
-            // is one too low.
+            // In one half second of every two seconds, all packets arrive late. After it, packets are missing, and
+            // their count is one too low.
             let phase = n % 2_000;
             if n > 4_000 && phase == 1_250 {
                 counted += MILLIS;

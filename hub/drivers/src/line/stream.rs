@@ -1,5 +1,5 @@
-//! A stream of packets: when to read and what is suspect, the deadlines after which the stream is silent or its head is
-//! blocked, and the counters of its session.
+//! Read schedule, deadlines and counters of a stream of packets. The deadlines detect a silent stream and a blocked
+//! head.
 
 use scanhub_schema::{MILLIS, Nanos};
 
@@ -8,23 +8,24 @@ use crate::line::framing::ByteCounters;
 use crate::line::session::{SessionStats, State};
 use crate::line::{Action, ReadLog};
 
-/// The reads of one session.
+/// Schedule of a session's reads, with the stamps and suspicions of its packets.
 #[derive(Clone, Debug)]
 pub struct ReadScheduler {
     read_log: ReadLog,
     last_byte: Nanos,
-    /// Size of the buffer of the next read.
+    /// Size of the buffer of the next read, in bytes.
     buffer_len: usize,
-    /// Time of the next read.
+    /// Time of the next read. If it has passed, the session reads as soon as the port has bytes.
     next_read_at: Nanos,
     last_packet: Nanos,
     last_revolution: Nanos,
-    /// Number of the byte from which on the next packet is suspect, and the reasons.
+    /// Offset of the byte after which the next packet to end is suspect, and the reasons: bits of
+    /// [`crate::line::suspect`].
     suspect: (u64, u8),
 }
 
 impl ReadScheduler {
-    /// Creates the reads of a session that begins at `now`.
+    /// Creates the schedule of a session that starts at `now`.
     pub fn new(now: Nanos) -> ReadScheduler {
         ReadScheduler {
             read_log: ReadLog::default(),
@@ -37,13 +38,13 @@ impl ReadScheduler {
         }
     }
 
-    /// Sets the size of the buffer of the next read.
+    /// Sets the size of the buffer of the next read, in bytes.
     pub fn set_buffer_len(&mut self, buffer_len: usize) {
         self.buffer_len = buffer_len;
     }
 
-    /// Handles a read of `len` bytes at `now`. While a scanner streams, some packets are read at once. A backlog is
-    /// read without pauses: while a tty is full, it drops bytes that arrive.
+    /// Handles a read of `len` bytes at `now`. While a scanner streams, the next read waits, so that it returns several
+    /// packets. A backlog is read without a wait, because a full tty drops bytes that arrive.
     pub fn note_read(&mut self, now: Nanos, len: usize, is_streaming: bool) {
         self.read_log.note_read(now, len);
         let is_drained = (1..self.buffer_len.min(MAX_TTY_READ)).contains(&len);
@@ -51,17 +52,17 @@ impl ReadScheduler {
         self.last_byte = if len > 0 { now } else { self.last_byte };
     }
 
-    /// Cancels the wait for the next read.
+    /// Cancels the wait before the next read.
     pub fn cancel_wait(&mut self) {
         self.next_read_at = 0;
     }
 
-    /// Returns the arrival times of bytes.
+    /// Returns the log of reads.
     pub fn read_log(&self) -> &ReadLog {
         &self.read_log
     }
 
-    /// Returns when the last byte arrived, or the session began.
+    /// Returns the time at which the last byte arrived, or the start of the session.
     pub fn last_byte(&self) -> Nanos {
         self.last_byte
     }
@@ -74,14 +75,15 @@ impl ReadScheduler {
         }
     }
 
-    /// Returns the marked reasons for packets that end before byte number `end`. The mark may belong to later ones,
-    /// because the framer may hold packets back.
+    /// Returns and clears the marked reasons for packets that end before the byte at `end`. If these packets were read
+    /// before the mark was set, the reasons stay for later packets, because the framer may have held packets back.
     pub fn take_suspect(&mut self, end: u64) -> u8 {
         if end > self.suspect.0 { core::mem::take(&mut self.suspect.1) } else { 0 }
     }
 
-    /// Returns what to wait for at `now`: the end of a rest, or bytes until the deadline `until`. If the framer holds a
-    /// packet back until the line was idle for `hold`, the deadline is the end of that time, if it comes first.
+    /// Returns the wait at `now`. Until the time of the next read, the session sleeps. After it, the session waits for
+    /// bytes until the deadline `until`. If the framer holds a packet back until the line was idle for `hold`, the
+    /// deadline is the end of that time at the latest.
     pub fn wait_action<'a>(&self, now: Nanos, until: Nanos, hold: Option<Nanos>) -> Action<'a> {
         if self.next_read_at > now {
             return Action::SleepUntil(self.next_read_at);
@@ -90,68 +92,71 @@ impl ReadScheduler {
         Action::Wait { until: until.min(held_until) }
     }
 
-    /// Returns the stamp of the end of a packet: `last`, but not before that of the previous packet.
+    /// Returns the stamp of a packet that ends at `last`. A stamp is never earlier than that of the previous packet.
     pub fn stamp_packet(&mut self, last: Nanos) -> Nanos {
         self.last_packet = last.max(self.last_packet);
         self.last_packet
     }
 
-    /// Returns the stamps of a revolution: `first` and `last`, but not before the beginning of the previous revolution.
+    /// Returns the stamps of a revolution. `first` is at least the start of the previous revolution, and `last` is at
+    /// least `first`.
     pub fn revolution_stamps(&self, first: Nanos, last: Nanos) -> (Nanos, Nanos) {
         let first = first.max(self.last_revolution);
         (first, last.max(first))
     }
 
-    /// Stores the beginning of a complete revolution.
+    /// Stores the start of a complete revolution.
     pub fn end_revolution(&mut self, first: Nanos) {
         self.last_revolution = first;
     }
 }
 
-/// Interval between reads of a stream: for some packets at once, and a tenth of the bytes that a tty keeps.
+/// Interval between the reads of a stream. One read returns several packets, and at most a tenth of the bytes that a
+/// tty can buffer.
 const READ_INTERVAL: Nanos = 5 * MILLIS;
 
-/// Deadlines of a stream, from its first packet on.
+/// Deadlines of a stream, which start with its first packet.
 #[derive(Clone, Copy, Debug)]
 pub struct Watchdog {
     silent_at: Nanos,
-    /// Time from which the wait for a revolution counts: the end of the last one, or the beginning of the stream.
+    /// Time from which the deadline of the next revolution counts: the end of the last revolution, or the start of the
+    /// stream.
     revolution_at: Nanos,
     has_revolution: bool,
 }
 
 impl Watchdog {
-    /// After this time without a packet, a stream is silent.
+    /// Time without a packet after which a stream is silent.
     pub const SILENCE_TIMEOUT: Nanos = 1_000 * MILLIS;
-    /// After this time without a revolution, the head is blocked. The slowest head rotates twice per second.
+    /// Time without a revolution after which the head counts as blocked. The slowest head rotates twice per second.
     const REVOLUTION_TIMEOUT: Nanos = 2_000 * MILLIS;
 
-    /// Creates the deadlines of a stream that begins at `now`.
+    /// Creates the deadlines of a stream that starts at `now`.
     pub fn new(now: Nanos) -> Watchdog {
         Watchdog { silent_at: now + Watchdog::SILENCE_TIMEOUT, revolution_at: now, has_revolution: false }
     }
 
-    /// Handles packets that arrived at `now`.
+    /// Restarts the deadline for silence after packets that arrived at `now`.
     pub fn note_packets(&mut self, now: Nanos) {
         self.silent_at = now + Watchdog::SILENCE_TIMEOUT;
     }
 
-    /// Handles a revolution that was complete at `now`.
+    /// Restarts the deadline for a revolution after one that was complete at `now`.
     pub fn note_revolution(&mut self, now: Nanos) {
         (self.revolution_at, self.has_revolution) = (now, true);
     }
 
-    /// Starts to wait for a revolution at `now`, whatever was before.
+    /// Restarts the deadline for a revolution at `now`, although there was no revolution.
     pub fn await_revolution(&mut self, now: Nanos) {
         self.revolution_at = now;
     }
 
-    /// Extends both deadlines for a head that may need until `until` to reach its speed, and measures only then.
+    /// Extends both deadlines for a head that may not reach its speed, and measure, before `until`.
     pub fn await_spin_up(&mut self, until: Nanos) {
         (self.revolution_at, self.silent_at) = (until, until);
     }
 
-    /// Returns when the stream is silent if no packet arrives.
+    /// Returns the time at which the stream is silent if no packet arrives.
     pub fn silent_at(&self) -> Nanos {
         self.silent_at
     }
@@ -166,20 +171,20 @@ impl Watchdog {
         now >= self.revolution_at + Watchdog::REVOLUTION_TIMEOUT
     }
 
-    /// Returns the state of a session whose stream this is.
+    /// Returns the state of the session: `Streaming` after the first revolution, `Starting` before it.
     pub fn state(&self) -> State {
         if self.has_revolution { State::Streaming } else { State::Starting }
     }
 }
 
-/// Counters of a session, in addition to those of its framer.
+/// Counters of a session that its framer does not have.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct StreamCounters {
     /// Discarded bytes of streams.
     damaged: u64,
-    /// All discarded bytes when `damaged` was updated.
+    /// Number of all discarded bytes at the last update of `damaged`.
     discarded: u64,
-    /// Discarded bytes of streams and bytes of packets, when the last revolution ended.
+    /// Number of damaged bytes and of bytes in packets, at the end of the last revolution.
     revolution_start: (u64, u64),
     resyncs: u64,
     restarts: u64,
@@ -187,30 +192,32 @@ pub struct StreamCounters {
 }
 
 impl StreamCounters {
-    /// Handles the beginning of a stream. Bytes that were discarded before it are not damage.
+    /// Handles the start of a stream. Bytes that were discarded before it do not count as damaged.
     pub fn begin_stream(&mut self, tally: &ByteCounters) {
         self.discarded = tally.discarded;
         self.await_revolution(tally);
     }
 
-    /// Handles packets of a stream that has begun before.
+    /// Handles packets of a stream that has started before. Counts the bytes that were discarded since the last call as
+    /// damaged.
     pub fn continue_stream(&mut self, tally: &ByteCounters) {
         self.damaged += tally.discarded - self.discarded;
         self.discarded = tally.discarded;
     }
 
-    /// Handles `packets` packets that can be assigned to revolutions. Bytes before the first ones are a cut packet.
+    /// Handles `packets` packets of a stream. If they are the first ones and bytes were discarded before them, the
+    /// first packet was truncated.
     pub fn note_packets(&mut self, tally: &ByteCounters, packets: usize) {
         self.first_frame_truncated |= tally.packets == packets as u64 && tally.discarded > 0;
     }
 
-    /// Starts to count for the next revolution.
+    /// Starts to count bytes for the next revolution.
     pub fn await_revolution(&mut self, tally: &ByteCounters) {
         self.revolution_start = (self.damaged, tally.in_packets);
     }
 
-    /// Returns whether most bytes since the last revolution were damaged, so that the next one may be missing because
-    /// of that.
+    /// Returns whether most bytes since the last revolution were damaged. The next revolution may then be missing
+    /// because of the damage.
     pub fn is_mostly_damaged(&self, tally: &ByteCounters) -> bool {
         let (damaged, in_packets) = self.revolution_start;
         self.damaged - damaged > tally.in_packets - in_packets
@@ -226,7 +233,8 @@ impl StreamCounters {
         self.restarts += 1;
     }
 
-    /// Returns all counters. `received_and_lost` are packets.
+    /// Returns all counters of the session. `received_and_lost` are numbers of packets, and `buffered` is a number of
+    /// bytes.
     pub fn stats(
         &self,
         tally: &ByteCounters,
