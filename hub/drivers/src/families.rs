@@ -1,4 +1,5 @@
-//! The list of the families: one [`Session`] for all of them. A caller that supports every family needs nothing else.
+//! List of all scanner families, and a [`Session`] for any of them. Code that supports every family needs only this
+//! module.
 
 use std::fmt;
 
@@ -12,21 +13,21 @@ use crate::settings::{Refusal, Settings, SettingsRequest};
 use crate::{ld, lms, rplidar, search};
 use scanhub_schema::{Counters, Family, Nanos, ScanHead, Status};
 
-/// Declares the families, each with its name and its module, in the order in which the search looks for them.
+/// Declares the families, each with its name, its module and its session, in the order in which the search tries them.
 macro_rules! families {
     ($($Family:ident $family:ident $Session:ident,)*) => {
-        /// A session with a scanner of one of the families.
+        /// Session with a scanner of one of the families.
         #[expect(clippy::large_enum_variant, reason = "there is one per open port")]
         #[derive(Clone, Debug)]
         pub enum Session {
             $(#[doc = concat!("Of family ", stringify!($family), ".")] $Family($family::$Session),)*
         }
 
-        /// Reason why a session does not stream as it should. Its text is the family's.
+        /// Reason why a session does not stream as it should. The family provides the text.
         #[derive(Clone, Copy, Debug, PartialEq)]
         pub enum Problem {
             $(#[doc = concat!("Of family ", stringify!($family), ".")] $Family($family::Problem),)*
-            /// The search has found no scanner.
+            /// The search has not found a scanner.
             Search(search::Problem),
         }
 
@@ -35,14 +36,14 @@ macro_rules! families {
             match family { $(Family::$Family => &$family::FEATURES,)* }
         }
 
-        /// Creates a recognizer for each family. The search listens, and sends its requests, in this order.
+        /// Creates a recognizer for each family. The search listens and sends requests in this order.
         pub(crate) fn probes() -> Vec<Box<dyn Probe>> {
             vec![$(Box::<$family::Probe>::default()),*]
         }
 
         impl Session {
-            /// Creates a session with a scanner of `family`, on a port that is open at the rate of `settings`, or else
-            /// of the model.
+            /// Creates a session with a scanner of `family`. The port is open at the baud rate of `settings`, or at the
+            /// default rate of the model or family.
             pub fn begin(family: Family, settings: &Settings, now: Nanos) -> Session {
                 match family { $(Family::$Family => Session::$Family($family::$Session::new((*settings).into(), now)),)* }
             }
@@ -53,7 +54,7 @@ macro_rules! families {
             }
         }
 
-        /// Returns the trouble of a session of any family.
+        /// Returns the problem of a session of any family.
         fn problem(session: &Session) -> Option<Problem> {
             match session { $(Session::$Family(session) => line::ScannerSession::problem(session).map(Problem::$Family),)* }
         }
@@ -67,7 +68,7 @@ macro_rules! families {
             }
         }
 
-        /// Evaluates an expression with the session of whatever family.
+        /// Evaluates an expression with the session inside, for any family.
         macro_rules! each {
             ($of:expr, $session:ident => $value:expr) => {
                 match $of { $(Session::$Family($session) => $value,)* }
@@ -82,8 +83,9 @@ families! {
     Rplidar rplidar RplidarSession,
 }
 
-/// Returns the possible scan heads of a scanner of `family`, as far as `settings` and the family determine them. They have
-/// the same number of beams, at most the maximum. A revolution has as many beams as there is space for.
+/// Returns all scan heads that a scanner of `family` with these `settings` may have. All of them have the same number
+/// of beams. For a revolution, this is the number in the settings, the maximum of the settings, or the default of the
+/// family.
 pub fn scan_heads(family: Family, settings: &Settings) -> Vec<ScanHead> {
     match family {
         Family::Lms => lms::scan_heads(settings),
@@ -94,7 +96,7 @@ pub fn scan_heads(family: Family, settings: &Settings) -> Vec<ScanHead> {
     }
 }
 
-/// Returns the settings that `request` has for a scanner of `family`.
+/// Returns the settings of a session with a scanner of `family`, after checking those of `request`.
 pub(crate) fn check(family: Family, request: &SettingsRequest) -> Result<Settings, Refusal> {
     match family {
         Family::Lms => lms::check(request),
@@ -102,8 +104,9 @@ pub(crate) fn check(family: Family, request: &SettingsRequest) -> Result<Setting
     }
 }
 
-/// Creates the inquiry of a scanner of `family`, on a port that is open at `rate`, in bits per second. Without a rate, the
-/// port is a serial server, whose rate is set there. Returns `None` for a family that [has none](Features::has_inquiry).
+/// Creates the inquiry of a scanner of `family`. The port is open at `rate`, in bits per second. `rate` is `None` for a
+/// serial server, whose baud rate is set there. Returns `None` for a family [without an
+/// inquiry](Features::has_inquiry).
 pub fn inquiry(family: Family, rate: Option<u32>, now: Nanos) -> Option<Inquiry> {
     match family {
         Family::Lms => Some(Inquiry::begin(rate, now)),
@@ -111,7 +114,7 @@ pub fn inquiry(family: Family, rate: Option<u32>, now: Nanos) -> Option<Inquiry>
     }
 }
 
-/// Features of a link whose family is searched for: space for every scanner.
+/// Features of a link with `family = "auto"`, with enough space for every scanner.
 pub const ANY_FAMILY: Features = {
     let mut any = Features {
         models: &[],
@@ -139,13 +142,13 @@ pub const ANY_FAMILY: Features = {
 };
 
 impl Session {
-    /// Returns the models and settings of its family.
+    /// Returns the models and settings of the session's family.
     pub fn features(&self) -> &'static Features {
         features(self.family())
     }
 }
 
-/// Writes methods that call those of the session inside.
+/// Defines methods that call the same method of the session inside.
 macro_rules! delegate {
     ($Trait:ident & $(fn $name:ident($($arg:ident: $Arg:ty),*) $(-> $Ret:ty)?;)*) => {
         $(fn $name(&self $(, $arg: $Arg)*) $(-> $Ret)? {
@@ -224,7 +227,7 @@ impl line::ScannerSession for Session {
     }
 }
 
-/// Rate at which a search begins that remembers no scanner, in bits per second.
+/// Baud rate at which a search without a known scanner starts, in bits per second.
 const FIRST_RATE: u32 = 230_400;
 const _: () = {
     let mut at = 0;

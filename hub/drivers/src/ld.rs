@@ -1,6 +1,7 @@
-//! LDROBOT LD06, LD19, STL19P, STL27L and LD14P, which stream without a request. Nothing is ever sent to them.
+//! Family `ld`: the LDROBOT scanners LD06, LD19, STL19P, STL27L and LD14P. They stream without a request, and the hub
+//! never sends them a byte.
 //!
-//! Here is what the family declares: its models, its settings, and its recognizer.
+//! This file has the models, the settings and the recognizer of the family.
 
 pub mod packet;
 mod point_count;
@@ -21,7 +22,7 @@ pub use session::{LdSession, Problem};
 /// Models and settings of the family.
 pub const FEATURES: Features = Features {
     models: &MODELS,
-    // Enough for all models but the STL27L.
+    // Enough for every model except the STL27L.
     defaults: family::Model { name: "auto", baud: Model::Ld19.baud(), beams: 720 },
     modes: &[],
     keys: &[],
@@ -33,16 +34,16 @@ pub const FEATURES: Features = Features {
     max_telegram: session::MAX_PACKETS_PER_SAMPLE * PACKET_LEN,
 };
 
-/// Describes a model for the configuration.
+/// Returns the description of a model for configurations.
 const fn describe(model: Model) -> family::Model {
     family::Model { name: model.name(), baud: model.baud(), beams: model.beams() }
 }
 
-/// All models, described for the configuration.
+/// Descriptions of all models for configurations.
 const MODELS: [family::Model; Model::ALL.len()] = table!(Model::ALL, describe);
 
 named! {
-    /// A scanner of the family.
+    /// Model of an LDROBOT scanner.
     Model {
         /// LD06.
         Ld06 "ld06",
@@ -58,7 +59,7 @@ named! {
 }
 
 impl Model {
-    /// Returns the model called `name`.
+    /// Returns the model whose name is `name`.
     pub fn from_name(name: &str) -> Option<Model> {
         Model::ALL.into_iter().find(|model| model.name() == name)
     }
@@ -68,7 +69,7 @@ impl Model {
         settings.model.and_then(Model::from_name)
     }
 
-    /// Returns the rate of its line, in bits per second.
+    /// Returns the baud rate of the scanner's line, in bits per second.
     pub const fn baud(self) -> u32 {
         match self {
             Model::Stl27l => 921_600,
@@ -76,7 +77,7 @@ impl Model {
         }
     }
 
-    /// Returns the number of points that it measures per second, at any speed of its head.
+    /// Returns the number of points that the scanner measures per second. It is the same at any speed of the head.
     pub const fn points_per_second(self) -> u32 {
         match self {
             Model::Stl27l => 21_600,
@@ -85,7 +86,7 @@ impl Model {
         }
     }
 
-    /// Returns the number of revolutions per second of a new scanner.
+    /// Returns the number of revolutions per second at which a new scanner rotates.
     pub const fn revolutions_per_second(self) -> u32 {
         match self {
             Model::Ld14p => 6,
@@ -102,7 +103,8 @@ impl Model {
         }
     }
 
-    /// Returns the model that measures `points_per_second`. Of models that cannot be distinguished, it is the best known one.
+    /// Returns the model that measures `points_per_second`. If several models cannot be distinguished, returns the best
+    /// known one.
     pub(crate) fn of_point_rate(points_per_second: f32) -> Model {
         match points_per_second {
             rate if rate > 10_000.0 => Model::Stl27l,
@@ -117,7 +119,7 @@ impl Model {
 pub struct Probe {
     framer: Framer,
     sequence: PacketSequencer,
-    /// Packets in sequence.
+    /// Number of packets in the current sequence.
     packets: u32,
 }
 
@@ -128,7 +130,7 @@ impl Default for Probe {
 }
 
 impl Probe {
-    /// Counts the packets in the framer that continue each other.
+    /// Reads the packets in the framer and counts those that continue the sequence.
     fn count(&mut self) {
         while let Some(span) = self.framer.advance(1) {
             let packet = self.framer.bytes(span).first_chunk().and_then(|bytes| Packet::check(bytes).ok());
@@ -187,6 +189,6 @@ const APPROACH: Approach = Approach {
     max_transmission: PACKET_LEN,
     advice: "it streams by itself once it has 5 V and its head rotates",
 };
-/// Packets in sequence that prove an LDROBOT. Each has a header and a checksum of 24 bits, and its angles and its clock have
-/// to continue those of the packet before.
+/// Number of packets in sequence that prove an LDROBOT scanner. The header and the checksum of a packet have 24 bits in
+/// total, and its angles and its clock must continue those of the previous packet.
 const MIN_PROOF_PACKETS: u32 = 4;

@@ -1,7 +1,9 @@
-//! The drivers: the protocol of each family of laser scanners, the session with a scanner, and the scans that it yields.
+//! Drivers of all scanner families: the protocol of each family, the session with a scanner, and the scans that a
+//! session returns.
 //!
-//! Sans-I/O: the caller passes bytes and the time, and gets bytes, events and deadlines back. No driver opens a port, reads a
-//! clock or starts a thread. Bytes outside telegrams are counted and are never an error.
+//! The drivers do no I/O. The caller passes bytes and the time, and gets bytes, events and deadlines in return. No
+//! driver opens a port, reads a clock or starts a thread. Bytes that are not part of a telegram or packet are counted
+//! and never cause an error.
 #![forbid(unsafe_code)]
 
 mod families;

@@ -31,12 +31,12 @@ pub mod suspect {
 
     /// The kernel's error counters of the line have increased.
     pub const LINE_ERROR: u8 = Reasons::LINE_ERROR;
-    /// The bytes before it were not part of a telegram or packet, so its neighbor was damaged.
+    /// Bytes before the packet were not part of another one, so the neighboring packet was damaged.
     pub const NEIGHBOUR: u8 = Reasons::NEIGHBOUR;
-    /// Its bytes took longer than usual to arrive.
+    /// The bytes took longer than usual to arrive.
     pub const SLOW: u8 = Reasons::SLOW;
-    /// It has bits set that no scanner sets.
+    /// Bits are set that no scanner sets.
     pub const FORBIDDEN_BITS: u8 = Reasons::FORBIDDEN_BITS;
-    /// It contains another valid header.
+    /// The bytes contain another valid header.
     pub const HEADER_INSIDE: u8 = Reasons::HEADER_INSIDE;
 }

@@ -1,7 +1,8 @@
-//! The session on a port: with a scanner of a configured family, or with the scanner that a [`Search`] finds.
+//! Session on a port, with a scanner of the configured family or with the scanner that a [`Search`] finds.
 //!
-//! A found scanner gets a session of its family. If nothing of the scanner arrives for 10 s, the search begins again,
-//! with that family first. The driver handles both like any session, and calls [`PortSession::advance`] at each wait.
+//! After the search, a session of the scanner's family takes over. If that session receives nothing for 10 s, the
+//! search starts again, with the same family first. The driver handles a search like a session, and calls
+//! [`PortSession::advance`] at each wait.
 
 use core::fmt;
 
@@ -16,36 +17,36 @@ use crate::line::{
 use crate::search::{FoundScanner, Memory, PortKind, Search};
 use crate::settings::Settings;
 
-/// A session on an open port.
+/// Session on an open port.
 #[derive(Debug)]
 pub struct PortSession {
     settings: Settings,
-    /// Whether the family is searched for.
+    /// Whether the family is `auto`, so that the session searches for the scanner.
     is_auto: bool,
     phase: Phase,
-    /// Reads of the search that the session of the found scanner has not handled yet, the oldest at the end.
+    /// Reads of the search that the session has not processed yet. The oldest one is the last element.
     captured: Vec<(Nanos, Vec<u8>)>,
     memory: Option<Memory>,
-    /// Rate at which the scanner was found.
+    /// Baud rate at which the search found the scanner, in bits per second.
     found_rate: Option<u32>,
-    /// Identity that an earlier session has saved, for the first scanner that is found.
+    /// Identity that an earlier session saved, for the first scanner that the search finds.
     identity: Option<Identity>,
     known_rate: Option<KnownRate>,
     /// Family, model and number of beams of the last scanner.
     last: Option<(Family, Model, usize)>,
-    /// Trouble of the last session, until the search has its own.
+    /// Problem of the last session, until the search has its own.
     problem: Option<Problem>,
     /// Whether a user has paused the search.
     is_paused: bool,
     now: Nanos,
-    /// Last time that was passed to the session. Captured reads are older than `now`.
+    /// Last time that was passed to the session. While the session processes captured reads, it is earlier than `now`.
     session_now: Nanos,
-    /// Time at which something of the found scanner arrived last.
+    /// Time at which the session last returned an event.
     received_at: Nanos,
     partial_reads: u8,
-    /// Bytes that were read by searches that have ended, or during a pause.
+    /// Number of bytes that were read by completed searches, or during a pause.
     searched: u64,
-    /// Counters of sessions that have ended.
+    /// Counters of the sessions that have ended.
     past_stats: SessionStats,
     past_counters: Counters,
 }
@@ -58,9 +59,9 @@ enum Phase {
 }
 
 impl PortSession {
-    /// Creates a session on a port that was opened at `now`. With a `family`, the port is open at the rate of
-    /// `settings`, or else of the model. Without one, it is open at the [rate of the search](Search::opening_rate),
-    /// which begins with the scanner in `memory`.
+    /// Creates a session on a port that was opened at `now`. With a `family`, the port is open at the baud rate of
+    /// `settings`, or at the default rate of the model. Without a family, the port is open at the [rate of the
+    /// search](Search::opening_rate), which starts with the scanner in `memory`.
     pub fn begin(
         family: Option<Family>,
         settings: &Settings,
@@ -93,27 +94,27 @@ impl PortSession {
         }
     }
 
-    /// Returns the session with the scanner. `None` while it is searched for.
+    /// Returns the session with the scanner. Returns `None` during a search.
     fn session(&self) -> Option<&Session> {
         if let Phase::Found(session) = &self.phase { Some(session) } else { None }
     }
 
-    /// Does the same as [`session`](Self::session), to change it.
+    /// Returns the session with the scanner as a mutable reference. Returns `None` during a search.
     fn session_mut(&mut self) -> Option<&mut Session> {
         if let Phase::Found(session) = &mut self.phase { Some(session) } else { None }
     }
 
-    /// Returns the family. `None` while it is searched for.
+    /// Returns the scanner's family. Returns `None` during a search.
     pub fn family(&self) -> Option<Family> {
         self.session().map(Session::family)
     }
 
-    /// Returns the models and settings of the family. `None` while it is searched for.
+    /// Returns the models and settings of the scanner's family. Returns `None` during a search.
     pub fn features(&self) -> Option<&'static Features> {
         self.family().map(features)
     }
 
-    /// Returns the scanner that the search has found, for the next search. `None` until it streams.
+    /// Returns the scanner that the search has found, for the next search. Returns `None` until the scanner streams.
     pub fn memory(&self) -> Option<Memory> {
         let Phase::Found(session) = &self.phase else { return None };
         if !self.is_auto || session.state() != State::Streaming {
@@ -121,14 +122,15 @@ impl PortSession {
         }
         let (family, stream_rate) = (session.family(), session.rate());
         let found_rate = self.found_rate.unwrap_or(stream_rate);
-        // A scanner that streamed when it was found has not shown at which rate it starts.
+        // A scanner that streamed when the search found it has not shown at which baud rate it replies.
         let before = self.memory.filter(|memory| memory.family == family && found_rate == stream_rate);
         let reply_rate = before.map_or(found_rate, |memory| memory.reply_rate);
         Some(Memory { family, stream_rate, reply_rate })
     }
 
-    /// Continues when [`poll_action`](line::Protocol::poll_action) has returned a wait. Returns whether there is more
-    /// to drain: the search has found a scanner, or it begins again.
+    /// Continues after [`poll_action`](line::Protocol::poll_action) has returned a wait. Returns whether the driver
+    /// must drain the session again, because the search has found a scanner, captured bytes were processed, or the
+    /// search has restarted.
     pub fn advance(&mut self) -> bool {
         if !self.is_auto {
             return false;
@@ -166,7 +168,7 @@ impl PortSession {
         }
     }
 
-    /// Begins a session with the scanner that the search has found.
+    /// Starts a session with the scanner that the search has found.
     fn begin_session(&mut self, found: FoundScanner) {
         let Phase::Searching(search) = &self.phase else { return };
         let FoundScanner { family, rate, model: _ } = found;
@@ -196,7 +198,7 @@ impl PortSession {
         self.phase = Phase::Found(session);
     }
 
-    /// Ends the session, because nothing of its scanner arrives any more, and searches again.
+    /// Ends the session, because it receives nothing from its scanner any more, and starts a search.
     fn restart_search(&mut self) {
         let Phase::Found(session) = &self.phase else { return };
         let stats = session.stats();
@@ -212,7 +214,7 @@ impl PortSession {
         self.search();
     }
 
-    /// Starts a search on a port that is open at any rate.
+    /// Starts a search. The port may be open at any baud rate, so the search sets it first.
     fn search(&mut self) {
         if let Phase::Searching(search) = &self.phase {
             self.searched += search.stats().read;
@@ -253,7 +255,7 @@ impl line::Protocol for PortSession {
         (self.now, self.session_now) = (now, now);
         match &mut self.phase {
             Phase::Searching(search) => {
-                // A scanner that replies may be another one.
+                // The scanner that replies may not be the one whose identity was saved.
                 self.identity = None;
                 search.handle_transmitted(now);
             }
@@ -289,7 +291,7 @@ impl line::Protocol for PortSession {
     }
 }
 
-/// Writes methods that return what the session of the found scanner does, and another value during a search.
+/// Defines methods that call the same method of the session. During a search they return the value after `=`.
 macro_rules! found {
     ($(fn $name:ident($($arg:ident: $Arg:ty),*) -> $Ret:ty = $searching:expr;)*) => {
         $(fn $name(&self $(, $arg: $Arg)*) -> $Ret {
@@ -438,7 +440,7 @@ impl line::ScannerSession for PortSession {
         fn scanner_time() -> Option<Nanos> = None;
     }
 
-    /// A search removes what an earlier scanner has reported.
+    /// Clears the status fields during a search, because they describe an earlier scanner.
     fn describe(&self, status: &mut Status) {
         match &self.phase {
             Phase::Searching(_) => {
@@ -495,8 +497,8 @@ fn sum(a: SessionStats, b: SessionStats) -> SessionStats {
     }
 }
 
-/// After this time without anything of a found scanner, the search begins again. Until then, the session of the family
-/// handles silence and power cycles.
+/// Time without an event from a found scanner after which the search starts again. Until then, the session handles
+/// silence and power cycles.
 const LOSS_TIMEOUT: Nanos = 10_000 * MILLIS;
-/// Stands for an unknown rate of the port, in bits per second.
+/// Baud rate to report while the rate of the port is unknown, in bits per second.
 const FALLBACK_RATE: u32 = 9_600;

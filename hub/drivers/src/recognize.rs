@@ -1,4 +1,5 @@
-//! Recognizes the family of raw bytes, such as those of a stream file, by the bytes that the framer of each family accepts.
+//! Recognition of the scanner family from raw bytes, such as those of a stream file. It counts the bytes that each
+//! family's framer accepts.
 
 use scanhub_schema::{Family, MILLIS, Nanos};
 
@@ -7,19 +8,19 @@ use crate::line::{Action, Event, Protocol as _, ScannerSession as _};
 use crate::lms::framer::{Framer, VETO_HOLD_TIME};
 use crate::{Session, Settings, features};
 
-/// Number of bytes at the beginning of a stream that are examined.
+/// Number of bytes at the start of a stream that are examined.
 pub const EXAMINED_BYTES: usize = 64 * 1024;
 
-/// Returns the family whose telegrams or packets take most of the first [`EXAMINED_BYTES`] bytes of `bytes`, and at least half of
-/// them. `None` if there is no such family.
+/// Returns the family whose telegrams or packets contain at least half of the first [`EXAMINED_BYTES`] bytes of
+/// `bytes`, and more of them than those of any other family. Returns `None` if there is no such family.
 pub fn family_of(bytes: &[u8]) -> Option<Family> {
     let examined = bytes.len().min(EXAMINED_BYTES);
     let [(first, max_bytes), ..] = bytes_by_family(bytes);
     (max_bytes > 0 && 2 * max_bytes >= examined).then_some(first)
 }
 
-/// Returns each family with the number of bytes in its telegrams or packets, among the first [`EXAMINED_BYTES`] bytes of `bytes`.
-/// The family with the most bytes is first.
+/// Returns each family with the number of bytes in its telegrams or packets, among the first [`EXAMINED_BYTES`] bytes
+/// of `bytes`. The family with the most bytes comes first.
 pub fn bytes_by_family(bytes: &[u8]) -> [(Family, usize); Family::ALL.len()] {
     let bytes = &bytes[..bytes.len().min(EXAMINED_BYTES)];
     let mut counts = Family::ALL.map(|family| (family, accepted_bytes(family, bytes)));
@@ -27,13 +28,13 @@ pub fn bytes_by_family(bytes: &[u8]) -> [(Family, usize); Family::ALL.len()] {
     counts
 }
 
-/// Returns the name of a scan mode that defines how to split `bytes` into packets of `family`. `None` if the bytes define it
-/// themselves. Packets of some modes look alike, so another mode may be the right one to decode them.
+/// Returns the name of a scan mode that determines how `bytes` are split into packets of `family`. Returns `None` if
+/// the bytes determine it themselves. The packets of some modes look alike, so decoding may require another mode.
 pub fn framing_mode(family: Family, bytes: &[u8]) -> Option<&'static str> {
     bytes_in_mode(family, &bytes[..bytes.len().min(EXAMINED_BYTES)])?.1
 }
 
-/// Returns the number of bytes in telegrams or packets of `family`.
+/// Returns the number of bytes in telegrams or packets of `family`. Ignores a number that noise can explain.
 fn accepted_bytes(family: Family, bytes: &[u8]) -> usize {
     match bytes_in_mode(family, bytes) {
         None => bytes_in_telegrams(bytes),
@@ -42,8 +43,8 @@ fn accepted_bytes(family: Family, bytes: &[u8]) -> usize {
     }
 }
 
-/// Returns the number of bytes in packets of `family`, and the [mode](framing_mode) in which they are packets. `None` if the
-/// family does not send packets.
+/// Returns the number of bytes in packets of `family`, and the [mode](framing_mode) by which they are split. Returns
+/// `None` if the family does not send packets.
 fn bytes_in_mode(family: Family, bytes: &[u8]) -> Option<(usize, Option<&'static str>)> {
     let in_mode = |mode| {
         let settings = Settings { mode, fixed_rate: true, listen_only: true, ..Settings::default() };
@@ -71,13 +72,13 @@ fn bytes_in_telegrams(mut bytes: &[u8]) -> usize {
         let len = fill(framer.read_buffer(), &mut bytes);
         framer.commit(len);
     }
-    // No more bytes can refute a telegram that is held back.
+    // No more bytes can show that the held telegram is not one.
     framer.release(VETO_HOLD_TIME);
     while framer.poll().is_some() {}
     framer.counters().in_telegrams as usize
 }
 
-/// Returns the number of bytes in packets, and whether the session cannot tell their kind.
+/// Returns the number of bytes in packets, and whether the session needs a setting to determine the kind of packets.
 fn bytes_in_packets(mut session: Session, mut bytes: &[u8]) -> (usize, bool) {
     let mut accepted = 0;
     let mut is_ended = false;
@@ -97,15 +98,15 @@ fn bytes_in_packets(mut session: Session, mut bytes: &[u8]) -> (usize, bool) {
         session.commit(0, len);
         if len == 0 {
             is_ended = true;
-            // No more bytes can refute packets that are held back.
+            // No more bytes can show that the held packets are not packets.
             session.handle_timeout(HOLD_TIMEOUT);
         }
     }
 }
 
-/// Time after which a session no longer holds packets back.
+/// Time after which a session releases packets that it holds back.
 const HOLD_TIMEOUT: Nanos = 100 * MILLIS;
-/// Number of bytes up to which packets may be noise that passed a short checksum.
+/// Maximum number of bytes that may be noise with a checksum that is right by chance.
 const MAX_CHANCE_BYTES: usize = 100;
 
 #[cfg(test)]

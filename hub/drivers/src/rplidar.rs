@@ -1,6 +1,7 @@
-//! Slamtec RPLIDAR A1, A2, A3, S1, S2, S3 and C1. No request changes a setting that the scanner keeps without power.
+//! Family `rplidar`: the Slamtec scanners RPLIDAR A1, A2, A3, S1, S2, S3 and C1. No request changes a setting that the
+//! scanner keeps without power.
 //!
-//! Here is what the family declares: its models and modes, its settings, and its recognizer.
+//! This file has the models, the scan modes, the settings and the recognizer of the family.
 
 mod framer;
 mod handshake;
@@ -26,7 +27,7 @@ pub use session::{Problem, RplidarSession};
 /// Models and settings of the family.
 pub const FEATURES: Features = Features {
     models: &MODELS,
-    // Enough for all models but the S2 and the S3.
+    // Enough for every model except the S2 and the S3.
     defaults: family::Model { name: "auto", baud: Model::A1.baud(), beams: 2_048 },
     modes: &MODES,
     keys: &[Key::ModeName, Key::Idle],
@@ -38,23 +39,23 @@ pub const FEATURES: Features = Features {
     max_telegram: stream::MAX_SAMPLE_LEN,
 };
 
-/// Describes a model for the configuration.
+/// Returns the description of a model for configurations.
 const fn describe(model: Model) -> family::Model {
     family::Model { name: model.name(), baud: model.baud(), beams: model.beams() }
 }
 
-/// All models, described for the configuration.
+/// Descriptions of all models for configurations.
 const MODELS: [family::Model; Model::ALL.len()] = table!(Model::ALL, describe);
 
-/// Names of all modes.
+/// Names of all scan modes.
 const MODES: [&str; Mode::ALL.len()] = table!(Mode::ALL, Mode::name);
 
 named! {
-    /// A scanner of the family.
+    /// Model of an RPLIDAR.
     Model {
         /// A1M8.
         A1 "a1",
-        /// A2M8, and the older ones of its kind.
+        /// A2M8, and older models of the A2 series.
         A2m8 "a2m8",
         /// A2M12.
         A2m12 "a2m12",
@@ -71,19 +72,19 @@ named! {
     }
 }
 
-/// What turns the head.
+/// Control of the motor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Motor {
-    /// The line DTR, while it is not asserted; nothing else can.
+    /// Only the line DTR controls the motor. The motor runs while DTR is not asserted.
     Dtr,
-    /// A request with a duty cycle, if an accessory board is there to obey; else as [`Motor::Dtr`].
+    /// A request with a duty cycle controls the motor, if the scanner has an accessory board. Otherwise, DTR does.
     Board,
-    /// A request with a speed.
+    /// A request with a speed controls the motor.
     Speed,
 }
 
 impl Model {
-    /// The model of this name.
+    /// Returns the model whose name is `name`.
     pub fn from_name(name: &str) -> Option<Model> {
         Model::ALL.into_iter().find(|model| model.name() == name)
     }
@@ -93,7 +94,7 @@ impl Model {
         settings.model.and_then(Model::from_name)
     }
 
-    /// The model that says `id` of itself: its series in the upper half.
+    /// Returns the model that reports the number `id`. The upper four bits are the series.
     pub(crate) fn of_id(id: u8) -> Option<Model> {
         match (id >> 4, id & 15) {
             (1, _) => Some(Model::A1),
@@ -108,7 +109,7 @@ impl Model {
         }
     }
 
-    /// Returns the number that the usual hardware of this model reports, for [`Model::of_id`].
+    /// Returns the number that the usual hardware of this model reports. It is the inverse of [`Model::of_id`].
     pub(crate) fn id(self) -> u8 {
         match self {
             Model::A1 => 0x18,
@@ -122,7 +123,7 @@ impl Model {
         }
     }
 
-    /// The rate at which it speaks, in bits per second.
+    /// Returns the baud rate of the scanner's line, in bits per second.
     pub const fn baud(self) -> u32 {
         match self {
             Model::A1 | Model::A2m8 => 115_200,
@@ -132,7 +133,7 @@ impl Model {
         }
     }
 
-    /// Points that it measures in a second in its fastest mode.
+    /// Returns the number of points per second in the fastest scan mode.
     pub const fn points_per_second(self) -> u32 {
         match self {
             Model::A1 => 7_874,
@@ -144,7 +145,7 @@ impl Model {
         }
     }
 
-    /// Turns in a second.
+    /// Returns the number of revolutions per second.
     pub const fn revolutions_per_second(self) -> f32 {
         match self {
             Model::A1 => 7.3,
@@ -152,18 +153,18 @@ impl Model {
         }
     }
 
-    /// Beams of a turn in its fastest mode unless something else is asked for: its points.
+    /// Returns the default number of beams. It is the number of points per revolution in the fastest scan mode.
     pub const fn beams(self) -> usize {
         self.beams_of(self.points_per_second() as f32)
     }
 
-    /// Beams of a turn where so many points are measured in a second.
+    /// Returns the number of points per revolution at `points_per_second`.
     const fn beams_of(self, points_per_second: f32) -> usize {
         (points_per_second / self.revolutions_per_second() + 0.5) as usize
     }
 
-    /// Returns the number of beams for a mode in which the scanner measures `points_per_second`: that of the model's fastest
-    /// mode, if it is close.
+    /// Returns the number of beams for a scan mode with `points_per_second`. If it is close to the number of the
+    /// fastest mode, it is that number.
     pub(crate) fn beams_in_mode(self, points_per_second: f32) -> usize {
         let (beams, fastest) = (self.beams_of(points_per_second), self.beams());
         let is_close = (beams as f64 / fastest as f64 - 1.0).abs() <= MAX_BEAM_DEVIATION;
@@ -171,31 +172,31 @@ impl Model {
     }
 }
 
-/// Share by which a number of beams may differ from that of the model's fastest mode, and still counts as the same.
+/// Maximum deviation from the number of beams of the fastest mode, as a ratio.
 const MAX_BEAM_DEVIATION: f64 = 0.03;
 
 named! {
-    /// A way of measuring that a model may offer.
+    /// Scan mode that a model may offer.
     Mode {
-        /// A packet for each point, with its quality; the slowest.
+        /// One packet per point, with its quality. The slowest mode.
         Standard "standard",
-        /// More points in packets with a checksum.
+        /// More points per second, in packets with a checksum.
         Express "express",
-        /// More points, for short distances.
+        /// More points per second, for short ranges.
         Boost "boost",
-        /// More points, for dark targets.
+        /// More points per second, for dark targets.
         Sensitivity "sensitivity",
-        /// Fewer points, where the sun shines.
+        /// Fewer points per second, for sunlight.
         Stability "stability",
-        /// The fastest of the S series and of the C1.
+        /// The fastest mode of the S series and of the C1.
         DenseBoost "denseboost",
-        /// The fastest with a quality for each point.
+        /// The fastest mode with a quality for each point.
         UltraDense "ultradense",
     }
 }
 
 impl Mode {
-    /// The mode of this name.
+    /// Returns the mode whose name is `name`.
     pub fn from_name(name: &str) -> Option<Mode> {
         Mode::from_device_name(name.as_bytes())
     }
@@ -205,7 +206,7 @@ impl Mode {
         settings.mode.and_then(Mode::from_name)
     }
 
-    /// The mode that a scanner calls `name`: in capitals, with spaces, ended by a zero, as it likes.
+    /// Returns the mode for a name that a scanner reports. Ignores case, spaces and a terminating zero.
     pub(crate) fn from_device_name(name: &[u8]) -> Option<Mode> {
         Mode::ALL.into_iter().find(|mode| {
             let letters = name.iter().filter(|byte| byte.is_ascii_alphanumeric());
@@ -221,7 +222,7 @@ pub struct Probe {
     is_reply_expected: bool,
     /// Whether packets have arrived.
     is_stream: bool,
-    /// The identity that the scanner has reported.
+    /// Identity that the scanner has reported.
     info: Option<Info>,
 }
 
@@ -245,7 +246,7 @@ impl crate::line::family::Probe for Probe {
         *self = Probe::default();
     }
 
-    // A fragment of an earlier reply would take the descriptor of the next one along, so nothing of it is kept.
+    // Discard everything, because a fragment of an earlier reply would swallow the descriptor of the next one.
     fn expect_reply(&mut self, is_expected: bool) {
         let expect = if is_expected { ExpectedBytes::Responses } else { ExpectedBytes::AnyPackets(None) };
         *self = Probe { framer: Framer::new(expect), is_reply_expected: is_expected, ..Probe::default() };
@@ -289,7 +290,7 @@ const APPROACH: Approach = Approach {
         stop: Some(StopRequest { request: &[0xA5, 0x25], quiet_time: 15 * MILLIS, max_wait: 60 * MILLIS }),
         requests: &[&[0xA5, 0x50]],
         gap: None,
-        // A reply takes some milliseconds, and an adapter that collects bytes adds 16, twice.
+        // A reply takes some milliseconds, and an adapter that collects bytes adds 16 ms in each direction.
         reply_timeout: 70 * MILLIS,
         extra_reply_time: 0,
         extra_partial_time: 20 * MILLIS,
@@ -313,7 +314,7 @@ mod tests {
 
     #[test]
     fn mode_close_to_the_fastest_one_has_its_beam_count() {
-        // The scanner reports 127 us per point, and its data sheet 8,000 points per second.
+        // The scanner reports 127 us per point, and its data sheet states 8,000 points per second.
         assert_eq!(Model::A2m8.beams_in_mode(1e6 / 127.0), 800);
         assert_eq!(Model::A2m12.beams_in_mode(1e6 / 63.0), 1_600);
         assert_eq!(Model::A2m8.beams_in_mode(1e6 / 201.0), 498);

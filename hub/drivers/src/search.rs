@@ -1,20 +1,21 @@
-//! Finds the scanner on a line whose family is not configured, and the rate of the line.
+//! Search for the family and the baud rate of the scanner on a line, if the family is not configured.
 //!
-//! A search consists of rounds, and a round of steps. Each step sets a rate, and then listens or sends a request:
+//! A search consists of rounds, and a round of steps. Each step sets a baud rate, and then listens or sends a request:
 //!
 //! 1. Listen for a stream that needs no request.
-//! 2. If bytes have arrived, listen at further rates for streams of scanners that should get no request while they
-//!    stream.
+//! 2. If bytes have arrived, listen at further rates for streams of scanners that should not receive a request while
+//!    they stream.
 //! 3. Send the requests of each family at its rates.
 //!
-//! In every second round, slow scanners have more time. Rounds without a byte are followed by pauses, which get longer.
+//! In every second round, slow scanners have more time. A pause follows each round without a byte except the first, and
+//! pauses get longer.
 //!
-//! An unknown scanner gets only requests that no scanner of another family accepts, at any rate, and that change
-//! nothing: each family declares them in its [`Approach`]. Resets, motor requests, changes of settings and of the line
-//! DTR belong to the sessions. In the first 150 ms after the open, no byte is sent.
+//! The search sends only requests that no scanner of another family accepts, at any baud rate, and that do not change
+//! anything. Each family declares them in its [`Approach`]. Resets, motor requests, changes of settings and of the line
+//! DTR belong to the sessions. In the first 150 ms after the port was opened, the search sends no byte.
 //!
-//! The search is a [`Protocol`]. It is done when it has [found](Search::found) the scanner. Then the bytes of its last
-//! step are available from [`Search::reads`], so that the family's session handles each of them.
+//! The search is a [`Protocol`]. It is done when it has [found](Search::found) the scanner. The bytes of its last step
+//! are then available from [`Search::reads`], so that the family's session can process them.
 
 use core::fmt;
 
@@ -24,100 +25,101 @@ use crate::families::probes;
 use crate::line::family::{Approach, Evidence, Probe, RequestSteps};
 use crate::line::{Action, Protocol, SessionStats};
 
-/// Result of a search.
+/// Result of a successful search.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FoundScanner {
     /// Family of the scanner.
     pub family: Family,
     /// Name of the model, if the scanner has reported it.
     pub model: Option<&'static str>,
-    /// Rate of the line, in bits per second. `None` if the port has no rate that can be set.
+    /// Baud rate of the line, in bits per second. `None` if the search cannot set the baud rate of the port.
     pub rate: Option<u32>,
 }
 
 /// Kind of a port.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PortKind {
-    /// A serial line, whose rate the search sets.
+    /// Serial line whose baud rate the search sets.
     Serial,
-    /// A serial server on the network, whose rate is set there.
+    /// Serial server on the network. The baud rate is set there.
     Server,
-    /// A recording, which receives nothing. Families whose streams prove nothing are found only by recorded replies.
+    /// Recording, to which the search cannot send. A family whose stream is not a proof is found only by recorded
+    /// replies.
     Recording,
 }
 
-/// Scanner that was found on the same port before.
+/// Scanner that an earlier search found on the same port.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Memory {
     /// Family of the scanner.
     pub family: Family,
-    /// Rate of its stream, in bits per second.
+    /// Baud rate of its stream, in bits per second.
     pub stream_rate: u32,
-    /// Rate at which it replied when it did not stream: that of [`FoundScanner`].
+    /// Baud rate at which it replied while it did not stream, in bits per second: the one of [`FoundScanner`].
     pub reply_rate: u32,
 }
 
-/// Reason why no scanner is found.
+/// Reason why the search has not found a scanner.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Problem {
     /// No byte arrives.
     Silent {
         /// Duration of the search in seconds, rounded down to 10, 100, 300, 600, ..
         seconds: u32,
-        /// Whether the port has a rate of the family's scanners, for each family in the order of [`Family::ALL`].
+        /// Whether the port supports a baud rate of the family, for each family in the order of [`Family::ALL`].
         is_possible: [bool; Family::ALL.len()],
     },
-    /// Bytes arrive, but no family recognizes them.
+    /// Bytes arrive, but they do not match any family.
     Unrecognized {
         /// Bytes per second in the last step that listened, rounded to three digits.
         bytes_per_second: u32,
     },
 }
 
-/// Rates at which a search looks for the scanners of one family.
+/// Baud rates at which a search tries to find the scanners of one family.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Coverage {
     /// The family.
     pub family: Family,
-    /// Rates of the family, in bits per second, without those that the port cannot have.
+    /// Baud rates of the family that the port supports, in bits per second.
     pub rates: Vec<u32>,
-    /// Rates of the family that the port cannot have.
+    /// Baud rates of the family that the port has rejected, in bits per second.
     pub rejected: Vec<u32>,
-    /// Properties of the scanner that the user should check if it is not found, as part of a message.
+    /// Part of a message for a search without success: properties of the scanner that the user should check.
     pub advice: &'static str,
 }
 
-/// A search on an open port. It returns no events.
+/// Search on an open port. It returns no events.
 #[derive(Debug)]
 pub struct Search {
     port: PortKind,
     memory: Option<Memory>,
     probes: Vec<Box<dyn Probe>>,
     phase: Phase,
-    /// Number of the round, from 0.
+    /// Index of the round.
     round: usize,
-    /// Steps of the round, and the number of those that were entered.
+    /// Steps of the round, and the number of steps that were started or skipped.
     steps: Vec<Step>,
     entered: usize,
-    /// Whether a request to the remembered scanner was sent in this round.
+    /// Whether this round has sent a request to the scanner in `memory`.
     is_memory_requested: bool,
     rate: Option<u32>,
     change_rate: bool,
-    /// Rates that the port cannot have.
+    /// Baud rates that the port has rejected.
     rejected: Vec<u32>,
     capture: Capture,
-    /// Number of the first captured byte that may belong to a reply.
+    /// Index of the first captured byte that may belong to a reply.
     reply_offset: usize,
     opened_at: Nanos,
     now: Nanos,
     last_byte: Nanos,
-    /// Bytes that were read: at all, when the round began, and when the step began.
+    /// Number of bytes read; below it, the same number at the start of the round and of the step.
     read: u64,
     round_read: u64,
     step_read: u64,
     step_began: Nanos,
     round_began: Nanos,
-    /// Bytes per second of the last step that listened and received any in this round.
+    /// Bytes per second of the last step in this round that listened and received a byte.
     step_bytes_per_second: Option<u32>,
     /// Bytes per second of the last complete round. `None` if no byte arrived in it.
     bytes_per_second: Option<u32>,
@@ -127,7 +129,7 @@ pub struct Search {
 #[derive(Clone, Copy, Debug)]
 struct Step {
     condition: StepCondition,
-    /// `None` if the port has no rate that can be set.
+    /// Baud rate of the step. `None` if the search cannot set the baud rate of the port.
     rate: Option<u32>,
     action: StepAction,
 }
@@ -135,64 +137,67 @@ struct Step {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum StepCondition {
     Always,
-    /// Bytes have arrived in this round, or the search has not listened in it because the port cannot have the rates.
+    /// Bytes have arrived in this round. Also holds at the start of a round, because the port has rejected the rates of
+    /// all earlier steps.
     Bytes,
-    /// The line looks like that of the remembered scanner, or is silent.
+    /// A request to the scanner in `memory` was sent in this round, no byte has arrived, or the bytes look like a
+    /// stream.
     KnownScanner,
-    /// No request to the remembered scanner was sent in this round.
+    /// No request to the scanner in `memory` was sent in this round.
     NotRequested,
 }
 
 #[derive(Clone, Copy, Debug)]
 enum StepAction {
-    /// Listens for this time, and longer by the second time if a transmission has begun.
+    /// Listens for the first duration, and up to the second duration longer if a transmission has begun.
     Listen(Nanos, Nanos),
-    /// Sends the request of the probe with this number.
+    /// Sends the request of the probe with this index.
     Request(usize),
 }
 
 #[derive(Clone, Copy, Debug)]
 enum Phase {
-    /// Waits for bytes until `until`, or for the end of a transmission that has begun until `at_most`.
+    /// The search listens until `until`. If a transmission has begun, it listens until `at_most` at the latest.
     Listening { until: Nanos, at_most: Nanos },
-    /// Waits until the request of `ask` may be sent.
+    /// The search waits until it may send the request of `ask`.
     Settling { ask: RequestState, until: Nanos },
-    /// The bytes of the request leave.
+    /// The search sends the bytes of the request.
     Sending { ask: RequestState, outgoing: OutgoingRequest },
-    /// Waits for the end of the stream that the request has stopped.
+    /// The search waits for the end of the stream that the stop request has stopped.
     Draining { ask: RequestState, until: Nanos, at_most: Nanos },
-    /// Waits for the reply, as [`Phase::Listening`].
+    /// The search waits for the reply, with deadlines as in [`Phase::Listening`].
     Awaiting { ask: RequestState, until: Nanos, at_most: Nanos },
-    /// Waits between two rounds. A byte ends the pause.
+    /// The search waits between two rounds. A byte ends the pause.
     Pausing { until: Nanos },
 }
 
-/// Requests of one step.
+/// State of the requests of one step.
 #[derive(Clone, Copy, Debug)]
 struct RequestState {
     probe: usize,
     steps: &'static RequestSteps,
-    /// Number of repetitions of the request that are left.
+    /// Remaining repetitions of the request.
     repeats: u8,
-    /// Number of repetitions that are left for damaged replies.
+    /// Remaining repetitions of the request after damaged replies.
     retries: u8,
-    /// Whether the request that leaves stops a stream.
+    /// Whether the request being sent is the one that stops a stream.
     is_stop: bool,
 }
 
-/// A request, and the number of its bytes that were sent. They are sent one by one if the scanner requires gaps.
+/// Request that is being sent, with the number of its sent bytes. If the scanner requires gaps, bytes are sent one by
+/// one.
 #[derive(Clone, Copy, Debug)]
 struct OutgoingRequest {
     request: &'static [u8],
     sent: usize,
     not_before: Nanos,
-    /// Time of the last byte.
+    /// Time at which the last byte was sent.
     sent_at: Nanos,
     restarts: u8,
 }
 
 impl Search {
-    /// Returns the rate at which the port has to be open, in bits per second.
+    /// Returns the baud rate at which the port must be opened, in bits per second.
     pub fn opening_rate(memory: Option<Memory>) -> u32 {
         let probes = probes();
         let first =
@@ -201,7 +206,7 @@ impl Search {
         memory.map(|memory| memory.stream_rate).or(first).unwrap_or(BOOT_RATE)
     }
 
-    /// Creates a search on a port that was opened at `now`, with the [`opening_rate`](Self::opening_rate).
+    /// Creates a search on a port that was opened at `now`, at the [`opening_rate`](Self::opening_rate).
     pub fn new(port: PortKind, memory: Option<Memory>, now: Nanos) -> Search {
         let probes = probes();
         let mut search = Search {
@@ -234,7 +239,8 @@ impl Search {
         search
     }
 
-    /// Requests the [`opening_rate`](Self::opening_rate) first, because the port is open at another rate.
+    /// Makes the search set the [`opening_rate`](Self::opening_rate) first, for a port that is open at another baud
+    /// rate.
     pub fn with_rate_change(mut self) -> Search {
         self.change_rate = self.rate.is_some();
         self
@@ -247,18 +253,18 @@ impl Search {
         self
     }
 
-    /// Returns the scanner, once it is found.
+    /// Returns the scanner that the search has found.
     pub fn found(&self) -> Option<FoundScanner> {
         self.found
     }
 
-    /// Returns the reads of the step in which the scanner was found: the time of each, and its bytes. Pass them to the
-    /// session of the family, before all later reads.
+    /// Returns the reads of the step in which the search found the scanner, each with its time and its bytes. Pass them
+    /// to the family's session before any later read.
     pub fn reads(&self) -> impl Iterator<Item = (Nanos, &[u8])> {
         self.capture.reads()
     }
 
-    /// Returns the rate of the port, in bits per second. `None` if it is unknown.
+    /// Returns the baud rate of the port, in bits per second. Returns `None` if it is unknown.
     pub fn rate(&self) -> Option<u32> {
         self.rate.filter(|&rate| rate != UNKNOWN_RATE)
     }
@@ -268,7 +274,7 @@ impl Search {
         self.round
     }
 
-    /// Returns the rates at which it searches for each family, in the order of [`Family::ALL`].
+    /// Returns the baud rates at which the search tries to find each family, in the order of [`Family::ALL`].
     pub fn coverage(&self) -> Vec<Coverage> {
         let approach_of = |family| {
             self.probes.iter().map(|probe| probe.approach()).find(|approach| approach.family == family)
@@ -282,13 +288,13 @@ impl Search {
         coverage.collect()
     }
 
-    /// Returns the counters. The bytes in [`reads`](Self::reads) count as buffered.
+    /// Returns the counters of the search. The bytes in [`reads`](Self::reads) count as buffered.
     pub fn stats(&self) -> SessionStats {
         let buffered = self.capture.len() as u64;
         SessionStats { read: self.read, discarded: self.read - buffered, buffered, ..SessionStats::default() }
     }
 
-    /// Returns why no scanner is found yet. `None` in the first two rounds.
+    /// Returns the reason why the search has not found a scanner. Returns `None` in the first two rounds.
     pub fn problem(&self) -> Option<Problem> {
         if self.round < 2 || self.found.is_some() {
             return None;
@@ -303,7 +309,7 @@ impl Search {
         Some(Problem::Silent { seconds, is_possible: Family::ALL.map(has_rates) })
     }
 
-    /// Ends the search if a family recognizes its scanner.
+    /// Ends the search if a probe has recognized a scanner.
     fn check_evidence(&mut self) {
         for probe in &self.probes {
             let approach = probe.approach();
@@ -353,12 +359,12 @@ impl Search {
         }
     }
 
-    /// Whether a reply to the request of this probe may have been damaged. The end of one that has begun is missing.
+    /// Returns whether the reply to the request of this probe was damaged, or has begun and is incomplete.
     fn is_damaged(&self, probe: usize) -> bool {
         matches!(self.probes[probe].evidence(), Evidence::Damaged | Evidence::Partial)
     }
 
-    /// Waits a little longer, but no longer than `at_most`, if a transmission has begun. Returns whether it has.
+    /// Extends the wait a little, up to `at_most`, if a transmission has begun. Returns whether one has begun.
     fn extend(&mut self, until: Nanos, at_most: Nanos) -> bool {
         let mut probes = self.probes.iter().filter(|probe| listens_at(probe.approach(), self.rate));
         if self.now >= at_most || !probes.any(|probe| probe.evidence() == Evidence::Partial) {
@@ -371,7 +377,7 @@ impl Search {
         true
     }
 
-    /// Stores the bytes per second of a step that listened.
+    /// Stores the bytes per second of a step that has listened.
     fn note_rate(&mut self) {
         let bytes = self.read - self.step_read;
         if bytes > 0 {
@@ -379,7 +385,7 @@ impl Search {
         }
     }
 
-    /// Starts the next step, or ends the round.
+    /// Starts the next step that applies, or ends the round.
     fn advance(&mut self) {
         while let Some(&step) = self.steps.get(self.entered) {
             self.entered += 1;
@@ -469,12 +475,13 @@ impl Search {
         self.advance();
     }
 
-    /// Pauses if no byte has arrived in the round, except after the first one.
+    /// Ends the round, and starts the pause after it. There is no pause if a byte has arrived, or after the first
+    /// round.
     fn end_round(&mut self) {
         let bytes = self.read - self.round_read;
         let mean = per_second(bytes, self.now.saturating_sub(self.round_began));
         let measured = (bytes > 0).then_some(self.step_bytes_per_second.unwrap_or(mean));
-        // A number that is about the same stays, so that its message does.
+        // Keep a number that is about the same, so that the message does not change.
         let is_same = |old: &u32| measured.is_some_and(|new| new / 3 <= old / 2 && old / 3 <= new / 2);
         self.bytes_per_second = self.bytes_per_second.filter(is_same).or(measured);
         let pause = if bytes == 0 { PAUSES[self.round.min(PAUSES.len() - 1)] } else { 0 };
@@ -490,7 +497,7 @@ impl Search {
         self.phase = Phase::Pausing { until: self.now + pause };
     }
 
-    /// Whether slow scanners have more time in this round.
+    /// Returns whether slow scanners have more time in this round.
     fn is_slow_round(&self) -> bool {
         self.round % 2 == 1
     }
@@ -574,7 +581,7 @@ impl Search {
         self.probes[number].approach().family
     }
 
-    /// Returns the rates at which the search sends requests of a family, the remembered ones first.
+    /// Returns the baud rates at which the search sends requests of a family, those in `memory` first.
     fn rates(&self, number: usize) -> Vec<u32> {
         let approach = self.probes[number].approach();
         let mut rates = approach.request_steps.map_or_else(Vec::new, |asks| asks.rates.to_vec());
@@ -631,7 +638,7 @@ impl Protocol for Search {
 
     fn handle_transmitted(&mut self, now: Nanos) {
         self.now = now;
-        // The rate of a server is unknown, so its bytes are sent at the slowest pace.
+        // The baud rate of a serial server is unknown, so assume the slowest one.
         let byte_time = line_time(1, self.rate.unwrap_or(BOOT_RATE));
         let Phase::Sending { ask, outgoing } = &mut self.phase else { return };
         outgoing.transmitted(now, byte_time, ask.steps.gap);
@@ -685,8 +692,8 @@ impl Protocol for Search {
 }
 
 impl Memory {
-    /// Returns the memory with rates of its family, at which the search may send its requests. `None` if the rate of
-    /// the stream is not one.
+    /// Returns the memory if the search can use its baud rates for its family. Replaces an unknown reply rate by the
+    /// stream rate. Returns `None` if the stream rate is unknown.
     fn checked(self, probes: &[Box<dyn Probe>]) -> Option<Memory> {
         let approach =
             probes.iter().map(|probe| probe.approach()).find(|approach| approach.family == self.family)?;
@@ -703,8 +710,8 @@ impl OutgoingRequest {
         &self.request[self.sent..end]
     }
 
-    /// Continues after the next bytes were written at `now`. If it was too late, the scanner has dropped the request,
-    /// which then starts over.
+    /// Updates the state after the next bytes were written at `now`. If they were too late, the scanner has dropped the
+    /// request, so it starts over.
     fn transmitted(&mut self, now: Nanos, byte_time: Nanos, gap: Option<(Nanos, Nanos)>) {
         let Some((min_gap, max_gap)) = gap else {
             self.sent = self.request.len();
@@ -722,13 +729,13 @@ impl OutgoingRequest {
     }
 }
 
-/// Bytes of the present step, with the times of their reads.
+/// Captured bytes of the current step, with the times of their reads.
 #[derive(Clone, Debug, Default)]
 struct Capture {
     bytes: Vec<u8>,
-    /// Number of bytes that are stored.
+    /// Number of stored bytes.
     len: usize,
-    /// End of each read, and its time.
+    /// End of each read, as an index of the bytes, and its time.
     reads: Vec<(usize, Nanos)>,
 }
 
@@ -738,7 +745,7 @@ impl Capture {
         &mut self.bytes[self.len..self.len + READ_LEN]
     }
 
-    /// Adds a read of `len` bytes, and returns how many old ones were removed to make room for the next read.
+    /// Adds a read of `len` bytes. Returns the number of old bytes that were removed to make room for the next read.
     fn commit(&mut self, now: Nanos, len: usize) -> usize {
         self.len += len;
         self.reads.push((self.len, now));
@@ -747,7 +754,7 @@ impl Capture {
         surplus
     }
 
-    /// Removes the first `len` bytes.
+    /// Removes the first `len` bytes, and the reads that end in them.
     fn discard(&mut self, len: usize) {
         self.bytes.copy_within(len..self.len, 0);
         self.len -= len;
@@ -773,7 +780,7 @@ impl Capture {
 }
 
 impl Problem {
-    /// Returns the message for the user of `port`.
+    /// Returns the message for the user of `port`, with the remedy.
     pub fn message(self, port: &str) -> String {
         match self {
             Problem::Silent { .. } => self.to_string(),
@@ -808,7 +815,7 @@ impl fmt::Display for Problem {
     }
 }
 
-/// Returns whether scanners of a family may use `rate`. All may at a port whose rate is unknown.
+/// Returns whether scanners of a family may use `rate`. If the rate is unknown, they may.
 fn listens_at(approach: &Approach, rate: Option<u32>) -> bool {
     let asks = approach.request_steps.map_or(&[][..], |asks| asks.rates);
     let mut rates = approach.listen_steps.iter().map(|listen| listen.rate).chain(asks.iter().copied());
@@ -822,31 +829,31 @@ fn per_second(bytes: u64, span: Nanos) -> u32 {
     ((exact + unit / 2) / unit * unit) as u32
 }
 
-/// Time after the open in which no byte is sent, so that a scanner that streams can be recognized first.
+/// Time after the open in which the search sends no byte, so that it can recognize a scanner that streams.
 const SILENT_AFTER_OPEN: Nanos = 150 * MILLIS;
-/// Duration of each step on a serial server.
+/// Duration of a step on a serial server.
 const SERVER_STEP_TIME: Nanos = 500 * MILLIS;
-/// Pauses after rounds without a byte, by the number of the round.
+/// Pauses after rounds without a byte, by the index of the round. The last one applies to all later rounds.
 const PAUSES: [Nanos; 4] = [0, 500 * MILLIS, 1_000 * MILLIS, 1_500 * MILLIS];
-/// Time from the first byte in a pause to the end of the pause: that of a boot message.
+/// Time from the first byte in a pause to the end of the pause. A boot message takes this time.
 const BOOT_MESSAGE_TIME: Nanos = 60 * MILLIS;
 /// Interval at which the search checks whether a transmission that has begun is complete.
 const EXTENSION_INTERVAL: Nanos = 20 * MILLIS;
-/// A byte that may leave within this time is passed to the driver at once.
+/// Time before its earliest moment at which a byte is passed to the driver, which waits for the rest.
 const TRANSMIT_AHEAD: Nanos = 5 * MILLIS;
-/// Number of times that a request is sent again because its reply may have been damaged.
+/// Number of times that the search sends a request again because its reply may have been damaged.
 const MAX_RETRIES: u8 = 2;
 /// Number of times that a request starts over because a byte was late.
 const MAX_RESTARTS: u8 = 3;
-/// Slowest rate, in bits per second. It sets the pace of requests where the rate is unknown.
+/// Lowest baud rate, in bits per second. It sets the speed of requests if the rate is unknown.
 const BOOT_RATE: u32 = 9_600;
-/// Stands for the rate of a port that has rejected a rate.
+/// Value of `rate` after the port has rejected a baud rate.
 const UNKNOWN_RATE: u32 = 0;
-/// Bytes of one step that are kept. The longest telegram has 814.
+/// Number of captured bytes that are kept. The longest telegram has 814.
 const CAPTURE_LEN: usize = 16 * 1_024;
-/// Bytes of one read: as many as a tty returns at once.
+/// Length of the buffer of one read. A tty returns no more bytes at once.
 const READ_LEN: usize = 4_096;
-/// Durations in messages. They are more than a minute apart, because each new message is logged.
+/// Durations in messages, in seconds. They differ by more than a minute, because the hub logs each new message.
 const MESSAGE_SECONDS: [u32; 7] = [10, 100, 300, 600, 1_800, 3_600, 36_000];
 
 #[cfg(test)]
@@ -865,7 +872,7 @@ mod tests {
         let late = 2 * (BYTE + 5 * MILLIS) + 1;
         outgoing.transmitted(late, BYTE, gap);
         assert_eq!((outgoing.sent, outgoing.not_before), (0, late + BYTE + 10 * MILLIS));
-        // Without end, the request would never be complete on a slow machine.
+        // Without a limit, the request would never be complete on a slow machine.
         outgoing.transmitted(late + 20 * MILLIS, BYTE, gap);
         outgoing.transmitted(late + 60 * MILLIS, BYTE, gap);
         assert_eq!(outgoing.sent, 2);

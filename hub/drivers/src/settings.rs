@@ -1,5 +1,5 @@
-//! Settings of a scanner: the keys of a configuration, and the settings of a session. A family lists the keys that only it has,
-//! and checks their values. A configuration adds the place of each key.
+//! Settings of a scanner: keys of a configuration, and the checked settings of a session. A family lists the keys that
+//! only it has, and checks their values. The crate `config` adds the position of each key in a file.
 
 use std::fmt;
 
@@ -10,7 +10,7 @@ use crate::line;
 use crate::line::family::Features;
 use crate::lms;
 
-/// Declares the keys, each with its name in a configuration, and the field that a request has for its value.
+/// Declares the keys, each with its name in a configuration and its field in a request.
 macro_rules! keys {
     ($($(#[doc = $doc:literal])+ $key:ident $name:literal $field:ident: $type:ty,)+) => {
         /// Key of a setting.
@@ -20,23 +20,23 @@ macro_rules! keys {
         }
 
         impl Key {
-            /// All keys.
+            /// All keys, in the order of declaration.
             pub const ALL: [Key; [$(Key::$key),+].len()] = [$(Key::$key),+];
 
-            /// Returns its name in a configuration.
+            /// Returns the name of the key in a configuration.
             pub fn name(self) -> &'static str {
                 match self { $(Key::$key => $name,)+ }
             }
         }
 
-        /// Settings that a user requests, before the family has checked them. Each value alone is valid.
+        /// Settings that a user requests, which the family has not checked yet. Each value is valid by itself.
         #[derive(Clone, Debug, Default, PartialEq)]
         pub struct SettingsRequest {
             $($(#[doc = $doc])+ pub $field: Option<$type>,)+
         }
 
         impl SettingsRequest {
-            /// Returns whether `key` is set.
+            /// Returns whether the request sets `key`.
             fn has(&self, key: Key) -> bool {
                 match key { $(Key::$key => self.$field.is_some(),)+ }
             }
@@ -45,17 +45,17 @@ macro_rules! keys {
 }
 
 keys! {
-    /// Name of the type that the scanner is expected to report.
+    /// Type that the scanner is expected to report.
     Type "type" expected_type: &'static str,
     /// Angle of view in degrees.
     Angle "angle" angle_deg: u16,
-    /// Angle between two beams in hundredths of a degree.
+    /// Angle between two beams, in hundredths of a degree.
     Resolution "resolution" resolution_cdeg: u16,
-    /// Unit of ranges in mm.
+    /// Unit of ranges, in millimeters.
     Unit "unit" unit_mm: u8,
-    /// Number of the measuring mode.
+    /// Number of the measurement mode.
     ModeNumber "mode" mode_number: u8,
-    /// Rate in bits per second.
+    /// Baud rate in bits per second.
     Baud "baud" baud: u32,
     /// Name of the model; `None` for [`AUTO`].
     Model "model" model: String,
@@ -63,27 +63,27 @@ keys! {
     Beams "beams" beams: usize,
     /// Name of the scan mode; `None` for [`AUTO`].
     ModeName "mode" mode: String,
-    /// Whether the motor stops while there are no subscribers.
+    /// Whether the motor stops while the sensor has no subscribers.
     Idle "idle" stop_when_idle: bool,
 }
 
 impl Key {
-    /// Returns whether every family accepts it with its default, [`AUTO`] or `run`.
+    /// Returns whether every family accepts the key with its default value, [`AUTO`] or `run`.
     fn has_default(self) -> bool {
         matches!(self, Key::Model | Key::Beams | Key::ModeName | Key::Idle)
     }
 }
 
-/// Value of a setting, as given.
+/// Value of a setting, as the user wrote it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Value<'a> {
     /// Text.
     Text(&'a str),
-    /// A whole number.
+    /// Whole number.
     Whole(i64),
-    /// Another number.
+    /// Number with a fraction.
     Number(f64),
-    /// Anything else, as it is written.
+    /// Value of any other type, as the user wrote it.
     Other(&'a str),
 }
 
@@ -98,14 +98,15 @@ impl fmt::Display for Value<'_> {
     }
 }
 
-/// A setting that is not valid, as text for a user.
+/// Reason why a setting is not valid, as text for the user.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Refusal {
-    /// Keys whose values cause the problem, the main one first. The others stand for it if it is not set.
+    /// Keys whose values cause the problem, the main one first. If it is not set, the next one that is set takes its
+    /// place.
     pub keys: Vec<Key>,
-    /// The problem, with the value.
+    /// Problem, with the value.
     pub what: String,
-    /// The remedy.
+    /// Remedy for the user.
     pub remedy: String,
 }
 
@@ -115,44 +116,47 @@ impl Refusal {
     }
 }
 
-/// Settings of a session, with names and numbers in place of a family's types. A family ignores what it does not have.
+/// Checked settings of a session. They are the same type for all families, so models and modes are names. A family
+/// ignores settings that it does not have.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Settings {
-    /// Name of one of the [`Features::models`]. `None`: the session finds it out.
+    /// Name of one of the [`Features::models`]. `None` if the session detects the model.
     pub model: Option<&'static str>,
-    /// Name of one of the [`Features::modes`]. `None`: the best one.
+    /// Name of one of the [`Features::modes`]. `None` if the session chooses the best one.
     pub mode: Option<&'static str>,
-    /// Number of beams of the grid. `None`: the model's number, at most [`max_beams`](Self::max_beams).
+    /// Number of beams of the grid. `None` for the model's number, up to [`max_beams`](Self::max_beams).
     pub beams: Option<usize>,
-    /// Maximum number of beams. `None`: the maximum of a grid.
+    /// Maximum number of beams. `None` for the maximum of a grid.
     pub max_beams: Option<usize>,
-    /// Angle of view in degrees and angle between two beams in hundredths of a degree. `None`: the family's usual ones.
+    /// Angle of view in degrees, and angle between two beams in hundredths of a degree. `None` for the family's
+    /// default.
     pub view: Option<(u16, u16)>,
-    /// Rate to stream at, in bits per second. `None`: that of the model or family.
+    /// Baud rate for the stream, in bits per second. `None` for the default of the model or family.
     pub baud: Option<u32>,
-    /// Name of the expected type. It is compared, never written.
+    /// Type that the scanner is expected to report. The session compares it and never changes the scanner's.
     pub expected_type: Option<&'static str>,
-    /// Expected unit of ranges in mm. It is compared, never written.
+    /// Expected unit of ranges, in millimeters. The session compares it and never changes the scanner's.
     pub unit_mm: Option<u8>,
-    /// Number of the mode that defines the meaning of values, for a recording that does not contain it.
+    /// Number of the measurement mode, which defines the meaning of values, for a recording that does not contain it.
     pub mode_number: Option<u8>,
-    /// Whether the port has one fixed rate and bytes do not arrive at the pace of a line, as with a serial server on
-    /// the network or a recording.
+    /// Whether the port has a fixed baud rate, and bytes do not arrive at the speed of a line. This applies to a serial
+    /// server on the network and to a recording.
     pub fixed_rate: bool,
-    /// Whether nothing can be sent, because the bytes are from a recording.
+    /// Whether the session cannot send, because the bytes come from a recording.
     pub listen_only: bool,
-    /// Whether the motor stops while there are no subscribers, if it [can](Features::can_stop_motor).
+    /// Whether the motor stops while the sensor has no subscribers, if the family [supports
+    /// it](Features::can_stop_motor).
     pub stop_when_idle: bool,
-    /// Whether a search has found the scanner. Its number of beams then follows what it reports.
+    /// Whether a search has found the scanner. The number of beams then depends on the data that the scanner reports.
     pub is_found: bool,
 }
 
 impl SettingsRequest {
-    /// Sets `key` to `value`. A name of a mode replaces a number, and a number a name.
+    /// Sets `key` to `value`. The name of a mode replaces a mode number, and the reverse.
     ///
     /// # Errors
     ///
-    /// Returns a refusal if no scanner can have this value.
+    /// Returns a refusal if the value is not valid for any scanner.
     pub fn set(&mut self, key: Key, value: Value<'_>) -> Result<(), Refusal> {
         let is_auto = matches!(value, Value::Text(text) if text.eq_ignore_ascii_case(AUTO));
         match (key, value) {
@@ -176,7 +180,7 @@ impl SettingsRequest {
         Ok(())
     }
 
-    /// Returns the keys that name a family, because only one has them. Each comes with its family and with its text in a
+    /// Returns the keys of this request that only one family has. Each comes with its family and its text for a
     /// message.
     pub fn family_keys(&self) -> impl Iterator<Item = (Key, Family, String)> {
         Key::ALL.into_iter().filter_map(|key| {
@@ -189,11 +193,11 @@ impl SettingsRequest {
         })
     }
 
-    /// Checks that some family has the model, if one is set.
+    /// Checks the model, if one is set.
     ///
     /// # Errors
     ///
-    /// Returns a refusal if no family has it.
+    /// Returns a refusal if no family has this model.
     pub fn check_model(&self) -> Result<(), Refusal> {
         let Some(model) = self.model.as_ref().filter(|model| family_of(model).is_none()) else {
             return Ok(());
@@ -211,11 +215,11 @@ impl SettingsRequest {
         Err(Refusal::new(&[Key::Model], format!("model = \"{model}\""), remedy))
     }
 
-    /// Returns the settings of a scanner of `family`.
+    /// Returns the settings of a session with a scanner of `family`.
     ///
     /// # Errors
     ///
-    /// Returns a refusal if the family does not have a setting, or not with this value.
+    /// Returns a refusal if the family does not have one of the settings, or does not support its value.
     pub fn check(&self, family: Family) -> Result<Settings, Refusal> {
         if self.stop_when_idle == Some(true) && !features(family).can_stop_motor {
             let what = format!("idle = \"stop\", and an {} cannot be told to rest", family.name());
@@ -226,7 +230,7 @@ impl SettingsRequest {
         Ok(settings)
     }
 
-    /// Refuses a key that only another family than `family` has.
+    /// Returns a refusal if the request sets a key that `family` does not have.
     fn check_keys(&self, family: Family, features: &Features) -> Result<(), Refusal> {
         let is_foreign = |key: &Key| self.has(*key) && !key.has_default() && !features.keys.contains(key);
         let Some(key) = Key::ALL.into_iter().find(is_foreign) else { return Ok(()) };
@@ -241,7 +245,8 @@ impl SettingsRequest {
         Err(Refusal::new(&[key], what, remedy))
     }
 
-    /// Returns the settings of a scanner of `family`, which has `features` with models.
+    /// Returns the settings for `family`, which has models in its `features`, after checking the names of the model and
+    /// the mode.
     pub(crate) fn check_models(&self, family: Family, features: &Features) -> Result<Settings, Refusal> {
         let mut settings = self.unchecked_settings();
         if let Some(model) = &self.model {
@@ -282,7 +287,7 @@ impl SettingsRequest {
 }
 
 impl Settings {
-    /// Returns the value of `key` in a configuration. `None` if it is not set and has no default.
+    /// Returns the value of `key` as in a configuration. Returns `None` if it is not set and has no default.
     pub fn value(&self, key: Key) -> Option<Value<'static>> {
         let whole = |number: u32| Value::Whole(number.into());
         match key {
@@ -303,30 +308,30 @@ impl Settings {
     }
 }
 
-/// Returns the family that alone has `key`.
+/// Returns the family that has `key`, if only one family has it.
 fn owning_family(key: Key) -> Option<Family> {
     Family::ALL.into_iter().find(|&family| features(family).keys.contains(&key))
 }
 
-/// Returns the family of the model called `model`. Each name belongs to one family.
+/// Returns the family with a model of this name. A name belongs to only one family.
 pub fn family_of(model: &str) -> Option<Family> {
     let has =
         |family: &Family| features(*family).models.iter().any(|known| known.name.eq_ignore_ascii_case(model));
     Family::ALL.into_iter().find(has)
 }
 
-/// Values of `idle`, and whether the motor then stops while there are no subscribers.
+/// Values of `idle`, each with whether the motor stops while the sensor has no subscribers.
 const IDLE_VALUES: [(&str, bool); 2] = [("run", false), ("stop", true)];
 
-/// Returns the refusal of a value that no scanner can have.
+/// Returns the refusal of a value that is not valid for any scanner.
 pub(crate) fn refusal(key: Key, value: Value<'_>, remedy: impl Into<String>) -> Refusal {
     Refusal::new(&[key], format!("{} = {value}", key.name()), remedy)
 }
 
-/// Returns the remedy that lists `names`.
+/// Returns a remedy that lists [`AUTO`] and `names`.
 pub fn auto_or(names: impl Iterator<Item = &'static str>) -> String {
     format!("{AUTO}, or one of: {}", names.collect::<Vec<_>>().join(", "))
 }
 
-/// The hub or the session detects or chooses the value.
+/// Value that lets the hub or the session detect or choose the setting.
 pub const AUTO: &str = "auto";

@@ -1,47 +1,49 @@
-//! Packets of the scanners, which all have 47 bytes and 12 points, in both directions (source: the manuals of LD06 and LD19,
-//! "data packet format"). The framer finds them in a stream that may lack bytes, and never discards an intact one.
+//! Packet format of LDROBOT scanners, with its encoder, its decoder and its framer. Every packet has 47 bytes and 12
+//! points (source: the manuals of LD06 and LD19, "data packet format"). The framer finds packets in a stream that may
+//! lack bytes, and never discards an intact one.
 
 use scanhub_schema::{MILLIS, Nanos};
 
 use crate::line::framing::FrameCheck;
 use crate::line::{self, Buffer, Point, suspect};
 
-/// Bytes of a packet.
+/// Length of a packet, in bytes.
 pub const PACKET_LEN: usize = 47;
-/// Points of a packet.
+/// Number of points in a packet.
 pub const POINTS_PER_PACKET: usize = 12;
-/// What every packet begins with: the start byte, and kind and number of points.
+/// First two bytes of every packet: the start byte, and the byte with the kind of packet and the number of points.
 pub const HEADER: [u8; 2] = [0x54, 0x2C];
-/// A turn in the packet's unit of angles, a hundredth of a degree.
+/// Angle of a revolution, in hundredths of a degree, which is the unit of angles in a packet.
 pub const FULL_CIRCLE: u16 = 36_000;
-/// The milliseconds of a packet begin again after so many.
+/// Period of the clock in packets, in milliseconds. The clock then restarts at 0.
 pub const CLOCK_PERIOD_MS: u16 = 30_000;
-/// The widest angle of a packet: a head that measures slower than it turns by so much is none.
+/// Maximum angle from the first to the last point of a packet, in hundredths of a degree. Bytes with a larger angle are
+/// not a packet.
 const MAX_SPAN: u16 = 4_500;
-/// The greatest range; greater values are codes.
+/// Maximum range in millimeters. Greater values are codes.
 pub const MAX_RANGE: u16 = 0xFFEF;
 
-/// A packet whose checksum is right and whose angles are angles.
+/// Packet whose checksum is right and whose angles are valid.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Packet<'a> {
     bytes: &'a [u8; PACKET_LEN],
 }
 
-/// Why bytes that begin like a packet are none.
+/// Reason why bytes that begin with a header are not a packet.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Reject {
     /// The checksum is wrong.
     Checksum,
-    /// The angles are none, or too far apart.
+    /// An angle is greater than 360 degrees, or the points cover too large an angle.
     Angle,
 }
 
 impl<'a> Packet<'a> {
-    /// The packet that `bytes` are.
+    /// Creates a packet from `bytes`.
     ///
     /// # Errors
     ///
-    /// They are none, for this reason.
+    /// Returns the reason why `bytes` are not a packet.
     pub fn check(bytes: &'a [u8; PACKET_LEN]) -> Result<Packet<'a>, Reject> {
         let packet = Packet { bytes };
         if bytes[..2] != HEADER || crc(&bytes[..PACKET_LEN - 1]) != bytes[PACKET_LEN - 1] {
@@ -55,54 +57,54 @@ impl<'a> Packet<'a> {
         }
     }
 
-    /// Returns the packet in bytes that [`Packet::check`] has accepted before.
+    /// Creates a packet from bytes that [`Packet::check`] has accepted before.
     pub(crate) fn assume_valid(bytes: &'a [u8; PACKET_LEN]) -> Packet<'a> {
         debug_assert!(Packet::check(bytes).is_ok());
         Packet { bytes }
     }
 
-    /// Its bytes.
+    /// Returns the bytes of the packet.
     pub fn bytes(&self) -> &'a [u8; PACKET_LEN] {
         self.bytes
     }
 
-    /// Speed of the head in degrees per second.
+    /// Returns the speed of the head in degrees per second.
     pub fn speed(&self) -> u16 {
         self.word(2)
     }
 
-    /// Angle of the first point in hundredths of a degree, clockwise.
+    /// Returns the angle of the first point in hundredths of a degree, clockwise.
     pub fn start(&self) -> u16 {
         self.word(4)
     }
 
-    /// From the first point to the last one, in hundredths of a degree.
+    /// Returns the angle from the first point to the last one, in hundredths of a degree.
     pub fn span(&self) -> u16 {
         ((u32::from(self.word(END_OFFSET)) + u32::from(FULL_CIRCLE) - u32::from(self.start()))
             % u32::from(FULL_CIRCLE)) as u16
     }
 
-    /// The scanner's clock in milliseconds, modulo [`CLOCK_PERIOD_MS`].
+    /// Returns the time of the scanner's clock in milliseconds, modulo [`CLOCK_PERIOD_MS`].
     pub fn millis(&self) -> u16 {
         self.word(END_OFFSET + 2) % CLOCK_PERIOD_MS
     }
 
-    /// Angle of point `i` in hundredths of a degree, clockwise, from the first point's on: of those between the first and
-    /// the last the packet does not tell more than that they lie evenly.
+    /// Returns the angle of point `i` in hundredths of a degree, clockwise. It may exceed [`FULL_CIRCLE`]. A packet
+    /// contains only the angles of its first and last point. The other points are evenly spaced between them.
     pub fn angle(&self, i: usize) -> f32 {
         f32::from(self.start()) + f32::from(self.span()) * i as f32 / (POINTS_PER_PACKET - 1) as f32
     }
 
-    /// Range in millimetres and intensity of point `i`; a range of 0 is no return.
+    /// Returns the range in millimeters and the intensity of point `i`. A range of 0 means no return.
     pub fn measured(&self, i: usize) -> (u16, u8) {
         let at = FIRST_POINT_OFFSET + 3 * i;
         (self.word(at), self.bytes[at + 2])
     }
 
-    /// Point `i`, in radians counter-clockwise.
+    /// Returns point `i`, with its angle in radians, counterclockwise.
     pub fn point(&self, i: usize) -> Point {
         let (range, intensity) = self.measured(i);
-        // The highest values are codes.
+        // Values above the maximum range are codes.
         let range = if (1..=MAX_RANGE).contains(&range) { range } else { line::NO_RETURN };
         Point { angle: self.angle(i) * -RADIANS_PER_UNIT, range, intensity }
     }
@@ -112,23 +114,23 @@ impl<'a> Packet<'a> {
     }
 }
 
-/// What a packet is made of.
+/// Values of a packet, from which [`PacketContents::encode`] creates its bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PacketContents {
-    /// Degrees per second.
+    /// Speed of the head in degrees per second.
     pub speed: u16,
-    /// Angle of the first point in hundredths of a degree.
+    /// Angle of the first point in hundredths of a degree, clockwise.
     pub start: u16,
-    /// Range in millimetres and intensity of each point.
+    /// Range in millimeters and intensity of each point.
     pub points: [(u16, u8); POINTS_PER_PACKET],
-    /// Angle of the last point in hundredths of a degree.
+    /// Angle of the last point in hundredths of a degree, clockwise.
     pub end: u16,
-    /// Milliseconds.
+    /// Time of the scanner's clock in milliseconds.
     pub millis: u16,
 }
 
 impl PacketContents {
-    /// The bytes of the packet.
+    /// Returns the bytes of the packet, including its checksum.
     pub fn encode(&self) -> [u8; PACKET_LEN] {
         let mut bytes = [0; PACKET_LEN];
         bytes[..2].copy_from_slice(&HEADER);
@@ -147,7 +149,7 @@ impl PacketContents {
     }
 }
 
-/// CRC-8 with the polynomial 4Dh, from 0, not reflected.
+/// Returns the CRC-8 of `bytes`, with the polynomial 4Dh, the initial value 0, and without reflection.
 pub fn crc(bytes: &[u8]) -> u8 {
     bytes.iter().fold(0, |crc, byte| CRC_TABLE[usize::from(crc ^ byte)])
 }
@@ -169,22 +171,23 @@ const CRC_TABLE: [u8; 256] = {
 
 const FIRST_POINT_OFFSET: usize = 6;
 const END_OFFSET: usize = FIRST_POINT_OFFSET + 3 * POINTS_PER_PACKET;
-/// Radians in a hundredth of a degree.
+/// Radians per hundredth of a degree.
 const RADIANS_PER_UNIT: f32 = core::f32::consts::PI / 18_000.0;
 
-/// Packets without anything between them, in the framer's buffer until the next bytes are committed.
+/// Consecutive packets without other bytes between them. They stay in the framer's buffer until the next bytes are
+/// committed.
 #[derive(Clone, Copy, Debug)]
 pub struct Span {
     at: usize,
     /// Number of packets.
     pub packets: usize,
-    /// Number of the first byte among all bytes committed, from 0.
+    /// Offset of the first byte, counted from the first committed byte.
     pub offset: u64,
-    /// Bits of [`suspect`]; 0 is clean.
+    /// Reasons why the first packet is suspect: bits of [`suspect`]; 0 means clean.
     pub reasons: u8,
 }
 
-/// The framer with its buffer.
+/// Framer of LDROBOT packets, with its buffer.
 #[derive(Clone, Debug)]
 pub struct Framer {
     pub(crate) buffer: Buffer<CAPACITY>,
@@ -218,7 +221,7 @@ impl line::framing::Format for Format {
 }
 
 impl Framer {
-    /// Returns the next packets, at most `most`. `None` until more bytes arrive.
+    /// Returns the next packets, at most `max_packets`. Returns `None` if the framer needs more bytes.
     pub fn advance(&mut self, max_packets: usize) -> Option<Span> {
         self.buffer.begin_check();
         loop {
@@ -240,18 +243,18 @@ impl Framer {
         Some(Span { at, packets, offset, reasons: if is_damaged { suspect::NEIGHBOUR } else { 0 } })
     }
 
-    /// Returns the bytes of the span that [`Framer::advance`] returned last.
+    /// Returns the bytes of `span`, which [`Framer::advance`] returned last.
     pub fn bytes(&self, span: Span) -> &[u8] {
         self.buffer.taken_bytes(span.at, span.packets * PACKET_LEN)
     }
 
-    /// Gives up all bytes that are still open, for example because the line's rate changes.
+    /// Discards all open bytes, for example because the baud rate changes.
     pub fn clear(&mut self) {
         self.buffer.clear();
         self.is_damaged = false;
     }
 
-    /// Discards the first open byte, and those after it up to the next one that may begin a packet.
+    /// Discards the first open byte, and the bytes after it up to the next one that may begin a packet.
     fn discard(&mut self, rejected: Option<Reject>) {
         if rejected == Some(Reject::Checksum) {
             self.buffer.reject_checksum();
@@ -263,16 +266,16 @@ impl Framer {
     }
 }
 
-/// Capacity of a tty for a late reader, and a part of a packet.
+/// Capacity of the buffer: the bytes that a tty can buffer while the hub does not read, and two incomplete packets.
 const CAPACITY: usize = 4_096 + 2 * PACKET_LEN;
-/// A packet takes 2.04 ms at 230,400 baud. After this time without a byte, none is in flight.
+/// Time without a byte after which no byte of a packet is in flight. A packet takes 2.04 ms at 230,400 baud.
 const HOLD_TIME: Nanos = 4 * MILLIS;
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// The packet that the manual of the LD06 explains.
+    /// Example packet from the manual of the LD06.
     const MANUAL: [u8; PACKET_LEN] = [
         0x54, 0x2C, 0x68, 0x08, 0xAB, 0x7E, 0xE0, 0x00, 0xE4, 0xDC, 0x00, 0xE2, 0xD9, 0x00, 0xE5, 0xD5, 0x00,
         0xE3, 0xD3, 0x00, 0xE4, 0xD0, 0x00, 0xE9, 0xCD, 0x00, 0xE4, 0xCA, 0x00, 0xE2, 0xC7, 0x00, 0xE9, 0xC5,

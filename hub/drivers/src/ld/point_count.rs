@@ -1,5 +1,5 @@
-//! Measures how many points a scanner measures per revolution. A head that spins up measures more of them, so only
-//! revolutions at a constant speed count.
+//! Measurement of the number of points per revolution. While a head spins up, it rotates more slowly and a revolution
+//! has more points. Only revolutions at a constant speed therefore count.
 
 use scanhub_schema::{MILLIS, Nanos};
 
@@ -7,31 +7,32 @@ use crate::ld::Model;
 use crate::ld::packet::{POINTS_PER_PACKET, Packet};
 use crate::ld::sequence::PacketPosition;
 
-/// The measurement, from packet to packet.
+/// Measurement in progress, updated with every packet.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct PointCount {
-    /// Packets in sequence.
+    /// Number of packets in sequence.
     packets: u32,
     revolution: Option<Revolution>,
     steady: Option<SteadySpeed>,
-    /// Time of the last packet, and degrees of its first point over all revolutions.
+    /// Time of the last packet in the scanner's clock; `angle` is the angle of its first point, in degrees over all
+    /// revolutions.
     time: Nanos,
     angle: f64,
 }
 
-/// A revolution that is being measured.
+/// Revolution that is being measured.
 #[derive(Clone, Copy, Debug)]
 struct Revolution {
-    /// Degrees at its start, over all revolutions.
+    /// Angle at its start, in degrees over all revolutions.
     angle: f64,
     packets: u32,
-    /// Sum of the speeds of those packets that arrived, and their number.
+    /// Sum of the speeds of the packets that arrived, in degrees per second, and the number of these packets.
     speeds: (f64, u32),
     slowest: u16,
     fastest: u16,
 }
 
-/// Revolutions with a constant speed.
+/// Consecutive revolutions at a constant speed.
 #[derive(Clone, Copy, Debug)]
 struct SteadySpeed {
     since: Nanos,
@@ -39,21 +40,21 @@ struct SteadySpeed {
     fastest: f64,
 }
 
-/// A complete revolution.
+/// Result for a complete revolution.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct CountedRevolution {
-    /// Packets in sequence up to its end.
+    /// Number of packets in sequence up to the end of the revolution.
     pub(crate) packets: u32,
     pub(crate) points_per_revolution: f64,
     pub(crate) revolutions_per_second: f64,
-    /// Duration for which the speed has been constant; 0 if it was not in this revolution.
+    /// Time for which the speed has been constant; 0 if the speed changed in this revolution.
     pub(crate) steady_time: Nanos,
-    /// Time of its end, by the scanner's clock.
+    /// Time at the end of the revolution, in the scanner's clock.
     pub(crate) at: Nanos,
 }
 
 impl PointCount {
-    /// Handles a packet at its place in the sequence. Returns the revolution that it completes.
+    /// Adds a packet at its position in the sequence. Returns the revolution that it completes.
     pub(crate) fn note_packet(
         &mut self,
         packet: &Packet<'_>,
@@ -85,8 +86,8 @@ impl PointCount {
         }
     }
 
-    /// Returns the model and its beams if a part of a revolution already is exactly as the model is sold: at the usual speed,
-    /// with the usual number of points.
+    /// Returns the model and its number of beams as soon as the first packets of a revolution match a model: the head
+    /// rotates at the model's usual speed and measures its usual number of points.
     pub(crate) fn typical_model(&self) -> Option<(Model, usize)> {
         let revolution = self.revolution.filter(|revolution| revolution.packets >= MIN_TYPICAL)?;
         let counted = revolution.count_until(self.angle);
@@ -113,13 +114,13 @@ impl PointCount {
 }
 
 impl Revolution {
-    /// Creates the revolution that begins with the first point of `packet`, at `angle`.
+    /// Creates a revolution that starts with the first point of `packet`, at `angle`.
     fn begin(packet: &Packet<'_>, angle: f64) -> Revolution {
         let speed = packet.speed();
         Revolution { angle, packets: 0, speeds: (f64::from(speed), 1), slowest: speed, fastest: speed }
     }
 
-    /// Returns the points up to a packet at `angle`.
+    /// Returns the result for the packets up to one whose first point is at `angle`.
     fn count_until(&self, angle: f64) -> CountedRevolution {
         let (sum, count) = self.speeds;
         let points_per_turn =
@@ -138,7 +139,7 @@ impl Revolution {
         f64::from(self.fastest) <= f64::from(self.slowest) * (1.0 + MAX_SPEED_VARIATION)
     }
 
-    /// Adds a packet that follows after `missing` others. Its points belong to the next packet's interval.
+    /// Adds a packet that follows `missing` missing ones. Its own points belong to the interval up to the next packet.
     fn add(&mut self, packet: &Packet<'_>, missing: u32) {
         let speed = packet.speed();
         self.packets += 1 + missing;
@@ -148,25 +149,26 @@ impl Revolution {
 }
 
 impl CountedRevolution {
-    /// Returns the model by the points per second, or one of the models that cannot be distinguished.
+    /// Returns the model that measures this number of points per second. If several models cannot be distinguished,
+    /// returns one of them.
     pub(crate) fn model(&self) -> Model {
         Model::of_point_rate((self.points_per_revolution * self.revolutions_per_second) as f32)
     }
 
-    /// Returns the number of beams for these points: that of the model, if it is close.
+    /// Returns the number of beams for these points. It is the model's number if the number of points is close to it.
     pub(crate) fn beams(&self) -> usize {
         let of_model = self.model().beams();
         let is_close = (self.points_per_revolution / of_model as f64 - 1.0).abs() <= MAX_COUNT_DEVIATION;
         if is_close { of_model } else { (self.points_per_revolution + 0.5) as usize }
     }
 
-    /// Returns whether the number of points is reliable. At another speed than that of its model, a head may still spin up,
-    /// slowly.
+    /// Returns whether the number of points is reliable. If the speed is not the usual one of the model, the head may
+    /// still be spinning up slowly, so the speed must be constant for longer.
     pub(crate) fn is_final(&self) -> bool {
         self.packets >= MIN_PACKETS && self.steady_time >= if self.is_usual() { 1 } else { SLOW_SPIN_UP_TIME }
     }
 
-    /// Returns whether the head rotates at the speed at which its model is sold.
+    /// Returns whether the head rotates at the usual speed of its model.
     fn is_usual(&self) -> bool {
         let usual_speed = f64::from(self.model().revolutions_per_second());
         (self.revolutions_per_second / usual_speed - 1.0).abs() <= MAX_SPEED_DEVIATION
@@ -178,17 +180,17 @@ impl CountedRevolution {
     }
 }
 
-/// Packets in sequence before a number of points is reliable.
+/// Minimum number of packets in sequence for a reliable number of points.
 const MIN_PACKETS: u32 = 64;
-/// Packets of a revolution that are enough if it is typical.
+/// Minimum number of packets of a revolution that can match a model.
 const MIN_TYPICAL: u32 = 16;
-/// More missing packets than these end a sequence: their number is uncertain.
+/// Maximum number of missing packets within a sequence. The count of more missing packets is uncertain.
 const MAX_MISSING: u32 = 8;
-/// Share by which a constant speed may vary. The speed of real heads varies by 1 %.
+/// Maximum variation of a constant speed, as a ratio. The speed of real scanners varies by 1 %.
 const MAX_SPEED_VARIATION: f64 = 0.02;
-/// Share by which a speed may differ from the usual one of the model.
+/// Maximum deviation of the speed from the usual speed of the model, as a ratio.
 const MAX_SPEED_DEVIATION: f64 = 0.015;
-/// Share by which the number of points may differ from the number of beams.
+/// Maximum deviation of the number of points from the number of beams, as a ratio.
 const MAX_COUNT_DEVIATION: f64 = 0.03;
-/// Duration for which an unusual speed must be constant.
+/// Time for which an unusual speed must be constant.
 const SLOW_SPIN_UP_TIME: Nanos = 3_000 * MILLIS;

@@ -1,22 +1,24 @@
-//! Position of a packet in its stream: the next one, one after a gap, a repetition, or an outlier. Angles, speed and
-//! milliseconds of two packets of one head have to agree, because a checksum of 8 bits alone does not prove a packet. The
-//! sequence counts the packets that are missing between two, and dates packets by the scanner's clock more finely than by
-//! its milliseconds. The clock, which starts at 0 with the scanner, also shows [restarts](Restarts).
+//! Position of each packet in its stream: the next packet, the first one after a gap, a repeated packet, or an outlier.
+//!
+//! An 8-bit checksum alone does not prove a packet, so the angles, the speed and the milliseconds of consecutive
+//! packets must also agree. The sequencer counts missing packets. It also computes times in the scanner's clock that
+//! are finer than the milliseconds of the packets. The clock starts at 0 with the scanner, so it also shows
+//! [restarts](Restarts).
 
 use scanhub_schema::{MILLIS, Nanos};
 
 use crate::ld::packet::{CLOCK_PERIOD_MS, FULL_CIRCLE, POINTS_PER_PACKET, Packet};
 
-/// The packets of one stream.
+/// State of a stream: its last packet, its rate of points, and its packet counters.
 #[derive(Clone, Debug)]
 pub(crate) struct PacketSequencer {
     last: Option<LastPacket>,
-    /// One that did not belong there: the next one may tell that it did.
+    /// Last packet that did not continue the sequence. The next packet may continue it.
     outlier: Option<LastPacket>,
-    /// Of those in a row.
+    /// Number of consecutive outliers.
     outliers: u32,
     points_per_second: f32,
-    /// Packets that it was learned from.
+    /// Number of packets from which `points_per_second` was estimated, up to [`WINDOW_PACKETS`].
     learned_packets: u32,
     received: u64,
     lost: u64,
@@ -28,42 +30,43 @@ struct LastPacket {
     span: u16,
     speed: u16,
     millis: u16,
-    /// Degrees of the first point, clockwise over all turns.
+    /// Angle of the first point, in degrees clockwise over all revolutions.
     angle: f64,
-    /// The scanner's clock since the sequence began, in whole milliseconds and as fine as it is known.
+    /// Time of the last point in the scanner's clock. `whole` has whole milliseconds, and `time` is the best estimate.
     whole: Nanos,
     time: Nanos,
 }
 
-/// The place of a packet in its stream.
+/// Position of a packet in its stream.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum PacketPosition {
-    /// A new sequence begins with it, and with it a new clock.
+    /// The packet starts a new sequence, with a new clock.
     First {
-        /// When its last point was measured, by the scanner's clock.
+        /// Time of the packet's last point, in the scanner's clock.
         time: Nanos,
-        /// Degrees of its first point, clockwise over all turns.
+        /// Angle of the packet's first point, in degrees clockwise over all revolutions.
         angle: f64,
     },
-    /// It goes on.
+    /// The packet continues the sequence.
     Next {
         /// As in [`PacketPosition::First`].
         time: Nanos,
         /// As in [`PacketPosition::First`].
         angle: f64,
-        /// Packets between the last one and this one.
+        /// Number of packets that are missing between the previous packet and this one.
         missing: u32,
-        /// Where the last one's last point was.
+        /// Angle of the previous packet's last point, in degrees clockwise over all revolutions.
         from: f64,
     },
-    /// The last one came again.
+    /// The packet equals the previous one.
     Repeated,
-    /// It does not belong here.
+    /// The packet does not fit into the sequence.
     Outlier,
 }
 
 impl PacketPosition {
-    /// When its last point was measured, by the scanner's clock; nothing if that is not known.
+    /// Returns the time of the packet's last point, in the scanner's clock. Returns `None` for a packet that is not
+    /// part of the sequence.
     pub(crate) fn time(self) -> Option<Nanos> {
         match self {
             PacketPosition::First { time, .. } | PacketPosition::Next { time, .. } => Some(time),
@@ -72,11 +75,11 @@ impl PacketPosition {
     }
 }
 
-/// How a packet follows another one.
+/// Difference between two packets of a sequence.
 struct PacketStep {
-    /// 1 for the next one; 0 for the same.
+    /// Number of packets from the first to the second: 1 if the second one is next, 0 if both are the same.
     packets: u32,
-    /// Between their first points.
+    /// Angle between their first points, in hundredths of a degree.
     advance: f32,
     millis: u16,
 }
@@ -94,22 +97,24 @@ impl PacketSequencer {
         }
     }
 
-    /// The stream ended: the next packet is the first one of another.
+    /// Ends the stream. The next packet starts a new sequence.
     pub(crate) fn end(&mut self) {
         (self.last, self.outlier, self.outliers, self.learned_packets) = (None, None, 0, 0);
     }
 
-    /// Points that the scanner measures in a second; nothing before enough packets told.
+    /// Returns the number of points that the scanner measures per second. Returns `None` until enough packets have
+    /// arrived.
     pub(crate) fn points_per_second(&self) -> Option<f32> {
         (self.learned_packets >= LEARNING_PACKETS).then_some(self.points_per_second)
     }
 
-    /// Nanoseconds from one point to the next, as far as they are known.
+    /// Returns the estimated time from one point to the next, in nanoseconds; 0 if it is unknown.
     pub(crate) fn point_ns(&self) -> f32 {
         if self.learned_packets > 0 { 1e9 / self.points_per_second } else { 0.0 }
     }
 
-    /// Returns the last known time from one packet to the next, in nanoseconds. It outlives its stream; 0 is unknown.
+    /// Returns the last known time from one packet to the next, in nanoseconds; 0 if it is unknown. The value stays
+    /// after the stream has ended.
     pub(crate) fn packet_ns(&self) -> f64 {
         if self.points_per_second > 0.0 {
             POINTS_PER_PACKET as f64 * 1e9 / f64::from(self.points_per_second)
@@ -118,12 +123,12 @@ impl PacketSequencer {
         }
     }
 
-    /// Packets that came, and those that did not although the ones before and after them did.
+    /// Returns the number of packets that arrived, and the number of missing packets between them.
     pub(crate) fn received_and_lost(&self) -> (u64, u64) {
         (self.received, self.lost)
     }
 
-    /// `packet` came.
+    /// Returns the position of the next received packet, and counts it.
     pub(crate) fn locate(&mut self, packet: &Packet<'_>) -> PacketPosition {
         self.received += 1;
         let Some(last) = self.last else { return self.locate_first(packet) };
@@ -157,7 +162,7 @@ impl PacketSequencer {
         }
         let whole = last.whole + Nanos::from(step.millis) * MILLIS;
         let passed = self.point_ns() * (POINTS_PER_PACKET as u32 * step.packets) as f32;
-        // The milliseconds are cut off, and points come evenly.
+        // The clock in packets is truncated to milliseconds, but points are evenly spaced in time.
         let time = (last.time + passed as Nanos).clamp(whole, whole + MILLIS - 1);
         self.lost += u64::from(missing.saturating_sub(self.outliers));
         (self.outlier, self.outliers) = (None, 0);
@@ -168,14 +173,14 @@ impl PacketSequencer {
         PacketPosition::Next { time, angle, missing, from: last.angle + f64::from(last.span) / 100.0 }
     }
 
-    /// How `packet` follows `last`; nothing if it cannot.
+    /// Returns the difference from `last` to `packet`. Returns `None` if `packet` does not fit into the sequence.
     fn step_from(&self, last: &LastPacket, packet: &Packet<'_>) -> Option<PacketStep> {
         let (full_circle, clock_turn) = (f32::from(FULL_CIRCLE), u32::from(CLOCK_PERIOD_MS));
         let millis = ((u32::from(packet.millis()) + clock_turn - u32::from(last.millis)) % clock_turn) as u16;
         if millis > MAX_GAP_MS || packet.span().abs_diff(last.span) > last.span / 4 + 30 {
             return None;
         }
-        // Hundredths of a degree in a millisecond.
+        // Speed in hundredths of a degree per millisecond.
         let speed = f32::from(last.speed) / 10.0;
         let expected = speed * f32::from(millis);
         let off = (f32::from(packet.start()) - f32::from(last.start) - expected) % full_circle;
@@ -187,7 +192,7 @@ impl PacketSequencer {
         let advance = expected + off;
         let packet_angle = f32::from(last.span) * POINTS_PER_PACKET as f32 / (POINTS_PER_PACKET - 1) as f32;
         let packets = match self.points_per_second() {
-            // Over a long time the clock knows better how many there were.
+            // Over a long gap, the clock gives the number of packets more exactly than the angles.
             Some(rate) if millis >= LONG_GAP_MS => {
                 f32::from(millis) * rate / (1_000 * POINTS_PER_PACKET) as f32
             }
@@ -197,7 +202,7 @@ impl PacketSequencer {
         Some(PacketStep { packets: (packets + 0.5).max(0.0) as u32, advance, millis })
     }
 
-    /// How many points a head measures in a second that turns so fast, so far apart.
+    /// Updates the estimate of the points per second with the speed of `packet` and the angle between its points.
     fn estimate_rate(&mut self, packet: &Packet<'_>) {
         if packet.span() == 0 || packet.speed() == 0 {
             return;
@@ -224,27 +229,29 @@ impl LastPacket {
     }
 }
 
-/// Packets that tell how many points there are in a second, and those of which the mean counts.
+/// Number of packets after which the rate of points is known; below it, the number of packets in the moving average.
 const LEARNING_PACKETS: u32 = 16;
 const WINDOW_PACKETS: u32 = 256;
-/// Over so many milliseconds packets are counted by the clock: a turn's tenth and more.
+/// Gap in milliseconds from which on packets are counted by the clock. It is a tenth of a revolution or more.
 const LONG_GAP_MS: u16 = 30;
-/// A session without a packet begins again after a second: what comes later is something new.
+/// Maximum gap within a sequence, in milliseconds. A session restarts after one second without a packet, so a later
+/// packet belongs to a new stream.
 const MAX_GAP_MS: u16 = 1_500;
 
-/// The restarts of one scanner.
+/// Detector that counts the restarts of a scanner.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Restarts {
-    /// Milliseconds of the last packet of a sequence, and the hub's time at which it had arrived.
+    /// Clock of the last packet of a sequence in milliseconds, and the hub's time at which the packet had arrived.
     last: Option<(u16, Nanos)>,
-    /// Whether the sequence that has just begun does not fit the one before it. Its second packet confirms it.
+    /// Whether the new sequence does not fit the previous one. The second packet of the new sequence confirms the
+    /// restart.
     is_suspected: bool,
     pub(crate) count: u64,
 }
 
 impl Restarts {
-    /// Notes the first packet of a sequence with its milliseconds. It arrived between the times of `arrival`, which are
-    /// `None` if they are unknown.
+    /// Handles the first packet of a sequence, whose clock shows `millis`. `arrival` has the earliest and the latest
+    /// time at which the packet can have arrived. It is `None` if these are unknown.
     pub(crate) fn note_first(&mut self, millis: u16, arrival: Option<(Nanos, Nanos)>) {
         let known = self.last.zip(arrival);
         self.is_suspected = known.is_some_and(|((last, at), (earliest, latest))| {
@@ -253,15 +260,15 @@ impl Restarts {
         });
     }
 
-    /// Notes a packet that follows another one in its sequence, with its milliseconds and the time `at` which it had arrived.
+    /// Handles a packet that continues a sequence. Its clock shows `millis`, and it had arrived at `at`.
     pub(crate) fn note_next(&mut self, millis: u16, at: Nanos) {
         self.count += u64::from(core::mem::take(&mut self.is_suspected));
         self.last = Some((millis, at));
     }
 }
 
-/// Returns whether a clock that showed `last` milliseconds began again and then showed `millis`, between `least` and `most`
-/// nanoseconds later.
+/// Returns whether a scanner's clock restarted between two packets. It showed `last` milliseconds first, and `millis`
+/// milliseconds after a time between `min_passed` and `max_passed` nanoseconds.
 fn has_restarted(last: u16, millis: u16, (min_passed, max_passed): (Nanos, Nanos)) -> bool {
     let clock_period = Nanos::from(CLOCK_PERIOD_MS) * MILLIS;
     let tolerance = ARRIVAL_JITTER + max_passed / DRIFT_DIVISOR;
@@ -272,9 +279,9 @@ fn has_restarted(last: u16, millis: u16, (min_passed, max_passed): (Nanos, Nanos
     began_since && continued > max_passed + tolerance
 }
 
-/// Error of a time of arrival, and of milliseconds that are cut off.
+/// Maximum error of an arrival time and of truncated milliseconds.
 const ARRIVAL_JITTER: Nanos = 30 * MILLIS;
-/// Two clocks differ by at most one part in this many.
+/// Inverse of the maximum drift between two clocks.
 const DRIFT_DIVISOR: Nanos = 100;
 
 #[cfg(test)]
@@ -282,7 +289,7 @@ mod tests {
     use super::*;
     use crate::ld::packet::{PACKET_LEN, PacketContents};
 
-    /// Packet number `n` of a head that turns 10 times and measures 4500 points a second.
+    /// Returns packet number `n` of a scanner that rotates 10 times and measures 4500 points per second.
     fn packet(n: u32) -> [u8; PACKET_LEN] {
         let start = n * 960;
         PacketContents {
@@ -406,11 +413,11 @@ mod tests {
 
     #[test]
     fn bytes_that_waited_in_the_host_are_not_a_restart() {
-        // A host that stood still for 9 s read then what was measured at some time since.
+        // The host was stopped for 9 s and then read a packet that was measured at some time in between.
         for advance in [100, 2_000, 8_900] {
             assert!(!has_restarted(1_000, 1_000 + advance, (0, 9 * SECOND)), "{advance}");
         }
-        // A host that was suspended: its own clock did not count that time.
+        // The host was suspended, so its own clock did not count the time.
         assert!(!has_restarted(1_000, 17_000, after(500 * MILLIS)));
     }
 

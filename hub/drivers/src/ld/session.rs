@@ -1,5 +1,5 @@
-//! The session with an LDROBOT scanner, which streams without a request. The session only receives: at the model's
-//! rate, or at both rates in turn until packets arrive. It learns how many points the scanner measures per second, and
+//! Session with an LDROBOT scanner, which streams without a request. The session only receives. It listens at the
+//! model's baud rate, or at both rates in turn until packets arrive. It measures the number of points per second, and
 //! returns packets as they arrive, and revolutions.
 
 use core::fmt;
@@ -17,43 +17,43 @@ use crate::line::{
 };
 use crate::settings::Settings;
 
-/// The session with one scanner.
+/// Session with an LDROBOT scanner.
 #[derive(Clone, Debug)]
 pub struct LdSession {
     settings: Settings,
     framer: Framer,
     reads: ReadScheduler,
     clock: SensorClock,
-    /// If a new sequence began within the packets that were returned last: the number of its first packet among them,
-    /// and the clock of the packets before.
+    /// Index of the first packet of a new sequence among the packets returned last, and the clock of the packets before
+    /// it. `None` if no sequence started in these packets.
     clock_before: Option<(usize, SensorClock)>,
     sequencer: PacketSequencer,
     revolutions: RevolutionAssembler<MAX_POINTS>,
-    /// Pace of the packet whose points were added last.
+    /// Speed of the head in the packet whose points were added last.
     rotation_rate: Option<RotationRate>,
     phase: Phase,
     baud: u32,
     change_baud: bool,
     point_count: PointCount,
-    /// Model and number of beams by the points that the scanner measures, once they are known. A power cycle does not
-    /// change them.
+    /// Model and number of beams according to the measured points. A power cycle does not change them.
     measured: Option<(Model, usize)>,
-    /// Time since which packets have arrived without a decision about the number of beams.
+    /// Time from which packets have arrived without a decision about the number of beams.
     undecided_since: Nanos,
-    /// Another number of beams, which the points have required since this time of the scanner's clock.
+    /// Different number of beams that fits the recent revolutions, and the time of the scanner's clock at which they
+    /// started.
     other_beams: Option<(usize, Nanos)>,
-    /// The last change of the number of beams, and until when it is reported.
+    /// Last change of the number of beams, and the time until which the session reports it.
     beams_change: Option<(Problem, Nanos)>,
-    /// Number of beams, once it is known.
+    /// Number of beams of a scan.
     beams: Option<usize>,
-    /// Whether the points per second of this stream are known.
+    /// Whether the number of points per second of this stream is known.
     is_rate_known: bool,
     scanner_time: Option<Nanos>,
-    /// Packets that were returned and whose points are not in revolutions yet.
+    /// Returned packets whose points have not been added to revolutions yet.
     current: Option<PendingPackets>,
     now: Nanos,
     problem: Option<Problem>,
-    /// Time since which no packet has arrived.
+    /// Time from which no packet has arrived.
     no_packet_since: Nanos,
     counters: StreamCounters,
     restarts: Restarts,
@@ -61,27 +61,27 @@ pub struct LdSession {
 
 #[derive(Clone, Copy, Debug)]
 enum Phase {
-    /// No packets yet. At `next_at` the session tries another rate.
+    /// No packet has arrived. At `next_at` the session changes to the other baud rate.
     Listening { shown: State, next_at: Nanos },
-    /// Packets arrive.
+    /// Packets are arriving.
     Streaming(Watchdog),
-    /// A user paused the session.
+    /// A user has paused the session.
     Paused,
 }
 
-/// Packets whose points are being added to revolutions.
+/// Packets whose points the session adds to revolutions.
 #[derive(Clone, Copy, Debug)]
 struct PendingPackets {
     span: Span,
     positions: [PacketPosition; MAX_PACKETS_PER_SAMPLE],
-    /// Number of the first packet that is not finished.
+    /// Index of the first packet that is not finished.
     packet: usize,
-    /// Whether its points were added.
+    /// Whether the points of this packet were added.
     is_added: bool,
 }
 
 impl LdSession {
-    /// Creates a session on a port that is open at the rate of `settings`.
+    /// Creates a session on a port that is open at the baud rate of the model in `settings`, or at the default rate.
     pub fn new(settings: Settings, now: Nanos) -> Self {
         LdSession {
             settings,
@@ -112,18 +112,20 @@ impl LdSession {
         }
     }
 
-    /// Restores the model and the number of beams that an earlier session on the same port has measured. Call it before
-    /// the first read.
+    /// Restores the model and the number of beams that an earlier session measured on the same port. Call it before the
+    /// first read.
     pub fn restore_model(&mut self, model: Model, beams: usize) {
         self.measured = Some((model, beams));
     }
 
-    /// Returns the model, once it is known. Of models that cannot be distinguished, it is one.
+    /// Returns the model. If several models cannot be distinguished, returns one of them. Returns `None` while the
+    /// model is unknown.
     pub fn model(&self) -> Option<Model> {
         Model::of(&self.settings).or(self.measured.map(|(model, _)| model))
     }
 
-    /// Returns the number of beams for scans: that of the settings, of the model in the settings, or the measured one.
+    /// Returns the number of beams for scans. In this order, it is the number in the settings, the default of the
+    /// configured model, or the measured number.
     fn known_beams(&self) -> Option<usize> {
         let of_model = || Model::of(&self.settings).map(Model::beams);
         let measured = || self.measured.map(|(_, beams)| beams);
@@ -131,8 +133,9 @@ impl LdSession {
         Some(beams.min(self.settings.max_beams.unwrap_or(usize::MAX)))
     }
 
-    /// Handles the points of a revolution of a scanner without a configured model. The first reliable number of points
-    /// decides. Later, it must be different for a long time.
+    /// Updates the measured model and number of beams with a revolution, for a scanner without a configured model. The
+    /// first reliable number of points decides. Later, only a number that has been different for a long time changes
+    /// them.
     fn update_beams(&mut self, counted: CountedRevolution) {
         let Some((_, beams)) = self.measured else {
             self.measured = counted.is_final().then(|| (counted.model(), counted.beams()));
@@ -142,7 +145,7 @@ impl LdSession {
             self.other_beams = None;
             return;
         }
-        // The clock of a scanner that has restarted begins again.
+        // The clock of a scanner that has restarted starts at 0, so the earlier time is not comparable.
         let is_same = |&(other, since): &(usize, Nanos)| !counted.differs_from(other) && since <= counted.at;
         let known = self.other_beams.filter(is_same);
         let (other, since) = *self.other_beams.insert(known.unwrap_or((counted.beams(), counted.at)));
@@ -157,19 +160,20 @@ impl LdSession {
         }
     }
 
-    /// Returns the model of the scanner if it is not the one of the settings. Models with the same number of points per
+    /// Returns the model of the scanner if it is not the configured one. Models with the same number of points per
     /// second cannot be distinguished.
     fn unexpected_model_by_rate(&self) -> Option<Model> {
         let configured = Model::of(&self.settings)?;
         self.model_by_rate().filter(|model| model.points_per_second() != configured.points_per_second())
     }
 
-    /// Returns the model that the points per second indicate.
+    /// Returns the model that measures the current number of points per second.
     fn model_by_rate(&self) -> Option<Model> {
         self.sequencer.points_per_second().map(Model::of_point_rate)
     }
 
-    /// Returns the points that the scanner measures per second, once enough packets have arrived.
+    /// Returns the number of points that the scanner measures per second. Returns `None` until enough packets have
+    /// arrived.
     pub fn points_per_second(&self) -> Option<f32> {
         self.sequencer.points_per_second()
     }
@@ -179,19 +183,19 @@ impl LdSession {
         self.framer.buffer.byte_counters()
     }
 
-    /// Returns the numbers of revolutions by kind.
+    /// Returns the counts of revolutions by kind.
     pub fn revolution_counts(&self) -> RevolutionCounts {
         self.revolutions.counts()
     }
 
-    /// Returns the rates at which packets may arrive.
+    /// Returns the baud rates at which packets may arrive, in bits per second.
     fn rates(&self) -> &'static [u32] {
         const BOTH: [u32; 2] = [230_400, 921_600];
         let at = usize::from(self.baud == BOTH[1]);
         if self.settings.model.is_some() || self.settings.fixed_rate { &BOTH[at..=at] } else { &BOTH }
     }
 
-    /// Ends the stream, and waits for packets. The session shows the state `shown` meanwhile.
+    /// Ends the stream and waits for packets. `shown` is the state of the session meanwhile.
     fn listen(&mut self, shown: State) {
         self.phase = Phase::Listening { shown, next_at: self.now + LISTEN_TIME };
         self.no_packet_since = self.now;
@@ -202,7 +206,7 @@ impl LdSession {
         self.reads.cancel_wait();
     }
 
-    /// Tries the next rate, because no packet arrived at this one, and updates the time in the trouble.
+    /// Changes to the other baud rate, because no packet arrived at this one. Updates the duration in the problem.
     fn listen_at_next_rate(&mut self, shown: State) {
         self.phase = Phase::Listening { shown, next_at: self.now + LISTEN_TIME };
         let rates = self.rates();
@@ -218,7 +222,7 @@ impl LdSession {
         }
     }
 
-    /// Handles deadlines after all bytes were framed. Bytes that are no packets do not extend a deadline.
+    /// Handles deadlines after all bytes were framed. Bytes that are not part of a packet do not extend a deadline.
     fn handle_deadlines(&mut self) {
         match self.phase {
             Phase::Listening { shown, next_at } if self.now >= next_at => self.listen_at_next_rate(shown),
@@ -235,7 +239,8 @@ impl LdSession {
         }
     }
 
-    /// Stamps the packets of `span`, and keeps them for revolutions.
+    /// Returns the packets of `span` with their stamps, and keeps them for
+    /// [`advance_revolutions`](Self::advance_revolutions).
     fn receive(&mut self, span: Span) -> ReceivedTelegram<'_> {
         let mut span = span;
         span.reasons |= self.reads.take_suspect(span.offset + (span.packets * PACKET_LEN) as u64);
@@ -293,7 +298,8 @@ impl LdSession {
         let latest = self.reads.read_log().latest(last_byte, line_rate);
         let last = stamp(span.packets - 1).map_or(latest, |at| at + packet_time);
         let at = first.unwrap_or(last.saturating_sub(packet_time * span.packets as u64));
-        // A packet that arrived twice is stamped by its arrival, and the next one by the scanner's clock.
+        // A repeated packet is stamped by its arrival, and the next one by the scanner's clock. The first stamp may be
+        // the later one.
         let last = self.reads.stamp_packet(last.max(at));
         self.current = Some(PendingPackets { span, positions, packet: 0, is_added: false });
         self.counters.note_packets(self.framer.buffer.byte_counters(), span.packets);
@@ -311,7 +317,7 @@ impl LdSession {
         }
     }
 
-    /// Returns the clock that stamps packet number `number` of those returned last.
+    /// Returns the clock that stamps the packet with index `number` among those returned last.
     fn clock_of(&self, number: usize) -> &SensorClock {
         match &self.clock_before {
             Some((first, clock)) if number < *first => clock,
@@ -319,7 +325,7 @@ impl LdSession {
         }
     }
 
-    /// Starts or extends the stream after packets have arrived.
+    /// Starts the stream after its first packets, or extends it after later ones.
     fn continue_stream(&mut self) {
         match &mut self.phase {
             Phase::Streaming(watchdog) => {
@@ -350,7 +356,7 @@ impl LdSession {
         }
     }
 
-    /// Adds the points of the current packets to revolutions. Returns the first revolution that is complete.
+    /// Adds the points of the current packets to revolutions, until one is complete. Returns that revolution.
     fn advance_revolutions(&mut self) -> Option<ClosedRevolution> {
         while let Some(current) = &mut self.current {
             let (bytes, _) = self.framer.bytes(current.span).as_chunks::<PACKET_LEN>();
@@ -367,9 +373,10 @@ impl LdSession {
                 if let PacketPosition::Next { angle, missing, from, .. } = position
                     && missing > 0
                 {
-                    // No point was received between the two angles. They may be in a revolution that has not begun yet.
+                    // No point between the two angles arrived. They may be in a revolution that has not started yet.
                     self.revolutions.mark_gap(from + rotation_rate.step, angle - rotation_rate.step);
-                    // The head may be slower now than in the revolution that ends here.
+                    // Use the speed before the gap for the revolution that ends here, because the head may rotate more
+                    // slowly now.
                     if let Some(closed) =
                         self.revolutions.close_before(angle, self.rotation_rate.unwrap_or(rotation_rate))
                     {
@@ -393,7 +400,7 @@ impl LdSession {
         None
     }
 
-    /// Returns a complete revolution, and updates the state of the session.
+    /// Returns a complete revolution as a scan, and updates the state of the session.
     fn complete_revolution(&mut self, revolution: ClosedRevolution) -> RawScan<'_> {
         let first = self.to_scan(revolution).first;
         self.reads.end_revolution(first);
@@ -405,7 +412,7 @@ impl LdSession {
         self.to_scan(revolution)
     }
 
-    /// Converts a revolution to the hub's clock.
+    /// Converts a revolution to a scan with stamps of the hub's clock.
     fn to_scan(&self, revolution: ClosedRevolution) -> RawScan<'_> {
         let packet = self.current.map_or(usize::MAX, |current| current.packet);
         let stamp = |at: Nanos| self.clock_of(packet).time(at).unwrap_or(self.now);
@@ -545,25 +552,25 @@ impl line::ScannerSession for LdSession {
     }
 }
 
-/// Reason why a session does not stream.
+/// Reason why a session does not stream as it should.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Problem {
-    /// No packets arrive.
+    /// No packet arrives.
     NoPackets {
-        /// The only rate that the session tried. `None`: it tried both.
+        /// The only baud rate at which the session listened. `None` if it listened at both.
         baud: Option<u32>,
-        /// Seconds without a packet, rounded down to 1, 2, 4, ..
+        /// Duration in seconds, rounded down to a power of two.
         seconds: u32,
     },
     /// No packet arrived for one second.
     Silence,
     /// Packets arrive, but the head does not rotate.
     HeadBlocked,
-    /// The scanner measures another number of points per revolution, so its scans have another number of beams.
+    /// The number of points per revolution has changed, and with it the number of beams.
     BeamsChanged {
-        /// Number of beams before.
+        /// Previous number of beams.
         from: usize,
-        /// Number of beams now.
+        /// Present number of beams.
         to: usize,
     },
 }
@@ -588,7 +595,7 @@ impl fmt::Display for Problem {
     }
 }
 
-/// Adds the points of `packet`, which is at `place` of the sequence, to `turns`.
+/// Adds the points of `packet`, which is at `position` of the sequence, to `revolutions`.
 fn add_points(
     revolutions: &mut RevolutionAssembler<MAX_POINTS>,
     packet: &Packet<'_>,
@@ -619,21 +626,21 @@ fn add_points(
     }
 }
 
-/// Returns how many packets are returned together: as many as arrive in 10 ms.
+/// Returns the maximum number of packets that are returned together. They arrive in 10 ms.
 const fn max_packets_per_sample(baud: u32) -> usize {
     if baud > 500_000 { MAX_PACKETS_PER_SAMPLE } else { 3 }
 }
 
-/// Maximum number of points in a revolution: more than an STL27L measures at five revolutions per second.
+/// Maximum number of points in a revolution. An STL27L measures fewer points even at five revolutions per second.
 const MAX_POINTS: usize = 4_400;
-/// How long the session listens at one rate. A stream has a packet every 3 ms.
+/// Time for which the session listens at one baud rate. A stream has a packet at least every 3 ms.
 const LISTEN_TIME: Nanos = 300 * MILLIS;
-/// Time after which a scanner whose speed is never constant, or whose sequence has a gap in every revolution, has the
-/// beams of its model.
+/// Time after which the session uses the number of beams of the model that fits the points per second. This is for a
+/// scanner whose speed is never constant, or whose sequence has a gap in every revolution.
 const DECISION_TIMEOUT: Nanos = 10_000 * MILLIS;
-/// After this time with another number of points per revolution, the number of beams changes.
+/// Time for which the number of points per revolution must be different before the number of beams changes.
 const CHANGE_DELAY: Nanos = 10_000 * MILLIS;
-/// Duration for which a change of the number of beams is reported.
+/// Time for which the session reports a change of the number of beams.
 const CHANGE_REPORT_TIME: Nanos = 60_000 * MILLIS;
-/// Maximum number of packets that are returned together: those of an STL27L in 10 ms, one every 0.56 ms.
+/// Maximum number of packets that are returned together. An STL27L sends a packet every 0.56 ms, so they cover 10 ms.
 pub(crate) const MAX_PACKETS_PER_SAMPLE: usize = 17;

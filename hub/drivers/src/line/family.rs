@@ -141,7 +141,7 @@ pub struct Approach {
     pub boot_rate: Option<u32>,
     /// Maximum length of a transmission, in bytes.
     pub max_transmission: usize,
-    /// Part of a message: what the user should check at the scanner if the search does not find it.
+    /// Part of a message for a search without success: properties of the scanner that the user should check.
     pub advice: &'static str,
 }
 

@@ -212,7 +212,7 @@ impl Grid {
             let Some(range) = ranges.get_mut(bin) else { continue };
             let is_taken = *range != NOT_MEASURED;
             collisions += u32::from(is_taken);
-            // A point without an echo has the greatest range, so any other point replaces it.
+            // Any other point replaces a point without an echo, because NO_RETURN exceeds every range.
             if point.range < *range {
                 *range = point.range;
                 intensities[bin] = point.intensity;

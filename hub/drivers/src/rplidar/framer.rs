@@ -1,7 +1,7 @@
-//! Finds responses and packets in a stream that may lack bytes, and the boot message of a scanner.
+//! Framer of RPLIDAR responses, packets and boot messages, in a stream that may lack bytes.
 //!
-//! A packet of one point has no checksum, and 1 in 70 wrong positions looks like one. So such packets are accepted
-//! after a run of them with angles near each other, and each only if another one follows it.
+//! A packet of one point has no checksum, and 1 in 70 wrong positions looks like one. The framer accepts these packets
+//! only after several consecutive ones with similar angles, and each of them only if another one follows it.
 
 use crate::line::framing::{Format, FrameCheck};
 use crate::line::{Buffer, suspect};
@@ -10,66 +10,67 @@ use scanhub_schema::{MILLIS, Nanos};
 use crate::rplidar::packet::PacketFormat;
 use crate::rplidar::request::{ResponseDescriptor, ResponseType};
 
-/// Expected contents of the bytes.
+/// Contents that the framer expects in the bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum ExpectedBytes {
-    /// Nothing: all bytes are discarded.
+    /// No contents. The framer discards all bytes, except for boot messages.
     Nothing,
-    /// Responses, among the rest of a stream.
+    /// Responses, possibly after the rest of a stream.
     Responses,
-    /// Packets of this kind.
+    /// Packets of this format.
     Packets(PacketFormat),
-    /// Packets of any kind. Express and dense ones look alike, and count as the given kind; `None` if unknown.
+    /// Packets of any format. Express and dense packets look alike and count as the given format. `None` if it is
+    /// unknown.
     AnyPackets(Option<PacketFormat>),
 }
 
-/// Contents that were found.
+/// Contents that the framer has found.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum FramerEvent {
-    /// A response with its descriptor.
+    /// Response, with its descriptor.
     Reply(ResponseType, Span),
-    /// The descriptor of packets.
+    /// Descriptor before a stream of packets.
     Stream(Span),
-    /// Packets without other bytes between them.
+    /// Consecutive packets without other bytes between them.
     Packets(PacketFormat, Span),
-    /// The boot message, which is text. Other bytes may be text too, but hardly ever contain the word `LIDAR`.
+    /// Boot message, which is text. Other bytes may look like text, but they rarely contain the word `LIDAR`.
     BootMessage {
-        /// Whether the text contains that word.
+        /// Whether the text contains the word `LIDAR`.
         is_named: bool,
     },
 }
 
-/// Bytes in the framer's buffer, until the next ones are committed.
+/// Range of bytes in the framer's buffer. It is valid until the next bytes are committed.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Span {
     at: usize,
     pub(crate) len: usize,
     /// Number of packets.
     pub(crate) packets: usize,
-    /// Number of the first byte among all bytes committed, from 0.
+    /// Offset of the first byte, counted from the first committed byte.
     pub(crate) offset: u64,
-    /// Number of bytes between it and the packet before.
+    /// Number of discarded bytes between the previous packet and this one.
     pub(crate) skipped: u32,
-    /// Bits of [`suspect`]; 0 is clean.
+    /// Reasons why the first packet is suspect: bits of [`suspect`]; 0 means clean.
     pub(crate) reasons: u8,
 }
 
-/// The framer with its buffer.
+/// Framer with its buffer.
 #[derive(Clone, Debug)]
 pub(crate) struct Framer {
     pub(crate) buffer: Buffer<CAPACITY>,
     expect: ExpectedBytes,
-    /// Whether the next packet must begin at the end of the last one.
+    /// Whether the next packet must start where the last one ended.
     is_locked: bool,
-    /// Whether a packet has arrived since the last descriptor of packets.
+    /// Whether a packet has arrived since the last descriptor of a stream.
     has_packet: bool,
     /// Number of bytes discarded since the last packet.
     skipped: u32,
-    /// Number of printable ones in a row, the last of them, and whether they contain [`NAME`].
+    /// Number of consecutive printable bytes, the last of them, and whether they contain [`BOOT_MESSAGE_NAME`].
     text_len: usize,
     last_text: [u8; BOOT_MESSAGE_NAME.len()],
     is_named: bool,
-    /// Whether packets that look alike have arrived, and their kind is unknown.
+    /// Whether packets that look alike have arrived whose format is unknown.
     is_ambiguous: bool,
 }
 
@@ -89,7 +90,7 @@ impl Format for PacketFormat {
     }
 }
 
-/// Action for the first open bytes.
+/// Next step of the framer with the first open bytes.
 enum FramerStep {
     Take(usize),
     Discard,
@@ -111,13 +112,13 @@ impl Framer {
         }
     }
 
-    /// Sets the expected contents of the open bytes and those that follow.
+    /// Sets the expected contents of the open bytes and all later ones.
     pub(crate) fn expect(&mut self, expect: ExpectedBytes) {
         self.expect = expect;
         (self.is_locked, self.skipped) = (false, 0);
     }
 
-    /// Returns what is next, at most `most` packets. `None` until more bytes arrive.
+    /// Returns the next contents, with at most `max_packets` packets. Returns `None` if the framer needs more bytes.
     pub(crate) fn advance(&mut self, max_packets: usize) -> Option<FramerEvent> {
         self.buffer.begin_check();
         loop {
@@ -162,13 +163,13 @@ impl Framer {
         }
     }
 
-    /// Returns the bytes of the span that [`Framer::advance`] returned last.
+    /// Returns the bytes of `span`, which [`Framer::advance`] returned last.
     pub(crate) fn bytes(&self, span: Span) -> &[u8] {
         self.buffer.taken_bytes(span.at, span.len)
     }
 
-    /// Shortens `span`, which [`Framer::advance`] returned last, to the first `packets` packets. The others will be
-    /// returned once more.
+    /// Shortens `span`, which [`Framer::advance`] returned last, to its first `packets` packets. The framer returns the
+    /// others again.
     pub(crate) fn shorten(&mut self, span: &mut Span, packets: usize) {
         let len = span.len / span.packets;
         self.buffer.unread((span.packets - packets) * len, span.packets - packets);
@@ -181,23 +182,23 @@ impl Framer {
         self.text_len = 0;
     }
 
-    /// Returns the kind of the expected packets.
+    /// Returns the format of the expected packets.
     pub(crate) fn kind(&self) -> Option<PacketFormat> {
         if let ExpectedBytes::Packets(kind) = self.expect { Some(kind) } else { None }
     }
 
-    /// Returns whether packets of an unknown kind have arrived.
+    /// Returns whether packets of an unknown format have arrived.
     pub(crate) fn is_ambiguous(&self) -> bool {
         self.is_ambiguous
     }
 
-    /// Returns the number of bytes that were discarded since the last packet.
+    /// Returns the number of bytes discarded since the last packet.
     pub(crate) fn skipped(&self) -> u32 {
         self.skipped
     }
 
-    /// Returns whether the open bytes follow a packet and may be the next one. Then they are, even if they look like a response.
-    /// Before the first packet, a scanner may respond to a repeated request.
+    /// Returns whether the open bytes follow a packet and may be the next packet. They then count as a packet even if
+    /// they look like a response. Before the first packet, a scanner may respond to a repeated request.
     fn is_at_packet(&self) -> bool {
         let may_be = |kind: PacketFormat| match self.buffer.open_bytes().get(..kind.byte_len()) {
             Some(packet) => kind.is_valid(packet),
@@ -231,7 +232,7 @@ impl Framer {
         }
     }
 
-    /// Checks for packets of one point, at most `most`.
+    /// Checks for packets of one point, at most `max_packets`.
     fn check_points(&self, max_packets: usize) -> FramerStep {
         let open = self.buffer.open_bytes();
         let (run_len, is_open) = count_run(open, max_packets.max(MIN_RUN) + 1);
@@ -250,7 +251,7 @@ impl Framer {
         }
     }
 
-    /// Searches for two consecutive packets of any kind.
+    /// Searches for two consecutive packets of any format.
     fn search_packets(&mut self, assumed: Option<PacketFormat>) -> FramerStep {
         let open = self.buffer.open_bytes();
         let mut is_open = false;
@@ -291,7 +292,7 @@ impl Framer {
         Span { at: self.buffer.take(len, packets), len, packets, offset, skipped, reasons }
     }
 
-    /// Discards the first open byte. Returns whether a boot message is found with it.
+    /// Discards the first open byte. Returns whether it completes a boot message.
     fn discard(&mut self) -> bool {
         let byte = self.buffer.open_bytes().first().copied().unwrap_or_default();
         let is_text = matches!(byte, b' '..=b'~' | b'\r' | b'\n');
@@ -304,12 +305,13 @@ impl Framer {
         self.text_len = if is_text { self.text_len + 1 } else { 0 };
         let is_name = self.last_text == *BOOT_MESSAGE_NAME && !self.is_named;
         self.is_named |= is_name;
-        // Text may precede the boot message, so that its name arrives late.
+        // Other text may precede the boot message, so the name may come after the minimum length.
         self.text_len == MIN_BOOT_MESSAGE_LEN || is_name && self.text_len > MIN_BOOT_MESSAGE_LEN
     }
 }
 
-/// Returns the number of consecutive packets of one point, at most `most`, and whether more bytes could extend the run.
+/// Returns the number of consecutive packets of one point, at most `max_packets`, and whether more bytes could extend
+/// the run.
 fn count_run(open: &[u8], max_packets: usize) -> (usize, bool) {
     let mut before = None;
     let (points, rest) = open.as_chunks::<5>();
@@ -327,16 +329,16 @@ fn count_run(open: &[u8], max_packets: usize) -> (usize, bool) {
     (points.len().min(max_packets), is_open)
 }
 
-/// Capacity of a tty for a late reader, and two packets.
+/// Capacity of the buffer: the bytes that a tty can buffer while the hub does not read, and two packets.
 const CAPACITY: usize = 4_096 + 2 * PacketFormat::MAX_LEN;
-/// After this time without a byte, no more bytes are in flight: in the slowest stream, an adapter passes on a packet
+/// Time without a byte after which no more bytes are in flight. In the slowest stream, an adapter forwards a packet
 /// every 6 ms.
 const HOLD_TIME: Nanos = 10 * MILLIS;
-/// Minimum number of packets of one point in a run. A wrong position has as many once in millions.
+/// Minimum number of packets of one point in a run. A wrong position yields such a run once in millions.
 const MIN_RUN: usize = 6;
-/// Maximum angle between two consecutive points in degrees, even if some are missing between them.
+/// Maximum angle between consecutive points in degrees, even if some points are missing between them.
 const MAX_STEP_DEG: f32 = 30.0;
-/// Minimum length of a boot message. It has 64 bytes of text, and some may be missing.
+/// Minimum length of the text of a boot message, in bytes. A complete one has 64 bytes.
 const MIN_BOOT_MESSAGE_LEN: usize = 40;
-/// Part of that text, near its beginning.
+/// Word near the beginning of the boot message.
 const BOOT_MESSAGE_NAME: &[u8; 5] = b"LIDAR";

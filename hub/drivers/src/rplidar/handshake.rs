@@ -1,10 +1,10 @@
-//! The way to a stream: the search for the rate of the line, and the handshake with the scanner that responds.
+//! Steps from an open port to a stream: the search for the baud rate of the line, and the handshake with the scanner.
 //!
-//! The search tries one rate after the other. A scanner that lost its power is soon back at the rate of its last stream, and
-//! sends a boot message there, so that rate is remembered.
+//! [`RateSearch`] tries one baud rate after the other. A scanner that has lost power soon restarts at the rate of its
+//! last stream and sends its boot message there, so the search stores that rate.
 //!
-//! [`Handshake`] has the queries in their order, what the scanner has reported, and the scan mode that follows from it. It
-//! decides which step comes next; the session carries it out, and waits for responses.
+//! [`Handshake`] has the queries in their order, the data that the scanner has reported, and the scan mode that results
+//! from it. It decides the next step. The session carries out the step, and waits for responses.
 
 use scanhub_schema::{MILLIS, Nanos};
 
@@ -14,8 +14,8 @@ use crate::rplidar::session::{MAX_DRAIN_TIME, Problem};
 use crate::rplidar::{FEATURES, Mode, Model, Motor};
 use crate::settings::Settings;
 
-/// A request whose response the session waits for, in the order of the handshake. Those about a mode contain its place
-/// in the list of modes.
+/// Request whose response the session waits for, in the order of the handshake. A query about a mode contains the index
+/// of the mode in the scanner's list.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Query {
     Info,
@@ -26,18 +26,19 @@ pub(crate) enum Query {
     SampleTime(u8),
     Kind(u8),
     Name(u8),
-    /// The times per point of a scanner that does not list its modes.
+    /// Request the times per point of a scanner that does not list its modes.
     SampleTimes,
-    /// The time per point of the chosen mode once more, because responses have no checksum and all stamps depend on it.
+    /// Request the time per point of the chosen mode again. Responses have no checksum, and all stamps depend on this
+    /// time.
     Confirm(u8),
     /// Start the standard scan.
     StandardScan,
-    /// Start a scan mode whose packets contain several points.
+    /// Start the scan mode with this number, whose packets contain several points.
     ExpressScan(u8),
 }
 
 impl Query {
-    /// Returns the request.
+    /// Returns the request that sends this query.
     pub(crate) fn request(self) -> Request {
         match self {
             Query::Info => Request::INFO,
@@ -56,8 +57,8 @@ impl Query {
         }
     }
 
-    /// Returns the contents of a response if `answer` and its `data` belong to this query. A response about a key
-    /// begins with that key.
+    /// Returns the contents of a response with `data`, if the response belongs to this query. The response to a query
+    /// with a key begins with that key.
     fn contents(self, response: ResponseType, data: &[u8]) -> Option<&[u8]> {
         let (expected, key) = match self {
             Query::Info => (ResponseType::Info, None),
@@ -81,45 +82,45 @@ impl Query {
     }
 }
 
-/// Step that follows from a response, or from its absence.
+/// Step that follows a response or a missing response.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum NextStep {
-    /// Nothing. For example, it was not the expected response.
+    /// Do nothing, for example because the response was not the expected one.
     Nothing,
-    /// The scanner has responded to the first query: send this one.
+    /// Send this query. The scanner has responded to the first one.
     ScannerFound(Query),
     /// Send this query.
     Query(Query),
-    /// Restart the scanner, which reports an error.
+    /// Restart the scanner, because it reports an error.
     Reset,
-    /// Wait: the scanner reports an error even after a restart.
+    /// Wait, because the scanner reports an error even after a restart.
     Unhealthy(Health),
-    /// Start the motor, and send this query.
+    /// Start the motor, and then send this query.
     StartMotor(Query),
-    /// Start this mode.
+    /// Start this scan mode.
     Scan(ScanMode),
-    /// Begin again, because a response was damaged.
+    /// Start the handshake again, because a response was damaged.
     Restart,
-    /// The scanner does not begin to measure.
+    /// Report that the scanner does not start to measure.
     Refused,
 }
 
-/// Properties that the scanner has reported, and the scan mode that follows from it.
+/// State of the handshake: the data that the scanner has reported, and the scan mode that results from it.
 #[derive(Clone, Debug)]
 pub(crate) struct Handshake {
     settings: Settings,
     pub(crate) info: Option<Info>,
     pub(crate) health: Option<Health>,
-    /// Whether a scanner that reported an error was already restarted.
+    /// Whether the session has already restarted the scanner because of an error.
     was_reset: bool,
-    /// Whether an accessory board controls the motor, by its duty cycle.
+    /// Whether an accessory board controls the motor with a duty cycle.
     has_board: bool,
     pub(crate) modes: ScanModes,
-    /// The mode in use, if scanhub knows it.
+    /// Scan mode in use, if scanhub supports it.
     pub(crate) mode: Option<Mode>,
-    /// The mode of the settings, if the scanner cannot use it.
+    /// Configured scan mode, if the scanner cannot use it.
     pub(crate) unavailable_mode: Option<Mode>,
-    /// In a recording: place of the last mode in a response to the recorded program, and the key of that response.
+    /// For a recording: index of the mode in the last response about a mode, and the key of that response.
     last_recorded: (u8, u8),
 }
 
@@ -138,21 +139,21 @@ impl Handshake {
         }
     }
 
-    /// Returns the model, once it is known.
+    /// Returns the model that the scanner has reported, or the configured one.
     pub(crate) fn model(&self) -> Option<Model> {
         self.info.and_then(|info| info.model()).or(Model::of(&self.settings))
     }
 
-    /// Handles the descriptor of a stream with packets of `kind`. In a recording, the mode is the only reported one with such
-    /// packets, if there is only one.
+    /// Handles the descriptor of a stream with packets of format `kind`. In a recording without a configured mode, the
+    /// mode is the only reported one with this format.
     pub(crate) fn stream_begins(&mut self, kind: PacketFormat) {
         if self.settings.listen_only && self.settings.mode.is_none() {
             self.mode = self.modes.single_mode(kind);
         }
     }
 
-    /// Returns the kind of packets that look like both express and dense ones if no response has named it: the fastest
-    /// kind of the model.
+    /// Returns the format of packets that may be express or dense ones and whose descriptor is missing. It follows from
+    /// the configured mode, or it is the format of the model's fastest mode.
     pub(crate) fn ambiguous_format(&self) -> Option<PacketFormat> {
         match (Mode::of(&self.settings), self.model()) {
             (Some(Mode::DenseBoost), _) => Some(PacketFormat::Dense),
@@ -162,7 +163,7 @@ impl Handshake {
         }
     }
 
-    /// Returns the request that starts the motor, or stops it. `None` if the line DTR controls it.
+    /// Returns the request that starts or stops the motor. Returns `None` if the line DTR controls the motor.
     pub(crate) fn motor_request(&self, is_on: bool) -> Option<Request> {
         match self.motor() {
             Motor::Speed => Some(Request::set_motor_speed(if is_on { MOTOR_SPEED_RPM } else { 0 })),
@@ -175,8 +176,8 @@ impl Handshake {
         self.info.map_or(Motor::Dtr, |info| info.motor())
     }
 
-    /// Handles a response with the contents `data`, while the response to `query` is expected, on a line of `baud` bits
-    /// per second. It may belong to an earlier query.
+    /// Handles a response with the contents `data`, while the session waits for the response to `query`. The response
+    /// may belong to an earlier query. `baud` is the baud rate of the line, in bits per second.
     pub(crate) fn handle_response(
         &mut self,
         query: Option<Query>,
@@ -229,11 +230,11 @@ impl Handshake {
         self.after(query, baud)
     }
 
-    /// Continues without the response to `query`, other than [`Query::Info`].
+    /// Continues the handshake without the response to `query`, which is not [`Query::Info`].
     pub(crate) fn handle_no_response(&mut self, query: Query, baud: u32) -> NextStep {
         match query {
             Query::Board => NextStep::StartMotor(Query::ModeCount),
-            // The scanner responds, but not to everything. Its health counts as good.
+            // The scanner responds, but does not support this request. Assume that its health is good.
             Query::Health => self.after_health(),
             Query::ModeCount => NextStep::Query(Query::SampleTimes),
             Query::SampleTimes => {
@@ -260,7 +261,7 @@ impl Handshake {
         }
     }
 
-    /// Handles the reported health.
+    /// Handles the health that the scanner has reported.
     fn handle_health(&mut self, health: Option<Health>) -> NextStep {
         self.health = health;
         match health {
@@ -285,7 +286,8 @@ impl Handshake {
         }
     }
 
-    /// Confirms the time per point of the chosen scan mode, and then starts the mode.
+    /// Returns the query that confirms the time per point of the chosen scan mode. Starts the mode if the time is
+    /// unknown.
     fn confirm(&mut self, baud: u32) -> NextStep {
         if self.settings.listen_only {
             return NextStep::Nothing;
@@ -304,7 +306,8 @@ impl Handshake {
         NextStep::Scan(mode)
     }
 
-    /// Returns the mode of the settings, or the fastest one if the scanner or the line cannot use it.
+    /// Returns the configured scan mode. If none is configured, or the scanner or the line does not support it, returns
+    /// the fastest mode.
     fn choose_mode(&mut self, baud: u32) -> ScanMode {
         let baud = (!self.settings.fixed_rate).then_some(baud);
         let requested = Mode::of(&self.settings);
@@ -314,8 +317,8 @@ impl Handshake {
         usable.or_else(fastest).unwrap_or_default()
     }
 
-    /// Infers the query from a response in a recording: a program lists the modes in their order, and the keys of each
-    /// mode in ascending order.
+    /// Infers the query that a response in a recording belongs to. A program requests the modes in the order of the
+    /// list, and the keys of each mode in ascending order.
     fn infer_query(&mut self, response: ResponseType, data: &[u8]) -> Query {
         let key = match response {
             ResponseType::Info => return Query::Info,
@@ -341,12 +344,12 @@ impl Handshake {
     }
 }
 
-/// A scan mode as the scanner describes it.
+/// Scan mode as the scanner describes it.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct ScanMode {
-    /// Number in the request that starts it.
+    /// Number of the mode in the request that starts it.
     id: u8,
-    /// Microseconds from one point to the next.
+    /// Time from one point to the next, in microseconds.
     pub(crate) sample_us: Option<f32>,
     kind: Option<PacketFormat>,
     mode: Option<Mode>,
@@ -363,7 +366,7 @@ impl ScanMode {
     }
 }
 
-/// The scan modes of a scanner.
+/// List of the scan modes of a scanner.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct ScanModes {
     list: [ScanMode; ScanModes::MAX],
@@ -374,7 +377,7 @@ pub(crate) struct ScanModes {
 impl ScanModes {
     const MAX: usize = 12;
 
-    /// Begins a list of `count` modes.
+    /// Starts a list of `count` modes.
     fn begin(&mut self, count: usize) {
         *self = ScanModes { count: count.min(ScanModes::MAX), ..ScanModes::default() };
         (0..).zip(&mut self.list).for_each(|(id, mode)| mode.id = id);
@@ -384,18 +387,18 @@ impl ScanModes {
         self.list[..self.count].get(usize::from(index))
     }
 
-    /// Changes the mode at `place` of the list.
+    /// Changes the mode at `index` of the list.
     fn change_mode(&mut self, index: u8, set: impl Fn(&mut ScanMode)) {
         self.list[..self.count].get_mut(usize::from(index)).into_iter().for_each(set);
     }
 
-    /// Marks the mode with number `id` as the one that the manufacturer recommends.
+    /// Stores the number of the mode that the manufacturer recommends.
     fn set_recommended(&mut self, id: u8) {
         self.typical = Some(id);
     }
 
-    /// Returns the two modes that every scanner has, for one that does not list its modes. The times per point are in
-    /// microseconds; 0 if unknown.
+    /// Returns the two modes that every scanner has, for a scanner that does not list its modes. The times per point
+    /// are in microseconds; 0 if they are unknown.
     fn without_list(standard_us: u16, express_us: u16) -> ScanModes {
         let mode_of = |us: u16, kind, mode| ScanMode {
             id: 0,
@@ -410,8 +413,8 @@ impl ScanModes {
         modes
     }
 
-    /// Returns the offered mode that is `mode`, if a line of `baud` bits per second can carry it. `None` for `baud`:
-    /// the line has no rate.
+    /// Returns the offered mode for `mode`, if a line of `baud` bits per second can carry it. `baud` is `None` for a
+    /// port without a baud rate, which can carry every mode.
     fn find_mode(&self, mode: Mode, baud: Option<u32>) -> Option<ScanMode> {
         let kind = match mode {
             Mode::Standard => Some(PacketFormat::Standard),
@@ -425,7 +428,7 @@ impl ScanModes {
             .or_else(|| self.possible_modes(baud).find(|offered| kind.is_some() && offered.kind == kind))
     }
 
-    /// Returns the fastest mode that the line can carry. Among equally fast ones, it prefers those with a checksum,
+    /// Returns the fastest mode that the line can carry. Among equally fast modes, it prefers one with a checksum, and
     /// then the recommended one.
     fn fastest(&self, baud: Option<u32>) -> Option<ScanMode> {
         self.possible_modes(baud).min_by(|a, b| {
@@ -438,36 +441,39 @@ impl ScanModes {
         })
     }
 
-    /// Returns the microseconds from one point to the next for packets of `kind`: in `mode` if it has such packets,
-    /// otherwise in the fastest mode that has.
+    /// Returns the time per point for packets of format `kind`, in microseconds. It is the time of `mode` if this mode
+    /// has such packets, and otherwise the time of the fastest mode that has.
     pub(crate) fn sample_us(&self, kind: PacketFormat, mode: Option<Mode>) -> Option<f32> {
         let of_kind = || self.of_kind(kind);
         let in_mode = of_kind().filter(|(named, _)| mode.is_some() && *named == mode).map(|(_, us)| us);
         in_mode.reduce(f32::min).or_else(|| of_kind().map(|(_, us)| us).reduce(f32::min))
     }
 
-    /// Returns the reported microseconds per point that are nearest to `us`, among the modes with packets of `kind`.
+    /// Returns the reported time per point that is nearest to `us`, in microseconds, among the modes with packets of
+    /// format `kind`.
     pub(crate) fn nearest_us(&self, kind: PacketFormat, us: f32) -> Option<f32> {
         self.of_kind(kind)
             .map(|(_, reported)| reported)
             .min_by(|a, b| (a - us).abs().total_cmp(&(b - us).abs()))
     }
 
-    /// Returns the mode with packets of `kind`, if there is only one and scanhub knows it.
+    /// Returns the mode with packets of format `kind`, if there is only one and scanhub supports it.
     fn single_mode(&self, kind: PacketFormat) -> Option<Mode> {
         let mut modes = self.list[..self.count].iter().filter(|mode| mode.kind == Some(kind));
         let single = modes.next().filter(|_| modes.next().is_none());
         single.and_then(|mode| mode.mode)
     }
 
-    /// Returns whether all reported modes with packets of `kind` have the same time per point, so that the packets define it.
+    /// Returns whether all reported modes with packets of format `kind` have the same time per point, so that the
+    /// format determines it.
     pub(crate) fn is_unambiguous(&self, kind: PacketFormat) -> bool {
         let mut times = self.of_kind(kind).map(|(_, us)| us);
         let first = times.next();
         times.all(|us| Some(us) == first)
     }
 
-    /// Returns whether a reported mode with packets of `kind` and this time per point is `mode`.
+    /// Returns whether `mode` is a reported mode with packets of format `kind` and with the time per point that is
+    /// nearest to `us`.
     pub(crate) fn has(&self, mode: Mode, kind: PacketFormat, us: f32) -> bool {
         let nearest = self.nearest_us(kind, us);
         self.of_kind(kind).any(|(named, us)| named == Some(mode) && Some(us) == nearest)
@@ -488,7 +494,7 @@ impl ScanModes {
     }
 }
 
-/// Decodes a little-endian number of one to four bytes.
+/// Decodes a little-endian number of up to four bytes.
 fn number(data: &[u8]) -> u32 {
     data.iter().take(4).rev().fold(0, |number, byte| number << 8 | u32::from(*byte))
 }
@@ -498,27 +504,27 @@ fn sample_us(data: &[u8]) -> f32 {
     number(data) as f32 / 256.0
 }
 
-/// Requested speed, in revolutions per minute: of an S1, the manufacturer's choice.
+/// Motor speed to request, in revolutions per minute. It is the manufacturer's default for an S1.
 const MOTOR_SPEED_RPM: u16 = 600;
-/// Requested duty cycle of the motor, of 1,023: of an A2, the manufacturer's choice.
+/// Duty cycle of the motor to request, out of 1,023. It is the manufacturer's default for an A2.
 const MOTOR_PWM: u16 = 660;
 
-/// The rate of the line, and the state of the search for it.
+/// Baud rate of the line, and the state of the search for it.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct RateSearch {
     pub(crate) baud: u32,
-    /// Whether the port has this rate and no other, or nothing can be sent.
+    /// Whether the search cannot change the baud rate, because the port has a fixed rate or nothing can be sent.
     is_fixed: bool,
-    /// Whether the port does not have the rate yet.
+    /// Whether the port must still be set to the baud rate.
     pub(crate) needs_change: bool,
-    /// Time since which no response has arrived, and the number of bytes read by then.
+    /// Time from which no response has arrived, and the number of bytes read until then.
     no_response_since: Option<(Nanos, u64)>,
-    /// Rate of the last stream, until a boot message is received or the session restarts the scanner.
+    /// Baud rate of the last stream. `None` after a boot message, or after the session has restarted the scanner.
     stream_rate: Option<u32>,
 }
 
 impl RateSearch {
-    /// Creates a search on a port that is open at the rate of `settings`.
+    /// Creates a search on a port that is open at the baud rate of the configured model, or at the default rate.
     pub(crate) fn new(settings: &Settings) -> RateSearch {
         RateSearch {
             baud: Model::of(settings).map_or(FEATURES.defaults.baud, Model::baud),
@@ -529,12 +535,12 @@ impl RateSearch {
         }
     }
 
-    /// Begins at `baud`, which the port has.
+    /// Starts at `baud`, at which the port is open.
     pub(crate) fn begin_at(&mut self, baud: u32) {
         self.baud = baud;
     }
 
-    /// Returns the rate if the port has to be set to it.
+    /// Returns the baud rate if the port must be set to it.
     pub(crate) fn take_change(&mut self) -> Option<u32> {
         core::mem::take(&mut self.needs_change).then_some(self.baud)
     }
@@ -544,11 +550,11 @@ impl RateSearch {
         self.no_response_since = None;
     }
 
-    /// Tries the next rate, because no response arrived. `read` is the number of bytes read so far. Returns since when
-    /// no response has arrived.
+    /// Changes to the next baud rate, because no response has arrived. `read` is the number of bytes read so far.
+    /// Returns the time from which no response has arrived.
     pub(crate) fn advance(&mut self, now: Nanos, read: u64) -> Nanos {
         let (since, read_before) = *self.no_response_since.get_or_insert((now, read));
-        // Stay at the rate of the last stream for a while, so that the boot message is received.
+        // Stay at the rate of the last stream for a while, in order to receive the boot message.
         let may_boot =
             self.stream_rate == Some(self.baud) && read == read_before && now < since + BOOT_TIMEOUT;
         if let Some(baud) = self.next_rate().filter(|_| !may_boot) {
@@ -558,37 +564,37 @@ impl RateSearch {
         since
     }
 
-    /// Returns whether the search is young. During this time, a scanner that streams on after the stop request is not
-    /// asked at this rate, because at the right rate it would have stopped. Later a request is sent, because the line
-    /// may never be quiet.
+    /// Returns whether the search has just started. A scanner that still streams after the stop request then uses
+    /// another baud rate, because it would have stopped at this one, so the session does not send a query. Later, the
+    /// session sends queries anyway, because the line may never be quiet.
     pub(crate) fn is_quick(&self, now: Nanos) -> bool {
         self.no_response_since.is_none_or(|(since, _)| now < since + QUICK_SEARCH_TIME)
             && self.next_rate().is_some()
     }
 
-    /// Returns the message that no response has arrived since `since`, after a second.
+    /// Returns the problem that no response has arrived since `since`, if this is at least one second ago.
     pub(crate) fn no_response_problem(&self, since: Nanos, now: Nanos) -> Option<Problem> {
         let seconds = (now.saturating_sub(since) / (1_000 * MILLIS)) as u32;
         let baud = self.next_rate().is_none().then_some(self.baud);
         (seconds > 0).then(|| Problem::NoResponse { baud, seconds: 1 << seconds.ilog2() })
     }
 
-    /// Handles packets, which arrived at this rate.
+    /// Stores the current baud rate as that of the last stream.
     pub(crate) fn note_stream(&mut self) {
         self.stream_rate = Some(self.baud);
     }
 
-    /// Forgets the rate of the last stream if it is this rate. Returns whether it is.
+    /// Deletes the stored rate of the last stream if it is the current baud rate. Returns whether it was.
     pub(crate) fn take_stream(&mut self) -> bool {
         self.stream_rate.take_if(|baud| *baud == self.baud).is_some()
     }
 
-    /// Forgets the rate of the last stream.
+    /// Deletes the stored rate of the last stream.
     pub(crate) fn forget_stream(&mut self) {
         self.stream_rate = None;
     }
 
-    /// Returns the rate after this one. `None` if there is no choice.
+    /// Returns the baud rate to try next. Returns `None` if the rate is fixed.
     fn next_rate(&self) -> Option<u32> {
         const RATES: [u32; 4] = [115_200, 256_000, 460_800, 1_000_000];
         let at = RATES.iter().position(|rate| *rate == self.baud)?;
@@ -598,14 +604,15 @@ impl RateSearch {
 
 /// Maximum time from power-on to the boot message.
 const BOOT_TIMEOUT: Nanos = 3_000 * MILLIS;
-/// All rates are tried twice in this time if bytes arrive at each of them, because a stop request can be lost.
+/// Time in which all baud rates are tried twice if bytes arrive at each of them. A stop request can be lost, so one try
+/// is not enough.
 const QUICK_SEARCH_TIME: Nanos = 8 * MAX_DRAIN_TIME;
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// The modes of a real A1M8.
+    /// Modes of a real A1M8.
     fn a1() -> ScanModes {
         let mut listed = ScanModes::default();
         listed.begin(5);

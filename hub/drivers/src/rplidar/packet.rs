@@ -1,34 +1,35 @@
-//! The kinds of packets with points, and what is in each. Sources: the maker's description of the protocol and its own
-//! unpacker. A packet of several points tells the angle of its first one only: where the others are, the next one's says.
+//! Formats of the packets that contain points, and their decoders. Sources: the manufacturer's protocol description and
+//! its own decoder. A packet of several points contains only the angle of its first point. The angles of the others
+//! follow from the next packet.
 
-/// What a stream is made of. HQ packets (83h) are not known here.
+/// Format of the packets of a stream. HQ packets (83h) are not supported.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PacketFormat {
-    /// A point a packet, without a checksum.
+    /// One point, without a checksum.
     Standard,
     /// 32 points, each with a compensation of its angle.
     Express,
-    /// 96 points, of which two in three are differences.
+    /// 96 points. Two of three are stored as differences.
     Ultra,
     /// 40 points.
     Dense,
-    /// 64 points with their qualities.
+    /// 64 points, each with its quality.
     UltraDense,
 }
 
-/// A point of a packet.
+/// Point of a packet.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct PacketPoint {
-    /// By how many degrees it lies before its place, or if negative behind it, among the evenly spaced points of its packet.
+    /// Angle in degrees by which the point lies before its evenly spaced angle. Negative if it lies after it.
     pub before: f32,
-    /// Millimetres; 0 is no return.
+    /// Range in millimeters; 0 means no return.
     pub range: u16,
-    /// How strong the echo was; 0 also where the kind does not tell.
+    /// Strength of the echo; 0 if the format does not contain it.
     pub quality: u8,
 }
 
 impl PacketFormat {
-    /// All of them.
+    /// Every format.
     pub const ALL: [PacketFormat; 5] = [
         PacketFormat::Standard,
         PacketFormat::Express,
@@ -36,17 +37,17 @@ impl PacketFormat {
         PacketFormat::Dense,
         PacketFormat::UltraDense,
     ];
-    /// Bytes of the longest packet.
+    /// Length of the longest packet, in bytes.
     pub const MAX_LEN: usize = 170;
-    /// The most points of a packet.
+    /// Maximum number of points in a packet.
     pub const MAX_POINTS: usize = 96;
 
-    /// The kind of which a scanner says this byte.
+    /// Returns the format whose type in a descriptor is `answer`.
     pub(crate) fn of(answer: u8) -> Option<PacketFormat> {
         PacketFormat::ALL.into_iter().find(|kind| kind.response_type() == answer)
     }
 
-    /// Returns the type of this kind in a descriptor.
+    /// Returns the type of this format in a descriptor.
     pub(crate) const fn response_type(self) -> u8 {
         match self {
             PacketFormat::Standard => 0x81,
@@ -57,7 +58,7 @@ impl PacketFormat {
         }
     }
 
-    /// Bytes of a packet.
+    /// Returns the length of a packet, in bytes.
     pub const fn byte_len(self) -> usize {
         match self {
             PacketFormat::Standard => 5,
@@ -67,7 +68,7 @@ impl PacketFormat {
         }
     }
 
-    /// Points of a packet.
+    /// Returns the number of points in a packet.
     pub const fn points(self) -> usize {
         match self {
             PacketFormat::Standard => 1,
@@ -78,12 +79,12 @@ impl PacketFormat {
         }
     }
 
-    /// Whether packets have a checksum.
+    /// Returns whether packets have a checksum.
     pub const fn is_checked(self) -> bool {
         !matches!(self, PacketFormat::Standard)
     }
 
-    /// Degrees by which a point may lie before its place, and some.
+    /// Returns an upper bound for [`PacketPoint::before`], in degrees, with a margin.
     pub(crate) const fn max_before(self) -> f64 {
         match self {
             PacketFormat::Dense | PacketFormat::UltraDense => 0.5,
@@ -91,16 +92,17 @@ impl PacketFormat {
         }
     }
 
-    /// Degrees by which a point may lie behind its place.
+    /// Returns the maximum angle in degrees by which a point lies after its evenly spaced angle.
     pub(crate) const fn max_after(self) -> f64 {
         if matches!(self, PacketFormat::Ultra) { 21.0 } else { 0.0 }
     }
 
-    /// Whether a packet may begin with `bytes`, as far as there are any.
+    /// Returns whether `bytes` may be the start of a packet. Returns `true` if `bytes` is empty.
     pub(crate) fn begins(self, bytes: &[u8]) -> bool {
         let fits = |at: usize, is_match: fn(u8) -> bool| bytes.get(at).is_none_or(|byte| is_match(*byte));
         match self {
-            // The bit that a turn begins and its inverse differ; the lowest bit of the angle's word is set.
+            // The bit for the start of a revolution differs from the bit after it, which is its inverse. The lowest bit
+            // of the angle is 1.
             PacketFormat::Standard => {
                 fits(0, |byte| (byte ^ byte >> 1) & 1 == 1) && fits(1, |byte| byte & 1 == 1)
             }
@@ -108,7 +110,7 @@ impl PacketFormat {
         }
     }
 
-    /// Whether `packet` is one, by its checksum if it has one.
+    /// Returns whether `packet` is valid. Checks its first bytes, its angle, and its checksum if it has one.
     pub(crate) fn is_valid(self, packet: &[u8]) -> bool {
         let is_sum_valid = || {
             let sum = packet[2..].iter().fold(0, |sum, byte| sum ^ byte);
@@ -117,7 +119,7 @@ impl PacketFormat {
         self.begins(packet) && (!self.is_checked() || is_sum_valid()) && self.start_angle(packet) <= 360.0
     }
 
-    /// Degrees, clockwise, of the first point of `packet`.
+    /// Returns the angle of the first point of `packet`, in degrees clockwise.
     pub fn start_angle(self, packet: &[u8]) -> f32 {
         match self {
             PacketFormat::Standard => f32::from(word(packet, 1) >> 1) / 64.0,
@@ -126,7 +128,7 @@ impl PacketFormat {
         }
     }
 
-    /// Point `i` of `packet`, which `next` follows.
+    /// Returns point `i` of `packet`. `next` is the packet that follows.
     pub fn point(self, packet: &[u8], next: &[u8], i: usize) -> PacketPoint {
         match self {
             PacketFormat::Standard => {
@@ -151,7 +153,9 @@ fn word(bytes: &[u8], at: usize) -> u16 {
     u16::from_le_bytes([bytes[at], bytes[at + 1]])
 }
 
-/// The first of three points has a range of its own, the others differ from it or from the first of the next three.
+/// Decodes point `i` of an ultra packet. The first of three points has an absolute range. The second is a difference
+/// from the first point, and the third one from the first of the next three. If the first has no return, the second is
+/// a difference from the next three, too.
 fn ultra(packet: &[u8], next: &[u8], i: usize) -> PacketPoint {
     let triple = |packet: &[u8], n: usize| {
         u32::from(word(packet, 4 + 4 * n)) | u32::from(word(packet, 6 + 4 * n)) << 16
@@ -160,7 +164,7 @@ fn ultra(packet: &[u8], next: &[u8], i: usize) -> PacketPoint {
     let this_triple = triple(packet, n);
     let next_triple = if n + 1 < cabins { triple(packet, n + 1) } else { triple(next, 0) };
     let ((major, level), (next_major, next_level)) = (major(this_triple), major(next_triple));
-    // Two numbers of ten bits with a sign.
+    // Two signed numbers of ten bits.
     let (first, second) = ((this_triple << 10) as i32 >> 22, this_triple as i32 >> 22);
     let differs = |difference: i32, base: i32, level: u32| {
         if matches!(difference, -512 | 511) { 0 } else { base + (difference << level) }
@@ -175,7 +179,8 @@ fn ultra(packet: &[u8], next: &[u8], i: usize) -> PacketPoint {
     PacketPoint { before: before(range), range, quality: 0 }
 }
 
-/// A range in millimetres of which the steps get wider, and how many bits they are wider.
+/// Decodes an absolute range, whose resolution is coarser for longer ranges. Returns the range in millimeters, and the
+/// number of bits by which differences from it are shifted.
 fn major(three: u32) -> (i32, u32) {
     let stored = (three & 0xFFF) as i32;
     const SCALES: [(i32, i32, u32); 4] =
@@ -184,7 +189,8 @@ fn major(three: u32) -> (i32, u32) {
     scale.map_or((stored, 0), |(from, base, level)| (base + ((stored - from) << level), level))
 }
 
-/// Degrees by which a point so far away lies before its place: light comes back beside the way that it went.
+/// Returns the angle in degrees by which a point at `range` millimeters lies before its evenly spaced angle. The angle
+/// depends on the range because the light does not return along the path on which it was sent.
 fn before(range: u16) -> f32 {
     if range < 50 {
         return 7.5;
@@ -194,7 +200,7 @@ fn before(range: u16) -> f32 {
     8.0 - radians.to_degrees()
 }
 
-/// 20 bits a point: range and quality in one of four scales.
+/// Decodes point `i` of an ultra-dense packet. A point has 20 bits, with range and quality in one of four scales.
 fn ultra_dense(packet: &[u8], i: usize) -> PacketPoint {
     let cabin = &packet[10 + i / 2 * 5..][..5];
     let half = i % 2;
@@ -228,7 +234,7 @@ mod tests {
         assert_eq!(PacketFormat::Standard.start_angle(&node), 90.0);
         let point = PacketFormat::Standard.point(&node, &node, 0);
         assert_eq!(point, PacketPoint { before: 0.0, range: 2_000, quality: 15 });
-        // Without a quality nothing came back.
+        // A quality of 0 means no return.
         assert_eq!(PacketFormat::Standard.point(&[0x01, 1, 0x2D, 0x40, 0x1F], &node, 0).range, 0);
         for wrong in
             [[0x3F, 1, 0x2D, 0, 0], [0x3C, 1, 0x2D, 0, 0], [0x3D, 0, 0x2D, 0, 0], [0x3D, 0xFF, 0xFF, 0, 0]]
@@ -239,7 +245,7 @@ mod tests {
 
     #[test]
     fn express_points_lie_before_their_places() {
-        // 1,234 mm and 37 eighths of a degree, 40 mm and 26.
+        // 1,234 mm with 37/8 degrees, and 40 mm with 26/8 degrees.
         let [a, b] = [1_234 << 2 | 2u16, 40 << 2 | 1].map(u16::to_le_bytes);
         let bytes = packet(PacketFormat::Express, &[0x80, 0x16, a[0], a[1], b[0], b[1], 0xA5]);
         assert!(PacketFormat::Express.is_valid(&bytes[..84]));
@@ -275,14 +281,14 @@ mod tests {
         let three = |major: u32, first: i32, second: i32| {
             (major | (first as u32 & 0x3FF) << 12 | (second as u32 & 0x3FF) << 22).to_le_bytes()
         };
-        // 688 mm in steps of 2, 2,128 mm in steps of 4, none, 2,128 mm.
+        // 688 mm in steps of 2, 2,128 mm in steps of 4, no return, and 2,128 mm.
         let threes = [three(600, 10, -3), three(1_300, -512, 511), three(0, 5, -1), three(1_300, 0, 0)];
         let mut body = [0; 18];
         body[2..].copy_from_slice(threes.as_flattened());
         let bytes = packet(PacketFormat::Ultra, &body);
         let ranges: [u16; 9] = core::array::from_fn(|i| PacketFormat::Ultra.point(&bytes, &bytes, i).range);
         assert_eq!(ranges, [688, 708, 2_116, 2_128, 0, 0, 0, 2_148, 2_124]);
-        // The last one differs from what the next packet begins with.
+        // The last point is a difference from the first point of the next packet.
         let mut body = [0; 130];
         body[126..].copy_from_slice(&three(100, 0, 7));
         let (last, next) =

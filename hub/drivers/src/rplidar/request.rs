@@ -1,13 +1,13 @@
-//! Requests to a scanner, the descriptors of its responses, and the identity and health that it reports, after the
-//! manufacturer's description of the protocol. Requests can be made only here. None of them changes a setting that the
-//! scanner keeps without power.
+//! Requests to a scanner, the descriptors of its responses, and the identity and health that it reports, according to
+//! the manufacturer's protocol description. Only this module can create requests. None of them changes a setting that
+//! the scanner keeps without power.
 
 use core::fmt;
 
 use crate::rplidar::packet::PacketFormat;
 use crate::rplidar::{Mode, Model, Motor};
 
-/// An encoded request.
+/// Encoded request.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Request {
     bytes: [u8; Request::MAX_LEN],
@@ -17,17 +17,17 @@ pub(crate) struct Request {
 impl Request {
     const MAX_LEN: usize = 12;
 
-    /// Stops a stream. There is no response.
+    /// Stops a stream. The scanner sends no response.
     pub(crate) const STOP: Request = Request::without_payload(0x25);
     /// Restarts the scanner.
     pub(crate) const RESET: Request = Request::without_payload(0x40);
-    /// Starts the standard scan: single points.
+    /// Starts the standard scan, whose packets contain one point each.
     pub(crate) const SCAN: Request = Request::without_payload(0x20);
-    /// Requests model, versions and serial number.
+    /// Requests the model, the versions and the serial number.
     pub(crate) const INFO: Request = Request::without_payload(0x50);
     /// Requests the health.
     pub(crate) const HEALTH: Request = Request::without_payload(0x52);
-    /// Requests the time per point of a scanner that does not list its modes.
+    /// Requests the times per point of a scanner that does not list its modes.
     pub(crate) const SAMPLE_TIMES: Request = Request::without_payload(0x59);
 
     const fn without_payload(command: u8) -> Request {
@@ -46,28 +46,28 @@ impl Request {
         request
     }
 
-    /// Starts the scan mode with this number, whose packets contain several points.
+    /// Returns the request that starts the scan mode with this number, whose packets contain several points.
     pub(crate) fn express(mode: u8) -> Request {
         Request::with_payload(0x82, &[mode, 0, 0, 0, 0])
     }
 
-    /// Requests the value of `key`, of one mode if `mode` is given.
+    /// Returns the request for the value of `key`, for one mode if `mode` is given.
     pub(crate) fn configuration(key: u8, mode: Option<u8>) -> Request {
         let payload = [key, 0, 0, 0, mode.unwrap_or_default(), 0];
         Request::with_payload(0x84, &payload[..if mode.is_some() { 6 } else { 4 }])
     }
 
-    /// Requests whether an accessory board controls the motor.
+    /// Returns the request for whether an accessory board controls the motor.
     pub(crate) fn accessory_board() -> Request {
         Request::with_payload(0xFF, &[0; 4])
     }
 
-    /// Sets the duty cycle of the motor, 0 to 1,023.
+    /// Returns the request that sets the duty cycle of the motor, from 0 to 1,023.
     pub(crate) fn set_motor_pwm(duty: u16) -> Request {
         Request::with_payload(0xF0, &duty.to_le_bytes())
     }
 
-    /// Sets the speed of the head, in revolutions per minute.
+    /// Returns the request that sets the speed of the head, in revolutions per minute.
     pub(crate) fn set_motor_speed(revolutions_per_minute: u16) -> Request {
         Request::with_payload(0xA8, &revolutions_per_minute.to_le_bytes())
     }
@@ -77,7 +77,7 @@ impl Request {
     }
 }
 
-/// Requests that are sent together.
+/// Requests that are sent in one write.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct RequestQueue {
     bytes: [u8; 32],
@@ -85,7 +85,7 @@ pub(crate) struct RequestQueue {
 }
 
 impl RequestQueue {
-    /// Adds `request` after the requests that are queued, as far as there is room.
+    /// Adds `request` after the queued ones. Bytes for which there is no room are dropped.
     pub(crate) fn push(&mut self, request: &Request) {
         for byte in request.bytes() {
             if let Some(slot) = self.bytes.get_mut(self.len) {
@@ -95,19 +95,19 @@ impl RequestQueue {
         }
     }
 
-    /// Returns the bytes to send. A scanner needs no gaps between them.
+    /// Returns the bytes to send. The scanner does not require gaps between them.
     pub(crate) fn bytes(&self) -> &[u8] {
         &self.bytes[..self.len]
     }
 }
 
-/// Keys of [`Request::configuration`].
+/// Keys for [`Request::configuration`].
 pub(crate) mod key {
     /// Number of modes.
     pub(crate) const COUNT: u8 = 0x70;
-    /// Time per point of a mode, in 1/256 us.
+    /// Time per point of a mode, in units of 1/256 us.
     pub(crate) const SAMPLE_TIME: u8 = 0x71;
-    /// Kind of the packets of a mode.
+    /// Packet format of a mode.
     pub(crate) const RESPONSE_TYPE: u8 = 0x75;
     /// Number of the mode that the manufacturer recommends.
     pub(crate) const TYPICAL: u8 = 0x7C;
@@ -115,16 +115,16 @@ pub(crate) mod key {
     pub(crate) const NAME: u8 = 0x7F;
 }
 
-/// Descriptor at the beginning of a response.
+/// Descriptor at the start of a response.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum ResponseDescriptor {
-    /// One response with this number of bytes follows.
+    /// A single response of this type follows, with this number of bytes.
     Reply(ResponseType, usize),
-    /// A stream of these packets follows, until it is stopped.
+    /// A stream of packets of this format follows, until the stop request.
     Stream(PacketFormat),
 }
 
-/// The request that a response belongs to.
+/// Type of a response, by the request to which it responds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum ResponseType {
     /// [`Request::INFO`].
@@ -140,7 +140,7 @@ pub(crate) enum ResponseType {
 }
 
 impl ResponseType {
-    /// Returns the type in the descriptor.
+    /// Returns the value of the type in a descriptor.
     const fn number(self) -> u8 {
         match self {
             ResponseType::Info => 0x04,
@@ -156,7 +156,7 @@ impl ResponseDescriptor {
     /// Length of a descriptor, in bytes.
     pub(crate) const LEN: usize = 7;
 
-    /// Decodes the descriptor that `bytes` begin with. Returns `None` if they begin with something else, or are too few.
+    /// Decodes the descriptor at the start of `bytes`. Returns `None` if there is no descriptor, or it is incomplete.
     pub(crate) fn parse(bytes: &[u8]) -> Option<ResponseDescriptor> {
         let &[START_BYTE, 0x5A, a, b, c, d, response] = bytes.first_chunk()? else { return None };
         let word = u32::from_le_bytes([a, b, c, d]);
@@ -176,7 +176,7 @@ impl ResponseDescriptor {
         }
     }
 
-    /// Encodes the descriptor, in the form in which a scanner sends it.
+    /// Encodes the descriptor as a scanner sends it.
     pub(crate) fn encode(self) -> [u8; ResponseDescriptor::LEN] {
         let (len, times, kind) = match self {
             ResponseDescriptor::Reply(answer, len) => (len, 0, answer.number()),
@@ -186,7 +186,7 @@ impl ResponseDescriptor {
         [START_BYTE, 0x5A, a, b, c, d, kind]
     }
 
-    /// Returns whether `bytes` may be the beginning of a descriptor.
+    /// Returns whether `bytes` may be the start of a descriptor.
     pub(crate) fn begins(bytes: &[u8]) -> bool {
         match bytes {
             [] => true,
@@ -197,7 +197,7 @@ impl ResponseDescriptor {
 }
 
 const START_BYTE: u8 = 0xA5;
-/// Maximum length of a response: more than the longest name of a mode needs.
+/// Maximum length of a response, in bytes. It is enough for the longest name of a mode.
 const MAX_RESPONSE_LEN: usize = 64;
 
 /// Identity of a scanner, from its reply to `A5 50`.
@@ -205,7 +205,7 @@ const MAX_RESPONSE_LEN: usize = 64;
 pub struct Info {
     /// Number of the model. The upper four bits are the series.
     pub id: u8,
-    /// Version of the firmware: major, minor.
+    /// Major and minor version of the firmware.
     pub firmware: (u8, u8),
     /// Revision of the hardware.
     pub hardware: u8,
@@ -214,18 +214,18 @@ pub struct Info {
 }
 
 impl Info {
-    /// Length of a reply, in bytes.
+    /// Length of the reply, in bytes.
     pub(crate) const LEN: usize = 20;
 
-    /// Decodes a reply.
+    /// Decodes a reply. Returns `None` if it is too short.
     pub(crate) fn parse(reply: &[u8]) -> Option<Info> {
         let &[id, minor, major, hardware, ref serial @ ..] = reply.first_chunk::<{ Info::LEN }>()?;
         Some(Info { id, firmware: (major, minor), hardware, serial: *serial })
     }
 
-    /// Returns the identity of a scanner whose status has this `text` as its type, such as `S2 denseboost 1.02`. A status has
-    /// no hardware revision and no serial number: they are 0. Returns `None` if neither `model` nor the text has the number
-    /// of the model.
+    /// Returns the identity of a scanner from a status whose type is `text`, such as `S2 denseboost 1.02`. A status
+    /// does not contain the hardware revision and the serial number, so they are 0. Returns `None` if the number of the
+    /// model is neither in `model` nor in the text.
     pub(crate) fn of_status(model: Option<Model>, text: &str) -> Option<Info> {
         let words: Vec<&str> = text.split_whitespace().collect();
         let number = |word: &&str| u8::from_str_radix(word.strip_prefix("0x")?, 16).ok();
@@ -247,12 +247,12 @@ impl Info {
         reply
     }
 
-    /// Returns the model, if scanhub knows its number.
+    /// Returns the model, if scanhub supports it.
     pub fn model(&self) -> Option<Model> {
         Model::of_id(self.id)
     }
 
-    /// Returns how the motor is controlled.
+    /// Returns the control of the motor.
     pub(crate) fn motor(&self) -> Motor {
         match self.id >> 4 {
             0 | 1 => Motor::Dtr,
@@ -267,14 +267,14 @@ impl Info {
 pub enum Health {
     /// The scanner works.
     Good,
-    /// The scanner measures, but may fail soon; with its error code.
+    /// The scanner measures, but may fail soon. Contains its error code.
     Warning(u16),
-    /// The scanner does not measure; with its error code.
+    /// The scanner has failed and does not measure. Contains its error code.
     Error(u16),
 }
 
 impl Health {
-    /// Decodes a reply.
+    /// Decodes a reply. Returns `None` if it is too short.
     pub(crate) fn parse(reply: &[u8]) -> Option<Health> {
         let &[status, low, high] = reply.first_chunk()?;
         let code = u16::from_le_bytes([low, high]);
@@ -301,22 +301,22 @@ impl fmt::Display for Health {
     }
 }
 
-/// Facts that the responses report.
+/// Contents of the responses before a stream, for a stream file that lacks them.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct StreamHead {
     /// Identity of the scanner, if it is known.
     pub(crate) info: Option<Info>,
-    /// Mode of the stream, if scanhub knows it.
+    /// Scan mode of the stream, if scanhub supports it.
     pub(crate) mode: Option<Mode>,
-    /// Microseconds per point, if they are known.
+    /// Time per point in microseconds, if it is known.
     pub(crate) sample_us: Option<f64>,
-    /// Kind of the packets.
+    /// Format of the packets.
     pub(crate) kind: PacketFormat,
 }
 
 impl StreamHead {
-    /// Encodes the responses: the identity, a list of modes that contains only the one of the stream, and the descriptor of the
-    /// packets.
+    /// Encodes the responses. They are the identity, a list of modes that contains only the mode of the stream, and the
+    /// descriptor of the stream.
     pub(crate) fn encode(&self) -> Vec<u8> {
         let mut bytes = Vec::new();
         if let Some(info) = &self.info {

@@ -1,22 +1,24 @@
-//! Position of a packet in its stream: the next one, one after a gap, or an outlier.
+//! Position of each packet in its stream: the next packet, the first one after a gap, or an outlier.
 //!
-//! Packets have no counter. But a head rotates evenly, so the angle from packet to packet is known. The number of
-//! missing packets follows from the angle of the gap, and the number of missing revolutions from the time.
+//! Packets have no counter. A head rotates at a constant speed, so the angle from packet to packet is known. The number
+//! of missing packets follows from the angle of the gap, and the number of missing revolutions from its time.
 
-/// The packets of one stream: of several points each, or of one.
+/// State of a stream: its last packet, the speed of the head, and the packet counters. A packet has one point or
+/// several.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct PacketSequencer {
     last: Option<LastPacket>,
-    /// Angle of the last outlier. The next packet may show that it was none.
+    /// Angle of the last outlier, in degrees. The next packet may show that it belongs to the stream.
     outlier: Option<f32>,
     outliers: u32,
-    /// Degrees from one packet to the next, and number of packets that it was measured with.
+    /// Angle from one packet to the next in degrees, and the number of packets from which it was measured.
     advance: f64,
     learned_packets: u32,
-    /// For packets of one point: angle at which a full revolution began, and number of packets since.
+    /// For packets of one point: the angle at which the measurement of a revolution started, and the number of packets
+    /// since then.
     revolution: (f64, u32),
     is_whole: bool,
-    /// Number of points that the bytes between packets since then may have been.
+    /// Number of points that the discarded bytes in this revolution may have been.
     uncertain_points: u32,
     received: u64,
     lost: u64,
@@ -29,43 +31,43 @@ struct LastPacket {
     time: f64,
 }
 
-/// The place of a packet in its stream.
+/// Position of a packet in its stream.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct PacketPosition {
     /// Relation to the last packet.
     pub(crate) step: Step,
-    /// Degrees of its first point, clockwise over all revolutions.
+    /// Angle of the first point, in degrees clockwise over all revolutions.
     pub(crate) angle: f64,
-    /// Time of its first point, by the scanner's clock in nanoseconds.
+    /// Time of the first point in the scanner's clock, in nanoseconds.
     pub(crate) time: f64,
 }
 
-/// Relation of a packet to the last one.
+/// Relation of a packet to the previous one.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Step {
-    /// The packet begins a new sequence, and with it a new clock.
+    /// The packet starts a new sequence, with a new clock.
     First,
-    /// The packet is the next one.
+    /// The packet follows the previous one directly.
     Next,
-    /// Packets are missing between the two, or may be. The last one was at `from`.
+    /// Packets are missing before this one, or may be missing. The previous packet was at the angle `from`.
     Gap {
-        /// Degrees, as in [`PacketPosition::angle`].
+        /// Angle in degrees, as in [`PacketPosition::angle`].
         from: f64,
-        /// Duration in nanoseconds, by the counted packets.
+        /// Duration in nanoseconds, by the number of counted packets.
         ns: f64,
     },
-    /// The packet is an outlier.
+    /// The packet does not fit into the sequence.
     Outlier,
 }
 
-/// A received packet.
+/// Received packet, as the sequencer needs it.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct ReceivedPacket {
-    /// Degrees of its first point, clockwise.
+    /// Angle of the first point, in degrees clockwise.
     pub(crate) start: f32,
-    /// Number of discarded bytes between it and the last one.
+    /// Number of discarded bytes between the previous packet and this one.
     pub(crate) skipped: u32,
-    /// Nanoseconds from one packet to the next.
+    /// Time from one packet to the next, in nanoseconds.
     pub(crate) packet_ns: f64,
 }
 
@@ -91,28 +93,30 @@ impl PacketSequencer {
         }
     }
 
-    /// Ends the sequence: the next packet is the first one of another.
+    /// Ends the sequence. The next packet starts a new one.
     pub(crate) fn end(&mut self) {
         (self.last, self.outlier, self.outliers, self.learned_packets) = (None, None, 0, 0);
     }
 
-    /// Returns whether a packet has arrived since the sequence began.
+    /// Returns whether a packet has arrived since the sequence started.
     pub(crate) fn has_begun(&self) -> bool {
         self.last.is_some()
     }
 
-    /// Returns the numbers of received packets, and of lost ones between them.
+    /// Returns the number of received packets, and the number of lost packets between them.
     pub(crate) fn received_and_lost(&self) -> (u64, u64) {
         (self.received, self.lost)
     }
 
-    /// Returns the degrees from one packet to the next. `None` until they are known, and if the head stands still.
+    /// Returns the angle from one packet to the next, in degrees. Returns `None` until it is known, and if the head
+    /// does not rotate.
     pub(crate) fn advance(&self) -> Option<f64> {
         (self.learned_packets >= LEARNING_PACKETS && self.advance > MIN_PACKET_DEG).then_some(self.advance)
     }
 
-    /// Places a packet of several points. `late` returns the nanoseconds by which it arrived later than usual if its
-    /// first point was measured at the given time. Its second argument is whether there is a gap before.
+    /// Returns the position of a packet of several points. `delay` takes the time of its first point and whether there
+    /// is a gap before the packet. It returns the delay of the packet's arrival in nanoseconds, compared with the usual
+    /// arrival.
     pub(crate) fn locate(
         &mut self,
         packet: ReceivedPacket,
@@ -141,7 +145,7 @@ impl PacketSequencer {
         let late = |time: f64| delay(time, true);
         let angle = angle + 360.0 * speed.missing_revolutions(late(last.time + speed.time(angle)));
         let packets = f64::from((angle / advance + 0.5) as u32);
-        // In a long gap, a head may have changed its speed. Then the time indicates the number of packets better.
+        // During a long gap, the speed of the head may have changed. The time then gives a better number of packets.
         let max_correction = f64::from((0.1 * packets) as u32);
         let late_by = late(last.time + packets * packet.packet_ns) / packet.packet_ns;
         let off = (late_by + 0.5f64.copysign(late_by)).clamp(-max_correction, max_correction) as i32;
@@ -158,7 +162,7 @@ impl PacketSequencer {
         self.locate_next(last, packet, angle, packets, Step::Gap { from: last.angle, ns })
     }
 
-    /// Places a packet of one point, whose angle may be smaller than that of an earlier one.
+    /// Returns the position of a packet of one point. Its angle may be smaller than that of an earlier packet.
     pub(crate) fn locate_point(
         &mut self,
         packet: ReceivedPacket,
@@ -169,8 +173,8 @@ impl PacketSequencer {
         let angle = clockwise(last.start, packet.start);
         let angle = if angle > 360.0 - MAX_BACKWARD_DEG { angle - 360.0 } else { angle };
         self.is_whole &= packet.is_adjacent();
-        // The skipped bytes may be points that lost bytes or had additional ones, but not if they took less time than
-        // points.
+        // The skipped bytes may have been points that lost bytes or had extra ones. If they took less time than points,
+        // they were not points.
         let points = f64::from(1 + (packet.skipped + 3) / POINT_LEN);
         let early =
             if packet.is_adjacent() { 0.0 } else { -delay(last.time + points * packet.packet_ns, false) };
@@ -215,7 +219,7 @@ impl PacketSequencer {
         PacketPosition { step: Step::First, angle, time }
     }
 
-    /// Places a packet `packets` packets and `angle` degrees after `last`.
+    /// Returns the position of a packet that is `packets` packets and `angle` degrees after `last`.
     fn locate_next(
         &mut self,
         last: LastPacket,
@@ -245,7 +249,7 @@ impl PacketSequencer {
         self.revolution.1 += packets as u32;
         let (from, count) = self.revolution;
         let passed = position.angle - from;
-        // A revolution in which the head stood still does not count.
+        // A revolution in which the head stopped does not count.
         if self.advance().is_some_and(|advance| f64::from(count) > (passed + 90.0) / advance) {
             return self.locate_first(packet.start);
         }
@@ -255,7 +259,7 @@ impl PacketSequencer {
         (self.revolution, self.uncertain_points) = ((position.angle, 0), 0);
         let whole = core::mem::replace(&mut self.is_whole, true);
         match self.advance() {
-            // Points are missing without a jump of the angle.
+            // Points are missing, although the angle has not jumped.
             Some(advance) if !whole => {
                 let missing = passed / advance - f64::from(count);
                 if missing >= 2.0 {
@@ -273,7 +277,7 @@ impl PacketSequencer {
         position
     }
 
-    /// Handles an outlier, unless enough of them follow each other.
+    /// Counts an outlier. If enough consecutive outliers agree with each other, starts a new sequence instead.
     fn handle_outlier(&mut self, packet: ReceivedPacket) -> PacketPosition {
         let is_continued =
             self.outlier.is_some_and(|outlier| clockwise(outlier, packet.start) < MAX_PACKET_DEG);
@@ -286,22 +290,22 @@ impl PacketSequencer {
     }
 }
 
-/// Returns the degrees from one angle to another, 0 to 360.
+/// Returns the clockwise angle from one angle to another, from 0 to 360 degrees.
 fn clockwise(from: f32, to: f32) -> f64 {
     let angle = f64::from(to) - f64::from(from);
     if angle < 0.0 { angle + 360.0 } else { angle }
 }
 
-/// Speed of a head.
+/// Speed of the head, per packet.
 #[derive(Clone, Copy)]
 struct RotationSpeed {
-    /// Degrees and nanoseconds from one packet to the next.
+    /// Angle from one packet to the next in degrees; `packet_ns` is the time in nanoseconds.
     advance: f64,
     packet_ns: f64,
 }
 
 impl RotationSpeed {
-    /// Returns the nanoseconds for `angle` degrees.
+    /// Returns the time in nanoseconds in which the head rotates by `angle` degrees.
     fn time(self, angle: f64) -> f64 {
         angle / self.advance * self.packet_ns
     }
@@ -311,38 +315,40 @@ impl RotationSpeed {
         f64::from((late.max(0.0) / self.time(360.0) + 0.5) as u32)
     }
 
-    /// Returns whether a packet `angle` degrees after the last one arrived before it was measured. The clocks differ by
-    /// little.
+    /// Returns whether a packet `angle` degrees after the previous one arrived before it can have been measured. The
+    /// tolerance covers the drift of the clocks.
     fn is_early(self, late: f64, angle: f64) -> bool {
         late < -(MAX_EARLY_NS + MAX_DRIFT * self.time(angle))
     }
 
-    /// Returns whether the scanner did not send for a while, because a packet is much later than its angle indicates.
+    /// Returns whether the packet is much later than its angle indicates, because the scanner has paused.
     fn is_after_pause(self, late: f64) -> bool {
         late > 0.15 * self.time(360.0)
     }
 }
 
-/// Number of packets in agreement until the angle between them counts, and of outliers in a row until they do.
+/// Number of packets in agreement after which the angle between them counts, and number of consecutive outliers after
+/// which they start a new sequence.
 const LEARNING_PACKETS: u32 = 3;
-/// Number of packets in agreement until missing ones count as lost. Before, the head may not have its speed yet.
+/// Number of packets in agreement after which missing packets count as lost. Before, the head may still be spinning up.
 const STEADY_PACKETS: u32 = 12;
-/// Maximum degrees of a packet. A faster head measures less than four of them in a revolution.
+/// Maximum angle of a packet in degrees. If it is larger, a revolution has fewer than four packets.
 const MAX_PACKET_DEG: f64 = 100.0;
-/// Maximum degrees of a packet of a head that stands still.
+/// Angle of a packet in degrees up to which the head counts as stopped.
 const MIN_PACKET_DEG: f64 = 0.02;
-/// Beginning of the scanner's clock in nanoseconds, so late that no time is negative.
+/// Start of the scanner's clock in nanoseconds. It is large enough that no time is negative.
 const CLOCK_START_NS: f64 = 1e10;
-/// Degrees by which a point may be before the previous one, and after it without a gap.
+/// Maximum angle in degrees by which a point may precede the previous one; below it, by which it may follow without a
+/// gap.
 const MAX_BACKWARD_DEG: f64 = 25.0;
 const MAX_FORWARD_DEG: f64 = 25.0;
-/// Nanoseconds by which a packet may be early, and share of the time since the last packet by which two clocks may
-/// differ.
+/// Maximum time in nanoseconds by which a packet may be early; below it, the maximum drift between the clocks, as a
+/// ratio.
 const MAX_EARLY_NS: f64 = 3e6;
 const MAX_DRIFT: f64 = 0.02;
 /// Length of a packet of one point, in bytes.
 const POINT_LEN: u32 = 5;
-/// Number of single points that may be missing without a gap.
+/// Maximum number of single points that may be missing without a gap.
 const MAX_MISSING_POINTS: u32 = 30;
 
 #[cfg(test)]
@@ -377,7 +383,7 @@ mod tests {
         (0..40).map(f64::from).for_each(|n| {
             place(n, n * advance);
         });
-        // The head was slower by 0.2 %.
+        // The head rotated more slowly by 0.2 %.
         let behind = place(39.0 + 256.8, (39.0 + 256.4) * advance);
         assert!(matches!(behind.step, Step::Gap { .. }), "{behind:?}");
         assert_eq!(((behind.time - CLOCK_START_NS) / packet_ns).round(), 39.0 + 257.0);
@@ -394,7 +400,7 @@ mod tests {
         (0..3_000).for_each(|n| {
             place(n, 0);
         });
-        // 12 bytes after each point, then 4,693 at once, and a fragment of ten lost points.
+        // 12 bytes after each point, then 4,693 bytes at once, and later the rest of ten lost points.
         let steps: [Step; 49] = core::array::from_fn(|i| place(3_001 + i as u32, 12).step);
         assert!(matches!(steps, [Step::Next, .., Step::Gap { .. }]), "that many bytes may have been points");
         place(3_051, 4_693);

@@ -1,8 +1,8 @@
-//! The session with an RPLIDAR: it requests the identity of the scanner, starts a scan mode, and returns packets as
-//! they arrive, and revolutions.
+//! Session with an RPLIDAR. It requests the identity of the scanner, starts a scan mode, and returns packets as they
+//! arrive, and revolutions.
 //!
-//! A stream that another program left running is stopped, never continued: express and dense packets look alike, and a
-//! scanner that measures answers no request.
+//! The session stops a stream that another program has left running, and never continues it. Express and dense packets
+//! look alike, and a scanner does not respond to requests while it streams.
 
 use core::fmt;
 
@@ -22,50 +22,51 @@ use crate::rplidar::stream::{LineTiming, Stream};
 use crate::rplidar::{Mode, Model, describe};
 use crate::settings::Settings;
 
-/// The session with one scanner.
+/// Session with an RPLIDAR scanner.
 #[derive(Clone, Debug)]
 pub struct RplidarSession {
     settings: Settings,
     now: Nanos,
     phase: Phase,
-    /// State that is shown until measured data arrive.
+    /// State to report until measured data arrives.
     shown: State,
     problem: Option<Problem>,
     framer: Framer,
     reads: ReadScheduler,
     rate: RateSearch,
     requests: RequestQueue,
-    /// Level that the DTR line has to get.
+    /// Level that the line DTR must be set to.
     change_dtr: Option<bool>,
     handshake: Handshake,
     stream: Stream,
-    /// Kind of the stream and arrival of its descriptor, once the descriptor has arrived.
+    /// Packet format of the stream and arrival time of its descriptor. `None` until the descriptor has arrived.
     announced: Option<(PacketFormat, Nanos)>,
     counters: StreamCounters,
-    /// Time since which there are no subscribers.
+    /// Time from which the sensor has had no subscribers.
     idle_since: Option<Nanos>,
 }
 
 #[derive(Clone, Copy, Debug)]
 enum Phase {
-    /// A recording. No packets have been read yet.
+    /// The session reads a recording, and no packet has been read.
     Listening { since: Nanos },
-    /// The stop request was sent. The session sends the first query at `until`, or at `at_most` if bytes still arrive.
+    /// The stop request was sent. The session sends the first query when the line is quiet at `until`, or at `at_most`
+    /// even if bytes still arrive.
     Draining { attempts: u8, until: Nanos, at_most: Nanos },
-    /// The response to `query` is expected by `until`.
+    /// The session waits for the response to `query` until `until`.
     Querying { query: Query, attempts: u8, until: Nanos },
-    /// The scanner restarts.
+    /// The scanner is restarting.
     Booting { until: Nanos },
-    /// The scanner reports an error. The session requests the health again at `until`.
+    /// The scanner reports an error. The session requests its health again at `until`.
     Unhealthy { until: Nanos },
-    /// Packets arrive.
+    /// Packets are arriving.
     Streaming(Watchdog),
-    /// A user paused the session, or, if `is_resting`, there are no subscribers.
+    /// A user has paused the session, or, if `is_idle`, the sensor has no subscribers.
     Paused { is_idle: bool },
 }
 
 impl RplidarSession {
-    /// Creates a session on a port that is open at the rate of `settings`.
+    /// Creates a session on a port that is open at the baud rate of the configured model, or at the default rate.
     pub fn new(settings: Settings, now: Nanos) -> Self {
         let mut session = RplidarSession {
             settings,
@@ -88,22 +89,22 @@ impl RplidarSession {
         session
     }
 
-    /// Returns the model, once it is known.
+    /// Returns the model that the scanner has reported, or the configured one.
     pub fn model(&self) -> Option<Model> {
         self.handshake.model()
     }
 
-    /// Returns the identity that the scanner reported.
+    /// Returns the identity that the scanner has reported.
     pub fn info(&self) -> Option<Info> {
         self.handshake.info
     }
 
-    /// Returns the health that the scanner reported.
+    /// Returns the health that the scanner has reported.
     pub fn health(&self) -> Option<Health> {
         self.handshake.health
     }
 
-    /// Returns the points that the scanner measures per second, once they are known.
+    /// Returns the number of points that the scanner measures per second. Returns `None` until it is known.
     pub fn points_per_second(&self) -> Option<f32> {
         self.stream.points_per_second()
     }
@@ -113,12 +114,12 @@ impl RplidarSession {
         self.framer.buffer.byte_counters()
     }
 
-    /// Returns the numbers of revolutions by kind.
+    /// Returns the counts of revolutions by kind.
     pub fn revolution_counts(&self) -> RevolutionCounts {
         self.stream.revolution_counts()
     }
 
-    /// Begins again at the current rate. The session shows the state `shown` until measured data arrive.
+    /// Starts again at the current baud rate. `shown` is the state of the session until measured data arrives.
     fn begin(&mut self, shown: State) {
         self.end_stream();
         self.announced = None;
@@ -127,12 +128,12 @@ impl RplidarSession {
             self.phase = Phase::Listening { since: self.now };
             return self.framer.expect(ExpectedBytes::AnyPackets(self.handshake.ambiguous_format()));
         }
-        // Opening a port asserts it, which keeps the motor of an A1 off.
+        // The kernel asserts DTR when a port is opened, which keeps the motor of an A1 off.
         self.change_dtr = Some(false);
         self.stop(0);
     }
 
-    /// Sends the stop request. The first query follows; `attempts` of it were not answered.
+    /// Sends the stop request, and then the first query. `attempts` is the number of earlier attempts with that query.
     fn stop(&mut self, attempts: u8) {
         self.framer.expect(ExpectedBytes::Responses);
         self.requests = RequestQueue::default();
@@ -141,7 +142,7 @@ impl RplidarSession {
         self.phase = Phase::Draining { attempts, until, at_most };
     }
 
-    /// Stops the stream and the motor, and expects nothing.
+    /// Stops the stream and the motor. The session then expects nothing.
     fn stop_scanner(&mut self, is_idle: bool) {
         self.end_stream();
         self.framer.expect(ExpectedBytes::Nothing);
@@ -153,18 +154,19 @@ impl RplidarSession {
         self.phase = Phase::Paused { is_idle };
     }
 
-    /// Starts the motor, or stops it.
+    /// Starts or stops the motor.
     fn set_motor(&mut self, is_on: bool) {
         match self.handshake.motor_request(is_on) {
             _ if self.settings.listen_only => {}
             Some(request) => self.requests.push(&request),
-            // A session begins with DTR cleared.
+            // Every session clears DTR at its start.
             None if is_on => {}
             None => self.change_dtr = Some(true),
         }
     }
 
-    /// Sends `query`. There were `attempts` before. In a recording, the recorded program sends queries.
+    /// Sends `query`, after `attempts` earlier attempts. Does nothing for a recording, in which the recorded program
+    /// has sent the queries.
     fn query(&mut self, query: Query, attempts: u8) {
         if self.settings.listen_only {
             return;
@@ -199,7 +201,7 @@ impl RplidarSession {
         self.proceed(next);
     }
 
-    /// Handles that no response to `query` arrived.
+    /// Handles a missing response to `query`.
     fn on_no_response(&mut self, query: Query, attempts: u8) {
         // Bytes arrived, but no valid response. The response may have been damaged, so do not conclude that the request
         // is unsupported.
@@ -253,39 +255,40 @@ impl RplidarSession {
         }
     }
 
-    /// Tries the next rate, and updates the time in the trouble.
+    /// Changes to the next baud rate, and updates the duration in the problem.
     fn search_next_rate(&mut self) {
         let since = self.rate.advance(self.now, self.framer.buffer.byte_counters().read);
         self.report_no_response(since);
         self.stop(0);
     }
 
-    /// Reports that no response has arrived since `since`.
+    /// Reports the problem that no response has arrived since `since`.
     fn report_no_response(&mut self, since: Nanos) {
         if self.problem != Some(Problem::AmbiguousPackets) {
             self.problem = self.rate.no_response_problem(since, self.now).or(self.problem);
         }
     }
 
-    /// Handles the boot message of a scanner, which has lost its settings. `is_named` as of [`Found::BootMessage`].
+    /// Handles the boot message of a scanner, which has lost its settings. `is_named` is the field of
+    /// [`FramerEvent::BootMessage`].
     fn on_boot_message(&mut self, is_named: bool) {
         match self.phase {
             Phase::Paused { .. } | Phase::Listening { .. } => {}
-            // The first query follows anyway. A stream at another rate may look like text again and again.
+            // The first query follows anyway. A stream at another baud rate may look like text repeatedly.
             Phase::Draining { .. } | Phase::Querying { query: Query::Info, .. } => {
                 if is_named && self.rate.take_stream() {
                     self.counters.note_restart();
                 }
             }
             Phase::Booting { .. } => self.phase = Phase::Booting { until: self.now + SETTLE_TIME },
-            // The rest of a packet may be text too, but a scanner that boots pauses before its boot message. A name
-            // proves it even after other bytes, which a scanner sends while its supply drops.
+            // The rest of a packet may look like text too, but a scanner pauses before its boot message. The name
+            // proves the message even after other bytes, which a scanner sends while its supply voltage drops.
             Phase::Streaming(watchdog)
                 if !is_named
                     && (watchdog.silent_at().abs_diff(self.now + Watchdog::SILENCE_TIMEOUT)
                         < BOOT_SILENCE
                         || self.framer.skipped() > PacketFormat::MAX_LEN as u32 + BOOT_MESSAGE_LEN) => {}
-            // A stream whose beginning was damaged looks like text here and there.
+            // A stream whose first bytes were damaged may look like text in some places.
             Phase::Querying { .. } if !is_named => {}
             phase => {
                 if matches!(phase, Phase::Streaming(_)) {
@@ -303,7 +306,7 @@ impl RplidarSession {
     /// Handles the descriptor of a stream.
     fn on_stream_begin(&mut self) {
         match self.phase {
-            // Another stream, in an unknown mode: of another program, or of another scanner.
+            // The descriptor announces another stream in an unknown mode, from another program or another scanner.
             Phase::Streaming(_) if !self.settings.listen_only && !self.is_repeated_announcement() => {
                 self.counters.note_resync();
                 self.begin(State::Starting);
@@ -325,9 +328,9 @@ impl RplidarSession {
         }
     }
 
-    /// Returns whether the descriptor that has just arrived announces the session's own stream once more: the scanner
-    /// responds to a request and to its repetition. A head may need a second to reach its speed. During this time, another
-    /// scanner or program can start a stream, too.
+    /// Returns whether the descriptor that has just arrived announces the session's own stream again. A scanner
+    /// responds to a request and to its repetition. Another scanner or program can also start a stream in the second
+    /// that a head may need to spin up, so only a descriptor shortly after the first one counts.
     fn is_repeated_announcement(&self) -> bool {
         let is_repeated = |(kind, at): (PacketFormat, Nanos)| {
             self.framer.kind() == Some(kind) && self.now < at + 2 * self.response_timeout()
@@ -335,7 +338,7 @@ impl RplidarSession {
         !self.stream.has_begun() && self.announced.is_some_and(is_repeated)
     }
 
-    /// Starts or extends the stream after packets have arrived. Returns its deadlines.
+    /// Starts the stream after its first packets, or extends it after later ones. Returns its deadlines.
     fn continue_stream(&mut self) -> Watchdog {
         let mut watchdog = Watchdog::new(self.now);
         if let Phase::Streaming(known) = self.phase {
@@ -351,13 +354,13 @@ impl RplidarSession {
         watchdog
     }
 
-    /// Ends the stream: the next packet belongs to another one.
+    /// Ends the stream. The next packet belongs to a new one.
     fn end_stream(&mut self) {
         self.stream.end();
         self.reads.cancel_wait();
     }
 
-    /// Stamps the packets of `span`, and keeps them for revolutions.
+    /// Returns the packets of `span` with their stamps, and keeps them for revolutions.
     fn receive(&mut self, kind: PacketFormat, mut span: Span) -> ReceivedTelegram<'_> {
         self.continue_stream();
         span.reasons |= self.reads.take_suspect(span.offset + span.len as u64);
@@ -388,7 +391,7 @@ impl RplidarSession {
         }
     }
 
-    /// Returns the packets of a response for the caller.
+    /// Returns the bytes of a response or descriptor as a reply.
     fn reply(&self, span: Span) -> ReceivedTelegram<'_> {
         ReceivedTelegram {
             bytes: self.framer.bytes(span),
@@ -403,7 +406,7 @@ impl RplidarSession {
         }
     }
 
-    /// Returns a complete revolution, and updates the state of the session.
+    /// Returns a complete revolution as a scan, and updates the state of the session.
     fn complete_revolution(&mut self, revolution: ClosedRevolution) -> RawScan<'_> {
         let first = self.stream.to_scan(revolution, &self.reads, self.now).first;
         self.reads.end_revolution(first);
@@ -415,7 +418,8 @@ impl RplidarSession {
         self.stream.to_scan(revolution, &self.reads, self.now)
     }
 
-    /// Handles deadlines after all bytes were framed. Bytes that belong to nothing do not extend a deadline.
+    /// Handles deadlines after all bytes were framed. Bytes that are not part of a packet or response do not extend a
+    /// deadline.
     fn handle_deadlines(&mut self) {
         let now = self.now;
         let is_idle =
@@ -453,11 +457,11 @@ impl RplidarSession {
         }
     }
 
-    /// Returns when the session has to act without a byte.
+    /// Returns the time at which the session must act even if no byte arrives.
     fn deadline(&self) -> Nanos {
         match self.phase {
             Phase::Listening { since } => {
-                // The next full second, for the time in the trouble.
+                // The next full second, at which the duration in the problem changes.
                 let seconds = self.now.saturating_sub(since) / SECOND;
                 since + (seconds + 1) * SECOND
             }
@@ -670,7 +674,7 @@ impl line::ScannerSession for RplidarSession {
     }
 
     fn device_info(&self) -> Option<DeviceInfo> {
-        // The health is known, unless the scanner does not respond to that request.
+        // The health is known, unless the scanner does not respond to this request.
         let is_unconfirmed = matches!(
             self.phase,
             Phase::Draining { .. } | Phase::Querying { query: Query::Info | Query::Health, .. }
@@ -700,11 +704,11 @@ impl line::ScannerSession for RplidarSession {
 /// Reason why a session does not stream as it should.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Problem {
-    /// No response, or no packets in a recording.
+    /// No response arrives. In a recording, no packet arrives.
     NoResponse {
-        /// The only rate that the session tried. `None`: it tried all.
+        /// The only baud rate that the session tried. `None` if it tried all of them.
         baud: Option<u32>,
-        /// Seconds without a response, rounded down to 1, 2, 4, ..
+        /// Duration in seconds, rounded down to a power of two.
         seconds: u32,
     },
     /// No measured data arrived for one second.
@@ -713,11 +717,11 @@ pub enum Problem {
     HeadBlocked,
     /// The scanner reports a warning or an error.
     Unhealthy(Health),
-    /// The scanner responds, but does not begin to measure.
+    /// The scanner responds, but does not start to measure.
     Refused,
-    /// A recording contains packets that may be of two kinds, and nothing shows which kind they are.
+    /// A recording contains packets that may have one of two formats, and nothing in it shows which one.
     AmbiguousPackets,
-    /// The scanner does not have this mode, or the line is too slow for it. The scanner uses another mode.
+    /// The scanner does not have this mode, or the line is too slow for it, so the scanner uses another mode.
     ModeUnavailable(Mode),
 }
 
@@ -750,11 +754,12 @@ impl fmt::Display for Problem {
     }
 }
 
-/// A line without a byte for this time after the stop request is quiet.
+/// Time without a byte after the stop request after which the line counts as quiet.
 const QUIET_TIME: Nanos = 15 * MILLIS;
 /// Maximum time to wait for a quiet line before the first query.
 pub(crate) const MAX_DRAIN_TIME: Nanos = 60 * MILLIS;
-/// A response takes some milliseconds. An adapter that collects bytes takes 16 ms more, twice.
+/// Maximum time for a response on a serial line. A response takes some milliseconds, and an adapter that collects bytes
+/// adds 16 ms in each direction.
 const RESPONSE_TIMEOUT: Nanos = 70 * MILLIS;
 /// Maximum time for a response over a network.
 const NETWORK_TIMEOUT: Nanos = 500 * MILLIS;
@@ -770,8 +775,8 @@ const BOOT_MESSAGE_LEN: u32 = 64;
 const SETTLE_TIME: Nanos = 10 * MILLIS;
 /// Interval between requests for the health of a scanner that reports an error.
 const HEALTH_RETRY_INTERVAL: Nanos = 2_000 * MILLIS;
-/// Some heads have to reach their speed before they measure.
+/// Maximum time until a head has reached its speed. Some heads measure only then.
 const SPIN_UP_TIME: Nanos = 3_000 * MILLIS;
-/// The motor stops after this time without subscribers. A program that restarts subscribes again in less.
+/// Time without subscribers after which the motor stops. A program that restarts subscribes again in less time.
 const IDLE_TIME: Nanos = 5_000 * MILLIS;
 const SECOND: Nanos = 1_000 * MILLIS;

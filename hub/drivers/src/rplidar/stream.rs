@@ -1,5 +1,5 @@
-//! Packets of a stream: gives them stamps, and assembles their points into revolutions. The points of a packet with
-//! several points are known once the next packet has arrived, and only if nothing is missing between the two.
+//! Stamps and revolutions of the packets of a stream. The points of a packet with several points are known once the
+//! next packet has arrived, and only if no packet is missing between the two.
 
 use crate::line::{
     self, ClosedRevolution, RawScan, ReadLog, ReadScheduler, RevolutionAssembler, RevolutionCounts,
@@ -14,17 +14,17 @@ use crate::rplidar::packet::PacketFormat;
 use crate::rplidar::sequence::{PacketPosition, PacketSequencer, ReceivedPacket, Step};
 use crate::rplidar::{Mode, Model};
 
-/// The line that packets arrive on.
+/// Timing of the line on which packets arrive.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct LineTiming<'a> {
     pub(crate) read_log: &'a ReadLog,
-    /// Rate in bits per second.
+    /// Baud rate in bits per second.
     pub(crate) baud: u32,
-    /// Rate if bytes arrive at the pace of the line, unlike those of a network or a recording.
+    /// The same baud rate, if bytes arrive at the speed of a line. `None` for a network port and for a recording.
     pub(crate) line_rate: Option<u32>,
 }
 
-/// The packets of a stream and their points.
+/// State of a stream, from its packets to its revolutions.
 #[derive(Clone, Debug)]
 pub(crate) struct Stream {
     settings: Settings,
@@ -32,9 +32,9 @@ pub(crate) struct Stream {
     clock: SensorClock,
     point_time: PointTime,
     revolutions: Revolutions,
-    /// Number of beams, once it is known.
+    /// Number of beams of a scan, once it is known.
     pub(crate) beams: Option<usize>,
-    /// Time of the last packet, by the scanner's clock.
+    /// Time of the last packet in the scanner's clock.
     pub(crate) scanner_time: Option<Nanos>,
 }
 
@@ -51,7 +51,7 @@ impl Stream {
         }
     }
 
-    /// Ends the stream: the next packet belongs to another one.
+    /// Ends the stream. The next packet belongs to a new one.
     pub(crate) fn end(&mut self) {
         self.sequencer.end();
         self.revolutions.end();
@@ -62,39 +62,39 @@ impl Stream {
         }
     }
 
-    /// Returns whether packets have arrived since the stream began.
+    /// Returns whether a packet has arrived since the stream started.
     pub(crate) fn has_begun(&self) -> bool {
         self.sequencer.has_begun()
     }
 
-    /// Sets the microseconds per point that the scanner reported for the mode that it is about to start.
+    /// Sets the time per point in microseconds that the scanner has reported for the mode that starts next.
     pub(crate) fn set_sample_us(&mut self, sample_us: Option<f32>) {
         self.point_time.ns = sample_us.map(|us| f64::from(us) * 1e3);
     }
 
-    /// Returns the points that the scanner measures per second, once they are known.
+    /// Returns the number of points that the scanner measures per second. Returns `None` until it is known.
     pub(crate) fn points_per_second(&self) -> Option<f32> {
         self.point_time.ns.map(|ns| (1e9 / ns) as f32)
     }
 
-    /// Returns the numbers of received and lost packets.
+    /// Returns the number of received and of lost packets.
     pub(crate) fn received_and_lost(&self) -> (u64, u64) {
         self.sequencer.received_and_lost()
     }
 
-    /// Returns the numbers of revolutions by kind.
+    /// Returns the counts of revolutions by kind.
     pub(crate) fn revolution_counts(&self) -> RevolutionCounts {
         self.revolutions.assembler.counts()
     }
 
-    /// Returns the number of packets that arrive in 10 ms, as far as a sample has space for them.
+    /// Returns the maximum number of packets in a sample: those that arrive in 10 ms, limited by the space of a sample.
     pub(crate) fn max_packets_per_sample(&self, kind: PacketFormat) -> usize {
         let packet_ns = self.point_time.ns.unwrap_or(1e6) * kind.points() as f64;
         ((1e7 / packet_ns) as usize).clamp(1, (MAX_SAMPLE_LEN / kind.byte_len()).min(MAX_PACKETS))
     }
 
-    /// Measures the time per point with the packets of `span`, if the scanner has not reported it. Returns whether it
-    /// is known.
+    /// Measures the time per point with the packets of `span`, unless the scanner has reported it. Returns whether the
+    /// time is known.
     pub(crate) fn measure_point_time(
         &mut self,
         kind: PacketFormat,
@@ -110,16 +110,16 @@ impl Stream {
                 self.sequencer.end();
             }
             if change > 0.001 {
-                // Its times were based on the previous value.
+                // The times of this clock were computed with the previous value.
                 self.clock = SensorClock::new();
             }
         }
         self.point_time.ns.is_some()
     }
 
-    /// Places the packets of `span` in the sequence, and keeps them for [`advance`](Self::advance). Packets after a gap
-    /// are given back to the framer, so that they arrive once more by themselves. Returns the stamps of the first point
-    /// of the first packet and of the last point of the last packet, if they are known.
+    /// Locates the packets of `span` in the sequence, and keeps them for [`advance`](Self::advance). If there is a gap
+    /// within the span, returns the packets after the gap to the framer and shortens `span`, so that they form the next
+    /// span. Returns the stamps of the first and the last packet: of the last point in each, if they are known.
     pub(crate) fn locate(
         &mut self,
         kind: PacketFormat,
@@ -155,7 +155,7 @@ impl Stream {
                 } else {
                     arrivals.earliest(end, timing)
                 };
-                // A packet from a backlog is late for another reason.
+                // A packet from a backlog is late because it was buffered.
                 earliest.unwrap_or(0).saturating_sub(packet_time + due) as f64
             };
             let before = self.sequencer;
@@ -169,7 +169,7 @@ impl Stream {
             }
             let last_point = (position.time + to_last_point) as Nanos;
             if position.step == Step::First {
-                // Neither a revolution nor the clock continues from earlier packets.
+                // Revolutions and the clock restart with a new sequence.
                 self.clock = SensorClock::new();
                 self.revolutions.assembler.discard();
                 self.revolutions.pending = None;
@@ -200,7 +200,7 @@ impl Stream {
         stamps
     }
 
-    /// Chooses the number of beams as soon as the speed of the head is known, once per stream.
+    /// Chooses the number of beams once per stream, as soon as the speed of the head is known.
     fn choose_beams(&mut self, kind: PacketFormat, handshake: &Handshake) {
         let Settings { beams, max_beams, .. } = self.settings;
         let Some(point_ns) = self.point_time.ns.filter(|_| !self.revolutions.has_begun) else { return };
@@ -216,9 +216,10 @@ impl Stream {
         self.revolutions.begin(beams);
     }
 
-    /// Returns the number of beams of a `model` that takes `point_ns` per point: that of the mode in the settings, or that of
-    /// the mode that the scanner has reported, if the beams follow it. Otherwise that of the fastest mode. An A1 with an old
-    /// firmware measures half as many points as the others.
+    /// Returns the number of beams of a `model` that takes `point_ns` nanoseconds per point. It is the number for a
+    /// configured mode. For a recording, and for a scanner that a search has found without a configured model, it is
+    /// the number for the mode that the scanner reports. Otherwise it is the number for the model's fastest mode. An A1
+    /// with old firmware measures half as many points as others.
     fn beams_of(&self, model: Model, kind: PacketFormat, point_ns: f64, handshake: &Handshake) -> usize {
         let Settings { model: configured, mode, is_found, listen_only, .. } = self.settings;
         let point_us = (point_ns / 1e3) as f32;
@@ -230,8 +231,9 @@ impl Stream {
         mode_us.map_or(model.beams(), |us| model.beams_in_mode(1e6 / us))
     }
 
-    /// Returns the microseconds per point that a scanner of this `model` must have reported: the measured ones, unless the
-    /// number of `beams` of its scans shows that it reported another value. A real A1 takes 0.7 % longer than it reports.
+    /// Returns the time per point that a scanner of this `model` must have reported, in microseconds. It is the
+    /// measured time, unless the number of `beams` of its scans shows that the reported time was different. A real A1
+    /// takes 0.7 % longer than it reports.
     pub(crate) fn reported_us(&self, model: Option<Model>, beams: Option<usize>) -> Option<f64> {
         let measured = self.point_time.ns? / 1e3;
         let of_scans = model.zip(beams).and_then(|(model, beams)| {
@@ -242,14 +244,14 @@ impl Stream {
         of_scans.or(Some(measured))
     }
 
-    /// Returns the speed of the head. `None` before the revolutions have begun.
+    /// Returns the speed of the head. Returns `None` until revolutions are assembled.
     fn rotation_rate(&self, kind: PacketFormat) -> Option<RotationRate> {
         let known = self.point_time.ns.zip(self.sequencer.advance());
         let (point_ns, advance) = known.filter(|_| self.revolutions.has_begun)?;
         Some(RotationRate { step: advance / kind.points() as f64, point_ns })
     }
 
-    /// Adds the points of the placed packets to revolutions. Returns the first revolution that is complete.
+    /// Adds the points of the located packets to revolutions, until one is complete. Returns that revolution.
     pub(crate) fn advance(&mut self, framer: &Framer) -> Option<ClosedRevolution> {
         let rate = self.revolutions.current.and_then(|current| self.rotation_rate(current.kind));
         self.revolutions.advance(framer, rate)
@@ -260,7 +262,7 @@ impl Stream {
         self.revolutions.assembler.partial_revolution(self.rotation_rate(kind)?)
     }
 
-    /// Converts a revolution, complete or partial, to the hub's clock.
+    /// Converts a revolution, complete or partial, to a scan with stamps of the hub's clock.
     pub(crate) fn to_scan(
         &self,
         revolution: ClosedRevolution,
@@ -275,25 +277,26 @@ impl Stream {
     }
 }
 
-/// Nanoseconds per point: as the scanner reported, or measured.
+/// Time per point in nanoseconds, as the scanner reported or the stream measured it.
 #[derive(Clone, Copy, Debug, Default)]
 struct PointTime {
     ns: Option<f64>,
     measurement: Option<Measurement>,
 }
 
-/// Duration and number of points of spans without anything missing between them.
+/// Measurement of the time per point over spans with no missing packets between them.
 #[derive(Clone, Copy, Debug)]
 struct Measurement {
-    /// Arrival of the last packet.
+    /// Arrival time of the last packet.
     last: Nanos,
-    /// Whether something is missing before it.
+    /// Whether packets are missing before it, or it was late.
     is_incomplete: bool,
-    /// Nanoseconds by which the last packet arrived later than in a steady stream. It falls while packets catch up.
+    /// Time in nanoseconds by which the last packet was later than in a steady stream. It decreases while packets catch
+    /// up.
     lateness: f64,
     elapsed: Nanos,
     points: u64,
-    /// Duration after which the result counts.
+    /// Duration of the measurement in nanoseconds.
     duration: Nanos,
 }
 
@@ -304,9 +307,10 @@ impl Measurement {
 }
 
 impl PointTime {
-    /// Measures with the packets of `span`, whose last one arrived at `at`. Among the reported times of modes with
-    /// packets of `kind`, the nearest one counts. Without any, the measured time counts, and is measured again over
-    /// longer and longer durations. Returns the relative change of a time that was known.
+    /// Continues the measurement with the packets of `span`, whose last packet arrived at `at`. The result is the
+    /// nearest of the reported times for modes with packets of format `kind`. If there is none, it is the measured
+    /// time, and the measurement is repeated with twice the duration. Returns the relative change of a time that was
+    /// known before.
     fn measure_span(
         &mut self,
         kind: PacketFormat,
@@ -327,11 +331,11 @@ impl PointTime {
         let is_late = steady.is_some_and(|steady| interval as f64 > 1.5 * steady + LATE_TOLERANCE_NS);
         measurement.lateness = match steady {
             Some(_) if is_late => -ahead,
-            // Packets that waited with the late one arrive fast until they have caught up.
+            // Packets that were buffered behind the late one arrive fast until they have caught up.
             Some(steady) if ahead > steady / 2.0 => (measurement.lateness - ahead).max(0.0),
             _ => 0.0,
         };
-        // Packets that arrive at the same time as an incomplete span were read together with it.
+        // Packets that arrive at the same time as an incomplete span were in the same read.
         measurement.is_incomplete = span.reasons != 0
             || is_late
             || measurement.lateness > 0.0
@@ -352,15 +356,15 @@ impl PointTime {
     }
 }
 
-/// Assembles the points of placed packets into revolutions.
+/// Assembly of located packets into revolutions.
 #[derive(Clone, Debug)]
 struct Revolutions {
     assembler: RevolutionAssembler<MAX_POINTS>,
-    /// Whether the number of beams of this stream is known.
+    /// Whether the assembler has the number of beams of this stream.
     has_begun: bool,
-    /// Positions of the packets of the last span.
+    /// Positions of the packets in the last span.
     positions: [PacketPosition; MAX_PACKETS],
-    /// Packets whose points are not in revolutions yet.
+    /// Packets whose points have not been added to revolutions yet.
     current: Option<CurrentSpan>,
     pending: Option<PendingPacket>,
 }
@@ -372,11 +376,11 @@ struct CurrentSpan {
     span: Span,
     /// Index of the first packet that is not finished.
     next_packet: usize,
-    /// Whether its points were added.
+    /// Whether the points of this packet were added.
     is_added: bool,
 }
 
-/// A packet whose points are known only with the next packet.
+/// Packet whose points are known only when the next packet arrives.
 #[derive(Clone, Copy, Debug)]
 struct PendingPacket {
     bytes: [u8; PacketFormat::MAX_LEN],
@@ -395,21 +399,21 @@ impl Revolutions {
         }
     }
 
-    /// Begins revolutions with `beams` beams.
+    /// Starts to assemble revolutions with `beams` beams.
     fn begin(&mut self, beams: usize) {
         self.has_begun = true;
         self.assembler.begin(beams);
     }
 
-    /// Gives up what is not complete, because the stream ended.
+    /// Ends the stream, and discards incomplete revolutions.
     fn end(&mut self) {
         self.assembler.discard();
         self.has_begun = false;
         (self.current, self.pending) = (None, None);
     }
 
-    /// Adds the points of the current packets, of a head with the speed `pace`. Returns the first revolution that is
-    /// complete.
+    /// Adds the points of the current packets to revolutions, until one is complete. Returns that revolution. `rate` is
+    /// the speed of the head.
     fn advance(&mut self, framer: &Framer, rate: Option<RotationRate>) -> Option<ClosedRevolution> {
         while let Some(CurrentSpan { kind, span, next_packet: packet, is_added: is_put }) = self.current {
             let position = self.positions.get(packet).copied().filter(|_| packet < span.packets);
@@ -433,7 +437,7 @@ impl Revolutions {
         None
     }
 
-    /// Adds the points that are known with the packet `bytes`: its own, or those of the packet before.
+    /// Adds the points that are known with the packet `bytes`: its own point, or the points of the previous packet.
     fn add_packet(
         &mut self,
         kind: PacketFormat,
@@ -472,7 +476,7 @@ impl Revolutions {
         self.pending = Some(PendingPacket { bytes: copy, position, reasons });
     }
 
-    /// Adds the points of `pending`, which the packet `next` at `place` follows.
+    /// Adds the points of `pending`. The packet `next` follows it at `position`.
     fn add_pending(
         &mut self,
         kind: PacketFormat,
@@ -498,17 +502,17 @@ impl Revolutions {
     }
 }
 
-/// Duration of the first measurement of the time per point. Revolutions begin after it.
+/// Duration of the first measurement of the time per point. Revolutions are assembled after it.
 const FIRST_MEASUREMENT_TIME: Nanos = 250 * MILLIS;
-/// Fraction by which the speed of a head may change during a gap.
+/// Maximum change of the head's speed during a gap, as a ratio.
 const SPEED_VARIATION: f64 = 0.005;
-/// Nanoseconds by which packets that arrive together may be late.
+/// Maximum delay in nanoseconds of packets that arrive together.
 const LATE_TOLERANCE_NS: f64 = 15e6;
-/// Maximum share by which the time per point may differ from the reported one.
+/// Maximum deviation of the time per point from the reported one, as a ratio.
 const MAX_POINT_TIME_DEVIATION: f64 = 0.02;
-/// Maximum number of points in a revolution: those of an S2 at four revolutions per second.
+/// Maximum number of points in a revolution. It is enough for an S2 at four revolutions per second.
 const MAX_POINTS: usize = 8_192;
-/// Maximum number of packets of one sample.
+/// Maximum number of packets in a sample.
 const MAX_PACKETS: usize = 128;
-/// Maximum number of bytes of one sample.
+/// Maximum length of a sample, in bytes.
 pub(crate) const MAX_SAMPLE_LEN: usize = 800;
