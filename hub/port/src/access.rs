@@ -1,8 +1,8 @@
 //! Access to a port: whether its owner, group and mode permit this process to open it, and which other process has it
 //! open.
 //!
-//! Permissions are read from files, so users of a directory service are not found. Each search for processes reads
-//! about all of them, so it runs once after an error, not repeatedly.
+//! Names of users and groups are read from files, so those of a directory service are not found. Each search for
+//! processes reads about all of them. It should therefore run once after an error, not repeatedly.
 
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
@@ -11,20 +11,20 @@ use std::{fmt, fs};
 use rustix::fs::{major, minor};
 use rustix::process::{getegid, geteuid, getgroups};
 
-/// Everything that decides whether this process may open a port.
+/// Owner, user and groups that decide whether this process may open a port.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct PortPermissions {
-    /// Owner, group and mode of the port; `None` if they cannot be read.
+    /// Owner, group and mode of the port. `None` if they cannot be read.
     pub port: Option<Ownership>,
     /// User ID of this process.
     pub uid: u32,
     /// Groups of this process.
     pub groups: Vec<u32>,
-    /// Name of the user, or the ID if it has no name.
+    /// Name of the user, or the ID if there is no name.
     pub user: String,
-    /// Name of the port's group, or the ID if it has no name.
+    /// Name of the port's group, or the ID if there is no name.
     pub group: String,
-    /// Whether `/etc/group` lists the user in the port's group, whatever groups this process has.
+    /// Whether `/etc/group` lists the user in the port's group, even if this process does not have that group.
     pub is_listed: bool,
 }
 
@@ -40,7 +40,7 @@ pub struct Ownership {
 }
 
 impl PortPermissions {
-    /// Reads the permissions of this process at `path`.
+    /// Reads the permissions of this process for the port `path`.
     pub fn of(path: &Path) -> PortPermissions {
         let port = fs::metadata(path).ok().map(|metadata| Ownership {
             uid: metadata.uid(),
@@ -62,7 +62,7 @@ impl PortPermissions {
         PortPermissions { port, uid, groups, user, group, is_listed }
     }
 
-    /// Returns the reason for a refusal, and the remedy.
+    /// Returns the reason why this process may not open the port, and the remedy.
     pub fn explain(&self, path: &Path) -> (String, String) {
         let PortPermissions { user, group, .. } = self;
         let path = path.display();
@@ -91,11 +91,11 @@ impl PortPermissions {
     }
 }
 
-/// Read and write permission, as the last digit of a mode.
+/// Read and write permission, as one octal digit of a mode.
 const RW_BITS: u32 = 0o6;
 
-/// Returns the fields of the line whose third field is `id`, in a file like `/etc/group`. There are at least three
-/// fields.
+/// Returns the fields of the line whose third field is `id`, in a file such as `/etc/group`. The result has at least
+/// three fields.
 fn database_entry(file: &str, id: u32) -> Option<Vec<String>> {
     let text = fs::read_to_string(file).ok()?;
     let id = id.to_string();
@@ -103,12 +103,12 @@ fn database_entry(file: &str, id: u32) -> Option<Vec<String>> {
     text.lines().map(words).find(|words| words.get(2) == Some(&id))
 }
 
-/// A process that has a port open.
+/// Process that has a port open.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Holder {
     /// Process ID.
     pub pid: u32,
-    /// Name of its program, at most 15 bytes.
+    /// Name of the program, at most 15 bytes.
     pub program: String,
 }
 
@@ -118,19 +118,19 @@ impl fmt::Display for Holder {
     }
 }
 
-/// Returns the first other process that has `path` open and that this user may see.
+/// Returns the first other process that has `path` open and is visible to this user.
 pub fn holder(path: &Path) -> Option<Holder> {
     all_holders(path).into_iter().next()
 }
 
-/// Returns all other processes that have `path` open and that this user may see.
+/// Returns all other processes that have `path` open and are visible to this user.
 pub fn all_holders(path: &Path) -> Vec<Holder> {
     let device = path.canonicalize().ok();
     device.and_then(|device| holders(&[&device]).pop()).unwrap_or_default()
 }
 
-/// Returns the other process that has locked `path`, whichever user it belongs to. Returns `None` if no running
-/// process has locked it.
+/// Returns the other process that has locked `path`, which may belong to any user. Returns `None` if no running process
+/// has locked it.
 pub(super) fn lock_owner(path: &Path) -> Option<Holder> {
     let file = fs::metadata(path).ok()?;
     let device = file.dev();
@@ -140,7 +140,8 @@ pub(super) fn lock_owner(path: &Path) -> Option<Holder> {
     Path::new(&format!("/proc/{pid}")).exists().then(|| Holder { pid, program: name_of(pid) })
 }
 
-/// Returns the processes that hold a lock made by flock(2) on the file `key`, as in `/proc/locks` (proc_locks(5)).
+/// Returns the IDs of the processes that hold an flock(2) lock on the file `key`, in the format of `/proc/locks`
+/// (proc_locks(5)).
 fn lock_owners<'a>(locks: &'a str, key: &'a str) -> impl Iterator<Item = u32> + 'a {
     locks.lines().filter_map(move |line| match line.split_whitespace().collect::<Vec<_>>()[..] {
         [_, "FLOCK", _, _, pid, file, ..] if file == key => pid.parse().ok(),
@@ -148,19 +149,20 @@ fn lock_owners<'a>(locks: &'a str, key: &'a str) -> impl Iterator<Item = u32> + 
     })
 }
 
-/// Returns the program that may have changed the settings of `path`, as part of a message: one that is known to try every
-/// port, or another process that has the port open.
+/// Returns the program that may have changed the settings of `path`, as part of a message. It is a program that tries
+/// every port, or another process that has the port open.
 pub fn altering_program(path: &Path) -> Option<String> {
     let running = |name: &str| pids().any(|pid| name_of(pid) == name);
     let known = PORT_PROGRAMS.iter().find(|(name, _)| running(name));
     known.map(|(name, remedy)| format!("{name} runs: {remedy}")).or_else(|| {
-        // The service manager only keeps the port for the hub.
+        // systemd only keeps the port open for the hub.
         let holder = all_holders(path).into_iter().find(|holder| holder.program != "systemd")?;
         Some(format!("{holder} has it open"))
     })
 }
 
-/// Returns whether this process has `path` open, apart from descriptors that it inherited from its parent.
+/// Returns whether this process has opened `path` itself. Descriptors 0 to 2, which it inherited from its parent, do
+/// not count.
 pub(super) fn is_opened_here(path: &Path) -> bool {
     let open = fs::read_dir("/proc/self/fd").into_iter().flatten().flatten();
     let is_standard =
@@ -170,8 +172,8 @@ pub(super) fn is_opened_here(path: &Path) -> bool {
     path.canonicalize().is_ok_and(|device| targets.any(|target| target == device))
 }
 
-/// Returns, for each of `devices`, the other processes that have it open. The paths must be canonical. Reads all
-/// processes once.
+/// Returns the other processes that have each of `devices` open. The paths must be canonical. Reads the descriptors of
+/// all processes once.
 pub(super) fn holders(devices: &[&Path]) -> Vec<Vec<Holder>> {
     let mut found: Vec<Vec<Holder>> = vec![Vec::new(); devices.len()];
     for pid in pids().filter(|&pid| pid != std::process::id()) {
@@ -179,7 +181,7 @@ pub(super) fn holders(devices: &[&Path]) -> Vec<Vec<Holder>> {
         for target in open.filter_map(|entry| fs::read_link(entry.path()).ok()) {
             let at = devices.iter().position(|&device| device == target);
             let found_holders = at.and_then(|at| found.get_mut(at));
-            // List a process once, even if it has several descriptors of the device.
+            // Add a process only once, even if it has several descriptors of the device.
             if let Some(known) = found_holders.filter(|known| known.last().is_none_or(|last| last.pid != pid))
             {
                 known.push(Holder { pid, program: name_of(pid) });
@@ -203,7 +205,7 @@ fn name_of(pid: u32) -> String {
     }
 }
 
-/// Programs that open every serial port that they find, and the remedy.
+/// Programs that open every serial port, and the remedy for each.
 const PORT_PROGRAMS: [(&str, &str); 2] = [
     ("ModemManager", "sudo systemctl stop ModemManager"),
     ("brltty", "without a Braille display, sudo apt remove brltty"),

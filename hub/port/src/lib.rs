@@ -1,5 +1,5 @@
-//! Ports of links: a serial line of this machine, or one behind a serial server. The other crates of the hub open and
-//! use them only through [`Port`].
+//! Ports of links: serial lines of this machine, and lines of serial servers. The other crates of the hub open and use
+//! a port only through [`Port`].
 
 mod access;
 pub mod clock;
@@ -26,29 +26,29 @@ pub use serial_ports::{
 pub use tcp::{PendingConnection, ReadBudget, Tcp};
 pub use tty::{LineErrors, SettingsChange, Tty, UartCounters};
 
-/// Source of a link's bytes, as it is written in a configuration.
+/// Port of a link, as it is written in a configuration.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum PortSpec {
-    /// A serial line.
+    /// Serial line of this machine.
     Tty(PathBuf),
-    /// A line behind a serial server (`tcp:HOST:PORT`), which must be set to the link's rate.
+    /// Line of a serial server (`tcp:HOST:PORT`). The server must be set to the baud rate of the link.
     Tcp {
-        /// Name or address, an IPv6 address without its brackets.
+        /// Name or address of the server. An IPv6 address has no brackets here.
         host: String,
-        /// Port in raw TCP mode.
+        /// TCP port of the server, which must be in raw TCP mode.
         port: u16,
     },
-    /// A recording (`file:PATH`), replayed with its scan period or, with `?rate=max`, as fast as it can be read.
+    /// Recording (`file:PATH`). It is replayed with its scan period or, with `?rate=max`, as fast as it can be read.
     File {
-        /// The recording.
+        /// Path of the recording.
         path: PathBuf,
-        /// Whether the scan period is kept.
+        /// Whether the replay keeps the scan period.
         paced: bool,
     },
 }
 
 impl PortSpec {
-    /// Returns the source as it is written in a configuration.
+    /// Returns the port as it is written in a configuration.
     pub fn name(&self) -> String {
         match self {
             PortSpec::Tty(path) => path.display().to_string(),
@@ -59,8 +59,8 @@ impl PortSpec {
         }
     }
 
-    /// Returns whether `other` names the same port: the same serial line, or the same address of a serial server. Two names of
-    /// a server with the same port number are resolved, which may take some seconds.
+    /// Returns whether `other` names the same port: the same serial line, or the same address of a serial server. If
+    /// the port numbers of two servers are equal, their names are resolved, which may take some seconds.
     pub fn is_same_port(&self, other: &PortSpec) -> bool {
         match (self, other) {
             (PortSpec::Tty(a), PortSpec::Tty(b)) => is_same_line(a, b),
@@ -78,11 +78,11 @@ impl PortSpec {
         }
     }
 
-    /// Parses the source in `text`.
+    /// Parses a port from a configuration.
     ///
     /// # Errors
     ///
-    /// Returns a message if it is not valid.
+    /// Returns a message with the remedy if `text` is not a valid port.
     pub fn parse(text: &str) -> Result<PortSpec, &'static str> {
         if let Some(server) = text.strip_prefix("tcp:") {
             let (host, port) = server.rsplit_once(':').ok_or("tcp: without a port: write tcp:HOST:PORT")?;
@@ -113,24 +113,33 @@ impl PortSpec {
     }
 }
 
-/// An open port. Reads and writes never block.
+/// Open port. Reads and writes never block.
 pub enum Port {
-    /// A serial line, exclusive and raw.
+    /// Serial line, which is exclusive and raw.
     Tty(Tty),
-    /// A connection to a serial server.
+    /// Connection to a serial server.
     Tcp(Tcp),
 }
 
 impl Port {
-    /// Opens `source` at `baud`. Waits for a serial server for some seconds at most, or until `stop` is set.
+    /// Opens `spec` at `baud` bits per second. Waits for a serial server for at most some seconds, or until `stop` is
+    /// set.
     ///
-    /// Returns a failure of one of the kinds for ports, with its remedy. The kind is `short` without descriptors,
-    /// `configuration_reply` for a recording, and `interrupted` if `stop` is set.
+    /// # Errors
+    ///
+    /// Returns a failure of one of the kinds for ports, with its remedy. The kind is
+    /// [`Kind::ResourceExhausted`](scanhub_schema::Kind::ResourceExhausted) if descriptors run out,
+    /// [`Kind::Configuration`](scanhub_schema::Kind::Configuration) for a recording, and
+    /// [`Kind::Interrupted`](scanhub_schema::Kind::Interrupted) if `stop` is set.
     pub fn open(spec: &PortSpec, baud: u32, stop: &AtomicBool) -> Result<Port, Failure> {
         Port::try_open(spec, baud, stop).map_err(|error| error.explain(spec))
     }
 
-    /// Does the same as [`Port::open`], for repeated attempts. It returns only the reason, without looking up details.
+    /// Opens the port as [`Port::open`] does, for repeated attempts.
+    ///
+    /// # Errors
+    ///
+    /// Returns only the reason, without looking up details.
     pub fn try_open(spec: &PortSpec, baud: u32, stop: &AtomicBool) -> Result<Port, PortError> {
         match spec {
             PortSpec::Tty(path) => Tty::open(path, baud).map(Port::Tty),
@@ -139,26 +148,27 @@ impl Port {
         }
     }
 
-    /// Continues with `line`, which an earlier hub had opened, if `source` still names it.
+    /// Creates a port from `line`, which an earlier hub had opened. Returns `None` if `spec` does not name this line,
+    /// or the line cannot be configured.
     pub fn adopt(line: OwnedFd, spec: &PortSpec, baud: u32) -> Option<Port> {
         match spec {
             PortSpec::Tty(path) => Tty::adopt(line, path, baud).ok().map(Port::Tty),
-            // Bytes in a connection that no program reads become old, and the server may have closed it.
+            // Unread bytes in a connection become old, and the server may have closed it.
             PortSpec::Tcp { .. } | PortSpec::File { .. } => None,
         }
     }
 
-    /// Returns whether `source` names the open `line`.
+    /// Returns whether `spec` names the open `line`.
     pub fn is_at(line: &OwnedFd, spec: &PortSpec) -> bool {
         matches!(spec, PortSpec::Tty(path) if Tty::is_at(line, path))
     }
 
-    /// Returns whether another program simulates the sensor.
+    /// Returns whether the line is a pty, so that another program simulates the scanner.
     pub fn is_simulated(&self) -> bool {
         self.tty().is_some_and(Tty::is_simulated)
     }
 
-    /// Starts to open `source` if that takes time. `None` if [`Port::try_open`] returns at once.
+    /// Starts to open `spec` if this takes time. Returns `None` if [`Port::try_open`] returns at once.
     pub fn connect(spec: &PortSpec) -> Option<Result<PendingConnection, PortError>> {
         match spec {
             PortSpec::Tcp { host, port } => Some(PendingConnection::start(host, *port)),
@@ -166,13 +176,17 @@ impl Port {
         }
     }
 
-    /// Returns the serial line. `None` for a serial server, whose line is at the other end of the network.
+    /// Returns the serial line. Returns `None` for a serial server, whose line is at the other end of the network.
     fn tty(&self) -> Option<&Tty> {
         if let Port::Tty(tty) = self { Some(tty) } else { None }
     }
 
-    /// Changes the rate, and discards the bytes that arrived at the old one. An error of kind `Unsupported` means that
-    /// the driver rejected the rate or set another one, or that the rate cannot be changed from here.
+    /// Changes the baud rate, and discards the bytes that arrived at the old one.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error of kind `Unsupported` if the driver rejected the rate or set another one, or if the port is a
+    /// serial server. Returns other errors if the line is lost.
     pub fn set_baud(&self, baud: u32) -> io::Result<()> {
         match self {
             Port::Tty(tty) => tty.set_baud(baud),
@@ -183,13 +197,21 @@ impl Port {
         }
     }
 
-    /// Asserts or clears DTR. A port without this line ignores it.
+    /// Asserts or clears DTR. A port without DTR ignores the call.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if the line is lost.
     pub fn set_dtr(&self, on: bool) -> io::Result<()> {
         self.tty().map_or(Ok(()), |tty| tty.set_dtr(on))
     }
 
-    /// Does the same as [`Port::set_baud`], for callers that can try other rates. Returns the error if this rate is not
-    /// possible.
+    /// Changes the baud rate as [`Port::set_baud`] does, for callers that can try other rates. Returns the error as a
+    /// value if this rate is not possible.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if the line is lost.
     pub fn try_baud(&self, baud: u32) -> io::Result<Option<io::Error>> {
         match self.set_baud(baud) {
             Err(error) if error.kind() == io::ErrorKind::Unsupported => Ok(Some(error)),
@@ -197,7 +219,11 @@ impl Port {
         }
     }
 
-    /// Discards the bytes that have arrived, and uses `baud` from now on. A serial server keeps its rate.
+    /// Discards the received bytes, and sets the baud rate to `baud`. The rate of a serial server does not change.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if the line is lost, or if the driver rejects the rate.
     pub fn discard_input(&self, baud: u32) -> io::Result<()> {
         match self {
             Port::Tty(tty) => tty.set_baud(baud),
@@ -205,12 +231,12 @@ impl Port {
         }
     }
 
-    /// Returns the number of bytes in the tty's input buffer, or `None` for a network port.
+    /// Returns the number of bytes in the tty's input buffer. Returns `None` for a network port.
     pub fn buffered_bytes(&self) -> Option<usize> {
         self.tty()?.buffered_bytes()
     }
 
-    /// Returns the read budget of a network port. `None` for a tty, which is never throttled.
+    /// Returns the read budget of a network port at `baud`. Returns `None` for a tty, which is never throttled.
     pub fn read_budget(&self, baud: u32) -> Option<ReadBudget> {
         match self {
             Port::Tty(_) => None,
@@ -218,7 +244,11 @@ impl Port {
         }
     }
 
-    /// Reads the available bytes, 0 if there are none. Returns an error if the line is lost.
+    /// Reads the available bytes into `buffer`, and returns their number. It is 0 if no byte is available.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if the line is lost.
     pub fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
         match self {
             Port::Tty(tty) => tty.read(buffer),
@@ -226,7 +256,12 @@ impl Port {
         }
     }
 
-    /// Writes `bytes`. A line that is full drops the rest, as a cable would, and the session repeats the request.
+    /// Writes `bytes`. If the output buffer is full, the rest is dropped as on a cable, and the session repeats the
+    /// request.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if the line is lost.
     pub fn write(&self, bytes: &[u8]) -> io::Result<()> {
         match self {
             Port::Tty(tty) => tty.write(bytes),
@@ -234,43 +269,46 @@ impl Port {
         }
     }
 
-    /// Returns the errors that the driver counted on the line since the last call. Returns 0, without a system call, if
-    /// it counts none.
+    /// Returns the number of errors that the driver has counted on the line since the last call. Returns 0, without a
+    /// system call, if the driver does not count errors.
     pub fn line_errors(&self) -> u64 {
         self.tty().map_or(0, Tty::line_errors)
     }
 
-    /// Returns the driver's counters since it was loaded, if it has any.
+    /// Returns the driver's counters since the driver was loaded. Returns `None` if it has none.
     pub fn uart_counters(&self) -> Option<UartCounters> {
         self.tty()?.uart_counters()
     }
 
-    /// Returns the settings that another process has changed. `None` if they are unchanged, or if the settings are made
-    /// elsewhere.
+    /// Returns the settings that another process has changed. Returns `None` if they are unchanged, or if the port is a
+    /// serial server.
     ///
     /// # Errors
     ///
+    /// Returns an error if the line is lost.
     /// Returns an error if the line is lost.
     pub fn changed_settings(&self) -> io::Result<Option<SettingsChange>> {
         self.tty().map_or(Ok(None), Tty::changed_settings)
     }
 
-    /// Restores the settings of this process, at `baud`, and discards the input that arrived with others. If the driver
-    /// rejects the rate, the rate stays as it is, and a search tries others.
+    /// Restores the settings of this process, at `baud`, and discards the input that arrived with other settings. If
+    /// the driver rejects the rate, the line keeps its rate, and a search tries others.
     ///
     /// # Errors
     ///
+    /// Returns an error if the line is lost.
     /// Returns an error if the line is lost.
     pub fn restore(&self, baud: u32) -> io::Result<()> {
         self.tty().map_or(Ok(()), |tty| tty.restore(baud))
     }
 
-    /// Returns the device that the port's name resolved to when it was opened; `None` for a serial server.
+    /// Returns the device that the port's name resolved to when the port was opened. Returns `None` for a serial
+    /// server.
     pub fn device(&self) -> Option<&Path> {
         self.tty().map(Tty::device)
     }
 
-    /// Returns the rate that the driver reports; `None` if the rate is set elsewhere.
+    /// Returns the baud rate that the driver reports. Returns `None` for a serial server.
     pub fn baud(&self) -> Option<u32> {
         self.tty()?.baud()
     }
@@ -285,7 +323,7 @@ impl AsFd for Port {
     }
 }
 
-/// Writes `bytes` to `fd`, which does not block. Drops the bytes for which it has no room.
+/// Writes `bytes` to `fd`, which is non-blocking. Drops the bytes for which there is no room.
 fn write_all(fd: impl AsFd, mut bytes: &[u8]) -> Result<(), Errno> {
     while !bytes.is_empty() {
         match rustix::io::write(&fd, bytes) {
@@ -305,7 +343,7 @@ mod tests {
     use std::io::Read as _;
     use std::os::unix::net::UnixStream;
 
-    /// Creates a pty; returns its master and the path of its slave.
+    /// Creates a pty. Returns its master and the path of its slave.
     pub(crate) fn pty() -> (OwnedFd, PathBuf) {
         use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
         let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).expect("a pty");

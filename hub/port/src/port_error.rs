@@ -1,5 +1,6 @@
-//! Why a port cannot be opened, and what to do about it. The reason is found by trying; its circumstances (which
-//! process has it open, which other ports exist) are looked up once, when the failure is reported.
+//! Reasons why a port cannot be opened, with messages and remedies. An attempt to open the port yields the reason.
+//! Details, such as the process that has the port open or the ports that exist, are looked up only when the failure is
+//! reported.
 
 use std::fmt;
 use std::io;
@@ -12,41 +13,41 @@ use super::access::{Holder, PortPermissions, holder, is_opened_here, lock_owner}
 use super::serial_ports::{PortlessAdapter, SerialPortInfo, serial_ports};
 use crate::PortSpec;
 
-/// Only the reason; equal as long as nothing changes.
+/// Reason why a port cannot be opened. Two errors are equal as long as nothing changes.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum PortError {
-    /// Nothing exists at that path.
+    /// Nothing exists at this path.
     Missing,
-    /// Something exists, but it is not a terminal.
+    /// The file is not a terminal.
     NotTty,
     /// This user has no permission.
     PermissionDenied,
-    /// Another process has it.
+    /// Another process uses the port.
     Busy,
-    /// The name exists, but no device behind it.
+    /// The device file exists, but the device does not.
     NoDevice,
-    /// This process has no descriptor or thread left, or the kernel no memory.
+    /// This process has no descriptor or thread left, or the kernel has no memory.
     ResourceExhausted(Errno),
-    /// The driver sets another rate than the wanted one.
+    /// The driver sets a baud rate other than the requested one.
     Rate {
-        /// The wanted rate, in Bd.
+        /// Requested baud rate, in bits per second.
         requested: u32,
-        /// The rate that the driver sets instead.
+        /// Baud rate that the driver sets instead, in bits per second.
         actual: u32,
     },
-    /// The serial server's name cannot be looked up.
+    /// The name of the serial server cannot be resolved. Contains the reason.
     NoHost(String),
-    /// The serial server runs, but accepts no connection at this port.
+    /// The serial server runs, but does not accept a connection at this TCP port.
     Refused,
-    /// The serial server does not answer.
+    /// The serial server does not reply.
     TimedOut,
-    /// The network has no route to it.
+    /// The serial server cannot be reached over the network. Contains the reason.
     Network(String),
-    /// The caller wanted to stop.
+    /// The caller stopped the attempt.
     Interrupted,
-    /// It is a recording, not a line.
+    /// The port is a recording, which cannot be opened as a line.
     Recording,
-    /// Any other error of the kernel.
+    /// Other error of the kernel.
     Other(Errno),
 }
 
@@ -55,7 +56,7 @@ impl PortError {
         Errno::from_io_error(error).map_or(PortError::Other(Errno::IO), PortError::from)
     }
 
-    /// The reason with its circumstances at `source`, as they are now.
+    /// Returns the failure to report for `spec`, with details and remedy. Looks up the details now.
     pub fn explain(&self, spec: &PortSpec) -> Failure {
         let name = spec.name();
         let path = Path::new(&name);
@@ -67,7 +68,7 @@ impl PortError {
                 let (what, remedy) = PortPermissions::of(path).explain(path);
                 Failure::new(Kind::PortPermission, what, remedy)
             }
-            // The owner of the lock is certain; a program that only has the port open may be harmless.
+            // The owner of the lock certainly uses the port. Another program that has it open may be harmless.
             PortError::Busy => match lock_owner(path).or_else(|| holder(path)) {
                 None if is_opened_here(path) => Failure::new(
                     Kind::PortBusy,
@@ -151,7 +152,8 @@ impl From<Errno> for PortError {
             Errno::ACCESS | Errno::PERM => PortError::PermissionDenied,
             Errno::BUSY => PortError::Busy,
             Errno::NOTTY | Errno::ISDIR | Errno::NOTDIR => PortError::NotTty,
-            // A UART that the board does not have, an adapter that was pulled out a moment ago, half a pty.
+            // For example, a UART that the board does not have, an adapter that was just unplugged, or a pty whose
+            // master is closed.
             Errno::IO | Errno::NXIO | Errno::NODEV => PortError::NoDevice,
             Errno::MFILE | Errno::NFILE | Errno::NOMEM => PortError::ResourceExhausted(errno),
             errno => PortError::Other(errno),
@@ -159,7 +161,7 @@ impl From<Errno> for PortError {
     }
 }
 
-/// The adapters of this machine that have no port.
+/// Returns the adapters of this machine that have no port.
 fn portless_adapters() -> Vec<PortlessAdapter> {
     PortlessAdapter::all(Path::new("/"))
 }
@@ -176,8 +178,8 @@ fn missing_failure(path: &Path, ports: &[SerialPortInfo], portless: &[PortlessAd
     Failure::new(Kind::PortMissing, what, alternatives(&name, ports, portless))
 }
 
-/// Returns what to do where `name` does not exist: an adapter without a port may be the one, otherwise the ports of this machine
-/// are named, the most similar names first.
+/// Returns the remedy for a port `name` that does not exist. It lists adapters without a port, which may be the cause,
+/// and the ports of this machine. The ports with the most similar names come first.
 fn alternatives(name: &str, ports: &[SerialPortInfo], portless: &[PortlessAdapter]) -> String {
     let mut sorted: Vec<&SerialPortInfo> = ports.iter().collect();
     sorted.sort_by_key(|candidate| {

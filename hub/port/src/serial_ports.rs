@@ -1,5 +1,5 @@
-//! The serial lines of this machine: the permanent name of each, and what the kernel reports about it without opening it. Also
-//! the USB serial adapters that have no port, because no driver has created a tty for them.
+//! Serial lines of this machine, with the permanent name of each and the properties that the kernel reports without
+//! opening it. Also the USB serial adapters that have no port, because no driver has created a tty for them.
 
 use std::ops::RangeInclusive;
 use std::os::unix::fs::{FileTypeExt, MetadataExt};
@@ -11,29 +11,30 @@ use rustix::fs::{Access, access, major, minor};
 use crate::PortError;
 use crate::access::{Holder, holders};
 
-/// A serial line of this machine.
+/// Serial line of this machine.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SerialPortInfo {
-    /// Permanent name: the one below `/dev/serial/by-id` unless another adapter shares it, otherwise the one below
-    /// `/dev/serial/by-path`, otherwise the device.
+    /// Permanent name. It is the name below `/dev/serial/by-id` unless another adapter shares it. Otherwise it is the
+    /// name below `/dev/serial/by-path`, or the device if there is none.
     pub name: PathBuf,
-    /// The device itself.
+    /// Path of the device file.
     pub device: PathBuf,
-    /// Name below `/dev/serial/by-id` that this adapter shares with another one, because both have the same serial number or
-    /// none. It stands for one of them, and for the other one perhaps after a restart.
+    /// Name below `/dev/serial/by-id` that this adapter shares with another one, because both have the same serial
+    /// number or none. The name belongs to one of them, and possibly to the other one after a restart.
     pub shared_name: Option<PathBuf>,
-    /// Its driver, such as `ftdi_sio`.
+    /// Driver, such as `ftdi_sio`.
     pub driver: Option<String>,
-    /// Maker and product, as its adapter reports them.
+    /// Manufacturer and product that the adapter reports.
     pub product: Option<String>,
-    /// The process that has it open, as far as this user may see.
+    /// Process that has the line open, if it is visible to this user.
     pub holder: Option<Holder>,
     /// Whether this user may open it.
     pub is_permitted: bool,
 }
 
 impl SerialPortInfo {
-    /// Returns what a user should know before naming the port `path`, and what to do about it.
+    /// Returns the warning and the remedy for a user who wants to configure the port `path`. Returns `None` if there is
+    /// no warning.
     pub fn caution(&self, path: &Path) -> Option<(String, String)> {
         if self.device.ends_with(PI_5_DEBUG_TTY) {
             let what = "the debug connector of a Raspberry Pi 5, not pins 8 and 10 of its header: /dev/serial0 names it by default";
@@ -65,7 +66,7 @@ impl fmt::Display for SerialPortInfo {
     }
 }
 
-/// The serial lines of this machine, USB adapters first. Opens none.
+/// Returns the serial lines of this machine, USB adapters first. Does not open any of them.
 pub fn serial_ports() -> Vec<SerialPortInfo> {
     let mut found = serial_ports_in(Path::new("/"));
     let devices: Vec<&Path> = found.iter().map(|candidate| candidate.device.as_path()).collect();
@@ -77,9 +78,9 @@ pub fn serial_ports() -> Vec<SerialPortInfo> {
     found
 }
 
-/// The serial lines in `sys` and `dev` below `root`.
+/// Returns the serial lines in `sys` and `dev` below `root`. Does not fill in the holder and the permission.
 pub fn serial_ports_in(root: &Path) -> Vec<SerialPortInfo> {
-    // Names with the devices that they stand for.
+    // Pairs of a device and one of its names.
     let [by_id, by_path] = ["by-id", "by-path"].map(|kind| -> Vec<(PathBuf, PathBuf)> {
         let names = entries(&root.join("dev/serial").join(kind)).into_iter();
         names.filter_map(|name| Some((name.canonicalize().ok()?, name))).collect()
@@ -95,7 +96,7 @@ pub fn serial_ports_in(root: &Path) -> Vec<SerialPortInfo> {
         .iter()
         .filter_map(|class| {
             let device = root.join("dev").join(class.file_name()?);
-            // A terminal without hardware has no device; a UART that the driver did not find has type 0.
+            // A terminal without hardware has no device, and a UART that the driver did not find has type 0.
             let hardware = class.join("device").canonicalize().ok()?;
             if read_word(&class.join("type")).as_deref() == Some("0") || !device.exists() {
                 return None;
@@ -124,8 +125,8 @@ pub fn serial_ports_in(root: &Path) -> Vec<SerialPortInfo> {
     found
 }
 
-/// Returns whether `path` is a terminal, according to the kernel. It is not opened, because opening other devices can do
-/// harm: a watchdog, a pipe that waits for its other end.
+/// Returns whether `path` is a terminal, according to the kernel. The file is not opened, because opening other devices
+/// can do harm. Examples are a watchdog, and a pipe whose other end is not open.
 pub fn is_tty(path: &Path) -> bool {
     check_tty(path).is_ok()
 }
@@ -134,14 +135,14 @@ pub fn is_tty(path: &Path) -> bool {
 ///
 /// # Errors
 ///
-/// [`PortError::NoDevice`] if no device is behind a device file, as in a container whose /dev has a file for an adapter that is
-/// unplugged. [`PortError::NotTty`] if it is another device, or not a device. Those of the kernel if the name cannot be
-/// resolved.
+/// Returns [`PortError::NoDevice`] if the device of a device file does not exist, for example in a container whose
+/// `/dev` has a file for an unplugged adapter. Returns [`PortError::NotTty`] if it is another device or not a device.
+/// Returns the kernel's error if the name cannot be resolved.
 pub fn check_tty(path: &Path) -> Result<(), PortError> {
     check_tty_in(path, Path::new("/sys/dev/char"))
 }
 
-/// Checks `path` as [`check_tty`] does; the kernel lists its devices in `known`.
+/// Checks `path` as [`check_tty`] does. `known` is the directory in which the kernel lists character devices.
 fn check_tty_in(path: &Path, known: &Path) -> Result<(), PortError> {
     let metadata = path.metadata().map_err(|error| PortError::of_io(&error))?;
     if !metadata.file_type().is_char_device() {
@@ -151,18 +152,18 @@ fn check_tty_in(path: &Path, known: &Path) -> Result<(), PortError> {
     match fs::read_link(known.join(format!("{major}:{minor}/subsystem"))) {
         Ok(subsystem) if subsystem.ends_with("tty") => Ok(()),
         Ok(_) => Err(PortError::NotTty),
-        // Ptys are not listed; without sysfs nothing is.
+        // Ptys are not listed, and without sysfs no device is.
         Err(error)
             if error.kind() == io::ErrorKind::NotFound && !UNIX98_PTYS.contains(&major) && known.exists() =>
         {
             Err(PortError::NoDevice)
         }
-        // Opening it will show whether it is a terminal.
+        // Opening the file will show whether it is a terminal.
         Err(_) => Ok(()),
     }
 }
 
-/// Returns whether two paths name the same line: the same device number, whatever the names are.
+/// Returns whether two paths name the same line. Different names with the same device number do.
 pub fn is_same_line(a: &Path, b: &Path) -> bool {
     let number = |path: &Path| {
         let metadata = fs::metadata(path).ok().filter(|metadata| metadata.file_type().is_char_device())?;
@@ -172,7 +173,8 @@ pub fn is_same_line(a: &Path, b: &Path) -> bool {
     a == b || number(a).is_some_and(|a| Some(a) == number(b)) || is_same_file()
 }
 
-/// How long the adapter at `path` collects bytes before it hands them over, in milliseconds, if it reports that.
+/// Returns the time for which the adapter at `path` collects bytes before it delivers them, in milliseconds. Returns
+/// `None` if the adapter does not report it.
 pub fn latency_ms(path: &Path) -> Option<u8> {
     let device = path.canonicalize().ok()?;
     latency_of(&Path::new("/sys/class/tty").join(device.file_name()?).join("device"))
@@ -182,8 +184,8 @@ fn latency_of(hardware: &Path) -> Option<u8> {
     read_word(&hardware.join("latency_timer"))?.parse().ok()
 }
 
-/// The driver of `hardware`, or of what it is a part of: since Linux 6.5 the UARTs of a board hang below a bus that has
-/// no driver of its own.
+/// Returns the driver of `hardware`, or of a device that contains it. Since Linux 6.5, the UARTs of a board are below a
+/// bus that has no real driver.
 fn driver_of(hardware: &Path) -> Option<String> {
     let mut drivers = hardware.ancestors().filter_map(|part| part.join("driver").canonicalize().ok());
     let driver = drivers.find(|driver| !driver.iter().any(|part| part == "serial-base"))?;
@@ -195,8 +197,9 @@ fn usb_of(hardware: &Path) -> Option<&Path> {
     hardware.ancestors().find(|directory| directory.join("idVendor").exists())
 }
 
-/// Returns the properties from which udev derives the name below `/dev/serial/by-id` (60-serial.rules, usb_id): the IDs and
-/// strings of the USB device, its interface and the port. `None` if `hardware` is not a USB adapter.
+/// Returns the properties from which udev derives the name below `/dev/serial/by-id` (60-serial.rules, usb_id). They
+/// are the IDs and strings of the USB device, its interface, and the port. Returns `None` if `hardware` is not a USB
+/// adapter.
 fn identity_of(hardware: &Path) -> Option<Vec<String>> {
     let usb = usb_of(hardware)?;
     let of_device =
@@ -206,7 +209,7 @@ fn identity_of(hardware: &Path) -> Option<Vec<String>> {
     Some(of_device.into_iter().chain([interface, port]).map(Option::unwrap_or_default).collect())
 }
 
-/// What the USB device above `hardware` calls itself.
+/// Returns the manufacturer and product of the USB device above `hardware`, or its IDs.
 fn product_of(hardware: &Path) -> Option<String> {
     let usb = usb_of(hardware)?;
     let words = ["manufacturer", "product"].map(|key| read_word(&usb.join(key)));
@@ -218,7 +221,7 @@ fn product_of(hardware: &Path) -> Option<String> {
     Some(words.join(" "))
 }
 
-/// What stands in a file, if anything does.
+/// Returns the text of a file without surrounding blanks. Returns `None` if it is empty or cannot be read.
 pub(super) fn read_word(path: &Path) -> Option<String> {
     let text = fs::read_to_string(path).ok()?;
     let text = text.trim();
@@ -232,23 +235,24 @@ pub(super) fn entries(directory: &Path) -> Vec<PathBuf> {
     paths
 }
 
-/// An adapter that collects bytes for longer blurs the stamps.
+/// Maximum time for which an adapter may collect bytes, in milliseconds. A longer time makes stamps inaccurate.
 pub const MAX_LATENCY_MS: u8 = 2;
-/// The first UART of the processor of a Raspberry Pi 5 (alias `serial10` in its device tree); only the debug connector has it.
+/// First UART of the processor of a Raspberry Pi 5 (alias `serial10` in its device tree). Only the debug connector uses
+/// it.
 const PI_5_DEBUG_TTY: &str = "ttyAMA10";
-/// Majors of the ends of ptys that are opened by name (Linux, devices.txt).
+/// Major numbers of pty slaves (Linux, devices.txt).
 const UNIX98_PTYS: RangeInclusive<u32> = 136..=143;
 
-/// A USB serial adapter without a port.
+/// USB serial adapter without a port.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PortlessAdapter {
-    /// USB socket, as the kernel's log names it, such as `1-1.2`.
+    /// USB socket as the kernel's log names it, such as `1-1.2`.
     pub usb: String,
     /// Vendor and product ID, such as `1a86:7523`.
     pub id: String,
     /// Name of the chip, such as `CH340`.
     pub chip: &'static str,
-    /// Kernel module that drives it, such as `ch341`.
+    /// Name of its kernel module, such as `ch341`.
     pub module: &'static str,
     /// Reason why it has no port.
     pub reason: NoPortReason,
@@ -257,26 +261,26 @@ pub struct PortlessAdapter {
 /// Reason why an adapter has no port.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum NoPortReason {
-    /// brltty runs, which takes adapters away from their driver to look for a Braille display.
+    /// brltty is running. It detaches adapters from their driver to search for a Braille display.
     Brltty {
         /// Process ID of brltty.
         pid: u32,
     },
     /// Another program uses the adapter directly, through usbfs.
     Claimed,
-    /// The kernel has its tty, but no device file exists: a container was not given it.
+    /// The kernel has a tty, but its device file does not exist, because a container lacks it.
     NoDevice {
         /// Name of the tty.
         tty: String,
     },
-    /// The module is not loaded.
+    /// The kernel module is not loaded.
     NotLoaded,
-    /// The running kernel has no such module.
+    /// The running kernel does not have the module.
     NotInstalled {
         /// Release of the kernel.
         release: String,
     },
-    /// The module is loaded, and does not drive the adapter.
+    /// The module is loaded, but does not control the adapter.
     NotBound,
 }
 
@@ -315,7 +319,7 @@ impl PortlessAdapter {
         found
     }
 
-    /// Returns what to do about it.
+    /// Returns the remedy.
     pub fn remedy(&self) -> String {
         let module = self.module;
         let replug = "then unplug the adapter and plug it in again";
@@ -358,7 +362,7 @@ impl fmt::Display for PortlessAdapter {
     }
 }
 
-/// Returns why no driver has made a tty of `device`, which `module` should drive.
+/// Returns the reason why there is no tty for `device`, whose kernel module is `module`.
 fn no_driver_reason(root: &Path, device: &Path, module: &str) -> NoPortReason {
     let interfaces = entries(device).into_iter().filter_map(|part| part.join("driver").canonicalize().ok());
     if interfaces.into_iter().any(|driver| driver.ends_with("usbfs")) {
@@ -371,7 +375,7 @@ fn no_driver_reason(root: &Path, device: &Path, module: &str) -> NoPortReason {
     let release = read_word(&root.join("proc/sys/kernel/osrelease")).unwrap_or_default();
     let lists = ["modules.dep", "modules.builtin"]
         .map(|list| fs::read_to_string(root.join("lib/modules").join(&release).join(list)));
-    // A file name may have - where the module's name has _.
+    // A file name may have - where the name of the module has _.
     let is_module = |path: &str| {
         let file = path.split(':').next().and_then(|path| path.rsplit('/').next()).unwrap_or_default();
         file.split(".ko").next().is_some_and(|name| name.replace('-', "_") == module)
@@ -379,13 +383,13 @@ fn no_driver_reason(root: &Path, device: &Path, module: &str) -> NoPortReason {
     let is_known =
         |list: &std::io::Result<String>| list.as_ref().is_ok_and(|list| list.lines().any(is_module));
     match lists.iter().any(is_known) {
-        // A container has no list.
+        // A container does not have the lists.
         false if lists.iter().any(Result::is_ok) => NoPortReason::NotInstalled { release },
         _ => NoPortReason::NotLoaded,
     }
 }
 
-/// Returns the process called `name`.
+/// Returns the ID of a process whose name is `name`.
 fn find_process(root: &Path, name: &str) -> Option<u32> {
     let is_process = |path: &PathBuf| read_word(&path.join("comm")).is_some_and(|comm| comm == name);
     let pid = |path: PathBuf| path.file_name()?.to_str()?.parse().ok();
@@ -395,8 +399,9 @@ fn find_process(root: &Path, name: &str) -> Option<u32> {
 /// Command that creates missing device files.
 const UDEV_COMMAND: &str = "sudo udevadm trigger --subsystem-match=tty";
 
-/// Serial bridges of scanners and of the adapters that they are sold with: vendor, product, chip, kernel module (Linux,
-/// `drivers/usb/serial/*.c`; the last ones have the class CDC ACM, `drivers/usb/class/cdc-acm.c`).
+/// Serial bridges in scanners and in the adapters that are sold with them. Each entry has vendor ID, product ID, chip
+/// and kernel module (Linux, `drivers/usb/serial/*.c`). The last entries have the class CDC ACM
+/// (`drivers/usb/class/cdc-acm.c`).
 const USB_CHIPS: [(&str, &str, &str, &str); 25] = [
     ("1a86", "7523", "CH340", "ch341"),
     ("1a86", "7522", "CH340", "ch341"),
@@ -431,7 +436,7 @@ mod tests {
     use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname};
     use std::os::unix::fs::symlink;
 
-    /// A made-up machine: files below a temporary directory.
+    /// Simulated machine, whose files are below a temporary directory.
     pub(crate) struct Machine {
         pub(crate) root: PathBuf,
         _directory: tempfile::TempDir,
@@ -460,7 +465,7 @@ mod tests {
             symlink(self.root.join(target), path).unwrap();
         }
 
-        /// Plugs a USB device in at `place`, with one interface.
+        /// Adds a USB device with one interface at `place`.
         pub(crate) fn usb(&self, place: &str, id: &str, serial: &str) {
             let (vendor, product) = id.split_once(':').unwrap();
             let device = format!("sys/devices/usb1/{place}");
@@ -482,7 +487,7 @@ mod tests {
             self.file(&format!("dev/{name}"), "");
         }
 
-        /// Adds a UART on the board, with the type that its driver found.
+        /// Adds a UART of the board, with the type that its driver has found.
         fn uart(&self, name: &str, kind: &str) {
             self.directory("sys/devices/pnp");
             self.link("sys/devices/pnp", &format!("sys/class/tty/{name}/device"));
@@ -496,7 +501,7 @@ mod tests {
         let pty = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
         grantpt(&pty).unwrap();
         let name = ptsname(&pty, Vec::new()).unwrap();
-        // Still locked: opening it would be refused.
+        // The line is still locked, so opening it would fail.
         assert!(is_tty(Path::new(name.to_str().unwrap())));
         assert!(is_tty(Path::new("/dev/tty")));
         for other in ["/dev/null", "/dev/zero", "/dev", "/etc/hostname", "/dev/no-such-port"] {
@@ -560,7 +565,7 @@ mod tests {
             );
         }
         let by_id = "dev/serial/by-id/usb-Silicon_Labs_CP2102_0001-if00-port0";
-        // udev gives the name to one of them; after a restart, to the other one.
+        // udev gives the name to one of the adapters, and to the other one after a restart.
         for owner in ["ttyUSB0", "ttyUSB1"] {
             machine.link(&format!("dev/{owner}"), by_id);
             let found = serial_ports_in(&machine.root);
@@ -599,7 +604,7 @@ mod tests {
         assert!(remedy.contains("dtparam=uart0=on") && remedy.contains("/dev/ttyAMA0"), "{remedy}");
     }
 
-    /// A machine with one adapter that has no port.
+    /// Creates a machine with one adapter that has no port.
     fn machine(id: &str) -> Machine {
         let machine = Machine::new();
         machine.usb("1-1.2", id, "");

@@ -1,10 +1,10 @@
-//! A serial line behind a serial server on the network: a plain stream of bytes. Its rate is set in the server and
-//! cannot be changed from here. Resolving a name and connecting can block for an unknown time, so a separate thread
-//! does both, and ends by itself.
+//! Connection to a serial server on the network, which delivers the bytes of a serial line. The baud rate is set in the
+//! server and cannot be changed from here. Resolving a name and connecting can block for an unknown time, so a separate
+//! thread does both. The thread ends by itself.
 //!
-//! A connection can deliver more than any line. The read budget allows twice as much as the line carries, and up to one
-//! second of that at once, because a network delays data and catches up. The rest stays in the connection, and is older
-//! than it seems when it is read.
+//! A connection can deliver bytes faster than any line. The read budget allows twice the rate of the line, and up to
+//! one second of this at once, because a network delays data and then catches up. The other bytes stay in the
+//! connection. When they are read, they are older than they seem.
 
 use std::io::{self, ErrorKind, PipeReader, PipeWriter};
 use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
@@ -24,13 +24,13 @@ use scanhub_shm::resource_limits;
 
 use crate::{Port, PortError, write_all};
 
-/// A connection to a serial server. Reads and writes never block.
+/// Connection to a serial server. Reads and writes never block.
 pub struct Tcp {
     stream: TcpStream,
 }
 
 impl Tcp {
-    /// Connects to `port` of `host`, and waits for the result, or until `stop` is set.
+    /// Connects to `port` of `host`. Waits for the result, or until `stop` is set.
     pub(crate) fn open(host: &str, port: u16, stop: &AtomicBool) -> Result<Tcp, PortError> {
         let pending = PendingConnection::start(host, port)?;
         for _ in 0..MAX_POLLS {
@@ -51,10 +51,10 @@ impl Tcp {
         }
     }
 
-    /// Discards the bytes that have arrived.
+    /// Discards the received bytes.
     pub(crate) fn discard_input(&self) -> io::Result<()> {
         let mut buffer = [0; 4096];
-        // The loop is bounded, because the server may send as fast as this reads.
+        // Limit the loop, because the server may send as fast as it reads.
         for _ in 0..MAX_DISCARDED / buffer.len() {
             if self.read(&mut buffer)? == 0 {
                 break;
@@ -68,9 +68,9 @@ impl Tcp {
     }
 
     fn new(stream: TcpStream) -> Result<Tcp, Errno> {
-        // The bytes of a request are sent one by one, as the scanner requires.
+        // Requests are sent byte by byte, as the scanner requires.
         set_tcp_nodelay(&stream, true)?;
-        // A server that has lost power sends nothing. With keepalive, the socket reports an error.
+        // A server that has lost power sends nothing. With keepalive, the socket then reports an error.
         set_socket_keepalive(&stream, true)?;
         set_tcp_keepidle(&stream, Duration::from_secs(2))?;
         set_tcp_keepintvl(&stream, Duration::from_secs(1))?;
@@ -87,21 +87,21 @@ impl AsFd for Tcp {
     }
 }
 
-/// A connection attempt. Its descriptor is ready when the attempt has ended.
+/// Connection attempt in progress. Its descriptor becomes ready when the attempt ends.
 pub struct PendingConnection {
     outcome: Receiver<Result<Tcp, PortError>>,
-    /// Readable once the thread has dropped the other end.
+    /// Pipe that becomes readable when the thread drops the other end.
     ready: PipeReader,
 }
 
 impl PendingConnection {
-    /// Starts an attempt.
+    /// Starts an attempt to connect to `port` of `host`.
     pub(crate) fn start(host: &str, port: u16) -> Result<PendingConnection, PortError> {
         let (ready, open_end) = io::pipe().map_err(|error| PortError::of_io(&error))?;
         let (send, outcome) = channel();
         let host = host.to_owned();
         let body = move || send_outcome(connect(&host, port), &send, open_end);
-        // The system refuses a thread with AGAIN.
+        // The kernel reports AGAIN if it cannot create a thread.
         let thread_error = |error: io::Error| match PortError::of_io(&error) {
             PortError::Other(Errno::AGAIN) => PortError::ResourceExhausted(Errno::AGAIN),
             error => error,
@@ -110,7 +110,7 @@ impl PendingConnection {
         Ok(PendingConnection { outcome, ready })
     }
 
-    /// Returns the result, or an error if the attempt has not ended.
+    /// Returns the result. Returns an error if the attempt has not ended.
     pub fn finish(self) -> Result<Port, PortError> {
         self.outcome.try_recv().unwrap_or(Err(PortError::TimedOut)).map(Port::Tcp)
     }
@@ -135,7 +135,7 @@ fn send_outcome(
 fn connect(host: &str, port: u16) -> Result<Tcp, PortError> {
     let addresses: Vec<SocketAddr> = match (host, port).to_socket_addrs() {
         Ok(addresses) => addresses.collect(),
-        // Without descriptors, a lookup reports that the host does not exist.
+        // If descriptors run out, the lookup reports that the host does not exist.
         Err(_) if resource_limits::check_descriptors(LOOKUP_DESCRIPTORS).is_err() => {
             return Err(PortError::ResourceExhausted(Errno::MFILE));
         }
@@ -153,8 +153,8 @@ fn connect(host: &str, port: u16) -> Result<Tcp, PortError> {
     Err(last)
 }
 
-/// Returns the reason for `error`. If this machine is short of something, neither the network nor the server is the
-/// cause. Otherwise `otherwise` creates the reason.
+/// Returns the reason for `error`. If this machine has run out of a resource, neither the network nor the server is the
+/// cause. In all other cases, `otherwise` creates the reason.
 fn connection_error(error: &io::Error, otherwise: fn(String) -> PortError) -> PortError {
     match PortError::of_io(error) {
         short @ PortError::ResourceExhausted(_) => short,
@@ -162,32 +162,32 @@ fn connection_error(error: &io::Error, otherwise: fn(String) -> PortError) -> Po
     }
 }
 
-/// Maximum number of descriptors for looking up a name: a file, and a socket for each of its servers.
+/// Maximum number of descriptors that a name lookup needs: one for a file, and one for a socket to each name server.
 const LOOKUP_DESCRIPTORS: u64 = 4;
 /// Timeout of a connection. A serial server in the same building replies sooner.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(3);
-/// Maximum number of bytes to discard: more than a minute at 500 kBd.
+/// Maximum number of bytes to discard. A line at 500 kBd carries fewer in a minute.
 const MAX_DISCARDED: usize = 1 << 24;
 /// Interval between checks of `stop`.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
-/// Number of checks: six seconds for name and connection together.
+/// Number of checks. The name and the connection together may take six seconds.
 const MAX_POLLS: u32 = 60;
 
-/// Read budget of a network port. The clock is an argument.
+/// Read budget of a network port. It grows with time, and reading consumes it. The caller passes the time.
 #[derive(Clone, Debug)]
 pub struct ReadBudget {
-    /// Time that a byte costs.
+    /// Cost of a byte, in nanoseconds.
     byte_ns: Nanos,
-    /// Time until which the budget is spent.
+    /// Time until which the budget is consumed.
     spent_until: Nanos,
-    /// First and last time of the current period in which the budget was exhausted.
+    /// First and last time in the current period at which the budget was exhausted.
     exhausted: Option<(Nanos, Nanos)>,
     /// Whether the last read filled its buffer, so that more bytes may be available.
     has_more: bool,
 }
 
 impl ReadBudget {
-    /// Creates a full budget at time `now`, for a line of `baud`.
+    /// Creates a full budget at `now`, for a line of `baud` bits per second.
     pub fn new(baud: u32, now: Nanos) -> ReadBudget {
         let byte_ns = line_time(1, baud) / BUDGET_FACTOR;
         ReadBudget { byte_ns, spent_until: now.saturating_sub(MAX_BURST), exhausted: None, has_more: false }
@@ -198,14 +198,15 @@ impl ReadBudget {
         (now.saturating_sub(self.unspent_since(now)) / self.byte_ns) as usize
     }
 
-    /// Records that `len` bytes were read at `now` into a buffer of `room` bytes.
+    /// Records a read of `len` bytes at `now` into a buffer of `buffer_len` bytes.
     pub fn record_read(&mut self, len: usize, buffer_len: usize, now: Nanos) {
         self.has_more = len > 0 && len == buffer_len;
         self.spent_until = self.unspent_since(now) + len as Nanos * self.byte_ns;
     }
 
-    /// Returns when reading may resume, if the budget at `now` is too small to pay off. Until then, the caller only
-    /// waits for this time. `until` is the caller's next deadline, for which a single byte may be read.
+    /// Returns the time at which the caller may read again, if the budget at `now` is too small for an efficient read.
+    /// Until then, the caller waits for this time only. `until` is the next deadline of the caller, for which it may
+    /// read a single byte.
     pub fn throttled_until(&mut self, now: Nanos, until: Nanos) -> Option<Nanos> {
         let (byte_at, resume_at) = (self.spent_until + self.byte_ns, self.spent_until + MIN_REFILL);
         if now >= resume_at {
@@ -214,39 +215,39 @@ impl ReadBudget {
         let since =
             self.exhausted.filter(|&(_, last)| now < last + RECOVERY_TIME).map_or(now, |(since, _)| since);
         self.exhausted = Some((since, now));
-        // An overdue action waits for the end of the available bytes, which was not reached.
+        // An overdue deadline takes effect only after all available bytes were read, and there are more.
         Some(if until > now { until.clamp(byte_at, resume_at) } else { resume_at })
     }
 
-    /// Returns whether more bytes than the budget have been arriving for a while, as of `now`.
+    /// Returns whether the connection has delivered more bytes than the budget allows for a while, at `now`.
     pub fn is_flooded(&self, now: Nanos) -> bool {
         self.exhausted
             .is_some_and(|(since, last)| now < last + RECOVERY_TIME && last >= since + FLOOD_THRESHOLD)
     }
 
-    /// Returns whether the last bytes read may have been buffered in the connection, as of `now`: there were more bytes
-    /// than could be read, now or a moment ago.
+    /// Returns whether the bytes read last may have been buffered in the connection, at `now`. This is so if there were
+    /// more bytes than the caller could read, then or a moment before.
     pub fn is_backlogged(&self, now: Nanos) -> bool {
         self.has_more || self.exhausted.is_some_and(|(_, last)| now < last + SETTLE_TIME)
     }
 
-    /// Returns the time from which the budget is still unspent.
+    /// Returns the time from which the budget is unspent. Budget older than [`MAX_BURST`] has expired.
     fn unspent_since(&self, now: Nanos) -> Nanos {
         self.spent_until.max(now.saturating_sub(MAX_BURST))
     }
 }
 
-/// Factor between the budget and the rate of the line.
+/// Factor between the read budget and the rate of the line.
 const BUDGET_FACTOR: Nanos = 2;
 /// Maximum time for which unspent budget accumulates.
 const MAX_BURST: Nanos = 1_000 * MILLIS;
-/// Amount of budget to wait for when it is exhausted.
+/// Amount of budget to wait for after it was exhausted.
 const MIN_REFILL: Nanos = 20 * MILLIS;
-/// Minimum duration of a flood. Bytes that a network delayed are normally read within a second.
+/// Minimum duration of a flood. Bytes that a network has delayed are usually read within a second.
 const FLOOD_THRESHOLD: Nanos = 1_500 * MILLIS;
-/// Time without exhaustion after which bytes count as new. A network that catches up delivers bytes in bursts.
+/// Time without exhaustion after which bytes count as new. A network that catches up delivers its bytes in bursts.
 const SETTLE_TIME: Nanos = 200 * MILLIS;
-/// Time without exhaustion after which a period of it has ended.
+/// Time without exhaustion after which the period of exhaustion ends.
 const RECOVERY_TIME: Nanos = 5_000 * MILLIS;
 
 #[cfg(test)]
@@ -266,7 +267,8 @@ mod tests {
     const BAUD: u32 = 500_000;
     const SECOND: Nanos = 1_000 * MILLIS;
 
-    /// Reads from `begin` to `end` while more bytes are always available. Returns the number of bytes and of reads.
+    /// Reads from `begin` to `end` from a connection that always has more bytes. Returns the number of bytes and of
+    /// reads.
     fn flooded(allowance: &mut ReadBudget, begin: Nanos, end: Nanos) -> (usize, u32) {
         let (mut now, mut read, mut reads) = (begin, 0, 0);
         while now < end {
@@ -310,7 +312,7 @@ mod tests {
             allowance.record_read(50, 900, now);
             assert!(!allowance.is_backlogged(now));
         }
-        // Half a second of bytes was buffered in the network.
+        // The network delays half a second of bytes.
         assert!(allowance.bytes(60 * SECOND) > 25_000);
         allowance.record_read(25_000, 25_000, 60 * SECOND);
         assert!(allowance.is_backlogged(60 * SECOND), "more may be there");
@@ -322,7 +324,7 @@ mod tests {
     #[test]
     fn reader_is_backlogged_until_it_catches_up() {
         for (standstill, longest_ms) in [(1, 1), (5, 3_500), (20, 19_000)] {
-            // The line sends all the time.
+            // The line sends without pauses.
             let arrived = |now: Nanos| (now / 20_000) as usize;
             let mut allowance = ReadBudget::new(BAUD, 0);
             let (mut now, mut read) = (standstill * SECOND, 0);

@@ -1,14 +1,14 @@
-//! A serial line: opened exclusively, raw, and at a rate that the driver has confirmed.
+//! Serial line of this machine, opened exclusively, raw, and at a baud rate that the driver has confirmed.
 //!
-//! Rate, character and handshake are set by crate `serialport`, on a descriptor that was opened and locked here. Only
-//! settings that differ are set: each one reaches the driver separately, and a line that streams must not be disturbed.
-//! Two things are not taken from that crate: its `set_parity`, which makes the driver drop bytes with errors (IGNPAR),
-//! while here every byte counts; and the number of an error, which it does not keep.
+//! The crate `serialport` sets the baud rate, the character format and the handshake, on a descriptor that this module
+//! has opened and locked. Only settings that differ are set. Each one reaches the driver separately, and a line that
+//! streams must not be disturbed. Two parts of that crate are unsuitable. Its `set_parity` makes the driver drop bytes
+//! with errors (IGNPAR), but here every byte counts. It also does not keep the number of an error.
 //!
-//! The kernel provides the error counters of a UART, and no safe crate does. A driver without them, such as a pty's, reports
-//! that, which is not an error. The driver counts errors when bytes reach it, but not in which bytes. When a telegram has
-//! been read, an error may be in it, in another telegram of the same read, or in bytes that have arrived since: the start of
-//! the next telegram.
+//! The kernel provides the error counters of a UART, but no safe crate reads them. Some drivers, such as that of a pty,
+//! have no counters, which is not an error. The driver counts errors when bytes reach it, but does not report in which
+//! bytes. After a telegram was read, an error may be in this telegram, in another telegram of the same read, or in
+//! bytes that have arrived since, which start the next telegram.
 #![allow(unsafe_code)]
 
 use std::cell::Cell;
@@ -31,29 +31,28 @@ use serialport::{ClearBuffer, DataBits, FlowControl, SerialPort, StopBits, TTYPo
 use crate::serial_ports::{MAX_LATENCY_MS, check_tty, is_tty, latency_ms};
 use crate::{PortError, write_all};
 
-/// An open serial line, exclusive and raw. Reads and writes never block.
+/// Open serial line, exclusive and raw. Reads and writes never block.
 pub struct Tty {
     line: OwnedFd,
     /// Device that the port's name resolved to when it was opened.
     device: PathBuf,
-    /// Settings that this process made, to detect changes by another one.
+    /// Settings that this process has made, in order to detect changes by another process.
     settings: Cell<Settings>,
-    /// The driver's count of errors when it was last read; `None` if it has none.
+    /// Number of errors that the driver had counted at the last check. `None` if the driver does not count errors.
     errors: Cell<Option<u32>>,
 }
 
 impl Tty {
-    /// Opens `path` at `baud`. The bytes in the line's buffer stay there, because a hub that crashed may not have read
-    /// them.
+    /// Opens `path` at `baud`. Bytes in the line's buffer are kept, because a hub that crashed may not have read them.
     pub(crate) fn open(path: &Path, baud: u32) -> Result<Tty, PortError> {
         check_tty(path)?;
         let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
         Tty::begin(open(path, flags, Mode::empty())?, path, baud)
     }
 
-    /// Does the same as [`Tty::open`] with a `line` that is already open.
+    /// Configures `line`, which is already open, as [`Tty::open`] does.
     ///
-    /// Returns [`PortError::Missing`] if `path` names another line by now.
+    /// Returns [`PortError::Missing`] if `path` now names another line.
     pub(crate) fn adopt(line: OwnedFd, path: &Path, baud: u32) -> Result<Tty, PortError> {
         if Tty::is_at(&line, path) { Tty::begin(line, path, baud) } else { Err(PortError::Missing) }
     }
@@ -66,7 +65,8 @@ impl Tty {
 
     fn begin(line: OwnedFd, path: &Path, baud: u32) -> Result<Tty, PortError> {
         let termios = tcgetattr(&line)?;
-        // Lock before setting the exclusive mode: a process that does not get the lock must not end the owner's mode.
+        // Take the lock before setting the exclusive mode. A process that does not get the lock must not end the
+        // owner's mode.
         flock(&line, FlockOperation::NonBlockingLockExclusive).map_err(|error| match error {
             Errno::WOULDBLOCK => PortError::Busy,
             error => error.into(),
@@ -74,7 +74,7 @@ impl Tty {
         ioctl_tiocexcl(&line)?;
         let device = path.canonicalize().unwrap_or_else(|_| path.to_owned());
         let tty = Tty { line, device, settings: Cell::new(Settings::of(&termios)), errors: Cell::new(None) };
-        // Not all drivers support low latency, and scanners stream without it.
+        // Not all drivers support low latency, and scanners also stream without it.
         if let Err(error) = set_low_latency(&tty.line) {
             tracing::debug!(%error, "{}: no low latency", path.display());
         }
@@ -90,9 +90,10 @@ impl Tty {
         Ok(tty)
     }
 
-    /// Makes the line raw, at `baud`. `termios` has the settings so far.
+    /// Makes the line raw and sets `baud`. `termios` has the present settings.
     fn configure(&self, mut termios: Termios, baud: u32) -> Result<(), PortError> {
-        // No parity, and no byte is dropped or doubled because of an error. The modem lines are not connected.
+        // Disable parity, so that the driver drops or doubles no byte because of an error. Ignore the modem lines,
+        // which are not connected.
         termios.make_raw();
         termios.input_modes.remove(InputModes::IXOFF | InputModes::IXANY | InputModes::INPCK);
         termios.control_modes.insert(ControlModes::CREAD | ControlModes::CLOCAL);
@@ -102,7 +103,7 @@ impl Tty {
         checked
     }
 
-    /// Returns the settings that another process has changed; `None` if they are unchanged.
+    /// Returns the settings that another process has changed. Returns `None` if they are unchanged.
     ///
     /// # Errors
     ///
@@ -115,8 +116,8 @@ impl Tty {
         }))
     }
 
-    /// Restores the settings of this process, at `baud`, and discards the input that arrived with others. If the driver
-    /// rejects the rate, the rate stays as it is, and a search tries others.
+    /// Restores the settings of this process, at `baud`, and discards the input that arrived with other settings. If
+    /// the driver rejects the rate, the line keeps its rate, and a search tries others.
     ///
     /// # Errors
     ///
@@ -124,7 +125,7 @@ impl Tty {
     pub(crate) fn restore(&self, baud: u32) -> io::Result<()> {
         let configured = self.configure(tcgetattr(&self.line)?, baud);
         clear_input(&self.line).map_err(|_| self.lost_line_error())?;
-        // With other settings, every byte counts as an error.
+        // With other settings, the driver counts every byte as an error.
         self.line_errors();
         match configured {
             Ok(()) | Err(PortError::Rate { .. }) => Ok(()),
@@ -137,22 +138,23 @@ impl Tty {
         &self.device
     }
 
-    /// Returns whether another program simulates the sensor.
+    /// Returns whether the line is a pty, so that another program simulates the scanner.
     pub(crate) fn is_simulated(&self) -> bool {
         self.device.starts_with("/dev/pts")
     }
 
-    /// Returns the driver's counters since it was loaded, if it has any.
+    /// Returns the driver's counters since the driver was loaded. Returns `None` if it has none.
     pub(crate) fn uart_counters(&self) -> Option<UartCounters> {
         UartCounters::of(&self.line).ok()
     }
 
-    /// Returns the rate that the driver reports.
+    /// Returns the baud rate that the driver reports.
     pub(crate) fn baud(&self) -> Option<u32> {
         tcgetattr(&self.line).ok().map(|termios| termios.output_speed())
     }
 
-    /// Returns the errors that the driver counted since the last call. A change of the rate also counts as a call.
+    /// Returns the number of errors that the driver has counted since the last call. A change of the baud rate also
+    /// counts as a call.
     pub(crate) fn line_errors(&self) -> u64 {
         let Some(before) = self.errors.get() else { return 0 };
         let now = self.uart_counters().map_or(before, |counts| counts.errors());
@@ -166,7 +168,7 @@ impl Tty {
             self.settings.set(Settings { speed, ..self.settings.get() });
         }
         clear_input(&self.line).map_err(|_| self.lost_line_error())?;
-        // At a wrong rate, every byte counts as an error.
+        // At a wrong baud rate, the driver counts every byte as an error.
         self.line_errors();
         applied.map_err(|error| match error {
             PortError::Rate { .. } => io::Error::new(ErrorKind::Unsupported, error.to_string()),
@@ -174,8 +176,8 @@ impl Tty {
         })
     }
 
-    /// Asserts or clears DTR. A pty and some adapters do not have it. If it is asserted, it stays so when the line is
-    /// closed.
+    /// Asserts or clears DTR. A pty and some adapters do not have it. If DTR is asserted, it stays asserted after the
+    /// line is closed.
     pub(crate) fn set_dtr(&self, on: bool) -> io::Result<()> {
         let mut termios = tcgetattr(&self.line)?;
         termios.control_modes.set(ControlModes::HUPCL, !on);
@@ -193,7 +195,7 @@ impl Tty {
 
     pub(crate) fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
         match rustix::io::read(&self.line, buffer) {
-            // With VMIN = 0, which some programs set, an empty buffer reads like the end of the line.
+            // With VMIN = 0, which some programs set, reading an empty buffer returns the same as the end of the line.
             Ok(0) if self.baud().is_some() => Ok(0),
             Ok(0) | Err(Errno::IO) => Err(hangup_error()),
             Err(Errno::AGAIN | Errno::INTR) => Ok(0),
@@ -206,15 +208,15 @@ impl Tty {
         written.map_err(|error| if error == Errno::IO { hangup_error() } else { error.into() })
     }
 
-    /// Checks the result of changing settings by the rate that the driver has set instead of `wanted`. A lost line
-    /// reports an error when its settings are read. Otherwise the driver rejected the settings, and the library does
-    /// not keep the number of the error.
+    /// Checks the result of a change of settings, and the baud rate that the driver has set for `requested`. If the
+    /// line is lost, reading its settings fails. Otherwise an error means that the driver rejected a setting, because
+    /// the library does not keep the number of the error.
     fn check(&self, result: serialport::Result<()>, requested: u32) -> Result<(), PortError> {
         let actual = tcgetattr(&self.line)?.output_speed();
         check_rate(result.map_err(|_| Errno::INVAL), actual, requested)
     }
 
-    /// Returns the error of a line whose settings cannot be read.
+    /// Returns the error that reading the settings of a lost line reports.
     fn lost_line_error(&self) -> io::Error {
         tcgetattr(&self.line).err().unwrap_or(Errno::IO).into()
     }
@@ -228,7 +230,7 @@ impl AsFd for Tty {
 
 impl Drop for Tty {
     fn drop(&mut self) {
-        // The exclusive mode of a pty would outlive the close. A line that hung up does not need this.
+        // The exclusive mode of a pty would outlast the close. A line that hung up is not affected.
         let _ = ioctl_tiocnxcl(&self.line);
     }
 }
@@ -236,13 +238,13 @@ impl Drop for Tty {
 /// Settings of a line that decide whether bytes arrive as they were sent.
 #[derive(Clone, Copy, PartialEq, Eq)]
 struct Settings {
-    /// Rate in bits per second.
+    /// Baud rate in bits per second.
     speed: u32,
     input: InputModes,
     output: OutputModes,
     control: ControlModes,
     local: LocalModes,
-    /// Number of bytes that a read waits for.
+    /// Number of bytes that a read waits for (VMIN).
     min: u8,
 }
 
@@ -259,12 +261,12 @@ impl Settings {
     }
 }
 
-/// A change of an open line's settings by another process.
+/// Change of an open line's settings by another process.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SettingsChange {
-    /// The rate in bits per second, possibly with other settings.
+    /// The baud rate has changed, in bits per second. Other settings may have changed as well.
     Rate(u32),
-    /// Settings other than the rate.
+    /// Settings other than the baud rate have changed.
     Settings,
 }
 
@@ -277,7 +279,8 @@ impl fmt::Display for SettingsChange {
     }
 }
 
-/// Control modes that matter, except the rate, which has a separate field. HUPCL only matters when the line is closed.
+/// Control modes that matter on an open line. HUPCL matters only when the line is closed, and the baud rate has a
+/// separate field.
 const CHARACTER_MODES: ControlModes = ControlModes::CSIZE
     .union(ControlModes::CSTOPB)
     .union(ControlModes::CREAD)
@@ -287,13 +290,13 @@ const CHARACTER_MODES: ControlModes = ControlModes::CSIZE
     .union(ControlModes::CLOCAL)
     .union(ControlModes::CRTSCTS);
 
-/// Returns the error of a read if the adapter was unplugged, the other end of a pty was closed, or the line hung up.
+/// Returns the error of a read after the adapter was unplugged, the other end of a pty was closed, or the line hung up.
 fn hangup_error() -> io::Error {
     io::Error::new(ErrorKind::UnexpectedEof, "the line hung up")
 }
 
-/// Checks the rate that a driver has `given` after it was set to `wanted`. Some drivers set another rate, and some
-/// reject a rate that they do not support.
+/// Checks that `actual`, which a driver has set, is close to the `requested` baud rate. Some drivers set another rate,
+/// and others reject a rate that they do not support.
 fn check_rate(result: Result<(), Errno>, actual: u32, requested: u32) -> Result<(), PortError> {
     match result {
         Ok(()) | Err(Errno::INVAL) if !is_near(actual, requested) => {
@@ -303,8 +306,8 @@ fn check_rate(result: Result<(), Errno>, actual: u32, requested: u32) -> Result<
     }
 }
 
-/// Returns whether a UART at `given` can receive from one at `wanted`. In the middle of the last bit, both ends
-/// together may be off by half a bit, so each of them by at most 3 %.
+/// Returns whether a UART at `actual` bits per second can receive from one at `requested`. At the middle of the last
+/// bit, both ends together may be off by half a bit, so each end may be off by at most 3 %.
 fn is_near(actual: u32, requested: u32) -> bool {
     u64::from(actual.abs_diff(requested)) * 100 <= u64::from(requested) * 3
 }
@@ -313,7 +316,7 @@ fn is_near(actual: u32, requested: u32) -> bool {
 ///
 /// # Errors
 ///
-/// Returns an error if the driver rejects a setting or the line is lost. The library does not distinguish these.
+/// Returns an error if the driver rejects a setting, or the line is lost. The library does not distinguish the two.
 fn apply_settings(line: impl AsFd, baud: u32) -> serialport::Result<()> {
     with_library(line, |port| {
         if port.data_bits()? != DataBits::Eight {
@@ -329,11 +332,11 @@ fn apply_settings(line: impl AsFd, baud: u32) -> serialport::Result<()> {
     })
 }
 
-/// Sets only the rate.
+/// Sets only the baud rate.
 ///
 /// # Errors
 ///
-/// Returns the errors of [`apply_settings`].
+/// Returns the same errors as [`apply_settings`].
 fn apply_baud(line: impl AsFd, baud: u32) -> serialport::Result<()> {
     with_library(line, |port| set_rate(port, baud))
 }
@@ -342,12 +345,12 @@ fn apply_baud(line: impl AsFd, baud: u32) -> serialport::Result<()> {
 ///
 /// # Errors
 ///
-/// Returns an error if the line has no DTR, or is lost.
+/// Returns an error if the line does not have DTR, or is lost.
 fn apply_dtr(line: impl AsFd, on: bool) -> serialport::Result<()> {
     with_library(line, |port| port.write_data_terminal_ready(on))
 }
 
-/// Discards the input.
+/// Discards the received bytes.
 ///
 /// # Errors
 ///
@@ -357,24 +360,24 @@ fn clear_input(line: impl AsFd) -> serialport::Result<()> {
 }
 
 fn set_rate(port: &mut TTYPort, baud: u32) -> serialport::Result<()> {
-    // The library returns an error if the rates of the two directions differ. Then set both.
+    // The library returns an error if the baud rates of the two directions differ. Set both then.
     if port.baud_rate().ok() == Some(baud) { Ok(()) } else { port.set_baud_rate(baud) }
 }
 
-/// Calls `set` with the library's view of `line`. This process must already have locked the line, because the view
+/// Calls `set` with `line` as a port of the library. This process must have locked the line before, because the library
 /// locks it too.
 fn with_library<T>(
     line: impl AsFd,
     set: impl FnOnce(&mut TTYPort) -> serialport::Result<T>,
 ) -> serialport::Result<T> {
     let line = line.as_fd();
-    // SAFETY: the descriptor is open while it is borrowed, which is longer than the view lives. The view is never
-    // dropped, so it neither closes the descriptor nor ends its exclusive mode.
+    // SAFETY: the descriptor is open while it is borrowed, which is longer than `port` exists. `port` is never dropped,
+    // so it neither closes the descriptor nor ends its exclusive mode.
     let mut port = ManuallyDrop::new(unsafe { TTYPort::from_raw_fd(line.as_raw_fd()) });
     set(&mut port)
 }
 
-/// Counters of a line since its driver was loaded. All of them wrap.
+/// Counters of a line since its driver was loaded. All of them wrap around.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct UartCounters {
     /// Bytes received.
@@ -392,7 +395,7 @@ pub struct UartCounters {
 }
 
 impl UartCounters {
-    /// Reads the counters of the driver of `line`.
+    /// Reads the counters from the driver of `line`.
     pub(crate) fn of(line: impl AsFd) -> Result<UartCounters, Errno> {
         let mut words = [0; STRUCT_WORDS];
         ioctl_words::<TIOCGICOUNT>(line.as_fd(), &mut words)?;
@@ -405,15 +408,17 @@ impl UartCounters {
         [framing, overrun, parity, breaks, buffer].into_iter().fold(0, u32::wrapping_add)
     }
 
-    /// Reads a `serial_icounter_struct`: cts dsr rng dcd rx tx frame overrun parity brk buf_overrun.
+    /// Creates the counters from the words of a `serial_icounter_struct`: cts dsr rng dcd rx tx frame overrun parity
+    /// brk buf_overrun.
     fn from_words(words: &[u32; STRUCT_WORDS]) -> UartCounters {
         let [_, _, _, _, received, _, framing, overrun, parity, breaks, buffer, ..] = *words;
         UartCounters { received, framing, overrun, parity, breaks, buffer }
     }
 }
 
-/// Sets the driver to low latency, so that an FTDI adapter delivers bytes every millisecond instead of every 16. Also
-/// removes a custom divisor that an old `setserial` may have left, which replaces the rate 38400 by another one.
+/// Enables low latency in the driver, so that an FTDI adapter delivers bytes every millisecond instead of every 16 ms.
+/// Also removes a custom divisor, which an old `setserial` may have set and which replaces the rate 38400 by another
+/// one.
 pub(super) fn set_low_latency(line: impl AsFd) -> Result<(), Errno> {
     let mut serial = [0; STRUCT_WORDS];
     ioctl_words::<TIOCGSERIAL>(line.as_fd(), &mut serial)?;
@@ -443,29 +448,29 @@ const FLAGS_INDEX: usize = 4;
 /// Bits of the flags (linux/tty_flags.h).
 const ASYNC_LOW_LATENCY: u32 = 1 << 13;
 const ASYNC_SPD_MASK: u32 = 1 << 12 | 1 << 5 | 1 << 4;
-/// asm-generic/ioctls.h.
+/// Numbers of ioctls (asm-generic/ioctls.h).
 const TIOCGSERIAL: Opcode = 0x541E;
 const TIOCSSERIAL: Opcode = 0x541F;
 const TIOCGICOUNT: Opcode = 0x545D;
 
-/// Tracks whether errors may belong to the bytes that were read.
+/// Tracker of whether the driver's errors may be in the bytes that were read.
 #[derive(Debug, Default)]
 pub struct LineErrors {
-    /// Whether the driver counted errors since the last wait for bytes.
+    /// Whether the driver has counted errors since the last wait for bytes.
     is_current: bool,
-    /// Whether it counted errors in the period before that.
+    /// Whether the driver counted errors in the period before.
     was_previous: bool,
 }
 
 impl LineErrors {
-    /// Records that a telegram was read, and that the driver counted `errors` since the previous one. Returns whether
-    /// they may be in this telegram.
+    /// Records that a telegram was read, and that the driver has counted `errors` since the previous telegram. Returns
+    /// whether an error may be in this telegram.
     pub fn note_telegram(&mut self, errors: u64) -> bool {
         self.is_current |= errors > 0;
         self.is_current || self.was_previous
     }
 
-    /// Records that all telegrams of a read, at least one, were noted.
+    /// Records the end of a read, after all of its telegrams were noted. The read had at least one telegram.
     pub fn note_read(&mut self) {
         self.was_previous = std::mem::take(&mut self.is_current);
     }
@@ -479,7 +484,7 @@ mod tests {
     #[test]
     fn rates_that_are_near_enough() {
         assert!(is_near(500_000, 500_000) && is_near(485_000, 500_000) && is_near(515_000, 500_000));
-        // Rates that drivers set instead of 500 kBd if they do not support it.
+        // Baud rates that drivers set instead of 500 kBd if they do not support it.
         assert!(!is_near(460_800, 500_000) && !is_near(9600, 500_000) && !is_near(0, 500_000));
     }
 
@@ -529,7 +534,7 @@ mod tests {
         assert_eq!(check_rate(Ok(()), 500_000, 500_000), Ok(()));
         assert_eq!(check_rate(Ok(()), 460_800, 500_000), no_rate(460_800));
         assert_eq!(check_rate(Err(Errno::INVAL), 38_400, 500_000), no_rate(38_400));
-        // The driver has the rate, but rejects another setting.
+        // The driver supports the rate, but rejects another setting.
         assert_eq!(check_rate(Err(Errno::INVAL), 500_000, 500_000), Err(PortError::Other(Errno::INVAL)));
         assert_eq!(check_rate(Err(Errno::IO), 38_400, 500_000), Err(PortError::NoDevice));
     }
@@ -570,7 +575,7 @@ mod tests {
         assert_eq!(read(&[3]), [true]);
         assert_eq!(read(&[0]), [true]);
         assert_eq!(read(&[0]), [false]);
-        // Several telegrams in one read: the counter of the first one covers all of them.
+        // There are several telegrams in one read, so the error count of the first one applies to all of them.
         assert_eq!(read(&[1, 0, 0]), [true; 3]);
         assert_eq!(read(&[2]), [true]);
         assert_eq!(read(&[0, 0]), [true; 2]);
