@@ -1,9 +1,11 @@
-//! Changes a sensor's EEPROM settings. It checks that the settings are still those of the plan, enters installation
-//! mode, writes, leaves that mode, reads the settings back, and restores the earlier operating mode. After any failure
-//! it tries to leave installation mode, and its outcome says what is known of the sensor's state.
+//! Protocol that changes the EEPROM settings of a scanner. It checks that the settings are still those of the plan,
+//! enters installation mode, writes, leaves that mode, reads the settings back, and restores the earlier operating
+//! mode. After any failure it tries to leave installation mode. Its outcome states what is known about the scanner's
+//! state.
 //!
-//! The only code that sends a request of [`crate::eeprom`], and it needs [`Consent`]. A write that was not
-//! acknowledged is not simply repeated: first the configuration is read, to see whether it was done.
+//! Only this module sends a request of [`crate::eeprom`], and it needs [`Consent`]. If the scanner does not acknowledge
+//! a write, the protocol first reads the configuration to check whether the write was done. It does not simply repeat
+//! the write.
 
 use scanhub_drivers::line::{Action, Protocol};
 use scanhub_drivers::lms::command::{self, Request};
@@ -19,67 +21,70 @@ use scanhub_schema::{MILLIS, Nanos};
 use crate::eeprom::{EepromWrite, PowerOn};
 use crate::plan::{Consent, OwnedConfiguration, Plan};
 
-/// A change under way; it cannot be copied, as consent is to one.
+/// Change in progress. It cannot be copied, because a consent is valid for only one change.
 #[derive(Debug)]
 pub struct Change {
     plan: Plan,
     channel: RequestChannel<CurrentRequest>,
     step: Step,
-    /// How often more the configuration may be written.
+    /// Number of times that the configuration may still be written.
     writes_left: u8,
-    /// The sensor sends nothing unasked. Before that the rest of a scan may look like a NAK.
+    /// Whether the scanner has stopped sending scans. Before that, the rest of a scan may look like a NAK.
     is_stopped: bool,
     outcome: Outcome,
 }
 
-/// How far a change is, in its order.
+/// Step of a change, in the order of execution.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Step {
-    /// Whether it is still the sensor that the plan was made for: a person takes time to answer.
+    /// Check that the scanner still has the settings of the plan. A person may have taken some time to confirm the
+    /// plan.
     Compare,
-    /// Into installation mode.
+    /// Enter installation mode.
     Enter,
-    /// The configuration is written.
+    /// Write the configuration.
     Write,
-    /// Nobody said whether it was: the configuration is read.
+    /// Read the configuration, because the scanner has not reported whether it was written.
     Check,
-    /// The rate after power-on is written.
+    /// Write the setting for the baud rate after power-on.
     PowerOn,
-    /// Out of installation mode.
+    /// Leave installation mode.
     Leave,
-    /// The configuration that is in force now.
+    /// Read the configuration that is now in effect.
     ReadBack,
-    /// Whether another rate than 9600 comes after power-on.
+    /// Read whether the scanner will use a baud rate other than 9600 after power-on.
     ReadStatus,
-    /// Back to the stream that was found.
+    /// Restore the earlier operating mode.
     Restore,
-    /// Over.
+    /// The change is complete.
     Done,
 }
 
-/// What became of it.
+/// Outcome of a change.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Outcome {
-    /// The step that failed first, and how; `None` if all went well.
+    /// First step that failed, and its error. `None` if every step succeeded.
     pub failed: Option<(Step, ChangeError)>,
-    /// Whether a write may have reached the sensor.
+    /// Whether a write may have reached the scanner.
     pub written: bool,
-    /// The configuration as it was read back.
+    /// Configuration as it was read back.
     pub configuration: Option<OwnedConfiguration>,
-    /// Whether a rate other than 9600 comes after power-on, if that was to change and could be read back.
+    /// Whether the scanner uses a baud rate other than 9600 after power-on. `None` if the plan does not change this
+    /// setting, or it could not be read back.
     pub permanent_baud: Option<bool>,
-    /// The operating mode in which the sensor is now; `None` if it may still be in installation mode.
+    /// Current operating mode of the scanner. `None` if it may still be in installation mode.
     pub operating_mode: Option<u8>,
 }
 
-/// How a step failed.
+/// Reason why a step failed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ChangeError {
-    /// No reply, or none that can be read.
+    /// The scanner sent no reply, or none that can be decoded.
     Unanswered,
-    /// The sensor refused; at [`Step::Enter`]: the password is wrong.
+    /// The scanner rejected the request. At [`Step::Enter`], the password is wrong.
     Refused,
-    /// The settings read back differ from those written; at [`Step::Compare`]: from those of the plan.
+    /// The settings that were read back differ from those that were written. At [`Step::Compare`], they differ from
+    /// those of the plan.
     Mismatch,
 }
 
@@ -91,7 +96,7 @@ enum CurrentRequest {
 }
 
 impl CurrentRequest {
-    /// What of it is written.
+    /// Returns the EEPROM write of this request. Returns `None` if the request does not write.
     fn write(&self) -> Option<EepromWrite<'_>> {
         match self {
             CurrentRequest::Request(_) => None,
@@ -105,7 +110,8 @@ impl EncodeRequest for CurrentRequest {
     fn encode(&self, address: u8) -> EncodedTelegram {
         let request = match self {
             CurrentRequest::Request(request) => *request,
-            // Which configuration there is does no harm to ask; but none is longer than a write may be.
+            // Never used, because no configuration is longer than a write may be. A request for the configuration does
+            // no harm.
             CurrentRequest::WriteConfiguration(_) | CurrentRequest::WritePowerOn(_) => Request::Configuration,
         };
         let write = self.write().and_then(|write| write.encode(address));
@@ -128,8 +134,8 @@ impl EncodeRequest for CurrentRequest {
         }
     }
 
-    /// A sensor that writes, or changes its mode, may have acknowledged unheard, behind a scan that it broke off: it is
-    /// waited for as long.
+    /// Returns the maximum time for the acknowledgment. A scanner that writes, or changes its mode, may have sent it
+    /// after a scan that it broke off, where it was not recognized. The time is therefore the same as for the reply.
     fn acknowledge_timeout(&self) -> Nanos {
         match self {
             CurrentRequest::Request(request) if request.command() == command::MODE => MODE_TIMEOUT,
@@ -140,7 +146,7 @@ impl EncodeRequest for CurrentRequest {
 }
 
 impl Change {
-    /// Carries out the plan that somebody consented to, on a port that is open at its rate.
+    /// Creates the change of a plan that a person has confirmed, on a port that is open at the scanner's baud rate.
     pub fn new(consent: Consent, now: Nanos) -> Self {
         let plan = consent.into_plan();
         let mut exchange = RequestChannel::new(plan.baud, now);
@@ -152,7 +158,7 @@ impl Change {
         change
     }
 
-    /// As a change on the line of a serial server, which may pack a reply before it sends it.
+    /// Sets that the line belongs to a serial server, which may collect a reply before it sends it.
     pub fn with_server(mut self) -> Self {
         self.channel.is_behind_server = true;
         self
@@ -168,12 +174,12 @@ impl Change {
         &self.outcome
     }
 
-    /// Begins with `step`, or the first one after it that has something to do.
+    /// Starts `step`, or the first step after it that sends a request.
     fn begin(&mut self, step: Step) {
         self.step = step;
         let plan = self.plan;
         let send = |request| Some((CurrentRequest::Request(request), TRIES));
-        // A wrong or lost request does nothing; it is for the next step to find out.
+        // Send a write only once. The next step checks whether it was done.
         let send_once = |request| Some((request, 1));
         let next_request = match step {
             Step::Enter => send(Request::Operate(Operating::Installation(plan.password))),
@@ -184,14 +190,14 @@ impl Change {
             Step::Leave => Some((CurrentRequest::Request(Request::Stop), ESSENTIAL_TRIES)),
             Step::ReadStatus if plan.power_on.is_none() => None,
             Step::ReadStatus => send(Request::Status),
-            // It may still be in installation mode.
+            // The scanner may still be in installation mode.
             Step::Restore if self.outcome.operating_mode.is_none() => {
                 Some((CurrentRequest::Request(Request::Stop), ESSENTIAL_TRIES))
             }
             Step::Restore => match plan.operating_mode {
                 STREAM => send(Request::Stream),
                 PARTIAL => send(Request::Operate(Operating::Partial)),
-                // What other modes need beside their byte nobody tells.
+                // The documents do not state which parameters other modes need.
                 _ => None,
             },
             Step::Done => return,
@@ -216,7 +222,8 @@ impl Change {
         };
         let done = match &reply {
             Some(Reply::Mode { done } | Reply::ConfigurationWritten { done, .. }) => Some(*done),
-            // The documents disagree about its first byte: the status has the result afterwards.
+            // The documents disagree about the first byte of this reply. The status, which is read later, has the
+            // result.
             Some(Reply::PowerOnSet { .. } | Reply::Status(_) | Reply::Configuration(_)) => Some(true),
             Some(Reply::Refused) => Some(false),
             _ => None,
@@ -233,7 +240,7 @@ impl Change {
         self.is_stopped |= is_changed;
         match self.step {
             _ if done == Some(false) => self.handle_failure(ChangeError::Refused),
-            // An answer that cannot be read says no more than none.
+            // A reply that cannot be decoded is as useless as no reply.
             Step::Write if done.is_none() => self.check_written(),
             _ if done.is_none() => self.handle_failure(ChangeError::Unanswered),
             Step::Compare if configuration != Some(self.plan.old) => {
@@ -294,19 +301,19 @@ impl Change {
     fn handle_failure(&mut self, error: ChangeError) {
         self.record_failure(error);
         match self.step {
-            // Nothing was said that changes anything.
+            // No request so far changes anything.
             Step::Compare => {
                 self.outcome.operating_mode = Some(self.plan.operating_mode);
                 self.begin(Step::Done);
             }
-            // Whether it heard that or not, it may be in installation mode.
+            // The scanner may be in installation mode, whether or not it received the request.
             Step::Enter | Step::Write | Step::Check | Step::PowerOn => self.begin(Step::Leave),
             Step::Leave => self.begin(Step::ReadBack),
             step => self.begin(next_step(step)),
         }
     }
 
-    /// The first failure is the cause of the others.
+    /// Stores the first failure, which is the cause of any later ones.
     fn record_failure(&mut self, error: ChangeError) {
         self.outcome.failed.get_or_insert((self.step, error));
     }
@@ -343,7 +350,8 @@ impl Protocol for Change {
         while let Some(event) = self.channel.advance() {
             match event {
                 ChannelEvent::Telegram(span) => self.on_telegram(span),
-                // While it may be writing, only time says no: noise is not worth a second write.
+                // While the scanner may be writing, only the timeout counts as a failure. A second write because of
+                // noise would wear the EEPROM.
                 ChannelEvent::Nak if !self.is_stopped || matches!(self.step, Step::Write | Step::PowerOn) => {
                 }
                 ChannelEvent::Nak => {
@@ -360,7 +368,7 @@ impl Protocol for Change {
     }
 }
 
-/// The step after one that went as it should.
+/// Returns the step after one that succeeded.
 fn next_step(step: Step) -> Step {
     match step {
         Step::Compare => Step::Enter,
@@ -374,5 +382,5 @@ fn next_step(step: Step) -> Step {
     }
 }
 
-/// A change of unit was seen to take 7 s (QM), one driver waits 15 s.
+/// Timeout for a write. A change of unit was observed to take 7 s (QM), and one driver waits 15 s.
 const WRITE_TIMEOUT: Nanos = 15_000 * MILLIS;

@@ -1,27 +1,28 @@
-//! Requests that write a sensor's EEPROM, which wears out after a few thousand writes. They work in installation mode
-//! only (Telegram listing 7-1). This module encodes and decodes them, and sends none.
+//! Requests that write a scanner's EEPROM, which wears out after a few thousand writes. A scanner accepts them only in
+//! installation mode (Telegram listing 7-1). This module encodes and decodes requests, and does not send them.
 
 use scanhub_drivers::lms::telegram::{EncodedTelegram, MAX_LENGTH, Telegram, Writer};
 
-/// A request that writes the EEPROM.
+/// Request that writes the EEPROM.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum EepromWrite<'a> {
-    /// 40h: a field. The parameters as they are: their layout is not known here.
+    /// 40h: write a field. Contains the raw parameters, because this module does not decode their layout.
     Field(&'a [u8]),
-    /// 42h: the password of the installation mode. The parameters as they are.
+    /// 42h: change the password of the installation mode. Contains the raw parameters.
     Password(&'a [u8]),
-    /// 46h: teach a field. The parameters as they are.
+    /// 46h: teach a field. Contains the raw parameters.
     Teach(&'a [u8]),
-    /// 66h: the rate after power-on, or how the type is kept.
+    /// 66h: set the baud rate after power-on, or keep the type.
     PowerOn(PowerOn),
-    /// 77h: the first part of the configuration; fewer than its 34 bytes change the leading ones only.
+    /// 77h: write the first part of the configuration. Fewer than 34 bytes change only the first bytes of it.
     Configuration(&'a [u8]),
-    /// 7Ch: the second part of the configuration, 84 bytes.
+    /// 7Ch: write the second part of the configuration, 84 bytes.
     Configuration2(&'a [u8]),
 }
 
 impl<'a> EepromWrite<'a> {
-    /// The telegram that says it to the sensor at `address`; `None` if its bytes are more than such a request may have.
+    /// Returns the telegram that sends this request to the scanner at `address`. Returns `None` if the data is too long
+    /// or too short.
     pub fn encode(self, address: u8) -> Option<EncodedTelegram> {
         let data = match &self {
             EepromWrite::PowerOn(power_on) => core::slice::from_ref(power_on.as_byte()),
@@ -34,7 +35,7 @@ impl<'a> EepromWrite<'a> {
         self.fits(data.len()).then(|| Writer::new(address, self.command()).slice(data).finish())
     }
 
-    /// The write that `telegram` asks for; `None` if it is none, or longer or shorter than it may be.
+    /// Decodes the write in `telegram`. Returns `None` if the telegram is not a write, or its length is not valid.
     pub fn decode(telegram: Telegram<'a>) -> Option<EepromWrite<'a>> {
         if telegram.is_reply() {
             return None;
@@ -55,7 +56,7 @@ impl<'a> EepromWrite<'a> {
         write.fits(data.len()).then_some(write)
     }
 
-    /// The command byte.
+    /// Returns the command byte.
     pub fn command(self) -> u8 {
         match self {
             EepromWrite::Field(_) => FIELD,
@@ -77,27 +78,28 @@ impl<'a> EepromWrite<'a> {
     }
 }
 
-/// What 66h sets (Telegram listing, 66h).
+/// Setting of command 66h (Telegram listing, 66h).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PowerOn {
-    /// 00h: 9600 after power-on, as from the factory.
+    /// 00h: use 9600 baud after power-on, which is the factory setting.
     Baud9600,
-    /// 01h: the present rate after power-on; a sensor so left at 500 kBd is found by nobody who looks at 9600.
+    /// 01h: use the present baud rate after power-on. A program that searches only at 9600 does not find a scanner that
+    /// was set to 500 kBd.
     KeepBaud,
     /// 02h: keep the type.
     KeepType,
 }
 
 impl PowerOn {
-    /// All of them.
+    /// Every setting.
     pub const ALL: [PowerOn; 3] = [PowerOn::Baud9600, PowerOn::KeepBaud, PowerOn::KeepType];
 
-    /// Its byte.
+    /// Returns the byte of the setting.
     pub fn byte(self) -> u8 {
         *self.as_byte()
     }
 
-    /// What `byte` sets.
+    /// Returns the setting that `byte` stands for.
     pub fn of_byte(byte: u8) -> Option<PowerOn> {
         PowerOn::ALL.into_iter().find(|power_on| power_on.byte() == byte)
     }
@@ -111,22 +113,22 @@ impl PowerOn {
     }
 }
 
-/// Bytes of the first part of the configuration (Telegram listing, 77h; older firmware has 32).
+/// Length of the first part of the configuration, in bytes (Telegram listing, 77h). Older firmware has 32 bytes.
 pub const CONFIGURATION_LEN: usize = 34;
-/// Bytes of the second part (Telegram listing, 7Ch).
+/// Length of the second part of the configuration, in bytes (Telegram listing, 7Ch).
 pub const CONFIGURATION_2_LEN: usize = 84;
 
-/// Command: write a field.
+/// Command that writes a field.
 pub const FIELD: u8 = 0x40;
-/// Command: change the password.
+/// Command that changes the password.
 pub const PASSWORD: u8 = 0x42;
-/// Command: teach a field.
+/// Command that teaches a field.
 pub const TEACH: u8 = 0x46;
-/// Command: rate after power-on.
+/// Command that sets the baud rate after power-on.
 pub const POWER_ON_RATE: u8 = 0x66;
-/// Command: write the first part of the configuration.
+/// Command that writes the first part of the configuration.
 pub const CONFIGURATION: u8 = 0x77;
-/// Command: write the second part of the configuration.
+/// Command that writes the second part of the configuration.
 pub const CONFIGURATION_2: u8 = 0x7C;
 
 #[cfg(test)]

@@ -1,8 +1,8 @@
-//! What a sensor keeps without power, and how it is changed. All requests that write the EEPROM are here, and so is the
-//! [`Consent`] without which none is sent. A crate of its own, so that Cargo keeps it from everything that talks to a
-//! sensor by itself: the hub is built without it.
+//! Permanent settings of an LMS, and the protocol that changes them. This crate has all requests that write the EEPROM,
+//! and the [`Consent`] that is required to send one. It is a separate crate, and the hub is built without it. No code
+//! that contacts a scanner without a user can therefore write the EEPROM.
 //!
-//! Sans-I/O like the drivers: no port and no clock.
+//! Like the drivers, the crate does no I/O and reads no clock.
 #![forbid(unsafe_code)]
 
 mod change;

@@ -1,5 +1,6 @@
-//! A planned change of the EEPROM settings, and a person's consent to it. A plan is only values. It can be carried out
-//! only with consent, which is for one plan as it was shown.
+//! Planned change of the EEPROM settings, and a person's consent to it. A plan contains only values.
+//! [`Change`](crate::Change) carries it out only with a consent, which is valid for exactly the plan that the person
+//! has seen.
 
 use scanhub_drivers::lms::command::Password;
 use scanhub_drivers::lms::configuration::{CONFIGURATION_LEN, Configuration, ITEMS, Item};
@@ -8,7 +9,7 @@ use scanhub_drivers::lms::variant::Baud;
 
 use crate::eeprom::PowerOn;
 
-/// The first part of a configuration with its own storage: 34 bytes, 32 with older firmware.
+/// First part of a configuration, in its own storage. It has 34 bytes, or 32 with older firmware.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct OwnedConfiguration {
     bytes: [u8; CONFIGURATION_LEN],
@@ -16,7 +17,7 @@ pub struct OwnedConfiguration {
 }
 
 impl OwnedConfiguration {
-    /// A copy of `bytes`; `None` if they are no configuration.
+    /// Copies `bytes`. Returns `None` if they are not a configuration.
     pub fn new(bytes: &[u8]) -> Option<OwnedConfiguration> {
         Configuration::new(bytes)?;
         let mut configuration = OwnedConfiguration { bytes: [0; CONFIGURATION_LEN], len: bytes.len() };
@@ -24,19 +25,19 @@ impl OwnedConfiguration {
         Some(configuration)
     }
 
-    /// The bytes as the sensor keeps them.
+    /// Returns the bytes as the scanner stores them.
     pub fn bytes(&self) -> &[u8] {
         &self.bytes[..self.len]
     }
 
-    /// Sets one byte; beyond its end nothing.
+    /// Sets the byte at index `at`. Does nothing if the configuration is shorter.
     pub fn set(&mut self, at: usize, byte: u8) {
         if let Some(slot) = self.bytes[..self.len].get_mut(at) {
             *slot = byte;
         }
     }
 
-    /// The items in which `self` and `other` differ.
+    /// Returns the items in which `self` and `other` differ.
     pub fn differences<'a>(&'a self, other: &'a OwnedConfiguration) -> impl Iterator<Item = Item> + 'a {
         let of = |configuration: &'a OwnedConfiguration, item: &Item| {
             configuration.bytes().get(item.at..item.at + item.len)
@@ -45,27 +46,27 @@ impl OwnedConfiguration {
     }
 }
 
-/// What is to be changed in one sensor.
+/// Planned change of one scanner's settings.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Plan {
-    /// The rate at which the sensor talks.
+    /// Baud rate at which the scanner communicates.
     pub baud: Baud,
-    /// Its own address.
+    /// Address of the scanner.
     pub address: u8,
-    /// The operating mode in which it was found.
+    /// Operating mode in which the scanner was found.
     pub operating_mode: u8,
-    /// Its configuration.
+    /// Present configuration.
     pub old: OwnedConfiguration,
-    /// What its configuration shall be.
+    /// New configuration.
     pub new: OwnedConfiguration,
-    /// What the rate after power-on shall be, if that shall change.
+    /// New setting for the baud rate after power-on. `None` if it does not change.
     pub power_on: Option<PowerOn>,
-    /// The password of the installation mode.
+    /// Password of the installation mode.
     pub password: Password,
 }
 
 impl Plan {
-    /// No change of the sensor that told `report`; `None` if it did not tell all that is needed.
+    /// Creates a plan without changes for the scanner of `report`. Returns `None` if the report lacks necessary data.
     pub fn from_report(report: &Report) -> Option<Plan> {
         let old = OwnedConfiguration::new(report.configuration()?.bytes())?;
         Some(Plan {
@@ -79,19 +80,19 @@ impl Plan {
         })
     }
 
-    /// Whether there is nothing to do.
+    /// Returns whether the plan changes nothing.
     pub fn is_empty(&self) -> bool {
         self.old == self.new && self.power_on.is_none()
     }
 }
 
-/// A person saw a plan and confirmed it. Code that has a consent can write a sensor's EEPROM, so it is made where a
-/// person is asked, and nowhere else.
+/// Consent to a plan, from a person who has seen and confirmed it. Code with a consent can write a scanner's EEPROM.
+/// Create one only where a person is asked, and nowhere else.
 #[derive(Debug)]
 pub struct Consent(Plan);
 
 impl Consent {
-    /// A person at a terminal saw `plan` and confirmed it.
+    /// Creates the consent of a person who has seen `plan` at a terminal and confirmed it.
     pub fn confirmed_by_person(plan: Plan) -> Consent {
         Consent(plan)
     }

@@ -1,5 +1,5 @@
-//! Any bytes at all, as telegrams with a right checksum: nothing panics, what was understood as a write is said again as it
-//! came and is no request, and what is explained of it is what it says.
+//! Property tests with random bytes in telegrams with a right checksum. Nothing panics. A telegram that decodes to a
+//! write encodes to the same bytes again, does not decode to a request, and its explanation states the same fields.
 
 use proptest::prelude::*;
 use scanhub_drivers::lms::command::Request;
@@ -11,13 +11,13 @@ fn telegram(address: u8, command: u8, data: &[u8]) -> EncodedTelegram {
     Writer::new(address, command).slice(data).finish()
 }
 
-/// Commands that mean something, more often than others.
+/// Commands, among which those with a meaning are more frequent.
 fn commands() -> impl Strategy<Value = u8> {
     let known: Vec<u8> = (0x10..=0x7C).chain(0x90..=0xFC).collect();
     prop_oneof![proptest::sample::select(known), any::<u8>()]
 }
 
-/// Data of which the counts are small enough to fit now and then.
+/// Data whose counts are so small that they are valid now and then.
 fn data() -> impl Strategy<Value = Vec<u8>> {
     prop_oneof![
         proptest::collection::vec(any::<u8>(), 0..800),
