@@ -1,4 +1,4 @@
-//! The values in effect, each with the place where it was set. They are the values that the hub would use.
+//! Values in effect, as the hub would use them, each with the place where it was set.
 
 use std::fmt;
 
@@ -20,14 +20,16 @@ pub struct Value {
     class: &'static str,
     /// Key, as `--set` takes it.
     pub key: String,
-    /// Value in the units of the configuration; null if it is not set and has no default.
+    /// Value in the unit of the configuration. Null if it is not set and has no default.
     pub value: Json,
-    /// Place where it is set, `FILE:LINE:COLUMN` or a flag. Otherwise `default`, possibly with the value that it
-    /// depends on.
+    /// Place where the value is set: `FILE:LINE:COLUMN` or a flag. Otherwise `default`, possibly with the setting from
+    /// which the default follows.
     pub origin: String,
 }
 
 /// Returns all values of links, limits and gateway from `sources`.
+///
+/// # Errors
 ///
 /// Returns [`scanhub_schema::Kind::Configuration`] with place, value and remedy if a value is not valid.
 pub fn values(sources: &Sources) -> Result<Vec<Value>, Failure> {
@@ -76,7 +78,8 @@ fn of_link(merged: &MergedConfig<'_>, link: &Link, merged_link: &MergedLink<'_>)
     values.into_iter().map(value).collect()
 }
 
-/// Returns the keys of a link, and of each section under its name, with their default values as TOML; `-` for a key without.
+/// Returns the keys of a link, and the keys of each section under its name. Each key has its default value as TOML, or
+/// `-` if it has none.
 pub fn keys() -> Vec<(&'static str, Vec<(Key, String)>)> {
     let (link, limits, gateway) = (LinkKeys::default(), LimitsKeys::default(), Gateway::default());
     let keys_of = |section: &dyn Section, values: Vec<(&str, Json)>| {
@@ -93,13 +96,13 @@ pub fn keys() -> Vec<(&'static str, Vec<(Key, String)>)> {
 }
 
 impl Value {
-    /// Returns the value as it is written in a configuration; `-` for null.
+    /// Returns the value as it is written in a configuration. Returns `-` for null.
     pub fn text(&self) -> String {
         TomlValue(&self.value).to_string()
     }
 }
 
-/// Formats JSON as the equivalent TOML.
+/// Wrapper that displays JSON as the equivalent TOML.
 struct TomlValue<'a>(&'a Json);
 
 impl fmt::Display for TomlValue<'_> {

@@ -1,6 +1,6 @@
-//! Sections that belong to no link. Section `limits` is for the topics of all links. Section `gateway` is for
-//! `scanhub gateway`, which can use the hub's configuration; its topics, addresses and durations are text here, and the
-//! gateway parses them.
+//! Sections that do not belong to a link. Section `limits` applies to the topics of all links. Section `gateway` is for
+//! `scanhub gateway`, which can read the hub's configuration. Its topics, addresses and durations are text here, and
+//! the gateway parses them.
 
 use std::path::PathBuf;
 
@@ -22,7 +22,7 @@ section! {
 }
 
 section! {
-    /// Section `gateway`; `None` for keys that are not set.
+    /// Section `gateway`. A key is `None` if it is not set.
     pub struct Gateway: "keys of gateway, as { interface = \"eth0\" }" {
         /// for the multicast groups; no default
         ///
@@ -62,7 +62,7 @@ impl Gateway {
     /// Default of [`mtu`](Self::mtu).
     pub const MTU: i64 = MTU_SAFE as i64;
 
-    /// Returns keys and values in effect.
+    /// Returns all keys with the values in effect.
     pub(crate) fn effective_values(&self) -> Vec<(&'static str, Json)> {
         let mut values = self.values();
         for (key, value) in values.iter_mut().filter(|(_, value)| value.is_null()) {

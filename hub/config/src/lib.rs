@@ -1,5 +1,5 @@
-//! The configuration of the hub: links with their ports, and the settings of their sensors. A later source takes
-//! precedence over an earlier one.
+//! Configuration of the hub: its links with their ports, and the settings of their scanners. A value from a later
+//! source takes precedence over one from an earlier source.
 
 mod effective;
 mod gateway;

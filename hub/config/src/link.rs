@@ -1,4 +1,5 @@
-//! The links of a hub, each with its port and the settings of its sensor: keys of the sources and values in effect.
+//! Links of a hub, each with its port and the settings of its scanner: the keys of the sources, and the values in
+//! effect.
 
 use scanhub_drivers::{Features, Settings, scan_heads};
 use scanhub_port::PortSpec;
@@ -11,17 +12,17 @@ use crate::processing::{
 use crate::scanner::Scanner;
 use crate::section::{CheckResult, Section, invalid_value, optional, section};
 
-/// The effective configuration.
+/// Configuration in effect.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Config {
-    /// The links in their order: a sensor's number is its place here.
+    /// Links in their order. The number of a sensor is the index of its link.
     pub links: Vec<Link>,
-    /// What the topics of a link are made for, but for what its scanner needs.
+    /// Limits for the topics of a link, except those that depend on its scanner.
     pub limits: TopicLimits,
 }
 
 impl Config {
-    /// Returns what the topics of each link are made for.
+    /// Returns the limits for the topics of each link.
     pub fn topic_limits(&self) -> Vec<TopicLimits> {
         self.links.iter().map(|link| link.limits(&self.limits)).collect()
     }
@@ -34,7 +35,8 @@ impl Config {
         }
     }
 
-    /// Returns the remedy for too little shared memory: to set the family of a link. `None` if all links have one.
+    /// Returns the remedy for a lack of shared memory, which is to set the family of a link. Returns `None` if all
+    /// links have a family.
     pub fn memory_remedy(&self) -> Option<String> {
         let link = self.links.iter().find(|link| link.family().is_none())?;
         let families = Family::ALL.map(Family::name).join(", ");
@@ -42,26 +44,26 @@ impl Config {
     }
 }
 
-/// One link and what to ask of its sensor.
+/// One link, with the settings of its scanner and of the processing.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Link {
-    /// The sensor's name in topics.
+    /// Name of the sensor in topics.
     pub name: String,
-    /// The source of its bytes.
+    /// Port of the link.
     pub port: PortSpec,
     /// Family and settings of its scanner.
     pub scanner: Scanner,
-    /// How its scans are processed.
+    /// Settings for processing the scans.
     pub processing: Processing,
 }
 
 impl Link {
-    /// Returns the rate at which its port is opened, in bits per second.
+    /// Returns the baud rate at which the hub opens the port, in bits per second.
     pub fn rate(&self) -> u32 {
         self.scanner.rate()
     }
 
-    /// Returns the highest rate that the scanner can have at its port.
+    /// Returns the highest baud rate that the scanner can have at this port.
     pub fn max_rate(&self) -> u32 {
         self.scanner.max_rate_at(&self.port)
     }
@@ -71,24 +73,25 @@ impl Link {
         self.scanner.max_beams()
     }
 
-    /// Returns the limits of its topics. `all` are those of all links.
+    /// Returns the limits for the topics of this link. `all` are the limits that do not depend on the scanner.
     pub fn limits(&self, all: &TopicLimits) -> TopicLimits {
         let &Features { array_flags: contents, max_telegram, .. } = self.scanner.features();
         TopicLimits { beams: self.max_beams(), contents, telegram: max_telegram, ..*all }
     }
 
-    /// Returns the family of its scanner. `None`: it is searched for.
+    /// Returns the family of the scanner. Returns `None` if the hub searches for it.
     pub fn family(&self) -> Option<Family> {
         self.scanner.family
     }
 
-    /// Returns the keys, apart from its processing, that differ in `other`.
+    /// Returns the names of the keys whose values differ in `other`, apart from those for processing.
     pub fn differences(&self, other: &Link) -> Vec<&'static str> {
         let port = (self.port != other.port).then_some("port");
         port.into_iter().chain(self.scanner.differences(&other.scanner)).collect()
     }
 
-    /// Returns the possible heads of its scans, as far as they are known; those with the most beams first.
+    /// Returns all scan heads that the scanner may have, as far as they are known. Those with the most beams come
+    /// first.
     pub fn scan_heads(&self) -> Vec<ScanHead> {
         let families = self.family().map_or(Family::ALL.to_vec(), |family| vec![family]);
         let settings = self.settings();
@@ -98,16 +101,16 @@ impl Link {
         heads
     }
 
-    /// Returns the settings of a session at its port. Nothing can be sent to a recording.
+    /// Returns the settings of a session at the port of this link. A session cannot send to a recording.
     pub fn settings(&self) -> Settings {
         self.scanner.settings_at(&self.port, matches!(self.port, PortSpec::File { .. }))
     }
 
-    /// Checks whether `model` may belong to its sensor, as far as that is known.
+    /// Checks whether a background `model` may belong to the sensor of this link.
     ///
     /// # Errors
     ///
-    /// Returns the beams and the unit that such a model has, as text.
+    /// Returns the expected beams and unit as text if the model has others.
     pub fn check_background(&self, model: &Background) -> Result<(), String> {
         let heads = self.scan_heads();
         let count = heads[0].count;
@@ -115,7 +118,7 @@ impl Link {
             true => (model.count <= count, format!("at most {count}")),
             false => (model.count == count, count.to_string()),
         };
-        // A unit that is not configured may be any.
+        // An unknown family may have any unit.
         let unit_um = if heads.len() > 1 { model.unit_um } else { heads[0].unit_um };
         if fits && model.unit_um == unit_um {
             return Ok(());
@@ -125,7 +128,8 @@ impl Link {
 }
 
 section! {
-    /// Keys of a link. A scanner key is in [`scanhub_drivers::Key`], too; its family checks the value.
+    /// Keys of a link. The keys of its scanner are also in [`scanhub_drivers::Key`], and the family checks their
+    /// values.
     pub(crate) struct LinkKeys: "keys of a link, as { name = \"front\", port = \"/dev/ttyUSB0\" }" {
         /// first part of topic names: a-z, 0-9, _ and -
         ///
@@ -195,7 +199,7 @@ section! {
 }
 
 impl LinkKeys {
-    /// Returns its sections, each with its name.
+    /// Returns the sections of a link, each with its name.
     pub(crate) fn sections(&self) -> [(&'static str, &dyn Section); 7] {
         [
             ("pose", &self.pose),
@@ -221,18 +225,19 @@ fn port(_: &str, port: &str) -> CheckResult {
 /// Maximum number of links of one hub.
 pub(crate) const MAX_LINKS: usize = 256;
 
-/// Shared memory and descriptors that links need.
+/// Estimates of the shared memory and the descriptors that links need.
 pub mod resource_estimate {
     use scanhub_schema::Topic;
     use scanhub_schema::limits::TopicLimits;
     use scanhub_shm::resource_limits::{self, sensor_bytes};
 
-    /// Returns the number of bytes of shared memory for links with topics for `limits`, and their first subscribers.
+    /// Returns the number of bytes of shared memory for links with topics of these `limits`, including their first
+    /// subscribers.
     pub fn memory(limits: &[TopicLimits]) -> u64 {
         limits.iter().map(|limits| sensor_bytes(&Topic::OF_LINKS, limits)).sum::<u64>() + BASE_MEMORY
     }
 
-    /// Returns the number of bytes of their longest shared-memory segment.
+    /// Returns the length of the longest shared-memory segment of these links, in bytes.
     pub fn longest_segment(limits: &[TopicLimits]) -> u64 {
         limits
             .iter()
@@ -241,17 +246,19 @@ pub mod resource_estimate {
             .unwrap_or_default()
     }
 
-    /// Returns the number of descriptors for `links` links and a first subscriber of each, in addition to those that are
-    /// open from the start.
+    /// Returns the number of descriptors for `links` links and one subscriber of each. Those that are open from the
+    /// start are not included.
     pub fn descriptors(links: usize) -> u64 {
         BASE_DESCRIPTORS + links as u64 * LINK_DESCRIPTORS
     }
 
-    /// Descriptors that belong to no link: 16 stay open, and more are open while they are created.
+    /// Descriptors that do not belong to a link. 16 of them stay open, and the others are open while topics are
+    /// created.
     const BASE_DESCRIPTORS: u64 = 24;
-    /// Descriptors of a link: four for each of its services, which are the topics and the event. The others are for its
-    /// port, the lock of its name, and a first subscriber.
+    /// Descriptors of a link. Each of its services needs four. The services are the topics and the event service. The
+    /// other descriptors are for the port, the lock of the name, and one subscriber.
     const LINK_DESCRIPTORS: u64 = 4 * (Topic::OF_LINKS.len() as u64 + 1) + 7;
-    /// Bytes of the control service, of everything else that belongs to no link, and of the first subscribers.
+    /// Bytes of shared memory for the control service, for everything else that does not belong to a link, and for the
+    /// first subscribers.
     const BASE_MEMORY: u64 = 512 * 1024;
 }

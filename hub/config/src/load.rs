@@ -1,5 +1,5 @@
-//! Merges all sources of a configuration into the values in effect; the last one wins. Each source must be valid by itself,
-//! so that an error names its place.
+//! Merging of all sources of a configuration into the values in effect. The last source takes precedence. Each source
+//! must be valid by itself, so that an error states the place in it.
 
 use std::ops::Range;
 use std::path::Path;
@@ -22,7 +22,7 @@ use crate::scanner::ScannerRequest;
 use crate::section::{Section, find};
 use crate::sources::{SourceKind, SourceMap, Sources};
 
-/// Keys of a source. Sections are for all links.
+/// Keys of a source. Its sections apply to all links.
 #[derive(Default, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub(crate) struct Document {
@@ -38,7 +38,7 @@ pub(crate) struct Document {
 }
 
 impl Document {
-    /// Checks its values, which were read from `table`, but for those of the gateway.
+    /// Checks the values, which were read from `table`, except those of the gateway.
     fn check(&self, table: &DeTable<'_>, sources: &SourceMap) -> Result<(), Failure> {
         let Document { link: _, zones, marks, lines, motion, background, early, limits, gateway: _ } = self;
         let sections: [(_, &dyn Section); _] = [
@@ -63,7 +63,7 @@ fn check_section(
     let Some(value) = find(table, name) else { return Ok(()) };
     match value.get_ref() {
         DeValue::Table(table) => section.check(table, sources),
-        // serde would assign the elements to the keys in their order.
+        // serde would assign the elements of a list to the keys in their order.
         _ => Err(sources.refuse(value.span(), format!("{name} is a list"), format!("write it as [{name}]"))),
     }
 }
@@ -71,23 +71,24 @@ fn check_section(
 /// All sources, merged.
 pub(crate) struct MergedConfig<'a> {
     sources: &'a SourceMap,
-    /// Values for all links, of limits and of the gateway.
+    /// Values that apply to all links, and those of the limits and the gateway.
     pub(crate) general: DeTable<'a>,
     /// Links in the order in which they were added.
     pub(crate) links: Vec<MergedLink<'a>>,
-    /// Failure of the first source with an invalid value for the gateway, which the hub ignores.
+    /// Failure of the first source whose value for the gateway is not valid. The hub ignores it.
     gateway: Result<(), Failure>,
 }
 
-/// One link of all sources.
+/// One link, merged from all sources.
 pub(crate) struct MergedLink<'a> {
-    /// Place where the link starts.
+    /// Place where the link is first defined.
     location: String,
     /// Values for this link only.
     own: DeTable<'a>,
-    /// Values for this link and for all links. Those for this link take precedence, whichever source they are from.
+    /// Values for this link and for all links. A value for this link takes precedence over one for all links,
+    /// regardless of the order of their sources.
     pub(crate) table: DeTable<'a>,
-    /// Keys of `table`.
+    /// Keys with the values of `table`.
     pub(crate) keys: LinkKeys,
 }
 
@@ -121,7 +122,8 @@ impl<'a> MergedConfig<'a> {
         Ok(merged)
     }
 
-    /// Adds one source, whose values take precedence. `flags` are the names of links of `--link` so far.
+    /// Adds one source, whose values take precedence over earlier ones. `flags` are the names of the links from
+    /// `--link` so far.
     fn add_source(
         &mut self,
         kind: SourceKind,
@@ -210,7 +212,7 @@ impl<'a> MergedConfig<'a> {
         Ok(Config { links, limits })
     }
 
-    /// Merges the section of the gateway alone.
+    /// Merges only the section of the gateway.
     fn of_gateway(sources: &'a SourceMap) -> Result<MergedConfig<'a>, Failure> {
         let mut merged =
             MergedConfig { sources, general: DeTable::new(), links: Vec::new(), gateway: Ok(()) };
@@ -227,13 +229,13 @@ impl<'a> MergedConfig<'a> {
         self.section("gateway")
     }
 
-    /// Returns the section `name` that belongs to no link.
+    /// Returns the section `name`, which does not belong to a link.
     pub(crate) fn section<T: DeserializeOwned + Default>(&self, name: &str) -> Result<T, Failure> {
         let table = find(&self.general, name).and_then(|section| section.get_ref().as_table());
         table.map_or(Ok(T::default()), |table| self.sources.deserialize(table.clone()))
     }
 
-    /// Returns the place where `key` is set that belongs to no link.
+    /// Returns the place where `key`, which does not belong to a link, is set.
     pub(crate) fn location(&self, key: &str) -> Option<String> {
         find(&self.general, key).map(|value| self.sources.location(value.span()))
     }
@@ -245,7 +247,7 @@ impl<'a> MergedConfig<'a> {
 }
 
 impl MergedLink<'_> {
-    /// Returns the link.
+    /// Checks the merged values and returns the link.
     fn finish(&self, sources: &SourceMap) -> Result<Link, Failure> {
         let MergedLink { location, own, table, keys } = self;
         let name = keys.name.clone();
@@ -279,7 +281,7 @@ impl MergedLink<'_> {
     }
 }
 
-/// Puts the values of `over` into `under`, in place of values of the same keys.
+/// Merges the values of `over` into `under`. A value replaces the earlier one of the same key.
 fn overlay<'a>(under: &mut DeTable<'a>, over: DeTable<'a>) {
     for (key, value) in over {
         let span = value.span();
@@ -293,28 +295,28 @@ fn overlay<'a>(under: &mut DeTable<'a>, over: DeTable<'a>) {
 }
 
 impl Config {
-    /// Reads all sources.
+    /// Reads and merges all sources.
     ///
     /// # Errors
     ///
-    /// Returns [`scanhub_schema::Kind::Configuration`] with place, value and remedy if a value is not valid, or if there is no
-    /// link.
+    /// Returns [`scanhub_schema::Kind::Configuration`] with place, value and remedy if a value is not valid, or if
+    /// there is no link.
     pub fn load(sources: &Sources) -> Result<Config, Failure> {
         Config::of(&sources.read())
     }
 
-    /// Merges sources that were read.
+    /// Merges sources that were already read.
     ///
     /// # Errors
     ///
-    /// As those of [`load`](Self::load).
+    /// Returns the same errors as [`load`](Self::load).
     pub fn of(sources: &SourceMap) -> Result<Config, Failure> {
         MergedConfig::of(sources)?.config()
     }
 }
 
 impl Gateway {
-    /// Merges the section in all `sources`; the last one wins. Links are not required.
+    /// Merges the section `gateway` of all `sources`. The last source takes precedence. Links are not required.
     ///
     /// # Errors
     ///
@@ -329,12 +331,12 @@ impl Gateway {
     }
 }
 
-/// Refuses two links at one line, also where it goes by two names at this moment.
+/// Returns a failure if two links have the same port, even if it has two names at this moment.
 fn check_ports(links: &[Link]) -> Result<(), Failure> {
     let is_same = |a: &PortSpec, b: &PortSpec| match (a, b) {
         (PortSpec::File { .. }, _) => false,
         (PortSpec::Tty(a), PortSpec::Tty(b)) => is_same_line(a, b),
-        // No name of a server is resolved to read a configuration.
+        // Do not resolve names of servers in order to read a configuration.
         _ => a == b,
     };
     for (at, link) in links.iter().enumerate() {
@@ -357,7 +359,7 @@ fn check_ports(links: &[Link]) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Returns whether udev has made the name of an adapter's serial number.
+/// Returns whether `path` is a name that udev derives from the serial number of an adapter.
 fn is_by_serial_number(path: &Path) -> bool {
     path.parent().is_some_and(|parent| parent.ends_with("serial/by-id"))
 }
@@ -513,7 +515,7 @@ mod tests {
         let [first, second, shared] = [by_path.join("first"), by_path.join("second"), by_id.join("shared")];
         std::os::unix::fs::symlink("/dev/null", &first).unwrap();
         std::os::unix::fs::symlink("/dev/zero", &second).unwrap();
-        // Since the restart, the shared name stands for the second adapter.
+        // After a restart, the shared name belongs to the second adapter.
         std::os::unix::fs::symlink("/dev/zero", &shared).unwrap();
         let links =
             |front: &Path| [format!("front={}", front.display()), format!("rear={}", second.display())];

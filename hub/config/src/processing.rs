@@ -1,5 +1,6 @@
-//! Processing of a link's scans: sections pose, zones, marks, lines, motion, background and early, as keys of the
-//! sources and as values in effect. Meters, radians and degrees of the keys become the units of the processors.
+//! Sections for processing the scans of a link: pose, zones, marks, lines, motion, background and early. They are
+//! available as keys of the sources and as values in effect. Keys in meters, radians and degrees are converted to the
+//! units of the processors.
 
 use std::path::PathBuf;
 
@@ -22,7 +23,7 @@ use crate::sources::SourceMap;
 /// Settings for processing the scans of one link.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Processing {
-    /// Pose of the sensor.
+    /// Pose of the sensor in the frame of the robot.
     pub pose: Pose,
     /// Zones around the robot.
     pub zones: zones::Settings,
@@ -30,7 +31,7 @@ pub struct Processing {
     pub marks: marks::Settings,
     /// Detection of straight lines.
     pub lines: lines::Settings,
-    /// Limits of the robot's steps that are accepted.
+    /// Limits for the steps of the robot. The motion estimate rejects larger ones.
     pub motion: motion::Settings,
     /// Learning of the background.
     pub background: Background,
@@ -41,35 +42,35 @@ pub struct Processing {
 /// Values of section `[early]`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Early {
-    /// Number of reads per LMS telegram while the topic has a subscriber, 2 to 8.
+    /// Number of reads per LMS telegram while the topic `early` has a subscriber, 2 to 8.
     pub reads_per_telegram: u8,
 }
 
 /// Values of section `[background]`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Background {
-    /// Whether the hub keeps a background. Otherwise it publishes neither foreground nor background.
+    /// Whether the hub learns a background. If not, it publishes neither foreground nor background.
     pub is_enabled: bool,
-    /// Settings of learning.
+    /// Settings for learning.
     pub learning: Learning,
-    /// File that the background starts with.
+    /// File with the background to start with.
     pub file: Option<PathBuf>,
-    /// Whether the start was set explicitly, so that a background of an earlier hub is not used.
+    /// Whether the key `start` is set. If so, the hub does not use the background of an earlier hub.
     pub is_start_set: bool,
-    /// Whether the learned background is saved for the next hub, which starts with it.
+    /// Whether the hub saves the learned background, so that the next hub starts with it.
     pub is_saved: bool,
-    /// Background to start with: the contents of the file, or the background of an earlier hub.
+    /// Background to start with, from the file or from an earlier hub.
     pub model: Option<Box<scanhub_schema::Background>>,
-    /// Whether the model is published with every scan, and not only for a new generation and after a period of
-    /// learning.
+    /// Whether the background is published with every scan. If not, it is published only for a new generation and after
+    /// each period of learning.
     pub every_scan: bool,
 }
 
 impl Background {
-    /// Reads the file that the background of `link` starts with, if there is one, and compares it with the
-    /// configuration of that link.
+    /// Reads the file with the background to start with, if there is one, and compares it with the configuration of
+    /// `link`.
     ///
-    /// Returns [`Kind::Configuration`] with file and reason if it does not fit.
+    /// Returns [`Kind::Configuration`] with file and reason if the background does not fit.
     pub(crate) fn read(&mut self, link: &Link) -> Result<(), Failure> {
         let sensor = &link.name;
         let Some(file) = self.file.as_ref().filter(|_| self.is_enabled) else { return Ok(()) };
@@ -103,7 +104,7 @@ impl Background {
     }
 }
 
-/// Values of `start`.
+/// Valid values of the key `start`.
 pub(crate) const START_VALUES: &str =
     "\"empty\", \"first-scan\", or a file that `scanhub background SENSOR save` has written";
 
@@ -168,15 +169,15 @@ section! {
     }
 }
 
-/// A sector of the robot's own body.
+/// Sector of the sensor's view that the robot's own body covers.
 #[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields, expecting = "a sector, as { from_deg = -77.5, to_deg = -60.0, range = 0.42 }")]
 pub(crate) struct SectorKeys {
     from_deg: Option<f64>,
     to_deg: Option<f64>,
     range: f64,
-    /// The former keys, whose 0 was to the right. Many of their values are possible in both frames, so none is
-    /// accepted.
+    /// Key of earlier versions, like `to`. Its angle 0 was to the right. Many values are valid in both frames, so neither
+    /// key is accepted.
     #[serde(skip_serializing)]
     from: Option<f64>,
     #[serde(skip_serializing)]
@@ -328,7 +329,7 @@ section! {
 }
 
 impl Processing {
-    /// Returns the values in effect of the sections of a link.
+    /// Converts the sections of a link to values in effect.
     pub(crate) fn of(keys: &LinkKeys) -> Processing {
         let LinkKeys { pose, zones, marks, lines, motion, background, early, .. } = keys;
         Processing {
@@ -426,10 +427,10 @@ impl BackgroundKeys {
     }
 }
 
-/// Checks a link's `own` values, which are not those for all links.
+/// Checks the keys that a link sets itself. `own` are its values without those for all links.
 ///
-/// Returns [`Kind::Configuration`] if it sets a key that a scanner of `family` does not have. A key for all links applies to
-/// the families that have it.
+/// Returns [`Kind::Configuration`] if it sets a key that a scanner of `family` does not have. A key for all links
+/// applies only to families that have it.
 pub(crate) fn check_family(own: &DeTable<'_>, sources: &SourceMap, family: Family) -> Result<(), Failure> {
     let name = family.name();
     for key in FAMILY_KEYS.into_iter().filter(|key| !has_key(Some(family), key)) {
@@ -453,7 +454,7 @@ pub(crate) fn check_family(own: &DeTable<'_>, sources: &SourceMap, family: Famil
     Ok(())
 }
 
-/// Returns whether a scanner of `family` has the key of a section. If the scanner is searched for, it may have all.
+/// Returns whether a scanner of `family` has the `key` of a section. If the family is unknown, it may have every key.
 pub(crate) fn has_key(family: Option<Family>, key: &str) -> bool {
     family.is_none_or(|family| match key {
         "marks.min_level" => family.has_reflector_levels(),
@@ -466,7 +467,7 @@ pub(crate) fn has_key(family: Option<Family>, key: &str) -> bool {
 /// Keys that only some families have.
 const FAMILY_KEYS: [&str; 3] = ["early.pieces", "marks.level", "marks.min_level"];
 
-/// Returns the nearest whole number of millimeters, saturated to a u16.
+/// Converts meters to the nearest whole number of millimeters, limited to the range of a u16.
 fn in_mm(meters: f64) -> u16 {
     (meters * 1000.0).round() as u16
 }
@@ -540,16 +541,17 @@ fn start(key: &str, start: &str) -> CheckResult {
 }
 
 const OFFSET_REMEDY: &str = "metres from the robot's centre, at most 100";
-/// A radius in mm must fit into 16 bits.
+/// Maximum radius in meters. In millimeters, it must fit into 16 bits.
 const MAX_RADIUS_M: f64 = 65.0;
-/// A larger yaw, in either direction, was written in degrees by mistake.
+/// Maximum yaw in radians, in either direction. A larger value was probably written in degrees.
 const FULL_CIRCLE: f64 = 2.0 * std::f64::consts::PI;
 
-/// Checks that a sensor's beams cover enough of its largest zone to ever detect a violation. A zone that cannot be violated
-/// is an error of the configuration. The real sensor is unknown here, so the hub checks again with its scans.
+/// Checks that the beams of a sensor cover enough of its largest zone to detect a violation. A zone that cannot be
+/// violated is an error in the configuration. The real scanner is unknown here, so the hub repeats the check with its
+/// scans.
 ///
-/// Returns [`Kind::Configuration`] with the place of the cause in `table`, the values of the link, or else with `place`,
-/// where the link starts.
+/// Returns [`Kind::Configuration`] with the place of the cause in `table`, which has the values of the link. If the
+/// cause is not set there, the place is `location`, where the link is defined.
 pub(crate) fn check_coverage(
     link: &Link,
     table: &DeTable<'_>,
@@ -561,7 +563,7 @@ pub(crate) fn check_coverage(
     let (beams, min_beams) = (link.scan_heads()[0].count.into(), settings.min_beams);
     let refuse = |keys: &[&str], what: String, remedy: &str| {
         let spans = keys.iter().filter_map(|key| find(table, key).map(Spanned::span));
-        // The first key of the last source.
+        // Report the first of the keys that the last source sets.
         let last = spans.rev().max_by_key(|span| sources.index(span));
         let location = last.map_or(location.to_owned(), |span| sources.location(span));
         let message = format!("{location}: link {}: {what}", link.name);
@@ -571,7 +573,7 @@ pub(crate) fn check_coverage(
         let what = format!("min_beams = {min_beams}, and a scan has {beams} beams");
         return refuse(&["zones.min_beams"], what, "the default is one beam");
     }
-    // The maximum number of beams that can detect something in the largest zone.
+    // Returns the maximum number of beams that can detect an object in the largest zone.
     let effective_beams = |settings: &zones::Settings| {
         let of_head = |head: &ScanHead| {
             let beams = usize::from(head.count);

@@ -1,5 +1,5 @@
-//! The scanner of a link: its family and settings, as values in effect and as keys of the sources. The family checks the
-//! settings; this module knows where each one is set.
+//! Scanner of a link: its family and settings, as values in effect and as keys of the sources. The family checks the
+//! settings, and this module adds the place where each one is set.
 
 use scanhub_drivers::{
     ANY_FAMILY, AUTO, Features, Key, Model, Refusal, Settings, SettingsRequest, Value, auto_or, family_of,
@@ -15,19 +15,19 @@ use crate::link::LinkKeys;
 use crate::section::{Section, find};
 use crate::sources::SourceMap;
 
-/// Family of a scanner, with its settings.
+/// Family and settings of a scanner.
 #[derive(Clone, Debug)]
 pub struct Scanner {
-    /// Family of the scanner. `None`: the hub searches for it.
+    /// Family of the scanner. `None` if the hub searches for it.
     pub family: Option<Family>,
-    /// Values that are set for the session. Those of the port follow from the link.
+    /// Settings of the session, except those that follow from the port of the link.
     pub settings: Settings,
-    /// Keys that name the family: `family`, and those that only one family has.
+    /// Keys that determine the family: `family`, and keys that only one family has.
     pub named_by: Vec<&'static str>,
 }
 
 impl PartialEq for Scanner {
-    /// Compares what the link does. The keys that name the family are only for messages.
+    /// Compares family and settings. The keys that determine the family are only used in messages.
     fn eq(&self, other: &Scanner) -> bool {
         (self.family, &self.settings) == (other.family, &other.settings)
     }
@@ -36,42 +36,42 @@ impl PartialEq for Scanner {
 impl Eq for Scanner {}
 
 impl Scanner {
-    /// Returns the models and settings of the family, or of all families if it is searched for.
+    /// Returns the models and settings of the family, or of all families if the family is unknown.
     pub fn features(&self) -> &'static Features {
         self.family.map_or(&ANY_FAMILY, features)
     }
 
-    /// Returns the model, or the values for an unknown one if the session must detect it.
+    /// Returns the configured model, or the defaults of the family if the session must detect the model.
     pub fn model(&self) -> Model {
         let features = self.features();
         let named = features.models.iter().find(|model| Some(model.name) == self.settings.model);
         named.copied().unwrap_or(features.defaults)
     }
 
-    /// Returns whether the session must detect the model, and with it the number of beams.
+    /// Returns whether the session must detect the model, which determines the number of beams.
     pub fn is_auto(&self) -> bool {
         let Settings { model, beams, .. } = self.settings;
         let has_models = self.family.is_none_or(|family| !features(family).models.is_empty());
         has_models && model.is_none() && beams.is_none()
     }
 
-    /// Returns the number of beams of a scan, or its maximum if it is not known before.
+    /// Returns the number of beams of a scan, or its maximum if the number is unknown.
     pub fn max_beams(&self) -> usize {
         let Some(beams) = self.settings.beams else { return self.model().beams };
         if self.family.is_some() {
             return beams;
         }
-        // A scanner that reports its model has its own number of beams.
+        // A family that reports its model has its own number of beams, which may be greater.
         let own = Family::ALL.into_iter().map(features).filter(|features| features.models.is_empty());
         own.map(|features| features.defaults.beams).max().unwrap_or(beams).max(beams)
     }
 
-    /// Returns the rate at which a tty is opened, in bits per second.
+    /// Returns the baud rate at which a tty is opened, in bits per second.
     pub fn rate(&self) -> u32 {
         self.settings.baud.unwrap_or(self.model().baud)
     }
 
-    /// Returns the highest rate that the scanner can have.
+    /// Returns the highest baud rate that the scanner can have.
     fn max_rate(&self) -> u32 {
         let families =
             self.family.map_or(Family::ALL.to_vec(), |family| vec![family]).into_iter().map(features);
@@ -80,20 +80,20 @@ impl Scanner {
         if self.is_auto() { all.max().unwrap_or(self.rate()) } else { self.rate() }
     }
 
-    /// Returns the highest rate that the scanner can have at `port`. A serial server has its own rate, whatever is
-    /// configured here.
+    /// Returns the highest baud rate that the scanner can have at `port`. The rate of a serial server is set there, so
+    /// it may differ from the configured one.
     pub fn max_rate_at(&self, port: &PortSpec) -> u32 {
         if matches!(port, PortSpec::Tty(_)) { self.rate() } else { self.max_rate() }
     }
 
-    /// Returns the settings of a session at `port`. `listen_only` is whether nothing may be sent.
+    /// Returns the settings of a session at `port`. `listen_only` is whether the session cannot send.
     pub fn settings_at(&self, port: &PortSpec, listen_only: bool) -> Settings {
         let fixed_rate = !matches!(port, PortSpec::Tty(_));
         let is_found = self.family.is_none() || self.settings.is_found;
         Settings { max_beams: Some(self.max_beams()), fixed_rate, listen_only, is_found, ..self.settings }
     }
 
-    /// Returns the keys that the scanner can have, with their values.
+    /// Returns the keys of settings that this scanner has, with their values.
     pub(crate) fn values(&self) -> impl Iterator<Item = (&'static str, Json)> {
         let has_models = !self.features().models.is_empty();
         let own = self.family.map_or(&[][..], |_| self.features().keys);
@@ -105,11 +105,11 @@ impl Scanner {
         keys.map(|key| (key.name(), self.settings.value(key).map_or(Json::Null, json)))
     }
 
-    /// Returns the keys whose values differ in `other`.
+    /// Returns the names of the keys whose values differ in `other`.
     pub(crate) fn differences(&self, other: &Scanner) -> Vec<&'static str> {
         let is_other_family = self.family != other.family;
         let differs = |key: &Key| {
-            // Another family has another default.
+            // The defaults of these keys depend on the family.
             let follows = is_other_family && matches!(key, Key::Angle | Key::Resolution);
             !follows && self.settings.value(*key) != other.settings.value(*key)
         };
@@ -129,9 +129,9 @@ fn json(value: Value<'_>) -> Json {
     }
 }
 
-/// The scanner that the keys of a link request, with their places.
+/// Scanner that the keys of a link request, with the places where they are set.
 pub(crate) struct ScannerRequest<'a> {
-    /// Family, if it is set. `None` in it: it is searched for.
+    /// Value of the key `family`, if it is set. `Some(None)` means `auto`.
     family: Option<Option<Family>>,
     request: SettingsRequest,
     table: &'a DeTable<'a>,
@@ -139,9 +139,10 @@ pub(crate) struct ScannerRequest<'a> {
 }
 
 impl<'a> ScannerRequest<'a> {
-    /// Returns the request of `keys`, which were read from `table`.
+    /// Creates the request from `keys`, which were read from `table`.
     ///
-    /// Returns [`scanhub_schema::Kind::Configuration`] with place, value and remedy if no scanner can have a value.
+    /// Returns [`scanhub_schema::Kind::Configuration`] with place, value and remedy if a value is not valid for any
+    /// scanner.
     pub(crate) fn of(
         keys: &LinkKeys,
         table: &'a DeTable<'a>,
@@ -161,7 +162,7 @@ impl<'a> ScannerRequest<'a> {
         for key in Key::ALL {
             let value = match &values[key.name()] {
                 Json::Null if find(table, key.name()).is_none() => continue,
-                // JSON has neither NaN nor infinity.
+                // JSON has neither NaN nor infinity, so these values are null.
                 Json::Null if key.name() != "mode" => Value::Number(f64::NAN),
                 Json::String(text) => Value::Text(text),
                 Json::Number(number) => match (number.as_i64(), number.as_f64()) {
@@ -171,7 +172,7 @@ impl<'a> ScannerRequest<'a> {
                 },
                 _ => Value::Other(&mode),
             };
-            // A mode has a name or a number.
+            // The key `mode` is a name or a number, depending on its type.
             if (key == Key::ModeName) != matches!(value, Value::Text(_)) && key.name() == "mode" {
                 continue;
             }
@@ -182,14 +183,14 @@ impl<'a> ScannerRequest<'a> {
         Ok(ScannerRequest { family: family.transpose()?, request, table, sources })
     }
 
-    /// Returns the place of the number of a measuring mode, if one is set.
+    /// Returns the place where the number of a measurement mode is set. Returns `None` if none is set.
     pub(crate) fn mode_number_location(&self) -> Option<String> {
         self.request.mode_number?;
         self.location("mode")
     }
 
-    /// Returns the scanner. `refuse` creates the failure for a place, a problem and a remedy. Without a place, it is that
-    /// of the link.
+    /// Returns the scanner. `refuse` creates a failure from a place, a problem and a remedy. Without a place, it uses
+    /// the place of the link.
     pub(crate) fn finish(
         &self,
         refuse: impl Fn(Option<String>, String, &str) -> Failure,
@@ -225,7 +226,7 @@ impl<'a> ScannerRequest<'a> {
         Ok(Scanner { family, settings, named_by })
     }
 
-    /// Returns the family that the keys name which only one family has. `None` if there are none.
+    /// Returns the family whose own keys are set. Returns `None` if no key determines the family.
     fn named_family(
         &self,
         refuse: impl Fn(Option<String>, String, &str) -> Failure,

@@ -1,8 +1,8 @@
-//! Sections of the configuration. Each is one struct of the macro [`section!`]: a field is a key, with its description, its
-//! default and its check.
+//! Sections of the configuration. Each is a struct that the macro [`section!`] declares. A field is a key, with its
+//! description, its default and its check.
 //!
-//! To add a key, add a field and the line that uses it, and generate the default configuration and the page again
-//! (`hub/config/tests/reference.rs`). A key of a scanner also has an entry in `hub/drivers/src/settings.rs`.
+//! To add a key, add a field and the code that uses it. Then generate the default configuration and the page again
+//! (`hub/config/tests/reference.rs`). A key of a scanner also needs an entry in `hub/drivers/src/settings.rs`.
 
 use std::borrow::Borrow;
 use std::ops::RangeInclusive;
@@ -14,9 +14,9 @@ use toml::de::{DeTable, DeValue};
 
 use crate::sources::SourceMap;
 
-/// Declares a section: a struct that serde reads and writes.
+/// Declares a section as a struct that serde reads and writes.
 ///
-/// The first paragraph of a key's description is its comment in the default configuration, the others are for
+/// The first paragraph of a key's description is its comment in the default configuration. The other paragraphs are for
 /// `docs/configuration.md`. A key without a default has an `example`.
 macro_rules! section {
     (
@@ -69,23 +69,23 @@ macro_rules! section {
 }
 pub(crate) use section;
 
-/// A key of a section.
+/// Key of a section.
 #[derive(Clone, Copy, Debug)]
 pub struct Key {
-    /// Name.
+    /// Name of the key.
     pub name: &'static str,
-    /// Description: lines of a doc comment. Its first paragraph is short.
+    /// Description of the key, as lines of a doc comment. Its first paragraph is short.
     pub text: &'static str,
-    /// Example of a key without a default, as TOML.
+    /// Example for a key without a default, as TOML. Empty if the key has a default.
     pub example: &'static str,
 }
 
-/// A value that is not valid.
+/// Description of a value that is not valid.
 #[derive(Debug)]
 pub(crate) struct InvalidValue {
     what: String,
     remedy: String,
-    /// Index of the invalid element of a list.
+    /// Index of the invalid element, if the value is a list.
     at: Option<usize>,
 }
 
@@ -93,16 +93,16 @@ pub(crate) struct InvalidValue {
 pub(crate) type CheckResult = Result<(), InvalidValue>;
 
 pub(crate) trait Section {
-    /// Returns its keys in their order.
+    /// Returns the keys of the section in their order.
     fn keys(&self) -> &'static [Key];
 
-    /// Returns all values as one object.
+    /// Returns all values of the section as one JSON object.
     fn json(&self) -> Json;
 
-    /// Returns the first key whose value is not valid, and why.
+    /// Returns the first key whose value is not valid, with the reason.
     fn find_invalid(&self) -> Option<(&'static str, InvalidValue)>;
 
-    /// Returns keys and values in their order.
+    /// Returns the keys with their values, in their order.
     fn values(&self) -> Vec<(&'static str, Json)> {
         let json = self.json();
         self.keys().iter().map(|key| (key.name, json[key.name].clone())).collect()
@@ -110,7 +110,7 @@ pub(crate) trait Section {
 
     /// Checks the values, which were read from `table`.
     ///
-    /// Returns [`scanhub_schema::Kind::Configuration`] with place, value and remedy if one is not valid.
+    /// Returns [`scanhub_schema::Kind::Configuration`] with place, value and remedy if a value is not valid.
     fn check(&self, table: &DeTable<'_>, sources: &SourceMap) -> Result<(), Failure> {
         let Some((key, InvalidValue { what, remedy, at })) = self.find_invalid() else { return Ok(()) };
         let list = find(table, key);
@@ -120,7 +120,7 @@ pub(crate) trait Section {
     }
 }
 
-/// Returns the value at `path` in `table`, such as `zones.margin`.
+/// Returns the value at `path` in `table`. A path is a key, or a section and a key such as `zones.margin`.
 pub(crate) fn find<'t, 'i>(table: &'t DeTable<'i>, path: &str) -> Option<&'t Spanned<DeValue<'i>>> {
     match path.split_once('.') {
         None => table.get(path),
@@ -128,33 +128,33 @@ pub(crate) fn find<'t, 'i>(table: &'t DeTable<'i>, path: &str) -> Option<&'t Spa
     }
 }
 
-/// Returns the refusal of `value`. `remedy` states the valid values.
+/// Creates the description of a value that is not valid. `remedy` states the valid values.
 pub(crate) fn invalid_value(what: impl Into<String>, remedy: impl Into<String>) -> InvalidValue {
     InvalidValue { what: what.into(), remedy: remedy.into(), at: None }
 }
 
-/// Returns the check of a number in `allowed`; `remedy` states the range.
+/// Returns a check for a number in the range `allowed`. `remedy` states the range.
 pub(crate) fn within(allowed: RangeInclusive<f64>, remedy: &str) -> impl Fn(&str, &f64) -> CheckResult {
-    // NaN is not within any range.
+    // NaN is not in any range.
     move |key, value| match allowed.contains(value) {
         true => Ok(()),
         false => Err(invalid_value(format!("{key} = {value}"), remedy)),
     }
 }
 
-/// Returns the check of a length in meters.
+/// Returns a check for a length in meters.
 pub(crate) fn meters(allowed: RangeInclusive<f64>) -> impl Fn(&str, &f64) -> CheckResult {
     let remedy = format!("metres, from {} to {}", allowed.start(), allowed.end());
     move |key, value| within(allowed.clone(), &remedy)(key, value)
 }
 
-/// Returns the check of a whole number.
+/// Returns a check for a whole number.
 pub(crate) fn whole(allowed: RangeInclusive<i64>) -> impl Fn(&str, &i64) -> CheckResult {
     let remedy = format!("a whole number from {} to {}", allowed.start(), allowed.end());
     whole_or(allowed, remedy)
 }
 
-/// Returns the check of a whole number with its own `remedy`.
+/// Returns a check for a whole number that has its own `remedy`.
 pub(crate) fn whole_or(allowed: RangeInclusive<i64>, remedy: String) -> impl Fn(&str, &i64) -> CheckResult {
     move |key, value| match allowed.contains(value) {
         true => Ok(()),
@@ -162,14 +162,14 @@ pub(crate) fn whole_or(allowed: RangeInclusive<i64>, remedy: String) -> impl Fn(
     }
 }
 
-/// Returns the check of a value that may be missing.
+/// Returns a check for an optional value. A missing value is valid.
 pub(crate) fn optional<T: Borrow<U>, U: ?Sized>(
     check: impl Fn(&str, &U) -> CheckResult,
 ) -> impl Fn(&str, &Option<T>) -> CheckResult {
     move |key, value| value.as_ref().map_or(Ok(()), |value| check(key, value.borrow()))
 }
 
-/// Returns the check of each element of a list.
+/// Returns a check for every element of a list.
 pub(crate) fn each<T>(check: impl Fn(&str, &T) -> CheckResult) -> impl Fn(&str, &[T]) -> CheckResult {
     move |key, values| {
         let checked =

@@ -1,5 +1,5 @@
-//! The sources of a configuration: files and flags, and the place of each value in them, so that an error can name file,
-//! line and column, or the flag. `load.rs` merges them.
+//! Sources of a configuration: files and flags, and the place of each value in them. An error can therefore state the
+//! file, line and column, or the flag. `load.rs` merges the sources.
 
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -10,20 +10,20 @@ use serde::de::DeserializeOwned;
 use toml::Spanned;
 use toml::de::{DeArray, DeTable, DeValue, ValueDeserializer};
 
-/// Sources of values, in addition to the defaults.
+/// Sources of values that take precedence over the defaults.
 #[derive(Clone, Debug, Default)]
 pub struct Sources {
-    /// Files in their order; each must exist.
+    /// Files, in order of increasing precedence. Each one must exist.
     pub files: Vec<PathBuf>,
-    /// `--set KEY=VALUE`, as given.
+    /// Values of the flags `--set KEY=VALUE`.
     pub set: Vec<String>,
-    /// `--link NAME=PORT[,KEY=VALUE]..`, as given.
+    /// Values of the flags `--link NAME=PORT[,KEY=VALUE]..`.
     pub links: Vec<String>,
 }
 
 impl Sources {
-    /// Returns the system's files that exist: `/etc/scanhub/scanhub.toml`, then `/etc/scanhub/conf.d/*.toml` in the
-    /// order of their names.
+    /// Returns those of the system's configuration files that exist: `/etc/scanhub/scanhub.toml`, and then
+    /// `/etc/scanhub/conf.d/*.toml` in the order of their names.
     pub fn system() -> Vec<PathBuf> {
         let base = Path::new("/etc/scanhub");
         let mut files: Vec<_> =
@@ -36,7 +36,7 @@ impl Sources {
         files
     }
 
-    /// Reads each source once, up to the first one that cannot be read.
+    /// Reads each source once. Stops at the first source that cannot be read.
     pub fn read(&self) -> SourceMap {
         let mut map = SourceMap { text: String::new(), lines: vec![0], sources: Vec::new(), failure: None };
         map.failure = self.read_into(&mut map).err();
@@ -59,7 +59,8 @@ impl Sources {
         Ok(())
     }
 
-    /// Returns the flags, each with its TOML and with the error and the remedy for a flag without.
+    /// Returns the flags. Each one has its TOML, or `None` if it is not valid, and the problem and the remedy for that
+    /// case.
     fn flags(&self) -> impl Iterator<Item = (SourceKind, String, Option<String>, &str, &str)> {
         let links = self.links.iter().map(|flag| {
             let remedy = "write --link NAME=PORT, for example front=/dev/ttyUSB0";
@@ -77,16 +78,17 @@ impl Sources {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum SourceKind {
     File,
-    /// `--link`.
+    /// Flag `--link`.
     Link,
-    /// `--set`.
+    /// Flag `--set`.
     Setting,
 }
 
-/// The texts of all sources, one after the other. A position in them names a source, and a line and column in it.
+/// Text of all sources, one after the other. A position in this text determines the source, and the line and column in
+/// it.
 pub struct SourceMap {
     text: String,
-    /// Positions at which lines start.
+    /// Positions at which the lines start.
     lines: Vec<usize>,
     sources: Vec<Source>,
     /// Failure of the first source that could not be read.
@@ -97,7 +99,7 @@ struct Source {
     kind: SourceKind,
     /// Path of the file, or the flag as given.
     name: String,
-    /// Part of the text that is from this source.
+    /// Range of the text that comes from this source.
     span: Range<usize>,
 }
 
@@ -110,10 +112,10 @@ impl SourceMap {
         self.lines.extend(self.text[begin..].match_indices('\n').map(|(end, _)| begin + end + 1));
     }
 
-    /// Parses the sources into tables, whose spans are positions in this text, and into values of type `T`.
+    /// Parses each source into a table, whose spans are positions in this text, and into a value of type `T`.
     ///
-    /// Returns [`Kind::Configuration`] with place and remedy if a source is not valid TOML, has an unknown key or a value of
-    /// the wrong type, and [`Kind::Input`] if it cannot be read.
+    /// Returns [`Kind::Configuration`] with place and remedy if a source is not valid TOML, or has an unknown key or a
+    /// value of the wrong type. Returns [`Kind::Input`] if a source cannot be read.
     pub(crate) fn layers<T: DeserializeOwned>(&self) -> Result<Vec<(SourceKind, DeTable<'_>, T)>, Failure> {
         let mut layers = Vec::new();
         for Source { kind, span: Range { start: begin, end }, .. } in &self.sources {
@@ -125,16 +127,16 @@ impl SourceMap {
         self.failure.clone().map_or(Ok(layers), Err)
     }
 
-    /// Returns the value that `table` contains.
+    /// Deserializes `table`.
     ///
-    /// Returns [`Kind::Configuration`] with place and remedy if there is an unknown key, or a value of the wrong type.
+    /// Returns [`Kind::Configuration`] with place and remedy if there is an unknown key or a value of the wrong type.
     pub(crate) fn deserialize<T: DeserializeOwned>(&self, table: DeTable<'_>) -> Result<T, Failure> {
         let begin = table.keys().map(|key| key.span().start).min().unwrap_or_default();
         let table = Spanned::new(begin..begin, DeValue::Table(table));
         T::deserialize(ValueDeserializer::from(table)).map_err(|error| self.explain(&error, 0))
     }
 
-    /// Returns the index of the source of `span`.
+    /// Returns the index of the source that contains `span`.
     pub(crate) fn index(&self, span: &Range<usize>) -> usize {
         self.sources.partition_point(|source| source.span.start <= span.start).saturating_sub(1)
     }
@@ -161,8 +163,8 @@ impl SourceMap {
         Failure::new(Kind::Configuration, format!("{}: {what}", self.location(span)), remedy)
     }
 
-    /// Returns the failure for an error of the TOML parser in a text that starts at `begin`. For an unknown key or word, it
-    /// suggests the nearest known one.
+    /// Returns the failure for an error of the TOML parser. The parsed text starts at position `begin`. For an unknown
+    /// key or word, the remedy suggests the most similar known one.
     fn explain(&self, error: &toml::de::Error, begin: usize) -> Failure {
         let span = error.span().unwrap_or_default();
         let span = span.start + begin..span.end + begin;
@@ -188,7 +190,8 @@ impl SourceMap {
             .unwrap_or_else(|| self.refuse(span, message, "see docs/configuration.md"))
     }
 
-    /// Returns the failure for a value of the wrong type, in terms of TOML instead of the program's own types.
+    /// Returns the failure for a value of the wrong type, in terms of TOML instead of Rust types. Returns `None` for
+    /// other errors.
     fn mistyped(&self, message: &str, span: Range<usize>) -> Option<Failure> {
         let (_, expected) = message.strip_prefix("invalid type: ")?.rsplit_once(", expected ")?;
         let value = self.text.get(span.clone())?;
@@ -217,7 +220,7 @@ impl SourceMap {
     }
 }
 
-/// Returns `table` with spans that are moved by `begin`.
+/// Moves all spans in `table` by `begin`.
 fn moved_table(table: DeTable<'_>, begin: usize) -> DeTable<'_> {
     table.into_iter().map(|(key, value)| (moved(key, begin), moved_value(value, begin))).collect()
 }
@@ -241,8 +244,8 @@ fn moved<T>(value: Spanned<T>, begin: usize) -> Spanned<T> {
     Spanned::new(span.start + begin..span.end + begin, value.into_inner())
 }
 
-/// Returns `link.NAME.KEY=VALUE`, or a key of all links such as `zones.margin=0.05`, as TOML. A value that is not valid
-/// TOML becomes text.
+/// Converts `link.NAME.KEY=VALUE`, or a key for all links such as `zones.margin=0.05`, to TOML. A value that is not
+/// valid TOML becomes text.
 fn set_as_toml(flag: &str) -> Option<String> {
     let (path, value) = flag.split_once('=')?;
     let (table, key) = path.split_once('.')?;
@@ -258,14 +261,14 @@ fn set_as_toml(flag: &str) -> Option<String> {
     Some(format!("{head}{key} = {}", to_toml(value)))
 }
 
-/// Returns `NAME=PORT`, followed by any number of `,KEY=VALUE`, as TOML.
+/// Converts `NAME=PORT`, which may be followed by several `,KEY=VALUE`, to TOML.
 fn link_as_toml(flag: &str) -> Option<String> {
     let (name, rest) = flag.split_once('=')?;
     let is_set = |part: &&str| {
         part.split_once('=')
             .is_some_and(|(key, _)| key.chars().all(|c| c.is_ascii_lowercase() || c == '_' || c == '.'))
     };
-    // The name of a port may contain a comma.
+    // The port may contain a comma.
     let parts: Vec<&str> = rest.split(',').collect();
     let set = parts.iter().rev().take_while(|part| is_set(part)).count().min(parts.len() - 1);
     let (port, set) = parts.split_at(parts.len() - set);
@@ -276,7 +279,7 @@ fn link_as_toml(flag: &str) -> Option<String> {
     Some(text)
 }
 
-/// Returns `value` as TOML. It becomes text unless it is valid TOML.
+/// Converts `value` to TOML. It becomes text if it is not valid TOML.
 fn to_toml(value: &str) -> String {
     match toml::from_str::<toml::Table>(&format!("v = {value}")) {
         Ok(table) if table.len() == 1 => value.to_owned(),
@@ -284,7 +287,7 @@ fn to_toml(value: &str) -> String {
     }
 }
 
-/// Returns `text` as a TOML string.
+/// Converts `text` to a TOML string.
 fn quoted(text: &str) -> String {
     let escaped: String = text
         .chars()

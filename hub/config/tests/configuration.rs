@@ -1,5 +1,5 @@
-//! What is made of the scans, as it is configured: who wins over whom, what cannot be, and that each refusal names
-//! place, value and remedy.
+//! Tests of merging: which source takes precedence, which values are rejected, and that each error states place, value
+//! and remedy.
 
 use scanhub_drivers::features;
 use std::fs;
@@ -21,7 +21,7 @@ impl TempConfig {
     }
 }
 
-/// Where no file says which there are.
+/// Links for tests whose files have none.
 const LINKS: [&str; 2] = ["front=/dev/ttyUSB0,family=lms", "rear=/dev/ttyUSB1,family=lms"];
 
 fn load(files: &[&TempConfig], set: &[&str]) -> Result<Config, String> {
@@ -58,7 +58,8 @@ fn the_page_holds() {
         (top.family(), top.scanner.is_auto(), set.mode, set.stop_when_idle),
         (Some(Family::Rplidar), true, None, false)
     );
-    // What the page shows as the values without a word are those: the front's are changed in these sections.
+    // The default configuration shows the default values. The sections of the first link change them, so compare with
+    // the second.
     let Processing { zones, marks, lines, background, early, .. } = Processing::default();
     let shown = &rear.processing;
     assert_eq!((&shown.zones, shown.marks, &shown.background), (&zones, marks, &background));
@@ -66,7 +67,7 @@ fn the_page_holds() {
     assert_eq!(shown.early, early);
 }
 
-/// The output of `config default` has a section for each family; all but the first are comments.
+/// Every family has a section in the output of `config default`. All sections but the first are comments.
 #[test]
 fn the_default_has_a_section_for_each_family() {
     let is_setting = |line: &&str| *line == "[[link]]" || line.contains(" = ");
@@ -259,7 +260,8 @@ fn a_circle_that_the_sensor_cannot_see_is_refused() {
         &["zones.min_beams=300", "link.rear.resolution=1"],
         "link rear: min_beams = 300, and a scan has 181",
     );
-    // Two metres ahead it looks away; turned about, it sees the circle. 30 degrees of it: 61 beams.
+    // Two meters ahead of the center, the sensor faces away from the circle. Turned by 180 degrees, it sees 30 degrees
+    // of the circle: 61 beams.
     let facing_away = "link.front.pose.x=2";
     refused(
         &[facing_away, "link.front.pose.y=0"],
@@ -273,7 +275,7 @@ fn a_circle_that_the_sensor_cannot_see_is_refused() {
         &[&back[..], &["zones.radii=[0.5]"]].concat(),
         "min_beams = 100, and 57 can see the circle of 0.5 m\n  set fewer",
     );
-    // The farthest reading in mm is 32 m.
+    // The maximum range in units of 1 mm is 32 m.
     let far = ["link.front.pose.x=40", "link.front.pose.yaw=3.1416"];
     assert_eq!(set(&far), Ok(()));
     refused(&[&far[..], &["link.front.unit=mm"]].concat(), "no beam sees into the circle of 1 m");
@@ -308,7 +310,7 @@ fn a_background_begins_with_a_model_of_its_own_sensor() {
     let started = processing(&[], &[&start], 0).background;
     assert_eq!((started.model.as_deref(), started.learning.start), (Some(&*model), Start::Empty));
     assert_eq!(processing(&[], &[&start, "link.front.background.start=empty"], 0).background.model, None);
-    // Of no use to who keeps none.
+    // The file is ignored if there is no background.
     assert!(load(&[], &[&start, "background.method=off"]).is_ok());
 
     let name = file.0.display().to_string();
@@ -401,7 +403,7 @@ fn the_gateway_has_a_section_that_needs_no_links() {
         )
     );
     assert_eq!(gateway(&[], &[]).unwrap(), (Gateway::default(), None));
-    // A hub takes the same files.
+    // A hub reads the same files.
     let links = TempConfig::new("gateway-links.toml", "[[link]]\nname = \"a\"\nport = \"x\"\n");
     assert_eq!(load(&[&first, &links], &[]).unwrap().links.len(), 1);
     for (set, message) in [

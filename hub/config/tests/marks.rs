@@ -1,5 +1,5 @@
-//! From which intensity on a beam belongs to a mark is said in another key for reflector levels than for counts of any
-//! surface: what does not fit a link is refused where it is said for it alone.
+//! Tests of the minimum intensity of marks. It has one key for levels of reflectors, and another one for intensities of
+//! any surface. A link rejects the key that does not apply to its scanner if it is set for this link alone.
 
 use scanhub_config::{Config, Link, Sources, values};
 

@@ -1,5 +1,6 @@
-//! The default configuration and the tables of `docs/configuration.md` are generated from the keys of the sections. To write
-//! them again: `SCANHUB_REWRITE=1 cargo test -p scanhub-config --test reference`.
+//! Generator of the default configuration and of the tables of `docs/configuration.md`, from the keys of the sections.
+//! The tests fail if the files are not as generated. To write them again: `SCANHUB_REWRITE=1 cargo test -p
+//! scanhub-config --test reference`.
 
 use std::fs;
 use std::path::Path;
@@ -15,7 +16,7 @@ const PAGE_HEAD: &str = "\
 # `scanhub probe PORT` finds the scanner at a port, and `scanhub probe PORT --toml` prints its section.
 ";
 
-/// Links of the default configuration, all of which but the first are comments: title, name, port and family.
+/// Links of the default configuration: title, name, port and family. All of them but the first are comments.
 const LINKS: [(&str, &str, &str, Option<Family>); 5] = [
     ("", "front", "/dev/ttyUSB0", None),
     ("A SICK LMS 2xx.", "rear", "/dev/ttyUSB1", Some(Family::Lms)),
@@ -49,7 +50,7 @@ fn line(setting: &str, comment: &str) -> String {
     }
 }
 
-/// Returns the line of a key with its default, or behind a `#` with an example.
+/// Returns the line of a key with its default, or as a comment with an example.
 fn with_default(key: &Key, default: &str) -> String {
     let setting = match key.example {
         "" => format!("{} = {default}", key.name),
@@ -63,7 +64,7 @@ fn join_with_or(names: &[&str]) -> String {
     format!("{} or {last}", others.join(", "))
 }
 
-/// Returns the keys of a scanner that the link of `family` shows, each with an example and its comment.
+/// Returns the example and the comment of `key`, if the link of `family` shows it.
 fn value_and_source(family: Family, key: &Key) -> Option<(String, String)> {
     let Features { models, modes, keys, .. } = features(family);
     let models: Vec<_> = [AUTO].into_iter().chain(models.iter().map(|model| model.name)).collect();
@@ -133,7 +134,7 @@ fn reference_file() -> String {
     text
 }
 
-/// Returns `page` with the table of each section between its markers.
+/// Returns `page` with the table of each section written between its markers.
 fn with_tables(page: &str) -> String {
     let mut parts = page.split("<!-- keys of ");
     let mut text = parts.next().expect("a part").to_owned();
@@ -156,7 +157,7 @@ fn with_tables(page: &str) -> String {
     text
 }
 
-/// Returns the comment `text` as a sentence.
+/// Returns the comment `text` as a sentence: with an upper-case letter and a full stop.
 fn sentence(text: &str) -> String {
     format!("{}{}.", text[..1].to_uppercase(), &text[1..])
 }

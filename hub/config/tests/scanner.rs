@@ -1,5 +1,5 @@
-//! Which scanner a link has, wherever that is said, and that what its family does not have is refused with place, value
-//! and remedy.
+//! Tests of the scanner of a link: the keys that determine it, and that a key or value that its family does not support
+//! is rejected with place, value and remedy.
 
 use scanhub_config::{Config, Link, Sources};
 use scanhub_drivers::{Settings, features};
@@ -17,7 +17,7 @@ fn load(set: &[&str]) -> Result<Config, String> {
     })
 }
 
-/// Family, model and beams of a scanner whose head turns.
+/// Family, model and beams of a rotating scanner.
 fn scanner_settings(link: &Link) -> Option<(&'static str, &'static str, Option<usize>)> {
     let scanner = &link.scanner;
     let family = scanner.family.filter(|family| *family != Family::Lms)?;
@@ -45,23 +45,23 @@ fn family_determines_rate_beams_and_valid_settings() {
         // A model implies its family.
         (&["link.front.model=LD19"], set("ld19", None), 230_400, 450),
         (&["link.front.model=s2"], Some(("rplidar", "s2", None)), 1_000_000, 3200),
-        // Room for every model but the one that the remedy of a status names.
+        // There is space for every model but one. For that model, a status names the remedy.
         (&[family, "link.front.model=auto"], set("auto", None), 230_400, 720),
-        // What it does anyway may be said.
+        // A link may set the defaults explicitly.
         (&[family, "link.front.mode=auto", "link.front.idle=run"], set("auto", None), 230_400, 720),
-        // The later one counts, of whichever family it is.
+        // The later key takes precedence, even if it belongs to another family.
         (&[family, "link.front.mode=1", "link.front.mode=auto"], set("auto", None), 230_400, 720),
         (&["link.front.family=lms", "link.front.mode=auto", "link.front.idle=run"], None, 500_000, 401),
     ] {
         let link = front(setting).unwrap();
         assert_eq!(known(&link), (scanner, rate, beams), "{setting:?}");
     }
-    // What is said for all links is for those that have it.
+    // A key for all links applies to those that support it.
     let config =
         load(&[family, "marks.level=240", "marks.min_level=2", "link.front.marks.level=250"]).unwrap();
     let marks = |link: &Link| (link.processing.marks.min_level, link.processing.marks.level);
     assert_eq!((marks(&config.links[0]), marks(&config.links[1])), ((2, Some(250)), (2, Some(240))));
-    // The other link is what it was.
+    // The other link is unchanged.
     assert_eq!(load(&[family]).unwrap().links[1].family(), None);
 
     let lms = "is of family lms; a scanner of another family has no such setting\n  leave it out, or set family = \"lms\"";
@@ -179,7 +179,7 @@ fn a_mode_and_rest_are_for_those_that_have_them() {
     assert_eq!(set(&["link.front.model=Auto"]).0, "auto");
     let link = front(&settings).unwrap();
     assert_eq!((link.rate(), link.max_beams()), (1_000_000, 3200));
-    // The later source wins, also over the number of an LMS.
+    // The later source takes precedence, even over the number of an LMS mode.
     assert_eq!(set(&["link.front.mode=1", "link.front.mode=express"]), ("auto", Some("express"), false));
     for (setting, words) in [
         ("mode=fast", "link front: mode = \"fast\"\n  auto, or one of: standard, express, boost"),
@@ -206,7 +206,7 @@ fn keys_of_a_link_may_follow_its_port() {
     assert_eq!((link.name.as_str(), link.port.name().as_str()), ("side", "/dev/ttyUSB2"));
     assert_eq!(scanner_settings(&link), Some(("ld", "ld19", Some(300))));
     assert_eq!(load("a=tcp:10.0.0.7:4001,angle=100,unit=cm").unwrap().scanner.settings.view, Some((100, 50)));
-    // A comma may be in the name of a port.
+    // The name of a port may contain a comma.
     assert_eq!(load("a=file:/tmp/a,b.bin").unwrap().port.name(), "file:/tmp/a,b.bin");
     for (link, words) in [
         ("a=/dev/x,famly=ld", "--link a=/dev/x,famly=ld: unknown key `famly`\n  did you mean `family`?"),
@@ -233,7 +233,7 @@ fn a_family_may_be_searched_for() {
                 && limits.contents & family.array_flags == family.array_flags
         );
     }
-    // Keys of every link, and automatic values, name no family.
+    // Keys that every link has, and automatic values, do not determine the family.
     for set in [&["link.front.model=auto", "link.front.mode=Auto"][..], &["link.front.marks.level=200"]] {
         assert_eq!(front(set).unwrap().family(), None, "{set:?}");
     }
@@ -243,7 +243,7 @@ fn a_family_may_be_searched_for() {
     assert_eq!(load(&[]).unwrap().with_remedy(short()).hint, format!("free some of it; {remedy}"));
     let named = load(&["link.front.family=ld", "link.rear.family=lms"]).unwrap();
     assert_eq!(named.with_remedy(short()), short());
-    // An LMS has its own number of beams.
+    // An LMS has its own number of beams, which is greater.
     let beams = front(&["link.front.beams=300"]).unwrap();
     assert_eq!((beams.scanner.settings.beams, beams.max_beams()), (Some(300), 401));
     for (set, family) in [
