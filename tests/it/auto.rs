@@ -190,7 +190,8 @@ fn a_number_of_beams_outlives_a_restart_of_the_hub() {
     let hub = hub(&env);
     let mut scans = env.echo(&["front/scan"]);
     scans.await_line("a scan with the other number", |line| is_class("scan")(line) && line["count"] == 450);
-    let message = "scans have 450 beams instead of 666, as many as the scanner measures points";
+    let message =
+        "scans have 450 beams instead of 666, because the scanner measures 450 points per revolution";
     env.await_info("front", |info| text(info, "last_error") == message);
     let counts = counts(&scans.end(INT));
     let change = counts.iter().position(|count| *count == 450).expect("awaited");

@@ -56,7 +56,7 @@ fn hub_waits_for_missing_ports() {
     for (sensor, message) in [
         ("gone", "its adapter is not plugged in"),
         ("never", "/dev/ttyNever: no such port; "),
-        ("dangling", "it points to /dev/ttyGone, which is not there"),
+        ("dangling", "it points to /dev/ttyGone, which does not exist"),
     ] {
         let info = env.await_info(sensor, |info| info["state"] == "absent");
         assert!(info["last_error"].as_str().is_some_and(|error| error.contains(message)), "{info}");

@@ -76,7 +76,7 @@ fn reports_unsupported_mode() {
     let _simulator = simulator(&env, "a1", &[]);
     let _hub = hub(&env, &["mode=ultradense"]);
     let info = env.await_info("front", |info| info["state"] == "streaming" && info["last_error"] != "");
-    assert!(text(&info, "last_error").contains("cannot do mode ultradense"), "{info}");
+    assert!(text(&info, "last_error").contains("does not support mode ultradense"), "{info}");
 }
 
 #[test]

@@ -189,7 +189,7 @@ impl<'a> MergedConfig<'a> {
         }
         if kind == SourceKind::Setting {
             let names: Vec<_> = self.links.iter().map(|link| link.keys.name.as_str()).collect();
-            let remedy = format!("there are: {}", names.join(", "));
+            let remedy = format!("the links are: {}", names.join(", "));
             return Err(sources.refuse(span, format!("no link {name}"), remedy));
         }
         if self.links.len() >= MAX_LINKS {
@@ -431,7 +431,9 @@ mod tests {
         assert!(unknown.contains("--set link.front.prot=/dev/x: unknown key `prot`"), "{unknown}");
         assert!(unknown.contains("did you mean `port`?"), "{unknown}");
         assert!(refusal(&["link.front.angle=170"], &[]).contains("angle = 170\n  100 or 180"));
-        assert!(refusal(&["link.side.angle=100"], &[]).contains("no link side\n  there are: front, rear"));
+        assert!(
+            refusal(&["link.side.angle=100"], &[]).contains("no link side\n  the links are: front, rear")
+        );
         assert!(
             refusal(&["link.front.resolution=0.25"], &[]).contains("no sensor scans 180 degrees at 0.25")
         );
@@ -443,7 +445,7 @@ mod tests {
         assert!(refusal(&[], &["front=file:x?rate=2"]).contains("rate=max"));
         assert!(refusal(&[], &["front=tcp:box"]).contains("write tcp:HOST:PORT"));
         assert!(refusal(&[], &["front=tcp::4001"]).contains("without a host"));
-        assert!(refusal(&[], &["front=tcp:box:0"]).contains("a number to 65535"));
+        assert!(refusal(&[], &["front=tcp:box:0"]).contains("a number from 1 to 65535"));
         assert!(refusal(&[], &["front=tcp:fe80::1:4001"]).contains("in brackets"));
     }
 

@@ -118,7 +118,7 @@ section! {
         /// radians, counterclockwise from ahead
         ///
         /// Direction in which the sensor looks, in radians counterclockwise from ahead, at most one turn.
-        yaw: f64 = 0.0, check within(-FULL_CIRCLE..=FULL_CIRCLE, "radians, counter-clockwise: 90 degrees are 1.5708");
+        yaw: f64 = 0.0, check within(-FULL_CIRCLE..=FULL_CIRCLE, "radians, counterclockwise: 90 degrees are 1.5708");
         /// whether the sensor hangs upside down
         ///
         /// Whether the sensor hangs upside down, so that its first beam is the leftmost.
@@ -232,7 +232,7 @@ section! {
         /// meters from one scan to the next
         ///
         /// Maximum distance in meters from one scan to the next: 0.01 to 10. A longer step is refused.
-        max_step: f64 = 0.5, check within(0.01..=10.0, "metres from scan to scan, from 0.01 to 10");
+        max_step: f64 = 0.5, check within(0.01..=10.0, "meters from scan to scan, from 0.01 to 10");
         /// degrees from one scan to the next
         ///
         /// Maximum turn in degrees from one scan to the next: 1 to 85.
@@ -437,16 +437,16 @@ pub(crate) fn check_family(own: &DeTable<'_>, sources: &SourceMap, family: Famil
         let Some(value) = find(own, key) else { continue };
         let (what, remedy) = match key {
             "marks.level" => (
-                format!("level, and the intensities of an {name} are levels of reflectors, 0 to 7"),
-                "min_level is the least of them",
+                format!("level, but the intensities of an {name} are reflector levels, 0 to 7"),
+                "use min_level, the lowest level of a reflector",
             ),
             "marks.min_level" => (
-                format!("min_level, and the intensities of an {name} are counts of any surface"),
-                "level is the least of a reflector, as intensities of scans show it",
+                format!("min_level, but the intensities of an {name} are not reflector levels"),
+                "use level, the lowest intensity of a reflector in scans",
             ),
             _ => (
-                format!("pieces, and an {name} sends packets, which are short"),
-                "it warns by each packet anyway",
+                format!("pieces, but an {name} sends short packets"),
+                "leave it out: early warnings use every packet",
             ),
         };
         return Err(sources.refuse(value.span(), what, remedy));
@@ -478,7 +478,7 @@ fn radii(key: &str, radii: &[f64]) -> CheckResult {
         return refuse("1 to 8 radii, the largest first, for example [1.0, 0.6]");
     }
     if !radii.iter().all(|radius| (0.001..=MAX_RADIUS_M).contains(radius)) {
-        return refuse("metres around the robot's centre, more than 0 and at most 65");
+        return refuse("meters around the robot's center, more than 0 and at most 65");
     }
     match radii.iter().copied().map(in_mm).is_sorted_by(|one, next| one > next) {
         true => Ok(()),
@@ -489,7 +489,7 @@ fn radii(key: &str, radii: &[f64]) -> CheckResult {
 fn sectors(key: &str, sectors: &[SectorKeys]) -> CheckResult {
     if sectors.len() > MAX_SECTORS {
         let what = format!("{key} has {} sectors", sectors.len());
-        return Err(invalid_value(what, format!("at most {MAX_SECTORS}: merge neighbours")));
+        return Err(invalid_value(what, format!("at most {MAX_SECTORS}: merge neighboring ones")));
     }
     each(sector)(key, sectors)
 }
@@ -523,7 +523,7 @@ fn sector(key: &str, sector: &SectorKeys) -> CheckResult {
         );
     }
     if !(0.001..=MAX_RADIUS_M).contains(&range) {
-        return refuse("range in metres: readings that are nearer are the robot's own body");
+        return refuse("range is in meters: nearer readings are the robot's own body");
     }
     Ok(())
 }
@@ -540,7 +540,7 @@ fn start(key: &str, start: &str) -> CheckResult {
     if start.is_empty() { Err(invalid_value(format!("{key} = \"\""), START_VALUES)) } else { Ok(()) }
 }
 
-const OFFSET_REMEDY: &str = "metres from the robot's centre, at most 100";
+const OFFSET_REMEDY: &str = "meters from the robot's center, at most 100";
 /// Maximum radius in meters. In millimeters, it must fit into 16 bits.
 const MAX_RADIUS_M: f64 = 65.0;
 /// Maximum yaw in radians, in either direction. A larger value was probably written in degrees.
@@ -570,7 +570,7 @@ pub(crate) fn check_coverage(
         Err(Failure::new(Kind::Configuration, message, remedy.replace("NAME", &link.name)))
     };
     if usize::from(min_beams) > beams {
-        let what = format!("min_beams = {min_beams}, and a scan has {beams} beams");
+        let what = format!("min_beams = {min_beams}, but a scan has {beams} beams");
         return refuse(&["zones.min_beams"], what, "the default is one beam");
     }
     // Returns the maximum number of beams that can detect an object in the largest zone.
@@ -604,7 +604,9 @@ pub(crate) fn check_coverage(
     }
     refuse(
         &["zones.min_beams"],
-        format!("min_beams = {min_beams}, and {max_effective_beams} can see the circle of {circle_m} m"),
+        format!(
+            "min_beams = {min_beams}, but only {max_effective_beams} beams see the circle of {circle_m} m"
+        ),
         "set fewer beams, a larger circle, or another pose or body_mask",
     )
 }

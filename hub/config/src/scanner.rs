@@ -206,8 +206,9 @@ impl<'a> ScannerRequest<'a> {
                 if let Some(implied) = family_of(model).filter(|implied| *implied != family) {
                     let [implied, family] = [implied.name(), family.name()];
                     let location = self.location("family").unwrap_or_default();
-                    let what =
-                        format!("model = \"{model}\" is of family {implied}, but {location} says {family}");
+                    let what = format!(
+                        "model = \"{model}\" belongs to family {implied}, but {location} sets {family}"
+                    );
                     let remedy = format!("leave `family` out, or set family = \"{implied}\"");
                     return Err(refuse(self.location(Key::Model.name()), what, &remedy));
                 }
@@ -235,7 +236,7 @@ impl<'a> ScannerRequest<'a> {
         let Some((first_key, first, first_what)) = all.next() else { return Ok(None) };
         if let Some((key, other, what)) = all.find(|(_, other, _)| *other != first) {
             let what = format!(
-                "{what} is of family {}, but {first_what} at {} is of family {}",
+                "{what} belongs to family {}, but {first_what} at {} belongs to family {}",
                 other.name(),
                 self.location(first_key.name()).unwrap_or_default(),
                 first.name()

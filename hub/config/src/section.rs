@@ -144,7 +144,7 @@ pub(crate) fn within(allowed: RangeInclusive<f64>, remedy: &str) -> impl Fn(&str
 
 /// Returns a check for a length in meters.
 pub(crate) fn meters(allowed: RangeInclusive<f64>) -> impl Fn(&str, &f64) -> CheckResult {
-    let remedy = format!("metres, from {} to {}", allowed.start(), allowed.end());
+    let remedy = format!("meters, from {} to {}", allowed.start(), allowed.end());
     move |key, value| within(allowed.clone(), &remedy)(key, value)
 }
 

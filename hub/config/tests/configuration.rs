@@ -149,10 +149,10 @@ fn link_settings_and_later_sources_take_precedence() {
 #[test]
 fn refusal_names_place_value_and_remedy() {
     for (setting, words) in [
-        ("link.front.pose.x=nan", "x = NaN\n  metres"),
+        ("link.front.pose.x=nan", "x = NaN\n  meters"),
         ("link.front.pose=[1, 2]", "pose is a list\n  write it as [pose]"),
-        ("link.front.pose.y=300", "y = 300\n  metres from the robot's centre, at most 100"),
-        ("link.front.pose.yaw=90", "yaw = 90\n  radians, counter-clockwise: 90 degrees are 1.5708"),
+        ("link.front.pose.y=300", "y = 300\n  meters from the robot's center, at most 100"),
+        ("link.front.pose.yaw=90", "yaw = 90\n  radians, counterclockwise: 90 degrees are 1.5708"),
         (
             "link.front.pose.yam=1",
             "unknown key `yam`\n  did you mean `yaw`? Known here: x, y, yaw, upside_down",
@@ -167,7 +167,7 @@ fn refusal_names_place_value_and_remedy() {
         ("zones.radii=[1.0,0]", "more than 0 and at most 65"),
         ("zones.radii=[1000]", "more than 0 and at most 65"),
         ("zones.radii=1.0", "radii = 1.0 is not a list\n  zones.radii = [1.0], with brackets"),
-        ("zones.margin=-0.1", "margin = -0.1\n  metres, from 0 to 10"),
+        ("zones.margin=-0.1", "margin = -0.1\n  meters, from 0 to 10"),
         ("zones.max_invalid=10", "max_invalid = 10\n  a share from 0 to 1"),
         ("zones.max_invalid=nan", "max_invalid = NaN"),
         ("zones.min_beams=0", "min_beams = 0\n  a whole number from 1 to 8192"),
@@ -186,19 +186,19 @@ fn refusal_names_place_value_and_remedy() {
         ("zones.body_mask=[{from=0,to=20,range=1}]", "{ from_deg = -90.0, to_deg = -70.0, range = 1.0 }"),
         ("zones.body_mask=[{from_deg=1,to=20,range=1}]", "without its two angles\n  give it both"),
         ("zones.body_mask=[{range=1}]", "without its two angles"),
-        ("zones.body_mask=[{from_deg=1,to_deg=12,range=0}]", "range in metres"),
+        ("zones.body_mask=[{from_deg=1,to_deg=12,range=0}]", "range is in meters"),
         ("zones.body_mask=[{from_deg=1,to_deg=12,rang=1}]", "unknown key `rang`\n  did you mean `range`?"),
         ("zonse.margin=1", "unknown key `zonse`\n  did you mean `zones`?"),
         ("marks.min_level=8", "min_level = 8\n  a whole number from 1 to 7"),
         ("marks.level=0", "level = 0\n  a whole number from 1 to 65535"),
         (
             "link.front.marks.level=200",
-            "level, and the intensities of an lms are levels of reflectors, 0 to 7\n  min_level is",
+            "level, but the intensities of an lms are reflector levels, 0 to 7\n  use min_level",
         ),
-        ("marks.max_range_step=100", "max_range_step = 100\n  metres"),
+        ("marks.max_range_step=100", "max_range_step = 100\n  meters"),
         ("marks.max_gap=-1", "max_gap = -1"),
         ("lines.max=65", "max = 65\n  a whole number from 1 to 64"),
-        ("motion.max_step=0", "max_step = 0\n  metres from scan to scan, from 0.01 to 10"),
+        ("motion.max_step=0", "max_step = 0\n  meters from scan to scan, from 0.01 to 10"),
         ("motion.max_turn=90", "max_turn = 90\n  degrees from scan to scan, from 1 to 85"),
         ("motion.min_overlap=0", "min_overlap = 0\n  a share from 0.1 to 1"),
         ("lines.min_points=2", "min_points = 2\n  a whole number from 3 to 8192"),
@@ -254,11 +254,11 @@ fn a_circle_that_the_sensor_cannot_see_is_refused() {
     assert_eq!(set(&["link.front.zones.min_beams=361"]), Ok(()));
     refused(
         &["zones.min_beams=362"],
-        "--set zones.min_beams=362: link front: min_beams = 362, and a scan has 361 beams\n  the default is one beam",
+        "--set zones.min_beams=362: link front: min_beams = 362, but a scan has 361 beams\n  the default is one beam",
     );
     refused(
         &["zones.min_beams=300", "link.rear.resolution=1"],
-        "link rear: min_beams = 300, and a scan has 181",
+        "link rear: min_beams = 300, but a scan has 181",
     );
     // Two meters ahead of the center, the sensor faces away from the circle. Turned by 180 degrees, it sees 30 degrees
     // of the circle: 61 beams.
@@ -273,7 +273,7 @@ fn a_circle_that_the_sensor_cannot_see_is_refused() {
     assert_eq!(set(&back), Ok(()));
     refused(
         &[&back[..], &["zones.radii=[0.5]"]].concat(),
-        "min_beams = 100, and 57 can see the circle of 0.5 m\n  set fewer",
+        "min_beams = 100, but only 57 beams see the circle of 0.5 m\n  set fewer",
     );
     // The maximum range in units of 1 mm is 32 m.
     let far = ["link.front.pose.x=40", "link.front.pose.yaw=3.1416"];

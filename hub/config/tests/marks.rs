@@ -30,16 +30,16 @@ fn refuses_out_of_range_and_unsupported_settings() {
         ("marks.level=65536", "level = 65536\n  a whole number from 1 to 65535"),
         (
             "link.front.marks.level=200",
-            "level, and the intensities of an lms are levels of reflectors, 0 to 7\n  min_level is the least",
+            "level, but the intensities of an lms are reflector levels, 0 to 7\n  use min_level",
         ),
         (
             "link.side.marks.min_level=2",
-            "min_level, and the intensities of an ld are counts of any surface\n  level is the least of a reflector",
+            "min_level, but the intensities of an ld are not reflector levels\n  use level, the lowest intensity of a reflector",
         ),
         ("early.pieces=1", "pieces = 1\n  a whole number from 2 to 8"),
         (
             "link.side.early.pieces=4",
-            "pieces, and an ld sends packets, which are short\n  it warns by each packet anyway",
+            "pieces, but an ld sends short packets\n  leave it out: early warnings use every packet",
         ),
     ] {
         let failure = Config::load(&sources(&[setting])).expect_err(setting);

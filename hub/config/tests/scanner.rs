@@ -64,7 +64,7 @@ fn family_determines_rate_beams_and_valid_settings() {
     // The other link is unchanged.
     assert_eq!(load(&[family]).unwrap().links[1].family(), None);
 
-    let lms = "is of family lms; a scanner of another family has no such setting\n  leave it out, or set family = \"lms\"";
+    let lms = "is a setting of family lms; no other family has it\n  leave it out, or set family = \"lms\"";
     for (others, setting, words) in [
         (&[][..], "family=sick", "family = \"sick\"\n  auto, or one of: lms, ld, rplidar"),
         (&[], "famly=ld", "unknown key `famly`\n  did you mean `family`?"),
@@ -82,13 +82,13 @@ fn family_determines_rate_beams_and_valid_settings() {
         (
             &["link.front.family=lms"],
             "model=ld19",
-            "link front: model = \"ld19\" is of family ld, but --set link.front.family=lms says lms\n  leave `family` \
+            "link front: model = \"ld19\" belongs to family ld, but --set link.front.family=lms sets lms\n  leave `family` \
              out, or set family = \"ld\"",
         ),
         (
             &[family],
             "model=s2",
-            "link front: model = \"s2\" is of family rplidar, but --set link.front.family=ld says ld\n  leave `family` \
+            "link front: model = \"s2\" belongs to family rplidar, but --set link.front.family=ld sets ld\n  leave `family` \
              out, or set family = \"rplidar\"",
         ),
         (
@@ -112,7 +112,7 @@ fn family_determines_rate_beams_and_valid_settings() {
         (
             &[family],
             "mode=express",
-            "link front: mode = \"express\", and an ld measures in one way only\n  leave it out",
+            "link front: mode = \"express\", but an ld has only one scan mode\n  leave it out",
         ),
         (
             &["link.front.family=lms"],
@@ -125,23 +125,23 @@ fn family_determines_rate_beams_and_valid_settings() {
         (
             &[family],
             "idle=stop",
-            "link front: idle = \"stop\", and an ld cannot be told to rest\n  leave it out",
+            "link front: idle = \"stop\", but the motor of an ld cannot be stopped\n  leave it out",
         ),
         (
             &["link.front.family=lms"],
             "idle=stop",
-            "link front: idle = \"stop\", and an lms cannot be told to rest",
+            "link front: idle = \"stop\", but the motor of an lms cannot be stopped",
         ),
         (&[family], "idle=rest", "idle = \"rest\"\n  one of: run, stop"),
         (
             &[family],
             "marks.min_level=2",
-            "min_level, and the intensities of an ld are counts of any surface\n  level is the least of a reflector",
+            "min_level, but the intensities of an ld are not reflector levels\n  use level, the lowest intensity of a reflector",
         ),
         (
             &[family],
             "baud=38400",
-            "link front: baud is of family lms; a scanner of another family has no such setting\n  \
+            "link front: baud is a setting of family lms; no other family has it\n  \
              leave it out: the rate is the model's",
         ),
     ] {
@@ -183,7 +183,7 @@ fn a_mode_and_rest_are_for_those_that_have_them() {
     assert_eq!(set(&["link.front.mode=1", "link.front.mode=express"]), ("auto", Some("express"), false));
     for (setting, words) in [
         ("mode=fast", "link front: mode = \"fast\"\n  auto, or one of: standard, express, boost"),
-        ("mode=1", "link front: mode is of family lms"),
+        ("mode=1", "link front: mode is a setting of family lms"),
         ("mode=1", "\n  name one of: standard, express"),
         ("baud=38400", "\n  leave it out: the rate is the model's"),
         ("model=a4", "link front: model = \"a4\"\n  auto, or one of: a1, a2m8, a2m12, a3, s1, s2, s3, c1"),
@@ -270,17 +270,17 @@ fn a_family_may_be_searched_for() {
         (
             "angle=180",
             "model=ld19",
-            "model = \"ld19\" is of family ld, but angle at --set link.front.angle=180 is of family lms",
+            "model = \"ld19\" belongs to family ld, but angle at --set link.front.angle=180 belongs to family lms",
         ),
         (
             "model=ld19",
             "idle=stop",
-            "idle is of family rplidar, but model = \"ld19\" at --set link.front.model=ld19",
+            "idle belongs to family rplidar, but model = \"ld19\" at --set link.front.model=ld19",
         ),
         (
             "baud=38400",
             "mode=boost",
-            "mode = \"boost\" is of family rplidar, but baud at --set link.front.baud=38400",
+            "mode = \"boost\" belongs to family rplidar, but baud at --set link.front.baud=38400",
         ),
     ] {
         let [first, second] = [first, second].map(|set| format!("link.front.{set}"));

@@ -800,7 +800,7 @@ impl fmt::Display for Problem {
                 };
                 write!(f, "no scanner replies (looked for {} for {seconds} s", names(true))?;
                 if is_possible.contains(&false) {
-                    write!(f, "; the port cannot have the rates of {}", names(false))?;
+                    write!(f, "; the port does not support the rates of {}", names(false))?;
                 }
                 f.write_str("): power, cable?")
             }
@@ -906,7 +906,7 @@ mod tests {
         assert_eq!((&of(Family::Lms).rejected[..], rates(&lms).len()), (&[500_000][..], 4));
         (search.round, search.now) = (2, 10_000 * MILLIS);
         let message = search.problem().expect("it is silent").to_string();
-        let expected = "no scanner replies (looked for lms, rplidar for 10 s; the port cannot have the rates of ld): \
+        let expected = "no scanner replies (looked for lms, rplidar for 10 s; the port does not support the rates of ld): \
                         power, cable?";
         assert_eq!(message, expected);
         let only = Search::new(PortKind::Serial, None, 0).restricted_to(Family::Rplidar).coverage();

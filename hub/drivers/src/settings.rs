@@ -209,7 +209,7 @@ impl SettingsRequest {
             .map(|(family, _)| family.name().to_uppercase())
             .collect();
         let remedy = format!(
-            "{names}; leave it out for an {}, which reports its model; `type` is the expected one",
+            "{names}; leave it out for an {}, which reports its model; `type` is the expected model",
             without_models.join(" or ")
         );
         Err(Refusal::new(&[Key::Model], format!("model = \"{model}\""), remedy))
@@ -222,7 +222,7 @@ impl SettingsRequest {
     /// Returns a refusal if the family does not have one of the settings, or does not support its value.
     pub fn check(&self, family: Family) -> Result<Settings, Refusal> {
         if self.stop_when_idle == Some(true) && !features(family).can_stop_motor {
-            let what = format!("idle = \"stop\", and an {} cannot be told to rest", family.name());
+            let what = format!("idle = \"stop\", but the motor of an {} cannot be stopped", family.name());
             return Err(Refusal::new(&[Key::Idle], what, "leave it out"));
         }
         let settings = check(family, self)?;
@@ -235,8 +235,7 @@ impl SettingsRequest {
         let is_foreign = |key: &Key| self.has(*key) && !key.has_default() && !features.keys.contains(key);
         let Some(key) = Key::ALL.into_iter().find(is_foreign) else { return Ok(()) };
         let owner = owning_family(key).unwrap_or(family).name();
-        let what =
-            format!("{} is of family {owner}; a scanner of another family has no such setting", key.name());
+        let what = format!("{} is a setting of family {owner}; no other family has it", key.name());
         let remedy = match (key, features.modes) {
             (Key::Baud, _) => "leave it out: the rate is the model's".to_owned(),
             (Key::ModeNumber, [_, ..]) => format!("name one of: {}", features.modes.join(", ")),
@@ -262,7 +261,7 @@ impl SettingsRequest {
                 let what = format!("mode = \"{mode}\"");
                 match features.modes {
                     [] => {
-                        let what = format!("{what}, and an {} measures in one way only", family.name());
+                        let what = format!("{what}, but an {} has only one scan mode", family.name());
                         Refusal::new(&[Key::ModeName], what, "leave it out")
                     }
                     modes => Refusal::new(&[Key::ModeName], what, auto_or(modes.iter().copied())),

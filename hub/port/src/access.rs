@@ -67,8 +67,9 @@ impl PortPermissions {
         let PortPermissions { user, group, .. } = self;
         let path = path.display();
         let Some(Ownership { uid, gid, mode }) = self.port else {
-            let remedy = "a directory above it is closed: check its parents with ls -ld".to_owned();
-            return (format!("{path}: no permission for user {user} to look at it"), remedy);
+            let remedy =
+                "a directory in its path denies access: check the directories with ls -ld".to_owned();
+            return (format!("{path}: no permission for user {user} to access it"), remedy);
         };
         let what = format!("{path}: no permission for user {user}: group {group}, mode {mode:03o}");
         let remedy = if uid == self.uid && mode & RW_BITS << 6 != RW_BITS << 6 {
@@ -80,7 +81,7 @@ impl PortPermissions {
             format!("owner and mode allow it, so an access list or a container forbids it: getfacl {path}")
         } else if gid == 0 || mode & RW_BITS << 3 != RW_BITS << 3 {
             // A new device is in this state for a moment, until udev has processed it.
-            "no group may use it; a udev rule gives it to one: SUBSYSTEM==\"tty\", GROUP=\"dialout\", MODE=\"0660\""
+            "its group has no access: give it to a group with a udev rule, SUBSYSTEM==\"tty\", GROUP=\"dialout\", MODE=\"0660\""
                 .to_owned()
         } else if self.is_listed {
             format!("user {user} is in group {group}, but was not when this session started: log in again")

@@ -86,13 +86,16 @@ impl PortSpec {
     pub fn parse(text: &str) -> Result<PortSpec, &'static str> {
         if let Some(server) = text.strip_prefix("tcp:") {
             let (host, port) = server.rsplit_once(':').ok_or("tcp: without a port: write tcp:HOST:PORT")?;
-            let port =
-                port.parse().ok().filter(|&port| port > 0).ok_or("tcp: the port is a number to 65535")?;
+            let port = port
+                .parse()
+                .ok()
+                .filter(|&port| port > 0)
+                .ok_or("tcp: the port must be a number from 1 to 65535")?;
             let bracketed = host.strip_prefix('[').and_then(|host| host.strip_suffix(']'));
             return match bracketed.unwrap_or(host) {
                 "" => Err("tcp: without a host: write tcp:HOST:PORT"),
                 host if bracketed.is_none() && host.contains(':') => {
-                    Err("an IPv6 address stands in brackets: tcp:[ADDRESS]:PORT")
+                    Err("write an IPv6 address in brackets: tcp:[ADDRESS]:PORT")
                 }
                 host => Ok(PortSpec::Tcp { host: host.to_owned(), port }),
             };
@@ -191,7 +194,7 @@ impl Port {
         match self {
             Port::Tty(tty) => tty.set_baud(baud),
             Port::Tcp(_) => {
-                let what = "the rate of a serial server is set there, by hand";
+                let what = "the rate of a serial server can only be set in the server";
                 Err(io::Error::new(io::ErrorKind::Unsupported, what))
             }
         }

@@ -115,9 +115,7 @@ impl PortError {
             PortError::Other(Errno::NAMETOOLONG) => {
                 failure(Kind::PortNotTty, "name a port with a shorter path")
             }
-            PortError::Other(_) => {
-                failure(Kind::PortNotTty, "the kernel refuses it; its log (dmesg) may show why")
-            }
+            PortError::Other(_) => failure(Kind::PortNotTty, "the kernel's log (dmesg) may show why"),
         }
     }
 }
@@ -129,10 +127,12 @@ impl fmt::Display for PortError {
             PortError::NotTty => f.write_str("not a serial line"),
             PortError::PermissionDenied => f.write_str("no permission"),
             PortError::Busy => f.write_str("in use"),
-            PortError::NoDevice => f.write_str("no such port: the name exists, but no line behind it"),
+            PortError::NoDevice => {
+                f.write_str("no such port: the device file exists, but the device does not")
+            }
             PortError::ResourceExhausted(errno) => write!(f, "cannot be opened: {errno}"),
             PortError::Rate { requested: wanted, actual: given } => {
-                write!(f, "{wanted} Bd is not possible here, the driver gives {given} Bd")
+                write!(f, "the driver does not support {wanted} Bd, and sets {given} Bd instead")
             }
             PortError::NoHost(why) => write!(f, "no such host: {why}"),
             PortError::Refused => f.write_str("connection refused"),
@@ -169,7 +169,9 @@ fn portless_adapters() -> Vec<PortlessAdapter> {
 fn missing_failure(path: &Path, ports: &[SerialPortInfo], portless: &[PortlessAdapter]) -> Failure {
     let name = path.display().to_string();
     let what = match path.read_link() {
-        Ok(target) => format!("{name}: no such port: it points to {}, which is not there", target.display()),
+        Ok(target) => {
+            format!("{name}: no such port: it points to {}, which does not exist", target.display())
+        }
         Err(_) if path.starts_with("/dev/serial") => {
             format!("{name}: no such port: its adapter is not plugged in, or it is another adapter")
         }
@@ -190,7 +192,7 @@ fn alternatives(name: &str, ports: &[SerialPortInfo], portless: &[PortlessAdapte
         portless.iter().map(|adapter| format!("{adapter}; {}", adapter.remedy())).collect();
     if !sorted.is_empty() {
         let names: Vec<String> = sorted.iter().map(|candidate| candidate.to_string()).collect();
-        hints.push(format!("there are: {}", names.join(", ")));
+        hints.push(format!("existing ports: {}", names.join(", ")));
     }
     if hints.is_empty() { "no serial line is plugged in".to_owned() } else { hints.join("; ") }
 }
@@ -198,22 +200,23 @@ fn alternatives(name: &str, ports: &[SerialPortInfo], portless: &[PortlessAdapte
 fn busy_failure(path: &Path, holder: Option<Holder>) -> Failure {
     let name = path.display();
     let (owner, remedy) = match holder {
-        None => {
-            ("another process".to_owned(), format!("stop it first; sudo fuser -v {name} shows which it is"))
-        }
+        None => (
+            "another process".to_owned(),
+            format!("stop it first; sudo fuser -v {name} shows which process it is"),
+        ),
         Some(holder) => {
             let remedy = match holder.program.as_str() {
                 "ModemManager" => {
-                    "stop it first (sudo systemctl stop ModemManager), or a udev rule keeps it away: \
+                    "stop it first (sudo systemctl stop ModemManager), or exclude the port with a udev rule: \
                      ENV{ID_MM_DEVICE_IGNORE}=\"1\""
                 }
                 "brltty" => "stop it first: without a Braille display, sudo apt remove brltty",
                 "agetty" | "getty" => {
-                    "a login waits there: stop it first (sudo systemctl stop serial-getty@...)"
+                    "it waits for a login: stop it first (sudo systemctl stop serial-getty@...)"
                 }
                 "systemd" => "the service manager keeps it open for a service: sudo systemctl stop scanhub",
                 "gpsd" => "stop it first (sudo systemctl stop gpsd.socket gpsd)",
-                "scanhub" => "stop it first, or listen to it: scanhub list --domains",
+                "scanhub" => "stop it first, or subscribe to its sensors: scanhub list --domains",
                 _ => "stop it first",
             };
             (holder.to_string(), remedy.to_owned())
@@ -224,7 +227,7 @@ fn busy_failure(path: &Path, holder: Option<Holder>) -> Failure {
 
 fn rate_remedy(requested: u32) -> &'static str {
     if requested == 500_000 {
-        "adapters with an FT232R, FT232H or FT4232H do it exactly; a UART clocked with 1.8432 MHz cannot: baud = 38400"
+        "use an adapter with an FT232R, FT232H or FT4232H, or set baud = 38400; a UART with a 1.8432 MHz clock cannot do it"
     } else {
         "set another rate: baud = 38400, 19200 or 9600"
     }
@@ -240,18 +243,18 @@ mod tests {
         let source = PortSpec::Tty("/dev/full".into());
         for (refusal, kind, text) in [
             (Errno::NOTTY.into(), Kind::PortNotTty, "name a tty, or tcp:HOST:PORT"),
-            (Errno::IO.into(), Kind::PortMissing, "no line behind it"),
-            (Errno::NXIO.into(), Kind::PortMissing, "no line behind it"),
+            (Errno::IO.into(), Kind::PortMissing, "the device does not"),
+            (Errno::NXIO.into(), Kind::PortMissing, "the device does not"),
             (Errno::MFILE.into(), Kind::ResourceExhausted, "ulimit -n"),
             (PortError::ResourceExhausted(Errno::AGAIN), Kind::ResourceExhausted, "ulimit -u"),
             (Errno::LOOP.into(), Kind::PortNotTty, "its symbolic links form a loop"),
-            (Errno::INVAL.into(), Kind::PortNotTty, "the kernel refuses it"),
+            (Errno::INVAL.into(), Kind::PortNotTty, "the kernel's log (dmesg)"),
             (Errno::PERM.into(), Kind::PortPermission, "/dev/full"),
             (Errno::BUSY.into(), Kind::PortBusy, "stop it first"),
             (
                 PortError::Rate { requested: 500_000, actual: 115_200 },
                 Kind::PortRate,
-                "/dev/full: 500000 Bd is not possible here, the driver gives 115200 Bd\n  adapters with an FT232R",
+                "/dev/full: the driver does not support 500000 Bd, and sets 115200 Bd instead\n  use an adapter with an FT232R",
             ),
             (PortError::Rate { requested: 9600, actual: 0 }, Kind::PortRate, "set another rate"),
         ] {
@@ -297,7 +300,7 @@ mod tests {
         let hint = missing_failure(Path::new("/dev/ttyUSB7"), &candidates[2..], &[adapter]).hint;
         assert!(hint.starts_with("USB adapter 1-1 (CH340, 1a86:7523) has no port: "), "{hint}");
         assert!(
-            hint.contains("sudo modprobe ch341") && hint.ends_with("; there are: /dev/ttyS0 (ftdi_sio)"),
+            hint.contains("sudo modprobe ch341") && hint.ends_with("; existing ports: /dev/ttyS0 (ftdi_sio)"),
             "{hint}"
         );
         assert_eq!(missing_failure(Path::new("/dev/x"), &[], &[]).hint, "no serial line is plugged in");

@@ -37,7 +37,7 @@ impl SerialPortInfo {
     /// no warning.
     pub fn caution(&self, path: &Path) -> Option<(String, String)> {
         if self.device.ends_with(PI_5_DEBUG_TTY) {
-            let what = "the debug connector of a Raspberry Pi 5, not pins 8 and 10 of its header: /dev/serial0 names it by default";
+            let what = "the debug connector of a Raspberry Pi 5, not pins 8 and 10 of its header: by default, /dev/serial0 is this connector";
             let remedy = "for a scanner at pins 8 and 10, put dtparam=uart0=on into /boot/firmware/config.txt, restart, and use \
                           /dev/ttyAMA0";
             return Some((what.to_owned(), remedy.to_owned()));

@@ -81,7 +81,7 @@ impl Tty {
         tty.configure(termios, baud)?;
         if let Some(ms) = latency_ms(path).filter(|&ms| ms > MAX_LATENCY_MS) {
             tracing::warn!(
-                "{}: the adapter collects bytes for {ms} ms, so stamps are off by as much; a udev rule ends that: \
+                "{}: the adapter collects bytes for {ms} ms, so stamps are wrong by up to this time; fix it with a udev rule: \
                  ACTION==\"add\", SUBSYSTEM==\"usb-serial\", DRIVER==\"ftdi_sio\", ATTR{{latency_timer}}=\"1\"",
                 path.display()
             );

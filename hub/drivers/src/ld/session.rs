@@ -587,9 +587,14 @@ impl fmt::Display for Problem {
                 write!(f, " baud for {seconds} s: power, cable, other port?")
             }
             Problem::Silence => f.write_str("no packet for one second"),
-            Problem::HeadBlocked => f.write_str("packets come, but the head does not turn: is it blocked?"),
+            Problem::HeadBlocked => {
+                f.write_str("packets arrive, but the head does not rotate: is it blocked?")
+            }
             Problem::BeamsChanged { from, to } => {
-                write!(f, "scans have {to} beams instead of {from}, as many as the scanner measures points")
+                write!(
+                    f,
+                    "scans have {to} beams instead of {from}, because the scanner measures {to} points per revolution"
+                )
             }
         }
     }

@@ -290,11 +290,11 @@ impl fmt::Display for Health {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Health::Good => f.write_str("good"),
-            Health::Warning(code) => write!(f, "warning, code {code:04X}h: it measures, and may fail soon"),
+            Health::Warning(code) => write!(f, "warning, code {code:04X}h: it measures, but may fail soon"),
             Health::Error(code) => {
                 write!(
                     f,
-                    "error, code {code:04X}h: it protects itself and does not measure; is its head blocked?"
+                    "error, code {code:04X}h: it has stopped measuring to protect itself; is its head blocked?"
                 )
             }
         }

@@ -737,16 +737,18 @@ impl fmt::Display for Problem {
                 write!(f, " baud for {seconds} s: power, cable, other port?")
             }
             Problem::Silence => f.write_str("no measured data for one second"),
-            Problem::HeadBlocked => f.write_str("packets come, but the head does not turn: is it blocked?"),
+            Problem::HeadBlocked => {
+                f.write_str("packets arrive, but the head does not rotate: is it blocked?")
+            }
             Problem::Unhealthy(health) => write!(f, "the scanner reports: {health}"),
-            Problem::Refused => f.write_str("the scanner answers, but does not begin to measure"),
+            Problem::Refused => f.write_str("the scanner replies, but does not start to measure"),
             Problem::AmbiguousPackets => f.write_str(
-                "the packets may be of two kinds (82h or 85h), which nothing here tells: name the model or the mode",
+                "the packets may have either of two formats (82h or 85h): set the model or the mode",
             ),
             Problem::ModeUnavailable(mode) => {
                 write!(
                     f,
-                    "the scanner or its line cannot do mode {}: it measures in its fastest one",
+                    "the scanner or its line does not support mode {}: it measures in its fastest mode",
                     mode.name()
                 )
             }
