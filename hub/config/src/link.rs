@@ -139,9 +139,10 @@ section! {
         ///
         /// A tty, `tcp:HOST:PORT`, or `file:PATH[?rate=max]`.
         port: Option<String> = None, check optional(port), example "\"/dev/ttyUSB0\"";
-        /// lms200, lms211, lms221 or lms291: other settings are refused
+        /// expected type: lms200, lms211, lms221 or lms291
         ///
-        /// Expected type of an LMS: `lms200`, `lms211`, `lms221` or `lms291`. Settings that it does not support are refused.
+        /// Expected type of an LMS: `lms200`, `lms211`, `lms221` or `lms291`. Settings that it does not support are
+        /// refused.
         expected_type ("type"): Option<String> = None;
         /// auto: the hub finds the scanner
         ///
@@ -151,7 +152,7 @@ section! {
         ///
         /// The name of a model, see below, or `auto`, the default.
         model: Option<String> = None, example "\"auto\"";
-        /// of a scan, 2 to 8192; default: as many points as the model measures per revolution
+        /// beams per scan, 2 to 8192; default: as many points as the model measures per revolution
         ///
         /// Beams per scan for a rotating scanner, 2 to 8192. Default: as many points as the model measures per
         /// revolution.
@@ -164,9 +165,9 @@ section! {
         ///
         /// Angle between two beams of an LMS in degrees: 0.25, 0.5 or 1.
         resolution: Option<f64> = None, example "0.5";
-        /// mm or cm, compared with the sensor's, never written
+        /// expected unit: mm or cm
         ///
-        /// Expected unit of an LMS: `mm` or `cm`. It is compared, never written.
+        /// Expected unit of an LMS: `mm` or `cm`. The hub compares it with the sensor's unit and never changes that.
         unit: Option<String> = None, example "\"mm\"";
         /// measuring mode, for a recording that does not contain it
         ///
@@ -176,9 +177,9 @@ section! {
         ///
         /// `run`; or `stop`: the motor of an RPLIDAR stops while no program subscribes.
         idle: Option<String> = None, example "\"run\"";
-        /// the rate to stream at: 500000, 38400, 19200 or 9600
+        /// baud rate of the stream: 500000, 38400, 19200 or 9600
         ///
-        /// Rate at which an LMS streams: 500000, 38400, 19200 or 9600. Default: 500000, or 38400 on RS-232
+        /// Baud rate at which an LMS streams: 500000, 38400, 19200 or 9600. Default: 500000, or 38400 on RS-232
         /// ([scanners.md](scanners.md)).
         baud: Option<i64> = None, example "500000";
         /// in the robot's frame: meters, radians

@@ -117,7 +117,8 @@ section! {
         y: f64 = 0.0, check within(-100.0..=100.0, OFFSET_REMEDY);
         /// radians, counterclockwise from ahead
         ///
-        /// Direction in which the sensor looks, in radians counterclockwise from ahead, at most one turn.
+        /// Direction in which the sensor looks, in radians counterclockwise from ahead, at most 2 pi in either
+        /// direction.
         yaw: f64 = 0.0, check within(-FULL_CIRCLE..=FULL_CIRCLE, "radians, counterclockwise: 90 degrees are 1.5708");
         /// whether the sensor hangs upside down
         ///
@@ -149,16 +150,16 @@ section! {
         ///
         /// A circle is violated if at least this number of beams is inside.
         min_beams: i64 = 1, check whole(1..=MAX_BEAMS as i64);
-        /// consecutive scans in which they do
+        /// consecutive scans in which a circle must be violated
         ///
-        /// Number of consecutive scans in which a circle must be violated, at most 1000. The verdict is unknown until this number of
-        /// scans has followed a start, a silence or a scan with too many invalid beams.
+        /// Number of consecutive scans in which a circle must be violated, at most 1000. The verdict is unknown until
+        /// this number of scans has followed a start, a silence or a scan with too many invalid beams.
         min_scans: i64 = 1, check whole(1..=1000);
         /// the verdict is unknown if a larger share of the beams has no reading
         ///
         /// The verdict is unknown if a larger share of the beams that see into the largest circle has no reading.
         max_invalid: f64 = 0.1, check within(0.0..=1.0, "a share from 0 to 1");
-        /// ignore what stands between the sensor and the near side of a circle
+        /// ignore points between the sensor and the near side of a circle
         ///
         /// Whether a sensor outside a circle ignores points in front of the circle's near side.
         exact: bool = true;
@@ -176,8 +177,8 @@ pub(crate) struct SectorKeys {
     from_deg: Option<f64>,
     to_deg: Option<f64>,
     range: f64,
-    /// Key of earlier versions, like `to`. Its angle 0 was to the right. Many values are valid in both frames, so neither
-    /// key is accepted.
+    /// Key of earlier versions, like `to`. Its angle 0 was to the right. Many values are valid in both frames, so
+    /// neither key is accepted.
     #[serde(skip_serializing)]
     from: Option<f64>,
     #[serde(skip_serializing)]
@@ -212,16 +213,16 @@ section! {
         /// lines of a scan, 1 to 64
         ///
         /// Maximum number of lines of a scan, 1 to 64. If there are more, those that differ least are joined, and beams
-        /// that fit no line well are left out.
+        /// that do not fit a line well are dropped.
         max: i64 = 64, check whole(1..=MAX_LINES as i64);
         /// beams of a line, at least 3
         ///
         /// Minimum number of beams of a line, 3 to 8192.
         min_points: i64 = 5, check whole(3..=MAX_BEAMS as i64);
-        /// the slower, better fit
+        /// slower fit with a better result
         ///
-        /// Whether cuts between lines are moved to wherever they help most, and beams that fit worst at the ends of lines
-        /// are left out, at most one in twenty. This is slower.
+        /// Whether the cuts between lines are moved to their best positions, and the worst beams at the ends of lines
+        /// are dropped, at most one in twenty. This is slower.
         refine: bool = false;
     }
 }
@@ -231,16 +232,16 @@ section! {
     pub(crate) struct MotionKeys: "keys of motion, as { max_step = 0.5, max_turn = 30.0 }" {
         /// meters from one scan to the next
         ///
-        /// Maximum distance in meters from one scan to the next: 0.01 to 10. A longer step is refused.
+        /// Maximum distance in meters from one scan to the next: 0.01 to 10. A longer step is rejected.
         max_step: f64 = 0.5, check within(0.01..=10.0, "meters from scan to scan, from 0.01 to 10");
         /// degrees from one scan to the next
         ///
         /// Maximum turn in degrees from one scan to the next: 1 to 85.
         max_turn: f64 = 30.0, check within(1.0..=85.0, "degrees from scan to scan, from 1 to 85");
-        /// share of readings on surfaces of the scan before
+        /// share of readings on surfaces of the previous scan
         ///
-        /// Minimum share of a scan's readings that lie on surfaces of the scan before, 0.1 to 1. With less, the step is
-        /// refused.
+        /// Minimum share of a scan's readings that lie on surfaces of the previous scan, 0.1 to 1. With less, the step
+        /// is rejected.
         min_overlap: f64 = 0.4, check within(0.1..=1.0, "a share from 0.1 to 1");
     }
 }
@@ -255,42 +256,42 @@ section! {
         method: MethodKey = MethodKey::Multi;
         /// distance from the background that still belongs to it; default: 30, 60 or 100, by the unit
         ///
-        /// Distance in mm from the background at which a reading still belongs to it, up to 10,000; at least one unit of
-        /// the sensor. Default: 30, 60 for units of cm, 100 for dm.
+        /// Distance in mm from the background at which a reading still belongs to it, up to 10,000; at least one unit
+        /// of the sensor. Default: 30, 60 for units of cm, 100 for dm.
         threshold_mm: Option<i64> = None, check optional(whole(1..=10_000)), example "30";
-        /// of paper: the same distance from a candidate, with the same default
+        /// for paper: the same distance from a candidate, with the same default
         ///
         /// `paper`: the same distance from a candidate that may become background.
         candidate_mm: Option<i64> = None, check optional(whole(1..=10_000)), example "30";
         /// scans until a surface is background; default: those of 10 s
         ///
-        /// Number of scans in which a surface must be seen before it is background, at most 8191; for `paper` they must be
-        /// consecutive. Default: the number of scans in 10 s at the full rate. `multi` knows a surface after 5/8 of this
-        /// number, even when you set it.
+        /// Number of scans in which a surface must be seen before it is background, at most 8191; for `paper` they must
+        /// be consecutive. Default: the number of scans in 10 s at the full rate. With `multi`, a surface is known
+        /// after 5/8 of this number, even if you set it.
         scans: Option<i64> = None, check optional(whole(1..=8_191)), example "375";
-        /// of paper: first or latest
+        /// for paper: first or latest
         ///
         /// `paper`: a candidate is compared with the `first` reading of its run, or with the `latest`.
         candidate: CandidateKey = CandidateKey::First;
         /// empty, first-scan or a saved file; default: the saved background if it fits, or empty
         ///
-        /// The model to start with: `empty`; `first-scan`; or a file that `scanhub background SENSOR save` wrote for this
-        /// sensor. A relative path starts in the directory in which the hub was started. Default: the model that an
-        /// earlier hub kept, if it fits, otherwise `empty`.
+        /// Background to start with: `empty`; `first-scan`; or a file that `scanhub background SENSOR save` wrote for
+        /// this sensor. A relative path starts in the directory in which the hub was started. Default: the background
+        /// that an earlier hub saved, if it fits, otherwise `empty`.
         start: Option<String> = None, check optional(start), example "\"empty\"";
-        /// the next hub starts with this background; false: it starts empty
+        /// whether the next hub starts with this background
         ///
-        /// Whether the learned model survives the hub: the next hub starts with it. See below.
+        /// Whether the hub saves the learned background, so that the next hub starts with it. See below.
         keep: bool = true;
-        /// whether no echo is a background far away; default: true, of paper false
+        /// whether no echo counts as a background far away; default: true, for paper false
         ///
         /// If true, no echo counts as a background far away; if false, as no reading. Default: true for `multi`, false
         /// for `paper`.
         no_return_is_far: Option<bool> = None, example "true";
         /// on-demand or every-scan
         ///
-        /// `on-demand`: the model is published when a new generation begins, and after every `scans` scans that it learned
-        /// from; `every-scan`.
+        /// `on-demand`: the background is published when a new generation begins, and after every `scans` scans from
+        /// which it learned; or `every-scan`.
         publish: PublishKey = PublishKey::OnDemand;
     }
 }
