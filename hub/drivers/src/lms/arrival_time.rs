@@ -1,19 +1,21 @@
-//! Arrival times of bytes, and the time of the next read. A port only reports when a read returned and how many bytes
-//! it had. From that, [`ArrivalEstimator`] computes a stamp for any byte, and [`TelegramTiming`] measures how long a telegram takes, so
-//! that the host can sleep meanwhile.
+//! Arrival times of bytes and of telegrams.
+//!
+//! A port reports only when a read returned and how many bytes it had. From these reads, [`ArrivalEstimator`] computes
+//! a stamp for any byte, and [`TelegramTiming`] measures how long a telegram takes, so that the host can sleep until
+//! the next one is nearly complete.
 
 use crate::lms::variant::BYTES_PER_REVOLUTION;
 use scanhub_schema::{MICROS, MILLIS, Nanos, line_time};
 
-/// The last reads, newest last, by the number of the byte after their last one.
+/// The last reads in a ring buffer. The stamp of a byte follows from the reads that returned it and the bytes after it.
 #[derive(Clone, Debug)]
 pub(crate) struct ArrivalEstimator {
     reads: [ReadRecord; ArrivalEstimator::CAPACITY],
     next: usize,
     total: u64,
-    /// Time at which the line last had bytes. A line that holds its bytes back looks empty.
+    /// Time of the last read with bytes, or of the last call of `note_unread`.
     last_checked: Nanos,
-    /// Bytes that were buffered while the host did not read.
+    /// Present while the bytes that are read were buffered when the host did not read.
     backlog: Option<Backlog>,
 }
 
@@ -24,41 +26,41 @@ struct ReadRecord {
     backlog: Option<Backlog>,
 }
 
-/// Bytes that arrived while the host did not run, or that the line held back. Their age is not known. But the line's
-/// buffer keeps the oldest ones, so they arrived at the speed of the line, starting at the last read.
+/// Bytes that were buffered while the host or the line was stopped. Their exact age is unknown. The line's buffer keeps
+/// the oldest bytes, so the backlog arrived at the speed of the line, starting at the last read before the stop.
 #[derive(Clone, Copy, Debug)]
 struct Backlog {
-    /// Number of its first byte.
+    /// Offset of the first byte of the backlog.
     begin_offset: u64,
-    /// Time at which the line had bytes before.
+    /// Time of the last read with bytes before the backlog.
     since: Nanos,
-    /// Time of the last read that had more bytes than can have arrived since the read before, and number of bytes after
-    /// it.
+    /// Time of the last read that returned more bytes than can have arrived since the read before.
     last_surplus: Nanos,
     read_since: usize,
 }
 
-/// A stamp, and whether its error may be more than the pace of a UART.
+/// A stamp, and whether it is an estimate because its error may exceed 64 bytes' time on the line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Timestamp {
     pub(crate) at: Nanos,
     pub(crate) estimated: bool,
-    /// For a byte in a backlog: its latest possible arrival. Then `at` is the earliest possible one.
+    /// Latest possible arrival of a byte in a backlog; `at` is then the earliest possible arrival. `None` for other
+    /// bytes.
     pub(crate) latest: Option<Nanos>,
 }
 
 impl ArrivalEstimator {
-    /// Two telegrams in pieces of 16 bytes.
+    /// Number of stored reads: enough for two telegrams in chunks of 16 bytes.
     const CAPACITY: usize = 128;
 
-    /// Creates it at `now`. No byte is older.
+    /// Creates an estimator at `now`. No byte gets an earlier stamp.
     pub(crate) fn new(now: Nanos) -> Self {
         let reads = [ReadRecord::default(); ArrivalEstimator::CAPACITY];
         ArrivalEstimator { reads, next: 0, total: 0, last_checked: now, backlog: None }
     }
 
-    /// Handles a read of `len` bytes at `now`, from a line of `pace` bits per second. `None`: bytes do not arrive at
-    /// the pace of a line.
+    /// Records a read of `len` bytes at `now`. `line_rate` is the rate of the line in bits per second; `None` if bytes
+    /// do not arrive at such a rate, as from a recording or a network.
     pub(crate) fn note_read(&mut self, now: Nanos, len: usize, line_rate: Option<u32>) {
         let since = self.last_checked;
         if len > 0 {
@@ -88,7 +90,7 @@ impl ArrivalEstimator {
         }
     }
 
-    /// Handles that at `now`, the line had `len` bytes for the next read.
+    /// Records that `len` bytes were waiting in the line's buffer at `now`, which the next read will return.
     pub(crate) fn note_unread(&mut self, now: Nanos, len: usize) {
         self.last_checked = now;
         let read = ReadRecord { end_offset: self.total + len as u64, now, backlog: self.backlog };
@@ -96,7 +98,7 @@ impl ArrivalEstimator {
         self.next += 1;
     }
 
-    /// Ends the backlog: bytes that were read after the last hurried read are not part of it.
+    /// Ends the backlog. Reads after its last surplus do not belong to it.
     fn end_backlog(&mut self) {
         if let Some(backlog) = self.backlog.take() {
             for read in self.reads.iter_mut().filter(|read| read.now > backlog.last_surplus) {
@@ -105,9 +107,10 @@ impl ArrivalEstimator {
         }
     }
 
-    /// Returns the latest possible arrival of byte number `offset`: bytes after it, in the same read or soon after,
-    /// took their time on the line. For a byte in a backlog, it is the earliest possible arrival, because old values
-    /// must not look new. If the period of the stream is known, [`crate::lms::cadence`] is more exact.
+    /// Returns the stamp of the byte with this offset, on a line of `baud` bits per second. It is the latest time at
+    /// which the byte can have arrived, because the bytes after it in the same read, or in the next ones, took their
+    /// time on the line. For a byte in a backlog, it is the earliest possible time, so that old values do not appear
+    /// new. If the period of the stream is known, [`crate::lms::scan_schedule`] computes a more exact stamp.
     pub(crate) fn stamp(&self, offset: u64, baud: u32) -> Timestamp {
         let oldest = self.next.saturating_sub(ArrivalEstimator::CAPACITY);
         let (mut at, mut arrival, mut later_bytes) = (Nanos::MAX, Nanos::MAX, MAX_EXACT_BYTES + 1);
@@ -126,7 +129,7 @@ impl ArrivalEstimator {
                 is_backlogged = true;
             }
         }
-        // Small differences between the delays of reads do not make it an estimate.
+        // A small jitter between reads does not make the stamp an estimate.
         let is_estimated = arrival - at > line_time(MAX_EXACT_BYTES, baud);
         Timestamp {
             at,
@@ -136,20 +139,20 @@ impl ArrivalEstimator {
     }
 }
 
-/// Duration of a telegram of the stream, as measured. A busy host can only measure too much, so the minimum of several
-/// counts.
+/// Measured duration of a telegram of the stream. A busy host measures too long a time but never too short, so the
+/// minimum of several telegrams is used.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct TelegramTiming {
     pub(crate) duration: Option<Nanos>,
-    /// Minimum duration of the last `counted` telegrams.
+    /// Minimum duration of the last `measured_telegrams` telegrams.
     min_duration: Nanos,
     measured_telegrams: u32,
-    /// Arrival of the first byte of the telegram that is arriving.
+    /// Arrival of the first byte of the current telegram; `None` after the last sleep for it.
     first: Option<Nanos>,
     /// Minimum number of reads per telegram.
     partial_reads: u8,
     lead: WakeLead,
-    /// Reads since the sleep that ended shortly before the end of the telegram. `None` before that sleep.
+    /// Number of reads with bytes since the sleep for the end of the telegram. `None` before that sleep.
     reads_near_end: Option<u32>,
 }
 
@@ -166,25 +169,26 @@ impl TelegramTiming {
         }
     }
 
-    /// Sets the number of reads per telegram, at equal distances; 0 is 1.
+    /// Sets the number of reads per telegram, evenly spaced. 0 counts as 1.
     pub(crate) fn set_partial_reads(&mut self, partial_reads: u8) {
         self.partial_reads = partial_reads.max(1);
     }
 
-    /// Handles the arrival of the first byte of a telegram.
+    /// Records the arrival of the first byte of a telegram.
     pub(crate) fn begin_telegram(&mut self, first: Nanos) {
         self.first = Some(first);
     }
 
-    /// Handles a read that returned bytes.
+    /// Counts a read that returned bytes.
     pub(crate) fn count_read(&mut self) {
         if let Some(reads) = &mut self.reads_near_end {
             *reads += 1;
         }
     }
 
-    /// Returns the time until which the host can sleep: to the next piece, or to the end of the telegram. Only once for
-    /// each.
+    /// Returns the time until which the host can sleep: up to the next partial read, or up to shortly before the end of
+    /// the telegram. Returns `None` if the duration is unknown, if the sleep would be too short, or if the sleep for
+    /// the end was already returned.
     pub(crate) fn sleep_until(&mut self, now: Nanos) -> Option<Nanos> {
         let (first, duration) = (self.first?, self.duration?);
         let end = first + duration.checked_sub(self.lead.nanos())?;
@@ -201,7 +205,7 @@ impl TelegramTiming {
         pays_off.then_some(until)
     }
 
-    /// Handles a complete telegram with the given duration from its first to its last byte.
+    /// Records a complete telegram that took `elapsed` ns from its first to its last byte.
     pub(crate) fn end_telegram(&mut self, elapsed: Nanos) {
         self.first = None;
         if let Some(reads) = self.reads_near_end.take() {
@@ -218,32 +222,33 @@ impl TelegramTiming {
         }
     }
 
-    /// Discards the arrival of the first byte.
+    /// Discards the current telegram.
     pub(crate) fn reset(&mut self) {
         self.first = None;
         self.reads_near_end = None;
     }
 
-    /// Returns whether the duration `took` is unusually long.
+    /// Returns whether a telegram that took `elapsed` ns was unusually slow.
     pub(crate) fn is_slow(&self, elapsed: Nanos) -> bool {
         self.duration.is_some_and(|duration| elapsed > duration + SLOW_TOLERANCE)
     }
 }
 
-/// Time between the end of the host's sleep and the expected end of a telegram. It adapts to the lateness of sleeps and to
-/// the chunks of the line. The sleep should end between the last two chunks of a telegram, so that the host waits once.
+/// Time between the end of the host's sleep and the expected end of a telegram. The sleep should end between the last
+/// two chunks of a telegram, so that the host has to wait only once more. The lead therefore adapts to the lateness of
+/// the host's sleeps and to the chunks of the line.
 #[derive(Clone, Copy, Debug)]
 pub struct WakeLead(Nanos);
 
 impl WakeLead {
-    /// One or two chunks of 16 bytes at 500,000 baud.
+    /// Maximum lead, and the first value: one or two chunks of 16 bytes at 500,000 baud.
     const MAX: Nanos = 600 * MICROS;
-    /// The sleeps of an idle host are late by 50 to 100 us.
+    /// Minimum lead. The sleeps of an idle host end 50 to 100 us late.
     const MIN: Nanos = 100 * MICROS;
     /// Increase after a sleep that ended too late.
     const INCREASE: Nanos = 80 * MICROS;
-    /// Decrease after a telegram for which the host had to wait twice. It is a fraction of [`INCREASE`](Self::RISE), so that
-    /// few telegrams are late.
+    /// Decrease after a telegram for which the host had to wait at least twice after the sleep. It is a fraction of
+    /// [`INCREASE`](Self::INCREASE), so that few sleeps end too late.
     const DECREASE: Nanos = 5 * MICROS;
 
     /// Returns the lead in ns.
@@ -251,8 +256,8 @@ impl WakeLead {
         self.0
     }
 
-    /// Handles a complete telegram. `reads` is the number of reads that returned bytes after the sleep. If it is 1, the
-    /// telegram was complete before the sleep ended.
+    /// Adapts the lead after a complete telegram. `reads` is the number of reads with bytes after the sleep. If it is
+    /// 1, the telegram was already complete when the sleep ended.
     pub fn adapt(&mut self, reads: u32) {
         match reads {
             1 => self.0 = (self.0 + WakeLead::INCREASE).min(WakeLead::MAX),
@@ -268,22 +273,22 @@ impl Default for WakeLead {
     }
 }
 
-/// With more bytes than this after a byte in the same read, its stamp is an estimate. An adapter's chunk has 62.
+/// Maximum number of later bytes in the same read for which a stamp is exact. A chunk of a USB adapter has 62 bytes.
 const MAX_EXACT_BYTES: usize = 64;
-/// After this time without bytes, longer than any sleep at the highest rate, the host was stopped or starved, or the
-/// line was.
+/// Minimum time without bytes, after which a large read is a backlog. It is longer than any sleep at the highest rate,
+/// so the host or the line was stopped.
 const STALL_THRESHOLD: Nanos = 50 * MILLIS;
-/// After this time with no more bytes than the line can carry, the backlog ends. It is shorter than a telegram, and
-/// longer than the kernel needs to move bytes from one buffer to the next.
+/// Time without a surplus of bytes that ends a backlog. It is shorter than a telegram, and longer than the kernel needs
+/// to move bytes from one buffer to the next.
 const BACKLOG_END_TIME: Nanos = 12 * MILLIS;
 /// Minimum sleep. A shorter one is not worth the system call.
 const MIN_SLEEP: Nanos = 500 * MICROS;
-/// Number of telegrams before the first sleep.
+/// Number of telegrams that are measured before the first sleep.
 const LEARNING_TELEGRAMS: u32 = 3;
-/// Number of telegrams whose minimum counts from then on. A telegram during which the host slept too long measures at
-/// most the sleep, so the sleep becomes shorter.
+/// Number of telegrams per minimum after that. A telegram during which the host sleeps too long measures at most the
+/// sleep, so the sleeps become shorter again.
 const WINDOW_TELEGRAMS: u32 = 16;
-/// A telegram that takes longer than usual by more than this is suspect (framing: quality, reason 4).
+/// A telegram that takes longer than usual by more than this time is suspect (framing: quality, reason 4).
 const SLOW_TOLERANCE: Nanos = 8 * MILLIS;
 
 #[cfg(test)]
@@ -304,17 +309,17 @@ mod tests {
         assert_eq!(seen(&arrivals, 0), (1_000_000 - 15 * 20_000, false));
         assert_eq!(seen(&arrivals, 499), (11_000_000, false));
         assert_eq!(seen(&arrivals, 16), (11_000_000 - 483 * 20_000, true));
-        // Two reads of buffered bytes. The line was not faster.
+        // Two reads of buffered bytes arrive faster than the line can carry them.
         arrivals.note_read(11_010_000, 500, Some(500_000));
         assert_eq!(seen(&arrivals, 499), (11_010_000 - 500 * 20_000, true));
-        // A jitter of some microseconds changes nothing.
+        // A jitter of some microseconds does not make a stamp an estimate.
         arrivals.note_read(31_000_000, 16, Some(500_000));
         arrivals.note_read(31_300_000, 16, Some(500_000));
         assert_eq!(seen(&arrivals, 1_015), (30_980_000, false));
         for _ in 0..200 {
             arrivals.note_read(40_000_000, 1, Some(500_000));
         }
-        // The byte is older than the stored reads.
+        // The byte is older than all stored reads.
         assert!(arrivals.stamp(0, 500_000).estimated);
     }
 
@@ -322,11 +327,11 @@ mod tests {
     fn backlogged_bytes_are_not_stamped_as_new() {
         let mut arrivals = ArrivalEstimator::new(0);
         arrivals.note_read(1_000 * MILLIS, 16, Some(500_000));
-        // Two seconds later, as fast as they can be read, and then as they arrive.
+        // After two seconds, the backlog is read as fast as possible. New bytes follow.
         for read in 0..4 {
             arrivals.note_read(3_000 * MILLIS + read * 100_000, 1_600, Some(500_000));
         }
-        // The kernel moves the rest a little later. Then new bytes arrive.
+        // The kernel moves the rest of the backlog a little later. Then new bytes arrive.
         arrivals.note_read(3_002 * MILLIS, 50, Some(500_000));
         arrivals.note_read(3_002 * MILLIS + 50_000, 1_550, Some(500_000));
         arrivals.note_read(3_010 * MILLIS, 16, Some(500_000));
@@ -337,7 +342,7 @@ mod tests {
             assert_eq!(seen(&arrivals, 16 + byte), (at, true));
         }
         assert_eq!(seen(&arrivals, 8_031), (3_010 * MILLIS, false));
-        // A silent line is read in time. A slow one has kept its pace while the host slept.
+        // A silent line was read in time. A slow line kept its rate while the host slept.
         arrivals.note_read(5_000 * MILLIS, 62, Some(500_000));
         assert_eq!(seen(&arrivals, 8_109), (5_000 * MILLIS, false));
         arrivals.note_read(5_762 * MILLIS, 730, Some(9600));
@@ -386,7 +391,7 @@ mod tests {
         assert_eq!(rhythm.sleep_until(100_000_000), Some(117_400_000));
         assert_eq!(rhythm.sleep_until(117_400_000), None, "once per telegram");
         assert!(rhythm.is_slow(26_000_001) && !rhythm.is_slow(26_000_000));
-        // All of them were complete before the host read, so it reads earlier from then on.
+        // All of these telegrams were complete before the host read, so the lead grows.
         for _ in 0..16 {
             rhythm.end_telegram(17_500_000);
         }
@@ -394,9 +399,9 @@ mod tests {
         assert_eq!(rhythm.sleep_until(200_000_000), Some(216_900_000));
     }
 
-    /// Plays 400 telegrams of 18 ms that arrive in chunks of `chunk`, to a host whose sleeps are late by up to `lateness`.
-    /// Returns the average number of reads after the sleep in the last 200 of them, and how many were complete before
-    /// it ended.
+    /// Simulates 400 telegrams of 18 ms that arrive in chunks of `chunk` ns, on a host whose sleeps are late by up to
+    /// `lateness` ns. For the last 200 telegrams, returns the average number of reads after the sleep, and the number
+    /// of telegrams that were complete before the sleep ended.
     fn play(chunk: Nanos, lateness: Nanos) -> (f64, u32) {
         const DURATION: Nanos = 18 * MILLIS;
         let mut rhythm = TelegramTiming::new();
@@ -432,7 +437,7 @@ mod tests {
             );
             assert!(late <= 20, "{chunk} us, {lateness} us: {late} of 200 late");
         }
-        // Sleeps that are late by more than a chunk leave two chunks, or are too late.
+        // Sleeps that are late by more than a chunk either leave two chunks or end too late.
         let (reads, late) = play(320 * MICROS, 500 * MICROS);
         assert!(reads < 2.5 && late <= 40, "{reads} reads, {late} late");
     }
@@ -453,7 +458,7 @@ mod tests {
             Some(117_400_000),
             "a late host skips pieces that have arrived"
         );
-        // With 200 pieces, the last one would be at the end.
+        // With 200 reads per telegram, the last one would be at the end.
         rhythm.set_partial_reads(200);
         rhythm.begin_telegram(0);
         let looks = core::iter::successors(rhythm.sleep_until(0), |&at| rhythm.sleep_until(at)).count();

@@ -1,21 +1,23 @@
-//! Requests whose effect ends with a power cycle, and the parameters that several of them share. Hosts encode requests. The
-//! simulator, and the verbs that explain telegrams, decode them. Requests that write the EEPROM are in `lms_configure`, so
-//! code that has only a [`Request`] cannot write it.
+//! Requests of the LMS whose effect ends with a power cycle, and their parameters. The hub encodes them. The simulator,
+//! and the verbs that explain telegrams, decode them.
+//!
+//! Requests that write the EEPROM are in `lms_configure`, so code that has only a [`Request`] cannot write it.
 
 use crate::lms::operating::{self, Operating};
 use crate::lms::telegram::{EncodedTelegram, Telegram, Writer};
 use crate::lms::variant::{Baud, Variant};
 
-/// Part of a request: encoded after the command, and decoded from the data.
+/// A parameter of a request.
 pub(crate) trait Parameter: Sized {
-    /// Decodes it from the beginning of `data`. Returns it with the rest.
+    /// Decodes the parameter at the beginning of `data`, and returns it with the rest.
     fn read(data: &[u8]) -> Option<(Self, &[u8])>;
 
-    /// Appends it to a telegram.
+    /// Appends the parameter to a telegram.
     fn write(self, writer: Writer) -> Writer;
 }
 
-/// Declares requests, each with its parameters, its code, and the byte that follows the code if it is always the same.
+/// Declares an enum of requests. Each has parameters, a command code, and a mode byte after the code if the request
+/// always has the same one.
 macro_rules! requests {
     ($(#[$doc:meta])* $Enum:ident by $code_of:ident {
         $($(#[doc = $text:literal])+ $Name:ident $(($($field:ident: $Type:ty),+))? = $code:tt $(+ $after:path)?,)+
@@ -27,7 +29,7 @@ macro_rules! requests {
         }
 
         impl $Enum {
-            /// Returns its code.
+            /// Returns the command code.
             pub fn $code_of(self) -> u8 {
                 match self { $($Enum::$Name { .. } => $code,)+ }
             }
@@ -43,7 +45,7 @@ macro_rules! requests {
                 }
             }
 
-            /// Returns the request with this `code` whose parameters are exactly `data`.
+            /// Returns the request with this `code` whose parameters use all of `data`.
             fn read_parameters(code: u8, data: &[u8]) -> Option<$Enum> {
                 $(if code == $code {
                     let read = || {
@@ -63,54 +65,54 @@ macro_rules! requests {
 pub(crate) use requests;
 
 requests! {
-    /// A request that is forgotten at power-off.
+    /// A request whose effect ends with a power cycle.
     Request by command {
-        /// 10h: restart, as after power-on; clears the fault memory.
+        /// 10h: restart, as after power-on. Clears the error memory.
         Reset = RESET,
-        /// 20h 24h: send all values of every scan from now on.
+        /// 20h 24h: send all values of every scan continuously.
         Stream = MODE + operating::STREAM,
-        /// 20h 25h: values on request only; so this is the stop command, and the way out of installation mode.
+        /// 20h 25h: send values only on request. This stops a stream and ends installation mode.
         Stop = MODE + operating::ON_REQUEST,
-        /// 20h 40h, 41h, 42h, 48h: change the rate of the line; acknowledged at the old one, forgotten at power-off.
+        /// 20h 40h, 41h, 42h, 48h: change the baud rate until power-off. The scanner replies at the old rate.
         Baud(baud: Baud) = MODE,
-        /// 20h with any other mode.
+        /// 20h with any other operating mode.
         Operate(operating: Operating) = MODE,
-        /// 30h: one telegram of values, selected by the byte (Telegram listing 7-14): 1 all, 2 vertical minimum, 3 taught,
-        /// 6 every second, 7 every twentieth, 8 the current partial scan.
+        /// 30h: one telegram of values, selected by the byte (Telegram listing 7-14): 1 all, 2 vertical minimum, 3
+        /// taught, 6 every second, 7 every twentieth, 8 the current partial scan.
         Values(number: u8) = VALUES,
-        /// 31h: status of the sensor; the reply is [`crate::lms::reply::Reply::Status`].
+        /// 31h: status of the scanner. The reply is [`crate::lms::reply::Reply::Status`].
         Status = STATUS,
         /// 32h: present and past errors.
         Errors = ERRORS,
-        /// 35h: hours and power-ons; LMS 211, 221 and 291 only.
+        /// 35h: hours of operation and power-ons; LMS 211, 221 and 291 only.
         Counters = COUNTERS,
         /// 36h: mean values of this number of scans, 2 to 250.
         Means(number: u8) = MEANS,
-        /// 37h: values of a sub-range; bit 15 of its first asks for direct output of a partial scan.
+        /// 37h: values of a sub-range. Bit 15 of the first index requests direct output of a partial scan.
         Range(span: SubRange) = RANGE,
         /// 3Ah: type and firmware.
         Type = TYPE,
-        /// 3Bh: switch angle and resolution; forgotten at power-off.
+        /// 3Bh: change the scan angle and the resolution until power-off.
         Variant(variant: Variant) = VARIANT,
-        /// 3Eh: values of a sub-range with those of the fields A, B and C; at most 100.
+        /// 3Eh: values of a sub-range, with the borders of the fields A, B and C; at most 100 beams.
         RangeFields(span: SubRange) = RANGE_FIELDS,
         /// 3Fh: mean values of this number of scans in a sub-range.
         RangeMeans(number: u8, span: SubRange) = RANGE_MEANS,
-        /// 41h: switch the set of fields. Its parameters are not decoded.
+        /// 41h: select the set of fields. The parameters are not decoded.
         FieldSet(raw: RawParameters) = FIELD_SET,
-        /// 44h: all ranges, and the reflectivity of a sub-range; LMS S14 only.
+        /// 44h: all ranges, and the reflectivity of a sub-range; version S14 only.
         Reflectivity(span: SubRange) = REFLECTIVITY,
-        /// 45h: read a field. Its parameters are not decoded.
+        /// 45h: read a field. The parameters are not decoded.
         Field(raw: RawParameters) = FIELD,
         /// 4Ah: state of the field outputs.
         Outputs = OUTPUTS,
-        /// 69h: the ranges of the positioning aid.
+        /// 69h: ranges of the positioning aid.
         Positioning = POSITIONING,
         /// 74h: first part of the configuration, with unit and measuring mode.
         Configuration = CONFIGURATION,
         /// 75h: ranges and reflectivities of one to five sub-ranges.
         Reflectivities(spans: SubRanges) = REFLECTIVITIES,
-        /// 76h: a sub-range as Cartesian coordinates, at most 200.
+        /// 76h: a sub-range as Cartesian coordinates, at most 200 points.
         Cartesian(span: SubRange) = CARTESIAN,
         /// 7Bh: second part of the configuration.
         Configuration2 = CONFIGURATION_2,
@@ -118,13 +120,13 @@ requests! {
 }
 
 impl Request {
-    /// Returns the telegram with this request for the scanner at `address`; 0 is for all.
+    /// Returns the telegram that sends this request to the scanner at `address`. Address 0 reaches every scanner.
     pub fn encode(self, address: u8) -> EncodedTelegram {
         self.write_parameters(Writer::new(address, self.command())).finish()
     }
 
-    /// Returns the request in `telegram`. `None` if it is a reply, unknown, a request that writes the EEPROM, or has invalid
-    /// parameters.
+    /// Returns the request in `telegram`. Returns `None` for a reply, an unknown command, a request that writes the
+    /// EEPROM, or invalid parameters.
     pub fn decode(telegram: Telegram<'_>) -> Option<Request> {
         if telegram.is_reply() {
             return None;
@@ -132,66 +134,66 @@ impl Request {
         Request::read_parameters(telegram.command(), telegram.data())
     }
 
-    /// Returns the request for installation mode, with its `password`. [`Request::Stop`] ends that mode.
+    /// Returns the request that enters installation mode with `password`. [`Request::Stop`] ends that mode.
     pub fn install(password: Password) -> Request {
         Request::Operate(Operating::Installation(password))
     }
 }
 
-/// Command: restart.
+/// Command byte: restart.
 pub const RESET: u8 = 0x10;
-/// Command: change the operating mode.
+/// Command byte: change the operating mode.
 pub const MODE: u8 = 0x20;
-/// Command: values, once.
+/// Command byte: request values once.
 pub const VALUES: u8 = 0x30;
-/// Command: status.
+/// Command byte: request the status.
 pub const STATUS: u8 = 0x31;
-/// Command: errors.
+/// Command byte: request the errors.
 pub const ERRORS: u8 = 0x32;
-/// Command: operating data counters.
+/// Command byte: request the operating data counters.
 pub const COUNTERS: u8 = 0x35;
-/// Command: mean values.
+/// Command byte: request mean values.
 pub const MEANS: u8 = 0x36;
-/// Command: values of a sub-range.
+/// Command byte: request the values of a sub-range.
 pub const RANGE: u8 = 0x37;
-/// Command: type.
+/// Command byte: request type and firmware.
 pub const TYPE: u8 = 0x3A;
-/// Command: switch the variant.
+/// Command byte: change the variant.
 pub const VARIANT: u8 = 0x3B;
-/// Command: values of a sub-range with field values.
+/// Command byte: request the values of a sub-range with field values.
 pub const RANGE_FIELDS: u8 = 0x3E;
-/// Command: mean values of a sub-range.
+/// Command byte: request the mean values of a sub-range.
 pub const RANGE_MEANS: u8 = 0x3F;
-/// Command: switch the set of fields.
+/// Command byte: select the set of fields.
 pub const FIELD_SET: u8 = 0x41;
-/// Command: ranges, and reflectivities of a sub-range.
+/// Command byte: request ranges, and the reflectivities of a sub-range.
 pub const REFLECTIVITY: u8 = 0x44;
-/// Command: read a field.
+/// Command byte: read a field.
 pub const FIELD: u8 = 0x45;
-/// Command: state of the outputs.
+/// Command byte: request the state of the field outputs.
 pub const OUTPUTS: u8 = 0x4A;
-/// Command: positioning aid.
+/// Command byte: request the ranges of the positioning aid.
 pub const POSITIONING: u8 = 0x69;
-/// Command: read the configuration.
+/// Command byte: read the first part of the configuration.
 pub const CONFIGURATION: u8 = 0x74;
-/// Command: ranges and reflectivities of sub-ranges.
+/// Command byte: request the ranges and reflectivities of sub-ranges.
 pub const REFLECTIVITIES: u8 = 0x75;
-/// Command: Cartesian coordinates.
+/// Command byte: request Cartesian coordinates.
 pub const CARTESIAN: u8 = 0x76;
-/// Command: read the second part of the configuration.
+/// Command byte: read the second part of the configuration.
 pub const CONFIGURATION_2: u8 = 0x7B;
 
-/// Commands that write the sensor's EEPROM: fields, password, taught fields, permanent rate, configuration parts 1 and 2
-/// (Telegram listing 7-1: those that need the installation mode). They are written by `lms_configure`, never a
+/// Commands that write the scanner's EEPROM: fields, password, taught fields, permanent baud rate, configuration parts
+/// 1 and 2 (Telegram listing 7-1: those that need the installation mode). Only `lms_configure` encodes them; none is a
 /// [`Request`].
 pub const EEPROM_WRITES: [u8; 6] = [0x40, 0x42, 0x46, 0x66, 0x77, 0x7C];
 
-/// A sub-range of the values, both ends included, counted from 1.
+/// A sub-range of the values. Indices are counted from 1, and both ends are included.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct SubRange {
-    /// The first value.
+    /// Index of the first value.
     pub first: u16,
-    /// The last value.
+    /// Index of the last value.
     pub last: u16,
 }
 
@@ -235,10 +237,10 @@ pub struct SubRanges {
 }
 
 impl SubRanges {
-    /// Maximum number in a telegram (Telegram listing, 75h).
+    /// Maximum number of sub-ranges in a telegram (Telegram listing, 75h).
     pub const MAX: usize = 5;
 
-    /// Creates the list. `None` if it is empty, or has more than five sub-ranges.
+    /// Creates the list. Returns `None` if `spans` is empty or has more than five sub-ranges.
     pub fn new(spans: &[SubRange]) -> Option<SubRanges> {
         if spans.is_empty() {
             return None;
@@ -301,7 +303,7 @@ impl Parameter for Variant {
     }
 }
 
-/// Parameters without a known layout: at most sixteen bytes, unchanged.
+/// Parameters without a known layout: at most sixteen bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct RawParameters {
     bytes: [u8; RawParameters::MAX],
@@ -312,7 +314,7 @@ impl RawParameters {
     /// Maximum length in bytes.
     pub const MAX: usize = 16;
 
-    /// Copies `bytes`. `None` if they are longer than [`RawParameters::MAX`].
+    /// Copies `bytes`. Returns `None` if there are more than [`RawParameters::MAX`].
     pub fn new(bytes: &[u8]) -> Option<RawParameters> {
         let mut kept = [0; RawParameters::MAX];
         kept.get_mut(..bytes.len())?.copy_from_slice(bytes);

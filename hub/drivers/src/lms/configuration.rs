@@ -1,45 +1,46 @@
-//! The first part of a sensor's configuration, which 74h reads and 77h writes: 34 bytes, 32 with older firmware
+//! The first part of a scanner's configuration, which 74h reads and 77h writes: 34 bytes, or 32 with older firmware
 //! (Telegram listing, 77h blocks A to P).
 
 use crate::lms::variant::{Mode, Unit};
 
-/// Data of a configuration, as the sensor keeps them.
+/// Bytes of a configuration, in the scanner's layout.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Configuration<'a>(&'a [u8]);
 
 impl<'a> Configuration<'a> {
-    /// The configuration that `bytes` are; `None` if they are fewer than 32.
+    /// Returns the configuration in `bytes`, or `None` if there are fewer than 32.
     pub fn new(bytes: &'a [u8]) -> Option<Configuration<'a>> {
         (bytes.len() >= OLD_CONFIGURATION_LEN).then_some(Configuration(bytes))
     }
 
-    /// The bytes as the sensor keeps them.
+    /// Returns the bytes in the scanner's layout.
     pub fn bytes(&self) -> &'a [u8] {
         self.0
     }
 
-    /// Bit 0 availability level 3, bit 1 real-time indices, bit 2 availability level 2.
+    /// Returns the availability byte: bit 0 is availability level 3, bit 1 real-time indices, bit 2 availability level
+    /// 2.
     pub fn availability(&self) -> u8 {
         self.0[4]
     }
 
-    /// Whether telegrams of values end with two indices.
+    /// Returns whether telegrams of values end with the two real-time indices.
     pub fn has_indices(&self) -> bool {
         self.availability() & REAL_TIME_INDICES != 0
     }
 
-    /// How values are split.
+    /// Returns the measuring mode, which defines how a value is split into range and upper bits.
     pub fn mode(&self) -> Mode {
         Mode(self.0[5])
     }
 
-    /// Unit of the ranges; `None` for an unknown code.
+    /// Returns the unit of the ranges, or `None` for an unknown code.
     pub fn unit(&self) -> Option<Unit> {
         Unit::of_code(self.0[6])
     }
 }
 
-/// A factory-new configuration with this measuring mode and unit.
+/// Returns the configuration of a factory-new scanner, with this measuring mode and unit.
 pub fn factory_configuration(mode: Mode, unit: Unit) -> [u8; CONFIGURATION_LEN] {
     let mut bytes = [0; CONFIGURATION_LEN];
     bytes[2] = 0x70;
@@ -51,18 +52,18 @@ pub fn factory_configuration(mode: Mode, unit: Unit) -> [u8; CONFIGURATION_LEN] 
     bytes
 }
 
-/// One value of the configuration: where it is and what it is.
+/// Location and name of one value of the configuration.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Item {
-    /// Its first byte.
+    /// Index of its first byte.
     pub at: usize,
-    /// Its bytes: one, or two for a word.
+    /// Number of its bytes: 1, or 2 for a word.
     pub len: usize,
-    /// Its name.
+    /// Name for users.
     pub name: &'static str,
 }
 
-/// All values in their order, without gaps.
+/// All values of a configuration, in their order and without gaps.
 pub const ITEMS: [Item; 31] = {
     const fn byte(at: usize, name: &'static str) -> Item {
         Item { at, len: 1, name }
@@ -105,7 +106,7 @@ pub const ITEMS: [Item; 31] = {
     ]
 };
 
-/// What availability byte `byte` sets.
+/// Returns the meaning of the availability byte `byte` as text.
 pub fn availability_text(byte: u8) -> &'static str {
     match byte & 7 {
         0 => "level 1",
@@ -119,11 +120,11 @@ pub fn availability_text(byte: u8) -> &'static str {
     }
 }
 
-/// Bytes of a configuration.
+/// Number of bytes of a configuration.
 pub const CONFIGURATION_LEN: usize = 34;
-/// Bytes with older firmware.
+/// Number of bytes of a configuration with older firmware.
 pub const OLD_CONFIGURATION_LEN: usize = 32;
-/// Bit of the availability byte: telegrams of values carry indices.
+/// Bit of the availability byte that makes telegrams of values end with the two real-time indices.
 pub const REAL_TIME_INDICES: u8 = 2;
 
 #[cfg(test)]

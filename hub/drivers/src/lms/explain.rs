@@ -1,8 +1,9 @@
-//! Explains a telegram: every byte belongs to a field, and every field has a name, a value and, if it needs them, words.
+//! Explanation of a telegram as a list of fields that covers every byte. A field has a name, a value and, if needed,
+//! its meaning as text.
 //!
-//! [`explain`] shows the fields one after the other to a visitor, so nothing is allocated. [`Headline`] is the telegram in one
-//! line. The layouts are those of the Telegram listing, chapter 7. Requests that write the EEPROM are explained here, but never
-//! made.
+//! [`explain`] passes one field after the other to a callback and allocates nothing. [`Headline`] is the telegram in
+//! one line. The layouts are from the Telegram listing, chapter 7. Requests that write the EEPROM are explained here
+//! but encoded in `lms_configure`.
 
 use core::fmt::{self, Display};
 
@@ -41,36 +42,36 @@ pub enum Value<'a> {
     Text(&'a [u8]),
     /// Bytes without a layout.
     Bytes(&'a [u8]),
-    /// Rows of words, a word for each column.
+    /// Rows of words, with one word per column.
     Rows {
-        /// All rows.
+        /// Bytes of all rows.
         bytes: &'a [u8],
-        /// Names of the words of a row.
+        /// Names of the columns.
         columns: &'static [&'static str],
     },
     /// Measured values.
     Ranges(Ranges<'a>),
 }
 
-/// Measured values with what is needed to read them.
+/// Measured values with the settings that are needed to decode them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Ranges<'a> {
     bytes: &'a [u8],
-    /// Mode, which defines how a value is split.
+    /// Measuring mode, which defines how a value is split into range and upper bits.
     pub mode: Mode,
-    /// Whether the mode is known. Otherwise, it is assumed.
+    /// Whether the mode is known. If not, the lower 13 bits are assumed to be the range.
     pub mode_known: bool,
     /// Unit of the ranges.
     pub unit: Unit,
 }
 
 impl<'a> Ranges<'a> {
-    /// Returns the value words unchanged.
+    /// Returns the words of the values as sent.
     pub fn raw(&self) -> impl ExactSizeIterator<Item = u16> + 'a {
         self.bytes.chunks_exact(2).map(|pair| u16::from_le_bytes([pair[0], pair[1]]))
     }
 
-    /// Returns the range of each value in millimeters, or the code that says why it has none.
+    /// Returns the range of each value in millimeters, or the code that says why there is none.
     pub fn millimeters(&self) -> impl ExactSizeIterator<Item = Result<u32, crate::lms::variant::Code>> + 'a {
         let (mode, mm) = (self.mode, u32::from(self.unit.mm()));
         self.raw().map(move |word| mode.split(word).range.map(|range| u32::from(range) * mm))
@@ -107,7 +108,7 @@ impl fmt::Display for Ranges<'_> {
     }
 }
 
-/// A telegram in one line: its direction, its command, and the most important of its contents.
+/// Display of a telegram in one line: its direction, its command and the most important contents.
 #[derive(Clone, Copy, Debug)]
 pub struct Headline<'a>(pub Telegram<'a>);
 
@@ -198,10 +199,10 @@ fn write_measured(f: &mut fmt::Formatter<'_>, values: MeasuredValues<'_>) -> fmt
     }
 }
 
-/// Shows the fields of `telegram` to `visit`, from STX to the checksum, without a gap.
+/// Passes each field of `telegram` to `visit`, from STX to the checksum, without gaps.
 ///
-/// `mode` defines how the scanner splits its values, which a telegram of values does not state. Without it, the lower 13 bits
-/// count as the range.
+/// `mode` defines how a value is split into range and upper bits. A telegram of values does not contain the mode.
+/// Without it, the lower 13 bits are assumed to be the range.
 pub fn explain(telegram: Telegram<'_>, mode: Option<Mode>, visit: &mut dyn FnMut(&Field<'_>)) {
     let mut reader = FieldReader::new(telegram.bytes(), visit);
     // A telegram that is shorter than its layout ends early. The rest is shown as bytes.
@@ -231,7 +232,8 @@ fn fields(reader: &mut FieldReader<'_, '_>, telegram: Telegram<'_>, mode: Option
     if telegram.is_reply() { reply_fields(reader, telegram, mode) } else { request_fields(reader, telegram) }
 }
 
-/// Returns the name of `command` (Telegram listing, table 7-1), for a reply that of the request. `None` if it is unknown.
+/// Returns the name of `command` (Telegram listing, table 7-1), or `None` if it is unknown. The name of most replies is
+/// that of the request.
 pub fn name(command: u8, is_reply: bool) -> Option<&'static str> {
     if !is_reply {
         return request_name(command);
@@ -293,7 +295,7 @@ fn request_name(command: u8) -> Option<&'static str> {
     })
 }
 
-/// Shows the parameters of a request. Those without a layout here are left for the caller.
+/// Reads the parameters of a request. Parameters without a known layout are left to the caller.
 fn request_fields(reader: &mut FieldReader<'_, '_>, telegram: Telegram<'_>) -> Option<()> {
     match telegram.command() {
         MODE => mode_fields(reader),
@@ -379,7 +381,7 @@ const WRITE_CONFIGURATION: u8 = 0x77;
 /// Bit of the first value of a sub-range: direct output of a partial scan.
 const DIRECT: u16 = 1 << 15;
 
-/// Shows the data of a reply. Data without a layout here is left for the caller.
+/// Reads the data of a reply. Data without a known layout are left to the caller.
 fn reply_fields(reader: &mut FieldReader<'_, '_>, telegram: Telegram<'_>, mode: Option<Mode>) -> Option<()> {
     match telegram.command() {
         RESET | REFUSED => Some(()),
@@ -438,7 +440,7 @@ fn reply_fields(reader: &mut FieldReader<'_, '_>, telegram: Telegram<'_>, mode: 
     }
 }
 
-/// Shows count word, values, and the two indices if they are present.
+/// Reads the count word, the values, and the two indices if they are present.
 fn values(reader: &mut FieldReader<'_, '_>, mode: Option<Mode>) -> Option<()> {
     let (count, unit) = counted(reader)?;
     ranges(reader, count, unit, mode)?;
@@ -525,7 +527,7 @@ fn status_fields(reader: &mut FieldReader<'_, '_>) -> Option<()> {
     Some(())
 }
 
-/// Shows the configuration, as far as the telegram contains it.
+/// Reads the configuration, up to its end or the end of the data.
 fn configuration_fields(reader: &mut FieldReader<'_, '_>) -> Option<()> {
     for item in configuration::ITEMS {
         if reader.remaining() < item.len {
@@ -580,7 +582,8 @@ fn unit_text(code: u8) -> &'static str {
     Unit::of_code(code).map_or("unknown", unit_name)
 }
 
-/// A walk through the bytes of a telegram. It never steps over the end of the layout, and never leaves a byte out.
+/// Reader that turns the bytes of a telegram into fields. It never reads past the end of the layout and never skips a
+/// byte.
 struct FieldReader<'t, 'v> {
     bytes: &'t [u8],
     at: usize,
@@ -598,7 +601,7 @@ impl<'t, 'v> FieldReader<'t, 'v> {
         self.end = end;
     }
 
-    /// Shows the bytes that have no field yet, up to the last `len` bytes of the telegram, which follow.
+    /// Reports all bytes up to the last `len` bytes of the telegram as one field. The last bytes have their own fields.
     fn show_to_tail(&mut self, len: usize) {
         self.end = self.bytes.len() - len;
         self.show_rest("data");
@@ -626,7 +629,7 @@ impl<'t, 'v> FieldReader<'t, 'v> {
         self.number(name, 2, Some(|value| meaning(value as u16))).map(|value| value as u16)
     }
 
-    /// Shows a number of one to four bytes, the low byte first.
+    /// Reports a number of one to four bytes, low byte first.
     fn number<D: Display>(
         &mut self,
         name: &'static str,
@@ -653,7 +656,7 @@ impl<'t, 'v> FieldReader<'t, 'v> {
         Some(())
     }
 
-    /// Shows all bytes before the end of the layout.
+    /// Reports all bytes before the end of the layout as one field.
     fn show_rest(&mut self, name: &'static str) -> Option<()> {
         self.raw(name, self.remaining())
     }
@@ -664,7 +667,7 @@ impl<'t, 'v> FieldReader<'t, 'v> {
         Some(())
     }
 
-    /// Shows `count` measured values. `make` adds what is needed to read their bytes.
+    /// Reports `count` measured values. `make` adds the settings that are needed to decode their bytes.
     fn ranges(
         &mut self,
         name: &'static str,
@@ -677,7 +680,7 @@ impl<'t, 'v> FieldReader<'t, 'v> {
         Some(())
     }
 
-    /// Shows a field, unless it has no bytes.
+    /// Passes a field to the callback, unless the field is empty.
     fn show(&mut self, field: &Field<'_>) {
         if !field.bytes.is_empty() {
             (self.visit)(field);
@@ -695,7 +698,7 @@ impl<'t, 'v> FieldReader<'t, 'v> {
 /// Text that is written when it is displayed.
 struct LazyText<F>(F);
 
-/// Returns text that `write` writes.
+/// Returns text that calls `write` when it is displayed.
 fn lazy_text<F: Fn(&mut fmt::Formatter<'_>) -> fmt::Result>(write: F) -> LazyText<F> {
     LazyText(write)
 }

@@ -1,12 +1,14 @@
-//! Finds telegrams in a stream that may lack bytes, and never discards an intact one.
+//! Framer that finds telegrams in a stream with missing bytes. It never discards an intact telegram.
 //!
-//! A parser that collects a damaged telegram to its announced length includes the beginning of the next one. So no byte is
-//! discarded here before it was examined: every position with an acceptable header is a *candidate*, and the first
-//! candidate that is complete with a right checksum is the telegram. Because that checksum is weak, such a frame is *held*
-//! while another header begins inside it, or might begin with its last bytes. If that one succeeds, the frame was wrong. A
-//! gap in time may release a held frame, but it never drops a byte.
+//! A parser that collects a damaged telegram up to its announced length also consumes the beginning of the next one.
+//! The framer therefore examines every byte before it discards it. Each position with an acceptable header is a
+//! *candidate*, and the first candidate that is complete with a right checksum is the telegram. Because the checksum is
+//! weak, the framer *holds* such a frame while another header begins inside it, or might begin with its last bytes. If
+//! the inner telegram turns out to be valid, the outer frame was wrong. A pause on the line may release a held frame,
+//! but never discards a byte.
 //!
-//! The counters in [`FramerCounters`] include every byte: always `read == in_telegrams + acknowledge + discarded + buffered`.
+//! [`FramerCounters`] accounts for every byte: `read == in_telegrams + acknowledge + discarded + buffered` always
+//! holds.
 
 use scanhub_schema::{MILLIS, Nanos};
 
@@ -17,52 +19,52 @@ use crate::lms::header::{
 use crate::lms::measured::MEASURED;
 use crate::lms::telegram::{ACK, Checksum, MAX_TELEGRAM, NAK, STX, Telegram};
 
-/// What became of the bytes; every field only grows.
+/// Counters of bytes and telegrams. They only increase.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct FramerCounters {
     /// Bytes committed.
     pub read: u64,
     /// Bytes in delivered telegrams.
     pub in_telegrams: u64,
-    /// ACK and NAK outside telegrams, while a reply was awaited.
+    /// ACK and NAK bytes outside telegrams, while a reply was expected.
     pub acknowledge: u64,
-    /// Bytes that were in nothing.
+    /// Bytes that belong to no telegram or acknowledgement.
     pub discarded: u64,
-    /// Of these the bytes of measured-value telegrams that broke off for a reply.
+    /// Discarded bytes of measured-value telegrams that broke off for a reply. They are included in `discarded`.
     pub broken_off: u64,
     /// Delivered telegrams.
     pub telegrams: u64,
     /// Measured-value telegrams that broke off for a reply.
     pub aborted: u64,
-    /// Delivered telegrams that had to wait for a header inside them to fail.
+    /// Delivered telegrams that were held because another header began inside them.
     pub held: u64,
-    /// Refused start bytes among the discarded, by [`Reject`].
+    /// Start bytes among the discarded bytes, by the reason for their rejection.
     pub rejected: [u64; Reject::COUNT],
 }
 
-/// A telegram as it was found.
+/// A telegram with its position in the stream.
 #[derive(Clone, Copy, Debug)]
 pub struct FramedTelegram<'a> {
-    /// The telegram; it lies in the framer's buffer.
+    /// The telegram, in the framer's buffer.
     pub telegram: Telegram<'a>,
-    /// Number of its first byte among all bytes committed, from 0.
+    /// Offset of its first byte among all bytes committed.
     pub offset: u64,
-    /// Bits of [`suspect`]; 0 is clean.
+    /// Bits of [`suspect`]; 0 if the telegram is clean.
     pub reasons: u8,
 }
 
-/// The bytes of a telegram that has begun, as far as they are there: nothing of them is checked but the header.
+/// The received bytes of an incomplete telegram. Only its header has been checked.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct PartialTelegram<'a> {
-    /// From its start byte on.
+    /// Bytes from the start byte on.
     pub(crate) bytes: &'a [u8],
-    /// Number of its first byte among all bytes committed, from 0.
+    /// Offset of the first byte among all bytes committed.
     pub(crate) offset: u64,
-    /// Bits of [`suspect`] that are known already.
+    /// Bits of [`suspect`] that are already known.
     pub(crate) reasons: u8,
 }
 
-/// What was found next.
+/// Next telegram or acknowledgement in the stream.
 #[derive(Clone, Copy, Debug)]
 pub enum FramerEvent<'a> {
     /// A telegram.
@@ -73,7 +75,7 @@ pub enum FramerEvent<'a> {
     Nak,
 }
 
-/// [`Found`] without the bytes.
+/// [`FramerEvent`] without the bytes.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum FoundItem {
     Telegram(TelegramSpan),
@@ -81,7 +83,7 @@ pub(crate) enum FoundItem {
     Nak,
 }
 
-/// Where in the buffer a telegram lies, until the next bytes come.
+/// Location of a telegram in the buffer, valid until the next bytes are read.
 #[derive(Clone, Copy, Debug)]
 pub struct TelegramSpan {
     at: usize,
@@ -90,24 +92,24 @@ pub struct TelegramSpan {
     reasons: u8,
 }
 
-/// The framer with its buffer of twice the longest telegram.
+/// The framer, with a buffer for two of the longest telegrams.
 #[derive(Clone, Debug)]
 pub struct Framer {
     buffer: [u8; BUFFER_LEN],
-    /// `buffer[start..end]` are the bytes whose fate is open.
+    /// `buffer[start..end]` are the bytes that are neither delivered nor discarded.
     start: usize,
     end: usize,
-    /// Every position before it was judged.
+    /// All positions before it have been checked for a header.
     cursor: usize,
-    /// Positions with an acceptable header whose checksum was not looked at, ascending.
+    /// Positions with an acceptable header whose checksum has not been checked yet, ascending.
     candidates: Candidates,
-    /// A frame with a right checksum that waits for a header inside it.
+    /// A frame with a right checksum that is held because another header may begin inside it.
     held: Option<HeldFrame>,
-    /// Checksum of a candidate that is arriving, and the number of its first byte.
+    /// Checksum of the bytes of a candidate so far, and the offset of the candidate's first byte.
     partial_checksum: (u64, Checksum),
     expect: ExpectedHeaders,
     expects_acknowledge: bool,
-    /// Bytes were discarded since the last telegram.
+    /// Whether bytes were discarded since the last telegram.
     has_damage: bool,
     counters: FramerCounters,
 }
@@ -138,8 +140,8 @@ impl Default for Framer {
 }
 
 impl Framer {
-    /// Room for the next bytes, never empty after [`Framer::poll`] answered `None`: write into its beginning, then
-    /// [`Framer::commit`].
+    /// Returns the space for the next bytes. It is never empty after [`Framer::poll`] returned `None`. Write to its
+    /// beginning, then call [`Framer::commit`].
     pub fn read_buffer(&mut self) -> &mut [u8] {
         if self.start == self.end {
             self.shift(self.start);
@@ -150,24 +152,24 @@ impl Framer {
         &mut self.buffer[self.end..]
     }
 
-    /// The first `len` bytes of [`Framer::read_buffer`] are valid now.
+    /// Adds the first `len` bytes of [`Framer::read_buffer`] to the stream.
     pub fn commit(&mut self, len: usize) {
         self.end += len;
         assert!(self.end <= BUFFER_LEN, "more bytes committed than there was room");
         self.counters.read += len as u64;
     }
 
-    /// What may come from now on. Bytes that were judged stay judged.
+    /// Sets the acceptable headers. Positions that were already checked keep their result.
     pub fn expect(&mut self, expect: ExpectedHeaders) {
         self.expect = expect;
     }
 
-    /// Whether single ACK and NAK bytes may come.
+    /// Sets whether single ACK and NAK bytes are acknowledgements.
     pub fn expect_acknowledge(&mut self, is_expected: bool) {
         self.expects_acknowledge = is_expected;
     }
 
-    /// The next telegram or acknowledgement in the bytes committed so far, or `None` until more come.
+    /// Returns the next telegram or acknowledgement in the committed bytes, or `None` until more bytes arrive.
     pub fn poll(&mut self) -> Option<FramerEvent<'_>> {
         Some(match self.advance()? {
             FoundItem::Telegram(span) => FramerEvent::Telegram(self.telegram_at(span)),
@@ -176,13 +178,13 @@ impl Framer {
         })
     }
 
-    /// The telegram at a span that [`Framer::advance`] answered last.
+    /// Returns the telegram at a span that [`Framer::advance`] returned last.
     pub(crate) fn telegram_at(&self, span: TelegramSpan) -> FramedTelegram<'_> {
         let TelegramSpan { at, end, offset, reasons } = span;
         FramedTelegram { telegram: Telegram::assume_valid(&self.buffer[at..end]), offset, reasons }
     }
 
-    /// As [`Framer::poll`], for a caller who must look at other things between finding and reading.
+    /// Returns the same as [`Framer::poll`], but without a borrow of the buffer.
     pub(crate) fn advance(&mut self) -> Option<FoundItem> {
         loop {
             self.check_headers();
@@ -215,14 +217,16 @@ impl Framer {
         }
     }
 
-    /// How long the line must be idle until [`Framer::release`] may deliver the held frame; `None` if none is held.
+    /// Returns the time without bytes after which [`Framer::release`] delivers the held frame, or `None` if none is
+    /// held.
     pub fn hold(&self) -> Option<Nanos> {
         self.held.map(|held| {
             if self.candidates.has_candidate_before(held.end) { VETO_HOLD_TIME } else { SUFFIX_HOLD_TIME }
         })
     }
 
-    /// A read found nothing, and no byte came for `idle`: gives up waiting for headers inside the held frame.
+    /// Handles a read without bytes, after the line has been idle for `idle` ns. After enough time, headers inside the
+    /// held frame are no longer waited for.
     pub fn release(&mut self, idle: Nanos) {
         if self.hold().is_some_and(|hold| idle >= hold) {
             self.refute_headers_inside();
@@ -230,7 +234,7 @@ impl Framer {
         }
     }
 
-    /// Gives up all bytes that are still open, for example because the line's rate changes.
+    /// Discards all undecided bytes, for example because the baud rate changes.
     pub fn clear(&mut self) {
         self.candidates = Candidates::new();
         self.held = None;
@@ -239,7 +243,7 @@ impl Framer {
         self.has_damage = false;
     }
 
-    /// What the earliest open position waits for, after [`Framer::poll`] answered `None`.
+    /// Returns the next bytes that the earliest candidate needs, after [`Framer::poll`] returned `None`.
     pub fn state(&self) -> State {
         match self.candidates.first() {
             Some(candidate) if self.end + 2 < usize::from(candidate.end) => State::Body,
@@ -251,7 +255,7 @@ impl Framer {
         }
     }
 
-    /// The earliest telegram that has begun and was not delivered, after [`Framer::poll`] answered `None`.
+    /// Returns the earliest telegram that has begun and was not delivered, after [`Framer::poll`] returned `None`.
     pub(crate) fn partial_telegram(&self) -> Option<PartialTelegram<'_>> {
         let held = self.held.map(|held| (held.at, held.end));
         let first_candidate =
@@ -261,17 +265,17 @@ impl Framer {
         Some(PartialTelegram { bytes: &self.buffer[at..end.min(self.end)], offset: self.offset(at), reasons })
     }
 
-    /// What became of the bytes.
+    /// Returns the counters.
     pub fn counters(&self) -> &FramerCounters {
         &self.counters
     }
 
-    /// Bytes whose fate is open.
+    /// Returns the number of bytes that are neither delivered nor discarded.
     pub fn buffered(&self) -> usize {
         self.end - self.start
     }
 
-    /// Returns the number of the byte at `at` among all bytes committed, from 0.
+    /// Returns the offset of the byte at `at` among all bytes committed.
     fn offset(&self, at: usize) -> u64 {
         self.counters.read - (self.end - at) as u64
     }
@@ -293,8 +297,7 @@ impl Framer {
         self.cursor = self.end.max(self.cursor);
     }
 
-    /// Adds the bytes that have arrived to the checksum of the first candidate, so that little is left to do after its last
-    /// byte.
+    /// Adds the received bytes of the first candidate to its checksum, so that little work is left after its last byte.
     fn add_arrived(&mut self) {
         if let Some(first) = self.candidates.first() {
             let (at, end) = (usize::from(first.at), usize::from(first.end));
@@ -304,19 +307,20 @@ impl Framer {
         }
     }
 
-    /// Returns the checksum of the candidate at `at`, which may already include some of its bytes.
+    /// Returns the checksum of the candidate at `at`. It may already include some of the candidate's bytes.
     fn checksum(&self, at: usize) -> Checksum {
         let (offset, checksum) = self.partial_checksum;
         if offset == self.offset(at) { checksum } else { Checksum::default() }
     }
 
-    /// Looks at the checksum of the earliest complete candidate: a wrong one ends it, a right one ends those that
-    /// began before it and the held frame that it began in.
+    /// Checks the checksum of the earliest complete candidate. A wrong checksum removes the candidate. A right one
+    /// removes the candidates that began before it and, if it began inside the held frame, replaces that frame.
     fn complete(&mut self, candidate: Candidate) {
         let (at, end) = (usize::from(candidate.at), usize::from(candidate.end));
         let is_valid = Telegram::check_with(&self.buffer[at..end], self.checksum(at)).is_some();
         match &mut self.held {
-            // What began inside the held frame reaches into this telegram, so it is none.
+            // This telegram begins after the held frame. A candidate inside the held frame would overlap it, so it is
+            // not valid.
             Some(held) if is_valid && held.end <= at => return self.refute_headers_inside(),
             Some(held) => held.header_inside |= at < held.end,
             None => {}
@@ -350,12 +354,12 @@ impl Framer {
         TelegramSpan { at, end, offset: self.offset(at), reasons }
     }
 
-    /// Whatever becomes of `held`, what came before it is in nothing.
+    /// Discards the bytes before `held`, which cannot belong to any telegram.
     fn discard_before(&mut self, held: HeldFrame) {
         self.discard(held.at, Some((self.buffer[held.at + 4], held.end)));
     }
 
-    /// Gives up the bytes before `to`; `winner` is the command of the telegram that begins there, and its end.
+    /// Discards the bytes before `to`. `successor` has the command and the end of the telegram that begins there.
     fn discard(&mut self, to: usize, successor: Option<(u8, usize)>) {
         let is_reply = successor.is_some_and(|(command, _)| command != MEASURED);
         let decided = successor.map_or(self.end, |(_, end)| end);
@@ -376,8 +380,8 @@ impl Framer {
         self.start = to;
     }
 
-    /// Counts why the start byte at `at` was none, as it stood when the bytes before `decided` were there. Whether a scan
-    /// began there that broke off.
+    /// Counts the reason why the start byte at `at` did not become a telegram, as of the moment at which the bytes
+    /// before `decided` had arrived. Returns whether a scan began there and broke off for a reply.
     fn count_rejection(&mut self, at: usize, is_reply: bool, decided: usize) -> bool {
         let reject = match check_header(&self.buffer[at..self.end.min(at + MAX_HEADER_LEN)], &self.expect) {
             HeaderCheck::Refused(reject) => reject,
@@ -398,7 +402,7 @@ impl Framer {
         false
     }
 
-    /// The bytes before `by` are gone from the buffer.
+    /// Adjusts all positions after the first `by` bytes of the buffer were removed.
     fn shift(&mut self, by: usize) {
         self.start -= by;
         self.end -= by;
@@ -411,28 +415,29 @@ impl Framer {
     }
 }
 
-/// Returns the index of the first STX. A block without one is skipped by a single vector comparison.
+/// Returns the index of the first STX. One vector comparison skips a block of 16 bytes without an STX.
 fn find_stx(bytes: &[u8]) -> Option<usize> {
     let is_empty = |block: &&[u8; 16]| !block.iter().fold(false, |any, &byte| any | (byte == STX));
     let skipped = 16 * bytes.as_chunks().0.iter().take_while(is_empty).count();
     bytes[skipped..].iter().position(|&byte| byte == STX).map(|at| skipped + at)
 }
 
-/// A held frame and a header that begins with its last byte must fit.
+/// Length of the buffer: enough for a held frame and a telegram that begins with its last byte.
 pub(crate) const BUFFER_LEN: usize = 2 * MAX_TELEGRAM;
-/// The longest pause inside a telegram (Telegram listing 4.3): a header inside a held frame is given up after it.
+/// Time without bytes after which a header inside a held frame no longer counts: the longest pause inside a telegram
+/// (Telegram listing 4.3).
 pub const VETO_HOLD_TIME: Nanos = 14 * MILLIS;
-/// A frame whose last bytes might begin a header is delivered when nothing followed for so long.
+/// Time without bytes after which a held frame is delivered whose last bytes might begin a header.
 pub const SUFFIX_HOLD_TIME: Nanos = 2 * MILLIS;
 
-/// A position with an acceptable header, and where its telegram would end.
+/// A position with an acceptable header, and the end of its telegram.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Candidate {
     pub(crate) at: u16,
     pub(crate) end: u16,
 }
 
-/// The candidates in a full buffer, ascending by position.
+/// The candidates in the buffer, ascending by position. There is room for as many as a full buffer can contain.
 #[derive(Clone, Debug)]
 pub(crate) struct Candidates {
     list: [Candidate; Candidates::MAX_CANDIDATES],
@@ -459,8 +464,8 @@ impl Candidates {
         self.as_slice().first().copied()
     }
 
-    /// Returns the candidate that is complete first, with bytes up to `end`. If two have the same end, it is the inner
-    /// one, which may refute the outer one.
+    /// Returns the candidate that is complete first, with bytes up to `end`. If two end at the same position, it is the
+    /// inner one, because that one may refute the outer one.
     pub(crate) fn first_complete(&self, end: usize) -> Option<Candidate> {
         let complete = self.as_slice().iter().filter(|candidate| usize::from(candidate.end) <= end);
         complete.copied().min_by_key(|candidate| (candidate.end, core::cmp::Reverse(candidate.at)))

@@ -1,83 +1,83 @@
-//! What may stand at the head of a telegram: the only test that a position in the stream must pass to be watched as
-//! a candidate. Looks at the first 5 or 7 bytes, never at the checksum.
+//! The check of a telegram's header. A position in the stream becomes a candidate only if its header passes this check,
+//! which uses the first 5 or 7 bytes and never the checksum.
 
 use crate::lms::command;
 use crate::lms::measured::MEASURED;
 use crate::lms::telegram::{FRAME_LEN, MAX_LENGTH, REPLY, STX};
 use crate::lms::variant::MAX_BEAMS;
 
-/// What a candidate waits for; the six states of the paper's Fig. 3.
+/// The next bytes that a position in the stream needs: the six states of Fig. 3 of the paper.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum State {
-    /// Nothing yet: the start byte.
+    /// The start byte. No header has begun.
     Stx,
     /// The address.
     Address,
-    /// The low byte of the length, which is not judged alone.
+    /// The low byte of the length. It is checked together with the high byte.
     LengthLow,
     /// The high byte of the length.
     LengthHigh,
-    /// Command, data, status.
+    /// Command, data and status.
     Body,
     /// The two bytes of the checksum.
     Crc,
 }
 
-/// Why a start byte was not, or not the beginning of, a delivered telegram.
+/// Reason why a start byte did not become a delivered telegram.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Reject {
-    /// The address is not one that a sensor sends, or not this sensor's.
+    /// The address is not that of a reply, or not that of this scanner.
     Address,
-    /// The length is beyond [`MAX_LENGTH`], or not the one expected.
+    /// The length exceeds [`MAX_LENGTH`], or is not the expected one.
     Length,
-    /// The command is not that of a reply, or of none that may come.
+    /// The command is not that of a reply, or not that of an expected reply.
     Command,
-    /// The count word does not fit the length, or is not the one expected.
+    /// The count word does not match the length, or is not the expected one.
     Count,
     /// The checksum is wrong.
     Crc,
-    /// The checksum was right, but another telegram with a right checksum began inside.
+    /// The checksum was right, but another telegram with a right checksum began inside this one.
     Vetoed,
     /// Another telegram was complete first.
     Superseded,
 }
 
 impl Reject {
-    /// Number of reasons: the length of a table with a counter for each.
+    /// Number of reasons, and the length of a table with one counter for each.
     pub const COUNT: usize = 7;
 }
 
-/// Seven bytes that begin every measured-value telegram of a stream in a known mode: STX, address, length, command
-/// and count word.
+/// First seven bytes of every measured-value telegram of a stream in a known mode: STX, address, length, command and
+/// count word.
 pub type StreamHeader = [u8; 7];
 
-/// Which headers are acceptable at the moment.
+/// Headers that are acceptable at the moment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ExpectedHeaders {
-    /// Any reply of at most [`MAX_LENGTH`]; a measured-value telegram must have the length that its count asks for.
+    /// Any reply of at most [`MAX_LENGTH`] bytes. The length of a measured-value telegram must match its count.
     Anything,
-    /// A stream in a known mode, and the reply to the request that is open, or its refusal. At any time what a sensor
-    /// says late, twice or after power-on, if it has the length that it always has.
+    /// Telegrams of a stream in a known mode, the reply to the open request, and its refusal. Replies that may arrive
+    /// late, twice or after power-on are always accepted if they have their usual length.
     Stream {
-        /// How each measured-value telegram begins.
+        /// First bytes of each measured-value telegram.
         header: StreamHeader,
-        /// Command byte of the open reply.
+        /// Command byte of the reply to the open request; `None` without such a request.
         reply: Option<u8>,
     },
 }
 
-/// What the first bytes at a position are.
+/// Result of checking the first bytes at a position.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum HeaderCheck {
-    /// The beginning of an acceptable header, which ends before the state that it names.
+    /// The beginning of an acceptable header. The next missing byte is that of the given state.
     Prefix(State),
-    /// A whole acceptable header of a telegram of `len` bytes, STX to checksum.
+    /// A complete, acceptable header of a telegram of `len` bytes from STX to checksum.
     Candidate { len: usize },
     /// Not acceptable.
     Refused(Reject),
 }
 
-/// Judges the header that begins at `bytes[0]`; only as many bytes are looked at as a header has.
+/// Checks the header that begins at `bytes[0]`, which must be STX. Bytes after the header are ignored.
 pub(crate) fn check_header(bytes: &[u8], expect: &ExpectedHeaders) -> HeaderCheck {
     use HeaderCheck::{Candidate, Prefix, Refused};
     let Some(&stx) = bytes.first() else { return Prefix(State::Stx) };
@@ -163,7 +163,7 @@ fn count_fits(word: [u8; 2], length: usize, expect: &ExpectedHeaders) -> bool {
     match expect {
         ExpectedHeaders::Anything => {
             let count = usize::from(u16::from_le_bytes(word) & 0x03FF);
-            // Command, count word and status; two more where real-time indices are on.
+            // Command, count word and status, and two more bytes if real-time indices are on.
             let len_without_indices = 2 * count + 4;
             (1..=MAX_BEAMS).contains(&count)
                 && (length == len_without_indices || length == len_without_indices + 2)
@@ -176,16 +176,18 @@ fn stream_length(header: &StreamHeader) -> usize {
     usize::from(u16::from_le_bytes([header[2], header[3]]))
 }
 
-/// Whether a sensor sends telegrams with this command byte unasked, scan after scan, in one of its operating modes.
+/// Returns whether a scanner sends telegrams with this command byte continuously, without a request for each, in one of
+/// its operating modes.
 pub(crate) fn is_data(command: u8) -> bool {
     STREAM_COMMANDS.contains(&command)
 }
 
-/// All values, means, a sub-range, with field values, means of a sub-range, with reflectivity, ranges and
-/// reflectivity, Cartesian (Telegram listing, 20h).
+/// Command bytes of telegrams that a scanner sends continuously: all values, means, a sub-range, with field values,
+/// means of a sub-range, with reflectivity, ranges and reflectivity, Cartesian (Telegram listing, 20h).
 const STREAM_COMMANDS: [u8; 8] = [MEASURED, 0xB6, 0xB7, 0xBE, 0xBF, 0xC4, 0xF5, 0xF6];
-/// Replies to the requests of a session, the refusal, and the banner at power-on, each with its LENGTH: names have 20
-/// or 21 characters, configurations 32 or 34 bytes. Without their length they would be found in scans.
+/// Replies to a session's requests, the refusal, and the boot message, each with its possible LENGTH: types have 20 or
+/// 21 characters, configurations 32 or 34 bytes. Without this restriction, the bytes of scans would often look like
+/// one.
 const REPLIES_IN_STREAM: [(u8, core::ops::RangeInclusive<usize>); 7] = [
     (crate::lms::reply::POWER_ON, 20..=26),
     (crate::lms::reply::REFUSED, 2..=2),
@@ -195,12 +197,12 @@ const REPLIES_IN_STREAM: [(u8, core::ops::RangeInclusive<usize>); 7] = [
     (command::VARIANT | REPLY, 7..=7),
     (command::CONFIGURATION | REPLY, 33..=36),
 ];
-/// Command and status.
+/// Minimum LENGTH: command and status.
 const MIN_LENGTH: usize = 2;
-/// Bytes of the longest header.
+/// Number of bytes of the longest header.
 pub(crate) const MAX_HEADER_LEN: usize = 7;
-/// Acceptable headers cannot begin closer to each other: the length's high byte is at most 3, so it is no address,
-/// but it may be a start byte.
+/// Minimum distance between two acceptable headers. The high byte of a length is at most 3, so it is not a valid
+/// address, but it may be a start byte.
 pub(crate) const MIN_HEADER_DISTANCE: usize = 3;
 
 const _: () = assert!(MAX_LENGTH < 0x0400, "HEADER_DISTANCE rests on it");

@@ -1,5 +1,5 @@
-//! Finds the rate of a scanner, and requests what it is, without changing its mode, its rate or a setting. A scanner
-//! that streams continues; each reply costs a scan.
+//! Dialog that finds the baud rate of a scanner and requests its identity and state, without changing its mode, its
+//! baud rate or a setting. A scanner that streams continues; each reply costs a scan.
 //!
 //! The inquiry listens first, because a stream at the port's rate needs no request. Then it requests the status at each
 //! rate, in two rounds, because a scanner may overlook a request. A rate at which telegrams arrived is tried more
@@ -22,18 +22,18 @@ use crate::lms::status::{DIRTY_BELOW_PERCENT, Errors, StatusByte, StatusReport};
 use crate::lms::telegram::{EncodedTelegram, MAX_TELEGRAM, REPLY};
 use crate::lms::variant::Baud;
 
-/// Progress of an inquiry.
+/// State machine of the dialog.
 #[derive(Clone, Debug)]
 pub struct Inquiry {
     channel: RequestChannel<Request>,
     phase: Phase,
-    /// The rates in the order of the search.
+    /// Baud rates in the order of the search.
     rates: [Baud; Baud::ALL.len()],
-    /// Number of rates that are tried.
+    /// Number of entries of `rates` that are tried.
     count: usize,
-    /// Number of telegrams that arrived without a request at each of them.
+    /// Number of telegrams that arrived without a request, for each entry of `rates`.
     unrequested: [u32; Baud::ALL.len()],
-    /// Number of further requests at a rate at which telegrams arrived.
+    /// Remaining number of additional requests at rates at which telegrams arrived.
     extra_requests: u8,
     report: Report,
 }
@@ -49,7 +49,7 @@ enum Phase {
     Requesting {
         question: usize,
     },
-    /// Bytes arrived, but no reply. The inquiry checks whether they are a stream.
+    /// Bytes arrived, but no reply. The inquiry checks at each rate whether they are a stream.
     ListeningPerRate {
         attempt: usize,
         give_up_at: Nanos,
@@ -58,20 +58,20 @@ enum Phase {
 }
 
 impl Inquiry {
-    /// All rates of a scanner, in bits per second.
+    /// All baud rates of a scanner.
     pub const RATES: [u32; Baud::ALL.len()] = table!(Baud::ALL, Baud::rate);
 
-    /// Creates an inquiry on a port that is open at `rate`, in bits per second. Without a rate, the port is a serial
-    /// server, whose rate is set there.
+    /// Creates an inquiry on a port that is open at `rate` baud. `None` stands for a serial server, which sets the rate
+    /// itself.
     pub fn begin(rate: Option<u32>, now: Nanos) -> Self {
         match rate {
             Some(rate) => Inquiry::new(Baud::of_rate(rate).unwrap_or(Baud::B500000), now),
-            // The scanner reports the rate later. The slowest rate waits long enough for any.
+            // The status will report the rate. Timeouts for the slowest rate are long enough for every rate.
             None => Inquiry::at_fixed_rate(Baud::B9600, now),
         }
     }
 
-    /// Creates an inquiry on a port that is open at `first`. It tries all rates, that one first.
+    /// Creates an inquiry on a port that is open at `first`. It tries all baud rates, starting with `first`.
     pub fn new(first: Baud, now: Nanos) -> Self {
         let mut rates = Baud::ALL;
         if let Some(at) = rates.iter().position(|&baud| baud == first) {
@@ -80,7 +80,7 @@ impl Inquiry {
         Inquiry::with_rates(rates, rates.len(), now)
     }
 
-    /// Creates an inquiry on the line of a serial server, whose rate is fixed.
+    /// Creates an inquiry on the line of a serial server, whose baud rate is fixed.
     pub fn at_fixed_rate(baud: Baud, now: Nanos) -> Self {
         let mut inquiry = Inquiry::with_rates([baud; Baud::ALL.len()], 1, now);
         inquiry.channel.is_behind_server = true;
@@ -104,12 +104,12 @@ impl Inquiry {
         &self.report
     }
 
-    /// Returns the rate that the inquiry tries now.
+    /// Returns the baud rate that the inquiry tries now.
     pub fn baud(&self) -> Baud {
         self.channel.baud
     }
 
-    /// Returns the counters of bytes, and the number of bytes that are not assigned yet.
+    /// Returns the counters of bytes, and the number of buffered bytes that are not counted in a class yet.
     pub fn byte_counters(&self) -> (&FramerCounters, usize) {
         self.channel.byte_counters()
     }
@@ -119,7 +119,8 @@ impl Inquiry {
         let (command, address, status) = (telegram.command(), telegram.address() & !REPLY, telegram.status());
         let is_status = matches!(Reply::decode(telegram), Some(Reply::Status(_)));
         let reply = EncodedTelegram::of(telegram);
-        // The checksum is weak, and bytes of another rate may pass it. There, only a complete status proves the rate.
+        // The checksum is weak, so bytes at a wrong rate may pass it. During the search, only a complete status proves
+        // the rate.
         let may_be_reply = is_status || matches!(self.phase, Phase::Requesting { .. });
         let Some(request) = may_be_reply.then(|| self.channel.take_answered(command)).flatten() else {
             return self.on_unrequested(command);
@@ -147,7 +148,7 @@ impl Inquiry {
         }
     }
 
-    /// Sends the request after `request`.
+    /// Sends the request that follows `request` in [`REQUESTS`], or ends the inquiry.
     fn request_next(&mut self, request: Request) {
         let index = request_index(request).map_or(REQUESTS.len(), |at| at + 1);
         match REQUESTS.get(index) {
@@ -160,26 +161,27 @@ impl Inquiry {
         }
     }
 
-    /// Returns whether the scanner may have counters. A scanner of an unknown type refuses the request itself.
+    /// Returns whether the scanner may have counters. If its model is unknown, the request is sent, and the scanner can
+    /// refuse it.
     fn has_counters(&self) -> bool {
         let family = self.report.kind().and_then(LmsModel::of_type);
         family.is_none_or(|family| family.refuses(Request::Counters).is_none())
     }
 
-    /// Requests the status at the rate of `attempt`.
+    /// Requests the status at the baud rate of `attempt`, not before `not_before`.
     fn search(&mut self, attempt: usize, not_before: Nanos) {
         if attempt >= self.count * ROUNDS {
             return self.listen_per_rate(0);
         }
         self.phase = Phase::Searching { attempt };
         self.channel.set_baud(self.rates[attempt % self.count]);
-        // In the second round, the request is sent twice.
+        // The request is sent once in the first round, and twice in the second.
         let tries = 1 + (attempt / self.count) as u8;
         self.channel.send_request(Request::Status, not_before, tries);
     }
 
-    /// Waits for any telegram at one rate after the other, each for the time of the two longest ones. Not if the line
-    /// is silent, or telegrams have arrived before.
+    /// Waits for any telegram at one baud rate after the other, at each for the time of two of the longest telegrams.
+    /// Ends the inquiry instead if the line is silent, or if telegrams have already arrived.
     fn listen_per_rate(&mut self, attempt: usize) {
         let is_silent = self.channel.byte_counters().0.read == 0;
         if is_silent || attempt >= self.count || self.unrequested.iter().any(|&count| count > 0) {
@@ -191,7 +193,7 @@ impl Inquiry {
         self.phase = Phase::ListeningPerRate { attempt, give_up_at };
     }
 
-    /// Ends without a reply. A stream reveals its rate.
+    /// Ends the inquiry without a reply. If a stream was found, the report has its baud rate.
     fn end_without_reply(&mut self) {
         self.phase = Phase::Done;
         let busiest = self.unrequested.iter().zip(self.rates).max_by_key(|(count, _)| **count);
@@ -255,7 +257,7 @@ impl Protocol for Inquiry {
         while let Some(event) = self.channel.advance() {
             match event {
                 ChannelEvent::Telegram(span) => self.on_telegram(span),
-                // During the search for the rate, noise contains such bytes too.
+                // While the baud rate is unknown, noise can contain NAK bytes too.
                 ChannelEvent::Nak if matches!(self.phase, Phase::Requesting { .. }) => {
                     if self.channel.on_nak() == Some(false) {
                         self.on_no_reply();
@@ -274,16 +276,16 @@ impl Protocol for Inquiry {
     }
 }
 
-/// Replies of a scanner.
+/// Result of an inquiry.
 #[derive(Clone, Debug, Default)]
 pub struct Report {
-    /// Rate of the scanner. `None` if no telegram arrived at any.
+    /// Baud rate of the scanner; `None` if no telegram arrived at any rate.
     pub baud: Option<Baud>,
     /// Address of the scanner, 0 to 127.
     pub address: Option<u8>,
     /// Whether telegrams arrived without a request.
     pub streams: bool,
-    /// The last status byte.
+    /// Status byte of the last reply.
     pub status_byte: Option<u8>,
     /// Number of received bytes.
     pub bytes: u64,
@@ -291,7 +293,8 @@ pub struct Report {
 }
 
 impl Report {
-    /// Returns whether the scanner has replied. One that streams and does not reply does not receive requests.
+    /// Returns whether the scanner has replied. A scanner that streams but does not reply does not receive the
+    /// requests.
     pub fn has_replied(&self) -> bool {
         self.replies.iter().any(Option::is_some)
     }
@@ -309,7 +312,7 @@ impl Report {
         }
     }
 
-    /// Returns type, number and firmware, such as `LMS200;S18063;V02.19`, usually in ASCII.
+    /// Returns model, number and firmware, such as `LMS200;S18063;V02.19`, usually in ASCII.
     pub fn kind(&self) -> Option<&[u8]> {
         match self.reply(Request::Type)? {
             Reply::Type(kind) => Some(kind),
@@ -333,8 +336,8 @@ impl Report {
         }
     }
 
-    /// Returns whether the window is dirty, by the status byte or by the measured value in the status. `None` if
-    /// neither was reported.
+    /// Returns whether the front window is dirty, according to the status byte or to the measured transmission in the
+    /// status. Returns `None` if the scanner reported neither.
     pub fn is_polluted(&self) -> Option<bool> {
         let reported = self.status_byte.map(|byte| StatusByte(byte).is_polluted());
         let measured = self
@@ -344,7 +347,7 @@ impl Report {
         reported.max(measured)
     }
 
-    /// Stores the `reply` to one of the questions.
+    /// Stores the `reply` to one of [`REQUESTS`].
     fn store_reply(&mut self, request: Request, reply: EncodedTelegram) {
         if let Some(slot) = request_index(request).and_then(|at| self.replies.get_mut(at)) {
             *slot = Some(reply);
@@ -352,15 +355,15 @@ impl Report {
     }
 }
 
-/// Returns the index of `request` among the questions.
+/// Returns the index of `request` in [`REQUESTS`].
 fn request_index(request: Request) -> Option<usize> {
     REQUESTS.iter().position(|&question| question == request)
 }
 
-/// The requests in their order. The first one finds the rate.
+/// Requests of an inquiry in their order. The first one finds the baud rate.
 const REQUESTS: [Request; 5] =
     [Request::Status, Request::Type, Request::Configuration, Request::Errors, Request::Counters];
-/// Number of rounds through all rates.
+/// Number of rounds through all baud rates.
 const ROUNDS: usize = 2;
-/// Number of further requests at a rate at which telegrams arrived.
+/// Maximum number of additional requests at rates at which telegrams arrived.
 const MAX_EXTRA_REQUESTS: u8 = 5;

@@ -1,5 +1,4 @@
-//! The members of the family, and what each of them cannot do, with the reason. Recognised from what a sensor says of
-//! itself; knows nothing of a particular sensor's settings.
+//! Models of the LMS family, with their factory settings and their limits.
 
 use crate::line::family::named;
 use crate::lms::command::{
@@ -9,28 +8,28 @@ use crate::lms::operating::Operating;
 use crate::lms::variant::{Unit, Variant};
 
 named! {
-    /// A type of sensor.
+    /// Model of a scanner.
     LmsModel {
-        /// Indoors.
+        /// Indoor scanner.
         Lms200 "lms200",
-        /// Outdoors, behind a window of 100 degrees.
+        /// Outdoor scanner behind a window of 100 degrees.
         Lms211 "lms211",
-        /// Outdoors; an LMS 220 is one.
+        /// Outdoor scanner. An LMS 220 counts as one.
         Lms221 "lms221",
-        /// Indoors, long range.
+        /// Indoor scanner with long range.
         Lms291 "lms291",
-        /// Version S14 of an LMS 211, 221 or 291: twice as fast, 90 degrees at 0.5 and nothing else.
+        /// Version S14 of an LMS 211, 221 or 291: twice as fast, with 90 degrees at 0.5 as its only variant.
         Fast "s14",
     }
 }
 
 impl LmsModel {
-    /// The one that is called so in configurations.
+    /// Returns the model with this name in the configuration.
     pub fn of_name(name: &str) -> Option<LmsModel> {
         LmsModel::ALL.into_iter().find(|family| family.name().eq_ignore_ascii_case(name))
     }
 
-    /// The one that a sensor is by its type reply, such as `LMS200;S18063;V02.19`; `None` if it is none of these.
+    /// Returns the model in a type reply such as `LMS200;S18063;V02.19`, or `None` if it is not one of these.
     pub fn of_type(text: &[u8]) -> Option<LmsModel> {
         let mut parts = text.split(|&byte| byte == b';');
         let (kind, version) = (parts.next()?, parts.next().unwrap_or_default());
@@ -44,7 +43,8 @@ impl LmsModel {
         Some(if version.starts_with(b"S14") { LmsModel::Fast } else { family })
     }
 
-    /// Angle and resolution as it leaves the factory; `None` for those of [`LmsModel::Fast`], which are no [`Variant`].
+    /// Returns the factory setting of angle and resolution. Returns `None` for [`LmsModel::Fast`], whose angle and
+    /// resolution are not a [`Variant`].
     pub fn factory_variant(self) -> Option<Variant> {
         match self {
             LmsModel::Lms200 | LmsModel::Lms221 | LmsModel::Lms291 => Some(Variant::HALF),
@@ -53,7 +53,7 @@ impl LmsModel {
         }
     }
 
-    /// Unit as it leaves the factory: 8 m in millimetres, or 80 m in centimetres.
+    /// Returns the factory setting of the unit: mm for ranges up to 8 m, or cm for ranges up to 80 m.
     pub fn factory_unit(self) -> Unit {
         match self {
             LmsModel::Lms200 => Unit::Mm,
@@ -61,7 +61,7 @@ impl LmsModel {
         }
     }
 
-    /// Why it cannot scan `variant`.
+    /// Returns the reason why the model cannot scan `variant`, or `None` if it can.
     pub fn refuses_variant(self, variant: Variant) -> Option<&'static str> {
         match self {
             LmsModel::Lms211 if variant.angle_deg > 100 => Some("its window is 100 degrees wide"),
@@ -70,17 +70,18 @@ impl LmsModel {
         }
     }
 
-    /// Why it has no sensitivity to set (byte 3 of the configuration, 0 to 3); there it is a peak threshold.
+    /// Returns the reason why the model has no sensitivity setting (byte 3 of the configuration, 0 to 3), or `None` if
+    /// it has one. For the other models, this byte is a peak threshold.
     pub fn refuses_sensitivity(self) -> Option<&'static str> {
         (self != LmsModel::Lms291)
             .then_some("only the LMS 291 has a sensitivity; here the byte is a peak threshold")
     }
 
-    /// Why it cannot do what `request` asks.
+    /// Returns the reason why the model cannot execute `request`, or `None` if it can.
     pub fn refuses(self, request: Request) -> Option<&'static str> {
         match request {
             Request::Variant(variant) => self.refuses_variant(variant),
-            // What it does not answer once it does not send continuously.
+            // An operating mode needs the command that requests the same data once.
             Request::Operate(Operating::Reflectivity(_)) => self.refuses_command(REFLECTIVITY),
             Request::Operate(Operating::RangeFields(_)) => self.refuses_command(RANGE_FIELDS),
             Request::Operate(Operating::Reflectivities(_)) => self.refuses_command(REFLECTIVITIES),
@@ -88,7 +89,8 @@ impl LmsModel {
         }
     }
 
-    /// Why it does not know `command` (Telegram listing table 7-1), one that writes the EEPROM too.
+    /// Returns the reason why the model does not support `command` (Telegram listing table 7-1), or `None` if it does.
+    /// Commands that write the EEPROM are included.
     pub fn refuses_command(self, command: u8) -> Option<&'static str> {
         match (command, self) {
             (COUNTERS, LmsModel::Lms200) => Some("only the LMS 211, 221 and 291 count their hours"),
@@ -105,7 +107,7 @@ impl LmsModel {
     }
 }
 
-/// Commands that write fields: their module is not named here.
+/// Commands that write fields. This module does not depend on `lms_configure`, which encodes them.
 const FIELD_WRITE_COMMANDS: &[u8] = &[0x40, 0x46];
 
 #[cfg(test)]

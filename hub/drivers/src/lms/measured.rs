@@ -1,6 +1,7 @@
-//! Measured values. B0h, B6h, B7h and BFh contain a count word, one word per beam, and the two real-time indices if the
-//! scanner is set to send them. The measuring mode, which no telegram of values contains, defines the meaning of a word.
-//! F5h, C4h and BEh contain more than a word per beam: ranges with reflectivities, or with the borders of the fields.
+//! Telegrams with measured values. B0h, B6h, B7h and BFh contain a count word, one word per beam, and two real-time
+//! indices if the scanner is set to send them. The meaning of a word depends on the measuring mode, which is not in the
+//! telegram. F5h, C4h and BEh contain more than one word per beam: ranges with reflectivities, or with the borders of
+//! the fields.
 
 use scanhub_schema::{Nanos, ScanHead};
 
@@ -11,7 +12,7 @@ use crate::lms::variant::{MAX_BEAMS, Mode, Unit, Variant};
 /// Command byte of a measured-value telegram.
 pub const MEASURED: u8 = 0xB0;
 
-/// View of measured values, from the count word on.
+/// View of measured values that begins with the count word.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct MeasuredValues<'a> {
     count_word: u16,
@@ -20,8 +21,8 @@ pub struct MeasuredValues<'a> {
 }
 
 impl<'a> MeasuredValues<'a> {
-    /// The view, if `telegram` is one: command B0h, a known unit, as many words as it says, nothing else but the two
-    /// real-time indices.
+    /// Returns the view of `telegram`. Returns `None` unless the command is B0h, the unit is known, and the number of
+    /// words matches the count, with at most the two real-time indices after them.
     pub fn decode(telegram: Telegram<'a>) -> Option<Self> {
         if telegram.command() != MEASURED || !telegram.is_reply() {
             return None;
@@ -29,7 +30,7 @@ impl<'a> MeasuredValues<'a> {
         MeasuredValues::read(telegram.data())
     }
 
-    /// The values that `data` are, from the count word on.
+    /// Returns the view of `data`, which begins with the count word.
     pub(crate) fn read(data: &'a [u8]) -> Option<Self> {
         let [low, high, rest @ ..] = data else { return None };
         let count_word = u16::from_le_bytes([*low, *high]);
@@ -47,7 +48,7 @@ impl<'a> MeasuredValues<'a> {
         Some(MeasuredValues { count_word, values, indices })
     }
 
-    /// Appends them to a reply; `None` if they do not fit into it.
+    /// Appends the values to a reply. Returns `None` if they do not fit.
     pub(crate) fn write(&self, writer: Writer) -> Option<Writer> {
         let writer = writer.word(self.count_word).reply_slice(self.values)?;
         match self.indices {
@@ -56,23 +57,23 @@ impl<'a> MeasuredValues<'a> {
         }
     }
 
-    /// Number of beams: 1 to 401.
+    /// Returns the number of beams: 1 to 401.
     pub fn count(&self) -> usize {
         self.values.len() / 2
     }
 
-    /// Unit of the ranges.
+    /// Returns the unit of the ranges.
     pub fn unit(&self) -> Unit {
-        // decode() refused code 3.
+        // `read` has rejected the unknown code 3.
         Unit::of_code((self.count_word >> 14) as u8).unwrap_or(Unit::Mm)
     }
 
-    /// Of a partial scan, its start in quarters of a degree (0 to 3); `None` for a whole scan.
+    /// Returns the start of a partial scan in quarters of a degree (0 to 3), or `None` for a complete scan.
     pub fn partial(&self) -> Option<u8> {
         (self.count_word & PARTIAL_FLAG != 0).then_some((self.count_word >> 11) as u8 & 3)
     }
 
-    /// Scan index and telegram index, both modulo 256, where the sensor is set to send them.
+    /// Returns the scan index and the telegram index, both modulo 256, if the scanner sends them.
     pub fn indices(&self) -> Option<(u8, u8)> {
         self.indices
     }
@@ -82,12 +83,12 @@ impl<'a> MeasuredValues<'a> {
         mode.forbidden() != 0 && self.words().any(|word| word & mode.forbidden() != 0)
     }
 
-    /// Returns the scan, with its values split as `mode` says. Its stamps are 0.
+    /// Returns the scan, with its values split according to `mode`. Its stamps are 0.
     pub fn scan(&self, mode: Mode) -> RawScan<'a> {
         raw_scan(self.values, head(self.count(), self.unit(), self.partial(), mode), mode)
     }
 
-    /// The values as sent: range in the low bits, reflector level or field bits above (see [`crate::lms::variant::Mode`]).
+    /// Returns the words as sent: the range in the low bits, reflector level or field bits above (see [`Mode`]).
     pub fn words(&self) -> impl ExactSizeIterator<Item = u16> + use<'a> {
         words(self.values)
     }
@@ -106,7 +107,7 @@ pub struct PartialValues<'a> {
 }
 
 impl<'a> PartialValues<'a> {
-    /// Those of the telegram that begins with `bytes`, if its header is that of a whole scan.
+    /// Returns the values in the incomplete telegram `bytes`, if its header announces a complete scan.
     pub(crate) fn of(bytes: &'a [u8]) -> Option<Self> {
         let [_, _, _, _, MEASURED, low, high, rest @ ..] = bytes else { return None };
         let count_word = u16::from_le_bytes([*low, *high]);
@@ -117,7 +118,7 @@ impl<'a> PartialValues<'a> {
         is_whole.then_some(PartialValues { count, unit, values })
     }
 
-    /// Returns the scan so far, with its values split as `mode` says. Its stamps are 0.
+    /// Returns the incomplete scan, with its values split according to `mode`. Its stamps are 0.
     pub(crate) fn scan(&self, mode: Mode) -> RawScan<'a> {
         raw_scan(self.values, head(self.count, self.unit, None, mode), mode)
     }
@@ -128,11 +129,12 @@ fn raw_scan(bytes: &[u8], head: ScanHead, mode: Mode) -> RawScan<'_> {
     RawScan { number: 0, first: 0, last: 0, period: 0, reasons: 0, bytes: 0, head, values }
 }
 
-/// Returns the head of a scan of `count` values. Beams are in the order in which the sensor sends them: counterclockwise as seen
-/// from above, the first one on the right. Their angles are counted from ahead (REP 103).
+/// Returns the head of a scan of `count` values. Beams are in the order in which the scanner sends them:
+/// counterclockwise as seen from above, with the first one on the right. Their angles are counted from straight ahead
+/// (REP 103).
 fn head(count: usize, unit: Unit, partial: Option<u8>, mode: Mode) -> ScanHead {
     let variant = Variant::of_beams(count);
-    // A partial scan has 180 or 181 beams, a degree apart.
+    // A partial scan has 180 or 181 beams, 1 degree apart.
     let step_mdeg = variant.map_or(1000, |variant| variant.resolution_cdeg * 10);
     let first_angle_mdeg = match (variant, partial) {
         (None, Some(quarters)) => i32::from(quarters) * 250 - 90_000,
@@ -144,32 +146,32 @@ fn head(count: usize, unit: Unit, partial: Option<u8>, mode: Mode) -> ScanHead {
     }
 }
 
-/// Returns the nominal time between two scans of `beams` values at `baud`, rounded down to microseconds; 0 if there is no variant
-/// with this number of values.
+/// Returns the nominal time between two scans of `beams` values at `baud`, rounded down to microseconds, or 0 if no
+/// variant has this number of values.
 pub fn nominal_period(beams: usize, baud: u32) -> Nanos {
-    // STX to count word, status and checksum: 10 bytes beside the values.
+    // In addition to the values, a telegram has 10 bytes: STX to count word, status and checksum.
     let period = |variant: Variant| variant.period(2 * variant.beams() + 10, baud);
     Variant::of_beams(beams).map_or(0, |variant| period(variant) / 1000 * 1000)
 }
 
-/// A measured-value telegram of a whole scan from the sensor at `address` (0 to 127): at most 401 `words` as they
-/// are, then `status`.
+/// Encodes the measured-value telegram of a complete scan from the scanner at `address` (0 to 127), with at most 401
+/// `words` and the status byte.
 pub fn encode(address: u8, unit: Unit, words: &[u16], status: u8) -> EncodedTelegram {
     encode_with(address, ScanFrame { unit, partial: None, indices: None }, words, status)
 }
 
-/// What a measured-value telegram says beside its values.
+/// Contents of a measured-value telegram other than its values.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ScanFrame {
     /// Unit of the ranges.
     pub unit: Unit,
-    /// Of a partial scan, its start in quarters of a degree (0 to 3).
+    /// Start of a partial scan in quarters of a degree (0 to 3); `None` for a complete scan.
     pub partial: Option<u8>,
-    /// Scan index and telegram index.
+    /// Scan index and telegram index; `None` if they are not sent.
     pub indices: Option<(u8, u8)>,
 }
 
-/// As [`encode`], also for partial scans and with real-time indices.
+/// Encodes a measured-value telegram like [`encode`], but also partial scans and real-time indices.
 pub fn encode_with(address: u8, frame: ScanFrame, words: &[u16], status: u8) -> EncodedTelegram {
     let partial = frame.partial.map_or(0, |quarter| PARTIAL_FLAG | u16::from(quarter & 3) << 11);
     let count_word = words.len() as u16 | partial | u16::from(frame.unit.code()) << 14;
@@ -183,17 +185,18 @@ pub fn encode_with(address: u8, frame: ScanFrame, words: &[u16], status: u8) -> 
     writer.byte(status).finish()
 }
 
-/// Bits of the count word that are the count.
+/// Bits of the count word that contain the count.
 pub(crate) const COUNT_MASK: u16 = 0x03FF;
 /// Bit of the count word that marks a partial scan.
 pub(crate) const PARTIAL_FLAG: u16 = 1 << 13;
 
-/// Data of a reply with more than one word per beam, whose counts fit its length. The two real-time indices may follow.
+/// Data of a reply with more than one word per beam, whose counts match its length. Two real-time indices may follow.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Rows<'a>(&'a [u8]);
 
 impl<'a> Rows<'a> {
-    /// Checks the data of F5h: one to five sub-ranges, with range and reflectivity of each beam (Telegram listing, 75h).
+    /// Checks the data of F5h: one to five sub-ranges, with range and reflectivity of each beam (Telegram listing,
+    /// 75h).
     pub fn of_reflectivities(data: &'a [u8]) -> Option<Self> {
         let mut used = 2;
         for _ in 0..word(data, 0)? {
@@ -202,14 +205,15 @@ impl<'a> Rows<'a> {
         Rows::check_len(data, used)
     }
 
-    /// Checks the data of C4h, which an LMS S14 sends: all ranges as words, then the reflectivity of a sub-range as bytes.
+    /// Checks the data of C4h, which a version S14 sends: all ranges as words, then the reflectivity of a sub-range as
+    /// bytes.
     pub fn of_reflectivity(data: &'a [u8]) -> Option<Self> {
         let reflectivities = 2 + 2 * count(data, 0)?;
         Rows::check_len(data, reflectivities + 6 + count(data, reflectivities)?)
     }
 
     /// Checks the data of BEh: a sub-range, with the range of each beam and the borders of the fields A, B and C in its
-    /// direction. These are four words each: 100 beams fill the longest telegram to the byte.
+    /// direction. A beam has four words, so 100 beams fill the longest telegram completely.
     pub fn of_fields(data: &'a [u8]) -> Option<Self> {
         Rows::check_len(data, 6 + 8 * count(data, 4)?)
     }

@@ -1,4 +1,4 @@
-//! Operating modes, which follow command 20h. The two that every session needs, and the rates, are separate requests.
+//! Operating modes, which follow command byte 20h. Streaming, stopping and the baud rates are separate requests.
 
 use crate::lms::command::{Parameter, Password, RawParameters, SubRange, SubRanges, requests};
 use crate::lms::telegram::Writer;
@@ -7,7 +7,7 @@ use crate::lms::variant::Baud;
 requests! {
     /// An operating mode other than [`crate::lms::command::Request::Stream`], `Stop` and `Baud` (Telegram listing 7.3).
     Operating by byte {
-        /// 00h: installation, the only mode in which the EEPROM can be written; the fields' outputs are blocked in it.
+        /// 00h: installation, the only mode in which the EEPROM can be written. It blocks the field outputs.
         Installation(password: Password) = INSTALLATION,
         /// 10h: diagnosis.
         Diagnosis = 0x10,
@@ -23,21 +23,21 @@ requests! {
         Means(number: u8) = MEANS,
         /// 27h: a sub-range, continuously; each telegram is a B7h.
         Range(span: SubRange) = RANGE,
-        /// 28h: mean values of a sub-range, continuously; BFh.
+        /// 28h: mean values of a sub-range, continuously; each telegram is a BFh.
         RangeMeans(number: u8, span: SubRange) = RANGE_MEANS,
-        /// 29h: a sub-range with field values, continuously; BEh.
+        /// 29h: a sub-range with field values, continuously; each telegram is a BEh.
         RangeFields(span: SubRange) = RANGE_FIELDS,
-        /// 2Ah: each mirror turn as soon as it is complete; B0h of partial scans.
+        /// 2Ah: a partial scan after each revolution of the mirror; each telegram is a B0h.
         Partial = PARTIAL,
-        /// 2Bh: ranges and reflectivities of sub-ranges, continuously; F5h.
+        /// 2Bh: ranges and reflectivities of sub-ranges, continuously; each telegram is an F5h.
         Reflectivities(spans: SubRanges) = REFLECTIVITIES,
-        /// 2Ch: the lowest value of each segment in a sub-range. Its parameters are not decoded.
+        /// 2Ch: the lowest value of each segment in a sub-range. The parameters are not decoded.
         SegmentMinimumOfRange(raw: RawParameters) = 0x2C,
         /// 2Eh: records for navigation.
         Navigation = 0x2E,
         /// 30h: tests a password.
         TestPassword(password: Password) = 0x30,
-        /// 50h: ranges, and reflectivities of a sub-range, continuously; C4h. LMS S14 only.
+        /// 50h: ranges, and reflectivities of a sub-range, continuously; each telegram is a C4h. Version S14 only.
         Reflectivity(span: SubRange) = 0x50,
     }
 }
@@ -82,7 +82,7 @@ pub fn name(mode: u8) -> &'static str {
     }
 }
 
-/// Returns the mode that changes the rate of the line to `baud`.
+/// Returns the mode byte that changes the baud rate to `baud`.
 pub fn of_baud(baud: Baud) -> u8 {
     match baud {
         Baud::B38400 => 0x40,
@@ -158,7 +158,7 @@ mod tests {
 
     #[test]
     fn one_range_as_drivers_ask_for_it() {
-        // 20 2B 01 00 01 00 B5 00, as CARMEN says it.
+        // CARMEN sends 20 2B 01 00 01 00 B5 00.
         let spans = SubRanges::new(&[SubRange { first: 1, last: 181 }]).unwrap();
         let encoded = Request::Operate(Operating::Reflectivities(spans)).encode(0);
         assert_eq!(encoded.telegram().data(), [0x2B, 1, 0, 1, 0, 0xB5, 0]);

@@ -1,4 +1,4 @@
-//! The protocol state of a session: how the scanner is found, brought to a stream, supervised, and stopped.
+//! Protocol state of a session: it finds the scanner, starts its stream, monitors it, and stops it.
 //!
 //! It handles telegrams and deadlines; the session handles bytes. No request changes a setting that outlives a power
 //! cycle.
@@ -18,7 +18,7 @@ use crate::lms::start::{MAX_STOPS, NextQuestion, Questions, Start, Step};
 use crate::lms::telegram::{REPLY, Telegram};
 use crate::lms::variant::Baud;
 
-/// The protocol state of a session.
+/// State machine of a session.
 #[derive(Clone, Debug)]
 pub(crate) struct ProtocolState {
     settings: Settings,
@@ -27,18 +27,18 @@ pub(crate) struct ProtocolState {
     open_request: Option<PendingRequest>,
     pub(crate) rate: LineRate,
     pub(crate) sensor: Sensor,
-    /// Identity that an earlier session saved; used until the first request is sent.
+    /// Identity that an earlier session saved. The first request discards it.
     restored_identity: Option<Identity>,
-    /// Reason why the session does not stream now. [`ProtocolState::trouble`] adds those that persist.
+    /// Reason why the session does not stream now. [`ProtocolState::problem`] also returns lasting problems.
     problem: Option<Problem>,
     /// Whether a user paused the session.
     is_paused: bool,
     /// Whether the scanner keeps another variant than the requested one.
     variant_refused: bool,
-    /// Whether bytes have arrived since the session began to listen, to stop the scanner, or to search for another
-    /// round.
+    /// Whether bytes have arrived since the last time at which the session started to listen, to stop the scanner, or
+    /// to search for another round.
     has_received: bool,
-    /// Time since which no telegram has arrived.
+    /// Time of the last telegram, or of the start of the session.
     no_telegram_since: Nanos,
     pub(crate) resyncs: u64,
     restarts: Restarts,
@@ -46,18 +46,18 @@ pub(crate) struct ProtocolState {
 
 #[derive(Clone, Copy, Debug)]
 enum Phase {
-    /// Waiting for a stream without sending. The state is `shown` meanwhile. The session then sends request number
-    /// `attempt` of the search: at `quiet_at` if no byte has arrived, otherwise at `give_up_at`.
+    /// Waits for a stream without sending, while the reported state is `shown`. Then the session sends request number
+    /// `attempt` of the search: at `quiet_at` if no byte has arrived, otherwise at `deadline`.
     Listening { deadline: Nanos, quiet_at: Nanos, shown: State, attempt: usize },
-    /// Sending a request at one rate after the other.
+    /// Sends a request at one rate after the other.
     Probing { attempt: usize },
-    /// The scanner receives requests, and is brought to a stream.
+    /// Brings a scanner that receives requests to the stream.
     Starting(Start),
-    /// Measured data arrive.
+    /// Receives measured data.
     Streaming { header: StreamHeader, silent_at: Nanos, questions: Questions },
-    /// Bytes are from a recording.
+    /// Reads a recording.
     Replaying,
-    /// The scanner is stopped. A stream that continues is stopped `stops_left` times more.
+    /// Has stopped the scanner. If a stream continues, `stops_left` further stops are sent.
     Paused { stops_left: u8 },
 }
 
@@ -101,17 +101,17 @@ impl ProtocolState {
         }
     }
 
-    /// Handles that the port cannot have the rate to which it was to be set.
+    /// Handles the port's refusal of a rate.
     pub(crate) fn reject_rate(&mut self) {
         self.rate.reject();
     }
 
-    /// Returns the rate if the port has to be set to it now.
+    /// Returns the rate to which the port must be set now.
     pub(crate) fn take_rate_change(&mut self) -> Option<Baud> {
         self.rate.take_change()
     }
 
-    /// Returns the identity of a scanner that streams, for a later session.
+    /// Returns the identity of a streaming scanner, for a later session.
     pub(crate) fn identity(&self) -> Option<line::Identity> {
         match self.phase {
             Phase::Streaming { header, .. } => self.sensor.identity(header).map(Identity::to_bytes),
@@ -119,7 +119,7 @@ impl ProtocolState {
         }
     }
 
-    /// Returns the number of restarts of the scanner.
+    /// Returns the number of restarts of the scanner that the session did not request.
     pub(crate) fn restarts(&self) -> u64 {
         self.restarts.count
     }
@@ -136,7 +136,7 @@ impl ProtocolState {
         }
     }
 
-    /// Returns the trouble that the session has now, or else one that persists. During a pause, those do not matter.
+    /// Returns the current problem, or otherwise a lasting one. During a pause, lasting problems do not matter.
     pub(crate) fn problem(&self) -> Option<Problem> {
         if self.is_paused {
             return self.problem;
@@ -145,7 +145,7 @@ impl ProtocolState {
         let no_ranges = self.sensor.mode.filter(|mode| !mode.has_ranges()).map(Problem::NoRanges);
         let variant_refused = self.variant_refused.then_some(Problem::VariantRefused);
         let needs_rs422 = self.rate.problem();
-        // While the scanner is lost, it explains every other finding.
+        // A lost scanner is the cause of all other problems.
         let main_problem = needs_rs422.filter(|_| self.rate.has_lost_scanner()).or(self.problem);
         main_problem.or(has_other_angles).or(no_ranges).or(needs_rs422).or(variant_refused)
     }
@@ -155,12 +155,12 @@ impl ProtocolState {
         self.open_request.as_ref()
     }
 
-    /// Handles that a byte of the open request was written at `now`.
+    /// Records that a byte of the open request was written at `now`.
     pub(crate) fn on_transmitted(&mut self, now: Nanos) {
         let Some(open) = &mut self.open_request else { return };
         open.on_byte_sent(now, self.rate.baud);
         if self.settings.fixed_rate {
-            // On a network, the first bytes of a reply may be all of it.
+            // A network may deliver a complete reply in one read.
             open.on_byte(self.rate.baud);
         }
     }
@@ -176,8 +176,8 @@ impl ProtocolState {
         }
     }
 
-    /// Returns when the dialogue has to act without a byte: the end of its phase or of the wait for a reply, or the
-    /// time at which the next byte of a request may leave.
+    /// Returns the time at which the protocol must act without a byte: the end of its phase, the timeout of a reply, or
+    /// the earliest time of the next byte of a request.
     pub(crate) fn deadline(&self) -> Nanos {
         let phase_ends_at = match self.phase {
             Phase::Listening { deadline: give_up_at, .. } if self.has_received => give_up_at,
@@ -190,7 +190,7 @@ impl ProtocolState {
         phase_ends_at.min(request.deadline).min(next_byte_at)
     }
 
-    /// Handles a deadline that has passed.
+    /// Handles an expired deadline.
     pub(crate) fn handle_timeout(&mut self, now: Nanos) {
         match self.phase {
             Phase::Listening { deadline: give_up_at, quiet_at, attempt, .. }
@@ -202,7 +202,7 @@ impl ProtocolState {
                 self.resyncs += 1;
                 self.problem = Some(Problem::Silence);
                 self.sensor.reset_identity();
-                // The cable may be back sooner than the power.
+                // The cable may be connected again before the power, so search first at the rate of the stream.
                 self.rate.expect_target();
                 return self.listen(now, State::Silent);
             }
@@ -213,7 +213,7 @@ impl ProtocolState {
         }
     }
 
-    /// Handles bytes, whatever they are.
+    /// Records the arrival of bytes, before they are decoded.
     pub(crate) fn on_bytes(&mut self) {
         self.has_received = true;
         if let Some(open) = &mut self.open_request {
@@ -228,8 +228,8 @@ impl ProtocolState {
         }
     }
 
-    /// Handles a NAK. It proves nothing during a search or while a stream is stopped, because the rest of a scan, or a
-    /// stream at another rate, contains such bytes. Then only the timeout counts.
+    /// Handles a NAK. It is ignored during a search and while a stream is being stopped, because the rest of a scan, or
+    /// a stream at another rate, contains such bytes. Only the timeout counts then.
     pub(crate) fn on_nak(&mut self, now: Nanos) {
         let is_credible = !matches!(self.phase, Phase::Probing { .. }) && !self.sensor.streams;
         if is_credible && self.open_request.as_ref().is_some_and(PendingRequest::is_sent) {
@@ -237,8 +237,8 @@ impl ProtocolState {
         }
     }
 
-    /// Handles a telegram whose first byte arrived at `first`. It counts as a reply even if it cannot be decoded to a
-    /// `reply`. `is_line_damaged` is whether the line has damaged telegrams recently.
+    /// Handles a telegram whose first byte arrived at `first`. It counts as the reply to the open request even if it
+    /// has no decoded `reply`. `is_line_damaged`: the line has damaged telegrams recently.
     pub(crate) fn on_telegram(
         &mut self,
         telegram: Telegram<'_>,
@@ -248,7 +248,7 @@ impl ProtocolState {
         now: Nanos,
     ) {
         self.no_telegram_since = now;
-        // A lost scanner needs a power cycle, so that restart does not count as a sign of a weak supply.
+        // A lost scanner needs a power cycle. That restart is not a sign of a weak power supply.
         let is_expected_restart = self.rate.has_lost_scanner();
         self.rate.note_telegram();
         self.sensor.set_line_damaged(is_line_damaged);
@@ -272,7 +272,7 @@ impl ProtocolState {
         }
     }
 
-    /// Handles data that the scanner sends without a request. `measured` is a complete scan.
+    /// Handles data that the scanner sends without a request. `measured` is its decoded form if it is a complete scan.
     fn on_data(
         &mut self,
         telegram: Telegram<'_>,
@@ -282,10 +282,10 @@ impl ProtocolState {
     ) {
         let next_silence = self.silence_deadline(now);
         match self.phase {
-            // It arrived at the previous rate.
+            // The data arrived at the previous rate.
             _ if self.rate.needs_change => return,
             Phase::Streaming { header, silent_at: ref mut at, .. } => {
-                // The framer accepted a telegram of another kind before this stream was known.
+                // The framer may have accepted a telegram of another kind before it had the header of this stream.
                 if telegram.bytes().starts_with(&header) {
                     *at = next_silence;
                     self.send_question(now);
@@ -327,13 +327,13 @@ impl ProtocolState {
         }
     }
 
-    /// Handles the boot message: the scanner lost power or was reset. Its settings are lost, and it receives at this
-    /// rate.
+    /// Handles the boot message. The scanner lost power or was reset, so its settings are lost. It receives requests at
+    /// the current rate.
     fn on_power_on(&mut self, now: Nanos) {
         match self.phase {
             Phase::Replaying => {}
             _ if self.is_paused => {
-                // The scanner is at rest.
+                // After power-on, the scanner does not stream.
                 self.open_request = None;
                 self.phase = Phase::Paused { stops_left: MAX_STOPS };
                 self.problem = None;
@@ -347,7 +347,7 @@ impl ProtocolState {
 
     /// Handles the reply to `request`.
     fn on_reply(&mut self, request: Request, reply: Option<Reply<'_>>, now: Nanos) {
-        // A sensor that does not report its state may be streaming: it is stopped, a limited number of times.
+        // A scanner that does not report its state may be streaming, so it is stopped, a limited number of times.
         self.sensor.streams |= request == Request::Status && !matches!(reply, Some(Reply::Status(_)));
         match self.phase {
             Phase::Probing { .. } if self.is_paused => self.stop(now),
@@ -357,7 +357,8 @@ impl ProtocolState {
                 self.restarts.note_found(self.rate.baud, is_idle);
                 self.problem.take_if(|trouble| matches!(trouble, Problem::NoReply { .. } | Problem::Silence));
                 if request == Request::Type {
-                    // The line was silent before the request. The status follows at the rate to stream at.
+                    // The line was silent before the request, so the scanner does not stream. The status is requested
+                    // at the target rate.
                     self.sensor.streams = false;
                 }
                 self.proceed(Start::CHECK.after_reply(request, reply.as_ref()), now);
@@ -375,11 +376,12 @@ impl ProtocolState {
         }
     }
 
-    /// Handles that the open request had no reply: sends it again from `at` on, or continues without it.
+    /// Handles the missing reply to the open request: sends the request again, not before `not_before`, or continues
+    /// without it.
     fn retry(&mut self, not_before: Nanos) {
         let Some(pending) = &mut self.open_request else { return };
         let request = pending.request;
-        // A mode change may have happened. Do not repeat it, but check the state.
+        // A mode change may have been executed. Check the state instead of repeating the request.
         let is_acknowledged = pending.reply() == MODE_REPLY && pending.is_acknowledged;
         if !is_acknowledged && pending.retry(not_before) {
             return;
@@ -393,7 +395,7 @@ impl ProtocolState {
         }
     }
 
-    /// Sends `request` from `not_before` on, at most `tries` times, in place of the open one.
+    /// Sends `request` instead of the open one, not before `not_before`, at most `tries` times.
     fn send_request(&mut self, request: Request, not_before: Nanos, tries: u8) {
         self.restored_identity = None;
         let address = self.sensor.address.map_or(0, |address| address & !REPLY);
@@ -403,11 +405,11 @@ impl ProtocolState {
         self.open_request = Some(PendingRequest::new(request, address, not_before, tries));
     }
 
-    /// Begins like a new session: listens at the rate to stream at and sends nothing.
+    /// Begins like a new session: listens at the target rate and sends nothing.
     fn begin(&mut self, now: Nanos) {
         let was_paused = core::mem::take(&mut self.is_paused);
         if was_paused {
-            // During the pause, no reply was expected.
+            // The session expected no telegrams during the pause.
             self.no_telegram_since = now;
         }
         self.problem = None;
@@ -417,30 +419,30 @@ impl ProtocolState {
         self.listen(now, State::Probing);
     }
 
-    /// Begins at `baud`, at which a search has found the scanner and the port is open.
+    /// Begins at `baud`, at which the port is open and a search has found the scanner.
     pub(crate) fn begin_at(&mut self, baud: Baud, now: Nanos) {
         self.rate.begin_at(baud);
         self.listen(now, State::Probing);
     }
 
-    /// Listens for a stream at this rate.
+    /// Listens for a stream at the current rate.
     fn listen(&mut self, now: Nanos, shown: State) {
         self.open_request = None;
         self.has_received = false;
         let give_up_at = now + LISTEN_TIME.max(2 * self.scan_period());
-        // A stream that fell silent may continue, and bytes from a network arrive in bursts.
+        // An interrupted stream may continue, and bytes from a network arrive in bursts, so a short silence does not prove that there is no stream.
         let may_pause = shown == State::Silent || self.settings.fixed_rate;
         let quiet_at = if may_pause { give_up_at } else { now + QUIET_TIME };
         self.phase = Phase::Listening { deadline: give_up_at, quiet_at, shown, attempt: 0 };
     }
 
-    /// Sends request number `attempt` of the search, for the status. On a silent line, at another rate than the one to
-    /// stream at, it is for the type: at 9,600 baud, the 160 bytes of a status take 0.17 s. The status follows after
-    /// the change of the rate. In every other round it is always for the status, because some scanners do not report
-    /// their type.
+    /// Sends request number `attempt` of the search. It requests the status. On a silent line at a rate other than the
+    /// target rate, it requests the type instead, because the 160 bytes of a status take 0.17 s at 9,600 baud. The
+    /// status is then requested after the change of the rate. Every other round always requests the status, because
+    /// some scanners do not report their type.
     fn probe(&mut self, now: Nanos, attempt: usize) {
         self.phase = Phase::Probing { attempt };
-        // The next reply may come from another scanner. Address 0 is for all.
+        // The next reply may come from another scanner. Address 0 reaches every scanner.
         self.sensor.address = None;
         let (round, position) = (attempt / SEARCH_ORDER.len(), attempt % SEARCH_ORDER.len());
         let baud = self.rate.nth_rate(position);
@@ -455,8 +457,8 @@ impl ProtocolState {
         }
     }
 
-    /// Continues the search after `attempt` had no reply. After a round without a single byte, it pauses at the rate at
-    /// which a scanner sends its boot message, up to a minute after power-on (Telegram listing 7.1).
+    /// Continues the search after `attempt` got no reply. After a round without a single byte, the session pauses at
+    /// the rate of the boot message, which a scanner sends up to a minute after power-on (Telegram listing 7.1).
     fn continue_search(&mut self, attempt: usize, now: Nanos) {
         let next = attempt + 1;
         if !next.is_multiple_of(SEARCH_ORDER.len()) {
@@ -464,7 +466,7 @@ impl ProtocolState {
         }
         let round = next / SEARCH_ORDER.len();
         if self.is_paused && round == STOP_SEARCH_ROUNDS {
-            // A scanner that streams anyway does not receive requests.
+            // A scanner that still streams does not receive requests.
             self.phase = Phase::Paused { stops_left: 0 };
             self.problem = self.has_received.then_some(Problem::NotStopped);
             return;
@@ -484,13 +486,13 @@ impl ProtocolState {
             Phase::Listening { deadline: until, quiet_at: until, shown: State::Probing, attempt: next };
     }
 
-    /// Continues a start, now that it is known what the scanner does.
+    /// Continues a start after the scanner has reported its status.
     fn proceed(&mut self, start: Start, now: Nanos) {
         let is_at_rate = self.rate.baud == self.rate.target;
         self.enter_step(start.proceed(&self.sensor, is_at_rate, self.settings.variant), now);
     }
 
-    /// Sends the request of the step of `start`.
+    /// Enters the step of `start` and sends its request.
     fn enter_step(&mut self, start: Start, now: Nanos) {
         let (request, tries) = start.request(self.rate.target, self.settings.variant);
         self.restarts.streamed_at = None;
@@ -498,7 +500,7 @@ impl ProtocolState {
         self.send_request(request, now, tries);
     }
 
-    /// Handles the `reply` to `request`, which belongs to the step of `start`.
+    /// Handles the `reply` to `request`, which was sent for the step of `start`.
     fn on_step(&mut self, start: Start, request: Request, reply: Option<Reply<'_>>, now: Nanos) {
         let is_refused = matches!(reply, Some(Reply::Refused | Reply::Mode { done: false }));
         let is_done = matches!(reply, Some(Reply::Variant { done: true, .. }));
@@ -526,7 +528,7 @@ impl ProtocolState {
                 }
                 self.enter_step(start.next_setting(&self.sensor, self.settings.variant), now);
             }
-            // The stream begins with its first telegram, which is due like one that went missing.
+            // The stream begins with its first telegram. Until then, the timeout is that of a stream.
             Step::Stream => {
                 let until = self.silence_deadline(now);
                 self.phase =
@@ -535,8 +537,8 @@ impl ProtocolState {
         }
     }
 
-    /// Handles that `request`, which belongs to the step of `start`, had no reply in all its tries, or that the scanner
-    /// acknowledged it and did not report the result.
+    /// Handles a missing reply to `request`, which was sent for the step of `start`: it had no reply in all its tries,
+    /// or the scanner acknowledged it but did not report the result.
     fn on_no_reply(&mut self, start: Start, request: Request, is_acknowledged: bool, at: Nanos) {
         let is_optional = match start.step {
             Step::Variant => {
@@ -548,7 +550,7 @@ impl ProtocolState {
             Step::Check | Step::Baud => false,
         };
         if is_optional {
-            // The scanner may be unavailable. Check that, but not for long.
+            // The scanner may be unavailable. Check that with few tries.
             self.phase = Phase::Starting(start.with_check());
             return self.send_request(Request::Status, at, TRIES);
         }
@@ -558,23 +560,24 @@ impl ProtocolState {
         self.probe(at, 0);
     }
 
-    /// Returns whether a stream has the requested beams. A scanner that refused them is accepted as it is.
+    /// Returns whether a stream has the requested beams. A stream of a scanner that refused them is accepted as it is.
     fn is_requested(&self, measured: MeasuredValues<'_>) -> bool {
         measured.count() == self.settings.variant.beams() || self.variant_refused
     }
 
-    /// Returns the time between two telegrams of the requested variant.
+    /// Returns the time between two telegrams of the requested variant at the target rate.
     fn scan_period(&self) -> Nanos {
         let variant = self.settings.variant;
         variant.period(2 * variant.beams() + OVERHEAD_BYTES, self.rate.target.rate())
     }
 
-    /// Returns when a stream is silent if no measured data arrive: after a second, on a slow line after two telegrams.
+    /// Returns the time at which a stream without further data counts as silent: after a second, or on a slow line
+    /// after two and a half telegram periods.
     fn silence_deadline(&self, now: Nanos) -> Nanos {
         now + SILENCE_TIMEOUT.max(5 * self.scan_period() / 2)
     }
 
-    /// Begins to stream: measured data arrive, and are accepted as they are.
+    /// Starts streaming with the first measured data, and accepts their settings as they are.
     fn begin_stream(&mut self, telegram: Telegram<'_>, measured: Option<MeasuredValues<'_>>, now: Nanos) {
         let Some(&header) = telegram.bytes().first_chunk::<{ size_of::<StreamHeader>() }>() else { return };
         let is_requested = measured.is_some_and(|scan| scan.count() == self.settings.variant.beams());
@@ -586,7 +589,8 @@ impl ProtocolState {
         self.sensor.streams = true;
         self.restarts.streamed_at = Some(self.rate.baud);
         let silent_at = self.silence_deadline(now);
-        // A reply may still arrive to a complete request. The scanner must drop a partial one before the next.
+        // The reply to a complete request may still arrive. The scanner must drop a partial request before the next
+        // one.
         let unsent_request = self.open_request.take_if(|open| !open.is_sent());
         let first_request_at = if unsent_request.is_some_and(|open| open.is_partly_sent()) {
             now + PARTIAL_REQUEST_TIMEOUT
@@ -597,8 +601,8 @@ impl ProtocolState {
         self.send_question(now);
     }
 
-    /// Sends the next question right after a scan. A reply costs the scan that it interrupts, so the next question
-    /// waits for the next scan.
+    /// Sends the next of the [`Questions`] right after a scan. A reply costs the scan that it interrupts, so there is
+    /// at most one request per scan.
     fn send_question(&mut self, now: Nanos) {
         let Phase::Streaming { questions, .. } = &mut self.phase else { return };
         if self.open_request.is_some() {
@@ -615,8 +619,8 @@ impl ProtocolState {
         }
     }
 
-    /// Handles a request of a user. A pause stops the scanner, after a search for it if necessary. It ends with the
-    /// report that the scanner has stopped, or that this is not known.
+    /// Handles a request of a user. A pause stops the scanner, after a search for it if necessary. In the end, the
+    /// session reports that the scanner has stopped, or that this is unknown.
     pub(crate) fn control(&mut self, control: Control, now: Nanos) {
         match (control, self.phase) {
             (_, Phase::Replaying) => {}
@@ -625,7 +629,7 @@ impl ProtocolState {
                 self.problem = None;
                 let is_rate_unknown = match phase {
                     Phase::Probing { .. } | Phase::Listening { shown: State::Probing, .. } => true,
-                    // It may change at this moment.
+                    // The rate may be changing at this moment.
                     Phase::Starting(start) => start.step == Step::Baud,
                     _ => false,
                 };
@@ -640,7 +644,7 @@ impl ProtocolState {
         }
     }
 
-    /// Stops the scanner, which receives at this rate.
+    /// Stops the scanner, which receives requests at the current rate.
     fn stop(&mut self, now: Nanos) {
         self.phase = Phase::Paused { stops_left: MAX_STOPS };
         self.restarts.streamed_at = None;
@@ -648,10 +652,10 @@ impl ProtocolState {
         self.send_request(Request::Stop, now, TRIES);
     }
 
-    /// Stops the scanner again, because it continues, or nothing that it sent shows that it stopped.
+    /// Stops the scanner again if bytes have arrived since the last stop, because the stream may continue.
     fn repeat_stop(&mut self, now: Nanos) {
         match self.phase {
-            // The line is silent: the scanner is at rest, or not connected.
+            // The line is silent, so the scanner has stopped or is not connected.
             _ if !self.has_received => {}
             Phase::Paused { stops_left: 0 } => self.problem = Some(Problem::NotStopped),
             Phase::Paused { stops_left } => {
@@ -667,30 +671,30 @@ impl ProtocolState {
 #[derive(Clone, Copy, Debug, Default)]
 struct Restarts {
     count: u64,
-    /// Whether a telegram has arrived since the session began or the last boot message. Without it, a boot message is
-    /// first contact, or a copy of the last one.
+    /// Whether a telegram has arrived since the session began or since the last boot message. Otherwise, a boot message
+    /// is the first contact or a copy of the last one.
     is_in_contact: bool,
     /// Rate of the last stream, until a request stops it or the scanner is found again.
     streamed_at: Option<Baud>,
 }
 
 impl Restarts {
-    /// Handles a boot message.
+    /// Records a boot message. An expected restart is not counted.
     fn note_boot_message(&mut self, is_expected: bool) {
         let is_restart = core::mem::take(&mut self.is_in_contact) && !is_expected;
         self.count += u64::from(is_restart);
         self.streamed_at = None;
     }
 
-    /// Handles that the scanner was found at `baud`. It has restarted, and its boot message was lost, if it streamed
-    /// and no request stopped it, but now it `is_idle` or has another rate.
+    /// Records that the scanner was found at `baud`. If it streamed, no request stopped it, and it now has another rate
+    /// or `is_idle`, it has restarted and its boot message was lost.
     fn note_found(&mut self, baud: Baud, is_idle: bool) {
         let has_restarted = self.streamed_at.take().is_some_and(|old_rate| old_rate != baud || is_idle);
         self.count += u64::from(has_restarted);
     }
 }
 
-/// Rounds seconds down to the coarse steps of messages, so that they do not change every second.
+/// Rounds seconds down to coarse steps for messages, so that a message does not change every second.
 fn round_down_seconds(seconds: u64) -> u32 {
     const HOUR_SECONDS: u32 = 3_600;
     const STEP_SECONDS: [u32; 9] = [1, 3, 10, 30, 60, 300, 600, 1_800, HOUR_SECONDS];
@@ -698,28 +702,28 @@ fn round_down_seconds(seconds: u64) -> u32 {
     if step < HOUR_SECONDS { step } else { (seconds / u64::from(HOUR_SECONDS)) as u32 * HOUR_SECONDS }
 }
 
-/// Command byte of the reply to every change of mode or rate.
+/// Command byte of the reply to a change of mode or rate.
 const MODE_REPLY: u8 = MODE | REPLY;
-/// Time to listen for a stream: more than two scans of the slowest variant. It is longer where the line is slower than
-/// the scans.
+/// Time to listen for a stream: more than two scans of the slowest variant. On a line that is slower than the scans,
+/// the session listens longer.
 pub(crate) const LISTEN_TIME: Nanos = 120 * MILLIS;
-/// A line that is silent for this time carries no stream of whole scans: the slowest variant begins one every 53 ms,
-/// and has bytes on the line for at least a third of that. Two telegram times of the usual variant.
+/// Silence after which a line is known to carry no stream of complete scans: two telegram times of the usual variant.
+/// The slowest variant begins a scan every 53 ms and has bytes on the line for at least a third of that.
 const QUIET_TIME: Nanos = 55 * MILLIS;
-/// After this time without measured data, the session begins again (paper: resynchronize after one second).
+/// Time without measured data after which the session restarts (paper: resynchronize after one second).
 pub const SILENCE_TIMEOUT: Nanos = 1_000 * MILLIS;
 /// Pause after a refusal, before the search begins.
 const REFUSAL_PAUSE: Nanos = 500 * MILLIS;
-/// A whole scan that began this long after a request shows that the scanner overlooked the request, which would have
-/// interrupted the stream. The time is for bytes that an adapter keeps.
+/// Time after a request at which the beginning of a complete scan shows that the scanner overlooked the request, which
+/// would have interrupted the stream. It allows for bytes that an adapter still buffers.
 const OVERLOOK_TIME: Nanos = 25 * MILLIS;
-/// Pauses before the next round of the search, by the number of rounds without a byte.
+/// Pauses before the next round of the search, by the number of completed rounds.
 const PAUSES: [Nanos; 4] = [0, 500 * MILLIS, 1_000 * MILLIS, 1_500 * MILLIS];
-/// Rounds of the search for a scanner that only has to stop: a brief and a patient one.
+/// Number of rounds of the search for a scanner that must stop: one short and one patient round.
 const STOP_SEARCH_ROUNDS: usize = 2;
-/// Additional time for the reply in every other round. A slow scanner would never be found otherwise.
+/// Additional time for the reply in every other round, so that a slow scanner is found too.
 const EXTRA_REPLY_TIME: Nanos = 250 * MILLIS;
-/// Bytes of a telegram besides its values: STX to the number of values, status and checksum.
+/// Number of bytes of a telegram other than its values: STX to count word, status and checksum.
 const OVERHEAD_BYTES: usize = 10;
 
 #[cfg(test)]

@@ -1,13 +1,14 @@
-//! The rate of the line: the one to stream at, and the order in which the search for a scanner tries the others.
+//! Baud rate of the line: the target rate for the stream, and the order in which the search for a scanner tries the
+//! others.
 //!
-//! A line may not be able to carry 500,000 baud, such as RS-232. There, the scanner acknowledges the switch, and then
-//! does not communicate before its power is cycled. After [`MAX_SILENT_SWITCHES`] such switches in a row, a session with an
+//! A line such as RS-232 cannot carry 500,000 baud. On it, the scanner acknowledges the switch to that rate and is then
+//! unreachable until its power is cycled. After [`MAX_SILENT_SWITCHES`] such switches in a row, a session with an
 //! automatic rate streams at 38,400 baud, the highest rate of RS-232. The count outlives boot messages, sessions and
-//! runs of the hub: the power of a scanner is often cycled together with that of its host.
+//! runs of the hub, because the power of a scanner is often cycled together with that of its host.
 //!
-//! The port may not be able to have 500,000 baud either. A named LMS is refused there when the port is opened. If a
-//! search has found the scanner at another rate, the port is set to 500,000 baud for a moment before the scanner is
-//! switched to it.
+//! The port may not support 500,000 baud either. For a link with a configured LMS, opening the port at that rate fails.
+//! If a search has found the scanner at another rate, the session therefore sets the port to 500,000 baud for a moment
+//! before it switches the scanner.
 
 use scanhub_schema::{MILLIS, Nanos};
 
@@ -16,44 +17,44 @@ use crate::lms::sensor::Problem;
 use crate::lms::session::Settings;
 use crate::lms::variant::Baud;
 
-/// The rate of the line.
+/// Baud rate of the port, with the rates that the session requests.
 #[derive(Clone, Debug)]
 pub(crate) struct LineRate {
     pub(crate) baud: Baud,
-    /// Whether the port does not have the rate yet.
+    /// Whether the port must still be set to `baud`.
     pub(crate) needs_change: bool,
-    /// Whether the port has one rate and no other.
+    /// Whether the rate of the port cannot be changed.
     is_fixed: bool,
-    /// Rate to stream at.
+    /// Rate for the stream.
     pub(crate) target: Baud,
-    /// Rate to stream at if the line can carry it.
+    /// Rate for the stream if the line can carry it.
     preferred: Baud,
-    /// Whether to keep to the wanted rate even if the line cannot carry it.
+    /// Whether the preferred rate is kept even if the line cannot carry it.
     is_preferred_forced: bool,
-    /// The most likely rate of a scanner that does not stream when a session begins.
+    /// Most likely rate of a scanner that does not stream when a session begins.
     idle_rate: Baud,
-    /// The rate that the search tries first.
+    /// Rate that the search tries first.
     first_tried: Baud,
-    /// The rate at which the search had its last reply.
+    /// Rate at which the search received its last reply.
     found_at: Option<Baud>,
     fast_switches: FastSwitches,
     trial: Trial,
 }
 
-/// Trial whether the port can have the rate to stream at.
+/// Test of whether the port supports the target rate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Trial {
-    /// The port is open at that rate, or it was tried.
+    /// The port is open at the target rate, or the test is complete.
     Done,
     Due,
-    /// The port was set to that rate.
+    /// The port was set to the target rate, and no error has been reported yet.
     Running,
-    /// The port cannot have that rate.
+    /// The port does not support the target rate.
     Failed,
 }
 
 impl LineRate {
-    /// Creates the rate of a port that is open at the rate of `settings`.
+    /// Creates the state for a port that is open at the rate of `settings`.
     pub(crate) fn new(settings: &Settings) -> LineRate {
         let &Settings { baud, fixed_rate, listen_only, keep_baud, .. } = settings;
         LineRate {
@@ -71,7 +72,7 @@ impl LineRate {
         }
     }
 
-    /// Returns the rate if the port has to be set to it.
+    /// Returns the rate to which the port must be set now.
     pub(crate) fn take_change(&mut self) -> Option<Baud> {
         match self.trial {
             Trial::Due => {
@@ -87,21 +88,21 @@ impl LineRate {
         core::mem::take(&mut self.needs_change).then_some(self.baud)
     }
 
-    /// Handles that the port cannot have the rate to which it was to be set.
+    /// Handles the port's refusal of the rate that [`LineRate::take_change`] returned.
     pub(crate) fn reject(&mut self) {
         if self.trial == Trial::Running {
             (self.trial, self.target, self.needs_change) = (Trial::Failed, RS232_BAUD, true);
         }
     }
 
-    /// Changes the rate, unless the port has only one.
+    /// Changes the rate, unless the rate of the port is fixed.
     pub(crate) fn set(&mut self, baud: Baud) {
         if self.baud != baud && !self.is_fixed {
             (self.baud, self.needs_change) = (baud, true);
         }
     }
 
-    /// Begins at `baud`, at which the port is open and a search has found the scanner.
+    /// Starts at `baud`, at which the port is open and a search has found the scanner.
     pub(crate) fn begin_at(&mut self, baud: Baud) {
         (self.idle_rate, self.first_tried) = (baud, baud);
         (self.baud, self.needs_change) = (baud, false);
@@ -110,19 +111,20 @@ impl LineRate {
         }
     }
 
-    /// Begins at the rate to stream at. If there is no stream, the search tries that rate first if the scanner was
-    /// stopped there (`is_stopped`), otherwise the most likely one.
+    /// Starts at the target rate. If no stream arrives, the search first tries the target rate if the scanner was
+    /// stopped there (`is_stopped`), otherwise the most likely rate.
     pub(crate) fn begin(&mut self, is_stopped: bool) {
         self.first_tried = if is_stopped { self.target } else { self.idle_rate };
         self.set(self.target);
     }
 
-    /// Makes the search try the rate to stream at first, because the scanner fell silent there.
+    /// Makes the search try the target rate first, because the scanner fell silent at that rate.
     pub(crate) fn expect_target(&mut self) {
         self.first_tried = self.target;
     }
 
-    /// Returns the rate number `turn` of a round of the search: the most likely one, the one to stream at, the others.
+    /// Returns the rate at `position` in a round of the search: first the most likely rate, then the target rate, then
+    /// the others.
     pub(crate) fn nth_rate(&self, position: usize) -> Baud {
         let (first, target) = (self.first_tried, self.target);
         let second = (first != target).then_some(target);
@@ -130,12 +132,12 @@ impl LineRate {
         [first].into_iter().chain(second).chain(others).nth(position).unwrap_or(target)
     }
 
-    /// Handles that the search had a reply.
+    /// Records that the scanner replied at the current rate during the search.
     pub(crate) fn note_found(&mut self) {
         self.found_at = Some(self.baud);
     }
 
-    /// Handles a telegram.
+    /// Records the arrival of a telegram.
     pub(crate) fn note_telegram(&mut self) {
         let is_fast = self.baud == FAST_BAUD && !self.needs_change;
         if self.fast_switches.receive(is_fast) {
@@ -144,7 +146,7 @@ impl LineRate {
         }
     }
 
-    /// Changes to the rate to stream at, because the scanner has acknowledged the switch.
+    /// Changes to the target rate, because the scanner has acknowledged the switch.
     pub(crate) fn switch_to_target(&mut self) {
         self.set(self.target);
         if self.target == FAST_BAUD {
@@ -152,7 +154,7 @@ impl LineRate {
         }
     }
 
-    /// Handles a request that got no reply in all its tries.
+    /// Records that a request got no reply in all its tries.
     pub(crate) fn note_no_reply(&mut self) {
         if self.baud == FAST_BAUD {
             self.fast_switches.note_no_reply();
@@ -161,13 +163,13 @@ impl LineRate {
         }
     }
 
-    /// Restores the rate at which an earlier session found the scanner.
+    /// Restores the rate at which an earlier session found the scanner. The search tries it first.
     pub(crate) fn restore(&mut self, baud: Baud) {
         (self.idle_rate, self.first_tried) = (baud, baud);
     }
 
-    /// Restores the [number of silent switches](Self::silent_switches). Returns whether the rate to stream at has
-    /// changed because of them.
+    /// Restores the [number of silent switches](Self::silent_switches). Returns whether this number has changed the
+    /// target rate.
     pub(crate) fn restore_silent_switches(&mut self, count: u8) -> bool {
         self.fast_switches.silent_switches = count;
         self.limit_to_rs232()
@@ -178,19 +180,19 @@ impl LineRate {
         self.fast_switches.silent_switches
     }
 
-    /// Returns what the next search should know. For a line that cannot carry 500,000 baud, it is the rate in use.
-    /// `None` if there was no search.
+    /// Returns the rate that the next session should try first, and the number of silent switches. If the line cannot
+    /// carry 500,000 baud, it is the rate in use. Returns `None` if there was no search.
     pub(crate) fn known(&self) -> Option<KnownRate> {
         let baud = self.replacement().or(self.found_at)?;
         Some(KnownRate { baud: baud.rate(), silent_switches: self.silent_switches() })
     }
 
-    /// Returns whether the scanner was lost in a switch, and needs a power cycle.
+    /// Returns whether the scanner has been silent since a switch and therefore needs a power cycle.
     pub(crate) fn has_lost_scanner(&self) -> bool {
         self.fast_switches.have_lost()
     }
 
-    /// Returns the message that the port or the line cannot have the wanted rate, if so.
+    /// Returns the problem that the port or the line does not support the requested rate.
     pub(crate) fn problem(&self) -> Option<Problem> {
         if self.trial == Trial::Failed {
             return Some(Problem::PortLacksRate { fallback: self.target });
@@ -199,19 +201,19 @@ impl LineRate {
         has_failed.then(|| Problem::NeedsRs422 { fallback: self.replacement() })
     }
 
-    /// Returns the rate that is used in place of the wanted one, if the line cannot carry that one.
+    /// Returns the rate that is used instead of the requested one if the line or the port does not support that one.
     fn replacement(&self) -> Option<Baud> {
         Some(self.target).filter(|&baud| baud != self.preferred)
     }
 
-    /// Has [`known`](Self::known) return a rate even without a search, so that the number of silent switches is saved
-    /// with it.
+    /// Makes [`known`](Self::known) return a rate even without a search, so that the number of silent switches is
+    /// saved.
     fn save_count(&mut self) {
         self.found_at = self.found_at.or(Some(self.idle_rate));
     }
 
-    /// Streams at 38,400 baud in place of 500,000 baud from now on if the line cannot carry that rate. Returns whether
-    /// it is a change.
+    /// Replaces the target rate of 500,000 baud by 38,400 baud if the line cannot carry it. Returns whether the target
+    /// changed.
     fn limit_to_rs232(&mut self) -> bool {
         let is_limited =
             self.fast_switches.have_failed() && self.target == FAST_BAUD && !self.is_preferred_forced;
@@ -222,26 +224,26 @@ impl LineRate {
     }
 }
 
-/// Switches to 500,000 baud that the scanner acknowledged, and after which no telegram arrived.
+/// Counts switches to 500,000 baud that the scanner acknowledged and that were followed by silence.
 #[derive(Clone, Copy, Debug, Default)]
 struct FastSwitches {
     /// Number of silent switches in a row.
     silent_switches: u8,
-    /// Whether a switch was acknowledged, and no telegram has arrived at the new rate yet.
+    /// Whether the scanner acknowledged a switch and no telegram has arrived at the new rate yet.
     is_pending: bool,
-    /// Whether the last switch was silent, and no telegram has arrived at any rate since. The scanner may need a power
-    /// cycle.
+    /// Whether the last switch was followed by silence and no telegram has arrived at any rate since. The scanner may
+    /// need a power cycle.
     is_lost: bool,
 }
 
 impl FastSwitches {
-    /// Handles the acknowledgment of a switch to 500,000 baud.
+    /// Records that the scanner acknowledged a switch to 500,000 baud.
     fn acknowledge(&mut self) {
         self.is_pending = true;
     }
 
-    /// Handles a telegram. If it arrived at 500,000 baud (`is_fast`), the line can carry that rate. Returns whether
-    /// that is news.
+    /// Records the arrival of a telegram. At 500,000 baud (`is_fast`), it proves that the line can carry that rate.
+    /// Returns whether the number of silent switches changed.
     fn receive(&mut self, is_fast: bool) -> bool {
         self.is_lost = false;
         if is_fast {
@@ -251,7 +253,7 @@ impl FastSwitches {
         false
     }
 
-    /// Handles a request that got no reply in all its tries.
+    /// Records that a request got no reply in all its tries.
     fn note_no_reply(&mut self) {
         if core::mem::take(&mut self.is_pending) {
             self.silent_switches = self.silent_switches.saturating_add(1).min(MAX_SILENT_SWITCHES);
@@ -259,29 +261,28 @@ impl FastSwitches {
         }
     }
 
-    /// Returns whether the line counts as one that cannot carry 500,000 baud.
+    /// Returns whether the line is treated as unable to carry 500,000 baud.
     fn have_failed(self) -> bool {
         self.silent_switches >= MAX_SILENT_SWITCHES
     }
 
-    /// Returns whether the scanner was lost in the switch that made the line count as one that cannot carry 500,000
-    /// baud, or in a later one.
+    /// Returns whether the last silent switch lost the scanner and the line is treated as unable to carry 500,000 baud.
     fn have_lost(self) -> bool {
         self.have_failed() && self.is_lost
     }
 }
 
-/// Silent switches after which the line counts as one that cannot carry 500,000 baud.
+/// Number of silent switches after which the line is treated as unable to carry 500,000 baud.
 const MAX_SILENT_SWITCHES: u8 = 2;
-/// The rate that needs RS-422.
+/// Baud rate that needs RS-422.
 const FAST_BAUD: Baud = Baud::B500000;
-/// The highest rate of RS-232.
+/// Highest baud rate of RS-232.
 const RS232_BAUD: Baud = Baud::B38400;
-/// A scanner begins at this rate, unless its EEPROM contains another one.
+/// Baud rate of a scanner after power-on, unless its EEPROM contains another one.
 pub(crate) const POWER_ON_BAUD: Baud = Baud::B9600;
-/// The rates in the order of a search, the most likely ones first: after power-on, after a hub, the others.
+/// Baud rates in the order of a search, the most likely ones first: after power-on, after a hub, the others.
 pub(crate) const SEARCH_ORDER: [Baud; 4] = [Baud::B9600, Baud::B500000, Baud::B38400, Baud::B19200];
-/// After a change of the rate, the UARTs of scanner and adapter need a moment.
+/// Pause after a change of the baud rate, for the UARTs of scanner and adapter.
 pub(crate) const SETTLE_TIME: Nanos = 20 * MILLIS;
 
 #[cfg(test)]

@@ -1,5 +1,5 @@
-//! Replies: what a sensor says to a host's requests, and unasked in a stream. Every reply ends with a status byte, which
-//! is [`crate::lms::status::StatusByte`]'s affair, not this file's.
+//! Replies of a scanner: to requests, and without a request in a stream and after power-on. Every reply ends with a
+//! status byte, see [`crate::lms::status::StatusByte`].
 
 use crate::lms::command as request;
 use crate::lms::command::{Parameter as _, SubRange};
@@ -12,109 +12,110 @@ use crate::lms::variant::{Mode, Unit, Variant};
 pub use crate::lms::configuration::Configuration;
 pub use crate::lms::status::{SimulatedStatus, StatusReport, status_reply};
 
-/// A reply.
+/// Contents of a reply.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Reply<'a> {
-    /// 90h: what a sensor says when it is up, after power-on or a reset: type, number and firmware.
+    /// 90h: boot message after power-on or a reset, with model, number and firmware.
     PowerOn(&'a [u8]),
-    /// 91h: the reset begins; 90h follows within 60 s.
+    /// 91h: the reset begins. 90h follows within 60 s.
     Reset,
-    /// 92h: a well-formed command that this sensor cannot do, or not now.
+    /// 92h: the command is well-formed, but the scanner cannot execute it, or not now.
     Refused,
-    /// A0h: the operating mode (or rate) was changed, or not.
+    /// A0h: result of a change of the operating mode or of the baud rate.
     Mode {
-        /// Whether it was.
+        /// Whether it was changed.
         done: bool,
     },
-    /// B0h: a scan, asked for or streamed.
+    /// B0h: a scan, on request or in a stream.
     Measured(MeasuredValues<'a>),
-    /// B1h.
+    /// B1h: status of the scanner.
     Status(StatusReport<'a>),
-    /// B2h: none, if everything is well.
+    /// B2h: present and past errors; empty if there are none.
     Errors(Errors<'a>),
-    /// B5h.
+    /// B5h: operating data counters.
     Counters {
         /// Hours of operation, in units of two.
         hours_by_2: u16,
-        /// How often the power came on.
+        /// Number of power-ons.
         power_ons: u16,
     },
     /// B6h: mean values.
     Means {
-        /// Of how many scans.
+        /// Number of averaged scans.
         scans: u8,
         /// The values.
         values: MeasuredValues<'a>,
     },
     /// B7h: a sub-range.
     Range {
-        /// Which.
+        /// Indices of the values.
         span: SubRange,
         /// The values.
         values: MeasuredValues<'a>,
     },
     /// BAh: type, number and firmware as ASCII, such as `LMS200;S18063;V02.19`.
     Type(&'a [u8]),
-    /// BBh: the variant now in force, and whether it is the one asked for.
+    /// BBh: result of a change of the variant, with the variant in effect.
     Variant {
-        /// Whether the switch was done.
+        /// Whether it was changed.
         done: bool,
-        /// Angle in degrees and resolution in 1/100 degree as the sensor says them.
+        /// Angle in degrees, as reported.
         angle_deg: u16,
-        /// See `angle_deg`.
+        /// Resolution in 1/100 degree, as reported.
         resolution_cdeg: u16,
     },
     /// BEh: a sub-range with field values.
     RangeFields(Rows<'a>),
     /// BFh: mean values of a sub-range.
     RangeMeans {
-        /// Of how many scans.
+        /// Number of averaged scans.
         scans: u8,
-        /// Which.
+        /// Indices of the values.
         span: SubRange,
         /// The values.
         values: MeasuredValues<'a>,
     },
-    /// C4h: ranges, and reflectivities of a sub-range; LMS S14.
+    /// C4h: ranges, and reflectivities of a sub-range; version S14 only.
     Reflectivity(Rows<'a>),
-    /// E6h: to the change of the rate after power-on.
+    /// E6h: result of a change of the baud rate after power-on.
     PowerOnSet {
-        /// The result; [`StatusReport::has_permanent_baud`] has the present state.
+        /// Result code. [`StatusReport::has_permanent_baud`] has the present state.
         outcome: u8,
         /// The byte that was set.
         set: u8,
     },
-    /// F4h.
+    /// F4h: first part of the configuration.
     Configuration(Configuration<'a>),
     /// F5h: ranges and reflectivities.
     Reflectivities(Rows<'a>),
-    /// F7h: to the change of the configuration.
+    /// F7h: result of writing the first part of the configuration.
     ConfigurationWritten {
         /// Whether it was changed.
         done: bool,
-        /// What is in force now.
+        /// The configuration in effect.
         configuration: Configuration<'a>,
     },
     /// FBh: second part of the configuration, 84 bytes.
     Configuration2(&'a [u8]),
-    /// FCh: to the change of the second part.
+    /// FCh: result of writing the second part of the configuration.
     Configuration2Written {
         /// Whether it was changed.
         done: bool,
-        /// What is in force now.
+        /// The bytes in effect.
         parameters: &'a [u8],
     },
-    /// C0h, C1h, C2h, C5h, C6h, CAh, E9h and F6h, whose layout is not known here: the data as they are.
+    /// C0h, C1h, C2h, C5h, C6h, CAh, E9h and F6h, whose layout is not known here.
     Undecoded {
         /// The command byte.
         command: u8,
-        /// Without the status byte.
+        /// Data without the status byte.
         data: &'a [u8],
     },
 }
 
 impl<'a> Reply<'a> {
-    /// Returns the measuring mode that it reports: `Some(None)` after power-on, when the mode of earlier replies is no longer valid.
+    /// Returns the measuring mode in the reply. `Some(None)` for the boot message: the mode of earlier replies is no
+    /// longer valid.
     pub fn mode(&self) -> Option<Option<Mode>> {
         match self {
             Reply::Configuration(configuration) => Some(Some(configuration.mode())),
@@ -124,7 +125,8 @@ impl<'a> Reply<'a> {
         }
     }
 
-    /// What `telegram` says; `None` if it is no reply of this list or its data are not as its kind needs them.
+    /// Decodes `telegram`. Returns `None` for a request, an unknown command, or data that do not match the command's
+    /// layout.
     pub fn decode(telegram: Telegram<'a>) -> Option<Reply<'a>> {
         if !telegram.is_reply() || telegram.status().is_none() {
             return None;
@@ -176,8 +178,8 @@ impl<'a> Reply<'a> {
         })
     }
 
-    /// The telegram that says it, from the sensor at `address`, ending with `status`; `None` if it is longer than a
-    /// telegram may be. Names are filled up with spaces to the 21 characters that they have.
+    /// Encodes the reply of the scanner at `address`, with `status` as its status byte. Returns `None` if it exceeds
+    /// the maximum length of a telegram. Names are padded with spaces to their 21 characters.
     pub fn encode(&self, address: u8, status: u8) -> Option<EncodedTelegram> {
         let writer = Writer::new(address | REPLY, self.command());
         let writer = match *self {
@@ -216,7 +218,7 @@ impl<'a> Reply<'a> {
         Some(writer.byte(status).finish())
     }
 
-    /// The command byte.
+    /// Returns the command byte.
     pub fn command(&self) -> u8 {
         match self {
             Reply::PowerOn(_) => POWER_ON,
@@ -245,22 +247,22 @@ impl<'a> Reply<'a> {
     }
 }
 
-/// A0h: mode or rate changed (or not), from `address`, ending with `status`.
+/// Encodes A0h, the result of a change of mode or rate, from the scanner at `address`.
 pub fn mode_reply(address: u8, done: bool, status: u8) -> EncodedTelegram {
     Writer::new(address | REPLY, MODE).byte(u8::from(!done)).byte(status).finish()
 }
 
-/// 92h: refused, from `address`, ending with `status`.
+/// Encodes 92h, the refusal of a command, from the scanner at `address`.
 pub fn refusal(address: u8, status: u8) -> EncodedTelegram {
     Writer::new(address | REPLY, REFUSED).byte(status).finish()
 }
 
-/// BAh: `name` is type, number and firmware, 20 or 21 ASCII characters by custom.
+/// Encodes BAh. `name` has model, number and firmware, usually 20 or 21 ASCII characters.
 pub fn type_reply(address: u8, name: &[u8], status: u8) -> EncodedTelegram {
     Writer::new(address | REPLY, TYPE).slice(name).byte(status).finish()
 }
 
-/// BBh: whether the switch was done, and the variant in force.
+/// Encodes BBh, the result of a change of the variant, with the variant in effect.
 pub fn variant_reply(address: u8, done: bool, variant: Variant, status: u8) -> EncodedTelegram {
     Writer::new(address | REPLY, VARIANT)
         .byte(u8::from(done))
@@ -270,7 +272,7 @@ pub fn variant_reply(address: u8, done: bool, variant: Variant, status: u8) -> E
         .finish()
 }
 
-/// F4h: 34 bytes of a sensor as it left the factory, with this measuring mode and unit.
+/// Encodes F4h, the 34 bytes of a factory-new configuration with this measuring mode and unit.
 pub fn configuration_reply(address: u8, mode: Mode, unit: Unit, status: u8) -> EncodedTelegram {
     Writer::new(address | REPLY, CONFIGURATION)
         .slice(&factory_configuration(mode, unit))
@@ -278,11 +280,11 @@ pub fn configuration_reply(address: u8, mode: Mode, unit: Unit, status: u8) -> E
         .finish()
 }
 
-/// Command byte of what a sensor says when it is up.
+/// Command byte of the boot message.
 pub const POWER_ON: u8 = 0x90;
 /// Command byte of the beginning of a reset.
 pub const RESET: u8 = 0x91;
-/// Command byte of the refusal.
+/// Command byte of a refusal.
 pub const REFUSED: u8 = 0x92;
 
 const MODE: u8 = request::MODE | REPLY;
@@ -302,7 +304,7 @@ const REFLECTIVITIES: u8 = request::REFLECTIVITIES | REPLY;
 const CONFIGURATION_WRITTEN: u8 = 0xF7;
 const CONFIGURATION_2: u8 = request::CONFIGURATION_2 | REPLY;
 const CONFIGURATION_2_WRITTEN: u8 = 0xFC;
-/// Replies without a layout here.
+/// Command bytes of replies whose layout is not known here.
 const UNDECODED_COMMANDS: [u8; 8] = [0xC0, 0xC1, 0xC2, 0xC5, 0xC6, 0xCA, 0xE9, 0xF6];
-/// Characters of type, number and firmware.
+/// Number of characters of model, number and firmware.
 const NAME_LEN: usize = 21;

@@ -1,8 +1,8 @@
-//! Sends one request after another, and returns the replies. [`crate::lms::inquiry`] and a change of the configuration
-//! use [`RequestChannel`]. A session only uses `PendingRequest`, the request that is being sent, or whose reply is expected.
+//! Sender of requests with their timeouts and retries. [`crate::lms::inquiry`] and a change of the configuration use
+//! [`RequestChannel`]. A session has its own framer and uses only `PendingRequest`.
 //!
-//! The scanner requires at least 55 us and at most 6 ms between bytes, and may overlook a request while its mirror rotates
-//! (Telegram listing 4.3). So a request is sent byte by byte.
+//! The scanner requires at least 55 us and at most 6 ms between bytes, and may overlook a request while its mirror
+//! rotates (Telegram listing 4.3). A request is therefore sent byte by byte.
 
 use scanhub_schema::{MICROS, MILLIS, Nanos, line_time};
 
@@ -13,25 +13,25 @@ use crate::lms::reply::REFUSED;
 use crate::lms::telegram::{EncodedTelegram, REPLY, Telegram};
 use crate::lms::variant::Baud;
 
-/// A line with at most one open request.
+/// Port with a framer and at most one open request.
 #[derive(Clone, Debug)]
 pub struct RequestChannel<R> {
     framer: Framer,
     open_request: Option<PendingRequest<R>>,
     change_baud: bool,
-    /// Rate of the port.
+    /// Baud rate of the port.
     pub baud: Baud,
-    /// Time of the last call.
+    /// Time of the last call that had a time.
     pub now: Nanos,
     last_byte: Nanos,
-    /// Address of the scanner, once it is known; 0 is for all.
+    /// Address of the scanner, or 0 for all scanners while it is unknown.
     pub address: u8,
-    /// Whether the port is a serial server on the network, whose first bytes of a reply may be all of it.
+    /// Whether the port is a serial server on the network, which may deliver a complete reply in one read.
     pub is_behind_server: bool,
 }
 
 impl<R: EncodeRequest> RequestChannel<R> {
-    /// Creates it on a port that is open at `baud`.
+    /// Creates a channel on a port that is open at `baud`.
     pub fn new(baud: Baud, now: Nanos) -> Self {
         RequestChannel {
             framer: Framer::default(),
@@ -45,7 +45,7 @@ impl<R: EncodeRequest> RequestChannel<R> {
         }
     }
 
-    /// Returns the buffer of the next read, like [`Protocol::spare`](crate::line::Protocol::read_buffer).
+    /// Returns the buffer of the next read, like [`Protocol::read_buffer`](crate::line::Protocol::read_buffer).
     pub fn read_buffer(&mut self) -> &mut [u8] {
         self.framer.read_buffer()
     }
@@ -61,23 +61,24 @@ impl<R: EncodeRequest> RequestChannel<R> {
         }
     }
 
-    /// Handles a read that found nothing. Returns whether the wait for the reply has ended.
+    /// Handles a read without bytes. Returns whether the reply is overdue.
     pub fn handle_timeout(&mut self, now: Nanos) -> bool {
         self.now = now;
         self.framer.release(now.saturating_sub(self.last_byte));
         self.open_request.as_ref().is_some_and(|open| now >= open.deadline)
     }
 
-    /// Handles that a byte is about to be written, like
-    /// [`Protocol::restart_if_late`](crate::line::Protocol::restart_if_late). For a serial server, the gaps on the line
-    /// are not known.
+    /// Restarts the request if its next byte is late, like
+    /// [`Protocol::restart_if_late`](crate::line::Protocol::restart_if_late). The gaps on the line of a serial server
+    /// are not known, so its requests are not restarted.
     pub fn restart_if_late(&mut self, now: Nanos) -> bool {
         self.now = now;
         !self.is_behind_server
             && self.open_request.as_mut().is_some_and(|open| open.restart_if_late(now, self.baud))
     }
 
-    /// Handles that a byte was written, like [`Protocol::transmitted`](crate::line::Protocol::handle_transmitted).
+    /// Handles the transmission of a byte, like
+    /// [`Protocol::handle_transmitted`](crate::line::Protocol::handle_transmitted).
     pub fn handle_transmitted(&mut self, now: Nanos) {
         self.now = now;
         if let Some(open) = &mut self.open_request {
@@ -88,18 +89,18 @@ impl<R: EncodeRequest> RequestChannel<R> {
         }
     }
 
-    /// Changes the rate.
+    /// Changes the baud rate of the port.
     pub fn set_baud(&mut self, baud: Baud) {
         self.change_baud |= self.baud != baud;
         self.baud = baud;
     }
 
-    /// Sends `request` from `not_before` on, at most `tries` times.
+    /// Sends `request`, not before `not_before`, at most `tries` times. Replaces an open request.
     pub fn send_request(&mut self, request: R, not_before: Nanos, tries: u8) {
         self.open_request = Some(PendingRequest::new(request, self.address, not_before, tries));
     }
 
-    /// Sends the open request once more, from `at` on. Returns whether there is one, and it had a try left.
+    /// Sends the open request again, not before `not_before`. Returns whether there is one with a try left.
     pub fn retry(&mut self, not_before: Nanos) -> bool {
         let has_try = self.open_request.as_mut().is_some_and(|open| open.retry(not_before));
         if !has_try {
@@ -108,7 +109,7 @@ impl<R: EncodeRequest> RequestChannel<R> {
         has_try
     }
 
-    /// Handles a NAK that counts. Returns whether the request will be sent again. `None` if there was none.
+    /// Handles a NAK. Returns whether the request will be sent again, or `None` if no request was sent.
     pub fn on_nak(&mut self) -> Option<bool> {
         self.open_request
             .as_ref()
@@ -116,7 +117,7 @@ impl<R: EncodeRequest> RequestChannel<R> {
             .then(|| self.retry(self.now + NAK_PAUSE))
     }
 
-    /// Removes the open request if a telegram with this `command` is its reply, or a refusal.
+    /// Removes and returns the open request if a telegram with this `command` is its reply or a refusal.
     pub fn take_answered(&mut self, command: u8) -> Option<R> {
         let is_answer = |open: &mut PendingRequest<R>| {
             open.is_sent() && (command == REFUSED || command == open.request.command() | REPLY)
@@ -124,9 +125,9 @@ impl<R: EncodeRequest> RequestChannel<R> {
         self.open_request.take_if(is_answer).map(|open| open.request)
     }
 
-    /// Returns the next telegram or NAK in the received bytes, and handles acknowledgments.
+    /// Returns the next telegram or NAK in the received bytes, and handles acknowledgments on the way.
     pub fn advance(&mut self) -> Option<ChannelEvent> {
-        // Bytes that arrived before a change of the rate are not checked.
+        // Bytes that arrived before a change of the rate are discarded.
         while !self.change_baud {
             match self.framer.advance()? {
                 FoundItem::Telegram(span) => return Some(ChannelEvent::Telegram(span)),
@@ -141,12 +142,12 @@ impl<R: EncodeRequest> RequestChannel<R> {
         None
     }
 
-    /// Returns the telegram that was found last.
+    /// Returns the telegram that [`advance`](Self::advance) returned last.
     pub fn view(&self, span: TelegramSpan) -> Telegram<'_> {
         self.framer.telegram_at(span).telegram
     }
 
-    /// Returns the next action. `own` is an additional deadline of the caller.
+    /// Returns the next action. `caller_deadline` is an additional deadline of the caller.
     pub fn poll_action(&mut self, caller_deadline: Nanos) -> Action<'_> {
         if core::mem::take(&mut self.change_baud) {
             self.framer.clear();
@@ -169,7 +170,7 @@ impl<R: EncodeRequest> RequestChannel<R> {
         Action::Wait { until }
     }
 
-    /// Returns the counters of bytes, and the number of bytes that are not assigned yet.
+    /// Returns the counters of bytes, and the number of buffered bytes that are not counted in a class yet.
     pub fn byte_counters(&self) -> (&FramerCounters, usize) {
         (self.framer.counters(), self.framer.buffered())
     }
@@ -178,17 +179,17 @@ impl<R: EncodeRequest> RequestChannel<R> {
 /// A received telegram or NAK.
 #[derive(Clone, Copy, Debug)]
 pub enum ChannelEvent {
-    /// A telegram. [`RequestChannel::view`] returns it.
+    /// A telegram, which [`RequestChannel::view`] returns.
     Telegram(TelegramSpan),
     /// A NAK.
     Nak,
 }
 
-/// A telegram that has a reply.
+/// A request that has a reply.
 pub trait EncodeRequest {
-    /// Encodes it for the scanner at `address`.
+    /// Encodes the request for the scanner at `address`.
     fn encode(&self, address: u8) -> EncodedTelegram;
-    /// Returns its command byte.
+    /// Returns the command byte.
     fn command(&self) -> u8;
     /// Returns the maximum time from the acknowledgment to the reply.
     fn reply_timeout(&self) -> Nanos;
@@ -219,32 +220,32 @@ impl EncodeRequest for Request {
     }
 }
 
-/// The open request.
+/// The open request, with its progress and its deadlines.
 #[derive(Clone, Debug)]
 pub(crate) struct PendingRequest<R = Request> {
     pub(crate) request: R,
     encoded: EncodedTelegram,
     sent: usize,
     not_before: Nanos,
-    /// Earliest time at which the byte before the next one can have left, see [`PendingRequest::restart_if_late`].
+    /// Earliest time at which the last byte can have left the port, see [`PendingRequest::restart_if_late`].
     min_sent_at: Nanos,
-    /// Number of times that the request was started over because a byte was late.
+    /// Number of restarts because a byte was late.
     restarts: u8,
     max_tries: u8,
     tries_left: u8,
-    /// Additional time for each wait for the acknowledgment.
+    /// Additional time until the acknowledgment, for each try.
     extra_time: Nanos,
     pub(crate) is_acknowledged: bool,
     /// Whether a byte has arrived since the last one was sent.
     has_received: bool,
-    /// Time at which the last byte was sent.
+    /// Time at which the last byte of the request was sent.
     pub(crate) sent_at: Option<Nanos>,
-    /// End of the wait for the reply, which begins with the last byte.
+    /// End of the wait for the reply, which begins with the last byte of the request.
     pub(crate) deadline: Nanos,
 }
 
 impl<R: EncodeRequest> PendingRequest<R> {
-    /// Creates `request` for the scanner at `address`, to be sent from `not_before` on, at most `tries` times.
+    /// Creates `request` for the scanner at `address`. It is sent not before `not_before`, at most `tries` times.
     pub(crate) fn new(request: R, address: u8, not_before: Nanos, tries: u8) -> Self {
         let encoded = request.encode(address);
         PendingRequest {
@@ -269,23 +270,23 @@ impl<R: EncodeRequest> PendingRequest<R> {
         self.extra_time = extra_time;
     }
 
-    /// Returns the next byte. Empty if all of them were sent.
+    /// Returns the next byte, or an empty slice if all bytes were sent.
     pub(crate) fn next_byte(&self) -> &[u8] {
         self.encoded.bytes().get(self.sent..=self.sent).unwrap_or_default()
     }
 
-    /// Returns the earliest time of the next byte.
+    /// Returns the earliest time of the next byte, or `None` if all bytes were sent.
     pub(crate) fn next_at(&self) -> Option<Nanos> {
         (!self.is_sent()).then_some(self.not_before)
     }
 
-    /// Handles that the next byte was sent at `now`.
+    /// Records that the next byte was sent at `now`.
     pub(crate) fn on_byte_sent(&mut self, now: Nanos, baud: Baud) {
         self.sent += 1;
         self.not_before = now + line_time(1, baud.rate()) + BYTE_GAP;
         if self.sent == self.encoded.bytes().len() {
             self.sent_at = Some(now);
-            // A slow scanner needs a longer wait, not more tries, because each try interrupts the last one.
+            // A slow scanner needs a longer wait, not more tries, because each try interrupts the previous one.
             let previous_tries = Nanos::from(self.max_tries - self.tries_left - 1);
             self.deadline = now
                 + self.request.acknowledge_timeout()
@@ -294,16 +295,16 @@ impl<R: EncodeRequest> PendingRequest<R> {
         }
     }
 
-    /// Handles that bytes arrived. After the beginning of a scan that the request interrupted, the acknowledgment is
-    /// not detected, only the reply, which may have begun now.
+    /// Records the arrival of bytes, and extends the deadline once. If the request interrupted a scan, the framer does
+    /// not detect the acknowledgment, so the bytes may be the beginning of the reply.
     pub(crate) fn on_byte(&mut self, baud: Baud) {
         if self.is_sent() && !core::mem::replace(&mut self.has_received, true) {
             self.deadline += line_time(1 + MAX_REPLY_LEN, baud.rate());
         }
     }
 
-    /// Handles an acknowledgment, after which the reply may take longer. Only the first one counts: a stream at another
-    /// rate looks like endless acknowledgments, which must not extend the deadline again and again.
+    /// Handles an acknowledgment, after which the reply may take longer. Only the first one counts, because a stream at
+    /// another rate looks like endless acknowledgments, which must not extend the deadline repeatedly.
     pub(crate) fn on_acknowledged(&mut self, now: Nanos, baud: Baud) {
         if core::mem::replace(&mut self.is_acknowledged, true) {
             return;
@@ -311,7 +312,7 @@ impl<R: EncodeRequest> PendingRequest<R> {
         self.deadline = now + self.request.reply_timeout() + line_time(MAX_REPLY_LEN, baud.rate());
     }
 
-    /// Begins again, not before `at`. Returns whether there was a try left.
+    /// Starts the request again, not before `not_before`. Returns whether there was a try left.
     pub(crate) fn retry(&mut self, not_before: Nanos) -> bool {
         self.sent = 0;
         self.not_before = not_before;
@@ -322,9 +323,9 @@ impl<R: EncodeRequest> PendingRequest<R> {
         self.tries_left.checked_sub(1).map(|left| self.tries_left = left).is_some()
     }
 
-    /// Starts over with the first byte if `now` is too late for the next one, and returns whether it is. The sensor has
-    /// dropped the request, and it cannot have received its last byte. This does not count as a try. After
-    /// [`MAX_RESTARTS`] the request is sent to its end anyway, so that the wait for its reply ends.
+    /// Restarts the request if `now` is too late for its next byte, and returns whether it did. The scanner has dropped
+    /// the request, whose last byte was not sent yet. A restart does not use up a try. After [`MAX_RESTARTS`] the
+    /// request is sent to its end anyway, so that the wait for its reply ends.
     pub(crate) fn restart_if_late(&mut self, now: Nanos, baud: Baud) -> bool {
         let is_gap =
             self.is_partly_sent() && now > self.min_sent_at + line_time(1, baud.rate()) + MAX_BYTE_GAP;
@@ -337,51 +338,52 @@ impl<R: EncodeRequest> PendingRequest<R> {
         is_late
     }
 
-    /// Returns the command byte of its reply.
+    /// Returns the command byte of the reply.
     pub(crate) fn reply(&self) -> u8 {
         self.request.command() | REPLY
     }
 
-    /// Returns whether some of its bytes were sent, but not all.
+    /// Returns whether some of the bytes were sent, but not all.
     pub(crate) fn is_partly_sent(&self) -> bool {
         self.sent > 0 && !self.is_sent()
     }
 
-    /// Returns whether all of it was sent.
+    /// Returns whether all bytes were sent.
     pub(crate) fn is_sent(&self) -> bool {
         self.sent >= self.encoded.bytes().len()
     }
 }
 
-/// Number of tries. A scanner may overlook a request while its mirror rotates. All drivers give it three tries.
+/// Number of tries of a request. A scanner may overlook a request while its mirror rotates. All known drivers try three
+/// times.
 pub const TRIES: u8 = 3;
-/// Number of tries of requests without which there is no stream.
+/// Number of tries of requests that are necessary for a stream.
 pub const ESSENTIAL_TRIES: u8 = 5;
-/// The scanner drops a partial request after 6 ms (Telegram listing 4.3).
+/// Time after which the scanner has dropped a partial request. It drops it after 6 ms (Telegram listing 4.3).
 pub(crate) const PARTIAL_REQUEST_TIMEOUT: Nanos = 10 * MILLIS;
-/// Time from the end of a byte to the next one: more than 55 us, far less than 6 ms (Telegram listing 4.3).
+/// Time from the end of a byte to the next one: more than 55 us, and much less than 6 ms (Telegram listing 4.3).
 const BYTE_GAP: Nanos = 120 * MICROS;
-/// Maximum number of times that a request starts over because a byte was late. A machine that is late more often cannot
-/// send it.
+/// Maximum number of restarts of a request because a byte was late. On a machine that is late more often, the request
+/// cannot be sent.
 const MAX_RESTARTS: u8 = 50;
-/// Longest time between the end of a byte and the next one: 6 ms (Telegram listing 4.3), less the time of the write.
+/// Longest time from the end of a byte to the next one: 6 ms (Telegram listing 4.3), less the time of the write.
 const MAX_BYTE_GAP: Nanos = 5 * MILLIS;
-/// A byte that may be sent within this time is requested at once. A later one has a deadline like everything else.
+/// Time before a byte is due at which the session returns it. A byte that is due later is a deadline first.
 pub(crate) const SEND_AHEAD: Nanos = 5 * MILLIS;
-/// ACK or NAK arrives within 60 ms (Telegram listing 4.3), and captured replies begin within 100 ms. The rest is for
-/// adapters.
+/// Timeout of the acknowledgment. ACK or NAK arrives within 60 ms (Telegram listing 4.3), and captured replies begin
+/// within 100 ms. The rest is for adapters.
 const ACKNOWLEDGE_TIMEOUT: Nanos = 150 * MILLIS;
-/// A captured reply to a stop takes 94 ms, and its acknowledgment is hidden in the stream. Waiting is cheap: a scanner
-/// that overlooked the stop continues to stream.
+/// Timeout of the acknowledgment of a stop. A captured reply takes 94 ms, and the acknowledgment is hidden in the
+/// stream. A long timeout costs little, because a scanner that overlooked the stop continues to stream.
 const STOP_TIMEOUT: Nanos = 300 * MILLIS;
-/// Captured replies with type, status and configuration take up to 158 ms.
+/// Timeout of a reply. Captured replies with type, status and configuration take up to 158 ms.
 pub(crate) const REPLY_TIMEOUT: Nanos = 500 * MILLIS;
-/// A change of mode takes up to 3 s (Telegram listing 7.3), but mostly 0.1 s. A request for the mode before its end
-/// returns the previous mode, and undoes the change.
+/// Timeout of a change of mode. It takes up to 3 s (Telegram listing 7.3), but usually 0.1 s. A status request before
+/// its end returns the previous mode and undoes the change.
 pub const MODE_TIMEOUT: Nanos = 3_200 * MILLIS;
-/// Length of the status reply, in bytes.
+/// Length of the longest expected reply, the status, in bytes.
 const MAX_REPLY_LEN: usize = 160;
-/// The scanner requires a pause of 30 ms after a NAK (Telegram listing 4.3).
+/// Pause after a NAK: the scanner requires 30 ms (Telegram listing 4.3).
 pub(crate) const NAK_PAUSE: Nanos = 30 * MILLIS;
 
 #[cfg(test)]
@@ -421,7 +423,7 @@ mod tests {
                 match exchange.poll_action(Nanos::MAX) {
                     Action::Transmit { bytes, not_before } => {
                         let &[byte] = bytes else { panic!("no gaps between {bytes:?}") };
-                        // The fourth byte is late, once.
+                        // The fourth byte is late once.
                         let late = if written == 3 && restarts == 0 { byte_ns + gap } else { 0 };
                         now = (now + late).max(not_before);
                         if exchange.restart_if_late(now) {
@@ -433,7 +435,7 @@ mod tests {
                         exchange.handle_transmitted(now);
                     }
                     Action::Wait { until } => {
-                        // The sensor forgets what it has received.
+                        // The scanner drops the bytes that it has received.
                         assert_eq!((until - now, written), (10 * MILLIS, 0));
                         now = until;
                         assert!(!exchange.handle_timeout(now));
@@ -488,7 +490,7 @@ mod tests {
         }
         assert!(outgoing.is_sent());
         assert_eq!(outgoing.deadline, now + ACKNOWLEDGE_TIMEOUT);
-        // The bytes may be the start of the longest reply, which starts once.
+        // The bytes may be the beginning of the longest reply. It begins only once, so the second call adds nothing.
         for _ in 0..2 {
             outgoing.on_byte(Baud::B500000);
             assert_eq!(outgoing.deadline, now + ACKNOWLEDGE_TIMEOUT + line_time(161, 500_000));

@@ -1,36 +1,36 @@
-//! Losses of a stream: scans that were due and did not arrive, and bytes that were damaged on the line.
+//! Counters of losses in a stream: scans that were due but did not arrive, and bytes that were damaged on the line.
 //!
-//! A scanner sends scans one period apart, even if they do not arrive. So lost ones can be counted, and one that was in
-//! a backlog can be stamped. If a scanner is silent for longer than the session waits, that is not a loss on the line:
-//! the stream starts again.
+//! A scanner sends scans one period apart, even if they do not arrive. Lost scans can therefore be counted, and a scan
+//! in a backlog can be stamped. A silence that is longer than the session's timeout is not a loss on the line, because
+//! the session restarts the stream.
 
 use scanhub_schema::{MILLIS, Nanos};
 
 use crate::lms::framer::FramerCounters;
 
-/// Due times of one stream, and counters of all streams of a session.
+/// Due times of the current stream, and counters of all streams of a session.
 #[derive(Clone, Debug)]
 pub(crate) struct ScanSchedule {
-    /// Period by the scanner's settings.
+    /// Period that follows from the scanner's settings.
     nominal: Nanos,
-    /// Measured period. It differs, because the scanner's motor and the host's clock are never exact.
+    /// Measured period. It differs from the nominal one because the scanner's motor and the host's clock are not exact.
     period: Nanos,
-    /// Due time of the last scan. `None`: the next one begins a cadence.
+    /// Due time of the last scan. `None` if the next scan begins a stream.
     last_due: Option<Nanos>,
-    /// Whether two scans have arrived one period apart, so that the scanner does send that often.
+    /// Whether two scans have arrived one period apart, so that the scanner is known to send every period.
     is_steady: bool,
     window: PeriodWindow,
-    /// Number of scans that were due after the first one of each cadence, and of those that arrived.
+    /// Number of scans that were due after the first one of each stream.
     pub(crate) due: u64,
     arrived: u64,
-    /// Number of scans that certainly did not arrive.
+    /// Number of scans that were missing for a second.
     pub(crate) lost: u64,
-    /// Minimum number of missing scans since `min_since`. A late one is missing only for a moment.
+    /// Minimum number of missing scans since `min_since`. A scan that is only late is missing for a short time.
     min_missing: u64,
     min_since: Nanos,
 }
 
-/// Measurement of the period.
+/// Measurement of the mean period over `length` periods.
 #[derive(Clone, Copy, Debug)]
 struct PeriodWindow {
     begin: Nanos,
@@ -54,12 +54,13 @@ impl ScanSchedule {
         }
     }
 
-    /// Returns the due time `slots` periods after the last scan. `None` before the scanner is known to be steady.
+    /// Returns the due time `slots` periods after the last scan, or `None` until the scanner is known to send every
+    /// period.
     pub(crate) fn due_after(&self, slots: u64) -> Option<Nanos> {
         self.last_due.filter(|_| self.is_steady).map(|last| last + slots * self.period)
     }
 
-    /// Ends the cadence, because the stream ended, or a request was sent, for which the scanner skips scans.
+    /// Ends the stream of due times, because the scanner stopped or skips scans for a request.
     pub(crate) fn end_stream(&mut self) {
         if self.last_due.take().is_some() {
             self.lost = self.lost.max(self.due.saturating_sub(self.arrived));
@@ -67,7 +68,7 @@ impl ScanSchedule {
         }
     }
 
-    /// Handles a scan that began at `at`, of a scanner with the period `nominal`.
+    /// Records a scan that began at `at`. The scanner's settings have the period `nominal`.
     pub(crate) fn note_scan(&mut self, at: Nanos, estimated: bool, nominal: Nanos) {
         if nominal != self.nominal {
             self.end_stream();
@@ -82,7 +83,7 @@ impl ScanSchedule {
         let (since, period) = (at as i64 - last as i64, self.period as i64);
         let slots = (since + period / 2).div_euclid(period).max(0);
         let off = since - slots * period;
-        // The delay that a busy host adds to one stamp must not move the due times by as much.
+        // A busy host may delay a stamp. The due times follow a deviation only in part.
         let due = last.saturating_add_signed(slots * period + off / if estimated { 8 } else { 2 });
         self.last_due = Some(due);
         let slots = slots as u64;
@@ -98,7 +99,7 @@ impl ScanSchedule {
         }
     }
 
-    /// Uses the mean of the measurement as the period, if it is plausible.
+    /// Adopts the mean of the measurement as the period, if it is plausible.
     fn update_period(&mut self, due: Nanos) {
         let PeriodWindow { begin, slots, length } = self.window;
         let mean = due.saturating_sub(begin) / slots;
@@ -108,7 +109,7 @@ impl ScanSchedule {
         self.window = PeriodWindow { begin: due, slots: 0, length: (2 * length).min(MAX_WINDOW_SCANS) };
     }
 
-    /// Counts scans as lost that were missing for a whole second.
+    /// Counts scans as lost that have been missing for a second.
     fn count_lost(&mut self, at: Nanos) {
         let missing = self.due.saturating_sub(self.arrived);
         self.min_missing = self.min_missing.min(missing);
@@ -120,27 +121,28 @@ impl ScanSchedule {
     }
 }
 
-/// Number of scans of the first measurement, and of the longest one.
+/// Number of periods of the first measurement. Later ones are longer, up to `MAX_WINDOW_SCANS`.
 const FIRST_WINDOW_SCANS: u64 = 64;
 const MAX_WINDOW_SCANS: u64 = 256;
-/// A mean that differs by this part of the nominal period is not plausible: scans were miscounted.
+/// Largest plausible deviation of a mean from the nominal period, as its divisor. A mean that differs more is due to
+/// miscounted scans.
 const TOLERANCE_DIVISOR: u64 = 6;
-/// A scan that is later than this is lost. A network may delay scans for some tenths of a second.
+/// Time after which a missing scan is lost. A network may delay scans for some tenths of a second.
 const LOSS_TIMEOUT: Nanos = 1_000 * MILLIS;
 
-/// Damage of all streams of a session.
+/// Counter of damaged bytes in all streams of a session.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct LineDamage {
-    /// Number of damaged bytes, up to `seen`.
+    /// Number of damaged bytes up to the last check.
     damaged: u64,
-    /// Number of bytes in no telegram when the stream was last checked. `None` without a stream.
+    /// Number of bytes outside telegrams at the last check. `None` without a stream.
     checked: Option<u64>,
-    /// Time at which bytes were last found damaged.
+    /// Time of the last check that found damaged bytes.
     last_damage: Option<Nanos>,
 }
 
 impl LineDamage {
-    /// Handles the counters of a stream that begins or continues.
+    /// Adds the damage since the last check. Begins a stream if there is none.
     pub(crate) fn note_bytes(&mut self, counters: &FramerCounters, now: Nanos) {
         let unassigned = unassigned_bytes(counters);
         if let Some(checked) = self.checked.replace(unassigned)
@@ -151,7 +153,7 @@ impl LineDamage {
         }
     }
 
-    /// Ends the stream.
+    /// Ends the stream. Bytes outside telegrams are not damage until the next one begins.
     pub(crate) fn end_stream(&mut self) {
         self.checked = None;
     }
@@ -171,7 +173,7 @@ fn unassigned_bytes(counters: &FramerCounters) -> u64 {
     counters.discarded - counters.broken_off
 }
 
-/// Time for which a line counts as damaging after the last damage.
+/// Time after the last damage for which the line is considered to damage telegrams.
 const RECENT_DAMAGE_TIME: Nanos = 10_000 * MILLIS;
 
 #[cfg(test)]
@@ -180,7 +182,7 @@ mod tests {
 
     const PERIOD: Nanos = 26_640_000;
 
-    /// Returns the cadence after scans at these times, in periods.
+    /// Returns the schedule after scans at these times, in periods.
     fn after_scans(scans: impl IntoIterator<Item = f64>) -> ScanSchedule {
         let mut cadence = ScanSchedule::new();
         for at in scans {
@@ -207,7 +209,7 @@ mod tests {
     fn delays_are_not_losses() {
         let jittery = (0..4000).map(|n| f64::from(n) + f64::from(n * 7 % 10) * 0.04);
         assert_eq!(after_scans(jittery).lost, 0);
-        // A network that sometimes delays scans for 200 ms, and then delivers all at once.
+        // A network sometimes delays scans for 200 ms and then delivers all of them at once.
         let held = (0..4000).map(|n| f64::from(if n % 100 < 8 { n - n % 100 + 8 } else { n }));
         let mut cadence = ScanSchedule::new();
         for at in held {

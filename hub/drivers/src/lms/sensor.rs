@@ -1,5 +1,5 @@
-//! State of a scanner as far as it has reported it, for messages and for the next session. It is discarded when the
-//! next telegram may come from another scanner.
+//! State of a scanner as its telegrams have reported it, for messages and for the next session. It is discarded when
+//! the next telegram may come from another scanner.
 
 use core::fmt;
 
@@ -12,41 +12,42 @@ use crate::lms::status::{DIRTY_BELOW_PERCENT, Severity, StatusByte, StatusReport
 use crate::lms::telegram::Telegram;
 use crate::lms::variant::{Baud, Mode, Unit, Variant};
 
-/// Reason why a session does not stream as it should.
+/// Reason why a session does not stream as requested.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Problem {
-    /// No reply at any rate.
+    /// The scanner does not reply at any rate.
     NoReply {
-        /// The only rate that the session tried. `None`: it tried all.
+        /// The only rate that the session tried; `None` if it tried all.
         baud: Option<Baud>,
-        /// Seconds without a reply, rounded down to steps that grow.
+        /// Seconds without a reply, rounded down to steps of increasing length.
         seconds: u32,
     },
-    /// A request had no reply in all its tries.
+    /// The scanner did not reply to this request in all its tries.
     Unanswered(Request),
     /// The scanner refused a request.
     Refused(Request),
-    /// The scanner keeps another angle or resolution than the requested one, and streams that.
+    /// The scanner keeps another angle or resolution than the requested one, and streams with it.
     VariantRefused,
     /// No measured data arrived for one second.
     Silence,
     /// The line cannot carry 500,000 baud: it was silent after two switches to that rate.
     NeedsRs422 {
-        /// Rate that the session uses instead; `None` if it has to keep to 500,000 baud.
+        /// Rate that the session uses instead; `None` if the settings require 500,000 baud.
         fallback: Option<Baud>,
     },
-    /// The port cannot have 500,000 baud.
+    /// The port does not support 500,000 baud.
     PortLacksRate {
         /// Rate that the session uses instead.
         fallback: Baud,
     },
-    /// The session is paused, but bytes arrive, and the scanner has not confirmed that it stops.
+    /// The session is paused, but bytes arrive, and the scanner has not confirmed the stop.
     NotStopped,
-    /// The scanner reports that it is a version S14, which scans 90 degrees with as many values as others 180.
+    /// The scanner is a version S14, which scans 90 degrees with as many values as other scanners use for 180.
     AnglesUnknown,
-    /// The scanner is set to a measuring mode whose values are not ranges, or whose layout is not documented.
+    /// The scanner's measuring mode has values that are not ranges, or whose layout is not documented.
     NoRanges(Mode),
-    /// The scanner does not report its measuring mode, so it is not known how many of the 16 bits are the range.
+    /// The scanner does not report its measuring mode, so the number of range bits among the 16 bits of a value is
+    /// unknown.
     ModeUnknown,
 }
 
@@ -94,27 +95,27 @@ impl fmt::Display for Problem {
     }
 }
 
-/// State of a scanner as far as it has reported it.
+/// State of a scanner as its telegrams have reported it. A field is `None` before its first report.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Sensor {
-    /// Address byte of its telegrams: its own address + 80h.
+    /// Address byte of the scanner's telegrams: its own address + 80h.
     pub address: Option<u8>,
-    /// Measuring mode, which defines how values are split.
+    /// Measuring mode, which defines how values are split into range and upper bits.
     pub mode: Option<Mode>,
     /// Unit of its ranges.
     pub unit: Option<Unit>,
     /// Angle and resolution.
     pub variant: Option<Variant>,
-    /// Whether it sends scans without a request, or is in a mode in which it does not measure.
+    /// Whether the scanner sends scans without a request, or is in a mode in which it does not measure.
     pub streams: bool,
-    /// Status byte of its telegrams. A worse one counts at once, a better one after some hundred telegrams, because it
-    /// may change with each scan.
+    /// Status byte of the telegrams. A worse one is accepted at once, a better one only after some hundred telegrams,
+    /// because the status byte may change with every scan.
     pub status_byte: Option<StatusByte>,
-    /// Whether it reports that it is defective.
+    /// Whether the scanner reports that it is defective.
     pub defective: Option<bool>,
-    /// Whether its EEPROM contains a rate for power-on that is not the factory's 9,600 baud.
+    /// Whether the EEPROM contains a baud rate for power-on other than the factory's 9,600 baud.
     pub permanent_baud: Option<bool>,
-    /// Laser power in percent of the nominal one. Real scanners report 156 to 161.
+    /// Laser power in percent of the nominal power. Real scanners report 156 to 161.
     pub laser_power_percent: Option<u16>,
     /// Transmission of the dirtiest channel of the window, in percent of a clean one. The scanner warns below 75, and
     /// reports an error below 30.
@@ -122,37 +123,38 @@ pub struct Sensor {
     software: [u8; SOFTWARE_NAME_LEN],
     kind: [u8; MAX_TYPE_LEN],
     kind_len: usize,
-    /// Family that the type names.
+    /// Model in the type reply.
     family: Option<LmsModel>,
-    /// Number of telegrams in a row whose condition was better.
+    /// Number of consecutive telegrams with a better status byte.
     better_telegrams: u16,
-    /// Whether the line damages telegrams, so that a single one does not prove a worse condition.
+    /// Whether the line damages telegrams, so that a single telegram does not prove a worse status.
     is_line_damaged: bool,
-    /// Number of reports of a worse condition on such a line, and telegrams since the first one.
+    /// Number of reports of a worse status on a damaging line, and number of telegrams since the first one.
     worse_reports: u8,
     worse_since: u16,
-    /// Number of reports of a fatal condition.
+    /// Number of reports of a fatal status.
     fatal_reports: u8,
-    /// Complaint of the last status report, and whether the one before had the same.
+    /// Issues of the last status report. `is_confirmed`: the previous report had the same issues.
     issues: Option<HealthIssues>,
     is_confirmed: bool,
 }
 
-/// Whether a status report says that the scanner is defective, and that its window is dirty.
+/// Issues of a status report: whether the scanner is defective, and whether its window is dirty.
 type HealthIssues = (bool, bool);
 
 impl Sensor {
-    /// Returns type, number and firmware as ASCII, such as `LMS200;S18063;V02.19`. Empty if not reported yet.
+    /// Returns model, number and firmware as ASCII, such as `LMS200;S18063;V02.19`. Empty if not reported yet.
     pub fn kind(&self) -> &[u8] {
         &self.kind[..self.kind_len]
     }
 
-    /// Returns whether its scans have none of the angles of [`Variant`], although they look so.
+    /// Returns whether the scans have angles other than those of a [`Variant`], although their number of values matches
+    /// one.
     pub fn has_other_angles(&self) -> bool {
         self.family == Some(LmsModel::Fast)
     }
 
-    /// Returns the measuring mode if values are ranges at known angles. `None`: there are no scans.
+    /// Returns the measuring mode if the values are ranges at known angles; `None` if no scans can be published.
     pub(crate) fn mode_of_scans(&self) -> Option<Mode> {
         self.mode.filter(|mode| mode.has_ranges() && !self.has_other_angles())
     }
@@ -162,7 +164,7 @@ impl Sensor {
         self.software.trim_ascii()
     }
 
-    /// Returns the notices for the owner, the worst first. Faults come before all others.
+    /// Returns the notices for the user, the worst first. Faults come before all other notices.
     pub fn notices(&self) -> impl Iterator<Item = Notice> {
         let severity = self.status_byte.and_then(StatusByte::severity);
         let dirty = self.status_byte.is_some_and(StatusByte::is_polluted);
@@ -178,8 +180,8 @@ impl Sensor {
         .filter_map(|(is_so, notice)| is_so.then_some(notice))
     }
 
-    /// Discards the identity and the layout of values: the next telegram may come from another scanner, or from the
-    /// same one with another configuration. State that each scan repeats may stay.
+    /// Discards the identity and the layout of values, because the next telegram may come from another scanner, or from
+    /// the same one with another configuration. State that every scan repeats is kept.
     pub(crate) fn reset_identity(&mut self) {
         self.mode = None;
         self.set_kind(&[]);
@@ -188,7 +190,7 @@ impl Sensor {
         self.is_confirmed = false;
     }
 
-    /// Stores whether the line damages telegrams now. Some of them pass their weak checksum.
+    /// Stores whether the line damages telegrams now. Some damaged telegrams pass their weak checksum.
     pub(crate) fn set_line_damaged(&mut self, is_line_damaged: bool) {
         self.is_line_damaged = is_line_damaged;
         if !is_line_damaged {
@@ -196,31 +198,31 @@ impl Sensor {
         }
     }
 
-    /// Returns whether the health must be requested again, because a single report with a complaint may be damaged.
+    /// Returns whether the status must be requested again, because a single report of an issue may be damaged.
     pub(crate) fn needs_confirmation(&self) -> bool {
         self.issues.is_some() && !self.is_confirmed
     }
 
-    /// Accepts the last report, because there will not be a second one.
+    /// Accepts the last status report, because there will not be a second one.
     pub(crate) fn accept_unconfirmed(&mut self) {
         self.is_confirmed = true;
     }
 
-    /// Returns the identity, for a session that continues with the stream whose scans begin with `header`. `None` if
-    /// not all of it is known.
+    /// Returns the identity of the scanner, for a session that continues the stream whose scans begin with `header`.
+    /// Returns `None` if it is incomplete.
     pub(crate) fn identity(&self, header: StreamHeader) -> Option<Identity> {
         let mode = self.mode.filter(|_| self.kind_len > 0)?;
         Some(Identity { header, mode, kind: self.kind })
     }
 
-    /// Restores an identity of a scanner that still streams as it did then.
+    /// Restores the identity of a scanner that still streams.
     pub(crate) fn restore_identity(&mut self, known: Identity) {
         self.mode = Some(known.mode);
         let kind_len = known.kind.iter().position(|&byte| byte == 0).unwrap_or(MAX_TYPE_LEN);
         self.set_kind(&known.kind[..kind_len]);
     }
 
-    /// Stores the first [`MAX_TYPE_LEN`] bytes of the type `kind`.
+    /// Stores the first [`MAX_TYPE_LEN`] bytes of the type reply.
     fn set_kind(&mut self, kind: &[u8]) {
         self.kind_len = kind.len().min(MAX_TYPE_LEN);
         self.kind = [0; MAX_TYPE_LEN];
@@ -228,7 +230,7 @@ impl Sensor {
         self.family = LmsModel::of_type(self.kind());
     }
 
-    /// Stores what `telegram` reports, which decodes to `reply`.
+    /// Stores the state in `telegram`, which decodes to `reply`.
     pub(crate) fn update(&mut self, reply: Option<&Reply<'_>>, telegram: Telegram<'_>) {
         self.address = Some(telegram.address());
         self.note_status_byte(telegram.status().map(StatusByte));
@@ -272,8 +274,9 @@ impl Sensor {
         self.software = *report.bytes().first_chunk().unwrap_or(&[0; SOFTWARE_NAME_LEN]);
     }
 
-    /// Counts a worse condition on a line that damages telegrams. Returns whether there were enough of them. A scanner
-    /// may report a fatal condition only now and then, so two scans are enough, however far apart.
+    /// Counts a report of a worse status on a line that damages telegrams. Returns whether there were enough reports. A
+    /// scanner may report a fatal status only from time to time, so two such reports are enough, however far apart they
+    /// are.
     fn count_worse_report(&mut self, is_fatal: bool) -> bool {
         if is_fatal {
             self.fatal_reports += 1;
@@ -306,19 +309,19 @@ impl Sensor {
     }
 }
 
-/// Identity of a scanner that streams, which its scans do not contain. With it, a session that continues with the same
-/// stream has the meaning of values before it sends a request.
+/// Identity of a scanner that streams, which is not part of its scans. With it, a session that continues the same
+/// stream can decode values before it sends a request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Identity {
-    /// Beginning of each of its scans.
+    /// First bytes of each scan.
     pub(crate) header: StreamHeader,
     mode: Mode,
-    /// Type, padded with 0.
+    /// Type reply, padded with zeros.
     kind: [u8; MAX_TYPE_LEN],
 }
 
 impl Identity {
-    /// Encodes it: header, mode, type.
+    /// Encodes the identity: header, mode, type.
     pub(crate) fn to_bytes(self) -> line::Identity {
         let mut bytes = line::Identity::default();
         let (header, rest) = bytes.split_at_mut(self.header.len());
@@ -341,7 +344,7 @@ impl Identity {
 
 const _: () = assert!(size_of::<StreamHeader>() + 1 + MAX_TYPE_LEN == size_of::<line::Identity>());
 
-/// A fact that the owner of the scanner should know although scans arrive.
+/// Condition that the user should know about although scans arrive.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Notice {
     /// The status report says that the scanner is defective.
@@ -352,17 +355,17 @@ pub enum Notice {
     Error,
     /// The window is dirty.
     Dirty,
-    /// After power-on, the scanner does not begin at 9,600 baud.
+    /// After power-on, the scanner does not use 9,600 baud.
     PermanentBaud,
 }
 
 impl Notice {
-    /// Returns whether scans may be wrong because of it.
+    /// Returns whether scans may be wrong because of the condition.
     pub fn is_fault(self) -> bool {
         self != Notice::PermanentBaud
     }
 
-    /// Returns the message.
+    /// Returns the message for the user.
     pub(crate) fn text(self) -> &'static str {
         match self {
             Notice::Defective => {
@@ -378,22 +381,22 @@ impl Notice {
     }
 }
 
-/// Returns how bad a condition is, as far as notices report it.
+/// Returns the rank of a status byte; a worse one has a higher rank. Only severity and a dirty window count.
 fn severity_rank(condition: Option<StatusByte>) -> u8 {
     let severity = condition.and_then(StatusByte::severity).unwrap_or(Severity::Ok);
     let polluted = condition.is_some_and(StatusByte::is_polluted);
     if severity >= Severity::Error { 2 * severity.code() + u8::from(polluted) } else { u8::from(polluted) }
 }
 
-/// Number of better telegrams in a row before a bad one is discarded: some seconds of scans.
+/// Number of consecutive better telegrams after which a bad status byte is replaced: some seconds of scans.
 const RECOVERY_TELEGRAMS: u16 = 200;
-/// Number of telegrams, among [`RECOVERY_TELEGRAMS`], that must report a worse condition on a line that damages some of them.
+/// Number of reports of a worse status, among [`RECOVERY_TELEGRAMS`] telegrams, that are needed on a damaging line.
 const CONFIRMATIONS: u8 = 3;
-/// Number of telegrams, among any number, that must report a fatal condition on such a line.
+/// Number of reports of a fatal status, among any number of telegrams, that are needed on a damaging line.
 const FATAL_CONFIRMATIONS: u8 = 2;
-/// Length of the firmware's name, in bytes.
+/// Length of the firmware version, in bytes.
 const SOFTWARE_NAME_LEN: usize = 7;
-/// Maximum length of a type. Replies have 20 or 21 characters.
+/// Maximum length of a stored type reply. Real ones have 20 or 21 characters.
 const MAX_TYPE_LEN: usize = 24;
 /// Operating mode: values on request.
 const ON_REQUEST: u8 = 0x25;
@@ -407,7 +410,7 @@ mod tests {
 
     #[test]
     fn repeated_conditions_count_on_a_damaged_line() {
-        // Severity in the lowest bits: 0 ok, 4 fatal; the highest one is a dirty window.
+        // The lowest bits of a status byte are the severity: 0 ok, 4 fatal. The highest bit is a dirty window.
         let (ok, fatal, dirty) = (StatusByte(0x10), StatusByte(0x14), StatusByte(0x90));
         let report = |sensor: &mut Sensor, condition: StatusByte, calm: u32| {
             sensor.note_status_byte(Some(condition));

@@ -1,4 +1,5 @@
-//! The session with an LMS: bytes and the time go in; telegrams, bytes to send and the next deadline come out.
+//! Session with one LMS. Its inputs are bytes and the time; its outputs are telegrams, bytes to send and the next
+//! deadline.
 
 use scanhub_schema::{Counter, Counters, Nanos, Status};
 
@@ -22,23 +23,23 @@ use crate::settings;
 /// Settings of a session.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Settings {
-    /// Requested angle and resolution. A scanner that refuses them streams what it has.
+    /// Requested angle and resolution. If the scanner refuses them, it streams with its own.
     pub variant: Variant,
-    /// Rate to stream at.
+    /// Baud rate for the stream.
     pub baud: Baud,
-    /// Whether nothing can be sent, because the bytes are from a recording.
+    /// Whether nothing can be sent, because the bytes come from a recording.
     pub listen_only: bool,
-    /// Whether the port has the rate [`baud`](Self::baud) and no other, as with a serial server on the network.
+    /// Whether [`baud`](Self::baud) is the only rate of the port, as with a serial server on the network.
     pub fixed_rate: bool,
-    /// Whether to keep to [`baud`](Self::baud) even if the line cannot carry it. Otherwise, the session streams at
-    /// 38,400 baud after two switches to 500,000 baud that the scanner acknowledged and that were followed by silence.
+    /// Whether [`baud`](Self::baud) is kept even if the line cannot carry it. Otherwise, the session streams at 38,400
+    /// baud after two switches to 500,000 baud that the scanner acknowledged and that were followed by silence.
     pub keep_baud: bool,
-    /// Measuring mode of a recording that does not contain it.
+    /// Measuring mode for a recording that does not contain it.
     pub mode: Option<Mode>,
 }
 
-/// The session with one scanner. If the scanner is replaced within a second by one that streams already, with the same
-/// number of values and the same address, the session does not notice.
+/// Session with one scanner. It does not detect a replacement of the scanner within a second if the new one already
+/// streams with the same number of values and the same address.
 #[derive(Clone, Debug)]
 pub struct LmsSession {
     settings: Settings,
@@ -48,20 +49,20 @@ pub struct LmsSession {
     timing: TelegramTiming,
     schedule: ScanSchedule,
     damage: LineDamage,
-    /// Number of the first byte of the last scan.
+    /// Offset of the first byte of the last scan.
     last_scan: u64,
     now: Nanos,
     last_byte: Nanos,
     /// Stamp of the last byte of the last telegram.
     last_stamp: Nanos,
     first_frame_truncated: bool,
-    /// Size of the buffer of the next read.
+    /// Length of the buffer of the next read.
     buffer_len: usize,
     /// Whether the last read filled its buffer, so that more bytes may be waiting.
     has_more: bool,
     /// Time until which waiting bytes are not read.
     deferred_until: Option<Nanos>,
-    /// Mode that the last telegrams of a recording reported.
+    /// Measuring mode in the last telegrams of a recording.
     recorded_mode: Option<Mode>,
 }
 
@@ -89,7 +90,7 @@ impl LmsSession {
     }
 
     /// Restores the [number of silent switches](Self::silent_switches) that the previous session counted. After two of
-    /// them, the session streams at 38,400 baud, unless its settings keep it at 500,000. Call it before the first read.
+    /// them, the session streams at 38,400 baud, unless its settings require 500,000. Call this before the first read.
     pub fn restore_silent_switches(&mut self, count: u8) {
         self.protocol.restore_silent_switches(count, self.now);
     }
@@ -100,17 +101,17 @@ impl LmsSession {
         self.protocol.rate.silent_switches()
     }
 
-    /// Returns the rate of the line.
+    /// Returns the baud rate of the line.
     pub fn baud(&self) -> Baud {
         self.protocol.rate.baud
     }
 
-    /// Returns what the scanner has reported.
+    /// Returns the state that the scanner has reported.
     pub fn sensor(&self) -> &Sensor {
         &self.protocol.sensor
     }
 
-    /// Returns why the session does not stream.
+    /// Returns the reason why the session does not stream as requested.
     pub fn problem(&self) -> Option<Problem> {
         self.protocol.problem()
     }
@@ -120,7 +121,7 @@ impl LmsSession {
         self.framer.counters()
     }
 
-    /// Stamps a telegram, and passes it to the dialogue.
+    /// Stamps a telegram and passes it to the protocol state.
     fn receive(&mut self, span: TelegramSpan) -> ReceivedTelegram<'_> {
         let baud = self.baud().rate();
         let framed = self.framer.telegram_at(span);
@@ -130,11 +131,11 @@ impl LmsSession {
         let period = self.period(telegram, reply.as_ref());
         let mut first = self.arrivals.stamp(span.offset, baud);
         let last = self.arrivals.stamp(span.offset + len - 1, baud);
-        // A line may have held back only the end of a telegram.
+        // The line may have held back only the end of a telegram.
         let estimated = first.estimated || last.estimated;
         let due = period.and(self.due_time(&first, span.offset, len));
-        // A later read may show that bytes were older than their stamps. Those before them were older still, but their
-        // stamps are published.
+        // A later read may show that bytes are older than estimated. The stamps of earlier bytes are already published,
+        // so a stamp is never earlier than the last one.
         first.at = due.unwrap_or(first.at).max(self.last_stamp);
         let last = match due.and(self.timing.duration) {
             Some(duration) => (first.at + duration).min(last.latest.unwrap_or(last.at)),
@@ -154,7 +155,7 @@ impl LmsSession {
         self.last_scan = if is_scan { span.offset } else { self.last_scan };
         self.first_frame_truncated |=
             is_scan && self.framer_counters().telegrams == 1 && self.framer_counters().discarded > 0;
-        // Replies follow requests, and a recording has the pace of its reader.
+        // Only scans of a live stream are measured. Replies depend on requests, and a recording on its reader.
         let is_measurable = is_scan && self.is_live() && !first.estimated;
         let elapsed = last.saturating_sub(first.at);
         let is_slow = is_measurable && self.timing.is_slow(elapsed);
@@ -175,40 +176,40 @@ impl LmsSession {
         ReceivedTelegram { first: first.at, last, estimated, reasons, ..received }
     }
 
-    /// Returns when the first byte arrived that is in no telegram yet.
+    /// Returns the arrival of the first byte that is not in a telegram yet.
     fn next_start(&self) -> Nanos {
         let open = self.framer_counters().read - self.framer.buffered() as u64;
         self.arrivals.stamp(open, self.baud().rate()).at
     }
 
-    /// Returns the time between two scans like `telegram`, which decodes to `reply`, if it is part of a stream with a
-    /// known period.
+    /// Returns the time between two scans like `telegram`, which decodes to `reply`. Returns `None` unless it is a
+    /// complete scan of a live stream whose number of beams belongs to a variant.
     fn period(&self, telegram: Telegram<'_>, reply: Option<&Reply<'_>>) -> Option<Nanos> {
         let Some(Reply::Measured(measured)) = reply.filter(|_| self.is_live()) else { return None };
         let variant = Variant::of_beams(measured.count()).filter(|_| measured.partial().is_none())?;
         Some(variant.period(telegram.bytes().len(), self.baud().rate()))
     }
 
-    /// Returns when the scan of `len` bytes at `offset` began, if it is part of a backlog of a host that did not run.
-    /// The time follows from its position in the backlog, limited by the time of the read.
+    /// Returns the time at which the scan of `len` bytes at `offset` began, if it was in a backlog of a stopped host.
+    /// The time follows from its position in the backlog and is limited by the time of the read.
     fn due_time(&self, first: &Timestamp, offset: u64, len: u64) -> Option<Nanos> {
         let latest = first.latest?;
         let slots = (offset - self.last_scan + len / 2) / len;
         self.schedule.due_after(slots).map(|due| due.clamp(first.at, latest))
     }
 
-    /// Returns whether a scanner streams, and not a recording.
+    /// Returns whether a scanner streams. A recording is not live.
     fn is_live(&self) -> bool {
         self.protocol.state() == State::Streaming && !self.settings.listen_only
     }
 
-    /// Returns whether the line has the rate of the settings, so that periods and durations are those of that rate.
+    /// Returns whether the line has the target rate, so that periods and durations are those of that rate.
     fn is_at_rate(&self) -> bool {
         let rate = &self.protocol.rate;
         !rate.needs_change && rate.baud == rate.target
     }
 
-    /// Returns whether bytes arrive at the pace of a line, unlike those of a recording or a network.
+    /// Returns whether bytes arrive at the rate of the line, unlike those of a recording or a network.
     fn has_line_rate(&self) -> bool {
         !(self.settings.listen_only || self.settings.fixed_rate)
     }
@@ -249,7 +250,7 @@ impl line::Protocol for LmsSession {
         self.now = now;
         self.framer.release(now.saturating_sub(self.last_byte));
         if self.is_live() {
-            // The stream may be over now.
+            // Bytes outside telegrams must be counted even if the stream has ended.
             self.damage.note_bytes(self.framer.counters(), now);
         }
         self.protocol.handle_timeout(now);
@@ -277,7 +278,7 @@ impl line::Protocol for LmsSession {
         self.framer.expect_acknowledge(self.protocol.open_request().is_some());
         let next_at = self.protocol.open_request().and_then(PendingRequest::next_at);
         if let Some(not_before) = next_at.filter(|&at| at <= self.now + SEND_AHEAD) {
-            // The sensor skips scans while it answers.
+            // The scanner skips scans while it replies.
             self.schedule.end_stream();
             let bytes = self.protocol.open_request().map_or(&[][..], PendingRequest::next_byte);
             return Action::Transmit { bytes, not_before };
@@ -294,7 +295,7 @@ impl line::Protocol for LmsSession {
         {
             return Action::SleepUntil(until);
         }
-        // A telegram may be held back until the line was idle for a while.
+        // A held telegram is delivered after the line has been idle for a while.
         let held_until = self.framer.hold().map_or(Nanos::MAX, |hold| self.last_byte + hold);
         Action::Wait { until: self.protocol.deadline().min(held_until) }
     }
@@ -317,8 +318,8 @@ impl line::ScannerSession for LmsSession {
 
     fn defer_read(&mut self, now: Nanos, waiting: usize) -> bool {
         self.now = now;
-        // If the bytes of more than a revolution wait, the host did not run. Then the read has to find out since when
-        // they wait.
+        // If the bytes of more than a revolution are waiting, the host was stopped. The read must then determine their
+        // age.
         if (1..=BYTES_PER_REVOLUTION).contains(&waiting) && self.can_defer_read() {
             self.arrivals.note_unread(now, waiting);
             let start = self.next_start();
@@ -350,10 +351,10 @@ impl line::ScannerSession for LmsSession {
         self.baud().rate()
     }
 
-    /// The number of scans that the scanner must have sent follows from their period, after the first scan of each
-    /// stream. A stream ends when no scan arrives for a second, and when a request is sent. Nothing is due of a stream
-    /// without a known period, of partial scans, and of a recording. A loss is counted a second later. A scan that the
-    /// scanner aborts to reply is not damage. The session resynchronizes when no measured data arrive for a second,
+    /// The number of scans that are due follows from their period, counted from the first scan of each stream. A stream
+    /// ends when no scan arrives for a second, and when a request is sent. No scans are due in a stream without a known
+    /// period, in a stream of partial scans, or in a recording. A loss is counted a second later. A scan that the
+    /// scanner aborts for a reply is not damage. The session resynchronizes when no measured data arrive for a second,
     /// when the scanner reports power-on, and when a user requests it.
     fn stats(&self) -> SessionStats {
         let tally = self.framer.counters();
@@ -382,7 +383,7 @@ impl line::ScannerSession for LmsSession {
         self.protocol.identity()
     }
 
-    /// The search tries it in place of 9,600 baud if no stream arrives.
+    /// Makes the search try this rate instead of 9,600 baud if no stream arrives.
     fn hint_rate(&mut self, known: KnownRate) {
         if let Some(baud) = Baud::of_rate(known.baud) {
             self.protocol.restore_rate(baud);
@@ -396,7 +397,7 @@ impl line::ScannerSession for LmsSession {
         }
     }
 
-    /// For a line that cannot carry 500,000 baud, it is the rate in use.
+    /// Returns the rate in use if the line cannot carry 500,000 baud.
     fn known_rate(&self) -> Option<KnownRate> {
         self.protocol.rate.known()
     }
@@ -484,7 +485,7 @@ impl line::ScannerSession for LmsSession {
     }
 }
 
-/// Returns `telegram`, which decodes to `reply`, with stamps of 0. Its scan, if it has one, is split as `mode` says.
+/// Converts `telegram`, which decodes to `reply`, with stamps of 0. A scan is split according to `mode`.
 fn to_received<'a>(
     telegram: Telegram<'a>,
     reply: Option<&Reply<'a>>,
@@ -498,7 +499,7 @@ fn to_received<'a>(
     };
     let beams = measured.map_or(0, |measured| measured.count());
     let period = nominal_period(beams, baud.rate());
-    // No range is better than a wrong one.
+    // Without a valid mode there is no scan, because a wrong range is worse than none.
     let split = measured.zip(mode.filter(|mode| mode.has_ranges()));
     let is_forbidden = split.is_some_and(|(measured, mode)| measured.is_forbidden(mode));
     let scan = split.map(|(measured, mode)| RawScan { number, period, ..measured.scan(mode) });
@@ -529,7 +530,7 @@ impl From<settings::Settings> for Settings {
     }
 }
 
-/// Counters of rejected telegrams, except for a wrong checksum, which every family has.
+/// Counters of rejected telegrams, except for a wrong checksum, which has a counter in every family.
 const REJECTS: [(Reject, Counter); Reject::COUNT - 1] = [
     (Reject::Address, Counter::RejectedAddress),
     (Reject::Length, Counter::RejectedLength),

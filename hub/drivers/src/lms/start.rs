@@ -1,5 +1,5 @@
-//! Sequences of requests: the steps that bring a scanner to the requested stream, and the questions to a scanner that
-//! streams already. Settings that a scanner does not have, or does not report right after a reset, are left out.
+//! Sequences of requests: the steps that bring a scanner to the requested stream, and the requests to a scanner that
+//! already streams. Settings that the scanner does not have, or does not report after a reset, are skipped.
 
 use scanhub_schema::{MILLIS, Nanos};
 
@@ -9,13 +9,14 @@ use crate::lms::request_channel::{ESSENTIAL_TRIES, TRIES};
 use crate::lms::sensor::Sensor;
 use crate::lms::variant::{Baud, Variant};
 
-/// Step of a [`Start`], each a request. Between two changes of mode or rate, whose replies look alike, there is always
-/// another one. So a reply that is late, or arrives twice, is not taken for the next one's.
+/// Step of a [`Start`], which sends one request. Between two changes of mode or rate, whose replies look the same,
+/// there is always another step, so that a late or repeated reply is not taken for the reply to the next change.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Step {
-    /// Ends a stream, or the installation mode.
+    /// Ends a stream or the installation mode.
     Stop,
-    /// Requests what the scanner does now, which also shows whether it receives at this rate.
+    /// Requests the status, which contains the operating mode and proves that the scanner receives requests at this
+    /// rate.
     Check,
     Baud,
     Variant,
@@ -24,23 +25,23 @@ pub(crate) enum Step {
     Stream,
 }
 
-/// Progress of a start: the scanner receives requests, and is brought to rest, to the rate to stream at, to its
-/// settings, and to a stream.
+/// Progress of a start. The scanner receives requests. The steps stop its stream, change its baud rate and its
+/// settings, and start the requested stream.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Start {
     pub(crate) step: Step,
     /// Number of stops that may still be sent.
     stops_left: u8,
-    /// Steps once the scanner is at rest, at the rate to stream at.
+    /// Remaining steps after the scanner has stopped at the target rate.
     setting_steps: &'static [Step],
-    /// Whether the scanner has reported its status, which contains what it does and how its values are split.
+    /// Whether the scanner has reported its status, which contains the operating mode and the measuring mode.
     has_status: bool,
     /// Whether the scanner has replied to a request for its type.
     has_type: bool,
 }
 
 impl Start {
-    /// A start that begins with a check.
+    /// A start whose first step is a check.
     pub(crate) const CHECK: Start = Start {
         step: Step::Check,
         stops_left: MAX_STOPS + 1,
@@ -49,7 +50,7 @@ impl Start {
         has_type: false,
     };
 
-    /// Returns the request of the step, and its number of tries.
+    /// Returns the request of the step and its number of tries.
     pub(crate) fn request(&self, baud: Baud, variant: Variant) -> (Request, u8) {
         match self.step {
             Step::Stop => (Request::Stop, ESSENTIAL_TRIES),
@@ -62,7 +63,8 @@ impl Start {
         }
     }
 
-    /// Returns the start after the `reply` to `request`. A scanner that refuses to report its type is not asked again.
+    /// Returns the start after the `reply` to `request`. The type is not requested again from a scanner that refuses to
+    /// report it.
     pub(crate) fn after_reply(self, request: Request, reply: Option<&Reply<'_>>) -> Start {
         Start {
             has_status: self.has_status || matches!(reply, Some(Reply::Status(_))),
@@ -76,13 +78,13 @@ impl Start {
         Start { step: Step::Check, ..self }
     }
 
-    /// Returns whether a scanner that refused to change its rate may be in a mode that does not allow it, because its
-    /// status is not known and it was not stopped.
+    /// Returns whether the mode of the scanner may be the reason why it refused to change its rate: its status is
+    /// unknown, and no stop was sent.
     pub(crate) fn may_be_in_other_mode(&self) -> bool {
         !self.has_status && self.stops_left > MAX_STOPS
     }
 
-    /// Returns the next step, now that it is known what the scanner does.
+    /// Returns the next step after a check.
     pub(crate) fn proceed(self, sensor: &Sensor, is_at_rate: bool, variant: Variant) -> Start {
         match self.stops_left.checked_sub(1) {
             Some(stops_left) if sensor.streams => Start { step: Step::Stop, stops_left, ..self },
@@ -93,7 +95,7 @@ impl Start {
 
     /// Returns the step for the next setting that is not known to be right.
     pub(crate) fn next_setting(mut self, sensor: &Sensor, variant: Variant) -> Start {
-        // Without any left, the stream was requested, and it is not known what came of it.
+        // If no setting is left, the stream was already requested, and its result is unknown.
         self.step = Step::Stream;
         while let Some((&step, rest)) = self.setting_steps.split_first() {
             self.setting_steps = rest;
@@ -111,39 +113,39 @@ impl Start {
     }
 }
 
-/// Questions to a scanner that streams: who it is, which may say at which angles it measures, and how its values are
-/// split, which two replies report. A reply costs the scan that it interrupts. After some rounds, only how values are
-/// split is requested, and rarely: without it there are no scans.
+/// Requests to a scanner that already streams: its type, which may imply other angles, and its measuring mode, which
+/// two replies report. A reply costs the scan that it interrupts. After some rounds, requests are rare and continue
+/// only while the measuring mode is unknown, because there are no scans without it.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Questions {
-    /// The rest of this round.
+    /// Remaining requests of this round.
     remaining: &'static [Request],
     /// Number of complete rounds.
     rounds: u8,
-    /// Earliest time of the next question.
+    /// Earliest time of the next request.
     next_at: Nanos,
 }
 
-/// Action that follows from the questions.
+/// Action that follows from the state of [`Questions`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum NextQuestion {
     /// Send this request.
     Send(Request),
-    /// Nothing now: the next round follows.
+    /// Send nothing now. Another round follows.
     Later,
-    /// All is known, or as much as the scanner reports.
+    /// Everything is known, or as much as the scanner reports.
     Done,
-    /// The scanner does not report how its values are split.
+    /// The scanner does not report its measuring mode.
     ModeUnknown,
 }
 
 impl Questions {
-    /// Returns the questions from the time `next_at` on.
+    /// Creates the requests, not to be sent before `start_at`.
     pub(crate) fn new(start_at: Nanos) -> Questions {
         Questions { remaining: STATUS_REQUESTS, rounds: 0, next_at: start_at }
     }
 
-    /// Returns what follows at `now`, right after a scan, while no request is open.
+    /// Returns the next action at `now`, right after a scan, while no request is open.
     pub(crate) fn next(&mut self, sensor: &Sensor, now: Nanos) -> NextQuestion {
         if now < self.next_at {
             return NextQuestion::Later;
@@ -174,10 +176,10 @@ impl Questions {
     }
 }
 
-/// Number of stops after the first one. A scanner that continues after them does not receive them.
+/// Number of stops after the first one. A scanner that continues to stream after them does not receive requests.
 pub(crate) const MAX_STOPS: u8 = 2;
 const STATUS_REQUESTS: &[Request] = &[Request::Type, Request::Status, Request::Configuration];
-/// Number of rounds of questions without a pause.
+/// Number of rounds of requests without a pause.
 const ROUNDS: u8 = 5;
 /// Pause between later rounds.
 const ROUND_PAUSE: Nanos = 10_000 * MILLIS;

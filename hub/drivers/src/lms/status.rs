@@ -1,23 +1,23 @@
-//! Health of a scanner as it reports it: the status byte that ends every reply, the long status B1h, and the errors of B2h
-//! (Telegram listing 7-5, 7-18, 8 and 9).
+//! Health of a scanner: the status byte that ends every reply, the status report B1h, and the errors of B2h (Telegram
+//! listing 7-5, 7-18, 8 and 9).
 //!
-//! The same scanner sends the status byte 10h on one day and 11h on the next, so only its bits have a meaning. The offsets
-//! in the long status were checked against a real scanner.
+//! The status byte of the same scanner may be 10h on one day and 11h on the next, so only its single bits have a
+//! meaning. The offsets in the status report were checked against a real scanner.
 
 use core::fmt;
 
 use crate::lms::telegram::{EncodedTelegram, REPLY, Writer};
 use crate::lms::variant::{Baud, Mode, Unit, Variant};
 
-/// A status byte.
+/// Status byte of a reply.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct StatusByte(pub u8);
 
 impl StatusByte {
-    /// A healthy LMS type 6.
+    /// Status byte of a healthy LMS type 6.
     pub const OK: StatusByte = StatusByte(0x10);
 
-    /// Returns the severity. `None` for codes without a meaning.
+    /// Returns the severity, or `None` for an undefined code.
     pub fn severity(self) -> Option<Severity> {
         Severity::of_code(self.0 & 7)
     }
@@ -63,7 +63,7 @@ pub enum Severity {
 }
 
 impl Severity {
-    /// Returns the severity with code 0 to 4.
+    /// Returns the severity with this code, 0 to 4.
     pub fn of_code(code: u8) -> Option<Severity> {
         [Severity::Ok, Severity::Info, Severity::Warning, Severity::Error, Severity::Fatal]
             .get(usize::from(code))
@@ -87,12 +87,12 @@ impl Severity {
     }
 }
 
-/// Data of a status reply.
+/// View of the data of a status reply.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct StatusReport<'a>(&'a [u8; REPORT_LEN]);
 
 impl<'a> StatusReport<'a> {
-    /// Creates the view of the report in `bytes`. `None` if they are not 152.
+    /// Returns the view of `bytes`, or `None` if there are not exactly 152.
     pub fn new(bytes: &'a [u8]) -> Option<StatusReport<'a>> {
         bytes.try_into().ok().map(StatusReport)
     }
@@ -107,7 +107,7 @@ impl<'a> StatusReport<'a> {
         self.0[..7].trim_ascii()
     }
 
-    /// Returns the operating mode, the byte after command 20h (24h: streaming, 25h: on request).
+    /// Returns the operating mode, as in the byte after command 20h (24h: streaming, 25h: on request).
     pub fn operating_mode(&self) -> u8 {
         self.0[7]
     }
@@ -117,8 +117,8 @@ impl<'a> StatusReport<'a> {
         self.0[8] != 0
     }
 
-    /// Returns the transmission of the window at its dirtiest channel, in percent of that of the clean window. `None`
-    /// if the clean window was never measured.
+    /// Returns the transmission of the dirtiest channel of the window, in percent of a clean window. Returns `None` if
+    /// the clean window was never measured.
     pub fn window_percent(&self) -> Option<u16> {
         let percent = |channel| {
             let (measured, clean) = (self.word(18 + 2 * channel), self.word(42 + 2 * channel));
@@ -132,17 +132,17 @@ impl<'a> StatusReport<'a> {
         self.word(82)
     }
 
-    /// Returns the measuring mode, which defines the bits of a value.
+    /// Returns the measuring mode, which defines how a value is split into range and upper bits.
     pub fn mode(&self) -> Mode {
         Mode(self.0[101])
     }
 
-    /// Returns the current angle and resolution. `None` if no telegram can have this pair.
+    /// Returns the current angle and resolution, or `None` if they are not a [`Variant`].
     pub fn variant(&self) -> Option<Variant> {
         Variant::new(self.word(106), self.word(108))
     }
 
-    /// Returns the baud rate of the line. `None` for an unknown divisor.
+    /// Returns the baud rate of the line, or `None` for an unknown divisor.
     pub fn baud(&self) -> Option<Baud> {
         baud_of_divisor(self.word(115))
     }
@@ -157,7 +157,7 @@ impl<'a> StatusReport<'a> {
         self.0[119]
     }
 
-    /// Returns the unit of the ranges. `None` for an unknown code.
+    /// Returns the unit of the ranges, or `None` for an unknown code.
     pub fn unit(&self) -> Option<Unit> {
         Unit::of_code(self.0[121])
     }
@@ -177,9 +177,9 @@ impl<'a> StatusReport<'a> {
 pub struct SimulatedStatus {
     /// Firmware version, 7 ASCII characters.
     pub software: [u8; 7],
-    /// Operating mode, the byte after the last 20h.
+    /// Operating mode, as in the byte after command 20h.
     pub operating_mode: u8,
-    /// Measuring mode, which defines the bits of a value.
+    /// Measuring mode, which defines how a value is split into range and upper bits.
     pub mode: Mode,
     /// Current angle and resolution.
     pub variant: Variant,
@@ -190,7 +190,8 @@ pub struct SimulatedStatus {
 }
 
 impl SimulatedStatus {
-    /// Returns a report with these settings, a motor at its nominal speed and the laser on. Everything else is 0.
+    /// Returns a report with these settings, with the motor at its nominal speed and the laser on. All other values are
+    /// 0.
     pub fn report(&self) -> [u8; REPORT_LEN] {
         let mut data = [0; REPORT_LEN];
         data[..7].copy_from_slice(&self.software);
@@ -206,7 +207,7 @@ impl SimulatedStatus {
     }
 }
 
-/// Encodes the status reply B1h with the settings of `health`, see [`SimulatedStatus::report`].
+/// Encodes the status reply B1h with the settings in `health`, see [`SimulatedStatus::report`].
 pub fn status_reply(address: u8, health: &SimulatedStatus, status: u8) -> EncodedTelegram {
     Writer::new(address | REPLY, crate::lms::command::STATUS | REPLY)
         .slice(&health.report())
@@ -214,7 +215,7 @@ pub fn status_reply(address: u8, health: &SimulatedStatus, status: u8) -> Encode
         .finish()
 }
 
-/// Returns the divisor word of a baud rate, n with the upper bit set: the rate is 16 MHz / (16 (n + 1)).
+/// Returns the divisor word of a baud rate: n with the upper bit set, where the rate is 16 MHz / (16 (n + 1)).
 fn divisor_of(baud: Baud) -> u16 {
     match baud {
         Baud::B500000 => 0x8001,
@@ -224,7 +225,7 @@ fn divisor_of(baud: Baud) -> u16 {
     }
 }
 
-/// Returns the baud rate of a divisor word. `None` if it is unknown.
+/// Returns the baud rate of a divisor word, or `None` if it is unknown.
 pub(crate) fn baud_of_divisor(divisor: u16) -> Option<Baud> {
     Baud::ALL.into_iter().find(|&baud| divisor_of(baud) == divisor)
 }
@@ -259,7 +260,8 @@ const fn item(at: usize, len: usize, name: &'static str, kind: ValueFormat) -> I
     Item { at, len, name, kind }
 }
 
-/// All values in their order, without gaps. The listing counts from the command byte, so its offsets are higher by one.
+/// All values of the report, in their order and without gaps. The listing counts from the command byte, so its offsets
+/// are higher by one.
 pub const ITEMS: [Item; 50] = [
     item(0, 7, "software version", ValueFormat::Text),
     item(7, 1, "operating mode", ValueFormat::Number),
@@ -315,18 +317,18 @@ pub const ITEMS: [Item; 50] = [
 
 /// Transmission in percent below which the window is dirty (Telegram listing, errors 18 and 19).
 pub(crate) const DIRTY_BELOW_PERCENT: u16 = 75;
-/// Number of channels of the pollution measurement that measure the window. The others are its reference.
+/// Number of channels of the pollution measurement that measure the window. The other channels are its reference.
 const WINDOW_CHANNELS: usize = 8;
 
 /// Length of the report in bytes: LENGTH 9Ah without command and status (Telegram listing 7-5).
 pub const REPORT_LEN: usize = 152;
 
-/// The errors of a reply.
+/// View of the errors of a reply.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Errors<'a>(&'a [u8]);
 
 impl<'a> Errors<'a> {
-    /// Creates the view of the pairs in `bytes`. `None` if the last one is not complete.
+    /// Returns the view of the pairs in `bytes`, or `None` if the last pair is incomplete.
     pub fn new(bytes: &'a [u8]) -> Option<Errors<'a>> {
         bytes.len().is_multiple_of(2).then_some(Errors(bytes))
     }
@@ -342,7 +344,7 @@ impl<'a> Errors<'a> {
     }
 }
 
-/// One error.
+/// Error in a reply to [`crate::lms::command::Request::Errors`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Fault {
     /// Error type: the severity, plus 80h if the error is past.
@@ -352,7 +354,7 @@ pub struct Fault {
 }
 
 impl Fault {
-    /// Returns the severity. `None` for codes without a meaning.
+    /// Returns the severity, or `None` for an undefined code.
     pub fn severity(self) -> Option<Severity> {
         Severity::of_code(self.kind & !PAST_FLAG)
     }
@@ -362,7 +364,7 @@ impl Fault {
         self.kind & PAST_FLAG != 0
     }
 
-    /// Returns the meaning of the number. `None` if it is unknown.
+    /// Returns the meaning of the number, or `None` if it is unknown.
     pub fn meaning(self) -> Option<&'static str> {
         Some(match self.number {
             5 => "dazzled",
@@ -468,7 +470,7 @@ mod tests {
 
     #[test]
     fn reads_captured_errors() {
-        // Captured: B2 84 16 (84 31)x8 84 16 01 31. Repeated pairs are left out.
+        // Captured: B2 84 16 (84 31)x8 84 16 01 31. Repeated pairs are left out here.
         let errors = Errors::new(&[0x84, 0x16, 0x84, 0x31, 1, 0x31]).unwrap();
         let words: Vec<_> = errors.iter().map(|fault| fault.to_string()).collect();
         assert_eq!(

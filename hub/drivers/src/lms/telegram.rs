@@ -1,36 +1,37 @@
-//! One telegram: a view that exists only if its length and checksum are right, and the writer that encodes one.
+//! One telegram: a view that exists only if its length and checksum are right, and a writer.
 //!
 //! `02 | ADR | LENGTH, 2 bytes | COMMAND | DATA .. | [STATUS, replies only] | CRC, 2 bytes` (Telegram listing 4).
-//! LENGTH counts command to status. [`crate::lms::command`] and [`crate::lms::reply`] give the data their meaning.
+//! LENGTH counts the bytes from command to status. [`crate::lms::command`] and [`crate::lms::reply`] decode the data.
 
 use core::fmt;
 
 /// First byte of every telegram.
 pub const STX: u8 = 0x02;
-/// Single byte before a reply: address and checksum of the request were right.
+/// Byte before a reply: address and checksum of the request were right.
 pub const ACK: u8 = 0x06;
-/// Single byte instead of a reply: the address was right, the checksum was not.
+/// Byte instead of a reply: the address of the request was right, but its checksum was not.
 pub const NAK: u8 = 0x15;
-/// Added to the sensor's own address in what it sends, and to a command in its reply.
+/// Bit that is added to the scanner's address in its telegrams, and to the command of a request in its reply.
 pub const REPLY: u8 = 0x80;
-/// STX, address, two length bytes, two checksum bytes: what LENGTH does not count.
+/// Number of bytes that LENGTH does not count: STX, address, two length bytes, two checksum bytes.
 pub const FRAME_LEN: usize = 6;
-/// Greatest LENGTH: 401 values with real-time indices.
+/// Maximum LENGTH: that of 401 values with real-time indices.
 pub const MAX_LENGTH: usize = 808;
-/// Longest telegram in bytes.
+/// Length of the longest telegram in bytes.
 pub const MAX_TELEGRAM: usize = MAX_LENGTH + FRAME_LEN;
 
-/// A whole telegram whose length and checksum are right, in the caller's buffer.
+/// View of a complete telegram whose length and checksum are right. The bytes are in the caller's buffer.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub struct Telegram<'a>(&'a [u8]);
 
 impl<'a> Telegram<'a> {
-    /// The telegram that `bytes` are, from STX to the second checksum byte; `None` if they are not exactly one.
+    /// Returns the telegram in `bytes`, from STX to the second checksum byte, or `None` if they are not exactly one
+    /// telegram.
     pub fn check(bytes: &'a [u8]) -> Option<Self> {
         Telegram::check_with(bytes, Checksum::default())
     }
 
-    /// Checks `bytes` like [`Telegram::check`]. `checksum` already includes the first ones.
+    /// Checks `bytes` like [`Telegram::check`]. `checksum` may already include the first bytes.
     pub(crate) fn check_with(bytes: &'a [u8], checksum: Checksum) -> Option<Self> {
         let [STX, _, low, high, _, .., crc_low, crc_high] = *bytes else { return None };
         let length = usize::from(u16::from_le_bytes([low, high]));
@@ -40,45 +41,45 @@ impl<'a> Telegram<'a> {
             .then_some(Telegram(bytes))
     }
 
-    /// The telegram in bytes that [`Telegram::check`] has seen before.
+    /// Returns the telegram in bytes that [`Telegram::check`] has already accepted.
     pub(crate) fn assume_valid(bytes: &'a [u8]) -> Self {
         debug_assert!(Telegram::check(bytes).is_some());
         Telegram(bytes)
     }
 
-    /// All bytes, STX to checksum.
+    /// Returns all bytes, from STX to the checksum.
     pub fn bytes(&self) -> &'a [u8] {
         self.0
     }
 
-    /// The address byte; from a sensor it is the sensor's own address + 80h.
+    /// Returns the address byte. A scanner sends its own address + 80h.
     pub fn address(&self) -> u8 {
         self.0[1]
     }
 
-    /// Whether a sensor sent it (and so a status byte ends its data).
+    /// Returns whether a scanner sent the telegram, so that its data end with a status byte.
     pub fn is_reply(&self) -> bool {
         self.address() & REPLY != 0
     }
 
-    /// LENGTH: number of bytes from command to status.
+    /// Returns LENGTH, the number of bytes from command to status.
     pub fn length(&self) -> usize {
         self.0.len() - FRAME_LEN
     }
 
-    /// The command byte; a reply's is that of its request + 80h.
+    /// Returns the command byte. In a reply, it is that of the request + 80h.
     pub fn command(&self) -> u8 {
         self.0[4]
     }
 
-    /// The bytes between command and checksum, without the status byte of a reply.
+    /// Returns the bytes between command and checksum, without the status byte of a reply.
     pub fn data(&self) -> &'a [u8] {
         let end = self.0.len() - 2 - usize::from(self.is_reply() && self.length() > 1);
         &self.0[5..end]
     }
 
-    /// The status byte of a reply (Telegram listing 8): bits 0 to 2 tell severity, bit 6 implausible values, bit 7
-    /// pollution. `None` in a request.
+    /// Returns the status byte of a reply (Telegram listing 8): bits 0 to 2 are the severity, bit 6 means implausible
+    /// values, bit 7 a dirty window. Returns `None` for a request.
     pub fn status(&self) -> Option<u8> {
         (self.is_reply() && self.length() > 1).then(|| self.0[self.0.len() - 3])
     }
@@ -96,7 +97,7 @@ impl fmt::Debug for Telegram<'_> {
     }
 }
 
-/// Room for any telegram, and the way to write one.
+/// Writer of a telegram, with a buffer for the longest one.
 #[derive(Clone)]
 pub struct Writer {
     bytes: [u8; MAX_TELEGRAM],
@@ -104,14 +105,18 @@ pub struct Writer {
 }
 
 impl Writer {
-    /// Begins a telegram to `address` (or from it, with [`REPLY`] added) with `command`.
+    /// Begins a telegram with `command` to `address`, or from it with [`REPLY`] added.
     pub fn new(address: u8, command: u8) -> Self {
         let mut bytes = [0; MAX_TELEGRAM];
         bytes[..5].copy_from_slice(&[STX, address, 0, 0, command]);
         Writer { bytes, len: 5 }
     }
 
-    /// Appends one byte. A telegram longer than [`MAX_TELEGRAM`] cannot be said, and panics.
+    /// Appends one byte.
+    ///
+    /// # Panics
+    ///
+    /// Panics if the telegram is longer than [`MAX_TELEGRAM`].
     pub fn byte(mut self, byte: u8) -> Self {
         self.bytes[self.len] = byte;
         self.len += 1;
@@ -124,24 +129,24 @@ impl Writer {
         self.byte(low).byte(high)
     }
 
-    /// Appends bytes as they are.
+    /// Appends bytes.
     pub fn slice(mut self, bytes: &[u8]) -> Self {
         self.bytes[self.len..self.len + bytes.len()].copy_from_slice(bytes);
         self.len += bytes.len();
         self
     }
 
-    /// Appends bytes as they are; `None` if they leave no room for the status byte that a reply ends with.
+    /// Appends bytes. Returns `None` if there is no space left for the status byte at the end of a reply.
     pub(crate) fn reply_slice(self, bytes: &[u8]) -> Option<Self> {
         (self.length() + bytes.len() < MAX_LENGTH).then(|| self.slice(bytes))
     }
 
-    /// LENGTH so far: command and what was appended.
+    /// Returns the LENGTH so far: that of the command and everything appended.
     pub fn length(&self) -> usize {
         self.len - 4
     }
 
-    /// Writes length and checksum. A reply appends its status byte before.
+    /// Writes length and checksum. Append the status byte of a reply before.
     pub fn finish(mut self) -> EncodedTelegram {
         let [low, high] = (self.length() as u16).to_le_bytes();
         self.bytes[2] = low;
@@ -151,24 +156,24 @@ impl Writer {
     }
 }
 
-/// A telegram with its own storage.
+/// An encoded telegram in its own buffer.
 #[derive(Clone)]
 pub struct EncodedTelegram(Writer);
 
 impl EncodedTelegram {
-    /// A copy of `telegram`.
+    /// Copies `telegram`.
     pub fn of(telegram: Telegram<'_>) -> EncodedTelegram {
         let mut bytes = [0; MAX_TELEGRAM];
         bytes[..telegram.0.len()].copy_from_slice(telegram.0);
         EncodedTelegram(Writer { bytes, len: telegram.0.len() })
     }
 
-    /// The telegram's bytes, STX to checksum.
+    /// Returns all bytes, from STX to the checksum.
     pub fn bytes(&self) -> &[u8] {
         &self.0.bytes[..self.0.len]
     }
 
-    /// The telegram as a view.
+    /// Returns a view of the telegram.
     pub fn telegram(&self) -> Telegram<'_> {
         Telegram(self.bytes())
     }
@@ -185,11 +190,11 @@ pub fn crc(bytes: &[u8]) -> u16 {
     Checksum::default().of(bytes)
 }
 
-/// Checksum of a telegram that is arriving.
+/// Incremental checksum of a telegram.
 ///
 /// The manual defines it byte by byte: `crc = crc * x + previous * x^8 + byte`, modulo x^16 + x^15 + x^2 + 1 over GF(2)
-/// (Telegram listing 4, checked against 54 printed telegrams). The sum S of all bytes, each multiplied by x for every
-/// byte after it, is simpler. `crc = S + (S + last byte) * x^7`, and eight bytes are added to S at once.
+/// (Telegram listing 4, checked against 54 printed telegrams). It can be computed from the sum S of all bytes, each
+/// multiplied by x for every byte after it: `crc = S + (S + last byte) * x^7`. Eight bytes are added to S at once.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Checksum {
     /// Number of bytes in the sum, a multiple of 8.
@@ -198,8 +203,8 @@ pub(crate) struct Checksum {
 }
 
 impl Checksum {
-    /// Adds `bytes`, the first bytes of the telegram, except those that are already included. Up to seven bytes are left
-    /// for the next call.
+    /// Adds the `bytes` of the telegram that are not included yet. `bytes` begins with the first byte of the telegram.
+    /// Up to seven bytes are left for the next call.
     pub(crate) fn extend(&mut self, bytes: &[u8]) {
         let (words, _) = bytes[self.len..].as_chunks();
         let add = |(sum, carry), &word| {
@@ -227,8 +232,8 @@ fn times_x(sum: u16, power: u32) -> u16 {
     product ^ residue(high)
 }
 
-/// Returns `sum * x^power` without the [`residue`] of the polynomial that it also returns: of h, the part of the product
-/// from x^16 on. `h * x^16` is `h * (x^2 + x)` and that residue.
+/// Returns `sum * x^power` without the [`residue`] of the polynomial, and that polynomial h, the part of the product
+/// from x^16 on. `h * x^16` is `h * (x^2 + x)` plus the residue.
 #[inline]
 fn shift(sum: u16, power: u32) -> (u16, u16) {
     let high = sum >> (16 - power);
@@ -236,14 +241,14 @@ fn shift(sum: u16, power: u32) -> (u16, u16) {
 }
 
 /// Returns x^15 + x + 1 if `polynomial` has an odd number of terms, otherwise 0. A product with x has the same residue,
-/// so the residues of many steps are added at once.
+/// so the residues of many steps can be added at once.
 #[inline]
 fn residue(polynomial: u16) -> u16 {
     let odd = (polynomial.count_ones() as u16 & 1).wrapping_neg();
     odd & 0x8003
 }
 
-/// Returns the sum of eight bytes, the first one multiplied by x^7 and the last one by 1.
+/// Returns the sum of eight bytes. The first byte is multiplied by x^7, and the last one by 1.
 #[inline]
 fn polynomial(bytes: [u8; 8]) -> u16 {
     const LOW: u64 = 0x00FF_00FF_00FF_00FF;
@@ -291,7 +296,7 @@ mod tests {
         assert_eq!(crc(&[]), 0);
     }
 
-    /// The checksum as the manual defines it.
+    /// Returns the checksum as the manual defines it.
     fn manual_crc(bytes: &[u8]) -> u16 {
         let step = |(crc, previous): (u16, u8), &byte: &u8| {
             let carry = if crc & 0x8000 == 0 { 0 } else { 0x8005 };

@@ -1,16 +1,17 @@
-//! Settings of a scanner: variant (angle and resolution), unit, measuring mode, and rate of the line, with the times that
-//! follow from them. The measuring mode defines how the 16 bits of a measured value are split: a range, or a code in its
-//! place, and the bits above it (Telegram listing, 77h block D and 10.8).
+//! Settings of a scanner: variant (angle and resolution), unit, measuring mode and baud rate, with the times that
+//! follow from them. The measuring mode defines how the 16 bits of a measured value are split into a range, or a code
+//! in its place, and the bits above it (Telegram listing, 77h block D and 10.8).
 
 use core::fmt;
 
 use scanhub_schema::Nanos;
 
-/// One mirror turn: 75 Hz nominal (Telegram listing 10; a real motor word of 148 gives 13.32 ms).
+/// Time of one revolution of the mirror: 75 Hz nominal (Telegram listing 10; a real motor word of 148 gives 13.32 ms).
 pub const MIRROR_PERIOD: Nanos = 13_320_000;
-/// The sensor sends at most so many bytes per mirror turn, so 732 bytes come in two bursts.
+/// Maximum number of bytes that the scanner sends per revolution. A telegram of 732 bytes is therefore sent in two
+/// bursts.
 pub const BYTES_PER_REVOLUTION: usize = 508;
-/// Most beams in one telegram: 100 degrees at 0.25.
+/// Maximum number of beams in one telegram: 100 degrees at 0.25.
 pub const MAX_BEAMS: usize = 401;
 
 /// Angle and resolution of a scan.
@@ -23,10 +24,10 @@ pub struct Variant {
 }
 
 impl Variant {
-    /// 180 degrees at 0.5: 361 beams, as LMS 200 and 291 leave the factory.
+    /// 180 degrees at 0.5 with 361 beams, the factory setting of an LMS 200 and 291.
     pub const HALF: Variant = Variant { angle_deg: 180, resolution_cdeg: 50 };
 
-    /// All variants that a telegram can carry; 180 at 0.25 is not one (401 values are the cap).
+    /// All variants that fit into a telegram. 180 degrees at 0.25 does not, because the maximum is 401 values.
     pub const ALL: [Variant; 5] = [
         Variant { angle_deg: 180, resolution_cdeg: 100 },
         Variant::HALF,
@@ -35,52 +36,54 @@ impl Variant {
         Variant { angle_deg: 100, resolution_cdeg: 25 },
     ];
 
-    /// The variant of `angle_deg` degrees in steps of `resolution_cdeg` hundredths, if there is one.
+    /// Returns the variant of `angle_deg` degrees in steps of `resolution_cdeg` hundredths of a degree, or `None` if it
+    /// does not exist.
     pub fn new(angle_deg: u16, resolution_cdeg: u16) -> Option<Variant> {
         Variant::ALL.into_iter().find(|v| v.angle_deg == angle_deg && v.resolution_cdeg == resolution_cdeg)
     }
 
-    /// The variant whose telegrams carry `beams` values.
+    /// Returns the variant whose telegrams have `beams` values.
     pub fn of_beams(beams: usize) -> Option<Variant> {
         Variant::ALL.into_iter().find(|v| v.beams() == beams)
     }
 
-    /// Values in a telegram: 101, 181, 201, 361 or 401.
+    /// Returns the number of values in a telegram: 101, 181, 201, 361 or 401.
     pub fn beams(self) -> usize {
         usize::from(self.angle_deg * 100 / self.resolution_cdeg) + 1
     }
 
-    /// Mirror turns that make one scan: 1, 2 or 4.
+    /// Returns the number of revolutions of the mirror per scan: 1, 2 or 4.
     pub fn revolutions(self) -> u64 {
         u64::from(100 / self.resolution_cdeg)
     }
 
-    /// Angle of the first beam in 1/1000 degree, counter-clockwise, 0 ahead: beams lie evenly to both sides of it.
+    /// Returns the angle of the first beam in 1/1000 degree, counterclockwise from straight ahead. Beams are symmetric
+    /// to straight ahead.
     pub fn first_angle_mdeg(self) -> i32 {
         -500 * i32::from(self.angle_deg)
     }
 
-    /// Time between telegrams of `telegram_len` bytes at `baud`: whole scans, as many as the line needs (Telegram
-    /// listing table 10-17).
+    /// Returns the time between telegrams of `telegram_len` bytes at `baud`. It is a multiple of the scan time, with
+    /// the smallest factor that the line can carry (Telegram listing table 10-17).
     pub fn period(self, telegram_len: usize, baud: u32) -> Nanos {
         let scan = self.revolutions() * MIRROR_PERIOD;
         scan * scanhub_schema::line_time(telegram_len, baud).div_ceil(scan).max(1)
     }
 }
 
-/// Unit of a range value.
+/// Unit of a range.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Unit {
-    /// Centimetres.
+    /// Centimeters.
     Cm,
-    /// Millimetres.
+    /// Millimeters.
     Mm,
-    /// Ten centimetres (reserved in the listing, known to several drivers).
+    /// Ten centimeters (reserved in the listing, but supported by several drivers).
     Dm,
 }
 
 impl Unit {
-    /// Millimetres per unit: 1, 10 or 100.
+    /// Returns the number of millimeters per unit: 1, 10 or 100.
     pub fn mm(self) -> u8 {
         match self {
             Unit::Cm => 10,
@@ -89,24 +92,24 @@ impl Unit {
         }
     }
 
-    /// The unit of code 0, 1 or 2, as in bits 14 and 15 of a count word and in byte 6 of the configuration.
+    /// Returns the unit with code 0, 1 or 2, as in bits 14 and 15 of a count word and in byte 6 of the configuration.
     pub fn of_code(code: u8) -> Option<Unit> {
         [Unit::Cm, Unit::Mm, Unit::Dm].get(usize::from(code)).copied()
     }
 
-    /// Its code.
+    /// Returns the code of the unit.
     pub fn code(self) -> u8 {
         self as u8
     }
 }
 
-/// The measuring-mode byte of the configuration: how the 16 bits of a value are split (Telegram listing, 77h
+/// Measuring-mode byte of the configuration, which defines how the 16 bits of a value are split (Telegram listing, 77h
 /// block D).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Mode(pub u8);
 
 impl Mode {
-    /// Low bits of a value that are the range: 13, 14 or 15.
+    /// Returns the number of low bits that are the range: 13, 14 or 15.
     pub fn range_bits(self) -> u8 {
         match self.0 {
             0x03 | 0x04 => 14,
@@ -115,7 +118,7 @@ impl Mode {
         }
     }
 
-    /// Upper bits that are a reflector level: 3, 2, 1 or none; else they are field bits.
+    /// Returns the number of upper bits that are a reflector level: 3, 2, 1 or 0. The other upper bits are field bits.
     pub fn intensity_bits(self) -> u8 {
         match self.0 {
             0x01 => 3,
@@ -125,35 +128,35 @@ impl Mode {
         }
     }
 
-    /// Bits of a value that this mode never sets.
+    /// Returns the bits of a value that this mode never sets.
     pub fn forbidden(self) -> u16 {
         if self.0 == 0x0F { 0x8000 } else { 0 }
     }
 
-    /// The greatest range value, which means "no return".
+    /// Returns the maximum value of the range bits, which means "no return".
     pub fn max_value(self) -> u16 {
         (1 << self.range_bits()) - 1
     }
 }
 
-/// A rate that the sensor's line can have.
+/// Baud rate of the scanner's line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Baud {
-    /// 9,600 bits per second: power-on.
+    /// 9,600 bits per second, the rate after power-on.
     B9600,
-    /// 19,200.
+    /// 19,200 bits per second.
     B19200,
-    /// 38,400.
+    /// 38,400 bits per second.
     B38400,
-    /// 500,000: RS-422 only.
+    /// 500,000 bits per second; RS-422 only.
     B500000,
 }
 
 impl Baud {
-    /// Every rate, slowest first.
+    /// All baud rates, the slowest first.
     pub const ALL: [Baud; 4] = [Baud::B9600, Baud::B19200, Baud::B38400, Baud::B500000];
 
-    /// Bits per second.
+    /// Returns the rate in bits per second.
     pub const fn rate(self) -> u32 {
         match self {
             Baud::B9600 => 9_600,
@@ -163,26 +166,27 @@ impl Baud {
         }
     }
 
-    /// The rate of `rate` bits per second.
+    /// Returns the baud rate of `rate` bits per second.
     pub fn of_rate(rate: u32) -> Option<Baud> {
         Baud::ALL.into_iter().find(|b| b.rate() == rate)
     }
 }
 
-/// A measured value, split.
+/// A measured value, split into its parts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Value {
-    /// The range in device units, or why there is none.
+    /// The range in device units, or the code that says why there is none.
     pub range: Result<u16, Code>,
-    /// The bits above the range, moved down: a reflector level or field bits, as [`Mode::intensity_bits`] says. The
-    /// documents contradict each other about which field bit is dazzle and which is field A, so they stay bits.
+    /// The bits above the range, shifted down: a reflector level or field bits, see [`Mode::intensity_bits`]. The
+    /// documents contradict each other about which field bit is dazzle and which is field A, so field bits are not
+    /// decoded.
     pub upper: u8,
 }
 
-/// Why there is no range: the greatest values are codes, counted down from the greatest.
+/// Reason why a value has no range. The highest values of the range bits are codes, counted down from the maximum.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Code {
-    /// 0: no stop signal, nothing came back.
+    /// 0: no stop signal, because nothing was reflected.
     NoReturn,
     /// 1: dazzled.
     Dazzled,
@@ -192,14 +196,14 @@ pub enum Code {
     Noise,
     /// 5: channel 1 could not be read.
     Channel1,
-    /// 8: more than the greatest range.
+    /// 8: the range exceeds the maximum.
     TooFar,
-    /// 3, 6 or 7, without a meaning.
+    /// 3, 6 or 7, which are undefined.
     Reserved(u8),
 }
 
 impl Code {
-    /// The code of a value that is so much less than the greatest; `None` if it is a range.
+    /// Returns the code of a value that is `below_max` less than the maximum, or `None` if it is a range.
     pub fn from_distance(below_max: u16) -> Option<Code> {
         Some(match below_max {
             0 => Code::NoReturn,
@@ -229,20 +233,20 @@ impl fmt::Display for Code {
 }
 
 impl Mode {
-    /// `word` as this mode splits it.
+    /// Splits `word` according to this mode.
     pub fn split(self, word: u16) -> Value {
         let range = word & self.max_value();
         let code = Code::from_distance(self.max_value() - range);
         Value { range: code.map_or(Ok(range), Err), upper: (word >> self.range_bits()) as u8 }
     }
 
-    /// Whether its values hold a range at all, split in a way that the listing tells: 3Fh is energy, and 0Dh and 0Eh are
-    /// reserved there.
+    /// Returns whether values contain a range in a documented layout. 3Fh is energy, and 0Dh and 0Eh are reserved in
+    /// the listing.
     pub fn has_ranges(self) -> bool {
         matches!(self.0, 0x00..=0x06 | 0x0F)
     }
 
-    /// What it measures, in words.
+    /// Returns the meaning of the mode as text.
     pub fn name(self) -> &'static str {
         match self.0 {
             0x00 => "8 m (80 m), fields A and B, dazzle",
