@@ -1,5 +1,6 @@
-//! Recordings of real sensors through the framer: every telegram bit for bit at its place, nothing else, and a
-//! reason for every refused start byte. The recordings are no part of this project: without them the tests skip.
+//! Tests of the framer on recordings of real scanners. It must find every telegram at its position, bit by bit, and
+//! nothing else, and have a reason for every rejected start byte. The recordings are not part of this project. Without
+//! them, the tests pass without a check.
 
 #[path = "../../../../tests/testkit/skip.rs"]
 mod skip;
@@ -11,7 +12,7 @@ use scanhub_drivers::lms::telegram::{ACK, STX};
 use skip::skip;
 use std::path::PathBuf;
 
-/// A file of `$SCANHUB_DATA/captures` or `../shared/data/captures`.
+/// Returns a file of `$SCANHUB_DATA/captures` or `../shared/data/captures`, or `None` if it does not exist.
 fn capture(name: &str) -> Option<Vec<u8>> {
     let default_directory = || PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data");
     let path = std::env::var_os("SCANHUB_DATA")
@@ -27,7 +28,8 @@ fn capture(name: &str) -> Option<Vec<u8>> {
     }
 }
 
-/// Where a recording's table says that a telegram lies: offset and length, the last columns but the command.
+/// Returns offset and length of each telegram in the table of a recording. `columns` are the columns of offset and
+/// length; if there is no column for the length, it is `every_len`.
 fn telegram_ranges(csv: &[u8], columns: (usize, Option<usize>), every_len: usize) -> Vec<(usize, usize)> {
     let text = std::str::from_utf8(csv).expect("a table is text");
     let number = |line: &str, column: usize| line.split(',').nth(column).and_then(|n| n.parse().ok());
@@ -40,13 +42,13 @@ fn telegram_ranges(csv: &[u8], columns: (usize, Option<usize>), every_len: usize
         .collect()
 }
 
-/// A line with a framer at its end, and what came of it.
+/// A framer, the bytes that it has received, and its results.
 #[derive(Default)]
 struct FramedCapture {
     framer: Framer,
-    /// Everything fed so far.
+    /// All bytes so far.
     bytes: Vec<u8>,
-    /// Offset and length of what was found.
+    /// Offset and length of each telegram found.
     found: Vec<(usize, usize)>,
     acknowledged: u64,
     suspect: usize,
@@ -81,7 +83,7 @@ impl FramedCapture {
         assert_eq!(read, in_telegrams + acknowledge + discarded + self.framer.buffered() as u64);
     }
 
-    /// Silence, then the end: gives up what is still open and prints a line of the table.
+    /// Handles silence, then the end of the recording: discards undecided bytes and prints a line of the table.
     fn end(&mut self, legend: &str) -> FramerCounters {
         self.framer.release(VETO_HOLD_TIME);
         self.drain();
@@ -100,7 +102,7 @@ impl FramedCapture {
         tally
     }
 
-    /// Each start byte outside the telegrams is refused for exactly one reason, or began what was aborted.
+    /// Checks that each start byte outside telegrams was rejected for exactly one reason, or began an aborted scan.
     fn assert_every_start_byte_has_a_reason(&self, tally: &FramerCounters) {
         let inside = |at: usize| self.found.iter().any(|&(start, len)| (start..start + len).contains(&at));
         let starts = (0..self.bytes.len()).filter(|&at| self.bytes[at] == STX && !inside(at)).count();
@@ -142,12 +144,12 @@ fn seven_sessions_as_a_session_listens_to_them() {
             stream = Some(header_of(telegram));
             line.framer.expect_acknowledge(false);
         } else {
-            // The recorder left out what precedes each reply on the line.
+            // The recording lacks the ACK before each reply.
             line.framer.expect_acknowledge(true);
             line.feed(&[ACK], 1);
         }
         expected.push((line.bytes.len(), len));
-        // What may come changes in the middle of a scan, while which a request goes out, or behind a reply.
+        // The acceptable headers change in the middle of a scan, during which a request is sent, or after a reply.
         let open = places.get(i + 1).map(command).filter(|&command| command != MEASURED);
         let (before, after) = telegram.split_at(if telegram[4] == MEASURED { len / 2 } else { len });
         line.feed(before, 16);
@@ -217,7 +219,7 @@ fn a_scan_broken_off_by_a_reply() {
             line.framer.expect_acknowledge(true);
             line.feed(&bytes, piece);
             let known = if expect == ExpectedHeaders::Anything { "anything" } else { "stream" };
-            // 15 bytes of a scan, ACK, a reply of 29 bytes, the beginning of the next scan.
+            // 15 bytes of a scan, ACK, a reply of 29 bytes, and the beginning of the next scan.
             assert_eq!((line.found.as_slice(), bytes[20]), (&[(16, 29)][..], 0xBA));
             assert_eq!(line.framer.buffered(), 687);
             let tally = line.end(&format!("scan_interrupted_by_reply, {known}, by {piece}"));

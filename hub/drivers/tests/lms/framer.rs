@@ -1,5 +1,5 @@
-//! The framer, situation by situation, then against everything: any content, any damage, any way the bytes are cut
-//! into reads.
+//! Tests of the framer: first single situations, then property tests with any contents, any damage, and any division of
+//! the bytes into reads.
 
 use proptest::prelude::*;
 use scanhub_drivers::line::suspect;
@@ -24,7 +24,7 @@ fn framer(expect: ExpectedHeaders) -> Framer {
     framer
 }
 
-/// All telegrams with their reasons after these bytes, fed in pieces of at most `piece`.
+/// Feeds `bytes` in pieces of at most `max_piece_len`, and returns the telegrams found with their suspect reasons.
 fn feed(framer: &mut Framer, mut bytes: &[u8], max_piece_len: usize) -> Vec<(Vec<u8>, u8)> {
     let mut telegrams = Vec::new();
     while !bytes.is_empty() {
@@ -80,9 +80,10 @@ fn a_telegram_behind_a_shortened_one_is_not_lost() {
     }
 }
 
-/// A damaged telegram whose checksum is right by accident: it took the first byte of the next one as its last.
+/// Returns a damaged telegram whose checksum is right by chance, and whose last byte is the first byte of the next
+/// telegram.
 fn false_frame_that_ends_with(next: &[u8]) -> Vec<u8> {
-    // The last two bytes are the checksum: search a scan whose checksum's high byte is the next telegram's STX.
+    // The last two bytes are the checksum. Search a scan whose checksum's high byte is the STX of the next telegram.
     (0..=u16::MAX)
         .map(|seed| scan(|i| if i == 7 { seed & 0x1FFF } else { 100 + (seed >> 13) }))
         .find(|bytes| bytes[731] == next[0])
@@ -93,12 +94,12 @@ fn false_frame_that_ends_with(next: &[u8]) -> Vec<u8> {
 fn frame_ending_in_stx_waits_for_the_next_byte() {
     let next = scan(|i| 4000 + i as u16);
     let ends_with_stx = false_frame_that_ends_with(&next);
-    // Refuted by the next byte.
+    // The next byte refutes the header.
     let mut framer = framer(STREAM_EXPECT);
     assert_eq!(feed(&mut framer, &ends_with_stx, 16), []);
     assert_eq!(framer.hold(), Some(SUFFIX_HOLD_TIME));
     assert_eq!(feed(&mut framer, &next[..1], 1), [(ends_with_stx.clone(), 0)]);
-    // Nothing follows: released by idleness, not before.
+    // No byte follows: the frame is released after the idle time, not earlier.
     let mut framer = self::framer(STREAM_EXPECT);
     feed(&mut framer, &ends_with_stx, 999);
     framer.release(SUFFIX_HOLD_TIME - 1);
@@ -107,7 +108,7 @@ fn frame_ending_in_stx_waits_for_the_next_byte() {
     let mut late = Vec::new();
     drain(&mut framer, &mut late);
     assert_eq!(late, [(ends_with_stx.clone(), 0)]);
-    // The start byte was the next telegram's: that one wins.
+    // The start byte belongs to the next telegram, which is delivered instead.
     let mut framer = self::framer(STREAM_EXPECT);
     let mut bytes = ends_with_stx;
     bytes.extend(&next[1..]);
@@ -117,7 +118,7 @@ fn frame_ending_in_stx_waits_for_the_next_byte() {
 
 #[test]
 fn a_frame_with_a_header_inside_waits_for_it_to_fail() {
-    // Values that spell a header, as a scan in an unlucky room might.
+    // The values of this scan look like a header, as those of a real room might.
     let spelled = scan(|i| match i {
         200 => 0x8002,
         201 => 0x02D6,
@@ -134,7 +135,7 @@ fn a_frame_with_a_header_inside_waits_for_it_to_fail() {
     let mut late = Vec::new();
     drain(&mut framer, &mut late);
     assert_eq!(late, [(spelled.clone(), suspect::HEADER_INSIDE)]);
-    // Or the next telegram arrives whole, which the false one would reach into.
+    // Or the next telegram arrives completely, and the false one would overlap it.
     let next = scan(|_| 4000);
     let mut framer = self::framer(STREAM_EXPECT);
     let mut bytes = spelled.clone();
@@ -156,7 +157,7 @@ fn scan_interrupted_by_reply_counts_as_aborted() {
     assert_eq!(feed(&mut framer, &bytes, 16), [(reply.bytes().to_vec(), 0), (next, 0)]);
     let tally = framer.counters();
     assert_eq!((tally.aborted, tally.acknowledge, tally.discarded), (1, 1, 15));
-    // The high byte of its length is a start byte too.
+    // The high byte of the telegram's length is a start byte too.
     let mut rejected = [0; Reject::COUNT];
     rejected[Reject::Address as usize] = 1;
     assert_eq!(tally.rejected, rejected);
@@ -184,7 +185,7 @@ fn every_refusal_has_its_reason() {
     wrong[400] ^= 1;
     feed(&mut framer, &wrong, 100);
     let mut expected = [0; Reject::COUNT];
-    // 02 02, and D6 02 B0 and D6 02 B1 where the length's high byte is a start byte; D7 02 02 likewise.
+    // 02 02, and D6 02 B0 and D6 02 B1, in which the high byte of the length is a start byte, and D7 02 02.
     expected[Reject::Length as usize] = 1;
     expected[Reject::Command as usize] = 1;
     expected[Reject::Count as usize] = 1;
@@ -202,13 +203,14 @@ fn a_flood_of_headers_is_bounded() {
         assert_eq!(feed(&mut framer, &flood, piece), []);
     }
     let good = scan(|_| 3000);
-    // Headers of the flood reach up to 814 bytes on; the telegram behind them is found all the same.
+    // Headers of the flood announce up to 814 bytes. The telegram after them is found anyway.
     assert_eq!(feed(&mut framer, &good, 16).len(), 1);
 }
 
 #[test]
 fn frames_that_refute_each_other_leave_room() {
-    // The longest frames, each with a right checksum, and each beginning eight bytes before the one before it ends.
+    // The longest frames, each with a right checksum, and each beginning eight bytes before the end of the previous
+    // one.
     let header = [0x02, 0x80, 0x28, 0x03, 0xB1];
     let frame = |begins_with: &[u8]| {
         let mut writer = lms::telegram::Writer::new(0x80, 0xB1).slice(begins_with);
@@ -251,7 +253,7 @@ prop_compose! {
 }
 
 prop_compose! {
-    /// Telegrams, some with a hole, and what may follow: garbage. Returns the bytes and the intact telegrams.
+    /// Generates telegrams, some of them with lost bytes. Returns the bytes and the intact telegrams.
     fn damaged_stream()(
         scans in prop::collection::vec((scan_content(), prop::option::of((0usize..732, 1usize..12))), 1..8),
     ) -> (Vec<u8>, Vec<Vec<u8>>) {

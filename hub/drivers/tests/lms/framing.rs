@@ -1,5 +1,6 @@
-//! The framer's promises on a lossy line, by the thousand: no intact telegram is lost, no wrong one looks clean, and
-//! none is late by more than the hold. Two other parsers read the same line for comparison.
+//! Tests of the framer on a simulated line that loses bytes, with thousands of telegrams: no intact telegram is lost,
+//! no wrong one is clean, and none is delayed by more than the hold. Two other parsers read the same line for
+//! comparison.
 
 use crate::line::LineContent;
 use crate::line::{DiscardingParser, RewindingParser};
@@ -14,11 +15,11 @@ fn no_intact_telegram_is_lost_and_none_is_late() {
         let (mut stats, mut framer) = (TelegramCounts::default(), framer(&line));
         stats.run_parser(&line, &mut framer);
         eprintln!("{:<14} {stats:?}", scene.name());
-        // Four in ten, as in the paper; otherwise the line proves nothing.
+        // Four in ten, as in the paper. With fewer damaged telegrams, the test would prove nothing.
         assert!((700..=900).contains(&stats.damaged), "{} damaged", stats.damaged);
         assert_eq!((stats.intact_lost, stats.wrong_clean), (0, 0), "{}", scene.name());
         assert!(stats.extra_max_ms() <= 2.1, "{} ms late", stats.extra_max_ms());
-        // One telegram in 256 ends with what might be a start byte.
+        // One telegram in 256 ends with a byte that might be a start byte.
         assert!(stats.extra_mean_ms() <= 0.05, "{} ms late on average", stats.extra_mean_ms());
         let FramerCounters { read, in_telegrams, acknowledge, discarded, .. } = *framer.counters();
         assert_eq!(read, line.received.len() as u64);
@@ -26,8 +27,8 @@ fn no_intact_telegram_is_lost_and_none_is_late() {
     }
 }
 
-/// That none is lost means something: others lose intact telegrams on the same line, nearly one for each damaged one
-/// where they discard what they collected.
+/// Shows that the line is hard: other parsers lose intact telegrams on it. A parser that discards what it has collected
+/// loses nearly one intact telegram for each damaged one.
 #[test]
 fn loses_no_intact_telegram_unlike_discarding_framer() {
     let line = SimulatedLine::new(LineContent::Furnished, 2_000, 0);
@@ -35,7 +36,8 @@ fn loses_no_intact_telegram_unlike_discarding_framer() {
     discarding.run_parser(&line, &mut DiscardingParser::new(line.header));
     rewinding.run_parser(&line, &mut RewindingParser::new(line.header));
     ours.run_parser(&line, &mut framer(&line));
-    // Of a share p that is damaged 2p/(1+p) are lost: 17 % of all for the 41 % here.
+    // If a share p of the telegrams is damaged, that parser loses a share of 2p/(1+p), including the damaged ones. For
+    // the 41 % here, 17 % of all telegrams are intact but lost.
     assert!((280..=400).contains(&discarding.intact_lost), "{discarding:?}");
     assert!(rewinding.intact_lost < 5, "{rewinding:?}");
     assert_eq!(ours.intact_lost, 0);

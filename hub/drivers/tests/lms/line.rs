@@ -1,11 +1,13 @@
-//! A line that loses bytes in bursts, on a virtual clock: the pieces that a reader gets, and the telegrams that the scanner sent.
-//! An account drives a parser along the line and counts the fate of each telegram. Two parsers as they are usually written serve
-//! as a comparison: both check headers as strictly as the framer, and differ only in their treatment of bytes that are not a
-//! telegram. The test of the framer and the benches `line_loss` and `host_load` use this file.
+//! Simulated line that loses bytes in bursts, in virtual time. It has the chunks that a reader receives, and the
+//! telegrams that the scanner sent. [`TelegramCounts`] runs a parser on the line and counts the fate of each telegram.
 //!
-//! Losses come in bursts (paper III.B.4: 0.135 % of the bytes, 40.8 % of the telegrams): one starts at a byte with
-//! probability 7.14e-4, and its length is geometric with mean 1.89. The scanner sends 508 bytes of a telegram, pauses, and
-//! sends the rest; the reader sees pieces of 16, as the FIFO of a UART passes them on.
+//! Two ordinary parsers serve as a comparison. Both check headers as strictly as the framer, and differ only in their
+//! treatment of bytes that are not a telegram. The test of the framer and the benches `line_loss` and `host_load` use
+//! this file.
+//!
+//! Losses come in bursts (paper III.B.4: 0.135 % of the bytes, 40.8 % of the telegrams). A burst begins at a byte with
+//! probability 7.14e-4, and its length is geometric with mean 1.89. The scanner sends 508 bytes of a telegram, pauses,
+//! and sends the rest. The reader receives chunks of 16 bytes, as the FIFO of a UART passes them on.
 
 use fastrand::Rng;
 use scanhub_drivers::line::suspect;
@@ -16,41 +18,41 @@ use scanhub_drivers::lms::telegram::{STX, Telegram};
 use scanhub_drivers::lms::variant::{BYTES_PER_REVOLUTION, MIRROR_PERIOD, Unit};
 use scanhub_schema::{MICROS, MILLIS, Nanos};
 
-/// Bytes of each telegram: 361 beams.
+/// Number of bytes of each telegram, with 361 beams.
 pub(crate) const TELEGRAM_LEN: usize = 732;
-/// Time from the first byte of a telegram to the first of the next: 361 beams take two turns.
+/// Time from the first byte of a telegram to the first byte of the next one: 361 beams take two revolutions.
 const TELEGRAM_PERIOD: Nanos = 2 * MIRROR_PERIOD;
-/// Time of a byte at 500 kBd.
+/// Time of a byte at 500,000 baud.
 const BYTE_TIME: Nanos = 20 * MICROS;
-/// Bytes that a UART collects before it hands them over.
+/// Number of bytes that a UART collects before it passes them on.
 const UART_PIECE_LEN: usize = 16;
-/// A UART passes its bytes on when no byte arrived for four byte times.
+/// Time without a byte after which a UART passes on fewer bytes.
 const UART_FLUSH_TIME: Nanos = 4 * BYTE_TIME;
 
-/// Bytes that become readable together.
+/// Chunk of bytes that become readable at the same time.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct ReadablePiece {
-    /// When.
+    /// Time at which they become readable.
     pub(crate) at: Nanos,
-    /// End of the piece in [`Line::received`]; it begins where the one before ended.
+    /// End of the chunk in [`SimulatedLine::received`]. It begins at the end of the previous chunk.
     pub(crate) end: usize,
 }
 
-/// The history of a line: a number of telegrams, and what was left of them.
+/// Telegrams that were sent on a line, and the bytes that arrived.
 pub(crate) struct SimulatedLine {
-    /// All that the sensor sent.
+    /// All bytes that the scanner sent.
     pub(crate) sent: Vec<u8>,
     /// Bytes that arrived.
     pub(crate) received: Vec<u8>,
-    /// Pieces in which these bytes become readable, in order.
+    /// Chunks of these bytes in their order.
     pub(crate) pieces: Vec<ReadablePiece>,
     /// Header of every telegram.
     pub(crate) header: StreamHeader,
-    /// First and last + 1 of each run of lost bytes in `sent`, ascending.
+    /// Start and end of each run of lost bytes in `sent`, ascending. The end is exclusive.
     lost_runs: Vec<(usize, usize)>,
-    /// For each hole where it lies in `received`.
+    /// For each run of lost bytes, its position in `received`.
     cuts: Vec<usize>,
-    /// For each hole how many bytes were lost up to its end.
+    /// For each run of lost bytes, the number of bytes lost up to its end.
     lost: Vec<usize>,
 }
 
@@ -74,13 +76,13 @@ impl SimulatedLine {
         line
     }
 
-    /// Returns the number of the sent byte that arrived as number `received`.
+    /// Returns the index in `sent` of the byte at index `received` of the received bytes.
     pub(crate) fn origin(&self, received: usize) -> usize {
         let holes = self.cuts.partition_point(|&cut| cut <= received);
         received + holes.checked_sub(1).map_or(0, |last| self.lost[last])
     }
 
-    /// Returns the time at which the byte that arrived as number `received` became readable.
+    /// Returns the time at which the byte at index `received` of the received bytes became readable.
     pub(crate) fn readable_at(&self, received: usize) -> Nanos {
         self.pieces[self.pieces.partition_point(|piece| piece.end <= received)].at
     }
@@ -127,7 +129,7 @@ impl SimulatedLine {
     }
 }
 
-/// Returns the time at which the scanner has sent byte `number`.
+/// Returns the time at which the scanner has sent the byte at index `number`.
 pub(crate) fn sent_at(number: usize) -> Nanos {
     let (telegram, byte) = ((number / TELEGRAM_LEN) as Nanos, number % TELEGRAM_LEN);
     let (turn, in_turn) =
@@ -135,8 +137,8 @@ pub(crate) fn sent_at(number: usize) -> Nanos {
     telegram * TELEGRAM_PERIOD + turn * MIRROR_PERIOD + in_turn * BYTE_TIME
 }
 
-/// Draws the runs of lost bytes among `len`. Probabilities are multiples of 2^-32, so every machine draws the same
-/// line.
+/// Draws the runs of lost bytes among `len` bytes. Probabilities are multiples of 2^-32, so every machine draws the
+/// same line.
 fn bursts(len: usize, rng: &mut Rng) -> Vec<(usize, usize)> {
     let chance = |probability: f64| (probability * 4_294_967_296.0) as u32;
     let (begins, goes_on) = (chance(7.14e-4), chance(1.0 - 1.0 / 1.89));
@@ -156,9 +158,10 @@ fn bursts(len: usize, rng: &mut Rng) -> Vec<(usize, usize)> {
     holes
 }
 
-/// A lost byte that equals a kept neighbour could as well be that neighbour: the reader sees the same bytes. At a
-/// telegram's border the two histories blame different telegrams, so all that look alike are told alike: the hole
-/// is moved left as far as the bytes are equal, and joined with one it meets.
+/// Moves each run of lost bytes to the left as far as the bytes there are equal, and merges it with a run that it
+/// reaches. A lost byte next to an equal byte that arrived could as well be that byte, because the reader sees the same
+/// bytes. At the border of a telegram, the two cases would blame different telegrams, so all equivalent cases get the
+/// same form.
 fn normalize_runs(sent: &[u8], runs: Vec<(usize, usize)>) -> Vec<(usize, usize)> {
     let mut slid: Vec<(usize, usize)> = Vec::with_capacity(runs.len());
     for (mut start, mut end) in runs {
@@ -180,20 +183,20 @@ fn normalize_runs(sent: &[u8], runs: Vec<(usize, usize)>) -> Vec<(usize, usize)>
     slid
 }
 
-/// A frame that a parser accepted.
+/// A frame that a parser has accepted.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct AcceptedFrame<'a> {
-    /// Number of its first byte among those read.
+    /// Offset of its first byte among all bytes read.
     pub(crate) offset: usize,
-    /// The frame.
+    /// Bytes of the frame.
     pub(crate) bytes: &'a [u8],
     /// Bits of [`suspect`].
     pub(crate) reasons: u8,
 }
 
-/// A parser that can be compared.
+/// A parser of the comparison.
 pub(crate) trait Parser {
-    /// Reads `bytes` and hands over every frame that it accepts.
+    /// Reads `bytes` and passes each accepted frame to `accept`.
     fn read(&mut self, bytes: &[u8], accept: &mut dyn FnMut(AcceptedFrame<'_>));
 
     /// Returns the time without bytes after which [`Parser::release`] may return more.
@@ -201,7 +204,7 @@ pub(crate) trait Parser {
         None
     }
 
-    /// Handles an idle line: no byte arrived for `idle`.
+    /// Handles `idle` ns without a byte.
     fn release(&mut self, _idle: Nanos, _accept: &mut dyn FnMut(AcceptedFrame<'_>)) {}
 }
 
@@ -246,29 +249,29 @@ pub(crate) fn framer(line: &SimulatedLine) -> Framer {
 /// Fate of the telegrams of one or more lines.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct TelegramCounts {
-    /// Telegrams sent.
+    /// Number of telegrams sent.
     pub(crate) telegrams: u64,
-    /// Number of these that lost a byte.
+    /// Number of telegrams that lost a byte.
     pub(crate) damaged: u64,
-    /// Were not handed over.
+    /// Number of telegrams that were not delivered.
     pub(crate) lost: u64,
-    /// Were not handed over although every byte arrived.
+    /// Number of telegrams that were not delivered although every byte arrived.
     pub(crate) intact_lost: u64,
-    /// Frames handed over that no telegram was.
+    /// Number of delivered frames that are not a sent telegram.
     pub(crate) wrong: u64,
     /// Number of these without a suspect mark.
     pub(crate) wrong_clean: u64,
-    /// Frames that waited for a header inside them to fail.
+    /// Number of delivered frames that were held because of a header inside them.
     pub(crate) held: u64,
-    /// Time from the arrival of the last byte to acceptance, of the other telegrams: sum and maximum.
+    /// Sum of the times from the arrival of the last byte to the delivery, for telegrams that were not held.
     pub(crate) extra_time: Nanos,
-    /// See `extra`.
+    /// Maximum of these times.
     pub(crate) extra_time_max: Nanos,
 }
 
 impl TelegramCounts {
-    /// Runs `parser` on `line` to its end like a session: every piece when it arrives, and the release when a read
-    /// finds no bytes after the hold.
+    /// Runs `parser` on the whole `line` like a session: it reads every chunk on its arrival, and calls `release` when
+    /// no byte has arrived for the hold.
     pub(crate) fn run_parser(&mut self, line: &SimulatedLine, parser: &mut impl Parser) {
         let mut delivered = vec![false; line.telegrams()];
         let mut begin = 0;
@@ -316,7 +319,8 @@ impl TelegramCounts {
         let number = line.origin(offset) / TELEGRAM_LEN;
         let held = reasons & suspect::HEADER_INSIDE != 0;
         self.held += u64::from(held);
-        // Bytes decide: a damaged telegram that equal bytes of the next one completed is what was sent.
+        // Only the bytes count. If equal bytes of the next telegram completed a damaged one, it is what the scanner
+        // sent.
         if bytes == line.telegram(number) && !delivered[number] {
             delivered[number] = true;
             let extra = now - line.readable_at(last);
@@ -348,11 +352,10 @@ impl core::ops::AddAssign for TelegramCounts {
     }
 }
 
-/// A telegram that takes longer than usual by this time is suspect.
+/// A telegram that takes longer than usual by more than this time is suspect.
 const SUSPECT_DELAY: Nanos = 8 * MILLIS;
 
-/// A state machine with six states that collects a telegram, and discards what it collected if it turns out not to be a
-/// telegram.
+/// A parser with six states that collects a telegram, and discards all collected bytes if they are not a telegram.
 pub(crate) struct DiscardingParser {
     header: StreamHeader,
     collected: Vec<u8>,
@@ -373,7 +376,7 @@ impl Parser for DiscardingParser {
             let fits = match *self.collected.as_slice() {
                 [stx] => stx == STX,
                 [_, address] => address == self.header[1],
-                // The low byte of the length is not checked alone.
+                // The low byte of the length is checked together with the high byte.
                 [_, _, _] => true,
                 [_, _, low, high] => [low, high] == self.header[2..4],
                 ref collected if collected.len() < TELEGRAM_LEN => true,
@@ -395,8 +398,8 @@ impl Parser for DiscardingParser {
     }
 }
 
-/// Collects a telegram after a strict header, and returns to the byte after its start byte if it turns out not to be a
-/// telegram.
+/// A parser that collects a telegram after a strict header. If the bytes are not a telegram, it continues with the byte
+/// after the start byte.
 pub(crate) struct RewindingParser {
     header: StreamHeader,
     open: Vec<u8>,
@@ -438,25 +441,25 @@ impl Parser for RewindingParser {
 
 const BEAM_COUNT: usize = 361;
 
-/// A surrounding, and what makes it easy or hard.
+/// Content of the scans on a line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum LineContent {
-    /// Walls and furniture with noise, in mm: the everyday case.
+    /// Walls and furniture with noise, in mm, as in an ordinary room.
     Furnished,
-    /// Only a few grains of dust in range: long runs of equal bytes, in which losses look alike.
+    /// Only a few grains of dust in range. There are long runs of equal bytes, in which different losses look the same.
     Empty,
-    /// A wall at 640 cm all around: its words are the first two bytes of a header.
+    /// A wall at 640 cm in all directions. Its words are the first two bytes of a header.
     Wall,
-    /// Random words: every byte value everywhere, whatever a room may be.
+    /// Random words, with every byte value at every position.
     Random,
 }
 
 impl LineContent {
-    /// All four.
+    /// All contents.
     pub(crate) const ALL: [LineContent; 4] =
         [LineContent::Furnished, LineContent::Empty, LineContent::Wall, LineContent::Random];
 
-    /// Returns its name in a table.
+    /// Returns the name for tables.
     pub(crate) fn name(self) -> &'static str {
         match self {
             LineContent::Furnished => "furnished",
@@ -490,7 +493,7 @@ impl LineContent {
     }
 }
 
-/// Flat faces, each a run of beams whose ranges rise or fall evenly.
+/// Draws flat surfaces. Each is a run of beams whose ranges rise or fall evenly.
 fn furniture(rng: &mut Rng) -> [u16; BEAM_COUNT] {
     let mut ranges = [0; BEAM_COUNT];
     let mut at = 0;
@@ -509,7 +512,7 @@ fn with_chance(rng: &mut Rng, n: u32) -> Option<&mut Rng> {
     (rng.u32(..n) == 0).then_some(rng)
 }
 
-/// The code of a beam without return, 13 bits.
+/// Code of a beam without a return, with 13 range bits.
 const NO_RETURN: u16 = 0x1FFF;
 /// Number of scans after which a moving robot sees another part of the room.
 const SCANS_PER_PLACE: usize = 100;

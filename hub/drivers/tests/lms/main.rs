@@ -1,4 +1,4 @@
-//! The protocol of the SICK LMS 2xx: framing on lines that lose bytes, replies, and any bytes at all.
+//! Tests of the protocol of the SICK LMS 2xx: framing on lines that lose bytes, replies, and telegrams with any bytes.
 
 mod captures;
 mod framer;

@@ -1,5 +1,6 @@
-//! Replies in both directions: printed and captured ones, and those that follow from the layout. The checksum refuses what the
-//! documents misprint. Telegrams with any bytes and a right checksum cause no panic, and are encoded as they were decoded.
+//! Tests of the codec of replies, in both directions: printed and captured replies, and those that follow from the
+//! layout. The checksum rejects the misprints of the documents. Telegrams with any bytes and a right checksum cause no
+//! panic, and are encoded as they were decoded.
 
 use proptest::prelude::*;
 use scanhub_drivers::lms::command::{Request, SubRange};
@@ -12,7 +13,7 @@ use scanhub_drivers::lms::telegram::{EncodedTelegram, Telegram, Writer};
 use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
 use scanhub_drivers::lms::{measured, reply};
 
-/// Bytes written as in a document: hexadecimal, and text between quotes.
+/// Parses bytes as documents print them: hexadecimal, and text in quotes.
 fn bytes(text: &str) -> Vec<u8> {
     let mut bytes = Vec::new();
     for (number, part) in text.split('"').enumerate() {
@@ -77,26 +78,26 @@ fn printed_and_captured_replies_both_ways() {
     assert_eq!(reply::variant_reply(0, true, Variant::HALF, 0x10).bytes()[11..], [0x03, 0x9D]);
 }
 
-/// What the documents print wrong, as far as the bytes are known (found by computing the checksums).
+/// Misprints of the documents. The right bytes were found by computing the checksums.
 #[test]
 fn misprints_are_refused() {
     let a_zero_lost =
         format!("02 80 25 00 F7 01 00 00 70 00 00 00 01 00 00 02 02 {} 02 00 10 C5 7A", &ZERO_BYTES[3..]);
     for text in [
-        // Installation mode with the checksum of table 6-4, copied into programs.
+        // Installation mode with the checksum of table 6-4, which programs have copied.
         "02 00 0A 00 20 00 \"SICK_LMS\" 5F B2",
-        // The power-on string of tables 6-2 and 7-5.
+        // The boot message of tables 6-2 and 7-5.
         "02 80 17 00 90 \"LMS200;301063;V02.10 \" 10 63 56",
-        // STX and address swapped, and their checksum (7-105).
+        // STX and address are swapped, with a matching checksum (7-105).
         "00 02 01 00 69 7D 0A",
-        // Lost in print, as in 6-8.
+        // A byte is missing in print, as in 6-8.
         &a_zero_lost,
         // LENGTH 0, as in C1h, C2h and E6h.
         "02 80 00 00 C1 10 00 00",
     ] {
         assert_eq!(Telegram::check(&bytes(text)), None, "{text}");
     }
-    // As they should have been.
+    // The right telegrams.
     assert!(Telegram::check(&bytes("02 00 0A 00 20 00 \"SICK_LMS\" BE C5")).is_some());
     let up = bytes("02 80 17 00 90 \"LMS200;301063;V02.10 \" 10 63 5E");
     let up = Telegram::check(&up).map(Reply::decode);
@@ -152,7 +153,7 @@ fn rejects_malformed_and_oversized_replies() {
     assert_eq!(Reply::decode(request.telegram()), None, "a host sends no reply");
     assert!(Reply::Configuration2(&[0; 900]).encode(0, 0x10).is_none());
     assert!(Reply::Type(&[b'x'; 900]).encode(0, 0x10).is_none());
-    // All that a telegram of values holds, and one byte more.
+    // The longest telegram of values, and one byte more.
     let frame = ScanFrame { unit: Unit::Mm, partial: None, indices: Some((1, 2)) };
     let longest = measured::encode_with(0, frame, &[7; 401], 0x10);
     let values = MeasuredValues::decode(longest.telegram()).expect("is one");
@@ -170,13 +171,13 @@ fn telegram(address: u8, command: u8, data: &[u8]) -> EncodedTelegram {
     Writer::new(address, command).slice(data).finish()
 }
 
-/// Commands that mean something, more often than others.
+/// Generates commands, most of them known ones.
 fn commands() -> impl Strategy<Value = u8> {
     let known: Vec<u8> = (0x10..=0x7C).chain(0x90..=0xFC).collect();
     prop_oneof![proptest::sample::select(known), any::<u8>()]
 }
 
-/// Generates data with counts that are small enough to fit sometimes.
+/// Generates data whose counts are small enough to match the length sometimes.
 fn data() -> impl Strategy<Value = Vec<u8>> {
     prop_oneof![
         proptest::collection::vec(any::<u8>(), 0..800),
@@ -190,7 +191,7 @@ fn data() -> impl Strategy<Value = Vec<u8>> {
     ]
 }
 
-/// Explains `telegram`; every byte of it must be in one field, in order.
+/// Explains `telegram`, and checks that every byte is in one field, in order.
 fn explain_all(telegram: Telegram<'_>, mode: Option<Mode>) -> String {
     let mut text = Headline(telegram).to_string();
     let mut at = 0;
@@ -246,7 +247,7 @@ proptest! {
         let telegram = encoded.telegram();
         prop_assert_eq!(Request::decode(telegram), None);
         if let Some(reply) = Reply::decode(telegram) {
-            // Values with several encodings get one of them: yes and no, and names with their spaces.
+            // Some values have several encodings, such as names with trailing spaces. They are encoded in one of them.
             let again = reply.encode(address, status).expect("it was short enough before");
             prop_assert_eq!(again.telegram().status(), telegram.status());
             prop_assert_eq!(Reply::decode(again.telegram()), Some(reply));

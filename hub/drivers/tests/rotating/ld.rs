@@ -1,5 +1,5 @@
-//! Sessions with heads of LDROBOT scanners that turn, over lines that damage bytes, in virtual time. Whatever arrives, every byte is
-//! counted once, and the session does not panic.
+//! Tests of sessions with LDROBOT scanners, on lines that damage bytes, in virtual time. Whatever arrives, the session
+//! counts every byte once and does not panic.
 
 use scanhub_drivers::Settings;
 use scanhub_drivers::ld::packet::{
@@ -12,10 +12,10 @@ use scanhub_schema::{MILLIS, Nanos};
 
 use crate::{DamageRates, DamagedLine, SentPacket};
 
-/// A revolution as the session delivered it.
+/// A revolution as the session returned it.
 #[derive(Debug)]
 struct DeliveredRevolution {
-    /// Numbers of the head's points.
+    /// Indices of the scanner's points.
     points: Vec<u64>,
     /// Number of points whose range and angle do not match.
     wrong: usize,
@@ -29,7 +29,7 @@ struct DeliveredRevolution {
 struct SessionLog {
     packets: Vec<[u8; PACKET_LEN]>,
     revolutions: Vec<DeliveredRevolution>,
-    /// The longest time between two packets of a sample, and the most packets.
+    /// Maximum number of packets in a sample.
     max_packets: usize,
     reads: usize,
     bauds: Vec<u32>,
@@ -47,7 +47,7 @@ impl TestBench {
         TestBench { session: LdSession::new(settings, 0), scanner, now: 0, log: SessionLog::default() }
     }
 
-    /// Drives the session until `until`.
+    /// Runs the session until `until`.
     fn run(&mut self, until: Nanos) {
         while self.now < until {
             let (wakes_at, waits) = match self.drain() {
@@ -68,7 +68,7 @@ impl TestBench {
         let room = self.session.read_buffer().len();
         let mut bytes = self.scanner.read(self.now, room);
         if self.session.rate() != self.scanner.model.baud() {
-            // A rate four times as fast or slow makes noise of it.
+            // At a wrong rate, the bytes are noise.
             bytes = bytes.iter().step_by(4).map(|byte| byte | 0x80).collect();
         }
         self.session.read_buffer()[..bytes.len()].copy_from_slice(&bytes);
@@ -81,7 +81,7 @@ impl TestBench {
         assert_eq!(stats.read, stats.in_telegrams + stats.discarded + stats.buffered);
     }
 
-    /// Returns the end of the session's rest, if it rests, and the end of its wait.
+    /// Returns the end of the session's sleep, if it sleeps, and the end of its wait.
     fn drain(&mut self) -> (Option<Nanos>, Nanos) {
         loop {
             match self.session.poll_action() {
@@ -113,7 +113,7 @@ impl TestBench {
                         let right = head.angle(**point) % 36_000.0;
                         let off =
                             (-f64::from(delivered.angle).to_degrees() * 100.0 - right).rem_euclid(36_000.0);
-                        // The packet's own angles are cut off to a hundredth.
+                        // The angles of a packet are truncated to hundredths of a degree.
                         off.min(36_000.0 - off) > 2.0
                     });
                     let wrong = wrong.count();
@@ -131,8 +131,8 @@ impl TestBench {
         }
     }
 
-    /// Checks every revolution: its points belong to one revolution of the head, in order, and are right. Without a
-    /// mark, none is missing. Returns the largest error of a stamp.
+    /// Checks that the points of every revolution are right, in order, and from one revolution of the head. An unmarked
+    /// revolution must be complete. Returns the largest error of a stamp.
     fn check_revolutions(&self) -> Nanos {
         let beams = self.session.beams().expect("known");
         let edge = 18_000.0 / beams as f64;
@@ -140,7 +140,7 @@ impl TestBench {
         let turn_of = |point: u64| ((self.scanner.angle(point) + edge) / 36_000.0).floor();
         for revolution in &self.log.revolutions {
             let (first, last) = (revolution.points[0], revolution.points[revolution.points.len() - 1]);
-            // The rounding of angles may put a point into another packet.
+            // Because angles are rounded, a point may appear in another revolution.
             let is_whole = revolution.points.len() as u64 == last - first + 1;
             assert!(revolution.points.windows(2).all(|pair| pair[0] < pair[1]), "{revolution:?}");
             assert!(
@@ -197,11 +197,11 @@ fn uneven_speed_does_not_change_the_models_beams() {
 #[test]
 fn receives_every_revolution_of_every_model() {
     for model in Model::ALL {
-        // A speed at which no two turns have their points at the same places.
+        // At this speed, no two revolutions have their points at the same angles.
         let head =
             SimulatedScanner::new(model, points_per_revolution(model) * 1.000_7, 1, DamageRates::default());
         let mut bench = TestBench::new(settings_of(model), head);
-        // The session reads byte by byte until it knows the stream.
+        // The session reads byte by byte until it has identified the stream.
         bench.run(2 * ONE_SECOND);
         bench.log.reads = 0;
         bench.run(11 * ONE_SECOND);
@@ -217,7 +217,7 @@ fn receives_every_revolution_of_every_model() {
         assert_eq!(stats.due, stats.telegrams);
         assert_eq!(bench.session.state(), State::Streaming);
         assert_eq!(bench.session.beams(), Some(model.beams()));
-        // A read each five milliseconds, not one for each byte.
+        // About one read every 5 ms, not one per byte.
         assert!(bench.log.reads < 1_900, "{model:?}: {} reads", bench.log.reads);
         assert!(bench.log.max_packets <= 17 && bench.log.bauds.is_empty());
     }
@@ -320,7 +320,7 @@ fn long_host_stall_is_not_a_scanner_restart() {
         let head = SimulatedScanner::new(Model::Ld19, 450.0, 3, DamageRates::default());
         let mut bench = TestBench::new(settings_of(Model::Ld19), head);
         bench.run(3 * ONE_SECOND);
-        // The tty keeps what arrives first, and the rest finds no room.
+        // The tty keeps the first bytes and has no room for the rest.
         bench.now += stall * ONE_SECOND;
         bench.scanner.lose_until(bench.now);
         bench.read(true);
@@ -335,7 +335,8 @@ fn revolution_cut_by_a_gap_keeps_previous_period() {
         settings_of(Model::Ld19),
         SimulatedScanner::new(Model::Ld19, 450.0, 3, DamageRates::default()),
     );
-    // In the twentieth turn it gets slower, but is where it was, a turn aside.
+    // In the twentieth revolution, the head slows down, and at the end of the gap it is at the same angle, one
+    // revolution later.
     bench.run(ONE_SECOND + 1_970 * MILLIS);
     bench.scanner.points_per_revolution = 450.0 * 19.7 / 18.7;
     bench.scanner.lose_until(bench.now + 200 * MILLIS);
@@ -442,19 +443,19 @@ fn revolution_fills_a_grid_of_constant_beams() {
     }
 }
 
-/// A head that rotates evenly. The range of each point identifies it.
+/// A scanner whose head rotates evenly. The range of each point identifies it.
 struct SimulatedScanner {
     model: Model,
-    /// Points in a turn.
+    /// Points per revolution.
     points_per_revolution: f64,
-    /// Share by which its clock is slow.
+    /// Fraction by which its clock is slow.
     drift: f64,
-    /// Share by which the speed in every other packet differs from the true one.
+    /// Fraction by which the speed in every other packet differs from the true speed.
     jitter: f64,
     random: fastrand::Rng,
     line: DamagedLine,
     sent: Vec<SentPacket>,
-    /// When it was switched on, and how many packets it has sent since.
+    /// Time of power-on, and number of packets sent since.
     switched_on_at: Nanos,
     packets: u64,
 }
@@ -474,29 +475,29 @@ impl SimulatedScanner {
         }
     }
 
-    /// Returns the time of point number `point` on the hub's clock.
+    /// Returns the time of the point with index `point` on the hub's clock.
     fn time(&self, point: u64) -> Nanos {
         let sensor_s = point as f64 / f64::from(self.model.points_per_second());
         self.switched_on_at + (sensor_s / (1.0 - self.drift) * 1e9) as Nanos
     }
 
-    /// Returns the angle of point number `point` in hundredths of a degree, over all revolutions.
+    /// Returns the angle of the point with index `point` in hundredths of a degree, summed over all revolutions.
     fn angle(&self, point: u64) -> f64 {
         point as f64 * f64::from(FULL_CIRCLE) / self.points_per_revolution
     }
 
-    /// The range of point number `point`: by which it is known again.
+    /// Returns the range of the point with index `point`, which identifies it.
     fn range(point: u64) -> u16 {
         100 + (point % 20_011) as u16
     }
 
-    /// The point of this range that is the nearest to number `about`.
+    /// Returns the index of the point with this range that is nearest to `about`.
     fn point_of(range: u16, about: u64) -> u64 {
         let off = (u64::from(range) + 20_011 - 100 - about % 20_011) % 20_011;
         if off > 10_005 { about + off - 20_011 } else { about + off }
     }
 
-    /// Bytes that have arrived by `now`, `room` at most.
+    /// Returns the bytes that have arrived by `now`, at most `room`.
     fn read(&mut self, now: Nanos, room: usize) -> Vec<u8> {
         self.send_until(now);
         self.line.read(now, room)
@@ -536,7 +537,7 @@ impl SimulatedScanner {
         }
     }
 
-    /// Loses the bytes on the line and the next ones up to `until`.
+    /// Drops the bytes on the line and the following ones up to `until`.
     fn lose_until(&mut self, until: Nanos) {
         self.send_until(until);
         self.line.bytes.retain(|(at, _)| *at > until);
@@ -545,7 +546,7 @@ impl SimulatedScanner {
     }
 }
 
-/// A packet with a right checksum that says anything.
+/// Returns a packet with random content and a right checksum.
 fn random_packet(random: &mut fastrand::Rng) -> [u8; PACKET_LEN] {
     let angle = |random: &mut fastrand::Rng| random.u16(..=36_000);
     let start = angle(random);

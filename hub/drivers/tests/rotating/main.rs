@@ -1,4 +1,4 @@
-//! Sessions with rotating scanners, and the line from such a scanner, which damages bytes.
+//! Tests of sessions with rotating scanners, with the simulated line from such a scanner, which damages bytes.
 
 mod ld;
 mod rplidar;
@@ -7,14 +7,14 @@ use std::collections::VecDeque;
 
 use scanhub_schema::{Nanos, line_time};
 
-/// Faults of the bytes of packets, as shares of all bytes.
+/// Rates of damage to the bytes of packets, as fractions of all bytes.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct DamageRates {
-    /// Starts of bursts that are lost. Their mean length is four bytes.
+    /// Rate at which a burst of lost bytes begins. The mean length of a burst is four bytes.
     lost: f64,
-    /// Bytes that follow an inserted one.
+    /// Rate of inserted bytes.
     inserted: f64,
-    /// Bytes with flipped bits.
+    /// Rate of bytes with flipped bits.
     flipped: f64,
 }
 
@@ -30,7 +30,7 @@ pub(crate) struct DamagedLine {
 pub(crate) struct SentPacket {
     bytes: Vec<u8>,
     intact: bool,
-    /// Time at which its last byte has left the line, if none was lost.
+    /// Time at which its last byte has left the line, if that byte was not lost.
     at: Nanos,
 }
 

@@ -1,6 +1,6 @@
-//! A session and a scanner of Slamtec with the line between them, in virtual time, and the invariants of all tests. The scanner
-//! replies to requests and measures, without a room: the range of each point identifies it. Its packets are encoded from the
-//! description of the formats and not from the decoder.
+//! Test bench with a session, a simulated RPLIDAR and the line between them, in virtual time, and the invariants of all
+//! tests. The scanner replies to requests and measures without a room: the range of each point identifies it. Its
+//! packets are encoded according to the description of the formats and independently of the decoder.
 
 mod start;
 mod stream;
@@ -14,10 +14,10 @@ use scanhub_schema::{MILLIS, Nanos, line_time};
 use crate::{DamageRates, DamagedLine, SentPacket};
 
 pub(crate) const ONE_SECOND: Nanos = 1_000 * MILLIS;
-/// Bytes that a tty returns at once.
+/// Maximum number of bytes that one read of a tty returns.
 const TTY_READ_LEN: usize = 4_095;
 
-/// A revolution as the session delivered it.
+/// A revolution as the session returned it.
 #[derive(Debug)]
 pub(crate) struct DeliveredRevolution {
     /// Points: clockwise angle in degrees, 0 to 360, and range in mm.
@@ -28,7 +28,7 @@ pub(crate) struct DeliveredRevolution {
     pub(crate) beams: usize,
 }
 
-/// An output of the session as a recorder keeps it.
+/// An output of the session in the form that a recorder stores.
 #[derive(Clone)]
 pub(crate) struct RecordedOutput {
     pub(crate) first: Nanos,
@@ -61,7 +61,7 @@ impl TestBench {
         TestBench { session: RplidarSession::new(settings, 0), scanner, now: 0, log: SessionLog::default() }
     }
 
-    /// Drives the session until `until`.
+    /// Runs the session until `until`.
     pub(crate) fn run(&mut self, until: Nanos) {
         while self.now < until {
             let (wakes_at, waits) = self.drain();
@@ -71,7 +71,7 @@ impl TestBench {
         }
     }
 
-    /// Drives it until `done`, for `most` at most. How long that took.
+    /// Runs the session until `is_done`, for at most `max_time`. Returns how long it took.
     pub(crate) fn run_until(&mut self, max_time: Nanos, is_done: impl Fn(&TestBench) -> bool) -> Nanos {
         let started = self.now;
         while !is_done(self) {
@@ -85,7 +85,7 @@ impl TestBench {
         let room = self.session.read_buffer().len().min(TTY_READ_LEN);
         let mut bytes = self.scanner.read(self.now, room);
         if self.session.rate() != self.scanner.baud {
-            // Another rate makes noise of it.
+            // At a wrong rate, the bytes are noise.
             let made = |byte: &u8| if self.scanner.is_text { b'0' | byte & 15 } else { byte | 0x80 };
             bytes = bytes.iter().step_by(3).map(made).collect();
         }
@@ -99,7 +99,7 @@ impl TestBench {
         assert_eq!(stats.read, stats.in_telegrams + stats.discarded + stats.buffered);
     }
 
-    /// Returns the end of the session's rest or wait, and whether it is a wait.
+    /// Returns the end of the session's sleep or wait, and whether it is a wait.
     fn drain(&mut self) -> (Nanos, bool) {
         loop {
             match self.session.poll_action() {
@@ -157,9 +157,9 @@ impl TestBench {
         }
     }
 
-    /// Checks the revolutions of the current stream: each has points of one revolution of the head at their right
-    /// places. Without a mark, none is missing. Returns the largest error of a stamp, and the number of wrong points
-    /// of unmarked revolutions.
+    /// Checks the revolutions of the current stream: each has points of one revolution of the head, at the right
+    /// angles. An unmarked revolution must be complete. Returns the largest error of a stamp, and the number of wrong
+    /// points in unmarked revolutions.
     pub(crate) fn check_revolutions(&self, revolutions: &[DeliveredRevolution]) -> (Nanos, usize) {
         let kind = self.scanner.kind().expect("measuring");
         let (step, mut worst, mut wrong) = (self.scanner.step(), 0, 0);
@@ -167,7 +167,7 @@ impl TestBench {
         let per_turn = 360.0 / step;
         let mut last_turn = -1.0;
         for delivered in revolutions.iter().filter(|delivered| delivered.first > started) {
-            // Beam 0's edge is half a beam before the zero.
+            // The edge of beam 0 is half a beam before the zero.
             let edge = 180.0 / delivered.beams as f64;
             let about =
                 (delivered.first - started) as f64 / (self.scanner.time(1.0).unwrap() - started) as f64;
@@ -201,7 +201,7 @@ impl TestBench {
         (from.max(0.0) as u64..to.max(0.0) as u64).any(|point| {
             let sample = SimulatedScanner::sample(point);
             let range = if range == line::NO_RETURN { 0 } else { u32::from(range) };
-            // A difference from a missing return cannot be encoded.
+            // The difference to a missing return cannot be encoded.
             let is_untold = kind == PacketFormat::Ultra
                 && point % 3 == 2
                 && SimulatedScanner::sample(point + 1).range == 0;
@@ -219,7 +219,7 @@ impl TestBench {
     }
 }
 
-/// Degrees by which points lie before their places on the mean.
+/// Mean angle in degrees by which points lie before their nominal angles.
 fn mean_shift(kind: PacketFormat) -> f64 {
     match kind {
         PacketFormat::Express => 4.0,
@@ -228,7 +228,7 @@ fn mean_shift(kind: PacketFormat) -> f64 {
     }
 }
 
-/// A mode that it offers.
+/// A scan mode of the scanner: name, microseconds per point, packet format.
 pub(crate) type OfferedMode = (&'static str, f64, PacketFormat);
 
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -237,7 +237,7 @@ enum ScannerState {
     Booting {
         until: Nanos,
     },
-    /// First point of the stream, and number of packets that were sent.
+    /// Time of the first point of the stream, and number of packets sent.
     Measuring {
         kind: PacketFormat,
         us: f64,
@@ -251,13 +251,13 @@ pub(crate) struct SimulatedScanner {
     pub(crate) baud: u32,
     pub(crate) modes: Vec<OfferedMode>,
     pub(crate) typical: u8,
-    /// Firmware that cannot list its modes.
+    /// Whether the firmware cannot list its modes.
     pub(crate) is_old: bool,
-    /// Turns in a second.
+    /// Revolutions per second.
     pub(crate) hz: f64,
-    /// Time from a request to its first point, in addition to the usual one.
+    /// Additional time from a request to its first point.
     pub(crate) spin_up: Nanos,
-    /// Share by which its points take longer than it reports.
+    /// Fraction by which its points take longer than it reports.
     pub(crate) drift: f64,
     /// Health status and error code.
     pub(crate) health: (u8, u16),
@@ -265,14 +265,14 @@ pub(crate) struct SimulatedScanner {
     pub(crate) clears_on_reboot: bool,
     /// Requests that the scanner ignores, one entry for each time.
     pub(crate) ignored_requests: Vec<u8>,
-    /// Whether it has power.
+    /// Whether the scanner has power.
     pub(crate) is_on: bool,
-    /// Bytes that it sends before its greeting.
+    /// Bytes that it sends before its boot message.
     pub(crate) junk: Vec<u8>,
     pub(crate) dtr: bool,
     /// Whether its bytes look like text at another rate.
     pub(crate) is_text: bool,
-    /// The last request for a motor: duty or speed.
+    /// The last value for the motor: duty cycle or speed.
     pub(crate) motor: Option<u16>,
     pub(crate) requests: Vec<u8>,
     state: ScannerState,
@@ -281,7 +281,7 @@ pub(crate) struct SimulatedScanner {
     pub(crate) line: DamagedLine,
     free_at: Nanos,
     pub(crate) sent: Vec<SentPacket>,
-    /// Points of the streams before this one.
+    /// Number of points of all streams before this one.
     earlier_points: u64,
 }
 
@@ -364,7 +364,7 @@ impl SimulatedScanner {
         }
     }
 
-    /// Starts its first mode of this kind, as another program may have left it.
+    /// Starts the first mode with this packet format, as another program may have done before the session.
     pub(crate) fn start_before(&mut self, kind: PacketFormat, now: Nanos) {
         let us = self.modes.iter().find(|(.., of)| *of == kind).map_or(254.0, |(_, us, _)| *us);
         self.state = ScannerState::Measuring { kind, us, first_point_at: now, packets: 0 };
@@ -395,7 +395,7 @@ impl SimulatedScanner {
         }
     }
 
-    /// Returns the time of point number `point` of this stream.
+    /// Returns the time of the point with index `point` of this stream.
     pub(crate) fn time(&self, point: f64) -> Option<Nanos> {
         self.us().map(|(zero, ns)| zero + (point * ns) as Nanos)
     }
@@ -405,16 +405,16 @@ impl SimulatedScanner {
         self.us().map_or(0.0, |(_, ns)| 360.0 * self.hz * ns / 1e9)
     }
 
-    /// Returns point number `point`.
+    /// Returns the point with index `point`.
     pub(crate) fn sample(point: u64) -> TestPoint {
         let range = if point % 7 == 3 { 0 } else { 1_500 + (point * 7_919 % 997) as u32 };
         TestPoint { range, eighths: (point * 13 % 64) as u32, quality: 1 + (point % 60) as u32 }
     }
 
-    /// Returns the angle by which it lies before its place, in degrees.
+    /// Returns the angle in degrees by which a point lies before its nominal angle.
     pub(crate) fn angle_before(kind: PacketFormat, sample: TestPoint) -> f64 {
         match kind {
-            // One in eight comes out of order, by up to five places.
+            // One in eight points is out of order, by up to five positions.
             PacketFormat::Standard if sample.eighths < 8 => f64::from(sample.eighths),
             PacketFormat::Express => f64::from(sample.eighths) / 8.0,
             PacketFormat::Ultra if sample.range < 50 => 7.5,
@@ -426,7 +426,7 @@ impl SimulatedScanner {
         }
     }
 
-    /// Takes a byte that the host sent at `rate` and that left the line at `now`.
+    /// Handles a byte that the host sent at `rate` and that left the line at `now`.
     pub(crate) fn write(&mut self, byte: u8, rate: u32, now: Nanos) {
         self.send_until(now);
         if !self.is_on || rate != self.baud || matches!(self.state, ScannerState::Booting { .. }) {
@@ -513,7 +513,8 @@ impl SimulatedScanner {
         }
     }
 
-    /// `data`, or packets of as many bytes as it says.
+    /// Sends a descriptor, followed by `data` as a single reply. If `times` is not 0, the descriptor announces packets whose
+    /// length is `data[0]`, and nothing else is sent.
     fn reply(&mut self, answer: u8, times: u8, data: &[u8], now: Nanos) {
         let len = if times > 0 { data[0] } else { data.len() as u8 };
         let mut at = (now + 2 * MILLIS).max(self.free_at);
@@ -589,7 +590,7 @@ impl SimulatedScanner {
         self.sent.push(sent);
     }
 
-    /// Sends the rest of a packet, which is text.
+    /// Sends the rest of a packet, which looks like text.
     pub(crate) fn send_rest_as_text(&mut self, now: Nanos) {
         self.send_until(now);
         for _ in 0..60 {
@@ -598,7 +599,7 @@ impl SimulatedScanner {
         }
     }
 
-    /// Loses the bytes on the line and the next ones up to `until`.
+    /// Drops the bytes on the line and the following ones up to `until`.
     pub(crate) fn lose_until(&mut self, until: Nanos) {
         self.send_until(until);
         let oldest = self.line.bytes.front().map_or(until, |(at, _)| *at);
@@ -607,7 +608,7 @@ impl SimulatedScanner {
         self.sent.iter_mut().filter(is_hit).for_each(|sent| sent.intact = false);
     }
 
-    /// Drops whole packets because the host did not read until `until` and the buffer has only about `room` bytes.
+    /// Drops complete packets, as when the host does not read until `until` and the buffer has only about `room` bytes.
     pub(crate) fn overflow(&mut self, until: Nanos, room: usize) {
         self.send_until(until);
         let Some(kind) = self.kind() else { return };
@@ -616,7 +617,7 @@ impl SimulatedScanner {
         self.sent.iter_mut().rev().take(dropped).for_each(|sent| sent.intact = false);
     }
 
-    /// Returns the kind of the packets that it sends.
+    /// Returns the format of the packets that it sends.
     pub(crate) fn kind(&self) -> Option<PacketFormat> {
         if let ScannerState::Measuring { kind, .. } = self.state { Some(kind) } else { None }
     }
@@ -627,12 +628,12 @@ impl SimulatedScanner {
     }
 }
 
-/// A point as it is encoded: its raw angle is that of its place.
+/// A point before it is encoded. Its raw angle is that of its index.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct TestPoint {
     /// Range in mm; 0 is no return.
     pub(crate) range: u32,
-    /// Eighths of a degree by which it lies before its place; express packets only.
+    /// Eighths of a degree by which it lies before its nominal angle; express packets only.
     pub(crate) eighths: u32,
     pub(crate) quality: u32,
 }
@@ -698,8 +699,8 @@ pub(crate) fn encode(kind: PacketFormat, start: f64, samples: &[TestPoint], next
     bytes
 }
 
-/// Returns the stored value of a range, the range that it stands for, and the number of bits by which its steps are
-/// wider.
+/// Returns the encoded value of a range, the range that the value decodes to, and the number of bits by which its
+/// quantization is coarser.
 fn encode_major(range: u32) -> (u32, i64, u32) {
     let (from, base, level) = match range {
         0x4000.. => (3328, 0x4000, 4),
@@ -723,7 +724,7 @@ fn twenty_bits(sample: TestPoint) -> u32 {
     }
 }
 
-/// Returns the descriptor type of packets of this kind.
+/// Returns the response type in the descriptor of this packet format.
 pub(crate) fn descriptor_type(kind: PacketFormat) -> u8 {
     match kind {
         PacketFormat::Standard => 0x81,

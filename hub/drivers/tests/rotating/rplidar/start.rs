@@ -1,4 +1,4 @@
-//! The start of a session with a Slamtec scanner, whatever the scanner was doing before.
+//! Tests of the start of a session with an RPLIDAR in any previous state.
 
 use scanhub_drivers::Settings;
 use scanhub_drivers::line::{Action, Control, Event, Protocol as _, ScannerSession as _, State};
@@ -87,7 +87,7 @@ fn restarts_abandoned_stream_within_500ms() {
     for model in Model::ALL {
         let kinds = SimulatedScanner::new(model, 1).modes.into_iter().map(|(.., kind)| kind);
         for kind in kinds {
-            // The rate of the first is tried first.
+            // The search tries the rate of the settings first.
             for first in [
                 Settings::default(),
                 settings_of(model),
@@ -144,7 +144,7 @@ fn reports_health_error_and_retries_until_it_clears() {
     assert!(!bench.scanner.is_measuring());
     bench.scanner.health = (1, 7);
     bench.run_until(3 * ONE_SECOND, is_streaming);
-    // It measures, and says that it may not for long.
+    // The scanner measures, and warns that it may stop soon.
     let warning = Health::Warning(7);
     assert_eq!(
         (bench.session.problem(), bench.session.health()),
@@ -204,7 +204,7 @@ fn reports_mode_firmware_and_unexpected_model() {
     let standard = Settings { mode: Some(Mode::Standard.name()), ..settings_of(Model::A2m8) };
     assert_eq!(details_and_unexpected_model(standard, Model::A2m8), (" standard 1.29".to_owned(), None));
     assert_eq!(details_and_unexpected_model(settings_of(Model::A1), Model::A2m8).1, Some("a2m8"));
-    // As long as a status has room for it.
+    // The longest text must fit into a status.
     let longest = Model::ALL.map(|model| model.name().len()).into_iter().max().expect("some");
     let mode = Model::ALL.iter().flat_map(|_| Mode::ALL).map(|mode| mode.name().len()).max().expect("some");
     assert!(longest + 1 + mode + " 1.29".len() <= 24);
@@ -337,7 +337,7 @@ fn a_second_without_data_begins_again() {
     assert_eq!(bench.session.stats().lost, 0, "silence is no loss on the line");
 }
 
-/// Returns a bench with a scanner that has announced its stream and spins up.
+/// Returns a test bench whose scanner has announced its stream and spins up.
 fn spinning_up(model: Model) -> TestBench {
     let mut bench = TestBench::new(
         Settings::default(),
@@ -351,7 +351,7 @@ fn spinning_up(model: Model) -> TestBench {
 
 #[test]
 fn identifies_a_scanner_streaming_during_spin_up() {
-    // Packets of another kind, and packets of the same kind with another time per point.
+    // Packets of another format, and packets of the same format with another time per point.
     for (before, model) in [(Model::S1, Model::A3), (Model::A3, Model::S1), (Model::A1, Model::A2m8)] {
         let mut bench = spinning_up(before);
         bench.run(bench.now + 500 * MILLIS);
@@ -424,7 +424,7 @@ fn boot_message_during_a_stream_restarts_at_once() {
 
 #[test]
 fn a_greeting_after_other_bytes_is_a_restart() {
-    // A supply that dips sends other bytes first, some of them text.
+    // A dip of the supply makes the scanner send other bytes first, some of which are text.
     let junk = [vec![0x00; 1], vec![0xFF, 0x00, 0x80], vec![0xA5; 300], vec![b'x'; 45], vec![0xF0; 2_000]];
     for (model, junk) in
         [Model::A1, Model::S2].into_iter().flat_map(|model| junk.each_ref().map(|it| (model, it)))

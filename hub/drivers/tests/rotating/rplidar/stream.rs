@@ -1,5 +1,5 @@
-//! Sessions with the packets of Slamtec scanners: revolutions, stamps, damage, and sessions of recordings, which have no scanner.
-//! Whatever arrives, every byte is counted once, and the session does not panic.
+//! Tests of sessions with packets of RPLIDAR scanners: revolutions, stamps, damage, and sessions on recordings, which
+//! have no scanner. Whatever arrives, the session counts every byte once and does not panic.
 
 use scanhub_drivers::line::{Action, Control, Event, Protocol as _, RawScan, ScannerSession as _};
 use scanhub_drivers::rplidar::packet::PacketFormat;
@@ -44,7 +44,7 @@ fn receives_every_revolution_in_every_mode() {
     }
 }
 
-/// All kinds of packets, each with a model and a mode that has it.
+/// All packet formats, each with a model and a mode that uses it.
 const PACKET_KINDS: [(Model, Mode); 6] = [
     (Model::A1, Mode::Standard),
     (Model::A1, Mode::Express),
@@ -139,7 +139,8 @@ fn counts_packets_lost_in_a_full_buffer() {
     }
 }
 
-/// The remaining packets start where the last packet before them ended, even if whole revolutions were dropped.
+/// Checks that whole dropped packets are counted. The remaining packets begin where the previous one ended, even if
+/// whole revolutions were dropped.
 #[test]
 fn counts_loss_of_whole_packets_in_a_full_buffer() {
     for kind in PACKET_KINDS {
@@ -168,7 +169,7 @@ fn counts_loss_of_whole_packets_in_a_full_buffer() {
     }
 }
 
-/// A pty and its driver buffer more: the host reads the buffered bytes in pieces while more arrive.
+/// A pty and its driver buffer more bytes. The host reads them in pieces while more arrive.
 #[test]
 fn stamps_after_pty_overflow_are_within_3_ms() {
     for kind in [(Model::A3, Mode::Sensitivity), (Model::S2, Mode::DenseBoost), (Model::S3, Mode::UltraDense)]
@@ -266,7 +267,7 @@ fn revolutions_resume_after_the_head_stood_still() {
     }
 }
 
-/// Turns of a recording: stamp, points a second, beams, and how many points each has.
+/// A revolution of a replayed recording.
 #[derive(Debug, PartialEq)]
 struct ReplayedRevolution {
     first: Nanos,
@@ -275,7 +276,7 @@ struct ReplayedRevolution {
     incomplete: bool,
 }
 
-/// Returns a session with these `settings` after it has read `outputs`, and its revolutions.
+/// Runs a session with these `settings` on `outputs`. Returns it with its revolutions.
 fn replay(settings: Settings, outputs: &[RecordedOutput]) -> (RplidarSession, Vec<ReplayedRevolution>) {
     let settings = Settings { fixed_rate: true, listen_only: true, ..settings };
     let mut session = RplidarSession::new(settings, outputs[0].first);
@@ -324,7 +325,7 @@ fn record(model: Model, mode: Mode, seconds: u64) -> TestBench {
     live
 }
 
-/// The recording has the replies: the time per point and the kind of the packets.
+/// The recording contains the replies with the time per point and the packet format.
 #[test]
 fn replayed_recording_yields_the_same_revolutions() {
     for (model, mode) in STREAM_MODES {
@@ -334,7 +335,7 @@ fn replayed_recording_yields_the_same_revolutions() {
             let per_second = session.points_per_second().expect("told");
             assert_eq!(Some(per_second), live.session.points_per_second(), "{model:?} {mode:?}");
             assert_eq!(session.model(), Some(model));
-            // If the configured mode is unknown, the first quarter of a second may be of another mode.
+            // Without the configured mode, the first quarter of a second may belong to another mode.
             let missing = if settings.mode.is_some() { 0 } else { 3 };
             assert!(
                 revolutions.len() + missing >= live.log.revolutions.len(),
@@ -344,7 +345,7 @@ fn replayed_recording_yields_the_same_revolutions() {
             let behind = live.log.revolutions.len() - revolutions.len();
             for (replayed, delivered) in revolutions.iter().zip(&live.log.revolutions[behind..]) {
                 assert_eq!(replayed.incomplete, delivered.incomplete, "{model:?} {mode:?}");
-                // Without the mode it is another grid, which begins elsewhere.
+                // Without the mode, the grid of beams is different and begins at a different angle.
                 let off = if settings.mode.is_some() { 0 } else { 2 };
                 assert!(replayed.points.abs_diff(delivered.points.len()) <= off, "{model:?} {mode:?}");
                 assert!(settings.mode.is_none() || replayed.beams == delivered.beams);
@@ -377,7 +378,7 @@ fn one_that_begins_in_the_midst_has_turns_soon() {
     }
 }
 
-/// Returns the difference between the stamp of each of `turns` and the delivered one.
+/// For each of `revolutions`, returns the smallest difference between its stamp and the stamp of a delivered one.
 fn stamp_errors(live: &TestBench, revolutions: &[ReplayedRevolution]) -> Vec<Nanos> {
     let off = |replayed: &ReplayedRevolution| {
         live.log.revolutions.iter().map(|delivered| delivered.first.abs_diff(replayed.first)).min()
@@ -385,7 +386,7 @@ fn stamp_errors(live: &TestBench, revolutions: &[ReplayedRevolution]) -> Vec<Nan
     revolutions.iter().map(|replayed| off(replayed).expect("some")).collect()
 }
 
-/// A recording does not have damaged packets: only the marks of the packets after them show that they are missing.
+/// A recording contains no damaged packets. Only the marks of the following packets show that they are missing.
 #[test]
 fn lossy_recording_from_mid_stream_has_right_stamps() {
     for (model, mode) in STREAM_MODES {
@@ -408,8 +409,8 @@ fn lossy_recording_from_mid_stream_has_right_stamps() {
     }
 }
 
-/// While a busy machine stands still, packets wait in its driver. Then their stamps are late and close together, and have little to
-/// do with the time that a point takes.
+/// While a busy host does not run, packets wait in its driver. Their stamps are then late and close together, and do
+/// not depend on the time per point.
 #[test]
 fn backlogged_packets_do_not_change_time_per_point() {
     for (model, mode) in STREAM_MODES {
@@ -421,7 +422,7 @@ fn backlogged_packets_do_not_change_time_per_point() {
         let mut free = 0;
         for output in &mut stalled {
             let into = output.last % (300 * MILLIS);
-            // The hub takes a tenth of a millisecond for each of those that waited.
+            // The hub needs 0.1 ms for each waiting packet.
             let at = if into < 40 * MILLIS { output.last - into + 40 * MILLIS } else { output.last };
             free = at.max(free + MILLIS / 10);
             output.last = free;
@@ -434,7 +435,7 @@ fn backlogged_packets_do_not_change_time_per_point() {
     }
 }
 
-/// Ranges of the one kind are nonsense as those of the other one.
+/// Ranges of one format are meaningless when they are decoded in the other one.
 #[test]
 fn refuses_packets_that_may_be_of_two_kinds() {
     let live = record(Model::S1, Mode::DenseBoost, 4);
@@ -447,7 +448,7 @@ fn refuses_packets_that_may_be_of_two_kinds() {
     assert!(revolutions.len() > 10);
 }
 
-/// Heads of answers, of packets of all kinds, and of none.
+/// Descriptors of replies, of packets of all formats, and of unknown ones.
 const REPLY_DESCRIPTORS: [[u8; 7]; 12] = [
     [0xA5, 0x5A, 0x14, 0, 0, 0, 0x04],
     [0xA5, 0x5A, 0x03, 0, 0, 0, 0x06],
@@ -463,7 +464,7 @@ const REPLY_DESCRIPTORS: [[u8; 7]; 12] = [
     [0xA5, 0x5A, 0xFF, 0xFF, 0xFF, 0xFF, 0x83],
 ];
 
-/// Creates a packet with any content and a right checksum. Its angle may continue from the packet before.
+/// Returns a packet with random content and a right checksum. Its angle may continue that of the previous packet.
 fn random_packet(random: &mut fastrand::Rng, kind: PacketFormat, angle: &mut u16, jumps: u16) -> Vec<u8> {
     let mut bytes: Vec<u8> = (0..kind.byte_len()).map(|_| random.u8(..)).collect();
     *angle = if random.u16(..jumps) == 0 { random.u16(..) } else { (*angle % 23_040 + 1_152) % 23_040 };
@@ -488,7 +489,7 @@ fn every_byte_is_counted_once() {
     let mut count = 0;
     for seed in 0..400 {
         let mut random = fastrand::Rng::with_seed(seed);
-        // In some runs, the packets continue for a while.
+        // In half of the runs, the angles mostly continue without jumps.
         let is_calm = seed % 2 == 0;
         let jumps = if is_calm { 1_000 } else { 8 };
         let settings = Settings {
