@@ -1,21 +1,21 @@
-//! A background model as one JSON object: the line that shows it, and the file that it is saved to and loaded from. Input
-//! may come from anybody, so all of it is checked. Refuses to know where the text is stored.
+//! A background model as one JSON object: the output line that shows it, and the file that it is saved to and loaded
+//! from. The file may come from an untrusted source, so all of its values are checked.
 
 use serde::{Deserialize, Serialize, Serializer};
 
 use crate::{Background, BackgroundHead, Failure, Kind, MAX_BEAMS, in_degrees};
 
-/// A model that was read, and its sensor.
+/// A model that was read from a file, with its sensor.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct BackgroundFile {
-    /// The sensor that it was saved from.
+    /// Name of the sensor that the model was saved from.
     pub sensor: String,
-    /// The model, with the generation and flags that it had.
+    /// The model, with the generation and flags of the saved one.
     pub model: Box<Background>,
 }
 
-/// Returns `model` of `sensor` as an object of class `background`: what [`BackgroundFile::parse`] reads. Angles are null as long as
-/// there was no scan.
+/// Returns `model` of `sensor` as a JSON object of class `background`, in the format that [`BackgroundFile::parse`]
+/// reads. Angles are null before the first scan.
 pub fn as_json<'a>(sensor: &'a str, model: &'a Background) -> impl Serialize + 'a {
     #[derive(Serialize)]
     struct BackgroundJson<'a> {
@@ -51,12 +51,12 @@ pub fn as_json<'a>(sensor: &'a str, model: &'a Background) -> impl Serialize + '
 }
 
 impl BackgroundFile {
-    /// Returns the model in `text`, which was found at `place`. Keys that this program does not know are passed over.
+    /// Parses the model in `text`. `source` is its place for messages. Unknown keys are ignored.
     ///
     /// # Errors
     ///
-    /// [`Kind::Configuration`] with place and reason if it is not a complete model: cut short, not JSON, of another class,
-    /// or with numbers that are impossible or contradict each other.
+    /// Returns [`Kind::Input`] with `source` and the reason if `text` is not a complete model: it is truncated,
+    /// not JSON, of another class, or has values that are out of range or contradict each other.
     pub fn parse(text: &[u8], source: &str) -> Result<BackgroundFile, Failure> {
         let head: ClassKey = read(text, source)?;
         if head.class != CLASS {
@@ -74,7 +74,8 @@ struct ClassKey {
     class: String,
 }
 
-/// Wider than what fits, so that a number that does not is named with its beam.
+/// The JSON object before its values are checked. Ranges are wider than in a model, so that the message about a value
+/// that does not fit can name its beam.
 #[derive(Deserialize)]
 struct ParsedFile {
     sensor: String,
@@ -146,7 +147,8 @@ impl ParsedFile {
         Ok(model)
     }
 
-    /// In version 1, which knew the LMS alone, 0 was right, and ahead was 90.
+    /// Returns whether the angles are those of version 1, which supported only the LMS: 0 was on the right, and 90
+    /// ahead.
     fn has_version_1_angles(&self) -> bool {
         let layouts =
             [(181, 0.0, 1.0), (361, 0.0, 0.5), (101, 40.0, 1.0), (201, 40.0, 0.5), (401, 40.0, 0.25)];
@@ -160,7 +162,7 @@ fn read<'a, T: Deserialize<'a>>(text: &'a [u8], source: &str) -> Result<T, Failu
         if text.is_empty() {
             return invalid_file(source, "it is empty");
         }
-        // In the middle of a number the end of the text is no other error than a wrong digit.
+        // A text that ends inside a number causes the same error as a wrong digit.
         let is_cut = error.is_eof() || text.starts_with(b"{") && !text.ends_with(b"}");
         invalid_file(source, &if is_cut { format!("it is cut short: {error}") } else { error.to_string() })
     })
@@ -171,11 +173,11 @@ fn invalid_file(source: &str, reason: &str) -> Failure {
     Failure::new(Kind::Input, format!("{source} is no background model: {reason}"), hint)
 }
 
-/// Writes a unit of so many micrometres in mm, a whole number where it is one.
+/// Serializes a unit of `unit_um` micrometers in mm, as a whole number if it is one.
 ///
 /// # Errors
 ///
-/// The serializer's.
+/// Returns the serializer's error.
 pub fn unit_in_mm<S: Serializer>(unit_um: &u32, serializer: S) -> Result<S::Ok, S::Error> {
     match unit_um % 1000 {
         0 => serializer.serialize_u32(unit_um / 1000),
@@ -194,7 +196,7 @@ fn far_beams<S: Serializer>(ranges: &[u16], serializer: S) -> Result<S::Ok, S::E
 }
 
 const CLASS: &str = "background";
-/// The greatest reading that is no code, in any family.
+/// Highest range in any family that is not a code.
 const MAX_RANGE: u16 = 0xFFEF;
 
 #[cfg(test)]
@@ -215,7 +217,7 @@ mod tests {
         Background::of(head, &ranges)
     }
 
-    /// As in the saved models of version 1 but for the angle of the first beam.
+    /// Returns a saved model of version 1, with the angle of the first beam as in version 2.
     fn lms(count: u16) -> Box<Background> {
         match count {
             181 => model(181, -90.0, 1.0),

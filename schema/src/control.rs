@@ -1,9 +1,8 @@
-//! Requests to a running hub, and its answers: the payloads of the control service. Refuses to know who carries out a
-//! request.
+//! Requests to a running hub, and its responses: the payloads of the control service.
 
 use crate::{Background, Failure, Kind, text};
 
-/// What a request asks for.
+/// Command of a request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u16)]
 pub enum Verb {
@@ -11,11 +10,11 @@ pub enum Verb {
     Pause = 1,
     /// Let the sensor stream again.
     Resume = 2,
-    /// Restart the session with the sensor.
+    /// Restart the session with the scanner.
     Resync = 3,
     /// Return the background model.
     Show = 16,
-    /// Forget the background model and learn it again.
+    /// Discard the background model and learn it again.
     Reset = 17,
     /// Freeze the background model.
     Freeze = 18,
@@ -50,36 +49,36 @@ impl Verb {
         }
     }
 
-    /// Returns the verb called `name`.
+    /// Returns the verb with this name, or `None`.
     pub fn parse(name: &str) -> Option<Verb> {
         Verb::all().find(|verb| verb.name() == name)
     }
 }
 
-/// A request. Its bytes are the sensor's name in 32, the verb in two, little-endian, six of 0, and the model for
-/// [`Verb::Load`].
+/// A request. It is encoded as the sensor's name (32 bytes), the verb (two bytes, little-endian), six bytes of 0, and
+/// the model for [`Verb::Load`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Request {
-    /// The sensor that is meant.
+    /// Name of the sensor.
     pub sensor: String,
-    /// Nothing if a newer client has one that this program does not know.
+    /// The command; `None` if it comes from a newer client and this program does not know it.
     pub verb: Option<Verb>,
     /// The model to load.
     pub model: Option<Box<Background>>,
 }
 
 impl Request {
-    /// Asks for `verb` at `sensor`, a name of at most 32 bytes.
+    /// Creates the request `verb` for `sensor`, a name of at most 32 bytes.
     pub fn new(sensor: &str, verb: Verb) -> Request {
         Request { sensor: sensor.to_owned(), verb: Some(verb), model: None }
     }
 
-    /// Asks `sensor` to use the ranges of `model` as its background.
+    /// Creates the request that `sensor` use the ranges of `model` as its background.
     pub fn load(sensor: &str, model: &Background) -> Request {
         Request { model: Some(model.boxed()), ..Request::new(sensor, Verb::Load) }
     }
 
-    /// Returns the request as bytes.
+    /// Encodes the request.
     pub fn encode(&self) -> Vec<u8> {
         let mut bytes = vec![0; REQUEST_HEAD_LEN];
         text::write(&mut bytes[..SENSOR_NAME_LEN], &self.sensor);
@@ -89,7 +88,7 @@ impl Request {
         bytes
     }
 
-    /// Returns the request in `bytes`, if that is one.
+    /// Decodes the request in `bytes`. Returns `None` if it is not valid.
     pub fn decode(bytes: &[u8]) -> Option<Request> {
         let (head, model) = bytes.split_at_checked(REQUEST_HEAD_LEN)?;
         let verb = u16::from_le_bytes([head[SENSOR_NAME_LEN], head[SENSOR_NAME_LEN + 1]]);
@@ -104,30 +103,30 @@ impl Request {
 /// A background model in a response.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ResponseModel {
-    /// As it is now.
+    /// The present model.
     pub model: Box<Background>,
-    /// When the model was saved that the next hub starts with, in nanoseconds since 1970; nothing if there is none.
+    /// Time at which the model was saved that the next hub starts with, in ns since 1970; `None` if there is none.
     pub kept_wall_ns: Option<u64>,
 }
 
 impl From<Box<Background>> for ResponseModel {
-    /// A model that is not saved.
+    /// Wraps a model that is not saved.
     fn from(model: Box<Background>) -> ResponseModel {
         ResponseModel { model, kept_wall_ns: None }
     }
 }
 
-/// An answer: success, with the requested model if there is one, or a failure. Its bytes are exit code and message length
-/// (two bytes each, little-endian), then the message, then the model. The second line of the message of a failure
-/// is the remedy; with a model, it is the time at which a model was saved, in decimal digits.
+/// A response: success, with the requested model if there is one, or a failure. It is encoded as exit code and message
+/// length (two bytes each, little-endian), then the message, then the model. The second line of the message of a
+/// failure is the remedy. With a model, the message is the time at which a model was saved, in decimal digits.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Response(pub Result<Option<ResponseModel>, Failure>);
 
 impl Response {
-    /// Bytes of a response without a model; a message beyond it is cut.
+    /// Maximum length in bytes of a response without a model. A longer message is truncated.
     pub const MAX_LEN: usize = 1024;
 
-    /// Returns the response as bytes.
+    /// Encodes the response.
     pub fn encode(&self) -> Vec<u8> {
         let (code, body) = match &self.0 {
             Ok(shown) => {
@@ -144,7 +143,8 @@ impl Response {
         [head.as_flattened(), &message, model].concat()
     }
 
-    /// Returns the response in `bytes`, if that is one. A code that no kind of failure has is [`Kind::Failed`].
+    /// Decodes the response in `bytes`. Returns `None` if it is not valid. An unknown exit code becomes
+    /// [`Kind::Failed`].
     pub fn decode(bytes: &[u8]) -> Option<Response> {
         let (&[code_low, code_high, low, high], rest) = bytes.split_first_chunk()?;
         let (message, model) = rest.split_at_checked(usize::from(u16::from_le_bytes([low, high])))?;
@@ -162,14 +162,14 @@ impl Response {
     }
 }
 
-/// Exit code and message length.
+/// Length in bytes of exit code and message length.
 const RESPONSE_HEAD_LEN: usize = 4;
 
-/// Bytes of a request for the sensor's name, and before the model.
+/// Length in bytes of the sensor's name in a request.
 const SENSOR_NAME_LEN: usize = 32;
 const REQUEST_HEAD_LEN: usize = 40;
 
-/// The failures that a hub answers with; each exit code stands for one of them.
+/// The kinds of failure in responses. Each has a different exit code.
 const RESPONSE_KINDS: [Kind; 4] = [Kind::Failed, Kind::NoTopic, Kind::ResourceExhausted, Kind::Configuration];
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! Scans and marks as rows of CSV.
+//! Rows of CSV for scans and marks.
 
 use std::io::{self, Write};
 
@@ -18,7 +18,7 @@ impl ScanColumns {
     ///
     /// # Errors
     ///
-    /// The error of `line`.
+    /// Returns the error of `line`.
     pub fn write_header(self, line: &mut impl Write, beams: usize) -> io::Result<()> {
         write!(line, "{STAMP_COLUMNS},unit_um,first_angle_deg,step_deg")?;
         (0..beams).try_for_each(|i| write!(line, ",range_{i}"))?;
@@ -26,12 +26,12 @@ impl ScanColumns {
         (0..intensities).try_for_each(|i| write!(line, ",intensity_{i}"))
     }
 
-    /// Writes the columns of `scan`, without a line end. A range without a reading and an intensity that the sensor does not
-    /// send are empty.
+    /// Writes the columns of `scan`, without a line end. Ranges without a reading, and intensities that the scanner
+    /// does not send, are empty.
     ///
     /// # Errors
     ///
-    /// The error of `line`.
+    /// Returns the error of `line`.
     pub fn write_row(self, line: &mut impl Write, header: &Header, scan: &Scan) -> io::Result<()> {
         write_stamps(line, header)?;
         let unit_um = if self.meters { UM_PER_M } else { scan.unit_um };
@@ -54,7 +54,7 @@ impl ScanColumns {
     }
 }
 
-/// Columns of marks. A scan has one row for each of its marks, or a single row without a mark.
+/// Columns of marks. A scan has one row for each of its marks, or a single row if it has none.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct MarkColumns {
     /// Ranges in meters instead of millimeters.
@@ -66,18 +66,18 @@ impl MarkColumns {
     ///
     /// # Errors
     ///
-    /// The error of `out`.
+    /// Returns the error of `out`.
     pub fn write_header(self, out: &mut impl Write) -> io::Result<()> {
         let range = if self.meters { "range_m" } else { "range_mm" };
         writeln!(out, "{STAMP_COLUMNS},marks,mark,angle_deg,{range},peak,weight,first_beam,last_beam,edge")
     }
 
-    /// Writes the lines of `marks`: column `marks` is their number, or empty if the sensor's mode has no marks. Without a mark,
+    /// Writes the rows of `marks`. Column `marks` is their count, or empty if marks are unavailable. Without a mark,
     /// the columns after it are empty.
     ///
     /// # Errors
     ///
-    /// The error of `out`.
+    /// Returns the error of `out`.
     pub fn write_rows(self, out: &mut impl Write, header: &Header, marks: &Marks) -> io::Result<()> {
         for (number, mark) in marks.marks().iter().enumerate() {
             write_stamps(out, header)?;

@@ -1,5 +1,5 @@
-//! A sample as one datagram, or as several if it is longer; and the announcement of a sensor, which a gateway sends once a
-//! second. Their format needs no library to read, and every field is checked before it is used.
+//! A sample as one datagram, or as several if it is longer; and the announcement of a sensor, which a gateway sends
+//! once a second. Their format needs no library to read, and every field is checked before it is used.
 //!
 //! This module needs neither shared memory nor a heap. Senders and receivers are in `clients/network`.
 
@@ -59,8 +59,8 @@ struct DatagramHead {
     part: u8,
     /// Number of parts of the sample, mostly 1.
     parts: u8,
-    /// Family of the sensor: [`Family`](crate::Family); 255 while the hub searches for the scanner. Other numbers belong to
-    /// later versions, whose telegrams are just bytes.
+    /// Family of the sensor: [`Family`](crate::Family); 255 while the hub searches for the scanner. Other numbers
+    /// belong to later versions, whose telegrams are just bytes.
     family: u8,
     /// Length in bytes of the payload, or of this part of it, without the MAC.
     payload_len: u16,
@@ -150,9 +150,9 @@ pub struct Datagram<'a> {
 }
 
 impl Head {
-    /// Writes the header and the checksum before a payload of `len` bytes that starts at [`HEADER_LEN`] in `buffer`. Returns
-    /// the whole datagram, without a MAC, or `None` if the buffer ends before the payload does or the length does not
-    /// fit into two bytes.
+    /// Writes the header and the checksum before a payload of `len` bytes that starts at [`HEADER_LEN`] in `buffer`.
+    /// Returns the whole datagram, without a MAC, or `None` if the buffer ends before the payload does or the length
+    /// does not fit into two bytes.
     pub fn seal<'a>(&self, buffer: &'a mut [u8], len: usize) -> Option<&'a [u8]> {
         let datagram = buffer.get_mut(..HEADER_LEN + len)?;
         self.write(datagram, len, self.flags & !LanFlags::AUTHENTICATED)?;
@@ -297,7 +297,8 @@ const CRC: Crc<u32, Table<16>> = Crc::<u32, Table<16>>::new(&CRC_32_ISCSI);
 const _: () = assert!(cfg!(target_endian = "little"));
 
 /// Reason why a datagram is refused. The reasons are in the order of the checks, and the first check that fails counts.
-/// [`Datagram::read`] returns those up to the checksum, [`Datagram::check_payload`] the last two, and receivers the others.
+/// [`Datagram::read`] returns those up to the checksum, [`Datagram::check_payload`] the last two, and receivers the
+/// others.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum DatagramError {
     /// Fewer bytes than a header.
@@ -403,8 +404,8 @@ pub struct Announced {
     pub next: u32,
 }
 
-/// Maximum number of topics of an announcement: 37. That many fit into the shortest datagram that a gateway may be limited
-/// to, with a MAC and the numbers of replaced samples. An announcement is never sent in parts.
+/// Maximum number of topics of an announcement: 37. That many fit into the shortest datagram that a gateway may be
+/// limited to, with a MAC and the numbers of replaced samples. An announcement is never sent in parts.
 const MAX_TOPICS: usize =
     (MIN_MTU - HEADER_LEN - MAC_LEN - size_of::<AnnounceHead>()) / (size_of::<Announced>() + 4);
 
@@ -416,7 +417,8 @@ impl Announce {
     /// Last byte of the address of their group.
     pub const GROUP: u8 = 80;
 
-    /// Creates an announcement of `sensor`, a sensor of type `kind`, without topics. `boot` identifies the run of its hub.
+    /// Creates an announcement of `sensor`, a sensor of type `kind`, without topics. `boot` identifies the run of its
+    /// hub.
     pub fn new(boot: u64, sensor: &str, kind: &str) -> Announce {
         let mut head = AnnounceHead::zeroed();
         text::write(&mut head.sensor_text, sensor);
@@ -432,8 +434,8 @@ impl Announce {
         }
     }
 
-    /// Sets how many samples of the topic that was added last were replaced by newer ones before they got a sequence number.
-    /// The number wraps. Call it for all topics or for none.
+    /// Sets how many samples of the topic that was added last were replaced by newer ones before they got a sequence
+    /// number. The number wraps. Call it for all topics or for none.
     pub fn add_replaced(&mut self, replaced: u64) {
         if let Some(slot) = self.replaced[..usize::from(self.head.count)].last_mut() {
             *slot = replaced as u32;
@@ -441,8 +443,8 @@ impl Announce {
         }
     }
 
-    /// Returns how many samples of the topic with this number were replaced by newer ones before they got a sequence number.
-    /// The number wraps. `None` if the gateway does not report it.
+    /// Returns how many samples of the topic with this number were replaced by newer ones before they got a sequence
+    /// number. The number wraps. `None` if the gateway does not report it.
     pub fn replaced(&self, topic: u8) -> Option<u32> {
         let at = self.topics().iter().position(|announced| announced.topic == topic)?;
         self.has_replaced().then(|| self.replaced[at])
@@ -494,8 +496,9 @@ impl Announce {
         write(room, &[bytes_of(&head), cast_slice(self.topics()), replaced])
     }
 
-    /// Returns the announcement in `payload`, with its first 37 topics. `None` if it is shorter than its own count requires, or
-    /// if the sensor's name is not valid. Numbers of replaced samples are read only if all topics have one.
+    /// Returns the announcement in `payload`, with its first 37 topics. `None` if it is shorter than its own count
+    /// requires, or if the sensor's name is not valid. Numbers of replaced samples are read only if all topics have
+    /// one.
     pub fn unpack(payload: &[u8]) -> Option<Announce> {
         let head: AnnounceHead = read_head(payload)?;
         let count = usize::from(head.count);
@@ -503,7 +506,7 @@ impl Announce {
             payload[size_of::<AnnounceHead>()..].split_at_checked(count * size_of::<Announced>())?;
         let mut announce =
             Announce::new(head.boot, text::read(&head.sensor_text), text::read(&head.type_text));
-        // A byte that is not UTF-8 ends the text, but not the name.
+        // A byte that is not UTF-8 ends the text. The name is then rejected.
         let name_len = head.sensor_text.iter().position(|&byte| byte == 0)?;
         check_sensor(announce.sensor()).ok().filter(|()| announce.sensor().len() == name_len)?;
         let is_reported = head.flags & AnnounceHead::REPLACED != 0 && replaced.len() >= 4 * count;

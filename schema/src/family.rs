@@ -1,8 +1,8 @@
 //! The families of scanners, by number and name, and what differs between them: the codes of the SICK LMS 2xx, and the
 //! content of topic `telegram`.
 //!
-//! A telegram is what the scanner sent, in the unit in which its family transmits: one telegram of an LMS from STX to CRC,
-//! or whole packets of another family that arrived together. The hub has checked it before it publishes it.
+//! A telegram is what the scanner sent, in the unit in which its family transmits: one telegram of an LMS from STX to
+//! CRC, or whole packets of another family that arrived together. The hub has checked it before it publishes it.
 
 use std::f64::consts::TAU;
 use std::ops::{Deref, DerefMut};
@@ -224,9 +224,9 @@ impl<'a> Telegram<'a> {
         max
     };
 
-    /// Returns the telegram with which a payload of `family`'s begins: of an LMS its length field says how long it is, and what
-    /// follows is a later revision's; of another family it is all of the payload. Nothing if there is none, or if it is longer
-    /// than [`MAX`](Self::MAX_LEN).
+    /// Returns the telegram at the start of a payload of `family`. The length field of an LMS telegram gives its
+    /// length, and the bytes after it belong to a later revision of the payload. For another family, it is the whole
+    /// payload. Returns `None` if there is no telegram, or if it is longer than [`MAX_LEN`](Self::MAX_LEN).
     pub fn of(family: u8, payload: &'a [u8]) -> Option<Telegram<'a>> {
         let family = Family::of_number(family);
         let len = match (family, payload) {
@@ -240,22 +240,24 @@ impl<'a> Telegram<'a> {
         Some(Telegram { family, bytes })
     }
 
-    /// Returns whether they are a telegram of an LMS, which has the fields below.
+    /// Returns whether this is a telegram of an LMS, to which the fields below apply.
     pub fn is_lms(self) -> bool {
         self.family == Some(Family::Lms)
     }
 
-    /// Returns facts about the packets. `None` for an LMS, and for a family that this version does not know.
+    /// Returns the contents of the packets. `None` for an LMS, and for a family that this version does not know.
     pub fn packets(self) -> Option<PacketInfo> {
         self.family?.packets(self.bytes)
     }
 
-    /// Returns the address byte (to the sensor, or its answer's 80h + address); 0 if the bytes end before.
+    /// Returns the address byte: the scanner's address, with 80h added in its replies. Returns 0 if the bytes end
+    /// before it.
     pub fn address(self) -> u8 {
         self.bytes.get(1).copied().unwrap_or_default()
     }
 
-    /// Returns the length field: bytes from the command to the status, both included.
+    /// Returns the length field, the number of bytes from the command to the status, both included. Returns 0 if the
+    /// bytes end before it.
     pub fn length(self) -> u16 {
         match self.bytes.get(2..4) {
             Some(bytes) => u16::from_le_bytes([bytes[0], bytes[1]]),
@@ -263,12 +265,12 @@ impl<'a> Telegram<'a> {
         }
     }
 
-    /// Returns the command or answer byte; 0 if the bytes end before.
+    /// Returns the command byte of a request or reply. Returns 0 if the bytes end before it.
     pub fn command(self) -> u8 {
         self.bytes.get(4).copied().unwrap_or_default()
     }
 
-    /// Returns what lies between command and CRC: the data and, last, the status byte.
+    /// Returns the bytes between command and CRC: the data and, in a reply, the status byte at their end.
     pub fn data(self) -> &'a [u8] {
         self.bytes.get(5..self.bytes.len().saturating_sub(2)).unwrap_or_default()
     }
@@ -315,9 +317,9 @@ impl DerefMut for TelegramBytes {
     }
 }
 
-/// Begins every telegram of an LMS (Telegram listing 4).
+/// First byte of every telegram of an LMS (Telegram listing 4).
 const STX: u8 = 0x02;
-/// STX, address, length and CRC (Telegram listing 4).
+/// Number of bytes of STX, address, length and CRC (Telegram listing 4).
 const FRAME_LEN: usize = 6;
 
 #[cfg(test)]
@@ -334,7 +336,7 @@ mod tests {
         let info = [&[0xA5, 0x5A, 20, 0, 0, 0, 4][..], &[7; 20]].concat();
         assert_eq!(packet_facts(&info), ("reply", None, 1));
         assert_eq!(packet_facts(&[0xA5, 0x5A, 0x84, 0, 0, 0x40, 0x84]), ("reply", None, 1));
-        // The nibbles of the checksum are A5h, and so is the checksum of the rest.
+        // The two nibbles of the checksum form A5h, which is also the checksum of the other bytes.
         let mut capsule = [0; 132];
         (capsule[0], capsule[1], capsule[2]) = (0xA5, 0x5A, 0xA5);
         assert_eq!(packet_facts(&capsule), ("data", Some(true), 1));

@@ -1,5 +1,4 @@
-//! What every sample carries besides its payload: numbers that show loss, stamps that join topics, the run of the hub.
-//! Refuses to know what the payload is.
+//! Header of every sample: sequence numbers that show losses, stamps that relate topics, and the run of the hub.
 
 use bytemuck::{Pod, Zeroable};
 #[cfg(feature = "ipc")]
@@ -21,7 +20,8 @@ pub struct Header {
     pub stamp_first_ns: u64,
     /// Stamp of the telegram's last byte, in ns of CLOCK_MONOTONIC.
     pub stamp_last_ns: u64,
-    /// Wall clock of the telegram's first byte, in ns since 1970; in a replay the recorded one, if the recording has it.
+    /// Wall clock of the telegram's first byte, in ns since 1970; in a replay the recorded one, if the recording has
+    /// it.
     pub wall_ns: u64,
     /// Random number of the hub's run. Another value means that `seq` and `topic_seq` started again.
     pub boot: u64,
@@ -46,15 +46,16 @@ pub struct Header {
 }
 
 impl Header {
-    /// Returns the time from the telegram's last byte until the sample was sent, in ns, at most 256 too much; nothing if it
-    /// is not told, or was more than four seconds.
+    /// Returns the time from the telegram's last byte until the sample was sent, in ns, rounded up by at most 256 ns.
+    /// Returns `None` if it is unknown, or 4.3 s or more.
     pub fn hub_time_ns(&self) -> Option<u64> {
         let [low, middle, high] = self.hub_time;
         let units = u32::from_le_bytes([low, middle, high, 0]);
         (1..MAX_HUB_TIME).contains(&units).then(|| u64::from(units) * HUB_TIME_UNIT_NS)
     }
 
-    /// Sets the moment at which the sample is sent to `now_ns` of CLOCK_MONOTONIC; the telegram's stamps must be set.
+    /// Sets the time at which the sample is sent to `now_ns` of CLOCK_MONOTONIC. The telegram's stamps must already be
+    /// set.
     pub fn set_sent_at(&mut self, now_ns: u64) {
         let units = now_ns.saturating_sub(self.stamp_last_ns).div_ceil(HUB_TIME_UNIT_NS);
         let units = units.clamp(1, MAX_HUB_TIME.into()) as u32;
@@ -62,12 +63,12 @@ impl Header {
         self.hub_time = [low, middle, high];
     }
 
-    /// Returns the family of the sensor; nothing if this version does not know it.
+    /// Returns the family of the scanner, or `None` if this version does not know it.
     pub fn family(&self) -> Option<Family> {
         Family::of_number(self.family)
     }
 
-    /// Returns the quality as a word; unknown values are suspect.
+    /// Returns the quality. Unknown values count as suspect.
     ///
     /// # Examples
     ///

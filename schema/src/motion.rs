@@ -1,4 +1,4 @@
-//! How a sensor moved from one scan to the next, as its scans tell it. Refuses to know how that is found.
+//! Motion of a sensor from one scan to the next, as estimated from its scans.
 
 use std::fmt;
 
@@ -11,8 +11,8 @@ use crate::text::named;
 
 /// The payload of topic `motion`, 120 bytes: one sample per scan, in the robot's frame.
 ///
-/// The step is the pose of the robot at this scan in the frame that it had at the scan before. The pose is the sum of all
-/// steps since the start: it drifts.
+/// The step is the pose of the robot at this scan in the frame that it had at the scan before. The pose is the sum of
+/// all steps since the start: it drifts.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Motion.v2"))]
 #[repr(C)]
@@ -39,9 +39,9 @@ pub struct Motion {
     pub flags: u8,
     /// Steps that were refused since the start; 65535 is that many and more. The summed pose leaves them out.
     pub refused_steps: u16,
-    /// Covariance of the summed pose in the frame of the start, in the layout of [`Motion::covariance`]. Refused steps add
-    /// nothing to it. It is 0 for the first scan, if the pose is not valid, and if the sender's payload has revision 1. See
-    /// [`Motion::sum_covariance`].
+    /// Covariance of the summed pose in the frame of the start, in the layout of [`Motion::covariance`]. Refused steps
+    /// add nothing to it. It is 0 for the first scan, if the pose is not valid, and if the sender's payload has
+    /// revision 1. See [`Motion::sum_covariance`].
     pub pose_covariance: [f32; 9],
     /// Always 0.
     pub reserved: u32,
@@ -88,7 +88,7 @@ impl Default for Motion {
 }
 
 impl FixedPayload for Motion {
-    /// The covariance of the pose is missing.
+    /// The first revision ends before the covariance of the pose.
     const FIRST_REVISION_LEN: usize = std::mem::offset_of!(Motion, pose_covariance);
 
     fn is_valid(&self) -> bool {
@@ -105,17 +105,17 @@ impl Motion {
     /// Flag: a step since the start was degenerate, so the summed pose may be off by any distance.
     pub const OPEN: u8 = 2;
 
-    /// Returns how the step was found; a number that is not known says nothing.
+    /// Returns the method. An unknown number counts as refused.
     pub fn method(&self) -> MotionMethod {
         MotionMethod::ALL.get(usize::from(self.method)).copied().unwrap_or(MotionMethod::Refused)
     }
 
-    /// Returns whether there is a step: else its numbers are 0.
+    /// Returns whether the sample has a step. If not, the step's numbers are 0.
     pub fn has_step(&self) -> bool {
         !matches!(self.method(), MotionMethod::First | MotionMethod::Refused)
     }
 
-    /// Returns whether the summed pose is known: else it is 0.
+    /// Returns whether the summed pose is known. If not, its numbers are 0.
     pub fn has_pose(&self) -> bool {
         self.method() != MotionMethod::Refused
     }
@@ -132,7 +132,7 @@ impl Motion {
         (self.has_valid_pose() && is_reported).then_some(&self.pose_covariance)
     }
 
-    /// Returns whether the surroundings leave a direction open.
+    /// Returns whether the surroundings do not show the motion in some direction.
     pub fn is_degenerate(&self) -> bool {
         self.flags & Motion::DEGENERATE != 0
     }

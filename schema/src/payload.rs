@@ -1,9 +1,9 @@
 //! Payloads in memory and as they are sent over a network: the fields of shared memory in their order, without unused
 //! elements of arrays. A received payload is checked against its own counts before it is used.
 //!
-//! Most payloads are structs of fixed size, for which [`FixedPayload`] is all that they implement. The others have a head of
-//! fixed size and arrays whose length depends on the number of beams. `sliced!` defines them, and they implement [`DatagramPayload`]
-//! next to their definition. They have whole words of eight bytes, so that every array is aligned.
+//! Most payloads are structs of fixed size and implement only [`FixedPayload`]. The others have a head of fixed size
+//! and arrays whose length depends on the number of beams. The macro `sliced!` defines them, and they implement
+//! [`DatagramPayload`] themselves. Their length is a multiple of eight bytes, so that every array is aligned.
 
 use bytemuck::{Pod, bytes_of, bytes_of_mut, pod_read_unaligned};
 
@@ -131,8 +131,8 @@ fn unpack_fields<P: FixedPayload>(memory: &mut [u8], payload: &[u8]) -> Option<(
     Some(())
 }
 
-/// Implements [`DatagramPayload`] for a payload of variable length that is sent as it is in memory. Its functions `packed_len` and
-/// `widen` do the rest: the length of a valid payload, and the limits that it needs.
+/// Implements [`DatagramPayload`] for a payload of variable length that is sent as it is in memory. The type provides
+/// `packed_len`, the length of a valid payload, and `widen`, the limits that a payload needs.
 macro_rules! packed_as_is {
     ($payload:ident) => {
         impl $crate::payload::DatagramPayload for $payload {
@@ -180,8 +180,8 @@ impl<'a> Datagram<'a> {
         self.head.revision > 0 && self.head.parts == 1
     }
 
-    /// Checks that the topic is known, and that the payload is valid for it. Returns the bytes of memory that the payload
-    /// fills, as [`DatagramPayload::room`] does. They are 0 for an announcement.
+    /// Checks that the topic is known, and that the payload is valid for it. Returns the bytes of memory that the
+    /// payload fills, as [`DatagramPayload::room`] does. They are 0 for an announcement.
     ///
     /// # Errors
     ///
@@ -253,7 +253,7 @@ pub(crate) fn write(room: &mut [u8], parts: &[&[u8]]) -> Option<usize> {
     Some(end)
 }
 
-/// Makes the type of a payload, and that of its words, by which the shared-memory library knows it.
+/// Defines the type of a payload and the type of its words, whose name identifies it to the shared-memory library.
 macro_rules! sliced {
     ($(#[$about:meta])* $payload:ident, $word:ident, $name:tt, $head:ident) => {
         #[doc = concat!("Eight bytes of a [`", stringify!($payload), "`].")]
@@ -273,29 +273,29 @@ macro_rules! sliced {
             /// Bytes before the arrays.
             pub const HEAD: usize = size_of::<$head>();
 
-            /// Returns memory for `len` bytes, at least a head, all of it 0.
+            /// Returns a payload with memory for `len` bytes, at least a head, filled with 0.
             pub fn zeroed(len: usize) -> Box<Self> {
                 let words = vec![$word::default(); Self::words(len)].into_boxed_slice();
                 bytemuck::allocation::TransparentWrapperAlloc::wrap_box(words)
             }
 
-            /// Returns the words that `len` bytes take, at least those of a head.
+            /// Returns the number of words for `len` bytes, at least the number for a head.
             pub const fn words(len: usize) -> usize {
                 let len = if len > Self::HEAD { len } else { Self::HEAD };
                 len.div_ceil(size_of::<$word>())
             }
 
-            /// Returns `words` as they are read.
+            /// Returns the payload in `words`.
             pub fn of_words(words: &[$word]) -> &Self {
                 bytemuck::TransparentWrapper::wrap_ref(words)
             }
 
-            /// Returns `words` as they are written.
+            /// Returns the payload in `words`, for writing.
             pub fn of_words_mut(words: &mut [$word]) -> &mut Self {
                 bytemuck::TransparentWrapper::wrap_mut(words)
             }
 
-            /// Returns a copy in the memory of this process, as long as what is used.
+            /// Returns a copy of the used bytes in the memory of this process.
             pub fn boxed(&self) -> Box<Self> {
                 Self::of_bytes(self.bytes())
             }
@@ -307,25 +307,25 @@ macro_rules! sliced {
                 copy
             }
 
-            /// Makes `payload` longer if it has memory for fewer than `len` bytes; then it is 0.
+            /// Replaces `payload` by one of `len` bytes, filled with 0, if it has memory for fewer.
             pub fn grow(payload: &mut Box<Self>, len: usize) {
                 if payload.capacity() < len {
                     *payload = Self::zeroed(len);
                 }
             }
 
-            /// Returns the bytes that there is memory for.
+            /// Returns the number of bytes that there is memory for.
             pub fn capacity(&self) -> usize {
                 self.memory().len()
             }
 
-            /// Returns the bytes that are used.
+            /// Returns the used bytes.
             pub fn bytes(&self) -> &[u8] {
                 let memory = self.memory();
                 memory.get(..self.used()).unwrap_or(memory)
             }
 
-            /// Writes `bytes` to the beginning; `false` if there is too little memory.
+            /// Writes `bytes` to the start of the payload. Returns `false` if there is too little memory.
             pub fn copy_from(&mut self, bytes: &[u8]) -> bool {
                 let memory = self.memory_mut().get_mut(..bytes.len());
                 memory.map(|memory| memory.copy_from_slice(bytes)).is_some()
@@ -345,7 +345,7 @@ macro_rules! sliced {
 
             fn deref(&self) -> &$head {
                 const NONE: [$word; size_of::<$head>() / size_of::<$word>()] = [$word { word: 0 }; size_of::<$head>() / size_of::<$word>()];
-                // A stranger's sample may be shorter than a head: then there are no beams.
+                // A sample of an unknown publisher may be shorter than a head. It then has no beams.
                 let head = self.memory().get(..Self::HEAD);
                 bytemuck::from_bytes(head.unwrap_or(bytemuck::cast_slice(&NONE)))
             }

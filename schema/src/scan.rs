@@ -314,7 +314,7 @@ impl Intensities<'_> {
         }
     }
 
-    /// Returns whether there are none.
+    /// Returns whether there are no intensities.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }

@@ -63,7 +63,7 @@ impl Status {
     /// The measuring mode as long as the sensor has not reported it.
     pub const MODE_UNKNOWN: u8 = 0xFF;
 
-    /// Returns the state as a word; nothing if a newer hub has one that this program does not know.
+    /// Returns the state, or `None` if it comes from a newer hub and this program does not know it.
     pub fn state(&self) -> Option<State> {
         State::ALL.get(usize::from(self.state)).copied()
     }
@@ -109,25 +109,25 @@ impl Status {
         is_measured.then(|| f64::from(self.rate_mhz) / 1000.0)
     }
 
-    /// Returns the share of the line's bytes that were in nothing over the last 10 s, 0 to 1: those of a stream,
-    /// without scans that the sensor broke off to answer.
+    /// Returns the fraction of the line's bytes that were damaged in the last 10 s, 0 to 1: bytes outside telegrams
+    /// while a stream arrived, except those of scans that the scanner broke off for a reply.
     pub fn damaged_share(&self) -> f64 {
         self.counters[Counter::DamagedPpm] as f64 / 1e6
     }
 
-    /// Scans, or of a scanner whose head turns packets, that must have been sent and did not arrive; nothing if that is
-    /// not known.
+    /// Returns the number of scans of an LMS, or of packets of another scanner, that must have been sent but did not
+    /// arrive. Returns `None` if it is unknown.
     pub fn lost_on_line(&self) -> Option<u64> {
         (self.counters[Counter::DueOnLine] > 0).then_some(self.counters[Counter::LostOnLine])
     }
 
-    /// Returns their share of those that were due in the last 10 s, 0 to 1.
+    /// Returns the fraction of the scans or packets due in the last 10 s that were lost, 0 to 1.
     pub fn lost_share(&self) -> Option<f64> {
         self.lost_on_line().map(|_| self.counters[Counter::LostPpm] as f64 / 1e6)
     }
 
-    /// Returns what the line takes away, in words such as `41 % lost on the line`, if that is more than a thousandth in
-    /// the last 10 s.
+    /// Returns the loss of the line as text, such as `41 % lost on the line`, if it exceeded a thousandth in the last
+    /// 10 s.
     pub fn line_loss(&self) -> Option<String> {
         let lost = self.lost_share().filter(|&share| share > LOSS_REPORT_THRESHOLD);
         let damaged = Some(self.damaged_share()).filter(|&share| share > LOSS_REPORT_THRESHOLD);
@@ -136,9 +136,9 @@ impl Status {
         Some(format!("{percent:.digits$} % {word} on the line"))
     }
 
-    /// Returns the numbers of discarded and of all bytes since the hub's start, if telegrams have arrived, but most bytes were
-    /// in none, and the hub looks for the scanner again. Only then are they a finding: before, the bytes may be those of
-    /// another scanner.
+    /// Returns the number of discarded bytes and of all bytes since the hub's start, if most bytes were in no telegram,
+    /// telegrams have arrived before, and the hub searches for the scanner again. Before the first telegram, the bytes
+    /// may come from another scanner and mean nothing.
     pub fn discarded_and_read(&self) -> Option<(u64, u64)> {
         let (discarded, read) = (self.counters[Counter::BytesDiscarded], self.counters[Counter::BytesRead]);
         let has_replied = self.counters[Counter::Telegrams] > 0;
@@ -156,7 +156,7 @@ impl Status {
         if Status::is_model_number(model) { format!("{model} (unknown)") } else { model.to_owned() }
     }
 
-    /// Returns whether the sensor is a recording, of which nothing can be asked.
+    /// Returns whether the sensor is a recording, which cannot receive requests.
     pub fn is_replayed(&self) -> bool {
         self.port().starts_with("file:")
     }
@@ -178,25 +178,25 @@ impl Status {
         word.filter(|word| !word.is_empty())
     }
 
-    /// Returns how a scanner measures whose modes have names, the second word of what the sensor calls itself; nothing
-    /// if unknown.
+    /// Returns the scan mode of a scanner whose modes have names: the second word of its type. Returns `None` if it is
+    /// unknown.
     pub fn mode_name(&self) -> Option<&str> {
         let is_named = self.family().is_some_and(|family| family != Family::Lms);
         let word = self.sensor_type().split_whitespace().nth(1).filter(|_| is_named)?;
         word.starts_with(|c: char| c.is_ascii_lowercase()).then_some(word)
     }
 
-    /// Returns what the scanner sends, of which [`lost_on_line`](Self::lost_on_line) counts: scans, or packets.
+    /// Returns the unit that [`lost_on_line`](Self::lost_on_line) counts: scans or packets.
     pub fn transmission_name(&self) -> &'static str {
         if self.family() == Some(Family::Lms) { "scans" } else { "packets" }
     }
 
-    /// Returns what the sensor calls itself; empty if unknown.
+    /// Returns the type that the scanner reports; empty if unknown.
     pub fn sensor_type(&self) -> &str {
         text::read(&self.type_text)
     }
 
-    /// Sets the sensor's type: at most 24 bytes, the rest is cut.
+    /// Sets the sensor's type. It is truncated to 24 bytes.
     pub fn set_sensor_type(&mut self, value: &str) {
         text::write(&mut self.type_text, value);
     }
@@ -206,12 +206,12 @@ impl Status {
         text::read(&self.port_text)
     }
 
-    /// Sets the port: at most 128 bytes, the rest is cut.
+    /// Sets the port. It is truncated to 128 bytes.
     pub fn set_port(&mut self, value: &str) {
         text::write(&mut self.port_text, value);
     }
 
-    /// Returns the last error in words; empty if there was none.
+    /// Returns the message of the last error; empty if there was none.
     pub fn last_error(&self) -> &str {
         text::read(&self.last_error_text)
     }
@@ -219,13 +219,13 @@ impl Status {
     /// Maximum length of the last error, in bytes.
     pub const MAX_ERROR_LEN: usize = 160;
 
-    /// Sets the last error: at most [`Self::MAX_ERROR_LEN`] bytes, the rest is cut.
+    /// Sets the last error. It is truncated to [`Self::MAX_ERROR_LEN`] bytes.
     pub fn set_last_error(&mut self, value: &str) {
         text::write(&mut self.last_error_text, value);
     }
 }
 
-/// A line that takes away more than this share has something that is to be looked for.
+/// Fraction of losses above which a line is reported as faulty.
 const LOSS_REPORT_THRESHOLD: f64 = 0.001;
 
 /// Flag in the first reserved byte of the pose: a threshold for reflectors is configured.
@@ -262,7 +262,7 @@ named! {
     Paused "paused",
 }
 
-/// The counters of a link. All grow only, except the gauges: `bytes_buffered`, `damaged_ppm` and `lost_ppm`.
+/// Counters of a link. They only increase, except the gauges `bytes_buffered`, `damaged_ppm` and `lost_ppm`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Counters.v2"))]
 #[repr(C)]
@@ -289,10 +289,10 @@ impl IndexMut<Counter> for Counters {
     }
 }
 
-/// Declares the counters once: number, variant, name and meaning stand in one line.
+/// Declares the counters. Each line has the variant, its name and its meaning.
 macro_rules! counters {
     ($($variant:ident $name:literal $meaning:literal,)*) => {
-        /// The counters by name; the number is the place in [`Counters`].
+        /// Name of a counter. The number is its index in [`Counters`].
         #[derive(Clone, Copy, Debug, PartialEq, Eq)]
         #[repr(usize)]
         pub enum Counter { $(#[doc = $meaning] $variant,)* }
@@ -359,15 +359,15 @@ pub struct Pose {
 }
 
 impl Pose {
-    /// Returns the direction of the beam at sensor angle `angle` (radians; 0 ahead, counter-clockwise as an upright sensor
-    /// sees it) in the robot's frame: a unit vector.
+    /// Returns the direction of a beam in the robot's frame, as a unit vector. `angle` is in radians, counterclockwise
+    /// from ahead as seen by an upright sensor.
     pub fn direction(&self, angle: f64) -> (f64, f64) {
         let turned = if self.upside_down == 0 { angle } else { -angle };
         let (sin, cos) = (self.yaw_rad + turned).sin_cos();
         (cos, sin)
     }
 
-    /// Returns the point at `range_mm` on that beam in the robot's frame, in mm.
+    /// Returns the point at `range_mm` on the beam at `angle`, in the robot's frame in mm.
     pub fn point_mm(&self, angle: f64, range_mm: f64) -> (f64, f64) {
         let (x, y) = self.direction(angle);
         (1000.0 * self.x_m + range_mm * x, 1000.0 * self.y_m + range_mm * y)

@@ -79,7 +79,7 @@ pub fn json_line(line: String) -> String {
     String::from_utf8(line).unwrap_or_default()
 }
 
-/// The kinds of failure; each has a name for `--json` and an exit code.
+/// Kinds of failure. Each has a name for `--json` and an exit code.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Kind {

@@ -57,7 +57,8 @@ pub struct CloudHead {
     pub generation: u32,
     /// Number of points, at most [`MAX_BEAMS`](crate::MAX_BEAMS).
     pub count: u16,
-    /// Flags: [`FIRST`](Cloud::FIRST), [`LAST`](Cloud::LAST), [`COMPLETE`](Cloud::COMPLETE), [`UNRELIABLE`](Cloud::UNRELIABLE).
+    /// Flags: [`FIRST`](Cloud::FIRST), [`LAST`](Cloud::LAST), [`COMPLETE`](Cloud::COMPLETE),
+    /// [`UNRELIABLE`](Cloud::UNRELIABLE).
     pub flags: u8,
     /// 0.
     pub reserved: [u8; 5],
@@ -327,7 +328,7 @@ impl Obstacles {
         &self.obstacle_array[..usize::from(self.count).min(MAX_OBSTACLES)]
     }
 
-    /// Adds an obstacle, or counts it as left out if there is no room for it.
+    /// Adds an obstacle, or counts it as dropped if there is no room for it.
     pub fn push(&mut self, obstacle: Obstacle) {
         match self.obstacle_array.get_mut(usize::from(self.count)) {
             Some(slot) => {

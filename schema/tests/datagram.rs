@@ -1,5 +1,6 @@
-//! Golden datagrams of version 2, in `tests/vectors/datagram.json`: the tests build them from values and read the values back.
-//! Do not change these tests: another form needs another version. `docs/datagram.md` explains the bytes.
+//! Golden datagrams of version 2, in `tests/vectors/datagram.json`. The tests build them from values and read the
+//! values back. Do not change these tests: a different format needs a new version. `docs/datagram.md` explains the
+//! bytes.
 
 #[path = "datagram/describe.rs"]
 mod describe;
@@ -12,7 +13,7 @@ use scanhub_schema::Family;
 use scanhub_schema::datagram::{Datagram, DatagramError, HEADER_LEN, Head, LanFlags, MIN_MTU, MTU_SAFE};
 use vectors::{Vector, bytes as vector, vectors};
 
-/// Changes a datagram and makes its checksum right again.
+/// Returns `datagram` with a change and a right checksum.
 fn changed(datagram: &[u8], change: impl FnOnce(&mut Vec<u8>)) -> Vec<u8> {
     let mut bytes = datagram.to_vec();
     change(&mut bytes);
@@ -49,7 +50,7 @@ fn a_later_hub_appends() {
     assert_eq!(datagram, vector("longer_payload"));
 }
 
-/// The MAC is the first 16 bytes of HMAC-SHA256 under the list's key, over the datagram before it with a CRC of 0.
+/// The MAC is the first 16 bytes of HMAC-SHA256 with the list's key, over the datagram before the MAC with a CRC of 0.
 #[test]
 fn the_mac_stands_behind_the_payload() {
     const KEY_BYTES: [u8; 16] =
@@ -66,7 +67,7 @@ fn the_mac_stands_behind_the_payload() {
     }
 }
 
-/// Each part by itself is no payload; what they are together is in the crate of both ends of a network.
+/// A single part is not a valid payload. The crate `clients/network` tests that the parts together are one.
 #[test]
 fn parts_of_a_scan_are_these_bytes() {
     let scan = vector("scan");
@@ -111,7 +112,7 @@ fn refusals_are_these_bytes() {
     assert_eq!(damaged, vector("crc"));
 }
 
-/// Which datagrams a receiver refuses although their bytes are right is tested in `clients/network/tests/golden.rs`.
+/// `clients/network/tests/golden.rs` tests which valid datagrams a receiver refuses.
 #[test]
 fn these_bytes_are_values_or_refused() {
     for Vector { name, bytes, description } in vectors() {
@@ -138,7 +139,7 @@ fn these_bytes_are_values_or_refused() {
 #[test]
 fn every_reason_has_its_datagram() {
     let vectors = vectors();
-    // When a datagram was sent again is nothing that its bytes say.
+    // The bytes of a datagram do not show that it was sent again.
     for reason in DatagramError::ALL.into_iter().filter(|reason| *reason != DatagramError::Untimely) {
         assert!(
             vectors.iter().any(|vector| vector.description["refusal"] == reason.name()),
@@ -148,7 +149,7 @@ fn every_reason_has_its_datagram() {
     }
 }
 
-/// What the page shows is so: header fields without a hole, sizes, an example, reasons and their order.
+/// Checks the facts on the page: header fields without gaps, sizes, an example, and the reasons in their order.
 #[test]
 fn the_page_shows_these_bytes() {
     let top = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
@@ -193,5 +194,5 @@ fn sealed_datagram(head: Head, payload: &[u8]) -> Vec<u8> {
     head.seal(&mut buffer, payload.len()).unwrap().to_vec()
 }
 
-/// Where the checksum stands.
+/// Offset of the checksum.
 const CRC_OFFSET: usize = 44;

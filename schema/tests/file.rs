@@ -1,5 +1,5 @@
-//! The golden recording of version 2: built from values it is these bytes. Do not change this test: another form is
-//! another version. `docs/recording.md` explains it.
+//! The golden recording of version 2, which the test builds from values. Do not change this test: a different format
+//! needs a new version. `docs/recording.md` explains the format.
 #![cfg(feature = "mcap")]
 
 use std::collections::BTreeMap;
@@ -25,7 +25,7 @@ fn header(seq: u64, topic_seq: u64) -> Header {
     }
 }
 
-/// The reply to a request to be quiet (Telegram listing 7.11), with its CRC.
+/// Reply to a request to stop the stream (Telegram listing 7.11), with its CRC.
 const TELEGRAM_BYTES: [u8; 9] = [0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A];
 
 fn recording() -> Vec<u8> {
@@ -64,7 +64,7 @@ fn others_read_it() {
     assert_eq!((schema.name.as_str(), schema.encoding.as_str()), ("scanhub.Zones.v2", "scanhub.v2"));
 }
 
-/// What was closed is there although nothing follows, as after a kill.
+/// A closed chunk can be read even if nothing follows it, as after a kill.
 #[test]
 fn a_closed_chunk_outlives_its_writer() {
     struct FullDisk<'a>(&'a mut Vec<u8>);

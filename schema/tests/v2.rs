@@ -1,5 +1,5 @@
-//! Golden size, offsets and bytes of every payload of version 2. Do not change these tests: another layout needs another version.
-//! Readers in other languages use the same bytes from `tests/vectors/v2`.
+//! Golden sizes, offsets and bytes of every payload of version 2. Do not change these tests: a different layout needs a
+//! new version. Readers in other languages use the same bytes from `tests/vectors/v2`.
 
 use std::mem::{offset_of, size_of};
 
@@ -21,7 +21,7 @@ fn golden(size: usize, fields: &[(usize, &[u8])]) -> Vec<u8> {
     bytes
 }
 
-/// Returns the bytes with this name that readers in other languages use.
+/// Returns the file of this name in `tests/vectors/v2`.
 fn read_vector(name: &str) -> Vec<u8> {
     let lines = include_str!("../../tests/vectors/v2/bytes.txt").lines();
     let digits = lines.filter_map(|line| line.split_once(' ')).find(|(of, _)| *of == name);
@@ -390,7 +390,7 @@ fn the_bytes_of_a_scan_of_the_lms() {
     assert_eq!(read_vector("scan"), expected);
 }
 
-/// A clockwise scan with exact angles, a missing packet, and all values of a beam.
+/// A clockwise scan with exact angles, a missing packet, and every kind of value.
 #[test]
 fn the_bytes_of_a_scan_of_a_turn() {
     let head = ScanHead {
@@ -434,7 +434,7 @@ fn the_bytes_of_a_scan_of_a_turn() {
     assert_eq!(read_vector("scan_turn"), expected);
 }
 
-/// Meanings of values above the ranges: those of an LMS, and those of all other families.
+/// Meanings of the values above the ranges, for an LMS and for all other families.
 #[test]
 fn codes() {
     let word = |code: Option<Code>| code.map(Code::name);

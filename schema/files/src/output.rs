@@ -1,8 +1,8 @@
-//! Files that a user names as output. Other users of the machine may write to the same directory, so every verb creates its
-//! files here.
+//! Files that a user names as output. Other users of the machine may write to the same directory, so every verb creates
+//! its files here.
 //!
-//! A file that is written at once is complete or absent: [`OutputFile`] has a random name until it is complete. A file that
-//! grows has its own name from the start, see [`Target::create`], so that a kill loses nothing.
+//! A file that is written at once is complete or absent: [`OutputFile`] has a random name until it is complete. A file
+//! that grows has its own name from the start, see [`Target::create`], so that a kill loses nothing.
 //!
 //! - The last component of a path is never a link, and never a device, a pipe or a socket.
 //! - A link on the way is followed, unless it belongs to another user and lies in a sticky directory, such as /tmp.
@@ -23,33 +23,33 @@ use tempfile::NamedTempFile;
 use crate::path_walk::{LinkPolicy, PathWalk, WalkError, components_of, describe_user, effective_uid};
 use scanhub_schema::{Failure, Kind};
 
-/// Writes all of `content` to the file at `path`; replaces an existing one if `force`.
+/// Writes `content` to the file at `path`. With `force`, it replaces an existing file.
 ///
 /// # Errors
 ///
-/// Those of [`OutputFile::create`] and [`OutputFile::commit`].
+/// Returns the errors of [`OutputFile::create`] and [`OutputFile::commit`].
 pub fn write(path: &Path, content: &[u8], force: bool) -> Result<(), Failure> {
     let mut file = OutputFile::create(path, force)?;
     file.write_all(content).map_err(|error| unwritable(path, &error))?;
     file.commit()
 }
 
-/// Creates the directory `path` and those above it that do not exist, with the permissions that the umask leaves. An
-/// existing one stays as it is.
+/// Creates the directory `path` and its missing parents, with the permissions that the umask leaves. An existing
+/// directory is not changed.
 ///
 /// # Errors
 ///
-/// [`Kind::Output`] if it cannot be created, is not a directory, or is reached by a link that another user has put into a sticky
-/// directory.
+/// Returns [`Kind::Output`] if it cannot be created, is not a directory, or is reached by a link that another user has
+/// put into a sticky directory.
 pub fn create_directory(path: &Path) -> Result<(), Failure> {
     open_directory(path, path, Some(Mode::RWXU | Mode::RWXG | Mode::RWXO)).map(drop)
 }
 
-/// A file that is written at once. It has a random name in the directory of its target, and mode 0600, until [`commit`](Self::commit).
-/// Without that, it is removed when it is dropped.
+/// A file that is written as a whole. Until [`commit`](Self::commit), it has a random name in the directory of its
+/// target and mode 0600. If it is dropped before, it is removed.
 #[derive(Debug)]
 pub struct OutputFile {
-    // Dropping it removes the file, for which the directory must still be open.
+    // Dropping it removes the file, which needs the open directory.
     file: NamedTempFile,
     target: Target,
     force: bool,
@@ -60,7 +60,8 @@ impl OutputFile {
     ///
     /// # Errors
     ///
-    /// Those of [`Target::open`] and [`Target::check`], and [`Kind::Output`] if the directory takes no file.
+    /// Returns the errors of [`Target::open`] and [`Target::check`], and [`Kind::Output`] if the file cannot be created
+    /// in the directory.
     pub fn create(path: &Path, force: bool) -> Result<OutputFile, Failure> {
         let target = Target::open(path)?;
         target.check(force)?;
@@ -72,12 +73,12 @@ impl OutputFile {
         Ok(OutputFile { target, file, force })
     }
 
-    /// Gives the complete file its name. A new file has the permissions that the umask leaves, and one that replaces another
-    /// has owner and permissions of that.
+    /// Gives the complete file its name. A new file gets the permissions that the umask leaves. A file that replaces
+    /// another one gets the owner and the permissions of that file.
     ///
     /// # Errors
     ///
-    /// [`Kind::Output`] if it cannot be written, or if something has the name by now.
+    /// Returns [`Kind::Output`] if the file cannot be written, or if another file has taken the name since.
     pub fn commit(self) -> Result<(), Failure> {
         let OutputFile { target, file, force } = self;
         let old = target.check(force)?;
@@ -119,7 +120,7 @@ impl Write for OutputFile {
 pub struct Target {
     directory: OwnedFd,
     name: OsString,
-    /// As the user named it.
+    /// Path as the user wrote it.
     path: PathBuf,
 }
 
@@ -128,11 +129,11 @@ impl Target {
     ///
     /// # Errors
     ///
-    /// [`Kind::Output`] if it does not exist, cannot be opened, or is reached by a link that another user has put into a
-    /// sticky directory, and if `path` names no file.
+    /// Returns [`Kind::Output`] if the directory does not exist, cannot be opened, or is reached by a link that another
+    /// user has put into a sticky directory, and if `path` does not name a file.
     pub fn open(path: &Path) -> Result<Target, Failure> {
         let Some(name) = path.file_name() else {
-            // It ends with the root or with "..".
+            // The path ends with the root or with "..".
             let message = format!("cannot write {}: it is a directory", path.display());
             return Err(Failure::new(Kind::Output, message, "name a file in it"));
         };
@@ -145,7 +146,7 @@ impl Target {
     ///
     /// # Errors
     ///
-    /// [`Kind::Output`] if it exists and `force` is not set, and in any case if it is not a regular file.
+    /// Returns [`Kind::Output`] if the file exists and `force` is not set, and always if it is not a regular file.
     pub fn check(&self, force: bool) -> Result<Option<Stat>, Failure> {
         let stat = match statat(&self.directory, &self.name, AtFlags::SYMLINK_NOFOLLOW) {
             Ok(stat) => stat,
@@ -170,7 +171,7 @@ impl Target {
                     FileType::Socket => "a socket",
                     _ => "a device",
                 };
-                // The shell opens a pipe or a device without any of these checks.
+                // The shell can open a pipe or a device without these checks.
                 (
                     what.to_owned(),
                     format!("name a file; or stdout, if this verb has it: - > {}", self.path.display()),
@@ -181,12 +182,13 @@ impl Target {
         Err(Failure::new(Kind::Output, message, hint))
     }
 
-    /// Creates the empty file, with the permissions that the umask leaves. If there is one, it is opened and keeps its
-    /// content with `reuse`, and otherwise this is an error.
+    /// Creates an empty file with the permissions that the umask leaves. With `reuse`, an existing file is opened and
+    /// keeps its content.
     ///
     /// # Errors
     ///
-    /// The system's error: [`ErrorKind::AlreadyExists`] if there is a file and `reuse` is not set, and always for a link.
+    /// Returns the system's error: [`ErrorKind::AlreadyExists`] if the file exists and `reuse` is not set, and always
+    /// for a link.
     pub fn create(&self, reuse: bool) -> io::Result<File> {
         self.open_file(reuse, PUBLIC_MODE)
     }
@@ -213,12 +215,12 @@ impl Target {
         Ok(file)
     }
 
-    /// Creates the empty file, which replaces an existing regular file if `force`. It has the permissions `mode`, without
-    /// those that the umask takes away.
+    /// Creates an empty file with the permissions `mode`, without those that the umask removes. With `force`, it
+    /// replaces an existing regular file.
     ///
     /// # Errors
     ///
-    /// Those of [`check`](Self::check), and [`Kind::Output`] if it cannot be created.
+    /// Returns the errors of [`check`](Self::check), and [`Kind::Output`] if the file cannot be created.
     pub fn create_new(&self, force: bool, mode: u32) -> Result<File, Failure> {
         if self.check(force)?.is_some() {
             let removed = unlinkat(&self.directory, &self.name, AtFlags::empty());
@@ -236,7 +238,8 @@ impl Target {
     }
 }
 
-/// Opens `directory`, on the way to the output `path`. With `make`, missing directories are created with these permissions.
+/// Opens `directory`, which is on the way to the output `path`. With `make`, missing directories are created with these
+/// permissions.
 fn open_directory(path: &Path, directory: &Path, make: Option<Mode>) -> Result<OwnedFd, Failure> {
     let reached = PathWalk::begin(path, LinkPolicy::AllButSticky, effective_uid()).and_then(|mut walk| {
         let exists = walk.enter(components_of(directory), make)?;
@@ -244,7 +247,7 @@ fn open_directory(path: &Path, directory: &Path, make: Option<Mode>) -> Result<O
     });
     let error = match reached {
         Ok(walk) => return Ok(walk.into_parts().0),
-        // The usual case needs no second path.
+        // Usually it is this directory, and the message needs no second path.
         Err(WalkError::System(failed_at, error)) if failed_at == directory => error.into(),
         Err(WalkError::System(failed_at, error)) => {
             io::Error::other(format!("{}: {}", failed_at.display(), io::Error::from(error)))
@@ -258,7 +261,7 @@ fn open_directory(path: &Path, directory: &Path, make: Option<Mode>) -> Result<O
             );
             io::Error::other(what)
         }
-        // Only directories of this user's own are checked for that.
+        // `PathWalk::enter` never returns this error; only `enter_own` does.
         Err(WalkError::Writable(failed_at, _)) => return Err(unwritable(&failed_at, &Errno::PERM.into())),
         Err(WalkError::Untrusted(failed_at, what)) => {
             let message = format!("cannot write {}: {} {what}", path.display(), failed_at.display());
@@ -272,7 +275,7 @@ fn open_directory(path: &Path, directory: &Path, make: Option<Mode>) -> Result<O
     Err(Failure { hint, ..failure })
 }
 
-/// Permissions of a new file, before the umask takes some away.
+/// Permissions of a new file before the umask removes some.
 pub const PUBLIC_MODE: u32 = 0o666;
 /// Permissions of a new file that only this user may read.
 pub const PRIVATE_MODE: u32 = 0o600;
@@ -290,8 +293,8 @@ fn already_exists(path: &Path) -> Failure {
     Failure::new(Kind::Output, format!("{} exists", path.display()), "--force replaces it")
 }
 
-/// Returns the permissions that new files of this process do not get. If the kernel does not report them (before Linux 4.7),
-/// those of group and others.
+/// Returns the permissions that new files of this process do not get. If the kernel does not report them (before Linux
+/// 4.7), these are the permissions of group and others.
 fn umask() -> u32 {
     let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
     let umask = status.lines().find_map(|line| line.strip_prefix("Umask:"));
@@ -341,7 +344,7 @@ mod tests {
         let file = OutputFile::create(&path, false).unwrap();
         fs::write(&path, "old").unwrap();
         fs::set_permissions(&path, Permissions::from_mode(0o640)).unwrap();
-        // It appeared after the check.
+        // The file was created after the check.
         let failure = file.commit().unwrap_err();
         assert_eq!((failure.kind, failure.message.ends_with("/a exists")), (Kind::Output, true), "{failure}");
         assert!(failure.hint.contains("--force"), "{failure}");

@@ -1,4 +1,5 @@
-//! Opens a directory component by component, so that no other user can put another directory in its place.
+//! Walk to a directory, which opens its path component by component, so that no other user can substitute another
+//! directory.
 
 use std::ffi::{OsStr, OsString};
 use std::os::fd::OwnedFd;
@@ -8,48 +9,48 @@ use std::path::{Component, Path, PathBuf};
 use rustix::fs::{AtFlags, CWD, FileType, Mode, OFlags, fstat, mkdirat, openat, readlinkat, statat};
 use rustix::io::Errno;
 
-/// A directory that was reached by its path.
+/// An open directory, and the path by which it was reached.
 pub struct PathWalk {
-    /// The user who has to own directories and may make links.
+    /// User who must own directories and whose links are followed.
     user: u32,
     policy: LinkPolicy,
-    /// The last component that was opened.
+    /// Last component that was opened.
     directory: OwnedFd,
     path: PathBuf,
     /// Number of links that were followed.
     links: usize,
 }
 
-/// Which links on the way are followed. Links of root and of this user always are, in directories that no other user can write
-/// to.
+/// Links that are followed on the way. Links of root and of this user are always followed if they are in directories
+/// that no other user can write to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LinkPolicy {
-    /// No others.
+    /// No other links.
     Own,
-    /// All but those of other users in a sticky directory, such as /tmp.
+    /// All other links, except those of other users in a sticky directory such as /tmp.
     AllButSticky,
 }
 
-/// Reason for not opening a directory.
+/// Reason why a directory was not opened.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum WalkError {
-    /// The system refuses it.
+    /// The system's error for this path.
     System(PathBuf, Errno),
-    /// Another user may have put something at this path. The text continues a sentence that begins with the path.
+    /// Another user may have put this path there. The text continues a sentence that begins with the path.
     Untrusted(PathBuf, String),
-    /// Owner and mode of a directory that belongs to another user.
+    /// The directory belongs to another user. Path, owner and mode.
     Foreign(PathBuf, u32, u32),
-    /// Mode of a directory that other users can write to.
+    /// Other users can write to the directory. Path and mode.
     Writable(PathBuf, u32),
 }
 
 impl PathWalk {
-    /// Starts at the root of the file system if `path` is absolute, otherwise at the working directory. `user` is the one
-    /// who has to own directories.
+    /// Starts at the root of the file system if `path` is absolute, otherwise at the working directory. `user` must own
+    /// the directories of [`enter_own`](Self::enter_own).
     ///
     /// # Errors
     ///
-    /// [`WalkError::System`] if that cannot be opened.
+    /// Returns [`WalkError::System`] if this directory cannot be opened.
     pub fn begin(path: &Path, policy: LinkPolicy, user: u32) -> Result<PathWalk, WalkError> {
         let start = Path::new(if path.is_absolute() { "/" } else { "." });
         let directory = openat(CWD, start, OPEN_DIRECTORY | OFlags::PATH, Mode::empty());
@@ -58,12 +59,13 @@ impl PathWalk {
         Ok(PathWalk { user, policy, directory: at, path, links: 0 })
     }
 
-    /// Opens the `components` in this order, and follows links as the policy permits. With `make`, a missing directory is
-    /// created with these permissions, without those that the umask takes away. Returns `false` if one is missing.
+    /// Opens the `components` in this order, and follows links as the policy permits. With `make`, a missing directory
+    /// is created with these permissions, without those that the umask removes. Returns `false` if a component is
+    /// missing.
     ///
     /// # Errors
     ///
-    /// [`WalkError`] if a component cannot be opened or is not to be trusted.
+    /// Returns [`WalkError`] if a component cannot be opened or is not trusted.
     pub fn enter(
         &mut self,
         mut components: Vec<OsString>,
@@ -82,12 +84,12 @@ impl PathWalk {
         Ok(true)
     }
 
-    /// Opens one component, which must be a directory of this user that no other user can write to.
-    /// A link is not followed. `flags` has flags for opening it.
+    /// Opens one component, which must be a directory of this user that no other user can write to. A link is not
+    /// followed. `flags` are additional flags for opening it.
     ///
     /// # Errors
     ///
-    /// Those of [`enter`](Self::enter), [`WalkError::Foreign`] and [`WalkError::Writable`].
+    /// Returns the errors of [`enter`](Self::enter), [`WalkError::Foreign`] and [`WalkError::Writable`].
     pub fn enter_own(
         &mut self,
         component: &OsStr,
@@ -116,7 +118,7 @@ impl PathWalk {
         Ok(true)
     }
 
-    /// Returns the directory that was reached, and its path.
+    /// Returns the directory and its path.
     pub fn into_parts(self) -> (OwnedFd, PathBuf) {
         (self.directory, self.path)
     }
@@ -143,7 +145,7 @@ impl PathWalk {
             }
             Err(Errno::NOENT) => Ok(ComponentResult::Absent),
             Err(Errno::NOTDIR | Errno::LOOP) => Ok(ComponentResult::NotDirectory),
-            // A directory without read permission still has a visible owner.
+            // The owner of a directory can be read even if the directory cannot.
             Err(Errno::ACCESS) => {
                 let component = statat(&self.directory, name, AtFlags::SYMLINK_NOFOLLOW);
                 let component = component.map(|stat| (self.path.join(name), stat));
@@ -156,7 +158,7 @@ impl PathWalk {
         }
     }
 
-    /// Returns the components that the link `name` stands for.
+    /// Returns the components of the target of the link `name`.
     fn read_link(&mut self, name: &OsStr) -> Result<Vec<OsString>, WalkError> {
         let path = self.path.join(name);
         let broken = |error| WalkError::System(path.clone(), error);
@@ -198,7 +200,7 @@ impl PathWalk {
 enum ComponentResult {
     Entered,
     Absent,
-    /// A link, or something else that is not entered.
+    /// A link, or a file that is not a directory.
     NotDirectory,
 }
 
@@ -213,7 +215,7 @@ pub fn components_of(path: &Path) -> Vec<OsString> {
         .collect()
 }
 
-/// Returns the number of `user`, and the name if it has one.
+/// Returns the ID of `user`, with the name if there is one.
 pub fn describe_user(user: u32) -> String {
     let entry = nix::unistd::User::from_uid(user.into()).ok().flatten();
     entry.map_or_else(|| user.to_string(), |known| format!("{user} ({})", known.name))
@@ -225,9 +227,9 @@ pub fn effective_uid() -> u32 {
 }
 
 const OPEN_DIRECTORY: OFlags = OFlags::DIRECTORY.union(OFlags::NOFOLLOW).union(OFlags::CLOEXEC);
-/// Group and others may write.
+/// Permission bits with which group and others may write.
 const OTHERS_WRITE: u32 = 0o022;
-/// Only owners may rename and remove what is in the directory (inode(7)).
+/// Mode bit with which only owners may rename and remove the files in a directory (inode(7)).
 pub const STICKY: u32 = 0o1000;
-/// As many links as the kernel follows (path_resolution(7)).
+/// Maximum number of links, which is that of the kernel (path_resolution(7)).
 const MAX_LINKS: usize = 40;

@@ -1,5 +1,5 @@
-//! Reads files named by a user: only regular ones, and only up to an expected length. A pipe may have no writer and a
-//! device no end, so neither is read. Refuses to know what is in them.
+//! Reads of files that a user names: only regular files, and only up to a maximum length. Pipes and devices are
+//! rejected, because a pipe may have no writer and a device no end.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, ErrorKind, Read};
@@ -10,15 +10,16 @@ use rustix::fs::OFlags;
 
 use scanhub_schema::{Failure, Kind};
 
-/// Most bytes of a configuration, a world or a model: many times what people write. Parsed, it is a hundred times as
-/// long.
+/// Maximum length of a configuration, a world or a model in bytes: many times the length of real files. The parsed form
+/// needs a hundred times the memory.
 pub const MAX_FILE_BYTES: u64 = 512 << 10;
 
-/// Opens the regular file at `path`; never waits.
+/// Opens the regular file at `path`, without waiting.
 ///
 /// # Errors
 ///
-/// [`ErrorKind::InvalidInput`] with what it is instead, else the system's error.
+/// Returns [`ErrorKind::InvalidInput`] with the kind of the file if it is not a regular file, otherwise the system's
+/// error.
 pub fn open(path: &Path) -> io::Result<File> {
     let flags = OFlags::NONBLOCK | OFlags::NOCTTY;
     let file = OpenOptions::new().read(true).custom_flags(flags.bits() as i32).open(path)?;
@@ -32,30 +33,30 @@ pub fn open(path: &Path) -> io::Result<File> {
     Err(io::Error::new(ErrorKind::InvalidInput, format!("it is {what}, not a regular file")))
 }
 
-/// Returns all of the regular file at `path`, which has at most `longest` bytes.
+/// Returns the content of the regular file at `path`.
 ///
 /// # Errors
 ///
-/// As [`open`]; [`ErrorKind::FileTooLarge`] if it is longer.
+/// Returns the errors of [`open`], and [`ErrorKind::FileTooLarge`] if the file has more than `max_bytes` bytes.
 pub fn read(path: &Path, max_bytes: u64) -> io::Result<Vec<u8>> {
     read_all(&mut open(path)?, max_bytes)
 }
 
-/// Returns the same as text; [`ErrorKind::InvalidData`] if it is not UTF-8.
+/// Returns the content of the regular file at `path` as text.
 ///
 /// # Errors
 ///
-/// As [`read`]; [`ErrorKind::InvalidData`] if it is not UTF-8.
+/// Returns the errors of [`read`], and [`ErrorKind::InvalidData`] if the content is not UTF-8.
 pub fn read_text(path: &Path, max_bytes: u64) -> io::Result<String> {
     String::from_utf8(read(path, max_bytes)?)
         .map_err(|_| io::Error::new(ErrorKind::InvalidData, "it is no text in UTF-8"))
 }
 
-/// Returns all of `input`, which has at most `longest` bytes; [`ErrorKind::FileTooLarge`] if it has more.
+/// Returns everything up to the end of `input`.
 ///
 /// # Errors
 ///
-/// [`ErrorKind::FileTooLarge`] if it has more, else the system's error.
+/// Returns [`ErrorKind::FileTooLarge`] if `input` has more than `max_bytes` bytes, otherwise the system's error.
 pub fn read_all(input: &mut dyn Read, max_bytes: u64) -> io::Result<Vec<u8>> {
     let mut content = Vec::new();
     input.take(max_bytes + 1).read_to_end(&mut content)?;
@@ -66,7 +67,7 @@ pub fn read_all(input: &mut dyn Read, max_bytes: u64) -> io::Result<Vec<u8>> {
     Ok(content)
 }
 
-/// Returns the failure of a file that a user named as input, which is at `place`.
+/// Returns the failure to read the input file `name`.
 pub fn unreadable(name: &str, error: &io::Error) -> Failure {
     let hint = match error.kind() {
         ErrorKind::InvalidInput => "name a regular file",
@@ -99,7 +100,7 @@ mod tests {
         assert_eq!(refused(&file).as_deref(), Ok(&b"1234567"[..]));
         assert_eq!(refused(&link).as_deref(), Ok(&b"1234567"[..]));
         assert_eq!(read(&file, 6).unwrap_err().kind(), ErrorKind::FileTooLarge);
-        // Its size is said to be 0.
+        // The kernel reports a size of 0 for this file.
         assert!(read(Path::new("/proc/self/status"), 1 << 16).unwrap().len() > 100);
         fs::write(&file, b"\xFF").unwrap();
         assert_eq!(read_text(&file, 6).unwrap_err().kind(), ErrorKind::InvalidData);

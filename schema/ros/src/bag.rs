@@ -20,7 +20,7 @@ pub struct BagWriter {
     /// Channels of scans and of points, by topic.
     channels: Vec<(String, u16)>,
     transforms: Option<Transforms>,
-    /// By frame.
+    /// Poses by frame.
     poses: Vec<(String, Pose)>,
     message: Vec<u8>,
 }
@@ -29,7 +29,7 @@ pub struct BagWriter {
 #[derive(Clone, Copy, Debug)]
 struct Transforms {
     channel: u16,
-    /// Number and minimum time of the next message. The latest message must be the one with the most poses.
+    /// Number of the next message, and its minimum time. The latest message must be the one with the most poses.
     number: u32,
     min_ns: u64,
 }

@@ -118,7 +118,7 @@ impl Value {
     }
 }
 
-/// Returns the value of `message`, which has type `of`. `None` if it has fewer or more bytes than the type.
+/// Decodes `message` of type `message_type`. Returns `None` if it has fewer or more bytes than the type.
 pub fn read(message_type: &Type, message: &[u8]) -> Option<Value> {
     let body = message.strip_prefix(&[0, 1, 0, 0])?;
     let layout = MessageDef::of(message_type);

@@ -9,10 +9,10 @@ use sha2::{Digest, Sha256};
 
 use crate::Type;
 
-/// A release of ROS 2, as far as the wire depends on it.
+/// A release of ROS 2. The wire format depends on it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Distro {
-    /// Has no hashes of types.
+    /// Humble Hawksbill, which has no hashes of types.
     Humble,
     /// Jazzy Jalisco.
     Jazzy,
@@ -41,7 +41,7 @@ impl Distro {
         Distro::ALL.into_iter().find(|distro| distro.name() == name)
     }
 
-    /// Returns the hash of `of`, or the text that the release has in its place.
+    /// Returns the hash of `message_type`, or the text that the release uses instead.
     pub fn hash(self, message_type: &Type) -> String {
         match self {
             Distro::Humble => "TypeHashNotSupported".to_owned(),

@@ -1,5 +1,5 @@
-//! Scans as `sensor_msgs/msg/LaserScan`, and points as `sensor_msgs/msg/PointCloud2`: those of a scan, of its foreground, and
-//! of a sweep in three dimensions.
+//! Scans as `sensor_msgs/msg/LaserScan`, and points as `sensor_msgs/msg/PointCloud2`: those of a scan, of its
+//! foreground, and of a sweep in three dimensions.
 
 use std::mem::offset_of;
 
@@ -10,17 +10,17 @@ use crate::cdr::Cdr;
 
 /// Appends `scan` in frame `frame` to `message` as a LaserScan.
 ///
-/// - Angles are in radians, counterclockwise from the sensor's x axis (ahead), in ascending order. They are those of the
-///   sensor, even if it is mounted upside down.
-/// - Ranges are in meters (REP 103), each the float nearest to the sensor's value. +inf means no echo within the sensor's
-///   range, -inf an object that is too near, and NaN an unknown range (REP 117).
-/// - The stamp is the time of the message's first beam. A clockwise scanner measures that beam last, and the time between
-///   beams is then negative.
+/// - Angles are in radians, counterclockwise from the sensor's x axis (ahead), in ascending order. They are those of
+///   the sensor, even if it is mounted upside down.
+/// - Ranges are in meters (REP 103), each the float nearest to the sensor's value. +inf means no echo within the
+///   sensor's range, -inf an object that is too near, and NaN an unknown range (REP 117).
+/// - The stamp is the time of the message's first beam. A clockwise scanner measures that beam last, and the time
+///   between beams is then negative.
 pub fn laser_scan(message: &mut Vec<u8>, frame: &str, header: &Header, scan: &Scan) {
     let mut cdr = Cdr::begin(message);
     cdr.header(stamp_ns(header, scan), frame);
     let last = scan.beams().saturating_sub(1);
-    // Number of the beam that is beam `i` of the message.
+    // Index of the beam of the scan that is beam `i` of the message.
     let beam = |i: usize| if is_clockwise(scan) { last - i } else { i };
     let (first_angle, step) = (scan.first_angle + beam(0) as f64 * scan.step, scan.step.abs());
     for value in [
@@ -81,9 +81,9 @@ fn meters(range: u16, scan: &Scan) -> f32 {
     (f64::from(range) * f64::from(scan.unit_um) / 1e6) as f32
 }
 
-/// Appends the readings of `scan` in frame `frame` to `message` as a PointCloud2: a point for each beam with a reading, in the order of the
-/// beams, with the stamp of the LaserScan. A point is x, y, z in meters (z is 0) and the intensity that the scanner reports
-/// (0 if it reports none), as 32-bit floats.
+/// Appends the readings of `scan` in frame `frame` to `message` as a PointCloud2, with a point for each reading in the
+/// order of the beams and the stamp of the LaserScan. A point is x, y, z in meters (z is 0) and the intensity that the
+/// scanner reports (0 if it reports none), as 32-bit floats.
 pub fn scan_cloud(message: &mut Vec<u8>, frame: &str, header: &Header, scan: &Scan) {
     let points = || (0..scan.beams()).filter_map(|i| Some((i, scan.distance_m(i)?)));
     let width = points().count();
@@ -99,9 +99,9 @@ pub fn scan_cloud(message: &mut Vec<u8>, frame: &str, header: &Header, scan: &Sc
     cdr.bool(true);
 }
 
-/// Appends the `foreground` of `scan` in frame `frame` to `message` as a PointCloud2 with the stamp of the LaserScan. It has a
-/// point x, y, z (meters, 32-bit floats; z is 0) for each of its beams that has a range, in the order of the beams. `scan` has
-/// the directions of the beams, and both must come from the same telegram.
+/// Appends the `foreground` of `scan` in frame `frame` to `message` as a PointCloud2 with the stamp of the LaserScan.
+/// It has a point x, y, z (meters, 32-bit floats; z is 0) for each foreground beam that has a range, in the order of
+/// the beams. The directions of the beams come from `scan`, which must belong to the same telegram.
 pub fn foreground_cloud(
     message: &mut Vec<u8>,
     frame: &str,
@@ -126,9 +126,9 @@ pub fn foreground_cloud(
     cdr.bool(true);
 }
 
-/// Appends the `points` of a sweep, in the robot's frame, to `message` as a PointCloud2: x, y, z (meters, 32-bit floats), beam
-/// (its number in the scan, 16 bits) and class (8 bits: 0 unknown, 1 background, 2 foreground, 3 behind the background). The
-/// stamp is that of `header`, which belongs to the last point.
+/// Appends the `points` of a sweep, in the robot's frame, to `message` as a PointCloud2: x, y, z (meters, 32-bit
+/// floats), beam (index in the scan, 16 bits) and class (8 bits: 0 unknown, 1 background, 2 foreground, 3 behind the
+/// background). The stamp is that of `header`, which must belong to the last point.
 pub fn sweep_cloud(message: &mut Vec<u8>, header: &Header, points: &[CloudPoint]) {
     let point_len = size_of::<CloudPoint>() as u32;
     let mut cdr = begin(message, header.wall_ns, BASE_FRAME, &SWEEP_FIELDS, (point_len, points.len()));
@@ -140,8 +140,8 @@ pub fn sweep_cloud(message: &mut Vec<u8>, header: &Header, points: &[CloudPoint]
     cdr.bool(true);
 }
 
-/// Starts a PointCloud2 of `count` points that have `point` bytes each, up to the first point. `fields` are the name, offset and
-/// type of each field of a point.
+/// Starts a PointCloud2 of `count` points of `point` bytes each. The caller appends the points. `fields` are the name,
+/// offset and type of each field of a point.
 fn begin<'a>(
     message: &'a mut Vec<u8>,
     stamp_ns: u64,
@@ -196,7 +196,7 @@ mod tests {
         Scan::of(ScanHead::lms(ranges.len(), -90_000, step_mdeg, 10, 13), ranges)
     }
 
-    /// The numbers behind a frame of four letters, whose end makes three bytes of padding.
+    /// Returns the numbers after a frame ID of four letters, whose end is padded by three bytes.
     fn read_floats(message: &[u8]) -> Vec<f32> {
         let body = &message[4..];
         assert_eq!(body[8..20], [5, 0, 0, 0, b'r', b'e', b'a', b'r', 0, 0, 0, 0]);
@@ -212,7 +212,8 @@ mod tests {
         it.arrays().upper[1] = 7;
         laser_scan(&mut message, "rear", &header, &it);
         assert_eq!(message[..4], [0, 1, 0, 0]);
-        // The first of six beams of a degree each was measured five 360ths of a turn before the last, which stamps.
+        // The first of six beams, 1 degree apart, was measured 5/360 of a revolution before the last one, whose time is
+        // the stamp.
         let nanosec = 1_000_000_000 - 5 * 37_000;
         assert_eq!(message[4..8], 1_700_000_000_i32.to_le_bytes());
         assert_eq!(message[8..12], (nanosec as u32).to_le_bytes());
@@ -253,7 +254,8 @@ mod tests {
         laser_scan(&mut message, "rear", &Header { wall_ns: 5_000_000_000, ..Header::default() }, &it);
         let values = read_floats(&message);
         let quarter = std::f32::consts::FRAC_PI_2;
-        // The grid begins ahead and turns to the right; its last beam looks left and was measured 75 ms after the first.
+        // The grid begins ahead and continues clockwise. Its last beam points left and was measured 75 ms after the
+        // first one.
         assert_eq!(message[4..12], [5, 0, 0, 0, 0xC0, 0x68, 0x78, 0x04]);
         assert_eq!(values[..5], [-3.0 * quarter, 0.0, quarter, -0.025, 0.1]);
         assert_eq!(values[8..12], [4.0, 3.0, 2.0, 1.0]);
@@ -272,7 +274,7 @@ mod tests {
         let mut message = Vec::new();
         foreground_cloud(&mut message, "front", &header, &scan, &foreground);
         let decoded = read(&POINT_CLOUD, &message).unwrap();
-        // The second of them, ahead and too near, is no point.
+        // The second beam, which points ahead, is too near and therefore not a point.
         let wanted =
             [[0.0, -1.0], [2.0 * 1_f64.to_radians().cos(), 2.0 * 1_f64.to_radians().sin()], [0.0, 3.0]];
         assert_eq!((decoded.number("height"), decoded.number("width")), (Some(1.0), Some(3.0)));
@@ -293,7 +295,7 @@ mod tests {
             );
             assert_eq!(got_z, 0.0);
         }
-        // As late as the scan's first beam.
+        // The stamp is the time of the scan's first beam.
         let nanoseconds = 1e9 * decoded.number("header.stamp.sec").unwrap()
             + decoded.number("header.stamp.nanosec").unwrap();
         assert_eq!(nanoseconds, (7_000_000_000 + scan.beam_ns(0)) as f64);
@@ -315,7 +317,7 @@ mod tests {
                 message.number(&format!("data.{}", at + i)).unwrap() as u8
             }))
         };
-        // Beam 90 looks ahead, and is the 89th with a reading.
+        // Beam 90 points ahead. Its point has index 88.
         let ahead = [0, 4, 8, 12].map(|offset| float(88 * 16 + offset));
         assert!((ahead[0] - 2.0).abs() < 1e-6 && ahead[1].abs() < 1e-6, "{ahead:?}");
         assert_eq!(ahead[2..], [0.0, 0.0]);

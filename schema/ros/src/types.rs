@@ -170,7 +170,7 @@ pub(crate) struct Field<'a> {
 }
 
 impl<'a> MessageDef<'a> {
-    /// Parses the definition of `of`. The names of contained types must include the package.
+    /// Parses the definition of `message_type`. The names of contained types must include the package.
     pub(crate) fn of(message_type: &'a Type) -> MessageDef<'a> {
         let types = message_type.text.split(Type::SEPARATOR).enumerate().map(|(index, text)| {
             let (name, fields) = if index == 0 {
@@ -189,7 +189,7 @@ impl<'a> MessageDef<'a> {
     }
 }
 
-/// Parses a line: type, name, and perhaps a default, which is not part of messages.
+/// Parses a line with type, name and an optional default, which is not part of messages.
 fn field(line: &str) -> Option<Field<'_>> {
     let mut words = line.split_whitespace();
     let (type_name, name) = (words.next()?, words.next()?);

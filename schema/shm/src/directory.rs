@@ -51,8 +51,8 @@ impl Directory {
     /// # Errors
     ///
     /// Returns [`Kind::Failed`] with the path, its owner and the remedy if base or domain belongs to another user, can
-    /// be written to by others, or is reached by a link that another user could have made. Returns [`Kind::ResourceExhausted`] if
-    /// descriptors run out.
+    /// be written to by others, or is reached by a link that another user could have made. Returns
+    /// [`Kind::ResourceExhausted`] if descriptors run out.
     pub fn open(root: &Path) -> Result<Option<Directory>, Failure> {
         Directory::walk(root, 2, Purpose::Domain, effective_uid(), false)
     }
@@ -71,7 +71,7 @@ impl Directory {
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`make`](Self::create).
+    /// Returns the errors of [`create`](Self::create).
     pub fn create_state(path: &Path, owned_components: usize) -> Result<Directory, Failure> {
         Directory::create_directory(path, owned_components, Purpose::State)
     }
@@ -99,12 +99,13 @@ impl Directory {
         self.check_file(name, opened)
     }
 
-    /// Replaces the content of the file `name` in one step: a reader, or the next process after a crash, finds the old
-    /// or the new content. Waits for the disk.
+    /// Replaces the content of the file `name` in one step. A reader, or the next process after a crash, finds either
+    /// the old or the new content. Waits for the disk.
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`open_or_create`](Self::file_or_new), and [`Kind::Failed`] if the file cannot be written.
+    /// Returns the errors of [`open_or_create`](Self::open_or_create), and [`Kind::Failed`] if the file cannot be
+    /// written.
     pub(crate) fn replace(&self, name: &str, content: &[u8]) -> Result<(), Failure> {
         let temporary = format!("{name}.new");
         // A crash may have left such a file.
@@ -119,7 +120,7 @@ impl Directory {
         })
     }
 
-    /// Removes the file `name`; does nothing if it does not exist or cannot be removed.
+    /// Removes the file `name`. Ignores a file that does not exist or cannot be removed.
     pub(crate) fn remove(&self, name: &OsStr) {
         let _ = self.try_remove(name);
     }
@@ -200,7 +201,7 @@ impl Directory {
         created.ok_or_else(|| purpose.unusable(path, Errno::NOENT))
     }
 
-    /// Opens `path`, whose last `own` components must belong to `user`.
+    /// Opens `path`, whose last `owned_components` components must belong to `user`.
     fn walk(
         path: &Path,
         owned_components: usize,
@@ -343,7 +344,7 @@ impl FileLock {
 }
 
 impl Drop for FileLock {
-    /// Closing is not enough: a process that is just being started has a copy of the descriptor for a moment.
+    /// Closing is not enough, because a process that is just being started briefly has a copy of the descriptor.
     fn drop(&mut self) {
         let _ = fcntl(self.file.as_raw_fd(), FcntlArg::F_OFD_SETLK(&whole_file(libc::F_UNLCK)));
     }
@@ -552,7 +553,7 @@ mod tests {
 
     use super::*;
 
-    /// `HERE/base/domain`, each with mode 0700.
+    /// Directory `HERE/base/domain`, with mode 0700 on each component below HERE.
     struct TestDirectory(TempDir);
 
     impl TestDirectory {

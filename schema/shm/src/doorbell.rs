@@ -1,5 +1,6 @@
-//! The doorbell of a sensor: three futex words in shared memory, one for each [`DoorbellWord`], at which subscribers sleep. One
-//! system call of the hub wakes all threads that sleep at a word; an event needs one message for each subscriber.
+//! The doorbell of a sensor: three futex words in shared memory, one for each [`DoorbellWord`], on which subscribers
+//! sleep. One system call of the hub wakes all threads that sleep on a word. An event needs one message for each
+//! subscriber.
 //!
 //! The page is in /dev/shm under the domain's prefix. Subscribers map it read-only. A killed hub leaves the page, and
 //! the next hub continues with it, so that subscribers that sleep meanwhile are woken. A hub that ends normally closes
@@ -43,7 +44,8 @@ impl DoorbellRinger {
     /// Opens the doorbell of `sensor` that a killed hub has left, which subscribers still have mapped, or creates a new
     /// one.
     ///
-    /// Returns [`Kind::Short`] if there is no memory for it, and [`Kind::Failed`] if another user's file has its name.
+    /// Returns [`Kind::ResourceExhausted`] if there is no memory for it, and [`Kind::Failed`] if another user's file
+    /// has its name.
     pub(crate) fn open_or_create<S: Service>(
         node: &Node<S>,
         sensor: &str,
@@ -121,8 +123,8 @@ impl Doorbell {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::ResourceExhausted`] if memory or descriptors are short, and [`Kind::Failed`] if the file belongs to another
-    /// user.
+    /// Returns [`Kind::ResourceExhausted`] if memory or descriptors are short, and [`Kind::Failed`] if the file belongs
+    /// to another user.
     pub fn open<S: Service>(node: &Node<S>, sensor: &str) -> Result<Option<Doorbell>, Failure> {
         let path = path(node, sensor);
         let mapped = open_own(OpenOptions::new().read(true), &path).and_then(|file| {
@@ -144,8 +146,8 @@ impl Doorbell {
         }
     }
 
-    /// Returns how often the hub has rung `ring`, modulo 2^32. A subscriber that receives after this call gets
-    /// everything that was sent before.
+    /// Returns the number of times that the hub has rung `word`, modulo 2^32. A subscriber that receives after this
+    /// call gets every sample that was sent before.
     pub fn ring_count(&self, word: DoorbellWord) -> u32 {
         read_count(self.0.page().word(word))
     }
@@ -280,8 +282,8 @@ trait FutexWord {
     fn wake(&self);
 }
 
-/// Increments the counter `rung` and wakes all threads that sleep at it. A thread that sees the new count also sees
-/// everything that was sent before.
+/// Increments the counter `rung` and wakes all threads that sleep on it. A thread that sees the new count also sees all
+/// samples that were sent before.
 fn ring(counter: &impl FutexWord) {
     counter.fetch_add(1, Ordering::Release);
     counter.wake();

@@ -60,7 +60,7 @@ mod tests {
         let free_again = is_unheld();
         fs::remove_file(&path).unwrap();
         assert_eq!([written, read, only_mapped], [false; 3]);
-        // A system without leases does not know.
+        // A system without leases cannot tell.
         assert_eq!(free, free_again);
         assert!(free || fs::read_to_string("/proc/sys/fs/leases-enable").is_ok_and(|it| it.trim() == "0"));
     }

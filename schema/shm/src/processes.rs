@@ -39,7 +39,7 @@ pub type Node<S = LocalService> = iceoryx2::node::Node<S>;
 pub enum Role {
     /// A process that holds a [`HubLock`], [`ListenLock`] or [`NameLock`].
     Publisher,
-    /// A process that only follows topics.
+    /// A process that only subscribes to topics.
     Subscriber,
 }
 
@@ -286,9 +286,9 @@ pub fn publisher_pid(root: &Path) -> Result<Option<u32>, Failure> {
     }
 }
 
-/// Returns the domain in which a program publishes: at the first place, in the order in which clients search, where a
-/// hub or a listener is running. If none is, at the place that a hub in this `environment` would take, so that the hub
-/// that starts next is in the same domain. Only below `base` if it is given.
+/// Returns the domain in which a program publishes. This is the first location, in the order in which clients search,
+/// where a hub or a listener is running. If there is none, it is the location that a hub in this `environment` would
+/// use, so that the hub that starts next uses the same domain. If `base` is given, only locations below it count.
 ///
 /// # Errors
 ///
@@ -389,8 +389,8 @@ pub(crate) fn config(root: &Path) -> Result<Option<Config>, Failure> {
 /// a service. The library waits for them forever and cleans up only finished ones, so no later hub could create that
 /// service again.
 ///
-/// The caller must hold the [`ServiceCreationLock`]. Then no process creates services, and no process has opened an unfinished
-/// one. Finished descriptions are read-only.
+/// The caller must hold the [`ServiceCreationLock`]. Then no process creates services, and no process has opened an
+/// unfinished one. Finished descriptions are read-only.
 fn remove_unfinished_services(root: &Path) {
     let Ok(Some(directory)) = Directory::open(root) else { return };
     let Some(services) = directory.subdirectory(SERVICES_DIRECTORY) else { return };

@@ -40,7 +40,7 @@ pub fn check_memory(needed: u64, max_segment: u64) -> Result<(), Failure> {
     check_address_space(needed)
 }
 
-/// Fails with [`Kind::Short`] if this process may not create files of `needed` bytes. Segments are files.
+/// Fails with [`Kind::ResourceExhausted`] if this process may not create files of `needed` bytes. Segments are files.
 fn check_file_size(needed: u64) -> Result<(), Failure> {
     let limit = getrlimit(Resource::Fsize).current.unwrap_or(u64::MAX);
     if limit >= needed {
@@ -59,7 +59,7 @@ fn check_file_size(needed: u64) -> Result<(), Failure> {
 }
 
 /// Fails if this process may not map `needed` more bytes and the memory for creating them. The library would leave a
-/// segment behind that it cannot map.
+/// segment that it cannot map.
 ///
 /// # Errors
 ///

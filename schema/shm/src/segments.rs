@@ -27,8 +27,9 @@ use crate::directory::{Directory, ServiceCreationLock};
 use crate::domain::Domain;
 use crate::resource_limits::{self, SHARED_MEMORY_DIRECTORY, memory_failure};
 
-/// Returns the reason for a failure in the domain in `root`: another user's directory or file with owner, mode and
-/// remedy, otherwise a shortage if there is one, otherwise `what`.
+/// Returns the failure for `message` in the domain in `root`. If another user's directory or file is the reason, it
+/// reports that one with owner, mode and remedy. If a resource is short, it reports the shortage. Otherwise it reports
+/// `message`.
 pub(crate) fn access_failure(root: &Path, message: impl Into<String>) -> Failure {
     let directory = Directory::open(root).err();
     directory
@@ -217,7 +218,7 @@ fn prefix_start(root: &Path) -> String {
 /// # Errors
 ///
 /// Returns [`Kind::Failed`] with file, owner and remedy if another user's file has its name or another user could write
-/// to it. Returns [`Kind::Short`] if there is no memory for it.
+/// to it. Returns [`Kind::ResourceExhausted`] if there is no memory for it.
 pub(crate) fn ensure_node_counter(prefix: &str) -> Result<(), Failure> {
     let path = node_counter_path(prefix);
     loop {
@@ -287,7 +288,7 @@ const NODE_COUNTER_CONTENT: [u8; 16] = {
 
 /// Name of the prefix's file in the domain's directory.
 const PREFIX_FILE: &str = "prefix";
-/// Length of the random word: 60 million words.
+/// Length of the random word, which has one of 60 million values.
 const RANDOM_WORD_LEN: usize = 5;
 const ALPHABET: &[u8] = b"0123456789abcdefghijklmnopqrstuvwxyz";
 const MAX_PREFIX_FILE_BYTES: u64 = 64;

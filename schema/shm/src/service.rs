@@ -31,7 +31,7 @@ use crate::segments::access_failure;
 pub(crate) enum OpenFailure {
     /// The service does not exist, or is being created or removed right now.
     Absent,
-    /// There is no place for another process.
+    /// All slots for processes are taken.
     Full,
     /// The service has another layout, or another version of iceoryx2.
     Incompatible(&'static str),
@@ -105,8 +105,8 @@ pub(crate) fn name(service: &str) -> Result<ServiceName, Failure> {
     })
 }
 
-/// Calls `make` until the service exists, for at most two seconds. A service that its last user is leaving can be
-/// created again soon.
+/// Calls `make` until the service exists, for at most two seconds. A service that its last user is just leaving can
+/// soon be created again.
 #[expect(clippy::disallowed_methods, reason = "waits for a service that another process has half created")]
 pub(crate) fn create<T, S: Service>(
     node: &Node<S>,
@@ -152,7 +152,7 @@ pub fn sensors(domain: &Domain) -> Result<Vec<String>, Failure> {
     sensors_with_topic(domain, |_| true)
 }
 
-/// Returns those of [`sensors`] that have a link, here or on another machine. A tracker has no link.
+/// Returns the [`sensors`] that have a link, here or on another machine. A tracker has no link.
 ///
 /// # Errors
 ///
@@ -161,7 +161,7 @@ pub fn links(domain: &Domain) -> Result<Vec<String>, Failure> {
     sensors_with_topic(domain, |topic| topic.publisher_kind() == PublisherKind::Link)
 }
 
-/// Returns those of [`sensors`] that have zones. A robot's combined verdict is computed from them.
+/// Returns the [`sensors`] that have zones. A robot's combined verdict is computed from them.
 ///
 /// # Errors
 ///
@@ -177,8 +177,8 @@ fn sensors_with_topic(domain: &Domain, is_match: impl Fn(Topic) -> bool) -> Resu
     Ok(sensors)
 }
 
-/// Returns all topics in `domain` with their sensors, sorted by sensor. Those of a dead hub stay as long as a
-/// subscriber keeps them.
+/// Returns all topics in `domain` with their sensors, sorted by sensor. The topics of a dead hub exist until their last
+/// subscriber leaves.
 ///
 /// # Errors
 ///
@@ -214,7 +214,7 @@ pub(crate) fn publisher_failure(service: &ServiceName, error: PublisherCreateErr
     }
 }
 
-/// Returns the failure if all `limit` places for subscribers of the topic `service` are taken.
+/// Returns the failure if all `limit` slots for subscribers of the topic `service` are taken.
 pub(crate) fn subscribers_full(service: &ServiceName, limit: usize) -> Failure {
     let (start, key) = match parse_service_name(service.as_str()) {
         Some((sensor, _)) if is_remote(sensor) => ("start what publishes it", "--subscribers"),
@@ -228,7 +228,7 @@ pub(crate) fn subscribers_full(service: &ServiceName, limit: usize) -> Failure {
     Failure { hint, ..clients_full(service, limit) }
 }
 
-/// Returns the failure if all `limit` places for subscribers or clients of `service` are taken.
+/// Returns the failure if all `limit` slots for subscribers or clients of `service` are taken.
 pub(crate) fn clients_full(service: &ServiceName, limit: usize) -> Failure {
     Failure::new(
         Kind::ResourceExhausted,
@@ -237,7 +237,7 @@ pub(crate) fn clients_full(service: &ServiceName, limit: usize) -> Failure {
     )
 }
 
-/// Returns the failure for any other port that cannot be created. As a rule, descriptors or places are short.
+/// Returns the failure for any other port that cannot be created. Usually descriptors or slots are short.
 pub(crate) fn port_failure(service: &ServiceName, error: &dyn Debug) -> Failure {
     resource_limits::find_shortage(Path::new(resource_limits::SHARED_MEMORY_DIRECTORY)).unwrap_or_else(|| {
         let hint = "too many subscribers, or `ulimit -n` is too small: about 4 descriptors for each";

@@ -1,5 +1,5 @@
-//! A topic in shared memory: its service, its subscriber, and its publisher, which numbers samples, writes them in
-//! place, and counts those that there is no memory for. The code for each payload is generated from the table of
+//! A topic in shared memory: its service, its subscriber and its publisher. The publisher numbers samples, writes them
+//! in place, and counts those that it has no memory for. The code for each payload is generated from the table of
 //! topics.
 
 use std::borrow::BorrowMut;
@@ -46,12 +46,12 @@ pub trait Payload: sealed::Sealed + Debug + 'static {
     type Memory: IceoryxSend + Debug + ?Sized + 'static;
 
     /// Returns the topic of `sensor`, for the hub. It is created with `limits` if it does not exist. If subscribers of
-    /// a dead hub keep it alive, it is reused with its number of places.
+    /// a dead hub keep it alive, it is reused with its number of slots.
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::ResourceExhausted`] if memory or descriptors are short, and [`Kind::Incompatible`] if it exists with another
-    /// layout.
+    /// Returns [`Kind::ResourceExhausted`] if memory or descriptors are short, and [`Kind::Incompatible`] if it exists
+    /// with another layout.
     fn create<S: Service>(
         node: &Node<S>,
         sensor: &str,
@@ -62,7 +62,8 @@ pub trait Payload: sealed::Sealed + Debug + 'static {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::ResourceExhausted`] if memory or descriptors are short, and [`Kind::Incompatible`] if it has another layout.
+    /// Returns [`Kind::ResourceExhausted`] if memory or descriptors are short, and [`Kind::Incompatible`] if it has
+    /// another layout.
     fn open<S: Service>(node: &Node<S>, sensor: &str) -> Result<Option<TopicService<Self, S>>, Failure>;
 
     /// Returns the publisher of a topic, with memory for the longest samples that `limits` allow.
@@ -79,7 +80,7 @@ pub trait Payload: sealed::Sealed + Debug + 'static {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::ResourceExhausted`] if memory, descriptors or places for subscribers are short.
+    /// Returns [`Kind::ResourceExhausted`] if memory, descriptors or slots for subscribers are short.
     fn subscriber<S: Service>(
         node: &Node<S>,
         topic: &TopicService<Self, S>,
@@ -107,7 +108,7 @@ pub trait Payload: sealed::Sealed + Debug + 'static {
     /// Returns the payload of a loaned sample.
     fn write<S: Service>(loan: &mut SampleMut<Self, S>) -> &mut Self;
 
-    /// A payload in the memory of this process.
+    /// Type of a payload in the memory of this process.
     type Owned: BorrowMut<Self>;
 
     /// Returns a default payload in the memory of this process. A payload of variable length has `len` bytes, at least
@@ -275,7 +276,7 @@ macro_rules! payloads {
 
 scanhub_schema::for_each_topic!(payloads);
 
-// The bytes of a telegram with a name, for programs. The hub uses the bytes themselves.
+// Telegrams as a type with a name, for programs. The hub uses the bytes themselves.
 payload!(
     TelegramBytes,
     Topic::Telegram,
@@ -290,7 +291,7 @@ payload!(
     TelegramBytes::bytes
 );
 
-/// Returns the number of places for subscribers that `topic` was created with.
+/// Returns the number of slots for subscribers that `topic` was created with.
 pub fn subscriber_capacity<P: Payload + ?Sized, S: Service>(topic: &TopicService<P, S>) -> usize {
     topic.static_config().max_subscribers()
 }
@@ -357,14 +358,14 @@ impl<P: Payload + ?Sized, S: Service> SharedMemory<P, S> {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::DomainHeld`] if another process publishes the topic, [`Kind::ResourceExhausted`] if memory or descriptors
-    /// are short, and [`Kind::Incompatible`] if the topic exists with another layout.
+    /// Returns [`Kind::DomainHeld`] if another process publishes the topic, [`Kind::ResourceExhausted`] if memory or
+    /// descriptors are short, and [`Kind::Incompatible`] if the topic exists with another layout.
     pub fn new(node: &Node<S>, sensor: &str, limits: &TopicLimits) -> Result<Self, Failure> {
         let service = P::create(node, sensor, limits)?;
         Ok(SharedMemory { publisher: P::publisher(&service, limits)?, service })
     }
 
-    /// Returns the number of places for subscribers. A topic that was taken over may have another number than its
+    /// Returns the number of slots for subscribers. A topic that was taken over may have another number than its
     /// limits.
     pub fn subscriber_capacity(&self) -> usize {
         subscriber_capacity::<P, S>(&self.service)
@@ -396,7 +397,7 @@ impl<P: Payload + ?Sized, S: Service> SampleTransport<P> for SharedMemory<P, S> 
     }
 }
 
-/// Publishes the samples of one topic of one sensor. Their numbers start at 0 and have a gap where samples were lost
+/// Publisher of one topic of one sensor. It numbers samples from 0. The numbers have a gap where samples were lost
 /// before they could be sent.
 #[derive(Debug)]
 pub struct TopicPublisher<P: Payload + ?Sized, M = SharedMemory<P>> {
@@ -407,7 +408,8 @@ pub struct TopicPublisher<P: Payload + ?Sized, M = SharedMemory<P>> {
 }
 
 impl<P: Payload + ?Sized, S: Service> TopicPublisher<P, SharedMemory<P, S>> {
-    /// Creates a publisher into shared memory. Otherwise the same as [`with_transport`](TopicPublisher::with_transport).
+    /// Creates a publisher into shared memory. Otherwise the same as
+    /// [`with_transport`](TopicPublisher::with_transport).
     ///
     /// # Errors
     ///
@@ -459,7 +461,7 @@ impl<P: Payload + ?Sized, M: SampleTransport<P>> TopicPublisher<P, M> {
     /// # Errors
     ///
     /// Returns the library's error if there is no memory, or if bytes are longer than
-    /// [`Telegram::MAX`](scanhub_schema::Telegram::MAX_LEN).
+    /// [`Telegram::MAX_LEN`](scanhub_schema::Telegram::MAX_LEN).
     pub fn loan(&self, len: usize) -> Result<M::Loan, LoanError> {
         self.transport.loan(len)
     }
@@ -475,7 +477,7 @@ impl<P: Payload + ?Sized, M: SampleTransport<P>> TopicPublisher<P, M> {
         self.transport.send(loan, &header).inspect_err(|_| self.failed += 1)
     }
 
-    /// Uses a number for a sample that there is no memory for.
+    /// Uses up the number of a sample for which there is no memory.
     pub fn count_failed(&mut self) {
         self.next += 1;
         self.failed += 1;
@@ -486,8 +488,8 @@ impl<P: Payload + ?Sized, M: SampleTransport<P>> TopicPublisher<P, M> {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::ResourceExhausted`] if there is no memory for it, or if it is longer than the topic was created for. Its
-    /// number is then used.
+    /// Returns [`Kind::ResourceExhausted`] if there is no memory for it, or if it is longer than the topic was created
+    /// for. Its number is then used.
     pub fn send_len(
         &mut self,
         header: &Header,
@@ -521,7 +523,7 @@ impl<M: SampleTransport<[u8]>> TopicPublisher<[u8], M> {
     /// # Errors
     ///
     /// Returns [`Kind::ResourceExhausted`] if there is no memory for it, or if it is longer than
-    /// [`Telegram::MAX`](scanhub_schema::Telegram::MAX_LEN).
+    /// [`Telegram::MAX_LEN`](scanhub_schema::Telegram::MAX_LEN).
     pub fn send_bytes(&mut self, header: &Header, bytes: &[u8]) -> Result<usize, Failure> {
         self.send_len(header, bytes.len(), |sample| sample.copy_from_slice(bytes))
     }

@@ -1,5 +1,5 @@
-//! Waking the subscribers of a sensor: a doorbell for programs that use this code, and an event service for all other
-//! languages. The hub rings and notifies without knowing which of the two has subscribers.
+//! Wake-ups of the subscribers of a sensor: a doorbell for programs that use this code, and an event service for all
+//! other languages. The hub uses both, whichever of them has subscribers.
 //!
 //! A thread can sleep on the events of several sensors at once. Waking up and taking the wake-ups are two calls, so
 //! that samples can be received in between. A pending wake-up loses nothing, and taking it costs several system calls.
@@ -26,13 +26,13 @@ use crate::service::{OpenFailure, clients_full, create, name, open, port_failure
 
 /// Event service that wakes the subscribers of one sensor.
 pub type WakeService<S = LocalService> = event::PortFactory<S>;
-/// Wakes subscribers.
+/// Port that wakes subscribers.
 pub type Notifier<S = LocalService> = port::notifier::Notifier<S>;
-/// Sleeps until it is woken.
+/// Port on which a subscriber sleeps.
 pub type Listener<S = LocalService> = port::listener::Listener<S>;
 
-/// The hub's end. It wakes subscribers with [`WakeEvent::HubUp`] when it is created, and with [`WakeEvent::HubDown`] when it is
-/// dropped.
+/// The hub's end. It wakes subscribers with [`WakeEvent::HubUp`] when it is created, and with [`WakeEvent::HubDown`]
+/// when it is dropped.
 pub struct WakeSender<S: Service = LocalService> {
     ringer: DoorbellRinger,
     notifier: Notifier<S>,
@@ -40,25 +40,26 @@ pub struct WakeSender<S: Service = LocalService> {
 }
 
 impl<S: Service> WakeSender<S> {
-    /// Creates the waker of `sensor`. Create it before the sensor's topics, because a subscriber that finds a topic
-    /// sleeps at it.
+    /// Creates the sender of `sensor`. Create it before the sensor's topics, because a subscriber that finds a topic
+    /// sleeps on it.
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::ResourceExhausted`] if memory is short, and [`Kind::Incompatible`] if the service has another layout.
+    /// Returns [`Kind::ResourceExhausted`] if memory is short, and [`Kind::Incompatible`] if the service has another
+    /// layout.
     pub fn new(node: &Node<S>, sensor: &str) -> Result<WakeSender<S>, Failure> {
         let ringer = DoorbellRinger::open_or_create(node, sensor)?;
         let service = create_service(node, sensor)?;
         Ok(WakeSender { ringer, notifier: notifier(&service, WakeEvent::Telegram as usize)?, service })
     }
 
-    /// Wakes all threads that sleep at the doorbell word `ring`, with one system call.
+    /// Wakes all threads that sleep on the doorbell word `word`, with one system call.
     pub fn ring(&self, word: DoorbellWord) {
         self.ringer.ring(word);
     }
 
-    /// Returns a number that changes when a subscriber or listener of the sensor attaches by a library of this project.
-    /// Other programs may not change it.
+    /// Returns a number that changes when a subscriber or listener of the sensor attaches through a library of this
+    /// project. Other programs may not change it.
     pub fn attached(&self) -> u32 {
         self.ringer.attached()
     }
@@ -68,7 +69,7 @@ impl<S: Service> WakeSender<S> {
         self.service.dynamic_config().number_of_listeners() > 0
     }
 
-    /// Sends the event `why` to its listeners.
+    /// Sends `event` to its listeners.
     ///
     /// # Errors
     ///
@@ -83,7 +84,7 @@ impl<S: Service> WakeSender<S> {
             .map_err(|error| Failure::new(Kind::Failed, format!("cannot wake subscribers: {error:?}"), ""))
     }
 
-    /// Wakes all subscribers for `why`, whatever topics they have.
+    /// Wakes all subscribers for `event`, whatever topics they have.
     ///
     /// # Errors
     ///
@@ -99,17 +100,17 @@ impl<S: Service> WakeSender<S> {
     }
 }
 
-/// Doorbell words to ring: a subscriber has received a sample of one of their topics since they were last rung.
+/// Doorbell words that must be rung, because subscribers have received samples since the last ring.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct PendingWakeups([bool; DoorbellWord::ALL.len()]);
 
 impl PendingWakeups {
-    /// Records that `reached` subscribers received a sample of `topic`.
+    /// Records that `receivers` subscribers received a sample of `topic`.
     pub fn note_sample(&mut self, topic: Topic, receivers: usize) {
         self.0[topic.spec().doorbell_word as usize] |= receivers > 0;
     }
 
-    /// Returns whether `ring` must be rung, and records it as rung.
+    /// Returns whether `word` must be rung, and records it as rung.
     pub fn take_due(&mut self, word: DoorbellWord) -> bool {
         std::mem::take(&mut self.0[word as usize])
     }
@@ -136,8 +137,8 @@ fn create_service<S: Service>(node: &Node<S>, sensor: &str) -> Result<WakeServic
 ///
 /// # Errors
 ///
-/// Returns [`Kind::ResourceExhausted`] if memory or descriptors are short, and [`Kind::Incompatible`] if the service has another
-/// layout.
+/// Returns [`Kind::ResourceExhausted`] if memory or descriptors are short, and [`Kind::Incompatible`] if the service
+/// has another layout.
 pub fn open_wake<S: Service>(node: &Node<S>, sensor: &str) -> Result<Option<WakeService<S>>, Failure> {
     open_event(node, &WakeEvent::service(sensor))
 }
@@ -151,7 +152,7 @@ pub(crate) fn open_event<S: Service>(
     open(node, &service, node.service_builder(&service).event().open())
 }
 
-/// Returns a notifier of the event whose default event ID is `event`.
+/// Returns a notifier whose default event ID is `event`.
 pub(crate) fn notifier<S: Service>(service: &WakeService<S>, event: usize) -> Result<Notifier<S>, Failure> {
     let builder = service.notifier_builder().default_event_id(EventId::new(event));
     builder.create().map_err(|error| port_failure(service.name(), &error))
@@ -161,7 +162,7 @@ pub(crate) fn notifier<S: Service>(service: &WakeService<S>, event: usize) -> Re
 ///
 /// # Errors
 ///
-/// Returns [`Kind::ResourceExhausted`] if memory, descriptors or places for subscribers are short.
+/// Returns [`Kind::ResourceExhausted`] if memory, descriptors or slots for subscribers are short.
 pub fn listener<S: Service>(node: &Node<S>, wake: &WakeService<S>) -> Result<Listener<S>, Failure> {
     let listener = create_listener(wake)?;
     if let Some((sensor, _)) = parse_service_name(wake.name().as_str()) {

@@ -1,4 +1,4 @@
-//! Topics in shared memory, each test in a domain of its own.
+//! Tests of topics in shared memory, each in a separate domain.
 
 mod temp_domain;
 
@@ -246,7 +246,7 @@ fn topic_half_created_by_a_killed_hub_is_recreated() {
     let text = std::fs::read(&description).unwrap();
     drop((topic, hub));
     assert!(!description.exists());
-    // Written, but not yet made read-only.
+    // A service description that was written but is not read-only yet.
     std::fs::write(&description, text).unwrap();
     let hub = scanhub_shm::hub_node(&test_domain.domain).unwrap();
     Scan::create(&hub, "front", &TOPIC_LIMITS).unwrap();
@@ -283,7 +283,7 @@ fn clients_that_went_while_they_asked_are_no_obstacle() {
         let client = scanhub_shm::ControlClient::open(&node).unwrap().expect("the hub made it");
         let pending = client.send(&Request::new("front", verb)).unwrap();
         if verb == Verb::Pause {
-            // Received and then given up.
+            // Receives the request and drops it without a response.
             let request = server.receive().unwrap().expect("was asked");
             drop(pending);
             assert!(!request.is_client_waiting());

@@ -1,4 +1,4 @@
-//! The names of a domain's shared memory, and the bells that lie under them.
+//! Tests of the names of a domain's shared memory, and of the doorbells with these names.
 
 #![expect(clippy::disallowed_methods, reason = "limits and periods of real time")]
 
@@ -40,7 +40,7 @@ fn one_ring_wakes_all_sleepers_of_a_doorbell() {
             })
         })
         .collect();
-    // Of a sensor that only half of them follow; they go on sleeping.
+    // Only half of the threads also wait for `front`. They continue to sleep on `rear`.
     front.wake(WakeEvent::Telegram).unwrap();
     rear.wake(WakeEvent::Telegram).unwrap();
     assert!(sleepers.into_iter().all(|sleeper| sleeper.join().unwrap() == ring_count + 1));
@@ -81,7 +81,7 @@ fn the_bell_of_a_killed_hub_is_rung_by_the_next_one() {
     let hub = scanhub_shm::hub_node(&test_domain.domain).unwrap();
     let killed = WakeSender::new(&hub, "front").unwrap();
     let doorbell = Doorbell::open(&hub, "front").unwrap().expect("the hub hung it");
-    // A process that is killed closes nothing.
+    // A process that is killed does not close its doorbell.
     std::mem::forget(killed);
     let next = WakeSender::new(&hub, "front").unwrap();
     let ring_count = doorbell.ring_count(DoorbellWord::First);
@@ -145,7 +145,7 @@ fn the_last_one_out_takes_the_names_along() {
     assert!(prefix().is_some_and(|second| second != first));
 }
 
-/// Root and prefix are as long as they may be.
+/// Creates a domain at a location of the maximum length, and uses all kinds of shared memory in it.
 #[test]
 fn at_the_longest_place_all_works() {
     let test_domain = TempDomain::new();
@@ -166,7 +166,7 @@ fn at_the_longest_place_all_works() {
     assert!(Scan::receive(&subscriber).unwrap().is_some());
 }
 
-/// CLOCK_MONOTONIC in so many seconds.
+/// Returns the time of CLOCK_MONOTONIC in `seconds` seconds.
 fn ns_after_seconds(seconds: i64) -> u64 {
     let now = clock_gettime(ClockId::Monotonic);
     (now.tv_sec + seconds) as u64 * 1_000_000_000 + now.tv_nsec as u64

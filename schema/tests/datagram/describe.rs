@@ -1,4 +1,4 @@
-//! Describes datagrams in the terms of the list of golden datagrams.
+//! JSON description of the contents of a datagram, as in the list of golden datagrams.
 
 use scanhub_schema::datagram::{Announce, Datagram, DatagramPayload, MTU_SAFE};
 use scanhub_schema::{
@@ -71,7 +71,7 @@ fn scan(scan: &Scan) -> Value {
         "incomplete": scan.is_incomplete(), "intensity_bits": scan.intensity_bits,
         "ranges": scan.ranges(), "codes": each(&|i| scan.code(i).map(Code::name).into()),
         "times_ns": each(&|i| scan.beam_ns(i).into()),
-        // JSON has no nan.
+        // JSON has no NaN.
         "angles": scan.exact_angles().iter().map(|&exact| Some(exact).filter(|exact| !exact.is_nan())).collect::<Vec<_>>(),
         "intensities": scan.intensities().iter().collect::<Vec<_>>(), "upper": scan.upper(),
     })

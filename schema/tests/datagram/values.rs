@@ -9,10 +9,10 @@ use scanhub_schema::{
     Tilt, Topic, Track, TrackSensor, TrackState, Tracks, Verdict, Zone, Zones,
 };
 
-/// Name of the file, header, and what writes the payload.
+/// Name of the file, header, and function that writes the payload.
 pub(crate) type GoldenDatagram = (&'static str, Head, fn(&mut [u8]) -> Option<usize>);
 
-/// Those that a gateway of this version sends.
+/// Datagrams that a gateway of this version sends.
 pub(crate) const GOLDEN_DATAGRAMS: [GoldenDatagram; 22] = [
     ("announce", Head { sequence: 7, counter: 0, ..head(None) }, announce),
     ("telegram", Head { sequence: u32::MAX, ..head(Some(Topic::Telegram)) }, telegram),
@@ -105,7 +105,7 @@ const EARLY_WARNING: Early = Early {
     beams_seen: 148,
 };
 
-/// The header of `zones`.
+/// Header of a datagram with `zones`.
 pub(crate) const ZONES_HEAD: Head = Head { sequence: 5000, ..head(Some(Topic::Zones)) };
 
 const fn head(topic: Option<Topic>) -> Head {
@@ -139,7 +139,7 @@ fn announce(buffer: &mut [u8]) -> Option<usize> {
     announce.pack(buffer)
 }
 
-/// The packet that the manual of the LD06 explains, twice.
+/// The example packet in the manual of the LD06, twice.
 fn packets(buffer: &mut [u8]) -> Option<usize> {
     const PACKET: [u8; 47] = [
         0x54, 0x2C, 0x68, 0x08, 0xAB, 0x7E, 0xE0, 0x00, 0xE4, 0xDC, 0x00, 0xE2, 0xD9, 0x00, 0xE5, 0xD5, 0x00,
@@ -155,7 +155,7 @@ fn telegram(buffer: &mut [u8]) -> Option<usize> {
     Some(telegram.len())
 }
 
-/// Every 60th beam has a code. All upper bits are 0 where there are no intensities.
+/// Returns a scan in which every 60th beam has a code. If there are no intensities, all upper bits are 0.
 fn scan(count: u16, first_angle_mdeg: i32, step_mdeg: u32, intensity_bits: u8) -> Box<Scan> {
     let head = ScanHead::lms(count.into(), first_angle_mdeg, step_mdeg, 1, 13);
     let range = |i| if i % 60 == 0 { 0x1FFF - i / 60 } else { 1000 + 37 * i % 7000 };
@@ -167,7 +167,8 @@ fn scan(count: u16, first_angle_mdeg: i32, step_mdeg: u32, intensity_bits: u8) -
     scan
 }
 
-/// Eight bins of a clockwise turn with all arrays: a code in each second, the first of them not measured.
+/// Returns eight beams of a clockwise revolution with all arrays. Every second beam has a code, the first of them
+/// `not_measured`.
 fn full_circle_scan() -> Box<Scan> {
     let head = ScanHead {
         first_angle: -0.375,
@@ -223,7 +224,7 @@ fn marks() -> Marks {
     marks
 }
 
-/// Numbers that a 32-bit float has exactly.
+/// Returns a motion whose numbers are exact as 32-bit floats.
 fn motion() -> Motion {
     Motion {
         x_m: 12.5,
@@ -242,7 +243,7 @@ fn motion() -> Motion {
     }
 }
 
-/// The same.
+/// Returns lines whose numbers are exact as 32-bit floats.
 fn lines() -> Lines {
     let mut lines = Lines {
         count: 2,
@@ -299,7 +300,7 @@ fn zones() -> Zones {
     zones
 }
 
-/// 64 segments of three beams, of which 54 fit.
+/// Returns 64 segments of three beams, of which 54 fit into a datagram.
 fn foreground() -> Box<Foreground> {
     let mut foreground = Foreground::of(361);
     let head = ForegroundHead {
@@ -350,7 +351,7 @@ fn background() -> Box<Background> {
 
 fn status() -> Status {
     let mut counters = [0; MAX_COUNTERS];
-    // Those that came later are 0 in it.
+    // Counters that were added after `line_errors` are 0 here.
     for (i, counter) in counters[..=Counter::LineErrors as usize].iter_mut().enumerate() {
         *counter = 1_000_000_000_000_000 + i as u64;
     }

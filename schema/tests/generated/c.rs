@@ -59,7 +59,7 @@ fn prefix(set: &str) -> String {
     format!("SCANHUB_{}_", name.to_uppercase())
 }
 
-/// Returns the set that already has constants for the values of this one, if there is one.
+/// Returns the set that already has constants for the values of this one, or `None`.
 fn shared_prefix(set: &str) -> Option<&'static str> {
     (set == "Obstacles").then_some("Cloud")
 }

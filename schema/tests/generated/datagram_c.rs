@@ -10,7 +10,7 @@ use super::description::{Description, Field, Kind, Layout, snake};
 use super::readers::{self, BoundsCheck, FieldSource, FloatRun, ShownField};
 use super::rules;
 
-/// Enums whose values have names in this header, with their names.
+/// Enums whose values have names in this header: name in Rust, name in C, and start of the names of the values.
 const ENUM_NAMES: [(&str, &str, &str); 6] = [
     ("Family", "family", ""),
     ("Verdict", "verdict", ""),

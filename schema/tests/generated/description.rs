@@ -86,7 +86,7 @@ const NUMBER_TYPES: [(&str, usize); 10] = [
     ("f64", 8),
 ];
 
-/// Stands in a comment for the values of the field's set.
+/// Character in a comment that is replaced by the values of the field's set.
 const VALUES_MARK: char = '\u{1}';
 
 impl Field {

@@ -7,7 +7,7 @@ use super::rules::fixed_part;
 
 /// A field as the readers of datagrams show it.
 pub(crate) struct ShownField<'a> {
-    /// Name in Python and Lua, and in C unless [`name_in_c`] has another one.
+    /// Name in Python and Lua. C may use another name.
     pub(crate) name: String,
     pub(crate) field: &'a Field,
     /// Index of the first element in the field.
@@ -125,7 +125,7 @@ pub(crate) fn checks(payload: &str) -> &'static [BoundsCheck] {
     }
 }
 
-/// Which numbers of a field must not be infinite or NaN.
+/// Numbers of a field that must not be infinite or NaN.
 #[derive(Clone, Copy, PartialEq)]
 pub(crate) enum FiniteRule {
     Required,
@@ -214,7 +214,8 @@ pub(crate) fn names_of(set: &str) -> String {
     }
 }
 
-/// Payloads whose arrays depend on each other, so that Python and Lua read them by hand. Only their heads are generated.
+/// Payloads whose arrays depend on each other, so that Python and Lua read them by hand. Only their heads are
+/// generated.
 pub(crate) const VARIABLE_PAYLOADS: [&str; 2] = ["Scan", "Foreground"];
 
 /// Returns the field and the value of it with which a field is unknown.

@@ -11,7 +11,7 @@ const MAX_LINE_WIDTH: usize = 120;
 const NAME_COLUMN: usize = 25;
 /// A set of more values is not listed.
 const MAX_VALUES: usize = 10;
-/// Stands for a space at which a line does not end.
+/// Character for a space at which a line must not end.
 const JOIN_MARK: &str = "\u{1}";
 
 /// Returns the description: the header, and a paragraph for each topic.

@@ -112,8 +112,8 @@ pub(crate) fn number_size(kind: &str) -> usize {
     kind[1..].parse::<usize>().expect("a number's type ends with its bits") / 8
 }
 
-/// Returns the size in bytes of a payload's first revision if a later one has more fields. Readers fill the missing fields
-/// with 0.
+/// Returns the size in bytes of a payload's first revision if a later one has more fields. Readers fill the missing
+/// fields with 0.
 pub(crate) fn first_revision(layout: &str) -> Option<usize> {
     (layout == "Motion").then_some(80)
 }

@@ -430,7 +430,8 @@ impl ProtocolState {
         self.open_request = None;
         self.has_received = false;
         let give_up_at = now + LISTEN_TIME.max(2 * self.scan_period());
-        // An interrupted stream may continue, and bytes from a network arrive in bursts, so a short silence does not prove that there is no stream.
+        // An interrupted stream may continue, and bytes from a network arrive in bursts, so a short silence does not
+        // prove that there is no stream.
         let may_pause = shown == State::Silent || self.settings.fixed_rate;
         let quiet_at = if may_pause { give_up_at } else { now + QUIET_TIME };
         self.phase = Phase::Listening { deadline: give_up_at, quiet_at, shown, attempt: 0 };

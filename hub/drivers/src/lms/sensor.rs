@@ -139,7 +139,7 @@ pub struct Sensor {
     is_confirmed: bool,
 }
 
-/// Issues of a status report: whether the scanner is defective, and whether its window is dirty.
+/// The two issues in a status report: a defective scanner and a dirty window.
 type HealthIssues = (bool, bool);
 
 impl Sensor {

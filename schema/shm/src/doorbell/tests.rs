@@ -1,6 +1,6 @@
-//! The interleavings of hubs and consumers, and the orders in which their memory may be seen, over a futex made of a
-//! lock and a condition variable. A wake-up is lost if a consumer sleeps when no hub will wake it any more: then the
-//! model ends its sleep and counts it.
+//! Model checks of the doorbell over all interleavings of hubs and subscribers, and all permitted orders of their
+//! memory accesses. The futex is modeled by a lock and a condition variable. A wake-up is lost if a subscriber sleeps
+//! and no hub will wake it any more. The model then ends the sleep and counts it.
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicUsize;
@@ -11,14 +11,14 @@ use loom::thread;
 
 use super::*;
 
-/// What the kernel does: it compares words and puts to sleep under one lock.
+/// Model of the kernel's futex, which compares words and puts threads to sleep under one lock.
 #[derive(Default)]
 struct Futex {
     calls: Mutex<Calls>,
     changed: Condvar,
 }
 
-/// How often threads were woken, and how many hubs may still wake some.
+/// Number of wake-ups, and number of hubs that may still wake threads.
 #[derive(Default)]
 struct Calls {
     wakes: u32,
@@ -59,8 +59,8 @@ impl FutexWord for ModelWord {
     }
 }
 
-/// As the system's call: returns at once if one of the words has another value than the one beside it. False where nobody is left
-/// to wake the caller.
+/// Sleeps like the system call: returns at once if one of the words differs from its given value. Returns `false` if no
+/// hub is left to wake the caller.
 fn sleep(words: &[(&ModelWord, u32)]) -> bool {
     let futex = &words[0].0.futex;
     let mut calls = futex.calls.lock().unwrap();
@@ -77,7 +77,8 @@ fn sleep(words: &[(&ModelWord, u32)]) -> bool {
     true
 }
 
-/// One sensor's page, and how many samples were sent: seen no earlier than the words allow.
+/// The page of one sensor, and the number of the last sample. The memory orders of the words decide when a thread sees
+/// it.
 struct Sensor {
     rung: ModelWord,
     closed: ModelWord,
@@ -93,7 +94,8 @@ impl Sensor {
         self.sent.store(number, Ordering::Relaxed);
     }
 
-    /// As a consumer does: the number first, then what was sent, then sleep. False if the wake-up was lost.
+    /// Waits for sample `number` like a subscriber: reads the count, then the samples, then sleeps. Returns `false` if
+    /// the wake-up was lost.
     fn await_sample(&self, number: u32) -> bool {
         loop {
             let ring_count = read_count(&self.rung);
@@ -123,7 +125,7 @@ fn new_sensor() -> Arc<Sensor> {
     Arc::new(Sensor::new(&Arc::default()))
 }
 
-/// Runs `act` in a thread with a sensor of its own.
+/// Runs `act` on `sensor` in a thread.
 fn spawn_subscriber(
     sensor: &Arc<Sensor>,
     act: impl FnOnce(&Sensor) -> bool + 'static,
@@ -132,7 +134,7 @@ fn spawn_subscriber(
     thread::spawn(move || act(&sensor))
 }
 
-/// Runs `act` in a thread that is counted as a hub until it is through.
+/// Runs `act` in a thread that counts as a hub until it returns.
 fn spawn_hub(sensor: &Arc<Sensor>, act: impl FnOnce(&Sensor) + 'static) -> thread::JoinHandle<()> {
     let sensor = sensor.clone();
     sensor.rung.futex.calls.lock().unwrap().hubs += 1;
@@ -143,8 +145,9 @@ fn spawn_hub(sensor: &Arc<Sensor>, act: impl FnOnce(&Sensor) + 'static) -> threa
     })
 }
 
-/// Tries `act` in all interleavings with at most two switches away from a thread that could go on, which is where nearly all
-/// faults of this kind lie and takes seconds in place of hours; in how many of them it says false.
+/// Runs `act` in all interleavings with at most two switches away from a thread that could continue. Nearly all defects
+/// of this kind need no more, and it takes seconds instead of hours. Returns the number of interleavings in which `act`
+/// returns `false`.
 fn count_lost_wakeups(act: impl Fn() -> bool + Sync + Send + 'static) -> usize {
     let lost = Arc::new(AtomicUsize::new(0));
     let count = lost.clone();
@@ -193,7 +196,7 @@ fn one_call_wakes_two_subscribers() {
 
 #[test]
 fn next_hub_wakes_sleepers_left_by_a_killed_hub() {
-    // Killed before the number, and after it.
+    // The hub is killed before it increments the count, or after that.
     for counted in [false, true] {
         let lost = count_lost_wakeups(move || {
             let sensor = new_sensor();
@@ -279,7 +282,7 @@ fn model_detects_a_wakeup_lost_without_the_fence() {
             ring(&sensor.rung);
         });
         let got = loop {
-            // Without the fence of `rung`.
+            // Without the fence of `read_count`.
             let ring_count = sensor.rung.load(Ordering::Relaxed);
             if sensor.sent.load(Ordering::Relaxed) == 1 {
                 break true;

@@ -1,11 +1,11 @@
-//! A domain of one test's own.
+//! A domain for a single test.
 
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use scanhub_shm::Domain;
 
-/// A domain that goes with the test.
+/// A domain that is removed at the end of the test.
 pub(crate) struct TempDomain {
     pub(crate) base: PathBuf,
     pub(crate) domain: Domain,
@@ -24,7 +24,7 @@ impl TempDomain {
 impl Drop for TempDomain {
     fn drop(&mut self) {
         let _ = std::fs::remove_dir_all(&self.base);
-        // The node management of a domain outlives its nodes.
+        // The library's management segment of a domain outlives its nodes.
         for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
             if entry.file_name().to_string_lossy().starts_with(&self.domain.prefix()) {
                 let _ = std::fs::remove_file(entry.path());

@@ -513,8 +513,8 @@ impl SimulatedScanner {
         }
     }
 
-    /// Sends a descriptor, followed by `data` as a single reply. If `times` is not 0, the descriptor announces packets whose
-    /// length is `data[0]`, and nothing else is sent.
+    /// Sends a descriptor, followed by `data` as a single reply. If `times` is not 0, the descriptor announces packets
+    /// whose length is `data[0]`, and nothing else is sent.
     fn reply(&mut self, answer: u8, times: u8, data: &[u8], now: Nanos) {
         let len = if times > 0 { data[0] } else { data.len() as u8 };
         let mut at = (now + 2 * MILLIS).max(self.free_at);
