@@ -144,7 +144,7 @@ fn write_request(f: &mut fmt::Formatter<'_>, telegram: Telegram<'_>) -> fmt::Res
         }
         Some(_) => Ok(()),
         None if EEPROM_WRITES.contains(&telegram.command()) => f.write_str(" (EEPROM)"),
-        None => f.write_str(", not as it should be"),
+        None => f.write_str(", malformed"),
     }
 }
 
@@ -177,14 +177,14 @@ fn write_reply(f: &mut fmt::Formatter<'_>, telegram: Telegram<'_>) -> fmt::Resul
         Some(Reply::Variant { done, angle_deg, resolution_cdeg }) => {
             let degrees = Degrees(resolution_cdeg);
             let outcome = if done { "done" } else { "not done" };
-            write!(f, ": {outcome}, {angle_deg} degrees at {degrees} in force")
+            write!(f, ": {outcome}, {angle_deg} degrees at {degrees} in effect")
         }
         Some(Reply::Configuration(configuration)) => write!(f, ": {}", configuration.mode().name()),
         Some(Reply::ConfigurationWritten { done, .. } | Reply::Configuration2Written { done, .. }) => {
             f.write_str(if done { ": done" } else { ": not done" })
         }
         Some(_) => Ok(()),
-        None => f.write_str(", not as it should be"),
+        None => f.write_str(", malformed"),
     }
 }
 
@@ -365,7 +365,7 @@ fn power_on(byte: u8) -> &'static str {
 fn selection(byte: u8) -> &'static str {
     match byte {
         1 => "all values",
-        2 => "least vertical distance",
+        2 => "shortest vertical distance",
         3 => "taught values",
         6 => "every 2nd value",
         7 => "every 20th value",
@@ -507,7 +507,7 @@ fn status_fields(reader: &mut FieldReader<'_, '_>) -> Option<()> {
                         "unit" => f.write_str(unit_text(value as u8)),
                         "defective" => f.write_str(if value == 0 { "no" } else { "yes" }),
                         "laser" => f.write_str(if value == 0 { "off" } else { "on" }),
-                        "motor" => write!(f, "{} us a turn", 90 * value),
+                        "motor" => write!(f, "{} us per revolution", 90 * value),
                         "laser power" => write!(f, "{value} %"),
                         "scan angle" => write!(f, "{value} degrees"),
                         "resolution" => write!(f, "{} degrees", Degrees(value as u16)),
@@ -554,7 +554,7 @@ fn done_if_zero(outcome: u8) -> &'static str {
 }
 
 fn done_if_one(outcome: u8) -> &'static str {
-    if outcome == 1 { "done" } else { "not done: what is in force follows" }
+    if outcome == 1 { "done" } else { "not done: the present settings follow" }
 }
 
 /// Hundredths of a degree, shown without trailing zeros: 0.25, 0.5, 1.

@@ -101,7 +101,7 @@ impl LmsModel {
             (_, LmsModel::Fast) if FIELD_WRITE_COMMANDS.contains(&command) => {
                 Some("version S14 has no fields")
             }
-            (REFLECTIVITIES | CARTESIAN, LmsModel::Fast) => Some("version S14 does not know this command"),
+            (REFLECTIVITIES | CARTESIAN, LmsModel::Fast) => Some("version S14 does not have this command"),
             _ => None,
         }
     }

@@ -68,7 +68,7 @@ impl fmt::Display for Problem {
             Problem::VariantRefused => f.write_str("the sensor keeps its own angle and resolution"),
             Problem::ModeUnknown => f.write_str("the sensor does not report its measuring mode: no scans"),
             Problem::AnglesUnknown => {
-                f.write_str("the sensor is a version S14, whose angles are not known here: no scans")
+                f.write_str("the scanner is a version S14, whose angles are not supported: no scans")
             }
             Problem::NoRanges(Mode(mode)) => {
                 write!(f, "the sensor measures in mode {mode:02x}h, which has no ranges: no scans")
@@ -83,8 +83,8 @@ impl fmt::Display for Problem {
             ),
             Problem::PortLacksRate { fallback: instead } => write!(
                 f,
-                "the port cannot have 500000 baud, so the hub uses {} baud, with a tenth of the scans. An adapter with \
-                 an FTDI chip can have it",
+                "the port does not support 500000 baud, so the hub uses {} baud, with a tenth of the scans. An adapter \
+                 with an FTDI chip supports it",
                 instead.rate()
             ),
             Problem::NeedsRs422 { fallback: None } => f.write_str(

@@ -35,7 +35,7 @@ impl fmt::Display for StatusByte {
             None => write!(f, "severity {}", self.0 & 7)?,
         }
         let flags = [
-            (self.0 >> 3 & 3 != 0b10, "no LMS of type 6"),
+            (self.0 >> 3 & 3 != 0b10, "not an LMS of type 6"),
             (self.0 & 0x20 != 0, "restart input high"),
             (self.0 & 0x40 != 0, "implausible values"),
             (self.is_polluted(), "window polluted"),
@@ -383,7 +383,7 @@ impl Fault {
             53 => "FLASH written",
             56 => "watchdog",
             57 => "no zero index",
-            58..=61 => "synchronisation of two sensors",
+            58..=61 => "synchronization of two scanners",
             62 => "DIP switches",
             86..=92 => "reference target",
             124..=126 => "memory",
@@ -426,7 +426,7 @@ mod tests {
             (0x92, "warning, window polluted"),
             (0x53, "error, implausible values"),
             (0x34, "fatal, restart input high"),
-            (0x18, "ok, no LMS of type 6"),
+            (0x18, "ok, not an LMS of type 6"),
             (0x15, "severity 5"),
         ] {
             assert_eq!(StatusByte(byte).to_string(), words);

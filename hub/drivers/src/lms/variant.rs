@@ -257,7 +257,7 @@ impl Mode {
             0x05 => "32 m, 2 reflector levels",
             0x06 => "32 m, field A",
             0x0F => "32 m, no bits above",
-            0x0D => "reserved; drivers use it for normalised remission",
+            0x0D => "reserved; drivers use it for normalized remission",
             0x0E => "reserved; drivers use it for remission",
             0x3F => "energy, no range",
             _ => "unknown",

@@ -196,7 +196,7 @@ fn scans_arrive_at_a_port_that_rejects_rates() {
                 // It was not sent to a rate that only it can have.
                 assert_eq!(session.rate(), 38_400, "{name}");
                 let problem = session.problem().map(|problem| problem.to_string()).unwrap_or_default();
-                assert!(problem.starts_with("the port cannot have 500000 baud"), "{name}: {problem}");
+                assert!(problem.starts_with("the port does not support 500000 baud"), "{name}: {problem}");
             }
         }
     }
