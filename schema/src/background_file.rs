@@ -133,15 +133,15 @@ impl ParsedFile {
             match slots.get_mut(beam) {
                 Some(slot @ &mut Background::UNKNOWN) => *slot = Background::FAR,
                 Some(_) => return Err(format!("beam {beam} is far twice, or has a range")),
-                None => return Err(format!("beam {beam} is far, and there are {count}")),
+                None => return Err(format!("beam {beam} is far, but there are only {count} beams")),
             }
         }
         let known_beams = model.ranges().iter().filter(|&&range| range != Background::UNKNOWN).count();
         if self.known_beams != known_beams {
-            return Err(format!("known_beams is {}, and {known_beams} beams are", self.known_beams));
+            return Err(format!("known_beams is {}, but {known_beams} beams are known", self.known_beams));
         }
         if known_beams == 0 {
-            return Err("it knows no beam".to_owned());
+            return Err("the background of every beam is unknown".to_owned());
         }
         model.known_beams = known_beams as u16;
         Ok(model)
@@ -169,8 +169,8 @@ fn read<'a, T: Deserialize<'a>>(text: &'a [u8], source: &str) -> Result<T, Failu
 }
 
 fn invalid_file(source: &str, reason: &str) -> Failure {
-    let hint = "such a file is made by `scanhub background SENSOR save FILE`";
-    Failure::new(Kind::Input, format!("{source} is no background model: {reason}"), hint)
+    let hint = "`scanhub background SENSOR save FILE` creates such a file";
+    Failure::new(Kind::Input, format!("{source} is not a background model: {reason}"), hint)
 }
 
 /// Serializes a unit of `unit_um` micrometers in mm, as a whole number if it is one.
@@ -265,7 +265,7 @@ mod tests {
         empty.ranges_mut().fill(Background::UNKNOWN);
         empty.known_beams = 0;
         let failure = BackgroundFile::parse(text(&empty).as_bytes(), "m").unwrap_err();
-        let expected = "m is no background model: it knows no beam";
+        let expected = "m is not a background model: the background of every beam is unknown";
         assert_eq!((failure.kind, failure.message.as_str()), (Kind::Input, expected));
     }
 
@@ -276,7 +276,7 @@ mod tests {
             let failure = BackgroundFile::parse(&whole.as_bytes()[..length], "/m.json").unwrap_err();
             assert_eq!(failure.kind, Kind::Input);
             let why = if length == 0 { "it is empty" } else { "it is cut short" };
-            let expected = format!("/m.json is no background model: {why}");
+            let expected = format!("/m.json is not a background model: {why}");
             assert!(failure.message.starts_with(&expected), "{length}: {failure}");
         }
     }
@@ -299,10 +299,10 @@ mod tests {
             ("65519", "65535", "the range of beam 3 is 65535"),
             ("[400", "[-1", "the range of beam 0 is -1"),
             ("[400", "[400.5", "invalid type: floating point `400.5`, expected i64"),
-            ("[2]", "[181]", "beam 181 is far, and there are 181"),
+            ("[2]", "[181]", "beam 181 is far, but there are only 181 beams"),
             ("[2]", "[2,2]", "beam 2 is far twice, or has a range"),
             ("[2]", "[0]", "beam 0 is far twice, or has a range"),
-            ("\"known_beams\":3", "\"known_beams\":4", "known_beams is 4, and 3 beams are"),
+            ("\"known_beams\":3", "\"known_beams\":4", "known_beams is 4, but 3 beams are known"),
             ("[2]}", "[2]}{}", "trailing characters"),
         ] {
             assert!(whole.contains(from), "{from}");

@@ -264,7 +264,7 @@ impl Compression {
             "zstd" => Ok(Compression::Zstd),
             "lz4" => Ok(Compression::Lz4),
             "none" => Ok(Compression::None),
-            _ => Err(Failure::new(Kind::Usage, format!("no compression {text:?}"), "zstd, lz4 or none")),
+            _ => Err(Failure::new(Kind::Usage, format!("unknown compression {text:?}"), "zstd, lz4 or none")),
         }
     }
 

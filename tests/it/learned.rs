@@ -118,8 +118,8 @@ fn unusable_or_unwanted_background_is_not_loaded() {
     for (wrong, why) in [
         (text[..text.len() / 2].to_owned(), "cut short"),
         (text.replacen("\"front\"", "\"rear\"", 1), "is the background of rear"),
-        (text.replacen("\"known_beams\":", "\"known_beams\":9", 1), "is no background model"),
-        ("\u{0}\u{1}".to_owned(), "is no background model"),
+        (text.replacen("\"known_beams\":", "\"known_beams\":9", 1), "is not a background model"),
+        ("\u{0}\u{1}".to_owned(), "is not a background model"),
     ] {
         fs::write(file(&env), &wrong).expect("written");
         let outcome =

@@ -63,7 +63,7 @@ fn hub_short_of_address_space_leaves_no_segment() {
 #[test]
 fn reports_a_file_size_limit_below_segment_size() {
     let env = TestEnv::new();
-    let words = "files are too short: ";
+    let words = "the limit on file sizes is too low: ";
     for limit in ["1", "64", "250"] {
         let limit = format!("-f {limit}");
         assert_out_of_resources(

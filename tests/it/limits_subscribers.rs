@@ -89,7 +89,7 @@ fn reports_configured_limit_to_surplus_subscriber() {
         let outcome = env.run(&["echo", "front/scan", "--json"]);
         let error = &outcome.of_class("error")[0];
         assert_eq!((outcome.exit_code, &error["kind"]), (Some(75), &"short".into()), "{outcome}");
-        assert_eq!(error["message"], "scanhub/v2/front/scan has 3 subscribers, the most that are possible");
+        assert_eq!(error["message"], "scanhub/v2/front/scan has 3 subscribers, which is the maximum");
         assert!(error["hint"].to_string().contains("limits.subscribers, up to 250"), "{error}");
         // The other topics are not concerned.
         assert_eq!(env.info("front")["state"], "absent");

@@ -324,7 +324,7 @@ fn a_background_begins_with_a_model_of_its_own_sensor() {
     let cut = TempConfig::new("cut.json", &text[..900]);
     let refusal = load(&[], &[&format!("link.front.background.start={}", cut.0.display())]).unwrap_err();
     assert!(refusal.contains(": link front: background.start: "), "{refusal}");
-    assert!(refusal.contains("cut.json is no background model: it is cut short"), "{refusal}");
+    assert!(refusal.contains("cut.json is not a background model: it is cut short"), "{refusal}");
 }
 
 #[test]

@@ -265,7 +265,11 @@ fn open_directory(path: &Path, directory: &Path, make: Option<Mode>) -> Result<O
         Err(WalkError::Writable(failed_at, _)) => return Err(unwritable(&failed_at, &Errno::PERM.into())),
         Err(WalkError::Untrusted(failed_at, what)) => {
             let message = format!("cannot write {}: {} {what}", path.display(), failed_at.display());
-            return Err(Failure::new(Kind::Output, message, "name it without that link, or another one"));
+            return Err(Failure::new(
+                Kind::Output,
+                message,
+                "name a path without that link, or another file",
+            ));
         }
     };
     let failure = unwritable(path, &error);

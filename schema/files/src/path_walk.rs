@@ -103,7 +103,7 @@ impl PathWalk {
                 let stat = statat(&self.directory, component, AtFlags::SYMLINK_NOFOLLOW)
                     .map_err(|error| self.system(error))?;
                 let is_link = FileType::from_raw_mode(stat.st_mode) == FileType::Symlink;
-                let kind = if is_link { "a link" } else { "no directory, but a file" };
+                let kind = if is_link { "a link" } else { "not a directory, but a file" };
                 let what = format!("is {kind} of user {}", describe_user(stat.st_uid));
                 return Err(WalkError::Untrusted(self.path.join(component), what));
             }

@@ -49,7 +49,7 @@ pub fn read(path: &Path, max_bytes: u64) -> io::Result<Vec<u8>> {
 /// Returns the errors of [`read`], and [`ErrorKind::InvalidData`] if the content is not UTF-8.
 pub fn read_text(path: &Path, max_bytes: u64) -> io::Result<String> {
     String::from_utf8(read(path, max_bytes)?)
-        .map_err(|_| io::Error::new(ErrorKind::InvalidData, "it is no text in UTF-8"))
+        .map_err(|_| io::Error::new(ErrorKind::InvalidData, "it is not UTF-8 text"))
 }
 
 /// Returns everything up to the end of `input`.
@@ -61,7 +61,7 @@ pub fn read_all(input: &mut dyn Read, max_bytes: u64) -> io::Result<Vec<u8>> {
     let mut content = Vec::new();
     input.take(max_bytes + 1).read_to_end(&mut content)?;
     if content.len() as u64 > max_bytes {
-        let what = format!("it is longer than {max_bytes} bytes, so it is something else");
+        let what = format!("it is longer than {max_bytes} bytes");
         return Err(io::Error::new(ErrorKind::FileTooLarge, what));
     }
     Ok(content)

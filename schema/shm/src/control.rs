@@ -107,7 +107,11 @@ impl ControlServer {
         }
         let bytes = response.encode();
         let unsent = |error: &dyn Debug| {
-            Failure::new(Kind::ResourceExhausted, format!("cannot answer a client: {error:?}"), "")
+            Failure::new(
+                Kind::ResourceExhausted,
+                format!("cannot send a response to a client: {error:?}"),
+                "",
+            )
         };
         let loan = request.0.loan_slice_uninit(bytes.len()).map_err(|error| unsent(&error))?;
         loan.write_from_slice(&bytes).send().map_err(|error| unsent(&error))?;
@@ -166,13 +170,17 @@ impl ControlClient {
     /// Returns [`Kind::ResourceExhausted`] if it cannot be sent, and [`Kind::NoHub`] if no hub receives it.
     pub fn send(&self, request: &Request) -> Result<SentRequest, Failure> {
         let unsent = |error: &dyn Debug| {
-            Failure::new(Kind::ResourceExhausted, format!("cannot ask the hub: {error:?}"), "try again later")
+            Failure::new(
+                Kind::ResourceExhausted,
+                format!("cannot send a request to the hub: {error:?}"),
+                "try again later",
+            )
         };
         let bytes = request.encode();
         let loan = self.client.loan_slice_uninit(bytes.len()).map_err(|error| unsent(&error))?;
         let pending = loan.write_from_slice(&bytes).send().map_err(|error| unsent(&error))?;
         if pending.number_of_server_connections() == 0 {
-            return Err(Failure::new(Kind::NoHub, "no hub takes requests", "start one with `scanhub run`"));
+            return Err(Failure::new(Kind::NoHub, "no hub accepts requests", "start one with `scanhub run`"));
         }
         self.requests.notify().map_err(|error| unsent(&error))?;
         Ok(SentRequest(pending))
@@ -192,7 +200,7 @@ impl SentRequest {
     /// Returns [`Kind::Failed`] if it cannot be received or decoded.
     pub fn try_receive(&self) -> Result<Option<Response>, Failure> {
         let unreadable = |error: &dyn Debug| {
-            Failure::new(Kind::Failed, format!("the hub's answer cannot be read: {error:?}"), "")
+            Failure::new(Kind::Failed, format!("cannot read the hub's response: {error:?}"), "")
         };
         let Some(received) = self.0.receive().map_err(|error| unreadable(&error))? else { return Ok(None) };
         Response::decode(received.payload()).map(Some).ok_or_else(|| unreadable(&received.payload()))

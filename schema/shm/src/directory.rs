@@ -183,7 +183,7 @@ impl Directory {
         })?;
         let stat = fstat(&fd).map_err(|error| self.purpose.unusable(&path, error))?;
         if FileType::from_raw_mode(stat.st_mode) != FileType::RegularFile {
-            return Err(self.purpose.untrusted(&path, "is no regular file"));
+            return Err(self.purpose.untrusted(&path, "is not a regular file"));
         }
         if stat.st_uid != effective_uid() {
             let what = format!("belongs to user {}", describe_user(stat.st_uid));
@@ -277,7 +277,7 @@ impl Purpose {
         Failure::new(
             Kind::Failed,
             format!("{path} {what}: scanhub opens nothing in it"),
-            format!("look at it with `ls -ld {path}` and remove it, or {}", self.alternative()),
+            format!("examine it with `ls -ld {path}` and remove it, or {}", self.alternative()),
         )
     }
 
@@ -500,7 +500,7 @@ impl StateDirectory {
     pub fn remove(&self, name: &str) -> Result<(), Failure> {
         let Some(directory) = self.open()? else { return Ok(()) };
         directory.try_remove(OsStr::new(name)).map_err(|error| {
-            let message = format!("{}: an old file stays: {error}", self.path(name).display());
+            let message = format!("cannot remove {}: {error}", self.path(name).display());
             Failure::new(Kind::Failed, message, "remove the file")
         })
     }
@@ -517,9 +517,9 @@ impl StateDirectory {
 /// The directory of the domain, and the one of all domains above it.
 const OWNED_COMPONENTS: usize = 2;
 
-/// Adds to the message that nothing can be kept.
+/// Adds to the message that no state can be saved.
 fn not_saved(failure: Failure) -> Failure {
-    Failure { message: format!("nothing can be kept: {}", failure.message), ..failure }
+    Failure { message: format!("no state can be saved: {}", failure.message), ..failure }
 }
 
 fn base_in(variable: impl Fn(&str) -> Option<OsString>) -> Option<PathBuf> {
@@ -664,7 +664,7 @@ mod tests {
         symlink(here.at("victim"), here.at("base/domain/prefix.new")).unwrap();
         let fifo = here.at("base/domain/fifo");
         rustix::fs::mknodat(rustix::fs::CWD, &fifo, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).unwrap();
-        for (name, word) in [("link", "is a link"), ("fifo", "is no regular file")] {
+        for (name, word) in [("link", "is a link"), ("fifo", "is not a regular file")] {
             for failure in [directory.file(name).unwrap_err(), directory.open_or_create(name).unwrap_err()] {
                 assert!(failure.message.contains(word), "{name}: {failure}");
             }
@@ -747,7 +747,7 @@ mod tests {
         symlink(state.path("f"), state.path("link")).unwrap();
         refused(&state, "link", "is a link");
         fs::create_dir(state.path("directory")).unwrap();
-        refused(&state, "directory", "no regular file");
+        refused(&state, "directory", "is not a regular file");
         fs::set_permissions(state.path("f"), fs::Permissions::from_mode(0o620)).unwrap();
         refused(&state, "f", "mode 0620");
         drop(place);
@@ -758,7 +758,7 @@ mod tests {
         let state = StateDirectory::at("/dev/null/x");
         let failures = [state.read("f", 9).map(drop).unwrap_err(), state.write("f", "text").unwrap_err()];
         let [_, failure] = failures;
-        assert!(failure.message.contains("nothing can be kept: /dev/null"), "{failure}");
+        assert!(failure.message.contains("no state can be saved: /dev/null"), "{failure}");
         assert!(failure.hint.contains("STATE_DIRECTORY"), "{failure}");
     }
 

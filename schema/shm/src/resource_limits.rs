@@ -47,7 +47,7 @@ fn check_file_size(needed: u64) -> Result<(), Failure> {
         return Ok(());
     }
     let what = format!(
-        "files are too short: {} kB at most, a segment of shared memory needs {} kB",
+        "the limit on file sizes is too low: it is {} kB, and a segment of shared memory needs {} kB",
         limit / 1024,
         needed.div_ceil(1024)
     );
@@ -135,7 +135,7 @@ pub(crate) fn check_client() -> Result<(), Failure> {
 pub(crate) fn find_shortage(root: &Path) -> Option<Failure> {
     let files = || {
         let directory = root.ancestors().find(|path| path.exists()).unwrap_or(root);
-        let hint = "free some of it, or choose another place with --root";
+        let hint = "free some of it, or choose another location with --root";
         check_free_space(directory, CLIENT_BYTES).map_err(|what| {
             Failure::new(Kind::ResourceExhausted, format!("{}: {what}", root.display()), hint)
         })

@@ -102,12 +102,12 @@ pub fn foreign_segments(root: &Path) -> Vec<Segment> {
 /// Returns the failure to report if `segment` has a name that this process needs.
 pub(crate) fn name_conflict(segment: &Segment) -> Failure {
     let (path, owner, mode) = (segment.path.display(), describe_user(segment.owner), segment.mode);
-    let is_file = if segment.is_file { "" } else { " and is no file" };
+    let is_file = if segment.is_file { "" } else { " and is not a regular file" };
     let own = rustix::process::geteuid().as_raw();
     Failure::new(
         if segment.owner == own { Kind::Failed } else { Kind::OtherUser },
         format!(
-            "{path} belongs to user {owner} with mode {mode:04o}{is_file}: it is in the way, and is not opened"
+            "{path} belongs to user {owner} with mode {mode:04o}{is_file}: scanhub needs its name and does not open it"
         ),
         format!(
             "let user {owner} or an administrator remove it (sudo rm {path}), or choose another --domain"

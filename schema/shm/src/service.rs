@@ -101,7 +101,7 @@ open_failure! {
 /// Returns the name of a service as the library takes it.
 pub(crate) fn name(service: &str) -> Result<ServiceName, Failure> {
     ServiceName::new(service).map_err(|error| {
-        Failure::new(Kind::Configuration, format!("{service:?} is no service: {error:?}"), "")
+        Failure::new(Kind::Configuration, format!("{service:?} is not a valid service name: {error:?}"), "")
     })
 }
 
@@ -217,12 +217,12 @@ pub(crate) fn publisher_failure(service: &ServiceName, error: PublisherCreateErr
 /// Returns the failure if all `limit` slots for subscribers of the topic `service` are taken.
 pub(crate) fn subscribers_full(service: &ServiceName, limit: usize) -> Failure {
     let (start, key) = match parse_service_name(service.as_str()) {
-        Some((sensor, _)) if is_remote(sensor) => ("start what publishes it", "--subscribers"),
+        Some((sensor, _)) if is_remote(sensor) => ("start its publisher", "--subscribers"),
         _ => ("configure the hub", "limits.subscribers"),
     };
     let max = TopicLimits::SUBSCRIBERS.end();
     let hint = format!(
-        "{start} with a greater {key}, up to {max}, or stop some; the places of those that crashed are free again within \
+        "{start} with a larger {key}, up to {max}, or stop some; the slots of crashed subscribers become free within \
          seconds"
     );
     Failure { hint, ..clients_full(service, limit) }
@@ -232,8 +232,8 @@ pub(crate) fn subscribers_full(service: &ServiceName, limit: usize) -> Failure {
 pub(crate) fn clients_full(service: &ServiceName, limit: usize) -> Failure {
     Failure::new(
         Kind::ResourceExhausted,
-        format!("{service} has {limit} subscribers, the most that are possible"),
-        "stop some of them; the places of those that crashed are free again within seconds",
+        format!("{service} has {limit} subscribers, which is the maximum"),
+        "stop some of them; the slots of crashed subscribers become free within seconds",
     )
 }
 
@@ -241,7 +241,7 @@ pub(crate) fn clients_full(service: &ServiceName, limit: usize) -> Failure {
 pub(crate) fn port_failure(service: &ServiceName, error: &dyn Debug) -> Failure {
     resource_limits::find_shortage(Path::new(resource_limits::SHARED_MEMORY_DIRECTORY)).unwrap_or_else(|| {
         let hint = "too many subscribers, or `ulimit -n` is too small: about 4 descriptors for each";
-        Failure::new(Kind::ResourceExhausted, format!("no port at {service}: {error:?}"), hint)
+        Failure::new(Kind::ResourceExhausted, format!("cannot create a port for {service}: {error:?}"), hint)
     })
 }
 
@@ -253,7 +253,7 @@ fn failure<S: Service>(node: &Node<S>, service: &ServiceName, error: OpenFailure
     match error {
         OpenFailure::Full => Failure::new(
             Kind::ResourceExhausted,
-            format!("{service} has no place for another process"),
+            format!("{service} has no free slot for another process"),
             "stop some subscribers",
         ),
         OpenFailure::Absent => {

@@ -305,7 +305,7 @@ pub fn payload_revision(attributes: &AttributeSet) -> u32 {
 const REVISION_KEY: &str = "revision";
 
 fn revision(topic: Topic) -> Result<AttributeVerifier, Failure> {
-    let impossible = |_| Failure::new(Kind::Failed, "the payload's revision is no attribute", "");
+    let impossible = |_| Failure::new(Kind::Failed, "the payload's revision is not a valid attribute", "");
     let value = topic.revision().to_string();
     let key = REVISION_KEY.try_into().map_err(|_| impossible(()))?;
     let value = value.as_str().try_into().map_err(|_| impossible(()))?;
