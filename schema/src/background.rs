@@ -282,7 +282,7 @@ impl Foreground {
 
 impl DatagramPayload for Foreground {
     /// Writes head, bits, the used ranges, and as many segments as there is room for. The other segments are counted as
-    /// left out.
+    /// dropped.
     fn pack(&self, room: &mut [u8]) -> Option<usize> {
         let fixed = |head: &ForegroundHead, room: &mut [u8]| {
             write(room, &[bytes_of(head), self.bits(), cast_slice::<u16, u8>(self.ranges())])

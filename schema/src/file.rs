@@ -45,7 +45,7 @@ pub struct ForeignChannel<'a> {
 }
 
 impl<W: Write> Writer<W> {
-    /// Starts a recording with `profile` (empty, or `ros2`) and the metadata `facts`. Its chunks are not compressed.
+    /// Starts a recording with `profile` (empty, or `ros2`) and `metadata`. Its chunks are not compressed.
     ///
     /// # Errors
     ///

@@ -31,7 +31,7 @@ pub trait DatagramPayload {
     #[must_use]
     fn fill(&mut self, payload: &[u8], room: usize) -> bool;
 
-    /// Gives `place` memory of `room` bytes if it has less.
+    /// Replaces `target` by a value with memory for `room` bytes if it has less.
     fn make_room(target: &mut Box<Self>, room: usize) {
         let _ = (target, room);
     }
@@ -43,7 +43,7 @@ pub trait DatagramPayload {
         Self::room(payload).is_some_and(|room| self.fill(payload, room))
     }
 
-    /// Does the same as [`unpack`](Self::unpack), and makes `place` longer if it is too short.
+    /// Does the same as [`unpack`](Self::unpack), and makes `target` longer if it is too short.
     #[must_use]
     fn unpack_into(target: &mut Box<Self>, payload: &[u8]) -> bool {
         Self::room(payload).is_some_and(|room| {

@@ -175,7 +175,7 @@ impl Kind {
 pub struct Failure {
     /// Kind of the failure.
     pub kind: Kind,
-    /// Message with the place and the value.
+    /// Message with the location of the error and the value.
     pub message: String,
     /// Remedy; may be empty.
     pub hint: String,

@@ -59,9 +59,9 @@ impl PathWalk {
         Ok(PathWalk { user, policy, directory: at, path, links: 0 })
     }
 
-    /// Opens the `components` in this order, and follows links as the policy permits. With `make`, a missing directory
-    /// is created with these permissions, without those that the umask removes. Returns `false` if a component is
-    /// missing.
+    /// Opens the `components` in this order, and follows links as the policy permits. With `create_mode`, a missing
+    /// directory is created with these permissions, without those that the umask removes. Returns `false` if a
+    /// component is missing.
     ///
     /// # Errors
     ///

@@ -56,7 +56,7 @@ impl RosNames {
         &self.namespace
     }
 
-    /// Returns the topic `word` of `sensor`. Its names have letters, digits and `_`, and do not start with a digit.
+    /// Returns the topic `name` of `sensor`. Its names have letters, digits and `_`, and do not start with a digit.
     pub fn topic(&self, sensor: &str, name: &str) -> String {
         let mut topic = [self.namespace(), &self.prefix].concat();
         for part in sensor.split('.') {

@@ -62,7 +62,7 @@ pub enum Qos {
 }
 
 impl Qos {
-    /// Returns the number of messages that are kept.
+    /// Returns the number of messages in the history.
     pub fn depth(self) -> usize {
         match self {
             Qos::SensorData => 5,

@@ -96,7 +96,7 @@ impl ControlServer {
             .map_err(|error| port_failure(self.control.name(), &error))
     }
 
-    /// Sends `response` to the client of `asked`, if it still waits.
+    /// Sends `response` to the client of `request`, if it still waits.
     ///
     /// # Errors
     ///

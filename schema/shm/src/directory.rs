@@ -66,8 +66,8 @@ impl Directory {
         Directory::create_directory(root, 2, Purpose::Domain)
     }
 
-    /// Returns the directory `path`, in which programs keep files across restarts. This user must own its last `own`
-    /// components. Missing directories are created for this user only.
+    /// Returns the directory `path`, in which programs keep files across restarts. This user must own its last
+    /// `owned_components` components. Missing directories are created for this user only.
     ///
     /// # Errors
     ///
@@ -312,8 +312,8 @@ impl FileLock {
     ///
     /// # Errors
     ///
-    /// Returns the failure `held` if another process has the lock. Its argument is the ID of that process, or 0 if the
-    /// process has not written it yet. Returns [`Kind::Failed`] if the file cannot be locked.
+    /// Returns the failure of `on_held` if another process has the lock. Its argument is the ID of that process, or 0
+    /// if the process has not written it yet. Returns [`Kind::Failed`] if the file cannot be locked.
     pub(crate) fn acquire(
         root: &Path,
         name: &str,
@@ -455,7 +455,7 @@ impl StateDirectory {
     /// # Errors
     ///
     /// Returns the errors of [`check`](Self::check). Returns [`Kind::Failed`] if the file cannot be read, is not a
-    /// regular file of this user that no other user can write, has more than `most` bytes, or is not UTF-8.
+    /// regular file of this user that no other user can write, has more than `max_bytes` bytes, or is not UTF-8.
     pub fn read(&self, name: &str, max_bytes: u64) -> Result<Option<String>, Failure> {
         let Some(directory) = self.open()? else { return Ok(None) };
         let Some(file) = directory.file(name)? else { return Ok(None) };

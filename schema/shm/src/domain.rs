@@ -236,7 +236,7 @@ impl RunningHub {
         Some(RunningHub { pid, uid, user, domain, base, program })
     }
 
-    /// Returns who runs the hub, and the command that reaches it, for a client of `caller` that has asked for `domain`.
+    /// Returns who runs the hub, and the command that reaches it, for a client of `caller` that searched for `domain`.
     pub fn describe(&self, verb: &str, domain: &str, caller: &Environment) -> String {
         let owner =
             if self.uid == caller.uid { "this user".to_owned() } else { format!("user {}", self.user) };
@@ -249,7 +249,7 @@ impl RunningHub {
     }
 
     /// Returns the command with which the user of `caller` runs `verb` in the domain of this hub. `domain` is the one
-    /// that the caller has asked for. If the hub's domain is unknown, the command lists the domains of the hub's user.
+    /// that the caller searched for. If the hub's domain is unknown, the command lists the domains of the hub's user.
     pub fn command(&self, verb: &str, domain: &str, caller: &Environment) -> String {
         // sudo resets the environment of the command.
         let (sudo, environment, domain) = if self.uid == caller.uid {

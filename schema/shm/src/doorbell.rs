@@ -162,8 +162,8 @@ impl Doorbell {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct WaitUnsupported;
 
-/// Sleeps until one of `bells` has rung more often than its given count, a signal arrives, or CLOCK_MONOTONIC reaches
-/// `until_ns`.
+/// Sleeps until one of `doorbells` has rung more often than its given count, a signal arrives, or CLOCK_MONOTONIC
+/// reaches `until_ns`.
 ///
 /// # Errors
 ///
@@ -282,19 +282,21 @@ trait FutexWord {
     fn wake(&self);
 }
 
-/// Increments the counter `rung` and wakes all threads that sleep on it. A thread that sees the new count also sees all
-/// samples that were sent before.
+/// Increments the `counter` of rings and wakes all threads that sleep on it. A thread that sees the new count also sees
+/// all samples that were sent before.
 fn ring(counter: &impl FutexWord) {
     counter.fetch_add(1, Ordering::Release);
     counter.wake();
 }
 
-/// Increments the counter `attached`. A hub that sees the new count also sees what was attached before.
+/// Increments the `counter` of attached programs. A hub that sees the new count also sees the programs that attached
+/// before.
 fn increment(counter: &impl FutexWord) {
     counter.fetch_add(1, Ordering::Release);
 }
 
-/// Returns the counter `rung`. Everything that was sent before it was incremented can be received after this call.
+/// Returns the `counter` of rings. All samples that were sent before it was incremented can be received after this
+/// call.
 fn read_count<W: FutexWord>(counter: &W) -> u32 {
     // Only a relaxed load may touch memory that is mapped read-only.
     let count = counter.load(Ordering::Relaxed);

@@ -233,7 +233,7 @@ struct PublisherLock {
 
 impl PublisherLock {
     /// Takes the lock `name`, chooses a prefix if the domain has none, and writes this process's ID into the lock's
-    /// file. `held` returns the failure if another process has the lock.
+    /// file. `on_held` returns the failure if another process has the lock.
     fn acquire(root: &Path, name: &str, on_held: impl Fn(u32) -> Failure) -> Result<PublisherLock, Failure> {
         let lock = FileLock::acquire(root, name, on_held)?;
         // A reader that finds a process ID relies on the prefix.

@@ -28,8 +28,8 @@ const PORT_DESCRIPTORS: u64 = 8;
 /// Descriptors that a client of the control service needs.
 pub(crate) const CONTROL_DESCRIPTORS: u64 = 24;
 
-/// Fails if fewer than `needed` bytes of shared memory, in segments of at most `longest`, are free or allowed for this
-/// process.
+/// Fails if fewer than `needed` bytes of shared memory, in segments of at most `max_segment`, are free or allowed for
+/// this process.
 ///
 /// # Errors
 ///
@@ -155,7 +155,7 @@ fn assumed_descriptors(error: &io::Error, limit: u64) -> u64 {
     }
 }
 
-/// Fails with a message if fewer than `needed` bytes are free at `place`.
+/// Fails with a message if fewer than `needed` bytes are free in the file system of `path`.
 fn check_free_space(path: &Path, needed: u64) -> Result<(), String> {
     let Ok(stat) = statvfs(path) else { return Ok(()) };
     let free = free(&stat);

@@ -84,7 +84,7 @@ impl<S: Service> WakeSender<S> {
             .map_err(|error| Failure::new(Kind::Failed, format!("cannot wake subscribers: {error:?}"), ""))
     }
 
-    /// Wakes all subscribers for `event`, whatever topics they have.
+    /// Wakes all subscribers for `event`, whichever topics they follow.
     ///
     /// # Errors
     ///

@@ -59,7 +59,7 @@ impl DamagedLine {
         SentPacket { bytes: packet.to_vec(), intact, at }
     }
 
-    /// Returns the bytes that have arrived by `now`, at most `room`.
+    /// Returns the bytes that have arrived by `now`, at most `max_len`.
     fn read(&mut self, now: Nanos, max_len: usize) -> Vec<u8> {
         let count = self.bytes.iter().take(max_len).take_while(|(at, _)| *at <= now).count();
         self.bytes.drain(..count).map(|(_, byte)| byte).collect()
