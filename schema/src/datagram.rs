@@ -1,5 +1,6 @@
-//! A sample as one datagram, or as several if it is longer; and the announcement of a sensor, which a gateway sends
-//! once a second. Their format needs no library to read, and every field is checked before it is used.
+//! Format of datagrams: a sample in one datagram, or in several if it is longer, and the announcement of a sensor,
+//! which a gateway sends once a second. A reader needs no library for the format. Every field is checked before it is
+//! used.
 //!
 //! This module needs neither shared memory nor a heap. Senders and receivers are in `clients/network`.
 

@@ -1,7 +1,6 @@
-//! The families of scanners, by number and name, and what differs between them: the codes of the SICK LMS 2xx, and the
-//! content of topic `telegram`.
+//! Families of scanners: their numbers and names, the codes of the SICK LMS 2xx, and the content of topic `telegram`.
 //!
-//! A telegram is what the scanner sent, in the unit in which its family transmits: one telegram of an LMS from STX to
+//! A telegram has the bytes of a scanner in the unit in which its family transmits: one telegram of an LMS from STX to
 //! CRC, or whole packets of another family that arrived together. The hub has checked it before it publishes it.
 
 use std::f64::consts::TAU;

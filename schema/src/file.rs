@@ -16,8 +16,8 @@ pub use mcap::MAGIC;
 
 /// Encoding of the messages, and of the text that describes them.
 pub const ENCODING: &str = "scanhub.v2";
-/// Encoding of recordings of version 1. Header, telegrams, marks, zones and statuses are the same as today; the others
-/// differ.
+/// Encoding of recordings of version 1. Header, telegrams, marks, zones and statuses are the same as in version 2; the
+/// other payloads differ.
 pub const ENCODING_V1: &str = "scanhub";
 /// Name of the metadata record at the start of a recording, which describes its origin.
 pub const METADATA: &str = "scanhub";

@@ -1,5 +1,5 @@
 //! One revolution of a scanner: ranges in device units with their codes, and optional arrays. Each scan contains the
-//! few numbers that are needed to read it, so that a reader needs to know neither protocol nor mode of the scanner.
+//! few numbers that are needed to decode it, so a reader does not depend on the scanner's protocol or mode.
 
 use std::fmt;
 

@@ -1,5 +1,5 @@
-//! The state of a link and its sensor: the state itself, what is known about the sensor with its pose on the robot, and
-//! counters, most of which only increase.
+//! Status of a link: its state, the properties of the scanner, its pose on the robot, and counters, most of which only
+//! increase.
 
 use std::ops::{Index, IndexMut};
 

@@ -1,5 +1,5 @@
-//! Writes ROS messages to an MCAP file as rosbag2 does: profile `ros2`, each channel with the definition of its type
-//! and the quality of service that its publisher offers.
+//! Writer of ROS messages to an MCAP file in the form of rosbag2: profile `ros2`, and each channel with the definition
+//! of its type and the quality of service that its publisher offers.
 
 use std::io::{self, Write};
 

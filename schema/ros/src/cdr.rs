@@ -1,5 +1,5 @@
-//! Writes and reads messages in little-endian CDR (OMG XCDR1): values in order, each at a multiple of its size from the
-//! start of the body.
+//! Writer and reader of messages in little-endian CDR (OMG XCDR1): values in order, each at a multiple of its size from
+//! the start of the body.
 
 use crate::types::{Field, MessageDef, Type};
 

@@ -1,4 +1,4 @@
-//! Checks whether any process uses a file.
+//! Check whether any process uses a file.
 #![allow(unsafe_code)]
 
 use std::fs::OpenOptions;

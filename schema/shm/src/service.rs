@@ -1,5 +1,5 @@
-//! Creates, opens and lists services. Failures are classified by the remedy: wait, retry later, or report it to the
-//! user.
+//! Creation, opening and listing of services. Failures are classified by the remedy: wait, retry later, or report it to
+//! the user.
 
 use std::fmt::Debug;
 use std::path::Path;

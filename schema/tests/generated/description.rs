@@ -1,4 +1,4 @@
-//! The description of all layouts, read from the sources of this crate: every struct of a payload with its fields,
+//! Description of all layouts, read from the sources of this crate: every struct of a payload with its fields,
 //! their types and comments, and the constants and enums that the comments link to.
 //!
 //! Offsets are sums of sizes. That is exact, because every one of these structs derives `Pod`, which rejects padding.

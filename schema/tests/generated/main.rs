@@ -1,6 +1,6 @@
-//! Generates the layouts of all payloads for other languages from the Rust structs, and checks that the committed files
-//! are up to date. After a change of a struct, `SCANHUB_WRITE=1 cargo test -p scanhub-schema --test generated` writes
-//! them.
+//! Generator of the layouts of all payloads for other languages, from the Rust structs, and the test that the committed
+//! files are up to date. After a change of a struct, `SCANHUB_WRITE=1 cargo test -p scanhub-schema --test generated`
+//! writes them.
 //!
 //! The generator reads names, types and comments of the fields. These conventions carry the rest:
 //!

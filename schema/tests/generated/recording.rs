@@ -1,4 +1,4 @@
-//! The description of all messages that every recording contains, `schema/src/file/layout.txt`.
+//! Description of all messages that every recording contains, `schema/src/file/layout.txt`.
 
 use scanhub_schema::{Header, Topic};
 

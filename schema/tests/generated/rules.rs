@@ -1,4 +1,4 @@
-//! Properties of payloads that the structs do not have.
+//! Rules for payloads that the structs do not express, such as arrays whose length depends on counts.
 
 use super::description::{Field, Layout};
 

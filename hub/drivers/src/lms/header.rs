@@ -1,4 +1,4 @@
-//! The check of a telegram's header. A position in the stream becomes a candidate only if its header passes this check,
+//! Check of a telegram's header. A position in the stream becomes a candidate only if its header passes this check,
 //! which uses the first 5 or 7 bytes and never the checksum.
 
 use crate::lms::command;
