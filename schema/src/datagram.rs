@@ -323,7 +323,7 @@ pub enum DatagramError {
     /// A key is required, and the sensor or topic was not announced within 5 s of this machine's clock. The datagram
     /// may be a recorded one.
     Untimely,
-    /// It comes from another sender than the other datagrams of this gateway and epoch, and is not known to come from
+    /// The datagram comes from another sender than the others of this gateway and epoch, and is not known to come from
     /// the same gateway. A second gateway probably has the same number.
     Twin,
     /// The sequence number is older than the window, so it is unknown whether the sample is a duplicate.

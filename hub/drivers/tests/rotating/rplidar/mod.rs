@@ -631,7 +631,7 @@ impl SimulatedScanner {
 /// A point before it is encoded. Its raw angle is that of its index.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct TestPoint {
-    /// Range in mm; 0 is no return.
+    /// Range in mm; 0 for no return.
     pub(crate) range: u32,
     /// Eighths of a degree by which it lies before its nominal angle; express packets only.
     pub(crate) eighths: u32,
