@@ -1,4 +1,4 @@
-//! What has to hold whatever a network carries: datagrams are refused, or they say what can be said again.
+//! Invariants for datagrams from a network: each datagram is refused, or its contents can be encoded again.
 
 use scanhub_network::lan::{EvictedTotals, GatewayTable, MAX_ROWS, SequenceStatus};
 use scanhub_schema::Topic;
@@ -6,11 +6,11 @@ use scanhub_schema::datagram::{
     Announce, Datagram, DatagramError, DatagramPayload, HEADER_LEN, Head, MTU_ETHERNET,
 };
 
-/// Any datagrams, one after the other: each is counted once, what is refused changes nothing, and what is not, can be
-/// said again.
+/// Checks that each of the datagrams in `data` is counted once, that a refused datagram changes nothing else, and that
+/// an accepted datagram can be encoded again.
 ///
-/// A piece begins with a byte and its length in two more. Odd: a header in short and a payload, to which a checksum is
-/// made; even: a datagram as it is.
+/// A datagram in `data` starts with a mode byte and a length of two bytes. With an even mode, the bytes that follow are
+/// the datagram itself. With an odd mode, they are a short header and a payload, and the checksum is computed here.
 pub(crate) fn lan(data: &[u8]) {
     let mut table = Box::new(GatewayTable::new(&Topic::ALL));
     let mut rest = data;
@@ -23,7 +23,7 @@ pub(crate) fn lan(data: &[u8]) {
         let bytes = if mode & 1 == 0 { Some(piece) } else { sealed_datagram(piece, &mut buffer) };
         let Some(bytes) = bytes else { continue };
         let before = counters(&table);
-        // From one of two senders, half a second later.
+        // Datagrams come from two senders, one every half second.
         let (from, now_ns) = (u64::from(mode >> 1 & 1), 500_000_000 * given);
         let result = table.receive(bytes, from, now_ns);
         given += 1;
@@ -57,13 +57,14 @@ pub(crate) fn lan(data: &[u8]) {
     assert!(table.rows().count() <= MAX_ROWS);
 }
 
-/// Received, lost, duplicate and reordered of each row, and what was given up.
+/// Returns the counts of received, lost, duplicate and reordered datagrams of each row, and the totals of evicted rows.
 fn counters(table: &GatewayTable) -> (Vec<[u64; 4]>, EvictedTotals) {
     let rows = table.rows().map(|row| [row.received, row.lost(), row.duplicate, row.reordered]);
     (rows.collect(), table.evicted())
 }
 
-/// A datagram of few hubs, epochs and sensors, so that they meet.
+/// Returns a datagram with a valid checksum, or `None` if `piece` is too short. It has one of few hubs, epochs and
+/// sensors, so that datagrams of the same stream are frequent.
 fn sealed_datagram<'a>(piece: &[u8], buffer: &'a mut [u8]) -> Option<&'a [u8]> {
     let (short, payload) = piece.split_first_chunk::<10>()?;
     let head = Head {
@@ -82,7 +83,7 @@ fn sealed_datagram<'a>(piece: &[u8], buffer: &'a mut [u8]) -> Option<&'a [u8]> {
     head.seal(buffer, payload.len())
 }
 
-/// What a payload says, packed again, says the same.
+/// Checks that a payload that is decoded and encoded has the same contents when it is decoded again.
 fn can_be_reencoded(datagram: &Datagram<'_>) {
     fn reencode<T: DatagramPayload + ?Sized>(payload: &[u8])
     where
@@ -94,7 +95,7 @@ fn can_be_reencoded(datagram: &Datagram<'_>) {
         let len = value.pack(&mut first).expect("room");
         assert!(T::unpack_into(&mut value, &first[..len]));
         assert_eq!(value.pack(&mut second), Some(len));
-        // As bytes, because a number may be none, which is not even itself.
+        // Compare bytes, because a number may be NaN, which does not equal itself.
         assert_eq!(first, second);
     }
     let payload = datagram.payload;
@@ -112,7 +113,7 @@ fn can_be_reencoded(datagram: &Datagram<'_>) {
     scanhub_schema::for_each_topic!(by_topic);
 }
 
-/// The checksum sees one to three changed bits, wherever they are (its Hamming distance at these lengths is 4).
+/// Checks that the checksum detects one to three changed bits. Its Hamming distance at these lengths is 4.
 fn is_damage_detected(bytes: &[u8], offsets: &[u8]) {
     let mut damaged = bytes.to_vec();
     let mut at = 0;

@@ -1,4 +1,4 @@
-//! Any scans and any settings, through all processors: whatever the bytes say, what comes out keeps to its own rules.
+//! Invariants for the results of all processors, for any scans and any settings.
 
 use scanhub_preprocess::background::{BackgroundModel, Candidate, Method, Settings, Start};
 use scanhub_preprocess::segments::Segmenter;
@@ -8,10 +8,10 @@ use scanhub_schema::{ArrayFlags, Background, Foreground, MAX_BEAMS, MAX_ZONES, M
 
 use super::scans::{Bytes, fill, layout};
 
-/// Read as settings, then as one scan after the other until nothing is left.
+/// Reads settings from `data`, and then processes one scan after the other until no bytes are left.
 pub(super) fn processors(data: &[u8]) {
     let mut bytes = Bytes(data);
-    // Now and then a scan has more beams than that.
+    // Some scans have more beams than this limit.
     let maximum = TopicLimits::default().beams;
     let pose = bytes.pose();
     let radii_mm: Vec<u16> = (0..bytes.u8() % 10).map(|_| bytes.u16()).collect();

@@ -1,5 +1,5 @@
-//! What has to hold whatever is in a file: a recording is refused or read to its end, twice the same, and its telegrams
-//! are telegrams.
+//! Invariants for recordings: any file is refused, or it can be read to its end twice with the same result, and its
+//! telegrams are valid.
 
 use std::fs;
 
@@ -9,7 +9,7 @@ use scanhub_recording::{Encoding, Form, Recording};
 use scanhub_schema::Family;
 use tempfile::NamedTempFile;
 
-/// Any bytes as a file.
+/// Opens a file with the bytes of `data` as a recording.
 pub(crate) fn recording(data: &[u8]) {
     let file = NamedTempFile::new().expect("a temporary file");
     fs::write(&file, data).expect("a writable file");
@@ -27,13 +27,13 @@ pub(crate) fn recording(data: &[u8]) {
     assert!(contents.scans <= contents.telegrams);
 }
 
-/// How many telegrams it gives; as many as it says.
+/// Reads all telegrams and returns their number, which must match the number in the table of contents.
 fn read(recording: &Recording) -> u64 {
     let (contents, encoding) = (recording.contents(), Encoding { unit: Unit::Mm, mode: Mode(1) });
     let mut telegrams = 0;
     for frame in recording.telegrams(encoding).expect("it was chosen") {
         telegrams += 1;
-        // In an MCAP file with right checksums, anything can stand where a telegram should be.
+        // An MCAP file with valid checksums can contain any bytes as a telegram.
         if contents.form != Form::Mcap && contents.family == Family::Lms as u8 {
             assert!(Telegram::check(&frame.telegram).is_some());
         }

@@ -1,8 +1,9 @@
-//! Scans, and what they are read as, from the bytes of an input. Refuses to know who looks at them.
+//! Scans from the bytes of a fuzzing input.
 
 use scanhub_schema::{ArrayFlags, Family, MAX_BEAMS, Pose, Scan, ScanArrays, ScanHead};
 
-/// Another sensor, or the same one set otherwise; now and then one that there is.
+/// Changes the layout of the scan: the number and angles of its beams, its unit and its longest range. Some layouts are
+/// those of a real scanner.
 pub(super) fn layout(bytes: &mut Bytes<'_>, scan: &mut Scan) {
     let variant =
         [(361, -90_000, 500), (181, -90_000, 1000), (401, -50_000, 250)].get(usize::from(bytes.u8()));
@@ -27,7 +28,8 @@ pub(super) fn layout(bytes: &mut Bytes<'_>, scan: &mut Scan) {
     scan.begin(head);
 }
 
-/// Stretches of beams with the same reading, until they are enough or nothing is left.
+/// Fills the scan with groups of neighboring beams that have the same reading, until all beams are set or no bytes are
+/// left.
 pub(super) fn fill(bytes: &mut Bytes<'_>, scan: &mut Scan) {
     let ScanArrays { angles, ranges, wide, upper } = scan.arrays();
     let mut end = 0;
@@ -45,7 +47,7 @@ pub(super) fn fill(bytes: &mut Bytes<'_>, scan: &mut Scan) {
     }
 }
 
-/// What is left of the input; zeroes when nothing is.
+/// The remaining bytes of the input. At its end, all values are zero.
 pub(super) struct Bytes<'a>(pub(super) &'a [u8]);
 
 impl Bytes<'_> {
@@ -80,7 +82,7 @@ impl Bytes<'_> {
         i32::from_le_bytes(self.take())
     }
 
-    /// Any number, infinite ones and those that are none too; mostly of a size that a sensor's place has.
+    /// Returns any number, including infinities and NaN. Most numbers are in the range of coordinates of a sensor.
     pub(super) fn number(&mut self) -> f64 {
         match self.u8() {
             0 => f64::from_bits(u64::from_le_bytes(self.take())),

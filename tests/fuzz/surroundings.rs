@@ -1,5 +1,5 @@
-//! Any scans through those processors that follow the robot: lines, motion, and the map around it. Whatever the bytes say,
-//! what comes out keeps to its own rules, and nothing is surer than the readings that say it.
+//! Invariants for the processors that track the robot's motion: line features, motion, and the background of a moving
+//! robot. No uncertainty is smaller than the readings permit.
 
 use scanhub_preprocess::background::{BackgroundModel, Candidate, Class, Method, Settings, Start};
 use scanhub_preprocess::lines::{self, LineFinder, StopCriterion};
@@ -10,7 +10,7 @@ use scanhub_schema::{ArrayFlags, Foreground, Lines, MAX_BEAMS, Motion, MotionMet
 
 use super::scans::{Bytes, fill, layout};
 
-/// Read as settings, then as one scan after the other until nothing is left.
+/// Reads settings from `data`, and then processes one scan after the other until no bytes are left.
 pub(super) fn surroundings(data: &[u8]) {
     let mut bytes = Bytes(data);
     let maximum = TopicLimits::default().beams;
@@ -36,7 +36,7 @@ pub(super) fn surroundings(data: &[u8]) {
         if bytes.is_empty() {
             break;
         }
-        // Else it is the same scan again.
+        // With larger values, the previous scan is processed again.
         let what = bytes.u8();
         match what {
             0..=3 => estimator.reset(),
@@ -114,14 +114,14 @@ fn assert_motion(scan: &Scan, before: &Motion, motion: &Motion, settings: &motio
                 assert!((of(row, column) - of(column, row)).abs() <= 1e-5 * maximum, "{motion:?}");
                 assert!(of(row, column).abs() <= (1.0 + 1e-5) * maximum, "{motion:?}");
             }
-            // Of all beams together, if they looked at one wall and nothing else were unsure.
+            // The variance if all beams measured the same wall without any other uncertainty.
             let surest = MIN_VARIANCE / scan.beams() as f64;
             assert!(of(0, 0) >= surest && of(1, 1) >= surest && of(2, 2) > 0.0, "{motion:?}");
         }
     }
 }
 
-/// Walls: a reading from each beam to the next is longer or shorter by the same.
+/// Fills the scan with walls: the range changes by the same amount from each beam to the next, plus noise.
 fn walls(bytes: &mut Bytes<'_>, scan: &mut Scan) {
     let ranges = scan.arrays().ranges;
     let mut end = 0;
@@ -137,7 +137,7 @@ fn walls(bytes: &mut Bytes<'_>, scan: &mut Scan) {
     }
 }
 
-/// The map's own settings.
+/// Settings of the background of a moving robot, apart from those that the input changes.
 const MAP_SETTINGS: Settings = Settings {
     method: Method::Moving,
     threshold_mm: None,
@@ -147,7 +147,8 @@ const MAP_SETTINGS: Settings = Settings {
     start: Start::Empty,
     no_return_is_far: None,
 };
-/// A hundredth of the least variance of a range, (5 mm)^2, of which a beam that grazes its wall has a twentieth.
+/// A hundredth of the minimum variance of a range, (5 mm)^2. A beam that grazes its wall has a twentieth of that
+/// variance.
 const MIN_VARIANCE: f64 = 2.5e-7;
-/// A map takes long to forget.
+/// Maximum number of scans, because the background of a moving robot takes long to forget.
 const SCANS: usize = 40;

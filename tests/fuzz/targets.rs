@@ -1,5 +1,6 @@
-//! What has to hold whatever comes: one function for each place where the world's bytes enter. The fuzzer calls them
-//! with what it invents, `tests/it/fuzzed.rs` with the corpus and with seeded noise. They know invariants, no examples.
+//! Fuzz targets: one function for each point at which the hub and its clients read bytes from outside. The fuzzer calls
+//! them with generated input, and `tests/it/fuzzed.rs` with the corpus and with seeded noise. They check invariants
+//! only, not expected outputs.
 
 mod lan;
 mod processors;
@@ -23,7 +24,7 @@ use scanhub_drivers::lms::variant::{Baud, Variant};
 use scanhub_lms_configure::eeprom::EepromWrite;
 use scanhub_schema::{MILLIS, Nanos};
 
-/// A target by its name.
+/// A target with its name.
 pub type Target = (&'static str, fn(&[u8]));
 
 /// All targets. The corpus of each is `corpus/NAME.txt`.
@@ -38,12 +39,13 @@ pub const TARGETS: [Target; 8] = [
     ("recording", recording),
 ];
 
-/// Any bytes in any pieces: what is delivered stood there and has a right checksum, in order, and no byte vanishes.
+/// Passes any bytes to the framer, in pieces. Each delivered telegram is at the reported position and has a valid
+/// checksum, telegrams arrive in order, and no byte disappears.
 ///
-/// The first byte says what to expect, the second the size of the pieces.
+/// The first byte selects the expected headers, and the second one is the size of the pieces.
 pub fn framer(data: &[u8]) {
     let [expects, piece, bytes @ ..] = data else { return };
-    // The head of a stream is that of a telegram that came, so its length is possible.
+    // A session takes the header of a stream from a telegram that it received, so its length is valid.
     let head = bytes.first_chunk().filter(|head: &&[u8; 7]| head[3] < 3);
     let expect = match (expects & 3, head) {
         (1, Some(&header)) => ExpectedHeaders::Stream { header, reply: None },
@@ -84,7 +86,8 @@ fn drain(framer: &mut Framer, bytes: &[u8], checked_len: &mut usize) {
     assert_eq!(read, in_telegrams + acknowledge + discarded + framer.buffered() as u64);
 }
 
-/// Any data in a telegram with a right checksum, either direction: whatever can be read can be said again.
+/// Decodes any data in a telegram with a valid checksum, as a request and as a reply. Everything that can be decoded
+/// can be encoded again.
 pub fn replies(data: &[u8]) {
     let [address, command, rest @ ..] = data else { return };
     let rest = &rest[..rest.len().min(MAX_LENGTH - 1)];
@@ -108,7 +111,7 @@ pub fn replies(data: &[u8]) {
             reply.encode(*address, status).map(|again| Reply::decode(again.telegram()) == Some(reply));
         assert_ne!(again, Some(false), "{reply:?}");
     }
-    // The fields are the whole telegram, one after the other.
+    // The fields cover the whole telegram without gaps.
     let mut end = 0;
     explain(telegram, None, &mut |field| {
         assert_eq!(field.offset, end, "{}", field.name);
@@ -117,8 +120,8 @@ pub fn replies(data: &[u8]) {
     assert_eq!(end, encoded.bytes().len());
 }
 
-/// Any order of events: bytes, time, bytes that leave or stay. Read as a program of two-byte instructions, after the
-/// settings.
+/// Runs an LMS session with any sequence of events: received bytes, elapsed time, and transmitted or pending bytes. The
+/// input is a program of two-byte instructions after two bytes of settings.
 pub fn session(data: &[u8]) {
     let [variant, baud, program @ ..] = data else { return };
     let settings = Settings {
@@ -162,7 +165,7 @@ pub fn session(data: &[u8]) {
         let known = tally.in_telegrams + tally.acknowledge + tally.discarded + session.stats().buffered;
         assert_eq!((tally.read, known), (read, read), "bytes vanished");
         match what & 3 {
-            // Bytes of the program itself.
+            // Receive bytes of the program itself.
             0 => {
                 let spare = session.read_buffer();
                 let len = rest.len().min(usize::from(*much)).min(spare.len());
@@ -171,13 +174,13 @@ pub fn session(data: &[u8]) {
                 read += len as u64;
                 session.commit(now, len);
             }
-            // Time that need not be enough.
+            // Advance the time, perhaps by less than the session waits for.
             1 => {
                 now += Nanos::from(*much) * MILLIS / 8;
                 session.commit(now, 0);
                 session.handle_timeout(now);
             }
-            // Whatever was waited for.
+            // Advance the time to the session's deadline.
             2 if until != Nanos::MAX => {
                 now = now.max(until);
                 session.handle_timeout(now);
@@ -186,7 +189,7 @@ pub fn session(data: &[u8]) {
                 const CONTROLS: [Control; 3] = [Control::Pause, Control::Resume, Control::Resync];
                 session.control(CONTROLS[usize::from(*much) % CONTROLS.len()], now);
             }
-            // A reply with a right checksum, its data from the program.
+            // Receive a reply with a valid checksum and data from the program.
             _ => {
                 let len = rest.len().min(usize::from(*much)).min(120);
                 let (reply, after) = rest.split_at(len);
@@ -205,7 +208,7 @@ pub fn session(data: &[u8]) {
     assert_harmless(&request_bytes);
 }
 
-/// No telegram that stands anywhere in what was said, whatever it was cut by, writes the EEPROM.
+/// Checks that no telegram at any position in `request_bytes` writes the EEPROM.
 fn assert_harmless(request_bytes: &[u8]) {
     for at in 0..request_bytes.len() {
         let [STX, _, low, high, command, ..] = request_bytes[at..] else { continue };
@@ -216,9 +219,9 @@ fn assert_harmless(request_bytes: &[u8]) {
     }
 }
 
-/// Any text as flags and as a file: it is taken, or refused with a remedy.
+/// Loads any text as flags and as a configuration file. The configuration is accepted, or refused with a remedy.
 ///
-/// The text is cut at zero bytes: the first piece is a file, the others are `--set` and `--link` in turn.
+/// The text is split at zero bytes: the first part is the file, the others are values of `--set` and `--link` in turn.
 pub fn configuration(data: &[u8]) {
     use scanhub_config::{Config, Sources};
     let text = String::from_utf8_lossy(data);
@@ -238,22 +241,23 @@ pub fn configuration(data: &[u8]) {
     }
 }
 
-/// Any scans, whoever sends such, with any settings, through all processors.
+/// Passes any scans with any settings through all processors.
 pub fn processors(data: &[u8]) {
     processors::processors(data);
 }
 
-/// Any scans through those processors that follow the robot: lines, motion, and the map around it.
+/// Passes any scans through the processors that track the robot's motion: line features, motion, and the background of
+/// a moving robot.
 pub fn surroundings(data: &[u8]) {
     surroundings::surroundings(data);
 }
 
-/// Any datagrams, one after the other, through all checks and the receiver's account.
+/// Passes any datagrams through all checks and the receiver's counters.
 pub fn lan(data: &[u8]) {
     lan::lan(data);
 }
 
-/// Any bytes, as a file that shall be a recording.
+/// Opens any bytes as a recording.
 pub fn recording(data: &[u8]) {
     recording::recording(data);
 }

@@ -1,4 +1,4 @@
-//! `cargo fuzz run replies`: the target of that name.
+//! Fuzz target for the contents of LMS telegrams: `cargo fuzz run replies`.
 #![no_main]
 
 libfuzzer_sys::fuzz_target!(|data: &[u8]| scanhub_fuzz::replies(data));

@@ -1,4 +1,4 @@
-//! `cargo fuzz run session`: the target of that name.
+//! Fuzz target for the LMS session: `cargo fuzz run session`.
 #![no_main]
 
 libfuzzer_sys::fuzz_target!(|data: &[u8]| scanhub_fuzz::session(data));

@@ -1,4 +1,4 @@
-//! `cargo fuzz run surroundings`: the target of that name.
+//! Fuzz target for the processors that track the robot's motion: `cargo fuzz run surroundings`.
 #![no_main]
 
 libfuzzer_sys::fuzz_target!(|data: &[u8]| scanhub_fuzz::surroundings(data));
