@@ -1,15 +1,20 @@
-//! Figures of rotating scanners behind the whole hub, in virtual time. Each model runs in each mode for ten minutes. A
-//! hundred lines lose bytes in bursts, and a hundred hubs stop for half a second again and again. Scanners start from
-//! any state. The figures are in docs/measured.md:
-//! `cargo run --release -p scanhub-world --example revolutions`. Arguments after `--` select the tables whose names
-//! begin with them.
+//! Figures on revolutions of rotating scanners for docs/measured.md, measured behind a whole hub in virtual time. The
+//! tables cover:
+//!
+//! - each model in each mode for ten minutes,
+//! - a hundred lines that lose bytes in bursts,
+//! - a hundred hubs whose process stops for half a second at a time,
+//! - the time until a scanner streams, whatever its state was when the hub started.
+//!
+//! Run it with `cargo run --release -p scanhub-world --example turns`. Arguments after `--` select the tables whose
+//! names start with one of them.
 
 use std::fmt::Write as _;
 
 use scanhub_world::{Detail, RevolutionFigures, Scenario, run};
 
 const LD_MODELS: [&str; 5] = ["ld06", "ld19", "stl19p", "stl27l", "ld14p"];
-/// Each mode of each model of RPLIDAR.
+/// All modes of each RPLIDAR model.
 const RPLIDAR_MODELS: [(&str, &[&str]); 8] = [
     ("a1", &["standard", "express", "boost", "sensitivity", "stability"]),
     ("a2m8", &["standard", "express", "boost", "sensitivity", "stability"]),
@@ -20,14 +25,15 @@ const RPLIDAR_MODELS: [(&str, &[&str]); 8] = [
     ("s3", &["standard", "denseboost", "ultradense"]),
     ("c1", &["standard", "denseboost"]),
 ];
-/// One of each kind of packets.
+/// One model and mode for each packet format.
 const PACKET_KINDS: [&str; 5] = ["a1:standard", "a1:express", "a1:boost", "s1:denseboost", "s3:ultradense"];
 
-/// The tables that are wanted.
+/// Selected tables; all if empty.
 struct Tables(Vec<String>);
 
 impl Tables {
-    /// All that `scenarios` of `seconds` with `actions` come to, and what the judges say of them.
+    /// Runs worlds with `model` and `actions` for `seconds` each, and prints their figures and violations as one row of
+    /// `table`.
     fn measure(&self, table: &str, model: &str, seeds: std::ops::Range<u64>, seconds: u64, actions: &str) {
         if !self.0.is_empty() && !self.0.iter().any(|expected| table.starts_with(expected.as_str())) {
             return;
@@ -57,7 +63,7 @@ impl Tables {
     }
 }
 
-/// Again and again what `action` says, every so many milliseconds for a minute.
+/// Returns actions that repeat `action` every `every_ms` milliseconds, from 3 s to 48 s.
 fn repeated_action(every_ms: u64, action: &str) -> String {
     let mut actions = String::new();
     for at_ms in (3_000..48_000).step_by(every_ms as usize) {

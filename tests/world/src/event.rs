@@ -1,4 +1,4 @@
-//! Everything that happens in a world, as the judges see it and as its hash has it. Refuses to know what is right.
+//! Events of a world. Every invariant and the history hash receive each of them.
 
 use scanhub_network::lan::StreamCounters;
 use scanhub_network::lan::outgoing;
@@ -11,162 +11,164 @@ use crate::remote::Forgery;
 use crate::subscriber::SubscriberId;
 use crate::topics::Sample;
 
-/// Something that happened, at a time that is told beside it.
+/// An event. Its time is passed separately.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Event<'a> {
-    /// Hub number so many begins; its links have these names.
+    /// Hub number `run` has started, with the boot ID `boot`.
     HubStarted { run: u64, boot: u64 },
-    /// It is gone, because it was killed or ended in order.
+    /// The hub was killed or ended in order.
     HubEnded { run: u64, killed: bool },
-    /// The process of the hub does not run until then.
+    /// The process of the hub is stopped until this time.
     Stalled { until: Nanos },
-    /// The hub opened the line to a sensor, whose port had taken so many bytes before that nobody gets any more.
+    /// The hub has opened the line to a sensor. The `offset` bytes that the port had received before are lost.
     PortOpened { sensor: usize, offset: u64 },
     /// The line has no owner any more.
     PortClosed { sensor: usize },
-    /// Another sensor is there instead of the one that was.
+    /// Another scanner is connected to the line.
     ScannerExchanged { sensor: usize },
-    /// A scanner whose head turns measured these points.
+    /// A rotating scanner has measured these points.
     Measured { sensor: usize, points: &'a [TruePoint] },
-    /// The last byte of a telegram went into the port, or did not.
+    /// The last byte of a telegram has arrived at the port, or was lost on the way.
     Sent { sensor: usize, telegram: &'a Telegram<'a> },
-    /// Bytes that were in the port are gone, those from one to the other.
+    /// The port has discarded the bytes of its buffer, from position `from` up to position `to`.
     Flushed { sensor: usize, from: u64, to: u64 },
-    /// The port has another rate: what a session knew of bytes before is void.
+    /// The hub has changed the rate of the port, which invalidates what a session has derived from earlier bytes.
     RateChanged { sensor: usize },
     /// Another process has set the port to another rate.
     RateAltered { sensor: usize },
     /// The hub has written bytes to the port.
     Written { sensor: usize },
-    /// The hub has read so many bytes, up to this one.
+    /// The hub has read `len` bytes. The position after the last one is `to`.
     Read { sensor: usize, len: usize, to: u64 },
-    /// A sample went to whoever is attached.
+    /// A sample was sent to all attached subscribers.
     Published { sensor: usize, sample: &'a Sample },
-    /// Whoever sleeps at the bell of a sensor for topics of this ring is woken.
+    /// The hub rang the doorbell of a sensor for subscribers of this word.
     Rung { sensor: usize, ring: DoorbellWord },
     /// The hub sent the event of a sensor, which wakes its listeners.
     Notified { sensor: usize },
-    /// A sample got no memory.
+    /// There was no memory for a sample.
     OutOfMemory { sensor: usize, topic: Topic },
-    /// A consumer came.
+    /// A subscriber has attached.
     Attached { subscriber: SubscriberId, sensor: usize, topic: Topic, is_prompt: bool, is_listener: bool },
-    /// It took a sample, of which it was told by its number that it missed so many before.
+    /// A subscriber took a sample. By the sequence number, it missed `missed` samples before.
     Taken { subscriber: SubscriberId, sample: &'a Sample, missed: u64 },
-    /// A sample fell out of its full queue.
+    /// A sample was dropped from the full queue of a subscriber.
     Dropped { subscriber: SubscriberId, sample: &'a Sample },
-    /// It is gone, after it took all that waited, or not.
+    /// A subscriber has left or was killed. `is_drained` means that it had taken all samples before.
     Detached { subscriber: SubscriberId, is_drained: bool },
-    /// A robot believes this of a sensor's zones from now on.
+    /// A robot accepts this verdict on a sensor's zones from now on.
     VerdictAccepted { sensor: usize, verdict: Verdict },
-    /// A gateway begins, as a consumer of the hub's topics.
+    /// A gateway has started, as a subscriber of the hub's topics.
     GatewayStarted { epoch: u32 },
-    /// It is gone.
+    /// A gateway has ended.
     GatewayEnded { epoch: u32, is_killed: bool },
-    /// It made a datagram, which its sockets took or not.
+    /// A gateway sent a datagram. Its sockets accepted the datagram if `is_taken`.
     Transmitted { datagram: &'a Datagram<'a>, bytes: &'a [u8], is_taken: bool },
-    /// A row of the account of a gateway that ends; announcements are of no topic.
+    /// A row of the counters of a gateway that ends. The row of announcements has no topic.
     GatewayCounters { sensor: usize, topic: Option<Topic>, row: &'a outgoing::TopicStats },
-    /// Somebody else sent this.
+    /// Another sender sent these bytes.
     Forged { forgery: Forgery, bytes: &'a [u8] },
-    /// A listener begins.
+    /// A listener has started.
     ListenerStarted { run: u64 },
-    /// It took what had come to its machine, which may be a datagram, at some time before.
+    /// A listener took a message that had arrived at its machine at `arrived_at`. `datagram` is `None` if it is not a
+    /// datagram.
     Arrived {
         arrived_at: Nanos,
         datagram: Option<&'a Datagram<'a>>,
         bytes: &'a [u8],
         outcome: DatagramOutcome,
     },
-    /// A consumer of remote sensors got a sample; the payload is as in a datagram.
+    /// A subscriber of a remote sensor received a sample. The payload is encoded as in a datagram.
     Republished { sensor: usize, topic: Topic, header: &'a Header, payload: &'a [u8] },
-    /// A remote robot believes this of a sensor's zones from now on.
+    /// A remote robot accepts this verdict on a sensor's zones from now on.
     RemoteVerdictAccepted { sensor: usize, verdict: Verdict },
-    /// A row of the account of a listener that ends.
+    /// A row of the counters of a listener that ends.
     ListenerCounters { row: &'a StreamCounters },
-    /// It is gone: what it refused, the lives of gateways that it gave up, and how many sensors it published.
+    /// A listener has ended, with the number of datagrams that it refused, of runs of gateways that it evicted, and of
+    /// sensors that it published.
     ListenerEnded { run: u64, refused: u64, evicted: u64, sensors: usize },
-    /// An action.
+    /// An action, as text.
     ActionTaken { text: &'a str },
-    /// From now on nothing goes wrong.
+    /// All faults are cleared, and no further ones follow.
     FaultsCleared,
-    /// It is over, and the last hub has ended.
+    /// The world is at its end, and its last hub has ended.
     WorldEnded { eeprom_writes: u64, handles: usize, loans: usize, held: usize },
 }
 
-/// What a listener makes of what came.
+/// How a listener handles a message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum DatagramOutcome {
-    /// It is refused.
+    /// The listener refuses the datagram.
     Refused(DatagramError),
-    /// A part of a sample that is not whole yet.
+    /// A part of a sample that is not complete yet.
     Part,
-    /// It came before, or is an announcement that a newer one overtook.
+    /// The datagram arrived before, or is an announcement that is older than another one.
     Duplicate,
     /// An announcement.
     Announcement,
-    /// A sample, before all newer ones or not.
+    /// A complete sample. It is `late` if a newer one was complete before it.
     Sample { late: bool },
 }
 
-/// A telegram that left a sensor.
+/// A telegram or packet that a scanner sent.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Telegram<'a> {
-    /// As it should have been.
+    /// The bytes as the scanner sent them.
     pub(crate) bytes: &'a [u8],
-    /// Place of its first byte, and of the one behind its last, among all bytes that went into the port.
+    /// Position of the first byte, and the one after the last byte, among all bytes that arrived at the port.
     pub(crate) span: (u64, u64),
-    /// Time at which its first bytes went into the port, and its baud rate.
+    /// Time at which the first bytes arrived at the port, and baud rate.
     pub(crate) first_at: Nanos,
     pub(crate) rate: u32,
-    /// Why it did not go into the port as it should have been.
+    /// Reason why the bytes did not arrive as they were sent.
     pub(crate) damage: Option<&'static str>,
-    /// The sensor did not send all of it.
+    /// Whether the scanner did not send all of it.
     pub(crate) aborted: bool,
-    /// It is a reply, and no measured values.
+    /// Whether it is a reply, without measured values.
     pub(crate) is_reply: bool,
 }
 
-/// How much of what happens is told to standard error.
+/// Events that are printed to standard error.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Detail {
     /// Nothing.
     Nothing,
-    /// What does not happen with each telegram.
+    /// Events that do not occur with every telegram.
     Rare,
-    /// Verdicts, too.
+    /// The rare events, and all verdicts.
     All,
 }
 
-/// What the turns of heads were like that the judges of turns saw.
+/// Figures of all revolutions that the invariant `turns` checked.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct RevolutionFigures {
-    /// Scans, and those that were marked because packets of them are missing.
+    /// Number of scans.
     pub scans: u64,
-    /// See above.
+    /// Number of scans that were marked because packets are missing.
     pub incomplete: u64,
-    /// Points that were found among the true ones.
+    /// Number of points that were found among the measured ones.
     pub points: u64,
-    /// How far the exact angle of one was off at most, in degrees.
+    /// Largest error of an angle, in degrees.
     pub angle_deg: f64,
-    /// How far its range was off at most, in millimetres.
+    /// Largest error of a range, in millimeters.
     pub range_mm: f64,
-    /// How far the stamp of a scan was off at most, of those that are judged.
+    /// Largest error of the stamp of a scan. Only scans whose stamps must be right count.
     pub stamp_ns: Nanos,
-    /// By how much the time between two of them was another one than that which passed, at most.
+    /// Largest error of the time between two consecutive scans, by their stamps.
     pub uneven_ns: Nanos,
-    /// Points of scans without any mark that are more than 5 cm from everything that was measured.
+    /// Number of points in scans without any mark that are more than 5 cm from every measured point.
     pub wrong: u64,
-    /// Packets that a hub counted as lost on the line.
+    /// Number of packets that the hub counted as lost on the line.
     pub lost: u64,
-    /// When a hub had the first packet of measured values, and the first scan; what a scanner waited for its motor not
-    /// counted.
+    /// Time until the hub had the first packet of measured values, without the time in which the scanner waited for its
+    /// motor.
     pub data_ns: Nanos,
-    /// See above.
+    /// Time until the hub published the first scan, without the time in which the scanner waited for its motor.
     pub scan_ns: Nanos,
 }
 
 impl RevolutionFigures {
-    /// Takes over what is worse in `other`, and adds what it counts.
+    /// Adds the counts of `other`, and takes the larger of each pair of errors.
     pub fn add(&mut self, other: &RevolutionFigures) {
         self.scans += other.scans;
         self.incomplete += other.incomplete;
@@ -182,14 +184,14 @@ impl RevolutionFigures {
     }
 }
 
-/// What a judge says.
+/// A violation of an invariant.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Violation {
-    /// The judge.
+    /// Name of the invariant.
     pub invariant: &'static str,
-    /// When, in virtual nanoseconds.
+    /// Time of the violation, in virtual nanoseconds.
     pub at_ns: Nanos,
-    /// What is not as it should be.
+    /// Description of the violation.
     pub message: String,
 }
 
@@ -200,9 +202,9 @@ impl std::fmt::Display for Violation {
 }
 
 impl Event<'_> {
-    /// Takes it into the hash of everything.
+    /// Adds the event to the history hash.
     pub(crate) fn hash(&self, at: Nanos, history: &mut HistoryHash) {
-        // The hash contains the replies of the scanner.
+        // The replies of the scanner are in the hash.
         if matches!(self, Event::Written { .. }) {
             return;
         }
@@ -225,11 +227,11 @@ impl Event<'_> {
             Event::Read { sensor, to, .. } => numbers(&[9, sensor as u64, to]),
             Event::Published { sensor, sample } => {
                 numbers(&[10, sensor as u64, sample.topic as u64]);
-                // The process is another one in each run.
+                // The process ID differs from run to run.
                 history.add_bytes(bytemuck::bytes_of(&Header { hub_pid: 0, ..sample.header }));
                 history.add_bytes(&sample.bytes);
             }
-            // What it tells of them is hashed.
+            // The packets with these points are in the hash.
             Event::Measured { .. } | Event::Written { .. } => {}
             Event::Rung { sensor, ring } => numbers(&[29, sensor as u64, ring as u64]),
             Event::Notified { sensor } => numbers(&[32, sensor as u64]),
@@ -276,7 +278,7 @@ impl Event<'_> {
                 numbers(&[27, row.epoch.into(), row.sensor.into(), row.topic.into()]);
                 numbers(&[row.received, row.lost(), row.duplicate, row.reordered]);
             }
-            // It follows from all that is told of before.
+            // The counters follow from events that are in the hash.
             Event::GatewayCounters { .. } => {}
             Event::ListenerEnded { run, refused, evicted: given_up, sensors } => {
                 numbers(&[28, run, refused, given_up, sensors as u64]);
@@ -284,7 +286,7 @@ impl Event<'_> {
         }
     }
 
-    /// What to say of it to whoever wants to see so much of it.
+    /// Returns the line to print for the event, or `None` if `detail` leaves it out.
     pub(crate) fn describe(&self, detail: Detail) -> Option<String> {
         match self {
             Event::Sent {
@@ -334,7 +336,7 @@ impl Event<'_> {
     }
 }
 
-/// Enough to know what it is.
+/// Returns enough of the bytes to recognize a telegram.
 fn prefix(bytes: &[u8]) -> &[u8] {
     &bytes[..bytes.len().min(8)]
 }

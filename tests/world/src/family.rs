@@ -1,5 +1,5 @@
-//! The families of scanners in a world, a file each: how one of them is found, what its link's configuration says, what
-//! its bytes mean to the judges. All else in a world knows none of them.
+//! Scanner families of a world, one file each. A family defines in which state a scanner is found, the configuration of
+//! its link, and what its bytes mean to invariants. The rest of the world does not depend on the family.
 
 mod either;
 mod ld;
@@ -21,12 +21,12 @@ use scanhub_sim::world::World as Scene;
 
 use crate::scenario::Action;
 
-/// A scanner of a world and its link, as the seed has them.
+/// A scanner of a world with its link, as drawn from the seed.
 pub(crate) trait Family {
-    /// The keys of its link, as `KEY=VALUE`.
+    /// Returns the configuration keys of the link, as `KEY=VALUE`.
     fn keys(&self) -> Vec<String>;
 
-    /// Returns this scanner with a link that has no family, and no key that names one.
+    /// Returns this scanner with a link that has no family and no key that implies one.
     fn auto(&self) -> Rc<dyn Family>;
 
     /// Returns the family, or both families of a scanner that is exchanged for a scanner of another family.
@@ -35,75 +35,77 @@ pub(crate) trait Family {
     /// Returns the rates that the line may have, in bits per second.
     fn baud_rates(&self) -> Vec<u32>;
 
-    /// The longest time between two scans, and from when something is measured until the scan that tells it has left.
+    /// Returns the longest time between two scans, and the longest time from a measurement until the scan that contains
+    /// it has been sent.
     fn scan_times(&self) -> (Nanos, Nanos);
 
-    /// The scanner as it is found, whose view changes as `changes` say.
+    /// Returns the scanner as the hub finds it. Its scene changes by `changes`.
     fn initial_scanner(&self, changes: Changes) -> Box<dyn Scanner>;
 
-    /// What it sent one by one, of the bytes of a sample of telegrams.
+    /// Splits a sample of topic `telegram` into the telegrams or packets that the scanner sent.
     fn telegrams<'a>(&self, sample: &'a [u8]) -> Vec<&'a [u8]>;
 
-    /// So many of them are in a sample at the most.
+    /// Returns the maximum number of telegrams or packets in a sample.
     fn max_telegrams(&self) -> usize;
 
-    /// Whether `unit` is measured values, and no reply.
+    /// Returns whether `unit` contains measured values and is not a reply.
     fn is_data(&self, unit: &[u8]) -> bool;
 
-    /// Whether `scan` has the values of the last `sample` of telegrams, where a sample has those of a scan.
+    /// Returns whether `scan` has the values of `sample`, for families with one telegram per scan.
     fn is_scan_of(&self, scan: &Scan, sample: &[u8]) -> bool;
 
-    /// Whether a line may have made `got` of one of the units that it `damaged` lately, so that nobody can know: a
-    /// checksum is right once in a while.
+    /// Returns whether the line may have made `got` from a recently `damaged` unit in such a way that the checksum is
+    /// valid by chance. The hub cannot detect this.
     fn is_collision(&self, got: &[u8], damaged: &mut dyn Iterator<Item = &[u8]>) -> bool;
 
-    /// Whether its head turns all around, and its scans are turns of points whose truth is known.
+    /// Returns whether this is a rotating scanner, whose points the simulation records.
     fn is_rotating(&self) -> bool {
         false
     }
 
-    /// Where the points of `unit` begin, if it has any and its head turns.
+    /// Returns the position of the first point of `unit`, or `None` if it has no points or the scanner does not rotate.
     fn first_point(&self, unit: &[u8]) -> Option<FirstPoint> {
         let _ = unit;
         None
     }
 
-    /// How exactly `unit` tells points.
+    /// Returns the accuracy of the points in `unit`.
     fn point_accuracy(&self, unit: &[u8]) -> PointAccuracy {
         let _ = unit;
         PointAccuracy::default()
     }
 }
 
-/// The points of a packet.
+/// Position of the points of a packet.
 pub(crate) struct FirstPoint {
-    /// Where the first one is.
+    /// Angle of the first point.
     pub(crate) clockwise_deg: f64,
-    /// How many there are, one after the other.
+    /// Number of consecutive points.
     pub(crate) points: usize,
-    /// How long the packet is on the line after the last one.
+    /// Time for which the packet is on the line after the last point.
     pub(crate) line_time: Nanos,
 }
 
-/// How exactly a packet tells points, and how much may be missing without a mark.
+/// Accuracy of the points of a packet, and what may be missing from a scan that is not marked.
 #[derive(Clone, Copy)]
 pub(crate) struct PointAccuracy {
     pub(crate) angle_deg: f64,
     pub(crate) range_mm: f64,
-    /// Where nothing came back, the angle says little.
+    /// Tolerance of the angle of a point without a return.
     pub(crate) no_return_deg: f64,
-    /// Points of a turn.
+    /// Number of points of a revolution that may be missing without a mark.
     pub(crate) points: usize,
-    /// Packets before and behind damaged bytes that may be lost with them: of what has a checksum only the one before
-    /// them, and only that which follows could tell how its points are.
+    /// Number of packets before and after damaged bytes that may be lost with them. If packets have a checksum, it is
+    /// only the packet before them, and only where the following packet is needed to decode the points.
     pub(crate) neighbors: usize,
-    /// Whether packets have a time of their own. Without one it takes a while until it is known how the scanner's clock
-    /// goes, and over a long gap nobody can know how many packets there were.
+    /// Whether packets contain a timestamp. Without one, the session needs a while to estimate the scanner's clock, and
+    /// cannot determine the number of packets that are missing in a long gap.
     pub(crate) has_clock: bool,
 }
 
 impl Default for PointAccuracy {
-    /// Packets that tell angles and ranges as they are, and everything by themselves.
+    /// Returns the accuracy of packets that contain exact angles and ranges, and that can be decoded without another
+    /// packet.
     fn default() -> PointAccuracy {
         PointAccuracy {
             angle_deg: 0.05,
@@ -116,53 +118,55 @@ impl Default for PointAccuracy {
     }
 }
 
-/// A simulated scanner, and what only some of its family can do; of the others it does nothing.
+/// A simulated scanner. Methods that only some families need do nothing by default.
 pub(crate) trait Scanner {
-    /// The scanner itself.
+    /// Returns the simulated device.
     fn device(&self) -> &dyn Device;
 
-    /// The same, to be driven.
+    /// Returns the simulated device, to advance it or send it bytes.
     fn device_mut(&mut self) -> &mut dyn Device;
 
-    /// Another one is at the line from `now` on, as `action` says; what somebody said to it just before, in bytes.
+    /// Replaces the scanner at `now` as `action` says. Returns the bytes that another host has just sent to the new
+    /// scanner.
     fn exchange(&mut self, action: &Action, now: Nanos) -> Vec<u8>;
 
-    /// Lets its voltage dip at `now`.
+    /// Makes the supply voltage dip at `now`.
     fn brown_out(&mut self, now: Nanos) {
         self.device_mut().brown_out(now);
     }
 
-    /// It behaves badly as `action` says, or well again.
+    /// Starts the misbehavior of `action`, or ends it with `None`.
     fn misbehave(&mut self, action: Option<&Action>);
 
-    /// Something happens to it that only some scanners know.
+    /// Injects a fault that only some scanners can have.
     fn inject_fault(&mut self, fault: ScannerFault, now: Nanos) {
         let _ = (fault, now);
     }
 
-    /// Its head turns at this share of its usual speed, as soon as it gets there.
+    /// Sets the target speed of the head, as a share of its usual speed.
     fn set_speed(&mut self, share: f64) {
         let _ = share;
     }
 
-    /// The points that it measured since this was asked last, if their truth is known.
+    /// Returns the points that were measured since the last call, if the simulation records them.
     fn measured(&mut self) -> Vec<TruePoint> {
         Vec::new()
     }
 }
 
-/// What happens to a scanner beside its line.
+/// A fault of a scanner that does not come from its line.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum ScannerFault {
-    /// Something holds its head for so long.
+    /// The head is blocked for this time.
     HeadHeld { span: Nanos },
-    /// It says that it is well (0), may not be for long (1), or is not (2); if it is stubborn, also after it booted.
+    /// The reported health status: good (0), warning (1) or error (2). A stubborn scanner keeps the status after a
+    /// restart.
     Unhealthy { status: u8, is_stubborn: bool },
-    /// While it measures it hears nothing; or it hears again.
+    /// The scanner ignores all requests while it measures.
     IgnoresRequests(bool),
 }
 
-/// The scanners that `random` draws.
+/// Draws one or two scanners.
 pub(crate) fn draw(random: &mut fastrand::Rng) -> Vec<Rc<dyn Family>> {
     let count = random.usize(1..=2);
     let one = |random: &mut fastrand::Rng| -> Rc<dyn Family> {
@@ -192,8 +196,8 @@ pub(crate) fn is_ld_packet(bytes: &[u8]) -> bool {
     bytes.len() == scanhub_drivers::ld::packet::PACKET_LEN && bytes.starts_with(&[0x54, 0x2C])
 }
 
-/// The scanner that a plan calls so, otherwise as `random` draws it; nothing if there is none: `ld19`, `a1`,
-/// `a1:boost`, `a1:boost:streaming`.
+/// Returns the scanner with this name, with its other settings drawn from `random`, or `None` for an unknown name.
+/// Examples are `ld19`, `a1`, `a1:boost` and `a1:boost:streaming`.
 pub(crate) fn from_name(text: &str, random: &mut fastrand::Rng) -> Option<Rc<dyn Family>> {
     match scanhub_drivers::ld::Model::from_name(text) {
         Some(model) => Some(Rc::new(ld::Ld::of(model, random))),
@@ -201,7 +205,7 @@ pub(crate) fn from_name(text: &str, random: &mut fastrand::Rng) -> Option<Rc<dyn
     }
 }
 
-/// How a scanner behaves to which `action` happens: shares are in percent.
+/// Returns the faulty behavior that `action` requests. Shares in an action are in percent.
 fn quirks(action: &Action) -> ProtocolQuirks {
     let share = |name| action.value(name) as f64 / 1e2;
     ProtocolQuirks {
@@ -214,7 +218,7 @@ fn quirks(action: &Action) -> ProtocolQuirks {
     }
 }
 
-/// The rooms without any noise, for all worlds. No LMS tells its scans of them.
+/// Returns the rooms without noise, computed once for all worlds. No LMS uses them.
 fn still_rooms() -> Arc<PrecomputedScans> {
     static SCANS: LazyLock<Arc<PrecomputedScans>> = LazyLock::new(|| {
         let rooms = rooms(|scene| scene.with_noise(NoiseModel::NONE));
@@ -223,13 +227,13 @@ fn still_rooms() -> Arc<PrecomputedScans> {
     SCANS.clone()
 }
 
-/// A head that is slowed down turns at this share of its speed.
+/// Lowest speed of a head that is slowed down, as a share of its usual speed.
 const MIN_SPEED: f64 = 0.6;
-/// The most by which a head gets faster or slower in a second, as a share of its usual speed.
+/// Maximum change of speed per second, as a share of the usual speed.
 const MAX_SPEED_CHANGE: f64 = 0.4;
 
-/// What scanners see in all worlds: a room without anything near, the same with a post 0.8 m ahead, and with one 0.4 m
-/// ahead.
+/// Returns the scenes of all worlds: a room without near objects, the same room with a post 0.8 m ahead, and with a
+/// post 0.4 m ahead.
 fn rooms(layers: impl Fn(Scene) -> Scene) -> Vec<Room> {
     let rooms = [None, Some(800), Some(400)].map(|ahead_mm: Option<u32>| {
         let post =
@@ -240,7 +244,7 @@ fn rooms(layers: impl Fn(Scene) -> Scene) -> Vec<Room> {
     rooms.to_vec()
 }
 
-/// Four walls, and noise as a real sensor has it, but no codes: what is near is seen by every scan.
+/// Four walls, with the noise of a real scanner but without codes, so that every scan shows a near object.
 const WORLD_CONFIG: &str = "
 [noise]
 tail = 0

@@ -1,4 +1,4 @@
-//! Actions of the hub's process and its host: its end, its resources, its configuration and its clock.
+//! Actions on the hub's process and its host: exit, resources, configuration and clock.
 
 use scanhub_schema::MILLIS;
 
@@ -7,7 +7,7 @@ use crate::event::Event;
 use crate::scenario::Action;
 use crate::world::{HubEnding, World};
 
-/// The hub is killed, and another one starts after a while.
+/// Kills the hub. Another one starts after `away_ms`.
 pub(super) const KILL_HUB: ActionKind = ActionKind {
     name: "kill_hub",
     per_minute: 3.0,
@@ -15,7 +15,7 @@ pub(super) const KILL_HUB: ActionKind = ActionKind {
     act: |world, action| end_hub(world, action, true),
 };
 
-/// The hub ends in order, and another one starts after a while.
+/// Ends the hub in order. Another one starts after `away_ms`.
 pub(super) const END_HUB: ActionKind = ActionKind {
     name: "end_hub",
     per_minute: 1.5,
@@ -28,7 +28,7 @@ fn end_hub(world: &mut World, action: &Action, is_killed: bool) {
     world.hub_requests.ending = Some(HubEnding { is_killed, restart_at: back_at });
 }
 
-/// The hub's process does not run for a while.
+/// Stops the hub's process for `span_ms`.
 pub(super) const STALL: ActionKind = ActionKind {
     name: "stall",
     per_minute: 4.0,
@@ -42,7 +42,7 @@ fn stall_hub(world: &mut World, action: &Action) {
     world.shared.log_event(&Event::Stalled { until: world.stalled_until });
 }
 
-/// The configuration changes, to a valid or an invalid one, and the hub gets the request to read it.
+/// Changes the configuration to a valid or an invalid one, and requests that the hub reload it.
 pub(super) const RELOAD: ActionKind = ActionKind {
     name: "reload",
     per_minute: 4.0,
@@ -55,7 +55,7 @@ fn reload_configuration(world: &mut World, action: &Action) {
     world.hub_requests.reload = true;
 }
 
-/// The disk is full for a while.
+/// Fills the disk for `span_ms`.
 pub(super) const DISK_FULL: ActionKind = ActionKind {
     name: "disk_full",
     per_minute: 2.0,
@@ -68,7 +68,7 @@ fn fill_disk(world: &mut World, action: &Action) {
     world.schedule(action.value("span_ms"), |world| world.shared.disk_is_full.set(false));
 }
 
-/// There is no memory for samples for a while.
+/// Makes all requests for sample memory fail for `span_ms`.
 pub(super) const NO_MEMORY: ActionKind = ActionKind {
     name: "no_memory",
     per_minute: 2.0,
@@ -81,7 +81,7 @@ fn exhaust_memory(world: &mut World, action: &Action) {
     world.schedule(action.value("span_ms"), |world| world.shared.topics.borrow_mut().lacks_memory = false);
 }
 
-/// The hub cannot open anything for a while.
+/// Makes the hub run out of file descriptors for `span_ms`.
 pub(super) const NO_DESCRIPTORS: ActionKind = ActionKind {
     name: "no_descriptors",
     per_minute: 2.0,
@@ -94,7 +94,7 @@ fn exhaust_descriptors(world: &mut World, action: &Action) {
     world.schedule(action.value("span_ms"), |world| world.shared.lacks_descriptors.set(false));
 }
 
-/// The wall clock is set.
+/// Sets the wall clock forward or back.
 pub(super) const WALL_STEP: ActionKind = ActionKind {
     name: "wall_step",
     per_minute: 2.0,

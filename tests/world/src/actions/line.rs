@@ -1,4 +1,5 @@
-//! Actions of the line and its port: faults of bytes and telegrams, and ports that are unplugged, refused or altered.
+//! Actions on the line and its port: damaged bytes and telegrams, and ports that are unplugged, cannot be opened or are
+//! set to another rate.
 
 use scanhub_port::PortError;
 use scanhub_schema::{MILLIS, Nanos};
@@ -8,7 +9,7 @@ use super::{ActionKey, ActionKind, SENSOR};
 use crate::scenario::Action;
 use crate::world::World;
 
-/// The line loses, flips, inserts and duplicates bytes for a while. Shares are in units of 1e-5.
+/// Loses, flips, inserts and duplicates bytes on the line for `span_ms`. Shares are in units of 1e-5.
 pub(super) const NOISE: ActionKind = ActionKind {
     name: "noise",
     per_minute: 3.0,
@@ -28,7 +29,7 @@ fn add_noise(world: &mut World, action: &Action) {
     world.inject_line_fault(action, &noise_faults(action));
 }
 
-/// Returns the faults of the bytes on the line.
+/// Returns the line faults of a `noise` action.
 pub(super) fn noise_faults(action: &Action) -> Faults {
     let share = |name| action.value(name) as f64 / 1e5;
     let burst = action.value("burst") as f64;
@@ -44,7 +45,7 @@ pub(super) fn noise_faults(action: &Action) -> Faults {
     }
 }
 
-/// Floods of random bytes and walls of start bytes arrive on the line for a while.
+/// Inserts floods of random bytes and long runs of start bytes into the line for `span_ms`.
 pub(super) const GARBAGE: ActionKind = ActionKind {
     name: "garbage",
     per_minute: 3.0,
@@ -62,15 +63,15 @@ fn add_garbage(world: &mut World, action: &Action) {
     world.inject_line_fault(action, &garbage_faults(action));
 }
 
-/// Returns the faults of the bytes on the line.
+/// Returns the line faults of a `garbage` action.
 pub(super) fn garbage_faults(action: &Action) -> Faults {
     let every = action.value("every_ms") as f64 / 1e3;
     let (flood, wall) = (action.value("flood") as f64, action.value("wall") as f64);
     Faults { flood, flood_every: every, wall, wall_every: every, ..Faults::default() }
 }
 
-/// Whole telegrams are damaged for a while: the line loses their ends, changes their length fields or duplicates them, or the
-/// scanner aborts them. Shares are in percent.
+/// Damages whole telegrams for `span_ms`: the line truncates them, changes their length fields or duplicates them, or
+/// the scanner aborts them. Shares are in percent.
 pub(super) const TELEGRAMS: ActionKind = ActionKind {
     name: "telegrams",
     per_minute: 3.0,
@@ -89,7 +90,7 @@ fn damage_telegrams(world: &mut World, action: &Action) {
     world.inject_line_fault(action, &telegram_faults(action));
 }
 
-/// Returns the faults of the bytes on the line.
+/// Returns the line faults of a `telegrams` action.
 pub(super) fn telegram_faults(action: &Action) -> Faults {
     let share = |name| action.value(name) as f64 / 1e2;
     Faults {
@@ -101,7 +102,7 @@ pub(super) fn telegram_faults(action: &Action) -> Faults {
     }
 }
 
-/// No byte arrives for a while, or every byte arrives late.
+/// Drops all bytes for `span_ms`, or delays them.
 pub(super) const SILENCE: ActionKind = ActionKind {
     name: "silence",
     per_minute: 4.0,
@@ -110,12 +111,12 @@ pub(super) const SILENCE: ActionKind = ActionKind {
 };
 
 fn silence_line(world: &mut World, action: &Action) {
-    // The line would still hold bytes back after the world has healed.
+    // Otherwise the line would still hold back bytes after the faults are cleared.
     let faults = silence_faults(action, world.now(), world.time_until_faults_clear());
     world.inject_line_fault(action, &faults);
 }
 
-/// Returns the faults of the bytes on the line from `now` on, which end after `most`.
+/// Returns the line faults of a `silence` action that starts at `now`. They last for at most `max_span`.
 pub(super) fn silence_faults(action: &Action, now: Nanos, max_span: Nanos) -> Faults {
     let span = (action.value("span_ms") * MILLIS).min(max_span) as f64 / 1e9;
     let at = now as f64 / 1e9 + 1e-3;
@@ -125,7 +126,7 @@ pub(super) fn silence_faults(action: &Action, now: Nanos, max_span: Nanos) -> Fa
     }
 }
 
-/// The adapter is unplugged, and plugged in again.
+/// Unplugs the adapter, and plugs it in again after `span_ms`.
 pub(super) const UNPLUG: ActionKind = ActionKind {
     name: "unplug",
     per_minute: 3.0,
@@ -141,7 +142,7 @@ fn unplug(world: &mut World, action: &Action) {
     });
 }
 
-/// The adapter is unplugged and returns under another name, and later under its own.
+/// Unplugs the adapter, plugs it in under another name, and after `span_ms` under its own.
 pub(super) const REPLUG_ELSEWHERE: ActionKind = ActionKind {
     name: "replug_elsewhere",
     per_minute: 1.5,
@@ -163,8 +164,8 @@ fn replug_elsewhere(world: &mut World, action: &Action) {
     });
 }
 
-/// For a while, a port exists but cannot be opened: the hub has no permission, another program has the port, or the driver
-/// refuses the rate.
+/// Makes opening the port fail for `span_ms`: the hub has no permission, another program has the port open, or the
+/// driver rejects the rate.
 pub(super) const PORT_DENIED: ActionKind = ActionKind {
     name: "denied",
     per_minute: 2.0,
@@ -185,7 +186,7 @@ fn deny_port(world: &mut World, action: &Action) {
     });
 }
 
-/// Another process that opened the port before the hub sets it to another rate.
+/// Sets the port to another rate, like another process that opened the port before the hub.
 pub(super) const RATE_ALTERED: ActionKind = ActionKind {
     name: "altered",
     per_minute: 2.0,
@@ -199,5 +200,5 @@ fn alter_rate(world: &mut World, action: &Action) {
     world.with_port(sensor, |tty, log, now| tty.alter(rate, log, now));
 }
 
-/// Rates that programs try, in bits per second.
+/// Rates that programs often use, in bits per second.
 const ALTERED_RATES: [u32; 5] = [9_600, 38_400, 57_600, 115_200, 500_000];

@@ -1,5 +1,6 @@
-//! Actions of a plan: faults and events, each with its name, its keys and its effect. A plan draws, prints and parses all
-//! actions alike. An action undoes its effect after a while, or when the world heals.
+//! Actions of a scenario: faults and other events, each with its name, its keys and its effect. All kinds of actions
+//! are drawn, printed and parsed in the same way. An action undoes its effect after a while, or when all faults are
+//! cleared.
 
 mod hub;
 mod line;
@@ -18,13 +19,13 @@ pub(crate) use scanner::{objects_inside, scene_changes};
 #[derive(Debug)]
 pub(crate) struct ActionKind {
     pub(crate) name: &'static str,
-    /// Number of occurrences per minute in a world that has it.
+    /// Mean number of occurrences per minute, in a scenario that contains this kind.
     pub(crate) per_minute: f64,
     pub(crate) keys: &'static [ActionKey],
     pub(crate) act: fn(&mut World, &Action),
 }
 
-/// A key of an action, and the range of its drawn values.
+/// A key of an action, with the range from which its value is drawn.
 #[derive(Debug)]
 pub(crate) struct ActionKey {
     pub(crate) name: &'static str,
@@ -38,10 +39,10 @@ impl ActionKey {
     }
 }
 
-/// Number of the sensor that the action affects.
+/// Index of the sensor that the action affects.
 const SENSOR: ActionKey = ActionKey::new("sensor", 0, 1);
 
-/// All kinds, in the order in which plans draw them.
+/// All kinds, in the order in which a scenario draws them.
 pub(crate) const ACTION_KINDS: &[ActionKind] = &[
     scanner::OBJECT_INSIDE,
     line::UNPLUG,
@@ -83,17 +84,17 @@ pub(crate) const ACTION_KINDS: &[ActionKind] = &[
     subscribers::ATTACH_BETWEEN_SAMPLES,
 ];
 
-/// Returns whether gateway and listener of a world with these actions have a key.
+/// Returns whether these actions need a gateway and a listener that have a key.
 pub(crate) fn have_key(actions: &[Action]) -> bool {
     actions.iter().any(|action| action.name() == network::KEY_ERRORS.name)
 }
 
-/// Returns whether gateway and listener of a world with these actions are bridges with a router between them.
+/// Returns whether these actions need bridges with a router between them in place of gateway and listener.
 pub(crate) fn are_bridges(actions: &[Action]) -> bool {
     !have_key(actions) && actions.iter().any(|action| action.name() == network::ROUTER_KILLED.name)
 }
 
-/// Returns the topics that lose their constant subscribers in a world with these actions. No judge needs them.
+/// Returns the topics that have no permanent subscriber in a world with these actions. No invariant needs one on them.
 pub(crate) fn topics_without_constant_subscriber(actions: &[Action], seed: u64) -> Vec<Topic> {
     if actions.iter().all(|action| action.name() != subscribers::ATTACH_BETWEEN_SAMPLES.name) {
         return Vec::new();
@@ -103,7 +104,7 @@ pub(crate) fn topics_without_constant_subscriber(actions: &[Action], seed: u64) 
     topics.into_iter().filter(|_| random.u8(..4) > 0).collect()
 }
 
-/// Returns the faults that `action` causes on its line from `now` on, if it affects bytes.
+/// Returns the line faults of `action` if it starts at `now`, or `None` if it does not affect bytes.
 pub(crate) fn faults(action: &Action, now: Nanos) -> Option<Faults> {
     let name = action.name();
     if name == line::SILENCE.name {
@@ -119,7 +120,7 @@ pub(crate) fn faults(action: &Action, now: Nanos) -> Option<Faults> {
 }
 
 impl ActionKind {
-    /// Draws values for the keys. Where a range is wide, their logarithms are evenly distributed.
+    /// Draws values for the keys, log-uniformly from wide ranges.
     pub(crate) fn draw(&self, random: &mut fastrand::Rng) -> Vec<u64> {
         let value = |key: &ActionKey| match key {
             ActionKey { min: minimum, max: maximum, .. } if *maximum > 20 * (*minimum).max(1) => {

@@ -1,4 +1,4 @@
-//! Actions of the network and of the processes at its ends.
+//! Actions on the network, and on the gateway and the listener.
 
 use scanhub_schema::MILLIS;
 
@@ -8,7 +8,7 @@ use crate::remote::Forgery;
 use crate::scenario::Action;
 use crate::world::World;
 
-/// The network loses, duplicates, damages, delays and reorders datagrams for a while, and the gateway's sockets refuse some.
+/// Loses, duplicates, damages, delays and reorders datagrams for `span_ms`. The gateway's sockets refuse some, too.
 /// Shares are in thousandths.
 pub(super) const NETWORK_LOSS: ActionKind = ActionKind {
     name: "network_loss",
@@ -45,7 +45,7 @@ fn set_network_faults(world: &mut World, faults: Faults, refusal: f64) {
     world.remote_machines.refusal_rate = refusal;
 }
 
-/// No datagram passes the network for a while.
+/// Cuts the network for `span_ms`.
 pub(super) const PARTITION: ActionKind = ActionKind {
     name: "partition",
     per_minute: 4.0,
@@ -62,7 +62,7 @@ fn partition(world: &mut World, action: &Action) {
     });
 }
 
-/// The gateway's or the listener's process does not run for a while.
+/// Stops the process of the gateway or of the listener for `span_ms`.
 pub(super) const NETWORK_STALL: ActionKind = ActionKind {
     name: "network_stall",
     per_minute: 4.0,
@@ -75,7 +75,7 @@ fn stall_network(world: &mut World, action: &Action) {
     world.remote_machines.stall(action.value("is_listener") > 0, until);
 }
 
-/// The gateway is killed or ends in order, and another one starts after a while.
+/// Kills the gateway, or ends it in order. Another one starts after `away_ms`.
 pub(super) const GATEWAY_KILLED: ActionKind = ActionKind {
     name: "gateway_killed",
     per_minute: 3.0,
@@ -88,7 +88,7 @@ fn kill_gateway(world: &mut World, action: &Action) {
     world.schedule(action.value("away_ms"), |world| world.remote_machines.begin_gateway(&world.shared));
 }
 
-/// The listener is killed, and another one starts after a while.
+/// Kills the listener. Another one starts after `away_ms`.
 pub(super) const LISTENER_KILLED: ActionKind = ActionKind {
     name: "listener_killed",
     per_minute: 3.0,
@@ -101,9 +101,9 @@ fn kill_listener(world: &mut World, action: &Action) {
     world.schedule(action.value("away_ms"), |world| world.remote_machines.begin_listener(&world.shared));
 }
 
-/// The router between gateway and listener is killed with everything that it holds, and another one starts after a while.
-/// Gateway and listener of such a world are bridges, unless they have a key. Then the network takes the place of the router,
-/// and no datagram passes it meanwhile.
+/// Kills the router between two bridges, with everything that it holds. Another one starts after `away_ms`. A scenario
+/// with this action has bridges in place of gateway and listener, unless they have a key. In that case there is no
+/// router, and the network is cut instead.
 pub(super) const ROUTER_KILLED: ActionKind = ActionKind {
     name: "router_killed",
     per_minute: 4.0,
@@ -117,10 +117,11 @@ fn kill_router(world: &mut World, action: &Action) {
     world.schedule(action.value("away_ms"), |world| world.remote_machines.begin_router(&world.shared));
 }
 
-/// A sender on the network has no key, has another key, or repeats recorded datagrams; or the clocks of both machines are apart
-/// for a while. Gateway and listener of such a world have a key.
+/// Sends datagrams from a machine that does not have the key, or sets the clocks of both machines apart for `span_ms`.
+/// A scenario with this action has a gateway and a listener with a key.
 ///
-/// `what`: 0 no MAC, 1 another key, 2 the MAC of another datagram, 3 a recording that is sent again, 4 clocks that are apart.
+/// Values of `what`: 0 no MAC, 1 another key, 2 the MAC of another datagram, 3 recorded datagrams that are sent again,
+/// 4 clocks that are apart.
 pub(super) const KEY_ERRORS: ActionKind = ActionKind {
     name: "key_errors",
     per_minute: 6.0,
@@ -141,7 +142,7 @@ fn forge(world: &mut World, action: &Action) {
         2 => Forgery::OtherMac,
         3 => Forgery::Recording,
         _ => {
-            // Behind as often as ahead.
+            // The clock is set back as often as forward.
             let apart_s = action.value("apart_s") as i64;
             let apart_s = if count.is_multiple_of(2) { apart_s } else { -apart_s };
             world.remote_machines.set_extra_clock_offset(apart_s * 1_000_000_000);

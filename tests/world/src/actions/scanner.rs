@@ -1,4 +1,4 @@
-//! Actions of a scanner and of the scene that it measures.
+//! Actions on a scanner and on the scene that it measures.
 
 use scanhub_schema::{MILLIS, Nanos};
 use scanhub_sim::room::Changes;
@@ -9,7 +9,7 @@ use crate::family::ScannerFault;
 use crate::scenario::{Action, Scenario};
 use crate::world::World;
 
-/// Another scanner is connected to the line, at some rate, idle or already streaming.
+/// Connects another scanner to the line, at some rate, idle or already streaming.
 pub(super) const EXCHANGE: ActionKind = ActionKind {
     name: "exchange",
     per_minute: 1.5,
@@ -26,7 +26,7 @@ fn exchange_scanner(world: &mut World, action: &Action) {
     world.shared.log_event(&Event::ScannerExchanged { sensor });
 }
 
-/// A scanner's power goes off and on.
+/// Turns the power of a scanner off and on.
 pub(super) const POWER_CYCLE: ActionKind =
     ActionKind { name: "power_cycle", per_minute: 2.0, keys: &[SENSOR], act: power_cycle };
 
@@ -37,7 +37,7 @@ fn power_cycle(world: &mut World, action: &Action) {
     });
 }
 
-/// The voltage of a scanner dips, and the scanner restarts.
+/// Makes the voltage of a scanner dip, so that the scanner restarts.
 pub(super) const BROWN_OUT: ActionKind =
     ActionKind { name: "brown_out", per_minute: 1.5, keys: &[SENSOR], act: brown_out };
 
@@ -48,7 +48,7 @@ fn brown_out(world: &mut World, action: &Action) {
     });
 }
 
-/// A scanner misbehaves for a while: it overlooks requests, refuses them, or replies twice or late. Shares are in percent.
+/// Makes a scanner overlook or refuse requests, or reply twice or late, for `span_ms`. Shares are in percent.
 pub(super) const PROTOCOL_QUIRKS: ActionKind = ActionKind {
     name: "habits",
     per_minute: 1.5,
@@ -72,8 +72,8 @@ fn misbehave(world: &mut World, action: &Action) {
     });
 }
 
-/// The head of a scanner turns slower or faster for a while and changes its speed gradually, as motors do. Scanners without
-/// full revolutions ignore the action. The speed is in percent of the usual one.
+/// Makes the head of a scanner rotate slower or faster for `span_ms`. The speed changes gradually, as that of a motor
+/// does, and is given in percent of the usual one. Scanners without full revolutions ignore the action.
 pub(super) const HEAD_SPEED: ActionKind = ActionKind {
     name: "pace",
     per_minute: 3.0,
@@ -93,7 +93,7 @@ fn change_speed(world: &mut World, action: &Action) {
     world.schedule(action.value("span_ms"), move |world| set(world, 1.0));
 }
 
-/// Something holds the head of a scanner for a while. Scanners without a rotating head ignore the action.
+/// Blocks the head of a scanner for `span_ms`. Scanners without a rotating head ignore the action.
 pub(super) const HEAD_HELD: ActionKind = ActionKind {
     name: "hold",
     per_minute: 1.0,
@@ -102,13 +102,13 @@ pub(super) const HEAD_HELD: ActionKind = ActionKind {
 };
 
 fn hold_head(world: &mut World, action: &Action) {
-    // Whatever holds the head releases it when the world heals.
+    // The head must be free again when all faults are cleared.
     let span = (action.value("span_ms") * MILLIS).min(world.time_until_faults_clear());
     world.inject_scanner_fault(action, ScannerFault::HeadHeld { span });
 }
 
-/// A scanner reports that it may fail soon, or that it does not measure. Some still report so after they have booted. Scanners
-/// without a health status ignore the action.
+/// Makes a scanner report a warning (1) or an error (2) as its health status for `span_ms`. A `stubborn` one still
+/// reports it after it has booted. Scanners without a health status ignore the action.
 pub(super) const UNHEALTHY: ActionKind = ActionKind {
     name: "unwell",
     per_minute: 1.0,
@@ -127,8 +127,8 @@ fn report_unhealthy(world: &mut World, action: &Action) {
     world.inject_scanner_fault_later(action, ScannerFault::Unhealthy { status: 0, is_stubborn: false });
 }
 
-/// A scanner that measures ignores every request for a while, even the request to stop. Scanners without such a fault ignore
-/// the action.
+/// Makes a scanner ignore every request while it measures, even the request to stop, for `span_ms`. Scanners without
+/// this fault ignore the action.
 pub(super) const IGNORED_REQUESTS: ActionKind = ActionKind {
     name: "deaf",
     per_minute: 1.0,
@@ -141,8 +141,8 @@ fn ignore_requests(world: &mut World, action: &Action) {
     world.inject_scanner_fault_later(action, ScannerFault::IgnoresRequests(false));
 }
 
-/// An object is inside a circle for a while: a post ahead of a sensor, inside the larger circle or inside both. Plans know only
-/// this action from the start, because the scans are measured before.
+/// Puts an object into a zone for `span_ms`: a post ahead of a sensor, inside the larger zone or inside both. The scans
+/// are computed before the world starts, so the action has no effect of its own at its time.
 pub(crate) const OBJECT_INSIDE: ActionKind = ActionKind {
     name: "object",
     per_minute: 12.0,
@@ -150,8 +150,8 @@ pub(crate) const OBJECT_INSIDE: ActionKind = ActionKind {
     act: |_, _| (),
 };
 
-/// Returns the time spans of objects inside a circle of `sensor`, and whether each object is near. The world has this number of
-/// `sensors`.
+/// Returns the time spans in which an object is inside a zone of `sensor`, and whether it is in both zones. The world
+/// has `sensors` sensors.
 fn object_spans(scenario: &Scenario, sensor: usize, sensors: usize) -> Vec<(Nanos, Nanos, bool)> {
     let is_its = |action: &&Action| {
         action.name() == OBJECT_INSIDE.name && action.value("sensor") as usize % sensors == sensor
@@ -163,7 +163,7 @@ fn object_spans(scenario: &Scenario, sensor: usize, sensors: usize) -> Vec<(Nano
     scenario.actions.iter().filter(is_its).map(span).collect()
 }
 
-/// Returns the time spans in which an object is inside a circle of `sensor`. Spans that overlap are joined.
+/// Returns the time spans in which an object is inside a zone of `sensor`. Spans that overlap are joined.
 pub(crate) fn objects_inside(scenario: &Scenario, sensor: usize, sensors: usize) -> Vec<(Nanos, Nanos)> {
     let mut joined: Vec<(Nanos, Nanos)> = Vec::new();
     for (from, until, _) in object_spans(scenario, sensor, sensors) {
@@ -175,7 +175,7 @@ pub(crate) fn objects_inside(scenario: &Scenario, sensor: usize, sensors: usize)
     joined
 }
 
-/// Returns the changes of the scene of `sensor`: room 1 has the post inside the larger circle, room 2 inside both.
+/// Returns the changes of the scene of `sensor`: room 1 has the post inside the larger zone, room 2 inside both zones.
 pub(crate) fn scene_changes(scenario: &Scenario, sensor: usize, sensors: usize) -> Changes {
     let spans = object_spans(scenario, sensor, sensors);
     let mut times: Vec<Nanos> = spans.iter().flat_map(|&(from, until, _)| [from, until]).collect();

@@ -1,5 +1,5 @@
-//! Actions of subscribers and users: subscribers come late and leave, are killed while they hold samples, and stop for a while.
-//! Users send requests to a link.
+//! Actions of subscribers and users. Subscribers attach late and leave, are killed while they hold samples, and stop
+//! for a while. Users send requests to a link.
 
 use scanhub_schema::{MILLIS, Topic, Verb};
 
@@ -14,7 +14,7 @@ const TOPIC: ActionKey = ActionKey::new("topic", 0, 6);
 const ANY_TOPIC: ActionKey = ActionKey::new("topic", 0, Topic::OF_LINKS.len() as u64 - 1);
 const HELD_SAMPLES: ActionKey = ActionKey::new("holds", 0, 4);
 
-/// A subscriber attaches, and leaves after a while.
+/// Attaches a subscriber, which leaves after `span_ms`.
 pub(super) const ATTACH: ActionKind = ActionKind {
     name: "consumer_comes",
     per_minute: 6.0,
@@ -28,7 +28,7 @@ pub(super) const ATTACH: ActionKind = ActionKind {
     act: |world, action| attach_subscriber(world, action, false),
 };
 
-/// A subscriber attaches, and is killed after a while.
+/// Attaches a subscriber, which is killed after `span_ms`.
 pub(super) const ATTACH_AND_KILL: ActionKind = ActionKind {
     name: "consumer_killed",
     per_minute: 6.0,
@@ -42,8 +42,8 @@ pub(super) const ATTACH_AND_KILL: ActionKind = ActionKind {
     act: |world, action| attach_subscriber(world, action, true),
 };
 
-/// A subscriber attaches between two samples of a scan, and leaves between two others. In a world with such actions, some
-/// topics have no other subscribers.
+/// Attaches a subscriber between two samples of a scan. It leaves between two others. In a world with such actions,
+/// some topics have no other subscribers.
 pub(super) const ATTACH_BETWEEN_SAMPLES: ActionKind = ActionKind {
     name: "consumer_amid",
     per_minute: 20.0,
@@ -72,7 +72,7 @@ fn attach_between_samples(world: &mut World, action: &Action) {
     world.shared.changes.borrow_mut().push(change);
 }
 
-/// A subscriber does not run for a while.
+/// Stops a subscriber for `span_ms`.
 pub(super) const STALL_SUBSCRIBER: ActionKind = ActionKind {
     name: "consumer_stops",
     per_minute: 6.0,
@@ -80,7 +80,7 @@ pub(super) const STALL_SUBSCRIBER: ActionKind = ActionKind {
     act: stall_subscriber,
 };
 
-/// Attaches a subscriber. One that polls every 0 ms is prompt.
+/// Attaches a subscriber. It is prompt if `every_ms` is 0 or 1.
 fn attach_subscriber(world: &mut World, action: &Action, is_killed: bool) {
     let topic = Topic::OF_LINKS[action.value("topic") as usize % Topic::OF_LINKS.len()];
     let behavior = match action.value("every_ms") {
@@ -93,7 +93,7 @@ fn attach_subscriber(world: &mut World, action: &Action, is_killed: bool) {
     }
 }
 
-/// Stops a subscriber that is not prompt.
+/// Stops a subscriber that is not prompt until the end of the action.
 fn stall_subscriber(world: &mut World, action: &Action) {
     let until = world.now() + action.value("span_ms") * MILLIS;
     let mut slow: Vec<_> =
@@ -104,7 +104,7 @@ fn stall_subscriber(world: &mut World, action: &Action) {
     }
 }
 
-/// A user pauses a sensor, and resumes it.
+/// Pauses a sensor, and resumes it after `span_ms`.
 pub(super) const PAUSE: ActionKind = ActionKind {
     name: "pause",
     per_minute: 2.0,
@@ -120,7 +120,7 @@ fn pause_sensor(world: &mut World, action: &Action) {
     });
 }
 
-/// A user restarts the session of a link, or resets, freezes, thaws or shows its background.
+/// Restarts the session of a link, or resets, freezes, thaws or publishes its background.
 pub(super) const RESYNC: ActionKind = ActionKind {
     name: "resync",
     per_minute: 3.0,

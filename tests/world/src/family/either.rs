@@ -1,5 +1,5 @@
-//! Two rotating scanners of different families that take turns at one port: an exchange connects the other scanner.
-//! Packets of an LDROBOT are recognized by their header; all other bytes belong to the other family.
+//! Two rotating scanners of different families at one port. An exchange replaces one with the other. Packets of an
+//! LDROBOT are recognized by their header; all other bytes belong to the other family.
 
 use std::rc::Rc;
 
@@ -11,7 +11,7 @@ use scanhub_sim::room::Changes;
 use super::{Family, FirstPoint, PointAccuracy, Scanner, ScannerFault, is_ld_packet};
 use crate::scenario::Action;
 
-/// Both scanners. The link has the keys of the first one.
+/// The two scanners. The link has the keys of the first one.
 pub(super) struct TwoFamilies {
     /// The scanner that is connected at the start.
     pub(super) first: Rc<dyn Family>,
@@ -20,7 +20,7 @@ pub(super) struct TwoFamilies {
 }
 
 impl TwoFamilies {
-    /// Returns the family of these bytes.
+    /// Returns the family to which these bytes belong.
     fn of(&self, bytes: &[u8]) -> &dyn Family {
         let is_ld =
             bytes.chunks(scanhub_drivers::ld::packet::PACKET_LEN).all(is_ld_packet) && !bytes.is_empty();
@@ -90,7 +90,7 @@ impl Family for TwoFamilies {
     }
 }
 
-/// The scanner at the line, and the one that takes its place.
+/// The scanner that is connected, and the one that replaces it at the next exchange.
 struct ConnectedScanners {
     connected: Box<dyn Scanner>,
     other: Box<dyn Scanner>,

@@ -1,5 +1,5 @@
-//! LDROBOT: a head that turns and tells of what it measures in packets, unasked. What it measures has no noise, so that
-//! each point that is told can be found among those that are true.
+//! LDROBOT scanners, which send packets without a request. The simulated points have no noise, so that each published
+//! point can be found among the measured ones.
 
 use std::rc::Rc;
 
@@ -15,13 +15,13 @@ use scanhub_sim::room::Room;
 use super::{Family, FirstPoint, MAX_SPEED_CHANGE, MIN_SPEED, Scanner, still_rooms};
 use crate::scenario::Action;
 
-/// One of them, and what its link asks for.
+/// An LDROBOT with its link.
 #[derive(Clone)]
 pub(super) struct Ld {
     settings: LdSettings,
     /// Name of the family in the link.
     family: &'static str,
-    /// The link says which model it is.
+    /// Whether the link configures the model.
     is_model_configured: bool,
     beams: Option<usize>,
 }
@@ -33,7 +33,7 @@ impl Ld {
         Ld { beams, ..Ld::of(model, random) }
     }
 
-    /// One of this model, on its own beams.
+    /// Returns an LDROBOT of this model with its default number of beams.
     pub(super) fn of(model: Model, random: &mut fastrand::Rng) -> Ld {
         let settings = LdSettings {
             speed_variation: random.f64() * 0.01,
@@ -65,7 +65,8 @@ impl Family for Ld {
         vec![self.settings.model.baud()]
     }
 
-    /// What appears where the head has just been is measured a turn later, and told when that turn is over.
+    /// An object that appears just after the head has passed it is measured one revolution later, and published when
+    /// that revolution is complete.
     fn scan_times(&self) -> (Nanos, Nanos) {
         let LdSettings { revolutions_per_second: turns_per_second, speed_variation: wander, .. } =
             self.settings;
@@ -90,12 +91,12 @@ impl Family for Ld {
         true
     }
 
-    /// A turn has points of many samples.
+    /// The points of a revolution come from many samples.
     fn is_scan_of(&self, _: &Scan, _: &[u8]) -> bool {
         true
     }
 
-    /// One of 256 damaged ones has a right checksum.
+    /// One of 256 damaged packets has a valid checksum.
     fn is_collision(&self, _: &[u8], damaged: &mut dyn Iterator<Item = &[u8]>) -> bool {
         damaged.next().is_some()
     }
@@ -115,14 +116,14 @@ impl Family for Ld {
     }
 }
 
-/// A scanner at a line.
+/// A simulated LDROBOT.
 struct LdScanner {
     head: LdSimulator,
     settings: LdSettings,
     changes: Changes,
-    /// Packets whose points were told as true.
+    /// Number of packets whose points have been reported as measured.
     reported: u64,
-    /// The share of its usual speed at which it turns, and at which it shall.
+    /// Current and target speed, as shares of the usual speed.
     speed: f64,
     target_speed: f64,
 }
@@ -144,12 +145,12 @@ impl Scanner for LdScanner {
         &mut self.head
     }
 
-    /// Does nothing. Its clock begins again, and where that shows the time that a clock which continued would show, no
-    /// session can distinguish a restart from a stall: stamps are then off until the next revolutions. The session's
-    /// own tests cover restarts.
+    /// Does nothing. After a restart, the scanner's clock starts at zero. If that equals the time that a running clock
+    /// would show, no session can distinguish the restart from a stall, and stamps are off until the next revolutions.
+    /// The session's own tests cover restarts.
     fn brown_out(&mut self, _: Nanos) {}
 
-    /// It gets its power then.
+    /// Replaces the scanner with a new one, whose power is turned on at `now`.
     fn exchange(&mut self, _: &Action, now: Nanos) -> Vec<u8> {
         let seed = self.settings.seed.wrapping_add(1);
         *self = LdScanner::new(LdSettings { seed, ..self.settings }, self.changes.clone());
@@ -180,5 +181,5 @@ impl Scanner for LdScanner {
     }
 }
 
-/// The last packet of a turn, until the hub has all of it.
+/// Time until the hub has read the whole last packet of a revolution.
 const LAST_PACKET_TIME: Nanos = 20 * MILLIS;

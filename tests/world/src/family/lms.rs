@@ -1,5 +1,5 @@
-//! SICK LMS 2xx: found at any rate and in any state, asked for any variant. Its scans were measured once for all
-//! worlds.
+//! SICK LMS 2xx scanners, which are found at any rate and in any state, with links that configure any variant. Their
+//! scans are computed once for all worlds.
 
 use std::rc::Rc;
 use std::sync::{Arc, LazyLock, Mutex, PoisonError};
@@ -20,7 +20,7 @@ use scanhub_sim::room::{Changes, PrecomputedScans};
 use super::{Family, Scanner, quirks, rooms};
 use crate::scenario::Action;
 
-/// One of them, and what its link asks for.
+/// An LMS with its link.
 #[derive(Clone)]
 pub(super) struct Lms {
     settings: Settings,
@@ -69,7 +69,7 @@ impl Family for Lms {
         ]
     }
 
-    /// An LMS whose link has no keys streams in the usual variant, at 500,000 baud.
+    /// A link without keys has an LMS that streams in the usual variant at 500,000 baud.
     fn auto(&self) -> Rc<dyn Family> {
         Rc::new(Lms { is_auto: true, variant: Variant::HALF, baud: Baud::B500000, ..self.clone() })
     }
@@ -82,7 +82,7 @@ impl Family for Lms {
         Baud::ALL.map(Baud::rate).to_vec()
     }
 
-    /// At the rate that the link asks for.
+    /// Calculated for the rate that the link configures.
     fn scan_times(&self) -> (Nanos, Nanos) {
         let len = 2 * self.variant.beams() + 10;
         let rate = self.baud.rate();
@@ -119,7 +119,7 @@ impl Family for Lms {
         scan.beams() == count && words.len() >= count && scan.ranges().iter().zip(&words[..count]).all(same)
     }
 
-    /// One of 65,536 damaged ones of its length has a right checksum.
+    /// One of 65,536 damaged telegrams of the same length has a valid checksum.
     fn is_collision(&self, got: &[u8], damaged: &mut dyn Iterator<Item = &[u8]>) -> bool {
         let others = |sent: &[u8], got: &[u8]| sent.iter().zip(got).filter(|(sent, got)| sent != got).count();
         damaged.filter(|sent| sent.len() == got.len()).any(|sent| {
@@ -128,14 +128,14 @@ impl Family for Lms {
             };
             let last = sent.iter().zip(got).rposition(|(sent, got)| sent != got).unwrap_or(first);
             let (sent, got) = (&sent[first..=last], &got[first..=last]);
-            // A byte too many and one too few shift what is between.
+            // An inserted byte and a lost byte shift all bytes between them.
             let shifted = [others(&sent[1..], got), others(sent, &got[1..])];
             others(sent, got).min(shifted[0]).min(shifted[1]) <= MAX_CHANGED_BYTES
         })
     }
 }
 
-/// A sensor at a line.
+/// A simulated LMS.
 struct LmsScanner {
     machine: LmsSimulator,
     settings: Settings,
@@ -152,7 +152,7 @@ impl Scanner for LmsScanner {
         &mut self.machine
     }
 
-    /// At some rate, idle or streaming already.
+    /// The new scanner has the rate of `action`, and is idle or streams already.
     fn exchange(&mut self, action: &Action, _: Nanos) -> Vec<u8> {
         let baud = Baud::ALL[action.value("rate") as usize % Baud::ALL.len()];
         let seed = self.settings.seed.wrapping_add(1);
@@ -173,7 +173,7 @@ fn machine(settings: &Settings, series: &Arc<PrecomputedScans>, changes: &Change
     LmsSimulator::new(settings.clone(), ScanSource::Room(room))
 }
 
-/// The scans that sensors of `variant` tell, measured once.
+/// Returns the scans of a scanner with `variant`, computed once.
 fn measured(variant: Variant) -> Arc<PrecomputedScans> {
     type MeasuredScans = Mutex<Vec<(Variant, Arc<PrecomputedScans>)>>;
     static MEASURED_SCANS: LazyLock<MeasuredScans> = LazyLock::new(MeasuredScans::default);
@@ -194,7 +194,8 @@ fn measured(variant: Variant) -> Arc<PrecomputedScans> {
     }
 }
 
-/// So many different scans of each room: enough that no model of it stands still.
+/// Number of different scans of each room, so that processors do not receive the same scan all the time.
 const SCANS_PER_ROOM: usize = 12;
-/// A line that changes more bytes of a telegram changes its neighbours, too, and then it is suspect.
+/// Maximum number of changed bytes in a telegram that still looks intact. A line that changes more damages the
+/// neighboring telegrams, too, and then the telegram is suspect.
 const MAX_CHANGED_BYTES: usize = 32;

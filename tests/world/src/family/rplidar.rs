@@ -1,6 +1,6 @@
-//! Slamtec RPLIDAR: a scanner that is asked and told to measure, in one of several modes whose packets differ. What it
-//! measures has no noise, so that each point that is told can be found among those that are true. It has no EEPROM;
-//! what it would keep is changed by one request only, and each of these counts as a write.
+//! Slamtec RPLIDAR scanners, which measure on request, in one of several modes with different packets. The simulated
+//! points have no noise, so that each published point can be found among the measured ones. An RPLIDAR has no EEPROM; a
+//! single request changes its permanent settings, and counts as an EEPROM write.
 
 use std::rc::Rc;
 
@@ -17,15 +17,15 @@ use scanhub_sim::{Arrival, ChunkSize};
 use super::{Family, FirstPoint, PointAccuracy, Scanner, ScannerFault, quirks, still_rooms};
 use crate::scenario::Action;
 
-/// One of them, and what its link asks for.
+/// An RPLIDAR with its link.
 #[derive(Clone)]
 pub(super) struct Rplidar {
     settings: RplidarSettings,
     /// Name of the family in the link.
     family: &'static str,
-    /// Nobody told its motor to turn.
+    /// Whether the motor is off at the start.
     is_off: bool,
-    /// The link says which model it is, and in which of its modes it shall measure.
+    /// Whether the link configures the model, and the mode that it configures.
     is_model_configured: bool,
     mode: Option<usize>,
     beams: Option<usize>,
@@ -45,7 +45,7 @@ impl Rplidar {
         drawn
     }
 
-    /// One of this model, idle, on its own beams and in its fastest mode.
+    /// Returns an RPLIDAR of this model that is idle, with the default number of beams and its fastest mode.
     fn of(model: Model, random: &mut fastrand::Rng) -> Rplidar {
         let settings = RplidarSettings {
             speed_variation: random.f64() * 0.01,
@@ -58,8 +58,8 @@ impl Rplidar {
         Rplidar { settings, family: "rplidar", is_off: false, is_model_configured, mode: None, beams: None }
     }
 
-    /// The one that is written `MODEL`, `MODEL:MODE` or `MODEL:MODE:STATE`; without a mode it is the fastest, and
-    /// without a state it is idle.
+    /// Returns the scanner with this name: `MODEL`, `MODEL:MODE` or `MODEL:MODE:STATE`. It has the fastest mode if
+    /// there is no mode, and is idle if there is no state.
     pub(super) fn from_name(text: &str, random: &mut fastrand::Rng) -> Option<Rplidar> {
         let mut words = text.split(':');
         let (model, mode, state) = (words.next()?, words.next(), words.next());
@@ -78,7 +78,7 @@ impl Rplidar {
         words.next().is_none().then_some(named)
     }
 
-    /// What these bytes are packets of: by what each begins with, for a wrong checksum does not make them others.
+    /// Returns the packet format of these bytes, by their first bytes. A wrong checksum does not change the format.
     fn kind(&self, sample: &[u8]) -> Option<PacketFormat> {
         let is_of = |kind: &PacketFormat| {
             let begins = |packet: &[u8]| packet[0] >> 4 == 0xA && packet[1] >> 4 == 0x5;
@@ -114,7 +114,8 @@ impl Family for Rplidar {
         models_alike(self.settings.model).iter().map(|model| model.baud()).collect()
     }
 
-    /// As of any head that turns; whether a turn is over is seen only when the head is well behind its end.
+    /// Like those of other rotating scanners. The session detects the end of a revolution only when the head is well
+    /// past it.
     fn scan_times(&self) -> (Nanos, Nanos) {
         let slowest = models_alike(self.settings.model).iter().map(|model| model.revolutions_per_second());
         let slowest =
@@ -147,12 +148,12 @@ impl Family for Rplidar {
         !is_reply(unit) && self.kind(unit).is_some_and(|kind| kind.byte_len() == unit.len())
     }
 
-    /// A turn has points of many samples.
+    /// The points of a revolution come from many samples.
     fn is_scan_of(&self, _: &Scan, _: &[u8]) -> bool {
         true
     }
 
-    /// One of 256 damaged ones has a right checksum, and single points have none.
+    /// One of 256 damaged packets has a valid checksum, and standard packets have none.
     fn is_collision(&self, got: &[u8], damaged: &mut dyn Iterator<Item = &[u8]>) -> bool {
         let sum = || got[2..].iter().fold(0, |sum, byte| sum ^ byte);
         let is_right = match self.kind(got).filter(|_| !is_reply(got)) {
@@ -168,7 +169,7 @@ impl Family for Rplidar {
 
     fn first_point(&self, unit: &[u8]) -> Option<FirstPoint> {
         let kind = self.kind(unit).filter(|kind| !is_reply(unit) && kind.byte_len() == unit.len())?;
-        // What its first point is depends on nothing that comes behind it.
+        // The first point does not depend on the next packet.
         let before = kind.point(unit, unit, 0).before;
         let clockwise_deg = f64::from(kind.start_angle(unit) - before).rem_euclid(360.0);
         Some(FirstPoint {
@@ -181,30 +182,31 @@ impl Family for Rplidar {
     fn point_accuracy(&self, unit: &[u8]) -> PointAccuracy {
         let plain = PointAccuracy { no_return_deg: 9.0, has_clock: false, ..PointAccuracy::default() };
         match self.kind(unit) {
-            // Angles are told in eighths of a degree, up to 63.
+            // Angles are in steps of an eighth of a degree, up to 63.
             Some(PacketFormat::Express) => PointAccuracy { angle_deg: 0.25, points: 12, ..plain },
-            // Angles follow from ranges, whose steps get wider.
+            // Angles are derived from ranges, whose steps grow with the range.
             Some(PacketFormat::Ultra) => PointAccuracy { angle_deg: 0.4, range_mm: 6.0, points: 16, ..plain },
             Some(PacketFormat::UltraDense) => PointAccuracy { range_mm: 6.0, ..plain },
             Some(PacketFormat::Dense) => plain,
-            // So many may be missing without a mark.
+            // A standard packet is one point. This number of points may be missing without a mark.
             Some(PacketFormat::Standard) | None => PointAccuracy { points: 45, neighbors: 16, ..plain },
         }
     }
 }
 
-/// A scanner at a line.
+/// A simulated RPLIDAR.
 struct RplidarScanner {
     unit: RplidarSimulator,
     settings: RplidarSettings,
     changes: Changes,
-    /// The stream of which so many packets' points were told as true: when it began.
+    /// Start time of the stream to which `reported` applies, and number of packets whose points have been reported as
+    /// measured.
     stream: Option<Nanos>,
     reported: u64,
-    /// The share of its usual speed at which its head shall turn.
+    /// Target speed, as a share of the usual speed.
     target_speed: f64,
     quirks: ProtocolQuirks,
-    /// While it measures it hears nothing, not even that it shall stop.
+    /// Whether the scanner ignores all requests while it measures, even the request to stop.
     ignores_requests: bool,
 }
 
@@ -224,7 +226,7 @@ impl RplidarScanner {
         }
     }
 
-    /// Brings its head nearer to the speed that it shall have.
+    /// Changes the speed of the head toward the target speed.
     fn change_speed(&mut self, passed_s: f64) {
         let usual = self.settings.revolutions_per_second;
         let Some(share) = self.unit.revolutions_per_second().map(|turns| turns / usual) else { return };
@@ -249,7 +251,8 @@ impl Scanner for RplidarScanner {
         &mut self.unit
     }
 
-    /// Of the same kind, maybe another model; it gets its power then, or somebody has it stream.
+    /// The new scanner may be another model that measures in the same way. Its power is turned on at `now`, or it
+    /// streams already.
     fn exchange(&mut self, action: &Action, now: Nanos) -> Vec<u8> {
         let models = models_alike(self.settings.model);
         let at = models.iter().position(|model| *model == self.settings.model).unwrap_or(0);
@@ -310,8 +313,8 @@ impl Scanner for RplidarScanner {
     }
 }
 
-/// The models that measure alike: what one of them sends another one may send, and nobody takes one's packets for the
-/// other's.
+/// Returns the models that measure in the same way. Each of them may send what another one sends, and none has packets
+/// that look like those of the other group.
 fn models_alike(model: Model) -> &'static [Model] {
     if is_triangulating(model) {
         &[Model::A1, Model::A2m8, Model::A2m12, Model::A3]
@@ -324,17 +327,18 @@ fn is_triangulating(model: Model) -> bool {
     matches!(model, Model::A1 | Model::A2m8 | Model::A2m12 | Model::A3)
 }
 
-/// So many packets a second take long to judge, and need not be in many worlds.
+/// Returns whether the mode has few enough packets per second to check in many worlds.
 fn is_moderate(mode: &scanhub_sim::rplidar::Mode) -> bool {
     mode.form != scanhub_sim::rplidar::PacketFormat::Standard || mode.sample_us > 150.0
 }
 
-/// The name of a mode as links write it.
+/// Returns the name of a mode as in the configuration of a link.
 fn key(name: &str) -> String {
     name.chars().filter(char::is_ascii_alphanumeric).collect::<String>().to_lowercase()
 }
 
-/// Whether it is an answer: what a packet begins with would also be an answer's head, if its length were that of one.
+/// Returns whether `bytes` are a response. The start of a packet can look like the descriptor of a response, so the
+/// length is checked, too.
 fn is_reply(bytes: &[u8]) -> bool {
     let &[0xA5, 0x5A, a, b, c, d, _, ref rest @ ..] = bytes else { return false };
     let word = u32::from_le_bytes([a, b, c, d]);
@@ -342,7 +346,7 @@ fn is_reply(bytes: &[u8]) -> bool {
     rest.len() == if follows { 0 } else { len }
 }
 
-/// A request with a payload, and its checksum.
+/// Returns a request with its payload and checksum.
 fn request(command: u8, payload: &[u8]) -> Vec<u8> {
     let bytes = [&[0xA5, command, payload.len() as u8], payload].concat();
     let sum = bytes.iter().fold(0, |sum, byte| sum ^ byte);
@@ -353,7 +357,7 @@ fn line_time(unit: &[u8], model: Model) -> Nanos {
     scanhub_schema::line_time(unit.len(), model.baud())
 }
 
-/// The models that are drawn, fast ones seldom: their points take long to measure.
+/// Models to draw from. Fast ones are rare, because their points take long to compute.
 const DRAWN_MODELS: [Model; 13] = [
     Model::A1,
     Model::A1,
@@ -369,6 +373,6 @@ const DRAWN_MODELS: [Model; 13] = [
     Model::S2,
     Model::S3,
 ];
-/// A head is ten degrees and two packets behind the end of a turn before it is over, and the last packet is on the
-/// line.
+/// Maximum time from the end of a revolution until its scan: the head must be ten degrees and two packets past the end,
+/// and the last packet is still on the line.
 const EDGE_DELAY: Nanos = 90 * MILLIS;
