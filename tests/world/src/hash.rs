@@ -1,7 +1,7 @@
-//! A number for everything that happened: two runs of one seed differ in nothing if their numbers are equal. The same in
-//! debug and release, on every machine.
+//! Hash of everything that happened in a world. Two runs with the same hash had the same events. The hash is the same
+//! in debug and release builds and on every machine.
 
-/// Takes bytes and numbers one after the other.
+/// A hash of a sequence of bytes and numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct HistoryHash(u64);
 
@@ -10,13 +10,13 @@ impl HistoryHash {
         HistoryHash(0x9E37_79B9_7F4A_7C15)
     }
 
-    /// Takes a number.
+    /// Adds a number.
     pub(crate) fn add_number(&mut self, value: u64) {
         let mixed = (self.0 ^ value).wrapping_mul(0xFF51_AFD7_ED55_8CCD);
         self.0 = mixed ^ (mixed >> 32);
     }
 
-    /// Takes bytes, and how many they are.
+    /// Adds bytes and their count.
     pub(crate) fn add_bytes(&mut self, bytes: &[u8]) {
         let (words, rest) = bytes.as_chunks::<8>();
         words.iter().for_each(|word| self.add_number(u64::from_le_bytes(*word)));
@@ -26,7 +26,7 @@ impl HistoryHash {
         self.add_number(bytes.len() as u64);
     }
 
-    /// Of these bytes alone.
+    /// Returns the hash of these bytes alone.
     pub(crate) fn hash_bytes(bytes: &[u8]) -> u64 {
         let mut history = HistoryHash::new();
         history.add_bytes(bytes);

@@ -1,5 +1,6 @@
-//! A life of the hub in a world: its links, each a state machine that says what to wait for, and whoever writes what they learn.
-//! What [`daemon`]'s supervision does with threads and descriptors is done here with times. Refuses to know why it ends.
+//! A run of the hub in a world: its links, each a state machine that returns what it waits for, and the saver of
+//! learned state. The supervision of [`daemon`] works with threads and descriptors; here, virtual time takes their
+//! place.
 
 use std::rc::Rc;
 
@@ -13,7 +14,7 @@ use crate::shared::SharedState;
 use crate::sim_platform::SimPlatform;
 use crate::world::{HubEnding, World};
 
-/// A hub begins, lives and ends; `world` knows then when the next one begins.
+/// Runs a hub from its start to its end. `world` then has the time at which the next one starts.
 pub(crate) fn run_hub(world: &mut World) {
     let shared = world.shared.clone();
     let (run, now) = (world.run, world.now());
@@ -22,7 +23,7 @@ pub(crate) fn run_hub(world: &mut World) {
     shared.log_event(&Event::HubStarted { run, boot });
     let ending = match start(world, &shared, boot) {
         Ok(ending) => ending,
-        // A service manager tries it again.
+        // A service manager starts the hub again.
         Err(failure) => {
             shared.log_event(&Event::ActionTaken { text: &format!("hub {run} did not start: {failure}") });
             HubEnding { is_killed: true, restart_at: now + RESTART_INTERVAL }
@@ -36,7 +37,7 @@ pub(crate) fn run_hub(world: &mut World) {
 
 fn start(world: &mut World, shared: &Rc<SharedState>, boot: u64) -> Result<HubEnding, Failure> {
     let (setup, edition) = (world.setup.clone(), world.edition.clone());
-    // What was refused is not there when the next hub begins.
+    // The next hub starts with a valid configuration, even if the current one is invalid.
     let read = || setup.config(edition.get());
     let config = read().or_else(|_| setup.config(0))?;
     let wall_ns = |now: Nanos| now + shared.wall_offset.get();
@@ -58,7 +59,7 @@ fn start(world: &mut World, shared: &Rc<SharedState>, boot: u64) -> Result<HubEn
     }
     let mut writes_at = world.now();
     world.poll_all_subscribers();
-    // Its process is another one than that which stood still.
+    // A stall applied to the process of the previous hub.
     world.stalled_until = 0;
     let ending = loop {
         world.deliver_wakeups();
@@ -84,7 +85,7 @@ fn start(world: &mut World, shared: &Rc<SharedState>, boot: u64) -> Result<HubEn
                 world.commands.as_mut().map(|commands| commands.enqueue(&names[sensor], verb, model));
             match result {
                 Some(Ok(_)) => links[sensor].is_requested = true,
-                // Too many wait: whoever asks tries again.
+                // The queue of requests is full, so the user tries again.
                 _ => world.hub_requests.sensor_requests.push((sensor, verb)),
             }
         }
@@ -106,7 +107,7 @@ fn start(world: &mut World, shared: &Rc<SharedState>, boot: u64) -> Result<HubEn
             platform.clock.advance_to(now);
             link.end();
         }
-        // What they say last wakes whoever sleeps.
+        // The last samples wake their subscribers.
         world.deliver_wakeups();
         if let Some(saver) = &mut saver {
             saver.flush_due(world.now(), wall_ns(world.now()), true);
@@ -115,16 +116,16 @@ fn start(world: &mut World, shared: &Rc<SharedState>, boot: u64) -> Result<HubEn
     Ok(ending)
 }
 
-/// A link and what its thread would wait for.
+/// A link, and what its thread waits for.
 struct RunningLink<'a> {
     link: LiveLink<'a, SimPlatform<'a>>,
     platform: &'a SimPlatform<'a>,
-    /// The device that it watches, and whether for bytes or only for its loss.
+    /// The device that the thread polls, and whether it waits for bytes or only for the loss of the port.
     watched: Option<(u64, bool)>,
     due_at: Nanos,
-    /// What it watches is ready, and its thread runs then.
+    /// Time at which the thread runs because the device is ready.
     ready_at: Option<Nanos>,
-    /// A user wants something.
+    /// Whether a user has sent a request.
     is_requested: bool,
 }
 
@@ -133,7 +134,7 @@ impl<'a> RunningLink<'a> {
         RunningLink { link, platform, watched: None, due_at: 0, ready_at: None, is_requested: false }
     }
 
-    /// When it has something to do, or when its sensor has something that it may have to.
+    /// Returns the time at which the link has something to do, or its scanner may send something.
     fn next_ns(&self) -> Nanos {
         let SimPlatform { shared, number, clock, .. } = self.platform;
         let due = match (self.is_requested, self.ready_at, self.watched) {
@@ -148,7 +149,7 @@ impl<'a> RunningLink<'a> {
         due.max(clock.peek())
     }
 
-    /// Looks whether what it watches is ready.
+    /// Checks whether the polled device is ready.
     fn poll(&mut self, now: Nanos) {
         let Some((device, wants_bytes)) = self.watched.filter(|_| self.ready_at.is_none()) else { return };
         let SimPlatform { shared, number, .. } = self.platform;
@@ -161,7 +162,7 @@ impl<'a> RunningLink<'a> {
         }
     }
 
-    /// Its thread runs at `now`, if there is a reason.
+    /// Runs the link's thread at `now`, if it has a reason to wake.
     fn run(&mut self, now: Nanos) {
         let woken = if std::mem::take(&mut self.is_requested) {
             WakeReason::Request
@@ -184,7 +185,7 @@ impl<'a> RunningLink<'a> {
     }
 }
 
-/// The files of the domain's state.
+/// Files in the state directory of the domain.
 struct StateFiles(Rc<SharedState>);
 
 impl StateStore for StateFiles {
@@ -210,11 +211,11 @@ impl StateStore for StateFiles {
     }
 }
 
-/// From a port that is ready to a thread that runs.
+/// Time from a ready port to a running thread.
 const WAKE_DELAY: Nanos = 50 * MICROS;
-/// A timer is late by so much.
+/// Delay of timers.
 const TIMER_DELAY: Nanos = 50 * MICROS;
-/// What was learned is written within so long.
+/// Maximum time until learned state is saved.
 const WRITE_DELAY: Nanos = 100 * MILLIS;
-/// A service manager starts a hub again that did not start.
+/// Time after which a service manager restarts a hub that failed to start.
 const RESTART_INTERVAL: Nanos = 1_000 * MILLIS;

@@ -1,83 +1,83 @@
-//! Defects that are built into the models around the hub and its network on purpose, to see that the judges find them.
-//! None is in the hub's own code, so that nothing has to be built twice. Refuses to know who notices.
+//! Injected defects: bugs in the models around the hub and its network, to prove that invariants find them. None is in
+//! the hub's own code, so the hub is not compiled twice.
 
 use std::cell::Cell;
 
 use scanhub_drivers::lms::telegram::Writer;
 use scanhub_schema::{Counter, Family, Flags, Header, Scan, ScanHead, Status, Topic};
 
-/// A defect.
+/// An injected defect.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Defect {
-    /// Now and then nobody is woken.
+    /// Some rings of the doorbell are lost.
     LostWake,
-    /// Whoever waits for zones is woken only when all is sent.
+    /// Subscribers to zones are woken only after all samples of a scan have been sent.
     OneRing,
-    /// Now and then the last byte of a read is lost.
+    /// The last byte of some reads is lost.
     LostByte,
-    /// Now and then a bit of what is read is another one.
+    /// A bit of some reads is flipped.
     FlippedBit,
-    /// The hub's word that the zones are unknown says that they are clear.
+    /// Unknown zones are published as clear.
     SurvivingVerdict,
-    /// A line that was opened is never closed.
+    /// An open line is never closed.
     UnreleasedHandle,
-    /// Now and then a sample is sent twice.
+    /// Some samples are sent twice.
     SentTwice,
-    /// Now and then a sample has the number of the one before it.
+    /// Some samples have the sequence number of the one before.
     Renumbered,
-    /// Now and then a telegram is not sent.
+    /// Some telegrams are not sent.
     UnsentTelegram,
-    /// Now and then the memory of a sample is not given back.
+    /// The memory of some samples is never released.
     LeakedLoan,
-    /// Something writes the sensor's EEPROM.
+    /// A request writes the EEPROM of the scanner.
     EepromWrite,
-    /// Nobody is told that a line hung up.
+    /// The hub is not notified of a hang-up of the line.
     SwallowedHangUp,
-    /// Now and then a sample is sent only with the next one.
+    /// Some samples are sent only with the next one.
     Delayed,
-    /// Now and then two samples come in the wrong order.
+    /// Some pairs of samples arrive in the wrong order.
     Reordered,
-    /// Now and then the second half of a turn is that of the turn before it.
+    /// The second half of some revolutions comes from the previous revolution.
     MergedRevolution,
-    /// Now and then a scan has a beam more.
+    /// Some scans have an additional beam.
     ExtraBeam,
-    /// A scan that waited for the hub is stamped when it was made.
+    /// A backlogged scan has the time of its publication as its stamp.
     StampedOnArrival,
-    /// A turn of which packets are missing is not marked.
+    /// An incomplete revolution is not marked.
     UnmarkedRevolution,
-    /// What was lost on the line is not counted.
+    /// Packets that are lost on the line are not counted.
     UncountedLoss,
-    /// Now and then a byte of a remote sample is another one.
+    /// A byte of some remote samples is changed.
     RemoteAltered,
-    /// Now and then a listener takes a part for the whole sample.
+    /// A listener takes some parts for complete samples.
     RemoteHalf,
-    /// Now and then a listener takes one datagram twice.
+    /// A listener accepts some datagrams twice.
     RemoteCountedTwice,
-    /// A datagram has the time at which it was read, not that at which it came.
+    /// A datagram has the time at which it was read instead of the time of its arrival.
     RemoteStampedLate,
-    /// A remote robot does not see that nothing comes.
+    /// A remote robot does not detect a silence.
     RemoteSurvivingVerdict,
-    /// A listener with a key checks no MAC.
+    /// A listener with a key does not check MACs.
     RemoteUnchecked,
-    /// A gateway says only once who its sensors are.
+    /// A gateway announces its sensors only once.
     Unannounced,
-    /// A bridge does not come back to a router that was killed.
+    /// A bridge does not reconnect to a router that was killed.
     RouterNotReconnected,
-    /// Now and then a bridge throws a sample away that waits, and its account says that it was sent.
+    /// A bridge drops some queued samples, and counts them as sent.
     UncountedDrop,
-    /// Now and then a packet is published whose checksum is wrong.
+    /// Some packets with a wrong checksum are published.
     WrongChecksum,
-    /// What comes beside damaged bytes is not marked.
+    /// Packets next to damaged bytes are not marked.
     UnmarkedNeighbor,
-    /// A scanner that measures hears nothing, not even that it shall stop.
+    /// A scanner ignores all requests while it measures, even the request to stop.
     IgnoredRequests,
-    /// No request for a motor gets through.
+    /// Requests to start a motor are lost.
     UnstartedMotor,
-    /// Now and then all points of a turn are a degree beside their places.
+    /// All points of some revolutions are shifted by one degree.
     ShiftedPoints,
-    /// A warning that does not hold is not taken back.
+    /// A false early warning is not withdrawn.
     KeptWarning,
-    /// The port hides that another process set its rate.
+    /// The port hides that another process has changed its rate.
     HiddenRate,
     /// An estimated stamp of a telegram is not marked.
     UnmarkedEstimate,
@@ -85,20 +85,20 @@ pub enum Defect {
     NeedlessEstimate,
     /// No early warning is sent.
     UnsentWarning,
-    /// Now and then a scan has another family than its scanner.
+    /// Some scans have the wrong family.
     WrongFamily,
-    /// Now and then the hub sends a needless byte to a scanner that streams.
+    /// The hub sends an unnecessary byte to some streaming scanners.
     NeedlessByte,
-    /// The hub is not told that a subscriber has attached.
+    /// The hub is not notified of a new subscriber.
     UnnoticedSubscriber,
-    /// Now and then the hub rings although no subscriber has a new sample.
+    /// Some rings of the doorbell follow although no subscriber has a new sample.
     NeedlessRing,
-    /// Now and then the event is not sent.
+    /// Some events are not sent.
     UnsentEvent,
 }
 
 impl Defect {
-    /// All of them.
+    /// All defects.
     pub const ALL: [Defect; 43] = [
         Defect::LostWake,
         Defect::OneRing,
@@ -146,7 +146,7 @@ impl Defect {
     ];
 }
 
-/// The defect that is injected into a world, if any.
+/// The injected defect of a world, if any.
 #[derive(Debug, Default)]
 pub(crate) struct InjectedDefect {
     defect: Option<Defect>,
@@ -158,12 +158,12 @@ impl InjectedDefect {
         InjectedDefect { defect, opportunities: Cell::new(0) }
     }
 
-    /// Whether `defect` is there.
+    /// Returns whether `defect` is injected.
     pub(crate) fn is_active(&self, defect: Defect) -> bool {
         self.defect == Some(defect)
     }
 
-    /// Whether `defect` shows this time: of so many chances with the last.
+    /// Counts an opportunity, and returns whether `defect` shows: once in every `of` opportunities.
     pub(crate) fn triggers(&self, defect: Defect, of: u64) -> bool {
         if !self.is_active(defect) {
             return false;
@@ -173,15 +173,15 @@ impl InjectedDefect {
     }
 }
 
-/// What [`Defect`]s of turns make of scans and of what is counted.
+/// Applies those [`Defect`]s that change published samples.
 #[derive(Debug, Default)]
 pub(crate) struct SampleCorrupter {
-    /// The last scan as it was.
+    /// The last scan, before it was changed.
     last_scan: Option<Box<Scan>>,
 }
 
 impl SampleCorrupter {
-    /// Spoils a sample of `topic` that is sent at `now`, if one of these defects is `defect`.
+    /// Changes a sample of `topic` that is sent at `now`, if the injected defect requires it.
     pub(crate) fn corrupt(
         &mut self,
         defect: &InjectedDefect,
@@ -242,7 +242,7 @@ impl SampleCorrupter {
         bytes.extend_from_slice(scan.bytes());
     }
 
-    /// Whether one of these is `defect`.
+    /// Returns whether the injected defect changes published samples.
     pub(crate) fn is_needed(injected: &InjectedDefect) -> bool {
         let mine = [
             Defect::MergedRevolution,
@@ -261,10 +261,10 @@ impl SampleCorrupter {
     }
 }
 
-/// What waited for so long did not come just now.
+/// Age from which a sample counts as backlogged.
 const BACKLOG_AGE_NS: u64 = 100_000_000;
 
-/// A request that writes the EEPROM: 66h, the rate after power-on.
+/// Returns a request that writes the EEPROM: 66h, which sets the baud rate after power-on.
 pub(crate) fn eeprom_request() -> Vec<u8> {
     Writer::new(0, 0x66).byte(0x42).finish().bytes().to_vec()
 }

@@ -1,9 +1,9 @@
-//! The whole hub in one thread and in virtual time: simulated scanners, lines with faults, ttys, the hub's core, topics in
-//! memory, and subscribers. A gateway, a network, a listener and a robot on another machine follow them. A seed draws the faults
-//! and their times, and judges check every event. A failure is a seed that can be repeated, and shrinks to the few actions that
-//! matter.
+//! Simulation of a whole hub in one thread and in virtual time: simulated scanners, lines with faults, ttys, the hub's
+//! core, topics in memory, and subscribers. It includes another machine with a gateway, a network, a listener and a
+//! robot. A seed determines the faults and their times, and invariants check every event. A failure can be repeated
+//! with its seed, and shrinks to the few actions that cause it.
 //!
-//! [`Scenario`] is the course of a world as data, [`run`] runs it, and [`Outcome`] is the result of the judges.
+//! A [`Scenario`] is the list of a world's actions, [`run`] runs it, and [`Outcome`] is the result with its violations.
 
 mod actions;
 mod event;

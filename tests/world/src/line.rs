@@ -1,4 +1,4 @@
-//! A hub's end of a port: it implements [`scanhub_daemon::platform::Line`] with a simulated tty.
+//! The hub's end of a port: an implementation of [`scanhub_daemon::platform::Line`] for a simulated tty.
 
 use std::cell::Cell;
 use std::io;
@@ -13,29 +13,29 @@ use crate::event::Event;
 use crate::injected_defects::{Defect, eeprom_request};
 use crate::shared::SharedState;
 
-/// The time of one link: its thread may be ahead of the others' while it writes a request byte by byte.
+/// The clock of one link. The link's thread may be ahead of the others while it writes a request byte by byte.
 #[derive(Default)]
 pub(crate) struct LinkClock(Cell<Nanos>);
 
 impl LinkClock {
-    /// Each look at the clock takes a moment.
+    /// Returns the time. Each call takes [`CLOCK_READ_TIME`].
     pub(crate) fn now(&self) -> Nanos {
         self.0.set(self.0.get() + CLOCK_READ_TIME);
         self.0.get()
     }
 
-    /// The time, without a look.
+    /// Returns the time without advancing it.
     pub(crate) fn peek(&self) -> Nanos {
         self.0.get()
     }
 
-    /// It is at least `time`.
+    /// Advances the clock to `time`, unless it is later already.
     pub(crate) fn advance_to(&self, time: Nanos) {
         self.0.set(self.0.get().max(time));
     }
 }
 
-/// What it takes to look at a clock.
+/// Time that a read of the clock takes.
 const CLOCK_READ_TIME: Nanos = 40;
 
 /// An open descriptor of a port; the port is closed with the last one.
@@ -60,7 +60,11 @@ pub(crate) struct OpenLine {
 }
 
 impl OpenLine {
-    /// Whether it is there; an error if it is not, as the kernel tells it.
+    /// Returns whether the device is connected.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error like that of the kernel if it is not connected.
     fn check(&self, is_connected: bool) -> io::Result<bool> {
         let is_told = !self.handle.shared.defect.is_active(Defect::SwallowedHangUp);
         if is_connected || !is_told {
@@ -99,7 +103,7 @@ impl PortIo for OpenLine {
         let (mut tty, now) = (shared.ports[*port].borrow_mut(), self.clock.now());
         tty.advance(now, &shared.log);
         let is_deaf = shared.defect.is_active(Defect::IgnoredRequests) && tty.sensor.is_streaming();
-        // Half a request is none.
+        // A part of a request has no effect.
         let cuts = shared.defect.is_active(Defect::UnstartedMotor);
         let is_cut = |byte: &&u8| cuts && matches!(byte, 0xF0 | 0xA8);
         if self.check(tty.is_plugged_in(*device))? && !is_deaf {

@@ -1,4 +1,4 @@
-//! Judges of counters: those of subscribers, listeners and bridges, and the resources that remain at the end.
+//! Invariants on counters of subscribers, listeners and bridges, and on the resources in use at the end.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -11,25 +11,25 @@ use crate::remote::{FIRST_NUMBER, LinkSettings};
 use crate::subscriber::SubscriberId;
 use crate::topics::Sample;
 
-/// Judge: the counters of each subscriber are right. By their numbers, its taken samples and its missed samples are
-/// together the published ones. No sample arrives twice or out of order, and each sample that was sent to a subscriber
-/// was taken or fell out of its queue.
+/// Invariant: the counters of each subscriber are right. Its taken samples and its missed samples, which it detects by
+/// their sequence numbers, are together the published ones. No sample arrives twice or out of order, and each sample
+/// that was sent to a subscriber was taken or dropped from its queue.
 #[derive(Default)]
 pub(crate) struct SubscriberCounters {
     subscribers: BTreeMap<SubscriberId, SubscriberState>,
-    /// Life, number and index of the last sample of each topic.
+    /// Boot ID, sequence number and index of the last sample of each topic.
     published: BTreeMap<(usize, Topic), (u64, u64, u64)>,
 }
 
 struct SubscriberState {
     topic: (usize, Topic),
-    /// Of the hub whose samples it gets.
+    /// Counters for the hub that published the last taken sample.
     run: Option<RunCounters>,
 }
 
 struct RunCounters {
     boot: u64,
-    /// The number at which its account begins, and the index of its first sample.
+    /// Sequence number from which samples count, and index of the first sample.
     first: u64,
     first_index: u64,
     taken: u64,
@@ -92,7 +92,7 @@ impl SubscriberState {
         let number = header.topic_seq;
         let is_new = self.run.as_ref().is_none_or(|run| run.boot != header.boot);
         if is_new {
-            // Who was there before got everything of the new hub.
+            // A subscriber that was attached before the hub started gets all of its samples.
             let (first, first_index) = if self.run.is_some() { (0, 0) } else { (number, *index) };
             let dropped = index - first_index;
             let boot = header.boot;
@@ -111,14 +111,14 @@ impl SubscriberState {
     }
 
     fn drop(&mut self, sample: &Sample) {
-        // What fell out before the first one was taken is known by that one's index.
+        // Samples that were dropped before the first one was taken are counted by the index of that one.
         if let Some(run) = self.run.as_mut().filter(|run| run.boot == sample.header.boot) {
             run.dropped += 1;
         }
     }
 }
 
-/// Judge: at the end no line is open, no loan is out, and no sample is held.
+/// Invariant: at the end, no line is open, no loan is unused, and no sample is held.
 pub(crate) struct Resources;
 
 impl Invariant for Resources {
@@ -136,33 +136,33 @@ impl Invariant for Resources {
     }
 }
 
-/// Epoch, sensor's number and topic's.
+/// Epoch, number of the sensor, and number of the topic.
 type StreamKey = (u32, u8, u8);
 
-/// Judge: the counters of each listener are right (`docs/datagram.md`). In each row, `received` counts datagrams that arrived,
-/// `duplicate` those that arrived again, and `lost` the numbers between the first and the last known one that did not arrive.
-/// If nothing is wrong at the end and the last announcement arrived, the listener knows every number that the gateway sent.
-/// The counters belong to the running listener.
+/// Invariant: the counters of each listener are right (`docs/datagram.md`). In each row, `received` counts datagrams
+/// that arrived, `duplicate` those that arrived again, and `lost` the sequence numbers between the first and the last
+/// known one that did not arrive. If the faults are cleared at the end and the last announcement arrived, the listener
+/// knows every number that the gateway sent. The counters belong to the running listener.
 #[derive(Default)]
 pub(crate) struct ListenerCounters {
-    /// Number of sequence numbers in use.
+    /// Next sequence number of each stream.
     sequence_counts: BTreeMap<StreamKey, u32>,
     rows: BTreeMap<StreamKey, ExpectedRow>,
-    /// Datagrams that it took, and those that it refused.
+    /// Number of datagrams that the listener accepted, and number of those that it refused.
     arrived: u64,
     refused: u64,
-    /// Sum of the counters so far, and number of their rows.
+    /// Sum of the counters checked so far, and number of their rows.
     counted: u64,
     counted_rows: usize,
     is_over: bool,
 }
 
-/// One row as it has to be.
+/// Expected contents of a row.
 struct ExpectedRow {
     taken: BTreeSet<u32>,
     duplicates: u64,
     late: u64,
-    /// The first known number, and the one behind the last known.
+    /// First known sequence number, and the one after the last known one.
     first: u32,
     after_last: u32,
 }
@@ -177,7 +177,7 @@ impl Invariant for ListenerCounters {
             Event::Transmitted { datagram, .. } => {
                 let head = &datagram.head;
                 let next = self.sequence_counts.entry((head.epoch, head.sensor, head.topic)).or_default();
-                // A sample that fits into no datagram has a number, too.
+                // A sample that is too large for datagrams uses a sequence number, too.
                 let is_next = if head.part > 0 { head.sequence + 1 == *next } else { head.sequence >= *next };
                 if !is_next {
                     reporter.report(format!("a number that was there, {next} is next: {head:?}"));
@@ -272,7 +272,7 @@ impl Invariant for ListenerCounters {
 }
 
 impl ListenerCounters {
-    /// The row of `key`, which begins with `first` if it is new.
+    /// Returns the row of `key`. A new row starts at `first`.
     fn row(&mut self, key: StreamKey, first: u32) -> &mut ExpectedRow {
         let new = || ExpectedRow { taken: BTreeSet::new(), duplicates: 0, late: 0, first, after_last: first };
         self.rows.entry(key).or_insert_with(new)
@@ -280,7 +280,7 @@ impl ListenerCounters {
 }
 
 impl ExpectedRow {
-    /// Takes a number, and returns whether it is new.
+    /// Adds a sequence number, and returns whether it is new.
     fn take(&mut self, number: u32) -> bool {
         let is_late = self.taken.last().is_some_and(|&last| last > number);
         let is_new = self.taken.insert(number);
@@ -295,11 +295,12 @@ fn announce(datagram: &Datagram<'_>) -> Option<Announce> {
     if datagram.head.topic == Announce::NUMBER { Announce::unpack(datagram.payload) } else { None }
 }
 
-/// Judge: the counters of a bridge are right (`docs/bridge.md`). Each sample that the bridge took is sent once, counted as
-/// replaced, or still waiting. Announcements report the replaced samples, and all of them if nothing is wrong at the end.
+/// Invariant: the counters of a bridge are right (`docs/bridge.md`). Each sample that the bridge took is sent once,
+/// counted as replaced, or still queued. Announcements report the replaced samples, and all of them if the faults are
+/// cleared at the end.
 pub(crate) struct BridgeCounters {
     are_bridges: bool,
-    /// All samples of scans and their like go out.
+    /// Whether every sample of scans, telegrams and foregrounds is sent.
     sends_all: bool,
     topics: BTreeMap<(usize, Option<Topic>), TopicCounters>,
     is_over: bool,
@@ -308,11 +309,12 @@ pub(crate) struct BridgeCounters {
 
 #[derive(Default)]
 struct TopicCounters {
-    /// Samples that it took of the hub, that went out, and of these that were not taken.
+    /// Samples that the bridge took from the hub, samples that it sent, and sent samples that the router did not
+    /// accept.
     taken: u64,
     sent: u64,
     failed: u64,
-    /// Replaced samples in the last announcement, and in the counters.
+    /// Replaced samples in the last announcement, and in the bridge's counters.
     reported_replaced: u64,
     replaced: u64,
 }
@@ -376,7 +378,7 @@ impl Invariant for BridgeCounters {
             }
             Event::FaultsCleared => self.is_over = true,
             Event::GatewayCounters { sensor, topic, row } => {
-                // Announcements, backgrounds and silences come of themselves, too.
+                // Announcements, backgrounds and silences are sent without a sample of the hub, too.
                 let is_counted = matches!(topic, Some(Topic::Scan | Topic::Telegram | Topic::Foreground));
                 let all_go_out = self.sends_all && is_counted;
                 let of = self.topic_counters(sensor, topic);

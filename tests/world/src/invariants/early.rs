@@ -1,7 +1,7 @@
-//! A warning before its scan is complete says slow or stop, never clear, and it is true of the scan or taken back: before the
-//! next zones of its number or a greater one, which are of its scan, unless these are at least as bad. While nothing goes
-//! wrong, no warning is withdrawn, and no zones say stop without an earlier warning. That warning was sent when at most three
-//! quarters of the scan had arrived.
+//! Invariant on early warnings, which are verdicts from partial scans. An early warning is slow or stop, never clear.
+//! It is confirmed by zones that are at least as bad, or withdrawn before the next zones whose `seq` is not smaller.
+//! While nothing is wrong, no warning is withdrawn, and no zones are stop without a warning that was sent when at most
+//! three quarters of the scan had arrived.
 
 use std::collections::BTreeMap;
 
@@ -11,35 +11,35 @@ use scanhub_schema::{MILLIS, Nanos, Scan, Topic, Verdict, Zones};
 use super::{Invariant, ViolationReporter};
 use crate::event::Event;
 
-/// What was said of the scans that are arriving, by sensors.
+/// State of the early warnings of each sensor.
 #[derive(Default)]
 pub(crate) struct EarlyWarnings {
     sensors: BTreeMap<usize, SensorWarnings>,
     faults_cleared_at: Option<Nanos>,
 }
 
-/// A warning.
+/// An early warning.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Warning {
     seq: u64,
     verdict: Verdict,
-    /// Its scan has exactly its number, and no greater one.
+    /// Whether the `seq` of the scan is exactly that of the warning, and not a greater one.
     is_of_telegram: bool,
-    /// Beams that had arrived.
+    /// Number of beams that had arrived.
     beams_seen: u16,
 }
 
 #[derive(Default)]
 struct SensorWarnings {
-    /// The warning that stands.
+    /// The warning that is neither confirmed nor withdrawn.
     current: Option<Warning>,
-    /// The number of the last zones.
+    /// The `seq` of the last zones.
     zones: Option<u64>,
-    /// A sample had no memory, so that nobody knows what stands.
+    /// Whether there was no memory for a sample, so that the current warning is not known.
     is_unknown: bool,
-    /// A warning was withdrawn although nothing had gone wrong.
+    /// Whether a warning was withdrawn although nothing was wrong.
     is_needless: bool,
-    /// Scans since the hub found the scanner, and beams of the last one.
+    /// Number of scans since the hub found the scanner, and number of beams of the last one.
     scans: usize,
     beams: usize,
 }
@@ -58,7 +58,7 @@ impl Invariant for EarlyWarnings {
                 let wrong = match sample.topic {
                     Topic::Scan => {
                         let before = std::mem::replace(&mut of.beams, Scan::of_bytes(&sample.bytes).beams());
-                        // The session begins its revolutions again with another number of beams.
+                        // With another number of beams, the session starts to learn revolutions again.
                         of.scans = if before == of.beams { of.scans + 1 } else { 0 };
                         None
                     }
@@ -87,7 +87,7 @@ impl Invariant for EarlyWarnings {
 }
 
 impl SensorWarnings {
-    /// What is wrong with a warning, or with what takes it back.
+    /// Returns the error of a warning, or of its withdrawal.
     fn check_warning(
         &mut self,
         seq: u64,
@@ -119,12 +119,11 @@ impl SensorWarnings {
             .map(|before| format!("{before:?} stood, and {warning:?} is no worse"))
     }
 
-    /// Returns the error of the current warning, or of a missing one, now that there are `zones`. Nothing goes wrong while all
-    /// `is_well`.
+    /// Returns the error of the current or missing warning for these `zones`. Nothing is wrong if `is_faultless`.
     fn check_zones(&mut self, seq: u64, zones: &Zones, is_faultless: bool) -> Option<String> {
         self.zones = Some(seq);
-        // A hub that ends withdraws its warning, and sends no zones after that.
-        // A scan is published before its zones. With another number of beams, the one that was announced is not completed.
+        // A hub that ends withdraws its warning, and sends no zones after that. A scan is published before its zones.
+        // If the number of beams changes, the announced scan is never completed.
         if std::mem::take(&mut self.is_needless) && self.scans > 0 {
             return Some("a warning was withdrawn although nothing went wrong".to_owned());
         }
@@ -144,7 +143,7 @@ impl SensorWarnings {
     }
 }
 
-/// Time after the last fault from which nothing is due to it any more.
+/// Time after the last fault from which on no effect of a fault is expected.
 const RECOVERY_TIME: Nanos = 3_000 * MILLIS;
-/// Scans of a stream after which the session knows its rhythm.
+/// Number of scans in a stream after which the session has estimated the scan period.
 const LEARNING_SCANS: usize = 20;

@@ -1,4 +1,4 @@
-//! Judges of headers: numbers, stamps and periods.
+//! Invariants on headers: sequence numbers, stamps and periods.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::rc::Rc;
@@ -12,17 +12,17 @@ use crate::family::Family;
 use crate::remote::LinkSettings;
 use crate::topics::Sample;
 
-/// Judge: headers are consistent. Numbers increase, stamps are neither in the future nor decrease, and every sample that is
-/// derived from a telegram has its number, stamps and quality.
+/// Invariant: headers are consistent. Sequence numbers increase, stamps are neither in the future nor decrease, and
+/// every sample that is derived from a telegram has its `seq`, stamps and quality.
 pub(crate) struct HeaderConsistency {
-    /// Of which sample of a sensor all others are made that say when they were sent.
+    /// For each sensor, the topic from which all samples with a hub time are derived.
     sources: Vec<Topic>,
     last: BTreeMap<(usize, Topic), Header>,
 }
 
 impl HeaderConsistency {
     pub(crate) fn new(sensors: &[Rc<dyn Family>]) -> HeaderConsistency {
-        // A turn is of many telegrams: what is made of it is of its scan.
+        // A revolution consists of several packets, so results have the header of its scan.
         let source =
             |family: &Rc<dyn Family>| if family.is_rotating() { Topic::Scan } else { Topic::Telegram };
         HeaderConsistency { sources: sensors.iter().map(source).collect(), last: BTreeMap::new() }
@@ -36,7 +36,7 @@ impl Invariant for HeaderConsistency {
 
     fn on_event(&mut self, at: Nanos, event: &Event<'_>, reporter: &mut ViolationReporter<'_>) {
         if let Event::HubStarted { .. } = event {
-            // What it publishes first may be made of what it has no memory to publish.
+            // The first results of a hub may come from a scan that could not be published for lack of memory.
             return self.last.clear();
         }
         let Event::Published { sensor, sample } = *event else { return };
@@ -59,14 +59,14 @@ impl Invariant for HeaderConsistency {
                 broken("a stamp that goes back");
             }
         }
-        // What has no telegram does not say when it was sent.
+        // A sample that is not derived from a telegram has no hub time.
         let source = self.sources[sensor];
         if *topic != Topic::Telegram && *topic != source && header.hub_time_ns().is_some() {
             let of = |header: &Header| {
                 let Header { seq, boot, stamp_first_ns, stamp_last_ns, wall_ns, reasons, .. } = *header;
                 (seq, boot, stamp_first_ns, stamp_last_ns, wall_ns, reasons)
             };
-            // One without memory was not published.
+            // The sample at the source was not published if there was no memory for it.
             let source = self.last.get(&(sensor, source));
             if source.is_some_and(|source| source.seq >= header.seq && of(source) != of(header)) {
                 broken("not that of what it was made of");
@@ -75,9 +75,10 @@ impl Invariant for HeaderConsistency {
     }
 }
 
-/// Judge: a listener publishes the numbers, stamps and periods of `docs/topics.md`. The number is the datagram's and continues
-/// over runs of the gateway. Both stamps are the time of arrival. The period is the median of the last five intervals between
-/// two samples as sent. No sample that arrived in time is left out once its topic exists.
+/// Invariant: a listener publishes the sequence numbers, stamps and periods that `docs/topics.md` describes. The
+/// sequence number is the datagram's and continues over runs of the gateway. Both stamps are the time of arrival. The
+/// period is the median of the last five intervals between two samples as sent. Once a topic exists, every sample that
+/// arrived in time is published.
 pub(crate) struct RemoteHeaders {
     terms: LinkSettings,
     topics: BTreeMap<(usize, Topic), TopicHeaders>,
@@ -87,9 +88,9 @@ pub(crate) struct RemoteHeaders {
 struct TopicHeaders {
     /// Datagrams that arrived in time and are not published yet: time of arrival and header.
     unpublished: VecDeque<(Nanos, Head)>,
-    /// The last one that was published of them.
+    /// The last of them that was published.
     last: Option<(Nanos, Head)>,
-    /// The last number here.
+    /// Last sequence number of the republished topic.
     number: Option<u64>,
     intervals_ns: VecDeque<Nanos>,
 }
@@ -132,7 +133,11 @@ impl Invariant for RemoteHeaders {
 }
 
 impl TopicHeaders {
-    /// Takes a published `header`, and returns its error.
+    /// Checks the header of a published sample.
+    ///
+    /// # Errors
+    ///
+    /// Returns a description of the error.
     fn publish(&mut self, header: &Header, begin_ns: u64) -> Result<(), String> {
         let before = self.number.replace(header.topic_seq);
         if header.flags & Flags::REMOTE == 0 || header.stamp_first_ns != header.stamp_last_ns {
@@ -144,7 +149,7 @@ impl TopicHeaders {
             of == (header.stamp_last_ns, header.seq, header.wall_ns)
         };
         let Some(at) = self.unpublished.iter().position(is_it) else {
-            // It stands for a silence.
+            // The sample was published because of a silence.
             let due = before.map_or(0, |before| before + 1);
             return if header.topic_seq == due {
                 Ok(())
@@ -171,8 +176,8 @@ impl TopicHeaders {
         let mut known: Vec<_> = self.intervals_ns.iter().copied().collect();
         known.sort_unstable();
         let period_us = known.get(known.len().saturating_sub(1) / 2).map_or(0, |period_ns| period_ns / 1000);
-        // The first number of a run of the listener is the datagram's. Datagrams of another gateway that did not
-        // arrive count.
+        // The first sequence number of a run of the listener is the datagram's. Missing datagrams of another gateway
+        // count, too.
         let due = match (before, steps) {
             (Some(before), Some(steps)) => before + u64::from(steps),
             (Some(before), None) => before + 1 + u64::from(head.sequence),

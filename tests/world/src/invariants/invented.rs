@@ -1,4 +1,5 @@
-//! Judges of invented data: each sample was sent by a scanner, and each remote sample was published by the hub.
+//! Invariants against invented data: each sample was sent by a scanner, and each remote sample was published by the
+//! hub.
 
 use std::collections::hash_map::Entry;
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque};
@@ -14,26 +15,26 @@ use crate::family::Family;
 use crate::hash::HistoryHash;
 use crate::remote::{Forgery, LinkSettings, PayloadBuffer};
 
-/// Judge: the hub delivers nothing that no scanner sent, unless it marks it as suspect: each telegram byte by byte, as often as
-/// it was sent, and each scan value by value.
+/// Invariant: the hub delivers nothing that no scanner sent, unless it marks it as suspect. Each telegram is compared
+/// byte by byte and is published at most as often as it was sent. Each scan is compared value by value.
 pub(crate) struct NothingInvented {
     sensors: Vec<SensorTelegrams>,
 }
 
 struct SensorTelegrams {
     family: Rc<dyn Family>,
-    /// Number of times that a telegram was sent and not published.
+    /// Number of times that a telegram was sent and not published, by its hash.
     unpublished: HashMap<u64, u32>,
     /// Published units that were not sent. The next telegram decides whether foreign bytes arrived before it, because
     /// more bytes were read than the known telegrams have.
     foreign: Vec<Vec<u8>>,
-    /// Place behind the last byte that was read.
+    /// Position after the last byte that was read.
     read_end: u64,
     /// Last telegrams that the line damaged. An empty one stands for foreign bytes between two telegrams.
     damaged: VecDeque<Vec<u8>>,
-    /// Place behind the last telegram.
+    /// Position after the last telegram.
     sent_end: u64,
-    /// Number, life and bytes of the last published sample of telegrams.
+    /// Sequence number, boot ID and bytes of the last published sample of topic `telegram`.
     last: (u64, u64, Vec<u8>),
 }
 
@@ -107,7 +108,7 @@ impl Invariant for NothingInvented {
 }
 
 impl SensorTelegrams {
-    /// Reports strange units that are not a mixture of damaged telegrams.
+    /// Reports foreign units that are not a mixture of damaged telegrams.
     fn check_foreign(&mut self, sensor: usize, reporter: &mut ViolationReporter<'_>) {
         for unit in std::mem::take(&mut self.foreign) {
             if !self.family.is_collision(&unit, &mut self.damaged.iter().map(Vec::as_slice)) {
@@ -116,13 +117,13 @@ impl SensorTelegrams {
         }
     }
 
-    /// The line damaged `telegram`.
+    /// Remembers a telegram that the line damaged.
     fn damage(&mut self, telegram: &[u8]) {
         self.damaged.truncate(MAX_DAMAGED - 1);
         self.damaged.push_front(telegram.to_vec());
     }
 
-    /// Takes a telegram that was sent and not published. Returns whether there is one.
+    /// Removes a telegram that was sent and not published. Returns whether there was one.
     fn take(&mut self, key: u64) -> bool {
         let Entry::Occupied(mut entry) = self.unpublished.entry(key) else { return false };
         *entry.get_mut() -= 1;
@@ -136,31 +137,35 @@ impl SensorTelegrams {
 /// Number of damaged telegrams that are kept.
 const MAX_DAMAGED: usize = 4;
 
-/// Judge: the network delivers nothing that the hub did not publish. The listener accepts no datagram that was not sent with
-/// the same bits. It refuses no datagram that was, except after the end of its gateway's run, or with a key if the datagram is
-/// not known to be new. A listener publishes samples of the hub with number, time and quality, and never a part of one.
+/// Invariant: the network delivers nothing that the hub did not publish. The listener accepts no datagram that was not
+/// sent with the same bits. It accepts every datagram that was, except after the end of its gateway's run, or with a
+/// key if the datagram is not known to be new. A listener publishes samples of the hub with sequence number, time and
+/// quality, and never a part of one.
 ///
-/// Two samples have no source (`docs/topics.md`): unknown zones, because no sample arrived, and a silent sensor after 3 s of
-/// silence. A late listener may report a silence of the past, so its stamp counts: no sample arrived in the 3 s before it.
+/// Two samples have no source (`docs/topics.md`): unknown zones, because no sample arrived, and a silent sensor after 3
+/// s of silence. A late listener may report a silence of the past, so its stamp counts: no sample arrived in the 3 s
+/// before it.
 pub(crate) struct RemoteNothingInvented {
     published: HashSet<u64>,
-    /// Lives of the hub.
+    /// Boot IDs of the hub's runs.
     boots: HashSet<u64>,
-    /// By epoch, sensor, topic, number and part.
+    /// Hashes of the sent datagrams by epoch, sensor, topic, sequence number and part.
     sent: BTreeMap<(u32, u8, u8, u32, u8), u64>,
-    /// The greatest epoch that the listener took.
+    /// The greatest epoch that the listener accepted.
     epoch: u32,
-    /// Epoch and sensor of the announcements that the listener took: before it nobody knows whose samples are.
+    /// Epoch and sensor of the announcements that the listener accepted. The sensor of a sample is unknown before.
     announced: HashSet<(u32, u8)>,
-    /// When samples of each sensor came that the listener took, knew and did not find late.
+    /// Times at which samples of each sensor arrived that the listener accepted, could assign to a sensor, and did not
+    /// mark as late.
     arrived_at: BTreeSet<(usize, Nanos)>,
-    /// With a key: by epoch, sensor and topic the first number that was announced to the listener, and the highest it took.
+    /// With a key, for each epoch, sensor and topic: the first sequence number that was announced to the listener, and
+    /// the highest that it accepted.
     numbers: BTreeMap<(u32, u8, u8), (u32, u32)>,
     has_key: bool,
-    /// CLOCK_MONOTONIC of the listener's machine when the world began.
+    /// `CLOCK_MONOTONIC` of the listener's machine when the world began.
     clock_offset: Nanos,
     packet: PayloadBuffer,
-    /// What everybody may say.
+    /// Payload of the unknown zones, which a listener may publish without a source.
     unknown: Vec<u8>,
 }
 
@@ -186,8 +191,8 @@ impl RemoteNothingInvented {
 }
 
 impl RemoteNothingInvented {
-    /// Whether a listener with a key refuses it rightly: it came before its sensor's announcement, or is older than that, or
-    /// than the window, as a recording is.
+    /// Returns whether a listener with a key is right to refuse a datagram. The datagram arrived before its sensor's
+    /// announcement, or it is older than that or than the window of sequence numbers, like a recorded one.
     fn is_rightly_refused(&self, head: &Head, reason: DatagramError) -> bool {
         let known = self.numbers.get(&(head.epoch, head.sensor, head.topic));
         match (reason, known) {
@@ -199,7 +204,7 @@ impl RemoteNothingInvented {
         }
     }
 
-    /// The listener took this.
+    /// Stores the sequence numbers of a datagram that the listener accepted.
     fn take_number(&mut self, datagram: &Datagram<'_>) {
         let head = &datagram.head;
         let own = self.numbers.entry((head.epoch, head.sensor, head.topic));
@@ -232,7 +237,7 @@ impl Invariant for RemoteNothingInvented {
                 _ = self.sent.insert(part_key(datagram), HistoryHash::hash_bytes(bytes))
             }
             Event::ListenerStarted { .. } => {
-                // With a key it is kept.
+                // A listener with a key saves the epoch.
                 self.epoch = if self.has_key { self.epoch } else { 0 };
                 self.numbers.clear();
                 self.announced.clear();
@@ -293,8 +298,8 @@ impl Invariant for RemoteNothingInvented {
     }
 }
 
-/// What of a sample stays the same over the network. A status is stamped when it is sent, and the beginning of its state when
-/// it is first heard of.
+/// Returns a hash of everything in a sample that a network must not change. The stamps of a status may change: it is
+/// stamped when it is sent, and its state starts when the listener first receives it.
 fn key(sensor: usize, topic: Topic, header: &Header, payload: &[u8]) -> u64 {
     let flags = header.flags & (Flags::SIMULATED | Flags::REPLAYED | Flags::STAMP_ESTIMATED);
     let is_suspect = header.quality() == Quality::Suspect;
@@ -323,11 +328,11 @@ fn part_key(datagram: &Datagram<'_>) -> (u32, u8, u8, u32, u8) {
     (head.epoch, head.sensor, head.topic, head.sequence, head.part)
 }
 
-/// So long nothing came of a sensor that is silent.
+/// Time without a sample after which a sensor is silent.
 const SILENCE_TIMEOUT: Nanos = 3_000 * MILLIS;
 
-/// Judge: with a key, a listener refuses every forged datagram for the right reason, and never accepts a recorded datagram
-/// as new. Other judges check that it counts all refusals and always accepts the right gateway.
+/// Invariant: with a key, a listener refuses every forged datagram for the right reason, and never accepts a recorded
+/// datagram as new. Other invariants check that it counts all refusals and always accepts the right gateway.
 #[derive(Default)]
 pub(crate) struct RemoteKeys {
     forged: HashMap<u64, Forgery>,

@@ -1,4 +1,4 @@
-//! Judges of recovery: once nothing is wrong any more, everything works again soon.
+//! Invariants on recovery: soon after the last fault, everything works again.
 
 use std::rc::Rc;
 
@@ -10,9 +10,9 @@ use crate::family::Family;
 use crate::remote::{LinkSettings, MAX_DRAIN_TIME, RECONNECT_INTERVAL};
 use crate::setup::Setup;
 
-/// Judge: once nothing is wrong any more, each link soon reports that it streams, and publishes measured values. It publishes
-/// scans as soon as the scanner has reported how its values are split; the session repeats that request now and then. The
-/// search for a scanner of another family starts after ten seconds without data.
+/// Invariant: soon after the last fault, each link reports that it streams, and publishes measured values. It publishes
+/// scans as soon as the scanner has reported how its values are split; the session repeats that request from time to
+/// time. The search for a scanner of another family starts after ten seconds without data.
 pub(crate) struct Liveness {
     faults_cleared_at: Option<Nanos>,
     sensors: Vec<SensorProgress>,
@@ -23,11 +23,11 @@ struct SensorProgress {
     reports_streaming: bool,
     /// Time at which the search for a scanner of another family begins.
     search_starts_at: Nanos,
-    /// Telegrams of measured values came, and scans.
+    /// Whether telegrams with measured values have been published, and whether scans have.
     has_arrived: [bool; 2],
-    /// When the first one of each came, without the time that the scanner waited for its motor.
+    /// Times of the first telegram and of the first scan, without the time for which the scanner waited for its motor.
     first_at: [Option<Nanos>; 2],
-    /// When it answered last before that, and when it measured first after that answer.
+    /// Time of the scanner's last reply before that, and time of the first measurement after that reply.
     answered_at: Nanos,
     measured_at: Option<Nanos>,
 }
@@ -118,30 +118,31 @@ impl Invariant for Liveness {
     }
 }
 
-/// So soon: after a second of silence a sensor is sought that may be at another rate, for some 2.4 s
-/// (`docs/measured.md`); one whose last word was damaged, just before everything was well, is asked again for up to 3 s
-/// first. One that streams and does not tell how is asked every ten seconds.
+/// Time limits for streaming and for scans. After a second of silence, the hub searches for a scanner that may be at
+/// another rate, for some 2.4 s (`docs/measured.md`). If the scanner's last bytes were damaged just before the faults
+/// were cleared, the session first repeats its requests for up to 3 s. If a scanner streams without reporting its
+/// settings, the session requests them every ten seconds.
 const RECOVERY_LIMITS: [Nanos; 2] = [5_500 * MILLIS, 11_000 * MILLIS];
-/// Time after which the search begins again because nothing of the scanner arrives.
+/// Time without data from the scanner after which the search starts again.
 const SEARCH_TIMEOUT: Nanos = 10_000 * MILLIS;
 
-/// Judge: once nothing is wrong any more, a remote robot soon knows what the hub knows. The next announcement names the sensor,
-/// and then the next zones are sent. The robot knows the verdict from then on, unless the zones are so rare that the first
-/// ones, which have no period yet, expire before the second ones arrive (`docs/topics.md`).
+/// Invariant: soon after the last fault, a remote robot has the same verdict as the hub. The next announcement names
+/// the sensor, and then the next zones are sent. From then on, the robot's verdict is not unknown, unless the zones are
+/// so rare that the first ones, which have no period yet, expire before the second ones arrive (`docs/topics.md`).
 pub(crate) struct RemoteLiveness {
     are_faults_cleared: bool,
     sensors: Vec<RemoteSensor>,
 }
 
 struct RemoteSensor {
-    /// From known zones in the hub to known ones here, at most.
+    /// Maximum time from a known verdict of the hub to a known verdict of the robot.
     max_delay: Nanos,
-    /// Zones come less often than a verdict stands whose period is not known.
+    /// Whether the interval of zones is longer than the validity of a verdict without a period.
     is_slow: bool,
     /// Time since which the hub has published a known verdict, if it does.
     known_since: Option<Nanos>,
     is_known: bool,
-    /// Whether the robot knew the verdict after the world healed.
+    /// Whether the robot has had a known verdict since the last fault.
     has_recovered: bool,
 }
 
@@ -150,7 +151,7 @@ impl RemoteLiveness {
         let sensor = |of: usize| {
             let (period, _) = setup.sensors[of].scan_times();
             let every = terms.send_interval.get() * period;
-            // Time to find a router that returns when the world heals, and to send the queue.
+            // Time to find a router that returns when the faults are cleared, and to send the queue.
             let over_router = if terms.are_bridges { RECONNECT_INTERVAL + MAX_DRAIN_TIME } else { 0 };
             let max_delay = ANNOUNCE_INTERVAL + every + period + terms.delay_ns + over_router + TIMER_DELAY;
             RemoteSensor {
@@ -228,7 +229,7 @@ impl RemoteSensor {
 
 /// Interval of zones up to which their verdict is always known.
 const MAX_FREQUENT_INTERVAL: Nanos = 230 * MILLIS;
-/// Between two announcements.
+/// Interval between two announcements.
 const ANNOUNCE_INTERVAL: Nanos = 1_000 * MILLIS;
-/// Threads and timers are late by no more than this, all together.
+/// Maximum delay of all threads and timers together.
 const TIMER_DELAY: Nanos = 3 * MILLIS;

@@ -1,4 +1,4 @@
-//! Judges of losses: bytes, telegrams, and packets that the line loses.
+//! Invariants on losses of bytes, telegrams and packets.
 
 use std::collections::VecDeque;
 use std::rc::Rc;
@@ -10,8 +10,8 @@ use super::{Invariant, ViolationReporter};
 use crate::event::{Event, RevolutionFigures, Telegram};
 use crate::family::Family;
 
-/// Judge: no byte disappears. The bytes that a status reports as read are those that the port returned to the running hub, and
-/// each of them is in a telegram, in an acknowledgement, discarded, or still in the buffer.
+/// Invariant: no byte disappears. The bytes that a status reports as read are those that the port returned to the
+/// running hub, and each of them is in a telegram, in an acknowledgement, discarded, or still in the buffer.
 pub(crate) struct ByteCounters(Vec<u64>);
 
 impl ByteCounters {
@@ -51,9 +51,9 @@ impl Invariant for ByteCounters {
     }
 }
 
-/// Judge: a running hub loses no intact telegram. A telegram is due if the port returned all its bytes as they were
-/// sent, while the hub reported that it streams. The hub publishes it once and in order, unless there was no memory
-/// for it.
+/// Invariant: a running hub loses no intact telegram. A telegram is due if the port returned all its bytes as they were
+/// sent, while the hub reported that it streams. The hub publishes it once and in order, unless there was no memory for
+/// it.
 pub(crate) struct NothingLost {
     sensors: Vec<SensorTelegrams>,
 }
@@ -61,38 +61,39 @@ pub(crate) struct NothingLost {
 struct SensorTelegrams {
     family: Rc<dyn Family>,
     sent: VecDeque<SentTelegram>,
-    /// Place of the first byte that the session on the line can know.
+    /// Position of the first byte that the session on the line can have received.
     valid_from: u64,
-    /// Place behind the last byte that the hub had read when it began to say that it streams, if it still says so.
+    /// Position after the last byte that the hub had read when it reported that it streams, or `None` if it does not
+    /// stream.
     streams_from: Option<u64>,
     read_end: u64,
-    /// Sensors that were there before this one, and whether the hub has heard a scan of this one: one whose scans are others
-    /// is met only after a silence.
+    /// Number of exchanged scanners before this one, and whether the hub has not yet received a scan of this one. The
+    /// session accepts a scanner with other scans only after a silence.
     exchanged: u32,
     is_other: bool,
-    /// Until when something of the sensor before this one may still be on the line.
+    /// Time until which bytes of the previous scanner may still be on the line.
     mixed_until: Nanos,
-    /// Telegrams for which there was no memory.
+    /// Number of telegrams for which there was no memory.
     lacked_memory: usize,
-    /// Place behind the last telegram, and how many of the next ones may be lost with damaged bytes before them.
+    /// Position after the last telegram, and number of next telegrams that may be lost with damaged bytes before them.
     sent_end: u64,
     allowed_losses: usize,
-    /// What was published last, if nobody sent it.
+    /// The last published unit, if no scanner sent it.
     foreign: Vec<u8>,
-    /// From when until when the hub does not run.
+    /// Start and end of the last stall of the hub.
     stall: (Nanos, Nanos),
 }
 
 struct SentTelegram {
     bytes: Vec<u8>,
     span: (u64, u64),
-    /// Of which sensor.
+    /// Number of exchanges before the scanner that sent it.
     exchanged: u32,
     is_whole: bool,
-    /// All of its bytes arrived as they were sent.
+    /// Whether all of its bytes arrived as they were sent.
     is_intact: bool,
     is_read: bool,
-    /// When the hub had all of it, if it has to be published.
+    /// Time at which the hub had read all of it, if it has to be published.
     due_at: Option<Nanos>,
 }
 
@@ -198,7 +199,7 @@ impl SensorTelegrams {
         let Telegram { bytes, span, damage, aborted, .. } = *telegram;
         let is_intact = damage.is_none() && !aborted;
         let near = self.family.point_accuracy(bytes).neighbors;
-        // What is asked of one whose head turns is asked again until it answers.
+        // The session of a rotating scanner repeats a request until it gets a reply, so a lost reply is not an error.
         let is_promised = !self.family.is_rotating() || self.family.is_data(bytes);
         let is_plain = span.1 - span.0 == bytes.len() as u64 && span.0 <= self.sent_end;
         self.sent_end = span.1;
@@ -244,7 +245,7 @@ impl SensorTelegrams {
         }
     }
 
-    /// The stream ends: what came just before may still have been held back, to see what follows.
+    /// Ends the stream. The session may still have held back the last telegrams, to see what follows them.
     fn end_stream(&mut self, at: Nanos) {
         let at = if self.stall.1 >= at { self.stall.0 } else { at };
         for sent in
@@ -252,7 +253,7 @@ impl SensorTelegrams {
         {
             sent.due_at = None;
         }
-        // Where only what follows tells that it is one, nothing follows the last one.
+        // If only the next packet confirms a packet, the last one is never confirmed.
         if let Some(last) = self.sent.iter_mut().rfind(|sent| sent.is_read)
             && self.family.point_accuracy(&last.bytes).neighbors > 0
         {
@@ -260,7 +261,8 @@ impl SensorTelegrams {
         }
     }
 
-    /// Whether damaged bytes came before `unit`, which has a checksum and is published now: then it has to be marked.
+    /// Returns whether damaged bytes arrived before `unit`, which has a checksum and is published now. In that case, it
+    /// must be marked.
     fn is_after_damage(&self, unit: &[u8]) -> bool {
         let exactness = self.family.point_accuracy(unit);
         if !self.foreign.is_empty()
@@ -280,14 +282,16 @@ impl SensorTelegrams {
         })
     }
 
-    /// A telegram is published. What was lost before it.
+    /// Handles the publication of a telegram. Returns a description of the telegrams that were lost before it.
     fn publish(&mut self, at: Nanos, bytes: &[u8]) -> Option<String> {
         let is_it = |sent: &SentTelegram| sent.is_read && sent.bytes == bytes;
-        // Replies are often the same, and single points sometimes: of those that are, the one that has to come, or a whole one.
+        // Replies are often identical, and standard packets sometimes are. Among identical units, choose one that is
+        // due, or an intact one.
         let due = self.sent.iter().position(|sent| sent.due_at.is_some() && is_it(sent));
         let whole = due.or_else(|| self.sent.iter().position(|sent| sent.is_whole && is_it(sent)));
         let first = self.sent.iter().position(is_it);
-        // The first of two alike, if the other would mean that something between them is lost; what is lost shows later.
+        // Choose the first of two identical units if choosing the other would mean that something between them was
+        // lost. A real loss is detected later.
         let is_due = |sent: &SentTelegram| sent.due_at.is_some();
         let skips = whole.is_some_and(|whole| self.sent.range(first.unwrap_or(0)..whole).any(is_due));
         let found = if skips { first } else { whole.or(first) };
@@ -298,11 +302,13 @@ impl SensorTelegrams {
         };
         let is_of_this = self.family.is_data(bytes) && self.sent[found].exchanged == self.exchanged;
         self.is_other &= !is_of_this || at < self.mixed_until;
-        // One that lost its first byte is whole again with the last one of the one before it, if that is the same: either is.
+        // A unit that lost its first byte is intact again with the last byte of the unit before it, if these bytes are
+        // the same. Either unit may be the published one.
         let is_lent = !self.sent[found].is_whole;
         let passed = self.sent.drain(..=found).take(found);
         let mut lost: Vec<SentTelegram> = passed.filter(|sent| sent.due_at.is_some()).collect();
-        // A checksum of one byte is right by chance in 1 of 256: what damage made of two packets has a part of the intact one.
+        // A checksum of one byte is valid by chance in 1 of 256 cases. A unit that damage made from two packets
+        // contains a part of the intact one.
         if let Some(torn) = lost.iter().position(|sent| overlaps(&foreign, &sent.bytes)) {
             lost.remove(torn);
         }
@@ -318,23 +324,24 @@ impl SensorTelegrams {
     }
 }
 
-/// Whether one of both ends, by a header at least, with what the other begins with.
+/// Returns whether one unit ends with a start of the other, at least with its header.
 fn overlaps(foreign: &[u8], sent: &[u8]) -> bool {
     let is_end = |len: usize| foreign.ends_with(&sent[..len]) || sent.ends_with(&foreign[..len]);
     (MIN_HEADER_LEN..foreign.len().min(sent.len())).any(is_end)
 }
 
-/// Bytes by which what has a checksum is known to begin.
+/// Number of bytes by which a packet with a checksum is recognized.
 const MIN_HEADER_LEN: usize = 2;
-/// A telegram is held back no longer than so.
+/// Maximum time for which a session holds back a telegram.
 const MAX_HOLD_TIME: Nanos = 100 * MILLIS;
-/// A line holds bytes back for no longer than so (action `silence`).
+/// Maximum time for which a line holds back bytes (action `silence`).
 const MAX_LINE_DELAY: Nanos = 4_000 * MILLIS;
-/// So many samples that were never due are remembered.
+/// Number of stored telegrams that were never due.
 const MAX_REMEMBERED: usize = 64;
 
-/// Judge: the hub counts packets that a scanner sent and the hub did not receive. Packets without a number follow each other;
-/// the hub counts as many as are missing between two packets that arrived, as exactly as their times and angles permit.
+/// Invariant: the hub counts packets that a scanner sent and the hub did not receive. Packets have no sequence number,
+/// so the hub counts as many as are missing between two packets that arrived, as exactly as their times and angles
+/// permit.
 pub(crate) struct LostOnLine {
     sensors: Vec<PacketCounters>,
 }
@@ -343,23 +350,23 @@ struct PacketCounters {
     family: Rc<dyn Family>,
     /// Packets that were sent and not published yet, in order. An empty one marks a power cycle or an exchange.
     sent: VecDeque<Vec<u8>>,
-    /// The last one that was published.
+    /// The last published packet.
     last: Vec<u8>,
-    /// Count in the last status of this hub. The other fields apply since the last agreement: reported packets,
-    /// missing packets, and their allowed difference.
+    /// Count in the last status of this hub. The other fields apply since the last time at which the counts agreed:
+    /// lost packets as reported by the hub, packets that are missing, and the allowed difference between both.
     counted: Option<u64>,
     reported: u64,
     missing: u64,
     allowed_difference: u64,
     /// Sum of reported and missing packets at the last status.
     total_at_last_status: u64,
-    /// Whether both disagreed then. After a stall of the hub, and for points without a checksum, the hub detects the
-    /// number of missing packets later.
+    /// Whether the counts disagreed then. After a stall of the hub, and for points without a checksum, the hub detects
+    /// the number of missing packets later.
     disagreed: bool,
     /// Number of the next statuses that are not checked, after something that cannot be counted: another session, or a
     /// packet that was not sent.
     unchecked_statuses: u8,
-    /// Packets were not published for lack of memory.
+    /// Whether packets were not published for lack of memory.
     lacked_memory: bool,
     measured_at: Nanos,
     /// Total count of all statuses.
@@ -440,7 +447,7 @@ impl Invariant for LostOnLine {
 }
 
 impl PacketCounters {
-    /// Takes measured points. After a power cycle, the number of missing packets is unknown.
+    /// Handles measured points. After a power cycle, the number of missing packets is unknown.
     fn measure(&mut self, points: &[TruePoint]) {
         let Some(last) = points.last() else { return };
         if last.at_ns > self.measured_at + MIN_POWER_OFF {
@@ -477,13 +484,18 @@ impl PacketCounters {
             self.unchecked_statuses = UNCHECKED_STATUSES;
         }
         self.missing += missing;
-        // How many fit between two packets is rounded, and a head may change its speed between them.
+        // The number of packets that fit between two packets is rounded, and the speed of a head may change between
+        // them.
         let exactness = self.family.point_accuracy(unit);
         let unmarked = if exactness.neighbors > 0 { MAX_UNMARKED_DIFFERENCE + missing / 10 } else { 1 };
         self.allowed_difference += if missing > 0 { unmarked + missing / 20 } else { 0 };
     }
 
-    /// Returns the error of the count in `status`.
+    /// Checks the count in `status`.
+    ///
+    /// # Errors
+    ///
+    /// Returns a description of the error.
     fn check(&mut self, status: &Status) -> Result<(), String> {
         let counted = status.counters[Counter::LostOnLine];
         let reported = counted.saturating_sub(self.counted.replace(counted).unwrap_or(0));
@@ -514,12 +526,12 @@ impl PacketCounters {
 /// The status after something that cannot be counted, and the next one, which may contain losses that the hub detected
 /// later.
 const UNCHECKED_STATUSES: u8 = 2;
-/// Allowed difference if only the number of points per revolution shows a loss.
+/// Allowed difference if only the number of points per revolution reveals a loss.
 const MAX_UNMARKED_DIFFERENCE: u64 = 30;
-/// Number of packets that are kept: as many as a tty buffers of the fastest scanner.
+/// Number of stored packets: as many as a tty buffers for the fastest scanner.
 const MAX_SENT: usize = 20_000;
-/// Longest countable gap, in packets: 1.5 s of the slowest scanner. The scanner's clock may have changed in a longer
-/// one.
+/// Longest countable gap, in packets: 1.5 s of the slowest scanner. In a longer one, the scanner may have been
+/// exchanged, and its clock with it.
 const MAX_GAP_PACKETS: u64 = 400;
 /// Minimum duration of a power cycle.
 const MIN_POWER_OFF: Nanos = 50 * MILLIS;

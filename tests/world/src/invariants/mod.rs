@@ -1,5 +1,5 @@
-//! Invariants of a world, which the simulator calls judges: each watches every event for one promise and reports when it is
-//! broken. A judge knows neither the other judges nor the intent of a plan.
+//! Invariants of a world. Each one checks every event for one property, and reports its violations. It depends neither
+//! on the other invariants nor on the scenario's actions.
 
 mod counters;
 mod early;
@@ -21,21 +21,21 @@ use crate::remote::LinkSettings;
 use crate::scenario::Scenario;
 use crate::setup::Setup;
 
-/// One promise.
+/// A property that must always hold.
 pub(crate) trait Invariant {
-    /// Its name in what is said.
+    /// Returns the name in reports.
     fn name(&self) -> &'static str;
 
-    /// `event` happened at `at`.
+    /// Handles an event at time `at`.
     fn on_event(&mut self, at: Nanos, event: &Event<'_>, reporter: &mut ViolationReporter<'_>);
 
-    /// What it measured, if that can be told in figures.
+    /// Returns the figures that the invariant measured, if any.
     fn figures(&self) -> RevolutionFigures {
         RevolutionFigures::default()
     }
 }
 
-/// Where a judge says what is broken.
+/// Collects the violations of one invariant at one time.
 pub(crate) struct ViolationReporter<'a> {
     pub(crate) invariant: &'static str,
     pub(crate) at_ns: Nanos,
@@ -43,16 +43,16 @@ pub(crate) struct ViolationReporter<'a> {
 }
 
 impl ViolationReporter<'_> {
-    /// `words` say what is not as it should be.
+    /// Adds a violation.
     pub(crate) fn report(&mut self, message: String) {
-        // What is broken once is often broken with each sample.
+        // A violation often repeats with every sample.
         if self.violations.len() < MAX_VIOLATIONS {
             self.violations.push(Violation { invariant: self.invariant, at_ns: self.at_ns, message });
         }
     }
 }
 
-/// All judges, for a world that begins with `setup`.
+/// Returns all invariants for a world that starts with `setup`.
 pub(crate) fn all(setup: &Setup, scenario: &Scenario) -> Vec<Box<dyn Invariant>> {
     let (sensors, terms) = (&setup.sensors[..], LinkSettings::from_scenario(scenario));
     vec![
@@ -84,5 +84,5 @@ pub(crate) fn all(setup: &Setup, scenario: &Scenario) -> Vec<Box<dyn Invariant>>
     ]
 }
 
-/// More are not said of one world.
+/// Maximum number of reported violations per world.
 const MAX_VIOLATIONS: usize = 20;

@@ -1,6 +1,6 @@
-//! What a recorder took is what is read from its file: each telegram of each sensor with its header, in order, and as many
-//! missing as it missed. Written by the real writer, into memory, and read by the real reader. In one world of four: it takes
-//! as long as all the rest.
+//! Invariant on recordings: a recording contains each telegram of each sensor with its header, in order, and the number
+//! of missing ones. The real writer writes the recording into memory, and the real reader reads it. It takes as long as
+//! everything else, so only one world in four is recorded.
 
 use std::collections::BTreeMap;
 use std::io::{self, Write};
@@ -22,16 +22,16 @@ use crate::topics::Sample;
 
 /// A recorder of all telegrams and statuses.
 pub(crate) struct Recording {
-    /// The consumers that it is: of which sensor and topic.
+    /// Sensor and topic of each subscriber whose samples are recorded.
     subscriptions: BTreeMap<SubscriberId, (usize, Topic)>,
     writer: Option<Writer<Vec<u8>>>,
-    /// Header and hash of each telegram that it took.
+    /// Header and hash of each telegram that was recorded.
     taken: BTreeMap<usize, Vec<(Header, u64)>>,
     missed: BTreeMap<usize, u64>,
 }
 
 impl Recording {
-    /// Records if `seed` is one of those whose worlds are recorded.
+    /// Records the world if `seed` is a multiple of [`RECORDING_INTERVAL`].
     pub(crate) fn new(seed: u64) -> Recording {
         let begin = || Writer::begin(Vec::new(), "", BTreeMap::new());
         Recording {
@@ -56,7 +56,11 @@ impl Recording {
         writer.write_sample(&name, *topic, header, bytes)
     }
 
-    /// Reads the file; what is not as it was taken.
+    /// Reads the recording. Returns a description of the difference from the samples that were recorded.
+    ///
+    /// # Errors
+    ///
+    /// Returns a message if the recording cannot be written or read.
     fn read_back(&mut self) -> Result<Option<String>, String> {
         let Some(writer) = self.writer.take() else { return Ok(None) };
         let bytes = writer.finish().map_err(|error| error.to_string())?;
@@ -76,7 +80,7 @@ impl Recording {
                 .map(|frame| (frame.header.unwrap_or_default(), HistoryHash::hash_bytes(&frame.telegram)))
                 .collect();
             let (missing, missed) = (part.contents().damage.telegrams, self.missed[&sensor]);
-            // Between two hubs a reader cannot know how many there were.
+            // A reader cannot detect the number of samples that were missed between two hubs.
             if read != *taken || missing > missed {
                 let (read, taken) = (read.len(), taken.len());
                 return Ok(Some(format!(
@@ -97,7 +101,7 @@ impl Invariant for Recording {
         match *event {
             Event::Attached { subscriber, sensor, topic, is_prompt: true, .. } => {
                 let is_wanted = matches!(topic, Topic::Telegram | Topic::Status);
-                // The first one of each.
+                // Only the first subscriber of each topic is recorded.
                 if is_wanted && self.subscriptions.values().all(|known| *known != (sensor, topic)) {
                     self.subscriptions.insert(subscriber, (sensor, topic));
                 }
@@ -118,7 +122,7 @@ impl Invariant for Recording {
     }
 }
 
-/// One world of so many is recorded.
+/// Number of worlds of which one is recorded.
 const RECORDING_INTERVAL: u64 = 4;
-/// What only logs need that are no recordings of a hub.
+/// Encoding, which only logs need that are not recordings of a hub.
 const ENCODING: Encoding = Encoding { unit: Unit::Mm, mode: Mode(1) };

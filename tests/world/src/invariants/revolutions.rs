@@ -1,9 +1,9 @@
-//! A turn of a head is what the head measured in one turn, no more and, unless it is marked, no less: each point of a scan
-//! is where a point was measured, at the time that the scan says, and all of one turn. Scans of a topic's life have as many
-//! beams.
+//! Invariant on revolutions: a scan of a rotating scanner contains the points of one revolution, no others, and all of
+//! them unless it is marked. Each point of the scan was measured at its angle, with its range, at the time that the
+//! scan states. All scans in a run of a topic have the same number of beams.
 //!
-//! A stamp can only be right once the hub has heard a packet without delay: before that, nobody can tell a line that is
-//! late from a scanner that is.
+//! A stamp can be right only after the hub has received a packet without delay. Before that, a delayed line cannot be
+//! distinguished from a delayed scanner.
 
 use std::cell::Cell;
 use std::collections::hash_map::Entry;
@@ -20,45 +20,47 @@ use crate::family::{Family, FirstPoint, PointAccuracy};
 use crate::hash::HistoryHash;
 use crate::topics::Sample;
 
-/// What each sensor whose head turns measured.
+/// Points and packets of all rotating scanners.
 pub(crate) struct Revolutions {
     sensors: Vec<SensorPoints>,
-    /// Until when the hub does not run, or did not lately.
+    /// Time until which the hub is stalled, or the end of its last stall.
     stalled_until: Nanos,
     figures: RevolutionFigures,
 }
 
 struct SensorPoints {
     family: Rc<dyn Family>,
-    /// All that was measured lately, in the order of time.
+    /// Recently measured points, in order of time.
     points: VecDeque<Point>,
-    /// Hashes of what was sent lately, and in their order.
+    /// Hashes of recently sent packets: their counts, and their order.
     sent: HashMap<u64, u32>,
     sent_order: VecDeque<u64>,
-    /// How many of these were forgotten, and how many came before the one that is published next.
+    /// Number of packets that were removed from the start of `sent_order`, and number of packets before the next one to
+    /// be published.
     dropped: usize,
     matched: usize,
-    /// How exactly the packets tell that were published last.
+    /// Accuracy of the packets that were published last.
     exactness: PointAccuracy,
-    /// When something was published last that was not sent, or was not published for lack of memory, so that nobody saw
-    /// whether it was sent; and the number of the last telegram that was.
+    /// Time at which a unit was last published that was not sent, or that could not be published for lack of memory, so
+    /// that its origin is unknown; and sequence number of the last telegram that was sent.
     foreign_at: Option<Nanos>,
     last_known: Option<u64>,
     /// Run of the hub, number of beams, and time of the first scan with this number since the port was opened.
     beams: Option<(u64, usize, Nanos)>,
-    /// Place behind the last packet that came without delay, and when it did.
+    /// Position after the last packet that arrived without delay, and the time of its arrival.
     prompt: Option<(u64, Nanos)>,
-    /// How many were read without delay since the session began, and when the last one of the first few was.
+    /// Number of packets that were read without delay since the session began, time at which the session had enough of
+    /// them, and time of the last one.
     prompts: u32,
     settled_at: Option<Nanos>,
     last_prompt_at: Option<Nanos>,
-    /// Place behind the last packet that was sent, and when bytes came that took no time on the line: what was read with them
-    /// looks earlier than it was.
+    /// Position after the last sent packet, and time of the last bytes that took no time on the line. Packets that are
+    /// read together with such bytes seem to arrive early.
     end: u64,
     queued_at: Option<Nanos>,
-    /// When a packet was on the line last that arrived as it was sent.
+    /// Time at which an intact packet was last on the line.
     arrived_at: Nanos,
-    /// By how much the stamp of the last scan was off that is judged.
+    /// Error of the stamp of the last scan whose stamp was checked.
     last_error: Cell<Option<i64>>,
 }
 
@@ -141,12 +143,12 @@ impl Invariant for Revolutions {
 }
 
 impl SensorPoints {
-    /// What the session knew of the scanner's clock is void.
+    /// Discards the estimate of the scanner's clock.
     fn restart(&mut self) {
         (self.prompts, self.settled_at, self.last_error) = (0, None, Cell::default());
     }
 
-    /// A packet was read without delay at `at`.
+    /// Handles a packet that was read without delay at `at`.
     fn on_prompt_packet(&mut self, at: Nanos) {
         let before = self.last_prompt_at.replace(at).unwrap_or(0);
         if !self.exactness.has_clock && before + MAX_GAP < at {
@@ -163,7 +165,7 @@ impl SensorPoints {
         for &truth in points {
             let rotated_deg = match self.points.back() {
                 Some(last) => {
-                    // After its power was off it is another turn, whatever the angle; and points may come out of order.
+                    // After a power cycle a new revolution starts, whatever the angle. Points may be out of order.
                     let is_new = truth.at_ns > last.truth.at_ns + MIN_POWER_OFF;
                     let step_deg = (truth.clockwise_deg - last.truth.clockwise_deg).rem_euclid(360.0);
                     let is_back = step_deg > 360.0 - MAX_REORDER_DEG && !is_new;
@@ -183,7 +185,7 @@ impl SensorPoints {
         }
     }
 
-    /// When the last point was measured of a packet that was through at `at`.
+    /// Returns the time at which the last point of a packet was measured that arrived completely at `at`.
     fn last_point_time(&self, at: Nanos, packet: &FirstPoint, exactness: PointAccuracy) -> Option<Nanos> {
         let (of, maximum) = (self.points.len(), at.saturating_sub(MAX_PACKET_TIME + packet.line_time));
         let lately = (0..of).rev().skip(packet.points - 1);
@@ -193,7 +195,12 @@ impl SensorPoints {
         Some(self.points[first + packet.points - 1].truth.at_ns)
     }
 
-    /// What is wrong with what is published, if it is a scan; it may be of packets that `waited` for a hub that stood still.
+    /// Checks a published sample. `was_backlogged` means that its packets may have been buffered while the hub was
+    /// stalled.
+    ///
+    /// # Errors
+    ///
+    /// Returns a description of the error.
     fn publish(
         &mut self,
         at: Nanos,
@@ -232,7 +239,8 @@ impl SensorPoints {
                 let before = self.beams.filter(|(of, ..)| *of == boot);
                 match before {
                     Some((_, before, _)) if before == beams => {}
-                    // While the port stays open, only after a scanner's points per revolution were others for so long.
+                    // While the port stays open, the number of beams changes only after the points per revolution have
+                    // been different for this time.
                     Some((_, before, since)) if at < since + MIN_BEAM_COUNT_TIME => {
                         return Err(format!("{beams} beams after {before}"));
                     }
@@ -247,7 +255,11 @@ impl SensorPoints {
         }
     }
 
-    /// What is wrong with `scan`, whose `header` says when its first beam was measured.
+    /// Checks `scan`, whose `header` has the time of its first beam.
+    ///
+    /// # Errors
+    ///
+    /// Returns a description of the error.
     fn check(
         &self,
         at: Nanos,
@@ -269,13 +281,14 @@ impl SensorPoints {
         };
         let is_crowded = self.queued_at.is_some_and(|crowded_at| at < crowded_at + DELAY_WINDOW);
         let settles = if self.exactness.has_clock { SETTLE_TIME } else { CLOCK_LEARNING_TIME };
-        // A hub that stands still learns nothing meanwhile.
+        // A stalled hub does not improve its estimate of the clock.
         let learned_at = if self.exactness.has_clock { Some(at) } else { self.last_prompt_at };
         let is_learned =
             |settled_at: Nanos| learned_at.is_some_and(|learned_at| settled_at + settles < learned_at);
         let is_settled = self.settled_at.is_some_and(is_learned) && !is_crowded;
         let (mut points, mut shift) = (found(0), 0);
-        // Of packets without a clock that waited it is seen later how many whole turns are missing in a gap between them.
+        // For backlogged packets without a timestamp, the number of revolutions that are missing in a gap is determined
+        // later.
         let is_open = was_backlogged && scan.is_incomplete() && !self.exactness.has_clock;
         if let Some(gap) = points.iter().position(Option::is_none).filter(|gap| is_open && *gap > 0)
             && self.is_from_later_revolution(
@@ -334,7 +347,7 @@ impl SensorPoints {
         let around = around.take_while(|turned| *turned < end_deg + MAX_REORDER_DEG);
         let measured = around.filter(|turned| (first_deg..end_deg).contains(turned)).count();
         let there = reported.len() + usize::from(scan.collisions);
-        // Those at the very edge may be of either turn.
+        // Points at the edge may belong to either revolution.
         if !scan.is_incomplete() && measured.abs_diff(there) > self.exactness.points {
             return Err(format!("{there} of {measured} points, and it is not marked"));
         }
@@ -354,7 +367,8 @@ impl SensorPoints {
             return;
         }
         if telegram.damage.is_none() {
-            // The line lost all packets between. Without a clock in the packets, the next ones have no time yet.
+            // The line lost all packets in this time. If packets have no timestamp, the next ones have no known time
+            // yet.
             if !self.exactness.has_clock && self.arrived_at + MAX_GAP < at {
                 self.restart();
             }
@@ -387,8 +401,8 @@ impl SensorPoints {
         }
     }
 
-    /// Whether `unit`, which is published, was sent. Single points without a checksum are so short that pieces of two often
-    /// are one that was sent before: they have to come in their order, too.
+    /// Returns whether the published `unit` was sent. Standard packets are so short that fragments of two often equal a
+    /// packet that was sent before. They must therefore be in order, too.
     fn was_sent(&mut self, unit: &[u8]) -> bool {
         let key = HistoryHash::hash_bytes(unit);
         if self.exactness.neighbors == 0 {
@@ -404,7 +418,7 @@ impl SensorPoints {
         is_last || ahead.is_some()
     }
 
-    /// Returns the measured point of `told` at its time plus `shift`, within `lenience`.
+    /// Returns the measured point that matches `reported` at its time plus `shift`, within `tolerance`.
     fn find(&self, reported: &ReportedPoint, shift: i64, tolerance: Nanos) -> Option<&Point> {
         let at_ns = reported.at_ns.saturating_add_signed(shift);
         let begin = self.points.partition_point(|point| point.truth.at_ns + tolerance < at_ns);
@@ -412,7 +426,8 @@ impl SensorPoints {
         near.into_iter().find(|point| point.matches(reported, &self.exactness))
     }
 
-    /// Whether all of `told` were measured one or several turns of `period` later than told, the same for all.
+    /// Returns whether all `reported` points were measured one or several revolutions later than reported, all by the
+    /// same time.
     fn is_from_later_revolution(
         &self,
         reported: &[ReportedPoint],
@@ -424,7 +439,7 @@ impl SensorPoints {
             && reported.iter().all(|reported| self.find(reported, shift, tolerance(reported)).is_some())
     }
 
-    /// Returns the number of points of `told` without a measurement within 5 cm.
+    /// Returns the number of `reported` points without a measurement within 5 cm.
     fn count_wrong(&self, reported: &[ReportedPoint], shift: i64) -> u64 {
         let exactness = PointAccuracy { angle_deg: 1.0, range_mm: 50.0, ..self.exactness };
         let is_wrong = |reported: &&ReportedPoint| {
@@ -437,8 +452,8 @@ impl SensorPoints {
         reported.iter().filter(is_wrong).count() as u64
     }
 
-    /// Returns the time by which most points were measured later than reported. Points repeat nearly from revolution
-    /// to revolution, so the revolution that fits best counts.
+    /// Returns the time by which most points were measured later than reported. Points repeat nearly from revolution to
+    /// revolution, so the revolution that fits best counts.
     fn best_shift(&self, reported: &[ReportedPoint]) -> i64 {
         let Some(first) = reported.iter().find(|reported| reported.range_mm.is_some()) else { return 0 };
         let fit = |reported: &mut dyn Iterator<Item = &ReportedPoint>, shift: i64| {
@@ -456,43 +471,44 @@ impl SensorPoints {
     }
 }
 
-/// A point may lie so far before one that was measured before it.
+/// Maximum angle by which a point may lie before one that was measured earlier.
 const MAX_REORDER_DEG: f64 = 40.0;
 /// Minimum time with the same number of beams while the port stays open.
 const MIN_BEAM_COUNT_TIME: Nanos = 10_000 * MILLIS;
-/// The first point of a packet was measured no longer before the last one.
+/// Maximum time between the first and the last point of a packet.
 const MAX_PACKET_TIME: Nanos = 60 * MILLIS;
-/// A stamp is off by no more; a later point by a tenth of the time since it more, while the head changes its speed.
+/// Maximum error of a stamp. While the speed of the head changes, a later point may be off by another tenth of the time
+/// since the stamp.
 const MAX_STAMP_ERROR: Nanos = 5 * MILLIS;
-/// A packet is on its way, or in the port, for no longer.
+/// Maximum time that a packet spends on the line and in the port if it is not delayed.
 const MAX_PROMPT_DELAY: Nanos = 15 * MILLIS;
-/// A clock is tied by so many packets without delay.
+/// Number of packets without delay after which the session has estimated the clock.
 const MIN_PROMPT_PACKETS: u32 = 10;
-/// Whoever knows that is right from so much later on.
+/// Time after that from which on stamps must be right.
 const SETTLE_TIME: Nanos = 10 * MILLIS;
-/// Where packets have no clock, it takes so long until it is known how the scanner's goes; after so long without a packet it
-/// may be another one.
+/// For packets without a timestamp, the time that the session needs to estimate the scanner's clock, and the time
+/// without a packet after which a different scanner may be connected.
 const CLOCK_LEARNING_TIME: Nanos = 1_500 * MILLIS;
 const MAX_GAP: Nanos = 300 * MILLIS;
-/// The least delays of so many seconds count.
+/// Time over which the session takes the smallest delay.
 const DELAY_WINDOW: Nanos = 9_000 * MILLIS;
-/// For so long after a packet that nobody sent turns may have points of it.
+/// Time after a foreign packet in which revolutions may contain its points.
 const FOREIGN_POINTS_TIME: Nanos = 2_000 * MILLIS;
-/// A hub that stood still has read all that waited within so long.
+/// Time in which a hub has read its backlog after a stall.
 const CATCH_UP_TIME: Nanos = 10 * MILLIS;
-/// Nobody switches a power off and on sooner.
+/// Minimum duration of a power cycle.
 const MIN_POWER_OFF: Nanos = 50 * MILLIS;
-/// What was measured is remembered for so long, and so many packets are.
+/// Time for which measured points are stored, and number of stored packets.
 const HISTORY_TIME: Nanos = 12_000 * MILLIS;
 const MAX_SENT: usize = 65_536;
-/// Time within which a measurement near a point makes it right.
+/// Maximum time between a point and a measurement that confirms it.
 const POINT_MATCH_NS: Nanos = 15 * MILLIS;
 
-/// A point that was measured.
+/// A measured point.
 #[derive(Clone, Copy, PartialEq)]
 struct Point {
     truth: TruePoint,
-    /// Degrees since the first one, turns and all.
+    /// Angle since the first point in degrees, including whole revolutions.
     rotated_deg: f64,
 }
 
@@ -504,7 +520,7 @@ struct ReportedPoint {
     range_mm: Option<u16>,
 }
 
-/// The beams of `scan` that were measured.
+/// Returns the measured beams of `scan`.
 fn reported_points(stamp: Nanos, scan: &Scan) -> Vec<ReportedPoint> {
     let beams = (0..scan.beams()).filter(|&i| scan.code(i) != Some(Code::NotMeasured));
     let reported = |i: usize| ReportedPoint {

@@ -1,4 +1,4 @@
-//! Judges of the hub's access to a scanner: its family, the rate of its port, and its EEPROM.
+//! Invariants on the hub's access to a scanner: its family, the rate of its port, and its EEPROM.
 
 use std::rc::Rc;
 
@@ -9,9 +9,9 @@ use crate::event::{Event, Telegram};
 use crate::family::{Family, is_ld_packet};
 use crate::topics::Sample;
 
-/// Judge: a sample has the family of its scanner. At a link without a family, samples have none until the scanner is found: the
-/// link publishes no telegram and no scan, and a status only while the hub searches or has no port. The hub sends no byte to an
-/// LDROBOT that streams undisturbed.
+/// Invariant: a sample has the family of its scanner. At a link without a family, samples have none until the scanner
+/// is found: the link publishes no telegram and no scan, and a status only while the hub searches or has no port. The
+/// hub sends no byte to an LDROBOT that streams undisturbed.
 pub(crate) struct Families(Vec<FamilyProgress>);
 
 struct FamilyProgress {
@@ -21,10 +21,10 @@ struct FamilyProgress {
     opened_at: Nanos,
     /// Time from which a scanner that was exchanged for one of another family must be found like any other.
     search_from: Nanos,
-    /// Time since which packets have been arriving without damage and without gaps, and of the last one.
+    /// Time since which packets have been arriving without damage and without gaps, and time of the last one.
     clean_since: Option<Nanos>,
     last_at: Nanos,
-    /// Place after the last packet.
+    /// Position after the last packet.
     sent_end: u64,
 }
 
@@ -76,7 +76,7 @@ impl FamilyProgress {
     /// Returns whether an LDROBOT has been streaming since the port was opened, or for longer than a search needs to
     /// notice.
     fn is_undisturbed(&self, at: Nanos) -> bool {
-        // A scanner of another family may be remembered, whose rates are tried first.
+        // The hub may have saved the other family, whose rates it then tries first.
         let is_known = self.families == [FamilyName::Ld];
         let is_old = |since: Nanos| {
             is_known && since <= self.opened_at || since.max(self.search_from) + SEARCH_ROUND < at
@@ -86,7 +86,7 @@ impl FamilyProgress {
 
     fn send(&mut self, at: Nanos, telegram: &Telegram<'_>) {
         let begin = std::mem::replace(&mut self.sent_end, telegram.span.1);
-        // The scanner and the line are intact: the port has another rate, or the hub does not read.
+        // The scanner and the line are intact: the port is at another rate, or the hub does not read.
         let is_harmless = |damage: &str| matches!(damage, "baud" | "unread" | "flushed");
         let is_clean = is_ld_packet(telegram.bytes)
             && telegram.damage.is_none_or(is_harmless)
@@ -95,7 +95,11 @@ impl FamilyProgress {
         self.clean_since = self.clean_since.filter(|_| is_next).or(Some(at)).filter(|_| is_clean);
     }
 
-    /// Returns what is wrong with the family of a sample.
+    /// Checks the family of a sample.
+    ///
+    /// # Errors
+    ///
+    /// Returns a description of the error.
     fn check(&self, Sample { topic, header, bytes, .. }: &Sample) -> Result<(), String> {
         let family = header.family();
         let may_be_unknown = match topic {
@@ -119,15 +123,15 @@ impl FamilyProgress {
     }
 }
 
-/// Time between two packets of a scanner that streams.
+/// Maximum time between two packets of a scanner that streams.
 const MAX_PACKET_GAP: Nanos = 50 * MILLIS;
 /// Duration of a round of the search, after which it notices that a scanner has begun to stream.
 const SEARCH_ROUND: Nanos = 4_000 * MILLIS;
-/// Time after which the search begins again because nothing of the scanner arrives.
+/// Time without data from the scanner after which the search starts again.
 const SEARCH_TIMEOUT: Nanos = 10_000 * MILLIS;
 
-/// Judge: a port that another process sets to another rate soon has the hub's rate again. The hub does not read bytes at the
-/// wrong rate for a whole second.
+/// Invariant: a port that another process sets to another rate soon has the hub's rate again. The hub does not read
+/// bytes at the wrong rate for a whole second.
 pub(crate) struct PortRate {
     sensors: Vec<PortState>,
 }
@@ -137,7 +141,7 @@ struct PortState {
     is_altered: bool,
     /// Time of the first read since the alteration, or since the last telegram.
     misread_since: Option<Nanos>,
-    /// The last read was too long after it.
+    /// Whether the last read was too long after that.
     is_overdue: bool,
 }
 
@@ -172,7 +176,7 @@ impl Invariant for PortRate {
                     reporter.report(format!("sensor {sensor}: the rate of another process stays"));
                     of.is_altered = false;
                 }
-                // The hub acts after the read, not before it.
+                // The hub sets the rate after the read, not before it.
                 of.is_overdue = at > *of.misread_since.get_or_insert(at) + MAX_MISREAD_TIME;
             }
             _ => {}
@@ -183,7 +187,7 @@ impl Invariant for PortRate {
 /// Time for which bytes may arrive at the wrong rate.
 const MAX_MISREAD_TIME: Nanos = 1_000 * MILLIS;
 
-/// Judge: no request of the hub writes the EEPROM of a scanner. It checks the end of the world.
+/// Invariant: no request of the hub writes the EEPROM of a scanner. It is checked at the end of the world.
 pub(crate) struct Eeprom;
 
 impl Invariant for Eeprom {

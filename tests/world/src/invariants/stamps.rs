@@ -1,4 +1,4 @@
-//! Judges of time: stamps of telegrams, and the delay until a subscriber wakes.
+//! Invariants on time: stamps of telegrams, and the delay until a subscriber wakes.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::rc::Rc;
@@ -11,9 +11,10 @@ use crate::family::Family;
 use crate::subscriber::SubscriberId;
 use crate::topics::Sample;
 
-/// Judge: the stamps of a scan's telegram are right, or the hub marks them as estimates. Without the mark, they are the times at
-/// which the first and last bytes of the telegram went into the port, even if the hub was held up. While nothing is wrong, no
-/// stamp of a streaming scanner is an estimate. Only families whose samples are single telegrams; `turns` checks the others.
+/// Invariant: the stamps of a scan's telegram are right, or the hub marks them as estimates. Without the mark, they are
+/// the times at which the first and last bytes of the telegram arrived at the port, even if the hub was stalled. While
+/// nothing is wrong, no stamp of a streaming scanner is an estimate. It applies to families whose samples are single
+/// telegrams; the invariant `turns` checks the others.
 pub(crate) struct Stamps {
     families: Vec<Rc<dyn Family>>,
     sensors: BTreeMap<usize, SensorStamps>,
@@ -104,14 +105,14 @@ impl SensorStamps {
         }
     }
 
-    /// Returns what is wrong with the stamps of a scan's telegram that is published, while nothing goes wrong if all `is_well`.
+    /// Returns the error of the stamps of a scan's telegram that is published. Nothing is wrong if `is_faultless`.
     fn publish(&mut self, header: &Header, bytes: &[u8], is_faultless: bool) -> Option<String> {
         if header.flags & Flags::STAMP_ESTIMATED != 0 {
             let is_new = self.consecutive_scans <= LEARNING_SCANS;
             return (is_faultless && !is_new)
                 .then(|| "a stamp is an estimate although nothing went wrong".to_owned());
         }
-        // It is marked as suspect: it follows damaged bytes, or took longer than usual.
+        // The telegram is marked as suspect: it follows damaged bytes, or took longer than usual.
         if header.reasons != 0 {
             return None;
         }
@@ -139,15 +140,15 @@ const MAX_STAMP_ERROR: Nanos = 5 * MILLIS;
 const MAX_DELAY: Nanos = 8 * MILLIS;
 /// Bytes that a USB adapter passes on at once, and after which a stamp is an estimate.
 const USB_CHUNK_LEN: usize = 64;
-/// Time after the last fault from which nothing is due to it any more.
+/// Time after the last fault from which on no effect of a fault is expected.
 const RECOVERY_TIME: Nanos = 3_000 * MILLIS;
-/// Scans of a stream after which the session knows its rhythm.
+/// Number of scans in a stream after which the session has estimated the scan period.
 const LEARNING_SCANS: usize = 8;
-/// Telegrams that are remembered: more than a port holds.
+/// Number of stored telegrams: more than a port buffers.
 const MAX_TELEGRAMS: usize = 256;
 
-/// Judge: the hub wakes a sleeping subscriber. A prompt subscriber has each sample of a telegram a moment after the telegram was
-/// sent, and a subscriber to zones need not wait for the marks of the same scan.
+/// Invariant: the hub wakes a sleeping subscriber. A prompt subscriber has each sample of a telegram shortly after the
+/// telegram was sent, and a subscriber to zones need not wait for the marks of the same scan.
 #[derive(Default)]
 pub(crate) struct Wakeups {
     /// Times at which prompt subscribers attached.

@@ -1,4 +1,5 @@
-//! Judge of subscribers that attach and leave at any time: each gets the next sample, and none is woken late or needlessly.
+//! Invariant on subscribers that attach and leave at any time: each one gets the next sample, and none is woken late or
+//! needlessly.
 
 use std::collections::BTreeMap;
 
@@ -9,9 +10,9 @@ use crate::event::Event;
 use crate::subscriber::SubscriberId;
 use crate::topics::Sample;
 
-/// Judge: a subscriber gets the samples of every scan that begins after it has attached (`docs/topics.md`). The doorbell rings
-/// once all samples of a ring are sent, before those of the next ring and the next telegram, and only if a sample of that ring has a subscriber. The event
-/// follows if one of its listeners has a sample.
+/// Invariant: a subscriber gets the samples of every scan that begins after it has attached (`docs/topics.md`). The hub
+/// rings a word of the doorbell once all samples of that word are sent, before those of the next word and the next
+/// telegram, and only if one of the samples has a subscriber. The event follows if one of its listeners has a sample.
 pub(crate) struct Subscribers {
     sensors: Vec<SensorSubscribers>,
     sensor_of_subscriber: BTreeMap<SubscriberId, usize>,
@@ -20,25 +21,25 @@ pub(crate) struct Subscribers {
 #[derive(Default)]
 struct SensorSubscribers {
     subscribers: BTreeMap<SubscriberId, AttachedSubscriber>,
-    /// Number of the last telegram, and of the last scan, of this hub.
+    /// The `seq` of the last telegram, and of the last scan, of this hub.
     last: Option<u64>,
     scan: Option<u64>,
-    /// For each topic, the number in its last sample.
+    /// For each topic, the `seq` of its last sample.
     published: BTreeMap<Topic, u64>,
     /// Topics that had no memory since the last scan.
     without_memory: Vec<Topic>,
-    /// For each ring, whether a sample has subscribers that were not woken since, and the telegram of the first one that has to
-    /// be rung before the next telegram.
+    /// For each word of the doorbell, whether a sample has subscribers that were not woken since, and the `seq` of the
+    /// first telegram for which the hub must ring before the next telegram.
     is_due: [bool; RING_COUNT],
     due: [Option<u64>; RING_COUNT],
-    /// The telegram whose samples have listeners that were not notified.
+    /// The `seq` of the telegram whose samples have listeners that were not notified.
     unnotified: Option<u64>,
 }
 
 struct AttachedSubscriber {
     topic: Topic,
     is_listener: bool,
-    /// The last telegram before the subscriber attached.
+    /// The `seq` of the last telegram before the subscriber attached.
     after: Option<u64>,
 }
 
@@ -56,7 +57,7 @@ impl Invariant for Subscribers {
 
     fn on_event(&mut self, _: u64, event: &Event<'_>, reporter: &mut ViolationReporter<'_>) {
         match *event {
-            // The numbers of a hub begin with 0.
+            // The sequence numbers of a hub start at 0.
             Event::HubStarted { .. } | Event::HubEnded { .. } => {
                 self.sensors.iter_mut().for_each(SensorSubscribers::forget_hub);
             }
@@ -102,11 +103,11 @@ impl SensorSubscribers {
         };
     }
 
-    /// Takes a sample, and returns what is wrong.
+    /// Handles a sample, and returns its errors.
     fn publish(&mut self, sample: &Sample) -> Vec<String> {
         let mut broken = Vec::new();
         let (topic, seq) = (sample.topic, sample.header.seq);
-        // A warning has the number of the telegram that is not complete yet.
+        // A warning has the `seq` of a telegram that is not complete yet.
         let is_next = topic == Topic::Early || self.last < Some(seq);
         if self.due[DoorbellWord::Early as usize].is_some() && topic != Topic::Early {
             broken.push(format!("{topic:?} of {seq} was sent while subscribers of a warning slept"));
@@ -131,7 +132,7 @@ impl SensorSubscribers {
                 broken.extend(self.missing_topics(&[Topic::Scan], Some(seq)));
                 self.without_memory.clear();
             }
-            // A scan that waited too long has no time of the hub, either.
+            // A backlogged scan has no hub time, either.
             self.scan = is_of_scan.then_some(seq);
         }
         self.published.insert(topic, seq);
@@ -153,7 +154,8 @@ impl SensorSubscribers {
         broken
     }
 
-    /// Returns those of `topics` that have no sample of `scan`, although one of their subscribers came before it.
+    /// Returns those of `topics` that have no sample of `scan`, although one of their subscribers had attached before
+    /// it.
     fn missing_topics(&self, topics: &[Topic], scan: Option<u64>) -> Vec<String> {
         let Some(scan) = scan else { return Vec::new() };
         let is_absent = |of: &&AttachedSubscriber| {

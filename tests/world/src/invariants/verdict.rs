@@ -1,4 +1,4 @@
-//! Judges of verdicts that robots accept, next to the hub and on another machine.
+//! Invariants on the verdicts that robots accept, next to the hub and on another machine.
 
 use scanhub_schema::datagram::DatagramPayload;
 use scanhub_schema::{MILLIS, Nanos, Topic, Verdict, Zones};
@@ -10,20 +10,21 @@ use crate::remote::LinkSettings;
 use crate::scenario::Scenario;
 use crate::setup::Setup;
 
-/// Judge: a robot never accepts a clear verdict for longer than promised while an object is inside a circle.
+/// Invariant: a robot does not accept a clear verdict for longer than documented while an object is inside a zone.
 ///
-/// The promise (`docs/topics.md`): a verdict is valid for two periods and 20 ms in the hub, for 20 ms more in a subscriber, and
-/// unknown after that. A scan shows the objects at the time of its measurement and is then on the line for a while. A circle is
-/// violated by a number of scans in a row, each of which may be as late as a verdict is valid in the hub.
+/// According to `docs/topics.md`, a verdict is valid for two periods and 20 ms in the hub, for 20 ms more in a
+/// subscriber, and unknown after that. A scan shows the objects at the time of its measurement and is then on the line
+/// for a while. A zone is violated by a number of consecutive scans, each of which may be as late as a verdict is valid
+/// in the hub.
 pub(crate) struct LocalVerdict {
     sensors: Vec<SensorVerdict>,
 }
 
 struct SensorVerdict {
-    /// When something is inside.
+    /// Times at which an object is inside a zone.
     object_spans: Vec<(Nanos, Nanos)>,
     max_delay: Nanos,
-    /// Since when it is believed that the way is clear, if it is.
+    /// Time since which the robot has accepted a clear verdict, if it does.
     clear_since: Option<Nanos>,
 }
 
@@ -74,32 +75,35 @@ impl SensorVerdict {
     }
 }
 
-/// For so long it may be believed that nothing is inside a circle of sensor `number`, although something is.
+/// Returns the maximum time for which a robot may accept a clear verdict of sensor `number` while an object is inside a
+/// zone.
 fn max_clear_time(setup: &Setup, number: usize) -> Nanos {
     let (period, told_after) = setup.sensors[number].scan_times();
     let in_hub = 2 * period + STALENESS_MARGIN;
     told_after + setup.min_scans * in_hub + STALENESS_MARGIN + TIMER_DELAY
 }
 
-/// What is added to the two periods in the hub, and once more with a consumer.
+/// Margin after two periods in the hub, and once more in a subscriber.
 const STALENESS_MARGIN: Nanos = 20 * MILLIS;
-/// Threads and timers are late by no more than this, all together.
+/// Maximum delay of all threads and timers together.
 const TIMER_DELAY: Nanos = 3 * MILLIS;
 
-/// Judge: a remote robot never accepts a clear verdict for longer than promised while an object is inside a circle.
+/// Invariant: a remote robot does not accept a clear verdict for longer than documented while an object is inside a
+/// zone.
 ///
-/// The promise has two halves. A gateway is a subscriber of the hub like a robot, so it sends no clear zones for longer than a
-/// robot next to the hub accepts them. From its arrival on (`docs/topics.md`: the delay on the network is unknown), a verdict is
-/// valid for two periods as sent and 40 ms, at least half a second and at most 5.04 s, and unknown after that.
+/// The maximum time has two parts. A gateway is a subscriber of the hub like a robot, so it sends clear zones for no
+/// longer than a robot next to the hub accepts them. From its arrival on (`docs/topics.md`: the delay on the network is
+/// unknown), a verdict is valid for two periods as sent and 40 ms, at least half a second and at most 5.04 s, and
+/// unknown after that.
 pub(crate) struct RemoteVerdict {
     begin_ns: u64,
     sensors: Vec<RemoteSensor>,
 }
 
 struct RemoteSensor {
-    /// When something is inside.
+    /// Times at which an object is inside a zone.
     object_spans: Vec<(Nanos, Nanos)>,
-    /// Time for which a robot next to the hub may accept another verdict.
+    /// Maximum time for which a robot next to the hub may accept another verdict.
     max_delay: Nanos,
     /// Time until which the last published verdict is valid.
     valid_until: Nanos,
@@ -110,7 +114,7 @@ impl RemoteVerdict {
     pub(crate) fn new(setup: &Setup, scenario: &Scenario, terms: &LinkSettings) -> RemoteVerdict {
         let sensor = |number: usize| {
             let object_spans = objects_inside(scenario, number, setup.sensors.len());
-            // In a bridge the newest of those that go out waits until the next one comes.
+            // In a bridge, the newest sample may wait until the next one arrives.
             let (period, _) = setup.sensors[number].scan_times();
             let waits = if terms.are_bridges { terms.send_interval.get() * period } else { 0 };
             let max_delay = max_clear_time(setup, number) + waits;
