@@ -95,7 +95,7 @@ pub(crate) enum Event<'a> {
     WorldEnded { eeprom_writes: u64, handles: usize, loans: usize, held: usize },
 }
 
-/// How a listener handles a message.
+/// Result of a message that a listener took.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum DatagramOutcome {
     /// The listener refuses the datagram.

@@ -1,5 +1,5 @@
-//! Runs worlds: `cargo run --release -p scanhub-world -- --seeds 0..200`. A violation is printed with its seed and with
-//! the shortest list of actions that still shows it.
+//! Command-line program that runs worlds: `cargo run --release -p scanhub-world -- --seeds 0..200`. It prints a
+//! violation with its seed and the shortest list of actions that still causes it.
 
 use std::io::{IsTerminal, Write};
 use std::process::{Command, ExitCode};
@@ -57,7 +57,7 @@ fn main() -> ExitCode {
     let arguments = Arguments::parse();
     let is_over = Arc::new(AtomicBool::new(false));
     for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-        // Without it the first signal ends the program.
+        // A second signal ends the program at once.
         let _ = signal_hook::flag::register_conditional_shutdown(signal, 130, is_over.clone());
         let _ = signal_hook::flag::register(signal, is_over.clone());
     }
@@ -116,7 +116,7 @@ fn scenarios(arguments: &Arguments) -> Result<Vec<Scenario>, String> {
     })
 }
 
-/// Says what failed, and the shortest plan that still does.
+/// Prints the violations, and the shortest scenario that still causes the first one.
 fn report(scenario: &Scenario, outcome: &Outcome, is_same: bool, is_long: bool) {
     println!("SEED={}{} COMMIT={}", scenario.seed, if scenario.is_auto { " --auto" } else { "" }, commit());
     if !is_same {
@@ -152,7 +152,7 @@ fn print_totals(totals: &Totals, took_s: f64, is_json: bool) {
     }
 }
 
-/// Descriptors that this process has open.
+/// Returns the number of open file descriptors of this process.
 fn descriptors() -> usize {
     std::fs::read_dir("/proc/self/fd").map_or(0, Iterator::count)
 }

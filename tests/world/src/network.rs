@@ -1,42 +1,42 @@
-//! A network in virtual time that loses, doubles, damages, delays and reorders datagrams, and is cut at times: all by a seed.
-//! Refuses to know what a datagram says.
+//! A network in virtual time that loses, duplicates, damages, delays and reorders datagrams, and has partitions. A seed
+//! determines all faults.
 
 use std::collections::BTreeMap;
 
 use fastrand::Rng;
 
-/// Nanoseconds since the begin of the run.
+/// Nanoseconds since the start of the run.
 pub(crate) type Nanos = u64;
 
-/// What goes wrong, and how often.
+/// Faults of a network. Rates are shares of all datagrams, from 0 to 1.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Faults {
-    /// Of all datagrams so many are lost, from 0 to 1.
+    /// Rate of lost datagrams.
     pub(crate) loss: f64,
-    /// So many come twice.
+    /// Rate of datagrams that arrive twice.
     pub(crate) duplicate: f64,
-    /// So many come with one to three other bits.
+    /// Rate of datagrams in which one to three bits are flipped.
     pub(crate) damage: f64,
-    /// The shortest way.
+    /// Minimum delay.
     pub(crate) delay_ns: Nanos,
-    /// What the way takes longer at most, each datagram by itself: they overtake each other.
+    /// Maximum additional delay. It is drawn for each datagram, so datagrams overtake each other.
     pub(crate) jitter_ns: Nanos,
-    /// Nothing passes for this long at most, each few seconds; 0: never.
+    /// Maximum duration of the partitions, which start every few seconds. With 0 there are none.
     pub(crate) partition_ns: Nanos,
 }
 
-/// The datagrams on their way.
+/// The datagrams that are on their way.
 pub(crate) struct Network {
     rng: Rng,
     faults: Faults,
-    /// By the time at which they come, and by a number.
+    /// Datagrams by time of arrival and a number that makes the key unique.
     queue: BTreeMap<(Nanos, u64), Vec<u8>>,
     number: u64,
-    /// When it is cut the next time, or was, and until when.
+    /// Start and end of the current or next partition.
     partition: (Nanos, Nanos),
 }
 
-/// Between two partitions, at most.
+/// Maximum time between two partitions.
 const MAX_PARTITION_INTERVAL_NS: Nanos = 6_000_000_000;
 
 impl Network {
@@ -52,13 +52,13 @@ impl Network {
         network
     }
 
-    /// From now on the faults are these.
+    /// Replaces the faults at `now`.
     pub(crate) fn set_faults(&mut self, faults: Faults, now: Nanos) {
         self.faults = faults;
         self.partition = self.next_partition(now);
     }
 
-    /// Takes a datagram at `now`.
+    /// Accepts a datagram at `now`.
     pub(crate) fn send(&mut self, now: Nanos, bytes: &[u8]) {
         while now >= self.partition.1 {
             self.partition = self.next_partition(self.partition.1);
@@ -78,12 +78,12 @@ impl Network {
         }
     }
 
-    /// Returns a datagram that came until `now`, the earliest one.
+    /// Returns the earliest datagram that has arrived by `now`.
     pub(crate) fn poll(&mut self, now: Nanos) -> Option<Vec<u8>> {
         self.queue.first_entry().filter(|first| first.key().0 <= now).map(|first| first.remove())
     }
 
-    /// Returns when the next datagram comes.
+    /// Returns the time at which the next datagram arrives.
     pub(crate) fn next_delivery(&self) -> Option<Nanos> {
         self.queue.first_key_value().map(|((at, _), _)| *at)
     }

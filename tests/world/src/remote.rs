@@ -1,5 +1,5 @@
-//! The other machine, which receives the topics of the hub: a gateway, a network, a listener that publishes, and a robot. Each
-//! of them starts and ends by itself.
+//! The other machine of a world, which receives the topics of the hub: a gateway, a network, a listener that publishes,
+//! and a robot. Each of them starts and ends independently.
 
 mod forger;
 mod gateway;
@@ -32,28 +32,28 @@ use router::Router;
 pub(crate) use router::{MAX_DRAIN_TIME, RECONNECT_INTERVAL};
 use topics::TopicMemory;
 
-/// How gateway, network and listener are, as the seed has it.
+/// Settings of gateway, network and listener, drawn from the seed.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct LinkSettings {
-    /// Of what comes with each scan every so many go out.
+    /// Interval at which samples that follow from a scan are sent, in samples.
     pub(crate) send_interval: NonZeroU64,
-    /// Telegrams go out too.
+    /// Whether telegrams are sent, too.
     sends_telegrams: bool,
-    /// The longest datagram, in bytes.
+    /// Maximum length of a datagram, in bytes.
     max_datagram_len: usize,
-    /// Between two times that a background goes out.
+    /// Interval at which the background is sent again.
     background_interval: Option<Duration>,
-    /// The shortest way.
+    /// Minimum delay of the network.
     pub(crate) delay_ns: Nanos,
-    /// The clocks of the machine that listens, when a world begins.
+    /// Clocks of the listener's machine when the world begins.
     pub(crate) initial_clocks: WallTimestamp,
-    /// Gateway and listener have a key.
+    /// Whether gateway and listener have a key.
     pub(crate) has_key: bool,
-    /// Gateway and listener are bridges, and a router is between them.
+    /// Whether gateway and listener are bridges, with a router between them.
     pub(crate) are_bridges: bool,
     /// Topics that the gateway does not send.
     without_subscribers: [bool; Topic::ALL.len()],
-    /// With a key: so much the wall clock of the listener's machine is ahead of the hub's, in ns.
+    /// With a key: time by which the wall clock of the listener's machine is ahead of the hub's, in nanoseconds.
     clock_offset_ns: i64,
 }
 
@@ -83,7 +83,7 @@ impl LinkSettings {
         }
     }
 
-    /// Every how manieth sample of `topic` goes out, if any do.
+    /// Returns the interval at which samples of `topic` are sent, in samples, or `None` if the gateway does not send them.
     pub(crate) fn send_interval(&self, topic: Topic) -> Option<NonZeroU64> {
         match topic {
             Topic::Telegram if !self.sends_telegrams => None,
@@ -93,41 +93,41 @@ impl LinkSettings {
         }
     }
 
-    /// A moment on the clocks of the machine that listens.
+    /// Returns the clocks of the listener's machine at `now`.
     fn stamp(&self, now: Nanos) -> WallTimestamp {
         let WallTimestamp { monotonic_ns, wall_ns } = self.initial_clocks;
         WallTimestamp { monotonic_ns: monotonic_ns + now, wall_ns: wall_ns + now }
     }
 
-    /// The key, if there is one.
+    /// Returns the key of gateway and listener, or `None` if they have none.
     fn key(&self) -> Option<Key> {
         self.has_key.then(|| Key::new(&[7; Key::LEN]))
     }
 
-    /// That machine is never suspended.
+    /// Returns the timestamp of the listener's machine at `now`. The machine is never suspended.
     fn moment(&self, now: Nanos) -> Timestamp {
         let WallTimestamp { monotonic_ns, .. } = self.stamp(now);
         Timestamp { monotonic_ns, boottime_ns: monotonic_ns }
     }
 }
 
-/// Everything from the gateway on.
+/// Everything after the hub: gateway, network or router, listener and robot.
 pub(crate) struct RemoteMachines {
     terms: LinkSettings,
     sensors: usize,
     gateway: Option<Gateway>,
-    /// How many there were.
+    /// Number of gateways that have been started.
     gateways: u32,
-    /// The gateway's process does not run until then, and the listener's.
+    /// Times until which the process of the gateway and that of the listener are stalled.
     gateway_stalled_until: Nanos,
     listener_stalled_until: Nanos,
     network: Network,
-    /// Instead of a network, if they are bridges.
+    /// Router between the bridges, which replaces the network.
     router: Option<Router>,
     faults: Faults,
-    /// So many partitions last.
+    /// Number of partitions that are active.
     active_partitions: usize,
-    /// The sockets of the gateway take so many datagrams of what is sent less, from 0 to 1.
+    /// Rate of datagrams that the gateway's sockets refuse, from 0 to 1.
     pub(crate) refusal_rate: f64,
     random: fastrand::Rng,
     listener: Option<Listener>,
@@ -135,9 +135,9 @@ pub(crate) struct RemoteMachines {
     memory: TopicMemory,
     robot: RemoteRobot,
     forger: Forger,
-    /// So much more the wall clocks are apart now, in ns.
+    /// Additional difference of the wall clocks at present, in nanoseconds.
     extra_clock_offset_ns: i64,
-    /// The greatest epochs, as listeners keep them.
+    /// Highest epoch of each hub, as saved by the listeners.
     epochs: HashMap<u64, u32>,
 }
 
@@ -169,7 +169,7 @@ impl RemoteMachines {
         }
     }
 
-    /// A gateway begins, if there is none.
+    /// Starts a gateway, if none is running.
     pub(crate) fn begin_gateway(&mut self, shared: &SharedState) {
         if self.gateway.is_none() {
             self.gateways += 1;
@@ -177,7 +177,7 @@ impl RemoteMachines {
         }
     }
 
-    /// The gateway is killed, or ends in order: then it has a last word.
+    /// Kills the gateway, or ends it in order. In that case it sends a final announcement.
     pub(crate) fn end_gateway(&mut self, shared: &SharedState, is_killed: bool) {
         let Some(mut gateway) = self.gateway.take() else { return };
         let now = shared.clock.get();
@@ -188,7 +188,7 @@ impl RemoteMachines {
         gateway.detach(shared, is_killed, false);
     }
 
-    /// A listener begins, if there is none.
+    /// Starts a listener, if none is running.
     pub(crate) fn begin_listener(&mut self, shared: &SharedState) {
         if self.listener.is_none() {
             self.listeners += 1;
@@ -198,31 +198,31 @@ impl RemoteMachines {
         }
     }
 
-    /// The listener is killed: what waits in its sockets is lost.
+    /// Kills the listener. Datagrams that wait in its sockets are lost.
     pub(crate) fn kill_listener(&mut self, shared: &SharedState) {
         if let Some(listener) = self.listener.take() {
             listener.end(shared, shared.clock.get());
         }
     }
 
-    /// The process of the gateway, or of the listener, does not run until then.
+    /// Stops the process of the gateway or of the listener until `until`.
     pub(crate) fn stall(&mut self, is_listener: bool, until: Nanos) {
         let RemoteMachines { gateway_stalled_until, listener_stalled_until, .. } = self;
         let stalled = if is_listener { listener_stalled_until } else { gateway_stalled_until };
         *stalled = until.max(*stalled);
     }
 
-    /// All processes run.
+    /// Ends all stalls.
     pub(crate) fn clear_faults(&mut self) {
         (self.gateway_stalled_until, self.listener_stalled_until) = (0, 0);
     }
 
-    /// The wall clock of the listener's machine is so much further ahead, in ns.
+    /// Sets the time by which the wall clock of the listener's machine is further ahead, in nanoseconds.
     pub(crate) fn set_extra_clock_offset(&mut self, offset_ns: i64) {
         self.extra_clock_offset_ns = offset_ns;
     }
 
-    /// Somebody sends so many datagrams of this kind.
+    /// Sends `count` datagrams of this kind from a machine without the key.
     pub(crate) fn forge(&mut self, shared: &SharedState, forgery: Forgery, count: usize) {
         let now = shared.clock.get();
         for bytes in self.forger.forge(forgery, count, self.wall_ns(shared, now)) {
@@ -231,20 +231,20 @@ impl RemoteMachines {
         }
     }
 
-    /// The wall clock of the listener's machine at `now`, with a key: as far from the hub's as clocks are that are set by the
-    /// same server, but for what goes wrong.
+    /// Returns the wall clock of the listener's machine at `now`, for a world with a key. It differs from the hub's as
+    /// clocks do that are set by the same server, apart from an injected offset.
     fn wall_ns(&self, shared: &SharedState, now: Nanos) -> Nanos {
         (now + shared.wall_offset.get())
             .saturating_add_signed(self.terms.clock_offset_ns + self.extra_clock_offset_ns)
     }
 
-    /// The network has these faults from now on, besides its delay.
+    /// Replaces the faults of the network. Its minimum delay remains.
     pub(crate) fn set_faults(&mut self, faults: Faults, now: Nanos) {
         self.faults = Faults { delay_ns: self.terms.delay_ns + faults.delay_ns, ..faults };
         self.apply_network_faults(now);
     }
 
-    /// One partition more begins, or one ends.
+    /// Starts or ends one partition.
     pub(crate) fn change_partitions(&mut self, begins: bool, now: Nanos) {
         self.active_partitions =
             if begins { self.active_partitions + 1 } else { self.active_partitions.saturating_sub(1) };
@@ -260,7 +260,7 @@ impl RemoteMachines {
         self.network.set_faults(Faults { loss, ..self.faults }, now);
     }
 
-    /// The router is killed, with what it holds.
+    /// Kills the router, with everything that it holds.
     pub(crate) fn kill_router(&mut self, now: Nanos) {
         match &mut self.router {
             Some(router) => router.kill(now),
@@ -268,7 +268,7 @@ impl RemoteMachines {
         }
     }
 
-    /// And another one is there.
+    /// Starts another router.
     pub(crate) fn begin_router(&mut self, shared: &SharedState) {
         let now = shared.clock.get();
         match &mut self.router {
@@ -277,7 +277,7 @@ impl RemoteMachines {
         }
     }
 
-    /// What waits in a bridge goes to its router, as far as there is room.
+    /// Passes the queue of a bridge to the router, as long as the router has room.
     fn hand_over(&mut self, shared: &SharedState, gateway: &mut Gateway, now: Nanos) {
         while let Some(router) = self.router.as_mut().filter(|router| router.next_room_at() <= now) {
             let is_taken = self.refusal_rate <= 0.0 || self.random.f64() >= self.refusal_rate;
@@ -288,14 +288,14 @@ impl RemoteMachines {
         }
     }
 
-    /// The hub woke the consumers of a sensor at `at`.
+    /// Wakes the gateway. The hub has woken the subscribers of a sensor at `at`.
     pub(crate) fn wake(&mut self, at: Nanos) {
         if let Some(gateway) = &mut self.gateway {
             gateway.wake(at);
         }
     }
 
-    /// When something is due.
+    /// Returns the time at which the next thing happens.
     pub(crate) fn next_ns(&self, now: Nanos) -> Nanos {
         let room_at = self.router.as_ref().map_or(Nanos::MAX, Router::next_room_at);
         let gateway = self.gateway.as_ref().map(|gateway| {
@@ -313,7 +313,7 @@ impl RemoteMachines {
         all.fold(self.robot.next_ns(&self.terms, now), Nanos::min)
     }
 
-    /// Does what is due at `now`.
+    /// Runs gateway, network, listener and robot at `now`.
     pub(crate) fn run_due(&mut self, shared: &SharedState, now: Nanos) {
         if now >= self.gateway_stalled_until
             && let Some(mut gateway) = self.gateway.take()
@@ -328,7 +328,7 @@ impl RemoteMachines {
         self.robot.run(shared, &self.terms, &self.memory, now);
     }
 
-    /// What came until `now` is the listener's.
+    /// Passes the datagrams that have arrived by `now` to the listener.
     fn deliver(&mut self, shared: &SharedState, now: Nanos) {
         let wall_ns = self.wall_ns(shared, now);
         while let Some(bytes) =
@@ -349,7 +349,7 @@ impl RemoteMachines {
         }
     }
 
-    /// Takes all that waits and that is on its way, and ends.
+    /// Delivers everything that is queued or on its way, and ends all processes.
     pub(crate) fn close(&mut self, shared: &SharedState) {
         let mut now = shared.clock.get();
         if let Some(mut gateway) = self.gateway.take() {
@@ -388,7 +388,7 @@ impl RemoteMachines {
     }
 }
 
-/// From a datagram or a ring to a process that runs.
+/// Time from a datagram or a ring to a running process.
 const WAKE_DELAY: Nanos = 60 * MICROS;
-/// A listener sleeps no longer than so.
+/// Maximum interval between the checks of a listener.
 const MAX_SLEEP: Nanos = 100 * MILLIS;

@@ -1,4 +1,4 @@
-//! Many worlds, each in one thread, as many at a time as there are threads. Refuses to know what is printed.
+//! Runner of many worlds. Each world runs in one thread, and several run at the same time.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc;
@@ -11,34 +11,34 @@ use crate::event::Detail;
 use crate::scenario::Scenario;
 use crate::world::{Outcome, run};
 
-/// What is to be run.
+/// Worlds to run.
 #[derive(Clone, Debug)]
 pub struct Runner {
-    /// The plans.
+    /// Scenarios of the worlds.
     pub scenarios: Vec<Scenario>,
-    /// So many of the first are run twice, and must have the same hash.
+    /// Number of worlds, from the first one, that are run twice and must have the same hash both times.
     pub run_twice: usize,
-    /// Worlds at a time.
+    /// Number of worlds that run at the same time.
     pub threads: usize,
 }
 
-/// What came of all.
+/// Sums over all worlds.
 #[derive(Clone, Debug, Default)]
 pub struct Totals {
-    /// Worlds that were run, those that were run twice once.
+    /// Number of worlds. A world that was run twice counts once.
     pub worlds: usize,
-    /// Virtual seconds, times sensors.
+    /// Virtual seconds times sensors.
     pub sensor_seconds: u64,
-    /// Samples that hubs published.
+    /// Number of samples that hubs published.
     pub samples: u64,
-    /// Time that threads had a core.
+    /// CPU time of all threads.
     pub busy: Duration,
-    /// Plans that ended in violations, or differently the second time.
+    /// Scenarios that ended with violations, or with another hash the second time. The flag is false in that case.
     pub failed: Vec<(Scenario, Outcome, bool)>,
 }
 
 impl Runner {
-    /// Runs all until `is_over`; tells `progress` after each.
+    /// Runs all worlds until `is_over`. Calls `progress` after each one.
     pub fn run(&self, is_over: &AtomicBool, mut progress: impl FnMut(&Totals)) -> Totals {
         let next = AtomicU64::new(0);
         let mut totals = Totals::default();
@@ -54,7 +54,7 @@ impl Runner {
                         let outcome = run(scenario, Detail::Nothing);
                         let is_same =
                             at >= self.run_twice || run(scenario, Detail::Nothing).hash == outcome.hash;
-                        // Nobody hears it who has ended.
+                        // Sending fails only if the receiver has panicked.
                         let _ =
                             sender.send((at, outcome, is_same, thread_cpu_time().saturating_sub(started)));
                     }
@@ -78,7 +78,7 @@ impl Runner {
     }
 }
 
-/// How long this thread has had a core: others may want it, too.
+/// Returns the CPU time of this thread, which does not depend on the load of the machine.
 fn thread_cpu_time() -> Duration {
     let time = clock_gettime(ClockId::ThreadCPUTime);
     Duration::new(time.tv_sec.unsigned_abs(), time.tv_nsec as u32)

@@ -1,5 +1,6 @@
-//! The plan of a world as data: a seed, a duration, and a list of timed actions. The seed draws the list, which can be printed,
-//! parsed and shortened, so that a failure can be repeated with fewer actions. `actions` defines their effects.
+//! The scenario of a world as data: a seed, a duration, and a list of timed actions. The list is drawn from the seed.
+//! It can be printed, parsed and shortened, so that a failure can be repeated with fewer actions. `actions` defines
+//! their effects.
 
 use std::fmt;
 use std::str::FromStr;
@@ -10,41 +11,42 @@ use scanhub_sim::fault::Faults;
 use crate::actions::{self, ACTION_KINDS, ActionKind};
 use crate::family;
 
-/// What shall happen. Everything else (how many sensors, their rates, the consumers) follows from the seed.
+/// The actions of a world. Everything else follows from the seed: the number of sensors, their rates, the subscribers.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scenario {
-    /// Of all random numbers.
+    /// Seed of all random numbers.
     pub seed: u64,
-    /// How long it lasts, in virtual seconds.
+    /// Duration, in virtual seconds.
     pub seconds: u64,
-    /// The only sensor, by its model, of some its mode and what it does at first; else the seed draws one or two.
+    /// Model of the only sensor, for some models with its mode and its state at the start. Without it, one or two
+    /// sensors are drawn.
     pub model: Option<String>,
-    /// Whether half of the links have no family, and the hub searches for their scanners. The link of the only sensor
-    /// has none.
+    /// Whether half of the links have no family, so that the hub searches for their scanners. The link of an only
+    /// sensor has none.
     pub is_auto: bool,
-    /// In the order of time.
+    /// Actions in order of time.
     pub actions: Vec<Action>,
 }
 
-/// Something that happens at a time.
+/// An action at its time.
 #[derive(Clone, Debug)]
 pub struct Action {
-    /// When, in milliseconds since the beginning.
+    /// Time, in milliseconds since the start of the world.
     pub at_ms: u64,
     pub(crate) kind: &'static ActionKind,
-    /// A value for each key of the kind.
+    /// Values, one for each key of the kind.
     pub(crate) values: Vec<u64>,
 }
 
 impl Scenario {
-    /// What `seed` draws for `seconds`: of the kinds of action about half (swarm testing: many faults hide each other),
-    /// each of the others some times, and nothing in the last eight seconds.
+    /// Draws a scenario of `seconds` seconds. It has about half of the kinds of actions (swarm testing, because many
+    /// faults hide each other), each of them one or more times, and no actions in the last 12 seconds.
     pub fn from_seed(seed: u64, seconds: u64) -> Scenario {
         let mut random = fastrand::Rng::with_seed(seed ^ 0x5EED_0F1A_C710_0000);
         let end_ms = (seconds * 1_000).saturating_sub(RECOVERY_TIME / MILLIS);
         let mut actions = Vec::new();
         for kind in ACTION_KINDS {
-            // Drawn for each kind, so that a new kind changes little of what the old ones do.
+            // Each kind has its own random numbers, so that a new kind hardly changes the actions of the others.
             let mut random = random.fork();
             if random.bool() || end_ms <= START_DELAY_MS {
                 continue;
@@ -59,35 +61,37 @@ impl Scenario {
         Scenario { seed, seconds, model: None, is_auto: false, actions }
     }
 
-    /// Returns the plan of [`of_seed`](Scenario::from_seed) for a world in which half of the links have no family.
+    /// Returns the scenario of [`from_seed`](Scenario::from_seed) for a world in which half of the links have no
+    /// family.
     pub fn auto_from_seed(seed: u64, seconds: u64) -> Scenario {
         Scenario { is_auto: true, ..Scenario::from_seed(seed, seconds) }
     }
 
-    /// When everything is made well again: what is to be seen then has eight seconds.
+    /// Returns the time at which all faults are cleared, 12 seconds before the end. The effects that must follow have
+    /// this time to show.
     pub fn faults_clear_at(&self) -> Nanos {
         (self.seconds * 1_000 * MILLIS).saturating_sub(RECOVERY_TIME)
     }
 }
 
-/// Without actions at the end, in which everything has to come back.
+/// Time without actions at the end of a world, in which everything has to recover.
 pub(crate) const RECOVERY_TIME: Nanos = 12_000 * MILLIS;
-/// Nothing happens in the first moment: a hub has to be there first.
+/// Time without actions at the start of a world, in which the hub starts.
 const START_DELAY_MS: u64 = 200;
 
 impl Action {
-    /// The value of the key called `name`.
+    /// Returns the value of the key `name`.
     pub fn value(&self, name: &str) -> u64 {
         let at = self.kind.keys.iter().position(|key| key.name == name);
         at.and_then(|at| self.values.get(at)).copied().unwrap_or_default()
     }
 
-    /// What it does to the bytes on a line from `now` on, if it is of such a kind.
+    /// Returns the line faults of the action if it starts at `now`, or `None` if it does not affect bytes.
     pub fn faults(&self, now: Nanos) -> Option<Faults> {
         actions::faults(self, now)
     }
 
-    /// The name of its kind.
+    /// Returns the name of its kind.
     pub fn name(&self) -> &'static str {
         self.kind.name
     }
@@ -129,7 +133,7 @@ impl FromStr for Action {
 }
 
 impl fmt::Display for Scenario {
-    /// A line for the seed, and one for each action.
+    /// Writes a line with the seed, and one line for each action.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "seed {} seconds {}", self.seed, self.seconds)?;
         self.model.iter().try_for_each(|model| write!(f, " {model}"))?;
@@ -172,11 +176,11 @@ impl FromStr for Scenario {
     }
 }
 
-/// Returns the plans that once ended in a violation, each with its reason. They must stay without a violation.
+/// Returns the scenarios that once ended in a violation, each with its reason. They must stay without a violation.
 ///
 /// # Panics
 ///
-/// If the file is not a valid corpus.
+/// Panics if the file is not a valid corpus.
 pub fn corpus() -> Vec<(String, Scenario)> {
     let scenarios = CORPUS_TEXT.split("\n\n").filter(|text| text.lines().any(|line| !line.starts_with('#')));
     let parse = |text: &str| {
@@ -189,11 +193,11 @@ pub fn corpus() -> Vec<(String, Scenario)> {
     scenarios.map(parse).collect()
 }
 
-/// Plans as text with an empty line between two. Lines before each plan give its reason.
+/// Scenarios as text, separated by empty lines. The lines before each scenario give its reason.
 const CORPUS_TEXT: &str = include_str!("corpus.txt");
 
-/// Returns the shortest plan found for which `judge` names the same judge as for `plan`. The search leaves out halves of the
-/// actions as long as the same judge reports a violation, then quarters, down to single actions.
+/// Returns the shortest scenario found for which `check` returns the same invariant as for `scenario`. The search
+/// removes halves of the actions as long as the result stays the same, then quarters, down to single actions.
 pub fn shrink(scenario: &Scenario, mut check: impl FnMut(&Scenario) -> Option<&'static str>) -> Scenario {
     let Some(expected) = check(scenario) else { return scenario.clone() };
     let mut best = scenario.clone();

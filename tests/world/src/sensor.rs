@@ -1,5 +1,5 @@
-//! A simulated sensor and the line to a port, in the order of time: what a host writes goes in, what arrives comes out. Refuses
-//! to know what a port does with it.
+//! A simulated scanner and the line between it and a port. Bytes of the host and of the scanner are delivered in order
+//! of time.
 
 use std::collections::VecDeque;
 
@@ -12,27 +12,27 @@ use scanhub_sim::line_model::{Delivery, LineModel};
 use crate::family::{Scanner, ScannerFault};
 use crate::scenario::Action;
 
-/// A sensor at the end of its line.
+/// A scanner at the end of its line.
 pub(crate) struct Sensor {
     scanner: Box<dyn Scanner>,
     line: LineModel,
-    /// Bytes of the host on their way: when they are through, and their rate.
+    /// Bytes of the host on their way to the scanner: time of arrival, value and baud rate.
     outgoing: VecDeque<(Nanos, u8, u32)>,
     now: Nanos,
-    /// Requests to write the EEPROM that sensors heard which are not there any more.
+    /// EEPROM writes that were received by scanners that have been exchanged since.
     eeprom_writes: u64,
 }
 
-/// What happens at a sensor and its line.
+/// An event at a scanner or its line.
 pub(crate) enum SensorEvent {
-    /// Bytes come out of the line.
+    /// The line delivers bytes.
     Arrived(Delivery),
     /// The scanner measured these points.
     Measured(Vec<TruePoint>),
 }
 
 impl Sensor {
-    /// `scanner`, and a line without faults.
+    /// Creates a sensor with `scanner` and a line without faults.
     pub(crate) fn new(scanner: Box<dyn Scanner>) -> Sensor {
         Sensor {
             scanner,
@@ -43,13 +43,14 @@ impl Sensor {
         }
     }
 
-    /// When something may come next.
+    /// Returns the time of the next possible event.
     pub(crate) fn next_ns(&self) -> Option<Nanos> {
         let received_at = self.outgoing.front().map(|(at, ..)| *at);
         self.line.poll_timeout(self.scanner.device(), self.now).into_iter().chain(received_at).min()
     }
 
-    /// Lets the time be `to`, unless it is later already; what arrives or is measured meanwhile goes to `draw`.
+    /// Advances the time to `to`, unless it is later already. Passes bytes that arrive and points that are measured
+    /// until then to `on_event`.
     pub(crate) fn advance(&mut self, to: Nanos, mut on_event: impl FnMut(Nanos, SensorEvent)) {
         while let Some(at) = self.next_ns().filter(|&at| at <= to) {
             self.now = self.now.max(at);
@@ -65,7 +66,7 @@ impl Sensor {
             while self.outgoing.front().is_some_and(|(at, ..)| *at <= self.now)
                 && let Some((at, byte, rate)) = self.outgoing.pop_front()
             {
-                // At another rate it hears something else, which is no request.
+                // A byte at another rate is not a part of a request.
                 if self.scanner.device().rate() == rate {
                     self.line.receive(self.scanner.device_mut(), byte, Arrival::at(at));
                 }
@@ -74,33 +75,33 @@ impl Sensor {
         self.now = self.now.max(to);
     }
 
-    /// A host writes `byte` at `now`, at `rate`.
+    /// Sends `byte` from the host at `now`, at baud rate `rate`.
     pub(crate) fn write(&mut self, now: Nanos, byte: u8, rate: u32) {
         let free = self.outgoing.back().map_or(now, |(at, ..)| now.max(*at));
         self.outgoing.push_back((free + line_time(1, rate), byte, rate));
     }
 
-    /// The cable is pulled out: what is on its way does not arrive.
+    /// Discards the bytes on the way to the scanner, because the cable was unplugged.
     pub(crate) fn drop_outgoing(&mut self) {
         self.outgoing.clear();
     }
 
-    /// Its head turns at this share of its usual speed.
+    /// Sets the target speed of the head, as a share of its usual speed.
     pub(crate) fn set_speed(&mut self, share: f64) {
         self.scanner.set_speed(share);
     }
 
-    /// Its power goes off and on.
+    /// Interrupts the power supply for a moment.
     pub(crate) fn power_cycle(&mut self) {
         self.scanner.device_mut().power_cycle(self.now);
     }
 
-    /// Lets the voltage of the scanner dip.
+    /// Makes the voltage of the scanner dip.
     pub(crate) fn brown_out(&mut self) {
         self.scanner.brown_out(self.now);
     }
 
-    /// Another one is there instead, as `action` says.
+    /// Replaces the scanner as `action` says.
     pub(crate) fn exchange(&mut self, action: &Action) {
         self.eeprom_writes += self.scanner.device().eeprom_writes();
         let sent = self.scanner.exchange(action, self.now);
@@ -111,31 +112,31 @@ impl Sensor {
         }
     }
 
-    /// The line has these faults from now on.
+    /// Replaces the faults of the line.
     pub(crate) fn set_faults(&mut self, faults: &Faults, seed: u64) {
         self.line.set_faults(faults, seed);
     }
 
-    /// It behaves badly as `action` says, or well again.
+    /// Starts the misbehavior of `action`, or ends it with `None`.
     pub(crate) fn misbehave(&mut self, action: Option<&Action>) {
         self.scanner.misbehave(action);
     }
 
-    /// Something happens to it.
+    /// Injects a fault of the scanner.
     pub(crate) fn inject_fault(&mut self, fault: ScannerFault) {
         self.scanner.inject_fault(fault, self.now);
     }
 
-    /// Whether it sends unasked.
+    /// Returns whether the scanner sends data without a request.
     pub(crate) fn is_streaming(&self) -> bool {
         self.scanner.device().streams()
     }
 
-    /// Requests heard that would write the EEPROM.
+    /// Returns the number of received requests that write the EEPROM.
     pub(crate) fn eeprom_writes(&self) -> u64 {
         self.eeprom_writes + self.scanner.device().eeprom_writes()
     }
 }
 
-/// Who makes a sensor stream pauses so long after each byte.
+/// Pause after each byte of a host that starts a stream.
 const BYTE_INTERVAL: Nanos = 60 * MICROS;

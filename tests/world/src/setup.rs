@@ -1,5 +1,5 @@
-//! What a world begins with, as its seed has it: the sensors and the state in which they are found, the hub's
-//! configuration, whether a service manager keeps ports, the consumers. Refuses to know what happens later.
+//! Setup of a world, drawn from its seed: the scanners and the states in which they are found, the hub's configuration,
+//! whether a service manager keeps ports, and the permanent subscribers.
 
 use std::rc::Rc;
 
@@ -13,17 +13,17 @@ use crate::scenario::Scenario;
 use crate::sensor::Sensor;
 use crate::subscriber::Behavior;
 
-/// How a world begins.
+/// Setup of a world.
 pub(crate) struct Setup {
-    /// The sensors, and what their links ask for.
+    /// The scanners with their links.
     pub(crate) sensors: Vec<Rc<dyn Family>>,
-    /// Rates that the port of each sensor cannot have.
+    /// For each sensor, the rates that its port does not support.
     pub(crate) unsupported_rates: Vec<Vec<u32>>,
-    /// A service manager keeps the ports of a killed hub.
+    /// Whether a service manager keeps the ports of a killed hub.
     pub(crate) keeps_ports: bool,
-    /// Scans in a row that violate a circle.
+    /// Number of consecutive scans that violate a zone.
     pub(crate) min_scans: u64,
-    /// What consumers are there from the start: of which sensor and topic, how they behave, how many samples they hold.
+    /// Permanent subscribers: sensor, topic, behavior, and number of samples that they hold.
     pub(crate) subscribers: Vec<(usize, Topic, Behavior, usize)>,
 }
 
@@ -50,12 +50,12 @@ impl Setup {
         Setup { sensors, unsupported_rates, keeps_ports, min_scans, subscribers }
     }
 
-    /// The sensors' names in topics.
+    /// Returns the name of a sensor in topics.
     pub(crate) fn name(sensor: usize) -> String {
         format!("s{sensor}")
     }
 
-    /// The configuration; the second of `edition` 1 differs in what is made of scans, and that of 2 is refused.
+    /// Returns the configuration. Edition 1 has other settings of processors, and edition 2 is invalid.
     pub(crate) fn config(&self, edition: u64) -> Result<Config, Failure> {
         let mut set = vec![format!("zones.min_scans={}", self.min_scans)];
         let mut links = Vec::new();
@@ -72,7 +72,7 @@ impl Setup {
         Config::load(&Sources { files: Vec::new(), set, links })
     }
 
-    /// The sensors as they are found, whose view changes as `changes` say.
+    /// Returns the sensors as the hub finds them. `changes` returns the changes of a sensor's scene.
     pub(crate) fn sensors(&self, mut changes: impl FnMut(usize) -> Changes) -> Vec<Sensor> {
         let sensor =
             |(number, of): (usize, &Rc<dyn Family>)| Sensor::new(of.initial_scanner(changes(number)));
@@ -80,11 +80,11 @@ impl Setup {
     }
 }
 
-/// Removes the family from the link of the only sensor of `plan`, or from half of the links. At some of these links, an
-/// exchange connects a scanner of another family, and some of their ports cannot have all rates of the search. Returns
-/// the sensors, and the rates that each port cannot have.
+/// Removes the family from the link of the only sensor of `scenario`, or from half of the links. At some of these
+/// links, an exchange connects a scanner of another family, and some of their ports do not support all rates of the
+/// search. Returns the sensors, and the rates that each port does not support.
 fn half_auto(sensors: &[Rc<dyn Family>], scenario: &Scenario) -> (Vec<Rc<dyn Family>>, Vec<Vec<u32>>) {
-    // Its own random numbers: everything else is as in the world in which all links have a family.
+    // Separate random numbers keep everything else as in the world in which all links have a family.
     let mut random = fastrand::Rng::with_seed(scenario.seed ^ 0xA070_0000_0000_0000);
     let of = |sensor: &Rc<dyn Family>| {
         let mut random = random.fork();
@@ -102,6 +102,6 @@ fn half_auto(sensors: &[Rc<dyn Family>], scenario: &Scenario) -> (Vec<Rc<dyn Fam
     sensors.iter().map(of).unzip()
 }
 
-/// Rates of the search, in bits per second, except the slowest, which every port can have.
+/// Rates of the search, in bits per second, except the slowest, which every port supports.
 const SEARCH_RATES: [u32; 9] =
     [19_200, 38_400, 115_200, 230_400, 256_000, 460_800, 500_000, 921_600, 1_000_000];

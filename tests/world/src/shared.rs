@@ -1,5 +1,5 @@
-//! What all parts of a world have in common: the clock, the ports, the topics, the files, and the log that everything is told
-//! to. Lives in one thread.
+//! State that all parts of a world share: the clock, the ports, the topics, the files, and the log of events. It
+//! belongs to one thread.
 
 use std::cell::{Cell, RefCell};
 use std::collections::BTreeMap;
@@ -20,31 +20,32 @@ use crate::tty::Tty;
 pub(crate) struct SharedState {
     /// Nanoseconds since the machine was started.
     pub(crate) clock: Cell<Nanos>,
-    /// From the clock to 1970.
+    /// Time to add to the clock for the time since 1970, in nanoseconds.
     pub(crate) wall_offset: Cell<u64>,
     pub(crate) ports: Vec<RefCell<Tty>>,
     pub(crate) topics: RefCell<TopicBoard>,
     pub(crate) log: EventLog,
     pub(crate) defect: InjectedDefect,
-    /// The directory in which what was learned is kept, and whether its disk is full.
+    /// Files with learned state, and whether their disk is full.
     pub(crate) files: RefCell<BTreeMap<String, String>>,
     pub(crate) disk_is_full: Cell<bool>,
-    /// The little files in the domain's directory.
+    /// Small files in the domain's directory.
     pub(crate) records: RefCell<BTreeMap<String, Vec<u8>>>,
-    /// A service manager keeps ports of a killed hub.
+    /// Whether a service manager keeps the ports of a killed hub.
     pub(crate) keeps_ports: bool,
     pub(crate) stored_lines: RefCell<BTreeMap<String, Rc<Handle>>>,
-    /// Lines that are open, kept ones too.
+    /// Number of open lines, including those that a service manager keeps.
     pub(crate) handles: Cell<usize>,
-    /// Nobody can open anything.
+    /// Whether every attempt to open something fails.
     pub(crate) lacks_descriptors: Cell<bool>,
-    /// Sensors whose subscribers were woken, the bell, and the time.
+    /// Wakeups that are not delivered yet: sensor, source and time.
     pub(crate) wakeups: RefCell<Vec<(usize, WakeSource, Nanos)>>,
-    /// Number of the next subscriber.
+    /// ID of the next subscriber.
     pub(crate) next_subscriber: Cell<u32>,
     /// Changes of subscribers that happen while a hub sends the samples of a scan.
     pub(crate) changes: RefCell<Vec<SubscriberChange>>,
-    /// Subscribers that such a change has attached, with the milliseconds for which they stay, and those that have left.
+    /// Subscribers that such a change has attached, with the milliseconds for which they stay; and subscribers that
+    /// have left.
     pub(crate) attached: RefCell<Vec<(Subscriber, u64)>>,
     pub(crate) detached: RefCell<Vec<SubscriberId>>,
 }
@@ -52,15 +53,15 @@ pub(crate) struct SharedState {
 /// A change of the subscribers of a sensor after it has sent some more samples.
 pub(crate) struct SubscriberChange {
     pub(crate) sensor: usize,
-    /// Number of samples that are sent before it happens.
+    /// Number of samples that are sent before the change.
     pub(crate) after_sends: u64,
     pub(crate) kind: ChangeKind,
 }
 
-/// Subscriber that attaches or leaves.
+/// Kind of a change.
 #[derive(Clone, Copy)]
 pub(crate) enum ChangeKind {
-    /// A new one attaches, and stays for this number of milliseconds.
+    /// A new subscriber attaches, and stays for this number of milliseconds.
     Attach { topic: Topic, behavior: Behavior, max_held: usize, span_ms: u64 },
     /// This subscriber of a topic leaves.
     Detach { topic: Topic, id: SubscriberId },
@@ -71,14 +72,14 @@ impl SharedState {
         self.log.record(self.clock.get(), event);
     }
 
-    /// Returns the number of a new subscriber.
+    /// Returns the ID of a new subscriber.
     pub(crate) fn next_subscriber_id(&self) -> SubscriberId {
         let number = self.next_subscriber.get();
         self.next_subscriber.set(number + 1);
         SubscriberId(number)
     }
 
-    /// Makes the changes of subscribers that are due after a sample of `sensor` was sent at `now`.
+    /// Applies the changes of subscribers that are due after a sample of `sensor` was sent at `now`.
     pub(crate) fn change_subscribers(&self, sensor: usize, now: Nanos) {
         let mut due = Vec::new();
         self.changes.borrow_mut().retain_mut(|change| {
@@ -109,13 +110,13 @@ impl SharedState {
     }
 }
 
-/// Everything that happens goes through here: into the hash, and to the judges.
+/// Log that adds each event to the hash and passes it to all invariants.
 pub(crate) struct EventLog {
     inner: RefCell<LogState>,
     detail: Detail,
-    /// Judges of which one violation is enough.
+    /// Invariants whose first violation ends the world.
     sought_invariants: &'static [&'static str],
-    /// Whether one of them has found something.
+    /// Whether one of them has reported a violation.
     is_found: Cell<bool>,
 }
 
@@ -137,12 +138,12 @@ impl EventLog {
         EventLog { inner: RefCell::new(inner), detail, sought_invariants, is_found: Cell::new(false) }
     }
 
-    /// Returns whether a judge whose violation is sought has found one.
+    /// Returns whether one of the sought invariants has reported a violation.
     pub(crate) fn is_found(&self) -> bool {
         self.is_found.get()
     }
 
-    /// `event` happened at `at`.
+    /// Handles an event at time `at`.
     pub(crate) fn record(&self, at: Nanos, event: &Event<'_>) {
         let LogState { history, invariants, violations, published } = &mut *self.inner.borrow_mut();
         if self.detail > Detail::Nothing
@@ -161,7 +162,7 @@ impl EventLog {
         }
     }
 
-    /// What the judges said, the hash of everything, how many samples were published, and what the judges measured.
+    /// Returns all violations, the hash, the number of published samples, and the figures of the invariants.
     pub(crate) fn finish(&self) -> (Vec<Violation>, u64, u64, RevolutionFigures) {
         let mut inner = self.inner.borrow_mut();
         let mut figures = RevolutionFigures::default();

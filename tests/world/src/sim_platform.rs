@@ -1,5 +1,5 @@
-//! The platform of one link in a world: it implements [`scanhub_daemon::platform::Platform`] with simulated ports, topics and
-//! files.
+//! The platform of one link in a world: an implementation of [`scanhub_daemon::platform::Platform`] with simulated
+//! ports, topics and files.
 
 use std::cell::Cell;
 use std::rc::Rc;
@@ -25,12 +25,12 @@ pub(crate) struct SimPlatform<'a> {
     pub(crate) number: usize,
     pub(crate) clock: Rc<LinkClock>,
     pub(crate) save_slot: Option<scanhub_daemon::SaveSlot<'a>>,
-    /// An injected defect owes the first ring.
+    /// Whether an injected defect holds back the first ring.
     is_ring_delayed: Cell<bool>,
 }
 
 impl<'a> SimPlatform<'a> {
-    /// Of a hub that began at the world's present time.
+    /// Creates the platform for a hub that starts at the current time of the world.
     pub(crate) fn new(
         shared: &Rc<SharedState>,
         number: usize,
@@ -43,7 +43,7 @@ impl<'a> SimPlatform<'a> {
         SimPlatform { shared: shared.clone(), number, clock, save_slot, is_ring_delayed: Cell::default() }
     }
 
-    /// Whoever sleeps for topics of `ring` will hear it.
+    /// Rings the doorbell word `ring`, which wakes the subscribers that sleep on it.
     fn wake_subscribers(&self, ring: DoorbellWord) {
         let (now, SharedState { defect, wakeups: woken, log, .. }) = (self.clock.now(), &*self.shared);
         if !defect.triggers(Defect::LostWake, 200) {
@@ -75,7 +75,7 @@ impl Platform for SimPlatform<'_> {
     }
 
     fn pause(&self, until: Nanos) {
-        // A sleeping thread is late by about so much.
+        // Typical delay of a sleeping thread.
         self.clock.advance_to(until + 50 * MICROS);
     }
 
@@ -132,7 +132,7 @@ impl Platform for SimPlatform<'_> {
     }
 
     fn release(&self, name: &str) {
-        // Not while it is borrowed: the port may be closed with it.
+        // The borrow must end first, because dropping the line may close the port.
         let kept = self.shared.stored_lines.borrow_mut().remove(name);
         drop(kept);
     }

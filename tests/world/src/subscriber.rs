@@ -1,6 +1,6 @@
-//! Models of consumers: prompt ones that sleep until they are woken, slow ones that look now and then, those that hold samples,
-//! and a robot that believes the verdict of a sensor's zones, with the client library's own rules. Refuses to know who
-//! publishes.
+//! Models of subscribers: prompt ones that sleep until they are woken, slow ones that poll at fixed intervals, ones
+//! that hold samples, and a robot that accepts the verdicts of a sensor's zones. They use the rules of the client
+//! library.
 
 use std::collections::VecDeque;
 use std::rc::Rc;
@@ -14,20 +14,20 @@ use crate::event::Event;
 use crate::shared::SharedState;
 use crate::topics::Sample;
 
-/// Which consumer.
+/// ID of a subscriber.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub(crate) struct SubscriberId(pub(crate) u32);
 
-/// What a consumer does.
+/// Behavior of a subscriber.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Behavior {
-    /// Sleeps until it is woken, then takes all that waits.
+    /// Sleeps until it is woken, then takes all queued samples.
     Prompt,
-    /// Takes one sample each so many milliseconds.
+    /// Takes one sample every `every_ms` milliseconds.
     Slow { every_ms: u64 },
-    /// As a prompt one, but it sleeps on the event of the sensor.
+    /// Like a prompt one, but sleeps on the event of the sensor.
     Listener,
-    /// As a prompt one, and believes what it hears.
+    /// Like a prompt one, and accepts the verdicts.
     Robot,
 }
 
@@ -40,25 +40,25 @@ pub(crate) enum WakeSource {
     Event,
 }
 
-/// One consumer of one topic of one sensor.
+/// A subscriber to one topic of one sensor.
 pub(crate) struct Subscriber {
     pub(crate) id: SubscriberId,
     pub(crate) sensor: usize,
     pub(crate) topic: Topic,
     behavior: Behavior,
-    /// The samples that it holds, and how many it wants to.
+    /// Samples that the subscriber holds, and their maximum number.
     held_samples: VecDeque<Rc<Sample>>,
     max_held: usize,
     sequence: SequenceTracker,
-    /// When it looks again; [`Nanos::MAX`] if only somebody else can wake it.
+    /// Time of the next poll; [`Nanos::MAX`] if only a wakeup starts one.
     next_poll_at: Nanos,
-    /// Until when it does not run.
+    /// Time until which the subscriber is stalled.
     stalled_until: Nanos,
     accepted: Option<(StalenessTimer, Verdict)>,
 }
 
 impl Subscriber {
-    /// Attaches at `now`. Returns `None` if there is no place.
+    /// Attaches a subscriber at `now`. Returns `None` if there is no free slot.
     pub(crate) fn attach(
         shared: &SharedState,
         id: SubscriberId,
@@ -90,7 +90,7 @@ impl Subscriber {
         })
     }
 
-    /// Wakes the subscriber if it sleeps on `bell`, which the hub rang at `at`.
+    /// Wakes the subscriber if it sleeps on `source`, which the hub rang or sent at `at`.
     pub(crate) fn wake(&mut self, source: WakeSource, at: Nanos) {
         let awaited = match self.behavior {
             Behavior::Listener => WakeSource::Event,
@@ -108,12 +108,12 @@ impl Subscriber {
         }
     }
 
-    /// Whether it takes everything as soon as it is woken.
+    /// Returns whether it takes all samples as soon as it is woken.
     pub(crate) fn is_prompt(&self) -> bool {
         self.behavior == Behavior::Prompt
     }
 
-    /// It does not run until then. A robot that does not run believes nothing.
+    /// Stops the subscriber until `until`. A stopped robot has no verdict.
     pub(crate) fn stall(&mut self, shared: &SharedState, until: Nanos) {
         self.stalled_until = until;
         if let Some((_, verdict)) = &mut self.accepted {
@@ -121,14 +121,14 @@ impl Subscriber {
         }
     }
 
-    /// When it does something next.
+    /// Returns the time at which the subscriber next does something.
     pub(crate) fn next_ns(&self, now: Nanos) -> Nanos {
         let left = self.accepted.as_ref().and_then(|(freshness, _)| freshness.time_left(moment(now)));
         let silent = left.map_or(Nanos::MAX, |left| now.saturating_add(left.as_nanos() as Nanos));
         self.next_poll_at.min(silent).max(self.stalled_until)
     }
 
-    /// Does what it does at `now`.
+    /// Takes the samples that are due at `now`, and detects a silence.
     pub(crate) fn run(&mut self, shared: &SharedState, now: Nanos) {
         match self.behavior {
             Behavior::Slow { every_ms } => {
@@ -147,12 +147,12 @@ impl Subscriber {
         }
     }
 
-    /// Takes all that waits.
+    /// Takes all queued samples.
     pub(crate) fn drain(&mut self, shared: &SharedState) {
         while self.take(shared, shared.clock.get()) {}
     }
 
-    /// It is gone, because it left or because it was killed; if it `is_drained`, nothing waited for it any more.
+    /// Removes the subscriber, which left or was killed. `is_drained` means that its queue is empty.
     pub(crate) fn detach(self, shared: &SharedState, is_killed: bool, is_drained: bool) {
         shared.topics.borrow_mut().detach(self.sensor, self.topic, self.id, is_killed);
         shared.log_event(&Event::Detached { subscriber: self.id, is_drained });
@@ -185,12 +185,12 @@ fn accept_verdict(shared: &SharedState, sensor: usize, verdict: &mut Verdict, ne
     }
 }
 
-/// The machine is never suspended.
+/// Returns the timestamp for `now`. The machine is never suspended.
 fn moment(now: Nanos) -> Timestamp {
     Timestamp { monotonic_ns: now, boottime_ns: now }
 }
 
-/// From the hub's ring to a consumer that has a sample.
+/// Time from the hub's ring until a subscriber has a sample.
 const WAKE_DELAY: Nanos = 60 * MICROS;
-/// A hub that lives hands what it keeps to newcomers within so long, and wakes nobody for it.
+/// Time within which a running hub passes the history to a new subscriber, without waking it.
 const HISTORY_DELAY: Nanos = 110 * MILLIS;

@@ -1,5 +1,5 @@
-//! The topics in the memory of one process, with the limits of the real ones: a queue for each consumer that drops the oldest
-//! sample when it is full, the history for late joiners, the loans of a publisher. Refuses to know what a sample means.
+//! Topics in the memory of one process, with the limits of the real ones: a queue for each subscriber that drops the
+//! oldest sample when it is full, the history for late joiners, and the loans of a publisher.
 
 use std::borrow::{Borrow, BorrowMut};
 use std::cell::{Cell, RefCell};
@@ -25,16 +25,16 @@ pub(crate) struct Sample {
     pub(crate) topic: Topic,
     pub(crate) header: Header,
     pub(crate) bytes: Vec<u8>,
-    /// When it was sent, and how many of its topic were sent before it by the same hub.
+    /// Time at which it was sent, and number of samples of its topic that the same hub had sent before.
     pub(crate) sent_at: Nanos,
     pub(crate) index: u64,
     /// Number of subscribers to which it was sent.
     pub(crate) receivers: usize,
-    /// Samples that are in memory count as long as anybody has them.
+    /// Counts the sample as long as a queue, a history or a subscriber has it.
     _counted: LiveCount,
 }
 
-/// One of the things that are counted while they are there.
+/// Increments a counter while it exists.
 #[derive(Debug)]
 struct LiveCount(Rc<Cell<usize>>);
 
@@ -54,12 +54,12 @@ impl Drop for LiveCount {
 /// All topics of all sensors.
 pub(crate) struct TopicBoard {
     sensors: Vec<[Channel; Topic::ALL.len()]>,
-    /// Loans that were not sent, and samples that are held, wait or are kept.
+    /// Number of loans that were not sent, and number of samples that are held, queued or in a history.
     loans: Rc<Cell<usize>>,
     samples: Rc<Cell<usize>>,
     /// For each sensor, the number of times that a subscriber has attached.
     attached: Vec<u32>,
-    /// No publisher gets memory.
+    /// Whether every publisher runs out of memory.
     pub(crate) lacks_memory: bool,
 }
 
@@ -75,7 +75,7 @@ struct SubscriberSlot {
     is_connected: bool,
     /// Whether the subscriber sleeps on the event of the sensor.
     is_listener: bool,
-    /// Its process was killed; the next hub cleans up.
+    /// Whether the subscriber's process was killed. The next hub removes it.
     was_killed: bool,
 }
 
@@ -90,12 +90,12 @@ impl TopicBoard {
         }
     }
 
-    /// Loans and samples that are there.
+    /// Returns the numbers of loans and samples.
     pub(crate) fn in_use(&self) -> (usize, usize) {
         (self.loans.get(), self.samples.get())
     }
 
-    /// A hub begins to publish: what dead ones left is cleaned up, and everybody has to connect anew.
+    /// Prepares a topic for a new hub. Subscribers of dead processes are removed, and all others must connect again.
     fn begin(&mut self, sensor: usize, topic: Topic) {
         self.remove_killed();
         let channel = &mut self.sensors[sensor][topic as usize];
@@ -103,13 +103,13 @@ impl TopicBoard {
         channel.slots.iter_mut().for_each(|place| place.is_connected = false);
     }
 
-    /// What killed consumers left is removed.
+    /// Removes the subscribers that were killed.
     pub(crate) fn remove_killed(&mut self) {
         let channels = self.sensors.iter_mut().flatten();
         channels.for_each(|channel| channel.slots.retain(|place| !place.was_killed));
     }
 
-    /// The hub is gone: nobody keeps anything for late joiners any more.
+    /// Clears the history of all topics, because the hub has ended.
     pub(crate) fn end(&mut self) {
         self.sensors.iter_mut().flatten().for_each(|channel| channel.history.clear());
     }
@@ -124,7 +124,8 @@ impl TopicBoard {
         self.sensors[sensor].iter().flat_map(|channel| &channel.slots).any(|place| place.is_listener)
     }
 
-    /// Attaches `consumer`, which sleeps on the event of the sensor if it `is_listener`. Returns whether there was a place.
+    /// Attaches `subscriber`, which sleeps on the event of the sensor if it `is_listener`. Returns whether there was a
+    /// free slot.
     pub(crate) fn attach(
         &mut self,
         sensor: usize,
@@ -148,7 +149,7 @@ impl TopicBoard {
         has_room
     }
 
-    /// `consumer` leaves, or is killed.
+    /// Removes `subscriber`, or marks it as killed.
     pub(crate) fn detach(&mut self, sensor: usize, topic: Topic, subscriber: SubscriberId, is_killed: bool) {
         let places = &mut self.sensors[sensor][topic as usize].slots;
         if is_killed {
@@ -158,7 +159,7 @@ impl TopicBoard {
         }
     }
 
-    /// The oldest sample that waits for `consumer`.
+    /// Takes the oldest sample from the queue of `subscriber`.
     pub(crate) fn take(
         &mut self,
         sensor: usize,
@@ -207,21 +208,21 @@ impl SubscriberSlot {
     }
 }
 
-/// The publishing end of one topic of one sensor.
+/// The publisher of one topic of one sensor.
 pub(crate) struct SimTransport<P: ?Sized> {
     shared: Rc<SharedState>,
     clock: Rc<LinkClock>,
     sensor: usize,
-    /// Loans of this publisher that were not sent.
+    /// Number of loans of this publisher that were not sent.
     loaned: Rc<Cell<usize>>,
     sent: Cell<u64>,
-    /// A sample that an injected defect holds back.
+    /// Sample that an injected defect holds back.
     delayed: RefCell<Option<Rc<Sample>>>,
     corrupter: RefCell<SampleCorrupter>,
     payload: PhantomData<fn(&P)>,
 }
 
-/// Memory of a sample.
+/// Loaned memory for a sample.
 pub(crate) struct Loan<P: Payload + ?Sized> {
     payload: P::Owned,
     _counted: (LiveCount, LiveCount),
@@ -335,5 +336,5 @@ impl<P: Payload + ?Sized> SimTransport<P> {
     }
 }
 
-/// The first byte of zones of which nothing is known.
+/// First byte of unknown zones.
 const UNKNOWN: u8 = Verdict::Unknown as u8;

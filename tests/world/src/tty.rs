@@ -1,5 +1,5 @@
-//! A serial port as the kernel has it: a buffer of 4,095 bytes, a rate, one owner; it can be pulled out and come back
-//! as another device. Says everything that happens to bytes. Refuses to know who reads them.
+//! A serial port with the properties of a Linux tty: a buffer, a baud rate, and one owner. It can be unplugged, and
+//! returns as another device. It logs everything that happens to bytes.
 
 use std::collections::VecDeque;
 
@@ -13,27 +13,27 @@ use crate::event::{Event, Telegram};
 use crate::sensor::{Sensor, SensorEvent};
 use crate::shared::EventLog;
 
-/// A port and the sensor at its line.
+/// A port with the sensor at its line.
 pub(crate) struct Tty {
     number: usize,
     pub(crate) sensor: Sensor,
-    /// The number of the device that is plugged in, if one is.
+    /// ID of the device that is plugged in, if any.
     device: Option<u64>,
-    /// Devices that were there until now.
+    /// Number of devices so far.
     devices: u64,
-    /// The device has another name than the one that is configured.
+    /// Whether the device has another name than the configured one.
     has_other_name: bool,
-    /// Rates that it cannot have.
+    /// Rates that the port does not support.
     unsupported_rates: Vec<u32>,
-    /// Why it cannot be opened although it is there.
+    /// Error of opening the port, although it exists.
     pub(crate) open_error: Option<PortError>,
     is_open: bool,
     rate: u32,
-    /// Rate that the hub has set; another process may have set another one.
+    /// Rate that the hub has set. It differs from `rate` if another process has changed that.
     hub_rate: u32,
     baud_mismatch: BaudMismatch,
     buffer: VecDeque<u8>,
-    /// Bytes that went into the buffer, ever.
+    /// Number of bytes that have ever entered the buffer.
     received: u64,
     /// Telegram that is on the line.
     partial_telegram: Option<PartialTelegram>,
@@ -41,20 +41,21 @@ pub(crate) struct Tty {
 
 /// Telegram that is on the line.
 struct PartialTelegram {
-    /// Place of its first byte, and when that went into the port.
+    /// Position of its first byte, and time at which that entered the buffer.
     first: u64,
     first_at: Nanos,
-    /// Why it is damaged.
+    /// Reason why it is damaged.
     damage: Option<&'static str>,
 }
 
-/// Bytes that a tty holds, as a pty of Linux does; more are lost.
+/// Number of bytes that a tty buffers, like a pty of Linux. Further bytes are lost.
 const BUFFER_LEN: usize = 17_024;
-/// Those of them of which it tells, and that it hands out at once; the rest waits in the driver's buffers.
+/// Number of these bytes in the line discipline, which the tty reports and returns at once. The others are in the
+/// driver's buffers.
 const LINE_DISCIPLINE_LEN: usize = 4_095;
 
 impl Tty {
-    /// Creates the port of a sensor. It cannot have the rates in `impossible`.
+    /// Creates the port of a sensor, which does not support the rates in `unsupported_rates`.
     pub(crate) fn new(number: usize, sensor: Sensor, unsupported_rates: Vec<u32>) -> Tty {
         Tty {
             number,
@@ -74,9 +75,9 @@ impl Tty {
         }
     }
 
-    /// Lets the sensor's time be `to`.
+    /// Advances the sensor's time to `to`.
     pub(crate) fn advance(&mut self, to: Nanos, log: &EventLog) {
-        // The sensor is lent out, so that what arrives can go into the buffer.
+        // Borrow the fields separately, because the sensor adds bytes to the buffer.
         let Tty {
             number,
             sensor,
@@ -135,7 +136,11 @@ impl Tty {
         });
     }
 
-    /// Opens it at `rate`; returns the number of its device.
+    /// Opens the port at `rate`. Returns the ID of its device.
+    ///
+    /// # Errors
+    ///
+    /// Returns the error of the port if it is missing, denied or already open, or does not support `rate`.
     pub(crate) fn open(&mut self, rate: u32, log: &EventLog, now: Nanos) -> Result<u64, PortError> {
         self.advance(now, log);
         let device = self.device.filter(|_| !self.has_other_name).ok_or(PortError::Missing)?;
@@ -154,7 +159,7 @@ impl Tty {
         Ok(device)
     }
 
-    /// Another hub goes on with it, at `rate`; whether it is still the same.
+    /// Takes over the open port for another hub, at `rate`. Returns false if the device is not the same any more.
     pub(crate) fn adopt(&mut self, device: u64, rate: u32, log: &EventLog, now: Nanos) -> bool {
         self.advance(now, log);
         if !self.is_plugged_in(device) || self.has_other_name || !self.supports_rate(rate) {
@@ -165,7 +170,7 @@ impl Tty {
         true
     }
 
-    /// The last owner of `device` is gone.
+    /// Closes `device` after its last owner has released it.
     pub(crate) fn close(&mut self, device: u64, log: &EventLog, now: Nanos) {
         if self.is_plugged_in(device) {
             self.advance(now, log);
@@ -175,17 +180,17 @@ impl Tty {
         }
     }
 
-    /// Whether `device` is plugged in.
+    /// Returns whether `device` is plugged in.
     pub(crate) fn is_plugged_in(&self, device: u64) -> bool {
         self.device == Some(device)
     }
 
-    /// Bytes that wait to be read, as far as a driver tells: those of its line discipline.
+    /// Returns the number of bytes to read that a driver reports: those in the line discipline.
     pub(crate) fn waiting(&self) -> usize {
         self.buffer.len().min(LINE_DISCIPLINE_LEN)
     }
 
-    /// Reads what there is into `into`, at most what the line discipline holds.
+    /// Reads buffered bytes into `into`, at most those in the line discipline. Returns their number.
     pub(crate) fn read(&mut self, into: &mut [u8], log: &EventLog, now: Nanos) -> usize {
         let len = into.len().min(self.waiting());
         for (place, byte) in into.iter_mut().zip(self.buffer.drain(..len)) {
@@ -201,19 +206,19 @@ impl Tty {
         self.sensor.write(now, byte, self.rate);
     }
 
-    /// Returns whether the port can have this rate.
+    /// Returns whether the port supports this rate.
     pub(crate) fn supports_rate(&self, rate: u32) -> bool {
         !self.unsupported_rates.contains(&rate)
     }
 
-    /// Changes the rate, and discards what arrived.
+    /// Changes the rate, and discards all buffered bytes.
     pub(crate) fn set_rate(&mut self, rate: u32, log: &EventLog, now: Nanos) {
         self.flush(log, now);
         (self.rate, self.hub_rate) = (rate, rate);
         log.record(now, &Event::RateChanged { sensor: self.number });
     }
 
-    /// Sets the rate as another process does.
+    /// Sets the rate on behalf of another process.
     pub(crate) fn alter(&mut self, rate: u32, log: &EventLog, now: Nanos) {
         self.advance(now, log);
         if self.is_open && rate != self.rate {
@@ -222,12 +227,12 @@ impl Tty {
         }
     }
 
-    /// Returns the rate that another process has set since the hub did.
+    /// Returns the rate that another process has set since the hub set its own.
     pub(crate) fn altered_rate(&self) -> Option<u32> {
         (self.rate != self.hub_rate).then_some(self.rate)
     }
 
-    /// The adapter is pulled out.
+    /// Unplugs the adapter.
     pub(crate) fn unplug(&mut self, log: &EventLog, now: Nanos) {
         self.advance(now, log);
         if self.device.take().is_some() {
@@ -239,7 +244,7 @@ impl Tty {
         }
     }
 
-    /// It is plugged in again, as another device, which may have another name.
+    /// Plugs the adapter in again as another device, perhaps with another name.
     pub(crate) fn plug(&mut self, has_other_name: bool, log: &EventLog, now: Nanos) {
         self.advance(now, log);
         self.has_other_name = has_other_name;
@@ -260,7 +265,7 @@ impl Tty {
         }
     }
 
-    /// Bytes that are not in the buffer any more.
+    /// Returns the number of bytes that have left the buffer.
     fn removed(&self) -> u64 {
         self.received - self.buffer.len() as u64
     }

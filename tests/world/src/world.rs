@@ -1,5 +1,4 @@
-//! A world from its beginning to its end: one clock that jumps from one thing that is due to the next. Refuses to know
-//! what a hub does with its links, and what actions mean.
+//! A world from start to end: one clock that advances from one event to the next.
 
 use std::cell::{Cell, RefCell};
 use std::collections::{BTreeMap, VecDeque};
@@ -23,55 +22,55 @@ use crate::subscriber::{Behavior, Subscriber, SubscriberId, WakeSource};
 use crate::topics::TopicBoard;
 use crate::tty::Tty;
 
-/// What came of a plan.
+/// Result of a scenario.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Outcome {
-    /// What the judges said, in the order of time.
+    /// Violations in order of time.
     pub violations: Vec<Violation>,
-    /// Of everything that happened.
+    /// Hash of all events.
     pub hash: u64,
-    /// Virtual seconds, times sensors.
+    /// Virtual seconds times sensors.
     pub sensor_seconds: u64,
-    /// Samples that hubs published.
+    /// Number of samples that hubs published.
     pub samples: u64,
-    /// What the turns of heads were like.
+    /// Figures of the revolutions of rotating scanners.
     pub figures: RevolutionFigures,
 }
 
-/// Lets happen what `plan` says, and tells standard error so much of it.
+/// Runs `scenario`, and prints its events to standard error as `detail` says.
 pub fn run(scenario: &Scenario, detail: Detail) -> Outcome {
     World::new(scenario, detail, None, &[]).run_to_end()
 }
 
-/// Returns whether one of `invariants` finds a violation while `plan` is played with `defect` around the hub. The world
+/// Returns whether one of `invariants` finds a violation while `scenario` runs with `defect` around the hub. The world
 /// ends with the first violation.
 pub fn is_found(scenario: &Scenario, defect: Option<Defect>, invariants: &'static [&'static str]) -> bool {
     let outcome = World::new(scenario, Detail::Nothing, defect, invariants).run_to_end();
     outcome.violations.iter().any(|violation| invariants.contains(&violation.invariant))
 }
 
-/// Something that is to be done at its time, or when everything is made well again.
+/// A task that runs at its time, or when all faults are cleared.
 type ScheduledTask = Box<dyn FnOnce(&mut World)>;
 
-/// What actions want of the hub.
+/// Requests of actions to the hub.
 #[derive(Default)]
 pub(crate) struct HubRequests {
-    /// That it is gone, killed or ended in order.
+    /// Request to end.
     pub(crate) ending: Option<HubEnding>,
-    /// That it reads its configuration again.
+    /// Request to reload the configuration.
     pub(crate) reload: bool,
-    /// That it does this to a sensor.
+    /// Requests to sensors.
     pub(crate) sensor_requests: Vec<(usize, Verb)>,
 }
 
-/// How a hub ends, and when the next one begins.
+/// The kind of a hub's end, and the time at which the next one starts.
 #[derive(Clone, Copy)]
 pub(crate) struct HubEnding {
     pub(crate) is_killed: bool,
     pub(crate) restart_at: Nanos,
 }
 
-/// All that there is beside a hub.
+/// Everything in a world except the hub.
 pub(crate) struct World {
     pub(crate) shared: Rc<SharedState>,
     pub(crate) setup: Rc<Setup>,
@@ -83,15 +82,15 @@ pub(crate) struct World {
     faults_clear_at: Nanos,
     end: Nanos,
     pub(crate) hub_requests: HubRequests,
-    /// Which configuration the next reading finds.
+    /// Edition of the configuration that the hub reads next.
     pub(crate) edition: Rc<Cell<u64>>,
-    /// Number of the hub, and when it begins or begun.
+    /// Number of the current or next run of the hub, and time at which it starts or has started.
     pub(crate) run: u64,
     pub(crate) hub_starts_at: Nanos,
-    /// Until when its process does not run.
+    /// Time until which the hub's process is stalled.
     pub(crate) stalled_until: Nanos,
     pub(crate) commands: Option<CommandSender>,
-    /// What is behind the hub's topics in another machine.
+    /// The machines that receive the hub's topics.
     pub(crate) remote_machines: RemoteMachines,
 }
 
@@ -166,17 +165,17 @@ impl World {
         self.shared.clock.get()
     }
 
-    /// Whether it is over.
+    /// Returns whether the world has ended.
     pub(crate) fn is_over(&self) -> bool {
         self.now() >= self.end || self.shared.log.is_found()
     }
 
-    /// How long things may still go wrong.
+    /// Returns the time for which faults may still occur.
     pub(crate) fn time_until_faults_clear(&self) -> Nanos {
         self.faults_clear_at.saturating_sub(self.now())
     }
 
-    /// When something is due that is not the hub's.
+    /// Returns the time of the next event outside the hub.
     pub(crate) fn next_ns(&self) -> Nanos {
         let action = self.actions.front().map(|action| action.at_ms * MILLIS);
         let later = self.scheduled.first_key_value().map(|((at, _), _)| *at);
@@ -187,7 +186,7 @@ impl World {
             .unwrap_or(self.end)
     }
 
-    /// The time is `now`: does what is due.
+    /// Sets the time to `now`, and does everything that is due outside the hub.
     pub(crate) fn run_due(&mut self, now: Nanos) {
         self.shared.clock.set(self.now().max(now));
         while self.actions.front().is_some_and(|action| action.at_ms * MILLIS <= now)
@@ -210,7 +209,7 @@ impl World {
         self.remote_machines.run_due(&self.shared, now);
     }
 
-    /// Lets consumers know that they were woken.
+    /// Delivers all wakeups to their subscribers.
     pub(crate) fn deliver_wakeups(&mut self) {
         self.apply_subscriber_changes();
         for (sensor, wake_source, at) in self.shared.wakeups.borrow_mut().drain(..) {
@@ -222,7 +221,7 @@ impl World {
         }
     }
 
-    /// Takes over the subscribers that attached and left while samples were sent.
+    /// Applies the attachments and departures of subscribers that happened while samples were sent.
     fn apply_subscriber_changes(&mut self) {
         let shared = self.shared.clone();
         let leavers = shared.detached.take();
@@ -242,21 +241,22 @@ impl World {
         }
     }
 
-    /// Consumers look for a hub now and then, and find the one that begins.
+    /// Makes all subscribers poll. Each of them searches for a hub at fixed intervals, and finds the one that has
+    /// started.
     pub(crate) fn poll_all_subscribers(&mut self) {
         let at = self.now() + HUB_POLL_INTERVAL;
         self.subscribers.iter_mut().for_each(|subscriber| subscriber.poll_at(at));
         self.remote_machines.wake(at);
     }
 
-    /// Does `what` in `span_ms`, or when everything is made well again.
+    /// Schedules `task` to run in `span_ms`, or when all faults are cleared.
     pub(crate) fn schedule(&mut self, span_ms: u64, task: impl FnOnce(&mut World) + 'static) {
         let at = self.now() + span_ms * MILLIS;
         self.scheduled.insert((at, self.next_task_id), Box::new(task));
         self.next_task_id += 1;
     }
 
-    /// A new consumer, if there is a place for it.
+    /// Attaches a new subscriber, if there is a free slot.
     pub(crate) fn attach(
         &mut self,
         sensor: usize,
@@ -271,19 +271,19 @@ impl World {
         Some(number)
     }
 
-    /// It leaves, or is killed.
+    /// Removes a subscriber, which leaves or is killed.
     pub(crate) fn detach(&mut self, id: SubscriberId, is_killed: bool) {
         if let Some(at) = self.subscribers.iter().position(|subscriber| subscriber.id == id) {
             self.subscribers.remove(at).detach(&self.shared, is_killed, false);
         }
     }
 
-    /// Does `what` to the port of `sensor`.
+    /// Calls `task` with the port of `sensor`.
     pub(crate) fn with_port(&mut self, sensor: usize, task: impl FnOnce(&mut Tty, &EventLog, Nanos)) {
         task(&mut self.shared.ports[sensor].borrow_mut(), &self.shared.log, self.now());
     }
 
-    /// The line of an action's sensor has `faults` for the action's time.
+    /// Applies `faults` to the line of an action's sensor for the duration of the action.
     pub(crate) fn inject_line_fault(&mut self, action: &Action, faults: &Faults) {
         let (sensor, seed) = (self.sensor(action), self.seed ^ action.at_ms);
         self.with_port(sensor, |tty, log, now| {
@@ -298,7 +298,7 @@ impl World {
         });
     }
 
-    /// `ailment` happens to an action's sensor.
+    /// Injects `fault` into the scanner of an action's sensor.
     pub(crate) fn inject_scanner_fault(&mut self, action: &Action, fault: ScannerFault) {
         self.with_port(self.sensor(action), |tty, log, now| {
             tty.advance(now, log);
@@ -306,13 +306,13 @@ impl World {
         });
     }
 
-    /// The same when an action's time is over.
+    /// Injects `fault` at the end of an action.
     pub(crate) fn inject_scanner_fault_later(&mut self, action: &Action, fault: ScannerFault) {
         let copy = action.clone();
         self.schedule(action.value("span_ms"), move |world| world.inject_scanner_fault(&copy, fault));
     }
 
-    /// The sensor that an action means.
+    /// Returns the index of an action's sensor.
     pub(crate) fn sensor(&self, action: &Action) -> usize {
         action.value("sensor") as usize % self.setup.sensors.len()
     }
@@ -328,7 +328,7 @@ impl World {
         self.shared.log_event(&Event::FaultsCleared);
     }
 
-    /// Until the next hub begins.
+    /// Runs the world until the next hub starts.
     fn run_without_hub(&mut self) {
         while self.now() < self.hub_starts_at && !self.is_over() {
             self.run_due(self.next_ns().min(self.hub_starts_at));
@@ -359,9 +359,9 @@ impl World {
     }
 }
 
-/// The wall clock when a world begins: some day in 2026.
+/// Wall clock at the start of a world, a day in 2026.
 const WALL_NS: u64 = 1_780_000_000_000_000_000;
-/// More than the samples of one scan. A subscriber leaves after fewer.
+/// More than the number of samples of one scan. A subscriber leaves after fewer.
 const MAX_SENDS: u64 = 12;
-/// A consumer without a hub looks for one so often.
+/// Interval at which a subscriber without a hub searches for one.
 const HUB_POLL_INTERVAL: Nanos = 50 * MILLIS;

@@ -1,5 +1,4 @@
-//! Proves that the invariants can fail: each injected defect is found within 200 seeds, by an invariant that is
-//! responsible for it.
+//! Tests of the invariants: each injected defect is found within 200 seeds, by the invariant that checks for it.
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -43,7 +42,7 @@ fn invariants(defect: Defect) -> &'static [&'static str] {
     }
 }
 
-/// Defects of turns and of requests, in worlds with nothing but this scanner, whose head turns.
+/// Defects of revolutions and requests, each with the model of the only scanner in its worlds.
 const ROTATING_DEFECTS: [(Defect, &str); 12] = [
     (Defect::MergedRevolution, "a1:express"),
     (Defect::UnmarkedRevolution, "s1"),
@@ -59,8 +58,8 @@ const ROTATING_DEFECTS: [(Defect, &str); 12] = [
     (Defect::UnsentWarning, "ld19"),
 ];
 
-/// First seeds by which a defect was found when this was written, where that is not 0. Seeds that find nothing are not
-/// played again; if one of these finds nothing either, all are.
+/// First seed that finds a defect, if it is not 0. The test starts with this seed, and tries all others only if it no
+/// longer finds the defect.
 const SEEDS: [(Defect, &str, u64); 17] = [
     (Defect::MergedRevolution, "", 1),
     (Defect::ExtraBeam, "", 1),
@@ -81,7 +80,7 @@ const SEEDS: [(Defect, &str, u64); 17] = [
     (Defect::IgnoredRequests, "a1::streaming", 3),
 ];
 
-/// Returns the seed by which `defect` is found in worlds with `model` alone, or in all if it is empty.
+/// Returns a seed that finds `defect` in worlds with `model` alone, or in all worlds if it is empty.
 fn found_by(defect: Defect, model: &str) -> Option<u64> {
     let finds = |seed: &u64| {
         let model = Some(model.to_owned()).filter(|model| !model.is_empty());
@@ -112,7 +111,7 @@ fn every_injected_defect_is_found() {
     assert_eq!(missed.into_inner().expect("whole"), []);
 }
 
-/// What happens between the machines, and a defect that shows when nothing else happens.
+/// Kinds of actions between the machines, each with a defect that they reveal without other actions.
 const NETWORK_DEFECTS: [(&str, Defect); 3] = [
     ("partition", Defect::RemoteSurvivingVerdict),
     ("router_killed", Defect::RouterNotReconnected),

@@ -96,7 +96,7 @@ impl Family for Ld {
         true
     }
 
-    /// One of 256 damaged packets has a valid checksum.
+    /// Of 256 damaged packets, one has a valid checksum.
     fn is_collision(&self, _: &[u8], damaged: &mut dyn Iterator<Item = &[u8]>) -> bool {
         damaged.next().is_some()
     }

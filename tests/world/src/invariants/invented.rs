@@ -151,7 +151,7 @@ pub(crate) struct RemoteNothingInvented {
     boots: HashSet<u64>,
     /// Hashes of the sent datagrams by epoch, sensor, topic, sequence number and part.
     sent: BTreeMap<(u32, u8, u8, u32, u8), u64>,
-    /// The greatest epoch that the listener accepted.
+    /// Highest epoch that the listener accepted.
     epoch: u32,
     /// Epoch and sensor of the announcements that the listener accepted. The sensor of a sample is unknown before.
     announced: HashSet<(u32, u8)>,

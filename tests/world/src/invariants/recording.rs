@@ -122,7 +122,7 @@ impl Invariant for Recording {
     }
 }
 
-/// Number of worlds of which one is recorded.
+/// Interval of seeds at which worlds are recorded.
 const RECORDING_INTERVAL: u64 = 4;
 /// Encoding, which only logs need that are not recordings of a hub.
 const ENCODING: Encoding = Encoding { unit: Unit::Mm, mode: Mode(1) };

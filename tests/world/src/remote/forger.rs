@@ -1,5 +1,5 @@
-//! Somebody on the network who hears all that reaches the listener's machine, and sends what looks like it. Refuses to know the
-//! key of the others, and who believes.
+//! An attacker on the network, who receives all datagrams for the listener's machine and sends similar ones, but does
+//! not have the key.
 
 use std::collections::VecDeque;
 
@@ -7,28 +7,28 @@ use scanhub_network::lan::Key;
 use scanhub_schema::Nanos;
 use scanhub_schema::datagram::{Datagram, HEADER_LEN, Head, LanFlags, MAC_LEN};
 
-/// What somebody sends who has not the key.
+/// A kind of datagram that the attacker sends.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Forgery {
     /// Datagrams without a MAC.
     Plain,
-    /// With one of another key.
+    /// Datagrams with a MAC of another key.
     OtherKey,
-    /// With the MAC of another one.
+    /// Datagrams with the MAC of another datagram.
     OtherMac,
-    /// Datagrams of the gateway that were recorded.
+    /// Recorded datagrams of the gateway.
     Recording,
 }
 
-/// What was recorded.
+/// Datagrams that the attacker has recorded.
 #[derive(Default)]
 pub(super) struct Forger {
-    /// The datagrams, with the time by the listener's wall clock; the oldest first.
+    /// Datagrams, oldest first, with their times of arrival by the listener's wall clock.
     recorded: VecDeque<(Nanos, Vec<u8>)>,
 }
 
 impl Forger {
-    /// A datagram reached the listener's machine at `wall_ns` of its clock.
+    /// Records a datagram that reached the listener's machine at `wall_ns`, by the machine's clock.
     pub(super) fn record(&mut self, wall_ns: Nanos, bytes: &[u8]) {
         if self.recorded.len() == MAX_RECORDED {
             self.recorded.pop_front();
@@ -36,8 +36,9 @@ impl Forger {
         self.recorded.push_back((wall_ns, bytes.to_vec()));
     }
 
-    /// So many datagrams as `forgery` says, made of what was heard last, or recorded at least 8 s before `wall_ns`: what is
-    /// younger may be believed by a listener that has just begun (docs/datagram.md).
+    /// Returns up to `count` datagrams of this kind. They are derived from the last recorded ones, or are recorded ones
+    /// that are at least 8 s older than `wall_ns`. A listener that has just started may accept younger ones
+    /// (docs/datagram.md).
     pub(super) fn forge(&self, forgery: Forgery, count: usize, wall_ns: Nanos) -> Vec<Vec<u8>> {
         let is_old = |at: Nanos| at.abs_diff(wall_ns) > MIN_REPLAY_AGE;
         let all = self.recorded.iter();
@@ -54,7 +55,7 @@ impl Forger {
     }
 }
 
-/// A datagram that says otherwise and comes next.
+/// Returns a datagram with different contents that follows `bytes` in sequence.
 fn forge_next(bytes: &[u8], forgery: Forgery) -> Option<Vec<u8>> {
     let Datagram { head, payload, mac } = Datagram::read(bytes).ok()?;
     let head = Head {
@@ -74,7 +75,7 @@ fn forge_next(bytes: &[u8], forgery: Forgery) -> Option<Vec<u8>> {
     sealed.map(<[u8]>::to_vec)
 }
 
-/// Datagrams that are recorded.
+/// Maximum number of recorded datagrams.
 const MAX_RECORDED: usize = 4_000;
-/// Recorded so long ago, a datagram is believed by nobody.
+/// Age from which on no listener accepts a recorded datagram.
 const MIN_REPLAY_AGE: Nanos = 8_000_000_000;

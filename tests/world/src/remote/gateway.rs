@@ -1,4 +1,4 @@
-//! A run of a gateway: it subscribes to topics of the hub like any subscriber, and passes datagrams to a network.
+//! A run of a gateway: a subscriber to the hub's topics that sends datagrams to a network.
 
 use scanhub_client::clock::Timestamp;
 use scanhub_client::streams::{SequenceGap, SequenceTracker, ZonesState};
@@ -23,26 +23,26 @@ pub(super) struct Gateway {
     outgoing: Outgoing,
     epoch: u32,
     subscriptions: Vec<TopicSubscription>,
-    /// What is known of each sensor's zones.
+    /// State of the zones of each sensor.
     zones: Vec<ZonesState>,
     background_interval: Option<std::time::Duration>,
-    /// When it looks at its topics.
+    /// Time at which the gateway polls its topics.
     next_poll_at: Nanos,
     tick_at: Nanos,
 }
 
-/// One topic of one sensor.
+/// Subscription to one topic of one sensor.
 struct TopicSubscription {
     sensor: usize,
     topic: Topic,
     id: SubscriberId,
     sequence: SequenceTracker,
-    /// There was a place for it.
+    /// Whether the topic had a free slot for the gateway.
     is_attached: bool,
 }
 
 impl Gateway {
-    /// Number `run` of all gateways follows `sensors`.
+    /// Starts run number `run` of the gateway, with `sensors` sensors.
     pub(super) fn begin(shared: &SharedState, terms: &LinkSettings, run: u32, sensors: usize) -> Gateway {
         let (now, epoch) = (shared.clock.get(), BASE_EPOCH + run);
         shared.log_event(&Event::GatewayStarted { epoch });
@@ -67,19 +67,19 @@ impl Gateway {
         Gateway { outgoing, epoch, subscriptions, zones, background_interval, next_poll_at, tick_at }
     }
 
-    /// The hub woke the consumers of a sensor at `at`.
+    /// Wakes the gateway. The hub has woken the subscribers of a sensor at `at`.
     pub(super) fn wake(&mut self, at: Nanos) {
         self.next_poll_at = self.next_poll_at.min(at + WAKE_DELAY);
     }
 
-    /// When it has something to do.
+    /// Returns the time at which the gateway has something to do.
     pub(super) fn next_ns(&self, now: Nanos) -> Nanos {
         let left = self.zones.iter().filter_map(|zones| zones.time_left(moment(now))).min();
         let silence = left.map_or(Nanos::MAX, |left| now.saturating_add(left.as_nanos() as Nanos));
         silence.min(self.next_poll_at).min(self.tick_at)
     }
 
-    /// Sends what waits, and what is due.
+    /// Sends all samples that are queued, and everything that is due.
     pub(super) fn run(&mut self, shared: &SharedState, now: Nanos, uplink: &mut Uplink<'_>) {
         self.next_poll_at = Nanos::MAX;
         let stamp = stamp(shared, now);
@@ -119,17 +119,17 @@ impl Gateway {
         }
     }
 
-    /// Says who all sensors are.
+    /// Sends announcements of all sensors.
     pub(super) fn announce(&mut self, shared: &SharedState, now: Nanos, uplink: &mut Uplink<'_>) {
         self.outgoing.announce(stamp(shared, now), uplink);
     }
 
-    /// Whether a sample waits until it is handed over.
+    /// Returns whether a sample is queued.
     pub(super) fn is_waiting(&self) -> bool {
         self.outgoing.is_waiting()
     }
 
-    /// The sample that has waited for longest, which is handed over now and taken or not.
+    /// Removes the sample that has been queued for longest, and returns its bytes. The router accepts it if `is_taken`.
     pub(super) fn take_next(&mut self, shared: &SharedState, now: Nanos, is_taken: bool) -> Option<Vec<u8>> {
         if shared.defect.triggers(Defect::UncountedDrop, 100) {
             self.outgoing.take_next(stamp(shared, now));
@@ -144,7 +144,7 @@ impl Gateway {
         Some(bytes)
     }
 
-    /// It is gone.
+    /// Ends the gateway, and detaches its subscriptions.
     pub(super) fn detach(self, shared: &SharedState, is_killed: bool, is_drained: bool) {
         for (sensor, rows) in self.outgoing.counters().enumerate() {
             for (topic, row) in rows.used_topics() {
@@ -160,7 +160,7 @@ impl Gateway {
 }
 
 impl TopicSubscription {
-    /// Takes a place, if there is one.
+    /// Attaches to the topic, if it has a free slot.
     fn attach(&mut self, shared: &SharedState) {
         let TopicSubscription { sensor, topic, id, .. } = *self;
         self.is_attached = shared.topics.borrow_mut().attach(sensor, topic, id, false);
@@ -170,7 +170,7 @@ impl TopicSubscription {
         }
     }
 
-    /// The oldest sample that waits, and how many were missed before it.
+    /// Takes the oldest sample from the queue. Returns it with the number of samples that were missed before it.
     fn take(&mut self, shared: &SharedState, now: Nanos) -> Option<(std::rc::Rc<Sample>, u64)> {
         let sample = shared.topics.borrow_mut().take(self.sensor, self.topic, self.id)?;
         let SequenceGap { missed, .. } = self.sequence.note(&sample.header);
@@ -179,7 +179,7 @@ impl TopicSubscription {
     }
 }
 
-/// The way to the network.
+/// The gateway's access to the network.
 pub(super) struct Uplink<'a> {
     pub(super) shared: &'a SharedState,
     pub(super) now: Nanos,
@@ -200,7 +200,7 @@ impl Transmit for Uplink<'_> {
     }
 }
 
-/// The clocks of the hub's machine.
+/// Returns the clocks of the hub's machine.
 fn stamp(shared: &SharedState, now: Nanos) -> WallTimestamp {
     WallTimestamp { monotonic_ns: now, wall_ns: now + shared.wall_offset.get() }
 }
@@ -209,21 +209,21 @@ fn moment(now: Nanos) -> Timestamp {
     Timestamp { monotonic_ns: now, boottime_ns: now }
 }
 
-/// The gateway's number.
+/// ID of the hub in datagrams.
 const HUB_ID: u64 = 0x5f3a_12bc_00d1_e2f3;
-/// The epoch before the first one.
+/// Epoch before the first one.
 const BASE_EPOCH: u32 = 1_780_000_000;
-/// As consumers, gateways have numbers beyond those of all others.
+/// First subscriber ID of gateways. Those of all other subscribers are lower.
 pub(crate) const FIRST_SUBSCRIBER_ID: u32 = 1_000_000;
-/// Between two announcements.
+/// Interval between two announcements.
 const ANNOUNCE_INTERVAL: Nanos = ANNOUNCEMENT_INTERVAL.as_nanos() as Nanos;
-/// A hub that lives hands what it keeps to newcomers within so long, and wakes nobody for it.
+/// Time within which a running hub passes the history to a new subscriber, without waking it.
 const HISTORY_DELAY: Nanos = 110 * MILLIS;
 
 /// Defines `lend`, which reads the bytes of a sample by the table of topics.
 macro_rules! payloads {
     ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
-        /// Passes the payload of `sample` to `to`.
+        /// Passes the payload of `sample` to `to`, and returns the result.
         fn lend<R>(sample: &Sample, to: impl FnOnce(PayloadRef<'_>) -> R) -> R {
             match sample.topic {
                 $(scanhub_schema::Topic::$topic => to(PayloadRef::$topic(payloads!($payload sample))),)*
@@ -252,14 +252,14 @@ macro_rules! payloads {
 
 scanhub_schema::for_each_topic!(payloads);
 
-/// Buffer for a payload as in datagrams. Its size limits some payloads.
+/// Buffer for a payload as in datagrams. Its size limits the length of payloads.
 pub(crate) struct PayloadBuffer {
     buffer: Vec<u8>,
 }
 
 impl PayloadBuffer {
     pub(crate) fn new(terms: &LinkSettings) -> PayloadBuffer {
-        // A bridge sends samples whole.
+        // A bridge does not split samples.
         let room = if terms.are_bridges {
             u16::MAX.into()
         } else {
@@ -268,7 +268,7 @@ impl PayloadBuffer {
         PayloadBuffer { buffer: vec![0; room] }
     }
 
-    /// Returns the payload of `sample` in datagrams, or `None` if it does not fit.
+    /// Returns the payload of `sample` as in datagrams, or `None` if it does not fit.
     pub(crate) fn encode(&mut self, sample: &Sample) -> Option<&[u8]> {
         let len = lend(sample, |payload| payload.pack(&mut self.buffer))?;
         self.buffer.get(..len)

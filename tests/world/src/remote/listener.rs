@@ -1,5 +1,6 @@
-//! A run of a listener, and a robot that follows its topics. The listener takes datagrams in the order in which they arrived, and
-//! publishes their samples. The robot follows the zones of remote sensors by the rules of the client library.
+//! A run of a listener, and a robot that subscribes to its topics. The listener takes datagrams in the order in which
+//! they arrived, and publishes their samples. The robot handles the zones of remote sensors by the rules of the client
+//! library.
 
 use std::collections::{HashMap, VecDeque};
 
@@ -23,16 +24,16 @@ pub(super) struct Listener {
     run: u64,
     incoming: Incoming,
     republisher: Republisher<TopicMemory>,
-    /// Datagrams that the kernel has, with the time at which they came.
+    /// Datagrams in the kernel's buffer, with their times of arrival.
     kernel_queue: VecDeque<(Nanos, Vec<u8>)>,
     queued: usize,
-    /// When it looks at its sockets, and at what is due now and then.
+    /// Time at which the listener reads its sockets, and time of its next periodic check.
     next_at: Nanos,
     next_check_at: Nanos,
 }
 
 impl Listener {
-    /// Number `run` of all listeners publishes in `memory`.
+    /// Starts run number `run` of the listener, which publishes in `memory`.
     pub(super) fn begin(
         shared: &SharedState,
         terms: &LinkSettings,
@@ -57,7 +58,7 @@ impl Listener {
         }
     }
 
-    /// A datagram came, if there is room for it.
+    /// Adds a datagram to the kernel's buffer, if it has room.
     pub(super) fn receive(&mut self, now: Nanos, bytes: Vec<u8>) {
         if self.queued + bytes.len() <= RECEIVE_BUFFER_LEN {
             self.queued += bytes.len();
@@ -66,12 +67,13 @@ impl Listener {
         }
     }
 
-    /// When it has something to do.
+    /// Returns the time at which the listener has something to do.
     pub(super) fn next_ns(&self) -> Nanos {
         self.next_at.min(self.next_check_at)
     }
 
-    /// Takes what waits. With a key its machine's wall clock is `ahead_ns` of the world's, and `epochs` are kept.
+    /// Reads the datagrams in the kernel's buffer. With a key, the wall clock of the listener's machine is
+    /// `clock_offset_ns` ahead of virtual time, and accepted epochs are saved in `epochs`.
     pub(super) fn run(
         &mut self,
         shared: &SharedState,
@@ -129,7 +131,7 @@ impl Listener {
             ReceiveOutcome::Refused { reason: why, .. } => DatagramOutcome::Refused(*why),
             ReceiveOutcome::Untimely { .. } => DatagramOutcome::Refused(DatagramError::Untimely),
             ReceiveOutcome::Part => DatagramOutcome::Part,
-            // No hub is selected, and this network has no names.
+            // This listener selects no hub, and its gateway has no name.
             ReceiveOutcome::Duplicate | ReceiveOutcome::Ignored | ReceiveOutcome::Foreign => {
                 DatagramOutcome::Duplicate
             }
@@ -157,7 +159,7 @@ impl Listener {
         }
     }
 
-    /// It is gone; its account is what it would have told.
+    /// Ends the listener, and reports its counters.
     pub(super) fn end(self, shared: &SharedState, now: Nanos) {
         let stats = self.incoming.gateways();
         for row in stats.rows() {
@@ -169,7 +171,7 @@ impl Listener {
     }
 }
 
-/// What a listener that does not wait for the other parts would make of one: a sample that has nothing where these belong.
+/// Returns the sample that a faulty listener would make from one part: zeros take the place of the other parts.
 fn partial_sample(bytes: &[u8]) -> Option<Vec<u8>> {
     let Datagram { head, payload, .. } = Datagram::read(bytes).ok().filter(|it| it.head.parts > 1)?;
     let begin = HEADER_LEN + payload.len() * usize::from(head.part);
@@ -179,11 +181,11 @@ fn partial_sample(bytes: &[u8]) -> Option<Vec<u8>> {
     Some(Head { part: 0, parts: 1, ..head }.seal(&mut buffer, len)?.to_vec())
 }
 
-/// The process that publishes.
+/// ID of the publishing process.
 const PUBLISHER_PID: u32 = 77;
-/// Datagrams that are taken before anything else has its turn.
+/// Maximum number of datagrams that are handled before other work.
 const BATCH_SIZE: usize = 64;
-/// Bytes that wait in the kernel.
+/// Size of the kernel's buffer, in bytes.
 const RECEIVE_BUFFER_LEN: usize = 1 << 20;
 
 /// A subscriber to all topics of all remote sensors.
@@ -211,7 +213,7 @@ impl RemoteRobot {
         left.min().map_or(Nanos::MAX, |left| now.saturating_add(left.as_nanos() as Nanos))
     }
 
-    /// Takes what waits, and sees what does not come.
+    /// Takes all published samples, and detects silences.
     pub(super) fn run(
         &mut self,
         shared: &SharedState,

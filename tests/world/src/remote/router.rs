@@ -1,34 +1,35 @@
-//! A router between the machines, as a bridge meets it: a link that is slow at times and closed at others, on which everything
-//! comes once and in order, until the router is killed with all that it holds. Both ends find it again by themselves. Refuses
-//! to know what a datagram says.
+//! A router between two bridges, with a link to each of them. Everything that it accepts arrives once and in order, but
+//! the links can be slow or closed, and everything in the router is lost when it is killed. Both ends reconnect by
+//! themselves.
 
 use std::collections::VecDeque;
 
 use scanhub_schema::{MICROS, MILLIS, Nanos};
 
-/// The router, and the links to it.
+/// The router and its links.
 pub(super) struct Router {
-    /// Bytes a second, of a link that is well, and of the link as it is now.
+    /// Bytes per second: of a link without faults, and of the link at present.
     rate: u64,
     current_rate: u64,
     delay_ns: Nanos,
     is_running: bool,
-    /// So many partitions last.
+    /// Whether a partition is active.
     is_partitioned: bool,
-    /// The sender hands over from the one time until the other one, when it knows that its link is no more.
+    /// Time span in which the sender can pass datagrams to the router. It ends when the sender detects the loss of its
+    /// link.
     connected: (Nanos, Nanos),
-    /// From then on the receiver hears.
+    /// Time from which on the receiver is connected.
     receives_from: Nanos,
-    /// When there is room for more.
+    /// Time at which the link can accept the next datagram.
     has_room_at: Nanos,
-    /// With the time at which each comes.
+    /// Datagrams on their way, with their times of arrival.
     in_transit: VecDeque<(Nanos, Vec<u8>)>,
     bytes: usize,
     random: fastrand::Rng,
 }
 
 impl Router {
-    /// A router that both ends are connected to.
+    /// Creates a router to which both ends are connected.
     pub(super) fn new(seed: u64, delay_ns: Nanos) -> Router {
         let mut random = fastrand::Rng::with_seed(seed ^ 0x0B41_D6E0);
         let rate = LINK_RATES[random.usize(..LINK_RATES.len())];
@@ -47,16 +48,16 @@ impl Router {
         }
     }
 
-    /// A network that loses so many packets and takes so long: what is lost is sent again, which takes time.
+    /// Sets the packet loss and the delay of the link. Lost packets are sent again, which takes time.
     pub(super) fn set_link(&mut self, loss: f64, delay_ns: Nanos) {
         self.current_rate = (self.rate as f64 / (1.0 + 100.0 * loss)) as u64;
         self.delay_ns = delay_ns;
     }
 
-    /// Nothing passes, or something does again.
+    /// Starts or ends a partition.
     pub(super) fn set_partitioned(&mut self, is_partitioned: bool, now: Nanos) {
         if self.is_partitioned && !is_partitioned {
-            // What waited for this comes now, in its order.
+            // The datagrams that waited arrive now, in order.
             for ((at, _), after) in self.in_transit.iter_mut().zip((now..).step_by(MAX_SPACING_NS)) {
                 *at = after.max(*at);
             }
@@ -64,7 +65,8 @@ impl Router {
         self.is_partitioned = is_partitioned;
     }
 
-    /// It is killed: what it has is lost, and what is handed over until the sender knows.
+    /// Kills the router. Everything in it is lost, and so is everything that the sender passes on until it detects the
+    /// loss.
     pub(super) fn kill(&mut self, now: Nanos) {
         if self.is_running {
             self.is_running = false;
@@ -75,7 +77,7 @@ impl Router {
         }
     }
 
-    /// It is there again. Both ends try to connect now and then; they never do if it `is_given_up`.
+    /// Starts another router. Both ends try to connect from time to time. With `gives_up`, they never do.
     pub(super) fn begin(&mut self, now: Nanos, gives_up: bool) {
         if !self.is_running && !gives_up {
             self.is_running = true;
@@ -86,20 +88,20 @@ impl Router {
         }
     }
 
-    /// A listener begins.
+    /// Connects a listener that has just started.
     pub(super) fn connect_listener(&mut self, now: Nanos) {
         if self.is_running {
             self.receives_from = self.receives_from.max(now + CONNECT_TIME);
         }
     }
 
-    /// When there is room for a datagram that waits; never as long as nobody knows when.
+    /// Returns the time at which there is room for a queued datagram, or [`Nanos::MAX`] if that is unknown.
     pub(super) fn next_room_at(&self) -> Nanos {
         let at = self.has_room_at.max(self.connected.0);
         if at >= self.connected.1 || self.bytes >= SOCKET_BUFFER_LEN { Nanos::MAX } else { at }
     }
 
-    /// Takes what is handed over.
+    /// Accepts a datagram from the sender.
     pub(super) fn send(&mut self, now: Nanos, bytes: &[u8]) {
         self.has_room_at = now + bytes.len() as u64 * 1_000_000_000 / self.current_rate;
         if !self.is_running {
@@ -110,12 +112,12 @@ impl Router {
         self.in_transit.push_back((last.max(self.has_room_at + self.delay_ns), bytes.to_vec()));
     }
 
-    /// When something comes.
+    /// Returns the time at which the next datagram arrives.
     pub(super) fn next_delivery(&self) -> Option<Nanos> {
         self.in_transit.front().filter(|_| !self.is_partitioned).map(|(at, _)| *at)
     }
 
-    /// What came to the receiver until `now`, the earliest first.
+    /// Returns the earliest datagram that has reached the receiver by `now`.
     pub(super) fn poll(&mut self, now: Nanos) -> Option<Vec<u8>> {
         while self.next_delivery().is_some_and(|at| at <= now) {
             let (at, bytes) = self.in_transit.pop_front()?;
@@ -128,17 +130,17 @@ impl Router {
     }
 }
 
-/// A link has one of these: a radio link, a network.
+/// Possible rates of a link, in bytes per second: a radio link, a network.
 const LINK_RATES: [u64; 3] = [2_000_000, 5_000_000, 50_000_000];
-/// So much waits in sockets.
+/// Number of bytes that wait in sockets.
 const SOCKET_BUFFER_LEN: usize = 64 << 10;
-/// Between two that come at once, in nanoseconds.
+/// Interval between datagrams that arrive after a partition, in nanoseconds.
 const MAX_SPACING_NS: usize = 10_000;
-/// A sender knows of the end of its link after so long, at most.
+/// Maximum time until a sender detects the loss of its link.
 const MAX_DISCONNECT_DELAY: Nanos = 20 * MILLIS;
-/// Who begins is connected after so long.
+/// Time until a new listener is connected.
 const CONNECT_TIME: Nanos = 500 * MICROS;
-/// Between two attempts to connect, and until it is connected.
+/// Maximum time until an end is connected again.
 pub(crate) const RECONNECT_INTERVAL: Nanos = 500 * MILLIS;
-/// What waits has gone out after so long on a link that is well: the longest samples of all topics.
+/// Time in which a link without faults sends the whole queue: the longest samples of all topics.
 pub(crate) const MAX_DRAIN_TIME: Nanos = 200 * MILLIS;

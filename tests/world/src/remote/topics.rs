@@ -1,5 +1,4 @@
-//! The topics of remote sensors as queues in memory, which their consumers look at when they are woken. Refuses to know who
-//! publishes and who takes.
+//! Topics of remote sensors, as queues in memory. A subscriber reads them when it is woken.
 
 use std::cell::RefCell;
 use std::collections::{BTreeMap, VecDeque};
@@ -9,35 +8,35 @@ use scanhub_network::lan::incoming::CheckedPayload;
 use scanhub_network::lan::republish::{SensorTopics, TopicStore};
 use scanhub_schema::{Failure, Header, Topic, WakeEvent};
 
-/// Topics in memory, by their sensors' names. They stay when who publishes is gone.
+/// Queues of all sensors, by name. They outlive their publisher.
 #[derive(Clone, Default)]
 pub(crate) struct TopicMemory(Rc<RefCell<BTreeMap<String, SensorQueue>>>);
 
-/// What waits of one sensor for its consumer.
+/// Samples of one sensor that its subscriber has not taken yet.
 #[derive(Default)]
 struct SensorQueue {
     samples: VecDeque<PublishedSample>,
     is_woken: bool,
 }
 
-/// A sample that was published.
+/// A published sample.
 pub(crate) struct PublishedSample {
     pub(crate) topic: Topic,
     pub(crate) header: Header,
-    /// As in a datagram.
+    /// Payload, encoded as in a datagram.
     pub(crate) payload: Vec<u8>,
 }
 
 /// The topics of one sensor.
 pub(crate) struct MemoryTopics {
     name: String,
-    /// The next number of each topic that is there.
+    /// Next sequence number of each topic that exists.
     next: [Option<u64>; Topic::ALL.len()],
     memory: TopicMemory,
 }
 
 impl TopicMemory {
-    /// What waits of the sensor called `name`, if its consumer was woken since the last call.
+    /// Returns the queued samples of the sensor `name` if its subscriber was woken since the last call.
     pub(crate) fn take(&self, name: &str) -> VecDeque<PublishedSample> {
         let mut all = self.0.borrow_mut();
         let Some(waiting) = all.get_mut(name) else { return VecDeque::new() };
