@@ -1,6 +1,7 @@
-//! How many beams a grid for each model of a turning scanner should have: what share of its points find their bin taken,
-//! and what share of the bins stays empty, against the number of bins; and how long a turn takes to be put there. The
-//! tables of docs/measured.md: `cargo run --release -p scanhub-sim --example beams`.
+//! Measurement of the best number of beams for each model of a rotating scanner. For several numbers of bins in the
+//! grid, it prints the share of points whose bin is already taken and the share of empty bins. It also prints the time
+//! that it takes to fill the grid with a revolution. The tables are in docs/measured.md: `cargo run --release -p
+//! scanhub-sim --example beams`.
 
 use scanhub_drivers::line::{Action, Event, ScannerSession};
 use scanhub_drivers::line::{Grid, NOT_MEASURED, Point};
@@ -20,7 +21,8 @@ fn room() -> Room {
     Room::new(&world, 1)
 }
 
-/// The whole turns that `session` makes of what `device` sends in `seconds`, and the beams that it has by itself.
+/// Returns the complete revolutions that `session` forms from the bytes that `device` sends in `seconds`, and the
+/// default number of beams.
 fn revolutions<S>(mut session: S, mut device: impl Device, seconds: u64) -> (Vec<Vec<Point>>, usize)
 where
     S: ScannerSession,
@@ -63,7 +65,7 @@ where
     (revolutions, session.beams().expect("it was heard"))
 }
 
-/// A grid and the slices that it fills.
+/// A grid and the arrays that it fills.
 struct GridSheet {
     grid: Grid,
     ranges: Vec<u16>,
@@ -77,7 +79,8 @@ impl GridSheet {
         GridSheet { grid, ranges: vec![0; beams], intensities: vec![0; beams], angles: vec![0.0; beams] }
     }
 
-    /// Returns how many of `points` were dropped because their beam was taken, and how many beams were not measured.
+    /// Fills the grid. Returns the number of `points` whose bin was already taken, and the number of beams without a
+    /// point.
     fn fill(&mut self, points: &[Point]) -> (u32, u32) {
         let collisions = self.grid.fill(points, &mut self.ranges, &mut self.intensities, &mut self.angles);
         let empty = self.ranges.iter().filter(|range| **range == NOT_MEASURED).count();
@@ -85,7 +88,7 @@ impl GridSheet {
     }
 }
 
-/// The rows of one model, which measures so many points in a turn.
+/// Prints the rows of one model, which measures `points_per_revolution` points in a revolution.
 fn rows(name: &str, points_per_revolution: usize, revolutions: &[Vec<Point>], percents: &[usize]) {
     let points: usize = revolutions.iter().map(Vec::len).sum();
     for percent in percents {

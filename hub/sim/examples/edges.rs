@@ -1,9 +1,10 @@
-//! Values between two surfaces at edges, in simulated scans. The table of docs/measured.md has the same figures of recordings:
-//! `cargo run --release -p scanhub-sim --example edges -- WORLD..`
-//! World `board` is a board in front of a wall.
+//! Measurement of the values between two surfaces at edges in simulated scans. The table in docs/measured.md has the
+//! same figures for recordings: `cargo run --release -p scanhub-sim --example edges -- WORLD..` The world `board` is a
+//! board in front of a wall.
 //!
-//! At an edge, three beams in a row are on one surface and three on another one. Between them are at most [`MAX_BETWEEN`] beams, all
-//! of them with values between. Beams without width would have other values there, so an oblique surface does not count as an edge.
+//! At an edge, three consecutive beams are on one surface and three on another one. Between them are at most
+//! [`MAX_BETWEEN`] beams, all of them with values between the surfaces. Beams without width would have other values
+//! there, so an oblique surface does not count as an edge.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -48,7 +49,7 @@ fn edges(ranges: &[Option<f64>]) -> Vec<Edge> {
     (0..ranges.len()).filter_map(edge).collect()
 }
 
-/// Edges, those with a value between, and those with several.
+/// Numbers of edges, of edges with a value between the surfaces, and of edges with several.
 #[derive(Default)]
 struct Counts {
     all: u32,
@@ -69,7 +70,8 @@ impl Counts {
     }
 }
 
-/// Median of the standard deviations of the values between, of edges that have one at the same beam in a tenth of the scans.
+/// Returns the median of the standard deviations of the values between. Edges count if they have one value between at
+/// the same beam in a tenth of the scans.
 fn median_deviation(edges_by_beam: &BTreeMap<(u64, usize, usize), Vec<f64>>) -> String {
     let often = edges_by_beam.values().filter(|shares| shares.len() >= SCAN_COUNT as usize / 10);
     let mut deviations: Vec<f64> = often
@@ -161,14 +163,15 @@ pose = [0, 2800]
 jitter_mm = 200
 ";
 const DEPTHS_MM: std::ops::RangeInclusive<f64> = 300.0..=1_500.0;
-/// Beams in a row that make a surface, and the maximum distance of neighbors. Values between are farther from both surfaces.
+/// Number of consecutive beams that form a surface, and maximum distance of neighboring points on it. Values between
+/// are farther than that from both surfaces.
 const MIN_SURFACE_BEAMS: usize = 3;
 const MIN_MARGIN_MM: f64 = 60.0;
 /// Maximum number of values between.
 const MAX_BETWEEN: usize = 3;
-/// Number of seeds, and of scans for each of them and each sensor: 53 s.
+/// Number of seeds, and number of scans for each seed and sensor: 53 s.
 const SEED_COUNT: u64 = 20;
 const SCAN_COUNT: u64 = 200;
-/// Number of scans from one that is measured to the next one, and the time of one.
+/// Number of scans from one that is measured to the next one, and period of the scans.
 const SCAN_SPACING: u64 = 10;
 const SCAN_PERIOD_NS: u64 = 26_640_000;

@@ -1,11 +1,11 @@
 //! The result of one beam: its echo, and the noise of the measured range.
 //!
-//! The echo is computed from the rays that the spot of the beam covers. If they hit two surfaces, the scanner reports one
-//! of them, or, if they are not far apart, a value between them. That value follows the share of the light on each surface,
-//! so it hardly changes from scan to scan. `cargo run --release -p scanhub-sim --example edges` measures it.
+//! The echo is computed from the rays that the spot of the beam covers. If they hit two surfaces, the scanner reports
+//! one of them, or, if they are not far apart, a value between them. That value follows the share of the light on each
+//! surface, so it hardly changes from scan to scan. `cargo run --release -p scanhub-sim --example edges` measures it.
 //!
-//! The noise has layers, each with its own switch. Two effects have no switch: ranges are sent in whole units, and a range
-//! beyond the maximum is sent as a code.
+//! The noise has layers, each with its own switch. Two effects have no switch: ranges are sent in whole units, and a
+//! range beyond the maximum is sent as a code.
 
 use scanhub_drivers::lms;
 use scanhub_schema::Nanos;
@@ -22,12 +22,13 @@ pub struct NoiseModel {
     pub bias_mm: f64,
     /// Standard deviation of a range, in millimeters.
     pub sigma_mm: f64,
-    /// Share of the readings at edges whose standard deviation is [`TAIL_SIGMA_MM`] instead. In a recording of a scanner at rest,
-    /// 316 of 348 beams were never off by 30 mm, and 22 were off in more than one scan of a hundred. So the tail belongs to
-    /// a few beams.
+    /// Share of the readings at edges whose standard deviation is [`TAIL_SIGMA_MM`] instead. In a recording of a
+    /// scanner at rest, 316 of 348 beams were never off by 30 mm, and 22 were off in more than one scan of a hundred.
+    /// So the tail belongs to a few beams.
     pub tail: f64,
-    /// Whether a beam is as wide as a real one. On two surfaces, it then reports one, the other or a value between. If they
-    /// are far apart, it reports one, the other or too weak a signal. Without the layer, a beam is a line without width.
+    /// Whether a beam is as wide as a real one. On two surfaces, it then reports one, the other or a value between. If
+    /// they are far apart, it reports one, the other or too weak a signal. Without the layer, a beam is a line without
+    /// width.
     pub spot: bool,
     /// Share of the beams that report a code although they could report a range.
     pub errors: f64,
@@ -35,8 +36,8 @@ pub struct NoiseModel {
     pub weak: bool,
     /// Whether the sun dazzles.
     pub dazzle: bool,
-    /// Whether beams between whole degrees are measured in later mirror turns, as in a real scanner. Otherwise all beams are
-    /// measured at the same time.
+    /// Whether beams between whole degrees are measured in later revolutions of the mirror, as in a real scanner.
+    /// Otherwise all beams are measured at the same time.
     pub comb: bool,
 }
 
@@ -120,19 +121,20 @@ impl NoiseModel {
         (rng.error < self.errors).then(|| CODES.iter().find(of).map_or(NO_RETURN, |code| code.1))
     }
 
-    /// Returns whether an echo of this `signal` is lost. All are lost below [`MIN_SIGNAL`], and none above twice that. If the
-    /// spot is `torn`, a share of the beams between the two surfaces is lost.
+    /// Returns whether an echo of this `signal` is lost. All are lost below [`MIN_SIGNAL`], and none above twice that.
+    /// If the spot is `torn`, a share of the beams between the two surfaces is lost.
     pub(crate) fn loses(&self, signal: f64, torn: bool, rng: &BeamRng) -> bool {
         let faint = self.weak && rng.weak > signal / MIN_SIGNAL - 1.0;
         faint || torn && rng.weak < EDGE_LOSS_SHARE
     }
 
-    /// Returns whether the sun dazzles this beam. It dazzles `share` of the beams in its direction.
+    /// Returns whether the sun dazzles this beam. It dazzles the given `share` of the beams in its direction.
     pub(crate) fn dazzles(&self, share: f64, rng: &BeamRng) -> bool {
         self.dazzle && rng.dazzle < share
     }
 
-    /// Returns the start of mirror turn `turn` of `turns` in a scan that ended at `end_ns`.
+    /// Returns the start of revolution number `revolution` of the mirror in a scan that ended at `end_ns` and took
+    /// `revolutions` of them.
     pub(crate) fn revolution_ns(&self, revolution: u64, revolutions: u64, end_ns: Nanos) -> Nanos {
         let before_end = if self.comb { revolutions - revolution } else { 1 };
         end_ns.saturating_sub(before_end * lms::variant::MIRROR_PERIOD)
@@ -141,7 +143,7 @@ impl NoiseModel {
 
 #[cfg(test)]
 impl BeamRng {
-    /// The middle of each distribution.
+    /// The random numbers in the middle of each distribution.
     const CENTER: BeamRng = BeamRng {
         mirror: 0.0,
         surface: 0.5,
@@ -168,7 +170,7 @@ pub(crate) struct Echo {
     pub(crate) range_mm: f64,
     /// Signal relative to a white surface at 1 m that is at a right angle to the beam.
     pub(crate) signal: f64,
-    /// Share of such beams that have an echo.
+    /// Share of the beams with the same target that have an echo.
     pub(crate) returns: f64,
     /// Share of the light that fell on reflectors.
     pub(crate) reflector_share: f64,
@@ -198,8 +200,8 @@ impl SpotPart<'_> {
         self.weight * if self.is_reflector() { REFLECTOR_BRIGHTNESS } else { 1.0 }
     }
 
-    /// Returns the target of a beam that hits only this part. An object that moved away counts as an uncovered surface: it is
-    /// new to the beam, but not nearer than the previous target.
+    /// Returns the target of a beam that hits only this part. An object that moved away counts as an uncovered surface:
+    /// it is new to the beam, but not nearer than the previous target.
     fn kind(&self) -> Kind {
         match self.face.map_or(Kind::Static, |face| face.kind) {
             Kind::Box { since_ns } if self.hit.since_ns >= since_ns => Kind::Static,
@@ -244,8 +246,8 @@ fn heaviest<'a>(parts: impl Iterator<Item = &'a SpotPart<'a>>) -> Option<(Option
     parts.max_by(|a, b| a.echo().total_cmp(&b.echo())).map(|part| (part.face, part.hit.range_mm))
 }
 
-/// Returns the face and the range that the scanner reports for a spot on a `near` and perhaps a `far` face. The nearer one
-/// has `share` of the light.
+/// Returns the face and the range that the scanner reports for a spot on a `near` and perhaps a `far` face. The nearer
+/// one has `share` of the light.
 fn reported_surface<'a>(
     near: Option<(Option<&'a Face>, f64)>,
     far: Option<(Option<&'a Face>, f64)>,
@@ -334,8 +336,8 @@ fn signal(face: &Face, range_mm: f64, angle_mdeg: i32) -> f64 {
     white * square / (range_mm / 1000.0).powi(2)
 }
 
-/// Standard deviation of the readings in the tail, in millimeters. Most of them differ by more than 30 mm, which algorithms
-/// take for a change.
+/// Standard deviation of the readings in the tail, in millimeters. Most of them differ by more than 30 mm, which
+/// algorithms take for a change.
 pub const TAIL_SIGMA_MM: f64 = 60.0;
 /// Minimum signal for a range, relative to a white surface at 1 m: 10 % of white at 18 m.
 const MIN_SIGNAL: f64 = 0.0003;
@@ -346,21 +348,21 @@ pub(crate) const NO_RETURN: u16 = 0;
 pub(crate) const DAZZLE: u16 = 1;
 pub(crate) const TOO_WEAK: u16 = 4;
 const OVERFLOW: u16 = 2;
-/// Codes of beams that could have reported a range, with cumulative shares. They come from a recording of a real LMS 200, of
-/// beams that reported a range in at least 16 of 20 scans.
+/// Codes of beams that could have reported a range, with cumulative shares. They come from a recording of a real LMS
+/// 200, of beams that reported a range in at least 16 of 20 scans.
 const CODES: [(f64, u16); 3] = [(0.57, NO_RETURN), (0.94, TOO_WEAK), (1.0, OVERFLOW)];
 /// Diameter of the spot at the window in millimeters, and its growth per millimeter of range.
 const SPOT_DIAMETER_MM: f64 = 10.0;
 const SPOT_GROWTH: f64 = 0.0045;
-/// Standard deviation of a beam's direction, in rays: 0.0025 degrees. The value between two surfaces then has a standard
-/// deviation of about 0.01 of their distance, without the other layers. In recordings of scanners that stand, it is 0.004
-/// to 0.03 in total.
+/// Standard deviation of a beam's direction, in rays: 0.0025 degrees. The value between two surfaces then has a
+/// standard deviation of about 0.01 of their distance, without the other layers. In recordings of scanners that stand,
+/// it is 0.004 to 0.03 in total.
 const MIRROR_SIGMA_RAYS: f64 = 0.04;
 /// Maximum distance of surfaces that count as one, such as the two sides of a corner.
 const MAX_STEP_MM: f64 = 40.0;
-/// Maximum distance of two surfaces whose echoes the scanner takes for one. It separates the echoes of surfaces that are
-/// farther apart, or loses them. Recordings have hardly any value between for edges deeper than 1.25 m, and hardly any lost
-/// beam for edges below 1 m.
+/// Maximum distance of two surfaces whose echoes the scanner takes for one. It separates the echoes of surfaces that
+/// are farther apart, or loses them. Recordings have hardly any value between for edges deeper than 1.25 m, and hardly
+/// any lost beam for edges below 1 m.
 const MAX_MERGE_DISTANCE_MM: f64 = 1_000.0;
 /// Brightness of a reflector relative to other surfaces. In recordings, beams that only touch one report its range.
 const REFLECTOR_BRIGHTNESS: f64 = 100.0;
@@ -368,8 +370,8 @@ const REFLECTOR_BRIGHTNESS: f64 = 100.0;
 const MIN_REPORTED_SHARE: f64 = 0.17;
 /// Share of the beams on a faint surface that have an echo.
 const FAINT_RETURN_SHARE: f64 = 0.15;
-/// Share of the readings at an edge that are values between the two surfaces. In recordings of an LMS 200, it was 203 of 205
-/// for beams with at least one such value.
+/// Share of the readings at an edge that are values between the two surfaces. In recordings of an LMS 200, it was 203
+/// of 205 for beams with at least one such value.
 const MIXED_SHARE: f64 = 0.98;
 
 #[cfg(test)]
@@ -400,7 +402,8 @@ mod tests {
         }
     }
 
-    /// A person whose right edge is `edge_x` to the right of the beam at 0 degrees, 3 m ahead, before a wall at `far_y`.
+    /// Returns a view of a person whose right edge is `edge_x` to the right of the beam at 0 degrees, 3 m ahead, in
+    /// front of a wall at `far_y`.
     fn edge(edge_x: f64, far_y: f64) -> View {
         view(&[
             (wall(-2_000.0, edge_x, 3_000.0), Surface::Plain, Kind::Person),

@@ -22,15 +22,15 @@ pub trait Device {
     /// Receives a byte of the host. Call it after [`Device::poll_transmit`] returned `None` for `arrival.not_after`.
     fn receive(&mut self, byte: u8, arrival: Arrival);
 
-    /// Switches the power off and on. Returns whether a telegram was broken off.
+    /// Switches the power off and on. Returns whether a telegram was aborted.
     fn power_cycle(&mut self, now: Nanos) -> bool;
 
-    /// Lets the voltage dip at `now`, so that the scanner restarts. Returns whether a telegram was broken off.
+    /// Makes the voltage dip at `now`, so that the scanner restarts. Returns whether a telegram was aborted.
     fn brown_out(&mut self, now: Nanos) -> bool {
         self.power_cycle(now)
     }
 
-    /// Breaks off the current telegram. A stream continues with a whole telegram.
+    /// Aborts the current telegram. A stream continues with a whole telegram.
     fn abort(&mut self, now: Nanos);
 
     /// Returns the rate of the line in bits per second.
@@ -39,7 +39,8 @@ pub trait Device {
     /// Returns whether the scanner streams.
     fn streams(&self) -> bool;
 
-    /// Returns the length of a telegram, if all have the same. Otherwise each telegram contains its length.
+    /// Returns the length of a telegram if all telegrams have the same length. Otherwise each telegram contains its
+    /// length.
     fn telegram_len(&self) -> Option<usize> {
         None
     }
@@ -49,7 +50,7 @@ pub trait Device {
         None
     }
 
-    /// Returns the number of requests that would change the permanent settings, carried out or refused.
+    /// Returns the number of requests that would change the permanent settings, executed or refused.
     fn eeprom_writes(&self) -> u64 {
         0
     }
@@ -58,11 +59,11 @@ pub trait Device {
 /// Bytes that the host's hardware delivers at once.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Chunk {
-    /// Up to 62 bytes; empty at the end of a telegram that was broken off between two bursts.
+    /// Up to 62 bytes. There are none at the end of a telegram that was aborted between two bursts.
     pub bytes: Vec<u8>,
     /// Rate of the line in bits per second.
     pub rate: u32,
-    /// Whether the line is idle after them.
+    /// Whether the line is idle after these bytes.
     pub idle_after: bool,
     /// Position in the telegram.
     pub part: ChunkKind,
@@ -86,7 +87,7 @@ pub struct SentTelegram {
     pub is_reply: bool,
     /// The intact telegram.
     pub telegram: Vec<u8>,
-    /// Whether it was broken off by a request or a power cycle.
+    /// Whether it was aborted by a request or a power cycle.
     pub aborted: bool,
 }
 
@@ -113,7 +114,7 @@ impl ChunkSize {
 #[derive(Debug)]
 pub(crate) struct Transmission<T> {
     bytes: Vec<u8>,
-    /// Number of bytes to send: all, or fewer if the transmission was broken off.
+    /// Number of bytes to send. It is smaller than the total if the transmission was aborted.
     send_len: usize,
     taken_len: usize,
     start_ns: Nanos,
@@ -124,7 +125,7 @@ pub(crate) struct Transmission<T> {
 }
 
 impl<T> Transmission<T> {
-    /// Creates a transmission of `bytes` (at least one) from `start_ns` on.
+    /// Creates a transmission of `bytes` (at least one) that starts at `start_ns`.
     pub(crate) fn new(bytes: Vec<u8>, start_ns: Nanos, rate: u32, chunk: ChunkSize, tag: T) -> Self {
         let leaving = bytes.len();
         Transmission { bytes, send_len: leaving, taken_len: 0, start_ns, rate, chunk: chunk.bytes(), tag }
@@ -155,8 +156,8 @@ impl<T> Transmission<T> {
         self.rate
     }
 
-    /// Returns the next chunk, if it is complete at `now`, and whether the line is idle after it. The chunk is empty if
-    /// the transmission was broken off between two bursts.
+    /// Returns the next chunk if it is complete at `now`, and whether the line is idle after it. The chunk is empty if
+    /// the transmission was aborted between two bursts.
     pub(crate) fn take_chunk(&mut self, now: Nanos) -> Option<(&[u8], bool)> {
         if self.next_chunk_ns() > now {
             return None;
@@ -166,12 +167,12 @@ impl<T> Transmission<T> {
         Some((&self.bytes[from..to], to == self.send_len || to % BYTES_PER_REVOLUTION == 0))
     }
 
-    /// Returns whether every byte to send was taken.
+    /// Returns whether all bytes to send were taken.
     pub(crate) fn is_done(&self) -> bool {
         self.taken_len == self.send_len
     }
 
-    /// Returns whether the transmission was broken off before its last byte.
+    /// Returns whether the transmission was aborted before its last byte.
     pub(crate) fn is_aborted(&self) -> bool {
         self.send_len < self.bytes.len()
     }
@@ -189,8 +190,8 @@ impl<T> Transmission<T> {
         (self.bytes, self.tag)
     }
 
-    /// Returns the end of the first `count` (at least 1) bytes. If 508 bytes need less time than a turn of the mirror,
-    /// the rest waits for the next turn.
+    /// Returns the end of the first `count` (at least 1) bytes. If 508 bytes need less time than a revolution of the
+    /// mirror, the rest waits for the next revolution.
     fn end_of_bytes_ns(&self, count: usize) -> Nanos {
         let rate = self.rate;
         let revolutions = (count - 1) / BYTES_PER_REVOLUTION;
@@ -260,7 +261,7 @@ impl TxQueue {
         self.free_ns
     }
 
-    /// Breaks off the current telegram and drops the rest. Returns whether a telegram was broken off.
+    /// Aborts the current telegram and drops all others. Returns whether a telegram was aborted.
     pub(crate) fn abort(&mut self, now: Nanos) -> bool {
         self.queue.retain(|transmission| transmission.start_ns() <= now);
         let mut broken = false;

@@ -1,14 +1,14 @@
-//! Injected faults. A user writes them as `loss=0.00135,burst=1.89`, and one table has the keys with their meaning and
-//! range for the parser, the printer and the help.
+//! Faults that a simulation injects. A user writes them as `loss=0.00135,burst=1.89`. One table defines the keys with
+//! their meaning and range for the parser, the printer and the help.
 //!
-//! [`crate::line_model`] applies the faults between the scanner and the port, except the scanner's own deviations from the
-//! protocol:
+//! [`crate::line_model`] applies the faults between the scanner and the port, except the scanner's own deviations from
+//! the protocol:
 //!
-//! - Damage to bytes. A byte is lost, flipped or doubled, or has random bytes before it. The random numbers of each byte
-//!   are drawn in any case, so that the same seed damages the same bytes in every run, for any size of chunks.
-//! - Damage to telegrams. A telegram is truncated, broken off or sent twice, or has another length field. Its random
+//! - Damage to bytes. A byte is lost, flipped or doubled, or has random bytes before it. The random numbers of each
+//!   byte are drawn in any case, so that the same seed damages the same bytes in every run, for any size of chunks.
+//! - Damage to telegrams. A telegram is truncated, aborted or sent twice, or its length field is changed. Its random
 //!   numbers are drawn at its start.
-//! - Faults at a time, in time of the scanner: `Schedule` has points in time, `FaultWindow` spans of time, `Garbage`
+//! - Faults at a time, by the scanner's clock: `Schedule` has points in time, `FaultWindow` spans of time, `Garbage`
 //!   garbage between or inside telegrams, and `Delay` the delays of chunks.
 
 use std::fmt;
@@ -20,10 +20,10 @@ use scanhub_schema::{Failure, Kind, MILLIS, Nanos};
 use crate::machine::ProtocolQuirks;
 
 /// First cause for which a telegram did not reach the host intact, as recorded in the truth. A telegram is intact if
-/// all its bytes arrive as sent and next to each other.
+/// all its bytes arrive as sent and without other bytes between them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Fault {
-    /// The scanner broke off the telegram, for a request or by itself.
+    /// The scanner aborted the telegram, because of a request or spontaneously.
     Aborted,
     /// Bytes were lost on the line.
     Loss,
@@ -39,7 +39,7 @@ pub enum Fault {
     Length,
     /// A flood of garbage arrived between its bytes.
     Flood,
-    /// A wall of start bytes arrived between its bytes.
+    /// A long run of start bytes arrived between its bytes.
     Wall,
     /// The line was interrupted.
     Silence,
@@ -220,7 +220,8 @@ impl FromStr for Faults {
 }
 
 impl fmt::Display for Faults {
-    /// Writes the keys that differ from their default, in the form that is parsed. Without faults, writes nothing.
+    /// Writes the keys that differ from their default, in the form that the parser accepts. Without faults, the text is
+    /// empty.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let mut faults = *self;
         let parts = TABLE.iter().filter_map(|key| {
@@ -388,12 +389,12 @@ pub(crate) struct TelegramFaults {
     random: fastrand::Rng,
     /// Share of the bytes that arrive, if the telegram is truncated.
     arriving_share: Option<f64>,
-    /// Mask of the flipped bits of the length field; 0 if there are none.
+    /// Mask of the flipped bits of the length field; 0 if no bit is flipped.
     length_mask: u16,
     is_repeated: bool,
-    /// Share of the bytes after which the scanner breaks off the telegram.
+    /// Share of the bytes after which the scanner aborts the telegram.
     abort_share: Option<f64>,
-    /// Length of the telegram, as far as its bytes have announced it.
+    /// Length of the telegram, as far as the bytes so far determine it.
     len: usize,
     has_length_field: bool,
 }
@@ -415,7 +416,7 @@ impl TelegramFaults {
         }
     }
 
-    /// Starts a telegram. It has `len` bytes, or announces its length.
+    /// Starts a telegram of `len` bytes. With `None`, the telegram contains its length.
     pub(crate) fn begin(&mut self, len: Option<usize>) {
         let shares = [self.random.f64(), self.random.f64()];
         // Half of the changed lengths are valid.
@@ -429,7 +430,8 @@ impl TelegramFaults {
         self.has_length_field = len.is_none();
     }
 
-    /// Returns the byte that arrives for `byte` at `position`, or `None` if it is lost, and the fault.
+    /// Returns the byte that arrives in place of `byte` at `position`, or `None` if it is lost, and the fault that
+    /// occurred.
     pub(crate) fn apply(&mut self, position: usize, byte: u8) -> (Option<u8>, Option<Fault>) {
         let [low, high] = self.length_mask.to_le_bytes();
         // Telegrams of a fixed length have it in the byte after the first one.
@@ -449,7 +451,7 @@ impl TelegramFaults {
         (Some(byte ^ flipped), (flipped != 0).then_some(Fault::Length))
     }
 
-    /// Returns whether the scanner breaks off the telegram after `position` bytes.
+    /// Returns whether the scanner aborts the telegram after `position` bytes.
     pub(crate) fn aborts_at(&self, position: usize) -> bool {
         position > 4 && self.abort_share.is_some_and(|share| position >= self.position_at(share))
     }
@@ -474,9 +476,9 @@ pub(crate) struct Schedule {
 }
 
 impl Schedule {
-    /// Creates a schedule. The first time is `at_s`, and each next time is `every_s` later on average, in seconds. If
-    /// `every_s` is 0, there is only the first time. If `at_s` is 0, the first time is drawn like the others, or is
-    /// [`DEFAULT_FAULT_TIME_S`] if there are no others.
+    /// Creates a schedule. The first time is `at_s` seconds, and each next time is `every_s` seconds later on average.
+    /// If `every_s` is 0, there is only the first time. If `at_s` is 0, the first time is drawn like the others. If
+    /// both are 0, it is [`DEFAULT_FAULT_TIME_S`].
     pub(crate) fn new(at_s: f64, every_s: f64, random: fastrand::Rng) -> Schedule {
         let mut schedule = Schedule { every_s, next_ns: 0, random };
         schedule.next_ns = match (at_s > 0.0, every_s > 0.0) {
@@ -529,18 +531,18 @@ impl Schedule {
 pub(crate) struct FaultWindow {
     begins: Schedule,
     span_ns: Nanos,
-    /// End of the span that has begun last.
+    /// End of the span that has started last.
     until_ns: Nanos,
 }
 
 impl FaultWindow {
-    /// Creates spans of `span_s` seconds that begin at the times of [`Schedule::new`]. There are none if `span_s` is 0.
+    /// Creates spans of `span_s` seconds that start at the times of [`Schedule::new`]. There are none if `span_s` is 0.
     pub(crate) fn new(span_s: f64, at_s: f64, every_s: f64, random: fastrand::Rng) -> FaultWindow {
         let begins = if span_s > 0.0 { Schedule::new(at_s, every_s, random) } else { Schedule::never() };
         FaultWindow { begins, span_ns: nanos(span_s), until_ns: 0 }
     }
 
-    /// Creates a single span, which begins at `begin_ns`.
+    /// Creates a single span, which starts at `begin_ns`.
     pub(crate) fn once(begin_ns: Nanos, span_ns: Nanos) -> FaultWindow {
         let begins = Schedule { next_ns: begin_ns, ..Schedule::never() };
         FaultWindow { begins, span_ns, until_ns: 0 }
@@ -556,7 +558,7 @@ impl FaultWindow {
         FaultWindow::new(faults.unplug, faults.unplug_at, faults.unplug_every, random(seed, 9))
     }
 
-    /// Returns the times at which something holds the head of the scanner.
+    /// Returns the times at which the head of the scanner is blocked.
     pub(crate) fn stalls(faults: &Faults, seed: u64) -> FaultWindow {
         FaultWindow::new(faults.hold, faults.hold_at, faults.hold_every, random(seed, 13))
     }
@@ -580,7 +582,7 @@ impl FaultWindow {
     }
 }
 
-/// Garbage that arrives now and then, between telegrams or inside one.
+/// Garbage that arrives at random times, between telegrams or inside one.
 #[derive(Clone, Debug)]
 pub(crate) struct Garbage {
     pub(crate) fault: Fault,
@@ -600,7 +602,7 @@ impl Garbage {
         Garbage::new(Fault::Flood, faults.flood, faults.flood_every, faults.inside, random(seed, 5))
     }
 
-    /// Creates walls of start bytes.
+    /// Creates long runs of start bytes.
     pub(crate) fn walls(faults: &Faults, seed: u64) -> Garbage {
         Garbage::new(Fault::Wall, faults.wall, faults.wall_every, faults.inside, random(seed, 6))
     }
@@ -620,12 +622,13 @@ impl Garbage {
         }
     }
 
-    /// Returns the time of the next garbage, for a line between two telegrams, or inside one if `inside` is set.
+    /// Returns the time of the next garbage between two telegrams, or inside one if `inside` is set. Returns
+    /// [`Nanos::MAX`] if the next garbage arrives at the other kind of position.
     pub(crate) fn due_ns(&self, inside: bool) -> Nanos {
         if inside == self.is_next_inside { self.schedule.next_ns() } else { Nanos::MAX }
     }
 
-    /// Returns the garbage, if it is due before the byte that ends at `now`. `header` has the first bytes of the
+    /// Returns the garbage if it is due before the byte that ends at `now`. `header` contains the first bytes of the
     /// stream's telegrams.
     pub(crate) fn take(&mut self, now: Nanos, inside: bool, header: &[u8]) -> Option<Vec<u8>> {
         if self.due_ns(inside) > now {
@@ -674,7 +677,7 @@ impl Delay {
         }
     }
 
-    /// Returns these delays, with every chunk after those that `other` delays.
+    /// Returns these delays, such that no chunk overtakes those that `other` delays.
     pub(crate) fn after(self, other: &Delay) -> Delay {
         Delay { last_ns: other.last_ns, ..self }
     }

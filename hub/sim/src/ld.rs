@@ -1,5 +1,6 @@
-//! A simulated scanner of LDROBOT, without I/O. Its head rotates and measures point by point, each at its own time, and a
-//! packet has twelve points. It receives nothing. Instead of measuring, it can send recorded packets.
+//! A simulated LDROBOT scanner, without I/O. Its head rotates and measures one point after the other. Each point has
+//! its own time, and a packet has twelve points. The scanner receives nothing. Instead of measuring, it can send
+//! recorded packets.
 
 use std::path::Path;
 
@@ -42,7 +43,7 @@ pub struct LdSettings {
 }
 
 impl LdSettings {
-    /// Returns a `model` with factory settings that was switched on two seconds ago.
+    /// Returns the factory settings of `model`, for a scanner that was switched on two seconds ago.
     pub fn of(model: Model) -> LdSettings {
         LdSettings {
             model,
@@ -57,7 +58,7 @@ impl LdSettings {
     }
 }
 
-/// A simulated scanner of LDROBOT.
+/// A simulated LDROBOT scanner.
 pub struct LdSimulator {
     settings: LdSettings,
     source: Source,
@@ -65,7 +66,7 @@ pub struct LdSimulator {
     power_ns: Nanos,
     /// Time from which on the head rotates.
     rotates_from_ns: Nanos,
-    /// Number of packets since then.
+    /// Number of packets since the head rotates.
     sent: u64,
     rotation: Rotation,
     tx_queue: TxQueue,
@@ -86,7 +87,7 @@ enum Source {
 }
 
 impl LdSimulator {
-    /// Creates the scanner that `settings` describe in `room`, at time 0. Its head rotates already.
+    /// Creates the scanner with `settings` in `room`, at time 0. Its head rotates already.
     pub fn new(settings: LdSettings, room: Room) -> LdSimulator {
         LdSimulator::of(settings, Source::Room(BeamSampler::new(room)))
     }
@@ -104,13 +105,14 @@ impl LdSimulator {
         LdSimulator { settings, source, power_ns: 0, rotates_from_ns: 0, sent: 0, rotation, tx_queue }
     }
 
-    /// Changes the speed from the next packet on. The caller has to simulate the inertia of a real head, whose speed differs
-    /// by at most 5 % between two consecutive packets.
+    /// Changes the speed from the next packet on. The caller has to simulate the inertia of a real head, whose speed
+    /// differs by at most 5 % between two consecutive packets.
     pub fn set_speed(&mut self, revolutions_per_second: f64) {
         self.rotation.set_speed(self.seconds(self.sent * POINTS_PER_PACKET as u64), revolutions_per_second);
     }
 
-    /// Returns the number of packets of a room since the head rotates, including the current one. Each has twelve points.
+    /// Returns the number of packets measured in a room since the head rotates, including the current one. Each has
+    /// twelve points.
     pub fn sent(&self) -> u64 {
         self.sent
     }
@@ -142,7 +144,7 @@ impl LdSimulator {
         point as f64 / self.settings.points_per_second
     }
 
-    /// Restarts the scanner at `now`; packets follow after `boot_ns`. Returns whether a packet was broken off.
+    /// Restarts the scanner at `now`. Its first packet follows after `boot_ns`. Returns whether a packet was aborted.
     fn restart(&mut self, now: Nanos, boot_ns: Nanos, spin_up_s: f64) -> bool {
         let broken = self.tx_queue.abort(now);
         self.power_ns = now;
@@ -156,7 +158,7 @@ impl LdSimulator {
         broken
     }
 
-    /// Returns packet number `number` of a room.
+    /// Returns packet number `number`, measured in the room.
     fn measure(&mut self, number: u64) -> [u8; PACKET_LEN] {
         let first = number * POINTS_PER_PACKET as u64;
         let times_and_angles: [(Nanos, f64); POINTS_PER_PACKET] =
@@ -225,7 +227,7 @@ impl Device for LdSimulator {
         self.restart(now, self.settings.boot_ns, self.settings.spin_up_s)
     }
 
-    /// Restarts the scanner: the clock begins again, while the inertia of the head keeps it turning.
+    /// Restarts the scanner. Its clock restarts at 0, while the inertia of the head keeps it rotating.
     fn brown_out(&mut self, now: Nanos) -> bool {
         self.restart(now, RESTART_NS, 0.0)
     }
@@ -247,11 +249,12 @@ impl Device for LdSimulator {
     }
 }
 
-/// Returns the packets in the recording at `path`, without damaged ones. If it has several sensors, `sensor` selects one.
+/// Returns the packets in the recording at `path`, without damaged ones. If it has several sensors, `sensor` selects
+/// one.
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Input`] if it cannot be read or has no packet, and the errors of [`Recording::of`].
+/// Returns [`Kind::Input`] if the recording cannot be read or has no packet, and the errors of [`Recording::of`].
 pub fn recorded_packets(path: &Path, sensor: Option<&str>) -> Result<Vec<[u8; PACKET_LEN]>, Failure> {
     let whole = Recording::open_stream(path, Some(Family::Ld))?;
     let recording = sensor.map_or(Ok(whole.clone()), |sensor| whole.of(sensor))?;

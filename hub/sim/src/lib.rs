@@ -1,9 +1,9 @@
 //! Simulated scanners on ptys or TCP servers, for tests, demonstrations and measurements without hardware.
 //!
-//! - [`machine`] is a SICK LMS 2xx, [`ld`] a scanner of LDROBOT, and [`rplidar`] one of Slamtec. They do no I/O, and
-//!   time is an argument.
-//! - [`world`] describes their surroundings, [`room`] measures them and has the true values, and [`mount`] tilts a
-//!   scanner.
+//! - [`machine`] is a SICK LMS 2xx, [`ld`] an LDROBOT, and [`rplidar`] an RPLIDAR of Slamtec. They do no I/O, and time
+//!   is an argument.
+//! - [`world`] describes the surroundings of a scanner, [`room`] computes scans of them together with the true values,
+//!   and [`mount`] tilts a scanner.
 //! - [`line_model`] and [`fault`] simulate the line.
 //! - [`port`] is the only file that reads a clock.
 //! - [`simulate()`] is the command.

@@ -1,11 +1,11 @@
-//! The line between scanner and port with all its faults. Time is an argument, so that ptys and tests in virtual time
+//! The line between scanner and port, with all its faults. Time is an argument, so that ptys and tests in virtual time
 //! share this model.
 //!
-//! A [`LineModel`] is driven like a [`Device`]: call [`LineModel::poll_transmit`] until it returns `None`, pass the host's
-//! bytes, and call again at [`LineModel::poll_timeout`]. The properties of the host's port, such as another rate, apply
-//! after the line. A [`UartReceiver`] at the wrong rate converts bytes to bits at the rate of the sender, and samples them at
-//! its own. An ideal UART that samples a little early agrees with recordings of real ones. Bytes with a wrong stop bit are
-//! delivered, as Linux does.
+//! A [`LineModel`] is driven like a [`Device`]: call [`LineModel::poll_transmit`] until it returns `None`, pass the
+//! host's bytes, and call again at [`LineModel::poll_timeout`]. Another rate of the host's port takes effect after the
+//! line. A [`UartReceiver`] at the wrong rate converts bytes to bits at the rate of the sender, and samples them at its
+//! own rate. An ideal UART that samples a little early agrees with recordings of real ones. Bytes with a wrong stop bit
+//! are delivered, as in Linux.
 
 use std::collections::VecDeque;
 
@@ -24,7 +24,7 @@ pub struct Delivery {
     pub bytes: Vec<u8>,
     /// Rate at which they were sent, in bits per second.
     pub rate: u32,
-    /// Whether the line is idle after them.
+    /// Whether the line is idle after these bytes.
     pub idle_after: bool,
     /// The part of a telegram that was sent; `None` for bytes that the scanner did not send.
     pub part: Option<ChunkKind>,
@@ -43,19 +43,19 @@ pub struct LineModel {
     unplug: FaultWindow,
     power: Schedule,
     brownouts: Schedule,
-    /// Whether the line carries nothing at [`RS422_RATE`] or more.
+    /// Whether this is an RS-232 line, which carries nothing at [`RS422_RATE`] or more.
     is_rs232: bool,
     /// Whether the adapter is plugged in.
     plugged: bool,
     /// Number of bytes of the current telegram that were sent.
     position: usize,
-    /// The last one of these bytes.
+    /// The last of the bytes that were sent.
     last: u8,
-    /// First cause for which one of them did not arrive as sent.
+    /// First cause for which a byte of the current telegram did not arrive as sent.
     fault: Option<Fault>,
-    /// Whether a power cycle broke off the current telegram.
+    /// Whether a power cycle aborted the current telegram.
     power_broke: bool,
-    /// Length of a telegram, if all have the same.
+    /// Length of a telegram, if all telegrams have the same length.
     telegram_len: Option<usize>,
     /// First bytes of the last telegram of measured values.
     header: Vec<u8>,
@@ -87,7 +87,7 @@ impl LineModel {
         }
     }
 
-    /// Changes the faults from now on, with new random numbers. Bytes that were sent before do not change.
+    /// Replaces the faults from now on, and draws new random numbers. Bytes that were sent before do not change.
     pub fn set_faults(&mut self, faults: &Faults, seed: u64) {
         let fresh = LineModel::new(faults, seed);
         let delay = fresh.delay.after(&self.delay);
@@ -111,8 +111,8 @@ impl LineModel {
         self.plugged
     }
 
-    /// Passes a byte of the host to `machine`, if the line carries it. Call it after [`LineModel::poll_transmit`] returned
-    /// `None`.
+    /// Passes a byte of the host to `machine`, if the line carries it. Call it after [`LineModel::poll_transmit`]
+    /// returned `None`.
     pub fn receive(&mut self, machine: &mut dyn Device, byte: u8, arrival: Arrival) {
         if self.plugged && self.carries(machine.rate()) {
             machine.receive(byte, arrival);
@@ -214,8 +214,8 @@ impl LineModel {
         arrived
     }
 
-    /// Returns the bytes that arrive for `bytes` of a telegram, and the first fault. The telegram has `len` bytes, if that is
-    /// known.
+    /// Returns the bytes that arrive for `bytes` of a telegram, and the first fault. The telegram has `len` bytes;
+    /// `usize::MAX` means that its length is unknown.
     fn damage_telegram(
         &mut self,
         bytes: &[u8],
@@ -246,7 +246,8 @@ impl LineModel {
             fault = fault.or(telegram_fault).or(is_lost.then_some(Fault::Loss));
             let Some(byte) = changed.filter(|_| !is_lost) else { continue };
             fault = fault.or((flip_mask != 0).then_some(Fault::Flip));
-            // A copy of the first byte is before the intact telegram, and a copy of the last byte is after it.
+            // The first copy of a doubled first byte precedes the intact telegram, and the second copy of a doubled
+            // last byte follows it. Neither damages the telegram.
             let splits = is_doubled && position > 0 && position + 1 < len;
             fault = fault.or(splits.then_some(Fault::Double));
             arrived.extend(std::iter::repeat_n(byte ^ flip_mask, 1 + usize::from(is_doubled)));
@@ -287,7 +288,7 @@ impl Delivery {
 }
 
 /// Changes foreign bytes `between` two bytes of a telegram, so that they differ from their neighbors. Otherwise the
-/// telegram would be intact, with a shift.
+/// bytes of the telegram would still be contiguous, only shifted.
 fn separated(mut bytes: Vec<u8>, between: Option<(u8, u8)>) -> Vec<u8> {
     if let (Some((before, after)), [first, rest @ ..]) = (between, &mut bytes[..]) {
         let last = rest.last_mut();
@@ -318,8 +319,8 @@ pub struct UartReceiver {
 pub struct BaudMismatch(Option<((u32, u32), UartReceiver)>);
 
 impl BaudMismatch {
-    /// Receives bytes like [`UartReceiver::receive`]. The line has the first of the `rates`, and the port the second, in bits per
-    /// second.
+    /// Receives bytes like [`UartReceiver::receive`]. The first of the `rates` is that of the line, and the second that
+    /// of the port, in bits per second.
     pub fn receive(&mut self, rates: (u32, u32), bytes: &[u8], idle_after: bool) -> Vec<u8> {
         let known = self.0.take().filter(|(known, _)| *known == rates);
         let (_, receiver) =
@@ -337,7 +338,7 @@ impl BaudMismatch {
 enum ReceiverState {
     /// Waits for a falling edge after bit number `after`, whose level was `level`.
     Hunting { after: u64, level: bool },
-    /// A start bit fell at the beginning of bit number `start`; `bits` data bits were sampled.
+    /// Samples a byte whose start bit fell at the beginning of bit number `start`. `bits` data bits were sampled.
     Sampling { start: u64, bits: u32, byte: u8 },
 }
 
@@ -361,7 +362,7 @@ impl UartReceiver {
             self.levels.push_back(true);
         }
         if idle_after {
-            // The time of a byte of the receiver, so that it completes the last byte.
+            // An idle line of one receiver byte lets the receiver complete the last byte.
             let bits = (11.0 * self.ratio).ceil() as usize + 1;
             self.levels.extend(std::iter::repeat_n(true, bits));
         }
@@ -407,12 +408,12 @@ impl UartReceiver {
     }
 }
 
-/// Lowest rate that RS-232 does not carry, in bits per second.
+/// Lowest rate that an RS-232 line does not carry, in bits per second.
 const RS422_RATE: u32 = 500_000;
 /// Length of a stream's header in bytes: STX to count word.
 const HEADER_LEN: usize = 7;
-/// Position in a bit at which the receiver samples. 0.40 to 0.48 agree with a recording of a real port at 19200 on a line
-/// at 38400; 0.5 and more do not (reference, section 2).
+/// Position in a bit at which the receiver samples. 0.40 to 0.48 agree with a recording of a real port at 19200 on a
+/// line at 38400; 0.5 and more do not (reference, section 2).
 const SAMPLE_POSITION: f64 = 0.45;
 
 #[cfg(test)]
@@ -458,7 +459,8 @@ mod tests {
         }
     }
 
-    /// Compares the recording of a host at 19200 on a line at 38400 with the model, which receives what that scanner sent.
+    /// Compares a recording of a host at 19200 on a line at 38400 with the output of the model for the bytes that the
+    /// scanner sent.
     #[test]
     fn agrees_with_a_recording() {
         let data = std::env::var_os("SCANHUB_DATA").map_or_else(
@@ -474,7 +476,7 @@ mod tests {
         let model = UartReceiver::new(38_400, 19_200).receive(&sent, true);
         let grams: HashSet<&[u8]> = model.windows(4).collect();
         let found = real.windows(4).filter(|gram| grams.contains(gram)).count();
-        // The recordings show different scenes; with a sample position of 0.5 none at all is found.
+        // The recordings show different scenes. With a sample position of 0.5, no run is found.
         println!("{found} of {} runs of 4 bytes are in the model's output", real.len() - 3);
         assert!(found > 3_000, "{found}");
         let histogram = |bytes: &[u8]| {

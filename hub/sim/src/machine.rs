@@ -1,9 +1,9 @@
-//! A simulated LMS, without I/O: bytes of the host and times go in, and chunks of bytes with the time of their
-//! transmission come out. It is driven as a [`Device`]; [`ScanSource`] provides its measured values, and [`crate::line_model`]
-//! damages the bytes later.
+//! A simulated LMS, without I/O. Its inputs are bytes of the host and times, and its outputs are chunks of bytes with
+//! the times of their transmission. It is driven as a [`Device`]; [`ScanSource`] provides its measured values, and
+//! [`crate::line_model`] damages the bytes later.
 //!
 //! It supports every request on the way to a stream, every mode that sends measured values, and the part of the
-//! installation mode that changes the configuration and the permanent rate. Every other well-formed request is refused
+//! installation mode that changes the configuration and the permanent rate. It refuses every other well-formed request
 //! with 92h, as a real scanner does with requests that it does not support. It counts the requests that would write its
 //! EEPROM. Automatic code never sends one, and tests check the count.
 
@@ -50,7 +50,7 @@ pub struct Settings {
     pub configuration_len: usize,
     /// State in which an earlier host left the scanner.
     pub start: StartState,
-    /// Time from power-on to the boot message 90h. A real scanner takes up to 60 s.
+    /// Time from power-on to the boot message 90h. A real scanner needs up to 60 s.
     pub boot_ns: Nanos,
     /// The byte that ends each reply: 10h for a healthy scanner, 11h after some events (Telegram listing 8).
     pub status: u8,
@@ -65,7 +65,7 @@ pub struct Settings {
     /// Speed of the simulation's time, relative to that of the host. The host measures the gaps of its requests by its
     /// own clock.
     pub speed: f64,
-    /// Seed of the delays before replies, and of the deviations.
+    /// Seed of the random delays before replies, and of the deviations.
     pub seed: u64,
 }
 
@@ -128,7 +128,7 @@ pub struct ProtocolQuirks {
     /// Whether the scanner drops requests whose bytes arrive less than 55 us apart (Telegram listing 4.3). Most hosts
     /// ignore that limit.
     pub checks_gaps: bool,
-    /// Time from each ACK to the reply; 0 selects a random time as of real scanners.
+    /// Time from each ACK to the reply; 0 selects a random time in the range of real scanners.
     pub reply_delay_ns: Nanos,
     /// Commands that the scanner refuses with 92h.
     pub refused_commands: Vec<u8>,
@@ -178,7 +178,7 @@ struct Reply {
     effect: ReplyEffect,
 }
 
-/// Action after a reply.
+/// Action after the transmission of a reply.
 #[derive(Clone, Copy, Debug)]
 enum ReplyEffect {
     Nothing,
@@ -189,7 +189,7 @@ enum ReplyEffect {
 }
 
 impl LmsSimulator {
-    /// Creates the scanner that `settings` describe, at time 0.
+    /// Creates the scanner with `settings`, at time 0.
     pub fn new(settings: Settings, source: ScanSource) -> Self {
         let mut machine = LmsSimulator {
             eeprom: Eeprom::new(&settings),
@@ -233,7 +233,7 @@ impl LmsSimulator {
         self.settings.quirks = quirks;
     }
 
-    /// Returns a telegram of measured values for a scanner in `operating`, with a scan that ended at `at_ns`.
+    /// Returns a telegram of measured values in mode `operating`, with a scan that ended at `at_ns`.
     fn measure(&mut self, operating: &OperatingMode, at_ns: Nanos) -> Option<Vec<u8>> {
         let (variant, unit, mode) = (self.variant, self.eeprom.unit(), self.eeprom.mode());
         let Settings { address, status, .. } = self.settings;
@@ -590,7 +590,7 @@ impl Device for LmsSimulator {
 
     /// Switches the power off and on. The transmission ends with the byte in the transmitter, and only the EEPROM
     /// remains. After the start-up, the scanner sends the boot message 90h at the permanent rate or at 9600. Returns
-    /// whether a telegram was broken off.
+    /// whether a telegram was aborted.
     fn power_cycle(&mut self, now: Nanos) -> bool {
         self.queue.retain(|transmission| transmission.start_ns() <= now);
         self.queue.truncate(1);
@@ -606,8 +606,8 @@ impl Device for LmsSimulator {
         broken
     }
 
-    /// Breaks off the current transmission, as if for a request that the scanner then ignored. A stream continues with
-    /// a complete scan.
+    /// Aborts the current transmission, as a request does that the scanner then ignores. A stream continues with a
+    /// complete scan.
     fn abort(&mut self, now: Nanos) {
         if self.queue.front().is_some_and(|front| front.start_ns() <= now) {
             self.interrupt(now);
@@ -679,7 +679,7 @@ impl Eeprom {
         self.permanent_baud.unwrap_or(Baud::B9600)
     }
 
-    /// Returns the EEPROM with `data` as the leading bytes of its configuration, without excess bytes. Returns `None`
+    /// Returns the EEPROM with the start of its configuration replaced by `data`, without excess bytes. Returns `None`
     /// if a scanner does not accept these settings.
     fn with_configuration(&self, data: &[u8]) -> Option<Eeprom> {
         let mut eeprom = self.clone();

@@ -1,5 +1,5 @@
-//! A mount that tilts a sensor: its angle at each time, and the reports of its encoder, which may have faults. Both are pure
-//! functions of time.
+//! A mount that tilts a scanner: its angle at each time, and the reports of its encoder, which may have faults. Both
+//! are pure functions of time.
 
 use std::cmp::Reverse;
 use std::f64::consts::PI;
@@ -9,13 +9,13 @@ use scanhub_schema::Nanos;
 use crate::shape::Plane;
 use crate::shape::Point;
 
-/// A mount with a horizontal axis across the view, which swings to and fro at a constant speed. Greater angles look farther
-/// down.
+/// A mount with a horizontal axis across the field of view, which swings back and forth at a constant speed. Larger
+/// angles are farther down.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Mount {
     /// Height of the axis above the floor.
     pub height_mm: f64,
-    /// Position of the sensor relative to the axis at angle 0: ahead, and up.
+    /// Position of the scanner relative to the axis at angle 0: ahead, and up.
     pub arm_mm: (f64, f64),
     /// Angle at the start and at one reversal.
     pub from_deg: f64,
@@ -34,9 +34,9 @@ pub struct Mount {
 pub struct Fault {
     /// Kind of the fault.
     pub kind: FaultKind,
-    /// Start in seconds since the start of the sensor.
+    /// Start in seconds since the start of the scanner.
     pub from_s: f64,
-    /// End in seconds since the start of the sensor.
+    /// End in seconds since the start of the scanner.
     pub until_s: f64,
 }
 
@@ -78,7 +78,7 @@ pub(crate) struct Encoder {
     mount: Mount,
     /// Number of the next report.
     number: u64,
-    /// Reports that were sent and have not arrived. The last one arrives first.
+    /// Reports that were sent and have not arrived, in reverse order of arrival.
     pending: Vec<Report>,
 }
 
@@ -88,7 +88,7 @@ impl Encoder {
         Encoder { mount, number: 0, pending: Vec::new() }
     }
 
-    /// Returns the next report that has arrived at `now_ns`.
+    /// Returns the next report that has arrived by `now_ns`.
     pub(crate) fn poll(&mut self, now_ns: Nanos) -> Option<Report> {
         while self.next_report_ns() <= now_ns {
             self.pending.extend(self.mount.report(self.number));
@@ -110,7 +110,7 @@ impl Encoder {
 }
 
 impl Mount {
-    /// Returns the angle of the sensor at `time_ns` in radians.
+    /// Returns the angle of the scanner at `time_ns` in radians.
     pub fn angle_rad(&self, time_ns: Nanos) -> f64 {
         self.angle_deg(time_ns as f64 / 1e9).to_radians()
     }
@@ -147,7 +147,7 @@ impl Mount {
         })
     }
 
-    /// Returns the plane in which the sensor measures at `time_ns`.
+    /// Returns the plane in which the scanner measures at `time_ns`.
     pub(crate) fn plane(&self, time_ns: Nanos) -> Plane {
         let down_deg = self.angle_deg(time_ns as f64 / 1e9);
         let (sin, cos) = down_deg.to_radians().sin_cos();
@@ -184,7 +184,8 @@ impl Fault {
     }
 }
 
-/// Speed at which the error of [`FaultKind::Drift`] grows, in degrees per second. No step of it differs from the mount's motion.
+/// Speed at which the error of [`FaultKind::Drift`] grows, in degrees per second. It is so slow that each step of the
+/// angle still looks like the mount's motion.
 const DRIFT_DEG_S: f64 = 2.0;
 
 #[cfg(test)]

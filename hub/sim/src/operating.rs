@@ -1,6 +1,6 @@
 //! Operating modes of an LMS: the telegrams that a scanner sends continuously after a request 20h, or once after the
-//! request for one value (Telegram listing, 20h, 30h to 3Fh and 75h). [`ScanSource`] provides the measured values: a room, or
-//! a recording.
+//! request for one value (Telegram listing, 20h, 30h to 3Fh and 75h). [`ScanSource`] provides the measured values: a
+//! room, or a recording.
 
 use scanhub_drivers::lms::command::Request;
 use scanhub_drivers::lms::measured::{ScanFrame, encode_with};
@@ -28,7 +28,7 @@ pub enum OperatingMode {
     MeanRange(u8, u16, u16),
     /// 29h: the values from one beam to another, with the states of the fields, BEh.
     Fields(u16, u16),
-    /// 2Ah: every mirror turn as a separate scan, B0h with the partial bit.
+    /// 2Ah: every revolution of the mirror as a separate scan, B0h with the partial bit.
     Partial,
     /// 2Bh: range and reflectivity of up to five ranges of beams, F5h.
     Reflectivity(Vec<(u16, u16)>),
@@ -70,8 +70,8 @@ impl OperatingMode {
         !matches!(self, OperatingMode::Installation | OperatingMode::OnRequest)
     }
 
-    /// Returns the mode that `request` selects, once or from now on, if a scanner in `variant` supports it. It is never the
-    /// installation mode, which needs a password.
+    /// Returns the mode that `request` selects, once or from now on, if a scanner in `variant` supports it. It is never
+    /// the installation mode, which needs a password.
     pub(crate) fn of_request(request: Request, variant: Variant) -> Option<OperatingMode> {
         let operating = match request {
             Request::Stream | Request::Values(1) => OperatingMode::All,
@@ -107,7 +107,8 @@ impl OperatingMode {
             OperatingMode::Reflectivity(ranges) => {
                 let pairs: usize =
                     ranges.iter().map(|(first, last)| usize::from(last.abs_diff(*first)) + 1).sum();
-                // The maximum of LENGTH: 808 less command, number of ranges, their heads, and status.
+                // Maximum of LENGTH, which is 808, minus the command, the number of ranges, their headers, and the
+                // status.
                 let room = 6 * ranges.len() + 4 * pairs <= 804;
                 room && ranges.iter().all(|&(first, last)| within(first, last))
             }
@@ -115,7 +116,7 @@ impl OperatingMode {
         }
     }
 
-    /// Returns the minimum number of mirror turns from one telegram to the next.
+    /// Returns the minimum number of revolutions of the mirror from one telegram to the next.
     pub(crate) fn revolutions(&self, variant: Variant) -> u64 {
         match self {
             OperatingMode::Partial => 1,
@@ -190,7 +191,7 @@ impl MeasuredValues<'_> {
         encode_with(self.address, frame, words, self.status).bytes().to_vec()
     }
 
-    /// Returns the numbers of the mirror turn and of the telegram, if real-time indices are on.
+    /// Returns the numbers of the revolution and of the telegram, or `None` if real-time indices are off.
     fn indices(&self) -> Option<(u8, u8)> {
         self.index.map(|index| ((self.at_ns / MIRROR_PERIOD) as u8, index))
     }
@@ -199,8 +200,8 @@ impl MeasuredValues<'_> {
         self.room.scan(self.variant, self.unit, self.mode, self.at_ns)
     }
 
-    /// Returns ranges without levels, each the mean of `shots` scans. A beam without a range in a fifth of them has the code
-    /// for overflow.
+    /// Returns ranges without levels, each the mean of `shots` scans. A beam without a range in at least a fifth of the
+    /// scans has the code for overflow.
     fn means(&self, shots: u8) -> Vec<u16> {
         let (greatest, scan) = (self.mode.max_value(), self.variant.revolutions() * MIRROR_PERIOD);
         let mut sums = vec![(0u32, 0u32); self.variant.beams()];
@@ -248,8 +249,8 @@ pub enum ScanSource {
 }
 
 impl ScanSource {
-    /// Returns the next telegram of a scanner in `operating`, with the values that `measure` takes from the room. Returns
-    /// `None` at the end of a recording, and in a mode that sends nothing.
+    /// Returns the next telegram of a scanner in `operating`, with the values that `measure` takes from the room.
+    /// Returns `None` at the end of a recording, and in a mode that sends nothing.
     pub(crate) fn telegram<'a>(
         &'a mut self,
         operating: &OperatingMode,

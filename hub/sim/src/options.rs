@@ -1,4 +1,4 @@
-//! The options of `simulate`: their values, the parsers of their texts, and the check that they fit together.
+//! Options of `simulate`: their values, the parsers of their texts, and the check of their combination.
 
 use std::path::PathBuf;
 use std::str::FromStr;
@@ -22,9 +22,9 @@ use crate::world::World;
 pub struct SimulateOptions {
     /// Ports of the scanners: the path of the symlink to a pty, or `tcp:HOST:PORT` for a TCP server.
     pub ports: Vec<PathBuf>,
-    /// Rate of the line; `None` selects the permanent rate, or else 9600.
+    /// Rate of the line; `None` selects the permanent rate, or 9600 if there is no permanent rate.
     pub baud: Option<Baud>,
-    /// Rate at power-on that a former owner has written into the scanner.
+    /// Rate at power-on that a previous owner has written into the scanner.
     pub permanent_baud: Option<Baud>,
     /// Address of the scanners, 0 to 127.
     pub address: u8,
@@ -44,7 +44,7 @@ pub struct SimulateOptions {
     pub short_configuration: bool,
     /// Surroundings of the scanners, unless they replay.
     pub world: World,
-    /// Recording to send instead.
+    /// Recording to send instead of scans of a world.
     pub replay: Option<PathBuf>,
     /// Sensor of the recording that each port plays: one for all ports, or none if the recording has only one.
     pub sensors: Vec<String>,
@@ -63,26 +63,27 @@ pub struct SimulateOptions {
     pub force: bool,
     /// Type that the scanners report, which limits what they support.
     pub family: LmsModel,
-    /// Angle and resolution; `None` selects those of the recording, or else of the type.
+    /// Angle and resolution; `None` selects those of the recording, or those of the type without a recording.
     pub variant: Option<Variant>,
-    /// Unit; `None` selects that of the recording, or else of the type.
+    /// Unit; `None` selects that of the recording, or that of the type without a recording.
     pub unit: Option<Unit>,
-    /// Measuring mode; `None` selects that of the recording, or else 0x01.
+    /// Measuring mode; `None` selects that of the recording, or 0x01 without a recording.
     pub mode: Option<Mode>,
     /// Number of bytes that the host's hardware delivers at once.
     pub chunk: ChunkSize,
     /// Whether the scanners wait while the host's buffer is full. Otherwise bytes are lost, as on a real line.
     pub lossless: bool,
-    /// Scanner of another family; `None` is an LMS. Options that only an LMS has must keep their defaults then.
+    /// Scanner of another family; `None` is an LMS. With a scanner, options that only an LMS has must have their
+    /// defaults.
     pub scanner: Option<Scanner>,
 }
 
 /// A scanner of another family than LMS.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Scanner {
-    /// One of LDROBOT.
+    /// An LDROBOT.
     Ld(ld::Model),
-    /// One of Slamtec.
+    /// An RPLIDAR.
     Rplidar {
         /// The model.
         model: rplidar::Model,
@@ -236,8 +237,8 @@ pub fn type_name(family: LmsModel) -> String {
     format!("{};301063;V02.30 ", family.name().to_uppercase())
 }
 
-/// Returns the scanner that `family`, `model` and the name of a `mode` select. Returns `None` for an LMS, whose models are
-/// types and whose modes are numbers.
+/// Returns the scanner that `family`, `model` and the name of a `mode` select. Returns `None` for an LMS, whose models
+/// are types and whose modes are numbers.
 pub fn parse_family(
     family: &str,
     model: Option<&str>,

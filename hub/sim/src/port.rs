@@ -1,13 +1,13 @@
-//! The port that a host opens to reach a simulated scanner: a pty with a symlink as its name, or a TCP server that passes
-//! bytes on as a serial server in raw mode does. A port that is dropped disappears like an adapter that was unplugged.
-//! The clock is here too: no other file of this crate reads the kernel's clock.
+//! The port that a host opens to reach a simulated scanner: a pty with a symlink as its name, or a TCP server that
+//! passes on bytes like a serial server in raw mode. A port that is dropped disappears like an adapter that was
+//! unplugged. The clock is here too: no other file of this crate reads the kernel's clock.
 //!
 //! A pty differs from a serial line in three ways:
 //!
-//! - It keeps bytes that no host reads. Nothing is written while the host's side is closed, and unread bytes are
-//!   discarded when it closes.
-//! - Its exclusive mode survives the last close, so it is cleared.
-//! - It does not report that it is closed before the first open, so it is opened and closed once.
+//! - It keeps bytes that no host reads. The simulator writes nothing while the host's side is closed, and discards
+//!   unread bytes when it closes.
+//! - Its exclusive mode survives the last close, so the simulator clears it.
+//! - It does not report that it is closed before the first open, so the simulator opens and closes it once.
 
 use std::ffi::OsStr;
 use std::fs::{self, Metadata};
@@ -37,7 +37,7 @@ pub(crate) enum SimPort {
 }
 
 impl SimPort {
-    /// Creates a port: a server for `tcp:HOST:PORT`, or else a pty with a symlink at the path `port`.
+    /// Creates a port: a server for `tcp:HOST:PORT`, and otherwise a pty with a symlink at the path `port`.
     pub(crate) fn new(port: &Path) -> Result<SimPort, Failure> {
         if let Some(address) = server(port) {
             return Server::open(address).map(SimPort::Tcp);
@@ -101,7 +101,7 @@ impl SimPort {
         }
     }
 
-    /// Returns the descriptor to wait for. A pty that no host has open is not waited for, because it would be ready all
+    /// Returns the descriptor to wait for. There is none for a pty that no host has open, because it would be ready all
     /// the time.
     pub(crate) fn wait_fd(&self, is_open: bool) -> Option<BorrowedFd<'_>> {
         match self {
@@ -189,7 +189,7 @@ impl Server {
         bytes.len() - rest.len()
     }
 
-    /// Returns the descriptor to wait for: that of the connection, or else that of the listener.
+    /// Returns the descriptor to wait for: that of the connection, or that of the listener while no host is connected.
     pub(crate) fn wait_fd(&self) -> BorrowedFd<'_> {
         match &self.host {
             Some(host) => host.as_fd(),
@@ -217,7 +217,7 @@ pub struct Pty {
 pub(crate) enum WaitResult {
     /// Time, bytes, or the host's side was closed.
     Line,
-    /// One of the stop descriptors is readable.
+    /// A stop descriptor is readable.
     Stop,
 }
 
@@ -299,7 +299,7 @@ impl Pty {
 
     /// Discards unread bytes after the host's side was closed, and lets users other than root open it again.
     fn clean_up_after_close(&self) {
-        // If another host has opened it exclusively in the meantime, there is nothing to clean up.
+        // If another host has opened the pty exclusively in the meantime, there is nothing to clean up.
         if let Ok(slave) = self.open_slave() {
             let _ = tcflush(&slave, QueueSelector::IFlush);
             let _ = ioctl_tiocnxcl(&slave);

@@ -1,13 +1,13 @@
-//! Decodes the bytes of a host into requests of an LMS. Bytes that a host writes at once leave its UART one after the
-//! other, which a pty does not imitate. Each byte is therefore received at the time at which the line would have carried it.
-//! A request with too long a gap is dropped. A strict scanner also drops a request with too short gaps.
+//! Decoder of the requests of a host to an LMS. If a host writes several bytes at once, its UART sends them one after
+//! the other, which a pty does not imitate. The decoder therefore handles each byte at the time at which the line would
+//! have carried it. It drops a request with too long a gap. A strict scanner also drops a request with too short gaps.
 
 use std::fmt;
 
 use scanhub_drivers::lms::telegram::{FRAME_LEN, MAX_LENGTH, STX};
 use scanhub_schema::{MICROS, MILLIS, Nanos, line_time};
 
-/// Time at which the host wrote a byte, as far as it is known.
+/// Time at which the host wrote a byte, as a range.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Arrival {
     /// Earliest possible time.
@@ -82,8 +82,8 @@ impl RequestDecoder {
         self.dropped.take()
     }
 
-    /// Adds a byte on a line at `baud` bits per second. Returns the request that it completes, unless its gaps were certainly
-    /// wrong.
+    /// Adds a byte on a line at `baud` bits per second. Returns the request that it completes, unless its gaps were
+    /// certainly wrong.
     pub(crate) fn receive(&mut self, byte: u8, arrival: Arrival, baud: u32) -> Option<DecodedRequest> {
         let possible = self.narrow_arrival(arrival, baud);
         self.last = Some(possible);
@@ -109,13 +109,14 @@ impl RequestDecoder {
         Some(DecodedRequest { bytes, at: possible.not_before.max(arrival.not_after) })
     }
 
-    /// Returns the time at which the line can have carried a byte that the host wrote at `arrival`. Drops the present request
-    /// if the byte is too late for it.
+    /// Returns the range of times at which the line can have carried a byte that the host wrote at `arrival`. Drops the
+    /// incomplete request if the byte is too late for it.
     fn narrow_arrival(&mut self, arrival: Arrival, baud: u32) -> Arrival {
         let Some(last) = self.last else { return arrival };
         let scaled = |span: Nanos| (span as f64 * self.speed) as Nanos;
         let byte_ns = scaled(line_time(1, baud));
-        // Bytes that were read at once arrived one after the other, so each one leaves less time for the next.
+        // The line carries bytes one after the other even if they were read at once, so each one leaves less time for
+        // the next.
         let min_gap = if self.is_strict { scaled(MIN_GAP) } else { 0 };
         let earliest = last.not_before + byte_ns + min_gap;
         let latest = last.not_after + byte_ns + scaled(MAX_GAP);
@@ -248,8 +249,8 @@ mod tests {
             (0, 0, false),
             (6 * MILLIS, 0, true),
             (6 * MILLIS + MICROS, 0, false),
-            // Bytes that may have arrived long before they were read prove nothing. But seven bytes within 2 ms were too
-            // fast for 9600 in any case.
+            // Bytes that may have arrived long before they were read prove nothing. But seven bytes within 2 ms were
+            // too fast for 9600 in any case.
             (40 * MICROS, 50 * MICROS, true),
             (0, 100 * MICROS, false),
             (6_100 * MICROS, MILLIS, true),

@@ -1,6 +1,6 @@
-//! The measurements of an LMS 2xx in a world, with the true target of each beam. They are a pure function of world, seed
-//! and time. [`PrecomputedScans`] are measured once and then repeated, for simulations in which hours pass in seconds:
-//! measuring a scan takes far longer than sending it.
+//! Measurements of an LMS 2xx in a world, with the true target of each beam. They are a pure function of world, seed
+//! and time. [`PrecomputedScans`] are measured once and then repeated, for simulations that run through hours in
+//! seconds: measuring a scan takes far longer than sending it.
 
 use std::sync::Arc;
 
@@ -39,8 +39,8 @@ impl Room {
         Room::of_port(world, seed, 0)
     }
 
-    /// Creates the room of the sensor at port number `port`, counted from 0. The sensors of a world have the first ports. The
-    /// next port belongs to another such world with the next seed.
+    /// Creates the room of the sensor at port number `port`, counted from 0. The first ports belong to the sensors of
+    /// the world. The next port belongs to a second copy of the world, with the next seed.
     pub fn of_port(world: &World, seed: u64, port: u64) -> Self {
         let sensors = world.sensors() as u64;
         let (seed, sensor) = (seed.wrapping_add(port / sensors), port % sensors);
@@ -58,8 +58,8 @@ impl Room {
         Room { seed: 0, view: RoomView::PrecomputedScans(series, changes) }
     }
 
-    /// Returns the values of the scan whose last mirror turn ended at `end_ns`: one for each beam of `variant`, in `unit`, split
-    /// according to `mode`. The same arguments give the same values.
+    /// Returns the values of the scan whose last revolution of the mirror ended at `end_ns`: one for each beam of
+    /// `variant`, in `unit`, split according to `mode`. The same arguments give the same values.
     pub fn scan(&self, variant: Variant, unit: Unit, mode: Mode, end_ns: Nanos) -> Vec<u16> {
         match &self.view {
             RoomView::PrecomputedScans(series, changes) => {
@@ -74,17 +74,17 @@ impl Room {
         self.measure(angles_mdeg(variant), variant.revolutions(), unit, mode, end_ns, &|_| Vec::new())
     }
 
-    /// Returns the values of the partial scan whose mirror turn ended at `end_ns`: 181 beams on whole degrees, or 180 that are
-    /// `quarter` quarters of a degree after them.
+    /// Returns the values of the partial scan whose revolution of the mirror ended at `end_ns`: 181 beams on whole
+    /// degrees, or 180 that are `quarter` quarters of a degree after them.
     pub(crate) fn partial_scan(&self, quarter: u8, unit: Unit, mode: Mode, end_ns: Nanos) -> Vec<u16> {
         let beams = if quarter > 0 { 180 } else { 181 };
         let angles_mdeg = (0..beams).map(|beam| 1_000 * beam + 250 * i32::from(quarter) - 90_000).collect();
         self.measure(angles_mdeg, 1, unit, mode, end_ns, &|_| Vec::new()).words
     }
 
-    /// Returns the values of [`Room::scan`] with more shapes in view, such as the legs of people and the doors of a
-    /// simulation of the caller. `shapes` returns them at a time, in the frame of the world. A world that is not a scene, and a
-    /// tilted sensor, do not show them.
+    /// Returns the values of [`Room::scan`] with additional shapes in view, such as the legs of people and the doors in
+    /// a simulation of the caller. `shapes` returns the shapes at a time, in the frame of the world. A world that is
+    /// not a scene, and a tilted sensor, do not show them.
     pub fn scan_with(
         &self,
         shapes: &dyn Fn(Nanos) -> Vec<Shape>,
@@ -104,8 +104,8 @@ impl Room {
         }
     }
 
-    /// Returns what the beams at `angles_mdeg` measure, one after the other in the next of `turns` mirror turns, with
-    /// `shapes` in view.
+    /// Returns the measurements of the beams at `angles_mdeg`, with `shapes` in view. Consecutive beams are measured in
+    /// consecutive ones of the `revolutions` of the mirror.
     fn measure(
         &self,
         angles_mdeg: Vec<i32>,
@@ -140,8 +140,8 @@ fn angles_mdeg(variant: Variant) -> Vec<i32> {
     (0..variant.beams() as i32).map(|beam| variant.first_angle_mdeg() + beam * step_mdeg).collect()
 }
 
-/// Returns what the beams at `angles_mdeg` measure of `world` and `shapes`, one after the other in the next of `turns` mirror
-/// turns.
+/// Returns the measurements of the beams at `angles_mdeg` in `world`, with `shapes` in view. Consecutive beams are
+/// measured in consecutive ones of the `revolutions` of the mirror.
 #[allow(clippy::too_many_arguments)]
 fn measure(
     world: &WorldView,
@@ -162,7 +162,7 @@ fn measure(
     let views: Vec<View> = times.iter().map(|&time_ns| world.view_with(time_ns, &shapes(time_ns))).collect();
     let mut scan = LabeledScan::default();
     for (beam, &angle_mdeg) in angles_mdeg.iter().enumerate() {
-        // The beams between whole degrees are measured in the turns after the first.
+        // Beams between whole degrees are measured in the later revolutions.
         let revolution = beam % revolutions as usize;
         measure_beam(
             world,
@@ -176,8 +176,8 @@ fn measure(
     scan
 }
 
-/// Returns the same for a sensor whose plane turns during the scan. Each beam is measured at its own time according to
-/// [`ScanHead::lms`]. Without layer `comb`, all are measured at the end.
+/// Returns the measurements of a sensor whose plane moves during the scan. Each beam is measured at its own time
+/// according to [`ScanHead::lms`]. Without the layer `comb`, all are measured at the end.
 fn measure_tilted(
     world: &WorldView,
     angles_mdeg: &[i32],
@@ -202,7 +202,7 @@ fn measure_tilted(
     scan
 }
 
-/// Adds to `scan` the beam at the angle and time `at`. `view` contains the surroundings of the beam.
+/// Adds the beam at the angle and time `at` to `scan`. `view` contains the surroundings of the beam.
 fn measure_beam(
     world: &WorldView,
     view: &View,
@@ -221,7 +221,7 @@ fn measure_beam(
     scan.truth.push(truth(word, echo.target, mode));
 }
 
-/// Returns the value of a beam with this `echo`. The sun dazzles `sun` of such beams.
+/// Returns the value of a beam with this `echo`. The sun dazzles the share `sun` of the beams in this direction.
 fn word(world: &WorldView, echo: &Echo, sun: f64, unit: Unit, mode: Mode, rng: &BeamRng) -> u16 {
     match reported_range(world, echo, sun, rng) {
         Err(code) => mode.max_value() - code,
@@ -248,7 +248,7 @@ pub(crate) fn reported_range(world: &WorldView, echo: &Echo, sun: f64, rng: &Bea
     }
 }
 
-/// Returns the truth for a beam that hit `target` and reported `word`.
+/// Returns the true target of a beam that hit `target` and reported `word`.
 fn truth(word: u16, target: BeamTarget, mode: Mode) -> BeamTarget {
     if word & mode.max_value() >= mode.max_value() - scanhub_recording::BEYOND_RANGE_OFFSET {
         BeamTarget::Invalid
@@ -269,7 +269,7 @@ fn level(echo: &Echo, mode: Mode, rng: &BeamRng) -> u16 {
         return 0;
     }
     let max = f64::from((1u16 << mode.intensity_bits()) - 1);
-    // Real recordings have 0 to 5 of 7.
+    // Reflectors in real recordings have levels of 0 to 5, of a maximum of 7.
     let top = (max * 0.75).round();
     (top * echo.reflector_share + LEVEL_DEVIATION * rng.bright).round().clamp(0.0, max) as u16
 }
@@ -285,26 +285,27 @@ pub struct LabeledScan {
 
 /// Target of a beam with all of its spot.
 ///
-/// An object that has appeared, disappeared or moved has the time of this change. The user of this type decides how long
-/// afterwards it counts as foreground.
+/// An object that has appeared, disappeared or moved has the time of this change. The user of this type decides how
+/// long afterwards it counts as foreground.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BeamTarget {
     /// The surroundings at the start of the world, and everything that people do not carry away.
     Static {
-        /// Time from which on the beam hits it: 0, or the time at which an object in front of it was removed. The surface is
-        /// old then, but new to the beam. People who pass do not change it.
+        /// Time from which on the beam hits it: 0, or the time at which an object in front of it was removed. The
+        /// surface is old then, but new to the beam. People who pass do not change it.
         since_ns: Nanos,
     },
     /// A leg of a person who stands or walks.
     Person,
-    /// An object or a door that was put down or moved after the start of the world, and is nearer than the previous target. An
-    /// object that moved away from the sensor is [`BeamTarget::Static`], like the surfaces that it uncovered.
+    /// An object or a door that was put down or moved after the start of the world, and is nearer than the previous
+    /// target. An object that moved away from the sensor is [`BeamTarget::Static`], like the surfaces that it
+    /// uncovered.
     Box {
         /// Time at which it was put down or came to rest; the time of the scan while it moves.
         since_ns: Nanos,
     },
-    /// A person or an object as in [`BeamTarget::Box`], and another surface next to it. The beam may report either of them. The
-    /// edges of a box remain this target.
+    /// A person or an object as in [`BeamTarget::Box`], and another surface next to it. The beam may report either of
+    /// them. The edges of a box remain this target.
     Grazed,
     /// Any target; the value is a code instead of a range.
     Invalid,
@@ -313,14 +314,14 @@ pub enum BeamTarget {
 /// True position of a reflector.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Mark {
-    /// Angle of its middle in degrees, counter-clockwise, 0 ahead of the sensor.
+    /// Angle of its middle in degrees, counterclockwise, 0 ahead of the sensor.
     pub angle_deg: f64,
     /// Range of its middle in millimeters.
     pub range_mm: f64,
 }
 
-/// Some scans of each of a few rooms, between which the view changes at fixed times. No two scans within
-/// [`PrecomputedScans::COUNT_CYCLE`] mirror turns are equal, because the first beam counts them.
+/// Several scans of each of a few rooms, with changes between the rooms at fixed times. No two scans within
+/// [`PrecomputedScans::COUNT_CYCLE`] revolutions of the mirror are equal, because the first beam counts them.
 #[derive(Clone, Debug)]
 pub struct PrecomputedScans {
     settings: (Variant, Unit, Mode),
@@ -332,11 +333,11 @@ pub struct PrecomputedScans {
 pub struct Changes(Vec<(Nanos, usize)>);
 
 impl PrecomputedScans {
-    /// Number of mirror turns after which the count of the first beam restarts: 54 s.
+    /// Number of revolutions of the mirror after which the count of the first beam restarts: 54 s.
     pub const COUNT_CYCLE: u64 = 4_096;
 
-    /// Measures `count` scans (at least one) of each of `rooms` (at least one) with `variant`, `unit` and `mode`. For a sensor
-    /// with other settings, each scan is measured on demand.
+    /// Measures `count` scans (at least one) of each of `rooms` (at least one) with `variant`, `unit` and `mode`. For a
+    /// sensor with other settings, each scan is measured on demand.
     pub fn new(rooms: Vec<Room>, count: usize, variant: Variant, unit: Unit, mode: Mode) -> PrecomputedScans {
         let measured = |room: Room| {
             let scans = (0..count as Nanos).map(|i| room.scan(variant, unit, mode, i * PERIOD)).collect();
@@ -384,8 +385,8 @@ impl PrecomputedScans {
 }
 
 impl Changes {
-    /// Creates changes from times and indices of rooms, in the order of time. Before the first time, the sensor is in the first
-    /// room.
+    /// Creates changes from times and indices of rooms, in the order of time. Before the first time, the sensor is in
+    /// the first room.
     pub fn new(changes: Vec<(Nanos, usize)>) -> Changes {
         Changes(changes)
     }
@@ -396,11 +397,12 @@ impl Changes {
     }
 }
 
-/// Standard deviation of a reflector level; a recording of a standing sensor shows none at all.
+/// Standard deviation of a reflector level. A recording of a standing sensor shows no deviation at all.
 const LEVEL_DEVIATION: f64 = 0.1;
-/// Time between the measured scans; it does not matter.
+/// Time between the measured scans. Its value has no influence.
 const PERIOD: Nanos = 26_640_000;
-/// Start of the count of the first beam, in the unit of the range. With the count, it fits into 13 bits, below all codes.
+/// Start of the count of the first beam, in the unit of the range. With the count, it fits into 13 bits, below all
+/// codes.
 const COUNT_START: u16 = 2_000;
 
 #[cfg(test)]

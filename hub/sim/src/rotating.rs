@@ -1,5 +1,5 @@
-//! Parts that all simulated rotating scanners share: the clockwise rotation of the head, and the measurement of a room
-//! beam by beam, each at its own time and angle.
+//! Parts of all simulated rotating scanners: the clockwise rotation of the head, and the measurement of a room beam by
+//! beam, each at its own time and angle.
 
 use std::f64::consts::TAU;
 
@@ -38,9 +38,9 @@ pub struct TruePoint {
 }
 
 impl Rotation {
-    /// Creates the rotation of a head with a mean speed of `turns_per_second` that varies by the share `wander`. The
-    /// spin-up has a time constant of `spin_up_s` seconds; 0 means full speed at once. `seed` selects the first angle
-    /// and the phase of the variation.
+    /// Creates the rotation of a head with a mean speed of `revolutions_per_second` that varies by the share
+    /// `speed_variation`. The spin-up has a time constant of `spin_up_s` seconds; 0 means full speed at once. `seed`
+    /// selects the first angle and the phase of the variation.
     pub(crate) fn new(
         revolutions_per_second: f64,
         speed_variation: f64,
@@ -96,9 +96,9 @@ pub(crate) fn counterclockwise_deg(clockwise_deg: f64) -> f64 {
 #[derive(Clone, Debug)]
 pub(crate) struct BeamSampler {
     room: Room,
-    /// The static surroundings of the last beam. Each beam draws over it.
+    /// View of the static surroundings, reduced to those of the last beam. Each beam draws over it.
     view: Option<View>,
-    /// The beams of each room of a series.
+    /// Samplers of the rooms of precomputed scans.
     rooms: Vec<BeamSampler>,
 }
 

@@ -1,8 +1,8 @@
 //! A simulated RPLIDAR of Slamtec, without I/O. It replies to requests of a host, its motor spins up, and its head
-//! measures point by point, each at its own time. The points leave in packets of the requested mode.
+//! measures one point after the other, each at its own time. It sends the points in packets of the requested mode.
 //!
-//! The laser of a scanner that triangulates is beside its lens. The angle of a point therefore lags behind that of the
-//! head by a shift that depends on the range, and points at the edge of a near object are out of angular order. The
+//! In a scanner that triangulates, the laser is next to the lens. The angle of a point therefore lags behind that of
+//! the head by a shift that depends on the range, and points at the edge of a near object are out of angular order. The
 //! vendor's decoder of type 0x84 has a formula for the shift, which is used here for all modes of such a scanner. At an
 //! edge where the formula has no solution, there is no return.
 //!
@@ -40,13 +40,13 @@ pub struct RplidarSettings {
     pub start: RplidarStart,
     /// Time from power-on to the boot message.
     pub boot_ns: Nanos,
-    /// Status and code that the scanner reports. A status of 2 is an error, in which it does not measure.
+    /// Health status and code that the scanner reports. A status of 2 is an error, in which it does not measure.
     pub health: (u8, u16),
     /// Whether the status remains after a RESET.
     pub keeps_health: bool,
     /// Deviations from the manual. Those that only an LMS has are ignored.
     pub quirks: ProtocolQuirks,
-    /// Faults of the scanner: times at which something holds its head.
+    /// Faults of the scanner: times at which its head is blocked.
     pub faults: Faults,
     /// Number of bytes that the host's hardware delivers at once.
     pub chunk: ChunkSize,
@@ -66,7 +66,7 @@ pub enum RplidarStart {
 }
 
 impl RplidarSettings {
-    /// Returns a `model` with factory settings that was switched on long ago.
+    /// Returns the factory settings of `model`, for a scanner that was switched on long ago.
     pub fn of(model: Model) -> RplidarSettings {
         RplidarSettings {
             model,
@@ -93,7 +93,7 @@ pub struct RplidarSimulator {
     decoder: Decoder,
     tx_queue: TxQueue,
     random: fastrand::Rng,
-    /// Motion of the motor; `None` while it is off or held.
+    /// Motion of the motor; `None` while it is off or blocked.
     motor: Option<Motion>,
     stream: Option<Stream>,
     health: (u8, u16),
@@ -102,13 +102,13 @@ pub struct RplidarSimulator {
     /// Time from which on the scanner receives requests.
     receives_from_ns: Nanos,
     stalls: FaultWindow,
-    /// Motion of the motor to resume, while something holds the head.
+    /// Motion of the motor to resume; `None` while the head is not blocked.
     held_motion: Option<Option<Motion>>,
     writes: u64,
 }
 
 impl RplidarSimulator {
-    /// Creates the scanner that `settings` describe, at time 0, in `room`.
+    /// Creates the scanner with `settings` in `room`, at time 0.
     pub fn new(settings: RplidarSettings, room: Room) -> RplidarSimulator {
         let RplidarSettings { model, seed, health, .. } = settings;
         let mut simulator = RplidarSimulator {
@@ -185,7 +185,7 @@ impl RplidarSimulator {
         self.settings.quirks = quirks;
     }
 
-    /// Holds the head from `now` on for `span`.
+    /// Blocks the head from `now` on for `span`.
     pub fn hold(&mut self, now: Nanos, span: Nanos) {
         self.stalls = FaultWindow::once(now, span);
     }
@@ -217,7 +217,8 @@ impl RplidarSimulator {
         }
     }
 
-    /// Starts a stream in `mode` that was requested at `requested_ns`, as soon as the speed of the motor is steady.
+    /// Starts a stream in `mode` that was requested at `requested_ns`. Points follow as soon as the speed of the motor
+    /// is steady.
     fn start_stream(&mut self, mode: Mode, forced: bool, requested_ns: Nanos) {
         self.stream = Some(Stream::new(self.settings.model, mode, forced, requested_ns, self.motor));
     }
@@ -228,7 +229,7 @@ impl RplidarSimulator {
         }
     }
 
-    /// Restarts the scanner. The boot message is sent after `span`.
+    /// Restarts the scanner. It sends the boot message after `span`. Returns whether a packet was aborted.
     fn restart(&mut self, now: Nanos, span: Nanos) -> bool {
         let broken = self.tx_queue.abort(now);
         self.stream = None;
@@ -364,7 +365,7 @@ impl Device for RplidarSimulator {
 
     fn poll_timeout(&self) -> Option<Nanos> {
         let data_ns = self.tx_queue.next_ns().or_else(|| self.stream?.due_ns(self.motor));
-        // While the head is held, the end of the window is still ahead.
+        // While the head is blocked, the end of the window is the next change.
         let held_ns = self.stalls.next_ns(if self.held_motion.is_some() { 0 } else { Nanos::MAX });
         let times = [data_ns, self.boot_at_ns, Some(held_ns)];
         times.into_iter().flatten().filter(|&at| at < Nanos::MAX).min()
@@ -447,8 +448,8 @@ struct Stream {
 }
 
 impl Stream {
-    /// Creates a stream of `model` in `mode` that was requested at `requested_ns`. It starts as soon as `motor` is steady,
-    /// or at once if it is `forced`.
+    /// Creates a stream of `model` in `mode` that was requested at `requested_ns`. It starts as soon as `motor` is
+    /// steady, or at once if it is `forced`.
     fn new(model: Model, mode: Mode, forced: bool, requested_ns: Nanos, motor: Option<Motion>) -> Stream {
         let steady_ns = if forced { Some(0) } else { motor.map(|motion| motion.steady_ns) };
         let begin_ns = steady_ns.map(|steady_ns| steady_ns.max(requested_ns));
@@ -577,8 +578,8 @@ impl Optics {
         if random.f64() < STRAY_SHARE { 2.0 + 7.0 * random.f64() } else { shift_deg(None) }
     }
 
-    /// Returns whether the echo is strong enough. Indoors, scanners that triangulate lose most points: those of dark, far
-    /// or oblique surfaces. The direction of a patch of surface determines how dark it is.
+    /// Returns whether the echo is strong enough. Indoors, scanners that triangulate lose most points: those of dark,
+    /// far or oblique surfaces. The darkness of a patch of surface is drawn for its direction.
     fn has_return(&self, at_ns: Nanos, clockwise_deg: f64, beam: &BeamReading) -> bool {
         if !self.model.triangulates() {
             return true;
@@ -605,7 +606,7 @@ fn shift_deg(range_mm: Option<f64>) -> f64 {
 
 /// Health status of a scanner that does not measure.
 const HEALTH_ERROR: u8 = 2;
-/// Health code while something holds the head. It is invented, because the real ones are not published.
+/// Health code while the head is blocked. It is invented, because the real ones are not published.
 const HELD_CODE: u16 = 0x0001;
 /// Time from RESET to the boot message, as measured on a real A1.
 const RESTART_NS: Nanos = 671 * MILLIS;
@@ -626,6 +627,7 @@ const MAX_ITERATIONS: usize = 6;
 /// Width of a patch of surface that is equally dark, in degrees.
 const PATCH_DEG: f64 = 2.0;
 /// Minimum signal for a return from the brightest surfaces, relative to a white surface at 1 m. The darkest surfaces
-/// need [`MAX_DARKNESS`] times as much. With these values, 61 to 84 % of the points indoors are invalid, as on a real A1.
+/// need [`MAX_DARKNESS`] times as much. With these values, 61 to 84 % of the points indoors are invalid, as on a real
+/// A1.
 const MIN_SIGNAL: f64 = 0.003;
 const MAX_DARKNESS: f64 = 20_000.0;

@@ -34,7 +34,7 @@ pub(crate) enum Surface {
     Plain,
     Dark,
     Reflector,
-    /// Glass reflects a beam only at a right angle. Other beams pass through.
+    /// Glass, which reflects a beam only at a right angle. Other beams pass through.
     Glass,
     /// A glossy or oblique surface that reflects only few beams.
     Faint,
@@ -55,7 +55,8 @@ pub(crate) struct Object {
     pub(crate) until_s: f64,
     /// Moves while the object is present, in the order of time. They do not overlap.
     pub(crate) moves: Vec<Movement>,
-    /// Time after which all moves start again, in seconds. They end where they began, and within this time.
+    /// Time after which all moves start again, in seconds. The last move ends within this time, where the first one
+    /// began.
     pub(crate) repeat_s: Option<f64>,
     /// Maximum distance by which the seed moves the object along each axis.
     pub(crate) jitter_mm: f64,
@@ -93,8 +94,8 @@ impl Object {
         self.from_s <= 0.0 && self.until_s.is_infinite() && self.moves.is_empty()
     }
 
-    /// Returns the pose at `time_s`, if the object is present, and the time of its arrival there. This time is 0 if
-    /// the object has been there from the start, and `time_s` while it moves.
+    /// Returns the pose at `time_s` if the object is present, and the time of its arrival there. This time is 0 if the
+    /// object has been there from the start, and `time_s` while it moves.
     pub(crate) fn at(&self, time_s: f64) -> Option<Presence> {
         let start = Presence { pose: self.pose, since_s: self.from_s.max(0.0) };
         let last = |_, presence: Presence| presence;
@@ -128,8 +129,8 @@ impl Object {
         }
     }
 
-    /// Returns the poses after the moves of `round` that have begun at `time_s`, and the times at which the object came to
-    /// each of them: `time_s` for a move that is not over.
+    /// Returns the poses after the moves of `round` that have begun at `time_s`, and the times at which the object
+    /// arrived at each of them: `time_s` for a move that has not ended.
     fn poses(&self, time_s: f64, round: f64) -> impl Iterator<Item = Presence> {
         let offset_s = round * self.repeat_s.unwrap_or(0.0);
         let started = self.moves.iter().take_while(move |movement| movement.from_s + offset_s <= time_s);
@@ -140,7 +141,7 @@ impl Object {
     }
 }
 
-/// Returns the pose at `time_s` of an object that was at `pose` before the move `way`.
+/// Returns the pose at `time_s` of an object that was at `pose` before `movement`.
 fn moved(pose: Pose, movement: &Movement, time_s: f64) -> Pose {
     let lasts_s = movement.until_s - movement.from_s;
     let share = if lasts_s > 0.0 { ((time_s - movement.from_s) / lasts_s).clamp(0.0, 1.0) } else { 1.0 };
@@ -179,9 +180,9 @@ pub(crate) struct PersonSpec {
 /// Path of a person.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum WalkPath {
-    /// A closed curve within `reach` of `centre` that the seed selects.
+    /// A closed curve within `reach` of `centre`, drawn with the seed.
     Roam { centre: Point, reach: Point },
-    /// A polyline of corners, with a rest at each. After the last corner, the person disappears, or walks to the first
+    /// A polyline of corners, with a pause at each. After the last corner, the person disappears, or walks to the first
     /// corner if the path `repeats`.
     Path { corners: Vec<Corner>, speed: Speed, repeats: bool },
 }
@@ -201,7 +202,7 @@ pub(crate) struct Corner {
 pub(crate) enum Speed {
     /// The seed draws a speed between two bounds, in millimeters per second.
     Between(f64, f64),
-    /// The person reaches the end of the path, after all rests, when they have to disappear.
+    /// The person reaches the end of the path, after all pauses, at the time at which they disappear.
     ToEnd,
 }
 
@@ -218,14 +219,14 @@ pub(crate) struct Person {
 
 #[derive(Clone, Debug)]
 enum Course {
-    /// `pace` is the number of cycles per second along the two axes.
+    /// A closed curve. `frequency` is the number of cycles per second along the two axes.
     Roam { centre: Point, reach: Point, frequency: Point, phase: Point },
-    /// Time, position and distance walked at each corner, before and after the rest. If the path `repeats`, those of
-    /// one lap.
+    /// A polyline. `knots` has the time, position and distance walked at each corner, before and after the pause. If
+    /// the path `repeats`, they describe one lap.
     Path { knots: Vec<(f64, Point, f64)>, seats: Vec<Seat>, repeats: bool },
 }
 
-/// A rest during which a person sits.
+/// A pause during which a person sits.
 #[derive(Clone, Copy, Debug)]
 struct Seat {
     from_s: f64,
@@ -234,7 +235,7 @@ struct Seat {
 }
 
 impl Seat {
-    /// Returns how far the person sits at `time_s`: 0 if they stand, 1 if they sit.
+    /// Returns 0 if the person stands at `time_s`, 1 if they sit, and a value between while they sit down or stand up.
     fn share(&self, time_s: f64) -> f64 {
         ((time_s - self.from_s).min(self.until_s - time_s) / SIT_DOWN_S).clamp(0.0, 1.0)
     }
@@ -252,13 +253,13 @@ struct BodyPose {
 }
 
 impl Person {
-    /// Creates the person of `plan`, with random parts from `random`.
+    /// Creates a person as `plan` describes, with random parts from `random`.
     pub(crate) fn new(plan: &PersonSpec, random: &mut fastrand::Rng) -> Person {
         let phase = random.f64();
         let PersonSpec { from_s, until_s, jitter_mm, leg_mm, .. } = *plan;
         let course = match plan.path {
             WalkPath::Roam { centre, reach } => {
-                // Peak speed is 2 pi * reach * pace: 0.5 to 1.3 m/s, as people indoors walk.
+                // The peak speed is 2 pi * reach * frequency: 0.5 to 1.3 m/s, as people indoors walk.
                 let mut frequency = |reach: f64| (500.0 + 800.0 * random.f64()) / (TAU * reach);
                 let frequency = (frequency(reach.0), frequency(reach.1));
                 Course::Roam { centre, reach, frequency, phase: (random.f64(), random.f64()) }
@@ -354,8 +355,8 @@ impl Course {
                 let ((t0, a, s0), (t1, b, s1)) = (knots[next - 1], knots[next]);
                 let share = if t1 > t0 { ((time_s - t0) / (t1 - t0)).min(1.0) } else { 1.0 };
                 let seat = seats.iter().find(|seat| (seat.from_s..seat.until_s).contains(&time_s));
-                // A person who rests looks along the path, and at its end back to where the path came from. A person
-                // who sits down turns from the previous part of the path to the seat, and later to the next part.
+                // A person who pauses faces along the path, and at the end of the path back along it. A person who sits
+                // down turns from the previous part of the path to the seat, and later to the next part.
                 let is_arriving = seat.is_some_and(|seat| time_s < (seat.from_s + seat.until_s) / 2.0);
                 let before = || knots[..next].windows(2).rev();
                 let after = || knots[next - 1..].windows(2);
@@ -376,7 +377,7 @@ impl Course {
     }
 }
 
-/// Returns time, position and distance walked at each corner, before and after the rest, for a person who starts at
+/// Returns time, position and distance walked at each corner, before and after the pause, for a person who starts at
 /// `from_s`.
 fn course(corners: &[Corner], from_s: f64, speed: f64) -> Vec<(f64, Point, f64)> {
     let (mut time_s, mut walked) = (from_s, 0.0);
@@ -412,7 +413,7 @@ pub(crate) fn length(corners: &[Corner]) -> f64 {
     corners.windows(2).map(|pair| distance(pair[0].point, pair[1].point)).sum()
 }
 
-/// Returns the direction of `way`, turned by `share` of the angle to `to_deg`, the shorter way round.
+/// Returns `direction`, turned by `share` of the angle to `to_deg`, in the direction of the smaller angle.
 fn turned(direction: Point, to_deg: f64, share: f64) -> Point {
     let from = direction.1.atan2(direction.0);
     let angle = (to_deg.to_radians() - from + TAU / 2.0).rem_euclid(TAU) - TAU / 2.0;
@@ -600,7 +601,7 @@ mod tests {
             f64::INFINITY,
         );
         assert!(walker.legs(9.99).is_none());
-        // A lap takes 12 s: 4 s each way and both rests.
+        // A lap takes 12 s: 4 s in each direction and both pauses.
         for lap_s in [0.0, 12.0, 12_000.0] {
             for (at_s, y) in [(10.5, 0.0), (13.0, 1000.0), (17.0, 2000.0), (20.0, 1000.0)] {
                 let body = body(&walker, lap_s + at_s);
@@ -615,7 +616,8 @@ mod tests {
 
     #[test]
     fn person_sits_down_and_stands_up() {
-        // From (0, 0) to a chair 2 m ahead in 4 s, there for 10 s, and on. The sitter faces left.
+        // The person walks from (0, 0) to a chair 2 m ahead in 4 s, stays there for 10 s, and continues. The person
+        // faces left while sitting.
         let seat = Corner { seat_deg: Some(180.0), ..corner(0.0, 2000.0, 10.0) };
         let corners = vec![corner(0.0, 0.0, 0.0), seat, corner(1000.0, 2000.0, 0.0)];
         let speed = Speed::Between(500.0, 500.0);
@@ -626,7 +628,8 @@ mod tests {
             assert!(distance(left, (-300.0, 1890.0)) < 1e-6, "{time_s} s: {left:?}");
             assert!(distance(right, (-300.0, 2110.0)) < 1e-6, "{time_s} s: {right:?}");
         }
-        // Feet do not jump when the person sits down, and hardly when the person, who stands again, turns to walk on.
+        // The feet do not jump when the person sits down, and hardly move when the person stands up and turns to walk
+        // on.
         for tenth in 35..139 {
             let (before, after) = (feet(f64::from(tenth) / 10.0), feet(f64::from(tenth + 1) / 10.0));
             let jumps = before.iter().zip(after).map(|(a, b)| distance(*a, b)).fold(0.0, f64::max);
@@ -649,7 +652,7 @@ mod tests {
             repeats: true,
         };
         let walker = person(way, 10.0, f64::INFINITY);
-        // A lap takes 13 s: 4 s each way and the rest.
+        // A lap takes 13 s: 4 s in each direction and the pause.
         for lap_s in [0.0, 13.0, 13_000.0] {
             let share = |time_s| walker.body_pose(lap_s + time_s).map(|stand| stand.seated);
             assert_eq!((share(12.0), share(16.5), share(20.0)), (Some(0.0), Some(1.0), Some(0.0)));
@@ -704,7 +707,7 @@ mod tests {
         let walks = person(WalkPath::Path { corners, speed: Speed::ToEnd, repeats: false }, 2.0, 7.0);
         assert!(distance(body(&walks, 5.0), (0.0, 1000.0)) < 1.0);
         assert!(walks.legs(6.99).is_some() && walks.legs(7.0).is_none());
-        // No way at all is in time as well.
+        // A path without length is completed in time as well.
         let corners = vec![corner(5.0, 7.0, 1.0), corner(5.0, 7.0, 0.0)];
         let waits = person(WalkPath::Path { corners, speed: Speed::ToEnd, repeats: false }, 2.0, 7.0);
         assert_eq!((waits.legs(2.0), waits.legs(7.0)), (waits.legs(6.99), None));

@@ -21,9 +21,9 @@ pub enum Shape {
     },
     /// A round post.
     Post {
-        /// Its center.
+        /// Center of the post.
         centre: Point,
-        /// Its radius in millimeters.
+        /// Radius in millimeters.
         radius: f64,
     },
 }
@@ -96,7 +96,7 @@ impl Shape {
         }
     }
 
-    /// Returns the shape with `place` applied to every point.
+    /// Returns the shape with `transform` applied to every point.
     pub(crate) fn transformed(&self, transform: impl Fn(Point) -> Point) -> Shape {
         match *self {
             Shape::Wall { from, to } => Shape::Wall { from: transform(from), to: transform(to) },
@@ -142,7 +142,7 @@ type Corner = (f64, f64, f64);
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Heights {
     pub(crate) from_mm: f64,
-    /// Infinite if the object is higher than any beam.
+    /// Highest point; infinite if the object is higher than any beam.
     pub(crate) to_mm: f64,
 }
 
@@ -167,8 +167,8 @@ impl Plane {
         Plane { eye, sin, cos }
     }
 
-    /// Calls `each` with the cut of each surface of an object with the outline `shapes`. Posts have lids, and so has an
-    /// object that `is_box`.
+    /// Calls `each` with the cut of each surface of an object with the outline `shapes`. A post has surfaces at its
+    /// ends, and so has an object that `is_box`.
     pub(crate) fn cut(&self, shapes: &[Shape], heights: Heights, is_box: bool, mut each: impl FnMut(Shape)) {
         let (bottom, top) = (heights.from_mm.min(MAX_DISTANCE_MM), heights.to_mm.min(MAX_DISTANCE_MM));
         let mut wall = |from: Point, to: Point| {
@@ -254,7 +254,7 @@ fn polygon(centre: Point, radius: f64) -> [Point; SIDES] {
     })
 }
 
-/// Number of sides of a round post. For a radius of 100 mm, they are off by 2 mm.
+/// Number of sides of the polygon that replaces a round post. For a radius of 100 mm, it is off by 2 mm.
 const SIDES: usize = 16;
 /// Maximum distance and height of everything that is measured, in millimeters.
 const MAX_DISTANCE_MM: f64 = 100_000.0;

@@ -1,6 +1,6 @@
-//! The verb `simulate`: simulates scanners on ptys or TCP servers until it is stopped.
+//! The verb `simulate`, which simulates scanners on ptys or TCP servers until it is stopped.
 //!
-//! Each port has a thread, `PortThread`, which paces scanner and line by their deadlines and adds what happens at the
+//! Each port has a thread, `PortThread`, which runs scanner and line by their deadlines. It adds the effects of the
 //! host's port: another rate, no host, a host that does not read, an unplugged adapter. [`Truth`] is the log of the
 //! telegrams: one line per telegram, and one per port at the end, in a file or on stdout. The hub never reads it.
 
@@ -42,9 +42,9 @@ pub struct SimulatedPort {
     pub pty: Option<PathBuf>,
 }
 
-/// Simulates the scanners of `options` until `stop` is readable, and returns the summary of each port. `on_ready` is called
-/// once all ports exist, and `on_record` with each telegram from the thread of the port. The symlinks are removed when this
-/// function returns.
+/// Simulates the scanners of `options` until `stop` is readable, and returns the summary of each port. `on_ready` is
+/// called once all ports exist, and `on_record` with each telegram from the thread of the port. The symlinks are
+/// removed when this function returns.
 pub fn simulate(
     options: &SimulateOptions,
     stop: impl AsFd,
@@ -54,8 +54,8 @@ pub fn simulate(
     simulate_with(options, stop, on_ready, on_record, |_| None, |_, _| {})
 }
 
-/// Simulates like [`simulate()`]. The thread of each port repeatedly calls `event`, which returns an event for this port.
-/// `on_report` receives the number of a port and the reports of the encoder of its mount, in time of the clock.
+/// Simulates like [`simulate()`]. The thread of each port repeatedly calls `event`, which returns an event for this
+/// port. `on_report` receives the number of a port and the reports of the encoder of its mount, in time of the clock.
 pub fn simulate_with(
     options: &SimulateOptions,
     stop: impl AsFd,
@@ -198,8 +198,8 @@ fn device(
     })
 }
 
-/// Returns the settings of an LMS from the flags, or else from the recording, or else of the factory, and its measured
-/// values.
+/// Returns the settings of an LMS and its measured values. The settings come from the flags, then from the recording,
+/// and then from the factory settings.
 fn lms(
     options: &SimulateOptions,
     recording: Option<&Recording>,
@@ -283,7 +283,7 @@ struct PortThread<'a> {
     pub(crate) on_record: &'a (dyn Fn(&Record) -> Result<(), Failure> + Sync),
     /// Returns the next event for this port.
     pub(crate) event: &'a (dyn Fn(&Path) -> Option<Event> + Sync),
-    /// Encoder of its mount, if it has one.
+    /// Encoder of the scanner's mount, if it has one.
     pub(crate) encoder: Option<Encoder>,
     /// Receives the reports of the encoder, in time of the clock.
     on_report: &'a (dyn Fn(usize, Report) + Sync),
@@ -306,13 +306,14 @@ struct PortThread<'a> {
 pub enum Event {
     /// The power goes off and on.
     PowerCycle,
-    /// The host's adapter is unplugged for this time in nanoseconds. Then it is another terminal with the same name.
+    /// The host's adapter is unplugged for this time in nanoseconds. Afterwards it is another terminal with the same
+    /// name.
     Unplug(Nanos),
     /// The line has these faults from now on, with random numbers of this seed. Times count from now.
     Faults(Box<Faults>, u64),
 }
 
-/// Time of the scanner: it starts at 0, and is `speed` times as fast as the clock.
+/// Clock of the scanner. It starts at 0, and is `speed` times as fast as the kernel's clock.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct ScaledClock {
     zero_ns: Nanos,
@@ -334,7 +335,7 @@ impl PortThread<'_> {
     /// Runs until one of `stops` is readable.
     pub(crate) fn run(mut self, stops: [BorrowedFd<'_>; 2]) -> Result<Summary, Failure> {
         let mut buffer = [0; 64];
-        // Time of the clock until which there was nothing to read.
+        // Time of the kernel's clock until which there was nothing to read.
         let mut quiet_ns = now_ns();
         loop {
             let read_ns = now_ns();
@@ -395,7 +396,8 @@ impl PortThread<'_> {
         Summary { eeprom_writes: self.machine.eeprom_writes(), port: self.port, sent: self.sent }
     }
 
-    /// Waits until the host has read all held bytes or has closed its side. The time of the scanner stands still.
+    /// Waits until the host has read all held bytes or has closed its side. The clock of the scanner stands still
+    /// during the wait.
     fn wait_for_room(&mut self, stops: [BorrowedFd<'_>; 2]) -> Result<WaitResult, Failure> {
         let begun_ns = now_ns();
         while !self.unsent.is_empty() {
@@ -442,8 +444,8 @@ impl PortThread<'_> {
         rate.is_none_or(|rate| same_rate(rate, self.machine.rate()))
     }
 
-    /// Stops the time of the scanner while this thread could not run for long. Otherwise the line would deliver more bytes at
-    /// once than it can carry.
+    /// Stops the clock of the scanner if this thread has not run for a long time. Otherwise the line would deliver more
+    /// bytes at once than it can carry.
     fn limit_lag(&mut self, now_ns: Nanos) {
         let machine_ns = self.time.of_machine(now_ns);
         let Some(due_ns) = self.line.poll_timeout(&*self.machine, machine_ns) else { return };
@@ -474,7 +476,7 @@ impl PortThread<'_> {
             }
             None => fault = fault.or(Some(Fault::Unread)),
         }
-        // Read the clock before the hash, which takes longer than a host that waits for this byte.
+        // Read the clock before computing the hash, which takes longer than a host needs to wake for this byte.
         let sent_ns = now_ns();
         if is_telegram {
             self.fault = self.fault.or(fault);
@@ -525,7 +527,7 @@ impl Record {
         Sha256::digest(telegram).into()
     }
 
-    /// Returns its line without the line end. The keys have the order of the contract.
+    /// Returns the JSON line without the line end. The keys have the documented order.
     pub fn line(&self) -> String {
         let port = json!(self.port.to_string_lossy());
         let kind = if self.is_reply { "reply" } else { "data" };
@@ -550,7 +552,7 @@ pub struct Summary {
 }
 
 impl Summary {
-    /// Returns its line without the line end.
+    /// Returns the JSON line without the line end.
     pub fn line(&self) -> String {
         let port = json!(self.port.to_string_lossy());
         let Summary { sent, eeprom_writes, .. } = self;
@@ -567,7 +569,7 @@ pub struct Truth {
 }
 
 impl Truth {
-    /// Creates the file at `path`, which replaces an existing one if `force`. `-` is stdout.
+    /// Creates the file at `path`, which replaces an existing one if `force` is set. `-` is stdout.
     ///
     /// # Errors
     ///
@@ -605,15 +607,15 @@ fn failure(path: &Path, error: &io::Error) -> Failure {
     Failure::new(Kind::Failed, what, "the disk must have space, and the reader of stdout must stay")
 }
 
-/// Maximum lag of the scanner, in its own time: 5 kB at its highest rate, a quarter of the buffer of a pty.
+/// Maximum lag of the scanner, by its own clock: 5 kB at its highest rate, a quarter of the buffer of a pty.
 const MAX_LAG_NS: Nanos = 100 * MILLIS;
-/// Maximum time from a write to a pty until the byte can be read. A worker thread of the kernel moves it.
+/// Maximum time from a write to a pty until the byte can be read. A worker thread of the kernel transfers it.
 const PTY_DELAY_NS: Nanos = 2 * MILLIS;
 /// Interval at which a lossless line checks for room in the host's buffer.
 const ROOM_CHECK_INTERVAL_NS: Nanos = MILLIS;
-/// Interval between polls of the port, because no event reports that a host opened it. It also limits the uncertainty of
-/// the time at which a byte arrived. At 9600, where every host begins, it is short enough to prove to a strict scanner
-/// that a request was written without gaps.
+/// Interval between polls of the port, because no event reports that a host opened it. It also limits the uncertainty
+/// of the time at which a byte arrived. At 9600, where every host begins, it is short enough to prove to a strict
+/// scanner that a request was written without gaps.
 const POLL_INTERVAL_NS: Nanos = 4 * MILLIS;
 
 #[cfg(test)]

@@ -1,5 +1,5 @@
-//! The surroundings of a scanner. [`WorldView`] is a scene whose random parts a seed has drawn, seen by one scanner. It
-//! draws a [`View`]: the nearest surface in each direction at one time, as a row of narrow rays.
+//! Views of the surroundings of a scanner. A [`WorldView`] is a scene as one scanner sees it, with random parts drawn
+//! from a seed. It draws a [`View`]: the nearest surface in each direction at one time, as a row of narrow rays.
 
 use std::ops::Range;
 use std::sync::LazyLock;
@@ -31,7 +31,7 @@ pub(crate) struct WorldView {
 }
 
 impl WorldView {
-    /// Creates the view of sensor number `sensor` in `scene`, with the random parts that `seed` draws.
+    /// Creates the view of sensor number `sensor` in `scene`, with random parts drawn from `seed`.
     pub(crate) fn new(scene: &Scene, seed: u64, sensor: u64) -> WorldView {
         let mut random = fastrand::Rng::with_seed(seed);
         let people = scene.people.iter().map(|plan| Person::new(plan, &mut random)).collect();
@@ -232,7 +232,7 @@ impl Kind {
 /// End of a ray.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Hit {
-    /// Infinite if there is no surface.
+    /// Range of the surface; infinite if there is none.
     pub(crate) range_mm: f64,
     /// Index of the face.
     face: u32,
@@ -252,7 +252,7 @@ impl Hit {
 pub(crate) struct View {
     faces: Vec<Face>,
     hits: Vec<Hit>,
-    /// Index of the first ray.
+    /// Index of the first ray among all directions.
     first: usize,
 }
 
@@ -347,7 +347,7 @@ fn ray_index(angle_mdeg: i32) -> usize {
 /// Returns the indices in `range` of the rays that can meet `shape`.
 fn rays(shape: &Shape, range: Range<usize>) -> impl Iterator<Item = usize> + use<> {
     let span = shape.span_deg();
-    // A span may reach in from both ends.
+    // The span may enter the range of rays from either end.
     [-360.0, 0.0, 360.0].into_iter().flat_map(move |turn| {
         let Some((first, width)) = span else { return 0..0 };
         let ray = |angle_deg: f64| {
@@ -359,7 +359,7 @@ fn rays(shape: &Shape, range: Range<usize>) -> impl Iterator<Item = usize> + use
     })
 }
 
-/// Number of rays per degree. They are 4 mm apart at 4 m, and each beam of each variant is on one.
+/// Number of rays per degree. They are 4 mm apart at 4 m, and each beam of each variant coincides with one.
 const RAYS_PER_DEGREE: i32 = 16;
 /// Number of rays to each side that the widest spot covers: more than a degree.
 pub(crate) const SPOT_RAYS: usize = 20;

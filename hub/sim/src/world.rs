@@ -1,4 +1,4 @@
-//! The available worlds: some for tests of the scanner, built-in scenes, and scenes in TOML files.
+//! The available worlds: some that test the scanner itself, built-in scenes, and scenes in TOML files.
 //!
 //! The parser checks each value of a file at its position, so that a failure names file, line and column.
 //! `docs/worlds.md` describes the format.
@@ -23,7 +23,7 @@ use crate::shape::{Heights, Point, Pose, Shape};
 /// The surroundings of the simulated scanners.
 #[derive(Clone, Debug, PartialEq)]
 pub enum World {
-    /// Nothing within reach.
+    /// No surface within the maximum range.
     Empty,
     /// A wall around the scanner at which every value is 640. Its bytes are `80 02` throughout, so each beam except the
     /// last ends with the first bytes of a header.
@@ -172,7 +172,7 @@ fn parse_scene(name: &str, text: &str) -> Result<Scene, Failure> {
     })
 }
 
-/// Pose in the middle of the world, with y ahead, so that angles are those of a page.
+/// Pose in the middle of the world, facing along y, so that angles are those of a drawing with x to the right.
 const PAGE_POSE: Pose = Pose { x_mm: 0.0, y_mm: 0.0, turn_deg: 90.0 };
 
 #[derive(Deserialize)]

@@ -83,7 +83,8 @@ impl LinkSettings {
         }
     }
 
-    /// Returns the interval at which samples of `topic` are sent, in samples, or `None` if the gateway does not send them.
+    /// Returns the interval at which samples of `topic` are sent, in samples, or `None` if the gateway does not send
+    /// them.
     pub(crate) fn send_interval(&self, topic: Topic) -> Option<NonZeroU64> {
         match topic {
             Topic::Telegram if !self.sends_telegrams => None,

@@ -1,11 +1,11 @@
-//! The models of RPLIDARs and their wire format: decodes requests, and encodes responses and packets of points.
+//! Models of RPLIDARs and their wire format: a decoder of requests, and encoders of responses and packets of points.
 //!
 //! A request is `A5 command`. If the top bit of the command is set, a length, a payload of this length and the XOR of
 //! all bytes follow. A response is a descriptor and its data. Angles and ranges are rounded here to the resolution of
-//! the format. The driver has its own description of the protocol, so that an error in one of them is noticed.
+//! the format. The driver has its own description of the protocol, so that a mistake in one of them is detected.
 //!
-//! Whole microseconds, names and response types of the A1 are those of a real A1M8 with firmware 1.29. Those of the other
-//! models come from their data sheets and the logs of the vendor's driver, and were not measured.
+//! Whole microseconds, names and response types of the A1 are those of a real A1M8 with firmware 1.29. Those of the
+//! other models come from their data sheets and the logs of the vendor's driver, and were not measured.
 
 /// Model of an RPLIDAR.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -59,7 +59,7 @@ pub struct Mode {
 /// Control of the motor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Motor {
-    /// The line DTR. A pty does not have it, so the motor turns while there is power.
+    /// The signal DTR. A pty does not have it, so the motor runs while the power is on.
     Dtr,
     /// An accessory board that receives a duty cycle.
     Pwm,
@@ -144,7 +144,7 @@ impl Model {
         }
     }
 
-    /// Returns the modes, each at the index that is its number.
+    /// Returns the modes. The index of each is its number.
     pub fn modes(self) -> &'static [Mode] {
         match self {
             Model::A1 | Model::A2m8 => &MODES_8K,
@@ -167,8 +167,8 @@ impl Model {
         }
     }
 
-    /// Returns the revolutions per second with factory settings. A real A1 sent 1,954 points per second, and 264 to 267 of them per
-    /// revolution.
+    /// Returns the revolutions per second with factory settings. A real A1 sent 1,954 points per second, and 264 to 267
+    /// of them per revolution.
     pub fn revolutions_per_second(self) -> f64 {
         if self == Model::A1 { 7.36 } else { 10.0 }
     }
@@ -186,8 +186,8 @@ impl Model {
         }
     }
 
-    /// Returns whether the scanner triangulates, with a laser beside its lens: then the angle of a point depends on its range, and
-    /// weak surfaces have no return. The others measure the time of flight of the light.
+    /// Returns whether the scanner triangulates, with a laser next to its lens. In that case, the angle of a point
+    /// depends on its range, and weak surfaces have no return. The others measure the time of flight of the light.
     pub(crate) fn triangulates(self) -> bool {
         matches!(self, Model::A1 | Model::A2m8 | Model::A2m12 | Model::A3)
     }
@@ -200,8 +200,8 @@ impl Model {
         }
     }
 
-    /// Returns the firmware as (major, minor), and the number of the hardware. The vendor's driver expects 256,000 baud from an A2 or
-    /// A3 with hardware 6.
+    /// Returns the firmware as (major, minor), and the number of the hardware. The vendor's driver expects 256,000 baud
+    /// from an A2 or A3 with hardware 6.
     fn versions(self) -> ([u8; 2], u8) {
         match self {
             Model::A1 => ([1, 29], 5),
@@ -212,8 +212,8 @@ impl Model {
         }
     }
 
-    /// Returns the length of the scanner's microsecond in microseconds of the host: a real A1 reported 508 us per point, and sent
-    /// 1,954 points per second.
+    /// Returns the duration of the scanner's microsecond, in microseconds of the host. A real A1 reported 508 us per
+    /// point, and sent 1,954 points per second.
     pub(crate) fn clock_ratio(self) -> f64 {
         if self == Model::A1 { 1.0 / (508e-6 * 1_954.0) } else { 1.0 }
     }
@@ -223,8 +223,8 @@ const fn mode(name: &'static str, sample_us: f64, form: PacketFormat, reach_m: f
     Mode { name, sample_us, form, reach_m }
 }
 
-/// Returns the modes of a scanner that triangulates. A point takes `us` microseconds in the fastest modes, and `stable_us` in mode
-/// Stability.
+/// Returns the modes of a scanner that triangulates. A point takes `us` microseconds in the fastest modes, and
+/// `stable_us` in mode Stability.
 const fn modes(us: f64, stable_us: f64, reach_m: f64, fast_reach_m: f64) -> [Mode; 5] {
     [
         mode("Standard", 4.0 * us, PacketFormat::Standard, reach_m),
@@ -507,7 +507,7 @@ fn start_angle(is_first: bool, readings: &[Reading]) -> Vec<u8> {
     start.to_le_bytes().to_vec()
 }
 
-/// Adds the checksum before `body`: the XOR of all its bytes, with four bits after each of the marks A and 5.
+/// Returns `body` with its checksum in front: the XOR of all its bytes, with four bits after each of the marks A and 5.
 fn with_checksum(body: Vec<u8>) -> Vec<u8> {
     let sum = body.iter().fold(0, |sum, byte| sum ^ byte);
     [vec![0xA0 | sum & 0x0F, 0x50 | sum >> 4], body].concat()

@@ -1,5 +1,5 @@
-//! The verb behind TCP: a host that connects as to a serial server in raw mode gets the bytes of every family as they were
-//! sent, one host at a time.
+//! The verb behind TCP: a host that connects as to a serial server in raw mode gets the bytes of every family as they
+//! were sent, one host at a time.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;

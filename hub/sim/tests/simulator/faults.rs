@@ -1,6 +1,6 @@
-//! Every fault of the table against the real session, in virtual time. The hub delivers what arrived intact once, in order and
-//! bit for bit. It marks what was not sent. Bytes are conserved, and no request writes the EEPROM. In the end the session
-//! streams.
+//! Every fault of the table against the real session, in virtual time. The hub delivers what arrived intact once, in
+//! order and bit for bit. It marks what was not sent. Bytes are conserved, and no request writes the EEPROM. In the end
+//! the session streams.
 //!
 //! A failure names the flags with which `simulate` is the same scanner on a pty.
 

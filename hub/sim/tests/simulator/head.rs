@@ -1,5 +1,5 @@
-//! Scanners of LDROBOT in simulated rooms: the session reports what they measured. The number of beams of a scanner without a
-//! configured model is the number of points that it measures per revolution, whatever happens to its power.
+//! Scanners of LDROBOT in simulated rooms: the session reports what they measured. The number of beams of a scanner
+//! without a configured model is the number of points that it measures per revolution, whatever happens to its power.
 
 use scanhub_drivers::ld::packet::PACKET_LEN;
 use scanhub_drivers::ld::{LdSession, Model, Problem};

@@ -1,5 +1,5 @@
-//! The simulated sensor in virtual time: one binary with a module for each thing that is held, so that what they all link
-//! is linked once. The tests on ptys are in `tests/port`: they must not wait for processors that these tests use.
+//! The simulated sensor in virtual time: one binary with a module for each thing that is held, so that what they all
+//! link is linked once. The tests on ptys are in `tests/port`: they must not wait for processors that these tests use.
 
 mod faults;
 mod head;

@@ -1,5 +1,5 @@
-//! The family of raw bytes is recognized by the bytes alone: of every simulated scanner, in every mode, from any byte on, and
-//! on a line that loses bytes.
+//! The family of raw bytes is recognized by the bytes alone: of every simulated scanner, in every mode, from any byte
+//! on, and on a line that loses bytes.
 
 use scanhub_drivers::lms::variant::{Baud, Variant};
 use scanhub_drivers::recognize::{EXAMINED_BYTES, family_of};

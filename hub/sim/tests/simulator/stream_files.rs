@@ -1,5 +1,5 @@
-//! A recording becomes a stream file (`.bin`) and is read again: every model of the rotating scanners, in every mode, has the same
-//! scans, wherever the recording begins. A stream file has no stamps, so stamps are not compared.
+//! A recording becomes a stream file (`.bin`) and is read again: every model of the rotating scanners, in every mode,
+//! has the same scans, wherever the recording begins. A stream file has no stamps, so stamps are not compared.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -173,12 +173,13 @@ fn is_same(a: &Scan, b: &Scan) -> bool {
         && angles(a).iter().zip(&angles(b)).all(is_near)
 }
 
-/// Checks that `path` has the scans of `live` that began after `from`. Where the recording begins in the middle of the stream, the
-/// first one may be missing.
+/// Checks that `path` has the scans of `live` that began after `from`. Where the recording begins in the middle of the
+/// stream, the first one may be missing.
 fn check(name: &str, live: &LiveStream, from: Nanos, path: &Path) {
     let expected: Vec<_> = live.scans.iter().filter(|(first, _)| *first >= from).collect();
     let read = scans_of(path);
-    // A file that has the time per point may have an earlier scan, before which the live session was measuring that time.
+    // A file that has the time per point may have an earlier scan, before which the live session was measuring that
+    // time.
     let earlier = (0..read.len().min(2)).find(|&number| is_same(&expected[0].1, &read[number])).unwrap_or(0);
     let read = &read[earlier..];
     let first = read.first().unwrap_or_else(|| panic!("{name}: no scan"));
@@ -263,8 +264,8 @@ fn every_ldrobot_has_the_same_scans() {
     }
 }
 
-/// The packets alone do not define the model, or the time per point. The responses at the beginning of a stream do, and so
-/// does the topic `status`.
+/// The packets alone do not define the model, or the time per point. The responses at the beginning of a stream do, and
+/// so does the topic `status`.
 #[test]
 fn refuses_stream_file_without_status_and_responses() {
     for model in Model::ALL {
@@ -287,8 +288,8 @@ fn refuses_stream_file_without_status_and_responses() {
     }
 }
 
-/// A stream that was captured without the responses of the scanner is read as before: its packets are found, and scans need the
-/// model or the mode if the packets may be of two kinds.
+/// A stream that was captured without the responses of the scanner is read as before: its packets are found, and scans
+/// need the model or the mode if the packets may be of two kinds.
 #[test]
 fn ambiguous_stream_needs_the_model_or_mode() {
     let folder = TempDir::new().unwrap();

@@ -19,8 +19,8 @@ pub(crate) struct Stamps {
     families: Vec<Rc<dyn Family>>,
     sensors: BTreeMap<usize, SensorStamps>,
     faults_cleared_at: Option<Nanos>,
-    /// Until this time, bytes may arrive that took no time on the line. Telegrams that are read with them look earlier than
-    /// they were.
+    /// Until this time, bytes may arrive that took no time on the line. Telegrams that are read with them look earlier
+    /// than they were.
     crowded_until: Nanos,
 }
 

@@ -1,5 +1,5 @@
-//! Requests to a simulated scanner for its identity, in virtual time: a scanner that replies is found at any rate and in any
-//! mode, and left as it was. A line may lose bytes, and a scanner may overlook requests or not exist.
+//! Requests to a simulated scanner for its identity, in virtual time: a scanner that replies is found at any rate and
+//! in any mode, and left as it was. A line may lose bytes, and a scanner may overlook requests or not exist.
 
 mod change;
 mod random;

@@ -1,5 +1,5 @@
-//! Random bytes, random orders of events and the fault table against inquiries and changes: they do not panic, they end, and
-//! their results are true. A change writes no more often than it may, and never unnoticed.
+//! Random bytes, random orders of events and the fault table against inquiries and changes: they do not panic, they
+//! end, and their results are true. A change writes no more often than it may, and never unnoticed.
 
 use scanhub_drivers::line::{Action, Protocol};
 use scanhub_drivers::lms::Inquiry;

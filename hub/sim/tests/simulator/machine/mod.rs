@@ -1,5 +1,5 @@
-//! A simulated LMS in virtual time: its replies, the time at which bytes have left the line, the effect of requests on its stream,
-//! and the line itself.
+//! A simulated LMS in virtual time: its replies, the time at which bytes have left the line, the effect of requests on
+//! its stream, and the line itself.
 
 mod states;
 

@@ -1,6 +1,6 @@
-//! The search finds scanners of all models and states in time, and sends no byte that a scanner should not get. It finds a
-//! remembered scanner nearly as soon as a session of its family does, and a scanner that gets power late soon after it can
-//! reply. Bytes that no scanner sent never end a search, and no scanner accepts a request at another rate.
+//! The search finds scanners of all models and states in time, and sends no byte that a scanner should not get. It
+//! finds a remembered scanner nearly as soon as a session of its family does, and a scanner that gets power late soon
+//! after it can reply. Bytes that no scanner sent never end a search, and no scanner accepts a request at another rate.
 
 use scanhub_drivers::line::{Action, KnownRate, Protocol as _, ScannerSession as _};
 use scanhub_drivers::lms::variant::{Baud, Variant};
@@ -313,8 +313,8 @@ fn finds_another_scanner_than_the_remembered_one() {
 
 const ONE_SECOND: Nanos = 1_000 * MILLIS;
 
-/// Returns the worst time from when scanners that `create` creates can answer until they are found. They get power `after` this
-/// time from the open, and then start for `boot`.
+/// Returns the worst time from when scanners that `create` creates can answer until they are found. They get power
+/// `after` this time from the open, and then start for `boot`.
 fn worst_find_time(name: &str, after: Nanos, boot: Nanos, create: impl Fn(u64) -> Box<dyn Device>) -> Nanos {
     let times = (0..10).map(|seed| {
         let after = after + seed * 317 * MILLIS;
@@ -448,8 +448,8 @@ fn receivers() -> Vec<(String, bool, Box<dyn Device>)> {
     all
 }
 
-/// Returns what a scanner at `rate` receives of a request that a host sends at `sent_at`, `drift` percent off, with `gap`
-/// between its bytes.
+/// Returns what a scanner at `rate` receives of a request that a host sends at `sent_at`, `drift` percent off, with
+/// `gap` between its bytes.
 fn received_bytes(request: &[u8], sent_at: u32, rate: u32, gap: Nanos, drift: f64) -> Vec<u8> {
     let rate_of_host = (f64::from(sent_at) * (1.0 + drift / 100.0)) as u32;
     let mut receiver = UartReceiver::new(rate_of_host, rate);
@@ -461,8 +461,8 @@ fn received_bytes(request: &[u8], sent_at: u32, rate: u32, gap: Nanos, drift: f6
     bytes
 }
 
-/// Returns how many telegrams that are not part of a stream, and how many parts of broken ones, `device` sends from `now` until
-/// `end`.
+/// Returns how many telegrams that are not part of a stream, and how many parts of broken ones, `device` sends from
+/// `now` until `end`.
 fn count_reactions(device: &mut dyn Device, now: &mut Nanos, end: Nanos) -> usize {
     use scanhub_sim::device::ChunkKind;
     let mut count = 0;

@@ -1,5 +1,5 @@
-//! A search and a simulated scanner at the two ends of a line, in virtual time. If port and scanner have different rates, bytes
-//! are garbled in both directions.
+//! A search and a simulated scanner at the two ends of a line, in virtual time. If port and scanner have different
+//! rates, bytes are garbled in both directions.
 
 mod finding;
 mod port;

@@ -1,5 +1,5 @@
-//! A session and a simulated scanner at the two ends of a line, in virtual time. Tests define what the line does to bytes; the
-//! bench checks the invariants at every step.
+//! A session and a simulated scanner at the two ends of a line, in virtual time. Tests define what the line does to
+//! bytes; the bench checks the invariants at every step.
 
 mod control;
 mod losses;

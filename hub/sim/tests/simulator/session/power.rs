@@ -1,5 +1,6 @@
-//! Power cycles and restarts, in a scan, in the start of a session, and of a scanner that takes a minute to boot. A scanner on
-//! RS-232, which carries nothing at 500,000 baud: after a switch to that rate, the scanner is lost until its power is cycled.
+//! Power cycles and restarts, in a scan, in the start of a session, and of a scanner that takes a minute to boot. A
+//! scanner on RS-232, which carries nothing at 500,000 baud: after a switch to that rate, the scanner is lost until its
+//! power is cycled.
 
 use scanhub_drivers::line::{Control, ScannerSession as _, State};
 use scanhub_drivers::lms;

@@ -1,5 +1,5 @@
-//! Scanners that refuse, overlook or misreply, lines that lose requests or replies, and streams that stop: the session streams
-//! anyway, and reports what a scanner says about itself.
+//! Scanners that refuse, overlook or misreply, lines that lose requests or replies, and streams that stop: the session
+//! streams anyway, and reports what a scanner says about itself.
 
 use scanhub_drivers::line::{ScannerSession as _, State};
 use scanhub_drivers::lms;
@@ -393,8 +393,8 @@ fn a_condition_that_comes_and_goes_is_there() {
     bench.run_until("forgotten", 10_000 * MILLIS, |bench| bench.session.sensor().notices().next().is_none());
 }
 
-/// Hands over whole scans of 361 beams, as `change` makes them of their number and bytes; the rest of the one on the line is
-/// lost.
+/// Hands over whole scans of 361 beams, as `change` makes them of their number and bytes; the rest of the one on the
+/// line is lost.
 fn scan_filter(change: impl Fn(u32, Vec<u8>) -> Vec<u8> + 'static) -> HostFilter {
     let mut count = 0;
     let mut held = Vec::new();

@@ -1,5 +1,5 @@
-//! Points against the measurements: each packet form of each model, and the quirks of an A1. A second, slow decoder, written
-//! straight from the published formulas, judges the packets of the simulator.
+//! Points against the measurements: each packet form of each model, and the quirks of an A1. A second, slow decoder,
+//! written straight from the published formulas, judges the packets of the simulator.
 
 use scanhub_schema::Nanos;
 use scanhub_sim::beam::NoiseModel;

@@ -128,9 +128,9 @@ fn outliers_are_as_frequent_as_in_recordings() {
     assert!((0.004..0.012).contains(&share), "{share}");
 }
 
-/// Measures a post at 1.5 m before a wall that is `depth_mm` behind it. The post stands at several places, so that its edges
-/// are anywhere between two beams. Returns the share of values between, of all readings of the beams around it, and the mean
-/// of their standard deviations at one beam, as a share of the depth.
+/// Measures a post at 1.5 m before a wall that is `depth_mm` behind it. The post stands at several places, so that its
+/// edges are anywhere between two beams. Returns the share of values between, of all readings of the beams around it,
+/// and the mean of their standard deviations at one beam, as a share of the depth.
 fn values_between(depth_mm: f64, spot: bool) -> (f64, f64) {
     let (mut all, mut between, mut deviations) = (0, 0, Vec::new());
     for x_mm in 0..26 {

@@ -1,5 +1,5 @@
-//! Worlds as data: every file is a world that runs, the simulator refuses a wrong one by name and place, and the truth is what
-//! geometry says.
+//! Worlds as data: every file is a world that runs, the simulator refuses a wrong one by name and place, and the truth
+//! is what geometry says.
 
 mod layers;
 
