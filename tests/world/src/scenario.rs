@@ -34,7 +34,7 @@ pub struct Action {
     /// Time, in milliseconds since the start of the world.
     pub at_ms: u64,
     pub(crate) kind: &'static ActionKind,
-    /// Values, one for each key of the kind.
+    /// Values of the keys of `kind`, in the same order.
     pub(crate) values: Vec<u64>,
 }
 

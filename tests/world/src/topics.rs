@@ -1,5 +1,5 @@
-//! Topics in the memory of one process, with the limits of the real ones: a queue for each subscriber that drops the
-//! oldest sample when it is full, the history for late joiners, and the loans of a publisher.
+//! Topics in the memory of one process, with the limits of the real ones. There is a queue for each subscriber that
+//! drops the oldest sample when it is full, the history for late joiners, and the loans of a publisher.
 
 use std::borrow::{Borrow, BorrowMut};
 use std::cell::{Cell, RefCell};

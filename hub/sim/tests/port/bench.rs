@@ -1,4 +1,4 @@
-//! A simulator in a thread, a folder for its files, and a host that opens its port, writes requests, and finds the
+//! A simulator in a thread, a directory for its files, and a host that opens its port, writes requests, and finds the
 //! telegrams in the received bytes.
 
 use std::io::Write;
@@ -67,7 +67,7 @@ impl Simulator {
         self.records.recv_timeout(WAIT_TIMEOUT).expect("a telegram is sent")
     }
 
-    /// Returns the next record that fulfills `wanted`.
+    /// Returns the next record for which `is_expected` returns true.
     pub(crate) fn record_where(&self, is_expected: impl Fn(&Record) -> bool) -> Record {
         let end = Instant::now() + WAIT_TIMEOUT;
         while Instant::now() < end {
@@ -79,7 +79,7 @@ impl Simulator {
         panic!("no such telegram was sent");
     }
 
-    /// Returns the sent telegrams that did not arrive, since the last call.
+    /// Returns the numbers and faults of the telegrams since the last call that did not arrive intact.
     pub(crate) fn faults(&self) -> Vec<(u64, Fault)> {
         self.records.try_iter().filter_map(|record| Some((record.index, record.fault?))).collect()
     }
@@ -121,13 +121,13 @@ impl Host {
         tcsetattr(&self.port, OptionalActions::Now, &termios)
     }
 
-    /// Writes `request` as most drivers do: at once, for the UART to space.
+    /// Writes `request` at once, as most drivers do. A UART would add the gaps.
     pub(crate) fn write(&self, request: Request) {
         let encoded = request.encode(0);
         assert_eq!(rustix::io::write(&self.port, encoded.bytes()), Ok(encoded.bytes().len()));
     }
 
-    /// Returns the next telegram that arrives within `patience`; `None` if the port is unplugged before.
+    /// Returns the next telegram that arrives within `timeout`, or `None` if there is none or the port is unplugged.
     pub(crate) fn telegram(&mut self, timeout: Duration) -> Option<Vec<u8>> {
         let end = Instant::now() + timeout;
         loop {
@@ -140,7 +140,7 @@ impl Host {
             let timeout = Timespec { tv_sec: left.as_secs() as _, tv_nsec: left.subsec_nanos() as _ };
             let mut fds = [PollFd::new(&self.port, PollFlags::IN)];
             if poll(&mut fds, Some(&timeout)).unwrap() == 0 {
-                // A frame whose end looks like a beginning is delivered when nothing follows.
+                // The framer holds back a frame whose end looks like the start of a telegram, until nothing follows.
                 self.framer.release(lms::framer::VETO_HOLD_TIME);
                 if let Some(FramerEvent::Telegram(framed)) = self.framer.poll() {
                     return Some(framed.telegram.bytes().to_vec());
@@ -156,7 +156,7 @@ impl Host {
         }
     }
 
-    /// Sends `request` and returns the reply to it; telegrams before that are skipped.
+    /// Sends `request`, and returns its reply. Drops the telegrams before the reply.
     pub(crate) fn ask(&mut self, request: Request) -> Vec<u8> {
         self.write(request);
         loop {

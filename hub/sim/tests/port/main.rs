@@ -1,5 +1,5 @@
-//! The verb on real ptys: a host opens the port, asks, and reads; what it got is compared with the truth. Every wait
-//! is for something, with a deadline far beyond what it takes.
+//! Tests of the verb `simulate` on real ptys: a host opens the port, sends requests, reads, and compares the received
+//! bytes with the truth. Every wait ends with an event, and has a limit far longer than the event needs.
 
 #![expect(clippy::disallowed_methods, reason = "limits and periods of real time")]
 
@@ -28,7 +28,7 @@ use scanhub_sim::simulate::Record;
 
 use bench::{Host, Simulator, TestFolder};
 
-/// Limit of every wait. It only bounds a hang.
+/// Limit of every wait. It matters only if a test hangs.
 const WAIT_TIMEOUT: Duration = Duration::from_secs(180);
 
 fn options(port: PathBuf) -> SimulateOptions {
@@ -130,7 +130,7 @@ fn wrong_rate_garbles_both_directions() {
     let mut host = Host::open(&port, 500_000);
     host.ask(Request::Stream);
     host.set_rate(250_000);
-    // The reply to the request before is recorded ahead of the first garbled scan.
+    // The record of the reply to the previous request precedes that of the first garbled scan.
     while simulator.record().fault != Some(Fault::Baud) {}
     host.write(Request::Status);
     let mut garbled = 1;
@@ -139,7 +139,7 @@ fn wrong_rate_garbles_both_directions() {
         assert!(!record.is_reply, "answered at the wrong rate");
         garbled += usize::from(record.fault == Some(Fault::Baud));
     }
-    // What is in the host's buffer now was garbled, except for a scan that came before.
+    // The bytes in the host's buffer are garbled, except for a scan that arrived before the change.
     let mut buffer = vec![0; 30_000];
     assert!(rustix::io::read(&host.port, &mut buffer).unwrap() > 0);
     host.set_rate(500_000);
@@ -203,7 +203,7 @@ fn replay_is_sent_once_in_order_then_line_is_silent() {
         let telegram = host.telegram(WAIT_TIMEOUT).expect("a scan");
         assert!(&telegram == scan, "not scan {number}; sent: {:?}", simulator.faults());
     }
-    // It still answers; the count below says that nothing else was sent.
+    // The scanner still replies. The count below proves that it sent nothing else.
     host.ask(Request::Status);
     let (summaries, records) = simulator.end();
     assert_eq!(records.iter().filter(|record| is_data(record)).count(), 100);
@@ -287,14 +287,14 @@ fn unplugged_port_disappears_and_returns_by_name() {
     let simulator = Simulator::start(SimulateOptions { faults, state, ..options(port.clone()) });
     let first = fs::read_link(&port).unwrap();
     for _ in 0..2 {
-        // A busy machine may unplug the port before a scan is complete.
+        // On a busy machine, the port may be unplugged before a scan is complete.
         let mut plugged = None;
         wait_until("a scan", || {
             plugged = Host::try_open(&port, 500_000).ok();
             plugged.as_mut().is_some_and(|host| host.telegram(WAIT_TIMEOUT).is_some())
         });
         let host = plugged.expect("the port of the scan");
-        // The hosts of a pty whose other side is gone read its end.
+        // A host of a pty reads the end of file once the other side is closed.
         let mut buffer = [0; 4096];
         wait_until("it is unplugged", || rustix::io::read(&host.port, &mut buffer) == Ok(0));
         assert!(rustix::termios::tcgetattr(&host.port).is_err(), "the port is there");

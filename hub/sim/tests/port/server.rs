@@ -1,5 +1,5 @@
-//! The verb behind TCP: a host that connects as to a serial server in raw mode gets the bytes of every family as they
-//! were sent, one host at a time.
+//! Tests of the verb `simulate` with TCP servers: a host that connects as to a serial server in raw mode receives the
+//! bytes of every family as they were sent, one host at a time.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -22,7 +22,7 @@ fn options(scanner: Option<Scanner>) -> SimulateOptions {
     SimulateOptions { ports: vec!["tcp:127.0.0.1:0".into()], scanner, ..SimulateOptions::default() }
 }
 
-/// Connects to where `simulator` says that it is.
+/// Connects to the address that `simulator` reports.
 fn connect(simulator: &Simulator) -> TcpStream {
     let port = simulator.ready[0].port.to_str().expect("a name");
     assert_eq!(simulator.ready[0].pty, None);
@@ -45,14 +45,14 @@ fn every_family_speaks_over_tcp_as_the_truth_says() {
         (Some(Scanner::Ld(ld::Model::Ld19)), Vec::new()),
         (Some(rplidar), vec![0xA5, 0x82, 5, 1, 0, 0, 0, 0, 0xA5 ^ 0x82 ^ 5 ^ 1]),
     ] {
-        // Fast enough that an LMS at its 9,600 baud is through with some scans.
+        // At this speed, an LMS at 9,600 baud sends some scans in a short time.
         let simulator = Simulator::start(SimulateOptions { speed: 4.0, ..options(scanner) });
         let mut host = connect(&simulator);
         host.write_all(&request).expect("written");
         let bytes = read(&mut host, 2_500);
         let (summaries, records) = simulator.end();
         assert_eq!(summaries[0].eeprom_writes, 0);
-        // What was sent before it was known that somebody is connected went nowhere.
+        // Bytes that were sent before the server accepted the connection are lost.
         let intact = records.iter().filter(|record| record.fault.is_none());
         let found = intact.filter(|record| {
             bytes.windows(record.length).any(|window| Record::hash(window) == record.sha256)
@@ -78,7 +78,7 @@ fn one_host_at_a_time_and_the_next_when_it_has_left() {
     let mut third = loop {
         let mut host = connect(&simulator);
         host.set_read_timeout(Some(Duration::from_millis(50))).expect("set");
-        // Turned away as long as it is not known that the first one has left.
+        // The server closes the connection as long as it has not detected that the first host has left.
         let is_away = matches!(host.read(&mut [0; 1]), Ok(0));
         if !is_away {
             break host;
@@ -104,7 +104,7 @@ fn unplugged_server_returns_at_the_same_address() {
     let simulator = Simulator::start(SimulateOptions { faults, ..options(scanner) });
     let mut host = connect(&simulator);
     let mut rest = Vec::new();
-    // It may end with a reset, where bytes were on their way.
+    // The connection may end with a reset if bytes were on their way.
     let _ = host.read_to_end(&mut rest);
     let end = Instant::now() + WAIT_TIMEOUT;
     let address = simulator.ready[0].port.to_str().expect("a name").replace("tcp:", "");

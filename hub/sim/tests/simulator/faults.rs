@@ -1,8 +1,8 @@
-//! Every fault of the table against the real session, in virtual time. The hub delivers what arrived intact once, in
-//! order and bit for bit. It marks what was not sent. Bytes are conserved, and no request writes the EEPROM. In the end
-//! the session streams.
+//! Tests of every fault of the table with a real session, in virtual time. The session delivers intact telegrams once,
+//! in order and bit for bit. It marks telegrams that the scanner did not send. Bytes are conserved, and no request
+//! writes the EEPROM. At the end, the session streams.
 //!
-//! A failure names the flags with which `simulate` is the same scanner on a pty.
+//! A failure prints the flags with which `simulate` is the same scanner on a pty.
 
 use std::collections::HashMap;
 
@@ -19,7 +19,7 @@ use scanhub_sim::room::Room;
 
 use crate::session::{Bench, ReceivedTelegram, SentTelegram};
 
-/// Runs `faults` with seeds up to this one, and sums up.
+/// Runs `faults` with `seeds` seeds, and returns the sum of the results.
 fn run_scene(faults: &str, span_ms: u64, seeds: u64) -> SceneResult {
     let all = run_seeds(&FaultScene::new(faults.parse().expect("faults"), span_ms), seeds);
     println!("{faults}: {all:?}");
@@ -33,7 +33,7 @@ fn run_seeds(scene: &FaultScene, seeds: u64) -> SceneResult {
     all
 }
 
-/// Seeds for each scene.
+/// Number of seeds for each scene.
 const SEED_COUNT: u64 = 100;
 
 macro_rules! scenes {
@@ -125,14 +125,14 @@ struct FaultScene {
     is_idle: bool,
 }
 
-/// Results of a run.
+/// Result of a run.
 #[derive(Debug, Default)]
 struct SceneResult {
-    /// Telegrams that arrived as sent while the session streamed: all of them were delivered.
+    /// Number of telegrams that arrived as sent while the session streamed. All of them were delivered.
     intact: usize,
-    /// Telegrams that did not arrive as sent.
+    /// Number of telegrams that did not arrive as sent.
     faulty: usize,
-    /// Delivered telegrams that the scanner did not send, and those of them without a suspect mark.
+    /// Number of delivered telegrams that the scanner did not send, and number of those without a suspect mark.
     wrong: usize,
     unmarked: usize,
     resyncs: u64,
@@ -187,7 +187,7 @@ impl FaultScene {
         SceneResult { effects, resyncs: bench.session.stats().resyncs, recovery_ms: back / MILLIS, ..verdict }
     }
 
-    /// Holds what was delivered against what was sent.
+    /// Compares the delivered telegrams with those that were sent.
     fn compare(&self, bench: &Bench, seed: u64) -> SceneResult {
         let is_due = |sent: &SentTelegram| sent.was_streaming && !sent.damaged;
         let unmatched = align(&bench.sent, &bench.received, is_due);
@@ -230,26 +230,26 @@ const SEARCH_TIMEOUT: Nanos = 10_000 * MILLIS;
 /// Number of occurrences of each effect.
 #[derive(Debug, Default)]
 struct Effects {
-    /// Requests that reached the sensor and were not acknowledged.
+    /// Requests that reached the scanner and were not acknowledged.
     unacknowledged: usize,
     naks: usize,
-    /// Replies beyond one for each ACK.
+    /// Replies beyond the first one for each ACK.
     extra_replies: usize,
     /// Replies 92h.
     refused: usize,
-    /// Acknowledgements, and replies, later than the sensor usually has them.
+    /// Acknowledgements and replies that are later than usual.
     late_acknowledgements: usize,
     late_replies: usize,
-    /// Scans that arrived at a time that does not fit the mirror.
+    /// Scans whose time of arrival does not fit the mirror.
     unaligned_scans: usize,
     /// Telegrams that arrived twice.
     copies: usize,
-    /// Bytes between telegrams that the sensor did not send.
+    /// Bytes between telegrams that the scanner did not send.
     foreign: usize,
 }
 
 impl Effects {
-    /// Returns the effects that show on `bench`.
+    /// Counts the effects in `bench`.
     fn of(bench: &Bench) -> Effects {
         let Bench { request_times, acknowledged, sent, foreign, .. } = bench;
         let naks = acknowledged.iter().filter(|(_, byte)| *byte == NAK).count();
@@ -294,27 +294,27 @@ impl Effects {
     }
 }
 
-/// The last of `times` that is not after `at`; `at` itself if there is none.
+/// Returns the last of `times` that is not after `at`, or `at` itself if there is none.
 fn last_before(times: &[Nanos], at: Nanos) -> Nanos {
     times.iter().rev().copied().find(|&time| time <= at).unwrap_or(at)
 }
 
-/// Telegrams that a pairing leaves over.
+/// Telegrams without a partner after the pairing.
 struct Unmatched<'a> {
-    /// Sent, due, and not delivered.
+    /// Telegrams that were sent and due, but not delivered.
     lost: Vec<&'a SentTelegram>,
-    /// Delivered, and not sent.
+    /// Telegrams that were delivered, but not sent.
     unsent: Vec<&'a ReceivedTelegram>,
 }
 
-/// Pairs `received` with `sent`. The telegrams that are due must be received.
+/// Pairs `received` with `sent`. Telegrams that are due must have a partner.
 fn align<'a>(
     sent: &'a [SentTelegram],
     received: &'a [ReceivedTelegram],
     is_due: impl Fn(&SentTelegram) -> bool,
 ) -> Unmatched<'a> {
     let same = |s: usize, r: usize| sent[s].telegram == received[r].telegram;
-    // best[s][r]: (lost, wrong) of the rest from these on.
+    // best[s][r] has the numbers of lost and of wrong telegrams among those from `s` and `r` on.
     let mut best = vec![vec![(0, 0); received.len() + 1]; sent.len() + 1];
     for s in (0..=sent.len()).rev() {
         for r in (0..=received.len()).rev() {

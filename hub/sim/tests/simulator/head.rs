@@ -1,5 +1,6 @@
-//! Scanners of LDROBOT in simulated rooms: the session reports what they measured. The number of beams of a scanner
-//! without a configured model is the number of points that it measures per revolution, whatever happens to its power.
+//! Tests of LDROBOT scanners in simulated rooms: the session reports the points that they measured. If no model is
+//! configured, the number of beams is the number of points that the scanner measures per revolution, regardless of
+//! power failures.
 
 use scanhub_drivers::ld::packet::PACKET_LEN;
 use scanhub_drivers::ld::{LdSession, Model, Problem};
@@ -15,7 +16,7 @@ use scanhub_sim::line_model::LineModel;
 use scanhub_sim::room::Room;
 use scanhub_sim::world::World;
 
-/// A packet that left, and whether nothing happened to it on its way.
+/// A packet that was sent, and whether it arrived intact.
 struct SentPacket {
     bytes: Vec<u8>,
     intact: bool,
@@ -44,7 +45,7 @@ struct Bench {
     revolutions: Vec<Revolution>,
 }
 
-/// A room without noise.
+/// Returns a world without noise.
 fn noiseless_world(world: &str) -> World {
     world.parse::<World>().expect("a world").with_noise(NoiseModel::NONE)
 }
@@ -107,7 +108,7 @@ impl Bench {
     fn transmit(&mut self) {
         while let Some(carried) = self.line.poll_transmit(&mut self.scanner, self.now) {
             self.intact &= carried.fault.is_none();
-            // Bytes at another rate are of no use.
+            // The host cannot read bytes at another rate.
             if carried.rate == self.session.rate() {
                 self.inbox.extend(carried.bytes);
             }
@@ -158,7 +159,7 @@ impl Bench {
         }
     }
 
-    /// Compares each revolution with the measurements of the head since `zero`. Its points belong to one revolution
+    /// Compares each revolution with the measurements of the head since `start`. Its points belong to one revolution
     /// and are in order. Without a mark, none is missing, and each is at most `angle_deg` and `range_mm` off. Returns
     /// the largest error of a stamp.
     fn check_revolutions(&mut self, start: Nanos, angle_deg: f64, range_mm: f64) -> Nanos {
@@ -269,8 +270,8 @@ fn other_line_faults_cost_no_intact_packet() {
         bench.run(8 * ONE_SECOND);
         bench.check_packets();
         let worst = bench.check_revolutions(0, 0.05, 2.0);
-        // Here, the bytes of a flood arrive at once, as on no real line. Bytes before them look as early as the last
-        // read.
+        // Here, the bytes of a flood arrive at once, which no real line can do. Bytes before them look as early as the
+        // last read.
         let early = if faults.contains("every") { 5 * MILLIS } else { 0 };
         assert!(worst < 5 * MILLIS + early, "{faults}: {worst}");
         let stats = bench.session.stats();
@@ -316,14 +317,14 @@ fn every_brown_out_is_a_restart() {
         let mut bench = Bench::new(LdSettings::of(model), &noiseless_world("wall640"), "", 3);
         bench.run(4 * ONE_SECOND);
         for restarts in 1..=12 {
-            // A voltage that falls makes the head slower first.
+            // A falling voltage first makes the head slower.
             let turns_per_second = f64::from(model.revolutions_per_second());
             for slow in 0..restarts {
                 bench.scanner.set_speed(turns_per_second * (1.0 - 0.03 * slow as f64));
                 bench.run(bench.now + 30 * MILLIS);
             }
             bench.brown_out();
-            // Odd times, so that the clock of 30 s stands elsewhere each time.
+            // Odd times, so that the clock, which wraps after 30 s, has another value each time.
             bench.run(bench.now + 2 * ONE_SECOND + restarts * 417 * MILLIS);
             assert_eq!(bench.session.stats().restarts, restarts, "{model:?}");
             assert_eq!(
@@ -376,7 +377,7 @@ fn points_stay_accurate_when_the_speed_changes() {
     let mut bench = Bench::new(LdSettings::of(Model::Ld19), &noiseless_world("room"), "", 7);
     for step in 0..60 {
         bench.run(2 * ONE_SECOND + step * 100 * MILLIS);
-        // From 10 turns in a second to 6 and back to 12.
+        // The speed falls from 10 revolutions per second to 6, and rises to 12.
         let turns = if step < 20 { 10.0 - 0.2 * step as f64 } else { 6.2 + 0.15 * (step - 20) as f64 };
         bench.scanner.set_speed(turns);
     }
@@ -387,7 +388,7 @@ fn points_stay_accurate_when_the_speed_changes() {
     let periods: Vec<_> = revolutions.windows(2).map(|pair| pair[1].first - pair[0].first).collect();
     let (shortest, longest) = (periods.iter().min().unwrap(), periods.iter().max().unwrap());
     assert!(*shortest < 87 * MILLIS && *longest > 155 * MILLIS, "{shortest} {longest}");
-    // The measurements since the last change are known.
+    // The true points are available since the last change of speed.
     let after = revolutions.into_iter().filter(|revolution| revolution.first > 8_100 * MILLIS);
     bench.revolutions = after.collect();
     assert!(bench.revolutions.len() > 18, "{}", bench.revolutions.len());
@@ -425,19 +426,19 @@ fn same_seed_repeats_and_recording_replays_packets() {
     }
 }
 
-/// Bytes that a real line of 500 kBd lost.
+/// Byte loss that was measured on a real line at 500 kBd.
 const LOSS_FAULTS: &str = "loss=0.00135,burst=1.89";
 
 const SPIN_UP_TIMES_S: [f64; 4] = [0.0, 0.5, 1.5, 3.0];
 
-/// A scanner and a session that does not know its model.
+/// Creates a scanner with a session for which no model is configured.
 fn new_bench(settings: LdSettings, seed: u64) -> Bench {
     let mut bench = Bench::new(LdSettings { seed, ..settings }, &noiseless_world("wall640"), "", seed);
     bench.session = LdSession::new(Settings::default(), 0);
     bench
 }
 
-/// Different numbers of beams of the revolutions, in their order.
+/// Returns the numbers of beams of the revolutions in order, without repetitions.
 fn beam_counts(bench: &Bench) -> Vec<usize> {
     let mut numbers: Vec<usize> = bench.revolutions.iter().map(|revolution| revolution.beams).collect();
     numbers.dedup();
@@ -491,7 +492,7 @@ fn beams_are_the_points_that_a_revolution_has() {
             bench.run(10 * ONE_SECOND);
             let numbers = beam_counts(&bench);
             assert!(numbers.len() == 1 && numbers[0].abs_diff(beams) * 100 <= beams, "{numbers:?}");
-            // A configured number stays.
+            // A configured number does not change.
             let configured = Settings { beams: Some(300), ..Settings::default() };
             let mut bench = new_bench(settings, seed);
             bench.session = LdSession::new(configured, 0);

@@ -1,5 +1,6 @@
-//! The simulated sensor in virtual time: one binary with a module for each thing that is held, so that what they all
-//! link is linked once. The tests on ptys are in `tests/port`: they must not wait for processors that these tests use.
+//! Tests of the simulated scanners in virtual time. They are one binary with a module for each subject, so that their
+//! common dependencies are linked only once. The tests on ptys are in `tests/port`, because they must not wait for
+//! processors that these tests use.
 
 mod faults;
 mod head;

@@ -1,5 +1,5 @@
-//! The family of raw bytes is recognized by the bytes alone: of every simulated scanner, in every mode, from any byte
-//! on, and on a line that loses bytes.
+//! Tests that the family of a byte stream is recognized from the bytes alone: for every simulated scanner, in every
+//! mode, from any byte on, and on a line that loses bytes.
 
 use scanhub_drivers::lms::variant::{Baud, Variant};
 use scanhub_drivers::recognize::{EXAMINED_BYTES, family_of};
@@ -14,7 +14,7 @@ use scanhub_sim::operating::ScanSource;
 use scanhub_sim::room::Room;
 use scanhub_sim::rplidar::{self, RplidarSettings, RplidarSimulator, RplidarStart};
 
-/// Returns at most the first `len` bytes that arrive from `device` within 30 s.
+/// Returns the first bytes that arrive from `device` within 30 s, at most `len` of them.
 fn first_bytes(device: &mut dyn Device, faults: &str, len: usize) -> Vec<u8> {
     let mut wire = LineModel::new(&faults.parse::<Faults>().expect("faults"), 3);
     let (mut now, mut bytes): (Nanos, _) = (0, Vec::new());
@@ -33,7 +33,7 @@ fn room() -> Room {
     Room::new(&"room".parse().expect("a world"), 1)
 }
 
-/// Every scanner that streams, with its family and a name.
+/// Returns every streaming scanner with its family and a name.
 fn scanners() -> Vec<(Family, String, Box<dyn Device>)> {
     let mut scanners: Vec<(Family, String, Box<dyn Device>)> = Vec::new();
     let modes =

@@ -1,5 +1,6 @@
-//! A recording becomes a stream file (`.bin`) and is read again: every model of the rotating scanners, in every mode,
-//! has the same scans, wherever the recording begins. A stream file has no stamps, so stamps are not compared.
+//! Tests of conversions from a recording to a stream file (`.bin`) and back. For every model and mode of the rotating
+//! scanners, the stream file yields the same scans, wherever the recording starts. A stream file has no stamps, so
+//! stamps are not compared.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -22,11 +23,11 @@ use scanhub_sim::rplidar::{Model, RplidarSettings, RplidarSimulator};
 use tempfile::TempDir;
 
 const ONE_SECOND: Nanos = 1_000 * MILLIS;
-/// Length of a recording. The motor of an RPLIDAR takes 1.6 s to get up to speed.
+/// Length of a recording. The motor of an RPLIDAR takes 1.6 s to reach its speed.
 const RECORDING_LEN: Nanos = 9 * ONE_SECOND;
-/// Time at which a recording begins that lacks the beginning of the stream.
+/// Start of a recording that lacks the start of the stream.
 const LATE_START: Nanos = 4 * ONE_SECOND;
-/// Time at which the clock of a read file begins.
+/// Start of the clock of a file that is read.
 const FILE_CLOCK_START: Nanos = 10 * ONE_SECOND;
 /// Length of a packet of one point, in bytes.
 const POINT_PACKET_LEN: u64 = 5;
@@ -173,13 +174,13 @@ fn is_same(a: &Scan, b: &Scan) -> bool {
         && angles(a).iter().zip(&angles(b)).all(is_near)
 }
 
-/// Checks that `path` has the scans of `live` that began after `from`. Where the recording begins in the middle of the
+/// Checks that `path` has the scans of `live` that began after `from`. If the recording starts in the middle of the
 /// stream, the first one may be missing.
 fn check(name: &str, live: &LiveStream, from: Nanos, path: &Path) {
     let expected: Vec<_> = live.scans.iter().filter(|(first, _)| *first >= from).collect();
     let read = scans_of(path);
-    // A file that has the time per point may have an earlier scan, before which the live session was measuring that
-    // time.
+    // A file that contains the time per point may yield an earlier first scan, because the live session had to measure
+    // that time first.
     let earlier = (0..read.len().min(2)).find(|&number| is_same(&expected[0].1, &read[number])).unwrap_or(0);
     let read = &read[earlier..];
     let first = read.first().unwrap_or_else(|| panic!("{name}: no scan"));
@@ -194,7 +195,7 @@ fn check(name: &str, live: &LiveStream, from: Nanos, path: &Path) {
     assert!(read.len() > 20, "{name}: {}", read.len());
 }
 
-/// Checks that the scans of `live` come back from a stream file, whenever the recording began.
+/// Checks that a stream file yields the scans of `live`, wherever the recording starts.
 fn check_stream_files(name: &str, live: &LiveStream) {
     let folder = TempDir::new().unwrap();
     for from in [0, LATE_START] {
@@ -207,7 +208,7 @@ fn check_stream_files(name: &str, live: &LiveStream) {
         assert_eq!((read.contents().form, read.family()), (Form::Telegrams, Some(live.family)), "{name}");
         // A point without a checksum counts only if another one follows.
         assert!(read.contents().damage.bytes <= POINT_PACKET_LEN, "{name}: {}", read.contents().damage);
-        // Models of LDROBOT may be alike.
+        // Several models of LDROBOT have the same rate and number of beams.
         let model = |recording: &Recording| recording.model().unwrap().map(|model| (model.baud, model.beams));
         assert_eq!(model(&read), model(&recording), "{name}");
         let scanner_ns = read.contents().scanner_ns.expect("a clock of the scanner");
@@ -220,7 +221,7 @@ fn check_stream_files(name: &str, live: &LiveStream) {
                 .unwrap();
         assert!(scanner_ns.abs_diff(expected) < ONE_SECOND, "{name}: {scanner_ns} {expected}");
         check(&name, live, from, &stream);
-        // A file of packets and their stamps again, and a stream file of that.
+        // Convert the stream file to a file of packets with stamps, and that to a stream file.
         let (again, _) = convert_file(&stream, "b.mcap");
         check(&format!("{name}, in MCAP"), live, from, &again);
         let (twice, _) = convert_file(&again, "c.bin");
@@ -264,7 +265,7 @@ fn every_ldrobot_has_the_same_scans() {
     }
 }
 
-/// The packets alone do not define the model, or the time per point. The responses at the beginning of a stream do, and
+/// The packets alone do not determine the model or the time per point. The responses at the start of a stream do, and
 /// so does the topic `status`.
 #[test]
 fn refuses_stream_file_without_status_and_responses() {
@@ -288,8 +289,8 @@ fn refuses_stream_file_without_status_and_responses() {
     }
 }
 
-/// A stream that was captured without the responses of the scanner is read as before: its packets are found, and scans
-/// need the model or the mode if the packets may be of two kinds.
+/// A stream file without the responses of the scanner can be read: its packets are found. Its scans need the model or
+/// the mode if the packets may be of two kinds.
 #[test]
 fn ambiguous_stream_needs_the_model_or_mode() {
     let folder = TempDir::new().unwrap();
@@ -328,7 +329,7 @@ fn ambiguous_stream_needs_the_model_or_mode() {
         let beams = in_mode(named);
         assert!(beams.len() > 20 && beams.iter().all(|beams| beams.abs_diff(920) < 20), "{beams:?}");
     }
-    // It stays as it is.
+    // The file is copied unchanged.
     let (copy, _) = convert_file(&path, "copy.bin");
     assert!(std::fs::read(copy).unwrap() == bytes);
 }

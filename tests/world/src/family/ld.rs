@@ -96,7 +96,7 @@ impl Family for Ld {
         true
     }
 
-    /// Of 256 damaged packets, one has a valid checksum.
+    /// A damaged packet has a valid checksum in 1 of 256 cases.
     fn is_collision(&self, _: &[u8], damaged: &mut dyn Iterator<Item = &[u8]>) -> bool {
         damaged.next().is_some()
     }

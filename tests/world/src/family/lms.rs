@@ -119,7 +119,7 @@ impl Family for Lms {
         scan.beams() == count && words.len() >= count && scan.ranges().iter().zip(&words[..count]).all(same)
     }
 
-    /// Of 65,536 damaged telegrams of the same length, one has a valid checksum.
+    /// A damaged telegram of the same length has a valid checksum in 1 of 65,536 cases.
     fn is_collision(&self, got: &[u8], damaged: &mut dyn Iterator<Item = &[u8]>) -> bool {
         let others = |sent: &[u8], got: &[u8]| sent.iter().zip(got).filter(|(sent, got)| sent != got).count();
         damaged.filter(|sent| sent.len() == got.len()).any(|sent| {

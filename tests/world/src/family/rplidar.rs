@@ -153,7 +153,7 @@ impl Family for Rplidar {
         true
     }
 
-    /// Of 256 damaged packets, one has a valid checksum, and standard packets have none.
+    /// A damaged packet has a valid checksum in 1 of 256 cases, and standard packets have none.
     fn is_collision(&self, got: &[u8], damaged: &mut dyn Iterator<Item = &[u8]>) -> bool {
         let sum = || got[2..].iter().fold(0, |sum, byte| sum ^ byte);
         let is_right = match self.kind(got).filter(|_| !is_reply(got)) {

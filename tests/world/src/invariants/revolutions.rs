@@ -41,8 +41,8 @@ struct SensorPoints {
     matched: usize,
     /// Accuracy of the packets that were published last.
     exactness: PointAccuracy,
-    /// Time at which a unit was last published that was not sent, or that could not be published for lack of memory, so
-    /// that its origin is unknown; and sequence number of the last telegram that was sent.
+    /// Time at which a unit of unknown origin was last published: it was not sent, or an earlier one could not be
+    /// published for lack of memory. The second field is the sequence number of the last telegram that was sent.
     foreign_at: Option<Nanos>,
     last_known: Option<u64>,
     /// Run of the hub, number of beams, and time of the first scan with this number since the port was opened.

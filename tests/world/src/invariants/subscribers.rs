@@ -10,9 +10,10 @@ use crate::event::Event;
 use crate::subscriber::SubscriberId;
 use crate::topics::Sample;
 
-/// Invariant: a subscriber gets the samples of every scan that begins after it has attached (`docs/topics.md`). The hub
-/// rings a word of the doorbell once all samples of that word are sent, before those of the next word and the next
-/// telegram, and only if one of the samples has a subscriber. The event follows if one of its listeners has a sample.
+/// Invariant: a subscriber gets the samples of every scan that begins after it has attached (`docs/topics.md`). Each
+/// sample belongs to a word of the doorbell. The hub rings a word once all its samples are sent, before the samples of
+/// the next word and the next telegram, and only if one of them has a subscriber. The event follows if one of its
+/// listeners has a sample.
 pub(crate) struct Subscribers {
     sensors: Vec<SensorSubscribers>,
     sensor_of_subscriber: BTreeMap<SubscriberId, usize>,

@@ -1,5 +1,5 @@
-//! Changing what a sensor keeps for ever, with consent: written once, read back, and the stream goes on; and what is
-//! known when it goes wrong.
+//! Tests of changes of permanent settings with the user's consent: the host writes them once and reads them back, and
+//! the stream resumes. If something fails, the outcome states what is known.
 
 use scanhub_drivers::lms::Inquiry;
 use scanhub_drivers::lms::command::Password;
@@ -14,7 +14,7 @@ use scanhub_sim::operating::OperatingMode;
 
 use super::{Bench, machine, make_stream, sensor};
 
-/// Asks the sensor what it is; returns the plan to change nothing, and when that was known.
+/// Requests the scanner's identity. Returns a plan that changes nothing, and the time at which it was complete.
 pub(crate) fn probe_and_plan(machine: LmsSimulator, now: Nanos) -> (Plan, LmsSimulator, Nanos) {
     let mut bench = Bench::new(Inquiry::new(Baud::B500000, now), Baud::B500000, machine, now);
     bench.finish(20_000 * MILLIS);
@@ -22,7 +22,7 @@ pub(crate) fn probe_and_plan(machine: LmsSimulator, now: Nanos) -> (Plan, LmsSim
     (plan, bench.machine, bench.now)
 }
 
-/// Unit mm, mode 4.
+/// Sets unit cm and mode 4.
 pub(crate) fn set_other_values(plan: &mut Plan) {
     plan.new.set(5, 4);
     plan.new.set(6, Unit::Cm.code());
@@ -32,7 +32,7 @@ pub(crate) fn change(plan: Plan, machine: LmsSimulator, now: Nanos) -> Bench<Cha
     Bench::new(Change::new(Consent::confirmed_by_person(plan), now), plan.baud, machine, now)
 }
 
-/// What the sensor says of itself now.
+/// Requests the scanner's current settings.
 pub(crate) fn probe_again(bench: Bench<Change>) -> (Plan, LmsSimulator, Nanos) {
     probe_and_plan(bench.machine, bench.now)
 }
@@ -147,11 +147,12 @@ fn a_reply_that_was_lost_costs_no_second_write() {
     let (mut plan, machine, now) = probe_and_plan(sensor(Baud::B38400), 0);
     set_other_values(&mut plan);
     let mut bench = change(plan, machine, now);
-    // Everything is lost while the sensor answers the write: its ACK too.
+    // All bytes of the reply to the write are lost, including its ACK.
     let mut received = 0;
     bench.to_host = Box::new(move |bytes| {
         received += bytes.len();
-        // ACK and F4h of 42 bytes come first, then ACK and A0h of 9, then ACK and F7h of 43.
+        // The bytes before are an ACK and F4h of 42 bytes, and an ACK and A0h of 9 bytes. The lost bytes are an ACK and
+        // F7h of 43 bytes.
         if received > 53 && received <= 53 + 44 { Vec::new() } else { bytes }
     });
     bench.finish(120_000 * MILLIS);
@@ -218,7 +219,7 @@ fn bad_habits_and_lossy_lines_never_lie() {
     assert!(done >= 45, "{done} of 60");
 }
 
-/// Loses the first `count` stops on their way.
+/// Loses the first `count` requests to stop on their way.
 fn losing_stops(mut count: usize) -> Box<dyn FnMut(Vec<u8>) -> Vec<u8>> {
     let mut last = [0; 6];
     Box::new(move |bytes| {
@@ -253,7 +254,8 @@ fn leaves_installation_mode_although_stops_are_lost() {
 
 #[test]
 fn a_stray_nak_is_not_believed_where_it_does_harm() {
-    // Before the first reply, and while the sensor writes: behind the ACK and F4h of 42 bytes, the ACK and A0h of 9.
+    // The change fails before the first reply, and while the scanner writes: after an ACK and F4h of 42 bytes, and an
+    // ACK and A0h of 9 bytes.
     for after in [0, 53] {
         let (mut plan, mut machine, now) = probe_and_plan(sensor(Baud::B38400), 0);
         set_other_values(&mut plan);
@@ -284,7 +286,7 @@ fn a_reply_that_cannot_be_read_is_no_refusal() {
     bench.to_host = Box::new(move |bytes| {
         let before = received;
         received += bytes.len();
-        // ACK and F4h of 42 bytes, ACK and A0h of 9, ACK; then F7h of 43.
+        // The bytes are an ACK and F4h of 42 bytes, an ACK and A0h of 9 bytes, and an ACK. F7h of 43 bytes follows.
         match before {
             54 => short.bytes().to_vec(),
             55..97 => Vec::new(),

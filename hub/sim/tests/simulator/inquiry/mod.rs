@@ -1,5 +1,6 @@
-//! Requests to a simulated scanner for its identity, in virtual time: a scanner that replies is found at any rate and
-//! in any mode, and left as it was. A line may lose bytes, and a scanner may overlook requests or not exist.
+//! Tests of requests for the identity of a simulated scanner, in virtual time. A scanner that replies is found at any
+//! rate and in any mode, and left in the same state. The line may lose bytes, and the scanner may overlook requests or
+//! be missing.
 
 mod change;
 mod random;
@@ -69,7 +70,7 @@ pub(crate) fn make_stream(machine: &mut LmsSimulator) -> Nanos {
 }
 
 impl<C: Protocol> Bench<C> {
-    /// Creates a conversation that starts at `now` of the machine's time, at a port with the rate `port`.
+    /// Creates a bench that starts at `now` of the machine's time, at a port with the rate `port`.
     pub(crate) fn new(protocol: C, port: Baud, machine: LmsSimulator, now: Nanos) -> Self {
         Bench {
             protocol,
@@ -87,7 +88,7 @@ impl<C: Protocol> Bench<C> {
         }
     }
 
-    /// Runs to the end of the conversation, which must be within `span`. Returns its duration.
+    /// Runs until the protocol is complete, which must happen within `span`. Returns the duration.
     pub(crate) fn finish(&mut self, span: Nanos) -> Nanos {
         let started = self.now;
         while let Some(until) = self.drain() {
@@ -106,7 +107,7 @@ impl<C: Protocol> Bench<C> {
         self.now - started
     }
 
-    /// Returns the telegrams that end in `span` without a request.
+    /// Returns the telegrams that end within `span`, while the host sends no request.
     pub(crate) fn collect_telegrams(&mut self, span: Nanos) -> Vec<Vec<u8>> {
         let mut sent = Vec::new();
         let end = self.now + span;
@@ -195,7 +196,7 @@ impl<C: Protocol> Bench<C> {
 /// Time from an event to a running host.
 const WAKE_DELAY: Nanos = 50 * MICROS;
 
-/// 20h 00h with the password that every sensor leaves the factory with.
+/// Returns the request 20h 00h with the factory password.
 fn installation_request() -> EncodedTelegram {
     Writer::new(0, 0x20).byte(0).slice(b"SICK_LMS").finish()
 }
@@ -222,7 +223,7 @@ fn identifies_scanner_at_each_rate_and_in_each_mode() {
                 let configuration = report.configuration().expect("was asked");
                 assert_eq!((configuration.mode(), configuration.unit()), (Mode(1), Some(Unit::Mm)));
                 println!("port at {first:?}, {word} at {baud:?}: {} ms", elapsed / MILLIS);
-                // It is as it was.
+                // The scanner is in its previous state.
                 assert_eq!((bench.machine.baud(), bench.machine.eeprom_writes()), (baud, 0));
                 let scans = bench.collect_telegrams(2_000 * MILLIS);
                 assert_eq!(scans.is_empty(), mode != 0x24, "{word}");
@@ -361,7 +362,7 @@ fn repeats_an_overlooked_request() {
         let mut machine = sensor(baud);
         let now = make_stream(&mut machine);
         let mut bench = Bench::new(Inquiry::new(Baud::B500000, now), Baud::B500000, machine, now);
-        // The first byte of a request is lost, and so the whole of it.
+        // The loss of its first byte makes a request invalid.
         let mut random = fastrand::Rng::with_seed(seed);
         bench.to_scanner =
             Box::new(move |bytes| if bytes[0] == 0x02 && random.f64() < 0.3 { Vec::new() } else { bytes });

@@ -1,5 +1,5 @@
-//! Random bytes, random orders of events and the fault table against inquiries and changes: they do not panic, they
-//! end, and their results are true. A change writes no more often than it may, and never unnoticed.
+//! Tests of inquiries and changes with random bytes, random sequences of events and the fault table. They do not panic,
+//! they end, and their results are true. A change writes no more often than permitted, and reports every write.
 
 use scanhub_drivers::line::{Action, Protocol};
 use scanhub_drivers::lms::Inquiry;
@@ -18,7 +18,7 @@ use scanhub_sim::machine::{LmsSimulator, ProtocolQuirks};
 use super::change::{change, probe_again, probe_and_plan, set_other_values};
 use super::{Bench, make_stream, sensor};
 
-/// Drives `protocol` until it is over, by what comes to mind; returns the telegrams that it said.
+/// Drives `protocol` with random events until it is complete. Returns the telegrams that it sent.
 fn drive<C: Protocol>(protocol: &mut C, seed: u64) -> Vec<Vec<u8>> {
     let mut random = fastrand::Rng::with_seed(seed);
     let (mut now, mut sent, mut request): (Nanos, Vec<Vec<u8>>, Vec<u8>) = (0, Vec::new(), Vec::new());
@@ -66,7 +66,7 @@ fn drive<C: Protocol>(protocol: &mut C, seed: u64) -> Vec<Vec<u8>> {
     panic!("no end, seed {seed}");
 }
 
-/// Noise, acknowledgements, or a telegram that a sensor may send, often the answer to what it was `asked`.
+/// Returns noise, acknowledgements, or a telegram that a scanner may send, often the reply to `request`.
 fn random_bytes_or_reply(request: Option<u8>, random: &mut fastrand::Rng) -> Vec<u8> {
     let noise = |random: &mut fastrand::Rng, maximum| {
         (0..random.usize(..maximum)).map(|_| random.u8(..)).collect::<Vec<u8>>()
@@ -149,7 +149,7 @@ fn writes_the_plan_and_leaves_installation_mode() {
     assert!((1..=3).contains(&maximum), "{maximum} writes");
 }
 
-/// Faults, and the minimum number of 8 inquiries and of 8 changes that must succeed with them.
+/// Faults, each with the minimum numbers of 8 inquiries and of 8 changes that must succeed despite them.
 const SCENES: &[(&str, [usize; 2])] = &[
     ("loss=0.001,burst=3", [7, 7]),
     ("flip=0.001", [7, 7]),
@@ -172,7 +172,7 @@ const SCENES: &[(&str, [usize; 2])] = &[
     ("overlook=0.2,nak=0.1", [7, 7]),
 ];
 
-/// The sensor of `seed`, idle or streaming, and when it is.
+/// Returns a scanner for `seed`, idle or streaming, with its rate and the time.
 fn any_scanner(seed: u64) -> (Baud, LmsSimulator, u64, bool) {
     let baud = Baud::ALL[seed as usize % 4];
     let mut machine = sensor(baud);
@@ -181,7 +181,7 @@ fn any_scanner(seed: u64) -> (Baud, LmsSimulator, u64, bool) {
     (baud, machine, now, is_streaming)
 }
 
-/// `bench` with `faults`, the sensor's own and the line's.
+/// Adds the faults of the scanner and of the line to `bench`.
 fn with_faults<C>(mut bench: Bench<C>, faults: &Faults, seed: u64) -> Bench<C> {
     bench.machine.set_quirks(faults.quirks());
     let fresh = LineModel::new(faults, seed);
@@ -202,7 +202,7 @@ fn probe_report_is_right_despite_faults() {
             let report = bench.protocol.report();
             if let Some(status) = report.status() {
                 found += 1;
-                // The power may have gone since.
+                // The power may have failed after the report.
                 if faults.power_every == 0.0 {
                     let mode = if is_streaming { 0x24 } else { 0x25 };
                     assert_eq!((report.baud, status.operating_mode()), (Some(baud), mode), "{text}, {seed}");
@@ -257,5 +257,5 @@ fn change_outcome_is_right_despite_faults() {
     }
 }
 
-/// Each rate, idle and streaming.
+/// Number of seeds: each rate, idle and streaming.
 const SEED_COUNT: u64 = 8;

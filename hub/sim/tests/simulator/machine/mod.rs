@@ -1,5 +1,5 @@
-//! A simulated LMS in virtual time: its replies, the time at which bytes have left the line, the effect of requests on
-//! its stream, and the line itself.
+//! Tests of a simulated LMS in virtual time: its replies, the times at which bytes have left the line, the effect of
+//! requests on its stream, and the line itself.
 
 mod states;
 
@@ -46,7 +46,7 @@ impl Bench {
         self.now = end;
     }
 
-    /// Says `bytes` with `gap` of idle time between them.
+    /// Sends `bytes` with idle time of `gap` before each of them.
     pub(crate) fn send(&mut self, bytes: &[u8], gap: Nanos) {
         for &byte in bytes {
             self.run_until(self.now + line_time(1, self.machine.baud().rate()) + gap);
@@ -54,7 +54,7 @@ impl Bench {
         }
     }
 
-    /// Sends `request` with correct timing, and returns the reply of the next half second.
+    /// Sends a request with correct timing, and returns the bytes that arrive in the next half second.
     pub(crate) fn ask(&mut self, bytes: &[u8]) -> Vec<u8> {
         let before = self.chunks.len();
         self.send(bytes, 60 * MICROS);
@@ -75,7 +75,7 @@ impl Bench {
     }
 }
 
-/// The reply in `bytes`, which are an ACK and one telegram.
+/// Decodes the reply in `bytes`, which are an ACK and one telegram.
 pub(crate) fn reply(bytes: &[u8]) -> Reply<'_> {
     assert_eq!(bytes[0], ACK);
     Reply::decode(Telegram::check(&bytes[1..]).expect("a whole telegram")).expect("a reply")
@@ -149,7 +149,7 @@ fn a_stream_keeps_its_grid_and_pauses_with_the_mirror() {
     let (first, last) = (sent[0].0, sent[sent.len() - 1].0);
     assert_eq!(last - first, (sent.len() as Nanos - 1) * 2 * MIRROR_PERIOD, "drifts");
     assert!(sent.iter().all(|(_, sent)| !sent.aborted && Telegram::check(&sent.telegram).is_some()));
-    // Of the last telegram: 508 bytes in 10.16 ms, a pause, the rest in the next turn.
+    // The last telegram consists of 508 bytes in 10.16 ms, a pause, and the rest in the next revolution of the mirror.
     let start = last - MIRROR_PERIOD - line_time(224, 500_000);
     let mut through = 0;
     let mut pauses = 0;
@@ -185,7 +185,7 @@ fn period_at_each_rate_and_variant_is_as_listed() {
 fn request_aborts_the_scan_then_a_full_one_is_sent() {
     let mut bench = Bench::new(fast_settings());
     bench.ask(Request::Stream.encode(0).bytes());
-    // Into the middle of the first burst.
+    // The request arrives in the middle of the first burst.
     let next = bench.sent().last().unwrap().0 + 2 * MIRROR_PERIOD - 17_800 * MICROS;
     bench.run_until(next + 3 * MILLIS);
     let (before, sent_before) = (bench.chunks.len(), bench.sent().len());
@@ -194,7 +194,7 @@ fn request_aborts_the_scan_then_a_full_one_is_sent() {
     assert_eq!((sent[0].1.is_reply, sent[0].1.aborted), (false, true));
     assert_eq!((sent[1].1.is_reply, sent[1].1.aborted), (true, false));
     assert!(sent[2..].iter().all(|(_, sent)| !sent.is_reply && !sent.aborted));
-    // On the wire: the scan's head, ACK, the whole reply, a whole scan.
+    // The bytes are the start of the scan, an ACK, the whole reply, and a whole scan.
     let broken = &sent[0].1.telegram;
     let head = bench.chunks[..before].iter().rev().take_while(|(_, chunk)| chunk.part == ChunkKind::Telegram);
     let head: usize = head.map(|(_, chunk)| chunk.bytes.len()).sum();
@@ -204,7 +204,7 @@ fn request_aborts_the_scan_then_a_full_one_is_sent() {
     let answer = &bytes[rest + 1..][..29];
     assert_eq!(answer, sent[1].1.telegram);
     assert_eq!(bytes[rest + 30..][..732], sent[2].1.telegram);
-    // The new scan begins where the mirror begins one.
+    // The new scan starts at the start of a revolution of the mirror.
     assert_eq!((sent[2].0 - 17_800 * MICROS) % (2 * MIRROR_PERIOD), 0);
 }
 
@@ -212,7 +212,7 @@ fn request_aborts_the_scan_then_a_full_one_is_sent() {
 fn request_between_bursts_also_aborts_the_scan() {
     let mut bench = Bench::new(fast_settings());
     bench.ask(Request::Stream.encode(0).bytes());
-    // 508 bytes are through, the others wait for the mirror.
+    // 508 bytes have been sent, and the others wait for the mirror.
     let next = bench.sent().last().unwrap().0 + 2 * MIRROR_PERIOD - 17_800 * MICROS;
     bench.run_until(next + 11 * MILLIS);
     let sent_before = bench.sent().len();
@@ -277,7 +277,7 @@ fn counts_refused_and_executed_eeprom_writes() {
     let centimetres = Writer::new(0, 0x77).slice(&[0, 0, 0x70, 0, 0, 4, 0]).finish();
     let before = bench.chunks.len();
     bench.ask(centimetres.bytes());
-    // Another unit takes its time.
+    // A change of the unit takes longer.
     bench.run_until(bench.now + 1_000 * MILLIS);
     let written = bench.bytes_from(before);
     assert_eq!((written[5], written[6], written.len()), (0xF7, 1, 44));
@@ -307,7 +307,8 @@ fn recording_is_sent_once_despite_host_requests() {
 }
 
 proptest! {
-    /// Without faults everything that leaves is intact, byte for byte, in every setting and however late it is asked.
+    /// Without faults, everything that the scanner sends is intact, byte for byte, with any settings and however late
+    /// it is polled.
     #[test]
     fn everything_sent_is_intact(
         seed in any::<u64>(),
@@ -352,14 +353,14 @@ proptest! {
     }
 }
 
-/// A telegram with the bytes that arrived in its time, and the verdict.
+/// A telegram with the bytes that arrived for it, and its fault.
 struct TransmittedTelegram {
     telegram: Vec<u8>,
     arrived: Vec<u8>,
     fault: Option<Fault>,
 }
 
-/// Everything that a sensor says within `span` over a wire with `faults`.
+/// Returns everything that a scanner sends within `span` over a line with `faults`.
 fn transmit(faults: &str, seed: u64, chunk: ChunkSize, span: Nanos) -> Vec<TransmittedTelegram> {
     let settings = Settings {
         baud: Baud::B500000,

@@ -1,4 +1,5 @@
-//! States of a simulated LMS: other operating modes that a host left behind, power cycles and resets, and quirks.
+//! Tests of the states of a simulated LMS: operating modes that a previous host selected, power cycles and resets, and
+//! quirks.
 
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::command::Password;
@@ -128,7 +129,7 @@ fn one_telegram_may_be_asked_for() {
         let answer = bench.ask(request.finish().bytes());
         assert_eq!((answer[5], answer.len() - 1), (command, len));
     }
-    // An LMS 211 sees no more than 100 degrees.
+    // An LMS 211 measures no more than 100 degrees.
     let type_name = "LMS211;301063;V02.30 ".into();
     let mut bench = Bench::new(Settings { type_name, variant: Variant::ALL[3], ..fast_settings() });
     let kept = bench.ask(Writer::new(0, 0x3B).word(180).word(50).finish().bytes());

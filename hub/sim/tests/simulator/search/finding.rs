@@ -1,6 +1,7 @@
-//! The search finds scanners of all models and states in time, and sends no byte that a scanner should not get. It
-//! finds a remembered scanner nearly as soon as a session of its family does, and a scanner that gets power late soon
-//! after it can reply. Bytes that no scanner sent never end a search, and no scanner accepts a request at another rate.
+//! Tests of the search. It finds scanners of all models and states in time, and sends no byte that a scanner should not
+//! get. It finds a remembered scanner nearly as soon as a session of its family does, and a scanner that gets power
+//! late soon after it can reply. Bytes that no scanner sent never end a search, and no scanner accepts a request at
+//! another rate.
 
 use scanhub_drivers::line::{Action, KnownRate, Protocol as _, ScannerSession as _};
 use scanhub_drivers::lms::variant::{Baud, Variant};
@@ -87,7 +88,7 @@ fn finds_every_scanner_behind_a_server() {
     assert!(times[times.len() - 1] <= 6_000 * MILLIS);
 }
 
-/// Times at which rounds begin, from the open: each one starts with a step at 230,400 baud.
+/// Returns the times at which rounds start, since the port was opened. Each round starts with a step at 230,400 baud.
 fn round_starts(bench: &Bench) -> Vec<Nanos> {
     let begins = bench.rates.iter().filter(|(_, rate)| *rate == 230_400).map(|(at, _)| at - bench.opened_at);
     [0].into_iter().chain(begins).collect()
@@ -100,7 +101,7 @@ fn rounds_take_their_time_on_a_silent_line() {
     let begins = round_starts(&bench);
     println!("silent: rounds begin at {:?} ms", begins.iter().map(|at| at / MILLIS).collect::<Vec<_>>());
     assert!(begins[1].abs_diff(1_200 * MILLIS) < 60 * MILLIS);
-    // A patient round and a pause of 0.5 s, then a round and a pause of 1 s.
+    // These are a longer round with a pause of 0.5 s, and a round with a pause of 1 s.
     assert!((begins[2] - begins[1]).abs_diff(3_060 * MILLIS) < 60 * MILLIS);
     assert!((begins[3] - begins[2]).abs_diff(2_200 * MILLIS) < 60 * MILLIS);
     let message = bench.host.problem().unwrap().message("/dev/ttyUSB0");
@@ -132,7 +133,7 @@ fn hands_over_every_read_of_the_last_step() {
                 let read: Vec<_> =
                     bench.read.iter().filter(|(_, bytes)| !bytes.is_empty()).cloned().collect();
                 if found.family == Family::Rplidar {
-                    // Only the reply is handed over.
+                    // Only the reply is passed to the session.
                     assert!(
                         reads[0].1.starts_with(&[0xA5, 0x5A, 0x14, 0, 0, 0, 0x04]),
                         "{name}: {reads:02X?}"
@@ -313,8 +314,8 @@ fn finds_another_scanner_than_the_remembered_one() {
 
 const ONE_SECOND: Nanos = 1_000 * MILLIS;
 
-/// Returns the worst time from when scanners that `create` creates can answer until they are found. They get power
-/// `after` this time from the open, and then start for `boot`.
+/// Returns the longest time from when scanners can reply until they are found. `create` creates the scanners. They get
+/// power `after` this time from the open, and then boot for `boot`.
 fn worst_find_time(name: &str, after: Nanos, boot: Nanos, create: impl Fn(u64) -> Box<dyn Device>) -> Nanos {
     let times = (0..10).map(|seed| {
         let after = after + seed * 317 * MILLIS;
@@ -402,7 +403,7 @@ fn garbage_is_not_a_scanner() {
     for port in [PortKind::Serial, PortKind::Server, PortKind::Recording] {
         for seed in 0..6 {
             count += feed_search(port, seed, 200, 20, |random| random.u8(..));
-            // Bytes that begin telegrams and packets of the families, among others.
+            // Frequent bytes are those that start telegrams and packets of the families.
             let heads = [0x02, 0x80, 0x81, 0xB0, 0xBA, 0x06, 0x54, 0x2C, 0xA5, 0x5A, 0x14, 0x04, 0x00, 0xFF];
             count += feed_search(port, seed, 200, 20, |random| heads[random.usize(..heads.len())]);
             count += feed_search(
@@ -448,8 +449,8 @@ fn receivers() -> Vec<(String, bool, Box<dyn Device>)> {
     all
 }
 
-/// Returns what a scanner at `rate` receives of a request that a host sends at `sent_at`, `drift` percent off, with
-/// `gap` between its bytes.
+/// Returns the bytes that a scanner at `rate` receives of a request. The host sends the request at `sent_at`, `drift`
+/// percent off, with `gap` between its bytes.
 fn received_bytes(request: &[u8], sent_at: u32, rate: u32, gap: Nanos, drift: f64) -> Vec<u8> {
     let rate_of_host = (f64::from(sent_at) * (1.0 + drift / 100.0)) as u32;
     let mut receiver = UartReceiver::new(rate_of_host, rate);
@@ -461,8 +462,8 @@ fn received_bytes(request: &[u8], sent_at: u32, rate: u32, gap: Nanos, drift: f6
     bytes
 }
 
-/// Returns how many telegrams that are not part of a stream, and how many parts of broken ones, `device` sends from
-/// `now` until `end`.
+/// Returns the number of telegrams that `device` sends from `now` until `end` and that are not part of a stream, plus
+/// the number of aborted telegrams.
 fn count_reactions(device: &mut dyn Device, now: &mut Nanos, end: Nanos) -> usize {
     use scanhub_sim::device::ChunkKind;
     let mut count = 0;
@@ -531,7 +532,8 @@ fn no_request_is_accepted_at_another_rate() {
 
 #[test]
 fn a_stop_for_an_lms_would_disturb_an_rplidar() {
-    // Why the search never sends this request to an unknown scanner: an RPLIDAR reads the beginning of a long one.
+    // The search never sends this request to an unknown scanner, because an RPLIDAR takes its bytes for the start of a
+    // long request.
     let stop = [0x02, 0x00, 0x02, 0x00, 0x20, 0x25, 0x35, 0x08];
     let is_disturbed = |tenths: i32| {
         let mut device = super::rplidar(Model::C1, false, 0, 1);

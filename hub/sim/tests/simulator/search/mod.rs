@@ -1,5 +1,5 @@
-//! A search and a simulated scanner at the two ends of a line, in virtual time. If port and scanner have different
-//! rates, bytes are garbled in both directions.
+//! Bench and tests of a search: a search and a simulated scanner at the two ends of a line, in virtual time. If port
+//! and scanner have different rates, bytes are garbled in both directions.
 
 mod finding;
 mod port;
@@ -21,7 +21,7 @@ use scanhub_sim::room::Room;
 use scanhub_sim::rplidar::{Model, RplidarSettings, RplidarSimulator, RplidarStart};
 use scanhub_sim::{Arrival, machine};
 
-/// Host's end of the line: a search, or a session to compare it with.
+/// Host at the end of the line: a search, or a session to compare it with.
 pub(crate) trait Host {
     type Result;
 
@@ -106,7 +106,7 @@ pub(crate) struct Bench<H = Search> {
     pub(crate) now: Nanos,
     port: PortKind,
     rate: u32,
-    /// Rates that the port cannot have.
+    /// Rates that the port does not support.
     pub(crate) unsupported_rates: Vec<u32>,
     to_host: BaudMismatch,
     to_device: BaudMismatch,
@@ -332,14 +332,14 @@ impl<H: Host> Bench<H> {
         }
     }
 
-    /// The line to the scanner is idle.
+    /// Reports to the scanner that the line is idle.
     fn flush(&mut self) {
         if !std::mem::replace(&mut self.is_flushed, true) {
             self.deliver(&[], true);
         }
     }
 
-    /// Bytes of the host arrive at the scanner, garbled if the rates differ.
+    /// Delivers bytes of the host to the scanner, garbled if the rates differ.
     fn deliver(&mut self, bytes: &[u8], is_idle: bool) {
         let Some(device) = self.device.as_mut().filter(|_| self.is_powered) else { return };
         let bytes = match device.rate() {
@@ -386,7 +386,7 @@ impl<H: Host> Bench<H> {
         self.now = self.now.max(to);
     }
 
-    /// The search sent nothing but the requests that an unknown scanner may get, and nothing just after the open.
+    /// Checks that the search sent only requests that an unknown scanner may get, and none just after the open.
     fn check_requests(&self) {
         const ALLOWED: [(&[u8], &[u32]); 4] = [
             (&[0x02, 0x00, 0x01, 0x00, 0x3A, 0x1E, 0x12], &[9_600, 19_200, 38_400, 500_000]),

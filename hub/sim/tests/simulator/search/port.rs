@@ -1,5 +1,5 @@
-//! A session on a port without a configured family: scans arrive soon, no byte is lost on the way from the search to
-//! the session, and the search begins again after the scanner was unplugged.
+//! Tests of a session on a port without a configured family: scans arrive soon, no byte is lost between the search and
+//! the session, and the search restarts after the scanner was unplugged.
 
 use scanhub_drivers::line::{self, Protocol, ScannerSession as _, SessionStats, State};
 use scanhub_drivers::lms::variant::Baud;
@@ -15,7 +15,7 @@ use super::{Bench, Host, HostAction};
 pub(crate) struct AutoHost {
     pub(crate) session: PortSession,
     scans: u64,
-    /// Wanted number of scans.
+    /// Number of scans at which the host returns.
     wanted_scans: u64,
     bytes: u64,
 }
@@ -59,7 +59,7 @@ impl Host for AutoHost {
 }
 
 impl AutoHost {
-    /// Every byte that was read is in the counters, in those of the status too.
+    /// Checks that every byte that was read is in the counters, including those of the status.
     fn check_counters(&self) {
         let stats = self.session.stats();
         let SessionStats { read, in_telegrams, acknowledge, discarded, buffered, .. } = stats;
@@ -137,7 +137,7 @@ fn finds_every_family_and_remembers_the_scanner() {
 #[test]
 fn the_telegrams_of_the_search_reach_the_session() {
     for seed in 0..20 {
-        // Each is found by its stream, so it gets no byte before the session begins.
+        // Both scanners are found by their streams, so they get no byte before the session starts.
         for (name, device, most_lost) in [
             ("lms", super::lms(Baud::B500000, true, seed), 814),
             ("ld", super::ld(ld::Model::Ld19, seed), 2 * 47),
@@ -193,7 +193,7 @@ fn scans_arrive_at_a_port_that_rejects_rates() {
             let session = &bench.host.session;
             assert_eq!(session.family(), Some(family), "{name}");
             if family == Family::Lms && impossible.contains(&500_000) {
-                // It was not sent to a rate that only it can have.
+                // The session did not switch the scanner to a rate that the port does not support.
                 assert_eq!(session.rate(), 38_400, "{name}");
                 let problem = session.problem().map(|problem| problem.to_string()).unwrap_or_default();
                 assert!(problem.starts_with("the port does not support 500000 baud"), "{name}: {problem}");

@@ -1,4 +1,4 @@
-//! What a user may ask of a running session: pause, resume, resync.
+//! Tests of requests of a user to a running session: pause, resume, resync.
 
 use scanhub_drivers::line::{Control, ScannerSession as _, State};
 use scanhub_drivers::lms;
@@ -15,7 +15,7 @@ impl Bench {
     }
 }
 
-/// Bytes of the sensor that came after `since`.
+/// Returns the number of telegrams that arrived from the scanner after `since`.
 fn bytes_sent_since(bench: &Bench, since: Nanos) -> usize {
     bench.sent.iter().filter(|sent| sent.at > since).count()
 }
@@ -40,7 +40,7 @@ fn a_pause_stops_the_stream_and_a_resume_starts_it() {
         bench.run(200 * MILLIS);
         assert!(bench.is_streaming(), "{round}: {bench}");
     }
-    // The scans that the three stops broke off are the only ones that were not delivered.
+    // Only the scans that the three stops aborted were not delivered.
     let mut intact = bench.intact_scans(0);
     intact.truncate(bench.received_scans(0).len());
     assert_eq!(bench.received_scans(0), intact, "{bench}");
@@ -88,7 +88,7 @@ fn an_absent_sensor_is_paused_in_peace() {
     bench.run(60_000 * MILLIS);
     assert_eq!((bench.session.state(), bench.sent_bytes.len()), (State::Paused, sent_count));
     assert_eq!(bench.session.problem(), None);
-    // A pause does not count as time in which it did not answer.
+    // The time of a pause does not count as time without a reply.
     bench.control(Control::Resume);
     bench.run_until("said", 3_000 * MILLIS, |bench| bench.session.problem().is_some());
     assert!(matches!(bench.session.problem(), Some(Problem::NoReply { seconds: 0..=3, .. })), "{bench}");
@@ -116,7 +116,7 @@ fn delivers_unstoppable_stream_and_limits_stops() {
     let mut bench = Bench::new(machine, started);
     bench.run_until("streaming", 100 * MILLIS, Bench::is_streaming);
     bench.run(300 * MILLIS);
-    // The line to the sensor breaks, the line back does not.
+    // The line to the scanner fails, and the line back does not.
     bench.to_scanner = Box::new(|_, _| None);
     let paused = bench.now;
     bench.control(Control::Pause);
@@ -132,7 +132,7 @@ fn delivers_unstoppable_stream_and_limits_stops() {
     bench.control(Control::Resume);
     bench.run_until("streaming", 100 * MILLIS, Bench::is_streaming);
     bench.run(5_000 * MILLIS);
-    // It is asked who it is, as often as any other.
+    // The session requests the type as often as from any other scanner.
     assert!(bench.is_streaming() && bench.sent_bytes.len() <= sent_count + 15 * 7, "{bench}");
 }
 
@@ -150,7 +150,7 @@ fn resync_restarts_and_is_counted() {
     let mut intact = bench.intact_scans(started);
     intact.truncate(bench.received_scans(started).len());
     assert_eq!(bench.received_scans(started), intact, "{bench}");
-    // From a pause too.
+    // A resync is also possible during a pause.
     bench.control(Control::Pause);
     bench.run(500 * MILLIS);
     bench.control(Control::Resync);

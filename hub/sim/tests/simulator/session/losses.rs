@@ -1,5 +1,5 @@
-//! Losses and delays of the line and the host. The session delivers intact telegrams and counts losses. Its stamps are
-//! right even if the host did not run for a while, or reads only when a telegram is due.
+//! Tests of losses and delays of the line and the host. The session delivers intact telegrams and counts losses. Its
+//! stamps are right even if the host did not run for a while, or reads only when a telegram is due.
 
 use scanhub_drivers::line::{Control, ScannerSession as _};
 use scanhub_drivers::lms;
@@ -59,7 +59,7 @@ fn long_bursts_and_single_bytes_too() {
     }
 }
 
-/// A stream whose questions are all answered.
+/// Returns a bench that streams, with replies to all requests.
 fn streaming(baud: Baud) -> Bench {
     let mut bench = Bench::with_settings(lms::Settings { baud, ..SESSION_SETTINGS }, sensor(baud), 0);
     bench.run_until("streaming", 5_000 * MILLIS, Bench::is_streaming);
@@ -67,7 +67,7 @@ fn streaming(baud: Baud) -> Bench {
     bench
 }
 
-/// Scans that were sent after `since`, and those of them that the line damaged.
+/// Returns the number of scans that were sent after `since`, and the number of those that the line damaged.
 fn sent_and_damaged(bench: &Bench, since: Nanos) -> (u64, u64) {
     let scans = || bench.sent.iter().filter(|sent| sent.at > since && !sent.is_reply && !sent.aborted);
     (scans().count() as u64, scans().filter(|sent| sent.damaged).count() as u64)
@@ -96,7 +96,7 @@ fn ten_minutes_of_the_bursts_of_the_paper() {
 
 #[test]
 fn counts_lost_scans_at_slower_rates() {
-    // The slower line would treat more in a row as a silence.
+    // At the lower rate, more consecutive losses would count as a silence.
     for (baud, loss, minutes) in [(Baud::B38400, 0.0003, 10), (Baud::B9600, 0.00008, 40)] {
         let mut bench = streaming(baud);
         let started = bench.now;
@@ -133,7 +133,7 @@ fn control_requests_and_silence_count_no_loss() {
     bench.run_until("streaming", 10_000 * MILLIS, Bench::is_streaming);
     bench.run(5_000 * MILLIS);
     assert!(well(&bench), "{bench}");
-    // One telegram less.
+    // One telegram is lost.
     let (started, due) = (bench.now, bench.session.stats().due);
     bench.to_host = Box::new(move |at, bytes| if at < started + 27 * MILLIS { Vec::new() } else { bytes });
     bench.run(5_000 * MILLIS);
@@ -141,7 +141,7 @@ fn control_requests_and_silence_count_no_loss() {
     assert!((185..190).contains(&(bench.session.stats().due - due)));
 }
 
-/// Returns a bench that has streamed for some seconds, and the time of a scan from its first to its last byte.
+/// Returns a bench that has streamed for some seconds, and the time from the first to the last byte of a scan.
 fn streaming_variant(baud: Baud, variant: Variant) -> (Bench, Nanos) {
     let settings = Settings { baud, variant, ..Settings::default() };
     let machine = LmsSimulator::new(settings, ScanSource::Room(Room::new(&"room".parse().unwrap(), 5)));
@@ -232,7 +232,7 @@ fn stop_between_scans_does_not_stamp_backlog_as_new() {
             bench.run(MILLIS);
         }
         let stopped = bench.now;
-        // As much as a tty has room for.
+        // Stops the host for as long as a tty has room.
         bench.stop_host(140 * MILLIS);
         let continued = bench.now;
         bench.run(5 * MILLIS);
@@ -246,7 +246,7 @@ fn stop_between_scans_does_not_stamp_backlog_as_new() {
     }
 }
 
-/// Whether the end of a telegram could be the beginning of the next one: such a telegram is held until the line is
+/// Returns whether the end of a telegram could be the start of the next one. Such a telegram is held until the line is
 /// idle (framing, rule 4).
 fn is_held(telegram: &[u8]) -> bool {
     (1..=6).any(|len| telegram.ends_with(&telegram[..len]))
@@ -280,7 +280,7 @@ fn a_telegram_is_there_soon_after_its_last_byte() {
     }
 }
 
-/// Telegrams that are read as they come, before the first rest.
+/// Number of telegrams that the session reads as their bytes arrive, before it defers reads.
 const TELEGRAMS_BEFORE_TIMING: usize = 6;
 
 #[test]
@@ -296,7 +296,7 @@ fn reads_a_scan_only_when_it_is_nearly_complete() {
         bench.run(MILLIS - MILLIS / 7);
         exposed += u32::from(bench.session.stats().buffered > 0);
     }
-    // 0.6 ms and a chunk of every 26.64.
+    // The line is polled during 0.6 ms and the time of a chunk in every 26.64 ms.
     assert!(exposed * 100 < polls * 6, "{exposed} of {polls}");
 }
 
@@ -305,8 +305,7 @@ fn replies_during_a_stream_are_received_within_2_ms() {
     let mut machine = sensor(Baud::B500000);
     let now = make_stream(&mut machine);
     let mut bench = Bench::new(machine, now);
-    // The scanner overlooks the first requests. The session knows the duration of a telegram by the time of the
-    // others.
+    // The scanner overlooks the first requests. The session estimates the duration of a telegram from the others.
     bench.to_scanner = Box::new(|number, byte| (number >= 60).then_some(byte));
     bench.run_until("streaming", 3_000 * MILLIS, Bench::is_streaming);
     bench.run(3_000 * MILLIS);

@@ -1,5 +1,5 @@
-//! A session and a simulated scanner at the two ends of a line, in virtual time. Tests define what the line does to
-//! bytes; the bench checks the invariants at every step.
+//! Bench and tests of a session: a session and a simulated scanner at the two ends of a line, in virtual time. Tests
+//! define how the line changes bytes; the bench checks the invariants at every step.
 
 mod control;
 mod losses;
@@ -38,9 +38,9 @@ pub(crate) struct Bench {
     pub(crate) now: Nanos,
     pub(crate) to_host: HostFilter,
     pub(crate) to_scanner: SensorFilter,
-    /// Bytes that the session said, with the time.
+    /// Bytes that the session sent, with their times.
     pub(crate) sent_bytes: Vec<(Nanos, u8)>,
-    /// When the sensor got the last byte of a request.
+    /// Times at which the scanner received the last byte of a request.
     pub(crate) request_times: Vec<Nanos>,
     /// Received ACKs and NAKs with their times.
     pub(crate) acknowledged: Vec<(Nanos, u8)>,
@@ -48,7 +48,7 @@ pub(crate) struct Bench {
     pub(crate) foreign: usize,
     pub(crate) sent: Vec<SentTelegram>,
     pub(crate) received: Vec<ReceivedTelegram>,
-    /// Every state that was seen, once in a row.
+    /// Every state of the session in order, without repetitions.
     pub(crate) states: Vec<State>,
     port: Baud,
     /// Size of the input buffer in bytes. As in a tty, bytes beyond it are lost.
@@ -66,15 +66,15 @@ pub(crate) struct Bench {
     request: Vec<u8>,
 }
 
-/// A telegram as the sensor sent it.
+/// A telegram as the scanner sent it.
 #[derive(Clone, Debug)]
 pub(crate) struct SentTelegram {
-    /// When its last byte was through.
+    /// Time at which its last byte had left the line.
     pub(crate) at: Nanos,
     pub(crate) telegram: Vec<u8>,
     pub(crate) is_reply: bool,
     pub(crate) aborted: bool,
-    /// Whether the line did something to it.
+    /// Whether the line damaged it.
     pub(crate) damaged: bool,
     /// Fault that the line applied.
     #[allow(dead_code, reason = "for the tests of faults")]
@@ -99,7 +99,7 @@ pub(crate) struct ReceivedTelegram {
     pub(crate) first: Nanos,
     #[allow(dead_code, reason = "for the tests of stamps")]
     pub(crate) estimated: bool,
-    /// Reads since the one before it.
+    /// Number of reads since the previous telegram.
     pub(crate) reads_since_last: u32,
 }
 
@@ -131,7 +131,7 @@ pub(crate) fn make_stream(machine: &mut LmsSimulator) -> Nanos {
         now += line_time(1, machine.baud().rate()) + 60 * MICROS;
         machine.receive(byte, Arrival::at(now));
     }
-    // The reply is through, and some scans.
+    // The reply and some scans have been sent.
     now += 2_000 * MILLIS;
     while machine.poll_transmit(now).is_some() {}
     now
@@ -173,18 +173,18 @@ impl Bench {
         }
     }
 
-    /// Has the session try `baud` first, as a hub does that has found the sensor there before.
+    /// Makes the session try `baud` first, like a hub that has found the scanner there before.
     pub(crate) fn set_first_probe_rate(&mut self, baud: Baud) {
         let silent_switches = self.session.silent_switches();
         self.session.hint_rate(KnownRate { baud: baud.rate(), silent_switches });
     }
 
-    /// Returns the rate at which the session has found the sensor.
+    /// Returns the rate at which the session has found the scanner.
     pub(crate) fn discovered_rate(&self) -> Option<Baud> {
         self.session.known_rate().and_then(|known| Baud::of_rate(known.baud))
     }
 
-    /// Connects this machine to a session with a history, none of whose requests is partly sent.
+    /// Connects the machine to a session that has run before and has no partly sent request.
     pub(crate) fn with_session(session: LmsSession, machine: LmsSimulator, now: Nanos) -> Bench {
         let (port, read) = (session.baud(), session.framer_counters().read);
         Bench { port, read, session, ..Bench::new(machine, now) }
@@ -198,7 +198,7 @@ impl Bench {
         }
     }
 
-    /// Runs until `is_so`, which must be within `span`; returns the time it took.
+    /// Runs until `is_true` returns true, which must happen within `span`. Returns the duration.
     pub(crate) fn run_until(
         &mut self,
         description: &str,
@@ -242,7 +242,7 @@ impl Bench {
         self.advance(self.now + span);
     }
 
-    /// One round of the host: everything that the session wants, then a wait, then a read.
+    /// Runs one round of the host: all actions of the session, then a wait, then a read.
     fn step(&mut self, limit: Nanos) {
         let (watch, until) = self.drain();
         self.wait(watch, until.min(limit));
@@ -315,7 +315,7 @@ impl Bench {
         wait
     }
 
-    /// Waits until `until`, or for bytes if they are watched for.
+    /// Waits until `until`. With `watch`, the arrival of bytes ends the wait.
     fn wait(&mut self, watch: bool, until: Nanos) {
         while !watch || self.inbox.is_empty() {
             match self.line.poll_timeout(&self.machine, self.now) {
@@ -366,7 +366,7 @@ impl Bench {
         self.now = self.now.max(to);
     }
 
-    /// Takes the bytes that the line delivers.
+    /// Handles the bytes that the line delivers.
     fn deliver(&mut self, delivery: Delivery) {
         if delivery.is_telegram() {
             self.fault = self.fault.or(delivery.fault);

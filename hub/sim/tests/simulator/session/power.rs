@@ -1,6 +1,6 @@
-//! Power cycles and restarts, in a scan, in the start of a session, and of a scanner that takes a minute to boot. A
-//! scanner on RS-232, which carries nothing at 500,000 baud: after a switch to that rate, the scanner is lost until its
-//! power is cycled.
+//! Tests of power cycles and restarts, during a scan, at the start of a session, and of a scanner that takes a minute
+//! to boot. They also cover a scanner on RS-232, which carries nothing at 500,000 baud: after a switch to that rate,
+//! the scanner is lost until its power is cycled.
 
 use scanhub_drivers::line::{Control, ScannerSession as _, State};
 use scanhub_drivers::lms;
@@ -16,10 +16,11 @@ use scanhub_sim::operating::OperatingMode;
 
 use super::{Bench, SESSION_SETTINGS, make_stream, sensor, sensor_with};
 
-/// What a session has to stream within after the banner.
+/// Time after the boot message within which a session must stream.
 const STREAM_TIMEOUT: Nanos = 5_000 * MILLIS;
 
-/// The same where the change of a mode is waited for that the sensor has forgotten, and then the rate is sought.
+/// Limit if the session first waits for a change of mode that the restarted scanner has forgotten, and then
+/// searches for the rate.
 const SEARCH_TIMEOUT: Nanos = 6_000 * MILLIS;
 
 fn booting(boot_ns: Nanos) -> Settings {
@@ -76,7 +77,8 @@ fn at_any_moment_of_the_conversation() {
 
 #[test]
 fn boot_message_is_answered_at_once() {
-    // In a stream at 9600, and in the search, where the pauses between its rounds are spent at 9600.
+    // The power fails during a stream at 9600, and during the search, which is at 9600 in the pauses between its
+    // rounds.
     let slow_settings = lms::Settings { baud: Baud::B9600, ..super::SESSION_SETTINGS };
     let mut bench = Bench::with_settings(slow_settings, sensor_with(booting(300 * MILLIS)), 0);
     bench.run_until("streaming", 5_000 * MILLIS, Bench::is_streaming);

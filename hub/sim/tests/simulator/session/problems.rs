@@ -1,5 +1,5 @@
-//! Scanners that refuse, overlook or misreply, lines that lose requests or replies, and streams that stop: the session
-//! streams anyway, and reports what a scanner says about itself.
+//! Tests of scanners that refuse or overlook requests or reply wrongly, of lines that lose requests or replies, and of
+//! streams that stop. The session streams anyway, and reports the scanner's messages about itself.
 
 use scanhub_drivers::line::{ScannerSession as _, State};
 use scanhub_drivers::lms;
@@ -41,7 +41,7 @@ fn refused_variant_is_reported_again_after_silence() {
     bench.run_until("silent", 1_040 * MILLIS, |bench| bench.session.state() == State::Silent);
     assert_eq!(bench.session.problem(), Some(Problem::Silence));
     bench.states.clear();
-    // Nobody tells the mode for some time.
+    // The mode is unknown for some time, because the scanner sends no replies.
     let mute = ProtocolQuirks { is_mute: true, ..ProtocolQuirks::default() };
     bench.machine.set_quirks(mute);
     bench.run_until("streaming", 200 * MILLIS, Bench::is_streaming);
@@ -69,7 +69,7 @@ fn any_byte_of_the_requests_may_be_lost_or_damaged() {
                 None => None,
                 Some(bits) => Some(byte ^ bits),
             });
-            // A change of rate that was not understood is found out after three tries and a search.
+            // After three attempts and a search, the session detects that the scanner did not receive a change of rate.
             bench.run_until("streaming", 6_000 * MILLIS, Bench::is_streaming);
             bench.run(200 * MILLIS);
             assert!(bench.is_streaming(), "byte {wrong} {damage:?}: {bench}");
@@ -85,7 +85,7 @@ fn any_reply_may_be_lost_or_damaged() {
         bench.sent.iter().filter(|sent| sent.is_reply).count()
     };
     assert!(replies >= 4);
-    // By the number of the chunk: replies and their acknowledgements are the first ones.
+    // Replies and their acknowledgements are the first chunks.
     for wrong in 0..replies * 8 {
         for damage in [None, Some(0x04)] {
             let mut bench = Bench::new(sensor(Baud::B9600), 0);
@@ -120,7 +120,7 @@ fn silence_of_1_s_restarts_with_two_requests() {
     bench.run(1_000 * MILLIS);
     assert!(bench.is_streaming(), "{bench}");
     assert_eq!((bench.session.stats().resyncs, bench.session.problem()), (1, None));
-    // Who it is, and how its values are split: it might be another one.
+    // The session requests the type and the mode again, because another scanner may be connected.
     assert_eq!(bench.sent_bytes.len(), sent_count + 2 * 7);
 }
 
@@ -184,7 +184,7 @@ fn a_sensor_that_was_swapped_may_have_another_address() {
     assert_eq!(bench.session.sensor().address, Some(0x82));
 }
 
-/// Sensors with these quirks, idle and streaming at each rate, stream as wanted within `limit` ms.
+/// Checks that scanners with these quirks, idle and streaming at each rate, stream as configured within `limit` ms.
 fn assert_all_stream(quirks: ProtocolQuirks, seeds: std::ops::Range<u64>, limit: u64) {
     let mut longest = 0;
     for seed in seeds {
@@ -230,7 +230,7 @@ fn replies_come_twice() {
 
 #[test]
 fn acknowledgements_and_replies_are_late() {
-    // As late as the listing allows, and later.
+    // The delays are as long as the listing allows, and longer.
     for late in [52, 100, 300] {
         let late_ns = late * MILLIS;
         assert_all_stream(
@@ -322,7 +322,8 @@ fn a_stream_of_a_sensor_that_answers_nothing_is_taken() {
     bench.run(5_000 * MILLIS);
     assert_eq!(bench.states, [State::Probing, State::Streaming], "{bench}");
     assert_eq!(bench.session.problem(), Some(Problem::ModeUnknown));
-    // Three questions, five times each; then rarely, because without an answer there are no scans.
+    // The session sends three requests five times each. After that it repeats them rarely, because scans cannot be
+    // published without a reply.
     assert_eq!(bench.sent_bytes.len(), 15 * 7);
     bench.run(25_000 * MILLIS);
     assert!(bench.sent_bytes.len() <= (15 + 3 * 3) * 7, "{} bytes said", bench.sent_bytes.len());
@@ -382,7 +383,7 @@ fn reports_dirty_windows_and_errors() {
 #[test]
 fn a_condition_that_comes_and_goes_is_there() {
     let mut bench = streaming_bench(Settings { baud: Baud::B500000, ..Settings::default() });
-    // A scan with a dirty window now and then.
+    // Every fifth scan reports a dirty window.
     bench.to_host = scan_filter(|count, scan| with_dirty_window(scan, count % 5 == 0));
     bench.run_until("told", 1_000 * MILLIS, |bench| bench.session.sensor().notices().eq([Notice::Dirty]));
     for _ in 0..200 {
@@ -393,8 +394,8 @@ fn a_condition_that_comes_and_goes_is_there() {
     bench.run_until("forgotten", 10_000 * MILLIS, |bench| bench.session.sensor().notices().next().is_none());
 }
 
-/// Hands over whole scans of 361 beams, as `change` makes them of their number and bytes; the rest of the one on the
-/// line is lost.
+/// Returns a filter that passes on whole scans of 361 beams after `change` has changed them by their number and bytes.
+/// The rest of the scan on the line is lost.
 fn scan_filter(change: impl Fn(u32, Vec<u8>) -> Vec<u8> + 'static) -> HostFilter {
     let mut count = 0;
     let mut held = Vec::new();
@@ -411,7 +412,7 @@ fn scan_filter(change: impl Fn(u32, Vec<u8>) -> Vec<u8> + 'static) -> HostFilter
     })
 }
 
-/// `scan`, whose sensor complains of its window if it `is_dirty`, with a right checksum.
+/// Returns `scan` with a valid checksum. If it `is_dirty`, the scan reports a dirty window.
 fn with_dirty_window(mut scan: Vec<u8>, is_dirty: bool) -> Vec<u8> {
     if is_dirty {
         scan[729] |= 0x80;
@@ -432,7 +433,7 @@ fn single_complaint_on_a_damaging_line_is_ignored() {
         bench.run(27 * MILLIS);
         assert_eq!(bench.session.sensor().notices().next(), None, "{bench}");
     }
-    // A condition that the scanner reports repeatedly counts.
+    // A condition that the scanner reports repeatedly is a notice.
     bench.to_host = scan_filter(|count, scan| match count % 4 {
         0 => scan[..700].to_vec(),
         _ => with_dirty_window(scan, true),

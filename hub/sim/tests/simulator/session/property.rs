@@ -1,5 +1,5 @@
-//! Whatever happens in whatever order: nothing panics, no byte is unaccounted for, no request writes the EEPROM, and
-//! once a healthy sensor is there, its stream is. One seed reproduces a run.
+//! Property test of a session with random events: it never panics, every byte is counted, no request writes the EEPROM,
+//! and once a healthy scanner is connected, it streams. One seed reproduces a run.
 
 use scanhub_drivers::line::{Action, Event, Protocol as _, ScannerSession as _};
 use scanhub_drivers::line::{Control, State};
@@ -17,7 +17,7 @@ use scanhub_sim::operating::OperatingMode;
 
 use super::{Bench, SESSION_SETTINGS, sensor_with};
 
-/// A host without manners: reads when it likes, writes when it likes, calls when it likes.
+/// A host that reads, writes and calls the session at random times.
 struct RandomHost {
     session: LmsSession,
     now: Nanos,
@@ -83,7 +83,7 @@ impl RandomHost {
         }
     }
 
-    /// Until it waits; if the host is `lazy`, only until it wants to write.
+    /// Executes the actions of the session until it waits. With `is_partial`, it may stop at a write.
     fn drain(&mut self, is_partial: bool) {
         loop {
             match self.session.poll_action() {
@@ -111,7 +111,7 @@ impl RandomHost {
         assert_eq!(tally.telegrams, self.telegrams);
     }
 
-    /// Noise, or what a sensor might say, whole or cut.
+    /// Returns noise, or a telegram of a scanner, whole or truncated.
     fn bytes(&mut self) -> Vec<u8> {
         let random = &mut self.random;
         let address = if random.u8(..8) == 0 { random.u8(..128) } else { 0 };
@@ -167,7 +167,7 @@ fn any_baud(random: &mut fastrand::Rng) -> Baud {
     Baud::ALL[random.usize(..4)]
 }
 
-/// Every telegram that stands anywhere in `said`, whatever it was cut by.
+/// Returns every telegram at any position in `bytes`.
 fn telegrams(bytes: &[u8]) -> impl Iterator<Item = Telegram<'_>> {
     (0..bytes.len()).filter_map(|at| {
         let [STX, _, low, high, ..] = bytes[at..] else { return None };

@@ -1,5 +1,5 @@
-//! The start of a session, from the first request to the stream. The scanner is idle at some rate, streams already,
-//! streams in another mode or is in installation mode. The line may have a fixed rate.
+//! Tests of the start of a session, from the first request to the stream. The scanner is idle at some rate, streams
+//! already, streams in another mode or is in installation mode. The line may have a fixed rate.
 
 use scanhub_drivers::line::{Control, ScannerSession as _, State};
 use scanhub_drivers::lms;
@@ -30,9 +30,9 @@ fn from_each_rate_to_a_stream_within_three_seconds() {
         assert_eq!((bench.session.problem(), bench.session.stats().resyncs), (None, 0));
         let scans = bench.received_scans(since);
         assert!(scans.len() >= 36 && scans == bench.intact_scans(since)[..scans.len()], "{bench}");
-        // A rate is changed only where it has to be.
+        // The session changes the rate only if necessary.
         assert_eq!(bench.states.contains(&State::Switching), baud != Baud::B500000, "{bench}");
-        // Nothing is asked of a sensor whose questions are all answered.
+        // After all replies have arrived, the session sends no further request.
         let aborted = bench.sent.iter().filter(|sent| sent.aborted).count();
         assert_eq!(aborted, 0, "{bench}");
     }
@@ -53,7 +53,7 @@ fn sets_the_configured_variant() {
 
 #[test]
 fn reports_missing_scanner_and_keeps_searching() {
-    // It gets its power at any moment of two rounds and the pauses after them.
+    // The scanner gets power at some time in two rounds and the pauses after them.
     for moment in 0..60 {
         let mut bench = Bench::new(sensor(Baud::B9600), 0);
         bench.to_scanner = Box::new(|_, _| None);
@@ -68,7 +68,7 @@ fn reports_missing_scanner_and_keeps_searching() {
     }
 }
 
-/// A sensor that answers 60 ms after its ACK, as the faster half of those captured.
+/// Returns settings of a scanner that replies 60 ms after its ACK, like the faster half of captured replies.
 fn fast_settings(baud: Baud, start: StartState) -> Settings {
     let quirks = ProtocolQuirks { reply_delay_ns: 60 * MILLIS, ..ProtocolQuirks::default() };
     Settings { baud, start, quirks, ..Settings::default() }
@@ -76,7 +76,7 @@ fn fast_settings(baud: Baud, start: StartState) -> Settings {
 
 #[test]
 fn a_sensor_that_just_got_its_power_streams_soon() {
-    // Never seen before, or where it was the last time.
+    // The rate is unknown, or saved from the last time.
     for (seed, first, within) in (0..20).flat_map(|seed| [(seed, None, 500), (seed, Some(Baud::B9600), 500)])
     {
         let settings =
@@ -88,7 +88,7 @@ fn a_sensor_that_just_got_its_power_streams_soon() {
         assert!(bench.received.last().is_some_and(|got| got.range_bits == Some(13)), "{elapsed}: {bench}");
         let known = bench.session.sensor();
         assert_eq!((known.kind(), known.unit), (&b"LMS200;301063;V02.30"[..], Some(Unit::Mm)));
-        // At 9600 nothing long is said: a type and a change of rate.
+        // At 9600, the session requests nothing with a long reply: only a type and a change of rate.
         let replies: Vec<u8> =
             bench.sent.iter().filter(|sent| sent.is_reply).map(|sent| sent.telegram[4]).collect();
         assert_eq!(replies, [0xBA, 0xA0, 0xB1, 0xA0], "{bench}");
@@ -128,7 +128,7 @@ fn last_rate_is_tried_first_but_not_assumed() {
             let now = make_stream(&mut machine);
             let mut bench = Bench::new(machine, now);
             bench.set_first_probe_rate(first);
-            // A stream at the wanted rate is heard before anything is asked.
+            // The session receives a stream at the configured rate before it sends any request.
             let within = if baud == Baud::B500000 { 60 } else { 4_000 };
             bench.run_until("streaming", within * MILLIS, Bench::is_streaming);
             assert_eq!(bench.discovered_rate().is_none(), baud == Baud::B500000);
@@ -136,7 +136,8 @@ fn last_rate_is_tried_first_but_not_assumed() {
     }
 }
 
-/// It does not answer at all where others say that they cannot: at every rate it is asked for its status too.
+/// The scanner does not reply to a request for its type, where others refuse it. The session therefore requests the
+/// status at every rate, too.
 #[test]
 fn finds_scanner_by_status_if_type_is_unanswered() {
     for baud in Baud::ALL {
@@ -154,7 +155,8 @@ fn finds_scanner_by_status_if_type_is_unanswered() {
     }
 }
 
-/// Its rate may not be changed in the mode in which it is, which was not asked yet: it is stopped first.
+/// The scanner does not accept a change of rate in its present mode, which the session has not requested yet. The
+/// session stops it first.
 #[test]
 fn scanner_that_refuses_a_rate_is_stopped_first() {
     for baud in [Baud::B9600, Baud::B19200, Baud::B38400] {
@@ -169,7 +171,7 @@ fn scanner_that_refuses_a_rate_is_stopped_first() {
         bench.run_until("streaming", 2_000 * MILLIS, Bench::is_streaming);
         bench.run(500 * MILLIS);
         assert!(bench.is_streaming() && bench.session.problem().is_none(), "{bench}");
-        // Whoever refuses it always is told of, and asked again.
+        // If a scanner always refuses, the session reports it and repeats the request.
         let quirks = ProtocolQuirks { refused_commands: vec![0x20], ..ProtocolQuirks::default() };
         let settings = fast_settings(baud, StartState::Operating(OperatingMode::OnRequest));
         let mut bench = Bench::new(sensor_with(Settings { quirks, ..settings }), 0);
@@ -185,7 +187,7 @@ fn scanner_that_refuses_a_rate_is_stopped_first() {
 
 #[test]
 fn at_the_wanted_rate_it_is_taken_as_it_streams() {
-    // Begun at any moment of a scan's period.
+    // The session starts at different times within the period of a scan.
     for phase in 0..28 {
         let mut machine = sensor(Baud::B500000);
         let started = make_stream(&mut machine) + phase * 970 * MICROS;
@@ -197,7 +199,7 @@ fn at_the_wanted_rate_it_is_taken_as_it_streams() {
             "spoke before it listened"
         );
         assert_eq!(bench.states, [State::Probing, State::Streaming], "{bench}");
-        // Two questions, for measuring mode and type.
+        // Two requests abort a scan: for the measuring mode and the type.
         let aborted = bench.sent.iter().filter(|sent| sent.aborted).count();
         assert!(aborted <= 2, "{aborted} scans were broken off");
         assert!(bench.session.sensor().mode.is_some() && !bench.session.sensor().kind().is_empty());
@@ -236,7 +238,7 @@ fn telegrams_at_another_rate_give_no_scans() {
     // all later requests, so it cannot be stopped.
     let request_len = 2 * Request::Status.encode(0).bytes().len();
     bench.to_scanner = Box::new(move |number, byte| (number < request_len).then_some(byte));
-    // The host stands still at times, so that several scans wait where it changes its rate.
+    // The host stops at times, so that several scans are buffered when it changes its rate.
     for pause in 1..60 {
         bench.run(pause * 70 * MILLIS);
         bench.stop_host(1_700 * MILLIS);
@@ -253,7 +255,7 @@ fn telegrams_at_another_rate_give_no_scans() {
 
 #[test]
 fn on_a_slow_line_it_is_waited_for() {
-    // A telegram takes 0.19 s at 38400 and 0.76 s at 9600, the next one comes 0.21 and 0.77 s later.
+    // A telegram takes 0.19 s at 38400 and 0.76 s at 9600, and the period is 0.21 s and 0.77 s.
     for baud in [Baud::B9600, Baud::B38400] {
         let mut machine = sensor(baud);
         let started = make_stream(&mut machine) + 100 * MILLIS;
@@ -293,7 +295,7 @@ fn restored_identity_of_another_scanner_is_replaced() {
     let mut last = Bench::new(sensor(Baud::B500000), 0);
     last.run_until("known", 4_000 * MILLIS, |bench| bench.session.identity().is_some());
     let known = last.session.identity().expect("it streams");
-    // Its scans begin otherwise.
+    // The scans of the other scanner start with other bytes.
     let centimetres = Settings { baud: Baud::B500000, unit: Unit::Cm, mode: Mode(4), ..Settings::default() };
     let mut other = sensor_with(centimetres);
     let started = make_stream(&mut other);
@@ -302,7 +304,7 @@ fn restored_identity_of_another_scanner_is_replaced() {
     bench.run_until("its mode", 2_000 * MILLIS, |bench| bench.session.sensor().mode.is_some());
     bench.run(200 * MILLIS);
     assert!(bench.received.iter().filter_map(|got| got.range_bits).all(|bits| bits == 14), "{bench}");
-    // They begin in the same way, and mean something else: its status tells.
+    // The scans start with the same bytes, but have another meaning, which the status reveals.
     let mut other = sensor_with(Settings { baud: Baud::B500000, mode: Mode(4), ..Settings::default() });
     let started = make_stream(&mut other);
     let mut bench = Bench::new(other, started);
@@ -321,7 +323,7 @@ fn another_one_is_not_taken_for_the_first() {
         let mut bench = Bench::new(sensor(Baud::B500000), 0);
         bench.run_until("streaming", 3_000 * MILLIS, Bench::is_streaming);
         assert_eq!(bench.session.sensor().mode, Some(Mode(1)));
-        // It streams as the first one did, but what its values mean is something else.
+        // The new scanner streams like the first one, but its values have another meaning.
         let mut other = sensor_with(Settings {
             baud: Baud::B500000,
             start: StartState::Operating(OperatingMode::All),
@@ -365,7 +367,7 @@ fn modes() -> [OperatingMode; 9] {
     ]
 }
 
-/// A sensor that does this since `age`.
+/// Returns a scanner that has been streaming in this mode since time 0, at the time `since`.
 fn streaming(settings: Settings, operating: &OperatingMode, since: Nanos) -> (LmsSimulator, Nanos) {
     let mut machine =
         sensor_with(Settings { start: StartState::Operating(operating.clone()), seed: since, ..settings });
@@ -500,12 +502,12 @@ fn a_permanent_rate_is_found_worked_with_and_kept() {
         let mut bench = Bench::new(sensor_with(settings), 0);
         bench.run_until("streaming", 3_000 * MILLIS, Bench::is_streaming);
         bench.run(500 * MILLIS);
-        // That is a notice and not a problem.
+        // The permanent rate is a notice and not a problem.
         let is_said = bench.session.sensor().notices().eq([Notice::PermanentBaud]);
         assert_eq!(is_said, permanent != Baud::B9600, "{permanent:?}: {bench}");
         assert_eq!(bench.session.sensor().permanent_baud, Some(is_said));
         assert_eq!(bench.session.problem(), None);
-        // It comes back at its own rate, and is found again.
+        // The scanner restarts at its own rate, and the session finds it again.
         let now = bench.now;
         bench.machine.power_cycle(now);
         bench.run_until("silent", 1_200 * MILLIS, |bench| !bench.is_streaming());
@@ -563,7 +565,7 @@ fn twelve_of_twelve_stream_within_five_seconds() {
             for seed in 0..10 {
                 let start = StartState::Operating(operating.clone());
                 let settings = Settings { baud, start, seed, ..Settings::default() };
-                // Begun at any moment of a scan.
+                // The session starts at different times within a scan.
                 let started = seed * 83 * MILLIS;
                 let mut bench = Bench::new(sensor_with(settings), started);
                 let ms = bench.run_until("streaming", 5_000 * MILLIS, Bench::is_streaming) / MILLIS;

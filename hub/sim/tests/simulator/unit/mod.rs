@@ -1,4 +1,4 @@
-//! Scanners of Slamtec in simulated rooms, in virtual time: replies byte for byte, their consequences, and faults.
+//! Tests of RPLIDARs in simulated rooms, in virtual time: responses byte for byte, the effects of requests, and faults.
 
 mod points;
 mod session;
@@ -14,7 +14,7 @@ use scanhub_sim::world::World;
 
 pub(crate) const ONE_SECOND: Nanos = 1_000 * MILLIS;
 
-/// A telegram that left.
+/// A telegram that was sent.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct SentMessage {
     pub(crate) bytes: Vec<u8>,
@@ -135,7 +135,7 @@ fn only_reply(mut replies: Vec<Vec<u8>>) -> Vec<u8> {
 fn every_request_is_answered_byte_for_byte() {
     let mut bench = bench(Model::A1);
     let info = only_reply(bench.ask(&[0xA5, 0x50]));
-    // Model 18h, firmware 1.29, hardware 5, and sixteen bytes that are another scanner's only with another seed.
+    // Model 18h, firmware 1.29, hardware 5, and sixteen bytes that depend on the seed.
     assert_eq!(info[..11], [0xA5, 0x5A, 0x14, 0, 0, 0, 0x04, 0x18, 29, 1, 5]);
     assert_eq!(info.len(), 7 + 20);
     assert_eq!(only_reply(bench.ask(&[0xA5, 0x52])), [0xA5, 0x5A, 3, 0, 0, 0, 0x06, 0, 0, 0]);
@@ -150,7 +150,7 @@ fn every_request_is_answered_byte_for_byte() {
     assert_eq!(only_reply(bench.configuration(0x75, 2)), conf(0x75, &[0x84]));
     assert_eq!(only_reply(bench.configuration(0x7C, 0)), conf(0x7C, &[3, 0]));
     assert_eq!(only_reply(bench.configuration(0x7F, 4)), conf(0x7F, b"Stability\0"));
-    // The vendor's driver sends 32 more bytes behind the key.
+    // The vendor's driver sends 32 more bytes after the key.
     let mut long = vec![0x7F, 0, 0, 0];
     long.extend([0; 32]);
     assert_eq!(only_reply(bench.ask(&with_payload(0x84, &long))), conf(0x7F, b"Standard\0"));
@@ -187,7 +187,7 @@ fn descriptor_starts_a_stream_and_any_request_ends_it() {
                 packets.iter().all(|packet| packet.len() == mode.form.packet_len()) && packets.len() > 10
             );
             if mode.form != PacketFormat::Standard {
-                // Only the first of a stream has the flag of a beginning.
+                // Only the first packet of a stream has the flag of a new stream.
                 let at = if mode.form == PacketFormat::UltraDense { 9 } else { 3 };
                 let begins: Vec<_> = packets.iter().map(|packet| packet[at] & 0x80 != 0).collect();
                 assert!(begins[0] && begins[1..].iter().all(|begins| !begins), "{mode:?}");
@@ -227,7 +227,7 @@ fn a_motor_is_steered_as_its_model_wants() {
             bench.run_for(ONE_SECOND);
             bench.sent.len() > sent
         };
-        // The descriptor comes at once, points when the motor is at speed.
+        // The descriptor arrives at once, and points when the motor has reached its speed.
         assert_eq!(bench.ask(&stream_request(1)).len(), 1);
         assert_eq!(flows(&mut bench), turns, "{model:?}");
         if stop.is_empty() {
@@ -254,7 +254,7 @@ fn accepts_requests_only_after_the_boot_message() {
     bench.run_for(ONE_SECOND);
     let requested_at = bench.now;
     assert!(bench.ask(&[0xA5, 0x40]).is_empty());
-    // It is busy with itself.
+    // The scanner is booting.
     assert!(bench.ask(&[0xA5, 0x50]).is_empty());
     bench.run_for(ONE_SECOND);
     let boot_message = bench.sent.last().expect("a banner").clone();
@@ -273,7 +273,7 @@ fn accepts_requests_only_after_the_boot_message() {
     assert!(bench.sent[0].bytes.len() == 64 && bench.sent[0].at > 2 * ONE_SECOND);
 }
 
-/// A scanner that streams in its mode number `typical` from the start.
+/// Returns a scanner that streams in mode number `mode` from the start.
 fn streaming(model: Model, mode: usize, faults: &str) -> Bench {
     let settings = RplidarSettings {
         typical: mode,
@@ -333,7 +333,7 @@ fn brown_out_sends_boot_message_during_a_stream() {
     let boot_message = bench.sent.iter().position(|sent| sent.is_reply).expect("a banner");
     assert!(boot_message > 50 && boot_message + 1 == bench.sent.len(), "it stays silent behind it");
     assert!(bench.sent[boot_message].bytes.starts_with(b"RP LIDAR"));
-    // The motor has its power all the while.
+    // The motor has power all the time.
     assert_eq!(bench.ask(&stream_request(3)).len(), 1);
     let sent = bench.sent.len();
     bench.run_for(ONE_SECOND);
@@ -345,7 +345,7 @@ fn points_after_a_power_cycle_need_a_running_motor() {
     let mut bench = streaming(Model::A1, 1, "");
     bench.run(ONE_SECOND);
     bench.cycle_power();
-    // The scanner boots for two seconds and then accepts requests at once. Its motor turns since the power is on.
+    // The scanner boots for two seconds and then accepts requests at once. Its motor has been running since power-on.
     bench.run(3 * ONE_SECOND + ONE_SECOND / 10);
     assert_eq!(bench.ask(&stream_request(1)).len(), 1);
     let before = bench.data().len();
@@ -396,7 +396,7 @@ fn held_head_sends_no_points_and_spins_up_again() {
     assert_eq!(gaps.len(), 1);
     let (last, first) = (gaps[0][0].at, gaps[0][1].at);
     assert!(last < 2 * ONE_SECOND + ONE_SECOND / 20, "{last}");
-    // A second of standstill and 1.6 of getting up to speed.
+    // The head is blocked for one second, and needs 1.6 s to reach its speed.
     assert!((46 * ONE_SECOND / 10..47 * ONE_SECOND / 10).contains(&first), "{first}");
     let mut bench = streaming(Model::A1, 1, "hold=5,hold_at=1");
     bench.run(2 * ONE_SECOND);

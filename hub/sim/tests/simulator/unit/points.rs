@@ -1,5 +1,5 @@
-//! Points against the measurements: each packet form of each model, and the quirks of an A1. A second, slow decoder,
-//! written straight from the published formulas, judges the packets of the simulator.
+//! Tests of the points against the true measurements, for each packet format of each model, and of the properties of an
+//! A1. A second, slow decoder, written directly from the published formulas, decodes the packets of the simulator.
 
 use scanhub_schema::Nanos;
 use scanhub_sim::beam::NoiseModel;
@@ -8,16 +8,16 @@ use scanhub_sim::world::World;
 
 use super::{Bench, ONE_SECOND, stream_request};
 
-/// A point as the wire has it.
+/// A decoded point.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct DecodedPoint {
-    /// Degrees, clockwise, 0 to 360.
+    /// Clockwise angle in degrees, 0 to 360.
     pub(crate) clockwise_deg: f64,
-    /// 0: no return.
+    /// Range in millimeters; 0 means no return.
     pub(crate) range_mm: f64,
     /// Quality, if the packet has one.
     pub(crate) quality: Option<u8>,
-    /// The flag of a new turn, where the wire has one.
+    /// Flag of a new revolution, for formats that have it.
     pub(crate) starts_revolution: bool,
 }
 
@@ -44,7 +44,7 @@ pub(crate) fn standard(packet: &[u8]) -> DecodedPoint {
     }
 }
 
-/// Returns the points of all packets except the last one, for the type `answer`.
+/// Returns the points of all packets except the last one, for the response type `answer`.
 pub(crate) fn capsules(answer: u8, packets: &[Vec<u8>]) -> Vec<DecodedPoint> {
     packets.windows(2).flat_map(|pair| capsule(answer, &pair[0], &pair[1])).collect()
 }
@@ -104,7 +104,7 @@ fn capsule(answer: u8, packet: &[u8], next: &[u8]) -> Vec<DecodedPoint> {
     (0..count as usize).map(point).collect()
 }
 
-/// Range number `k` of a packet of 32 words.
+/// Decodes range number `k` of a packet of 32 words.
 fn ultra(body: &[u8], next: &[u8], k: usize) -> f64 {
     let at = |cabin: usize| if cabin < 32 { &body[4 * cabin..] } else { next };
     let bits = |cabin: usize| u32::from_le_bytes(at(cabin)[..4].try_into().expect("four bytes"));
@@ -141,12 +141,12 @@ fn angle_correction_deg(mm: f64) -> f64 {
     8.0 - (k / 1_024.0).to_degrees() - (k * k * k / 6_442_450_944.0).to_degrees()
 }
 
-/// A room, without noise.
+/// Returns a world without noise.
 fn noiseless_world(world: &str) -> World {
     world.parse::<World>().expect("a world").with_noise(NoiseModel::NONE)
 }
 
-/// Streams in mode `mode` for `span` in `world`; the points that were sent.
+/// Streams in mode `mode` for `span` in `world`. Returns the points that were sent.
 fn stream_points(
     settings: RplidarSettings,
     mode: usize,
@@ -155,7 +155,7 @@ fn stream_points(
 ) -> (Bench, Vec<DecodedPoint>) {
     let model = settings.model;
     let mut bench = Bench::new(settings, world, "");
-    // Those whose motor rests until it is told.
+    // Some motors start only after this request.
     bench.ask(&[0xA5, 0xF0, 0x02, 0x94, 0x02, 0xC1]);
     bench.ask(&stream_request(mode));
     bench.run_for(2 * ONE_SECOND + span);
@@ -168,7 +168,7 @@ fn stream_points(
     (bench, points)
 }
 
-/// Degrees from `b` to `a`, -180 to 180.
+/// Returns the angle from `b` to `a` in degrees, -180 to 180.
 fn difference_deg(a: f64, b: f64) -> f64 {
     (a - b + 540.0).rem_euclid(360.0) - 180.0
 }
@@ -183,7 +183,7 @@ fn every_point_of_every_mode_matches_its_truth() {
             let seconds = (bench.now - begin) as f64 / 1e9;
             let due = seconds * 1e6 / mode.sample_us;
             assert!((points.len() as f64 / due - 1.0).abs() < 0.05, "{model:?} {number}: {}", points.len());
-            // What the angle and the range lose by their bits.
+            // Maximum errors of angle and range that result from their numbers of bits.
             let (deg, mm) = match mode.form {
                 PacketFormat::Standard => (0.01, 0.6),
                 PacketFormat::Express => (0.08, 0.8),
@@ -199,7 +199,7 @@ fn every_point_of_every_mode_matches_its_truth() {
                 }
                 let range = truth.range_mm.expect("something is there");
                 ranges += 1;
-                // Where a coarse range is near a step of the shift, the decoder's angle is one step off.
+                // If a coarse range is near a step of the shift, the decoder's angle is one step off.
                 let is_off = difference_deg(point.clockwise_deg, truth.clockwise_deg).abs() > deg;
                 edges += usize::from(is_off);
                 assert!(
@@ -249,9 +249,9 @@ fn an_a1_indoors_is_as_odd_as_a_real_one() {
     );
     assert!((61.0..84.0).contains(&share(invalid, in_all)));
     assert!((9.0..15.0).contains(&share(backward, in_all)));
-    // Of a real one 264 to 267 were counted.
+    // A real A1 had 264 to 267 points per revolution.
     assert!(counts[0] >= 263 && counts[counts.len() - 1] <= 268 && counts[0] + 2 <= counts[counts.len() - 1]);
-    // Where somebody stands right before it, it comes behind zero.
+    // If a person stands right before zero, the first point of a revolution is after zero.
     let usual = flags.iter().filter(|deg| (351.0..=359.5).contains(*deg)).count();
     assert!(share(usual, flags.len()) > 97.0, "{usual} of {}", flags.len());
 }

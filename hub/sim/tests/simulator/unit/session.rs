@@ -1,4 +1,4 @@
-//! The hub's session with a scanner of Slamtec: what it makes of the bytes beside what the scanner measured.
+//! Tests of the session for RPLIDARs: its revolutions are compared with the true measurements of the scanner.
 
 use scanhub_drivers::Settings;
 use scanhub_drivers::line::NO_RETURN;
@@ -12,20 +12,20 @@ use scanhub_sim::world::World;
 
 use super::{Bench, ONE_SECOND};
 
-/// A turn as it was handed out.
+/// A revolution as the session delivered it.
 struct DeliveredRevolution {
     first: Nanos,
     period: Nanos,
-    /// Whether it says that something is missing, or damaged beside it.
+    /// Whether the session marked points as missing, or bytes next to it as damaged.
     is_marked: bool,
-    /// Degrees clockwise and millimetres, 0 is no return.
+    /// Clockwise angles in degrees, and ranges in millimeters; 0 means no return.
     points: Vec<(f64, u16)>,
 }
 
 struct SessionBench {
     bench: Bench,
     session: RplidarSession,
-    /// Bytes of the line that were read.
+    /// Number of received bytes that the session has read.
     read: usize,
     revolutions: Vec<DeliveredRevolution>,
 }
@@ -93,7 +93,8 @@ impl SessionBench {
         }
     }
 
-    /// Points of whole turns, those of them that are not where one was measured, and the worst error of a stamp.
+    /// Returns the number of points in complete revolutions, the number of those that match no measurement, and the
+    /// largest error of a stamp.
     fn check_points(&mut self, from: usize) -> (usize, usize, Nanos) {
         let begin = self.bench.unit.begin_ns().expect("it streams");
         let seconds = (self.bench.now - begin) as f64 / 1e9;
@@ -107,7 +108,7 @@ impl SessionBench {
             .iter()
             .filter(|revolution| revolution.first > begin && !revolution.is_marked)
         {
-            // Where a scanner says that nothing was, it does not say exactly where that is.
+            // The angle of a point without a return is not exact.
             for (deg, mm) in revolution.points.iter().filter(|(_, mm)| *mm > 0) {
                 let about = at(revolution.first + (deg / 360.0 * revolution.period as f64).max(0.0) as Nanos);
                 let reach = 40.max(revolution.points.len() / 12);
@@ -130,7 +131,7 @@ impl SessionBench {
     }
 }
 
-/// Every mode by which a session can call it.
+/// Returns all modes that a session can request, and `None` for the default.
 fn selectable_modes(model: Model) -> impl Iterator<Item = Option<Mode>> {
     let named = model.modes().iter().map(|mode| Some(Mode::from_name(mode.name).expect(mode.name)));
     named.chain([None])
@@ -188,12 +189,12 @@ fn brown_outs_and_power_cycles_count_as_restarts() {
             SessionBench::new(settings, RplidarSettings::of(model), "brownout_at=4,brownout_every=5");
         bench.run(30 * ONE_SECOND);
         let banners = bench.bench.sent.iter().filter(|sent| sent.bytes.starts_with(b"RP LIDAR"));
-        // A banner that completes the bytes of a packet is recognized once the stream is silent for a second.
+        // A boot message that completes the bytes of a packet is recognized once the stream is silent for a second.
         let recognized =
             banners.clone().filter(|sent| sent.at + 1_100 * MILLIS < bench.bench.now).count() as u64;
         let restarts = bench.session.stats().restarts;
         assert!(recognized >= 3, "{model:?}: {recognized}");
-        // One of 256 completes them to a packet with a right checksum, and is lost.
+        // One of 256 boot messages completes the bytes to a packet with a valid checksum, and is lost.
         assert!((recognized - 1..=banners.count() as u64).contains(&restarts), "{model:?}: {restarts}");
 
         // A power cycle takes longer than the silence after which the session searches.

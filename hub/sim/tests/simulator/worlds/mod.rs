@@ -1,5 +1,5 @@
-//! Worlds as data: every file is a world that runs, the simulator refuses a wrong one by name and place, and the truth
-//! is what geometry says.
+//! Tests of worlds: every file is a valid world, the simulator rejects an invalid one with its name and position, and
+//! the truth agrees with geometry.
 
 mod layers;
 
@@ -19,7 +19,7 @@ const WORLDS_FOLDER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/wo
 /// Time of one scan of 361 beams.
 const SCAN_PERIOD_NS: Nanos = 26_640_000;
 
-/// The room of a world in TOML.
+/// Returns the room of a world in TOML.
 fn room(text: &str, seed: u64) -> Room {
     Room::new(&world(text), seed)
 }
@@ -28,12 +28,12 @@ fn world(text: &str) -> World {
     World::of_toml("world", text).unwrap_or_else(|failure| panic!("{failure}"))
 }
 
-/// 361 beams in millimetres with levels.
+/// Measures a scan of 361 beams in millimeters, with levels.
 fn scan_at(room: &Room, end_ns: Nanos) -> LabeledScan {
     room.labeled_scan(Variant::HALF, Unit::Mm, Mode(1), end_ns)
 }
 
-/// A text of the directory.
+/// Returns the text of a file in the directory.
 fn text(name: &str) -> String {
     std::fs::read_to_string(format!("{WORLDS_FOLDER}/{name}.toml")).expect("a file of this name")
 }
@@ -103,7 +103,8 @@ fn ten_seeds_are_ten_runs() {
     }
 }
 
-/// Two sensors at the same place see the same people, each through its own noise; a port too many is another world.
+/// Two sensors at the same position see the same people, each with its own noise. A port beyond the last sensor belongs
+/// to another world.
 #[test]
 fn ports_share_a_world_until_its_sensors_are_taken() {
     let text = format!("{}[[sensor]]\npose = [0, 100, 90]\n", text("fig8"));
@@ -237,7 +238,7 @@ fn the_page_shows_a_world_with_every_key() {
     let example =
         page.split("```toml\n").nth(1).and_then(|rest| rest.split("```").next()).expect("an example");
     world(example);
-    // The shapes and ways that exclude those shown are in comments.
+    // Shapes and paths that exclude those of the example are in comments.
     let shown = |key: &str| example.lines().any(|line| line.trim_start_matches("# ").starts_with(key));
     let failure = World::of_toml("w.toml", "[[thing]]\nx = 1").unwrap_err();
     let persons = World::of_toml("w.toml", "[[person]]\nx = 1").unwrap_err();
@@ -252,7 +253,7 @@ fn the_page_shows_a_world_with_every_key() {
 }
 
 proptest! {
-    /// Whatever a file has become, it is refused with a place or it runs.
+    /// Any damaged file is rejected with a position, or is a valid world.
     #[test]
     fn a_damaged_file_is_refused_or_runs(
         file in 0..13usize,
@@ -281,14 +282,15 @@ const ONE_SECOND: Nanos = 1_000_000_000;
 /// No noise, but beams as wide as real ones.
 const WIDE_BEAMS: NoiseModel = NoiseModel { spot: true, ..NoiseModel::NONE };
 
-/// The looks at `text` with and without everything from `cut` on, which stands at its end.
+/// Returns the scans of `text` with and without everything from `cut` on, which must be its end.
 fn with_and_without(text: &str, cut: &str, end_ns: Nanos) -> (LabeledScan, LabeledScan) {
     let (without, _) = text.split_once(cut).expect("what is to be cut");
     let look_at = |text: &str| scan_at(&Room::new(&world(text).with_noise(WIDE_BEAMS), 4), end_ns);
     (look_at(text), look_at(without))
 }
 
-/// Nothing in the world may depend on the seed, or what is cut would move the rest.
+/// Returns a world that does not depend on the seed. Otherwise, the removed part would change the random numbers of the
+/// rest.
 fn without_randomness(name: &str) -> String {
     text(name).lines().filter(|line| !line.starts_with("jitter_mm")).collect::<Vec<_>>().join("\n")
 }
@@ -311,7 +313,7 @@ fn person_beams_differ_from_the_empty_room() {
                     assert!(inside, "beam {beam} at {tenth}");
                     grazed += 1;
                 }
-                // Two surfaces far apart can cost a beam its signal.
+                // A beam on two surfaces far apart can lose its signal.
                 BeamTarget::Invalid if inside => {}
                 _ => assert_eq!((range, target), (empty, &without.truth[beam]), "beam {beam} at {tenth}"),
             }
@@ -348,7 +350,7 @@ fn surface_uncovered_by_a_box_is_static_and_new() {
     for beam in beams {
         let is_valid_twice =
             before.truth[beam] != BeamTarget::Invalid && after.truth[beam] != BeamTarget::Invalid;
-        // At its edges a beam may have told what is behind it before.
+        // A beam at an edge of the box may have reported the surface behind the box before.
         let edge = before.truth[beam - 2..beam + 3] != [BeamTarget::Static { since_ns: 0 }; 5];
         let [then, now] = [&before, &after].map(|look| i32::from(look.words[beam] & 8191));
         assert!(
@@ -377,7 +379,7 @@ fn a_door_is_a_box_while_it_turns_and_since_it_rests() {
         since
     };
     assert!(since(10 * ONE_SECOND).is_empty());
-    // While it moves, the time of the mirror turn.
+    // While the box moves, its time is that of the revolution of the mirror.
     assert_eq!(since(14 * ONE_SECOND + ONE_SECOND / 2), [14 * ONE_SECOND + ONE_SECOND / 2 - 13_320_000]);
     assert_eq!(since(20 * ONE_SECOND), [15 * ONE_SECOND + ONE_SECOND / 2]);
     assert_eq!(since(50 * ONE_SECOND), [35 * ONE_SECOND + ONE_SECOND / 2]);
@@ -409,10 +411,10 @@ fn a_code_is_invalid_whatever_the_beam_met() {
     assert!(codes > 500, "{codes}");
 }
 
-/// Beams as thin as lines, each at its own time.
+/// Beams without width, each at its own time.
 const THIN_BEAMS: NoiseModel = NoiseModel { comb: true, ..NoiseModel::NONE };
 
-/// The world with one sensor 1 m high that swings from 0 to 40 degrees, and `things`.
+/// Returns a world with `things` and one sensor, 1 m high, that swings from 0 to 40 degrees.
 fn tilted_world(things: &str) -> World {
     let mount = "[sensor.mount]\nheight_mm = 1000\nfrom_deg = 0\nto_deg = 40\ndeg_s = 20\n";
     world(&format!("[[sensor]]\npose = [0, 0, 90]\n{mount}\n{things}")).with_noise(THIN_BEAMS)
