@@ -242,7 +242,11 @@ fn refuses_recordings_of_another_family() {
     assert_eq!((outcome.exit_code, outcome.stderr.contains("of family ld")), (Some(66), true), "{outcome}");
     let port = format!("--port={}", env.path_argument("other"));
     let outcome = env.run(&["simulate", &port, "--replay", &recording]);
-    assert_eq!((outcome.exit_code, outcome.stderr.contains("not of an LMS")), (Some(66), true), "{outcome}");
+    assert_eq!(
+        (outcome.exit_code, outcome.stderr.contains("not a recording of an LMS")),
+        (Some(66), true),
+        "{outcome}"
+    );
     // A family of tomorrow.
     let later = env.path("later.mcap");
     let mut writer = Writer::begin(std::fs::File::create(&later).expect("a file"), "", BTreeMap::new())

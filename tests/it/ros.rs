@@ -272,7 +272,7 @@ fn stream_file_converts_to_ros_and_csv_with_its_mode() {
     for (words, code, says) in [
         (&[&rows[..], "--ros2", "--force"][..], 2, "--ros2 makes an MCAP file"),
         (&["b.bin", "--mode=0x01"], 2, "--mode is for scans"),
-        (&["b.csv", "--mode=0x77"], 78, "none of a range"),
+        (&["b.csv", "--mode=0x77"], 78, "not a measuring mode with ranges"),
     ] {
         let outcome = env.run(&[&["convert", &stream], words].concat());
         assert!(outcome.exit_code == Some(code) && outcome.stderr.contains(says), "{outcome}");

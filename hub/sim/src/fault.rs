@@ -116,54 +116,54 @@ macro_rules! faults {
 }
 
 faults! {
-    loss, 0.0 to 0.5, 0.0, "share of the bytes from sensor to host that are lost";
-    burst, 1.0 to 1000.0, 1.0, "mean number of bytes lost in a row, geometric";
+    loss, 0.0 to 0.5, 0.0, "share of the bytes from scanner to host that are lost";
+    burst, 1.0 to 1000.0, 1.0, "mean number of consecutive lost bytes, geometric";
     flip, 0.0 to 0.5, 0.0, "share of the bytes in which a run of flipped bits starts";
     flip_bits, 1.0 to 64.0, 1.0, "mean number of neighboring bits in a run, geometric";
-    insert, 0.0 to 0.5, 0.0, "share of the bytes before which random ones are inserted";
-    insert_burst, 1.0 to 1000.0, 1.0, "mean number of random bytes in a row, geometric";
+    insert, 0.0 to 0.5, 0.0, "share of the bytes with random bytes inserted before them";
+    insert_burst, 1.0 to 1000.0, 1.0, "mean number of consecutive random bytes, geometric";
     double, 0.0 to 0.5, 0.0, "share of the bytes that arrive twice";
     repeat, 0.0 to 1.0, 0.0, "share of the telegrams that arrive twice; the copy has its own line in the truth file";
     truncate, 0.0 to 1.0, 0.0, "share of the telegrams whose end is lost";
     length, 0.0 to 1.0, 0.0, "share of the telegrams whose length field is changed";
-    abort, 0.0 to 1.0, 0.0, "share of the scans that the sensor breaks off by itself";
-    flood, 0.0 to 8000.0, 0.0, "bytes of a flood of garbage";
+    abort, 0.0 to 1.0, 0.0, "share of the scans that the scanner aborts spontaneously";
+    flood, 0.0 to 8000.0, 0.0, "number of bytes in a flood of garbage";
     flood_every, 0.01 to 86400.0, 1.0, "mean seconds between floods";
-    wall, 0.0 to 8000.0, 0.0, "bytes of a wall of start bytes: 02, 02 80, or headers like the stream's";
-    wall_every, 0.01 to 86400.0, 1.0, "mean seconds between walls";
-    inside, 0.0 to 1.0, 0.5, "share of the floods and walls that start inside a telegram";
+    wall, 0.0 to 8000.0, 0.0, "number of bytes in a run of start bytes: 02, 02 80, or headers like the stream's";
+    wall_every, 0.01 to 86400.0, 1.0, "mean seconds between runs of start bytes";
+    inside, 0.0 to 1.0, 0.5, "share of the floods and of the runs of start bytes that start inside a telegram";
     silence, 0.0 to 86400.0, 0.0, "seconds for which nothing arrives";
     silence_at, 0.0 to 86400.0, 0.0, "time of the first silence, in seconds; 0: 5, or within silence_every";
-    silence_every, 0.0 to 86400.0, 0.0, "mean seconds to the next; 0: once";
-    stall, 0.0 to 86400.0, 0.0, "seconds for which everything is held back and then arrives late";
+    silence_every, 0.0 to 86400.0, 0.0, "mean seconds to the next one; 0: only once";
+    stall, 0.0 to 86400.0, 0.0, "seconds for which the line holds back all bytes";
     stall_at, 0.0 to 86400.0, 0.0, "as silence_at";
     stall_every, 0.0 to 86400.0, 0.0, "as silence_every";
-    delay, 0.0 to 10.0, 0.0, "greatest random lateness of each piece, in seconds";
-    unplug, 0.0 to 86400.0, 0.0, "seconds for which the port is gone";
+    delay, 0.0 to 10.0, 0.0, "maximum random delay of each chunk, in seconds";
+    unplug, 0.0 to 86400.0, 0.0, "seconds for which the adapter is unplugged";
     unplug_at, 0.0 to 86400.0, 0.0, "as silence_at";
     unplug_every, 0.0 to 86400.0, 0.0, "as silence_every";
     power_at, 0.0 to 86400.0, 0.0, "time of the first power cycle, in seconds; 0: within power_every";
-    power_every, 0.0 to 86400.0, 0.0, "mean seconds to the next; 0: once";
-    brownout_at, 0.0 to 86400.0, 0.0, "time of the first brown-out, which restarts the sensor, as power_at";
+    power_every, 0.0 to 86400.0, 0.0, "mean seconds to the next one; 0: only once";
+    brownout_at, 0.0 to 86400.0, 0.0, "time of the first brown-out, which restarts the scanner, as power_at";
     brownout_every, 0.0 to 86400.0, 0.0, "as power_every";
-    hold, 0.0 to 86400.0, 0.0, "of an RPLIDAR: seconds for which something holds its head";
+    hold, 0.0 to 86400.0, 0.0, "RPLIDAR: seconds for which the head is blocked";
     hold_at, 0.0 to 86400.0, 0.0, "as silence_at";
     hold_every, 0.0 to 86400.0, 0.0, "as silence_every";
-    health, 0.0 to 2.0, 0.0, "of an RPLIDAR: status that it reports until a RESET: 1 warning, 2 error";
-    stubborn, 0.0 to 1.0, 0.0, "1: a RESET does not change that status";
-    id, 0.0 to 255.0, 0.0, "of an RPLIDAR: number that it reports as its model, such as 0x95; 0: that of the model";
-    overlook, 0.0 to 1.0, 0.0, "share of the requests that the sensor ignores";
-    nak, 0.0 to 1.0, 0.0, "share of the requests that it answers with NAK";
-    twice, 0.0 to 1.0, 0.0, "share of the replies that it sends twice";
-    late, 0.0 to 60.0, 0.0, "delay of its replies, in seconds";
-    late_ack, 0.0 to 60.0, 0.0, "delay of its ACK, in seconds";
-    late_mode, 0.0 to 60.0, 0.0, "extra seconds that a change of mode, rate or variant takes";
-    late_write, 0.0 to 60.0, 0.0, "extra seconds that a write to the EEPROM takes";
-    strict, 0.0 to 1.0, 0.0, "1: in installation mode it refuses to measure";
-    strict_gap, 0.0 to 1.0, 0.0, "1: it drops requests whose bytes arrive less than 55 us apart";
-    answer, 0.0 to 10.0, 0.0, "seconds from each ACK to its reply; 0: by chance 0.055 to 0.145";
-    refuse, 0.0 to 255.0, 0.0, "command that it refuses, such as 0x3B";
-    mute, 0.0 to 1.0, 0.0, "1: it does not answer";
+    health, 0.0 to 2.0, 0.0, "RPLIDAR: health status until a RESET: 1 warning, 2 error";
+    stubborn, 0.0 to 1.0, 0.0, "1: the health status remains after a RESET";
+    id, 0.0 to 255.0, 0.0, "RPLIDAR: number that the scanner reports as its model, such as 0x95; 0: that of the model";
+    overlook, 0.0 to 1.0, 0.0, "share of the requests that the scanner ignores";
+    nak, 0.0 to 1.0, 0.0, "share of the requests that the scanner answers with NAK";
+    twice, 0.0 to 1.0, 0.0, "share of the replies that the scanner sends twice";
+    late, 0.0 to 60.0, 0.0, "additional delay of replies, in seconds";
+    late_ack, 0.0 to 60.0, 0.0, "additional delay of an ACK, in seconds";
+    late_mode, 0.0 to 60.0, 0.0, "additional seconds for a change of mode, rate or variant";
+    late_write, 0.0 to 60.0, 0.0, "additional seconds for a write to the EEPROM";
+    strict, 0.0 to 1.0, 0.0, "1: the scanner does not measure in installation mode";
+    strict_gap, 0.0 to 1.0, 0.0, "1: the scanner drops requests whose bytes arrive less than 55 us apart";
+    answer, 0.0 to 10.0, 0.0, "seconds from each ACK to the reply; 0: random, 0.055 to 0.145";
+    refuse, 0.0 to 255.0, 0.0, "command that the scanner refuses, such as 0x3B";
+    mute, 0.0 to 1.0, 0.0, "1: the scanner sends no replies";
     rs232, 0.0 to 1.0, 0.0, "1: the line is RS-232, which carries nothing at 500000 baud or more";
 }
 
@@ -205,14 +205,18 @@ impl FromStr for Faults {
                 part.split_once('=').ok_or_else(|| invalid_fault(part, "is not KEY=VALUE", key_names()))?;
             let key = TABLE.iter().find(|key| key.name == name);
             let FaultKey { min, max, field, .. } =
-                key.ok_or_else(|| invalid_fault(part, "names no fault", key_names()))?;
+                key.ok_or_else(|| invalid_fault(part, "is not a known fault", key_names()))?;
             let number = match value.strip_prefix("0x") {
                 Some(digits) => u8::from_str_radix(digits, 16).ok().map(f64::from),
                 None => value.parse().ok(),
             };
             *field(&mut faults) =
                 number.filter(|number| (*min..=*max).contains(number)).ok_or_else(|| {
-                    invalid_fault(part, "is out of range", format!("{name} is a number from {min} to {max}"))
+                    invalid_fault(
+                        part,
+                        "is out of range",
+                        format!("set {name} to a number from {min} to {max}"),
+                    )
                 })?;
         }
         Ok(faults)

@@ -266,8 +266,9 @@ pub fn recorded_packets(path: &Path, sensor: Option<&str>) -> Result<Vec<[u8; PA
         .filter(|packet| Packet::check(packet).is_ok())
         .collect();
     if packets.is_empty() {
-        let message = format!("cannot replay {}: it holds no packet of an LDROBOT scanner", path.display());
-        let hint = "a recording of one, or a file of the bytes that one sent";
+        let message =
+            format!("cannot replay {}: it contains no packet of an LDROBOT scanner", path.display());
+        let hint = "name a recording of an LDROBOT scanner, or a stream file with its bytes";
         return Err(Failure::new(Kind::Input, message, hint));
     }
     Ok(packets)

@@ -153,7 +153,7 @@ impl SimulateOptions {
             if self.ports[..number].contains(port) && !is_any {
                 return invalid(
                     format!("port {} is named twice", port.display()),
-                    "each sensor needs its own path",
+                    "give each scanner its own port",
                 );
             }
         }
@@ -251,7 +251,7 @@ pub fn parse_family(
             if let Some(mode) = mode {
                 return invalid(
                     format!("mode {mode:?} of family \"ld\""),
-                    "its scanners have one way to measure",
+                    "leave --mode out: LDROBOT scanners have only one way to measure",
                 );
             }
             let models = ld::Model::ALL.map(|model| (model.name(), Scanner::Ld(model)));
@@ -275,7 +275,7 @@ pub fn parse_family(
         _ => match model {
             None => Ok(None),
             Some(model) => {
-                let hint = "--type says which LMS; the families ld and rplidar have models";
+                let hint = "--type says which LMS; --model is for the families ld and rplidar";
                 invalid(format!("model {model:?} of family \"lms\""), hint)
             }
         },
@@ -310,15 +310,19 @@ pub fn parse_state(text: &str) -> Result<StartState, Failure> {
 pub fn parse_error(text: &str) -> Result<(u8, u8), Failure> {
     let pair = text.split_once(':').and_then(|(kind, number)| Some((byte(kind)?, byte(number)?)));
     pair.ok_or_else(|| {
-        let hint = "TYPE:NUMBER, such as 3:18, or 0x84:22 for a fatal one that is over";
-        Failure::new(Kind::Configuration, format!("error {text:?} is not understood"), hint)
+        let hint = "write TYPE:NUMBER, such as 3:18, or 0x84:22 for a fatal error of the past";
+        Failure::new(Kind::Configuration, format!("error {text:?} is not TYPE:NUMBER"), hint)
     })
 }
 
 /// Parses a byte, such as `0x10` or `16`. `what` names the option in the error.
 pub fn parse_byte(what: &str, text: &str) -> Result<u8, Failure> {
     byte(text).ok_or_else(|| {
-        Failure::new(Kind::Configuration, format!("{what} {text:?} is no byte"), "0 to 255, or 0x00 to 0xFF")
+        Failure::new(
+            Kind::Configuration,
+            format!("{what} {text:?} is not a byte"),
+            "use 0 to 255, or 0x00 to 0xFF",
+        )
     })
 }
 
@@ -360,7 +364,7 @@ pub fn parse_baud(text: &str) -> Result<Baud, Failure> {
 pub fn parse_mode(text: &str) -> Result<Mode, Failure> {
     byte(text).filter(|mode| MODES.contains(mode)).map(Mode).ok_or_else(|| {
         let hint = format!("one of: {}", MODES.map(|mode| format!("{mode:#04x}")).join(", "));
-        Failure::new(Kind::Configuration, format!("mode {text:?} is none of a range"), hint)
+        Failure::new(Kind::Configuration, format!("mode {text:?} is not a measuring mode with ranges"), hint)
     })
 }
 

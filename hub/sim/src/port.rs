@@ -135,8 +135,10 @@ impl Server {
         };
         open().map_err(|error: std::io::Error| {
             let (kind, hint) = match error.kind() {
-                ErrorKind::AddrInUse => (Kind::PortBusy, "name another port; 0 is any that is free"),
-                ErrorKind::PermissionDenied => (Kind::PortPermission, "ports from 1024 on are for everybody"),
+                ErrorKind::AddrInUse => (Kind::PortBusy, "name another port, or 0 for any free port"),
+                ErrorKind::PermissionDenied => {
+                    (Kind::PortPermission, "name a port from 1024 on, which needs no privileges")
+                }
                 ErrorKind::InvalidInput => (Kind::Configuration, "write HOST:PORT, such as 127.0.0.1:0"),
                 _ => (Kind::PortMissing, "name an address of this machine, such as 127.0.0.1:0"),
             };
@@ -245,8 +247,8 @@ impl Pty {
         make().map_err(|errno| {
             Failure::new(
                 Kind::ResourceExhausted,
-                format!("cannot make a pty: {errno}"),
-                "see /proc/sys/kernel/pty/nr and max",
+                format!("cannot create a pty: {errno}"),
+                "compare /proc/sys/kernel/pty/nr with /proc/sys/kernel/pty/max",
             )
         })
     }
@@ -354,7 +356,7 @@ impl PtySymlink {
                 return Err(Failure::new(
                     Kind::PortBusy,
                     format!("port {} belongs to another simulator, which still runs", path.display()),
-                    "name another path, or end that one first",
+                    "name another path, or stop the other simulator first",
                 ));
             }
             Ok(metadata) => {
@@ -362,7 +364,7 @@ impl PtySymlink {
                 return Err(Failure::new(
                     Kind::PortNotTty,
                     format!("port {} exists and is {kind}", path.display()),
-                    "name a path that is free, or remove what is there",
+                    "name an unused path, or remove the existing file",
                 ));
             }
             Err(error) if error.kind() == ErrorKind::NotFound => {}
@@ -396,13 +398,13 @@ fn is_terminal(path: &Path) -> bool {
 
 fn failure(path: &Path, error: &std::io::Error) -> Failure {
     let (kind, hint) = match error.kind() {
-        ErrorKind::NotFound => (Kind::PortMissing, "its directory must exist"),
+        ErrorKind::NotFound => (Kind::PortMissing, "create its directory first, or name another path"),
         ErrorKind::PermissionDenied => {
             (Kind::PortPermission, "name a path in a directory that this user may write to")
         }
         _ => (Kind::Failed, ""),
     };
-    Failure::new(kind, format!("cannot make the symlink {}: {error}", path.display()), hint)
+    Failure::new(kind, format!("cannot create the symlink {}: {error}", path.display()), hint)
 }
 
 #[cfg(test)]

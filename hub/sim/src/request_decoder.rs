@@ -42,7 +42,7 @@ impl fmt::Display for DroppedRequest {
                 write!(f, "a request was dropped: more than 6 ms of silence after {after} of its bytes")
             }
             DroppedRequest::ShortGap => f.write_str(
-                "a request was dropped: less than 55 us between its bytes, which strict_gap=1 demands",
+                "a request was dropped: less than 55 us between its bytes, which strict_gap=1 does not allow",
             ),
         }
     }

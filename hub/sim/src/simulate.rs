@@ -117,7 +117,7 @@ pub fn simulate_with(
 /// Runs each port in a separate thread. If one fails, the others end too.
 fn run(threads: Vec<PortThread<'_>>, stop: BorrowedFd<'_>) -> Result<Vec<Summary>, Failure> {
     let failed: OwnedFd = eventfd(0, EventfdFlags::CLOEXEC).map_err(|errno| {
-        Failure::new(Kind::ResourceExhausted, format!("cannot make an eventfd: {errno}"), "")
+        Failure::new(Kind::ResourceExhausted, format!("cannot create an eventfd: {errno}"), "")
     })?;
     std::thread::scope(|scope| {
         let threads: Vec<_> = threads
@@ -158,8 +158,11 @@ fn device(
                 (recording, _) => recording.cloned(),
             };
             if let Some(other) = chosen.as_ref().filter(|chosen| !chosen.contents().is_lms()) {
-                let message = format!("{} is not of an LMS, which is simulated", other.path().display());
-                let hint = "--family says of which scanner it is";
+                let message = format!(
+                    "{} is not a recording of an LMS, which --family selects",
+                    other.path().display()
+                );
+                let hint = "set --family to the family of the scanner in the recording";
                 return Err(Failure::new(Kind::Input, message, hint));
             }
             let (settings, source) = lms(options, chosen.as_ref(), seed, room)?;
@@ -250,7 +253,7 @@ fn scans(
     if recording.contents().scans == 0 {
         return Err(Failure::new(
             Kind::Configuration,
-            format!("recording {} holds no scan", recording.path().display()),
+            format!("recording {} contains no scan", recording.path().display()),
             "replay one with measured-value telegrams (B0h), or a CARMEN log with scans",
         ));
     }
@@ -604,7 +607,7 @@ impl Truth {
 
 fn failure(path: &Path, error: &io::Error) -> Failure {
     let what = format!("cannot write the truth to {}: {error}", path.display());
-    Failure::new(Kind::Failed, what, "the disk must have space, and the reader of stdout must stay")
+    Failure::new(Kind::Failed, what, "free space on the disk, and keep the reader of stdout running")
 }
 
 /// Maximum lag of the scanner, by its own clock: 5 kB at its highest rate, a quarter of the buffer of a pty.

@@ -303,8 +303,12 @@ impl ThingFile {
                 return Err(origin.refuse(file.from_s.span(), what, remedy));
             }
             if end_s > until_s {
-                let what = format!("a move until {end_s} s of what is taken away at {until_s} s");
-                return Err(origin.refuse(file.until_s.span(), what, "moves while it is there"));
+                let what = format!("a move until {end_s} s of a thing that is removed at {until_s} s");
+                return Err(origin.refuse(
+                    file.until_s.span(),
+                    what,
+                    "end all moves before the thing is removed",
+                ));
             }
             moves.push(Movement { from_s: start_s, until_s: end_s, offset: pose(origin, &file.by)? });
         }
@@ -463,8 +467,8 @@ impl PersonFile {
         };
         let repeats = self.repeat.as_ref().filter(|repeat| *repeat.get_ref());
         if let Some(repeat) = repeats.filter(|_| speed == Speed::ToEnd || length(&corners) == 0.0) {
-            let remedy = "repeat = true only beside a path with several corners and speed_mm_s";
-            return Err(origin.refuse(repeat.span(), "a path that cannot be walked again and again", remedy));
+            let remedy = "set repeat = true only with a path with several corners and speed_mm_s";
+            return Err(origin.refuse(repeat.span(), "a path that cannot be repeated", remedy));
         }
         Ok(WalkPath::Path { corners, speed, repeats: repeats.is_some() })
     }
@@ -476,7 +480,7 @@ impl SunFile {
             let (from, to) = point(*sector.get_ref());
             let what = format!("sector_deg = [{from}, {to}] counts angles from the right");
             let [from, to] = [from, to].map(|deg| (deg * 1000.0 - 90_000.0).round() / 1000.0);
-            let remedy = format!("angles are counted from ahead now: from_deg = {from:?}, to_deg = {to:?}");
+            let remedy = format!("angles count from ahead: from_deg = {from:?}, to_deg = {to:?}");
             return Err(origin.refuse(sector.span(), what, remedy));
         }
         let from_deg = origin.number(&self.from_deg, -180.0, -180.0..=180.0)?;
@@ -528,8 +532,8 @@ fn pose(origin: &Origin, values: &Spanned<Vec<Number>>) -> Result<Pose, Failure>
         [x, y] => Ok(Pose { x_mm: x.0, y_mm: y.0, turn_deg: 0.0 }),
         [x, y, turn] => Ok(Pose { x_mm: x.0, y_mm: y.0, turn_deg: turn.0 }),
         ref other => {
-            let what = format!("{} numbers are no pose", other.len());
-            Err(origin.refuse(values.span(), what, "[x, y] in millimetres, or [x, y, degrees]"))
+            let what = format!("a pose of {} numbers", other.len());
+            Err(origin.refuse(values.span(), what, "[x, y] in millimeters, or [x, y, degrees]"))
         }
     }
 }

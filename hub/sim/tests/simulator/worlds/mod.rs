@@ -140,7 +140,7 @@ fn refuses_invalid_worlds_with_place_and_remedy() {
         ("[noise]\nsigma_mm = -1", "w.toml:2:12: -1 is out of range", "from 0 to 1000"),
         ("[noise]\nerrors = 1.5", "w.toml:2:10: 1.5", "from 0 to 1"),
         ("[noise]\nspot = 1", "w.toml:2:8: ", "docs/worlds.md"),
-        ("[[sensor]]\npose = [1]", "w.toml:2:8: 1 numbers are no pose", "[x, y] in millimetres"),
+        ("[[sensor]]\npose = [1]", "w.toml:2:8: a pose of 1 numbers", "[x, y] in millimeters"),
         ("[[sensor]]\npose = [nan, 2]", "w.toml:2:8: NaN is not between", "docs/worlds.md"),
         ("\n[[thing]]\npose = [1, 2]", "w.toml:2:1: a thing with no shape", "one of: line"),
         ("[[thing]]\nline = [[0, 0]]", "w.toml:1:1: a thing", "one of: line"),
@@ -161,8 +161,8 @@ fn refuses_invalid_worlds_with_place_and_remedy() {
         ),
         (
             "[[thing]]\nradius_mm = 10\nuntil_s = 3\nmoves = [{ from_s = 2, until_s = 4, by = [1, 1] }]",
-            "w.toml:4:34: a move until 4 s of what is taken away at 3 s",
-            "while it is there",
+            "w.toml:4:34: a move until 4 s of a thing that is removed at 3 s",
+            "before the thing is removed",
         ),
         (
             "[[thing]]\nradius_mm = 10\nmoves = [{ from_s = 2, until_s = 4, by = [1, 1] }]\nrepeat_s = 5",
