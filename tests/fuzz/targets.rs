@@ -79,7 +79,7 @@ fn drain(framer: &mut Framer, bytes: &[u8], checked_len: &mut usize) {
         assert!(Telegram::check(telegram).is_some());
         let ahead = &bytes[*checked_len..];
         let at = ahead.windows(telegram.len()).position(|window| window == telegram);
-        let at = at.expect("a telegram that nobody sent, or one out of order");
+        let at = at.expect("a telegram that was not sent, or is out of order");
         *checked_len += at + telegram.len();
     }
     let FramerCounters { read, in_telegrams, acknowledge, discarded, .. } = *framer.counters();
@@ -99,7 +99,7 @@ pub fn replies(data: &[u8]) {
     }
     if let Some(write) = EepromWrite::decode(telegram) {
         assert!(lms::command::EEPROM_WRITES.contains(command), "{write:?}");
-        let again = write.encode(*address).expect("what was read can be said");
+        let again = write.encode(*address).expect("a decoded write can be encoded");
         assert_eq!(again.bytes(), encoded.bytes(), "{write:?}");
     }
     if let Some(measured) = MeasuredValues::decode(telegram) {
@@ -148,7 +148,7 @@ pub fn session(data: &[u8]) {
                     session.handle_transmitted(now);
                 }
                 Action::Transmit { .. } => break,
-                Action::SetDtr(_) => panic!("such a scanner has nothing at this line"),
+                Action::SetDtr(_) => panic!("an LMS does not use DTR"),
                 Action::SetRate(baud) => assert!(baud == settings.baud.rate() || !settings.fixed_rate),
                 Action::Event(Event::Scan(_)) => panic!("a telegram is a scan"),
                 Action::Event(Event::Telegram(received)) => {
@@ -204,7 +204,7 @@ pub fn session(data: &[u8]) {
             }
         }
     }
-    assert!(request_bytes.is_empty() || !settings.listen_only, "a listener speaks");
+    assert!(request_bytes.is_empty() || !settings.listen_only, "a session that only listens sent bytes");
     assert_harmless(&request_bytes);
 }
 
@@ -215,7 +215,7 @@ fn assert_harmless(request_bytes: &[u8]) {
         let len = usize::from(u16::from_le_bytes([low, high])) + FRAME_LEN;
         let telegram = request_bytes.get(at..at + len).and_then(Telegram::check);
         let is_write = telegram.is_some() && lms::command::EEPROM_WRITES.contains(&command);
-        assert!(!is_write, "{command:02X}h was said");
+        assert!(!is_write, "{command:02X}h was sent");
     }
 }
 

@@ -42,7 +42,7 @@ impl Tables {
             (RevolutionFigures::default(), Vec::new(), seeds.end - seeds.start);
         for seed in seeds {
             let text = format!("seed {seed} seconds {seconds} {model}\n{actions}");
-            let scenario: Scenario = text.parse().expect("a plan");
+            let scenario: Scenario = text.parse().expect("a scenario");
             let outcome = run(&scenario, Detail::Nothing);
             figures.add(&outcome.figures);
             broken.extend(outcome.violations.into_iter().map(|violation| format!("{seed}: {violation}")));

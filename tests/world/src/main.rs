@@ -10,40 +10,40 @@ use std::time::Instant;
 use clap::Parser;
 use scanhub_world::{Detail, Outcome, Runner, Scenario, Totals, corpus, run, shrink};
 
-/// Simulates whole hubs in made-up time, and watches what they promise.
+/// Simulate whole hubs in virtual time, and check invariants
 #[derive(Debug, Parser)]
 struct Arguments {
-    /// The seeds of the worlds, such as 0..200.
+    /// Seeds of the worlds, such as 0..200
     #[arg(long, value_parser = range, default_value = "0..200")]
     seeds: (u64, u64),
-    /// One seed, with everything that happens.
+    /// Run one seed, and print its events
     #[arg(long)]
     seed: Option<u64>,
-    /// With one seed or plan: every verdict, too.
+    /// With --seed or --plan: also print every verdict
     #[arg(long)]
     all: bool,
-    /// How long each world lasts.
+    /// Duration of each world
     #[arg(long, default_value_t = 60)]
     virtual_seconds: u64,
-    /// So many of the first worlds are run twice, and must be equal.
+    /// Run this number of worlds twice, from the first one on. Both runs must have the same hash
     #[arg(long, default_value_t = 0)]
     twice: usize,
-    /// Half of the links have no family: the hub searches for their scanners.
+    /// Remove the family from half of the links, so that the hub searches for their scanners
     #[arg(long)]
     auto: bool,
-    /// Worlds at a time.
+    /// Number of worlds that run at the same time
     #[arg(long, default_value_t = 2)]
     threads: usize,
-    /// The plan in this file instead.
+    /// Run the scenario in this file instead
     #[arg(long)]
     plan: Option<std::path::PathBuf>,
-    /// The plans that once failed instead.
+    /// Run the scenarios that once failed instead
     #[arg(long)]
     corpus: bool,
-    /// Totals as a line of JSON.
+    /// Print the totals as a line of JSON
     #[arg(long)]
     json: bool,
-    /// Leaves plans that fail as long as they are.
+    /// Do not shorten scenarios that fail
     #[arg(long)]
     no_shrink: bool,
 }
@@ -93,7 +93,7 @@ fn main() -> ExitCode {
     }
     let left = descriptors().saturating_sub(before);
     if left > 0 {
-        println!("{left} descriptors were not given back");
+        println!("{left} file descriptors were not closed");
     }
     print_totals(&totals, started.elapsed().as_secs_f64(), arguments.json);
     let is_well = totals.failed.is_empty() && left == 0 && !is_over.load(Ordering::Relaxed);
@@ -120,7 +120,7 @@ fn scenarios(arguments: &Arguments) -> Result<Vec<Scenario>, String> {
 fn report(scenario: &Scenario, outcome: &Outcome, is_same: bool, is_long: bool) {
     println!("SEED={}{} COMMIT={}", scenario.seed, if scenario.is_auto { " --auto" } else { "" }, commit());
     if !is_same {
-        println!("the second run was another one than the first");
+        println!("the second run has another hash than the first one");
     }
     outcome.violations.iter().take(5).for_each(|violation| println!("  {violation}"));
     let first_violation = |scenario: &Scenario| {
@@ -146,7 +146,7 @@ fn print_totals(totals: &Totals, took_s: f64, is_json: bool) {
     } else {
         println!(
             "{worlds} worlds, {} failed; {sensor_seconds} sensor-seconds and {samples} samples in {took_s:.1} s: \
-             {per_core:.0} sensor-seconds a second of a core",
+             {per_core:.0} sensor-seconds per second of CPU time",
             failed.len()
         );
     }

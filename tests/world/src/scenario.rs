@@ -115,7 +115,7 @@ impl FromStr for Action {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Action, String> {
-        let wrong = || format!("{text:?} is no action");
+        let wrong = || format!("{text:?} is not a valid action");
         let mut words = text.split_whitespace();
         let at_ms = words.next().and_then(|word| word.parse().ok()).ok_or_else(wrong)?;
         let name = words.next().ok_or_else(wrong)?;
@@ -151,7 +151,7 @@ impl FromStr for Scenario {
         let head = lines.next().unwrap_or_default();
         let words: Vec<&str> = head.split_whitespace().collect();
         let ["seed", seed, "seconds", seconds, ref rest @ ..] = words[..] else {
-            return Err(format!("{head:?} is not the first line of a plan"));
+            return Err(format!("{head:?} is not the first line of a scenario"));
         };
         let (is_auto, rest) = match rest {
             [model @ .., "auto"] => (true, model),
@@ -162,9 +162,9 @@ impl FromStr for Scenario {
             [model] if family::from_name(model, &mut fastrand::Rng::with_seed(0)).is_some() => {
                 Some(model.to_owned())
             }
-            _ => return Err(format!("{head:?} names no model")),
+            _ => return Err(format!("{head:?} does not name a known model")),
         };
-        let number = |word: &str| word.parse().map_err(|_| format!("{word:?} is no number"));
+        let number = |word: &str| word.parse().map_err(|_| format!("{word:?} is not a number"));
         let (seed, seconds) = (number(seed)?, number(seconds)?);
         Ok(Scenario {
             seed,

@@ -131,9 +131,9 @@ fn actions_between_machines_alone_reveal_their_defect() {
             !scenario.actions.is_empty() && is_found(&scenario, Some(defect), invariants(defect))
         };
         let found = (0..200).find(finds);
-        let seed = found.unwrap_or_else(|| panic!("{name}: nobody finds {defect:?}"));
+        let seed = found.unwrap_or_else(|| panic!("{name}: no invariant finds {defect:?}"));
         println!("{name}: {defect:?} is found by {:?} with seed {seed}", invariants(defect));
         let without = run(&alone(seed), Detail::Nothing).violations;
-        assert_eq!(without, [], "{name}, seed {seed}: something is found without it");
+        assert_eq!(without, [], "{name}, seed {seed}: a violation without the defect");
     }
 }

@@ -56,7 +56,7 @@ impl Invariant for SubscriberCounters {
                 if let Some(state) = self.subscribers.get_mut(&subscriber)
                     && let Err(words) = state.take(sample, missed)
                 {
-                    reporter.report(format!("consumer {}: {words}", subscriber.0));
+                    reporter.report(format!("subscriber {}: {words}", subscriber.0));
                 }
             }
             Event::Dropped { subscriber, sample } => {
@@ -74,7 +74,7 @@ impl Invariant for SubscriberCounters {
                     let (published, sent) = (number + 1 - first, index + 1 - first_index);
                     if (taken + missed, taken + dropped) != (published, sent) {
                         reporter.report(format!(
-                            "consumer {} of {topic:?}: {taken} taken, {missed} missed, {dropped} dropped of \
+                            "subscriber {} of {topic:?}: {taken} taken, {missed} missed, {dropped} dropped of \
                              {published} published, {sent} sent",
                             subscriber.0
                         ));
@@ -106,7 +106,7 @@ impl SubscriberState {
         if expected + missed == number {
             Ok(())
         } else {
-            Err(format!("number {number} where {expected} was expected, {missed} missed"))
+            Err(format!("topic_seq {number} instead of {expected}, {missed} missed"))
         }
     }
 
@@ -130,8 +130,9 @@ impl Invariant for Resources {
         if let Event::WorldEnded { handles, loans, held, .. } = *event
             && (handles, loans, held) != (0, 0, 0)
         {
-            reporter
-                .report(format!("{handles} lines are open, {loans} loans are out, {held} samples are held"));
+            reporter.report(format!(
+                "{handles} lines are open, {loans} loans are unused, {held} samples are held"
+            ));
         }
     }
 }
@@ -180,7 +181,7 @@ impl Invariant for ListenerCounters {
                 // A sample that is too large for datagrams uses a sequence number, too.
                 let is_next = if head.part > 0 { head.sequence + 1 == *next } else { head.sequence >= *next };
                 if !is_next {
-                    reporter.report(format!("a number that was there, {next} is next: {head:?}"));
+                    reporter.report(format!("a sequence number was used again, {next} is next: {head:?}"));
                 }
                 *next = head.sequence + 1;
                 if let Some(announce) = announce(datagram) {
@@ -210,7 +211,7 @@ impl Invariant for ListenerCounters {
                 let is_new = self.row(key(head.topic), head.sequence).take(head.sequence);
                 let is_told_new = outcome != DatagramOutcome::Duplicate;
                 if head.topic != Announce::NUMBER && is_new != is_told_new {
-                    reporter.report(format!("{outcome:?}, and it is new: {is_new}, {head:?}"));
+                    reporter.report(format!("{outcome:?}, although is_new is {is_new}: {head:?}"));
                 }
                 if let Some(announce) = announce(datagram) {
                     for announced in announce.topics() {
@@ -224,7 +225,7 @@ impl Invariant for ListenerCounters {
                 let key = (counted.epoch, counted.sensor, counted.topic);
                 let is_last = self.sequence_counts.keys().next_back().is_some_and(|last| last.0 == key.0);
                 let Some(row) = self.rows.get(&key) else {
-                    reporter.report(format!("{key:?}: a row of what did not come"));
+                    reporter.report(format!("{key:?}: a row for a stream that did not arrive"));
                     return;
                 };
                 self.counted += counted.received + counted.duplicate;
@@ -235,13 +236,15 @@ impl Invariant for ListenerCounters {
                 let has = (counted.received, counted.lost(), counted.duplicate, counted.reordered);
                 if has != due {
                     reporter.report(format!(
-                        "{key:?}: received, lost, duplicate, reordered {has:?}, due {due:?}"
+                        "{key:?}: received, lost, duplicate, reordered {has:?}, expected {due:?}"
                     ));
                 }
                 let sequence_counts = self.sequence_counts.get(&key).copied().unwrap_or_default();
                 if row.after_last > sequence_counts {
-                    reporter
-                        .report(format!("{key:?}: {} is known, {sequence_counts} were sent", row.after_last));
+                    reporter.report(format!(
+                        "{key:?}: {} sequence numbers are known, {sequence_counts} were sent",
+                        row.after_last
+                    ));
                 }
                 if self.is_over
                     && is_last
@@ -249,7 +252,7 @@ impl Invariant for ListenerCounters {
                     && row.after_last < sequence_counts
                 {
                     reporter.report(format!(
-                        "{key:?}: {} of {sequence_counts} are known at the end",
+                        "{key:?}: {} of {sequence_counts} sequence numbers are known at the end",
                         row.after_last
                     ));
                 }
@@ -262,7 +265,7 @@ impl Invariant for ListenerCounters {
                 }
                 if refused != self.refused || counted + refused != arrived || given_up != 0 {
                     reporter.report(format!(
-                        "{arrived} came, {counted} counted, {refused} refused, {given_up} lives given up"
+                        "{arrived} arrived, {counted} counted, {refused} refused, {given_up} runs evicted"
                     ));
                 }
             }
@@ -383,14 +386,12 @@ impl Invariant for BridgeCounters {
                 let all_go_out = self.sends_all && is_counted;
                 let of = self.topic_counters(sensor, topic);
                 if (row.sent, row.failed) != (of.sent - of.failed, of.failed) {
-                    reporter.report(format!("sensor {sensor}, {topic:?}: {row:?}, {} went out", of.sent));
+                    reporter.report(format!("sensor {sensor}, {topic:?}: {row:?}, {} sent", of.sent));
                 }
                 let accounted = row.sent + row.failed + row.replaced;
                 if all_go_out && !(accounted..=accounted + 1).contains(&of.taken) {
-                    reporter.report(format!(
-                        "sensor {sensor}, {topic:?}: {row:?} of {} that were taken",
-                        of.taken
-                    ));
+                    reporter
+                        .report(format!("sensor {sensor}, {topic:?}: {row:?} of {} taken samples", of.taken));
                 }
                 of.replaced = row.replaced;
             }
@@ -402,7 +403,7 @@ impl Invariant for BridgeCounters {
                     .filter(|((_, topic), of)| topic.is_some() && of.reported_replaced != of.replaced);
                 for ((sensor, topic), TopicCounters { reported_replaced: reported, replaced, .. }) in topics {
                     reporter.report(format!(
-                        "sensor {sensor}, {topic:?}: {reported} are said, {replaced} replaced"
+                        "sensor {sensor}, {topic:?}: {reported} announced as replaced, {replaced} replaced"
                     ));
                 }
             }

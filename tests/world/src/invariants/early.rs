@@ -67,7 +67,7 @@ impl Invariant for EarlyWarnings {
                     _ => None,
                 };
                 if let Some(wrong) = wrong {
-                    reporter.report(format!("sensor {sensor}, number {seq}: {wrong}"));
+                    reporter.report(format!("sensor {sensor}, seq {seq}: {wrong}"));
                 }
             }
             Event::OutOfMemory { sensor, topic: Topic::Early | Topic::Zones } => {
@@ -96,10 +96,10 @@ impl SensorWarnings {
     ) -> Option<String> {
         let verdict = early.verdict();
         if !matches!(verdict, Verdict::Slow | Verdict::Stop) {
-            return Some(format!("a warning says {}", verdict.name()));
+            return Some(format!("the verdict of a warning is {}", verdict.name()));
         }
         if self.zones.is_some_and(|zones| seq <= zones) {
-            return Some("a warning of a scan whose zones were there".to_owned());
+            return Some("a warning for a scan whose zones had been sent".to_owned());
         }
         let beams_seen = early.beams_seen;
         let warning = Warning { seq, verdict, is_of_telegram: early.bytes_seen > 0, beams_seen };
@@ -108,7 +108,7 @@ impl SensorWarnings {
             self.is_needless = is_faultless && self.scans > LEARNING_SCANS;
             let is_of = before.is_some_and(|before| (before.seq, before.verdict) == (seq, verdict));
             let is_of = is_of || std::mem::take(&mut self.is_unknown);
-            return (!is_of).then(|| format!("{before:?} stood, something else was taken back"));
+            return (!is_of).then(|| format!("another warning than {before:?} was withdrawn"));
         }
         self.current = Some(warning);
         self.is_unknown = false;
@@ -116,7 +116,7 @@ impl SensorWarnings {
             |before: &Warning| before.seq == seq && before.verdict.worse(verdict) != before.verdict;
         before
             .filter(|before| !is_worse(before))
-            .map(|before| format!("{before:?} stood, and {warning:?} is no worse"))
+            .map(|before| format!("{warning:?} follows {before:?}, and is not worse"))
     }
 
     /// Returns the error of the current or missing warning for these `zones`. Nothing is wrong if `is_faultless`.
@@ -133,13 +133,13 @@ impl SensorWarnings {
         if is_faultless && self.scans > LEARNING_SCANS && verdict == Verdict::Stop && is_soon {
             let is_in_time = |warning: &Warning| 4 * usize::from(warning.beams_seen) <= 3 * self.beams;
             if !warning.as_ref().is_some_and(is_in_time) {
-                return Some(format!("{warning:?} stood before a scan of {} beams, {zones:?}", self.beams));
+                return Some(format!("{warning:?} before a scan of {} beams, {zones:?}", self.beams));
             }
         }
         let warning = warning?;
         let holds =
             verdict.worse(warning.verdict) == verdict && (seq == warning.seq || !warning.is_of_telegram);
-        (!holds).then(|| format!("{warning:?}, the zones say {}", verdict.name()))
+        (!holds).then(|| format!("{warning:?}, the zones are {}", verdict.name()))
     }
 }
 

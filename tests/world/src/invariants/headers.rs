@@ -46,17 +46,17 @@ impl Invariant for HeaderConsistency {
             reporter.report(format!("sensor {sensor}, {topic:?}: {description}: {header:?}"))
         };
         if header.stamp_first_ns > header.stamp_last_ns || header.stamp_last_ns > at {
-            broken("a stamp of the future");
+            broken("a stamp in the future");
         }
         if usize::from(header.sensor) != sensor {
-            broken("the number of another sensor");
+            broken("the index of another sensor");
         }
         if let Some(before) = before.filter(|before| before.boot == header.boot) {
             if header.topic_seq <= before.topic_seq || header.seq < before.seq {
-                broken("a number that does not grow");
+                broken("a sequence number that does not increase");
             }
             if *topic == Topic::Telegram && header.stamp_last_ns < before.stamp_last_ns {
-                broken("a stamp that goes back");
+                broken("a stamp that decreases");
             }
         }
         // A sample that is not derived from a telegram has no hub time.
@@ -69,7 +69,7 @@ impl Invariant for HeaderConsistency {
             // The sample at the source was not published if there was no memory for it.
             let source = self.last.get(&(sensor, source));
             if source.is_some_and(|source| source.seq >= header.seq && of(source) != of(header)) {
-                broken("not that of what it was made of");
+                broken("not the header of the source");
             }
         }
     }
@@ -141,7 +141,7 @@ impl TopicHeaders {
     fn publish(&mut self, header: &Header, begin_ns: u64) -> Result<(), String> {
         let before = self.number.replace(header.topic_seq);
         if header.flags & Flags::REMOTE == 0 || header.stamp_first_ns != header.stamp_last_ns {
-            return Err("not as a remote one".to_owned());
+            return Err("not the header of a remote sample".to_owned());
         }
         let is_it = |(arrived_at, head): &(Nanos, Head)| {
             let Head { counter, stamp_ns, .. } = *head;
@@ -154,7 +154,7 @@ impl TopicHeaders {
             return if header.topic_seq == due {
                 Ok(())
             } else {
-                Err(format!("{due} is the number of a silence"))
+                Err(format!("the silence should have topic_seq {due}"))
             };
         };
         let passed: Vec<_> = self.unpublished.drain(..at).collect();
@@ -184,11 +184,11 @@ impl TopicHeaders {
             (None, _) => head.sequence.into(),
         };
         if header.topic_seq != due {
-            Err(format!("{due} is its number"))
+            Err(format!("topic_seq should be {due}"))
         } else if u64::from(header.period_us) != period_us {
-            Err(format!("{period_us} us is its period"))
+            Err(format!("the period should be {period_us} us"))
         } else if left_out > 0 {
-            Err(format!("{left_out} that came were left out before it"))
+            Err(format!("{left_out} samples that arrived before it are missing"))
         } else {
             Ok(())
         }

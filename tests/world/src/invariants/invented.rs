@@ -94,12 +94,12 @@ impl Invariant for NothingInvented {
                 let SensorTelegrams { family, last: (seq, boot, telegram), .. } = &self.sensors[sensor];
                 let mut scan = Box::<Scan>::default();
                 if !Scan::unpack_into(&mut scan, &sample.bytes) {
-                    reporter.report(format!("sensor {sensor}: what is no scan"));
+                    reporter.report(format!("sensor {sensor}: a sample that is not a valid scan"));
                 }
                 if (*seq, *boot) == (sample.header.seq, sample.header.boot)
                     && !family.is_scan_of(&scan, telegram)
                 {
-                    reporter.report(format!("sensor {sensor}: a scan that is not that of telegram {seq}"));
+                    reporter.report(format!("sensor {sensor}: a scan that differs from telegram {seq}"));
                 }
             }
             _ => {}
@@ -270,7 +270,7 @@ impl Invariant for RemoteNothingInvented {
                             _ => {}
                         }
                     }
-                    _ => reporter.report(format!("{} bytes that nobody sent so", bytes.len())),
+                    _ => reporter.report(format!("{} bytes that were not sent like this", bytes.len())),
                 }
             }
             Event::Republished { sensor, topic, header, payload } => {
@@ -287,10 +287,12 @@ impl Invariant for RemoteNothingInvented {
                     _ => false,
                 };
                 if !is_published && !is_said {
-                    reporter.report(format!("sensor {sensor}: nobody published this {topic:?}: {header:?}"));
+                    reporter.report(format!(
+                        "sensor {sensor}: {topic:?} was not published by the hub: {header:?}"
+                    ));
                 }
                 if usize::from(header.sensor) != sensor || !self.boots.contains(&header.boot) {
-                    reporter.report(format!("sensor {sensor}: of no sensor or hub: {header:?}"));
+                    reporter.report(format!("sensor {sensor}: unknown sensor or hub: {header:?}"));
                 }
             }
             _ => {}
@@ -368,13 +370,12 @@ impl Invariant for RemoteKeys {
                         _ => DatagramError::Mac,
                     };
                     if outcome != DatagramOutcome::Refused(due) {
-                        reporter
-                            .report(format!("{forgery:?}, and it is {outcome:?}, due {due:?}: {datagram:?}"));
+                        reporter.report(format!("{forgery:?}: {outcome:?} instead of {due:?}: {datagram:?}"));
                     }
                 } else if is_new && !self.accepted.insert(bytes) {
-                    reporter.report(format!("it was taken before: {datagram:?}"));
+                    reporter.report(format!("accepted twice: {datagram:?}"));
                 } else if is_new && self.replayed.contains(&bytes) {
-                    reporter.report(format!("it was recorded: {datagram:?}"));
+                    reporter.report(format!("accepted although it was recorded: {datagram:?}"));
                 }
             }
             _ => {}

@@ -222,7 +222,7 @@ impl RemoteSensor {
             && let Some(since) = self.known_since.filter(|since| at > since + self.max_delay)
         {
             let (ms, soon) = ((at - since) / MILLIS, self.max_delay / MILLIS);
-            reporter.report(format!("sensor {sensor}: nothing is known {ms} ms later, bound {soon}"));
+            reporter.report(format!("sensor {sensor}: no known verdict after {ms} ms, limit {soon}"));
         }
     }
 }

@@ -42,8 +42,9 @@ impl Invariant for ByteCounters {
                 let known: u64 = parts.into_iter().map(of).sum();
                 let handed = self.0[*sensor];
                 if (read, known) != (handed, handed) {
-                    reporter
-                        .report(format!("sensor {sensor}: {handed} handed out, {read} read, {known} known"));
+                    reporter.report(format!(
+                        "sensor {sensor}: {handed} returned by the port, {read} read, {known} in the counters"
+                    ));
                 }
             }
             _ => {}
@@ -144,7 +145,7 @@ impl Invariant for NothingLost {
                 let of = &mut self.sensors[sensor];
                 for unit in of.family.clone().telegrams(&sample.bytes) {
                     if sample.header.reasons == 0 && of.is_after_damage(unit) {
-                        reporter.report(format!("sensor {sensor}: beside damage, and not marked"));
+                        reporter.report(format!("sensor {sensor}: next to damaged bytes, and not marked"));
                     }
                     if let Some(lost) = of.publish(at, unit) {
                         reporter.report(format!("sensor {sensor}: {lost}"));
@@ -517,7 +518,7 @@ impl PacketCounters {
         (self.reported, self.missing, self.allowed_difference, self.total_at_last_status, self.disagreed) =
             (0, 0, 0, 0, false);
         if is_sure && !agree {
-            return Err(format!("{missing} packets are missing, {reported} are told"));
+            return Err(format!("{missing} packets are missing, {reported} are counted"));
         }
         Ok(())
     }

@@ -233,7 +233,7 @@ impl SensorPoints {
             Topic::Scan => {
                 let mut scan = Box::<Scan>::default();
                 if !Scan::unpack_into(&mut scan, &sample.bytes) {
-                    return Err("what is no scan".to_owned());
+                    return Err("a sample that is not a valid scan".to_owned());
                 }
                 let (boot, beams) = (sample.header.boot, scan.beams());
                 let before = self.beams.filter(|(of, ..)| *of == boot);
@@ -340,7 +340,7 @@ impl SensorPoints {
         };
         if let Some(point) = points.iter().flatten().copied().find(is_outside) {
             let (deg, us) = (point.truth.clockwise_deg, (point.truth.at_ns as i64 - stamp as i64) / 1_000);
-            return Err(format!("a point of another turn, at {deg} degrees, {us} us after the stamp"));
+            return Err(format!("a point of another revolution, at {deg} degrees, {us} us after the stamp"));
         }
         let begin = self.points.partition_point(|point| turned(&point) < first_deg - MAX_REORDER_DEG);
         let around = self.points.range(begin..).map(|point| turned(&point));
@@ -349,7 +349,7 @@ impl SensorPoints {
         let there = reported.len() + usize::from(scan.collisions);
         // Points at the edge may belong to either revolution.
         if !scan.is_incomplete() && measured.abs_diff(there) > self.exactness.points {
-            return Err(format!("{there} of {measured} points, and it is not marked"));
+            return Err(format!("{there} of {measured} points in a scan that is not marked"));
         }
         let mut figures =
             RevolutionFigures { wrong, ..RevolutionFigures::from_scan(scan, &reported, &points) };

@@ -60,7 +60,7 @@ impl Invariant for Families {
             }
             Event::RateAltered { sensor } => self.0[sensor].clean_since = None,
             Event::Written { sensor } if self.0[sensor].is_undisturbed(at) => {
-                reporter.report(format!("sensor {sensor}: an LDROBOT that streams gets a byte"));
+                reporter.report(format!("sensor {sensor}: the hub sent a byte to an LDROBOT that streams"));
             }
             Event::Published { sensor, sample } => {
                 if let Err(words) = self.0[sensor].check(sample) {
@@ -106,7 +106,10 @@ impl FamilyProgress {
             Topic::Status => {
                 let status: Status = bytemuck::pod_read_unaligned(bytes);
                 if status.family() != family {
-                    return Err(format!("a status of {:?} with a header of {family:?}", status.family()));
+                    return Err(format!(
+                        "a status with family {:?}, and a header with {family:?}",
+                        status.family()
+                    ));
                 }
                 let searches = matches!(status.state(), Some(State::Probing | State::Paused | State::Absent));
                 searches
@@ -119,7 +122,7 @@ impl FamilyProgress {
         if is_unknown || family.is_some_and(|family| self.families.contains(&family)) {
             return Ok(());
         }
-        Err(format!("{topic:?} of {family:?}, and the scanner is of {:?}", self.families))
+        Err(format!("{topic:?} with family {family:?}, and the scanner has {:?}", self.families))
     }
 }
 
@@ -173,7 +176,7 @@ impl Invariant for PortRate {
             Event::Read { sensor, .. } if self.sensors[sensor].is_altered => {
                 let of = &mut self.sensors[sensor];
                 if of.is_overdue {
-                    reporter.report(format!("sensor {sensor}: the rate of another process stays"));
+                    reporter.report(format!("sensor {sensor}: the port keeps the rate of another process"));
                     of.is_altered = false;
                 }
                 // The hub sets the rate after the read, not before it.
@@ -199,7 +202,7 @@ impl Invariant for Eeprom {
         if let Event::WorldEnded { eeprom_writes, .. } = *event
             && eeprom_writes > 0
         {
-            reporter.report(format!("sensors heard {eeprom_writes} requests that write the EEPROM"));
+            reporter.report(format!("scanners received {eeprom_writes} requests that write the EEPROM"));
         }
     }
 }

@@ -179,8 +179,9 @@ impl Invariant for Wakeups {
                 let (topic, seq) = (sample.topic, sample.header.seq);
                 if topic.spec().doorbell_word == DoorbellWord::Last && self.unwoken.get(&sensor) == Some(&seq)
                 {
-                    reporter
-                        .report(format!("{topic:?} of {seq} were made while those who wait for zones slept"));
+                    reporter.report(format!(
+                        "{topic:?} of {seq} was sent before subscribers to zones were woken"
+                    ));
                 }
                 let is_wanted = self.topics.values().any(|followed| *followed == (sensor, topic));
                 if matches!(topic, Topic::Scan | Topic::Zones) && is_wanted {
@@ -201,7 +202,7 @@ impl Invariant for Wakeups {
                 {
                     let us = late / 1_000;
                     reporter
-                        .report(format!("consumer {} got {:?} after {us} us", subscriber.0, sample.topic));
+                        .report(format!("subscriber {} got {:?} after {us} us", subscriber.0, sample.topic));
                 }
             }
             _ => {}

@@ -82,7 +82,7 @@ impl Invariant for Subscribers {
                 of.due[ring as usize] = None;
                 if !std::mem::take(&mut of.is_due[ring as usize]) {
                     reporter.report(format!(
-                        "sensor {sensor}: {ring:?} was rung, and no subscriber got a sample"
+                        "sensor {sensor}: {ring:?} was rung although no subscriber had a new sample"
                     ));
                 }
             }
@@ -111,7 +111,7 @@ impl SensorSubscribers {
         // A warning has the `seq` of a telegram that is not complete yet.
         let is_next = topic == Topic::Early || self.last < Some(seq);
         if self.due[DoorbellWord::Early as usize].is_some() && topic != Topic::Early {
-            broken.push(format!("{topic:?} of {seq} was sent while subscribers of a warning slept"));
+            broken.push(format!("{topic:?} of {seq} was sent before subscribers to warnings were woken"));
         }
         for ring in [DoorbellWord::First, DoorbellWord::Last] {
             if let Some(due) = self.due[ring as usize].filter(|&due| is_next && due < seq) {
@@ -168,7 +168,9 @@ impl SensorSubscribers {
         };
         let absent = self.subscribers.values().filter(is_absent);
         absent
-            .map(|of| format!("no {:?} of {scan} for a subscriber that came after {:?}", of.topic, of.after))
+            .map(|of| {
+                format!("no {:?} of {scan} for a subscriber that attached after {:?}", of.topic, of.after)
+            })
             .collect()
     }
 }

@@ -68,7 +68,7 @@ impl SensorVerdict {
             if end > since && end > from + self.max_delay {
                 let (was, bound) = ((end - from) / MILLIS, self.max_delay / MILLIS);
                 reporter.report(format!(
-                    "sensor {sensor}: clear, and something inside for {was} ms, bound {bound}"
+                    "sensor {sensor}: clear with an object inside for {was} ms, limit {bound}"
                 ));
             }
         }
@@ -141,7 +141,7 @@ impl Invariant for RemoteVerdict {
                 {
                     let (was, bound) = ((at - from) / MILLIS, of.max_delay / MILLIS);
                     reporter.report(format!(
-                        "sensor {sensor}: clear is sent, and something inside for {was} ms, bound {bound}"
+                        "sensor {sensor}: clear is sent with an object inside for {was} ms, limit {bound}"
                     ));
                 }
             }
@@ -150,8 +150,10 @@ impl Invariant for RemoteVerdict {
                 of.check(sensor, at, reporter);
                 let stands = (2_000 * u64::from(header.period_us) + VALIDITY_MARGIN).max(MIN_VALIDITY);
                 if stands > MAX_VALIDITY {
-                    reporter
-                        .report(format!("sensor {sensor}: a verdict that stands for {} ms", stands / MILLIS));
+                    reporter.report(format!(
+                        "sensor {sensor}: a verdict that is valid for {} ms",
+                        stands / MILLIS
+                    ));
                 }
                 of.valid_until = header.stamp_last_ns - self.begin_ns + stands;
             }
@@ -174,10 +176,8 @@ impl RemoteSensor {
     fn check(&self, sensor: usize, at: Nanos, reporter: &mut ViolationReporter<'_>) {
         if self.accepted != Verdict::Unknown && at > self.valid_until {
             let late = (at - self.valid_until) / MILLIS;
-            reporter.report(format!(
-                "sensor {sensor}: {:?}, which stands no more since {late} ms",
-                self.accepted
-            ));
+            reporter
+                .report(format!("sensor {sensor}: {:?}, which became stale {late} ms ago", self.accepted));
         }
     }
 }

@@ -136,7 +136,7 @@ impl Gateway {
         }
         let handed = self.outgoing.take_next(stamp(shared, now))?;
         let (sensor, topic, bytes) = (handed.sensor.0, handed.topic, handed.datagram.to_vec());
-        let datagram = Datagram::read(&bytes).expect("a bridge makes whole datagrams");
+        let datagram = Datagram::read(&bytes).expect("a bridge encodes valid datagrams");
         shared.log.record(now, &Event::Transmitted { datagram: &datagram, bytes: &bytes, is_taken });
         if !is_taken {
             self.outgoing.mark_failed(sensor, topic, bytes.len());
@@ -191,7 +191,7 @@ pub(super) struct Uplink<'a> {
 impl Transmit for Uplink<'_> {
     fn transmit(&mut self, bytes: &[u8], _group: u8, _above: u8) -> bool {
         let is_taken = self.refusal_rate <= 0.0 || self.random.f64() >= self.refusal_rate;
-        let datagram = Datagram::read(bytes).expect("a gateway makes whole datagrams");
+        let datagram = Datagram::read(bytes).expect("a gateway encodes valid datagrams");
         self.shared.log.record(self.now, &Event::Transmitted { datagram: &datagram, bytes, is_taken });
         if is_taken {
             self.network.send(self.now, bytes);
