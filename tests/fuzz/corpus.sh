@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Converts a corpus between corpus/TARGET.txt, which is in the repository, and the directory corpus/TARGET, which
-# `cargo fuzz` reads and extends. A line of the text file is one input in hex, then a space and its name if it has one.
+# `cargo fuzz` reads and extends. A line of the text file is one input in hex, followed by a space and a name if it has one.
+#
 #   corpus.sh unpack TARGET    writes each input to a file of the directory
 #   corpus.sh pack TARGET      writes the text file from the directory, named inputs first, each content once
 set -euo pipefail
@@ -15,13 +16,13 @@ case $1 in
         [ -f "$text" ] || { echo "$usage" >&2; exit 2; }
         mkdir -p "$directory"
         while read -r hex name; do
-            # The name that the fuzzer would choose.
+            # Use the name that the fuzzer would choose.
             [ -n "$name" ] || name=$(printf %b "$(sed 's/../\\x&/g' <<< "$hex")" | sha1sum | cut -d ' ' -f 1)
             printf %b "$(sed 's/../\\x&/g' <<< "$hex")" > "$directory/$name"
         done < "$text"
         ;;
     pack)
-        [ -d "$directory" ] || { echo "corpus.sh: there is no $directory; unpack the corpus first" >&2; exit 1; }
+        [ -d "$directory" ] || { echo "corpus.sh: $directory does not exist; unpack the corpus first" >&2; exit 1; }
         for file in "$directory"/*; do
             name=$(basename "$file")
             [[ $name =~ ^[0-9a-f]{40}$ ]] && name=
