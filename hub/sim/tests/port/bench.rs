@@ -160,7 +160,7 @@ impl Host {
     pub(crate) fn ask(&mut self, request: Request) -> Vec<u8> {
         self.write(request);
         loop {
-            let telegram = self.telegram(WAIT_TIMEOUT).unwrap_or_else(|| panic!("no answer to {request:?}"));
+            let telegram = self.telegram(WAIT_TIMEOUT).unwrap_or_else(|| panic!("no reply to {request:?}"));
             if telegram[4] == request.command() | 0x80 {
                 return telegram;
             }

@@ -92,7 +92,7 @@ fn requests_written_in_one_call_are_answered_at_9600() {
     let mut host = Host::open(&port, 9_600);
     for number in 0..100 {
         host.write(Request::Stop);
-        let reply = host.telegram(WAIT_TIMEOUT).unwrap_or_else(|| panic!("request {number} got no answer"));
+        let reply = host.telegram(WAIT_TIMEOUT).unwrap_or_else(|| panic!("request {number} got no reply"));
         assert_eq!(reply[4], 0xA0);
     }
     assert_eq!(simulator.end().0[0].sent, 100);
@@ -136,7 +136,7 @@ fn wrong_rate_garbles_both_directions() {
     let mut garbled = 1;
     while garbled < 4 {
         let record = simulator.record();
-        assert!(!record.is_reply, "answered at the wrong rate");
+        assert!(!record.is_reply, "replied at the wrong rate");
         garbled += usize::from(record.fault == Some(Fault::Baud));
     }
     // The bytes in the host's buffer are garbled, except for a scan that arrived before the change.

@@ -71,7 +71,7 @@ fn received_packets_match_the_truth_file() {
             let sha256 = Record::hash(packet).map(|byte| format!("{byte:02x}")).concat();
             assert!(
                 truth_lines.any(|line| line.contains(&sha256)),
-                "the truth has not this packet, or earlier"
+                "the truth does not contain this packet, or has it before the last one"
             );
         }
     }
@@ -133,7 +133,7 @@ fn wrong_rate_garbles_and_unsupported_options_fail() {
 fn receive(session: &mut LdSession, host: &Host, revolutions: usize) -> Vec<[u8; PACKET_LEN]> {
     let (end, mut packets, mut delivered) = (Instant::now() + WAIT_TIMEOUT, Vec::new(), 0);
     while delivered < revolutions {
-        assert!(Instant::now() < end, "{delivered} turns, {:?}", session.stats());
+        assert!(Instant::now() < end, "{delivered} revolutions, {:?}", session.stats());
         let (until, flags) = loop {
             match session.poll_action() {
                 Action::SetRate(rate) => host.set_rate(rate),

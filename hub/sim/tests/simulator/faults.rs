@@ -23,7 +23,10 @@ use crate::session::{Bench, ReceivedTelegram, SentTelegram};
 fn run_scene(faults: &str, span_ms: u64, seeds: u64) -> SceneResult {
     let all = run_seeds(&FaultScene::new(faults.parse().expect("faults"), span_ms), seeds);
     println!("{faults}: {all:?}");
-    assert!(is_sound(&all, faults), "delivered and never sent: {faults}: {all:?}");
+    assert!(
+        is_sound(&all, faults),
+        "telegrams were delivered that the scanner did not send: {faults}: {all:?}"
+    );
     all
 }
 
@@ -43,7 +46,7 @@ macro_rules! scenes {
             fn $name() {
                 let all = run_scene($faults, $span_ms, SEED_COUNT);
                 let least: fn(&SceneResult) -> bool = $least;
-                assert!(least(&all), "not what {} should do: {all:?}", $faults);
+                assert!(least(&all), "{} had too little effect: {all:?}", $faults);
             }
         )*
 
@@ -67,7 +70,7 @@ fn no_scene_is_about_nothing() {
         let FaultScene { is_idle, .. } = FaultScene::new(faults.parse().expect("faults"), span_ms);
         let inert = FaultScene { is_idle, ..FaultScene::new(Faults::default(), span_ms) };
         let all = healthy.entry((is_idle, span_ms)).or_insert_with(|| run_seeds(&inert, SEED_COUNT));
-        assert!(!has_effect(all), "without {faults} the same shows: {all:?}");
+        assert!(!has_effect(all), "the same effect without {faults}: {all:?}");
     }
 }
 
@@ -200,7 +203,7 @@ impl FaultScene {
         let unmarked: Vec<_> = unmatched.unsent.iter().filter(|wrong| wrong.reasons == 0).collect();
         if let Some(wrong) = unmarked.first() {
             let (command, at) = (wrong.telegram[4], wrong.at);
-            println!("{name}: nobody sent {command:02X} received {at}, and it is not marked: {bench}");
+            println!("{name}: {command:02X} received {at} was not sent, and is not marked: {bench}");
         }
         SceneResult {
             intact: bench.sent.iter().filter(|sent| is_due(sent)).count(),

@@ -187,7 +187,7 @@ impl Bench {
             let mut last = f64::MIN;
             for point in &revolution.points {
                 let angle = (clockwise(point) + edge_deg).rem_euclid(360.0);
-                assert!(angle > last, "merged: {angle} behind {last}");
+                assert!(angle > last, "merged: {angle} after {last}");
                 last = angle;
             }
             if revolution.incomplete {
@@ -215,7 +215,7 @@ fn every_point_matches_its_simulated_measurement() {
         let mut bench = Bench::new(LdSettings::of(model), &noiseless_world("room"), "", 7);
         bench.run(10 * ONE_SECOND);
         let due = 9 * model.revolutions_per_second() as usize;
-        assert!(bench.revolutions.len() >= due, "{model:?}: {} turns", bench.revolutions.len());
+        assert!(bench.revolutions.len() >= due, "{model:?}: {} revolutions", bench.revolutions.len());
         assert!(bench.revolutions.iter().all(|revolution| !revolution.incomplete));
         // Rounding hides half a millimeter of a range and a hundredth of a degree of an angle.
         let worst = bench.check_revolutions(0, 0.05, 2.0);

@@ -186,10 +186,10 @@ fn check(name: &str, live: &LiveStream, from: Nanos, path: &Path) {
     let first = read.first().unwrap_or_else(|| panic!("{name}: no scan"));
     let begin = expected.iter().position(|(_, scan)| is_same(scan, first));
     let beams = (first.beams(), expected[0].1.beams());
-    let begin = begin.unwrap_or_else(|| panic!("{name}: another scan, {beams:?} beams"));
+    let begin = begin.unwrap_or_else(|| panic!("{name}: a different scan, {beams:?} beams"));
     assert!(begin <= usize::from(from > 0), "{name}: the first {begin} scans are missing");
     for (number, (read, (_, live))) in read.iter().zip(&expected[begin..]).enumerate() {
-        assert!(is_same(read, live), "{name}: scan {number} is another one");
+        assert!(is_same(read, live), "{name}: scan {number} differs");
     }
     assert_eq!(begin + read.len(), expected.len(), "{name}: {begin} and {}", read.len());
     assert!(read.len() > 20, "{name}: {}", read.len());

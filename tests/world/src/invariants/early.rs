@@ -23,7 +23,7 @@ pub(crate) struct EarlyWarnings {
 struct Warning {
     seq: u64,
     verdict: Verdict,
-    /// Whether the `seq` of the scan is exactly that of the warning, and not a greater one.
+    /// Whether the scan has exactly the `seq` of the warning. Otherwise its `seq` may be greater.
     is_of_telegram: bool,
     /// Number of beams that had arrived.
     beams_seen: u16,

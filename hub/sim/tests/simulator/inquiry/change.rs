@@ -18,7 +18,7 @@ use super::{Bench, machine, make_stream, sensor};
 pub(crate) fn probe_and_plan(machine: LmsSimulator, now: Nanos) -> (Plan, LmsSimulator, Nanos) {
     let mut bench = Bench::new(Inquiry::new(Baud::B500000, now), Baud::B500000, machine, now);
     bench.finish(20_000 * MILLIS);
-    let plan = Plan::from_report(bench.protocol.report()).expect("it told all of it");
+    let plan = Plan::from_report(bench.protocol.report()).expect("a complete report");
     (plan, bench.machine, bench.now)
 }
 
@@ -272,7 +272,7 @@ fn a_stray_nak_is_not_believed_where_it_does_harm() {
         bench.finish(60_000 * MILLIS);
         assert_eq!((bench.protocol.outcome().failed, bench.machine.eeprom_writes()), (None, 1), "{after}");
         let commands: Vec<u8> = bench.sent_requests.iter().map(|telegram| telegram[4]).collect();
-        assert_eq!(commands, [0x74, 0x20, 0x77, 0x20, 0x74], "{after}: nothing was said twice");
+        assert_eq!(commands, [0x74, 0x20, 0x77, 0x20, 0x74], "{after}: no request was repeated");
     }
 }
 

@@ -92,7 +92,7 @@ impl<C: Protocol> Bench<C> {
     pub(crate) fn finish(&mut self, span: Nanos) -> Nanos {
         let started = self.now;
         while let Some(until) = self.drain() {
-            assert!(self.now < started + span, "not over within {} ms", span / MILLIS);
+            assert!(self.now < started + span, "not complete within {} ms", span / MILLIS);
             self.wait(until);
             let spare = self.protocol.read_buffer();
             let len = spare.len().min(self.inbox.len());
@@ -220,7 +220,7 @@ fn identifies_scanner_at_each_rate_and_in_each_mode() {
                 assert_eq!((report.baud, status.operating_mode()), (Some(baud), mode), "{word}");
                 assert_eq!((report.address, report.status_byte), (Some(0), Some(0x10)));
                 assert_eq!(report.kind(), Some(&b"LMS200;301063;V02.30"[..]));
-                let configuration = report.configuration().expect("was asked");
+                let configuration = report.configuration().expect("was requested");
                 assert_eq!((configuration.mode(), configuration.unit()), (Mode(1), Some(Unit::Mm)));
                 println!("port at {first:?}, {word} at {baud:?}: {} ms", elapsed / MILLIS);
                 // The scanner is in its previous state.
@@ -291,7 +291,7 @@ fn reports_faults_and_settings_of_a_used_scanner() {
     assert_eq!(report.status().map(|status| status.has_permanent_baud()), Some(true));
     assert_eq!(report.configuration().map(|configuration| configuration.bytes().len()), Some(32));
     assert_eq!(report.status_byte, Some(0x92));
-    let faults: Vec<_> = report.errors().expect("was asked").iter().map(|fault| fault.number).collect();
+    let faults: Vec<_> = report.errors().expect("was requested").iter().map(|fault| fault.number).collect();
     assert_eq!(faults, [22, 18]);
     assert!(report.reply(Request::Counters).is_some(), "an LMS 291 counts its hours");
 }

@@ -115,7 +115,11 @@ fn a_start_up_at_9600_to_a_stream_at_500k() {
     let sent = bench.sent().split_off(first);
     assert!(sent[0].1.is_reply && sent.len() > 20);
     for pair in sent[1..].windows(2) {
-        assert_eq!(pair[1].0 - pair[0].0, MIRROR_PERIOD, "181 beams at 500k come once a turn");
+        assert_eq!(
+            pair[1].0 - pair[0].0,
+            MIRROR_PERIOD,
+            "181 beams at 500k arrive once per revolution of the mirror"
+        );
         assert_eq!(pair[1].1.telegram.len(), 372);
     }
     assert_eq!(bench.machine.eeprom_writes(), 0);
@@ -245,7 +249,7 @@ fn ignores_or_refuses_invalid_requests() {
     let status = Request::Status.encode(0);
     bench.send(status.bytes(), 7 * MILLIS);
     bench.run_until(bench.now + 500 * MILLIS);
-    assert!(bench.chunks.is_empty(), "bytes with long gaps were heard");
+    assert!(bench.chunks.is_empty(), "a request with long gaps was accepted");
     assert_eq!(bench.machine.take_dropped(), Some(DroppedRequest::LongGap { after: 1 }));
     assert!(bench.ask(Request::Status.encode(4).bytes()).is_empty(), "another address");
     let mut wrong = status.bytes().to_vec();
@@ -301,7 +305,7 @@ fn recording_is_sent_once_despite_host_requests() {
     bench.ask(Request::Type.encode(0).bytes());
     let data = bench.sent().into_iter().filter(|(_, sent)| !sent.is_reply).map(|(_, sent)| sent.telegram);
     assert_eq!(data.collect::<Vec<_>>(), telegrams);
-    assert_eq!(bench.machine.poll_timeout(), None, "after the last one the line is silent");
+    assert_eq!(bench.machine.poll_timeout(), None, "the line is silent after the last telegram");
     let bytes = bench.ask(Request::Status.encode(0).bytes());
     assert!(matches!(reply(&bytes), Reply::Status(_)));
 }

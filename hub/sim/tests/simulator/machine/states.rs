@@ -108,7 +108,7 @@ fn indices_count_mirror_turns_and_telegrams() {
         .collect();
     for pair in indices.windows(2) {
         assert_eq!(pair[1].1, pair[0].1 + 1);
-        assert_eq!(pair[1].0.wrapping_sub(pair[0].0), 16, "8 scans of 2 turns each");
+        assert_eq!(pair[1].0.wrapping_sub(pair[0].0), 16, "8 scans of 2 revolutions each");
     }
 }
 
@@ -156,7 +156,10 @@ fn power_cycle_aborts_resets_and_sends_boot_message() {
     assert!(bench.machine.power_cycle(next), "nothing was on the line");
     let before = bench.chunks.len();
     bench.run_until(next + BOOT_TIME - 1_000 * MILLIS);
-    assert!(bench.ask(Request::Status.encode(0).bytes()).is_empty(), "heard while it starts");
+    assert!(
+        bench.ask(Request::Status.encode(0).bytes()).is_empty(),
+        "a request was accepted during the start-up"
+    );
     bench.run_until(next + 2 * BOOT_TIME);
     let sent: Vec<_> = bench.sent().into_iter().filter(|(at, _)| *at > next).collect();
     assert_eq!((sent[0].1.aborted, sent[0].1.is_reply, sent.len()), (true, false, 2));

@@ -325,7 +325,7 @@ fn worst_find_time(name: &str, after: Nanos, boot: Nanos, create: impl Fn(u64) -
         time.saturating_sub(after + boot)
     });
     let worst = times.max().unwrap_or(Nanos::MAX);
-    println!("{name:12} worst {} ms after it can answer", worst / MILLIS);
+    println!("{name:12} worst {} ms after it can reply", worst / MILLIS);
     worst
 }
 

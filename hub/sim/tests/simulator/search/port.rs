@@ -165,7 +165,7 @@ fn searches_again_10_s_after_the_scanner_disappears() {
     assert_eq!(bench.host.session.family(), Some(Family::Ld), "its session handles silence");
     bench.run(disconnected_at + 10_200 * MILLIS);
     assert_eq!(bench.host.session.family(), None);
-    assert!(bench.host.session.problem().is_some(), "the trouble of the session is shown");
+    assert!(bench.host.session.problem().is_some(), "the problem of the session is reported");
     let mut status = Status::default();
     status.set_sensor_type("LD19");
     bench.host.session.describe(&mut status);

@@ -32,7 +32,7 @@ fn a_pause_stops_the_stream_and_a_resume_starts_it() {
         let (quiet, sent_count) = (bench.now, bench.sent_bytes.len());
         bench.run(20_000 * MILLIS);
         assert_eq!((bench.session.state(), bench.sent_bytes.len()), (State::Paused, sent_count), "{bench}");
-        assert_eq!(bytes_sent_since(&bench, quiet), 0, "the sensor streams on: {bench}");
+        assert_eq!(bytes_sent_since(&bench, quiet), 0, "the scanner still streams: {bench}");
         assert_eq!((bench.session.problem(), bench.session.stats().resyncs), (None, 0));
         bench.control(Control::Resume);
         bench.control(Control::Resume);
@@ -65,7 +65,7 @@ fn a_pause_may_come_at_any_moment() {
                     (State::Paused, sent_count),
                     "{bench}"
                 );
-                assert_eq!(bytes_sent_since(&bench, quiet), 0, "{at}: the sensor streams on: {bench}");
+                assert_eq!(bytes_sent_since(&bench, quiet), 0, "{at}: the scanner still streams: {bench}");
                 assert_eq!(bench.machine.operating(), &OperatingMode::OnRequest, "{at}: {bench}");
                 assert_eq!(bench.session.problem(), None, "{at}: {bench}");
                 bench.control(Control::Resume);
@@ -84,13 +84,13 @@ fn an_absent_sensor_is_paused_in_peace() {
     bench.control(Control::Pause);
     bench.run(10_000 * MILLIS);
     let sent_count = bench.sent_bytes.len();
-    assert!(sent_count <= 8 * 8, "{sent_count} bytes to nobody");
+    assert!(sent_count <= 8 * 8, "{sent_count} bytes were sent to a line without a scanner");
     bench.run(60_000 * MILLIS);
     assert_eq!((bench.session.state(), bench.sent_bytes.len()), (State::Paused, sent_count));
     assert_eq!(bench.session.problem(), None);
     // The time of a pause does not count as time without a reply.
     bench.control(Control::Resume);
-    bench.run_until("said", 3_000 * MILLIS, |bench| bench.session.problem().is_some());
+    bench.run_until("reported", 3_000 * MILLIS, |bench| bench.session.problem().is_some());
     assert!(matches!(bench.session.problem(), Some(Problem::NoReply { seconds: 0..=3, .. })), "{bench}");
 }
 
@@ -146,7 +146,7 @@ fn resync_restarts_and_is_counted() {
     assert_eq!((bench.session.state(), bench.session.stats().resyncs), (State::Probing, 1));
     bench.run_until("streaming", 60 * MILLIS, Bench::is_streaming);
     bench.run(1_000 * MILLIS);
-    assert_eq!(bench.sent_bytes.len(), sent_count + 2 * 7, "an adopted stream costs two questions");
+    assert_eq!(bench.sent_bytes.len(), sent_count + 2 * 7, "a stream that is taken over needs two requests");
     let mut intact = bench.intact_scans(started);
     intact.truncate(bench.received_scans(started).len());
     assert_eq!(bench.received_scans(started), intact, "{bench}");

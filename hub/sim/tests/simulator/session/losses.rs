@@ -152,7 +152,7 @@ fn streaming_variant(baud: Baud, variant: Variant) -> (Bench, Nanos) {
         let got = bench.received.iter().rev().take(8).filter(|got| !got.estimated);
         got.filter_map(|got| Some(sent_at(bench, &got.telegram)? - got.first)).max()
     };
-    let scan_time = scan_time_of(&bench).expect("stamps that are no estimates");
+    let scan_time = scan_time_of(&bench).expect("stamps that are not estimates");
     (bench, scan_time)
 }
 
@@ -195,7 +195,7 @@ fn stamps_of_backlogged_scans_are_within_5_ms() {
             all.extend(errors.into_iter().filter(|(_, estimated)| *estimated).map(|(error, _)| error));
         }
         let (count, median) = (all.len(), median(all));
-        println!("{baud:?} {variant:?}: {count} that waited, median error {} us", median / MICROS);
+        println!("{baud:?} {variant:?}: {count} backlogged scans, median error {} us", median / MICROS);
         assert!(count > 15 && median < MILLIS, "{count} {median}");
         assert_eq!((bench.session.stats().resyncs, bench.session.stats().lost), (0, 0));
     }
@@ -214,7 +214,7 @@ fn stamps_after_overflow_are_right_or_estimated() {
                 assert!(estimated || error <= 5 * MILLIS, "{room} {span} ms: {error}");
             }
             let stamps: Vec<Nanos> = bench.received.iter().map(|got| got.first).collect();
-            assert!(stamps.is_sorted(), "stamps run backwards");
+            assert!(stamps.is_sorted(), "stamps decrease");
         }
         bench.run(2_000 * MILLIS);
         let lost = bench.sent.iter().filter(|sent| sent.damaged && !sent.is_reply && !sent.aborted).count();
@@ -273,9 +273,12 @@ fn a_telegram_is_there_soon_after_its_last_byte() {
             let latest = prompt.iter().copied().map(late).max().unwrap_or_default();
             assert!(latest <= 1_500 * MICROS, "{variant:?} {chunk:?}: {latest} ns");
             let latest = pairs.iter().map(late).max().unwrap_or_default();
-            assert!(latest <= 3_500 * MICROS, "{variant:?} {chunk:?}: {latest} ns for one that was held");
+            assert!(
+                latest <= 3_500 * MICROS,
+                "{variant:?} {chunk:?}: {latest} ns for one that was held back"
+            );
             let maximum = prompt.iter().map(|(got, _)| got.reads_since_last).max().unwrap_or_default();
-            assert!((1..=6).contains(&maximum), "{variant:?} {chunk:?}: {maximum} looks for a telegram");
+            assert!((1..=6).contains(&maximum), "{variant:?} {chunk:?}: {maximum} reads for a telegram");
         }
     }
 }

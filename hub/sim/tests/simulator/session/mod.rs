@@ -268,7 +268,7 @@ impl Bench {
     fn drain(&mut self) -> (bool, Nanos) {
         let wait = loop {
             match self.session.poll_action() {
-                Action::SetDtr(_) => panic!("there is nothing at this line"),
+                Action::SetDtr(_) => panic!("an LMS does not use DTR"),
                 Action::SetRate(baud) => {
                     self.port = self.session.baud();
                     assert_eq!(self.port.rate(), baud);
@@ -306,7 +306,7 @@ impl Bench {
         };
         let tally = self.session.framer_counters();
         let known = tally.in_telegrams + tally.acknowledge + tally.discarded + self.session.stats().buffered;
-        assert_eq!((tally.read, known), (self.read, self.read), "bytes vanished");
+        assert_eq!((tally.read, known), (self.read, self.read), "bytes disappeared");
         assert_eq!(self.machine.eeprom_writes(), 0);
         self.was_streaming &= self.is_streaming();
         if self.states.last() != Some(&self.session.state()) {

@@ -48,7 +48,7 @@ fn in_the_middle_of_a_scan() {
             assert_eq!(bench.session.stats().restarts, 1, "{boot} {phase}");
         }
     }
-    println!("streaming within {} ms of the banner", slowest / MILLIS);
+    println!("streaming within {} ms of the boot message", slowest / MILLIS);
 }
 
 #[test]

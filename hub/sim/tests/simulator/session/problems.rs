@@ -45,12 +45,14 @@ fn refused_variant_is_reported_again_after_silence() {
     let mute = ProtocolQuirks { is_mute: true, ..ProtocolQuirks::default() };
     bench.machine.set_quirks(mute);
     bench.run_until("streaming", 200 * MILLIS, Bench::is_streaming);
-    bench.run_until("told", 10_000 * MILLIS, |bench| bench.session.problem() == Some(Problem::ModeUnknown));
+    bench.run_until("reported", 10_000 * MILLIS, |bench| {
+        bench.session.problem() == Some(Problem::ModeUnknown)
+    });
     bench.machine.set_quirks(ProtocolQuirks::default());
     bench.run_until("mode known", 11_000 * MILLIS, |bench| bench.session.sensor().mode.is_some());
     bench.run(500 * MILLIS);
     assert_eq!(bench.session.problem(), Some(Problem::VariantRefused), "{bench}");
-    assert_eq!(bench.states, [State::Silent, State::Streaming], "it was taken as it is");
+    assert_eq!(bench.states, [State::Silent, State::Streaming], "the session did not take over the stream");
 }
 
 #[test]
@@ -114,7 +116,7 @@ fn silence_of_1_s_restarts_with_two_requests() {
     let (cut, sent_count) = (bench.now, bench.sent_bytes.len());
     bench.to_host = Box::new(move |at, bytes| if at < cut + 1_050 * MILLIS { Vec::new() } else { bytes });
     bench.run_until("silent", 1_040 * MILLIS, |bench| bench.session.state() == State::Silent);
-    assert!(bench.now >= cut + 970 * MILLIS, "gave up early: {bench}");
+    assert!(bench.now >= cut + 970 * MILLIS, "stopped trying early: {bench}");
     assert_eq!((bench.session.stats().resyncs, bench.session.problem()), (1, Some(Problem::Silence)));
     bench.run_until("streaming", 200 * MILLIS, Bench::is_streaming);
     bench.run(1_000 * MILLIS);
@@ -271,7 +273,7 @@ fn works_without_refused_requests_or_reports_them() {
     bench.run(60_000 * MILLIS);
     assert!(
         bench.sent_bytes.len() - sent_count < 3_000,
-        "{} bytes said in a minute",
+        "{} bytes sent in a minute",
         bench.sent_bytes.len() - sent_count
     );
     bench.machine.set_quirks(ProtocolQuirks::default());
@@ -326,7 +328,7 @@ fn a_stream_of_a_sensor_that_answers_nothing_is_taken() {
     // published without a reply.
     assert_eq!(bench.sent_bytes.len(), 15 * 7);
     bench.run(25_000 * MILLIS);
-    assert!(bench.sent_bytes.len() <= (15 + 3 * 3) * 7, "{} bytes said", bench.sent_bytes.len());
+    assert!(bench.sent_bytes.len() <= (15 + 3 * 3) * 7, "{} bytes sent", bench.sent_bytes.len());
     bench.machine.set_quirks(ProtocolQuirks::default());
     bench.run_until("mode known", 11_000 * MILLIS, |bench| bench.session.sensor().mode.is_some());
     bench.run(500 * MILLIS);
@@ -385,13 +387,13 @@ fn a_condition_that_comes_and_goes_is_there() {
     let mut bench = streaming_bench(Settings { baud: Baud::B500000, ..Settings::default() });
     // Every fifth scan reports a dirty window.
     bench.to_host = scan_filter(|count, scan| with_dirty_window(scan, count % 5 == 0));
-    bench.run_until("told", 1_000 * MILLIS, |bench| bench.session.sensor().notices().eq([Notice::Dirty]));
+    bench.run_until("reported", 1_000 * MILLIS, |bench| bench.session.sensor().notices().eq([Notice::Dirty]));
     for _ in 0..200 {
         bench.run(27 * MILLIS);
         assert!(bench.session.sensor().notices().eq([Notice::Dirty]), "{bench}");
     }
     bench.to_host = Box::new(|_, bytes| bytes);
-    bench.run_until("forgotten", 10_000 * MILLIS, |bench| bench.session.sensor().notices().next().is_none());
+    bench.run_until("cleared", 10_000 * MILLIS, |bench| bench.session.sensor().notices().next().is_none());
 }
 
 /// Returns a filter that passes on whole scans of 361 beams after `change` has changed them by their number and bytes.
@@ -438,5 +440,5 @@ fn single_complaint_on_a_damaging_line_is_ignored() {
         0 => scan[..700].to_vec(),
         _ => with_dirty_window(scan, true),
     });
-    bench.run_until("told", 1_000 * MILLIS, |bench| bench.session.sensor().notices().eq([Notice::Dirty]));
+    bench.run_until("reported", 1_000 * MILLIS, |bench| bench.session.sensor().notices().eq([Notice::Dirty]));
 }

@@ -96,7 +96,7 @@ impl RandomHost {
                     self.session.handle_transmitted(self.now);
                 }
                 Action::SetRate(_) => {}
-                Action::SetDtr(_) => panic!("there is nothing at this line"),
+                Action::SetDtr(_) => panic!("an LMS does not use DTR"),
                 Action::Event(Event::Scan(_)) => panic!("a telegram is a scan"),
                 Action::Event(Event::Telegram(received)) => {
                     assert!(Telegram::check(received.bytes).is_some());
@@ -107,7 +107,7 @@ impl RandomHost {
         }
         let tally = self.session.framer_counters();
         let known = tally.in_telegrams + tally.acknowledge + tally.discarded + self.session.stats().buffered;
-        assert_eq!((tally.read, known), (self.read, self.read), "bytes vanished");
+        assert_eq!((tally.read, known), (self.read, self.read), "bytes disappeared");
         assert_eq!(tally.telegrams, self.telegrams);
     }
 

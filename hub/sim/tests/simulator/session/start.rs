@@ -57,7 +57,7 @@ fn reports_missing_scanner_and_keeps_searching() {
     for moment in 0..60 {
         let mut bench = Bench::new(sensor(Baud::B9600), 0);
         bench.to_scanner = Box::new(|_, _| None);
-        bench.run_until("said", 3_000 * MILLIS, |bench| {
+        bench.run_until("reported", 3_000 * MILLIS, |bench| {
             matches!(bench.session.problem(), Some(lms::Problem::NoReply { .. }))
         });
         bench.run((10_000 + 100 * moment) * MILLIS);
@@ -175,7 +175,7 @@ fn scanner_that_refuses_a_rate_is_stopped_first() {
         let quirks = ProtocolQuirks { refused_commands: vec![0x20], ..ProtocolQuirks::default() };
         let settings = fast_settings(baud, StartState::Operating(OperatingMode::OnRequest));
         let mut bench = Bench::new(sensor_with(Settings { quirks, ..settings }), 0);
-        bench.run_until("said", 4_000 * MILLIS, |bench| {
+        bench.run_until("reported", 4_000 * MILLIS, |bench| {
             matches!(bench.session.problem(), Some(lms::Problem::Refused(_)))
         });
         bench.run(5_000 * MILLIS);
@@ -196,12 +196,12 @@ fn at_the_wanted_rate_it_is_taken_as_it_streams() {
         bench.run(2_000 * MILLIS);
         assert!(
             bench.sent_bytes.iter().all(|(at, _)| *at >= bench.received[0].at),
-            "spoke before it listened"
+            "sent a byte before it received one"
         );
         assert_eq!(bench.states, [State::Probing, State::Streaming], "{bench}");
         // Two requests abort a scan: for the measuring mode and the type.
         let aborted = bench.sent.iter().filter(|sent| sent.aborted).count();
-        assert!(aborted <= 2, "{aborted} scans were broken off");
+        assert!(aborted <= 2, "{aborted} scans were aborted");
         assert!(bench.session.sensor().mode.is_some() && !bench.session.sensor().kind().is_empty());
         // The session does not deliver the scan that was on the line at its start, but all others.
         let (scans, intact) = (bench.received_scans(0), bench.intact_scans(started));
@@ -262,7 +262,10 @@ fn on_a_slow_line_it_is_waited_for() {
         let mut bench = Bench::with_settings(lms::Settings { baud, ..SESSION_SETTINGS }, machine, started);
         bench.run_until("streaming", 2_000 * MILLIS, Bench::is_streaming);
         let first = bench.received[0].at;
-        assert!(bench.sent_bytes.iter().all(|(at, _)| *at >= first), "spoke before it listened: {bench}");
+        assert!(
+            bench.sent_bytes.iter().all(|(at, _)| *at >= first),
+            "sent a byte before it received one: {bench}"
+        );
         bench.run(10_000 * MILLIS);
         assert_eq!(bench.states, [State::Probing, State::Streaming], "{bench}");
     }
@@ -286,7 +289,7 @@ fn restored_identity_gives_scans_without_waiting() {
         assert_eq!((bench.session.sensor().defective, bench.session.identity()), (Some(false), Some(known)));
         // The session requests its status anyway.
         let aborted = bench.sent.iter().filter(|sent| sent.aborted).count();
-        assert!(aborted <= 1, "{aborted} scans were broken off");
+        assert!(aborted <= 1, "{aborted} scans were aborted");
     }
 }
 
@@ -313,7 +316,7 @@ fn restored_identity_of_another_scanner_is_replaced() {
     // No scanner streams, so a reply replaces the saved identity.
     let mut bench = Bench::new(sensor(Baud::B500000), 0);
     bench.session.restore_identity(known);
-    bench.run_until("an answer", 4_000 * MILLIS, |bench| !bench.received.is_empty());
+    bench.run_until("a reply", 4_000 * MILLIS, |bench| !bench.received.is_empty());
     assert_eq!(bench.session.sensor().kind(), b"");
 }
 
@@ -349,7 +352,7 @@ fn another_one_is_not_taken_for_the_first() {
         assert_eq!((known.mode, known.kind()), (Some(Mode(4)), &b"LMS291;S05063;V02.30"[..]), "{bench}");
         let scans = bench.received.iter().filter(|got| got.at > since);
         assert!(scans.filter_map(|got| got.range_bits).all(|bits| bits == 14), "{bench}");
-        assert!(!bench.states.contains(&State::Starting), "it was adopted: {bench}");
+        assert!(!bench.states.contains(&State::Starting), "the stream was not taken over: {bench}");
     }
 }
 
@@ -537,7 +540,7 @@ fn a_sensor_at_that_rate_streams() {
 #[test]
 fn fixed_rate_session_does_not_search_other_rates() {
     let mut bench = Bench::with_settings(settings_at(Baud::B38400), sensor(Baud::B9600), 0);
-    bench.run_until("said", 10_000 * MILLIS, |bench| {
+    bench.run_until("reported", 10_000 * MILLIS, |bench| {
         matches!(bench.session.problem(), Some(Problem::NoReply { baud: Some(Baud::B38400), .. }))
     });
     for _ in 0..100 {

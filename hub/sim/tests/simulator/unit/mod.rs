@@ -168,7 +168,7 @@ fn every_request_is_answered_byte_for_byte() {
     let set = [0x00, 0xCC, 0x01, 0x00, 1, 2, 3, 4];
     let answer = only_reply(bench.ask(&with_payload(0x85, &set)));
     assert_eq!(answer, [0xA5, 0x5A, 8, 0, 0, 0, 0x21, 0x00, 0xCC, 0x01, 0x00, 0, 0, 0, 0]);
-    assert_eq!(bench.unit.eeprom_writes(), 1, "a value that stays was set, and nobody counted it");
+    assert_eq!(bench.unit.eeprom_writes(), 1, "a change of a permanent setting was not counted");
 }
 
 #[test]
@@ -308,7 +308,7 @@ fn records_the_line_fault_of_each_packet() {
         let mut rest = &bench.received[..];
         for sent in bench.sent.iter().filter(|sent| sent.fault.is_none()) {
             let at = rest.windows(sent.bytes.len()).position(|window| window == sent.bytes);
-            rest = &rest[at.unwrap_or_else(|| panic!("{faults}: an intact packet is not there"))..]
+            rest = &rest[at.unwrap_or_else(|| panic!("{faults}: an intact packet is missing"))..]
                 [sent.bytes.len()..];
         }
     }
@@ -331,7 +331,10 @@ fn brown_out_sends_boot_message_during_a_stream() {
     let mut bench = streaming(Model::A1, 3, "brownout_at=1");
     bench.run(4 * ONE_SECOND);
     let boot_message = bench.sent.iter().position(|sent| sent.is_reply).expect("a banner");
-    assert!(boot_message > 50 && boot_message + 1 == bench.sent.len(), "it stays silent behind it");
+    assert!(
+        boot_message > 50 && boot_message + 1 == bench.sent.len(),
+        "the scanner sends nothing after that"
+    );
     assert!(bench.sent[boot_message].bytes.starts_with(b"RP LIDAR"));
     // The motor has power all the time.
     assert_eq!(bench.ask(&stream_request(3)).len(), 1);
@@ -358,7 +361,7 @@ fn points_after_a_power_cycle_need_a_running_motor() {
     bench.ask(&stream_request(1));
     let before = bench.data().len();
     bench.run_for(5 * ONE_SECOND);
-    assert_eq!(bench.data().len(), before, "nobody told this motor to turn");
+    assert_eq!(bench.data().len(), before, "this motor was not started");
     assert_eq!(bench.unit.eeprom_writes(), 0);
 }
 
@@ -373,7 +376,7 @@ fn health_error_ends_stream_and_some_survive_reset() {
         assert!(bench.sent.len() <= sent + 1);
         let health = |bench: &mut Bench| bench.ask(&[0xA5, 0x52])[0][7..].to_vec();
         assert_eq!(health(&mut bench), [2, 0x01, 0x80]);
-        assert!(bench.ask(&stream_request(2)).is_empty(), "it measures in spite of its error");
+        assert!(bench.ask(&stream_request(2)).is_empty(), "it measures despite its error");
         bench.ask(&[0xA5, 0x40]);
         bench.run_for(ONE_SECOND);
         let (status, answers) = if stubborn { (2, 0) } else { (0, 1) };
@@ -384,7 +387,7 @@ fn health_error_ends_stream_and_some_survive_reset() {
     warned.health = (1, 7);
     let mut bench = Bench::new(warned, &World::Empty, "");
     assert_eq!(bench.ask(&[0xA5, 0x52])[0][7..], [1, 7, 0]);
-    assert_eq!(bench.ask(&stream_request(1)).len(), 1, "a warning is no error");
+    assert_eq!(bench.ask(&stream_request(1)).len(), 1, "a warning is not an error");
 }
 
 #[test]
@@ -400,7 +403,7 @@ fn held_head_sends_no_points_and_spins_up_again() {
     assert!((46 * ONE_SECOND / 10..47 * ONE_SECOND / 10).contains(&first), "{first}");
     let mut bench = streaming(Model::A1, 1, "hold=5,hold_at=1");
     bench.run(2 * ONE_SECOND);
-    assert_eq!(bench.ask(&[0xA5, 0x52])[0][7], 2, "it does not say that its head is held");
+    assert_eq!(bench.ask(&[0xA5, 0x52])[0][7], 2, "it does not report that its head is blocked");
 }
 
 #[test]

@@ -241,7 +241,7 @@ fn an_a1_indoors_is_as_odd_as_a_real_one() {
     counts.sort_unstable();
     flags.sort_unstable_by(f64::total_cmp);
     println!(
-        "{}..{} a turn, flag at {:.1}..{:.1}",
+        "{}..{} per revolution, flag at {:.1}..{:.1}",
         counts[0],
         counts[counts.len() - 1],
         flags[0],

@@ -95,7 +95,7 @@ fn the_tail_is_heavy_and_belongs_to_edges() {
         let neighbors = beam.saturating_sub(1)..(beam + 2).min(361);
         assert!(
             neighbors.clone().any(|other| exact[other].abs_diff(exact[beam]) > 40),
-            "beam {beam} is at no edge"
+            "beam {beam} is not at an edge"
         );
         at_edges += 1;
         readings.extend(off);

@@ -284,7 +284,7 @@ const WIDE_BEAMS: NoiseModel = NoiseModel { spot: true, ..NoiseModel::NONE };
 
 /// Returns the scans of `text` with and without everything from `cut` on, which must be its end.
 fn with_and_without(text: &str, cut: &str, end_ns: Nanos) -> (LabeledScan, LabeledScan) {
-    let (without, _) = text.split_once(cut).expect("what is to be cut");
+    let (without, _) = text.split_once(cut).expect("the part to remove");
     let look_at = |text: &str| scan_at(&Room::new(&world(text).with_noise(WIDE_BEAMS), 4), end_ns);
     (look_at(text), look_at(without))
 }
@@ -470,8 +470,8 @@ fn things_have_a_height_and_boards_space_below() {
     assert!(on_it(&crate_points, 499.0, 501.0) > 300, "its lid");
     assert_eq!(on_it(&crate_points, 502.0, 2000.0) + on_it(&crate_points, -9.0, -2.0), 0);
     let board = all("[[thing]]\nbox = [600, 400]\nabove_mm = 450\nheight_mm = 500\npose = [0, 1700]");
-    assert_eq!(on_it(&board, 5.0, 445.0), 0, "below it is nothing");
-    assert!(on_it(&board, -1.0, 1.0) > 50, "but the floor");
+    assert_eq!(on_it(&board, 5.0, 445.0), 0, "no surface below it");
+    assert!(on_it(&board, -1.0, 1.0) > 50, "the floor is visible");
 }
 
 #[test]
