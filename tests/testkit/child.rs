@@ -1,12 +1,12 @@
-//! Starts every child process of a test, and ends it together with all its descendants.
+//! Child processes of tests: starts them, and ends each one together with all its descendants.
 //!
-//! A child runs in a process group of its own, so that dropping its [`Child`] also ends what it has started, such as
-//! the browser of a shell script that does not `exec`. A descendant may leave the group: a daemon or a program in a
-//! new session does. Two environment variables therefore mark all descendants: [`RUN`] names the test binary, and
-//! [`CHILD_VARIABLE`] the child.
+//! A child runs in a separate process group, so that dropping its [`Child`] also ends the processes that it has
+//! started, such as the browser of a shell script that does not `exec`. A descendant may leave the group, as a daemon
+//! or a program in a new session does. Two environment variables therefore mark all descendants: [`RUN_VARIABLE`] names
+//! the test binary, and [`CHILD_VARIABLE`] names the child.
 
 #![allow(clippy::disallowed_methods, reason = "limits of real time; crates of the hub use this file, too")]
-#![allow(dead_code)] // Every user of this file needs a part of it.
+#![allow(dead_code)] // Each user of this file needs only a part of it.
 
 use std::borrow::BorrowMut;
 use std::fs;
@@ -25,19 +25,22 @@ use rustix::process::{
     Pid, Signal, WaitId, WaitIdOptions, geteuid, kill_process, kill_process_group, waitid,
 };
 
-/// Target directory, process ID and start time of the test binary, with colons between. `.ci/run` searches for it, too.
+/// Variable with the target directory, process ID and start time of the test binary, separated by colons. `.ci/run`
+/// also searches for it.
 const RUN_VARIABLE: &str = "SCANHUB_TEST_RUN";
-/// The child that a process descends from: process ID and start time of the test binary, and a number. A test that runs
-/// again in another process appends the numbers of its own children.
+/// Variable that names the child from which a process descends: the process ID and start time of the test binary and an
+/// index, separated by dots. A test that runs again in another process appends the names of its own children after a
+/// slash.
 const CHILD_VARIABLE: &str = "SCANHUB_TEST_CHILD";
-/// Set by `.ci/run`: processes of a test binary that started at this time or later are left for its check.
+/// Variable that `.ci/run` sets to a time in clock ticks since boot. Processes of test binaries that started at this
+/// time or later are not ended, because `.ci/run` itself checks for them.
 const SINCE_VARIABLE: &str = "SCANHUB_TEST_SINCE";
 
-/// Time that a program has to end by itself after TERM.
+/// Time that a program has to exit after TERM before it is killed.
 const TERM_TIMEOUT: Duration = Duration::from_secs(2);
-/// Time in which the kernel ends killed processes, however busy the machine is.
+/// Time in which the kernel ends killed processes, even on a busy machine.
 const KILL_TIMEOUT: Duration = Duration::from_secs(60);
-/// Time that a process has to load its program. It is short, because the environment of another process may stay empty.
+/// Time that a process has to load its program. It is short, because the environment of some processes stays empty.
 const EXEC_TIMEOUT: Duration = Duration::from_millis(200);
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
@@ -48,14 +51,14 @@ pub(crate) struct Child {
     mark: String,
 }
 
-/// Starts `command` in a process group of its own.
+/// Starts `command` in a new process group.
 ///
-/// The child must not read from the terminal of the person who runs the tests, because it is not in that terminal's
-/// foreground: set its stdin.
+/// Set the stdin of `command`: the child must not read from the terminal of the person who runs the tests, because it
+/// is not in that terminal's foreground.
 ///
 /// # Errors
 ///
-/// If the program cannot be started.
+/// Returns an error if the program cannot be started.
 pub(crate) fn spawn(mut command: impl BorrowMut<Command>) -> io::Result<Child> {
     static NEXT_CHILD: AtomicU32 = AtomicU32::new(0);
     static ONCE: OnceLock<()> = OnceLock::new();
@@ -66,8 +69,8 @@ pub(crate) fn spawn(mut command: impl BorrowMut<Command>) -> io::Result<Child> {
     let mark = std::env::var(CHILD_VARIABLE).map_or(mark.clone(), |outer| format!("{outer}/{mark}"));
     let command = command.borrow_mut();
     command.env(RUN_VARIABLE, run()).env(CHILD_VARIABLE, &mark);
-    // `setsid` makes a session and a group with its own process ID. It would fork if it were the leader of a group
-    // already.
+    // `setsid` creates a session and a group with its own process ID. It would fork if it already were the leader of a
+    // group.
     if command.get_program() != "setsid" {
         command.process_group(0);
     }
@@ -78,17 +81,18 @@ pub(crate) fn spawn(mut command: impl BorrowMut<Command>) -> io::Result<Child> {
 ///
 /// # Errors
 ///
-/// If the program cannot be started or its output cannot be read.
+/// Returns an error if the program cannot be started or its output cannot be read.
 pub(crate) fn output(mut command: impl BorrowMut<Command>) -> io::Result<Output> {
     let command = command.borrow_mut();
     spawn(command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()))?.wait_with_output()
 }
 
-/// Runs `command` to its end with an empty stdin. Its output goes where that of the test goes, unless it is set.
+/// Runs `command` to its end with an empty stdin, and returns its exit status. The program inherits stdout and stderr
+/// of the test unless `command` sets them.
 ///
 /// # Errors
 ///
-/// If the program cannot be started.
+/// Returns an error if the program cannot be started.
 pub(crate) fn status(mut command: impl BorrowMut<Command>) -> io::Result<ExitStatus> {
     spawn(command.borrow_mut().stdin(Stdio::null()))?.wait()
 }
@@ -98,14 +102,14 @@ pub(crate) fn succeeds(command: impl BorrowMut<Command>) -> bool {
     output(command).is_ok_and(|output| output.status.success())
 }
 
-/// Writes an executable file, for example a shell script, that a test may start at once.
+/// Writes an executable file, for example a shell script. The test may start it at once.
 ///
 /// A child process writes the file. If this process did, another thread could fork a child that inherits the open
 /// file, and the kernel refuses to execute a file that any process has open for writing ("Text file busy").
 ///
 /// # Panics
 ///
-/// If it cannot be written.
+/// Panics if the file cannot be written.
 pub(crate) fn write_program(path: impl AsRef<Path>, content: impl AsRef<[u8]>) {
     let path = path.as_ref();
     let mut shell = Command::new("sh");
@@ -121,27 +125,30 @@ pub(crate) fn write_program(path: impl AsRef<Path>, content: impl AsRef<[u8]>) {
 }
 
 impl Child {
-    /// Sends a signal to the program, and not to its descendants.
+    /// Sends a signal to the program, but not to its descendants.
     ///
     /// # Errors
     ///
-    /// If its exit status was read: another process may have its ID by now.
+    /// Returns an error if the exit status of the program was read before, because another process may have its ID by
+    /// now.
     pub(crate) fn signal(&self, signal: Signal) -> rustix::io::Result<()> {
         self.has_ended()?;
         kill_process(Pid::from_child(&self.process), signal)
     }
 
-    /// Returns whether the program has ended, and leaves its exit status to be read. An error if that was read already.
+    /// Returns whether the program has ended, without reading its exit status. Returns an error if the exit status was
+    /// read before.
     fn has_ended(&self) -> rustix::io::Result<bool> {
         let flags = WaitIdOptions::EXITED | WaitIdOptions::NOHANG | WaitIdOptions::NOWAIT;
         Ok(waitid(WaitId::Pid(Pid::from_child(&self.process)), flags)?.is_some())
     }
 
-    /// Waits for the end, and returns what it wrote to the pipes that were not taken.
+    /// Closes stdin and waits for the end of the program. Returns its exit status and the output of the pipes that the
+    /// test has not taken.
     ///
     /// # Errors
     ///
-    /// If a pipe cannot be read.
+    /// Returns an error if a pipe cannot be read.
     pub(crate) fn wait_with_output(mut self) -> io::Result<Output> {
         drop(self.stdin.take());
         let errors = self.stderr.take();
@@ -154,7 +161,7 @@ impl Child {
     /// Ends the program and all its descendants, and waits for their end.
     pub(crate) fn end(&mut self) {
         let id = Pid::from_child(&self.process);
-        // Nothing else can have the ID of the process and of its group until the process is reaped.
+        // The kernel does not assign the ID of the process and of its group again until the process is reaped.
         let is_reaped = self.has_ended().is_err();
         if !is_reaped {
             // TERM first, so that the program can end its children and remove its files.
@@ -172,17 +179,19 @@ impl Child {
         }
     }
 
-    /// Returns the command lines of its living descendants, and its own if it lives.
+    /// Returns the command lines of its running descendants, and its own if it is running.
     pub(crate) fn living_command_lines(&self) -> Vec<String> {
         let text = |pid| fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
         let line = |pid| String::from_utf8_lossy(&text(pid)).trim_end_matches('\0').replace('\0', " ");
         self.living_pids(false).into_iter().map(line).collect()
     }
 
-    /// Returns the process IDs of its living descendants, and its own if it lives. The group counts if `is_group_ours`.
+    /// Returns the process IDs of its running descendants, and its own if it is running. The members of its process
+    /// group count as descendants if `is_group_ours`.
     fn living_pids(&self, is_group_ours: bool) -> Vec<i32> {
         let id = self.process.id() as i32;
-        // Process IDs ascend until the highest is reached, so a descendant has a higher one unless they began again.
+        // The kernel assigns ascending process IDs until it reaches the maximum. A descendant therefore has a higher
+        // ID, unless the IDs have started again from low numbers.
         let lowest = if newest_process_id().is_some_and(|newest| newest >= id) { id } else { 1 };
         let is_marked = |pid: &i32| {
             let mark = variable(*pid, CHILD_VARIABLE).unwrap_or_default();
@@ -213,14 +222,18 @@ impl Drop for Child {
     }
 }
 
-/// Reads all bytes of a pipe. Returns none if there is no pipe.
+/// Reads all bytes of a pipe. Returns no bytes if `pipe` is `None`.
 fn read_all(pipe: Option<impl Read>) -> io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     pipe.map_or(Ok(0), |mut pipe| pipe.read_to_end(&mut bytes))?;
     Ok(bytes)
 }
 
-/// Kills the processes that `living` returns, until it returns none.
+/// Kills the processes that `living` returns, and repeats this until it returns none.
+///
+/// # Panics
+///
+/// Panics if processes still run after [`KILL_TIMEOUT`].
 fn end_all(living: impl Fn() -> Vec<i32>) {
     let give_up_at = Instant::now() + KILL_TIMEOUT;
     loop {
@@ -240,13 +253,14 @@ fn end_all(living: impl Fn() -> Vec<i32>) {
     }
 }
 
-/// Ends what interrupted runs of this target directory left.
+/// Ends the processes that interrupted test runs of this target directory left.
 fn end_earlier_runs() {
     let since = std::env::var(SINCE_VARIABLE).ok().and_then(|text| text.parse().ok()).unwrap_or(u64::MAX);
     end_runs_of(run().rsplitn(3, ':').nth(2).unwrap_or_default(), since);
 }
 
-/// Ends this user's processes of test binaries in `target` that started before `since` and have ended.
+/// Ends processes of this user whose test binary belongs to the target directory `target`, started before `since`
+/// (clock ticks since boot) and has ended.
 pub(crate) fn end_runs_of(target: &str, since: u64) {
     let user = geteuid().as_raw();
     let is_left = |pid: &i32| {
@@ -257,19 +271,21 @@ pub(crate) fn end_runs_of(target: &str, since: u64) {
     end_all(|| process_ids().filter(is_left).collect());
 }
 
-/// Whether the value `run` of [`RUN`] names a test binary of `target` that started before `since` and has ended.
+/// Returns whether the value `run` of [`RUN_VARIABLE`] names a test binary of `target` that started before `since` and
+/// has ended.
 fn has_ended_before(run: &str, target: &str, since: u64) -> bool {
     let [start, pid, directory] = run.rsplitn(3, ':').collect::<Vec<_>>()[..] else { return false };
     let (Ok(start), Ok(pid)) = (start.parse::<u64>(), pid.parse()) else { return false };
     directory == target && start < since && start_time(pid) != Some(start)
 }
 
-/// Returns the value of [`RUN`] for the children of this process.
+/// Returns the value of [`RUN_VARIABLE`] for the children of this process.
 fn run() -> &'static str {
     static RUN_VARIABLE: OnceLock<String> = OnceLock::new();
     RUN_VARIABLE.get_or_init(|| {
         let program = std::env::current_exe().unwrap_or_default();
-        // Cargo names a directory in the target directory, but not to unit tests. They are in target/debug/deps.
+        // Cargo passes a directory in the target directory to integration tests only. Unit tests are in
+        // target/debug/deps.
         let target = option_env!("CARGO_TARGET_TMPDIR").map(Path::new).and_then(Path::parent);
         let target = target.or(program.ancestors().nth(3)).unwrap_or(Path::new("/"));
         let own = std::process::id();
@@ -292,7 +308,7 @@ fn newest_process_id() -> Option<i32> {
 fn variable(pid: i32, name: &str) -> Option<String> {
     let mut environment = environment(pid)?;
     let give_up_at = Instant::now() + EXEC_TIMEOUT;
-    // A process that starts another program has none for a moment.
+    // The environment of a process is empty for a moment while it starts another program.
     while environment.is_empty() && has_environment(pid) && Instant::now() < give_up_at {
         thread::sleep(Duration::from_millis(1));
         environment = self::environment(pid)?;
@@ -302,8 +318,8 @@ fn variable(pid: i32, name: &str) -> Option<String> {
     Some(String::from_utf8_lossy(value).into_owned())
 }
 
-/// Returns the first 256 kB of a process' environment. It is empty if the process starts another program between the two
-/// system calls; more than one `read` could return a part of it.
+/// Returns the first 256 kB of the environment of a process. The result is empty if the process starts another program
+/// between `open` and `read`. A single `read` is used, because several could return a part of the environment.
 fn environment(pid: i32) -> Option<Vec<u8>> {
     let mut bytes = vec![0; 1 << 18];
     let len = fs::File::open(format!("/proc/{pid}/environ")).ok()?.read(&mut bytes).ok()?;
@@ -328,12 +344,13 @@ fn group(pid: i32) -> Option<i32> {
     stat(pid)?.get(2)?.parse().ok()
 }
 
-/// Returns when a process started, in clock ticks since boot. `None` if there is none, or if it has ended.
+/// Returns the start time of a process in clock ticks since boot, or `None` if the process does not exist or has ended.
 fn start_time(pid: i32) -> Option<u64> {
     stat(pid)?.get(19)?.parse().ok()
 }
 
-/// Returns the fields of `/proc/PID/stat` from the third one on (see proc_pid_stat(5)) of a process that has not ended.
+/// Returns the fields of `/proc/PID/stat` (see proc_pid_stat(5)) from the third one on, or `None` if the process has
+/// ended.
 fn stat(pid: i32) -> Option<Vec<String>> {
     let text = fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
     // The second field is the name in brackets, which may contain spaces and brackets.

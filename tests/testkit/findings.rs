@@ -1,20 +1,21 @@
-//! What `scanhub doctor` finds, and a line of a table for each set-up in which it was found: what is wrong, which check
-//! says so, and the remedy.
+//! Findings of `scanhub doctor`, and assertions about them. For each expected problem, a line of a table is printed:
+//! the setup, the state, the check and the remedy.
 
 use serde_json::Value;
 
 use super::{Outcome, TestEnv};
 
-/// All findings of one examination.
+/// All findings of one run of `scanhub doctor`, as JSON lines of class `check`.
 pub(crate) struct Findings(Vec<Value>);
 
 impl Findings {
-    /// Those of the program with these arguments.
+    /// Runs `scanhub doctor` with these arguments, and returns its findings.
     pub(crate) fn of(env: &TestEnv, arguments: &[&str]) -> Findings {
         Findings::in_outcome(&env.run(&[&["doctor", "--json", "--no-system-config"], arguments].concat()))
     }
 
-    /// Those that it said. Whether one failed it said by its exit code too.
+    /// Returns the findings in the output of a run. Asserts that the exit code is 5 if a check has failed, and 0
+    /// otherwise.
     pub(crate) fn in_outcome(outcome: &Outcome) -> Findings {
         let findings = Findings(outcome.of_class("check"));
         let failed = findings.0.iter().any(|line| line["state"] == "failed");
@@ -22,12 +23,13 @@ impl Findings {
         findings
     }
 
-    /// Those that somebody else was told, as lines.
+    /// Creates findings from JSON lines that the test has obtained in another way.
     pub(crate) fn in_lines(lines: Vec<Value>) -> Findings {
         Findings(lines)
     }
 
-    /// In `set_up` check `name` must say `state` and a remedy with this word.
+    /// Asserts that check `name` has `state` and a remedy that contains `remedy_word`, and prints it as a line of the
+    /// table. `set_up` describes the setup of the test.
     pub(crate) fn assert_problem(&self, set_up: &str, name: &str, state: &str, remedy_word: &str) {
         let is_it = |line: &&Value| {
             let remedy = line["remedy"].as_str().unwrap_or_default();
@@ -40,7 +42,7 @@ impl Findings {
         println!("{set_up:44} {state:8} {name:13} {remedy}");
     }
 
-    /// Nothing may be wrong; what was not looked at has a reason.
+    /// Asserts that every check is `ok` or `skipped` and has a finding but no remedy.
     pub(crate) fn assert_no_problem(&self) {
         assert!(!self.0.is_empty());
         for line in &self.0 {
@@ -51,18 +53,18 @@ impl Findings {
         }
     }
 
-    /// Those of other checks than these.
+    /// Returns the findings of all checks except `names`.
     pub(crate) fn without(&self, names: &[&str]) -> Findings {
         let others = self.0.iter().filter(|line| !names.iter().any(|name| line["name"] == *name));
         Findings(others.cloned().collect())
     }
 
-    /// Those that are of no port.
+    /// Returns the findings that do not belong to a port.
     pub(crate) fn without_ports(&self) -> Findings {
         Findings(self.0.iter().filter(|line| line["port"].is_null()).cloned().collect())
     }
 
-    /// State and finding of the check `name`, the first if there are several.
+    /// Returns state and finding of the first check called `name`.
     pub(crate) fn state_and_text(&self, name: &str) -> (&str, &str) {
         let line = self.0.iter().find(|line| line["name"] == name);
         let line = line.unwrap_or_else(|| panic!("no {name}: {:#?}", self.0));

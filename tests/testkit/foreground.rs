@@ -1,5 +1,6 @@
-//! Scenes of the simulated world in which the truth of each beam is known, and scores of the methods that separate
-//! foreground from background. `benches/perception` measures ten runs of each scene, `tests/it/foreground.rs` one.
+//! Scenes of the simulated world in which the correct answer for each beam is known, and scores of the methods that
+//! separate foreground from background. `benches/perception` measures ten runs of each scene, and
+//! `tests/it/foreground.rs` measures one.
 
 #[path = "decoded_scan.rs"]
 mod decoded_scan;
@@ -17,13 +18,13 @@ use scanhub_sim::world::World;
 /// A scene of the simulated world: 2000 scans, 53 s.
 #[derive(Clone, Copy)]
 pub(crate) struct Scene {
-    /// Name in tables.
+    /// Name of the scene in tables.
     pub(crate) name: &'static str,
-    /// Name of its world.
+    /// Name of the simulated world.
     pub(crate) world: &'static str,
     pub(crate) unit: Unit,
-    /// Whether beams matching as wide as real ones. At an edge, such a beam measures one surface, the other, or a range in
-    /// between.
+    /// Whether beams are as wide as real ones. At an edge, a wide beam measures one surface, the other surface, or a
+    /// range between them.
     pub(crate) mixed: bool,
 }
 
@@ -34,27 +35,27 @@ const SCANS: u64 = 2_000;
 pub(crate) enum ExpectedAnswer {
     /// Foreground: the beam meets a person.
     Foreground,
-    /// Not foreground: the beam meets what was there from the start, what was behind an object that has been taken
-    /// away, or an object that was put down or moved more than [`OLD_AGE_S`] ago.
+    /// Not foreground: the beam meets a surface that existed from the start, a surface that became visible when an
+    /// object was removed, or an object that was put down or moved more than [`OLD_AGE_S`] ago.
     Other,
-    /// An object that was put down, moved or opened recently. It is foreground until it has been learned, and each
-    /// method takes a different time, so both answers matching right.
+    /// An object that was put down, moved or opened recently. It is foreground until the method has learned it. Each
+    /// method takes a different time to do so, so both answers are right.
     New,
     /// Not counted: the beam grazes a leg, or has no reading.
     Neither,
 }
 
-/// Age in seconds from which an object is background: twice the time that the paper's method takes at most.
+/// Age in seconds from which an object is background: twice the longest time that the paper's method takes.
 const OLD_AGE_S: f64 = 20.0;
 
-/// One scan with the correct answers.
+/// One scan with the correct answer and the target of each beam.
 pub(crate) struct LabeledScan {
     pub(crate) scan: Box<Scan>,
     pub(crate) expected: Vec<ExpectedAnswer>,
     pub(crate) targets: Vec<BeamTarget>,
 }
 
-/// Returns the scans of `scene` with random numbers from `seed`.
+/// Simulates `scene` with random numbers from `seed`, and returns its scans.
 pub(crate) fn play(scene: &Scene, seed: u64) -> Vec<LabeledScan> {
     let world: World = scene.world.parse().expect("a world that the program brings along");
     let mut layers = world.noise().expect("a world with noise");
@@ -83,13 +84,13 @@ fn expected_answer(scan: &Scan, i: usize, target: BeamTarget, end_ns: u64) -> Ex
     }
 }
 
-/// A method that separates foreground from background, scan by scan.
+/// Method that separates foreground from background, scan by scan.
 pub(crate) trait Detector {
-    /// Writes for each beam of `scan` whether it is foreground.
+    /// Processes the next scan, and writes to `foreground` for each beam whether it is foreground.
     fn update(&mut self, scan: &Scan, foreground: &mut [bool]);
 }
 
-/// A method of the hub.
+/// The hub's method.
 pub(crate) struct HubDetector {
     model: BackgroundModel,
     out: Box<Foreground>,
@@ -112,7 +113,7 @@ impl Detector for HubDetector {
     }
 }
 
-/// Beams by correct and given answer.
+/// Numbers of beams, counted by correct answer and by the answer of the method.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Score {
     scans: u64,
@@ -122,7 +123,7 @@ pub(crate) struct Score {
 }
 
 impl Score {
-    /// Runs `method` on `frames` in their order and counts its answers.
+    /// Runs `method` on `frames` in order, and counts its answers.
     pub(crate) fn of(method: &mut dyn Detector, frames: &[LabeledScan]) -> Score {
         let mut score = Score { scans: frames.len() as u64, ..Score::default() };
         let mut foreground = vec![false; frames.first().map_or(0, |frame| frame.expected.len())];
@@ -140,17 +141,17 @@ impl Score {
         score
     }
 
-    /// Returns the share of the foreground beams that were found.
+    /// Returns the fraction of the foreground beams that were found.
     pub(crate) fn recall(&self) -> f64 {
         self.found as f64 / (self.found + self.missed) as f64
     }
 
-    /// Returns the share of the beams reported as foreground that matching.
+    /// Returns the fraction of the beams reported as foreground that are foreground.
     pub(crate) fn precision(&self) -> f64 {
         self.found as f64 / (self.found + self.wrong) as f64
     }
 
-    /// Returns the number of beams per scan that were reported as foreground and matching not.
+    /// Returns the number of beams per scan that were reported as foreground but are not.
     pub(crate) fn wrong_per_scan(&self) -> f64 {
         self.wrong as f64 / self.scans as f64
     }
@@ -168,17 +169,18 @@ impl AddAssign for Score {
 /// Number of scans until a surface becomes background: the default for 361 beams.
 const LEARNING_SCANS: usize = 375;
 
-/// Beams of two boxes in the room of Fig. 8, over several runs: one is put down, the other is taken away.
+/// Answers for the beams of two boxes in the room of Fig. 8, over several runs. Box 1 is put down, and box 2 is taken
+/// away. N is [`LEARNING_SCANS`].
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Boxes {
-    /// Beams that meet box 1, N scans after it was put down. Counts those that matching still foreground.
+    /// Beams that meet box 1, N scans after it was put down, and how many of them are still foreground.
     new_box: Share,
-    /// Beams that met box 2, N and 2N scans after it was taken away. Counts those that would not be foreground if it
-    /// stood there again.
+    /// Beams that met box 2, N and 2N scans after it was taken away, and how many of them would not be foreground if it
+    /// were put back.
     removed_box: [Share; 2],
 }
 
-/// A number of beams, and how many of them have a property.
+/// Number of beams, and number of those that have a property.
 #[derive(Clone, Copy, Debug, Default)]
 struct Share {
     total: u64,
@@ -197,7 +199,7 @@ impl Share {
 }
 
 impl Boxes {
-    /// Adds a run of `frames`. `make` creates the method with an empty background.
+    /// Adds the answers for a run of `frames`. `make` creates the method with an empty background.
     pub(crate) fn add(&mut self, make: impl Fn() -> Box<dyn Detector>, frames: &[LabeledScan]) {
         let first = |is: fn(&BeamTarget) -> bool| {
             frames
@@ -217,7 +219,7 @@ impl Boxes {
             self.removed_box.iter_mut().zip([taken + LEARNING_SCANS, taken + 2 * LEARNING_SCANS])
         {
             let now = &frames[at];
-            // Beams at its edges may have measured what was behind it.
+            // Beams at the edges of the box may have measured the surface behind it.
             let inside = |i: &usize| now.targets[i - 1..=i + 1].iter().all(is_where_object_was_removed);
             let beams: Vec<usize> = (1..stood.targets.len() - 1).filter(inside).collect();
             let mut scan = now.scan.clone();
@@ -229,8 +231,8 @@ impl Boxes {
         }
     }
 
-    /// Returns the percentage of box 1 that is foreground N scans after it was put down, and those of box 2 that matching
-    /// background N and 2N scans after it was taken away.
+    /// Returns three percentages of beams: those of box 1 that are foreground N scans after it was put down, and those
+    /// of box 2 that are background N and 2N scans after it was taken away.
     pub(crate) fn percents(&self) -> [f64; 3] {
         [self.new_box.percent(), self.removed_box[0].percent(), self.removed_box[1].percent()]
     }
@@ -240,7 +242,7 @@ fn is_new(target: &BeamTarget) -> bool {
     matches!(target, BeamTarget::Box { .. })
 }
 
-/// Whether the beam meets the place from which an object was taken away.
+/// Returns whether the beam meets a surface from which an object was taken away.
 fn is_where_object_was_removed(target: &BeamTarget) -> bool {
     matches!(target, BeamTarget::Static { since_ns: 1.. })
 }
@@ -249,7 +251,7 @@ fn is_still(target: &BeamTarget) -> bool {
     matches!(target, BeamTarget::Static { since_ns: 0 })
 }
 
-/// Returns the answers of `method` for `scan` after it has seen `before`.
+/// Runs `method` on `before` and `scan`, and returns its answers for `scan`.
 fn answers(method: &mut dyn Detector, before: &[LabeledScan], scan: &Scan) -> Vec<bool> {
     let mut foreground = vec![false; scan.beams()];
     before.iter().for_each(|frame| method.update(&frame.scan, &mut foreground));

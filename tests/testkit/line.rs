@@ -1,4 +1,4 @@
-//! A serial line of which the test has the sensor's end: a pty that it writes to as fast as the hub reads.
+//! Serial line for tests: a pty. The test has the scanner's end, and can send bytes as fast as the hub reads them.
 
 use std::ffi::OsStr;
 use std::os::fd::OwnedFd;
@@ -14,11 +14,11 @@ use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
 
 use super::WAIT_TIMEOUT;
 
-/// The sensor's end.
+/// Scanner's end of the line.
 pub(crate) struct TestLine(OwnedFd);
 
 impl TestLine {
-    /// A raw pty whose other end is found at `place`.
+    /// Creates a raw pty, and a symlink at `path` to the hub's end of it.
     pub(crate) fn create(path: &Path) -> TestLine {
         let make = || -> Result<TestLine, Errno> {
             let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC)?;
@@ -42,14 +42,14 @@ impl TestLine {
         super::wait_until("somebody opens the line", || self.is_open());
     }
 
-    /// Whether the hub has the line open.
+    /// Returns whether the hub has the line open.
     pub(crate) fn is_open(&self) -> bool {
         let mut fds = [PollFd::new(&self.0, PollFlags::IN)];
         let now = Timespec { tv_sec: 0, tv_nsec: 0 };
         poll(&mut fds, Some(&now)).is_ok() && !fds[0].revents().contains(PollFlags::HUP)
     }
 
-    /// Waits for the first request of the hub, and returns its command.
+    /// Waits for a request of the hub, and returns its command byte.
     pub(crate) fn wait_for_request(&self) -> u8 {
         let mut buffer = Vec::new();
         super::wait_until("a request is said", || {
@@ -70,12 +70,12 @@ impl TestLine {
         received
     }
 
-    /// Sends the beginning of `bytes` that the line has room for.
+    /// Sends as many of `bytes` as the line has room for, from the first one on.
     pub(crate) fn offer(&self, bytes: &[u8]) {
         let _ = write(&self.0, bytes);
     }
 
-    /// Sends all of `bytes`, in the pace of whoever reads them; what the other end says meanwhile is not heard.
+    /// Sends all of `bytes`, as fast as the other end reads them. Discards bytes that the other end sends meanwhile.
     pub(crate) fn send(&self, mut bytes: &[u8]) {
         let give_up_at = Instant::now() + WAIT_TIMEOUT;
         while !bytes.is_empty() {
@@ -94,11 +94,12 @@ impl TestLine {
     }
 }
 
-/// Bytes of a request that asks for something, and which of them says what.
+/// Length in bytes of the LMS requests that the tests wait for.
 const REQUEST_LEN: usize = 7;
+/// Offset of the command byte in a request.
 const COMMAND_OFFSET: usize = 4;
 
-/// The host's end of the line at `place`, raw, at `rate`; reads and writes do not block.
+/// Opens the host's end of the line at `path`, raw and with the baud rate `rate`. Reads and writes do not block.
 pub(crate) fn open_line(path: &Path, rate: u32) -> std::fs::File {
     let make = || -> Result<OwnedFd, Errno> {
         let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;

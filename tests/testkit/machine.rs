@@ -1,4 +1,4 @@
-//! Another machine: a network namespace with one cable to the network of the test.
+//! Simulated second machine: a network namespace with one cable (a veth pair) to the network of the test.
 
 use std::ffi::OsStr;
 use std::io::Read;
@@ -10,16 +10,16 @@ use std::time::{Duration, Instant};
 
 use super::child::{Child, output, spawn, status};
 
-/// A machine that exists until this value is dropped. Its end of the cable is `eth0`.
+/// Machine that exists until this value is dropped. Its end of the cable is `eth0`.
 pub(crate) struct Machine {
-    /// Process in the namespace, which exists as long as this process.
+    /// Process that keeps the namespace alive.
     holder: Child,
     number: u8,
 }
 
 impl Machine {
-    /// Creates the machine with this number. The cable's network is 10.76.NUMBER.0/24. In it, the test has
-    /// address 1, and the machine has address 2.
+    /// Creates the machine with this number. The cable's network is 10.76.NUMBER.0/24. The test has address 1 in it,
+    /// and the machine has address 2.
     pub(crate) fn new(number: u8) -> Machine {
         let mut unshare = Command::new("unshare");
         unshare.args(["--net", "sh", "-c", "ip link set lo up && echo up && exec cat"]);
@@ -32,7 +32,7 @@ impl Machine {
         machine
     }
 
-    /// Creates the cable, which must not exist.
+    /// Creates the cable, which must not exist yet.
     fn plug(&self) {
         let (end, pid) = (self.test_interface(), self.holder.id());
         ip(&format!("link add {end} type veth peer name eth0 netns {pid}"));
@@ -64,12 +64,12 @@ impl Machine {
         Ipv4Addr::new(10, 76, self.number, 2)
     }
 
-    /// Returns the path of the file that lists its UDP sockets.
+    /// Returns the path of the file that lists the UDP sockets of the machine.
     pub(crate) fn udp_sockets(&self) -> PathBuf {
         PathBuf::from(format!("/proc/{}/net/udp", self.holder.id()))
     }
 
-    /// Returns the path of its network namespace.
+    /// Returns the path of the network namespace of the machine.
     pub(crate) fn network(&self) -> PathBuf {
         format!("/proc/{}/ns/net", self.holder.id()).into()
     }
@@ -85,7 +85,11 @@ impl Machine {
         }
     }
 
-    /// Runs a command on the machine.
+    /// Runs a command on the machine. Its words are separated by single spaces.
+    ///
+    /// # Panics
+    ///
+    /// Panics if the command fails.
     pub(crate) fn run_command(&self, command: &str) {
         assert!(self.try_run_command(command), "{command}");
     }
@@ -98,13 +102,17 @@ impl Machine {
     }
 }
 
-/// Runs `ip` with these arguments.
+/// Runs `ip` with these arguments, which are separated by single spaces.
+///
+/// # Panics
+///
+/// Panics if the command fails.
 pub(crate) fn ip(arguments: &str) {
     let done = status(Command::new("ip").args(arguments.split(' ')));
     assert!(done.is_ok_and(|status| status.success()), "ip {arguments}");
 }
 
-/// Returns a command that starts `program` in this network namespace.
+/// Returns a command that starts `program` in the network namespace with the path `network`.
 pub(crate) fn command_in(network: &Path, program: impl AsRef<OsStr>) -> Command {
     let mut command = Command::new("nsenter");
     command.arg(format!("--net={}", network.display())).arg(program);

@@ -1,6 +1,9 @@
-//! Where a test of the program takes place: a domain, a directory and children of its own, gone with the test however
-//! it ends. Everything is waited for by what it says, with a deadline far beyond what it takes.
-#![allow(dead_code, unused_imports)] // Every test file takes what it needs.
+//! Environment for tests of the program: each test has its own domain, directory and child processes, which are removed
+//! when the test ends, even if it fails.
+//!
+//! Tests do not sleep for a fixed time. They wait until a program prints a line or reaches a state, with a timeout that
+//! is much longer than needed.
+#![allow(dead_code, unused_imports)] // Each test binary uses only a part of this module.
 
 mod child;
 mod findings;
@@ -60,27 +63,27 @@ pub(crate) use telegrams::{
 pub(crate) use terminal::{TerminalSession, can_open_terminal, terminal};
 pub(crate) use tmux::Tmux;
 
-/// Limit of every wait. It only bounds a hang: no test depends on how long something takes.
+/// Timeout of every wait. It only ends a test that hangs: no test depends on how long something takes.
 pub(crate) const WAIT_TIMEOUT: Duration = Duration::from_secs(180);
 
-/// Flag of a simulator whose sensors take as long to answer as real ones do.
+/// Flag of `simulate` with which scanners take as long to reply as real ones.
 pub(crate) const REAL_REPLY_TIME: &str = "--fault=answer=0";
-/// Flag of one whose sensors answer after 5 ms.
+/// Flag of `simulate` with which scanners reply after 5 ms.
 const SHORT_REPLY_TIME: &str = "--fault=answer=0.005";
 
-/// Says where the program is, for a test that hides where it was built.
+/// Variable with the path of the program, for a test in which the directory where it was built is hidden.
 pub(crate) const PROGRAM_PATH_VARIABLE: &str = "SCANHUB_TEST_PROGRAM";
 
-/// A domain and a directory of one test.
+/// Domain and directory of one test. Dropping it removes the directory and the shared memory of the domain.
 pub(crate) struct TestEnv {
     directory: TempDir,
     domain: String,
-    /// Where its programs run, if not where the test does.
+    /// Network namespace in which its programs run; `None` for that of the test.
     network: Option<PathBuf>,
 }
 
 impl TestEnv {
-    /// Creates one with a name of its own.
+    /// Creates an environment with a unique domain.
     pub(crate) fn new() -> TestEnv {
         static NEXT: AtomicU32 = AtomicU32::new(0);
         let domain = format!("t{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
@@ -91,23 +94,24 @@ impl TestEnv {
         TestEnv { directory, domain, network: None }
     }
 
-    /// One whose programs run on another machine.
+    /// Creates an environment whose programs run on `machine`.
     pub(crate) fn on(machine: &Machine) -> TestEnv {
         let mut env = TestEnv::new();
         env.network = Some(machine.network());
         env
     }
 
-    /// Where its hub is, for consumers in the test itself.
+    /// Returns the domain of its hub, for subscribers in the test process.
     pub(crate) fn domain(&self) -> Domain {
         Domain::at(&self.domain, self.directory.path()).unwrap_or_else(|failure| panic!("{failure}"))
     }
 
+    /// Returns the path of the file `name` in the directory of the test.
     pub(crate) fn path(&self, name: &str) -> PathBuf {
         self.directory.path().join(name)
     }
 
-    /// `path` as an argument.
+    /// Returns the same path as [`TestEnv::path`], as an argument of a program.
     pub(crate) fn path_argument(&self, name: &str) -> String {
         self.path(name).display().to_string()
     }
@@ -118,7 +122,7 @@ impl TestEnv {
         self.path_argument(name)
     }
 
-    /// `--link NAME=PORT` for a port in this directory.
+    /// Returns the flag `--link=NAME=PORT` for a port called `name` in this directory.
     pub(crate) fn link(&self, name: &str) -> String {
         format!("--link={name}={}", self.path_argument(name))
     }
@@ -129,12 +133,12 @@ impl TestEnv {
         format!("{},family=lms", self.link(name))
     }
 
-    /// The program with `arguments`, in this domain.
+    /// Returns a command that runs the program with `arguments` in this domain.
     pub(crate) fn command<S: AsRef<str>>(&self, arguments: &[S]) -> Command {
         self.command_at(self.directory.path(), arguments)
     }
 
-    /// As [`TestEnv::command`], with the domain in another directory.
+    /// Returns the same command as [`TestEnv::command`], with the domain in the directory `root`.
     pub(crate) fn command_at<S: AsRef<str>>(&self, root: &Path, arguments: &[S]) -> Command {
         let program = std::env::var(PROGRAM_PATH_VARIABLE).unwrap_or_else(|_| scanhub().into());
         let mut command = match &self.network {
@@ -147,34 +151,35 @@ impl TestEnv {
         if !(words.next() == Some("web") && words.any(|word| word == "--replay")) {
             command.args(["--domain", &self.domain, "--root"]).arg(root);
         }
-        // Should the whole test be killed, its children end too.
+        // If the test itself is killed, its children exit too.
         command.env("SCANHUB_END_WITH_PARENT", "1").env("SCANHUB_LOG", "info").env_remove("SCANHUB_CONFIG");
-        // What is kept is kept here, not in the home of who runs the tests.
+        // The program saves its state in the directory of the test, not in the user's home directory.
         command.env("XDG_STATE_HOME", self.path("state")).env_remove("STATE_DIRECTORY");
         command
     }
 
-    /// Starts the program.
+    /// Starts the program with `arguments` in this domain.
     pub(crate) fn start<S: AsRef<str>>(&self, arguments: &[S]) -> Program {
         Program::start(self.command(arguments))
     }
 
-    /// Starts the program and lets it come to its end.
+    /// Runs the program with `arguments` until it exits.
     pub(crate) fn run<S: AsRef<str>>(&self, arguments: &[S]) -> Outcome {
         self.start(arguments).wait()
     }
 
-    /// A hub with these flags that is up.
+    /// Starts a hub with these flags, and waits until it is ready.
     pub(crate) fn hub<S: AsRef<str>>(&self, flags: &[S]) -> Program {
         self.start(&concat_args(&["run", "--json"], flags)).ready()
     }
 
-    /// What stands in for a service manager.
+    /// Creates a service manager with its socket in this directory.
     pub(crate) fn supervisor(&self) -> Supervisor {
         Supervisor::new(self.path_argument("notify"))
     }
 
-    /// Starts a hub with these flags as a service of `supervisor` and with what it keeps; it is not waited for.
+    /// Starts a hub with these flags as a service of `supervisor`, with the descriptor that `supervisor` has stored.
+    /// Does not wait until the hub is ready.
     pub(crate) fn service<S: AsRef<str>>(
         &self,
         supervisor: &mut Supervisor,
@@ -186,26 +191,29 @@ impl TestEnv {
         Program::start_with(command, stdin)
     }
 
-    /// A gateway with these flags that has begun; its number is kept in this directory.
+    /// Starts a gateway with these flags, and waits for its line of class `gateway`. The gateway saves its number in
+    /// this directory.
     pub(crate) fn gateway<S: AsRef<str>>(&self, flags: &[S]) -> Program {
         let mut gateway = self.start_gateway(flags);
         gateway.await_line("its begin", is_class("gateway"));
         gateway
     }
 
-    /// As [`TestEnv::gateway`], however it begins.
+    /// Starts a gateway like [`TestEnv::gateway`], but does not wait for a line.
     pub(crate) fn start_gateway<S: AsRef<str>>(&self, flags: &[S]) -> Program {
         self.start(&concat_args(&["gateway", "--json", "--no-system-config"], flags))
     }
 
-    /// A simulator with a port of each of these names that is up; its truth is in the file `truth`. Its sensors answer
-    /// soon unless `flags` have faults or [`REAL_REPLY_TIME`]: few tests are about that wait, and all would wait. A hub
-    /// that does not get a processor loses nothing: the sensors wait for it.
+    /// Starts a simulator with a port of each of these names, and waits until it is ready. It logs all telegrams that
+    /// it sends in the file `truth`.
+    ///
+    /// The scanners reply after 5 ms unless `flags` contain a fault or [`REAL_REPLY_TIME`], because few tests need the
+    /// real reply time. The lines are lossless: the simulator waits while the hub does not read.
     pub(crate) fn simulator<S: AsRef<str>>(&self, ports: &[&str], flags: &[S]) -> Program {
         self.simulator_on_real_lines(ports, &concat_args(flags, &["--lossless"]))
     }
 
-    /// Starts a simulator like [`TestEnv::simulator`], on lines that lose what a hub does not read.
+    /// Starts a simulator like [`TestEnv::simulator`], on lines that lose bytes which the hub does not read in time.
     pub(crate) fn simulator_on_real_lines<S: AsRef<str>>(&self, ports: &[&str], flags: &[S]) -> Program {
         let ports: Vec<_> = ports.iter().map(|port| format!("--port={}", self.path_argument(port))).collect();
         let truth = format!("--truth={}", self.path_argument("truth"));
@@ -218,15 +226,15 @@ impl TestEnv {
         self.start(&words).ready()
     }
 
-    /// Kills the simulator of one port. Its name is removed first: otherwise, the hub could open the name again after
-    /// another test's simulator has been given the same terminal.
+    /// Kills the simulator of one port. The symlink of the port is removed first. Otherwise, the hub could open it
+    /// again after the kernel has given the same terminal to the simulator of another test.
     pub(crate) fn kill_port_simulator(&self, simulator: Program, port: &str) {
         fs::remove_file(self.path(port)).unwrap_or_else(|error| panic!("{port}: {error}"));
         assert_eq!(simulator.end(KILL).exit_code, None);
     }
 
-    /// `echo --json` of these topics, attached to all of them, as soon as there are all of them: those of a remote
-    /// sensor come one by one, each with what is first heard of it.
+    /// Waits until all of `topics` exist, starts `echo --json` of them, and waits until it is attached to all of them.
+    /// The topics of a remote sensor are created one by one, each with its first datagram.
     pub(crate) fn echo(&self, topics: &[&str]) -> Program {
         let mut before = Vec::new();
         wait_until("all topics are there", || {
@@ -244,12 +252,13 @@ impl TestEnv {
         program
     }
 
-    /// How many consumers `topic` has.
+    /// Returns the number of subscribers of `topic`.
     pub(crate) fn subscribers(&self, topic: &str) -> u64 {
         self.all_subscribers(&[topic])[0].unwrap_or_else(|| panic!("there is no {topic}"))
     }
 
-    /// How many consumers each of `topics` has that is there, all of them at one time.
+    /// Returns the number of subscribers of each of `topics`, all from one run of `list`; `None` for a topic that does
+    /// not exist.
     fn all_subscribers(&self, topics: &[&str]) -> Vec<Option<u64>> {
         let outcome = self.run(&["list", "--json"]);
         let lines = outcome.lines();
@@ -262,8 +271,8 @@ impl TestEnv {
         topics.iter().map(subscribers).collect()
     }
 
-    /// Runs a verb that searches for a scanner, again while it finds none: on a busy machine, the simulated scanner may reply
-    /// too late.
+    /// Runs a verb that searches for a scanner, and repeats this while it finds none. On a busy machine, the simulated
+    /// scanner may reply too late.
     pub(crate) fn search(&self, arguments: &[&str]) -> Outcome {
         const NOT_FOUND: i32 = 3;
         let mut outcome = self.run(arguments);
@@ -277,14 +286,14 @@ impl TestEnv {
         outcome
     }
 
-    /// What `info` says of `sensor`.
+    /// Returns the line that `info` prints for `sensor`.
     pub(crate) fn info(&self, sensor: &str) -> Value {
         let outcome = self.run(&["info", sensor, "--json"]);
         let [line] = &outcome.lines()[..] else { panic!("not one line: {outcome}") };
         line.clone()
     }
 
-    /// Waits until `info` of `sensor` says what is `is_expected`, and returns it.
+    /// Runs `info` until its line for `sensor` is as `is_expected`, and returns the line.
     pub(crate) fn await_info(&self, sensor: &str, is_expected: impl Fn(&Value) -> bool) -> Value {
         let mut last = Value::Null;
         wait_until("the status", || {
@@ -294,7 +303,7 @@ impl TestEnv {
         last
     }
 
-    /// The telegrams that the simulator has sent so far, those of `port` in their order.
+    /// Returns the telegrams that the simulator has sent on `port` so far, in order.
     pub(crate) fn truth(&self, port: &str) -> Vec<SimulatedTelegram> {
         let port = self.path_argument(port);
         self.truth_lines("truth")
@@ -304,8 +313,8 @@ impl TestEnv {
             .collect()
     }
 
-    /// The simulator's last line about `port`: how many telegrams it sent, and how often it would have written the
-    /// sensor's EEPROM.
+    /// Returns two counters from the simulator's final line about `port`: the telegrams that it has sent, and the
+    /// writes to the scanner's EEPROM that it has simulated.
     pub(crate) fn simulator_totals(&self, port: &str) -> (u64, u64) {
         let port = self.path_argument(port);
         let lines = self.truth_lines("simulated");
@@ -322,7 +331,8 @@ impl TestEnv {
             .collect()
     }
 
-    /// Files of this domain's shared memory that are longer than what the library always leaves.
+    /// Returns the files in the shared memory of this domain that have more than 16 bytes. The library always leaves
+    /// shorter ones.
     pub(crate) fn leftover_files(&self) -> Vec<PathBuf> {
         shared_memory(&format!("sh_{}_", self.domain))
             .into_iter()
@@ -339,7 +349,7 @@ impl Drop for TestEnv {
     }
 }
 
-/// The program. Tests of other crates build it, once.
+/// Returns the path of the program. In tests of other crates, Cargo does not build it, so the first call does.
 fn scanhub() -> &'static str {
     static BUILT: OnceLock<String> = OnceLock::new();
     option_env!("CARGO_BIN_EXE_scanhub").unwrap_or_else(|| {
@@ -355,14 +365,14 @@ fn scanhub() -> &'static str {
     })
 }
 
-/// Files in shared memory whose names begin with `prefix`.
+/// Returns the files in `/dev/shm` whose names begin with `prefix`.
 pub(crate) fn shared_memory(prefix: &str) -> Vec<PathBuf> {
     let entries = fs::read_dir("/dev/shm").into_iter().flatten().flatten();
     let named = entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(prefix));
     named.map(|entry| entry.path()).collect()
 }
 
-/// Waits until `is_so`.
+/// Waits until `is_true` returns true, and panics with `description` after [`WAIT_TIMEOUT`].
 pub(crate) fn wait_until(description: &str, mut is_true: impl FnMut() -> bool) {
     let give_up_at = Instant::now() + WAIT_TIMEOUT;
     let mut pause = Duration::from_millis(1);
@@ -373,19 +383,19 @@ pub(crate) fn wait_until(description: &str, mut is_true: impl FnMut() -> bool) {
         }
         let elapsed = started.elapsed();
         assert!(Instant::now() < give_up_at, "waited in vain: {description}");
-        // A check that starts a program leaves the processors to others for most of the time.
+        // A check that starts a program may take at most a third of the time, so that other programs get the processor.
         thread::sleep(pause.max(2 * elapsed).min(Duration::from_millis(100)));
         pause = (2 * pause).min(Duration::from_millis(20));
     }
 }
 
-/// Waits until at least `span` has passed, for a program that must notice this by its own clock. No test fails if it
-/// takes longer.
+/// Waits for at least `span`, for a program that must notice by its own clock that this time has passed. A test must
+/// not fail if the wait takes longer.
 pub(crate) fn wait_at_least(span: Duration) {
     thread::sleep(span);
 }
 
-/// Whether anything is at `path`, be it a symlink to nothing.
+/// Returns whether `path` exists. A symlink with a missing target exists, too.
 pub(crate) fn exists_or_is_symlink(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok()
 }

@@ -1,4 +1,4 @@
-//! Runs a test again in a new network namespace, which has only the loopback.
+//! Tests that run again in a new network namespace, which has only the loopback interface.
 
 use std::process::Command;
 use std::sync::OnceLock;
@@ -6,10 +6,10 @@ use std::sync::OnceLock;
 use super::child::succeeds;
 use super::{own_program, rerun_test, single_test_args, skip};
 
-/// Set in the process that runs in the namespace.
+/// Variable that is set in the process that runs in the namespace.
 const NAMESPACE_VARIABLE: &str = "SCANHUB_TEST_NETWORK";
 
-/// Runs `test`, whose name is `name`, in a network namespace of its own. Skips it if the system does not allow that.
+/// Runs `test`, whose name is `name`, in a new network namespace. Skips it if the system does not allow that.
 pub(crate) fn in_a_network(name: &str, test: impl FnOnce()) {
     if std::env::var_os(NAMESPACE_VARIABLE).is_some() {
         return test();

@@ -1,4 +1,4 @@
-//! The program as a child of a test. Its output is read line by line.
+//! Program that runs as a child of a test. Its output is read line by line.
 
 use std::fmt;
 use std::io::{BufRead, BufReader, Read};
@@ -19,26 +19,26 @@ pub(crate) const KILL: Signal = Signal::KILL;
 pub(crate) const HUP: Signal = Signal::HUP;
 pub(crate) const USR1: Signal = Signal::USR1;
 
-/// A running program.
+/// Running program. Dropping it ends it.
 pub(crate) struct Program {
     name: String,
     process: Child,
-    /// Lines of its stdout. The last one may lack its line feed.
+    /// Lines of its stdout that have not been processed yet. The last one may lack its line feed.
     received_lines: Receiver<Vec<u8>>,
-    /// Bytes that were received from `received_lines`.
+    /// Bytes of all lines that were taken from `received_lines`.
     stdout: Vec<u8>,
     errors: Option<JoinHandle<String>>,
 }
 
-/// Result of a program that has ended.
+/// Result of a program that has exited.
 pub(crate) struct Outcome {
-    /// Its exit code; `None` if a signal ended it.
+    /// Exit code; `None` if a signal ended the program.
     pub(crate) exit_code: Option<i32>,
     /// All of its stdout.
     pub(crate) stdout: Vec<u8>,
     /// All of its stderr.
     pub(crate) stderr: String,
-    /// Command lines of the processes that it left. They have been ended.
+    /// Command lines of the descendants that were still running when it exited. They have been ended since.
     pub(crate) leftover_processes: Vec<String>,
     name: String,
 }
@@ -96,14 +96,14 @@ impl Program {
         self.state() == Some('T')
     }
 
-    /// Returns the state of its process in the kernel's letters.
+    /// Returns the state of its process as the letter of proc_pid_stat(5), or `None` if the process does not exist.
     fn state(&self) -> Option<char> {
         let status = std::fs::read_to_string(format!("/proc/{}/stat", self.pid())).ok()?;
         // The state follows the name in brackets.
         status.rsplit_once(')')?.1.trim_start().chars().next()
     }
 
-    /// Returns whether it ends without any output on stdout.
+    /// Waits for its next line or its end, and returns whether it ended without another line on stdout.
     pub(crate) fn ends_without_output(&mut self) -> bool {
         self.receive(Instant::now() + WAIT_TIMEOUT) == Err(RecvTimeoutError::Disconnected)
     }
@@ -119,13 +119,13 @@ impl Program {
         }
     }
 
-    /// Returns whether a line that was received so far is `is_expected`.
+    /// Returns whether one of the lines received so far is `is_expected`. Does not receive more lines.
     pub(crate) fn has_printed(&self, is_expected: impl Fn(&Value) -> bool) -> bool {
         let lines = self.stdout.split(|byte| *byte == b'\n');
         lines.filter_map(|line| serde_json::from_slice(line).ok()).any(|line| is_expected(&line))
     }
 
-    /// Receives the lines that it has written by now, and returns whether any line is `is_expected`.
+    /// Receives the lines that it has written by now, and returns whether one of all its lines is `is_expected`.
     pub(crate) fn prints(&mut self, is_expected: impl Fn(&Value) -> bool) -> bool {
         while self.receive(Instant::now()).is_ok() {}
         self.has_printed(is_expected)
@@ -166,7 +166,7 @@ impl Program {
         }
     }
 
-    /// Waits for the next line, and returns it, for programs that do not print JSON.
+    /// Waits for the next line and returns it, for programs that do not print JSON.
     pub(crate) fn next_text(&mut self) -> String {
         let begin = self.stdout.len();
         let give_up_at = Instant::now() + WAIT_TIMEOUT;
@@ -174,7 +174,7 @@ impl Program {
         String::from_utf8_lossy(&self.stdout[begin..]).trim_end().to_owned()
     }
 
-    /// Waits until it has written more than `len` bytes in all.
+    /// Waits until it has written more than `len` bytes to stdout in total.
     pub(crate) fn await_bytes(&mut self, len: usize) {
         let give_up_at = Instant::now() + WAIT_TIMEOUT;
         while self.stdout.len() <= len {
@@ -187,13 +187,13 @@ impl Program {
         self.process.signal(signal).unwrap_or_else(|error| panic!("{}: no {signal:?}: {error}", self.name));
     }
 
-    /// Sends a signal and waits for the end.
+    /// Sends a signal and waits until it exits.
     pub(crate) fn end(self, signal: Signal) -> Outcome {
         self.signal(signal);
         self.wait()
     }
 
-    /// Waits for the end.
+    /// Waits until it exits.
     pub(crate) fn wait(mut self) -> Outcome {
         let give_up_at = Instant::now() + WAIT_TIMEOUT;
         let why = loop {
@@ -229,7 +229,7 @@ impl Program {
     }
 
     fn fail_wait(&mut self, description: &str, why: RecvTimeoutError) -> ! {
-        // With its descendants, because any of them keeps stderr open.
+        // Ends its descendants, too, because any of them keeps stderr open.
         self.process.end();
         let errors = self.errors.take().and_then(|errors| errors.join().ok()).unwrap_or_default();
         let out = String::from_utf8_lossy(&self.stdout);
@@ -242,7 +242,8 @@ impl Program {
 }
 
 impl Drop for Program {
-    /// Ends it. If the test has failed, prints how the program was and what it reported, because that may be the reason.
+    /// Ends it. If the test has failed, prints the state of the program, its last lines and its stderr, because they
+    /// may show the reason.
     fn drop(&mut self) {
         let Some(errors) = self.errors.take().filter(|_| thread::panicking()) else { return };
         let status = self.process.try_wait().ok().flatten();

@@ -1,4 +1,4 @@
-//! A Python interpreter with the modules that a test needs.
+//! Python interpreter with the modules that a test needs.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -10,13 +10,13 @@ use super::{output, skip};
 #[path = "../../clients/python/sources.rs"]
 mod sources;
 
-/// Returns a command that starts a Python with `modules`: that of `SCANHUB_PYTHON`, or the one that `.ci/run`
-/// installs. If there is none, skips the test and returns `None`.
+/// Returns a command that starts a Python interpreter with `modules`: the one in the variable `SCANHUB_PYTHON`, or the
+/// one that `.ci/run` installs. If there is none, skips the test and returns `None`.
 pub(crate) fn python(modules: &str) -> Option<Command> {
     python_for("python-packages", modules)
 }
 
-/// Returns the same as [`python`], and skips the test for want of `need`.
+/// Returns the same as [`python`]. Skips the test because of `need` if there is no such interpreter.
 pub(crate) fn python_for(need: &str, modules: &str) -> Option<Command> {
     let made = Path::new(env!("CARGO_MANIFEST_DIR")).join("target/venv/bin/python");
     let python = std::env::var_os("SCANHUB_PYTHON").map_or(made, PathBuf::from);
@@ -30,8 +30,8 @@ pub(crate) fn python_for(need: &str, modules: &str) -> Option<Command> {
     Some(command)
 }
 
-/// Returns a command that starts a Python with the package `scanhub` that was built from these sources. If there is none,
-/// skips the test and returns `None`.
+/// Returns a command that starts a Python interpreter with the package `scanhub` that was built from these sources. If
+/// there is none, skips the test and returns `None`.
 pub(crate) fn client_python() -> Option<Command> {
     static CLIENT_PYTHON: OnceLock<(String, String)> = OnceLock::new();
     let command = python_for("python-packages", "numpy")?;
@@ -51,7 +51,7 @@ pub(crate) fn client_python() -> Option<Command> {
     Some(command)
 }
 
-/// Returns what a program prints in one line; empty if it fails.
+/// Returns the trimmed stdout of a program, or an empty string if it fails.
 fn text(mut command: Command) -> String {
     let output = output(command.stderr(Stdio::null())).ok().filter(|output| output.status.success());
     output.map(|output| String::from_utf8_lossy(&output.stdout).trim().to_owned()).unwrap_or_default()

@@ -1,4 +1,4 @@
-"""Reads recordings with other people's readers alone, and tells of them in JSON."""
+"""Reads recordings only with readers of other projects, and prints the content as JSON."""
 
 import json
 import math
@@ -10,7 +10,7 @@ from mcap.reader import NonSeekingReader
 
 
 def left(path):
-    """How many messages there are in a file without an end."""
+    """Counts the messages in a file that may lack its end."""
     count = 0
     with open(path, "rb") as file:
         try:
@@ -35,7 +35,7 @@ def header(header):
 
 
 def told(topic, log_time, message):
-    """What a message of ROS 2 says, whoever read it."""
+    """Returns the content of a ROS 2 message as a dictionary, the same for every reader."""
     line = {"topic": topic, "log_time": log_time}
     if topic == "/tf_static":
         line["transforms"] = [
@@ -60,14 +60,14 @@ def told(topic, log_time, message):
 
 
 def mcap_ros2(path):
-    """All messages, as mcap-ros2-support reads them."""
+    """Returns all messages, as mcap-ros2-support reads them."""
     from mcap_ros2.reader import read_ros2_messages
 
     return [told(found.channel.topic, found.log_time_ns, found.ros_msg) for found in read_ros2_messages(path)]
 
 
 def rosbags(path):
-    """All messages, as rosbags reads them."""
+    """Returns all messages, as rosbags reads them."""
     from pathlib import Path
 
     from rosbags.highlevel import AnyReader

@@ -1,4 +1,4 @@
-//! Who listens on a network, and knows nothing of who sends.
+//! Receiver for the datagrams of gateways in a network.
 
 use std::net::{Ipv4Addr, UdpSocket};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -11,7 +11,7 @@ use scanhub_schema::datagram::{Datagram, GROUP_PREFIX, PORT};
 
 use super::wait_until;
 
-/// Takes all datagrams that come to a port, from the four groups and from elsewhere.
+/// Thread that stores all datagrams that arrive at a port, both unicast and from the four multicast groups.
 pub(crate) struct Receiver {
     datagrams: Arc<Mutex<Vec<Vec<u8>>>>,
     stop: Arc<AtomicBool>,
@@ -19,12 +19,12 @@ pub(crate) struct Receiver {
 }
 
 impl Receiver {
-    /// On the interface with this address, at the port of the groups.
+    /// Receives on the interface with this address, at the default port of the groups.
     pub(crate) fn new(interface: Ipv4Addr) -> Receiver {
         Receiver::at(interface, PORT)
     }
 
-    /// At another port.
+    /// Receives on the interface with this address, at `port`.
     pub(crate) fn at(interface: Ipv4Addr, port: u16) -> Receiver {
         let socket = Receiver::socket(interface, port);
         let (datagrams, stop) = (Arc::new(Mutex::new(Vec::new())), Arc::new(AtomicBool::new(false)));
@@ -38,7 +38,7 @@ impl Receiver {
                     Err(_) if is_over => return,
                     Err(_) => {}
                 }
-                // What waits when it is told to stop is taken, what comes later is not waited for.
+                // Store the datagrams that have already arrived when the thread is stopped, but do not wait for more.
                 if !is_over && flag.load(Ordering::Relaxed) {
                     is_over = true;
                     socket.set_nonblocking(true).expect("need not wait");
@@ -48,25 +48,28 @@ impl Receiver {
         Receiver { datagrams, stop, thread: Some(thread) }
     }
 
-    /// Hears the four groups on this interface, at this port; waits 50 ms for a datagram.
+    /// Creates a socket at `port` that has joined the four groups on the interface with this address. Its read timeout
+    /// is 50 ms.
     pub(crate) fn socket(interface: Ipv4Addr, port: u16) -> UdpSocket {
         let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, port)).expect("the port is free");
         for last in 80..84 {
             let group = Ipv4Addr::new(GROUP_PREFIX[0], GROUP_PREFIX[1], GROUP_PREFIX[2], last);
             socket.join_multicast_v4(&group, &interface).expect("the group can be joined");
         }
-        // A test that is not scheduled for a second shall miss nothing; where that is not allowed it may.
+        // The buffer lets a test that is not scheduled for a second receive everything. A user without the privilege
+        // for this size may miss datagrams.
         let _ = set_socket_recv_buffer_size_force(&socket, 8 << 20);
         socket.set_read_timeout(Some(Duration::from_millis(50))).expect("waits that long");
         socket
     }
 
-    /// All that came so far, in its order.
+    /// Returns all datagrams received so far, in order.
     pub(crate) fn datagrams(&self) -> Vec<Vec<u8>> {
         self.datagrams.lock().expect("not poisoned").clone()
     }
 
-    /// Waits until so many datagrams were `is_expected` from now on; each is whole and says what its topic says.
+    /// Waits until `count` datagrams that are `is_expected` have arrived after this call. Panics if any new datagram is
+    /// invalid.
     pub(crate) fn wait_for_datagrams(&self, count: usize, is_expected: impl Fn(&Datagram<'_>) -> bool) {
         let before = self.datagrams().len();
         wait_until("datagrams", || {
@@ -75,7 +78,7 @@ impl Receiver {
         });
     }
 
-    /// Takes what still waits, and all of it.
+    /// Receives the datagrams that are still queued at the socket, stops, and returns all datagrams in order.
     pub(crate) fn finish(mut self) -> Vec<Vec<u8>> {
         self.stop_thread();
         self.datagrams()
@@ -94,7 +97,11 @@ impl Drop for Receiver {
     }
 }
 
-/// The datagram in `bytes`, which is in order.
+/// Decodes the datagram in `bytes` and checks its payload.
+///
+/// # Panics
+///
+/// Panics if the header or the payload is invalid.
 pub(crate) fn decode_datagram(bytes: &[u8]) -> Datagram<'_> {
     let datagram = Datagram::read(bytes).unwrap_or_else(|refusal| panic!("{refusal:?}: {bytes:02x?}"));
     datagram.check_payload().unwrap_or_else(|refusal| panic!("{refusal:?}: {bytes:02x?}"));

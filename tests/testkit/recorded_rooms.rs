@@ -1,5 +1,5 @@
-//! A recording of two sensors in simulated rooms with people: a hub in virtual time, whose topics are all written to a
-//! file.
+//! Recording of two sensors in simulated rooms with people. A hub in virtual time publishes the topics, and all samples
+//! are written to a file.
 
 #[path = "virtual_hub.rs"]
 pub(crate) mod virtual_hub;
@@ -21,7 +21,7 @@ use scanhub_sim::world::World;
 
 /// Names of the sensors, and their worlds.
 pub(crate) const SENSORS: [(&str, &str); 2] = [("front", "fig8"), ("rear", "demo")];
-/// Setting with which backgrounds are learned within the recording.
+/// Setting with which the background is learned after 40 scans, within the recording.
 pub(crate) const SHORT_LEARNING: &str = "background.scans=40";
 
 /// Returns the time from one scan to the next.
@@ -29,9 +29,9 @@ pub(crate) fn scan_period() -> Nanos {
     Variant::HALF.revolutions() * MIRROR_PERIOD
 }
 
-/// Drives a hub in `domain` in virtual time: a telegram with the mode, and `scans` scans of each sensor. Writes
-/// everything that it publishes to `file`, and passes it to `keep` with the index of the sensor. Before scan number
-/// `silence`, no byte of a sensor arrives for a second.
+/// Drives a hub in `domain` in virtual time. Each sensor sends a telegram with its mode and then `scans` scans. Writes
+/// each sample that the hub publishes to `file`, and passes it to `keep` with the index of the sensor. Before scan
+/// number `silence`, no byte of a sensor arrives for a second.
 pub(crate) fn record(
     domain: &Domain,
     file: &Path,
@@ -61,7 +61,7 @@ pub(crate) fn record(
                     lms::measured::encode(0, Unit::Mm, &look.words, 0x10)
                 };
                 links[number].read(at, telegram.bytes());
-                // What the hub publishes at the start does not belong to a telegram.
+                // Skip samples that the hub publishes at the start, because they do not belong to a telegram.
                 let is_of_one = |sample: &PublishedSample| scan > 0 || sample.header.hub_time_ns().is_some();
                 for sample in subscribers[number].take().into_iter().filter(is_of_one) {
                     let (name, _) = SENSORS[number];
@@ -80,7 +80,7 @@ pub(crate) fn record(
     writer.finish().expect("ends");
 }
 
-/// A sample as it was published.
+/// Sample as it was published, with its payload packed.
 #[derive(Debug, PartialEq)]
 pub(crate) struct PublishedSample {
     pub(crate) topic: Topic,
@@ -88,7 +88,7 @@ pub(crate) struct PublishedSample {
     pub(crate) payload: Vec<u8>,
 }
 
-/// Subscribers to everything that is computed from a sensor's telegrams.
+/// Subscribers to the telegrams of a sensor and to the topics that are computed from them.
 pub(crate) struct Subscribers {
     telegram: Subscriber<[u8]>,
     scan: Subscriber<Scan>,
@@ -99,6 +99,7 @@ pub(crate) struct Subscribers {
 }
 
 impl Subscribers {
+    /// Attaches to the topics of `sensor`.
     pub(crate) fn attach(node: &Node, sensor: &str) -> Subscribers {
         Subscribers {
             telegram: attach::<[u8]>(node, sensor),

@@ -1,4 +1,4 @@
-//! A recording as anybody reads it who knows its form from docs/recording.md.
+//! Recording that is read with the MCAP library and the format in docs/recording.md, without code of scanhub.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -8,14 +8,14 @@ use mcap::MessageStream;
 use mcap::read::{LinearReader, Options};
 use mcap::records::Record;
 
-/// What stands in a file.
+/// Content of a recording.
 pub(crate) struct Recording {
     pub(crate) messages: Vec<RecordedMessage>,
-    /// Metadata by name, in their order.
+    /// Names and entries of the metadata records, in file order.
     pub(crate) metadata: Vec<(String, BTreeMap<String, String>)>,
 }
 
-/// A message.
+/// Message of a recording.
 #[derive(Clone, Debug)]
 pub(crate) struct RecordedMessage {
     pub(crate) topic: String,
@@ -27,7 +27,8 @@ pub(crate) struct RecordedMessage {
 }
 
 impl Recording {
-    /// That of a recorder that came to its end: it has an index, and that is right.
+    /// Reads a recording that was finished normally. Asserts that it has an end and an index with the right number of
+    /// messages.
     pub(crate) fn read_complete(path: &Path) -> Recording {
         let bytes = file_bytes(path);
         let summary =
@@ -39,12 +40,12 @@ impl Recording {
         recording
     }
 
-    /// That of one that was killed, up to where it ends, which is behind a whole record.
+    /// Reads a recording whose recorder was killed, up to its last complete record.
     pub(crate) fn read_interrupted(path: &Path) -> Recording {
         Recording::read(&file_bytes(path), path)
     }
 
-    /// As of a file, of bytes that came from `from`.
+    /// Reads a recording from `bytes`. Panics name the path `from`.
     pub(crate) fn read(bytes: &[u8], from: &Path) -> Recording {
         let place = from.display();
         let options = Options::IgnoreEndMagic.into();
@@ -67,39 +68,39 @@ impl Recording {
         Recording { messages: recorded.collect(), metadata: notes.collect() }
     }
 
-    /// The messages of `topic`.
+    /// Returns the messages of `topic`, in file order.
     pub(crate) fn of(&self, topic: &str) -> Vec<&RecordedMessage> {
         self.messages.iter().filter(|message| message.topic == topic).collect()
     }
 
-    /// The metadata called `name`.
+    /// Returns the metadata records called `name`, in file order.
     pub(crate) fn metadata(&self, name: &str) -> Vec<&BTreeMap<String, String>> {
         self.metadata.iter().filter(|(other, _)| other == name).map(|(_, note)| note).collect()
     }
 }
 
 impl RecordedMessage {
-    /// The number of the telegram that it came from.
+    /// Returns the `seq` of the header: the number of the telegram from which the sample was computed.
     pub(crate) fn seq(&self) -> u64 {
         self.u64_at(0)
     }
 
-    /// Its number in its topic.
+    /// Returns the `topic_seq` of the header.
     pub(crate) fn topic_seq(&self) -> u64 {
         self.u64_at(8)
     }
 
-    /// The wall clock of what it is of.
+    /// Returns the wall-clock stamp of the header, in nanoseconds since 1970.
     pub(crate) fn wall_ns(&self) -> u64 {
         self.u64_at(32)
     }
 
-    /// The hub's life.
+    /// Returns the `boot` ID of the hub's run.
     pub(crate) fn boot(&self) -> u64 {
         self.u64_at(40)
     }
 
-    /// What stands behind the header.
+    /// Returns the payload, which follows the 64 bytes of the header.
     pub(crate) fn payload(&self) -> &[u8] {
         &self.data[64..]
     }
@@ -109,7 +110,11 @@ impl RecordedMessage {
     }
 }
 
-/// The numbers of `kept` in their topic, which have no gap.
+/// Returns the `topic_seq` of each of `messages`, which belong to one topic.
+///
+/// # Panics
+///
+/// Panics if there is a gap.
 pub(crate) fn contiguous_topic_seqs(messages: &[&RecordedMessage]) -> Vec<u64> {
     let numbers: Vec<u64> = messages.iter().map(|message| message.topic_seq()).collect();
     for pair in numbers.windows(2) {

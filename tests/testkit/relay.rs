@@ -1,6 +1,7 @@
-//! A relay between two machines: takes what one sends and passes it on to others, not all of it, not in its order, and some
-//! of it twice. It waits while the receive buffer of a machine fills up, so that the kernel drops nothing when a listener does
-//! not get a processor. Its log is therefore the truth about what the others received.
+//! Relay for datagrams between machines. It can drop, delay and duplicate datagrams at random.
+//!
+//! The relay waits while the receive buffer of a machine is filling up, so that the kernel drops nothing when a
+//! listener is not scheduled. The datagrams in `forwarded` are therefore exactly those that the machines receive.
 
 use std::net::{Ipv4Addr, UdpSocket};
 use std::path::{Path, PathBuf};
@@ -14,7 +15,8 @@ use scanhub_schema::datagram::{Announce, GROUP_PREFIX, PORT, group};
 
 use super::{Machine, Receiver, decode_datagram, wait_until};
 
-/// Passes on until it is dropped; nothing is lost, doubled or moved before it is told to.
+/// Thread that forwards datagrams until this value is dropped. It forwards each datagram once and in order until
+/// [`Relay::set_faulty`] is called.
 pub(crate) struct Relay {
     inner: Arc<Mutex<RelayState>>,
     stop: Arc<AtomicBool>,
@@ -22,27 +24,29 @@ pub(crate) struct Relay {
 }
 
 struct RelayState {
-    /// Sockets to the other machines, and the file in which each lists its UDP sockets.
+    /// Sockets to the other machines, each with the path of the file that lists the machine's UDP sockets.
     outputs: Vec<(UdpSocket, PathBuf)>,
-    /// All that came.
+    /// All datagrams that have arrived, in order.
     received: Vec<Vec<u8>>,
-    /// All that was passed on, in this order.
+    /// All datagrams that were forwarded, in the order in which they were sent.
     forwarded: Vec<Vec<u8>>,
-    /// What goes out later, and after how many more have come.
+    /// Datagrams that are forwarded later, each with the number of datagrams that must arrive before.
     delayed: Vec<(usize, Vec<u8>)>,
     rng: fastrand::Rng,
     is_faulty: bool,
 }
 
-/// In percent of what comes.
+/// Percentage of the arriving datagrams that are dropped.
 const LOSS_PERCENT: u8 = 5;
+/// Percentage of the arriving datagrams that are forwarded only later.
 const DELAY_PERCENT: u8 = 5;
+/// Percentage of the arriving datagrams that are forwarded at once and again later.
 const DUPLICATE_PERCENT: u8 = 2;
-/// What is moved goes out after so many others at most: some scans later.
+/// Maximum delay of a datagram, in datagrams that arrive meanwhile. It corresponds to several scans.
 const MAX_DELAY_DATAGRAMS: usize = 80;
 
 impl Relay {
-    /// From the machine `from`.
+    /// Starts a relay for the datagrams that the machine `from` sends. `seed` determines the faults.
     pub(crate) fn new(from: &Machine, seed: u64) -> Relay {
         let socket = Receiver::socket(from.test_address(), PORT);
         let inner = Arc::new(Mutex::new(RelayState {
@@ -66,7 +70,8 @@ impl Relay {
         Relay { inner, stop, thread: Some(thread) }
     }
 
-    /// Passes on to the machine `to` as well from now on; how many were passed on before. Listeners there have to be up.
+    /// Forwards to the machine `to` from now on, too, and returns the number of datagrams forwarded before. Listeners
+    /// on that machine must have started already.
     pub(crate) fn connect(&self, to: &Machine) -> usize {
         let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).expect("a port");
         set_ip_multicast_if(&socket, &to.test_address()).expect("the cable is plugged in");
@@ -76,7 +81,7 @@ impl Relay {
         inner.forwarded.len()
     }
 
-    /// Lets it lose, move and double, or not any more.
+    /// Turns loss, delay and duplication on or off. Turning them off forwards all delayed datagrams at once.
     pub(crate) fn set_faulty(&self, is_faulty: bool) {
         let mut inner = self.state();
         inner.is_faulty = is_faulty;
@@ -85,12 +90,12 @@ impl Relay {
         }
     }
 
-    /// What came so far.
+    /// Returns the datagrams that have arrived so far, in order.
     pub(crate) fn received(&self) -> Vec<Vec<u8>> {
         self.state().received.clone()
     }
 
-    /// What was passed on so far.
+    /// Returns the datagrams that were forwarded so far, in the order in which they were sent.
     pub(crate) fn forwarded(&self) -> Vec<Vec<u8>> {
         self.state().forwarded.clone()
     }
@@ -117,7 +122,7 @@ impl RelayState {
         }
     }
 
-    /// So many more have come.
+    /// Forwards the delayed datagrams that are due after `arrived` more datagrams have arrived.
     fn send_delayed(&mut self, arrived: usize) {
         for (left, datagram) in std::mem::take(&mut self.delayed) {
             match left.checked_sub(arrived).filter(|left| *left > 0) {
@@ -140,10 +145,12 @@ impl RelayState {
     }
 }
 
-/// Bytes that may wait at a socket before the relay waits: a fraction of the smallest receive buffer that a listener has.
+/// Number of bytes queued at a socket from which the relay waits. It is a fraction of the smallest receive buffer of a
+/// listener.
 const MAX_QUEUED_BYTES: u64 = 64 << 10;
 
-/// Bytes that wait at the fullest of the UDP sockets that the file `sockets` lists (proc(5), `rx_queue`).
+/// Returns the largest number of bytes that are queued at one of the UDP sockets in the file `sockets` (proc(5),
+/// `rx_queue`).
 fn max_queued_bytes(sockets: &Path) -> u64 {
     let text = std::fs::read_to_string(sockets).expect("the machine is there");
     let waiting = |line: &str| {

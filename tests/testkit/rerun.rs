@@ -1,5 +1,4 @@
-//! Runs a test again in a prepared process: in another network, with other mounts or as another user. Makes sure that
-//! it did run there.
+//! Tests that run again in a prepared process, such as one in another network, with other mounts or as another user.
 
 use std::io::{BufRead, BufReader};
 use std::process::{Command, Stdio};
@@ -11,16 +10,16 @@ pub(crate) fn own_program() -> std::path::PathBuf {
     std::env::current_exe().unwrap_or_else(|error| panic!("no path: {error}"))
 }
 
-/// Returns the arguments with which the test binary runs only the test `name` (with its modules).
+/// Returns the arguments with which the test binary runs only the test `name`, which includes the path of its modules.
 pub(crate) fn single_test_args(name: &str) -> [&str; 3] {
     ["--exact", name, "--nocapture"]
 }
 
-/// Runs `command`, which runs the test `name` and no other, and prints its output.
+/// Runs `command`, which runs only the test `name`, and prints its output.
 ///
 /// # Panics
 ///
-/// If the test fails there, or if there is no test of this name.
+/// Panics if the test fails there, or if no test has this name.
 pub(crate) fn rerun_test(name: &str, mut command: Command) {
     command.stdin(Stdio::null()).stdout(Stdio::piped());
     let mut child = spawn(command).unwrap_or_else(|error| panic!("{name} does not start again: {error}"));
@@ -34,12 +33,12 @@ pub(crate) fn rerun_test(name: &str, mut command: Command) {
     assert!(status.success() && passed, "{name} failed where it ran again: {status}");
 }
 
-/// Runs `test`, whose name is `name`, in a separate process: for a test that opens descriptors whose number counts, and
-/// that children of other tests would inherit.
+/// Runs `test`, whose name is `name`, in a separate process. This is for a test that depends on descriptor numbers or
+/// on the number of open descriptors, and for one whose descriptors children of other tests must not inherit.
 ///
 /// # Panics
 ///
-/// If the test fails.
+/// Panics if the test fails.
 pub(crate) fn in_own_process(name: &str, test: impl FnOnce()) {
     const CHILD_VARIABLE: &str = "SCANHUB_TEST_PROCESS";
     if std::env::var_os(CHILD_VARIABLE).is_some_and(|inside| inside == name) {

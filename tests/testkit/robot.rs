@@ -1,10 +1,10 @@
-//! A machine that carries sensors, with its hub and what its gateway sends.
+//! Robot for tests: a machine with simulated sensors, a hub and gateways.
 
 use super::{Machine, Program, TestEnv, is_class};
 
 const STREAM_FLAGS: [&str; 2] = ["--seed=61", "--baud=500000"];
 
-/// Machine number 1, on which a hub streams.
+/// Machine number 1 with a running hub.
 pub(crate) struct Robot {
     pub(crate) machine: Machine,
     pub(crate) env: TestEnv,
@@ -14,7 +14,7 @@ pub(crate) struct Robot {
 }
 
 impl Robot {
-    /// With these sensors.
+    /// Creates the machine, and starts a simulator and a hub for these sensors.
     pub(crate) fn new(sensors: &[&str]) -> Robot {
         let machine = Machine::new(1);
         let env = TestEnv::on(&machine);
@@ -25,17 +25,17 @@ impl Robot {
         robot
     }
 
-    /// Starts its hub.
+    /// Starts the hub, and waits until it is ready.
     pub(crate) fn start(&mut self) {
         self.hub = Some(self.env.hub(&self.links));
     }
 
-    /// Its hub, to be ended.
+    /// Returns the hub, so that the test can end it.
     pub(crate) fn take_hub(&mut self) -> Program {
         self.hub.take().expect("it was started")
     }
 
-    /// A gateway that has begun, on the cable.
+    /// Starts a gateway that sends on the machine's cable, and waits for its line of class `gateway`.
     pub(crate) fn gateway<S: AsRef<str>>(&self, flags: &[S]) -> Program {
         let flags = flags.iter().map(|flag| flag.as_ref().to_owned());
         let flags: Vec<String> = flags.chain(["--interface=eth0".to_owned()]).collect();

@@ -1,4 +1,4 @@
-//! What a gateway sends, said by a test: datagrams of one sensor with their numbers, on the loopback.
+//! Gateway that a test controls. It sends numbered datagrams of one sensor on the loopback interface.
 
 use std::net::{Ipv4Addr, UdpSocket};
 
@@ -12,23 +12,24 @@ use serde_json::Value;
 
 use super::{Program, wait_until};
 
-/// One sensor of one gateway.
+/// Gateway with one sensor. A test can change each field of its headers.
 pub(crate) struct TestGateway {
     socket: UdpSocket,
     pub(crate) hub: u64,
     pub(crate) epoch: u32,
     pub(crate) sensor: u8,
-    /// Of which family it is.
+    /// Family of the scanner.
     pub(crate) family: Family,
     pub(crate) name: String,
     pub(crate) boot: u64,
-    /// By topic's number: that of the next datagram.
+    /// Sequence number of the next datagram of each topic, indexed by the number of the topic.
     pub(crate) next: [u32; 256],
-    /// Of the telegram that is sent.
+    /// Counter of the current telegram.
     pub(crate) counter: u32,
-    /// Of what is sent, ns since 1970.
+    /// Stamp of the samples, in nanoseconds since 1970.
     pub(crate) stamp_ns: u64,
-    /// Samples by [`prove_delivery`](Sender::prove) so far. A listener counts them as `unnamed`.
+    /// Number of samples that [`prove_delivery`](TestGateway::prove_delivery) has sent. A listener counts them as
+    /// `unnamed`.
     pub(crate) delivery_proofs: u32,
 }
 
@@ -56,7 +57,7 @@ impl TestGateway {
         }
     }
 
-    /// The next datagram of `topic`.
+    /// Returns the next datagram of `topic`, without sending it.
     pub(crate) fn next_datagram(
         &mut self,
         topic: Topic,
@@ -67,14 +68,14 @@ impl TestGateway {
         self.seal(topic.number(), &mut buffer, len)
     }
 
-    /// The next telegram.
+    /// Returns the next datagram of topic `telegram`, without sending it.
     pub(crate) fn next_telegram(&mut self, bytes: &[u8]) -> Vec<u8> {
         let mut buffer = [0; MTU_ETHERNET];
         buffer[HEADER_LEN..HEADER_LEN + bytes.len()].copy_from_slice(bytes);
         self.seal(Topic::Telegram.number(), &mut buffer, bytes.len())
     }
 
-    /// Sends the next sample of `topic`, in parts if it is longer than a datagram.
+    /// Sends the next sample of `topic`, in parts if it does not fit into one datagram.
     pub(crate) fn send(&mut self, topic: Topic, payload: &(impl DatagramPayload + ?Sized)) {
         let mut packed = vec![0; 100_000];
         let len = payload.pack(&mut packed).expect("it fits");
@@ -93,13 +94,13 @@ impl TestGateway {
         self.send_to_group(group(topic), bytes);
     }
 
-    /// Announces `topics` with their next numbers.
+    /// Sends an announcement of `topics` with their next sequence numbers.
     pub(crate) fn announce(&mut self, topics: &[Topic]) {
         let datagram = self.announcement(topics);
         self.send_to_group(Announce::GROUP, &datagram);
     }
 
-    /// The announcement of `topics` with their next numbers.
+    /// Returns an announcement of `topics` with their next sequence numbers, stamped with the current time.
     pub(crate) fn announcement(&mut self, topics: &[Topic]) -> Vec<u8> {
         let mut announce = Announce::new(self.boot, &self.name, "LMS200;301063;V02.30");
         for &topic in topics {
@@ -114,8 +115,8 @@ impl TestGateway {
         datagram
     }
 
-    /// Sends a sample of another sensor of the same gateway. Such samples for a second prove that the gateway delivers, and
-    /// this sensor has sent nothing.
+    /// Sends a status of another sensor of the same gateway, which is never announced. A listener that receives such
+    /// samples for a second concludes that the network works and that the sensor under test is silent.
     pub(crate) fn prove_delivery(&mut self) {
         let status = usize::from(Topic::Status.number());
         let sensor = std::mem::replace(&mut self.sensor, UNANNOUNCED_SENSOR);
@@ -158,7 +159,7 @@ impl TestGateway {
         self.head(topic).seal(buffer, len).expect("it fits").to_vec()
     }
 
-    /// The header of the next sample of the topic with this number.
+    /// Returns the header of the next sample of the topic with this number, and increases the sequence number.
     fn head(&mut self, topic: u8) -> Head {
         let next = &mut self.next[usize::from(topic)];
         let head = Head {
@@ -180,7 +181,7 @@ impl TestGateway {
     }
 }
 
-/// The wall clock, ns since 1970.
+/// Returns the wall clock in nanoseconds since 1970.
 pub(crate) fn wall_ns() -> u64 {
     let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
     now.expect("after 1970").as_nanos() as u64

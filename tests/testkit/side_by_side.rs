@@ -1,13 +1,14 @@
-//! Calls of one function for several items, each in its own thread: for tests that mostly wait.
+//! Concurrent calls of one function for several items, for tests that mostly wait.
 
 use std::panic::resume_unwind;
 use std::thread;
 
-/// Calls `each` for every one of `items`, all at the same time, each in a separate thread.
+/// Calls `each` for all `items` at the same time, each call in its own thread, and returns the results in the order of
+/// the items.
 ///
 /// # Panics
 ///
-/// With the panic of the first call that panicked.
+/// Continues the panic of the first item whose call panicked.
 pub(crate) fn run_concurrently<T: Send, R: Send>(
     items: impl IntoIterator<Item = T>,
     each: impl Fn(T) -> R + Sync,

@@ -1,11 +1,12 @@
-//! What a machine may lack: the test that needs it is left out and says why, or fails where the machine is known to have it.
-//! `SCANHUB_REQUIRE` names what that is, with commas between; `.ci/run` sets it.
-#![allow(dead_code)] // The tests of a crate need a part of it.
+//! Requirements of tests that a machine may not meet. A test whose requirement is missing is skipped and prints the
+//! reason. It fails instead if the variable `SCANHUB_REQUIRE` lists the requirement. `.ci/run` sets this variable to
+//! names that are separated by commas.
+#![allow(dead_code)] // Each test binary uses only a part of it.
 
 use std::fmt::Display;
 use std::io::Write;
 
-/// What tests can do without, by its name in `SCANHUB_REQUIRE`.
+/// Names of all requirements, as in `SCANHUB_REQUIRE`.
 const NEEDS: [&str; 27] = [
     "bash",
     "cc",
@@ -15,58 +16,63 @@ const NEEDS: [&str; 27] = [
     "valgrind",
     // Version 3.9 or later.
     "python",
-    // What the pages and other people's readers of recordings import.
+    // Modules that programs on the pages import, and readers of recordings from other projects.
     "python-packages",
-    // Draws the picture of an example.
+    // An example draws a picture with it.
     "matplotlib",
-    // An event loop in place of that of asyncio.
+    // An event loop that replaces the one of asyncio.
     "uvloop",
-    // The vendor's driver of the RPLIDARs, of which there is no build for every Python.
+    // The vendor's driver for RPLIDARs, which is not built for every version of Python.
     "rplidar-driver",
     "setsid",
     "tmux",
     // A headless browser.
     "chromium",
     "tshark",
-    // The program `scanhub-bridge`, beside the program.
+    // The program `scanhub-bridge`, in the directory of the program `scanhub`.
     "bridge",
     "systemd-analyze",
-    // A user who may make a network namespace, and `ip`.
+    // Permission to create a network namespace, and the program `ip`.
     "netns",
-    // In it a pair of interfaces.
+    // A pair of interfaces in a network namespace.
     "veth",
-    // In it a queue that `tc` limits.
+    // A queue in a network namespace that `tc` limits.
     "tc",
-    // In it a version of IGMP that can be chosen.
+    // A version of IGMP that can be selected in a network namespace.
     "igmp",
     "ipv6",
-    // A user who may mount in a namespace of its own.
+    // Permission to mount file systems in a new namespace.
     "mounts",
-    // Root, who can be other users.
+    // The user root, who can start programs as other users.
     "root",
-    // A place of the program where other users can start it.
+    // A directory of the program in which other users can start it.
     "open-directory",
-    // A machine with x86-64 on which a process may trace its children.
+    // An x86-64 machine on which a process may trace its children.
     "ptrace",
-    // Of real sensors, in SCANHUB_DATA.
+    // Recordings of real scanners, in the directory SCANHUB_DATA.
     "recordings",
 ];
 
-/// Says that a test, or the rest of it, is left out for want of `need`, and why.
+/// Prints that the test, or the rest of it, is skipped because `need` is missing, and the reason `why`. The caller then
+/// returns from the test.
 ///
 /// # Panics
 ///
-/// If `need` is required here, or is none of those that are known.
+/// Panics if `SCANHUB_REQUIRE` contains `need`, or if `need` is not in [`NEEDS`].
 pub(crate) fn skip(need: &str, why: impl Display) {
     let required = std::env::var("SCANHUB_REQUIRE").unwrap_or_default();
     match verdict(&required, need, &why.to_string()) {
-        // Past what libtest keeps to itself.
+        // libtest captures `eprintln!`, but not this.
         Ok(line) => drop(writeln!(std::io::stderr(), "{line}")),
         Err(line) => panic!("{line}"),
     }
 }
 
-/// What is to be said where `need` lacks and `required` is required; as an error if the test may not be left out.
+/// Returns the message for a test whose requirement `need` is missing.
+///
+/// # Errors
+///
+/// Returns the message of a failure if the list `required` contains `need`, or if a name is not in [`NEEDS`].
 pub(crate) fn verdict(required: &str, need: &str, why: &str) -> Result<String, String> {
     let required: Vec<&str> = required.split(',').map(str::trim).filter(|name| !name.is_empty()).collect();
     if let Some(unknown) = required.iter().chain([&need]).find(|name| !NEEDS.contains(name)) {

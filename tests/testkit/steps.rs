@@ -1,10 +1,10 @@
-//! Single-steps a thread of another process by ptrace, and counts what it executes for each telegram: instructions and
-//! system calls. Used by `benches/path` and by `tests/it/path_cost.rs`.
+//! Tracer that single-steps a thread of another process by ptrace, and counts the instructions and system calls of each
+//! telegram. `benches/path` and `tests/it/path_cost.rs` use it.
 //!
-//! The cost of a telegram starts with the sleep after the previous telegram was published. It ends before the first sleep
-//! after a doorbell has rung for this one. Single steps take so long that the thread may fall behind. [`Stepper::run_past_telegram`]
-//! then runs it until telegrams arrive in time again.
-#![allow(dead_code)] // The test needs a part of it.
+//! The cost of a telegram starts with the sleep after the previous telegram was published. It ends before the first
+//! sleep after a doorbell has rung for this telegram. Single steps take so long that the thread may fall behind.
+//! [`Stepper::run_past_telegram`] then runs it until telegrams arrive in time again.
+#![allow(dead_code)] // The test uses only a part of it.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs;
@@ -17,46 +17,46 @@ use nix::sys::signal::Signal;
 use nix::sys::wait::{WaitPidFlag, WaitStatus, waitpid};
 use nix::unistd::Pid;
 
-/// A thread under ptrace, which only the thread that attached to it can step. It runs freely again after
+/// Thread under ptrace. Only the thread that attached to it can step it. It runs freely again after
 /// [`Stepper::detach`].
 pub(crate) struct Stepper {
     thread: Pid,
     /// Kind of the instruction at each address that was executed.
     kinds: HashMap<u64, InstructionKind>,
-    /// Functions that were called and have not returned, outermost first. Those called before the first step are not in
-    /// it.
+    /// Functions that were called since the first step and have not returned, outermost first.
     calls: Vec<Call>,
     /// Number of the system call that the thread has entered, after [`Stepper::run_past_telegram`].
     entered: Option<u64>,
-    /// Bytes that were read for the next telegram. Negative if some of an earlier one are missing.
+    /// Number of bytes that were read for the next telegram; negative if bytes of an earlier one are missing.
     read: i64,
-    /// Whether a doorbell has rung for it.
+    /// Whether a doorbell has rung for the next telegram.
     has_rung: bool,
     /// Number of the last system call.
     last_call: u64,
 }
 
-/// A function that was called.
+/// Function call that has not returned.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Call {
-    /// Address of its first instruction.
+    /// Address of the function's first instruction.
     pub(crate) function: u64,
-    /// Address of the return address on the stack.
+    /// Address on the stack at which the return address is stored.
     frame: u64,
 }
 
-/// Cost of a telegram, without repeated waits. At 9,600 baud a telegram arrives for 0.7 s, and the hub interrupts its wait
-/// every 50 ms to check for requests. At the usual 500,000 baud there is one wait.
+/// Cost of a telegram, without repeated waits. At 9,600 baud, a telegram takes 0.7 s to arrive, and the hub interrupts
+/// its wait every 50 ms to check for requests. At the usual 500,000 baud, the hub waits once.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct TelegramCost {
-    /// Number of telegrams that the cost is for: more than 1 if the next one was complete before the thread read.
+    /// Number of telegrams that the cost covers: more than 1 if the next telegram was complete before the thread read.
     pub(crate) telegrams: u64,
     pub(crate) instructions: u64,
     /// Number of system calls, by the number of the call.
     pub(crate) system_calls: BTreeMap<u64, u64>,
-    /// Steps of repeated waits, by their index: from one sleep to the next without another system call between them.
+    /// Ranges of step indexes that are repeated waits: from one sleep to the next without another system call in
+    /// between.
     pub(crate) repeats: Vec<Range<u64>>,
-    /// Time that the steps took after the last read, in which the thread falls behind.
+    /// Time that the steps after the last read took. The thread falls behind by this time.
     pub(crate) lag: Duration,
 }
 
@@ -67,24 +67,25 @@ enum InstructionKind {
     Other,
 }
 
-/// Bytes of a telegram of 361 beams.
+/// Length in bytes of a telegram with 361 beams.
 const TELEGRAM_LEN: i64 = 732;
 /// Result of a system call that has not returned, `-ENOSYS`.
 const NOT_RETURNED: u64 = -38_i64 as u64;
 
-/// Limit for a telegram. It only bounds a hang: on a busy machine, the steps of one take minutes.
+/// Timeout for a telegram. It only ends a test that hangs: on a busy machine, the steps of a telegram take minutes.
 const TELEGRAM_TIMEOUT: Duration = Duration::from_secs(900);
 
-/// Numbers of system calls on x86-64.
+/// Number of the system call `read` on x86-64.
 const READ_CALL: u64 = 0;
+/// Number of the system call `futex` on x86-64.
 const FUTEX_CALL: u64 = 202;
-/// Calls in which a thread of the hub sleeps: poll, nanosleep, clock_nanosleep, ppoll.
+/// Numbers of the system calls in which a thread of the hub sleeps: poll, nanosleep, clock_nanosleep, ppoll.
 const SLEEP_CALLS: [u64; 4] = [7, 35, 230, 271];
-/// FUTEX_WAKE and FUTEX_WAKE_BITSET.
+/// Operations of `futex` that ring a doorbell: FUTEX_WAKE and FUTEX_WAKE_BITSET.
 const WAKE_OPERATIONS: [u64; 2] = [1, 10];
 
 impl Stepper {
-    /// Stops the thread `thread`.
+    /// Attaches to the thread with the ID `thread`, and stops it.
     ///
     /// # Errors
     ///
@@ -107,8 +108,8 @@ impl Stepper {
         Ok(stepper)
     }
 
-    /// Runs the thread until it has published a telegram that it had to wait for, and sleeps again.
-    /// `interval` is the time between two telegrams.
+    /// Runs the thread until it has published a telegram for which it had to wait, and sleeps again. `interval` is the
+    /// time between two telegrams.
     pub(crate) fn run_past_telegram(&mut self, interval: Duration) -> Result<(), String> {
         loop {
             let started = Instant::now();
@@ -120,8 +121,8 @@ impl Stepper {
         }
     }
 
-    /// Runs the thread until the end of a telegram, and counts its system calls. This hardly delays the thread, unlike
-    /// steps, so that it makes the same calls as usual.
+    /// Runs the thread until the end of a telegram, and counts its system calls. Unlike single steps, this hardly
+    /// delays the thread, so it makes the same calls as without tracing.
     pub(crate) fn run_telegram(&mut self) -> Result<TelegramCost, String> {
         self.calls.clear();
         let (started, mut signal) = (Instant::now(), None);
@@ -151,8 +152,8 @@ impl Stepper {
         }
     }
 
-    /// Steps through one telegram. Calls `on_step` before each instruction with its address, the functions that it runs
-    /// in, outermost first, and the number of the system call that it makes, if any.
+    /// Single-steps through one telegram. Calls `on_step` before each instruction with its address, the functions in
+    /// which it runs, outermost first, and the number of the system call that it makes, if any.
     pub(crate) fn step_telegram(
         &mut self,
         mut on_step: impl FnMut(u64, &[Call], Option<u64>),
@@ -213,7 +214,7 @@ impl Stepper {
         }
     }
 
-    /// Ends the tracing. The thread continues.
+    /// Ends the tracing. The thread continues to run.
     pub(crate) fn detach(self) {
         // The process may have exited.
         let _ = ptrace::detach(self.thread, None);
@@ -237,12 +238,12 @@ impl Stepper {
     /// Handles the end of a system call.
     fn leave_call(&mut self, call: u64, result: u64) {
         if call == READ_CALL {
-            // A negative number is an error.
+            // A negative result is an error.
             self.read += (result as i64).max(0);
         }
     }
 
-    /// Executes one instruction. A signal is delivered first.
+    /// Executes one instruction. Delivers signals that arrive before it.
     fn step(&mut self) -> Result<(), String> {
         let mut signal = None;
         loop {
@@ -254,7 +255,7 @@ impl Stepper {
         }
     }
 
-    /// Waits until the thread stops. Returns the signal that stopped it, unless it is that of ptrace.
+    /// Waits until the thread stops. Returns the signal that stopped it, or `None` if ptrace did.
     fn wait(&mut self) -> Result<Option<Signal>, String> {
         match waitpid(self.thread, Some(WaitPidFlag::__WALL)).map_err(trace_error)? {
             WaitStatus::Stopped(_, Signal::SIGTRAP)
@@ -283,12 +284,13 @@ impl Stepper {
     }
 }
 
-/// Returns an error if no telegram has arrived since `begun` for far too long.
+/// Returns an error if more than [`TELEGRAM_TIMEOUT`] has passed since `started`.
 fn check_timeout(started: Instant) -> Result<(), String> {
     if started.elapsed() > TELEGRAM_TIMEOUT { Err("no telegram was published".to_owned()) } else { Ok(()) }
 }
 
-/// Returns the ID of the thread of the link in the hub `pid`, which has the name of its sensor.
+/// Returns the ID of the thread that runs the link of `sensor` in the hub with the process ID `pid`. The thread has the
+/// name of the sensor.
 ///
 /// # Errors
 ///

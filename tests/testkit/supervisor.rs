@@ -1,5 +1,5 @@
-//! A service manager as far as a hub speaks with one: it hears what the hub says, keeps the line that it is given, and
-//! hands it to the next hub as descriptor 3. For hubs with one link.
+//! Minimal service manager for hubs with one link. It receives the notifications of the hub, stores the descriptor of
+//! the line, and passes it to the next hub as descriptor 3.
 
 use std::io::IoSliceMut;
 use std::mem::MaybeUninit;
@@ -13,20 +13,20 @@ use rustix::net::{RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, recvmsg}
 
 use super::WAIT_TIMEOUT;
 
-/// Bound to a socket of its own.
+/// Service manager with its notification socket.
 pub(crate) struct Supervisor {
     socket: UnixDatagram,
     path: String,
-    /// What it keeps, with the name that it was given under.
+    /// Descriptor that a hub has stored, with its name.
     stored_descriptor: Option<(String, OwnedFd)>,
-    /// All that was said to it, a line each.
+    /// Lines of all notifications from all hubs.
     pub(crate) messages: Vec<String>,
-    /// Of that what nobody waited for yet, of the last hub: its threads speak in no order.
+    /// Lines of the last hub for which the test has not waited yet. Threads of the hub notify in no particular order.
     unread_messages: Vec<String>,
 }
 
 impl Supervisor {
-    /// One with its socket at `path`.
+    /// Creates a service manager with its socket at `path`.
     pub(crate) fn new(path: String) -> Supervisor {
         let socket = UnixDatagram::bind(&path).unwrap_or_else(|error| panic!("{path}: {error}"));
         Supervisor {
@@ -38,14 +38,15 @@ impl Supervisor {
         }
     }
 
-    /// The command that starts `hub` as its service, and the stdin by which that is handed what it keeps.
+    /// Returns the command that starts `hub` as a service, and the stdin that passes the stored descriptor to it.
+    /// `watchdog` is the watchdog interval.
     pub(crate) fn service(&mut self, hub: &Command, watchdog: Option<Duration>) -> (Command, Stdio) {
-        // What the one before said last is no word of this one.
+        // Messages that the previous hub sent last must not count as messages of the new one.
         self.socket.set_nonblocking(true).expect("a socket");
         while self.receive().is_ok() {}
         self.socket.set_nonblocking(false).expect("a socket");
         self.unread_messages.clear();
-        // The process id of a program that is not started yet only a shell can tell.
+        // Only a shell can set its own process ID before it starts the program in the same process.
         let mut command = Command::new("/bin/sh");
         command.args([
             "-c",
@@ -64,7 +65,7 @@ impl Supervisor {
         (command, line.into())
     }
 
-    /// Hears until the hub has said `is_expected`, as often as that was asked for.
+    /// Waits until the hub has sent the line `message`. Each call takes one such line.
     pub(crate) fn wait_for_message(&mut self, message: &str) {
         self.socket.set_read_timeout(Some(WAIT_TIMEOUT)).expect("a socket");
         while !self.unread_messages.iter().any(|line| line == message) {

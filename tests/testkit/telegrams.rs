@@ -1,4 +1,4 @@
-//! What a test knows of telegrams: the lines in which programs tell of them, and whether they are what was sent.
+//! Telegrams in JSON lines of programs, and checks that they are complete and in order.
 
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::telegram::Telegram;
@@ -11,13 +11,13 @@ use super::Outcome;
 /// Command of a measured-value telegram.
 pub(crate) const MEASURED_VALUES: u64 = 0xB0;
 
-/// A telegram as the simulator tells of it.
+/// Telegram as the simulator reports it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct SimulatedTelegram {
     pub(crate) is_reply: bool,
     pub(crate) hash: String,
     pub(crate) fault: Option<String>,
-    /// CLOCK_MONOTONIC after its last byte.
+    /// CLOCK_MONOTONIC after the last byte was sent, in nanoseconds.
     pub(crate) sent_ns: u64,
 }
 
@@ -32,18 +32,19 @@ impl SimulatedTelegram {
         }
     }
 
-    /// Whether it is a scan that reached the host as it was sent.
+    /// Returns whether it is a scan that the simulator sent without a fault.
     pub(crate) fn is_intact_scan(&self) -> bool {
         !self.is_reply && self.fault.is_none()
     }
 }
 
-/// Lower hex of SHA-256.
+/// Returns the SHA-256 hash of `bytes` in lower-case hexadecimal.
 pub(crate) fn hash(bytes: &[u8]) -> String {
     Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// The telegram in a line of class `telegram`; its checksum is right, and the line says the truth about it.
+/// Returns the bytes of the telegram in a line of class `telegram`. Asserts that its checksum is right and that the
+/// line has the right command and address.
 pub(crate) fn bytes_of(line: &Value) -> Vec<u8> {
     let text = line["data"].as_str().unwrap_or_else(|| panic!("no data: {line}"));
     let pair = |at| u8::from_str_radix(&text[at..at + 2], 16).unwrap_or_else(|_| panic!("no hex: {text}"));
@@ -54,18 +55,18 @@ pub(crate) fn bytes_of(line: &Value) -> Vec<u8> {
     bytes
 }
 
-/// A scan of 361 beams, of which no two with different seeds are equal, as a telegram.
+/// Returns a telegram with a scan of 361 beams. Scans with different seeds differ.
 pub(crate) fn scan(seed: u16) -> Vec<u8> {
     let words: [u16; 361] = std::array::from_fn(|beam| 500 + (seed * 7 + beam as u16 * 11) % 4000);
     lms::measured::encode(0, Unit::Mm, &words, 0x10).bytes().to_vec()
 }
 
-/// A number in a line.
+/// Returns the number with the key `key` in a line.
 pub(crate) fn number(line: &Value, key: &str) -> u64 {
     line[key].as_u64().unwrap_or_else(|| panic!("no number {key}: {line}"))
 }
 
-/// A numbering of lines, which has no gap.
+/// Returns the numbers with the key `key` in `lines`, and asserts that they have no gap.
 pub(crate) fn contiguous_numbers(lines: &[Value], key: &str) -> Vec<u64> {
     let numbers: Vec<u64> = lines.iter().map(|line| number(line, key)).collect();
     for pair in numbers.windows(2) {
@@ -74,11 +75,11 @@ pub(crate) fn contiguous_numbers(lines: &[Value], key: &str) -> Vec<u64> {
     numbers
 }
 
-/// Returns the numbers of the samples of `topic` that a client printed, after checking that they are in order and that the
-/// client reported every gap as missed. A client on a busy machine may miss some.
+/// Returns the `topic_seq` of the samples of `topic` that a client printed. Asserts that they are in order and that the
+/// client reported every gap as missed samples, because a client on a busy machine may miss some.
 pub(crate) fn checked_topic_seqs(outcome: &Outcome, topic: &str) -> Vec<u64> {
     let lines = outcome.of_class(topic);
-    // A client's own report of a silence has no number.
+    // The line with which a client reports a silence has no `topic_seq`.
     let mut numbers: Vec<u64> = lines.iter().filter_map(|line| line["topic_seq"].as_u64()).collect();
     numbers.dedup();
     assert!(numbers.is_sorted_by(|one, next| one < next), "out of order: {numbers:?}");
@@ -94,7 +95,7 @@ pub(crate) fn checked_topic_seqs(outcome: &Outcome, topic: &str) -> Vec<u64> {
     numbers
 }
 
-/// Whether a line is of `class`, as a condition to wait for.
+/// Returns a condition that is true for lines of `class`.
 pub(crate) fn is_class(class: &str) -> impl Fn(&Value) -> bool {
     move |line| line["class"] == class
 }

@@ -1,4 +1,4 @@
-//! A pseudoterminal whose other side the test has, and the content of its screen.
+//! Pseudoterminal in which a test runs a program, and the content of its screen.
 
 use std::ffi::OsStr;
 use std::fs::File;
@@ -20,7 +20,7 @@ use rustix::termios::{Termios, Winsize, tcgetattr, tcsetwinsize};
 use super::child::{Child, spawn, succeeds};
 use super::{WAIT_TIMEOUT, skip};
 
-/// Returns both sides of a new terminal: the test's, and the program's.
+/// Creates a terminal, and returns the test's side and the program's side.
 pub(crate) fn terminal() -> (File, OwnedFd) {
     let keys = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).unwrap();
     grantpt(&keys).unwrap();
@@ -31,7 +31,7 @@ pub(crate) fn terminal() -> (File, OwnedFd) {
     (keys.into(), screen)
 }
 
-/// Returns whether a test can start a program in a terminal of its own. Skips the test if not.
+/// Returns whether a test can start a program in a new terminal. Skips the test if not.
 pub(crate) fn can_open_terminal() -> bool {
     let can_sit = succeeds(Command::new("setsid").arg("true"));
     if !can_sit {
@@ -40,10 +40,10 @@ pub(crate) fn can_open_terminal() -> bool {
     can_sit
 }
 
-/// A program in a terminal of its own.
+/// Program in its own terminal.
 pub(crate) struct TerminalSession {
     process: Child,
-    /// The test's side of the terminal, until it is closed.
+    /// Test's side of the terminal, until the test closes it.
     input: Option<File>,
     terminal: OwnedFd,
     initial_modes: Termios,
@@ -55,13 +55,14 @@ pub(crate) struct TerminalSession {
 }
 
 impl TerminalSession {
-    /// Starts `command` in a terminal of `size`, columns and rows. It is the controlling terminal of a new session.
+    /// Starts `command` in a new terminal of `size` (columns and rows), which is the controlling terminal of a new
+    /// session.
     pub(crate) fn start(command: &Command, size: (u16, u16)) -> TerminalSession {
         TerminalSession::begin(command, size, &["-c"], None)
     }
 
-    /// Starts `command` like [`TerminalSession::start`], with `errors` as its stderr. Unless it is `has_controlling_terminal`, the terminal is not
-    /// the controlling one, so that closing it sends no signal.
+    /// Starts `command` like [`TerminalSession::start`], with `errors` as its stderr. If `has_controlling_terminal` is
+    /// false, the session has no controlling terminal, so that closing the terminal sends no signal.
     pub(crate) fn start_for_hang_up(
         command: &Command,
         size: (u16, u16),
@@ -125,7 +126,7 @@ impl TerminalSession {
         self.process.id()
     }
 
-    /// Returns all of its output.
+    /// Returns all output of the program so far.
     pub(crate) fn text(&self) -> String {
         String::from_utf8_lossy(&self.output.lock().unwrap()).into_owned()
     }
@@ -135,7 +136,7 @@ impl TerminalSession {
         screen_rows(&self.text(), self.size.0.into(), self.size.1.into())
     }
 
-    /// Waits until a row has `words`.
+    /// Waits until a row contains `words`.
     pub(crate) fn wait_for_text(&self, words: &str) {
         self.await_rows(words, |rows| rows.iter().any(|row| row.contains(words)));
     }
@@ -149,12 +150,12 @@ impl TerminalSession {
         }
     }
 
-    /// Types.
+    /// Types `keys`.
     pub(crate) fn press(&mut self, keys: &str) {
         self.input.as_mut().expect("it is open").write_all(keys.as_bytes()).unwrap();
     }
 
-    /// Sets the size of the terminal, columns and rows.
+    /// Sets the size of the terminal in columns and rows.
     pub(crate) fn resize(&mut self, size: (u16, u16)) {
         self.size = size;
         resize(&self.terminal, size);
@@ -165,7 +166,7 @@ impl TerminalSession {
         self.process.signal(signal).unwrap();
     }
 
-    /// Closes the terminal and waits for the end. Returns the exit code.
+    /// Closes the terminal and waits until the program exits. Returns its exit code.
     pub(crate) fn hang_up(mut self) -> Option<i32> {
         self.closed.store(true, Ordering::Relaxed);
         self.reader.take().map(JoinHandle::join).transpose().unwrap();
@@ -184,8 +185,8 @@ impl TerminalSession {
         }
     }
 
-    /// Waits for the end. Returns the exit code, the text below the picture, and whether the terminal has its old
-    /// modes.
+    /// Waits until the program exits. Returns the exit code, the text that it printed after it left the alternate
+    /// screen, and whether it used the alternate screen and restored the cursor and the modes of the terminal.
     pub(crate) fn finish(self) -> (Option<i32>, String, bool) {
         let (code, text, is_as_before) = self.finish_plain();
         let (picture, below) = text.rsplit_once("\x1b[?1049l").unwrap_or(("", &text));
@@ -194,7 +195,8 @@ impl TerminalSession {
         (code, below.replace("\x1b[?25h", ""), is_whole)
     }
 
-    /// Does the same for a program that draws no picture, and returns all of its output.
+    /// Waits until a program that does not use the alternate screen exits. Returns the exit code, all of its output,
+    /// and whether the terminal has its old modes.
     pub(crate) fn finish_plain(mut self) -> (Option<i32>, String, bool) {
         let code = self.wait();
         let give_up_at = Instant::now() + WAIT_TIMEOUT;
@@ -205,7 +207,7 @@ impl TerminalSession {
                 self.initial_modes.output_modes,
                 self.initial_modes.local_modes,
             );
-        // A mark behind the output shows that all of it has been read.
+        // A mark after the output shows that all of it has been read.
         let mark = "\u{1}end";
         File::from(self.terminal.try_clone().unwrap()).write_all(mark.as_bytes()).unwrap();
         while !self.text().ends_with(mark) {
@@ -225,7 +227,7 @@ fn resize(terminal: impl AsFd, (columns, rows): (u16, u16)) {
 }
 
 /// Returns the rows of a screen after `text` was written to it. Interprets cursor positions (CSI H), clearing (CSI J)
-/// and the alternate screen, and ignores colors.
+/// and switching to and from the alternate screen. Ignores all other sequences, such as colors.
 fn screen_rows(text: &str, columns: usize, rows: usize) -> Vec<String> {
     let mut screen = vec![vec![' '; columns]; rows];
     let (mut row, mut column) = (0, 0);

@@ -1,5 +1,5 @@
-//! A program in a window of tmux, to test its output on an independent implementation of a terminal. The tmux server
-//! has a socket in the directory of the test, and ends with the test.
+//! Window of tmux in which a test runs a program, to check its output with an independent implementation of a terminal.
+//! The tmux server has its socket in the directory of the test, and ends with the test.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
@@ -9,16 +9,16 @@ use std::time::{Duration, Instant};
 use super::child::{Child, output, spawn, succeeds};
 use super::{TestEnv, WAIT_TIMEOUT, skip};
 
-/// A session with one window.
+/// Session with one window.
 pub(crate) struct Tmux {
     socket: PathBuf,
-    /// The command that made the session. The server descends from it.
+    /// Command that created the session. The server descends from it.
     _session: Child,
 }
 
 impl Tmux {
-    /// Runs `line` in a shell in a window of `size`, columns and rows. If there is no tmux, skips the test and returns
-    /// `None`.
+    /// Runs `line` in a shell, in a window with this number of columns and rows. If tmux is not installed, skips the
+    /// test and returns `None`.
     pub(crate) fn start(env: &TestEnv, line: &str, (columns, rows): (u16, u16)) -> Option<Tmux> {
         if !succeeds(Command::new("tmux").arg("-V")) {
             skip("tmux", "there is none (Debian: apt-get install tmux)");
@@ -33,12 +33,12 @@ impl Tmux {
         Some(Tmux { socket, _session: session })
     }
 
-    /// Types keys, by their names in tmux.
+    /// Types `keys`, which are names of keys in tmux.
     pub(crate) fn press(&self, keys: &[&str]) {
         self.run_tmux(&[&["send-keys"], keys].concat());
     }
 
-    /// Sets the size of the window, columns and rows.
+    /// Sets the size of the window in columns and rows.
     pub(crate) fn resize(&self, (columns, rows): (u16, u16)) {
         self.run_tmux(&["resize-window", "-x", &columns.to_string(), "-y", &rows.to_string()]);
     }
@@ -81,7 +81,7 @@ impl Drop for Tmux {
 
 fn command(socket: &Path, words: &[&str]) -> Command {
     let mut command = Command::new("tmux");
-    // UTF-8, whatever the locale, and never the server of the person who runs the test.
+    // Use UTF-8 in every locale, and never the tmux server of the person who runs the test.
     command.arg("-u").arg("-S").arg(socket).args(words);
     command.env_remove("TMUX").env_remove("NO_COLOR");
     command

@@ -1,6 +1,7 @@
-//! The hub's links in virtual time: bytes are passed in with the time at which they arrived, and the topics are
-//! published in shared memory by the same code as those of a line. Many sensors can be driven faster than in real time.
-//! Bytes that a session sends are kept until a test takes them.
+//! Hub in virtual time, which can drive many sensors faster than in real time.
+//!
+//! The test passes bytes with the time at which they arrived. The same code as for a line publishes the topics in
+//! shared memory. Bytes that a session sends to its scanner are stored until the test takes them.
 
 use std::cell::{Cell, RefCell};
 use std::collections::VecDeque;
@@ -17,19 +18,20 @@ use scanhub_schema::{DoorbellWord, Failure, Nanos, WakeEvent};
 use scanhub_shm::{Domain, HubLock, resource_limits};
 use scanhub_shm::{Node, Payload, SharedMemory, WakeSender};
 
-/// A link in virtual time. Its port must be a recording in the configuration: it streams from the start, and its scans
-/// are read in the configured mode.
+/// Link in virtual time. Its port must be a recording in the configuration, so that the session expects a stream from
+/// the start and reads scans in the configured mode.
 pub(crate) struct VirtualLink<'a> {
     platform: &'a VirtualPlatform<'a>,
     link: LiveLink<'a, VirtualPlatform<'a>>,
     due_ns: Nanos,
 }
 
-/// Creates the links of `config` in `domain`, whatever their ports are, and passes them to `drive`. They end with it.
+/// Creates the links of `config` in `domain`, and passes them to `drive`. Their ports are not opened. The links end
+/// when `drive` returns.
 ///
 /// # Errors
 ///
-/// The domain is held by another hub, or its topics cannot be created.
+/// Returns an error if another hub holds the domain, or if its topics cannot be created.
 pub(crate) fn virtual_hub<T>(
     config: &Config,
     domain: &Domain,
@@ -52,8 +54,8 @@ pub(crate) fn virtual_hub<T>(
 }
 
 impl VirtualLink<'_> {
-    /// Passes `bytes` that arrived in one read at `now`: publishes what became due before, and what is complete with
-    /// them. Returns the number of telegrams.
+    /// Passes `bytes` that arrived in one read at `now`. The link first publishes everything that became due before,
+    /// and then the telegrams that are complete with these bytes. Returns the number of these telegrams.
     pub(crate) fn read(&mut self, now: Nanos, bytes: &[u8]) -> usize {
         self.platform.telegrams.set(0);
         while self.due_ns < now {
@@ -68,7 +70,7 @@ impl VirtualLink<'_> {
         self.platform.telegrams.get()
     }
 
-    /// Makes the port reject these `rates`.
+    /// Makes the port reject the baud rates `rates`.
     #[allow(dead_code, reason = "not every program that includes this module has such a port")]
     pub(crate) fn reject(&mut self, rates: &[u32]) {
         *self.platform.line.1.borrow_mut() = rates.to_vec();
@@ -86,19 +88,20 @@ impl VirtualLink<'_> {
     }
 }
 
-/// The platform of a link: a clock that stands still, bytes, and the shared memory of a domain.
+/// Platform of a link: a clock that only the test advances, bytes in memory, and the shared memory of a domain.
 struct VirtualPlatform<'a> {
     node: &'a Node,
     waker: WakeSender,
     now: Cell<Nanos>,
-    /// Nanoseconds from the clock to 1970.
+    /// Offset from the clock to nanoseconds since 1970.
     wall_ahead_ns: u64,
     line: Bytes,
-    /// Telegrams published since this was set to 0.
+    /// Number of telegrams published since it was set to 0.
     telegrams: Cell<usize>,
 }
 
-/// Bytes that have arrived and were not read, rates that the port rejects, and bytes that were written.
+/// Port in memory: bytes that have arrived and were not read yet, baud rates that the port rejects, and bytes that the
+/// session has written.
 #[derive(Clone, Default)]
 struct Bytes(Rc<RefCell<VecDeque<u8>>>, Rc<RefCell<Vec<u32>>>, Rc<RefCell<Vec<u8>>>);
 
@@ -163,7 +166,7 @@ impl Platform for VirtualPlatform<'_> {
     }
 
     fn has_listeners(&self) -> bool {
-        // It counts the events.
+        // `notify_event` counts the telegrams, so it must be called even without subscribers.
         true
     }
 
