@@ -46,7 +46,7 @@ fn hub_restores_baud_rate_changed_by_another_process() {
         (env, simulator, hub)
     });
     for (env, _simulator, hub) in hubs {
-        // The status has the message for ten seconds, which a busy machine may not look at in time; the log keeps it.
+        // The status keeps the message for only ten seconds, so a busy machine may miss it. The log has it, too.
         env.await_info("front", |info| info["state"] == "streaming" && info["last_error"] == "");
         let outcome = hub.end(TERM);
         let logs = |words: &str| outcome.stderr.contains(words);
@@ -62,7 +62,7 @@ fn a_program_that_is_known_to_change_ports_is_named() {
     let other = OtherProcess::open(&env.path("front"));
     let hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
-    // Any program of this name.
+    // Stands for any other program with this name.
     symlink(env!("CARGO_BIN_EXE_scanhub"), env.path("ModemManager")).expect("a link");
     let mut command = Command::new(env.path("ModemManager"));
     command

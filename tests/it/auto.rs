@@ -1,5 +1,4 @@
-//! A hub whose link has `family = "auto"`: it finds the scanner, reports it and remembers it, and reports if there is
-//! none.
+//! Hub whose link has `family = "auto"`: it finds the scanner, reports and saves it, and reports if there is none.
 
 use std::fs;
 
@@ -20,7 +19,7 @@ fn text<'a>(line: &'a Value, key: &str) -> &'a str {
     line[key].as_str().unwrap_or_default()
 }
 
-/// Text of the file that remembers the scanner.
+/// Returns the text of the file in which the hub saves the scanner that it found.
 fn saved_scanner(env: &TestEnv) -> String {
     let file = env.path("state/scanhub").join(env.domain().name()).join("front.scanner");
     fs::read_to_string(file).unwrap_or_default()
@@ -183,8 +182,8 @@ fn a_number_of_beams_outlives_a_restart_of_the_hub() {
         assert!(counts.iter().all(|count| *count == 666), "{counts:?}");
         hub.end(how);
     }
-    // Another model at the same rate: its first scans have the number that is remembered for the port. It changes once
-    // the other number is certain.
+    // Connect another model that uses the same rate. Its first scans have the saved number of beams. The hub changes
+    // the number once it is certain.
     env.kill_port_simulator(ld14p, "front");
     let _ld19 = env.simulator(&["front"], LD19_FLAGS);
     let hub = hub(&env);
@@ -202,7 +201,7 @@ fn a_number_of_beams_outlives_a_restart_of_the_hub() {
     assert_eq!(log.matches(message).count(), 1, "{log}");
 }
 
-/// A recording that begins during a stream has no reply with the scanner's type, but a status with it.
+/// A recording that starts during a stream contains no reply with the scanner's type, but a status with it.
 #[test]
 fn a_recording_has_the_model_of_its_scanner() {
     for (simulated, model) in [(LMS_FLAGS, "lms200"), (LD19_FLAGS, "ld19"), (A1_FLAGS, "a1")] {

@@ -1,4 +1,5 @@
-//! The background model of a running hub: shown, kept in a file, forgotten, taken back; and what is no model of it.
+//! `scanhub background` with a running hub: shows, saves, resets and loads the background model, and rejects files that
+//! do not fit.
 
 use std::fs;
 
@@ -6,7 +7,7 @@ use crate::testkit;
 use crate::testkit::{Outcome, Program, TERM, TestEnv, is_class, number};
 use serde_json::Value;
 
-/// What a hub is told so that a wall is learned within a second.
+/// Setting with which a wall is learned within a second.
 const QUICK_LEARNING: &str = "--set=background.scans=20";
 
 fn simulator(env: &TestEnv) -> Program {
@@ -17,18 +18,18 @@ fn run_background(env: &TestEnv, arguments: &[&str]) -> Outcome {
     env.run(&[&["background", "front", "--json"], arguments].concat())
 }
 
-/// The one line that `order` yields.
+/// Runs `background front` with these arguments, and returns the only line of its output.
 fn background_line(env: &TestEnv, arguments: &[&str]) -> Value {
     let outcome = run_background(env, arguments);
     let [line] = &outcome.lines()[..] else { panic!("not one line: {outcome}") };
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let mut line = line.clone();
-    // Meanwhile it is kept, and a file does not say so.
+    // The hub may save the model at any time, and a file does not contain the time of this.
     line.as_object_mut().map(|line| line.remove("kept_wall_ns"));
     line
 }
 
-/// The model once most of its beams are known, held as it is.
+/// Waits until most beams are known, freezes the model, and returns it.
 fn learn_background(env: &TestEnv) -> Value {
     testkit::wait_until("the background is learned", || {
         number(&background_line(env, &["show"]), "known_beams") > 300
@@ -74,20 +75,20 @@ fn saved_background_can_be_loaded_again() {
     let text = env.run(&["background", "front", "show"]);
     assert!(String::from_utf8_lossy(&text.stdout).starts_with("front: generation "), "{text}");
 
-    // Who follows the topic is told of each generation.
+    // Subscribers receive each generation.
     subscriber.await_line("the loaded model", |line| {
         line["class"] == "background" && line["generation"] == back["generation"]
     });
     drop(subscriber);
     assert_eq!(hub.end(TERM).exit_code, Some(0));
 
-    // A hub that begins with the file knows at once what that one had learned, before there is a scan that changes it.
+    // A hub that starts with the file has the learned background at once, before the first scan changes it.
     drop(simulator_of_first);
     let begin = format!("--set=link.front.background.start={file}");
     let _hub = env.hub(&[&env.link("front"), QUICK_LEARNING, &begin]);
     let at_start = background_line(&env, &["show"]);
     assert_eq!(at_start["ranges"], model["ranges"]);
-    // The sensor's scans fit it: they go on with it.
+    // The scans of the sensor fit the loaded background, so the hub continues with it.
     let _simulator = simulator(&env);
     let mut scans = env.echo(&["front/scan"]);
     scans.await_lines(5, "a scan", |line| line["class"] == "scan");

@@ -1,5 +1,5 @@
-//! A headless Chromium, driven over its debugging protocol: pages are opened, asked and photographed. Refuses to know what is
-//! on them.
+//! Headless Chromium that a test controls through its debugging protocol: it opens pages, evaluates scripts and takes
+//! screenshots.
 
 use std::fs;
 use std::io::{BufRead, BufReader, ErrorKind};
@@ -14,17 +14,17 @@ use tungstenite::{Message, WebSocket};
 
 use crate::testkit::{Child, WAIT_TIMEOUT, spawn};
 
-/// Where Debian has it, with a window and without.
+/// Names of the program in Debian, with and without support for windows.
 const BROWSER_NAMES: [&str; 2] = ["chromium", "chromium-headless-shell"];
 
-/// What a page is looked at with.
+/// Window and device with which a page is shown.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Appearance {
     pub(crate) width: u32,
     pub(crate) height: u32,
-    /// `light` or `dark`.
+    /// Color scheme: `light` or `dark`.
     pub(crate) scheme: &'static str,
-    /// A telephone: two dots a pixel, and fingers.
+    /// Whether the device is a phone, with two pixels per point and touch input.
     pub(crate) is_phone: bool,
 }
 
@@ -35,19 +35,19 @@ impl Appearance {
         Appearance { width: 390, height: 844, scheme: "dark", is_phone: true };
 }
 
-/// A browser with one page.
+/// Browser with one page.
 pub(crate) struct Browser {
     process: Child,
     socket: WebSocket<TcpStream>,
     session: String,
     calls: u64,
     profile: PathBuf,
-    /// What the page complained about.
+    /// Errors and warnings that the page wrote to the console.
     pub(crate) console_errors: Vec<String>,
 }
 
 impl Browser {
-    /// A new one that keeps its things in `profile`, looking as `look` says; nothing where there is none.
+    /// Starts a browser with its profile in the directory `profile`. Returns `None` if there is no Chromium.
     pub(crate) fn start(profile: PathBuf, appearance: Appearance) -> Option<Browser> {
         let spawned = BROWSER_NAMES.iter().find_map(|name| {
             let mut command = Command::new(name);
@@ -60,7 +60,7 @@ impl Browser {
         let mut lines = BufReader::new(process.stderr.take()?).lines().map_while(Result::ok);
         let address = lines.find_map(|line| Some(line.split_once("listening on ws://")?.1.to_owned()));
         let address = address.unwrap_or_else(|| panic!("the browser does not say where it listens"));
-        // What it says later is read, so that it does not wait for that.
+        // Read the rest of its stderr, so that a full pipe does not block the browser.
         thread::spawn(move || lines.for_each(drop));
         let (host, _) = address.split_once('/').expect("a path");
         let stream = TcpStream::connect(host).expect("its own port");
@@ -85,14 +85,14 @@ impl Browser {
         Some(browser)
     }
 
-    /// Changes the size of the window, the color scheme and the kind of device.
+    /// Sets the size of the window, the color scheme and the kind of device.
     pub(crate) fn set_appearance(&mut self, appearance: Appearance) {
         let Appearance { width, height, scheme, is_phone } = appearance;
         let ratio = if is_phone { 2 } else { 1 };
         let screen =
             json!({ "width": width, "height": height, "deviceScaleFactor": ratio, "mobile": is_phone });
         self.call("Emulation.setDeviceMetricsOverride", screen);
-        // Without motion, the view is in its final place with the next frame, however long a frame takes.
+        // With reduced motion, the view is in its final position after the next frame, however long that takes.
         let features = json!([
             { "name": "prefers-color-scheme", "value": scheme },
             { "name": "prefers-reduced-motion", "value": "reduce" },
@@ -104,7 +104,7 @@ impl Browser {
         self.call("Page.navigate", json!({ "url": url }));
     }
 
-    /// What `script` is on the page.
+    /// Evaluates `script` on the page, and returns its value.
     pub(crate) fn ask(&mut self, script: &str) -> Value {
         let parameters = json!({ "expression": script, "returnByValue": true, "awaitPromise": true });
         let response = self.call("Runtime.evaluate", parameters);
@@ -112,7 +112,7 @@ impl Browser {
         response["result"]["value"].clone()
     }
 
-    /// Waits until `script` is true on the page.
+    /// Waits until `script` evaluates to true on the page.
     pub(crate) fn await_true(&mut self, script: &str) {
         let give_up_at = Instant::now() + WAIT_TIMEOUT;
         while self.ask(script) != Value::Bool(true) {
@@ -122,9 +122,9 @@ impl Browser {
         }
     }
 
-    /// Types `key`, as `KeyboardEvent.key` has it.
+    /// Presses and releases `key`, which is a value of `KeyboardEvent.key`.
     pub(crate) fn press(&mut self, key: &str) {
-        // What the browser itself does with a key goes by its number and its text.
+        // The browser's own reaction to a key depends on its key code and its text.
         let (number, text) = match key {
             "Tab" => (9, ""),
             "Escape" => (27, ""),
@@ -141,7 +141,7 @@ impl Browser {
         }
     }
 
-    /// Moves the mouse, with its button held if `is_held`.
+    /// Sends a mouse event of this `kind` at a position, with the left button pressed if `is_held`.
     pub(crate) fn mouse(&mut self, kind: &str, (x, y): (f64, f64), is_held: bool) {
         let button = if is_held { "left" } else { "none" };
         let buttons = u8::from(is_held);
@@ -150,14 +150,14 @@ impl Browser {
         self.call("Input.dispatchMouseEvent", moved);
     }
 
-    /// Writes what is to be seen to a PNG file.
+    /// Writes a screenshot of the page to a PNG file.
     pub(crate) fn save_screenshot(&mut self, path: &Path) {
         let response = self.call("Page.captureScreenshot", json!({ "format": "png" }));
         let text = response["data"].as_str().expect("a picture");
         fs::write(path, from_base64(text)).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
     }
 
-    /// What the browser answers to a call of its protocol.
+    /// Calls a method of the debugging protocol, and returns the result.
     pub(crate) fn call(&mut self, method: &str, params: Value) -> Value {
         self.calls += 1;
         let mut call = json!({ "id": self.calls, "method": method, "params": params });
@@ -167,7 +167,8 @@ impl Browser {
         self.socket.send(Message::text(call.to_string())).expect("the browser lives");
         loop {
             let response = match self.socket.read() {
-                // The test's process was stopped and continued, for example by a virtual machine that was suspended.
+                // The process of the test was stopped and continued, for example because its virtual machine was
+                // suspended.
                 Err(tungstenite::Error::Io(error)) if error.kind() == ErrorKind::Interrupted => continue,
                 told => told.unwrap_or_else(|error| panic!("{method}: {error}")),
             };
@@ -194,7 +195,7 @@ impl Drop for Browser {
     }
 }
 
-/// RFC 4648, without line feeds.
+/// Decodes base64 (RFC 4648) without line feeds.
 fn from_base64(text: &str) -> Vec<u8> {
     let value = |sign: u8| match sign {
         b'A'..=b'Z' => sign - b'A',

@@ -1,4 +1,5 @@
-//! No process of a test stays: the testkit ends each child with its descendants, and the processes of interrupted runs.
+//! Cleanup of child processes: the testkit ends each child with its descendants, and the processes of interrupted test
+//! runs.
 
 use std::fs;
 use std::io::{BufRead, BufReader};
@@ -14,18 +15,18 @@ use crate::testkit::{
     status, wait_until, write_program,
 };
 
-/// Variable that the testkit sets: the test binary that a process descends from.
+/// Variable that the testkit sets. It names the test binary from which a process descends.
 const RUN_VARIABLE: &str = "SCANHUB_TEST_RUN";
-/// Set in the process that acts as the next run of the tests.
+/// Variable that is set in the process that acts as the next test run.
 const NEXT_RUN_VARIABLE: &str = "SCANHUB_TEST_NEXT_RUN";
 
-/// Whether a process runs; a zombie does not.
+/// Returns whether a process is running. A zombie is not.
 fn is_running(pid: &str) -> bool {
     let stat = fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
     stat.rsplit_once(')').is_some_and(|(_, rest)| !rest.trim_start().starts_with(['Z', 'X']))
 }
 
-/// Starts a shell with `script`, and returns its first line.
+/// Starts a shell with `script`, and returns the shell and its first line of output.
 fn shell(script: &str) -> (Child, String) {
     let mut shell = Command::new("sh");
     shell.args(["-c", script]).stdin(Stdio::null()).stdout(Stdio::piped());
@@ -38,17 +39,17 @@ fn shell(script: &str) -> (Child, String) {
 
 #[test]
 fn dropping_a_script_ends_its_children() {
-    // As the shell script that starts Debian's browser: it does not `exec`.
+    // Debian's browser is a shell script like this one, which does not `exec`.
     let (script, child) = shell("sleep 1000 & echo $!; wait");
     assert!(is_running(&child));
     drop(script);
     assert!(!is_running(&child), "the child of the script still runs");
-    // The script has ended before its child.
+    // The script exits before its child.
     let (mut script, child) = shell("sleep 1000 & echo $!");
     assert!(script.wait().is_ok_and(|status| status.success()) && is_running(&child));
     drop(script);
     assert!(!is_running(&child), "the child of an ended script still runs");
-    // A program that ignores TERM, as does its child.
+    // The program and its child ignore TERM.
     let (script, child) = shell("trap '' TERM; sleep 1000 & echo $!; wait");
     drop(script);
     assert!(!is_running(&child), "TERM was ignored");
@@ -79,7 +80,7 @@ fn outcome_names_leftover_processes() {
     );
 }
 
-/// Starts a process that looks like a descendant of the test binary in `run`.
+/// Starts a process that looks like a descendant of the test binary described by `run`.
 fn start_with_run(run: &str) -> Child {
     let (child, _) = shell(&format!("echo; export {RUN_VARIABLE}='{run}'; exec sleep 1000"));
     wait_until("it sleeps", || child.living_command_lines() == ["sleep 1000"]);
@@ -98,10 +99,10 @@ fn ends_processes_of_interrupted_runs() {
     ended.wait().expect("it ends");
     let start = run.rsplit(':').next().expect("the start time of this process");
     let (target, ended_pid) = (env.path_argument("target"), ended.id());
-    // The second: another process has the ID of the test binary by now.
+    // In the second case, another process has the ID of the test binary by now.
     let left =
         [format!("{target}:{ended_pid}:5"), format!("{target}:{own}:5")].map(|run| start_with_run(&run));
-    // The test binary runs; it started too late; it is in another directory; it is not named.
+    // The test binary still runs, started too late, is in another directory, or is not named.
     let kept = [
         format!("{target}:{own}:{start}"),
         format!("{target}:{ended_pid}:6"),
@@ -138,7 +139,7 @@ fn written_programs_start_at_once() {
     let env = TestEnv::new();
     let is_over = AtomicBool::new(false);
     thread::scope(|scope| {
-        // Their forks would inherit a file that this process has open for writing.
+        // Threads that start processes: each child would inherit a file that this process has open for writing.
         for _ in 0..4 {
             scope.spawn(|| {
                 while !is_over.load(Ordering::Relaxed) {

@@ -1,5 +1,5 @@
-//! The library for C and C++ from outside: its header against `schema`, programs in C and C++ built as its users build them
-//! and run against a hub. Skips, saying so, where there is no C compiler.
+//! Library for C and C++, tested from outside: its header is compared with `schema`, and programs in C and C++ are
+//! built as users build them and run against a hub. These tests are skipped if there is no C compiler.
 
 pub(crate) mod installed;
 mod layout;
@@ -19,7 +19,7 @@ fn expect_success(output: &Output) -> String {
     text(&output.stdout)
 }
 
-/// A program that finds the hub of this environment.
+/// Starts a program that finds the hub of this environment.
 fn program(env: &TestEnv, program: &Path, words: &[&str]) -> Program {
     let mut command = Command::new(program);
     command.args(words).env("SCANHUB_DOMAIN", env.domain().name()).env_remove("XDG_RUNTIME_DIR");
@@ -27,13 +27,13 @@ fn program(env: &TestEnv, program: &Path, words: &[&str]) -> Program {
     Program::start(command)
 }
 
-/// Bytes that a line has as hex.
+/// Returns the bytes that the key `data` of a line has as hexadecimal digits.
 fn data(line: &Value) -> Vec<u8> {
     let text = line["data"].as_str().unwrap_or_else(|| panic!("no data: {line}"));
     (0..text.len()).step_by(2).map(|at| u8::from_str_radix(&text[at..at + 2], 16).expect("hex")).collect()
 }
 
-/// In every standard that people use.
+/// Compiles the header with every language standard that users have.
 #[test]
 fn the_header_has_the_layout_of_schema() {
     if !is_installed("cc") {
@@ -59,7 +59,7 @@ fn the_header_has_the_layout_of_schema() {
     }
 }
 
-/// A program may read datagrams and topics.
+/// A program may use the headers for datagrams and for topics together.
 #[test]
 fn both_headers_go_into_one_program() {
     if !is_installed("cc") {
@@ -100,7 +100,7 @@ fn c_header_computes_the_same_values_as_schema() {
             let (range_m, angle) = (number(), number());
             assert_eq!(range_m.is_nan(), scan.distance_m(i).is_none(), "{line}");
             assert!(range_m.is_nan() || Some(range_m) == scan.distance_m(i), "{line}");
-            // A compiler may round once where another rounds twice.
+            // Compilers differ in when they round intermediate results.
             assert!((angle - scan.angle(i)).abs() <= 1e-12, "{line}: {}", scan.angle(i));
             let rest: Vec<_> = words.collect();
             let code = scan.code(i).map_or("reading", Code::name).to_owned();
@@ -112,7 +112,8 @@ fn c_header_computes_the_same_values_as_schema() {
     }
 }
 
-/// Everybody who waits in another way gets the same, where the hub wrote it.
+/// Programs that wait by `doorbell`, `poll` or `event` or that spin receive the same samples, in the memory where the
+/// hub wrote them.
 #[test]
 fn a_program_in_c_has_every_sample_in_shared_memory() {
     let Some(installed) = InstalledLibrary::installed() else { return };
@@ -150,7 +151,7 @@ fn a_program_in_c_outlives_its_hub() {
     let Some(installed) = InstalledLibrary::installed() else { return };
     let env = TestEnv::new();
     let follow = installed.compile(&env, &source("follow.c"), &[]);
-    // There is no hub yet.
+    // The hub has not started yet.
     let mut subscribers =
         ["doorbell", "poll"].map(|wait_method| program(&env, &follow, &["front", "2", wait_method, "0"]));
     for subscriber in &mut subscribers {
@@ -183,7 +184,8 @@ fn a_program_in_c_outlives_its_hub() {
     drop(simulator);
 }
 
-/// Returns whether a line has this reason, SCANHUB_SILENCE_.. of the header, and `text` is a part of its text.
+/// Returns a condition for lines that have this reason (SCANHUB_SILENCE_.. of the header) and a text that contains
+/// `text`.
 fn has_reason(reason: u64, text: &str) -> impl Fn(&Value) -> bool {
     move |line| line["reason"] == reason && line["text"].as_str().is_some_and(|it| it.contains(text))
 }
@@ -224,7 +226,7 @@ fn a_program_in_c_learns_why_no_sample_arrives() {
         let later = subscriber.await_line("time passes", is_class("silence"));
         assert!(number(&later, "silent_ns") > earlier, "{line}, {later}");
     }
-    // Without a hub, a poll of half a second times out, so the program prints its lines.
+    // Without a hub, a poll of half a second times out. Only then does the program print a line.
     let polled = mistyped[1].await_lines(6, "timeouts", is_class("silence"));
     let wakeups: u64 = polled.iter().map(|line| number(line, "wakeups")).sum();
     assert!(wakeups <= 5, "{polled:?}");
@@ -237,7 +239,7 @@ fn a_program_in_c_learns_why_no_sample_arrives() {
         assert_eq!(line["sensors"], "front rear", "{line}");
         let topics: Vec<&str> = line["topics"].as_str().expect("a text").split(' ').collect();
         assert!(topics.contains(&"front/scan") && topics.contains(&"rear/status"), "{line}");
-        // Sensor by sensor.
+        // Topics are sorted by sensor.
         assert!(topics.is_sorted_by_key(|topic| topic.split('/').next()), "{line}");
     }
     let is_streaming =
@@ -251,7 +253,7 @@ fn a_program_in_c_learns_why_no_sample_arrives() {
     scans.await_line("scans again", is_streaming);
 }
 
-/// Nobody who acts on zones needs a clock.
+/// A program that acts on zones does not need its own timeout: the library reports `unknown` when the hub is killed.
 #[test]
 fn zones_get_unknown_when_the_hub_is_killed() {
     let Some(installed) = InstalledLibrary::installed() else { return };
@@ -273,7 +275,7 @@ fn zones_get_unknown_when_the_hub_is_killed() {
     }
 }
 
-/// The worst of its sensors, of which one is switched off, then the hub killed.
+/// The combined verdict is that of the worst sensor. First one sensor is switched off, then the hub is killed.
 #[test]
 fn a_robot_is_as_unknown_as_its_worst_sensor() {
     let Some(installed) = InstalledLibrary::installed() else { return };
@@ -285,7 +287,7 @@ fn a_robot_is_as_unknown_as_its_worst_sensor() {
         let first = subscriber.await_line("there is no hub", is_class("robot"));
         assert_eq!((&first["verdict"], &first["nearest_mm"]), (&3.into(), &Value::Null), "{first}");
     }
-    // All is clear: nothing in the simulated room is so near.
+    // The verdict is clear, because the simulated room has nothing within the zones.
     let _front = env.simulator(&["front"], &["--seed=36", "--baud=500000"]);
     let rear =
         env.start(&["simulate", "--json", "--baud=500000", &format!("--port={}", env.path_argument("rear"))]);
@@ -295,7 +297,7 @@ fn a_robot_is_as_unknown_as_its_worst_sensor() {
         let sensors = line["sensors"].as_array().expect("a list");
         let of = |sensor: &Value| (sensor["sensor"].as_str().map(str::to_owned), number(sensor, "verdict"));
         let mut sensors: Vec<_> = sensors.iter().map(of).collect();
-        // Sensors are listed in the order in which their topics appeared.
+        // Sensors are listed in the order in which their topics were created.
         sensors.sort();
         (number(line, "verdict"), sensors)
     };
@@ -322,7 +324,8 @@ fn a_robot_is_as_unknown_as_its_worst_sensor() {
     }
 }
 
-/// Once as it is, and with two watches over memory, of the compiler and of valgrind: the library shares it with the program.
+/// Runs the program without checks of its memory, with those of the compiler, and with those of valgrind, because the
+/// library shares memory with the program.
 #[test]
 fn c_library_rejects_misuse() {
     let Some(installed) = InstalledLibrary::installed() else { return };
@@ -338,7 +341,8 @@ fn c_library_rejects_misuse() {
         Err(_) => eprintln!("without the compiler's watch over memory: it has none"),
     }
     if is_installed("valgrind") {
-        // What a child keeps of its parent is found, in part by addresses of its middle.
+        // valgrind still finds the memory that a child process inherits from its parent, in part through pointers into
+        // the middle of blocks, which is no definite leak.
         let leaks = ["--leak-check=full", "--show-leak-kinds=definite", "--errors-for-leak-kinds=definite"];
         let known =
             concat!("--suppressions=", env!("CARGO_MANIFEST_DIR"), "/tests/it/client_c/valgrind.supp");
@@ -355,7 +359,8 @@ fn c_library_rejects_misuse() {
     }
 }
 
-/// The examples, as the page about them builds them; and a program into which the library is linked.
+/// Builds the examples in the ways that their page describes, and a program into which the library is linked
+/// statically.
 #[test]
 fn the_examples_build_and_run() {
     let Some(installed) = InstalledLibrary::installed() else { return };
@@ -368,7 +373,7 @@ fn the_examples_build_and_run() {
     built.extend(installed.compile_with_pkg_config(&env, &examples.join("nearest.c")));
     let cmake = installed.cmake(&env, &examples);
     built.extend(cmake.iter().map(|build| build.join("nearest")));
-    // Only the sources have the static library, because its copy would take 100 MB.
+    // Only the build from the sources has the static library, because a copy of it would take 100 MB.
     built.extend(cmake.iter().skip(1).map(|build| build.join("nearest_static")));
     for nearest in &built {
         let outcome = program(&env, nearest, &["front", "5"]).wait();

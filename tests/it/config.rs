@@ -1,5 +1,6 @@
-//! `scanhub config`: what it prints loads, what it checks a hub would take, and what it shows names every place. And
-//! what follows from the command line's own definition: examples, the nearest name, completions, manual pages.
+//! `scanhub config`: its output can be loaded again, it checks configurations like a hub, and it shows the source of
+//! each value. Also tests the outputs that are generated from the definition of the command line: examples, suggestions
+//! for mistyped names, completions and manual pages.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -12,7 +13,7 @@ fn text(outcome: &Outcome) -> String {
     String::from_utf8_lossy(&outcome.stdout).into_owned()
 }
 
-/// What the program prints for `arguments`, which it takes.
+/// Runs the program with `arguments`, which must succeed, and returns its output.
 fn print_config(env: &TestEnv, arguments: &[&str]) -> String {
     let outcome = env.run(arguments);
     assert_eq!((outcome.exit_code, outcome.stderr.as_str()), (Some(0), ""), "{outcome}");
@@ -94,7 +95,7 @@ fn values_stand_below_each_other_with_their_places() {
     let columns = [file.as_str(), "default", "--set"];
     let begins: Vec<_> =
         shown.lines().map(|line| columns.iter().find_map(|word| line.find(&format!("  {word}")))).collect();
-    // The port may hold a word of these; all others begin where the first row does.
+    // Rows start at the same column. Only the row of the port may contain one of these words earlier.
     assert!(begins.iter().all(|at| at.is_some() && *at == begins[0]), "{shown}");
 }
 
@@ -120,7 +121,7 @@ fn typo_gets_a_tip_with_the_nearest_name() {
     );
 }
 
-/// The verbs that the help names, but `help` itself.
+/// Returns the verbs that the help lists, except `help` itself.
 fn verbs(env: &TestEnv) -> Vec<String> {
     let help = print_config(env, &["--help"]);
     let rows =
@@ -142,7 +143,7 @@ fn every_verb_has_an_example_a_page_and_a_completion() {
     print_config(&env, &["man", &pages]);
     let completions = ["bash", "zsh", "fish"].map(|shell| print_config(&env, &["completions", shell]));
     for verb in &verbs {
-        // A program of its own, which `cargo test` does not build; its tests hold its help.
+        // `bridge` is a separate program, which `cargo test` does not build here. Its own tests check its help.
         let is_apart = verb == "bridge";
         assert!(
             is_apart || print_config(&env, &[verb, "--help"]).contains(&format!("  scanhub {verb}")),
@@ -163,7 +164,7 @@ fn every_verb_has_an_example_a_page_and_a_completion() {
         "{refused}"
     );
 
-    // The shell itself says what it would complete; there is a bash on most machines.
+    // bash itself prints its completions. It is installed on most machines.
     let script = env.file("completion", &completions[0]);
     let ask = "source \"$0\"; COMP_WORDS=(scanhub ec); COMP_CWORD=1; _scanhub scanhub ec scanhub; echo \"${COMPREPLY[*]}\"";
     match output(Command::new("bash").args(["-c", ask, &script])) {
@@ -174,7 +175,8 @@ fn every_verb_has_an_example_a_page_and_a_completion() {
     }
 }
 
-/// What bash itself completes behind `words`, the last of which is being typed.
+/// Returns the completions of bash after `words`, the last of which is incomplete. Returns `None` and skips the rest of
+/// the test if there is no bash.
 fn complete_words(env: &TestEnv, words: &[&str]) -> Option<Vec<String>> {
     let program = Path::new(env!("CARGO_BIN_EXE_scanhub"));
     let script = env.file("completion", print_config(env, &["completions", "bash"]));
@@ -226,7 +228,7 @@ fn completes_sensors_and_topics_of_the_running_hub() {
     assert_eq!(hub.end(testkit::TERM).exit_code, Some(0));
 }
 
-/// All files below `directory`.
+/// Returns all files below `directory`.
 fn files(directory: &Path) -> Vec<PathBuf> {
     let entries = fs::read_dir(directory).into_iter().flatten().flatten().map(|entry| entry.path());
     entries.flat_map(|path| if path.is_dir() { files(&path) } else { vec![path] }).collect()
@@ -260,7 +262,7 @@ fn install_script_removes_manuals_and_completions() {
     assert!(unit.contains("\nExecReload=/bin/kill -HUP $MAINPID\n"), "{unit}");
     install(&["--remove"]);
     assert_eq!(files(&root), Vec::<PathBuf>::new());
-    // One that does not run here is installed without.
+    // A program that does not run on this machine is installed without them.
     let other = env.file("other", "of another processor");
     assert!(install(&["--program", &other]).contains("no manual pages, no completions"));
     assert!(!local.join("share").exists() || files(&local.join("share")).is_empty());

@@ -1,5 +1,5 @@
-//! `scanhub configure`, as a person runs it at a terminal, and as no person does: a sensor's EEPROM is written once,
-//! after a `yes`, and otherwise never.
+//! `scanhub configure` with and without a terminal: it writes the scanner's EEPROM once after the answer `yes`, and
+//! never otherwise.
 
 use std::fs::File;
 use std::io::{Read, Write};
@@ -11,14 +11,14 @@ use crate::testkit::{Child, INT, TERM, TestEnv, number, spawn, terminal, wait_un
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
-/// The program with a person before it: what it asks is read, and answered on a terminal.
+/// Running `scanhub configure` in a terminal, in which the test answers its question.
 struct ConfigureSession {
     process: Child,
-    /// The person's side of the terminal.
+    /// User's side of the terminal.
     keys: File,
 }
 
-/// What came of it.
+/// Result of a session.
 struct ConfigureOutcome {
     code: Option<i32>,
     out: String,
@@ -34,7 +34,7 @@ impl ConfigureSession {
         ConfigureSession { process: spawn(command).unwrap(), keys }
     }
 
-    /// Reads until it asks, answers by `act`, and waits for its end.
+    /// Reads until the program asks its question, calls `act` to answer it, and waits until the program exits.
     fn answer_questions(mut self, act: impl FnOnce(&mut File, u32)) -> ConfigureOutcome {
         let mut stdout = self.process.stdout.take().unwrap();
         let out = thread::spawn(move || {
@@ -43,7 +43,7 @@ impl ConfigureSession {
         });
         let mut errors = Vec::new();
         let mut byte = [0];
-        // A terminal that nobody has open any more ends by an error.
+        // Reading from a terminal that no program has open any more fails with an error.
         while !errors.ends_with(b"Type yes: ") && self.keys.read(&mut byte).is_ok_and(|len| len > 0) {
             errors.push(byte[0]);
         }
@@ -98,7 +98,7 @@ fn a_person_says_yes_and_it_is_written_once() {
         "{configured}"
     );
     assert_eq!(configured["before"], before["configuration"]);
-    // Stdout is a pipe: who is asked sees it on the terminal.
+    // Stdout is a pipe, so the program shows the difference and the question on the terminal.
     let shown = result.errors.split("Type yes").next().unwrap();
     assert!(shown.contains("unit: 01h (1 mm) -> 00h (10 mm)"), "{}", result.errors);
     let after = probe(&env, "front");
@@ -106,7 +106,7 @@ fn a_person_says_yes_and_it_is_written_once() {
     assert_eq!((number(&after, "unit_mm"), number(&after, "mode")), (10, 4), "{after}");
     assert_eq!((number(&after, "operating_mode"), number(&after, "baud")), (0x25, 38_400), "{after}");
 
-    // Back by what it was told, in words this time.
+    // Restore the old configuration with the value that the program printed, this time without `--json`.
     let backup = format!("configuration={}", before["configuration"].as_str().unwrap());
     let result = ConfigureSession::start(&env, &[&port, &backup]).type_text("yes\n");
     assert_eq!(result.code, Some(0), "{}", result.errors);
@@ -114,7 +114,7 @@ fn a_person_says_yes_and_it_is_written_once() {
     assert!(result.out.contains("to go back: scanhub configure"), "{}", result.out);
     assert_eq!(probe(&env, "front")["configuration"], before["configuration"]);
 
-    // And again: nothing to do, nothing asked.
+    // A second time, nothing has to be changed, so the program asks no question.
     let outcome = env.run(&["configure", &port, &backup, "unit=mm"]);
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     assert!(String::from_utf8_lossy(&outcome.stdout).contains("nothing to change"), "{outcome}");
@@ -174,7 +174,7 @@ fn reports_command_that_restores_previous_settings() {
     let back = format!("to go back: scanhub configure {port} power_on_baud=9600\n");
     assert!(out.contains(&back), "{out}");
     assert_eq!(probe(&env, "front")["permanent_rate"], true);
-    // The sensor does not report the previous permanent rate.
+    // The scanner does not report its previous permanent rate.
     let out = done(&["power_on_baud=9600"]);
     assert!(out.contains("cannot be restored") && !out.contains("to go back"), "{out}");
     assert_eq!(probe(&env, "front")["permanent_rate"], false);
@@ -197,12 +197,12 @@ fn everything_else_than_yes_writes_nothing() {
         signal(pid, INT);
     });
     assert_eq!(result.code, Some(130), "{}", result.errors);
-    // No terminal, no person: the difference is shown all the same.
+    // Without a terminal, the program still prints the difference.
     let outcome = env.run(&["configure", &port, "unit=cm", "--json"]);
     assert_eq!(outcome.exit_code, Some(2), "{outcome}");
     assert_eq!(outcome.of_class("difference").len(), 1, "{outcome}");
     assert_eq!(outcome.of_class("error")[0]["kind"], "usage", "{outcome}");
-    // Nor is one asked who cannot see the question.
+    // The program does not ask if the user cannot see the question, either.
     let (_keys, screen) = terminal();
     let mut unseen = env.command(&["configure", &port, "unit=cm"]);
     unseen.stdin(Stdio::from(screen)).stdout(Stdio::null()).stderr(Stdio::null());
@@ -237,7 +237,7 @@ fn rejects_impossible_settings_without_writing() {
         assert!(wrong.errors.contains(words), "{words}: {}", wrong.errors);
     }
     assert!(wrong.errors.contains(" ..\r\nscanhub: "), "{:?}", wrong.errors);
-    // A port that a hub has.
+    // The port belongs to a hub.
     let hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
     let outcome = env.run(&["configure", &port, "unit=cm"]);
@@ -278,7 +278,7 @@ fn signals_do_not_interrupt_a_write_in_progress() {
             ConfigureSession::start(&env, &[&port, setting, "--json"]).answer_questions(|keys, pid| {
                 let before = env.truth("front").len();
                 keys.write_all(b"yes\n").unwrap();
-                // The simulator may not have recorded the last telegram before the question yet.
+                // The simulator may not have logged the last telegram before the question yet.
                 wait_until("it has begun", || env.truth("front").len() > before + 1);
                 if sent == Signal::HUP {
                     // The terminal is closed, too.

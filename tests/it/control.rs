@@ -1,4 +1,4 @@
-//! What users ask of a running hub: a sensor is stopped, streams again, is begun anew with; and what is refused.
+//! `scanhub control` with a running hub: pauses, resumes and restarts a sensor, and rejects invalid requests.
 
 use crate::testkit;
 use crate::testkit::{
@@ -10,7 +10,7 @@ fn control(env: &TestEnv, sensor: &str, verb: &str) -> Outcome {
     env.run(&["control", sensor, verb, "--json"])
 }
 
-/// Asks for `verb`, which must be taken.
+/// Sends the request `verb`, which the hub must accept.
 fn control_accepted(env: &TestEnv, sensor: &str, verb: &str) {
     let outcome = control(env, sensor, verb);
     let [line] = &outcome.lines()[..] else { panic!("not one line: {outcome}") };
@@ -36,14 +36,14 @@ fn paused_sensor_stops_and_resumes_without_a_gap() {
     }
     control_accepted(&env, "front", "pause");
     await_state(&env, "front", "paused");
-    // It is the sensor that was stopped: it sends nothing any more while the other one goes on.
+    // The right scanner was stopped: it sends nothing more, and the other one continues to stream.
     let mut sent = 0;
     wait_until("the sensor is stopped", || {
         let before = std::mem::replace(&mut sent, env.truth("front").len());
         subscribers[2].await_lines(10, "a scan of the other sensor", is_class("scan"));
         before == sent
     });
-    // The second of two statuses is one of the pause.
+    // The hub repeats the status during the pause, so the second one was sent after it began.
     let statuses = env.run(&["echo", "front/status", "-n", "2", "--timeout", "5s"]);
     assert_eq!(statuses.exit_code, Some(0), "{statuses}");
     let paused = env.info("front");
@@ -52,7 +52,7 @@ fn paused_sensor_stops_and_resumes_without_a_gap() {
     assert_eq!((&later["state"], &later["last_error"]), (&"paused".into(), &"".into()));
     assert_eq!(later["counters"]["telegrams"], paused["counters"]["telegrams"]);
     assert_eq!(env.truth("front").len(), sent);
-    // Once more changes nothing.
+    // Pausing a sensor again changes nothing.
     control_accepted(&env, "front", "pause");
     control_accepted(&env, "front", "resume");
     let before = number(&paused["counters"], "telegrams");
@@ -100,12 +100,12 @@ fn absent_sensor_can_be_paused_before_it_appears() {
     assert_eq!(error["message"], "front: the port is away");
     let simulator = env.simulator(&["front"], &["--seed=33", "--baud=500000"]);
     await_state(&env, "front", "paused");
-    // It went and came again.
+    // The scanner is disconnected and connected again.
     assert_eq!(simulator.end(TERM).exit_code, Some(0));
     await_state(&env, "front", "absent");
     let _simulator = env.simulator(&["front"], &["--seed=33", "--baud=500000"]);
     let info = await_state(&env, "front", "paused");
-    // Each time it was told to stop, and said so; it did not send a scan.
+    // The scanner stays paused: it has replied to requests, but sent no scan.
     assert!(number(&info["counters"], "telegrams") <= 2, "{info}");
     control_accepted(&env, "front", "resume");
     await_state(&env, "front", "streaming");
@@ -147,17 +147,17 @@ fn many_ask_at_once_and_some_are_killed_while_they_do() {
             (0..10).map(|number| (number, env.start(&["control", "front", "pause", "--json"]))).collect();
         for (number, program) in asking {
             if number % 2 == 0 {
-                // Killed at whatever it is doing.
+                // Kill it at an arbitrary moment.
                 drop(program.end(testkit::KILL));
                 continue;
             }
             let outcome = program.wait();
-            // Taken, or told to come back.
+            // The hub accepts the request, or it is busy and the client should try again.
             assert!(matches!(outcome.exit_code, Some(0 | 75)), "{outcome}");
             assert_eq!(outcome.lines().len(), 1, "{outcome}");
         }
     }
-    // The killed ones may still take the places of all that may ask at a time.
+    // The killed programs may still hold all slots for requests.
     wait_until("there is room to ask", || {
         let outcome = control(&env, "front", "resume");
         assert!(matches!(outcome.exit_code, Some(0 | 75)), "{outcome}");

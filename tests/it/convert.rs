@@ -1,4 +1,4 @@
-//! `scanhub convert`: recordings in another form, as a user at a terminal and a script see it.
+//! `scanhub convert`: converts recordings to other formats, to files and to stdout.
 
 use std::process::Stdio;
 
@@ -19,18 +19,18 @@ fn a_stream_becomes_a_recording_that_plays() {
     assert_eq!(line["sensors"], json!(["left"]));
     assert_eq!((&line["telegrams"], &line["scans"], &line["missing"]), (&json!(20), &json!(20), &missing));
     assert_eq!((&line["from"], &line["to"]), (&json!("telegram stream"), &json!("MCAP")));
-    // The telegrams as they were, to whoever reads stdout.
+    // Stdout receives the unchanged telegrams.
     let outcome = env.run(&["convert", &mcap, "-", "--sensor=left"]);
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     assert!(outcome.stderr.contains("20 telegrams, 20 scans"), "{}", outcome.stderr);
-    // One who has had enough is no trouble, and is told nothing.
+    // A reader that closes the pipe early causes no error and no message.
     let (reader, writer) = std::io::pipe().expect("a pipe");
     drop(reader);
     let mut command = env.command(&["convert", &mcap, "-"]);
     command.stdin(Stdio::null()).stdout(writer).stderr(Stdio::piped());
     let closed = spawn(command).and_then(Child::wait_with_output).expect("it ends");
     assert_eq!((closed.status.code(), &closed.stderr[..]), (Some(0), &b""[..]), "{closed:?}");
-    // A simulated sensor has the recording.
+    // A simulated scanner can play the recording.
     let _simulator =
         env.simulator(&["left"], &["--baud=500000", &format!("--replay={mcap}"), "--sensor=left"]);
     let _hub = env.hub(&[env.link("left")]);

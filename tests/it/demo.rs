@@ -1,5 +1,4 @@
-//! The demonstration, as somebody runs it who has nothing set up: it ends well, tells that nothing was lost, and leaves
-//! nothing behind.
+//! `scanhub demo` without any setup: it succeeds, reports that no sample was lost, and leaves no files or processes.
 
 use std::fs;
 use std::path::Path;
@@ -11,7 +10,7 @@ use crate::testkit::{
 };
 use crate::web::{channels, connect_viewer};
 
-/// Runs the demonstration in an empty environment; `end` may wait for something and hasten its end.
+/// Runs the demo with an empty environment. `end` waits for its end, and may cause it.
 fn demo(arguments: &[&str], end: impl FnOnce(Program) -> Outcome) -> Outcome {
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
     let place = tempfile::tempdir().expect("a directory");
@@ -30,15 +29,16 @@ fn demo(arguments: &[&str], end: impl FnOnce(Program) -> Outcome) -> Outcome {
     outcome
 }
 
-/// Processes whose command line names `domain`.
+/// Returns the command lines of processes that contain `domain`.
 fn processes(domain: &str) -> Vec<String> {
     let entries = fs::read_dir("/proc").into_iter().flatten().flatten();
     let lines = entries.filter_map(|entry| fs::read_to_string(entry.path().join("cmdline")).ok());
     lines.filter(|line| line.split('\0').any(|word| word == domain)).collect()
 }
 
-/// Checks that the last lines, one for each of `names`, account for every telegram of a stream: it arrived, or a busy machine
-/// made the demonstration's subscriber miss it, and then the exit code and the message say so.
+/// Asserts that the last lines, one for each of `names`, account for every telegram of a stream. A telegram was
+/// received, or the demo's subscriber missed it on a busy machine. In the second case, the exit code and the message
+/// must report it.
 fn check_summaries(outcome: &Outcome, names: &[&str]) {
     let lines = outcome.of_class("summary");
     let sensors: Vec<_> = lines.iter().map(|line| line["sensor"].as_str().unwrap_or_default()).collect();
@@ -79,7 +79,8 @@ fn of_another_family_or_of_all() {
     ] {
         let outcome = demo(&["--headless", "--for", "2s", "--json", "--family", family], Program::wait);
         check_summaries(&outcome, names);
-        // Ten revolutions in a second, and not hundreds of packets. Stamps of a few scans are rough on a busy machine.
+        // The rate is ten revolutions per second, not hundreds of packets. It is computed from few scans, so it is
+        // inaccurate on a busy machine.
         let last = &outcome.of_class("summary")[1];
         assert!(last["hz"].is_null() || last["hz"].as_f64().is_some_and(|hz| hz < 50.0), "{last}");
     }
@@ -120,7 +121,7 @@ fn headless_in_an_empty_environment() {
             (domain, number(&ready, "pid")),
             (&*format!("demo-{}", program.pid()), u64::from(program.pid()))
         );
-        // Another terminal finds it by its name alone.
+        // A program in another terminal needs only the name of the domain.
         let mut list = Command::new(env!("CARGO_BIN_EXE_scanhub"));
         list.args(["list", "--json", "--domain", domain]).env_clear();
         let list = output(list).expect("it starts");
@@ -174,7 +175,7 @@ fn rejects_domain_flag_and_ignores_its_variable() {
     check_summaries(&outcome, &["front", "rear"]);
 }
 
-/// A verb of the program in `domain` of a demonstration that runs.
+/// Starts a verb of the program in the `domain` of a running demo.
 fn run_in_demo(domain: &str, arguments: &[&str]) -> Program {
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
     command.args(arguments).args(["--json", "--domain", domain]).env_clear();
@@ -216,7 +217,7 @@ fn people_are_followed_from_room_to_room_in_the_house() {
 
 #[test]
 fn interrupted() {
-    // All of its processes end. SIGHUP is the signal of a terminal that is closed.
+    // All processes of the demo end, too. SIGHUP is sent when a terminal is closed.
     for signal in [INT, HUP] {
         let outcome = demo(&["--headless", "--json"], |program| {
             let name = format!("demo-{}", program.pid());
@@ -237,7 +238,7 @@ fn second_interrupt_ends_at_once() {
         let mut echo = run_in_demo(domain, &["echo", "front/scan"]);
         echo.await_lines(2, "a scan", testkit::is_class("scan"));
         assert_eq!(echo.end(INT).exit_code, Some(0));
-        // Telegrams on their way from a simulator that does not run never arrive, so the demonstration waits for them.
+        // Telegrams that a stopped simulator has not sent never arrive, so the demo waits for them.
         let simulator = process_of(domain, "simulate");
         rustix::process::kill_process(simulator, rustix::process::Signal::STOP).expect("it runs");
         program.signal(INT);
@@ -252,7 +253,7 @@ fn second_interrupt_ends_at_once() {
     assert_eq!(outcome.of_class("summary").len(), 2, "{outcome}");
 }
 
-/// Returns the process of a demonstration in `domain` that runs `verb`.
+/// Returns the process of the demo in `domain` that runs `verb`.
 fn process_of(domain: &str, verb: &str) -> rustix::process::Pid {
     let entries = fs::read_dir("/proc").expect("procfs").flatten();
     let is_meant = |path: &Path| {
@@ -279,7 +280,7 @@ fn the_page_outlives_its_viewers() {
             viewer
         };
         let mut first = connect();
-        // Two reloads, then a second viewer.
+        // The browser reloads the page twice before a second viewer connects.
         for _ in 0..2 {
             drop(first);
             first = connect();

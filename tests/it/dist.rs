@@ -1,5 +1,5 @@
-//! What makes the hub a service: the script puts it in place and takes it away again, and the units are as closed as they
-//! say.
+//! Installation of the hub as a service: the script installs and removes all files, and the units are as restricted as
+//! they claim.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -7,14 +7,14 @@ use std::process::Command;
 
 use crate::testkit::{TestEnv, output, skip};
 
-/// How much a unit may be exposed, by the measure of systemd-analyze, in tenths.
+/// Maximum exposure of a unit as systemd-analyze measures it, in tenths.
 const MAX_EXPOSURE: u32 = 15;
 
 fn dist() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("hub/dist")
 }
 
-/// All files below `directory`, as paths from there.
+/// Returns all files below `directory`, with paths relative to it.
 fn files(directory: &Path) -> Vec<String> {
     let mut all = Vec::new();
     let mut open = vec![directory.to_owned()];
@@ -72,7 +72,7 @@ fn install_script_removes_every_file_it_installs() {
 fn unit_allows_adapters_plugged_in_after_the_start() {
     let unit = fs::read_to_string(dist().join("scanhub.service")).expect("is there");
     let has_line = |line: &str| unit.lines().any(|it| it == line);
-    // systemd.resource-control(5): a group that no driver has registered at the start is left out of the list.
+    // systemd.resource-control(5): systemd ignores a device group that no driver has registered when the unit starts.
     for (group, driver) in [("ttyUSB", "usbserial"), ("ttyACM", "cdc_acm")] {
         assert!(has_line(&format!("DeviceAllow=char-{group} rw")), "{group}");
         for key in ["Wants=", "After="] {
@@ -83,7 +83,7 @@ fn unit_allows_adapters_plugged_in_after_the_start() {
     }
 }
 
-/// Hub and gateway are one user, and what they keep is for that user alone.
+/// Hub and gateway run as one user. Only this user can read their saved state.
 #[test]
 fn units_share_one_private_state_directory() {
     for unit in ["scanhub.service", "scanhub-gateway.service"] {
@@ -110,7 +110,7 @@ fn units_leave_little_open() {
             return;
         }
         assert!(output.status.success(), "{unit} is too open:\n{text}");
-        // What it says of a program that is not installed here is no fault of the unit.
+        // Messages about programs that are not installed on this machine are not faults of the unit.
         let output = analyze(&["verify"]).unwrap_or_else(|error| panic!("{error}"));
         let errors = String::from_utf8_lossy(&output.stderr).into_owned();
         let faults: Vec<_> = errors.lines().filter(|line| line.contains(unit)).collect();
