@@ -1,5 +1,5 @@
-//! `scanhub doctor`, as somebody runs it: every condition has its line, what is wrong has its remedy, and nothing is
-//! changed by looking.
+//! `scanhub doctor` on working setups: it prints a line for each check and a remedy for each problem, and changes
+//! nothing.
 
 use std::path::Path;
 
@@ -9,7 +9,8 @@ use rustix::io::Errno;
 use rustix::process::Signal;
 use serde_json::Value;
 
-/// Findings by the name of their check; those of a port after it.
+/// Returns state and finding of the check `name`, followed by its remedy. `port` is the port of the line, if it has
+/// one.
 fn state<'a>(findings: &'a [Value], name: &str, port: Option<&str>) -> (&'a str, String) {
     let found = findings.iter().find(|line| line["name"] == name && line["port"].as_str() == port);
     let found = found.unwrap_or_else(|| panic!("no {name} of {port:?}: {findings:#?}"));
@@ -19,12 +20,13 @@ fn state<'a>(findings: &'a [Value], name: &str, port: Option<&str>) -> (&'a str,
     (text("state"), format!("{} {}", text("finding"), text("remedy")))
 }
 
-/// Runs it with this exit code; all its lines but a last error must be checks.
+/// Runs `doctor`, which must exit with `code`. All lines must be checks, except for an error at the end.
 fn doctor(env: &TestEnv, arguments: &[&str], code: i32) -> (Vec<Value>, Outcome) {
     checks(run(env, arguments), code)
 }
 
-/// As [`doctor`], for the scanner at `port`. On a busy machine, a simulated scanner may reply too late: then it runs again.
+/// Runs the same as [`doctor`], for the scanner at `port`. On a busy machine, a simulated scanner may reply too late;
+/// `doctor` is then run again.
 fn doctor_of_port(port: &str, env: &TestEnv, arguments: &[&str], code: i32) -> (Vec<Value>, Outcome) {
     let is_late =
         |line: &Value| line["name"] == "sensor" && line["port"] == port && line["state"] == "failed";
@@ -68,7 +70,7 @@ fn a_set_up_that_works() {
     for name in ["memory", "domain", "leftovers", "descriptors"] {
         assert_eq!(state(&findings, name, None).0, "ok", "{findings:#?}");
     }
-    // Once it is open, for opening ends the adapter's collecting.
+    // The latency is checked after the port was opened, because opening it sets the adapter to low latency.
     let place = |name: &str| findings.iter().position(|line| line["name"] == name);
     assert!(place("latency") > place("access"), "{findings:#?}");
     for name in ["port", "holder", "access", "rate", "settings", "power-on", "health"] {
@@ -113,7 +115,7 @@ fn reports_bad_settings_and_ports() {
     assert!(found == "failed" && text.contains("100 or 180"), "{text}");
 }
 
-/// A port has many names, and a hub may have been started in another directory.
+/// A port can have several names, and the hub may have been started in another directory.
 #[test]
 fn a_port_of_the_hub_is_found_by_any_of_its_names() {
     let env = TestEnv::new();
@@ -121,7 +123,7 @@ fn a_port_of_the_hub_is_found_by_any_of_its_names() {
     let (front, again, directory) = (env.path_argument("front"), env.path_argument("again"), env.path(""));
     std::os::unix::fs::symlink(&front, &again).expect("a link");
     let device = env.path("front").canonicalize().expect("a pty").display().to_string();
-    // Without a hub, the link of the configuration is found.
+    // Without a hub, `doctor` finds the link in the configuration.
     let arguments = [&again, &env.link("front"), "--set", "link.front.unit=cm"];
     let (findings, _) = doctor_of_port(&again, &env, &arguments, 0);
     let (found, text) = state(&findings, "settings", Some(&again));
@@ -153,7 +155,8 @@ fn a_port_of_the_hub_is_found_by_any_of_its_names() {
             );
         }
     }
-    // The links of the hub, from another directory, with a name that leads to the port.
+    // Without arguments, `doctor` checks the links of the hub. It runs in another directory, and the port has a
+    // different name that leads to it.
     let (findings, _) = doctor(&env, &[], 0);
     let (found, text) = state(&findings, "sensor", Some(&env.path("./front").display().to_string()));
     assert!(found == "ok" && text.contains("link front of the hub: streaming"), "{text}");
@@ -186,7 +189,7 @@ fn a_sensor_that_is_not_well_is_no_good_set_up() {
 #[test]
 fn reports_a_silent_port_after_a_bounded_search() {
     let env = TestEnv::new();
-    // A sensor that answers nothing.
+    // The scanner does not reply.
     let _simulator = env.simulator(&["front"], &["--fault=mute=1"]);
     let (findings, _) = doctor(&env, &[&env.path_argument("front")], 5);
     let (found, text) = state(&findings, "sensor", Some(&env.path_argument("front")));
@@ -202,7 +205,7 @@ fn queries_a_running_hub_and_reports_a_killed_one() {
     let before = env.info("front");
     let (port, link) = (env.path_argument("front"), env.link("front"));
     let (findings, _) = doctor(&env, &[&link], 0);
-    // A link of the hub stands for its port.
+    // The name of a link stands for its port.
     let (named, _) = doctor(&env, &["front"], 0);
     assert_eq!(state(&named, "sensor", Some(&env.path_argument("front"))).0, "ok", "{named:#?}");
     let pid = format!("process {}", hub.pid());
@@ -236,7 +239,7 @@ fn a_hub_that_is_stopped_is_no_good_set_up() {
         let (found, text) = state(&findings, name, Some(&port));
         assert!(found == "skipped" && text.contains("does not publish"), "{text}");
     }
-    // Its name is not taken for a port.
+    // `doctor` does not treat the name of the link as a port.
     let (named, _) = doctor(&env, &["front"], 5);
     assert_eq!(state(&named, "port", Some("front")).0, "skipped", "{named:#?}");
     hub.signal(Signal::CONT);
@@ -269,7 +272,7 @@ fn does_not_open_a_port_held_by_another_program() {
     let watch = inotify::init(CreateFlags::CLOEXEC | CreateFlags::NONBLOCK).unwrap();
     let device = env.path("front").canonicalize().unwrap();
     inotify::add_watch(&watch, &device, WatchFlags::OPEN).unwrap();
-    // This process has it open.
+    // This process has the port open.
     let (findings, _) = doctor(&env, &[&env.path_argument("front")], 5);
     assert_eq!(rustix::io::read(&watch, &mut [0; 64]), Err(Errno::AGAIN), "it was opened");
     drop(std::fs::File::open(&device).unwrap());

@@ -1,5 +1,5 @@
-//! Set-ups that are broken on purpose between the sensor and the hub's configuration: `scanhub doctor` finds each and names
-//! the remedy. `--nocapture` shows them as a table. Those of the machine are in `doctor_machine.rs`.
+//! Setups with faults between scanner and configuration: `scanhub doctor` finds each fault and names the remedy.
+//! `--nocapture` prints them as a table. Faults of the machine are in `doctor_machine.rs`.
 
 use std::fs::{self, File};
 use std::net::TcpListener;
@@ -11,7 +11,8 @@ use crate::testkit::{
     Findings, Program, TestEnv, TestLine, open_line, run_concurrently, skip, succeeds, wait_until,
 };
 
-/// What a simulated sensor has, and what the doctor says of it.
+/// Description of each fault, flags of the simulator, and the check, state and part of the remedy that `doctor` must
+/// report.
 const BROKEN_SENSORS: [(&str, &[&str], &str, &str, &str); 10] = [
     ("the window is dirty", &["--type=lms291", "--pollution=60"], "health", "warning", "clean its window"),
     (
@@ -67,7 +68,7 @@ fn finds_sensor_faults() {
             let expected = [of("unit=mm"), of("type=lms200")];
             let examine = || Findings::of(&env, &[&link, "--set", &expected[0], "--set", &expected[1]]);
             let mut findings = examine();
-            // A busy machine may run the simulated sensor too late to reply.
+            // On a busy machine, the simulated scanner may reply too late.
             wait_until("a sensor that can reply does", || {
                 let has_replied = name == "sensor" || findings.state_and_text("sensor").0 != "failed";
                 if !has_replied {
@@ -84,7 +85,7 @@ fn finds_sensor_faults() {
 fn finds_port_faults() {
     let env = TestEnv::new();
     let port = |name: &str| Findings::of(&env, &[&env.path_argument(name)]);
-    // What there is instead depends on the machine.
+    // The ports in the remedy depend on this machine.
     let instead =
         |finding: &Findings| if finding.state_and_text("port").1.is_empty() { "there are" } else { "" };
     let absent = port("absent");
@@ -130,7 +131,7 @@ fn reports_missing_port_permission_with_remedy() {
         let findings = Findings::in_outcome(&env.run(&arguments));
         return findings.assert_problem(NO_PERMISSION, "access", "failed", "chmod u+rw");
     }
-    // Root may open all: somebody else asks.
+    // Root may open every port, so another user runs `doctor`.
     let as_nobody = |mut command: Command| {
         command.uid(UNPRIVILEGED_UID).gid(UNPRIVILEGED_UID);
         command
@@ -171,5 +172,5 @@ fn finds_configuration_faults() {
     Findings::of(&env, &["--config", &missing]).assert_problem("no such file", "configuration", "failed", "");
 }
 
-/// The user that has nothing.
+/// ID of a user without any permissions.
 const UNPRIVILEGED_UID: u32 = 65534;

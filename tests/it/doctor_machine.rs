@@ -1,6 +1,6 @@
-//! Machines that are broken on purpose, and one that is well: `scanhub doctor` finds what is wrong with each and names the
-//! remedy, and has no complaint of the other. `--nocapture` shows them as a table. What an administrator may have
-//! written is laid out below a directory of the test.
+//! Machines with faults, and a healthy one: `scanhub doctor` finds each fault and names the remedy, and reports no
+//! problem on the healthy machine. `--nocapture` prints the faults as a table. System files that an administrator may
+//! have written are in a directory of the test.
 
 use std::fs;
 use std::os::unix::fs::{PermissionsExt, symlink};
@@ -16,7 +16,7 @@ use scanhub_config::Gateway;
 use scanhub_shm::Domain;
 use scanhub_tools::doctor::{Bridge, CheckTargets, System, run_checks};
 
-/// `sh` with these words before the program, as `ulimit -f 100; exec`, and its arguments.
+/// Returns a command that runs `doctor` in `sh` after the words `words`, such as `ulimit -f 100; exec`.
 fn command_under(env: &TestEnv, words: &str, arguments: &[&str]) -> Command {
     let inner = env.command(&[&["doctor", "--json", "--no-system-config"], arguments].concat());
     let mut command = Command::new("sh");
@@ -36,7 +36,7 @@ fn a_set_up_that_is_well() {
     let flags: Vec<&str> = flags.iter().map(String::as_str).collect();
     let examine = || {
         let findings = Findings::of(&env, &flags);
-        // How this machine itself is set up no test can know.
+        // The test cannot control how this machine itself is set up.
         let not_of_the_machine = ["service", "udev", "logout"];
         assert!(not_of_the_machine.iter().all(|name| !findings.state_and_text(name).1.is_empty()));
         findings.without(&not_of_the_machine).assert_no_problem();
@@ -56,7 +56,7 @@ fn a_set_up_that_is_well() {
     healthy_machine(&env).assert_no_problem();
 }
 
-/// A machine on which everything is installed, looked at by an ordinary user.
+/// Creates a machine on which everything is installed, and returns the findings for an ordinary user.
 fn healthy_machine(env: &TestEnv) -> Findings {
     let machine = env.path("machine");
     let put = |path: &str, text: &str| {
@@ -80,13 +80,13 @@ fn healthy_machine(env: &TestEnv) -> Findings {
     healthy_layout(env)
 }
 
-/// What is found on the machine below the environment's directory `machine`, for the user 1000.
+/// Returns the findings for user 1000 on the machine in the environment's directory `machine`.
 fn healthy_layout(env: &TestEnv) -> Findings {
-    // The ports of this machine are unknown to a test.
+    // The ports of this machine differ from test to test.
     port_findings(env).without_ports().without(&["ports", "multicast"])
 }
 
-/// All findings, including the ports of this machine and the adapters of the made-up one.
+/// Returns all findings, including the ports of this machine and the adapters of the simulated machine.
 fn port_findings(env: &TestEnv) -> Findings {
     let targets = CheckTargets {
         ports: Vec::new(),
@@ -118,7 +118,7 @@ fn reports_missing_module_and_brltty_for_an_adapter() {
     put("sys/bus/usb/devices/1-1/idProduct", "7523\n");
     let ports = || {
         let findings = port_findings(&env);
-        // It is a failure only where this machine has no port to examine.
+        // The check fails only if this machine has no port to examine.
         let (state, finding) = findings.state_and_text("ports");
         assert!(["warning", "failed"].contains(&state), "{state}");
         (state.to_owned(), finding.to_owned(), findings)
@@ -260,7 +260,7 @@ fn clean_removes_files_of_killed_hubs_only() {
     assert!(before.iter().all(|path| path.exists()), "{before:?}");
     hub.end(KILL);
     Findings::of(&env, &[]).assert_problem("a hub was killed", "leftovers", "warning", "doctor --clean");
-    // A neighbour whose name begins alike, and one that is a hub of this name elsewhere.
+    // A domain with a similar name, and a domain with the same name in another location. Each has a running hub.
     let (neighbour, other) = (TestEnv::new(), env.path("other"));
     let other_hub = Program::start(env.command_at(&other, &["run", "--json", &link])).ready();
     let held = env.leftover_files().len();
@@ -277,7 +277,7 @@ fn clean_removes_files_of_killed_hubs_only() {
     let left = env.leftover_files();
     assert!(left.len() < held && !left.is_empty(), "{left:?}");
     assert_eq!(neighbour.leftover_files(), neighbours);
-    // The other one is as it was: who comes now finds it.
+    // The other hub is unchanged, and clients still find it.
     assert_eq!(other_hub.end(TERM).exit_code, Some(0));
     assert_eq!((env.leftover_files().len(), hub.end(TERM).exit_code), (0, Some(0)));
 }
@@ -306,7 +306,7 @@ fn files_without_a_domain_are_taken_away() {
     fs::remove_dir_all(env.domain().root()).expect("it is ours");
     let findings = Findings::of(&env, &[]);
     findings.assert_problem("files of a domain that is gone", "leftovers", "warning", "doctor --clean");
-    // Somebody still reads one of them.
+    // A process still reads one of the files.
     let files = env.leftover_files();
     let held = fs::File::open(&files[0]).expect("it is ours");
     Findings::of(&env, &["--clean"]);
@@ -322,7 +322,7 @@ fn two_hubs_and_one_that_was_replaced() {
     let env = TestEnv::new();
     let link = env.link("absent");
     let program = env.path("scanhub");
-    // For the reason that `write_program` gives, another process writes it.
+    // Another process writes the program, for the reason that `write_program` gives.
     let mut copy = Command::new("sh");
     copy.args(["-c", "cp \"$1\" \"$0\" && echo another build >> \"$0\""]).arg(&program);
     assert!(succeeds(copy.arg(env!("CARGO_BIN_EXE_scanhub"))), "can be copied");
@@ -355,7 +355,7 @@ fn two_hubs_and_one_that_was_replaced() {
 fn no_way_to_the_network() {
     in_a_network("doctor_machine::no_way_to_the_network", || {
         let env = TestEnv::new();
-        // Nobody named an interface: nothing goes to a network.
+        // No interface is configured, so nothing is sent to a network.
         assert_eq!(Findings::of(&env, &[]).state_and_text("multicast").0, "skipped");
         let interface = Findings::of(&env, &["--set", "gateway.interface=eth7"]);
         interface.assert_problem("the gateway's interface is gone", "multicast", "failed", "there are lo");

@@ -1,16 +1,18 @@
-//! The topic `early`, from a line to a consumer: a warning comes before its telegram is complete, or the turn of a head, and
-//! either the zones of its scan confirm it or it is taken back; it is there only while somebody follows it.
+//! Topic `early`, from the line to a subscriber: a warning is sent before its telegram or revolution is complete. The
+//! zones of the scan then confirm it, or the hub withdraws it. Warnings are computed only while the topic has a
+//! subscriber.
 
 use std::cell::RefCell;
 
 use crate::testkit::{INT, Program, TERM, TestEnv, checked_topic_seqs, is_class, number};
 use serde_json::Value;
 
-/// A post in the smaller circle, to the right and a little ahead: in the first third of each telegram, and of each turn.
+/// World with a post in the smaller zone, to the right and a little ahead. It is in the first third of each telegram
+/// and of each revolution.
 pub(crate) const POST_WORLD: &str = "[noise]\nerrors = 0\n[[thing]]\nradius_mm = 60\npose = [460, 200]\n\
     [[thing]]\nline = [[-3000, -1000], [3000, -1000], [3000, 4000], [-3000, 4000], [-3000, -1000]]\n";
 
-/// A scanner: the simulator's flags, its link's keys, and a bit more than the beams of a third of its scan.
+/// Scanner: flags of the simulator, keys of the link, and slightly more beams than a third of its scan has.
 struct Scanner {
     flags: &'static [&'static str],
     keys: &'static [&'static str],
@@ -27,7 +29,7 @@ const RPLIDAR_SCANNER: Scanner = Scanner {
 };
 
 impl Scanner {
-    /// A hub of it, and its simulator in `world` on a line with `faults`.
+    /// Starts a hub for this scanner, and a simulator in `world` on a line with `faults`.
     fn start(&self, env: &TestEnv, world: &str, faults: &[&str]) -> (Program, Program) {
         let world = format!("--world={}", env.file("post.toml", world));
         let flags = [&["--seed=28", &world], self.flags, faults].concat();
@@ -37,7 +39,8 @@ impl Scanner {
     }
 }
 
-/// Follows `front/early` and `front/zones` of a line with `faults` until they have told `enough`.
+/// Receives `front/early` and `front/zones` from a line with `faults` until `is_enough` is true for the fates of the
+/// warnings. Asserts that no warning is wrong.
 fn check_warnings(
     env: &TestEnv,
     scanner: &Scanner,
@@ -50,44 +53,45 @@ fn check_warnings(
     echo.await_line("enough warnings", |line| {
         let mut lines = lines.borrow_mut();
         lines.push(line.clone());
-        // Not after every line: a test that reads slowly makes the client late.
+        // Checking after every line would make this test read slowly, and then the client misses samples.
         lines.len().is_multiple_of(16) && is_enough(&count_fates(&lines, scanner.first_third))
     });
     let outcome = echo.end(INT);
     assert_eq!(number(&env.info("front")["counters"], "loan_failed"), 0);
     assert_eq!((hub.end(TERM).exit_code, simulator.end(TERM).exit_code), (Some(0), Some(0)));
-    // No gap is excused that the client did not report.
+    // Samples count as missed only if the client reported the gap.
     checked_topic_seqs(&outcome, "early");
     checked_topic_seqs(&outcome, "zones");
     let counts = count_fates(&outcome.lines(), scanner.first_third);
     assert_eq!(counts.wrong, [""; 0], "{counts:?}");
 }
 
-/// Fates of the warnings. Each warning is in exactly one of the counts.
+/// Numbers of warnings by fate. Each warning is counted in one of the fields, except that `confirmed` includes
+/// `confirmed_early`.
 #[derive(Debug, Default)]
 struct WarningFates {
-    /// The zones of their scan were at least as bad.
+    /// Warnings for which the zones of the scan were at least as bad.
     confirmed: usize,
-    /// Confirmed ones that were sent when the first third of the scan had arrived, or less.
+    /// Confirmed warnings that were sent when at most a third of the scan had arrived.
     confirmed_early: usize,
-    /// The hub withdrew them.
+    /// Warnings that the hub withdrew.
     withdrawn: usize,
-    /// A worse one of the same scan took their place.
+    /// Warnings that a worse one of the same scan replaced.
     worsened: usize,
-    /// The client reported that it missed the sample that told, or took it too late to know its verdict; or the test had
-    /// not received it yet.
+    /// Warnings of which the test could not determine the fate: the client reported that it missed the sample with the
+    /// result, or it received that sample too late, or the test had not received it yet.
     unknown: usize,
-    /// Descriptions of the others, which are wrong.
+    /// Descriptions of all other warnings. They are errors.
     wrong: Vec<String>,
 }
 
-/// A sample of a topic, with the number of samples that the client missed just before it.
+/// Sample of a topic, with the number of samples that the client missed just before it.
 struct NumberedSample<'a> {
     line: &'a Value,
     missed: u64,
 }
 
-/// Returns the samples of `class` in `lines`. A silence that the client reports itself is not a sample.
+/// Returns the samples of `class` in `lines`. Lines with which the client reports a silence are not samples.
 fn numbered_samples<'a>(lines: &'a [Value], class: &str) -> Vec<NumberedSample<'a>> {
     let samples: Vec<_> =
         lines.iter().filter(|line| line["class"] == class && line["topic_seq"].is_u64()).collect();
@@ -98,8 +102,9 @@ fn numbered_samples<'a>(lines: &'a [Value], class: &str) -> Vec<NumberedSample<'
     samples.iter().enumerate().map(|(at, &line)| NumberedSample { line, missed: missed(at) }).collect()
 }
 
-/// Finds what became of each warning in `lines`, by its number: the next sample of the topic withdraws it or replaces it, or
-/// the zones of its scan confirm it. It depends on the numbers alone, and not on which of two topics was printed first.
+/// Determines the fate of each warning in `lines` by its sequence number: the next sample of the topic withdraws or
+/// replaces it, or the zones of its scan confirm it. The order in which lines of different topics were printed does not
+/// matter. `third` is the number of beams in the first third of a scan.
 fn count_fates(lines: &[Value], third: u64) -> WarningFates {
     let (warnings, zones) = (numbered_samples(lines, "early"), numbered_samples(lines, "zones"));
     let mut counts = WarningFates::default();
@@ -116,7 +121,7 @@ fn count_fates(lines: &[Value], third: u64) -> WarningFates {
         if is_withdrawn(line) {
             let stood = at.checked_sub(1).map(|before| warnings[before].line);
             let is_its = stood.is_some_and(|stood| !is_withdrawn(stood) && is_of_same(stood));
-            // The first sample of the client may withdraw a warning that was sent before it attached.
+            // The first sample that the client receives may withdraw a warning from before it attached.
             if !is_its && *missed == 0 && at > 0 {
                 counts.wrong.push(format!("nothing to withdraw: {line}"));
             }
@@ -135,13 +140,14 @@ fn count_fates(lines: &[Value], third: u64) -> WarningFates {
                 continue;
             }
             Some(next) if next.missed > 0 => {
-                // Its withdrawal may be among them.
+                // The sample that withdraws the warning may be among the missed ones.
                 counts.unknown += 1;
                 continue;
             }
             _ => {}
         }
-        // For a revolution, only its packets are numbered before it is complete, so its zones have a greater number.
+        // The `seq` of a warning for a revolution is that of a packet before it is complete, so the zones of the scan
+        // have a greater one.
         let is_telegram = number(line, "bytes_seen") > 0;
         let of_scan = zones.iter().position(|zones| number(zones.line, "seq") >= seq);
         let Some(NumberedSample { line: of_scan, missed }) = of_scan.map(|at| &zones[at]) else {
@@ -162,8 +168,8 @@ fn count_fates(lines: &[Value], third: u64) -> WarningFates {
             continue;
         }
         let holds = of_scan["verdict"] == "stop" || of_scan["verdict"] == line["verdict"];
-        // A revolution with gaps may be worse than it looks. A scan that waited for a busy hub says nothing about the
-        // present.
+        // The zones of a revolution with gaps may be worse than the warning. A scan that waited for a busy hub is too
+        // old for a verdict.
         let waited = of_scan["flags"].to_string().contains("stamp_estimated");
         let is_unsure =
             of_scan["verdict"] == "unknown" && (waited || line["verdict"] == "slow" && !is_telegram);
@@ -179,7 +185,7 @@ fn count_fates(lines: &[Value], third: u64) -> WarningFates {
 #[test]
 fn zones_confirm_warnings_of_incomplete_telegrams() {
     let env = TestEnv::new();
-    // The post is in the first third, and the telegram is read in three. A busy hub reads it later, but not always.
+    // The post is in the first third, and the hub reads a telegram in three parts. A busy hub sometimes reads later.
     check_warnings(&env, &LMS_SCANNER, &[], |counts| counts.confirmed >= 20 && counts.confirmed_early >= 10);
 }
 
@@ -199,7 +205,7 @@ fn warning_of_a_damaged_telegram_is_withdrawn() {
     });
 }
 
-/// Most of some turns is lost: they are counted, and make no scan.
+/// Line that loses most of some revolutions. The hub counts them as lost and publishes no scan of them.
 const GAPS: &str = "--fault=silence=0.07,silence_at=3,silence_every=0.3";
 
 #[test]
@@ -218,7 +224,7 @@ fn warnings_are_computed_only_for_subscribers() {
         let mut zones = env.echo(&["front/zones"]);
         zones.await_lines(10, "a post", |line| line["verdict"] == "stop");
         let first = env.echo(&["front/early"]).await_line("a warning", is_class("early"));
-        // What is not sent has a number too, if it was made.
+        // Results that the hub computed without sending them have a number, too.
         assert_eq!(number(&first, "topic_seq"), 0, "{first}");
     }
 }

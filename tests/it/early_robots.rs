@@ -1,5 +1,5 @@
-//! The robot's verdict with early warnings and without them. Rust, Python, C and the lights take the same ones, and only if
-//! they are requested.
+//! Combined verdict of a robot with and without early warnings. Rust, Python, C and `leds` use the same warnings, and
+//! only on request.
 
 use std::process::Command;
 
@@ -28,7 +28,7 @@ fn python_robot_subscribes_to_warnings_until_it_ends() {
     assert_eq!((hub.end(TERM).exit_code, simulator.end(TERM).exit_code), (Some(0), Some(0)));
 }
 
-/// A sensor whose zones and warnings are said here.
+/// Sensor whose zones and warnings the test publishes.
 struct SimulatedSensor {
     zones: Publication<Zones>,
     early: Publication<Early>,
@@ -36,7 +36,7 @@ struct SimulatedSensor {
 }
 
 impl SimulatedSensor {
-    /// One called `robot1.front`, alone in the domain of `env`.
+    /// Creates the sensor `robot1.front`, the only one in the domain of `env`.
     fn new(env: &TestEnv) -> SimulatedSensor {
         let topics = [Topic::Zones, Topic::Early];
         let session =
@@ -46,7 +46,7 @@ impl SimulatedSensor {
         SimulatedSensor { zones, early, sensor }
     }
 
-    /// The header of what is said of scan `seq`, whose zones hold for longer than a test.
+    /// Returns a header for results of scan `seq`. Its period is so long that the zones remain valid during the test.
     fn header_of_scan(&self, seq: u64) -> Header {
         Header { seq, period_us: 1_000_000_000, ..self.zones.header() }
     }
@@ -66,7 +66,8 @@ impl SimulatedSensor {
     }
 }
 
-/// Programs that follow the verdict of `robot1.front`, each with warnings or without.
+/// Starts programs that print the verdict of `robot1.front`, each one with and without warnings. The flag is whether it
+/// uses warnings.
 fn start_robots(env: &TestEnv) -> Vec<(bool, Program)> {
     let mut commands = Vec::new();
     for early in [false, true] {
@@ -86,7 +87,7 @@ fn start_robots(env: &TestEnv) -> Vec<(bool, Program)> {
     commands.into_iter().map(|(early, command)| (early, Program::start(command))).collect()
 }
 
-/// What a line says of the robot, in C by its number.
+/// Returns the verdict in a line. Programs in C print its number.
 fn verdict(line: &Value) -> Option<Verdict> {
     let is_reported =
         |verdict: &Verdict| line["verdict"] == verdict.name() || line["verdict"] == *verdict as u64;

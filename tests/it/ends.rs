@@ -1,4 +1,5 @@
-//! How programs end: by a signal, by a reader that goes away, or by being killed, and what they leave behind.
+//! Exits of programs after a signal, after a reader has closed the pipe, and after being killed, and the files that
+//! remain.
 
 use std::fs::{self, File};
 use std::io::{BufRead, BufReader};
@@ -10,7 +11,7 @@ use crate::testkit::{INT, KILL, Program, TERM, TestEnv, exists_or_is_symlink, is
 use rustix::pipe::{PipeFlags, pipe_with};
 use serde_json::Value;
 
-/// A hub whose sensor is a recording of some minutes, in the sensor's pace.
+/// Starts a hub whose sensor is a recording of some minutes that is played in real time.
 fn hub(env: &TestEnv) -> Program {
     let scans: Vec<u8> = (0..4000).flat_map(testkit::scan).collect();
     let file = env.file("scans", scans);
@@ -27,7 +28,7 @@ fn a_hub_ends_by_both_signals_and_leaves_nothing() {
         subscriber.await_lines(3, "a scan", is_class("scan"));
         assert!(!env.leftover_files().is_empty(), "looked at the wrong place");
         assert_eq!(hub.end(signal).exit_code, Some(0), "{signal:?}");
-        // Once the consumer has gone too.
+        // Shared memory is freed once the subscriber has exited, too.
         assert_eq!(subscriber.end(INT).exit_code, Some(0));
         wait_until("shared memory is free", || env.leftover_files().is_empty());
         assert_eq!(simulator.end(signal).exit_code, Some(0));
@@ -52,7 +53,7 @@ fn interrupted_echo_reports_its_sample_count() {
             assert_eq!(error, (code == 130).then_some(Some("interrupted")));
         }
     }
-    // One that is through is not interrupted.
+    // A program that has printed all requested samples exits with 0, not as interrupted.
     let outcome = env.run(&["echo", "--json", "front/scan", "-n", "5"]);
     assert_eq!((outcome.exit_code, outcome.of_class("scan").len()), (Some(0), 5), "{outcome}");
 }
@@ -80,7 +81,7 @@ fn a_reader_that_has_enough_is_no_failure() {
 fn every_line_is_one_write() {
     let env = TestEnv::new();
     let _hub = hub(&env);
-    // A pipe that keeps writes apart: what is read at once was written at once.
+    // A packet pipe preserves the boundaries of writes, so that each read returns the bytes of one write.
     let (read, write) = pipe_with(PipeFlags::DIRECT | PipeFlags::CLOEXEC).expect("a pipe");
     let mut command = env.command(&["echo", "--json", "front/scan", "front/telegram", "front/status"]);
     command.stdin(Stdio::null()).stdout(write).stderr(Stdio::null());
@@ -119,7 +120,7 @@ fn a_killed_echo_leaves_whole_lines() {
 fn a_simulator_takes_and_leaves_only_its_own_place() {
     let env = TestEnv::new();
     let (port, mine) = (env.path("front"), env.file("mine", "mine"));
-    // What a killed simulator left behind is replaced.
+    // A new simulator replaces the symlink that a killed one left.
     let simulator = env.simulator(&["front"], &[] as &[&str]);
     let old = fs::read_link(&port).expect("a symlink");
     assert_eq!(simulator.end(KILL).exit_code, None);
@@ -128,7 +129,7 @@ fn a_simulator_takes_and_leaves_only_its_own_place() {
     assert!(fs::metadata(&port).is_ok(), "leads nowhere");
     assert_eq!(simulator.end(INT).exit_code, Some(0));
     assert!(!exists_or_is_symlink(&port));
-    // Nothing else is.
+    // A simulator never replaces other files or symlinks.
     symlink(&mine, &port).expect("a symlink");
     let link = env.path_argument("front");
     for place in [&mine, &link] {

@@ -1,5 +1,5 @@
-//! Exit codes of files that a user names: 66 for an input that cannot be read, 73 for an output that cannot be created, and 78
-//! for wrong values in a file that could be read.
+//! Exit codes for files that a user names: 66 for an input that cannot be read, 73 for an output that cannot be
+//! created, and 78 for wrong values in a readable file.
 
 use std::fs::{self, Permissions};
 use std::os::unix::fs::{PermissionsExt, symlink};
@@ -10,9 +10,9 @@ use rustix::fs::{CWD, FileType, Mode, mknodat};
 use crate::foreign_user::{OTHER_UID, scanhub, with_another_user};
 use crate::testkit::{Outcome, Program, TestEnv};
 
-/// Command lines with an input file, for which `FILE` stands, and whether that is a recording, which may have any size.
-/// `doctor` is not one of them: it reports such a file as a failed check. Nor is a file that a configuration names, because
-/// its name is a value of the configuration (78).
+/// Command lines with an input file in place of `FILE`, and whether the file is a recording, which may have any size.
+/// `doctor` is not in this list, because it reports such a file as a failed check. Neither are files that a
+/// configuration names, because their name is a value of the configuration (78).
 const INPUT_COMMANDS: [(&str, bool); 20] = [
     ("run --no-system-config --config FILE", false),
     ("run --no-system-config --link=a=file:FILE", true),
@@ -36,7 +36,7 @@ const INPUT_COMMANDS: [(&str, bool); 20] = [
     ("site check FILE", false),
 ];
 
-/// Command lines with an output file, for which `FILE` stands.
+/// Command lines with an output file in place of `FILE`.
 const OUTPUT_COMMANDS: [&str; 6] = [
     "record --output FILE",
     "convert LOG FILE",
@@ -49,7 +49,7 @@ const OUTPUT_COMMANDS: [&str; 6] = [
 const SITE_FILE: &str = "[[sensor]]\nname = \"front\"\npose = { x = 0, y = 0, yaw = 0 }\n[[room]]\nname = \"a\\u0007<b>\"\npolygon = \
                     [[0, 0], [4, 0], [4, 3]]\n";
 
-/// Runs the program with the words of `line`, and with `file` for `FILE`.
+/// Runs the program with the words of `line`, with `file` in place of `FILE`.
 fn run(env: &TestEnv, line: &str, file: &str) -> Outcome {
     let words: Vec<String> = line
         .split(' ')
@@ -66,7 +66,7 @@ fn run(env: &TestEnv, line: &str, file: &str) -> Outcome {
 fn an_input_that_cannot_be_read_is_66() {
     let env = TestEnv::new();
     let long = env.file("long", "# long\n".repeat(100_000));
-    // A key must not be readable for others.
+    // A file with a key must not be readable by other users.
     fs::set_permissions(&long, Permissions::from_mode(0o600)).expect("it is ours");
     let [directory, pipe, socket] = ["directory", "pipe", "socket"].map(|name| env.path(name));
     fs::create_dir(&directory).expect("a directory");
@@ -83,7 +83,7 @@ fn an_input_that_cannot_be_read_is_66() {
             assert_eq!(run(&env, line, file).exit_code, Some(66), "{line} {file}");
         }
     }
-    // `telegram decode` reports bytes without a telegram itself (5).
+    // `telegram decode` itself reports bytes without a telegram, and exits with 5.
     let is_checked = |line: &str| !line.contains("--config") && !line.starts_with("telegram");
     let mut random = fastrand::Rng::with_seed(43);
     let junk = env.file("junk", std::iter::repeat_with(|| random.u8(..)).take(50_000).collect::<Vec<u8>>());
@@ -167,7 +167,7 @@ fn an_output_that_cannot_be_created_is_73() {
         refused(&env.path_argument("link.mcap"), &format!("it is a link to {file}"));
         refused(&env.path_argument("dangling.mcap"), "it is a link to absent");
         refused(&env.path_argument("nowhere/new.mcap"), "No such file or directory");
-        // `convert` knows no such format.
+        // `convert` has no format for this name.
         if !line.starts_with("convert") {
             refused("/dev/null", "it is a device");
         }
@@ -199,7 +199,7 @@ fn an_existing_output_is_replaced_by_force() {
     ]);
     drop(simulator.ready());
     assert!(!fs::read_to_string(&truth).expect("a file").starts_with("old"));
-    // `man` checks each page.
+    // `man` checks each page before it writes one.
     let pages = env.path_argument("man");
     fs::create_dir(&pages).expect("a directory");
     let page = env.path("man/scanhub-run.1");

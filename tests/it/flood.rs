@@ -1,5 +1,6 @@
-//! Ten megabytes of garbage as fast as the hub reads, with a telegram now and then: each is delivered, and nothing
-//! grows. From a serial server no more is read than twice what the line brings, and what it costs is little.
+//! Floods of garbage. Ten megabytes arrive as fast as the hub reads, with a telegram now and then: the hub publishes
+//! each telegram, and its memory does not grow. From a serial server, the hub reads at most twice what the line can
+//! carry, with little CPU time.
 
 use std::io::Write;
 use std::net::TcpListener;
@@ -9,7 +10,7 @@ use std::time::{Duration, Instant};
 use crate::testkit::{INT, Program, TERM, TestEnv, TestLine, bytes_of, is_class, number, scan, wait_until};
 use fastrand::Rng;
 
-/// Garbage that a framer has to work for: noise, start bytes, and heads of telegrams that never end.
+/// Returns garbage that is expensive for a framer: noise, start bytes, and heads of telegrams that never end.
 fn garbage(random: &mut Rng, len: usize) -> Vec<u8> {
     let head = &scan(0)[..7];
     let mut bytes = Vec::with_capacity(len + 64);
@@ -22,20 +23,20 @@ fn garbage(random: &mut Rng, len: usize) -> Vec<u8> {
         }
     }
     bytes.truncate(len);
-    // Its end must not be the beginning of what follows it.
+    // The end must not look like the start of the bytes that follow.
     bytes.extend([0; 8]);
     bytes
 }
 
-/// Resident kilobytes of a process.
+/// Returns the resident memory of a process in kilobytes.
 fn resident_kb(pid: u32) -> u64 {
     let status = std::fs::read_to_string(format!("/proc/{pid}/status")).expect("the hub lives");
     let line = status.lines().find(|line| line.starts_with("VmRSS:")).expect("a resident size");
     line.split_whitespace().nth(1).and_then(|number| number.parse().ok()).expect("a number")
 }
 
-/// Waits for all that was `sent`, in order and bit for bit. Of random frames one in 65,536 has a right checksum by
-/// chance: what else comes must be marked, and is counted.
+/// Waits for all telegrams in `sent`, in order and with the same bytes. By chance, one in 65,536 random frames has a
+/// right checksum. Such telegrams must be marked as suspect; returns their number.
 fn receive(subscriber: &mut Program, sent: &[Vec<u8>]) -> u64 {
     let mut wrong = 0;
     for sent in sent {
@@ -65,8 +66,8 @@ fn telegrams_in_a_flood_of_garbage() {
             line.send(&sent[sent.len() - 1]);
         }
     };
-    // A stream to be adopted, until the mode of the sensor, which nobody tells, has been asked for in vain; and a
-    // first flood, after which everything that the hub ever touches was touched.
+    // Send a stream until the hub has adopted it and has stopped requesting the sensor's mode, to which no reply comes.
+    // The first flood then makes the hub touch all memory that it will ever use.
     let steady = scan(0);
     line.send(&[&steady[..], &steady].concat());
     subscriber.await_lines(2, "the stream", is_class("telegram"));
@@ -86,7 +87,7 @@ fn telegrams_in_a_flood_of_garbage() {
     assert_eq!(hub.end(TERM).exit_code, Some(0));
 }
 
-/// Processor time that a process has taken.
+/// Returns the CPU time that a process has used.
 fn cpu_time(pid: u32) -> Duration {
     let tasks = std::fs::read_dir(format!("/proc/{pid}/task")).expect("the hub lives").flatten();
     let of_task = |task: std::fs::DirEntry| {
@@ -104,7 +105,7 @@ fn a_serial_server_that_sends_garbage_at_full_speed() {
     let hub = env.hub(&[link]);
     let mut subscriber = env.echo(&["front/telegram"]);
     let (mut server, _) = listener.accept().expect("the hub comes");
-    // More than is allowed at once, with telegrams in it; then garbage without an end.
+    // Send more than is allowed at once, with telegrams in it, and then endless garbage.
     let mut random = Rng::with_seed(5);
     let sent: Vec<Vec<u8>> = (0..20).map(|number| scan(1000 + number)).collect();
     let steady = scan(0);
@@ -124,7 +125,7 @@ fn a_serial_server_that_sends_garbage_at_full_speed() {
     let says = "the server sends more than a line of 500000 baud carries";
     env.await_info("front", |info| info["last_error"].as_str().is_some_and(|error| error.starts_with(says)));
     let bytes = || number(&env.info("front")["counters"], "bytes_read");
-    // The counters are as old as the last status: a second.
+    // The counters come from the last status, so they are up to a second old.
     let (before, since, idle) = (bytes(), Instant::now(), cpu_time(hub.pid()));
     wait_until("a part of it is read", || bytes() > before + 300_000);
     let worked = cpu_time(hub.pid()).saturating_sub(idle);

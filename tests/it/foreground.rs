@@ -1,5 +1,6 @@
-//! Checks that `multi` separates people from a room, and better than the paper's method: one run of each scene that has
-//! a target. `benches/perception` measures ten. A change of the simulated world or of a method shows here first.
+//! Quality of the method `multi`: it separates people from a room, and better than the paper's method. Each scene that
+//! has a target is run once. `benches/perception` runs each scene ten times. Changes of the simulated world or of a
+//! method show here first.
 
 #[path = "../testkit/foreground.rs"]
 mod scenes;
@@ -10,7 +11,7 @@ use scanhub_schema::{Background, Foreground};
 
 use scenes::{Boxes, Detector, ExpectedAnswer, HubDetector, LabeledScan, Scene, Score, play};
 
-/// A seed that no parameter was tuned on.
+/// Seed for which no parameter was tuned.
 const SCENE_SEED: u64 = 20;
 
 fn hub_detector(method: Kind) -> Box<dyn Detector> {
@@ -23,7 +24,7 @@ fn scores(frames: &[LabeledScan]) -> (Score, Score) {
 
 #[test]
 fn multi_separates_people_from_rooms() {
-    // The limits are somewhat below the average of ten runs, because a single run varies.
+    // The limits are slightly below the average of ten runs, because a single run varies.
     for (name, world, unit, recall, precision, wrong_per_scan) in [
         ("the room of Fig. 8", "fig8", Unit::Mm, 0.98, 0.95, 0.1),
         ("a corridor", "corridor", Unit::Cm, 0.9, 0.95, 0.1),
@@ -52,13 +53,13 @@ fn boxes_are_learned_and_forgotten() {
     );
 }
 
-/// A model that starts with a saved background, which has one range per beam, reports no more wrong beams than one that
-/// continues.
+/// A model that starts with a saved background, which has one range per beam, reports no more wrong beams than a model
+/// that was not interrupted.
 #[test]
 fn a_model_taken_back_is_right_at_once() {
     for world in ["fig8", "faint"] {
         let frames = play(&Scene { name: world, world, unit: Unit::Mm, mixed: true }, SCENE_SEED);
-        // Before the walker arrives, and while a person is present.
+        // Switch before a person enters, and while a person is present.
         for at in [LEARNING_SCANS, 800] {
             let mut model = BackgroundModel::new(Settings::default(), BEAM_COUNT);
             let mut out = Foreground::of(BEAM_COUNT);
@@ -86,7 +87,7 @@ fn a_model_taken_back_is_right_at_once() {
     }
 }
 
-/// Beams of each scan.
+/// Number of beams of each scan.
 const BEAM_COUNT: usize = 361;
-/// Number of scans after which everything in these rooms is known.
+/// Number of scans after which the background of all beams in these rooms is known.
 const LEARNING_SCANS: usize = 560;

@@ -1,5 +1,6 @@
-//! What another user of the same machine can do to hub and clients of this one: nothing but to be named. Each test has
-//! a /tmp and a /dev/shm of its own; the user is root, whom no permission stops, and the stranger somebody else.
+//! Attacks by another user of the same machine: the hub and its clients name that user, but are not harmed otherwise.
+//! Each test has its own /tmp and /dev/shm. The programs run as root, whom no permission stops, and the attacker is
+//! another user.
 
 use std::fs;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt, symlink};
@@ -10,18 +11,19 @@ use std::process::Command;
 use crate::testkit;
 use crate::testkit::{INT, KILL, Outcome, Program, TERM, TestEnv, is_class, succeeds, wait_until};
 
-/// Where the namespace is made: the test that shall run in it.
+/// Variable that is set in the process that runs in the new namespace.
 const NAMESPACE_VARIABLE: &str = "SCANHUB_TEST_STRANGERS";
 pub(crate) const OTHER_UID: u32 = 65533;
-/// What root has and nobody may touch.
+/// Content of root's file that no program may change.
 const CONTENT: &str = "not a lock";
 
-/// Runs `test`, which is called `name`, beside a stranger; says so if the system does not allow that.
+/// Runs `test`, whose name is `name`, in a namespace with its own /tmp and /dev/shm. Skips it if the system does not
+/// allow that.
 pub(crate) fn with_another_user(name: &str, test: impl FnOnce()) {
     if std::env::var_os(NAMESPACE_VARIABLE).is_some() {
         return test();
     }
-    // Where /tmp is hidden the programs may be, too.
+    // The programs may be in the directory that the new /tmp hides, so copy them.
     let script = "mount -t tmpfs -o mode=755 none /mnt && cp \"$1\" /mnt/test && cp \"$2\" /mnt/scanhub \
                   && mount -t tmpfs -o mode=1777 none /tmp && mount -t tmpfs -o mode=1777 none /dev/shm";
     let unshare = |then: &str| {
@@ -40,7 +42,7 @@ pub(crate) fn with_another_user(name: &str, test: impl FnOnce()) {
     testkit::rerun_test(name, inside);
 }
 
-/// The program with `arguments` and nothing but them, as root or as the stranger.
+/// Returns a command that runs the program with only these arguments, as this user.
 pub(crate) fn scanhub(user: u32, arguments: &[&str]) -> Command {
     let mut command = Command::new("/mnt/scanhub");
     command.args(arguments).env_clear().env("SCANHUB_END_WITH_PARENT", "1").uid(user).gid(user);
@@ -51,19 +53,19 @@ fn run(user: u32, arguments: &[&str]) -> Outcome {
     Program::start(scanhub(user, arguments)).wait()
 }
 
-/// What the stranger does, as a line for the shell; it has to succeed.
+/// Runs a line of shell as the other user. It must succeed.
 pub(crate) fn run_as_other_user(script: &str) {
     assert!(succeeds_as_other_user(script), "{script}");
 }
 
-/// Whether the stranger can do it.
+/// Returns whether a line of shell succeeds as the other user.
 fn succeeds_as_other_user(script: &str) -> bool {
     let mut shell = Command::new("sh");
     shell.args(["-c", script]).uid(OTHER_UID).gid(OTHER_UID).current_dir("/tmp");
     succeeds(shell)
 }
 
-/// A directory of root with what `doctor --clean` removes from a domain, and its owner's alone.
+/// Creates a private directory of root with files that `doctor --clean` removes from a domain.
 fn create_victim_directory() -> PathBuf {
     let prey = PathBuf::from("/tmp/prey");
     fs::DirBuilder::new().mode(0o700).create(&prey).expect("a directory");
@@ -84,7 +86,8 @@ fn check_untouched(target: &Path) {
     }
 }
 
-/// Hub, clients and doctor refuse with all of `words`, and `prey` is as it was.
+/// Asserts that hub, clients and doctor fail with a message that contains all of `words`, and that `target` is
+/// unchanged.
 fn check_all_refuse(target: &Path, base: &[&str], words: &[&str]) {
     for verb in [
         &["run", "--no-system-config", "--link=front=/tmp/no-port"][..],
@@ -110,7 +113,7 @@ fn the_fallback_directory_that_a_stranger_made() {
         check_all_refuse(&prey, &[], &["/tmp/scanhub-0", "belongs to user 65533"]);
         run_as_other_user("rm -r /tmp/scanhub-0 && ln -s /tmp/prey /tmp/scanhub-0");
         check_all_refuse(&prey, &[], &["/tmp/scanhub-0", "is a link"]);
-        // The domain itself is root's, and its owner could put another one there.
+        // The domain itself belongs to root, but the owner of the directory above could replace it.
         run_as_other_user("rm /tmp/scanhub-0 && mkdir -m 777 /tmp/scanhub-0");
         fs::DirBuilder::new().mode(0o700).create("/tmp/scanhub-0/scanhub").expect("a domain");
         check_all_refuse(&prey, &[], &["/tmp/scanhub-0", "belongs to user 65533"]);
@@ -133,7 +136,8 @@ fn links_in_a_domain_and_on_the_way_to_it() {
         mode(&base.join("scanhub"), 0o700);
         check_all_refuse(&prey, &["--root=/tmp/base"], &["/tmp/base/scanhub/hub.lock", "is a link"]);
         fs::remove_file(base.join("scanhub/hub.lock")).expect("is root's to remove");
-        // Above the base: root's own link where nobody else writes is followed, in /tmp none is.
+        // Above the base, a link of root is followed if only root can write to its directory. In /tmp, no link is
+        // followed.
         run_as_other_user("ln -s /tmp/base /tmp/way");
         check_all_refuse(&prey, &["--root=/tmp/way/b"], &["/tmp/way", "is a link of user 65533"]);
         symlink(base, "/mnt/way").expect("a link of root's");
@@ -145,14 +149,15 @@ fn links_in_a_domain_and_on_the_way_to_it() {
     });
 }
 
-/// Segments and bells of `env`.
+/// Returns the files of the shared memory of `env`, sorted.
 fn segments(env: &TestEnv) -> Vec<PathBuf> {
     let mut paths = testkit::shared_memory(&env.domain().prefix());
     paths.sort();
     paths
 }
 
-/// Returns what another user could do to `path`: its mode, if it is not private, and attacks that succeeded.
+/// Returns the operations on `path` that another user is allowed: its mode if it is not private, and attacks that
+/// succeeded.
 fn allowed_attacks(path: &Path) -> Vec<String> {
     let mode = fs::metadata(path).map_or(0, |metadata| metadata.mode() & 0o077);
     let path = path.display();
@@ -171,14 +176,14 @@ fn allowed_attacks(path: &Path) -> Vec<String> {
 #[test]
 fn shared_memory_of_strangers() {
     with_another_user("foreign_user::shared_memory_of_strangers", || {
-        // Both would be the names, if they could be guessed.
+        // A domain without a random prefix would use this name.
         run_as_other_user("touch /dev/shm/sh_scanhub_front.bell");
         let env = TestEnv::new();
         let simulator = env.simulator(&["front"], &["--baud=500000"]);
         let hub = env.hub(&[env.link("front")]);
         let mut subscriber = env.echo(&["front/scan"]);
         let mut allowed = Vec::new();
-        // With its next scans, the hub removes segments of a subscriber that has left, perhaps during the attacks.
+        // With its next scans, the hub removes segments of a subscriber that has exited, perhaps during the attacks.
         wait_until("the attacks change nothing", || {
             let own = segments(&env);
             subscriber.await_lines(10, "a scan", is_class("scan"));
@@ -187,7 +192,7 @@ fn shared_memory_of_strangers() {
             own == segments(&env)
         });
         assert!(allowed.is_empty(), "{allowed:?}");
-        // A file of no use under the names, which all can see now, is in nobody's way.
+        // Now that every user can see the prefix, useless files with it do no harm.
         let prefix = fs::read_to_string(env.domain().root().join("prefix")).expect("the hub's");
         let prefix = prefix.trim_end();
         run_as_other_user(&format!(
@@ -202,7 +207,8 @@ fn shared_memory_of_strangers() {
         let text = finding.to_string();
         assert!(text.contains(&format!("{prefix}anything")) && text.contains("65533"), "{text}");
 
-        // The bell goes with the hub; who waits keeps the names, so that a stranger can occupy it meanwhile.
+        // The hub removes its doorbell when it exits. The waiting subscriber keeps the prefix in use, so another user
+        // can occupy the name of the doorbell.
         assert_eq!(hub.end(TERM).exit_code, Some(0));
         run_as_other_user(&format!("mkfifo /dev/shm/{prefix}front.bell"));
         let refused = env.run(&["run", "--no-system-config", &env.link("front")]);
@@ -214,7 +220,7 @@ fn shared_memory_of_strangers() {
         let hub = env.hub(&[env.link("front")]);
         subscriber.await_line("the next hub's", |line| line["kind"] == "hub_back");
         subscriber.await_line("a scan", is_class("scan"));
-        // Killed, it leaves all of them.
+        // A killed hub leaves all of its files.
         assert_eq!(hub.end(KILL).exit_code, None);
         let hub = env.hub(&[env.link("front")]);
         subscriber.await_line("the third hub's", |line| line["kind"] == "hub_back");
@@ -222,7 +228,7 @@ fn shared_memory_of_strangers() {
         for program in [subscriber, second, hub] {
             assert_eq!(program.end(INT).exit_code, Some(0));
         }
-        // After the last one nothing but the stranger's is there, and none of it was written to.
+        // After the last program has exited, only the files of the other user remain, and nothing was written to them.
         assert_eq!(
             segments(&env),
             [format!("/dev/shm/{prefix}anything"), format!("/dev/shm/{prefix}link")].map(PathBuf::from)

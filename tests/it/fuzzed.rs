@@ -1,5 +1,5 @@
-//! Runs the fuzzer's targets without the fuzzer: on the inputs of the corpora, on mutations of them, and on noise from
-//! fixed seeds. `tests/fuzz/README.md` says how to search for more inputs.
+//! Targets of the fuzzer, run without the fuzzer on the inputs of the corpora, on mutations of them, and on noise from
+//! fixed seeds. `tests/fuzz/README.md` describes how to search for more inputs.
 
 // Public because `cargo fuzz` uses the same file as a crate.
 #[allow(unreachable_pub)]
@@ -11,8 +11,8 @@ use std::path::Path;
 
 use fastrand::Rng;
 
-/// Returns the inputs in the corpus of `target`: each line has the bytes of one in hex, and a name after a space if it
-/// was written by hand.
+/// Returns the inputs in the corpus of `target`. Each line has the bytes of an input in hexadecimal, and a name after a
+/// space if the input was written by hand.
 fn corpus(target: &str) -> Vec<Vec<u8>> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/fuzz/corpus/{target}.txt"));
     let text = fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
@@ -30,7 +30,7 @@ fn input(line: &str) -> Vec<u8> {
     pairs.iter().map(|&[high, low]| digit(high) << 4 | digit(low)).collect()
 }
 
-/// Returns one input of `corpus` with a few bytes changed, inserted, cut off or copied from another input.
+/// Returns one input of `corpus` with a few bytes changed, inserted, removed or copied from another input.
 fn mutate(random: &mut Rng, corpus: &[Vec<u8>]) -> Vec<u8> {
     let mut input = corpus[random.usize(..corpus.len())].clone();
     for _ in 0..random.usize(1..8) {
@@ -111,7 +111,7 @@ fn recording() {
     run("recording");
 }
 
-/// Number of inputs for each target in addition to those of the corpus.
+/// Number of mutated inputs for each target.
 const MUTATION_ROUNDS: u32 = 4_000;
 /// Maximum length of a mutated input, in bytes.
 const MAX_INPUT_LEN: usize = 4_096;

@@ -1,5 +1,5 @@
-//! The hub on a network: everything that is sent is heard, checked and counted by a receiver that knows nothing of the
-//! gateway. Each test has a network of its own.
+//! `scanhub gateway`: an independent receiver checks and counts everything that it sends. Each test has its own network
+//! namespace.
 
 use std::collections::BTreeMap;
 use std::net::{Ipv4Addr, UdpSocket};
@@ -24,7 +24,7 @@ fn is_from(sensor: u8, topic: Topic) -> impl Fn(&Datagram<'_>) -> bool {
     move |datagram| (datagram.head.sensor, datagram.head.topic) == (sensor, topic.number())
 }
 
-/// The last lines of an account: those behind the last object of another class.
+/// Returns the final statistics of the gateway: the lines after the last notice.
 fn last_statistics(outcome: &Outcome) -> Vec<Value> {
     let lines = outcome.lines();
     let mut last: Vec<Value> = lines.into_iter().rev().take_while(|line| line["class"] != "notice").collect();
@@ -39,7 +39,7 @@ fn last_statistics(outcome: &Outcome) -> Vec<Value> {
     last
 }
 
-/// What was heard is exactly what the gateway says that it sent, topic by topic, and what it announced last.
+/// Asserts that the received datagrams match the counters of the gateway, topic by topic, and its last announcement.
 fn check_counters(received: &[Vec<u8>], outcome: &Outcome) {
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let mut table = Box::new(GatewayTable::new(&Topic::ALL));
@@ -88,7 +88,7 @@ fn two_sensors_go_out_whole() {
         for topic in ["announce", "scan", "marks", "zones", "foreground", "background", "status"] {
             assert_eq!(sensors.iter().filter(|it| *it == topic).count(), 2, "{topic}");
         }
-        // What a consumer here sees is what one there can read.
+        // A scan that a local subscriber received has the same content in its datagram.
         let scans: Vec<_> =
             received.iter().map(|bytes| decode_datagram(bytes)).filter(is_from(0, Topic::Scan)).collect();
         let mut same = 0;
@@ -105,7 +105,7 @@ fn two_sensors_go_out_whole() {
         let is_front = |line: &&Value| line["sensor"] == "front" && line["topic"] == "scan";
         let missed = number(last_statistics(&outcome).iter().find(is_front).expect("its account"), "missed");
         assert!(same > 0 && same + missed >= 40, "{same} scans were sent, {missed} missed");
-        // The last word is an announcement of each, which says how much was sent.
+        // The last datagram of each sensor is an announcement with the number of datagrams that were sent.
         let last: Vec<_> = received.iter().rev().take(2).map(|bytes| decode_datagram(bytes)).collect();
         for datagram in &last {
             let announce = Announce::unpack(datagram.payload).expect("an announcement");
@@ -140,7 +140,7 @@ fn thinned_topics_keep_samples_of_the_same_scans() {
         };
         let (scans, zones) = (counters(Topic::Scan), counters(Topic::Zones));
         assert!(scans.len() >= 20 && scans.iter().all(|counter| counter % 4 == 0), "{scans:?}");
-        // On a busy machine the gateway misses some.
+        // On a busy machine, the gateway misses some scans.
         assert!(zones.iter().filter(|counter| scans.contains(counter)).count() >= 10, "{zones:?}");
         assert!(zones.iter().all(|counter| counter % 4 == 0), "{zones:?}");
         for bytes in &received {
@@ -250,7 +250,7 @@ fn hubs_and_gateways_are_replaced() {
         first.await_line("the hub", |line| line["kind"] == "hub_back");
         receiver.wait_for_datagrams(10, has_topic(Topic::Scan));
         hub.end(KILL);
-        // Who listens there learns that nothing is known any more.
+        // A listener receives the zones `unknown`.
         wait_until("the last word", || {
             let received = receiver.datagrams();
             let last = received.iter().map(|bytes| decode_datagram(bytes)).rfind(has_topic(Topic::Zones));
@@ -289,7 +289,8 @@ fn oversized_telegrams_are_reported_and_counted() {
         let env = TestEnv::new();
         let _simulator = env.simulator(&["front"], &STREAM_FLAGS);
         let _hub = env.hub(&[env.link("front")]);
-        // Telegrams by themselves cannot go in parts: those of scans have 732 bytes, replies are shorter.
+        // Datagrams with bare telegrams cannot be split into parts. Telegrams of scans have 732 bytes; replies are
+        // shorter.
         let mut gateway = env.gateway(&["--interface=lo", "--mtu=700", "--bare"]);
         let report = gateway.await_line("what does not fit", is_class("lan_link"));
         assert_eq!((&report["to"], &report["state"]), (&"front/telegram".into(), &"failing".into()));
@@ -332,7 +333,7 @@ fn samples_sent_in_parts_are_reassembled() {
             "{remote}"
         );
         assert!(remote.of_class("lan_refused").iter().all(|line| line["payload"] == 0), "{remote}");
-        // The room's scans have intensities: 1095 bytes of payload.
+        // The scans of the room have intensities, so that their payload has 1095 bytes.
         let received = receiver.finish();
         assert!(received.iter().all(|bytes| bytes.len() <= 576));
         let parts = |topic: Topic| {

@@ -1,5 +1,5 @@
-//! What becomes of a gateway when the network does: interfaces that go and come, queues that are full, and what it is told
-//! that cannot be. Each test has a network of its own.
+//! Gateway on a network with faults: interfaces that are removed and created again, full queues, and invalid options.
+//! Each test has its own network namespace.
 
 use std::net::Ipv4Addr;
 use std::process::{Command, Stdio};
@@ -18,7 +18,7 @@ use serde_json::Value;
 const STREAM_FLAGS: [&str; 2] = ["--seed=62", "--baud=500000"];
 const OWN_ADDRESS: Ipv4Addr = Ipv4Addr::new(10, 76, 0, 1);
 
-/// An interface with another one at the end of its cable.
+/// Creates the interface `ours` with another one at the end of its cable.
 fn create_interface() {
     ip("link add ours type veth peer name theirs");
     ip("addr add 10.76.0.1/24 dev ours");
@@ -26,12 +26,12 @@ fn create_interface() {
     ip("link set theirs up");
 }
 
-/// Waits for the state of a destination.
+/// Waits until a destination has this state.
 fn await_state(gateway: &mut Program, state: &str) -> Value {
     gateway.await_line(state, |line| line["class"] == "lan_link" && line["state"] == state)
 }
 
-/// Waits until the account of the scans says more of `key` than now.
+/// Waits until the counter `key` of the scans is higher than now.
 fn await_growth(gateway: &mut Program, key: &str) {
     let mut current = || {
         gateway.signal(USR1);
@@ -41,8 +41,8 @@ fn await_growth(gateway: &mut Program, key: &str) {
     wait_until(key, || current() > now + 3);
 }
 
-/// The first number that the account of `row` can begin with: that of its first datagram, or that which an earlier
-/// announcement says is next.
+/// Returns the first sequence number that the counters of `row` can start with: that of its first datagram, or the next
+/// number in an earlier announcement.
 fn first_sequence(received: &[Vec<u8>], row: &StreamCounters) -> u64 {
     let found = received.iter().find_map(|bytes| {
         let Datagram { head, payload, .. } = decode_datagram(bytes);
@@ -59,7 +59,8 @@ fn first_sequence(received: &[Vec<u8>], row: &StreamCounters) -> u64 {
     u64::from(found.expect("it was heard"))
 }
 
-/// All numbers from the first one heard on were used once: what was not sent has failed.
+/// Asserts that each sequence number from the first received one on was used once: each datagram was received, or the
+/// gateway counted it as failed.
 fn check_gap_free(received: &[Vec<u8>], outcome: &Outcome) {
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let mut table = Box::new(GatewayTable::new(&Topic::ALL));
@@ -84,7 +85,8 @@ fn a_link_that_goes_and_comes() {
         let receiver = Receiver::new(OWN_ADDRESS);
         receiver.wait_for_datagrams(10, |datagram| datagram.head.topic == Topic::Scan.number());
         await_growth(&mut gateway, "sent");
-        // The cable is out, then it is switched off, then it is another one of that name.
+        // Unplug the cable, switch the interface off, and take its address away. Below, another interface gets the same
+        // name.
         for (away, back) in [
             ("link set theirs down", "link set theirs up"),
             ("link set ours down", "link set ours up"),
@@ -105,7 +107,7 @@ fn a_link_that_goes_and_comes() {
         create_interface();
         await_state(&mut gateway, "up");
         await_growth(&mut gateway, "sent");
-        // There the groups have to be joined anew.
+        // The receiver must join the groups again on the new interface.
         let again = Receiver::new(OWN_ADDRESS);
         again.wait_for_datagrams(10, |datagram| datagram.head.topic == Topic::Scan.number());
         let outcome = gateway.end(TERM);
@@ -147,7 +149,7 @@ fn a_reader_that_does_not_read_delays_nothing() {
         let receiver = Receiver::new(Ipv4Addr::LOCALHOST);
         let _simulator = env.simulator(&["front"], &STREAM_FLAGS);
         let _hub = env.hub(&[env.link("front")]);
-        // The pipe stays open, and is soon full.
+        // The pipe stays open, but nothing reads it, so it is soon full.
         let (_reader, writer) = std::io::pipe().expect("a pipe");
         fcntl_setpipe_size(&writer, 8192).expect("a small one");
         let mut command = env.command(&["gateway", "--json", "--no-system-config", "--interface=lo"]);
@@ -162,7 +164,7 @@ fn a_reader_that_does_not_read_delays_nothing() {
             signal(USR1);
             poll(&mut [PollFd::new(&writer, PollFlags::OUT)], Some(&now)) == Ok(0)
         });
-        // Some seconds of accounts that nobody can be told.
+        // The gateway continues although it cannot write its statistics for several seconds.
         let is_announce =
             |datagram: &scanhub_schema::datagram::Datagram<'_>| datagram.head.topic == Announce::NUMBER;
         receiver.wait_for_datagrams(3, is_announce);
@@ -196,7 +198,7 @@ fn prints_statistics_on_sigusr1() {
         gateway.signal(USR1);
         gateway.wait_for_text("front/background: ");
         gateway.wait_for_text("to lo: ");
-        // A new one goes out at once, between the repetitions.
+        // A new background is sent at once, between the repetitions.
         let generation = |bytes: &[u8]| {
             let datagram = decode_datagram(bytes);
             let is_one = is_background(&datagram);
@@ -262,7 +264,7 @@ fn rejects_impossible_settings_with_a_hint() {
             Program::start(command).wait()
         };
         assert_eq!(unwritable.exit_code, Some(73), "{unwritable}");
-        // What the configuration says counts, and a flag wins over it.
+        // The gateway uses the values of the configuration, but flags take precedence.
         let configured = config("[gateway]\ninterface = \"eth8\"\ntopics = [\"front/status\"]\nmtu = 1400\n");
         let mut gateway = env.start_gateway(&["--interface=lo", &configured]);
         let begin = gateway.await_line("its begin", is_class("gateway"));

@@ -1,4 +1,4 @@
-//! What a hub keeps for the next one beside shared memory: where it is, for whom, and that nothing depends on it.
+//! Files in which a hub saves state for the next one: their location and mode, and that the hub works without them.
 
 use std::fs;
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
@@ -20,12 +20,12 @@ fn next_hub_begins_its_search_at_the_saved_rate() {
     assert_eq!(simulator.end(TERM).exit_code, Some(0));
     assert_eq!(env.simulator_totals("front").1, 0);
 
-    // Nobody streams: the next one asks there, for what is told in few bytes.
+    // No scanner streams on this line, so the next hub starts its search at the saved rate.
     let line = TestLine::create(&env.path("front"));
     let outcome = search(&env, &line, env.lms_link("front"));
     assert!(outcome.stderr.contains("the search begins at 19200 baud"), "{outcome}");
 
-    // A link with the same name at another port, and a file that anybody may have written.
+    // The saved rate is ignored for a link with the same name at another port, and if other users can write the file.
     let other = TestLine::create(&env.path("other"));
     let outcome = search(&env, &other, format!("--link=front={},family=lms", env.path_argument("other")));
     assert!(!outcome.stderr.contains("the search begins at"), "{outcome}");
@@ -37,8 +37,8 @@ fn next_hub_begins_its_search_at_the_saved_rate() {
     assert!(outcome.stderr.contains("delete it; its content is learned again"), "{outcome}");
 }
 
-/// Ends a hub that has asked for the status of a sensor on `line`. The rate of the line says little: a test that a busy
-/// machine does not run for a while sees a later one.
+/// Runs a hub until it has sent a request on `line`, and returns its outcome with the log. The log shows where the
+/// search started. The baud rate of the line does not, because on a busy machine the test may read a later one.
 fn search(env: &TestEnv, line: &TestLine, link: String) -> Outcome {
     let mut command = env.command(&["run", "--json", &link]);
     command.env("SCANHUB_LOG", "debug");

@@ -1,4 +1,4 @@
-//! Datagrams with a key: who has it believes its gateway, and nobody else, and nothing that is sent again.
+//! Datagrams with a key: a listener with the key accepts each datagram of its gateway once, and no others.
 
 use std::net::UdpSocket;
 use std::os::unix::fs::PermissionsExt;
@@ -12,7 +12,7 @@ use serde_json::Value;
 
 const STREAM_FLAGS: [&str; 2] = ["--seed=61", "--baud=500000"];
 
-/// A new key.
+/// Creates a key file, and returns the flag that names it.
 fn key(env: &TestEnv, name: &str) -> String {
     let made = env.run(&["key", "new", &env.path_argument(name), "--json"]);
     assert_eq!(made.exit_code, Some(0), "{made}");
@@ -23,18 +23,18 @@ fn listener(env: &TestEnv, key: &str) -> Program {
     env.start(&["listen", "--json", "--topic=zones", "--topic=scan", key]).ready()
 }
 
-/// Datagrams that were refused for this reason.
+/// Returns the number of datagrams that were refused for this reason.
 fn refusal_count(outcome: &Outcome, reason: &str) -> u64 {
     number(outcome.of_class("lan_refused").last().expect("the account"), reason)
 }
 
-/// The line of this class of the account that it gives when asked.
+/// Requests statistics from `program`, and returns the line of this class.
 fn request_statistics(program: &mut Program, class: &str) -> Value {
     program.signal(USR1);
     program.await_line(class, is_class(class))
 }
 
-/// Datagrams that came to `socket` so far.
+/// Returns the datagrams that have arrived at `socket` so far.
 fn drain(socket: &UdpSocket) -> Vec<Vec<u8>> {
     let mut buffer = [0; 2000];
     std::iter::from_fn(|| socket.recv(&mut buffer).ok().map(|len| buffer[..len].to_vec())).collect()
@@ -53,7 +53,7 @@ fn listener_with_key_accepts_only_its_gateway() {
         let with_other_key = listener(&env, &other);
         let gateway = env.gateway(&["--interface=lo", "--to=127.0.0.1:22299", &ours]);
         let scans = with_key.await_lines(20, "a scan", is_class("scan"));
-        // Somebody without a key.
+        // Another sender has no key.
         let mut sender = TestGateway::new(5, 7, 0, "front");
         sender.announce(&Topic::ALL);
         sender.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
@@ -67,13 +67,14 @@ fn listener_with_key_accepts_only_its_gateway() {
         assert!(
             recorded.iter().all(|bytes| decode_datagram(bytes).head.flags & LanFlags::AUTHENTICATED != 0)
         );
-        // It is sent again to who heard it, and to who has just come.
+        // Send the recorded datagrams again, to the listener that received them and to a new one.
         let replay = |mut program: Program| {
             for bytes in &recorded {
                 let topic = Topic::of_number(decode_datagram(bytes).head.topic);
                 sender.send_to_group(topic.map_or(Announce::GROUP, group), bytes);
             }
-            // What comes after all of it in each of the groups that are heard has arrived after all of it.
+            // Short datagrams in each group that the listener has joined mark the end: once they are counted, all
+            // datagrams before them were processed.
             let groups = [Announce::GROUP, group(Topic::Zones), group(Topic::Scan)];
             groups.iter().for_each(|&group| sender.send_to_group(group, b"the end"));
             while number(&request_statistics(&mut program, "lan_refused"), "short") < groups.len() as u64 {}
@@ -81,7 +82,7 @@ fn listener_with_key_accepts_only_its_gateway() {
         };
         let replayed = replay(with_key);
         assert_eq!(refusal_count(&replayed, "unauthenticated"), 2, "{replayed}");
-        // Each of its life is known to be over.
+        // The listener has seen a later epoch, so it refuses all of these.
         assert_eq!(refusal_count(&replayed, "epoch"), recorded.len() as u64, "{replayed}");
         let late_joiner = replay(listener(&env, &ours));
         assert!(

@@ -1,4 +1,4 @@
-//! Datagrams as other languages and tools read them, and what networks do to them.
+//! Datagrams in other languages and tools, and gateways on networks with faults.
 
 mod c;
 mod capture;
