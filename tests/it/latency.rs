@@ -1,5 +1,5 @@
-//! `scanhub latency` with a hub that streams: the stretches of an age add up, limits end in exit 5, and remote sensors have
-//! the part of their way that is here.
+//! `scanhub latency` with a streaming hub: the parts of an age add up, an exceeded limit ends it with 5, and for remote
+//! sensors it reports the parts that this machine can measure.
 
 use std::collections::BTreeSet;
 
@@ -10,12 +10,12 @@ use serde_json::{Value, json};
 
 const PERCENTILE_KEYS: [&str; 6] = ["min_ns", "p50_ns", "p90_ns", "p99_ns", "p999_ns", "max_ns"];
 
-/// What came of the only topic.
+/// Returns the last result line.
 fn latency_line(outcome: &Outcome) -> Value {
     outcome.of_class("latency").pop().unwrap_or_else(|| panic!("no result: {outcome}"))
 }
 
-/// How many times there are of `span`, whose percentiles have to be in order.
+/// Returns the number of measurements of `span`, and asserts that its percentiles are in order.
 fn count(line: &Value, span: &str) -> u64 {
     let of = &line[span];
     if *of == Value::Null {
@@ -45,10 +45,10 @@ fn ages_of_a_stream_are_split_and_judged() {
         assert_eq!((number(&line, "received"), number(&line, "in_future")), (20, 0), "{line}");
         assert_eq!(line["flags"][0], "simulated");
         assert_eq!(count(&line, "age") + number(&line, "before"), 20, "{line}");
-        // On a busy machine, a header cannot hold the time that a sample took in the hub.
+        // A header cannot hold the long time that a sample may spend in the hub on a busy machine.
         let in_hub = count(&line, "hub");
         assert!(in_hub == count(&line, "wake") && in_hub <= count(&line, "age"), "{line}");
-        // Of a telegram whose stamps were computed, on a busy machine, nothing is known of the line.
+        // If the stamps of a telegram were estimated on a busy machine, its time on the line is unknown.
         assert!(count(&line, "line") <= 20 && count(&line, "line") == count(&line, "total"), "{line}");
         for part in ["hub", "wake"].into_iter().filter(|_| in_hub > 0) {
             assert!(number(&line[part], "max_ns") <= number(&line["age"], "max_ns"), "{line}");
@@ -63,17 +63,17 @@ fn ages_of_a_stream_are_split_and_judged() {
         (Some(5), &json!("check")),
         "{outcome}"
     );
-    // There is a line for each topic a second, too.
+    // A result line is also printed every second for each topic.
     let results = outcome.of_class("latency");
     let topics: BTreeSet<_> = results.iter().map(|line| line["topic"].to_string()).collect();
     assert_eq!(topics.len(), 2, "{outcome}");
     let mut latency = env.start(&["latency", "front/scan", "--json"]);
     let line = latency.await_line("a time on the line", |line| count(line, "line") > 0);
-    // 732 bytes of ten bits.
+    // 732 bytes with ten bits each.
     assert!(number(&line["line"], "max_ns") > 14_000_000, "{line}");
     assert!(number(&line["total"], "min_ns") > number(&line["line"], "min_ns"), "{line}");
     assert_eq!(latency.end(INT).exit_code, Some(0));
-    // A status says something without a telegram: it has an age, and nothing else.
+    // A status does not belong to a telegram: it has an age, but no other part.
     let mut latency = env.start(&["latency", "front/status", "--json", "--no-realtime"]);
     let line = latency.await_line("a status", |line| line["age"] != Value::Null);
     assert_eq!((&line["line"], &line["hub"], &line["total"]), (&Value::Null, &Value::Null, &Value::Null));
@@ -82,7 +82,7 @@ fn ages_of_a_stream_are_split_and_judged() {
     assert!(number(&latency_line(&outcome), "before") <= 1, "the one that is kept for late joiners");
     let text = env.run(&["latency", "front/scan", "-n", "5"]);
     let out = String::from_utf8_lossy(&text.stdout).into_owned();
-    // On a busy machine, all of them may have waited for the subscriber.
+    // On a busy machine, all samples may have been sent before the subscriber was ready.
     let are_left_out = out.contains("5 were sent before this listened");
     assert!(are_left_out || out.contains("p99.9") && out.contains("\nwake "), "{text}");
     assert!(!out.contains(" ##"), "{text}");
@@ -105,7 +105,7 @@ fn splits_remote_age_into_network_and_local_part() {
         let zones = Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() };
         let known = |line: &Value| line["class"] == "latency" && line["age"] != Value::Null;
         sender.stamp_ns = testkit::wall_ns() - 50_000_000;
-        // Samples from before its own report that it is attached do not count.
+        // Samples that were sent before `latency` was attached do not count.
         let mut line = Value::Null;
         wait_until("ages", || {
             sender.send(Topic::Zones, &zones);
@@ -114,10 +114,10 @@ fn splits_remote_age_into_network_and_local_part() {
         assert_eq!(line["flags"], json!(["simulated", "remote"]), "{line}");
         assert!(number(&line["network"], "min_ns") > 49_000_000, "{line}");
         assert_eq!((&line["line"], &line["hub"]), (&Value::Null, &Value::Null));
-        // What the listener says itself came over no network.
+        // Zones that the listener publishes itself have not passed the network.
         assert!((1..=count(&line, "age")).contains(&count(&line, "network")), "{line}");
         assert_eq!(number(&line, "in_future"), 0, "{line}");
-        // Its clock goes ahead of ours.
+        // The clock of the gateway is ahead.
         sender.stamp_ns = testkit::wall_ns() + 3_600_000_000_000;
         sender.send(Topic::Zones, &zones);
         let line = latency.await_line("clocks that differ", |line| line["in_future"] == 1);

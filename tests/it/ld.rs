@@ -1,5 +1,5 @@
-//! A hub on simulated scanners of LDROBOT: what they measure is published in scans of an even grid, and their packets as
-//! they came. They have no EEPROM and are never spoken to.
+//! Hub with simulated LDROBOT scanners: it publishes their points as scans with an even grid, and their unchanged
+//! packets. These scanners have no EEPROM and receive no bytes.
 
 use serde_json::Value;
 
@@ -7,22 +7,22 @@ use crate::testkit::{
     INT, Program, TERM, TestEnv, contiguous_numbers, exists_or_is_symlink, hash, is_class, number,
 };
 
-/// Bytes of a packet of twelve points.
+/// Length in bytes of a packet with twelve points.
 const PACKET_LEN: usize = 47;
-/// What its packets begin with.
+/// First bytes of each packet.
 const PACKET_HEADER: [u8; 2] = [0x54, 0x2C];
 
 fn ld19(env: &TestEnv) -> Program {
     env.simulator(&["front"], &["--family=ld", "--model=ld19", "--world=room", "--seed=7"])
 }
 
-/// A hub of one link with these settings.
+/// Starts a hub with one link and these settings.
 fn hub(env: &TestEnv, settings: &[&str]) -> Program {
     let set = ["family=ld"].iter().chain(settings).map(|setting| format!("--set=link.front.{setting}"));
     env.hub(&[vec![env.link("front")], set.collect()].concat())
 }
 
-/// Whether a line of class `scan` is of a whole turn in so many beams.
+/// Asserts that a line of class `scan` has a whole revolution in `beams` beams.
 fn check_scan(scan: &Value, beams: usize) {
     let step = -360.0 / beams as f64;
     let values = |key: &str| scan[key].as_array().unwrap_or_else(|| panic!("no {key}: {scan}"));
@@ -37,7 +37,7 @@ fn check_scan(scan: &Value, beams: usize) {
     for (beam, (angle, range)) in angles.iter().zip(ranges).enumerate() {
         assert_eq!(angle.is_null(), range.is_null(), "beam {beam}");
         let Some(angle) = angle.as_f64() else { continue };
-        // An angle is in its own bin, and bin 0 lies on both sides of the scanner's zero.
+        // Each angle lies within its own beam. Beam 0 is centered at the scanner's zero.
         let off = (angle - step * beam as f64 + 180.0).rem_euclid(360.0) - 180.0;
         assert!(off.abs() <= step.abs() / 2.0 + 1e-3, "beam {beam} at {angle}");
         exact += usize::from(off.abs() > 1e-3);
@@ -127,7 +127,7 @@ fn a_scanner_that_goes_and_comes_back() {
     }
     let info = env.info("front");
     assert_eq!((number(&info["counters"], "reconnects"), &info["last_error"]), (1, &"".into()), "{info}");
-    // One hub, one life: the numbers go on.
+    // Within one run of a hub, numbers continue without a gap.
     contiguous_numbers(&subscriber.end(INT).of_class("scan"), "topic_seq");
     assert_eq!(hub.end(TERM).exit_code, Some(0));
 }
@@ -148,7 +148,7 @@ fn marks_need_a_level() {
     let info = shown(&env);
     assert!(info.contains(&format!("unavailable: {remedy}")), "{info}");
     assert_eq!(without.end(TERM).exit_code, Some(0));
-    // Reflectors of the room have 255 of 255.
+    // Reflectors of the simulated room have an intensity of 255, the maximum.
     let _hub = hub(&env, &["model=ld19", "marks.level=250"]);
     let is_found = |line: &Value| line["marks"].as_array().is_some_and(|marks| !marks.is_empty());
     let marks = env.echo(&["front/marks"]).await_line("marks", is_found);

@@ -1,5 +1,6 @@
-//! What a hub has learned of its sensors' surroundings is there when the next one begins, also after a kill; and is not
-//! where it would be wrong: at another pose, where somebody said otherwise, in a recording.
+//! Saved backgrounds: the next hub starts with the background that the previous one has learned, even if that one was
+//! killed. It does not if the background would be wrong: at another pose, after a reset, with other settings, or in a
+//! recording.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -9,14 +10,15 @@ use crate::testkit;
 use crate::testkit::{KILL, Outcome, Program, TERM, TestEnv, is_class, number};
 use serde_json::Value;
 
-/// Whoever learns so soon is a first hub; whoever needs so long learns nothing in a test.
+/// Setting with which a hub learns the background within a test.
 const QUICK_LEARNING: &str = "--set=background.scans=20";
+/// Setting with which a hub does not learn a background within a test, so that a known background must be a loaded one.
 const SLOW_LEARNING: &str = "--set=background.scans=8191";
 
-/// A wall around the sensor, 3 m ahead.
+/// World with a wall around the sensor, 3 m ahead.
 const ROOM_WORLD: &str = "[noise]\nerrors = 0\ntail = 0\n\n\
      [[thing]]\nline = [[3000, -500], [3000, 3000], [-3000, 3000], [-3000, -500]]\n";
-/// In it somebody who stands 1.5 m ahead.
+/// Person in that world, 1.5 m ahead.
 const POST: &str = "\n[[thing]]\nradius_mm = 150\npose = [0, 1500]\n";
 
 fn simulator(env: &TestEnv, world: &str) -> Program {
@@ -38,7 +40,7 @@ fn known_beams(env: &TestEnv) -> u64 {
     number(&show_background(env), "known_beams")
 }
 
-/// A hub that has seen scans, and what it ended with.
+/// Runs a hub until it has published scans, calls `action`, and returns the outcome of the hub.
 fn with_streaming_hub(env: &TestEnv, flags: &[&str], action: impl FnOnce()) -> Outcome {
     let link = env.link("front");
     let hub = env.hub(&[&[link.as_str()], flags].concat());
@@ -51,7 +53,7 @@ fn with_streaming_hub(env: &TestEnv, flags: &[&str], action: impl FnOnce()) -> O
     outcome
 }
 
-/// The room as a first hub has learned and kept it.
+/// Lets a first hub learn and save the background of the room.
 fn save_background_of_room(env: &TestEnv) {
     with_streaming_hub(env, &[QUICK_LEARNING], || {
         testkit::wait_until("the room is learned", || known_beams(env) > 350)
@@ -77,7 +79,7 @@ fn post_placed_between_hub_runs_is_foreground_at_once() {
         let hub = env.hub(&[&env.link("front"), SLOW_LEARNING]);
         let mut subscriber = env.echo(&["front/foreground"]);
         let first = subscriber.await_line("foreground", is_class("foreground"));
-        // The post is 11 degrees wide. Of a first scan two beams may not have been believed.
+        // The post is 11 degrees wide. In a first scan, two of its beams may not be foreground yet.
         let (beams, generation) =
             (first["beams"].as_array().map_or(0, Vec::len), number(&first, "generation"));
         assert!((18..=26).contains(&beams) && generation == 1, "{first}");
@@ -113,7 +115,7 @@ fn unusable_or_unwanted_background_is_not_loaded() {
     );
     empty(&["--set=background.keep=false"], "");
     empty(&["--set=background.start=empty"], "");
-    // Damaged, cut short, of another sensor, somebody else's.
+    // Damaged, cut short, of another sensor, or writable by other users.
     let text = String::from_utf8(kept.clone()).expect("text");
     for (wrong, why) in [
         (text[..text.len() / 2].to_owned(), "cut short"),
@@ -129,13 +131,13 @@ fn unusable_or_unwanted_background_is_not_loaded() {
     fs::write(file(&env), &kept).expect("written");
     fs::set_permissions(file(&env), fs::Permissions::from_mode(0o666)).expect("set");
     empty(&[], "others can write it");
-    // As it was it is taken.
+    // The unchanged file with the right mode is accepted.
     fs::set_permissions(file(&env), fs::Permissions::from_mode(0o600)).expect("set");
     with_streaming_hub(&env, &[SLOW_LEARNING], || assert!(known_beams(&env) > 350));
-    // What was forgotten on purpose does not come back.
+    // After a reset, the background is not loaded again.
     for (flags, content) in [
         (vec![SLOW_LEARNING], &kept[..]),
-        // Also not what the hub that forgets did not take.
+        // A reset also removes a file that the hub has rejected.
         (vec![SLOW_LEARNING, "--set=link.front.pose.x=0.2"], &kept),
         (vec![SLOW_LEARNING], b"cut short"),
     ] {
@@ -159,7 +161,7 @@ fn where_nothing_is_kept_nothing_is_written() {
     assert!(!file(&env).exists());
     simulator.end(TERM);
 
-    // Of recordings nothing is kept, and what is there is not theirs.
+    // A background of a recording is not saved, and a saved background is not loaded for a recording.
     let log: String = (0..60)
         .map(|scan| {
             let at = 1000.0 + f64::from(scan) / 50.0;

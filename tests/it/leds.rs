@@ -1,4 +1,4 @@
-//! The lights: what a robot shows of its zones and marks, on a terminal and on diodes that a directory stands in for.
+//! `scanhub leds`: shows zones and marks of a robot in a terminal and on LEDs, for which a directory stands in.
 
 use std::fs;
 use std::io::Read;
@@ -14,7 +14,7 @@ use rustix::time::{ClockId, clock_gettime};
 use scanhub_schema::{Topic, Verdict, Zones};
 use serde_json::Value;
 
-/// The walls of a room, far from the sensor, and in it what `thing` says.
+/// Returns the flag for a world with the walls of a room, far from the sensor, and the object `thing` in it.
 fn world(env: &TestEnv, name: &str, thing: &str) -> String {
     let room = "[noise]\ntail = 0\n\n[[thing]]\nline = [[3000, -3000], [3000, 3000], [-3000, 3000], [-3000, -3000]]\n";
     format!("--world={}", env.file(name, format!("{room}\n{thing}")))
@@ -27,7 +27,7 @@ fn simulator(env: &TestEnv, world: &str) -> Program {
     env.simulator(&["front"], &["--seed=61", "--baud=500000", world])
 }
 
-/// Diodes as Linux has them.
+/// Directory that stands in for the LEDs of Linux.
 struct FakeLeds(PathBuf);
 
 const LED_NAMES: [&str; 4] = ["gn", "ye", "rd", "mk"];
@@ -40,7 +40,7 @@ impl FakeLeds {
         diodes
     }
 
-    /// There is one with all its files, or none.
+    /// Creates an LED with all its files in one step, as the kernel does.
     fn create_led(&self, name: &str) {
         let aside = self.0.with_extension(name);
         fs::create_dir(&aside).unwrap();
@@ -56,7 +56,7 @@ impl FakeLeds {
         fs::remove_dir_all(self.0.join(name)).unwrap();
     }
 
-    /// Those that are lit; nothing while one is neither on nor off.
+    /// Returns the names of the LEDs that are lit, or `None` while one is neither on nor off.
     fn lit_names(&self) -> Option<String> {
         let mut lit = Vec::new();
         for name in LED_NAMES {
@@ -84,14 +84,14 @@ fn leds_show_the_verdict_and_red_without_one() {
     let env = TestEnv::new();
     let diodes = FakeLeds::new(&env);
     let [root, led] = diodes.flags();
-    // Before there is a hub.
+    // No hub is running yet.
     let leds = env.start(&["leds", "front", "--json", &root, &led]);
     diodes.wait_until_lit("rd");
     let open = world(&env, "open", STRIP_WORLD);
     let sensor = simulator(&env, &open);
     let hub = env.hub(&[env.link("front")]);
     diodes.wait_until_lit("gn mk");
-    // The sensor falls silent, then the hub.
+    // First the sensor stops sending, and then the hub exits.
     assert_eq!(sensor.end(TERM).exit_code, Some(0));
     diodes.wait_until_lit("rd");
     let _sensor = simulator(&env, &open);
@@ -100,7 +100,7 @@ fn leds_show_the_verdict_and_red_without_one() {
     diodes.wait_until_lit("rd");
     let hub = env.hub(&[env.link("front")]);
     diodes.wait_until_lit("gn mk");
-    // The reader ends by itself, so no program watches the verdict any more.
+    // `leds` exits, so no program monitors the verdict any more, and it shows red.
     let outcome = leds.end(INT);
     assert_eq!((outcome.exit_code, diodes.lit_names().as_deref()), (Some(0), Some("rd")), "{outcome}");
     assert_eq!(hub.end(TERM).exit_code, Some(0));
@@ -114,7 +114,7 @@ fn leds_show_the_verdict_and_red_without_one() {
         assert_eq!(line["mark"], line["marks"].as_u64().is_some_and(|marks| marks > 0), "{line}");
     }
     for pair in lines.windows(2) {
-        // A machine that is busy may lose scans, which is the reason of a line.
+        // A busy machine may lose scans. A line is then printed because its reason changes.
         let shown = |line: &Value| ["verdict", "marks", "reason"].map(|key| line[key].clone());
         assert!(shown(&pair[0]) != shown(&pair[1]), "no change: {pair:#?}");
     }
@@ -129,7 +129,7 @@ fn mark_led_turns_off_when_scans_end() {
     let hub = env.hub(&[env.link("front")]);
     let leds = env.start(&["leds", "front", "--json", &root, &led]);
     diodes.wait_until_lit("gn mk");
-    // The last marks wait together with the hub's word that there are no scans.
+    // While `leds` is stopped, the last marks and the zones that report missing scans queue up together.
     leds.signal(Signal::STOP);
     assert_eq!(env.run(&["echo", "front/marks", "-n", "5"]).exit_code, Some(0));
     assert_eq!(sensor.end(TERM).exit_code, Some(0));
@@ -197,7 +197,7 @@ fn the_robot_is_red_for_the_sensor_that_is_worst_off() {
     let mut leds = env.start(&["leds", "robot", "--json"]);
     leds.await_line("clear", |line| line["verdict"] == "clear" && line["green"] == true);
     assert_eq!(rear.end(TERM).exit_code, Some(0));
-    // Any sensor may be late for a moment; that one stays away.
+    // Any sensor may be late for a moment, but `rear` remains absent.
     let lost = leds.await_line("unknown", |line| line["verdict"] == "unknown" && line["worst"] == "rear");
     assert_eq!(
         (&lost["sensor"], &lost["worst"], &lost["red"]),
@@ -211,7 +211,7 @@ fn now_ns() -> u64 {
     now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
 }
 
-/// Each verdict said once: what stands for a moment and what is held is known to the test.
+/// The test sends each verdict itself, so it knows how long a verdict was valid.
 #[test]
 fn only_a_better_verdict_waits_for_the_hold_time() {
     in_a_network("leds::only_a_better_verdict_waits_for_the_hold_time", || {
@@ -223,7 +223,7 @@ fn only_a_better_verdict_waits_for_the_hold_time() {
         let mut send_verdict = |verdict: Verdict| {
             front.send(Topic::Zones, &Zones { verdict: verdict as u8, ..Zones::unknown() });
         };
-        // Others see what is said as it is said.
+        // Each of these programs shows the same verdicts with a different hold time.
         let leds = |hold: &[&str]| {
             let before = env.subscribers("robot1.front/zones");
             let program = env.start(&[&["leds", "robot1.front", "--json"], hold].concat());
@@ -239,7 +239,7 @@ fn only_a_better_verdict_waits_for_the_hold_time() {
         }
         let sent_ns = now_ns();
         let mut shown = Value::Null;
-        // The verdict is valid while it is repeated.
+        // The verdict is only valid while it is repeated.
         wait_until("clear when it has stood", || {
             send_verdict(Verdict::Clear);
             usual.printed(is("clear")).map(|line| shown = line).is_some()
@@ -279,9 +279,9 @@ fn rejects_unknown_leds_and_sensors() {
         hint.as_str().is_some_and(|hint| hint.starts_with("no light \"gren\": green=NAME")),
         "{misspelt}"
     );
-    // One that was taken before another was refused shows the stop light.
+    // An LED that was opened before another one was refused shows red.
     assert_eq!(fs::read_to_string(diodes.0.join("rd/brightness")).unwrap(), "255\n");
-    // As with all that follow: bounded needs a hub, and a hub knows its sensors.
+    // As for all subscribers: a run with a time limit needs a running hub, and an unknown sensor is an error.
     assert_eq!(env.run(&["leds", "front", "--for=1s"]).exit_code, Some(3));
     let _hub = env.hub(&[env.link("front")]);
     let unknown = env.run(&["leds", "side", "--json"]);
@@ -301,7 +301,7 @@ fn on_a_terminal_one_line_is_drawn_over_itself() {
         command.stdin(Stdio::null()).stderr(Stdio::null()).stdout(Stdio::from(screen));
         let mut process = spawn(command).unwrap();
         let mut printed = Vec::new();
-        // A terminal that nobody has open any more ends by an error.
+        // Reading from a terminal that no program has open any more fails with an error.
         let _ = keys.read_to_end(&mut printed);
         assert_eq!(process.wait().unwrap().code(), Some(3));
         let text = String::from_utf8(printed).unwrap();

@@ -1,5 +1,5 @@
-//! Descriptors that are short: whoever cannot work says so and exits 75; a hub that runs out of them serves on whom it
-//! serves, and says that others get nothing.
+//! Shortage of descriptors: a program that cannot work reports it and exits with 75. A hub that runs out of them
+//! continues to serve its subscribers, and reports that others receive nothing.
 
 use std::process::Command;
 
@@ -9,11 +9,11 @@ use crate::testkit::{
 };
 use rustix::process::{Pid, Resource, Rlimit, getrlimit, prlimit};
 
-/// Starts the program with room for `limit` descriptors, besides those that it inherits.
+/// Starts the program with room for `limit` descriptors in addition to those that it inherits.
 fn start_limited<S: AsRef<str>>(env: &TestEnv, limit: u64, arguments: &[S]) -> Program {
     let inner = env.command(arguments);
     let mut command = Command::new("sh");
-    // The process that runs the tests may have left some open. A shell can close only those with one digit.
+    // The process that runs the tests may have left some open. A shell can close only descriptors with one digit.
     let closed = "exec 3<&- 4<&- 5<&- 6<&- 7<&- 8<&- 9<&-";
     let limit = limit + inherited_descriptors();
     let script = format!("{closed} && ulimit -n \"$0\" && exec \"$@\"");
@@ -65,7 +65,7 @@ fn a_client_works_or_says_how_many_it_needs() {
         &["control", "front", "pause"],
     ];
     for limit in [5, 6, 8, 10] {
-        // Nor does one wait for a hub that it cannot see.
+        // A program without enough descriptors does not wait for a hub that it cannot find.
         assert_out_of_descriptors(&start_limited(&env, limit, &["echo", "front/status"]).wait());
     }
     run_concurrently(verbs, |verb| {
@@ -94,7 +94,7 @@ fn hub_out_of_descriptors_keeps_serving_subscribers() {
     let mut served = env.echo(&["front/scan", "front/status"]);
     served.await_lines(20, "a scan", is_class("scan"));
     let others: Vec<_> = (0..16).map(|_| env.start(&["echo", "--json", "front/scan"])).collect();
-    // Who is attached also ends by a signal as it should.
+    // An attached subscriber still exits after a signal.
     wait_until("all are attached", || env.subscribers("front/scan") == 17);
     let reports_shortage = |line: &serde_json::Value| {
         line["class"] == "status"
@@ -109,7 +109,7 @@ fn hub_out_of_descriptors_keeps_serving_subscribers() {
     for other in others {
         assert_eq!(other.end(INT).exit_code, Some(0));
     }
-    // Who comes now is served again.
+    // New subscribers are served again.
     wait_until("there is room again", || env.run(&["info", "front"]).exit_code == Some(0));
     served.await_line("that all get something", |line| line["class"] == "status" && line["last_error"] == "");
     assert_eq!(env.run(&["echo", "front/scan", "-n", "5", "--timeout", "9s"]).exit_code, Some(0));

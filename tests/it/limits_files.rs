@@ -1,6 +1,6 @@
-//! Files that eat memory or time: a device or a pipe where a file is expected, one that unpacks to far more than it is,
-//! thousands of channels or links. Each is refused or read within 64 MB and a second, in the words and with the exit
-//! code of what is wrong.
+//! Files that could use too much memory or time: a device or a pipe in place of a file, a file that unpacks to much
+//! more than its size, and thousands of channels or links. The program refuses or reads each one within 64 MB and a
+//! second, with a suitable message and exit code.
 
 use std::io::Write;
 use std::process::Command;
@@ -12,8 +12,8 @@ use flate2::write::GzEncoder;
 use rustix::fs::{CWD, FileType, Mode, mknodat};
 use scanhub_schema::file::ENCODING;
 
-/// Runs the program with all its address space in 90 MB, of which some 23 are itself, and in two seconds of processor
-/// time, which a program that is not optimized needs for what takes a second.
+/// Runs the program with a limit of 90 MB for its address space, of which the program itself uses 23 MB, and of two
+/// seconds of CPU time, which an unoptimized build needs for one second of work.
 fn run_bounded(env: &TestEnv, arguments: &[&str]) -> Outcome {
     let own = env.command(arguments);
     let mut command = Command::new("sh");
@@ -35,7 +35,7 @@ fn assert_refused(env: &TestEnv, arguments: &[&str], code: i32, words: &str) {
     assert!(outcome.stderr.contains(words), "{arguments:?}: {outcome}");
 }
 
-/// A pipe that nobody writes to.
+/// Creates a named pipe that no process writes to.
 fn pipe(env: &TestEnv) -> String {
     let path = env.path("pipe");
     mknodat(CWD, &path, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).expect("a pipe");
@@ -56,7 +56,7 @@ fn text(text: &str) -> Vec<u8> {
     [&(text.len() as u32).to_le_bytes()[..], text.as_bytes()].concat()
 }
 
-/// An MCAP file of these records.
+/// Returns an MCAP file with these records.
 fn mcap(records: &[Vec<u8>]) -> Vec<u8> {
     const MAGIC: &[u8] = b"\x89MCAP0\r\n";
     let header = record(1, &[text(""), text("")].concat());
@@ -89,12 +89,12 @@ fn rejects_devices_pipes_and_directories_at_once() {
             &["convert", path, "x.mcap"],
             &["background", "a", "load", path],
         ] {
-            // What a configuration names is a value of it.
+            // The name of such a file is a value of the configuration, so the exit code is 78.
             let code = if arguments.contains(&model.as_str()) { 78 } else { 66 };
             assert_refused(&env, arguments, code, words);
         }
     }
-    // Stdin is what it is: a file is read, a pipe is not.
+    // Stdin may be a file, but not a pipe.
     let file = env.file("links.toml", "[[link]]\nname = \"a\"\nport = \"x\"\n");
     let check = |stdin: std::process::Stdio| {
         let command = env.command(&["config", "check", "/dev/stdin"]);
@@ -194,7 +194,7 @@ fn rejects_surplus_links_at_the_first_one() {
     assert_refused(&env, &["config", "check", &more], 78, "more.toml:770:8: more than 256 links");
     let far_more = env.file("far-more.toml", links(20_000));
     assert_refused(&env, &["config", "check", &far_more], 66, "it is longer than 524288 bytes");
-    // Values of which each has a place of its own.
+    // The hub stores the location of each of these values.
     let sectors = "{from_deg=1.0,to_deg=2.0,range=0.1},".repeat(13_000);
     let sectors = format!("{}[zones]\nbody_mask = [{sectors}]\n", links(2));
     let outcome = run_bounded(&env, &["config", "check", &env.file("sectors.toml", sectors)]);

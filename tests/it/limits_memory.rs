@@ -1,5 +1,6 @@
-//! Shared memory that is short, from the start or later on: a message and exit 75, never a bare signal; who is there
-//! already loses nothing. Each test has a /dev/shm of its own, in a mount namespace of its own.
+//! Shortage of shared memory, at the start or later: programs print a message and exit with 75, and are never ended by
+//! a signal. Programs that are already attached lose nothing. Each test has its own /dev/shm in its own mount
+//! namespace.
 
 use std::fs::{File, OpenOptions};
 use std::io::{ErrorKind, Write};
@@ -11,10 +12,10 @@ use crate::testkit::{
 };
 use rustix::process::Signal;
 
-/// Where the namespace is made: the test that shall run in it.
+/// Variable that is set in the process that runs in the namespace.
 const NAMESPACE_VARIABLE: &str = "SCANHUB_TEST_INSIDE";
 
-/// Runs `test`, which is called `name`, in a mount namespace of its own; says so if the system does not allow that.
+/// Runs `test`, whose name is `name`, in a new mount namespace. Skips it if the system does not allow that.
 fn in_a_namespace(name: &str, test: impl FnOnce()) {
     if std::env::var_os(NAMESPACE_VARIABLE).is_some() {
         return test();
@@ -34,7 +35,7 @@ fn in_a_namespace(name: &str, test: impl FnOnce()) {
     rerun_test(name, unshare);
 }
 
-/// A new and empty /dev/shm of so many bytes.
+/// Mounts a new and empty /dev/shm of this size.
 fn mount(bytes: u64) {
     let size = format!("size={bytes}");
     let mounted = status(Command::new("mount").args(["-t", "tmpfs", "-o", &size, "tmpfs", "/dev/shm"]));
@@ -45,7 +46,7 @@ fn unmount() {
     assert!(status(Command::new("umount").arg("/dev/shm")).is_ok_and(|status| status.success()));
 }
 
-/// Takes all of /dev/shm but so many bytes.
+/// Fills /dev/shm except for `remaining` bytes.
 fn fill(remaining: u64) {
     let mut file = File::create(FILL_FILE).expect("an empty file needs no memory");
     let mut len = 0;
@@ -59,7 +60,7 @@ fn fill(remaining: u64) {
     file.set_len(len.saturating_sub(remaining)).expect("is cut");
 }
 
-/// Gives all of it back; the file may be gone with its /dev/shm.
+/// Frees the memory that [`fill`] has used. The file may have been removed with its /dev/shm.
 fn free() {
     if let Ok(file) = OpenOptions::new().write(true).open(FILL_FILE) {
         file.set_len(0).expect("is cut");
@@ -68,7 +69,7 @@ fn free() {
 
 const FILL_FILE: &str = "/dev/shm/fill";
 
-/// Ended in order, or said that memory is short.
+/// Asserts that a program was successful, or reported that memory is short.
 fn assert_done_or_out_of_memory(outcome: &Outcome) {
     match outcome.exit_code {
         Some(0) => {}

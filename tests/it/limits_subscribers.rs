@@ -1,5 +1,5 @@
-//! Many subscribers, also stopped and killed ones: the others miss nothing, each one counts exactly what it missed, and
-//! the hub has all resources back after they have exited.
+//! Many subscribers, slow subscribers and killed subscribers: no other subscriber misses samples because of them, each
+//! one can determine exactly which samples it missed, and the hub then uses as many resources as before.
 
 use std::fs;
 use std::thread;
@@ -17,11 +17,11 @@ use scanhub_shm::Domain;
 use scanhub_shm::Payload;
 use serde_json::Value;
 
-/// Environment variables of a subscriber that is killed: name and location of the domain.
+/// Variables with the name and the location of the domain, for a process that is killed while it holds samples.
 const HOLD_VARIABLES: [&str; 2] = ["SCANHUB_TEST_DOMAIN", "SCANHUB_TEST_BASE"];
 
-/// Starts a hub that replays a recording of many minutes with a scan every `period_ms`. That is slow enough that a busy
-/// machine causes no missed scans.
+/// Starts a hub with a recording of many minutes that has a scan every `period_ms`. This is so slow that a subscriber
+/// does not miss scans just because the machine is busy.
 fn streaming(env: &TestEnv, period_ms: u32, flags: &[&str]) -> Program {
     let line = |scan: u32| {
         let (ranges, at) = (vec!["1.5"; 181].join(" "), f64::from(scan * period_ms) / 1000.0);
@@ -35,8 +35,8 @@ fn subscribe(domain: &Domain) -> Subscriber<Scan> {
     Subscriber::builder("front").in_domain(domain).timeout(Duration::from_secs(20)).open().expect("a name")
 }
 
-/// Subscribes `count` times and receives until each subscriber has `sample_count` scans. Returns the number of scans that
-/// all of them together missed.
+/// Attaches `count` subscribers, and receives until each has `sample_count` scans. Returns the number of scans that
+/// they missed in total.
 fn count_missed(domain: &Domain, count: usize, sample_count: usize) -> u64 {
     let mut subscribers: Vec<_> = (0..count).map(|_| (subscribe(domain), 0, 0)).collect();
     while subscribers.iter().any(|(_, received, _)| *received < sample_count) {
@@ -46,7 +46,7 @@ fn count_missed(domain: &Domain, count: usize, sample_count: usize) -> u64 {
                 (*received, *missed) = (*received + 1, *missed + scan.missed);
             }
         }
-        // The next one comes for all at the same time.
+        // A new scan reaches all subscribers at the same time, so waiting for one is enough.
         let (subscriber, received, missed) = &mut subscribers[0];
         let scan = subscriber.next().expect("works").expect("comes");
         (*received, *missed) = (*received + 1, *missed + scan.missed);
@@ -91,7 +91,7 @@ fn reports_configured_limit_to_surplus_subscriber() {
         assert_eq!((outcome.exit_code, &error["kind"]), (Some(75), &"short".into()), "{outcome}");
         assert_eq!(error["message"], "scanhub/v2/front/scan has 3 subscribers, which is the maximum");
         assert!(error["hint"].to_string().contains("limits.subscribers, up to 250"), "{error}");
-        // The other topics are not concerned.
+        // Other topics are not affected.
         assert_eq!(env.info("front")["state"], "absent");
         drop(subscribers);
         let late = env.echo(&["front/scan"]);
@@ -158,7 +158,7 @@ fn killed_subscribers_leave_no_samples() {
     let hub_domain = env.domain();
     let segments = || testkit::shared_memory(&hub_domain.prefix()).len();
     let (open_before, segments_before) = (descriptors(), segments());
-    // If their samples were not returned, the hub would have none left.
+    // If killed subscribers kept their samples, the hub would have none left.
     const {
         assert!(
             KILL_COUNT * SUBSCRIBERS_PER_PROCESS * limits::MAX_BORROWED_SAMPLES
@@ -175,7 +175,7 @@ fn killed_subscribers_leave_no_samples() {
         holder.wait_for_text("holding");
         assert_eq!(holder.end(KILL).exit_code, None);
     }
-    // The numbers before may include a client that counted the subscribers and was just exiting.
+    // The numbers before may include resources of the client that counted the subscribers and was just exiting.
     wait_until("the hub is as before", || descriptors() <= open_before && segments() <= segments_before);
     echo.await_lines(40, "a scan", is_class("scan"));
     assert_eq!(env.info("front")["counters"]["loan_failed"], 0);
@@ -186,12 +186,12 @@ fn killed_subscribers_leave_no_samples() {
     assert!(env.leftover_files().is_empty(), "{:?}", env.leftover_files());
 }
 
-/// Borrows as many samples as a subscriber may, prints their number, and does not return.
+/// Receives as many samples as it may hold, prints how many it holds, and waits to be killed.
 fn hold_samples(domain: &Domain) {
     let node = scanhub_shm::client_node(domain).expect("joins");
     let topic = Scan::open(&node, "front").expect("works").expect("is there");
     let mut subscribers = Vec::new();
-    // Subscribers that were killed before keep their slots until the hub removes them.
+    // Killed subscribers keep their slots until the hub cleans up.
     wait_until("places", || {
         subscribers.extend(Scan::subscriber(&node, &topic));
         subscribers.len() == SUBSCRIBERS_PER_PROCESS
@@ -211,5 +211,5 @@ fn hold_samples(domain: &Domain) {
 }
 
 const KILL_COUNT: usize = 20;
-/// Subscribers in each process that is killed.
+/// Number of subscribers in each process that is killed.
 const SUBSCRIBERS_PER_PROCESS: usize = 12;

@@ -1,8 +1,9 @@
-//! A line that loses bytes: hub and clients say how much of the stream that costs, as the simulator has it.
+//! Line that loses bytes: hub and clients report the share of the stream that is lost, and it agrees with the
+//! simulator.
 
 use crate::testkit::{INT, TERM, TestEnv, is_class, number, wait_until};
 
-/// What the paper found on a line of theirs.
+/// Rate and length of the bursts that the paper found on a line.
 const BURST_FAULTS: &str = "--fault=loss=0.00135,burst=1.89";
 
 #[test]
@@ -17,7 +18,7 @@ fn a_line_that_loses_is_seen_everywhere() {
     let begin = env.info("front");
     let first_sent = env.truth("front").len();
     let mut statuses = env.echo(&["front/status"]);
-    // Ten seconds and more on any machine.
+    // This takes at least ten seconds on any machine.
     for due in [200, 400] {
         let due = number(&begin["counters"], "due_on_line") + due;
         statuses.await_line("scans that were due", |line| {
@@ -25,7 +26,7 @@ fn a_line_that_loses_is_seen_everywhere() {
         });
     }
     let end = env.info("front");
-    // A status is of this second, and what is missing is lost a second later.
+    // The status is from the current second, but missing scans count as lost only a second later.
     let sent = &env.truth("front")[first_sent..];
     let damaged = sent.iter().filter(|sent| sent.fault.is_some()).count() as f64;
     let grown = |name: &str| number(&end["counters"], name) as f64 - number(&begin["counters"], name) as f64;
@@ -72,7 +73,7 @@ fn a_line_that_is_well_says_so_from_the_first_second() {
     let outcome = env.run(&["doctor", &env.path_argument("front"), "--json"]);
     let checks = outcome.of_class("check");
     let check = checks.iter().find(|check| check["name"] == "line-loss").expect("it is looked at");
-    // A simulated sensor stands still while a busy machine does not run it, and the hub then counts scans as lost.
+    // A busy machine may stop a simulated scanner for a while. The hub then counts scans as lost.
     let lost = number(&env.info("front")["counters"], "lost_on_line");
     assert!(check["state"] == "ok" || lost > 0, "{check}");
     assert_eq!(info["damaged"], 0.0, "{info}");

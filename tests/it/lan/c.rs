@@ -1,4 +1,4 @@
-//! The C header against the golden datagrams and against `schema`; skips, saying so, where there is no C compiler.
+//! C header for datagrams, compared with the golden datagrams and with `schema`. Skipped if there is no C compiler.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -7,7 +7,8 @@ use crate::testkit::{output, skip};
 
 use super::readers::{self, Reader};
 
-/// The reader, compiled as strictly as it goes; with a watch over its memory where the compiler has one.
+/// Compiles the reader with strict warnings, and with checks of its memory if the compiler has them. Skips the test and
+/// returns `None` if there is no C compiler.
 fn reader() -> Option<PathBuf> {
     let top = Path::new(env!("CARGO_MANIFEST_DIR"));
     let program = Path::new(env!("CARGO_TARGET_TMPDIR")).join("lan-reader");

@@ -1,4 +1,4 @@
-//! Captures of UDP datagrams, and what tshark shows of them with the project's dissector.
+//! Captures of UDP datagrams, and their fields as tshark shows them with the project's dissector.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -6,13 +6,13 @@ use std::process::Command;
 
 use crate::testkit::{output, skip, succeeds};
 
-/// A capture file as it grows: pcap 2.4, in which every packet begins with its IPv4 header (link type 101).
+/// Capture file in memory: pcap 2.4, in which every packet starts with its IPv4 header (link type 101).
 #[derive(Default)]
 pub(crate) struct Capture {
     packets: Vec<u8>,
 }
 
-/// Whether there is a tshark; says so if not.
+/// Returns whether tshark is installed. Skips the test if not.
 pub(crate) fn has_tshark() -> bool {
     let found = succeeds(Command::new("tshark").arg("--version"));
     if !found {
@@ -22,7 +22,7 @@ pub(crate) fn has_tshark() -> bool {
 }
 
 impl Capture {
-    /// A datagram from 127.0.0.1 to 239.255.76.80, port 22200.
+    /// Adds a datagram from 127.0.0.1 to 239.255.76.80, port 22200.
     pub(crate) fn add(&mut self, datagram: &[u8]) {
         let udp_len = 8 + datagram.len() as u16;
         let ip_len = 20 + udp_len;
@@ -39,12 +39,13 @@ impl Capture {
         self.packets.extend(datagram);
     }
 
-    /// What tshark shows of each packet: the values of these fields, joined by commas. `name` is the file's.
+    /// Returns the values that tshark shows for these fields in each packet, joined by commas. `name` is the name of
+    /// the capture file.
     pub(crate) fn fields(&self, name: &str, fields: &[String]) -> Vec<BTreeMap<String, String>> {
         self.fields_with(name, fields, &[])
     }
 
-    /// The same with these settings of the dissector.
+    /// Returns the same as [`fields`](Self::fields), with these settings of the dissector.
     pub(crate) fn fields_with(
         &self,
         name: &str,
@@ -58,8 +59,8 @@ impl Capture {
         let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/wireshark/scanhub.lua");
         let mut tshark = Command::new("tshark");
         tshark.arg("-X").arg(format!("lua_script:{}", script.display())).arg("-r").arg(&path);
-        // Twice, as in Wireshark: what is found on the way stays what it was. A home of its own, so that no other
-        // settings and no installed copy of the dissector are in the way.
+        // Dissect twice, as Wireshark does: the second pass must show the same. Use a home directory without other
+        // settings and without an installed copy of the dissector.
         tshark.args(["-2", "-T", "fields"]).env("HOME", env!("CARGO_TARGET_TMPDIR"));
         tshark.env("XDG_CONFIG_HOME", env!("CARGO_TARGET_TMPDIR"));
         settings.iter().for_each(|setting| {
@@ -84,5 +85,5 @@ impl Capture {
     }
 }
 
-/// The field that tells where a script went wrong.
+/// Field with the error of a Lua script.
 const LUA_ERROR: &str = "_ws.lua.error";

@@ -1,4 +1,4 @@
-//! Datagrams with damage inside and a right checksum, and what `schema` says of them.
+//! Datagrams with a damaged content and a right checksum, and the result of `schema` for each.
 
 use fastrand::Rng;
 use scanhub_schema::Topic;
@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 
 use super::{describe, vectors};
 
-/// So many of them, always the same, made from the golden ones.
+/// Returns `count` damaged copies of the golden datagrams. They are the same in every run.
 pub(crate) fn datagrams(count: u32) -> Vec<(Vec<u8>, Value)> {
     let mut random = Rng::with_seed(6);
     let mut golden: Vec<Vec<u8>> = vectors::vectors().into_iter().map(|vector| vector.bytes).collect();
@@ -25,7 +25,7 @@ pub(crate) fn datagrams(count: u32) -> Vec<(Vec<u8>, Value)> {
     datagrams
 }
 
-/// What `schema` says of a datagram, in the words of the list.
+/// Returns the result of `schema` for a datagram, in the format of the list of golden datagrams.
 pub(crate) fn expected(bytes: &[u8]) -> Value {
     let sound = Datagram::read(bytes).and_then(|datagram| datagram.check_payload().map(|_| datagram));
     match sound {
@@ -34,14 +34,14 @@ pub(crate) fn expected(bytes: &[u8]) -> Value {
     }
 }
 
-/// A few bytes of header and payload are others, or the payload ends earlier or later. Text and what is no number stay:
-/// languages differ in how they show those.
+/// Changes a few bytes of header and payload, or the length of the payload. Bytes of texts and of other values that are
+/// not numbers are not changed, because languages show them differently.
 fn damage(random: &mut Rng, datagram: &Datagram<'_>) -> Vec<u8> {
     let mut payload = datagram.payload.to_vec();
     let is_spared = |at: usize| match Topic::of_number(datagram.head.topic) {
         Some(Topic::Status) => (24..336).contains(&at) || at >= 560,
         None => (40..64).contains(&at),
-        // Where texts begin goes by the counts, too.
+        // The positions of texts depend on the counts, so those are not changed, either.
         Some(Topic::Tracks) => {
             at < 2 || !(8..8 + 80 * usize::from(datagram.payload[0])).contains(&at) || at % 80 >= 56
         }
@@ -49,7 +49,7 @@ fn damage(random: &mut Rng, datagram: &Datagram<'_>) -> Vec<u8> {
         Some(_) => false,
     };
     for _ in 0..random.usize(..4) {
-        // The beginning has the counts.
+        // The counts are at the start, so half of the changes are made there.
         let end = if random.bool() { payload.len() } else { payload.len().min(48) };
         let at = random.usize(..end.max(1));
         if at < payload.len() && !is_spared(at) {

@@ -1,33 +1,33 @@
-//! The golden datagrams with a MAC, and what a receiver that has the key makes of each, one behind the other.
+//! Golden datagrams with a MAC, and the result for each in a receiver with the key that gets them one after the other.
 
 use std::fs;
 use std::path::Path;
 
 use serde_json::Value;
 
-/// What came, in this order.
+/// Key and datagrams of the list.
 pub(crate) struct KeyedVectors {
-    /// The key of the receiver, as hex digits.
+    /// Key of the receiver, in hexadecimal digits.
     pub(crate) key: String,
-    /// The datagrams.
+    /// Datagrams in the order in which they arrive.
     pub(crate) steps: Vec<Step>,
 }
 
-/// One datagram.
+/// One datagram and its result.
 pub(crate) struct Step {
-    /// What it is there for.
+    /// Purpose of the datagram.
     pub(crate) name: String,
-    /// The receiver's clock when it comes: seconds since 1970.
+    /// Receiver's clock when the datagram arrives, in seconds since 1970.
     pub(crate) at_s: u64,
-    /// The datagram.
+    /// Bytes of the datagram.
     pub(crate) bytes: Vec<u8>,
-    /// Its MAC is `right` or `wrong`, or there is `none`.
+    /// State of its MAC: `right`, `wrong` or `none`.
     pub(crate) mac: String,
-    /// It is `taken`, a `duplicate`, a `part` that others are needed for, or why it is refused.
+    /// Result: `taken`, `duplicate`, `part` (other parts are missing), or the reason why it is refused.
     pub(crate) outcome: String,
 }
 
-/// All of them.
+/// Reads the list.
 pub(crate) fn read_vectors() -> KeyedVectors {
     let list: Value = serde_json::from_str(&text()).expect("JSON");
     let word = |step: &Value, key: &str| step[key].as_str().unwrap_or_else(|| panic!("no {key}")).to_owned();
@@ -42,14 +42,14 @@ pub(crate) fn read_vectors() -> KeyedVectors {
     KeyedVectors { key: word(&list, "key"), steps }
 }
 
-/// The file.
+/// Returns the text of the file with the list.
 pub(crate) fn text() -> String {
     let here = Path::new(env!("CARGO_MANIFEST_DIR"));
     let top = here.ancestors().find(|path| path.join("hub").is_dir()).expect("the top");
     fs::read_to_string(top.join("tests/vectors/keyed.json")).expect("the list")
 }
 
-/// The bytes of hex digits.
+/// Decodes hexadecimal digits.
 pub(crate) fn unhex(digits: &str) -> Vec<u8> {
     let digit = |c: char| c.to_digit(16).expect("hex") as u8;
     let digits: Vec<u8> = digits.chars().map(digit).collect();

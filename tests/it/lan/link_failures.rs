@@ -1,5 +1,5 @@
-//! What happens to networks and programs, as heard at the other end of the cable: the gateway outlives it, what it
-//! could not send is counted, and it sends again.
+//! Faults of networks and programs, observed at the other end of the cable: the gateway survives them, counts each
+//! datagram that it cannot send, and sends again afterwards.
 
 use crate::testkit::{
     INT, KILL, Machine, Outcome, Program, Receiver, Relay, Robot, TERM, TestEnv, decode_datagram,
@@ -14,13 +14,14 @@ fn is_scan(datagram: &Datagram<'_>) -> bool {
     datagram.head.topic == Topic::Scan.number()
 }
 
-/// Waits for the gateway's word on a destination.
+/// Waits until the gateway reports this state of a destination.
 fn await_link(gateway: &mut Program, to: &str, state: &str) {
     let is_it = |line: &Value| line["class"] == "lan_link" && line["to"] == to && line["state"] == state;
     gateway.await_line(state, is_it);
 }
 
-/// Waits until a second's account has `more` failures to `to` than the last.
+/// Waits until the statistics, which are printed every second, have at least `min_increase` more failures to `to` than
+/// the first ones.
 fn await_failures(gateway: &mut Program, to: &str, min_increase: u64) {
     let count =
         |line: &Value| (line["class"] == "lan_to" && line["to"] == to).then(|| number(line, "send_failed"));
@@ -28,7 +29,7 @@ fn await_failures(gateway: &mut Program, to: &str, min_increase: u64) {
     gateway.await_line("failures", |line| count(line).is_some_and(|failed| failed >= before + min_increase));
 }
 
-/// What was sent to `to` in all, and what was not.
+/// Returns the total numbers of datagrams to `to` that were sent and that failed.
 fn sent_and_failed(outcome: &Outcome, to: &str) -> (u64, u64) {
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let last = outcome.of_class("lan_to").into_iter().rfind(|line| line["to"] == to);
@@ -36,7 +37,7 @@ fn sent_and_failed(outcome: &Outcome, to: &str) -> (u64, u64) {
     (number(&last, "sent"), number(&last, "send_failed"))
 }
 
-/// What a receiver says: received and lost, in all.
+/// Returns the total numbers of datagrams that a receiver received and that it counts as lost.
 fn count_received_and_lost(received: &[Vec<u8>]) -> (u64, u64) {
     let mut table = Box::new(GatewayTable::new(&Topic::ALL));
     received.iter().for_each(|bytes| assert!(table.receive(bytes, 1, 0).is_ok()));
@@ -69,8 +70,8 @@ fn a_cable_is_pulled_and_an_address_taken() {
         let (sent, failed) = sent_and_failed(&outcome, "eth0");
         let (received, lost) = count_received_and_lost(&receiver.finish());
         assert_eq!(received + lost, sent + failed, "every number is accounted for");
-        // Either may be more than the other. The kernel accepts a few datagrams and drops them when the link goes. When
-        // it is back, the gateway counts what it sends as failed until it looks at the link again, up to a second
+        // Either number may be greater. When the link fails, the kernel accepts a few datagrams and drops them. When
+        // the link is back, the gateway counts datagrams as failed until it checks the link again, up to a second
         // later.
         assert!(failed >= 300 && lost >= 300, "{lost} lost, {failed} counted");
     });
@@ -89,13 +90,14 @@ fn a_queue_is_full() {
         }
         await_link(&mut gateway, "eth0", "failing");
         await_failures(&mut gateway, "eth0", 100);
-        // What waits in it goes with it.
+        // Replacing the queue drops the datagrams in it.
         robot.machine.run_command("tc qdisc change dev eth0 root tbf rate 1gbit burst 100kb limit 1mb");
         receiver.wait_for_datagrams(20, is_scan);
         await_link(&mut gateway, "eth0", "recovered");
         let outcome = gateway.end(TERM);
         let (sent, failed) = sent_and_failed(&outcome, "eth0");
-        // What the kernel took got there, what it did not take was counted: nothing is lost that nobody knows of.
+        // The kernel delivered all datagrams that it accepted, and the gateway counted all others, so no loss is
+        // unreported.
         assert_eq!(count_received_and_lost(&receiver.finish()), (sent, failed));
         assert!(failed >= 100, "{failed}");
     });
@@ -139,7 +141,7 @@ fn hubs_and_gateways_are_killed() {
         relay.connect(&second);
         let env = TestEnv::on(&second);
         let mut listener = env.start(&["listen", "--json", "--topic=scan"]).ready();
-        // Scans of another life than those before.
+        // Wait for scans of another run of the hub or the gateway.
         let mut await_new = |description: &str, key: &str, before: &Value| {
             let line =
                 listener.await_line(description, |line| line["class"] == "scan" && line[key] != before[key]);

@@ -1,5 +1,5 @@
-//! The Python module against the golden datagrams and against `schema`; skips, saying so, where there is no python3. Its
-//! numpy part skips by itself.
+//! Python module for datagrams, compared with the golden datagrams and with `schema`. Skipped if there is no python3.
+//! The part that needs numpy is skipped separately.
 
 use std::path::Path;
 use std::process::Command;
@@ -9,7 +9,7 @@ use crate::testkit::{output, skip, succeeds};
 use super::readers::{self, Reader};
 use super::vectors;
 
-/// The reader in the Python of `SCANHUB_PYTHON`, or in the first one.
+/// Starts the reader in the Python interpreter of `SCANHUB_PYTHON`, or in `python3`.
 fn reader() -> Option<Reader> {
     let top = Path::new(env!("CARGO_MANIFEST_DIR"));
     let python = std::env::var("SCANHUB_PYTHON").unwrap_or("python3".to_owned());

@@ -1,5 +1,5 @@
-//! Readers in other languages against the one in `schema`: over the golden datagrams, and over damaged ones whose checksum
-//! is right.
+//! Readers of datagrams in other languages, compared with the reader in `schema` for golden datagrams and for damaged
+//! ones with a right checksum.
 
 use std::io::{BufRead, BufReader, Write};
 use std::process::{ChildStdin, ChildStdout, Command, Stdio};
@@ -12,7 +12,7 @@ use crate::testkit::{Child, spawn};
 
 use super::{damaged, keyed_vectors, vectors};
 
-/// A program that answers a datagram in hex with a line of JSON.
+/// Program that replies to a datagram in hexadecimal digits with a line of JSON.
 pub(crate) struct Reader {
     child: Child,
     input: ChildStdin,
@@ -26,7 +26,7 @@ impl Reader {
         Reader { child, input, output: BufReader::new(output) }
     }
 
-    /// What it says of a datagram; `key` as hex digits.
+    /// Returns the program's line for a datagram. `key` has hexadecimal digits.
     pub(crate) fn read(&mut self, key: Option<&str>, datagram: &[u8]) -> Value {
         let digits: String = datagram.iter().map(|byte| format!("{byte:02x}")).collect();
         self.request(&key.map_or(digits.clone(), |key| format!("{key}:{digits}")))
@@ -39,14 +39,15 @@ impl Reader {
         serde_json::from_str(&answer).unwrap_or_else(|error| panic!("{error} in {answer:?} to {line}"))
     }
 
-    /// It ends by itself, and well.
+    /// Closes stdin, and asserts that the program exits successfully.
     pub(crate) fn end(mut self) {
         drop(self.input);
         assert!(self.child.wait().expect("it ends").success());
     }
 }
 
-/// Every golden datagram is what the list says. What depends on those before it, or on a key, is sound by itself.
+/// Asserts that the reader's result for every golden datagram is that of the list. If the result in the list depends on
+/// earlier datagrams or on a key, the reader must agree with `schema`, which reads the datagram alone.
 pub(crate) fn check_vectors(reader: &mut Reader) {
     for vector in vectors::vectors() {
         let says = vector.description.as_object().expect("an object");
@@ -57,7 +58,8 @@ pub(crate) fn check_vectors(reader: &mut Reader) {
     }
 }
 
-/// With the key they take, and refuse, what the receiving end in Rust does: also what is sent again.
+/// Asserts that the reader with the key accepts and refuses the same datagrams as the receiver in Rust, including
+/// repeated ones.
 pub(crate) fn check_keyed_vectors(reader: &mut Reader) {
     let keyed = keyed_vectors::read_vectors();
     for step in keyed.steps {
@@ -67,7 +69,7 @@ pub(crate) fn check_keyed_vectors(reader: &mut Reader) {
     }
 }
 
-/// Whatever a payload says, they agree on whether it is sound and on what it says.
+/// Asserts that the reader and `schema` agree on `count` damaged datagrams: whether each is valid, and its content.
 pub(crate) fn check_damaged(reader: &mut Reader, count: u32) {
     for (datagram, expected) in damaged::datagrams(count) {
         assert_same("a damaged one", &datagram, reader.read(None, &datagram), &expected);
@@ -81,7 +83,7 @@ fn assert_same(name: &str, bytes: &[u8], mut reported: Value, expected: &Value) 
         let expected: Vec<_> = (0..scan.beams()).map(|i| scan.distance_m(i)).collect();
         assert_eq!(metres, as_read_from_json(&json!(expected)), "{name}: {bytes:02x?}");
     }
-    // A language without names for them.
+    // This reader reports counters without their names.
     if let Some(counters) = reported["payload"]["counters"].as_array() {
         let names = Counter::ALL.iter().map(|counter| counter.name().to_owned());
         let named: Map<String, Value> = names.zip(counters.iter().cloned()).collect();
@@ -92,7 +94,7 @@ fn assert_same(name: &str, bytes: &[u8], mut reported: Value, expected: &Value) 
     }
 }
 
-/// The same as text and back, which a number of many digits does not outlive to its last bit.
+/// Converts a value to text and back, because parsing may change the last bit of a number with many digits.
 fn as_read_from_json(value: &Value) -> Value {
     serde_json::from_str(&value.to_string()).expect("JSON")
 }

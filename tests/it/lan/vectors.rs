@@ -1,11 +1,11 @@
-//! The golden datagrams of `tests/vectors/datagram.json` and their values, for every reader of datagrams.
+//! Golden datagrams of `tests/vectors/datagram.json` with their values, for all tests of readers.
 
 use std::fs;
 use std::path::Path;
 
 use serde_json::Value;
 
-/// A golden datagram.
+/// Golden datagram.
 pub(crate) struct Vector {
     pub(crate) name: String,
     pub(crate) bytes: Vec<u8>,
@@ -38,7 +38,7 @@ fn unhex(text: &str) -> Vec<u8> {
 
 /// Returns the whole list: `vectors`, and `key`, the key of the datagrams that have a MAC, as hex digits.
 pub(crate) fn read_list() -> Value {
-    // Crates at several depths read them.
+    // Crates at several depths of the source tree include this file.
     let mut above = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors();
     let top = above.find(|folder| folder.join("tests/vectors").is_dir()).expect("the top");
     let text = fs::read_to_string(top.join("tests/vectors/datagram.json")).expect("the list");

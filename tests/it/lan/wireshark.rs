@@ -1,5 +1,5 @@
-//! The dissector for Wireshark on captures that are written here: every field of the golden datagrams, and what is flagged
-//! in a sequence. Skips, saying so, where there is no tshark.
+//! Dissector for Wireshark, tested on captures: it shows every field of the golden datagrams, and marks faults in a
+//! sequence. Skipped if there is no tshark.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -10,7 +10,8 @@ use scanhub_schema::datagram::{DatagramPayload, HEADER_LEN, Head};
 use scanhub_schema::{EventKind, Family, PointClass, State, Topic, TrackState, Verdict, Zones};
 use serde_json::Value;
 
-/// What the list says of a payload, in the names and the words of the dissector: the values of each field, in their order.
+/// Returns the values of a payload in the list by the dissector's name of their field, in order and as the dissector
+/// shows them.
 fn fields(topic: &str, description: &Value) -> BTreeMap<String, Vec<String>> {
     let mut fields = BTreeMap::new();
     flatten(topic, "", description, &mut fields);
@@ -19,7 +20,7 @@ fn fields(topic: &str, description: &Value) -> BTreeMap<String, Vec<String>> {
 
 fn flatten(topic: &str, name: &str, description: &Value, fields: &mut BTreeMap<String, Vec<String>>) {
     match description {
-        // Computed of fields that are shown.
+        // Times are computed from other fields, so the dissector does not show them.
         Value::Object(items) => items
             .iter()
             .filter(|(key, _)| *key != "times_ns")
@@ -35,7 +36,7 @@ fn flatten(topic: &str, name: &str, description: &Value, fields: &mut BTreeMap<S
             };
             items.iter().for_each(|item| flatten(topic, single, item, fields));
         }
-        // In the bytes it is a number that stands for nothing.
+        // A missing value is encoded as a special number.
         Value::Null => {}
         value => {
             let field = match name {
@@ -73,7 +74,8 @@ fn shown_field(name: &str, value: &Value) -> String {
     }
 }
 
-/// Angles, and the numbers of lines and motions, have as many digits as the tool likes.
+/// Rounds values of angles, lines, motions and similar fields, because the dissector shows them with a different number
+/// of digits.
 fn shown_value(name: &str, values: &str) -> String {
     let is_angle = ["angle", "step", "spacing"].iter().any(|word| name.ends_with(word))
         || ["lines", "motion", "tracks", "tilt", "cloud", "obstacles"]
@@ -97,7 +99,7 @@ fn golden_datagrams_are_shown_field_by_field() {
     let vectors = vectors::vectors();
     let mut capture = Capture::default();
     vectors.iter().for_each(|vector| capture.add(&vector.bytes));
-    // Field by vector.
+    // Expected fields of each datagram.
     let mut expected: Vec<BTreeMap<String, Vec<String>>> = Vec::new();
     for vector in &vectors {
         let mut target = BTreeMap::new();
@@ -114,7 +116,7 @@ fn golden_datagrams_are_shown_field_by_field() {
                 target.insert("scanhub.refused".to_owned(), Vec::new());
                 target.insert("scanhub.crc_status".to_owned(), vec!["good".to_owned()]);
             }
-            // A part is shown as one; what it is a part of is not.
+            // The dissector shows a part as such, without the content of the sample.
             Some("payload") if vector.name.starts_with("scan_part_") => {
                 let part = vector.name.trim_start_matches("scan_part_");
                 for (field, value) in [("part", part), ("parts", "3"), ("crc_status", "good")] {
@@ -122,7 +124,7 @@ fn golden_datagrams_are_shown_field_by_field() {
                 }
                 target.insert("scanhub.refused".to_owned(), Vec::new());
             }
-            // A capture has no key, and other datagrams before it.
+            // These results depend on a key or on earlier datagrams, which the capture does not have.
             Some("unauthenticated" | "mac" | "epoch" | "twin" | "stale" | "capacity") => {}
             Some(refusal) => {
                 target.insert("scanhub.refused".to_owned(), vec![refusal.to_owned()]);
@@ -147,7 +149,7 @@ fn golden_datagrams_are_shown_field_by_field() {
     assert!(names.len() > 80, "{names:?}");
 }
 
-/// What a receiver refuses is shown with the reason, and nothing stops the dissector.
+/// The dissector shows the reason why a receiver would refuse a datagram, and continues with the next one.
 #[test]
 fn damaged_datagrams_are_shown_as_refused() {
     if !has_tshark() {
@@ -160,14 +162,14 @@ fn damaged_datagrams_are_shown_as_refused() {
     assert_eq!(shown.len(), damaged.len());
     for ((datagram, expected), shown) in damaged.iter().zip(&shown) {
         let refusal = expected["refusal"].as_str().unwrap_or_default();
-        // By itself a part is no payload, and it is shown as a part.
+        // A part alone is not a valid payload, but the dissector shows it as a part.
         let is_part = refusal == "payload" && datagram[34] > 1;
         let refusal = if is_part { "" } else { refusal };
         assert_eq!(shown["scanhub.refused"], refusal, "{datagram:02x?}");
     }
 }
 
-/// With the key, what is not of it is refused; without one, nobody knows.
+/// With the key, the dissector marks datagrams with a wrong MAC as refused. Without a key, it cannot check them.
 #[test]
 fn macs_are_checked() {
     if !has_tshark() {
