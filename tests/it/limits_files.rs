@@ -12,8 +12,8 @@ use flate2::write::GzEncoder;
 use rustix::fs::{CWD, FileType, Mode, mknodat};
 use scanhub_schema::file::ENCODING;
 
-/// Runs the program with a limit of 90 MB for its address space, of which the program itself uses 23 MB, and of two
-/// seconds of CPU time, which an unoptimized build needs for one second of work.
+/// Runs the program with at most 96,000 kB of address space and two seconds of CPU time. The program itself uses about
+/// 23 MB of the address space. An unoptimized build needs the two seconds for one second of work.
 fn run_bounded(env: &TestEnv, arguments: &[&str]) -> Outcome {
     let own = env.command(arguments);
     let mut command = Command::new("sh");

@@ -1,5 +1,5 @@
-//! `scanhub listen` against datagrams that the test sends: lines of every topic, the account of what did not come, and
-//! what is refused.
+//! `scanhub listen` with datagrams that the test sends: the lines of every topic, exact counters, and refused
+//! datagrams.
 
 use std::io::Read;
 use std::time::Duration;
@@ -18,7 +18,7 @@ use serde_json::{Value, json};
 
 const HUB_ID: u64 = 0x5f3a_12bc_00d1_e2f3;
 
-/// A reply with the shortest status there is; its checksum is nobody's business here.
+/// A reply with the shortest possible status. Its checksum is not checked.
 const TELEGRAM_BYTES: [u8; 9] = [0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A];
 
 fn scan() -> Box<Scan> {
@@ -33,7 +33,7 @@ fn listener(env: &TestEnv, words: &[&str]) -> Program {
     env.start(&[&["listen", "--json"], words].concat()).ready()
 }
 
-/// What the account says of these topics: received, lost, duplicate, reordered.
+/// Returns the counters of a topic in an epoch: received, lost, duplicate and reordered.
 fn counters(outcome: &Outcome, epoch: u32, topic: &str) -> [u64; 4] {
     let lines = outcome.of_class("lan");
     let found: Vec<_> = lines.iter().filter(|it| it["epoch"] == epoch && it["topic"] == topic).collect();
@@ -127,7 +127,7 @@ fn people_read_lines_too() {
         let words = ["listen", "--interface=lo", "--topic=zones", "--name=robot1=5f3a12bc00d1e2f3", "-n2"];
         let program = env.start(&words);
         let mut sender = TestGateway::new(HUB_ID, 7, 0, "front");
-        // It does not say on stdout that it listens.
+        // The listener does not print when it is ready, so wait until it has joined the group.
         wait_until("the group is joined", || igmp_memberships().contains("514CFFEF"));
         sender.announce(&[Topic::Zones]);
         sender.send(Topic::Marks, &Marks::default());
@@ -154,12 +154,12 @@ fn people_read_lines_too() {
     });
 }
 
-/// The groups that this network namespace has joined, as the kernel lists them.
+/// Returns the multicast groups that this network namespace has joined, as the kernel lists them.
 fn igmp_memberships() -> String {
     std::fs::read_to_string("/proc/net/igmp").expect("the kernel has multicast")
 }
 
-/// How many of our groups were joined on `interface`.
+/// Returns the number of groups of scanhub that were joined on `interface`.
 fn joined_groups(interface: &str) -> usize {
     let text = igmp_memberships();
     let mut lines = text.lines().skip_while(|line| line.split_whitespace().nth(1) != Some(interface)).skip(1);
@@ -167,7 +167,7 @@ fn joined_groups(interface: &str) -> usize {
     groups.filter(|line| line.contains("4CFFEF")).count()
 }
 
-/// Runs `ip` with these words.
+/// Runs `ip` with these words, and returns whether it succeeded.
 fn ip(words: &str) -> bool {
     succeeds(std::process::Command::new("ip").args(words.split(' ')))
 }
@@ -231,7 +231,8 @@ fn the_account_is_exact() {
         let mut program = listener(&env, &["--topic=zones", "--topic=scan"]);
         let mut sender = TestGateway::new(HUB_ID, 7, 0, "front");
         sender.announce(&[Topic::Zones, Topic::Scan, Topic::Telegram]);
-        // Of 100 zones numbers 10, 11 and 50 are lost, 20 and 21 change places, 30 comes twice, and 40 after 45.
+        // Of 100 zones, numbers 10, 11 and 50 are lost, 20 and 21 are swapped, 30 arrives twice, and 40 arrives after
+        // 45.
         let datagrams: Vec<_> =
             (0..100).map(|_| sender.next_datagram(Topic::Zones, &zones(Verdict::Clear))).collect();
         let mut order: Vec<usize> = (0..100).filter(|n| ![10, 11, 40, 50].contains(n)).collect();
@@ -241,7 +242,7 @@ fn the_account_is_exact() {
         for n in order {
             sender.send_bytes(Topic::Zones, &datagrams[n]);
         }
-        // Two scans are lost before an announcement tells of them, and nobody asked for telegrams.
+        // Two scans are lost before an announcement makes this known. Telegrams are not requested.
         sender.send(Topic::Scan, &*scan());
         sender.next[usize::from(Topic::Scan.number())] += 2;
         sender.next[usize::from(Topic::Telegram.number())] += 9;
@@ -262,7 +263,7 @@ fn the_account_is_exact() {
             let notices = outcome.of_class("notice").into_iter().filter(|line| line["topic"] == topic);
             notices.map(|line| testkit::number(&line, "missed")).sum()
         };
-        // When the next one came, 20 and 40 were missing.
+        // Numbers 20 and 40 count as missed, because they had not arrived when the next number did.
         assert_eq!((missed("zones"), missed("scan")), (5, 2));
     });
 }
@@ -317,7 +318,7 @@ fn counts_90_gateway_runs_in_a_bounded_table() {
         let evicted = &outcome.of_class("lan_evicted")[0];
         assert_eq!(evicted["runs"], RUNS - 64, "{outcome}");
         let sum = |key| number(evicted, key) + lines.iter().map(|line| number(line, key)).sum::<u64>();
-        // An announcement, and of four zones the first and the last.
+        // In each run, an announcement and the first and last of four zones arrive.
         assert_eq!((sum("received"), sum("lost")), (3 * RUNS, 2 * RUNS), "{outcome}");
         assert_eq!(refusals(&outcome)["capacity"], 0, "{outcome}");
         assert!(outcome.of_class("notice").iter().all(|line| line["kind"] == "missed"), "{outcome}");
@@ -355,7 +356,7 @@ fn each_refusal_has_its_reason() {
         sender.send(Topic::Zones, &zones(Verdict::Clear));
         sender.next[number] = 5001;
         TestGateway::new(HUB_ID, 7, 0, "front").send(Topic::Zones, &zones(Verdict::Clear));
-        // All the others deliver for a second.
+        // All other gateways deliver for a second.
         let mut others: Vec<_> = (0..63).map(|hub| TestGateway::new(hub, 7, 0, "front")).collect();
         for wait_ms in [1100, 0] {
             sender.send(Topic::Zones, &zones(Verdict::Slow));
@@ -370,7 +371,7 @@ fn each_refusal_has_its_reason() {
         let outcome = program.end(INT);
         let refused = refusals(&outcome);
         for reason in DatagramError::ALL {
-            // A listener without a key has no use for three of them.
+            // A listener without a key does not use three of the reasons.
             const KEY_ERRORS: [DatagramError; 3] =
                 [DatagramError::Unauthenticated, DatagramError::Mac, DatagramError::Untimely];
             let expected = u64::from(!KEY_ERRORS.contains(&reason));
@@ -389,11 +390,11 @@ fn reports_two_gateways_with_one_id_once() {
     in_a_network("listen::reports_two_gateways_with_one_id_once", || {
         let env = TestEnv::new();
         let mut program = listener(&env, &["--topic=zones", "--stats"]);
-        // Of the later life first: all of the earlier one are refused.
+        // The gateway with the greater epoch sends first, so all datagrams of the other one are refused.
         let mut gateways = [9, 7].map(|epoch| TestGateway::new(HUB_ID, epoch, 0, "front"));
         for _ in 0..80 {
             gateways.iter_mut().for_each(|gateway| gateway.send(Topic::Zones, &zones(Verdict::Clear)));
-            // As far apart as they send: what comes in one moment is no second gateway.
+            // Send them over several seconds, because datagrams in a short time do not count as a second gateway.
             wait_at_least(Duration::from_millis(50));
         }
         let line = program.await_line("the remedy", |line| line["kind"] == "problem");

@@ -1,6 +1,6 @@
-//! Remote sensors with more beams than an LMS has, and with exact angles: `scanhub listen --publish` makes their topics as
-//! long as what comes. Gateway, network and listener are real, and all samples of the remote sensor are compared with those
-//! of the hub.
+//! Remote sensors with more beams than an LMS, and with exact angles. `scanhub listen --publish` creates their topics
+//! with the length of the received samples. Gateway, network and listener are real, and each sample of the remote
+//! sensor is compared with that of the hub.
 
 use serde_json::{Value, json};
 
@@ -9,7 +9,7 @@ use crate::testkit::{
 };
 use scanhub_schema::{ArrayFlags, Family, MAX_BEAMS, Scan, ScanHead, Topic};
 
-/// What both say of one scan, but for what is of the place where it was published.
+/// Returns the values of a scan that must be the same at both ends. The others depend on the machine that published it.
 fn values_of_scan(line: &Value) -> Vec<Value> {
     let keys = [
         "seq",
@@ -64,13 +64,14 @@ fn turns_of_any_length_come_whole() {
             };
             echo.await_lines(25, "scans", |line| is_there(line) && is_class("scan")(line));
             echo.await_lines(5, "a foreground", |line| is_there(line) && is_class("foreground")(line));
-            // It is sent when it is new, and the listener keeps it for who comes later.
+            // A background is sent when it is new, and the listener keeps it for late joiners.
             assert!(echo.has_printed(is_model), "no model of {beams} beams");
             let outcome = echo.end(INT);
             for topic in ["scan", "foreground", "telegram"] {
                 let lines = outcome.of_class(topic);
                 let (far, near): (Vec<_>, Vec<_>) = lines.into_iter().partition(is_there);
-                // One echo of all topics may skip some on a busy machine; the network loses none, see below.
+                // On a busy machine, `echo` of all topics may miss some samples, but the network loses none, as checked
+                // below.
                 let numbers: Vec<u64> = far.iter().map(|line| number(line, "topic_seq")).collect();
                 assert!(numbers.is_sorted_by(|one, next| one < next), "{topic}: {numbers:?}");
                 let same = |line: &Value| near.iter().find(|it| it["seq"] == line["seq"]).cloned();

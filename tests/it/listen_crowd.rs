@@ -1,5 +1,6 @@
-//! `scanhub listen` where more is sent than there is room for, as when somebody invents gateways and sensors: what is known
-//! to deliver stays, a true one that comes later is heard at once, and the log says what happened without a line for each.
+//! `scanhub listen` with more gateways and sensors than it has room for, as when a sender invents them. Delivering
+//! sensors are not evicted, a genuine one that starts later is received at once, and the log reports the shortage
+//! without a line for each sender.
 
 use std::time::Duration;
 
@@ -16,16 +17,17 @@ fn zones(verdict: Verdict) -> Zones {
     Zones { verdict: verdict as u8, ..Zones::unknown() }
 }
 
-/// Announces a sensor and delivers a sample of it.
+/// Announces a sensor and sends samples of it.
 fn deliver_samples(sender: &mut TestGateway) {
     sender.announce(&[Topic::Zones, Topic::Status]);
     sender.send(Topic::Zones, &zones(Verdict::Clear));
 }
 
-/// Whoever has delivered for so long, by the listener's clock, is known for it.
+/// Time on the listener's clock after which a delivering gateway or sensor counts as proven.
 const PROOF_TIME: Duration = Duration::from_secs(1);
 
-/// Delivers for as long as it takes to be known for it; `is_heard` waits until the next sample is.
+/// Delivers until the sender counts as proven. `wait_until_received` waits until the listener has received the sample
+/// before.
 fn deliver_for_proof_time(sender: &mut TestGateway, mut wait_until_received: impl FnMut(&mut TestGateway)) {
     deliver_samples(sender);
     wait_until_received(sender);
@@ -43,7 +45,7 @@ fn await_verdict(sender: &mut TestGateway, echo: &mut Program, verdict: Verdict)
     }
 }
 
-/// How often it was told that there was no room.
+/// Returns how often the listener has reported that there was no room.
 fn count_capacity_notices(outcome: &Outcome) -> usize {
     let reports_capacity =
         |line: &&Value| line["message"].as_str().is_some_and(|text| text.contains("--hub"));
@@ -72,12 +74,12 @@ fn receives_real_gateway_at_once_after_64_invented() {
             deliver_samples(&mut sender);
             let hub = json!("5f3a12bc00d1e2f3");
             program.await_line("the true one", |line| line["hub"] == hub && line["class"] == "zones");
-            // It may come before the true one is heard, or after.
+            // The report may be printed before or after the line of the genuine sensor.
             let is_trouble = |line: &Value| line["kind"] == "problem";
             if !program.has_printed(is_trouble) {
                 program.await_line("that there was no room", is_trouble);
             }
-            // Its first announcement puts out none that just delivered, its next one is taken.
+            // The first announcement evicts no sensor that has just delivered. The next one is accepted.
             deliver_samples(&mut sender);
             program.await_line("its name", |line| line["sensor"] == "front" && line["class"] == "zones");
             let outcome = program.end(INT);
@@ -112,7 +114,7 @@ fn invented_gateways_do_not_evict_a_delivering_one() {
             }
             let topic_seq = sender.next[usize::from(Topic::Zones.number())];
             sender.send(Topic::Zones, &zones(Verdict::Stop));
-            // What is read keeps the flood from running over the kernel's buffer.
+            // Waiting for each sample keeps the flood from overrunning the kernel's buffer.
             program.await_line("the true one", |line| {
                 line["verdict"] == "stop" && line["topic_seq"] == json!(topic_seq)
             });
@@ -129,8 +131,8 @@ fn publisher(env: &TestEnv) -> Program {
     env.start(&["listen", "--json", "--publish", NAME_FLAG]).ready()
 }
 
-/// A true sensor, which is published when its gateway has delivered for a second. The sensor itself is not known to deliver
-/// then: the samples before do not count for it.
+/// Creates a genuine sensor, and waits until it is published, which is when its gateway has delivered for a second. The
+/// sensor itself is not proven by then, because samples from before do not count for it.
 fn published_sender(program: &mut Program) -> TestGateway {
     let mut sender = TestGateway::new(HUB_ID, 7, 0, "front");
     wait_until("it is published", || {
@@ -181,7 +183,7 @@ fn new_sensors_do_not_evict_a_delivering_one() {
                 invented.announce(&[Topic::Zones]);
                 invented.send(Topic::Zones, &zones(Verdict::Clear));
             }
-            // Never twice the same, so that an earlier one is not taken for it.
+            // Alternate the verdict, so that an earlier sample is not mistaken for the new one.
             await_verdict(&mut sender, &mut echo, if round % 2 == 0 { Verdict::Stop } else { Verdict::Slow });
         }
         let echoed = echo.end(INT);

@@ -1,4 +1,4 @@
-//! `scanhub listen` against what nobody should send: damaged datagrams of every kind, and words that make no sense.
+//! `scanhub listen` with hostile input: damaged datagrams of every kind, and valid ones with senseless content.
 
 use crate::testkit::{INT, Program, TestEnv, TestGateway, in_a_network, number};
 use scanhub_schema::datagram::{DatagramError, DatagramPayload, HEADER_LEN, Head, MTU_ETHERNET};
@@ -7,7 +7,7 @@ use serde_json::Value;
 
 const DAMAGED_COUNT: u64 = 100_000;
 
-/// What a listener's buffer surely holds at once.
+/// Number of datagrams that the listener's receive buffer can hold in any case.
 const BATCH_SIZE: u64 = 50;
 
 fn resident_kb(program: &Program) -> u64 {
@@ -17,7 +17,7 @@ fn resident_kb(program: &Program) -> u64 {
     line.split_whitespace().nth(1).and_then(|number| number.parse().ok()).expect("kB")
 }
 
-/// A datagram of each of these topics, whole.
+/// Returns a valid datagram of each topic.
 fn valid_datagrams(sender: &mut TestGateway) -> Vec<Vec<u8>> {
     let scan = Scan::of(ScanHead::lms(361, -90_000, 500, 1, 13), &[0; 361]);
     vec![
@@ -54,7 +54,7 @@ fn nothing_damaged_is_accepted_and_memory_stays_flat() {
                     bytes[begin] ^= 1;
                 }
             }
-            // Flips may have undone each other.
+            // Flipping a bit twice restores it.
             if whole.contains(&bytes) {
                 bytes[0] ^= 0x80;
             }
@@ -83,7 +83,7 @@ fn nothing_damaged_is_accepted_and_memory_stays_flat() {
     });
 }
 
-/// Whoever sends may seal what it likes: nonsense with a right checksum.
+/// A hostile sender can compute a right checksum for senseless content.
 #[test]
 fn sealed_nonsense_neither_ends_it_nor_fills_memory() {
     in_a_network("listen_hostile::sealed_nonsense_neither_ends_it_nor_fills_memory", || {
@@ -103,7 +103,7 @@ fn sealed_nonsense_neither_ends_it_nor_fills_memory() {
                 let _ = Zones::unknown().pack(&mut buffer[HEADER_LEN..]);
             }
             let head = Head {
-                // One in three says that it is a part.
+                // One third of the datagrams claim to be parts.
                 part: [0, 0, random.u8(..4)][n as usize % 3],
                 parts: [1, 1, 3][n as usize % 3],
                 topic: random.u8(..9),
@@ -119,7 +119,7 @@ fn sealed_nonsense_neither_ends_it_nor_fills_memory() {
             };
             sender.send_bytes(Topic::Zones, head.seal(&mut buffer, len).expect("it fits"));
             if n % 50 == 49 {
-                // Its place in the list was taken before: it goes on whatever else there is.
+                // This sensor already has a slot in the listener's table, so it is received in spite of all others.
                 sender.send(Topic::Zones, &Zones::unknown());
                 counted += 1;
                 std::thread::yield_now();
@@ -141,7 +141,7 @@ fn sealed_nonsense_neither_ends_it_nor_fills_memory() {
         assert!(lines.len() <= 1024, "{} lines", lines.len());
         let own = lines.iter().find(|it| it["hub"] == "000000000000abcd" && it["topic"] == "zones");
         let own = own.unwrap_or_else(|| panic!("its sender is forgotten: {lines:?}"));
-        // The listener cannot know of datagrams that the flood displaced after the last one that it received.
+        // The listener cannot count datagrams that the flood displaced after the last one that it received.
         let known = number(own, "received") + number(own, "lost");
         assert!((1..=counted).contains(&known), "{known} of {counted}");
         let sensors = &outcome.of_class("lan_published")[0]["sensors"];

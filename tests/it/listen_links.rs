@@ -1,5 +1,5 @@
-//! `scanhub listen` and links that go away for a moment: what the switch behind them hears, which filters by group and
-//! forgets who was there.
+//! `scanhub listen` on links that fail for a moment. A switch that filters by multicast group forgets the members on
+//! such a link, so the listener must join its groups again.
 
 use std::collections::BTreeSet;
 use std::os::fd::OwnedFd;
@@ -7,10 +7,10 @@ use std::os::fd::OwnedFd;
 use crate::testkit::{INT, Machine, TestEnv, command_in, in_a_network, ip, skip, status, wait_until};
 use rustix::net::{AddressFamily, RecvFlags, SocketFlags, SocketType, eth, recv, socket_with};
 
-/// What comes to the network of the test of IGMP, version 2.
+/// Socket that receives the IGMP messages (version 2) that a switch would receive.
 struct FakeSwitch {
     socket: OwnedFd,
-    /// A message's type and the last byte of its group; no report from before a leave.
+    /// Type of each message and last byte of its group. A leave removes the reports of its group from before.
     memberships: BTreeSet<(u8, u8)>,
 }
 
@@ -24,7 +24,7 @@ impl FakeSwitch {
         FakeSwitch { socket: socket.expect("root of the network may"), memberships: BTreeSet::new() }
     }
 
-    /// Waits for such a message of each group that a listener joins.
+    /// Waits for a message of type `kind` for each group that a listener joins.
     fn wait_for_each_group(&mut self, description: &str, kind: u8) {
         let expected: BTreeSet<_> = (80..84).map(|group| (kind, group)).collect();
         wait_until(description, || {
@@ -41,7 +41,7 @@ impl FakeSwitch {
     }
 }
 
-/// The message in an IP packet, if it is one of our groups.
+/// Returns type and last byte of the group of an IGMP message in an IP packet, if the group belongs to scanhub.
 fn message(packet: &[u8]) -> Option<(u8, u8)> {
     const IGMP_PROTOCOL: u8 = 2;
     let header = usize::from(packet.first()? & 15) * 4;
@@ -89,7 +89,8 @@ fn rejoins_groups_each_time_an_interface_is_recreated() {
         let mut switch = FakeSwitch::new();
         let env = TestEnv::on(&machine);
         let listener = env.start(&["listen", "--json"]).ready();
-        // A socket can join 20 groups, and there are four of them.
+        // A socket can join 20 groups, and four are used. Joining must therefore not use up more of them with each new
+        // cable.
         for _ in 0..8 {
             switch.memberships.clear();
             machine.replace_cable();
@@ -100,8 +101,9 @@ fn rejoins_groups_each_time_an_interface_is_recreated() {
     });
 }
 
-/// Lets whoever leaves a group on `interface` of `machine` say so, as it does in this version, so that joining again is not
-/// the first time said twice; says so if it cannot.
+/// Makes the kernel use IGMP version 2 on `interface` of `machine`, in which it reports leaving a group. A report after
+/// a leave can therefore be distinguished from the repetition of the first report. Skips the test and returns false if
+/// this is not possible.
 fn force_igmp_version_2(machine: &Machine, interface: &str) -> bool {
     let mut version = command_in(&machine.network(), "sh");
     let path = format!("/proc/sys/net/ipv4/conf/{interface}/force_igmp_version");

@@ -1,5 +1,5 @@
-//! Memory that strangers on the network can make `scanhub listen --publish` use: topics are made only for gateways that
-//! have delivered for a second, and all of them together take no more than `--memory` allows.
+//! Memory that unknown senders can make `scanhub listen --publish` use. Topics are created only for gateways that have
+//! delivered for a second, and all topics together use at most the memory that `--memory` allows.
 
 use std::time::Duration;
 
@@ -19,19 +19,19 @@ fn publisher(env: &TestEnv, megabytes: u64) -> Program {
     env.start(&["listen", "--json", "--publish", NAME_FLAG, &format!("--memory={megabytes}")]).ready()
 }
 
-/// The longest scan that there can be.
+/// Returns the longest possible scan.
 fn longest_scan() -> Box<Scan> {
     let head = ScanHead { contents: ArrayFlags::ALL, ..ScanHead::of_revolution(Family::Ld, MAX_BEAMS) };
     Scan::of(head, &vec![1_234; MAX_BEAMS])
 }
 
-/// Bytes of all files of the domain in shared memory.
+/// Returns the total size in bytes of the domain's files in shared memory.
 fn used_memory(env: &TestEnv) -> u64 {
     let files = shared_memory(&format!("sh_{}_", env.domain().name()));
     files.iter().filter_map(|path| path.metadata().ok()).map(|metadata| metadata.len()).sum()
 }
 
-/// The line of this class of the counts that it prints when asked.
+/// Requests statistics from `program`, and returns the line of this class.
 fn request_statistics(program: &mut Program, class: &str) -> Value {
     program.signal(USR1);
     program.await_line(class, is_class(class))
@@ -101,7 +101,7 @@ fn unproven_gateways_take_no_shared_memory() {
         for n in 0..16 {
             let mut invented = TestGateway::new(INVENTED_HUB_ID + n, 7, 0, "other");
             invented.announce(&Topic::ALL);
-            // One sample never covers a second, however busy the machine is.
+            // A single sample never covers a second, even on a busy machine.
             invented.send(Topic::Zones, &Zones::unknown());
         }
         wait_until("all samples are counted", || {

@@ -1,4 +1,4 @@
-//! `scanhub listen` against people: tracks and events of another machine are lines like those of this one.
+//! `scanhub listen` with people: it prints tracks and events of another machine in the same format as local ones.
 
 use crate::testkit::{INT, TestEnv, TestGateway, in_a_network, is_class};
 use scanhub_schema::{Event, EventKind, Pose, PublisherKind, Topic, Track, TrackSensor, Tracks};

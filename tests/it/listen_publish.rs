@@ -1,4 +1,4 @@
-//! `scanhub listen --publish`: remote sensors as local ones, for every verb that follows, through loss, restarts and
+//! `scanhub listen --publish`: every verb can use remote sensors like local ones, even after losses, restarts and
 //! kills.
 
 use std::time::Duration;
@@ -18,17 +18,17 @@ fn publisher(env: &TestEnv) -> Program {
     env.start(&["listen", "--json", "--publish", "--name=robot1=5f3a12bc00d1e2f3"]).ready()
 }
 
-/// A listener that publishes what a sender has announced.
+/// Starts a listener, and waits until it has published the sensor that `sender` announces.
 fn start_and_publish(env: &TestEnv, sender: &mut TestGateway) -> Program {
     let mut program = publisher(env);
     let topics = [Topic::Zones, Topic::Scan, Topic::Status, Topic::Telegram];
     assert_eq!(sender.wait_until_published(&mut program, &topics)["sensor"], SENSOR_NAME);
-    // Whoever lists sensors waits for one.
+    // Verbs that list sensors wait for the status of each one.
     sender.send(Topic::Status, &Status { state: State::Starting as u8, ..Status::default() });
     program
 }
 
-/// Zones that somebody sent, not those of a silence.
+/// Returns whether a line has zones that were sent, not those that a client reports for a silence.
 fn is_zones(line: &Value) -> bool {
     line["class"] == "zones" && line["stale"] != true
 }
@@ -64,7 +64,7 @@ fn a_remote_sensor_is_as_a_local_one() {
             since_start_ns.split(' ').next().and_then(|text| text.parse().ok()).expect("seconds");
         let age_s = uptime_s - number(&line, "stamp_ns") as f64 / 1e9;
         assert!((-1.0..60.0).contains(&age_s), "the stamp is not of the arrival: {age_s} s");
-        // Two lost, one late, one doubled.
+        // Two samples are lost, and one arrives late and twice.
         let (late, lost) = (sender.next_datagram(Topic::Zones, &zones(Verdict::Stop)), 2);
         sender.next[usize::from(Topic::Zones.number())] += lost;
         sender.send(Topic::Zones, &zones(Verdict::Clear));
@@ -140,7 +140,7 @@ fn gateways_and_hubs_that_start_again_are_followed() {
         for _ in 0..3 {
             sender.send(Topic::Zones, &zones(Verdict::Clear));
         }
-        // The gateway starts again: two come before it says who its sensor is.
+        // The gateway restarts. Two samples arrive before it announces its sensor.
         let mut again = TestGateway::new(HUB_ID, 8, 1, "front");
         again.send(Topic::Zones, &zones(Verdict::Slow));
         again.send(Topic::Zones, &zones(Verdict::Slow));
@@ -148,7 +148,7 @@ fn gateways_and_hubs_that_start_again_are_followed() {
         again.send(Topic::Zones, &zones(Verdict::Stop));
         let line = echo.await_line("the gateway's next life", |line| line["verdict"] == "stop");
         assert_eq!(line["topic_seq"], 5);
-        // The hub starts again: its gateway goes on counting, and so do its consumers.
+        // The hub restarts. Its gateway continues to count, and so do the subscribers.
         again.boot = 0xb008;
         again.announce(&[Topic::Zones]);
         again.next[usize::from(Topic::Zones.number())] += 1;
@@ -172,7 +172,7 @@ fn a_hub_and_two_remote_ones_live_in_one_domain() {
         let mut one = TestGateway::new(HUB_ID, 7, 0, "front");
         let mut other = TestGateway::new(0xab, 7, 0, "front");
         let mut listener = start_and_publish(&env, &mut one);
-        // Somebody who follows the hub's sensor waits for the hub, whoever else is in the domain.
+        // A subscriber to a sensor of the hub waits for the hub, even if the domain has other publishers.
         let mut early = env.start(&["echo", "--json", "front/scan"]);
         let absent = env.run(&["echo", "--json", "front/scan", "-n", "1"]);
         assert_eq!(
@@ -193,11 +193,11 @@ fn a_hub_and_two_remote_ones_live_in_one_domain() {
         for sensor in ["front", SENSOR_NAME, "00000000000000ab.front"] {
             echo.await_line(sensor, |line| line["sensor"] == sensor && line["class"] != "notice");
         }
-        // The robot's own sensors: those of other robots stand elsewhere.
+        // The verdict of `robot` combines the robot's own sensors, without those of other robots.
         let mut robot = env.start(&["echo", "--json", "robot/zones"]);
         robot.await_lines(3, "a verdict", |line| line["sensors"][0]["sensor"] == "front");
         let outcome = robot.end(INT);
-        // Without a sensor where a busy machine was late.
+        // On a busy machine, a sensor may be late and is then not in the verdict.
         let is_own = |line: &Value| line["sensors"].as_array().is_some_and(|sensors| sensors.len() <= 1);
         assert!(outcome.of_class("zones").iter().all(is_own), "{outcome}");
         let absent = env.run(&["echo", "--json", "robot2.front/zones", "-n", "1"]);
@@ -223,7 +223,8 @@ fn gateway_does_not_send_remote_sensors_again() {
         let env = TestEnv::new();
         let _simulator = env.simulator(&["front"], &["--seed=62", "--baud=500000"]);
         let mut listener = env.start(&["listen", "--json", "--publish", "--interface=lo"]).ready();
-        // The gateway waits for the hub, though the domain lives already; and what the listener brings is not its to send.
+        // The gateway waits for the hub, although the listener already uses the domain. It never sends topics that the
+        // listener publishes.
         let mut gateway = env.start(&["gateway", "--json", "--interface=lo", "--topic=front/scan"]);
         let id = gateway.await_line("its begin", |line| line["class"] == "gateway")["hub"].clone();
         let hub = env.hub(&[env.link("front")]);
@@ -261,7 +262,7 @@ fn a_number_that_another_sensor_has_is_its_own() {
         sender.send(Topic::Zones, &zones(Verdict::Clear));
         echo.await_line("zones", is_zones);
         (sender.name, sender.boot) = ("rear".to_owned(), 0xb008);
-        // Named twice, as a stranger may.
+        // An unknown sender may announce a topic twice.
         let late = sender.announcement(&[Topic::Zones]);
         sender.announce(&[Topic::Zones, Topic::Zones]);
         let line = program.await_line("a sensor", |line| line["kind"] == "published");
@@ -271,7 +272,8 @@ fn a_number_that_another_sensor_has_is_its_own() {
         let mut rear = env.echo(&["robot1.rear/zones"]);
         sender.send(Topic::Zones, &zones(Verdict::Stop));
         rear.await_line("its own", |line| line["verdict"] == "stop");
-        // The first one comes back with another number, of which it knows nothing. What is late says nothing.
+        // The first sensor returns with another number, for which the listener has no counters. A late announcement has
+        // no effect.
         let mut front = TestGateway::new(HUB_ID, 7, 1, "front");
         front.boot = 0xb008;
         front.next[usize::from(Topic::Zones.number())] = 40;
@@ -316,7 +318,7 @@ fn renumbered_sensors_are_not_mixed_up() {
         let next = echo.await_line("the next life", |line| is_next(line, &front))["boot"].clone();
         echo.await_line("the next life of the other", |line| is_next(line, &rear));
         assert_eq!(hub.end(TERM).exit_code, Some(0));
-        // The one that has the other's number now takes it at once.
+        // `front` now has the number that `rear` had, and the listener accepts it at once.
         let _hub = env.hub(&[env.link("front")]);
         echo.await_line("one is left", |line| is_next(line, &front) && line["boot"] != next);
         env.await_info(&rear, |info| info["state"] == "silent");
@@ -360,7 +362,7 @@ fn samples_without_topic_are_counted_by_cause() {
         let mut rear = TestGateway::new(HUB_ID, 7, 4, "rear");
         rear.announce(&[Topic::Zones]);
         rear.send(Topic::Zones, &zones(Verdict::Clear));
-        // What there is room for goes on.
+        // Sensors for which there is room continue.
         front.send(Topic::Zones, &zones(Verdict::Slow));
         echo.await_line("zones", |line| is_zones(line) && line["verdict"] == "slow");
         let outcome = program.end(INT);
@@ -381,7 +383,8 @@ fn there_is_room_for_sixteen_sensors() {
         let mut program = publisher(&env);
         let mut senders: Vec<_> =
             (0..17).map(|number| TestGateway::new(0xab, 7, number, &format!("s{number}"))).collect();
-        // All but the last one are published when their gateway has delivered for a second, and deliver for another one.
+        // All except the last one are published when their gateway has delivered for a second. They then deliver for
+        // another second.
         for (count, wait_ms) in [(16, 1100), (16, 1100), (17, 0)] {
             for sender in &mut senders[..count] {
                 sender.announce(&[Topic::Zones]);

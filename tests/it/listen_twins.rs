@@ -1,10 +1,11 @@
-//! Two machines with one state directory, as after a disk was copied, whose gateways begin in one epoch: they send under one
-//! number. Who listens hears one of them and is told, and no sample of the other one is ever taken for the first one's.
+//! Two machines with one state directory, for example after a disk was copied. Their gateways use the same ID and
+//! epoch. A listener accepts one of them and reports the conflict, and it never accepts a sample of the other one as
+//! one of the first.
 
 use crate::testkit::{INT, Machine, Outcome, Program, TERM, TestEnv, in_a_network, is_class, number};
 use serde_json::{Value, json};
 
-/// A machine with a hub, whose sensor has so many beams, and what it keeps of its gateway.
+/// Machine with a hub, whose sensor has a given number of beams, and a directory for the state of its gateway.
 struct Robot {
     env: TestEnv,
     _simulator: Program,
@@ -23,8 +24,8 @@ impl Robot {
         Robot { env, _simulator: simulator, _hub: hub, _machine: machine }
     }
 
-    /// A gateway that goes on from the state that both have: an epoch far ahead, so that the seconds of their starts do
-    /// not matter.
+    /// Starts a gateway from the state that both machines have. Its epoch is far in the future, so that the times of
+    /// the starts do not affect it.
     fn gateway(&self) -> Program {
         let domain = self.env.domain().name().to_owned();
         let state = self.env.path("state/scanhub");
@@ -43,7 +44,7 @@ fn reports_two_gateways(line: &Value) -> bool {
     line["message"].as_str().is_some_and(|text| text.contains("two gateways send as 5f3a12bc00d1e2f3"))
 }
 
-/// The numbers of beams of the scans.
+/// Returns the different numbers of beams of consecutive scans.
 fn beam_counts(outcome: &Outcome) -> Vec<usize> {
     let scans = outcome.of_class("scan");
     let mut beams: Vec<_> = scans.iter().map(|line| line["ranges"].as_array().map_or(0, Vec::len)).collect();
@@ -55,7 +56,7 @@ fn beam_counts(outcome: &Outcome) -> Vec<usize> {
 fn reports_two_machines_with_one_id_and_mixes_nothing() {
     in_a_network("listen_twins::reports_two_machines_with_one_id_and_mixes_nothing", || {
         let (one, other) = (Robot::new(1, 361), Robot::new(2, 181));
-        // Here both cables are plugged in.
+        // The environment of the test is connected to both machines.
         let env = TestEnv::new();
         let mut listener = env.start(&["listen", "--json"]).ready();
         let mut publisher = env.start(&["listen", "--json", "--publish"]).ready();
@@ -69,13 +70,14 @@ fn reports_two_machines_with_one_id_and_mixes_nothing() {
         let echoed = echo.end(INT);
         assert_eq!(beam_counts(&echoed), [361], "{echoed}");
         assert_eq!(echoed.of_class("summary")[0]["missed"], 0, "{echoed}");
-        // One that comes now hears either, but not both.
+        // A listener that starts now receives one of them, but never both.
         let mut late = env.start(&["listen", "--json"]).ready();
         late.await_line("that there are two", reports_two_gateways);
         late.await_lines(10, "scans", is_class("scan"));
         let late = late.end(INT);
         assert!(beam_counts(&late) == [361] || beam_counts(&late) == [181], "{:?}", beam_counts(&late));
-        // When the first one ends, the other one does not stand in for it: more than 3 s of it are refused.
+        // After the first gateway has exited, the running listeners do not accept the other one in its place: they
+        // refuse its datagrams for more than 3 s.
         assert_eq!(first.end(TERM).exit_code, Some(0));
         let mut other = env.start(&["listen", "--json"]).ready();
         other.await_lines(200, "scans of the second one", is_class("scan"));

@@ -1,10 +1,9 @@
-//! CARMEN logs through the program: each range and each code of a log reaches a consumer, from the log itself and from
-//! what it was converted to.
+//! CARMEN logs: each range and each code of a log reaches a subscriber, from the log itself and from its conversions.
 
 use crate::testkit::{INT, Outcome, TestEnv, number};
 use serde_json::{Value, json};
 
-/// A log of scans `period_ms` apart, each of which has these ranges first.
+/// Writes a log with scans `period_ms` apart, each of which starts with `ranges`. Returns its path.
 fn log(env: &TestEnv, ranges: &[&str], scans: u64, period_ms: u64) -> String {
     let line = |scan: u64| {
         let beams: Vec<&str> = ranges.iter().chain([&"1.50"; 181]).take(181).copied().collect();
@@ -14,7 +13,7 @@ fn log(env: &TestEnv, ranges: &[&str], scans: u64, period_ms: u64) -> String {
     env.file("a.log", (0..scans).map(line).collect::<String>())
 }
 
-/// What a consumer gets of `file` that is played, and what the player said.
+/// Replays `file`, and returns the outcomes of a subscriber and of the player.
 fn replay_and_echo(env: &TestEnv, file: &str) -> (Outcome, Outcome) {
     let words = ["replay", "--json", "--no-system-config", file, "--paused"];
     let player = env.start(&words).ready();
@@ -68,7 +67,7 @@ fn a_log_is_read_as_it_reaches_and_says_so_first() {
 #[test]
 fn zones_stay_valid_until_the_next_scan_of_a_slow_log() {
     let env = TestEnv::new();
-    // Much longer than a sensor that is at work leaves between two scans.
+    // This period is much longer than that of any streaming scanner.
     let file = log(&env, &["1.50"], 4, 400);
     let mcap = file.replace("a.log", "a.mcap");
     assert_eq!(env.run(&["convert", &file, &mcap]).exit_code, Some(0));
@@ -80,7 +79,7 @@ fn zones_stay_valid_until_the_next_scan_of_a_slow_log() {
             .iter()
             .position(|zones| zones["verdict"] != "unknown")
             .unwrap_or_else(|| panic!("{outcome}"));
-        // After the last one nothing more is heard, and who follows says that too.
+        // After the last scan, the client reports the silence with the verdict unknown.
         let until_last = zones[first..].iter().take_while(|zones| zones["seq"] != last);
         let unknown = until_last.filter(|zones| zones["verdict"] == "unknown");
         assert_eq!(unknown.count(), 0, "{file}: {outcome}");

@@ -1,6 +1,6 @@
 /*
- * Follows a topic and prints a line of JSON for each sample: follow SENSOR TOPIC doorbell|event|spin|poll COUNT. COUNT 0: for
- * ever. Whether it lies in shared memory is what /proc says of its address.
+ * Subscribes to a topic and prints a line of JSON for each sample: follow SENSOR TOPIC doorbell|event|spin|poll COUNT. With
+ * COUNT 0, it never stops. /proc shows whether the address of a sample lies in shared memory.
  */
 #include <scanhub/attach.h>
 

@@ -1,6 +1,5 @@
-//! The library installed as its users have it, and programs built against it as they build theirs. Refuses to know what
-//! the programs do.
-#![allow(dead_code)] // Every test takes what it needs.
+//! The C library, installed as users install it, and the ways in which they build programs with it.
+#![allow(dead_code)] // Each test binary uses only a part of it.
 
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
@@ -9,20 +8,20 @@ use std::sync::OnceLock;
 
 use crate::testkit::{TestEnv, output, skip};
 
-/// A place where the library and its header are.
+/// Prefix with the installed library and its header.
 pub(crate) struct InstalledLibrary {
     pub(crate) prefix: PathBuf,
-    /// Where it was installed from.
+    /// Directory from which the library was installed.
     pub(crate) library: PathBuf,
     /// Output of the script that installed it.
     pub(crate) messages: String,
 }
 
-/// As strictly as it goes.
+/// Flags for strict warnings.
 const STRICT_FLAGS: [&str; 5] = ["-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"];
 
 impl InstalledLibrary {
-    /// The one that all tests share; nothing where there is no C compiler.
+    /// Installs the library once for all tests. Skips the test and returns `None` if there is no C compiler.
     pub(crate) fn installed() -> Option<&'static InstalledLibrary> {
         static INSTALLED: OnceLock<InstalledLibrary> = OnceLock::new();
         if !is_installed("cc") {
@@ -33,7 +32,7 @@ impl InstalledLibrary {
             let _ = std::fs::remove_dir_all(&here);
             let (prefix, library) = (here.join("prefix"), here.join("library"));
             std::fs::create_dir_all(&library).expect("a directory");
-            // Not the one for linking into programs, which has 100 MB.
+            // Without the static library, which has 100 MB.
             let shared = "libscanhub.so";
             std::os::unix::fs::symlink(build_directory().join(shared), library.join(shared))
                 .expect("a place for a link");
@@ -45,12 +44,12 @@ impl InstalledLibrary {
         }))
     }
 
-    /// The program of `source`, against the shared library.
+    /// Compiles `source` with the shared library, and returns the path of the program.
     pub(crate) fn compile(&self, env: &TestEnv, source: &Path, flags: &[&str]) -> PathBuf {
         self.try_compile(env, source, flags).unwrap_or_else(|message| panic!("{message}"))
     }
 
-    /// As [`compile`](Self::compile); what the compiler says if it does not.
+    /// Compiles like [`compile`](Self::compile), but returns the compiler's messages if it fails.
     pub(crate) fn try_compile(
         &self,
         env: &TestEnv,
@@ -61,25 +60,28 @@ impl InstalledLibrary {
         self.build("cc", env, source, &[&words, flags].concat(), &self.shared())
     }
 
-    /// The program of `source` in C++; nothing where there is no compiler for it.
+    /// Compiles `source` as C++11, and returns the path of the program. Skips the test and returns `None` if there is
+    /// no C++ compiler.
     pub(crate) fn compile_cpp(&self, env: &TestEnv, source: &Path) -> Option<PathBuf> {
         let built = self.try_compile_cpp(env, source)?;
         Some(built.unwrap_or_else(|message| panic!("{message}")))
     }
 
-    /// Returns the program of `source` in C++20. `None` if there is no compiler for it.
+    /// Compiles `source` as C++20, and returns the path of the program. Skips the test and returns `None` if there is
+    /// no C++ compiler.
     pub(crate) fn compile_cpp20(&self, env: &TestEnv, source: &Path) -> Option<PathBuf> {
         let built =
             is_installed("c++").then(|| self.build("c++", env, source, &["-std=c++20"], &self.shared()))?;
         Some(built.unwrap_or_else(|errors| panic!("{errors}")))
     }
 
-    /// As [`compile_cpp`](Self::compile_cpp); what the compiler says if it does not.
+    /// Compiles like [`compile_cpp`](Self::compile_cpp), but returns the compiler's messages if it fails.
     pub(crate) fn try_compile_cpp(&self, env: &TestEnv, source: &Path) -> Option<Result<PathBuf, String>> {
         is_installed("c++").then(|| self.build("c++", env, source, &["-std=c++11"], &self.shared()))
     }
 
-    /// The program of `source` with the library in it; nothing where pkg-config does not say how.
+    /// Compiles `source` with the static library, and returns the path of the program. Skips the test and returns `None`
+    /// if there is no pkg-config.
     pub(crate) fn compile_static(&self, env: &TestEnv, source: &Path) -> Option<PathBuf> {
         let mut ask = self.with_packages(Command::new("pkg-config"));
         let Ok(pkg_config) = output(ask.args(["--static", "--libs-only-l", "scanhub"])) else {
@@ -93,13 +95,13 @@ impl InstalledLibrary {
         Some(program.unwrap_or_else(|message| panic!("{message}")))
     }
 
-    /// Builds the project `source` with CMake in each way in which the package is found, and returns the build
-    /// directories. Empty if a tool is missing.
+    /// Builds the project `source` with CMake in each way in which CMake can find the package. Returns the build
+    /// directories, which is an empty list if a tool is missing.
     pub(crate) fn cmake(&self, env: &TestEnv, source: &Path) -> Vec<PathBuf> {
         if !["cmake", "c++"].into_iter().all(is_installed) {
             return Vec::new();
         }
-        // A package that names its own prefix does not work after this.
+        // A package that contains the path of its prefix does not work after this.
         let moved = env.path("moved");
         let mut copy = Command::new("cp");
         copy.arg("-a").arg(&self.prefix).arg(&moved);
@@ -123,7 +125,8 @@ impl InstalledLibrary {
         ways.map(build_in).into()
     }
 
-    /// Builds `source` with the flags of pkg-config. `None` if there is no pkg-config.
+    /// Compiles `source` with the flags of pkg-config, and returns the path of the program. Skips the test and returns
+    /// `None` if there is no pkg-config.
     pub(crate) fn compile_with_pkg_config(&self, env: &TestEnv, source: &Path) -> Option<PathBuf> {
         let is_missing = || skip("pkg-config", "there is none");
         let flags =
@@ -162,7 +165,7 @@ impl InstalledLibrary {
     }
 }
 
-/// Whether there is such a tool; says so if not.
+/// Returns whether a tool is installed. Skips the test if not.
 pub(crate) fn is_installed(name: &str) -> bool {
     let found = output(Command::new(name).arg("--version")).is_ok();
     if !found {
@@ -171,12 +174,12 @@ pub(crate) fn is_installed(name: &str) -> bool {
     found
 }
 
-/// A program in C of these tests.
+/// Returns the path of a C program of these tests.
 pub(crate) fn source(name: &str) -> PathBuf {
     repository().join("tests/it/client_c").join(name)
 }
 
-/// Where the header is, in the project.
+/// Returns the directory of the header in the source tree.
 pub(crate) fn header_directory() -> PathBuf {
     repository().join("clients/c/include")
 }
@@ -185,7 +188,7 @@ fn repository() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// Cargo builds the library for this test, and puts it beside the test's own program.
+/// Returns the directory in which Cargo builds the library for this test, next to the test binary.
 fn build_directory() -> PathBuf {
     let own = std::env::current_exe().expect("the path of this test");
     own.parent().expect("a directory").to_owned()

@@ -1,4 +1,4 @@
-//! The layouts of all payloads, and a program that reports the layouts of C: offset and size of every field.
+//! Layouts of all payloads, and C programs that print the layout and the computed values of the C header.
 
 use scanhub_schema::{ArrayFlags, Counter, Family, Header, Scan, ScanHead};
 
@@ -7,7 +7,7 @@ struct Layout {
     name: String,
     /// Size in bytes.
     size: usize,
-    /// Name, offset and size in bytes.
+    /// Name, offset and size in bytes of each field.
     fields: Vec<(String, usize, usize)>,
 }
 
@@ -39,7 +39,7 @@ fn layouts() -> Vec<Layout> {
     layouts
 }
 
-/// What [`program`] should say.
+/// Returns the lines that [`program`] must print.
 pub(crate) fn expected() -> Vec<String> {
     let mut lines = Vec::new();
     for Layout { name, size, fields } in layouts() {
@@ -51,7 +51,8 @@ pub(crate) fn expected() -> Vec<String> {
     lines
 }
 
-/// A program in C and C++ that says how it lays the payloads out.
+/// Returns a program in C or C++ that prints the size of each payload, the offset and size of each of its fields, and the
+/// indexes of the counters.
 pub(crate) fn program() -> String {
     let mut says = String::new();
     for Layout { name, fields, .. } in layouts() {
@@ -71,7 +72,7 @@ pub(crate) fn program() -> String {
     format!("#include <scanhub/attach.h>\n#include <stdio.h>\nint main(void) {{\n{says}return 0;\n}}\n")
 }
 
-/// Scans of all forms: of an LMS in each of its modes, of a turn with all arrays, without any, and none.
+/// Returns scans of all kinds: LMS scans in each mode, revolutions with all arrays and without any, and an empty scan.
 pub(crate) fn scans() -> Vec<Box<Scan>> {
     let ranges = |count: u32, greatest: u32| -> Vec<u16> {
         (0..count).map(|i| (greatest - (i * 3) % 40) as u16).collect()
@@ -111,8 +112,8 @@ pub(crate) fn scans() -> Vec<Box<Scan>> {
     scans
 }
 
-/// A program that computes what the header does, of all beams of `scan` and three more; and of a sample that is none, and of
-/// one that is cut short, that nothing leads outside of it.
+/// Returns a program that computes the values that the header provides for all beams of `scan` and for three more. For
+/// an invalid sample and for one that is cut short, it checks that no value is read outside of it.
 pub(crate) fn computed_values_c(header: &Header, scan: &Scan) -> String {
     let bytes = scan.bytes();
     let list: Vec<String> = bytes.iter().map(u8::to_string).collect();

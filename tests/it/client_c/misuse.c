@@ -1,4 +1,4 @@
-/* Everything that a program may do wrong, and what the library answers: misuse SENSOR, where a hub lives. */
+/* Calls the library in every wrong way and checks its errors: misuse SENSOR. Needs a running hub. */
 #include <scanhub/attach.h>
 
 #include <poll.h>
@@ -19,7 +19,7 @@
             exit(EXIT_FAILURE);                                                                      \
         }                                                                                            \
     } while (0)
-/* Limit of a wait, in milliseconds. It only bounds a hang. */
+/* Timeout of a wait, in milliseconds. It only ends a program that hangs. */
 #define PATIENCE_MS 60000
 #define SAYS(text) MUST(strstr(scanhub_error(), text) != NULL)
 
@@ -135,7 +135,7 @@ static void *publishes_elsewhere(void *publication)
 {
     refused_as_a_publication(publication);
     MUST(scanhub_unpublish(publication) == SCANHUB_REFUSED_ARGUMENT);
-    /* It ends with its thread. */
+    /* The publication ends with its thread. */
     publish("third");
     return NULL;
 }
@@ -156,7 +156,7 @@ static void publications(const char *sensor)
     MUST(scanhub_publish_tilt(&again, NULL, "mount") == SCANHUB_REFUSED_FAILED && again == NULL);
     SAYS("the name mount is published by process ");
     MUST(scanhub_send_tilt(mount, 0, 0.5, NAN) == 0 && scanhub_send_tilt(second, 1, 0.5, 0.1) == 0);
-    /* What follows is no publication, and what publishes is followed by other handles. */
+    /* An attachment is not a valid publication, and a publication is not a valid attachment. */
     struct scanhub_attachment *angles;
     struct scanhub_sample sample;
     MUST(scanhub_open(&angles, NULL, "mount", SCANHUB_TOPIC_TILT, SCANHUB_WAIT_DOORBELL) == 0);
@@ -175,7 +175,7 @@ static void publications(const char *sensor)
     pthread_t thread;
     MUST(pthread_create(&thread, NULL, publishes_elsewhere, mount) == 0 && pthread_join(thread, NULL) == 0);
     MUST(scanhub_unpublish(publish("third")) == 0);
-    /* A child takes nothing from its parent. */
+    /* A child process cannot use the publication of its parent. */
     const pid_t child = fork();
     MUST(child >= 0);
     if (child == 0) {
@@ -188,7 +188,7 @@ static void publications(const char *sensor)
     MUST(scanhub_unpublish(mount) == 0 && scanhub_unpublish(NULL) == 0);
     refused_as_a_publication(mount);
     MUST(scanhub_unpublish(mount) == SCANHUB_REFUSED_ARGUMENT);
-    /* The name is free, and `second` is left to the end of the process. */
+    /* The name is free again. `second` remains published until the process exits. */
     MUST(scanhub_unpublish(publish("mount")) == 0);
 }
 
@@ -225,13 +225,13 @@ static void threads(const char *sensor)
     struct scanhub_sample sample;
     MUST(scanhub_wait(handle, PATIENCE_MS) == 1 && scanhub_take(handle, &sample) == 1);
     MUST(pthread_create(&thread, NULL, releases, &sample) == 0 && pthread_join(thread, NULL) == 0);
-    /* It is still there, to be given back by who took it. */
+    /* The sample is still valid, and the thread that took it can release it. */
     MUST(sample.payload != NULL && scanhub_release(&sample) == 0 && sample.payload == NULL);
     MUST(scanhub_close(handle) == 0);
     MUST(pthread_create(&thread, NULL, leaves_it_open, name) == 0 && pthread_join(thread, NULL) == 0);
 }
 
-/* A child that ends as any program does takes nothing from its parent. */
+/* A child process that exits normally does not affect the attachment of its parent. */
 static void children(const char *sensor)
 {
     struct scanhub_attachment *handle = open_scans(sensor, SCANHUB_WAIT_EVENT);
@@ -255,7 +255,7 @@ static void children(const char *sensor)
     MUST(scanhub_close(handle) == 0);
 }
 
-/* What a wait took, poll still sees. */
+/* poll still reports samples that scanhub_wait has reported before. */
 static void polls(const char *sensor)
 {
     struct scanhub_attachment *handle = open_scans(sensor, SCANHUB_WAIT_EVENT);
@@ -294,7 +294,7 @@ static void samples(const char *sensor)
     MUST(scanhub_release(&copy) == SCANHUB_REFUSED_ARGUMENT);
 }
 
-/* What a robot's verdict points to lives until it is released. */
+/* The memory to which a robot's verdict points stays valid until the verdict is released. */
 static void robots(const char *sensor)
 {
     struct scanhub_attachment *handle;
@@ -351,7 +351,7 @@ int main(int argc, char **argv)
     robots(sensor);
     publications(sensor);
     signals();
-    /* Left open, with a sample: the end of the process is an end, too. */
+    /* The attachment and its sample are released when the process exits. */
     struct scanhub_attachment *left = open_scans(sensor, SCANHUB_WAIT_EVENT);
     struct scanhub_sample sample;
     MUST(scanhub_wait(left, PATIENCE_MS) == 1 && scanhub_take(left, &sample) == 1);

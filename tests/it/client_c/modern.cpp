@@ -1,4 +1,4 @@
-// Follows scans with the functions of attach.hpp that need C++17 and C++20: modern SENSOR. Prints one line per scan.
+// Subscribes to scans with the functions of attach.hpp that need C++17 and C++20: modern SENSOR. Prints one line per scan.
 #include <scanhub/attach.hpp>
 
 #include <cstdio>

@@ -1,5 +1,5 @@
-/* Publishes the angles of a mount: publish NAME. Each line of stdin is a sample: angle, rate and stamp, 0 for now. Says so when
- * it publishes, and after each sample; ends with stdin. */
+/* Publishes the angles of a mount: publish NAME. Each line of stdin is a sample with angle, rate and stamp (0 for now).
+ * Prints a line when it starts to publish and after each sample. Exits at the end of stdin. */
 #include <scanhub/attach.h>
 
 #include <inttypes.h>

@@ -1,5 +1,5 @@
-/* Follows scans and prints a line of JSON with the reason for the silence ten times a second, and the names that exist:
- * silence SENSOR doorbell|event. With `event`, it waits by poll for half a second, and the line has the wake-ups. */
+/* Subscribes to scans and prints a line of JSON ten times a second, with the reason for the silence and the existing names:
+ * silence SENSOR doorbell|event. With `event`, it waits by poll for half a second, and the line has the number of wake-ups. */
 #include <scanhub/attach.h>
 
 #include <inttypes.h>
@@ -34,7 +34,7 @@ static void print_names(const char *key, int (*list)(const char *, char *, size_
     print_text(key, names);
 }
 
-/* Waits for a sample or for the time of one line. Returns how often it was woken without a sample. */
+/* Waits for a sample or for the time of one line. Returns the number of wake-ups without a sample. */
 static int wait_for_line(struct scanhub_attachment *scans, int is_event)
 {
     struct scanhub_sample sample;

@@ -1,6 +1,8 @@
-/* Reads datagrams with clients/c/scanhub.h: a line of hex digits in, a line of JSON out, in the words of the list of golden
- * datagrams. Before them and a colon may be the hex digits of a key, `@` and the second at which the datagram comes: then
- * what becomes of it is told, after those before, by clients/c/scanhub_key.h. */
+/* Reads datagrams with clients/c/scanhub.h. Each line of stdin has the hexadecimal digits of a datagram. For each one, prints
+ * a line of JSON in the format of the list of golden datagrams.
+ *
+ * A line may start with the digits of a key, `@`, the second at which the datagram arrives, and a colon. The printed line is
+ * then the outcome of clients/c/scanhub_key.h, which depends on earlier datagrams. */
 #include "scanhub_key.h"
 
 #include <stdio.h>
@@ -36,7 +38,7 @@ static void telegram(const struct scanhub_telegram *t)
         printf("null}");
 }
 
-/* With as few digits as say the number and no other, and a point; JSON has neither nan nor infinity. */
+/* Prints a number with a decimal point and the fewest digits that identify it. JSON has neither nan nor infinity. */
 static void number(const char *before, double value)
 {
     char digits[32];
@@ -305,7 +307,7 @@ static void status(const struct scanhub_status *s)
            boolean(s->upside_down == 1));
 }
 
-/* Reads and prints the payload of one topic, behind `prefix`. */
+/* Reads and prints head and payload of a datagram of one topic. */
 #define TOPIC(NUMBER, NAME)                                                                                               \
     case NUMBER: {                                                                                                        \
         struct scanhub_##NAME value;                                                                                      \
@@ -351,7 +353,7 @@ static enum scanhub_result payload(const struct scanhub_datagram *d)
     return SCANHUB_SKIPPED;
 }
 
-/* Puts one sample of three parts together. */
+/* Stores a part of a sample with three parts. Returns 1 and the whole sample once all parts have arrived. */
 static int is_whole(struct scanhub_datagram *d)
 {
     static uint8_t bytes[3][1424], whole[3 * 1424];
@@ -370,7 +372,7 @@ static int is_whole(struct scanhub_datagram *d)
     return 1;
 }
 
-/* What becomes of a datagram, with a key that takes up the first 64 characters of `key`, `@` and the second. */
+/* Prints the outcome of a datagram. `key` has the 64 digits of the key, `@` and the second of the arrival. */
 static void keyed(const char *key, const uint8_t *bytes, size_t len)
 {
     static struct scanhub_guard guard;
@@ -426,7 +428,7 @@ int main(void)
     while (fgets(buffer, sizeof buffer, stdin)) {
         const char *key = strchr(buffer, ':') ? buffer : NULL, *line = key ? strchr(buffer, ':') + 1 : buffer;
         size_t len = strspn(line, "0123456789abcdef") / 2;
-        /* Of its very length, so that a tool that watches memory sees whoever reads behind it. */
+        /* Allocate exactly this length, so that memory checkers detect reads past the end. */
         uint8_t *bytes = malloc(len ? len : 1);
         if (!bytes)
             return 1;

@@ -1,6 +1,9 @@
-"""Reads datagrams with clients/python/scanhub_lan.py: a line of hex digits in, behind the hex digits of a key and a colon
-where there is one, a line of JSON out, in the words of the list of golden datagrams. Behind the key and `@` may be the
-second at which the datagram comes; then what becomes of it is told, after those before."""
+"""Reads datagrams with clients/python/scanhub_lan.py.
+
+Each line of stdin has the hexadecimal digits of a datagram, after the digits of a key and a colon if there is one. For each
+datagram, prints a line of JSON in the format of the list of golden datagrams. If the key is followed by `@` and the second at
+which the datagram arrives, the line has the outcome instead, which depends on earlier datagrams.
+"""
 
 import dataclasses
 import json
@@ -17,7 +20,7 @@ except ImportError:
 
 
 def plain(value):
-    """JSON has no bytes."""
+    """Converts bytes to hexadecimal digits, because JSON has no bytes."""
     return value.hex() if isinstance(value, bytes) else value
 
 
@@ -34,10 +37,10 @@ def says(datagram):
     if datagram.topic == "announce":
         out["boot"] = f"{payload.boot:016x}"
     if datagram.topic == "telegram":
-        # The list has its number in the head.
+        # The list has the number of the family in the head.
         assert out.pop("family") == scanhub_lan.FAMILIES[datagram.family]
     if datagram.topic == "scan":
-        # The list has what is computed of these.
+        # The list has the values that are computed from these.
         for name in ("payload", "first_beam_ns", "turns", "turn_ns", "exact"):
             del out[name]
         out["codes"], out["times_ns"], out["upper"] = payload.codes(), payload.times_ns(), list(payload.upper)
@@ -57,7 +60,7 @@ def says(datagram):
 
 
 def whole(datagrams):
-    """The payload that comes of these datagrams, if any does."""
+    """Reassembles the parts in these datagrams. Returns the payload, or None if it is incomplete."""
     parts = scanhub_lan.Parts()
     taken = [parts.take(scanhub_lan.read(datagram)) for datagram in datagrams]
     assert taken[:-1] == [None] * (len(taken) - 1)
@@ -72,7 +75,7 @@ guard, parts = scanhub_lan.Guard(), scanhub_lan.Parts()
 
 
 def outcome(data, key, at_s):
-    """What becomes of a datagram that comes at this second."""
+    """Returns the outcome of a datagram that arrives at this second."""
     datagram = guard.take(scanhub_lan.read(data, key), at_s * 1_000_000_000)
     if datagram.parts == 1:
         return "taken"

@@ -69,7 +69,7 @@ pub(crate) fn check_keyed_vectors(reader: &mut Reader) {
     }
 }
 
-/// Asserts that the reader and `schema` agree on `count` damaged datagrams: whether each is valid, and its content.
+/// Asserts that the reader and `schema` agree on the validity and the content of `count` damaged datagrams.
 pub(crate) fn check_damaged(reader: &mut Reader, count: u32) {
     for (datagram, expected) in damaged::datagrams(count) {
         assert_same("a damaged one", &datagram, reader.read(None, &datagram), &expected);
