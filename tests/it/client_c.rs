@@ -341,8 +341,8 @@ fn c_library_rejects_misuse() {
         Err(_) => eprintln!("without the compiler's watch over memory: it has none"),
     }
     if is_installed("valgrind") {
-        // A child process keeps pointers to the memory of its parent, some of them into the middle of blocks. These blocks
-        // do not count as definite leaks.
+        // A child process keeps pointers to the memory of its parent, some of them into the middle of blocks. These
+        // blocks do not count as definite leaks.
         let leaks = ["--leak-check=full", "--show-leak-kinds=definite", "--errors-for-leak-kinds=definite"];
         let known =
             concat!("--suppressions=", env!("CARGO_MANIFEST_DIR"), "/tests/it/client_c/valgrind.supp");

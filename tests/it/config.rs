@@ -262,7 +262,7 @@ fn install_script_removes_manuals_and_completions() {
     assert!(unit.contains("\nExecReload=/bin/kill -HUP $MAINPID\n"), "{unit}");
     install(&["--remove"]);
     assert_eq!(files(&root), Vec::<PathBuf>::new());
-    // A program that does not run on this machine is installed without them.
+    // A program that does not run on this machine is installed without manual pages and completions.
     let other = env.file("other", "of another processor");
     assert!(install(&["--program", &other]).contains("no manual pages, no completions"));
     assert!(!local.join("share").exists() || files(&local.join("share")).is_empty());

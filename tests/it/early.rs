@@ -78,8 +78,8 @@ struct WarningFates {
     withdrawn: usize,
     /// Warnings that a worse one of the same scan replaced.
     worsened: usize,
-    /// Warnings with an unknown fate. The client reported that it missed the sample with the result, or it received that
-    /// sample too late, or the test has not received it yet.
+    /// Warnings with an unknown fate. The client reported that it missed the sample with the result, or it received
+    /// that sample too late, or the test has not received it yet.
     unknown: usize,
     /// Descriptions of all other warnings. They are errors.
     wrong: Vec<String>,

@@ -18,7 +18,7 @@ const SLOW_LEARNING: &str = "--set=background.scans=8191";
 /// World with a wall around the sensor, 3 m ahead.
 const ROOM_WORLD: &str = "[noise]\nerrors = 0\ntail = 0\n\n\
      [[thing]]\nline = [[3000, -500], [3000, 3000], [-3000, 3000], [-3000, -500]]\n";
-/// Person in that world, 1.5 m ahead.
+/// Post in that world, 1.5 m ahead of the sensor.
 const POST: &str = "\n[[thing]]\nradius_mm = 150\npose = [0, 1500]\n";
 
 fn simulator(env: &TestEnv, world: &str) -> Program {

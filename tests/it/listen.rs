@@ -231,7 +231,7 @@ fn the_account_is_exact() {
         let mut program = listener(&env, &["--topic=zones", "--topic=scan"]);
         let mut sender = TestGateway::new(HUB_ID, 7, 0, "front");
         sender.announce(&[Topic::Zones, Topic::Scan, Topic::Telegram]);
-        // Of 100 zones, numbers 10, 11 and 50 are lost, 20 and 21 are swapped, 30 arrives twice, and 40 arrives after
+        // Send 100 zones. Numbers 10, 11 and 50 are lost, 20 and 21 are swapped, 30 arrives twice, and 40 arrives after
         // 45.
         let datagrams: Vec<_> =
             (0..100).map(|_| sender.next_datagram(Topic::Zones, &zones(Verdict::Clear))).collect();

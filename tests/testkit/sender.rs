@@ -37,6 +37,7 @@ pub(crate) struct TestGateway {
 const UNANNOUNCED_SENSOR: u8 = 255;
 
 impl TestGateway {
+    /// Creates a gateway with the ID `hub`, in its run `epoch`, for the sensor with this number and name.
     pub(crate) fn new(hub: u64, epoch: u32, sensor: u8, name: &str) -> TestGateway {
         let socket = UdpSocket::bind("127.0.0.1:0").expect("a port");
         set_ip_multicast_if(&socket, &Ipv4Addr::LOCALHOST).expect("the loopback has an address");

@@ -22,6 +22,7 @@ pub(crate) struct SimulatedTelegram {
 }
 
 impl SimulatedTelegram {
+    /// Reads a telegram from a line of the simulator's log.
     pub(crate) fn of(line: &Value) -> SimulatedTelegram {
         let text = |key: &str| line[key].as_str().map(str::to_owned);
         SimulatedTelegram {

@@ -80,8 +80,8 @@ impl InstalledLibrary {
         is_installed("c++").then(|| self.build("c++", env, source, &["-std=c++11"], &self.shared()))
     }
 
-    /// Compiles `source` with the static library, and returns the path of the program. Skips the test and returns `None`
-    /// if there is no pkg-config.
+    /// Compiles `source` with the static library, and returns the path of the program. Skips the test and returns
+    /// `None` if there is no pkg-config.
     pub(crate) fn compile_static(&self, env: &TestEnv, source: &Path) -> Option<PathBuf> {
         let mut ask = self.with_packages(Command::new("pkg-config"));
         let Ok(pkg_config) = output(ask.args(["--static", "--libs-only-l", "scanhub"])) else {

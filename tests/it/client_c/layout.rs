@@ -51,8 +51,8 @@ pub(crate) fn expected() -> Vec<String> {
     lines
 }
 
-/// Returns a program in C or C++ that prints the size of each payload, the offset and size of each of its fields, and the
-/// indexes of the counters.
+/// Returns a program in C or C++ that prints the size of each payload, the offset and size of each of its fields, and
+/// the indexes of the counters.
 pub(crate) fn program() -> String {
     let mut says = String::new();
     for Layout { name, fields, .. } in layouts() {

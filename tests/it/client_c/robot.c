@@ -1,4 +1,5 @@
-/* Subscribes to the verdict of a robot and prints a line of JSON for each one: robot doorbell|event|spin|poll [SENSORS [early]]. */
+/* Subscribes to the verdict of a robot and prints a line of JSON for each one:
+ * robot doorbell|event|spin|poll [SENSORS [early]]. */
 #include <scanhub/attach.h>
 
 #include <errno.h>
