@@ -42,7 +42,7 @@ fn hub_restores_baud_rate_changed_by_another_process() {
         let hub = env.hub(&[format!("{}{link}", env.link("front"))]);
         env.await_info("front", |info| info["state"] == "streaming");
         other.change(|termios| termios.set_speed(9600).expect("a valid rate"));
-        wait_until("the hub has set its rate again", || other.rate() == rate);
+        wait_until("the hub restores its baud rate", || other.rate() == rate);
         (env, simulator, hub)
     });
     for (env, _simulator, hub) in hubs {
@@ -70,7 +70,7 @@ fn a_program_that_is_known_to_change_ports_is_named() {
         .env("SCANHUB_END_WITH_PARENT", "1");
     let _program = Program::start(command).ready();
     other.change(|termios| termios.set_speed(115_200).expect("a valid rate"));
-    wait_until("the hub has set its rate again", || other.rate() == 500_000);
+    wait_until("the hub restores its baud rate", || other.rate() == 500_000);
     let outcome = hub.end(TERM);
     let words = "set to 115200 baud by another process; ModemManager runs";
     assert!(outcome.stderr.contains(words), "{outcome}");
@@ -84,7 +84,7 @@ fn other_settings_are_made_again_too() {
     let hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
     other.change(|termios| termios.local_modes.insert(LocalModes::ICANON));
-    wait_until("the line is raw again", || {
+    wait_until("the hub restores the raw mode", || {
         !tcgetattr(&other.0).expect("a terminal").local_modes.contains(LocalModes::ICANON)
     });
     let outcome = hub.end(TERM);

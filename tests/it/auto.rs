@@ -42,7 +42,7 @@ fn scanners_of_every_family_are_found_and_remembered() {
         assert_eq!((text(&info, "family"), text(&info, "last_error")), (family, ""), "{info}");
         assert_eq!(info["baud"].to_string(), rate, "{info}");
         contiguous_numbers(&scans.end(INT).of_class("scan"), "topic_seq");
-        crate::testkit::wait_until("the scanner is remembered", || saved_scanner(&env).contains(model));
+        crate::testkit::wait_until("the hub saves the scanner", || saved_scanner(&env).contains(model));
         assert!(
             saved_scanner(&env).starts_with(&format!("{family} {model} {rate} ")),
             "{}",
@@ -69,7 +69,8 @@ fn reports_replaced_scanner_and_continues_numbering() {
     let first = env.simulator(&["front"], LD19_FLAGS);
     let hub = hub(&env);
     let mut subscriber = env.echo(&["front/scan", "front/status"]);
-    subscriber.await_line("a scan of the first one", |line| is_class("scan")(line) && line["family"] == "ld");
+    subscriber
+        .await_line("a scan of the first scanner", |line| is_class("scan")(line) && line["family"] == "ld");
     env.await_info("front", |info| info["model"] == "ld19");
     env.kill_port_simulator(first, "front");
     subscriber.await_line("absent", |line| line["state"] == "absent");
@@ -77,7 +78,7 @@ fn reports_replaced_scanner_and_continues_numbering() {
     subscriber.await_line("a search", |line| is_class("status")(line) && line["family"].is_null());
     subscriber.await_line("a scan", |line| is_class("scan")(line) && line["family"] == "rplidar");
     env.await_info("front", |info| info["family"] == "rplidar" && info["model"] == "a1");
-    crate::testkit::wait_until("the scanner is remembered", || {
+    crate::testkit::wait_until("the hub saves the scanner", || {
         saved_scanner(&env).starts_with("rplidar a1 ")
     });
     contiguous_numbers(&subscriber.end(INT).of_class("scan"), "topic_seq");
@@ -93,10 +94,10 @@ fn replay_drops_telegrams_of_another_family() {
     let recorder = recorder(&env, "swap.mcap", &["front/telegram", "front/scan", "front/status"]);
     let mut scans = env.echo(&["front/scan"]);
     let of = |family: &'static str| move |line: &Value| is_class("scan")(line) && line["family"] == family;
-    scans.await_lines(5, "a scan of the first one", of("rplidar"));
+    scans.await_lines(5, "a scan of the first scanner", of("rplidar"));
     env.kill_port_simulator(first, "front");
     let _second = env.simulator(&["front"], LD19_FLAGS);
-    scans.await_lines(5, "a scan of the second one", of("ld"));
+    scans.await_lines(5, "a scan of the second scanner", of("ld"));
     assert_eq!(
         [recorder.end(INT).exit_code, scans.end(INT).exit_code, live.end(TERM).exit_code],
         [Some(0); 3]
@@ -177,7 +178,9 @@ fn a_number_of_beams_outlives_a_restart_of_the_hub() {
         let hub = hub(&env);
         let mut scans = env.echo(&["front/scan"]);
         scans.await_lines(10, "a scan", is_class("scan"));
-        crate::testkit::wait_until("the beams are remembered", || saved_scanner(&env).contains(" 666 "));
+        crate::testkit::wait_until("the hub saves the number of beams", || {
+            saved_scanner(&env).contains(" 666 ")
+        });
         let counts = counts(&scans.end(INT));
         assert!(counts.iter().all(|count| *count == 666), "{counts:?}");
         hub.end(how);
@@ -193,10 +196,12 @@ fn a_number_of_beams_outlives_a_restart_of_the_hub() {
         "scans have 450 beams instead of 666, because the scanner measures 450 points per revolution";
     env.await_info("front", |info| text(info, "last_error") == message);
     let counts = counts(&scans.end(INT));
-    let change = counts.iter().position(|count| *count == 450).expect("awaited");
+    let change = counts.iter().position(|count| *count == 450).expect("the loop above waited for this scan");
     assert!(change >= 1 && counts[..change].iter().all(|count| *count == 666), "{counts:?}");
     assert!(counts[change..].iter().all(|count| *count == 450), "{counts:?}");
-    crate::testkit::wait_until("the other number is remembered", || saved_scanner(&env).contains(" 450 "));
+    crate::testkit::wait_until("the hub saves the other number of beams", || {
+        saved_scanner(&env).contains(" 450 ")
+    });
     let log = hub.end(TERM).stderr;
     assert_eq!(log.matches(message).count(), 1, "{log}");
 }

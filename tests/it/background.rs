@@ -21,7 +21,7 @@ fn run_background(env: &TestEnv, arguments: &[&str]) -> Outcome {
 /// Runs `background front` with these arguments, and returns the only line of its output.
 fn background_line(env: &TestEnv, arguments: &[&str]) -> Value {
     let outcome = run_background(env, arguments);
-    let [line] = &outcome.lines()[..] else { panic!("not one line: {outcome}") };
+    let [line] = &outcome.lines()[..] else { panic!("exactly one line was expected: {outcome}") };
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let mut line = line.clone();
     // The hub may save the model at any time, and a file does not contain the time of this.
@@ -59,7 +59,7 @@ fn saved_background_can_be_loaded_again() {
     let saved = background_line(&env, &["save", &file]);
     assert_eq!((&saved["class"], &saved["file"]), (&"saved".into(), &file.as_str().into()));
     let written: Value = serde_json::from_slice(&fs::read(&file).unwrap()).unwrap();
-    assert_eq!(written, model, "a file is what is shown");
+    assert_eq!(written, model, "the file differs from the output of show");
 
     background_line(&env, &["reset"]);
     let empty = background_line(&env, &["show"]);
@@ -138,7 +138,7 @@ fn hub_rejects_background_of_another_sensor() {
     let usage = env.run(&["background", "front", "melt"]);
     assert_eq!(usage.exit_code, Some(2), "{usage}");
     let mut subscriber = env.echo(&["front/foreground"]);
-    subscriber.await_lines(5, "the hub goes on", is_class("foreground"));
+    subscriber.await_lines(5, "another scan", is_class("foreground"));
     assert_eq!(hub.end(TERM).exit_code, Some(0));
 }
 

@@ -59,13 +59,14 @@ impl Browser {
         let mut process = spawned?;
         let mut lines = BufReader::new(process.stderr.take()?).lines().map_while(Result::ok);
         let address = lines.find_map(|line| Some(line.split_once("listening on ws://")?.1.to_owned()));
-        let address = address.unwrap_or_else(|| panic!("the browser does not say where it listens"));
+        let address = address.unwrap_or_else(|| panic!("the browser does not print its debugging address"));
         // Read the rest of its stderr, so that a full pipe does not block the browser.
         thread::spawn(move || lines.for_each(drop));
         let (host, _) = address.split_once('/').expect("a path");
-        let stream = TcpStream::connect(host).expect("its own port");
+        let stream = TcpStream::connect(host).expect("the debugging port accepts connections");
         stream.set_read_timeout(Some(WAIT_TIMEOUT)).expect("a timeout");
-        let (socket, _) = tungstenite::client(format!("ws://{address}"), stream).expect("its protocol");
+        let (socket, _) =
+            tungstenite::client(format!("ws://{address}"), stream).expect("the WebSocket handshake succeeds");
         let mut browser = Browser {
             process,
             socket,
@@ -117,7 +118,11 @@ impl Browser {
         let give_up_at = Instant::now() + WAIT_TIMEOUT;
         while self.ask(script) != Value::Bool(true) {
             let page_state = |browser: &mut Browser| browser.ask("JSON.stringify(window.scanhub)");
-            assert!(Instant::now() < give_up_at, "{script} is not to be seen: {}", page_state(self));
+            assert!(
+                Instant::now() < give_up_at,
+                "timeout: {script} is not true; state of the page: {}",
+                page_state(self)
+            );
             thread::sleep(Duration::from_millis(20));
         }
     }
@@ -153,7 +158,7 @@ impl Browser {
     /// Writes a screenshot of the page to a PNG file.
     pub(crate) fn save_screenshot(&mut self, path: &Path) {
         let response = self.call("Page.captureScreenshot", json!({ "format": "png" }));
-        let text = response["data"].as_str().expect("a picture");
+        let text = response["data"].as_str().expect("the response has a screenshot");
         fs::write(path, from_base64(text)).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
     }
 
@@ -164,7 +169,7 @@ impl Browser {
         if !self.session.is_empty() {
             call["sessionId"] = self.session.clone().into();
         }
-        self.socket.send(Message::text(call.to_string())).expect("the browser lives");
+        self.socket.send(Message::text(call.to_string())).expect("the browser accepts the call");
         loop {
             let response = match self.socket.read() {
                 // The process of the test was stopped and continued, for example because its virtual machine was

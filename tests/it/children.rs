@@ -30,7 +30,7 @@ fn is_running(pid: &str) -> bool {
 fn shell(script: &str) -> (Child, String) {
     let mut shell = Command::new("sh");
     shell.args(["-c", script]).stdin(Stdio::null()).stdout(Stdio::piped());
-    let mut shell = spawn(shell).expect("there is a shell");
+    let mut shell = spawn(shell).expect("sh starts");
     let mut line = String::new();
     let out = shell.stdout.take().expect("a pipe");
     BufReader::new(out).read_line(&mut line).expect("text");
@@ -83,7 +83,7 @@ fn outcome_names_leftover_processes() {
 /// Starts a process that looks like a descendant of the test binary described by `run`.
 fn start_with_run(run: &str) -> Child {
     let (child, _) = shell(&format!("echo; export {RUN_VARIABLE}='{run}'; exec sleep 1000"));
-    wait_until("it sleeps", || child.living_command_lines() == ["sleep 1000"]);
+    wait_until("the process sleeps", || child.living_command_lines() == ["sleep 1000"]);
     child
 }
 
@@ -96,7 +96,7 @@ fn is_killed(mut child: Child) -> bool {
 fn ends_processes_of_interrupted_runs() {
     let (env, own) = (TestEnv::new(), std::process::id());
     let (mut ended, run) = shell(&format!("echo ${RUN_VARIABLE}"));
-    ended.wait().expect("it ends");
+    ended.wait().expect("the process exits");
     let start = run.rsplit(':').next().expect("the start time of this process");
     let (target, ended_pid) = (env.path_argument("target"), ended.id());
     // In the second case, another process has the ID of the test binary by now.
@@ -125,11 +125,12 @@ fn first_child_ends_interrupted_runs() {
         return;
     }
     let (mut ended, run) = shell(&format!("echo ${RUN_VARIABLE}"));
-    ended.wait().expect("it ends");
+    ended.wait().expect("the process exits");
     let target = run.rsplitn(3, ':').nth(2).expect("the target directory");
     let left = start_with_run(&format!("{target}:{}:5", ended.id()));
     let mut next = Command::new(own_program());
-    let next = output(next.args(single_test_args(NAME)).env(NEXT_RUN_VARIABLE, "1")).expect("it runs");
+    let next =
+        output(next.args(single_test_args(NAME)).env(NEXT_RUN_VARIABLE, "1")).expect("the program runs");
     assert!(next.status.success(), "{next:?}");
     assert!(is_killed(left));
 }
@@ -143,7 +144,7 @@ fn written_programs_start_at_once() {
         for _ in 0..4 {
             scope.spawn(|| {
                 while !is_over.load(Ordering::Relaxed) {
-                    status(Command::new("true")).expect("there is one");
+                    status(Command::new("true")).expect("`true` starts");
                 }
             });
         }

@@ -23,14 +23,18 @@ fn expect_success(output: &Output) -> String {
 fn program(env: &TestEnv, program: &Path, words: &[&str]) -> Program {
     let mut command = Command::new(program);
     command.args(words).env("SCANHUB_DOMAIN", env.domain().name()).env_remove("XDG_RUNTIME_DIR");
-    command.env("RUNTIME_DIRECTORY", env.domain().root().parent().expect("it has one"));
+    command
+        .env("RUNTIME_DIRECTORY", env.domain().root().parent().expect("the domain has a parent directory"));
     Program::start(command)
 }
 
 /// Returns the bytes that the key `data` of a line has as hexadecimal digits.
 fn data(line: &Value) -> Vec<u8> {
-    let text = line["data"].as_str().unwrap_or_else(|| panic!("no data: {line}"));
-    (0..text.len()).step_by(2).map(|at| u8::from_str_radix(&text[at..at + 2], 16).expect("hex")).collect()
+    let text = line["data"].as_str().unwrap_or_else(|| panic!("no data in {line}"));
+    (0..text.len())
+        .step_by(2)
+        .map(|at| u8::from_str_radix(&text[at..at + 2], 16).expect("the text is hexadecimal"))
+        .collect()
 }
 
 /// Compiles the header with every language standard that users have.
@@ -53,8 +57,8 @@ fn the_header_has_the_layout_of_schema() {
             cc.args(["-x", "c++"]);
         }
         cc.arg("-I").arg(header_directory()).arg(env.path("layout.c")).arg("-o").arg(env.path("layout"));
-        expect_success(&output(cc).expect("a compiler"));
-        let printed = expect_success(&output(Command::new(env.path("layout"))).expect("it runs"));
+        expect_success(&output(cc).expect("a compiler starts"));
+        let printed = expect_success(&output(Command::new(env.path("layout"))).expect("the program runs"));
         assert_eq!(printed.lines().collect::<Vec<_>>(), layout::expected(), "{compiler} {standard}");
     }
 }
@@ -73,7 +77,7 @@ fn both_headers_go_into_one_program() {
         cc.args(["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-c", &file, "-o"]);
         cc.arg(env.path("both.o")).arg("-I").arg(header_directory());
         cc.arg("-I").arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/c"));
-        expect_success(&output(cc).expect("a compiler"));
+        expect_success(&output(cc).expect("a compiler starts"));
     }
 }
 
@@ -89,8 +93,8 @@ fn c_header_computes_the_same_values_as_schema() {
         let mut cc = Command::new("cc");
         cc.args(["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-fsanitize=undefined"]);
         cc.args(["-fno-sanitize-recover=all", "-I"]).arg(header_directory()).arg(env.path("computes.c"));
-        expect_success(&output(cc.arg("-o").arg(env.path("computes"))).expect("a compiler"));
-        let printed = expect_success(&output(Command::new(env.path("computes"))).expect("it runs"));
+        expect_success(&output(cc.arg("-o").arg(env.path("computes"))).expect("a compiler starts"));
+        let printed = expect_success(&output(Command::new(env.path("computes"))).expect("the program runs"));
         let mut lines = printed.lines();
         let head = format!("{} {} {}", scan.beams(), scan.collisions, u8::from(scan.is_incomplete()));
         assert_eq!(lines.next(), Some(head.as_str()));
@@ -127,7 +131,7 @@ fn a_program_in_c_has_every_sample_in_shared_memory() {
         .map(|wait_method| program(&env, &follow, &["front", "1", wait_method, "60"]))
         .collect();
     for subscriber in &mut subscribers {
-        subscriber.await_line("its begin", is_class("open"));
+        subscriber.await_line("line of class open", is_class("open"));
     }
     let outcomes: Vec<_> = subscribers.into_iter().map(Program::wait).collect();
     assert_eq!(hub.end(TERM).exit_code, Some(0));
@@ -138,7 +142,10 @@ fn a_program_in_c_has_every_sample_in_shared_memory() {
         let samples = outcome.of_class("sample");
         assert_eq!(samples.len(), 60, "{outcome}");
         assert!(samples.iter().all(|line| line["shared"] == true && line["restarted"] == 0), "{outcome}");
-        assert!(samples.iter().all(|line| sent.contains(&hash(&data(line)))), "never sent: {outcome}");
+        assert!(
+            samples.iter().all(|line| sent.contains(&hash(&data(line)))),
+            "a sample differs from all that were sent: {outcome}"
+        );
         for pair in samples.windows(2) {
             let gap = number(&pair[1], "topic_seq") - number(&pair[0], "topic_seq") - 1;
             assert_eq!(gap, number(&pair[1], "missed"), "{outcome}");
@@ -155,7 +162,7 @@ fn a_program_in_c_outlives_its_hub() {
     let mut subscribers =
         ["doorbell", "poll"].map(|wait_method| program(&env, &follow, &["front", "2", wait_method, "0"]));
     for subscriber in &mut subscribers {
-        subscriber.await_line("its begin", is_class("open"));
+        subscriber.await_line("line of class open", is_class("open"));
     }
     let simulator = env.simulator(&["front"], &["--seed=32"]);
     let mut boots = Vec::new();
@@ -174,7 +181,7 @@ fn a_program_in_c_outlives_its_hub() {
                 .await_lines(20, "scans", |line| line["boot"] == first["boot"] && line["restarted"] == 0);
         }
         let info = env.info("front");
-        boots.push(subscribers[0].await_line("one more", is_class("sample"))["boot"].clone());
+        boots.push(subscribers[0].await_line("a sample of the next hub", is_class("sample"))["boot"].clone());
         assert_eq!(info["state"], "streaming");
         hub.end(how);
     }
@@ -201,7 +208,7 @@ fn a_program_in_c_names_the_user_of_a_domain() {
     let silence = installed.compile(&env, &source("silence.c"), &[]);
     let domain = env.domain();
     std::fs::create_dir_all(domain.root()).expect("a directory");
-    std::os::unix::fs::chown(domain.root(), Some(65_534), Some(65_534)).expect("root may");
+    std::os::unix::fs::chown(domain.root(), Some(65_534), Some(65_534)).expect("root can change the owner");
     let other_user = 2;
     for wait_method in ["doorbell", "event"] {
         let mut subscriber = program(&env, &silence, &["front", wait_method]);
@@ -220,10 +227,10 @@ fn a_program_in_c_learns_why_no_sample_arrives() {
     let mut scans = start("front", "doorbell");
     let mut mistyped = ["doorbell", "event"].map(|wait_method| start("frnot", wait_method));
     for subscriber in mistyped.iter_mut().chain([&mut scans]) {
-        let line = subscriber.await_line("there is no hub", has_reason(no_hub, "scanhub run"));
+        let line = subscriber.await_line("the reason that no hub runs", has_reason(no_hub, "scanhub run"));
         assert_eq!((&line["sensors"], &line["topics"]), (&"".into(), &"".into()), "{line}");
         let earlier = number(&line, "silent_ns");
-        let later = subscriber.await_line("time passes", is_class("silence"));
+        let later = subscriber.await_line("another line", is_class("silence"));
         assert!(number(&later, "silent_ns") > earlier, "{line}, {later}");
     }
     // Without a hub, a poll of half a second times out. Only then does the program print a line.
@@ -284,7 +291,7 @@ fn a_robot_is_as_unknown_as_its_worst_sensor() {
     let mut subscribers =
         [&["doorbell"][..], &["poll"], &["event", "front rear"]].map(|words| program(&env, &robot, words));
     for subscriber in &mut subscribers {
-        let first = subscriber.await_line("there is no hub", is_class("robot"));
+        let first = subscriber.await_line("the reason that no hub runs", is_class("robot"));
         assert_eq!((&first["verdict"], &first["nearest_mm"]), (&3.into(), &Value::Null), "{first}");
     }
     // The verdict is clear, because the simulated room has nothing within the zones.
@@ -303,11 +310,11 @@ fn a_robot_is_as_unknown_as_its_worst_sensor() {
     };
     let both = |front, rear| vec![(Some("front".to_owned()), front), (Some("rear".to_owned()), rear)];
     for subscriber in &mut subscribers {
-        let line = subscriber.await_line("all is clear", |line| verdicts(line) == (0, both(0, 0)));
+        let line = subscriber.await_line("the verdict clear", |line| verdicts(line) == (0, both(0, 0)));
         assert_eq!(line["worst"], line["sensors"][0]["sensor"], "{line}");
         let nearest =
             line["sensors"].as_array().expect("a list").iter().min_by_key(|it| number(it, "nearest_mm"));
-        let nearest = nearest.expect("one of two");
+        let nearest = nearest.expect("one of the sensors has a distance");
         assert_eq!(
             (&line["nearest_mm"], &line["nearest_sensor"]),
             (&nearest["nearest_mm"], &nearest["sensor"])
@@ -315,12 +322,13 @@ fn a_robot_is_as_unknown_as_its_worst_sensor() {
     }
     env.kill_port_simulator(rear, "rear");
     for subscriber in &mut subscribers {
-        let line = subscriber.await_line("the rear is gone", |line| verdicts(line) == (3, both(0, 3)));
+        let line =
+            subscriber.await_line("the loss of the rear sensor", |line| verdicts(line) == (3, both(0, 3)));
         assert_eq!(line["worst"], "rear", "{line}");
     }
     assert_eq!(hub.end(KILL).exit_code, None);
     for subscriber in &mut subscribers {
-        subscriber.await_line("the hub is gone", |line| verdicts(line) == (3, both(3, 3)));
+        subscriber.await_line("the exit of the hub", |line| verdicts(line) == (3, both(3, 3)));
     }
 }
 
@@ -338,7 +346,7 @@ fn c_library_rejects_misuse() {
     let watch = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"];
     match installed.try_compile(&env, &source("misuse.c"), &watch) {
         Ok(watched) => ways.push(vec![watched.display().to_string()]),
-        Err(_) => eprintln!("without the compiler's watch over memory: it has none"),
+        Err(_) => eprintln!("not run with memory checks of the compiler, which has none"),
     }
     if is_installed("valgrind") {
         // A child process keeps pointers to the memory of its parent, some of them into the middle of blocks. These
@@ -406,7 +414,10 @@ fn the_examples_build_and_run() {
         let (feed, _keep) = std::io::pipe().expect("a pipe");
         let mut command = Command::new(&stop);
         command.arg("front").env("SCANHUB_DOMAIN", env.domain().name()).env_remove("XDG_RUNTIME_DIR");
-        command.env("RUNTIME_DIRECTORY", env.domain().root().parent().expect("it has one"));
+        command.env(
+            "RUNTIME_DIRECTORY",
+            env.domain().root().parent().expect("the domain has a parent directory"),
+        );
         let mut stop = Program::start_with(command, feed);
         let verdict = stop.next_text();
         assert!(
@@ -444,7 +455,7 @@ fn install_script_removes_every_file_it_installs() {
         let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/c/install.sh");
         let mut command = Command::new(script);
         command.args(words).arg("--library").arg(&installed.library).env("DESTDIR", &destination);
-        output(command).expect("sh")
+        output(command).expect("sh starts")
     };
     for _ in 0..2 {
         expect_success(&run(&["--prefix", "/opt/robot"]));
@@ -459,7 +470,8 @@ fn install_script_removes_every_file_it_installs() {
     ] {
         assert!(below.join(file).is_file(), "{file}");
     }
-    let description = std::fs::read_to_string(below.join("lib/pkgconfig/scanhub.pc")).expect("is there");
+    let description =
+        std::fs::read_to_string(below.join("lib/pkgconfig/scanhub.pc")).expect("the file exists");
     assert!(description.contains("prefix=/opt/robot\n"), "{description}");
     assert!(description.contains(concat!("Version: ", env!("CARGO_PKG_VERSION"), "\n")), "{description}");
     let version = below.join("lib/cmake/scanhub/scanhub-config-version.cmake");
@@ -467,7 +479,7 @@ fn install_script_removes_every_file_it_installs() {
     let line = concat!("set(PACKAGE_VERSION \"", env!("CARGO_PKG_VERSION"), "\")\n");
     assert!(version.contains(line), "{version}");
     expect_success(&run(&["--prefix", "/opt/robot", "--remove"]));
-    let left = output(Command::new("find").arg(&destination).args(["!", "-type", "d"])).expect("find");
+    let left = output(Command::new("find").arg(&destination).args(["!", "-type", "d"])).expect("find starts");
     assert_eq!(expect_success(&left), "");
     assert_eq!(run(&["--prefix", "here"]).status.code(), Some(2));
 }

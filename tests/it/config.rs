@@ -207,7 +207,7 @@ fn completes_sensors_and_topics_of_the_running_hub() {
     let root = format!("--root={}", root.parent().expect("a directory").display());
     let ask = |words: &[&str]| complete_words(&env, &[&words[..1], &[&domain, &root], &words[1..]].concat());
     let Some(before) = ask(&["echo", "front/s"]) else { return };
-    assert_eq!(before, [""; 1], "without a hub there is nothing to add");
+    assert_eq!(before, [""; 1], "without a hub, there is no completion");
     let hub = env.hub(&["--link=front=/no/such/port", "--link=rear=/no/such/port2"]);
     for (words, expected) in [
         (&["echo", "front/s"][..], &["front/scan", "front/status"][..]),
@@ -240,7 +240,7 @@ fn install_script_removes_manuals_and_completions() {
     let install = |arguments: &[&str]| {
         let mut command = Command::new("sh");
         command.arg(concat!(env!("CARGO_MANIFEST_DIR"), "/hub/dist/install.sh")).args(arguments);
-        let done = output(command.env("DESTDIR", env.path("root"))).expect("a shell");
+        let done = output(command.env("DESTDIR", env.path("root"))).expect("a shell starts");
         assert!(done.status.success(), "{done:?}");
         String::from_utf8_lossy(&done.stderr).into_owned()
     };

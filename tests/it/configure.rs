@@ -133,7 +133,8 @@ fn suggested_command_makes_marks_available() {
         let lines = outcome.of_class("marks");
         assert!(lines.iter().all(|line| line["available"] == reported["available"]), "{outcome}");
         let doctor = env.run(&["doctor", &port, "--json", "--no-system-config"]).of_class("check");
-        let found = doctor.iter().find(|line| line["name"] == "marks").expect("it is checked").clone();
+        let found =
+            doctor.iter().find(|line| line["name"] == "marks").expect("doctor checks the marks").clone();
         let ended = hub.end(TERM);
         assert_eq!(ended.exit_code, Some(0), "{ended}");
         (reported, found, ended.stderr)
@@ -207,7 +208,7 @@ fn everything_else_than_yes_writes_nothing() {
     let mut unseen = env.command(&["configure", &port, "unit=cm"]);
     unseen.stdin(Stdio::from(screen)).stdout(Stdio::null()).stderr(Stdio::null());
     let mut process = spawn(unseen).unwrap();
-    wait_until("it does not ask", || process.try_wait().unwrap().is_some());
+    wait_until("configure exits without a question", || process.try_wait().unwrap().is_some());
     assert_eq!(process.wait().unwrap().code(), Some(2));
     assert_eq!(number(&probe(&env, "front"), "unit_mm"), 1);
     assert_eq!(simulator.end(TERM).exit_code, Some(0));
@@ -261,7 +262,7 @@ fn resumes_an_abandoned_stream_after_writing() {
     assert_eq!(result.code, Some(0), "{}", result.errors);
     assert!(result.out.contains("now at: all values, continuously"), "{}", result.out);
     let sent = env.truth("front").len();
-    wait_until("it streams on", || env.truth("front").len() > sent + 20);
+    wait_until("the scanner continues to stream", || env.truth("front").len() > sent + 20);
     assert_eq!(number(&probe(&env, "front"), "availability"), 1);
     assert_eq!(simulator.end(TERM).exit_code, Some(0));
     assert_eq!(env.simulator_totals("front").1, 1);
@@ -279,7 +280,7 @@ fn signals_do_not_interrupt_a_write_in_progress() {
                 let before = env.truth("front").len();
                 keys.write_all(b"yes\n").unwrap();
                 // The simulator may not have logged the last telegram before the question yet.
-                wait_until("it has begun", || env.truth("front").len() > before + 1);
+                wait_until("the simulator has received a request", || env.truth("front").len() > before + 1);
                 if sent == Signal::HUP {
                     // The terminal is closed, too.
                     *keys = File::open("/dev/null").unwrap();

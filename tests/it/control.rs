@@ -13,7 +13,7 @@ fn control(env: &TestEnv, sensor: &str, verb: &str) -> Outcome {
 /// Sends the request `verb`, which the hub must accept.
 fn control_accepted(env: &TestEnv, sensor: &str, verb: &str) {
     let outcome = control(env, sensor, verb);
-    let [line] = &outcome.lines()[..] else { panic!("not one line: {outcome}") };
+    let [line] = &outcome.lines()[..] else { panic!("exactly one line was expected: {outcome}") };
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     assert_eq!(
         *line,
@@ -158,7 +158,7 @@ fn many_ask_at_once_and_some_are_killed_while_they_do() {
         }
     }
     // The killed programs may still hold all slots for requests.
-    wait_until("there is room to ask", || {
+    wait_until("the hub accepts a request", || {
         let outcome = control(&env, "front", "resume");
         assert!(matches!(outcome.exit_code, Some(0 | 75)), "{outcome}");
         outcome.exit_code == Some(0)

@@ -28,7 +28,7 @@ fn a_stream_becomes_a_recording_that_plays() {
     drop(reader);
     let mut command = env.command(&["convert", &mcap, "-"]);
     command.stdin(Stdio::null()).stdout(writer).stderr(Stdio::piped());
-    let closed = spawn(command).and_then(Child::wait_with_output).expect("it ends");
+    let closed = spawn(command).and_then(Child::wait_with_output).expect("the program exits");
     assert_eq!((closed.status.code(), &closed.stderr[..]), (Some(0), &b""[..]), "{closed:?}");
     // A simulated scanner can play the recording.
     let _simulator =
@@ -50,7 +50,7 @@ fn every_reader_counts_bytes_between_telegrams() {
     let outcome = env.run(&["convert", &stream, &mcap]);
     assert!(
         outcome.exit_code == Some(66) && outcome.stderr.contains("lms 15 %"),
-        "too few to recognize: {outcome}"
+        "too few scans for this check: {outcome}"
     );
     let outcome = env.run(&["convert", &stream, &mcap, "--family=lms", "--json"]);
     let line = outcome.of_class("converted").pop().unwrap_or_else(|| panic!("{outcome}"));

@@ -20,11 +20,18 @@ fn demo(arguments: &[&str], end: impl FnOnce(Program) -> Outcome) -> Outcome {
     let program = Program::start(command);
     let name = format!("demo-{}", program.pid());
     let outcome = end(program);
-    assert!(!exists_or_is_symlink(&home), "it kept something");
+    assert!(!exists_or_is_symlink(&home), "the demo created files in the home directory");
     assert_eq!(shared_memory(&format!("sh_{name}_")), [] as [&Path; 0]);
-    assert_eq!(fs::read_dir(&temporary).expect("it is there").count(), 0, "its directory is left");
+    assert_eq!(
+        fs::read_dir(&temporary).expect("the directory exists").count(),
+        0,
+        "the directory of the demo still exists"
+    );
     let uid = rustix::process::getuid().as_raw();
-    assert!(!exists_or_is_symlink(format!("/tmp/scanhub-{uid}/{name}").as_ref()), "its domain is left");
+    assert!(
+        !exists_or_is_symlink(format!("/tmp/scanhub-{uid}/{name}").as_ref()),
+        "the domain of the demo still exists"
+    );
     assert_eq!(outcome.leftover_processes, [] as [String; 0]);
     outcome
 }
@@ -49,7 +56,10 @@ fn check_summaries(outcome: &Outcome, names: &[&str]) {
         let [sent, received, lost, missed] =
             ["sent", "received", "lost", "missed"].map(|key| number(line, key));
         assert_eq!((sent - lost, number(line, "eeprom_writes")), (received, 0), "{outcome}");
-        assert!(received > 0 && (lost == 0 || missed > 0), "a loss without a cause: {outcome}");
+        assert!(
+            received > 0 && (lost == 0 || missed > 0),
+            "samples were lost without a reported reason: {outcome}"
+        );
         assert!(line["nearest_mm"].is_u64() && line["hub_cpu_percent"].is_f64(), "{outcome}");
         lost_in_all += lost;
     }
@@ -124,7 +134,7 @@ fn headless_in_an_empty_environment() {
         // A program in another terminal needs only the name of the domain.
         let mut list = Command::new(env!("CARGO_BIN_EXE_scanhub"));
         list.args(["list", "--json", "--domain", domain]).env_clear();
-        let list = output(list).expect("it starts");
+        let list = output(list).expect("the program starts");
         assert!(
             list.status.success() && String::from_utf8_lossy(&list.stdout).contains("\"rear\""),
             "{list:?}"
@@ -143,7 +153,7 @@ fn where_the_users_own_place_is_too_long_for_a_domain() {
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
     command.args(["demo", "--headless", "--for", "1s", "--json"]).env_clear().env("XDG_RUNTIME_DIR", &place);
     let outcome = Program::start(command).wait();
-    let left = fs::read_dir(&place).expect("it is there").count();
+    let left = fs::read_dir(&place).expect("the directory exists").count();
     assert_eq!(left, 0, "{outcome}");
     check_summaries(&outcome, &["front", "rear"]);
 }
@@ -193,7 +203,7 @@ fn people_are_followed_from_room_to_room_in_the_house() {
             list.lines().iter().any(|line| line["sensor"] == "people")
         });
         let mut echo = run_in_demo(domain, &["echo", "people/tracks", "people/events"]);
-        let tracks = echo.await_line("somebody whom a sensor sees", |line| {
+        let tracks = echo.await_line("a track that a sensor sees", |line| {
             line["tracks"].as_array().is_some_and(|tracks| {
                 let is_seen = |track: &serde_json::Value| {
                     track["state"] == "confirmed"
@@ -204,7 +214,7 @@ fn people_are_followed_from_room_to_room_in_the_house() {
         });
         assert_eq!((&tracks["class"], &tracks["sensor"]), (&"tracks".into(), &"people".into()));
         assert!(number(&tracks["tracks"][0], "id") > 0, "{tracks}");
-        let door = echo.await_line("who goes through a door", |line| line["kind"] == "door");
+        let door = echo.await_line("a passage through a door", |line| line["kind"] == "door");
         assert!(["left", "right"].iter().any(|name| door["door"] == *name), "{door}");
         assert!(number(&door, "id") > 0, "{door}");
         assert_eq!(echo.end(INT).exit_code, Some(0));
@@ -221,8 +231,8 @@ fn interrupted() {
     for signal in [INT, HUP] {
         let outcome = demo(&["--headless", "--json"], |program| {
             let name = format!("demo-{}", program.pid());
-            wait_until("hub, simulator and consumers", || processes(&name).len() >= 4);
-            wait_until("a domain", || !shared_memory(&format!("sh_{name}_")).is_empty());
+            wait_until("hub, simulator and subscribers run", || processes(&name).len() >= 4);
+            wait_until("the domain exists", || !shared_memory(&format!("sh_{name}_")).is_empty());
             program.end(signal)
         });
         let lost = outcome.of_class("summary").iter().map(|line| number(line, "lost")).sum();
@@ -240,9 +250,9 @@ fn second_interrupt_ends_at_once() {
         assert_eq!(echo.end(INT).exit_code, Some(0));
         // Telegrams that a stopped simulator has not sent never arrive, so the demo waits for them.
         let simulator = process_of(domain, "simulate");
-        rustix::process::kill_process(simulator, rustix::process::Signal::STOP).expect("it runs");
+        rustix::process::kill_process(simulator, rustix::process::Signal::STOP).expect("the process runs");
         program.signal(INT);
-        wait_until("it ends", || {
+        wait_until("the demo exits", || {
             program.signal(INT);
             program.has_ended()
         });
@@ -260,7 +270,7 @@ fn process_of(domain: &str, verb: &str) -> rustix::process::Pid {
         let line = fs::read_to_string(path.join("cmdline")).unwrap_or_default();
         line.split('\0').nth(1) == Some(verb) && line.split('\0').any(|word| word == domain)
     };
-    let found = entries.map(|entry| entry.path()).find(|path| is_meant(path)).expect("it runs");
+    let found = entries.map(|entry| entry.path()).find(|path| is_meant(path)).expect("the process runs");
     let pid = found.file_name().and_then(|name| name.to_str()).and_then(|name| name.parse().ok());
     rustix::process::Pid::from_raw(pid.expect("a number")).expect("a process")
 }
@@ -298,7 +308,7 @@ fn the_picture_into_a_pipe() {
     let outcome = demo(&["--for", "2s"], Program::wait);
     assert!([Some(0), Some(5)].contains(&outcome.exit_code), "{outcome}");
     let text = String::from_utf8_lossy(&outcome.stdout);
-    assert!(!text.contains('\x1b'), "controls a terminal that is none: {text:?}");
+    assert!(!text.contains('\x1b'), "the output has control sequences without a terminal: {text:?}");
     for word in [
         "scanhub demo",
         "front",

@@ -24,7 +24,7 @@ fn files(directory: &Path) -> Vec<String> {
             if path.is_dir() {
                 open.push(path);
             } else {
-                let path = path.strip_prefix(directory).expect("it is below");
+                let path = path.strip_prefix(directory).expect("the path is below the directory");
                 all.push(path.display().to_string());
             }
         }
@@ -58,7 +58,8 @@ fn install_script_removes_every_file_it_installs() {
     {
         assert!(installed.iter().any(|path| path == file), "{file} is missing: {installed:?}");
     }
-    let unit = fs::read_to_string(destination.join("etc/systemd/system/scanhub.service")).expect("is there");
+    let unit =
+        fs::read_to_string(destination.join("etc/systemd/system/scanhub.service")).expect("the file exists");
     assert!(unit.contains("ExecStart=/usr/local/bin/scanhub run\n"));
     let (code, text) = install(&destination, &["--remove"]);
     assert_eq!((code, files(&destination)), (Some(0), Vec::new()), "{text}");
@@ -70,7 +71,7 @@ fn install_script_removes_every_file_it_installs() {
 
 #[test]
 fn unit_allows_adapters_plugged_in_after_the_start() {
-    let unit = fs::read_to_string(dist().join("scanhub.service")).expect("is there");
+    let unit = fs::read_to_string(dist().join("scanhub.service")).expect("the file exists");
     let has_line = |line: &str| unit.lines().any(|it| it == line);
     // systemd.resource-control(5): systemd ignores a device group that no driver has registered when the unit starts.
     for (group, driver) in [("ttyUSB", "usbserial"), ("ttyACM", "cdc_acm")] {
@@ -87,7 +88,7 @@ fn unit_allows_adapters_plugged_in_after_the_start() {
 #[test]
 fn units_share_one_private_state_directory() {
     for unit in ["scanhub.service", "scanhub-gateway.service"] {
-        let text = fs::read_to_string(dist().join(unit)).expect("is there");
+        let text = fs::read_to_string(dist().join(unit)).expect("the file exists");
         for expected in ["User=scanhub", "StateDirectory=scanhub", "StateDirectoryMode=0700", "UMask=0077"] {
             assert!(text.lines().any(|line| line == expected), "{unit}: {expected}");
         }
@@ -101,15 +102,15 @@ fn units_leave_little_open() {
         let analyze = |words: &[&str]| output(Command::new("systemd-analyze").args(words).arg(&path));
         let limit = format!("--threshold={MAX_EXPOSURE}");
         let Ok(output) = analyze(&["security", "--offline=true", "--no-pager", &limit]) else {
-            skip("systemd-analyze", "there is none");
+            skip("systemd-analyze", "it is not installed");
             return;
         };
         let text = String::from_utf8_lossy(&output.stdout);
         if !text.contains("exposure level") {
-            skip("systemd-analyze", "this one looks at no files");
+            skip("systemd-analyze", "this version cannot check files");
             return;
         }
-        assert!(output.status.success(), "{unit} is too open:\n{text}");
+        assert!(output.status.success(), "{unit} exceeds the maximum exposure:\n{text}");
         // Messages about programs that are not installed on this machine are not faults of the unit.
         let output = analyze(&["verify"]).unwrap_or_else(|error| panic!("{error}"));
         let errors = String::from_utf8_lossy(&output.stderr).into_owned();

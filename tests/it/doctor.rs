@@ -100,7 +100,7 @@ fn reports_bad_settings_and_ports() {
     let (found, text) = state(&findings, "port", Some(&absent));
     assert!(found == "failed" && text.contains("no such port"), "{text}");
     let (found, text) = state(&findings, "access", Some("/dev/null"));
-    assert!(!text.contains("file:"), "no recording is asked: {text}");
+    assert!(!text.contains("file:"), "doctor sends no request to a recording: {text}");
     let of_null = findings.iter().filter(|line| line["port"] == "/dev/null");
     assert!(
         of_null.clone().count() > 0 && of_null.clone().all(|line| line["state"] != "ok"),
@@ -214,13 +214,13 @@ fn queries_a_running_hub_and_reports_a_killed_one() {
     assert!(state(&findings, "sensor", Some(&port)).1.contains("streaming"));
     let after = env.info("front");
     let counters = |info: &Value| (info["counters"]["aborted"].clone(), info["counters"]["resyncs"].clone());
-    assert_eq!(counters(&before), counters(&after), "it was disturbed");
+    assert_eq!(counters(&before), counters(&after), "doctor changed the counters of the hub");
 
     assert_eq!(hub.end(KILL).exit_code, None);
     let (findings, _) = doctor(&env, &[&link], 0);
     let (found, text) = state(&findings, "leftovers", None);
     assert!(found == "warning" && text.contains("1 process died") && text.contains("scanhub run"), "{text}");
-    assert!(!env.leftover_files().is_empty(), "it deleted something");
+    assert!(!env.leftover_files().is_empty(), "doctor deleted files");
 }
 
 #[test]
@@ -250,7 +250,7 @@ fn a_hub_that_is_stopped_is_no_good_set_up() {
 fn hub_is_not_reported_as_leftover_of_another_root() {
     let env = TestEnv::new();
     let hub = env.hub(&[env.link("absent")]);
-    assert!(!env.leftover_files().is_empty(), "it has shared memory");
+    assert!(!env.leftover_files().is_empty(), "the domain has no shared memory");
     let domains = |root: &Path| Program::start(env.command_at(root, &["list", "--domains", "--json"])).wait();
     let domain = env.domain();
     let here = domains(domain.root().parent().unwrap()).of_class("domain");
@@ -274,9 +274,12 @@ fn does_not_open_a_port_held_by_another_program() {
     inotify::add_watch(&watch, &device, WatchFlags::OPEN).unwrap();
     // This process has the port open.
     let (findings, _) = doctor(&env, &[&env.path_argument("front")], 5);
-    assert_eq!(rustix::io::read(&watch, &mut [0; 64]), Err(Errno::AGAIN), "it was opened");
+    assert_eq!(rustix::io::read(&watch, &mut [0; 64]), Err(Errno::AGAIN), "doctor opened the port");
     drop(std::fs::File::open(&device).unwrap());
-    assert!(rustix::io::read(&watch, &mut [0; 64]).is_ok(), "nobody would have noticed");
+    assert!(
+        rustix::io::read(&watch, &mut [0; 64]).is_ok(),
+        "the watch does not report that a port is opened"
+    );
     let (found, text) = state(&findings, "holder", Some(&env.path_argument("front")));
     assert!(found == "failed" && text.contains(&format!("process {}", std::process::id())), "{text}");
     assert_eq!(state(&findings, "sensor", Some(&env.path_argument("front"))).0, "skipped");
@@ -303,7 +306,12 @@ fn too_few_descriptors_for_a_hub_is_a_failure() {
     let run = ["run", "--json", &link];
     let refused = limited(40, &run).wait();
     assert_eq!(refused.exit_code, Some(75), "{refused}");
-    let words = refused.stderr.split_once("descriptors are short: ").expect("it says so").1.split(' ');
+    let words = refused
+        .stderr
+        .split_once("descriptors are short: ")
+        .expect("the message reports the shortage")
+        .1
+        .split(' ');
     let numbers: Vec<u64> = words.filter_map(|word| word.parse().ok()).collect();
     let enough = numbers[0] + numbers[1];
     assert_eq!(limited(enough - 1, &run).wait().exit_code, Some(75));

@@ -41,14 +41,14 @@ const BROKEN_SENSORS: [(&str, &[&str], &str, &str, &str); 10] = [
     ("a mode without reflector bits", &["--mode=0x00"], "marks", "warning", "mode=0x01"),
     ("nobody answers", &["--fault=mute=1"], "sensor", "failed", "power, cable, jumper 7-8"),
     (
-        "a wire is broken: it streams and hears nothing",
+        "a wire is broken: the scanner streams and receives nothing",
         &["--state=streaming", "--baud=38400", "--fault=overlook=1"],
         "sensor",
         "failed",
         "the wire to its receiver",
     ),
     (
-        "noise is all that comes",
+        "only noise arrives",
         &["--state=streaming", "--baud=500000", "--fault=flip=0.5,flip_bits=64,overlook=1"],
         "sensor",
         "failed",
@@ -69,7 +69,7 @@ fn finds_sensor_faults() {
             let examine = || Findings::of(&env, &[&link, "--set", &expected[0], "--set", &expected[1]]);
             let mut findings = examine();
             // On a busy machine, the simulated scanner may reply too late.
-            wait_until("a sensor that can reply does", || {
+            wait_until("the simulated scanner replies in time", || {
                 let has_replied = name == "sensor" || findings.state_and_text("sensor").0 != "failed";
                 if !has_replied {
                     findings = examine();
@@ -97,8 +97,8 @@ fn finds_port_faults() {
         "{:?}",
         unplugged.state_and_text("port")
     );
-    unplugged.assert_problem("the adapter behind the name is gone", "port", "failed", "");
-    Findings::of(&env, &["/dev/null"]).assert_problem("no serial line", "access", "failed", "name a tty");
+    unplugged.assert_problem("the adapter of the name is unplugged", "port", "failed", "");
+    Findings::of(&env, &["/dev/null"]).assert_problem("not a serial line", "access", "failed", "name a tty");
     port("").assert_problem("a directory", "access", "failed", "it is a directory");
 
     let line = TestLine::create(&env.path("held"));
@@ -127,7 +127,8 @@ fn reports_missing_port_permission_with_remedy() {
     let _line = TestLine::create(&env.path("front"));
     let arguments = ["doctor", "--json", "--no-system-config", &env.path_argument("front")];
     if !rustix::process::getuid().is_root() {
-        fs::set_permissions(env.path("front"), fs::Permissions::from_mode(0o000)).expect("it is ours");
+        fs::set_permissions(env.path("front"), fs::Permissions::from_mode(0o000))
+            .expect("the owner can change the mode");
         let findings = Findings::in_outcome(&env.run(&arguments));
         return findings.assert_problem(NO_PERMISSION, "access", "failed", "chmod u+rw");
     }
@@ -138,13 +139,13 @@ fn reports_missing_port_permission_with_remedy() {
     };
     let mut attempt = as_nobody(Command::new(env!("CARGO_BIN_EXE_scanhub")));
     if !succeeds(attempt.arg("--version")) {
-        skip("open-directory", "the program lies where other users cannot start it");
+        skip("open-directory", "other users cannot start the program in its directory");
         return;
     }
     let group = |gid, mode| {
         let device = env.path("front").canonicalize().expect("a device");
-        std::os::unix::fs::chown(&device, Some(0), Some(gid)).expect("root may");
-        fs::set_permissions(&device, fs::Permissions::from_mode(mode)).expect("root may");
+        std::os::unix::fs::chown(&device, Some(0), Some(gid)).expect("root is permitted");
+        fs::set_permissions(&device, fs::Permissions::from_mode(mode)).expect("root is permitted");
         Findings::in_outcome(&Program::start(as_nobody(env.command(&arguments))).wait())
     };
     group(20, 0o660).assert_problem(NO_PERMISSION, "access", "failed", "sudo usermod -aG");
@@ -160,7 +161,7 @@ fn finds_configuration_faults() {
     };
     broken("an unknown key", "[[link]]\nname = \"front\"\nbuad = 500000\n", "baud");
     broken(
-        "a value that cannot be",
+        "an impossible value",
         "[[link]]\nname = \"front\"\nport = \"/dev/x\"\nangle = 170\n",
         "100 or 180",
     );

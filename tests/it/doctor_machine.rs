@@ -52,7 +52,7 @@ fn a_set_up_that_is_well() {
     env.await_info("front", |info| info["state"] == "streaming");
     assert!(examine().state_and_text("version").1.ends_with("the hub runs the same program"));
     assert_eq!(hub.end(TERM).exit_code, Some(0));
-    assert!(examine().state_and_text("leftovers").1.starts_with("none"), "an orderly end leaves nothing");
+    assert!(examine().state_and_text("leftovers").1.starts_with("none"), "files remain after a normal exit");
     healthy_machine(&env).assert_no_problem();
 }
 
@@ -100,7 +100,7 @@ fn port_findings(env: &TestEnv) -> Findings {
     };
     let mut lines = Vec::new();
     let mut add_finding = |finding: &scanhub_tools::doctor::Finding| {
-        lines.push(serde_json::to_value(finding).expect("is JSON"))
+        lines.push(serde_json::to_value(finding).expect("a finding can be written as JSON"))
     };
     let _ = run_checks(&targets, &AtomicBool::new(false), &mut add_finding);
     Findings::in_lines(lines)
@@ -143,7 +143,7 @@ fn finds_faults_of_service_and_udev_rule() {
     let remove = |path: &str| fs::remove_file(at(path)).unwrap_or_else(|error| panic!("{path}: {error}"));
     remove("var/lib/systemd/linger/robot");
     healthy_layout(&env).assert_problem(
-        "logging out takes shared memory away",
+        "logging out removes shared memory",
         "logout",
         "warning",
         "enable-linger robot",
@@ -187,7 +187,7 @@ fn finds_resource_shortages() {
         "sudo prlimit --pid $$ --nofile=",
     );
     limited("ulimit -f 100").assert_problem(
-        "files may not be long",
+        "the length of files is limited",
         "file-size",
         "failed",
         "ulimit -f unlimited",
@@ -201,7 +201,7 @@ fn finds_resource_shortages() {
         command
     };
     if !succeeds(mounted("size=64k", "true").arg("true")) {
-        skip("mounts", "this user may not make a mount namespace");
+        skip("mounts", "this user may not create a mount namespace");
         return;
     }
     for (set_up, options, after, remedy) in [
@@ -223,23 +223,23 @@ fn finds_domain_faults() {
     let env = TestEnv::new();
     let root = env.domain().root().to_owned();
     fs::create_dir(&root).expect("can be created");
-    fs::set_permissions(&root, fs::Permissions::from_mode(0o777)).expect("it is ours");
+    fs::set_permissions(&root, fs::Permissions::from_mode(0o777)).expect("the file belongs to this user");
     Findings::of(&env, &[]).assert_problem(
-        "others may write in the domain",
+        "other users can write in the domain",
         "domain",
         "failed",
         "chmod go-w",
     );
     if std::os::unix::fs::chown(&root, Some(1), None).is_ok() {
-        fs::set_permissions(&root, fs::Permissions::from_mode(0o700)).expect("root may");
+        fs::set_permissions(&root, fs::Permissions::from_mode(0o700)).expect("root is permitted");
         Findings::of(&env, &[]).assert_problem(
-            "the domain is another user's",
+            "the domain belongs to another user",
             "domain",
             "failed",
             "run as user 1",
         );
     } else {
-        skip("root", "this user cannot give a directory away");
+        skip("root", "only root can change the owner of a directory");
     }
     let nowhere = env.command_at(Path::new("/dev/null"), &["doctor", "--json", "--no-system-config"]);
     let findings = Findings::in_outcome(&Program::start(nowhere).wait());
@@ -303,12 +303,12 @@ fn files_without_a_domain_are_taken_away() {
     let env = TestEnv::new();
     let hub = env.hub(&[env.link("absent")]);
     hub.end(KILL);
-    fs::remove_dir_all(env.domain().root()).expect("it is ours");
+    fs::remove_dir_all(env.domain().root()).expect("the file belongs to this user");
     let findings = Findings::of(&env, &[]);
-    findings.assert_problem("files of a domain that is gone", "leftovers", "warning", "doctor --clean");
+    findings.assert_problem("files of a deleted domain", "leftovers", "warning", "doctor --clean");
     // A process still reads one of the files.
     let files = env.leftover_files();
-    let held = fs::File::open(&files[0]).expect("it is ours");
+    let held = fs::File::open(&files[0]).expect("the file belongs to this user");
     Findings::of(&env, &["--clean"]);
     assert_eq!(env.leftover_files(), files[..1]);
     drop(held);
@@ -335,7 +335,7 @@ fn two_hubs_and_one_that_was_replaced() {
     let (service, user) = (env.path("a"), env.path("b/scanhub"));
     let _first = run_at(&program, &service);
     let _second = run_at(Path::new(env!("CARGO_BIN_EXE_scanhub")), &user);
-    fs::remove_file(&program).expect("it is ours");
+    fs::remove_file(&program).expect("the file belongs to this user");
     let name = env.domain().name().to_owned();
     let mut doctor = Command::new(env!("CARGO_BIN_EXE_scanhub"));
     doctor.args(["doctor", "--json", "--no-system-config", "--domain", &name, &link]);
@@ -358,6 +358,11 @@ fn no_way_to_the_network() {
         // No interface is configured, so nothing is sent to a network.
         assert_eq!(Findings::of(&env, &[]).state_and_text("multicast").0, "skipped");
         let interface = Findings::of(&env, &["--set", "gateway.interface=eth7"]);
-        interface.assert_problem("the gateway's interface is gone", "multicast", "failed", "there are lo");
+        interface.assert_problem(
+            "the gateway's interface does not exist",
+            "multicast",
+            "failed",
+            "there are lo",
+        );
     });
 }

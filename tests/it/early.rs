@@ -50,7 +50,7 @@ fn check_warnings(
     let (hub, simulator) = scanner.start(env, POST_WORLD, faults);
     let mut echo = env.echo(&["front/early", "front/zones"]);
     let lines = RefCell::new(Vec::new());
-    echo.await_line("enough warnings", |line| {
+    echo.await_line("warnings with all expected fates", |line| {
         let mut lines = lines.borrow_mut();
         lines.push(line.clone());
         // Checking after every line would make this test read slowly, and then the client misses samples.

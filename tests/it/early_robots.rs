@@ -21,10 +21,10 @@ fn python_robot_subscribes_to_warnings_until_it_ends() {
     let (hub, simulator) = (env.hub(&[env.link("front")]), env.simulator(&["front"], &flags));
     let mut robot = Program::start(command);
     robot.await_line("the post", |line| line["verdict"] == "stop");
-    wait_until("it follows warnings", || env.subscribers("front/early") == 1);
+    wait_until("the program is attached to the warnings", || env.subscribers("front/early") == 1);
     robot.await_line("the post, after that", |line| line["verdict"] == "stop");
     assert_eq!(robot.end(INT).exit_code, Some(0));
-    wait_until("nobody follows them", || env.subscribers("front/early") == 0);
+    wait_until("no program is attached to the warnings", || env.subscribers("front/early") == 0);
     assert_eq!((hub.end(TERM).exit_code, simulator.end(TERM).exit_code), (Some(0), Some(0)));
 }
 
@@ -39,10 +39,13 @@ impl SimulatedSensor {
     /// Creates the sensor `robot1.front`, the only one in the domain of `env`.
     fn new(env: &TestEnv) -> SimulatedSensor {
         let topics = [Topic::Zones, Topic::Early];
-        let session =
-            PublishSession::open(&env.domain(), &topics, TopicLimits::default()).expect("nobody else");
+        let session = PublishSession::open(&env.domain(), &topics, TopicLimits::default())
+            .expect("the name is not in use");
         let sensor = session.sensor("robot1.front").expect("a name");
-        let (zones, early) = (sensor.topic().expect("room"), sensor.topic().expect("room"));
+        let (zones, early) = (
+            sensor.topic().expect("the topic can be created"),
+            sensor.topic().expect("the topic can be created"),
+        );
         SimulatedSensor { zones, early, sensor }
     }
 
@@ -54,15 +57,15 @@ impl SimulatedSensor {
     fn publish_zones(&mut self, seq: u64, verdict: Verdict) {
         let header = self.header_of_scan(seq);
         let zones = Zones { verdict: verdict as u8, ..Zones::unknown() };
-        self.zones.send_with(&header, |sample| *sample = zones).expect("there is room");
-        self.sensor.wake(WakeEvent::Telegram).expect("they are woken");
+        self.zones.send_with(&header, |sample| *sample = zones).expect("a sample can be sent");
+        self.sensor.wake(WakeEvent::Telegram).expect("subscribers can be woken");
     }
 
     fn publish_warning(&mut self, seq: u64, flags: u8) {
         let header = self.header_of_scan(seq);
         let stop = Early { verdict: 2, flags, beam: 40, distance_mm: 500, bytes_seen: 240, beams_seen: 116 };
-        self.early.send_with(&header, |sample| *sample = stop).expect("there is room");
-        self.sensor.wake(WakeEvent::Early).expect("they are woken");
+        self.early.send_with(&header, |sample| *sample = stop).expect("a sample can be sent");
+        self.sensor.wake(WakeEvent::Early).expect("subscribers can be woken");
     }
 }
 
@@ -80,7 +83,10 @@ fn start_robots(env: &TestEnv) -> Vec<(bool, Program)> {
             let mut command = Command::new(installed.compile(env, &source("robot.c"), &[]));
             command.args([wait_method, "robot1.front"]).args(early.then_some("early"));
             command.env("SCANHUB_DOMAIN", env.domain().name()).env_remove("XDG_RUNTIME_DIR");
-            command.env("RUNTIME_DIRECTORY", env.domain().root().parent().expect("it has one"));
+            command.env(
+                "RUNTIME_DIRECTORY",
+                env.domain().root().parent().expect("the domain has a parent directory"),
+            );
             commands.push((early, command));
         }
     }
@@ -103,7 +109,7 @@ fn robots_handle_warnings_only_if_requested() {
     let mut in_rust = [(false, builder()), (true, builder().early())]
         .map(|(is_early, builder)| (is_early, builder.open().expect("a name")));
     let all = robots.len() as u64 + 2;
-    wait_until("zones are followed by all, and warnings by those who want them", || {
+    wait_until("all programs are attached to zones, and some to warnings", || {
         for (_, robot) in &mut in_rust {
             robot.now().expect("a domain");
         }
@@ -151,7 +157,9 @@ fn leds_show_warnings_and_withdrawals_if_requested() {
         let early: &[&str] = if follows_early { &["--early"] } else { &[] };
         let mut leds = env.start(&[&["leds", "robot1.front", "--hold=0s", "--json"], early].concat());
         let topics = ["robot1.front/zones", "robot1.front/early"];
-        wait_until("it follows", || topics.map(|topic| env.subscribers(topic)) == [1, follows_early.into()]);
+        wait_until("the program is attached", || {
+            topics.map(|topic| env.subscribers(topic)) == [1, follows_early.into()]
+        });
         let mut shows = |is_of_warning: bool, expected: Verdict| {
             if follows_early || !is_of_warning {
                 let is_it = |line: &Value| line["class"] == "leds" && verdict(line) == Some(expected);

@@ -26,13 +26,13 @@ fn a_hub_ends_by_both_signals_and_leaves_nothing() {
         let hub = env.hub(&[env.link("front"), env.link("rear")]);
         let mut subscriber = env.echo(&["front/scan"]);
         subscriber.await_lines(3, "a scan", is_class("scan"));
-        assert!(!env.leftover_files().is_empty(), "looked at the wrong place");
+        assert!(!env.leftover_files().is_empty(), "the hub should have files in shared memory");
         assert_eq!(hub.end(signal).exit_code, Some(0), "{signal:?}");
         // Shared memory is freed once the subscriber has exited, too.
         assert_eq!(subscriber.end(INT).exit_code, Some(0));
-        wait_until("shared memory is free", || env.leftover_files().is_empty());
+        wait_until("shared memory is freed", || env.leftover_files().is_empty());
         assert_eq!(simulator.end(signal).exit_code, Some(0));
-        assert!(!exists_or_is_symlink(&env.path("front")), "the simulator's symlink is left");
+        assert!(!exists_or_is_symlink(&env.path("front")), "the symlink of the simulator still exists");
     }
 }
 
@@ -65,12 +65,12 @@ fn a_reader_that_has_enough_is_no_failure() {
     for format in ["--json", "--csv"] {
         let mut command = env.command(&["echo", "front/scan", format]);
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
-        let mut echo = spawn(command).expect("starts");
+        let mut echo = spawn(command).expect("the program starts");
         let mut line = String::new();
         let mut reader = BufReader::with_capacity(1, echo.stdout.take().expect("a pipe"));
         let read = reader.read_line(&mut line);
         drop(reader);
-        let outcome = echo.wait_with_output().expect("ends");
+        let outcome = echo.wait_with_output().expect("the program exits");
         assert!(read.is_ok() && line.len() > 100, "{line:?}");
         let errors = String::from_utf8_lossy(&outcome.stderr);
         assert_eq!((outcome.status.code(), &*errors), (Some(0), ""));
@@ -85,15 +85,15 @@ fn every_line_is_one_write() {
     let (read, write) = pipe_with(PipeFlags::DIRECT | PipeFlags::CLOEXEC).expect("a pipe");
     let mut command = env.command(&["echo", "--json", "front/scan", "front/telegram", "front/status"]);
     command.stdin(Stdio::null()).stdout(write).stderr(Stdio::null());
-    let mut echo = spawn(command).expect("starts");
+    let mut echo = spawn(command).expect("the program starts");
     for _ in 0..60 {
         let mut buffer = [0; 8192];
         let len = rustix::io::read(&read, &mut buffer).expect("a line");
         let whole = buffer[..len].ends_with(b"\n") && buffer[..len].starts_with(b"{");
-        assert!(whole, "a piece: {:?}", String::from_utf8_lossy(&buffer[..len]));
+        assert!(whole, "a line was written in several parts: {:?}", String::from_utf8_lossy(&buffer[..len]));
     }
-    echo.kill().expect("is killed");
-    echo.wait().expect("is dead");
+    echo.kill().expect("echo can be killed");
+    echo.wait().expect("echo can be waited for");
 }
 
 #[test]
@@ -105,12 +105,14 @@ fn a_killed_echo_leaves_whole_lines() {
         let file = File::create(&path).expect("a file");
         let mut command = env.command(&["echo", "--json", "front/scan", "front/telegram"]);
         command.stdin(Stdio::null()).stdout(file).stderr(Stdio::null());
-        let mut echo = spawn(command).expect("starts");
-        wait_until("some lines", || fs::metadata(&path).is_ok_and(|metadata| metadata.len() > 40_000));
-        echo.kill().expect("is killed");
-        echo.wait().expect("is dead");
-        let text = fs::read_to_string(&path).expect("is text");
-        assert!(text.ends_with('\n'), "half a line is left");
+        let mut echo = spawn(command).expect("the program starts");
+        wait_until("some lines are written", || {
+            fs::metadata(&path).is_ok_and(|metadata| metadata.len() > 40_000)
+        });
+        echo.kill().expect("echo can be killed");
+        echo.wait().expect("echo can be waited for");
+        let text = fs::read_to_string(&path).expect("the output is UTF-8 text");
+        assert!(text.ends_with('\n'), "an incomplete line remains");
         let lines: Vec<Value> = text.lines().map(|line| serde_json::from_str(line).expect(line)).collect();
         assert!(lines.len() > 10);
     }
@@ -126,7 +128,7 @@ fn a_simulator_takes_and_leaves_only_its_own_place() {
     assert_eq!(simulator.end(KILL).exit_code, None);
     assert_eq!(fs::read_link(&port).ok(), Some(old));
     let simulator = env.simulator(&["front"], &[] as &[&str]);
-    assert!(fs::metadata(&port).is_ok(), "leads nowhere");
+    assert!(fs::metadata(&port).is_ok(), "the port has no target");
     assert_eq!(simulator.end(INT).exit_code, Some(0));
     assert!(!exists_or_is_symlink(&port));
     // A simulator never replaces other files or symlinks.

@@ -67,7 +67,7 @@ fn an_input_that_cannot_be_read_is_66() {
     let env = TestEnv::new();
     let long = env.file("long", "# long\n".repeat(100_000));
     // A file with a key must not be readable by other users.
-    fs::set_permissions(&long, Permissions::from_mode(0o600)).expect("it is ours");
+    fs::set_permissions(&long, Permissions::from_mode(0o600)).expect("the file belongs to this user");
     let [directory, pipe, socket] = ["directory", "pipe", "socket"].map(|name| env.path(name));
     fs::create_dir(&directory).expect("a directory");
     mknodat(CWD, &pipe, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).expect("a pipe");
@@ -76,7 +76,7 @@ fn an_input_that_cannot_be_read_is_66() {
         for file in ["absent", "directory", "pipe", "socket"].map(|name| env.path_argument(name)) {
             let outcome = run(&env, line, &file);
             assert_eq!(outcome.exit_code, Some(66), "{line} {file}: {outcome}");
-            assert!(outcome.stderr.contains(&file), "the message names the file: {line}: {outcome}");
+            assert!(outcome.stderr.contains(&file), "the message must name the file: {line}: {outcome}");
         }
         let files = if is_recording { vec!["/dev/zero"] } else { vec!["/dev/zero", &long] };
         for file in files {
@@ -94,7 +94,7 @@ fn an_input_that_cannot_be_read_is_66() {
         for file in [&junk, &zeros] {
             let outcome = run(&env, line, file);
             assert_eq!(outcome.exit_code, Some(66), "{line} {file}: {outcome}");
-            assert!(outcome.stderr.contains(file), "the message names the file: {line}: {outcome}");
+            assert!(outcome.stderr.contains(file), "the message must name the file: {line}: {outcome}");
         }
     }
     assert!(!env.path("out.csv").exists() && !env.path("out.mcap").exists());
@@ -104,7 +104,8 @@ fn an_input_that_cannot_be_read_is_66() {
 fn an_input_that_this_user_may_not_read_is_66() {
     with_another_user("exit_codes::an_input_that_this_user_may_not_read_is_66", || {
         fs::write("/tmp/secret", "text").expect("a file");
-        fs::set_permissions("/tmp/secret", Permissions::from_mode(0o600)).expect("it is ours");
+        fs::set_permissions("/tmp/secret", Permissions::from_mode(0o600))
+            .expect("the file belongs to this user");
         for (line, _) in INPUT_COMMANDS {
             let line =
                 line.replace("FILE", "/tmp/secret").replace("PORT", "/tmp/port").replace("OUT", "/tmp/out");
@@ -132,7 +133,7 @@ fn a_wrong_value_in_a_file_that_could_be_read_is_78() {
         assert_eq!(outcome.exit_code, Some(78), "{line}: {outcome}");
         assert!(outcome.stderr.contains("wrong.toml"), "{line}: {outcome}");
     }
-    fs::set_permissions(&file, Permissions::from_mode(0o600)).expect("it is ours");
+    fs::set_permissions(&file, Permissions::from_mode(0o600)).expect("the file belongs to this user");
     for line in ["gateway --no-system-config --interface=lo --key-file FILE", "listen --key-file FILE"] {
         assert_eq!(run(&env, line, &file).exit_code, Some(78), "{line}");
     }
@@ -175,7 +176,7 @@ fn an_output_that_cannot_be_created_is_73() {
         assert_eq!(outcome.exit_code, Some(73), "{line}: {outcome}");
         assert!(outcome.stderr.contains("old.mcap exists"), "{line}: {outcome}");
     }
-    assert_eq!(fs::read_to_string(&file).expect("it is there"), "old");
+    assert_eq!(fs::read_to_string(&file).expect("the file exists"), "old");
     assert!(!env.path("absent").exists() && !env.path("nowhere").exists());
 }
 
@@ -207,7 +208,7 @@ fn an_existing_output_is_replaced_by_force() {
     let outcome = env.run(&["man", &pages]);
     assert_eq!(outcome.exit_code, Some(73), "{outcome}");
     assert!(outcome.stderr.contains("scanhub-run.1: it is a link to"), "{outcome}");
-    fs::remove_file(&page).expect("it is ours");
+    fs::remove_file(&page).expect("the file belongs to this user");
     for _ in 0..2 {
         assert_eq!(env.run(&["man", &pages]).exit_code, Some(0));
     }
@@ -220,11 +221,11 @@ fn token_file_must_be_readable_only_by_its_user() {
     let env = TestEnv::new();
     let file = env.file("token", "carrot\n");
     let web = |env: &TestEnv| env.command(&["web", "--json", "--listen=127.0.0.1:0", "--token-file", &file]);
-    fs::set_permissions(&file, Permissions::from_mode(0o640)).expect("it is ours");
+    fs::set_permissions(&file, Permissions::from_mode(0o640)).expect("the file belongs to this user");
     let refused = Program::start(web(&env)).wait();
     assert_eq!(refused.exit_code, Some(78), "{refused}");
     assert!(refused.to_string().contains("mode 0640"), "{refused}");
-    fs::set_permissions(&file, Permissions::from_mode(0o600)).expect("it is ours");
+    fs::set_permissions(&file, Permissions::from_mode(0o600)).expect("the file belongs to this user");
     let mut command = web(&env);
     command.env("SCANHUB_WEB_TOKEN", "of-the-environment");
     let mut web = Program::start(command);

@@ -30,8 +30,8 @@ fn garbage(random: &mut Rng, len: usize) -> Vec<u8> {
 
 /// Returns the resident memory of a process in kilobytes.
 fn resident_kb(pid: u32) -> u64 {
-    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).expect("the hub lives");
-    let line = status.lines().find(|line| line.starts_with("VmRSS:")).expect("a resident size");
+    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).expect("the hub runs");
+    let line = status.lines().find(|line| line.starts_with("VmRSS:")).expect("the status has VmRSS");
     line.split_whitespace().nth(1).and_then(|number| number.parse().ok()).expect("a number")
 }
 
@@ -89,7 +89,7 @@ fn telegrams_in_a_flood_of_garbage() {
 
 /// Returns the CPU time that a process has used.
 fn cpu_time(pid: u32) -> Duration {
-    let tasks = std::fs::read_dir(format!("/proc/{pid}/task")).expect("the hub lives").flatten();
+    let tasks = std::fs::read_dir(format!("/proc/{pid}/task")).expect("the hub runs").flatten();
     let of_task = |task: std::fs::DirEntry| {
         let text = std::fs::read_to_string(task.path().join("schedstat")).ok()?;
         text.split_whitespace().next()?.parse::<u64>().ok()
@@ -100,11 +100,14 @@ fn cpu_time(pid: u32) -> Duration {
 #[test]
 fn a_serial_server_that_sends_garbage_at_full_speed() {
     let env = TestEnv::new();
-    let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");
-    let link = format!("--link=front=tcp:{},family=lms", listener.local_addr().expect("it has an address"));
+    let listener = TcpListener::bind("127.0.0.1:0").expect("a TCP port is free");
+    let link = format!(
+        "--link=front=tcp:{},family=lms",
+        listener.local_addr().expect("the listener has an address")
+    );
     let hub = env.hub(&[link]);
     let mut subscriber = env.echo(&["front/telegram"]);
-    let (mut server, _) = listener.accept().expect("the hub comes");
+    let (mut server, _) = listener.accept().expect("the hub connects");
     // Send more than is allowed at once, with telegrams in it, and then endless garbage.
     let mut random = Rng::with_seed(5);
     let sent: Vec<Vec<u8>> = (0..20).map(|number| scan(1000 + number)).collect();
@@ -127,17 +130,17 @@ fn a_serial_server_that_sends_garbage_at_full_speed() {
     let bytes = || number(&env.info("front")["counters"], "bytes_read");
     // The counters come from the last status, so they are up to a second old.
     let (before, since, idle) = (bytes(), Instant::now(), cpu_time(hub.pid()));
-    wait_until("a part of it is read", || bytes() > before + 300_000);
+    wait_until("the hub reads a part of the garbage", || bytes() > before + 300_000);
     let worked = cpu_time(hub.pid()).saturating_sub(idle);
     let (read, elapsed) = (bytes() - before, since.elapsed());
     let maximum = 100_000.0 * (elapsed.as_secs_f64() + 2.0);
     let share = worked.as_secs_f64() / elapsed.as_secs_f64();
     eprintln!("{read} bytes in {elapsed:?}, {:.1} % of a processor", 100.0 * share);
     assert!(read as f64 <= maximum, "{read} bytes in {elapsed:?}");
-    assert!(share < 0.5, "{:.1} % of a processor, in a program that is not optimized", 100.0 * share);
+    assert!(share < 0.5, "{:.1} % CPU time in an unoptimized build", 100.0 * share);
     let outcome = hub.end(TERM);
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let message_count = outcome.stderr.lines().filter(|line| line.contains(says)).count();
     assert!((1..=2).contains(&message_count), "{outcome}");
-    writer.join().expect("it ends with the hub");
+    writer.join().expect("the writer ends with the hub");
 }

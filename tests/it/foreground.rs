@@ -49,7 +49,7 @@ fn boxes_are_learned_and_forgotten() {
     let [new, _, left] = boxes.percents();
     assert!(
         new == 0.0 && left == 0.0,
-        "{new} % of a box still new after N scans, {left} % left of one after 2N"
+        "{new} % of the new box is foreground after N scans, {left} % of the removed one remains after 2N"
     );
 }
 
@@ -67,7 +67,7 @@ fn a_model_taken_back_is_right_at_once() {
             let mut shown = Background::zeroed(Background::len(BEAM_COUNT));
             model.write(&mut shown);
             let mut next = BackgroundModel::new(Settings::default(), BEAM_COUNT);
-            next.load(&shown).expect("it fits");
+            next.load(&shown).expect("the payload fits");
             let [on, anew] = [model, next].map(|mut model| {
                 let (mut found, mut wrong) = (0, 0);
                 for frame in &frames[at..at + 200] {

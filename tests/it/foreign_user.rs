@@ -34,7 +34,7 @@ pub(crate) fn with_another_user(name: &str, test: impl FnOnce()) {
     };
     let is_root = rustix::process::getuid().is_root();
     if !is_root || !succeeds(unshare("true")) {
-        testkit::skip("root", "only root can be two users, and needs a mount namespace for it");
+        testkit::skip("root", "only root can start programs as another user, and it needs a mount namespace");
         return;
     }
     let mut inside = unshare(&format!("exec /mnt/test --exact {name} --nocapture"));
@@ -77,8 +77,10 @@ fn create_victim_directory() -> PathBuf {
 }
 
 fn check_untouched(target: &Path) {
-    let mut names: Vec<_> =
-        fs::read_dir(target).expect("is there").map(|it| it.expect("a name").file_name()).collect();
+    let mut names: Vec<_> = fs::read_dir(target)
+        .expect("the directory exists")
+        .map(|it| it.expect("a name").file_name())
+        .collect();
     names.sort();
     assert_eq!(names, ["empty", "front.sensor", "hub.lock", "letter", "listen.lock", "prefix"]);
     for file in names.iter().filter(|name| *name != "empty") {
@@ -99,7 +101,7 @@ fn check_all_refuse(target: &Path, base: &[&str], words: &[&str]) {
         let output_text = format!("{}{}", outcome.stderr, String::from_utf8_lossy(&outcome.stdout));
         assert!(matches!(outcome.exit_code, Some(1 | 3 | 5)), "{verb:?}: {outcome}");
         for word in words {
-            assert!(output_text.contains(word), "{verb:?} does not say {word:?}: {outcome}");
+            assert!(output_text.contains(word), "{verb:?} does not print {word:?}: {outcome}");
         }
         check_untouched(target);
     }
@@ -125,22 +127,23 @@ fn links_in_a_domain_and_on_the_way_to_it() {
     with_another_user("foreign_user::links_in_a_domain_and_on_the_way_to_it", || {
         let prey = create_victim_directory();
         let base = Path::new("/tmp/base");
-        fs::DirBuilder::new().mode(0o700).create(base).expect("a base");
+        fs::DirBuilder::new().mode(0o700).create(base).expect("the directory can be created");
         fs::create_dir(base.join("scanhub")).expect("a domain");
-        let mode =
-            |path: &Path, mode| fs::set_permissions(path, fs::Permissions::from_mode(mode)).expect("is ours");
+        let mode = |path: &Path, mode| {
+            fs::set_permissions(path, fs::Permissions::from_mode(mode)).expect("root can change the mode")
+        };
         mode(&base.join("scanhub"), 0o777);
         mode(base, 0o755);
         run_as_other_user("ln -s /tmp/prey/letter /tmp/base/scanhub/hub.lock");
         check_all_refuse(&prey, &["--root=/tmp/base"], &["/tmp/base/scanhub", "mode 0777", "chmod go-w"]);
         mode(&base.join("scanhub"), 0o700);
         check_all_refuse(&prey, &["--root=/tmp/base"], &["/tmp/base/scanhub/hub.lock", "is a link"]);
-        fs::remove_file(base.join("scanhub/hub.lock")).expect("is root's to remove");
+        fs::remove_file(base.join("scanhub/hub.lock")).expect("root can remove the file");
         // Above the base, a link of root is followed if only root can write to its directory. In /tmp, no link is
         // followed.
         run_as_other_user("ln -s /tmp/base /tmp/way");
         check_all_refuse(&prey, &["--root=/tmp/way/b"], &["/tmp/way", "is a link of user 65533"]);
-        symlink(base, "/mnt/way").expect("a link of root's");
+        symlink(base, "/mnt/way").expect("root can create a link");
         let domain =
             scanhub(0, &["run", "--json", "--no-system-config", "--link=front=/tmp/no", "--root=/mnt/way/b"]);
         let hub = Program::start(domain).ready();
@@ -193,7 +196,8 @@ fn shared_memory_of_strangers() {
         });
         assert!(allowed.is_empty(), "{allowed:?}");
         // Now that every user can see the prefix, useless files with it do no harm.
-        let prefix = fs::read_to_string(env.domain().root().join("prefix")).expect("the hub's");
+        let prefix =
+            fs::read_to_string(env.domain().root().join("prefix")).expect("the hub has written its prefix");
         let prefix = prefix.trim_end();
         run_as_other_user(&format!(
             "touch /dev/shm/{prefix}anything; ln -s /mnt/letter /dev/shm/{prefix}link"
@@ -218,12 +222,12 @@ fn shared_memory_of_strangers() {
         }
         run_as_other_user(&format!("rm /dev/shm/{prefix}front.bell"));
         let hub = env.hub(&[env.link("front")]);
-        subscriber.await_line("the next hub's", |line| line["kind"] == "hub_back");
+        subscriber.await_line("the next hub", |line| line["kind"] == "hub_back");
         subscriber.await_line("a scan", is_class("scan"));
         // A killed hub leaves all of its files.
         assert_eq!(hub.end(KILL).exit_code, None);
         let hub = env.hub(&[env.link("front")]);
-        subscriber.await_line("the third hub's", |line| line["kind"] == "hub_back");
+        subscriber.await_line("the third hub", |line| line["kind"] == "hub_back");
         subscriber.await_line("a scan", is_class("scan"));
         for program in [subscriber, second, hub] {
             assert_eq!(program.end(INT).exit_code, Some(0));
@@ -235,7 +239,8 @@ fn shared_memory_of_strangers() {
         );
         assert_eq!(fs::read_to_string("/mnt/letter").expect("a file"), CONTENT);
         let next = env.hub(&[env.link("front")]);
-        let others = fs::read_to_string(env.domain().root().join("prefix")).expect("the hub's");
+        let others =
+            fs::read_to_string(env.domain().root().join("prefix")).expect("the hub has written its prefix");
         assert_ne!(others.trim_end(), prefix);
         assert_eq!((next.end(INT).exit_code, simulator.end(INT).exit_code), (Some(0), Some(0)));
     });
@@ -251,7 +256,7 @@ fn hub_of_another_user_is_reported_with_a_remedy() {
             .iter()
             .filter(|path| path.extension().is_some_and(|it| it == "bell"))
         {
-            fs::remove_file(doorbell).expect("root may");
+            fs::remove_file(doorbell).expect("root is permitted");
         }
         for verb in [
             &["list"][..],
@@ -268,6 +273,6 @@ fn hub_of_another_user_is_reported_with_a_remedy() {
         let outcome_of_owner = run(OTHER_UID, &["list", "--root=/tmp/theirs"]);
         assert_eq!(outcome_of_owner.exit_code, Some(0), "{outcome_of_owner}");
         assert_eq!(hub.end(INT).exit_code, Some(0));
-        wait_until("it is gone", || testkit::shared_memory("sh_scanhub_").is_empty());
+        wait_until("shared memory is removed", || testkit::shared_memory("sh_scanhub_").is_empty());
     });
 }

@@ -17,7 +17,7 @@ fn corpus(target: &str) -> Vec<Vec<u8>> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/fuzz/corpus/{target}.txt"));
     let text = fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
     let inputs: Vec<Vec<u8>> = text.lines().map(input).collect();
-    assert!(!inputs.is_empty(), "{} is empty", path.display());
+    assert!(!inputs.is_empty(), "the corpus {} is empty", path.display());
     inputs
 }
 

@@ -103,7 +103,10 @@ fn two_sensors_go_out_whole() {
             same += 1;
         }
         let is_front = |line: &&Value| line["sensor"] == "front" && line["topic"] == "scan";
-        let missed = number(last_statistics(&outcome).iter().find(is_front).expect("its account"), "missed");
+        let missed = number(
+            last_statistics(&outcome).iter().find(is_front).expect("the statistics have a line of the topic"),
+            "missed",
+        );
         assert!(same > 0 && same + missed >= 40, "{same} scans were sent, {missed} missed");
         // The last datagram of each sensor is an announcement with the number of datagrams that were sent.
         let last: Vec<_> = received.iter().rev().take(2).map(|bytes| decode_datagram(bytes)).collect();
@@ -178,7 +181,10 @@ fn bare_telegrams_are_those_of_the_line() {
             let sent: Vec<_> = env.truth(name).into_iter().map(|sent| sent.hash).collect();
             assert!(received.iter().all(|bytes| sent.contains(&hash(bytes))), "{name}");
             let lines = last_statistics(&outcome);
-            let line = lines.iter().find(|line| line["sensor"] == name).expect("its account");
+            let line = lines
+                .iter()
+                .find(|line| line["sensor"] == name)
+                .expect("the statistics have a line of the topic");
             assert_eq!((number(line, "sent"), &line["topic"]), (received.len() as u64, &"telegram".into()));
         }
     });
@@ -202,7 +208,10 @@ fn copies_are_equal_despite_an_unreachable_host() {
         assert_eq!(copies.finish(), received);
         let to = |name: &str| {
             let lines = outcome.of_class("lan_to");
-            lines.into_iter().rfind(|line| line["to"] == name).expect("its account")
+            lines
+                .into_iter()
+                .rfind(|line| line["to"] == name)
+                .expect("the statistics have a line of the topic")
         };
         let (dead, copy) = (to("127.0.0.1:9"), to("localhost:30000"));
         assert!(number(&dead, "send_failed") > 0 && number(&dead, "reported") > 0, "{dead}");
@@ -215,7 +224,7 @@ fn copies_are_equal_despite_an_unreachable_host() {
 fn copies_go_over_ipv6_too() {
     in_a_network("gateway::copies_go_over_ipv6_too", || {
         let Ok(copies) = UdpSocket::bind("[::1]:30000") else {
-            skip("ipv6", "no IPv6 here");
+            skip("ipv6", "this network has no IPv6");
             return;
         };
         let env = TestEnv::new();
@@ -251,7 +260,7 @@ fn hubs_and_gateways_are_replaced() {
         receiver.wait_for_datagrams(10, has_topic(Topic::Scan));
         hub.end(KILL);
         // A listener receives the zones `unknown`.
-        wait_until("the last word", || {
+        wait_until("the gateway sends unknown zones", || {
             let received = receiver.datagrams();
             let last = received.iter().map(|bytes| decode_datagram(bytes)).rfind(has_topic(Topic::Zones));
             last.is_some_and(|last| is_unknown(&last))
@@ -292,13 +301,16 @@ fn oversized_telegrams_are_reported_and_counted() {
         // Datagrams with bare telegrams cannot be split into parts. Telegrams of scans have 732 bytes; replies are
         // shorter.
         let mut gateway = env.gateway(&["--interface=lo", "--mtu=700", "--bare"]);
-        let report = gateway.await_line("what does not fit", is_class("lan_link"));
+        let report = gateway.await_line("the report of samples that are too long", is_class("lan_link"));
         assert_eq!((&report["to"], &report["state"]), (&"front/telegram".into(), &"failing".into()));
-        gateway.await_line("an account", |line| line["class"] == "lan" && number(line, "send_failed") >= 20);
+        gateway.await_line("statistics", |line| line["class"] == "lan" && number(line, "send_failed") >= 20);
         let outcome = gateway.end(TERM);
         assert_eq!((outcome.exit_code, outcome.of_class("lan_link").len()), (Some(0), 1), "{outcome}");
         let lines = last_statistics(&outcome);
-        let telegrams = lines.iter().find(|line| line["topic"] == "telegram").expect("its account");
+        let telegrams = lines
+            .iter()
+            .find(|line| line["topic"] == "telegram")
+            .expect("the statistics have a line of the topic");
         assert!(number(telegrams, "bytes") <= 700 * number(telegrams, "sent"), "{telegrams}");
     });
 }
@@ -317,7 +329,9 @@ fn samples_sent_in_parts_are_reassembled() {
             env.gateway(&[&["--interface=lo", "--to=127.0.0.1:30000", "--mtu=576"], &topics[..]].concat());
         listener.await_lines(20, "a scan", is_class("scan"));
         let last = number(&listener.await_line("a scan", is_class("scan")), "seq");
-        echo.await_line("the last of them", |line| line["class"] == "scan" && number(line, "seq") >= last);
+        echo.await_line("the last of these samples", |line| {
+            line["class"] == "scan" && number(line, "seq") >= last
+        });
         let (remote, own) = (listener.end(INT), echo.end(INT));
         assert_eq!(gateway.end(TERM).exit_code, Some(0));
         let own: BTreeMap<_, _> = own
@@ -357,17 +371,17 @@ fn without_an_interface_nothing_goes_to_groups() {
         let _hub = env.hub(&[env.link("front")]);
         let copies = Receiver::at(LOOPBACK, 30_000);
         let mut gateway = env.start_gateway(&["--to=127.0.0.1:30000"]);
-        let begin = gateway.await_line("its begin", is_class("gateway"));
+        let begin = gateway.await_line("line of class gateway", is_class("gateway"));
         assert_eq!((&begin["interface"], &begin["to"]), (&json!(null), &json!(["127.0.0.1:30000"])));
         copies.wait_for_datagrams(30, |datagram| datagram.head.topic == Topic::Scan.number());
         let outcome = gateway.end(TERM);
         assert_eq!(outcome.exit_code, Some(0), "{outcome}");
-        let to = outcome.of_class("lan_to").pop().expect("an account");
+        let to = outcome.of_class("lan_to").pop().expect("the statistics have a line of the topic");
         assert_eq!((&to["to"], number(&to, "send_failed")), (&json!("127.0.0.1:30000"), 0), "{outcome}");
         assert_eq!(copies.finish().len() as u64, number(&to, "sent"));
         let is_scan = |line: &&Value| line["topic"] == "scan";
         let scan = outcome.of_class("lan").iter().rfind(is_scan).cloned().expect("a row");
         assert!(number(&scan, "sent") >= 30 && number(&scan, "send_failed") == 0, "{scan}");
-        assert!(groups.finish().is_empty(), "somebody else could have read it");
+        assert!(groups.finish().is_empty(), "datagrams were sent to multicast groups");
     });
 }

@@ -35,7 +35,7 @@ fn await_state(gateway: &mut Program, state: &str) -> Value {
 fn await_growth(gateway: &mut Program, key: &str) {
     let mut current = || {
         gateway.signal(USR1);
-        number(&gateway.await_line("the account", |it| it["class"] == "lan" && it["topic"] == "scan"), key)
+        number(&gateway.await_line("the statistics", |it| it["class"] == "lan" && it["topic"] == "scan"), key)
     };
     let now = current();
     wait_until(key, || current() > now + 3);
@@ -56,7 +56,7 @@ fn first_sequence(received: &[Vec<u8>], row: &StreamCounters) -> u64 {
         let next = announce.topics().iter().find(|topic| topic.topic == row.topic)?.next;
         Some(next)
     });
-    u64::from(found.expect("it was heard"))
+    u64::from(found.expect("a datagram of the row was received"))
 }
 
 /// Asserts that each sequence number from the first received one on was used once: each datagram was received, or the
@@ -128,7 +128,7 @@ fn datagrams_dropped_by_a_full_queue_are_counted() {
         receiver.wait_for_datagrams(10, |datagram| datagram.head.topic == Topic::Scan.number());
         let limit = "qdisc add dev ours root tbf rate 64kbit burst 2000 limit 4000";
         if !succeeds(Command::new("tc").args(limit.split(' '))) {
-            skip("tc", "there is no queue that can be limited here");
+            skip("tc", "the kernel cannot limit a queue");
             return;
         }
         let failing = await_state(&mut gateway, "failing");
@@ -151,16 +151,16 @@ fn a_reader_that_does_not_read_delays_nothing() {
         let _hub = env.hub(&[env.link("front")]);
         // The pipe stays open, but nothing reads it, so it is soon full.
         let (_reader, writer) = std::io::pipe().expect("a pipe");
-        fcntl_setpipe_size(&writer, 8192).expect("a small one");
+        fcntl_setpipe_size(&writer, 8192).expect("the pipe can be made smaller");
         let mut command = env.command(&["gateway", "--json", "--no-system-config", "--interface=lo"]);
-        command.stdout(writer.try_clone().expect("another end")).stdin(Stdio::null());
+        command.stdout(writer.try_clone().expect("the pipe can be duplicated")).stdin(Stdio::null());
         let mut gateway = spawn(command).expect("a gateway");
-        let signal = |signal| gateway.signal(signal).expect("it lives");
+        let signal = |signal| gateway.signal(signal).expect("the gateway runs");
         let is_scan =
             |datagram: &scanhub_schema::datagram::Datagram<'_>| datagram.head.topic == Topic::Scan.number();
         receiver.wait_for_datagrams(3, is_scan);
         let now = Timespec { tv_sec: 0, tv_nsec: 0 };
-        wait_until("a full pipe", || {
+        wait_until("the pipe is full", || {
             signal(USR1);
             poll(&mut [PollFd::new(&writer, PollFlags::OUT)], Some(&now)) == Ok(0)
         });
@@ -172,7 +172,7 @@ fn a_reader_that_does_not_read_delays_nothing() {
         receiver.wait_for_datagrams(30, is_scan);
         signal(TERM);
         let mut status = None;
-        wait_until("its end", || {
+        wait_until("the gateway exits", || {
             status = gateway.try_wait().expect("a child");
             status.is_some()
         });
@@ -206,7 +206,7 @@ fn prints_statistics_on_sigusr1() {
             Some(model.generation)
         };
         assert_eq!(env.run(&["background", "front", "reset"]).exit_code, Some(0));
-        wait_until("another generation", || {
+        wait_until("another generation is sent", || {
             let mut all: Vec<_> = receiver.datagrams().iter().filter_map(|bytes| generation(bytes)).collect();
             all.dedup();
             all.len() > 1
@@ -267,7 +267,7 @@ fn rejects_impossible_settings_with_a_hint() {
         // The gateway uses the values of the configuration, but flags take precedence.
         let configured = config("[gateway]\ninterface = \"eth8\"\ntopics = [\"front/status\"]\nmtu = 1400\n");
         let mut gateway = env.start_gateway(&["--interface=lo", &configured]);
-        let begin = gateway.await_line("its begin", is_class("gateway"));
+        let begin = gateway.await_line("line of class gateway", is_class("gateway"));
         assert_eq!((&begin["interface"], number(&begin, "longest")), (&"lo".into(), 1400));
         let line =
             gateway.await_line("a status", |line| line["class"] == "lan" && line["topic"] != "announce");

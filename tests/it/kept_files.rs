@@ -13,8 +13,10 @@ fn next_hub_begins_its_search_at_the_saved_rate() {
     let directory = env.path("state/scanhub").join(env.domain().name());
     let rate_file = directory.join("front.rate");
     let expected = format!("19200 {}\n", env.path_argument("front"));
-    wait_until("it is kept", || fs::read_to_string(&rate_file).is_ok_and(|text| text == expected));
-    let mode = |path| fs::metadata(path).expect("it is there").mode() & 0o7777;
+    wait_until("the hub saves the baud rate", || {
+        fs::read_to_string(&rate_file).is_ok_and(|text| text == expected)
+    });
+    let mode = |path| fs::metadata(path).expect("the file exists").mode() & 0o7777;
     assert_eq!((mode(&directory), mode(&rate_file)), (0o700, 0o600));
     assert_eq!(hub.end(TERM).exit_code, Some(0));
     assert_eq!(simulator.end(TERM).exit_code, Some(0));
@@ -29,7 +31,8 @@ fn next_hub_begins_its_search_at_the_saved_rate() {
     let other = TestLine::create(&env.path("other"));
     let outcome = search(&env, &other, format!("--link=front={},family=lms", env.path_argument("other")));
     assert!(!outcome.stderr.contains("the search begins at"), "{outcome}");
-    fs::set_permissions(&rate_file, fs::Permissions::from_mode(0o666)).expect("it is ours");
+    fs::set_permissions(&rate_file, fs::Permissions::from_mode(0o666))
+        .expect("the file belongs to this user");
     let line = TestLine::create(&env.path("again"));
     let outcome = search(&env, &line, format!("--link=front={},family=lms", env.path_argument("again")));
     assert!(!outcome.stderr.contains("the search begins at"), "{outcome}");

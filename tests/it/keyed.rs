@@ -25,7 +25,7 @@ fn listener(env: &TestEnv, key: &str) -> Program {
 
 /// Returns the number of datagrams that were refused for this reason.
 fn refusal_count(outcome: &Outcome, reason: &str) -> u64 {
-    number(outcome.of_class("lan_refused").last().expect("the account"), reason)
+    number(outcome.of_class("lan_refused").last().expect("the statistics have a line of refusals"), reason)
 }
 
 /// Requests statistics from `program`, and returns the line of this class.
@@ -46,7 +46,7 @@ fn listener_with_key_accepts_only_its_gateway() {
         let env = TestEnv::new();
         let (ours, other) = (key(&env, "ours"), key(&env, "other"));
         let copy = UdpSocket::bind("127.0.0.1:22299").expect("a port");
-        copy.set_nonblocking(true).expect("need not wait");
+        copy.set_nonblocking(true).expect("the socket can be made nonblocking");
         let _simulator = env.simulator(&["front"], &STREAM_FLAGS);
         let _hub = env.hub(&[env.link("front")]);
         let mut with_key = listener(&env, &ours);
@@ -61,8 +61,9 @@ fn listener_with_key_accepts_only_its_gateway() {
         assert_eq!(gateway.end(TERM).exit_code, Some(0));
         let recorded = drain(&copy);
         let next = env.gateway(&["--interface=lo", &ours]);
-        with_key
-            .await_line("the next life", |line| is_class("scan")(line) && line["epoch"] != scans[0]["epoch"]);
+        with_key.await_line("sample of the next run", |line| {
+            is_class("scan")(line) && line["epoch"] != scans[0]["epoch"]
+        });
         assert_eq!(next.end(TERM).exit_code, Some(0));
         assert!(
             recorded.iter().all(|bytes| decode_datagram(bytes).head.flags & LanFlags::AUTHENTICATED != 0)
@@ -103,14 +104,17 @@ fn a_key_file_that_others_can_use_is_refused() {
     let env = TestEnv::new();
     let made = env.run(&["key", "new", &env.path_argument("key")]);
     assert!(made.exit_code == Some(0) && String::from_utf8_lossy(&made.stdout).contains(": key "), "{made}");
-    let mode = || std::fs::metadata(env.path("key")).expect("it was made").permissions().mode() & 0o777;
+    let mode =
+        || std::fs::metadata(env.path("key")).expect("the key file exists").permissions().mode() & 0o777;
     assert_eq!(mode(), 0o600);
     let again = env.run(&["key", "new", &env.path_argument("key")]);
     assert!(again.exit_code == Some(73) && again.stderr.contains("key exists"), "{again}");
     let short = env.file("short", "00ff\n");
-    std::fs::set_permissions(env.path("short"), PermissionsExt::from_mode(0o600)).expect("it is ours");
+    std::fs::set_permissions(env.path("short"), PermissionsExt::from_mode(0o600))
+        .expect("the file belongs to this user");
     let open = env.file("open", "0".repeat(64));
-    std::fs::set_permissions(env.path("open"), PermissionsExt::from_mode(0o644)).expect("it is ours");
+    std::fs::set_permissions(env.path("open"), PermissionsExt::from_mode(0o644))
+        .expect("the file belongs to this user");
     let missing = env.path_argument("missing");
     for (file, message, code) in
         [(&short, "are no key", 78), (&open, "its mode is 0644", 78), (&missing, "No such file", 66)]

@@ -40,7 +40,11 @@ fn ages_of_a_stream_are_split_and_judged() {
         assert_eq!((&conditions["class"], &conditions["wait"]), (&json!("conditions"), &json!(wait)));
         assert!(conditions["clock_read_ns"].as_f64().is_some_and(|ns| ns > 0.0), "{conditions}");
         let all = conditions["realtime"] == true && conditions["memory_locked"] == true;
-        assert_eq!(conditions["refused"] == json!([]), all, "what is missing is explained: {conditions}");
+        assert_eq!(
+            conditions["refused"] == json!([]),
+            all,
+            "the missing parts must be explained: {conditions}"
+        );
         let line = latency_line(&outcome);
         assert_eq!((number(&line, "received"), number(&line, "in_future")), (20, 0), "{line}");
         assert_eq!(line["flags"][0], "simulated");
@@ -79,7 +83,10 @@ fn ages_of_a_stream_are_split_and_judged() {
     assert_eq!((&line["line"], &line["hub"], &line["total"]), (&Value::Null, &Value::Null, &Value::Null));
     let outcome = latency.end(INT);
     assert_eq!((outcome.exit_code, &outcome.lines()[0]["realtime"]), (Some(0), &json!(false)), "{outcome}");
-    assert!(number(&latency_line(&outcome), "before") <= 1, "the one that is kept for late joiners");
+    assert!(
+        number(&latency_line(&outcome), "before") <= 1,
+        "at most the sample of the history was sent before"
+    );
     let text = env.run(&["latency", "front/scan", "-n", "5"]);
     let out = String::from_utf8_lossy(&text.stdout).into_owned();
     // On a busy machine, all samples may have been sent before the subscriber was ready.
@@ -101,13 +108,13 @@ fn splits_remote_age_into_network_and_local_part() {
         let mut listener = env.start(&publisher).ready();
         sender.wait_until_published(&mut listener, &[Topic::Zones]);
         let mut latency = env.start(&["latency", "--json", "robot1.front/zones"]);
-        wait_until("it is attached", || env.subscribers("robot1.front/zones") == 1);
+        wait_until("latency is attached", || env.subscribers("robot1.front/zones") == 1);
         let zones = Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() };
         let known = |line: &Value| line["class"] == "latency" && line["age"] != Value::Null;
         sender.stamp_ns = testkit::wall_ns() - 50_000_000;
         // Samples that were sent before `latency` was attached do not count.
         let mut line = Value::Null;
-        wait_until("ages", || {
+        wait_until("latency prints an age", || {
             sender.send(Topic::Zones, &zones);
             latency.printed(known).map(|printed| line = printed).is_some()
         });
@@ -120,7 +127,7 @@ fn splits_remote_age_into_network_and_local_part() {
         // The clock of the gateway is ahead.
         sender.stamp_ns = testkit::wall_ns() + 3_600_000_000_000;
         sender.send(Topic::Zones, &zones);
-        let line = latency.await_line("clocks that differ", |line| line["in_future"] == 1);
+        let line = latency.await_line("a stamp in the future", |line| line["in_future"] == 1);
         assert!(count(&line, "age") > count(&line, "network"), "{line}");
         assert_eq!(latency.end(INT).exit_code, Some(0));
         assert_eq!(listener.end(TERM).exit_code, Some(0));

@@ -84,9 +84,10 @@ fn a_scanner_that_turns_is_published_like_any_other() {
     assert_eq!(simulator.end(TERM).exit_code, Some(0));
     let truth = env.truth("front");
     let arrived: Vec<String> = packets.into_iter().map(hash).collect();
-    let begin = truth.iter().position(|sent| sent.hash == arrived[0]).expect("it was sent");
+    let begin =
+        truth.iter().position(|sent| sent.hash == arrived[0]).expect("the first received packet was sent");
     let sent = truth[begin..].iter().map(|sent| &sent.hash).take(arrived.len());
-    assert!(sent.eq(&arrived), "not what it sent");
+    assert!(sent.eq(&arrived), "the packets differ from those that were sent");
 }
 
 #[test]

@@ -32,7 +32,7 @@ fn file(env: &TestEnv) -> PathBuf {
 
 fn show_background(env: &TestEnv) -> Value {
     let outcome = env.run(&["background", "front", "show", "--json"]);
-    let [line] = &outcome.lines()[..] else { panic!("not one line: {outcome}") };
+    let [line] = &outcome.lines()[..] else { panic!("exactly one line was expected: {outcome}") };
     line.clone()
 }
 
@@ -67,11 +67,14 @@ fn post_placed_between_hub_runs_is_foreground_at_once() {
         let env = TestEnv::new();
         let room = simulator(&env, ROOM_WORLD);
         let hub = env.hub(&[&env.link("front"), QUICK_LEARNING]);
-        testkit::wait_until("the room is learned and kept", || {
+        testkit::wait_until("the room is learned and saved", || {
             let shown = show_background(&env);
             number(&shown, "known_beams") > 350 && shown["kept_wall_ns"].is_u64()
         });
-        assert_eq!(fs::metadata(file(&env)).expect("kept").permissions().mode() & 0o777, 0o600);
+        assert_eq!(
+            fs::metadata(file(&env)).expect("the background is saved").permissions().mode() & 0o777,
+            0o600
+        );
         hub.end(how);
         room.end(TERM);
 
@@ -100,12 +103,12 @@ fn unusable_or_unwanted_background_is_not_loaded() {
     let env = TestEnv::new();
     let _simulator = simulator(&env, ROOM_WORLD);
     save_background_of_room(&env);
-    let kept = fs::read(file(&env)).expect("kept");
+    let kept = fs::read(file(&env)).expect("the background is saved");
     let empty = |flags: &[&str], why: &str| {
         let flags = [&[SLOW_LEARNING], flags].concat();
         let outcome = with_streaming_hub(&env, &flags, || assert_eq!(known_beams(&env), 0, "{flags:?}"));
         assert!(outcome.stderr.contains(why), "{outcome}\n{}", outcome.stderr);
-        assert_eq!(fs::read(file(&env)).expect("still there"), kept, "{flags:?}");
+        assert_eq!(fs::read(file(&env)).expect("the file still exists"), kept, "{flags:?}");
     };
     empty(&["--set=link.front.pose.x=0.2"], "the background starts empty: ");
     empty(&["--set=link.front.pose.yaw=0.1"], "is of another pose");
@@ -123,16 +126,16 @@ fn unusable_or_unwanted_background_is_not_loaded() {
         (text.replacen("\"known_beams\":", "\"known_beams\":9", 1), "is not a background model"),
         ("\u{0}\u{1}".to_owned(), "is not a background model"),
     ] {
-        fs::write(file(&env), &wrong).expect("written");
+        fs::write(file(&env), &wrong).expect("the file can be written");
         let outcome =
             with_streaming_hub(&env, &[SLOW_LEARNING], || assert_eq!(known_beams(&env), 0, "{why}"));
         assert!(outcome.stderr.contains(why), "{why}: {}", outcome.stderr);
     }
-    fs::write(file(&env), &kept).expect("written");
-    fs::set_permissions(file(&env), fs::Permissions::from_mode(0o666)).expect("set");
+    fs::write(file(&env), &kept).expect("the file can be written");
+    fs::set_permissions(file(&env), fs::Permissions::from_mode(0o666)).expect("the mode can be set");
     empty(&[], "others can write it");
     // The unchanged file with the right mode is accepted.
-    fs::set_permissions(file(&env), fs::Permissions::from_mode(0o600)).expect("set");
+    fs::set_permissions(file(&env), fs::Permissions::from_mode(0o600)).expect("the mode can be set");
     with_streaming_hub(&env, &[SLOW_LEARNING], || assert!(known_beams(&env) > 350));
     // After a reset, the background is not loaded again.
     for (flags, content) in [
@@ -141,10 +144,10 @@ fn unusable_or_unwanted_background_is_not_loaded() {
         (vec![SLOW_LEARNING, "--set=link.front.pose.x=0.2"], &kept),
         (vec![SLOW_LEARNING], b"cut short"),
     ] {
-        fs::write(file(&env), content).expect("written");
+        fs::write(file(&env), content).expect("the file can be written");
         with_streaming_hub(&env, &flags, || {
             assert_eq!(env.run(&["background", "front", "reset"]).exit_code, Some(0));
-            testkit::wait_until("it is gone", || !file(&env).exists());
+            testkit::wait_until("the file is deleted", || !file(&env).exists());
         });
     }
 }
@@ -153,7 +156,7 @@ fn unusable_or_unwanted_background_is_not_loaded() {
 fn where_nothing_is_kept_nothing_is_written() {
     let env = TestEnv::new();
     let simulator = simulator(&env, ROOM_WORLD);
-    let is_known = || testkit::wait_until("it is learned", || known_beams(&env) > 350);
+    let is_known = || testkit::wait_until("the room is learned", || known_beams(&env) > 350);
     with_streaming_hub(&env, &[QUICK_LEARNING, "--set=background.keep=false"], || {
         is_known();
         assert!(show_background(&env)["kept_wall_ns"].is_null());
@@ -170,7 +173,7 @@ fn where_nothing_is_kept_nothing_is_written() {
         .collect();
     let log = env.file("log", log);
     let is_played = |hub: Program, words: &str| {
-        testkit::wait_until("it is learned", || known_beams(&env) == 181);
+        testkit::wait_until("the room is learned", || known_beams(&env) == 181);
         assert!(show_background(&env)["kept_wall_ns"].is_null(), "{words}");
         hub.end(TERM);
         assert!(!file(&env).exists(), "{words}");

@@ -171,7 +171,7 @@ fn reports_unplugged_led_and_drives_the_others() {
     diodes.wait_until_lit("gn mk");
     diodes.remove_led("gn");
     assert_eq!(sensor.end(TERM).exit_code, Some(0));
-    let failed = leds.await_line("the failure", |line| line["class"] == "led");
+    let failed = leds.await_line("report that an LED failed", |line| line["class"] == "led");
     assert_eq!(
         (&failed["light"], &failed["name"], &failed["state"]),
         (&"green".into(), &"gn".into(), &"failed".into())
@@ -179,7 +179,7 @@ fn reports_unplugged_led_and_drives_the_others() {
     assert!(failed["message"].as_str().is_some_and(|message| message.contains("gn/brightness")), "{failed}");
     assert_eq!(fs::read_to_string(diodes.0.join("rd/brightness")).unwrap(), "255\n", "the stop light");
     diodes.create_led("gn");
-    let back = leds.await_line("its return", |line| line["class"] == "led");
+    let back = leds.await_line("report that the LED works again", |line| line["class"] == "led");
     assert_eq!((&back["name"], &back["state"]), (&"gn".into(), &"recovered".into()));
     assert_eq!(diodes.lit_names().as_deref(), Some("rd"));
     let _sensor = simulator(&env, &world(&env, "open", STRIP_WORLD));
@@ -227,7 +227,7 @@ fn only_a_better_verdict_waits_for_the_hold_time() {
         let leds = |hold: &[&str]| {
             let before = env.subscribers("robot1.front/zones");
             let program = env.start(&[&["leds", "robot1.front", "--json"], hold].concat());
-            wait_until("it follows", || env.subscribers("robot1.front/zones") > before);
+            wait_until("leds is attached", || env.subscribers("robot1.front/zones") > before);
             program
         };
         let (mut usual, mut long, mut none) = (leds(&[]), leds(&["--hold=1h"]), leds(&["--hold=0s"]));
@@ -235,21 +235,21 @@ fn only_a_better_verdict_waits_for_the_hold_time() {
         let is =
             |verdict: &'static str| move |line: &Value| is_class("leds")(line) && line["verdict"] == verdict;
         for program in [&mut usual, &mut long, &mut none] {
-            program.await_line("stop at once, whatever the hold", is("stop"));
+            program.await_line("immediate stop", is("stop"));
         }
         let sent_ns = now_ns();
         let mut shown = Value::Null;
         // The verdict is only valid while it is repeated.
-        wait_until("clear when it has stood", || {
+        wait_until("clear is shown after the hold time", || {
             send_verdict(Verdict::Clear);
             usual.printed(is("clear")).map(|line| shown = line).is_some()
         });
-        none.await_line("clear at once", is("clear"));
+        none.await_line("immediate clear", is("clear"));
         let valid_ns = number(&shown, "stamp_ns") - sent_ns;
-        assert!(valid_ns > 250_000_000, "it had stood for {} ms", valid_ns / 1_000_000);
+        assert!(valid_ns > 250_000_000, "clear was shown after {} ms", valid_ns / 1_000_000);
         let outcome = long.end(INT);
         let verdicts: Vec<_> = outcome.of_class("leds").iter().map(|line| line["verdict"].clone()).collect();
-        assert_eq!(verdicts, ["unknown", "stop", "unknown"], "at the end nobody watches: {outcome}");
+        assert_eq!(verdicts, ["unknown", "stop", "unknown"], "leds must show unknown at its end: {outcome}");
         assert_eq!((usual.end(INT).exit_code, none.end(INT).exit_code), (Some(0), Some(0)));
     });
 }

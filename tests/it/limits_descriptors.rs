@@ -28,7 +28,7 @@ fn start_limited<S: AsRef<str>>(env: &TestEnv, limit: u64, arguments: &[S]) -> P
 fn inherited_descriptors() -> u64 {
     let mut shell = Command::new("sh");
     shell.args(["-c", "for fd in /proc/$$/fd/*; do echo ${fd##*/}; done"]);
-    let listed = String::from_utf8(output(shell).expect("a shell").stdout).expect("numbers");
+    let listed = String::from_utf8(output(shell).expect("a shell starts").stdout).expect("numbers");
     listed.lines().filter(|fd| fd.parse::<u32>().is_ok_and(|fd| fd > 9)).count() as u64
 }
 
@@ -71,7 +71,7 @@ fn a_client_works_or_says_how_many_it_needs() {
     run_concurrently(verbs, |verb| {
         for limit in [5, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30, 32, 64] {
             let mut outcome = start_limited(&env, limit, verb).wait();
-            wait_until("the hub answers in time, however busy the machine is", || {
+            wait_until("the hub replies in time", || {
                 let is_late = outcome.exit_code == Some(3);
                 if is_late {
                     outcome = start_limited(&env, limit, verb).wait();
@@ -100,7 +100,7 @@ fn hub_out_of_descriptors_keeps_serving_subscribers() {
         line["class"] == "status"
             && line["last_error"].as_str().is_some_and(|error| error.contains("attached but get nothing"))
     };
-    served.await_line("that others get nothing", reports_shortage);
+    served.await_line("report that clients are not served", reports_shortage);
     served.await_lines(20, "a scan", is_class("scan"));
     let refused = env.run(&["control", "front", "resync", "--json"]);
     let error = &refused.of_class("error")[0];
@@ -110,8 +110,10 @@ fn hub_out_of_descriptors_keeps_serving_subscribers() {
         assert_eq!(other.end(INT).exit_code, Some(0));
     }
     // New subscribers are served again.
-    wait_until("there is room again", || env.run(&["info", "front"]).exit_code == Some(0));
-    served.await_line("that all get something", |line| line["class"] == "status" && line["last_error"] == "");
+    wait_until("the hub has free descriptors again", || env.run(&["info", "front"]).exit_code == Some(0));
+    served.await_line("report that all clients are served", |line| {
+        line["class"] == "status" && line["last_error"] == ""
+    });
     assert_eq!(env.run(&["echo", "front/scan", "-n", "5", "--timeout", "9s"]).exit_code, Some(0));
     let outcome = served.end(INT);
     contiguous_numbers(&outcome.of_class("scan"), "topic_seq");
@@ -131,10 +133,10 @@ fn a_listener_that_runs_out_of_them_listens_on() {
         let pid = Pid::from_raw(listener.pid() as i32);
         let maximum = getrlimit(Resource::Nofile).maximum;
         let none = Rlimit { current: Some(0), maximum };
-        let usual = prlimit(pid, Resource::Nofile, none).expect("it may have fewer");
-        let notice = listener.await_line("what is wrong", |line| line["kind"] == "problem");
+        let usual = prlimit(pid, Resource::Nofile, none).expect("the limit can be reduced");
+        let notice = listener.await_line("report of the shortage", |line| line["kind"] == "problem");
         assert!(notice["message"].to_string().contains("cannot list network interfaces"), "{notice}");
-        prlimit(pid, Resource::Nofile, usual).expect("as before");
+        prlimit(pid, Resource::Nofile, usual).expect("the limit can be restored");
         let outcome = listener.end(TERM);
         assert_eq!(outcome.exit_code, Some(0), "{outcome}");
         assert_eq!(outcome.of_class("notice").len(), 1, "{outcome}");

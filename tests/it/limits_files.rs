@@ -44,8 +44,8 @@ fn pipe(env: &TestEnv) -> String {
 
 fn gzip_file(env: &TestEnv, name: &str, content: &[u8]) -> String {
     let mut encoder = GzEncoder::new(Vec::new(), Compression::best());
-    encoder.write_all(content).expect("memory");
-    env.file(name, encoder.finish().expect("memory"))
+    encoder.write_all(content).expect("the content can be compressed");
+    env.file(name, encoder.finish().expect("the content can be compressed"))
 }
 
 fn record(opcode: u8, body: &[u8]) -> Vec<u8> {
@@ -100,7 +100,7 @@ fn rejects_devices_pipes_and_directories_at_once() {
         let command = env.command(&["config", "check", "/dev/stdin"]);
         Program::start_with(command, stdin).wait()
     };
-    let taken = check(std::fs::File::open(&file).expect("it was written").into());
+    let taken = check(std::fs::File::open(&file).expect("the file can be opened").into());
     assert_eq!((taken.exit_code, &taken.stdout[..]), (Some(0), &b"ok: 1 link: a at x\n"[..]), "{taken}");
     let outcome = check(std::process::Stdio::piped());
     assert_eq!(outcome.exit_code, Some(66), "{outcome}");
@@ -149,7 +149,7 @@ fn reads_long_chunks_up_to_the_limit() {
     let copy = env.path_argument("copy.mcap");
     let outcome = run_bounded(&env, &["convert", &whole, &copy, "--compression", "none"]);
     assert_eq!((outcome.exit_code, outcome.stderr.contains("missing")), (Some(0), false), "{outcome}");
-    assert!(std::fs::metadata(&copy).expect("it was written").len() > 14 << 20);
+    assert!(std::fs::metadata(&copy).expect("the file exists").len() > 14 << 20);
     let long = env.file("long.mcap", mcap(&[channel(0, "t", "cdr"), chunk(20 << 20)]));
     assert_refused(&env, &["convert", &long, &copy, "--force"], 66, "it has a chunk of 20 MB; at most 8");
     assert_refused(&env, &["convert", &long, &copy, "--force"], 66, "mcap filter");

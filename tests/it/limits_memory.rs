@@ -28,7 +28,7 @@ fn in_a_namespace(name: &str, test: impl FnOnce()) {
     let mut attempt = Command::new("unshare");
     attempt.args(unshare.get_args()).args(["mount", "-t", "tmpfs", "tmpfs", "/dev/shm"]);
     if !succeeds(attempt) {
-        skip("mounts", "this user may not make a mount namespace");
+        skip("mounts", "this user may not create a mount namespace");
         return;
     }
     unshare.arg(own_program()).args(single_test_args(name)).env(NAMESPACE_VARIABLE, "1");
@@ -39,7 +39,7 @@ fn in_a_namespace(name: &str, test: impl FnOnce()) {
 fn mount(bytes: u64) {
     let size = format!("size={bytes}");
     let mounted = status(Command::new("mount").args(["-t", "tmpfs", "-o", &size, "tmpfs", "/dev/shm"]));
-    assert!(mounted.is_ok_and(|status| status.success()), "no tmpfs of {bytes} bytes");
+    assert!(mounted.is_ok_and(|status| status.success()), "cannot mount a tmpfs of {bytes} bytes");
 }
 
 fn unmount() {
@@ -57,13 +57,13 @@ fn fill(remaining: u64) {
             Err(error) => panic!("{error}"),
         }
     }
-    file.set_len(len.saturating_sub(remaining)).expect("is cut");
+    file.set_len(len.saturating_sub(remaining)).expect("the file can be truncated");
 }
 
 /// Frees the memory that [`fill`] has used. The file may have been removed with its /dev/shm.
 fn free() {
     if let Ok(file) = OpenOptions::new().write(true).open(FILL_FILE) {
-        file.set_len(0).expect("is cut");
+        file.set_len(0).expect("the file can be truncated");
     }
 }
 
@@ -95,7 +95,7 @@ fn hub_starts_or_reports_the_memory_it_needs() {
             needed.unwrap_or_else(|| panic!("{outcome}")) * 1024
         };
         let needed = short(16 << 10);
-        assert!(needed <= 8 << 20, "{needed} bytes for one link");
+        assert!(needed <= 8 << 20, "one link needs {needed} bytes");
         for bytes in (15..22)
             .map(|shift| 1 << shift)
             .filter(|bytes| *bytes < needed)

@@ -23,7 +23,7 @@ fn second_hub_waits_for_the_port_and_names_its_holder() {
     let holder = format!("in use by process {} (scanhub)", first.pid());
     let info = other.info("front");
     assert!(info["last_error"].as_str().is_some_and(|error| error.contains(&holder)), "{info}");
-    assert_eq!(env.info("front")["state"], "streaming", "was disturbed");
+    assert_eq!(env.info("front")["state"], "streaming", "the running hub was disturbed");
     assert_eq!(first.end(TERM).exit_code, Some(0));
     other.await_info("front", |info| info["state"] == "streaming");
     assert_eq!(second.end(TERM).exit_code, Some(0));
@@ -54,7 +54,7 @@ fn only_one_of_two_links_opens_a_shared_port() {
         symlink(&pty, env.path(name)).expect("a symlink");
     }
     // The link that opens the port first has it.
-    wait_until("one of them streams and the other one says why not", || {
+    wait_until("one link streams and the other one reports the reason", || {
         let infos = ["one", "two"].map(|name| env.info(name));
         let streams = infos.iter().filter(|info| info["state"] == "streaming").count();
         let is_refused = |info: &&serde_json::Value| {

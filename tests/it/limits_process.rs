@@ -36,15 +36,15 @@ fn hub_short_of_address_space_leaves_no_segment() {
         command.args(["-c", &format!("ulimit -v {limit} && exec \"$0\" \"$@\"")]);
         command.arg(inner.get_program()).args(inner.get_args()).env("SCANHUB_END_WITH_PARENT", "1");
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
-        let mut hub = spawn(command).expect("a shell");
+        let mut hub = spawn(command).expect("a shell starts");
         let mut line = String::new();
         BufReader::new(hub.stdout.take().expect("a pipe")).read_line(&mut line).expect("text");
         is_up = line.contains("ready");
         if is_up {
             let pid = Pid::from_raw(hub.id() as i32).expect("a process");
-            kill_process(pid, TERM).expect("it is there");
+            kill_process(pid, TERM).expect("the hub runs");
         }
-        let outcome = hub.wait_with_output().expect("it ends");
+        let outcome = hub.wait_with_output().expect("the hub exits");
         let errors = String::from_utf8_lossy(&outcome.stderr);
         if errors.contains("address space is short: ") {
             assert_eq!(outcome.status.code(), Some(75), "{limit}: {errors}");

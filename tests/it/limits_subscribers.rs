@@ -41,14 +41,14 @@ fn count_missed(domain: &Domain, count: usize, sample_count: usize) -> u64 {
     let mut subscribers: Vec<_> = (0..count).map(|_| (subscribe(domain), 0, 0)).collect();
     while subscribers.iter().any(|(_, received, _)| *received < sample_count) {
         for (subscriber, received, missed) in &mut subscribers {
-            while let Some(scan) = subscriber.try_next().expect("works") {
+            while let Some(scan) = subscriber.try_next().expect("samples can be received") {
                 assert!(!scan.restarted);
                 (*received, *missed) = (*received + 1, *missed + scan.missed);
             }
         }
         // A new scan reaches all subscribers at the same time, so waiting for one is enough.
         let (subscriber, received, missed) = &mut subscribers[0];
-        let scan = subscriber.next().expect("works").expect("comes");
+        let scan = subscriber.next().expect("samples can be received").expect("a scan arrives");
         (*received, *missed) = (*received + 1, *missed + scan.missed);
     }
     subscribers.iter().map(|(.., missed)| missed).sum()
@@ -82,9 +82,10 @@ fn reports_configured_limit_to_surplus_subscriber() {
     in_own_process("limits_subscribers::reports_configured_limit_to_surplus_subscriber", || {
         let env = TestEnv::new();
         let hub = env.hub(&[env.link("front"), "--set=limits.subscribers=3".to_owned()]);
-        let node = scanhub_shm::client_node(&env.domain()).expect("joins");
-        let topic = Scan::open(&node, "front").expect("works").expect("is there");
-        let subscribers: Vec<_> = (0..3).map(|_| Scan::subscriber(&node, &topic).expect("a place")).collect();
+        let node = scanhub_shm::client_node(&env.domain()).expect("the process can join the domain");
+        let topic = Scan::open(&node, "front").expect("the topic can be opened").expect("the topic exists");
+        let subscribers: Vec<_> =
+            (0..3).map(|_| Scan::subscriber(&node, &topic).expect("the topic has a free slot")).collect();
         assert_eq!(env.subscribers("front/scan"), 3);
         let outcome = env.run(&["echo", "front/scan", "--json"]);
         let error = &outcome.of_class("error")[0];
@@ -108,9 +109,11 @@ fn refusal_on_a_remote_topic_names_the_listener_flag() {
         let flags = ["listen", "--json", "--publish", "--subscribers=2", "--name=robot1=5f3a12bc00d1e2f3"];
         let mut program = env.start(&flags).ready();
         sender.wait_until_published(&mut program, &[Topic::Zones, Topic::Status]);
-        let node = scanhub_shm::client_node(&env.domain()).expect("joins");
-        let topic = Zones::open(&node, "robot1.front").expect("works").expect("is there");
-        let subscribers = [(); 2].map(|()| Zones::subscriber(&node, &topic).expect("a place"));
+        let node = scanhub_shm::client_node(&env.domain()).expect("the process can join the domain");
+        let topic =
+            Zones::open(&node, "robot1.front").expect("the topic can be opened").expect("the topic exists");
+        let subscribers =
+            [(); 2].map(|()| Zones::subscriber(&node, &topic).expect("the topic has a free slot"));
         let outcome = env.run(&["echo", "robot1.front/zones", "--json"]);
         let error = &outcome.of_class("error")[0];
         assert_eq!((outcome.exit_code, &error["kind"]), (Some(75), &"short".into()), "{outcome}");
@@ -131,7 +134,7 @@ fn only_a_stopped_subscriber_misses_samples() {
     let first = number(&other.await_line("a scan", is_class("scan")), "topic_seq");
     other.await_line("many scans", |line| line["class"] == "scan" && number(line, "topic_seq") > first + 100);
     stopped.signal(Signal::CONT);
-    stopped.await_line("what it missed", |line| line["kind"] == "missed");
+    stopped.await_line("report of missed scans", |line| line["kind"] == "missed");
     stopped.await_lines(20, "a scan", is_class("scan"));
     let (stopped, other) = (stopped.end(INT), other.end(INT));
     let (scans, notices) = (stopped.of_class("scan"), stopped.of_class("notice"));
@@ -149,12 +152,12 @@ fn only_a_stopped_subscriber_misses_samples() {
 #[test]
 fn killed_subscribers_leave_no_samples() {
     if let [Ok(domain), Ok(base)] = HOLD_VARIABLES.map(std::env::var) {
-        return hold_samples(&Domain::at(&domain, base.as_ref()).expect("a place"));
+        return hold_samples(&Domain::at(&domain, base.as_ref()).expect("the domain is valid"));
     }
     let env = TestEnv::new();
     let hub = streaming(&env, 50, &[]);
     let mut echo = env.echo(&["front/scan"]);
-    let descriptors = || fs::read_dir(format!("/proc/{}/fd", hub.pid())).expect("lives").count();
+    let descriptors = || fs::read_dir(format!("/proc/{}/fd", hub.pid())).expect("the hub runs").count();
     let hub_domain = env.domain();
     let segments = || testkit::shared_memory(&hub_domain.prefix()).len();
     let (open_before, segments_before) = (descriptors(), segments());
@@ -170,13 +173,15 @@ fn killed_subscribers_leave_no_samples() {
         holder.args(testkit::single_test_args("limits_subscribers::killed_subscribers_leave_no_samples"));
         holder
             .env(HOLD_VARIABLES[0], hub_domain.name())
-            .env(HOLD_VARIABLES[1], hub_domain.root().parent().expect("a base"));
+            .env(HOLD_VARIABLES[1], hub_domain.root().parent().expect("the domain has a parent directory"));
         let mut holder = Program::start(holder);
         holder.wait_for_text("holding");
         assert_eq!(holder.end(KILL).exit_code, None);
     }
     // The numbers before may include resources of the client that counted the subscribers and was just exiting.
-    wait_until("the hub is as before", || descriptors() <= open_before && segments() <= segments_before);
+    wait_until("the hub has as many descriptors and segments as before", || {
+        descriptors() <= open_before && segments() <= segments_before
+    });
     echo.await_lines(40, "a scan", is_class("scan"));
     assert_eq!(env.info("front")["counters"]["loan_failed"], 0);
     let outcome = echo.end(INT);
@@ -188,19 +193,22 @@ fn killed_subscribers_leave_no_samples() {
 
 /// Receives as many samples as it may hold, prints how many it holds, and waits to be killed.
 fn hold_samples(domain: &Domain) {
-    let node = scanhub_shm::client_node(domain).expect("joins");
-    let topic = Scan::open(&node, "front").expect("works").expect("is there");
+    let node = scanhub_shm::client_node(domain).expect("the process can join the domain");
+    let topic = Scan::open(&node, "front").expect("the topic can be opened").expect("the topic exists");
     let mut subscribers = Vec::new();
     // Killed subscribers keep their slots until the hub cleans up.
-    wait_until("places", || {
+    wait_until("all slots are free", || {
         subscribers.extend(Scan::subscriber(&node, &topic));
         subscribers.len() == SUBSCRIBERS_PER_PROCESS
     });
     let mut held = Vec::new();
     for subscriber in &subscribers {
         for _ in 0..limits::MAX_BORROWED_SAMPLES {
-            wait_until("a scan", || {
-                Scan::receive(subscriber).expect("works").map(|scan| held.push(scan)).is_some()
+            wait_until("a scan arrives", || {
+                Scan::receive(subscriber)
+                    .expect("samples can be received")
+                    .map(|scan| held.push(scan))
+                    .is_some()
             });
         }
     }

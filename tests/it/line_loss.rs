@@ -42,7 +42,7 @@ fn a_line_that_loses_is_seen_everywhere() {
     assert!(text.contains("of the bytes damaged") && text.contains("of the scans lost in 10 s"), "{text}");
     let outcome = env.run(&["doctor", &env.path_argument("front"), "--json"]);
     let checks = outcome.of_class("check");
-    let check = checks.iter().find(|check| check["name"] == "line-loss").expect("it is looked at");
+    let check = checks.iter().find(|check| check["name"] == "line-loss").expect("doctor checks the line");
     assert_eq!(check["state"], "warning", "{check}");
     let found = check["finding"].as_str().unwrap_or_default();
     assert!(found.contains(" % lost on the line; "), "{check}");
@@ -72,7 +72,7 @@ fn a_line_that_is_well_says_so_from_the_first_second() {
     let info = env.await_info("front", |info| number(&info["counters"], "due_on_line") > 60);
     let outcome = env.run(&["doctor", &env.path_argument("front"), "--json"]);
     let checks = outcome.of_class("check");
-    let check = checks.iter().find(|check| check["name"] == "line-loss").expect("it is looked at");
+    let check = checks.iter().find(|check| check["name"] == "line-loss").expect("doctor checks the line");
     // A busy machine may stop a simulated scanner for a while. The hub then counts scans as lost.
     let lost = number(&env.info("front")["counters"], "lost_on_line");
     assert!(check["state"] == "ok" || lost > 0, "{check}");
@@ -96,12 +96,12 @@ fn line_that_damages_all_scans_is_reported() {
     let is_found = || {
         let outcome = env.run(&["doctor", &env.path_argument("front"), "--json"]);
         let checks = outcome.of_class("check");
-        let check = checks.iter().find(|check| check["name"] == "line-loss").expect("it is looked at");
+        let check = checks.iter().find(|check| check["name"] == "line-loss").expect("doctor checks the line");
         check["state"] == "failed" && check["finding"].to_string().contains("were in no intact telegram")
     };
-    wait_until("doctor finds it, while the hub looks for the scanner", is_found);
+    wait_until("doctor reports the damage while the hub searches for the scanner", is_found);
     let info_reports =
         || env.run(&["info", "front"]).to_string().contains("bytes were in no intact telegram");
-    wait_until("info says it, while the hub looks for the scanner", info_reports);
+    wait_until("info reports the damage while the hub searches for the scanner", info_reports);
     assert_eq!(hub.end(TERM).exit_code, Some(0));
 }

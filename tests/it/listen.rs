@@ -58,7 +58,7 @@ fn every_topic_is_a_line() {
         assert_eq!((&early["sensor"], &early["age_ms"]), (&json!("#2"), &Value::Null));
         assert_eq!(early["boot"], Value::Null);
         sender.announce(&Topic::ALL);
-        let named = program.await_line("its name", |line| line["kind"] == "named");
+        let named = program.await_line("a line with the name of the sensor", |line| line["kind"] == "named");
         assert_eq!((&named["number"], &named["sensor"]), (&json!(2), &json!("front")));
         sender.counter = 77;
         sender.stamp_ns = wall_ns() - 5_000_000;
@@ -83,7 +83,7 @@ fn every_topic_is_a_line() {
         sender.send(Topic::Motion, &motion);
         sender.send(Topic::Early, &Early { verdict: Verdict::Stop as u8, beam: 8, ..Early::default() });
         sender.send(Topic::Status, &status);
-        program.await_line("the last one", is_class("status"));
+        program.await_line("the last sample", is_class("status"));
         let outcome = program.end(INT);
         assert_eq!(outcome.exit_code, Some(0), "{outcome}");
         let lines = outcome.lines();
@@ -180,7 +180,7 @@ fn on_a_terminal_the_account_is_drawn_over_itself() {
         let mut command = env.command(&["listen", "--stats", "--interface=lo"]);
         let null = std::process::Stdio::null;
         command.stdin(null()).stdout(screen).stderr(null());
-        let mut process = spawn(command).expect("starts");
+        let mut process = spawn(command).expect("the program starts");
         wait_until("the groups are joined", || joined_groups("lo") == 4);
         TestGateway::new(HUB_ID, 7, 0, "front").send(Topic::Zones, &zones(Verdict::Clear));
         let mut text = String::new();
@@ -194,8 +194,8 @@ fn on_a_terminal_the_account_is_drawn_over_itself() {
         };
         read("#0/zones");
         read("\x1b[3A\x1b[J");
-        process.signal(INT).expect("it lives");
-        assert!(process.wait().expect("it ends").success());
+        process.signal(INT).expect("the program runs");
+        assert!(process.wait().expect("the program exits").success());
     });
 }
 
@@ -204,13 +204,13 @@ fn groups_are_joined_where_a_link_comes_or_comes_back() {
     in_a_network("listen::groups_are_joined_where_a_link_comes_or_comes_back", || {
         let make = || ip("link add scan0 type veth peer name far0") && ip("addr add 10.9.0.1/24 dev scan0");
         if !make() {
-            skip("veth", "the kernel makes no pair of interfaces");
+            skip("veth", "the kernel cannot create a pair of interfaces");
             return;
         }
         let env = TestEnv::new();
         for words in [&["--interface=scan0"][..], &[]] {
             let program = listener(&env, words);
-            assert_eq!(joined_groups("scan0"), 0, "it is down");
+            assert_eq!(joined_groups("scan0"), 0, "the interface is down");
             assert!(ip("link set scan0 up") && ip("link set far0 up"));
             wait_until("the groups are joined", || joined_groups("scan0") == 4);
             assert!(ip("link set far0 down") && ip("link set far0 up"));
@@ -285,7 +285,7 @@ fn counts_each_epoch_and_each_hub_separately() {
         again.send(Topic::Zones, &zones(Verdict::Slow));
         first.send(Topic::Zones, &zones(Verdict::Clear));
         other.send(Topic::Zones, &zones(Verdict::Stop));
-        program.await_line("the other one's last", |line| {
+        program.await_line("the last sample of the other gateway", |line| {
             line["hub"] == "0000000000000001" && line["topic_seq"] == 3
         });
         let outcome = program.end(INT);
@@ -294,7 +294,11 @@ fn counts_each_epoch_and_each_hub_separately() {
         assert_eq!(counters(&outcome, 3, "zones"), [4, 0, 0, 0], "{outcome}");
         assert_eq!(refusals(&outcome)["epoch"], 1, "{outcome}");
         let slow = outcome.of_class("zones").into_iter().find(|line| line["verdict"] == "slow");
-        assert_eq!(slow.map(|line| line["sensor"].clone()), Some(json!("#0")), "not announced in this life");
+        assert_eq!(
+            slow.map(|line| line["sensor"].clone()),
+            Some(json!("#0")),
+            "the sensor is not announced in this run"
+        );
     });
 }
 
@@ -310,7 +314,9 @@ fn counts_90_gateway_runs_in_a_bounded_table() {
             sender.send(Topic::Zones, &zones(Verdict::Clear));
             sender.next[usize::from(Topic::Zones.number())] += 2;
             sender.send(Topic::Zones, &zones(Verdict::Stop));
-            program.await_line("a life", |line| line["epoch"] == epoch && line["verdict"] == "stop");
+            program.await_line("sample of the next run", |line| {
+                line["epoch"] == epoch && line["verdict"] == "stop"
+            });
         }
         let outcome = program.end(INT);
         let lines = outcome.of_class("lan");
@@ -367,7 +373,7 @@ fn each_refusal_has_its_reason() {
         sender.send_empty(255);
         sender.send_empty(Topic::Zones.number());
         sender.send(Topic::Zones, &zones(Verdict::Stop));
-        program.await_line("the last one", |line| line["verdict"] == "stop");
+        program.await_line("the last sample", |line| line["verdict"] == "stop");
         let outcome = program.end(INT);
         let refused = refusals(&outcome);
         for reason in DatagramError::ALL {
@@ -397,7 +403,7 @@ fn reports_two_gateways_with_one_id_once() {
             // Send them over several seconds, because datagrams in a short time do not count as a second gateway.
             wait_at_least(Duration::from_millis(50));
         }
-        let line = program.await_line("the remedy", |line| line["kind"] == "problem");
+        let line = program.await_line("notice with a remedy", |line| line["kind"] == "problem");
         let message = line["message"].as_str().unwrap_or_default();
         assert!(message.contains(&format!("{HUB_ID:016x}")) && message.contains("gateway-*"), "{line}");
         let outcome = program.end(INT);

@@ -42,7 +42,7 @@ fn turns_of_any_length_come_whole() {
         let words: Vec<_> =
             ["gateway", "--json", "--interface=lo"].into_iter().map(str::to_owned).chain(topics).collect();
         let mut gateway = env.start(&words);
-        let id = gateway.await_line("its begin", is_class("gateway"))["hub"].clone();
+        let id = gateway.await_line("line of class gateway", is_class("gateway"))["hub"].clone();
         let remote = |name: &str| format!("{}.{name}", id.as_str().unwrap_or_default());
         let settings = ["front.family=ld", "front.model=ld19", "rear.family=ld", "rear.model=stl27l"]
             .map(|set| format!("--set=link.{set}"));
@@ -65,7 +65,7 @@ fn turns_of_any_length_come_whole() {
             echo.await_lines(25, "scans", |line| is_there(line) && is_class("scan")(line));
             echo.await_lines(5, "a foreground", |line| is_there(line) && is_class("foreground")(line));
             // A background is sent when it is new, and the listener keeps it for late joiners.
-            assert!(echo.has_printed(is_model), "no model of {beams} beams");
+            assert!(echo.has_printed(is_model), "no background with {beams} beams");
             let outcome = echo.end(INT);
             for topic in ["scan", "foreground", "telegram"] {
                 let lines = outcome.of_class(topic);

@@ -54,7 +54,7 @@ fn count_capacity_notices(outcome: &Outcome) -> usize {
 
 fn zones_row(outcome: &Outcome, hub: &str) -> Value {
     let row = outcome.of_class("lan").into_iter().find(|line| line["hub"] == hub && line["topic"] == "zones");
-    row.unwrap_or_else(|| panic!("no row of {hub}: {outcome}"))
+    row.unwrap_or_else(|| panic!("no statistics of {hub}: {outcome}"))
 }
 
 #[test]
@@ -73,15 +73,19 @@ fn receives_real_gateway_at_once_after_64_invented() {
             let mut sender = TestGateway::new(HUB_ID, 7, 0, "front");
             deliver_samples(&mut sender);
             let hub = json!("5f3a12bc00d1e2f3");
-            program.await_line("the true one", |line| line["hub"] == hub && line["class"] == "zones");
+            program.await_line("sample of the genuine sensor", |line| {
+                line["hub"] == hub && line["class"] == "zones"
+            });
             // The report may be printed before or after the line of the genuine sensor.
             let is_trouble = |line: &Value| line["kind"] == "problem";
             if !program.has_printed(is_trouble) {
-                program.await_line("that there was no room", is_trouble);
+                program.await_line("report of the shortage", is_trouble);
             }
             // The first announcement evicts no sensor that has just delivered. The next one is accepted.
             deliver_samples(&mut sender);
-            program.await_line("its name", |line| line["sensor"] == "front" && line["class"] == "zones");
+            program.await_line("a line with the name of the sensor", |line| {
+                line["sensor"] == "front" && line["class"] == "zones"
+            });
             let outcome = program.end(INT);
             let capacity = number(&outcome.of_class("lan_refused")[0], "capacity");
             assert_eq!(
@@ -101,7 +105,9 @@ fn invented_gateways_do_not_evict_a_delivering_one() {
         let env = TestEnv::new();
         let mut program = env.start(&["listen", "--json", "--topic=zones", NAME_FLAG]).ready();
         let mut sender = TestGateway::new(HUB_ID, 7, 0, "front");
-        deliver_for_proof_time(&mut sender, |_| drop(program.await_line("it is heard", is_class("zones"))));
+        deliver_for_proof_time(&mut sender, |_| {
+            drop(program.await_line("sample of the sensor", is_class("zones")))
+        });
         const ROUNDS: u64 = 100;
         let mut invented = TestGateway::new(0, 7, 0, "other");
         for round in 0..ROUNDS {
@@ -115,7 +121,7 @@ fn invented_gateways_do_not_evict_a_delivering_one() {
             let topic_seq = sender.next[usize::from(Topic::Zones.number())];
             sender.send(Topic::Zones, &zones(Verdict::Stop));
             // Waiting for each sample keeps the flood from overrunning the kernel's buffer.
-            program.await_line("the true one", |line| {
+            program.await_line("sample of the genuine sensor", |line| {
                 line["verdict"] == "stop" && line["topic_seq"] == json!(topic_seq)
             });
         }
@@ -123,7 +129,7 @@ fn invented_gateways_do_not_evict_a_delivering_one() {
         let row = zones_row(&outcome, "5f3a12bc00d1e2f3");
         assert_eq!((number(&row, "received"), number(&row, "lost")), (ROUNDS + 2, 0), "{row}");
         assert!(number(&outcome.of_class("lan_evicted")[0], "evicted_active") > 1000, "{outcome}");
-        assert_eq!(count_capacity_notices(&outcome), 1, "4000 of them, one line");
+        assert_eq!(count_capacity_notices(&outcome), 1, "4000 gateways must cause only one report");
     });
 }
 
@@ -135,7 +141,7 @@ fn publisher(env: &TestEnv) -> Program {
 /// sensor itself is not proven by then, because samples from before do not count for it.
 fn published_sender(program: &mut Program) -> TestGateway {
     let mut sender = TestGateway::new(HUB_ID, 7, 0, "front");
-    wait_until("it is published", || {
+    wait_until("the sensor is published", || {
         deliver_samples(&mut sender);
         program.prints(|line| line["kind"] == "published" && line["sensor"] == "robot1.front")
     });
@@ -162,7 +168,7 @@ fn publishes_real_sensor_at_once_after_16_invented() {
             assert_eq!(count_capacity_notices(&outcome), 1, "{outcome}");
             let sensors = &outcome.of_class("lan_published")[0]["sensors"];
             assert_eq!(sensors.as_array().map(Vec::len), Some(16), "{outcome}");
-            assert!(!sensors.to_string().contains("ab.s0\""), "the oldest made room: {sensors}");
+            assert!(!sensors.to_string().contains("ab.s0\""), "the oldest sensor must be evicted: {sensors}");
         }
     });
 }
@@ -191,7 +197,7 @@ fn new_sensors_do_not_evict_a_delivering_one() {
         let outcome = program.end(INT);
         let line = &outcome.of_class("lan_published")[0];
         assert!(line["sensors"].to_string().contains("robot1.front"), "{line}");
-        assert!(number(line, "capacity") > 0, "so many are not made at once: {line}");
+        assert!(number(line, "capacity") > 0, "the listener must refuse some of the sensors: {line}");
         assert_eq!(count_capacity_notices(&outcome), 1, "{outcome}");
     });
 }
@@ -206,10 +212,10 @@ fn subscriber_survives_eviction_of_its_sensor() {
         let mut others: Vec<_> = (0..16).map(|n| TestGateway::new(0xab, 7, n, &format!("s{n}"))).collect();
         others[0].wait_until_published(&mut program, &[Topic::Zones, Topic::Status]);
         others.iter_mut().for_each(deliver_samples);
-        program.await_line("the last one", |line| line["sensor"] == "00000000000000ab.s15");
-        echo.await_line("nothing is known any more", |line| line["verdict"] == "unknown");
+        program.await_line("the last sample", |line| line["sensor"] == "00000000000000ab.s15");
+        echo.await_line("unknown zones", |line| line["verdict"] == "unknown");
         deliver_samples(&mut sender);
-        program.await_line("it is back", |line| line["sensor"] == "robot1.front");
+        program.await_line("sample of the sensor again", |line| line["sensor"] == "robot1.front");
         await_verdict(&mut sender, &mut echo, Verdict::Stop);
         drop((echo.end(INT), program.end(INT)));
         assert!(env.leftover_files().is_empty(), "{:?}", env.leftover_files());

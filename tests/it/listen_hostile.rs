@@ -12,8 +12,8 @@ const BATCH_SIZE: u64 = 50;
 
 fn resident_kb(program: &Program) -> u64 {
     let path = format!("/proc/{}/status", program.pid());
-    let text = std::fs::read_to_string(path).expect("it lives");
-    let line = text.lines().find(|line| line.starts_with("VmRSS")).expect("it has memory");
+    let text = std::fs::read_to_string(path).expect("the program runs");
+    let line = text.lines().find(|line| line.starts_with("VmRSS")).expect("the status has VmRSS");
     line.split_whitespace().nth(1).and_then(|number| number.parse().ok()).expect("kB")
 }
 
@@ -62,7 +62,7 @@ fn nothing_damaged_is_accepted_and_memory_stays_flat() {
             if n % BATCH_SIZE == BATCH_SIZE - 1 {
                 let seq = sender.next[usize::from(Topic::Zones.number())];
                 sender.send(Topic::Zones, &Zones { verdict: Verdict::Stop as u8, ..Zones::unknown() });
-                program.await_line("what is whole", |line| line["topic_seq"] == seq);
+                program.await_line("the valid datagram", |line| line["topic_seq"] == seq);
             }
             if n == DAMAGED_COUNT / 10 {
                 kb = resident_kb(&program);
@@ -117,7 +117,7 @@ fn sealed_nonsense_neither_ends_it_nor_fills_memory() {
                 revision: random.u16(..3),
                 counter: random.u32(..),
             };
-            sender.send_bytes(Topic::Zones, head.seal(&mut buffer, len).expect("it fits"));
+            sender.send_bytes(Topic::Zones, head.seal(&mut buffer, len).expect("the payload fits"));
             if n % 50 == 49 {
                 // This sensor already has a slot in the listener's table, so it is received in spite of all others.
                 sender.send(Topic::Zones, &Zones::unknown());
@@ -128,7 +128,7 @@ fn sealed_nonsense_neither_ends_it_nor_fills_memory() {
                 kb = resident_kb(&program);
             }
         }
-        assert!(resident_kb(&program).saturating_sub(kb) < 2048, "{kb} kB and more");
+        assert!(resident_kb(&program).saturating_sub(kb) < 2048, "memory grew from {kb} kB");
         let outcome = program.end(INT);
         assert_eq!(outcome.exit_code, Some(0), "{outcome}");
         let reports_flood = |it: &&Value| {
@@ -140,13 +140,13 @@ fn sealed_nonsense_neither_ends_it_nor_fills_memory() {
         let lines = outcome.of_class("lan");
         assert!(lines.len() <= 1024, "{} lines", lines.len());
         let own = lines.iter().find(|it| it["hub"] == "000000000000abcd" && it["topic"] == "zones");
-        let own = own.unwrap_or_else(|| panic!("its sender is forgotten: {lines:?}"));
+        let own = own.unwrap_or_else(|| panic!("the sender was evicted: {lines:?}"));
         // The listener cannot count datagrams that the flood displaced after the last one that it received.
         let known = number(own, "received") + number(own, "lost");
         assert!((1..=counted).contains(&known), "{known} of {counted}");
         let sensors = &outcome.of_class("lan_published")[0]["sensors"];
         let sensors = sensors.as_array().map(Vec::len).unwrap_or_default();
-        assert!((1..=16).contains(&sensors), "{sensors} of nonsense and one");
+        assert!((1..=16).contains(&sensors), "{sensors} sensors were published");
     });
 }
 
@@ -180,10 +180,10 @@ fn reports_timeouts_and_an_occupied_port() {
             let lines = outcome.lines();
             let error = lines.last().unwrap_or_else(|| panic!("{outcome}"));
             assert_eq!(error["kind"], "timeout", "{outcome}");
-            assert_eq!(outcome.of_class("lan_refused").len(), 1, "the account comes all the same");
+            assert_eq!(outcome.of_class("lan_refused").len(), 1, "the statistics must be printed anyway");
         }
         assert_eq!(env.run(&["listen", "--json", "--for=100ms"]).exit_code, Some(0));
-        let holder = std::net::UdpSocket::bind("0.0.0.0:22200").expect("nobody has it");
+        let holder = std::net::UdpSocket::bind("0.0.0.0:22200").expect("the port is free");
         let outcome = env.run(&["listen", "--json"]);
         assert_eq!(outcome.exit_code, Some(1), "{outcome}");
         assert!(

@@ -88,7 +88,7 @@ fn a_signal_asks_for_the_account_so_far() {
             sender.send(Topic::Zones, &zones(Verdict::Clear));
             program.await_line("zones", is_class("zones"));
             program.signal(USR1);
-            let line = program.await_line("the account", is_class("lan"));
+            let line = program.await_line("the statistics", is_class("lan"));
             assert_eq!((number(&line, "received"), &line["topic"]), (received, &json!("zones")));
         }
         let outcome = program.end(INT);

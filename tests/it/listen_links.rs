@@ -21,7 +21,7 @@ impl FakeSwitch {
     fn new() -> FakeSwitch {
         let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
         let socket = socket_with(AddressFamily::PACKET, SocketType::DGRAM, flags, Some(eth::IP));
-        FakeSwitch { socket: socket.expect("root of the network may"), memberships: BTreeSet::new() }
+        FakeSwitch { socket: socket.expect("root can open a packet socket"), memberships: BTreeSet::new() }
     }
 
     /// Waits for a message of type `kind` for each group that a listener joins.
@@ -110,7 +110,7 @@ fn force_igmp_version_2(machine: &Machine, interface: &str) -> bool {
     version.args(["-c", &format!("echo 2 > {path}")]);
     let is_done = status(version).is_ok_and(|status| status.success());
     if !is_done {
-        skip("igmp", "its version cannot be chosen here");
+        skip("igmp", "its version cannot be selected");
     }
     is_done
 }

@@ -51,7 +51,7 @@ fn invented_sensors_stay_within_the_memory() {
         // A sensor that has delivered for a second is never removed for others while it delivers.
         for pause_ms in [1_100, 0] {
             front.send(Topic::Scan, &*own);
-            echo.await_line("the true one", is_class("scan"));
+            echo.await_line("sample of the genuine sensor", is_class("scan"));
             wait_at_least(Duration::from_millis(pause_ms));
         }
 
@@ -60,7 +60,7 @@ fn invented_sensors_stay_within_the_memory() {
         invented.wait_until_published(&mut program, &topics);
         let scan = longest_scan();
         let (mut max_used, mut rounds) = (0, 0);
-        wait_until("there is no room", || {
+        wait_until("the listener reports a shortage", || {
             rounds += 1;
             for number in 0..16 {
                 (invented.sensor, invented.name) = (number, format!("s{number}"));
@@ -68,7 +68,7 @@ fn invented_sensors_stay_within_the_memory() {
                 invented.send(Topic::Scan, &*scan);
                 // Waiting for it keeps the flood from overrunning the kernel's buffer.
                 front.send(Topic::Scan, &*own);
-                echo.await_line("the true one", is_class("scan"));
+                echo.await_line("sample of the genuine sensor", is_class("scan"));
                 max_used = max_used.max(used_memory(&env));
             }
             rounds > 2 && number(&request_statistics(&mut program, "lan_published"), "no_room") > 0
@@ -79,7 +79,8 @@ fn invented_sensors_stay_within_the_memory() {
         assert_eq!(echoed.of_class("summary")[0]["missed"], 0, "{echoed}");
         contiguous_numbers(&echoed.of_class("scan"), "topic_seq");
         let outcome = program.end(INT);
-        let published = outcome.of_class("lan_published").pop().expect("the counts");
+        let published =
+            outcome.of_class("lan_published").pop().expect("the statistics have a line of published sensors");
         assert!(published["sensors"].to_string().contains("robot1.front"), "{published}");
         let last = outcome.of_class("lan_no_room").pop().expect("a gateway");
         assert_eq!((&last["hub"], &last["no_room"]), (&json!("00000000000000ab"), &published["no_room"]));
@@ -109,7 +110,8 @@ fn unproven_gateways_take_no_shared_memory() {
         });
         assert_eq!(used_memory(&env), before);
         let outcome = program.end(INT);
-        let published = outcome.of_class("lan_published").pop().expect("the counts");
+        let published =
+            outcome.of_class("lan_published").pop().expect("the statistics have a line of published sensors");
         assert_eq!((&published["sensors"], &published["no_room"]), (&json!(["robot1.front"]), &json!(0)));
     });
 }

@@ -63,7 +63,7 @@ fn a_remote_sensor_is_as_a_local_one() {
         let uptime_s: f64 =
             since_start_ns.split(' ').next().and_then(|text| text.parse().ok()).expect("seconds");
         let age_s = uptime_s - number(&line, "stamp_ns") as f64 / 1e9;
-        assert!((-1.0..60.0).contains(&age_s), "the stamp is not of the arrival: {age_s} s");
+        assert!((-1.0..60.0).contains(&age_s), "the stamp differs from the arrival by {age_s} s");
         // Two samples are lost, and one arrives late and twice.
         let (late, lost) = (sender.next_datagram(Topic::Zones, &zones(Verdict::Stop)), 2);
         sender.next[usize::from(Topic::Zones.number())] += lost;
@@ -72,7 +72,7 @@ fn a_remote_sensor_is_as_a_local_one() {
         sender.send_bytes(Topic::Zones, &late);
         sender.send(Topic::Zones, &zones(Verdict::Slow));
         echo.await_lines(2, "zones", is_zones);
-        hz.await_line("a second", |line| line["class"] == "hz" && line["received"] == 3);
+        hz.await_line("the rate of a second", |line| line["class"] == "hz" && line["received"] == 3);
         let outcome = echo.end(INT);
         let zones: Vec<_> = outcome.lines().into_iter().filter(is_zones).collect();
         let numbers: Vec<_> = zones.iter().map(|line| number(line, "topic_seq")).collect();
@@ -86,11 +86,11 @@ fn a_remote_sensor_is_as_a_local_one() {
 
         let info = env.await_info(SENSOR_NAME, |info| info["state"] == "streaming");
         assert_eq!(info["port"], "/dev/ttyUSB7");
-        assert!(number(&info, "since_ns") > 5, "the beginning is on another machine's clock: {info}");
+        assert!(number(&info, "since_ns") > 5, "since_ns must use this machine's clock: {info}");
         let listed = env.run(&["list", "--json"]).of_class("topic");
         let topics: Vec<_> = listed.iter().map(|line| &line["topic"]).collect();
-        assert_eq!(topics, ["telegram", "scan", "zones", "status"], "those that were announced");
-        let domains = output(env.command(&["list", "--domains", "--json"])).expect("runs");
+        assert_eq!(topics, ["telegram", "scan", "zones", "status"], "only announced topics exist");
+        let domains = output(env.command(&["list", "--domains", "--json"])).expect("the program runs");
         assert!(String::from_utf8_lossy(&domains.stdout).contains(&program.pid().to_string()));
         env.await_info(SENSOR_NAME, |info| info["state"] == "silent" && info["last_error"] != "");
 
@@ -101,7 +101,11 @@ fn a_remote_sensor_is_as_a_local_one() {
             (&line["sensors"], &line["late"], &line["loan_failed"]),
             (&json!([SENSOR_NAME]), &json!(1), &json!(0))
         );
-        assert_eq!(env.run(&["info", SENSOR_NAME, "--json"]).exit_code, Some(3), "nobody publishes");
+        assert_eq!(
+            env.run(&["info", SENSOR_NAME, "--json"]).exit_code,
+            Some(3),
+            "the sensor is not published any more"
+        );
     });
 }
 
@@ -146,14 +150,14 @@ fn gateways_and_hubs_that_start_again_are_followed() {
         again.send(Topic::Zones, &zones(Verdict::Slow));
         again.announce(&[Topic::Zones]);
         again.send(Topic::Zones, &zones(Verdict::Stop));
-        let line = echo.await_line("the gateway's next life", |line| line["verdict"] == "stop");
+        let line = echo.await_line("sample of the gateway's next run", |line| line["verdict"] == "stop");
         assert_eq!(line["topic_seq"], 5);
         // The hub restarts. Its gateway continues to count, and so do the subscribers.
         again.boot = 0xb008;
         again.announce(&[Topic::Zones]);
         again.next[usize::from(Topic::Zones.number())] += 1;
         again.send(Topic::Zones, &zones(Verdict::Clear));
-        let line = echo.await_line("the hub's next life", |line| line["boot"] == "000000000000b008");
+        let line = echo.await_line("sample of the hub's next run", |line| line["boot"] == "000000000000b008");
         assert_eq!(line["topic_seq"], 7);
         let outcome = echo.end(INT);
         assert_eq!(outcome.of_class("summary")[0]["missed"], 3, "{outcome}");
@@ -207,10 +211,10 @@ fn a_hub_and_two_remote_ones_live_in_one_domain() {
             "{absent}"
         );
         let refused = env.run(&["control", "robot1.front", "pause", "--json"]);
-        assert_eq!(refused.exit_code, Some(2), "nobody commands another machine's sensor: {refused}");
+        assert_eq!(refused.exit_code, Some(2), "a remote sensor cannot be controlled: {refused}");
         assert_eq!(hub.end(TERM).exit_code, Some(0));
         one.send(Topic::Zones, &zones(Verdict::Clear));
-        echo.await_line("the remote sensor goes on", |line| line["verdict"] == "clear");
+        echo.await_line("sample of the remote sensor", |line| line["verdict"] == "clear");
         drop(echo);
         assert_eq!(listener.end(TERM).exit_code, Some(0));
         assert!(env.leftover_files().is_empty(), "{:?}", env.leftover_files());
@@ -226,7 +230,8 @@ fn gateway_does_not_send_remote_sensors_again() {
         // The gateway waits for the hub, although the listener already uses the domain. It never sends topics that the
         // listener publishes.
         let mut gateway = env.start(&["gateway", "--json", "--interface=lo", "--topic=front/scan"]);
-        let id = gateway.await_line("its begin", |line| line["class"] == "gateway")["hub"].clone();
+        let id =
+            gateway.await_line("line of class gateway", |line| line["class"] == "gateway")["hub"].clone();
         let hub = env.hub(&[env.link("front")]);
         let line = listener.await_line("a sensor", |line| line["kind"] == "published");
         let remote = format!("{}.front", id.as_str().unwrap_or_default());
@@ -241,7 +246,10 @@ fn gateway_does_not_send_remote_sensors_again() {
             let Some(same) = same else { continue };
             assert_eq!((&same["ranges"], &same["codes"]), (&line["ranges"], &line["codes"]));
             assert_eq!((&same["boot"], &same["wall_ns"]), (&line["boot"], &line["wall_ns"]));
-            assert!(number(same, "stamp_ns") < number(line, "stamp_ns"), "it came later");
+            assert!(
+                number(same, "stamp_ns") < number(line, "stamp_ns"),
+                "the remote sample must have a later stamp"
+            );
         }
         assert!(there.iter().filter(|line| here.iter().any(|it| it["seq"] == line["seq"])).count() > 30);
         assert_eq!((gateway.end(TERM).exit_code, hub.end(TERM).exit_code), (Some(0), Some(0)));
@@ -267,11 +275,11 @@ fn a_number_that_another_sensor_has_is_its_own() {
         sender.announce(&[Topic::Zones, Topic::Zones]);
         let line = program.await_line("a sensor", |line| line["kind"] == "published");
         assert_eq!(line["sensor"], "robot1.rear");
-        echo.await_line("nothing is known any more", |line| line["verdict"] == "unknown");
+        echo.await_line("unknown zones", |line| line["verdict"] == "unknown");
         env.await_info(SENSOR_NAME, |info| info["state"] == "silent");
         let mut rear = env.echo(&["robot1.rear/zones"]);
         sender.send(Topic::Zones, &zones(Verdict::Stop));
-        rear.await_line("its own", |line| line["verdict"] == "stop");
+        rear.await_line("sample of the second sensor", |line| line["verdict"] == "stop");
         // The first sensor returns with another number, for which the listener has no counters. A late announcement has
         // no effect.
         let mut front = TestGateway::new(HUB_ID, 7, 1, "front");
@@ -280,8 +288,8 @@ fn a_number_that_another_sensor_has_is_its_own() {
         front.announce(&[Topic::Zones]);
         sender.send_to_group(Announce::GROUP, &late);
         front.send(Topic::Zones, &zones(Verdict::Slow));
-        let line = echo.await_line("it again", |line| line["verdict"] == "slow");
-        assert_eq!(line["topic_seq"], 2, "the network counts on in a new life of the hub");
+        let line = echo.await_line("sample of the first sensor", |line| line["verdict"] == "slow");
+        assert_eq!(line["topic_seq"], 2, "the gateway must continue its numbers when the hub restarts");
         let outcome = echo.end(INT);
         assert!(outcome.of_class("zones").iter().all(|line| line["verdict"] != "stop"), "{outcome}");
         let (rear, program) = (rear.end(INT), program.end(INT));
@@ -289,7 +297,7 @@ fn a_number_that_another_sensor_has_is_its_own() {
         let rows = program.of_class("lan");
         let names: Vec<_> =
             rows.iter().filter(|line| line["topic"] == "zones").map(|line| &line["sensor"]).collect();
-        assert_eq!(names, ["#0", "front"], "the first one was sent by both");
+        assert_eq!(names, ["#0", "front"], "two sensors used number 0, so its counters have no name");
     });
 }
 
@@ -300,27 +308,28 @@ fn renumbered_sensors_are_not_mixed_up() {
         let _simulator = env.simulator(&["front", "rear"], &["--seed=63", "--baud=500000"]);
         let mut listener = env.start(&["listen", "--json", "--publish", "--interface=lo"]).ready();
         let mut gateway = env.start(&["gateway", "--json", "--interface=lo"]);
-        let id = gateway.await_line("its begin", |line| line["class"] == "gateway")["hub"].clone();
+        let id =
+            gateway.await_line("line of class gateway", |line| line["class"] == "gateway")["hub"].clone();
         let remote = |name: &str| format!("{}.{name}", id.as_str().unwrap_or_default());
         let (front, rear) = (remote("front"), remote("rear"));
         let hub = env.hub(&[env.link("front"), env.link("rear")]);
         listener.await_line("a sensor", |line| line["kind"] == "published");
-        listener.await_line("the other", |line| line["kind"] == "published");
+        listener.await_line("sample of the other sensor", |line| line["kind"] == "published");
         let topics = [&front, &rear].map(|name| ["status", "scan"].map(|topic| format!("{name}/{topic}")));
         let topics: Vec<_> = topics.iter().flatten().map(String::as_str).collect();
         let mut echo = env.echo(&topics);
         let is_scan =
             |line: &Value, name: &String| line["class"] == "scan" && line["sensor"] == name.as_str();
-        let first = echo.await_line("a life", |line| is_scan(line, &front))["boot"].clone();
+        let first = echo.await_line("scan of the first run", |line| is_scan(line, &front))["boot"].clone();
         assert_eq!(hub.end(TERM).exit_code, Some(0));
         let hub = env.hub(&[env.link("rear"), env.link("front")]);
         let is_next = |line: &Value, name| is_scan(line, name) && line["boot"] != first;
-        let next = echo.await_line("the next life", |line| is_next(line, &front))["boot"].clone();
-        echo.await_line("the next life of the other", |line| is_next(line, &rear));
+        let next = echo.await_line("sample of the next run", |line| is_next(line, &front))["boot"].clone();
+        echo.await_line("scan of the other sensor in the next run", |line| is_next(line, &rear));
         assert_eq!(hub.end(TERM).exit_code, Some(0));
         // `front` now has the number that `rear` had, and the listener accepts it at once.
         let _hub = env.hub(&[env.link("front")]);
-        echo.await_line("one is left", |line| is_next(line, &front) && line["boot"] != next);
+        echo.await_line("scan of the remaining sensor", |line| is_next(line, &front) && line["boot"] != next);
         env.await_info(&rear, |info| info["state"] == "silent");
         for line in echo.end(INT).of_class("status") {
             let (sensor, port) =
@@ -351,9 +360,9 @@ fn samples_without_topic_are_counted_by_cause() {
         front.wait_until_published(&mut program, &[Topic::Zones]);
         let mut echo = env.echo(&["robot1.front/zones"]);
         let pid = program.pid();
-        let used = std::fs::read_dir(format!("/proc/{pid}/fd")).expect("it runs").count() as u64;
+        let used = std::fs::read_dir(format!("/proc/{pid}/fd")).expect("the program runs").count() as u64;
         let few = Rlimit { current: Some(used + 4), maximum: getrlimit(Resource::Nofile).maximum };
-        prlimit(Pid::from_raw(pid as i32), Resource::Nofile, few).expect("it may have fewer");
+        prlimit(Pid::from_raw(pid as i32), Resource::Nofile, few).expect("the limit can be reduced");
         front.announce(&[Topic::Zones, Topic::Scan]);
         let line = program.await_line("a shortage", |line| line["kind"] == "problem");
         assert!(line["message"].to_string().contains("descriptors"), "{line}");
@@ -392,7 +401,8 @@ fn there_is_room_for_sixteen_sensors() {
             }
             wait_at_least(Duration::from_millis(wait_ms));
         }
-        let line = program.await_line("one too many", |line| line["kind"] == "problem");
+        let line =
+            program.await_line("report of a sensor that does not fit", |line| line["kind"] == "problem");
         assert!(line["message"].as_str().is_some_and(|text| text.contains("16 published")), "{line}");
         let listed = env.run(&["list", "--json"]).of_class("topic");
         assert_eq!(listed.len(), 16);

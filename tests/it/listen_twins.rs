@@ -34,7 +34,7 @@ impl Robot {
         std::fs::write(file, "5f3a12bc00d1e2f3 4000000000\n").expect("can be written");
         let mut gateway =
             self.env.start_gateway(&["--interface=eth0", "--topic=front/scan", "--topic=front/status"]);
-        let begin = gateway.await_line("its begin", is_class("gateway"));
+        let begin = gateway.await_line("line of class gateway", is_class("gateway"));
         assert_eq!((&begin["hub"], number(&begin, "epoch")), (&json!("5f3a12bc00d1e2f3"), 4_000_000_001));
         gateway
     }
@@ -61,18 +61,18 @@ fn reports_two_machines_with_one_id_and_mixes_nothing() {
         let mut listener = env.start(&["listen", "--json"]).ready();
         let mut publisher = env.start(&["listen", "--json", "--publish"]).ready();
         let first = one.gateway();
-        listener.await_lines(10, "scans of the first one", is_class("scan"));
+        listener.await_lines(10, "scans of the first machine", is_class("scan"));
         publisher.await_line("a sensor", |line| line["kind"] == "published");
         let mut echo = env.echo(&["5f3a12bc00d1e2f3.front/scan"]);
         let second = other.gateway();
-        listener.await_line("that there are two", reports_two_gateways);
-        echo.await_lines(100, "scans of the first one", is_class("scan"));
+        listener.await_line("report of two gateways", reports_two_gateways);
+        echo.await_lines(100, "scans of the first machine", is_class("scan"));
         let echoed = echo.end(INT);
         assert_eq!(beam_counts(&echoed), [361], "{echoed}");
         assert_eq!(echoed.of_class("summary")[0]["missed"], 0, "{echoed}");
         // A listener that starts now receives one of them, but never both.
         let mut late = env.start(&["listen", "--json"]).ready();
-        late.await_line("that there are two", reports_two_gateways);
+        late.await_line("report of two gateways", reports_two_gateways);
         late.await_lines(10, "scans", is_class("scan"));
         let late = late.end(INT);
         assert!(beam_counts(&late) == [361] || beam_counts(&late) == [181], "{:?}", beam_counts(&late));
@@ -80,11 +80,11 @@ fn reports_two_machines_with_one_id_and_mixes_nothing() {
         // refuse its datagrams for more than 3 s.
         assert_eq!(first.end(TERM).exit_code, Some(0));
         let mut other = env.start(&["listen", "--json"]).ready();
-        other.await_lines(200, "scans of the second one", is_class("scan"));
-        assert_eq!(beam_counts(&other.end(INT)), [181], "alone it is heard by who comes now");
+        other.await_lines(200, "scans of the second machine", is_class("scan"));
+        assert_eq!(beam_counts(&other.end(INT)), [181], "a new listener must receive the remaining gateway");
         assert_eq!(second.end(TERM).exit_code, Some(0));
         let (listener, publisher) = (listener.end(INT), publisher.end(INT));
-        assert_eq!(beam_counts(&listener), [361], "only the first one");
+        assert_eq!(beam_counts(&listener), [361], "only the first gateway must be received");
         for outcome in [&listener, &publisher] {
             let notices = outcome.of_class("notice").iter().filter(|line| reports_two_gateways(line)).count();
             assert_eq!(notices, 1, "{outcome}");

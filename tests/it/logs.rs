@@ -20,7 +20,7 @@ fn replay_and_echo(env: &TestEnv, file: &str) -> (Outcome, Outcome) {
     let mut subscriber = env.echo(&["front/scan", "front/zones", "front/status"]);
     env.await_info("front", |info| info["state"] == "paused");
     assert_eq!(env.run(&["control", "front", "resume"]).exit_code, Some(0));
-    subscriber.await_line("the end", |line| line["last_error"] == "the recording is at its end");
+    subscriber.await_line("end of the recording", |line| line["last_error"] == "the recording is at its end");
     let player = player.wait();
     (subscriber.end(INT), player)
 }

@@ -114,7 +114,7 @@ pub(crate) fn write_program(path: impl AsRef<Path>, content: impl AsRef<[u8]>) {
     let path = path.as_ref();
     let mut shell = Command::new("sh");
     shell.args(["-c", "cat > \"$0\" && chmod 755 \"$0\""]).arg(path);
-    let mut shell = spawn(shell.stdin(Stdio::piped())).expect("there is a shell");
+    let mut shell = spawn(shell.stdin(Stdio::piped())).expect("sh starts");
     let written = shell.stdin.take().map(|mut stdin| stdin.write_all(content.as_ref()));
     let status = shell.wait();
     assert!(
@@ -154,7 +154,7 @@ impl Child {
         let errors = self.stderr.take();
         let errors = thread::spawn(|| read_all(errors));
         let stdout = read_all(self.stdout.take())?;
-        let stderr = errors.join().expect("reading does not panic")?;
+        let stderr = errors.join().expect("the thread that reads stderr does not panic")?;
         Ok(Output { status: self.wait()?, stdout, stderr })
     }
 
@@ -246,7 +246,7 @@ fn end_all(living: impl Fn() -> Vec<i32>) {
         });
         if Instant::now() > give_up_at {
             // A panic while another one unwinds would abort the test binary.
-            assert!(thread::panicking(), "killed processes do not end: {pids:?}");
+            assert!(thread::panicking(), "killed processes still run: {pids:?}");
             return;
         }
         thread::sleep(POLL_INTERVAL);

@@ -10,7 +10,8 @@ pub(crate) const MODE: Mode = Mode(1);
 /// Returns the scan that the hub publishes when an LMS sends the values `words` in `unit` and [`MODE`].
 pub(crate) fn scan(words: &[u16], unit: Unit) -> Box<Scan> {
     let telegram = measured::encode(0, unit, words, 0x10);
-    let measured = MeasuredValues::decode(telegram.telegram()).expect("as many words as a variant has");
+    let measured =
+        MeasuredValues::decode(telegram.telegram()).expect("a number of values that an LMS variant has");
     let raw = measured.scan(MODE);
     let mut scan = Scan::zeroed(raw.payload_len());
     raw.write(&mut scan);

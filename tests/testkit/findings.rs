@@ -36,8 +36,9 @@ impl Findings {
             line["name"] == name && line["state"] == state && remedy.contains(remedy_word)
         };
         let line = self.0.iter().find(is_it);
-        let line =
-            line.unwrap_or_else(|| panic!("{set_up}: no {name} {state} with {remedy_word}: {:#?}", self.0));
+        let line = line.unwrap_or_else(|| {
+            panic!("{set_up}: check {name} is not {state} with {remedy_word} in its remedy: {:#?}", self.0)
+        });
         let remedy = line["remedy"].as_str().unwrap_or_default();
         println!("{set_up:44} {state:8} {name:13} {remedy}");
     }
@@ -67,7 +68,7 @@ impl Findings {
     /// Returns state and finding of the first check called `name`.
     pub(crate) fn state_and_text(&self, name: &str) -> (&str, &str) {
         let line = self.0.iter().find(|line| line["name"] == name);
-        let line = line.unwrap_or_else(|| panic!("no {name}: {:#?}", self.0));
+        let line = line.unwrap_or_else(|| panic!("no check {name} in {:#?}", self.0));
         (line["state"].as_str().unwrap_or_default(), line["finding"].as_str().unwrap_or_default())
     }
 }

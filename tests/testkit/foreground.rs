@@ -57,7 +57,7 @@ pub(crate) struct LabeledScan {
 
 /// Simulates `scene` with random numbers from `seed`, and returns its scans.
 pub(crate) fn play(scene: &Scene, seed: u64) -> Vec<LabeledScan> {
-    let world: World = scene.world.parse().expect("a world that the program brings along");
+    let world: World = scene.world.parse().expect("the name of a built-in world");
     let mut layers = world.noise().expect("a world with noise");
     layers.spot &= scene.mixed;
     let room = Room::new(&world.with_noise(layers), seed);
@@ -205,7 +205,7 @@ impl Boxes {
             frames
                 .iter()
                 .position(|frame| frame.targets.iter().any(is))
-                .expect("boxes come and go in this room")
+                .expect("boxes are put down and removed in this room")
         };
         let at = first(is_new) + LEARNING_SCANS;
         let answers = answers(&mut *make(), &frames[..at], &frames[at].scan);

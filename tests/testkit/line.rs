@@ -34,12 +34,12 @@ impl TestLine {
             rustix::fs::symlink(OsStr::from_bytes(name.as_bytes()), path)?;
             Ok(TestLine(master))
         };
-        make().unwrap_or_else(|error| panic!("no pty at {}: {error}", path.display()))
+        make().unwrap_or_else(|error| panic!("cannot create a pty at {}: {error}", path.display()))
     }
 
     /// Waits until the hub has the line open.
     pub(crate) fn wait_until_open(&self) {
-        super::wait_until("somebody opens the line", || self.is_open());
+        super::wait_until("the hub opens the line", || self.is_open());
     }
 
     /// Returns whether the hub has the line open.
@@ -52,7 +52,7 @@ impl TestLine {
     /// Waits for a request of the hub, and returns its command byte.
     pub(crate) fn wait_for_request(&self) -> u8 {
         let mut buffer = Vec::new();
-        super::wait_until("a request is said", || {
+        super::wait_until("the hub sends a request", || {
             let mut bytes = [0; 16];
             let len = read(&self.0, &mut bytes).unwrap_or(0);
             buffer.extend(&bytes[..len]);
@@ -87,9 +87,9 @@ impl TestLine {
                     let mut fds = [PollFd::new(&self.0, PollFlags::OUT)];
                     let _ = poll(&mut fds, Some(&Timespec { tv_sec: 1, tv_nsec: 0 }));
                 }
-                Err(error) => panic!("the line is gone: {error}"),
+                Err(error) => panic!("cannot write to the line: {error}"),
             }
-            assert!(Instant::now() < give_up_at, "nobody reads");
+            assert!(Instant::now() < give_up_at, "timeout: the other end does not read");
         }
     }
 }

@@ -26,7 +26,7 @@ impl Machine {
         let mut holder = spawn(unshare.stdin(Stdio::piped()).stdout(Stdio::piped())).expect("unshare runs");
         let mut buffer = [0; 3];
         let read = holder.stdout.as_mut().map(|out| out.read_exact(&mut buffer));
-        assert!(matches!(read, Some(Ok(()))), "no namespace");
+        assert!(matches!(read, Some(Ok(()))), "cannot create a network namespace");
         let machine = Machine { holder, number };
         machine.plug();
         machine
@@ -80,7 +80,7 @@ impl Machine {
         let mut show = command_in(&self.network(), "ip");
         show.args(["link", "show", "eth0"]);
         while !output(&mut show).is_ok_and(|it| String::from_utf8_lossy(&it.stdout).contains("state UP")) {
-            assert!(Instant::now() < give_up_at, "no link");
+            assert!(Instant::now() < give_up_at, "timeout: eth0 has no carrier");
             thread::sleep(Duration::from_millis(20));
         }
     }
@@ -91,7 +91,7 @@ impl Machine {
     ///
     /// Panics if the command fails.
     pub(crate) fn run_command(&self, command: &str) {
-        assert!(self.try_run_command(command), "{command}");
+        assert!(self.try_run_command(command), "the command failed: {command}");
     }
 
     /// Runs a command on the machine, and returns whether it succeeded.
@@ -109,7 +109,7 @@ impl Machine {
 /// Panics if the command fails.
 pub(crate) fn ip(arguments: &str) {
     let done = status(Command::new("ip").args(arguments.split(' ')));
-    assert!(done.is_ok_and(|status| status.success()), "ip {arguments}");
+    assert!(done.is_ok_and(|status| status.success()), "the command failed: ip {arguments}");
 }
 
 /// Returns a command that starts `program` in the network namespace with the path `network`.

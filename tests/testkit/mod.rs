@@ -90,7 +90,9 @@ impl TestEnv {
         // Not TMPDIR: root and prefix of a domain must be short.
         let mut builder = tempfile::Builder::new();
         builder.prefix(&domain).rand_bytes(4).permissions(Permissions::from_mode(0o755));
-        let directory = builder.tempdir_in("/tmp").unwrap_or_else(|error| panic!("/tmp: {error}"));
+        let directory = builder
+            .tempdir_in("/tmp")
+            .unwrap_or_else(|error| panic!("cannot create a directory in /tmp: {error}"));
         TestEnv { directory, domain, network: None }
     }
 
@@ -195,7 +197,7 @@ impl TestEnv {
     /// this directory.
     pub(crate) fn gateway<S: AsRef<str>>(&self, flags: &[S]) -> Program {
         let mut gateway = self.start_gateway(flags);
-        gateway.await_line("its begin", is_class("gateway"));
+        gateway.await_line("line of class gateway", is_class("gateway"));
         gateway
     }
 
@@ -237,13 +239,13 @@ impl TestEnv {
     /// The topics of a remote sensor are created one by one, each with its first datagram.
     pub(crate) fn echo(&self, topics: &[&str]) -> Program {
         let mut before = Vec::new();
-        wait_until("all topics are there", || {
+        wait_until("all topics exist", || {
             let listed = self.all_subscribers(topics);
             before = listed.iter().copied().flatten().collect();
             before.len() == topics.len()
         });
         let program = self.start(&concat_args(&["echo", "--json"], topics));
-        wait_until("the consumer is attached", || {
+        wait_until("echo is attached to all topics", || {
             self.all_subscribers(topics)
                 .iter()
                 .zip(&before)
@@ -254,7 +256,7 @@ impl TestEnv {
 
     /// Returns the number of subscribers of `topic`.
     pub(crate) fn subscribers(&self, topic: &str) -> u64 {
-        self.all_subscribers(&[topic])[0].unwrap_or_else(|| panic!("there is no {topic}"))
+        self.all_subscribers(&[topic])[0].unwrap_or_else(|| panic!("topic {topic} does not exist"))
     }
 
     /// Returns the number of subscribers of each of `topics`, all from one run of `list`; `None` for a topic that does
@@ -263,7 +265,8 @@ impl TestEnv {
         let outcome = self.run(&["list", "--json"]);
         let lines = outcome.lines();
         let subscribers = |topic: &&str| {
-            let (sensor, name) = topic.split_once('/').unwrap_or_else(|| panic!("{topic} has no sensor"));
+            let (sensor, name) =
+                topic.split_once('/').unwrap_or_else(|| panic!("{topic} lacks the name of a sensor"));
             let is_it =
                 |line: &&Value| line["class"] == "topic" && line["sensor"] == sensor && line["topic"] == name;
             lines.iter().find(is_it).map(|line| number(line, "subscribers"))
@@ -289,14 +292,14 @@ impl TestEnv {
     /// Returns the line that `info` prints for `sensor`.
     pub(crate) fn info(&self, sensor: &str) -> Value {
         let outcome = self.run(&["info", sensor, "--json"]);
-        let [line] = &outcome.lines()[..] else { panic!("not one line: {outcome}") };
+        let [line] = &outcome.lines()[..] else { panic!("exactly one line was expected: {outcome}") };
         line.clone()
     }
 
     /// Runs `info` until its line for `sensor` is as `is_expected`, and returns the line.
     pub(crate) fn await_info(&self, sensor: &str, is_expected: impl Fn(&Value) -> bool) -> Value {
         let mut last = Value::Null;
-        wait_until("the status", || {
+        wait_until("info has the expected status", || {
             last = self.info(sensor);
             is_expected(&last)
         });
@@ -319,12 +322,12 @@ impl TestEnv {
         let port = self.path_argument(port);
         let lines = self.truth_lines("simulated");
         let line = lines.iter().find(|line| line["port"] == port.as_str());
-        let line = line.unwrap_or_else(|| panic!("no account of {port}"));
+        let line = line.unwrap_or_else(|| panic!("the simulator has printed no totals for {port}"));
         (number(line, "sent"), number(line, "eeprom_writes"))
     }
 
     fn truth_lines(&self, class: &str) -> Vec<Value> {
-        let text = fs::read_to_string(self.path("truth")).expect("the truth is there");
+        let text = fs::read_to_string(self.path("truth")).expect("the simulator creates the file truth");
         text.lines()
             .map(|line| serde_json::from_str::<Value>(line).unwrap_or_else(|error| panic!("{line}: {error}")))
             .filter(|line| line["class"] == class)
@@ -355,7 +358,8 @@ fn scanhub() -> &'static str {
     option_env!("CARGO_BIN_EXE_scanhub").unwrap_or_else(|| {
         BUILT.get_or_init(|| {
             let built = own_program().ancestors().nth(2).map(|directory| directory.join("scanhub"));
-            let built = built.unwrap_or_else(|| panic!("tests are not where Cargo puts them"));
+            let built =
+                built.unwrap_or_else(|| panic!("the test binary is not in a target directory of Cargo"));
             let mut cargo = Command::new(env!("CARGO"));
             cargo.args(["build", "--quiet", "--package=scanhub", "--bin=scanhub"]);
             cargo.args(built.components().any(|word| word.as_os_str() == "release").then_some("--release"));
@@ -382,7 +386,7 @@ pub(crate) fn wait_until(description: &str, mut is_true: impl FnMut() -> bool) {
             return;
         }
         let elapsed = started.elapsed();
-        assert!(Instant::now() < give_up_at, "waited in vain: {description}");
+        assert!(Instant::now() < give_up_at, "timeout while waiting for: {description}");
         // A check that starts a program may take at most a third of the time, so that other programs get the processor.
         thread::sleep(pause.max(2 * elapsed).min(Duration::from_millis(100)));
         pause = (2 * pause).min(Duration::from_millis(20));

@@ -23,7 +23,7 @@ pub(crate) fn in_a_network(name: &str, test: impl FnOnce()) {
     attempt.args(unshare.get_args()).args(["ip", "link", "set", "lo", "up"]);
     static IS_ALLOWED: OnceLock<bool> = OnceLock::new();
     if !*IS_ALLOWED.get_or_init(|| succeeds(attempt)) {
-        skip("netns", "this user may not make a network namespace, or there is no `ip`");
+        skip("netns", "this user may not create a network namespace, or `ip` is not installed");
         return;
     }
     let up = "ip link set lo up && exec \"$@\"";

@@ -184,7 +184,9 @@ impl Program {
 
     /// Sends a signal.
     pub(crate) fn signal(&self, signal: Signal) {
-        self.process.signal(signal).unwrap_or_else(|error| panic!("{}: no {signal:?}: {error}", self.name));
+        self.process
+            .signal(signal)
+            .unwrap_or_else(|error| panic!("{}: cannot send {signal:?}: {error}", self.name));
     }
 
     /// Sends a signal and waits until it exits.
@@ -203,7 +205,7 @@ impl Program {
             }
         };
         if why == RecvTimeoutError::Timeout {
-            self.fail_wait("its end", why);
+            self.fail_wait("the exit of the program", why);
         }
         let status = self.process.wait().unwrap_or_else(|error| panic!("{}: {error}", self.name));
         let errors = self.errors.take().map(JoinHandle::join);
@@ -235,7 +237,7 @@ impl Program {
         let out = String::from_utf8_lossy(&self.stdout);
         let tail: Vec<_> = out.lines().rev().take(5).collect();
         panic!(
-            "scanhub {}: waited in vain ({why}) for {description}; it said last: {tail:#?}\n{errors}",
+            "scanhub {}: timeout or exit while waiting for {description} ({why}); its last lines: {tail:#?}\n{errors}",
             self.name
         );
     }
@@ -253,7 +255,7 @@ impl Drop for Program {
         let out = String::from_utf8_lossy(&self.stdout);
         let tail: Vec<_> = out.lines().rev().take(5).collect();
         let errors = errors.join().unwrap_or_default();
-        eprintln!("scanhub {}: {state}; it reported last: {tail:#?}\n{errors}", self.name);
+        eprintln!("scanhub {}: {state}; its last lines: {tail:#?}\n{errors}", self.name);
     }
 }
 
@@ -261,7 +263,7 @@ impl Outcome {
     /// Parses its stdout as lines of JSON.
     pub(crate) fn lines(&self) -> Vec<Value> {
         let text = String::from_utf8_lossy(&self.stdout);
-        assert!(text.is_empty() || text.ends_with('\n'), "half a line: {self}");
+        assert!(text.is_empty() || text.ends_with('\n'), "the last line is incomplete: {self}");
         text.lines()
             .map(|line| serde_json::from_str(line).unwrap_or_else(|error| panic!("{line}: {error}\n{self}")))
             .collect()

@@ -22,7 +22,7 @@ pub(crate) fn python_for(need: &str, modules: &str) -> Option<Command> {
     let python = std::env::var_os("SCANHUB_PYTHON").map_or(made, PathBuf::from);
     let import = format!("import {modules}");
     if !succeeds(Command::new(&python).args(["-B", "-c", &import])) {
-        skip(need, format!("{} is not there, or has no {modules}: .ci/run makes one", python.display()));
+        skip(need, format!("{} does not exist or lacks {modules}; .ci/run creates one", python.display()));
         return None;
     }
     let mut command = Command::new(python);
@@ -44,8 +44,8 @@ pub(crate) fn client_python() -> Option<Command> {
     });
     if found != expected {
         let python = command.get_program().display();
-        let what = format!("{python} has no package scanhub of these sources");
-        skip("python-packages", format!("{what}: clients/python/build.sh makes it"));
+        let what = format!("{python} has no package scanhub that was built from these sources");
+        skip("python-packages", format!("{what}; clients/python/build.sh builds it"));
         return None;
     }
     Some(command)

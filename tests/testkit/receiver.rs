@@ -34,14 +34,14 @@ impl Receiver {
             let mut is_over = false;
             loop {
                 match socket.recv(&mut bytes) {
-                    Ok(len) => to.lock().expect("not poisoned").push(bytes[..len].to_vec()),
+                    Ok(len) => to.lock().expect("no thread has panicked").push(bytes[..len].to_vec()),
                     Err(_) if is_over => return,
                     Err(_) => {}
                 }
                 // Store the datagrams that have already arrived when the thread is stopped, but do not wait for more.
                 if !is_over && flag.load(Ordering::Relaxed) {
                     is_over = true;
-                    socket.set_nonblocking(true).expect("need not wait");
+                    socket.set_nonblocking(true).expect("the socket can be made nonblocking");
                 }
             }
         });
@@ -59,20 +59,20 @@ impl Receiver {
         // The buffer lets a test that is not scheduled for a second receive everything. A user without the privilege
         // for this size may miss datagrams.
         let _ = set_socket_recv_buffer_size_force(&socket, 8 << 20);
-        socket.set_read_timeout(Some(Duration::from_millis(50))).expect("waits that long");
+        socket.set_read_timeout(Some(Duration::from_millis(50))).expect("the read timeout can be set");
         socket
     }
 
     /// Returns all datagrams received so far, in order.
     pub(crate) fn datagrams(&self) -> Vec<Vec<u8>> {
-        self.datagrams.lock().expect("not poisoned").clone()
+        self.datagrams.lock().expect("no thread has panicked").clone()
     }
 
     /// Waits until `count` datagrams that are `is_expected` have arrived after this call. Panics if any new datagram is
     /// invalid.
     pub(crate) fn wait_for_datagrams(&self, count: usize, is_expected: impl Fn(&Datagram<'_>) -> bool) {
         let before = self.datagrams().len();
-        wait_until("datagrams", || {
+        wait_until("the expected datagrams arrive", || {
             let datagrams = self.datagrams();
             datagrams[before..].iter().filter(|bytes| is_expected(&decode_datagram(bytes))).count() >= count
         });
@@ -87,7 +87,7 @@ impl Receiver {
     fn stop_thread(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         let ended = self.thread.take().is_none_or(|thread| thread.join().is_ok());
-        assert!(ended || thread::panicking(), "the receiver panicked");
+        assert!(ended || thread::panicking(), "the thread of the receiver panicked");
     }
 }
 

@@ -44,9 +44,12 @@ pub(crate) fn record(
         links: SENSORS.map(|(name, _)| format!("{name}=file:nothing")).to_vec(),
         set: ["link.front.mode=1", "link.rear.mode=1", SHORT_LEARNING].map(str::to_owned).to_vec(),
     };
-    let config = Config::load(&sources).expect("a configuration");
-    let rooms = SENSORS.map(|(_, name)| Room::new(&name.parse::<World>().expect("a world"), 7));
-    let mut writer = Writer::begin(File::create(file).expect("a file"), "", BTreeMap::new()).expect("begins");
+    let config = Config::load(&sources).expect("the configuration is valid");
+    let rooms =
+        SENSORS.map(|(_, name)| Room::new(&name.parse::<World>().expect("the name of a built-in world"), 7));
+    let mut writer =
+        Writer::begin(File::create(file).expect("the recording can be created"), "", BTreeMap::new())
+            .expect("the recording can be started");
     let driven = virtual_hub::virtual_hub(&config, domain, |links| {
         let node = scanhub_shm::client_node(domain).expect("a node");
         let subscribers = SENSORS.map(|(name, _)| Subscribers::attach(&node, name));
@@ -67,17 +70,17 @@ pub(crate) fn record(
                     let (name, _) = SENSORS[number];
                     writer
                         .write_sample(name, sample.topic, &sample.header, &sample.payload)
-                        .expect("is written");
+                        .expect("the recording can be written");
                     keep(number, sample);
                 }
             }
             if scan % 4 == 0 {
-                writer.close_chunk().expect("is written");
+                writer.close_chunk().expect("the recording can be written");
             }
         }
     });
     assert_eq!(driven, Ok(()));
-    writer.finish().expect("ends");
+    writer.finish().expect("the recording can be finished");
 }
 
 /// Sample as it was published, with its payload packed.
@@ -125,8 +128,9 @@ impl Subscribers {
 }
 
 fn attach<P: Payload + ?Sized>(node: &Node, sensor: &str) -> Subscriber<P> {
-    let service = P::open(node, sensor).expect("a topic").expect("is there");
-    P::subscriber(node, &service).expect("a place")
+    let service =
+        P::open(node, sensor).expect("the topic can be opened").expect("the hub has created the topic");
+    P::subscriber(node, &service).expect("the topic has a free slot")
 }
 
 fn drain<P: Payload + ?Sized>(
@@ -134,7 +138,7 @@ fn drain<P: Payload + ?Sized>(
     to: &mut Vec<PublishedSample>,
     bytes: impl Fn(&P) -> Vec<u8>,
 ) {
-    while let Some(sample) = P::receive(from).expect("works") {
+    while let Some(sample) = P::receive(from).expect("samples can be received") {
         to.push(PublishedSample {
             topic: P::TOPIC,
             header: *sample.user_header(),
@@ -145,7 +149,7 @@ fn drain<P: Payload + ?Sized>(
 
 fn packed(payload: &(impl DatagramPayload + ?Sized)) -> Vec<u8> {
     let mut room = vec![0; 4096];
-    let len = payload.pack(&mut room).expect("there is room");
+    let len = payload.pack(&mut room).expect("the payload fits into the buffer");
     room.truncate(len);
     room
 }

@@ -33,10 +33,10 @@ impl Recording {
         let bytes = file_bytes(path);
         let summary =
             mcap::Summary::read(&bytes).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
-        let stats = summary.and_then(|summary| summary.stats).expect("an index");
+        let stats = summary.and_then(|summary| summary.stats).expect("the recording has an index");
         let recording = Recording::read(&bytes, path);
         assert_eq!(stats.message_count, recording.messages.len() as u64, "{}", path.display());
-        MessageStream::new(&bytes).expect("it has an end");
+        MessageStream::new(&bytes).expect("the recording is complete");
         recording
     }
 
@@ -118,7 +118,7 @@ impl RecordedMessage {
 pub(crate) fn contiguous_topic_seqs(messages: &[&RecordedMessage]) -> Vec<u64> {
     let numbers: Vec<u64> = messages.iter().map(|message| message.topic_seq()).collect();
     for pair in numbers.windows(2) {
-        assert_eq!(pair[1], pair[0] + 1, "a gap");
+        assert_eq!(pair[1], pair[0] + 1, "the topic_seq of the recording has a gap");
     }
     numbers
 }

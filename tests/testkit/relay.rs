@@ -63,7 +63,7 @@ impl Relay {
             let mut bytes = [0; 65_536];
             while !flag.load(Ordering::Relaxed) {
                 if let Ok(len) = socket.recv(&mut bytes) {
-                    to.lock().expect("not poisoned").receive(&bytes[..len]);
+                    to.lock().expect("no thread has panicked").receive(&bytes[..len]);
                 }
             }
         });
@@ -73,9 +73,9 @@ impl Relay {
     /// Forwards to the machine `to` from now on, too, and returns the number of datagrams forwarded before. Listeners
     /// on that machine must have started already.
     pub(crate) fn connect(&self, to: &Machine) -> usize {
-        let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).expect("a port");
-        set_ip_multicast_if(&socket, &to.test_address()).expect("the cable is plugged in");
-        socket.set_multicast_loop_v4(false).expect("it is IPv4");
+        let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).expect("a UDP port is free");
+        set_ip_multicast_if(&socket, &to.test_address()).expect("the interface of the cable exists");
+        socket.set_multicast_loop_v4(false).expect("multicast loopback can be disabled");
         let mut inner = self.state();
         inner.outputs.push((socket, to.udp_sockets()));
         inner.forwarded.len()
@@ -101,7 +101,7 @@ impl Relay {
     }
 
     fn state(&self) -> MutexGuard<'_, RelayState> {
-        self.inner.lock().expect("not poisoned")
+        self.inner.lock().expect("no thread has panicked")
     }
 }
 
@@ -137,9 +137,9 @@ impl RelayState {
         let [a, b, c] = GROUP_PREFIX;
         let group = Ipv4Addr::new(a, b, c, topic.map_or(Announce::GROUP, group));
         for (out, sockets) in &self.outputs {
-            wait_until("listeners read", || max_queued_bytes(sockets) < MAX_QUEUED_BYTES);
+            wait_until("the listeners read their sockets", || max_queued_bytes(sockets) < MAX_QUEUED_BYTES);
             let sent = out.send_to(datagram, (group, PORT));
-            assert_eq!(sent.expect("the cable takes it"), datagram.len());
+            assert_eq!(sent.expect("the datagram can be sent"), datagram.len());
         }
         self.forwarded.push(datagram.to_vec());
     }
@@ -152,7 +152,7 @@ const MAX_QUEUED_BYTES: u64 = 64 << 10;
 /// Returns the largest number of bytes that are queued at one of the UDP sockets in the file `sockets` (proc(5),
 /// `rx_queue`).
 fn max_queued_bytes(sockets: &Path) -> u64 {
-    let text = std::fs::read_to_string(sockets).expect("the machine is there");
+    let text = std::fs::read_to_string(sockets).expect("the process of the machine runs");
     let waiting = |line: &str| {
         let queues = line.split_whitespace().nth(4)?;
         u64::from_str_radix(queues.split_once(':')?.1, 16).ok()
@@ -164,6 +164,6 @@ impl Drop for Relay {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         let ended = self.thread.take().is_none_or(|thread| thread.join().is_ok());
-        assert!(ended || thread::panicking(), "the relay panicked");
+        assert!(ended || thread::panicking(), "the thread of the relay panicked");
     }
 }

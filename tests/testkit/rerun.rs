@@ -7,7 +7,7 @@ use super::child::spawn;
 
 /// Returns the path of the test binary.
 pub(crate) fn own_program() -> std::path::PathBuf {
-    std::env::current_exe().unwrap_or_else(|error| panic!("no path: {error}"))
+    std::env::current_exe().unwrap_or_else(|error| panic!("the path of the test binary is unknown: {error}"))
 }
 
 /// Returns the arguments with which the test binary runs only the test `name`, which includes the path of its modules.
@@ -22,15 +22,19 @@ pub(crate) fn single_test_args(name: &str) -> [&str; 3] {
 /// Panics if the test fails there, or if no test has this name.
 pub(crate) fn rerun_test(name: &str, mut command: Command) {
     command.stdin(Stdio::null()).stdout(Stdio::piped());
-    let mut child = spawn(command).unwrap_or_else(|error| panic!("{name} does not start again: {error}"));
-    let out = child.stdout.take().expect("a pipe");
+    let mut child =
+        spawn(command).unwrap_or_else(|error| panic!("cannot run {name} in another process: {error}"));
+    let out = child.stdout.take().expect("stdout is a pipe");
     let mut passed = false;
     for line in BufReader::new(out).lines().map_while(Result::ok) {
         passed |= line.starts_with("test result: ok. 1 passed");
         println!("{line}");
     }
-    let status = child.wait().expect("it can be waited for");
-    assert!(status.success() && passed, "{name} failed where it ran again: {status}");
+    let status = child.wait().expect("the process can be waited for");
+    assert!(
+        status.success() && passed,
+        "{name} failed in another process, or no test has this name: {status}"
+    );
 }
 
 /// Runs `test`, whose name is `name`, in a separate process. This is for a test that depends on descriptor numbers or

@@ -32,7 +32,7 @@ impl Robot {
 
     /// Returns the hub, so that the test can end it.
     pub(crate) fn take_hub(&mut self) -> Program {
-        self.hub.take().expect("it was started")
+        self.hub.take().expect("the hub was started")
     }
 
     /// Starts a gateway that sends on the machine's cable, and waits for its line of class `gateway`.
@@ -40,7 +40,7 @@ impl Robot {
         let flags = flags.iter().map(|flag| flag.as_ref().to_owned());
         let flags: Vec<String> = flags.chain(["--interface=eth0".to_owned()]).collect();
         let mut gateway = self.env.start_gateway(&flags);
-        let begin = gateway.await_line("its begin", is_class("gateway"));
+        let begin = gateway.await_line("line of class gateway", is_class("gateway"));
         assert_eq!(begin["interface"], "eth0");
         gateway
     }

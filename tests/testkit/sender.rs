@@ -39,7 +39,7 @@ const UNANNOUNCED_SENSOR: u8 = 255;
 impl TestGateway {
     /// Creates a gateway with the ID `hub`, in its run `epoch`, for the sensor with this number and name.
     pub(crate) fn new(hub: u64, epoch: u32, sensor: u8, name: &str) -> TestGateway {
-        let socket = UdpSocket::bind("127.0.0.1:0").expect("a port");
+        let socket = UdpSocket::bind("127.0.0.1:0").expect("a UDP port is free");
         set_ip_multicast_if(&socket, &Ipv4Addr::LOCALHOST).expect("the loopback has an address");
         let (boot, next, counter, stamp_ns) = (0xb007, [0; 256], 0, wall_ns());
         let (name, family) = (name.to_owned(), Family::Lms);
@@ -65,7 +65,7 @@ impl TestGateway {
         payload: &(impl DatagramPayload + ?Sized),
     ) -> Vec<u8> {
         let mut buffer = [0; MTU_ETHERNET];
-        let len = payload.pack(&mut buffer[HEADER_LEN..]).expect("it fits");
+        let len = payload.pack(&mut buffer[HEADER_LEN..]).expect("the payload fits into a datagram");
         self.seal(topic.number(), &mut buffer, len)
     }
 
@@ -79,14 +79,17 @@ impl TestGateway {
     /// Sends the next sample of `topic`, in parts if it does not fit into one datagram.
     pub(crate) fn send(&mut self, topic: Topic, payload: &(impl DatagramPayload + ?Sized)) {
         let mut packed = vec![0; 100_000];
-        let len = payload.pack(&mut packed).expect("it fits");
+        let len = payload.pack(&mut packed).expect("the payload fits into a datagram");
         let parts = len.div_ceil(MAX_PART_LEN).max(1);
         let head = self.head(topic.number());
         for (part, payload) in packed[..len].chunks(MAX_PART_LEN).enumerate() {
             let mut buffer = [0; MTU_ETHERNET];
             buffer[HEADER_LEN..HEADER_LEN + payload.len()].copy_from_slice(payload);
             let head = Head { part: part as u8, parts: parts as u8, ..head };
-            self.send_bytes(topic, head.seal(&mut buffer, payload.len()).expect("it fits"));
+            self.send_bytes(
+                topic,
+                head.seal(&mut buffer, payload.len()).expect("the payload fits into a datagram"),
+            );
         }
     }
 
@@ -109,7 +112,7 @@ impl TestGateway {
             announce.add(Announced { topic: topic.number(), group: group(topic), port: PORT, next });
         }
         let mut buffer = [0; MTU_ETHERNET];
-        let len = announce.pack(&mut buffer[HEADER_LEN..]).expect("it fits");
+        let len = announce.pack(&mut buffer[HEADER_LEN..]).expect("the payload fits into a datagram");
         let stamp_ns = std::mem::replace(&mut self.stamp_ns, wall_ns());
         let datagram = self.seal(Announce::NUMBER, &mut buffer, len);
         self.stamp_ns = stamp_ns;
@@ -153,11 +156,11 @@ impl TestGateway {
     pub(crate) fn send_to_group(&self, group: u8, bytes: &[u8]) {
         let [a, b, c] = GROUP_PREFIX;
         let sent = self.socket.send_to(bytes, (Ipv4Addr::new(a, b, c, group), PORT));
-        assert_eq!(sent.expect("the loopback takes it"), bytes.len());
+        assert_eq!(sent.expect("the datagram can be sent on the loopback"), bytes.len());
     }
 
     fn seal(&mut self, topic: u8, buffer: &mut [u8], len: usize) -> Vec<u8> {
-        self.head(topic).seal(buffer, len).expect("it fits").to_vec()
+        self.head(topic).seal(buffer, len).expect("the payload fits into a datagram").to_vec()
     }
 
     /// Returns the header of the next sample of the topic with this number, and increases the sequence number.
@@ -185,5 +188,5 @@ impl TestGateway {
 /// Returns the wall clock in nanoseconds since 1970.
 pub(crate) fn wall_ns() -> u64 {
     let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
-    now.expect("after 1970").as_nanos() as u64
+    now.expect("the clock is later than 1970").as_nanos() as u64
 }

@@ -76,7 +76,7 @@ pub(crate) fn skip(need: &str, why: impl Display) {
 pub(crate) fn verdict(required: &str, need: &str, why: &str) -> Result<String, String> {
     let required: Vec<&str> = required.split(',').map(str::trim).filter(|name| !name.is_empty()).collect();
     if let Some(unknown) = required.iter().chain([&need]).find(|name| !NEEDS.contains(name)) {
-        return Err(format!("{unknown:?} is nothing that a test needs; there are {}", NEEDS.join(", ")));
+        return Err(format!("{unknown:?} is not a requirement of tests; known are {}", NEEDS.join(", ")));
     }
     if required.contains(&need) {
         return Err(format!("{need} is required here by SCANHUB_REQUIRE: {why}"));

@@ -61,7 +61,8 @@ impl Supervisor {
         }
         let Some((name, line)) = &self.stored_descriptor else { return (command, Stdio::null()) };
         command.env("LISTEN_FDS", "1").env("LISTEN_FDNAMES", name);
-        let line = line.try_clone().unwrap_or_else(|error| panic!("no descriptor: {error}"));
+        let line =
+            line.try_clone().unwrap_or_else(|error| panic!("cannot duplicate the descriptor: {error}"));
         (command, line.into())
     }
 
@@ -70,10 +71,14 @@ impl Supervisor {
         self.socket.set_read_timeout(Some(WAIT_TIMEOUT)).expect("a socket");
         while !self.unread_messages.iter().any(|line| line == message) {
             if let Err(error) = self.receive() {
-                panic!("waited in vain for {message}: {error}; heard {:?}", self.messages);
+                panic!("the hub did not send {message}: {error}; received {:?}", self.messages);
             }
         }
-        let at = self.unread_messages.iter().position(|line| line == message).expect("it was said");
+        let at = self
+            .unread_messages
+            .iter()
+            .position(|line| line == message)
+            .expect("the loop ends when the message has arrived");
         self.unread_messages.remove(at);
     }
 

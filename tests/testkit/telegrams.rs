@@ -27,7 +27,7 @@ impl SimulatedTelegram {
         let text = |key: &str| line[key].as_str().map(str::to_owned);
         SimulatedTelegram {
             is_reply: line["kind"] == "reply",
-            hash: text("sha256").unwrap_or_else(|| panic!("no hash: {line}")),
+            hash: text("sha256").unwrap_or_else(|| panic!("no sha256 in {line}")),
             fault: text("fault"),
             sent_ns: number(line, "sent_ns"),
         }
@@ -47,10 +47,12 @@ pub(crate) fn hash(bytes: &[u8]) -> String {
 /// Returns the bytes of the telegram in a line of class `telegram`. Asserts that its checksum is right and that the
 /// line has the right command and address.
 pub(crate) fn bytes_of(line: &Value) -> Vec<u8> {
-    let text = line["data"].as_str().unwrap_or_else(|| panic!("no data: {line}"));
-    let pair = |at| u8::from_str_radix(&text[at..at + 2], 16).unwrap_or_else(|_| panic!("no hex: {text}"));
+    let text = line["data"].as_str().unwrap_or_else(|| panic!("no data in {line}"));
+    let pair =
+        |at| u8::from_str_radix(&text[at..at + 2], 16).unwrap_or_else(|_| panic!("not hexadecimal: {text}"));
     let bytes: Vec<u8> = (0..text.len()).step_by(2).map(pair).collect();
-    let telegram = Telegram::check(&bytes).unwrap_or_else(|| panic!("torn: {line}"));
+    let telegram = Telegram::check(&bytes)
+        .unwrap_or_else(|| panic!("the telegram is incomplete or has a wrong checksum: {line}"));
     assert_eq!(u64::from(telegram.command()), number(line, "command"), "{line}");
     assert_eq!(u64::from(telegram.address()), number(line, "address"), "{line}");
     bytes
@@ -64,7 +66,7 @@ pub(crate) fn scan(seed: u16) -> Vec<u8> {
 
 /// Returns the number with the key `key` in a line.
 pub(crate) fn number(line: &Value, key: &str) -> u64 {
-    line[key].as_u64().unwrap_or_else(|| panic!("no number {key}: {line}"))
+    line[key].as_u64().unwrap_or_else(|| panic!("no number {key} in {line}"))
 }
 
 /// Returns the numbers with the key `key` in `lines`, and asserts that they have no gap.
@@ -83,7 +85,7 @@ pub(crate) fn checked_topic_seqs(outcome: &Outcome, topic: &str) -> Vec<u64> {
     // The line with which a client reports a silence has no `topic_seq`.
     let mut numbers: Vec<u64> = lines.iter().filter_map(|line| line["topic_seq"].as_u64()).collect();
     numbers.dedup();
-    assert!(numbers.is_sorted_by(|one, next| one < next), "out of order: {numbers:?}");
+    assert!(numbers.is_sorted_by(|one, next| one < next), "topic_seq is out of order: {numbers:?}");
     let (Some(first), Some(last)) = (numbers.first(), numbers.last()) else { return numbers };
     let notices = outcome.of_class("notice");
     let missed = notices.iter().filter(|line| line["kind"] == "missed" && line["topic"] == topic);
@@ -91,7 +93,7 @@ pub(crate) fn checked_topic_seqs(outcome: &Outcome, topic: &str) -> Vec<u64> {
     assert_eq!(
         numbers.len() as u64 + missed,
         last - first + 1,
-        "{topic}: a gap that was not reported: {outcome}"
+        "{topic}: a gap was not reported as missed: {outcome}"
     );
     numbers
 }

@@ -35,7 +35,7 @@ pub(crate) fn terminal() -> (File, OwnedFd) {
 pub(crate) fn can_open_terminal() -> bool {
     let can_sit = succeeds(Command::new("setsid").arg("true"));
     if !can_sit {
-        skip("setsid", "there is none (Debian: apt-get install util-linux)");
+        skip("setsid", "it is not installed (Debian: apt-get install util-linux)");
     }
     can_sit
 }
@@ -145,14 +145,18 @@ impl TerminalSession {
     pub(crate) fn await_rows(&self, description: &str, is_expected: impl Fn(&[String]) -> bool) {
         let give_up_at = Instant::now() + WAIT_TIMEOUT;
         while !is_expected(&self.rows()) {
-            assert!(Instant::now() < give_up_at, "no {description}:\n{}", self.rows().join("\n"));
+            assert!(
+                Instant::now() < give_up_at,
+                "timeout: the terminal does not show {description}:\n{}",
+                self.rows().join("\n")
+            );
             thread::sleep(Duration::from_millis(10));
         }
     }
 
     /// Types `keys`.
     pub(crate) fn press(&mut self, keys: &str) {
-        self.input.as_mut().expect("it is open").write_all(keys.as_bytes()).unwrap();
+        self.input.as_mut().expect("the terminal is open").write_all(keys.as_bytes()).unwrap();
     }
 
     /// Sets the size of the terminal in columns and rows.
@@ -180,7 +184,11 @@ impl TerminalSession {
             if let Some(status) = self.process.try_wait().unwrap() {
                 return status.code();
             }
-            assert!(Instant::now() < give_up_at, "it does not end:\n{}", self.rows().join("\n"));
+            assert!(
+                Instant::now() < give_up_at,
+                "timeout: the program does not exit:\n{}",
+                self.rows().join("\n")
+            );
             thread::sleep(Duration::from_millis(10));
         }
     }

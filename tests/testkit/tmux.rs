@@ -21,7 +21,7 @@ impl Tmux {
     /// test and returns `None`.
     pub(crate) fn start(env: &TestEnv, line: &str, (columns, rows): (u16, u16)) -> Option<Tmux> {
         if !succeeds(Command::new("tmux").arg("-V")) {
-            skip("tmux", "there is none (Debian: apt-get install tmux)");
+            skip("tmux", "it is not installed (Debian: apt-get install tmux)");
             return None;
         }
         let socket = env.path("tmux");
@@ -55,7 +55,11 @@ impl Tmux {
             if is_expected(&rows) {
                 return rows;
             }
-            assert!(Instant::now() < give_up_at, "no {description}:\n{}", rows.join("\n"));
+            assert!(
+                Instant::now() < give_up_at,
+                "timeout: the window does not show {description}:\n{}",
+                rows.join("\n")
+            );
             thread::sleep(Duration::from_millis(50));
         }
     }

@@ -37,7 +37,7 @@ pub(crate) fn virtual_hub<T>(
     domain: &Domain,
     drive: impl FnOnce(&mut [VirtualLink<'_>]) -> T,
 ) -> Result<T, Failure> {
-    resource_limits::raise_descriptor_limit().expect("a limit can be raised");
+    resource_limits::raise_descriptor_limit().expect("the limit of descriptors can be raised");
     let _lock = HubLock::acquire(domain.root())?;
     let node = scanhub_shm::hub_node(domain)?;
     let (_commands, queues) = CommandSender::new(config.links.iter().map(|link| link.name.as_str()))?;

@@ -35,10 +35,10 @@ impl InstalledLibrary {
             // Without the static library, which has 100 MB.
             let shared = "libscanhub.so";
             std::os::unix::fs::symlink(build_directory().join(shared), library.join(shared))
-                .expect("a place for a link");
+                .expect("the link can be created");
             let mut command = Command::new(repository().join("clients/c/install.sh"));
             command.arg("--prefix").arg(&prefix).arg("--library").arg(&library).env_remove("DESTDIR");
-            let messages = output(command).expect("a shell");
+            let messages = output(command).expect("a shell starts");
             let messages = stdout_if_success(&messages).unwrap_or_else(|errors| panic!("{errors}"));
             InstalledLibrary { prefix, library, messages }
         }))
@@ -85,7 +85,7 @@ impl InstalledLibrary {
     pub(crate) fn compile_static(&self, env: &TestEnv, source: &Path) -> Option<PathBuf> {
         let mut ask = self.with_packages(Command::new("pkg-config"));
         let Ok(pkg_config) = output(ask.args(["--static", "--libs-only-l", "scanhub"])) else {
-            skip("pkg-config", "there is none, which says how the library gets into a program");
+            skip("pkg-config", "it is not installed, so the flags for the static library are unknown");
             return None;
         };
         let said = stdout_if_success(&pkg_config).unwrap_or_else(|said| panic!("{said}"));
@@ -105,7 +105,7 @@ impl InstalledLibrary {
         let moved = env.path("moved");
         let mut copy = Command::new("cp");
         copy.arg("-a").arg(&self.prefix).arg(&moved);
-        stdout_if_success(&output(copy).expect("cp")).unwrap_or_else(|errors| panic!("{errors}"));
+        stdout_if_success(&output(copy).expect("cp starts")).unwrap_or_else(|errors| panic!("{errors}"));
         let sources = vec![
             format!("-Dscanhub_DIR={}", repository().join("clients/c/cmake").display()),
             format!("-Dscanhub_LIBRARY_DIR={}", build_directory().display()),
@@ -128,7 +128,7 @@ impl InstalledLibrary {
     /// Compiles `source` with the flags of pkg-config, and returns the path of the program. Skips the test and returns
     /// `None` if there is no pkg-config.
     pub(crate) fn compile_with_pkg_config(&self, env: &TestEnv, source: &Path) -> Option<PathBuf> {
-        let is_missing = || skip("pkg-config", "there is none");
+        let is_missing = || skip("pkg-config", "it is not installed");
         let flags =
             output(self.with_packages(Command::new("pkg-config")).args(["--cflags", "--libs", "scanhub"]));
         let flags = flags.inspect_err(|_| is_missing()).ok()?;
@@ -151,7 +151,7 @@ impl InstalledLibrary {
         let mut command = Command::new(compiler);
         command.args(STRICT_FLAGS).args(flags).arg("-I").arg(self.prefix.join("include")).arg(source);
         command.args(libraries).arg("-o").arg(&program);
-        stdout_if_success(&output(command).expect("a compiler")).map(|_| program)
+        stdout_if_success(&output(command).expect("a compiler starts")).map(|_| program)
     }
 
     fn shared(&self) -> Vec<String> {
@@ -169,7 +169,7 @@ impl InstalledLibrary {
 pub(crate) fn is_installed(name: &str) -> bool {
     let found = output(Command::new(name).arg("--version")).is_ok();
     if !found {
-        skip(name, "there is none");
+        skip(name, "it is not installed");
     }
     found
 }

@@ -24,7 +24,7 @@ fn reader() -> Option<PathBuf> {
             .arg(top.join("tests/it/lan/reader.c"))
             .arg("-o")
             .arg(&program);
-        output(cc).expect("a compiler")
+        output(cc).expect("a compiler starts")
     };
     if !compile(&["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]).status.success() {
         eprintln!("without a watch over memory: this compiler has none");

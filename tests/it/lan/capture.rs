@@ -16,7 +16,7 @@ pub(crate) struct Capture {
 pub(crate) fn has_tshark() -> bool {
     let found = succeeds(Command::new("tshark").arg("--version"));
     if !found {
-        skip("tshark", "there is none (Debian: apt-get install tshark)");
+        skip("tshark", "it is not installed (Debian: apt-get install tshark)");
     }
     found
 }
@@ -70,7 +70,7 @@ impl Capture {
         for name in &names {
             tshark.args(["-e", name]);
         }
-        let output = output(tshark).expect("tshark");
+        let output = output(tshark).expect("tshark starts");
         let errors = String::from_utf8_lossy(&output.stderr);
         assert!(output.status.success() && !errors.contains("Lua"), "{errors}");
         let text = String::from_utf8(output.stdout).expect("text");

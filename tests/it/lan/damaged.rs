@@ -21,7 +21,7 @@ pub(crate) fn datagrams(count: u32) -> Vec<(Vec<u8>, Value)> {
         })
         .collect();
     let sound = datagrams.iter().filter(|(_, expected)| expected["refusal"].is_null()).count() as u32;
-    assert!((count / 10..count * 9 / 10).contains(&sound), "{sound} of {count} are sound");
+    assert!((count / 10..count * 9 / 10).contains(&sound), "{sound} of {count} damaged datagrams are valid");
     datagrams
 }
 
@@ -75,5 +75,5 @@ fn damage(random: &mut Rng, datagram: &Datagram<'_>) -> Vec<u8> {
     }
     let mut buffer = [0; MTU_ETHERNET];
     buffer[HEADER_LEN..HEADER_LEN + payload.len()].copy_from_slice(&payload);
-    head.seal(&mut buffer, payload.len()).expect("it fits").to_vec()
+    head.seal(&mut buffer, payload.len()).expect("the payload fits").to_vec()
 }

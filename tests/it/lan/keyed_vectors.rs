@@ -45,13 +45,13 @@ pub(crate) fn read_vectors() -> KeyedVectors {
 /// Returns the text of the file with the list.
 pub(crate) fn text() -> String {
     let here = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let top = here.ancestors().find(|path| path.join("hub").is_dir()).expect("the top");
-    fs::read_to_string(top.join("tests/vectors/keyed.json")).expect("the list")
+    let top = here.ancestors().find(|path| path.join("hub").is_dir()).expect("the root of the source tree");
+    fs::read_to_string(top.join("tests/vectors/keyed.json")).expect("the list can be read")
 }
 
 /// Decodes hexadecimal digits.
 pub(crate) fn unhex(digits: &str) -> Vec<u8> {
-    let digit = |c: char| c.to_digit(16).expect("hex") as u8;
+    let digit = |c: char| c.to_digit(16).expect("the text is hexadecimal") as u8;
     let digits: Vec<u8> = digits.chars().map(digit).collect();
     digits.chunks(2).map(|pair| pair[0] << 4 | pair[1]).collect()
 }

@@ -25,7 +25,7 @@ fn await_link(gateway: &mut Program, to: &str, state: &str) {
 fn await_failures(gateway: &mut Program, to: &str, min_increase: u64) {
     let count =
         |line: &Value| (line["class"] == "lan_to" && line["to"] == to).then(|| number(line, "send_failed"));
-    let before = count(&gateway.await_line("an account", |line| count(line).is_some())).unwrap_or_default();
+    let before = count(&gateway.await_line("statistics", |line| count(line).is_some())).unwrap_or_default();
     gateway.await_line("failures", |line| count(line).is_some_and(|failed| failed >= before + min_increase));
 }
 
@@ -69,7 +69,7 @@ fn a_cable_is_pulled_and_an_address_taken() {
         let outcome = gateway.end(TERM);
         let (sent, failed) = sent_and_failed(&outcome, "eth0");
         let (received, lost) = count_received_and_lost(&receiver.finish());
-        assert_eq!(received + lost, sent + failed, "every number is accounted for");
+        assert_eq!(received + lost, sent + failed, "each number was received, lost or failed");
         // Either number may be greater. When the link fails, the kernel accepts a few datagrams and drops them. When
         // the link is back, the gateway counts datagrams as failed until it checks the link again, up to a second
         // later.
@@ -85,7 +85,7 @@ fn a_queue_is_full() {
         let mut gateway = robot.gateway::<&str>(&[]);
         receiver.wait_for_datagrams(10, is_scan);
         if !robot.machine.try_run_command("tc qdisc add dev eth0 root tbf rate 128kbit burst 2kb limit 4kb") {
-            skip("tc", "there is no tc or no tbf");
+            skip("tc", "tc is not installed, or the kernel has no tbf");
             return;
         }
         await_link(&mut gateway, "eth0", "failing");
@@ -124,7 +124,7 @@ fn unreachable_hosts_do_not_disturb_other_receivers() {
         let received = receiver.finish();
         assert_eq!(count_received_and_lost(&received), sent_and_failed(&outcome, "eth0"));
         assert_eq!(sent_and_failed(&outcome, "eth0").1, 0);
-        assert_eq!(copies.finish(), received, "copies of all, in their order");
+        assert_eq!(copies.finish(), received, "the relay must forward all datagrams in order");
         assert_eq!(count_received_and_lost(&far.finish()).0, sent_and_failed(&outcome, no_route).0);
         let lines = outcome.of_class("lan_link");
         assert!(lines.iter().any(|line| line["to"] == no_host && line["state"] == "failing"), "{lines:?}");
@@ -156,7 +156,7 @@ fn hubs_and_gateways_are_killed() {
             let is_zones = datagram.head.topic == Topic::Zones.number() && zones.unpack(datagram.payload);
             is_zones.then(|| zones.verdict())
         };
-        wait_until("that nothing is known", || {
+        wait_until("the gateway sends unknown zones", || {
             relay.forwarded().iter().rev().find_map(verdict) == Some(Verdict::Unknown)
         });
         robot.start();
@@ -169,7 +169,7 @@ fn hubs_and_gateways_are_killed() {
         let of_epoch = |is_first: bool| {
             let lines = outcome.of_class("lan").into_iter().filter(|line| line["topic"] == "scan");
             let mut lines = lines.filter(|line| (line["epoch"] == of_first["epoch"]) == is_first);
-            lines.next().unwrap_or_else(|| panic!("no account: {outcome}"))
+            lines.next().unwrap_or_else(|| panic!("no statistics: {outcome}"))
         };
         for line in [of_epoch(true), of_epoch(false)] {
             assert!(number(&line, "received") >= 20 && line["lost"] == 0, "{line}");

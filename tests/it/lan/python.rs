@@ -49,7 +49,7 @@ fn the_module_puts_parts_together() {
         let top = Path::new(env!("CARGO_MANIFEST_DIR"));
         let mut command = Command::new(std::env::var("SCANHUB_PYTHON").unwrap_or("python3".to_owned()));
         command.arg("-B").arg(top.join("tests/it/lan/reader.py")).args(order);
-        let output = output(command.env("PYTHONPATH", top.join("clients/python"))).expect("runs");
+        let output = output(command.env("PYTHONPATH", top.join("clients/python"))).expect("the program runs");
         assert_eq!(String::from_utf8_lossy(&output.stdout).trim(), whole, "{output:?}");
     }
 }

@@ -33,16 +33,16 @@ impl Reader {
     }
 
     fn request(&mut self, line: &str) -> Value {
-        writeln!(self.input, "{line}").expect("it reads");
+        writeln!(self.input, "{line}").expect("the reader reads its stdin");
         let mut answer = String::new();
-        self.output.read_line(&mut answer).expect("it answers");
+        self.output.read_line(&mut answer).expect("the reader prints a line");
         serde_json::from_str(&answer).unwrap_or_else(|error| panic!("{error} in {answer:?} to {line}"))
     }
 
     /// Closes stdin, and asserts that the program exits successfully.
     pub(crate) fn end(mut self) {
         drop(self.input);
-        assert!(self.child.wait().expect("it ends").success());
+        assert!(self.child.wait().expect("the reader exits").success());
     }
 }
 
@@ -79,7 +79,7 @@ pub(crate) fn check_damaged(reader: &mut Reader, count: u32) {
 fn assert_same(name: &str, bytes: &[u8], mut reported: Value, expected: &Value) {
     if let Some(metres) = reported["payload"].as_object_mut().and_then(|payload| payload.remove("m")) {
         let mut scan = Scan::zeroed(bytes.len());
-        assert!(scan.unpack(Datagram::read(bytes).expect("it was read").payload));
+        assert!(scan.unpack(Datagram::read(bytes).expect("the datagram is valid").payload));
         let expected: Vec<_> = (0..scan.beams()).map(|i| scan.distance_m(i)).collect();
         assert_eq!(metres, as_read_from_json(&json!(expected)), "{name}: {bytes:02x?}");
     }

@@ -32,7 +32,7 @@ fn vector(description: &Value) -> Vector {
 }
 
 fn unhex(text: &str) -> Vec<u8> {
-    let digits: Vec<u32> = text.chars().map(|c| c.to_digit(16).expect("hex")).collect();
+    let digits: Vec<u32> = text.chars().map(|c| c.to_digit(16).expect("the text is hexadecimal")).collect();
     digits.chunks(2).map(|pair| (pair[0] << 4 | pair[1]) as u8).collect()
 }
 
@@ -40,7 +40,8 @@ fn unhex(text: &str) -> Vec<u8> {
 pub(crate) fn read_list() -> Value {
     // Crates at several depths of the source tree include this file.
     let mut above = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors();
-    let top = above.find(|folder| folder.join("tests/vectors").is_dir()).expect("the top");
-    let text = fs::read_to_string(top.join("tests/vectors/datagram.json")).expect("the list");
+    let top =
+        above.find(|folder| folder.join("tests/vectors").is_dir()).expect("the root of the source tree");
+    let text = fs::read_to_string(top.join("tests/vectors/datagram.json")).expect("the list can be read");
     serde_json::from_str(&text).expect("JSON")
 }

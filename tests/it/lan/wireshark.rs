@@ -238,8 +238,8 @@ fn gaps_are_flagged_per_hub_epoch_sensor_and_topic() {
     let mut capture = Capture::default();
     for (head, _) in sent {
         let mut buffer = [0; 100];
-        let len = Zones::unknown().pack(&mut buffer[HEADER_LEN..]).expect("room");
-        capture.add(head.seal(&mut buffer, len).expect("room"));
+        let len = Zones::unknown().pack(&mut buffer[HEADER_LEN..]).expect("the payload fits into the buffer");
+        capture.add(head.seal(&mut buffer, len).expect("the payload fits into the buffer"));
     }
     let flags = ["lost", "reordered", "duplicate", "stale", "retired"];
     let names = flags.map(|name| format!("scanhub.{name}"));
