@@ -156,22 +156,22 @@ fn finds_faults_of_service_and_udev_rule() {
         "systemctl status scanhub",
     );
     remove("usr/local/bin/scanhub");
-    healthy_layout(&env).assert_problem("the service's program is gone", "service", "failed", "install.sh");
+    healthy_layout(&env).assert_problem(
+        "the service's program does not exist",
+        "service",
+        "failed",
+        "install.sh",
+    );
     write_program(at("usr/local/bin/scanhub"), "#!/bin/sh\necho scanhub 0.0.1\n");
     let stale = healthy_layout(&env);
-    stale.assert_problem("the service is of another version", "service", "warning", "restart scanhub");
+    stale.assert_problem("the service has another version", "service", "warning", "restart scanhub");
     assert!(
         stale.state_and_text("service").1.contains("version 0.0.1"),
         "{:?}",
         stale.state_and_text("service")
     );
     fs::write(at("etc/udev/rules.d/60-scanhub.rules"), "# of a year ago\n").expect("can be written");
-    healthy_layout(&env).assert_problem(
-        "the udev rule is of another version",
-        "udev",
-        "warning",
-        "install.sh",
-    );
+    healthy_layout(&env).assert_problem("the udev rule has another version", "udev", "warning", "install.sh");
 }
 
 #[test]

@@ -28,7 +28,7 @@ fn multi_separates_people_from_rooms() {
     for (name, world, unit, recall, precision, wrong_per_scan) in [
         ("the room of Fig. 8", "fig8", Unit::Mm, 0.98, 0.95, 0.1),
         ("a corridor", "corridor", Unit::Cm, 0.9, 0.95, 0.1),
-        ("somebody walks at the sensor", "approach", Unit::Mm, 0.98, 0.98, 0.1),
+        ("a person walks toward the sensor", "approach", Unit::Mm, 0.98, 0.98, 0.1),
         ("a glass wall", "glass", Unit::Mm, 0.97, 0.98, 0.1),
         ("a wall seldom seen", "faint", Unit::Mm, 0.97, 0.95, 0.1),
     ] {

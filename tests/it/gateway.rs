@@ -199,7 +199,7 @@ fn copies_are_equal_despite_an_unreachable_host() {
         let _hub = env.hub(&[env.link("front")]);
         let flags = ["--interface=lo", "--to=127.0.0.1:9", "--to=localhost:30000"];
         let mut gateway = env.gateway(&flags);
-        let failing = gateway.await_line("the dead host", is_class("lan_link"));
+        let failing = gateway.await_line("report of the unreachable host", is_class("lan_link"));
         assert_eq!((&failing["to"], &failing["state"]), (&"127.0.0.1:9".into(), &"failing".into()));
         receiver.wait_for_datagrams(30, has_topic(Topic::Scan));
         let outcome = gateway.end(TERM);

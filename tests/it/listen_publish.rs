@@ -119,12 +119,12 @@ fn subscribers_survive_a_killed_listener() {
         sender.send(Topic::Zones, &zones(Verdict::Clear));
         echo.await_line("zones", is_zones);
         assert_eq!(first.end(KILL).exit_code, None);
-        echo.await_line("the news", |line| line["kind"] == "hub_gone");
+        echo.await_line("notice hub_gone", |line| line["kind"] == "hub_gone");
         for _ in 0..4 {
             sender.send(Topic::Zones, &zones(Verdict::Slow));
         }
         let second = start_and_publish(&env, &mut sender);
-        echo.await_line("the news", |line| line["kind"] == "hub_back");
+        echo.await_line("notice hub_back", |line| line["kind"] == "hub_back");
         sender.send(Topic::Zones, &zones(Verdict::Stop));
         echo.await_line("zones", |line| line["verdict"] == "stop");
         let outcome = echo.end(INT);
