@@ -1,5 +1,7 @@
-//! The program from outside: one binary with a module for each thing that is held, so that what they all link is linked
-//! once. A test runs beside others in one process: what it changes of a process it changes in a child of its own.
+//! Tests of the `scanhub` program from the outside, as one binary with one module per property, so that shared code is
+//! linked once.
+//!
+//! Tests run concurrently in one process. A test that changes process-wide state does so in a child process.
 
 #[path = "../testkit/mod.rs"]
 mod testkit;

@@ -1,15 +1,17 @@
-//! A robot that sees itself: it stops for its own post until it is told to look past it.
+//! Tests of `zones mask`, for a robot whose sensor sees the robot's own post: the verdict is `stop` until the mask
+//! hides the post.
 
 use crate::testkit;
 use crate::testkit::{INT, KILL, Outcome, Program, TERM, TestEnv, is_class};
 
-/// A room of six metres, and 0.4 m before the sensor what `thing` says.
+/// Returns the argument for a room of 6 m by 6 m with `thing` in it.
 fn world(env: &TestEnv, thing: &str) -> String {
     let room = "[noise]\ntail = 0\n\n[[thing]]\nline = [[3000, -3000], [3000, 3000], [-3000, 3000], [-3000, -3000]]\n";
     format!("--world={}", env.file("world.toml", format!("{room}\n{thing}")))
 }
 
-/// What is told beside a mask that a person should look at; on a busy machine also that scans were missed.
+/// Parts of the warnings that `mask` prints when a person should check the result. Missed scans are not among them,
+/// because a busy machine may miss some.
 const WARNINGS: [&str; 3] = ["nothing of the robot", "something moved", "are hidden"];
 
 const POST_WORLD: &str = "[[thing]]\nradius_mm = 20\npose = [0, 400]\n";
@@ -18,7 +20,8 @@ fn simulator(env: &TestEnv, world: &str) -> Program {
     env.simulator(&["front"], &["--seed=51", "--baud=500000", world])
 }
 
-/// Runs the verb with these arguments, and for a longer time if the scans were too few, as its message advises.
+/// Runs `zones front mask` with the arguments `more`. Repeats it with a longer `--for` if it received too few scans, as
+/// the error message advises.
 fn mask(env: &TestEnv, more: &[&str]) -> Outcome {
     let run = |time: &str| env.run(&[&["zones", "front", "mask", "--for", time], more].concat());
     let few = |outcome: &Outcome| {
@@ -27,7 +30,7 @@ fn mask(env: &TestEnv, more: &[&str]) -> Outcome {
     ["20s", "60s"].into_iter().fold(run("4s"), |last, time| if few(&last) { run(time) } else { last })
 }
 
-/// Waits until scans come and the verdict is `verdict`.
+/// Waits until `front/zones` has the verdict `verdict`.
 fn await_verdict(env: &TestEnv, verdict: &str) {
     env.echo(&["front/zones"]).await_line(verdict, |line| line["verdict"] == verdict);
 }
@@ -54,7 +57,7 @@ fn mask_hides_the_robots_own_post() {
     let table: toml::Table = text.parse().unwrap_or_else(|error| panic!("{error}: {outcome}"));
     let sectors = table["link"][0]["zones"]["body_mask"].as_array().unwrap();
     let key = |sector: &toml::Value, key: &str| sector[key].as_float().unwrap();
-    // The post is 6 degrees wide, and a beam or two beside it meet its edge.
+    // The post is 6 degrees wide, and one or two more beams on each side hit its edge.
     let first = sectors.iter().map(|sector| key(sector, "from_deg")).fold(90.0, f64::min);
     let last = sectors.iter().map(|sector| key(sector, "to_deg")).fold(-90.0, f64::max);
     assert!((-5.0..=-2.5).contains(&first) && (2.5..=5.0).contains(&last), "{outcome}");
@@ -65,11 +68,11 @@ fn mask_hides_the_robots_own_post() {
     await_verdict(&env, "clear");
     let mut subscriber = env.echo(&["front/zones"]);
     let lines = subscriber.await_lines(100, "a verdict", is_class("zones"));
-    // On a busy machine a scan may be late, which is `unknown`; but nothing is seen.
+    // On a busy machine a scan may be late, which makes the verdict `unknown`. No zone may be violated.
     let violations: Vec<_> =
         lines.iter().filter(|line| line["verdict"] == "stop" || line["verdict"] == "slow").collect();
     assert!(violations.is_empty(), "{violations:#?}");
-    // A mask that is in force does not hinder the next one: scans are as the sensor sends them.
+    // An active mask does not affect the next one: topic `scan` is published without the mask.
     let again = mask(&env, &["--json"]);
     assert_eq!(again.exit_code, Some(0), "{again}");
     let mask = &again.of_class("mask")[0];
@@ -97,7 +100,7 @@ fn empty_mask_loads_into_a_hub() {
     let _hub = env.hub(&[&env.link("front"), "--config", &file]);
     await_verdict(&env, "clear");
 
-    // The walls are no body, but in a circle that is as large as the room they are: that is told.
+    // Walls are not part of the robot, but with a circle as large as the room they are masked, which a warning reports.
     let outcome = mask(&env, &["--within", "6"]);
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     assert!(outcome.stderr.contains("the hub will be blind there"), "{outcome}");
@@ -142,7 +145,7 @@ fn too_little_to_learn_from_is_refused() {
         "{unknown}"
     );
 
-    // Interrupted, and left alone by the hub.
+    // Interrupt it, and then kill the hub while it runs.
     let looking = env.start(&["zones", "front", "mask", "--for=1h", "--json"]);
     testkit::wait_until("it looks", || env.subscribers("front/scan") == 1);
     assert_eq!(looking.end(INT).exit_code, Some(130));

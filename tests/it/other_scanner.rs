@@ -1,4 +1,5 @@
-//! A hub at a scanner of another family than its link has: bytes arrive, and none of them make sense.
+//! Tests of a hub whose link has another family than the scanner on the line: bytes arrive, but the hub cannot decode
+//! them.
 
 use std::fs::File;
 use std::path::Path;
@@ -22,7 +23,8 @@ use crate::testkit::{INT, TERM, TestEnv};
 
 const REMEDY: &str = "Remove family from link front and restart the hub: it finds the scanner";
 
-/// A scanner that streams, and one that waits for requests, with the families that they do not belong to. An LDROBOT never waits.
+/// Flags of `simulate` for scanners that stream, each with two families that it does not belong to. [`IDLE_SCANNERS`]
+/// wait for requests. An LDROBOT scanner always streams.
 const STREAMING_SCANNERS: [(&[&str], [&str; 2]); 3] = [
     (&["--family=ld", "--model=ld19"], ["lms", "rplidar"]),
     (&["--baud=500000", "--state=streaming"], ["ld", "rplidar"]),
@@ -31,7 +33,7 @@ const STREAMING_SCANNERS: [(&[&str], [&str; 2]); 3] = [
 const IDLE_SCANNERS: [(&[&str], [&str; 2]); 2] =
     [(&[], ["ld", "rplidar"]), (&["--family=rplidar", "--model=a1"], ["lms", "ld"])];
 
-/// Calls `check` with each scanner and each family that it does not belong to, at the same time.
+/// Calls `check` concurrently for each scanner and each family that it does not belong to.
 fn check_each_scanner(scanners: &[(&[&str], [&str; 2])], check: impl Fn(&[&str], &str) + Sync) {
     std::thread::scope(|scope| {
         let cases =
@@ -93,7 +95,8 @@ fn a_silent_line_may_have_another_scanner() {
     });
 }
 
-/// `doctor` searches only for the family that a link names. `configure` writes only to an LMS.
+/// `doctor` tries only the family that a link names, and `configure` writes only to an LMS. Both therefore suggest
+/// `probe`.
 #[test]
 fn doctor_and_configure_suggest_scanhub_probe() {
     let try_this = |port: &str| format!("is it another scanner? Try: scanhub probe {port}; ");
@@ -113,14 +116,15 @@ fn doctor_and_configure_suggest_scanhub_probe() {
             let hint = failure["hint"].as_str().expect("a text");
             assert!(outcome.exit_code == Some(3) && hint.starts_with(&try_this(&port)), "{outcome}");
         }
-        // This leads to the scanner.
+        // The suggested command finds the scanner.
         assert_eq!(env.search(&["probe", &port, "--json"]).exit_code, Some(0));
     };
     check_each_scanner(&STREAMING_SCANNERS, check);
     check_each_scanner(&IDLE_SCANNERS, check);
 }
 
-/// The remedy that the hub names leads to the scanner, and so does `probe`, which cannot search a port of the hub.
+/// The suggested command finds the scanner once the hub has stopped, and so does removing the key `family`. `probe`
+/// cannot search a port while the hub uses it.
 #[test]
 fn refusal_of_a_busy_port_shows_hub_error_and_remedy() {
     let (env, other) = (TestEnv::new(), TestEnv::new());
@@ -143,7 +147,7 @@ fn refusal_of_a_busy_port_shows_hub_error_and_remedy() {
         assert!(message.starts_with(&begin) && message.contains(remedy), "{message}");
         assert_eq!(hint, format!("scanhub info front; before another program may use the port, {stop}"));
     }
-    // From another domain, the command names the domain of the hub.
+    // From another domain, the suggested command names the domain of the hub.
     let [message, hint] = refused(&other, &["probe", &port]);
     assert!(
         message.contains("in use by the hub, process ") && message.contains("its link front"),
@@ -180,13 +184,13 @@ fn refusal_of_a_busy_port_shows_hub_error_and_remedy() {
     drop(reader);
 
     assert_eq!(hub.end(TERM).exit_code, Some(0), "{info}");
-    // Each of the two remedies leads to the scanner.
+    // Each of the two remedies finds the scanner.
     assert_eq!(env.search(&["probe", &port, "--json"]).lines()[0]["model"], "ld19");
     let _hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming" && info["model"] == "ld19");
 }
 
-/// Scanners that stream, with the name that the message has for each.
+/// Returns streaming scanners, each with its name in the hub's message.
 fn scanners() -> [(&'static str, Box<dyn Device>); 3] {
     let room = || Room::new(&"room".parse().expect("a world"), 7);
     let head = LdSettings { seed: 7, ..LdSettings::of(ld::Model::Ld19) };
@@ -207,8 +211,8 @@ fn scanners() -> [(&'static str, Box<dyn Device>); 3] {
     ]
 }
 
-/// Connects `device` to a link of the hub from `begin` to `end`. The rate of the line garbles no bytes. Calls `note` with the time
-/// of each step.
+/// Connects `device` to a link of the hub from `begin` to `end`. Bytes arrive intact, whatever baud rate the hub has
+/// set. Calls `note` with the time after each step of 10 ms.
 fn connect(
     device: &mut dyn Device,
     link: &mut VirtualLink<'_>,
@@ -220,7 +224,7 @@ fn connect(
         while let Some(chunk) = device.poll_transmit(now) {
             bytes.extend(chunk.bytes);
         }
-        // It was not connected before.
+        // Discard what the device sent before it was connected.
         link.read(now, if now == begin { &[] } else { &bytes });
         for (number, byte) in link.take_written().into_iter().enumerate() {
             device.receive(byte, Arrival::at(now + number as Nanos * MILLIS / 4));
@@ -230,14 +234,15 @@ fn connect(
 }
 
 const ONE_SECOND: Nanos = 1_000 * MILLIS;
-/// Time at which the scanner is exchanged.
+/// Time at which the scanner is replaced by another one.
 const REPLACED_AT: Nanos = 10 * ONE_SECOND;
 
 /// Time, family and last error of a status.
 type ReportedStatus = (Nanos, Option<Family>, String);
 
-/// Runs a hub in virtual time until `end`: the scanner with this number streams, and is then replaced by the next one on the same
-/// line. `keys` belong to the link. Returns the name of the first scanner, and what the hub has reported.
+/// Runs a hub in virtual time until `end`. The scanner with the index `number` streams and is replaced by the next one
+/// on the same line at [`REPLACED_AT`]. `keys` are added to the link. Returns the name of the first scanner and all
+/// published statuses.
 fn replace_scanner(keys: &str, number: usize, end: Nanos) -> (&'static str, Vec<ReportedStatus>) {
     let env = TestEnv::new();
     let (name, mut first) = scanners().into_iter().nth(number).expect("three");
@@ -263,7 +268,8 @@ fn replace_scanner(keys: &str, number: usize, end: Nanos) -> (&'static str, Vec<
     (name, driven.expect("the domain is free"))
 }
 
-/// Checks that a hub reports the exchange of a scanner called `name` within 4 s, with `remedy`, and no damage of the line.
+/// Asserts that the hub reports the exchange of the scanner `name` within 4 s, with `remedy`, and never reports damage
+/// on the line.
 fn check_replacement(name: &str, remedy: &str, reported: &[ReportedStatus]) {
     let message =
         format!(" bytes/s arrive, but nothing from the {name}: another scanner, or a damaged line? {remedy}");
@@ -292,7 +298,7 @@ fn replaced_scanner_is_not_reported_as_damaged_line() {
     }
 }
 
-/// The links of a running hub need no name on the command line.
+/// `doctor` without arguments checks the links of the running hub.
 #[test]
 fn doctor_reports_each_link_of_the_running_hub() {
     let env = TestEnv::new();
@@ -329,7 +335,7 @@ fn doctor_reports_each_link_of_the_running_hub() {
     }
     let text = env.run(&["doctor", "--no-system-config"]).to_string();
     assert!(text.contains(&format!("{server} (link side)")), "{text}");
-    // A configuration of other links adds its own.
+    // Links of a configuration are checked in addition to those of the hub.
     let named = env.run(&["doctor", "--json", "--no-system-config", &env.link("front"), &env.link("rear")]);
     let findings = named.of_class("check");
     let links = ["front", "rear", "absent", "side"];

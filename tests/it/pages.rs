@@ -1,6 +1,6 @@
-//! Every example of every page, as it stands there: programs run beside a hub, in rooms with something in them and with
-//! nothing, of sensors that measure in mm and in cm; lines for the shell run; configurations and worlds are read. What cannot
-//! be run is named here, with the reason.
+//! Tests that run every example on every page as it is printed. Programs run next to a hub, in a room with walls and in
+//! an empty one, with sensors that measure in mm and in cm. Shell lines are run; configurations and worlds are parsed.
+//! Examples that cannot run are listed with the reason.
 
 mod blocks;
 mod data_blocks;
@@ -14,13 +14,13 @@ use blocks::{Block, blocks};
 pub(crate) use program::Example;
 use rustix::time::{ClockId, clock_gettime};
 
-/// A room, and a sensor in it.
+/// A simulated room and the sensor in it.
 #[derive(Clone, Copy, Debug)]
 struct ExampleScene {
     world: &'static str,
     sensor: &'static str,
     unit: &'static str,
-    /// How far everything is; nothing where there is nothing.
+    /// Range of every beam in meters, or `None` in an empty world.
     wall_m: Option<f64>,
 }
 
@@ -33,7 +33,7 @@ const EXAMPLE_SCENES: [ExampleScene; 5] = [
 ];
 
 impl ExampleScene {
-    /// A hub with a sensor `front` that streams.
+    /// Starts a simulator and a hub, and waits until the sensor `front` streams.
     fn start(&self, env: &TestEnv) -> [Program; 2] {
         let ExampleScene { world, sensor, unit, .. } = self;
         let flags = [
@@ -49,7 +49,7 @@ impl ExampleScene {
         [simulator, hub]
     }
 
-    /// What is wrong with what these print here.
+    /// Runs `examples` in this scene and returns a description of each failure.
     fn check_examples(&self, examples: &[Example]) -> Vec<String> {
         let env = TestEnv::new();
         let _running = self.start(&env);
@@ -63,16 +63,16 @@ impl ExampleScene {
         examples.iter().filter_map(|example| self.check_example(example, &run(example)).err()).collect()
     }
 
-    /// Whether there is something to tell, for an example that tells anything.
+    /// Returns whether `example` must print a distance or a verdict: if it prints at all, and the room has walls.
     fn needs_distance(&self, example: &Example) -> bool {
         self.wall_m.is_some() && example.text.contains("print")
     }
 
-    /// What is wrong with what an example printed here.
+    /// Returns an error that describes what is wrong with the output of `example`, if anything.
     fn check_example(&self, example: &Example, outcome: &Outcome) -> Result<(), String> {
         let wrong =
             |description: &str| Err(format!("{}, {self:?}: {description}\n{outcome}", example.location));
-        // Either it ends when it is through, or not before it is ended.
+        // An example either ends by itself or runs until the test ends it.
         if !matches!(outcome.exit_code, None | Some(0)) || !outcome.stderr.is_empty() {
             return wrong("it failed");
         }
@@ -97,7 +97,7 @@ impl ExampleScene {
 
 const VERDICTS: [&str; 4] = ["clear", "slow", "stop", "unknown"];
 
-/// The distance that a line tells: the number before a unit.
+/// Returns the first distance in `line`, in meters: a number before the unit `m` or `mm`.
 fn distance_m(line: &str) -> Option<f64> {
     let words: Vec<&str> = line.split_whitespace().collect();
     words.windows(2).find_map(|pair| {
@@ -110,13 +110,13 @@ fn distance_m(line: &str) -> Option<f64> {
     })
 }
 
-/// Runs `example` beside the hub of `env` until it has seen some scans, and `says` something if it should. `verdicts` come
-/// with the scans.
+/// Runs `example` next to the hub of `env` until it has received some scans, and until it has printed something if
+/// `must_print` is set. `verdicts` receives the verdicts of the same scans.
 fn run(example: &Example, env: &TestEnv, verdicts: &mut Program, must_print: bool) -> Outcome {
-    // Nobody types, and nobody closes it.
+    // Standard input stays open and empty.
     let (stdin, _typed) = std::io::pipe().expect("a pipe");
     let mut program = Program::start_with(example.command(env), stdin);
-    // From when it reads the hub's memory.
+    // The example is attached to the hub once it has mapped the hub's memory.
     let maps = format!("/proc/{}/maps", program.pid());
     let follows = || {
         let maps = std::fs::read_to_string(&maps).unwrap_or_default();
@@ -131,13 +131,13 @@ fn run(example: &Example, env: &TestEnv, verdicts: &mut Program, must_print: boo
     if program.has_ended() { program.wait() } else { program.end(TERM) }
 }
 
-/// CLOCK_MONOTONIC, as in stamps.
+/// Returns the time of CLOCK_MONOTONIC in ns, as in stamps.
 fn monotonic_ns() -> u64 {
     let now = clock_gettime(ClockId::Monotonic);
     now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
 }
 
-/// The words of the lines for a shell on `page` that begin with one of `begins`, behind the program's name.
+/// Returns the arguments of the shell lines on `page` that begin with one of `begins`, without the program's name.
 pub(crate) fn commands_on(page: &str, begins: &[&str]) -> Vec<Vec<String>> {
     let blocks =
         blocks().into_iter().filter(|block| block.language == "sh" && block.location.starts_with(page));
@@ -146,7 +146,7 @@ pub(crate) fn commands_on(page: &str, begins: &[&str]) -> Vec<Vec<String>> {
     lines.map(|line| shell::commands(&line).remove(0).split_off(1)).collect()
 }
 
-/// The block of `page` that is in `language` and begins with `begin`.
+/// Returns the block of `page` in `language` that begins with `begin`.
 pub(crate) fn text_on(page: &str, language: &str, begin: &str) -> String {
     let is_it = |block: &Block| {
         block.location.starts_with(page) && block.language == language && block.text.starts_with(begin)
@@ -158,10 +158,11 @@ fn is_program(block: &Block) -> bool {
     ["python", "rust", "c", "cpp"].contains(&block.language.as_str())
 }
 
-/// Pages whose programs follow a tracker, or publish a mount, and follow no hub; `track.rs` and `tilt.rs` run them.
+/// Pages whose programs subscribe to a tracker or publish a mount's angle instead of reading from a hub. `track.rs` and
+/// `tilt.rs` run them.
 const PAGES_TESTED_ELSEWHERE: [&str; 2] = ["docs/tracks.md", "docs/tilt.md"];
 
-/// The programs on `page` in which these `words` stand, as far as this machine can run them.
+/// Builds the programs on `page` that contain `words`, except those that this machine cannot build.
 pub(crate) fn examples_on(page: &str, words: &str, env: &TestEnv) -> Vec<Example> {
     let is_wanted = |block: &Block| block.location.starts_with(page) && block.text.contains(words);
     let blocks = blocks().into_iter().filter(is_wanted).map(|block| match block.language.as_str() {
@@ -184,7 +185,7 @@ fn page_programs_run_and_print_only_real_distances() {
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
 }
 
-/// What is wrong with the programs `blocks`, each line with its place.
+/// Runs the programs `blocks` in `scenes` and returns a description of each failure, with its location.
 fn failures(blocks: &[Block], scenes: &[ExampleScene]) -> Vec<String> {
     let shop = TestEnv::new();
     let (mut examples, mut wrong) = (Vec::new(), Vec::new());
@@ -194,12 +195,12 @@ fn failures(blocks: &[Block], scenes: &[ExampleScene]) -> Vec<String> {
             Err(refused) => wrong.push(format!("{}: {refused}", block.location)),
         }
     }
-    // Each has a hub of its own, and all of them wait most of the time.
+    // Each scene has its own hub, and all of them wait most of the time.
     wrong.extend(run_concurrently(scenes, |situation| situation.check_examples(&examples)).concat());
     wrong
 }
 
-/// What stood on pages once, and what is wrong with it.
+/// Examples with mistakes that pages once had, each with the expected error.
 #[test]
 fn a_program_that_takes_codes_for_distances_is_found() {
     let block = |language: &str, text: &str| Block {

@@ -1,5 +1,5 @@
 //! Upper bounds for the hub's instructions and system calls per telegram, so that a change shows its cost. They hardly
-//! depend on the load of the machine. `benches/path` shows where they come from.
+//! depend on the load of the machine. `benches/path` shows where the cost arises.
 
 #[cfg(not(target_arch = "x86_64"))]
 #[test]
@@ -14,31 +14,32 @@ fn a_telegram_costs_no_more_than_before() {
     use crate::testkit::{TERM, TestEnv, is_class, skip, wait_until};
     use std::time::Duration;
 
-    // Upper bounds, a quarter above the values that this test prints: `cargo test --test it -- path_cost --nocapture`.
-    // After a change that makes the path shorter, set them to 1.25 times the new values, so that the gain stays. Take the
-    // highest of five runs: the hub publishes the status with most telegrams that are stepped through, but not with all.
-    /// With a learned background, for the profile `dev`. 182,000 to 217,000 were measured.
+    // Upper bounds: a quarter above the values that this test prints with `cargo test --test it -- path_cost
+    // --nocapture`. After a change that makes the path shorter, set them to 1.25 times the new values, so that a later
+    // regression fails. Take the highest of five runs: the hub publishes the status with most telegrams that are
+    // stepped through, but not with all.
+    /// With a learned background, in the profile `dev`. 182,000 to 217,000 were measured.
     const MAX_INSTRUCTIONS: u64 = 271_000;
     /// At 500,000 baud. 7 were measured, and 5 to 9 on a busy machine.
     const MAX_SYSTEM_CALLS: u64 = 9;
 
     /// Telegrams that are stepped through. Each takes some seconds.
     const STEPPED_TELEGRAMS: usize = 10;
-    /// Telegrams whose system calls are counted, and telegrams before them. By then, the hub has learned how long before
-    /// the end of a telegram it has to wake up.
+    /// Telegrams whose system calls are counted, after [`LEARNING_TELEGRAMS`], in which the hub estimates how long
+    /// before the end of a telegram it has to wake up.
     const COUNTED_TELEGRAMS: usize = 40;
     const LEARNING_TELEGRAMS: usize = 110;
     /// Time between two telegrams at 9,600 baud.
     const TELEGRAM_INTERVAL: Duration = Duration::from_millis(773);
-    /// Learns the background within a second.
+    /// Setting with which the hub learns the background within a second.
     const SHORT_LEARNING: &str = "--set=background.scans=20";
 
-    /// A wall around the sensor, without the noise on which the number of instructions depends.
+    /// World with a wall around the sensor, without the noise on which the number of instructions depends.
     const ROOM_WORLD: &str = "[noise]\nerrors = 0\ntail = 0\n\n\
          [[thing]]\nline = [[3000, -500], [3000, 3000], [-3000, 3000], [-3000, -500]]\n";
 
-    /// Returns the values per telegram in ascending order. If two telegrams were complete before the hub read, it sleeps
-    /// once for both.
+    /// Returns the values per telegram in ascending order. If two telegrams were complete before the hub read, it
+    /// sleeps once for both.
     fn sorted(costs: &[TelegramCost], value: fn(&TelegramCost) -> u64) -> Vec<u64> {
         let mut values: Vec<u64> = costs.iter().map(|cost| value(cost).div_ceil(cost.telegrams)).collect();
         values.sort_unstable();

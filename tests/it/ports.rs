@@ -1,5 +1,5 @@
-//! The ways in which a port cannot be used: each has its message and its remedy. A hub ends only at a port that is not a
-//! serial line, and waits for all others.
+//! Tests of unusable ports: each cause has its message and its remedy. The hub exits only if a port is not a serial
+//! line. It waits for a port with any other problem.
 
 use std::net::{TcpListener, TcpStream};
 use std::os::unix::fs::{PermissionsExt, chown, symlink};
@@ -9,17 +9,17 @@ use crate::testkit::{self, Program, TERM, TestEnv, TestLine, is_class, skip, suc
 use rustix::process::geteuid;
 use serde_json::Value;
 
-/// Whoever is not root and owns nothing.
+/// An unprivileged user who owns no files.
 const UNPRIVILEGED_UID: u32 = 65534;
 
-/// What a hub at `port` says, which must end with code 4 and `kind`.
+/// Asserts that a hub with the port `port` exits with code 4 and an error of `kind`. Returns its message and hint.
 fn assert_refused(env: &TestEnv, port: &str, kind: &str) -> String {
     let outcome = env.run(&["run", "--json", &format!("--link=front={port}")]);
     assert_eq!(outcome.exit_code, Some(4), "{outcome}");
     message_and_hint(&outcome.stderr, kind)
 }
 
-/// Message and hint of the error at the end of a log.
+/// Asserts that `log` ends with an error of `kind`, and returns its message and hint.
 fn message_and_hint(log: &str, kind: &str) -> String {
     let line: Value = serde_json::from_str(log.lines().last().unwrap_or_default())
         .unwrap_or_else(|error| panic!("{error}: {log}"));
@@ -64,7 +64,7 @@ fn hub_waits_for_missing_ports() {
     assert_eq!(hub.end(TERM).exit_code, Some(0));
 }
 
-/// The rights to a pty are taken away: from nobody if this is root, else from its owner.
+/// Removes the permissions of a pty: for other users if the test runs as root, or else for its owner.
 #[test]
 fn hub_waits_for_a_port_without_permission() {
     let env = TestEnv::new();
@@ -98,7 +98,7 @@ fn hub_waits_for_a_port_without_permission() {
     }
 }
 
-/// Whether another user may run the program where it lies.
+/// Returns whether `user` may run the program in its directory.
 fn command_can_run(user: u32) -> bool {
     let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_scanhub"));
     succeeds(command.arg("--help").uid(user).gid(user))
@@ -126,7 +126,7 @@ fn hub_waits_for_a_port_held_by_another_hub() {
     let list = other.run(&["list"]);
     let reason = format!("front: {text}");
     assert!(String::from_utf8_lossy(&list.stdout).lines().any(|line| line == reason), "{list}");
-    // On a pty the exclusive mode outlives a close; the next process finds none.
+    // On a pty, exclusive mode persists after a close. The next process must not find it set.
     assert_eq!(hub.end(TERM).exit_code, Some(0));
     let taken = |info: &Value| info["state"] != "absent" && info["last_error"] == "";
     other.await_info("front", taken);
@@ -140,7 +140,7 @@ fn hub_waits_for_a_port_held_by_another_hub() {
 #[test]
 fn ready_text_names_ports_the_hub_waits_for() {
     let env = TestEnv::new();
-    // Nothing listens at the one, and the other one accepts no connection.
+    // No process listens at the first address, and the second one accepts no connection.
     let free = TcpListener::bind("127.0.0.1:0").and_then(|socket| socket.local_addr()).expect("a port");
     let mute = TcpListener::bind("127.0.0.1:0").expect("a port");
     rustix::net::listen(&mute, 0).expect("a socket");
@@ -155,7 +155,7 @@ fn ready_text_names_ports_the_hub_waits_for() {
     assert_eq!(hub.end(TERM).exit_code, Some(0));
 }
 
-/// A server that accepts the connection at once is not waited for.
+/// A server that accepts the connection at once is not listed in `waiting`.
 #[test]
 fn ready_names_no_serial_server_that_is_connected() {
     let env = TestEnv::new();

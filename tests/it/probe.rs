@@ -1,4 +1,4 @@
-//! `scanhub probe`, as somebody runs it: it tells what is there, and leaves it as it was.
+//! Tests of `scanhub probe`: it reports the scanner at a port and leaves the scanner in the state in which it was.
 
 use std::io::Read;
 
@@ -39,7 +39,8 @@ fn reports_identity_without_changing_the_scanner() {
     assert_eq!(env.simulator_totals("front").1, 0);
 }
 
-/// The last line is a command for a shell; `--toml` prints a section for a file. Both start a hub that streams.
+/// The last line of the output is a command for a shell. `--toml` prints a section for a file. A hub streams with
+/// either.
 #[test]
 fn printed_link_and_section_start_a_hub() {
     let families: [(&str, &[&str], &str); 3] = [
@@ -104,7 +105,7 @@ fn reports_dirty_window_despite_ok_status() {
 fn resumes_an_abandoned_stream() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--baud=500000"]);
-    // A hub that is killed leaves its sensor streaming.
+    // A hub that is killed leaves its scanner streaming.
     let hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
     hub.end(testkit::KILL);
@@ -138,10 +139,10 @@ fn reports_silent_and_unusable_ports() {
     );
 }
 
-/// Probe and doctor search in the same way. The code is that of a silent line.
+/// Verbs that search for a scanner in the same way, each with its exit code on a silent line.
 const SEARCH_COMMANDS: [(&[&str], i32); 2] = [(&["probe"], 3), (&["doctor", "--no-system-config"], 5)];
 
-/// Checks that `sent` has only requests of the search. Returns the number of each.
+/// Asserts that `sent` has only requests of the search. Returns the count of each.
 fn count_requests(mut sent: &[u8]) -> [usize; 4] {
     const REQUESTS: [&[u8]; 4] = [
         &[0x02, 0x00, 0x01, 0x00, 0x3A, 0x1E, 0x12],
@@ -151,7 +152,7 @@ fn count_requests(mut sent: &[u8]) -> [usize; 4] {
     ];
     let mut counts = [0; 4];
     while !sent.is_empty() {
-        // A request whose next byte would be late starts over.
+        // If the next byte of a request would be late, the search starts the request again.
         let len_of = |request: &[u8]| request.iter().zip(sent).take_while(|(a, b)| a == b).count();
         let (len, number) = (0..4).map(|number| (len_of(REQUESTS[number]), number)).max().expect("four");
         assert!(len > 0, "{sent:02X?}");
@@ -184,14 +185,14 @@ fn sends_only_search_requests_to_unknown_scanner() {
         ] {
             assert!(text.contains(part), "{part}: {outcome}");
         }
-        // Each family has four rates, and there are two rounds.
+        // Each family has four requests or rates per round, and there are two rounds.
         let counts = count_requests(&sent);
         assert!(counts[0] >= 4 && counts[1] >= 4 && counts[2] >= 8 && counts[3] >= 8, "{counts:?}");
     }
 }
 
-/// In virtual time, it gets no byte at all. On a busy machine, its packets may have a gap in which the search
-/// continues.
+/// Prints the requests that were sent. In virtual time a streaming scanner receives no byte at all. On a busy machine,
+/// its packets may have a gap in which the search continues.
 #[test]
 fn finds_streaming_scanner_with_search_requests_only() {
     let env = TestEnv::new();
@@ -216,7 +217,7 @@ fn finds_streaming_scanner_with_search_requests_only() {
     }
 }
 
-/// `probe` would get only a part of the bytes, and report the line as damaged.
+/// `probe` would receive only a part of the bytes and report the line as damaged.
 #[test]
 fn another_process_that_reads_the_port_is_named() {
     let env = TestEnv::new();
@@ -259,7 +260,7 @@ fn without_a_port_the_candidates_are_listed() {
     let env = TestEnv::new();
     let outcome = env.run(&["probe", "--json"]);
     match outcome.exit_code {
-        // What there is depends on the machine.
+        // The result depends on the ports of the machine.
         Some(0) => {
             for line in outcome.lines() {
                 assert_eq!(line["class"], "candidate", "{outcome}");

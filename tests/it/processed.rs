@@ -1,5 +1,5 @@
-//! What the hub makes of scans, from a line to consumers: marks, zones, foreground and background with each scan, the
-//! one `unknown` when scans stay out, and what users may ask of the background.
+//! Tests of the topics that the hub derives from scans: marks, zones, foreground and background with each scan, one
+//! `unknown` sample when scans stop, and the commands for the background.
 
 use crate::testkit;
 use crate::testkit::{INT, Outcome, TERM, TestEnv, checked_topic_seqs, is_class, number, wait_until};
@@ -11,7 +11,7 @@ fn background(env: &TestEnv, arguments: &[&str]) -> Outcome {
     env.run(&[&["background", "front"], arguments, &["--json"]].concat())
 }
 
-/// Asks for `verb`, which must be taken.
+/// Asserts that `background front` accepts `arguments`.
 fn background_accepted(env: &TestEnv, arguments: &[&str]) {
     let outcome = background(env, arguments);
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
@@ -37,7 +37,7 @@ fn each_scan_has_its_marks_zones_and_foreground() {
     let hub = env.hub(&[env.link("front")]);
     let topics = ["scan", "marks", "zones", "foreground"];
     let mut subscribers = topics.map(|topic| env.echo(&[&format!("front/{topic}")]));
-    // What is there before any scan: nothing is known, and the circles are those of the configuration.
+    // Before any scan, the verdict is unknown, and the radii are those of the configuration.
     let first = subscribers[2].await_line("the first word", is_class("zones"));
     assert_eq!((&first["verdict"], number(&first, "topic_seq")), (&"unknown".into(), 0), "{first}");
     assert_eq!(
@@ -56,13 +56,12 @@ fn each_scan_has_its_marks_zones_and_foreground() {
         });
         assert!(of_scans.count() > 0, "{name}: {lines:?}");
     }
-    // The room has reflectors, the simulated sensor tells of them, and nothing is known yet of what always stands
-    // there.
+    // The simulated room has reflectors, which the simulated scanner reports. The background is not known yet.
     assert!(marks.iter().all(|line| line["available"] == true));
     assert!(marks.iter().any(|line| line["marks"].as_array().is_some_and(|marks| !marks.is_empty())));
     assert!(zones.iter().all(|line| number(line, "nearest_mm") > 0 && line["verdict"] != "unknown"));
     assert!(foregrounds.iter().all(|line| line["beams"].as_array().is_some_and(Vec::is_empty)));
-    // A late subscriber missed nothing, because nothing was published before.
+    // A late subscriber missed no samples, because no subscriber received earlier ones.
     let late = env.run(&["echo", "--json", "front/marks", "front/foreground", "-n", "20"]);
     ["marks", "foreground"].iter().for_each(|topic| drop(checked_topic_seqs(&late, topic)));
     for (subscriber, topic) in subscribers.into_iter().zip(topics) {
@@ -74,7 +73,7 @@ fn each_scan_has_its_marks_zones_and_foreground() {
     assert_eq!(simulator.end(TERM).exit_code, Some(0));
 }
 
-/// The last word on zones, as a late joiner hears it: it is of a silence.
+/// Waits until a late joiner's sample of topic `zones` is the `unknown` of a silence, and returns it.
 fn await_silence_sample(env: &TestEnv) -> Value {
     let mut last = Value::Null;
     wait_until("the hub says that nothing is known", || {
@@ -98,14 +97,14 @@ fn silence_is_published_once_also_for_late_joiners() {
     assert_eq!(env.run(&["control", "front", "pause"]).exit_code, Some(0));
     env.await_info("front", |info| info["state"] == "paused");
     let unknown = await_silence_sample(&env);
-    // Five statuses later nothing was added to it.
+    // Five statuses later, no further sample was added.
     let mut statuses = env.echo(&["front/status", "front/scan", "front/background"]);
     let statuses = statuses.await_lines(5, "a status", is_class("status"));
-    // A subscriber that attaches meanwhile gets no scan, which is not an error.
+    // A subscriber that attaches meanwhile receives no scan, which is not an error.
     assert!(statuses.iter().all(|status| status["last_error"] == ""), "{statuses:?}");
     assert_eq!(env.run(&["control", "front", "resume"]).exit_code, Some(0));
     let next = zones.await_line("what comes after it", |line| {
-        // A silence that the client notices has no number.
+        // When the client itself detects a silence, the line has no `topic_seq`.
         line["class"] == "zones" && line["topic_seq"].as_u64() > unknown["topic_seq"].as_u64()
     });
     assert_eq!(number(&next, "topic_seq"), number(&unknown, "topic_seq") + 1);
@@ -115,7 +114,7 @@ fn silence_is_published_once_also_for_late_joiners() {
     let absent = env.await_info("front", |info| info["state"] == "absent");
     let line = await_silence_sample(&env);
     let last = scans.end(INT).of_class("scan").pop().expect("a scan");
-    // It belongs to the last telegram and is published later.
+    // The sample has the `seq` of the last telegram and a later stamp.
     assert!(number(&line, "seq") >= number(&last, "seq"), "{line}");
     assert!(number(&line, "stamp_ns") > number(&last, "stamp_ns"), "{line}");
     assert_eq!(absent["last_error"].as_str().map(str::is_empty), Some(false));
@@ -126,8 +125,8 @@ fn background_can_be_saved_frozen_reset_and_loaded() {
     let env = TestEnv::new();
     let _hub = env.hub(&[env.link("front"), "--set=background.scans=20".into()]);
     let mut generations = env.echo(&["front/background"]);
-    // A wall without people, learned in a second. A subscriber that a busy machine runs too late misses the sample in
-    // which nothing is learned yet; the second generation is frozen in that state.
+    // World with a wall and no people, learned in a second. A subscriber that starts too late on a busy machine misses
+    // the first, empty sample. The second generation is frozen while it is empty.
     let _simulator = env.simulator(&["front"], &["--seed=52", "--baud=500000", "--world=bare"]);
     let first = generations.await_line("the first generation", is_class("background"));
     assert_eq!((number(&first, "generation"), number(&first, "count")), (0, 361), "{first}");
@@ -142,7 +141,7 @@ fn background_can_be_saved_frozen_reset_and_loaded() {
     background_accepted(&env, &["reset"]);
     let second = generations.await_line("the second generation", |line| line["generation"] == 1);
     assert_eq!((number(&second, "generation"), number(&second, "known_beams")), (1, 0), "{second}");
-    // Frozen, it learns nothing however many scans come.
+    // While the background is frozen, scans do not change it.
     let scans = env.run(&["echo", "--json", "front/foreground", "-n", "60"]);
     assert!(scans.of_class("foreground").iter().all(|line| number(line, "generation") == 1), "{scans}");
     assert_eq!(number(&model(&env), "known_beams"), 0);
@@ -155,7 +154,7 @@ fn background_can_be_saved_frozen_reset_and_loaded() {
     background_accepted(&env, &["thaw"]);
     assert_eq!(model(&env)["frozen"], false);
 
-    // One of another resolution, and one of another unit.
+    // Models with another resolution or another unit are rejected.
     for (key, value, words) in [
         (
             "unit_mm",
@@ -186,13 +185,13 @@ fn background_can_be_saved_frozen_reset_and_loaded() {
     }
     assert_eq!(number(&model(&env), "generation"), 2);
     let outcome = generations.end(INT);
-    // One comes again after each 20 scans that it learned from.
+    // The hub publishes a generation again after every 20 scans that it learned from.
     let lines = outcome.of_class("background");
     let mut received: Vec<u64> = lines.iter().map(|line| number(line, "generation")).collect();
     received.dedup();
     assert_eq!(received, [0, 1, 2]);
 
-    // And it is what a hub may begin with.
+    // A hub can also start with a saved background.
     drop(_hub);
     let _hub = env.hub(&[env.link("front"), format!("--set=link.front.background.start={file}")]);
     let at_start = env.echo(&["front/background"]).await_line("the model", is_class("background"));
@@ -241,7 +240,7 @@ fn recording_has_zones_and_a_controllable_background() {
         (number(&shown, "generation"), number(&shown, "count"), &shown["frozen"]),
         (1, 361, &true.into())
     );
-    // A recording says nothing of reflectors: it is one of mode 00h.
+    // The recording has mode 00h, which does not report reflectors.
     let marks = env.run(&["echo", "--json", "front/marks", "-n", "1"]);
     assert_eq!(marks.of_class("marks")[0]["available"], false, "{marks}");
 }
@@ -250,13 +249,14 @@ fn recording_has_zones_and_a_controllable_background() {
 fn the_scans_of_a_slow_recording_follow_each_other() {
     let env = TestEnv::new();
     let ranges = vec!["2.0"; 181].join(" ");
-    // Ten a second, once a long break: the sensor alone would be silent after a twentieth of one.
+    // Ten scans per second and one pause of 0.9 s. A live sensor would be silent after a twentieth of such a pause.
     let at_s = |scan: usize| 10.0 + 0.1 * scan as f64 + if scan < 6 { 0.0 } else { 0.9 };
     let line = |at_s: f64| format!("FLASER 181 {ranges} 0 0 0 0 0 0 {at_s} host {at_s}\n");
     let log: String = (0..12).map(at_s).map(line).collect();
     let _hub = env.hub(&["--link", &format!("front=file:{}", env.file("log", log))]);
     env.await_info("front", |info| info["state"] == "silent");
-    // At its end it is silent like any sensor. Before it nothing was said but the first word and twelve verdicts.
+    // At its end the sensor is silent, like any other. Before that, there were only the first sample and twelve
+    // verdicts.
     let mut last = Value::Null;
     wait_until("the hub's word", || {
         last = env.run(&["echo", "--json", "front/zones", "-n", "1"]).lines()[0].clone();
@@ -282,7 +282,7 @@ fn bad_pose_or_circles_are_rejected_with_position() {
         assert_eq!((outcome.exit_code, outcome.stdout.is_empty()), (Some(78), true), "{outcome}");
         assert!(outcome.stderr.contains(words), "{words}: {outcome}");
     }
-    // Where the sensor sits is told to who asks.
+    // `info` reports the sensor's pose.
     let set = ["link.front.pose.x=0.3", "link.front.pose.yaw=1.5", "link.front.pose.upside_down=true"];
     let set = set.map(|flag| format!("--set={flag}"));
     let _hub = env.hub(&[&[env.link("front")][..], &set].concat());

@@ -1,5 +1,6 @@
-//! Programs in Python and in C that publish the angles of a mount: whoever follows them gets what those in Rust send, is woken,
-//! and sees one that was killed come back. A name has one publisher, in whatever language.
+//! Tests of Python and C programs that publish the angles of a mount. Subscribers receive the same samples as from Rust
+//! programs, are woken, and continue when a killed publisher is restarted. A name has one publisher, whatever its
+//! language.
 
 use std::io::{PipeWriter, Write};
 use std::process::Command;
@@ -13,7 +14,7 @@ use crate::client_c::installed::{InstalledLibrary, source};
 use crate::python::check_on;
 use crate::testkit::{KILL, Outcome, Program, TestEnv, exists_or_is_symlink, is_class, wait_until};
 
-/// A program that publishes `mount/tilt`, and the end of the pipe at which it is told what.
+/// A program that publishes `mount/tilt`, and the pipe through which it receives the angles.
 pub(crate) struct TestPublisher {
     program: Program,
     commands: PipeWriter,
@@ -25,28 +26,28 @@ impl TestPublisher {
         TestPublisher { program: Program::start_with(command, stdin), commands }
     }
 
-    /// One that publishes already.
+    /// Starts `command` and waits until it publishes.
     pub(crate) fn start_and_publish(command: Command) -> TestPublisher {
         let mut mount = TestPublisher::start(command);
         mount.program.await_line("it publishes", is_class("open"));
         mount
     }
 
-    /// Has it send an angle with its stamp, and waits until that is done.
+    /// Sends an angle with its stamp to the program, and waits until it has published it.
     pub(crate) fn send(&mut self, tilt: &Tilt, stamp_ns: u64) {
         let Tilt { angle_rad, rate_rad_s } = tilt;
         writeln!(self.commands, "{angle_rad} {rate_rad_s} {stamp_ns}").expect("it reads");
         self.program.await_line("it was sent", is_class("sent"));
     }
 
-    /// It ends by itself, because nobody tells it anything more.
+    /// Closes the program's standard input and waits until it ends.
     pub(crate) fn end(self) -> Outcome {
         drop(self.commands);
         self.program.wait()
     }
 }
 
-/// How one that publishes under a name is started, in each language that this machine has.
+/// Returns a function for each language available on this machine. It returns the command that publishes under a name.
 pub(crate) fn languages(env: &TestEnv) -> Vec<impl Fn(&str) -> Command + use<'_>> {
     let python = check_on(env, "publish").is_some().then_some(None);
     let c = InstalledLibrary::installed()
@@ -65,7 +66,7 @@ pub(crate) fn languages(env: &TestEnv) -> Vec<impl Fn(&str) -> Command + use<'_>
     starts.collect()
 }
 
-/// A place that somebody else holds, so that it lives.
+/// Takes the domain's place of a listener, so that the domain stays in use.
 fn listener(env: &TestEnv) -> PublishSession {
     PublishSession::open(&env.domain(), &[Topic::Marks], TopicLimits::default()).expect("nobody else")
 }
@@ -161,7 +162,7 @@ fn a_name_has_one_publisher_in_all_languages() {
             (ErrorKind::NameHeld, refused(mount.program.pid()))
         );
         assert_eq!(mount.end().exit_code, Some(0));
-        // It is free at once.
+        // The name is free at once.
         let in_rust = other_publisher().expect("the name is free");
         for other in &starts {
             let outcome = TestPublisher::start(other("mount")).program.wait();
@@ -177,7 +178,8 @@ fn a_name_has_one_publisher_in_all_languages() {
     }
 }
 
-/// Who has settled how the names of shared memory begin has joined as well, before another one that ends looks who is there.
+/// A publisher joins while it holds the lock that settles the prefix of shared memory. Another publisher that leaves at
+/// the same time therefore sees it and does not remove the prefix.
 #[test]
 fn publisher_is_visible_while_another_one_leaves() {
     let env = TestEnv::new();
@@ -223,7 +225,7 @@ fn subscribers_survive_a_killed_publisher() {
             assert_eq!(mount.program.end(KILL).exit_code, None);
         }
         drop((subscriber, listener));
-        // The last one of all takes everything along, also what the dead have left.
+        // The last publisher removes everything, including files that killed publishers left.
         assert_eq!(TestPublisher::start_and_publish(start("mount")).end().exit_code, Some(0));
         assert_eq!(env.leftover_files(), Vec::<std::path::PathBuf>::new());
         assert!(!exists_or_is_symlink(&env.domain().root().join("prefix")), "the next one has other names");

@@ -1,5 +1,6 @@
-//! The Python package next to a hub. Scripts check what only Python can see, and the tests compare the samples that they follow
-//! with those of `echo`. The tests skip if there is no Python with a package of these sources.
+//! Tests of the Python package next to a hub. Python scripts check properties that are visible only in Python, and the
+//! tests compare their samples with those of `echo`. The tests skip if no Python has a package built from these
+//! sources.
 
 mod read;
 
@@ -17,7 +18,7 @@ use scanhub_schema::{Header, Status, Topic, Verdict, Zones};
 use scanhub_shm::{HubLock, Node, Payload, PortFactory, WakeSender};
 use serde_json::{Value, json};
 
-/// A script of the package's tests, if there is a Python for it.
+/// Returns the command for a script of the package's tests, or `None` if no suitable Python is installed.
 fn check(name: &str) -> Option<Command> {
     let mut command = client_python()?;
     let scripts = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/python/tests");
@@ -25,7 +26,7 @@ fn check(name: &str) -> Option<Command> {
     Some(command)
 }
 
-/// The same with the environment's domain and root as its first arguments.
+/// Like [`check`], with the domain and the root of `env` as first arguments.
 pub(crate) fn check_on(env: &TestEnv, name: &str) -> Option<Command> {
     let mut command = check(name)?;
     let domain = env.domain();
@@ -80,7 +81,7 @@ fn refuses_impossible_subscriptions() {
     assert_success(command);
 }
 
-/// Starts a hub of `front` without a link. The test creates its topics.
+/// Takes the lock of a hub and creates the doorbell of `front`. The test creates the topics.
 fn hub_without_sensors(env: &TestEnv) -> (HubLock, Node, WakeSender) {
     let lock = HubLock::acquire(env.domain().root()).expect("no hub runs");
     let node = scanhub_shm::hub_node(&env.domain()).expect("a node");
@@ -113,7 +114,8 @@ fn notice_that_raises_loses_no_sample() {
     wait_until("the subscriber", || service.dynamic_config().number_of_subscribers() == 1);
     lines.write_all(b"\n").expect("it reads");
     script.await_line("it waits", is_class("waits"));
-    // The sample wakes no subscriber. So the look that notices the end of the hub also finds the sample.
+    // The sample does not wake the subscriber. The check that detects the end of the hub therefore also finds the
+    // sample.
     let mut sample = publisher.loan().expect("memory");
     *sample.user_header_mut() = Header { topic_seq: 7, ..Header::default() };
     *sample.payload_mut() = Status::default();
@@ -132,7 +134,7 @@ fn names_of_their_own_come_and_go() {
     assert_eq!(env.leftover_files(), Vec::<std::path::PathBuf>::new());
 }
 
-/// As a user without Rust and without a network.
+/// Simulates a user without Rust and without a network.
 #[test]
 fn wheel_installs_without_compiler_and_network() {
     let Some(python) = client_python() else { return };
@@ -239,7 +241,8 @@ fn samples_equal_those_of_echo() {
     }
 }
 
-/// Whether `echo` said the same of the sample; what it said otherwise fails. A status and a background have no number.
+/// Returns whether `echo` printed `sample` too. Fails if `echo` printed it differently. Lines of a status or a
+/// background have no `topic_seq`, so they count only if all keys match.
 fn is_printed_by(echo: &[Value], sample: &Value) -> bool {
     let is_numbered = |line: &Value| line.get("topic_seq").is_some();
     let same = |line: &&Value| line["topic_seq"] == sample["topic_seq"] && line["boot"] == sample["boot"];
@@ -247,7 +250,7 @@ fn is_printed_by(echo: &[Value], sample: &Value) -> bool {
         return echo.iter().any(|line| different_keys(line, sample).is_empty());
     }
     let Some(line) = echo.iter().find(same) else { return false };
-    // Each of the two decides by itself whether a verdict is stale, and then shows nothing of it.
+    // `echo` and the script each decide whether a verdict is stale. A stale verdict has no values.
     let of_verdict = ["verdict", "nearest_mm", "nearest_beam", "zones", "invalid_beams", "stale"];
     let is_stale = [line, sample].iter().any(|line| line["stale"] == true);
     let mut differing = different_keys(line, sample);
@@ -256,10 +259,10 @@ fn is_printed_by(echo: &[Value], sample: &Value) -> bool {
     true
 }
 
-/// The keys of `line` that `sample` has not, or otherwise.
+/// Returns the keys of `line` that are missing or different in `sample`.
 fn different_keys<'a>(line: &'a Value, sample: &Value) -> Vec<&'a String> {
     let keys = line.as_object().expect("an object").keys();
-    // Derived from the mode: what the package offers is the mode itself.
+    // `marks` is derived from the mode. The package offers the mode itself.
     keys.filter(|key| *key != "marks" || line["class"] == "marks")
         .filter(|key| line[*key] != sample[*key])
         .collect()
@@ -285,7 +288,7 @@ fn a_subscription_outlives_several_hubs() {
     let Some(mut command) = check_on(&env, "follow") else { return };
     command.args(["front/scan", "front/telegram", "front/zones"]);
     let _simulator = env.simulator(&["front"], &["--seed=62", "--baud=500000"]);
-    // It is there before its hub is.
+    // The subscriber starts before the hub.
     let mut subscriber = Program::start(command);
     let mut hub = env.hub(&[env.link("front")]);
     subscriber.await_line("hub_back", |line| line["kind"] == "hub_back");
@@ -309,7 +312,7 @@ fn a_subscription_outlives_several_hubs() {
             let boot = line["boot"].as_str().expect("a life").to_owned();
             let lines_of_run = runs.entry(boot).or_default();
             let python = &line["python"];
-            // Who was there before the hub got its samples from the first one on.
+            // A subscriber that waits for a hub receives its samples from the first one on.
             let next = lines_of_run.last().map_or(0, |last| number(last, "topic_seq") + 1);
             let is_first_hub = outcome.of_class(topic)[0]["boot"] == line["boot"];
             assert_eq!(python["restarted"], lines_of_run.is_empty() && !is_first_hub, "{line}");
@@ -322,7 +325,8 @@ fn a_subscription_outlives_several_hubs() {
     }
 }
 
-/// The worst of its sensors, of which one is switched off, then the hub killed: nothing stays clear by itself.
+/// Compares the combined verdict while one sensor is switched off and then the hub is killed: it never stays clear
+/// without data.
 #[test]
 fn a_robot_is_as_unknown_as_its_worst_sensor() {
     let env = TestEnv::new();
@@ -338,7 +342,7 @@ fn a_robot_is_as_unknown_as_its_worst_sensor() {
     let rear =
         env.start(&["simulate", "--json", "--baud=500000", &format!("--port={}", env.path_argument("rear"))]);
     let rear = rear.ready();
-    // All is clear: nothing in the simulated room is so near.
+    // The verdict is clear, because the simulated room has no object within these radii.
     let hub = env.hub(&[&env.link("front"), &env.link("rear"), "--set=zones.radii=[0.02,0.01]"]);
     let are = |verdict: &'static str, front: &'static str, rear: &'static str| {
         move |line: &Value| {
@@ -347,7 +351,7 @@ fn a_robot_is_as_unknown_as_its_worst_sensor() {
     };
     for subscriber in &mut subscribers {
         let line = subscriber.await_line("all is clear", are("clear", "clear", "clear"));
-        // Both are equally clear. A follower of all sensors may find either one first.
+        // Both sensors are equally clear. A subscriber of all sensors may find either one first.
         let is_sensor = |key: &str| ["front", "rear"].contains(&line[key].as_str().unwrap_or_default());
         assert!(is_sensor("worst") && is_sensor("nearest_sensor") && line["nearest_mm"].is_u64(), "{line}");
         subscriber
@@ -382,7 +386,7 @@ fn robot_without_a_hub_uses_remote_sensors() {
             move |line: &Value| line["verdict"] == verdict && line["sensors"] == json!({ sensor: verdict })
         };
         robot.await_line("nobody was heard", are("unknown", "robot1.front"));
-        // A verdict that a client reads too late is unknown to it.
+        // A client reports `unknown` for a verdict that it reads too late.
         wait_until("clear", || {
             front.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
             robot.prints(are("clear", "robot1.front"))
@@ -391,7 +395,7 @@ fn robot_without_a_hub_uses_remote_sensors() {
             let last = robot.last_printed(is_class("robot"));
             last.is_some_and(|line| are("unknown", "robot1.front")(&line))
         });
-        // One who always finds something that is sent from elsewhere, too.
+        // A second subscriber queries the current verdict on request and also has to find the remote sensor.
         let mut command = check_on(&env, "robot").expect("as before");
         command.arg("--asked");
         let (stdin, mut ask) = std::io::pipe().expect("a pipe");
@@ -402,7 +406,7 @@ fn robot_without_a_hub_uses_remote_sensors() {
             busy.await_line("what it knows", is_class("now"))["sensors"].clone()
         };
         wait_until("the other machine's", || query_sensors(&mut busy).get("robot1.front").is_some());
-        // A hub has sensors of its own, and when it goes nobody stands in for them.
+        // A hub has its own sensors. When it exits, remote sensors do not replace them.
         let _simulator = env.simulator(&["front"], &["--seed=65", "--baud=500000"]);
         let hub = env.hub(&[&env.link("front"), "--set=zones.radii=[0.02,0.01]"]);
         wait_until("the hub's own", || query_sensors(&mut busy) == json!({"front": "clear"}));
@@ -413,7 +417,7 @@ fn robot_without_a_hub_uses_remote_sensors() {
         assert_eq!(hub.end(KILL).exit_code, None);
         robot.await_line("the hub is gone", are("unknown", "front"));
         let mut named = env.start(&["echo", "--json", "robot1.front/zones"]);
-        // A verdict that a client reads too late is unknown to it.
+        // A client reports `unknown` for a verdict that it reads too late.
         wait_until("whom one names is heard", || {
             front.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
             named.prints(|line| line["verdict"] == "clear")
@@ -425,7 +429,7 @@ fn robot_without_a_hub_uses_remote_sensors() {
     });
 }
 
-/// Ctrl-C ends it at once, as any program in Python.
+/// Interrupts a script and asserts that it ends at once, as any Python program does on Ctrl-C.
 fn ended_by_interrupt(subscriber: Program) -> Outcome {
     let outcome = subscriber.end(INT);
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");

@@ -1,4 +1,4 @@
-//! A port that goes away and comes back under its name while the hub and its consumers run on.
+//! Tests of a port that disappears and comes back under its name while the hub and its subscribers run.
 
 use crate::testkit::{
     INT, Program, REAL_REPLY_TIME, TERM, TestEnv, TestLine, bytes_of, contiguous_numbers,
@@ -25,12 +25,12 @@ fn a_sensor_that_goes_and_comes_back() {
     assert_eq!(number(&info["counters"], "reconnects"), 1, "{info}");
     assert_eq!(info["last_error"], "");
     let outcome = subscriber.end(INT);
-    // One hub, one life: the numbers go on.
+    // Within one run of the hub, the sequence numbers continue.
     contiguous_numbers(&outcome.of_class("scan"), "topic_seq");
     assert_eq!(hub.end(TERM).exit_code, Some(0));
 }
 
-/// Sends telegrams until the consumer has one, with numbers of their own.
+/// Sends a scan and waits until the subscriber has received it. `seed` distinguishes the scans.
 fn stream(line: &TestLine, subscriber: &mut Program, seed: u16) {
     let scan = scan(seed);
     line.wait_until_open();
@@ -45,10 +45,11 @@ fn reopens_a_port_by_name_on_each_new_device() {
     let port = env.path("front");
     let hub = env.hub(&[env.lms_link("front")]);
     let mut subscriber = env.echo(&["front/telegram", "front/status"]);
-    // Another pty each time: the one before is still there when the next one is made.
+    // Each device is another pty: the previous one still exists when the next one is created.
     let mut line = TestLine::create(&port);
     for plugged in 1..=5 {
-        // When the hub opens a line, it discards what has already arrived. It sends its first request after that.
+        // When the hub opens a line, it discards bytes that have already arrived. It sends its first request after
+        // that.
         line.wait_for_request();
         stream(&line, &mut subscriber, plugged);
         std::fs::remove_file(&port).expect("the name is there");
@@ -79,7 +80,7 @@ fn a_name_that_moves_while_its_old_device_lives() {
     stream(&old, &mut subscriber, 1);
     std::fs::remove_file(&port).expect("the name is there");
     let new = TestLine::create(&port);
-    // What streams is not left for what may stream.
+    // The hub keeps a port that streams, even though its name belongs to another device.
     stream(&old, &mut subscriber, 2);
     assert!(!new.is_open());
     drop(old);
@@ -92,7 +93,7 @@ fn a_port_that_comes_back_in_other_hands() {
     let port = env.path("front");
     let hub = env.hub(&[env.lms_link("front")]);
     env.await_info("front", |info| info["state"] == "absent");
-    // This test holds it before it has its name.
+    // The test holds a lock on the device before it gets its name.
     let line = TestLine::create(&env.path("elsewhere"));
     let holder = std::fs::File::open(env.path("elsewhere")).expect("a tty");
     flock(&holder, FlockOperation::LockExclusive).expect("a lock");

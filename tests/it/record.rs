@@ -1,4 +1,5 @@
-//! `scanhub record`: everything that the hub published while it ran is in the file, however it was ended, and others read it.
+//! Tests of `scanhub record`: the file has everything that the hub published meanwhile, however the recorder was ended,
+//! and other readers can read it.
 
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::path::Path;
@@ -10,7 +11,7 @@ use crate::testkit::{
 };
 use serde_json::Value;
 
-/// Two sensors that stream.
+/// Starts two sensors and waits until both stream.
 fn sensors(env: &TestEnv, flags: &[&str]) -> [Program; 2] {
     let simulator = env.simulator(&["front", "rear"], flags);
     let hub = env.hub(&[env.link("front"), env.link("rear")]);
@@ -20,7 +21,7 @@ fn sensors(env: &TestEnv, flags: &[&str]) -> [Program; 2] {
     [simulator, hub]
 }
 
-/// A recorder of these flags into `walk.mcap`, of which `count` samples are written at least.
+/// Starts a recorder with these flags that writes `walk.mcap`, and waits until it has written at least `count` samples.
 fn start_recorder(env: &TestEnv, flags: &[&str], count: u64) -> Program {
     let file = env.path_argument("walk.mcap");
     let mut recorder = env.start(&[&["record", "--json", "-o", &file], flags].concat());
@@ -32,7 +33,7 @@ fn await_samples(recorder: &mut Program, count: u64) -> Value {
     recorder.await_line("samples", |line| line["class"] == "recording" && number(line, "samples") >= count)
 }
 
-/// The last line, which says that it came to its end.
+/// Asserts that the recorder ended successfully, and returns its last line.
 fn recorder_summary(outcome: &Outcome) -> Value {
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let lines = outcome.lines();
@@ -74,7 +75,7 @@ fn records_each_sample_exactly_once() {
                 (message.topic_seq() as u32, "scanhub.Telegram.v2")
             );
         }
-        // What came from one telegram has its time.
+        // Samples that are derived from one telegram have its log time.
         let times: BTreeMap<_, _> =
             telegrams.iter().map(|message| (message.seq(), message.log_time)).collect();
         let marks = recording.of(&format!("{sensor}/marks"));
@@ -149,7 +150,7 @@ fn killed_recorder_keeps_all_reported_samples() {
     assert_eq!(run_reader(python)["messages"], recording.messages.len());
 }
 
-/// What the reader of other people, which `python` starts, says.
+/// Runs `python` with an independent MCAP reader and returns its output.
 fn run_reader(mut python: std::process::Command) -> Value {
     let outcome = output(python.current_dir(env!("CARGO_MANIFEST_DIR"))).unwrap();
     assert!(outcome.status.success(), "{}", String::from_utf8_lossy(&outcome.stderr));
@@ -163,7 +164,7 @@ fn recording_continues_after_a_restart_of_the_hub() {
     let mut recorder = start_recorder(&env, &["*/telegram"], 30);
     assert_eq!(hub.end(KILL).exit_code, None);
     recorder.await_line("hub_gone", |line| line["kind"] == "hub_gone");
-    // It has another sensor than before, which is recorded, too.
+    // The next hub has another sensor, which is recorded too.
     let other = env.hub(&[env.link("front"), env.link("rear").replace("rear=", "back=")]);
     recorder.await_line("hub_back", |line| line["kind"] == "hub_back");
     env.await_info("back", |info| info["state"] == "streaming");
@@ -221,7 +222,7 @@ fn refuses_impossible_outputs_and_topics() {
     }
     assert_eq!(kind(&["robot/zones"]), (Some(2), "usage".into()));
     assert_eq!(kind(&["front/scam"]), (Some(2), "usage".into()));
-    // Nothing came, nothing stays.
+    // Without samples, no file remains.
     let new = env.path_argument("new.mcap");
     assert_eq!(kind(&["-o", &new, "--for", "5s"]), (Some(3), "no_hub".into()));
     assert!(!Path::new(&new).exists());

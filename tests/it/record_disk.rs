@@ -1,5 +1,5 @@
-//! `scanhub record` on disks that are full, gone, slow or too small: no live topic loses a sample to them, what can be held
-//! is not lost either, and what is missing is said and seen in the file.
+//! Tests of `scanhub record` on disks that are full, removed, slow or too small. Live topics lose no samples. The
+//! recorder keeps as much as it can hold, and reports gaps both in its output and in the file.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -15,7 +15,7 @@ use crate::testkit::{
 use rustix::process::Signal;
 use serde_json::Value;
 
-/// A sensor that streams.
+/// Starts a sensor and waits until it streams.
 fn sensor(env: &TestEnv) -> [Program; 2] {
     let simulator = env.simulator(&["front"], &["--world=room"]);
     let hub = env.hub(&[env.link("front")]);
@@ -36,7 +36,7 @@ fn await_samples(recorder: &mut Program, count: u64) {
     samples(recorder, before + count);
 }
 
-/// The files of a run that came to its end, each in its order.
+/// Asserts that the recorder ended successfully, and returns its files in their order.
 fn files(outcome: &Outcome) -> Vec<PathBuf> {
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let end = outcome.of_class("recorded").pop().unwrap_or_else(|| panic!("{outcome}"));
@@ -44,14 +44,14 @@ fn files(outcome: &Outcome) -> Vec<PathBuf> {
     files.map(|file| PathBuf::from(file.as_str().unwrap())).collect()
 }
 
-/// The recorder missed no telegram.
+/// Asserts that the recorder missed no telegram.
 fn nothing_missed(outcome: &Outcome) {
     let lines = outcome.of_class("summary");
     let telegrams = lines.iter().find(|line| line["topic"] == "telegram").expect("a summary");
     assert_eq!(number(telegrams, "missed"), 0, "{telegrams}");
 }
 
-/// The telegrams of several files, none of which is missing or there twice.
+/// Returns the telegrams of several files, and asserts that none is missing or duplicated.
 fn telegrams(recordings: &[Recording]) -> Vec<&RecordedMessage> {
     let all: Vec<_> = recordings.iter().flat_map(|recording| recording.of("front/telegram")).collect();
     contiguous_topic_seqs(&all);
@@ -73,14 +73,14 @@ fn splits_a_recording_and_keeps_the_last_files() {
     assert_eq!(files[0], env.path("walk-0001.mcap"));
     let (removed, stay) = files.split_at(files.len() - 3);
     assert!(removed.iter().all(|file| !file.exists()), "{files:?}");
-    // A machine that has no time for the recorder makes one chunk of what came meanwhile.
+    // A recorder that a busy machine delays writes everything that has arrived as one chunk.
     let lengths: Vec<_> = stay.iter().map(|file| fs::metadata(file).unwrap().len()).collect();
     assert!(lengths.iter().all(|length| *length <= 160 << 10), "{lengths:?}");
     assert!(lengths.iter().filter(|length| **length <= 128 << 10).count() > 1, "{lengths:?}");
     let recordings: Vec<_> = stay.iter().map(|file| Recording::read_complete(file)).collect();
     let expected = |number: usize| (files.len() - 3 + number).to_string();
     for (number, recording) in recordings.iter().enumerate() {
-        // So that it can be played alone.
+        // Each file begins with the status, so that it can be replayed alone.
         assert_eq!(recording.messages[0].topic, "front/status");
         assert_eq!(recording.metadata("scanhub")[0]["part"], expected(number + 1));
         assert_eq!(recording.metadata("scanhub.life").len(), 1);
@@ -111,7 +111,7 @@ fn keeps_the_last_files_of_all_runs_when_forced() {
     });
     assert_eq!(removed, [0, 0, 1]);
     assert_eq!(names(), ["walk-0002.mcap", "walk-0003.mcap"]);
-    // A file that another recorder writes stays, and does not count.
+    // A file that another recorder writes stays and does not count.
     let mut other = env.start(&["record", "--json", "--force", "-o", &env.path_argument("walk-0001.mcap")]);
     await_samples(&mut other, 10);
     fs::write(env.path("walk-0000.mcap"), "my notes").unwrap();
@@ -125,7 +125,7 @@ fn keeps_the_last_files_of_all_runs_when_forced() {
     let all = ["walk-0000.mcap", "walk-0001.mcap", "walk-0003.mcap", "walk-0004.mcap"];
     assert_eq!(names(), all);
     files(&other.end(INT));
-    // A run that records nothing removes nothing, and neither does one that is refused.
+    // A run that records no samples removes no files, and neither does one that is refused.
     assert_eq!(hub.end(INT).exit_code, Some(0));
     assert_eq!(env.run(&[&words[..], &["-n", "50"]].concat()).exit_code, Some(3));
     assert_eq!(env.run(&["record", "--split=1h", "--keep=2", "-o", &file]).exit_code, Some(73));
@@ -144,7 +144,7 @@ fn a_file_that_may_not_grow_is_followed_by_another() {
     let outcome = recorder.end(INT);
     let files = files(&outcome);
     assert_eq!(files[..2], [env.path("walk.mcap"), env.path("walk-0002.mcap")]);
-    // There is no room for the index of any but the last one.
+    // Only the last file has room for its index.
     let recordings: Vec<_> = files.iter().map(|file| Recording::read_interrupted(file)).collect();
     nothing_missed(&outcome);
     assert!(telegrams(&recordings).len() > 50);
@@ -167,7 +167,7 @@ fn a_directory_that_vanishes_is_waited_for() {
     await_samples(&mut recorder, 20);
     let outcome = recorder.end(INT);
     assert_eq!(files(&outcome)[1], place.join("walk-0002.mcap"));
-    // What was written until it was seen is where the directory is now.
+    // The samples that were written before the recorder noticed are in the renamed directory.
     let places = [env.path("unplugged/walk.mcap"), place.join("walk-0002.mcap")];
     let recordings = [Recording::read_interrupted(&places[0]), Recording::read_complete(&places[1])];
     nothing_missed(&outcome);
@@ -190,7 +190,7 @@ fn a_full_disk_is_waited_for() {
     let mut recorder =
         start_in(&env, &["unshare", "-rm", "sh", "-c", &script, "sh"], &["record", "--json", "-o", &file]);
     recorder.await_line("a failed write", is_kind("write_failed"));
-    // As the recorder sees it.
+    // Path of the file system in the recorder's mount namespace.
     let path_in_namespace = PathBuf::from(format!("/proc/{}/root{}", recorder.pid(), place.display()));
     let full = Recording::read_interrupted(&path_in_namespace.join("walk.mcap"));
     assert!(!full.of("front/telegram").is_empty(), "it ends behind a whole chunk");
@@ -200,7 +200,7 @@ fn a_full_disk_is_waited_for() {
     wait_until("it goes on", || {
         Recording::read_interrupted(&path_in_namespace.join("walk.mcap")).messages.len() > before
     });
-    // It ends with the file system that it is in.
+    // The file system ends with its namespace, so open the file before the recorder ends.
     let mut open = fs::File::open(path_in_namespace.join("walk.mcap")).unwrap();
     let outcome = recorder.end(INT);
     assert_eq!(files(&outcome).len(), 1);
@@ -215,7 +215,8 @@ fn counts_samples_dropped_because_of_a_slow_output() {
     let env = TestEnv::new();
     let stream: Vec<u8> = (0..40_000_u32).flat_map(|seed| scan((seed % 8000) as u16)).collect();
     env.file("stream", stream);
-    // A pipe that nobody reads: as slow as a disk can be. Held open so that the shell need not wait for its reader.
+    // A pipe without a reader, as the slowest possible disk. It is open for reading here, so that the shell can open it
+    // at once.
     let pipe = env.path("pipe");
     assert!(succeeds(Command::new("mkfifo").arg(&pipe)));
     let open = fs::File::options().read(true).write(true).open(&pipe).unwrap();
@@ -225,7 +226,7 @@ fn counts_samples_dropped_because_of_a_slow_output() {
     recorder.await_line("its begin", is_class("recording"));
     let mut reader = fs::File::open(&pipe).unwrap();
     drop(open);
-    // Again and again: a busy machine may lose most samples before the recorder can receive them.
+    // Replay in a loop, because a busy machine may lose most samples before the recorder can receive them.
     let stream = env.path_argument("stream");
     let words = ["replay", "--json", "--no-system-config", "--loop", "--rate=max", &stream];
     let _hub = env.start(&words).ready();
@@ -252,7 +253,7 @@ fn counts_samples_dropped_because_of_a_slow_output() {
 fn signals_that_come_together_are_one() {
     let env = TestEnv::new();
     let _others = sensor(&env);
-    // So little room that it waits for who reads, also at its end.
+    // The pipe is so small that the recorder waits for its reader, even at its end.
     let pipe = env.path("pipe");
     assert!(succeeds(Command::new("mkfifo").arg(&pipe)));
     let open = fs::File::options().read(true).write(true).open(&pipe).unwrap();
@@ -264,8 +265,8 @@ fn signals_that_come_together_are_one() {
     drop(open);
     wait_until("it receives", || env.subscribers("front/status") > 0);
     recorder.await_lines(2, "its progress", is_class("recording"));
-    // The recorder cannot handle the first one before the last one was sent. How far apart signals of one request may be is
-    // tested without a clock, in the crate `verbs`.
+    // The recorder cannot handle the first signal before the last one was sent. The crate `verbs` tests without a clock
+    // how far apart signals of one request may be.
     recorder.signal(Signal::STOP);
     wait_until("it is stopped", || recorder.is_stopped());
     [INT, TERM, HUP, Signal::QUIT].into_iter().for_each(|signal| recorder.signal(signal));
@@ -312,7 +313,7 @@ fn recorder_fails_if_its_reader_closes_the_pipe() {
         spawn(command.stdin(Stdio::null()).stdout(writer).stderr(Stdio::piped())).unwrap()
     };
     refused(begin(&[], writer).wait_with_output().unwrap());
-    // A connection that breaks in the middle of it looks the same.
+    // A connection that breaks during the recording looks the same.
     let _others = sensor(&env);
     let (mut reader, writer) = io::pipe().unwrap();
     let recorder = begin(&["--for=60s"], writer);
@@ -342,7 +343,7 @@ fn samples_of_a_file_that_was_removed_are_not_counted() {
     let repeated = 1;
     assert_eq!(number(&end, "samples") + repeated, next.messages.len() as u64, "{outcome}");
     assert_eq!(number(&end, "bytes"), fs::metadata(env.path("walk-0002.mcap")).unwrap().len());
-    // One that is removed at the very end, too.
+    // A file that is removed at the very end counts too.
     let mut recorder = env.start(&["record", "--json", "--force", "-o", &file]);
     await_samples(&mut recorder, 20);
     fs::remove_file(&file).unwrap();
@@ -367,7 +368,7 @@ fn two_recorders_do_not_write_one_file() {
     telegrams(&[Recording::read_complete(Path::new(&file))]);
 }
 
-/// The program, started by other words before its own.
+/// Starts the program with the command `before` in front of it.
 fn start_in(env: &TestEnv, before: &[&str], arguments: &[&str]) -> Program {
     let program = env.command(arguments);
     let mut command = Command::new(before[0]);

@@ -1,5 +1,5 @@
-//! What sensors see of a world as a hub would have recorded it: stamped when it was measured, in no time, however busy the machine
-//! of the test is.
+//! Recordings of simulated sensors with the stamps of a hub, computed without a wait and independent of the load of the
+//! machine.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -14,17 +14,17 @@ use scanhub_sim::world::World;
 
 use crate::testkit::TestEnv;
 
-/// When the world begins, by the wall clock.
+/// Start of the world on the wall clock, in ns.
 pub(crate) const START_NS: u64 = 1_700_000_000_000_000_000;
 const TELEGRAM_NS: u64 = 14_640_000;
-/// From one sensor's telegram to that of the next.
+/// Time from one sensor's telegram to that of the next sensor.
 const SENSOR_OFFSET_NS: u64 = 9_000_000;
-/// The sensors are well.
+/// Status byte of a scanner without a fault.
 const STATUS_OK: u8 = 0x10;
 
-/// A file with the telegrams of `sensors`, which look at `world` in its order for so many seconds: 361 beams in millimetres, at
-/// 500,000 baud.
-/// The angles of the first sensor's mount, if it has one, are in it as `mount/tilt`.
+/// Writes a file with the telegrams of `sensors`, each on the port of `world` with its index, for this number of
+/// `seconds`: 361 beams in millimeters, at 500,000 baud. The angles of the first sensor's mount, if it has one, are in
+/// it as `mount/tilt`. Returns the path.
 pub(crate) fn recorded_world(env: &TestEnv, world: &World, sensors: &[&str], seconds: u64) -> String {
     let file = env.path_argument("world.mcap");
     let rooms: Vec<Room> = (0..sensors.len() as u64).map(|port| Room::of_port(world, 5, port)).collect();
@@ -65,7 +65,8 @@ pub(crate) fn recorded_world(env: &TestEnv, world: &World, sensors: &[&str], sec
         }
         let now_ns = 1_000_000_000 + seq * period;
         while let Some(report) = reports.next_if(|report| report.arrival_ns <= now_ns) {
-            // The stamps of the telegrams are this much before the end of their scans.
+            // Stamps of telegrams are earlier than the end of their scans by this time, so shift the stamps of angles
+            // as well.
             let stamp_ns = report.stamp_ns - TELEGRAM_NS;
             let header = Header {
                 seq: angles,

@@ -1,5 +1,5 @@
-//! A hub whose sensor is a recording: every telegram of it is published once and in order, whatever lies between them,
-//! and the link is silent at its end.
+//! Tests of a hub whose port is a recording: it publishes every telegram once and in order, whatever bytes lie between
+//! them, and the link is silent at the end.
 
 use std::path::PathBuf;
 
@@ -9,8 +9,8 @@ use scanhub_drivers::lms;
 use scanhub_drivers::lms::variant::{Mode, Unit};
 use serde_json::Value;
 
-/// Publishes `file` with `option` behind its name to a consumer of `topics` that was there before, so that it gets the
-/// very first sample; returns what it received up to the end of the recording.
+/// Publishes `file`, with `option` appended to its name, to a subscriber of `topics` that started earlier and therefore
+/// receives the very first sample. Returns the outcome of the subscriber and the link's final `info`.
 fn play(env: &TestEnv, file: &str, option: &str, topics: &[&str]) -> (Outcome, Value) {
     let before = env.hub(&["--link=a=/no/such/port"]);
     let mut subscriber = env.echo(topics);
@@ -24,7 +24,7 @@ fn play(env: &TestEnv, file: &str, option: &str, topics: &[&str]) -> (Outcome, V
     (outcome, info)
 }
 
-/// What `info` says when the recording is at its end. Every byte of it is accounted for.
+/// Waits until the recording ends, and returns the link's `info`. Asserts that every byte of it is counted.
 fn await_end(env: &TestEnv) -> Value {
     let info = env.await_info("a", |info| info["state"] == "silent");
     assert_eq!(info["last_error"], "the recording is at its end");
@@ -35,7 +35,7 @@ fn await_end(env: &TestEnv) -> Value {
     info
 }
 
-/// Replies, scans, noise between them and one damaged scan: the bytes, and the telegrams that are to be found.
+/// Returns a stream with replies, scans, noise between them and one damaged scan, and the telegrams to be found in it.
 fn stream(scans: u16) -> (Vec<u8>, Vec<Vec<u8>>) {
     let configuration = lms::reply::configuration_reply(0, Mode(1), Unit::Mm, 0x10).bytes().to_vec();
     let mode = lms::reply::mode_reply(0, true, 0x10).bytes().to_vec();
@@ -46,7 +46,7 @@ fn stream(scans: u16) -> (Vec<u8>, Vec<Vec<u8>>) {
         [configuration, mode].into_iter().chain((0..scans).map(testkit::scan)).enumerate()
     {
         if number == 4 {
-            // Bytes of it are missing.
+            // Some of its bytes are missing.
             bytes.extend([&telegram[..300], &telegram[310..]].concat());
             continue;
         }
@@ -107,7 +107,7 @@ fn ambiguous_values_make_no_scans_until_mode_is_set() {
     let ranges: Vec<_> = outcome.of_class("scan").iter().map(|scan| scan["ranges"][7].clone()).collect();
     assert_eq!(ranges, [8600], "{outcome}");
     assert_eq!(hub.end(INT).exit_code, Some(0));
-    // Where no value has a higher bit there is one way.
+    // If no value has a higher bit, the values are not ambiguous.
     let plain = env.file("plain", testkit::scan(1).repeat(2));
     let (hub, words) = (env.hub(&[&format!("--link=a=file:{plain}")]), "no value has more than 13 bits");
     assert_eq!(await_end(&env)["counters"]["telegrams"], 2);
@@ -121,7 +121,7 @@ fn subscriber_at_start_gets_the_whole_recording() {
     let (bytes, whole) = stream(14);
     let file = env.file("recording", &bytes);
     let hub = env.hub(&[&format!("--link=a=file:{file}?rate=max")]);
-    // It attaches to one topic after the other, well within the second that the hub waits.
+    // The subscriber attaches to its topic well within the second that the hub waits.
     let outcome = env.run(&["echo", "--json", "a/telegram", "-n", &whole.len().to_string(), "--timeout=30s"]);
     check(&outcome, &whole);
     assert_eq!(hub.end(INT).exit_code, Some(0));
@@ -154,7 +154,7 @@ fn the_reflectors_of_a_recording_are_marks() {
 #[test]
 fn as_fast_as_it_can_be_read() {
     let env = TestEnv::new();
-    // No more than a consumer's buffer holds: nobody waits for it.
+    // No more samples than a subscriber's buffer holds, because the hub does not wait for subscribers.
     let (bytes, whole) = stream(14);
     let file = env.file("recording", &bytes);
     let (outcome, info) = play(&env, &file, "?rate=max", &["a/telegram", "a/status"]);
@@ -173,7 +173,7 @@ fn in_the_pace_of_the_sensor() {
     check(&outcome, &whole);
     let scans = outcome.of_class("scan");
     assert_eq!((scans.len(), contiguous_numbers(&scans, "topic_seq")[0]), (whole.len() - 2, 0));
-    // Mode 1, as the reply at its beginning says: 13 bits of range.
+    // Mode 1, as the reply at the start states: 13 bits of range.
     for (scan, telegram) in scans.iter().zip(&whole[2..]) {
         let first = u16::from_le_bytes([telegram[7], telegram[8]]);
         assert_eq!(
@@ -181,7 +181,7 @@ fn in_the_pace_of_the_sensor() {
             (Some(u64::from(first & 0x1FFF)), &1000.into())
         );
     }
-    // 59 periods of 26.64 ms, at the least: a busy machine makes it longer.
+    // At least 59 periods of 26.64 ms. A busy machine takes longer.
     let stamps: Vec<_> = scans.iter().map(|scan| number(scan, "stamp_ns")).collect();
     let span_ms = (stamps[stamps.len() - 1] - stamps[0]) / 1_000_000;
     assert!(span_ms > 1_200, "{span_ms} ms");
@@ -210,7 +210,8 @@ fn a_carmen_log() {
     }
 }
 
-/// Recordings of real sensors, which are not part of the project: SCANHUB_DATA, or beside the project.
+/// Returns the directory with recordings of real sensors, which are not part of the project: `SCANHUB_DATA`, or a
+/// default next to the project. Skips if it does not exist.
 fn data() -> Option<PathBuf> {
     let default_folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
     let place = std::env::var_os("SCANHUB_DATA").map_or(default_folder, PathBuf::from);
@@ -221,7 +222,7 @@ fn data() -> Option<PathBuf> {
     None
 }
 
-/// The counters of a hub that has read the file `name` of `data` to its end.
+/// Returns the counters of a hub that has read the file `name` of `data` to its end.
 fn counters_of(data: &std::path::Path, name: &str) -> Value {
     let env = TestEnv::new();
     let path = data.join(name);
@@ -243,7 +244,7 @@ fn recordings_of_real_sensors() {
         let counters = counters_of(&data, name);
         assert_eq!(counters["telegrams"].as_u64(), telegrams, "{name}: {counters}");
     }
-    // What another rate makes of a sensor's bytes: no telegram is believed.
+    // Bytes received at a wrong baud rate: no telegram is accepted.
     let counters = counters_of(&data, "captures/host19200_while_sensor_38400.bin");
     assert_eq!((&counters["telegrams"], &counters["bytes_discarded"]), (&0.into(), &7745.into()));
 }

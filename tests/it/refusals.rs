@@ -1,5 +1,6 @@
-//! What is refused: the exit code of each kind of failure, and a message that names the place, the value and the
-//! remedy; with `--json` an object, on stdout unless that belongs to the line that says that all is up.
+//! Tests of refusals: each kind of failure has an exit code and a message with the place, the value and the remedy.
+//! With `--json`, the error is an object. It goes to stdout, or to stderr for verbs whose stdout only has the line
+//! `ready`.
 
 use std::process::{Command, Stdio};
 
@@ -7,7 +8,8 @@ use crate::testkit;
 use crate::testkit::{Child, Outcome, TERM, TestEnv, run_concurrently, spawn};
 use serde_json::Value;
 
-/// Runs the program, which must refuse with `code` and `kind` and say all of `words`, in text and in JSON.
+/// Asserts that the program exits with `code` and an error of `kind` whose message contains all of `words`, as text and
+/// as JSON.
 fn assert_refused(env: &TestEnv, arguments: &[&str], code: i32, kind: &str, words: &[&str]) {
     let outcome = env.run(arguments);
     assert_eq!((outcome.exit_code, outcome.stdout.is_empty()), (Some(code), true), "{outcome}");
@@ -16,7 +18,7 @@ fn assert_refused(env: &TestEnv, arguments: &[&str], code: i32, kind: &str, word
     let outcome = env.run(&[arguments, &["--json"]].concat());
     assert_eq!(outcome.exit_code, Some(code), "{outcome}");
     let text = match arguments.first() {
-        // The log goes to stderr too, before it.
+        // The log goes to stderr as well. The error is its last line.
         Some(&("run" | "replay" | "simulate")) if kind != "usage" => {
             assert!(outcome.stdout.is_empty(), "{outcome}");
             outcome.stderr.lines().last().unwrap_or_default().to_owned()
@@ -147,14 +149,14 @@ fn every_verb_rejects_unknown_topic_and_sensor_names() {
         (&["echo", "*"], &["topics are"]),
         (&["record", "*/scam"], &["*/scam", "*/scan"]),
         (&["gateway", "--topic=*/scam"], &["*/scam", "*/scan"]),
-        // Forms that these do not take.
+        // Forms of topics that these verbs do not accept.
         (&["echo", "*/scan", "--csv"], &["--csv"]),
         (&["echo", "front/*", "--raw"], &["--raw"]),
         (&["latency", "*/scan"], &["*"]),
         (&["record", "robot/zones"], &["robot/zones", "*/zones"]),
         (&["gateway", "--topic=robot/zones"], &["robot/zones", "*/zones"]),
         (&["gateway", "--topic=front/status:every=2"], &["thinned"]),
-        // No sensor can be called so.
+        // Invalid sensor names.
         (&["echo", "Front/scan"], &["Front"]),
         (&["info", "Front"], &["Front"]),
         (&["control", "Front", "pause"], &["Front"]),
@@ -166,7 +168,7 @@ fn every_verb_rejects_unknown_topic_and_sensor_names() {
         assert_eq!((outcome.exit_code, outcome.stdout.is_empty()), (Some(2), true), "{outcome}");
         check_contains_all(&outcome.stderr, words, &outcome);
         let outcome = env.run(&[arguments, &["--json"]].concat());
-        // What is no flag of that command line is refused there.
+        // If the error is an unknown flag, the command line parser reports it.
         let kind = outcome.of_class("error").pop().map(|line| line["kind"].clone());
         assert_eq!((outcome.exit_code, kind), (Some(2), Some("usage".into())), "{outcome}");
     }
@@ -207,7 +209,7 @@ fn unreadable_input_exits_with_66() {
         let named = if is_there { "/etc/passwd" } else { &missing };
         assert_refused(&env, arguments, 66, "input", &[named]);
     }
-    // A value in a file that is there.
+    // A wrong value in a readable file.
     let wrong = env.file("wrong.toml", "[background]\nmethod = \"magic\"\n");
     assert_refused(
         &env,
@@ -348,7 +350,7 @@ fn reports_that_no_hub_is_running() {
 #[test]
 fn reports_unknown_sensors_and_timeouts() {
     let env = TestEnv::new();
-    // A port that is not there is a state of the hub's, no failure.
+    // A missing port is a state of the link, not a failure.
     let hub = env.hub(&[env.link("front")]);
     let info = env.await_info("front", |info| info["state"] == "absent");
     assert!(info["last_error"].as_str().is_some_and(|error| error.contains("no such port")), "{info}");
@@ -406,7 +408,7 @@ fn a_second_hub_in_the_domain() {
     let pid = format!("pid {}", hub.pid());
     assert_refused(&env, &["run", &env.link("front")], 1, "domain_held", &[&pid, "--domain"]);
     assert_eq!(hub.end(TERM).exit_code, Some(0));
-    // It is free again.
+    // The domain is free again.
     let hub = env.hub(&[env.link("front")]);
     assert_eq!(hub.end(TERM).exit_code, Some(0));
 }

@@ -1,6 +1,6 @@
-//! A configuration that changes while the hub runs: zones, marks, background and pose with the next scan, without a gap
-//! in the stream; lines at the next start; and one that cannot be changes nothing. A hangup of its terminal still ends
-//! a hub.
+//! Tests of a configuration that changes while the hub runs. Zones, marks, background and pose change with the next
+//! scan and without a gap in the stream. Lines change at the next start. An invalid configuration changes nothing.
+//! SIGHUP from a closed terminal still ends a hub.
 
 use std::process::Command;
 
@@ -11,18 +11,18 @@ use crate::testkit::{
 use serde_json::Value;
 
 const STREAM_FLAGS: [&str; 2] = ["--seed=71", "--baud=500000"];
-/// Minimum time from the stamp of the last scan to that of unknown zones that the hub sends in a silence, in ns: a verdict
-/// is valid for two periods of 26.6 ms and 20 ms.
+/// Minimum time from the stamp of the last scan to that of the unknown zones that the hub sends in a silence, in ns. A
+/// verdict is valid for two periods of 26.6 ms and 20 ms.
 const MAX_SILENCE_NS: u64 = 70_000_000;
 
-/// The configuration of one link in a file, with `more` behind it.
+/// Writes the configuration of one link with `settings` after it, and returns the flag for the file.
 fn configure(env: &TestEnv, settings: &str) -> String {
     let port = env.path_argument("front");
     let text = format!("[[link]]\nname = \"front\"\nport = \"{port}\"\n{settings}");
     format!("--config={}", env.file("scanhub.toml", text))
 }
 
-/// The radii of a line of class `zones` in mm.
+/// Returns the radii of a line of class `zones` in mm.
 fn radii(line: &Value) -> Vec<u64> {
     line["zones"].as_array().into_iter().flatten().map(|zone| number(zone, "radius_mm")).collect()
 }
@@ -64,16 +64,16 @@ fn circles_change_in_a_stream_without_a_gap() {
     let (telegrams, zones) = (telegrams.end(INT), zones.end(INT));
     for (outcome, class) in [(&telegrams, "telegram"), (&zones, "zones")] {
         let mut lines = outcome.of_class(class);
-        // A silence has no numbers.
+        // A silence that the client detected has no `topic_seq`.
         lines.retain(|line| line["topic_seq"].is_u64());
         contiguous_numbers(&lines, "topic_seq");
         assert_eq!(outcome.of_class("summary")[0]["missed"], 0, "{class}");
     }
-    // A line that arrived too late here has no circles.
+    // A line that arrived too late here is stale and has no zones.
     let mut verdicts = zones.of_class("zones");
     verdicts.retain(|line| line["topic_seq"].is_u64() && line["stale"] != true);
-    // On a busy machine, scans may be missing for so long that the hub sends unknown zones, at once with the new circles.
-    // The change does not cause them. All other samples belong to a scan.
+    // On a busy machine, scans may be missing for so long that the hub sends unknown zones, already with the new radii.
+    // The reload does not cause them. All other samples belong to a scan.
     let mut last_ns = 0;
     verdicts.retain(|line| {
         let stamp_ns = number(line, "stamp_ns");
@@ -81,7 +81,7 @@ fn circles_change_in_a_stream_without_a_gap() {
         last_ns = if is_silence { last_ns } else { stamp_ns };
         !is_silence
     });
-    // The first verdict of other circles is not unknown.
+    // The first verdict with new radii is not unknown.
     let firsts: Vec<_> = verdicts.windows(2).filter(|pair| radii(&pair[0]) != radii(&pair[1])).collect();
     assert_eq!(firsts.len(), 4, "{firsts:?}");
     assert!(firsts.iter().all(|pair| pair[1]["verdict"] != "unknown"), "{firsts:?}");
@@ -91,7 +91,7 @@ fn circles_change_in_a_stream_without_a_gap() {
     assert!(ended.stderr.contains("front: zones, marks, background changed as configured"), "{ended}");
     assert_eq!(simulator.end(TERM).exit_code, Some(0));
     assert_eq!(env.simulator_totals("front").1, 0, "EEPROM");
-    // What was sent from the first to the last that was received, was received.
+    // Every scan between the first and the last one that was received was received.
     let received = telegrams.of_class("telegram");
     let received: Vec<_> = received.iter().filter(|line| line["command"] == MEASURED_VALUES).collect();
     let received: Vec<String> = received.iter().map(|line| hash(&bytes_of(line))).collect();
@@ -107,7 +107,7 @@ fn reload_reports_refused_and_restart_only_changes() {
     let env = TestEnv::new();
     let mut supervisor = env.supervisor();
     let flags = [configure(&env, ""), "--no-system-config".to_owned()];
-    // Nothing is at the port: the topics say all the same how it is.
+    // The port does not exist. The topics still report the configuration.
     let hub = env.service(&mut supervisor, &flags, None).ready();
     supervisor.wait_for_message("READY=1");
     let mut zones = env.echo(&["front/zones"]);
@@ -149,7 +149,7 @@ fn hub_ends_with_its_terminal_except_under_nohup() {
         let env = TestEnv::new();
         let (keys, screen) = terminal();
         let hub = env.command(&["run", "--json", "--no-system-config", &configure(&env, "")]);
-        // Leader of a session that has this terminal.
+        // `setsid` makes the hub the leader of a session that has this terminal.
         let mut command = Command::new("setsid");
         command.arg("--ctty").args(nohup).arg(hub.get_program()).args(hub.get_args());
         command.envs(hub.get_envs().filter_map(|(key, value)| Some((key, value?))));
@@ -157,7 +157,7 @@ fn hub_ends_with_its_terminal_except_under_nohup() {
         let hub = hub.ready();
         drop(keys);
         if survives {
-            // It is asked to read its configuration instead, and does.
+            // Under `nohup`, the hub reads its configuration on SIGHUP.
             configure(&env, "pose = { x = 0.5 }\n");
             hub.signal(HUP);
             env.await_info("front", |info| info["pose"]["x_m"] == 0.5);

@@ -1,4 +1,4 @@
-//! `scanhub replay`: a hub whose sensors are a recording, with its options, its keys, and its end.
+//! Tests of `scanhub replay`, a hub whose ports are a recording: its options, its keys and its end.
 
 use std::collections::BTreeMap;
 
@@ -11,7 +11,7 @@ use scanhub_schema::file::Writer;
 use scanhub_schema::{Header, Marks, Topic};
 use serde_json::Value;
 
-/// A log with a scan every `period_ms`, from 1000 s on.
+/// Writes a log with a scan every `period_ms`, starting at 1000 s.
 fn log(env: &TestEnv, scans: u64, period_ms: u64) -> String {
     let line = |scan: u64| {
         let ranges = vec!["1.5"; 181].join(" ");
@@ -25,7 +25,7 @@ fn start(env: &TestEnv, words: &[&str]) -> Program {
     env.start(&[&["replay", "--json", "--no-system-config"], words].concat()).ready()
 }
 
-/// The wall clocks of scans, in ms from the log's beginning.
+/// Returns the wall clocks of the scans, in ms from the start of the log.
 fn wall_times_ms(outcome: &Outcome) -> Vec<u64> {
     outcome.of_class("scan").iter().map(|scan| number(scan, "wall_ns") / 1_000_000 - 1_000_000).collect()
 }
@@ -74,7 +74,7 @@ fn from_here_to_there_faster() {
     assert_eq!(number(&replay_summary(&player.wait()), "telegrams"), 20);
 }
 
-/// Log of an LMS at half degrees whose robot turns in a room, faster and faster.
+/// Writes a log of an LMS at half degrees whose robot turns in a room at an increasing rate.
 fn log_of_turning_robot(env: &TestEnv, scans: u64) -> String {
     const PERIOD_S: f64 = 0.026_64;
     let range = |angle: f64| {
@@ -144,12 +144,12 @@ fn hold_keeps_the_hub_running_and_pause_stops_it() {
     let player = start(&env, &[&log(&env, 100, 100), "--rate=max", "--hold"]);
     let info = env.await_info("front", |info| info["state"] == "silent");
     assert_eq!((number(&info["counters"], "telegrams"), &info["angle_deg"]), (100, &180.into()));
-    // It would have ended after a second.
+    // Without `--hold`, the replay would have ended after a second.
     assert_eq!(number(&replay_summary(&player.end(TERM)), "telegrams"), 100);
 }
 
-/// A recording of a hub of two lives, which each heard ten telegrams, of which the sixth says how values are split: marks
-/// were found from `understood` of each life on.
+/// Writes a recording of two runs of a hub. Each run has ten telegrams, and the sixth one reports how the values are
+/// encoded. `format_versions` gives the `seq` of each run from which marks were published.
 fn recording_of_two_runs(env: &TestEnv, format_versions: [u64; 2]) -> String {
     let file = std::fs::File::create(env.path("lives.mcap")).expect("a file");
     let mut writer = Writer::begin(file, "", BTreeMap::new()).expect("is written");
@@ -183,7 +183,7 @@ fn recording_of_two_runs(env: &TestEnv, format_versions: [u64; 2]) -> String {
     env.path("lives.mcap").display().to_string()
 }
 
-/// A line that loses six of ten scans, and is silent for two seconds in the middle; the last 300 of 20 s.
+/// Writes a recording of 20 s from a line that loses six of ten scans and is silent for two seconds in the middle.
 fn recording_with_gaps(env: &TestEnv) -> String {
     let file = std::fs::File::create(env.path("lossy.mcap")).expect("a file");
     let mut writer = Writer::begin(file, "", BTreeMap::new()).expect("is written");
@@ -220,19 +220,19 @@ fn missing_scans_are_not_reported_as_silence() {
         assert_eq!(listed.exit_code, Some(0), "{listed}");
         let rate =
             listed.lines().into_iter().find(|line| line["topic"] == "scan").map(|line| line["hz"].clone());
-        // Of 37.5 scans a second 15 come, twice as fast.
+        // 15 of 37.5 scans per second were recorded, and the replay is twice as fast.
         rate.and_then(|rate| rate.as_f64()).is_some_and(|hz| (15.0..60.0).contains(&hz))
     });
     env.await_info("front", |info| info["last_error"] == "the recording is at its end");
     let outcome = player.end(INT);
     let count_in_log = |word: &str| outcome.stderr.lines().filter(|line| line.contains(word)).count();
-    // Once for the pause, and at the end.
+    // Once for the pause and once for the end.
     assert_eq!((count_in_log("front: silent"), count_in_log("front: streaming")), (2, 2), "{outcome}");
 }
 
 #[test]
 fn replay_has_no_scans_before_their_mode_was_known() {
-    // One of both lives knew it from the life before.
+    // In each case, one of the two runs knew the encoding from its start, from the run before it.
     for understood in [[0, 6], [6, 0]] {
         let env = TestEnv::new();
         let player = start(&env, &[&recording_of_two_runs(&env, understood), "--paused"]);

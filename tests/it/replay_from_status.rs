@@ -1,12 +1,12 @@
-//! Recordings of scanners that are asked what they are, begun while they streamed already: nobody asks in them any more. The
-//! status that a hub published tells how the packets are to be read.
+//! Tests of recordings that start while an RPLIDAR already streams, so that they do not have the replies that identify
+//! it. The recorded status supplies the mode and the beams with which the packets are decoded.
 
 use scanhub_schema::Header;
 
 use crate::replay_packets::{recorder, replay, samples, scan};
 use crate::testkit::{INT, TERM, TestEnv, is_class};
 
-/// Records an RPLIDAR that streams with these settings, until so many scans came.
+/// Records an RPLIDAR that streams with these settings, until a subscriber has received this number of `scans`.
 fn record(env: &TestEnv, model: &str, settings: &[&str], scans: usize) {
     let words = ["--family=rplidar", &format!("--model={model}"), "--world=room", "--seed=5"];
     let faults = "--fault=loss=0.01,burst=40";
@@ -22,9 +22,10 @@ fn record(env: &TestEnv, model: &str, settings: &[&str], scans: usize) {
     assert_eq!(simulator.end(TERM).exit_code, Some(0));
 }
 
-/// Checks that the recorded scans are replayed, in the same order and with the same flags. On a busy machine, stamps of packets are
-/// rough. Then gaps may be judged differently, and scans may be missing (in virtual time, none are). With a wrong mode or number of
-/// beams, none would be found. Sequence numbers differ, so scans are found by their ranges.
+/// Asserts that the recorded scans are replayed in the same order and with the same flags. Scans are matched by their
+/// ranges, because sequence numbers differ. On a busy machine, stamps of packets are inexact. The replay may then judge
+/// gaps differently and lack some scans (in virtual time, it lacks none). With a wrong mode or number of beams, no scan
+/// would match.
 fn check(recorded: &[(Header, Vec<u8>)], replayed: &[(Header, Vec<u8>)]) {
     let (mut rest, mut compared) = (replayed, 0);
     for (header, payload) in recorded {
@@ -41,7 +42,7 @@ fn check(recorded: &[(Header, Vec<u8>)], replayed: &[(Header, Vec<u8>)]) {
 
 #[test]
 fn recorded_status_supplies_mode_and_beams() {
-    // Express packets and dense ones begin alike.
+    // Express packets and dense packets begin alike.
     for (model, settings, beams) in [
         ("a1", ["model=a1", "mode=express", "beams=400"], 400),
         ("s1", ["model=auto", "mode=denseboost", "beams=700"], 700),
@@ -57,7 +58,7 @@ fn recorded_status_supplies_mode_and_beams() {
 
 #[test]
 fn ambiguous_packets_need_a_configured_model_or_mode() {
-    // Of types 82h and 85h, which look alike.
+    // Packets of types 82h and 85h look alike.
     for (model, mode) in [("a1", "express"), ("s1", "denseboost")] {
         let env = TestEnv::new();
         let mode = format!("mode={mode}");
@@ -65,7 +66,7 @@ fn ambiguous_packets_need_a_configured_model_or_mode() {
         let simulator = env.simulator(&["front"], &words);
         let set = ["family=rplidar", &mode].map(|set| format!("--set=link.front.{set}"));
         let hub = env.hub(&[vec![env.link("front")], set.to_vec()].concat());
-        // From here on nobody asks the scanner anything.
+        // From here on, the hub sends no requests to the scanner.
         env.await_info("front", |info| info["state"] == "streaming");
         let recorder = recorder(&env, "telegrams.mcap", &["front/telegram"]);
         let mut echo = env.echo(&["front/scan"]);
@@ -81,7 +82,7 @@ fn ambiguous_packets_need_a_configured_model_or_mode() {
             let messages = ["does not tell of which kind its packets are", "link.NAME.model or mode is set"];
             assert!(messages.iter().all(|words| outcome.stderr.contains(words)), "{model}: {outcome}");
         }
-        // What the refusal says helps.
+        // The remedy in the error message works.
         replay(&env, "telegrams.mcap", &["--rate=max", &format!("--set=link.front.{mode}")]);
         assert!(samples(&env.path("replayed.mcap"), "front/scan").len() > 5, "{model}");
     }

@@ -1,5 +1,5 @@
-//! Recordings of scanners whose heads turn: their packets are played as those of an LMS are, and the scans that come of
-//! them are those that were published when they were recorded.
+//! Tests of recordings of rotating scanners: their packets are replayed like telegrams of an LMS, and the replay
+//! publishes the same scans as the recorded hub.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -11,7 +11,7 @@ use scanhub_schema::file::{self, Writer};
 use scanhub_schema::{Family, Flags, Header, Reasons, Scan, Topic};
 use serde_json::Value;
 
-/// A recorder of `flags` that is attached.
+/// Starts a recorder with `flags` and waits until it is attached.
 pub(crate) fn recorder(env: &TestEnv, name: &str, flags: &[&str]) -> Program {
     let file = env.path_argument(name);
     let before = env.subscribers("front/telegram");
@@ -20,8 +20,8 @@ pub(crate) fn recorder(env: &TestEnv, name: &str, flags: &[&str]) -> Program {
     recorder
 }
 
-/// Records two files, one with telegrams alone, until so many scans came: of a scanner of `model`, on a line with
-/// faults.
+/// Records two files, `all.mcap` and `telegrams.mcap`, until a subscriber has received this number of `scans`. The
+/// scanner is a `model` on a line with faults.
 fn record(env: &TestEnv, model: &str, settings: &[&str], scans: usize) {
     let set = ["family=ld"].iter().chain(settings).map(|set| format!("--set=link.front.{set}"));
     let hub = env.hub(&[vec![env.link("front")], set.collect()].concat());
@@ -39,7 +39,7 @@ fn record(env: &TestEnv, model: &str, settings: &[&str], scans: usize) {
     assert_eq!(simulator.end(TERM).exit_code, Some(0));
 }
 
-/// Replays `name` with these words, and records what comes of it.
+/// Replays `name` with the flags `words`, and records the result in `replayed.mcap`. Returns the player's last line.
 pub(crate) fn replay(env: &TestEnv, name: &str, words: &[&str]) -> Value {
     let file = env.path_argument(name);
     let words = [&["replay", "--json", "--no-system-config", "--paused", &file], words].concat();
@@ -52,7 +52,7 @@ pub(crate) fn replay(env: &TestEnv, name: &str, words: &[&str]) -> Value {
     outcome.of_class("replayed").pop().expect("what was played")
 }
 
-/// Headers and payloads of a topic in a file.
+/// Returns the headers and payloads of a topic in a file.
 pub(crate) fn samples(file: &Path, topic: &str) -> Vec<(Header, Vec<u8>)> {
     let recording = Recording::read_complete(file);
     let parts = |data: &[u8]| file::split_message(data).map(|(header, payload)| (header, payload.to_vec()));
@@ -65,8 +65,8 @@ pub(crate) fn scan(payload: &[u8]) -> Box<Scan> {
     scan
 }
 
-/// Checks that scans which were recorded are replayed as they were. Their stamps are not compared, because they depend
-/// on when the hub got a processor. Stamps of a live stream are checked in virtual time (`tests/world`, judge `turns`).
+/// Asserts that recorded scans are replayed unchanged. Stamps are not compared, because they depend on when the hub got
+/// a processor. `tests/world` checks stamps of a live stream in virtual time (invariant `turns`).
 fn check_scans(recorded: &[(Header, Vec<u8>)], replayed: &[(Header, Vec<u8>)]) {
     let by_seq: BTreeMap<u64, _> =
         replayed.iter().map(|(header, payload)| (header.seq, (header, payload))).collect();
@@ -90,7 +90,7 @@ fn check_scans(recorded: &[(Header, Vec<u8>)], replayed: &[(Header, Vec<u8>)]) {
         incomplete += u32::from(then.is_incomplete());
         suspect += u32::from(header.reasons != 0);
     }
-    // On a busy machine, the recorder may miss a scan of the replay, as the numbers of the samples tell.
+    // On a busy machine, the recorder may miss a scan of the replay. The sequence numbers show that.
     let gap = |pair: &[(Header, Vec<u8>)]| pair[1].0.topic_seq - pair[0].0.topic_seq - 1;
     let missed: u64 = replayed.windows(2).map(gap).sum();
     assert!(absent.len() as u64 <= missed, "no scans of {absent:?}, {missed} missed");
@@ -132,7 +132,7 @@ fn scans_are_those_that_were_recorded() {
     };
     let known = info(&[]);
     assert_eq!((&known["type"], number(&known, "angle_deg")), (&"LD19".into(), 360), "{known}");
-    // What is configured goes before what was recorded.
+    // A configured value has priority over a recorded one.
     let fewer = info(&["--set=link.front.beams=300"]);
     assert_eq!(fewer["step_deg"], 1.2, "{fewer}");
 }
@@ -144,7 +144,7 @@ fn beams_are_those_that_were_recorded() {
     let recorded = samples(&env.path("all.mcap"), "front/scan");
     replay(&env, "all.mcap", &[]);
     check_scans(&recorded, &samples(&env.path("replayed.mcap"), "front/scan"));
-    // Telegrams alone do not say into how many beams they were put: the model's, which they do say.
+    // A recording with only telegrams does not have the number of beams, so the replay uses that of the model.
     replay(&env, "telegrams.mcap", &["--rate=max"]);
     let replayed = samples(&env.path("replayed.mcap"), "front/scan");
     assert!(!replayed.is_empty() && replayed.iter().all(|(_, payload)| scan(payload).beams() == 2_160));
@@ -161,7 +161,7 @@ fn a_part_of_it_and_again() {
     assert!((8..=12).contains(&replayed.len()), "{} scans in a second", replayed.len());
     let ranges_of = |(_, payload): &(Header, Vec<u8>)| scan(payload).ranges().to_vec();
     let mut rest = recorded.iter().map(ranges_of);
-    // The first and the last may be of a part of a turn.
+    // The first and the last scan may be part of a revolution.
     let inner = &replayed[1..replayed.len() - 1];
     assert!(
         inner.iter().map(ranges_of).all(|ranges| rest.any(|then| then == ranges)),
@@ -192,7 +192,7 @@ fn stream_file_is_played_by_the_scanners_clock() {
     let scans = echo.await_lines(20, "a scan", is_class("scan"));
     assert_eq!((echo.end(INT).exit_code, player.end(INT).exit_code), (Some(0), Some(0)));
     let stamps = |of: &Value| number(of, "stamp_ns") as i64;
-    // In which turn it begins depends on what came before: they are found by what they say.
+    // The revolution in which the replay starts depends on earlier bytes, so match scans by their ranges.
     let ranges: Vec<Vec<Option<u64>>> = scans
         .iter()
         .map(|line| line["ranges"].as_array().expect("ranges").iter().map(Value::as_u64).collect())
@@ -209,7 +209,7 @@ fn stream_file_is_played_by_the_scanners_clock() {
     let known: Vec<_> =
         places.iter().zip(&scans).filter_map(|(place, line)| Some(((*place)?, line))).collect();
     for pair in known.windows(2) {
-        // Stamps follow from that clock alone: ten turns in a second.
+        // Stamps follow from the scanner's clock alone: ten revolutions per second.
         let turns = (pair[1].0 - pair[0].0) as f64;
         let passed_s = (stamps(pair[1].1) - stamps(pair[0].1)) as f64 / 1e9;
         assert!((0.08..0.12).contains(&(passed_s / turns)), "{passed_s} s for {turns} turns");
@@ -247,7 +247,7 @@ fn refuses_recordings_of_another_family() {
         (Some(66), true),
         "{outcome}"
     );
-    // A family of tomorrow.
+    // A family that this version does not have.
     let later = env.path("later.mcap");
     let mut writer = Writer::begin(std::fs::File::create(&later).expect("a file"), "", BTreeMap::new())
         .expect("is written");
@@ -285,7 +285,7 @@ fn other_programs_get_the_same_scans_of_packets() {
         published.len(),
         computed.len()
     );
-    // A stream has no stamps, and begins anywhere.
+    // A stream file has no stamps, and it may start within a revolution.
     let (bytes, again) = (env.path_argument("telegrams.bin"), env.path_argument("again.mcap"));
     for (from, to) in [(&env.path_argument("telegrams.mcap"), &bytes), (&bytes, &again)] {
         assert_eq!(env.run(&["convert", from, to]).exit_code, Some(0));

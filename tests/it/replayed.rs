@@ -1,5 +1,5 @@
-//! What a replay publishes of a recording is what was published when it was recorded, byte for byte, with the same
-//! parameters; and something else with others. Two sensors of simulated rooms with people, recorded in made-up time, and
+//! Tests that a replay publishes what was published during the recording, byte for byte, if it has the same parameters,
+//! and different samples otherwise. Two sensors in simulated rooms with people are recorded in virtual time and
 //! replayed telegram by telegram.
 
 #[path = "../testkit/recorded_rooms.rs"]
@@ -18,10 +18,10 @@ use scanhub_schema::{Flags, Topic};
 use scanhub_shm::{Domain, Node};
 
 const SCAN_COUNT: u64 = 400;
-/// Before this scan nothing is heard of a sensor for a second.
+/// Scan before which the sensor is silent for a second.
 const SILENCE_AT_SCAN: u64 = 300;
 
-/// Records two sensors; where, and what was published of each.
+/// Records two sensors. Returns the file and the published samples of each sensor.
 fn record(env: &TestEnv) -> (PathBuf, Vec<Vec<PublishedSample>>) {
     let (file, mut published) = (env.path("two.mcap"), vec![Vec::new(), Vec::new()]);
     recorded_rooms::record(&env.domain(), &file, SCAN_COUNT, Some(SILENCE_AT_SCAN), |number, sample| {
@@ -30,7 +30,7 @@ fn record(env: &TestEnv) -> (PathBuf, Vec<Vec<PublishedSample>>) {
     (file, published)
 }
 
-/// Replays `file` step by step; what was published of each sensor.
+/// Replays `file` step by step. Returns the published samples of each sensor.
 fn replay(env: &TestEnv, file: &Path, play: PlaybackOptions, set: &[&str]) -> Vec<Vec<PublishedSample>> {
     let set = set.iter().map(|word| (*word).to_owned()).collect();
     let sources = Sources { set, ..Sources::default() };
@@ -57,8 +57,8 @@ fn replay(env: &TestEnv, file: &Path, play: PlaybackOptions, set: &[&str]) -> Ve
     published
 }
 
-/// Plays a recording step by step. Attaches subscribers before the first telegram. `take` takes what they have got, and returns the
-/// number of telegrams so far.
+/// Plays a recording step by step, with subscribers attached before the first telegram. `take` takes the samples that
+/// have arrived, and returns the number of telegrams so far.
 pub(crate) fn step_through<T>(
     domain: &Domain,
     replay: &Replay<'_>,
@@ -83,13 +83,13 @@ pub(crate) fn step_through<T>(
             assert!(Instant::now() < give_up_at, "it does not come to an end");
             let before = take(&subscribers);
             player.step();
-            // A step that is a silence brings no telegram: after a while it is followed by another.
+            // A step that is a silence publishes no telegram, so continue after a short time.
             let patience = Instant::now() + Duration::from_millis(50);
             while take(&subscribers) == before && !player.progress().is_over && Instant::now() < patience {
                 thread::yield_now();
             }
         }
-        // With the silence after the end, which a hub reports that stays for a while.
+        // With `holds`, wait for the silence after the end, which the hub reports.
         let until = Instant::now() + Duration::from_millis(if replay.holds { 1_000 } else { 0 });
         while Instant::now() <= until {
             take(&subscribers);
@@ -101,7 +101,8 @@ pub(crate) fn step_through<T>(
     });
 }
 
-/// Topic, number, reasons and payload of all samples, those of a telegram together.
+/// Returns sequence number, topic, reasons and payload of all samples, sorted, so that samples of one telegram are
+/// adjacent.
 fn sorted_samples(published: &[PublishedSample]) -> Vec<(u64, Topic, u8, &[u8])> {
     let of = |it: &'_ PublishedSample| (it.header.seq, it.topic, it.header.reasons);
     let mut samples: Vec<_> = published.iter().map(|it| (of(it), &it.payload[..])).collect();
@@ -109,7 +110,7 @@ fn sorted_samples(published: &[PublishedSample]) -> Vec<(u64, Topic, u8, &[u8])>
     samples.into_iter().map(|((seq, topic, reasons), payload)| (seq, topic, reasons, payload)).collect()
 }
 
-/// The payloads of one topic.
+/// Returns the payloads of one topic.
 fn payloads(published: &[PublishedSample], topic: Topic) -> Vec<&[u8]> {
     published.iter().filter(|it| it.topic == topic).map(|it| &it.payload[..]).collect()
 }

@@ -1,5 +1,5 @@
-//! A hub that is killed or terminated and restarted while its subscribers run: they report it and continue, and the
-//! hub continues with the sensor, which still streams.
+//! Tests of a hub that is killed or ended and started again while its subscribers run: they report it and continue on
+//! their own, and the new hub adopts the sensor while it streams.
 
 use std::collections::{BTreeMap, HashSet};
 
@@ -10,7 +10,7 @@ use serde_json::Value;
 
 #[test]
 fn subscribers_outlive_several_hubs() {
-    // A hub that gets no time is stale, as it should be, and not gone.
+    // A hub that gets no CPU time makes topics stale, but is not reported as gone.
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--seed=21"]);
     let link = [env.lms_link("front")];
@@ -40,7 +40,7 @@ fn subscribers_outlive_several_hubs() {
 
     let notices = telegrams.of_class("notice");
     let kinds = notices.iter().map(|line| line["kind"].as_str().unwrap_or_default());
-    // On a busy machine a hub takes long to start.
+    // On a busy machine, a hub takes long to start.
     let changes: Vec<_> = kinds.filter(|kind| *kind != "stale").collect();
     assert_eq!(changes, ["hub_gone", "hub_back"].repeat(4));
     let truth = env.truth("front");
@@ -48,13 +48,12 @@ fn subscribers_outlive_several_hubs() {
     let runs = split_by_boot(telegrams.of_class("telegram"));
     assert_eq!(runs.len(), 5);
     for run in &runs {
-        // What is not torn but made of two halves would have a right checksum by chance, and be no telegram that was
-        // sent.
+        // A telegram that consists of parts of two could pass its checksum by chance, but it was never sent.
         assert!(run.iter().all(|line| sent.contains(&hash(&bytes_of(line)))), "never sent");
         contiguous_numbers(run, "seq");
         contiguous_numbers(run, "topic_seq");
     }
-    // Who was there before the hub got its samples from the first one on.
+    // A subscriber that waits for a hub receives its samples from the first one on.
     assert!(runs[1..].iter().all(|run| number(&run[0], "topic_seq") == 0));
     let runs = split_by_boot(scans.of_class("scan"));
     assert!(runs.len() == 5 && runs[1..].iter().all(|run| number(&run[0], "topic_seq") == 0));
@@ -62,7 +61,7 @@ fn subscribers_outlive_several_hubs() {
         assert_eq!(summary["missed"], 0);
     }
 
-    // The first hub found the rate and set it; all others took the sensor as it was.
+    // The first hub found the rate and changed it. Every later hub adopted the sensor as it was.
     assert_eq!((&info["state"], &info["baud"]), (&"streaming".into(), &500_000.into()));
     let states: Vec<_> = scans.of_class("status").iter().map(|line| line["state"].clone()).collect();
     let first = states.iter().position(|state| state == "streaming").expect("streams");
@@ -76,7 +75,7 @@ fn subscribers_outlive_several_hubs() {
     assert_eq!(env.simulator_totals("front").1, 0, "EEPROM");
 }
 
-/// Lines by the life of the hub that they are from, in their order.
+/// Groups lines by the run of the hub from which they are, in their order.
 fn split_by_boot(lines: Vec<Value>) -> Vec<Vec<Value>> {
     let mut order = Vec::new();
     let mut runs = BTreeMap::<String, Vec<Value>>::new();

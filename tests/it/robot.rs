@@ -1,12 +1,12 @@
-//! The robot's verdict over two sensors, to those who follow it: a sensor that dies makes it unknown, a hub that dies
-//! too, and whoever comes back is heard again.
+//! Tests of the combined verdict of a robot with two sensors: it becomes unknown if a sensor or the hub dies, and
+//! recovers when they return.
 
 use crate::testkit::{INT, KILL, Program, TERM, TestEnv, TestGateway, in_a_network, wait_until};
 use scanhub_client::{Robot, RobotSubscriber};
 use scanhub_schema::{Topic, Verdict, Zones};
 use serde_json::{Value, json};
 
-/// So near that nothing in the simulated room is inside.
+/// Radii within which the simulated room has no object.
 const SMALL_ZONES: &str = "--set=zones.radii=[0.02,0.01]";
 
 fn hub(env: &TestEnv) -> Program {
@@ -18,7 +18,7 @@ fn sensor(env: &TestEnv, name: &str) -> Program {
     env.start(&["simulate", "--json", "--baud=500000", &port]).ready()
 }
 
-/// The verdicts of robot, front and rear in a line of `echo robot/zones`.
+/// Returns the verdicts of robot, front and rear in a line of `echo robot/zones`.
 fn verdicts(line: &Value) -> [&str; 3] {
     let of = |value: &Value, name: &str| {
         let sensors = value["sensors"].as_array()?;
@@ -45,7 +45,7 @@ fn dead_sensor_or_hub_makes_the_robot_unknown() {
     assert!(line.get("stale").is_none() && line["nearest_mm"].is_u64(), "{line}");
 
     env.kill_port_simulator(rear, "rear");
-    // Whoever says it first, hub or client; the front's own samples are not stale.
+    // Either the hub or the client reports it first. The samples of `front` itself are not stale.
     echo.await_line("the front goes on without the rear", |line| {
         verdicts(line) == ["unknown", "clear", "unknown"] && line.get("stale").is_none()
     });
@@ -84,7 +84,7 @@ fn a_program_that_follows_the_robot() {
     });
 }
 
-/// A machine without a hub of its own, as an operator's: `robot` is of the sensors that its listener publishes.
+/// On a machine without a hub, `robot` combines the sensors that its listener publishes.
 #[test]
 fn robot_without_a_hub_uses_remote_sensors() {
     in_a_network("robot::robot_without_a_hub_uses_remote_sensors", || {
@@ -98,7 +98,7 @@ fn robot_without_a_hub_uses_remote_sensors() {
 
         let mut front = TestGateway::new(1, 7, 0, "front");
         front.wait_until_published(&mut listener, &[Topic::Zones]);
-        // Who publishes no zones is no part of the robot.
+        // A sensor without zones is not part of the robot.
         TestGateway::new(1, 7, 1, "mapper").wait_until_published(&mut listener, &[Topic::Scan]);
         let mut echo = env.start(&["echo", "--json", "robot/zones"]);
         let mut leds = env.start(&["leds", "--json", "robot", "--hold=0s"]);
@@ -115,9 +115,9 @@ fn robot_without_a_hub_uses_remote_sensors() {
         leds.await_line("slow", |line| line["verdict"] == "slow" && line["worst"] == "robot1.front");
         leds.await_line("silence", |line| line["verdict"] == "unknown" && line["red"] == true);
 
-        // A hub has sensors of its own, and when it goes nobody stands in for them.
+        // A hub has its own sensors. When it exits, remote sensors do not replace them.
         let _sensor = sensor(&env, "front");
-        // One who always finds something that is sent from elsewhere, too.
+        // A second subscriber queries the current verdict and also has to find the remote sensor.
         let mut busy = RobotSubscriber::builder(&[]).in_domain(&env.domain()).open().expect("no names");
         let names = |robot: &Robot| robot.sensors().map(|(name, _)| name.to_owned()).collect::<Vec<_>>();
         let mut query_names = |busy: &mut RobotSubscriber| {

@@ -1,5 +1,5 @@
-//! Recordings for ROS 2, made while sensors stream and later of what was recorded: other people's readers read every message
-//! of them, and what they read is what was measured, where and when.
+//! Tests of recordings for ROS 2, made live or converted later: independent readers can read every message, and its
+//! values, frame and time are those of the published scan.
 
 use std::collections::BTreeMap;
 use std::process::Command;
@@ -11,7 +11,7 @@ use scanhub_schema::datagram::DatagramPayload;
 use scanhub_schema::{Code, Header, Pose, Scan, file};
 use serde_json::Value;
 
-/// Two sensors with poses, of which one hangs upside down.
+/// Poses of two sensors. The second one is mounted upside down.
 const FRONT_POSE: Pose = Pose { x_m: 0.3, y_m: 0.1, yaw_rad: 0.25, upside_down: 0, reserved: [0; 7] };
 const REAR_POSE: Pose = Pose { x_m: -0.25, y_m: 0.0, yaw_rad: -2.5, upside_down: 1, reserved: [0; 7] };
 
@@ -25,7 +25,8 @@ fn link(env: &TestEnv, name: &str, pose: &Pose) -> Vec<String> {
 
 type PublishedScan = (Header, Box<Scan>);
 
-/// The scans of a recording as the hub published them, by topic of ROS and wall clock, which no two scans of a sensor share.
+/// Returns the scans of a recording as the hub published them, by ROS topic and wall clock. No two scans of a sensor
+/// have the same wall clock.
 fn published_scans(recording: &Recording) -> BTreeMap<(String, u64), PublishedScan> {
     let of = |sensor: &str| {
         let scan_messages = recording.of(&format!("{sensor}/scan"));
@@ -45,7 +46,7 @@ fn published_scans(recording: &Recording) -> BTreeMap<(String, u64), PublishedSc
     by_time
 }
 
-/// What other people's reader `verb` says of the file at `path`: all messages.
+/// Runs the independent reader `verb` on the file at `path` and returns all messages.
 fn run_reader(mut python: Command, verb: &str, path: &str) -> Vec<Value> {
     python.args(["tests/testkit/read.py", verb, path]).current_dir(env!("CARGO_MANIFEST_DIR"));
     let outcome = output(python).expect("Python");
@@ -57,7 +58,7 @@ fn real(line: &Value, key: &str) -> f64 {
     line[key].as_f64().unwrap_or_else(|| panic!("no {key}: {line}"))
 }
 
-/// A message has the very numbers of the scan that the hub published.
+/// Asserts that a message has exactly the values of the published scan.
 fn check_scan(message: &Value, (header, scan): &(Header, Box<Scan>)) {
     let sensor = message["topic"].as_str().and_then(|topic| topic.split('/').nth(1));
     assert_eq!(message["frame"].as_str(), sensor);
@@ -91,7 +92,7 @@ fn check_scan(message: &Value, (header, scan): &(Header, Box<Scan>)) {
     }
 }
 
-/// The direction that a transform gives the beam at `angle_deg` of a scan, as a quaternion turns it.
+/// Returns the direction to which the quaternion of `transform` rotates the beam at `angle_deg`.
 fn rotate(transform: &Value, angle_deg: f64) -> [f64; 3] {
     let [x, y, z, w] = ["qx", "qy", "qz", "qw"].map(|key| real(transform, key));
     let (b, a) = angle_deg.to_radians().sin_cos();
@@ -102,7 +103,7 @@ fn rotate(transform: &Value, angle_deg: f64) -> [f64; 3] {
     ]
 }
 
-/// The last message about frames knows both sensors, and each where its pose says.
+/// Asserts that the last message on `/tf_static` has both sensors with their poses.
 fn check_transforms(messages: &[Value]) {
     let of_frames: Vec<_> = messages.iter().filter(|line| line["topic"] == "/tf_static").collect();
     let last = of_frames.last().expect("where the sensors sit");
@@ -135,7 +136,7 @@ fn others_read_every_message_made_live_and_later() {
     for sensor in ["front", "rear"] {
         env.await_info(sensor, |info| info["state"] == "streaming");
     }
-    // What goes on around it is recorded from before until after.
+    // The recorder of all topics starts earlier and ends later than the ROS recorder.
     let [all, live, later] = ["all.mcap", "live.mcap", "later.mcap"].map(|name| env.path_argument(name));
     let mut recorder_of_all = env.start(&["record", "--all", "--json", "-o", &all]);
     recorder_of_all
@@ -184,7 +185,8 @@ fn others_read_every_message_made_live_and_later() {
                 let key = (topic, number(line, "log_time"));
                 match published.get(&key) {
                     Some(scan) => check_scan(line, scan),
-                    // A telegram was recorded, and its scan was not: the recorder attaches to topics one by one.
+                    // The recording may have a telegram without its scan at either end, because the recorder attaches
+                    // to one topic after the other.
                     None => assert!(is_at_an_end(&key), "{verb} of {name}: nobody published {key:?}"),
                 }
                 checked += usize::from(published.contains_key(&key));

@@ -1,19 +1,19 @@
-//! A hub on simulated scanners of Slamtec: it asks them what they are, has them measure as they can, publishes whole turns on
-//! an even grid and their packets as they came, and lets them rest if it is asked to. Nothing they keep is changed.
+//! Tests of a hub with simulated RPLIDARs: it identifies them, selects a mode, publishes whole revolutions on an even
+//! grid and the packets as they arrived, and stops the motor if configured. It changes no stored settings.
 
 use serde_json::Value;
 
 use crate::replay_packets::{recorder, replay, samples, scan};
 use crate::testkit::{INT, Program, TERM, TestEnv, contiguous_numbers, is_class, number};
 
-/// A scanner of this model.
+/// Starts a scanner of this model with the flags `more`.
 fn simulator(env: &TestEnv, model: &str, more: &[&str]) -> Program {
     let model = format!("--model={model}");
     let arguments = ["--family=rplidar", &model, "--world=room", "--seed=7"];
     env.simulator(&["front"], &[&arguments[..], more].concat())
 }
 
-/// A hub of one link with these settings.
+/// Starts a hub with one link with these settings.
 fn hub(env: &TestEnv, settings: &[&str]) -> Program {
     let set = ["family=rplidar"].iter().chain(settings).map(|setting| format!("--set=link.front.{setting}"));
     env.hub(&[vec![env.link("front")], set.collect()].concat())
@@ -37,13 +37,13 @@ fn identifies_scanner_and_publishes_its_revolutions() {
         ("rplidar", "a1", "streaming")
     );
     assert_eq!((number(&info, "baud"), text(&info, "last_error")), (115_200, ""), "{info}");
-    // On a busy machine, the simulator is late, and the hub counts the turns that it expected as lost.
+    // On a busy machine, the simulator is late, and the hub counts the revolutions that it expected as lost.
     assert_eq!(info["damaged"].as_f64(), Some(0.0), "{info}");
     let scans = scans.end(INT).of_class("scan");
     contiguous_numbers(&scans, "topic_seq");
     let counts: Vec<u64> = scans.iter().map(|scan| number(scan, "count")).collect();
     assert!(counts[0] > 300 && counts.iter().all(|count| *count == counts[0]), "{counts:?}");
-    // The first turn may have begun before it was heard.
+    // The first revolution may have begun before the hub received it.
     let whole = scans.iter().skip(1).filter(|scan| scan["incomplete"].is_null()).count();
     assert!(whole + 1 >= scans.len(), "{whole} of {} are whole", scans.len());
     let telegrams = telegrams.end(INT).of_class("telegram");
@@ -63,7 +63,7 @@ fn a_mode_and_a_model_may_be_named() {
     for scan in env.echo(&["front/scan"]).await_lines(5, "a scan", is_class("scan")) {
         assert_eq!((text(&scan, "family"), number(&scan, "count")), ("rplidar", 500), "{scan}");
     }
-    // Points one by one have no checksum.
+    // Packets with a single point have no checksum.
     let data = telegrams.await_line("packets", |line| line["kind"] == "data");
     assert!(data["checked"].is_null() && number(&data, "length") == 5 * number(&data, "packets"), "{data}");
     let info = env.await_info("front", |info| info["state"] == "streaming");
@@ -90,7 +90,7 @@ fn motor_stops_without_subscribers() {
     scans.await_lines(3, "a scan", is_class("scan"));
     assert_eq!(text(&env.info("front"), "state"), "streaming");
     scans.end(INT);
-    // Of the status alone nobody needs a scanner that measures.
+    // A subscriber to `status` alone does not need a scanner that measures.
     let _status = env.echo(&["front/status"]);
     env.await_info("front", paused);
     assert_eq!((hub.end(TERM).exit_code, simulator.end(TERM).exit_code), (Some(0), Some(0)));
@@ -120,7 +120,7 @@ fn probe_identifies_scanner_and_checks_its_line() {
     }
 }
 
-/// A model that is newer than this version.
+/// Tests a model ID that this version does not know.
 #[test]
 fn a_model_that_is_not_known_is_shown_with_its_number() {
     let env = TestEnv::new();
@@ -148,7 +148,8 @@ fn a_model_that_is_not_known_is_shown_with_its_number() {
     );
 }
 
-/// A recorder that is attached to a stream misses what the scanner has reported before. The stream file has it.
+/// A recorder that attaches to a running stream misses the replies that the scanner sent before. A converted stream
+/// file has them.
 #[test]
 fn a_stream_file_has_the_scans_that_were_recorded() {
     let env = TestEnv::new();
@@ -173,11 +174,11 @@ fn a_stream_file_has_the_scans_that_were_recorded() {
         scans.map(|(_, payload)| scan(&payload).ranges().to_vec()).collect()
     };
     let (recorded, replayed) = (ranges("all.mcap"), ranges("replayed.mcap"));
-    // The recorder of the default topics began later, and ended later.
+    // The recorder of the default topics started later and ended later.
     let begin = recorded.iter().position(|scan| *scan == replayed[0]).expect("the first one was recorded");
     let both = (recorded.len() - begin).min(replayed.len());
-    // On a busy machine, a recorder may miss samples, and the line may be late or lose bytes. All is counted, and the scans
-    // of these turns differ.
+    // On a busy machine, a recorder may miss samples, and the line may be late or lose bytes. All of these are counted,
+    // and the scans of these revolutions differ.
     let has_lost = env.truth("front").iter().any(|sent| sent.fault.is_some());
     let is_unbroken = |name: &str, topic: &str| {
         let numbers: Vec<u64> =
@@ -285,7 +286,7 @@ fn clears_resettable_error_and_reports_persistent_one() {
     let persistent = simulator(&env, "a1", &["--fault=health=2,stubborn=1"]);
     let info = env.await_info("front", |info| text(info, "last_error").contains("does not measure"));
     assert_ne!(info["state"], "streaming", "{info}");
-    // It comes back well, and nobody has to do anything.
+    // A healthy scanner streams again without a restart of the hub.
     env.kill_port_simulator(persistent, "front");
     let _well = simulator(&env, "a1", &[]);
     env.await_info("front", |info| info["state"] == "streaming" && info["last_error"] == "");

@@ -1,5 +1,5 @@
-//! A hub with an LMS on RS-232, on a pty: 500,000 baud loses the scanner until its power is cycled, so the hub falls back to
-//! 38,400 baud, and remembers it.
+//! Tests of a hub with an LMS on RS-232, on a pty: at 500,000 baud the hub loses the scanner until its power is cycled,
+//! so it falls back to 38,400 baud and saves that.
 
 use std::fs;
 use std::os::unix::net::UnixStream;
@@ -73,8 +73,8 @@ fn is_streaming_slowly(status: &Value) -> bool {
     status["state"] == "streaming" && status["baud"] == 38_400 && has_rs422_problem(status)
 }
 
-/// Checks that the log has the reason, and does not repeat it. Another reason in between is possible on a busy machine, when a
-/// reply is late.
+/// Asserts that the log has the reason and does not repeat it. On a busy machine, another reason may lie in between
+/// when a reply is late.
 fn assert_single_warning(log: &str) {
     let warnings: Vec<_> = log.lines().filter(|line| line.contains(" WARN ")).collect();
     let is_reason = |line: &&str| line.contains(RS422_MESSAGE);
@@ -101,7 +101,7 @@ fn falls_back_to_38400_baud_and_saves_the_rate() {
     assert!(text.starts_with("38400,silent=2 "), "{text}");
     scanner.end();
 
-    // After a power cycle, the scanner is at 9,600 baud. A single switch to 500,000 baud would lose it for good.
+    // After a power cycle, the scanner is at 9,600 baud. A single switch to 500,000 baud would lose it permanently.
     let scanner = Scanner::start(&env);
     let hub = env.hub(&[env.link("front")]);
     let mut echo = env.echo(&["front/status"]);

@@ -1,4 +1,4 @@
-//! A sensor behind a serial server: the server is played here, between a socket on the loopback and the simulator's
+//! Tests of a scanner behind a serial server, which the test simulates between a loopback socket and the simulator's
 //! pty.
 
 use std::io::{Read, Write};
@@ -16,17 +16,17 @@ use crate::testkit::{
 use rustix::process::Signal;
 use serde_json::Value;
 
-/// One connection at a time, until it is dropped.
+/// A serial server that accepts one connection at a time, until it is dropped.
 struct Server {
     address: String,
-    /// Ends the connection that there is.
+    /// Set to end the current connection.
     hang_up: Arc<AtomicBool>,
     end: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl Server {
-    /// A server whose serial port is the line at `place`, set to `rate` by hand.
+    /// Starts a server whose serial port is the line at `path` and is set to `rate`.
     fn new(env: &TestEnv, path: &str, rate: u32) -> Server {
         let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");
         let address = listener.local_addr().expect("it has an address").to_string();
@@ -61,7 +61,7 @@ impl Drop for Server {
     }
 }
 
-/// Bytes to and fro until `is_over`, or until the other end closes the connection.
+/// Copies bytes in both directions until `is_over`, or until either end fails or closes the connection.
 fn forward(line: &std::fs::File, socket: &TcpStream, is_over: &dyn Fn() -> bool) {
     let (mut line, mut socket) = (line, socket);
     let mut buffer = [0; 4096];
@@ -123,7 +123,7 @@ fn finds_scanner_of_any_family_behind_a_server() {
         subscriber.await_line("a scan", |line| is_class("scan")(line) && line["family"] == family);
         let info = env.await_info("front", |info| info["state"] == "streaming" && info["model"] == model);
         assert_eq!((&info["family"], &info["last_error"]), (&family.into(), &"".into()), "{info}");
-        // The search begins again with the connection, and with this scanner.
+        // After a reconnect, the search starts again and finds this scanner again.
         server.hang_up.store(true, Ordering::Relaxed);
         subscriber.await_line("absent", |line| line["state"] == "absent");
         subscriber.await_line("a search", |line| line["state"] == "probing" && line["family"].is_null());
@@ -140,7 +140,7 @@ fn finds_scanner_of_any_family_behind_a_server() {
     }
 }
 
-/// Scans that are sent while the hub is stopped.
+/// Number of scans that are sent while the hub is stopped.
 const BACKLOGGED_SCANS: usize = 20;
 
 #[test]
@@ -157,7 +157,7 @@ fn scans_buffered_for_a_stopped_hub_give_no_verdict() {
     wait_until("scans wait", || sent() > before + BACKLOGGED_SCANS);
     hub.signal(Signal::CONT);
     let is_estimated = |line: &Value| line["flags"].to_string().contains("stamp_estimated");
-    // The server sends five per second, so those of the last second may be recent.
+    // The server sends five per second, so the scans of the last second may be recent.
     for _ in 0..BACKLOGGED_SCANS - 6 {
         subscriber.await_line("an old scan", |line| line["verdict"] == "unknown" && is_estimated(line));
     }
@@ -180,9 +180,9 @@ fn a_serial_server_that_is_set_to_another_rate() {
 #[test]
 fn a_serial_server_that_is_not_there() {
     let env = TestEnv::new();
-    // The port was free a moment ago.
+    // This port was free a moment ago.
     let address = TcpListener::bind("127.0.0.1:0").and_then(|socket| socket.local_addr()).expect("a port");
-    // Too long for a name: nobody is asked for it.
+    // Longer than a DNS label may be, so no name server is queried.
     let nowhere = "x".repeat(64);
     let hub = env.hub(&[&format!("--link=front=tcp:{address}"), &format!("--link=named=tcp:{nowhere}:4001")]);
     for (sensor, message) in
@@ -218,7 +218,7 @@ fn a_want_of_descriptors_is_not_the_servers_fault() {
 #[test]
 fn interrupt_ends_connecting_to_a_mute_serial_server() {
     let env = TestEnv::new();
-    // Nobody accepts, and there is no room for one more: the kernel drops who comes.
+    // No process accepts, and the backlog is full, so the kernel drops further connections.
     let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");
     rustix::net::listen(&listener, 0).expect("a socket");
     let address = listener.local_addr().expect("it has an address");
@@ -263,7 +263,7 @@ fn probe_and_doctor_ask_there_too() {
     let outcome = env.search(&["probe", &port, "--json"]);
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let found = &outcome.lines()[0];
-    // The server has the rate; the sensor tells which it is.
+    // The rate is set in the server. The scanner reports which one it is.
     assert_eq!((number(found, "baud"), number(found, "operating_mode")), (38_400, 0x25), "{found}");
     let outcome = env.run(&["doctor", &port, "--no-system-config", "--json"]);
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
@@ -275,7 +275,7 @@ fn probe_and_doctor_ask_there_too() {
     assert_eq!(outcome.exit_code, Some(4), "{outcome}");
 }
 
-/// What a person sees who runs the program with `arguments` at a terminal and answers its question by yes; its exit
+/// Runs the program with `arguments` at a terminal and answers its question with yes. Returns the output and the exit
 /// code.
 fn run_and_confirm(env: &TestEnv, arguments: &[&str]) -> (String, Option<i32>) {
     let (mut keys, screen) = terminal();
@@ -285,7 +285,7 @@ fn run_and_confirm(env: &TestEnv, arguments: &[&str]) -> (String, Option<i32>) {
     let mut process = spawn(command.stdin(stdin).stdout(stdout).stderr(stderr)).expect("it starts");
     drop((command, screen));
     let (mut output, mut byte) = (Vec::new(), [0]);
-    // A terminal that nobody has open any more ends by an error.
+    // Reading fails once no process has the terminal open.
     while keys.read(&mut byte).is_ok_and(|len| len > 0) {
         output.push(byte[0]);
         if output.ends_with(b"Type yes: ") {

@@ -1,5 +1,5 @@
-//! The hub as a service: it says when it is up, feeds the watchdog with work that is done, and leaves its ports with
-//! the service manager, so that what a sensor sends while a killed hub is replaced is not lost.
+//! Tests of the hub as a service. It reports when it is ready, and notifies the watchdog only while its links work. It
+//! stores its ports in the service manager, so that data that arrives while a killed hub restarts is not lost.
 
 use std::collections::{HashMap, HashSet};
 use std::time::Duration;
@@ -30,7 +30,7 @@ fn restart_after_kill_loses_only_the_partial_telegram() {
         supervisor.wait_for_message("READY=1");
     }
     await_next_run(&mut telegrams, &mut boots);
-    // Only the service manager has the line, and it is still locked.
+    // Only the service manager has the line open, and it is still locked.
     kill_between_telegrams(&env, hub, &simulator, &mut telegrams);
     let elsewhere = TestEnv::new();
     let other = elsewhere.hub(&flags);
@@ -67,7 +67,7 @@ fn restart_after_kill_loses_only_the_partial_telegram() {
     let truth: Vec<_> = env.truth("front").into_iter().filter(|sent| sent.is_intact_scan()).collect();
     let at = |hash: &String| truth.iter().position(|sent| &sent.hash == hash).expect("it was sent");
     let span = &truth[at(&received[0])..=at(&received[received.len() - 1])];
-    // A hub that is killed takes the telegram along that it has read in part, and no other.
+    // A killed hub loses the telegram that it has partly read, and no other.
     let last_of = |run: &Vec<Value>| {
         let last = run.iter().rfind(|line| line["command"] == MEASURED_VALUES).expect("a measured telegram");
         at(&hash(&bytes_of(last)))
@@ -85,8 +85,8 @@ fn restart_after_kill_loses_only_the_partial_telegram() {
     assert_eq!(env.simulator_totals("front").1, 0, "EEPROM");
 }
 
-/// Stops `simulator` until `telegrams` has printed all that the line has brought, kills `hub`, and lets the simulator continue.
-/// A part of the last telegram may wait in the simulator for room on the line.
+/// Stops `simulator` until `telegrams` has printed everything that the line has carried, kills `hub`, and lets the
+/// simulator continue. A part of the last telegram may wait in the simulator for room on the line.
 fn kill_between_telegrams(env: &TestEnv, hub: Program, simulator: &Program, telegrams: &mut Program) {
     simulator.signal(Signal::STOP);
     let sent = env.truth("front");
@@ -98,7 +98,7 @@ fn kill_between_telegrams(env: &TestEnv, hub: Program, simulator: &Program, tele
     simulator.signal(Signal::CONT);
 }
 
-/// Waits for telegrams of a life of the hub that none of `boots` is: those of another one may still wait to be read.
+/// Waits for telegrams of a run that is not in `boots`, and adds it. Lines of earlier runs may still arrive first.
 fn await_next_run(telegrams: &mut Program, boots: &mut HashSet<String>) {
     let boot = |line: &Value| line["boot"].as_str().unwrap_or_default().to_owned();
     let is_new = |line: &Value| line["command"] == MEASURED_VALUES && !boots.contains(&boot(line));
@@ -125,12 +125,13 @@ fn scans_resume_with_first_telegram_of_the_next_hub() {
         let first = samples
             .await_line("a measured telegram", |line| of_next(line) && line["command"] == MEASURED_VALUES);
         let scan = samples.await_line("its scan", |line| of_next(line) && line["class"] == "scan");
-        // A client on a busy machine may miss the first ones; it reports that.
+        // A client on a busy machine may miss the first samples, which it reports.
         let has_missed = samples.has_printed(|line| line["kind"] == "missed");
         if has_missed || scan["seq"] == first["seq"] {
             break (first, scan);
         }
-        // On a busy machine, what the previous hub has saved is too old when the next one starts: more than 3 s.
+        // On a busy machine, the identity that the previous hub saved may be too old when the next one starts: more
+        // than 3 s.
         assert!(tries < 10, "{scan} {first}");
         samples.await_lines(100, "a scan", |line| of_next(line) && line["class"] == "scan");
         (boot, tries) = (first["boot"].clone(), tries + 1);
@@ -143,7 +144,7 @@ fn scans_resume_with_first_telegram_of_the_next_hub() {
         ["unit_um", "count"].map(|key| number(&scan, key)),
         ["unit_um", "count"].map(|key| number(&scans[0], key))
     );
-    // The hub requests the status anyway; the type is known.
+    // The hub requests the status again in any case. The type is known from the saved identity.
     let info = env.await_info("front", |info| info["counters"]["telegrams"].as_u64() > Some(100));
     assert_eq!((&info["type"], &info["mode"]), (&"LMS200;301063;V02.30".into(), &1.into()), "{info}");
     assert_eq!(hub.end(TERM).exit_code, Some(0));
@@ -160,13 +161,13 @@ fn hub_releases_stored_ports_it_cannot_use() {
     supervisor.wait_for_message("FDNAME=front");
     supervisor.wait_for_message("READY=1");
     assert_eq!(hub.end(KILL).exit_code, None);
-    // The next one has a link of another name: what was kept is nobody's.
+    // The next hub has a link with another name, so the stored port belongs to no link.
     let side = format!("--link=side={}", env.path_argument("side"));
     let hub = env.service(&mut supervisor, &[side], None).ready();
     supervisor.wait_for_message("FDSTOREREMOVE=1");
     supervisor.wait_for_message("STATUS=sensors: side");
     assert_eq!(hub.end(TERM).exit_code, Some(0));
-    // It was closed: whoever comes finds it free.
+    // The port was closed, so the next hub can open it.
     let hub = env.service(&mut supervisor, &[env.link("front")], None).ready();
     supervisor.wait_for_message("FDNAME=front");
     env.await_info("front", |info| info["state"] == "streaming");
@@ -186,14 +187,14 @@ fn renamed_link_takes_over_its_stored_port() {
     supervisor.wait_for_message("FDNAME=front");
     supervisor.wait_for_message("READY=1");
     assert_eq!(hub.end(KILL).exit_code, None);
-    // Whoever keeps it has it locked: it cannot be opened, only taken over.
+    // The stored port is still locked, so the hub cannot open it again, but only take it over.
     let side = format!("--link=side={}", env.path_argument("front"));
     let hub = env.service(&mut supervisor, &[side], None).ready();
     supervisor.wait_for_message("FDSTOREREMOVE=1");
     supervisor.wait_for_message("FDNAME=side");
     supervisor.wait_for_message("READY=1");
     assert_eq!(hub.end(KILL).exit_code, None);
-    // The name has another port now: what was kept under it is not kept beside the new one.
+    // The link has another port now, so the port stored under its name is released.
     let side = format!("--link=side={}", env.path_argument("nowhere"));
     let hub = env.service(&mut supervisor, &[side], None).ready();
     supervisor.wait_for_message("FDSTOREREMOVE=1");
@@ -206,7 +207,7 @@ fn renamed_link_takes_over_its_stored_port() {
 fn the_watchdog_is_fed_while_links_work() {
     let env = TestEnv::new();
     let mut supervisor = env.supervisor();
-    // A port that is not there is no link that hangs.
+    // A link whose port is missing does not hang.
     let hub = env.service(&mut supervisor, &[env.link("front")], Some(Duration::from_secs(2))).ready();
     for _ in 0..3 {
         supervisor.wait_for_message("WATCHDOG=1");

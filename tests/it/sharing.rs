@@ -1,5 +1,5 @@
-//! docs/sharing.md, tried: a hub under one user, its consumers under another one. Each test has a network, a /run, a /tmp and
-//! a /dev/shm of its own.
+//! Tests of docs/sharing.md: a hub that runs as one user and its subscribers as another. Each test has its own network,
+//! /run, /tmp and /dev/shm.
 
 use std::fs;
 use std::os::unix::fs::{DirBuilderExt, chown};
@@ -11,18 +11,18 @@ use crate::testkit::{INT, Program, TERM, is_class, number, succeeds, wait_until}
 use serde_json::{Value, json};
 
 const SHARING_PAGE: &str = include_str!("../../docs/sharing.md");
-/// Where the namespaces are made: the test that shall run in them.
+/// Variable that is set when the test runs again inside the namespaces.
 const NAMESPACE_VARIABLE: &str = "SCANHUB_TEST_SHARING";
-/// Users that need not be known to the system.
+/// User IDs that the system need not know.
 const HUB_UID: u32 = 65531;
 const OTHER_UID: u32 = 65532;
 
-/// Runs `test`, which is called `name`, where it can be two users; says so if the system does not allow that.
+/// Runs `test`, which is called `name`, in new namespaces as root. Skips if the system does not allow that.
 fn in_namespace(name: &str, test: impl FnOnce()) {
     if std::env::var_os(NAMESPACE_VARIABLE).is_some() {
         return test();
     }
-    // Where /tmp is hidden the programs may be, too.
+    // A mount on /tmp may hide the programs, so copy them to /mnt first.
     let script = "ip link set lo up && mount -t tmpfs -o mode=755 none /mnt && cp \"$1\" /mnt/test && cp \"$2\" /mnt/scanhub \
                   && mount -t tmpfs -o mode=755 none /run && mount -t tmpfs -o mode=1777 none /tmp \
                   && mount -t tmpfs -o mode=1777 none /dev/shm";
@@ -42,13 +42,14 @@ fn in_namespace(name: &str, test: impl FnOnce()) {
     testkit::rerun_test(name, inside);
 }
 
-/// A directory of `user` alone, which is there already if `path` is.
+/// Creates a directory at `path` that only `user` can access.
 fn create_directory_of(user: u32, path: &str) {
     fs::DirBuilder::new().recursive(true).mode(0o700).create(path).expect("a directory");
     chown(path, Some(user), Some(user)).expect("root gives it away");
 }
 
-/// The program as a user who logged in has it; the hub's is its service, too.
+/// Returns the program with the environment of a login session of `user`. The user of the hub also has that of its
+/// service.
 fn scanhub(user: u32, arguments: &[&str]) -> Command {
     let mut command = Command::new("/mnt/scanhub");
     command.args(arguments).env_clear().env("SCANHUB_END_WITH_PARENT", "1").current_dir("/");
@@ -64,14 +65,14 @@ fn start(user: u32, arguments: &[&str]) -> Program {
     Program::start(scanhub(user, arguments))
 }
 
-/// The words of the page's line that is so, or else begins so, without the program's name.
+/// Returns the arguments of the page's line that equals `begin` or, if there is none, starts with it.
 fn arguments_on_page(begin: &str) -> Vec<&'static str> {
     let find = |is_it: &dyn Fn(&str) -> bool| SHARING_PAGE.lines().find(|line| is_it(line));
     let line = find(&|line| line == begin).or_else(|| find(&|line| line.starts_with(begin)));
     line.unwrap_or_else(|| panic!("no line {begin:?}")).split(' ').skip(1).collect()
 }
 
-/// The same, with JSON and the gateway that is here in the place of the page's.
+/// Like [`arguments_on_page`], with `--json` and with the ID `hub` in place of the one on the page.
 fn arguments_with_hub(begin: &str, hub: &str) -> Vec<String> {
     let words = arguments_on_page(begin).into_iter().map(|word| word.replace("5f3a12bc00d1e2f3", hub));
     words.chain(["--json".to_owned()]).collect()
@@ -96,7 +97,7 @@ fn commands_of_the_page_work_for_another_user() {
             start(HUB_UID, &["simulate", "--json", &port_flag, "--seed=61", "--baud=500000"]).ready();
         let link = format!("--link=front={port}");
         let _hub = start(HUB_UID, &["run", "--json", &link]).ready();
-        // The other user can do nothing with the hub's memory.
+        // The other user cannot access the hub's memory.
         let alone = start(OTHER_UID, &["echo", "front/scan", "--json", "-n", "1"]).wait();
         assert_ne!(alone.exit_code, Some(0), "{alone}");
 
@@ -126,7 +127,7 @@ fn commands_of_the_page_work_for_another_user() {
         );
         assert_eq!(listener.end(TERM).exit_code, Some(0));
 
-        // Under a name of its own.
+        // A listener that publishes under a given name.
         let named = arguments_with_hub("scanhub listen --publish --interface lo --name", &hub);
         let listener = start(OTHER_UID, &words(&named)).ready();
         wait_until("the name is there", || {
@@ -145,15 +146,15 @@ fn commands_of_the_page_work_for_another_user() {
 /// Domain of the hubs that [`reports_the_user_of_a_running_hub`] starts. Hubs of other tests are visible in /proc too.
 const DOMAIN_FLAG: &str = "--domain=whose";
 
-/// The program as sudo starts it: without the variables of a login session.
+/// Starts the program as sudo does: without the variables of a login session.
 fn by_sudo(user: u32, arguments: &[&str]) -> Program {
     let mut command = scanhub(user, arguments);
     command.env_remove("XDG_RUNTIME_DIR").env_remove("RUNTIME_DIRECTORY");
     Program::start(command)
 }
 
-/// Checks that verbs of `caller` find no hub and suggest a command, and that this command lists the topics of `hub`, which
-/// belongs to `owner`.
+/// Asserts that verbs of `caller` find no hub and suggest a command, and that this command lists the topics of `hub`,
+/// which belongs to `owner`.
 fn assert_suggestion_works(caller: &dyn Fn(&[&str]) -> Program, owner: u32, hub: &Program) {
     let sudo = if owner == 0 { "sudo".to_owned() } else { format!("sudo -u '#{owner}'") };
     let suggested = format!("process {}: {sudo} /mnt/scanhub ", hub.pid());
@@ -170,7 +171,7 @@ fn assert_suggestion_works(caller: &dyn Fn(&[&str]) -> Program, owner: u32, hub:
             "{words:?}: {listed}"
         );
     }
-    // A verb that waits for a hub names it, too.
+    // A verb that waits for a hub suggests the command too.
     let mut echo = caller(&["echo", "front/scan", "--json", DOMAIN_FLAG]);
     let notice = echo.await_line("no hub", |line| line["kind"] == "hub_gone");
     assert!(notice["hint"].as_str().is_some_and(|hint| hint.contains(&suggested)), "{notice}");
@@ -202,7 +203,7 @@ fn reports_the_user_of_a_running_hub() {
         assert_suggestion_works(&root, OTHER_UID, &of_session);
         assert_eq!(of_session.end(TERM).exit_code, Some(0));
 
-        // Other users cannot read the variable, so they are not told a domain.
+        // Other users cannot read the variable, so they do not see the domain.
         let mut command = scanhub(0, &run[..run.len() - 1]);
         command.env_remove("XDG_RUNTIME_DIR").env("SCANHUB_DOMAIN", "whose");
         let of_variable = Program::start(command).ready();
@@ -232,7 +233,7 @@ fn reports_the_user_of_a_running_hub() {
         assert_eq!(web.end(TERM).exit_code, Some(0));
         assert_eq!(of_variable.end(TERM).exit_code, Some(0));
 
-        // A hub of this user below another directory is listed.
+        // A hub of this user in another directory is listed.
         let below = start(OTHER_UID, &[&run[..], &["--root", &format!("/tmp/{OTHER_UID}")]].concat()).ready();
         let listed = other(&["list", "--domains", "--json"]).wait();
         let root = json!(format!("/tmp/{OTHER_UID}/whose"));
@@ -241,7 +242,7 @@ fn reports_the_user_of_a_running_hub() {
     });
 }
 
-/// What the page says of the service is a configuration that a gateway takes.
+/// The configuration of the service on the page is valid for a gateway.
 #[test]
 fn the_page_s_configuration_is_one() {
     let block =
@@ -260,7 +261,7 @@ fn the_page_s_configuration_is_one() {
     assert!(shown.lines().iter().any(is_it), "{shown}");
 }
 
-/// The three terminals of docs/tilt.md, in the order of the page: the mount publishes before there is a hub.
+/// Runs the three commands of docs/tilt.md in the order of the page: the mount publishes before a hub runs.
 #[test]
 fn mount_and_hub_find_each_other_in_either_order() {
     in_namespace("sharing::mount_and_hub_find_each_other_in_either_order", || {
@@ -292,7 +293,7 @@ fn mount_and_hub_find_each_other_in_either_order() {
             tilt.await_line("a sweep", is_class("obstacles"));
             assert!(!fs::exists("/run/scanhub").expect("/run can be read"), "a service's place is not ours");
             assert_eq!((tilt.end(INT).exit_code, hub.end(INT).exit_code), (Some(0), Some(0)));
-            // Alone again, it is where the next hub looks for it, too.
+            // The mount continues alone in the directory in which the next hub searches.
             let hub = start(user, &run).ready();
             let mut echo = start(user, &["echo", "mount/tilt", "--json"]);
             echo.await_line("an angle", is_class("tilt"));

@@ -1,10 +1,11 @@
-//! A test that is left out says so past whoever keeps what passes to himself, and fails where it is required.
+//! Tests of skipped tests: a skip is reported even though the test harness hides the output of passed tests, and it
+//! fails if `SCANHUB_REQUIRE` names what is missing.
 
 use std::process::{Command, Output};
 
 use crate::testkit::{output, own_program, single_test_args, skip, skip_verdict};
 
-/// Set where the test is to be left out.
+/// Variable that is set when the test runs again in order to skip itself.
 const RERUN_VARIABLE: &str = "SCANHUB_TEST_SKIP";
 
 #[test]
@@ -16,7 +17,7 @@ fn required_tool_may_not_be_skipped() {
         let message = skip_verdict(required, "tmux", "there is none").expect_err(required);
         assert_eq!(message, "tmux is required here by SCANHUB_REQUIRE: there is none");
     }
-    // A name with a slip in it would require nothing.
+    // A misspelled name would require nothing.
     for (required, need) in [("tmuks", "tmux"), ("", "tmuks"), ("tmux,netn", "cc")] {
         let message = skip_verdict(required, need, "there is none").expect_err(required);
         assert!(message.contains("is not a requirement of tests; known are bash, cc, "), "{message}");
@@ -30,7 +31,7 @@ fn a_test_that_is_left_out_says_so_or_fails() {
     }
     let again = |required: &str| -> Output {
         let mut command = Command::new(own_program());
-        // What passes is not shown by itself.
+        // Without `--nocapture`, the harness hides the output of passed tests.
         command.args(&single_test_args("skips::a_test_that_is_left_out_says_so_or_fails")[..2]);
         command.env(RERUN_VARIABLE, "1").env("SCANHUB_REQUIRE", required).env_remove("RUST_TEST_NOCAPTURE");
         output(command).expect("it runs")

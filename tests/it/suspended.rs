@@ -1,6 +1,5 @@
-//! A hub that does not run for a while, as on a machine that is suspended: what its line's buffer had room for is
-//! delivered, what it had no room for is lost and counted, and then it goes on as if nothing had been. And a listener:
-//! what waited for it is not new.
+//! Tests of a hub that is stopped for a while, as on a suspended machine: it delivers what fits into the buffer of the
+//! line, counts the rest as lost, and continues. A stopped listener does not report waiting datagrams as new.
 
 use crate::testkit::{
     INT, TERM, TestEnv, TestGateway, bytes_of, hash, in_a_network, is_class, number, wait_until,
@@ -21,7 +20,7 @@ fn a_hub_that_was_stopped() {
     hub.signal(Signal::STOP);
     let lost = |env: &TestEnv| env.truth("front").iter().filter(|sent| sent.fault.is_some()).count();
     let before = lost(&env);
-    // The buffer is full, and more than a second passes.
+    // The buffer is full, and more than a second has passed.
     wait_until("telegrams are lost", || lost(&env) > before + 50);
     let continued = now_ns();
     hub.signal(Signal::CONT);
@@ -40,7 +39,7 @@ fn a_hub_that_was_stopped() {
     let (Some(&first), Some(&last)) = (places.first(), places.last()) else { panic!("nothing came") };
     assert!(places.is_sorted(), "out of order");
     assert!(places.iter().all(|&place| truth[place].fault.is_none()), "made up");
-    // The burst may be too fast for a consumer, who knows then how many it missed.
+    // The burst may be too fast for a subscriber, which then reports how many samples it missed.
     let notices = outcome.of_class("notice");
     let of_telegrams = notices.iter().filter(|line| line["kind"] == "missed" && line["topic"] == "telegram");
     let missed: u64 = of_telegrams.map(|line| number(line, "missed")).sum();
@@ -49,8 +48,9 @@ fn a_hub_that_was_stopped() {
 
     let stamps: Vec<u64> = lines.iter().map(|line| number(line, "stamp_ns")).collect();
     assert!(stamps.is_sorted(), "stamps run backwards: {stamps:?}");
-    // Nothing that waited looks newer than it is, or it says that its stamp is an estimate: where the kernel's own
-    // threads wait for a processor, the line falls silent before all that waited was read.
+    // The stamp of a telegram that waited is not too new, or it is marked as estimated. The latter occurs if the
+    // kernel's own threads have to wait for a processor, so that the line is silent before the hub has read the whole
+    // backlog.
     let is_estimate = |line: &Value| line["flags"].to_string().contains("stamp_estimated");
     let sample = |n: usize| (truth[places[n]].sent_ns, stamps[n], is_estimate(&lines[n]));
     let all: Vec<(u64, u64, bool)> = (0..places.len()).map(sample).collect();
@@ -58,12 +58,12 @@ fn a_hub_that_was_stopped() {
     let are_right = waited.iter().all(|(sent, stamp, is_estimate)| stamp < sent || *is_estimate);
     assert!(waited.len() > 10 && are_right, "{waited:?}");
     // The hub reads the first of them at once, so its stamp is wrong only if the host was late before it was stopped:
-    // the period of the scans before continues.
+    // stamps continue with the period of the earlier scans.
     let was_late = all.iter().any(|(sent, stamp, _)| *sent < stopped && stamp >= sent);
     assert!(was_late || waited.first().is_some_and(|(sent, stamp, _)| stamp < sent), "{all:?}");
 
-    // Each scan has a verdict; what the zones' numbers are ahead of the scans' by was said because scans stayed out.
-    // That is not said again between those that waited.
+    // Each scan has a verdict. Additional samples of `zones` report a silence, and there are no such samples between
+    // the scans that waited.
     let scans = outcome.of_class("scan");
     let ahead = outcome.of_class("zones").into_iter().filter_map(|line| {
         let scan = scans.iter().find(|scan| scan["seq"] == line["seq"])?;
@@ -75,7 +75,7 @@ fn a_hub_that_was_stopped() {
     assert!(last - first < waited.len() as u64 / 2, "{ahead:?} with {} that waited", waited.len());
 }
 
-/// CLOCK_MONOTONIC, as in the truth and in stamps.
+/// Returns the time of CLOCK_MONOTONIC in ns, as in the truth file and in stamps.
 fn now_ns() -> u64 {
     let now = clock_gettime(ClockId::Monotonic);
     now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
@@ -87,7 +87,7 @@ fn datagram_for_a_stopped_listener_keeps_arrival_time() {
         let env = TestEnv::new();
         let mut listener = env.start(&["listen", "--json"]).ready();
         let mut sender = TestGateway::new(0x5f3a_12bc_00d1_e2f3, 7, 2, "front");
-        // Sends to a listener that is stopped for a while; its stamp, and when it was sent.
+        // Sends a sample to a listener that is stopped for a while. Returns its line and the range of possible stamps.
         let mut stop = || {
             listener.signal(Signal::STOP);
             // Otherwise, a listener that still runs receives the datagram at once.
@@ -98,10 +98,10 @@ fn datagram_for_a_stopped_listener_keeps_arrival_time() {
             wait_until("a stamp of later would be wrong", || now_ns() > after + 200_000_000);
             listener.signal(Signal::CONT);
             let line = listener.await_line("zones", is_class("zones"));
-            // The kernel tells of another clock.
+            // The kernel stamps with another clock, so allow for a small difference.
             (line, before - 1_000_000..after + 100_000_000)
         };
-        // It begins to look at the clock some time after the first socket of the machine asked for that.
+        // The kernel starts to stamp datagrams some time after the first socket of the machine requests it.
         wait_until("the kernel stamps what comes", || {
             let (line, possible) = stop();
             possible.contains(&number(&line, "stamp_ns"))

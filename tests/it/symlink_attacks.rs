@@ -1,4 +1,4 @@
-//! Links that another user has planted where root writes files: root's files stay as they are.
+//! Tests of symbolic links that another user has planted where root writes files: root's files stay unchanged.
 
 use std::fs::{self, Permissions};
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
@@ -10,7 +10,7 @@ use crate::testkit::{INT, Outcome, Program, TERM, is_class, wait_until};
 const TARGET_FILE: &str = "/mnt/victim";
 const TARGET_CONTENT: &str = "a file of root";
 
-/// Creates root's file and an input for each verb, where the stranger can write nothing.
+/// Creates root's file and the input of each verb in a directory in which the other user cannot write.
 fn prepare() {
     fs::write(TARGET_FILE, TARGET_CONTENT).expect("a file");
     let scan = format!("FLASER 181{} 0 0 0 0 0 0 1.5 host 1.5\n", " 1.5".repeat(181));
@@ -23,7 +23,7 @@ fn run(words: &[&str]) -> Outcome {
     Program::start(scanhub(0, words)).wait()
 }
 
-/// Command lines of root that write to `file`.
+/// Returns command lines of root that write to `file`.
 fn outputs(file: &str) -> [Vec<&str>; 10] {
     [
         vec!["convert", "/mnt/walk.log", file],
@@ -83,19 +83,19 @@ fn directories_are_not_created_behind_links_of_others() {
         }
         assert_eq!(fs::read_dir("/mnt/prey").expect("it is ours").count(), 0);
         assert!(!fs::exists("/mnt/new").unwrap());
-        // Directories below a shared one are created like others.
+        // Directories in a shared directory are created as usual.
         let outcome = run(&["man", "/tmp/pages/deep"]);
         assert_eq!(outcome.exit_code, Some(0), "{outcome}");
         assert!(fs::exists("/tmp/pages/deep/scanhub-run.1").unwrap());
     });
 }
 
-/// A name that contains the process id can be planted before the process starts.
+/// Another user could plant a name that contains the process ID before the process starts.
 #[test]
 fn names_of_temporary_files_cannot_be_guessed() {
     with_another_user("symlink_attacks::names_of_temporary_files_cannot_be_guessed", || {
         prepare();
-        // The shell has the process id that the program gets.
+        // The program replaces the shell and therefore has its process ID.
         let planted = |name: &str, words: &str| {
             let link = format!("setpriv --reuid=65533 --clear-groups ln -s /mnt/victim /tmp/.{name}.$$");
             let mut shell = Command::new("sh");
@@ -116,7 +116,7 @@ fn names_of_temporary_files_cannot_be_guessed() {
     });
 }
 
-/// As after `sudo -E`: the environment of another user names the directory.
+/// After `sudo -E`, the environment of another user may name the directory.
 #[test]
 fn a_state_directory_of_another_user_is_not_used() {
     with_another_user("symlink_attacks::a_state_directory_of_another_user_is_not_used", || {
@@ -156,7 +156,7 @@ fn files_of_a_gateway_are_private() {
     with_another_user("symlink_attacks::files_of_a_gateway_are_private", || {
         fs::create_dir_all("/mnt/state/scanhub").expect("a directory");
         let file = "/mnt/state/scanhub/gateway-scanhub-lo-1";
-        // As an earlier version left it.
+        // An earlier version left the file with this mode.
         fs::write(file, "").expect("a file");
         fs::set_permissions(file, Permissions::from_mode(0o666)).expect("it is ours");
         let mut command = scanhub(0, &["gateway", "--json", "--no-system-config", "--interface=lo"]);
@@ -168,14 +168,14 @@ fn files_of_a_gateway_are_private() {
     });
 }
 
-/// Another user cannot occupy the directories of a demonstration.
+/// Another user cannot block a demo by occupying its directory.
 #[test]
 fn demo_runs_if_its_usual_directory_is_occupied() {
     with_another_user("symlink_attacks::demo_runs_if_its_usual_directory_is_occupied", || {
         run_as_other_user("mkdir -m 777 /tmp/scanhub-0");
         let mut demo = scanhub(0, &["demo", "--headless", "--json"]);
         demo.env("PATH", std::env::var_os("PATH").unwrap_or_default());
-        // Where /run belongs to root, that is the usual directory.
+        // If /run belongs to root, this is the usual directory.
         demo.env_remove("XDG_RUNTIME_DIR");
         let mut demo = Program::start(demo);
         let ready = demo.await_line("ready", is_class("ready"));

@@ -1,5 +1,6 @@
-//! Names of sensors, trackers and mounts are one name space per domain: the first process that publishes under a name has
-//! it. A hub waits for a name that a program has. A program is refused a name that another process has.
+//! Tests of names that are taken. Sensors, trackers and mounts share one name space per domain, and the first process
+//! that publishes under a name has it. A hub waits for a name that a program has. A program is refused a name that
+//! another process has.
 
 use std::sync::atomic::{AtomicU32, Ordering};
 
@@ -7,7 +8,7 @@ use serde_json::{Value, json};
 
 use crate::testkit::{INT, KILL, Outcome, Program, TERM, TestEnv, contiguous_numbers, is_class, scan};
 
-/// A simulated mount whose angles are published as `name`.
+/// Starts a simulated mount that publishes its angles as `name`.
 fn start_mount(env: &TestEnv, name: &str) -> Program {
     static NEXT: AtomicU32 = AtomicU32::new(0);
     let port =
@@ -15,12 +16,13 @@ fn start_mount(env: &TestEnv, name: &str) -> Program {
     env.start(&["simulate", "--json", "--world=tilt", &port, &format!("--angles={name}")])
 }
 
-/// The message of a process that lacks the name, because `holder` has it.
+/// Returns the message for a name that `holder` has.
 fn name_taken_message(name: &str, holder: &Program) -> String {
     format!("the name {name} is published by process {} (scanhub)", holder.pid())
 }
 
-/// Checks that a program was refused the name. Programs whose output is the line `ready` report errors on stderr.
+/// Asserts that a program was refused the name. Programs whose stdout only has the line `ready` report errors on
+/// stderr.
 fn assert_refused(outcome: &Outcome, message: &str) {
     let mut lines = outcome.stderr.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
     let error = lines.next_back().unwrap_or_default();
@@ -48,7 +50,7 @@ fn link_waits_for_the_name_that_a_program_has() {
         // The program keeps its topic, and other links stream.
         env.await_info("rear", |info| info["state"] == "streaming");
         env.echo(&["front/tilt"]).await_lines(20, "angles", is_class("tilt"));
-        // A second program gets the same answer as the hub.
+        // A second program receives the same message as the hub.
         assert_refused(&start_mount(&env, "front").wait(), &words);
 
         let mut waiting = env.echo(&["front/scan"]);
@@ -100,7 +102,7 @@ fn killed_hub_does_not_keep_its_names() {
     assert_eq!(ready["waiting"], Value::Array(Vec::new()), "{ready}");
     let outcome = hub.end(TERM);
     assert!(outcome.exit_code == Some(0) && !outcome.stderr.contains("is published by"), "{outcome}");
-    // Nor does a hub that ended.
+    // A hub that ended normally does not keep its names either.
     let holder = start_mount(&env, "front").ready();
     assert_eq!(holder.end(INT).exit_code, Some(0));
 }
@@ -116,7 +118,7 @@ fn program_is_refused_the_name_of_another_program() {
     assert!(env.leftover_files().is_empty(), "{:?}", env.leftover_files());
 }
 
-/// The links of a hub that plays play together, so none of them waits.
+/// A recording does not wait for its names, because the links of a replay start together.
 #[test]
 fn recording_is_refused_the_name_of_a_program() {
     let env = TestEnv::new();

@@ -1,5 +1,5 @@
-//! Runs `scanhub telegram decode` as a user would: every telegram is explained, every byte outside a telegram is counted,
-//! and input that cannot be read is refused with a remedy.
+//! Tests of `scanhub telegram decode`: it explains every telegram, counts every byte outside of telegrams, and refuses
+//! unreadable input with a remedy.
 
 use std::io::Write as _;
 use std::process::{Command, Output, Stdio};
@@ -30,10 +30,10 @@ fn telegram(words: &[&str], input: &[u8]) -> Output {
     let mut program = spawn(command).expect("it starts");
     let mut stdin = program.stdin.take().expect("a pipe");
     let input = input.to_vec();
-    // It may write before it has read everything.
+    // The program may write before it has read everything.
     let writer = std::thread::spawn(move || stdin.write_all(&input));
     let output = program.wait_with_output().expect("it ends");
-    // One that reads nothing closes its end.
+    // A program that reads nothing closes its end of the pipe.
     let _ = writer.join().expect("no panic");
     output
 }
@@ -46,7 +46,7 @@ fn lines(output: &Output) -> Vec<Value> {
     text(&output.stdout).lines().map(|line| serde_json::from_str(line).expect("an object")).collect()
 }
 
-/// Every request and the simpler replies, each with a part of its explanation.
+/// Returns every request and the simpler replies, each with a part of its explanation.
 fn telegrams() -> Vec<(EncodedTelegram, &'static str)> {
     let span = |first, last| SubRange { first, last };
     let spans = |spans: &[SubRange]| SubRanges::new(spans).expect("one to five");
@@ -226,7 +226,7 @@ fn the_telegrams_inside_a_recording_are_decoded() {
     let output = telegram(&["decode", "--json", golden], &[]);
     assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
     let (decoded, summary) = (lines(&output), lines(&output).pop().expect("a summary"));
-    // Every byte is of a telegram: nothing of the framing is taken for one.
+    // Every byte belongs to a telegram: the framing of the file is not taken for one.
     let inside: u64 = decoded.iter().filter_map(|line| line["length"].as_u64()).sum();
     assert!(inside > 0 && inside < bytes.len() as u64, "{summary}");
     assert_eq!((summary["bytes"].as_u64(), summary["other_bytes"].as_u64()), (Some(inside), Some(0)));
@@ -270,5 +270,5 @@ fn refusals_have_a_remedy() {
     assert!(lines(&garbled)[0]["message"].as_str().expect("words").contains("line 1: \"0q\" is no byte"));
 }
 
-/// Status byte of a sensor without a fault.
+/// Status byte of a scanner without a fault.
 const STATUS_OK: u8 = 0x10;

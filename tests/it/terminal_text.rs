@@ -1,15 +1,15 @@
-//! What stands in a file, on a line or in a name is shown, and obeyed by no terminal: control characters reach neither
-//! stdout nor stderr, in text and in JSON, which says them all the same.
+//! Tests of control characters in files, on a line and in names: they reach neither stdout nor stderr unescaped. JSON
+//! has them as escapes.
 
 use std::fs;
 
 use crate::testkit::{Outcome, TERM, TestEnv};
 use scanhub_drivers::lms::telegram::Writer;
 
-/// C0, DEL and C1, as a terminal takes them for a command.
+/// Characters of C0, DEL and C1, which a terminal may take for commands.
 const CONTROL_CHARACTERS: &str = "\u{1b}]0;x\u{7}\u{9b}31m\u{7f}\u{85}\u{9d}";
 
-/// There is text alone, but for the ends of lines.
+/// Asserts that the output has no control characters except line feeds.
 fn assert_printable(outcome: &Outcome) {
     for text in [String::from_utf8_lossy(&outcome.stdout).into_owned(), outcome.stderr.clone()] {
         let control = text.chars().find(|&c| c.is_control() && c != '\n');
@@ -26,7 +26,7 @@ fn a_configuration_commands_no_terminal() {
         "sound.toml",
         format!("[[link]]\nname = \"a\"\nport = \"{port}\"\n[gateway]\ninterface = \"{quoted}\"\n"),
     );
-    // Bytes that no TOML has, in a comment, a key and a value; C1 it may have.
+    // Bytes that TOML does not allow, in a key, and C1 characters, which it allows, in a value and a key.
     let raw = env.file("raw.toml", "[[link]]\nname = \"a\"\npo\u{1b}[2Jrt = 1\n");
     let value = env.file("value.toml", "[[link]]\nname = \"\u{9b}31m\"\nport = \"x\"\n");
     let key = env.file("key.toml", "[[link]]\n\"\u{9b}31m\\u001b\" = 1\n");
@@ -49,10 +49,10 @@ fn a_configuration_commands_no_terminal() {
             assert_printable(&outcome);
         }
     }
-    // JSON says what is there.
+    // JSON has the exact value.
     let outcome = env.run(&["config", "check", &sound, "--json"]);
     assert_eq!(outcome.lines()[0]["links"][0]["port"], format!("/dev/{CONTROL_CHARACTERS}"), "{outcome}");
-    // The log of a hub, its status, and who shows that.
+    // The log of a hub, its status, and verbs that print it.
     let hub = env.hub(&["--config", &sound]);
     for verb in
         [&["info", "a"][..], &["info", "a", "--json"], &["list"], &["echo", "a/status", "-n1", "--json"]]

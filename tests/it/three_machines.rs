@@ -1,5 +1,5 @@
-//! Three machines on a router: two rooms with a hub each, and somebody who watches both. The test's own network is the
-//! router's machine; cables lead from it to the three.
+//! Tests with three machines on a router: two rooms with a hub each, and a machine that watches both. The test's own
+//! network is the router's machine, which has a cable to each of the three.
 
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
@@ -10,7 +10,7 @@ use crate::testkit::{
     is_class, number, skip, wait_until,
 };
 
-/// The program `scanhub-bridge`, where it was built: `cargo build` alone does not.
+/// Returns the path of `scanhub-bridge`, or skips if it is not built: `cargo build` alone does not build it.
 fn bridge_program() -> Option<PathBuf> {
     let default_path = Path::new(env!("CARGO_BIN_EXE_scanhub")).with_file_name("scanhub-bridge");
     if !default_path.is_file() {
@@ -20,7 +20,7 @@ fn bridge_program() -> Option<PathBuf> {
     Some(default_path)
 }
 
-/// The program with these flags, in the network and domain of `env`.
+/// Returns the bridge with these flags, in the network and domain of `env`.
 fn command(env: &TestEnv, flags: &[&str]) -> Command {
     let inner = env.command(flags);
     let own = OsStr::new(env!("CARGO_BIN_EXE_scanhub"));
@@ -39,14 +39,14 @@ fn command(env: &TestEnv, flags: &[&str]) -> Command {
     command
 }
 
-/// A bridge that has begun, and what it is called.
+/// Starts a bridge and waits until it is ready. Returns it with its hub ID.
 fn bridge(env: &TestEnv, flags: &[&str]) -> (Program, String) {
     let mut program = Program::start(command(env, &[&["--json"], flags].concat()));
     let begin = program.await_line("its begin", is_class("bridge_ready"));
     (program, begin["hub"].as_str().unwrap_or_default().to_owned())
 }
 
-/// What a bridge that is only to be checked finds: the state and the words of each finding.
+/// Runs a bridge with `--check`. Returns its exit code, and the state and text of each finding.
 fn run_check(env: &TestEnv, flags: &[&str]) -> (Option<i32>, Vec<(String, String)>) {
     let outcome: Outcome = Program::start(command(env, &[&["--json", "--check"], flags].concat())).wait();
     let text_of = |line: &serde_json::Value, key: &str| line[key].as_str().unwrap_or_default().to_owned();
@@ -82,7 +82,7 @@ fn two_rooms_are_watched_from_a_third_machine() {
             here.await_line("a room", |line| line["kind"] == "published");
         }
 
-        // Both rooms, as if they were here.
+        // The third machine receives both rooms as if they were local.
         for room in ["room0.front", "room1.front"] {
             let ages = watcher.run(&["latency", &format!("{room}/scan"), "-n20", "--json"]);
             let line = ages.of_class("latency").pop();
@@ -106,10 +106,10 @@ fn two_rooms_are_watched_from_a_third_machine() {
         assert!(code == Some(0) && found.len() == 1 && found[0].0 == "ok", "{found:?}");
         assert!(bridges.iter().all(|(_, hub)| found[0].1.contains(hub)), "{found:?}");
 
-        // The picture's places are free only after who publishes cleaned up behind it.
+        // The slots of `watch` become free only after the publishers have cleaned up.
         wait_until("the picture is gone", || watcher.subscribers("room0.front/zones") == 0);
 
-        // Without the router the rooms go on by themselves, and nobody elsewhere believes an old verdict.
+        // Without the router, the rooms continue on their own, and no other machine keeps an old verdict.
         let mut zones = watcher.echo(&["room0.front/zones"]);
         zones.await_line("a verdict", |line| line["class"] == "zones" && line["verdict"] != "unknown");
         let mut local = rooms[0].start(&["hz", "--json", "front/scan"]);

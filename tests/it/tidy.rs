@@ -1,5 +1,5 @@
-//! The walls of the house, each one an assertion that was seen to fail: every test first finds the project in order,
-//! then plants a breach and must find that.
+//! Checks of the project's sources. Each test first finds the project in order, then builds in violations and must find
+//! each of them.
 
 mod between;
 mod crates;
@@ -15,7 +15,7 @@ mod verbs;
 
 use tree::{Rule, SourceTree};
 
-/// The wall stands in `tree` and would be missed in each of `broken`.
+/// Asserts that the project's tree conforms to the rule `wall`, and that each tree of `broken` violates it.
 fn assert_rule(wall: Rule, broken: impl Fn(&SourceTree) -> Vec<SourceTree>) {
     let tree = SourceTree::load();
     let breaches = wall(&tree);

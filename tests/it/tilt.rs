@@ -1,5 +1,5 @@
-//! `scanhub tilt`, from telegrams and angles to points and an obstacle: as its page walks through it, and with angles
-//! that stop.
+//! Tests of `scanhub tilt`, from telegrams and angles to points and an obstacle: with the commands of its page, and
+//! with missing angles.
 
 use std::cell::Cell;
 
@@ -14,8 +14,8 @@ use crate::recorded_world::{START_NS, recorded_world};
 use crate::testkit::{INT, Outcome, Program, TestEnv, is_class, number};
 use crate::tilted::TiltedPublisher;
 
-/// A hall with a post ahead of a sensor that swings slowly: how late the hub stamps scans on a busy machine moves
-/// points little.
+/// World with a hall, a post ahead of the sensor, and a mount that tilts slowly, so that late stamps of a busy machine
+/// move points little.
 const TILT_WORLD: &str = "
 [[sensor]]
 pose = [0, 0, 90]
@@ -36,7 +36,7 @@ height_mm = 800
 pose = [0, 1500]
 ";
 
-/// The post, as somebody says who wants nothing to stand there.
+/// Argument for a box around the post in which obstacles are near.
 pub(crate) const NEAR_FLAG: &str = "--near=1,2,-0.5,0.5,0.1,0.7";
 
 pub(crate) struct TiltHub {
@@ -50,7 +50,7 @@ impl TiltHub {
         TiltHub::with_encoder("mount")
     }
 
-    /// One where the mount's encoder has this name.
+    /// Starts a hub with a mount whose angles are published as `name`.
     fn with_encoder(name: &str) -> TiltHub {
         let env = TestEnv::new();
         let world = env.file("hall.toml", TILT_WORLD);
@@ -71,13 +71,13 @@ fn tilt(env: &TestEnv, more: &[&str]) -> Program {
     env.start(&[&place[..], more].concat())
 }
 
-/// Plays a recording of `world` again and again. Its stamps are exact, however busy the machine is.
+/// Replays a recording of `world` in a loop. Its stamps are exact, however busy the machine is.
 fn replay_tilt(env: &TestEnv, world: &str) -> Program {
     let file = recorded_world(env, &World::of_toml("hall", world).expect("a world"), &["front"], 20);
     env.start(&["replay", &file, "--loop", "--json", "--no-system-config"]).ready()
 }
 
-/// How far a point is from floor, walls and post.
+/// Returns the distance of a point from the nearest of floor, walls and post, in meters.
 fn distance_from_wall(point: &[f64]) -> f64 {
     let [x, y, z] = point[..] else { panic!("{point:?}") };
     let post = ((x - 1.5).hypot(y) - 0.1).abs();
@@ -89,7 +89,7 @@ fn has_obstacles(line: &Value) -> bool {
     is_class("obstacles")(line) && line["obstacles"] != Value::Array(Vec::new())
 }
 
-/// Whether it ended with an error that has these words.
+/// Returns whether `outcome` has an error whose message contains `words`.
 fn reports_error(outcome: &Outcome, words: &str) -> bool {
     outcome.of_class("error").iter().any(|line| line["message"].to_string().contains(words))
 }
@@ -128,9 +128,9 @@ fn points_match_the_hall_and_the_post_is_an_obstacle() {
     let points: Vec<Vec<f64>> = points.collect();
     let mut off: Vec<f64> = points.iter().map(|point| distance_from_wall(point)).collect();
     off.sort_by(f64::total_cmp);
-    // A machine that stands still stamps scans late.
+    // A machine that stalls stamps scans late.
     assert!(off[off.len() * 9 / 10] < 0.08, "{:?}", [off[off.len() / 2], off[off.len() * 9 / 10]]);
-    // Beside the others: a mount, a tracker's place, and what is made of both; a name has one publisher.
+    // A name that a link, a mount or another `tilt` has is refused.
     let again = hall.tilt(&["--as=hall"]).wait();
     let held = |name: &str, pid: u32| format!("the name {name} is published by process {pid} (scanhub)");
     assert!(again.exit_code == Some(75) && reports_error(&again, &held("hall", tilt.pid())), "{again}");
@@ -161,12 +161,13 @@ fn the_programs_of_the_page_say_how_a_mount_stands() {
         assert!(lines.iter().all(is_right), "{}: {lines:?}", example.location);
         assert!(angle_deg(&lines[0]) != angle_deg(&lines[49]), "{}: it stands", example.location);
         let outcome = mount.end(INT);
-        // An interrupt ends a program in Python with words.
+        // An interrupt ends a Python program with a traceback.
         assert!(outcome.stderr.is_empty() || outcome.stderr.contains("KeyboardInterrupt"), "{outcome}");
     }
 }
 
-/// A servo or an encoder whose program is not in Rust: it hears the encoder of the world, and says it again.
+/// Tests a mount whose program is not in Rust: it receives the angles of the simulated encoder and publishes them
+/// again.
 #[test]
 fn tilt_accepts_angles_of_programs_in_all_languages() {
     let hall = TiltHub::with_encoder("encoder");
@@ -208,7 +209,7 @@ pub(crate) fn end_cleanly(hall: TiltHub) {
 fn the_page_leads_to_an_obstacle() {
     let hall = TiltHub::new();
     let lines = commands_on("docs/tilt.md", &["scanhub tilt front --angles", "scanhub echo hall/"]);
-    // `--check` on the page has a test of its own.
+    // The third command, with `--check`, has its own test.
     let [tilt, echo, _] = &lines[..] else { panic!("{lines:?}") };
     let start = |words: &[String]| hall.env.start(&[words, &["--json".to_owned()]].concat());
     let mut tilt = start(tilt);
@@ -241,7 +242,7 @@ fn a_recording_has_three_dimensions() {
     assert_eq!(played.exit_code, Some(0), "{played}");
     let outcome = tilt.end(INT);
     let sum = &outcome.of_class("summary")[0];
-    // Four whole sweeps are enough to notice stamps that are 8 ms off.
+    // Four whole sweeps are enough to detect stamps that are off by 8 ms.
     assert!(number(sum, "sweeps") >= 4 && sum["late_ms"] == 0.0, "{sum}");
     assert!(number(sum, "points") > 50_000, "{sum}");
     let points_dropped =
@@ -306,7 +307,7 @@ fn reports_missing_angles_and_bad_arguments() {
     let mut hall = TiltHub::new();
     let mut tilt = hall.tilt(&[]);
     tilt.await_line("a sweep", is_class("obstacles"));
-    // Whoever says how the mount stands goes away with the simulator; the hub's scans go on from another one.
+    // The angles end with the simulator. Scans continue from another simulator.
     drop(hall.simulator.take().map(|simulator| simulator.end(INT)));
     hall.simulator = Some(hall.env.simulator(&["front"], &["--world=room", "--baud=500000"]));
     let report = tilt.await_line("no angles", |line| is_class("angles")(line) && line["problem"] == "silent");

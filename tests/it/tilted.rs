@@ -1,5 +1,5 @@
-//! Topics of a mount and of what makes points of it, published by a program beside a hub: every reader says the same of them,
-//! on this machine, on another one and in a recording.
+//! Tests of the topics that mounts and `tilt` publish, from a program next to a hub: every reader reports the same
+//! values, on this machine, on another one and in a recording.
 
 use std::cell::RefCell;
 use std::path::Path;
@@ -16,7 +16,7 @@ use crate::testkit::{
     INT, Outcome, Program, Recording, TestEnv, client_python, in_a_network, number, wait_until,
 };
 
-/// What turns a mount and what makes points of it, in one program.
+/// Publisher of a mount's angle and of clouds and obstacles, in one program.
 pub(crate) struct TiltedPublisher {
     tilt: Publication<Tilt>,
     cloud: Publication<Cloud>,
@@ -26,7 +26,8 @@ pub(crate) struct TiltedPublisher {
     pub(crate) round_count: u32,
 }
 
-/// Points of a sample: as many as the beams of an LMS, so that a datagram has no room for them.
+/// Points per sample: as many as the maximum number of beams of an LMS, so that a sample does not fit into one
+/// datagram.
 const POINT_COUNT: u16 = 401;
 
 impl TiltedPublisher {
@@ -40,7 +41,7 @@ impl TiltedPublisher {
         TiltedPublisher { tilt: mount.topic().unwrap(), cloud, obstacles, mount, room, round_count: 0 }
     }
 
-    /// An angle, obstacles and two clouds, different ones each time.
+    /// Publishes an angle, obstacles and two clouds that differ in each round.
     pub(crate) fn publish_round(&mut self) {
         let (sweep, k) = (self.round_count, self.round_count as f32 / 8.0);
         let at = |header: Header, sensor| Header { sensor, ..header };
@@ -81,7 +82,8 @@ impl TiltedPublisher {
         self.round_count += 1;
     }
 
-    /// Publishes until each of `programs` has said lines of every class from rounds that began after all of them had said one.
+    /// Publishes until each of `programs` has printed lines of every class from rounds after all of them had printed
+    /// some.
     fn publish_until_received(&mut self, programs: &mut [&mut Program]) {
         for since in [0, 1] {
             let since = since * u64::from(self.round_count);
@@ -96,7 +98,7 @@ impl TiltedPublisher {
     }
 }
 
-/// The round in which it was published.
+/// Returns the round in which the sample of `line` was published.
 pub(crate) fn round_of(line: &Value) -> u64 {
     match line["angle_deg"].as_f64() {
         Some(angle_deg) => (8.0 * (angle_deg.to_radians() - 0.5)).round() as u64,
@@ -107,12 +109,12 @@ pub(crate) fn round_of(line: &Value) -> u64 {
 pub(crate) const CLASSES: [&str; 3] = ["tilt", "cloud", "obstacles"];
 pub(crate) const TOPICS: [&str; 3] = ["mount/tilt", "room/cloud", "room/obstacles"];
 
-/// A hub whose sensor is not there.
+/// Starts a hub whose port does not exist.
 pub(crate) fn hub(env: &TestEnv) -> Program {
     env.hub(&[env.link("front")])
 }
 
-/// How many lines of `class` one program has said that another one has, too; what they say of `keys` is the same.
+/// Asserts that lines of `class` that both programs printed agree in `keys`. Returns the count of such lines.
 fn assert_same_lines(first: &Outcome, other: &Outcome, class: &str, keys: &[&str]) -> usize {
     let others = other.of_class(class);
     let mut same = 0;
@@ -161,7 +163,7 @@ fn echo_python_and_a_recording_say_the_same() {
             assert!(assert_same_lines(&echo, &subscriber, class, &keys) >= 2, "{class}");
         }
     }
-    // All were there before the first sample, so that what is kept is what was said.
+    // All subscribers were attached before the first sample, so the recording has the samples that `echo` printed.
     let recording = Recording::read_complete(file.as_ref());
     let [tilt, clouds, obstacles] = TOPICS.map(|topic| recording.of(topic));
     for (i, line) in echo.of_class("cloud").iter().enumerate() {
@@ -179,7 +181,7 @@ fn echo_python_and_a_recording_say_the_same() {
     assert!(tilt.len() >= 2 && Tilt::default().unpack(tilt[0].payload()));
 }
 
-/// A cloud takes several datagrams. What `listen --publish` publishes again is what was said on the other machine.
+/// Tests clouds that take several datagrams. `listen --publish` publishes the same values as the other machine.
 #[test]
 fn another_machine_says_the_same() {
     in_a_network("tilted::another_machine_says_the_same", || {

@@ -1,5 +1,5 @@
-//! `scanhub track` and `scanhub site`, from telegrams to who is where: one person from room to room, the same tracks again of a
-//! recording, a site file with a sensor that there is not, a plan that is drawn once.
+//! Tests of `scanhub track` and `scanhub site`, from telegrams to tracks: one person who walks from room to room,
+//! identical tracks from a replay, a site file with an unknown sensor, and a plan that is drawn once.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -55,7 +55,7 @@ speed_mm_s = 1000
 from_s = 12
 "#;
 
-/// What both sensors see over so many seconds.
+/// Records what both sensors see during this number of seconds, and returns the file.
 pub(crate) fn record_people(env: &TestEnv, seconds: u64) -> String {
     record_world(env, WORLD, seconds)
 }
@@ -67,7 +67,7 @@ fn record_world(env: &TestEnv, world: &str, seconds: u64) -> String {
 
 const SHORT_LEARNING: &str = "--set=background.scans=100";
 
-/// A hub that will play `file`, once it is told to.
+/// Starts a paused replay of `file`.
 pub(crate) fn replay(env: &TestEnv, file: &str) -> Program {
     env.start(&["replay", file, "--json", "--paused", "--hold", SHORT_LEARNING]).ready()
 }
@@ -121,7 +121,8 @@ fn person_is_tracked_between_rooms_and_counted_once() {
     assert!(counts.end(INT).of_class("tracks").is_empty(), "counts alone");
 }
 
-/// Follows people under the name `house`, until it misses nothing any more, and records telegrams and tracks to `file`.
+/// Starts a tracker named `house`, and a recorder that writes telegrams and tracks to `file`. Waits until both are
+/// attached to all of their topics.
 fn track_and_record(env: &TestEnv, site: &str, file: &str) -> (Program, Program) {
     let track = env.start(&["track", "--site", site, "--as=house", "--delay=2s", "--json"]);
     await_tracker(env);
@@ -133,7 +134,7 @@ fn track_and_record(env: &TestEnv, site: &str, file: &str) -> (Program, Program)
     (track, record)
 }
 
-/// Waits until the tracker `house` publishes and follows the sensors.
+/// Waits until the tracker `house` publishes and is subscribed to the sensors.
 fn await_tracker(env: &TestEnv) {
     wait_until("the tracker publishes", || {
         let listed = env.run(&["list", "--json"]).of_class("topic");
@@ -144,11 +145,12 @@ fn await_tracker(env: &TestEnv) {
     }
 }
 
-/// Times of the wall clock and payloads of a tracker's samples.
+/// Wall clocks and payloads of a tracker's samples.
 type PublishedSamples = Vec<(u64, Vec<u8>)>;
 
-/// Plays `file` to a tracker, and each telegram only when the tracker has nearly caught up: however busy the machine is, it
-/// misses nothing. Returns the tracks and events that it published of the first twenty seconds of the world.
+/// Plays `file` to a tracker, with each telegram only when the tracker has nearly caught up, so that it misses nothing
+/// however busy the machine is. Returns the tracks and events that it published in the first twenty seconds of the
+/// world.
 fn track_locally_and_remotely(env: &TestEnv, site: &str, file: &str) -> [PublishedSamples; 2] {
     let sources = Sources { set: vec!["background.scans=100".to_owned()], ..Sources::default() };
     let play = PlaybackOptions { is_paused: true, ..PlaybackOptions::default() };
@@ -198,15 +200,15 @@ fn track_locally_and_remotely(env: &TestEnv, site: &str, file: &str) -> [Publish
     })
 }
 
-/// Time that the tracker waits for scans of other sensors.
+/// Time that the tracker waits for scans of other sensors, in ns.
 const DELAY_NS: u64 = 300_000_000;
-/// Time of scans that the tracker may be behind: less than it waits for other sensors, and more than is between two of its
-/// samples (40 ms).
+/// Lead of the played scans over the tracker's samples in ns: less than the tracker waits for other sensors, and more
+/// than the interval of its samples (40 ms).
 const LEAD_NS: u64 = 160_000_000;
-/// The lead before its first sample, when nothing shows yet what it has received. With the delay, it is less than the 16
-/// foregrounds that wait for it (426 ms), and enough for that sample.
+/// Lead before its first sample in ns, when no sample shows yet what it has received. With the delay, this is less than
+/// the 16 foregrounds that wait for it (426 ms), and enough for that sample.
 const FIRST_LEAD_NS: u64 = 100_000_000;
-/// End of the compared span, from the start of the world.
+/// End of the compared span, in ns from the start of the world.
 const END_NS: u64 = 20_000_000_000;
 
 /// Ends the player even after a panic, because the test joins the hub's thread.
@@ -247,7 +249,7 @@ fn replay_gives_identical_tracks_and_events() {
         let [tracks_again, events_again] = track_locally_and_remotely(&env, &site, &file);
         assert!(tracks == tracks_again, "{} and {} tracks", tracks.len(), tracks_again.len());
         assert_eq!(events, events_again);
-        // And they say what the lines said.
+        // The samples have the same content as the lines.
         let is_door = |(_, payload): &&(u64, Vec<u8>)| {
             let mut event = Event::default();
             assert!(event.unpack(payload));
@@ -263,7 +265,7 @@ fn replay_gives_identical_tracks_and_events() {
     });
 }
 
-/// What `track` says on its lines, the program of the page says while it goes on.
+/// Compares the output of the page's program with the lines of `track` while both run.
 #[test]
 fn python_program_gets_all_events_live_and_in_order() {
     let env = TestEnv::new();

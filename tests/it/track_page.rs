@@ -1,5 +1,4 @@
-//! docs/tracks.md, walked as it stands: its site, a sensor of another machine in it, its commands, and what it says that they
-//! print.
+//! Tests docs/tracks.md: its site with a remote sensor in it, its commands, and the output that it shows.
 
 use crate::pages::text_on;
 use crate::recorded_world::recorded_world;
@@ -8,8 +7,8 @@ use scanhub_sim::world::World;
 
 const PAGE: &str = "docs/tracks.md";
 
-/// The site of the page: two rooms, and between them a corridor through which the first person goes from `hall` to `kitchen`. A
-/// sensor looks from the middle of each outer wall.
+/// World of the page's site: two rooms and a corridor between them, through which the first person walks from `hall` to
+/// `kitchen`. There is a sensor in the middle of each outer wall.
 const WORLD: &str = r#"
 [[sensor]]
 pose = [0, 2500, 0]
@@ -35,7 +34,7 @@ speed_mm_s = 1000
 from_s = 12
 "#;
 
-/// The robot, and the machine in the kitchen: each with the recording of its own sensor.
+/// Replays the recording of one sensor, as the hub of the robot or of the machine in the kitchen.
 fn play(env: &TestEnv, file: &str, sensor: &str) -> Program {
     let flags = ["--json", "--paused", "--hold"];
     env.start(&[&["replay", file, "--sensor", sensor][..], &flags].concat()).ready()
@@ -52,7 +51,7 @@ fn commands_of_the_page_print_its_output() {
         let world = World::of_toml("world.toml", WORLD).expect("a world");
         let file = recorded_world(&robot, &world, &["front", "rear"], 30);
         let _played = [play(&robot, &file, "front"), play(&kitchen, &file, "rear")];
-        // With a key, a sensor is published before it sends anything: the recordings are still paused.
+        // With a key, the sensor is published before it sends samples: the recordings are still paused.
         let made = robot.run(&["key", "new", &robot.path_argument("key")]);
         assert_eq!(made.exit_code, Some(0), "{made}");
         let key = format!("--key-file={}", robot.path_argument("key"));
@@ -63,7 +62,7 @@ fn commands_of_the_page_print_its_output() {
         let mut listen = robot.start(&["listen", "--publish", "--json", &name, &key]).ready();
         listen.await_line("the sensor in the kitchen", |line| line["sensor"] == "kitchen.rear");
 
-        // Twice as the page has them; both wait longer than it says, for a machine that is busy.
+        // Two of the commands on the page. Both wait longer than the page says, because the machine may be busy.
         let mut track = robot.start(&["track", "--site", &site, "--delay=2s"]);
         let count = robot.start(&["track", "--site", &site, "--count", "left", "--delay=2s"]);
         wait_until("they follow all sensors", || {

@@ -1,5 +1,5 @@
-//! A hub and its gateway on one machine, listeners on others, and what is between them: it loses, doubles and moves
-//! datagrams, and knows which.
+//! Tests of a hub and its gateway on one machine and listeners on others, with a relay between them that loses,
+//! duplicates and reorders datagrams and logs which.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -11,13 +11,13 @@ use scanhub_schema::Topic;
 use scanhub_schema::datagram::Announce;
 use serde_json::Value;
 
-/// Passed on while the network is rough: some seconds.
+/// Number of datagrams that are sent while the network is faulty, which takes some seconds.
 const ROUGH_DATAGRAMS: usize = 2000;
 
-/// A sensor's number and a topic's.
+/// Numbers of a sensor and of a topic.
 type StreamKey = (u8, u8);
 
-/// Sends all that two sensors have.
+/// Starts a gateway that sends all topics of all sensors.
 fn gateway(robot: &Robot) -> Program {
     robot.gateway(&Topic::OF_LINKS.map(|topic| format!("--topic=*/{}", topic.name())))
 }
@@ -26,7 +26,7 @@ fn listener(env: &TestEnv, words: &[&str]) -> Program {
     env.start(&[&["listen", "--json"], words].concat()).ready()
 }
 
-/// What a listener says of each stream: received, lost, duplicate, reordered.
+/// Returns the counters that a listener reports for each stream: received, lost, duplicate, reordered.
 fn reported_counters(outcome: &Outcome, names: &BTreeMap<String, u8>) -> BTreeMap<StreamKey, [u64; 4]> {
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let refused = outcome.of_class("lan_refused");
@@ -45,7 +45,7 @@ fn stream(line: &Value, names: &BTreeMap<String, u8>) -> StreamKey {
     (names[text("sensor")], topic)
 }
 
-/// The numbers of the sensors that are announced in `log`.
+/// Returns the numbers of the sensors that are announced in `log`, by name.
 fn announced_names(log: &[Vec<u8>]) -> BTreeMap<String, u8> {
     let announce = |bytes: &Vec<u8>| {
         let datagram = decode_datagram(bytes);
@@ -56,12 +56,13 @@ fn announced_names(log: &[Vec<u8>]) -> BTreeMap<String, u8> {
     log.iter().filter_map(announce).collect()
 }
 
-/// What one who heard `log` has to say of each stream, as docs/datagram.md defines it: with sets, and all at once.
+/// Computes the counters for a listener that received `log`, as docs/datagram.md defines them, from the whole log with
+/// sets.
 fn expected_counters(log: &[Vec<u8>]) -> BTreeMap<StreamKey, [u64; 4]> {
     #[derive(Default)]
     struct StreamLog {
         numbers: BTreeSet<u32>,
-        /// The next number that was announced before anything came.
+        /// Next sequence number in the first announcement, if that arrived before any sample.
         announced_first: Option<u32>,
         announced_last: u32,
         duplicate: u64,
@@ -122,7 +123,7 @@ fn listeners_count_exactly_the_datagrams_they_lost() {
         let late = listener(&env, &["--stats"]);
         let before_late = relay.connect(&third);
         wait_until("the other half", || relay.forwarded().len() > before_late + ROUGH_DATAGRAMS / 2);
-        // The last announcement gets through, so that what was lost at the end is known to be.
+        // Let the last announcement through, so that listeners can count the losses before it.
         relay.set_faulty(false);
         let sent = gateway.end(TERM);
         assert_eq!(sent.exit_code, Some(0), "{sent}");
@@ -140,7 +141,7 @@ fn listeners_count_exactly_the_datagrams_they_lost() {
             expected_counters(&log[before_late..]),
             "counted from when it joined"
         );
-        // Who was there from the begin can tell how much was sent.
+        // A listener that ran from the start can account for all that was sent.
         assert_eq!(said_early.len(), sent.len());
         for (stream, [received, lost, ..]) in &said_early {
             assert_eq!(received + lost, sent[stream], "{stream:?}");
@@ -156,7 +157,7 @@ fn listeners_count_exactly_the_datagrams_they_lost() {
     });
 }
 
-/// The last whole account: for each sensor and topic its last line.
+/// Returns the last line of `class` for each sensor and topic.
 fn last_of_class(outcome: &Outcome, class: &str) -> Vec<Value> {
     let key = |line: &Value| (line["sensor"].to_string(), line["topic"].to_string());
     let lines = outcome.of_class(class);
@@ -183,7 +184,7 @@ fn remote_sensor_works_like_a_local_one() {
         let mut there = robot.env.echo(&["front/scan"]);
         let mut here = env.echo(&[&front, &rear]);
         here.await_lines(40, "scans", is_class("scan"));
-        // On a busy machine, each of the two may miss scans that the other has received.
+        // On a busy machine, each of the two subscribers may miss scans that the other one received.
         let received_by_both = || {
             let scan = here.await_line("a scan", is_class("scan"));
             there.await_line("this scan or a later one", |line| line["seq"].as_u64() >= scan["seq"].as_u64());
@@ -196,7 +197,7 @@ fn remote_sensor_works_like_a_local_one() {
         let rate =
             hz.await_line("a rate", |line| line["class"] == "hz" && line["received"].as_u64() > Some(30));
         assert_eq!(rate["missed"], 0, "{rate}");
-        // Both ends go; who follows is told.
+        // The hub and then the gateway end. Subscribers of the remote sensor receive a notice.
         drop(there.end(INT));
         assert_eq!(robot.take_hub().end(TERM).exit_code, Some(0));
         here.await_line("nothing is known any more", |line| line["verdict"] == "unknown");

@@ -1,8 +1,8 @@
-//! An independent judge of the simulated RPLIDARs: the vendor's own driver, as the Python package `pyrplidarsdk` has it. It
-//! connects, finds model, health and modes, and its scans are the room that was simulated.
+//! Comparison of the simulated RPLIDARs with an independent implementation: the vendor's driver, in the Python package
+//! `pyrplidarsdk`. It connects, reads model, health and modes, and its scans match the simulated room.
 //!
-//! Here a scanner has a time of its own, that goes on while the driver reads: on a machine that is busy it measures later,
-//! and nothing of it is lost.
+//! The scanner has its own virtual time, which advances while the driver reads. On a busy machine it measures later,
+//! and nothing is lost.
 
 use std::thread;
 use std::time::Duration;
@@ -18,7 +18,7 @@ use serde_json::Value;
 
 use crate::testkit::{Program, python_for};
 
-/// Half a room's extent along x and y in metres, the sensor off its middle, and a pillar: nothing is alike to any side.
+/// World with walls around a sensor that is off the center, and a pillar, in mm. It has no symmetry.
 const ROOM_WORLD: &str = "
 [noise]
 sigma_mm = 0
@@ -38,7 +38,7 @@ box = [300, 300]
 pose = [700, 800]
 ";
 
-/// Metres from a point to the nearest wall of [`ROOM_WORLD`].
+/// Returns the distance of a point from the nearest wall of [`ROOM_WORLD`], in meters.
 fn distance_from_walls(x: f64, y: f64) -> f64 {
     let walls = [(x + 1.5).abs(), (x - 2.5).abs(), (y + 1.0).abs(), (y - 3.0).abs()];
     let (side, before) = ((x - 0.7).abs() - 0.15, (y - 0.8).abs() - 0.15);
@@ -49,7 +49,7 @@ fn distance_from_walls(x: f64, y: f64) -> f64 {
     walls.into_iter().fold(pillar, f64::min)
 }
 
-/// Serves `unit` at the other end of `pty` until `driver` is over.
+/// Simulates `unit` at the other end of `pty` until `driver` ends.
 fn run_simulator(unit: &mut RplidarSimulator, pty: &Pty, driver: &Program) {
     let mut now = 0;
     let mut unread = Vec::new();
@@ -72,12 +72,12 @@ fn run_simulator(unit: &mut RplidarSimulator, pty: &Pty, driver: &Program) {
         }
         match unit.poll_timeout().filter(|_| unread.is_empty()) {
             Some(due) => now = now.max(due),
-            // A port that nobody has open need not be waited for: it says so at once.
+            // `poll` returns at once for a pty that no process has open.
             None if !pty.is_open() => thread::sleep(POLL_INTERVAL),
             None => {
                 let expected = if unread.is_empty() { PollFlags::IN } else { PollFlags::IN | PollFlags::OUT };
                 let mut line = [PollFd::from_borrowed_fd(pty.wait_fd(), expected)];
-                // An interrupted wait is a short one.
+                // An interrupted wait only is a short one.
                 let _ = poll(&mut line, Some(&Timespec::try_from(POLL_INTERVAL).expect("a time")));
             }
         }
@@ -112,10 +112,10 @@ fn vendor_driver_reads_the_room_in_all_packet_forms() {
         let numbers = |value: &Value| -> Vec<f64> {
             value.as_array().expect("numbers").iter().map(|number| number.as_f64().expect("one")).collect()
         };
-        // The first one may have begun in the midst of a turn.
+        // The first scan may have begun in the middle of a revolution.
         for scan in &scans[1..] {
             let (angles, ranges) = (numbers(&scan[0]), numbers(&scan[1]));
-            // Clockwise from ahead, which is along y.
+            // Angles are clockwise from ahead, which is along y.
             let at =
                 |(angle, range): (&f64, &f64)| distance_from_walls(range * angle.sin(), range * angle.cos());
             let max_error_m = angles.iter().zip(&ranges).map(at).fold(0.0, f64::max);
@@ -126,5 +126,5 @@ fn vendor_driver_reads_the_room_in_all_packet_forms() {
     }
 }
 
-/// How often it is looked whether the driver is over.
+/// Interval between checks whether the driver has ended.
 const POLL_INTERVAL: Duration = Duration::from_millis(10);

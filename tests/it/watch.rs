@@ -1,5 +1,5 @@
-//! The picture on a terminal, as somebody sits at it: it follows the hub, keys and the size of the window, and gives the
-//! terminal back however it ends.
+//! Tests of `scanhub watch` on a terminal: it follows the hub, the keys and the size of the window, and restores the
+//! terminal however it ends.
 
 use std::fs::{self, File};
 use std::process::Command;
@@ -10,7 +10,7 @@ use rustix::process::Signal;
 
 const TERMINAL_SIZE: (u16, u16) = (60, 20);
 
-/// A wall ahead, a strip on it, and a post that the robot nearly touches.
+/// World with a wall ahead, a reflector, and a post within the robot's inner zone.
 const WORLD: &str =
     "[noise]\ntail = 0\n\n[[thing]]\nline = [[3000, -3000], [3000, 3000], [-3000, 3000], [-3000, -3000]]\n
 [[thing]]\nradius_mm = 20\npose = [0, 400]\n
@@ -60,7 +60,7 @@ fn it_follows_the_hub_the_keys_and_the_window() {
     });
     assert!(watch.text().contains("\x1b[38;5;1"), "a stop is red");
 
-    // Another window, in which all is drawn anew.
+    // After a change of size, everything is drawn again.
     watch.resize((110, 30));
     watch.await_rows("keys in the last row", |rows| rows[29].starts_with("q quit"));
     watch.await_rows("sensor with its marks", |rows| rows[28].contains("marks 1  objects"));
@@ -73,7 +73,8 @@ fn it_follows_the_hub_the_keys_and_the_window() {
     watch.await_rows("picture without marks", |rows| !rows[1..28].concat().contains('*'));
     watch.press(" ");
 
-    // Lines are found only while somebody looks at them; a place is read out, and counters are listed.
+    // The hub computes lines only while they have a subscriber. A key shows the position of the cursor, and another one
+    // lists the counters.
     assert_eq!(env.subscribers("front/lines"), 0);
     watch.press("e");
     testkit::wait_until("lines are followed", || env.subscribers("front/lines") == 1);
@@ -83,7 +84,7 @@ fn it_follows_the_hub_the_keys_and_the_window() {
     watch.wait_for_text(" m from the robot, x ");
     watch.press("x");
     watch.await_rows("nothing is read out", |rows| !rows.concat().contains("from the robot"));
-    // A click, in SGR's form, reads out the same; Escape ends that.
+    // A click, in SGR encoding, shows the position as well. Escape ends that.
     watch.press("\x1b[<0;40;12M\x1b[<0;40;12m");
     watch.wait_for_text(" m from the robot, x ");
     watch.press("\x1b");
@@ -93,7 +94,7 @@ fn it_follows_the_hub_the_keys_and_the_window() {
     watch.wait_for_text("bytes_in_telegrams");
     watch.press("n");
 
-    // Requests to the hub, and what came of them.
+    // Requests to the hub, and their results.
     watch.press("F");
     watch.wait_for_text("front: background is frozen");
     watch.wait_for_text("lost 0  frozen");
@@ -104,7 +105,7 @@ fn it_follows_the_hub_the_keys_and_the_window() {
     watch.press("R");
     watch.wait_for_text("front: background is learned again");
 
-    // Two lives of the hub; also while the picture is held the verdict is that of now.
+    // Two runs of the hub. While the picture is held, the verdict is still current.
     watch.press(" ");
     watch.wait_for_text(" STOP  HELD  front");
     drop(hub.end(KILL));
@@ -138,7 +139,7 @@ fn the_terminal_is_given_back_however_it_ends() {
         watch.press(key);
         assert_eq!(watch.finish(), (Some(0), String::new(), true), "{key:?}");
     }
-    // As with all that follow: bounded needs a hub.
+    // As for all such verbs, a bounded run needs a hub.
     let (code, below, is_whole) = start_session(&env, &["--for=5s"]).finish();
     assert!(code == Some(3) && below.contains("scanhub: no hub in domain") && is_whole, "{code:?} {below:?}");
     let _hub = env.hub(&[env.link("front")]);
@@ -199,7 +200,7 @@ fn a_terminal_that_is_closed_is_a_quiet_end() {
     let _sensor = env.simulator(&["front"], &["--seed=73", "--baud=500000"]);
     for streams in [false, true] {
         let _hub = streams.then(|| env.hub(&[env.link("front")]));
-        // With SIGHUP, as a shell's terminal sends it, and without anybody who tells it.
+        // With SIGHUP, as from a shell's terminal, and without it.
         for has_controlling_terminal in [true, false] {
             let errors = env.path("errors");
             let file = File::create(&errors).expect("a file");
@@ -224,7 +225,7 @@ fn a_terminal_that_is_closed_is_a_quiet_end() {
 #[test]
 fn tmux_shows_picture_help_and_narrow_windows() {
     let env = TestEnv::new();
-    // Should the test be killed, all of it is over after a while.
+    // If the test is killed, the programs end after a while.
     let program = env!("CARGO_BIN_EXE_scanhub");
     let line = format!("{program} demo --for=60s; echo ended with $?; sleep 20");
     let Some(tmux) = Tmux::start(&env, &line, (80, 30)) else { return };
@@ -250,7 +251,7 @@ fn tmux_shows_picture_help_and_narrow_windows() {
     tmux.resize((140, 30));
     tmux.await_rows("a wide window", |rows| !fits(rows) && both(rows));
     tmux.press(&["q"]);
-    // Before its time was over.
+    // The exit code shows that it was interrupted before its time elapsed.
     let rows = tmux.await_rows("end", |rows| rows.iter().any(|row| row == "ended with 130"));
     assert!(!is_picture(&rows), "the picture is left:\n{}", rows.join("\n"));
     assert_eq!(rows.iter().filter(|row| row.contains(" 0 lost in ")).count(), 2, "{}", rows.join("\n"));

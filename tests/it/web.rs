@@ -1,4 +1,5 @@
-//! The server of `web` as viewers and strangers meet it: the wire of Foxglove, closed doors, and too many.
+//! Tests of the server of `web` with viewers and strangers: Foxglove's protocol, access control, and the limit of
+//! viewers.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -9,7 +10,7 @@ use serde_json::{Value, json};
 use tungstenite::client::IntoClientRequest;
 use tungstenite::{Message, WebSocket};
 
-/// A server with these flags, and `HOST:PORT` of it.
+/// Starts a server with these flags, and returns it with its `HOST:PORT`.
 pub(crate) fn web(env: &TestEnv, flags: &[&str]) -> (Program, String) {
     let mut server = env.start(&[&["web", "--json", "--listen", "127.0.0.1:0"], flags].concat());
     let ready = server.await_line("its address", is_class("ready"));
@@ -24,7 +25,7 @@ pub(crate) fn connect(host: &str) -> TcpStream {
     stream
 }
 
-/// What the server answers to `head`; nothing if it says nothing.
+/// Returns the server's response to `head`, or an empty string if it sends none.
 pub(crate) fn send_request(host: &str, head: &str) -> String {
     let mut stream = connect(host);
     stream.write_all(head.as_bytes()).expect("it reads");
@@ -37,7 +38,7 @@ pub(crate) fn status(response: &str) -> &str {
     response.split(' ').nth(1).unwrap_or("none")
 }
 
-/// A viewer that was let in, or the status with which it was not.
+/// Connects a viewer. Returns the HTTP status if the server refuses it.
 pub(crate) fn connect_viewer(
     host: &str,
     path: &str,
@@ -46,7 +47,7 @@ pub(crate) fn connect_viewer(
     connect_viewer_with(host, path, origin, "foxglove.sdk.v1")
 }
 
-/// As [`view`], by this name of the protocol.
+/// Like [`connect_viewer`], with this name of the protocol.
 pub(crate) fn connect_viewer_with(
     host: &str,
     path: &str,
@@ -76,7 +77,7 @@ pub(crate) fn text(socket: &mut WebSocket<TcpStream>) -> Value {
     }
 }
 
-/// The channels of these `topics`, which there will be; messages that come before they are told are not looked at.
+/// Waits until the channels of `topics` are advertised, and returns them. Other messages are dropped meanwhile.
 pub(crate) fn channels<const N: usize>(viewer: &mut WebSocket<TcpStream>, topics: [&str; N]) -> [Value; N] {
     let give_up_at = Instant::now() + WAIT_TIMEOUT;
     let mut advertised: Vec<Value> = Vec::new();
@@ -90,7 +91,7 @@ pub(crate) fn channels<const N: usize>(viewer: &mut WebSocket<TcpStream>, topics
     topics.map(|topic| of(&advertised, topic).expect("it is there"))
 }
 
-/// Subscribes to channels by their ids, under these numbers.
+/// Subscribes to the channels with these IDs, with these numbers of subscriptions.
 pub(crate) fn subscribe(viewer: &mut WebSocket<TcpStream>, requested: &[(u32, &Value)]) {
     let expected: Vec<_> =
         requested.iter().map(|(number, id)| json!({ "id": number, "channelId": id })).collect();
@@ -145,7 +146,7 @@ fn viewer_gets_foxglove_messages_despite_hostile_one() {
     let mut viewer = connect_viewer(&host, "/", None).expect("let in");
     server.await_line("who came", |line| line["class"] == "viewer" && line["connected"] == true);
     assert_eq!(text(&mut viewer)["op"], "serverInfo");
-    // Hostile frames come from the next viewer; this one is not to notice.
+    // The next viewer sends hostile frames, which must not affect this one.
     let mut hostile = connect_viewer(&host, "/", None).expect("let in");
     hostile.send(Message::text("[".repeat(60_000))).expect("it reads");
     hostile.send(Message::binary(vec![1; 60_000])).expect("it reads");
@@ -191,7 +192,7 @@ fn as_many_come_in_as_there_is_room_for() {
     let (server, host) = web(&env, &[]);
     let mut viewers: Vec<_> = (0..32).map(|_| connect_viewer(&host, "/", None).expect("let in")).collect();
     assert_eq!(connect_viewer(&host, "/", None).err(), Some(503));
-    // Connections that ask for nothing take no viewer's place, and the page is still served.
+    // Connections without a request do not count as viewers, and the page is still served.
     let idle: Vec<_> = (0..20).map(|_| connect(&host)).collect();
     assert_eq!(status(&send_request(&host, &format!("GET / HTTP/1.1\r\nHost: {host}\r\n\r\n"))), "200");
     drop(idle);

@@ -1,5 +1,5 @@
-//! The page for whoever has no mouse, does not see it, or does not bear movement. Contrasts are computed where the colours
-//! are (`clients/viewer/src/server/page.rs`).
+//! Tests of the web page for users who cannot use a mouse, use a screen reader, or prefer reduced motion. Contrasts are
+//! checked where the colors are (`clients/viewer/src/server/page.rs`).
 
 use serde_json::{Value, json};
 
@@ -8,7 +8,7 @@ use crate::testkit::{TestEnv, wait_until};
 use crate::web::web;
 use crate::web_page::browse;
 
-/// The page of a hub with two sensors.
+/// Opens the page of a hub with two sensors.
 fn open_page(env: &TestEnv, appearance: Appearance) -> Option<(Browser, Vec<crate::testkit::Program>)> {
     let mut page = browse(env, appearance)?;
     let sensors = env.simulator(&["front", "rear"], &["--seed=5", "--baud=500000", "--world=demo"]);
@@ -20,7 +20,7 @@ fn open_page(env: &TestEnv, appearance: Appearance) -> Option<(Browser, Vec<crat
     Some((page, vec![sensors, hub, server]))
 }
 
-/// What has the keyboard, as far as words tell.
+/// Script that returns the name of the element with the keyboard focus.
 const FOCUSED_ELEMENT: &str = "(document.activeElement === document.body ? 'BODY' : document.activeElement.getAttribute('aria-label') || document.activeElement.innerText || \
                       document.activeElement.tagName).trim()";
 
@@ -28,7 +28,7 @@ const FOCUSED_ELEMENT: &str = "(document.activeElement === document.body ? 'BODY
 fn the_keyboard_alone_is_enough() {
     let env = TestEnv::new();
     let Some((mut page, _programs)) = open_page(&env, Appearance::LAPTOP) else { return };
-    // Once around: whatever can be pressed is reached, and it is seen where the keyboard is.
+    // Tab must reach every element that can be pressed, and each must show the focus.
     let mut reached: Vec<String> = Vec::new();
     for _ in 0..40 {
         page.press("Tab");
@@ -51,7 +51,7 @@ fn the_keyboard_alone_is_enough() {
     }
     assert!(all.as_array().is_some_and(|all| all.len() >= 11), "{all}");
 
-    // What has the keyboard is pressed by Enter and by the space bar.
+    // Enter and the space bar press the focused element.
     let pressed = |description: &str| {
         format!("document.querySelector('{description}').getAttribute('aria-pressed') === 'true'")
     };
@@ -65,7 +65,7 @@ fn the_keyboard_alone_is_enough() {
     page.await_true(&pressed("#sensors button"));
     page.press("0");
     page.await_true(&format!("!({})", pressed("#sensors button")));
-    // What a mouse and fingers do, keys do, too; the first one ends that the view follows the scene.
+    // Keys move the view as a mouse or touch does. The first key stops the automatic fit.
     page.press("ArrowUp");
     page.await_true(&format!("!({})", pressed("[data-do=fit]")));
     let moves =
@@ -86,7 +86,7 @@ fn the_keyboard_alone_is_enough() {
     assert_eq!(page.ask(keys), "s i f t b z m e o v g");
     page.await_true("document.querySelector('#scale').innerText.startsWith('0') && !document.querySelector('#scale').hidden");
     page.await_true("[...document.querySelectorAll('#layers button')].every((one) => one.ariaLabel && one.offsetHeight > 0)");
-    // A dialogue takes the keyboard, and gives it back.
+    // A dialog takes the focus and returns it.
     page.ask("document.querySelector('[data-do=layers]').focus()");
     page.press("?");
     page.await_true("document.querySelector('#help').contains(document.activeElement)");
@@ -95,7 +95,7 @@ fn the_keyboard_alone_is_enough() {
     assert!(page.console_errors.is_empty(), "{:?}", page.console_errors);
 }
 
-/// Roles and names of what a screen reader finds on the page.
+/// Returns role and name of each node that a screen reader finds on the page.
 fn tree(page: &mut Browser) -> Vec<(String, String)> {
     let tree = page.call("Accessibility.getFullAXTree", json!({}));
     let nodes = tree["nodes"].as_array().expect("nodes").iter().filter(|node| node["ignored"] != true);
@@ -103,7 +103,7 @@ fn tree(page: &mut Browser) -> Vec<(String, String)> {
     nodes.map(|node| (text(&node["role"]["value"]), text(&node["name"]["value"]))).collect()
 }
 
-/// The names of the nodes with `role`.
+/// Returns the names of the nodes with `role`.
 fn nodes_with_role<'a>(nodes: &'a [(String, String)], role: &str) -> Vec<&'a str> {
     nodes.iter().filter(|node| node.0 == role).map(|node| node.1.as_str()).collect()
 }
@@ -139,7 +139,8 @@ fn screen_readers_get_names_states_and_the_verdict() {
 fn reduced_motion_disables_animations() {
     let env = TestEnv::new();
     let Some((mut page, _programs)) = open_page(&env, Appearance::LAPTOP) else { return };
-    // How many places the picture has on its way back from a larger one, until it stands for 20 frames.
+    // Script that returns the number of different scales of the view on its way back from a larger one, until it is
+    // unchanged for 20 frames.
     let places = "new Promise((done) => {
         const scales = new Set();
         let [last, still] = [0, 0];

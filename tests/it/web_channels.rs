@@ -1,5 +1,6 @@
-//! All channels of `web` as Foxglove's own library subscribes to them, one message for each: what comes is decoded by the schema
-//! that came with it, CDR by the messages of ROS and JSON by JSON Schema, and is what `echo --json` says of the same samples.
+//! Tests of all channels of `web`, subscribed as by Foxglove's own library, with one message for each. Messages are
+//! decoded by the schema that the server sends, CDR by ROS messages and JSON by JSON Schema, and equal the lines of
+//! `echo --json` for the same samples.
 
 use std::collections::HashMap;
 use std::net::TcpStream;
@@ -13,10 +14,10 @@ use tungstenite::{Message, WebSocket};
 use crate::testkit::{INT, Outcome, TestEnv, WAIT_TIMEOUT, is_class, number, wall_ns};
 use crate::web::{connect_viewer_with, text, web};
 
-/// Where the sensor sits: metres ahead and to the left, and how it is turned, in radians.
+/// Pose of the sensor: meters ahead and to the left, and yaw in radians.
 const SENSOR_POSE: (f64, f64, f64) = (0.3, -0.1, 0.4);
 const TOPICS: [&str; 7] = ["scan", "foreground", "marks", "zones", "lines", "background", "status"];
-/// Somebody comes who is seen before the background, and walks into the circles; a reflector stands in the corner.
+/// World with a person who appears in front of the background and inside the zones, and a reflector in a corner.
 const WORLD: &str =
     "[noise]\ntail = 0\n\n[[thing]]\nline = [[3000, -3000], [3000, 3000], [-3000, 3000], [-3000, -3000]]\n
 [[thing]]\nradius_mm = 60\npose = [0, 700]\nfrom_s = 9\n
@@ -26,13 +27,14 @@ fn pose() -> Pose {
     Pose { x_m: SENSOR_POSE.0, y_m: SENSOR_POSE.1, yaw_rad: SENSOR_POSE.2, ..Pose::default() }
 }
 
-/// A message of a channel: when it was, in ns since 1970, and its body.
+/// Time of a message in ns since 1970, and its body.
 type ChannelMessage = (u64, Vec<u8>);
 
-/// A viewer as npm's `@foxglove/ws-protocol` 0.8.0 is one: subscriptions are numbered from 0 on, and each is a message of its own.
+/// A viewer that behaves like npm's `@foxglove/ws-protocol` 0.8.0: it numbers subscriptions from 0 and sends a message
+/// for each.
 struct Viewer {
     socket: WebSocket<TcpStream>,
-    /// By their subscriptions.
+    /// Channels by the number of their subscription.
     channels: Vec<Value>,
     messages: HashMap<String, Vec<ChannelMessage>>,
 }
@@ -44,7 +46,7 @@ impl Viewer {
         Viewer { socket, channels: Vec::new(), messages: HashMap::new() }
     }
 
-    /// Listens until every channel that was told said so many messages.
+    /// Receives until every advertised channel has sent this number of messages.
     fn receive_messages(&mut self, count: usize) {
         let give_up_at = Instant::now() + WAIT_TIMEOUT;
         while self.channels.len() < TOPICS.len() + 1 || self.min_count() < count {
@@ -82,7 +84,8 @@ impl Viewer {
             .collect()
     }
 
-    /// Of the channel that said least; what is told once counts as much as all.
+    /// Returns the smallest number of messages per channel. A channel that sends only one message counts as complete
+    /// with it.
     fn min_count(&self) -> usize {
         let once = ["/tf_static", "/front/background"];
         let enough = |(topic, count): (&str, usize)| {
@@ -96,7 +99,8 @@ impl Viewer {
     }
 }
 
-/// Whether `value` is what `schema` says, as far as this project's schemas say it: types, words, properties and items.
+/// Returns whether `value` conforms to `schema`, for the keywords that this project's schemas use: types, enums,
+/// properties and items.
 pub(crate) fn matches_schema(value: &Value, schema: &Value) -> bool {
     let is = |kind: &Value| match kind.as_str() {
         Some("object") => value.is_object(),
@@ -134,7 +138,7 @@ fn numbers(values: &[Told]) -> Vec<f64> {
         .collect()
 }
 
-/// Ranges of a line in m, nothing where there is none.
+/// Returns the ranges of a line in meters, or `None` for beams without one.
 fn ranges_m(line: &Value, unit: &str, in_m: f64) -> Vec<Option<f64>> {
     let unit = line[unit].as_f64().expect("a unit") * in_m;
     line["ranges"].as_array().expect("ranges").iter().map(|range| Some(range.as_f64()? * unit)).collect()
@@ -145,13 +149,14 @@ fn angle_rad(line: &Value, beam: usize) -> f64 {
     (degrees("first_angle_deg") + beam as f64 * degrees("step_deg")).to_radians()
 }
 
-/// The lines of a topic by the moments of their samples.
+/// Returns the lines of a topic by the wall clock of their samples.
 fn by_stamp(lines: &Outcome, class: &str) -> HashMap<u64, Value> {
     let lines = lines.of_class(class).into_iter();
     lines.filter_map(|line| Some((line["wall_ns"].as_u64()?, line))).collect()
 }
 
-/// That most of what was heard has its line, each as `is_same` says: a reader may miss a sample, but few.
+/// Asserts that most messages have a line, and that each of these equals its line by `is_same`. A reader may miss some
+/// samples.
 fn check_each_equals_a_line(
     topic: &str,
     messages: &[ChannelMessage],
@@ -185,7 +190,7 @@ fn is_scan(body: &[u8], line: &Value) -> bool {
         && ranges.iter().zip(&expected).all(is_range)
 }
 
-/// Points in the sensor's frame, as `scan` has the angles.
+/// Compares points in the sensor's frame. `scan` supplies the angles.
 fn is_foreground(body: &[u8], line: &Value, scan: &Value) -> bool {
     let message = read(&POINT_CLOUD, body).expect("a PointCloud2");
     let bytes: Vec<u8> =
@@ -210,7 +215,7 @@ fn object(body: &[u8]) -> Value {
     serde_json::from_slice(body).expect("JSON")
 }
 
-/// All of one kind in a SceneUpdate.
+/// Returns all items of one kind in a SceneUpdate.
 fn all(update: &Value, kind: &str) -> Vec<Value> {
     let entities = update["entities"].as_array().expect("entities").iter();
     entities.flat_map(|entity| entity[kind].as_array().expect("a list").clone()).collect()
@@ -220,7 +225,7 @@ fn position_of(of: &Value) -> (f64, f64) {
     (of["x"].as_f64().expect("a number"), of["y"].as_f64().expect("a number"))
 }
 
-/// Whether these are the same places, one after the other.
+/// Returns whether both lists have the same positions in the same order.
 fn are_same(a: &[(f64, f64)], b: &[(f64, f64)]) -> bool {
     a.len() == b.len() && a.iter().zip(b).all(|(a, b)| close(a.0, b.0) && close(a.1, b.1))
 }
@@ -229,8 +234,8 @@ fn list<'a>(line: &'a Value, key: &str) -> impl Iterator<Item = &'a Value> {
     line[key].as_array().expect("a list").iter()
 }
 
-/// Messages that stand for what was seen last: each that says something is what some line of `class` says, where those lost
-/// nothing; else most.
+/// Compares messages that show the latest state. Each relevant message must equal some line of `class`, or at least
+/// half of them if `echo` missed samples.
 fn check_each_equals_some_line(
     class: &str,
     messages: &[ChannelMessage],
@@ -402,7 +407,7 @@ fn every_channel_equals_the_output_of_echo() {
         viewer.receive_messages(5);
         viewer
     });
-    // What they heard is among the lines before these.
+    // The lines of the samples that the viewers received precede these.
     let now = wall_ns();
     for class in ["scan", "foreground", "marks", "zones", "lines"] {
         echo.await_line(class, |line| line["class"] == class && line["wall_ns"].as_u64() > Some(now));

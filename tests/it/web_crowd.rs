@@ -1,6 +1,6 @@
-//! The server of `web` among many, slow and hostile ones: who behaves well is served, memory and processor time stay small,
-//! and where the system is short of something it waits and says so. That nobody misses a message because of others is held
-//! where messages can be counted: `clients/viewer/tests/crowd.rs`.
+//! Tests of the server of `web` with many, slow and hostile viewers: it serves well-behaved viewers, its memory and CPU
+//! time stay small, and it waits and reports it when the system is short of something. `clients/viewer/tests/crowd.rs`
+//! tests that no viewer misses a message because of others, because messages can be counted there.
 
 use std::fs;
 use std::io::{Read, Write};
@@ -17,13 +17,13 @@ use rustix::process::{Pid, Resource, Rlimit, getrlimit, prlimit};
 use serde_json::json;
 use tungstenite::{Message, WebSocket};
 
-/// Subscribes to the channel `topic`, which there will be; messages of it that came meanwhile are not counted.
+/// Waits for the channel `topic` and subscribes to it.
 fn subscribe_to(viewer: &mut WebSocket<TcpStream>, topic: &str) {
     let [channel] = channels(viewer, [topic]);
     subscribe(viewer, &[(1, &channel["id"])]);
 }
 
-/// Set when this goes, in a panic too.
+/// Sets the flag when it is dropped, even in a panic.
 struct SetOnDrop<'a>(&'a AtomicBool);
 
 impl Drop for SetOnDrop<'_> {
@@ -32,7 +32,7 @@ impl Drop for SetOnDrop<'_> {
     }
 }
 
-/// Waits for so many messages, for each as long as it may take.
+/// Waits for this number of messages, for each up to the timeout.
 fn await_messages(viewer: &mut WebSocket<TcpStream>, count: u32) {
     for number in 1..=count {
         let give_up_at = Instant::now() + WAIT_TIMEOUT;
@@ -42,7 +42,7 @@ fn await_messages(viewer: &mut WebSocket<TcpStream>, count: u32) {
     }
 }
 
-/// What a process keeps in memory, in kB.
+/// Returns the resident memory of a process, in kB.
 fn memory(of: &Program) -> u64 {
     let text = fs::read_to_string(format!("/proc/{}/status", of.pid())).expect("it lives");
     let line = text.lines().find_map(|line| line.strip_prefix("VmRSS:")).expect("a line");
@@ -68,7 +68,7 @@ fn slow_viewer_and_full_server_do_not_block_others() {
     let idle: Vec<_> = (0..148).map(|_| connect(&host)).collect();
     let mut read = 0;
     for _ in 0..8 {
-        // 1 kB for each 12 messages, which are 15 kB.
+        // Read 1 kB for every 12 messages, which are 15 kB.
         await_messages(&mut reader, 12);
         read += slow.get_mut().read(&mut [0; 1000]).expect("it is not given up");
     }
@@ -90,7 +90,7 @@ fn hostile_frames_do_not_disturb_other_viewers() {
     subscribe_to(&mut reader, "/front/scan");
     let before = memory(&server);
 
-    // Frames of any bytes; of the client's that are masked or not, whole or cut, of every opcode.
+    // Frames of random bytes: with or without mask, complete or cut, of every opcode.
     let mut random = fastrand::Rng::with_seed(25);
     for _ in 0..60 {
         let mut viewer = connect_viewer(&host, "/", None).expect("let in");
@@ -100,7 +100,7 @@ fn hostile_frames_do_not_disturb_other_viewers() {
         }
         let _ = viewer.get_mut().write_all(&bytes);
     }
-    // More subscriptions than there may be, and a message that never ends.
+    // More subscriptions than allowed, and a message that never ends.
     let mut greedy = connect_viewer(&host, "/", None).expect("let in");
     let expected: Vec<_> = (0..400).map(|id| json!({ "id": id, "channelId": 1 })).collect();
     let wish = json!({ "op": "subscribe", "subscriptions": expected });
@@ -110,7 +110,7 @@ fn hostile_frames_do_not_disturb_other_viewers() {
     let part = [&[0x01, 0xFE, 0x40, 0, 0, 0, 0, 0][..], &[b' '; 0x4000]].concat();
     while endless.get_mut().write_all(&part).is_ok() {}
 
-    // Who does not stop talking is heard no more than the others are served.
+    // A viewer that sends without pause must not starve the others.
     let mut talker = connect_viewer(&host, "/", None).expect("let in");
     talker.get_ref().set_write_timeout(Some(WAIT_TIMEOUT)).expect("a timeout");
     let is_served = AtomicBool::new(false);
@@ -134,29 +134,29 @@ fn hostile_frames_do_not_disturb_other_viewers() {
     assert!(outcome.exit_code == Some(0) && !outcome.stderr.contains("panicked"), "{outcome}");
 }
 
-/// Lets it have descriptors below `most` alone, from now on.
+/// Lowers the limit of the server, so that it only gets descriptors below `max`.
 fn limit_descriptors(server: &Program, max: u64) {
     let pid = Pid::from_raw(i32::try_from(server.pid()).expect("a process"));
     let limit = Rlimit { current: Some(max), maximum: getrlimit(Resource::Nofile).maximum };
     prlimit(pid, Resource::Nofile, limit).expect("its limit");
 }
 
-/// What the server follows of a sensor when nobody asks for lines.
+/// Topics that the server subscribes to without a request for lines.
 const SERVER_TOPICS: [&str; 6] =
     ["front/scan", "front/marks", "front/zones", "front/foreground", "front/background", "front/status"];
 
-/// The lowest descriptor that it does not have.
+/// Returns the lowest descriptor that is not open.
 fn next_descriptor(server: &Program) -> u64 {
     let open = |number: &u64| !Path::new(&format!("/proc/{}/fd/{number}", server.pid())).exists();
     (0..).find(open).expect("not all are open")
 }
 
-/// Processor time that it used.
+/// Returns the CPU time that the server has used.
 fn cpu_time(server: &Program) -> Duration {
     let text = fs::read_to_string(format!("/proc/{}/stat", server.pid())).expect("it lives");
     let fields: Vec<&str> = text.rsplit_once(") ").expect("a name").1.split(' ').collect();
     let ticks: u64 = fields[11..13].iter().map(|field| field.parse::<u64>().expect("a number")).sum();
-    // proc(5): a hundred ticks a second wherever Linux runs on what this runs on.
+    // A hundred ticks per second (proc(5)) on all platforms of this project.
     Duration::from_millis(10 * ticks)
 }
 
@@ -169,7 +169,7 @@ fn new_viewer_waits_while_descriptors_are_short() {
     let (mut server, host) = web(&env, &[]);
     let mut viewer = connect_viewer(&host, "/", None).expect("let in");
     subscribe_to(&mut viewer, "/front/scan");
-    // All that it follows takes descriptors, too.
+    // Subscriptions take descriptors too, so wait for all of them first.
     wait_until("it follows all topics", || SERVER_TOPICS.iter().all(|topic| env.subscribers(topic) > 0));
     await_messages(&mut viewer, 5);
     limit_descriptors(&server, next_descriptor(&server));
@@ -180,7 +180,7 @@ fn new_viewer_waits_while_descriptors_are_short() {
     assert!(short["hint"].as_str().is_some_and(|text| text.contains("ulimit -n")), "{short}");
     let (started, before) = (Instant::now(), cpu_time(&server));
     await_messages(&mut viewer, 80);
-    // One who does not sleep because somebody is at the door works all the time.
+    // A server that does not sleep while a connection waits would use all of the CPU time.
     let (worked, elapsed) = (cpu_time(&server) - before, started.elapsed());
     assert!(worked < elapsed / 2, "{worked:?} of {elapsed:?}");
     limit_descriptors(&server, 1024);
@@ -203,7 +203,7 @@ fn lack_of_descriptors_for_a_topic_spares_the_others() {
     wait_until("it follows all topics", || SERVER_TOPICS.iter().all(|topic| env.subscribers(topic) > 0));
     await_messages(&mut viewer, 5);
     limit_descriptors(&server, next_descriptor(&server));
-    // Lines are followed as soon as somebody asks for them.
+    // The server subscribes to lines as soon as a viewer requests them.
     subscribe(&mut viewer, &[(2, &lines["id"])]);
     let short = server.await_line("what it is short of", is_class("web_short"));
     assert!(
@@ -228,7 +228,7 @@ fn where_there_are_no_descriptors_the_server_ends() {
     let mut viewer = connect_viewer(&host, "/", None).expect("let in");
     subscribe_to(&mut viewer, "/front/scan");
     await_messages(&mut viewer, 5);
-    // It may not even wait any more: better to end than to serve nobody.
+    // The server cannot even wait without descriptors, so it ends.
     limit_descriptors(&server, 1);
     let outcome = server.wait();
     assert!(outcome.exit_code.is_some_and(|code| code != 0), "{outcome}");

@@ -1,4 +1,5 @@
-//! A page on which nothing is drawn says why and what to do, and what is worse than it looks is as red as it is.
+//! Tests of pages without data: the page states the reason and the remedy, and its colors show how serious the state
+//! is.
 
 use serde_json::Value;
 
@@ -8,7 +9,7 @@ use crate::testkit::{INT, Program, TestEnv, in_a_network, is_class};
 use crate::web::web;
 use crate::web_page::browse;
 
-/// The colour that the page's style calls `name`.
+/// Returns the color that the page's style calls `name`.
 fn color(page: &mut Browser, name: &str) -> Value {
     page.ask(&format!(
         "(() => {{ const probe = document.createElement('i'); document.body.append(probe); \
@@ -16,7 +17,7 @@ fn color(page: &mut Browser, name: &str) -> Value {
     ))
 }
 
-/// Waits until the page says `what`, and how it is mended in words that have `remedy`.
+/// Waits until the page gives a reason that contains `description`, with a remedy that contains `remedy`.
 fn wait_for_reason(page: &mut Browser, description: &str, remedy: &str) {
     let reason = "document.querySelector('#reason')";
     let has_text =

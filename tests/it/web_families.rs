@@ -1,5 +1,5 @@
-//! Sensors of every family and form in one picture: equal beams and exact angles, upside down, fields that overlap, and those
-//! of other machines. Where the page draws points is compared with where the hub's scans and poses put them.
+//! Tests of sensors of every family and mounting in one picture: equal beams and exact angles, upside down, overlapping
+//! fields of view, and remote sensors. The points on the page are compared with those computed from scans and poses.
 
 use serde_json::Value;
 
@@ -10,11 +10,12 @@ use crate::web_page::browse;
 use scanhub_schema::{ArrayFlags, Header, Pose, Scan, ScanHead, State, Status, Topic, Verdict, Zones};
 use scanhub_viewer::scene::{PointerPosition, Scene};
 
-/// A hall that is as no mirror shows it.
+/// World with a hall that has no symmetry.
 const HALL_WORLD: &str = "[noise]\ntail = 0\n\n[[thing]]\nline = [[3000, -2500], [3500, 4000], [-2000, 3000], [-4000, -3000], [3000, -2500]]\n
 [[thing]]\nradius_mm = 150\npose = [900, 1300]\n";
 
-/// Points of `sensor` on the page, in the robot's frame; not a number where there is none.
+/// Returns the points of `sensor` on the page, in the robot's frame in meters. Coordinates are NaN for beams without a
+/// point.
 fn drawn_points(page: &mut Browser, sensor: &str) -> Vec<(f64, f64)> {
     let points = page.ask(&format!("scanhub.points('{sensor}')"));
     let numbers: Vec<f64> =
@@ -22,12 +23,12 @@ fn drawn_points(page: &mut Browser, sensor: &str) -> Vec<(f64, f64)> {
     numbers.chunks(2).map(|pair| (pair[0], pair[1])).collect()
 }
 
-/// Two numbers.
+/// Returns the two numbers of a list.
 fn pair(value: &Value) -> (f64, f64) {
     (value[0].as_f64().expect("a number"), value[1].as_f64().expect("a number"))
 }
 
-/// Where the beams of a line of class `scan` end for a sensor at `pose`.
+/// Returns where the beams in a line of class `scan` end, for a sensor at `pose`, in meters.
 fn measured_points(scan: &Value, pose: &Pose) -> Vec<(f64, f64)> {
     let unit_mm = number(scan, "unit_um") as f64 / 1000.0;
     let (first, step) =
@@ -72,7 +73,7 @@ fn every_form_is_drawn_where_it_sees() {
         ("top", Pose::default()),
     ];
     for (sensor, pose) in poses {
-        // On a busy machine the scan of a moment may have holes, and one that is too old to be shown is gone.
+        // On a busy machine, a scan may have gaps, and the page removes one that is too old.
         wait_until(&format!("{sensor} stands where it sees"), || {
             let outcome = env.run(&["echo", "--json", "-n", "1", &format!("{sensor}/scan")]);
             let scan = outcome.of_class("scan").pop().unwrap_or_else(|| panic!("no scan: {outcome}"));
@@ -97,7 +98,7 @@ fn remote_sensors_are_listed_but_not_on_this_robot() {
         let mut listener = env.start(&words).ready();
         let topics = [Topic::Zones, Topic::Scan, Topic::Status];
         sender.wait_until_published(&mut listener, &topics);
-        // Nothing in this hall comes near.
+        // This hall has no object near the sensor.
         let world = format!("--world={}", env.file("world", HALL_WORLD));
         let _lms = env.simulator(&["rear"], &["--seed=7", "--baud=500000", &world]);
         let _hub = env.hub(&[env.link("rear")]);
@@ -111,8 +112,8 @@ fn remote_sensors_are_listed_but_not_on_this_robot() {
         };
         let mut scan = Scan::of(head, &[2000; 181]);
         scan.arrays().upper.fill(77);
-        // It announces itself and says something all the time, as remote ones do: however long the rest took, it is there
-        // again.
+        // Announce the remote sensor and send its samples repeatedly, as a gateway does, so that it is present however
+        // long the other steps took.
         let mut send_until = |page: &mut Browser, measured_now: &str| {
             wait_until(measured_now, || {
                 sender.announce(&topics);
@@ -125,16 +126,16 @@ fn remote_sensors_are_listed_but_not_on_this_robot() {
         let card = "[...document.querySelectorAll('#sensors h2')].some((one) => /robot1\\.front/.test(one.innerText))";
         send_until(&mut page, card);
         send_until(&mut page, "scanhub.points('robot1.front').length === 362");
-        // It sits on another robot, and says nothing of this one.
+        // It belongs to another robot, so it does not affect the verdict of this one.
         send_until(&mut page, "scanhub.beams > 300 && scanhub.beams <= 361 && scanhub.verdict === 'clear'");
         let number = "[...document.querySelectorAll('#sensors button')].find((one) => /robot1/.test(one.innerText)).click()";
         page.ask(number);
         send_until(&mut page, "scanhub.beams === 181");
-        // What is read out of it is what the terminal would say of the same place.
+        // The page's read-out equals the text that `watch` shows for the same position.
         let mut scene = Scene::default();
         scene.sensor("robot1.front").take_status(&Status::default());
         scene.sensor("robot1.front").take_scan(&Header::default(), &scan, 0);
-        // Three points, and a place where there is none, in a picture that does not move any more.
+        // Check three points and a position without one. Pressing a key stops the automatic fit.
         page.press("-");
         let beam = |degrees: f64| (2.0 * degrees.to_radians().cos(), 2.0 * degrees.to_radians().sin());
         for (x, y) in [beam(0.0), beam(-53.0), beam(90.0), (0.7, 0.4)] {

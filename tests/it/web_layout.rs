@@ -1,4 +1,4 @@
-//! Layout of the page: in every demonstration and at every width, no box lies over another one, and no text is cut.
+//! Tests of the page's layout: in every demo and at every width, no box overlaps another one, and no text is cut.
 
 use std::process::Command;
 
@@ -34,7 +34,7 @@ const BREACHES_SCRIPT: &str = "(() => {
     return breaches;
 })()";
 
-/// Starts a demonstration, and returns the address of its page.
+/// Starts a demo, and returns it with the address of its page.
 fn demo(world: &str, home: &str) -> (Program, String) {
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
     command.args(["demo", "--world", world]).env_clear().env("XDG_STATE_HOME", home);
@@ -46,7 +46,7 @@ fn demo(world: &str, home: &str) -> (Program, String) {
     }
 }
 
-/// Asserts that the boxes have their places with and without the list of layers.
+/// Asserts that the layout is right with and without the list of layers.
 fn check(page: &mut Browser, description: &str) {
     for layers in ["", ", with layers"] {
         // A busy browser drops movements of the mouse, so keep moving it.
@@ -55,7 +55,7 @@ fn check(page: &mut Browser, description: &str) {
             page.mouse("mouseMoved", (x.next().expect("endless"), 330.0), false);
             page.ask("document.querySelector('#readout').innerText !== ''") == true
         });
-        // The report of skipped messages is shown for a moment only.
+        // The page shows the report of skipped messages only for a moment, so set it here.
         let report = "62 messages skipped: the server was too late, its machine may be busy";
         let script = format!("(document.querySelector('#news').textContent = '{report}', {BREACHES_SCRIPT})");
         assert_eq!(page.ask(&script), Value::Array(Vec::new()), "{description}{layers}");

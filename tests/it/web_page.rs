@@ -1,4 +1,5 @@
-//! The picture in a browser, as somebody looks at it: it follows the hub, says why nothing comes, and goes on by itself.
+//! Tests of the web page in a browser: it follows the hub, gives a reason when no samples arrive, and recovers on its
+//! own.
 
 use std::path::Path;
 
@@ -7,21 +8,21 @@ use crate::recorded_world::recorded_world;
 use crate::testkit::{INT, KILL, Program, TERM, TestEnv, skip, wait_until};
 use scanhub_sim::world::World;
 
-/// A hall with a reflector.
+/// World with a hall and a reflector.
 const WORLD: &str =
     "[noise]\ntail = 0\n\n[[thing]]\nline = [[3000, -3000], [3000, 3000], [-3000, 3000], [-3000, -3000]]\n
 [[thing]]\nline = [[900, 2000], [1000, 2000]]\nsurface = \"reflector\"\n";
 
-/// A post beside the robot.
+/// A post next to the robot.
 const POST_WORLD: &str = "\n[[thing]]\nradius_mm = 60\npose = [0, 450]\n";
 
-/// A scanner in the hall, and with `more` in it.
+/// Starts a scanner in the hall, with `more` added to the world.
 fn sensor(env: &TestEnv, more: &str) -> Program {
     let world = format!("--world={}", env.file("world", format!("{WORLD}{more}")));
     env.simulator(&["front"], &["--seed=71", "--baud=500000", &world])
 }
 
-/// A browser with a page, looking as `look` says; nothing, and why, where there is none.
+/// Starts a browser with this appearance. Returns `None`, and reports a skip, if none is installed.
 pub(crate) fn browse(env: &TestEnv, appearance: Appearance) -> Option<Browser> {
     let browser = Browser::start(env.path("browser"), appearance);
     if browser.is_none() {
@@ -30,7 +31,7 @@ pub(crate) fn browse(env: &TestEnv, appearance: Appearance) -> Option<Browser> {
     browser
 }
 
-/// Holds the picture when `seen` is true of it: on a busy machine, that of a moment may be empty.
+/// Holds the picture while `condition` is true, because on a busy machine the picture may be empty for a moment.
 pub(crate) fn freeze_page(page: &mut Browser, condition: &str) {
     wait_until("a picture is held", || {
         page.press(" ");
@@ -43,7 +44,7 @@ pub(crate) fn freeze_page(page: &mut Browser, condition: &str) {
     });
 }
 
-/// The server, and the address that it says.
+/// Starts the server, and returns it with its address.
 fn web(env: &TestEnv, listen: &str) -> (Program, String) {
     let mut web = env.start(&["web", "--json", "--listen", listen]);
     let ready = web.await_line("its address", |line| line["class"] == "ready");
@@ -51,7 +52,7 @@ fn web(env: &TestEnv, listen: &str) -> (Program, String) {
     (web, url)
 }
 
-/// Of the verdict's word.
+/// Script that returns the background color of the verdict.
 const COLOR_SCRIPT: &str = "getComputedStyle(document.querySelector('#verdict strong')).backgroundColor";
 
 #[test]
@@ -65,7 +66,7 @@ fn page_shows_samples_or_the_reason_for_their_absence() {
     page.await_true("/scanhub run/.test(scanhub.reason)");
     let red = page.ask(COLOR_SCRIPT);
 
-    // One that does not answer yet says where it is looked for, and what looks into that.
+    // A link whose scanner does not reply yet gives its own reason.
     let hub = env.hub(&[env.link("front")]);
     page.await_true("/^front: ./.test(scanhub.reason)");
     let empty_hall = sensor(&env, "");
@@ -74,7 +75,7 @@ fn page_shows_samples_or_the_reason_for_their_absence() {
     page.await_true("scanhub.zones === 2 && scanhub.marks > 0 && scanhub.sensors[0].hz > 0");
     page.await_true("document.querySelector('#sensors article').innerText.includes('streaming')");
 
-    // The post is new, and nearer than the robot may be.
+    // The post is new, and inside the inner zone.
     let learned = env.path("state/scanhub").join(env.domain().name()).join("front.background.json");
     wait_until("the background is learned", || learned.exists());
     assert_eq!(empty_hall.end(TERM).exit_code, Some(0));
@@ -82,7 +83,7 @@ fn page_shows_samples_or_the_reason_for_their_absence() {
     page.await_true("scanhub.verdict === 'stop' && scanhub.foreground > 2");
     page.await_true("document.querySelector('#verdict').innerText.startsWith('STOP')");
     page.await_true(&format!("scanhub.verdict === 'stop' && {COLOR_SCRIPT} === {red}"));
-    // Held, the picture stands and the verdict does not.
+    // While the picture is held, the verdict is still current.
     freeze_page(&mut page, "scanhub.beams > 100");
     hub.end(KILL);
     page.await_true("scanhub.verdict === 'unknown'");
@@ -96,7 +97,7 @@ fn page_shows_samples_or_the_reason_for_their_absence() {
     let _hub = env.hub(&[env.link("front")]);
     page.await_true("scanhub.verdict === 'stop' && scanhub.beams > 100");
 
-    // The socket is cut, and another server comes at the same place.
+    // The connection is lost, and another server starts at the same address.
     let address = url.trim_start_matches("http://").trim_end_matches('/').to_owned();
     server.end(INT);
     page.await_true("scanhub.verdict === 'unknown' && /No connection/.test(scanhub.reason)");
@@ -162,7 +163,7 @@ fn keys_and_the_mouse_change_the_picture() {
         page.press(key);
         page.await_true(&format!("scanhub.{layer} > 0"));
     }
-    // Lines are found only while somebody looks at them.
+    // The hub computes lines only while they have a subscriber.
     assert_eq!(page.ask("scanhub.lines"), 0);
     assert_eq!(env.subscribers("front/lines"), 0);
     page.press("e");
@@ -195,9 +196,9 @@ fn keys_and_the_mouse_change_the_picture() {
     page.await_true("document.querySelector('#help').open");
     page.press("Escape");
     page.await_true("!document.querySelector('#help').open");
-    // Nothing is wider than the screen, and every key can be hit by a finger.
+    // Nothing is wider than the screen, and every button is large enough for a finger.
     page.await_true("document.documentElement.scrollWidth <= 390");
-    // One that is hidden has no height.
+    // Hidden buttons have no height.
     let small = "[...document.querySelectorAll('nav button:not([hidden])')].filter((one) => one.offsetHeight < 40).length";
     assert_eq!(page.ask(small), 0);
     assert!(page.console_errors.is_empty(), "{:?}", page.console_errors);
@@ -228,8 +229,9 @@ fn curve(name: &str) -> String {
     )
 }
 
-/// As in the documents: `SCANHUB_PICTURES=docs cargo test --test it the_picture_of_the_documents` makes those anew, each when a
-/// minute is over. They are of a recording, because a simulator that has to wait for a busy machine loses bytes.
+/// Checks the page as in the pictures of the pages. `SCANHUB_PICTURES=docs cargo test --test it
+/// the_picture_of_the_documents` creates these pictures again, each after a minute. They show a recording, because a
+/// simulator on a busy machine loses bytes.
 #[test]
 fn the_picture_of_the_documents() {
     let env = TestEnv::new();

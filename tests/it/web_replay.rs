@@ -1,11 +1,11 @@
-//! A recording in a browser: its time line, pause, single steps and speed, by buttons and by keys, from a hub that nobody else
-//! has and that is gone afterwards.
+//! Tests of a recording in a browser: time line, pause, single steps and rate, with buttons and keys. Its hub serves
+//! only this page and ends with it.
 
 use crate::browser::Appearance;
 use crate::testkit::{INT, Program, TestEnv, is_class, shared_memory};
 use crate::web_page::browse;
 
-/// Starts what shows `file`, and waits for its address.
+/// Starts a web server that shows `file`, and returns it with its address.
 fn start_web(env: &TestEnv, file: &str, flags: &[&str]) -> (Program, String) {
     let words = ["web", "--json", "--listen", "127.0.0.1:0", "--replay", file];
     let mut web = env.start(&[&words, flags].concat());
@@ -17,7 +17,7 @@ fn start_web(env: &TestEnv, file: &str, flags: &[&str]) -> (Program, String) {
 /// Scans of a log that plays for two minutes, which is longer than a page takes to load.
 const SCAN_COUNT: u64 = 600;
 
-/// A CARMEN log of a wall that comes nearer with every scan, five of them a second.
+/// Writes a CARMEN log of a wall that is nearer in every scan, at five scans per second.
 fn log(env: &TestEnv, scans: u64) -> String {
     let line = |n: u64| {
         let stamp = 1000.0 + 0.2 * n as f64;
@@ -38,7 +38,7 @@ fn the_keys_of_a_player_are_on_the_page() {
     assert!(!shared_memory(&own).is_empty(), "a hub of its own");
     page.await_true("document.querySelector('#line').max > 119 && document.querySelector('#line').value > 0");
 
-    // Paused by a key: the picture stands, longer than a scan is what is there.
+    // A key pauses the replay. The picture stays for longer than a scan is valid.
     page.press("p");
     page.await_true("scanhub.player.paused && /paused/.test(document.querySelector('#played').innerText)");
     page.ask("window.pausedAt = performance.now()");
@@ -48,14 +48,14 @@ fn the_keys_of_a_player_are_on_the_page() {
     assert_eq!(page.ask("scanhub.reason"), serde_json::Value::Null);
     assert_eq!(page.ask("scanhub.verdict"), "unknown", "what stands is not what is there");
 
-    // One telegram each, by key and by button.
+    // A key and a button each step by one telegram.
     page.press(".");
     page.await_true(&format!("scanhub.player.telegrams === {}", before + 1));
     page.ask("document.querySelector('[data-order=step]').click()");
     page.await_true(&format!("scanhub.player.telegrams === {} && scanhub.player.paused", before + 2));
     page.await_true("scanhub.beams === 181");
 
-    // Twice as fast, half as fast.
+    // Double the rate, then halve it twice.
     page.press(">");
     page.await_true("scanhub.player.rate === 2");
     page.press("<");

@@ -1,6 +1,5 @@
-//! The examples of the pages: every block of code in README.md, `docs/` and beside the libraries, with its place and its
-//! language. Refuses to know what becomes of it.
-#![allow(dead_code)] // Every test takes what it needs.
+//! Blocks of code in README.md, in `docs/` and in the pages of the Python and C libraries, with location and language.
+#![allow(dead_code)] // Each test uses only some items.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -8,15 +7,15 @@ use std::path::{Path, PathBuf};
 /// A block of code on a page.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Block {
-    /// The page and the line on which it begins, as compilers write it.
+    /// Page and line of its fence as `PAGE:LINE`, the form that compilers use.
     pub(crate) location: String,
-    /// What is written behind the fence: sh, rust, python ..
+    /// Language after the fence, such as `sh`, `rust` or `python`. May be empty.
     pub(crate) language: String,
-    /// Its lines, each with a line feed.
+    /// Lines between the fences, each with a line feed.
     pub(crate) text: String,
 }
 
-/// All blocks of all pages.
+/// Returns all blocks of all pages.
 pub(crate) fn blocks() -> Vec<Block> {
     let top = Path::new(env!("CARGO_MANIFEST_DIR"));
     let mut pages = vec![top.join("README.md")];
@@ -32,7 +31,7 @@ pub(crate) fn blocks() -> Vec<Block> {
     pages.iter().flat_map(read).collect()
 }
 
-/// The blocks of one page.
+/// Returns the blocks of the page `name` with the text `text`.
 pub(crate) fn blocks_of_page(name: &str, text: &str) -> Vec<Block> {
     let mut blocks = Vec::new();
     let mut open: Option<Block> = None;

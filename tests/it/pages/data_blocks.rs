@@ -1,5 +1,5 @@
-//! What is no program on a page, but what one reads or writes: configurations, worlds, lines of JSON. What is only a text is
-//! named here, with where it is held to the truth.
+//! Tests of the blocks that are not programs: configurations, worlds, sites and lines of JSON. Blocks of plain text are
+//! listed with the test that checks them.
 
 use std::fs;
 use std::path::Path;
@@ -10,7 +10,7 @@ use super::blocks::{Block, blocks};
 use super::is_program;
 use crate::testkit::{TERM, TestEnv, output};
 
-/// Texts that are no examples, by how they begin, and what makes sure of them.
+/// Blocks of plain text: page, beginning, and how they are checked or why they are not.
 const TEXT_BLOCKS: [(&str, &str, &str); 8] = [
     ("README.md", " LMS 291 ──RS-422", "a drawing"),
     ("docs/datagram.md", " 0  53485542", "schema/tests/datagram.rs compares it with the golden datagram"),
@@ -25,7 +25,7 @@ const TEXT_BLOCKS: [(&str, &str, &str); 8] = [
 /// The CMake project of the examples in C and C++.
 const EXAMPLES: &str = include_str!("../../../clients/c/examples/CMakeLists.txt");
 
-/// What is wrong with a block that is no program, if anything is.
+/// Returns what is wrong with a block that is not a program, if anything.
 fn error_in_block(block: &Block) -> Option<String> {
     match block.language.as_str() {
         "toml" => error_in_toml(block),
@@ -43,20 +43,20 @@ fn error_in_block(block: &Block) -> Option<String> {
         {
             None
         }
-        // Zenoh's own: the bridge's tests run it.
+        // A configuration of Zenoh, which the bridge's tests use.
         "json5" if block.location.starts_with("docs/bridge.md") => None,
-        // What publishes angles: `tilt.rs` runs it.
+        // A program that publishes angles, which `tilt.rs` runs.
         "rust,no_run" if block.location.starts_with("docs/tilt.md") => None,
-        // It reads a recording: `python/read.rs` runs it.
+        // A program that reads a recording, which `python/read.rs` runs.
         "python,no_run" if block.location.starts_with("docs/python.md") => None,
-        // Of a crate that consumers of topics do not have: its own tests run it.
+        // Uses a crate that clients do not depend on. That crate's doc tests run it.
         "rust,edition2024" if block.location.starts_with("docs/tilt.md") => None,
         _ if is_program(block) => None,
         other => Some(format!("nobody knows what to do with {other:?}")),
     }
 }
 
-/// A configuration, a world, or a site.
+/// Returns what is wrong with a TOML block, unless it is a configuration, a world or a site.
 fn error_in_toml(block: &Block) -> Option<String> {
     let env = TestEnv::new();
     let file = env.file("page.toml", &block.text);
@@ -64,7 +64,7 @@ fn error_in_toml(block: &Block) -> Option<String> {
     if checked.exit_code == Some(0) {
         return None;
     }
-    // A section of its own is one of a configuration that has a link.
+    // A section without a link becomes a complete configuration with one.
     let with_link = format!("{}\n[[link]]\nname = \"front\"\nport = \"/dev/ttyUSB0\"\n", block.text);
     let completed = env.run(&["config", "check", &env.file("completed.toml", with_link)]);
     if checked.stderr.contains("no link is configured") && completed.exit_code == Some(0) {
@@ -82,7 +82,7 @@ fn error_in_toml(block: &Block) -> Option<String> {
     Some(format!("neither a configuration, a site nor a world: {checked}{}", world.wait()))
 }
 
-/// A line of output, with keys that docs/output.md names.
+/// Returns what is wrong with a line of JSON output, unless docs/output.md lists its class and all of its keys.
 fn error_in_json(line: &str) -> Option<String> {
     let Ok(Value::Object(keys)) = serde_json::from_str(line) else {
         return Some(format!("no object: {line}"));

@@ -1,5 +1,5 @@
-//! The lines for a shell on the pages, run by a shell: with a hub and a sensor `front`, recordings under the names that
-//! the pages use, and a spare sensor at every port that they name. What cannot be run is named here, with the reason.
+//! Tests that run the shell lines of the pages. They run with a hub, a sensor `front`, recordings with the names that
+//! the pages use, and a spare sensor at each port that they name. Commands that cannot run are listed with the reason.
 
 use std::fs;
 use std::process::Command;
@@ -15,8 +15,8 @@ use crate::testkit::{
 };
 use scanhub_schema::Topic;
 
-/// Commands that are not run, by how their line begins or what is in it, and what makes sure of them. Those of the
-/// program are read by `hub/cli.rs`.
+/// Commands that are not run: the beginning of the line, and the reason or the test that runs it. `hub/cli.rs` parses
+/// those of `scanhub`.
 const SKIPPED_COMMANDS: [(&str, &str); 18] = [
     ("sudo ", "changes the machine; tests/it/dist.rs and tests/it/client_c.rs install elsewhere"),
     ("sudoedit ", "an editor"),
@@ -37,21 +37,21 @@ const SKIPPED_COMMANDS: [(&str, &str); 18] = [
     ("scanhub tilt", "needs a mount; tests/it/tilt.rs runs it beside one"),
     ("scanhub echo hall/", "follows what that makes; the same"),
 ];
-/// The same of what is in the middle of a line.
+/// Parts of lines that are not run, with the reason.
 const NOT_RUN_IF_CONTAINS: [(&str, &str); 1] = [("| ssh ", "needs another machine")];
 
-/// Whether `line` is not run.
+/// Returns whether `line` is not run.
 fn is_excluded(line: &str) -> bool {
     SKIPPED_COMMANDS.iter().any(|(begin, _)| line.starts_with(begin))
         || NOT_RUN_IF_CONTAINS.iter().any(|(part, _)| line.contains(part))
 }
 
-/// Whether `line` has to do with a network.
+/// Returns whether `line` needs a network.
 fn needs_network(line: &str) -> bool {
     ["scanhub listen", "scanhub gateway", "robot1."].iter().any(|part| line.contains(part))
 }
 
-/// All lines of all pages with their places.
+/// Returns all shell lines of all pages with their locations.
 fn command_lines() -> Vec<(String, String)> {
     let blocks = blocks().into_iter().filter(|block| block.language == "sh");
     let lines = blocks
@@ -59,22 +59,22 @@ fn command_lines() -> Vec<(String, String)> {
     lines.collect()
 }
 
-/// What the pages take for granted.
+/// Environment that the pages assume: a running hub, recordings, and `scanhub` in `PATH`.
 struct ShellEnv {
     env: TestEnv,
-    /// Of lines that were run.
+    /// Count of lines that were run, which names the next directory.
     count: AtomicUsize,
 }
 
-/// Recordings of `front` under these names.
+/// Names under which pages use a recording of `front`.
 const RECORDINGS: [&str; 5] = ["walk.mcap", "day-0001.mcap", "cut.mcap", "killed.mcap", "robot.mcap"];
-/// A part of a recording that lasts longer than the one here, and the like of this one.
+/// Range of a recording on a page, and the range that replaces it because the recording of this test is shorter.
 const SHORTENED_RANGE: (&str, &str) = ("--start 1m --end 90s", "--start 200ms --end 500ms");
 /// Ports that pages name.
 const PORTS: [&str; 3] = ["/dev/serial/by-id/usb-FTDI...", "/dev/ttyUSB0", "/tmp/lms"];
 
 impl ShellEnv {
-    /// With what runs beside it, the simulator and the hub.
+    /// Creates the environment, and returns it with its simulator and hub.
     fn new() -> (ShellEnv, [Program; 2]) {
         let env = TestEnv::new();
         let simulator = env.simulator(&["front", "spare"], &["--seed=82", "--baud=500000"]);
@@ -84,7 +84,7 @@ impl ShellEnv {
         assert_eq!(recorded.exit_code, Some(0), "{recorded}");
         let stream = env.run(&["echo", "front/telegram", "--raw", "-n", "5"]);
         fs::create_dir(env.path("bin")).expect("a directory");
-        // One domain is not enough for two hubs.
+        // `run` and `replay` use another domain, because a domain has at most one hub.
         let (name, root) = (env.domain().name().to_owned(), env.path("").display().to_string());
         let script = format!(
             "#!/bin/sh\ncase $1 in run | replay) other=x ;; esac\n\
@@ -97,8 +97,8 @@ impl ShellEnv {
         (ShellEnv { env, count: AtomicUsize::new(0) }, [simulator, hub])
     }
 
-    /// Runs `line`, and returns the problem, if there is one. A search for a scanner runs again while it finds none: on a busy machine,
-    /// the simulated scanner may reply too late.
+    /// Runs `line` and returns the problem, if any. Repeats a search that finds no scanner, because the simulated
+    /// scanner may reply too late on a busy machine.
     fn run(&self, line: &str) -> Option<String> {
         let mut wrong = self.run_once(line);
         wait_until(line, || {
@@ -134,7 +134,7 @@ impl ShellEnv {
         });
         let typed = typed.replace(SHORTENED_RANGE.0, SHORTENED_RANGE.1);
         let mut shell = Command::new("sh");
-        // A single command is the shell's own process, so that what ends it ends that.
+        // A single command replaces the shell, so that signals reach it.
         let exec = if commands(line).len() == 1 { "exec " } else { "" };
         let path = format!("{}:{}", self.env.path_argument("bin"), std::env::var("PATH").unwrap_or_default());
         shell.arg("-c").arg(format!("{exec}{typed}")).current_dir(&here).env("PATH", path);
@@ -145,7 +145,7 @@ impl ShellEnv {
         let mut words = line.split_whitespace();
         let ends =
             words.next() == Some("scanhub") && words.next().is_some_and(|verb| ENDING_VERBS.contains(&verb));
-        // Any other may last. It is ended when it can be, and has had time for something to go wrong.
+        // Any other command may run forever. Interrupt it once it has a handler for SIGINT and has had time to fail.
         wait_until(line, || program.has_ended() || !ends && catches_interrupts(group));
         let started = Instant::now();
         wait_until(line, || program.has_ended() || started.elapsed() > TIME_TO_FAIL);
@@ -154,9 +154,9 @@ impl ShellEnv {
         let is_bounded = [" --for ", " -n "].iter().any(|flag| line.contains(flag));
         let is_right = match outcome.exit_code {
             Some(0) => true,
-            // A bounded run that is interrupted says so.
+            // A command with `--for` or `-n` exits with 130 when it is interrupted.
             Some(130) => is_ended && is_bounded,
-            // Of doctor: a condition is not met, here or on the machine that runs the test.
+            // Exit code of `doctor` if a condition is not met, for example on the machine that runs the test.
             Some(5) => line.starts_with("scanhub doctor"),
             _ => false,
         };
@@ -164,13 +164,13 @@ impl ShellEnv {
     }
 }
 
-/// Commands that end by themselves, however long that takes on this machine.
+/// Verbs that end by themselves. The test waits for them as long as they need.
 const ENDING_VERBS: [&str; 6] = ["doctor", "probe", "list", "info", "convert", "key"];
 
-/// Time in which a command that lasts may fail. A longer or shorter time does not let a right one fail.
+/// Time in which a command that runs forever may fail. A correct command passes whatever the value.
 const TIME_TO_FAIL: Duration = Duration::from_millis(1200);
 
-/// Whether there are programs of this project in `group`, and all of them have a handler for SIGINT (proc(5),
+/// Returns whether `group` contains a program of this project and each of them has a handler for SIGINT (proc(5),
 /// `SigCgt`).
 fn catches_interrupts(group: Pid) -> bool {
     let processes = fs::read_dir("/proc").into_iter().flatten().flatten().map(|entry| entry.path());
@@ -188,11 +188,12 @@ fn catches_interrupts(group: Pid) -> bool {
     !catches.is_empty() && catches.iter().all(|catches| *catches)
 }
 
-/// What is wrong with those of `lines` that can be run.
+/// Runs `lines` and returns a description of each failure.
 fn failures(environment: &ShellEnv, lines: &[(String, String)]) -> Vec<String> {
     let wrong = |(place, line): &(String, String)| Some(format!("{place}: {}", environment.run(line)?));
-    // There is one spare sensor, one domain for another hub, one place for a listener, and one sensor to be told what
-    // to do; the rest mostly waits.
+    // These commands share the spare sensor, the domain for another hub, the single slot for a listener, or the state
+    // of the sensor, so they run one after the other. Commands spend most of their time waiting, so the others run in
+    // three concurrent rows.
     const SEQUENTIAL_COMMANDS: [&str; 6] = [
         "scanhub run",
         "scanhub replay",
@@ -225,7 +226,8 @@ fn every_line_about_a_network_runs() {
         let lines: Vec<_> = command_lines().into_iter().filter(|(_, line)| needs_network(line)).collect();
         assert!(lines.len() > 3, "{lines:#?}");
         let (desk, _running) = ShellEnv::new();
-        // One after the other, each with what the one before it leaves running on the page.
+        // Lines that start a listener or a gateway run first. The other lines then run while a listener publishes, as
+        // on the page.
         let (alone, follows): (Vec<_>, Vec<_>) = lines
             .into_iter()
             .partition(|(_, line)| line.contains("scanhub listen") || line.contains("gateway"));
@@ -239,7 +241,7 @@ fn every_line_about_a_network_runs() {
     });
 }
 
-/// What is not run is still a command that exists, with files that exist.
+/// Excluded lines still start with listed commands and name existing files.
 #[test]
 fn excluded_shell_lines_exist_and_name_existing_files() {
     let lines = command_lines();

@@ -1,5 +1,4 @@
-//! Checks that no JSON key, configuration key or flag has one of the old public names. They misled, or contradicted the
-//! glossary.
+//! Checks that no JSON key, configuration key or flag uses a public name that misled or contradicted the glossary.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -7,8 +6,8 @@ use std::path::Path;
 
 use crate::testkit::TestEnv;
 
-/// Words that are not used as names, each with the places where it has another meaning: rows of `docs/output.md` by
-/// `CLASS VERB`.
+/// Words that are not used as names, each with the places in which it has an allowed meaning: rows of `docs/output.md`
+/// as `CLASS VERB`.
 const FORBIDDEN: [(&str, &[&str]); 36] = [
     ("self_min", &[]),
     ("i_min", &[]),
@@ -29,7 +28,7 @@ const FORBIDDEN: [(&str, &[&str]); 36] = [
     ("angles_unfit", &[]),
     ("pictures", &[]),
     ("trouble", &[]),
-    // Telegrams and datagrams that did not arrive, and the reason of a verdict.
+    // Allowed for telegrams and datagrams that did not arrive, and for the reason of a verdict.
     ("lost", &["summary demo", "lan listen", "lan_evicted listen", "bridge bridge", "leds leds"]),
     ("lan_given_up", &[]),
     ("bridge_given_up", &[]),
@@ -43,15 +42,15 @@ const FORBIDDEN: [(&str, &[&str]); 36] = [
     ("client", &[]),
     ("came", &[]),
     ("clients", &[]),
-    // A check that was not made, and a topic that the receiver does not know.
+    // Allowed for a check that was not made and for a topic that the receiver does not support.
     ("skipped", &["check doctor", "tilt_check tilt --check", "lan_refused listen"]),
     ("well", &[]),
-    // People who went through a door.
+    // Allowed for people who returned through a door.
     ("back", &["count track --count DOOR", "summary track"]),
     ("unheard", &[]),
 ];
 
-/// A name, and where it is used.
+/// Place in which a name is used, and the name.
 type Used = (String, String);
 
 /// Returns the names among `used` that are forbidden where they are used.
@@ -99,7 +98,7 @@ fn of_help(env: &TestEnv) -> Vec<Used> {
     let all = help(&["--help"]);
     let rows = all.lines().skip_while(|line| *line != "Commands:").skip(1).take_while(|row| !row.is_empty());
     let verbs: BTreeSet<_> = rows.filter_map(|row| row.split_whitespace().next()).collect();
-    // The bridge is another program, whose own test holds its flags.
+    // The bridge is another program. Its own test checks its flags.
     let verbs = verbs.into_iter().filter(|verb| !["help", "bridge"].contains(verb));
     let mut used = Vec::new();
     for verb in verbs {

@@ -1,5 +1,4 @@
-//! An example of a page as a program: built as its reader would build it, beside a hub, and what it prints. Refuses to know
-//! what should be printed.
+//! An example of a page as a program, built as a reader of the page would build it.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -12,20 +11,22 @@ use super::blocks::Block;
 use crate::client_c::installed::InstalledLibrary;
 use crate::testkit::{TestEnv, client_python, output, python};
 
-/// Something to start.
+/// An example that is ready to run.
 pub(crate) struct Example {
-    /// The page and the line.
+    /// Page and line of the block.
     pub(crate) location: String,
-    /// As it stands there.
+    /// Text of the block.
     pub(crate) text: String,
     program: PathBuf,
     arguments: Vec<PathBuf>,
 }
 
 impl Example {
-    /// Built in `env`; nothing, said, where this machine has not what that takes.
+    /// Builds `block` in `env`. Returns `None`, and prints the reason, if this machine lacks a tool that it needs.
     ///
-    /// The words of the compiler if it refuses.
+    /// # Errors
+    ///
+    /// The message of the compiler if it rejects the block.
     pub(crate) fn build(block: &Block, env: &TestEnv) -> Result<Option<Example>, String> {
         let name = block.location.replace(['/', '.', ':'], "_");
         let source = |ending: &str, text: &str| PathBuf::from(env.file(&format!("{name}.{ending}"), text));
@@ -40,10 +41,10 @@ impl Example {
         Ok(program.map(|program| Example { location, text, program, arguments: Vec::new() }))
     }
 
-    /// The program, to be run in `env` and with the hub there.
+    /// Returns the command that runs the example in `env` with the hub of `env`.
     pub(crate) fn command(&self, env: &TestEnv) -> Command {
         let mut command = Command::new(&self.program);
-        // Warnings are errors, except that the hub is still starting.
+        // Python warnings are errors, except the one for a hub that is still starting.
         command.args(&self.arguments).current_dir(env.path("")).env_remove("XDG_RUNTIME_DIR");
         command.env("SCANHUB_DOMAIN", env.domain().name()).env("PYTHONWARNINGS", "error,default:nothing yet");
         command.env("RUNTIME_DIRECTORY", env.domain().root().parent().expect("it has one"));
@@ -52,7 +53,7 @@ impl Example {
     }
 }
 
-/// The block, with a main function around it where it has none.
+/// Returns the text of `block`, inside a main function if it has none.
 fn with_main(block: &Block) -> String {
     let Block { language, text, .. } = block;
     match language.as_str() {
@@ -88,7 +89,7 @@ fn compile_cpp(source: &Path, env: &TestEnv) -> Result<Option<PathBuf>, String> 
     InstalledLibrary::installed().and_then(|installed| installed.try_compile_cpp(env, source)).transpose()
 }
 
-/// By the compiler itself, with the library that Cargo makes.
+/// Compiles `source` with `rustc` and the library that Cargo builds.
 fn compile_rust(source: &Path, env: &TestEnv) -> Result<PathBuf, String> {
     let program = env.path(&format!("{}-rust", source.file_stem().expect("a name").display()));
     let mut command = Command::new(std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into()));
@@ -104,11 +105,11 @@ fn compile_rust(source: &Path, env: &TestEnv) -> Result<PathBuf, String> {
     Ok(program)
 }
 
-/// What a consumer depends on.
+/// Name of the crate that clients depend on.
 const LIBRARY_NAME: &str = "scanhub_client";
 
-/// The one library of this project that a consumer depends on. Built alone: this test and the program, which run, are not made
-/// again.
+/// Builds the client library, once per process, and returns its path. It is built alone, because Cargo must not rebuild
+/// this test or the program while they run.
 fn library() -> &'static Path {
     static LIBRARY_PATH: OnceLock<PathBuf> = OnceLock::new();
     LIBRARY_PATH.get_or_init(build_library)
@@ -135,8 +136,8 @@ fn build_library() -> PathBuf {
     library.clone()
 }
 
-/// What stands before each example in C that is a part of a program.
+/// Text before each C example that is only a part of a program.
 const C_PRELUDE: &str = "#include <errno.h>\n#include <poll.h>\n#include <scanhub/attach.h>\n#include <stdio.h>\n#include <unistd.h>\n";
 const CPP_PRELUDE: &str = "#include <cmath>\n#include <cstdio>\n#include <scanhub/attach.hpp>\n";
-/// What is printed is to be seen by a test, too.
+/// Makes output available to the test line by line.
 const LINE_BUFFERING: &str = "setvbuf(stdout, NULL, _IOLBF, BUFSIZ);\n";

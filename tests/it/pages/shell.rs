@@ -1,13 +1,13 @@
-//! Lines for a shell, as far as examples use it: comments, quotes, pipes and redirections. Refuses to run anything.
-#![allow(dead_code)] // Every test takes what it needs.
+//! Parser for the shell syntax that examples use: comments, quotes, pipes and redirections.
+#![allow(dead_code)] // Each test uses only some items.
 
-/// The lines of a block without their comments.
+/// Returns the lines of a block without comments and empty lines.
 pub(crate) fn lines(text: &str) -> Vec<String> {
     let lines = text.lines().map(|line| without_comment(line).trim().to_owned());
     lines.filter(|line| !line.is_empty()).collect()
 }
 
-/// The words of each command in a line; redirections are none of them.
+/// Returns the words of each command in `line`, without redirections.
 pub(crate) fn commands(line: &str) -> Vec<Vec<String>> {
     let mut commands = vec![Vec::new()];
     let mut is_redirected = false;
@@ -22,7 +22,8 @@ pub(crate) fn commands(line: &str) -> Vec<Vec<String>> {
     commands
 }
 
-/// The words of each `scanhub` in a line, also of those that Cargo runs; an example is another program.
+/// Returns the words of each `scanhub` command in `line`, including those that `cargo run` starts. Examples of Cargo do
+/// not count.
 pub(crate) fn scanhub_commands(line: &str) -> Vec<Vec<String>> {
     let of_cargo = |words: &[String]| {
         let at = words
@@ -69,7 +70,7 @@ fn without_comment(line: &str) -> &str {
     line
 }
 
-/// Words and signs between commands, and whether there were quotes around them.
+/// Returns the words and operators of `line`, each with whether it was quoted.
 fn words(line: &str) -> Vec<(String, bool)> {
     let mut words = Vec::new();
     let (mut word, mut quote, mut is_quoted) = (String::new(), None, false);

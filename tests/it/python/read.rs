@@ -1,4 +1,4 @@
-//! `scanhub.read` returns the samples that a replay of the recording publishes, bit for bit.
+//! Tests that `scanhub.read` returns the samples that a replay of the recording publishes, bit for bit.
 
 use std::path::Path;
 use std::process::Command;
@@ -24,7 +24,7 @@ use crate::replayed::recorded_rooms::{self, SENSORS};
 use crate::replayed::step_through;
 use crate::testkit::{Program, TestEnv, client_python, in_own_process, python_for};
 
-/// Settings with which backgrounds are learned within a recording, and zones are violated.
+/// Settings with which the background is learned within the recording and zones are violated.
 const READ_SETTINGS: &str = r#"
 background.scans = 40
 zones.radii = [2.5, 1.5]
@@ -34,7 +34,7 @@ port = "/dev/ttyUSB0"
 zones.radii = [3.0, 2.0]
 "#;
 
-/// Samples of all topics that do not depend on the time of the run, as `read.py` prints them.
+/// Samples of all topics except `status`, in the form in which `read.py` prints them.
 #[derive(Default)]
 struct PublishedSamples {
     samples: Vec<Value>,
@@ -100,8 +100,9 @@ impl PublishedSamples {
     }
 }
 
-/// Samples in the order of sensor, topic and number. Those before the first telegram are left out, because a subscriber comes too
-/// late for them. Clocks of a recording without stamps are those of the run.
+/// Returns `samples` sorted by sensor, topic and `topic_seq`. Drops statuses and the zones before the first telegram,
+/// for which a subscriber of a replay attaches too late. Without `has_stamps`, the times come from the clock of the run
+/// and are replaced by null.
 fn sorted(samples: Vec<Value>, has_stamps: bool) -> Vec<Value> {
     let mut samples: Vec<Value> = samples
         .into_iter()
@@ -114,7 +115,8 @@ fn sorted(samples: Vec<Value>, has_stamps: bool) -> Vec<Value> {
     samples
 }
 
-/// Compares the samples that a replay publishes, with the settings in `config`, with those that a reader and `scanhub.read` return.
+/// Asserts that a replay of `file` with the settings in `config` publishes the samples that [`RecordingReader`] and, if
+/// `read` is given, `scanhub.read` return.
 fn compare(
     env: &TestEnv,
     read: Option<&Command>,
@@ -234,7 +236,7 @@ fn the_example_plots_a_recording() {
     assert!(picture.starts_with(b"\x89PNG"));
 }
 
-/// A log of a room, with a gap.
+/// Writes a log of a room, with a pause of 1.7 s.
 fn log(env: &TestEnv) -> String {
     let room = Room::new(&"demo".parse().expect("a world"), 7);
     let line = |scan: u64| {
@@ -248,7 +250,7 @@ fn log(env: &TestEnv) -> String {
     env.file("a.log", (0..110).map(line).collect::<String>())
 }
 
-/// Telegrams of a room, with damaged bytes between them.
+/// Writes a stream file of a room, with damaged bytes between its telegrams.
 fn stream(env: &TestEnv) -> String {
     let room = Room::new(&"demo".parse().expect("a world"), 8);
     let mut bytes = lms::reply::configuration_reply(0, Mode(1), Unit::Mm, 0x10).bytes().to_vec();
@@ -266,7 +268,7 @@ fn stream(env: &TestEnv) -> String {
     env.file("stream.bin", bytes)
 }
 
-/// Packets of a rotating scanner as they arrive on a line.
+/// Writes the packets of a rotating scanner as they arrive on a line.
 fn packets(env: &TestEnv) -> String {
     let room = Room::new(&"room".parse().expect("a world"), 7);
     let settings = LdSettings { seed: 7, ..LdSettings::of(ld::Model::Ld19) };

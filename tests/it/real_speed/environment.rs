@@ -1,4 +1,5 @@
-//! Sensors on ptys, a hub and consumers as processes, to which actions are done. Refuses to know what is right.
+//! Sensors on ptys, a hub and subscribers as processes, to which actions are applied. `invariants.rs` checks the
+//! result.
 
 use std::time::{Duration, Instant};
 
@@ -17,27 +18,28 @@ pub(super) struct RealSpeedEnvironment {
     started: Instant,
     sensors: Sensors,
     hub: Option<Program>,
-    /// What is to be done later because of an action before, and when.
+    /// Tasks that follow from earlier actions, each with its time.
     scheduled: Vec<(Nanos, ScheduledTask)>,
-    /// Consumers of telegrams, one of each sensor, there all the time.
+    /// Subscribers of topic `telegram`, one for each sensor, which run all the time.
     telegrams: Vec<Program>,
-    /// Consumers that come and go.
+    /// Subscribers that an action starts and ends.
     subscribers: Vec<Program>,
-    /// What users ask of sensors.
+    /// Running `control` commands.
     requests: Vec<Program>,
     edition: u64,
-    /// When a consumer was killed last.
+    /// Time at which a subscriber was last killed.
     killed_at: Option<Instant>,
 }
 
-/// A hub looks every five seconds what killed consumers left; one that ends earlier leaves it to the next.
+/// Time after which the hub has cleaned up after a killed subscriber: it does so every five seconds. A hub that ends
+/// earlier leaves the cleanup to the next one.
 const CLEANUP_INTERVAL: Duration = Duration::from_secs(9);
 
-/// What follows from an action.
+/// A task that follows from an action.
 type ScheduledTask = Box<dyn FnOnce(&mut RealSpeedEnvironment)>;
 
 impl RealSpeedEnvironment {
-    /// Everything is up; nothing streams yet.
+    /// Starts the sensors, the hub and the subscribers of telegrams. Does not wait until sensors stream.
     pub(super) fn new(seed: u64) -> RealSpeedEnvironment {
         let env = TestEnv::new();
         let sensors = Sensors::start(&env, seed);
@@ -64,7 +66,7 @@ impl RealSpeedEnvironment {
         self.started.elapsed().as_nanos() as Nanos
     }
 
-    /// Waits until `at` after the begin; what is due before is done.
+    /// Waits until `at` after the start, and runs the scheduled tasks that are due before.
     pub(super) fn wait_until(&mut self, at: Nanos) {
         loop {
             self.scheduled.sort_by_key(|(due, _)| *due);
@@ -82,8 +84,8 @@ impl RealSpeedEnvironment {
         self.scheduled.push((self.now() + span, Box::new(task)));
     }
 
-    /// Does `action`, if it can be done to a real program: the machine's clock, disk, memory and rights are left alone, and a
-    /// sensor's view and quirks are those that it began with.
+    /// Applies `action` if a real program allows it. Ignores actions on the machine's clock, disk, memory and
+    /// permissions, and on a sensor's view and quirks.
     pub(super) fn perform(&mut self, action: &Action) {
         let sensor = action.value("sensor") as usize % SENSORS.len();
         let span = action.value("span_ms") * MILLIS;
@@ -136,7 +138,7 @@ impl RealSpeedEnvironment {
 
     fn end_hub(&mut self, signal: Signal, down_time: Nanos) {
         let Some(hub) = self.hub.take() else { return };
-        // One that stands still would not hear of its end.
+        // A stopped process does not handle SIGTERM.
         hub.signal(Signal::CONT);
         let outcome = hub.end(signal);
         assert_eq!(outcome.exit_code, (signal == TERM).then_some(0), "{outcome}");
@@ -145,13 +147,13 @@ impl RealSpeedEnvironment {
 
     fn start_hub(&mut self) {
         if self.hub.is_none() {
-            // A bad configuration is for one that runs.
+            // A bad configuration is only for a reload, because a hub does not start with it.
             self.edition = self.edition.min(1);
             self.hub = Some(self.env.hub(&[self.configuration(), "--no-system-config".to_owned()]));
         }
     }
 
-    /// The hub's configuration, good or bad, in a file.
+    /// Writes the hub's configuration of the current edition, valid or not, and returns the flag for it.
     fn configuration(&self) -> String {
         let link = |name: &str| {
             format!("[[link]]\nname = \"{name}\"\nport = \"{}\"\n", self.env.path_argument(name))
@@ -161,7 +163,7 @@ impl RealSpeedEnvironment {
         format!("--config={}", self.env.file("scanhub.toml", text))
     }
 
-    /// A consumer comes, and gets `signal` after `span`.
+    /// Starts a subscriber that receives `signal` after `span`.
     fn attach_subscriber(&mut self, sensor: usize, topic: u64, span: Nanos, signal: Signal) {
         let topic = Topic::ALL[topic as usize % Topic::ALL.len()].name();
         let guest = self.env.start(&["echo", "--json", &format!("{}/{topic}", SENSORS[sensor])]);
@@ -175,7 +177,7 @@ impl RealSpeedEnvironment {
                 if signal == KILL {
                     environment.killed_at = Some(Instant::now());
                 }
-                // One that just began may not have got so far as to end in order.
+                // A subscriber that has just started may not handle the signal yet.
                 assert!(matches!(outcome.exit_code, None | Some(0)), "{outcome}");
             }
         });
@@ -192,12 +194,12 @@ impl RealSpeedEnvironment {
         });
     }
 
-    /// A user asks; a hub that is not there or stands still answers nothing.
+    /// Sends a control request. A hub that is down or stopped does not reply.
     fn send_request(&mut self, sensor: usize, verb: &str) {
         self.requests.push(self.env.start(&["control", SENSORS[sensor], verb, "--json"]));
     }
 
-    /// Ends what goes wrong, and waits until every sensor streams.
+    /// Runs the remaining tasks, clears all faults, and waits until every sensor streams.
     pub(super) fn clear_faults(&mut self) {
         while !self.scheduled.is_empty() {
             let (_, what) = self.scheduled.remove(0);
@@ -209,16 +211,16 @@ impl RealSpeedEnvironment {
         }
         for (number, name) in SENSORS.into_iter().enumerate() {
             self.clear_line_faults(number);
-            // Whoever was asked to pause may have been asked last.
+            // The last request may have been to pause.
             let outcome = self.env.run(&["control", name, "resume", "--json"]);
             assert_eq!(outcome.exit_code, Some(0), "{outcome}");
             self.env.await_info(name, |info| info["state"] == "streaming");
         }
     }
 
-    /// What has to be so at the end.
+    /// Checks the invariants at the end.
     pub(super) fn check_invariants(mut self) {
-        // From now on nothing goes wrong.
+        // From now on, there are no faults.
         let has_counters = |info: &Value| info["counters"].is_object();
         let calm =
             SENSORS.map(|name| number(&self.env.await_info(name, has_counters)["counters"], "telegrams"));

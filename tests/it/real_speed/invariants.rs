@@ -1,4 +1,4 @@
-//! What holds after any list of actions, as far as it can be seen from outside the program.
+//! Invariants after any scenario, as far as they are visible from outside the program.
 
 use std::collections::HashSet;
 
@@ -7,24 +7,25 @@ use serde_json::Value;
 
 use crate::testkit::{Outcome, bytes_of, number};
 
-/// So many telegrams come at the end, while nothing goes wrong.
+/// Telegrams at the end of a run that arrive without faults.
 pub(super) const FAULTLESS_TELEGRAMS: usize = 60;
 
-/// Every byte that was read is something by now.
+/// Asserts that every byte that was read is counted in exactly one category.
 pub(super) fn bytes_are_conserved(info: &Value) {
     let count = |name: &str| number(&info["counters"], name);
     let known = ["bytes_in_telegrams", "bytes_acknowledge", "bytes_discarded", "bytes_buffered"].map(count);
     assert_eq!(count("bytes_read"), known.iter().sum::<u64>(), "{info}");
 }
 
-/// What was published was taken, or counted as missed; each life of the hub begins its numbers at 0.
+/// Asserts that every published sample was received or counted as missed. Each run of the hub numbers from 0.
 pub(super) fn all_samples_are_counted(received: &[Value], outcome: &Outcome) {
     let [summary] = &outcome.of_class("summary")[..] else { panic!("{outcome}") };
     let mut published = 0;
     for run in received.chunk_by(|one, next| one["boot"] == next["boot"]) {
         let numbers: Vec<u64> = run.iter().map(|line| number(line, "topic_seq")).collect();
         assert!(numbers.windows(2).all(|pair| pair[0] < pair[1]), "out of order: {numbers:?}");
-        // Who is there before the hub gets all of it, but of the first one, which was there before.
+        // The subscriber receives every sample of a hub from the first one on, except of the first hub, which started
+        // earlier.
         let first = if published == 0 { numbers[0] } else { 0 };
         published += numbers[numbers.len() - 1] - first + 1;
     }
@@ -34,7 +35,7 @@ pub(super) fn all_samples_are_counted(received: &[Value], outcome: &Outcome) {
     assert_eq!(received.len() as u64 + number(summary, "missed"), published, "{summary}");
 }
 
-/// Telegrams without a doubt are those that the sensor sent, in its order, each once.
+/// Asserts that the sensor sent each clean telegram, in this order and each at most once.
 pub(super) fn nothing_is_invented(received: &[Value], sent: &[Record]) {
     let mut rest = sent.iter();
     for line in received.iter().filter(|line| line["quality"] == "clean") {
@@ -43,7 +44,7 @@ pub(super) fn nothing_is_invented(received: &[Value], sent: &[Record]) {
     }
 }
 
-/// While nothing goes wrong every telegram that reached the port whole comes, or is counted as missed.
+/// Asserts that, without faults, every telegram that reached the port intact is received or counted as missed.
 pub(super) fn nothing_is_lost(received: &[Value], sent: &[Record], outcome: &Outcome) {
     let [summary] = &outcome.of_class("summary")[..] else { panic!("{outcome}") };
     let calm = &received[received.len() - FAULTLESS_TELEGRAMS..];

@@ -1,4 +1,4 @@
-//! The simulated sensors of a stage, in threads of the test: what is done to them while they run, and what they sent.
+//! Simulated sensors in threads of the test. Events are applied to them while they run, and what they send is recorded.
 
 use std::collections::{HashMap, VecDeque};
 use std::os::unix::net::UnixStream;
@@ -14,10 +14,10 @@ use scanhub_sim::{Event, simulate_with};
 
 use crate::testkit::{TestEnv, WAIT_TIMEOUT};
 
-/// The names of sensors and their ports.
+/// Names of sensors and their ports.
 pub(super) const SENSORS: [&str; 2] = ["s0", "s1"];
 
-/// The simulator.
+/// The running simulator.
 pub(super) struct Sensors {
     stop: UnixStream,
     events: Events,
@@ -25,11 +25,11 @@ pub(super) struct Sensors {
     records: Receiver<Record>,
 }
 
-/// What is done to each port next.
+/// Next events of each port.
 type Events = Arc<Mutex<HashMap<PathBuf, VecDeque<Event>>>>;
 
 impl Sensors {
-    /// Sensors that have just been powered, whose ports can be opened.
+    /// Starts sensors that have just been powered on, and waits until their ports can be opened.
     pub(super) fn start(env: &TestEnv, seed: u64) -> Sensors {
         let ports = SENSORS.map(|name| env.path(name));
         let options = SimulateOptions { ports: ports.to_vec(), seed, ..SimulateOptions::default() };
@@ -45,7 +45,7 @@ impl Sensors {
                 &stopped,
                 |_| say_ready.send(()).expect("somebody waits"),
                 |record| {
-                    // Who has enough of them has ended.
+                    // The test drops the receiver once it has all records.
                     let _ = record_sender.lock().expect("whole").send(record.clone());
                 },
                 |port| event_queue.lock().expect("whole").get_mut(port)?.pop_front(),
@@ -56,13 +56,13 @@ impl Sensors {
         Sensors { stop, events, thread, records }
     }
 
-    /// Does `event` to sensor number `sensor`.
+    /// Applies `event` to the sensor with the index `sensor`.
     pub(super) fn inject(&self, env: &TestEnv, sensor: usize, event: Event) {
         let mut events = self.events.lock().expect("whole");
         events.get_mut(&env.path(SENSORS[sensor])).expect("a sensor").push_back(event);
     }
 
-    /// Ends them; what each sent in its order, and in all.
+    /// Ends the simulator. Returns what each sensor sent, in its order, and the summaries.
     pub(super) fn end(self, env: &TestEnv) -> ([Vec<Record>; 2], Vec<Summary>) {
         drop(self.stop);
         let summaries = self.thread.join().expect("no panic").expect("ends well");

@@ -1,4 +1,4 @@
-//! The walls between the crates: who knows whom, and of what each is built.
+//! Tests of the rules between crates: which crates and modules each may use, and how many dependencies it has.
 
 use super::{assert_rule, crates};
 
@@ -343,7 +343,7 @@ fn shared_memory_is_pinned() {
     });
 }
 
-/// A hub is small: most of its crates come with shared memory; serialport brings three.
+/// The hub has few dependencies: most of its crates come with shared memory, and serialport brings three.
 #[test]
 fn the_daemon_is_built_from_few_crates() {
     let mut crates = crates::dependency_tree("scanhub-daemon", &[]);
@@ -352,11 +352,12 @@ fn the_daemon_is_built_from_few_crates() {
     assert!(crates.len() <= 82, "{} crates: {crates:#?}", crates.len());
 }
 
-/// A client pays for shared memory and for little besides: for no verb, and for nothing that only verbs need.
+/// Besides shared memory, a client needs few crates: no verb, and no crate that only verbs need.
 #[test]
 fn the_client_is_built_from_few_crates() {
     let mut crates = crates::dependency_tree("scanhub-client", &[]);
-    // Cargo lists a crate that is not of this workspace only if it has downloaded everything, the bridge's crates included.
+    // Cargo lists a crate outside of this workspace only if it has downloaded everything, including the bridge's
+    // crates.
     let shared_memory = crates::dependency_tree("scanhub-shm", &[]);
     crates.retain(|name| !shared_memory.contains(name));
     eprintln!("client: {} crates besides those of shared memory", crates.len());
@@ -376,12 +377,12 @@ fn the_client_is_built_from_few_crates() {
     assert!(crates::dependency_tree("scanhub-verbs", &[]).iter().any(|name| of_verbs(&name)));
 }
 
-/// What needs a C compiler comes with recordings alone.
+/// Only recordings need crates that are built with a C compiler.
 #[test]
 fn clients_that_do_not_record_need_no_c_compiler() {
     let in_c = |package: &str, features: &[&str]| {
         let crates = crates::dependency_tree(package, features);
-        // The exception is the kernel's interface in Rust.
+        // `linux-raw-sys` is the exception: it is the kernel's interface in Rust.
         let is_in_c = |name: &String| name.contains("-sys ") && !name.starts_with("linux-raw-sys");
         crates.into_iter().filter(is_in_c).collect::<Vec<_>>()
     };

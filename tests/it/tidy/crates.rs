@@ -1,11 +1,11 @@
-//! Who may know whom: walls between the crates, read from the manifests and from what Cargo makes of them.
+//! Rules for dependencies between crates, checked with the manifests and with the output of `cargo tree`.
 
 use super::tree::{SourceTree, code, find};
 use crate::testkit::output;
 use std::collections::BTreeSet;
 use std::process::Command;
 
-/// Names of the crates of this project that a manifest names under `section`, such as `dependencies`.
+/// Returns the crates of this project that a manifest names in `sections`, such as `dependencies`.
 fn own_dependencies(manifest: &toml::Table, sections: &[&str]) -> BTreeSet<String> {
     let mut found = BTreeSet::new();
     for section in sections {
@@ -23,7 +23,7 @@ pub(crate) fn schema_depends_on_no_other_crate(tree: &SourceTree) -> Vec<String>
     own_dependencies(&tree.members()["scanhub-schema"], &ALL).into_iter().collect()
 }
 
-/// Finds names of the operating system in `schema`. Payloads and names are the same on every machine.
+/// Finds uses of the operating system in `schema`, whose payloads and names are the same on every machine.
 pub(crate) fn schema_uses_no_operating_system(tree: &SourceTree) -> Vec<String> {
     const OF_STD: [&str; 7] = ["env", "fs", "net", "os", "process", "thread", "time"];
     const CRATES: [&str; 4] = ["memmap2", "nix", "rustix", "tempfile"];
@@ -31,7 +31,7 @@ pub(crate) fn schema_uses_no_operating_system(tree: &SourceTree) -> Vec<String> 
     let mut breaches = dependencies_beyond(tree, "scanhub-schema", &known);
     breaches.extend(missing_attributes(tree, "schema/src/lib.rs", &["#![forbid(unsafe_code)]"]));
     for (path, text) in tree.sources().filter(|(path, _)| path.starts_with("schema/src/")) {
-        // One line, because a list of names may have several.
+        // Join the lines, because a list of names may have several.
         let text: String = code(text).map(|(_, line)| format!("{line} ")).collect();
         breaches.extend(
             text.split(';')
@@ -53,22 +53,22 @@ fn words(text: &str) -> impl Iterator<Item = &str> {
     text.split(|c: char| !c.is_alphanumeric() && c != '_')
 }
 
-/// Finds what `shm` and `files` use of this project besides `schema`.
+/// Finds crates of this project that `shm` and `files` may not use.
 pub(crate) fn shm_and_files_know_only_schema(tree: &SourceTree) -> Vec<String> {
     let known: [(&str, &[&str]); 2] =
         [("scanhub-files", &["scanhub-schema"]), ("scanhub-shm", &["scanhub-files", "scanhub-schema"])];
     forbidden_dependencies(tree, &known)
 }
 
-/// Names of all crates that a manifest names for what is built, tests left out.
+/// Returns the names of all crates that a manifest depends on, without those of tests.
 fn built_dependencies(manifest: &toml::Table) -> impl Iterator<Item = &String> {
     let sections = ["dependencies", "build-dependencies"].into_iter();
     let tables = sections.filter_map(|section| manifest.get(section).and_then(toml::Value::as_table));
     tables.flat_map(toml::Table::keys)
 }
 
-/// Finds what is more than computation in the drivers: time and bytes are arguments, so that the same code runs on a port, on a
-/// recording and in virtual time.
+/// Finds code in the drivers that does more than compute. Time and bytes are arguments, so that the same code runs on a
+/// port, on a recording and in virtual time.
 pub(crate) fn drivers_only_compute(tree: &SourceTree) -> Vec<String> {
     let mut breaches = dependencies_beyond(tree, "scanhub-drivers", &["scanhub-schema"]);
     breaches.extend(missing_attributes(tree, "hub/drivers/src/lib.rs", &["#![forbid(unsafe_code)]"]));
@@ -86,7 +86,7 @@ pub(crate) fn no_family_names_another(tree: &SourceTree) -> Vec<String> {
         for (path, text) in tree.sources().filter(|(path, _)| is_own(path)) {
             for (number, line) in code(text) {
                 let mut words = line.split(|c: char| !c.is_alphanumeric() && c != '_');
-                // The list of families is a way to any of them.
+                // The list of families gives access to any of them.
                 let is_list = line.contains("families") || line.contains("crate::Session");
                 if is_list || words.any(|word| word != own && FAMILIES.contains(&word)) {
                     breaches.push(format!("{path}:{number}: {}", line.trim()));
@@ -97,8 +97,8 @@ pub(crate) fn no_family_names_another(tree: &SourceTree) -> Vec<String> {
     breaches
 }
 
-/// Finds names of the RPLIDAR's driver in the simulator. If both used one description of the protocol, an error in it would stay
-/// unnoticed.
+/// Finds uses of the RPLIDAR's driver in the simulator. If both used one description of the protocol, an error in it
+/// would stay unnoticed.
 pub(crate) fn the_rplidar_simulator_is_independent(tree: &SourceTree) -> Vec<String> {
     let mut breaches = Vec::new();
     for (path, text) in tree.sources().filter(|(path, _)| path.starts_with("hub/sim/src/")) {
@@ -107,7 +107,7 @@ pub(crate) fn the_rplidar_simulator_is_independent(tree: &SourceTree) -> Vec<Str
         let naming = statements.filter(|statement| {
             let (_, path) = statement.split_once("scanhub_drivers").unwrap_or_default();
             let mut words = path.split(|c: char| !c.is_alphanumeric() && c != '_');
-            // Under another name, or by the list of families, the driver could be named without its word.
+            // With an alias or through the list of families, code could use the driver without its name.
             words.any(|word| ["rplidar", "scanner"].contains(&word))
                 || path.trim_start().starts_with("as ")
                 || path.starts_with("::{self")
@@ -117,7 +117,7 @@ pub(crate) fn the_rplidar_simulator_is_independent(tree: &SourceTree) -> Vec<Str
     breaches
 }
 
-/// Finds names of the operating system in the code below `folder`: clocks, sockets, files, threads, processes.
+/// Finds uses of the operating system in the code in `folder`: clocks, sockets, files, threads, processes, output.
 fn forbidden_paths(tree: &SourceTree, folder: &str) -> Vec<String> {
     const HARMLESS: [&str; 4] = ["std::f32", "std::f64", "std::fmt", "std::ops"];
     let below = |path: &str| path.starts_with(folder);
@@ -130,7 +130,7 @@ fn forbidden_paths(tree: &SourceTree, folder: &str) -> Vec<String> {
     breaches
 }
 
-/// Finds what is more than computation in the crate that encodes EEPROM writes.
+/// Finds code that does more than compute in the crate that encodes EEPROM writes.
 pub(crate) fn eeprom_writer_only_computes(tree: &SourceTree) -> Vec<String> {
     let mut breaches =
         dependencies_beyond(tree, "scanhub-lms-configure", &["scanhub-drivers", "scanhub-schema"]);
@@ -139,8 +139,8 @@ pub(crate) fn eeprom_writer_only_computes(tree: &SourceTree) -> Vec<String> {
     breaches
 }
 
-/// Cargo keeps requests that write the EEPROM from all crates but these: the one where a person is asked, and the
-/// simulator, which is the sensor. Tests of others may have them.
+/// Finds crates that are built with the requests that write the EEPROM, except the two that may be: the one that asks a
+/// person first, and the simulator. Dependencies of tests do not count.
 pub(crate) fn few_crates_can_write_the_eeprom(tree: &SourceTree) -> Vec<String> {
     const ALLOWED_CRATES: [&str; 2] = ["scanhub-tools", "scanhub-sim"];
     let top = ("scanhub".to_owned(), tree.manifest("Cargo.toml"));
@@ -160,7 +160,8 @@ fn missing_attributes(tree: &SourceTree, path: &str, attributes: &[&str]) -> Vec
     missing.map(|attribute| format!("{path} lacks {attribute}")).collect()
 }
 
-/// From payloads to payloads: no telegram, no shared memory, nothing of the system, no heap.
+/// Finds code in `preprocess` that does more than compute, and allocations. The crate turns payloads into payloads,
+/// without telegrams, shared memory, the operating system and, after a processor was created, the heap.
 pub(crate) fn preprocess_only_computes(tree: &SourceTree) -> Vec<String> {
     const HEAP: [&str; 12] = [
         "Vec<",
@@ -176,7 +177,7 @@ pub(crate) fn preprocess_only_computes(tree: &SourceTree) -> Vec<String> {
         "collect()",
         "collect::",
     ];
-    // Rc, Arc, maps, clocks, threads, files: all else that std has stands under another name.
+    // All other modules of `std` are forbidden, such as those of Rc, Arc, maps, clocks, threads and files.
     const HARMLESS: [&str; 7] =
         ["std::array", "std::error", "std::f32", "std::f64", "std::fmt", "std::mem", "std::ops"];
     let is_of_tests = |path: &str| {
@@ -189,8 +190,8 @@ pub(crate) fn preprocess_only_computes(tree: &SourceTree) -> Vec<String> {
         built_dependencies(manifest).filter(|name| *name != "scanhub-schema").cloned().collect();
     breaches.extend(missing_attributes(tree, "hub/preprocess/src/lib.rs", &["#![forbid(unsafe_code)]"]));
     let mut on_heap = find(tree, &HEAP, ours);
-    // For as many beams as its sensor has, or cells of a map, each processor takes its memory once. Settings with lists of circles
-    // and sectors are made before that.
+    // A processor allocates its memory once, for the number of its sensor's beams or the cells of a map. Settings with
+    // lists of radii and sectors exist before that.
     on_heap.retain(|place| {
         let (file, line) = place.split_once(": ").unwrap_or_default();
         let is_setting = ["radii_mm: ", "body_mask: ", "pub radii_mm: ", "pub body_mask: "];
@@ -213,7 +214,8 @@ pub(crate) fn preprocess_only_computes(tree: &SourceTree) -> Vec<String> {
     breaches
 }
 
-/// Checks that the result of a processor does not depend on which others run. Motion has its own line finder.
+/// Finds processors that use another one. The result of a processor must not depend on which others run. Motion may use
+/// its own instance of the line finder.
 pub(crate) fn no_processor_uses_another(tree: &SourceTree) -> Vec<String> {
     const BELOW: &str = "hub/preprocess/src/";
     const PROCESSORS: [&str; 6] = ["zones", "marks", "lines", "motion", "background", "segments"];
@@ -232,12 +234,12 @@ pub(crate) fn no_processor_uses_another(tree: &SourceTree) -> Vec<String> {
     breaches
 }
 
-/// A consumer's program has nothing of ours below it but the library and the words. The verbs stand on it as others do; the
-/// words of ROS come with them where they record. The viewer, the gateway, the listener and the perception of people and points
-/// stand on the verbs.
+/// Finds crates of this project that the client library and the crates above it may not use. The client library uses
+/// only `schema` and `shm`. The verbs use it like any client, and `ros` for recordings. The network and the viewer use
+/// the verbs.
 pub(crate) fn clients_know_only_schema(tree: &SourceTree) -> Vec<String> {
     let known: [(&str, &[&str]); 4] = [
-        // Its tests name it to enable its features.
+        // The crate's own tests name it to enable its features.
         ("scanhub-client", &["scanhub-client", "scanhub-schema", "scanhub-shm"]),
         (
             "scanhub-network",
@@ -262,7 +264,7 @@ pub(crate) fn clients_know_only_schema(tree: &SourceTree) -> Vec<String> {
     forbidden_dependencies(tree, &known)
 }
 
-/// Finds modules of `shm` that use one that is not before them in the list at the start of the crate.
+/// Finds modules of `shm` that use a module that does not precede them in the list at the start of the crate.
 pub(crate) fn modules_of_shm_form_layers(tree: &SourceTree) -> Vec<String> {
     const FOLDER: &str = "schema/shm/src/";
     let lib = tree.text("schema/shm/src/lib.rs");
@@ -289,7 +291,7 @@ pub(crate) fn modules_of_shm_form_layers(tree: &SourceTree) -> Vec<String> {
     breaches
 }
 
-/// Crates of this project that a crate names besides those that it may know.
+/// Returns the crates of this project that each crate in `known` names and may not.
 fn forbidden_dependencies(tree: &SourceTree, known: &[(&str, &[&str])]) -> Vec<String> {
     let members = tree.members();
     let others = known.iter().flat_map(|(name, known)| {
@@ -301,7 +303,8 @@ fn forbidden_dependencies(tree: &SourceTree, known: &[(&str, &[&str])]) -> Vec<S
     others.collect()
 }
 
-/// From payloads to messages: nothing of the system, nothing of others, so that anybody can call it.
+/// Finds code in `ros` that does more than turn payloads into messages. It uses only `schema`, so that any crate can
+/// use it.
 pub(crate) fn ros_knows_only_schema(tree: &SourceTree) -> Vec<String> {
     let mut breaches = dependencies_beyond(tree, "scanhub-ros", &["scanhub-schema", "sha2"]);
     breaches.extend(missing_attributes(tree, "schema/ros/src/lib.rs", &["#![forbid(unsafe_code)]"]));
@@ -310,7 +313,8 @@ pub(crate) fn ros_knows_only_schema(tree: &SourceTree) -> Vec<String> {
     breaches
 }
 
-/// From samples to datagrams and back: bytes and time are arguments, so that a simulation runs what sockets run.
+/// Finds code in the network's `lan` module that does more than turn samples into datagrams and back. Bytes and time
+/// are arguments, so that a simulation runs the same code as sockets.
 pub(crate) fn the_ends_of_a_network_only_compute(tree: &SourceTree) -> Vec<String> {
     const FOLDER: &str = "clients/network/src/lan";
     const OF_STD: [&str; 8] = ["array", "cmp", "collections", "fmt", "mem", "num", "ops", "time::Duration"];
@@ -337,7 +341,7 @@ pub(crate) fn the_ends_of_a_network_only_compute(tree: &SourceTree) -> Vec<Strin
     breaches
 }
 
-/// Finds in the scene what is more than computation: samples and times are its arguments, so that a terminal and a
+/// Finds code in the scene that does more than compute. Samples and times are arguments, so that a terminal and a
 /// browser show the same.
 pub(crate) fn the_scene_only_computes(tree: &SourceTree) -> Vec<String> {
     const HARMLESS: [&str; 5] =
@@ -353,8 +357,8 @@ pub(crate) fn the_scene_only_computes(tree: &SourceTree) -> Vec<String> {
     breaches
 }
 
-/// Finds clocks, sockets, files and threads in the code that computes people and points. Time is an argument there, so a
-/// recording gives what was live.
+/// Finds clocks, sockets, files and threads in the code that computes people and points. Time is an argument, so that a
+/// recording gives the same result as a live sensor.
 pub(crate) fn perception_only_computes(tree: &SourceTree) -> Vec<String> {
     const OUTSIDE: [&str; 17] = [
         "Instant",
@@ -400,8 +404,9 @@ pub(crate) fn perception_only_computes(tree: &SourceTree) -> Vec<String> {
     breaches
 }
 
-/// Finds in the web server what could reach a hub, a file or a process: input of strangers ends in it. It has an
-/// allowlist of crates and of modules, so that it cannot follow a hub through another module of its crate either.
+/// Finds code in the web server that could reach a hub, a file or a process, because the server handles input of
+/// strangers. It has lists of allowed crates and modules, so that it cannot subscribe through another module of its
+/// crate either.
 pub(crate) fn the_server_knows_no_hub(tree: &SourceTree) -> Vec<String> {
     const CRATES: [&str; 9] = [
         "data-encoding",
@@ -432,7 +437,7 @@ pub(crate) fn the_server_knows_no_hub(tree: &SourceTree) -> Vec<String> {
     breaches
 }
 
-/// A crate by its name and the folder of its sources.
+/// Name of a crate and the folder of its sources.
 struct Sources {
     name: &'static str,
     folder: &'static str,
@@ -440,8 +445,8 @@ struct Sources {
 
 const VIEWER: Sources = Sources { name: "scanhub-viewer", folder: "clients/viewer/src" };
 
-/// Finds what `module`, a file with a folder of the same name, names of its crate besides itself and `modules`, and
-/// which dependencies of the crate it names besides `crates`.
+/// Finds uses of other modules of the crate in `module`, a file with a folder of the same name, except `modules`, and
+/// uses of the crate's dependencies except `crates`.
 fn forbidden_names(
     tree: &SourceTree,
     of: &Sources,
@@ -459,7 +464,7 @@ fn forbidden_names(
     for (path, text) in tree.sources().filter(|(path, _)| *path == file || path.starts_with(&folder)) {
         for (number, line) in code(text) {
             let line = line.replace("pub(crate)", "pub");
-            // Every mention of the crate is a path to an allowed module, not an alias and not a list.
+            // Every mention of the crate must be a path to an allowed module, not an alias and not a list.
             let is_allowed = |rest: &str| {
                 let next = rest.strip_prefix("::").and_then(|rest| words(rest).next()).unwrap_or_default();
                 next == module || modules.contains(&next)
@@ -476,15 +481,15 @@ fn forbidden_names(
     breaches
 }
 
-/// What `package` is built with beside `known`.
+/// Returns the crates that `package` is built with, except `known`.
 fn dependencies_beyond(tree: &SourceTree, package: &str, known: &[&str]) -> Vec<String> {
     let members = tree.members();
     let others = built_dependencies(&members[package]).filter(|name| !known.contains(&name.as_str()));
     others.map(|name| format!("{package} is built with {name}")).collect()
 }
 
-/// Removes the crates of the hub that the Python package is built with for its feature `read` alone, which computes what a replay
-/// publishes. They stay if they are not optional, or if another feature names them.
+/// Removes the crates of the hub that the Python package is built with only for its feature `read`, which computes the
+/// samples of a replay. They stay if they are not optional, or if another feature names them.
 fn remove_feature_read(manifest: &mut toml::Table) {
     const OF_READ: [&str; 3] = ["scanhub-config", "scanhub-daemon", "scanhub-recording"];
     let features = manifest.get("features").and_then(toml::Value::as_table).cloned().unwrap_or_default();
@@ -506,7 +511,8 @@ fn remove_feature_read(manifest: &mut toml::Table) {
     }
 }
 
-/// Finds what the libraries for C and for Python use besides the client library, and crates that are built with them.
+/// Finds dependencies of the libraries for C and Python besides the client library, and crates that are built with
+/// these libraries.
 pub(crate) fn the_libraries_for_c_and_python_know_clients(tree: &SourceTree) -> Vec<String> {
     let mut members = tree.members();
     members.entry("scanhub-python".to_owned()).and_modify(remove_feature_read);
@@ -526,7 +532,8 @@ pub(crate) fn the_libraries_for_c_and_python_know_clients(tree: &SourceTree) -> 
     breaches
 }
 
-/// Nor anything that writes the EEPROM.
+/// Finds crates of clients, of the simulator and of the EEPROM writer among the direct and indirect dependencies of the
+/// daemon.
 pub(crate) fn the_daemon_knows_neither_clients_nor_sim(tree: &SourceTree) -> Vec<String> {
     let members = tree.members();
     let mut reached = BTreeSet::new();
@@ -550,7 +557,8 @@ pub(crate) fn the_daemon_knows_neither_clients_nor_sim(tree: &SourceTree) -> Vec
     reached.into_iter().filter(|name| NON_DEPENDENCIES.contains(&name.as_str())).collect()
 }
 
-/// The daemon, the clients, the simulator and the tools meet nowhere but in the program: no crate has two of them.
+/// Finds crates that depend on more than one of daemon, clients, simulator and tools. Only the program may combine
+/// them.
 pub(crate) fn only_the_program_sees_all(tree: &SourceTree) -> Vec<String> {
     let ends: [&[&str]; 4] = [
         &["scanhub-daemon"],
@@ -581,10 +589,10 @@ pub(crate) fn only_the_program_sees_all(tree: &SourceTree) -> Vec<String> {
     breaches
 }
 
-/// All ends in one thread, and in no program.
+/// Crate of tests that runs all of them in one thread and is part of no program.
 const WORLD: &str = "scanhub-world";
 
-/// Without it `cargo test` at the top would leave a crate out.
+/// Finds crates that `cargo test` at the top would not test.
 pub(crate) fn every_crate_is_tested_from_the_top(tree: &SourceTree) -> Vec<String> {
     let manifest = tree.manifest("Cargo.toml");
     let list = |key: &str| -> BTreeSet<String> {
@@ -593,7 +601,7 @@ pub(crate) fn every_crate_is_tested_from_the_top(tree: &SourceTree) -> Vec<Strin
     };
     let mut expected = list("members");
     expected.insert(".".to_owned());
-    // The hub is built without Zenoh, and without Python.
+    // The bridge needs Zenoh and the package needs Python, so they are not default members.
     let apart = ["clients/bridge", "clients/python"].map(|member| expected.take(member));
     let mut breaches: Vec<String> = expected
         .difference(&list("default-members"))
@@ -601,7 +609,7 @@ pub(crate) fn every_crate_is_tested_from_the_top(tree: &SourceTree) -> Vec<Strin
         .collect();
     if apart.iter().all(Option::is_some) {
         breaches.extend(missing_attributes(tree, ".ci/run", &["step cargo test --package scanhub-bridge"]));
-        // The tests of the package use what this builds.
+        // The tests of the package use the result of this script.
         if !tree.text(".ci/run").contains("step clients/python/build.sh") {
             breaches.push(".ci/run does not build clients/python".to_owned());
         }
@@ -609,7 +617,7 @@ pub(crate) fn every_crate_is_tested_from_the_top(tree: &SourceTree) -> Vec<Strin
     breaches
 }
 
-/// Every crate takes over the workspace's lints, which deny unsafe code.
+/// Finds crates that do not inherit the workspace's lints, which deny unsafe code.
 pub(crate) fn every_crate_obeys_the_lints(tree: &SourceTree) -> Vec<String> {
     let top = tree.manifest("Cargo.toml");
     let mut breaches = Vec::new();
@@ -625,14 +633,15 @@ pub(crate) fn every_crate_obeys_the_lints(tree: &SourceTree) -> Vec<String> {
     breaches
 }
 
-/// Hub and clients with two versions of it refuse each other.
+/// Checks that the version of `iceoryx2` is pinned: a hub and clients with different versions cannot share memory.
 pub(crate) fn shared_memory_is_pinned(tree: &SourceTree) -> Vec<String> {
     let manifest = tree.manifest("Cargo.toml");
     let version = manifest["workspace"]["dependencies"]["iceoryx2"]["version"].as_str().unwrap_or_default();
     if version.starts_with('=') { Vec::new() } else { vec![format!("iceoryx2 {version:?}")] }
 }
 
-/// Names of the crates that `package` is built from, itself included, as Cargo resolves it on this machine.
+/// Returns the names and versions of the crates that `package` is built from, including itself, as Cargo resolves them
+/// on this machine.
 pub(crate) fn dependency_tree(package: &str, features: &[&str]) -> BTreeSet<String> {
     let mut cargo = Command::new(env!("CARGO"));
     cargo.current_dir(env!("CARGO_MANIFEST_DIR")).args(["tree", "--offline", "--edges", "normal"]);
@@ -640,7 +649,7 @@ pub(crate) fn dependency_tree(package: &str, features: &[&str]) -> BTreeSet<Stri
     let output = output(cargo).expect("cargo can be called");
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let listing = String::from_utf8(output.stdout).expect("names are text");
-    // "name v1.2.3 (path or *)": two versions of a crate are two crates.
+    // Lines are "name v1.2.3 (path or *)". Two versions of a crate count as two.
     let names: BTreeSet<String> =
         listing.lines().map(|line| line.split(' ').take(2).collect::<Vec<_>>().join(" ")).collect();
     assert!(names.iter().any(|name| name.starts_with(package)), "{package} is built from {names:?}");

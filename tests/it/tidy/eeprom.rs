@@ -1,4 +1,5 @@
-//! The walls around a sensor's EEPROM: who can name a request that writes it, who can make one, and who can consent to it.
+//! Tests of the rules for a scanner's EEPROM: which code may name or encode a request that writes it, and which may
+//! give consent to it.
 
 use super::{assert_rule, crates, sources};
 

@@ -1,10 +1,10 @@
-//! How many files name a family of scanners: one more family is a module of the drivers, one of the simulator, and a line in
-//! each of these.
+//! Rule for the number of files that name a family of scanners. A new family is one module of the drivers, one of the
+//! simulator, and an entry in each of these files.
 
 use super::assert_rule;
 use super::tree::{SourceTree, code};
 
-/// What names a family, but for its driver, its simulator, tests, benches and pages; each says why.
+/// Files that may name a family, besides its driver, its simulator, tests, benches and pages, each with the reason.
 const ALLOWED_FILES: [&str; 9] = [
     // The modules of the drivers.
     "hub/drivers/src/lib.rs",
@@ -12,7 +12,7 @@ const ALLOWED_FILES: [&str; 9] = [
     "hub/drivers/src/families.rs",
     // The configuration that users start from, with a section for each.
     "hub/config/src/default.toml",
-    // Number and name, in each language that reads scans, and what can be said of its packets.
+    // Number and name, in each language that reads scans, and the properties of its packets.
     "schema/src/family.rs",
     "schema/src/file/layout.txt",
     "clients/c/include/scanhub/attach.h",
@@ -21,14 +21,15 @@ const ALLOWED_FILES: [&str; 9] = [
     "clients/wireshark/scanhub.lua",
 ];
 
-/// Words for a family, beside the name of its module.
+/// Other words for a family besides the name of its module.
 const FAMILY_WORDS: [(&str, &[&str]); 2] = [
     ("ld", &["ldrobot", "ld06", "ld19", "stl19p", "stl27l", "ld14p"]),
     ("rplidar", &["slamtec", "a1m8", "a2m8", "a2m12"]),
 ];
 
-/// Sources of the hub, its configuration, its tools and the program. Files directly in `hub/` count, too. They name no family, not
-/// even the LMS. Recordings and clients name the LMS, because its telegrams are a format of files and topics.
+/// Folders with sources of the hub, its configuration, its tools and the program, besides the files directly in `hub/`.
+/// They name no family, not even the LMS. Recordings and clients name the LMS, because its telegrams are a format of
+/// files and topics.
 const HUB_FOLDERS: [&str; 5] = ["hub/config/", "hub/daemon/", "hub/tools/", "hub/cli/", "hub/demo/"];
 
 /// Sources of the hub that name the LMS, each with the reason.
@@ -42,14 +43,14 @@ const MAY_NAME_LMS: [&str; 4] = [
     "hub/tools/src/doctor/sensor.rs",
 ];
 
-/// Sources of the hub that name the LMS and may not.
+/// Returns an error for each source of the hub that names the LMS and may not.
 fn hub_names_no_lms(tree: &SourceTree) -> Vec<String> {
     let others =
         hub_sources_with_lms(tree).filter(|path| !MAY_NAME_LMS.iter().any(|may| path.starts_with(may)));
     others.map(|path| format!("{path} names the LMS: call what the drivers have for every family")).collect()
 }
 
-/// Sources of the hub that name the LMS.
+/// Returns the sources of the hub that name the LMS.
 fn hub_sources_with_lms(tree: &SourceTree) -> impl Iterator<Item = &str> {
     let is_program = |path: &str| path.strip_prefix("hub/").is_some_and(|file| !file.contains('/'));
     let is_hub = move |path: &str| {
@@ -63,14 +64,14 @@ fn hub_sources_with_lms(tree: &SourceTree) -> impl Iterator<Item = &str> {
     sources.filter(move |(_, text)| code(text).any(|(_, line)| names_it(line))).map(|(path, _)| path)
 }
 
-/// Files that name a family and may not.
+/// Returns an error for each file that names a family and may not.
 fn few_files_name_a_family(tree: &SourceTree) -> Vec<String> {
     let named = FAMILY_WORDS.iter().flat_map(|(name, words)| files_with_words(tree, name, words));
     let others = named.filter(|path| !ALLOWED_FILES.contains(path));
     others.map(|path| format!("{path} names a family: what it needs of all belongs into a list")).collect()
 }
 
-/// Files that name the family `name`, or say one of `words`.
+/// Returns the files that contain the name `name` of a family, or one of `words`.
 fn files_with_words<'a>(tree: &'a SourceTree, name: &str, words: &[&str]) -> Vec<&'a str> {
     const OWN: [&str; 7] = [".ci/", "hub/sim/", "tests/", "benches/", "docs/", "README.md", "CHANGELOG.md"];
     let own = |path: &str| {
@@ -81,7 +82,7 @@ fn files_with_words<'a>(tree: &'a SourceTree, name: &str, words: &[&str]) -> Vec
             || path.ends_with(".lock")
     };
     let names_it = |line: &str| {
-        // An example in a help may name any family.
+        // An example in a help text may name any family.
         let is_example = line.trim_start().starts_with("scanhub ");
         let line = line.replace("ls -ld", "").to_lowercase();
         let mut named = line.split(|c: char| !c.is_alphanumeric());

@@ -1,4 +1,4 @@
-//! The walls within the sources and the pages: what may stand where.
+//! Tests of the rules for the contents of sources and pages.
 
 use super::{assert_rule, pages, sources};
 

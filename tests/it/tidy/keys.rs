@@ -1,10 +1,10 @@
-//! Number of files that name a key of the configuration: one with its field, and those that use it. Files that name a
-//! processor: those of `hub/preprocess`, and the pipeline.
+//! Rules for the number of files that name a key of the configuration (the file with its field and those that use it).
+//! Only the pipeline and the files of `hub/preprocess` may name a processor.
 
 use super::assert_rule;
 use super::tree::{SourceTree, code};
 
-/// Keys of sections and of scanners, as the beginning of a name that nothing else has.
+/// Keys of sections and of scanners that are checked, as beginnings of names that nothing else has.
 const CHECKED_KEYS: [&str; 7] = [
     "max_turn",
     "min_overlap",
@@ -18,7 +18,7 @@ const CHECKED_KEYS: [&str; 7] = [
 /// Maximum number of product files that name a key.
 const MAX_FILES: usize = 3;
 
-/// Keys that too many files name.
+/// Returns an error for each key that too many files name, or none.
 fn few_files_name_a_key(tree: &SourceTree) -> Vec<String> {
     let is_product = |path: &str| {
         ["hub/", "clients/", "schema/"].iter().any(|top| path.starts_with(top)) && !path.contains("tests")
@@ -48,13 +48,13 @@ fn a_key_is_in_few_files() {
     });
 }
 
-/// Types of processors. `hub/preprocess` has a file for each, and rules of its own.
+/// Types of processors. `hub/preprocess` has a file for each, and its own rules.
 const PROCESSORS: [&str; 4] = ["MarkDetector", "LineFinder", "MotionEstimator", "Segmenter"];
 
 /// The file that calls all processors.
 const PIPELINE_FILE: &str = "hub/daemon/src/pipeline.rs";
 
-/// Product files that name a processor and may not.
+/// Returns an error for each product file outside of `hub/preprocess` that names a processor, except the pipeline.
 fn only_the_pipeline_names_a_processor(tree: &SourceTree) -> Vec<String> {
     let is_outside = |path: &str| {
         path.starts_with("hub/")

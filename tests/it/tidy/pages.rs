@@ -1,5 +1,4 @@
-//! Text that exists twice is the same in both places: the program that docs/first-consumer.md shows is the example that is
-//! compiled.
+//! Rule for text that exists twice: the program on the first page for clients equals the example that is compiled.
 
 use super::tree::SourceTree;
 

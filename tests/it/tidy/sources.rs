@@ -1,14 +1,14 @@
-//! Rules for what a source may contain: unsafe code, shared memory, the scanner's EEPROM, and the shape of a file.
+//! Rules for the contents of sources: unsafe code, shared memory, the scanner's EEPROM, and the form of a file.
 
 use super::tree::{SourceTree, code, find};
 
-/// Integration tests and benches may do as they like with telegrams.
+/// Returns whether `path` is an integration test or a bench, which may encode any telegram.
 fn is_test(path: &str) -> bool {
     path.starts_with("tests/") || path.starts_with("benches/") || path.contains("/tests/")
 }
 
-/// Finds clocks in the program. Clippy holds this for the crates below `hub/` and `schema/`, but the program has the folder of all
-/// crates, also of those that may read a clock.
+/// Finds clocks in the program. Clippy checks this for the crates in `hub/` and `schema/`, but the program's folder
+/// contains all crates, including those that may read a clock.
 pub(crate) fn only_the_demonstration_of_the_program_reads_clocks(tree: &SourceTree) -> Vec<String> {
     find(tree, &["Instant::now", "SystemTime::now", "clock_gettime"], |path| {
         let in_hub = path.strip_prefix("hub/");
@@ -19,29 +19,29 @@ pub(crate) fn only_the_demonstration_of_the_program_reads_clocks(tree: &SourceTr
     })
 }
 
-/// Files that may hold unsafe code, each for something that no safe crate offers.
+/// Files that may contain unsafe code, each for something that no safe crate offers.
 const UNSAFE_FILES: [&str; 9] = [
-    // A page that hub and consumers map.
+    // A page that hub and subscribers map.
     "schema/shm/src/doorbell.rs",
-    // The descriptors that wake consumers.
+    // The descriptors that wake subscribers.
     "schema/shm/src/wake.rs",
-    // The kernel's word whether nobody has a file.
+    // A query to the kernel whether no process has a file open.
     "schema/shm/src/file_in_use.rs",
     // A handler for SIGBUS.
     "hub/daemon/src/process.rs",
-    // The kernel's counters of a UART, and a descriptor that is open and locked already, given to the library for serial
-    // lines.
+    // The kernel's counters of a UART, and a locked descriptor that is passed to the library for serial lines.
     "hub/port/src/tty.rs",
-    // Addresses that programs in C bring.
+    // Addresses from programs in C.
     "clients/c/src/ffi.rs",
-    // Names of functions as the linker of such programs looks for them; no block.
+    // Exported names of functions for the linker of such programs. The file has no unsafe block.
     "clients/c/src/export.rs",
     // A subscription that moves between threads of Python, and views of its samples.
     "clients/python/src/client.rs",
     // An allocator that counts.
     "hub/daemon/tests/counting/mod.rs",
 ];
-/// In what is shipped: tests and benches are listed and explained like all, and not counted.
+/// Maximum number of unsafe blocks in the product. Those of tests and benches must be listed and explained, but do not
+/// count.
 const MAX_UNSAFE_BLOCKS: usize = 12;
 
 pub(crate) fn unsafe_code_is_rare_and_explained(tree: &SourceTree) -> Vec<String> {
@@ -70,9 +70,9 @@ pub(crate) fn unsafe_code_is_rare_and_explained(tree: &SourceTree) -> Vec<String
     breaches
 }
 
-/// Services are built in one crate. Payloads in schema derive one trait of the library.
+/// Finds code outside of `shm` that uses iceoryx2. Payloads in `schema` may derive one of its traits.
 pub(crate) fn shared_memory_is_built_in_one_crate(tree: &SourceTree) -> Vec<String> {
-    // Messages longer than any payload are compared with sockets by a service that no topic has.
+    // This bench compares messages longer than any payload with sockets, over a service of its own.
     let may_build = |path: &str| path.starts_with("schema/shm/src/") || path == "benches/compare/topic.rs";
     let mut places = find(tree, &["iceoryx2::"], |path| !may_build(path));
     let derives =
@@ -81,7 +81,8 @@ pub(crate) fn shared_memory_is_built_in_one_crate(tree: &SourceTree) -> Vec<Stri
     places
 }
 
-/// Words of the wire become ranges in a unit in one file, between the protocol and what consumers see.
+/// Finds code in the daemon and the tools that converts raw values to ranges. Only one file may do that, between the
+/// protocol and the published topics.
 pub(crate) fn ranges_are_born_in_one_file(tree: &SourceTree) -> Vec<String> {
     find(tree, &[".words()", "range_array", "upper_array"], |path| {
         path.starts_with("hub/daemon/src/") || path.starts_with("hub/tools/src/")
@@ -89,14 +90,14 @@ pub(crate) fn ranges_are_born_in_one_file(tree: &SourceTree) -> Vec<String> {
 }
 
 /// Finds code that could write a scanner's EEPROM without a person's consent. Requests are encoded in `lms` and nowhere
-/// else. Those that write the EEPROM have their own crate, which most crates do not depend on. In the crates that do, only
-/// these files may name it: those that ask a person before a request is sent, and the simulator, which counts, executes and
-/// refuses such requests.
+/// else. Those that write the EEPROM have their own crate, which most crates do not depend on. In the crates that do,
+/// only these files may name it: those that ask a person before a request is sent, and the simulator, which counts,
+/// executes and refuses such requests.
 pub(crate) fn only_configure_may_write_the_eeprom(tree: &SourceTree) -> Vec<String> {
     const WRITE_COMMANDS: [&str; 6] = ["0x40", "0x42", "0x46", "0x66", "0x77", "0x7C"];
     const MAY_NAME_COMMANDS: [&str; 3] = ["hub/sim/", "hub/lms-configure/", "hub/tools/src/configure"];
     const MAY_USE_BYTES: [&str; 3] = ["hub/sim/", "hub/drivers/src/lms/", "hub/lms-configure/src/"];
-    /// Here requests are explained, and none is made.
+    /// Folder that explains requests and encodes none.
     const EXPLAIN_FOLDER: &str = "hub/drivers/src/lms/explain";
     let may_name =
         |path: &str| is_test(path) || MAY_NAME_COMMANDS.iter().any(|allowed| path.starts_with(allowed));
@@ -104,7 +105,7 @@ pub(crate) fn only_configure_may_write_the_eeprom(tree: &SourceTree) -> Vec<Stri
         !is_test(path) && !MAY_USE_BYTES.iter().any(|allowed| path.starts_with(allowed))
     });
     breaches.extend(find(tree, &["Writer::new", ".encode("], |path| path.starts_with(EXPLAIN_FOLDER)));
-    // Files and lines of text are written too, by writers of longer names.
+    // Other types whose names end with `Writer` write files and text.
     breaches.retain(|place| {
         let mut writers = place.match_indices("Writer::new");
         !place.contains("Writer::new")
@@ -129,7 +130,8 @@ pub(crate) fn only_configure_may_write_the_eeprom(tree: &SourceTree) -> Vec<Stri
     breaches
 }
 
-/// Only where a person is asked is consent made, without which nothing that writes the EEPROM leaves for a port.
+/// Finds code that creates consent outside of the one place that asks a person. Without consent, no request that writes
+/// the EEPROM is sent to a port.
 pub(crate) fn consent_is_given_by_persons(tree: &SourceTree) -> Vec<String> {
     const CONSENT_FILE: &str = "hub/tools/src/configure.rs";
     const CONSENT_USER: &str = "hub/lms-configure/src/";
@@ -148,7 +150,7 @@ pub(crate) fn consent_is_given_by_persons(tree: &SourceTree) -> Vec<String> {
     breaches
 }
 
-/// Finds tests that start children themselves. The testkit ends its children with all their descendants.
+/// Finds tests that start child processes themselves. The testkit ends its children with all their descendants.
 pub(crate) fn tests_start_children_in_one_file(tree: &SourceTree) -> Vec<String> {
     // The second file is a program and not a test. The third one runs an example in its own process and ends it.
     const ALLOWED: [&str; 3] =
@@ -163,25 +165,26 @@ pub(crate) fn tests_start_children_in_one_file(tree: &SourceTree) -> Vec<String>
     breaches
 }
 
-/// Tests that sleep: what stands in for a device or a person, or plays a list of actions at real speed. All others wait for an
-/// event, by `until` and its like of the test kits. Each says why.
+/// Tests that may sleep, each with the reason: they simulate a device or a person, run a scenario at real speed, or
+/// test a time. All others wait for an event with `wait_until` and similar functions of the testkits.
 const SLEEP_CALLS: [&str; 16] = [
-    // Waits for events: the kits of the programs, of the library, of the simulator and of its other tests.
+    // Functions that wait for events: the testkits of the programs, of the library, of the simulator and of its other
+    // tests.
     "tests/testkit/",
     "tests/it/browser.rs",
     "clients/client/tests/fake/",
     "clients/bridge/tests/ros2.rs",
     "hub/sim/tests/port/main.rs",
-    // Carries bytes as a serial server does.
+    // Forwards bytes as a serial server does.
     "tests/it/serial_server.rs",
-    // A sensor at its pace.
+    // A scanner at its own speed.
     "tests/it/vendor.rs",
     "hub/daemon/tests/allocation.rs",
     // Actions at real speed.
     "tests/it/real_speed/",
-    // Senders at their pace, until what they send was seen.
+    // Senders at their own rate, until their samples have arrived.
     "clients/verbs/tests/verbs/",
-    // The statement is about time: wake-ups in five seconds, a silence, one period, waits that are canceled.
+    // The test is about time: wake-ups in five seconds, a silence, one period, waits that are canceled.
     "clients/client/tests/descriptor.rs",
     "clients/client/tests/joined.rs",
     "clients/client/tests/silence.rs",
@@ -191,19 +194,19 @@ const SLEEP_CALLS: [&str; 16] = [
     "tests/it/replayed.rs",
 ];
 
-/// Tests that compare a time that passed with a number. They fail on a busy machine, unless the number is one that the
-/// program may not fall below.
+/// Tests that may compare an elapsed time with a number. Such tests fail on a busy machine unless a busy machine can
+/// only make the value more favorable.
 const TIME_COMPARISONS: [&str; 4] = [
-    // Share of a processor, and bytes in a second: a busy machine makes both less.
+    // Share of a processor and bytes per second: both are lower on a busy machine.
     "tests/it/flood.rs",
     "tests/it/web_crowd.rs",
-    // Wakes in three seconds: a busy machine makes them fewer.
+    // Wake-ups in three seconds: there are fewer on a busy machine.
     "clients/client/tests/descriptor.rs",
-    // Its report says how fast the world was.
+    // Its report prints the speed of the simulation.
     "tests/world/src/main.rs",
 ];
 
-/// Tests wait for events, never for a time, and hold no program to a time on a machine that others use too.
+/// Finds tests that wait for a time instead of an event, or require that a program is fast enough.
 pub(crate) fn tests_do_not_depend_on_time(tree: &SourceTree) -> Vec<String> {
     let is_of = |path: &str, listed: &[&str]| listed.iter().any(|listed| path.starts_with(listed));
     let is_held =
@@ -222,7 +225,7 @@ pub(crate) fn files_begin_with_a_description(tree: &SourceTree) -> Vec<String> {
     files.map(|(path, _)| format!("{path} does not begin with a description of the module")).collect()
 }
 
-/// Names that say nothing.
+/// Finds names of files and items with words that have no meaning, such as `util`.
 pub(crate) fn names_say_something(tree: &SourceTree) -> Vec<String> {
     const EMPTY_NAMES: [&str; 7] = ["manager", "util", "utils", "helper", "helpers", "common", "misc"];
     let empty = |name: &str| {
@@ -239,7 +242,7 @@ pub(crate) fn names_say_something(tree: &SourceTree) -> Vec<String> {
         }
         for (number, line) in code(text) {
             let word = |c: char| !c.is_alphanumeric() && c != '_';
-            // What stands between quotes is for people.
+            // Text between quotes is for people.
             let named = line.split('"').step_by(2).any(|outside| outside.split(word).any(empty));
             if line.contains("fn get_") || named {
                 breaches.push(format!("{path}:{number}: {}", line.trim()));
@@ -249,7 +252,7 @@ pub(crate) fn names_say_something(tree: &SourceTree) -> Vec<String> {
     breaches
 }
 
-/// This is no safety device, and nothing may read as if it were one. Only README says what it is not at length.
+/// Finds text that presents the project as a safety device. Only README.md explains at length that it is none.
 pub(crate) fn nothing_promises_safety(tree: &SourceTree) -> Vec<String> {
     let mut breaches = Vec::new();
     for ending in [".rs", ".md", ".toml", ".service", ".rules", ".run"] {

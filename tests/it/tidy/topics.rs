@@ -1,5 +1,5 @@
-//! Number of files that name a topic. Topic `motion` stands for all: a hub publishes it for each link, and no client uses it
-//! but to show it.
+//! Rule for the number of files that name a topic. It checks topic `motion` for all: the hub publishes it for each
+//! link, and clients only print it.
 
 use super::assert_rule;
 use super::tree::{SourceTree, code};
@@ -12,14 +12,14 @@ const TOPIC_FILES: [&str; 6] = [
     "schema/src/motion.rs",
     // The module with the payload.
     "schema/src/lib.rs",
-    // Its sample, which is filled and sent.
+    // Fills and sends its samples.
     "hub/daemon/src/link_output.rs",
     // Its lines as JSON and as text.
     "clients/verbs/src/json/results.rs",
     "clients/verbs/src/text.rs",
 ];
 
-/// Other files that name this topic for a reason that not every topic has.
+/// Other files that name this topic for a reason that does not apply to every topic.
 const OTHER_FILES: [&str; 3] = [
     // The processor that computes it. `keys.rs` counts the files of a processor.
     "hub/preprocess/",
@@ -28,7 +28,8 @@ const OTHER_FILES: [&str; 3] = [
     "clients/network/src/forward/selection.rs",
 ];
 
-/// Product files that name the topic, and are neither pages nor generated. The Python package reads shared memory on its own.
+/// Returns the product files that name the topic, except pages and generated files. The Python package reads shared
+/// memory on its own.
 fn files_with_topic(tree: &SourceTree) -> Vec<&str> {
     const EXCLUDED_FILES: [&str; 3] =
         ["clients/python/", "schema/src/file/layout.txt", "hub/sim/src/rplidar.rs"];
@@ -45,7 +46,7 @@ fn files_with_topic(tree: &SourceTree) -> Vec<&str> {
     sources.filter(|(_, text)| code(text).any(|(_, line)| names_it(line))).map(|(path, _)| path).collect()
 }
 
-/// Files that name the topic and may not.
+/// Returns an error for each file that names the topic and may not.
 fn few_files_name_a_topic(tree: &SourceTree) -> Vec<String> {
     let may =
         |path: &str| TOPIC_FILES.contains(&path) || OTHER_FILES.iter().any(|also| path.starts_with(also));
@@ -54,7 +55,7 @@ fn few_files_name_a_topic(tree: &SourceTree) -> Vec<String> {
     others.map(|path| format!("{path} names topic motion, but {ask}")).collect()
 }
 
-/// Files of the list that `docs/design.md` does not mention under "A topic".
+/// Returns an error for each file of the list that `docs/design.md` does not mention under "A topic".
 fn the_page_lists_the_files_of_a_topic(tree: &SourceTree) -> Vec<String> {
     let page = tree.text("docs/design.md");
     let entry = page.split("- **A topic**").nth(1).unwrap_or_default();

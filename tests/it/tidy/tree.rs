@@ -1,20 +1,20 @@
-//! The project's own files as text, read once, and a way to plant a file that breaks a wall: a check that cannot fail
-//! is worth nothing.
+//! The files of the project as text, and functions that change them in memory, so that a test can prove that a rule
+//! finds violations.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// Files by their path below the top, with `/` between its parts.
+/// Files by their path relative to the top, with `/` as separator.
 #[derive(Clone)]
 pub(crate) struct SourceTree {
     files: BTreeMap<String, String>,
 }
 
-/// A check: what breaks the wall, one line each.
+/// A rule. It returns one line for each violation.
 pub(crate) type Rule = fn(&SourceTree) -> Vec<String>;
 
 impl SourceTree {
-    /// Everything that people wrote: sources, manifests, pages, units, scripts.
+    /// Loads all text files that are not hidden or built: sources, manifests, pages, units, scripts.
     pub(crate) fn load() -> SourceTree {
         let mut tree = SourceTree { files: BTreeMap::new() };
         tree.add(Path::new(env!("CARGO_MANIFEST_DIR")), "");
@@ -22,14 +22,14 @@ impl SourceTree {
         tree
     }
 
-    /// The same with one file more, or another one in its place.
+    /// Returns a copy with the file at `path` added or replaced.
     pub(crate) fn with(&self, path: &str, text: &str) -> SourceTree {
         let mut tree = self.clone();
         tree.files.insert(path.to_owned(), text.to_owned());
         tree
     }
 
-    /// The same with `line` as first line of a section of a manifest.
+    /// Returns a copy with `line` as the first line of a section of a manifest.
     pub(crate) fn with_line(&self, path: &str, section: &str, line: &str) -> SourceTree {
         let text = self.text(path);
         let changed = if text.contains(section) {
@@ -40,12 +40,12 @@ impl SourceTree {
         self.with(path, &changed)
     }
 
-    /// A file that must be there.
+    /// Returns the text of a file. Panics if it is missing.
     pub(crate) fn text(&self, path: &str) -> &str {
         self.files.get(path).unwrap_or_else(|| panic!("{path} is missing"))
     }
 
-    /// All files with this ending.
+    /// Returns all files whose path ends with `suffix`.
     pub(crate) fn files(&self, suffix: &str) -> impl Iterator<Item = (&str, &str)> {
         self.files
             .iter()
@@ -53,17 +53,17 @@ impl SourceTree {
             .map(|(path, text)| (path.as_str(), text.as_str()))
     }
 
-    /// All Rust files but this test itself, whose planted breaches would be found.
+    /// Returns all Rust files except those of these rules, which contain violations on purpose.
     pub(crate) fn sources(&self) -> impl Iterator<Item = (&str, &str)> {
         self.files(".rs").filter(|(path, _)| !path.starts_with("tests/it/tidy"))
     }
 
-    /// A manifest, parsed.
+    /// Returns a parsed manifest.
     pub(crate) fn manifest(&self, path: &str) -> toml::Table {
         self.text(path).parse().unwrap_or_else(|error| panic!("{path}: {error}"))
     }
 
-    /// Manifests of the crates below the top, by the crate's name.
+    /// Returns the manifests of the crates below the top, by the name of the crate.
     pub(crate) fn members(&self) -> BTreeMap<String, toml::Table> {
         self.files("/Cargo.toml")
             .filter_map(|(path, _)| {
@@ -91,7 +91,7 @@ impl SourceTree {
     }
 }
 
-/// The code of a source: no comments, nothing from the unit tests at its end.
+/// Returns the numbered lines of code in `text`, without comments and without the unit tests at its end.
 pub(crate) fn code(text: &str) -> impl Iterator<Item = (usize, &str)> {
     text.lines()
         .enumerate()
@@ -100,7 +100,7 @@ pub(crate) fn code(text: &str) -> impl Iterator<Item = (usize, &str)> {
         .map(|(number, line)| (number + 1, line))
 }
 
-/// Places in the code of the sources that `select` wants where one of `needles` stands.
+/// Returns the lines of code with one of `needles` in the sources for which `select` returns true.
 pub(crate) fn find(tree: &SourceTree, needles: &[&str], select: impl Fn(&str) -> bool) -> Vec<String> {
     let mut places = Vec::new();
     for (path, text) in tree.sources().filter(|(path, _)| select(path)) {

@@ -1,4 +1,4 @@
-//! Number of files that name a verb. Verb `hz` stands for all.
+//! Rule for the number of files that name a verb. It checks verb `hz` for all.
 
 use super::assert_rule;
 use super::tree::{SourceTree, code};
@@ -7,13 +7,13 @@ use super::tree::{SourceTree, code};
 const VERB_FILES: [&str; 3] = [
     // Its arguments with help and examples, its run, and its text and JSON.
     "clients/verbs/src/hz.rs",
-    // The line of its module.
+    // Declares its module.
     "clients/verbs/src/lib.rs",
     // Its row in the table of verbs.
     "hub/cli.rs",
 ];
 
-/// Product files that name the verb.
+/// Returns the product files that name the verb.
 fn files_with_verb(tree: &SourceTree) -> Vec<&str> {
     let is_product = |path: &str| {
         ["hub/", "clients/", "schema/"].iter().any(|top| path.starts_with(top)) && !path.contains("tests")
@@ -27,14 +27,14 @@ fn files_with_verb(tree: &SourceTree) -> Vec<&str> {
     sources.filter(|(_, text)| code(text).any(|(_, line)| names_it(line))).map(|(path, _)| path).collect()
 }
 
-/// Files that name the verb and may not.
+/// Returns an error for each file that names the verb and may not.
 fn few_files_name_a_verb(tree: &SourceTree) -> Vec<String> {
     let others = files_with_verb(tree).into_iter().filter(|path| !VERB_FILES.contains(path));
     let ask = "a verb touches no further file: its `run` takes the whole `Context`";
     others.map(|path| format!("{path} names verb hz, but {ask}")).collect()
 }
 
-/// Files of the list that `docs/design.md` does not mention under "A verb".
+/// Returns an error for each file of the list that `docs/design.md` does not mention under "A verb".
 fn the_page_lists_the_files_of_a_verb(tree: &SourceTree) -> Vec<String> {
     let page = tree.text("docs/design.md");
     let entry = page.split("- **A verb**").nth(1).unwrap_or_default();
