@@ -1,5 +1,5 @@
-//! Three dimensions in the browser's picture and on its wire: channels are what `echo` says, and the page shows sweeps from the
-//! side while somebody looks at them so.
+//! Tests of three dimensions on the web page and in its channels: channels equal the output of `echo`, and the page
+//! shows sweeps from the side on request.
 
 use std::net::TcpStream;
 use std::path::Path;
@@ -18,7 +18,7 @@ use crate::web::{channels, connect_viewer, connect_viewer_with, subscribe, web};
 use crate::web_channels::matches_schema;
 use crate::web_page::{browse, freeze_page, save_screenshot};
 
-/// The messages of a round: an angle, a sweep, and what that has found.
+/// Publishes a round, and returns its messages: an angle, a sweep, and the obstacles in it.
 fn publish_round(publisher: &mut TiltedPublisher, viewer: &mut WebSocket<TcpStream>) -> [Vec<u8>; 3] {
     publisher.publish_round();
     let mut messages: [Option<Vec<u8>>; 3] = Default::default();
@@ -30,7 +30,7 @@ fn publish_round(publisher: &mut TiltedPublisher, viewer: &mut WebSocket<TcpStre
     messages.map(Option::unwrap_or_default)
 }
 
-/// Whether a point cloud has the points of these lines, which are of one sweep.
+/// Returns whether a point cloud has the points of these lines, which belong to one sweep.
 fn is_cloud(body: &[u8], lines: &[Value]) -> bool {
     let message = read(&POINT_CLOUD, body).expect("a PointCloud2");
     let byte = |value: &Told| if let Told::Number(byte) = value { *byte as u8 } else { panic!("a byte") };
@@ -51,14 +51,14 @@ fn is_cloud(body: &[u8], lines: &[Value]) -> bool {
         && all.iter().enumerate().all(is_point)
 }
 
-/// The number or the truth that an entity says of `key`.
+/// Returns the value that an entity has for `key` in its metadata: a number or a boolean.
 fn metadata(entity: &Value, key: &str) -> Value {
     let mut all = entity["metadata"].as_array().expect("a list").iter();
     let value = all.find(|one| one["key"] == key).and_then(|one| one["value"].as_str());
     serde_json::from_str(value.unwrap_or_else(|| panic!("no {key} in {entity}"))).expect("JSON")
 }
 
-/// Whether boxes are the obstacles of this line.
+/// Returns whether the boxes of `update` are the obstacles of this line.
 fn are_obstacles(update: &Value, line: &Value) -> bool {
     let entities = update["entities"].as_array().expect("a list");
     let expected = line["obstacles"].as_array().expect("a list");
@@ -127,7 +127,7 @@ fn channels_of_mount_and_sweep_equal_output_of_echo() {
             let expected = &lines("obstacles", number)[0];
             assert!(are_obstacles(&found, expected), "{found} {expected}");
         }
-        // Who does not look any more costs nothing.
+        // Without a viewer, the server drops its subscriptions.
         drop(viewer);
         wait_until("nobody looks", || seldom.map(|topic| env.subscribers(topic)) == [0, 0]);
     }
@@ -143,7 +143,7 @@ fn side_view_shows_sweeps_and_subscribes_to_points() {
     let (_server, host) = web(&hall.env, &[]);
     page.open(&format!("http://{host}/"));
     page.await_true("window.scanhub?.beams > 100");
-    // Where nobody makes sweeps the page is as ever.
+    // Without sweeps, the page has no view from the side.
     page.press("h");
     let is_plain = format!("{SIDE_BUTTON}.hidden && !scanhub.aside && {SWEPT_TEXT} === ''");
     page.await_true(&is_plain);
@@ -154,7 +154,8 @@ fn side_view_shows_sweeps_and_subscribes_to_points() {
     page.await_true("scanhub.obstacles > 0 && scanhub.beams > 100");
     page.await_true(&format!("{SIDE_BUTTON}.offsetHeight >= 40"));
     assert_eq!(hall.env.subscribers("hall/cloud"), 0, "points are not seen from above");
-    // The floor is in front of a background in two dimensions, whose beams had another angle.
+    // In two dimensions, the floor is in front of the background, whose beams had another angle. It is not shown as
+    // foreground.
     page.await_true("scanhub.sweeps[0].sweep !== undefined && scanhub.foreground === 0");
     let script = "new Promise((done) => {
         const until = scanhub.scans.front + 40;
@@ -177,14 +178,14 @@ fn side_view_shows_sweeps_and_subscribes_to_points() {
     page.await_true("scanhub.axes === 2");
     let floor = "document.querySelector('nav').getBoundingClientRect().top - scanhub.screen(0, 0)[1]";
     page.await_true(&format!("{floor} > 20 && {floor} < 120"));
-    // To the right is ahead, and up is up.
+    // Ahead is to the right, and up is up.
     let place = "scanhub.screen(1, -2).map(Math.round).join() !== scanhub.screen(0, 0).map(Math.round).join() && \
                  scanhub.screen(1, -2)[0] > scanhub.screen(0, 0)[0] && scanhub.screen(1, -2)[1] < scanhub.screen(0, 0)[1]";
     page.await_true(place);
     page.mouse("mouseMoved", (500.0, 400.0), false);
     page.await_true("/above the floor/.test(document.querySelector('#readout').innerText)");
 
-    // Layers, turns and the way back are on the keyboard.
+    // Keys toggle layers, rotate the view and reset it.
     page.press("o");
     page.await_true("scanhub.obstacles === 0");
     page.press("o");
@@ -201,7 +202,7 @@ fn side_view_shows_sweeps_and_subscribes_to_points() {
     page.await_true("scanhub.view.turn > 0.2");
     page.press("c");
     page.await_true("scanhub.view.turn === 0");
-    // Held, it stands; then it goes on.
+    // A held picture does not change. It then continues.
     freeze_page(&mut page, "scanhub.swept > 1000 && scanhub.sweeps[0].sweep != null");
     let [sweep, points] = ["scanhub.sweeps[0].sweep", "scanhub.swept"].map(|what| page.ask(what));
     page.press("h");
@@ -212,14 +213,14 @@ fn side_view_shows_sweeps_and_subscribes_to_points() {
     ));
     page.press(" ");
     page.await_true(&format!("scanhub.sweeps[0].sweep !== {sweep}"));
-    // Who comes back waits for points, and nothing is wrong meanwhile.
+    // After a switch back to this view, the page waits for the next sweep, which is not a problem.
     let waits = "/^Waiting for the next sweep\\s*$/.test(scanhub.reason)";
     page.await_true(&format!(
         "scanhub.sweeps[0].sweep && ({SIDE_BUTTON}.click(), {SIDE_BUTTON}.click(), {waits})"
     ));
     page.await_true("scanhub.swept > 1000 && scanhub.reason === null");
 
-    // What makes the sweeps is gone: they are not there any more, and that is said.
+    // When `tilt` has ended, the page removes the sweeps and gives the reason.
     assert_eq!(tilt.end(INT).exit_code, Some(0));
     page.await_true("scanhub.swept === 0 && /hall: no sweep any more/.test(scanhub.reason)");
     page.await_true("/scanhub tilt/.test(scanhub.reason)");
@@ -229,7 +230,7 @@ fn side_view_shows_sweeps_and_subscribes_to_points() {
     end_cleanly(hall);
 }
 
-/// The demonstration of a scanner on a mount tells the address of its page, which has sweeps.
+/// The demo with a mount prints the address of its page, which shows sweeps.
 #[test]
 fn the_page_of_the_demonstration_has_sweeps() {
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
@@ -252,7 +253,8 @@ fn the_page_of_the_demonstration_has_sweeps() {
     assert_eq!(demo.end(INT).exit_code, Some(0));
 }
 
-/// As in the documents, by the command that makes those of `web_page`: the hall of `docs/tilt.md`, once all has come that comes.
+/// Checks the page as in the picture of `docs/tilt.md`: its hall with all obstacles. The command in `web_page` that
+/// creates the pictures creates this one too.
 #[test]
 fn the_picture_of_the_documents_from_the_side() {
     let env = TestEnv::new();
@@ -272,12 +274,12 @@ fn the_picture_of_the_documents_from_the_side() {
     page.press("h");
     page.await_true("scanhub.aside && scanhub.swept > 1000 && scanhub.axes === 2");
     if let Some(directory) = &directory {
-        // A pole and a box, and whoever walks.
+        // A pole, a box, and a walking person.
         let condition = "scanhub.swept > 10_000 && scanhub.axes === 2 && scanhub.sweeps[0].complete === 'true' \
                     && scanhub.sweeps[0].obstacles.filter((one) => one.near === 'true').length >= 2 \
                     && document.querySelector('#sensors article.streaming:not(.lossy)') !== null \
                     && document.querySelector('#news').innerText === ''";
-        // Words come a moment after their sweep.
+        // The text follows a moment after its sweep.
         let is_told = format!("{SWEPT_TEXT} === `hall: ${{scanhub.sweeps[0].words}}`");
         page.await_true(&format!(
             "{condition} && {is_told} && scanhub.obstacles === scanhub.sweeps[0].obstacles.length"
