@@ -1,8 +1,8 @@
-//! How much earlier does a warning from a partial scan arrive, and what does it cost? Posts appear in the smaller zone,
-//! one after the other, at positions all over the scan. A warning is compared with the zones of the same scan by the
-//! times at which the hub sent them, for an LMS and for rotating scanners. On a line that loses bytes in bursts, some
-//! warnings are withdrawn, and counted. The CPU time of the hub with a subscriber to `early` is compared with that for
-//! `zones` alone. The bench does not measure what a robot gains: its brakes are slower.
+//! Gain and cost of early warnings from partial scans. Posts appear in the smaller zone, one after the other, at
+//! positions all over the scan. A warning is compared with the zones of the same scan by the times at which the hub
+//! sent them, for an LMS and for rotating scanners. On a line that loses bytes in bursts, some warnings are withdrawn,
+//! and counted. The CPU time of the hub with a subscriber to `early` is compared with that for `zones` alone. The bench
+//! does not measure what a robot gains: its brakes are slower.
 
 mod support;
 
@@ -27,14 +27,14 @@ fn main() -> ExitCode {
     support::main(measure)
 }
 
-/// A scanner, and what its figures are called.
+/// A scanner with the names of its figures.
 struct Scanner {
     name: &'static str,
     flags: &'static [&'static str],
     keys: &'static [&'static str],
-    /// Where its posts stand, in radians from the right, counter-clockwise.
+    /// Directions of its posts: the first, and the extent, in radians counterclockwise from the right.
     view: (f64, f64),
-    /// For how long each does, in seconds, and until the next one comes.
+    /// Time for which each post exists, and time from the start of one to the start of the next, in seconds.
     post_duration_s: f64,
     post_interval_s: f64,
     warning_figures: [&'static str; 4],
@@ -126,14 +126,14 @@ fn measure(options: &Options) -> Outcome<()> {
     Ok(())
 }
 
-/// What was measured of a scanner, one value per pair of runs.
+/// Results of a scanner, one value per pair of runs.
 #[derive(Default)]
 struct WarningFigures {
-    /// Medians in ms, by places in the scan.
+    /// Medians of the gain in ms, by parts of the scan.
     gains: BTreeMap<usize, Vec<f64>>,
-    /// Warnings, and those withdrawn, on a clean line and on one that loses bytes.
+    /// Number of warnings and of withdrawn warnings on a clean line, and then on one that loses bytes.
     counts: [Vec<f64>; 4],
-    /// The hub's CPU time in percent, with a follower of `early` and without.
+    /// CPU time of the hub in percent, with a subscriber to `early` and without.
     cpu_percents: [Vec<f64>; 2],
 }
 
@@ -195,7 +195,8 @@ impl Scanner {
         Ok(WarningRun::from_samples(&early, &zones, beams.max(1)))
     }
 
-    /// The hub's share of a processor in percent, with a follower of `zones`, and of `early` too if `is_early`.
+    /// Returns the CPU time of the hub in percent of one processor, with a subscriber to `zones`, and to `early` too if
+    /// `is_early`.
     fn busy_share(
         &self,
         environment: &BenchEnvironment,
@@ -223,7 +224,7 @@ impl Scanner {
         Ok(share)
     }
 
-    /// A room, and in it one post at a time, 0.55 m from the sensor, for a few scans each.
+    /// Returns a world with a room in which one post at a time appears, 0.55 m from the sensor, for a few scans each.
     fn posts_world(&self) -> Outcome<String> {
         let mut world = String::from("[noise]\nerrors = 0\nweak = false\n");
         world += "[[thing]]\nline = [[-4000, -3000], [4000, -3000], [4000, 4000], [-4000, 4000], [-4000, -3000]]\n";
@@ -238,16 +239,16 @@ impl Scanner {
     }
 }
 
-/// What was said in a run.
+/// Warnings of a run.
 struct WarningRun {
     warnings: usize,
     withdrawn: usize,
-    /// By how many ms the first warning of a scan came before its zones, by sixths of the scan.
+    /// Times in ms from the first warning of a scan to its zones, by sixths of the scan.
     gains_ms: BTreeMap<usize, Vec<f64>>,
 }
 
 impl WarningRun {
-    /// What the samples of both topics tell of scans of so many beams.
+    /// Evaluates the samples of both topics, for scans of this number of `beams`.
     fn from_samples(early: &[(Header, Early)], zones: &[(Header, ())], beams: usize) -> WarningRun {
         let sent: BTreeMap<u64, u64> =
             zones.iter().rev().map(|(header, ())| (header.seq, sent_ns(header))).collect();
@@ -258,7 +259,7 @@ impl WarningRun {
                 continue;
             }
             run.warnings += 1;
-            // Of a turn only the packets are numbered before it is over.
+            // During a revolution, a warning has the `seq` of a packet, so take the next zones.
             if let Some((_, zones_ns)) = sent.range(header.seq..).next() {
                 let gain_ms = (*zones_ns as f64 - sent_ns(header) as f64) / 1e6;
                 let place = usize::from(early.beam) * SCAN_PARTS / beams;
@@ -277,7 +278,7 @@ impl WarningRun {
     }
 }
 
-/// Headers of a topic for `span` from its first sample on, and what `take` takes of each.
+/// Receives a topic for `span` from its first sample on. Returns the headers, each with the result of `take`.
 fn receive<P: Payload, T>(
     environment: &BenchEnvironment,
     span: Duration,
@@ -296,13 +297,13 @@ fn receive<P: Payload, T>(
     Ok(received)
 }
 
-/// When the hub sent a sample, on the clock of stamps.
+/// Returns the time at which the hub sent a sample, on the clock of stamps.
 fn sent_ns(header: &Header) -> u64 {
     header.stamp_last_ns + header.hub_time_ns().unwrap_or(0)
 }
 
 const POST_COUNT: usize = 200;
-/// The parts by which places in a scan are told.
+/// Number of parts into which a scan is divided.
 const SCAN_PARTS: usize = 6;
-/// Until the sensor streams and the rhythm is learned.
+/// Time after which the sensor streams and the hub has estimated its timing.
 const SETTLE_TIME: Duration = Duration::from_secs(4);

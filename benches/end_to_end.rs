@@ -1,7 +1,7 @@
-//! Does everything that two sensors send arrive, in order, bit for bit and in time? 2 x 1500 telegrams pass from ptys
-//! at 500 kBd through the running hub into a process per sensor, and are compared with the log of the simulator. How
-//! long does a start take with an idle sensor at each of the four rates, compared with a bare host that knows the rate?
-//! Damaged bytes are left to the tests of the framer.
+//! Transport and start. 2 x 1500 telegrams pass from ptys at 500 kBd through the running hub into a process per sensor.
+//! They are compared with the log of the simulator, to check that everything arrives in order, bit for bit and in time.
+//! Starts are measured with an idle sensor at each of the four rates, and compared with a bare host that knows the
+//! rate. The tests of the framer cover damaged bytes.
 //!
 //! The baseline of a start knows the rate. At 9,600 baud it requests the status, which takes 0.17 s there. The hub
 //! first waits for a running stream, and then tries one rate after the other, 19,200 baud last.
@@ -29,7 +29,7 @@ fn measure(options: &Options) -> Outcome<()> {
     Ok(())
 }
 
-/// `count` telegrams of each sensor through the hub; each figure has a value per sensor.
+/// Receives `count` telegrams of each sensor through the hub. Each figure has one value per sensor.
 fn measure_transport(count: usize) -> Outcome<Vec<Figure>> {
     let environment = BenchEnvironment::new()?;
     let start = |sensor: &&str| {
@@ -37,7 +37,7 @@ fn measure_transport(count: usize) -> Outcome<Vec<Figure>> {
         subscriber.wait_for_line("attaching", STEP_TIMEOUT)?;
         Ok(subscriber)
     };
-    // Whoever listens from the beginning can tell whether something was lost: the sensors come last.
+    // A subscriber must attach before the sensors start in order to detect every loss, so the sensors start last.
     let subscribers: Vec<Child> = SENSORS.iter().map(start).collect::<Outcome<_>>()?;
     let hub = environment.start_hub(&SENSORS)?;
     hub.wait_for_line("ready", STEP_TIMEOUT)?;
@@ -61,7 +61,7 @@ fn measure_transport(count: usize) -> Outcome<Vec<Figure>> {
         let sent = known.iter().max().map_or(0, |last| last + 1);
         let values = [
             hashes.len() as f64,
-            // All that was sent up to the last one received.
+            // Everything that was sent up to the last telegram received.
             (sent - known.len()) as f64,
             places.iter().filter(|place| place.is_none()).count() as f64,
             known.windows(2).filter(|pair| pair[0] >= pair[1]).count() as f64,
@@ -82,7 +82,7 @@ fn measure_transport(count: usize) -> Outcome<Vec<Figure>> {
     ])
 }
 
-/// Starts of the hub and of the baseline, each with a sensor that was just powered on at `rate`.
+/// Measures starts of the hub and of the baseline, each with a sensor that was just powered on at `rate`.
 fn measure_starts(
     pairs: usize,
     rate: u32,
@@ -100,7 +100,7 @@ fn measure_starts(
     Ok(figures)
 }
 
-/// Milliseconds from exec of the hub to the state streaming and to the first scan in a consumer's hands.
+/// Returns the times from exec of the hub to the state `streaming` and to the first scan at a subscriber, in ms.
 fn start_hub(rate: u32) -> Outcome<[f64; 2]> {
     let environment = BenchEnvironment::new()?;
     let _simulator = environment.simulate(&ONE_SENSOR, rate)?;
@@ -115,7 +115,7 @@ fn start_hub(rate: u32) -> Outcome<[f64; 2]> {
     Ok([streaming, first])
 }
 
-/// The same of a host that knows the rate.
+/// Returns the same times for a host that knows the rate.
 fn start_baseline(rate: u32) -> Outcome<[f64; 2]> {
     let environment = BenchEnvironment::new()?;
     let _simulator = environment.simulate(&ONE_SENSOR, rate)?;
@@ -133,5 +133,5 @@ const START_CASES: [(u32, &str, &str); 4] = [
     (9_600, "9600 Bd to streaming", "9600 Bd to first scan"),
 ];
 const ONE_SENSOR: [&str; 1] = ["front"];
-/// 180 degrees in halves: two turns of the mirror.
+/// Rate at 180 degrees and 0.5 degrees: a scan takes two revolutions of the mirror.
 const NOMINAL_HZ: f64 = 1e9 / (2.0 * lms::variant::MIRROR_PERIOD as f64);

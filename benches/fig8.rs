@@ -58,7 +58,7 @@ impl Options {
     }
 }
 
-/// What is kept of the run.
+/// Results of the run.
 #[derive(Default)]
 struct WarningRun {
     /// Every position that was background at any time.
@@ -145,7 +145,7 @@ impl WarningRun {
     }
 }
 
-/// Returns what the hub publishes of the scan that ended at `end_ns`.
+/// Returns the scan that the hub would publish for the measurement that ended at `end_ns`.
 fn scan(room: &Room, end_ns: Nanos) -> Box<Scan> {
     decoded_scan::scan(&room.scan(Variant::HALF, Unit::Mm, decoded_scan::MODE, end_ns), Unit::Mm)
 }
@@ -212,22 +212,22 @@ struct Position {
 }
 
 impl Position {
-    /// Returns where beam `i` of `scan` ends if it has this range, in units of the scan.
+    /// Returns the end of beam `i` of `scan` if it has this range, in units of the scan.
     fn of(scan: &Scan, i: usize, range: u16) -> Position {
         let mm = f64::from(range) * f64::from(scan.unit_um) / 1000.0;
         let (left, ahead) = scan.angle(i).sin_cos();
         Position { right_mm: (-mm * left).round() as i32, ahead_mm: (mm * ahead).round() as i32 }
     }
 
-    /// Returns the position on the page. A pixel is a centimeter.
+    /// Returns the position on the page. A pixel is one centimeter.
     fn pixel(self) -> (i32, i32) {
         let centimeters = |mm: i32| (f64::from(mm) / 10.0).round() as i32;
         (LEFT + centimeters(self.right_mm), BOTTOM - centimeters(self.ahead_mm))
     }
 }
 
-/// A baseline plan as SVG, seen from above, with the sensor at the bottom: dots in classes, rings, a scale. Dots of one
-/// class are one path on a grid of a centimeter, so the file is small. It has no background and no extreme colors, so
+/// A floor plan as SVG, seen from above, with the sensor at the bottom: dots in classes, rings, a scale. Dots of one
+/// class are one path on a grid of one centimeter, so the file is small. It has no background and no extreme colors, so
 /// it is readable on light and on dark pages.
 struct FloorPlan {
     body: String,
@@ -301,8 +301,8 @@ impl FloorPlan {
 /// Classes of dots with their colors.
 const CLASSES: [(&str, &str); 4] =
     [("background", "#808080"), ("foreground", "#e67e22"), ("new", "#d9534f"), ("gone", "#3498db")];
-/// Size of the page, and position of the sensor on it, in pixels: the room of 6.3 by 5.5 m and the corridor behind its
-/// door.
+/// Size of the page, and position of the sensor on it, in pixels. The page shows the room of 6.3 by 5.5 m and the
+/// corridor behind its door.
 const WIDTH: i32 = 760;
 const HEIGHT: i32 = 730;
 const LEFT: i32 = 350;

@@ -1,8 +1,7 @@
-//! What does the hub cost per telegram? Measures its CPU time and its sleeps while 1, 2 or 4 sensors stream, with one
-//! sleeping subscriber per sensor. The baseline is a bare reader of ptys that makes only the necessary system calls and
-//! wakes a process per telegram. Hub, baselines and, with `--beside PROGRAM`, the hub of another build run at the same
-//! time (`support/simultaneous.rs`). The bench does not measure what subscribers cost, or what happens on a real
-//! adapter.
+//! Cost of the hub per telegram. Measures its CPU time and its sleeps while 1, 2 or 4 sensors stream, with one sleeping
+//! subscriber per sensor. The baseline is a bare reader of ptys that makes only the necessary system calls and wakes a
+//! process per telegram. Hub, baselines and, with `--beside PROGRAM`, the hub of another build run at the same time
+//! (`support/simultaneous.rs`). The bench does not measure the cost of subscribers, or of a real adapter.
 
 mod support;
 
@@ -80,7 +79,7 @@ impl Load {
     }
 }
 
-/// Runs all programs, and returns what each used in each second.
+/// Runs all programs, and returns their resource usage in every second.
 fn load_of_round(comparison: &Comparison, round: usize, seconds: u64) -> Outcome<Vec<Vec<Load>>> {
     let sensors = comparison.sensors;
     let mut running = Vec::new();
@@ -160,7 +159,7 @@ impl Sample {
 }
 
 /// Returns wake-ups and telegrams of all links as the hub has counted them. Called outside of the measured time,
-/// because it is a subscriber more.
+/// because it adds a subscriber.
 fn counters(environment: &BenchEnvironment, sensors: &[&str]) -> Outcome<(f64, f64)> {
     let mut sum = (0, 0);
     for sensor in sensors {

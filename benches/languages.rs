@@ -1,9 +1,9 @@
-//! How much longer does a subscriber in another language wait than one in Rust? Measured from the last byte that the
-//! hub read to the scan in one process, which is the only subscriber; the languages alternate. Rust sleeps on the
-//! doorbell, its default, and is the baseline. The bench does not measure what a program does with the scan.
+//! Latency of subscribers in other languages than Rust, measured from the last byte that the hub read to the scan in
+//! one process, which is the only subscriber. The languages alternate. Rust sleeps on the doorbell, its default, and is
+//! the baseline. The bench does not measure what a program does with the scan.
 //!
-//! How much longer does Python take to read ten minutes of two sensors from a recording into numpy arrays than the same
-//! loop in Rust? Both processes measure it without their start.
+//! Also measures the time in which Python reads ten minutes of two sensors from a recording into numpy arrays, compared
+//! with the same loop in Rust. Both processes measure it without their start.
 
 mod support;
 
@@ -24,13 +24,14 @@ use support::environment::{BenchEnvironment, Child, STEP_TIMEOUT};
 use support::figures::{self, Figure, Target, percentile};
 use support::{Options, Outcome};
 
-/// A language beside Rust.
+/// A language that is compared with Rust.
 struct Language {
     figures: [&'static str; 3],
-    /// What its p50 may be beside Rust's.
+    /// Maximum ratio of its p50 to that of Rust.
     max_ratio: f64,
-    /// Program and first arguments of its consumer, or nothing, said why, where this machine cannot run it. What follows
-    /// are domain, sensor and number of scans; it prints `aged SENSOR NS` for each, and `end`.
+    /// Returns program and first arguments of its subscriber. Returns `None`, and prints the reason, if this machine
+    /// cannot run it. Domain, sensor and number of scans follow as arguments. The subscriber prints `aged SENSOR NS`
+    /// for each scan, and `end`.
     subscriber_command: fn() -> Outcome<Option<Vec<String>>>,
 }
 
@@ -97,7 +98,7 @@ fn measure(options: &Options) -> Outcome<()> {
     Ok(())
 }
 
-/// Ages of `count` scans in microseconds, sorted. The first ones are left out.
+/// Returns the ages of `count` scans in us, sorted. Drops the first scans.
 fn ages(subscriber: &Child, count: usize) -> Outcome<Vec<f64>> {
     let lines = subscriber.lines_until("end", STEP_TIMEOUT + Duration::from_millis(50) * count as u32)?;
     let aged = lines.iter().filter(|line| line.text.starts_with("aged")).skip(SETTLE_TIME);
@@ -106,7 +107,7 @@ fn ages(subscriber: &Child, count: usize) -> Outcome<Vec<f64>> {
     Ok(ages)
 }
 
-/// Measures how long a recording takes to read.
+/// Measures how long it takes to read a recording.
 fn measure_reading(environment: &BenchEnvironment, options: &Options) -> Outcome<Option<Figure>> {
     let Some(mut words) = python_subscriber()? else { return Ok(None) };
     let file = environment.file("read.mcap");
@@ -166,7 +167,7 @@ fn record(file: &Path, seconds: u64) -> Outcome<()> {
     Ok(())
 }
 
-/// Reads the scans of a recording into arrays, and prints how long that took.
+/// Reads the scans of a recording into arrays, and prints the time that it took.
 fn read(file: &Path) -> Outcome<()> {
     let begin = Instant::now();
     let mut beams = 0;
@@ -206,14 +207,14 @@ fn python_subscriber() -> Outcome<Option<Vec<String>>> {
     Ok(Some(vec![python, "-B".into(), script]))
 }
 
-/// Built against the library that Cargo put beside this bench.
+/// Compiles the subscriber in C with the library that Cargo built for this bench.
 fn c_subscriber() -> Outcome<Option<Vec<String>>> {
     let top = Path::new(env!("CARGO_MANIFEST_DIR"));
     let own = std::env::current_exe()?;
     let library = own.parent().ok_or("a bench is in a directory")?.join("libscanhub.so");
     let place = Path::new(env!("CARGO_TARGET_TMPDIR")).join("languages");
     std::fs::create_dir_all(&place)?;
-    // What the linker looks for, and what the program does when it starts.
+    // Names under which the linker and the dynamic loader search for the library.
     for name in ["libscanhub.so", "libscanhub.so.0"] {
         let _ = std::fs::remove_file(place.join(name));
         std::os::unix::fs::symlink(&library, place.join(name))?;

@@ -1,8 +1,9 @@
-//! How old is a telegram when a subscriber receives it? Measured from the last byte written into the pty, by the
+//! Age of a telegram when a subscriber receives it. Measured from the last byte written into the pty, by the
 //! simulator's own stamp, to the sample in another process that sleeps in the client library, at 37.5 Hz from each of
 //! two sensors. The baseline is a bare chain with the same late read: pty, process, eventfd, process. Sent and received
 //! telegrams are matched by hash. Hub, baselines and, with `--beside PROGRAM`, the hub of another build run at the same
-//! time (`support/simultaneous.rs`). The bench does not measure when a beam was measured, or what an adapter adds.
+//! time (`support/simultaneous.rs`). The bench does not cover the time from the measurement of a beam to the line, or
+//! the delay of an adapter.
 //!
 //! The path up to the last byte is that of the baseline, so the difference lies between the read and the subscriber.
 //! The 99th percentile and the maximum depend on the machine as much as on the hub, because the simulator runs on the
@@ -76,15 +77,15 @@ struct WarningRun(Vec<ReceivedTelegram>);
 struct ReceivedTelegram {
     sensor: usize,
     hash: String,
-    /// When whoever has the pty open had its last byte.
+    /// Time at which the reader of the pty had its last byte.
     read_ns: u64,
-    /// When the subscriber had it.
+    /// Time at which the subscriber received it.
     at_ns: u64,
 }
 
 impl WarningRun {
-    /// Returns the time from which the run counts, and its end. They come from the sensor that started to stream last
-    /// and from the one that ended first.
+    /// Returns the time from which the run counts, and its end. The start is that of the sensor that started to stream
+    /// last, and the end that of the sensor that ended first.
     fn span(&self) -> (u64, u64) {
         let mut ends = HashMap::<usize, (u64, u64)>::new();
         for arrived in &self.0 {
@@ -95,8 +96,9 @@ impl WarningRun {
         (first + SETTLE_TIME.as_nanos() as u64, last)
     }
 
-    /// Returns microseconds from sent to received and from sent to read of the telegrams received in `span`. A hub
-    /// verifies checksums, so all its telegrams were sent. A baseline without checksums may receive parts of two.
+    /// Returns the times from sent to received and from sent to read of the telegrams received in `span`, in us. A hub
+    /// verifies checksums, so all its telegrams were sent. A baseline without checksums may receive parts of two
+    /// telegrams.
     fn latencies(&self, sent: &SentTimes, span: (u64, u64), is_hub: bool) -> Outcome<Latencies> {
         let mut latencies = Latencies::default();
         for arrived in self.0.iter().filter(|arrived| (span.0..=span.1).contains(&arrived.at_ns)) {
@@ -128,7 +130,7 @@ struct Latencies {
     read: Vec<f64>,
 }
 
-/// Runs all programs until each has received `count` telegrams of each sensor after the start. Returns them.
+/// Runs all programs until each has received `count` telegrams of each sensor after the start. Returns these telegrams.
 fn receive_round(comparison: &Comparison, round: usize, count: usize) -> Outcome<Vec<WarningRun>> {
     let count = count + (SETTLE_TIME.as_millis() as u64 * SCAN_RATE_MHZ / 1_000_000) as usize;
     let start = |(number, candidate): (usize, &MeasuredProgram)| -> Outcome<_> {
@@ -181,7 +183,7 @@ fn through_baseline(baseline: &Child, sensors: usize, count: usize) -> Outcome<W
     };
     let mut run = WarningRun(Vec::new());
     for sensor in 0..sensors {
-        // The wake-up carries no bytes: the nth is that of the nth telegram.
+        // The wake-up carries no bytes: the nth one belongs to the nth telegram.
         for (read, woken) in of("read", sensor).into_iter().zip(of("woken", sensor)) {
             let (hash, at_ns, read_ns) = (read.words()[2].to_owned(), woken.number(2)?, read.number(3)?);
             run.0.push(ReceivedTelegram { sensor, hash, read_ns, at_ns });
@@ -190,7 +192,7 @@ fn through_baseline(baseline: &Child, sensors: usize, count: usize) -> Outcome<W
     Ok(run)
 }
 
-/// When each telegram was sent, by sensor and hash.
+/// Time at which each telegram was sent, by sensor and hash.
 type SentTimes = HashMap<(usize, String), u64>;
 
 fn sent(environment: &BenchEnvironment, sensors: &[&str]) -> Outcome<SentTimes> {

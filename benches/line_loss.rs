@@ -1,13 +1,13 @@
-//! What does a line that loses bytes cost? The paper's Fig. 6: five minutes of telegrams, of which 0.135 % of the bytes
-//! are lost in bursts, read by three parsers. A telegram that the line damaged cannot be restored; whatever else is
-//! missing, the parser discarded. `--count N` sets the number of telegrams, `--pairs N` that of lines.
-//! `hub/drivers/tests/lms/framing.rs` checks the same in other surroundings.
+//! Losses on a line that loses bytes, as in the paper's Fig. 6. The line carries five minutes of telegrams and loses
+//! 0.135 % of their bytes in bursts, and three parsers read the rest. A telegram that the line damaged cannot be
+//! restored. The parser discarded all others that are missing. `--count N` sets the number of telegrams, `--pairs N`
+//! that of lines. `hub/drivers/tests/lms/framing.rs` checks the same with another content of the line.
 //!
 //! A damaged telegram lost at least one byte. A collateral telegram arrived with every byte, and the parser discarded
 //! it. The paper lost 0.135 % of the bytes and 40.8 % of the telegrams.
 
 #[path = "../hub/drivers/tests/lms/line.rs"]
-#[allow(dead_code)] // The test uses the other surroundings.
+#[allow(dead_code)] // The test uses the other content of the line.
 mod line;
 mod support;
 
@@ -45,7 +45,7 @@ fn measure(options: &Options) -> Outcome<()> {
     Ok(())
 }
 
-/// A line, and what each parser made of it.
+/// A line, and the counts of each parser.
 struct WarningRun {
     bytes_lost_percent: f64,
     stats: [TelegramCounts; 3],

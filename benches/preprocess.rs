@@ -2,7 +2,7 @@
 //! Fig. 8. Targets: zones, marks and background together 1 us with the method `paper`, 3 us with `multi`; 5 us with
 //! segments.
 
-#![allow(missing_docs)] // criterion's macros make public functions
+#![allow(missing_docs)] // The macros of criterion create public functions.
 
 #[path = "../tests/testkit/decoded_scan.rs"]
 mod decoded_scan;
@@ -18,14 +18,14 @@ use scanhub_schema::{Foreground, Marks, Pose, Scan, Zones};
 use scanhub_sim::room::Room;
 
 const SENSOR_POSE: Pose = Pose { x_m: 0.3, y_m: -0.1, yaw_rad: 0.2, upside_down: 0, reserved: [0; 7] };
-/// Of each scan.
+/// Beams of each scan.
 const BEAM_COUNT: usize = 361;
-/// Somebody walks through the room, and its background has been learned.
+/// First scan that is measured. By then, a person walks through the room, and the background is learned.
 const FIRST_SCAN: u64 = 800;
-/// Scans that take turns.
+/// Number of different scans that are measured in turn.
 const SCAN_COUNT: u64 = 64;
 
-/// Scans of a world from the first one.
+/// Returns the first `count` scans of a world.
 fn scans(world: &str, count: u64) -> Vec<Box<Scan>> {
     let room = Room::new(&world.parse().expect("a world that the program brings along"), 1);
     let scan = |number| {
@@ -35,7 +35,7 @@ fn scans(world: &str, count: u64) -> Vec<Box<Scan>> {
     (1..=count).map(scan).collect()
 }
 
-/// A model that has learned from what came before, and the scans that come then.
+/// Returns a model that has learned from the scans before [`FIRST_SCAN`], and the remaining scans.
 fn model(method: Method, scans: &[Box<Scan>]) -> (BackgroundModel, &[Box<Scan>]) {
     let mut model =
         BackgroundModel::new(background::Settings { method, ..background::Settings::default() }, BEAM_COUNT);
@@ -83,7 +83,7 @@ fn bench_background(c: &mut Criterion) {
     }
     let (mut model, scans) = model(Method::Multi, &scans);
     let mut cutter = Segmenter::new(SENSOR_POSE, BEAM_COUNT);
-    // What stands before the background is found once, and cut again and again.
+    // Compute the foreground once, and divide it into segments repeatedly.
     let mut foreground = Foreground::of(BEAM_COUNT);
     model.update(&scans[0], &mut foreground);
     time_scans(c, "segments", &scans[..1], |scan| cutter.update(scan, black_box(&mut foreground)));

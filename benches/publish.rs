@@ -1,12 +1,11 @@
-//! What does a scan cost the hub's thread from loan to wake-up, with 0 to 200 subscribers: awake, asleep on the
-//! doorbell, asleep on the event? And what does a datagram cost: packing and sealing, reading and checking? Publishing
-//! is measured as CPU time of the publishing thread, including some 0.3 us for reading that clock. The CPU time of
-//! subscribers is not included.
+//! CPU time that the hub's thread needs from loan to wake-up for a scan, with 0 to 200 subscribers that are awake,
+//! asleep on the doorbell, or asleep on the event. Also measures datagrams: packing and sealing, reading and checking.
+//! Publishing is measured as CPU time of the publishing thread, including some 0.3 us for reading that clock. The CPU
+//! time of subscribers is not included.
 //!
-//! Subscribers that are awake keep the memory in the cache. Those that sleep do so for a millisecond between two
-//! scans.
+//! Subscribers that are awake keep the memory in the cache. Between two scans, the others sleep for a millisecond.
 
-#![allow(missing_docs)] // criterion's macros make public functions
+#![allow(missing_docs)] // The macros of criterion create public functions.
 
 #[path = "support/mod.rs"]
 mod support;
@@ -25,7 +24,7 @@ use support::environment::{BenchEnvironment, STEP_TIMEOUT};
 use support::source::{self, SENSOR, ScanSource};
 use support::{Outcome, clock};
 
-/// What consumers do until there is something.
+/// The way in which subscribers wait for samples.
 #[derive(Clone, Copy, PartialEq)]
 enum WaitMethod {
     Awake,
@@ -74,7 +73,8 @@ fn publish(c: &mut Criterion) {
                             }
                             if rest != WaitMethod::Awake {
                                 wait_until(|| crowd.received.load(Ordering::Acquire) >= sent * count);
-                                // Scans do not come one upon the other: the last one, too, is asleep again.
+                                // Scans do not follow each other without a pause: wait until the last subscriber sleeps
+                                // again.
                                 thread::sleep(SCAN_INTERVAL);
                             }
                         }
@@ -87,7 +87,7 @@ fn publish(c: &mut Criterion) {
     group.finish();
 }
 
-/// What the threads of consumers have come to.
+/// State of the threads of subscribers.
 #[derive(Default)]
 struct SubscriberThreads {
     ready: AtomicU64,
@@ -95,7 +95,7 @@ struct SubscriberThreads {
     should_end: AtomicBool,
 }
 
-/// Lets the consumers go, however the bench ends: they look at least so often.
+/// Ends the subscribers however the bench ends. They check the flag at least every [`END_POLL_INTERVAL`].
 struct EndOnDrop<'a>(&'a SubscriberThreads);
 
 impl Drop for EndOnDrop<'_> {
@@ -188,9 +188,9 @@ where
 }
 
 const SUBSCRIBER_COUNTS: [u64; 6] = [0, 1, 4, 16, 64, 200];
-/// Between two scans, so that all sleep: a sensor's are 26 times as far apart.
+/// Pause between two scans, in which all subscribers fall asleep. The scans of a sensor are 26 times as far apart.
 const SCAN_INTERVAL: Duration = Duration::from_millis(1);
-/// So often consumers look whether the bench is over.
+/// Interval in which subscribers check whether the bench has ended.
 const END_POLL_INTERVAL: Duration = Duration::from_millis(500);
 
 criterion_group!(benches, publish, datagram);

@@ -1,9 +1,9 @@
-//! What does a pulled plug cost? A pty that plays a streaming sensor is removed under a running hub and comes back
-//! under its name, every other time with another number, twenty times in all. How long until the hub reports the port
-//! as absent, how long until a subscriber has a telegram again, and what does the hub cost in between? The same for
-//! rotating scanners, which also lose their power for a moment.
+//! Time and CPU time that a pulled plug costs. A pty that simulates a streaming sensor is removed under a running hub
+//! and returns under its name, every other time with another number, twenty times in all. The figures are the time
+//! until the hub reports the port as absent, the time until a subscriber has a telegram again, and the CPU time of the
+//! hub in between. The same is measured for rotating scanners, which also lose their power for a moment.
 //!
-//! The bench does not measure how long the kernel takes to notice an adapter, or udev to name it.
+//! The bench does not measure how long the kernel takes to detect the loss of an adapter, or udev to name it.
 
 mod support;
 
@@ -94,7 +94,7 @@ fn measure(options: &Options) -> Outcome<()> {
 struct PluggedSensor {
     is_unplugged: Arc<AtomicBool>,
     sensor: JoinHandle<OwnedFd>,
-    /// Time at which its name appeared.
+    /// Time at which the name of the sensor appeared.
     plugged_ns: u64,
 }
 
@@ -121,7 +121,8 @@ impl PluggedSensor {
     }
 }
 
-/// Sends scans like a sensor, two mirror turns apart and each in two parts, while a program has the line open.
+/// Sends scans like a sensor, two revolutions of the mirror apart and each in two parts, while a program has the line
+/// open.
 fn stream(line: OwnedFd, is_unplugged: &AtomicBool) -> OwnedFd {
     let mut at = clock::now();
     let mut buffer = [0; 256];
@@ -193,8 +194,9 @@ const SCANNERS: [RotatingScanner; 2] = [
     },
 ];
 
-/// Measures all rotating scanners, at ptys of the simulator in this process: the adapter is unplugged for two seconds,
-/// or the power is off for a moment. How long until a subscriber has a scan of a whole revolution again?
+/// Measures all rotating scanners, at ptys of the simulator in this process. The adapter is unplugged for two seconds,
+/// or the power is off for a moment. The figures are the times until a subscriber has a scan of a whole revolution
+/// again.
 fn rotating_scanners(options: &Options) -> Outcome<Vec<Figure>> {
     let mut figures = Vec::new();
     for scanner in &SCANNERS {
@@ -240,7 +242,7 @@ impl RotatingScanner {
             back.push((scans.wait_for_line("scanned", STEP_TIMEOUT)?.number(2)? - since) as f64 / 1e6);
             clock::sleep_until(clock::now() + (1_000 + 41 * (round % 10)) * MILLIS);
             inject(Event::PowerCycle)?;
-            // By then, whatever was in transit has arrived, and the scanner has sent nothing else.
+            // By then, everything that was in transit has arrived, and the scanner has sent nothing since.
             clock::sleep_until(clock::now() + BOOT_TIME.as_nanos() as u64);
             let since = clock::now();
             scans.lines_so_far();

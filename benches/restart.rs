@@ -1,11 +1,11 @@
-//! What does a crash of the hub cost its subscribers? The hub is killed with SIGKILL and started again, twenty times in
-//! all, without a service manager that keeps its lines, while a process per sensor receives its telegrams. How long
-//! until the services are up and until each subscriber has a telegram, compared with a bare reader that opens the same
-//! streaming ptys and wakes a process? Counts damaged telegrams, telegrams missed within a run, and writes to the
-//! sensors' EEPROM.
+//! Time and telegrams that a crash of the hub costs its subscribers. The hub is killed with SIGKILL and started again,
+//! twenty times in all, without a service manager that keeps its lines, while a process per sensor receives its
+//! telegrams. Measures the time until the services exist and until each subscriber has a telegram, compared with a bare
+//! reader that opens the same streaming ptys and wakes a process. Counts damaged telegrams, telegrams missed within a
+//! run, and writes to the sensors' EEPROM.
 //!
-//! Then the same under a service manager that keeps the line of one sensor open: how long is the silence, and what is
-//! lost? The bench does not measure how long a service manager takes to notice.
+//! The second part is the same under a service manager that keeps the line of one sensor open. It measures the silence
+//! and the losses. The bench does not measure how long a service manager takes to detect the exit of a service.
 
 #[path = "../tests/testkit/supervisor.rs"]
 mod supervisor;
@@ -44,7 +44,7 @@ fn measure(options: &Options) -> Outcome<()> {
     };
     runs.restart()?;
     let (mut hub, mut baseline) = (Vec::new(), Vec::new());
-    // A series of kills, then the same number of starts of the baseline, on the same streams.
+    // A series of kills, and then the same number of starts of the baseline, on the same streams.
     let each = options.count(20).div_ceil(options.pairs());
     for _ in 0..options.pairs() {
         for _ in 0..each {
@@ -93,7 +93,7 @@ fn measure(options: &Options) -> Outcome<()> {
 /// Times of a start, in ms from exec.
 struct StartTimes {
     up_ms: f64,
-    /// First telegram of the subscriber that was served first, and of the other one.
+    /// Times of the first telegram: of the subscriber that was served first, and of the other one.
     first_ms: [f64; 2],
 }
 
@@ -128,7 +128,8 @@ impl HubRuns<'_> {
         Ok(())
     }
 
-    /// Kills the hub, if one runs, and starts the next. Returns when each subscriber has a telegram of it.
+    /// Kills the hub, if one runs, and starts the next one. Returns the times at which each subscriber has a telegram
+    /// of it.
     fn restart(&mut self) -> Outcome<StartTimes> {
         self.kill()?;
         let hub = self.stage.start_hub(&SENSORS)?;
@@ -179,8 +180,8 @@ fn run_time(n: usize) -> Duration {
 
 /// Measures a hub whose line a service manager keeps open, as with the unit in hub/dist. The hub is killed `kills`
 /// times, spread evenly over a telegram, and half as many times in the 0.6 ms in which a telegram is read: the only
-/// time in which it has left the line and is not yet sent. The telegrams of a subscriber are compared with those that
-/// the simulated sensor sent.
+/// time in which a telegram has left the line and is not yet published. The telegrams of a subscriber are compared with
+/// those that the simulated sensor sent.
 fn measure_kept_line(kills: usize) -> Outcome<Vec<Figure>> {
     let spread = kill_with_kept_line(kills, |n| SCAN_PERIOD_NS * (2 * n + 1) / (2 * kills as u64))?;
     let reading = kill_with_kept_line(kills.div_ceil(2), |_| SCAN_PERIOD_NS - READ_AHEAD_NS / 2)?;
@@ -223,17 +224,17 @@ struct KillResults {
     /// Complete telegrams of measured data from the first that was received to the last.
     sent: usize,
     lost: usize,
-    /// Lost telegrams that no hub should have been reading when it was killed. A hub that is woken late reads all bytes
-    /// that have arrived.
+    /// Lost telegrams that the hub should not have been reading when it was killed. A hub that is woken late reads all
+    /// bytes that have arrived.
     lost_while_idle: usize,
-    /// Telegrams that the sensor aborted in this time to answer the next hub.
+    /// Telegrams that the sensor aborted in this time to reply to the next hub.
     aborted: usize,
 }
 
 /// A subscriber, with the time of the last sample of each run.
 struct Receiver {
     process: Child,
-    /// Words of a line: when the sample was received, and the run that it belongs to.
+    /// Positions of words in a line: the time at which the sample was received, and the run that it belongs to.
     words: (usize, usize),
     boot: u64,
     last_ns: u64,
@@ -263,8 +264,7 @@ impl Receiver {
         Ok(())
     }
 
-    /// Receives until there is a sample at or after `until_ns`, and until there have been `silences` changes of the
-    /// run.
+    /// Receives until there is a sample at or after `until_ns`, and until the run has changed `run_changes` times.
     fn receive_until(&mut self, until_ns: u64, run_changes: usize) -> Outcome<()> {
         while self.last_ns < until_ns || self.silences_ms.len() < run_changes {
             self.next()?;
@@ -273,7 +273,8 @@ impl Receiver {
     }
 }
 
-/// Kills the hub `kills` times, number n at the time `moment(n)` after the last byte of a telegram.
+/// Kills the hub `kills` times, each time at `moment(n)` after the last byte of a telegram, where n is the number of
+/// the kill.
 fn kill_with_kept_line(kills: usize, moment: impl Fn(u64) -> u64) -> Outcome<KillResults> {
     let environment = BenchEnvironment::new()?;
     let sensor = SENSORS[0];
@@ -332,15 +333,15 @@ fn kill_with_kept_line(kills: usize, moment: impl Fn(u64) -> u64) -> Outcome<Kil
     })
 }
 
-/// Time from one telegram of 361 beams to the next: two turns of the mirror.
+/// Time from one telegram of 361 beams to the next, in ns: two revolutions of the mirror.
 const SCAN_PERIOD_NS: u64 = 26_640_000;
-/// Time before a telegram's end at which the hub begins to read.
+/// Time before the end of a telegram at which the hub starts to read, in ns.
 const READ_AHEAD_NS: u64 = 600_000;
-/// Difference between the times that two processes report for the same event.
+/// Difference between the times that two processes report for the same event, in ns.
 const CLOCK_NOISE_NS: u64 = 400_000;
-/// Delay of a hub that shares its processors.
+/// Delay of a hub that shares its processors, in ns.
 const MAX_DELAY_NS: u64 = 4_000_000;
-/// Time after which the hub certainly knows the sensor's timing.
+/// Time after which the hub has certainly estimated the sensor's timing.
 const SETTLE_TIME: Duration = Duration::from_millis(700);
 /// Pause of a service manager: RestartSec of the unit.
 const RESTART_PAUSE: Duration = Duration::from_millis(20);

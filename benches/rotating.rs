@@ -1,7 +1,7 @@
-//! What do rotating scanners cost the hub, compared with a reader that coalesces their packets in the same way and does
-//! nothing else? And how exact are the stamps of packets and scans after the hub was stopped for half a second?
-//! Simulated scanners on ptys with two subscribers each, as processes. The bench does not measure what a real adapter
-//! costs, or what subscribers do.
+//! CPU time of the hub for rotating scanners, compared with a reader that coalesces their packets in the same way and
+//! does nothing else. Also measures the accuracy of the stamps of packets and scans after the hub was stopped for half
+//! a second. There are simulated scanners on ptys with two subscribers each, as processes. The bench does not measure
+//! the cost of a real adapter, or of subscribers.
 
 mod support;
 
@@ -39,7 +39,7 @@ struct ScannerGroup {
     model: &'static str,
     /// Approximate number of bytes per revolution.
     revolution_len: usize,
-    /// Bytes of a packet, and nanoseconds from one packet to the next.
+    /// Bytes of a packet, and time from one packet to the next in ns.
     packet: (usize, u64),
     load_figure: &'static str,
     missed_figure: &'static str,
@@ -124,7 +124,7 @@ fn load(group: &ScannerGroup, options: &Options) -> Outcome<[Figure; 2]> {
     ])
 }
 
-/// Stops the hub for half a second, again and again, while two scanners continue.
+/// Stops the hub repeatedly for half a second, while two scanners continue.
 fn stalls(group: &ScannerGroup, options: &Options) -> Outcome<[Figure; 5]> {
     let environment = BenchEnvironment::new()?;
     let sensors = &SENSORS[..2];
@@ -180,7 +180,7 @@ fn stalls(group: &ScannerGroup, options: &Options) -> Outcome<[Figure; 5]> {
             baseline: none(),
             target: Target::Max(0.0),
         },
-        // A real scanner would have sent in this time: stamps are off by it, and uneven.
+        // A real scanner would have sent in this time. Stamps are off by up to this time, and uneven.
         Figure { name: group.stall_figure, unit: "ms", hub: stood, baseline: none(), target: Target::None },
         Figure {
             name: group.unevenness_figure,
@@ -209,7 +209,7 @@ impl ScannerGroup {
         ["--family", self.family, "--model", self.model, "--world", "room"]
     }
 
-    /// Starts the hub and `each` subscribers per sensor, and waits for scans.
+    /// Starts the hub and `per_sensor` subscribers per sensor, and waits for scans.
     fn start_hub(
         &self,
         environment: &BenchEnvironment,
@@ -235,7 +235,8 @@ impl ScannerGroup {
         Ok((hub, subscribers))
     }
 
-    /// Returns the CPU time of the hub, and what subscribers should have received and did not.
+    /// Returns the CPU time of the hub, and the number of scans and packets that subscribers should have received and
+    /// did not.
     fn load_of_hub(&self, environment: &BenchEnvironment, span: Duration) -> Outcome<(f64, f64)> {
         let (hub, subscribers) = self.start_hub(environment, &SENSORS, 2)?;
         thread::sleep(SETTLE_TIME);
@@ -272,7 +273,7 @@ fn cpu_percent(pid: u32, span: Duration) -> Outcome<f64> {
     Ok(100.0 * work.busy_ns as f64 / (clock::now() - started) as f64)
 }
 
-/// Returns the transmissions that must have been sent and did not arrive, by the hub's own count.
+/// Returns the number of packets that must have been sent and did not arrive, as the hub counts them.
 fn lost(environment: &BenchEnvironment) -> Outcome<u64> {
     let mut sum = 0;
     for sensor in SENSORS {
@@ -286,18 +287,18 @@ fn lost(environment: &BenchEnvironment) -> Outcome<u64> {
 
 /// Number of scanners of a large vehicle.
 const SENSORS: [&str; 8] = ["a", "b", "c", "d", "e", "f", "g", "h"];
-/// Time after which rates and clocks are known and the start is complete.
+/// Time after which the start is complete, and rates and clocks are estimated.
 const SETTLE_TIME: Duration = Duration::from_secs(3);
 /// Length of a stall, as on an overloaded machine.
 const STALL_TIME: Duration = Duration::from_millis(500);
 /// Error from which a stamp is wrong, in ms.
 const MAX_STAMP_ERROR_MS: f64 = 5.0;
 
-/// Baseline of a hub whose scanners send packets without pause: sleeps until there are bytes, waits 5 ms as the hub
-/// does, reads all of them, and wakes two sleeping processes once per revolution. No framing, no checksum, no shared
-/// memory.
+/// Baseline of a hub whose scanners send packets without pause. It sleeps until there are bytes, waits 5 ms as the hub
+/// does, reads all of them, and wakes two sleeping processes once per revolution. It has no framing, no checksum and no
+/// shared memory.
 ///
-/// Reads each of `ports` forever in a separate thread; a revolution has `turn` bytes.
+/// Reads each of `ports` forever in a separate thread. A revolution has `revolution_len` bytes.
 fn coalesce(revolution_len: usize, ports: &[&str]) -> Outcome<()> {
     let mut sleepers: Vec<GuardedProcess> = Vec::new();
     let mut readers = Vec::new();
@@ -308,7 +309,7 @@ fn coalesce(revolution_len: usize, ports: &[&str]) -> Outcome<()> {
             sleepers.push(baseline::start_sleeper(number, 0, wake.try_clone()?)?);
             ends.push(wake);
         }
-        // The rate does not matter to a pty.
+        // A pty ignores the rate.
         let line = PtyLine::open(Path::new(port), 115_200)?;
         readers.push(thread::spawn(move || {
             if let Err(error) = read_revolutions(&line, &ends, revolution_len) {
@@ -340,7 +341,7 @@ fn read_revolutions(line: &PtyLine, ends: &[OwnedFd], revolution_len: usize) -> 
     }
 }
 
-/// Subscribers of a scanner.
+/// Number of subscribers to a scanner.
 const SUBSCRIBER_COUNTS: usize = 2;
 /// Time for which the hub leaves packets in the line, in ns.
 const READ_INTERVAL_NS: u64 = 5_000_000;
@@ -363,15 +364,15 @@ fn print_packets(domain: &str, sensor: &str, len: usize) -> Outcome<()> {
     let mut out = std::io::stdout().lock();
     loop {
         let Some(sample) = samples.next()? else { continue };
-        // Responses have other lengths.
+        // Replies have other lengths.
         if let Some(last) = sample.rchunks_exact(len).next().filter(|_| sample.len() % len == 0) {
             writeln!(out, "packets {} {}", sample.header().stamp_last_ns, truth::hash(last))?;
         }
     }
 }
 
-/// Returns the maximum error, in ms, of the stamps in `lines`, each of which was `due` at one of these times, and how
-/// many are off by more than `limit_ms`.
+/// Returns the maximum error, in ms, of the stamps in `lines`, and how many are off by more than `limit_ms`. `due` has
+/// the times at which each packet was due, by its hash.
 fn stamp_error_ms(
     lines: &[OutputLine],
     due: &HashMap<&str, Vec<u64>>,
@@ -388,7 +389,7 @@ fn stamp_error_ms(
     Ok((worst, off_ms.iter().filter(|off| **off > limit_ms).count()))
 }
 
-/// The output of a subscriber to scans.
+/// Output of a subscriber to scans.
 #[derive(Default)]
 struct ReceivedScans {
     stamps_ns: Vec<u64>,
@@ -407,7 +408,8 @@ impl ReceivedScans {
         Ok(scans)
     }
 
-    /// Returns by how much the distance of two consecutive scans differs from a whole number of revolutions, at most.
+    /// Returns the maximum deviation of the distance of two consecutive scans from a whole number of revolutions, in
+    /// ms.
     fn unevenness_ms(&self) -> f64 {
         let mut spans: Vec<f64> =
             self.stamps_ns.windows(2).map(|pair| pair[1].abs_diff(pair[0]) as f64 / 1e6).collect();

@@ -1,13 +1,13 @@
-//! How long does it take until a sensor streams? It starts in these states:
+//! Time until a sensor streams. It starts in these states:
 //!
 //! - at each of the four rates, idle, streaming or left in installation mode
 //! - just powered on, with quick replies, compared with a host that knows its rate and sends no request for information
 //! - power-cycled in the middle of a scan while another sensor streams
 //!
-//! The bench does not measure how long a real sensor boots: that is up to a minute, and passes before its boot message.
+//! The bench does not measure how long a real sensor boots. That takes up to a minute, before its boot message.
 //!
 //! The simulated sensor takes 55 to 145 ms to reply, like real captured ones. A stream that already runs delivers
-//! telegrams at once; scans follow when the sensor has reported its identity and how its values are split. The
+//! telegrams at once. Scans follow when the sensor has reported its identity and how its values are encoded. The
 //! baseline of a start after power-on knows the rate and sends no request for information: it changes the rate and
 //! starts the stream.
 
@@ -47,7 +47,7 @@ fn measure(options: &Options) -> Outcome<()> {
     Ok(())
 }
 
-/// Milliseconds from exec of the hub to the first scan in a consumer's hands.
+/// Returns the time from exec of the hub to the first scan at a subscriber, in ms.
 fn start(rate: &str, state: &str) -> Outcome<f64> {
     let environment = BenchEnvironment::new()?;
     let _simulator = environment.simulate_one("front", &["--baud", rate, "--state", state])?;
@@ -57,8 +57,8 @@ fn start(rate: &str, state: &str) -> Outcome<f64> {
     Ok((scans.wait_for_line("scan", STEP_TIMEOUT)?.number(2)? - hub.started_ns) as f64 / 1e6)
 }
 
-/// A sensor at rest at 9600 that answers after 60 ms: the hub's first start, the next one with what it keeps of the first,
-/// and the least that could be said, in turns.
+/// Measures starts with an idle sensor at 9600 baud that replies after 60 ms. The first start of the hub, the next one
+/// with the saved state of the first, and the baseline with the shortest possible dialog alternate.
 fn cold_starts(count: usize) -> Outcome<[Figure; 2]> {
     let (mut first, mut again, mut shortest) = (Vec::new(), Vec::new(), Vec::new());
     for _ in 0..count {
@@ -86,7 +86,8 @@ fn cold_starts(count: usize) -> Outcome<[Figure; 2]> {
     Ok([figure("power on, quick answers", first, 700.0), figure("the same, the next start", again, 700.0)])
 }
 
-/// A stream at the wanted rate that somebody left: from exec of the hub until it has adopted it, as its status says.
+/// Measures the time from exec of the hub until it has adopted an abandoned stream at the target rate, as its status
+/// reports.
 fn measure_adoption(count: usize) -> Outcome<Figure> {
     let mut hub = Vec::new();
     for _ in 0..count {
@@ -102,7 +103,8 @@ fn measure_adoption(count: usize) -> Outcome<Figure> {
     Ok(Figure { name: "500000 Bd, streaming, adopted", unit: "ms", hub, baseline: Vec::new(), target })
 }
 
-/// Cycles the power of one of two sensors: from its banner to its first telegram, and what the other one lost.
+/// Cycles the power of one of two sensors. Measures the time from its boot message to its first telegram, and the
+/// losses of the other sensor.
 fn power_cycles(count: usize) -> Outcome<[Figure; 3]> {
     let (mut back, mut lost, mut writes) = (Vec::new(), Vec::new(), Vec::new());
     for _ in 0..count {
@@ -124,7 +126,7 @@ fn power_cycles(count: usize) -> Outcome<[Figure; 3]> {
         }
         let first = received[received.len() - 1].number(2)?;
         back.push((first - banner) as f64 / 1e6);
-        // The other sensor's last telegrams are on their way.
+        // Wait for the last telegrams of the other sensor.
         drop(healthy);
         let truth = SensorTruth::read(&environment.own_truth("rear"), "rear")?;
         let last = truth.sent.last().map(|sent| sent.hash.clone()).unwrap_or_default();
@@ -157,7 +159,7 @@ fn power_cycles(count: usize) -> Outcome<[Figure; 3]> {
     ])
 }
 
-/// Waits until the sensor has said that its power came on; when its last byte was written.
+/// Waits for the boot message of the sensor, and returns the time at which its last byte was written.
 fn wait_for_boot_message(environment: &BenchEnvironment) -> Outcome<u64> {
     let banner = Reply::PowerOn(b"LMS200;301063;V02.30").encode(0, 0x10).ok_or("no banner")?;
     let banner = hash(banner.bytes());
@@ -176,10 +178,10 @@ fn wait_for_boot_message(environment: &BenchEnvironment) -> Outcome<u64> {
     }
 }
 
-/// Idle at 9600, 60 ms from ACK to reply.
+/// Flags of a sensor that is idle at 9600 baud and takes 60 ms from ACK to reply.
 const QUICK_FLAGS: [&str; 4] = ["--baud", "9600", "--fault", "answer=0.06"];
 
-/// Rate of the line, what the sensor was left doing, and the name of the figure.
+/// Rate of the line, state of the sensor, and name of the figure.
 const START_CASES: [(&str, &str, &str); 12] = [
     ("500000", "idle", "500000 Bd, idle"),
     ("500000", "streaming", "500000 Bd, streaming"),

@@ -1,6 +1,6 @@
-//! What does the picture in a browser cost, how soon does it show a scan, and how many bytes are sent? `scanhub web`
-//! with a headless Chromium, and with viewers that draw nothing. The baseline is a page that draws as many points from
-//! memory as soon as the browser lets it. The bench does not measure what a screen and a graphics card add.
+//! CPU time of the picture in a browser, delay until it shows a scan, and bytes that are sent. Measured with `scanhub
+//! web` and a headless Chromium, and with viewers that draw nothing. The baseline is a page that draws as many points
+//! from memory as soon as the browser lets it. The bench does not measure the delay of a screen and a graphics card.
 
 #[path = "../tests/it/browser.rs"]
 #[allow(dead_code, reason = "the tests press keys and make pictures, too")]
@@ -9,7 +9,7 @@ mod support;
 #[path = "../tests/testkit/child.rs"]
 mod test_child;
 
-/// The part of the test kit that the browser's driver needs.
+/// The part of the testkit that the driver of the browser needs.
 mod testkit {
     pub(crate) use crate::support::environment::STEP_TIMEOUT as WAIT_TIMEOUT;
     pub(crate) use crate::test_child::{Child, spawn};
@@ -36,7 +36,7 @@ fn main() -> ExitCode {
     support::main(measure)
 }
 
-/// The figures of all runs, by their names.
+/// Figures of all runs, in order of their first value.
 #[derive(Default)]
 struct FigureList(Vec<Figure>);
 
@@ -143,7 +143,7 @@ fn measure_lms(series: &mut FigureList, span: Duration) -> Outcome<()> {
     Ok(())
 }
 
-/// Measures two sensors of 3240 beams at 10 Hz, in a picture that turns, so that all of it is drawn as often as
+/// Measures two sensors of 3240 beams at 10 Hz, in a picture that rotates, so that all of it is drawn as often as
 /// possible.
 fn measure_rotating(series: &mut FigureList, span: Duration) -> Outcome<()> {
     let environment = BenchEnvironment::new()?;
@@ -194,8 +194,7 @@ fn serve(environment: &BenchEnvironment) -> Outcome<(Child, String)> {
     Ok((web, url))
 }
 
-/// Returns the times from the moment at which a subscriber has a scan to the end of the frame that draws it, in ms,
-/// sorted.
+/// Returns the times from the receipt of a scan by a subscriber to the end of the frame that draws it, in ms, sorted.
 fn delays(environment: &BenchEnvironment, page: &mut Browser, span: Duration) -> Outcome<Vec<f64>> {
     let over = AtomicBool::new(false);
     let (received, shown) = thread::scope(|scope| {
@@ -225,7 +224,7 @@ fn delays(environment: &BenchEnvironment, page: &mut Browser, span: Duration) ->
 
 type ReceivedStamps = HashMap<i64, f64>;
 
-/// Returns when scans of `sensor` arrived, in ms since 1970, by their stamps.
+/// Returns the times at which scans of `sensor` arrived, in ms since 1970, by their stamps.
 fn receive(
     environment: &BenchEnvironment,
     sensor: &str,
@@ -245,7 +244,7 @@ fn receive(
     follow().map_err(|error| error.to_string())
 }
 
-/// Returns a stamp in ms as the page has it, rounded to 5 us.
+/// Returns a stamp in ms, as the page has it, in units of 5 us.
 fn key(stamp_ms: f64) -> i64 {
     (stamp_ms * 200.0).round() as i64
 }
@@ -263,7 +262,7 @@ fn ages(environment: &BenchEnvironment, span: Duration) -> Outcome<Vec<f64>> {
     Ok(ages)
 }
 
-/// Returns the bytes per second of the same topics as lines of `echo --json`.
+/// Returns the bytes per second of the topics of the default view as lines of `echo --json`.
 fn echoed(environment: &BenchEnvironment, span: Duration) -> Outcome<f64> {
     let topics = ["*/scan", "*/foreground", "*/background", "*/marks", "*/zones", "*/status"];
     let run_for = format!("--for={}s", span.as_secs().max(1));
@@ -311,7 +310,7 @@ const BLANK_SCRIPT: &str = "(() => {
         });
     }, 26.7);
 })()";
-/// Turns the picture with each frame.
+/// Rotates the picture with each frame.
 const TURN_SCRIPT: &str = "(() => {
     const turn = () => {
         dispatchEvent(new KeyboardEvent('keydown', { key: '[' }));
@@ -319,14 +318,14 @@ const TURN_SCRIPT: &str = "(() => {
     };
     turn();
 })()";
-/// Walls all around, so that every beam ends at one.
+/// World with walls on all sides, so that every beam has a range.
 const HALL_WORLD: &str =
     "[[thing]]\nline = [[6000, -6000], [6000, 6000], [-6000, 6000], [-6000, -6000], [6000, -6000]]\n";
 const NO_BROWSER: &str = "there is no browser (Debian: apt-get install chromium)";
-/// Time after which the programs run as they will for hours.
+/// Time after which rates and caches no longer change.
 const SETTLE_TIME: Duration = Duration::from_secs(2);
 
-/// Plays a viewer without a picture: subscribes to the same channels as the page, and reads as fast as possible for
+/// Runs a viewer without a picture. It subscribes to the same channels as the page, and reads as fast as possible for
 /// `span`. Returns the bytes of messages per second after the first second.
 fn run_viewer(url: &str, span: Duration) -> Outcome<f64> {
     let mut socket = connect(url)?;
@@ -379,5 +378,5 @@ fn connect(url: &str) -> Outcome<WebSocket<TcpStream>> {
     Ok(socket)
 }
 
-/// Time that a viewer does not count.
+/// Time at the start of a viewer that does not count.
 const WARM_UP_TIME: Duration = Duration::from_secs(1);

@@ -1,7 +1,7 @@
-//! What does a message from one process to N others cost with this hub's topics, and with the mechanisms that users
-//! would take instead? UDP multicast, Unix sockets, TCP and pipes next to topics with each of their waits, and the bare
-//! wake-ups as baselines. The runs alternate, so that other load on the machine affects all of them. The bench does not
-//! measure what a network or another machine adds.
+//! Cost of a message from one process to N others. Topics of the hub, with each way to wait, are compared with the
+//! alternatives UDP multicast, Unix sockets, TCP and pipes. Bare wake-ups are the baselines. The runs alternate, so
+//! that other load on the machine affects all of them. The bench does not measure what a network or another machine
+//! adds.
 //!
 //! How to read the figures:
 //!
@@ -79,7 +79,7 @@ fn main() -> ExitCode {
     support::main_with(run_part, measure)
 }
 
-/// Plays a process of a run.
+/// Runs a process of a run, which is selected by its command line.
 fn run_part(words: &[&str]) -> Outcome<()> {
     let [part, way, payload, receivers, domain, place, ref rest @ ..] = *words else {
         return Err(format!("no part {words:?}").into());

@@ -106,8 +106,8 @@ impl Mechanism {
     }
 
     /// Returns whether the mechanism is run with this number of receivers and messages of this size. A receiver that
-    /// spins needs its own processor, and so does the sender. A baseline is between two processes. The client library
-    /// is compared only with the messages that it is used for.
+    /// spins needs its own processor, and so does the sender. A baseline has one receiver. The client library is
+    /// compared only for messages of the length of a scan.
     pub(crate) fn is_run_with(self, receivers: usize, payload: usize, processors: usize) -> bool {
         match self {
             Mechanism::Spin => receivers < processors,
@@ -131,7 +131,7 @@ pub(crate) struct Label {
 }
 
 impl Label {
-    /// Writes itself into both ends of `bytes`.
+    /// Writes the label to both ends of `bytes`.
     pub(crate) fn write(self, bytes: &mut [u8]) {
         let kind = self.phase as u64 * 2 + u64::from(self.is_end);
         let number = self.number.to_le_bytes();
@@ -164,7 +164,7 @@ pub(crate) struct MessageBuffer {
 }
 
 impl MessageBuffer {
-    /// Creates messages of `len` bytes.
+    /// Creates a buffer for messages of `len` bytes.
     pub(crate) fn new(len: usize) -> MessageBuffer {
         MessageBuffer { contents: contents(len), bytes: contents(len) }
     }
@@ -180,7 +180,7 @@ impl MessageBuffer {
         label.write(&mut self.bytes);
     }
 
-    /// Writes a message of the minimum length.
+    /// Writes a message of the minimum length, and returns it.
     pub(crate) fn write_short(&mut self, label: Label) -> &[u8] {
         let bytes = &mut self.bytes[..MIN_MESSAGE_LEN];
         label.write(bytes);
@@ -188,7 +188,7 @@ impl MessageBuffer {
     }
 }
 
-/// Returns the bytes of a message of `len` bytes between its ends.
+/// Returns the content of a message of `len` bytes, which the label then overwrites at both ends.
 pub(crate) fn contents(len: usize) -> Vec<u8> {
     (0..len).map(|i| i as u8).collect()
 }
@@ -203,7 +203,7 @@ const NUMBER_LEN: usize = size_of::<u64>();
 const LABEL_LEN: usize = 2 * NUMBER_LEN;
 const CACHE_LINE_LEN: usize = 64;
 
-/// Messages at one rate.
+/// A series of messages at one rate.
 pub(crate) struct Phase {
     /// Name in tables.
     pub(crate) name: &'static str,
@@ -216,14 +216,14 @@ pub(crate) struct Phase {
 }
 
 impl Phase {
-    /// Returns the number of messages of `way`. Baselines are always paced: a wake-up that no receiver waits for is not
-    /// one.
+    /// Returns the number of messages of `mechanism`. Baselines are sent only at a rate, because a wake-up counts only
+    /// while a receiver waits.
     pub(crate) fn count(&self, mechanism: Mechanism) -> usize {
         if mechanism.is_baseline() && self.period_ns == 0 { 0 } else { self.max_count }
     }
 
-    /// Returns when the phase ends in any case, in ns from its start. Receivers of a baseline detect the end by the
-    /// count alone.
+    /// Returns the time after which the phase ends in any case, in ns from its start. Receivers of a baseline detect
+    /// the end by the count alone.
     pub(crate) fn max_ns(&self, mechanism: Mechanism) -> u64 {
         if mechanism.is_baseline() { u64::MAX } else { self.max_ns }
     }

@@ -24,17 +24,17 @@ pub(crate) struct RunParameters<'a> {
     pub(crate) path_prefix: &'a str,
 }
 
-/// A mechanism's sending end.
+/// Sending end of a mechanism.
 pub(crate) trait MessageSender {
-    /// Returns what receivers need in order to connect.
+    /// Returns the address that receivers need in order to connect, or "-".
     fn address(&self) -> Outcome<String> {
         Ok("-".into())
     }
 
-    /// Connects to all receivers, which are ready now.
+    /// Connects to all receivers, which are ready by now.
     fn open(&mut self) -> Outcome<()>;
 
-    /// Writes a message to where it will be sent from. Mechanisms that carry no data write nothing.
+    /// Writes a message to the memory that it will be sent from. Mechanisms that carry no data write nothing.
     fn write(&mut self, label: Label) -> Outcome<()>;
 
     /// Sends the written message to all receivers.
@@ -47,8 +47,8 @@ pub(crate) trait MessageSender {
     }
 }
 
-/// Sends until it is told to end. Prints `ready ADDRESS`, `open`, and for each phase `sent BUSY_NS SENDING_NS
-/// SENT_NS..`. SENDING_NS leaves out the writing of messages and the waits, and is 0 where it was not measured.
+/// Sends until the control socket reports the end. Prints `ready ADDRESS`, `open`, and for each phase `sent BUSY_NS
+/// SENDING_NS SENT_NS..`. SENDING_NS excludes the writing of messages and the waits, and is 0 if it was not measured.
 pub(crate) fn send_all(task: &RunParameters) -> Outcome<()> {
     let control_socket = UnixDatagram::bind(control_path(task.path_prefix))?;
     let mut outlet = sender(task)?;
@@ -80,7 +80,7 @@ pub(crate) fn send_all(task: &RunParameters) -> Outcome<()> {
     Ok(())
 }
 
-/// Returns the path of the socket on which the sender is told to continue.
+/// Returns the path of the socket on which the bench signals the sender to continue.
 pub(crate) fn control_path(path_prefix: &str) -> String {
     format!("{path_prefix}-control")
 }
@@ -159,7 +159,7 @@ fn is_signaled(socket: &UnixDatagram) -> Outcome<bool> {
 /// Interval at which the end of a phase is reported again if it can be lost.
 const END_REPEAT_INTERVAL: Duration = Duration::from_millis(20);
 
-/// A mechanism's receiving end.
+/// Receiving end of a mechanism.
 pub(crate) trait MessageReceiver {
     /// Waits for the next message and reads it.
     fn next(&mut self) -> Outcome<Label>;

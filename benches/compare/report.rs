@@ -1,5 +1,5 @@
-//! The tables, one for each length of messages, number of receivers and rate. The targets say what topics should cost
-//! compared with the baselines and the cheapest socket.
+//! The tables, one for each length of messages, number of receivers and rate, and the targets: the maximum cost of
+//! topics relative to the baselines and to the cheapest socket.
 
 use serde_json::{Value, json};
 
@@ -12,8 +12,9 @@ use crate::support::figures::{self, Spread, percentile};
 /// Value of a figure.
 type FigureOf = fn(&PhaseFigures) -> Option<f64>;
 
-/// Prints all tables, after the machine. With `--json`: a line `{class: "machine", bench, machine, processors, runs}`,
-/// the digests as cells, and a line of class `compared` with all figures of a mechanism, length, number and rate.
+/// Prints all tables, after the machine. With `--json`, prints a line `{class: "machine", bench, machine, processors,
+/// runs}`, the most important figures as cells, and a line of class `compared` with all figures for each mechanism,
+/// length, number of receivers and rate.
 pub(crate) fn print_tables(options: &Options, processors: usize, pairs: usize, cells: &[Cell]) {
     let digests = cells.iter().flat_map(digests).collect::<Vec<_>>();
     if options.json {
@@ -66,7 +67,7 @@ fn columns(cell: &Cell) -> Vec<figures::Cell> {
     latency.chain(COST_FIGURES.into_iter().map(|column| figure("cost", column))).collect()
 }
 
-/// Returns the most important figures, over the number of receivers.
+/// Returns the most important figures, with one column for each number of receivers.
 fn digests(cell: &Cell) -> Vec<figures::Cell> {
     const PACED_FIGURES: [(&str, &str, FigureOf); 2] = [
         ("latency of the last receiver, p50", "us", |run| run.last[0]),
@@ -117,9 +118,9 @@ fn machine() -> String {
     format!("{}, Linux {}", model.map_or("unknown processor", |(_, model)| model), kernel.trim())
 }
 
-/// Prints what topics should cost compared with the baselines and with the cheapest socket, and whether they do. With
-/// `--json` as lines of class `measurement`, whose baseline is what topics are compared with, and of class `above` for
-/// each cell in which a socket is cheaper.
+/// Prints the targets of topics relative to the baselines and to the cheapest socket, and whether they are met. With
+/// `--json`, prints lines of class `measurement`, whose `baseline` is the mechanism that topics are compared with, and
+/// a line of class `above` for each cell in which a socket is cheaper.
 pub(crate) fn print_targets(options: &Options, cells: &[Cell]) {
     let mut verdicts = Vec::new();
     for cell in cells.iter().filter(|cell| cell.is_paced()) {
@@ -132,21 +133,21 @@ pub(crate) fn print_targets(options: &Options, cells: &[Cell]) {
     verdicts.iter().for_each(|verdict| verdict.print(options.json));
 }
 
-/// A target of a topic, and whether it was met.
+/// A target of a topic, and whether it is met.
 struct TargetCheck {
     class: &'static str,
     name: String,
     unit: &'static str,
     /// One value per run.
     topic_values: Vec<f64>,
-    /// One value per run of what it is compared with; empty if it is not compared.
+    /// One value per run of the mechanism that it is compared with; empty if there is none.
     compared_values: Vec<f64>,
     target: String,
     is_met: bool,
 }
 
 impl TargetCheck {
-    /// Compares `cell` with `other`; it should take at most `most` times as much.
+    /// Compares `cell` with `other`: it should take at most `max_ratio` times as much.
     fn check_ratio(
         cell: &Cell,
         other: &Cell,
@@ -190,7 +191,7 @@ impl TargetCheck {
     }
 }
 
-/// Compares a wait of topics with the bare futex, for messages as short as the hub's.
+/// Compares the wait of a topic with the bare futex, for messages that are no longer than those of the hub.
 fn check_waits(cell: &Cell, cells: &[Cell]) -> Option<TargetCheck> {
     let maximum = match cell.case.mechanism {
         Mechanism::Doorbell => 1.2,
@@ -208,7 +209,7 @@ fn check_waits(cell: &Cell, cells: &[Cell]) -> Option<TargetCheck> {
     )
 }
 
-/// Checks spinning, where two processors are otherwise idle.
+/// Checks spinning, for which the other processors must be idle.
 fn check_spinning(cell: &Cell, cells: &[Cell]) -> Option<TargetCheck> {
     const MAX_LATENCY_US: f64 = 1.0;
     if cell.case.mechanism != Mechanism::Spin || cell.case.payload > MAX_HUB_MESSAGE_LEN {
@@ -228,7 +229,7 @@ fn check_spinning(cell: &Cell, cells: &[Cell]) -> Option<TargetCheck> {
     })
 }
 
-/// Compares the client library with the topic that is used for all lengths here.
+/// Compares the client library with the topic of bytes that this bench uses for all lengths.
 fn check_subscriptions(cell: &Cell, cells: &[Cell]) -> Option<TargetCheck> {
     const COST_FIGURES: (&str, FigureOf) = ("receiver's CPU time", |run| run.receiver_us);
     if cell.case.mechanism != Mechanism::Subscription {
@@ -240,7 +241,7 @@ fn check_subscriptions(cell: &Cell, cells: &[Cell]) -> Option<TargetCheck> {
     Some(TargetCheck { target: "the same within the spread".into(), is_met, ..verdict })
 }
 
-/// Checks what the hub is for: many receivers of long messages.
+/// Checks the main use of the hub: many receivers of long messages.
 fn check_many_receivers(cell: &Cell, cells: &[Cell]) -> Vec<TargetCheck> {
     let times = match cell.case.mechanism {
         Mechanism::Doorbell => 50.0,
@@ -259,7 +260,7 @@ fn check_many_receivers(cell: &Cell, cells: &[Cell]) -> Vec<TargetCheck> {
     SENDER_FIGURES.into_iter().filter_map(verdict).collect()
 }
 
-/// Compares sender and last receiver with the cheapest socket: a target for all cells together, then one for each cell
+/// Compares sender and last receiver with the cheapest socket: one target for all cells together, and one for each cell
 /// that is above it.
 fn check_sockets(cells: &[Cell]) -> Vec<TargetCheck> {
     const LAST_FIGURE: (&str, FigureOf) = ("last receiver's p50", |run| run.last[0]);
@@ -314,7 +315,7 @@ fn median(mut values: Vec<f64>) -> Option<f64> {
     percentile(&values, 0.5)
 }
 
-/// The CPU time of the sender for a message, with and without writing it and waiting until it is due.
+/// CPU time of the sender for a message: including writing it and the wait until it is due, and without both.
 const SENDER_FIGURES: [(&str, FigureOf); 2] =
     [("sender's CPU time", |run| Some(run.sender_us)), ("sending alone", |run| run.sending_us)];
 /// Maximum length of the hub's own messages.

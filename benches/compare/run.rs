@@ -1,5 +1,5 @@
-//! One mechanism with one number of receivers and one length of messages: starts the processes, leads them through all
-//! phases, and computes figures from what they print.
+//! A run of one mechanism with one number of receivers and one length of messages: starts the processes, leads them
+//! through all phases, and computes figures from their output.
 
 use std::os::unix::net::UnixDatagram;
 
@@ -27,7 +27,7 @@ pub(crate) struct PhaseFigures {
     pub(crate) last: [Option<f64>; 3],
     /// CPU time of the sender per message, including writing it and waiting until it is due, in us.
     pub(crate) sender_us: f64,
-    /// The part of it that is sending, in us; only measured where messages are paced.
+    /// The part of it that is sending, in us; `None` if messages are not sent at a rate.
     pub(crate) sending_us: Option<f64>,
     /// CPU time of a receiver per message, in us; `None` if no message arrived.
     pub(crate) receiver_us: Option<f64>,
@@ -40,7 +40,7 @@ pub(crate) struct PhaseFigures {
 }
 
 impl Case {
-    /// Runs it, and returns one result for each phase that it has, with the index of the phase.
+    /// Runs the case, and returns the figures of each phase that it has, with the index of the phase.
     pub(crate) fn measure(&self, environment: &BenchEnvironment) -> Outcome<Vec<(usize, PhaseFigures)>> {
         let place = environment.port("compare");
         let [payload, receivers] = [self.payload, self.receivers].map(|number| number.to_string());
@@ -85,10 +85,11 @@ impl Case {
     }
 }
 
-/// Report of a process about one phase.
+/// Output of a process about one phase.
 struct Report {
     busy_ns: u64,
-    /// Time spent sending and times of the sender; number and time of each message, alternating, of a receiver.
+    /// A sender reports the CPU time of sending, and then the time of each message. A receiver reports number and time
+    /// of each message, alternating.
     numbers: Vec<u64>,
 }
 

@@ -1,4 +1,4 @@
-//! The mechanisms that users would take instead of topics: UDP multicast, Unix sockets, TCP and pipes.
+//! The alternatives that users would choose instead of topics: UDP multicast, Unix sockets, TCP and pipes.
 
 use std::fs::{File, OpenOptions};
 use std::io::{IoSlice, IoSliceMut, Read, Write};
@@ -21,9 +21,9 @@ use super::message::{Label, MIN_MESSAGE_LEN, Mechanism, MessageBuffer};
 use super::process::{MessageReceiver, MessageSender, RunParameters};
 use crate::support::Outcome;
 
-/// The sending sockets of UDP multicast on the loopback, which is one for the group, or of Unix datagram sockets, which
-/// are one per receiver. A message that is longer than a datagram is sent as several and reassembled by the receiver,
-/// as users would do it; if one of them is lost, the message is lost.
+/// Sending sockets of UDP multicast on the loopback, with one socket for the group, or of Unix datagrams, with one
+/// socket per receiver. A message that is longer than a datagram is sent as several datagrams and reassembled by the
+/// receiver, as users would do it. If one of them is lost, the message is lost.
 pub(crate) struct DatagramSender {
     group: Option<Ipv4Addr>,
     paths: Vec<String>,
@@ -105,7 +105,7 @@ fn send(socket: &OwnedFd, message: &[u8], part: usize) -> Outcome<()> {
     Ok(())
 }
 
-/// A receiving socket.
+/// A receiving socket for datagrams.
 pub(crate) struct DatagramReceiver {
     socket: OwnedFd,
     message: Vec<u8>,
@@ -122,7 +122,7 @@ impl DatagramReceiver {
             _ => UnixDatagram::bind(socket_path(task.path_prefix, number))?.into(),
         };
         let (len, part_len) = (task.payload, max_part_len(task));
-        // A part that arrives instead of the last one may be longer.
+        // A part of another message, received in place of the last part, may be longer.
         Ok(DatagramReceiver { socket, message: vec![0; len + part_len], len, part_len, received_parts: 0 })
     }
 
@@ -183,7 +183,7 @@ fn group_socket(group: Ipv4Addr) -> Outcome<OwnedFd> {
     Ok(socket.into())
 }
 
-/// Returns how much of a message a datagram of this kind holds.
+/// Returns how many bytes of a message a datagram of this kind holds.
 fn max_part_len(task: &RunParameters) -> usize {
     match task.mechanism {
         Mechanism::Multicast if task.payload > MAX_UDP_LEN => MAX_UDP_LEN - 2 * NUMBER_LEN,
@@ -196,7 +196,7 @@ fn socket_path(path_prefix: &str, number: usize) -> String {
     format!("{path_prefix}-mailbox-{number}")
 }
 
-/// Length of each of the two numbers at the start of a part: that of the message, and its own.
+/// Length of each of the two numbers at the start of a part: the number of the message, and the index of the part.
 const NUMBER_LEN: usize = size_of::<u64>();
 /// Maximum length of a UDP datagram.
 const MAX_UDP_LEN: usize = 65_507;

@@ -1,6 +1,6 @@
-//! Topics: a service with the settings of the hub's own for messages of any length, and the hub's own topic of scans
-//! for comparison. They are published as the hub does it: loaned, written in place, sent, and then all subscribers are
-//! woken once.
+//! Topics: a service of bytes with the settings of the hub for messages of any length, and the hub's topic `scan` for
+//! comparison. Both are published as in the hub: the sample is loaned, written in place and sent, and then all
+//! subscribers are woken once.
 
 use iceoryx2::prelude::ServiceName;
 use scanhub_schema::limits::TopicLimits;
@@ -14,7 +14,7 @@ use super::message::{BEAM_COUNT, Label, MIN_MESSAGE_LEN, Mechanism, SCAN_LEN, co
 use super::process::{MessageReceiver, MessageSender, RunParameters};
 use crate::support::{Outcome, clock, subscriber};
 
-/// Membership of a publishing process.
+/// Membership of a publishing process in the domain.
 struct HubMembership {
     waker: WakeSender,
     node: Node,
@@ -109,7 +109,7 @@ pub(crate) struct BytesReceiver {
     _node: Node,
 }
 
-/// How a subscriber waits, as in the client library.
+/// The way in which a subscriber waits, as in the client library.
 enum WaitMethod {
     /// The doorbell, its count when samples were last received, and whether the subscriber sleeps.
     Doorbell(Doorbell, u32, bool),
@@ -149,7 +149,7 @@ impl MessageReceiver for BytesReceiver {
 }
 
 impl WaitMethod {
-    /// Sleeps or spins until there may be a sample; returns at once if one may have arrived since samples were last
+    /// Sleeps or spins until a sample may have arrived. Returns at once if one may have arrived since samples were last
     /// received.
     fn wait(&mut self) -> Outcome<()> {
         match self {
@@ -223,7 +223,7 @@ pub(crate) struct ScanReceiver(scanhub_client::Subscriber<Scan>);
 impl ScanReceiver {
     pub(crate) fn new(task: &RunParameters) -> Outcome<ScanReceiver> {
         let mut scans = subscriber::subscribe::<Scan>(task.domain, SENSOR)?;
-        // Joins the domain; no message has been sent yet.
+        // This attaches to the domain. No message has been sent yet.
         scans.try_next()?;
         Ok(ScanReceiver(scans))
     }
@@ -241,7 +241,7 @@ impl MessageReceiver for ScanReceiver {
     }
 }
 
-/// The sensor whose subscribers are woken.
+/// Name of the sensor whose subscribers are woken.
 pub(crate) const SENSOR: &str = "front";
 const SERVICE_NAME: &str = "compare";
 const STEP_TIMEOUT: std::time::Duration = std::time::Duration::from_secs(10);

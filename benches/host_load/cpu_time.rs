@@ -1,5 +1,5 @@
-//! CPU time of the machine and of its processes, as the kernel counts it. There are two counts: `/proc/stat` charges
-//! whole ticks to the thread that runs when one falls, and the scheduler adds nanoseconds for each thread.
+//! CPU time of the machine and of its processes, as the kernel counts it. There are two counts. `/proc/stat` adds whole
+//! ticks to the thread that runs at the tick, and the scheduler adds nanoseconds to each thread.
 
 use std::collections::BTreeMap;
 use std::fs::{read_dir, read_to_string};
@@ -52,7 +52,7 @@ impl Snapshot {
         for entry in read_dir("/proc")? {
             let entry = entry?;
             if let Ok(pid) = entry.file_name().to_string_lossy().parse() {
-                // A process that ends at this moment does not count.
+                // A process that exits at this moment does not count.
                 processes.extend(Usage::of(&entry.path()).map(|usage| (pid, usage)));
             }
         }
@@ -96,8 +96,8 @@ impl<'a> Span<'a> {
         Ok(sum.share(self.percent(sum.busy_ns as f64)))
     }
 
-    /// Returns the CPU time of the kernel's threads by the scheduler, in percent of one processor. Some of them pass on
-    /// the bytes of ttys.
+    /// Returns the CPU time of the kernel's threads by the scheduler, in percent of one processor. Some of these
+    /// threads pass on the bytes of ttys.
     pub(crate) fn kernel(&self) -> f64 {
         self.sum(|usage| usage.is_kernel)
     }
@@ -125,7 +125,7 @@ pub(crate) fn processors() -> Outcome<usize> {
     Ok(stat.lines().filter(|line| line.starts_with("cpu") && !line.starts_with("cpu ")).count().max(1))
 }
 
-/// `/proc/stat` of all processors, in units of 1 / [`USER_HZ`] s.
+/// Values of `/proc/stat` for all processors, in units of 1 / [`USER_HZ`] s.
 #[derive(Clone, Copy)]
 struct Ticks {
     user: u64,
@@ -151,14 +151,14 @@ impl Ticks {
 struct Usage {
     /// CPU time, exact.
     busy_ns: u64,
-    /// Ticks, which divide it into user and system.
+    /// Ticks in user and system mode, which divide `busy_ns`.
     user: u64,
     system: u64,
     is_kernel: bool,
 }
 
 impl Usage {
-    /// Returns the process of this directory; `None` if it has ended.
+    /// Returns the counters of the process with this directory; `None` if it has exited.
     fn of(process: &Path) -> Option<Usage> {
         let stat = read_to_string(process.join("stat")).ok()?;
         // The name may contain spaces and brackets; the field after it is the third.
@@ -189,9 +189,9 @@ impl Usage {
         self.system += other.system;
     }
 
-    /// Returns `busy` divided into user and system.
+    /// Returns `busy` divided into user and system time.
     fn share(&self, busy: f64) -> Share {
-        // Half a tick is added to each, so that no time is lost where no tick fell.
+        // Half a tick is added to each, so that no time is lost if no tick was counted.
         let system = busy * (self.system as f64 + 0.5) / ((self.user + self.system) as f64 + 1.0);
         Share { user: busy - system, system }
     }

@@ -1,5 +1,5 @@
-//! Stands for the paper's unit between two sensors and a network, as far as its datagrams are concerned: bare telegrams
-//! to a multicast group on the loopback, one port per sensor, at the sensors' rate.
+//! Simulation of the paper's unit between two sensors and a network. It sends only the datagrams of that unit: bare
+//! telegrams to a multicast group on the loopback, one port per sensor, at the sensors' rate.
 
 use std::net::{Ipv4Addr, UdpSocket};
 
@@ -14,11 +14,11 @@ use scanhub_sim::room::Room;
 use crate::consumer::MODE;
 use crate::support::{Outcome, clock};
 
-/// Sends forever, to `port` for the first sensor and to the next one for the second; prints `ready` first.
+/// Prints `ready`, and then sends forever: to `port` for the first sensor, and to the next port for the second.
 pub(crate) fn send(port: u16) -> Outcome<()> {
     let socket = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0))?;
     set_ip_multicast_if(&socket, &Ipv4Addr::LOCALHOST)?;
-    // Datagrams leave this machine by no route.
+    // With this time to live, datagrams do not leave the machine.
     set_ip_multicast_ttl(&socket, 0)?;
     let rooms = [0, 1].map(telegrams);
     println!("ready");
@@ -34,7 +34,7 @@ pub(crate) fn send(port: u16) -> Outcome<()> {
     Ok(())
 }
 
-/// Returns a socket that receives what is sent to `port` of the group, like any number of others.
+/// Returns a socket that receives the datagrams for `port` of the group. Any number of sockets can do so.
 pub(crate) fn receiver(port: u16) -> Outcome<UdpSocket> {
     let socket = socket_with(AddressFamily::INET, SocketType::DGRAM, SocketFlags::CLOEXEC, None)?;
     set_socket_reuseaddr(&socket, true)?;
@@ -58,7 +58,7 @@ fn telegrams(sensor: u64) -> Vec<Vec<u8>> {
     (1..=375).map(telegram).collect()
 }
 
-/// A group that never leaves this machine, by its scope and the time to live.
+/// A group whose datagrams never leave this machine, because of its scope and the time to live.
 const GROUP: Ipv4Addr = Ipv4Addr::new(239, 255, 76, 90);
 /// Time from scan to scan of 361 beams, in ns.
 const SCAN_PERIOD_NS: u64 = 2 * MIRROR_PERIOD;

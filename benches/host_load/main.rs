@@ -1,26 +1,27 @@
-//! What do programs that use two sensors cost their machine (the paper's Fig. 7), if
+//! Load of a machine by programs that use two sensors (the paper's Fig. 7), in five setups.
 //!
-//! a. each reads the raw bytes, one by one, from two lines of its own, and does everything itself,
-//! b. does the same, but reads all bytes that have arrived,
-//! c. receives bare telegrams by multicast, as from the paper's unit, and does the rest itself,
-//! d. receives the scans of the hub,
-//! e. receives the zones and the foreground of the hub?
+//! - a: Each program reads the raw bytes, one by one, from its own two lines, and does everything itself.
+//! - b: Each does the same, but reads all bytes that have arrived.
+//! - c: Each receives bare telegrams by multicast, as from the paper's unit, and does the rest itself.
+//! - d: Each receives the scans of the hub.
+//! - e: Each receives the zones and the foreground of the hub.
 //!
 //! Each program is a process, and each receives 37.5 scans per second of each sensor; a table shows whether it did.
-//! Processes that stand for hardware (simulators, and in c the unit) are not counted: their time is subtracted from
-//! that of the machine.
+//! Processes that simulate hardware (simulators, and in c the unit) do not count: their time is subtracted from that of
+//! the machine.
 //!
-//! There are two counts for each run. `/proc/stat` is the paper's: the whole machine, with interrupts as system time,
-//! and whatever else runs there. Where the kernel counts by ticks (CONFIG_TICK_CPU_ACCOUNTING), it charges a tick of 1
-//! to 10 ms to the thread that runs when it falls, and most threads here run for less than 0.1 ms at a time. The table
-//! "/proc/stat, as a share of the scheduler's count" measures the error: 100 % would be exact. It is more if other
-//! processes ended during the run, because the scheduler's count then lacks them.
+//! Each run has two counts. `/proc/stat` is the paper's count: the whole machine, with interrupts as system time, and
+//! with all other programs that run. A kernel that counts by ticks (CONFIG_TICK_CPU_ACCOUNTING) adds a tick of 1 to 10
+//! ms to the thread that runs at the tick. Most threads here run for less than 0.1 ms at a time. The table "/proc/stat,
+//! as a share of the scheduler's count" measures the error: 100 % would be exact. It is more if other processes ended
+//! during the run, because the scheduler's count then lacks them.
 //!
 //! The count of the processes is the scheduler's, in nanoseconds (schedstat); only its division into user and system
-//! time is by ticks, over the whole run time of a process. The targets refer to this count. It does not include what
-//! threads of the kernel do for a pty, which is more where there are more ptys: another table shows these.
+//! time is by ticks, over the whole run time of a process. The targets refer to this count. It does not include the
+//! work of the kernel's threads for a pty, which is more if there are more ptys; another table shows it.
 //!
-//! The bench does not measure what a real UART costs: a pty has no interrupts. It needs an otherwise idle machine.
+//! The bench does not measure the cost of a real UART, because a pty has no interrupts. It needs an otherwise idle
+//! machine.
 //!
 //! Figures are shares of one processor. A rate below 37.5 Hz means that the setup fell behind: its load is that of an
 //! overloaded machine.
@@ -69,7 +70,7 @@ fn measure(options: &Options) -> Outcome<()> {
     let span = Duration::from_secs(seconds);
     let mut runs = Vec::new();
     for pair in 0..pairs {
-        // The CPU time of the sender without receivers.
+        // CPU time of the sender without receivers.
         let deaf = Setup::Datagrams.start(0)?.measure(span)?.drivers;
         for (round, &count) in counts.iter().enumerate() {
             let mut set_ups = Setup::ALL;
@@ -92,7 +93,7 @@ fn measure(options: &Options) -> Outcome<()> {
     Ok(())
 }
 
-/// One run of a set-up.
+/// One run of a setup.
 struct WarningRun {
     set_up: Setup,
     count: usize,
@@ -115,7 +116,7 @@ struct Table {
     value_of: Value,
 }
 
-/// Value of a run that a table shows.
+/// Function that returns the value of a run for a table.
 type Value = fn(&WarningRun) -> f64;
 
 impl<'a> Tables<'a> {
@@ -135,7 +136,7 @@ impl<'a> Tables<'a> {
         for Table { name, unit, rows, value_of } in TABLES {
             self.table(name.into(), unit, rows, value_of, &mut cells);
         }
-        // As a share of all processors, like in the paper.
+        // Share of all processors, as in the paper.
         let all = self.processors;
         let parts: [(&str, Value); 2] =
             [("system", |run| run.host.machine.system), ("user", |run| run.host.machine.user)];
@@ -159,8 +160,8 @@ impl<'a> Tables<'a> {
         }
     }
 
-    /// Returns the figures of the hub's results next to raw bytes. The targets are the paper's: a sixth of the system
-    /// time, a third of the user time.
+    /// Returns the figures of the hub's results compared with raw bytes. The targets are the paper's: a sixth of the
+    /// system time, a third of the user time.
     fn figures(&self) -> Vec<Figure> {
         let of = |name, value: Value, target| {
             let [hub, baseline] =
@@ -193,11 +194,11 @@ const fn load(name: &'static str, rows: &'static [Setup], value_of: Value) -> Ta
 }
 
 const BENCH_NAME: &str = "host_load";
-/// Number of consumers in the paper's set-up, to which its figures belong.
+/// Number of subscribers in the paper's setup, to which its figures belong.
 const MAX_SUBSCRIBERS: usize = 4;
-/// Set-ups with a hub.
+/// Setups with a hub.
 const WITH_HUB: [Setup; 2] = [Setup::Scans, Setup::Results];
-/// Load is in percent of one processor.
+/// Tables of the bench. Load is in percent of one processor.
 const TABLES: [Table; 11] = [
     load("system, processes of the host", &Setup::ALL, |run| run.host.processes.system),
     load("user, processes of the host", &Setup::ALL, |run| run.host.processes.user),

@@ -1,5 +1,5 @@
-//! The ways in which data of two sensors gets to programs. Each way is a set of processes on a stage; some belong to
-//! the host, and some only stand for hardware outside of it. Measures their CPU time.
+//! The ways in which programs receive the data of two sensors. Each setup is a set of processes. Some belong to the
+//! host, and some only simulate hardware outside of it. Also measures their CPU time.
 
 use std::thread;
 use std::time::Duration;
@@ -9,10 +9,10 @@ use crate::datagrams;
 use crate::support::Outcome;
 use crate::support::environment::{BenchEnvironment, Child, SENSORS, STEP_TIMEOUT};
 
-/// How data gets to the subscribers.
+/// The way in which data reaches the subscribers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Setup {
-    /// Each has two serial lines of its own, reads them byte by byte and does everything itself.
+    /// Each subscriber has its own two serial lines, reads them byte by byte and does everything itself.
     Bytes,
     /// The same, but each reads all bytes that have arrived.
     Blocks,
@@ -25,7 +25,7 @@ pub(crate) enum Setup {
 }
 
 impl Setup {
-    /// All set-ups in the order of the tables.
+    /// All setups in the order of the tables.
     pub(crate) const ALL: [Setup; 5] =
         [Setup::Bytes, Setup::Blocks, Setup::Datagrams, Setup::Scans, Setup::Results];
 
@@ -40,7 +40,8 @@ impl Setup {
         }
     }
 
-    /// Starts it for `count` subscribers; with none, only the sender of datagrams runs.
+    /// Starts the processes for `count` subscribers. With 0, only the sender of datagrams or the simulators and the hub
+    /// run.
     pub(crate) fn start(self, count: usize) -> Outcome<SetupProcesses> {
         let environment = BenchEnvironment::new()?;
         let part = |words: &[&str]| environment.start_part(&[&[PART_NAME], words].concat());
@@ -83,11 +84,11 @@ impl Setup {
     }
 }
 
-/// All processes of a set-up; they are ended in this order.
+/// All processes of a setup. They are ended in this order.
 pub(crate) struct SetupProcesses {
     pub(crate) consumers: Vec<Child>,
     pub(crate) hub: Option<Child>,
-    /// Processes that stand for hardware.
+    /// Processes that simulate hardware.
     pub(crate) drivers: Vec<Child>,
     _stage: BenchEnvironment,
 }
@@ -117,7 +118,7 @@ impl SetupProcesses {
                     [(first, from_ns), .., (last, to_ns)] => {
                         (last - first) as f64 * 1e9 / (to_ns - from_ns) as f64
                     }
-                    // Too slow, or the time is too short for a rate.
+                    // The program is too slow, or the time is too short for a rate.
                     _ => 0.0,
                 };
                 minimum = Some(minimum.map_or(hz, |minimum| minimum.min(hz)));
@@ -129,7 +130,7 @@ impl SetupProcesses {
 
 /// Second word of the command line of a part of this bench.
 pub(crate) const PART_NAME: &str = "host-load";
-/// Time after which buffers, caches and timing are as they will stay.
+/// Time after which buffers, caches and timing no longer change.
 const SETTLE_TIME: Duration = Duration::from_secs(2);
 
 /// CPU time during a run, in percent of one processor.
@@ -139,11 +140,11 @@ pub(crate) struct Load {
     pub(crate) machine: Share,
     /// Subscribers and hub by the scheduler.
     pub(crate) processes: Share,
-    /// Part of `processes`: the hub.
+    /// The part of `processes` that is the hub's.
     pub(crate) hub: Share,
     /// Threads of the kernel.
     pub(crate) kernel: f64,
-    /// Processes that stand for hardware.
+    /// Processes that simulate hardware.
     pub(crate) drivers: Share,
     /// This process.
     pub(crate) bench: Share,
@@ -155,7 +156,7 @@ pub(crate) struct Load {
     pub(crate) hz: f64,
 }
 
-/// The host's part by both counts, in percent of one processor.
+/// CPU time of the host by both counts, in percent of one processor.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Host {
     /// By `/proc/stat`, without processes that are not part of the host.
@@ -165,7 +166,7 @@ pub(crate) struct Host {
 }
 
 impl Load {
-    /// Returns the CPU time in `span` of these processes.
+    /// Returns the CPU time of these processes in `span`.
     pub(crate) fn of(span: &Span<'_>, children: &SetupProcesses, hz: f64) -> Outcome<Load> {
         let hub = span.of(&pids(&children.hub))?;
         Ok(Load {
@@ -181,9 +182,9 @@ impl Load {
         })
     }
 
-    /// Returns the host's part. On a loopback, a datagram is delivered within the system call of the sender; on a
-    /// network, the receiver's interrupt does that. The time that a sender needs beyond one without receivers, `deaf`,
-    /// therefore belongs to the host. Other set-ups do not need `deaf`.
+    /// Returns the host's part. On a loopback, the system call of the sender also delivers a datagram; on a network,
+    /// the receiver's interrupt does that. The time that a sender needs beyond `idle`, the time of one without
+    /// receivers, therefore belongs to the host. Other setups pass `None`.
     pub(crate) fn of_host(&self, idle: Option<Share>) -> Host {
         let delivery = idle.map_or(0.0, |deaf| (self.drivers.total() - deaf.total()).max(0.0));
         let delivery = Share { user: 0.0, system: delivery };

@@ -1,4 +1,4 @@
-//! What does the gateway add to a datagram, in latency and in CPU time, and how many datagrams can it send?
+//! Latency and CPU time that the gateway adds to a datagram, and the maximum number of datagrams that it can send.
 
 use std::io::Read;
 use std::net::UdpSocket;
@@ -24,15 +24,15 @@ use crate::wire::{self, has_topic, number};
 const SAMPLE_COUNT: usize = 800;
 /// Samples at the start of a run that do not count.
 const SKIPPED_SAMPLES: usize = 80;
-/// Two sensors at 37.5 Hz send every 13 ms; here it is somewhat faster, to keep runs short.
+/// Period of the samples, in ns. Two sensors at 37.5 Hz send every 13 ms; a shorter period keeps the runs short.
 const PERIOD_NS: u64 = 7_000_000;
-/// Position of the number in the header.
+/// Position of the sequence number in the header.
 const NUMBER_FIELD: std::ops::Range<usize> = 20..24;
-/// Words that make this program the sender of a bare run.
+/// Arguments with which this program is the sender of a baseline run.
 pub(crate) const SENDER_PART: [&str; 2] = ["part", "sender"];
 
-/// Measures p50 and p99 from shared memory to an application behind the loopback, alternating with an eventfd and a
-/// datagram of the same length.
+/// Measures p50 and p99 of the time from shared memory to a receiving application on the loopback. Alternates with a
+/// baseline that sends a datagram of the same length when an eventfd is signaled.
 pub(crate) fn latency(pairs: usize) -> Outcome<Vec<Figure>> {
     let (mut hub, mut baseline): (Vec<Run>, Vec<Run>) = Default::default();
     for pair in 0..pairs {
@@ -58,7 +58,7 @@ fn gateway_run() -> Outcome<Run> {
     let environment = BenchEnvironment::new()?;
     let mut source = ScanSource::open(&environment.domain)?;
     let gateway = wire::gateway(&environment, "lo", &[format!("--topic={SENSOR}/scan")])?;
-    // Until the gateway has found the hub and its sensor.
+    // Publish until the gateway has found the hub and its sensor.
     let attached = clock::now() + ATTACH_TIMEOUT_NS;
     while clock::now() < attached {
         clock::sleep_until(clock::now() + PERIOD_NS);
@@ -96,8 +96,8 @@ fn baseline_run() -> Outcome<Run> {
     application.end()
 }
 
-/// Plays the process that a bare run wakes: sends a datagram with the next number each time that the eventfd, its
-/// stdin, is signaled.
+/// Runs the process that a baseline run wakes. It sends a datagram with the next number each time that its stdin, an
+/// eventfd, is signaled.
 pub(crate) fn run_sender() -> Outcome<()> {
     set_parent_process_death_signal(Some(Signal::TERM))?;
     let socket = wire::sender()?;
@@ -127,7 +127,8 @@ struct Application {
 }
 
 impl Application {
-    /// Starts the thread. `stamp` finds in a datagram when it was made, in ns.
+    /// Starts the thread. `stamp` returns the time at which a datagram was created, in ns, or `None` for other
+    /// datagrams.
     fn start(stamp: impl Fn(&[u8]) -> Option<u64> + Send + 'static) -> Outcome<Application> {
         let (socket, is_finished) = (wire::receiver()?, Arc::new(AtomicBool::new(false)));
         let flag = is_finished.clone();
@@ -146,7 +147,8 @@ impl Application {
         Ok(Application { is_finished, thread })
     }
 
-    /// Returns what arrived. A hub does not wait for a process that is descheduled.
+    /// Ends the thread, and returns what arrived. Some may be missing, because a hub does not wait for a process that
+    /// is descheduled.
     fn end(self) -> Outcome<Run> {
         self.is_finished.store(true, Ordering::Relaxed);
         let ages = self.thread.join().map_err(|_| "the application panicked")?;
@@ -179,7 +181,7 @@ const ATTACH_TIMEOUT: Duration = Duration::from_secs(6);
 const UNPACED_TIME: Duration = Duration::from_secs(3);
 /// Name of the thread that is the baseline.
 const BASELINE_THREAD: &str = "bare";
-/// Datagrams within this time are sent without a pause.
+/// Datagrams within this time are sent without a pause, in ns.
 const BURST_NS: u64 = 1_000_000;
 
 /// Time of arrival, and a datagram.
@@ -216,7 +218,7 @@ pub(crate) fn cpu_time(pairs: usize) -> Outcome<Vec<Figure>> {
     ])
 }
 
-/// Returns the gateway's CPU time in ns, and what it sends.
+/// Returns the gateway's CPU time in ns, and the datagrams that it sent.
 fn gateway_cpu_time(environment: &BenchEnvironment) -> Outcome<(f64, Vec<ReceivedDatagram>)> {
     let gateway = wire::gateway(environment, "lo", &wire::all_topics())?;
     thread::sleep(ATTACH_TIMEOUT);
@@ -232,7 +234,7 @@ fn gateway_cpu_time(environment: &BenchEnvironment) -> Outcome<(f64, Vec<Receive
     Ok((busy_ns as f64, received))
 }
 
-/// Returns the CPU time of a thread that sends the same, with a receiver too.
+/// Returns the CPU time of a thread that sends the same datagrams, with a receiver as well.
 fn baseline_cpu_time(received: &[ReceivedDatagram]) -> Outcome<f64> {
     let (stop, socket, to_groups) = (Arc::new(AtomicBool::new(false)), wire::receiver()?, wire::sender()?);
     let flag = stop.clone();
@@ -280,7 +282,7 @@ fn receive(socket: &UdpSocket, stop: &AtomicBool) -> Vec<ReceivedDatagram> {
     received
 }
 
-/// Returns how many scans per second the gateway sends if there are always more.
+/// Returns how many scans per second the gateway sends if more are always available.
 fn max_rate_of_gateway() -> Outcome<f64> {
     let environment = BenchEnvironment::new()?;
     let mut source = ScanSource::open(&environment.domain)?;
@@ -291,7 +293,7 @@ fn max_rate_of_gateway() -> Outcome<f64> {
     }
     let lines = gateway.end()?;
     let scans: Vec<_> = lines.iter().filter(|(_, line)| has_topic(line, SENSOR, "scan")).collect();
-    // Between two of its statistics in the middle.
+    // Compare two of its statistics in the middle of the run.
     let [.., (from_ns, first), (to_ns, last), _] = scans[..] else { return Err("too few statistics".into()) };
     if number(last, "missed") == number(first, "missed") {
         eprintln!("the gateway could have sent more");

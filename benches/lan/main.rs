@@ -1,5 +1,5 @@
-//! What does the network add? Everything runs in separate network namespaces, with `unshare`, `nsenter` and `ip`. The
-//! parts are:
+//! Costs and losses of the network. Everything runs in separate network namespaces, with `unshare`, `nsenter` and `ip`.
+//! The parts are:
 //!
 //! - the age of a scan that a gateway sent, compared with a datagram that an eventfd triggers
 //! - the gateway's CPU time, compared with a thread that sends the same datagrams, and how many it can send
@@ -15,7 +15,7 @@
 mod child;
 mod gateway;
 #[path = "../../tests/testkit/machine.rs"]
-#[allow(dead_code)] // Tests use more of it.
+#[allow(dead_code)] // Tests use more items.
 mod machine;
 #[path = "../support/mod.rs"]
 mod support;
@@ -78,7 +78,7 @@ fn measure_healthy_link(seconds: u64) -> Outcome<Vec<Figure>> {
     let mut rates = Vec::new();
     for sensor in SENSORS {
         let lines: Vec<_> = sent.iter().filter(|(_, line)| has_topic(line, sensor, "scan")).collect();
-        // The first statistics are from before the sensors stream, the last may cover a fraction of a second.
+        // The first statistics are from before the sensors stream. The last ones may cover a fraction of a second.
         let [(from_ns, first), .., (to_ns, last), _] = lines[..] else { return Err("too short".into()) };
         let count = number(last, "sent") - number(first, "sent");
         rates.push(count as f64 / ((to_ns - from_ns) as f64 / 1e9));
@@ -120,11 +120,11 @@ fn size(name: &'static str, count: usize, contents: u8) -> Figure {
     Figure { name, unit: "B", hub, baseline: Vec::new(), target: Target::Max(MTU_SAFE as f64) }
 }
 
-/// Damaged datagrams between two intact ones; a listener's buffer certainly holds this number.
+/// Damaged datagrams between two intact ones. A listener's buffer certainly holds this number.
 const DAMAGED_PER_INTACT: u64 = 50;
 
-/// Sends `count` damaged and random datagrams to a listener: what does it accept, what does it report, and does its
-/// memory grow?
+/// Sends `count` damaged and random datagrams to a listener. Measures what it accepts and reports, and whether its
+/// memory grows.
 fn damaged_datagrams(count: u64) -> Outcome<Vec<Figure>> {
     let mut command = Command::new(wire::PROGRAM);
     command.args(["listen", "--json", "--interface=lo", "--topic=zones"]);
@@ -179,7 +179,7 @@ fn sealed_datagram(
     Ok(head.seal(buffer, len).ok_or("it does not fit")?.to_vec())
 }
 
-/// Returns one of `whole` with some bits, its end, or all of its rest changed; or noise.
+/// Returns one of `intact` with some bits flipped, with its end cut off, extended, or replaced; or random bytes.
 fn damaged_datagram(random: &mut fastrand::Rng, intact: &[Vec<u8>]) -> Vec<u8> {
     let mut bytes = intact[random.usize(..intact.len())].clone();
     match random.u8(..5) {
@@ -212,7 +212,7 @@ fn resident_kb(program: &Program) -> Outcome<u64> {
 /// Time for which the gateway's link is down.
 const DOWN_TIME: Duration = Duration::from_secs(10);
 
-/// Takes the gateway's link down: when is it received again, and does another machine notice?
+/// Takes the gateway's link down. Measures when it is received again, and whether another machine notices.
 fn measure_link_down() -> Outcome<Vec<Figure>> {
     let environment = BenchEnvironment::new()?;
     let (pulled, other) = (Machine::new(3), Machine::new(4));

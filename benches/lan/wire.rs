@@ -69,7 +69,7 @@ pub(crate) fn all_topics() -> Vec<String> {
     Topic::ALL.iter().map(|topic| format!("--topic=*/{}", topic.name())).collect()
 }
 
-/// Starts the gateway of `stage`.
+/// Starts a gateway in the domain of `environment`.
 pub(crate) fn gateway(environment: &BenchEnvironment, interface: &str, flags: &[String]) -> Outcome<Program> {
     let mut command = Command::new(PROGRAM);
     command
@@ -119,7 +119,8 @@ impl Program {
         }
     }
 
-    /// Returns when the first line of this class after `since_ns` arrived, and drops the lines before it.
+    /// Waits for the first line of this class after `since_ns`, and returns the time at which it arrived. Drops the
+    /// lines before it.
     pub(crate) fn wait_for_class_after(&self, since_ns: u64, class: &str) -> Outcome<u64> {
         loop {
             let (at_ns, line) =

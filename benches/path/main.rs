@@ -1,13 +1,13 @@
-//! Measures what the hub executes for one telegram. Counts instructions, code lines of 64 bytes, code pages of 4 KiB and
-//! system calls of a link's thread, by single steps under ptrace, with one subscriber that waits for scans. The figures
-//! hardly depend on the machine's load, unlike those of `hub_load`. The bench does not measure time.
+//! Instructions, code lines of 64 bytes, code pages of 4 KiB and system calls that the hub executes for one telegram.
+//! They are counted by single steps of a link's thread under ptrace, with one subscriber that waits for scans. The
+//! figures hardly depend on the machine's load, unlike those of `hub_load`. The bench does not measure time.
 //!
-//! The sensor sends at 9,600 baud, so that the steps keep up. Two costs would therefore be too high and are left out:
-//! repeated waits ([`steps::Cost`]), and what the hub does at most ten times a second, which is with every telegram at
-//! this rate, but with one of four at 500,000 baud. It examines the session and searches for subscribers, and once a
-//! second it publishes the status. The stage of the status is still shown. Without symbols, all figures contain it. The
-//! steps delay the hub, so it sleeps and reads less often than usual. System calls are therefore also counted at 500,000
-//! baud, without steps.
+//! The sensor sends at 9,600 baud, so that the steps keep up. Two costs would therefore be too high and are excluded.
+//! The first is repeated waits ([`steps::TelegramCost`]). The second is work that the hub does at most ten times a
+//! second: at this rate with every telegram, but at 500,000 baud with one of four. In it, the hub examines the session
+//! and searches for subscribers, and once a second it publishes the status. The stage of the status is still shown.
+//! Without symbols, all figures contain it. The steps delay the hub, so it sleeps and reads less often than usual.
+//! System calls are therefore also counted at 500,000 baud, without steps.
 //!
 //! The background is measured while it is being learned, and after it was. Another hub learns it at 500,000 baud, and
 //! the measured one starts with the saved model.

@@ -114,7 +114,7 @@ pub(crate) enum PathStage {
 }
 
 /// Stages by a part of the names of functions. The innermost function with a stage counts, so that the shared-memory
-/// library, `memcpy` and the standard library belong to their callers. The first entry that fits a name counts.
+/// library, `memcpy` and the standard library belong to their callers. The first entry that matches a name counts.
 const STAGES: [(&str, PathStage); 34] = [
     ("preprocess::zones::", PathStage::Zones),
     ("Pipeline::check_zones", PathStage::Zones),
@@ -152,7 +152,8 @@ const STAGES: [(&str, PathStage); 34] = [
     ("rustix::", PathStage::Sleeping),
 ];
 
-/// Ends of the names of functions in which everything belongs to the status. With it, the hub saves the scanner's identity.
+/// Ends of the names of functions whose steps all belong to the status. With the status, the hub saves the scanner's
+/// identity.
 const STATUS_SUFFIXES: [&str; 6] = [
     "SessionDriver<S>::report",
     "LinkState<S>::publish_status",
@@ -214,7 +215,7 @@ impl Steps {
 /// Profile of several telegrams.
 pub(crate) struct Profile<'a> {
     code: &'a Code,
-    /// Stage of each function that was met, by its address.
+    /// Stage of each function that was executed, by its address.
     stages: HashMap<u64, Option<PathStage>>,
     pub(crate) telegrams: u64,
     pub(crate) by_stage: BTreeMap<PathStage, Totals>,
@@ -240,9 +241,9 @@ impl<'a> Profile<'a> {
         }
     }
 
-    /// Returns patterns for the symbols of the functions that were stepped through, in their order: those of the path, or
-    /// those `of_status`. The patterns leave out the hash at the end of a symbol, and with it the types of a generic
-    /// function.
+    /// Returns patterns for the symbols of the functions that were stepped through, in their order: those of the path,
+    /// or those of the status if `of_status`. The patterns omit the hash at the end of a symbol, and with it the types
+    /// of a generic function.
     pub(crate) fn patterns(&self, of_status: bool) -> Vec<String> {
         let symbols = functions(&self.code.program, self.code.base, &[]);
         let of_address = |address| {

@@ -1,18 +1,18 @@
-//! How well are people separated from the background? The two methods of the hub next to two simple ones, in scenes of
-//! the simulated world in which the truth of each beam is known.
+//! Separation of people from the background, by the two methods of the hub and by two simple ones, in scenes of the
+//! simulated world in which the truth of each beam is known.
 //!
 //! A beam counts as foreground if it meets a person with all of its spot. A reported beam is wrong in three cases: it
 //! meets something that has always been in the scene, it meets what was behind an object that was taken away, or it
-//! meets an object that was put down or moved more than 20 s ago. Not counted are beams that graze a person or a moved
-//! object, beams without a reading, and objects that were put down or moved in the last 20 s.
+//! meets an object that was put down or moved more than 20 s ago. Beams do not count if they graze a person or a moved
+//! object, have no reading, or meet an object that was put down or moved in the last 20 s.
 //!
 //! Recall is the share of the foreground beams that are found, precision the share of the reported beams that are
 //! right. Wrong beams are per scan, over all 2000 scans including the first ones.
 //!
 //! A person who stands in the room at the start is learned, and no method finds this person while standing. The crowd
-//! is also present from the start. A person behind a door that has just opened is farther away than the door was, so
-//! no method finds this person either. Bytes are payloads on a network; an empty foreground has 58 of them. In the
-//! room of Fig. 8, a person is present for 40 % of the time.
+//! is also present from the start. A person behind a door that has just opened is farther away than the door was, so no
+//! method finds this person either. Bytes are payloads on a network; an empty foreground has 58 of them. In the room of
+//! Fig. 8, a person is present for 40 % of the time.
 
 use std::ops::Range;
 
@@ -110,7 +110,7 @@ pub(crate) fn measure(seeds: Range<u64>, is_json: bool) {
         }
         cells.extend(METHODS.iter().zip(&scores).flat_map(|(name, score)| scored(scene, name, score)));
     }
-    // One table for each of these quantities, although they are counted scene by scene.
+    // One table for each of these quantities, although they are computed scene by scene.
     cells.sort_by_key(|cell| {
         [RECALL_TABLE, PRECISION_TABLE, WRONG_TABLE].iter().position(|table| cell.table == *table)
     });
@@ -147,7 +147,7 @@ fn scored(scene: &Scene, method: &str, score: &Score) -> [Cell; 3] {
 }
 
 fn cell(table: &str, row: &str, method: &str, unit: &'static str, value: f64) -> Cell {
-    // Without a person or without an answer, the share is not a number.
+    // Without a person or without a reported beam, the share is not a number.
     let values = if value.is_finite() { vec![value] } else { Vec::new() };
     Cell { table: table.into(), row: row.into(), column: method.into(), unit, values }
 }
@@ -194,8 +194,8 @@ impl PayloadBytes {
     }
 }
 
-/// A teach-in that never adapts. The background of a beam is the median of its first [`LEARNING_SCANS`] readings; what is
-/// nearer by more than 30 mm (60 in cm mode) is foreground.
+/// A method that learns only at the start. The background of a beam is the median of its readings in the first
+/// [`LEARNING_SCANS`] scans. Readings that are nearer by more than 30 mm (60 in cm mode) are foreground.
 struct TeachIn {
     scans: usize,
     readings_mm: Vec<Vec<u32>>,
@@ -235,7 +235,7 @@ impl Detector for TeachIn {
 /// one mixture for each beam. At most five Gaussians, learning rate 1/375 (1/n at first). The heaviest ones that
 /// together weigh .9 are background. A reading within four standard deviations is background, one within three adapts
 /// the Gaussian. Weights decay by a prior of .05. The standard deviation starts at 15 mm and stays between 5 and 40 mm,
-/// twice as much in cm mode. Only what is nearer than the heaviest Gaussian counts as foreground.
+/// twice as much in cm mode. Only readings that are nearer than the heaviest Gaussian count as foreground.
 struct Mixtures {
     scans: f64,
     beams: Vec<Vec<Gaussian>>,

@@ -1,13 +1,13 @@
-//! How near are the lines of a scan to its beams, and how long does it take to find them? Both forms of the hub's
-//! method next to simple methods with the same number of vertices. Rooms are drawn at random as in the experiment of
-//! PLE (Schaefer, Buescher, Luft, Burgard, IROS 2018), and logs are of real sensors.
+//! Accuracy of the lines in a scan relative to its beams, and the time that it takes to find them. Both forms of the
+//! hub's method are compared with simple methods with the same number of vertices. Rooms are drawn at random as in the
+//! experiment of PLE (Schaefer, Buescher, Luft, Burgard, IROS 2018), and logs are from real sensors.
 //!
 //! J vertices make J - 1 lines. The ratio is to iterative end-point fit on the same scans, as in PLE's publication, and
 //! the target is PLE's own ratio. The lines have to cover .97 of the beams of a room.
 //!
 //! The RMSE covers the beams that meet a line, so it has to be read with the share of the beams. The hub's lines need
-//! not be connected. On logs, points more than 1 m apart are not connected, and if there are too many lines, the
-//! worst are left out.
+//! not be connected. On logs, points more than 1 m apart are not connected, and if there are too many lines, the worst
+//! are dropped.
 
 use std::f64::consts::{PI, TAU};
 use std::ops::Range;
@@ -51,7 +51,7 @@ pub(crate) fn measure(is_quick: bool, is_json: bool) {
 /// Returns the hub's line finder, limited only by the number of vertices. Points farther apart than `gap_m` are not
 /// connected.
 fn hub_line_finder(count: usize, refine: bool, gap_m: f64) -> LineFinder {
-    // Two beams, as for the others: all beams of a room count.
+    // At least two beams per line, as for the other methods, because all beams of a room count.
     let settings =
         Settings { max: count as u8 - 1, min_points: 2, refine, stop: StopCriterion::Number(gap_m) };
     LineFinder::new(Pose::default(), settings, 1081)
@@ -118,7 +118,8 @@ fn measure_rooms(seeds: Range<u64>, figures: &mut Vec<Figure>, cells: &mut Vec<C
     }
 }
 
-/// Compares lines with the true walls, as a user can configure them, next to end-point fit with the true number of vertices.
+/// Compares lines with the true walls, with settings that a user can configure, and with end-point fit with the true
+/// number of vertices.
 fn compare_with_walls(seeds: Range<u64>, cells: &mut Vec<Cell>) {
     let draws: Vec<Vec<Room>> = seeds.map(|seed| draw_rooms(seed, RAY_COUNT)).collect();
     let mut lines = Lines::default();
@@ -157,7 +158,7 @@ fn compare_with_walls(seeds: Range<u64>, cells: &mut Vec<Cell>) {
         });
     }
     put("end-point fit", &mut |room| end_points(&room.scan, room.corners + 1));
-    // A line of one beam for each beam.
+    // One line for each beam.
     put("true walls", &mut |room| {
         let line = |(beam, range): (usize, &f64)| (beam, beam, *range, room.scan.angle(beam));
         FoundLines { lines: room.walls_m.iter().enumerate().map(line).collect() }
@@ -253,7 +254,7 @@ fn mean(scores: &[Score]) -> Score {
     Score { rmse: mean(|score| score.rmse), share: mean(|score| score.share) }
 }
 
-/// A beam that has a range, and where it ends.
+/// A beam with a range, and its end.
 #[derive(Clone, Copy)]
 struct Point {
     beam: usize,
@@ -297,8 +298,8 @@ fn farthest(points: &[Point], first: usize, last: usize) -> (f64, usize) {
         .fold((0.0, first), |best, one| if one.0 > best.0 { one } else { best })
 }
 
-/// Returns the indices of the vertices of the polyline, starting with both ends. Each further vertex is the farthest
-/// point of all.
+/// Returns the indices of the vertices of the polyline. They start with both ends. Each further vertex is the point
+/// that is farthest from the polyline so far.
 fn vertices(points: &[Point], count: usize) -> Vec<usize> {
     let mut vertices = vec![0, points.len() - 1];
     let mut splits = vec![farthest(points, 0, points.len() - 1)];
@@ -315,11 +316,11 @@ fn vertices(points: &[Point], count: usize) -> Vec<usize> {
     vertices
 }
 
-/// Returns the beams that meet the line between the ends that its outermost points have on it.
+/// Returns the line with the first and last beam that meet it between the projections of the outermost points.
 fn beams_on_line(points: &[Point], (r, alpha): (f64, f64)) -> Option<(usize, usize, f64, f64)> {
     let (first, last) = (points.first()?, points.last()?);
     let (sin, cos) = alpha.sin_cos();
-    // Angle by which a point appears to the left of the end on the line, in radians.
+    // Returns the angle by which a point appears to the left of an end's projection on the line, in radians.
     let left_of = |p: &Point, end: &Point| {
         let off = end.x * cos + end.y * sin - r;
         let (x, y) = (end.x - off * cos, end.y - off * sin);
@@ -331,7 +332,7 @@ fn beams_on_line(points: &[Point], (r, alpha): (f64, f64)) -> Option<(usize, usi
     Some((begin.beam, end.beam, r, alpha))
 }
 
-/// Iterative end-point fit: the polyline through some of the points.
+/// Iterative end-point fit. The lines are those of the polyline through some of the points.
 fn end_points(scan: &Scan, count: usize) -> FoundLines {
     let points = points(scan);
     let mut lines = Vec::new();
@@ -361,8 +362,8 @@ fn regression(points: &[Point]) -> ((f64, f64), f64) {
     (normal_form(normal, x, y), error.max(0.0))
 }
 
-/// Split and merge: cuts into twice as many pieces as end-point fit, then merges the neighbors whose common line is
-/// nearest to their points until few enough are left.
+/// Split and merge. Cuts into twice as many pieces as end-point fit, and then merges the neighbors whose common line is
+/// nearest to their points until few enough remain.
 fn split_and_merge(scan: &Scan, count: usize) -> FoundLines {
     let points = points(scan);
     if points.len() < 2 {
@@ -398,8 +399,8 @@ const RANSAC_TRIES: usize = 200;
 /// Maximum distance of a point that belongs to a line of RANSAC, in meters.
 const RANSAC_DISTANCE_M: f64 = 0.05;
 
-/// RANSAC: of random lines through two points, takes the one with the longest row of near points, removes these points,
-/// and repeats.
+/// RANSAC. Draws random lines through two points, takes the one with the longest run of near points, removes these
+/// points, and repeats.
 fn ransac(scan: &Scan, count: usize) -> FoundLines {
     let mut random = Rng::with_seed(1);
     let mut left = points(scan);
@@ -420,7 +421,7 @@ fn ransac(scan: &Scan, count: usize) -> FoundLines {
         lines.extend(beams_on_line(&left[best.clone()], regression(&left[best.clone()]).0));
         left.drain(best);
     }
-    // If two lines cover a beam, the first one counts: it has more points.
+    // If two lines cover a beam, the first one counts, because it has more points.
     FoundLines { lines }
 }
 
@@ -445,8 +446,8 @@ const CORNER_COUNTS: [usize; 7] = [3, 4, 5, 6, 12, 36, 180];
 /// Standard deviation of the noise of a ray: of the angle in degrees, of the range in meters.
 const RAY_NOISE: (f64, f64) = (0.2, 0.03);
 
-/// Returns the set of scans of `seed`, each with `rays` rays over a full turn including both ends: the first and the
-/// last ray have the same direction.
+/// Returns the rooms of `seed` with scans of `rays` rays over 360 degrees including both ends: the first and the last
+/// ray have the same direction.
 fn draw_rooms(seed: u64, rays: usize) -> Vec<Room> {
     let mut random = Rng::with_seed(seed);
     (0..SCANS_PER_SET).map(|_| room(&mut random, rays)).collect()

@@ -1,9 +1,9 @@
-//! How good are the results that the hub computes from scans: foreground, lines, motion, and foreground of a moving
-//! robot? Each one next to simple methods, in simulated scenes with known truth and on recordings of real sensors, if
-//! there are any: `cargo bench --bench perception [-- [foreground|lines|motion|moving ..] [--json] [--quick] [--seeds
+//! Quality of the results that the hub computes from scans: foreground, lines, motion, and foreground of a moving
+//! robot. Each is compared with simple methods, in simulated scenes with known truth and on recordings of real sensors
+//! if they exist: `cargo bench --bench perception [-- [foreground|lines|motion|moving ..] [--json] [--quick] [--seeds
 //! FROM..TO]]`.
 //!
-//! It does not measure what the results cost in the hub: that is what `preprocess` is for.
+//! The bench `preprocess` measures what the results cost in the hub.
 
 mod foreground;
 mod lines;
@@ -12,7 +12,7 @@ mod moving;
 mod recordings;
 
 #[path = "../support/figures.rs"]
-#[allow(dead_code)] // Benches that measure processes use more of it.
+#[allow(dead_code)] // Benches that measure processes use more items.
 mod figures;
 #[path = "../../tests/testkit/foreground.rs"]
 mod scenes;

@@ -1,9 +1,9 @@
-//! How exact is a robot's motion that is estimated from its scans, and how long does it take? The hub's method next to
-//! plain point-to-point and point-to-line matching of two scans, which start at the pose of the first scan and leave
-//! out the worst tenth of the pairs. Measured on recorded drives of real robots and on simulated ones.
+//! Accuracy of a robot's motion that is estimated from its scans, and the time that it takes. The hub's method is
+//! compared with plain point-to-point and point-to-line matching of two scans. These start at the pose of the first
+//! scan and drop the worst tenth of the pairs. Measured on recorded drives of real robots and on simulated ones.
 //!
-//! The positions of three logs come from a map that was built from them, with errors of about 20 mm; those of the model
-//! cars mean nothing below 5 mm. Steps of three of the logs are a meter and more, so the limits of `[motion]` are
+//! The positions of three logs come from a map that was built from them, with errors of about 20 mm. Those of the model
+//! cars have no meaning below 5 mm. Steps of three of the logs are a meter and more, so the limits of `[motion]` are
 //! wider there. A step is wrong if it is off by 200 mm (100 mm for the cars) or 5 degrees. `people in half; hidden`
 //! compares with the same scans in which beams on people have no reading.
 
@@ -71,7 +71,7 @@ fn median(values: &mut [f64]) -> f64 {
     figures::percentile(values, 0.5).unwrap_or(f64::NAN)
 }
 
-/// Adds the scores of at most `most` steps of `drive`, evenly spread.
+/// Adds the scores of at most `max_steps` steps of `drive`, evenly spread.
 fn measure_drive(drive: &Drive, max_steps: usize, cells: &mut Vec<Cell>) {
     let (motions, times_us) = run(&drive.scans, drive.settings);
     let steps: Vec<(usize, Pose2)> = drive.steps().collect();
@@ -390,7 +390,8 @@ struct Walker {
     by_second: Point,
 }
 
-/// Moves the people, and replaces those who leave the view from `seen`, so that about half of the view is hidden.
+/// Moves the people, and replaces those who leave the view from `visible_from`, so that about half of the view is
+/// hidden.
 fn move_people(people: &mut Vec<Walker>, visible_from: &Pose2, random: &mut Rng) {
     for Walker { at, by_second } in people.iter_mut() {
         *at = (at.0 + by_second.0 * SCAN_PERIOD_S, at.1 + by_second.1 * SCAN_PERIOD_S);
@@ -411,7 +412,7 @@ fn move_people(people: &mut Vec<Walker>, visible_from: &Pose2, random: &mut Rng)
     }
 }
 
-/// Returns `count` scans of `beams` beams over 180 degrees (1081 beams: over 270), and the pose of the robot at each.
+/// Returns `count` scans of `beams` beams over 180 degrees (270 for 1081 beams), and the pose of the robot at each.
 fn drive(kind: DriveKind, beams: usize, count: usize, seed: u64) -> (Vec<Box<Scan>>, Vec<Pose2>) {
     let mut random = Rng::with_seed(seed);
     let walls = match kind {
@@ -431,7 +432,7 @@ fn drive(kind: DriveKind, beams: usize, count: usize, seed: u64) -> (Vec<Box<Sca
         if at > 0 {
             turn = (turn + 0.3 * (random.f64() - 0.5)).clamp(-0.8, 0.8);
             speed = (speed + 0.1 * (random.f64() - 0.5)).clamp(0.2, 1.2);
-            // Far from the center, the robot turns back.
+            // A robot far from the center turns back.
             let is_far = pose.x.hypot(pose.y) > 1.5;
             let home = (-pose.y).atan2(-pose.x) - pose.yaw;
             let turn = if is_far { 1.5 * home.sin() } else { turn };
@@ -474,7 +475,7 @@ fn drive(kind: DriveKind, beams: usize, count: usize, seed: u64) -> (Vec<Box<Sca
     (scans, poses)
 }
 
-/// Returns the square of `off` in standard deviations of `covariance`.
+/// Returns the square of `deviation` in standard deviations of `covariance`.
 fn normalized(deviation: &[f64; 3], covariance: &[f32; 9]) -> Option<f64> {
     let matrix = std::array::from_fn(|i| std::array::from_fn(|j| f64::from(covariance[3 * i + j])));
     let x = solve(matrix, *deviation)?;

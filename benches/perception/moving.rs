@@ -1,9 +1,9 @@
-//! How well does a robot that drives distinguish moving from static objects? `background.method = "moving"` on
-//! simulated drives with known truth, next to `multi` where the robot stands, and on recordings of a model car with
-//! another car whose position is known.
+//! Separation of moving from static objects by a robot that drives, with `background.method = "moving"`. Simulated
+//! drives have known truth, and a standing robot is compared with `multi`. Recordings are from a model car with another
+//! car whose position is known.
 //!
 //! A beam counts as foreground if it meets a person with all of its spot, in space that was seen free at least five
-//! times. Not counted are beams at a person's edge, people where nothing was seen before, and the first 12 s.
+//! times. Beams at a person's edge, people in space that was not seen before, and the first 12 s do not count.
 //!
 //! A point belongs to the other car within 0.2 m of its pose while it moves. A false beam is one reported more than
 //! 0.4 m from it.
@@ -56,8 +56,8 @@ impl Processors {
     }
 }
 
-/// Returns recall and precision of `method` from scan `from` on, and the time in us per scan. A map with the true poses
-/// says which beams are foreground.
+/// Returns recall and precision of `method` from scan `from` on, and the time in us per scan. A map built with the true
+/// poses determines which beams are foreground.
 fn run(drive: &Drive, method: Method, from: usize) -> (f64, f64, f64) {
     let beams = drive.scans[0].beams();
     let mut processors = Processors::new(method, beams);
@@ -116,8 +116,8 @@ fn measure_drives(seeds: Range<u64>, figures: &mut Vec<Figure>) {
     put("standing: precision below multi's", "1", less(1), Vec::new(), Target::Max(0.01));
 }
 
-/// Adds the scores for the other car while it moves: the share of its beams that are reported, and other beams that
-/// are, per scan.
+/// Adds the scores for the other car: the share of the beams on it that are reported while it moves, and the number of
+/// other beams that are reported per scan.
 fn measure_recordings(cells: &mut Vec<Cell>) {
     let recordings = recordings::drives_with_other_car();
     if recordings.is_empty() {

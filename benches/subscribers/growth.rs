@@ -1,4 +1,5 @@
-//! Quantities over a number of subscribers, sensors or beams: a table, and a fit that says how they grow.
+//! Tables of quantities for several numbers of subscribers, sensors or beams, with fits that show how the quantities
+//! grow.
 
 use crate::support::figures::{self, Cell, percentile};
 
@@ -14,17 +15,17 @@ pub(crate) struct Quantity {
 /// Values of several quantities, measured for several numbers.
 pub(crate) struct ParameterRange {
     title: String,
-    /// What is counted.
+    /// Name of the counted items, such as `subscribers`.
     counted: &'static str,
     quantities: Vec<Quantity>,
     /// The numbers in order, each with the values of all runs by quantity.
     rows: Vec<(usize, Vec<Vec<f64>>)>,
 }
 
-/// How a quantity grows, from the medians of its runs.
+/// Growth of a quantity, from the medians of its runs.
 #[derive(Clone, Copy, Debug)]
 struct Growth {
-    /// Parameters of `fixed + each * n`, by least squares of relative errors.
+    /// Parameters of the fit `fixed + per_item * n`, by least squares of relative errors.
     fixed: f64,
     per_item: f64,
     /// Slope of the logarithms for large numbers: 1 for a quantity that grows linearly.
@@ -32,7 +33,7 @@ struct Growth {
 }
 
 impl ParameterRange {
-    /// Creates a sweep without values.
+    /// Creates a range without values.
     pub(crate) fn new(title: &str, counted: &'static str, quantities: Vec<Quantity>) -> ParameterRange {
         ParameterRange { title: title.to_owned(), counted, quantities, rows: Vec::new() }
     }
@@ -47,7 +48,7 @@ impl ParameterRange {
         }
     }
 
-    /// Prints the values and how they grow.
+    /// Prints the values and their growth.
     pub(crate) fn print(&self, is_json: bool) {
         figures::print_cells("subscribers", is_json, &self.cells());
         figures::print_cells("subscribers", is_json, &self.growths(is_json));
@@ -68,7 +69,7 @@ impl ParameterRange {
         self.rows.iter().flat_map(row).collect()
     }
 
-    /// Returns the fits, and prints which quantities grow worse than linearly.
+    /// Returns the fits, and prints which quantities grow faster than linearly.
     fn growths(&self, json: bool) -> Vec<Cell> {
         let mut cells = Vec::new();
         for (at, quantity) in self.quantities.iter().enumerate() {
@@ -95,7 +96,7 @@ impl ParameterRange {
         cells
     }
 
-    /// The median of quantity `at` for each number.
+    /// Returns the median of quantity number `at` for each number.
     fn medians(&self, at: usize) -> Vec<(f64, f64)> {
         let median = |(number, row): &(usize, Vec<Vec<f64>>)| {
             let mut sorted = row[at].clone();
@@ -107,7 +108,7 @@ impl ParameterRange {
 }
 
 impl Growth {
-    /// Returns `None` for fewer than three numbers, or if a value is zero.
+    /// Returns the growth over `points`, or `None` for fewer than three numbers, or if a value is zero.
     fn of(points: &[(f64, f64)]) -> Option<Growth> {
         let greatest = points.last()?.0;
         if points.len() < 3 || points.iter().any(|&(n, value)| n <= 0.0 || value <= 0.0) {
@@ -116,7 +117,7 @@ impl Growth {
         let (fixed, per_item) = line(points.iter().map(|&(n, value)| (n, value, 1.0 / (value * value))))?;
         let far = points.iter().filter(|(n, _)| n * LARGE_FACTOR >= greatest);
         let near = points.len().saturating_sub(3);
-        // At least three, or the slope would be the spread of two runs.
+        // Use at least three points; with two, the slope would only show the spread of two runs.
         let far: Vec<_> =
             if far.clone().count() < 3 { points[near..].to_vec() } else { far.copied().collect() };
         let (_, exponent) = line(far.iter().map(|(n, value)| (n.ln(), value.ln(), 1.0)))?;
@@ -124,7 +125,7 @@ impl Growth {
     }
 }
 
-/// Returns a and b of the line `a + b x` that is nearest to the points with their weights.
+/// Returns a and b of the line `a + b x` with the smallest weighted sum of squares for points `(x, value, weight)`.
 fn line(points: impl Iterator<Item = (f64, f64, f64)>) -> Option<(f64, f64)> {
     let [mut weights, mut x, mut y, mut xx, mut xy] = [0.0; 5];
     for (at, value, weight) in points {
@@ -141,5 +142,5 @@ fn line(points: impl Iterator<Item = (f64, f64, f64)>) -> Option<(f64, f64)> {
 
 /// Numbers within this factor of the largest one count as large.
 const LARGE_FACTOR: f64 = 16.0;
-/// An exponent that is larger than that of linear growth by this much is not explained by the spread of a few runs.
+/// An exponent that exceeds that of linear growth by more than this is not explained by the spread of a few runs.
 const EXPONENT_TOLERANCE: f64 = 0.25;

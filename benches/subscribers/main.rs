@@ -1,30 +1,29 @@
-//! What do many subscribers cost, what do broken ones cost the others, and how do the hub's costs grow?
+//! Costs of many subscribers, effects of broken subscribers on the others, and growth of the hub's costs.
 //!
 //! A hundred subscribers receive one sensor at once. Then a process that holds samples is killed twenty times, a
-//! subscriber is stopped for two seconds, and all places of a topic are taken. A witness loses nothing in all of this,
-//! and the hub is afterwards as it was before.
+//! subscriber is stopped for two seconds, and all slots of a topic are taken. A witness loses nothing in all of this,
+//! and afterwards the hub is in the same state as before.
 //!
-//! CPU time and memory are then measured over the number of subscribers, of sensors on lines, of sensors in virtual
-//! time, and of beams; a fit says how each of them grows. Subscribers are threads of four processes. Lines are ptys of
-//! this machine: where simulators and hub no longer keep the rate of the sensors, the table shows it. The bench does
-//! not measure real adapters.
+//! CPU time and memory are then measured for several numbers of subscribers, of sensors on lines, of sensors in virtual
+//! time, and of beams, and a fit shows how each of them grows. Subscribers are threads of four processes. Lines are
+//! ptys of this machine. If simulators and hub no longer keep the rate of the sensors, the table shows it. The bench
+//! does not measure real adapters.
 //!
 //! How to read the figures:
 //!
-//! - In virtual time, the whole hub runs without ports and without waiting (`tests/testkit/virtual_hub.rs`).
-//!   Simulated telegrams arrive in three reads and pass framer, session, decoding and all processors into all topics
-//!   in shared memory. One system call wakes the subscribers, and one subscriber to each topic takes everything.
-//!   Reads, sleeps and wake-ups of subscribers are not included; `sensors on ptys` and `subscribers of one sensor`
-//!   include them.
+//! - In virtual time, the whole hub runs without ports and without waiting (`tests/testkit/virtual_hub.rs`). Simulated
+//!   telegrams arrive in three reads and pass framer, session, decoding and all processors into all topics in shared
+//!   memory. One system call wakes the subscribers, and one subscriber to each topic takes everything. Reads, sleeps
+//!   and wake-ups of subscribers are not included; `sensors on ptys` and `subscribers of one sensor` include them.
 //! - Many sensors run in hubs of 125 at the same time. The step between some ten and some hundred sensors comes from
-//!   the second-level cache: for each sample, the library checks all possible subscriber slots of the topic, 1168
-//!   bytes apart.
+//!   the second-level cache: for each sample, the library checks all possible subscriber slots of the topic, 1168 bytes
+//!   apart.
 //! - A table of growth has the line `fixed + for each * n` (least squares of relative errors), and the slope of
-//!   logarithms from a sixteenth of the largest number on. A slope 0.25 above that of linear growth is reported as
+//!   logarithms from a sixteenth of the largest number upwards. A slope 0.25 above that of linear growth is reported as
 //!   worse than linear.
 //! - Latency is that of the last subscriber. Numbers above 125 are measured once.
 //! - `program and libraries` are pages of the executable, which the machine holds only once. Touched shared memory is
-//!   the part of the samples that is in use, because the same few are used again and again.
+//!   the part of the samples that is in use, because the same few are used repeatedly.
 
 mod growth;
 mod many_subscribers;
@@ -69,7 +68,7 @@ fn measure(options: &Options) -> Outcome<()> {
     sensors::measure_lines(options)
 }
 
-/// Measures many subscribers, and the effect of broken ones on the others.
+/// Measures a crowd, and the effects of broken subscribers on the others.
 fn faults(options: &Options) -> Outcome<()> {
     let environment = BenchEnvironment::new()?;
     let _simulator = environment.simulate(&[SENSOR], 500_000)?;
@@ -79,7 +78,7 @@ fn faults(options: &Options) -> Outcome<()> {
     figures.extend(measure_kills(&environment, &hub)?);
     figures.extend(measure_stopped(&environment)?);
     figures.extend(fill_slots(&environment)?);
-    // Requesting a status needs a subscriber slot, and the many subscribers have exited by now.
+    // A request for the status needs a slot, and the crowd has left by now.
     thread::sleep(CLEANUP_TIMEOUT);
     let failed = counter(&environment, Counter::LoanFailed)?;
     figures.push(figure("samples without memory", "1", failed, Target::Max(0.0)));
@@ -123,7 +122,7 @@ fn measure_many_subscribers(
     ])
 }
 
-/// Kills a process that holds samples, again and again.
+/// Repeatedly kills a process that holds samples.
 fn measure_kills(environment: &BenchEnvironment, hub: &Child) -> Outcome<Vec<Figure>> {
     let witness = start_subscriber(environment)?;
     let open = || -> Outcome<usize> { Ok(fs::read_dir(format!("/proc/{}/fd", hub.guard.pid()))?.count()) };
@@ -154,7 +153,7 @@ fn measure_kills(environment: &BenchEnvironment, hub: &Child) -> Outcome<Vec<Fig
 
 /// Stops a subscriber for two seconds.
 fn measure_stopped(environment: &BenchEnvironment) -> Outcome<Vec<Figure>> {
-    // The witness attached before, and reports everything that was published.
+    // The witness attached first, and reports everything that was published.
     let (witness, stopped) = (start_subscriber(environment)?, start_subscriber(environment)?);
     let pid = Pid::from_raw(stopped.guard.pid() as i32).ok_or("no process")?;
     thread::sleep(Duration::from_secs(1));
@@ -183,7 +182,7 @@ fn measure_stopped(environment: &BenchEnvironment) -> Outcome<Vec<Figure>> {
     ])
 }
 
-/// Takes all places of a topic, and one more.
+/// Takes all slots of a topic, and one more.
 fn fill_slots(environment: &BenchEnvironment) -> Outcome<Vec<Figure>> {
     let child = environment.start_part(&["stay", environment.domain.name(), SENSOR, "210"])?;
     let refused = child.wait_for_line("refused", 6 * STEP_TIMEOUT)?;

@@ -1,6 +1,6 @@
-//! What do subscribers of one sensor cost the hub, when does the last of them have a scan, and how much memory does a
-//! hub with 200 subscribers take? Subscribers sleep on the doorbell or on the event, and the sensor at the other end of
-//! a pty keeps its rate.
+//! Cost of the subscribers of one sensor for the hub, time until the last of them has a scan, and memory of a hub with
+//! 200 subscribers. Subscribers sleep on the doorbell or on the event, and the sensor at the other end of a pty keeps
+//! its rate.
 
 use std::collections::BTreeMap;
 use std::sync::Barrier;
@@ -39,7 +39,7 @@ pub(crate) fn measure_subscribers(options: &Options) -> Outcome<()> {
             quantities,
         );
         for _ in 0..options.pairs().min(3) {
-            // One hub for all numbers: subscribers that leave give their memory back.
+            // One hub for all numbers of subscribers: those that leave return their memory.
             let hub = environment.hub_with_many_slots(&[SENSOR])?;
             hub.wait_for_line("ready", STEP_TIMEOUT)?;
             let mut runs = Vec::new();
@@ -58,9 +58,9 @@ pub(crate) fn measure_subscribers(options: &Options) -> Outcome<()> {
     Ok(())
 }
 
-/// Subscribes to the scans of `sensor` `count` times, and receives for `seconds` from the moment at which each
-/// subscriber has a scan. Prints for each scan how many subscribers got it and when the last one did, `last SEQ COUNT
-/// AGE_NS`, and `missed COUNT`.
+/// Subscribes to the scans of `sensor` `count` times, and receives for `seconds` after each subscriber has a scan.
+/// Prints for each scan how many subscribers received it and its age at the last of them, `last SEQ COUNT AGE_NS`, and
+/// then `missed COUNT`.
 pub(crate) fn subscribe_many(
     domain: &str,
     sensor: &str,
@@ -75,7 +75,7 @@ pub(crate) fn subscribe_many(
         let attached = attached.map_err(Into::into).and_then(|mut scans| -> Outcome<_> {
             scans.next()?.map(drop).map_or(Err("no scan arrived".into()), |()| Ok(scans))
         });
-        // The others do not wait for a subscriber that fails.
+        // A subscriber that fails must not block the others.
         all.wait();
         let mut scans = attached.map_err(|error| error.to_string())?;
         let words = |error: scanhub_client::Error| error.to_string();
@@ -145,7 +145,7 @@ fn run(
     wait: &str,
 ) -> Outcome<[f64; 7]> {
     let children = start(environment, SENSOR, count, seconds, wait)?;
-    // Ends before the first subscriber leaves.
+    // The measurement ends before the first subscriber leaves.
     let look =
         || -> Outcome<(u64, ThreadUsage)> { Ok((clock::now(), ThreadUsage::of(hub.guard.pid(), |_| true)?)) };
     let before = look()?;
@@ -184,7 +184,7 @@ const SENSOR: &str = "front";
 const SUBSCRIBER_COUNTS: [usize; 5] = [1, 4, 16, 64, 200];
 const PROCESS_COUNT: usize = 4;
 
-/// Number and bytes of files, by the ends of their names.
+/// Number and bytes of files, by the extension of their names.
 type SegmentSizes = BTreeMap<String, (usize, f64)>;
 
 /// Measures the memory of a hub with two links and 100 subscribers to the scans of each.
@@ -194,7 +194,7 @@ pub(crate) fn measure_memory(options: &Options) -> Outcome<()> {
     let hub = environment.hub_with_many_slots(&SENSORS)?;
     hub.wait_for_line("ready", STEP_TIMEOUT)?;
     let alone = segments(&environment.domain)?;
-    // They stay until they are ended, so that the first ones are still attached when the last ones are.
+    // The subscribers run until they are ended, so that the first ones are still attached when the last ones are.
     let (seconds, long) = (options.seconds(8), 3600);
     let children: Vec<_> = SENSORS
         .iter()

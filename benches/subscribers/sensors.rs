@@ -1,5 +1,5 @@
-//! What do sensors cost the hub: on lines, at their own rate; and in virtual time, as fast as they can be processed?
-//! And what do beams cost?
+//! Costs of sensors for the hub: on lines at their own rate, and in virtual time as fast as they can be processed. Also
+//! measures the cost of beams.
 
 use std::path::Path;
 use std::thread;
@@ -53,7 +53,7 @@ pub(crate) fn measure_lines(options: &Options) -> Outcome<()> {
     Ok(())
 }
 
-/// Returns the values of the sweep.
+/// Returns the values of the range for this number of `sensors`.
 fn run_on_lines(sensors: usize, seconds: u64) -> Outcome<[f64; 7]> {
     let environment = BenchEnvironment::new()?;
     let names: Vec<String> = (0..sensors).map(|number| format!("s{number}")).collect();
@@ -107,9 +107,9 @@ fn run_on_lines(sensors: usize, seconds: u64) -> Outcome<[f64; 7]> {
     ])
 }
 
-/// Measures 1 to 1,000 sensors in virtual time: how many could one core serve if their bytes cost nothing to receive?
-/// Many sensors are distributed over several hubs, because a hub has at most 256 links and a process not enough
-/// descriptors for more.
+/// Measures 1 to 1,000 sensors in virtual time, to find how many sensors one core could serve if receiving their bytes
+/// cost nothing. Many sensors are distributed over several hubs, because a hub has at most 256 links and a process not
+/// enough descriptors for more.
 pub(crate) fn measure_virtual_time(options: &Options) -> Outcome<()> {
     let quantity = |name, unit, linear| Quantity { name, unit, linear };
     let quantities = vec![
@@ -123,9 +123,9 @@ pub(crate) fn measure_virtual_time(options: &Options) -> Outcome<()> {
     let mut sweep = ParameterRange::new("sensors in virtual time", "sensors", quantities);
     let mut of_most = Vec::new();
     let telegrams = options.count(20_000);
-    // Leaves out numbers of sensors for which there are too few telegrams.
+    // Leave out numbers of sensors for which there are too few telegrams.
     for sensors in VIRTUAL_SENSOR_COUNTS.into_iter().filter(|sensors| sensors * 4 <= telegrams) {
-        // Setting up many sensors takes longer than measuring them, and they are many values.
+        // Setting up many sensors takes longer than measuring them, and one run already has many values.
         for _ in 0..if sensors > SENSORS_PER_HUB { 1 } else { runs(options) } {
             let both = run_in_virtual_time(sensors, Variant::HALF, telegrams, true).and_then(|followed| {
                 Ok((followed, run_in_virtual_time(sensors, Variant::HALF, telegrams, false)?))
@@ -155,7 +155,7 @@ pub(crate) fn measure_virtual_time(options: &Options) -> Outcome<()> {
             unit: "us",
             hub: of_most,
             baseline: Vec::new(),
-            // This number of sensors at their full rate on one core.
+            // Time per telegram at which one core serves this number of sensors at their full rate.
             target: Target::Max((1e7 / (MAX_SENSORS as f64 * SCAN_RATE_HZ)).floor() / 10.0),
         };
         figures::print("subscribers", options.json, &[figure]);
@@ -185,7 +185,7 @@ struct TelegramCost {
     descriptors: f64,
 }
 
-/// Runs `sensors` in several hubs, which begin together.
+/// Runs `sensors` in several hubs, which start measuring together.
 fn run_in_virtual_time(
     sensors: usize,
     variant: Variant,
@@ -237,12 +237,12 @@ const SENSORS_PER_HUB: usize = 125;
 /// Scans per second of a sensor with 361 beams.
 const SCAN_RATE_HZ: f64 = 37.5;
 
-/// Drives a hub in virtual time: telegrams of the simulated room of Fig. 8 go through framer, session, decoding and all
-/// processors into topics in shared memory. Nothing sleeps or waits, so the CPU time of a telegram remains. Each topic
-/// has a subscriber that takes all samples if `followed`, and otherwise none.
+/// Drives a hub in virtual time: telegrams of the simulated room of Fig. 8 pass framer, session, decoding and all
+/// processors into topics in shared memory. Nothing sleeps or waits, so only the CPU time per telegram remains. With
+/// `has_subscribers`, each topic has a subscriber that takes all samples; otherwise, it has none.
 ///
-/// Runs `sensors` with `beams` beams until all have learned their background, prints `ready`, and once there is a file
-/// `begin`, runs at least `telegrams` more. Prints `cost NS PUBLISHED RECEIVED DESCRIPTORS`.
+/// Runs `sensors` with `beams` beams until all have learned their background, and prints `ready`. Once the file `begin`
+/// exists, runs at least `telegrams` more. Prints `cost NS PUBLISHED RECEIVED DESCRIPTORS`.
 pub(crate) fn drive(
     begin: &Path,
     beams: usize,
@@ -299,7 +299,7 @@ struct TotalCost {
     received: usize,
 }
 
-/// Telegrams of the sensors. All of them see the same, each at a different moment.
+/// Telegrams of the sensors. All of them see the same room, each at a different moment.
 struct SensorStreams {
     telegrams: Vec<Vec<u8>>,
     period: Nanos,
@@ -321,8 +321,8 @@ impl SensorStreams {
         SensorStreams { telegrams, period, now: clock::now(), number: 0 }
     }
 
-    /// Passes the next telegrams of each sensor to the hub in three reads, like the hub reads them: the first bytes,
-    /// most of it, the end. Returns how many were published.
+    /// Passes the next telegrams of each sensor to the hub in three reads, as the hub reads them: the first bytes, most
+    /// of the telegram, and the end. Returns the number of published scans.
     fn pass_next(&mut self, links: &mut [VirtualLink<'_>]) -> usize {
         let mut published = 0;
         for _ in 0..TELEGRAMS_PER_TAKE {
@@ -364,7 +364,7 @@ impl Subscribers {
         })
     }
 
-    /// Takes all samples, and returns the number of scans for which all others have arrived.
+    /// Takes all samples, and returns the number of scans for which the samples of all other topics have arrived.
     fn take(&self) -> Outcome<usize> {
         let counts = [
             take::<Scan>(&self.scan)?,

@@ -1,11 +1,11 @@
 //! Minimal programs that the hub is compared with.
 //!
-//! [`chain`] is a hub that only streams: the system calls that a late reader of a pty cannot avoid, and one wake-up of
-//! a sleeping process per telegram. No framing, no CRC, no counters, no shared memory. A telegram is the next 732 bytes
-//! after a pause that is longer than the one within a telegram.
+//! [`run_baseline`] is a hub that only streams. It has the system calls that a late reader of a pty cannot avoid, and
+//! one wake-up of a sleeping process per telegram. It has no framing, no CRC, no counters and no shared memory. A
+//! telegram is the next 732 bytes after a pause that is longer than the one within a telegram.
 //!
-//! [`start`] is a hub that only starts a scanner whose rate it knows: it sends the requests and waits for the first
-//! scan. It does not search, and repeats a request only if it was lost.
+//! [`start_scanner`] is a hub that only starts a scanner whose rate it knows. It sends the requests and waits for the
+//! first scan. It does not search, and repeats a request only if it was lost.
 
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::path::Path;
@@ -25,8 +25,8 @@ use super::environment::GuardedProcess;
 use super::{Outcome, PART_WORD, clock, truth};
 
 /// Reads `count` telegrams (0: forever) from each of `ports` in a separate thread, and wakes one process per port. It
-/// wakes up `lead` nanoseconds before the expected end of a telegram, or, with 0, as long before it as the hub does. The
-/// first line says that it is up; at the end it prints the hash of each telegram and when it was read.
+/// wakes up `wake_ahead_ns` before the expected end of a telegram, or, with 0, as long before it as the hub does.
+/// Prints `ready` first. At the end, it prints the hash of each telegram and the time at which it was read.
 pub(crate) fn run_baseline(ports: &[&str], count: usize, wake_ahead_ns: u64) -> Outcome<()> {
     let mut sleepers = Vec::new();
     let mut ends = Vec::new();
@@ -52,7 +52,7 @@ pub(crate) fn run_baseline(ports: &[&str], count: usize, wake_ahead_ns: u64) -> 
 }
 
 /// Sleeps on the eventfd that is its stdin until `count` telegrams were reported (0: forever), and then prints the time
-/// of each wake-up. With 0 it prints the first one at once.
+/// of each wake-up. With 0, it prints the first one at once.
 pub(crate) fn run_sleeper(number: &str, count: usize) -> Outcome<()> {
     let wake = rustix::stdio::stdin();
     let mut times = Vec::with_capacity(count);
@@ -72,14 +72,15 @@ pub(crate) fn run_sleeper(number: &str, count: usize) -> Outcome<()> {
     Ok(())
 }
 
-/// Starts a process that sleeps on `wake` until `count` wake-ups have arrived, see [`sleeper`].
+/// Starts a process that runs [`run_sleeper`] on `wake` until `count` wake-ups have arrived.
 pub(crate) fn start_sleeper(number: usize, count: usize, wake: OwnedFd) -> Outcome<GuardedProcess> {
     let words = [PART_WORD, "sleeper", &number.to_string(), &count.to_string()].map(String::from);
     let process = Command::new(std::env::current_exe()?).args(words).stdin(Stdio::from(wake)).spawn()?;
     Ok(GuardedProcess::new(process))
 }
 
-/// Reads, and ends the whole process on an error: with one reader less, the baseline would be too low.
+/// Reads, and ends the whole process on an error, because the load of the baseline would be too low with one reader
+/// less.
 fn read_or_end(
     line: &SerialLine,
     wake: &OwnedFd,
@@ -92,7 +93,8 @@ fn read_or_end(
     })
 }
 
-/// The read loop. What it keeps of each telegram, it keeps after the wake-up, in the pause before the next telegram.
+/// Runs the read loop, and returns each telegram with the time at which it was complete. A telegram is stored after the
+/// wake-up, in the pause before the next one.
 fn read(
     line: &SerialLine,
     wake: impl AsFd,
@@ -121,7 +123,7 @@ fn read(
                     clock::sleep_until(
                         first + duration - if wake_ahead_ns > 0 { wake_ahead_ns } else { own_lead.nanos() },
                     );
-                    // As in the hub: bytes have certainly arrived, so there is no need to poll.
+                    // As in the hub, bytes have certainly arrived, so there is no need to poll.
                     filled += line.read(&mut telegram[filled..]).map_err(words)?;
                     reads_near_end = 1;
                 }
@@ -129,7 +131,7 @@ fn read(
         }
         let last = clock::now();
         if telegram[0] != lms::telegram::STX {
-            // The pause was not the one between two telegrams: the sender was descheduled.
+            // The pause was not the one between two telegrams, because the sender was descheduled.
             line.wait_for_pause(TELEGRAM_PAUSE_NS).map_err(words)?;
             continue;
         }
@@ -145,7 +147,7 @@ fn read(
     Ok(telegrams)
 }
 
-/// Duration of a telegram, estimated like in the hub: the minimum of several.
+/// Duration of a telegram, estimated as in the hub: the minimum of several.
 #[derive(Default)]
 struct TelegramDuration {
     duration_ns: Option<u64>,
@@ -170,19 +172,19 @@ impl TelegramDuration {
 const BAUD_RATE: u32 = 500_000;
 /// Length of a telegram of 361 beams, in bytes.
 const TELEGRAM_LEN: usize = 732;
-/// Time before the expected end of a telegram at which the baseline wakes up, in ns. The hub learns its
-/// own; this one stays as it is, so that ratios can be compared with earlier ones.
+/// Time before the expected end of a telegram at which the baseline wakes up, in ns. The hub estimates its own. This
+/// one is constant, so that ratios can be compared with earlier ones.
 pub(crate) const WAKE_AHEAD_NS: u64 = 600_000;
-/// Longer than the 3.2 ms within a telegram and shorter than the 8.8 ms after it, in ns.
+/// Pause between two telegrams, in ns: longer than the 3.2 ms within a telegram and shorter than the 8.8 ms after it.
 const TELEGRAM_PAUSE_NS: u64 = 6_000_000;
 
-/// Starts the scanner at `port`, which is at `rate`, as a hub that knew the rate would. Prints when the scanner
+/// Starts the scanner at `port`, which is at `rate`, as a hub that knew the rate would. Prints when the scanner had
 /// confirmed the stream and when the first scan had arrived.
 pub(crate) fn start_scanner(port: &Path, rate: u32) -> Outcome<()> {
     stream(port, rate, &[Request::Status], &[Request::Type, Request::Configuration])
 }
 
-/// Does the same without any request for information: the shortest possible dialog.
+/// Does the same without any request for information, which is the shortest possible dialog.
 pub(crate) fn start_scanner_unchecked(port: &Path, rate: u32) -> Outcome<()> {
     stream(port, rate, &[], &[])
 }

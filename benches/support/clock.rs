@@ -1,4 +1,4 @@
-//! CLOCK_MONOTONIC, the clock of every stamp here and in the hub, and waits until a time of it.
+//! CLOCK_MONOTONIC, the clock of all stamps in the benches and in the hub, and functions that wait until a time of it.
 
 use std::os::fd::AsFd;
 
@@ -6,7 +6,7 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 use rustix::time::{ClockId, clock_gettime};
 
-/// Returns nanoseconds of CLOCK_MONOTONIC.
+/// Returns the time of CLOCK_MONOTONIC in ns.
 pub(crate) fn now() -> u64 {
     let now = clock_gettime(ClockId::Monotonic);
     now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64

@@ -1,5 +1,5 @@
-//! Where a bench runs: its own domain and directory, and the processes in it. Processes are read line by line and ended
-//! by their ID, however the bench ends.
+//! Environment of a bench: its own domain and directory, and the processes in it. The output of processes is read line
+//! by line, and they are ended by their ID, however the bench ends.
 
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
@@ -42,7 +42,7 @@ impl BenchEnvironment {
         Ok(BenchEnvironment { domain, directory: std::env::temp_dir().join(format!("scanhub-{name}")) })
     }
 
-    /// Removes what interrupted benches left behind.
+    /// Removes the files of interrupted benches.
     pub(crate) fn remove_leftovers() -> Outcome<()> {
         for entry in std::fs::read_dir(std::env::temp_dir())? {
             let name = entry?.file_name().to_string_lossy().into_owned();
@@ -75,17 +75,17 @@ impl BenchEnvironment {
         self.simulator(sensors, Some(&self.truth()), &["--baud", &rate.to_string()])
     }
 
-    /// Starts a simulator with sensors that stream at 500 kBd to any program that opens their ptys. It logs nothing.
+    /// Starts a simulator with sensors that stream at 500 kBd to any program that opens their ptys. It writes no log.
     pub(crate) fn simulate_streaming(&self, sensors: &[&str]) -> Outcome<Child> {
         self.simulate_as(sensors, &["--baud", "500000", "--state", "streaming"])
     }
 
-    /// Starts a simulator with sensors at ptys and more `flags`. It logs nothing.
+    /// Starts a simulator with sensors at ptys and more `flags`. It writes no log.
     pub(crate) fn simulate_as(&self, sensors: &[&str], flags: &[&str]) -> Outcome<Child> {
         self.simulator(sensors, None, flags)
     }
 
-    /// Starts a simulator with one sensor and more `flags`. It logs to [`BenchEnvironment::own_truth`].
+    /// Starts a simulator with one sensor and more `flags`. It writes a log to [`BenchEnvironment::own_truth`].
     pub(crate) fn simulate_one(&self, sensor: &str, flags: &[&str]) -> Outcome<Child> {
         self.simulator(&[sensor], Some(&self.own_truth(sensor)), flags)
     }
@@ -105,12 +105,12 @@ impl BenchEnvironment {
         Ok(child)
     }
 
-    /// Starts the hub. Its first line says that it is up.
+    /// Starts the hub. It prints `ready` first.
     pub(crate) fn start_hub(&self, sensors: &[&str]) -> Outcome<Child> {
         Child::spawn(self.hub_command(PROGRAM, sensors), Stdio::null())
     }
 
-    /// Starts the hub with room for [`MAX_SUBSCRIBERS`] subscribers.
+    /// Starts the hub with slots for [`MAX_SUBSCRIBERS`] subscribers.
     pub(crate) fn hub_with_many_slots(&self, sensors: &[&str]) -> Outcome<Child> {
         let mut command = self.hub_command(PROGRAM, sensors);
         command.arg(format!("--set=limits.subscribers={MAX_SUBSCRIBERS}"));
@@ -122,7 +122,7 @@ impl BenchEnvironment {
         self.hub_command_on(self, program, sensors)
     }
 
-    /// Returns the command that starts the hub with the sensors of another stage, `lines`.
+    /// Returns the command that starts the hub with the sensors of another environment, `lines`.
     pub(crate) fn hub_command_on(
         &self,
         lines: &BenchEnvironment,
@@ -131,22 +131,22 @@ impl BenchEnvironment {
     ) -> Command {
         let mut command = Command::new(program);
         command.args(["run", "--domain", self.domain.name()]);
-        // The state of the hub is removed with the stage.
+        // The hub's state is removed with the environment.
         command.env("XDG_STATE_HOME", &self.directory).env_remove("STATE_DIRECTORY");
         sensors.iter().for_each(|sensor| {
-            // Without the time and the shared memory of a search.
+            // A fixed family avoids the time and the shared memory of a search.
             command.args(["--link", &format!("{sensor}={},family=lms", lines.port(sensor))]);
         });
         command
     }
 
-    /// Starts this program as a subscriber of `topic`, with more `words`.
+    /// Starts this program as a subscriber to `topic`, with more `words`.
     pub(crate) fn start_subscriber(&self, topic: &str, sensor: &str, words: &[&str]) -> Outcome<Child> {
         self.start_part(&[&["consume", topic, self.domain.name(), sensor], words].concat())
     }
 
-    /// Starts this program as the baseline that reads `count` telegrams from each port, and wakes up `lead` nanoseconds
-    /// before the expected end of each; 0: as long before it as the hub does.
+    /// Starts this program as the baseline. It reads `count` telegrams from each port, and wakes up `wake_ahead_ns`
+    /// before the expected end of each, or with 0 as long before it as the hub does.
     pub(crate) fn start_baseline(
         &self,
         sensors: &[&str],
@@ -160,7 +160,7 @@ impl BenchEnvironment {
         self.start_part(&words)
     }
 
-    /// Starts this program in one of its parts.
+    /// Starts this program as one of its parts.
     pub(crate) fn start_part(&self, words: &[&str]) -> Outcome<Child> {
         let words: Vec<String> =
             std::iter::once(&PART_WORD).chain(words).map(|word| word.to_string()).collect();
@@ -170,7 +170,7 @@ impl BenchEnvironment {
 
 impl Drop for BenchEnvironment {
     fn drop(&mut self) {
-        // The domain's name contains this process's ID, so nothing here belongs to another process.
+        // The domain's name contains the ID of this process, so no other process uses these files.
         let _ = std::fs::remove_dir_all(&self.directory);
         let _ = std::fs::remove_dir_all(self.domain.root());
         let entries = std::fs::read_dir("/dev/shm").into_iter().flatten().flatten();
@@ -185,7 +185,7 @@ impl Drop for BenchEnvironment {
 pub(crate) const SENSORS: [&str; 2] = ["front", "rear"];
 /// The sensors of a vehicle with one on each side.
 pub(crate) const ALL_AROUND: [&str; 4] = ["front", "rear", "left", "right"];
-/// Number of subscribers of a topic that [`BenchEnvironment::hub_with_many_slots`] has room for.
+/// Number of slots for subscribers to a topic with [`BenchEnvironment::hub_with_many_slots`].
 pub(crate) const MAX_SUBSCRIBERS: usize = 200;
 /// Timeout, far longer than any step takes.
 pub(crate) const STEP_TIMEOUT: Duration = Duration::from_secs(20);
@@ -196,7 +196,7 @@ pub(crate) const PROGRAM: &str = env!("CARGO_BIN_EXE_scanhub");
 pub(crate) struct GuardedProcess(Process);
 
 impl GuardedProcess {
-    /// Takes over a process that was started.
+    /// Guards a process that was started.
     pub(crate) fn new(process: Process) -> GuardedProcess {
         GuardedProcess(process)
     }
@@ -243,7 +243,7 @@ impl Drop for GuardedProcess {
 pub(crate) struct Child {
     pub(crate) guard: GuardedProcess,
     lines: Receiver<OutputLine>,
-    /// CLOCK_MONOTONIC just before the start.
+    /// CLOCK_MONOTONIC just before the start of the process.
     pub(crate) started_ns: u64,
 }
 
@@ -297,7 +297,7 @@ impl Child {
         Ok(Child { guard, lines, started_ns })
     }
 
-    /// Returns the next line that begins with `word`, and drops the lines before it.
+    /// Waits for the next line that begins with `word`, and returns it. Drops the lines before it.
     pub(crate) fn wait_for_line(&self, word: &str, timeout: Duration) -> Outcome<OutputLine> {
         let end = Instant::now() + timeout;
         loop {
@@ -314,7 +314,7 @@ impl Child {
         self.lines.recv_timeout(timeout).map_err(|_| "no line came".into())
     }
 
-    /// Returns all lines before the one that is `word`.
+    /// Waits for the line that equals `word`, and returns all lines before it.
     pub(crate) fn lines_until(&self, word: &str, timeout: Duration) -> Outcome<Vec<OutputLine>> {
         let end = Instant::now() + timeout;
         let mut lines = Vec::new();

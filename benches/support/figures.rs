@@ -1,6 +1,6 @@
-//! Figures with their spread: a series of values, one per run, next to those of the baseline, with the ratio run by
-//! run; figures of programs that ran at the same time; or cells of tables. They are printed as tables, or with `--json`
-//! as one line each (`PACE_SPREAD` is `{median, least, most}` or null):
+//! Figures with their spread. A figure is a series of values, one per run, with those of the baseline and the ratios
+//! run by run. There are also figures of programs that ran at the same time, and cells of tables. All are printed as
+//! tables, or with `--json` as one line each (`SPREAD` is `{median, least, most}` or null):
 //!
 //! - `{class: "measurement", bench, name, unit, runs, hub: SPREAD, baseline: SPREAD, ratio: SPREAD, target, met}`
 //! - the same with more keys, one line for each program that ran at the same time as the hub: `sensors`, `program` (its
@@ -65,7 +65,7 @@ impl Spread {
         Some(Spread(percentile(&sorted, 0.5)?, *sorted.first()?, *sorted.last()?))
     }
 
-    /// Returns the spread as it is in tables.
+    /// Returns the text of the spread in tables.
     pub(crate) fn text(&self) -> String {
         let Spread(middle, minimum, maximum) = self;
         if minimum == maximum {
@@ -74,7 +74,7 @@ impl Spread {
         format!("{} [{} .. {}]", short_number(*middle), short_number(*minimum), short_number(*maximum))
     }
 
-    /// Returns the spread as it is in lines of JSON.
+    /// Returns the value of the spread in lines of JSON.
     pub(crate) fn json(&self) -> Value {
         json!({ "median": self.0, "least": self.1, "most": self.2 })
     }
@@ -95,7 +95,7 @@ impl Figure {
         [&self.hub, &self.baseline, &self.ratios()].map(|series| Spread::of(series))
     }
 
-    /// Returns the line of JSON.
+    /// Returns the figure as a line of JSON.
     fn json(&self, bench: &str) -> Value {
         let [hub, baseline, ratio] = self.spreads().map(|spread| spread.map(|spread| spread.json()));
         let verdict = self.verdict();
@@ -106,14 +106,14 @@ impl Figure {
         })
     }
 
-    /// Returns the target and whether it was met, as they are in tables.
+    /// Returns the text of target and result in tables.
     fn verdict_text(&self) -> String {
         self.verdict().map_or(String::new(), |(words, is_met)| {
             format!("{words}: {}", if is_met { "met" } else { "MISSED" })
         })
     }
 
-    /// Returns the target as text, and whether it was met.
+    /// Returns the text of the target, and whether it is met.
     fn verdict(&self) -> Option<(String, bool)> {
         match self.target {
             Target::None => None,
@@ -145,7 +145,8 @@ pub(crate) fn print(bench: &str, json: bool, figures: &[Figure]) {
 }
 
 impl SimultaneousFigure {
-    /// Returns the figure with program number `number` in the place of the baseline. Only the baseline has a target.
+    /// Returns the figure with program number `number` as baseline. Only the second program, the baseline, has a
+    /// target.
     fn against(&self, number: usize) -> Figure {
         Figure {
             name: self.name,
@@ -156,7 +157,7 @@ impl SimultaneousFigure {
         }
     }
 
-    /// Returns by how much the hub's values are greater than those of program number `number`.
+    /// Returns the mean of the differences between the hub's values and those of program number `number`.
     fn difference(&self, number: usize) -> Option<Mean> {
         let pairs = self.programs[0].iter().zip(&self.programs[number]);
         Mean::of(&pairs.map(|(hub, program)| hub - program).collect::<Vec<_>>())
@@ -203,7 +204,7 @@ pub(crate) fn print_simultaneous(
     }
 }
 
-/// Mean of a series and its standard error, which one value does not have.
+/// Mean of a series, and its standard error, which needs at least two values.
 struct Mean(f64, Option<f64>);
 
 impl Mean {
@@ -270,7 +271,7 @@ fn in_order_of_appearance<'a>(names: impl Iterator<Item = &'a String>) -> Vec<&'
     found
 }
 
-/// Returns the value below which `part` of the `sorted` values lie: nearest rank, and for the median the mean of the
+/// Returns the value below which `part` of the `sorted` values lie, by nearest rank. The median is the mean of the
 /// middle two.
 pub(crate) fn percentile(sorted: &[f64], part: f64) -> Option<f64> {
     let last = sorted.len().checked_sub(1)?;

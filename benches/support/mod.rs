@@ -1,8 +1,8 @@
-//! Shared by the benches that start processes: a stage with simulator, hub and subscribers, minimal programs to compare
-//! them with, CPU time and memory of processes, and figures with their spread. A bench prints what it measured; a
-//! missed target is not an error.
+//! Shared code of the benches that start processes: an environment with simulator, hub and subscribers, minimal
+//! programs to compare them with, CPU time and memory of processes, and figures with their spread. A bench prints what
+//! it measured. A missed target is not an error.
 
-#![allow(dead_code)] // Every bench uses a part of it.
+#![allow(dead_code)] // Each bench uses only some items.
 
 pub(crate) mod baseline;
 pub(crate) mod clock;
@@ -19,11 +19,11 @@ use std::process::ExitCode;
 
 use rustix::process::{Signal, set_parent_process_death_signal};
 
-/// Result of a step of a bench; the error is a message.
+/// Result of a step of a bench. The error is a message.
 pub(crate) type Outcome<T> = Result<T, Box<dyn Error>>;
 
-/// Runs a bench: plays the part that the command line names, because a bench starts itself as subscriber and as
-/// baseline. Otherwise it measures.
+/// Runs a bench. A bench starts itself as subscriber and as baseline, so it runs a part if the command line names one.
+/// Otherwise it measures.
 pub(crate) fn main(measure: impl FnOnce(&Options) -> Outcome<()>) -> ExitCode {
     main_with(run_part, measure)
 }
@@ -52,7 +52,7 @@ pub(crate) fn main_with(
     }
 }
 
-/// Plays one of the parts that benches share.
+/// Runs one of the parts that benches share.
 pub(crate) fn run_part(words: &[&str]) -> Outcome<()> {
     match *words {
         ["consume", "scan", domain, sensor] => subscriber::print_first_scans(domain, sensor),
@@ -83,13 +83,13 @@ pub(crate) const PART_WORD: &str = "part";
 pub(crate) struct Options {
     /// Print one line of JSON per figure instead of tables.
     pub(crate) json: bool,
-    /// Measure less, in a few minutes, where a bench takes long.
+    /// Measure less, in a few minutes, if a bench takes long.
     pub(crate) quick: bool,
     pairs: Option<usize>,
     seconds: Option<u64>,
     count: Option<usize>,
     sensors: Option<usize>,
-    /// The program of another build, to be measured at the same time.
+    /// Program of another build that is measured at the same time.
     pub(crate) other_program: Option<String>,
 }
 
@@ -122,12 +122,13 @@ impl Options {
         Ok(options)
     }
 
-    /// Returns the number of pairs, each a run of the hub and one of the baseline, or of rounds, in which all run.
+    /// Returns the number of pairs, each a run of the hub and one of the baseline, or of rounds, in which all programs
+    /// run.
     pub(crate) fn pairs(&self) -> usize {
         self.pairs_or(5)
     }
 
-    /// Returns the same for a bench whose default is not five.
+    /// Returns the number of pairs for a bench whose default is not five.
     pub(crate) fn pairs_or(&self, default: usize) -> usize {
         self.pairs.unwrap_or(default).clamp(1, 100)
     }

@@ -1,6 +1,6 @@
 //! Programs that are measured at the same time: the hub, two baselines and, with `--beside`, the hub of another build.
-//! Each has a separate domain and separate simulated sensors. In every round they change places: each reads the lines
-//! that its neighbor read in the round before. The load of the machine, which all of them share, and differences between
+//! Each has its own domain and its own simulated sensors. In every round they rotate: each program reads the lines that
+//! its neighbor read in the round before. The load of the machine, which all of them share, and differences between
 //! simulators therefore cancel out in differences between programs.
 
 use std::process::Stdio;
@@ -14,7 +14,7 @@ pub(crate) struct Comparison {
     pub(crate) sensors: &'static [&'static str],
     /// The hub, two baselines and, with `--beside`, the hub of the other build, in this order.
     pub(crate) programs: Vec<MeasuredProgram>,
-    /// One per candidate.
+    /// Simulated sensors, one set per program.
     lines: Vec<SimulatedSensors>,
 }
 
@@ -30,13 +30,14 @@ pub(crate) struct MeasuredProgram {
 pub(crate) enum ProgramKind {
     /// The hub of the program at this path.
     Hub(String),
-    /// The baseline that wakes up this long before the end of a telegram, in ns; 0: as long as the hub.
+    /// The baseline that wakes up this long before the end of a telegram, in ns. With 0, it wakes up as long before it
+    /// as the hub does.
     Baseline(u64),
 }
 
 /// A set of simulated sensors.
 struct SimulatedSensors {
-    // Ends before the directory with its ports is removed.
+    // Dropped before the directory with its ports is removed.
     _simulator: Child,
     stage: BenchEnvironment,
 }
@@ -79,29 +80,29 @@ impl Comparison {
         Ok(Comparison { sensors, programs, lines })
     }
 
-    /// Returns the index of the lines that a candidate reads in a round.
+    /// Returns the index of the lines that a program reads in a round.
     pub(crate) fn line_index(&self, program: usize, round: usize) -> usize {
         (program + round) % self.lines.len()
     }
 
-    /// Returns the stage of the lines with this index.
+    /// Returns the environment of the lines with this index.
     pub(crate) fn lines(&self, line_index: usize) -> &BenchEnvironment {
         &self.lines[line_index].stage
     }
 
-    /// Returns the number of rounds. By default, each candidate reads all lines twice.
+    /// Returns the number of rounds. By default, each program reads all lines twice.
     pub(crate) fn rounds(&self, options: &Options) -> usize {
         options.pairs_or(2 * self.programs.len())
     }
 
-    /// Returns the names of all candidates.
+    /// Returns the names of all programs.
     pub(crate) fn names(&self) -> Vec<&str> {
         self.programs.iter().map(|candidate| candidate.name.as_str()).collect()
     }
 }
 
 impl MeasuredProgram {
-    /// Starts the program on `lines`. A baseline ends after `count` telegrams from each (0: never).
+    /// Starts the program on `lines`. A baseline ends after `count` telegrams from each line (0: never).
     pub(crate) fn start(&self, lines: &BenchEnvironment, sensors: &[&str], count: usize) -> Outcome<Child> {
         let child = match &self.program {
             ProgramKind::Hub(path) => {
@@ -114,12 +115,13 @@ impl MeasuredProgram {
         Ok(child)
     }
 
-    /// Returns whether it is a hub.
+    /// Returns whether the program is a hub.
     pub(crate) fn is_hub(&self) -> bool {
         matches!(self.program, ProgramKind::Hub(_))
     }
 
-    /// Starts a subscriber to the scans of each sensor, and waits until every subscriber has received one. Only for hubs.
+    /// Starts a subscriber to the scans of each sensor, and waits until every subscriber has received one. Only for
+    /// hubs.
     pub(crate) fn subscribe_to_scans(&self, sensors: &[&str]) -> Outcome<Vec<Child>> {
         let start = |sensor: &&str| self.stage.start_subscriber("scan", sensor, &[]);
         let subscribers = sensors.iter().map(start).collect::<Outcome<Vec<_>>>()?;
@@ -131,8 +133,9 @@ impl MeasuredProgram {
     }
 }
 
-/// Copies the program at `path` into the directory of `stage`, and returns the path of the copy. The simulators run
-/// from the program of this build. If a hub ran from the same file, they would keep its code in the processor's caches.
+/// Copies the program at `path` into the directory of `environment`, and returns the path of the copy. The simulators
+/// run from the program of this build. If a hub ran from the same file, they would keep its code in the processor's
+/// caches.
 fn copy_program(path: &str, environment: &BenchEnvironment) -> Outcome<String> {
     let copy = environment.file("scanhub");
     std::fs::copy(path, &copy).map_err(|error| format!("{path}: {error}"))?;
@@ -141,6 +144,6 @@ fn copy_program(path: &str, environment: &BenchEnvironment) -> Outcome<String> {
 
 /// Name of the baseline in tables.
 const BASELINE_NAME: &str = "baseline";
-/// Time at the start of a round that does not count. The hub learns the background in 6.3 s and the duration of a
-/// telegram in the first scans.
+/// Time at the start of a round that does not count. The hub learns the background in 6.3 s and estimates the duration
+/// of a telegram in the first scans.
 pub(crate) const SETTLE_TIME: Duration = Duration::from_secs(8);

@@ -7,7 +7,7 @@ use scanhub_shm::{Node, Payload, Publisher, TopicService, WakeSender};
 
 use super::Outcome;
 
-/// Name of its only sensor.
+/// Name of the only sensor.
 pub(crate) const SENSOR: &str = "front";
 
 /// A hub without sensors, which publishes the same scan on request.
@@ -16,7 +16,7 @@ pub(crate) struct ScanSource {
     waker: WakeSender,
     next: u64,
     _service: TopicService<Scan>,
-    /// Every hub has this topic. A gateway would request it again and again if it did not exist.
+    /// Every hub has this topic. A gateway would request it repeatedly if it did not exist.
     _status: TopicService<Status>,
     _node: Node,
     _lock: HubLock,

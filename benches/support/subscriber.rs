@@ -1,6 +1,6 @@
-//! Subscribers as separate processes: they receive a topic with the client library, sleep until they are woken, and
-//! print when a sample had arrived. If there are many, subscribers share a process, each in its own thread and with its
-//! own membership, queue and wake-ups, as if it were a process.
+//! Subscribers as separate processes. They receive a topic with the client library, sleep until they are woken, and
+//! print when a sample had arrived. In a crowd, many subscribers share a process, but each has its own thread,
+//! membership, queue and wake-ups.
 
 use scanhub_drivers::lms;
 use std::io::Write;
@@ -39,9 +39,9 @@ pub(crate) fn print_scans(domain: &str, sensor: &str) -> Outcome<()> {
     }
 }
 
-/// Receives telegrams of `sensor` until `count` with measured data have arrived, and then prints them; with 0, receives
-/// forever and prints each at once. A line is `telegram SENSOR RECEIVED_NS BOOT MISSED INTACT HASH READ_NS`, the last
-/// the hub's stamp of the last byte.
+/// Receives telegrams of `sensor` until `count` with measured data have arrived, and then prints them. With 0, receives
+/// forever and prints each at once. A line is `telegram SENSOR RECEIVED_NS BOOT MISSED INTACT HASH READ_NS`, with the
+/// hub's stamp of the last byte at its end.
 pub(crate) fn print_telegrams(domain: &str, sensor: &str, count: usize) -> Outcome<()> {
     let mut telegrams = subscribe::<[u8]>(domain, sensor)?;
     let mut received = Vec::with_capacity(count);
@@ -68,7 +68,7 @@ pub(crate) fn print_telegrams(domain: &str, sensor: &str, count: usize) -> Outco
     Ok(())
 }
 
-/// Receives scans of `sensor` until `count` have arrived. Then prints for each how old the telegram's last byte was on
+/// Receives scans of `sensor` until `count` have arrived. Then prints for each the age of the telegram's last byte on
 /// receipt: `aged SENSOR NS`.
 pub(crate) fn print_ages(domain: &str, sensor: &str, count: usize) -> Outcome<()> {
     let mut scans = subscribe::<Scan>(domain, sensor)?;
@@ -99,7 +99,7 @@ pub(crate) fn subscribe<P: Payload + ?Sized>(domain: &str, sensor: &str) -> Outc
     Ok(builder(domain, sensor).open()?)
 }
 
-/// Returns the options of a subscriber of a topic of the hub of this domain.
+/// Returns the builder of a subscriber to a topic of the hub of this domain.
 pub(crate) fn builder<P: Payload + ?Sized>(domain: &str, sensor: &str) -> SubscriberBuilder<P> {
     Subscriber::builder(sensor).domain(domain)
 }
@@ -118,9 +118,8 @@ fn write(out: &mut impl Write, sensor: &str, sample: &ReceivedSample) -> Outcome
     Ok(writeln!(out, "telegram {sensor} {now} {boot} {missed} {intact} {hash} {read}")?)
 }
 
-/// Subscribes to the scans of `sensor` `count` times, and receives for `seconds` from the moment at which each
-/// subscriber has a scan. Prints for each `followed RECEIVED MISSED PUBLISHED`, the last from its own first sample to
-/// its last.
+/// Subscribes to the scans of `sensor` `count` times, and receives for `seconds` after each subscriber has a scan.
+/// Prints for each subscriber `followed RECEIVED MISSED PUBLISHED`, the last counted from its first sample to its last.
 pub(crate) fn count_samples(domain: &str, sensor: &str, count: usize, seconds: u64) -> Outcome<()> {
     let all = Arc::new(Barrier::new(count + 1));
     let threads: Vec<_> = (0..count)
@@ -142,7 +141,7 @@ pub(crate) fn count_samples(domain: &str, sensor: &str, count: usize, seconds: u
     Ok(())
 }
 
-/// Takes all samples that `count` subscribers may hold, prints their number, and keeps them.
+/// Takes as many samples as `count` subscribers may hold, prints their number, and keeps them.
 pub(crate) fn hold_samples(domain: &str, sensor: &str, count: usize) -> Outcome<()> {
     let mut subscribers =
         (0..count).map(|_| subscribe::<Scan>(domain, sensor)).collect::<Outcome<Vec<_>>>()?;
@@ -194,7 +193,7 @@ fn count_scans(domain: &str, sensor: &str, all: &Barrier, seconds: u64) -> Outco
         Ok(scans)
     };
     let attached = attached();
-    // The others do not wait for a subscriber that fails.
+    // A subscriber that fails must not block the others.
     all.wait();
     let mut scans = attached?;
     // Samples that queued up while others attached do not count.

@@ -1,4 +1,4 @@
-//! The log of the simulator: the telegrams that it sent. Everything that is received is compared with it.
+//! The log of the simulator, with the telegrams that it sent. The benches compare received data with it.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -22,16 +22,17 @@ pub(crate) struct SentTelegram {
 #[derive(Clone, Debug, Default)]
 pub(crate) struct SensorTruth {
     pub(crate) sent: Vec<SentTelegram>,
-    /// Telegrams for which the host had no room, or not enough: the rest of a later one may complete it.
+    /// Telegrams for which the host had no room, or not enough. The rest of a later telegram may complete such a
+    /// telegram.
     overrun: Vec<SentTelegram>,
-    /// Times at which the sensor aborted a telegram of measured data to answer a request.
+    /// Times at which the sensor aborted a telegram of measured data to reply to a request.
     pub(crate) aborted_ns: Vec<u64>,
     /// Number of EEPROM writes; known once the simulator has ended.
     pub(crate) eeprom_writes: Option<u64>,
 }
 
 impl SensorTruth {
-    /// Reads what `sensor` sent from the file at `path`.
+    /// Reads the telegrams that `sensor` sent from the file at `path`.
     pub(crate) fn read(path: &Path, sensor: &str) -> Outcome<SensorTruth> {
         let mut truth = SensorTruth::default();
         for line in std::fs::read_to_string(path)?.lines() {
@@ -55,9 +56,9 @@ impl SensorTruth {
         Ok(truth)
     }
 
-    /// Returns the times at which each telegram was due, by its hash, and for how long in all the sensor was kept from
-    /// sending. The sensor sends one telegram every `every_ns`, and some of the neighbors of each telegram were sent in
-    /// time.
+    /// Returns the times at which each telegram was due, by its hash, and the total time in ns for which the sensor
+    /// could not send. The sensor sends one telegram every `every_ns`, and at least one of the neighbors of each
+    /// telegram was sent in time.
     pub(crate) fn due(&self, every_ns: u64) -> (HashMap<&str, Vec<u64>>, u64) {
         let mut all: Vec<&SentTelegram> = self.sent.iter().chain(&self.overrun).collect();
         all.sort_by_key(|sent| sent.index);
@@ -82,7 +83,7 @@ impl SensorTruth {
     }
 }
 
-/// Number of telegrams on either side, one of which was sent in time.
+/// Number of neighbors on either side of a telegram. At least one of them was sent in time.
 const NEIGHBOR_COUNT: usize = 200;
 
 /// Returns the SHA-256 of `bytes` as the simulator writes it.

@@ -20,7 +20,7 @@ pub(crate) struct ThreadUsage {
 }
 
 impl ThreadUsage {
-    /// Returns the counters of the threads of `pid` whose names `wanted` accepts.
+    /// Returns the counters of the threads of `pid` for whose names `is_counted` returns true.
     pub(crate) fn of(pid: u32, is_counted: impl Fn(&str) -> bool) -> Outcome<ThreadUsage> {
         let mut work = ThreadUsage::default();
         for task in read_dir(format!("/proc/{pid}/task"))? {
@@ -37,7 +37,7 @@ impl ThreadUsage {
         Ok(work)
     }
 
-    /// Returns what was added since `before`.
+    /// Returns the increase since `before`.
     pub(crate) fn since(&self, before: ThreadUsage) -> ThreadUsage {
         ThreadUsage {
             busy_ns: self.busy_ns.saturating_sub(before.busy_ns),
@@ -55,7 +55,7 @@ fn field(status: &str, name: &str) -> Outcome<u64> {
 /// Resident memory of a process, in bytes.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct ResidentMemory {
-    /// All of it.
+    /// The whole resident memory.
     pub(crate) all: f64,
     /// Heap and stacks.
     pub(crate) heap_and_stacks: f64,
@@ -84,8 +84,8 @@ impl ResidentMemory {
     }
 }
 
-/// Returns number and bytes of the files of `domain` in /dev/shm, by the ends of their names, which say what they are
-/// for.
+/// Returns number and bytes of the files of `domain` in /dev/shm, by the extension of their names, which shows their
+/// purpose.
 pub(crate) fn segments(domain: &Domain) -> Outcome<BTreeMap<String, (usize, f64)>> {
     let mut kinds = BTreeMap::<String, (usize, f64)>::new();
     for entry in read_dir("/dev/shm")? {
