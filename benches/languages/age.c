@@ -1,6 +1,6 @@
 /*
- * Follows the scans of a sensor until so many came, then prints for each how old its telegram's last byte was when the
- * sample was in hand: `aged SENSOR NS`. Arguments are domain, sensor and count.
+ * Receives COUNT scans of a sensor, and then prints for each the age of its telegram's last byte on receipt:
+ * `aged SENSOR NS`. Arguments: DOMAIN SENSOR COUNT.
  */
 #include <scanhub/attach.h>
 

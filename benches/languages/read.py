@@ -1,4 +1,4 @@
-"""Reads the scans of a recording into arrays, and prints how long that took: `took NS BEAMS`. The argument is the file."""
+"""Reads the scans of a recording into arrays, and prints the time that it took: `took NS BEAMS`. Argument: FILE."""
 
 import sys
 import time

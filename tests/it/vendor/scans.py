@@ -1,5 +1,5 @@
-"""What the vendor's own driver makes of a simulated RPLIDAR: scans.py PORT BAUD SCANS. Prints one line of JSON: the model
-that it saw, its health, and of each scan the angles (radians) and the ranges (metres)."""
+"""Reads scans of a simulated RPLIDAR with the vendor's driver. Arguments: PORT BAUD SCANS. Prints one line of JSON: the
+model, the health, and for each scan the angles (radians) and the ranges (meters)."""
 
 import json
 import sys
