@@ -1,9 +1,8 @@
-//! What does a bridge cost, and what does it lose? Routers are bridges that listen. The parts are:
-//!
+//! Benchmark of a bridge: its costs and its losses. Routers are bridges that listen. The parts are:
+//! - `hop`: the time of a scan from shared memory to a plain Zenoh client behind a router, compared with a plain
 //! - `hop`: the time of a scan from shared memory to a plain Zenoh client behind a router, compared with a plain
 //!   publisher
-//! - `killed`: a router that is killed again and again
-//! - `slow`: a link that is too slow
+//! - `killed`: a router that is killed repeatedly
 //! - `stalls`: the same link, on which nothing moves for 2 s of every 20 s
 //! - `loss`: all topics of two sensors for minutes
 //! - `plain`: the same behind a router with Zenoh's own configuration, to a plain Zenoh subscriber
@@ -34,7 +33,7 @@ use environment::{
 };
 use zenoh::sample::Sample;
 
-/// One row of the table.
+/// A row of the result table.
 struct TableRow {
     name: String,
     value: String,
@@ -79,8 +78,8 @@ const RUN_COUNT: usize = 5;
 /// Length of a run.
 const RUN_TIME: Duration = Duration::from_secs(10);
 
-/// How long does a scan take from shared memory over a router to a plain client, compared with the same bytes from a
-/// plain publisher over the same router in the same run?
+/// Measures the time of a scan from shared memory through a router to a plain client, compared with the same bytes from
+/// a plain publisher through the same router in the same run.
 fn latency(environment: &BenchEnvironment) -> Vec<TableRow> {
     let (robot, between) = (environment.machine("robot"), environment.machine("router"));
     let at = free_port();
@@ -90,7 +89,7 @@ fn latency(environment: &BenchEnvironment) -> Vec<TableRow> {
     let _bridge = robot.start_bridge(&[&format!("--connect=tcp/{at}")]);
     let (mut memory, mut sources) = robot.subscribe(SENSORS.map(|sensor| (sensor, Topic::Scan)));
 
-    // By sensor and number of the telegram: when a scan was in shared memory, on CLOCK_MONOTONIC.
+    // Time on CLOCK_MONOTONIC at which a scan was in shared memory, by sensor and telegram number.
     let mut sent: HashMap<(u8, u32), u64> = HashMap::new();
     let (through, plain): (Arc<Mutex<Vec<_>>>, SendTimes) = Default::default();
     let (listener, speaker) = (session(at), session(at));
@@ -164,10 +163,11 @@ fn latency(environment: &BenchEnvironment) -> Vec<TableRow> {
 
 /// Number of times that the router is killed.
 const KILLS: usize = 20;
-/// Time for which the router is away.
+/// Time for which the router does not run.
 const ROUTER_DOWNTIME: Duration = Duration::from_millis(700);
 
-/// How soon do scans arrive again after a router was killed and started again, and do both ends know what was lost?
+/// Measures how soon scans arrive again after a router was killed and restarted, and checks that both ends count the
+/// same losses.
 fn killed_router(environment: &BenchEnvironment) -> Vec<TableRow> {
     let [robot, between, desk] = ["robot", "router", "desk"].map(|name| environment.machine(name));
     let at = free_port();
@@ -190,7 +190,7 @@ fn killed_router(environment: &BenchEnvironment) -> Vec<TableRow> {
     let mut look = |local: &mut (Session, [Source; 2])| {
         for source in &mut local.1 {
             while let Some(sample) = source.receive(&mut local.0).expect("a sample") {
-                // Samples that waited here in the meantime do not count.
+                // Samples that waited before the first poll do not count.
                 missed += if is_first { 0 } else { sample.missed() };
                 received += 1;
             }
@@ -248,7 +248,7 @@ fn killed_router(environment: &BenchEnvironment) -> Vec<TableRow> {
     ]
 }
 
-/// Takes what has arrived, and returns whether a scan of a remote sensor was among it.
+/// Receives the samples that have arrived, and returns whether a scan of a remote sensor was among them.
 fn newest((memory, sources): &mut (Session, [Source; 1])) -> bool {
     let mut has_new = false;
     memory.check_hub().expect("a domain");
@@ -260,7 +260,7 @@ fn newest((memory, sources): &mut (Session, [Source; 1])) -> bool {
     has_new
 }
 
-/// All topics of two sensors over a router for minutes: what is lost, and how busy are the bridges?
+/// Measures losses and CPU time of the bridges, with all topics of two sensors through a router, for `minutes`.
 fn loss(environment: &BenchEnvironment, minutes: f64) -> Vec<TableRow> {
     let [robot, between, desk] = ["robot", "router", "desk"].map(|name| environment.machine(name));
     let at = free_port();
@@ -306,8 +306,8 @@ fn loss(environment: &BenchEnvironment, minutes: f64) -> Vec<TableRow> {
     ]
 }
 
-/// All topics of two sensors for minutes, through a router with Zenoh's own configuration: what does a plain subscriber
-/// to `scanhub/**` lose?
+/// Measures the losses of a plain subscriber to `scanhub/**`, with all topics of two sensors through a router with
+/// Zenoh's own configuration, for `minutes`.
 fn plain_router(environment: &BenchEnvironment, minutes: f64) -> Vec<TableRow> {
     let robot = environment.machine("robot");
     let at = free_port();
@@ -348,8 +348,8 @@ const STALL_TIME: Duration = Duration::from_secs(2);
 const BYTES_PER_SECOND: f64 = 500_000.0 / 8.0;
 const LINK_DELAY: Duration = Duration::from_millis(100);
 
-/// A link of 0.5 Mbit/s and 100 ms each way, with all topics of two sensors: how old are scans when they arrive, and do
-/// both ends know what did not arrive?
+/// Measures the age of scans on a link of 0.5 Mbit/s and 100 ms each way, with all topics of two sensors, and checks
+/// that both ends count the same losses.
 fn slow_link(environment: &BenchEnvironment, stalls: Option<StallPattern>) -> Vec<TableRow> {
     let [robot, desk] = ["robot", "desk"].map(|name| environment.machine(name));
     let at = free_port();
@@ -376,7 +376,7 @@ fn slow_link(environment: &BenchEnvironment, stalls: Option<StallPattern>) -> Ve
         for source in &mut sources {
             while let Some(sample) = source.receive(&mut memory).expect("a sample") {
                 let header = sample.header().filter(|header| header.flags & Flags::REMOTE != 0);
-                // Samples that waited here in the meantime are older.
+                // Samples that waited before the first poll are older.
                 if let Some(header) = header.filter(|_| !is_first) {
                     ages.push(clock::wall_ns().saturating_sub(header.wall_ns));
                 }
@@ -402,7 +402,7 @@ fn slow_link(environment: &BenchEnvironment, stalls: Option<StallPattern>) -> Ve
                 "0.5 Mbit/s, 100 ms each way{suffix}, all topics of two sensors: age of a scan, median, p95 and p99"
             ),
             format!("{p50:.0} ms, {p95:.0} ms, {p99:.0} ms, {} scans", ages.len()),
-            // What is on the way when a stall begins is more than 1 % of all, and 2 s late.
+            // With stalls, the samples in transit when a stall begins are more than 1 % of all, and 2 s late.
             stalls.is_none().then_some(("p99 at most 600 ms", p99 <= 600.0)),
         ),
         row(
@@ -423,14 +423,15 @@ fn has_class(line: &Value, name: &str) -> bool {
     line["sensor"].as_str().is_some_and(|sensor| sensor.ends_with(&format!(".{name}")))
 }
 
-/// Bytes that the sockets of the relay hold at either end.
+/// Buffer size of the relay's sockets at each end, in bytes.
 const SOCKET_BUFFER_LEN: usize = 4096;
-/// Bytes that are passed on at once: a packet of a network, not one of the loopback.
+/// Maximum number of bytes that the relay forwards at once: a packet of a network, which is smaller than one of the
+/// loopback.
 const PACKET_LEN: usize = 1448;
 
-/// A long, slow connection between `to` and programs that connect to the returned address: a number of bytes per
-/// second, each after the same delay, in both directions, and no more in transit than that needs. During `stalls`,
-/// nothing moves. (Kernels with netem and tbf do the same to a network namespace.)
+/// Starts a relay to `to`, and returns the address to connect to. It forwards `bytes_a_second` in each direction, each
+/// byte after `delay`, and has no more bytes in transit than that needs. During `stalls`, it forwards nothing. (Kernels
+/// with netem and tbf do the same to a network namespace.)
 fn relay(to: SocketAddr, bytes_a_second: f64, delay: Duration, stalls: Option<StallPattern>) -> SocketAddr {
     let listener = socket();
     listener.bind(&SocketAddr::from(([127, 0, 0, 1], 0)).into()).expect("a port");
@@ -438,7 +439,7 @@ fn relay(to: SocketAddr, bytes_a_second: f64, delay: Duration, stalls: Option<St
     let listener = TcpListener::from(listener);
     let at = listener.local_addr().expect("it is bound");
     let started = Instant::now();
-    // The thread ends with the bench.
+    // The thread runs until the bench exits.
     thread::spawn(move || {
         for near in listener.incoming().map_while(Result::ok) {
             let far = socket();
@@ -457,7 +458,7 @@ fn relay(to: SocketAddr, bytes_a_second: f64, delay: Duration, stalls: Option<St
     at
 }
 
-/// Returns one end of the connection, with the packets and the buffers of a network.
+/// Creates a socket of the relay, with the packet size and the buffers of a network.
 fn socket() -> Socket {
     let socket = Socket::new(Domain::IPV4, Type::STREAM, Some(Protocol::TCP)).expect("a socket");
     socket.set_tcp_mss(PACKET_LEN as u32).expect("a size");
@@ -467,7 +468,7 @@ fn socket() -> Socket {
     socket
 }
 
-/// The end of each period, in which a link stalls.
+/// Periodic stalls of a link, each at the end of an interval.
 #[derive(Clone, Copy)]
 struct StallPattern {
     interval: Duration,
@@ -475,7 +476,7 @@ struct StallPattern {
 }
 
 impl StallPattern {
-    /// Returns how long the link still stalls.
+    /// Returns the remaining time of the current stall; zero if there is none.
     fn time_left(self, since: Instant) -> Duration {
         let phase = since.elapsed().as_nanos() % self.interval.as_nanos();
         let left = self.interval.saturating_sub(Duration::from_nanos(phase as u64));
@@ -530,7 +531,7 @@ fn relay_bytes(
     }
 }
 
-/// Sums over all sensors and topics, without announcements.
+/// Sums over all sensors and topics, except announcements.
 #[derive(Default)]
 struct CounterTotals {
     sent: u64,
@@ -539,12 +540,12 @@ struct CounterTotals {
     replaced: u64,
     received: u64,
     lost: u64,
-    /// Rows in which the two ends differ.
+    /// Rows in which the two ends disagree.
     wrong: Vec<String>,
 }
 
 impl CounterTotals {
-    /// Returns whether both ends report the same.
+    /// Returns a table row that states whether both ends report the same.
     fn agreement_row(&self) -> TableRow {
         let first = self.wrong.first().map_or(String::new(), |first| format!(", the first {first}"));
         let value = format!("{}{first}", self.wrong.len());

@@ -1,6 +1,6 @@
-//! What does a scan cost on its way through a graph of ROS 2? Measures the time from shared memory until a plain Zenoh
-//! subscriber has decoded it, compared with the same bytes from a plain Zenoh publisher in the same run. Counts how
-//! many arrive, and the CPU time of the bridge.
+//! Benchmark of scans in a ROS 2 graph. It measures the time from shared memory until a plain Zenoh subscriber has
+//! decoded the scan, compared with the same bytes from a plain Zenoh publisher in the same run. It also counts the
+//! scans that arrive, and the CPU time of the bridge.
 //!
 //! `cargo bench -p scanhub-bridge --bench ros2 [-- SECONDS]` (default 20), after `cargo build --release`.
 
@@ -30,14 +30,14 @@ fn main() {
 fn measure(environment: &BenchEnvironment, run_for: Duration) {
     let (robot, between) = (environment.machine("robot"), environment.machine("router"));
     let at = free_port();
-    // Both ways lead over it.
+    // Both paths go through this router.
     let _router = between.start_bridge(&[&format!("--listen=tcp/{at}")]);
     wait_until_listening(at);
     let _hub = robot.robot();
     let bridge = robot.start_bridge(&[&format!("--connect=tcp/{at}"), "--ros2", "--domain-id=42"]);
     let (mut memory, mut sources) = robot.subscribe(SENSORS.map(|sensor| (sensor, Topic::Scan)));
 
-    // By the stamp of a message: when its scan was in shared memory, on CLOCK_MONOTONIC.
+    // Time on CLOCK_MONOTONIC at which a scan was in shared memory, by sensor and stamp of the message.
     let mut sent: HashMap<(bool, u64), u64> = HashMap::new();
     let (through, plain): (Arc<Mutex<Vec<_>>>, SendTimes) = Default::default();
     let (listener, speaker) = (session(at), session(at));

@@ -1,5 +1,5 @@
-//! What keeps a bridge from carrying anything, found by connecting as it would: who cannot be reached and why, whose clock is
-//! another one, who speaks another version. `scanhub doctor` shows it. Sends nothing, publishes nothing.
+//! `bridge --check`: a test connection that finds what keeps a bridge from working, such as an unreachable router, a
+//! wrong clock or another version. `scanhub doctor` shows the same findings. Nothing is sent or published.
 
 use std::collections::BTreeMap;
 use std::convert::Infallible;
@@ -20,29 +20,30 @@ use crate::diagnosis::{Diagnosis, UNREACHED};
 use crate::session::{CheckedConfig, Connection, LinkEvent, ZenohSession};
 use crate::{BridgeOptions, now_s};
 
-/// One line of what was found.
+/// A finding, which is one line of output.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 struct Finding {
     class: &'static str,
     state: &'static str,
     finding: String,
-    /// What to do; empty if nothing.
+    /// Remedy for the user; empty if there is nothing to do.
     remedy: String,
 }
 
-/// So long a router may take to answer, another one where one has refused, and then the hubs behind it.
+/// Time limits: for the first connection, for another router after one has refused, and for the announcements of the
+/// hubs.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
 const REFUSAL_TIMEOUT: Duration = Duration::from_secs(1);
 const ANNOUNCEMENT_TIMEOUT: Duration = Duration::from_secs(2);
-/// Between two looks.
+/// Interval between checks for a connection and for new sensors.
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
-/// Announcements are stamped when they are made, at most this long ago; what a clock is off beyond it is an error of the
-/// clock. A listener with a key demands as much.
+/// Maximum difference between the clocks of two machines. The stamp of an announcement is set when it is created, at
+/// most this long ago, so a larger difference is an error of a clock. A listener with a key has the same limit.
 const MAX_CLOCK_DIFFERENCE_NS: u64 = 5_000_000_000;
-/// Sensors that are asked: whoever can connect can say that some are there.
+/// Maximum number of sensors that are queried. It is bounded because any connected program can announce sensors.
 const MAX_SENSORS: usize = 256;
 
-/// Connects as `options` say, and writes to `out` what is found: a line each, of JSON if they say so.
+/// Connects with `options`, and writes one line for each finding to `out`, as JSON if `options.json` is set.
 ///
 /// # Errors
 ///
@@ -93,7 +94,7 @@ fn find(options: &BridgeOptions, stop: &AtomicBool) -> Result<Vec<Finding>, Fail
             Ok::<_, Infallible>(())
         };
         let Ok(()) = connection.events(event);
-        // Who is refused by one router may still be taken by another, but not by waiting for long.
+        // Another router may still accept a client that one router has refused, but it answers soon.
         if Diagnosis::of(&reasons.join("; ")).is_some_and(|known| known != UNREACHED) {
             end_at = end_at.min(Instant::now() + REFUSAL_TIMEOUT);
         }
@@ -112,7 +113,7 @@ fn find(options: &BridgeOptions, stop: &AtomicBool) -> Result<Vec<Finding>, Fail
     Ok(findings)
 }
 
-/// Why nobody is connected, as Zenoh says it.
+/// Returns the finding for a connection that failed for these `reasons`, which are messages of Zenoh.
 fn unreachable(reasons: &[String]) -> Finding {
     let message = reasons.join("; ");
     let Diagnosis { finding, remedy } = Diagnosis::of(&message).unwrap_or(UNREACHED);
@@ -120,10 +121,10 @@ fn unreachable(reasons: &[String]) -> Finding {
     Finding::failed(message, remedy)
 }
 
-/// What each hub is heard to say: by its number how much our clock is ahead of its, or that it speaks another version.
+/// Replies of the hubs by ID. A reply is the lead of our clock over the hub's in nanoseconds, or the error in its datagram.
 type HubReplies = BTreeMap<u64, Result<i64, DatagramError>>;
 
-/// Somebody is connected: asks all sensors for their announcements.
+/// Queries all sensors for their announcements, and returns the findings about their hubs.
 fn query_hubs(session: &ZenohSession) -> Result<Vec<Finding>, Failure> {
     let live_sensors: Arc<Mutex<Vec<String>>> = Arc::default();
     let replies: Arc<Mutex<HubReplies>> = Arc::default();

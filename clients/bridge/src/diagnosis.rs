@@ -1,4 +1,4 @@
-//! Causes and remedies for Zenoh's messages about failed connections. The texts are those of Zenoh 1.10, whose version is
+//! Causes and remedies for Zenoh's messages about failed connections. The texts match Zenoh 1.10, whose version is
 //! pinned.
 
 /// A cause and its remedy.
@@ -9,12 +9,12 @@ pub(crate) struct Diagnosis {
 }
 
 impl Diagnosis {
-    /// Returns what `words` mean, if that is known.
+    /// Returns the cause that Zenoh's message `words` indicates, if it is known.
     pub(crate) fn of(words: &str) -> Option<Diagnosis> {
         let words = words.to_lowercase();
         let has_any = |signs: &[&str]| signs.iter().any(|sign| words.contains(sign));
         let find = |known: &[KnownCause]| known.iter().find(|(signs, _)| has_any(signs)).map(|row| row.1);
-        // Only the end that connects writes this.
+        // Only the side that connects logs this text.
         let connects = words.contains("unable to connect");
         let of_certificate =
             || find(CERTIFICATE_CAUSES).map(|known| if connects { known } else { PEER_REFUSED });
@@ -22,13 +22,13 @@ impl Diagnosis {
     }
 }
 
-/// No program answers, or not in Zenoh's protocol.
+/// Default cause if the connecting side reports no other: no program answers there, or it does not use Zenoh's protocol.
 pub(crate) const UNREACHED: Diagnosis = Diagnosis {
     finding: "no router is reached",
     remedy: "start a router there (`scanhub bridge --listen ..` or zenohd), and check the firewall",
 };
 
-/// Parts of Zenoh's messages in lower case, and their cause. The first match counts.
+/// Parts of Zenoh's messages in lower case, and their cause. The first entry that matches is used.
 type KnownCause = (&'static [&'static str], Diagnosis);
 
 const KNOWN_CAUSES: &[KnownCause] = &[
@@ -69,7 +69,7 @@ const KNOWN_CAUSES: &[KnownCause] = &[
     ),
 ];
 
-/// Bad certificates, as the end that connects reports them.
+/// Certificate errors, as the side that connects reports them.
 const CERTIFICATE_CAUSES: &[KnownCause] = &[
     (
         &["expired"],
@@ -95,7 +95,7 @@ const CERTIFICATE_CAUSES: &[KnownCause] = &[
     ),
 ];
 
-/// A bad certificate, at the end that listens.
+/// Certificate error, as the side that listens reports it.
 const PEER_REFUSED: Diagnosis = Diagnosis {
     finding: "somebody was refused: the certificates do not fit",
     remedy: "a machine that connects must trust the authority of listen_certificate here; with enable_mtls, it must \

@@ -1,6 +1,6 @@
-//! Sends the topics of a hub to other machines over Zenoh, and publishes those of other machines, as `gateway` and
-//! `listen` do in a LAN. `scanhub_network` decides which samples are sent and accepted, and counts the lost ones. Only
-//! module `session` uses Zenoh.
+//! A bridge that sends the topics of a hub to other machines over Zenoh, and publishes the topics of other machines
+//! here. In a LAN, `gateway` and `listen` do the same over UDP. `scanhub_network` decides which samples are sent and
+//! accepted, and counts the lost ones. Only module `session` uses Zenoh.
 #![forbid(unsafe_code)]
 
 mod check;
@@ -32,60 +32,61 @@ pub use ros2::Ros2Options;
 use sending::{BridgeSender, DatagramSender};
 use session::{CheckedConfig, Connection};
 
-/// What a bridge is asked for.
+/// Options of a bridge.
 #[derive(Clone, Debug)]
 pub struct BridgeOptions {
-    /// Routers to connect to, as Zenoh writes them: `tcp/HOST:PORT`, `tls/HOST:PORT`.
+    /// Routers to connect to, in Zenoh's notation: `tcp/HOST:PORT`, `tls/HOST:PORT`.
     pub connect: Vec<String>,
-    /// Where to listen, as a router.
+    /// Addresses to listen on as a router, in the same notation.
     pub listen: Vec<String>,
-    /// A file of Zenoh's own configuration.
+    /// Zenoh configuration file.
     pub config: Option<PathBuf>,
-    /// What goes out; nothing: nothing does.
+    /// Topics to send; `None` if the bridge sends nothing.
     pub send: Option<SendOptions>,
-    /// What comes in; nothing: nothing does.
+    /// Topics to receive and publish; `None` if the bridge receives nothing.
     pub publish: Option<PublishOptions>,
-    /// What goes into a graph of ROS 2; nothing: nothing does.
+    /// Topics to publish in a ROS 2 graph; `None` if the bridge is not a ROS 2 node.
     pub ros2: Option<Ros2Options>,
-    /// Lines of JSON, with the account once a second.
+    /// Whether output is JSON lines. The statistics are then written once a second.
     pub json: bool,
 }
 
-/// What goes out.
+/// Topics that a bridge sends.
 #[derive(Clone, Debug)]
 pub struct SendOptions {
-    /// `SENSOR/TOPIC`, `*/TOPIC` or `SENSOR/*`, with `:every=N` to thin it; none: the default topics of all
-    /// sensors, as `scanhub gateway` sends them.
+    /// `SENSOR/TOPIC`, `*/TOPIC` or `SENSOR/*`. A suffix `:every=N` sends only the samples of every Nth telegram. If
+    /// empty, the default topics of all sensors, as `scanhub gateway` sends them.
     pub topics: Vec<String>,
-    /// Where the domain of the hub may be.
+    /// Possible locations of the hub's domain.
     pub locations: Vec<Domain>,
 }
 
-/// What comes in.
+/// Topics that a bridge receives and publishes.
 #[derive(Clone, Debug)]
 pub struct PublishOptions {
-    /// Where topics of other machines are published.
+    /// Domain in which remote topics are published.
     pub domain: Domain,
-    /// The topics that are received, of all sensors.
+    /// Topics to receive, of all sensors.
     pub topics: Vec<Topic>,
-    /// `NAME=HUB`: what to call a hub, instead of its 16 hex digits.
+    /// `NAME=HUB`: name of a hub, used instead of its 16 hex digits.
     pub names: Vec<String>,
-    /// The hubs to hear, by 16 hex digits or by one of `names`; none: all.
+    /// Hubs to receive from, by 16 hex digits or by a name in `names`. If empty, all hubs.
     pub hubs: Vec<String>,
-    /// What the topics are made for.
+    /// Limits of the published topics, such as the number of subscribers.
     pub limits: TopicLimits,
-    /// Bytes of shared memory that all topics may take together.
+    /// Maximum shared memory of all published topics together, in bytes.
     pub memory: u64,
 }
 
-/// Carries samples until `stop` is set, whatever becomes of the hub and of the network. The account goes to stdout at the
-/// end and whenever `report_requested` is set; what is no account to stderr if it is not JSON.
+/// Runs a bridge until `stop` is set, even while the hub or the network is unavailable. Writes the statistics to stdout
+/// at the end and whenever `report_requested` is set. Other messages go to stderr, or to stdout if they are JSON.
 ///
 /// # Errors
 ///
-/// [`Kind::Configuration`] if neither a router nor a place to listen is named, or what Zenoh is told cannot be;
-/// [`Kind::Input`] if the file of its configuration cannot be read; [`Kind::Usage`] if there is no such topic;
-/// [`Kind::DomainHeld`] if another listener publishes in the domain; [`Kind::NoTopic`] if the first hub has no such sensor.
+/// [`Kind::Configuration`] if neither a router nor an address to listen on is given, or if Zenoh rejects the
+/// configuration; [`Kind::Input`] if the configuration file cannot be read; [`Kind::Usage`] if a topic does not exist;
+/// [`Kind::DomainHeld`] if another listener publishes in the domain; [`Kind::NoTopic`] if the first hub has no such
+/// sensor.
 pub fn bridge(
     options: &BridgeOptions,
     report_requested: &AtomicBool,
@@ -105,7 +106,7 @@ pub fn bridge(
 const TICK_INTERVAL: Duration = ANNOUNCEMENT_INTERVAL;
 /// Time without a router after which the bridge reports that it waits.
 const REPORT_WAITING_AFTER: Duration = Duration::from_secs(1);
-/// The longest wait for the hub.
+/// Maximum wait for samples of the hub.
 const MAX_WAIT: Duration = Duration::from_millis(50);
 
 fn run(
@@ -193,7 +194,8 @@ fn report_counts(
     }
 }
 
-/// The work of the main thread until it is done.
+/// Runs the main thread until `is_done` returns true: forwards samples of the hub, and reports connections and
+/// statistics.
 fn run_main_thread(
     options: &BridgeOptions,
     connection: &Connection,
@@ -246,7 +248,7 @@ fn run_main_thread(
     Ok(())
 }
 
-/// Seconds since 1970.
+/// Returns the time in seconds since 1970.
 fn now_s() -> i64 {
     (now().wall_ns / 1_000_000_000) as i64
 }

@@ -1,5 +1,4 @@
-//! The program `scanhub-bridge`: its command line, its signals and its exit code. `scanhub bridge` runs it with the same
-//! arguments.
+//! The program `scanhub-bridge`: command line, signals and exit code. `scanhub bridge` runs it with the same arguments.
 #![forbid(unsafe_code)]
 
 use std::io::{self, Write};
@@ -85,7 +84,7 @@ struct Cli {
     json: bool,
 }
 
-/// What is below the help.
+/// Text below the help.
 const EXAMPLES: &str = "Examples:
   scanhub bridge --listen tcp/0.0.0.0:7447
   scanhub bridge --connect tcp/robot:7447 --publish --name robot1=5f3a12bc00d1e2f3
@@ -146,7 +145,7 @@ impl Cli {
                 return Err(Failure::new(Kind::Usage, what, "give the sensor a frame of its own"));
             }
         }
-        // One by one, so that the one that is wrong is named.
+        // Check each flag separately, so that the message names the wrong one.
         RosNames::new(&self.namespace, "", Vec::new()).map_err(|name| no_name("--namespace", &name))?;
         RosNames::new("", &self.topic_prefix, Vec::new()).map_err(|name| no_name("--topic-prefix", &name))?;
         let names = RosNames::new(&self.namespace, &self.topic_prefix, frames)
@@ -162,10 +161,11 @@ impl Cli {
     }
 }
 
-/// The greatest number of a domain of ROS 2 on Linux.
+/// Highest domain ID of ROS 2 on Linux.
 const MAX_DOMAIN_ID: u32 = 232;
 
-/// What the environment of a ROS user says; one who is no node need not know.
+/// Returns the domain ID from `ROS_DOMAIN_ID`, or 0 if it is not set. Called only for a ROS 2 node, so an invalid value
+/// does not affect other uses.
 fn domain_id() -> Result<u32, Failure> {
     let value = std::env::var("ROS_DOMAIN_ID").unwrap_or_default();
     match value.as_str() {
@@ -177,7 +177,7 @@ fn domain_id() -> Result<u32, Failure> {
     }
 }
 
-/// ROS takes words of letters, digits and `_`.
+/// Returns the failure for a `text` that is not a valid ROS name. Names in ROS consist of letters, digits and `_`.
 fn no_name(flag: &str, text: &str) -> Failure {
     let hint = match flag {
         "--frame" => "SENSOR=FRAME, the frame of letters, digits and _, for example front=laser",
@@ -198,7 +198,7 @@ fn main() -> ExitCode {
     match run(cli) {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
-            // Whoever closed them does not want it.
+            // An error means that the reader closed the stream, so there is no one left to inform.
             let _ = match json {
                 true => writeln!(io::stdout(), "{}", Printable(&scanhub_verbs::error_line(&failure))),
                 false => writeln!(io::stderr(), "scanhub-bridge: {}", Printable(&failure.to_string())),

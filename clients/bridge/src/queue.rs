@@ -1,6 +1,5 @@
-//! Messages on their way from the hub to Zenoh. One thread follows the hub and fills a queue. Another one hands the messages
-//! to Zenoh, so that a slow network delays only that one. Zenoh's own topics (`sending.rs`) and those of ROS 2 (`ros2.rs`) are
-//! the two queues.
+//! Queue between the thread that receives from the hub and the thread that sends over Zenoh, so that a slow network
+//! delays only the second. There are two kinds: one of datagrams (`sending.rs`) and one of ROS 2 messages (`ros2.rs`).
 
 use std::num::NonZeroU64;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -18,19 +17,20 @@ use scanhub_verbs::output::ExitReason;
 
 use crate::session::{Connection, ZenohSession};
 
-/// Messages that wait until they are sent. Newer ones of a topic replace older ones.
+/// Queue of messages to send. A newer message of a topic replaces an older one when there is no room.
 pub(crate) trait Queue: SampleSink {
     /// Returns whether a message waits.
     fn is_waiting(&self) -> bool;
 
-    /// Updates what depends on whether the hub is available. The follower calls it after each poll.
+    /// Updates the parts that depend on whether the hub is available. [`QueueFiller::forward`] calls it after each poll
+    /// of the hub.
     fn set_hub_available(&mut self, hub_is_available: bool, now: WallTimestamp);
 
-    /// Settles the message that was taken last: it was sent, or else it counts as not sent.
+    /// Settles the message that was taken last. If `is_sent` is false, it counts as not sent.
     fn settle(&mut self, is_sent: bool);
 }
 
-/// A queue that two threads share.
+/// Queue that two threads share.
 pub(crate) struct SharedQueue<Q>(Arc<(Mutex<Q>, Condvar)>);
 
 /// Fills a queue with the samples of a hub.
@@ -39,12 +39,12 @@ pub(crate) struct QueueFiller<Q> {
     queue: SharedQueue<Q>,
 }
 
-/// Sends the messages of a queue through a session. A message belongs to a topic, which has a number here.
+/// Sends the messages of a queue through a session. Each message belongs to a topic, which is given by its index.
 pub(crate) trait Sender {
-    /// The queue with the messages.
+    /// Queue that holds the messages.
     type Queue: Queue;
 
-    /// Declares what exists now: tokens, and publishers of new topics.
+    /// Declares tokens, and publishers of new topics.
     fn declare(&mut self, queue: &SharedQueue<Self::Queue>) -> Result<(), Failure>;
 
     /// Writes the message that has waited longest to `message`, counts it as sent until it is
@@ -62,23 +62,24 @@ pub(crate) trait Sender {
 const CHECK_INTERVAL: Duration = Duration::from_millis(50);
 /// Interval between checks of the links while there is no connection.
 const LINK_INTERVAL: Duration = Duration::from_millis(5);
-/// Time in which messages that still wait at the end are sent.
+/// Time limit at the end of a run for messages that still wait.
 const FLUSH_TIME: Duration = Duration::from_secs(1);
 
 impl<Q: Queue> QueueFiller<Q> {
-    /// Follows what is selected of the hub in the first live one of `locations`.
+    /// Creates a filler that subscribes to the selected topics of the first running hub in `locations`.
     pub(crate) fn new(selection: Selection, locations: &[Domain], queue: Q) -> QueueFiller<Q> {
         let mut queue = SharedQueue(Arc::new((Mutex::new(queue), Condvar::new())));
         let forwarder = Forwarder::new(selection, locations, &mut queue);
         QueueFiller { forwarder, queue }
     }
 
-    /// Requires that the hub has `sensor`, whether or not anything is sent of it.
+    /// Makes it an error if the hub does not have `sensor`, even if no topic of it is selected.
     pub(crate) fn require(&mut self, sensor: &str) {
         self.forwarder.require(sensor);
     }
 
-    /// Queues what the hub published, and polls the hub. Returns whether there may be more.
+    /// Adds new samples of the hub to the queue, and checks whether the hub runs. Returns whether more samples may be
+    /// available.
     pub(crate) fn forward(
         &mut self,
         report: &mut impl FnMut(Notice) -> Result<(), ExitReason>,
@@ -97,7 +98,7 @@ impl<Q: Queue> QueueFiller<Q> {
         Ok(more)
     }
 
-    /// Waits for the hub, for at most `at_most`.
+    /// Waits for samples of the hub, at most for `at_most`.
     pub(crate) fn wait(&mut self, at_most: Duration) -> Result<(), Failure> {
         self.forwarder.wait(at_most)
     }
@@ -111,11 +112,11 @@ impl<Q: Queue> QueueFiller<Q> {
 impl<Q> SharedQueue<Q> {
     /// Locks the queue.
     pub(crate) fn lock(&self) -> MutexGuard<'_, Q> {
-        // No code panics while it holds the lock; if one did, the messages would still be valid.
+        // No code panics while it holds the lock. Even if it did, the messages would be valid.
         self.0.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Wakes the thread that sends.
+    /// Wakes the sending thread.
     pub(crate) fn ring(&self) {
         self.0.1.notify_one();
     }
@@ -141,12 +142,12 @@ impl<Q: Queue> SampleSink for SharedQueue<Q> {
     }
 }
 
-/// Waits for the end of a thread that [sends](send) the messages of `queue`. A thread that still waits for room on a link after
-/// [`FLUSH_TIME`] is left to the end of the process, and its message counts as not sent.
+/// Waits for the end of a thread that [sends](send) the messages of `queue`. If the thread still waits for room on a
+/// link after [`FLUSH_TIME`], it is abandoned until the process exits, and its message counts as not sent.
 ///
 /// # Errors
 ///
-/// The error of the thread, or that it panicked.
+/// The error of the thread, or [`Kind::Failed`](scanhub_schema::Kind) if it panicked.
 pub(crate) fn join<Q: Queue>(
     thread: JoinHandle<Result<(), Failure>>,
     queue: &SharedQueue<Q>,
@@ -162,8 +163,8 @@ pub(crate) fn join<Q: Queue>(
     thread.join().unwrap_or_else(|_| Err(crate::thread_panicked()))
 }
 
-/// Sends the messages of `queue` until `is_over` is set, and then for at most [`FLUSH_TIME`] what still waits. `open` makes
-/// the sender as soon as there is a session.
+/// Sends the messages of `queue` until `is_over` is set, and then the messages that still wait, for at most
+/// [`FLUSH_TIME`]. Calls `open` to create the sender when the session is open.
 pub(crate) fn send<'a, S: Sender>(
     queue: &SharedQueue<S::Queue>,
     connection: &'a Connection,
@@ -182,7 +183,7 @@ pub(crate) fn send<'a, S: Sender>(
             }
         }
         sender.declare(queue)?;
-        // Without a link the newest messages wait for the next one.
+        // Without a link, keep the newest messages for the next link.
         if !session.is_linked() {
             thread::sleep(LINK_INTERVAL);
             continue;

@@ -1,5 +1,5 @@
-//! Receives samples of other machines over Zenoh: checks each against the address that it arrived under, counts it, and
-//! publishes it as a topic of this machine. All queues are limited, and what exceeds them is counted.
+//! Receiver of samples from other machines over Zenoh. It checks each sample against the key that it arrived under,
+//! counts it, and publishes it as a topic of this machine. All queues are limited, and rejected input is counted.
 
 use std::collections::VecDeque;
 use std::io::{stderr, stdout};
@@ -25,19 +25,19 @@ enum InboundEvent {
     Live(Box<str>),
 }
 
-/// Queue between the threads of Zenoh and the thread that takes the samples.
+/// Sending end of the queue between Zenoh's threads and the receiving thread.
 #[derive(Clone)]
 struct InboxSender {
     to: SyncSender<InboundEvent>,
     counts: Arc<Counts>,
 }
 
-/// Inputs that were rejected before they were checked.
+/// Counters of input that was rejected before it was checked.
 #[derive(Default)]
 struct Counts {
     /// Inputs that are longer than a sample can be, or have no payload.
     long: AtomicU64,
-    /// Inputs that found the queue full.
+    /// Inputs that arrived while the queue was full.
     overrun: AtomicU64,
 }
 
@@ -47,12 +47,12 @@ const QUEUE_CAPACITY: usize = 512;
 const MAX_SAMPLE_LEN: usize = HEADER_LEN + u16::MAX as usize + MAC_LEN;
 /// Maximum length of a key, in bytes. Keys of scanhub have at most 56.
 const MAX_KEY_LEN: usize = 128;
-/// Maximum number of inputs that are taken before other work is done.
+/// Maximum number of inputs that are handled before other work.
 const BATCH_SIZE: usize = 64;
 /// Maximum wait for input.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
 
-/// Takes samples until `is_over` is set. Reports the counts then, and whenever `tell` is set.
+/// Receives samples until `is_over` is set. Reports the statistics at the end, and whenever `report_requested` is set.
 pub(crate) fn run(
     options: &PublishOptions,
     json: bool,
@@ -141,7 +141,7 @@ impl InboxSender {
         }
     }
 
-    /// Never waits, so a sender that is too fast does not delay others.
+    /// Adds an event without waiting, so that a sender that is too fast does not delay others.
     fn put(&self, event: InboundEvent) {
         if self.to.try_send(event).is_err() {
             self.counts.overrun.fetch_add(1, Ordering::Relaxed);
@@ -153,11 +153,11 @@ type QueryFn<'a> = dyn Fn(&Address<'_>) -> Result<(), Failure> + 'a;
 
 struct ZenohReceiver<'a> {
     remote_receiver: RemoteReceiver<'a>,
-    /// Topics that a new sensor is queried for.
+    /// Topics for which a new sensor is queried; `None` stands for its announcement.
     queried_topics: Vec<Option<Topic>>,
     query_queue: QueryQueue,
     counts: Arc<Counts>,
-    /// Inputs under keys that are not of scanhub.
+    /// Inputs whose key is not one of scanhub's.
     foreign: u64,
     /// Queries an address.
     query: Box<QueryFn<'a>>,
@@ -166,8 +166,8 @@ struct ZenohReceiver<'a> {
 }
 
 impl ZenohReceiver<'_> {
-    /// Takes what is in the `inbox` until `is_over` is set. Then `close` ends the subscriptions, and the rest of the
-    /// queue is taken.
+    /// Handles the input in `inbox` until `is_over` is set. Then calls `close` to end the subscriptions, and handles
+    /// the rest of the queue.
     fn run(
         &mut self,
         inbox: &Receiver<InboundEvent>,
@@ -192,7 +192,7 @@ impl ZenohReceiver<'_> {
         self.report_counters()
     }
 
-    /// Takes at most [`BATCH_SIZE`] inputs. Returns whether there may be more.
+    /// Handles at most [`BATCH_SIZE`] inputs. Returns whether there may be more.
     fn take_batch(&mut self, inbox: &Receiver<InboundEvent>) -> Result<bool, ExitReason> {
         let mut next = inbox.recv_timeout(POLL_INTERVAL).ok();
         for _ in 0..BATCH_SIZE {
@@ -225,7 +225,7 @@ impl ZenohReceiver<'_> {
         self.remote_receiver.handle_datagram(payload, origin)
     }
 
-    /// Queries new sensors for their last samples, because the next ones may take long.
+    /// Queries new sensors for their last samples, because the next ones may not arrive for a long time.
     fn query_next(&mut self) -> Result<(), ExitReason> {
         while let Some((hub, sensor)) = self.query_queue.next(Instant::now()) {
             let queried = self
@@ -254,29 +254,29 @@ impl ZenohReceiver<'_> {
     }
 }
 
-/// Returns what a new sensor is queried for if `topics` are received: first its announcement, without which no sample
-/// is published.
+/// Returns the topics for which a new sensor is queried if `topics` are received. The first is the announcement
+/// (`None`), because no sample is published without it.
 fn topics_to_query(topics: &[Topic]) -> Vec<Option<Topic>> {
     let stored = [Topic::Status, Topic::Background].into_iter().filter(|topic| topics.contains(topic));
     std::iter::once(None).chain(stored.map(Some)).collect()
 }
 
-/// Sensors that have appeared and were not queried yet. Any sender can report new ones, so their number is limited, and
-/// the rest is counted. Time is an argument.
+/// Queue of new sensors that must still be queried. Any sender can announce sensors, so the queue is limited, and
+/// dropped sensors are counted. Time is an argument.
 struct QueryQueue {
     /// Hub and name of each sensor, the oldest first.
     waiting: VecDeque<(u64, Box<str>)>,
-    /// Number of sensors that were queried since `second`.
+    /// Number of sensors queried since `second`.
     queried: usize,
     second: Instant,
-    /// Sensors that are not queried, because there was no room or the query failed. Their announcement arrives without
-    /// it.
+    /// Number of sensors that were not queried, because the queue was full or the query failed. The bridge still
+    /// receives their periodic announcements.
     not_requested: u64,
 }
 
 /// Maximum number of sensors that are queried in a second.
 const MAX_QUERIES_PER_SECOND: usize = 64;
-/// Maximum number of sensors that wait: queries for 16 s, with at most 96 kB of names.
+/// Maximum number of sensors that wait. This is enough for 16 s of queries, with at most 96 kB of names.
 const MAX_WAITING_SENSORS: usize = 1024;
 const SECOND: Duration = Duration::from_secs(1);
 
@@ -285,7 +285,7 @@ impl QueryQueue {
         QueryQueue { waiting: VecDeque::new(), queried: 0, second: now, not_requested: 0 }
     }
 
-    /// Adds the sensor `name` of `hub`, which has appeared.
+    /// Adds the sensor `name` of `hub`.
     fn add(&mut self, hub: u64, name: &str) {
         if self.waiting.iter().any(|(other, its)| (*other, &**its) == (hub, name)) {
             return;
@@ -328,7 +328,7 @@ mod tests {
 
     const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
 
-    /// Puts `heard` into the inbox of a receiver and runs it, with `is_over` set or not. Returns its output and the
+    /// Runs a receiver on `events`, with `is_over` set from the start or by the first query. Returns its output and the
     /// number of queries.
     fn run(
         events: Vec<InboundEvent>,
@@ -371,7 +371,7 @@ mod tests {
             query: Box::new(query_and_end),
             refused: Box::new(|| 0),
         };
-        // Input after the end is not accepted.
+        // The inbox accepts no input after `close`.
         receiving.run(&inbox, &AtomicBool::new(false), &over, || drop(inbox_sender)).unwrap();
         drop(receiving);
         (String::from_utf8(out).unwrap(), questions.into_inner())

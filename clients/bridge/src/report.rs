@@ -1,5 +1,5 @@
-//! Reports of a bridge: about itself, its links, and the samples that it sends. Samples that it receives are reported where
-//! they are counted.
+//! Reports of a bridge about itself, its links, and the samples that it sends. `receiving.rs` reports the received
+//! samples.
 
 use std::io::Write;
 
@@ -16,7 +16,7 @@ use crate::session::LinkEvent;
 /// Writes the reports.
 pub(crate) struct Report<'a> {
     json: bool,
-    /// Causes that were reported since the last connection. Each remedy is reported once.
+    /// Causes reported since the last connection, so that each remedy is printed once.
     reported: Vec<Diagnosis>,
     out: Output<'a>,
     notes: Output<'a>,
@@ -33,7 +33,7 @@ impl<'a> Report<'a> {
         self.json
     }
 
-    /// Reports that the bridge is ready, its number, and what it does.
+    /// Reports that the bridge is ready, with its hub ID, epoch and addresses.
     pub(crate) fn begin(
         &mut self,
         options: &BridgeOptions,
@@ -81,7 +81,7 @@ impl<'a> Report<'a> {
         self.notes.line(|line| write!(line, "{message}"))
     }
 
-    /// Reports an event of the links.
+    /// Reports an event of a link. The first time that a cause occurs, its remedy is printed too.
     pub(crate) fn link(&mut self, event: &LinkEvent) -> Result<(), ExitReason> {
         let LinkEvent::Failing(words) = event else {
             let is_up = *event == LinkEvent::Up;
@@ -130,7 +130,7 @@ impl<'a> Report<'a> {
     }
 }
 
-/// Class `bridge_ready`.
+/// JSON line of class `bridge_ready`.
 #[derive(Serialize)]
 struct ReadyJson<'a> {
     class: &'static str,
@@ -143,14 +143,14 @@ struct ReadyJson<'a> {
     pid: u32,
 }
 
-/// Class `bridge_refused` of a bridge that receives nothing.
+/// JSON line of class `bridge_refused` of a bridge that receives nothing.
 #[derive(Serialize)]
 struct RefusedJson {
     class: &'static str,
     connection: u64,
 }
 
-/// Class `bridge_link`.
+/// JSON line of class `bridge_link`.
 #[derive(Serialize)]
 struct LinkJson<'a> {
     class: &'static str,
@@ -163,7 +163,7 @@ struct LinkJson<'a> {
 }
 
 impl LinkJson<'_> {
-    /// A line with nothing but the state.
+    /// Returns a line that has only a state.
     fn of(state: &'static str) -> Self {
         LinkJson { class: "bridge_link", state, message: None, finding: None, remedy: None }
     }

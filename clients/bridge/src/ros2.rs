@@ -1,5 +1,5 @@
-//! A hub in a graph of ROS 2: a node whose topics are the hub's, on the wire of `rmw_zenoh`. How messages and tokens look is
-//! not known here (`schema/ros`).
+//! A ROS 2 node that publishes the hub's topics in the wire format of `rmw_zenoh`. The format of messages and tokens is
+//! in `schema/ros`.
 
 mod graph;
 
@@ -24,16 +24,17 @@ use crate::queue::{self, Queue, QueueFiller, Sender, SharedQueue};
 use crate::session::{Connection, DeclaredToken, Publisher, Queryable, Reply, ZenohSession};
 use graph::{Graph, PublishedTopic};
 
-/// Options of the node of ROS 2.
+/// Options of the ROS 2 node.
 #[derive(Clone, Debug)]
 pub struct Ros2Options {
-    /// `SENSOR/TOPIC`, `*/TOPIC` or `SENSOR/*`, with `:every=N` to thin it. Empty: all topics that ROS has messages for.
+    /// `SENSOR/TOPIC`, `*/TOPIC` or `SENSOR/*`. A suffix `:every=N` sends only the samples of every Nth telegram. If
+    /// empty, all topics for which ROS has messages.
     pub topics: Vec<String>,
     /// Possible locations of the hub's domain.
     pub locations: Vec<Domain>,
-    /// `ROS_DOMAIN_ID`.
+    /// Domain ID of ROS 2 (`ROS_DOMAIN_ID`).
     pub domain_id: u32,
-    /// The release of ROS 2 whose nodes receive it.
+    /// ROS 2 release of the nodes that receive the topics.
     pub distro: Distro,
     /// Names of topics and frames.
     pub names: RosNames,
@@ -41,16 +42,18 @@ pub struct Ros2Options {
     pub reports_hub: bool,
 }
 
-/// The node's name.
+/// Name of the node.
 const NODE: &str = "scanhub";
-/// The longest wait for the hub.
+/// Maximum wait for samples of the hub.
 const MAX_WAIT: Duration = Duration::from_millis(50);
 
-/// Publishes the hub's topics until `is_over` is set. The statistics are written then, and whenever `report_requested` is set.
+/// Publishes the hub's topics until `is_over` is set. Writes the statistics at the end, and whenever `report_requested`
+/// is set.
 ///
 /// # Errors
 ///
-/// [`Kind::Usage`](scanhub_schema::Kind) if there is no such topic, [`Kind::NoTopic`](scanhub_schema::Kind) if the first hub has no such sensor.
+/// [`Kind::Usage`](scanhub_schema::Kind) if a topic does not exist, [`Kind::NoTopic`](scanhub_schema::Kind) if the
+/// first hub has no such sensor.
 pub(crate) fn run(
     options: &Ros2Options,
     json: bool,
@@ -67,7 +70,7 @@ pub(crate) fn run(
     let mut filler = QueueFiller::new(selection, &options.locations, graph);
     options.names.sensors_with_frame().for_each(|sensor| filler.require(sensor));
     let queue = filler.queue().clone();
-    // Set at any end, so that the other thread does not wait for a router any more.
+    // Set however this function ends, so that the sending thread stops waiting for a router.
     let is_done = Arc::new(AtomicBool::new(false));
     let work = {
         let (queue, connection, is_done) = (queue.clone(), connection.clone(), is_done.clone());
@@ -127,24 +130,24 @@ impl SampleSink for Graph {
     }
 }
 
-/// Sends the messages of a graph as a node of ROS 2.
+/// Sends the messages of a graph as a ROS 2 node.
 struct RosSender<'a> {
     session: &'a ZenohSession,
     node: Node,
-    /// In the order of the graph's topics.
+    /// Publishers in the order of [`Graph::topics`].
     publishers: Vec<RosPublisher>,
     _token: DeclaredToken,
 }
 
-/// Payload and attachment of the last message of a latched topic, for late joiners.
+/// Payload and attachment of the last message of a latched topic, kept for late joiners.
 type LastMessage = Arc<Mutex<Option<(Vec<u8>, Vec<u8>)>>>;
 
-/// A publisher of the node. Its token, and the queryable of a latched topic, exist as long as it does.
+/// A publisher of the node. Its tokens, and the queryable of a latched topic, are withdrawn when it is dropped.
 struct RosPublisher {
     publisher: Publisher,
     gid: [u8; 16],
     sequence: i64,
-    /// `None` if the topic is not latched.
+    /// Last message; `None` if the topic is not latched.
     last: Option<LastMessage>,
     _history: Option<Queryable>,
     _tokens: Vec<DeclaredToken>,
@@ -183,7 +186,7 @@ impl Sender for RosSender<'_> {
     }
 
     fn take(&mut self, graph: &mut Graph, now: WallTimestamp, message: &mut Vec<u8>) -> Option<usize> {
-        // A topic that appeared just now has no publisher yet.
+        // A new topic has no publisher until the next call of `declare`.
         if graph.topics().len() > self.publishers.len() {
             return None;
         }
@@ -216,7 +219,7 @@ impl RosPublisher {
             let kept = LastMessage::default();
             let history_key = node.history_key(of);
             let answers = kept.clone();
-            // Subscribers query the history, and expect the topic's own key in the answer.
+            // Subscribers query the history key, and expect a reply under the topic's own key.
             history = Some(session.answer(&history_key, move |_| {
                 let kept = answers.lock().unwrap_or_else(PoisonError::into_inner).clone();
                 let reply =
@@ -242,7 +245,7 @@ impl RosPublisher {
     }
 }
 
-/// Writes the statistics of each topic.
+/// Writes the statistics of each topic to `out`.
 fn write_counters(graph: &Graph, json: bool, out: &mut Output<'_>) -> Result<(), ExitReason> {
     for &PublishedTopic { ref name, of, sent, replaced, failed, .. } in graph.topics() {
         if json {
@@ -262,7 +265,7 @@ fn write_counters(graph: &Graph, json: bool, out: &mut Output<'_>) -> Result<(),
     Ok(())
 }
 
-/// Class `bridge_ros2`.
+/// JSON line of class `bridge_ros2`.
 #[derive(Serialize)]
 struct Ros2Json<'a> {
     class: &'static str,

@@ -1,5 +1,5 @@
-//! Topics of a hub under Zenoh's own keys: `scanhub/HUB/SENSOR/TOPIC`, with the datagrams of a gateway as payload. The newest
-//! sample of each topic waits until the links have room for it.
+//! Sender of a hub's topics under scanhub's own Zenoh keys: `scanhub/HUB/SENSOR/TOPIC`, with the datagrams of a gateway
+//! as payload. The newest sample of each topic waits until the links have room for it.
 
 use std::collections::HashMap;
 use std::collections::hash_map::Entry;
@@ -25,22 +25,22 @@ pub(crate) struct BridgeSender {
     filler: QueueFiller<Datagrams>,
 }
 
-/// The datagrams that wait, and their statistics.
+/// Queue of datagrams, with their statistics.
 pub(crate) struct Datagrams {
     hub: u64,
     outgoing: Outgoing,
     hub_is_available: bool,
-    /// Number of runs of the hub so far.
+    /// Number of the hub's runs so far.
     hub_runs: u64,
-    /// The message that was taken last and is not settled: number of the sensor, topic and length.
+    /// Message that was taken last and is not settled: sensor number, topic and length in bytes.
     in_flight: Option<(u8, Option<Topic>, usize)>,
 }
 
-/// Stands for the interface in the name of the file that keeps the bridge's number.
+/// Takes the place of the interface in the name of the file that stores the bridge's identity.
 const INTERFACE: &str = "bridge";
 
 impl BridgeSender {
-    /// Starts a run of the domain's bridge.
+    /// Starts a run of the domain's bridge, with a new epoch.
     pub(crate) fn open(options: &SendOptions) -> Result<BridgeSender, Failure> {
         let selection = Selection::parse(&options.topics, false)?;
         let domain = options.locations.first().map(Domain::name).unwrap_or_default();
@@ -51,17 +51,18 @@ impl BridgeSender {
         Ok(BridgeSender { identity, filler: QueueFiller::new(selection, &options.locations, datagrams) })
     }
 
-    /// Queues what the hub published, and polls the hub. Returns whether there may be more.
+    /// Adds new samples of the hub to the queue, and checks whether the hub runs. Returns whether more samples may be
+    /// available.
     pub(crate) fn forward(&mut self, report: &mut Report<'_>) -> Result<bool, ExitReason> {
         self.filler.forward(&mut |notice| report.hub(notice))
     }
 
-    /// Waits for the hub, for at most `at_most`.
+    /// Waits for samples of the hub, at most for `at_most`.
     pub(crate) fn wait(&mut self, at_most: Duration) -> Result<(), Failure> {
         self.filler.wait(at_most)
     }
 
-    /// Announces all sensors.
+    /// Queues the announcements of all sensors.
     pub(crate) fn announce(&mut self) {
         self.queue().lock().announce();
         self.queue().ring();
@@ -72,7 +73,7 @@ impl BridgeSender {
         write_counters(&self.queue().lock().outgoing, &self.identity, "bridge", json, out)
     }
 
-    /// Returns the queue, for the thread that sends.
+    /// Returns the queue, for the sending thread.
     pub(crate) fn queue(&self) -> &SharedQueue<Datagrams> {
         self.filler.queue()
     }
@@ -83,7 +84,7 @@ impl Datagrams {
         self.outgoing.announce(now(), &mut NullTransmit);
     }
 
-    /// Returns the last announcements, statuses and backgrounds whose key is part of a query.
+    /// Returns the last announcements, statuses and backgrounds whose key matches a query.
     fn replies(&mut self, is_queried: &dyn Fn(&str) -> bool) -> Vec<Reply> {
         let Datagrams { hub, outgoing, hub_is_available: true, .. } = self else { return Vec::new() };
         let kept = outgoing.stored_samples().map(|(sensor, topic)| (sensor.to_owned(), topic));
@@ -109,7 +110,7 @@ impl Queue for Datagrams {
     fn set_hub_available(&mut self, hub_is_available: bool, _: WallTimestamp) {
         if hub_is_available && !self.hub_is_available {
             self.hub_runs += 1;
-            // Sensors of the last run may not exist any more.
+            // Sensors of the previous run may not exist any more.
             self.outgoing.drop_kept();
         }
         self.hub_is_available = hub_is_available;
@@ -136,7 +137,7 @@ impl SampleSink for Datagrams {
     }
 }
 
-/// Transmits nothing at once: all samples wait.
+/// A transmitter that sends nothing, so that all samples wait in the queue.
 struct NullTransmit;
 
 impl Transmit for NullTransmit {
@@ -150,15 +151,15 @@ pub(crate) struct DatagramSender<'a> {
     session: &'a ZenohSession,
     hub: u64,
     topics: Vec<SentTopic>,
-    /// The tokens of the hub and its sensors, by key. Empty while the hub is unavailable.
+    /// Tokens of the hub and its sensors, by key. Empty while the hub is unavailable.
     tokens: HashMap<String, DeclaredToken>,
-    /// The run of the hub that the tokens announce.
+    /// Run of the hub that the tokens announce.
     hub_runs: u64,
     is_finished: bool,
     _queryable: Queryable,
 }
 
-/// A topic of a sensor. A sensor's number belongs to another one when the hub restarts with other links.
+/// A topic of a sensor. After a restart of the hub with other links, a sensor number may belong to another sensor.
 struct SentTopic {
     number: u8,
     sensor: String,
@@ -187,7 +188,7 @@ impl<'a> DatagramSender<'a> {
         })
     }
 
-    /// Announces that `key` exists, once.
+    /// Declares a token for `key`, unless it already exists.
     fn announce(&mut self, key: String) -> Result<(), Failure> {
         if let Entry::Vacant(vacant) = self.tokens.entry(key) {
             let token = self.session.token(vacant.key())?;
@@ -233,7 +234,7 @@ impl Sender for DatagramSender<'_> {
             let key = Address { hub, sensor, topic: of }.to_string();
             let live = format!("{PREFIX}/{hub:016x}/{sensor}/{LIVE}");
             self.topics[topic].publisher = Some(self.session.publisher(&key)?);
-            // Announcements are sent without a hub too.
+            // Announcements are sent even without a hub, but tokens are not.
             if !self.tokens.is_empty() {
                 self.announce(live)?;
             }
@@ -242,7 +243,7 @@ impl Sender for DatagramSender<'_> {
         Ok(publisher.is_some_and(|publisher| self.session.put(publisher, message, None)))
     }
 
-    /// The last announcement counts everything that was sent.
+    /// Queues the last announcement, whose counters include everything that was sent.
     fn finish(&mut self, queue: &mut Datagrams) -> bool {
         if self.is_finished {
             return false;

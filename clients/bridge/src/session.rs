@@ -1,5 +1,5 @@
-//! A Zenoh session, and nothing of scanhub: a background thread opens it, publishers, tokens, subscribers and queryables
-//! belong to it, and it reports the events of its links. Payloads are bytes here.
+//! A Zenoh session, independent of scanhub's topics. A background thread opens it. It creates publishers, tokens,
+//! subscribers and queryables, and reports the events of its links. Payloads are bytes.
 
 mod config;
 mod log;
@@ -21,13 +21,13 @@ use zenoh::{Session, Wait};
 pub(crate) use config::CheckedConfig;
 use log::{Log, without_locations};
 
-/// A session that opens in the background.
+/// A session that a background thread opens.
 pub(crate) struct Connection {
     state: Arc<State>,
     log: Log,
-    /// A session that listens opens soon, or never.
+    /// Whether the session listens. Such a session opens at once or fails.
     listens: bool,
-    /// Set once the user knows about the session. Nothing that arrives over it is reported earlier.
+    /// Set once the bridge has reported that it is ready. No sample is received or sent earlier.
     has_begun: AtomicBool,
     was_linked: Mutex<Option<bool>>,
 }
@@ -41,17 +41,17 @@ struct State {
 /// An event of the links.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum LinkEvent {
-    /// There is a connection.
+    /// A link is connected, and before there was none.
     Up,
-    /// The last connection has ended.
+    /// The last link has ended.
     Down,
-    /// A connection failed, in Zenoh's words.
+    /// A connection failed, with Zenoh's message.
     Failing(String),
 }
 
 /// Interval between attempts to open a session.
 const RETRY_INTERVAL: Duration = Duration::from_millis(300);
-/// Longest time to close a session.
+/// Time limit for closing a session.
 const CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
 /// Interval between checks for the session.
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
@@ -62,7 +62,7 @@ impl Connection {
         let log = Log::install();
         let (state, listens) = (Arc::new(State::default()), config.listens());
         let shared = state.clone();
-        // The thread ends with the process: nothing can end an attempt.
+        // No call can end an attempt, so the thread runs until the process exits.
         let opening = thread::Builder::new().name("opening".into()).spawn(move || {
             loop {
                 match zenoh::open(config.zenoh()).wait() {
@@ -70,7 +70,7 @@ impl Connection {
                         let _ = shared.session.set(ZenohSession { session, links: Mutex::default() });
                         return;
                     }
-                    // A session that listens needs no peer, so another attempt fails too.
+                    // A session that listens needs no peer, so another attempt would fail too.
                     Err(error) if listens => {
                         let what = format!("Zenoh does not start: {}", without_locations(&error.to_string()));
                         let failure = Failure::new(Kind::Configuration, what, "see --listen and --config");
@@ -93,7 +93,7 @@ impl Connection {
         })
     }
 
-    /// Lets [`session`](Connection::session) return the session: the user knows about it.
+    /// Lets [`session`](Connection::session) return the session. Called after the bridge has reported that it is ready.
     pub(crate) fn begin(&self) {
         self.has_begun.store(true, Ordering::Relaxed);
     }
@@ -120,18 +120,18 @@ impl Connection {
         self.state.session.get().is_some()
     }
 
-    /// Returns whether others connect to this session, so that it waits for no router.
+    /// Returns whether the session listens. It then needs no router.
     pub(crate) fn listens(&self) -> bool {
         self.listens
     }
 
-    /// Returns why there will never be a session, if that is known.
+    /// Returns the reason why the session can never open, if there is one.
     pub(crate) fn failure(&self) -> Option<Failure> {
         self.state.failure.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Passes the events since the last call to `report`. Why there will never be a session is not among them: see
-    /// [`failure`](Connection::failure).
+    /// Passes the link events since the last call to `report`. They do not include a final failure;
+    /// [`failure`](Connection::failure) returns that.
     pub(crate) fn events<E>(&self, mut report: impl FnMut(LinkEvent) -> Result<(), E>) -> Result<(), E> {
         if self.listens && !self.is_open() {
             return Ok(());
@@ -147,13 +147,13 @@ impl Connection {
         Ok(())
     }
 
-    /// Returns how many connections failed or were refused.
+    /// Returns the number of connections that failed or were refused.
     pub(crate) fn refused(&self) -> u64 {
         self.log.count()
     }
 
-    /// Closes the session. A stalled link may delay that for ten seconds: then it is left to the end of the process, which
-    /// the peers notice too.
+    /// Closes the session. A stalled link may delay this for ten seconds, so after [`CLOSE_TIMEOUT`] the session is
+    /// left to the end of the process. The peers notice that too.
     pub(crate) fn close(&self) {
         let Some(session) = self.state.session.get().map(|opened| opened.session.clone()) else { return };
         let closing = thread::Builder::new().name("closing".into()).spawn(move || {
@@ -172,25 +172,25 @@ pub(crate) struct ZenohSession {
     links: Mutex<Links>,
 }
 
-/// The connections at the last check.
+/// Result of the last check of the links.
 #[derive(Clone, Copy, Default)]
 struct Links {
     checked: Option<Instant>,
     is_linked: bool,
-    /// Only one program is connected, and it passes nothing on.
+    /// Whether exactly one program is connected, and it is a client, which forwards nothing.
     is_lone_client: bool,
 }
 
 /// Time for which a check is valid while there is a connection.
 const LINK_CHECK_LIFETIME: Duration = Duration::from_millis(10);
 
-/// A key to send under. It is not a publisher of Zenoh: such a publisher loses its first sample while it finds out who
-/// subscribed.
+/// A key to send under. A publisher of Zenoh is not used, because it loses its first sample while it finds the
+/// subscribers.
 pub(crate) struct Publisher {
     key_expr: KeyExpr<'static>,
 }
 
-/// Announces that something exists, until it is dropped.
+/// Announces that its key exists, until it is dropped.
 pub(crate) struct DeclaredToken {
     _token: LivelinessToken,
 }
@@ -205,7 +205,7 @@ pub(crate) struct Queryable {
     _queryable: zenoh::query::Queryable<()>,
 }
 
-/// An answer to a query.
+/// A reply to a query.
 pub(crate) struct Reply {
     pub(crate) key: String,
     pub(crate) payload: Vec<u8>,
@@ -235,7 +235,7 @@ impl ZenohSession {
         *links
     }
 
-    /// Returns the session's ID, in hexadecimal digits as Zenoh writes it.
+    /// Returns the session's ID in hexadecimal digits, as Zenoh prints it.
     pub(crate) fn id(&self) -> String {
         self.session.zid().to_string()
     }
@@ -248,10 +248,10 @@ impl ZenohSession {
 
     /// Sends `payload`, and waits until the links have room for it. Returns false if the session was closed.
     ///
-    /// The wait ends when the link breaks, or after 5 s (one client), 10 s (a router, from a client) or 1 s (several links),
-    /// unless Zenoh's configuration file says otherwise. The payload is then lost on that link.
+    /// The wait ends when the link breaks, or after 5 s (one client), 10 s (a router, from a client) or 1 s (several
+    /// links), unless Zenoh's configuration file has other values. The payload is then lost on that link.
     pub(crate) fn put(&self, to: &Publisher, payload: &[u8], attachment: Option<&[u8]>) -> bool {
-        // A router would pass `Block` on, and then one slow subscriber of the router would delay all others.
+        // A router would forward `Block`, and then one slow subscriber of the router would delay all others.
         let congestion_control = match self.links().is_lone_client {
             true => CongestionControl::Block,
             false => CongestionControl::Drop,
@@ -261,14 +261,14 @@ impl ZenohSession {
         put.is_ok() && !self.session.is_closed()
     }
 
-    /// Announces that `key` exists.
+    /// Declares a token that announces that `key` exists.
     pub(crate) fn token(&self, key: &str) -> Result<DeclaredToken, Failure> {
         let token = self.session.liveliness().declare_token(key.to_owned()).wait();
         token.map(|_token| DeclaredToken { _token }).map_err(|error| failed(key, &error))
     }
 
-    /// Passes key and payload of each sample that others send under `keys` to `receive`. The payload is `None` if it has
-    /// more than `max_len` bytes.
+    /// Subscribes to `keys`, and passes key and payload of each sample from other sessions to `receive`. The payload is
+    /// `None` if it has more than `max_len` bytes.
     pub(crate) fn subscribe(
         &self,
         keys: &str,
@@ -280,7 +280,7 @@ impl ZenohSession {
         subscriber.map(|_subscriber| Subscriber { _subscriber }).map_err(|error| failed(keys, &error))
     }
 
-    /// Passes the key of each token of `keys` that exists or appears to `receive`.
+    /// Passes the key of each token in `keys` to `receive`, both for existing and for new tokens.
     pub(crate) fn watch(
         &self,
         keys: &str,
@@ -296,7 +296,7 @@ impl ZenohSession {
         subscriber.map(|_subscriber| Subscriber { _subscriber }).map_err(|error| failed(keys, &error))
     }
 
-    /// Answers queries that intersect `keys` with the replies that `answer` returns. `answer` gets a function that checks
+    /// Replies to queries that intersect `keys`. `answer` returns the replies. Its argument is a function that checks
     /// whether a key matches the query, which may have wildcards.
     pub(crate) fn answer(
         &self,
@@ -307,7 +307,7 @@ impl ZenohSession {
             let is_queried =
                 |key: &str| KeyExpr::try_from(key).is_ok_and(|key| query.key_expr().intersects(&key));
             for Reply { key, payload, attachment } in answer(&is_queried) {
-                // The client may have gone, or it accepts only answers under the key of its query.
+                // The client may have exited, or it accepts only replies under the key of its query.
                 let _ = query.reply(key, payload).attachment(attachment).wait();
             }
         });
@@ -315,7 +315,7 @@ impl ZenohSession {
         queryable.map(|_queryable| Queryable { _queryable }).map_err(|error| failed(keys, &error))
     }
 
-    /// Queries `key`. The answers go to `receive` as those of [`subscribe`](ZenohSession::subscribe).
+    /// Queries `key`, and passes the replies to `receive` as [`subscribe`](ZenohSession::subscribe) does.
     pub(crate) fn query(
         &self,
         key: &str,
@@ -340,7 +340,7 @@ impl ZenohSession {
     }
 }
 
-/// Time within which a query is answered.
+/// Time limit for the replies to a query.
 const QUERY_TIMEOUT: Duration = Duration::from_secs(2);
 
 fn pass(sample: &Sample, max_len: usize, receive: &impl Fn(&str, Option<Vec<u8>>)) {

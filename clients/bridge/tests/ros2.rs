@@ -1,5 +1,6 @@
-//! The bridge as a node of ROS 2, judged by other people's implementations of the wire (PyPI's zenoh-ros2-sdk and rosbags, see
-//! ros2.py): two simulated sensors, their hub, the bridge as a router, and the hub's own consumers beside it.
+//! The bridge as a ROS 2 node, checked by independent implementations of the wire format (zenoh-ros2-sdk and rosbags
+//! from PyPI, see ros2.py). The setup is two simulated sensors, their hub, the bridge as a router, and subscribers of
+//! the hub.
 
 use std::fs::{self, DirBuilder, File};
 use std::io::{BufRead, BufReader};
@@ -19,7 +20,7 @@ mod child;
 use child::{Child, output, spawn, status, succeeds};
 
 const BRIDGE: &str = env!("CARGO_BIN_EXE_scanhub-bridge");
-/// The program beside the bridge; built if it is not there.
+/// Returns the path of `scanhub` next to the bridge, and builds it if it does not exist.
 fn scanhub() -> PathBuf {
     let program = Path::new(BRIDGE).with_file_name("scanhub");
     if !program.is_file() {
@@ -29,7 +30,7 @@ fn scanhub() -> PathBuf {
     program
 }
 
-/// A temporary directory with a domain in it.
+/// A temporary directory that contains a domain.
 struct TestDirectory(TempDir);
 
 impl TestDirectory {
@@ -45,7 +46,7 @@ impl TestDirectory {
         self.0.path().join(name).display().to_string()
     }
 
-    /// A program in the domain, which ends with the test.
+    /// Starts a program in the domain. It ends with the test.
     fn start(&self, program: &Path, arguments: &[&str], out: Stdio) -> RunningProgram {
         let mut command = Command::new(program);
         command.args(arguments).args(["--domain", "ros2", "--root", &self.path("root")]);
@@ -58,21 +59,21 @@ impl TestDirectory {
 struct RunningProgram(Child);
 
 impl RunningProgram {
-    /// Ends it by a signal; returns its exit code.
+    /// Ends the program with SIGTERM, and returns its exit code.
     fn end(mut self) -> Option<i32> {
         self.0.signal(rustix::process::Signal::TERM).expect("it lives");
         self.0.wait().ok().and_then(|status| status.code())
     }
 }
 
-/// Says why a test is left out, unless what `need`s it must be there.
+/// Prints why a test is skipped. Fails if the environment requires `need`.
 fn skip(need: &str, why: &str) {
     let required = std::env::var("SCANHUB_REQUIRE").unwrap_or_default();
     assert!(!required.split(',').any(|name| name == need), "{need} is required: {why}");
     eprintln!("skipped: {why}");
 }
 
-/// A Python with others' implementations of the wire.
+/// Returns a Python interpreter that has the independent implementations, if there is one.
 fn python() -> Option<PathBuf> {
     let made = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../target/venv/bin/python");
     let python = std::env::var_os("SCANHUB_PYTHON").map_or(made, PathBuf::from);
@@ -123,7 +124,7 @@ fn others_find_every_topic_and_decode_every_message() {
     assert_eq!(bridge.end(), Some(0));
 }
 
-/// All topics are there as a ROS node would have made them.
+/// Checks that all topics exist as a ROS node would declare them.
 fn check_graph(report: &Value) {
     let topics = report["topics"].as_object().expect("topics");
     let words = ["foreground", "marks", "scan", "verdict", "zones"];
@@ -145,7 +146,8 @@ fn check_graph(report: &Value) {
     }
 }
 
-/// What was decoded is what was measured, and nearly all of it came: best effort leaves out what a busy machine is late with.
+/// Checks that the decoded scans are the measured ones, and that nearly all of them arrived. With best effort, a busy
+/// machine drops those that are late.
 fn check_scans(report: &Value, sensor: &str) {
     let scans = &report["scans"][format!("/robot1/{sensor}/scan")];
     let number = |key: &str| scans[key].as_u64().unwrap_or_default();
@@ -155,13 +157,13 @@ fn check_scans(report: &Value, sensor: &str) {
     assert!(scans["angles"].as_f64().is_some_and(|apart| apart < 1e-6), "{sensor}: {scans}");
     let frame = if sensor == "rear" { "back" } else { "front" };
     assert_eq!((&scans["frames"], &scans["beams"]), (&[frame].as_slice().into(), &[361].as_slice().into()));
-    // Neighbouring beams of half a degree are of two turns.
+    // Adjacent beams of a half-degree scan come from two revolutions, so there is no time increment.
     assert_eq!(scans["time_increment"], Value::from([0.0].as_slice()), "{sensor}");
     let lost = number("published") - number("matched");
     assert!(100 * lost <= number("published") + 100, "{sensor}: {lost} lost: {scans}");
 }
 
-/// Every other topic said something, and what it should.
+/// Checks that every other topic had messages, and checks their contents.
 fn check_others(report: &Value) {
     for (name, count) in report["heard"].as_object().expect("counts") {
         assert!(count.as_u64() > Some(0), "{name}: {report:#}");
@@ -179,7 +181,7 @@ fn check_others(report: &Value) {
     }
 }
 
-/// The lines of its page that are ours, on a port of this machine: the first one listens, and the others connect to it.
+/// Runs the bridge commands of the page on a port of this machine. The first one listens, and the others connect to it.
 #[test]
 fn the_examples_of_the_page_run() {
     let page =
@@ -203,10 +205,10 @@ fn the_examples_of_the_page_run() {
     }
 }
 
-/// What the program says of `flags` where the environment says `domain`: its exit code and stderr.
+/// Runs the program with `flags` and `ROS_DOMAIN_ID` set to `domain`. Returns its exit code and stderr.
 fn run_bridge(domain: &str, flags: &[&str]) -> (Option<i32>, String) {
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub-bridge"));
-    // Nobody is at this port.
+    // No program listens on this port.
     command.args(["--connect=tcp/127.0.0.1:1", "--check"]).args(flags).env("ROS_DOMAIN_ID", domain);
     let output = output(command).expect("a program");
     (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())

@@ -1,7 +1,7 @@
-//! Where the benches of the bridge run: programs in separate directories, which end with the bench, plain Zenoh
-//! sessions next to them, and the CPU time of a process.
+//! Environment of the bridge's benches: programs in separate directories that end with the bench, plain Zenoh sessions,
+//! and the CPU time of a process.
 
-#![allow(dead_code)] // Each bench uses a part of it.
+#![allow(dead_code)] // Each bench uses only a part of it.
 
 use std::fs::{self, DirBuilder, File};
 use std::net::{SocketAddr, TcpListener, TcpStream};
@@ -17,7 +17,7 @@ use scanhub_client::{Domain, Topic};
 use tempfile::TempDir;
 use zenoh::{Config, Wait};
 
-/// A directory for the programs of a bench, removed when it is dropped.
+/// A directory for the programs of a bench. It is removed when dropped.
 pub(crate) struct BenchEnvironment {
     directory: TempDir,
     scanhub: PathBuf,
@@ -29,7 +29,7 @@ pub(crate) struct RunningProgram {
     stdout_path: PathBuf,
 }
 
-/// A simulated machine: all programs on it share a domain.
+/// A simulated machine. All programs on it share a domain.
 pub(crate) struct Machine<'a> {
     environment: &'a BenchEnvironment,
     pub(crate) root: PathBuf,
@@ -40,7 +40,7 @@ const BRIDGE: &str = env!("CARGO_BIN_EXE_scanhub-bridge");
 pub(crate) const SENSORS: [&str; 2] = ["front", "rear"];
 
 impl BenchEnvironment {
-    /// Creates the directory; `None` if the program with the hub was not built.
+    /// Creates the directory. Returns `None` if `scanhub` was not built.
     pub(crate) fn new(name: &str) -> Option<BenchEnvironment> {
         let scanhub = Path::new(BRIDGE).with_file_name("scanhub");
         if !scanhub.is_file() {
@@ -60,7 +60,7 @@ impl BenchEnvironment {
 }
 
 impl Machine<'_> {
-    /// Starts a hub of two simulated sensors at 500 kBd.
+    /// Starts two simulated sensors at 500 kBd and their hub.
     pub(crate) fn robot(&self) -> [RunningProgram; 2] {
         let port = |name: &str| self.root.join(format!("tty-{name}")).display().to_string();
         let ports = SENSORS.map(|name| format!("--port={}", port(name)));
@@ -101,20 +101,20 @@ impl Machine<'_> {
 }
 
 impl RunningProgram {
-    /// Returns the CPU time so far, in clock ticks of a hundredth of a second.
+    /// Returns the CPU time used so far, in clock ticks of 10 ms.
     pub(crate) fn cpu_ticks(&self) -> u64 {
         let stat = fs::read_to_string(format!("/proc/{}/stat", self.child.id())).unwrap_or_default();
         let after_name = stat.rsplit(") ").next().unwrap_or_default();
         after_name.split(' ').skip(11).take(2).filter_map(|number| number.parse::<u64>().ok()).sum()
     }
 
-    /// Returns what the program has printed so far, one object per line.
+    /// Returns the JSON lines that the program has printed so far.
     pub(crate) fn lines(&self) -> Vec<serde_json::Value> {
         let text = fs::read_to_string(&self.stdout_path).unwrap_or_default();
         text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect()
     }
 
-    /// Waits until the program prints a line that `what` accepts.
+    /// Waits until the program prints a line for which `is_expected` returns true.
     pub(crate) fn wait_for_line(
         &self,
         is_expected: impl Fn(&serde_json::Value) -> bool,
@@ -133,7 +133,7 @@ impl RunningProgram {
         }
     }
 
-    /// Ends the program with SIGINT, and returns what it printed.
+    /// Ends the program with SIGINT, and returns its output.
     pub(crate) fn end(mut self) -> Vec<serde_json::Value> {
         if let Some(process) = rustix::process::Pid::from_raw(self.child.id() as i32) {
             rustix::process::kill_process(process, rustix::process::Signal::INT).expect("it is ours");
@@ -168,12 +168,12 @@ pub(crate) fn wait_until_listening(at: SocketAddr) {
     }
 }
 
-/// Opens a plain Zenoh session at a router.
+/// Opens a plain Zenoh client session that is connected to a router.
 pub(crate) fn session(router: SocketAddr) -> zenoh::Session {
     open("client", "connect/endpoints", router)
 }
 
-/// Opens a Zenoh router with Zenoh's own configuration, as `zenohd` is one.
+/// Opens a Zenoh router with Zenoh's default configuration, like `zenohd`.
 pub(crate) fn plain_router(at: SocketAddr) -> zenoh::Session {
     open("router", "listen/endpoints", at)
 }
@@ -190,10 +190,10 @@ fn open(mode: &str, endpoints: &str, at: SocketAddr) -> zenoh::Session {
     zenoh::open(config).wait().expect("a session")
 }
 
-/// Durations in nanoseconds, measured by any thread.
+/// Durations in nanoseconds, which several threads collect.
 pub(crate) type SendTimes = Arc<Mutex<Vec<u64>>>;
 
-/// Returns the value below which this share of all lies, in us.
+/// Returns the value in microseconds below which the given share of all values lies.
 pub(crate) fn percentile(values: &mut [u64], share: f64) -> f64 {
     values.sort_unstable();
     let place = ((values.len() as f64 - 1.0) * share).max(0.0) as usize;

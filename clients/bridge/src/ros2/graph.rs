@@ -1,5 +1,5 @@
-//! Topics of ROS 2 that a bridge publishes for one hub. Each sample becomes a message. The messages of a topic wait in a
-//! queue, whose length is the depth of the topic's quality of service. Time is an argument.
+//! ROS 2 topics that a bridge publishes for one hub. Each sample becomes a message. Messages of a topic wait in a
+//! queue, whose length is the depth in the topic's quality of service. Time is an argument.
 
 use std::collections::VecDeque;
 use std::num::NonZeroU64;
@@ -11,7 +11,7 @@ use scanhub_ros::rmw_zenoh::Qos;
 use scanhub_ros::{DIAGNOSTICS, RosNames, TF_STATIC, Type};
 use scanhub_schema::{Cloud, Foreground, Header, Pose, Scan, Status, SweepPoints, Topic};
 
-/// The graph of one hub.
+/// ROS 2 topics of one hub, with the messages to send.
 #[derive(Debug)]
 pub(super) struct Graph {
     names: RosNames,
@@ -19,52 +19,52 @@ pub(super) struct Graph {
     sensors: Vec<Sensor>,
     topics: Vec<PublishedTopic>,
     slots: Vec<Slot>,
-    /// A slot for each message that waits, the one that waited for longest first.
+    /// Slot of each queued message, the longest waiting one first.
     waiting: VecDeque<usize>,
-    /// What was handed last, and memory for others.
+    /// Message that [`take_next`](Graph::take_next) returned last. Its memory is reused.
     current: Vec<u8>,
     spare: Vec<Vec<u8>>,
-    /// The topic of the last message from [`take_next`](Graph::hand), until it is settled.
+    /// Topic of the last message from [`take_next`](Graph::take_next), until it is settled.
     in_flight: Option<usize>,
-    /// By frame.
+    /// Last pose of each frame.
     poses: Vec<(String, Pose)>,
     poses_slot: Option<usize>,
 }
 
-/// A topic that has a publisher.
+/// A ROS 2 topic with its statistics.
 #[derive(Debug)]
 pub(super) struct PublishedTopic {
     pub(super) name: String,
     pub(super) of: Type,
     pub(super) qos: Qos,
-    /// Messages that were handed on, those that newer ones took the place of, and those that were not taken.
+    /// Messages that were sent, that newer messages replaced, and that could not be sent.
     pub(super) sent: u64,
     pub(super) replaced: u64,
     pub(super) failed: u64,
 }
 
-/// Where messages of a topic wait; topics of several sensors have one for each.
+/// Queue for messages of a topic. A topic that several sensors share has one slot for each sensor.
 #[derive(Debug)]
 struct Slot {
     topic: usize,
-    /// With CLOCK_MONOTONIC of when they came, the oldest first.
+    /// Messages with the time at which they were queued on CLOCK_MONOTONIC, the oldest first.
     messages: VecDeque<(u64, Vec<u8>)>,
 }
 
-/// What is to be sent.
+/// A message to send.
 #[derive(Debug)]
 pub(super) struct QueuedMessage<'a> {
-    /// Position among the [`topics`](Graph::topics).
+    /// Index in [`topics`](Graph::topics).
     pub(super) topic: usize,
     pub(super) message: &'a [u8],
 }
 
-/// What is said of the hub itself.
+/// State of the reports about the hub itself.
 #[derive(Debug, Default)]
 struct Hub {
-    /// Nothing if nobody wants to know how anything is.
+    /// Slot of the reports; `None` if the topic `status` is not selected.
     slot: Option<usize>,
-    /// Wall clock of when it was first missed, and of when it was told of last.
+    /// Wall clock time since when the hub is unavailable, and of the last report.
     missed_ns: Option<u64>,
     reported_ns: u64,
 }
@@ -74,19 +74,19 @@ struct Sensor {
     name: String,
     every: [Option<NonZeroU64>; TOPIC_COUNT],
     slots: TopicSlots,
-    /// The last scans, by the number of their telegram: foregrounds are points of them.
+    /// Last scans by `seq`. The points of a foreground are computed from its scan.
     scans: VecDeque<(u64, Box<Scan>)>,
-    /// A foreground that came before its scan.
+    /// Foreground that arrived before its scan.
     pending_foreground: Option<(Header, Box<Foreground>)>,
-    /// Of a name that has clouds.
+    /// Points of the current sweep, if the sensor has clouds.
     sweep: SweepPoints,
-    /// Wall clock of the last scan, and of the last status; when a status was told of last.
+    /// Wall clock times of the last scan, of the last status, and of the last report about a missing status.
     last_scan_ns: Option<u64>,
     last_status_ns: Option<u64>,
     reported_ns: u64,
 }
 
-/// Where the messages of a sensor wait; nothing where its topic does not go out.
+/// Slots for the messages of a sensor; `None` for topics that are not sent.
 #[derive(Clone, Copy, Debug, Default)]
 struct TopicSlots {
     scan: Option<usize>,
@@ -101,10 +101,10 @@ struct TopicSlots {
 }
 
 /// Time after which a waiting message is dropped if its topic has a newer one. On a good network, a subscriber with a
-/// depth of five misses no message. On a slow network, messages do not delay each other.
+/// depth of five misses no message. On a slow network, old messages do not delay newer ones.
 const MAX_QUEUED_NS: u64 = 100_000_000;
 const TOPIC_COUNT: usize = Topic::ALL.len();
-/// Number of scans that are kept for their foregrounds.
+/// Number of scans kept for their foregrounds.
 const MAX_SCANS: usize = 4;
 /// Time without a status after which the state of a sensor is unknown. A hub sends a status once a second.
 const SILENT_AFTER_NS: u64 = 3_000_000_000;
@@ -114,7 +114,7 @@ const ABSENT_AFTER_NS: u64 = 500_000_000;
 const REPORT_INTERVAL_NS: u64 = 1_000_000_000;
 
 impl Graph {
-    /// Creates the graph of a hub. With `tells_state`, it publishes once a second whether the hub runs.
+    /// Creates the graph of a hub. With `reports_hub`, it publishes once a second whether the hub runs.
     pub(super) fn new(names: RosNames, reports_hub: bool) -> Graph {
         let mut graph = Graph {
             names,
@@ -133,8 +133,8 @@ impl Graph {
         graph
     }
 
-    /// Takes the sensor called `name`, of whose topics the samples of every so many telegrams go out; nothing: none do.
-    /// Returns its position.
+    /// Adds the sensor `name`, and returns its index. `every` returns N if the samples of every Nth telegram of a topic
+    /// are sent, or `None` if the topic is not sent.
     pub(super) fn follow(&mut self, name: &str, every: &dyn Fn(Topic) -> Option<NonZeroU64>) -> usize {
         let every = Topic::ALL.map(every);
         let mut slot = |topic: Topic, word: &str, of: Type| {
@@ -168,7 +168,8 @@ impl Graph {
         self.sensors.len() - 1
     }
 
-    /// Returns whether samples of this topic are wanted: scans for their foregrounds, too, and a status for its pose.
+    /// Returns whether the graph uses samples of this topic. It needs scans also for their foregrounds, and the status
+    /// for the pose.
     pub(super) fn needs(&self, sensor: usize, topic: Topic) -> bool {
         let is_sent = |topic: Topic| self.sensors[sensor].every[topic as usize].is_some();
         match topic {
@@ -179,10 +180,10 @@ impl Graph {
         }
     }
 
-    /// Takes a sample of the sensor at this position.
+    /// Handles a sample of the sensor with this index.
     pub(super) fn sample(&mut self, sensor: usize, sample: &Sample<'_>, now: WallTimestamp) {
         let Some(header) = sample.header else {
-            // The word that nothing comes any more is as good as a sample of the verdict.
+            // A zones payload without a header means that scans have stopped, and carries the verdict `unknown`.
             if let PayloadRef::Zones(zones) = sample.payload {
                 let slot = self.sensors[sensor].slots.verdict;
                 self.write(slot, now, |message| scanhub_ros::verdict_message(message, zones.verdict()));
@@ -231,7 +232,8 @@ impl Graph {
         }
     }
 
-    /// Says each second whether the hub is there, and of sensors whose status stays out that nobody says how they are.
+    /// Queues the reports that are due, once a second: whether the hub runs, and that the state of a sensor without a
+    /// recent status is unknown.
     pub(super) fn report_silence(&mut self, is_hub_there: bool, now: WallTimestamp) {
         let now_ns = now.wall_ns;
         let missed_ns = *self.hub.missed_ns.get_or_insert(now_ns);
@@ -258,17 +260,17 @@ impl Graph {
         }
     }
 
-    /// Returns the topics that have a publisher; new ones append.
+    /// Returns all topics. New topics are added at the end.
     pub(super) fn topics(&self) -> &[PublishedTopic] {
         &self.topics
     }
 
-    /// Returns whether something is to be sent.
+    /// Returns whether a message waits.
     pub(super) fn is_waiting(&self) -> bool {
         !self.waiting.is_empty()
     }
 
-    /// Returns the message that has waited for longest, and counts it as sent.
+    /// Returns the message that has waited longest, and counts it as sent.
     pub(super) fn take_next(&mut self, now: WallTimestamp) -> Option<QueuedMessage<'_>> {
         loop {
             let slot = &mut self.slots[self.waiting.pop_front()?];
@@ -286,7 +288,7 @@ impl Graph {
         }
     }
 
-    /// Settles the last message from [`take_next`](Graph::hand): it was sent, or else it failed.
+    /// Settles the last message from [`take_next`](Graph::take_next). If `is_sent` is false, it counts as failed.
     pub(super) fn settle(&mut self, is_sent: bool) {
         if let Some(topic) = self.in_flight.take().filter(|_| !is_sent) {
             let topic = &mut self.topics[topic];
@@ -316,7 +318,7 @@ impl Graph {
         self.poses = poses;
     }
 
-    /// Keeps a scan for its foreground, which may have come before it.
+    /// Keeps a scan for its foreground. Handles the foreground at once if it arrived before the scan.
     fn scan(&mut self, sensor: usize, header: &Header, scan: &Scan, now: WallTimestamp) {
         let known = &mut self.sensors[sensor];
         known.last_scan_ns = Some(header.wall_ns);
@@ -332,7 +334,7 @@ impl Graph {
         }
     }
 
-    /// The points of a foreground, if its scan is there; else it waits for it.
+    /// Queues the points of a foreground, or keeps the foreground until its scan arrives.
     fn foreground(&mut self, sensor: usize, header: &Header, foreground: &Foreground, now: WallTimestamp) {
         let known = &mut self.sensors[sensor];
         let Some(index) = known.scans.iter().position(|(seq, _)| *seq == header.seq) else {
@@ -350,7 +352,7 @@ impl Graph {
         self.sensors[sensor].scans = scans;
     }
 
-    /// A message of a whole sweep, with the last of its samples.
+    /// Queues a message with all points of a sweep when its last sample has arrived.
     fn cloud(&mut self, sensor: usize, header: &Header, cloud: &Cloud, now: WallTimestamp) {
         let known = &mut self.sensors[sensor];
         let (slot, mut sweep) = (known.slots.cloud, std::mem::take(&mut known.sweep));
@@ -360,12 +362,12 @@ impl Graph {
         self.sensors[sensor].sweep = sweep;
     }
 
-    /// A new place for messages of how something is.
+    /// Creates a slot for diagnostics messages.
     fn publish_diagnostics(&mut self) -> usize {
         self.publish(self.names.global_topic(DIAGNOSTICS), scanhub_ros::DIAGNOSTIC_ARRAY, Qos::Reliable(10))
     }
 
-    /// A new place for messages of the topic called `name`.
+    /// Creates a slot for messages of the topic `name`, and the topic itself if it is new.
     fn publish(&mut self, name: String, of: Type, qos: Qos) -> usize {
         let known = self.topics.iter().position(|topic| topic.name == name);
         let topic = known.unwrap_or_else(|| {
@@ -376,7 +378,7 @@ impl Graph {
         self.slots.len() - 1
     }
 
-    /// Has a message for `slot` written; where there are as many as are kept, it takes the place of the oldest.
+    /// Queues a message in `slot`, which `write` fills. If the slot is full, the message replaces the oldest one.
     fn write(&mut self, slot: Option<usize>, now: WallTimestamp, write: impl FnOnce(&mut Vec<u8>)) {
         let Some(index) = slot else { return };
         let slot = &mut self.slots[index];
@@ -423,7 +425,7 @@ mod tests {
         Scan::of(ScanHead::lms(181, -90_000, 1000, 10, 13), &[range; 181])
     }
 
-    /// A foreground of the beam ahead.
+    /// Returns a foreground with only the beam straight ahead.
     fn foreground() -> Box<Foreground> {
         let mut foreground = Foreground::of(181);
         let head = ForegroundHead { unit_um: 10_000, count: 181, beams: 1, ..ForegroundHead::default() };
@@ -443,7 +445,7 @@ mod tests {
         graph
     }
 
-    /// All that waits: name of the topic and message.
+    /// Takes all waiting messages, and returns the topic name and the message of each.
     fn take_messages(graph: &mut Graph) -> Vec<(String, Value)> {
         let mut all = Vec::new();
         while let Some(QueuedMessage { topic, message }) = graph.take_next(at(0)) {
@@ -575,7 +577,7 @@ mod tests {
         graph.sample(0, &sample(&header(2), PayloadRef::Foreground(&foreground)), at(0));
         let messages = take_messages(&mut graph);
         assert_eq!((messages.len(), messages[0].1.number("header.stamp.sec")), (1, Some(99.0)));
-        // That of a scan that was missed, or is long gone, is none.
+        // A foreground is dropped if its scan was missed or is no longer kept.
         graph.sample(0, &sample(&header(6), PayloadRef::Foreground(&foreground)), at(0));
         graph.sample(0, &sample(&header(7), PayloadRef::Scan(&scan)), at(0));
         graph.sample(0, &sample(&header(1), PayloadRef::Foreground(&foreground)), at(0));
@@ -647,7 +649,7 @@ mod tests {
         };
         assert_eq!(levels_during(100..120, false), [(105, Some(3.0)), (115, Some(3.0))]);
         assert_eq!(levels_during(120..140, true), [(125, Some(0.0)), (135, Some(0.0))]);
-        // One that goes and comes at once is not gone.
+        // A hub that is back within 500 ms does not count as absent.
         assert_eq!(levels_during(140..144, false), []);
         assert_eq!(levels_during(144..150, true), [(145, Some(0.0))]);
         assert_eq!(levels_during(150..160, false), [(155, Some(3.0))]);

@@ -1,5 +1,5 @@
-//! Zenoh's configuration: its own configuration file, the addresses that the user named, and limits for what the file
-//! does not set. A session listens and searches only if the user or the file enables that.
+//! Zenoh's configuration: the user's configuration file, the given addresses, and limits for settings that the file
+//! does not contain. A session listens or scouts only if the user or the file enables that.
 
 use std::path::Path;
 
@@ -12,7 +12,7 @@ use zenoh::config::{EndPoint, WhatAmI};
 use super::log::without_locations;
 use crate::BridgeOptions;
 
-/// A valid configuration.
+/// A checked configuration.
 #[derive(Debug)]
 pub(crate) struct CheckedConfig {
     config: Config,
@@ -21,9 +21,9 @@ pub(crate) struct CheckedConfig {
 
 /// Keys of Zenoh's configuration, and the JSON values that they get if the file does not set them.
 ///
-/// Zenoh's own values are made for throughput: samples in long queues are old on a slow link. A message that finds no
-/// room waits in this session, while newer samples replace the samples in the queue. A router on the way has values of
-/// its own.
+/// Zenoh's defaults are chosen for throughput, and on a slow link samples in its long queues become old. With these
+/// limits, a message without room waits in this session, where newer samples replace older ones. A router on the path
+/// has its own settings.
 const LIMITS: &[(&str, &str)] = &[
     ("scouting/multicast/enabled", "false"),
     ("scouting/gossip/enabled", "false"),
@@ -34,27 +34,27 @@ const LIMITS: &[(&str, &str)] = &[
     ("transport/unicast/max_sessions", "64"),
     ("transport/link/tx/batch_size", "8192"),
     ("transport/link/tx/queue/size/data", "1"),
-    // A sample leaves at once, as with Zenoh's `express`. That one would also hold for routers on the way, which have
-    // room for two batches, and drop the third.
+    // Without batching, a sample is sent at once, as with Zenoh's `express`. But `express` would also apply to routers
+    // on the path, which have room for two batches, and drop the third.
     ("transport/link/tx/queue/batching/enabled", "false"),
     ("transport/link/rx/max_message_size", "1048576"),
     ("transport/link/tcp/so_sndbuf", "8192"),
     ("transport/link/tls/so_sndbuf", "8192"),
 ];
 
-/// Time for which a message waits for room before Zenoh drops it, and every later one until there is room, in
-/// microseconds: of a client, and of a router or peer. The second key is the time that a message in fragments waits
-/// beyond that.
+/// Time in microseconds for which a message waits for room before Zenoh drops it: for a client, and for a router or
+/// peer. Zenoh then drops later messages too, until there is room. The second key is the additional wait of a message
+/// in fragments.
 ///
-/// A client has one link. It waits as long as a link without data lives (10 s), so that it drops nothing unless the
-/// link breaks. A longer wait would delay the end of a dead link, because the wait holds a lock of Zenoh. A router may
-/// have many links, and one that stalls must not delay the others.
+/// A client has one link. It waits as long as a link without data stays open (10 s), so messages are dropped only if
+/// the link breaks. A longer wait would delay the detection of a dead link, because the waiting thread holds a lock of
+/// Zenoh. A router may have many links, and one that stalls must not delay the others.
 const WAIT_SETTINGS: [(&str, [&str; 2]); 2] = [
     ("transport/link/tx/queue/congestion_control/drop/wait_before_drop", ["10000000", "1000000"]),
     ("transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments", ["0", "2000000"]),
 ];
 
-/// Files that Zenoh opens when it connects, and not before.
+/// Files that Zenoh opens only when it connects.
 const FILES: &[(&str, Content)] = &[
     ("transport/link/tls/root_ca_certificate", Content::Trusted),
     ("transport/link/tls/listen_certificate", Content::Own),
@@ -64,10 +64,10 @@ const FILES: &[(&str, Content)] = &[
     ("transport/auth/usrpwd/dictionary_file", Content::Users),
 ];
 
-/// Without it nobody can listen with TLS.
+/// Key that listening with TLS requires.
 const CERTIFICATE: &str = "transport/link/tls/listen_certificate";
 
-/// What is in a file.
+/// Content of a file that the configuration names.
 #[derive(Clone, Copy)]
 enum Content {
     Trusted,
@@ -77,7 +77,7 @@ enum Content {
 }
 
 impl CheckedConfig {
-    /// Makes the configuration for these `options`. `now_s` is the time in seconds since 1970.
+    /// Reads and checks the configuration for these `options`. `now_s` is the time in seconds since 1970.
     ///
     /// # Errors
     ///
@@ -158,13 +158,13 @@ fn read(path: &Path) -> Result<Config, Failure> {
     })
 }
 
-/// Sets what is ours: a key and a value that Zenoh knows, as a test sees.
+/// Sets a key that this module chooses. Key and value are valid in Zenoh, which a test checks.
 fn set(config: &mut Config, key: &str, value: &str) {
     let set = config.insert_json5(key, value);
     debug_assert!(set.is_ok(), "{key} = {value}: {set:?}");
 }
 
-/// The addresses under `key` that are said for this `mode`.
+/// Returns the addresses under `key` for this `mode`.
 fn endpoints(config: &Config, key: &str, mode: WhatAmI) -> Vec<String> {
     let value = config.get_json(&format!("{key}/endpoints")).unwrap_or_default();
     let value: serde_json::Value = serde_json::from_str(&value).unwrap_or_default();
@@ -207,27 +207,27 @@ fn check_file(config: &Config, key: &str, content: Content, now_s: i64) -> Resul
     .map_err(|UnusableFile { reason: why, remedy }| refuse(why, remedy))
 }
 
-/// Reason why the file of a certificate or key cannot be used. The files are checked before Zenoh opens them: it does
-/// that only when it connects, and reports an expired certificate with the message of the other side.
+/// Reason why a certificate or key file cannot be used. This module checks the files, because Zenoh opens them only
+/// when it connects, and reports an expired certificate with the message of the peer.
 struct UnusableFile {
     reason: String,
     remedy: &'static str,
 }
 
-/// Checks that the first certificate in `text`, which this machine shows, is valid `now_s` seconds after 1970.
+/// Checks that the first certificate in `text`, which this machine presents, is valid `now_s` seconds after 1970.
 fn check_own(text: &[u8], now_s: i64) -> Result<(), UnusableFile> {
     check_validity(&certificates(text)?[0], now_s)
 }
 
-/// Checks that one of the certificates in `text`, which this machine trusts, is valid `now_s` seconds after 1970. A
-/// list may have expired ones.
+/// Checks that at least one certificate in `text`, which this machine trusts, is valid `now_s` seconds after 1970.
+/// Others in the list may have expired.
 fn check_trusted(text: &[u8], now_s: i64) -> Result<(), UnusableFile> {
     let certificates = certificates(text)?;
     let is_good = certificates[1..].iter().any(|block| check_validity(block, now_s).is_ok());
     check_validity(&certificates[0], now_s).or_else(|unusable| if is_good { Ok(()) } else { Err(unusable) })
 }
 
-/// Checks that `text` has a private key.
+/// Checks that `text` contains a private key.
 fn check_key(text: &[u8]) -> Result<(), UnusableFile> {
     if blocks(text)?.iter().any(|block| block.label.ends_with("PRIVATE KEY")) {
         return Ok(());
@@ -277,7 +277,7 @@ fn blocks(text: &[u8]) -> Result<Vec<Pem>, UnusableFile> {
 mod tests {
     use super::*;
 
-    /// Of no matter here: what certificates say of time is checked beside them.
+    /// Any time: other tests check the validity of certificates.
     const NOW_S: i64 = 0;
 
     fn options(connect: &[&str], listen: &[&str], config: Option<&Path>) -> BridgeOptions {
@@ -297,7 +297,7 @@ mod tests {
         prepared.config.get_json(key).unwrap()
     }
 
-    /// What becomes of a file with this `text`.
+    /// Reads a configuration file with this `text`.
     fn read_file(name: &str, text: &str, connect: &[&str]) -> Result<CheckedConfig, Failure> {
         let file = tempfile::Builder::new().suffix(name).tempfile().unwrap();
         std::fs::write(&file, text).unwrap();
@@ -372,9 +372,9 @@ mod tests {
         );
     }
 
-    /// Made by openssl: from 2026-01-01 to 2026-01-02, for CN=robot.
+    /// Certificate from openssl for CN=robot, valid from 2026-01-01 to 2026-01-02.
     const CERTIFICATE: &[u8] = include_bytes!("certificate/expired.pem");
-    /// 2026-01-01, in seconds.
+    /// 2026-01-01 in seconds since 1970.
     const SINCE_S: i64 = 1_767_225_600;
     const DAY_S: i64 = 86_400;
 

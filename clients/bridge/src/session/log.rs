@@ -1,5 +1,5 @@
-//! Zenoh's log lines about connections that fail, which is the only way to learn why. The newest lines wait here until they
-//! are reported, each once. Everything else in the log is ignored.
+//! Zenoh's log lines about failed connections, which are the only source of the reason. The newest lines wait here
+//! until they are reported, each once. All other log lines are ignored.
 
 use std::collections::VecDeque;
 use std::fmt::{Debug, Write};
@@ -9,56 +9,56 @@ use tracing::field::{Field, Visit};
 use tracing::span::{Attributes, Id, Record};
 use tracing::{Event, Level, Metadata, Subscriber};
 
-/// The lines of this process.
+/// Log lines of this process.
 #[derive(Clone, Default)]
 pub(super) struct Log(Arc<Mutex<Lines>>);
 
 #[derive(Default)]
 struct Lines {
     waiting: VecDeque<String>,
-    /// The last ones that were told or wait, so that they are told once.
+    /// Lines that were reported or wait, so that each is reported once.
     recent: VecDeque<String>,
     count: u64,
 }
 
-/// Lines that wait or are known: whoever can connect can cause them.
+/// Maximum number of waiting lines, and of recent lines. Bounded because any program that can connect can cause lines.
 const MAX_LINES: usize = 16;
-/// The longest line, in bytes.
+/// Maximum length of a line in bytes.
 const MAX_LINE_LEN: usize = 500;
 
-/// Text after which a line differs in each attempt (the time until the next one, the local port), or has advice for the
-/// wrong system, and how much of that text is kept.
+/// Texts after which a line is cut, and the number of bytes of the text that are kept. The rest differs in each attempt
+/// (time until the next attempt, local port), or is advice for another system.
 const CUT_MARKERS: [(&str, usize); 3] =
     [(" Retry in ", 0), ("Syn on: ", 3), (" Hint: increase the system", 0)];
-/// What Zenoh writes behind addresses, because this program told it so (`config.rs`).
+/// Suffix that Zenoh adds to addresses because of the settings in `config.rs`.
 const OUR_LIMIT: &str = "#so_sndbuf=8192";
 
-/// What Zenoh tells at the level of debugging only: where it is from, and how it begins. Why a connection that was lost does not
-/// come again, and why one that somebody else began was refused.
+/// Messages that Zenoh logs only at debug level: source and start of the text. They have the reasons why a lost
+/// connection does not return, and why an incoming connection was refused.
 const QUIET_MESSAGES: [(&str, &str); 3] = [
     ("zenoh::net::runtime::orchestrator", "Unable to connect"),
     ("zenoh_link_tls::unicast", "Can not accept"),
     ("zenoh_transport::unicast::establishment::accept", ""),
 ];
-/// Begin of Zenoh's line about a link that it closes because it has no room. Such a connection was not refused.
+/// Start of Zenoh's line about a link that it closes because it has no room. Such a connection was not refused.
 const CLOSED_MESSAGE: &str = "Unable to push";
-/// How it tells of one that it did not refuse.
+/// Start of a message about a connection that was accepted.
 const ACCEPTED_MESSAGE: &str = "New transport";
 
 impl Log {
-    /// Takes what is logged from now on. In a process that has somebody else for that, nothing comes.
+    /// Collects log lines from now on. If the process already has another subscriber for logs, nothing is collected.
     pub(super) fn install() -> Log {
         let log = Log::default();
         let _ = tracing::subscriber::set_global_default(LogSubscriber(log.clone()));
         log
     }
 
-    /// The lines that were not told yet.
+    /// Returns the lines that were not reported yet, and removes them.
     pub(super) fn take(&self) -> Vec<String> {
         self.lines().waiting.drain(..).collect()
     }
 
-    /// How many lines there were, those that were told before among them.
+    /// Returns the number of lines so far, including repeated ones.
     pub(super) fn count(&self) -> u64 {
         self.lines().count
     }
@@ -88,7 +88,7 @@ impl Log {
     }
 }
 
-/// `line` without the places in Zenoh's own files of which its errors tell, ` at PATH.rs:LINE`.
+/// Returns `line` without the source locations in Zenoh's errors, ` at PATH.rs:LINE`.
 pub(super) fn without_locations(line: &str) -> String {
     let mut kept = String::with_capacity(line.len());
     let mut remainder = line;
@@ -143,7 +143,7 @@ impl Subscriber for LogSubscriber {
     fn exit(&self, _: &Id) {}
 }
 
-/// The text of an event.
+/// Text of an event.
 struct MessageText(String);
 
 impl Visit for MessageText {

@@ -1,18 +1,18 @@
-//! Who may connect: certificates and users, as Zenoh's own configuration says. The certificates are made here.
+//! Tests of access control with certificates and users in Zenoh's own configuration. The tests create the certificates.
 
 use std::process::Command;
 
 use crate::testkit::{INT, Program, TestEnv, output};
 use crate::{address, bridge, bridge_without_peer, refusal_count};
 
-/// Runs `openssl` in the directory of this test.
+/// Runs `openssl` in the test's directory.
 fn run_openssl(env: &TestEnv, words: &str) {
     let output = output(Command::new("openssl").args(words.split(' ')).current_dir(env.path("")));
     let output = output.expect("openssl is installed");
     assert!(output.status.success(), "openssl {words}: {}", String::from_utf8_lossy(&output.stderr));
 }
 
-/// An authority called `ca`, and a certificate of it for the loopback called `name`.
+/// Creates an authority `ca`, and for each name a certificate of it for the loopback address.
 fn make_certificates(env: &TestEnv, ca: &str, names: &[&str]) {
     run_openssl(
         env,
@@ -33,7 +33,7 @@ fn make_certificates(env: &TestEnv, ca: &str, names: &[&str]) {
     }
 }
 
-/// A file of Zenoh's configuration: mutual TLS by the authority `ca` with the certificate `own`.
+/// Writes a Zenoh configuration with mutual TLS, the authority `ca` and the certificate `own`. Returns its path.
 fn tls(env: &TestEnv, file: &str, ca: &str, own: &str) -> String {
     let path = |name: &str| env.path_argument(name);
     let (ca, certificate, key) =
@@ -52,7 +52,7 @@ fn await_ready(program: &mut Program) {
     crate::wait_until_linked(program);
 }
 
-/// Waits until it says why it is not connected, in these words, and what to do.
+/// Waits until the program reports this finding about a failed connection, with a message and a remedy.
 fn await_finding(program: &mut Program, finding: &str) {
     let line = program.await_line("the reason", |line| {
         line["class"] == "bridge_link" && line["state"] == "failing" && line["finding"] == finding
@@ -60,7 +60,8 @@ fn await_finding(program: &mut Program, finding: &str) {
     assert!(line["remedy"].is_string() && line["message"].is_string(), "{line}");
 }
 
-/// What `doctor` and `bridge --check` find with this address and configuration: the same, and end so.
+/// Runs `doctor` and `bridge --check` with this address and configuration. Checks that both fail with the same finding,
+/// and returns it.
 fn check_finding(env: &TestEnv, at: &str, config: &str) -> String {
     let doctor = env.run(&["doctor", "--json", "--bridge", at, "--bridge-config", config]);
     assert_eq!(doctor.exit_code, Some(5), "{doctor}");
@@ -85,14 +86,14 @@ fn only_certificates_of_the_authority_can_connect() {
     await_ready(&mut here);
     await_ready(&mut robot);
     assert_eq!(here.end(INT).exit_code, Some(0));
-    // One that does not know the robot's authority, and one that the robot does not know.
+    // The first peer does not trust the robot's authority, and the robot does not trust the second one's.
     for (file, ca) in [("a.json5", "stranger"), ("b.json5", "ca")] {
         let config = of(file, ca, "thief");
         let mut intruder = bridge_without_peer(&other, &["--connect", &at, "--publish", "--config", &config]);
         await_finding(&mut intruder, "the certificates do not fit");
         assert_eq!(intruder.end(INT).of_class("bridge_published").len(), 0);
     }
-    // The robot only sends. It reports what its peers need, and counts them.
+    // The robot only sends. It reports the finding about a refused peer, and counts the peer.
     let line = robot.await_line("the refusal", |line| {
         line["class"] == "bridge_link"
             && line["finding"] == "somebody was refused: the certificates do not fit"
@@ -148,7 +149,7 @@ fn wrong_or_missing_password_is_refused() {
     await_finding(&mut robot, "somebody was refused: the user or the password is wrong, or there is none");
 }
 
-/// A certificate of its own authority for CN=robot that was good on one day in 2024.
+/// Creates a configuration with a self-signed certificate for CN=robot that was valid on one day in 2024.
 fn expired_config(env: &TestEnv) -> String {
     env.file("index", "");
     env.file("serial", "01\n");

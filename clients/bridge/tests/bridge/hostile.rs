@@ -1,4 +1,5 @@
-//! Peers that mean harm: whatever they send is refused, counted, and takes no memory; who is honest is heard.
+//! Tests with hostile peers. The bridge rejects and counts their input within bounded memory, and still receives from
+//! honest peers.
 
 use scanhub_schema::datagram::{HEADER_LEN, Head};
 use scanhub_schema::{State, Status, Topic, Verdict, Zones};
@@ -15,7 +16,7 @@ fn put(session: &Session, key: &str, bytes: &[u8]) {
     session.put(key, bytes).congestion_control(CongestionControl::Block).wait().expect("it is connected");
 }
 
-/// Memory of its own, in bytes.
+/// Returns the resident memory of a program in bytes.
 fn resident_bytes(program: &Program) -> u64 {
     let text = std::fs::read_to_string(format!("/proc/{}/statm", program.pid())).expect("it lives");
     let pages: u64 = text.split(' ').nth(1).and_then(|word| word.parse().ok()).expect("a number");
@@ -31,7 +32,7 @@ fn invalid_datagrams_do_not_block_a_valid_sender() {
     wait_until_linked(&mut here);
     let mut sender = TestGateway::new(HUB_ID, 7, 0, "front");
     let topics = [Topic::Zones, Topic::Status];
-    // Nobody has a name for it before the bridge has heard of it.
+    // Repeat the announcement until the bridge has subscribed.
     wait_until("the sensor is published", || {
         let bytes = sender.announcement(&topics);
         put(&session, &format!("{SENSOR_KEY}/announce"), &bytes);
@@ -65,7 +66,7 @@ fn invalid_datagrams_do_not_block_a_valid_sender() {
     for (topic, bytes, _) in &wrong {
         (0..50).for_each(|_| put(&session, &format!("{SENSOR_KEY}/{topic}"), bytes));
     }
-    // Names of others, names that are none, and a sensor that is called otherwise.
+    // IDs of other hubs, an invalid ID, and a key with another sensor's name.
     for key in [
         "scanhub/0000000000000001/front/zones",
         "scanhub/5f3a12bc00d1e2f3/rear/zones",
@@ -73,18 +74,19 @@ fn invalid_datagrams_do_not_block_a_valid_sender() {
     ] {
         put(&session, key, &good);
     }
-    // Ten thousand names, each with a datagram that says the same of itself.
+    // Ten thousand hub IDs, each with a datagram that matches its key.
     for n in 0..10_000_u64 {
         let topic = Topic::Zones.number();
         let head = Head { hub: n, epoch: 1, topic, revision: 1, ..Head::default() };
         let mut buffer = [0; 100];
         put(&session, &format!("scanhub/{n:016x}/front/zones"), head.seal(&mut buffer, 12).expect("it fits"));
     }
-    // A flood of what nobody can take so fast.
+    // Send more than the bridge can handle.
     for _ in 0..20_000 {
         put(&session, &format!("{SENSOR_KEY}/zones"), &broken);
     }
-    // Who is honest goes on, and announces: it sent for less than a second, and had to make room for others.
+    // The honest sender continues. It announces again, because it sent for less than a second and its entry was
+    // evicted.
     wait_until("who is honest is heard", || {
         put(&session, &format!("{SENSOR_KEY}/announce"), &sender.announcement(&topics));
         put(&session, &format!("{SENSOR_KEY}/zones"), &zones(&mut sender, Verdict::Stop));

@@ -1,4 +1,4 @@
-//! Two machines and a bridge on each: what the hub of one publishes is on the other.
+//! Tests with a bridge on each of two machines: topics of one machine's hub are available on the other.
 
 use std::cell::Cell;
 use std::process::Command;
@@ -13,7 +13,7 @@ use crate::{
     refusal_count, wait_until_linked,
 };
 
-/// By the number of the scan, what `name` saw.
+/// Returns `seq` and ranges of `count` scans of the topic `name`.
 fn scans(env: &TestEnv, name: &str, count: &str) -> Vec<(u64, Value)> {
     let outcome = env.run(&["echo", name, "--json", "-n", count, "--timeout", "20s"]);
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
@@ -34,7 +34,7 @@ fn hub_is_published_on_another_machine_without_loss() {
     let line = here.await_line("a sensor", |line| line["kind"] == "published");
     assert_eq!(line["sensor"], "robot1.front");
 
-    // The same scans on both sides.
+    // Both sides receive the same scans.
     let mut far = desk.echo(&["robot1.front/scan"]);
     let near = scans(&robot, "front/scan", "20");
     let last = near.last().expect("scans").0;
@@ -42,13 +42,13 @@ fn hub_is_published_on_another_machine_without_loss() {
     let far = far.end(INT);
     let far = far.of_class("scan");
     let both: Vec<_> = far.iter().map(|line| (number(line, "seq"), &line["ranges"])).collect();
-    // Where the machine is busy a newer scan takes the place of one that waits.
+    // On a busy machine, a newer scan replaces one that waits.
     let pairs =
         near.iter().filter_map(|(seq, ranges)| Some((ranges, both.iter().find(|far| far.0 == *seq)?.1)));
     let pairs: Vec<_> = pairs.collect();
     assert!(pairs.len() > 5 && pairs.iter().all(|(near, far)| near == far), "{} scans", pairs.len());
 
-    // Who comes late has state and background all the same, and at once.
+    // A late joiner gets status and background at once.
     let late = TestEnv::new();
     let (mut latest, _) = bridge(&late, &["--connect", &at, "--publish"]);
     latest.await_line("a sensor", |line| line["kind"] == "published");
@@ -57,7 +57,7 @@ fn hub_is_published_on_another_machine_without_loss() {
     let background = late.run(&["echo", &format!("{own}/background"), "--json", "-n1", "--timeout=20s"]);
     assert_eq!(background.exit_code, Some(0), "{background}");
 
-    // The hub goes: zones are unknown, and its bridge stays for the next one.
+    // When the hub exits, zones become unknown, and its bridge waits for the next hub.
     let mut zones = desk.echo(&["robot1.front/zones"]);
     hub.end(INT);
     zones.await_line("nothing is known", |line| line["class"] == "zones" && line["verdict"] == "unknown");
@@ -69,7 +69,7 @@ fn hub_is_published_on_another_machine_without_loss() {
         "{sent}{received}"
     );
     assert_eq!(assert_counters_agree(&sent, &received), 0, "{received}");
-    // Who came late lost nothing: what was sent before does not count.
+    // The late joiner lost nothing, because samples sent before it connected do not count.
     let (all, of_latest) =
         (final_counters(&sent, &["sent"]), final_counters(&latest, &["received", "lost", "duplicate"]));
     assert!(of_latest["front/scan"][0] > 0, "{latest}");
@@ -86,7 +86,7 @@ fn hub_is_published_on_another_machine_without_loss() {
     }
 }
 
-/// The keys of all answers to a query of a plain Zenoh client.
+/// Returns the keys of all replies that a plain Zenoh client gets to a query.
 fn answers(session: &zenoh::Session, query: &str) -> Vec<String> {
     let replies = session.get(query).wait().expect("a query");
     let mut keys = Vec::new();
@@ -118,7 +118,7 @@ fn plain_zenoh_client_gets_samples_and_query_replies() {
         "rear/background",
         "rear/status",
     ]);
-    // A router has room for two samples that are sent as `express`.
+    // A router has room for only two samples that are sent as `express`.
     let samples = client.declare_subscriber("scanhub/*/*/scan").wait().expect("a subscriber");
     for _ in 0..5 {
         assert!(!samples.recv().expect("a scan").express());
@@ -169,7 +169,7 @@ fn both_directions_go_through_one_connection() {
     assert_eq!(other.await_line("its sensor", published)["sensor"], format!("{left_id}.front"));
     wait_until("both have both", || left.sensor_count() == 2 && right.sensor_count() == 2);
     let (one, other) = (one.end(INT), other.end(INT));
-    // What came is not sent back.
+    // Received samples are not sent back.
     for outcome in [&one, &other] {
         let published = outcome.of_class("bridge_published");
         assert_eq!(
@@ -181,7 +181,7 @@ fn both_directions_go_through_one_connection() {
 }
 
 impl TestEnv {
-    /// How many sensors have topics here.
+    /// Returns the number of sensors that have topics in this domain.
     fn sensor_count(&self) -> usize {
         let topics = self.run(&["list", "--json"]).of_class("topic");
         let mut sensors: Vec<_> = topics.iter().map(|line| line["sensor"].to_string()).collect();
@@ -191,11 +191,12 @@ impl TestEnv {
     }
 }
 
-/// What `scanhub bridge` says in one line, with nothing of its own but `beside`, a text of a shell.
+/// Runs a copy of `scanhub` as `scanhub bridge`, alone in its directory or next to a script as `scanhub-bridge`.
+/// Returns the line that it prints.
 fn error_of_lone_program(env: &TestEnv, bridge_script: Option<&str>) -> String {
     let program = env.command(&["bridge", "--connect=tcp/127.0.0.1:1"]).get_program().to_owned();
     let alone = env.path("scanhub");
-    // For the reason that `write_program` gives, another process writes it.
+    // Another process writes the copy, for the reason that `write_program` explains.
     assert!(succeeds(Command::new("cp").arg(program).arg(&alone)), "can be copied");
     if let Some(script) = bridge_script {
         write_program(env.path("scanhub-bridge"), format!("#!/bin/sh\n{script}\n"));
@@ -230,7 +231,7 @@ fn it_is_ready_when_the_router_is_there() {
         waits.get() && why.get()
     });
     assert!(!there.prints(|line| line["class"] == "bridge_ready"));
-    // Who listens is ready when others can connect.
+    // A bridge that listens reports that it is ready once others can connect.
     let _router = bridge(&middle, &["--listen", &at]);
     let socket = at.strip_prefix("tcp/").expect("tcp");
     std::net::TcpStream::connect(socket).expect("it listens");

@@ -1,5 +1,5 @@
-//! The program `scanhub-bridge` from outside, as `scanhub bridge` runs it: a hub's topics on another machine, over routers
-//! that come and go, links that are slow, and among peers that mean harm. Routers are bridges that listen.
+//! Tests of the program `scanhub-bridge` from outside, run as `scanhub bridge`: topics of a hub on another machine,
+//! routers that restart, slow links and hostile peers. Routers are bridges that listen.
 
 #[path = "../../../../tests/testkit/mod.rs"]
 mod testkit;
@@ -19,34 +19,35 @@ use serde_json::Value;
 use testkit::{Outcome, Program, TestEnv, number, wait_until};
 use zenoh::{Config, Session, Wait};
 
-/// A simulator whose sensors are as usual.
+/// Flags of a simulator without any changes.
 const NO_FLAGS: &[&str] = &[];
 
-/// An address on the loopback that nobody listens at.
+/// Returns an address on the loopback on which no program listens.
 fn address(protocol: &str) -> String {
     let port =
         TcpListener::bind("127.0.0.1:0").and_then(|socket| socket.local_addr()).expect("a port").port();
     format!("{protocol}/127.0.0.1:{port}")
 }
 
-/// A bridge with these flags that listens or is connected, and what it is called if it sends.
+/// Starts a bridge with these flags, and waits until it listens or is connected. Returns it with its hub ID, which is
+/// empty if it does not send.
 fn bridge(env: &TestEnv, flags: &[&str]) -> (Program, String) {
     let mut program = bridge_without_peer(env, flags);
     let line = program.await_line("its begin", |line| line["class"] == "bridge_ready");
     (program, line["hub"].as_str().unwrap_or_default().to_owned())
 }
 
-/// A bridge with these flags that nobody waits for.
+/// Starts a bridge with these flags, without waiting for a connection.
 fn bridge_without_peer(env: &TestEnv, flags: &[&str]) -> Program {
     env.start(&[&["bridge", "--json"], flags].concat())
 }
 
-/// Waits until somebody is connected to it.
+/// Waits until the program reports a link.
 fn wait_until_linked(program: &mut Program) {
     program.await_line("a link", |line| line["class"] == "bridge_link" && line["state"] == "up");
 }
 
-/// A router that knows nothing of sensors.
+/// Starts a bridge that listens, in a domain without a hub.
 fn router(env: &TestEnv, listen: &str, connect: &[&str]) -> Program {
     let listen = format!("--listen={listen}");
     let connect: Vec<_> = connect.iter().map(|address| format!("--connect={address}")).collect();
@@ -73,13 +74,13 @@ fn open_peer(at: &str) -> Session {
     session.expect("a session")
 }
 
-/// By sensor and topic, the value of each of these keys in the last account of a bridge: in one before it, a sensor that is
-/// received may have had no name yet.
+/// Returns the values of `keys` in the last statistics of a bridge, by sensor and topic. Earlier statistics are not
+/// used, because a received sensor may have had no name yet.
 fn final_counters(outcome: &Outcome, keys: &[&str]) -> CounterValues {
     last_counters(&outcome.lines(), keys)
 }
 
-/// Returns the counters that a running bridge has printed last.
+/// Returns the values of `keys` in the last statistics that a running bridge has printed.
 fn current_counters(program: &mut Program, keys: &[&str]) -> CounterValues {
     let lines = RefCell::new(Vec::new());
     program.prints(|line| {
@@ -94,7 +95,7 @@ type CounterValues = BTreeMap<String, Vec<u64>>;
 fn last_counters(lines: &[Value], keys: &[&str]) -> CounterValues {
     let (mut rows, mut is_whole) = (BTreeMap::new(), false);
     for line in lines {
-        // The end of an account of what is received.
+        // This line ends the statistics of received samples.
         is_whole |= line["class"] == "bridge_refused";
         if line["class"] != "bridge" || line[keys[0]].is_null() {
             continue;
@@ -108,7 +109,7 @@ fn last_counters(lines: &[Value], keys: &[&str]) -> CounterValues {
     rows
 }
 
-/// What was refused for this reason, as last accounted.
+/// Returns the count of this rejection reason in the last statistics.
 fn refusal_count(outcome: &Outcome, reason: &str) -> u64 {
     outcome.of_class("bridge_refused").last().map_or(0, |line| number(line, reason))
 }
@@ -117,7 +118,8 @@ fn text(value: &Value) -> &str {
     value.as_str().unwrap_or_default()
 }
 
-/// Nothing that was sent is lost or counted twice: of each topic as much was received and lost as was sent.
+/// Checks that both ends agree: for each topic, the sum of received and lost samples is the number of sent ones.
+/// Returns the number of lost samples.
 fn assert_counters_agree(sent: &Outcome, received: &Outcome) -> u64 {
     let there = final_counters(sent, &["sent", "replaced"]);
     let here = final_counters(received, &["received", "lost", "replaced"]);
@@ -125,7 +127,7 @@ fn assert_counters_agree(sent: &Outcome, received: &Outcome) -> u64 {
     let mut lost = 0;
     for (name, row) in &there {
         assert_eq!(row[0], here[name][0] + here[name][1], "{name}: {there:?}\n{here:?}");
-        // Announcements do not tell of themselves.
+        // Announcements do not include their own counters.
         assert!(name.ends_with("/announce") || row[1] == here[name][2], "{name}: {there:?}\n{here:?}");
         lost += here[name][1];
     }

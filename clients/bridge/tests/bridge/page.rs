@@ -1,4 +1,4 @@
-//! The commands of docs/bridge.md run as they stand there, but for names and ports of this machine.
+//! Tests that the commands in docs/bridge.md run as written, except for names and ports of this machine.
 
 use std::fs;
 use std::path::Path;
@@ -7,7 +7,7 @@ use std::process::Command;
 use crate::bridge;
 use crate::testkit::{INT, TestEnv, output};
 
-/// The blocks of the page in this language.
+/// Returns the code blocks of the page in this language.
 fn blocks(language: &str) -> Vec<String> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/bridge.md");
     let page = fs::read_to_string(path).expect("the page is there");

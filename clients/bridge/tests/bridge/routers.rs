@@ -1,4 +1,4 @@
-//! Routers between the machines: two in a row, and one that is killed and comes back.
+//! Tests with routers between the machines: two in a row, and one that is killed and restarted.
 
 use rustix::process::Signal;
 use serde_json::Value;
@@ -26,7 +26,7 @@ fn losses_of_a_restarted_router_are_all_counted() {
     let mut local = robot.echo(&["front/scan"]);
     let mut remote = desk.echo(&["robot1.front/zones"]);
     for _ in 0..3 {
-        // Not those that were told before and not read yet.
+        // Ignore lines that were printed earlier but not read yet.
         let is_zones = |line: &Value, since_ns: u64| {
             let is_known = line["class"] == "zones" && line["stale"] != true && line["verdict"] != "unknown";
             is_known && number(line, "wall_ns") >= since_ns
@@ -44,7 +44,7 @@ fn losses_of_a_restarted_router_are_all_counted() {
     let local = local.end(INT);
     assert_eq!(local.of_class("summary")[0]["missed"], 0, "the hub's own consumers: {local}");
     let sent = there.end(INT);
-    // The last announcement goes over two routers.
+    // The last announcement passes through two routers.
     let announced = announcement_count(&sent);
     here.await_line("the last announcement", |line| {
         line["class"] == "bridge"
@@ -58,7 +58,7 @@ fn losses_of_a_restarted_router_are_all_counted() {
     assert_counters_agree(&sent, &here.end(INT));
 }
 
-/// The link of a router that is stopped ends with Zenoh's lease, although a sample waits for room on it.
+/// The link to a stopped router ends after Zenoh's lease, even while a sample waits for room on it.
 #[test]
 fn stopped_router_loses_its_link_and_gets_it_back() {
     let (robot, desk) = (TestEnv::new(), TestEnv::new());
@@ -81,7 +81,7 @@ fn stopped_router_loses_its_link_and_gets_it_back() {
     assert_eq!(there.end(INT).exit_code, Some(0));
 }
 
-/// How many announcements were sent.
+/// Returns the number of announcements that were sent.
 fn announcement_count(sent: &crate::testkit::Outcome) -> u64 {
     crate::final_counters(sent, &["sent"])
         .iter()

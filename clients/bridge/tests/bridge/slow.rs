@@ -1,5 +1,5 @@
-//! A link that is slower than what is sent: what arrives is new, what was replaced or lost is told exactly, and nobody on
-//! the robot waits.
+//! Tests with a link that is slower than the samples require: arriving samples are new, counters of replaced and lost
+//! samples are exact, and nothing on the robot waits.
 
 use std::process::Command;
 
@@ -12,16 +12,16 @@ use crate::{
     wait_until_linked,
 };
 
-/// Lets no more than 0.5 Mbit/s through the loopback, whose packets are those of a network.
+/// Limits the loopback to 0.5 Mbit/s, with the packet size of a network. Returns whether that succeeded.
 fn limit_rate() -> bool {
     let run = |program: &str, words: &str| succeeds(Command::new(program).args(words.split(' ')));
     run("ip", "link set lo mtu 1500")
         && run("tc", "qdisc add dev lo root tbf rate 500kbit burst 5000 latency 200ms")
 }
 
-/// Ends the bridges `there`, which sends, and `here`, which receives, after everything has arrived. The hub has ended
-/// before, so that the link gets empty: a bridge that ends cuts off the samples on its link. Returns what the sender printed,
-/// and the number of lost samples.
+/// Waits until everything has arrived, and then ends the bridges. The hub must have exited, so that the link becomes
+/// empty; a bridge that ends drops the samples that are still on its link. Returns the sender's output, and the number
+/// of lost samples.
 fn end_after_delivery(mut sender: Program, mut receiver: Program) -> (Outcome, u64) {
     let mut received = || current_counters(&mut receiver, &["received", "lost"]);
     wait_until("all samples have arrived", || {
@@ -70,10 +70,11 @@ fn on_a_slow_link_the_newest_comes_first() {
     });
 }
 
-/// Number of zones that newer ones must replace before the stalled link moves again: those of more than 1 s.
+/// Number of zones that newer ones must replace before the stalled link continues. It corresponds to more than 1 s.
 const MIN_REPLACED: u64 = 60;
 
-/// Stops the program that receives until newer samples have replaced many others, with this bridge as the router.
+/// Stops the receiving program until newer samples have replaced many others. The robot's bridge or the receiving one
+/// listens.
 fn stall(robot_listens: bool) {
     let (robot, desk) = (TestEnv::new(), TestEnv::new());
     let _sensor = robot.simulator(&["front"], NO_FLAGS);
@@ -84,7 +85,7 @@ fn stall(robot_listens: bool) {
     };
     let send = || bridge(&robot, &[robot_flag, &at, "--topic=*/*"]).0;
     let receive = || bridge(&desk, &[desk_flag, &at, "--publish"]).0;
-    // The one that listens must be first.
+    // Start the listening bridge first.
     let (mut there, mut here);
     if robot_listens {
         (there, here) = (send(), receive());
@@ -104,7 +105,7 @@ fn stall(robot_listens: bool) {
     here.signal(Signal::CONT);
     assert_eq!(hub.end(TERM).exit_code, Some(0));
     let (sent, lost) = end_after_delivery(there, here);
-    // A receiver that is stopped for longer than 5 s loses the link, and what was on it.
+    // A receiver that is stopped for longer than 5 s loses the link, and the samples on it.
     let is_broken = sent.of_class("bridge_link").iter().any(|line| line["state"] == "down");
     assert!(lost == 0 || is_broken, "{lost} samples were not sent: {sent}");
 }
